@@ -1,6 +1,7 @@
 import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -25,19 +26,20 @@ def nothing_left_running() -> Iterator[None]:
 
 
 class NoiseWorld:
-    """Small world of noise, in which a frame's number determines its bits."""
+    """Small world of noise, in which a frame's number determines its bits; it ends with an error at one of them."""
 
     width, height = 64, 48
+    fails_at: int | None = None
+    error: Exception = ZeroDivisionError("the world ended")
 
-    def __init__(self, fails_at: int | None = None) -> None:
+    def __init__(self) -> None:
         rig = load_rig("paper-rig")
         small = rig.pinhole.scaled(self.width, self.height)
         self.rig: Rig = rig.model_copy(update={"intrinsics": rig.intrinsics.model_copy(update=vars(small))})
-        self.fails_at = fails_at
 
     def images(self, number: int) -> SensedImages:
         if number == self.fails_at:
-            raise ZeroDivisionError("the world ended")
+            raise self.error
         noise, shape = np.random.default_rng(number), (self.height, self.width)
         depth, ir = noise.integers(0, 65536, shape, np.uint16), noise.integers(0, 256, shape, np.uint8)
         depth[0, :8] = 0
@@ -74,10 +76,10 @@ def hurried_clock() -> type[HurriedClock]:
     return HurriedClock
 
 
-def record_noise(path: Path, frames: int) -> Path:
-    """Record a NoiseWorld's first frames without waiting for real time."""
+def record_noise(path: Path, frames: int, world: Any = None) -> Path:
+    """Record the first frames of a world, a NoiseWorld if none is given, without waiting for real time."""
     recording = Recording(path, frames=frames)
-    with SimulatedCamera("sim:noise", NoiseWorld(), clock=HurriedClock(), recording=recording) as camera:
+    with SimulatedCamera("sim:noise", world or NoiseWorld(), clock=HurriedClock(), recording=recording) as camera:
         for _ in camera:
             pass
     return path
@@ -92,11 +94,6 @@ def recorded() -> Callable[..., Path]:
 def noise_bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Record twenty frames of a NoiseWorld."""
     return record_noise(tmp_path_factory.mktemp("bags") / "noise.bag", 20)
-
-
-@pytest.fixture
-def fake_l515() -> type[FakeLidar]:
-    return FakeLidar
 
 
 @pytest.fixture

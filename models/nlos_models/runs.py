@@ -244,8 +244,8 @@ def direct_start(recipe: Recipe, weights: Path | None) -> tuple[DirectNetwork | 
 
 def transfer_start(
     recipe: Recipe, weights: Path | None, *, partial: bool, on_report: Callable[[str], None]
-) -> tuple[RemappingNetwork | DirectNetwork, list[Recipe]]:
-    """Load the networks that a transfer starts from and the runs that made them.
+) -> tuple[RemappingNetwork | DirectNetwork, CheckpointRecord]:
+    """Load the networks that a transfer starts from and their record.
 
     By default they are the paper's where the recipe aims at a latent, else the direct ones. If `partial`, only matching
     layers of the compressor are loaded, `on_report` is called with a summary of them, and the others are initialised
@@ -254,12 +254,11 @@ def transfer_start(
     folder = weights_folder(weights, PAPER if recipe.latent_weight else DIRECT)
     _check_fits(recipe, folder)
     if not partial:
-        network, record = load_network(folder)
-        return network, record.runs
+        return load_network(folder)
     torch.manual_seed(recipe.seed)
     pipeline, record, report = load_pipeline_partly(folder)
     on_report(f"compressor: {report}")
-    return pipeline, record.runs
+    return pipeline, record
 
 
 def _pipeline_start(recipe: Recipe, weights: Path | None) -> tuple[RemappingNetwork, list[Recipe]]:

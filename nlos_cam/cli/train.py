@@ -184,8 +184,8 @@ def compressor(
     fabric = run.fabric(recipe)
     start, runs = models.compressor_start(recipe, vae_folder, weights)
     maps = data_sets.read_maps(recipe, data, held_out_data, wall, stream=stream)
-    recipe, rig = maps.limit_recipe(recipe), maps.plan.rig
-    record = models.record_run(recipe, run.out, (rig.name, rig.checksum), runs, weights, vae_folder)
+    recipe = maps.limit_recipe(recipe)
+    record = models.record_run(recipe, run.out, maps.rig, runs, weights, vae_folder)
     job = run.training(recipe, record, models.digest_of(start.vae, start.pipeline, maps.digest))
     run.finish(recipe, models.launch(fabric, models.run_compressor, job, start, maps.training, maps.held_out))
 
@@ -244,11 +244,11 @@ def transfer(
     """Fine-tune synthetic weights on a bench's recordings (SI 4): all layers first, then the classifier alone."""
     recipe = run.recipe("transfer")
     fabric = run.fabric(recipe)
-    pipeline, runs = models.transfer_start(recipe, weights, partial=partial, on_report=say)
+    pipeline, start = models.transfer_start(recipe, weights, partial=partial, on_report=say)
     encoder = models.load_encoder(vae_folder or weights)
-    maps = data_sets.read_maps(recipe, data, held_out_data, wall)
-    recipe, rig = maps.limit_recipe(recipe), maps.plan.rig
-    record = models.record_run(recipe, run.out, (rig.name, rig.checksum), runs, weights)
+    maps = data_sets.read_maps(recipe, data, held_out_data, wall, start=start)
+    recipe = maps.limit_recipe(recipe)
+    record = models.record_run(recipe, run.out, maps.rig, start.runs, weights)
     job = run.training(recipe, record, models.digest_of(pipeline, encoder, maps.digest))
     figures = models.launch(fabric, models.run_transfer, job, pipeline, encoder, maps.training, maps.held_out)
     run.finish(recipe, figures["after"], figures["before"])

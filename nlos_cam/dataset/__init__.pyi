@@ -16,6 +16,7 @@ __all__ = [
     "BuildReport",
     "Dataset",
     "DatasetPlan",
+    "Labelled",
     "Objects",
     "PackedMaps",
     "RigSpread",
@@ -49,7 +50,7 @@ __all__ = [
 
 from .build import HELD_OUT_SEED, TEST_SEED, TRAINING_SEED, BuildReport, build_dataset
 from .doubt_samples import EMPTY, GENERIC, ORDINARY, check_doubt_data, doubt_sets, quality_set, samples_on_disk
-from .labelled import FRAMES_PER_RECORDING, label_recordings, list_recordings, read_labelled, write_shards
+from .labelled import FRAMES_PER_RECORDING, Labelled, label_recordings, list_recordings, read_labelled, write_shards
 from .outliers import (
     HELD_OUT_OUTLIERS,
     SHAPE_OUTLIERS,

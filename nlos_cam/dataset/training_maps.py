@@ -10,13 +10,24 @@ import numpy as np
 import torch
 from nlos_calibration import Moments, load_measured
 from nlos_calibration.arrays import Float16, Float32
-from nlos_models import InMemory, MapBatch, MapSet, MapSource, Recipe, WithNoise, first_of, subtract_bare_wall
+from nlos_models import (
+    CheckpointRecord,
+    InMemory,
+    MapBatch,
+    MapSet,
+    MapSource,
+    Recipe,
+    WithNoise,
+    first_of,
+    subtract_bare_wall,
+)
 
 from nlos_cam.dataset.packed import map_noise
 from nlos_cam.dataset.plan import DatasetPlan, RigSpread
 from nlos_cam.dataset.reader import MAP_CHANNELS, Dataset, open_dataset
 from nlos_cam.errors import SceneError
 from nlos_cam.frames import MAP_COLUMNS, MAP_ROWS, maps_from_frame
+from nlos_cam.reconstruct import align_all, rig_to_align_with
 from nlos_cam.render import Scene, Sensor, render
 
 BARE_WALL_FRAMES = 60
@@ -32,11 +43,13 @@ class MapSplit(NamedTuple):
     training: MapSource
     held_out: MapSet
     plan: DatasetPlan
+    rig: tuple[str, str]
+    """Name and checksum of the rig that the maps are of, or aligned with."""
 
     @property
     def digest(self) -> str:
         """SHA-256 of the rig and the training objects: a run with another one cannot be resumed."""
-        return hashlib.sha256(self.plan.rig.checksum.encode() + self.training.image.tobytes()).hexdigest()
+        return hashlib.sha256(self.rig[1].encode() + self.training.image.tobytes()).hexdigest()
 
     def limit_recipe(self, recipe: Recipe) -> Recipe:
         """Return the recipe with the number of held-out objects available, which may be lower than it requests."""
@@ -80,19 +93,28 @@ def _subtract(batch: MapBatch, bare: BareMaps) -> MapBatch:
     return batch._replace(depth_m=difference_m, intensity=brighter)
 
 
-def read_maps(recipe: Recipe, data: Path, held_out_data: Path, wall: Path | None, *, stream: bool = False) -> MapSplit:
+def read_maps(
+    recipe: Recipe,
+    data: Path,
+    held_out_data: Path,
+    wall: Path | None,
+    *,
+    stream: bool = False,
+    start: CheckpointRecord | None = None,
+) -> MapSplit:
     """Return the maps of a recipe. Raises SceneError where they are too few, of two rigs, or not held out.
 
     To expected maps the sensor's noise is added, in each epoch another draw. A stream reads a whole dataset and keeps a
-    few shards in memory.
+    few shards in memory. Maps of another rig than that of the weights that a transfer has as its `start` are aligned
+    with it.
     """
     if wall and recipe.maps == "raw maps":
         raise SceneError(f"--wall {wall} only applies to difference maps; this recipe uses raw maps")
     if data.resolve() == held_out_data.resolve():
         raise SceneError(f"--dataset and --held-out are the same folder ({data}): hold out different objects")
-    training = open_dataset(data, color=recipe.colour, expected=recipe.maps == "raw maps")
+    dataset = open_dataset(data, color=recipe.colour, expected=recipe.maps == "raw maps")
     other = open_dataset(held_out_data, color=recipe.colour)
-    plan, count = training.plan, len(training)
+    plan, count = dataset.plan, len(dataset)
     if count < recipe.objects:
         raise SceneError(
             f"{data} holds {count} objects, the recipe needs {recipe.objects}: build more, or lower --objects"
@@ -107,13 +129,18 @@ def read_maps(recipe: Recipe, data: Path, held_out_data: Path, wall: Path | None
     held_out = first_of(other.arrays(), recipe.held_out)
     if bare:
         held_out = subtract_bare_wall(held_out, *bare)
+    rig = plan.rig
+    if start and plan.spread == RigSpread():
+        rig, held_out = rig_to_align_with(rig, start) or rig, align_all(held_out, rig, start)
     source: MapSource
     if stream:
-        source = Streamed(training, training.column("image"), bare)
+        source = Streamed(dataset, dataset.column("image"), bare)
     else:
-        maps = first_of(training.arrays(), recipe.objects)
-        source = InMemory(subtract_bare_wall(maps, *bare) if bare else maps)
-    return MapSplit(WithNoise(source, map_noise(plan)) if plan.expected else source, held_out, plan)
+        maps = first_of(dataset.arrays(), recipe.objects)
+        maps = subtract_bare_wall(maps, *bare) if bare else maps
+        source = InMemory(maps if rig is plan.rig or not start else align_all(maps, plan.rig, start))
+    training = WithNoise(source, map_noise(plan)) if plan.expected else source
+    return MapSplit(training, held_out, plan, (rig.name, rig.checksum))
 
 
 def measured_bare_wall(path: Path) -> BareMaps:

@@ -158,11 +158,13 @@ def evaluate(
     bare = bare_wall_for(record, objects.plan, wall)
     guesses, searched = baseline_answers(objects, training, nearest=nearest, tracked=tracked)
     doubter = load_uncertainty_model(weights, cache_folder() / "onnx") if record.input == "raw maps" else None
-    answers = answer_all(reconstructor, network_input(objects.maps, bare))
-    predicted, unseen = predict_quality(answers, objects.maps, doubter, objects.plan.rig), None
+    maps = network_input(objects.maps, bare, objects.plan, record)
+    answers = answer_all(reconstructor, maps)
+    predicted, unseen = predict_quality(answers, maps, doubter, objects.plan.rig), None
     if second:
-        others = answer_all(reconstructor, network_input(second.maps, bare))
-        sure = predict_quality(others, second.maps, doubter, second.plan.rig)
+        maps = network_input(second.maps, bare, second.plan, record)
+        others = answer_all(reconstructor, maps)
+        sure = predict_quality(others, maps, doubter, second.plan.rig)
         unseen = Unseen(second.names, second.maps.image.astype(np.float32), others.image, sure)
     facts = {
         "what": objects.description,

@@ -20,6 +20,7 @@ from nlos_cam.dataset import (
     BareMaps,
     Dataset,
     DatasetPlan,
+    RigSpread,
     measured_bare_wall,
     open_dataset,
     procedural_images,
@@ -39,7 +40,16 @@ from nlos_cam.objects import (
     object_depth,
     unseen_objects,
 )
-from nlos_cam.reconstruct import FrameConditions, Reconstruction, Verdict, VerdictFilter, estimate_doubt, verdict_limits
+from nlos_cam.reconstruct import (
+    FrameConditions,
+    Reconstruction,
+    Verdict,
+    VerdictFilter,
+    align_all,
+    estimate_doubt,
+    rig_to_align_with,
+    verdict_limits,
+)
 from nlos_cam.render import MultiBounce, Scene, SceneFile, SensorModel, render
 
 OnProgress = Callable[[int, int], None]
@@ -212,9 +222,11 @@ def bare_wall_for(record: CheckpointRecord, plan: DatasetPlan, wall: Path | None
     return measured_bare_wall(wall) if wall else render_bare_wall(plan)
 
 
-def network_input(maps: MapSet, bare: BareMaps | None) -> MapSet:
-    """Return the maps that the network takes: raw, or minus the bare wall."""
-    return subtract_bare_wall(maps, *bare) if bare else maps
+def network_input(maps: MapSet, bare: BareMaps | None, plan: DatasetPlan, record: CheckpointRecord) -> MapSet:
+    """Return the maps that the network takes: minus the bare wall, or raw and aligned with the rig of the weights."""
+    if bare:
+        return subtract_bare_wall(maps, *bare)
+    return maps if plan.spread != RigSpread() else align_all(maps, plan.rig, record)
 
 
 def baseline_answers(
@@ -237,7 +249,8 @@ def notes_about(record: CheckpointRecord, objects: HeldOutObjects, training: Dat
     """List mismatches between weights, objects and baselines that a reader of the figures has to know."""
     rig, notes = objects.plan.rig, list[str]()
     if record.rig_checksum != rig.checksum:
-        notes.append(f"the weights were trained for rig {record.rig_name} but the maps are of rig {rig.name}")
+        aligned = ", and aligned with it" if rig_to_align_with(rig, record) else ""
+        notes.append(f"the weights were trained for rig {record.rig_name} but the maps are of rig {rig.name}{aligned}")
     if training and training.plan.rig.checksum != rig.checksum:
         notes.append(f"the nearest neighbours come from {training.folder}, whose maps are of another rig")
     if unseen := sorted(set(left_out_categories(record)) & set(objects.categories)):

@@ -5,6 +5,7 @@ __all__ = [
     "Clock",
     "FrameConditions",
     "FrameResult",
+    "MapAlignment",
     "Mirrored",
     "PeriodicPhysicsCheck",
     "PhysicsCheck",
@@ -15,6 +16,8 @@ __all__ = [
     "Reconstruction",
     "Verdict",
     "VerdictFilter",
+    "align_all",
+    "alignment",
     "build_pipeline",
     "check_intrinsics",
     "check_reconstruction",
@@ -27,9 +30,11 @@ __all__ = [
     "log_warning",
     "open_bench",
     "reconstruct",
+    "rig_to_align_with",
     "verdict_limits",
 ]
 
+from .alignment import MapAlignment, align_all, alignment, rig_to_align_with
 from .bench import CalibratedRig, check_intrinsics, open_bench
 from .network import Clock, Mirrored, Quality, Reconstruction, estimate_doubt, reconstruct
 from .physics_check import (

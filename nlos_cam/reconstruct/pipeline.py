@@ -13,6 +13,7 @@ from nlos_models import CheckpointRecord, Reconstructor, UncertaintyModel, load_
 
 from nlos_cam.files import cache_folder
 from nlos_cam.frames import Frame, LidarMaps, MapMean, maps_from_frame
+from nlos_cam.reconstruct.alignment import alignment, rig_to_align_with
 from nlos_cam.reconstruct.bench import BenchObservation, CalibratedRig
 from nlos_cam.reconstruct.network import Clock, Network, Reconstruction, reconstruct_all
 from nlos_cam.reconstruct.physics_check import UNEXPLAINED, NullPhysicsCheck, PhysicsCheck, PhysicsCheckResult
@@ -64,8 +65,9 @@ class PreparedFrame:
 class Pipeline:
     """Per-frame reconstruction: frame -> maps -> difference maps -> networks -> uncertainty -> verdict.
 
-    Maps are the mean of the last `average` frames. An uncertainty model adds expected errors and a verdict, and removes
-    the surface where nothing is hidden. Stateful (running mean, drift, smoothed verdict): give `prepare` and `finish`
+    Maps are the mean of the last `average` frames; those of a bench other than the rig that networks were `trained` for
+    are aligned with it. An uncertainty model adds expected errors and a verdict, and removes the surface where nothing
+    is hidden. Stateful (running mean, drift, smoothed verdict): give `prepare` and `finish`
     the frames in order, from one thread; `reconstruct` keeps no state. The caller enters `checks`. Raises
     CalibrationError if the networks need difference maps and the bench has no reference.
     """
@@ -79,15 +81,25 @@ class Pipeline:
         average: int = 1,
         uncertainty_model: UncertaintyModel | None = None,
         checks: PhysicsCheck | None = None,
+        trained: CheckpointRecord | None = None,
     ) -> None:
         if uses_difference and bench.reference is None:
             raise CalibrationError(
                 "these weights expect difference maps: give --wall with a reference (calibrate the wall again)"
             )
-        self.bench, self.network, self.uncertainty_model = bench, network, uncertainty_model
+        self.network, self.uncertainty_model, self._trained = network, uncertainty_model, trained
         self.checks = checks or NullPhysicsCheck()
         self._verdicts = VerdictFilter(verdict_limits(uncertainty_model) if uncertainty_model else None)
-        self._uses_difference, self.average = uses_difference, average
+        self._uses_difference, self.average, self.bench = uses_difference, average, bench
+
+    @property
+    def bench(self) -> CalibratedRig:
+        """Bench of the frames; setting it aligns their maps with the training rig again. Any thread may set it."""
+        return self._bench[0]
+
+    @bench.setter
+    def bench(self, bench: CalibratedRig) -> None:
+        self._bench = bench, alignment(bench.rig, self._trained, bench.reference) if self._trained else None
 
     @property
     def average(self) -> int:
@@ -106,16 +118,18 @@ class Pipeline:
 
     def prepare(self, arrival: Arrival, clock: Clock, start_s: float) -> PreparedFrame:
         """Return the maps of a frame as the networks need them; call in frame order."""
-        taken_s, bench = clock(), self.bench  # another thread may replace it
+        taken_s, (bench, aligned) = clock(), self._bench  # another thread may replace it
         maps = maps_from_frame(arrival.frame)
         mapped_s = clock()
         maps = self._mean.add(maps)
         observation = bench.observe(arrival.frame, maps)
+        difference, corrected = observation.difference, bench.correct_range(maps)
+        network_input = difference if self._uses_difference and difference else corrected
+        if aligned:
+            network_input = aligned.align(corrected, difference.depth_m if difference else None)
         observed_s = clock()
         stages_s = {"wait": taken_s - start_s, "queue": taken_s - arrival.arrived_s}
         stages_s |= {"maps": mapped_s - taken_s, "bench": observed_s - mapped_s}
-        corrected = bench.correct_range(maps)
-        network_input = observation.difference if self._uses_difference and observation.difference else corrected
         return PreparedFrame(arrival, maps, observation, corrected, network_input, stages_s)
 
     def reconstruct(self, frames: Sequence[PreparedFrame], clock: Clock) -> list[Reconstruction]:
@@ -182,6 +196,7 @@ def build_pipeline(
         average=average,
         uncertainty_model=uncertainty_model,
         checks=checks,
+        trained=network.record,
     )
 
 
@@ -210,5 +225,6 @@ def _rig_warnings(rig: Rig, trained: CheckpointRecord) -> list[str]:
             return []
         return [f"the networks were trained for another rig than {rig.name}: expect larger errors"]
     if difference := rig_difference(rig, training_rig):
-        return [f"this rig differs from the training rig ({'; '.join(difference)}): expect larger errors"]
+        aligned = "its maps are aligned with that rig's, " if rig_to_align_with(rig, trained) else ""
+        return [f"this rig differs from the training rig ({'; '.join(difference)}): {aligned}expect larger errors"]
     return []

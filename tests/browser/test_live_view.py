@@ -71,11 +71,8 @@ def only(folder: Path, pattern: str) -> Path:
 
 def test_controls_of_a_live_run_do_what_they_say(start: Callable[..., Program], browser: Any, tmp_path: Path) -> None:
     program = start("live", "--camera", "sim")
-    page = Page(browser, program.address)
-    page.wait_drawn()  # from the address on, which is printed before networks and camera are there
-    again = Page(browser, program.address)
-    again.wait_drawn()
-    again.close()
+    page = Page(browser, program.address).drawn()  # printed before networks and camera are there
+    Page(browser, program.address).drawn().close()
     page.wait_until(lambda: page.state()["status"].get("fps", 0) > 1, "the status")
     for part in ("sim", "frames/s", "latency", "newest frame", "dropped", "°C", "disk for"):
         assert part in page.state()["statusText"]
@@ -134,15 +131,12 @@ def save_session(page: Page, browser: Any, folder: Path) -> None:
     page.wait_until(lambda: page.page.inner_text("#session") == "End session", "the button")
     page.page.wait_for_timeout(1500)
     assert "any browser" in page.click("#session")
-    session = Page(browser, only(folder, "session-*.html").as_uri())
-    session.wait_drawn()
-    session.close()
+    Page(browser, only(folder, "session-*.html").as_uri()).drawn().close()
 
 
 def test_page_without_the_token_is_read_only(start: Callable[..., Program], browser: Any) -> None:
     program = start("live", "--camera", "sim:bare-wall")
-    page = Page(browser, program.address.partition("#")[0])
-    page.wait_drawn()
+    page = Page(browser, program.address.partition("#")[0]).drawn()
     page.wait_until(lambda: page.page.query_selector("#record") is not None, "the controls")
     assert page.page.is_disabled("#record")
     assert "Read-only" in page.page.inner_text("#answer")
@@ -150,8 +144,7 @@ def test_page_without_the_token_is_read_only(start: Callable[..., Program], brow
 
 def test_empty_bench_is_taken_as_reference(start: Callable[..., Program], browser: Any, tmp_path: Path) -> None:
     program = start("live", "--camera", "sim:bare-wall")
-    page = Page(browser, program.address)
-    page.wait_drawn()
+    page = Page(browser, program.address).drawn()
     assert "change" not in page.state()["arrays"]
     page.wait_until(lambda: page.page.query_selector("#reference") is not None, "the controls")
     assert "reference of 60 frames" in page.click("#reference")
@@ -164,8 +157,7 @@ def test_recording_opens_plays_and_exports_in_the_page(
 ) -> None:
     capture = [sys.executable, "-c", "from nlos_cam.cli import run; run()", "capture", "--camera", "sim"]
     subprocess.run([*capture, "--seconds", "2", "--out", "run.bag"], check=True, cwd=tmp_path, capture_output=True)
-    page = Page(browser, start("view", "run.bag").address)
-    page.wait_drawn()
+    page = Page(browser, start("view", "run.bag").address).drawn()
     page.wait_until(lambda: not page.state()["status"].get("message"), "the whole recording")
     assert page.state()["end"] == pytest.approx(2.0, abs=0.3)
     page.page.evaluate("(t => { t.value = 1; t.dispatchEvent(new Event('input')); })(document.querySelector('#time'))")

@@ -32,8 +32,7 @@ def test_page_shows_every_layer_name_and_new_moment(browser: Any, calibrated: bo
     with WebViewer(RIG, exact_wall() if calibrated else None) as viewer:
         for first in (0, 10):  # the page is opened again
             viewer.show(full_moment(first))
-            page = Page(browser, viewer.address or "", size)
-            page.wait_drawn()
+            page = Page(browser, viewer.address or "", size).drawn()
             assert set(page.state()["arrays"]) >= LAYERS
             assert set(page.state()["labels"]) == NAMES
             assert page.state()["quads"] > 100
@@ -45,24 +44,16 @@ def test_page_shows_every_layer_name_and_new_moment(browser: Any, calibrated: bo
             assert page.page.evaluate("document.documentElement.scrollWidth") <= size[0], "nothing is beside the page"
             assert page.errors == []
             page.close()
-        assert ("distance" in page_text(browser, viewer)) == calibrated
-
-
-def page_text(browser: Any, viewer: WebViewer) -> str:
-    """Return the text of the calibration panel."""
-    page = Page(browser, viewer.address or "")
-    page.wait_drawn()
-    page.page.click("#tabs button:nth-child(3)")
-    with closing(page):
-        return page.page.inner_text("#facts")
+        page = Page(browser, viewer.address or "").drawn()
+        page.page.click("#tabs button:nth-child(3)")
+        assert ("distance" in page.page.inner_text("#facts")) == calibrated
 
 
 def test_page_says_ended_and_comes_back_with_the_next_run(browser: Any) -> None:
     with WebViewer(RIG) as viewer:
         port = urlsplit(viewer.address).port
         viewer.show(full_moment(0))
-        page = Page(browser, viewer.address or "")
-        page.wait_drawn()
+        page = Page(browser, viewer.address or "").drawn()
     page.wait_until(lambda: page.state()["headline"] == "The run has ended", "the end")
     with WebViewer(RIG, port=port) as viewer:
         viewer.show(full_moment(3))
@@ -80,7 +71,7 @@ def test_five_pages_and_one_that_never_reads_share_a_view(browser: Any) -> None:
         deaf.sendall(b"GET /stream HTTP/1.0\r\nHost: localhost\r\n\r\n")
         pages = [Page(browser, viewer.address or "") for _ in range(5)]
         for page in pages:
-            page.wait_drawn()
+            page.drawn()
         for number in range(1, 60):
             viewer.show(full_moment(number, size=(480, 640)))
             time.sleep(0.02)
@@ -99,7 +90,7 @@ def test_refused_page_goes_on_by_itself_and_a_hidden_one_makes_room(browser: Any
         for number in range(1, 20):  # a stream notices with the next messages that its browser left
             viewer.show(full_moment(number, size=(480, 640)))
             time.sleep(0.1)
-        page.wait_drawn()
+        page.drawn()
         for watcher in watchers:
             watcher.close()
         page.page.evaluate(
@@ -118,8 +109,7 @@ def test_saved_session_plays_from_the_file_alone(browser: Any, tmp_path: Path) -
     with SessionFile(tmp_path / "view.html", RIG, keeps_all=True) as session:
         for number in range(60):
             session.show(replace(full_moment(number), published_s=0.5 * number))
-    page = Page(browser, (tmp_path / "view.html").as_uri())
-    page.wait_drawn()
+    page = Page(browser, (tmp_path / "view.html").as_uri()).drawn()
     play_through(page)
     assert page.hosts <= {None, ""}
     with page.page.expect_download() as download:
@@ -129,9 +119,7 @@ def test_saved_session_plays_from_the_file_alone(browser: Any, tmp_path: Path) -
     assert len(saved) > 100
     page.close()
     with RecordedView(tmp_path / "view.html") as view:
-        served = Page(browser, view.address or "")
-        served.wait_drawn()
-        served.close()
+        Page(browser, view.address or "").drawn().close()
 
 
 def test_playback_plays_scrubs_and_changes_speed(browser: Any) -> None:
@@ -139,8 +127,7 @@ def test_playback_plays_scrubs_and_changes_speed(browser: Any) -> None:
         for number in range(60):
             viewer.show(replace(full_moment(number), published_s=0.5 * number))
         viewer.finish()
-        page = Page(browser, viewer.address or "")
-        page.wait_drawn()
+        page = Page(browser, viewer.address or "").drawn()
         page.wait_until(lambda: page.state()["end"] == pytest.approx(29.5), "the whole recording")
         play_through(page)
         page.close()
@@ -203,8 +190,7 @@ def test_page_without_truth_shows_the_errors_in_its_place(browser: Any) -> None:
     with WebViewer(RIG) as viewer:
         real = full_moment(0)
         viewer.show(replace(real, frame=replace(real.frame, truth_depth_m=None)))
-        page = Page(browser, viewer.address or "")
-        page.wait_drawn()
+        page = Page(browser, viewer.address or "").drawn()
         assert page.page.inner_text("#truth figcaption").startswith("Error")
         assert not page.page.is_visible("#errors")
         page.close()

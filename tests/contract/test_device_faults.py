@@ -38,18 +38,8 @@ class Tampered(SoftwareLidar):
             super()._push(profile, stream, *each)
 
 
-def late(number: int, time_s: float, pixels: np.ndarray, held: list[Push]) -> list[Push]:
-    held.append((number, time_s, pixels))
-    return []
-
-
-def frozen(number: int, time_s: float, pixels: np.ndarray, held: list[Push]) -> list[Push]:
-    del held
-    return [(number, time_s, np.full_like(pixels, 7))]
-
-
 WAYS: dict[str, Callable[[int, float, np.ndarray, list[Push]], list[Push]]] = {
-    "late": late,
+    "late": lambda n, t, p, held: held.append((n, t, p)) or [],
     "missing": lambda *_: [],
     "doubled": lambda n, t, p, _: [(n, t, p)] * 2,
     "five times": lambda n, t, p, _: [(n, t, p)] * 5,
@@ -61,7 +51,7 @@ WAYS: dict[str, Callable[[int, float, np.ndarray, list[Push]], list[Push]]] = {
     "clock still": lambda n, _t, p, _: [(n, 1.0, p)],
     "time not a number": lambda n, _t, p, _: [(n, float("nan"), p)],
     "time infinite": lambda n, _t, p, _: [(n, float("inf"), p)],
-    "frozen": frozen,
+    "frozen": lambda n, t, p, _: [(n, t, np.full_like(p, 7))],
     "black": lambda n, t, p, _: [(n, t, np.zeros_like(p))],
     "saturated": lambda n, t, p, _: [(n, t, np.full_like(p, np.iinfo(p.dtype).max))],
 }

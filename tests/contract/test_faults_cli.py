@@ -52,12 +52,6 @@ def test_live_goes_on_and_counts_faults(tmp_path: Path, capsys: pytest.CaptureFi
     assert 0 < report["counts"]["blank"] <= 10
 
 
-@pytest.mark.usefixtures("impatient")
-def test_live_prints_counts_in_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert run(tmp_path, PASSING[:-1], "--seconds", "1") == 0
-    assert len([line for line in capsys.readouterr().out.splitlines() if "3 duplicate" in line]) == 1
-
-
 @pytest.mark.slow
 @pytest.mark.usefixtures("impatient")
 def test_live_ends_with_counts_when_the_device_stays_away(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

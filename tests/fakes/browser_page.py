@@ -3,7 +3,7 @@
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 from urllib.parse import urlsplit
 
 import pytest
@@ -36,9 +36,10 @@ class Page:
         """Return what the page shows; empty while it loads."""
         return self.page.evaluate("window.nlos ? nlos.state() : {}")
 
-    def wait_drawn(self) -> None:
-        """Wait for a drawn moment."""
+    def drawn(self) -> Self:
+        """Wait for a drawn moment, and return the page."""
         self.wait_until(lambda: self.state().get("shown", 0) > 0, "a drawn moment")
+        return self
 
     def wait_until(self, holds: Callable[[], bool], purpose: str) -> None:
         deadline_s = time.monotonic() + DEADLINE_S

@@ -1,24 +1,21 @@
 """A measured wall, small and made up: frames of it, a reference from some of them, and its record on disk."""
 
-from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
 from datetime import date
 from pathlib import Path
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 from nlos_calibration.geometry import Intrinsics
 from nlos_calibration.reference import BareWall, BareWallStatistics, save_reference
-from nlos_calibration.rig import dump_toml, load_rig
+from nlos_calibration.rig import dump_toml
 from nlos_calibration.wall import WallFit, wall_depth
 from nlos_calibration.wall_record import MeasuredWall, load_measured, new_wall_record
+from small_frames import RIG, SERIAL, SMALL, FrameCamera
 
 from nlos_cam.frames import Frame, maps_from_frame
 
-RIG = load_rig("paper-rig")
-SMALL = Intrinsics(80, 64, 57.0, 61.0, 39.5, 31.5)
-SERIAL = "f0246262"
 NOISE_M = 5e-4
 WALL_M = wall_depth(RIG.wall_from_lidar, SMALL)
 WALL_M[~(WALL_M < 0.6)] = np.nan
@@ -69,26 +66,15 @@ def measured_wall(folder: Path) -> MeasuredWall:
     return load_measured(write_wall(folder / "wall.toml", bare_wall()))
 
 
-class WallCamera:
+class WallCamera(FrameCamera):
     """Frames of the bare wall; those of the numbers in `moved` are of a lidar 10 mm nearer."""
 
-    intrinsics, rig, incomplete, dropped = SMALL, None, 0, 0
-
     def __init__(self, frames: int, moved: range = range(0), celsius: float = 40.0, period_s: float = 1 / 30) -> None:
-        self.uri, self.identity, self.counts = "bag:fake.bag", {"serial": SERIAL}, Counter[str]()
-        self._frames, self._moved, self._celsius, self._period_s = frames, moved, celsius, period_s
-        self.asked = 0
+        def make(number: int) -> Frame:
+            return replace(wall_frame(number, 0.01 * (number in moved)), timestamp_s=number * period_s)
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        pass
-
-    def __iter__(self) -> Iterator[Frame]:
-        for number in range(self._frames):
-            frame = wall_frame(number, 0.01 if number in self._moved else 0.0)
-            yield replace(frame, timestamp_s=number * self._period_s)
+        super().__init__(frames, make=make)
+        self._celsius, self.asked = celsius, 0
 
     def telemetry(self, ending: str = "") -> Mapping[str, float]:
         self.asked += 1

@@ -7,13 +7,26 @@ from types import SimpleNamespace
 from typing import Self
 
 import numpy as np
-from fake_wall import RIG, SERIAL, SMALL
+from nlos_calibration import Intrinsics, load_rig
 
 from nlos_cam.frames import Frame
 from nlos_cam.reconstruct.network import Reconstruction
+from nlos_cam.render import SensedImages
 from nlos_cam.view.viewer import Moment, NullViewer
 
+RIG = load_rig("paper-rig")
+SMALL = Intrinsics(80, 64, 57.0, 61.0, 39.5, 31.5)
+SERIAL = "f0246262"
 NOTHING = Reconstruction(np.full((64, 64), np.nan, np.float32), np.eye(4), None, {})
+
+
+def assert_exposed(frame: Frame, images: SensedImages) -> None:
+    """Assert that a frame holds every bit of its exposure."""
+    depth_z16 = np.nan_to_num(frame.depth_m / np.float32(frame.settings["depth_units"])).round()
+    np.testing.assert_array_equal(np.isnan(frame.depth_m), images.depth_z16 == 0)
+    np.testing.assert_array_equal(depth_z16, images.depth_z16)
+    np.testing.assert_array_equal(frame.ir, images.ir)
+    np.testing.assert_array_equal(frame.confidence, images.confidence)
 
 
 def sheet_network(*_: np.ndarray) -> np.ndarray:

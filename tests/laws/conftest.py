@@ -9,7 +9,6 @@ import pytest
 
 from nlos_cam.render import Accuracy, Effects, Scene, TransportJob, renderer
 
-IMPLEMENTATIONS = ("cpu", "reference")
 COARSE = Accuracy("coarse", relay_columns=8, relay_rows=6)
 """Small enough for the brute force to take milliseconds."""
 
@@ -42,14 +41,9 @@ class Implementation:
         return renderer.transport(replace(job, accuracy=setting), backend)
 
 
-@pytest.fixture(scope="session", params=IMPLEMENTATIONS)
+@pytest.fixture(scope="session", params=("cpu", "reference"))
 def implementation(request: pytest.FixtureRequest) -> Implementation:
     return Implementation(request.param)
-
-
-@pytest.fixture(scope="session")
-def every_implementation() -> tuple[Implementation, ...]:
-    return tuple(map(Implementation, IMPLEMENTATIONS))
 
 
 @pytest.fixture

@@ -14,15 +14,13 @@ def assert_measured(bench: BoardBench, frames: int = 10, within_mm: float = 1.0,
     assert np.hypot(yaw_off_deg, pitch_off_deg) < within_deg
 
 
-@pytest.mark.parametrize("yaw_deg", [15.0, 30.0, 45.0, 60.0, 75.0])
-@pytest.mark.parametrize("distance_m", [0.15, 0.20, 0.30])
-def test_board_measures_every_wall_of_the_papers_ranges(distance_m: float, yaw_deg: float) -> None:
-    assert_measured(bench_at(distance_m, yaw_deg))
+RANGES = [(distance_m, yaw_deg) for distance_m in (0.15, 0.20, 0.30) for yaw_deg in (15.0, 30.0, 45.0, 60.0, 75.0)]
+TILTED = [(0.25, 40.0, 12.0), (0.25, 40.0, -12.0), (0.25, 0.0, 20.0), (0.25, 0.0, 0.0)]
 
 
-@pytest.mark.parametrize(("yaw_deg", "pitch_deg"), [(40.0, 12.0), (40.0, -12.0), (0.0, 20.0), (0.0, 0.0)])
-def test_board_measures_a_tilted_wall(yaw_deg: float, pitch_deg: float) -> None:
-    assert_measured(bench_at(0.25, yaw_deg, pitch_deg))
+@pytest.mark.parametrize("wall", [*RANGES, *TILTED])
+def test_board_measures_every_wall_of_the_papers_ranges_and_a_tilted_one(wall: tuple[float, ...]) -> None:
+    assert_measured(bench_at(*wall))
 
 
 @pytest.mark.parametrize("turn_deg", [90.0, 180.0, 37.0])
@@ -51,9 +49,7 @@ def test_board_interval_holds_the_truth_as_often_as_stated() -> None:
 def test_board_interval_allows_for_bow_and_stretch(sigma_px: float) -> None:
     generator, printed = np.random.default_rng(6), PrintErrors()
     found = coverage(
-        400,
-        lambda: random_bench(generator, printed),
-        lambda bench: bench.fit_corners(sigma_px, generator, printed),
+        400, lambda: random_bench(generator, printed), lambda bench: bench.fit_corners(sigma_px, generator, printed)
     )
     assert found.refused <= 4
     assert ((found.inside > 0.91) & (found.inside < 0.985)).all()

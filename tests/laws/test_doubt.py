@@ -10,7 +10,7 @@ from nlos_models import load_reconstructor, load_uncertainty_model
 from nlos_cam.dataset.outliers import TRAINING_OUTLIERS, Stimulus, draw_outlier, ordinary, vary_empty_bench
 from nlos_cam.evaluate import echoes_of, sense
 from nlos_cam.files import cache_folder
-from nlos_cam.frames import Frame, LidarMaps
+from nlos_cam.frames import Frame
 from nlos_cam.objects import benchmark_objects, object_box
 from nlos_cam.reconstruct import Arrival, CalibratedRig, FrameResult, Pipeline, Verdict
 from nlos_cam.render import Sensor, SensorModel, render
@@ -51,7 +51,8 @@ def test_known_objects_are_seen_with_honest_expected_errors(processing: Pipeline
     subjects = benchmark_objects(object_box(RIG))[::3]
     expected, observed, verdicts = list[float](), list[float](), list[Verdict | None]()
     for subject, maps in zip(subjects, sense(echoes_of(subjects, RIG, lambda *_: None), RIG), strict=True):
-        frame = frame_of(maps)
+        ir = np.clip(np.round(maps.intensity), 0, 255).astype(np.uint8)
+        frame = Frame(maps.depth_m, ir, ir, 0.0, 0, RIG.pinhole.scaled(80, 64))  # of one pixel per cell
         step = steps_of(processing, [frame] * 5)[-1]
         verdicts.append(step.verdict)
         uncertainty_m, off_m = step.reconstruction.uncertainty_m, step.reconstruction.depth_m - subject.depth_m
@@ -67,20 +68,12 @@ def test_known_objects_are_seen_with_honest_expected_errors(processing: Pipeline
     assert verdicts.count(Verdict.SEEN) >= 15
 
 
-def frame_of(maps: LidarMaps) -> Frame:
-    """Return a frame of one pixel per cell that yields these maps."""
-    ir = np.clip(np.round(maps.intensity), 0, 255).astype(np.uint8)
-    return Frame(maps.depth_m, ir, ir, 0.0, 0, RIG.pinhole.scaled(80, 64))
-
-
 @pytest.mark.parametrize("name", ["plates", "other rig", "other sensor", "large"])
 def test_plain_outliers_are_reported_as_unusual(processing: Pipeline, name: str) -> None:
     verdicts = list[Verdict | None]()
     for seed in range(8):
-        stimulus = draw_outlier(
-            TRAINING_OUTLIERS[name], np.random.default_rng([seed, 78]), Stimulus(RIG, SensorModel())
-        )
-        verdicts.append(steps_of(processing, frames_of(stimulus, 5, seed))[-1].verdict)
+        shown = draw_outlier(TRAINING_OUTLIERS[name], np.random.default_rng([seed, 78]), Stimulus(RIG, SensorModel()))
+        verdicts.append(steps_of(processing, frames_of(shown, 5, seed))[-1].verdict)
     assert verdicts.count(Verdict.OUTSIDE) + verdicts.count(Verdict.SATURATED) >= 6
 
 

@@ -3,25 +3,16 @@
 import numpy as np
 import pytest
 from nlos_calibration import TOLERANCE_DEG, TOLERANCE_M, Intrinsics, wall_depth
-from nlos_calibration.drift import BLIND_FRAMES, WINDOW_FRAMES, DriftCheck
-from synthetic_scenes import (
-    PINHOLE,
-    SMALL,
-    WallPose,
-    WallStream,
-    chained,
-    multipath,
-    noisy_depth,
-    occluding_sheet,
-    wall_from_lidar,
-)
+from nlos_calibration.drift import BLIND_FRAMES, WINDOW_FRAMES
+from synthetic_scenes import PINHOLE, SMALL, WallPose, WallStream, chained, multipath, noisy_depth, occluding_sheet
+
+from nlos_cam.calibrate import view
 
 POSES = [(0.2, 45.0, 0.0), (0.15, 15.0, 0.0), (0.3, 70.0, -8.0), (0.3, 15.0, 5.0), (0.2, -60.0, 10.0), (0.2, 0.0, 0.0)]
 SHIFTS = [(0.002, 0.0, 0.0), (-0.002, 0.0, 0.0), (0.0, 0.5, 0.0), (0.0, -0.5, 0.0), (0.0, 0.0, 0.5)]
 TOLD_FRAMES = 60
 SIGMAS = 4.5
 poses = pytest.mark.parametrize("pose", POSES)
-shifts = pytest.mark.parametrize("shift", SHIFTS)
 
 
 def assert_right(stream: WallStream, shift: WallPose) -> None:
@@ -74,7 +65,7 @@ def test_drift_check_is_silent_at_detours_across_the_wall(pose: WallPose, seed: 
 
 
 @poses
-@shifts
+@pytest.mark.parametrize("shift", SHIFTS)
 @pytest.mark.parametrize("share", [0.0, 0.3, 0.6])
 def test_drift_check_measures_a_knock_beside_an_object(pose: WallPose, shift: WallPose, share: float) -> None:
     stream = WallStream(pose, seed=3)
@@ -158,12 +149,12 @@ def test_drift_check_keeps_its_warning_while_the_wall_is_hidden() -> None:
 def test_drift_check_measures_whole_frames_with_holes() -> None:
     """As from a camera: every pixel has depth, except whole columns and whole frames."""
     stream, generator = WallStream(POSES[0], PINHOLE, seed=11), np.random.default_rng(1)
-    check = DriftCheck(stream.reference, wall_from_lidar(stream.pose))
-    depth_m = wall_depth(wall_from_lidar(stream.moved(0.002)), PINHOLE)
+    depth_m = wall_depth(view(*stream.moved(0.002), PINHOLE).pose, PINHOLE)
     depth_m[:, 200:400] = np.nan
     for number in range(40):
         frame = noisy_depth(depth_m, generator) if number % 4 else np.full_like(depth_m, np.nan)
-        check.observe(frame.astype(np.float32), {})
-    assert abs(check.drift.distance_m - 0.002) < SIGMAS * check.drift.distance_std_m < TOLERANCE_M
-    (line,) = check.warnings
+        stream.check.observe(frame.astype(np.float32), {})
+    drift = stream.check.drift
+    assert abs(drift.distance_m - 0.002) < SIGMAS * drift.distance_std_m < TOLERANCE_M
+    (line,) = stream.check.warnings
     assert "moved" in line

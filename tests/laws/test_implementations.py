@@ -6,7 +6,8 @@ from functools import cache
 import numpy as np
 import pytest
 import torch
-from nlos_calibration import Occluder, Rig, load_rig
+from depth_maps import depth_map
+from nlos_calibration import Occluder, load_rig
 
 from nlos_cam.errors import SceneError
 from nlos_cam.objects import cell_centers_m, object_box, object_depth
@@ -27,60 +28,28 @@ def _object(seed: int = 5, size: int = 32) -> np.ndarray:
     return object_depth(seed, RIG.object_box)[1][:: 64 // size, :: 64 // size].copy()
 
 
-def _background(size: int = 32) -> np.ndarray:
-    return np.full((size, size), np.nan, np.float32)
-
-
 def _plane(size: int = 22) -> np.ndarray:
-    depth = _background()
-    depth[4 : 4 + size, 4 : 4 + size] = 0.2 + 0.004 * np.arange(size)
-    return depth
+    return depth_map(32, np.nan, (np.s_[4 : 4 + size, 4 : 4 + size], 0.2 + 0.004 * np.arange(size)))
 
 
-def _occluder(x_m: float) -> Rig:
-    return RIG.model_copy(update={"occluder": Occluder(x_m=x_m, z_min_m=0.1)})
-
-
-def _near() -> np.ndarray:
-    depth = _background()
-    depth[10:20, 10:20] = 0.004
-    return depth
-
-
-def _pixel() -> np.ndarray:
-    depth = _background()
-    depth[15, 15] = 0.3
-    return depth
-
-
-def _cup() -> np.ndarray:
-    depth = np.full((4, 4), 0.15, np.float32)
-    depth[1:3, 1:3] = 0.32
-    return depth
-
-
-def _full() -> np.ndarray:
-    depth = np.full((32, 32), 0.38, np.float32)
-    depth[:, 12:14] = 0.15
-    return depth
-
-
+COLUMN_X_M = float(cell_centers_m(object_box(RIG), 32)[0][9])
+NEAR, PIXEL = depth_map(32, np.nan, (np.s_[10:20, 10:20], 0.004)), depth_map(32, np.nan, ((15, 15), 0.3))
 SCENES = {
     "object": Scene(RIG, _object()),
     "draughty object": Scene(RIG, _object(3)),
     "lambertian": Scene(RIG, _object(), radiometry="lambertian"),
     "no occluder": Scene(RIG.model_copy(update={"occluder": None}), _object()),
     "tilted plane": Scene(RIG, _plane()),
-    "occluder in front": Scene(_occluder(0.43), _plane()),
-    "occluder on a column": Scene(_occluder(float(cell_centers_m(object_box(RIG), 32)[0][9])), _plane()),
-    "near contact": Scene(RIG, _near()),
-    "near contact, lambertian": Scene(RIG, _near(), radiometry="lambertian"),
+    "occluder in front": Scene(RIG.model_copy(update={"occluder": Occluder(x_m=0.43, z_min_m=0.1)}), _plane()),
+    "occluder on a column": Scene(RIG.model_copy(update={"occluder": Occluder(x_m=COLUMN_X_M, z_min_m=0.1)}), _plane()),
+    "near contact": Scene(RIG, NEAR),
+    "near contact, lambertian": Scene(RIG, NEAR, radiometry="lambertian"),
     "coloured": Scene(RIG, _object(), Surface(np.array([0.9, 0.5, 0.1]))),
-    "one pixel": Scene(RIG, _pixel()),
-    "full grid": Scene(RIG, _full()),
+    "one pixel": Scene(RIG, PIXEL),
+    "full grid": Scene(RIG, depth_map(32, 0.38, (np.s_[:, 12:14], 0.15))),
     "phong": Scene(RIG, _plane(8), Material(kind="phong", exponent=3).surface),
-    "retroreflective": Scene(RIG, _pixel(), Material(kind="retroreflective").surface),
-    "inter-reflection": Scene(RIG, _cup(), radiometry="lambertian"),
+    "retroreflective": Scene(RIG, PIXEL, Material(kind="retroreflective").surface),
+    "inter-reflection": Scene(RIG, depth_map(4, 0.15, (np.s_[1:3, 1:3], 0.32)), radiometry="lambertian"),
 }
 MANY_PATCHES, FEW_PATCHES = 2e-3, 1.5e-2
 """Relative L1 from the reference: few patches do not average out paths that fall into the next bin."""
@@ -121,17 +90,18 @@ def test_torch_is_repeatable(backend: str) -> None:
     assert np.array_equal(_histograms("object", backend), _kept("object", backend))
 
 
-@pytest.mark.parametrize("backend", ["torch", pytest.param("cuda", marks=NO_GPU)])
+@pytest.mark.parametrize("backend", ["cpu", "torch", pytest.param("cuda", marks=NO_GPU)])
 def test_batch_renders_each_scene_as_alone(backend: str) -> None:
-    coloured = Scene(RIG, _pixel(), Surface(np.array([0.9, 0.5, 0.1])))
-    open_rig = SCENES["no occluder"].rig
-    scenes = [Scene(RIG, _object(size=16)), Scene(RIG), coloured, Scene(open_rig, _pixel()), SCENES["one pixel"]]
-    together = list(render_all(scenes, SMALL, backend=backend))
-    for scene, rendering in zip(scenes, together, strict=True):
-        alone = render(scene, SMALL, backend=backend)
-        np.testing.assert_allclose(rendering.multi.peak, alone.multi.peak, rtol=1e-5)
-        np.testing.assert_array_equal(rendering.color is None, alone.color is None)
-    assert together[2].color is not None
+    """To the last bit on the CPU, also of a batch of one."""
+    coloured = Scene(RIG, PIXEL, Surface(np.array([0.9, 0.5, 0.1])))
+    open_rig, lambertian = SCENES["no occluder"].rig, Scene(RIG, _object(size=16), radiometry="lambertian")
+    scenes = [Scene(RIG, _object(size=16)), Scene(RIG), coloured, Scene(open_rig, PIXEL), SCENES["one pixel"]]
+    for batch in ([*scenes, lambertian], scenes[:1]):
+        for scene, rendering in zip(batch, render_all(batch, SMALL, backend=backend), strict=True):
+            alone = render(scene, SMALL, backend=backend)
+            for one, same in ((rendering.multi.peak, alone.multi.peak), (rendering.intensity, alone.intensity)):
+                np.testing.assert_allclose(one, same, rtol=0 if backend == "cpu" else 1e-5)
+            assert (rendering.color is None) == (alone.color is None) == (scene is not coloured)
 
 
 def test_render_refuses_unknown_backends() -> None:

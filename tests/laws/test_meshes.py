@@ -67,9 +67,7 @@ def test_unit_of_a_file_does_not_matter(tmp_path: Path, name: str, unit: float) 
 
 @settings(max_examples=25, deadline=None)
 @given(st.floats(-6, 6), st.tuples(*[st.floats(-1e3, 1e3)] * 3), st.sampled_from(sorted(CATEGORIES)))
-def test_scale_and_origin_of_a_mesh_do_not_matter(
-    exponent: float, origin: tuple[float, float, float], category: str
-) -> None:
+def test_scale_and_origin_of_a_mesh_do_not_matter(exponent: float, origin: tuple[float, ...], category: str) -> None:
     triangles = category_triangles(category, 5)
     _assert_same(_depth((triangles + origin) * 10.0**exponent), _depth(triangles))
 

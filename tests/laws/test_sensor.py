@@ -7,6 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from nlos_calibration import Rig, load_rig
+from numpy.random import default_rng
 
 from nlos_cam.frames import SATURATED
 from nlos_cam.objects import object_depth
@@ -16,16 +17,9 @@ from nlos_cam.render.sensor.model import DEPTH_UNIT_M, MAX_CONFIDENCE, SensorMod
 
 QUIET = SensorModel(range_noise_m=0, range_noise_per_m=0, read_noise_counts=0, shot_noise=0, dead_share=0)
 RICH = SensorModel(ambient_counts=40, read_noise_counts=1.5, dead_share=0)
-BIASED = RICH.model_copy(
-    update={
-        "range_offset_m": 0.0045,
-        "ripple_m": 0.002,
-        "patch_drift_m": 0.001,
-        "drift_m_per_celsius": 0.0002,
-        "warm_up": WarmUp(from_celsius=25, to_celsius=45, time_constant_s=600),
-    }
-)
-BIAS_FIELDS = {"range_offset_m", "ripple_m", "patch_drift_m", "drift_m_per_celsius", "warm_up"}
+BIAS: dict[str, object] = {"warm_up": WarmUp(from_celsius=25, to_celsius=45, time_constant_s=600)}
+BIAS |= {"range_offset_m": 0.0045, "ripple_m": 0.002, "patch_drift_m": 0.001, "drift_m_per_celsius": 0.0002}
+BIASED = RICH.model_copy(update=BIAS)
 CELSIUS = 30.0
 ROUGH = BIASED.model_copy(update={"wall_texture": 0.3})
 FRAMES = 100
@@ -41,10 +35,6 @@ RIG, BARE = _at_map_size(load_rig("paper-rig")), _at_map_size(load_rig("bare-wal
 BRIGHTEST = float(cast(BARE, BARE.pinhole).direct.max())
 
 
-def _generator(seed: int = 0) -> np.random.Generator:
-    return np.random.default_rng(seed)
-
-
 def _echo(counts: np.ndarray | float, path_m: np.ndarray | float = 1.0) -> MultiBounce:
     """Echoes of these counts without a direct return."""
     peak = np.broadcast_to(np.asarray(counts) * BRIGHTEST / 48, (64, 80)).astype(np.float32)
@@ -53,7 +43,7 @@ def _echo(counts: np.ndarray | float, path_m: np.ndarray | float = 1.0) -> Multi
 
 
 def _frames(model: SensorModel, echo: MultiBounce) -> list[SensedImages]:
-    sensor, generator = Sensor(BARE, model), _generator(1)
+    sensor, generator = Sensor(BARE, model), default_rng(1)
     return [sensor.expose(echo, generator) for _ in range(FRAMES)]
 
 
@@ -64,7 +54,7 @@ def rendering() -> Rendering:
 
 
 def test_quiet_sensor_reports_the_rendering_within_rounding(rendering: Rendering) -> None:
-    images = Sensor(RIG, QUIET).expose(rendering.multi, _generator())
+    images = Sensor(RIG, QUIET).expose(rendering.multi, default_rng(0))
     returned = images.depth_z16 > 0
     assert returned.mean() > 0.5
     assert not (returned & np.isnan(rendering.depth_m)).any()
@@ -76,10 +66,8 @@ def test_quiet_sensor_reports_the_rendering_within_rounding(rendering: Rendering
 
 def _bias_m(model: SensorModel) -> np.ndarray:
     """At CELSIUS, a quarter of the way from cold to warm."""
-    wave, pattern = (
-        ripples((64, 80), WAVES, _generator(RIPPLES_SEED)).ravel(),
-        smooth_patches((64, 80), _generator(PATCHES_SEED)).ravel(),
-    )
+    wave = ripples((64, 80), WAVES, default_rng(RIPPLES_SEED)).ravel()
+    pattern = smooth_patches((64, 80), default_rng(PATCHES_SEED)).ravel()
     drift_m = 0.25 * model.patch_drift_m * (pattern - pattern.mean()) - 15 * model.drift_m_per_celsius
     return model.ripple_m * wave - model.range_offset_m + drift_m
 
@@ -89,14 +77,9 @@ def _bias_m(model: SensorModel) -> np.ndarray:
 )
 def test_sensor_equals_plain_float64_array_steps(rendering: Rendering, model: SensorModel) -> None:
     """The same chain written as plain array steps, in float64."""
-    fast, beams, generator = (
-        Sensor(RIG, model).expose(rendering.multi, _generator(3), celsius=CELSIUS),
-        cast(RIG, RIG.pinhole),
-        _generator(3),
-    )
-    peak, runner_up, path = (
-        m.ravel().astype(float) for m in (rendering.multi.peak, rendering.multi.runner_up, rendering.multi.path_m)
-    )
+    fast = Sensor(RIG, model).expose(rendering.multi, default_rng(3), celsius=CELSIUS)
+    multi, beams, generator = rendering.multi, cast(RIG, RIG.pinhole), default_rng(3)
+    peak, runner_up, path = (each.ravel().astype(float) for each in (multi.peak, multi.runner_up, multi.path_m))
     one, other = (generator.standard_normal(peak.size, np.float32) if model != QUIET else 0 for _ in range(2))
     intensity, second = np.maximum(peak, beams.direct), np.maximum(np.minimum(peak, beams.direct), runner_up)
     counts = 48 / BRIGHTEST * intensity * (texture((64, 80), model.wall_texture) if model.wall_texture else 1)
@@ -108,7 +91,7 @@ def test_sensor_equals_plain_float64_array_steps(rendering: Rendering, model: Se
     depth = np.where(peak > beams.direct, path / 2, beams.length_m) * beams.cos_axis
     depth += _bias_m(model)
     depth += other * (model.range_noise_m + model.range_noise_per_m * depth)
-    dead = _generator(0).random(peak.size) < model.dead_share
+    dead = default_rng(0).random(peak.size) < model.dead_share
     kept = (intensity > 0) & (confidence >= 1) & ~dead
     z16 = np.where(kept, np.nan_to_num(depth) / DEPTH_UNIT_M + 0.5, 0)
     ir = np.where(intensity > 0, np.clip(seen + 0.5, 0, SATURATED), 0)
@@ -119,23 +102,13 @@ def test_sensor_equals_plain_float64_array_steps(rendering: Rendering, model: Se
         assert apart.max() <= 1
 
 
-@pytest.mark.parametrize("ambient", [0.0, 40.0])
-def test_mean_over_frames_is_the_image_without_noise(ambient: float) -> None:
-    counts, echo = 60.3, _echo(60.3)
-    frames = _frames(RICH.model_copy(update={"ambient_counts": ambient}), echo)
-    assert np.mean([f.ir for f in frames]) == pytest.approx(counts, abs=0.03)
-    truth = Sensor(BARE, QUIET).expose(echo, _generator()).depth_z16.astype(float)
-    apart = np.mean([f.depth_z16 for f in frames], axis=0) - truth
-    assert apart.mean() == pytest.approx(0, abs=0.1)
-
-
 @pytest.mark.parametrize("path_m", [0.4, 1.0, 3.0])
 def test_bias_is_the_same_for_near_and_far_returns(path_m: float) -> None:
-    plain = QUIET.model_copy(update={name: value for name, value in BIASED if name in BIAS_FIELDS})
+    plain = QUIET.model_copy(update=BIAS)
     echo, free = _echo(60.0, path_m), Sensor(BARE, QUIET)
     apart = [
-        sensor.expose(echo, _generator(1), celsius=CELSIUS).depth_z16.astype(float)
-        - free.expose(echo, _generator(2)).depth_z16
+        sensor.expose(echo, default_rng(1), celsius=CELSIUS).depth_z16.astype(float)
+        - free.expose(echo, default_rng(2)).depth_z16
         for sensor in [Sensor(BARE, plain)] * 2
     ]
     np.testing.assert_array_equal(*apart)
@@ -144,26 +117,23 @@ def test_bias_is_the_same_for_near_and_far_returns(path_m: float) -> None:
 
 @pytest.mark.parametrize("counts", [15.0, 60.3, 120.0])
 @pytest.mark.parametrize("ambient", [0.0, 40.0, 90.0])
-def test_variance_is_read_plus_shot_plus_ambient_noise(counts: float, ambient: float) -> None:
-    frames = _frames(RICH.model_copy(update={"ambient_counts": ambient}), _echo(counts))
+def test_mean_is_free_of_noise_and_variance_read_plus_shot_plus_ambient_noise(counts: float, ambient: float) -> None:
+    frames = _frames(RICH.model_copy(update={"ambient_counts": ambient}), echo := _echo(counts))
     variance = 1.5**2 + 0.3**2 * (counts + ambient) + 1 / 12  # the last: rounding to whole counts
     assert np.var([f.ir for f in frames]) == pytest.approx(variance, rel=0.01)
+    assert np.mean([f.ir for f in frames]) == pytest.approx(counts, abs=0.03)
+    truth = Sensor(BARE, QUIET).expose(echo, default_rng(0)).depth_z16.astype(float)
+    assert (np.mean([f.depth_z16 for f in frames], axis=0) - truth).mean() == pytest.approx(0, abs=0.1)
 
 
 def test_noise_is_white_and_independent_of_range_noise() -> None:
     echo = _echo(60.0)
-    truth = Sensor(BARE, QUIET).expose(echo, _generator()).depth_z16.astype(float)
+    truth = Sensor(BARE, QUIET).expose(echo, default_rng(0)).depth_z16.astype(float)
     frames = _frames(RICH, echo)
     ir = np.array([f.ir - 60.0 for f in frames])
     depth = np.array([(f.depth_z16 - truth) / truth for f in frames])
-    pairs = (
-        (ir[:, :, 1:], ir[:, :, :-1]),
-        (ir[:, 1:], ir[:, :-1]),
-        (ir[1:], ir[:-1]),
-        (ir, depth),
-        (depth[1:], depth[:-1]),
-    )
-    for one, other in pairs:
+    neighbours = (ir[:, :, 1:], ir[:, :, :-1]), (ir[:, 1:], ir[:, :-1])
+    for one, other in (*neighbours, (ir[1:], ir[:-1]), (ir, depth), (depth[1:], depth[:-1])):
         assert abs(np.corrcoef(one.ravel(), other.ravel())[0, 1]) < 0.01
 
 
@@ -171,7 +141,7 @@ def test_noise_is_white_and_independent_of_range_noise() -> None:
 def test_ir_rises_with_intensity_and_saturates(ambient: float) -> None:
     counts = np.geomspace(1e-3, 1e3, 5120).reshape(64, 80)
     model = QUIET.model_copy(update={"ambient_counts": ambient})
-    ir = Sensor(BARE, model).expose(_echo(counts), _generator()).ir.astype(float)
+    ir = Sensor(BARE, model).expose(_echo(counts), default_rng(0)).ir.astype(float)
     assert (np.diff(ir.ravel()) >= 0).all()
     assert ir.max() == SATURATED - ambient
     assert np.abs(ir - np.minimum(counts, SATURATED - ambient)).max() <= 0.5 + 1e-3
@@ -180,7 +150,7 @@ def test_ir_rises_with_intensity_and_saturates(ambient: float) -> None:
 @pytest.mark.parametrize("model", [SensorModel(), QUIET], ids=["default", "quiet"])
 def test_confidence_never_rises_with_ambient_light(rendering: Rendering, model: SensorModel) -> None:
     images = [
-        Sensor(RIG, model.model_copy(update={"ambient_counts": ambient})).expose(rendering.multi, _generator())
+        Sensor(RIG, model.model_copy(update={"ambient_counts": ambient})).expose(rendering.multi, default_rng(0))
         for ambient in (0.0, 1e-9, 5.0, 40.0, 150.0, 254.9)
     ]
     for darker, brighter in pairwise(images):
@@ -192,7 +162,7 @@ def test_confidence_never_rises_with_ambient_light(rendering: Rendering, model: 
 def test_more_ambient_light_leaves_fewer_depths() -> None:
     faint = _echo(np.geomspace(0.1, 10, 5120).reshape(64, 80))
     models = [SensorModel(ambient_counts=ambient) for ambient in (0.0, 20.0, 200.0)]
-    depths = [(Sensor(BARE, model).expose(faint, _generator()).depth_z16 > 0).sum() for model in models]
+    depths = [(Sensor(BARE, model).expose(faint, default_rng(0)).depth_z16 > 0).sum() for model in models]
     assert depths[0] > depths[1] > depths[2] > 0
 
 
@@ -219,13 +189,13 @@ ODD = np.array([0, -0.0, -1, 1e-38, 1e-6, 1e-3, 1, 1e6, 1e38, np.nan, np.inf, -n
     ),
 )
 def test_any_input_gives_a_possible_image(seed: int, included: bool, model: SensorModel) -> None:
-    generator = _generator(seed)
+    generator = default_rng(seed)
     spread = (10 ** generator.uniform(-9, 3, 5120)).astype(np.float32)
     peak, runner_up, path = (
         np.where(generator.random(5120) < 0.5, spread, generator.choice(ODD, 5120)).reshape(64, 80) for _ in range(3)
     )
     multi = MultiBounce(peak, runner_up, path, direct_included=included)
-    one, same = (Sensor(RIG, model).expose(multi, _generator(seed), celsius=CELSIUS) for _ in range(2))
+    one, same = (Sensor(RIG, model).expose(multi, default_rng(seed), celsius=CELSIUS) for _ in range(2))
     for name in ("depth_z16", "ir", "confidence"):
         np.testing.assert_array_equal(getattr(one, name), getattr(same, name))
     assert one.confidence.max() <= MAX_CONFIDENCE

@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from depth_maps import depth_map
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from nlos_calibration import load_rig
@@ -22,12 +23,6 @@ PHONG = phong(0.4, 0.6, 10)
 RADIOMETRIES: tuple[Radiometry, ...] = ("paper", "lambertian")
 ALL_BUT_MORE = [name for name in EFFECTS if name != "inter-reflection"]
 NO_WIDTH = [name for name in ALL_BUT_MORE if name != "pulse"]
-
-
-def _plate(z_m: float = 0.25, cells: int = 8) -> np.ndarray:
-    depth = np.full((cells, cells), np.nan, np.float32)
-    depth[2:5, 1:6] = z_m
-    return depth
 
 
 def _rough(seed: int, low_m: float = 0.15, high_m: float = 0.35) -> np.ndarray:
@@ -108,9 +103,8 @@ def test_echoes_lie_between_shortest_and_longest_path(implementation: Any) -> No
 
 
 def test_single_path_has_its_bin_and_the_weight_of_s2(implementation: Any) -> None:
-    depth = np.full((8, 8), np.nan, np.float32)
-    depth[3, 3] = 0.3
-    job = _job(Scene(OPEN, depth), replace(COARSE, relay_columns=40, relay_rows=40, sub_bins=64))
+    scene = Scene(OPEN, depth_map(8, np.nan, ((3, 3), 0.3)))
+    job = _job(scene, replace(COARSE, relay_columns=40, relay_rows=40, sub_bins=64))
     job = replace(job, relay=job.relay.select(np.arange(len(job.relay.x_m)) == 905))
     foot, point, relay = job.laser_spot_m, job.patches.point_m[0], job.relay
     cell = np.array([relay.x_m[0], relay.y_m[0], 0])
@@ -130,8 +124,8 @@ def test_single_path_has_its_bin_and_the_weight_of_s2(implementation: Any) -> No
 
 @pytest.mark.slow
 def test_mirrored_object_gives_mirrored_maps(implementation: Any) -> None:
-    depth = _plate(0.25)  # level: the forward differences of S3 are not symmetric on a slope
-    depth[4:7, 4:7] = 0.2
+    # level: the forward differences of S3 are not symmetric on a slope
+    depth = depth_map(8, np.nan, (np.s_[2:5, 1:6], 0.25), (np.s_[4:7, 4:7], 0.2))
     one = implementation.render(Scene(RIG, depth))
     other = implementation.render(Scene(RIG, depth[::-1].copy()))
     np.testing.assert_allclose(one.multi.peak[::-1], other.multi.peak, rtol=3e-2)
@@ -160,23 +154,20 @@ def test_albedo_of_each_cell_weighs_that_cell(implementation: Any) -> None:
 
 
 def test_parts_that_do_not_shade_each_other_add_up(implementation: Any) -> None:
-    both, left, right = (np.full((8, 8), np.nan, np.float32) for _ in range(3))
-    left[1:4, 1:3], right[5:7, 5:8] = 0.22, 0.22
-    both[:] = np.where(np.isnan(left), right, left)
-    whole = implementation.three_bounce(Scene(RIG, both), SOME)
+    left, right = (np.s_[1:4, 1:3], 0.22), (np.s_[5:7, 5:8], 0.22)
+    whole = implementation.three_bounce(Scene(RIG, depth_map(8, np.nan, left, right)), SOME)
     parts = np.zeros_like(whole)
-    for part in (left, right):
+    for part in (depth_map(8, np.nan, left), depth_map(8, np.nan, right)):
         found = implementation.three_bounce(Scene(RIG, part), SOME)[:, : whole.shape[1]]
         parts[:, : found.shape[1]] += found
     np.testing.assert_allclose(whole, parts, rtol=1e-4, atol=1e-6 * whole.max())
 
 
 def test_front_part_shades_the_part_behind_it(implementation: Any) -> None:
-    behind, front = (np.full((8, 8), np.nan, np.float32) for _ in range(2))
-    behind[2:6, 5:8], front[2:6, 2:5] = 0.35, 0.14
-    together = np.where(np.isnan(front), behind, front)
-    apart = sum(implementation.three_bounce(Scene(RIG, part), SOME).sum() for part in (behind, front))
-    assert implementation.three_bounce(Scene(RIG, together), SOME).sum() < 0.98 * apart
+    behind, front = (np.s_[2:6, 5:8], 0.35), (np.s_[2:6, 2:5], 0.14)
+    scenes = [Scene(RIG, depth_map(8, np.nan, *parts)) for parts in ([behind], [front], [behind, front])]
+    *apart, together = (implementation.three_bounce(scene, SOME).sum() for scene in scenes)
+    assert together < 0.98 * sum(apart)
 
 
 @pytest.mark.slow
@@ -190,6 +181,5 @@ def test_transient_is_three_bounces_plus_the_direct_return(implementation: Any, 
     direct = prepare(scene, COARSE, ALL_BUT_MORE).beams.direct
     np.testing.assert_allclose(rest.sum(1), direct, rtol=1e-5, atol=1e-6 * whole.max())
     rendering = implementation.render(scene, NO_WIDTH)
-    np.testing.assert_allclose(
-        rendering.intensity.ravel(), np.maximum(three.max(1), direct).astype(np.float32), rtol=1e-6
-    )
+    stronger = np.maximum(three.max(1), direct).astype(np.float32)
+    np.testing.assert_allclose(rendering.intensity.ravel(), stronger, rtol=1e-6)

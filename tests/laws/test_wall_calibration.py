@@ -38,9 +38,10 @@ def assert_close(fit: WallFit, wall: View) -> None:
 @pytest.mark.parametrize("distance_m", [0.15, 0.20, 0.30])
 def test_wall_fit_measures_every_wall_of_the_papers_ranges(distance_m: float, yaw_deg: float, pitch_deg: float) -> None:
     wall = view(distance_m, yaw_deg, pitch_deg, PINHOLE)
-    fit = measured(wall.depth_m)
+    fit, again = measured(wall.depth_m), measured(wall.depth_m)
     assert_close(fit, wall)
     assert fit.verdict == "good"
+    np.testing.assert_array_equal(again.wall_from_lidar, fit.wall_from_lidar)
 
 
 @few
@@ -55,9 +56,7 @@ def test_wall_fit_needs_one_frame_even_with_dead_pixels(
 
 @few
 @given(distances_m, yaws_deg, pitches_deg, st.floats(0.0, 0.4), st.integers(0, 1000))
-def test_wall_fit_tolerates_forty_percent_of_outliers(
-    distance_m: float, yaw_deg: float, pitch_deg: float, share: float, seed: int
-) -> None:
+def test_wall_fit_allows_outliers(distance_m: float, yaw_deg: float, pitch_deg: float, share: float, seed: int) -> None:
     wall = view(distance_m, yaw_deg, pitch_deg, PINHOLE)
     generator, shape = np.random.default_rng(seed), wall.depth_m.shape
     stray = generator.random(shape) < share  # also where no wall is met
@@ -79,25 +78,16 @@ def test_wall_pose_and_angles_are_inverse(distance_m: float, yaw_deg: float, pit
     st.floats(-3.0, 3.0),
     st.tuples(st.floats(-0.05, 0.05), st.floats(-0.05, 0.05), st.floats(0.0, 0.1)),
 )
-def test_fit_depth_moves_with_its_points(
-    yaw_rad: float, pitch_rad: float, roll_rad: float, shift: tuple[float, ...]
-) -> None:
+def test_fit_moves_with_its_points(yaw_rad: float, pitch_rad: float, roll_rad: float, shift: tuple[float, ...]) -> None:
     wall = view(0.2, 20.0, 5.0, PINHOLE.scaled(40, 30))
     points = (PINHOLE.scaled(40, 30).rays() * wall.depth_m[..., np.newaxis]).reshape(-1, 3)
     roll = np.array([[np.cos(roll_rad), -np.sin(roll_rad), 0], [np.sin(roll_rad), np.cos(roll_rad), 0], [0, 0, 1]])
-    turn = (
-        roll @ view(1.0, np.degrees(yaw_rad), np.degrees(pitch_rad), PINHOLE).pose[:3, :3] @ np.diag([1.0, -1.0, -1.0])
-    )
+    turn = roll @ view(1.0, *np.degrees((yaw_rad, pitch_rad)), PINHOLE).pose[:3, :3] @ np.diag([1.0, -1.0, -1.0])
     points = points @ turn.T + shift
     fit = fit_depth(points / points[:, 2:], points[:, 2], np.random.default_rng(0))
     normal = turn @ wall.pose[2, :3]
     np.testing.assert_allclose(fit.normal, normal, atol=1e-6)
     assert fit.distance_m == pytest.approx(0.2 - normal @ shift, abs=1e-6)
-
-
-def test_wall_fit_is_repeatable() -> None:
-    depth_m = view(0.2, 45.0, 0.0, PINHOLE).depth_m
-    np.testing.assert_array_equal(measured(depth_m).wall_from_lidar, measured(depth_m).wall_from_lidar)
 
 
 @few

@@ -1,23 +1,16 @@
 """A wall that is not one bare flat wall is refused with its reason, or doubted; it is never called good."""
 
+from collections.abc import Callable
+from functools import partial
+
 import numpy as np
 import pytest
 from nlos_calibration import WallFit, fit_wall, load_rig
 from nlos_calibration.arrays import Float64
 from nlos_calibration.errors import WallRefusedError
 
-from nlos_cam.calibrate import (
-    View,
-    bent,
-    curved,
-    depth_statistics,
-    patch,
-    rippled,
-    stepped,
-    view,
-    window,
-    with_outliers,
-)
+from nlos_cam.calibrate import bent, curved, depth_statistics, patch, rippled, stepped, view, window, with_outliers
+from nlos_cam.calibrate.synthetic import View
 
 PINHOLE = load_rig("bare-wall").pinhole.scaled(160, 120)
 VIEWS = [(0.2, 20.0, 5.0), (0.2, 45.0, 0.0), (0.25, -60.0, 8.0)]
@@ -46,22 +39,33 @@ def is_right(fit: WallFit, pose: Float64) -> bool:
     return bool(turn_deg < 0.2 and abs(fit.distance_m - pose[2, 3]) < 0.001)
 
 
-def only(depth_m: Float64, rows: slice | list[int], columns: slice | list[int]) -> Float64:
+def only(seen: View, rows: slice | list[int], columns: slice | list[int]) -> Float64:
     """Return depth at some pixels only."""
-    some = np.full(depth_m.shape, np.nan)
-    some[rows, columns] = depth_m[rows, columns]
+    some = np.full(seen.depth_m.shape, np.nan)
+    some[rows, columns] = seen.depth_m[rows, columns]
     return some
 
 
-def test_wall_of_three_points_is_refused(seen: View) -> None:
-    with pytest.raises(WallRefusedError, match=r"0\.0%"):
-        measured(only(seen.depth_m, [10, 60, 110], [20, 140, 60]), frames=1)
+def hidden(seen: View, share: float, factor: float = 1.0, short_m: float = 0.0) -> Float64:
+    """Return depth that is another in a patch."""
+    return np.where(patch(seen, share), factor * seen.depth_m - short_m, seen.depth_m)
 
 
-@pytest.mark.parametrize("width", [9, 12])
-def test_wall_seen_through_a_slit_is_refused(seen: View, width: int) -> None:
-    with pytest.raises(WallRefusedError, match="line"):
-        measured(only(seen.depth_m, slice(None), slice(70, 70 + width)))
+@pytest.mark.parametrize(
+    ("change", "word"),
+    [
+        (partial(only, rows=[10, 60, 110], columns=[20, 140, 60]), r"0\.0%"),
+        *((partial(only, rows=slice(None), columns=slice(70, 70 + width)), "line") for width in (9, 12)),
+        *((partial(window, gap_m=gap_m), r"plane|in front") for gap_m in (0.01, 0.05, 0.3)),
+        *((partial(hidden, share=share, factor=3.0), "behind") for share in (0.15, 0.4)),  # a mirror
+        *((partial(hidden, share=0.2, short_m=short_m), "in front") for short_m in (0.02, 0.05)),  # saturated
+    ],
+)
+def test_wall_of_three_points_in_a_slit_a_window_a_mirror_or_a_saturated_patch_is_refused(
+    seen: View, change: Callable[[View], Float64], word: str
+) -> None:
+    with pytest.raises(WallRefusedError, match=word):
+        measured(change(seen))
 
 
 @pytest.mark.parametrize("frames", [1, 8])
@@ -72,16 +76,16 @@ def test_wall_with_sixty_percent_of_outliers_is_refused(seen: View, noise: float
         measured(stray, frames=frames, noise=noise)
 
 
-@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf, 0.0, -0.2])
-def test_wall_without_depth_is_refused(value: float) -> None:
-    with pytest.raises(WallRefusedError, match=r"0\.0%"):
-        measured(np.full((120, 160), value))
-
-
 @pytest.mark.parametrize("yaw_deg", [100.0, 125.0, -110.0])
 def test_wall_that_the_axis_never_meets_is_refused(yaw_deg: float) -> None:
     with pytest.raises(WallRefusedError):
         measured(view(0.2, yaw_deg, 0.0, PINHOLE).depth_m)
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf, 0.0, -0.2])
+def test_wall_without_depth_is_refused(value: float) -> None:
+    with pytest.raises(WallRefusedError, match=r"0\.0%"):
+        measured(np.full((120, 160), value))
 
 
 @pytest.mark.parametrize("value_m", [0.15, 0.2, 1.0])
@@ -128,32 +132,14 @@ def test_wall_with_a_step_is_refused_or_doubted(seen: View, height_m: float, dir
     assert fit is None or fit.verdict == "doubtful"
 
 
-@pytest.mark.parametrize("gap_m", [0.01, 0.05, 0.3])
-def test_window_and_what_is_behind_it_is_refused(seen: View, gap_m: float) -> None:
-    with pytest.raises(WallRefusedError, match=r"plane|in front"):
-        measured(window(seen, gap_m))
-
-
 def test_window_just_behind_its_frame_is_doubted(seen: View) -> None:
     assert measured(window(seen, 0.003)).verdict == "doubtful"
-
-
-@pytest.mark.parametrize("share", [0.15, 0.4])
-def test_wall_with_a_mirror_is_refused(seen: View, share: float) -> None:
-    with pytest.raises(WallRefusedError, match="behind"):
-        measured(np.where(patch(seen, share), 3.0 * seen.depth_m, seen.depth_m))
-
-
-@pytest.mark.parametrize("short_m", [0.02, 0.05])
-def test_wall_with_a_saturated_patch_is_refused(seen: View, short_m: float) -> None:
-    with pytest.raises(WallRefusedError, match="in front"):
-        measured(np.where(patch(seen, 0.2), seen.depth_m - short_m, seen.depth_m))
 
 
 @pytest.mark.parametrize("short_m", [0.001, 0.002, 0.004])
 @pytest.mark.parametrize("share", [0.03, 0.1, 0.3])
 def test_wall_with_slight_saturation_is_doubted_or_right(seen: View, share: float, short_m: float) -> None:
-    fit = measured_unless_refused(np.where(patch(seen, share), seen.depth_m - short_m, seen.depth_m))
+    fit = measured_unless_refused(hidden(seen, share, short_m=short_m))
     distance_m = pytest.approx(seen.pose[2, 3], abs=0.001)
     assert fit is None or fit.verdict == "doubtful" or fit.distance_m == distance_m
 

@@ -38,9 +38,7 @@ def test_wall_interval_holds_the_truth_as_often_as_stated(noise: float, frames: 
         (80, 0, 0.87, {"flicker": 0.05, "frames": 20}),
     ],
 )
-def test_wall_interval_allows_for_outliers_ripples_and_flicker(
-    count: int, at_least: int, share: float, setting: dict[str, Any]
-) -> None:
+def test_interval_allows_outliers_ripples_and_flicker(count: int, at_least: int, share: float, setting: dict) -> None:
     assert (inside(count, at_least, **setting).mean(axis=0) >= share).all()
 
 

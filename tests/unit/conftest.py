@@ -12,7 +12,6 @@ import torch
 from fake_bench import Bench
 from hypothesis import settings
 from measured_walls import exact_reference
-from nlos_calibration.arrays import Float32
 from nlos_calibration.geometry import normal_from_angles, wall_from_plane
 from nlos_calibration.noise import depth_noise_m
 from nlos_calibration.rig import load_rig
@@ -21,12 +20,6 @@ from nlos_calibration.wall_record import MeasuredWall, new_wall_record
 from nlos_models import compressor, vae
 from noise_bags import make_all
 from rosbags.rosbag1 import Reader, Writer
-from view_streams import ASSETS, Streams
-
-from nlos_cam.objects.depth_map import object_box, orthographic_depth
-from nlos_cam.objects.generators import Category
-from nlos_cam.objects.placement import Pose, place
-from nlos_cam.view.server import Served, ViewServer
 
 settings.register_profile("no clock", deadline=None)  # a machine that is busy fails no law
 settings.load_profile("no clock")
@@ -62,19 +55,6 @@ def one_thread() -> Iterator[None]:
     torch.set_num_threads(1)
     yield
     torch.set_num_threads(before)
-
-
-@pytest.fixture
-def streams() -> Streams:
-    return Streams()
-
-
-@pytest.fixture
-def server(streams: Streams) -> Iterator[ViewServer]:
-    server = ViewServer(Served(ASSETS, streams), 0)
-    yield server
-    streams.end.set()
-    server.close()
 
 
 @pytest.fixture
@@ -140,18 +120,6 @@ def fitted_wall(
 @pytest.fixture(scope="session")
 def measured() -> Callable[..., MeasuredWall]:
     return fitted_wall
-
-
-@pytest.fixture(scope="session")
-def straight_view() -> Callable[..., Float32]:
-    """The depth map of a category with its settings in the middle, but for those given, filling the paper's box."""
-    box = object_box(load_rig("paper-rig"))
-
-    def view(kind: Category, **changed: float) -> Float32:
-        settings = kind.draw([0.5] * len(kind.settings)) | changed
-        return orthographic_depth(place(kind.make(**settings), Pose(size_m=0.24, front_m=0.0), box), box)
-
-    return view
 
 
 @pytest.fixture(scope="module")

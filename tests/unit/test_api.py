@@ -7,15 +7,15 @@ import sys
 import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 from fake_doubter import FakeDoubter
-from fake_wall import RIG, SERIAL, WallCamera, bare_wall, write_wall
+from fake_wall import SERIAL, WallCamera, bare_wall, write_wall
 from nlos_calibration.errors import RecordFileError
 from nlos_models.errors import CheckpointError
+from small_frames import SheetNetwork
 
 import nlos_cam
 from nlos_cam import api
@@ -35,16 +35,11 @@ print(json.dumps([before, frames]))
 Open = Callable[..., Stream]
 
 
-class HalfSurface:
-    """Networks that see surface in the left half of the box, at v 0.5."""
+class HalfSurface(SheetNetwork):
+    """Network that sees surface in the left half of the box alone."""
 
-    runtime = "nothing at all"
-    record = SimpleNamespace(rig_name=RIG.name, rig_checksum=RIG.checksum, input="raw maps")
-
-    def __call__(self, *_: np.ndarray) -> np.ndarray:
-        image = np.zeros((1, 64, 64), np.float32)
-        image[..., :32] = 0.5
-        return image
+    def __call__(self, depth_m: np.ndarray, intensity: np.ndarray) -> np.ndarray:
+        return super().__call__(depth_m, intensity) * (np.arange(64) < 32)
 
 
 @pytest.fixture
@@ -108,28 +103,25 @@ def test_points_are_surface_in_wall_frame(opened: Open) -> None:
 
 
 class WatchedCamera(WallCamera):
-    """Camera that reports when its frames are delivered, and when it is closed."""
+    """Camera that reports when its frames are delivered."""
 
     def __init__(self, frames: int) -> None:
         super().__init__(frames)
-        self._frames, self.given, self.left = frames, threading.Event(), threading.Event()
+        self.given = threading.Event()
 
     def __iter__(self) -> Iterator[Any]:
-        yield from WallCamera(self._frames)
+        yield from super().__iter__()
         self.given.set()
-
-    def __exit__(self, *_: object) -> None:
-        self.left.set()
 
 
 def test_stream_stops_camera_after_error_and_needs_a_start(opened: Open) -> None:
-    camera = WatchedCamera(10**9)
+    camera = WallCamera(10**9)
     stream = opened(camera, "sim")
     with pytest.raises(NlosCamError, match="started"):
         next(stream)
     with pytest.raises(ZeroDivisionError), stream:
         next(stream).frame_number // 0
-    assert camera.left.is_set()
+    assert camera.closed.is_set()
 
 
 def test_stream_of_live_camera_drops_and_counts_old_frames(opened: Open) -> None:

@@ -5,13 +5,12 @@ import runpy
 import sys
 from collections.abc import Callable, Generator, Iterator, Sequence
 from pathlib import Path
-from typing import Any
 
 import pytest
 import trimesh
 from nlos_calibration import load_measured, load_rig
 
-from nlos_cam.camera import Recording, SimulatedCamera, open_world
+from nlos_cam.camera import open_world
 from nlos_cam.dataset import DatasetPlan, build_dataset
 from nlos_cam.dataset.samples import Samples, make_samples
 from nlos_cam.render import load_scene
@@ -46,18 +45,9 @@ def run(folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFix
 
 
 @pytest.fixture
-def recording(folder: Path, hurried_clock: Any) -> Record:
+def recording(folder: Path, recorded: Callable[..., Path]) -> Record:
     """Record the first frames of a scene."""
-
-    def make(name: str, frames: int) -> Path:
-        path = folder / f"{Path(name).stem}.bag"
-        recording = Recording(path, frames=frames)
-        with SimulatedCamera(f"sim:{name}", open_world(name), clock=hurried_clock(), recording=recording) as camera:
-            for _ in camera:
-                pass
-        return path
-
-    return make
+    return lambda name, frames: recorded(folder / f"{Path(name).stem}.bag", frames, open_world(name))
 
 
 @pytest.mark.slow

@@ -84,10 +84,10 @@ def judged(text: str, source: PackedMaps, sets: dict[str, MapSet]) -> dict[str, 
     """Return the facts and metrics of trained weights, NAME=DIR."""
     name, _, folder = text.partition("=")
     network, record = load_network(Path(folder))
-    recipe = record.runs[-1]
     if not isinstance(network, DirectNetwork):
         raise SystemExit(f"{folder} holds no direct network: give another --weights")
-    facts = {"name": name, "objects": len(source), "samples": recipe.objects * recipe.epochs}
+    samples = sum(recipe.objects * recipe.epochs for recipe in record.runs)
+    facts = {"name": name, "objects": len(source), "samples": samples}
     return facts | _judge(network, source, sets) | {"samples_per_s": None, "cpu_seconds": None}
 
 

@@ -114,12 +114,16 @@ def soak_faults(seed: int) -> list[str]:
     or more within it, and at most the light to a sub-bin outside. A winner must be the strongest for some such light.
     """
     generator = np.random.default_rng([seed, 20])
-    accuracy = renderer.Accuracy("soak", 8, 6, sub_bins=int(generator.choice([1, 4, 8, 64])))
+    grid = ((8, 6), (24, 20))[int(generator.random() < 0.2)]  # the finer one has more than one tile of relay cells
+    accuracy = renderer.Accuracy("soak", *grid, sub_bins=int(generator.choice([1, 4, 8, 64])))
     effects = "three-bounce", "direct", "line-of-sight", "occluder", "self-occlusion", "tilt"
     job = renderer.prepare(random_scene(generator), accuracy, effects).job
     if job is None:
         return []
-    job, fine = job.select(generator.integers(len(job.length_m), size=12)), 64
+    beams, fine = generator.integers(len(job.length_m), size=12), 64
+    if generator.random() < 0.5:  # neighbors, whose tile may see all of a patch or nothing
+        beams = np.argsort(np.linalg.norm(job.laser_spot_m - job.laser_spot_m[beams[0]], axis=1), kind="stable")[:12]
+    job = job.select(beams)
     found, echo = renderer.histograms(job).astype(np.float64), renderer.backend_numba.echoes(job)
     exact = replace(job, accuracy=renderer.STOPS["reference"], bin_m=job.bin_m / fine, bins=job.bins * fine)
     below = np.pad(np.cumsum(renderer.backend_reference.histograms(exact), 1), [(0, 0), (1, 0)])

@@ -2,14 +2,12 @@
 
 python tools/studies/transfer.py record DIR [--scene examples/bench.toml] [--frames 8]
 python tools/studies/transfer.py figures DIR [--weights W]      docs/transfer.json
-python tools/studies/transfer.py curve DIR RUNS --recipe models/recipes/paper-rig-transfer.toml [--weights W]
-    [--scratch models/recipes/paper-rig-compressor-scratch.toml]  docs/transfer_curve.json and .png
+python tools/studies/transfer.py curve DIR RUNS --recipe direct-transfer [--weights W]  docs/transfer_curve.json, .png
 
 DIR holds the 54 test objects as labelled recordings of a simulated bench, for adaptation, validation and judging: of 8
 frames of 640 x 480 they take 0.4 GB and two minutes, and a second call resumes. Frames of a bench at rest differ by
 their noise alone, so that more of them would add little; a person's recordings of a few seconds have more. One frame of
-each of 18 objects that no run trains on is judged. RUNS holds the trainings, which resume. With --scratch the same
-recordings also train a compressor from nothing, onto the latent of the weights' VAE.
+each of 18 objects that no run trains on is judged. RUNS holds the trainings, which resume.
 """
 
 import argparse
@@ -25,18 +23,19 @@ import numpy as np
 from matplotlib.figure import Figure
 from nlos_calibration import ObjectBox, load_rig
 from nlos_calibration.arrays import Float32
-from nlos_models import MapSet, Reconstructor, load_reconstructor, surface
+from nlos_models import CheckpointRecord, MapSet, Reconstructor, load_reconstructor, surface
 from numpy.typing import NDArray
 
 from nlos_cam.camera import FRAMES_PER_S, Recording, SimulatedCamera, World
 from nlos_cam.cli.common import tracked
 from nlos_cam.cli.main import main as nlos_cam
-from nlos_cam.dataset import list_recordings, read_labelled, write_shards
+from nlos_cam.dataset import Labelled, list_recordings, read_labelled, write_shards
 from nlos_cam.errors import NlosCamError, RecordingError
 from nlos_cam.evaluate import mm_per_v, over_objects, per_object, plain, reconstruct_all
 from nlos_cam.files import cache_folder
 from nlos_cam.frames import maps_from_frame
 from nlos_cam.objects import CATEGORIES, BenchmarkObject, benchmark_objects, image_from_depth, object_box
+from nlos_cam.reconstruct import align_all
 from nlos_cam.recording import CaptureSession, CaptureTarget, finalize, load_sidecar, sidecar_path, verify
 from nlos_cam.render import Scene, SceneFile, SensedImages, Sensor, SensorModel, load_scene, render
 
@@ -201,10 +200,12 @@ def on_paper_rig(on_progress: OnProgress) -> dict[str, MapSet]:
     return {part: MapSet(*map(np.stack, zip(*samples, strict=True))) for part, samples in parts.items()}
 
 
-def on_bench(folder: Path, on_progress: OnProgress) -> dict[str, MapSet]:
-    """Read one frame of each recording of each folder."""
+def on_bench(folder: Path, trained: CheckpointRecord, on_progress: OnProgress) -> dict[str, dict[str, MapSet]]:
+    """Read one frame of each recording of each folder: aligned with the rig of weights, and as measured."""
     found = {part: list_recordings(folder / part) for part in PARTS}
-    return {part: read_labelled(paths, frames=1, on_progress=on_progress).maps for part, paths in found.items()}
+    read = {part: read_labelled(paths, frames=1, on_progress=on_progress) for part, paths in found.items()}
+    aligned = {part: align_all(one.maps, one.rig, trained) for part, one in read.items()}
+    return {"bench": aligned, "bench, not aligned": {part: one.maps for part, one in read.items()}}
 
 
 def figures(asked: argparse.Namespace) -> None:
@@ -213,7 +214,7 @@ def figures(asked: argparse.Namespace) -> None:
     with tracked("rendering the paper's rig") as on_progress:
         rigs = {"paper-rig": on_paper_rig(on_progress)}
     with tracked("reading recordings") as on_progress:
-        rigs["bench"] = on_bench(asked.folder, on_progress)
+        rigs |= on_bench(asked.folder, reconstructor.record, on_progress)
     box = paper_box()
     found = {
         rig: {part: judge(reconstructor, maps, box) for part, maps in parts.items()} for rig, parts in rigs.items()
@@ -286,7 +287,7 @@ def curve(
 
     Points of an earlier call are read from `runs`.
     """
-    held_out = read_labelled(list_recordings(folder / HELD_OUT), frames=1).maps
+    held_out = read_labelled(list_recordings(folder / HELD_OUT), frames=1)
     validation = runs / "validation"
     write_shards(read_labelled(list_recordings(folder / VALIDATION), frames=frames), validation)
     yield Point("before", 0, _judged(before, held_out))
@@ -299,7 +300,7 @@ def curve(
             yield Point(name, count, _reached(lesson, trainer, held_out))
 
 
-def _reached(lesson: Lesson, trainer: Trainer, held_out: MapSet) -> dict[str, Any]:
+def _reached(lesson: Lesson, trainer: Trainer, held_out: Labelled) -> dict[str, Any]:
     done = lesson.out / FINISHED
     if not done.is_file():
         figures = _judged(trainer(lesson), held_out)
@@ -307,8 +308,9 @@ def _reached(lesson: Lesson, trainer: Trainer, held_out: MapSet) -> dict[str, An
     return json.loads(done.read_text(encoding="utf-8"))
 
 
-def _judged(weights: Path | None, maps: MapSet) -> dict[str, Any]:
-    return judge(load_reconstructor(weights, cache_folder() / "onnx"), maps, paper_box())
+def _judged(weights: Path | None, held_out: Labelled) -> dict[str, Any]:
+    reconstructor = load_reconstructor(weights, cache_folder() / "onnx")
+    return judge(reconstructor, align_all(held_out.maps, held_out.rig, reconstructor.record), paper_box())
 
 
 def draw(points: Sequence[Point]) -> Figure:
@@ -332,11 +334,8 @@ def draw(points: Sequence[Point]) -> Figure:
 
 def run_curve(asked: argparse.Namespace) -> None:
     """Train on growing numbers of recordings, and judge."""
-    weights = {flag: [flag, asked.weights] if asked.weights else [] for flag in ("--weights", "--vae")}
-    trainers = {"transfer": commanded("transfer", asked.recipe, *weights["--weights"])}
-    if asked.scratch:
-        trainers["from scratch"] = commanded("compressor", asked.scratch, *weights["--vae"])
-    points: list[Point] = []
+    given = ["--weights", asked.weights] if asked.weights else []
+    trainers, points = {"transfer": commanded("transfer", asked.recipe, *given)}, list[Point]()
     for point in curve(asked.folder, asked.runs, trainers, asked.weights, asked.counts):
         points.append(point)
         names = "foreground_rmse_mm", "foreground_too_far_mm", "silhouette_iou"
@@ -362,7 +361,6 @@ def main() -> None:
         if work is run_curve:
             part.add_argument("runs", type=Path)
             part.add_argument("--recipe", type=Path, required=True)
-            part.add_argument("--scratch", type=Path, help="recipe for `train compressor` on the same recordings")
             part.add_argument("--counts", type=int, nargs="+", default=COUNTS)
         part.add_argument("--weights", type=Path, help="initial weights (default: the shipped ones)")
         part.add_argument("--out", type=Path, help="folder of the results (default: docs)")

@@ -1,11 +1,10 @@
-"""Weights: the limits of their figures, their range of rigs, and kinds of objects they never saw.
+"""Weights: the limits of their figures, and their range of rigs.
 
 python tools/studies/weights.py limits [--weights DIR] [--frames 10 100]   docs/limits.json
 python tools/studies/weights.py rigs [--weights [NAME=]DIR ...]            docs/rig_map.json and images/rig_map.png
-python tools/studies/weights.py unseen WITHOUT WITH [--held-out DIR]       docs/unseen_kinds.json
 
 `limits` evaluates with one thing removed or added at a time. `rigs` moves the lidar over the distances and angles of
-SI 1, while occluder and object box stay, and resumes. `unseen` compares weights trained without and with some kinds.
+SI 1 and by what a bench built with a ruler is off, while occluder and object box stay, and resumes.
 """
 
 import argparse
@@ -25,6 +24,7 @@ from nlos_calibration.arrays import Float32
 from nlos_models import (
     MapSet,
     Reconstructor,
+    UncertaintyModel,
     cut_silhouette,
     latent_error,
     lift_edges,
@@ -32,7 +32,7 @@ from nlos_models import (
     load_pipeline,
     load_reconstructor,
     load_record,
-    refuse_color,
+    load_uncertainty_model,
     run,
     shipped_folder,
     weights_folder,
@@ -45,19 +45,13 @@ from nlos_cam.evaluate import (
     SMALLER_IS_BETTER,
     TARGETS,
     Figures,
-    HeldOutObjects,
-    PerObject,
     Subject,
-    advantage,
     as_map_set,
     bare_wall_for,
-    dataset_objects,
     echoes_of,
     format_interval,
     judge,
     network_input,
-    over_objects,
-    per_object,
     plain,
     reconstruct_all,
     rig_of,
@@ -66,9 +60,11 @@ from nlos_cam.evaluate import (
     truth_of,
 )
 from nlos_cam.files import cache_folder
+from nlos_cam.frames import LidarMaps
 from nlos_cam.objects import benchmark_objects, object_box
+from nlos_cam.reconstruct import estimate_doubt
 
-FRAMES, LEFT_OUT = (10, 100), "airplane,table"
+FRAMES = 10, 100
 DISTANCES_M, ANGLES_DEG = (0.15, 0.2, 0.25, 0.3), (15.0, 30.0, 45.0, 60.0, 75.0)
 
 
@@ -92,7 +88,8 @@ class Network:
         joint = recipe and recipe.steps == "two-then-joint"  # its decoder has left the encoder's latent
         self.encoder = None if joint else load_encoder(folder)
         self.rig = rig_of(self.record)
-        self.bare = bare_wall_for(self.record, DatasetPlan(self.rig, TEST_SEED))
+        self.plan = DatasetPlan(self.rig, TEST_SEED)
+        self.bare = bare_wall_for(self.record, self.plan)
 
     @torch.inference_mode()
     def raw_image(self, maps: MapSet) -> Float32:
@@ -131,11 +128,11 @@ def experiments(
         echoes = echoes_of([*subjects, *trained], rig, on_progress)
 
     def row(name: str, change: str, sensed: Any, images: Float32 = truth) -> Row:
-        maps = network_input(as_map_set(sensed, images), network.bare)
+        maps = network_input(as_map_set(sensed, images), network.bare, network.plan, network.record)
         return Row(name, change, judge(run(network.pipeline, maps), maps.image, box), network.latent_error(maps))
 
     first = sense(echoes[:count], rig)
-    maps = network_input(as_map_set(first, truth), network.bare)
+    maps = network_input(as_map_set(first, truth), network.bare, network.plan, network.record)
     yield row("as evaluated", "both steps, noise on, one frame", first)
     if (rebuilt := network.rebuilt(truth)) is not None:
         yield Row("VAE alone", "no compressor: the decoder on the true latent", judge(rebuilt, truth, box))
@@ -175,46 +172,95 @@ def limits_table(rows: Sequence[Row]) -> str:
 class Place:
     """Place of the lidar before the relay wall."""
 
-    distance_m: float
-    yaw_deg: float
+    distance_m: float = 0.2
+    yaw_deg: float = 45.0
+    pitch_deg: float = 0.0
+    aside_m: float = 0.0  # along the wall, towards the object
+    up_m: float = 0.0
 
     def rig(self, rig: Rig) -> Rig:
-        """Return the rig with its lidar here."""
-        lidar = rig.lidar.model_copy(update=asdict(self))
-        name = f"{rig.name} at {self.distance_m:g} m, {self.yaw_deg:g} degrees"
-        return rig.model_copy(update={"name": name, "lidar": lidar})
+        """Return the rig with its lidar here; positions on the wall are relative to the lidar's foot."""
+        lidar = rig.lidar.model_copy(
+            update={"distance_m": self.distance_m, "yaw_deg": self.yaw_deg, "pitch_deg": self.pitch_deg}
+        )
+        update: dict[str, Any] = {"name": f"{rig.name} with another lidar's place", "lidar": lidar}
+        for part in ("wall", "relay", "object_box"):
+            extent = getattr(rig, part)
+            ends = {f"x_{end}_m": getattr(extent, f"x_{end}_m") - self.aside_m for end in ("min", "max")}
+            ends |= {f"y_{end}_m": getattr(extent, f"y_{end}_m") - self.up_m for end in ("min", "max")}
+            update[part] = extent.model_copy(update=ends)
+        if rig.occluder:
+            update["occluder"] = rig.occluder.model_copy(update={"x_m": rig.occluder.x_m - self.aside_m})
+        return rig.model_copy(update=update)
 
 
-def cell(rig: Rig, subjects: Sequence[Subject], networks: Mapping[str, Reconstructor]) -> dict[str, Any]:
-    """Return the figures of all networks on one rig; difference maps are relative to its own bare wall."""
+BENCHES = [
+    Place(distance_m=0.202),
+    Place(distance_m=0.21),
+    Place(yaw_deg=45.5),
+    Place(yaw_deg=47.0),
+    Place(pitch_deg=1.0),
+    Place(aside_m=0.005, up_m=0.005),
+    Place(0.206, 46.8, 1.1, 0.004, -0.003),
+]
+"""What a bench built with a ruler is off by; the last is that of examples/bench.toml."""
+
+
+Judged = tuple[Reconstructor, UncertaintyModel | None]
+
+
+def cell(rig: Rig, subjects: Sequence[Subject], weights: Mapping[str, Judged]) -> dict[str, Any]:
+    """Return the figures of all weights on one rig, with maps aligned with their own rig and without.
+
+    Difference maps are relative to the rig's own bare wall. `outside` is the share of objects that are flagged.
+    """
     box, plan = object_box(rig), DatasetPlan(rig, TEST_SEED)
     truth = truth_of(subjects, box)
     maps = as_map_set(sense(echoes_of(subjects, rig, lambda *_: None), rig), truth)
-    inputs = {name: network_input(maps, bare_wall_for(network.record, plan)) for name, network in networks.items()}
-    found = {name: judge(reconstruct_all(network, inputs[name]), truth, box) for name, network in networks.items()}
+
+    def figures(network: Reconstructor, doubter: UncertaintyModel | None, taken: MapSet) -> dict[str, Any]:
+        images = reconstruct_all(network, taken)
+        found = plain(judge(images, truth, box))
+        if doubter:
+            seen = (LidarMaps(*pair, ~np.isnan(pair[0])) for pair in zip(taken.depth_m, taken.intensity, strict=True))
+            doubts = [estimate_doubt(doubter, one, image, box) for one, image in zip(seen, images, strict=True)]
+            found["outside"] = float(np.mean([doubt.outside > doubter.record.outside_above for doubt in doubts]))
+        return found
+
+    found = dict[str, Any]()
+    for name, judged in weights.items():
+        record = judged[0].record
+        found[name] = figures(*judged, network_input(maps, bare_wall_for(record, plan), plan, record))
+        if record.input == "raw maps":
+            found[f"{name}, not aligned"] = figures(*judged, maps)
     return {
         "rig_checksum": rig.checksum,
         "share_of_box_in_direct_sight": lidar_visible_share(rig, box),
         "share_of_cells_with_a_return": float(np.mean(~np.isnan(maps.depth_m))),
-        "weights": {name: plain(figures) for name, figures in found.items()},
+        "weights": found,
     }
 
 
 def rigs(asked: argparse.Namespace) -> None:
     """Map the figures of weights over the rigs of SI 1."""
     folders: dict[str, Path | None] = harness.by_name(asked.weights) or {"shipped": None}
-    networks = {name: load_reconstructor(folder, cache_folder() / "onnx") for name, folder in folders.items()}
+    graphs, weights = cache_folder() / "onnx", dict[str, Judged]()
+    for name, folder in folders.items():
+        weights[name] = load_reconstructor(folder, graphs), load_uncertainty_model(folder, graphs, quality=False)
     rig = load_rig(asked.rig)
     subjects = benchmark_objects(object_box(rig))
-    places = [Place(distance_m, yaw_deg) for distance_m in DISTANCES_M for yaw_deg in ANGLES_DEG]
+    places = [*(Place(distance_m, yaw_deg) for distance_m in DISTANCES_M for yaw_deg in ANGLES_DEG), *BENCHES]
     files = [file for folder in folders.values() for file in sorted(weights_folder(folder).iterdir())]
     key = hashlib.sha256(b"".join(file.read_bytes() for file in files if file.is_file())).hexdigest()
-    cells = harness.collect("rigs", places, lambda place, _: cell(place.rig(rig), subjects, networks), key=key)
-    harness.write("rig_map", {"objects": len(subjects), "cells": cells}, asked.out)
+    measured = harness.collect("rigs", places, lambda place, _: cell(place.rig(rig), subjects, weights), key=key)
+    cells, benches = measured[: -len(BENCHES)], measured[-len(BENCHES) :]
+    harness.write("rig_map", {"objects": len(subjects), "cells": cells, "benches": benches}, asked.out)
     harness.save("rig_map", draw_rigs(cells, rig), asked.out, dpi=80)
-    for one in cells:
-        ious = {name: figures["silhouette_iou"]["value"] for name, figures in one["weights"].items()}
-        print(f"{one['distance_m']:g} m, {one['yaw_deg']:g} degrees: IoU {ious}")
+    for one in measured:
+        print({key: one[key] for key in asdict(Place())})
+        for name, figures in one["weights"].items():
+            iou, rmse_mm = figures["silhouette_iou"]["value"], figures["foreground_rmse_mm"]["value"]
+            print(f"    {name}: IoU {iou:.3f}, RMSE {rmse_mm:.0f} mm, flagged {figures.get('outside')}")
 
 
 def draw_rigs(cells: Sequence[Mapping[str, Any]], rig: Rig) -> Figure:
@@ -253,68 +299,18 @@ def draw_heat(axis: Any, values: Any, metric: str) -> None:
     axis.set_title(metric.replace("_", " "), fontsize=9)
 
 
-def values_of(folder: Path, judged: HeldOutObjects) -> PerObject:
-    """Return every metric of every object. Raises CheckpointError for weights of full color."""
-    pipeline, record = load_pipeline(folder)
-    refuse_color(record, folder)
-    image = run(pipeline, network_input(judged.maps, bare_wall_for(record, judged.plan)))
-    return per_object(image, judged.maps.image, judged.plan.box)
-
-
-def compared(
-    without: PerObject, with_them: PerObject, categories: Sequence[str], left_out: Sequence[str]
-) -> list[dict[str, Any]]:
-    """Return a row for each kind that was left out, and one for all others."""
-    of = np.array(categories)
-    if missing := sorted(set(left_out) - set(categories)):
-        raise SystemExit(f"no {missing[0]} among the maps: choose from {', '.join(sorted(set(categories)))}")
-    groups = {kind: of == kind for kind in left_out} | {"all others": ~np.isin(of, left_out)}
-    rows = list[dict[str, Any]]()
-    for name, chosen in groups.items():
-        one, other = ({metric: v[chosen] for metric, v in values.items()} for values in (without, with_them))
-        figures = {
-            "without": over_objects(one),
-            "with": over_objects(other),
-            "without_better_by": advantage(one, other),
-        }
-        rows.append(
-            {"objects": name, "count": int(chosen.sum()), **{key: plain(value) for key, value in figures.items()}}
-        )
-    return rows
-
-
-def unseen(asked: argparse.Namespace) -> None:
-    """Compare weights trained without and with some kinds of objects."""
-    judged = dataset_objects(asked.held_out)
-    without, with_them = (values_of(folder, judged) for _, folder in (asked.without, asked.with_them))
-    rows = compared(without, with_them, judged.categories, asked.left_out)
-    harness.write("unseen_kinds", {"left_out": asked.left_out, "rows": rows}, asked.out)
-    parts = ("without", format_interval), ("with", format_interval), ("without_better_by", harness.difference)
-    cells = [
-        [f"{row['objects']} ({row['count']})", part.replace("_", " ")]
-        + [words(row[part][metric]) for metric in TARGETS]
-        for row in rows
-        for part, words in parts
-    ]
-    print(harness.table(["objects", "training", *TARGETS], cells))
-
-
 def main() -> None:
     """Run the named study."""
     parser = harness.options(__doc__)
     commands = parser.add_subparsers(required=True)
-    parts = {work.__name__: commands.add_parser(work.__name__, help=work.__doc__) for work in (limits, rigs, unseen)}
-    for work in (limits, rigs, unseen):
+    parts = {work.__name__: commands.add_parser(work.__name__, help=work.__doc__) for work in (limits, rigs)}
+    for work in (limits, rigs):
         parts[work.__name__].set_defaults(run=work)
         parts[work.__name__].add_argument("--out", type=Path, help="folder of the results (default: docs)")
     parts["limits"].add_argument("--weights", type=Path, default=shipped_folder("paper"))
     parts["limits"].add_argument("--frames", type=int, nargs="*", default=list(FRAMES))
     parts["rigs"].add_argument("--weights", type=harness.named, action="append", default=[])
     parts["rigs"].add_argument("--rig", default="paper-rig")
-    parts["unseen"].add_argument("without", type=harness.named)
-    parts["unseen"].add_argument("with_them", type=harness.named, metavar="with")
-    parts["unseen"].add_argument("--held-out", type=Path, default=Path("data/held-out"))
-    parts["unseen"].add_argument("--left-out", default=LEFT_OUT, type=lambda text: text.split(","))
     asked = parser.parse_args()
     with harness.one_line_errors():
         asked.run(asked)

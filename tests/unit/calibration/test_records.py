@@ -1,7 +1,6 @@
 import hashlib
 from collections.abc import Callable
 from dataclasses import replace
-from datetime import date
 from pathlib import Path
 
 import numpy as np
@@ -9,24 +8,20 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from nlos_calibration.errors import RecordFileError
-from nlos_calibration.geometry import Intrinsics, normal_from_angles, wall_from_plane
+from nlos_calibration.geometry import Intrinsics
 from nlos_calibration.occluder import OccluderFit
 from nlos_calibration.reference import BareWall, BareWallStatistics, Moments, load_reference, save_reference
 from nlos_calibration.rig import ObjectBox, Occluder, dump_toml, load_rig
-from nlos_calibration.wall import fit_wall, wall_depth
-from nlos_calibration.wall_record import VERSION, WallRecord, load_measured, load_wall, new_wall_record, with_occluder
+from nlos_calibration.wall_record import VERSION, MeasuredWall, WallRecord, load_measured, load_wall, with_occluder
 
-PINHOLE = Intrinsics(160, 120, 114.0, 115.0, 80.5, 59.0)
 EXAMPLE = Path(__file__).parents[3] / "calibration/records/wall.toml"
 SMALL = Intrinsics(16, 12, 11.4, 11.5, 7.5, 5.5)
 SHAPE, CELLS, FRAMES = (12, 16), (64, 80), 20
 
 
 @pytest.fixture
-def record() -> WallRecord:
-    pose = wall_from_plane(normal_from_angles(np.radians(40.0), np.radians(3.0)), 0.21)
-    fit = fit_wall(wall_depth(pose, PINHOLE), PINHOLE, np.random.default_rng(0))
-    return new_wall_record(fit, PINHOLE, camera="l515:f0246262", frames=60, created=date(2026, 1, 31))
+def record(measured: Callable[..., MeasuredWall]) -> WallRecord:
+    return measured(0.21).record
 
 
 def written(folder: Path, record: WallRecord) -> Path:
@@ -73,7 +68,7 @@ def test_wall_record_survives_a_file(tmp_path: Path, record: WallRecord) -> None
 
 def test_wall_record_rig_is_the_papers_as_measured(record: WallRecord) -> None:
     paper = load_rig("paper-rig")
-    assert record.rig.pinhole == PINHOLE
+    assert record.rig.pinhole == paper.pinhole.scaled(64, 48)
     np.testing.assert_allclose(record.rig.wall_from_lidar, record.wall_from_lidar, atol=1e-9)
     assert (record.rig.occluder, record.rig.object_box) == (paper.occluder, paper.object_box)
     moved = paper.model_copy(update={"lidar": paper.lidar.model_copy(update={"distance_m": 0.201})})
@@ -120,12 +115,7 @@ MATRIX_END = "0.0,\n        0.0,\n        0.0,\n        "
         (load_rig, "distance_m = 0.2", "distance_m = -0.2", r"lidar.distance_m: .*\(got "),
         (load_rig, "yaw_deg = 45.0", "yaw_degrees = 45.0", "lidar.yaw_deg: is missing"),
         (load_rig, "x_max_m = 0.575", "x_max_m = 0.1", r"object_box: .*x_min_m < x_max_m .*\(got .*x_max_m = 0.1"),
-        (
-            load_rig,
-            "z_far_m = 0.4",
-            "z_far_m = 0.1",
-            r"box: .*z_near_m < z_far_m \(got z_near_m = .*, z_far_m = 0.1\)",
-        ),
+        (load_rig, "z_far_m = 0.4", "z_far_m = 0.1", r"box: .*z_near_m < z_far_m \(got .*, z_far_m = 0.1\)"),
         (load_rig, 'name = "paper-rig"', 'name = "paper-rig"\nroof = 1', r"roof: .*\(got "),
         (load_wall, "schema_version = 3", "schema_version = 4", "3.*got 4"),
         (load_wall, "schema_version = 3", "schema_version = 0", "schema_version: .*got 0"),

@@ -2,20 +2,20 @@
 
 import re
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from datetime import datetime
 from io import StringIO
 from pathlib import Path
-from typing import Any, ClassVar, Self
+from typing import Any
 
 import numpy as np
 import pytest
 from nlos_calibration import BOARDS, Board, Occluder, OccluderRecord, load_measured, load_rig, load_wall, wall_depth
 from rich.console import Console
+from small_frames import FrameCamera
 from synthetic_scenes import at_near_edge, clean_infrared, infrared_frames
 
 from nlos_cam.calibrate import FrameFit, View, fit_frame
-from nlos_cam.camera import Recording, SimulatedCamera
 from nlos_cam.cli.calibrate import EVERY, gauge, panel, until_enter, watch_wall
 from nlos_cam.frames import Frame
 from nlos_cam.render.sensor.sensor import DEPTH_UNIT_M, SensedImages
@@ -26,16 +26,15 @@ WALL = *BARE, "--out", OUT
 Run = Callable[..., Any]
 
 
-class FakeCamera:
+class FakeCamera(FrameCamera):
     """A camera of 10 frames of the bare wall; `scale` moves the wall, `patch` puts part of the view behind it."""
 
     intrinsics = RIG.pinhole.scaled(160, 120)
-    identity: ClassVar = {"name": "L515", "serial": "f0246262", "firmware": "1.5.8.1"}
-    incomplete = dropped = taken = 0
-    uri = "sim"
 
     def __init__(self, frames: int = 10) -> None:
-        self.scale, self.patch, self.frames = 1.0, 1.0, frames
+        super().__init__(frames, make=self._frame, uri="sim")
+        self.identity |= {"name": "L515", "firmware": "1.5.8.1"}
+        self.scale, self.patch, self.taken = 1.0, 1.0, 0
 
     @property
     def depth_m(self) -> np.ndarray:
@@ -46,21 +45,9 @@ class FakeCamera:
     def telemetry(self, ending: str = "") -> dict[str, float]:
         return {"ldd_temperature": 40.0} if "ldd_temperature".endswith(ending) else {}
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None: ...
-
-    def __iter__(self) -> Iterator[Frame]:
-        depth_m, counts = self.depth_m, np.zeros((120, 160), np.uint8)
-        for number in range(self.frames):
-            self.taken += 1
-            yield Frame(depth_m, counts, counts, number / 30.0, number, self.intrinsics, {"laser_power": 80.0})
-
-
-@pytest.fixture(autouse=True)
-def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
+    def _frame(self, number: int) -> Frame:
+        self.taken, counts = self.taken + 1, np.zeros((120, 160), np.uint8)
+        return Frame(self.depth_m, counts, counts, number / 30.0, number, self.intrinsics, {"laser_power": 80.0})
 
 
 @pytest.fixture
@@ -157,7 +144,7 @@ def test_calibrate_moves_by_tape_and_reports_out_of_range(camera: FakeCamera, sh
     ("options", "changed", "error", "value"),
     [
         ((), {"patch": 1.5}, "WallRefusedError", r"\d+%"),
-        ((), {"frames": 0}, "WallRefusedError", "sim:bare-wall"),
+        ((), {"_count": 0}, "WallRefusedError", "sim:bare-wall"),
         (("--tape-m", "0.3"), {}, "CalibrationError", r"300\.0 mm.*200\.0 mm"),
     ],
     ids=["patch", "no frames", "tape"],
@@ -185,7 +172,7 @@ def test_calibrate_keeps_existing_files_unless_asked(run: Run, name: str) -> Non
 
 
 @pytest.fixture
-def record(noise_world: Any, hurried_clock: Any) -> Callable[..., Path]:
+def record(noise_world: Any, recorded: Callable[..., Path]) -> Callable[..., Path]:
     """Record the bare wall with a board on it; with a step, depth is no plane."""
 
     class BoardWorld(noise_world):
@@ -204,13 +191,7 @@ def record(noise_world: Any, hurried_clock: Any) -> Callable[..., Path]:
             ir = infrared_frames(self._clean, generator, 1)[0]
             return SensedImages(depth.astype(np.uint16), ir, np.full(ir.shape, 15, np.uint8))
 
-    def made(step_m: float = 0.0) -> Path:
-        recording = Recording(Path("board.bag"), frames=8)
-        with SimulatedCamera("sim:board", BoardWorld(step_m), clock=hurried_clock(), recording=recording) as camera:
-            assert sum(1 for _ in camera) >= 8
-        return recording.path
-
-    return made
+    return lambda step_m=0.0: recorded(Path("board.bag"), 8, BoardWorld(step_m))
 
 
 @pytest.mark.slow

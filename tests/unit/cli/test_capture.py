@@ -24,15 +24,14 @@ CAPTURE = "capture", "--camera", "sim", "--out", OUT
 
 
 @pytest.fixture(autouse=True)
-def noise(monkeypatch: Patch, noise_world: Any, hurried_clock: Any, tmp_path: Path) -> None:
-    """A NoiseWorld for every camera, and an empty folder."""
+def noise(monkeypatch: Patch, noise_world: Any, hurried_clock: Any) -> None:
+    """A NoiseWorld for every camera."""
 
     def open_noise(uri: str, *, on_progress: Any, recording: Recording) -> SimulatedCamera:
         on_progress(1, 1)
         return SimulatedCamera(uri, noise_world(), clock=hurried_clock(), recording=recording)
 
     monkeypatch.setattr("nlos_cam.camera.open_camera", open_noise)
-    monkeypatch.chdir(tmp_path)
 
 
 @pytest.fixture

@@ -7,6 +7,7 @@ from unittest.mock import Mock
 import pytest
 import usb.core
 from fake_bench import Bench, fake_device
+from fake_lidar import FakeLidar
 
 from nlos_cam.doctor.diagnosis import CHECKS
 from nlos_cam.doctor.udev import rules_text
@@ -20,8 +21,8 @@ def on_bench(monkeypatch: pytest.MonkeyPatch, bench: Bench) -> None:
     monkeypatch.setenv("COLUMNS", "160")
 
 
-def test_devices_lists_usb_and_sdk(run: Run, shown: Run, bench: Bench, fake_l515: Any) -> None:
-    bench.sdk_devices.append(fake_l515("123", name="Intel RealSense D435"))
+def test_devices_lists_usb_and_sdk(run: Run, shown: Run, bench: Bench) -> None:
+    bench.sdk_devices.append(FakeLidar("123", name="Intel RealSense D435"))
     bench.usb.devices.append(fake_device(0x0B55, serial="", port_numbers=(2,)))
     made = run("devices")
     assert list(made) == ["devices", "usb", "sdk_error", "usb_error"]

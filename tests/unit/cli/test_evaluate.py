@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from nlos_calibration import load_rig
 from nlos_models import CheckpointRecord, MapSet, Recipe
+from small_frames import SheetNetwork, sheet_network
 from small_maps import SmallDataset
 
 from nlos_cam import evaluate
@@ -30,22 +31,16 @@ JUDGE, RENDER, RECONSTRUCT = (
 STORED = ["--dataset", "held-out", "--training", "held-out"]
 
 
-class Guesser:
+class Guesser(SheetNetwork):
     """Network that answers everything with the same plate, and keeps the depth maps it was given."""
 
-    runtime = "none"
-
     def __init__(self, eats: str = "raw maps") -> None:
-        facts = {"rig_name": RIG.name, "rig_checksum": RIG.checksum, "input": eats, "compressor_recipe": None}
-        self.record = SimpleNamespace(vae_recipe=SimpleNamespace(left_out=["cup"]), **facts)
-        self.seen: list[np.ndarray] = []
+        super().__init__()
+        vars(self.record).update(input=eats, compressor_recipe=None, vae_recipe=SimpleNamespace(left_out=["cup"]))
 
     def __call__(self, depth_m: np.ndarray, intensity: np.ndarray) -> np.ndarray:
-        assert depth_m.shape == intensity.shape == (1, 64, 80)
-        self.seen.append(depth_m)
-        image = np.zeros((1, 64, 64), np.float32)
-        image[:, 16:48, 16:48] = 0.6
-        return image
+        inside = np.abs(np.arange(64) - 31.5) < 16
+        return super().__call__(depth_m, intensity) * np.outer(inside, inside)
 
 
 def _maps(plan: DatasetPlan, count: int) -> MapSet:
@@ -68,7 +63,7 @@ class Stored(SmallDataset):
 
 
 @pytest.fixture(autouse=True)
-def guessing(monkeypatch: Patch, tmp_path: Path) -> list[DatasetPlan]:
+def guessing(monkeypatch: Patch) -> list[DatasetPlan]:
     """A guesser as weights, a dataset, and training objects that are not rendered; their plans are kept."""
     asked: list[DatasetPlan] = []
 
@@ -80,7 +75,6 @@ def guessing(monkeypatch: Patch, tmp_path: Path) -> list[DatasetPlan]:
     monkeypatch.setattr(baselines, "NEIGHBOURS", 4)
     monkeypatch.setattr(report, "load_reconstructor", lambda *_: Guesser())
     monkeypatch.setattr(subjects, "open_dataset", lambda _: Stored(HELD_OUT_SEED, 3))
-    monkeypatch.chdir(tmp_path)
     return asked
 
 
@@ -136,7 +130,7 @@ def test_evaluate_subtracts_bare_wall_for_the_weights_alone(
     monkeypatch.setattr(subjects, "render_bare_wall", lambda _: (blank + np.float32(0.25), blank))
     monkeypatch.setattr(subjects, "measured_bare_wall", lambda _: (blank + np.float32(0.5), blank))
     result, raw = run(*JUDGE, *STORED, *options), _maps(DatasetPlan(RIG, HELD_OUT_SEED), 3)
-    np.testing.assert_allclose(np.concatenate(network.seen), raw.depth_m - wall_m, atol=1e-6)
+    np.testing.assert_allclose(np.stack(network.given), raw.depth_m - wall_m, atol=1e-6)
     assert result["input"] == maps
     assert result["baselines"]["nearest_neighbour"]["silhouette_iou"]["value"] == 1
 
@@ -174,12 +168,7 @@ def small(monkeypatch: Patch) -> list[Scene]:
 @pytest.fixture
 def plates(monkeypatch: Patch) -> None:
     """Two runtimes that answer with a plate, for any weights."""
-
-    def plate(depth_m: np.ndarray, intensity: np.ndarray) -> np.ndarray:
-        assert depth_m.shape == intensity.shape
-        return np.full((1, 64, 64), 0.5, np.float32)
-
-    made = {name: lambda _: plate for name in ("torch float32, cpu", "ONNX Runtime float32")}
+    made = {name: lambda _: sheet_network for name in ("torch float32, cpu", "ONNX Runtime float32")}
     monkeypatch.setattr("nlos_cam.evaluate.runtimes", lambda *_: made)
     monkeypatch.setattr(runtime_tradeoff, "MIN_CALLS", 2)
 

@@ -21,10 +21,9 @@ NAMES = [*EFFECTS, *(effect.name for effect in sensor_effects(SensorModel()))]
 
 
 @pytest.fixture(autouse=True)
-def undrawn(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
     """Pictures take a second each."""
     monkeypatch.setattr("nlos_cam.cli.render._draw", lambda path, *_: path.touch())
-    monkeypatch.chdir(tmp_path)
 
 
 @pytest.fixture

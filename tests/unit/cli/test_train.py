@@ -87,11 +87,6 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
-def out(tmp_path: Path) -> Path:
-    return tmp_path / "out"
-
-
-@pytest.fixture
 def go(folder: Path, out: Path, run: Run) -> Run:
     return lambda recipe, *options, code=0: run(*_arguments(folder, recipe, out, *options), code=code)
 

@@ -59,11 +59,6 @@ def go(folder: Path, out: Path, run: Run) -> Run:
     return train
 
 
-@pytest.fixture
-def out(tmp_path: Path) -> Path:
-    return tmp_path / "out"
-
-
 def test_color_training_notes_simulation_and_continues(go: Run, folder: Path, out: Path) -> None:
     answer = go("compressor", "--tensorboard", vae="vae")
     assert (out / "tensorboard").is_dir()

@@ -133,9 +133,7 @@ def test_build_replaces_only_damaged_shards_it_needs(
 
 
 @pytest.mark.parametrize("first", [1, 5, 7, 22])
-def test_build_grows_dataset_to_count_and_leaves_a_finished_one_alone(
-    tmp_path: Path, whole: Shards, first: int
-) -> None:
+def test_build_grows_dataset_to_count_and_leaves_finished_one_alone(tmp_path: Path, whole: Shards, first: int) -> None:
     """7 objects leave a shard half full, which a larger count must fill."""
     _build(tmp_path, count=first)
     assert len(open_dataset(tmp_path)) == first
@@ -175,9 +173,7 @@ def test_build_locks_its_folder_and_refuses_a_file(tmp_path: Path) -> None:
         _build(tmp_path / "file")
 
 
-def test_build_keeps_shards_when_an_object_fails_or_the_disk_is_full(
-    tmp_path: Path, whole: Shards, monkeypatch: Patch
-) -> None:
+def test_build_keeps_shards_if_object_fails_or_disk_is_full(tmp_path: Path, whole: Shards, monkeypatch: Patch) -> None:
     farm = FakeFarm(fails_after=4, error=errors.SceneError("cup.stl shows nothing"))
     with pytest.raises(errors.SceneError, match=r"cup\.stl"):
         _build(tmp_path, farm)

@@ -146,9 +146,7 @@ def test_crafted_shard_is_refused_within_little_memory(shard: Path, harm: str) -
 @pytest.mark.parametrize("shape", [(7,), (5, 3, 4), (33, 65)])
 @pytest.mark.parametrize("kind", ["f8", ">i2", "u1", "f2"])
 @pytest.mark.parametrize("storage", [{}, {"chunks": True}, {"compression": "gzip"}])
-def test_read_array_returns_what_was_stored(
-    tmp_path: Path, shape: tuple[int, ...], kind: str, storage: dict[str, Any]
-) -> None:
+def test_read_array_returns_what_was_stored(tmp_path: Path, shape: tuple[int, ...], kind: str, storage: dict) -> None:
     values = np.random.default_rng(1).integers(0, 100, shape).astype(kind)
     with h5py.File(tmp_path / "a.h5", "w") as file:
         file.create_dataset("a", data=values, **storage)
@@ -223,9 +221,7 @@ def _fill_disk(folder: Path) -> None:
         _stored(folder)
 
 
-def test_full_disk_and_ctrl_c_keep_the_earlier_shard_and_leave_no_partial_file(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_full_disk_and_ctrl_c_keep_the_earlier_shard_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = _stored(tmp_path)
     before = path.read_bytes()
     _in_child(_fill_disk, tmp_path)

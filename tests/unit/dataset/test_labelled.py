@@ -123,9 +123,7 @@ def test_read_labelled_refuses_missing_or_unknown_label(labelled: Label, label: 
 
 
 @pytest.mark.parametrize("dark_from", [2, 0])
-def test_read_labelled_skips_frames_without_return(
-    noise_world: Any, hurried_clock: Any, tmp_path: Path, dark_from: int
-) -> None:
+def test_dark_frames_are_skipped(noise_world: Any, hurried_clock: Any, tmp_path: Path, dark_from: int) -> None:
     class Dark(noise_world):
         def images(self, number: int) -> Any:
             seen = super().images(number)

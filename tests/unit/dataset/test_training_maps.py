@@ -104,9 +104,7 @@ def test_rendered_bare_wall_cancels_a_frame_of_bare_wall_of_the_one_rig() -> Non
 
 
 @pytest.mark.parametrize("wall", [None, WALL])
-def test_difference_maps_subtract_rendered_wall_or_reference_of_measured_one(
-    monkeypatch: pytest.MonkeyPatch, wall: Path | None
-) -> None:
+def test_difference_maps_subtract_rendered_or_measured_wall(monkeypatch: pytest.MonkeyPatch, wall: Path | None) -> None:
     flat = np.zeros((64, 80), np.float32)
     measured = SimpleNamespace(reference=SimpleNamespace(map_depth_m=flat + 0.5, map_intensity=flat + 2))
     monkeypatch.setattr(training_maps, "render_bare_wall", lambda _: (flat + 0.25, flat + 1))
@@ -227,9 +225,7 @@ def test_damaged_store_is_refused(tmp_path: Path, name: str) -> None:
         open_packed_maps([folder], tmp_path / "store").__enter__()
 
 
-def test_expected_maps_have_their_noise_to_be_drawn_and_datasets_of_two_kinds_or_too_few_objects_are_refused(
-    tmp_path: Path,
-) -> None:
+def test_expected_maps_have_noise_to_draw_and_mixed_datasets_or_too_few_objects_are_refused(tmp_path: Path) -> None:
     plain, expected = _add(tmp_path / "a", 0), _add(tmp_path / "b", 20, replace(PLAN, expected=True))
     for folder, wanted in ((plain, None), (expected, map_noise(PLAN))):
         with open_packed_maps([folder], tmp_path / f"store of {folder.name}") as packed:

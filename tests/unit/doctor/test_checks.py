@@ -13,6 +13,7 @@ from unittest.mock import Mock
 import pytest
 import usb.core
 from fake_bench import fake_device
+from fake_lidar import FakeLidar
 
 from nlos_cam.camera.sdk import WHEEL
 from nlos_cam.doctor.diagnosis import REPLUG
@@ -211,9 +212,9 @@ def test_firmware_is_judged_by_sdk_or_usb(bench: Any, firmware: str | int, statu
         assert ("1.5.8.1" in check.fix) == (status != "ok")
 
 
-def test_older_of_two_firmwares_counts(bench: Any, fake_l515: Any) -> None:
+def test_older_of_two_firmwares_counts(bench: Any) -> None:
     bench.usb.devices.append(fake_device(serial="F1", port_numbers=(2,), address=4))
-    bench.sdk_devices.append(fake_l515("f1"))
+    bench.sdk_devices.append(FakeLidar("f1"))
     bench.sdk_devices[1].info["firmware_version"] = "01.04.01.02"
     assert "f0246262" in (detail := bench.failed()["firmware"].detail)
     assert "01.04.01.02" in detail

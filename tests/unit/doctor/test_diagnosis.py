@@ -4,6 +4,7 @@ from typing import Any, get_args
 from unittest.mock import Mock
 
 from fake_bench import fake_device
+from fake_lidar import FakeLidar
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -62,13 +63,13 @@ def test_diagnosis_of_any_facts_gives_each_fault_a_fix(facts: Facts) -> None:
         assert bool(check.fix) == (check.status in {"warning", "failed"}), check
 
 
-def test_only_the_hidden_one_of_two_cameras_is_missed(bench: Any, fake_l515: Any) -> None:
+def test_only_the_hidden_one_of_two_cameras_is_missed(bench: Any) -> None:
     bench.usb.devices.append(fake_device(serial="00000000F0000001", port_numbers=(2,), address=4))
     bench.linux.plug("2-2", address=4)
     check = bench.failed()["sdk-camera"]
     assert "f0000001" in check.detail
     assert "f0246262" not in check.detail
-    bench.sdk_devices.append(fake_l515("f0000001"))
+    bench.sdk_devices.append(FakeLidar("f0000001"))
     assert bench.failed() == {}
     assert "l515:f0246262, l515:f0000001" in bench.checks()["sdk-camera"].detail
 
@@ -99,8 +100,8 @@ def test_gather_asks_this_machine() -> None:
     assert ("pyrealsense2", facts.sdk.version) in facts.sdk.packages
 
 
-def test_sdk_facts_hold_version_and_devices(bench: Any, fake_l515: Any) -> None:
-    bench.sdk_devices.append(fake_l515("9", name="Intel RealSense D435"))
+def test_sdk_facts_hold_version_and_devices(bench: Any) -> None:
+    bench.sdk_devices.append(FakeLidar("9", name="Intel RealSense D435"))
     sdk = bench.facts().sdk
     assert sdk.version == "2.54.2.5684"
     assert [one.serial for one in sdk.devices] == ["f0246262", "9"]

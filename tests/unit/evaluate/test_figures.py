@@ -50,9 +50,7 @@ def test_mosaic_shows_truth_reconstruction_and_difference() -> None:
 
 
 @pytest.mark.parametrize("count", [1, 4, 7, pytest.param(54, marks=pytest.mark.slow), 130])
-def test_sheet_names_up_to_54_objects_from_first_to_last_without_overlap(
-    tmp_path: Path, figures: list[Any], count: int
-) -> None:
+def test_sheet_names_up_to_54_objects_without_overlap(tmp_path: Path, figures: list[Any], count: int) -> None:
     names = [f"headphones {2_000_000_000 + k}" for k in range(count)]
     draw_sheet(tmp_path / "sheet.png", _images(count), _images(count), names)
     assert (tmp_path / "sheet.png").read_bytes().startswith(b"\x89PNG")

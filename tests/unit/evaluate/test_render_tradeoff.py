@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from depth_maps import depth_map
 from nlos_calibration import load_rig
 
 from nlos_cam.errors import SceneError
@@ -19,9 +20,7 @@ SMALL = {name: replace(stop, relay_columns=12, relay_rows=8) for name, stop in S
 
 
 def _scene() -> Scene:
-    depth = np.full((16, 16), np.nan, np.float32)
-    depth[4:8, 4:12] = 0.2 + 0.002 * np.arange(8)
-    return Scene(RIG, depth)
+    return Scene(RIG, depth_map(16, np.nan, (np.s_[4:8, 4:12], 0.2 + 0.002 * np.arange(8))))
 
 
 @pytest.fixture(scope="module")

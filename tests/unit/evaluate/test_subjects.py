@@ -86,9 +86,8 @@ def test_rig_of_weights_is_asked_for_where_missing_and_notes_name_other_rigs_and
     training = SmallDataset(JUDGED.maps, ELSEWHERE)
     training.folder = Path("train")
     assert notes_about(RECORD, JUDGED, SmallDataset(JUDGED.maps, PLAN)) == []
-    other_rig, left_out = notes_about(
-        RECORD.model_copy(update={"vae_recipe": recipe}), replace(JUDGED, plan=ELSEWHERE), training
-    )
+    record = RECORD.model_copy(update={"vae_recipe": recipe})
+    other_rig, left_out = notes_about(record, replace(JUDGED, plan=ELSEWHERE), training)
     assert ("paper-rig" in other_rig, "hat" in left_out, "car" in left_out) == (True, True, False)
     (other_training,) = notes_about(RECORD, JUDGED, training)
     assert "train" in other_training

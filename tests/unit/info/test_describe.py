@@ -23,7 +23,6 @@ from nlos_cam.info import Description, describe
 from nlos_cam.recording import BagReader, ExportOptions, export_recording
 from nlos_cam.report import Document
 
-EXAMPLES = Path(__file__).parents[3] / "examples"
 RIG = load_rig("paper-rig")
 FRAMES = {"frame_number": [3, 4], "timestamp_s": [0.0, 0.1], "rig_name": "paper-rig", "rig_checksum": "abc"}
 ARRAYS = {
@@ -57,7 +56,7 @@ def files(tmp_path_factory: pytest.TempPathFactory, noise_bag: Path, measured: C
     export_recording(bag, made["export of a recording"], options, stop=Event())
     made["report"] = folder / "report.html"
     made["report"].write_text(Document("a", "b", []).as_html())
-    made["scene of the simulated camera"] = EXAMPLES / "faults.toml"
+    made["scene of the simulated camera"] = Path(__file__).parents[3] / "examples" / "faults.toml"
     made["weights"] = shipped_folder()
     for name, content, kind in (
         ("figures.json", '{"objects": 3, "bars": {}}', "evaluation"),
@@ -89,7 +88,9 @@ def test_every_kind_is_known_and_whole(files: dict[str, Path], kind: str, verify
     assert all(line.split(" ")[0] in {"nlos-cam", "open"} for line in found.next)
 
 
-def test_facts_are_those_of_the_content(files: dict[str, Path]) -> None:
+def test_facts_are_those_of_the_content_and_a_view_names_its_program(files: dict[str, Path], tmp_path: Path) -> None:
+    (path := tmp_path / "view.rrd").write_bytes(b"RRF2....")
+    assert describe(path).next[-1] == f"rerun {path}"
     bag = describe(files["recording of a lidar"])
     assert bag.facts["depth"].startswith("20 frames, 30 per second")
     assert bag.facts["duration"] == "0.6 s"
@@ -101,14 +102,7 @@ def test_facts_are_those_of_the_content(files: dict[str, Path]) -> None:
     assert describe(files["wall record"]).facts["verdict"].startswith("good")
 
 
-def test_saved_view_of_rerun_names_the_program_that_opens_it(tmp_path: Path) -> None:
-    (path := tmp_path / "view.rrd").write_bytes(b"RRF2....")
-    assert describe(path).next[-1] == f"rerun {path}"
-
-
-def test_pipes_and_arrays_that_would_fill_the_memory_are_refused(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_pipes_and_arrays_that_would_fill_memory_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     os.mkfifo(tmp_path / "wall.toml")
     with pytest.raises(RecordingError, match="neither a file"):
         describe(tmp_path / "wall.toml")
@@ -145,7 +139,9 @@ def test_damaged_file_has_one_line_that_says_so(files: dict[str, Path], tmp_path
         assert str(place) in found.problem or source.name in found.problem
 
 
-def test_weights_that_differ_from_their_checksums_are_damaged(tmp_path: Path) -> None:
+def test_weights_unlike_checksums_and_lone_wall_records_are_damaged(files: dict[str, Path], tmp_path: Path) -> None:
+    (tmp_path / "wall.toml").write_bytes(files["wall record"].read_bytes())
+    assert "wall.npz is missing" in describe(tmp_path / "wall.toml").problem
     (tmp_path / "checkpoint.json").write_bytes((shipped_folder() / "checkpoint.json").read_bytes())
     (tmp_path / "a.safetensors").write_bytes(b"a")
     (tmp_path / "SHA256SUMS").write_text(f"{hashlib.sha256(b'a').hexdigest()}  a.safetensors\n")
@@ -154,11 +150,6 @@ def test_weights_that_differ_from_their_checksums_are_damaged(tmp_path: Path) ->
     assert "a.safetensors is damaged" in describe(tmp_path).problem
     (tmp_path / "a.safetensors").unlink()
     assert "a.safetensors is missing" in describe(tmp_path).problem
-
-
-def test_files_that_belong_together_are_missed(files: dict[str, Path], tmp_path: Path) -> None:
-    (tmp_path / "wall.toml").write_bytes(files["wall record"].read_bytes())
-    assert "wall.npz is missing" in describe(tmp_path / "wall.toml").problem
 
 
 @pytest.mark.parametrize("name", ["thesis.txt", "a.npy", "folder", "notes.toml", "list.json", "page.html", "view.rrd"])

@@ -271,12 +271,12 @@ def test_transfer_learns_the_bench_in_two_phases_and_resumes(tmp_path: Path) -> 
 @pytest.mark.slow
 def test_transfer_of_direct_weights_is_saved_with_both_runs(weights: Path, tmp_path: Path) -> None:
     recipe = _recipe(**TRANSFER, all_layers_epochs=1, epochs=1)
-    network, runs = transfer_start(recipe, weights, partial=False, on_report=pytest.fail)
-    record = record_run(recipe, tmp_path / "out", ("paper-rig", "0" * 64), runs, weights)
+    network, start = transfer_start(recipe, weights, partial=False, on_report=pytest.fail)
+    record = record_run(recipe, tmp_path / "out", ("paper-rig", "0" * 64), start.runs, weights)
     job = TrainingRun(recipe, tmp_path / "out", record)
     figures = run_transfer(open_fabric(recipe), job, network, None, InMemory(Source().maps), small_maps(4, 1))
     assert set(figures) == {"before", "after"}
-    assert load_record(tmp_path / "out").runs == [*runs, recipe]
+    assert load_record(tmp_path / "out").runs == [*start.runs, recipe]
     maps, (loaded, _) = Source().maps, load_network(tmp_path / "out")
     images = load_reconstructor(tmp_path / "out", tmp_path)(maps.depth_m, maps.intensity)
     np.testing.assert_allclose(images, reconstruct(loaded, maps), atol=1e-5)

@@ -51,9 +51,7 @@ def test_doubt_of_hard_maps_is_finite_and_in_range(network: DoubtNetwork, name: 
 
 def test_calibration_scales_error_and_divides_logits(network: DoubtNetwork) -> None:
     maps, image = hard_maps("saturated"), torch.full((1, 64, 64), 0.5)
-    plain, scaled = (
-        CalibratedDoubt(network, t, s).eval()(*maps, image) for t, s in (((1.0, 1.0), 1.0), ((2.0, 4.0), 1.5))
-    )
+    plain, scaled = (CalibratedDoubt(network, t, s).eval()(*maps, image) for t, s in (((1, 1), 1), ((2, 4), 1.5)))
     torch.testing.assert_close(scaled[2], 1.5 * plain[2])
     for one, other, divisor in zip(plain[:2], scaled[:2], (2.0, 4.0), strict=True):
         torch.testing.assert_close(torch.logit(other) * divisor, torch.logit(one))
@@ -70,9 +68,7 @@ def _train(folder: Path, steps: list[int], **running: Any) -> DoubtNetwork:
 
 
 @pytest.mark.slow
-def test_doubt_run_resumes_exactly_and_learns_what_is_empty_unusual_or_uncertain_within_its_limits(
-    tmp_path: Path,
-) -> None:
+def test_doubt_run_resumes_exactly_and_learns_what_is_empty_unusual_or_uncertain(tmp_path: Path) -> None:
     steps, trained, fresh = list[int](), _train(tmp_path / "whole", []), small_doubt_set(64, 2)
     with pytest.raises(KeyboardInterrupt):
         _train(tmp_path / "stopped", steps, stop=lambda: len(steps) == 11)
@@ -86,9 +82,7 @@ def test_doubt_run_resumes_exactly_and_learns_what_is_empty_unusual_or_uncertain
     assert dark > bright + 0.3
     some = small_doubt_set(200, 3)
     fitted, said = doubt_training.calibrate(trained, some), doubt_training.predict(trained, some)
-    nothing, outside = (
-        torch.sigmoid(logits / t).numpy() for logits, t in zip(said[:2], fitted.temperatures, strict=True)
-    )
+    nothing, outside = (torch.sigmoid(part / t).numpy() for part, t in zip(said[:2], fitted.temperatures, strict=True))
     usual = ~some.nothing & ~some.outside
     assert (outside[usual] > fitted.outside_above + 1e-6).mean() <= doubt_training.MAX_FALSE_ALARMS + 1 / usual.sum()
     assert (nothing[some.nothing] < fitted.nothing_above).mean() <= 1 / some.nothing.sum()
@@ -151,9 +145,7 @@ def record(tmp_path: Path, watched: Path) -> DoubtRecord:
     return untrained_doubt(tmp_path / "run", watched)
 
 
-def test_doubt_is_restored_with_watched_weights_which_alone_have_none(
-    tmp_path: Path, watched: Path, record: DoubtRecord
-) -> None:
+def test_doubt_is_restored_with_the_weights_that_it_watches(tmp_path: Path, watched: Path, record: DoubtRecord) -> None:
     network, found = doubt_network.load_doubt(tmp_path / "run")
     assert found == record
     assert not network.training
@@ -182,9 +174,7 @@ def test_load_doubt_refuses_other_weights_or_damaged_record(tmp_path: Path, name
         doubt_network.load_doubt(tmp_path / "run")
 
 
-def test_saved_bare_wall_keeps_its_precision_and_watched_weights_may_not_change(
-    tmp_path: Path, watched: Path, record: DoubtRecord
-) -> None:
+def test_saved_bare_wall_is_exact_and_watched_weights_stay(tmp_path: Path, watched: Path, record: DoubtRecord) -> None:
     network, wall_m = doubt_network.load_doubt(tmp_path / "run")[0].network, 0.3 + 1e-4 * torch.rand(5, 64, 80)
     network.learn_bare(wall_m, wall_m)
     doubt_network.save_doubt(tmp_path / "second", network, record, watched)
@@ -261,17 +251,14 @@ def test_figures_are_those_of_the_mirrored_frame_and_of_a_frame_alone_and_finite
 
 def test_model_takes_a_network_s_own_probability_of_a_surface_where_it_was_fitted_with_one() -> None:
     """Without one it takes the uncertainty network's, and a model that was fitted without one leaves it out."""
-    (images, said), own = frames(3), np.full((3, 64, 64), 0.5, np.float32)
-    plain, wide = (QualityModel(_sum_of_figures(count)) for count in (quality.FEATURES, quality.WITH_SURFACE))
+    (images, said), own, models = frames(3), np.full((3, 64, 64), 0.5, np.float32), list[QualityModel]()
+    for count in (quality.FEATURES, quality.WITH_SURFACE):  # whose outputs are the sum of small figures
+        layers = np.vstack([np.full((count, 5), 0.1), np.zeros((1, 5))])[None].tolist()
+        models.append(QualityModel(record_of(means=[0.0] * count, spreads=[10.0] * count, layers=layers)))
+    plain, wide = models
     np.testing.assert_array_equal(plain(images, said, own).iou, plain(images, said).iou)
     np.testing.assert_array_equal(wide(images, said, said.p_surface).iou, wide(images, said).iou)
     assert (wide(images, said, own).iou != wide(images, said).iou).any()
-
-
-def _sum_of_figures(count: int) -> QualityRecord:
-    """Return a model whose outputs are the sum of its figures, normalised to small numbers."""
-    layers = np.vstack([np.full((count, 5), 0.1), np.zeros((1, 5))])[None].tolist()
-    return record_of(means=[0.0] * count, spreads=[10.0] * count, layers=layers)
 
 
 def test_no_family_is_both_fitted_and_judged_and_every_row_is_judged_once() -> None:

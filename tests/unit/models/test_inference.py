@@ -3,6 +3,7 @@
 import shutil
 import sys
 from collections.abc import Iterator
+from itertools import product
 from pathlib import Path
 from unittest.mock import Mock
 
@@ -69,7 +70,7 @@ def pair(folders: tuple[Path, Path]) -> Pair:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("batch", [1, 5])
-def test_onnx_reconstruction_equals_torch_and_is_exported_once(
+def test_onnx_reconstruction_equals_torch_is_exported_once_and_of_hard_maps_a_possible_image(
     folders: tuple[Path, Path], pair: Pair, monkeypatch: pytest.MonkeyPatch, batch: int
 ) -> None:
     assert isinstance(pair[0], OnnxReconstructor)
@@ -89,14 +90,9 @@ def test_onnx_reconstruction_equals_torch_and_is_exported_once(
     monkeypatch.setattr(export, "export_onnx", lambda _: pytest.fail("exported again"))
     np.testing.assert_array_equal(load_reconstructor(*folders)(*maps), mine)
     assert [path.suffix for path in folders[1].iterdir()] == [".onnx"]
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", HARD_MAPS)
-def test_reconstruction_of_hard_maps_is_a_possible_image(pair: Pair, name: str) -> None:
-    for reconstructor in pair:
+    for name, reconstructor in product(HARD_MAPS, pair):
         image = reconstructor(*(part.numpy() for part in hard_maps(name)))
-        assert ((image == 0) | ((image >= MIN_V) & (image <= 1))).all()
+        assert ((image == 0) | ((image >= MIN_V) & (image <= 1))).all(), name
 
 
 def test_color_networks_are_not_exported_and_exports_are_named_by_weights(pipeline: RemappingNetwork) -> None:
@@ -201,9 +197,7 @@ def test_weights_without_graph_need_torch_in_one_line(tmp_path: Path, monkeypatc
         errors.require("nlos_models.train", "training")
 
 
-def test_paper_weights_name_what_they_or_a_package_without_them_lack(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_paper_weights_name_what_they_or_their_package_lack(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(CheckpointError, match=r"encoder.*train vae --recipe vae-encoder"):
         checkpoint.load_vae()
     assert checkpoint.load_encoder() is None

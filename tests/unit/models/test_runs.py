@@ -106,8 +106,8 @@ def test_transfer_starts_by_default_from_weights_that_its_loss_fits(
     shipped = {"paper": weights, "direct": tmp_path / "direct"}
     monkeypatch.setattr(runs, "weights_folder", lambda given, default: given or shipped[default])
     start = partial(transfer_start, partial=False, on_report=pytest.fail)
-    assert start(TRANSFER, None)[1] == [VAE, TWO]
-    assert start(TRANSFER.model_copy(update=IMAGES_ALONE), None)[1] == [straight]
+    assert start(TRANSFER, None)[1].runs == [VAE, TWO]
+    assert start(TRANSFER.model_copy(update=IMAGES_ALONE), None)[1].runs == [straight]
     with pytest.raises(TrainingError, match="latent"):
         start(TRANSFER, shipped["direct"])
 
@@ -121,9 +121,9 @@ def test_partial_start_fills_missing_tensors_by_seed(weights: Path) -> None:
     for seed in (3, 3, 4):
         torch.rand(1)
         recipe = small_recipe(task="transfer", seed=seed)
-        pipeline, earlier = transfer_start(recipe, weights, partial=True, on_report=messages.append)
+        pipeline, record = transfer_start(recipe, weights, partial=True, on_report=messages.append)
         rows.append(pipeline.compressor.get_parameter("classifier.1.weight").detach())
-        assert earlier == [VAE, TWO]
+        assert record.runs == [VAE, TWO]
         assert all(word in messages[-1] for word in ("more", "classifier.1.weight"))
     assert torch.equal(rows[0], rows[1])
     assert not torch.equal(rows[0], rows[2])

@@ -16,6 +16,7 @@ from torch import Tensor
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
+Patch = pytest.MonkeyPatch
 COUNT, BATCH = 16, 8
 STEPS = COUNT // BATCH
 CLASSIFIER_TENSORS = {"compressor.classifier.1.weight", "compressor.classifier.1.bias"}
@@ -60,9 +61,7 @@ def trained(tmp_path_factory: pytest.TempPathFactory) -> Trained:
     return *_vae(_recipe("vae"), folder), folder
 
 
-def test_vae_loss_falls_and_figures_are_of_last_epoch_and_resumed_run_equals_it(
-    trained: Trained, tmp_path: Path
-) -> None:
+def test_vae_loss_falls_figures_are_of_last_epoch_and_resumed_run_equals_it(trained: Trained, tmp_path: Path) -> None:
     vae, figures, folder = trained
     log = log_rows(folder)
     assert float(log[-1]["loss"]) < float(log[0]["loss"])
@@ -86,9 +85,7 @@ def test_vae_warm_up_ignores_divergence(tmp_path: Path) -> None:
     assert [one == other for one, other in zip(*losses, strict=True)] == [True, True, False, False]
 
 
-def test_vae_continues_from_given_weights_or_trains_an_encoder_for_a_decoder_that_is_kept(
-    trained: Trained, tmp_path: Path
-) -> None:
+def test_vae_continues_from_weights_or_trains_encoder_for_a_kept_decoder(trained: Trained, tmp_path: Path) -> None:
     start = SmallVae()
     start.load_state_dict(before := state_of(trained[0]))
     vae, figures = _vae(_recipe("vae", start="weights", epochs=1, learning_rate=1e-7), tmp_path, start=start)
@@ -154,9 +151,7 @@ def test_compressor_continues_from_weights_with_decoder_of_vae(trained: Trained,
     assert pipeline.compressor.classifier[0].p == 0.2
 
 
-def test_compiled_networks_are_the_trained_ones(
-    trained: Trained, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_compiled_networks_are_the_trained_ones(trained: Trained, tmp_path: Path, monkeypatch: Patch) -> None:
     compiled: list[object] = []
     monkeypatch.setattr(train, "compile_network", lambda network: compiled.append(network) or network)
     plain, quick = (_vae(_recipe("vae", epochs=1), tmp_path / f"{on}", compiled=on)[0] for on in (False, True))
@@ -178,9 +173,7 @@ def test_turn_some_with_mirror_gives_all_eight_views() -> None:
 
 
 @pytest.mark.parametrize(("augmentation", "turns"), [("mirror", []), ("turns", [0, 1, 2, 3])])
-def test_vae_turns_images_only_by_recipe(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, augmentation: str, turns: list[int]
-) -> None:
+def test_vae_turns_images_by_recipe(tmp_path: Path, monkeypatch: Patch, augmentation: str, turns: list[int]) -> None:
     quarters: list[int] = []
     monkeypatch.setattr(tasks, "turn_some", lambda images, turns: quarters.extend(turns.tolist()) or images)
     _vae(_recipe("vae", epochs=1, augmentation=augmentation), tmp_path)
@@ -189,7 +182,7 @@ def test_vae_turns_images_only_by_recipe(
 
 
 @torch.no_grad()
-def test_images_and_latents_in_parts_equal_those_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_images_and_latents_in_parts_equal_those_at_once(monkeypatch: Patch) -> None:
     pipeline, maps = RemappingNetwork(SmallCompressor(), SmallVae().decoder).eval(), small_maps(8, 3)
     whole, encoder = tasks.run(pipeline, maps), SmallVae().eval().encoder
     assert whole.shape == (8, 64, 64)
@@ -254,19 +247,15 @@ class Bench:
 
         recipe = _recipe("transfer", **({"epochs": 3, "all_layers_epochs": 2, "image_weight": 1.0} | changes))
         recipe = recipe.model_copy(update={"schedule": "plateau"})
-        source, encoder = InMemory(self.maps), self.vae.encoder
-        return tasks.train_transfer(
-            recipe, self.pipeline, encoder, source, self.held_out, self.folder, Running(on_step=on_step)
-        )[1]
+        source, encoder, running = InMemory(self.maps), self.vae.encoder, Running(on_step=on_step)
+        return tasks.train_transfer(recipe, self.pipeline, encoder, source, self.held_out, self.folder, running)[1]
 
     @property
     def state(self) -> dict[str, Tensor]:
         return state_of(self.pipeline)
 
 
-def test_transfer_changes_all_of_compressor_and_then_its_classifier_alone(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_transfer_changes_all_of_compressor_and_then_its_classifier_alone(tmp_path: Path, monkeypatch: Patch) -> None:
     bench = Bench(tmp_path / "second")
     before, fit = bench.state, tasks.Remapping.fit
     bench.go(all_layers_epochs=0, epochs=1, dropout=0.25, left_noise=0.125)
@@ -301,7 +290,7 @@ def test_transfer_phases_have_epochs_and_rates_of_recipe_and_resume_exactly(tmp_
         assert not changed_tensors(bench.state, again.state)
 
 
-def test_transfer_second_phase_starts_from_best_epoch(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_transfer_second_phase_starts_from_best_epoch(tmp_path: Path, monkeypatch: Patch) -> None:
     losses, found = iter([2.0, 1.0, 3.0, *[9.0] * 9]), list[dict[str, Tensor]]()
     bench = Bench(tmp_path)
 

@@ -283,12 +283,11 @@ def _no_compiler(*_: object) -> None:
     raise RuntimeError("No g++\nand a page of other words")
 
 
-def _no_gradients(_: Tensor) -> None:
-    raise InductorError(RuntimeError("No g++\nand more"), None)
+NO_GRADIENTS = Mock(side_effect=InductorError(RuntimeError("No g++\nand more"), None))
 
 
 @pytest.mark.usefixtures("compiler")
-@pytest.mark.parametrize("network", [torch.compile(nn.Linear(3, 2), backend=_no_compiler), _no_gradients])
+@pytest.mark.parametrize("network", [torch.compile(nn.Linear(3, 2), backend=_no_compiler), NO_GRADIENTS])
 def test_failed_compilation_is_one_line_and_not_blamed_for_errors_of_the_network(network: nn.Module) -> None:
     with pytest.raises(TrainingError, match=r"--compile .*No g\+\+") as caught, train.explain_compile_errors():
         network(torch.rand(1, 3))
@@ -309,9 +308,7 @@ class Hostile:
     [5, [1], Hostile(), {"recipe": 3}, {"recipe": "{}", "epoch": "a"}],
     ids=["number", "list", "hostile", "recipe", "epoch"],
 )
-def test_state_of_another_kind_is_refused_in_one_line(
-    tmp_path: Path, state: Any, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_state_of_another_kind_is_refused(tmp_path: Path, state: Any, capsys: pytest.CaptureFixture[str]) -> None:
     content = io.BytesIO()
     torch.save(state, content)
     for name in (train.LAST, train.PREVIOUS):

@@ -8,6 +8,7 @@ from fake_doubter import FakeDoubter
 from nlos_calibration.rig import load_rig
 from nlos_models import Answer
 from nlos_models.quality import QualityEstimate
+from small_frames import sheet_network
 
 from nlos_cam.errors import SceneError
 from nlos_cam.frames import LidarMaps
@@ -18,16 +19,13 @@ from nlos_cam.reconstruct.verdict import STEADY_FRAMES, FrameConditions, Verdict
 
 RIG = load_rig("paper-rig")
 BOX = object_box(RIG)
+HALF = sheet_network()
 
 
 def some_maps() -> LidarMaps:
     depth_m = np.full((64, 80), 0.3, np.float32)
     depth_m[0, 0] = np.nan
     return LidarMaps(depth_m, np.full((64, 80), 40.0, np.float32), ~np.isnan(depth_m))
-
-
-def half(*_: np.ndarray) -> np.ndarray:
-    return np.full((1, 64, 64), 0.5, np.float32)
 
 
 def test_mirrored_answers_alike_to_mirrored_maps_and_takes_every_surface() -> None:
@@ -53,20 +51,20 @@ def test_reconstruct_inverts_the_image_of_a_depth_map_and_stands_on_the_wall_bef
 
 def test_reconstruct_all_shares_the_network_time() -> None:
     ticks = itertools.count()
-    found = reconstruct_all([some_maps()] * 4, RIG, lambda *_: np.repeat(half(), 4, 0), lambda: float(next(ticks)))
+    found = reconstruct_all([some_maps()] * 4, RIG, lambda *_: np.repeat(HALF, 4, 0), lambda: float(next(ticks)))
     assert [(each.timings_s, each.uncertainty_m) for each in found] == [({"network": 0.25}, None)] * 4
 
 
 def test_reconstruct_with_doubt_adds_uncertainty_in_metres_and_a_stage() -> None:
     ticks, doubter = itertools.count(), FakeDoubter(lambda *_: (0.25, 0.5), error_v=0.1)
-    found = reconstruct(some_maps(), RIG, half, lambda: float(next(ticks)), doubter)
+    found = reconstruct(some_maps(), RIG, sheet_network, lambda: float(next(ticks)), doubter)
     assert found.timings_s == {"network": 1.0, "doubt": 1.0}
     assert (found.doubt.nothing, found.doubt.outside) == (0.25, 0.5)
     assert found.uncertainty_m is found.doubt.error_m
-    apart_m = depth_from_image(half()[0], BOX) - depth_from_image(half()[0] + np.float32(0.1), BOX)
+    apart_m = depth_from_image(HALF[0], BOX) - depth_from_image(HALF[0] + np.float32(0.1), BOX)
     np.testing.assert_allclose(found.uncertainty_m, apart_m, rtol=1e-5)
     assert [part.shape for part in doubter.asked[0]] == [(1, 64, 80), (1, 64, 80), (1, 64, 64)]
-    for asked, given in zip(doubter.asked[0], (some_maps().depth_m, some_maps().intensity, half()[0]), strict=True):
+    for asked, given in zip(doubter.asked[0], (some_maps().depth_m, some_maps().intensity, HALF[0]), strict=True):
         np.testing.assert_array_equal(asked[0], given)
     hidden = found.without_surface
     assert found.has_surface
@@ -86,7 +84,7 @@ class TellingNetwork:
     """Network that tells how probable a surface is: as much as the first cell's intensity says."""
 
     def answer(self, depth_m: np.ndarray, intensity: np.ndarray) -> Answer:
-        images = np.repeat(half(), len(depth_m), 0)
+        images = np.repeat(HALF, len(depth_m), 0)
         return Answer(images, images * intensity[:, :1, :1])
 
     def __call__(self, *maps: np.ndarray) -> np.ndarray:
@@ -101,14 +99,14 @@ def test_quality_is_predicted_from_each_frame_s_own_probability_of_a_surface() -
     nothing, found = reconstruct_all(frames, RIG, TellingNetwork(), uncertainty_model=doubter)
     assert nothing.doubt.quality is None
     assert found.doubt.quality.iou == (0.5, 0.5, 0.5)
-    np.testing.assert_array_equal(asked.call_args.args[2], half() * 40)
-    reconstruct(bright, RIG, half, uncertainty_model=doubter)
+    np.testing.assert_array_equal(asked.call_args.args[2], sheet_network() * 40)
+    reconstruct(bright, RIG, sheet_network, uncertainty_model=doubter)
     assert asked.call_args.args[2] is None
 
 
 def test_reconstruct_refuses_a_rig_without_object_box() -> None:
     with pytest.raises(SceneError, match="bare-wall"):
-        reconstruct(some_maps(), load_rig("bare-wall"), half)
+        reconstruct(some_maps(), load_rig("bare-wall"), sheet_network)
 
 
 LIMITS = VerdictLimits(nothing=0.5, outside=0.3, unexplained=0.8)

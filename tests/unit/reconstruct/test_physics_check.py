@@ -78,12 +78,10 @@ def test_fitted_gain_uses_the_wall_where_it_is_visible() -> None:
 
 
 def test_mean_cost_counts_cells_that_wrongly_return_and_lets_equal_echoes_swap_and_full_scale_hide_light() -> None:
-    close, clear = (
-        mean_cost(maps_of(expected_object().bare), expected_object(strength=by), GAIN, 1.0) for by in (1.1, 10.0)
-    )
+    wall = expected_object().bare
+    close, clear = (mean_cost(maps_of(wall), expected_object(strength=by), GAIN, 1.0) for by in (1.1, 10.0))
     assert close < 0.05
     assert clear > 0.4
-    wall = expected_object().bare
     half = replace(wall, direct=np.where(RIGHT, 0.0, wall.direct), direct_m=np.where(RIGHT, np.nan, wall.direct_m))
     assert mean_cost(maps_of(wall), half, GAIN, 1.0) == pytest.approx(0.5, abs=1e-3)
     assert mean_cost(maps_of(half), wall, GAIN, 1.0) == pytest.approx(0.5, abs=1e-3)
@@ -118,9 +116,7 @@ def seen(seed: int | None, noise: int = 0) -> LidarMaps:
 @pytest.mark.slow
 def test_check_scores_the_true_object_best() -> None:
     for seed in SEEDS:
-        scores = {
-            other: check_reconstruction(seen(seed), hidden(other), RIG, accuracy="draft").score for other in SEEDS
-        }
+        scores = {one: check_reconstruction(seen(seed), hidden(one), RIG, accuracy="draft").score for one in SEEDS}
         assert min(scores, key=lambda other: scores[other]) == seed
         assert scores[seed] < 0.5 * min(score for other, score in scores.items() if other != seed)
 

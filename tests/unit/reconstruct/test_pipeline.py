@@ -99,11 +99,8 @@ def test_batched_results_equal_results_in_turn(tmp_path: Path, count: int) -> No
     done: list[list[FrameResult]] = []
     for ahead in (False, True):
         checks = PeriodicPhysicsCheck(RIG, every=5, accuracy="draft")
-        bench, others = (
-            CalibratedRig(RIG, measured_wall(tmp_path)),
-            {"uncertainty_model": FakeDoubter(), "checks": checks},
-        )
-        pipeline = Pipeline(bench, looking, average=3, **others)
+        bench = CalibratedRig(RIG, measured_wall(tmp_path))
+        pipeline = Pipeline(bench, looking, average=3, uncertainty_model=FakeDoubter(), checks=checks)
         done.append(all_steps(pipeline, WallCamera(count, moved=range(count // 2)), ahead=ahead))
     assert [step.frame.frame_number for step in done[1]] == list(range(count))
     for one, other in zip(*done, strict=True):
@@ -156,9 +153,7 @@ def trained(rig_name: str = RIG.name, rig_checksum: str = RIG.checksum, eats: st
     return SimpleNamespace(rig_name=rig_name, rig_checksum=rig_checksum, input=eats)
 
 
-def test_compatibility_warnings_name_what_differs_from_training_and_a_wall_without_reference(
-    walled: CalibratedRig,
-) -> None:
+def test_warnings_name_what_differs_from_training_and_a_wall_without_reference(walled: CalibratedRig) -> None:
     farther = RIG.model_copy(update={"lidar": RIG.lidar.model_copy(update={"distance_m": 0.3})})
     assert compatibility_warnings(CalibratedRig(RIG), trained(), DOUBTER) == []
     (note,) = compatibility_warnings(CalibratedRig(farther), trained(), DOUBTER)
@@ -207,9 +202,7 @@ def observe(bench: CalibratedRig, number: int = 0, nearer_m: float = 0.0) -> Ben
     return bench.observe(frame, maps_from_frame(frame))
 
 
-def test_open_bench_takes_rig_and_reference_from_the_record_or_else_the_rig_of_the_camera(
-    wall: Path, tmp_path: Path
-) -> None:
+def test_open_bench_takes_rig_and_reference_from_a_record_or_the_rig_of_the_camera(wall: Path, tmp_path: Path) -> None:
     own = RIG.model_copy(update={"name": "own"})
     assert open_bench(None, camera(rig=own)).rig is own
     assert open_bench(None, camera(rig=load_rig("bare-wall"))).rig == RIG

@@ -20,16 +20,9 @@ Run = Callable[..., list[CaptureResult]]
 
 @pytest.fixture
 def world(noise_world: Any) -> Any:
-
-    class Vanishing(noise_world):
-        vanishes_at: int | None = None
-
-        def images(self, number: int) -> Any:
-            if number == self.vanishes_at:
-                raise CameraLostError("sim vanished: replug it")
-            return super().images(number)
-
-    return Vanishing()
+    world = noise_world()
+    world.error = CameraLostError("sim vanished: replug it")
+    return world
 
 
 @pytest.fixture
@@ -108,7 +101,7 @@ def test_takes_have_own_files_and_follow_each_other(run: Run, tmp_path: Path) ->
 def test_take_that_ends_early_is_whole_and_the_last(
     run: Run, world: Any, tmp_path: Path, vanishes_at: int, limits: dict[str, Any], state: str, sets: range, error: str
 ) -> None:
-    world.vanishes_at = vanishes_at
+    world.fails_at = vanishes_at
     (take,) = run(count=3, frames=500, **limits)
     assert take.state == saved_state(take) == state
     assert take.verified.frames == take.sets
@@ -127,7 +120,7 @@ def test_take_without_a_frame_or_a_start_leaves_no_file(session: Any, world: Any
         list(takes.record(Event(), print))
     assert list(tmp_path.iterdir()) == []
     takes, _ = session()
-    world.vanishes_at = 0
+    world.fails_at = 0
     (take,) = [finalize(take, verify) for take in takes.record(Event(), print)]
     assert (take.state, take.sets, take.verified) == ("lost", 0, None)
     assert list(tmp_path.iterdir()) == []
@@ -152,7 +145,8 @@ def test_take_whose_file_cannot_be_closed_is_not_read_back(run: Run, monkeypatch
     assert (take.state, saved_state(take), take.closed, take.verified) == ("disk full", "disk full", False, None)
     assert "nlos-cam repair" in str(take.error)
     summary = load_sidecar(take.sidecar.path).summary
-    assert (summary.frames, summary.frames_seen) == (None, 4)
+    assert summary.frames is None
+    assert summary.frames_seen in range(1, 5)  # a slow machine may notice the full disk before the last frame
 
 
 def test_take_whose_reading_back_fails_is_damaged(run: Run) -> None:

@@ -10,9 +10,9 @@ from types import ModuleType, SimpleNamespace
 from typing import Any
 
 import lz4.frame
-import numpy as np
 import pytest
 from rosbags.rosbag1 import Reader
+from small_frames import assert_exposed
 
 from nlos_cam.errors import NlosCamError, OutputExistsError, RecordingError
 from nlos_cam.recording import RepairResult, SdkReplayCamera, repair_recording, verify
@@ -70,10 +70,7 @@ def test_repaired_bag_is_read_bit_for_bit_by_every_reader(
         frames = list(camera)
     assert [frame.frame_number for frame in frames] == list(range(min(found.recovered_frames.values())))
     for frame in frames:
-        images = noise(frame.frame_number)
-        np.testing.assert_array_equal(frame.ir, images.ir)
-        np.testing.assert_array_equal(frame.confidence, images.confidence)
-        np.testing.assert_array_equal(np.nan_to_num(frame.depth_m / np.float32(0.00025)).round(), images.depth_z16)
+        assert_exposed(frame, noise(frame.frame_number))
 
 
 @pytest.mark.parametrize("name", ["packed", "plain"])
@@ -208,11 +205,7 @@ def test_repair_recovers_every_chunk_of_a_killed_capture(noise_world: Any, tmp_p
     assert min(found.recovered_frames.values()) > 40
     with SdkReplayCamera(out) as camera:
         for frame in camera:
-            images = world.images(frame.frame_number)
-            depth_z16 = np.nan_to_num(frame.depth_m / np.float32(frame.settings["depth_units"])).round()
-            np.testing.assert_array_equal(depth_z16, images.depth_z16)
-            np.testing.assert_array_equal(frame.ir, images.ir)
-            np.testing.assert_array_equal(frame.confidence, images.confidence)
+            assert_exposed(frame, world.images(frame.frame_number))
         assert {stream: camera.arrived[stream] for stream in found.recovered_frames} == found.recovered_frames
 
 

@@ -5,6 +5,7 @@ from unittest.mock import Mock
 
 import numpy as np
 import pytest
+from depth_maps import depth_map
 from nlos_calibration import load_rig
 
 from nlos_cam.errors import SceneError
@@ -21,13 +22,8 @@ SMALL = tuple(
 
 
 def _scene(**more: object) -> Scene:
-    depth = np.full((16, 16), np.nan, np.float32)
-    depth[5:9, 4:12] = 0.2 + 0.002 * np.arange(8)
+    depth = depth_map(16, np.nan, (np.s_[5:9, 4:12], 0.2 + 0.002 * np.arange(8)))
     return Scene(RIG, depth, **more)  # pyright: ignore[reportArgumentType]
-
-
-def _lit(scene: Scene) -> int:
-    return int(prepare(scene, SMALL[-1], "auto").beams.on_wall.sum())
 
 
 def by_rows(fixed_s: float, each_s: float) -> Callable[[Work, int], float]:
@@ -52,9 +48,7 @@ DIAL = [AccuracyChoice(replace(STOPS["standard"], name=name), *figures) for name
         *[(None, 0.025, "middling"), (None, 100.0, "exact"), (0.05, 100.0, "rough"), (0.001, 0.03, "good")],
     ],
 )
-def test_pick_takes_the_cheapest_stop_within_its_bounds(
-    max_error: float | None, max_seconds: float | None, name: str
-) -> None:
+def test_pick_takes_cheapest_stop_within_bounds(max_error: float | None, max_seconds: float | None, name: str) -> None:
     assert pick(DIAL, max_error, max_seconds).accuracy.name == name
 
 
@@ -79,16 +73,14 @@ def test_pick_names_the_nearest_stop_when_none_keeps_the_bounds(
 def test_predict_scales_seconds_to_all_beams() -> None:
     scene = _scene()
     found = predict(scene, "auto", "cpu", SMALL, by_rows(2.0, 0.001))
-    expected = 2 + 0.001 * _lit(scene)
+    expected = 2 + 0.001 * prepare(scene, SMALL[-1], "auto").beams.on_wall.sum()
     np.testing.assert_allclose([c.predicted_seconds for c in found], [*[expected] * 3, 1000 * expected])
     assert all(c.predicted_error == 0 for c in predict(Scene(RIG), "auto", "cpu", SMALL, by_rows(1.0, 0.0)))
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("albedo", "renderings"), [(np.ones(3), 1), (np.array([0.2, 1.0, 1.0]), 4)])
-def test_predict_times_one_rendering_for_each_color_channel(
-    albedo: np.ndarray, renderings: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_predict_times_each_color_channel(albedo: np.ndarray, renderings: int, monkeypatch: pytest.MonkeyPatch) -> None:
     watch, counted = Mock(return_value=1.0), Mock(wraps=beam_histograms)
     predict(_scene(surface=Surface(albedo)), "auto", "cpu", SMALL, watch)
     monkeypatch.setattr("nlos_cam.render.accuracy_search.beam_histograms", counted)

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from depth_maps import depth_map
 from nlos_calibration.rig import load_rig
 
 from nlos_cam.errors import SceneError
@@ -21,11 +22,9 @@ RIG = load_rig("paper-rig")
 SMALL = Accuracy("small", relay_columns=16, relay_rows=12, sub_bins=4)
 
 
-def _scene(size: int = 12, step_m: float = 0.01) -> Scene:
-    depth = np.full((16, 16), np.nan, np.float32)
-    depth[2 : 2 + size, 2 : 2 + size] = 0.2 + step_m * np.arange(size)
-    depth[5, 5] = 0.15
-    return Scene(RIG, depth)
+def _scene(size: int = 12) -> Scene:
+    plane = np.s_[2 : 2 + size, 2 : 2 + size], 0.2 + 0.01 * np.arange(size)
+    return Scene(RIG, depth_map(16, np.nan, plane, ((5, 5), 0.15)))
 
 
 def _job(scene: Scene, beams: int = 30, accuracy: Accuracy = SMALL) -> TransportJob:
@@ -88,9 +87,7 @@ def test_jobs_with_brdf_or_interreflection_stay_apart(change: dict[str, Any]) ->
 
 
 @pytest.mark.parametrize(("memory", "least", "most"), [(4 << 30, 1 << 23, 1 << 24), (1 << 40, 1 << 27, 1 << 27)])
-def test_chunk_for_fits_in_half_the_gpu_memory(
-    monkeypatch: pytest.MonkeyPatch, memory: int, least: int, most: int
-) -> None:
+def test_chunk_fits_in_half_the_gpu_memory(monkeypatch: pytest.MonkeyPatch, memory: int, least: int, most: int) -> None:
     monkeypatch.setattr(torch.cuda, "get_device_properties", lambda _: SimpleNamespace(total_memory=memory))
     assert least <= backend_torch.chunk_for(torch.device("cuda")) <= most
 
@@ -122,8 +119,7 @@ def _shaded(jobs: list[TransportJob], job: TransportJob, first: int, chunk: int 
 @pytest.mark.slow
 def test_shade_agrees_with_the_exact_walk_for_every_leg() -> None:
     """A ridge along either axis, scattered cells at any depth, and a generated object; alone and in a batch."""
-    generator, ridge = np.random.default_rng(4), np.full((32, 32), 0.35, np.float32)
-    ridge[:, 15] = 0.15
+    generator, ridge = np.random.default_rng(4), depth_map(32, 0.35, (np.s_[:, 15], 0.15))
     holes = generator.uniform(0.13, 0.39, (32, 32)).astype(np.float32)
     holes[generator.random((32, 32)) < 0.7] = np.nan
     thing = object_depth(3, object_box(RIG))[1][::2, ::2].copy()

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from nlos_calibration import load_rig
 
-from nlos_cam.render import Accuracy, Scene, TransportJob, backend_numba, glossy, prepare
+from nlos_cam.render import Accuracy, Scene, backend_numba, glossy, prepare
 from nlos_cam.render.brdf_table import scattered
 from nlos_cam.render.echoes import strongest
 from nlos_cam.render.material import Brdf, Surface, phong, retroreflective
@@ -14,15 +14,9 @@ from nlos_cam.render.material import Brdf, Surface, phong, retroreflective
 pytestmark = pytest.mark.slow
 COARSE = Accuracy("coarse", relay_columns=8, relay_rows=6)
 BRDF = phong(0.4, 0.6, 10)
-
-
-def _job(brdf: Brdf = BRDF) -> TransportJob:
-    depth = np.random.default_rng(0).uniform(0.1, 0.3, (4, 4)).astype(np.float32)
-    problem = prepare(Scene(load_rig("paper-rig"), depth, Surface(1.0, brdf)), COARSE, ("three-bounce", "tilt", "brdf"))
-    return problem.job
-
-
-JOB = _job()
+DEPTH = np.random.default_rng(0).uniform(0.1, 0.3, (4, 4)).astype(np.float32)
+SCENE = Scene(load_rig("paper-rig"), DEPTH, Surface(1.0, BRDF))
+JOB = prepare(SCENE, COARSE, ("three-bounce", "tilt", "brdf")).job
 
 
 def _directions(count: int, normal: np.ndarray) -> np.ndarray:
@@ -62,9 +56,7 @@ def test_a_lobe_too_sharp_for_the_limit_has_no_basis(monkeypatch: pytest.MonkeyP
 
 
 @pytest.mark.parametrize("sub_bins", [1, 8])
-def test_echoes_are_the_strongest_bins_of_the_histograms_bit_for_bit(
-    sub_bins: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_echoes_are_strongest_bins_of_histograms_bit_for_bit(sub_bins: int, monkeypatch: pytest.MonkeyPatch) -> None:
     job = replace(JOB.select(np.arange(0, len(JOB.length_m), 9)), accuracy=replace(COARSE, sub_bins=sub_bins))
     whole = backend_numba.histograms(job)
     assert whole.min() >= 0

@@ -42,12 +42,6 @@ def spread_beams(found: Gradients, count: int = 8) -> Any:
     return wins[:: len(wins) // count][:count]
 
 
-def random_vector(found: Gradients, seed: int = 0) -> SceneVector:
-    draw, shape = np.random.default_rng(seed).normal, found.problem.job.field.depth_m.shape  # pyright: ignore[reportOptionalMemberAccess]
-    points = np.zeros((len(found.echo_job.patches.beta), 3)).shape
-    return SceneVector(draw(size=shape), draw(size=shape), draw(size=points), draw(size=6), draw(size=6))
-
-
 @pytest.mark.parametrize("radiometry", ["paper", "lambertian"])
 @pytest.mark.parametrize("body", ["lidar", "wall"])
 def test_pose_derivatives_are_the_differences_of_the_reference(radiometry: str, body: str) -> None:
@@ -100,8 +94,9 @@ def test_albedo_times_its_derivative_is_the_intensity() -> None:
 
 @pytest.mark.parametrize("bin_m", [10.0, 0.01])
 def test_pull_is_the_transpose_of_push(bin_m: float) -> None:
-    found = gradients(bin_m)
-    change, draw = random_vector(found), np.random.default_rng(3).normal
+    found, draw = gradients(bin_m), np.random.default_rng(3).normal
+    shape, points = found.echo_job.field.depth_m.shape, (len(found.echo_job.patches.beta), 3)
+    change = SceneVector(*(draw(size=size) for size in (shape, shape, points, 6, 6)))
     weights = draw(size=found.intensity.shape), 1e-3 * draw(size=found.intensity.shape)
     forward = sum(float((w * rate).sum()) for w, rate in zip(weights, found.push(change), strict=True))
     pulled = found.pull(*weights)
@@ -115,9 +110,8 @@ def test_jacobian_sums_to_push() -> None:
         matrix = found.jacobian(name)
         whole = SceneVector(**{{"depth": "depth_m"}.get(name, name): np.ones((6, 6))})
         for part, rates in zip(matrix, found.push(whole), strict=True):
-            np.testing.assert_allclose(
-                part.sum(1), rates[found.three_bounce], rtol=1e-3, atol=1e-5 * np.abs(part).max()
-            )
+            limit = 1e-5 * np.abs(part).max()
+            np.testing.assert_allclose(part.sum(1), rates[found.three_bounce], rtol=1e-3, atol=limit)
 
 
 def test_path_of_a_receding_lidar_grows_by_both_legs() -> None:

@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from depth_maps import depth_map
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from nlos_calibration import load_rig
@@ -27,12 +28,7 @@ def _called_for(scene: Scene, stop: str = "standard") -> set[str]:
 
 
 def _plate(slope: float = 0.0) -> np.ndarray:
-    depth = np.full((16, 16), np.nan, np.float32)
-    depth[4:12, 2:14] = 0.25 + slope * 0.25 / 16 * np.arange(12)
-    return depth
-
-
-EMPTY = np.full((8, 8), np.nan, np.float32)
+    return depth_map(16, np.nan, (np.s_[4:12, 2:14], 0.25 + slope * 0.25 / 16 * np.arange(12)))
 
 
 @pytest.mark.parametrize(
@@ -41,7 +37,7 @@ EMPTY = np.full((8, 8), np.nan, np.float32)
         (Scene(RIG, object_depth(3, object_box(RIG))[1]), {"three-bounce", "occluder", "self-occlusion", "tilt"}),
         (Scene(BARE), set()),
         (Scene(RIG), {"occluder"}),
-        (Scene(RIG, EMPTY), {"occluder"}),
+        (Scene(RIG, depth_map(8)), {"occluder"}),
         (Scene(RIG, _plate()), {"three-bounce", "occluder"}),
     ],
     ids=["paper", "bare wall", "no object", "empty object", "level plate"],
@@ -195,9 +191,7 @@ def test_survey_share_is_cautious_and_at_most_1() -> None:
 @pytest.mark.parametrize("z_m", [0.0, 1e-9])
 def test_survey_bounds_the_energy_of_a_patch_on_the_wall(z_m: float) -> None:
     """A patch on the wall must not outweigh all others, whose bounds would then be too small."""
-    depth = np.full((8, 8), 0.2, np.float32)
-    depth[3, 3] = z_m
-    light = SceneFacts(Scene(RIG, depth, jump_m=0.5), COARSE).light
+    light = SceneFacts(Scene(RIG, depth_map(8, 0.2, ((3, 3), z_m)), jump_m=0.5), COARSE).light
     assert np.isfinite(light.energy).all()
     assert light.energy.max() < 1e3 * np.median(light.energy)
 
@@ -215,7 +209,7 @@ def test_facts_take_blocks_where_the_stride_divides_the_grid(cells: int, stride:
 
 
 def test_facts_have_no_patches_of_empty_boxes_or_beyond_the_gate() -> None:
-    for depth in (None, np.full((8, 8), np.nan, np.float32)):
+    for depth in (None, depth_map(8)):
         facts = SceneFacts(Scene(RIG, depth), COARSE)
         assert facts.patches is facts.light is facts.line_of_sight is None
         assert facts.interreflection == 0

@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from depth_maps import depth_map
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
@@ -61,12 +62,6 @@ def test_color_is_the_winning_echo_in_each_channel() -> None:
 BIN_M = 0.01
 
 
-def _beams(direct: list[float], length_m: float = 0.5) -> Beams:
-    n, every, foot = len(direct), np.full(len(direct), length_m), np.zeros((len(direct), 3))
-    lit = np.ones(n, np.bool_)
-    return Beams((1, n), foot, foot, every, every, np.full(n, 0.5), lit, np.array(direct), np.zeros(3))
-
-
 def _multi(peak: list[float], runner_up: list[float], path_m: float = 2.0) -> MultiBounce:
     paths = np.full(len(peak), path_m, np.float32)
     return MultiBounce(np.array(peak, np.float32), np.array(runner_up, np.float32), paths).reshape((1, len(peak)))
@@ -96,15 +91,15 @@ def test_strongest_finds_the_two_highest_bins(histogram: np.ndarray) -> None:
 def test_compete_takes_the_stronger_return(
     direct: list[float], multi: MultiBounce, depth_m: list[float], intensity: list[float], margin: list[float]
 ) -> None:
-    for found, expected in zip(compete(_beams(direct), multi), (depth_m, intensity, margin), strict=True):
+    n, half, foot = len(direct), np.full(len(direct), 0.5), np.zeros((len(direct), 3))
+    beams = Beams((1, n), foot, foot, half, half, half, np.ones(n, np.bool_), np.array(direct), np.zeros(3))
+    for found, expected in zip(compete(beams, multi), (depth_m, intensity, margin), strict=True):
         np.testing.assert_allclose(found[0], expected, rtol=1e-6)
 
 
 def _plate(share: float) -> Scene:
     """A plate that comes 4 cm nearer to the wall during a scan."""
-    depth = np.full((16, 16), np.nan, np.float32)
-    depth[4:12, 4:12] = 0.3 - 0.04 * share
-    return Scene(RIG, depth)
+    return Scene(RIG, depth_map(16, np.nan, (np.s_[4:12, 4:12], 0.3 - 0.04 * share)))
 
 
 def _still(_share: float) -> Scene:

@@ -176,9 +176,7 @@ def _wedge(folder: Path, height: float = 0.6) -> Path:
     return folder / "things" / "wedge.stl"
 
 
-def test_mesh_is_relative_to_the_scene_and_survives_a_file_elsewhere(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_mesh_is_relative_to_its_scene_and_survives_elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = _wedge(tmp_path)
     monkeypatch.chdir(tmp_path.parent)
     scene = _load(tmp_path, WEDGE)

@@ -7,17 +7,9 @@ from nlos_calibration import ObjectBox, Occluder, load_rig
 
 from nlos_cam.errors import SceneError
 from nlos_cam.objects import cell_centers_m, object_box, object_depth
-from nlos_cam.render import Accuracy, Scene, Surface, TransportJob, prepare, three_bounce
+from nlos_cam.render import Accuracy, Scene, Surface, TransportJob, interreflection, prepare, three_bounce
 from nlos_cam.render.backend_numba import NumbaJob
 from nlos_cam.render.energy_survey import occluded
-from nlos_cam.render.interreflection import (
-    WALL_CELLS,
-    form_factor,
-    patch_to_patch,
-    wall_cell_m2,
-    wall_cells,
-    wall_factors,
-)
 from nlos_cam.render.legs import DARK, FREE, NumbaOptics, NumbaSurface, judge
 from nlos_cam.render.line_of_sight import first_hits
 from nlos_cam.render.scene_facts import SceneFacts
@@ -118,8 +110,7 @@ def test_horizon_table_bounds_the_walk_on_every_leg(seed: int, sectors: int) -> 
     assert sure > 0 < walked
 
 
-PAPER = load_rig("paper-rig")
-OPEN = load_rig("bare-wall").model_copy(update={"object_box": PAPER.object_box})
+OPEN = load_rig("bare-wall").model_copy(update={"object_box": RIG.object_box})
 COARSE = Accuracy("coarse", relay_columns=8, relay_rows=6)
 UNIT_BOX = ObjectBox(x_min_m=0, x_max_m=1, y_min_m=0, y_max_m=1, z_near_m=0.1, z_far_m=1)
 
@@ -143,7 +134,7 @@ def test_first_hits_meet_a_column_by_its_front_or_side() -> None:
 
 
 def test_sight_is_empty_in_the_paper_rig_and_refused_inside() -> None:
-    assert SceneFacts(Scene(PAPER, np.full((8, 8), 0.12, np.float32)), COARSE).line_of_sight is None
+    assert SceneFacts(Scene(RIG, np.full((8, 8), 0.12, np.float32)), COARSE).line_of_sight is None
     box = ObjectBox(x_min_m=-0.1, x_max_m=0.1, y_min_m=-0.1, y_max_m=0.1, z_near_m=0.05, z_far_m=0.4)
     around = OPEN.model_copy(update={"object_box": box})
     with pytest.raises(SceneError, match=r"0\.2 m"):
@@ -183,41 +174,38 @@ def job() -> TransportJob:
 @pytest.mark.parametrize("lambertian", [True, False])
 def test_form_factor_of_two_squares_follows_s2(lambertian: bool) -> None:
     a, b = np.zeros(3), np.array([0.3, 0.0, 0.4])
-    found = form_factor(a, UP, b, DOWN, 1e-4, 1.0, 0.1, lambertian)
+    found = interreflection.form_factor(a, UP, b, DOWN, 1e-4, 1.0, 0.1, lambertian)
     expected = 1e-4 * 0.8 / 0.25 / ((np.pi / 0.8) if lambertian else 2 * np.pi)
     assert found == pytest.approx(expected)
     for back in ((a, DOWN, b, DOWN), (a, UP, b, UP)):
-        assert form_factor(*back, 1e-4, 1.0, 0.1, lambertian) == 0
+        assert interreflection.form_factor(*back, 1e-4, 1.0, 0.1, lambertian) == 0
 
 
 def test_patch_to_patch_is_reciprocal_and_loses_energy(job: TransportJob) -> None:
-    table = patch_to_patch(job.patch_arrays, job.field, 1e-9, True)  # beyond near contact
+    table = interreflection.patch_to_patch(job.patch_arrays, job.field, 1e-9, True)  # beyond near contact
     assert (table > 0).any()
     assert not np.diag(table).any()
     given = table / job.strength
     np.testing.assert_allclose(given, given.T, atol=1e-9 * given.max())
-    near = patch_to_patch(job.patch_arrays, job.field, job.near_m, True)
+    near = interreflection.patch_to_patch(job.patch_arrays, job.field, job.near_m, True)
     assert near.sum(1).max() <= 1
 
 
 def test_wall_factors_sum_to_at_most_1(job: TransportJob) -> None:
-    cells = wall_cells(job)
-    assert len(cells) == WALL_CELLS**2
-    extent = np.ptp(cells[:, :2], axis=0) * WALL_CELLS / (WALL_CELLS - 1)
-    assert wall_cell_m2(job) * len(cells) == pytest.approx(extent.prod())
-    there, back = wall_factors(job, cells)
+    cells, side = interreflection.wall_cells(job), interreflection.WALL_CELLS
+    assert len(cells) == side**2
+    extent = np.ptp(cells[:, :2], axis=0) * side / (side - 1)
+    assert interreflection.wall_cell_m2(job) * len(cells) == pytest.approx(extent.prod())
+    there, back = interreflection.wall_factors(job, cells)
     assert 0.5 < there.sum(1).max() <= 1
     assert back.sum(0).max() <= 1
 
 
-SOME = np.arange(5120)[::151]
-MORE = ["three-bounce", "occluder", "tilt", "self-occlusion", "inter-reflection"]
-
-
 def test_brute_force_refuses_too_many_interreflections() -> None:
     scene = Scene(RIG, np.full((32, 32), 0.2, np.float32), radiometry="lambertian")
+    effects = ["three-bounce", "occluder", "tilt", "self-occlusion", "inter-reflection"]
     with pytest.raises(SceneError, match="inter-reflection"):
-        three_bounce(scene, Accuracy("own", 3, 3, sub_bins=0), effects=MORE, chosen=SOME)
+        three_bounce(scene, Accuracy("own", 3, 3, sub_bins=0), effects=effects, chosen=np.arange(5120)[::151])
 
 
 @numba.njit(cache=True)
@@ -236,7 +224,8 @@ def test_verdict_on_a_tile_holds_for_each_leg(surface: str, edge: Occluder | Non
         "object": object_depth(0, BOX, ("airplane",))[1],
     }[surface]
     rig = RIG.model_copy(update={"occluder": edge})
-    job = prepare(Scene(rig, depth.astype(np.float32)), Accuracy("some", 40, 32), EFFECTS).job
+    effects = "direct", "three-bounce", "line-of-sight", "occluder", "self-occlusion", "tilt"
+    job = prepare(Scene(rig, depth.astype(np.float32)), Accuracy("some", 40, 32), effects).job
     assert job is not None
     single, where = NumbaJob(job), job.patches
     for points in (single.relay, single.feet(np.ones(len(job.laser_spot_m)))):
@@ -254,6 +243,3 @@ def test_verdict_on_a_tile_holds_for_each_leg(surface: str, edge: Occluder | Non
         assert (verdicts == DARK).mean() > 0.02
         if surface != "rough" and edge is None:
             assert (verdicts == FREE).mean() > 0.05
-
-
-EFFECTS = "direct", "three-bounce", "line-of-sight", "occluder", "self-occlusion", "tilt"

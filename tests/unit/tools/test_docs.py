@@ -78,9 +78,7 @@ def test_whole_docs_have_no_problem_and_every_page_a_place(tool: Tool, written: 
         ("docs/index.md", '# Start\n\n<script src="https://cdn.example.org/a.js"></script>\n', "cdn.example.org"),
     ],
 )
-def test_each_way_of_being_broken_is_told(
-    tool: Tool, written: Callable[..., Path], page: str, text: str, told: str
-) -> None:
+def test_each_way_to_break_is_told(tool: Tool, written: Callable[..., Path], page: str, text: str, told: str) -> None:
     root = written({page: text})
     assert any(told in problem for problem in tool("build_site").problems(root / "site", root))
 

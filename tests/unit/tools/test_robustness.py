@@ -8,6 +8,7 @@ from collections.abc import Callable
 from pathlib import Path
 from random import Random
 from types import ModuleType
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -116,10 +117,6 @@ def test_processes_of_a_killed_command_that_run_on_are_noticed(tool: Tool, monke
     assert not kills.survivors([process.pid])
 
 
-def fail(error: BaseException) -> None:
-    raise error
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("kind", "action"),
@@ -129,9 +126,9 @@ def fail(error: BaseException) -> None:
         ("crash", lambda: os._exit(3)),
         ("hang", lambda: time.sleep(60)),
         ("memory", lambda: bytearray((1 << 30) + (1 << 20))),
-        ("unexpected", lambda: fail(AttributeError("nobody foresaw this"))),
-        ("unexpected", lambda: fail(RecordingError("two\nlines"))),
-        ("refused", lambda: fail(RecordingError("foreseen"))),
+        ("unexpected", Mock(side_effect=AttributeError("nobody foresaw this"))),
+        ("unexpected", Mock(side_effect=RecordingError("two\nlines"))),
+        ("refused", Mock(side_effect=RecordingError("foreseen"))),
     ],
 )
 def test_judge_notices_each_kind_of_end(tool: Tool, kind: str, action: Callable[[], None]) -> None:

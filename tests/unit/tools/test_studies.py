@@ -11,12 +11,12 @@ import numpy as np
 import pytest
 from fake_doubter import FakeDoubter
 from nlos_calibration import load_rig
-from nlos_calibration.arrays import Float32
 from nlos_models import MapSet, checkpoint
-from small_maps import small_maps, untrained_weights, use_small_networks
+from small_frames import sheet_network
+from small_maps import untrained_weights, use_small_networks
 
-from nlos_cam.dataset import TEST_SEED, DatasetPlan, read_labelled
-from nlos_cam.evaluate import TARGETS, HeldOutObjects, seeded_objects
+from nlos_cam.dataset import read_labelled
+from nlos_cam.evaluate import TARGETS, seeded_objects
 from nlos_cam.objects import benchmark_objects, object_box
 from nlos_cam.recording import load_sidecar
 from nlos_cam.render import MultiBounce, load_scene
@@ -50,10 +50,6 @@ def run(tool: Tool, harness: ModuleType, monkeypatch: Patch) -> Read:
         return json.loads((harness.DOCS / f"{result}.json").read_text(encoding="utf-8"))
 
     return call
-
-
-def plate(*_: object) -> Float32:
-    return np.full((1, 64, 64), 0.5, np.float32)
 
 
 def test_interrupted_collection_resumes_with_the_same_records(harness: ModuleType) -> None:
@@ -108,26 +104,18 @@ def test_limits_leave_out_the_latent_of_weights_without_one(tool: Tool, weights:
 @pytest.mark.slow
 def test_rig_map_has_a_cell_for_every_place(tool: Tool, run: Read, weights: list[Path], monkeypatch: Patch) -> None:
     module = tool("weights")
-    network = type("Plate", (), {"record": SimpleNamespace(input="raw maps"), "__call__": plate})()
+    record = SimpleNamespace(input="raw maps", rig_name=RIG.name, rig_checksum=RIG.checksum)
+    network = type("Plate", (), {"record": record, "__call__": sheet_network})()
     monkeypatch.setattr(module, "load_reconstructor", lambda *_: network)
+    monkeypatch.setattr(module, "load_uncertainty_model", lambda *_, **__: None)
     monkeypatch.setattr(module, "benchmark_objects", lambda box: seeded_objects(0, 1, box))
     monkeypatch.setattr(module, "DISTANCES_M", (0.2,))
     monkeypatch.setattr(module, "ANGLES_DEG", (15.0, 45.0))
+    monkeypatch.setattr(module, "BENCHES", [module.Place(aside_m=0.005, up_m=0.005)])
     table = run("weights rigs --weights", "rig_map", f"plate={weights[0]}")
     assert [(cell["distance_m"], cell["yaw_deg"]) for cell in table["cells"]] == [(0.2, 15.0), (0.2, 45.0)]
     assert set(table["cells"][0]["weights"]["plate"]) >= set(TARGETS)
-
-
-def test_unseen_kinds_of_equal_weights_cost_nothing(
-    tool: Tool, run: Read, weights: list[Path], monkeypatch: Patch
-) -> None:
-    kinds = ["airplane", "table", "cup"]
-    judged = HeldOutObjects("some", kinds, kinds, small_maps(3, 0), DatasetPlan(RIG, TEST_SEED))
-    monkeypatch.setattr(tool("weights"), "dataset_objects", lambda *_: judged)
-    rows = run("weights unseen", "unseen_kinds", weights[0], f"again={weights[0]}")["rows"]
-    assert {row["without_better_by"]["silhouette_iou"]["value"] for row in rows} == {0}
-    with pytest.raises(SystemExit, match="no boat among the maps"):
-        run("weights unseen --left-out boat", "unseen_kinds", *weights)
+    assert [set(one["weights"]) for one in table["benches"]] == [{"plate", "plate, not aligned"}]
 
 
 def test_transfer_curve_trains_on_nested_sets(tool: Tool, monkeypatch: Patch) -> None:
@@ -161,7 +149,7 @@ def test_doubt_study_is_right_for_laplace_errors(tool: Tool, harness: ModuleType
     rows, covered = doubt.reliability(expected, observed), doubt.coverage(expected, observed)
     assert all(row["observed_mm"] == pytest.approx(row["expected_mm"], rel=0.05) for row in rows)
     assert all(row["observed"] == pytest.approx(row["level"], abs=0.01) for row in covered)
-    pipeline = doubt.Pipeline(RIG, plate, FakeDoubter(error_v=0.2))
+    pipeline = doubt.Pipeline(RIG, sheet_network, FakeDoubter(error_v=0.2))
     answer = pipeline.answer(np.full((64, 80), 0.3, np.float32), np.ones((64, 80), np.float32))
     assert doubt.of_outliers([answer, answer], np.array([100, 0]))["cannot_be_seen"] == 1
     parts = {"reliability": rows, "coverage": covered, "surface": [{"expected": 0.5, "observed": 0.6}]}

@@ -1,6 +1,6 @@
 import re
 import socket
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import closing, suppress
 from http.client import HTTPException
 from typing import Any
@@ -11,6 +11,19 @@ from view_streams import ASSETS, EVERYWHERE, Streams, ask
 
 from nlos_cam.errors import NlosCamError
 from nlos_cam.view.server import LOOPBACK, Served, ViewServer, address_of, exposed, is_loopback, names_of, resolved
+
+
+@pytest.fixture
+def streams() -> Streams:
+    return Streams()
+
+
+@pytest.fixture
+def server(streams: Streams) -> Iterator[ViewServer]:
+    server = ViewServer(Served(ASSETS, streams), 0)
+    yield server
+    streams.end.set()
+    server.close()
 
 
 def status_of(address: str, path: str, **options: Any) -> int:

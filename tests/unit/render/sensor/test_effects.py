@@ -73,6 +73,9 @@ def test_stage_is_included_exactly_when_the_model_has_it(name: str) -> None:
     assert included(bare, name)
     if name == "range noise":
         assert included(sensor_effects(QUIET.model_copy(update={"range_noise_per_m": 0.001})), name)
+    if name == "drift":  # at a steady temperature there is none
+        steady = sensor_effects(QUIET.model_copy(update={"drift_m_per_celsius": 0.001}))
+        assert [(e.included, e.bound) for e in steady if e.name == name] == [(False, 0.0)]
     assert {e.name for e in rich if not e.included} == {name}
     assert next(e.bound for e in rich if e.name == name) == 0
 
@@ -139,9 +142,7 @@ def test_depth_changes_by_at_most_the_bounds(monkeypatch: pytest.MonkeyPatch) ->
 
 @pytest.mark.parametrize("name", BIASES)
 @pytest.mark.parametrize("celsius", [25.0, 35.0, 45.0])
-def test_bias_changes_depth_by_half_to_all_of_its_bound(
-    name: str, celsius: float, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_bias_moves_depth_by_half_to_all_its_bound(name: str, celsius: float, monkeypatch: pytest.MonkeyPatch) -> None:
     model = BIASED.model_copy(update={"range_noise_m": 0.0, "range_noise_per_m": 0.0, "dead_share": 0.0})
     bound = next(e.bound for e in sensor_effects(model) if e.name == name)
 
@@ -151,9 +152,3 @@ def test_bias_changes_depth_by_half_to_all_of_its_bound(
 
     assert change_m(celsius) <= bound + DEPTH_UNIT_M / 20  # rounding to units adds to a mean of moduli
     assert change_m(WORST_AT.get(name, 45.0)) > bound / 2
-
-
-def test_drift_is_left_out_at_a_steady_temperature() -> None:
-    steady = QUIET.model_copy(update={"drift_m_per_celsius": 0.001})
-    drift = next(e for e in sensor_effects(steady) if e.name == "drift")
-    assert (drift.included, drift.bound) == (False, 0.0)

@@ -1,0 +1,188 @@
+"""Maps of a measured bench as the networks' training rig would have seen them.
+
+Networks know one rig, to the millimetre: a cell at the occluder's edge that sees something else than in training is
+enough to mislead them. But wherever the lidar stands, a point of the wall lit by it returns the same paths beyond the
+point, so most of what a bench's maps differ by is known from its calibration. Object boxes are laid on each other, and
+each cell of the training rig takes what the bench measured at the cell's point of the wall:
+
+- an echo of the wall is as much longer than the wall's distance there as on the bench;
+- an echo over three bounces, d1 + d2 + d3 + d4, changes by d1 to the point and by the mean change of d4;
+- intensities keep their ratio to the wall's own return, less the gain of the whole frame; over three bounces they do
+  not fall with d1.
+
+Cells that the bench does not see past its occluder are extrapolated from their neighbors, a few cells far.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+from nlos_calibration import BareWall, ObjectBox, Occluder, Rig, load_rig
+from nlos_calibration.arrays import Float32, Float64, Int64, Mask
+from nlos_calibration.errors import RecordFileError
+from nlos_models import CheckpointRecord, MapSet
+
+from nlos_cam.frames import MAP_COLUMNS, MAP_ROWS, LidarMaps
+from nlos_cam.objects import object_box
+from nlos_cam.render import SensorModel, cast
+
+SHAPE = MAP_ROWS, MAP_COLUMNS
+THREE_BOUNCES_M = 0.02
+"""Path beyond the wall's own from which on an echo counts as one over three bounces: two bins."""
+SAME_ECHO_M = 0.08
+"""Spread of four neighbors' paths below which they are of one echo, and interpolated."""
+BEYOND_CELLS = 3
+"""Columns over which maps are extrapolated at most, towards the occluder, where intensities rise; farther ones, and
+rows outside the view, repeat the last."""
+BEAMS = 8
+"""Beams along each axis of a cell that tell whether all of it sees the wall."""
+SAME_BOX_M = 0.001
+"""Largest difference between the sizes of two object boxes that count as one."""
+MIN_COUNTS = 0.5
+"""Intensity that stands for less, whose logarithm tells nothing."""
+
+
+class MapAlignment:
+    """Alignment of the maps of one bench with the rig that networks were trained for; see the module.
+
+    With the bench's own bare wall, its reflectance and a constant error of range are taken out as well.
+    """
+
+    def __init__(self, bench: Rig, trained: Rig, bare: BareWall | None = None) -> None:
+        box, wanted = object_box(bench), object_box(trained)
+        shift_m = np.array([box.x_min_m - wanted.x_min_m, box.y_min_m - wanted.y_min_m, 0.0])
+        bench = _with_occluder(bench, trained.occluder, shift_m[0])
+        here = cast(bench, bench.pinhole.scaled(MAP_COLUMNS, MAP_ROWS), occluder=False)
+        there = cast(trained, trained.pinhole.scaled(MAP_COLUMNS, MAP_ROWS))
+        # Of the training rig: the cells that see the wall, and what its cells see with nothing hidden.
+        self._cells = np.flatnonzero(there.on_wall)
+        counts = SensorModel().bare_wall_counts / cast(trained, trained.pinhole, occluder=False).direct.max()
+        self._depth_m = (there.length_m * there.cos_axis).astype(np.float32)
+        self._light = np.nan_to_num(there.direct * counts).astype(np.float32)
+        self._wall_path_m, self._half_cos = 2 * there.length_m[self._cells], there.cos_axis[self._cells] / 2
+        # Of the bench: the wall's own return, as measured or as the geometry has it.
+        wall_m, light = (here.length_m * here.cos_axis).reshape(SHAPE), here.direct.reshape(SHAPE)
+        if bare:
+            known = (bare.map_intensity > 0) & np.isfinite(bare.map_depth_m)
+            wall_m, light = np.where(known, bare.map_depth_m, wall_m), np.where(known, bare.map_intensity, light)
+        self._wall_m, self._path_per_depth = wall_m, (2 / here.cos_axis).reshape(SHAPE)
+        with np.errstate(divide="ignore"):
+            self._log_light = np.log(light)
+        spot_m = there.laser_spot_m[self._cells] + shift_m
+        sees_wall = _cells_on_wall(bench)
+        self._neighbors, self._share, self._nearest = _taken_from(bench, spot_m, sees_wall)
+        # The last leg ends at the lidar too, from wherever on the wall that the lidar sees.
+        seen = sees_wall.ravel()
+        last_m, wanted_m = (
+            here.length_m[seen],
+            np.linalg.norm(here.laser_spot_m[seen] - shift_m - there.lidar_m, axis=1),
+        )
+        first_m, its_m = np.linalg.norm(spot_m - here.lidar_m, axis=1), there.length_m[self._cells]
+        self._longer_m = first_m - its_m + (wanted_m - last_m).mean()
+        # Light on the wall does not fall with the distance that a narrow beam has come; the wall's own return does.
+        self._log_brighter = 2 * np.log(its_m / first_m) + np.log((wanted_m**-2).mean() / (last_m**-2).mean())
+
+    def align(self, maps: LidarMaps, beyond_wall_m: Float32 | None = None) -> LidarMaps:
+        """Return maps of the bench as those of the training rig.
+
+        `beyond_wall_m` (64, 80) are the depths less those of the bare wall, where they are known better than from
+        `maps`: without drift.
+        """
+        beyond_m = maps.depth_m - self._wall_m if beyond_wall_m is None else beyond_wall_m
+        path_m = beyond_m * self._path_per_depth
+        ratio = np.log(np.maximum(maps.intensity, MIN_COUNTS)) - self._log_light
+        rows, columns = self._neighbors
+        paths_m, row, column = path_m[rows, columns], *self._nearest
+        with np.errstate(invalid="ignore"):
+            same = paths_m.max(0) - paths_m.min(0) < SAME_ECHO_M
+            path_m = np.where(same, (self._share * paths_m).sum(0), path_m[row, column])
+            ratio = np.where(same, (self._share * ratio[rows, columns]).sum(0), ratio[row, column])
+            of_wall = np.abs(path_m) < THREE_BOUNCES_M
+        gain = np.median(ratio[of_wall]) if of_wall.any() else 0.0
+        path_m = self._wall_path_m + np.where(of_wall, path_m, path_m + self._longer_m)
+        ratio = np.where(of_wall, ratio, ratio + self._log_brighter)
+        depth_m, light = self._depth_m.copy(), self._light.copy()
+        depth_m[self._cells] = path_m * self._half_cos
+        light[self._cells] *= np.exp(ratio - gain)
+        depth_m, light = depth_m.reshape(SHAPE), light.reshape(SHAPE)
+        valid = np.isfinite(depth_m)
+        return LidarMaps(depth_m, np.where(valid, light, np.float32(0)), valid)
+
+
+def alignment(bench: Rig, trained: CheckpointRecord, bare: BareWall | None = None) -> MapAlignment | None:
+    """Return the alignment of a bench with the rig of weights; None where `rig_to_align_with` has none."""
+    rig = rig_to_align_with(bench, trained)
+    return MapAlignment(bench, rig, bare) if rig else None
+
+
+def align_all(maps: MapSet, bench: Rig, trained: CheckpointRecord) -> MapSet:
+    """Return the maps of a bench's samples as those of the rig of weights; as they are where `alignment` gives None."""
+    if (aligned := alignment(bench, trained)) is None:
+        return maps
+    pairs = zip(maps.depth_m, maps.intensity, strict=True)
+    done = [aligned.align(LidarMaps(depth_m, light, np.isfinite(depth_m))) for depth_m, light in pairs]
+    return replace(
+        maps, depth_m=np.stack([one.depth_m for one in done]), intensity=np.stack([one.intensity for one in done])
+    )
+
+
+def rig_to_align_with(bench: Rig, trained: CheckpointRecord) -> Rig | None:
+    """Return the rig of weights where a bench's maps can be aligned with it and have to be.
+
+    None where both are the same, where the rig of the weights is not known here, where the object boxes differ in size,
+    and for weights that expect difference maps.
+    """
+    if trained.input != "raw maps" or trained.rig_checksum == bench.checksum:
+        return None
+    try:
+        rig = load_rig(trained.rig_name)
+    except RecordFileError:  # trained for the rig of a file on another machine
+        return None
+    if rig.checksum != trained.rig_checksum or not (bench.object_box and rig.object_box):
+        return None
+    apart_m = np.subtract(_size_m(bench.object_box), _size_m(rig.object_box))
+    return rig if np.abs(apart_m).max() <= SAME_BOX_M and _cells_on_wall(bench).any() else None
+
+
+def _size_m(box: ObjectBox) -> tuple[float, ...]:
+    """Return a box's width, height, and distances from the wall: all but its place along the wall."""
+    return box.x_max_m - box.x_min_m, box.y_max_m - box.y_min_m, box.z_near_m, box.z_far_m
+
+
+def _with_occluder(bench: Rig, usual: Occluder | None, along_m: float) -> Rig:
+    """Return the bench, with the training rig's occluder where its own was not measured."""
+    if bench.occluder or not usual:
+        return bench
+    return bench.model_copy(update={"occluder": usual.model_copy(update={"x_m": usual.x_m + along_m})})
+
+
+def _cells_on_wall(rig: Rig) -> Mask:
+    """Return a mask (64, 80) of the cells that see the wall alone, past the occluder."""
+    on_wall = cast(rig, rig.pinhole.scaled(BEAMS * MAP_COLUMNS, BEAMS * MAP_ROWS)).on_wall
+    return np.all(on_wall.reshape(MAP_ROWS, BEAMS, MAP_COLUMNS, BEAMS), axis=(1, 3))
+
+
+def _taken_from(
+    bench: Rig, spot_m: Float64, sees_wall: Mask
+) -> tuple[tuple[Int64, Int64], Float64, tuple[Int64, Int64]]:
+    """Return the cells (4, n) around points (n, 3) of the wall, in the bench's wall frame, their shares (4, n), and the
+    nearest cells (n,).
+
+    Past the last cells that see the wall the shares extrapolate.
+    """
+    pinhole, pose = bench.pinhole.scaled(MAP_COLUMNS, MAP_ROWS), bench.wall_from_lidar
+    ray = (spot_m - pose[:3, 3]) @ pose[:3, :3]
+    column, row = pinhole.ppx + pinhole.fx * ray[:, 0] / ray[:, 2], pinhole.ppy + pinhole.fy * ray[:, 1] / ray[:, 2]
+    some = np.flatnonzero(sees_wall.any(1))
+    row = np.clip(row, some[0], some[-1])
+    top = np.clip(np.floor(row).astype(int), some[0], max(some[-1] - 1, some[0]))
+    first, last = sees_wall.argmax(1), MAP_COLUMNS - 1 - sees_wall[:, ::-1].argmax(1)
+    bottom = np.minimum(top + 1, some[-1])
+    low, high = np.maximum(first[top], first[bottom]), np.minimum(last[top], last[bottom])
+    column = np.clip(column, low - BEYOND_CELLS, high + BEYOND_CELLS)
+    left = np.clip(np.floor(column).astype(int), low, np.maximum(high - 1, low))
+    right = np.minimum(left + 1, MAP_COLUMNS - 1)
+    down, across = row - top, column - left
+    share = np.stack([(1 - across) * (1 - down), across * (1 - down), (1 - across) * down, across * down])
+    neighbors = np.stack([top, top, bottom, bottom]), np.stack([left, right, left, right])
+    nearest = np.clip(np.rint(row).astype(int), some[0], some[-1])
+    return neighbors, share, (nearest, np.clip(np.rint(column).astype(int), first[nearest], last[nearest]))
