@@ -102,6 +102,7 @@ __all__ = [
     "surface",
     "sync_folder",
     "train_direct",
+    "train_vae",
     "transfer_start",
     "vae_start",
     "weights_folder",
@@ -183,6 +184,6 @@ from .runs import (
     transfer_start,
     vae_start,
 )
-from .tasks import parts_of, rebuild, run
+from .tasks import parts_of, rebuild, run, train_vae
 from .train import Running, Scores, digest_of
 from .vae import latent_error
