@@ -89,8 +89,7 @@ from .board_pose import PrintErrors, fit_board
 from .board_wall import BoardRecord, BoardView, CameraErrors, WallByBoard, wall_with_board
 from .drift import WINDOW_FRAMES, Drift, DriftCheck, settings_changed
 from .geometry import Intrinsics, facing_angle_rad, normal_from_angles, wall_from_plane
-from .intervals import INTERVAL_STDS, with_degrees, with_mm
-from .noise import QUANTUM_M, DepthMean, MeanNoise, depth_noise_m
+from .noise import INTERVAL_STDS, QUANTUM_M, DepthMean, MeanNoise, depth_noise_m, with_degrees, with_mm
 from .occluder import OccluderFit, find_occluder
 from .range_offset import fit_with_tape_distance
 from .reference import FULL_SCALE, BareWall, BareWallStatistics, Moments, save_reference

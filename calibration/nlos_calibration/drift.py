@@ -11,8 +11,7 @@ import numpy as np
 
 from nlos_calibration.arrays import Float32, Float64
 from nlos_calibration.errors import CalibrationError
-from nlos_calibration.intervals import with_degrees, with_mm
-from nlos_calibration.noise import SCATTER_PER_MEDIAN
+from nlos_calibration.noise import SCATTER_PER_MEDIAN, with_degrees, with_mm
 from nlos_calibration.reference import BareWall
 from nlos_calibration.wall import TOLERANCE_DEG, TOLERANCE_M
 from nlos_calibration.wall_tracker import WallObservation, WallTrack

@@ -1,7 +1,10 @@
-"""Range noise of the lidar: of one sample and of the mean over many frames, with streaming statistics of depth."""
+"""Range noise of the lidar: of one sample and of the mean over many frames, with streaming statistics of depth.
+
+And 95 % intervals as text: as many digits as the interval justifies, and one unit.
+"""
 
 from dataclasses import dataclass, field, replace
-from math import exp, pi, sqrt
+from math import exp, floor, log10, pi, sqrt
 from typing import TypeVar
 
 import numpy as np
@@ -21,6 +24,10 @@ STATISTICS_POINTS = 20_000
 """Points that medians and percentiles are computed from."""
 MEDIAN_PER_SIGMA, SCATTER_PER_MEDIAN = 0.67449, 1.4826
 """Median of |x| of a normal distribution over its standard deviation, and the inverse."""
+INTERVAL_STDS = 1.96
+"""Half the width of a 95 % interval, in standard uncertainties."""
+MAX_DECIMALS_MM, MAX_DECIMALS_DEG = 2, 3
+"""Finest digits printed, however small the interval: an interval below one unit of them is printed as one unit."""
 
 
 def depth_noise_m(depth_m: Depth) -> Depth:
@@ -147,3 +154,24 @@ def _median(frames_m: Float64) -> Float64:
     ordered = np.sort(frames_m, axis=0)  # NaN last
     middle = np.isfinite(frames_m).sum(axis=0) // 2
     return np.take_along_axis(ordered, middle[np.newaxis], axis=0)[0]
+
+
+def with_mm(value_m: float, std_m: float | None, sign: str = "") -> str:
+    """Return a length in metres as millimetres with its 95 % interval: "200.00 ± 0.01 mm"."""
+    return f"{_with_interval(1e3 * value_m, None if std_m is None else 1e3 * std_m, MAX_DECIMALS_MM, sign)} mm"
+
+
+def with_degrees(value_deg: float, std_deg: float | None, sign: str = "") -> str:
+    """Return an angle with its 95 % interval: "45.000 ± 0.001°"."""
+    return f"{_with_interval(value_deg, std_deg, MAX_DECIMALS_DEG, sign)}°"
+
+
+def _with_interval(value: float, std: float | None, max_decimals: int, sign: str) -> str:
+    """Return a value and the half width of its 95 % interval; without a standard uncertainty the value alone."""
+    if std is None:
+        return f"{value:{sign}z.{max_decimals - 1}f}"
+    half = max(INTERVAL_STDS * std, 10.0**-max_decimals)
+    # one significant digit of the half width, two where it begins with 1: none after the point from 2 to 20, one from
+    # 0.2 to 2, ...
+    decimals = min(max(-floor(log10(half / 2.0)), 0), max_decimals)
+    return f"{value:{sign}z.{decimals}f} ± {half:.{decimals}f}"

@@ -14,8 +14,7 @@ from nlos_calibration.arrays import Float64, Mask
 from nlos_calibration.errors import OccluderRefusedError, WallRefusedError
 from nlos_calibration.flatness import ripples
 from nlos_calibration.geometry import Intrinsics, propagated_std
-from nlos_calibration.intervals import with_mm
-from nlos_calibration.noise import SCATTER_PER_MEDIAN, MeanNoise, depth_noise_m
+from nlos_calibration.noise import SCATTER_PER_MEDIAN, MeanNoise, depth_noise_m, with_mm
 from nlos_calibration.plane import GATE_SIGMAS, PlaneFit, fit_depth, plane_depth_m
 
 WALL_BAND_M = 0.004

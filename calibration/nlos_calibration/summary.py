@@ -4,7 +4,7 @@ The report, the live view and the terminal all show these rows.
 """
 
 from nlos_calibration.board_wall import BoardRecord
-from nlos_calibration.intervals import with_degrees, with_mm
+from nlos_calibration.noise import with_degrees, with_mm
 from nlos_calibration.wall_record import WallRecord
 
 Row = tuple[str, str, str]

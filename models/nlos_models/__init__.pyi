@@ -102,7 +102,6 @@ __all__ = [
     "surface",
     "sync_folder",
     "train_direct",
-    "train_vae",
     "transfer_start",
     "vae_start",
     "weights_folder",
@@ -184,6 +183,6 @@ from .runs import (
     transfer_start,
     vae_start,
 )
-from .tasks import parts_of, rebuild, run, train_vae
+from .tasks import parts_of, rebuild, run
 from .train import Running, Scores, digest_of
 from .vae import latent_error

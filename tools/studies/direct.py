@@ -2,7 +2,7 @@
 
 And a learning curve over runs of one recipe with other budgets: docs/direct_curve.json, docs/images/direct_curve.png.
 
-`python tools/studies/direct.py --store DIR --dataset DIR --held-out DIR [--cpu-seconds 200] [NAME:field=value,...]`:
+`python tools/studies/direct.py --store DIR --dataset DIR --held-out DIR [--samples N] [NAME:field=value,...]`:
 variants of models/recipes/paper-rig-direct.toml, compared with the first. One thread; results are appended. Variants
 and --weights NAME=DIR whose names begin with "curve" make the curve.
 """
@@ -57,10 +57,10 @@ def pace(recipe: Recipe, source: PackedMaps, held_out: MapSet) -> float:
     return recipe.batch * (len(marks) - 2) / (marks[-1] - marks[1])
 
 
-def measure(name: str, recipe: Recipe, source: PackedMaps, sets: dict[str, MapSet], seconds: float) -> dict[str, Any]:
-    """Train a variant for some processor seconds; return its facts and its metrics on each set, per object."""
+def measure(name: str, recipe: Recipe, source: PackedMaps, sets: dict[str, MapSet], given: Namespace) -> dict[str, Any]:
+    """Train a variant for some processor seconds, or samples; return its facts and metrics on each set, per object."""
     rate = pace(recipe, source, sets["held_out"])
-    steps = max(10, int(rate * seconds / recipe.batch))
+    steps = max(10, int(given.samples or rate * given.cpu_seconds) // recipe.batch)
     timed = recipe.model_copy(update={"objects": steps * recipe.batch, "epochs": 1})
     start_s = time.process_time()
     with TemporaryDirectory() as folder:
@@ -169,7 +169,7 @@ def compare(chosen: Namespace, source: PackedMaps) -> None:
     path = chosen.out / "direct_ablations.json"
     rows = json.loads(path.read_text(encoding="utf-8")) if path.exists() else []
     jobs = [partial(judged, text, source, sets) for text in chosen.weights]
-    jobs += [partial(measure, *variant(text, base), source, sets, chosen.cpu_seconds) for text in chosen.variant]
+    jobs += [partial(measure, *variant(text, base), source, sets, chosen) for text in chosen.variant]
     for job in jobs:
         row = job()
         rows = [*(one for one in rows if one["name"] != row["name"]), row]
@@ -198,5 +198,6 @@ if __name__ == "__main__":
     parser.add_argument("--dataset", type=Path, action="append", required=True)
     parser.add_argument("--held-out", type=Path, required=True)
     parser.add_argument("--cpu-seconds", type=float, default=200.0)
+    parser.add_argument("--samples", type=int, help="of each variant, in place of --cpu-seconds")
     parser.add_argument("--out", type=Path, default=harness.DOCS)
     main(parser.parse_args())
