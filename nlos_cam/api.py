@@ -25,29 +25,19 @@ import numpy as np
 from nlos_calibration import ObjectBox, Rig
 from nlos_calibration.arrays import Float32
 
+from nlos_cam import reconstruct
 from nlos_cam.camera import Camera, OnProgress, open_camera
 from nlos_cam.errors import NlosCamError
 from nlos_cam.frames import LidarMaps
 from nlos_cam.live import FrameReader, RunStatistics, iterate_results, warm_up, with_telemetry
 from nlos_cam.objects import SurfaceMesh, cell_centers_m, mesh_from_depth, object_box
-from nlos_cam.reconstruct import (
-    Clock,
-    FrameResult,
-    Pipeline,
-    Verdict,
-    build_pipeline,
-    compatibility_warnings,
-    load_networks,
-    load_uncertainty,
-    open_bench,
-)
 
 
 @dataclass(frozen=True)
 class Glimpse:
     """Result of one frame: the hidden surface with its uncertainty and verdict."""
 
-    step: FrameResult
+    step: reconstruct.FrameResult
     """Everything else about the frame: the frame itself, the reconstruction's pose, timings, the physics check."""
     box: ObjectBox
     """Box in which objects are reconstructed, in the wall frame."""
@@ -66,7 +56,7 @@ class Glimpse:
         return self.step.reconstruction.uncertainty_m
 
     @property
-    def verdict(self) -> Verdict | None:
+    def verdict(self) -> reconstruct.Verdict | None:
         """Reliability of the reconstruction, such as "object seen"; None without an uncertainty model."""
         return self.step.verdict
 
@@ -121,7 +111,13 @@ class Stream:
     """
 
     def __init__(
-        self, camera: Camera, pipeline: Pipeline, *, lossless: bool, notes: tuple[str, ...] = (), clock: Clock
+        self,
+        camera: Camera,
+        pipeline: reconstruct.Pipeline,
+        *,
+        lossless: bool,
+        notes: tuple[str, ...] = (),
+        clock: reconstruct.Clock,
     ) -> None:
         self.camera = camera
         self.notes = notes
@@ -176,7 +172,7 @@ def open_stream(
     weights: str | Path | None = None,
     average: int = 1,
     on_progress: OnProgress | None = None,
-    clock: Clock = time.time,
+    clock: reconstruct.Clock = time.time,
 ) -> Stream:
     """Open a camera and load the networks, without starting the camera yet; call it as `nlos_cam.open`.
 
@@ -187,10 +183,10 @@ def open_stream(
     the weights.
     """
     camera = open_camera(uri, on_progress=on_progress)
-    bench = open_bench(Path(wall) if wall else None, camera)
+    bench = reconstruct.open_bench(Path(wall) if wall else None, camera)
     folder = Path(weights) if weights else None
-    network, uncertainty_model = load_networks(folder), load_uncertainty(folder)
-    pipeline = build_pipeline(bench, network, average, uncertainty_model=uncertainty_model)
+    network, uncertainty_model = reconstruct.load_networks(folder), reconstruct.load_uncertainty(folder)
+    pipeline = reconstruct.build_pipeline(bench, network, average, uncertainty_model=uncertainty_model)
     warm_up(camera, pipeline)
-    notes = tuple(compatibility_warnings(bench, network.record, uncertainty_model))
+    notes = tuple(reconstruct.compatibility_warnings(bench, network.record, uncertainty_model))
     return Stream(camera, pipeline, lossless=uri.startswith("bag:"), notes=notes, clock=clock)

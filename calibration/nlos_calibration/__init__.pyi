@@ -45,6 +45,7 @@ __all__ = [
     "WallFit",
     "WallRecord",
     "board_agreement",
+    "corner_rays",
     "depth_noise_m",
     "depth_offset_m",
     "dump_toml",
@@ -112,7 +113,7 @@ from .rig import (
     read_toml,
     record_kind,
 )
-from .rig_check import GAP_RANGE_M, MAP_SHAPE, footprint, lidar_visible_share, on_plane, rig_difference
+from .rig_check import GAP_RANGE_M, MAP_SHAPE, corner_rays, footprint, lidar_visible_share, on_plane, rig_difference
 from .summary import board_agreement, wall_facts
 from .wall import (
     DISTANCE_RANGE_M,

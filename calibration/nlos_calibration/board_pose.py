@@ -88,7 +88,7 @@ def solve_pose(corners: CornerObservations) -> BoardPose:
         if apart_deg > SAME_NORMAL_DEG and other.chi2 - best.chi2 < AMBIGUOUS_CHI2:
             raise BoardRefusedError(
                 f"two poses, {apart_deg:.0f} degrees apart, explain the board equally well: bring it closer, or use a "
-                "larger one",
+                "larger one"
             )
     return best
 
@@ -191,11 +191,7 @@ class BoardFit:
 
 
 def fit_board(
-    corners: Corners,
-    board: Board,
-    intrinsics: Intrinsics,
-    printed: PrintErrors | None = None,
-    focal_std: float = 0.0,
+    corners: Corners, board: Board, intrinsics: Intrinsics, printed: PrintErrors | None = None, focal_std: float = 0.0
 ) -> BoardFit:
     """Fit the plane of `board` to its corners in the image of a pinhole, in the frame of that camera.
 
@@ -246,7 +242,7 @@ def _inliers(points_m: Float64, pixels: Float64) -> Mask:
     if good.sum() < max(MIN_CORNERS, MIN_GOOD_SHARE * len(good)):
         raise BoardRefusedError(
             f"only {good.sum()} of {len(good)} corners lie on one plane: make sure that the board is flat on the wall, "
-            "and keep the lidar still",
+            "and keep the lidar still"
         )
     return good
 
@@ -265,7 +261,7 @@ def _plane_variance_px2(points_m: Float64, pixels: Float64) -> float:
     if variance_px2 > MAX_RESIDUAL_PX**2:
         raise BoardRefusedError(
             f"the board is not flat: its corners are {sqrt(variance_px2):.2f} pixels RMS off a plane, "
-            f"{MAX_RESIDUAL_PX:g} allowed; glue it to the wall or to a stiff plate, and keep lidar and board still",
+            f"{MAX_RESIDUAL_PX:g} allowed; glue it to the wall or to a stiff plate, and keep lidar and board still"
         )
     return variance_px2
 
@@ -292,32 +288,30 @@ def _check_fit(pose: BoardPose) -> None:
         raise BoardRefusedError(
             f"the squares do not fit: the residuals of a pose are {sqrt(pose.chi2 / free):.1f} times those of a free "
             "plane; make sure that the print is neither stretched nor skewed, and that the intrinsics are this "
-            "camera's",
+            "camera's"
         )
 
 
 def _check_print(pose: BoardPose) -> None:
-    """Raise BoardRefusedError for a stretch or bow beyond the errors of a print."""
     stretch, bows_m = float(pose.parameters[6]), pose.parameters[7:]
     if abs(stretch) > MAX_STRETCH:
         raise BoardRefusedError(
             f"the squares do not fit: they are {100.0 * stretch:+.1f} % wider than high; print without stretching, and "
-            "use this camera's intrinsics",
+            "use this camera's intrinsics"
         )
     if float(np.abs(bows_m).max()) > MAX_BOW_M:
         raise BoardRefusedError(
             f"the board is not flat: its middle stands {1e3 * float(bows_m.sum()):+.1f} mm off the wall; glue it to "
-            "the wall or to a stiff plate",
+            "the wall or to a stiff plate"
         )
 
 
 def _check_certain(slopes: Float64, covariance: Float64) -> None:
-    """Raise BoardRefusedError if the corners leave the normal uncertain."""
     # the normal turns by at most distance x (change of the slopes), in the direction of the largest eigenvalue
     distance_m = 1.0 / float(np.linalg.norm(slopes))
     angle_std_deg = degrees(distance_m * sqrt(float(np.linalg.eigvalsh(covariance)[-1])))
     if angle_std_deg > MAX_ANGLE_STD_DEG:
         raise BoardRefusedError(
             f"the board determines the wall's angle only to {angle_std_deg:.1f} degrees, {MAX_ANGLE_STD_DEG:g} needed: "
-            "it is too far away, edge on, or mostly out of view; move it to the near side of the view",
+            "it is too far away, edge on, or mostly out of view; move it to the near side of the view"
         )

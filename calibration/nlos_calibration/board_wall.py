@@ -209,17 +209,17 @@ def _causes(depth: UncertainPlane, board: UncertainPlane, apart: Disagreement, *
         if abs(scale - 1.0) <= MAX_SCALE and not measured:
             causes.append(
                 f"the print's scale: squares of {100.0 * scale:.1f} % of their size would explain the distance; "
-                "measure the printed bar and give --square-mm",
+                "measure the printed bar and give --square-mm"
             )
         if abs(offset_m) <= MAX_OFFSET_M:
             causes.append(
                 f"the lidar's range offset: {1e3 * offset_m:+.1f} mm along its axis would explain the distance; "
-                "measure with a tape and give --tape-m",
+                "measure with a tape and give --tape-m"
             )
     if apart.angle_sigmas > AGREE_SIGMAS:
         causes.append(
             f"the angle: the normals are {apart.angle_deg:.2f} degrees apart; glue the board flat on the same wall, "
-            "and let the lidar warm up (ripples turn the depth's plane)",
+            "and let the lidar warm up (ripples turn the depth's plane)"
         )
     return tuple(causes) or ("distance and angle together: none of the usual causes fits; measure again",)
 

@@ -200,7 +200,7 @@ class DriftCheck:
         if (height, width) != (then.height, then.width):
             raise CalibrationError(
                 f"a frame of {width} x {height} pixels does not match the bare wall of {then.width} x {then.height}: "
-                "open the camera at that size, or calibrate the wall again",
+                "open the camera at that size, or calibrate the wall again"
             )
         if settings != self._settings:
             self._settings = dict(settings)
@@ -246,7 +246,6 @@ class DriftCheck:
             self._reported = self.drift
 
     def _update_blindness(self) -> None:
-        """Begin or end the warning that too little of the wall is in view."""
         sharp = self.drift is not None and self.drift.sharp
         self._blind = max(self._blind - BLIND_ENDS, 0) if sharp else min(self._blind + 1, BLIND_FRAMES)
         if self._blind == 0:

@@ -16,9 +16,7 @@ from nlos_calibration.arrays import Float64
 
 def normal_from_angles(yaw_rad: float, pitch_rad: float) -> Float64:
     """Return the wall's normal (3,) in the lidar frame; positive yaw turns the axis to wall +x, positive pitch up."""
-    return np.array(
-        [np.sin(yaw_rad) * np.cos(pitch_rad), -np.sin(pitch_rad), -np.cos(yaw_rad) * np.cos(pitch_rad)],
-    )
+    return np.array([np.sin(yaw_rad) * np.cos(pitch_rad), -np.sin(pitch_rad), -np.cos(yaw_rad) * np.cos(pitch_rad)])
 
 
 def angles_from_normal(normal_lidar: Float64) -> tuple[float, float]:

@@ -210,19 +210,17 @@ def _residual_scale(points: _Points, slopes: Float64, scale: float) -> float:
 
 
 def _check_majority(inside: Mask, points: _Points, slopes: Float64) -> None:
-    """Raise WallRefusedError if fewer than half of the points are inliers."""
     if inside.mean() >= MIN_INLIER_FRACTION:
         return
     farther = _errors(points, slopes)[0] > 0.0
     behind, before = (~inside & farther).mean(), (~inside & ~farther).mean()
     raise WallRefusedError(
         f"only {inside.mean():.1%} of the depth lies on one plane ({MIN_INLIER_FRACTION:.0%} needed), {behind:.0%} is "
-        f"behind it and {before:.0%} in front: remove object and occluder, so that the lidar sees one bare wall",
+        f"behind it and {before:.0%} in front: remove object and occluder, so that the lidar sees one bare wall"
     )
 
 
 def _check_extent(rays: Float64, min_extent: float) -> None:
-    """Raise WallRefusedError if the inliers are in a line across the view."""
     # width along the minor principal axis; percentiles, since a few chance inliers beside a line do not make a plane
     centred = rays[:, :2] - rays[:, :2].mean(axis=0)
     narrow = np.linalg.eigh(centred.T @ centred)[1][:, 0]

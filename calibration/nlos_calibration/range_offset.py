@@ -56,7 +56,7 @@ def fit_with_tape_distance(fit_with: FitWith, tape_m: float) -> TapedWall:
         raise CalibrationError(
             f"the tape reads {tape_m * 1e3:.1f} mm and the lidar {plain.distance_m * 1e3:.1f} mm, an offset of "
             f"{abs(origin_m) * 1e3:.0f} mm ({MAX_OFFSET_M * 1e3:.0f} mm allowed): measure from the front glass to the "
-            "wall, along the wall's normal",
+            "wall, along the wall's normal"
         )
     moved = _taped(fit_with(0.0, origin_m), origin_m, axis_share, "origin")
     corrected = _corrected(fit_with, plain, origin_m, tape_m)

@@ -160,7 +160,7 @@ def load_reference(path: Path, sha256: str) -> BareWall:
         digest = hashlib.sha256(content).hexdigest()
     except OSError as error:
         raise RecordFileError(
-            f"cannot read the bare-wall reference {path} ({error.strerror}): keep it beside its record, or {advice}",
+            f"cannot read the bare-wall reference {path} ({error.strerror}): keep it beside its record, or {advice}"
         ) from error
     if digest != sha256:
         raise RecordFileError(

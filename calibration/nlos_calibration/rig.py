@@ -60,6 +60,11 @@ class Extent(Record):
             raise ValueError("an extent needs x_min_m < x_max_m and y_min_m < y_max_m")
         return self
 
+    def contains(self, points_m: NDArray[np.float64]) -> NDArray[np.bool_]:
+        """Return the mask (...) of the points (..., 2 or 3) whose wall x and y lie within it."""
+        x_m, y_m = points_m[..., 0], points_m[..., 1]
+        return (x_m >= self.x_min_m) & (x_m <= self.x_max_m) & (y_m >= self.y_min_m) & (y_m <= self.y_max_m)
+
 
 class ObjectBox(Extent):
     """Box that holds the hidden object: an extent, and the depths of v = 1 (near) and v = 0.1 (far)."""

@@ -81,11 +81,13 @@ def footprint(
 ) -> Footprint:
     """Return the footprint of a map of `shape` cells seen from the pose (4, 4)."""
     cells_m = on_plane(wall_from_lidar, intrinsics.scaled(shape[1], shape[0]).rays())
+    return Footprint(on_plane(wall_from_lidar, corner_rays(intrinsics)), cells_m, wall.contains(cells_m))
+
+
+def corner_rays(intrinsics: Intrinsics) -> Float64:
+    """Return the rays (4, 3) of unit z through the view's corners: upper left, upper right, lower right, lower left."""
     (left, right), (top, bottom) = _view_edges(intrinsics)
-    corners = np.array([[left, top, 1.0], [right, top, 1.0], [right, bottom, 1.0], [left, bottom, 1.0]])
-    across, up = cells_m[..., 0], cells_m[..., 1]
-    on_wall = (across >= wall.x_min_m) & (across <= wall.x_max_m) & (up >= wall.y_min_m) & (up <= wall.y_max_m)
-    return Footprint(on_plane(wall_from_lidar, corners), cells_m, on_wall)
+    return np.array([[left, top, 1.0], [right, top, 1.0], [right, bottom, 1.0], [left, bottom, 1.0]])
 
 
 def _view_edges(intrinsics: Intrinsics) -> tuple[Float64, Float64]:
@@ -227,7 +229,6 @@ def _too_little_wall(rig: Rig, view: Footprint) -> list[str]:
 
 
 def _occluder_position(occluder: Occluder, box: ObjectBox | None, tilt_deg: float, name: str) -> list[str]:
-    """Compare the occluder's gap, position and tilt with the paper's ranges."""
     problems: list[str] = []
     (low_m, high_m), gap_m = GAP_RANGE_M, occluder.z_min_m
     if not low_m - TOLERANCE_M <= gap_m <= high_m + TOLERANCE_M:

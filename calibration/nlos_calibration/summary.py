@@ -39,8 +39,10 @@ def wall_facts(record: WallRecord) -> list[Row]:
         if found.tilt_deg is not None:
             leaning = "against the wall's normal; positive leans away from the lidar's foot"
             rows.append(("occluder's tilt", with_degrees(found.tilt_deg, None, "+"), leaning))
-    if record.board:
-        rows.append(_board_row(record.board))
+    if board := record.board:
+        plane = with_mm(board.distance_m, board.distance_std_m), with_degrees(board.facing_deg, board.facing_std_deg)
+        meaning = f"{board.corners} corners; used: {board.used}. {board_agreement(board)}"
+        rows.append(("printed board", ", ".join(plane), meaning))
     rows += _depth_rows(record)
     if record.footprint_share is not None:
         rows.append(("view on the wall", f"{100.0 * record.footprint_share:.1f} %", "of the map's 64 x 80 cells"))
@@ -61,13 +63,7 @@ def board_agreement(board: BoardRecord) -> str:
     )
 
 
-def _board_row(board: BoardRecord) -> Row:
-    plane = with_mm(board.distance_m, board.distance_std_m), with_degrees(board.facing_deg, board.facing_std_deg)
-    return "printed board", ", ".join(plane), f"{board.corners} corners; used: {board.used}. {board_agreement(board)}"
-
-
 def _depth_rows(record: WallRecord) -> list[Row]:
-    """Return how well the depth fits the plane."""
     if record.residual_m is None:
         return [("depth", "refused", "the plane is the board's alone")]
     measured: list[tuple[str, float | None, str, float, str]] = [

@@ -11,17 +11,10 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from nlos_calibration import geometry
 from nlos_calibration.arrays import Float64, Mask
 from nlos_calibration.errors import WallRefusedError
 from nlos_calibration.flatness import SURE_SIGMAS, Flatness, block_sums, flatness, ripples
-from nlos_calibration.geometry import (
-    Intrinsics,
-    angles_from_normal,
-    plane_from_slopes,
-    plane_gradients,
-    propagated_std,
-    wall_from_plane,
-)
 from nlos_calibration.noise import STATISTICS_POINTS, MeanNoise, depth_noise_m
 from nlos_calibration.plane import GATE_SIGMAS, fit_depth, plane_depth_m
 
@@ -48,12 +41,12 @@ def check_flat(flat: Flatness, ripple_m: float) -> None:
     if _tolerances(sure_m, sure_deg) > REFUSED_TOLERANCES and not _explained_by_offset(flat):
         raise WallRefusedError(
             f"the wall is not one flat wall: half of the view differs from the whole by {_amounts(flat)}, as of a "
-            "bend, a curve or a step; use a flat wall, or move so that only one is in view",
+            "bend, a curve or a step; use a flat wall, or move so that only one is in view"
         )
     if ripple_m > MAX_RIPPLE_M:
         raise WallRefusedError(
             f"the wall is not flat: parts are {ripple_m * 1e3:.1f} mm RMS off the plane, {MAX_RIPPLE_M * 1e3:.1f} "
-            "mm allowed; use a flat, matt wall and let the lidar warm up",
+            "mm allowed; use a flat, matt wall and let the lidar warm up"
         )
 
 
@@ -127,7 +120,7 @@ def out_of_range(distance_m: float, facing_deg: float) -> list[str]:
         turn = at_least(excess)
         problems.append(
             f"{facing_deg:.1f} degrees is outside {low:.0f} to {high:.0f}: turn the lidar {turn} "
-            f"degree{'s' * (turn != 1)} {way}",
+            f"degree{'s' * (turn != 1)} {way}"
         )
     return problems
 
@@ -153,22 +146,22 @@ class WallMeasures:
 
 def measures_of(slopes: Float64, covariance: Float64) -> WallMeasures:
     """Return distance and angles of `slopes` (3,) = -normal / distance_m with covariance (3, 3)."""
-    normal, distance_m = plane_from_slopes(slopes)
-    along, across = plane_gradients(normal, distance_m)
+    normal, distance_m = geometry.plane_from_slopes(slopes)
+    along, across = geometry.plane_gradients(normal, distance_m)
     turn = across @ covariance @ across.T
     # yaw = atan2(x, -z) has the gradient (-z, 0, x) / (x^2 + z^2) over the normal, pitch = asin(-y) that of
     # -y / sqrt(1 - y^2) = -y / sqrt(x^2 + z^2)
     x, z = normal[0], normal[2]
     level = x**2 + z**2
-    yaw_rad, pitch_rad = angles_from_normal(normal)
+    yaw_rad, pitch_rad = geometry.angles_from_normal(normal)
     return WallMeasures(
         distance_m=distance_m,
         yaw_deg=degrees(yaw_rad),
         pitch_deg=degrees(pitch_rad),
         facing_deg=degrees(_facing_rad(normal)),
-        distance_std_m=propagated_std(along, covariance),
-        yaw_std_deg=degrees(propagated_std(np.array([-z, 0.0, x]) / level, turn)),
-        pitch_std_deg=degrees(propagated_std(np.array([0.0, -1.0, 0.0]) / sqrt(level), turn)),
+        distance_std_m=geometry.propagated_std(along, covariance),
+        yaw_std_deg=degrees(geometry.propagated_std(np.array([-z, 0.0, x]) / level, turn)),
+        pitch_std_deg=degrees(geometry.propagated_std(np.array([0.0, -1.0, 0.0]) / sqrt(level), turn)),
         facing_std_deg=degrees(_facing_std_rad(normal, turn)),
     )
 
@@ -233,7 +226,7 @@ class WallFit(WallMeasures):
     warnings: tuple[str, ...]
 
 
-def wall_depth(wall_from_lidar: Float64, intrinsics: Intrinsics) -> Float64:
+def wall_depth(wall_from_lidar: Float64, intrinsics: geometry.Intrinsics) -> Float64:
     """Return the depth (height, width) in metres of a bare, endless wall; inf where a beam never meets it."""
     # depth x ray . normal + distance = 0, with the normal the third row of the rotation
     away = -(intrinsics.rays() @ wall_from_lidar[2, :3])
@@ -243,7 +236,7 @@ def wall_depth(wall_from_lidar: Float64, intrinsics: Intrinsics) -> Float64:
 
 def fit_wall(
     depth_m: NDArray[np.floating],
-    intrinsics: Intrinsics,
+    intrinsics: geometry.Intrinsics,
     generator: np.random.Generator,
     noise: MeanNoise | None = None,
     origin_m: float = 0.0,
@@ -270,7 +263,7 @@ def fit_wall(
     verdict, advice = judge(measures.distance_m, measures.facing_deg, flat, rippled.rms_m)
     return WallFit(
         **vars(measures),
-        wall_from_lidar=wall_from_plane(plane.normal, measures.distance_m),
+        wall_from_lidar=geometry.wall_from_plane(plane.normal, measures.distance_m),
         covariance=rippled.covariance,
         residual_m=plane.residual_m,
         noise_scale=scale,
@@ -286,19 +279,18 @@ def fit_wall(
 
 
 def _check_depth(depth_m: Float64) -> None:
-    """Raise WallRefusedError for a map that is nearly empty or constant."""
     valid_m = depth_m[np.isfinite(depth_m)]
     share = len(valid_m) / depth_m.size
     if share < MIN_VALID_SHARE:
         raise WallRefusedError(
-            f"{share:.1%} of the pixels have depth, {MIN_VALID_SHARE:.0%} needed: is the lens free and the wall near?",
+            f"{share:.1%} of the pixels have depth, {MIN_VALID_SHARE:.0%} needed: is the lens free and the wall near?"
         )
     some_m = valid_m[:: max(len(valid_m) // STATISTICS_POINTS, 1)]
     values_m, times = np.unique(some_m, return_counts=True)
     if times.max() >= STUCK_SHARE * len(some_m):
         raise WallRefusedError(
             f"{times.max() / len(some_m):.0%} of the view reads {values_m[times.argmax()]:.5f} m, as if the lidar were "
-            "stuck: restart it",
+            "stuck: restart it"
         )
 
 
@@ -318,5 +310,5 @@ def _check_one_surface(depth_m: Float64, expected_m: Float64) -> None:
     near = stray.sum() / total - far
     raise WallRefusedError(
         f"this does not look like a bare wall: {far:.0%} of the view is behind the wall's plane (light by way of a "
-        f"hidden object?), {near:.0%} in front of it (an occluder?): remove everything in front of the wall",
+        f"hidden object?), {near:.0%} in front of it (an occluder?): remove everything in front of the wall"
     )

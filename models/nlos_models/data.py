@@ -138,15 +138,12 @@ class InMemory:
 
     @property
     def image(self) -> Float16 | Float32:
-        """All images (n, 64, 64)."""
         return self.maps.image
 
     def first(self, count: int) -> MapSet:
-        """Return the first `count` objects."""
         return first_of(self.maps, count)
 
     def batches(self, batch: int, generator: torch.Generator) -> Iterator[MapBatch]:
-        """Yield one epoch."""
         return map_batches(self.maps, batch, generator)
 
 
@@ -159,7 +156,6 @@ class WithNoise:
 
     @property
     def image(self) -> Float16 | Float32:
-        """All images (n, 64, 64)."""
         return self.source.image
 
     def first(self, count: int) -> MapSet:

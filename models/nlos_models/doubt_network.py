@@ -13,20 +13,12 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from nlos_models import records
 from nlos_models.checkpoint import load_part, save_parts
 from nlos_models.compressor import conv_norm
 from nlos_models.errors import CheckpointError
-from nlos_models.records import (
-    DOUBT,
-    DOUBT_RECORD,
-    RECORD,
-    DoubtRecord,
-    checksum_of_watched,
-    load_doubt_record,
-    watched_files,
-)
+from nlos_models.inference import MAP_SHAPE
 
-MAP_SHAPE = (64, 80)
 DEPTH_SCALES_M = (0.1, 0.005)
 INTENSITY_SCALES = (10.0, 1.0)
 """Scales of the differences from the bare wall: coarse for the hidden object, fine for the question if there is one."""
@@ -129,24 +121,24 @@ class CalibratedDoubt(nn.Module):
         return torch.sigmoid(nothing), torch.sigmoid(outside), error_v, torch.sigmoid(raw.surface)
 
 
-def save_doubt(folder: Path, network: DoubtNetwork, record: DoubtRecord, watched: Path) -> None:
+def save_doubt(folder: Path, network: DoubtNetwork, record: records.DoubtRecord, watched: Path) -> None:
     """Write an uncertainty network and its record into a folder, with a copy of the watched weights from elsewhere."""
-    if checksum_of_watched(watched) != record.watches:
+    if records.checksum_of_watched(watched) != record.watches:
         raise CheckpointError(f"{watched} changed during the training of its uncertainty network: train again")
     text = json.dumps(record.model_dump(mode="json"), indent=2)
-    save_parts(folder, {DOUBT: network}, {DOUBT_RECORD: text})
+    save_parts(folder, {records.DOUBT: network}, {records.DOUBT_RECORD: text})
     if folder.resolve() != watched.resolve():
-        for name in (*watched_files(watched), RECORD):
+        for name in (*records.watched_files(watched), records.RECORD):
             shutil.copyfile(watched / name, folder / name)
 
 
-def load_doubt(folder: Path) -> tuple[CalibratedDoubt, DoubtRecord] | None:
+def load_doubt(folder: Path) -> tuple[CalibratedDoubt, records.DoubtRecord] | None:
     """Return the calibrated uncertainty network beside a pipeline's weights in eval mode, or None where there is none.
 
     Raises CheckpointError where it cannot be read or watches other weights.
     """
-    if (record := load_doubt_record(folder)) is None:
+    if (record := records.load_doubt_record(folder)) is None:
         return None
     network = DoubtNetwork()
-    load_part(folder / f"{DOUBT}.safetensors", network)
+    load_part(folder / f"{records.DOUBT}.safetensors", network)
     return CalibratedDoubt(network, record.temperatures, record.error_scale).eval(), record

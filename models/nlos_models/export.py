@@ -17,23 +17,13 @@ from numpy.typing import NDArray
 from onnx import TensorProto, helper, numpy_helper
 from torch import Tensor, nn
 
+from nlos_models import inference
 from nlos_models.arrays import Float32
 from nlos_models.checkpoint import load_network
 from nlos_models.direct import DirectNetwork
 from nlos_models.doubt_network import load_doubt
 from nlos_models.errors import CheckpointError, ModelError
 from nlos_models.files import write_checked
-from nlos_models.inference import (
-    CHECKSUM,
-    DOUBT_FILES,
-    DOUBT_INPUTS,
-    DOUBT_ONNX,
-    NETWORK_INPUTS,
-    NETWORK_ONNX,
-    Answer,
-    UncertaintyEstimate,
-    refuse_color,
-)
 from nlos_models.pipeline import RemappingNetwork
 from nlos_models.recipe import SIMULATION_ONLY
 from nlos_models.records import DOUBT, CheckpointRecord, checksum_of_watched, watched_files
@@ -60,12 +50,11 @@ class TorchReconstructor:
     def __call__(self, depth_m: Float32, intensity: Float32) -> Float32:
         return self.answer(depth_m, intensity).image
 
-    def answer(self, depth_m: Float32, intensity: Float32) -> Answer:
-        """Return images and, of a direct network, the probability of a surface."""
+    def answer(self, depth_m: Float32, intensity: Float32) -> inference.Answer:
         mixed = torch.autocast(self._device, self._dtype, enabled=self._dtype != torch.float32)
         with torch.inference_mode(), mixed:
             maps = [torch.from_numpy(np.ascontiguousarray(m)).to(self._device) for m in (depth_m, intensity)]
-            return Answer(*(each.float().cpu().numpy() for each in self._network(*maps)))
+            return inference.Answer(*(each.float().cpu().numpy() for each in self._network(*maps)))
 
 
 class _Answering(nn.Module):
@@ -78,7 +67,7 @@ class _Answering(nn.Module):
     @property
     def outputs(self) -> list[str]:
         """Names of the outputs."""
-        return list(Answer._fields[: 1 + isinstance(self.network, DirectNetwork)])
+        return list(inference.Answer._fields[: 1 + isinstance(self.network, DirectNetwork)])
 
     def forward(self, depth_m: Tensor, intensity: Tensor) -> tuple[Tensor, ...]:
         """Return the images of maps, and a direct network's probability of a surface."""
@@ -92,7 +81,7 @@ def load_torch_reconstructor(folder: Path) -> TorchReconstructor:
     return TorchReconstructor(*load_network(folder), "cuda")
 
 
-DOUBT_OUTPUTS = list(UncertaintyEstimate._fields)
+DOUBT_OUTPUTS = list(inference.UncertaintyEstimate._fields)
 
 
 def export_folder(folder: Path) -> list[Path]:
@@ -101,14 +90,20 @@ def export_folder(folder: Path) -> list[Path]:
     Raises CheckpointError where the weights cannot be read or are for color.
     """
     network, record = load_network(folder)
-    refuse_color(record, folder)
+    inference.refuse_color(record, folder)
     files, answering = watched_files(folder), _Answering(network)
     names = {"": files[0]} if record.direct_recipe else {f"{name.partition('.')[0]}.": name for name in files}
     parts = {f"network.{prefix}": name for prefix, name in names.items()}
-    graphs = {NETWORK_ONNX: _linked_graph(answering, folder, NETWORK_INPUTS, answering.outputs, parts, files)}
+    graphs = {
+        inference.NETWORK_ONNX: _linked_graph(
+            answering, folder, inference.NETWORK_INPUTS, answering.outputs, parts, files
+        )
+    }
     if loaded := load_doubt(folder):
-        parts = {"network.": DOUBT_FILES[0]}
-        graphs[DOUBT_ONNX] = _linked_graph(loaded[0], folder, DOUBT_INPUTS, DOUBT_OUTPUTS, parts, DOUBT_FILES)
+        parts = {"network.": inference.DOUBT_FILES[0]}
+        graphs[inference.DOUBT_ONNX] = _linked_graph(
+            loaded[0], folder, inference.DOUBT_INPUTS, DOUBT_OUTPUTS, parts, inference.DOUBT_FILES
+        )
     write_checked(folder, graphs)
     return [folder / name for name in graphs]
 
@@ -127,7 +122,9 @@ def doubt_export(folder: Path) -> Export:
     """Return the export of a folder's uncertainty network. Raises CheckpointError."""
     if not (loaded := load_doubt(folder)):
         raise CheckpointError(f"{folder} has no uncertainty network: train one with `train doubt`")
-    return f"{DOUBT}-{checksum_of(loaded[0])}.onnx", partial(write_onnx, loaded[0], DOUBT_INPUTS, DOUBT_OUTPUTS)
+    return f"{DOUBT}-{checksum_of(loaded[0])}.onnx", partial(
+        write_onnx, loaded[0], inference.DOUBT_INPUTS, DOUBT_OUTPUTS
+    )
 
 
 def export_onnx(pipeline: RemappingNetwork | DirectNetwork) -> bytes:
@@ -135,7 +132,7 @@ def export_onnx(pipeline: RemappingNetwork | DirectNetwork) -> bytes:
     if isinstance(pipeline, RemappingNetwork) and pipeline.intensities > 1:
         raise ModelError(f"color networks ({SIMULATION_ONLY}) cannot be exported: use them in torch")
     answering = _Answering(pipeline)
-    return write_onnx(answering, NETWORK_INPUTS, answering.outputs)
+    return write_onnx(answering, inference.NETWORK_INPUTS, answering.outputs)
 
 
 def write_onnx(network: nn.Module, inputs: Mapping[str, tuple[int, int]], outputs: list[str]) -> bytes:
@@ -226,7 +223,7 @@ def _linked_graph(
         node.doc_string = ""
         del node.metadata_props[:]
     model.graph.node.extend([*nodes, *rest])
-    helper.set_model_props(model, {CHECKSUM: checksum_of_watched(folder, sources)})
+    helper.set_model_props(model, {inference.CHECKSUM: checksum_of_watched(folder, sources)})
     return model.SerializeToString()
 
 

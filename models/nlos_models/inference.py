@@ -8,19 +8,12 @@ from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 
+from nlos_models import records
 from nlos_models.arrays import Float32
 from nlos_models.errors import CheckpointError, MissingExtraError, lacks_memory, require
 from nlos_models.files import TENSOR_LIMIT, load_cached, read_checked
 from nlos_models.quality import DOUBT_FILES, QualityModel, load_quality_model
 from nlos_models.recipe import SIMULATION_ONLY
-from nlos_models.records import (
-    CheckpointRecord,
-    DoubtRecord,
-    checksum_of_watched,
-    load_doubt_record,
-    load_record,
-    weights_folder,
-)
 
 MAP_SHAPE = (64, 80)
 NETWORK_INPUTS = {"depth_m": MAP_SHAPE, "intensity": MAP_SHAPE}
@@ -43,7 +36,7 @@ class Answer(NamedTuple):
 class Reconstructor(Protocol):
     """Trained pipeline that is ready to run."""
 
-    record: CheckpointRecord
+    record: records.CheckpointRecord
     runtime: str
 
     def __call__(self, depth_m: Float32, intensity: Float32) -> Float32:
@@ -66,7 +59,9 @@ def ask(network: Callable[[Float32, Float32], Float32], depth_m: Float32, intens
 class OnnxReconstructor:
     """Pipeline in ONNX Runtime on the CPU, about five times faster than torch there for one frame."""
 
-    def __init__(self, model: Path | bytes, record: CheckpointRecord, threads: int = 1, checksum: str = "") -> None:
+    def __init__(
+        self, model: Path | bytes, record: records.CheckpointRecord, threads: int = 1, checksum: str = ""
+    ) -> None:
         self.record, self.runtime = record, "ONNX Runtime on cpu"
         self._session = open_session(model, threads, checksum)
 
@@ -74,7 +69,6 @@ class OnnxReconstructor:
         return self.answer(depth_m, intensity).image
 
     def answer(self, depth_m: Float32, intensity: Float32) -> Answer:
-        """Return images and, of a direct network, the probability of a surface."""
         inputs = {"depth_m": np.ascontiguousarray(depth_m), "intensity": np.ascontiguousarray(intensity)}
         return Answer(*self._session.run(None, inputs))
 
@@ -95,7 +89,7 @@ class UncertaintyEstimate(NamedTuple):
 class UncertaintyModel(Protocol):
     """Uncertainty network that is ready to run."""
 
-    record: DoubtRecord
+    record: records.DoubtRecord
     quality: QualityModel | None
     """None for weights without a quality model."""
 
@@ -107,7 +101,7 @@ class UncertaintyModel(Protocol):
 class OnnxUncertaintyModel:
     """Uncertainty network in ONNX Runtime, on one thread of the CPU unless set otherwise."""
 
-    def __init__(self, model: Path | bytes, record: DoubtRecord, threads: int = 1, checksum: str = "") -> None:
+    def __init__(self, model: Path | bytes, record: records.DoubtRecord, threads: int = 1, checksum: str = "") -> None:
         self.record, self._session = record, open_session(model, threads, checksum)
         self.quality: QualityModel | None = None
 
@@ -150,13 +144,13 @@ def load_reconstructor(folder: Path | None, cache: Path, threads: int = 1) -> Re
     `threads` are ONNX Runtime's. Weights without a valid graph beside them are exported into the folder `cache`, which
     takes torch. Raises CheckpointError where they cannot be read or are for color, MissingExtraError without torch.
     """
-    folder = weights_folder(folder)
-    record = load_record(folder)
+    folder = records.weights_folder(folder)
+    record = records.load_record(folder)
     refuse_color(record, folder)
     if _has_cuda():
         return require("nlos_models.export", "inference on a GPU").load_torch_reconstructor(folder)
     try:
-        return OnnxReconstructor(folder / NETWORK_ONNX, record, threads, checksum_of_watched(folder))
+        return OnnxReconstructor(folder / NETWORK_ONNX, record, threads, records.checksum_of_watched(folder))
     except CheckpointError as error:
         key, export = _exporter(error).network_export(folder)
         return load_cached(cache / key, lambda model: OnnxReconstructor(model, record, threads), export)
@@ -169,11 +163,13 @@ def load_uncertainty_model(folder: Path | None, cache: Path, *, quality: bool = 
 
     Without a valid graph it is exported as by `load_reconstructor`. Raises CheckpointError, MissingExtraError.
     """
-    folder = weights_folder(folder)
-    if (record := load_doubt_record(folder)) is None:
+    folder = records.weights_folder(folder)
+    if (record := records.load_doubt_record(folder)) is None:
         return None
     try:
-        loaded = OnnxUncertaintyModel(folder / DOUBT_ONNX, record, checksum=checksum_of_watched(folder, DOUBT_FILES))
+        loaded = OnnxUncertaintyModel(
+            folder / DOUBT_ONNX, record, checksum=records.checksum_of_watched(folder, DOUBT_FILES)
+        )
     except CheckpointError as error:
         key, export = _exporter(error).doubt_export(folder)
         loaded = load_cached(cache / key, lambda model: OnnxUncertaintyModel(model, record), export)
@@ -181,7 +177,7 @@ def load_uncertainty_model(folder: Path | None, cache: Path, *, quality: bool = 
     return loaded
 
 
-def refuse_color(record: CheckpointRecord, folder: Path | None) -> None:
+def refuse_color(record: records.CheckpointRecord, folder: Path | None) -> None:
     """Raise CheckpointError for color weights: exports and runtimes are for depth."""
     if record.color:
         raise CheckpointError(

@@ -8,17 +8,8 @@ from pathlib import Path
 import torch
 from lightning_fabric import Fabric
 
+from nlos_models import checkpoint
 from nlos_models.arrays import Float16
-from nlos_models.checkpoint import (
-    load_encoder,
-    load_network,
-    load_pipeline,
-    load_pipeline_partly,
-    load_vae,
-    save_direct,
-    save_pipeline,
-    save_vae,
-)
 from nlos_models.data import MapSet, MapSource
 from nlos_models.direct import DirectNetwork
 from nlos_models.direct_training import NormalSource, train_direct, transfer_direct
@@ -118,7 +109,7 @@ def run_vae(fabric: Fabric, training: TrainingRun, start: ResVae | None, images:
     with training.watched(fabric, "VAE") as running:
         vae, figures = train_vae(training.recipe, images, held_out, training.out, running, start)
     if fabric.is_global_zero:
-        save_vae(training.out, vae, training.with_figures(figures))
+        checkpoint.save_vae(training.out, vae, training.with_figures(figures))
     return figures
 
 
@@ -129,7 +120,7 @@ def run_compressor(fabric: Fabric, training: TrainingRun, start: Start, maps: Ma
         pipeline, figures = train_compressor(recipe, start, maps, held_out, training.out, running)
     if fabric.is_global_zero:
         encoder = start.vae.encoder if start.vae and recipe.steps != "one" else None
-        save_pipeline(training.out, pipeline, training.with_figures(figures), encoder)
+        checkpoint.save_pipeline(training.out, pipeline, training.with_figures(figures), encoder)
         _export(training)
     return figures
 
@@ -140,7 +131,7 @@ def run_direct(
     """Train a direct network and save it; return its held-out figures."""
     with training.watched(fabric, "direct network") as running:
         network, figures = train_direct(training.recipe, source, held_out, training.out, running, start)
-    save_direct(training.out, network, training.with_figures(figures))
+    checkpoint.save_direct(training.out, network, training.with_figures(figures))
     _export(training)
     return figures
 
@@ -162,9 +153,9 @@ def run_transfer(
             network, after = train_transfer(training.recipe, network, encoder, maps, held_out, training.out, running)
     if fabric.is_global_zero:
         if isinstance(network, DirectNetwork):
-            save_direct(training.out, network, training.with_figures(after))
+            checkpoint.save_direct(training.out, network, training.with_figures(after))
         else:
-            save_pipeline(training.out, network, training.with_figures(after), encoder)
+            checkpoint.save_pipeline(training.out, network, training.with_figures(after), encoder)
         _export(training)
     return {"before": before, "after": after}
 
@@ -195,10 +186,10 @@ def vae_start(recipe: Recipe, weights: Path | None) -> tuple[ResVae, list[Recipe
     folder = weights_folder(weights, PAPER)
     if recipe.start == "decoder":
         torch.manual_seed(recipe.seed)
-        vae, (pipeline, record) = new_vae(color=recipe.colour), load_pipeline(folder)
+        vae, (pipeline, record) = new_vae(color=recipe.colour), checkpoint.load_pipeline(folder)
         vae.decoder = pipeline.decoder
     else:
-        vae, record = load_vae(folder)
+        vae, record = checkpoint.load_vae(folder)
     return vae, record.vae_runs
 
 
@@ -213,7 +204,7 @@ def compressor_start(recipe: Recipe, vae_folder: Path | None, weights: Path | No
         pipeline, runs = _pipeline_start(recipe, weights)
         return Start(vae, pipeline), [*(run for run in runs if run not in vae_runs), *vae_runs]
     pipeline, runs = _pipeline_start(recipe, weights)
-    if not (encoder := load_encoder(weights)):
+    if not (encoder := checkpoint.load_encoder(weights)):
         if recipe.latent_weight:
             raise TrainingError(
                 f"{weights_folder(weights, PAPER)} has no encoder to aim at: set latent_weight = 0 in the recipe"
@@ -232,7 +223,7 @@ def direct_start(recipe: Recipe, weights: Path | None) -> tuple[DirectNetwork | 
     if recipe.start == "scratch":
         return None, []
     folder = weights_folder(weights)
-    network, record = load_network(folder)
+    network, record = checkpoint.load_network(folder)
     if not isinstance(network, DirectNetwork):
         raise TrainingError(f"{folder} does not hold a direct network: choose other --weights")
     size, wanted = network.size, recipe.direct
@@ -254,16 +245,16 @@ def transfer_start(
     folder = weights_folder(weights, PAPER if recipe.latent_weight else DIRECT)
     _check_fits(recipe, folder)
     if not partial:
-        return load_network(folder)
+        return checkpoint.load_network(folder)
     torch.manual_seed(recipe.seed)
-    pipeline, record, report = load_pipeline_partly(folder)
+    pipeline, record, report = checkpoint.load_pipeline_partly(folder)
     on_report(f"compressor: {report}")
     return pipeline, record
 
 
 def _pipeline_start(recipe: Recipe, weights: Path | None) -> tuple[RemappingNetwork, list[Recipe]]:
     _check_fits(recipe, weights)
-    pipeline, record = load_pipeline(weights)
+    pipeline, record = checkpoint.load_pipeline(weights)
     return pipeline, record.runs
 
 

@@ -51,15 +51,12 @@ Network = TypeVar("Network", bound=Callable[..., Any])
 
 def write_last(folder: Path, state: State) -> None:
     """Write the run's last state; the one before it becomes the previous state. Raises TrainingError."""
-    with _written(folder / LAST, _pack(state)):
-        if (folder / LAST).exists():
-            (folder / LAST).replace(folder / PREVIOUS)
+    _write(folder / LAST, _pack(state), folder / PREVIOUS)
 
 
 def write_best(folder: Path, state: State) -> None:
     """Write the run's best state. Raises TrainingError where it cannot be written."""
-    with _written(folder / BEST, _pack(state)):
-        pass
+    _write(folder / BEST, _pack(state))
 
 
 def write_log(folder: Path, rows: list[Scores]) -> None:
@@ -68,8 +65,7 @@ def write_log(folder: Path, rows: list[Scores]) -> None:
     writer = csv.DictWriter(text, list(rows[0]))
     writer.writeheader()
     writer.writerows(rows)
-    with _written(folder / LOG, text.getvalue().encode()):
-        pass
+    _write(folder / LOG, text.getvalue().encode())
 
 
 def read_last(folder: Path, on_message: OnMessage) -> State | None:
@@ -127,16 +123,16 @@ def _unpack(path: Path) -> State | None:
     return cast("State", state) if isinstance(state, dict) else None
 
 
-@contextmanager
-def _written(path: Path, content: bytes) -> Generator[None]:
-    """Write a file beside `path`, and rename it to `path` at the end of the block. Raises TrainingError."""
+def _write(path: Path, content: bytes, previous: Path | None = None) -> None:
+    """Replace a file, and keep the one before it as `previous`, if given. Raises TrainingError."""
     try:
         with atomic_file(path) as part:
             with part.open("wb") as file:
                 file.write(content)
                 file.flush()
-                os.fsync(file.fileno())  # before the block: what it replaces goes when there is room for the new
-            yield
+                os.fsync(file.fileno())  # what it replaces goes when there is room for the new
+            if previous and path.exists():
+                path.replace(previous)
     except OSError as error:
         reason = error.strerror or error
         raise TrainingError(

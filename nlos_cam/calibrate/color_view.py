@@ -17,30 +17,13 @@ from nlos_calibration import BoardView, CameraErrors, Moments
 from nlos_calibration.arrays import Float64
 from numpy.typing import NDArray
 
-from nlos_cam.camera import (
-    FRAMES_PER_S,
-    NAMES,
-    find_l515,
-    find_streams,
-    intrinsics_of,
-    load_sdk,
-    sample_from_sdk,
-    shared_context,
-    stream_name,
-)
-from nlos_cam.errors import (
-    CameraError,
-    CameraLostError,
-    CameraNotFoundError,
-    NlosCamError,
-    RecordingError,
-    StreamMissingError,
-)
+from nlos_cam import camera as cameras
+from nlos_cam import errors
 from nlos_cam.recording import BagReader
 
 COLOR_STREAM, COLOR_FORMAT = "color", "rgb8"
 """The SDK's name of the stream, and the format requested from a live camera."""
-WANTED = COLOR_STREAM, COLOR_FORMAT, FRAMES_PER_S
+WANTED = COLOR_STREAM, COLOR_FORMAT, cameras.FRAMES_PER_S
 MAX_WIDTH_PX = 1280
 """A wider image does not improve the corners, which are found with subpixel accuracy."""
 SETTLING_FRAMES = 30
@@ -66,12 +49,7 @@ class _LiveOptions:
 
 
 def capture_color_view(
-    uri: str,
-    frames: int,
-    *,
-    on_frame: Callable[[], None] = lambda: None,
-    sdk: Any = None,
-    silence_s: float = SILENCE_S,
+    uri: str, frames: int, *, on_frame: Callable[[], None] = lambda: None, sdk: Any = None, silence_s: float = SILENCE_S
 ) -> BoardView:
     """Return the mean gray view over at most `frames` frames of the color camera of a recording or a live L515.
 
@@ -83,16 +61,16 @@ def capture_color_view(
     if scheme == "bag" and rest:
         return _recorded(Path(rest), frames, on_frame)
     if scheme == "l515":
-        return _live(uri, rest, sdk or load_sdk(), _LiveOptions(frames, on_frame, silence_s))
+        return _live(uri, rest, sdk or cameras.load_sdk(), _LiveOptions(frames, on_frame, silence_s))
     if scheme == "sim":
-        raise CameraError(f"{uri}: the simulated lidar has no colour camera: use --board-in infrared")
-    raise CameraNotFoundError(f"no camera is called {uri!r}: use {NAMES}")
+        raise errors.CameraError(f"{uri}: the simulated lidar has no colour camera: use --board-in infrared")
+    raise errors.CameraNotFoundError(f"no camera is called {uri!r}: use {cameras.NAMES}")
 
 
 def _recorded(path: Path, frames: int, on_frame: Callable[[], None]) -> BoardView:
     bag = BagReader(path)
     if missing := [stream for stream in ("depth", COLOR_STREAM) if stream not in bag.streams]:
-        raise StreamMissingError(
+        raise errors.StreamMissingError(
             f"{path} has no {' and no '.join(missing)} stream (it has {', '.join(sorted(bag.streams))}): record colour "
             "beside depth, e.g. with realsense-viewer, or use --board-in infrared"
         )
@@ -103,30 +81,30 @@ def _recorded(path: Path, frames: int, on_frame: Callable[[], None]) -> BoardVie
         pixels = bag.sample(COLOR_STREAM, index).pixels
         if info.format not in TO_GRAY or pixels.shape[:2] != shape:
             size = f"{pixels.shape[1]} x {pixels.shape[0]} {info.format}"
-            raise RecordingError(f"{path} has unsupported colour images ({size}): use --board-in infrared")
+            raise errors.RecordingError(f"{path} has unsupported colour images ({size}): use --board-in infrared")
         mean.add(TO_GRAY[info.format](pixels))
         on_frame()
     return BoardView(mean.mean(), info.intrinsics, lens, pose, "colour", CameraErrors())
 
 
 def _live(uri: str, serial: str, sdk: Any, options: _LiveOptions) -> BoardView:
-    device, _ = find_l515(sdk, shared_context(sdk), serial)
+    device, _ = cameras.find_l515(sdk, cameras.shared_context(sdk), serial)
     try:
         sensor, profile = _color_profile(device)
-        depth = find_streams(device)[1].get("depth")
+        depth = cameras.find_streams(device)[1].get("depth")
         if profile is None or depth is None:
-            raise CameraError(
-                f"{uri} offers no colour beside its depth at {FRAMES_PER_S} frames/s: use --board-in infrared"
+            raise errors.CameraError(
+                f"{uri} offers no colour beside its depth at {cameras.FRAMES_PER_S} frames/s: use --board-in infrared"
             )
         model = profile.as_video_stream_profile().get_intrinsics()
         lens = _lens(uri, model.model.name, np.array(model.coeffs))
         pose = _pose(profile.get_extrinsics_to(depth))
         image = _mean_of(uri, sensor, profile, options)
     except RuntimeError as error:
-        raise CameraError(
+        raise errors.CameraError(
             f"cannot open the colour camera of {uri} ({error}): close other programs that use it, or replug it"
         ) from error
-    return BoardView(image, intrinsics_of(profile), lens, pose, "colour", CameraErrors())
+    return BoardView(image, cameras.intrinsics_of(profile), lens, pose, "colour", CameraErrors())
 
 
 def _color_profile(device: Any) -> tuple[Any, Any]:
@@ -134,7 +112,7 @@ def _color_profile(device: Any) -> tuple[Any, Any]:
     best: tuple[int, Any, Any] = (0, None, None)
     for sensor in device.query_sensors():
         for profile in sensor.get_stream_profiles():
-            if (stream_name(profile), profile.format().name, profile.fps()) != WANTED:
+            if (cameras.stream_name(profile), profile.format().name, profile.fps()) != WANTED:
                 continue
             width = profile.as_video_stream_profile().width()
             if best[0] < width <= MAX_WIDTH_PX:
@@ -147,7 +125,7 @@ def _lens(where: str, model: str, coefficients: Float64) -> Float64:
     if not coefficients.any():
         return np.zeros(5)
     if model != "brown_conrady" or coefficients.shape != (5,) or not np.isfinite(coefficients).all():
-        raise NlosCamError(
+        raise errors.NlosCamError(
             f"{where}: unsupported distortion model for the colour stream: {model} {coefficients.tolist()}; "
             "use --board-in infrared"
         )
@@ -164,12 +142,12 @@ def _pose(extrinsics: Any) -> Float64:
 
 def _mean_of(uri: str, sensor: Any, profile: Any, options: _LiveOptions) -> Float64:
     """Return the mean gray image (height, width) of a sensor; it streams only during the call."""
-    size = intrinsics_of(profile)
+    size = cameras.intrinsics_of(profile)
     mean, queue = Moments((size.height, size.width)), Queue[NDArray[Any]](maxsize=QUEUE_FRAMES)
 
     def keep(frame: Any) -> None:
         with suppress(Full):  # never block the SDK: the scene stands still, so a later frame is as good
-            queue.put_nowait(sample_from_sdk(frame).pixels)
+            queue.put_nowait(cameras.sample_from_sdk(frame).pixels)
 
     sensor.open([profile])
     try:
@@ -180,7 +158,7 @@ def _mean_of(uri: str, sensor: Any, profile: Any, options: _LiveOptions) -> Floa
                 mean.add(TO_GRAY[COLOR_FORMAT](pixels))
                 options.on_frame()
     except Empty:
-        raise CameraLostError(
+        raise errors.CameraLostError(
             f"{uri} gave no colour frame for {options.silence_s:g} s: replug it, close other programs"
         ) from None
     finally:

@@ -2,33 +2,12 @@
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from datetime import datetime
 from itertools import islice
 from math import hypot
 
+import nlos_calibration as walls
 import numpy as np
-from nlos_calibration import (
-    TOLERANCE_DEG,
-    TOLERANCE_M,
-    BareWall,
-    BareWallStatistics,
-    Board,
-    BoardView,
-    Intrinsics,
-    MeasuredWall,
-    OccluderFit,
-    WallByBoard,
-    WallFit,
-    WallRecord,
-    depth_offset_m,
-    find_occluder,
-    fit_wall,
-    fit_with_tape_distance,
-    points_m,
-    settings_changed,
-    wall_from_zero,
-    wall_with_board,
-    with_occluder,
-)
 from nlos_calibration.arrays import Float32
 from nlos_calibration.errors import CalibrationError, WallRefusedError
 from numpy.typing import NDArray
@@ -47,13 +26,13 @@ class CaptureStatistics:
 
     camera: str
     """The URI."""
-    statistics: BareWallStatistics
-    intrinsics: Intrinsics
+    statistics: walls.BareWallStatistics
+    intrinsics: walls.Intrinsics
     serial: str
     firmware: str
     settings: Mapping[str, float]
 
-    def reference(self, inliers: NDArray[np.bool_]) -> BareWall:
+    def reference(self, inliers: NDArray[np.bool_]) -> walls.BareWall:
         """Return the bench's reference for difference maps; `inliers` (height, width) are the pixels of the plane."""
         return self.statistics.reference(inliers, serial=self.serial, settings=self.settings)
 
@@ -62,10 +41,27 @@ class CaptureStatistics:
         device = {"serial": self.serial, "firmware": self.firmware}
         return {**device, "settings": dict(self.settings), "temperatures_c": self.statistics.celsius()}
 
+    def record(
+        self,
+        fit: walls.WallFit | walls.WallByBoard,
+        facts: Mapping[str, object],
+        occluder: walls.OccluderRecord | None = None,
+    ) -> walls.WallRecord:
+        """Return today's record of a wall; `facts` are further fields, as the measurements return them."""
+        return walls.new_wall_record(
+            fit,
+            self.intrinsics,
+            camera=self.camera,
+            frames=self.statistics.depth.frames,
+            created=datetime.now().astimezone().date(),
+            occluder=occluder,
+            others={**self.facts(), **facts},
+        )
+
 
 def collect_statistics(camera: Camera, frames: int, on_frame: Callable[[], None] = lambda: None) -> CaptureStatistics:
     """Return the statistics of at most `frames` frames of an entered camera. Raises WallRefusedError without any."""
-    statistics, settings = BareWallStatistics(camera.intrinsics), dict[str, float]()
+    statistics, settings = walls.BareWallStatistics(camera.intrinsics), dict[str, float]()
     for number, frame in enumerate(islice(camera, frames)):
         maps = maps_from_frame(frame)
         statistics.add(frame.depth_m, frame.ir, maps.depth_m, maps.intensity)
@@ -83,19 +79,21 @@ NEAR_WALL_M = 0.02
 """Off the plane; with the occluder in place, pixels beyond are on the occluder or straddle its edge."""
 
 
-def measure_by_depth(capture: CaptureStatistics, tape_m: float | None = None) -> tuple[WallFit, dict[str, object]]:
+def measure_by_depth(
+    capture: CaptureStatistics, tape_m: float | None = None
+) -> tuple[walls.WallFit, dict[str, object]]:
     """Fit the wall to its depth; return the fit and, with a distance by tape, the record's range-offset fields.
 
     Raises WallRefusedError, and CalibrationError where tape and lidar cannot both be right.
     """
     depth_m, noise = capture.statistics.depth.mean_m(), capture.statistics.depth.noise()
 
-    def fit_with(offset_m: float, origin_m: float) -> WallFit:
-        return fit_wall(depth_m + offset_m, capture.intrinsics, np.random.default_rng(0), noise, origin_m)
+    def fit_with(offset_m: float, origin_m: float) -> walls.WallFit:
+        return walls.fit_wall(depth_m + offset_m, capture.intrinsics, np.random.default_rng(0), noise, origin_m)
 
     if tape_m is None:
         return fit_with(0.0, 0.0), {}
-    taped = fit_with_tape_distance(fit_with, tape_m)
+    taped = walls.fit_with_tape_distance(fit_with, tape_m)
     return taped.fit, {
         "range_offset_m": taped.offset_m,
         "range_offset_std_m": taped.offset_std_m,
@@ -104,8 +102,8 @@ def measure_by_depth(capture: CaptureStatistics, tape_m: float | None = None) ->
 
 
 def measure_by_board(
-    capture: CaptureStatistics, printed: Board, square_mm: float | None, color: BoardView | None = None
-) -> tuple[WallFit | WallByBoard, dict[str, object]]:
+    capture: CaptureStatistics, printed: walls.Board, square_mm: float | None, color: walls.BoardView | None = None
+) -> tuple[walls.WallFit | walls.WallByBoard, dict[str, object]]:
     """Fit the wall to its depth, unless that is refused, and to a printed board; return the fit and the board's record.
 
     The board is searched in the mean infrared, unless there is a `color` view of it. Raises BoardRefusedError.
@@ -116,12 +114,14 @@ def measure_by_board(
         depth = error
     measured = square_mm is not None
     board = printed.measured(square_mm) if measured else printed
-    view = color or BoardView(capture.statistics.ir_mean(), capture.intrinsics)
-    fit, record = wall_with_board(depth, view, board, measured=measured)
+    view = color or walls.BoardView(capture.statistics.ir_mean(), capture.intrinsics)
+    fit, record = walls.wall_with_board(depth, view, board, measured=measured)
     return fit, {"board": record}
 
 
-def measure_occluder(capture: CaptureStatistics, bare: MeasuredWall) -> tuple[WallRecord, NDArray[np.bool_]]:
+def measure_occluder(
+    capture: CaptureStatistics, bare: walls.MeasuredWall
+) -> tuple[walls.WallRecord, NDArray[np.bool_]]:
     """Find the occluder in front of a known bare wall; return the record with it, and the wall's pixels beside it.
 
     No object may be hidden yet. Raises OccluderRefusedError, CalibrationError for another camera, and WallRefusedError
@@ -134,23 +134,23 @@ def measure_occluder(capture: CaptureStatistics, bare: MeasuredWall) -> tuple[Wa
             f"the bare wall was measured with the camera {record.serial}, this is {capture.serial}: use that camera, "
             "or calibrate the bare wall with this one"
         )
-    offset_m = depth_offset_m(record)
-    depth_m, noise, pose = statistics.mean_m() + offset_m, statistics.noise(), wall_from_zero(record)
+    offset_m = walls.depth_offset_m(record)
+    depth_m, noise, pose = statistics.mean_m() + offset_m, statistics.noise(), walls.wall_from_zero(record)
     stds = {"distance_std_m": record.distance_std_m or 0.0, "yaw_std_deg": record.yaw_std_deg or 0.0}
-    found = find_occluder(depth_m, noise, capture.intrinsics, pose, np.random.default_rng(0), **stds)
+    found = walls.find_occluder(depth_m, noise, capture.intrinsics, pose, np.random.default_rng(0), **stds)
     # the wall is fitted again beside the occluder: if the lidar moved, the occluder's place would be wrong as well
-    off_m = np.abs(points_m(record, depth_m - offset_m, capture.intrinsics)[..., 2])
+    off_m = np.abs(walls.points_m(record, depth_m - offset_m, capture.intrinsics)[..., 2])
     beside = np.where((off_m < NEAR_WALL_M) & ~found.pixels, depth_m, np.nan)
     origin_m = record.range_offset_m - offset_m
-    wall = fit_wall(beside, capture.intrinsics, np.random.default_rng(0), noise, origin_m)
+    wall = walls.fit_wall(beside, capture.intrinsics, np.random.default_rng(0), noise, origin_m)
     _raise_if_moved(record, wall)
     found = replace(found, x_std_m=hypot(found.x_std_m, _edge_std_from_offset_m(record, found)))
-    changes = settings_changed(bare.reference, capture.settings) if bare.reference else ()
+    changes = walls.settings_changed(bare.reference, capture.settings) if bare.reference else ()
     notes = [f"settings have changed since the bare wall was measured: {', '.join(changes)}"] if changes else []
-    return with_occluder(record, replace(found, warnings=(*found.warnings, *notes))), wall.inliers
+    return walls.with_occluder(record, replace(found, warnings=(*found.warnings, *notes))), wall.inliers
 
 
-def _edge_std_from_offset_m(record: WallRecord, found: OccluderFit) -> float:
+def _edge_std_from_offset_m(record: walls.WallRecord, found: walls.OccluderFit) -> float:
     """Return the standard uncertainty in metres of the occluder's place along the wall due to the range offset's.
 
     An offset of the origin moves the edge along the optical axis z: dx = z_x per metre. An offset of depth stretches
@@ -162,14 +162,17 @@ def _edge_std_from_offset_m(record: WallRecord, found: OccluderFit) -> float:
     return abs(float(per_offset)) * (record.range_offset_std_m or 0.0)
 
 
-def _raise_if_moved(record: WallRecord, wall: WallFit) -> None:
+def _raise_if_moved(record: walls.WallRecord, wall: walls.WallFit) -> None:
     """Raise WallRefusedError if the lidar has moved since `record`.
 
     Yaw and pitch are compared, not the facing angle: on a wall faced obliquely, pitch hardly changes that.
     """
     apart_m = wall.distance_m - record.distance_m
     yaw_deg, pitch_deg = wall.yaw_deg - record.yaw_deg, wall.pitch_deg - record.pitch_deg
-    if max(abs(apart_m) / TOLERANCE_M, abs(yaw_deg) / TOLERANCE_DEG, abs(pitch_deg) / TOLERANCE_DEG) > 1.0:
+    if (
+        max(abs(apart_m) / walls.TOLERANCE_M, abs(yaw_deg) / walls.TOLERANCE_DEG, abs(pitch_deg) / walls.TOLERANCE_DEG)
+        > 1.0
+    ):
         raise WallRefusedError(
             f"the lidar has moved since the bare wall was measured: the wall is {1e3 * abs(apart_m):.1f} mm "
             f"{'farther' if apart_m > 0 else 'nearer'}, the lidar turned by {yaw_deg:+z.2f} degrees in yaw and "
@@ -185,7 +188,7 @@ MAX_FIT_COLUMNS = 160
 class FrameFit:
     """Wall fitted to one frame, for somebody who is positioning the lidar."""
 
-    fit: WallFit | None
+    fit: walls.WallFit | None
     refusal: str
     """Why there is no fit; empty where there is one."""
     saturated: float
@@ -197,15 +200,15 @@ def fit_frame(frame: Frame) -> FrameFit:
     depth_m, intrinsics = thinned(frame.depth_m, frame.intrinsics)
     saturated = saturated_share(frame.ir)
     try:
-        return FrameFit(fit_wall(depth_m, intrinsics, np.random.default_rng(0)), "", saturated)
+        return FrameFit(walls.fit_wall(depth_m, intrinsics, np.random.default_rng(0)), "", saturated)
     except WallRefusedError as error:
         return FrameFit(None, str(error), saturated)
 
 
-def thinned(depth_m: Float32, intrinsics: Intrinsics) -> tuple[Float32, Intrinsics]:
+def thinned(depth_m: Float32, intrinsics: walls.Intrinsics) -> tuple[Float32, walls.Intrinsics]:
     """Return every n-th pixel of every n-th row, and their intrinsics."""
     step = max(1, round(intrinsics.width / MAX_FIT_COLUMNS))
     first = step // 2
     few = depth_m[first::step, first::step]
     center = (intrinsics.ppx - first) / step, (intrinsics.ppy - first) / step
-    return few, Intrinsics(few.shape[1], few.shape[0], intrinsics.fx / step, intrinsics.fy / step, *center)
+    return few, walls.Intrinsics(few.shape[1], few.shape[0], intrinsics.fx / step, intrinsics.fy / step, *center)

@@ -3,19 +3,7 @@
 import shlex
 from html import escape
 
-from nlos_calibration import (
-    DISTANCE_RANGE_M,
-    FACING_RANGE_DEG,
-    GAP_RANGE_M,
-    TOLERANCE_DEG,
-    TOLERANCE_M,
-    MeasuredWall,
-    WallRecord,
-    board_agreement,
-    wall_facts,
-    with_degrees,
-    with_mm,
-)
+import nlos_calibration as walls
 
 from nlos_cam.calibrate.report_drawings import bench_picture, footprint_picture
 from nlos_cam.calibrate.report_maps import wall_maps
@@ -31,7 +19,7 @@ VERDICTS = {
 NO_MAPS = Picture("Maps of the wall", "This record names no reference of the bare wall: there are no maps to draw.")
 
 
-def report_html(wall: MeasuredWall, record_file: str) -> str:
+def report_html(wall: walls.MeasuredWall, record_file: str) -> str:
     """Return the report on a wall whose record is called `record_file`: HTML that needs no other file, no network."""
     record = wall.record
     maps = [NO_MAPS] if wall.reference is None else wall_maps(record, wall.reference)
@@ -69,37 +57,37 @@ def range_bar(name: str, value: float, allowed: tuple[float, float], tolerance: 
     )
 
 
-def banner(record: WallRecord) -> str:
+def banner(record: walls.WallRecord) -> str:
     """Return verdict, advice and warnings."""
     name = record.verdict.replace(" ", "-")
     text = f"<p class='word'>{VERDICTS[record.verdict]}</p><p>{escape(record.advice)}</p>"
     return f"<section class='verdict {name}'>{text}</section>{bullets('Note', record.warnings, 'warnings')}"
 
 
-def ranges(record: WallRecord) -> str:
+def ranges(record: walls.WallRecord) -> str:
     """Return bars that show this bench within the paper's ranges."""
     bars = [
-        _bar_in_cm("distance", record.distance_m, DISTANCE_RANGE_M, 45.0),
-        range_bar("facing angle", record.facing_deg, FACING_RANGE_DEG, TOLERANCE_DEG, "degrees", 90.0),
+        _bar_in_cm("distance", record.distance_m, walls.DISTANCE_RANGE_M, 45.0),
+        range_bar("facing angle", record.facing_deg, walls.FACING_RANGE_DEG, walls.TOLERANCE_DEG, "degrees", 90.0),
     ]
     if record.occluder is not None:
-        bars.append(_bar_in_cm("occluder's gap", record.occluder.gap_m, GAP_RANGE_M, 30.0))
+        bars.append(_bar_in_cm("occluder's gap", record.occluder.gap_m, walls.GAP_RANGE_M, 30.0))
     return f"<section><h2>Where the bench is in the paper's ranges</h2>{''.join(bars)}</section>"
 
 
 def _bar_in_cm(name: str, value_m: float, allowed_m: tuple[float, float], end_cm: float) -> str:
     low_cm, high_cm = (100.0 * end for end in allowed_m)
-    return range_bar(name, 100.0 * value_m, (low_cm, high_cm), 100.0 * TOLERANCE_M, "cm", end_cm)
+    return range_bar(name, 100.0 * value_m, (low_cm, high_cm), 100.0 * walls.TOLERANCE_M, "cm", end_cm)
 
 
-def measures(record: WallRecord) -> str:
+def measures(record: walls.WallRecord) -> str:
     """Return the measured quantities with the half width of each 95 % interval."""
     hint = "" if record.range_offset_std_m is not None else "<p>Range offset not measured: give --tape-m.</p>"
-    rows = table(wall_facts(record), ("", "measured (± 95 %)", "meaning"))
+    rows = table(walls.wall_facts(record), ("", "measured (± 95 %)", "meaning"))
     return f"<section><h2>What was measured</h2>{rows}{hint}</section>"
 
 
-def board(record: WallRecord) -> str:
+def board(record: walls.WallRecord) -> str:
     """Return the measurement by the printed board beside the record's; empty without a board."""
     found = record.board
     if found is None:
@@ -107,18 +95,24 @@ def board(record: WallRecord) -> str:
     rows = [
         (
             "distance",
-            with_mm(found.distance_m, found.distance_std_m),
-            with_mm(record.distance_m, record.distance_std_m),
+            walls.with_mm(found.distance_m, found.distance_std_m),
+            walls.with_mm(record.distance_m, record.distance_std_m),
         ),
         *(
-            (name, *(with_degrees(getattr(by, f"{key}_deg"), getattr(by, f"{key}_std_deg")) for by in (found, record)))
+            (
+                name,
+                *(
+                    walls.with_degrees(getattr(by, f"{key}_deg"), getattr(by, f"{key}_std_deg"))
+                    for by in (found, record)
+                ),
+            )
             for name, key in (("facing angle", "facing"), ("yaw", "yaw"), ("pitch", "pitch"))
         ),
     ]
     used = {"both": "depth and board together", "depth": "the depth alone", "board": "the board alone"}[found.used]
     printed = f"{found.printed.squares_x} x {found.printed.squares_y} squares of {found.printed.square_mm:.2f} mm"
     facts = (
-        f"{board_agreement(found)} The record's plane is of {used}. {found.corners} corners of {printed} "
+        f"{walls.board_agreement(found)} The record's plane is of {used}. {found.corners} corners of {printed} "
         f"({'measured on the print' if found.measured else 'as drawn, not measured on the print'}), "
         f"{found.residual_px:.2f} pixels RMS off; stretched by {100.0 * found.stretch:+z.2f} %, "
         f"bowed by {1e3 * found.bow_m:+z.2f} mm."
@@ -128,7 +122,7 @@ def board(record: WallRecord) -> str:
     return f"<section><h2>By a printed board</h2>{compared}<p>{escape(facts)}</p>{causes}</section>"
 
 
-def device(wall: MeasuredWall) -> str:
+def device(wall: walls.MeasuredWall) -> str:
     """Return the camera, its settings and temperatures."""
     record, reference = wall.record, wall.reference
     pinhole = record.rig.pinhole
@@ -149,7 +143,7 @@ def device(wall: MeasuredWall) -> str:
     return f"<section><h2>What it was measured with</h2><div class='columns'>{tables}</div></section>"
 
 
-def usage(record: WallRecord, record_file: str) -> str:
+def usage(record: walls.WallRecord, record_file: str) -> str:
     """Return the files that belong together, and the commands that use them."""
     facts = {"record": record_file, "rig's checksum": record.rig.checksum}
     if record.reference:

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import cv2
 import numpy as np
-from nlos_calibration import MAP_SHAPE, Extent, ObjectBox, Rig, WallRecord, footprint, on_plane
+from nlos_calibration import MAP_SHAPE, Extent, ObjectBox, Rig, WallRecord, corner_rays, footprint, on_plane
 from nlos_calibration.arrays import Float64
 
 from nlos_cam.report import Picture, figure_of, png
@@ -122,12 +122,9 @@ def _view(axis: "Axes", side: _Side, rig: Rig) -> None:
     """Draw the field of view: corner rays, the area between them, the optical axis."""
     pose, drawn = rig.wall_from_lidar, [side.across, side.up]
     start, corners = pose[:3, 3], [start := pose[:3, 3]]
-    for edge in _corner_rays(rig) @ pose[:3, :3].T:
+    for edge in corner_rays(rig.pinhole) @ pose[:3, :3].T:
         end = start + edge * min(start[Z] / -edge[Z] if edge[Z] < 0.0 else FAR_M, FAR_M)
-        corners += [
-            end,
-            end * np.array([1.0, 1.0, 0.0]),
-        ]  # and its foot on the wall: rays that pass over the wall cover it
+        corners += [end, end * np.array([1.0, 1.0, 0.0])]  # and its foot on the wall, which rays over the wall cover
         line = "-" if edge[Z] < 0.0 else "--"
         axis.plot(*np.stack([start, end])[:, drawn].T, color=EDGE, linewidth=1.0, linestyle=line)
     outline = cv2.convexHull(np.array(corners, np.float32)[:, drawn])[:, 0]
@@ -136,19 +133,12 @@ def _view(axis: "Axes", side: _Side, rig: Rig) -> None:
     axis.plot(*path[:, drawn].T, color=LIDAR, linewidth=1.3, linestyle="-.")
 
 
-def _corner_rays(rig: Rig) -> Float64:
-    edges = rig.pinhole.scaled(1, 1)
-    x, y = (np.array([-0.5, 0.5]) - edges.ppx) / edges.fx, (np.array([-0.5, 0.5]) - edges.ppy) / edges.fy
-    return np.array([[x[i], y[j], 1.0] for i, j in ((0, 0), (1, 0), (1, 1), (0, 1))])
-
-
 def _occluder_style(record: WallRecord) -> tuple[str, str]:
     """Return line style and label: dashed if its place is assumed."""
     return ("-", "occluder") if record.occluder is not None else ("--", "occluder (paper's)")
 
 
 def _occluder_from_above(axis: "Axes", record: WallRecord, low_m: float) -> None:
-    """Draw the sheet with its tilt, and the gap to the wall."""
     occluder, (line, label) = record.rig.occluder, _occluder_style(record)
     if occluder is None:
         return
@@ -229,8 +219,7 @@ def footprint_picture(record: WallRecord) -> Picture:
     axis = figure.add_subplot()
     axis.set(xlim=x, ylim=y, aspect="equal", xlabel=NAMES[X], ylabel=NAMES[Y], facecolor="0.93")
     _cells(axis, rig)
-    shown = Extent(x_min_m=x[0], x_max_m=x[1], y_min_m=y[0], y_max_m=y[1])
-    if not _holds(rig.wall, shown):
+    if not rig.wall.contains(np.column_stack([x, y])).all():
         _rectangle(axis, rig.wall, WALL, "-", "edge of the wall")
     _rectangle(axis, rig.relay, RELAY, "-", "relay: the part of the wall that reflects light to and from the object")
     if rig.object_box is not None:
@@ -252,13 +241,7 @@ def footprint_picture(record: WallRecord) -> Picture:
     return Picture("What the lidar sees of the wall", caption, png(figure))
 
 
-def _holds(outer: Extent, inner: Extent) -> bool:
-    across = outer.x_min_m <= inner.x_min_m and inner.x_max_m <= outer.x_max_m
-    return across and outer.y_min_m <= inner.y_min_m and inner.y_max_m <= outer.y_max_m
-
-
 def _cells(axis: "Axes", rig: Rig) -> None:
-    """Draw the grid of every eighth cell on the wall's plane."""
     from matplotlib.collections import PolyCollection
 
     rows, columns = MAP_SHAPE

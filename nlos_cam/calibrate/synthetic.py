@@ -6,17 +6,8 @@ are given by their height above that plane, or by a second plane.
 
 from dataclasses import dataclass
 
+import nlos_calibration as walls
 import numpy as np
-from nlos_calibration import (
-    QUANTUM_M,
-    DepthMean,
-    Intrinsics,
-    depth_noise_m,
-    facing_angle_rad,
-    normal_from_angles,
-    wall_depth,
-    wall_from_plane,
-)
 from nlos_calibration.arrays import Float64
 from numpy.typing import NDArray
 
@@ -32,16 +23,16 @@ class View:
 
     pose: Float64
     """wall_from_lidar (4, 4)."""
-    pinhole: Intrinsics
+    pinhole: walls.Intrinsics
 
     @property
     def depth_m(self) -> Float64:
         """(height, width) of the bare wall; inf where a beam never meets it."""
-        return wall_depth(self.pose, self.pinhole)
+        return walls.wall_depth(self.pose, self.pinhole)
 
     @property
     def facing_deg(self) -> float:
-        return float(np.degrees(facing_angle_rad(self.pose)))
+        return float(np.degrees(walls.facing_angle_rad(self.pose)))
 
     def on_wall(self) -> tuple[Float64, Float64]:
         """Return wall x and y (height, width) where each pixel's ray meets the wall; far away where it does not."""
@@ -50,9 +41,11 @@ class View:
         return points[..., 0], points[..., 1]
 
 
-def view(distance_m: float, yaw_deg: float, pitch_deg: float, pinhole: Intrinsics) -> View:
+def view(distance_m: float, yaw_deg: float, pitch_deg: float, pinhole: walls.Intrinsics) -> View:
     """Return the view of a wall at a distance and angles."""
-    return View(wall_from_plane(normal_from_angles(np.radians(yaw_deg), np.radians(pitch_deg)), distance_m), pinhole)
+    return View(
+        walls.wall_from_plane(walls.normal_from_angles(np.radians(yaw_deg), np.radians(pitch_deg)), distance_m), pinhole
+    )
 
 
 def wall_coordinate(seen: View, direction_rad: float) -> Float64:
@@ -76,7 +69,7 @@ def bent(seen: View, bend_deg: float, share: float, direction_rad: float = 0.0) 
     distance_m = -float(turned @ (fold_m * across - seen.pose[2, 3] * normal))
     if distance_m <= 0.0:
         raise ValueError(f"a bend of {bend_deg} degrees puts the lidar behind the wall")
-    other = View(wall_from_plane(turned, distance_m), seen.pinhole)
+    other = View(walls.wall_from_plane(turned, distance_m), seen.pinhole)
     depth_m = np.where(s > fold_m, other.depth_m, seen.depth_m)
     returned = (depth_m > 0.0) & (depth_m < LONGEST_DEPTH_M)
     return depth_m, other if (s > fold_m)[returned].mean() > 0.5 else seen
@@ -136,21 +129,16 @@ def with_outliers(depth_m: Float64, share: float, generator: np.random.Generator
 def depth_frame(depth_m: Float64, generator: np.random.Generator, noise: float = 1.0) -> NDArray[np.float32]:
     """Return one frame with an L515's noise, steps of 0.25 mm, limited range and dead pixels."""
     valid_m = np.where((depth_m > 0.0) & (depth_m < LONGEST_DEPTH_M), depth_m, np.nan)
-    noisy_m = valid_m + noise * depth_noise_m(valid_m) * generator.standard_normal(valid_m.shape)
+    noisy_m = valid_m + noise * walls.depth_noise_m(valid_m) * generator.standard_normal(valid_m.shape)
     dead = generator.random(valid_m.shape) < DEAD_SHARE
-    return np.where(dead, np.nan, np.round(noisy_m / QUANTUM_M) * QUANTUM_M).astype(np.float32)
+    return np.where(dead, np.nan, np.round(noisy_m / walls.QUANTUM_M) * walls.QUANTUM_M).astype(np.float32)
 
 
 def depth_statistics(
-    depth_m: Float64,
-    generator: np.random.Generator,
-    *,
-    frames: int = 8,
-    noise: float = 1.0,
-    flicker: float = 0.0,
-) -> DepthMean:
+    depth_m: Float64, generator: np.random.Generator, *, frames: int = 8, noise: float = 1.0, flicker: float = 0.0
+) -> walls.DepthMean:
     """Return the statistics of frames of `depth_m`; `flicker` is the share of outliers, redrawn in each frame."""
-    mean = DepthMean(*depth_m.shape)
+    mean = walls.DepthMean(*depth_m.shape)
     for _ in range(frames):
         mean.add(depth_frame(with_outliers(depth_m, flicker, generator), generator, noise))
     return mean

@@ -24,29 +24,17 @@ class Delivery:
     """Streams that deliver it."""
 
 
-def _black(images: SensedImages) -> SensedImages:
-    return SensedImages(np.zeros_like(images.depth_z16), np.zeros_like(images.ir), np.zeros_like(images.confidence))
-
-
-def _saturated(images: SensedImages) -> SensedImages:
-    return replace(images, ir=np.full_like(images.ir, 255))
-
-
 def _half_invalid(images: SensedImages) -> SensedImages:
     depth_z16 = images.depth_z16.copy()
     depth_z16[depth_z16.shape[0] // 2 :] = 0
     return replace(images, depth_z16=depth_z16)
 
 
-def _half_size(images: SensedImages) -> SensedImages:
-    return SensedImages(images.depth_z16[::2, ::2], images.ir[::2, ::2], images.confidence[::2, ::2])
-
-
 IMAGE_FAULTS: dict[FaultKind, Callable[[SensedImages], SensedImages]] = {
-    "all_zero": _black,
-    "saturated": _saturated,
+    "all_zero": lambda images: SensedImages(*map(np.zeros_like, vars(images).values())),
+    "saturated": lambda images: replace(images, ir=np.full_like(images.ir, 255)),
     "half_invalid": _half_invalid,
-    "wrong_size": _half_size,
+    "wrong_size": lambda images: SensedImages(*(pixels[::2, ::2] for pixels in vars(images).values())),
 }
 """Changes to the images, by kind of fault."""
 
@@ -89,15 +77,13 @@ class FaultyDevice:
         if self._has_fault(instant, "stall"):
             self._counted_from += 1
             return late
-        frame = Delivery(instant, instant - self._counted_from, self._timestamp_s(instant, due_s), images)
+        own_s = (instant - self._clock_from) / FRAMES_PER_S % WRAP_PERIOD_S
+        frame = Delivery(instant, instant - self._counted_from, own_s if self.has_own_clock else due_s, images)
         frames = [] if self._has_fault(instant, "drops") else [self._apply(frame, instant)]
         if self._is_held(instant):
             self._held = frames
             return late
         return [*frames * (2 if self._has_fault(instant, "duplicate") else 1), *late]
-
-    def _timestamp_s(self, instant: int, due_s: float) -> float:
-        return (instant - self._clock_from) / FRAMES_PER_S % WRAP_PERIOD_S if self.has_own_clock else due_s
 
     def _apply(self, delivery: Delivery, instant: int) -> Delivery:
         images = delivery.images

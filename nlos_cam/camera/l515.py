@@ -148,13 +148,7 @@ class L515Camera(LiveCamera):
     """Options that differ from the wanted values, and how."""
 
     def __init__(
-        self,
-        uri: str,
-        serial: str,
-        *,
-        recording: Recording | None = None,
-        sdk: Any = None,
-        clock: Clock | None = None,
+        self, uri: str, serial: str, *, recording: Recording | None = None, sdk: Any = None, clock: Clock | None = None
     ) -> None:
         sdk = sdk or load_sdk()
         self._context = shared_context(sdk)

@@ -88,14 +88,7 @@ class SdkRecorder:
     or vanishes during one, so `watch` checks the file instead. Raises RecordingError where nothing can be written.
     """
 
-    def __init__(
-        self,
-        path: Path,
-        device: Any,
-        sdk: Any,
-        *,
-        now: Callable[[], float] = time.monotonic,
-    ) -> None:
+    def __init__(self, path: Path, device: Any, sdk: Any, *, now: Callable[[], float] = time.monotonic) -> None:
         self.path = path
         self.failure: str | None = None
         """Reason of a failed write."""

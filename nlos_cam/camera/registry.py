@@ -30,11 +30,7 @@ NAMES = "l515, l515:SERIAL, sim, sim:bare-wall, sim:SCENE.toml or FILE.bag"
 
 
 def open_camera(
-    uri: str,
-    *,
-    on_progress: OnProgress | None = None,
-    recording: "Recording | None" = None,
-    reader: Reader = "plain",
+    uri: str, *, on_progress: OnProgress | None = None, recording: "Recording | None" = None, reader: Reader = "plain"
 ) -> Camera:
     """Find and check the camera of that name without starting it; a live one can be recorded.
 

@@ -10,19 +10,7 @@ from typing import Any
 from nlos_calibration import Intrinsics
 from nlos_calibration.arrays import Float32
 
-from nlos_cam.camera.streams import (
-    FORMATS,
-    FRAMES_PER_S,
-    SAME_INSTANT_S,
-    FrameSet,
-    FrameSynchronizer,
-    Sample,
-    frame_in_si,
-    intrinsics_of,
-    is_needed,
-    sample_from_sdk,
-    stream_name,
-)
+from nlos_cam.camera import streams
 from nlos_cam.camera.timestamps import ClockUnwrap
 from nlos_cam.frames import Frame
 from nlos_cam.threads import BoundedQueue
@@ -38,13 +26,13 @@ class SampleQueue:
     wait, which pauses the playback of a recording. `on_set` is called on an SDK thread with every set.
     """
 
-    def __init__(self, *, lossless: bool, on_set: Callable[[FrameSet], None] | None = None) -> None:
+    def __init__(self, *, lossless: bool, on_set: Callable[[streams.FrameSet], None] | None = None) -> None:
         self.arrived: Counter[str] = Counter()
         """Samples so far, by stream."""
         self._lossless, self._on_set = lossless, on_set
-        self._pairing = FrameSynchronizer()
+        self._pairing = streams.FrameSynchronizer()
         self._evicted = 0
-        self._sets = BoundedQueue[FrameSet](CAPACITY)
+        self._sets = BoundedQueue[streams.FrameSet](CAPACITY)
 
     @property
     def incomplete(self) -> int:
@@ -76,7 +64,7 @@ class SampleQueue:
         """Reject samples of any other shape (rows, columns)."""
         self._pairing.shape = shape
 
-    def put(self, sample: Sample) -> None:
+    def put(self, sample: streams.Sample) -> None:
         """Pair a sample, on an SDK thread."""
         with self._sets.changed:
             if self._lossless:
@@ -91,7 +79,7 @@ class SampleQueue:
         if self._on_set:
             self._on_set(complete)
 
-    def take(self, timeout_s: float) -> FrameSet | None:
+    def take(self, timeout_s: float) -> streams.FrameSet | None:
         """Return the oldest set; None after the timeout or once `ended`. Raises the error given to `finish`."""
         return self._sets.take(timeout_s)
 
@@ -118,15 +106,15 @@ def find_streams(device: Any, size: Size | None = None) -> tuple[Any, dict[str, 
     """Return the sensor with most of the needed streams, and their profiles; at `size` and 30 frames/s, if given."""
     best: tuple[Any, dict[str, Any]] = (None, {})
     for sensor in device.query_sensors():
-        profiles = [profile for profile in sensor.get_stream_profiles() if is_needed(profile)]
-        found = {stream_name(profile): profile for profile in profiles if size is None or _has(profile, size)}
+        profiles = [profile for profile in sensor.get_stream_profiles() if streams.is_needed(profile)]
+        found = {streams.stream_name(profile): profile for profile in profiles if size is None or _has(profile, size)}
         best = max(best, (sensor, found), key=lambda pair: len(pair[1]))
     return best
 
 
 def _has(profile: Any, size: Size) -> bool:
     video = profile.as_video_stream_profile()
-    return (video.width(), video.height()) == size and profile.fps() == FRAMES_PER_S
+    return (video.width(), video.height()) == size and profile.fps() == streams.FRAMES_PER_S
 
 
 def read_settings(sensor: Any, ending: str = "") -> dict[str, float]:
@@ -151,7 +139,7 @@ class Session:
     def __init__(self, sensor: Any, profiles: Mapping[str, Any], inbox: SampleQueue) -> None:
         self.inbox = inbox
         self.settings: dict[str, float] = {}
-        self.intrinsics: Intrinsics = intrinsics_of(profiles["depth"])
+        self.intrinsics: Intrinsics = streams.intrinsics_of(profiles["depth"])
         inbox.expect((self.intrinsics.height, self.intrinsics.width))
         self._sensor: Any = sensor
         self._profiles = list(profiles.values())
@@ -186,7 +174,7 @@ class Session:
         self._listening = True
         self._preview.close()
 
-    def look(self, timeout_s: float) -> FrameSet | None:
+    def look(self, timeout_s: float) -> streams.FrameSet | None:
         """Return the next set to come while the sensor is prepared; None after the timeout or `end_wait`."""
         while self._preview.take(0.0):
             pass
@@ -197,13 +185,13 @@ class Session:
         self._preview.close()
 
     def _on_frame(self, frame: Any) -> None:
-        sample = sample_from_sdk(frame)
+        sample = streams.sample_from_sdk(frame)
         if frame.get_frame_timestamp_domain().name == "hardware_clock":  # it wraps, for each stream by itself
             sample = replace(sample, timestamp_s=self._clocks[sample.stream].add(sample.timestamp_s))
         inbox = self.inbox if self._is_heard(sample) else self._preview
         inbox.put(sample)
 
-    def _is_heard(self, sample: Sample) -> bool:
+    def _is_heard(self, sample: streams.Sample) -> bool:
         """Return False for samples of a set that began before the settings held, which would be incomplete.
 
         At most one set is held back, so that a device whose clock stands still is not silenced.
@@ -211,9 +199,9 @@ class Session:
         if not self._listening:
             self._previewed_s = max(self._previewed_s, sample.timestamp_s)
             return False
-        began_before = abs(sample.timestamp_s - self._previewed_s) <= SAME_INSTANT_S
+        began_before = abs(sample.timestamp_s - self._previewed_s) <= streams.SAME_INSTANT_S
         self._held_back += began_before
-        return not began_before or self._held_back >= len(FORMATS)
+        return not began_before or self._held_back >= len(streams.FORMATS)
 
     @property
     def sensor(self) -> Any:
@@ -238,6 +226,6 @@ class Session:
         self._sensor = None
         self._profiles.clear()
 
-    def frame(self, found: FrameSet, truth_depth_m: Float32 | None = None) -> Frame:
+    def frame(self, found: streams.FrameSet, truth_depth_m: Float32 | None = None) -> Frame:
         """Return a set in SI units."""
-        return frame_in_si(found, self._unit_m, self.intrinsics, self.settings, truth_depth_m)
+        return streams.frame_in_si(found, self._unit_m, self.intrinsics, self.settings, truth_depth_m)

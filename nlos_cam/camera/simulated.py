@@ -180,7 +180,6 @@ class SimulatedCamera(LiveCamera):
         self._thread = None
 
     def _instant(self) -> int:
-        """Return the index of the world's present instant."""
         return int((self._clock.now() - self._start_s) * FRAMES_PER_S) if self._start_s is not None else 0
 
     def _is_connected(self) -> bool:

@@ -1,6 +1,6 @@
 """World of a simulated camera: a scene's loop of poses, pre-rendered and cached; the sensor model runs live."""
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from io import BytesIO
 from pathlib import Path
 from zipfile import BadZipFile
@@ -9,23 +9,13 @@ import numpy as np
 from nlos_calibration import Rig
 from nlos_calibration.arrays import Float32
 
+from nlos_cam import render as renderer
+from nlos_cam.camera.registry import OnProgress
 from nlos_cam.camera.streams import FRAMES_PER_S
 from nlos_cam.files import cache_folder, load_cached
-from nlos_cam.render import (
-    MultiBounce,
-    SceneFile,
-    SensedImages,
-    Sensor,
-    bare_wall_scene,
-    load_scene,
-    paper_scene,
-    render_scan,
-)
 
-Loop = tuple[list[MultiBounce], list[Float32]]
+Loop = tuple[list[renderer.MultiBounce], list[Float32]]
 """Echoes of each frame, and hidden depth at the middle of its scan."""
-OnProgress = Callable[[int, int], None]
-"""Called with the poses rendered so far and in all."""
 WORLDS = Path(__file__).parent / "worlds"
 """Loops of the packaged scenes, written by tools/packaged/contents.py."""
 CELSIUS_ABOVE = {
@@ -41,17 +31,19 @@ CELSIUS_ABOVE = {
 class World:
     """Loop of instants that repeats with new noise, while the device keeps warming."""
 
-    def __init__(self, scene: SceneFile, echoes: list[MultiBounce], truths: list[Float32 | None]) -> None:
+    def __init__(
+        self, scene: renderer.SceneFile, echoes: list[renderer.MultiBounce], truths: list[Float32 | None]
+    ) -> None:
         self.scene = scene
         self._echoes, self._truths = echoes, truths
-        self._sensor = Sensor(scene.rig, scene.sensor, scene.radiometry)
+        self._sensor = renderer.Sensor(scene.rig, scene.sensor, scene.radiometry)
 
     @property
     def rig(self) -> Rig:
         """Rig with the lidar in this world."""
         return self.scene.rig
 
-    def images(self, number: int) -> SensedImages:
+    def images(self, number: int) -> renderer.SensedImages:
         """Return the images of frame `number`, the same bits each time."""
         generator = np.random.default_rng([number, len(self._echoes)])
         echoes = self._echoes[number % len(self._echoes)]
@@ -79,7 +71,9 @@ def open_world(name: str, on_progress: OnProgress | None = None) -> World:
     The loops of the first two come with the package; others are rendered on first use and stored in the cache folder.
     Raises SceneError for an invalid scene.
     """
-    scene = {"": paper_scene, "bare-wall": bare_wall_scene}.get(name, lambda: load_scene(Path(name)))()
+    scene = {"": renderer.paper_scene, "bare-wall": renderer.bare_wall_scene}.get(
+        name, lambda: renderer.load_scene(Path(name))
+    )()
     loop = read_packaged(scene)
     if loop is None:
         cached = cache_folder() / "worlds" / f"{scene.checksum}.npz"
@@ -88,7 +82,7 @@ def open_world(name: str, on_progress: OnProgress | None = None) -> World:
     return World(scene, echoes, list(truths) if scene.hidden else [None])
 
 
-def read_packaged(scene: SceneFile) -> Loop | None:
+def read_packaged(scene: renderer.SceneFile) -> Loop | None:
     """Return the loop of a scene that comes with the package; None where it does not, or is damaged."""
     try:
         return _unpack((WORLDS / f"{scene.checksum}.npz").read_bytes())
@@ -96,12 +90,14 @@ def read_packaged(scene: SceneFile) -> Loop | None:
         return None
 
 
-def render_loop(scene: SceneFile, on_progress: OnProgress | None = None, poses: Iterable[int] | None = None) -> Loop:
+def render_loop(
+    scene: renderer.SceneFile, on_progress: OnProgress | None = None, poses: Iterable[int] | None = None
+) -> Loop:
     """Render the poses of a scene's loop, by default all."""
-    echoes: list[MultiBounce] = []
+    echoes: list[renderer.MultiBounce] = []
     truths: list[Float32] = []
     for number in range(scene.poses) if poses is None else poses:
-        echoes.append(render_scan(lambda share, start=number: scene.scene_at(start + share)).multi)
+        echoes.append(renderer.render_scan(lambda share, start=number: scene.scene_at(start + share)).multi)
         truth = scene.scene_at(number + 0.5).object_depth_m
         truths.append(np.zeros((0, 0), np.float32) if truth is None else truth)
         if on_progress:
@@ -109,7 +105,7 @@ def render_loop(scene: SceneFile, on_progress: OnProgress | None = None, poses: 
     return echoes, truths
 
 
-def pack_loop(echoes: list[MultiBounce], truths: list[Float32]) -> bytes:
+def pack_loop(echoes: list[renderer.MultiBounce], truths: list[Float32]) -> bytes:
     """Return a loop as the content of an .npz file."""
     packed = BytesIO()
     np.savez_compressed(
@@ -127,4 +123,4 @@ def _unpack(content: bytes) -> Loop:
     with np.load(BytesIO(content)) as file:
         poses = zip(file["peak"], file["runner_up"], file["path_m"], strict=True)
         mixed = bool(file["direct_included"])
-        return [MultiBounce(*pose, mixed) for pose in poses], list(file["truth_m"])
+        return [renderer.MultiBounce(*pose, mixed) for pose in poses], list(file["truth_m"])

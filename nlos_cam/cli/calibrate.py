@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable
-from datetime import datetime
 from pathlib import Path
 from threading import Event, Thread
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -100,8 +99,7 @@ def gauge(value: float, low: float, high: float) -> str:
 Wall = Annotated[bool, typer.Option("--wall", help="Measure the bare wall: no object, no occluder.")]
 Bag = Annotated[Path | None, typer.Option("--bag", help="Recording of the bare wall.")]
 BareRecord = Annotated[
-    Path | None,
-    typer.Option("--occluder", help="Find the occluder in front of the wall of this record (wall.toml)."),
+    Path | None, typer.Option("--occluder", help="Find the occluder in front of the wall of this record (wall.toml).")
 ]
 Frames = Annotated[int, typer.Option("--frames", min=1, help="Number of frames to average.")]
 Watch = Annotated[
@@ -217,7 +215,7 @@ def calibrate(
             fit, facts = bench.measure_by_board(capture, walls.BOARDS[paper or "a4"], square_mm, color)
         else:
             fit, facts = bench.measure_by_depth(capture, tape_m)
-        record, inliers = _record(capture, fit, facts, by_hand), fit.inliers if isinstance(fit, walls.WallFit) else None
+        record, inliers = capture.record(fit, facts, by_hand), fit.inliers if isinstance(fit, walls.WallFit) else None
     record = bench.write_record(files, record, None if inliers is None else capture.reference(inliers))
     fields = record.model_dump(mode="json", include=JSON_FIELDS)
     result = fields | {"out": str(files.record), "report": str(files.report)}
@@ -259,24 +257,6 @@ def _capture_color(uri: str, frames: int) -> walls.BoardView:
     with progress() as bar:
         task = bar.add_task("Averaging colour frames", total=frames)
         return bench.capture_color_view(uri, frames, on_frame=lambda: bar.advance(task))
-
-
-def _record(
-    capture: bench.CaptureStatistics,
-    fit: walls.WallFit | walls.WallByBoard,
-    facts: dict[str, object],
-    occluder: walls.OccluderRecord | None,
-) -> walls.WallRecord:
-    """Return today's record of a wall."""
-    return walls.new_wall_record(
-        fit,
-        capture.intrinsics,
-        camera=capture.camera,
-        frames=capture.statistics.depth.frames,
-        created=datetime.now().astimezone().date(),
-        occluder=occluder,
-        others={**capture.facts(), **facts},
-    )
 
 
 SheetOut = Annotated[Path | None, typer.Option("--out", help="PDF to write.")]

@@ -16,19 +16,7 @@ from rich.progress import Progress
 
 from nlos_cam import camera as cameras
 from nlos_cam import recording as recordings
-from nlos_cam.cli.common import (
-    Camera,
-    Json,
-    Overwrite,
-    exit_interrupted,
-    finish,
-    interrupted_by_signals,
-    output_path,
-    progress,
-    say,
-    stop_on_signals,
-    tracked,
-)
+from nlos_cam.cli import common
 from nlos_cam.errors import NlosCamError
 
 FIGURES = ("saturated_share", "invalid_share", "temporal_noise_mm")
@@ -129,7 +117,7 @@ Out = Annotated[Path | None, typer.Option("--out", help="Recording to write (.ba
 
 
 def capture(
-    camera: Camera = "sim",
+    camera: common.Camera = "sim",
     seconds: Seconds = None,
     frames: Frames = None,
     takes: TakeCount = 1,
@@ -137,31 +125,31 @@ def capture(
     label: Labels = None,
     wall: Wall = None,
     out: Out = None,
-    overwrite: Overwrite = False,
-    json: Json = False,
+    overwrite: common.Overwrite = False,
+    json: common.Json = False,
 ) -> None:
     """Record depth, infrared and confidence to .bag until --seconds, --frames or Ctrl-C, and verify each file."""
     targets = _targets(_base(seconds, frames, takes, out), takes, label or [], overwrite=overwrite)
     measured = recordings.load_measured_wall(wall) if wall else None
     recording = cameras.Recording(targets[0].path, frames=frames, seconds=seconds, last=takes == 1, overwrite=overwrite)
     try:
-        with interrupted_by_signals(), tracked(PRE_RENDERING, at_once=False) as on_progress:
+        with common.interrupted_by_signals(), common.tracked(PRE_RENDERING, at_once=False) as on_progress:
             source = cameras.open_camera(camera, on_progress=on_progress, recording=recording)
     except KeyboardInterrupt:
         result, text = empty_result(targets[0], several=takes > 1), f"Interrupted before the first frame; {NOTHING}"
-        finish(result, as_json=json, text=text)
-        exit_interrupted(NOTHING)
+        common.finish(result, as_json=json, text=text)
+        common.exit_interrupted(NOTHING)
     limit = frames or (round(seconds * cameras.FRAMES_PER_S) if seconds else None)
     _check_disk(source, targets, limit)
-    with stop_on_signals() as stop:
+    with common.stop_on_signals() as stop:
         results = _record(recordings.CaptureSession(source, recording, targets, wall=measured), stop, limit, pause_s)
         interrupted = stop.is_set() or results[-1].state == "interrupted"
-    finish(result_of(results, several=takes > 1), as_json=json, text="\n".join(map(format_take, results)))
+    common.finish(result_of(results, several=takes > 1), as_json=json, text="\n".join(map(format_take, results)))
     if error := final_error(results[-1]):
-        say(f"[bold red]error:[/] {escape(str(error))}", marked=True)
+        common.say(f"[bold red]error:[/] {escape(str(error))}", marked=True)
         raise typer.Exit(error.exit_code)
     if interrupted:
-        exit_interrupted(f"{sum(take.sets for take in results)} frames are kept")
+        common.exit_interrupted(f"{sum(take.sets for take in results)} frames are kept")
 
 
 def _base(seconds: float | None, frames: int | None, takes: int, out: Path | None) -> Path:
@@ -172,7 +160,7 @@ def _base(seconds: float | None, frames: int | None, takes: int, out: Path | Non
         raise typer.BadParameter(f"--takes {takes} needs --seconds or --frames")
     if out is not None and out.suffix != ".bag":
         raise typer.BadParameter(f"--out {out}: the name of a recording must end in .bag")
-    return out or output_path(None, "capture", ".bag", overwrite=False)
+    return out or common.output_path(None, "capture", ".bag", overwrite=False)
 
 
 def _targets(base: Path, takes: int, labels: list[str], *, overwrite: bool) -> list[recordings.CaptureTarget]:
@@ -187,7 +175,7 @@ def _targets(base: Path, takes: int, labels: list[str], *, overwrite: bool) -> l
     )
     for target in targets:
         for path in (target.path, recordings.sidecar_path(target.path)):
-            output_path(path, "", path.suffix, overwrite=overwrite)
+            common.output_path(path, "", path.suffix, overwrite=overwrite)
     return targets
 
 
@@ -198,22 +186,23 @@ def _check_disk(camera: cameras.Camera, targets: list[recordings.CaptureTarget],
     if limit is None:
         lasts_s = cameras.recording_s(camera.intrinsics, free)
         time = f"{int(lasts_s / 60)} minutes" if lasts_s >= 120 else f"{int(lasts_s)} s"
-        say(f"Disk space for at least {time} ({free / 1e9:.1f} GB free). Press Ctrl-C to stop.")
+        common.say(f"Disk space for at least {time} ({free / 1e9:.1f} GB free). Press Ctrl-C to stop.")
 
 
 def _record(
     session: recordings.CaptureSession, stop: Event, limit: int | None, pause_s: float | None
 ) -> list[recordings.CaptureResult]:
-    """Record the takes one after another and verify each."""
     results: list[recordings.CaptureResult] = []
-    with progress() as bar:
+    with common.progress() as bar:
         task = bar.add_task("recording", total=limit)
         with closing(session.record(stop, lambda sets: bar.update(task, completed=sets))) as recorded:
             for take in recorded:
                 result = recordings.finalize(take, partial(_verify, bar, take.sets))
                 results.append(result)
                 if dropped := result.summary.dropped:
-                    say(f"[yellow]Warning:[/] {dropped} frames were dropped; the recording has gaps", marked=True)
+                    common.say(
+                        f"[yellow]Warning:[/] {dropped} frames were dropped; the recording has gaps", marked=True
+                    )
                 if result.state != "complete" or stop.is_set():
                     break
                 if left := len(session.targets) - len(results):
@@ -229,7 +218,7 @@ def _verify(bar: Progress, sets: int, path: Path) -> recordings.VerifyResult | N
     """Return the contents of a closed file; None on Ctrl-C."""
     task = bar.add_task("verifying", total=sets)
     try:
-        with interrupted_by_signals():
+        with common.interrupted_by_signals():
             return recordings.verify(path, on_frame=lambda: bar.advance(task))
     except KeyboardInterrupt:
         return None
@@ -239,14 +228,14 @@ def _verify(bar: Progress, sets: int, path: Path) -> recordings.VerifyResult | N
 
 def _pause(bar: Progress, stop: Event, pause_s: float | None, text: str) -> None:
     """Print `text` and wait `pause_s`, or for Enter at a terminal; Ctrl-C sets `stop`."""
-    say(text)
+    common.say(text)
     if pause_s is not None or not sys.stdin.isatty():
         stop.wait(pause_s or 0.0)
         return
     bar.stop()
-    say("Press Enter to start the next take")
+    common.say("Press Enter to start the next take")
     try:
-        with interrupted_by_signals():
+        with common.interrupted_by_signals():
             sys.stdin.readline()
     except KeyboardInterrupt:
         stop.set()

@@ -17,17 +17,7 @@ from rich.text import Text
 from nlos_cam import dataset as data
 from nlos_cam import objects as shapes
 from nlos_cam import render as renderer
-from nlos_cam.cli.common import (
-    PAPER_RIG,
-    Json,
-    Overwrite,
-    exit_interrupted,
-    finish,
-    output_path,
-    progress,
-    say,
-    tracked,
-)
+from nlos_cam.cli import common
 
 PROCEDURAL = "procedural"
 
@@ -36,7 +26,8 @@ NewOut = Annotated[Path, typer.Option("--out", help="Folder of the dataset.")]
 Count = Annotated[int, typer.Option("--count", min=1, help="Total number of objects.")]
 Seed = Annotated[int, typer.Option("--seed", min=0, help="Seed of the first object; the others follow.")]
 RigName = Annotated[
-    str | None, typer.Option("--rig", show_default=PAPER_RIG, help="Name of a packaged rig, or a rig's TOML file.")
+    str | None,
+    typer.Option("--rig", show_default=common.PAPER_RIG, help="Name of a packaged rig, or a rig's TOML file."),
 ]
 SceneToml = Annotated[
     Path | None,
@@ -114,14 +105,16 @@ def build(
     expected_maps: Expected = False,
     workers: Workers = os.cpu_count() or 1,
     ray: RayAddress = None,
-    json: Json = False,
+    json: common.Json = False,
 ) -> None:
     """Render random objects into HDF5 shards; give the same command again to resume after an interruption."""
     if scene and rig is not None:
         raise typer.BadParameter(f"{scene} has its own rig: drop --rig")
     spread = data.RigSpread(place_m=rig_spread_mm / 1e3, angle_deg=rig_spread_deg, gain_share=gain_spread_percent / 100)
     plan = data.DatasetPlan.of_scene(
-        renderer.load_scene(scene) if scene else renderer.SceneFile(name="bare", rig=walls.rig_named(rig or PAPER_RIG)),
+        renderer.load_scene(scene)
+        if scene
+        else renderer.SceneFile(name="bare", rig=walls.rig_named(rig or common.PAPER_RIG)),
         seed,
         objects=_objects(objects, without, backgrounds, share_generic),
         accuracy=renderer.accuracy_named(accuracy).name,
@@ -129,7 +122,7 @@ def build(
         textures=tuple(shapes.TEXTURES) if colour else (),
         expected=expected_maps,
     )
-    with progress(Rate()) as bar:
+    with common.progress(Rate()) as bar:
         checks, renders = (bar.add_task(name, total=None, visible=False) for name in ("checking shards", "rendering"))
         try:
             report = data.build_dataset(
@@ -139,18 +132,18 @@ def build(
                 workers=workers,
                 on_progress=lambda done, total: bar.update(renders, completed=done, total=total, visible=True),
                 on_check=lambda done, total: bar.update(checks, completed=done, total=total, visible=done < total),
-                on_warning=say,
+                on_warning=common.say,
                 command=_command(context, "build"),
                 farm=data.ray_farm(ray) if ray else None,
             )
         except KeyboardInterrupt:
-            exit_interrupted(f"finished shards are kept in {out}; give the same command to resume")
+            common.exit_interrupted(f"finished shards are kept in {out}; give the same command to resume")
     rate = report.objects_per_s
     facts = {"objects": report.objects, "made": report.made, "damaged": [str(path) for path in report.damaged]}
     result = {**facts, "seconds": report.seconds, "objects_per_s": rate, "out": str(out)}
     new = f" ({report.made} new, {rate:.1f} per second)" if rate else ""
     note = models.SIMULATION_ONLY if colour else ""
-    finish(result, as_json=json, text=f"{report.objects} objects in {out}{new}", note=note)
+    common.finish(result, as_json=json, text=f"{report.objects} objects in {out}{new}", note=note)
 
 
 def label(
@@ -159,16 +152,16 @@ def label(
     out: NewOut,
     wall: Wall = None,
     frames: Frames = 8,
-    overwrite: Overwrite = False,
-    json: Json = False,
+    overwrite: common.Overwrite = False,
+    json: common.Json = False,
 ) -> None:
     """Make a dataset from labelled recordings of known objects: maps of single frames, with the hidden depth.
 
     A label is the name of a benchmark object, or of files beside the recordings: LABEL.truth.toml (the fields of a
     scene file's object; by default of the mesh LABEL.stl, .obj or .ply), or LABEL.npy (a depth map).
     """
-    folder = output_path(out, "dataset", "", overwrite=overwrite)
-    with tracked("reading recordings") as on_progress:
+    folder = common.output_path(out, "dataset", "", overwrite=overwrite)
+    with common.tracked("reading recordings") as on_progress:
         command = _command(context, "label")
         labelled = data.label_recordings(
             recordings, folder, wall=wall, frames=frames, command=command, on_progress=on_progress
@@ -177,7 +170,7 @@ def label(
     rig = {"rig_name": labelled.rig.name, "rig_checksum": labelled.rig.checksum}
     result = {"out": str(folder), "samples": samples, "recordings": files, "labels": labels, **rig}
     text = f"{samples} samples of {len(labels)} objects from {files} recordings in {folder}"
-    finish(result, as_json=json, text=text)
+    common.finish(result, as_json=json, text=text)
 
 
 def _command(context: typer.Context, name: str) -> str:
@@ -198,7 +191,7 @@ def _objects(objects: str, without: str, backgrounds: float, share_generic: floa
         return data.Objects.without(left_out, backgrounds, share_generic)
     if without or backgrounds:
         raise typer.BadParameter("--without and --backgrounds are for procedural objects: drop them")
-    with tracked("reading meshes") as on_progress:
+    with common.tracked("reading meshes") as on_progress:
         return replace(data.objects_from_folder(Path(objects), on_progress), share_generic=share_generic)
 
 

@@ -66,14 +66,14 @@ def _sdk_seen(facts: diagnosis.Facts, device: diagnosis.UsbDevice) -> bool | Non
 
 
 def _uri(info: cameras.DeviceInfo | None) -> str:
-    """Return the value of `--camera` for a device; empty if it is not an L515."""
     return f"l515:{info.serial}" if info and "L515" in info.name else ""
 
 
 def _table(facts: diagnosis.Facts) -> Table:
     table = Table("--camera", "name", "serial", "firmware", "link", "SDK", "USB", box=None, pad_edge=False)
     for pair in facts.pairs:
-        table.add_row(*_row(facts, pair))
+        visible = VISIBLE[None if facts.sdk.error else pair.sdk is not None], VISIBLE[_usb_seen(facts, pair)]
+        table.add_row(_uri(pair.sdk), *map(escape, (pair.name, pair.serial, pair.firmware, pair.link)), *visible)
     for device in facts.usb.of_kind("recovery") + facts.usb.of_kind("other"):
         table.add_row(
             "", escape(device.meaning), escape(device.serial), device.firmware, device.link, "", VISIBLE[True]
@@ -84,11 +84,6 @@ def _table(facts: diagnosis.Facts) -> Table:
     for uri, name in cameras.SIMULATED.items():
         table.add_row(uri, escape(name))
     return table
-
-
-def _row(facts: diagnosis.Facts, pair: diagnosis.Pair) -> list[str]:
-    visible = VISIBLE[None if facts.sdk.error else pair.sdk is not None], VISIBLE[_usb_seen(facts, pair)]
-    return [_uri(pair.sdk), *map(escape, (pair.name, pair.serial, pair.firmware, pair.link)), *visible]
 
 
 def _device_notes(facts: diagnosis.Facts) -> str:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from contextlib import nullcontext
 from dataclasses import asdict
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -16,38 +16,10 @@ from nlos_cam import camera as cameras
 from nlos_cam import evaluate as measure
 from nlos_cam import live as loop
 from nlos_cam import reconstruct
-from nlos_cam.cli.common import (
-    Camera,
-    Detail,
-    Json,
-    Overwrite,
-    exit_interrupted,
-    finish,
-    interrupted_by_signals,
-    output_path,
-    progress,
-    say,
-    stop_on_signals,
-    tracked,
-)
+from nlos_cam import view as views
+from nlos_cam.cli import common
+from nlos_cam.cli import view as viewing
 from nlos_cam.cli.recordings import AsObject, object_formats
-from nlos_cam.cli.view import (
-    SUFFIX,
-    NoView,
-    Open,
-    SaveReplayView,
-    SaveView,
-    Seconds,
-    Stills,
-    Video,
-    ViewHost,
-    ViewPort,
-    announce_view,
-    each_of,
-    once,
-    saving,
-    viewer_of,
-)
 
 LOSSES = {
     "dropped_camera": "at the camera",
@@ -87,34 +59,34 @@ Every = Annotated[int, typer.Option("--every", min=1, help="With --object, only 
 
 
 def demo(
-    seconds: Seconds = None,
-    no_view: NoView = False,
-    view_port: ViewPort = None,
-    open_view: Open = False,
-    json: Json = False,
+    seconds: viewing.Seconds = None,
+    no_view: viewing.NoView = False,
+    view_port: viewing.ViewPort = None,
+    open_view: viewing.Open = False,
+    json: common.Json = False,
 ) -> None:
     """Show the live view of a simulated bench; no camera is needed. The same as `live sim`."""
-    say(EXPLANATION)
+    common.say(EXPLANATION)
     live("sim", seconds=seconds, no_view=no_view, view_port=view_port, open_view=open_view, json=json)
 
 
 def live(
-    camera: Camera = "sim",
+    camera: common.Camera = "sim",
     wall: Wall = None,
-    seconds: Seconds = None,
-    no_view: NoView = False,
-    view_port: ViewPort = None,
-    view_host: ViewHost = None,
-    open_view: Open = False,
+    seconds: viewing.Seconds = None,
+    no_view: viewing.NoView = False,
+    view_port: viewing.ViewPort = None,
+    view_host: viewing.ViewHost = None,
+    open_view: viewing.Open = False,
     record: RecordTo = None,
     log: Log = None,
     weights: Weights = None,
     average: Average = 1,
     budget_ms: BudgetMs = None,
     tradeoff: Tradeoff = None,
-    save_view: SaveView = None,
-    overwrite: Overwrite = False,
-    json: Json = False,
+    save_view: viewing.SaveView = None,
+    overwrite: common.Overwrite = False,
+    json: common.Json = False,
 ) -> None:
     """Show what is hidden around the corner, live, in a browser."""
     if budget_ms is not None and average > 1:
@@ -127,15 +99,17 @@ def live(
     recorded = check_output(record, "--record", ".bag") if record else None
     recording = cameras.Recording(recorded, optional=True, overwrite=overwrite) if recorded else None
     frame_log = loop.FrameLog(check_output(log, "--log", *loop.LOG_SUFFIXES)) if log else None
-    view_file = check_output(save_view, "--save-view", SUFFIX) if save_view else None
+    view_file = check_output(save_view, "--save-view", views.SESSION_SUFFIX) if save_view else None
     control = loop.RunControl(camera)
-    with viewer_of(control, no_view=no_view, host=view_host, port=view_port) as viewer:  # serves before the camera runs
-        announce = once(partial(announce_view, viewer, host=view_host, port=view_port, open_it=open_view))
-        with interrupted_by_signals():
-            with tracked(
+    with viewing.viewer_of(
+        control, no_view=no_view, host=view_host, port=view_port
+    ) as viewer:  # serves before the camera runs
+        announce = cache(partial(viewing.announce_view, viewer, host=view_host, port=view_port, open_it=open_view))
+        with common.interrupted_by_signals():
+            with common.tracked(
                 "Pre-rendering the simulated scene (first run only, about 90 s)", at_once=False
             ) as on_progress:
-                on_rendering = each_of(lambda _, __: announce(), on_progress, control.show_progress)
+                on_rendering = viewing.each_of(lambda _, __: announce(), on_progress, control.show_progress)
                 opened = cameras.open_camera(camera, on_progress=on_rendering, recording=recording)
             announce()
             bench = reconstruct.open_bench(wall, opened)
@@ -147,9 +121,9 @@ def live(
         control.on_bench = lambda bench: viewer.begin(bench.rig, bench.measured)
         loop.offer_settings(control, opened, bench, tradeoff, weights)
         with (
-            stop_on_signals() as stop,
+            common.stop_on_signals() as stop,
             loop.realtime_priority(),
-            saving(viewer, bench, view_file) as viewers,
+            viewing.saving(viewer, bench, view_file) as viewers,
             frame_log or nullcontext(),
             loop.low_latency_interpreter(),
             opened as source,
@@ -162,23 +136,23 @@ def live(
                 seconds=seconds,
                 recorded=camera.startswith("bag:"),
                 clock=cameras.WallClock().now,
-                on_error=lambda report: say(summary(report, verbose=Detail.verbose)),
+                on_error=lambda report: common.say(summary(report, verbose=common.Detail.verbose)),
                 on_warning=warn,
                 on_moment=frame_log.add if frame_log else loop.ignore,
                 control=control,
             )
     if log:
-        say(f"Logged each frame to {log}")
+        common.say(f"Logged each frame to {log}")
     if recording:
-        say(f"Recorded {recording.sets} frames to {recording.path}")
+        common.say(f"Recorded {recording.sets} frames to {recording.path}")
     if view_file:
-        say(f"Saved the view: open {view_file} in a browser")
-    text, budget = summary(report, verbose=Detail.verbose), {}
+        common.say(f"Saved the view: open {view_file} in a browser")
+    text, budget = summary(report, verbose=common.Detail.verbose), {}
     if choice:
         text, budget = f"{text}\n{choice.describe_outcome(report)}", {"budget": choice.outcome(report)}
-    finish({**asdict(report), **budget}, as_json=json, text=text)
+    common.finish({**asdict(report), **budget}, as_json=json, text=text)
     if stop.is_set():
-        exit_interrupted(f"{report.frames} frames were processed")
+        common.exit_interrupted(f"{report.frames} frames were processed")
 
 
 def replay(
@@ -188,18 +162,18 @@ def replay(
     weights: Weights = None,
     average: Average = 1,
     reader: ReadBy = "plain",
-    save_view: SaveReplayView = False,
-    stills: Stills = 0,
-    video: Video = False,
+    save_view: viewing.SaveReplayView = False,
+    stills: viewing.Stills = 0,
+    video: viewing.Video = False,
     as_object: AsObject = "",
     every: Every = 1,
-    overwrite: Overwrite = False,
-    json: Json = False,
+    overwrite: common.Overwrite = False,
+    json: common.Json = False,
 ) -> None:
     """Reconstruct every frame of a recording: the same frames and the same bits each time."""
     formats = object_formats(as_object)
-    path = output_path(out, "replay", "", overwrite=overwrite)
-    with interrupted_by_signals():
+    path = common.output_path(out, "replay", "", overwrite=overwrite)
+    with common.interrupted_by_signals():
         opened = cameras.open_camera(f"bag:{bag}", reader=reader)
         bench = reconstruct.open_bench(wall, opened)
         from nlos_cam.reconstruct import PeriodicPhysicsCheck  # the renderer takes a second to import
@@ -208,7 +182,7 @@ def replay(
         pipeline = _build_pipeline(
             bench, reconstruct.load_networks(weights), reconstruct.load_uncertainty(weights), average, checks
         )
-    with opened as source, stop_on_signals() as stop, progress() as bar:
+    with opened as source, common.stop_on_signals() as stop, common.progress() as bar:
         task = bar.add_task("reconstructing", total=None)
         report = loop.replay_recording(
             source,
@@ -220,16 +194,16 @@ def replay(
             media=loop.ReplayMedia(bench, view=save_view, stills=stills, video=video, objects=formats, every=every),
         )
     text = f"Reconstructed {report.frames} frames in {report.seconds:.1f} s: open {path / loop.REPORT}"
-    finish(asdict(report), as_json=json, text=text)
+    common.finish(asdict(report), as_json=json, text=text)
     if stop.is_set():
-        exit_interrupted(f"{path} holds the first {report.frames} frames")
+        common.exit_interrupted(f"{path} holds the first {report.frames} frames")
 
 
 def _check_output(path: Path, option: str, *suffixes: str, overwrite: bool) -> Path:
     """Return the path if it can be written. Raises typer.BadParameter for another suffix."""
     if path.suffix not in suffixes:
         raise typer.BadParameter(f"{option} {path}: choose a name that ends in {' or '.join(suffixes)}")
-    return output_path(path, "live", path.suffix, overwrite=overwrite)
+    return common.output_path(path, "live", path.suffix, overwrite=overwrite)
 
 
 def _runtimes(*which: Any) -> Any:
@@ -257,7 +231,7 @@ def _choose_pipeline(
     # timed with the uncertainty model of `weights`: others take as long
     build = partial(reconstruct.build_pipeline, bench, uncertainty_model=uncertainty_model)
     network, choice = loop.choose_within_budget(budget_ms, settings, build, load, loop.pipeline_timer(camera))
-    say(choice.describe())
+    common.say(choice.describe())
     if choice.setting.weights != loop.SHIPPED:
         uncertainty_model = reconstruct.load_uncertainty(Path(choice.setting.weights))
     return _build_pipeline(bench, network, uncertainty_model, choice.setting.frames, checks), choice
@@ -271,15 +245,15 @@ def _build_pipeline(
     checks: reconstruct.PhysicsCheck,
 ) -> reconstruct.Pipeline:
     """Build the pipeline, and print the model's name and its mismatches with the bench."""
-    say(f"Loaded model {network.record.rig_name} ({network.runtime})")
+    common.say(f"Loaded model {network.record.rig_name} ({network.runtime})")
     for warning in reconstruct.compatibility_warnings(bench, network.record, uncertainty_model):
-        say(f"note: {warning}")
+        common.say(f"note: {warning}")
     return reconstruct.build_pipeline(bench, network, average, uncertainty_model=uncertainty_model, checks=checks)
 
 
 def warn(warning: str, begins: bool) -> None:
     """Print that a warning begins, or ends."""
-    say(f"[yellow]warning:[/] {escape(warning)}" if begins else f"no longer: {escape(warning)}", marked=True)
+    common.say(f"[yellow]warning:[/] {escape(warning)}" if begins else f"no longer: {escape(warning)}", marked=True)
 
 
 def _warn_once(warning: str) -> None:

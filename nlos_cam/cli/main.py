@@ -12,18 +12,8 @@ from nlos_calibration.errors import CalibrationError
 from nlos_models.errors import ModelError
 from typer.main import get_command
 
+from nlos_cam.cli import common
 from nlos_cam.cli import run as run  # noqa: PLC0414  scripts of earlier installations find it here
-from nlos_cam.cli.common import (
-    INTERRUPTED,
-    interrupted_by_signals,
-    release_outputs,
-    reserved_outputs,
-    say_error,
-    say_interrupted,
-    set_detail,
-    stderr,
-    stop_on_signals,
-)
 from nlos_cam.cli.config import shared_options
 from nlos_cam.cli.plain_help import plain_help
 from nlos_cam.cli.usage import usage_lines, usage_reason
@@ -137,12 +127,12 @@ def main(arguments: list[str]) -> int:
     """Run one command and return its exit code (see docs/reference.md: 0, 1, 2, 3, 4, 130)."""
     as_json = "--json" in arguments
     command, arguments = _split(arguments)
-    set_detail()
+    common.set_detail()
     try:
         return _run(command, arguments)
     except (typer.Abort, KeyboardInterrupt):
-        say_interrupted()
-        return INTERRUPTED
+        common.say_interrupted()
+        return common.INTERRUPTED
     except typer.TyperException as error:
         return _report_usage(error, as_json=as_json)
     except (NlosCamError, CalibrationError, ModelError) as error:
@@ -152,22 +142,22 @@ def main(arguments: list[str]) -> int:
             raise
         return _report(known, as_json=as_json)
     finally:
-        release_outputs()
+        common.release_outputs()
 
 
 def _run(command: str, arguments: list[str]) -> int:
-    with interrupted_by_signals():
+    with common.interrupted_by_signals():
         if command in COMMANDS:
             _check_address_space(TORCH_ADDRESS_BYTES if command == "train" else MIN_ADDRESS_BYTES)
-        with stop_on_signals() as stop:  # an interrupted import can end in any error of any library
+        with common.stop_on_signals() as stop:  # an interrupted import can end in any error of any library
             app = build_app(None if COMPLETION in os.environ else command)
             tree = get_command(app)
             plain_help(tree)
         if stop.is_set():
             raise KeyboardInterrupt
         code = tree(arguments or ["--help"], prog_name="nlos-cam", standalone_mode=False) or 0
-    if code == INTERRUPTED:
-        say_interrupted()
+    if code == common.INTERRUPTED:
+        common.say_interrupted()
     return code
 
 
@@ -206,17 +196,16 @@ def _known_error(error: Exception, command: str) -> NlosCamError | ModelError | 
 
 
 def _file_error(error: OSError) -> NlosCamError:
-    """Return the system's error about a file as one of ours."""
     if error.errno not in models.DISK_ERRORS:
         return RecordingError(
             f"{error.filename}: {error.strerror}: check that the file exists and that you have permission"
         )
-    name = error.filename or " and ".join(map(str, reserved_outputs())) or "standard output"
+    name = error.filename or " and ".join(map(str, common.reserved_outputs())) or "standard output"
     return DiskFullError(f"{name} cannot be written ({error.strerror}): free some space or choose another folder")
 
 
 def _report(error: NlosCamError | CalibrationError | ModelError, *, as_json: bool) -> int:
-    say_error(str(error))
+    common.say_error(str(error))
     if as_json:
         _print_error(type(error).__name__, str(error))
     return error.exit_code
@@ -225,12 +214,12 @@ def _report(error: NlosCamError | CalibrationError | ModelError, *, as_json: boo
 def _report_usage(error: typer.TyperException, *, as_json: bool) -> int:
     usage, hint = usage_lines(error)
     reason = usage_reason(error)
-    stderr.quiet = False
+    common.stderr.quiet = False
     if usage:
-        stderr.print(usage, soft_wrap=True, markup=False)
-    say_error(reason)
+        common.stderr.print(usage, soft_wrap=True, markup=False)
+    common.say_error(reason)
     if hint:
-        stderr.print(hint, soft_wrap=True, markup=False)
+        common.stderr.print(hint, soft_wrap=True, markup=False)
     if as_json:
         _print_error("UsageError", reason)
     return error.exit_code

@@ -9,18 +9,7 @@ import typer
 
 from nlos_cam import live as loop
 from nlos_cam import recording as bags
-from nlos_cam.cli.common import (
-    INTERRUPTED,
-    Json,
-    Overwrite,
-    exit_interrupted,
-    finish,
-    interrupted_by_signals,
-    output_path,
-    progress,
-    stop_on_signals,
-    tracked,
-)
+from nlos_cam.cli import common
 from nlos_cam.errors import RecordingError
 
 DamagedBag = Annotated[Path, typer.Argument(metavar="F.BAG", help="Recording that was killed, cut short or damaged.")]
@@ -59,12 +48,12 @@ def object_formats(text: str) -> list[str]:
     return names
 
 
-def repair(bag: DamagedBag, out: NewBag = None, overwrite: Overwrite = False, json: Json = False) -> None:
+def repair(bag: DamagedBag, out: NewBag = None, overwrite: common.Overwrite = False, json: common.Json = False) -> None:
     """Write the undamaged part of a recording, with a new index, to a new file; the original is not changed."""
     if out is not None and out.suffix != ".bag":
         raise typer.BadParameter(f"--out {out}: the name of a recording must end in .bag")
-    path = output_path(out, "repaired", ".bag", overwrite=overwrite)
-    with interrupted_by_signals(), tracked("repairing") as report:
+    path = common.output_path(out, "repaired", ".bag", overwrite=overwrite)
+    with common.interrupted_by_signals(), common.tracked("repairing") as report:
         repaired = bags.repair_recording(bag, path, report)
     result = {
         "recovered_frames": repaired.recovered_frames,
@@ -72,7 +61,7 @@ def repair(bag: DamagedBag, out: NewBag = None, overwrite: Overwrite = False, js
         "damaged": len(repaired.damages),
         "out": str(path),
     }
-    finish(result, as_json=json, text=_format_repair(repaired))
+    common.finish(result, as_json=json, text=_format_repair(repaired))
 
 
 def _format_repair(repaired: bags.RepairResult) -> str:
@@ -93,18 +82,18 @@ def export(
     streams: Streams = "",
     every: Every = 1,
     as_object: AsObject = "",
-    overwrite: Overwrite = False,
-    json: Json = False,
+    overwrite: common.Overwrite = False,
+    json: common.Json = False,
 ) -> None:
     """Write a recording's frames as files, or a replay's hidden surfaces for other programs."""
-    folder = output_path(out, "export", "", overwrite=overwrite)
+    folder = common.output_path(out, "export", "", overwrite=overwrite)
     if bag.suffix == ".npz" or as_object:
         _export_objects(bag, folder, object_formats(as_object), every, as_json=json)
         return
     names = [name.strip() for name in streams.split(",") if name.strip()]
     options, recording = bags.ExportOptions(form, ply, names, every), bags.BagReader(bag)
     total = sum(info.frames for name, info in recording.streams.items() if not names or name in names)
-    with stop_on_signals() as stop, progress() as bar:
+    with common.stop_on_signals() as stop, common.progress() as bar:
         task = bar.add_task("exporting", total=total)
         exported = bags.export_recording(recording, folder, options, stop=stop, on_frame=lambda: bar.advance(task))
     if exported.damage:
@@ -113,9 +102,9 @@ def export(
     clouds = counts.pop("points", 0)
     text = ", ".join(f"{count} {name}" for name, count in counts.items()) + " images"
     text += f"; {clouds} point cloud{'' if clouds == 1 else 's'}" if clouds else ""
-    finish({"frames": exported.frames, "out": exported.out}, as_json=json, text=f"{text}\nWrote {exported.out}")
+    common.finish({"frames": exported.frames, "out": exported.out}, as_json=json, text=f"{text}\nWrote {exported.out}")
     if stop.is_set():
-        exit_interrupted(f"{exported.out} holds the frames until then")
+        common.exit_interrupted(f"{exported.out} holds the frames until then")
 
 
 def _export_objects(result: Path, folder: Path, formats: list[str], every: int, *, as_json: bool) -> None:
@@ -123,9 +112,9 @@ def _export_objects(result: Path, folder: Path, formats: list[str], every: int, 
         raise typer.BadParameter(f"{result}: give the formats of its hidden surfaces, as in --object ply,glb,csv")
     if result.suffix == ".bag":
         raise typer.BadParameter(f"--object needs a replay's result: nlos-cam replay {result} --object ply,glb,csv")
-    with stop_on_signals() as stop, tracked("exporting") as on_frame:
+    with common.stop_on_signals() as stop, common.tracked("exporting") as on_frame:
         count = loop.export_objects(result, folder, formats, every, stop=stop, on_frame=on_frame)
     text = f"Hidden surfaces of {count} frame{'' if count == 1 else 's'} as {', '.join(formats)}\nWrote {folder}"
-    finish({"frames": {"objects": count}, "out": str(folder)}, as_json=as_json, text=text)
+    common.finish({"frames": {"objects": count}, "out": str(folder)}, as_json=as_json, text=text)
     if stop.is_set():
-        raise typer.Exit(INTERRUPTED)
+        raise typer.Exit(common.INTERRUPTED)

@@ -89,17 +89,11 @@ def _as_option(problem: str) -> str:
 
 
 def _numbers(text: str) -> float | tuple[float, ...]:
-    """Return one number, or those between commas."""
     try:
         values = tuple(float(part) for part in text.split(","))
     except ValueError as error:
         raise typer.BadParameter(f"--albedo takes 1 number or 3 with commas between, got {text!r}") from error
     return values[0] if len(values) == 1 else values
-
-
-def effects_of(text: str) -> renderer.Effects:
-    """Return the effects named by `--effects`."""
-    return "auto" if text == "auto" else [name for name in text.split(",") if name]
 
 
 def accuracy_of(
@@ -223,7 +217,8 @@ def render(
     angles = {"tilt_x_deg": tilt_x_deg, "tilt_y_deg": tilt_y_deg, "turn_deg": turn_deg}
     place = {"size_m": size_m, "x_m": x_m, "y_m": y_m, "front_m": front_m}
     depth_m = hidden_depth(hidden, bare.rig, {"seed": seed, "up": up, **angles, **place})
-    target, wanted = replace(bare, object_depth_m=depth_m), effects_of(effects)
+    target = replace(bare, object_depth_m=depth_m)
+    wanted: renderer.Effects = "auto" if effects == "auto" else [name for name in effects.split(",") if name]
     setting = accuracy_of(accuracy, max_error, max_seconds, beams_per_cell, target, wanted, backend)
     start_s = time.perf_counter()
     rendering = renderer.render(target, setting, wanted, backend)
@@ -279,11 +274,10 @@ def _table(effects: list[dict[str, Any]]) -> Table:
 
 
 def _draw(path: Path, title: str, depth_m: Float32, rendering: renderer.Rendering) -> None:
-    from matplotlib.figure import Figure
-
     from nlos_cam.files import atomic_file
+    from nlos_cam.report import figure_of
 
-    figure = Figure(figsize=(13, 3.3), layout="constrained")
+    figure = figure_of(13, 3.3)
     maps = {
         "hidden depth (m from the wall)": depth_m,
         "lidar depth (m)": rendering.depth_m,

@@ -11,16 +11,7 @@ import typer
 
 from nlos_cam import evaluate as measure
 from nlos_cam import render as renderer
-from nlos_cam.cli.common import (
-    Json,
-    Overwrite,
-    exit_interrupted,
-    finish,
-    interrupted_by_signals,
-    output_path,
-    say,
-    tracked,
-)
+from nlos_cam.cli import common
 from nlos_cam.cli.render import hidden_depth
 from nlos_cam.files import cache_folder
 
@@ -42,17 +33,17 @@ def render(
         str | None, typer.Option("--object", help="Category, mesh or depth map to hide (default: an airplane).")
     ] = None,
     seed: Annotated[int | None, typer.Option("--seed", min=0, help="Variation of the category.")] = None,
-    overwrite: Overwrite = False,
-    json: Json = False,
+    overwrite: common.Overwrite = False,
+    json: common.Json = False,
 ) -> None:
     """Measure the renderer's accuracy stops and their ingredients against brute force (about 30 s)."""
     if seed is not None and category is None:
         raise typer.BadParameter("--seed is the variation of an --object: give both")
-    folder = output_path(out, "tradeoff", "", overwrite=overwrite)
+    folder = common.output_path(out, "tradeoff", "", overwrite=overwrite)
     scene = _scene(category, seed or 0)
     size, planned = measure.render_facts(scene), len(measure.render_settings(scene))
     rows: list[measure.RenderRow] = []
-    say("Rendering the reference first (slowest step, about 30 s)")
+    common.say("Rendering the reference first (slowest step, about 30 s)")
     interrupted = _collect(measure.measure_renders(scene), rows, planned)
     table = measure.as_table(size, rows, planned)
     if rows:
@@ -69,16 +60,16 @@ def reconstruct(
     count: Annotated[
         int | None, typer.Option("--count", min=1, help="Number of random objects, instead of the 54 test objects.")
     ] = None,
-    overwrite: Overwrite = False,
-    json: Json = False,
+    overwrite: common.Overwrite = False,
+    json: common.Json = False,
 ) -> None:
     """Measure number formats, runtimes, threads and averaged frames on the test objects (1 to 2 minutes)."""
-    folder = output_path(out, "tradeoff", "", overwrite=overwrite)
+    folder = common.output_path(out, "tradeoff", "", overwrite=overwrite)
     folders: dict[str, Path | None] = {str(path): path for path in weights} if weights else {"shipped": None}
     rows: list[measure.RuntimeRow] = []
-    with interrupted_by_signals():
-        say("Rendering test objects, exporting and quantising networks first")
-        bench = measure.open_runtime_bench(folders, count, tracked)
+    with common.interrupted_by_signals():
+        common.say("Rendering test objects, exporting and quantising networks first")
+        bench = measure.open_runtime_bench(folders, count, common.tracked)
         makes = {
             name: measure.runtimes(path, bench.rig, bench.box, cache_folder() / "onnx")
             for name, path in folders.items()
@@ -101,7 +92,7 @@ def _scene(category: str | None, seed: int) -> renderer.Scene:
 def _collect(measured: Iterator[R], rows: list[R], planned: int) -> bool:
     """Append rows as they are measured; return True if interrupted."""
     try:
-        with interrupted_by_signals(), tracked("measuring") as on_progress:
+        with common.interrupted_by_signals(), common.tracked("measuring") as on_progress:
             on_progress(0, planned)
             for row in measured:
                 rows.append(row)
@@ -117,6 +108,6 @@ def _finish(
     text = "Nothing measured"
     if done:
         text = f"Measured {done} of {planned} settings: open {folder / measure.TRADEOFF_REPORT}"
-    finish({**table, "out": str(folder) if done else None}, as_json=as_json, text=text)
+    common.finish({**table, "out": str(folder) if done else None}, as_json=as_json, text=text)
     if interrupted:
-        exit_interrupted(f"{done} of {planned} settings are measured")
+        common.exit_interrupted(f"{done} of {planned} settings are measured")

@@ -198,8 +198,7 @@ def direct(
     ],
     held_out_data: HeldOut,
     weights: Annotated[
-        Path | None,
-        typer.Option("--weights", help='Direct weights that a recipe with start = "weights" goes on from.'),
+        Path | None, typer.Option("--weights", help='Direct weights that a recipe with start = "weights" goes on from.')
     ] = None,
     store: Annotated[
         Path | None, typer.Option("--store", help="Folder of the packed maps, kept for other runs (default: in --out).")
@@ -277,13 +276,9 @@ def doubt(
 
 
 def quality(
-    weights: Annotated[
-        Path,
-        typer.Option("--weights", help="Weights with an uncertainty network; gets quality.json."),
-    ],
+    weights: Annotated[Path, typer.Option("--weights", help="Weights with an uncertainty network; gets quality.json.")],
     data: Annotated[
-        Path,
-        typer.Option("--dataset", help="Maps that the weights were not trained on, with generic shapes."),
+        Path, typer.Option("--dataset", help="Maps that the weights were not trained on, with generic shapes.")
     ],
     objects: Annotated[int, typer.Option("--objects", min=100, help="Number of objects.")] = 6000,
     json: Json = False,

@@ -31,8 +31,7 @@ ViewPort = Annotated[
     ),
 ]
 ViewHost = Annotated[
-    str | None,
-    typer.Option("--view-host", help="Address to serve the view on for other machines (0.0.0.0: all)."),
+    str | None, typer.Option("--view-host", help="Address to serve the view on for other machines (0.0.0.0: all).")
 ]
 Open = Annotated[bool, typer.Option("--open", help="Open the view in the default browser.")]
 DESKTOPS = "DISPLAY", "WAYLAND_DISPLAY", "BROWSER"
@@ -48,17 +47,6 @@ def viewer_of(
         return views.NullViewer()
     control.thread_start = loop.yield_to_loop  # an ordinary thread could be stopped while it holds Python's lock
     return views.WebViewer(host=host or views.LOOPBACK, port=port, controls=control, on_thread=loop.yield_to_loop)
-
-
-def once(function: Callable[[], None]) -> Callable[[], None]:
-    """Return the function, without effect after its first call."""
-    waiting = [function]
-
-    def call() -> None:
-        if waiting:
-            waiting.pop()()
-
-    return call
 
 
 def each_of(*functions: Callable[[int, int], None]) -> Callable[[int, int], None]:
@@ -104,7 +92,6 @@ def opened_in_browser(address: str) -> bool:
         return False
 
 
-SUFFIX = ".html"
 SaveView = Annotated[
     Path | None, typer.Option("--save-view", help="Save the view to this .html file, which any browser plays.")
 ]

@@ -5,38 +5,14 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from zlib import crc32
 
+import nlos_models as models
 import numpy as np
 from nlos_calibration import Rig
 from nlos_calibration.arrays import Float32
-from nlos_models import (
-    DoubtSet,
-    MapSet,
-    QualitySet,
-    Recipe,
-    Reconstructor,
-    UncertaintyModel,
-    ask,
-    first_of,
-    parts_of,
-    quality_features,
-    read_arrays,
-    silhouette_iou,
-)
 from numpy.typing import NDArray
 
+from nlos_cam.dataset import outliers
 from nlos_cam.dataset.build import HELD_OUT_SEED, TRAINING_SEED
-from nlos_cam.dataset.outliers import (
-    HELD_OUT_OUTLIERS,
-    SLIGHT,
-    TRAINING_OUTLIERS,
-    Stimulus,
-    draw_outlier,
-    generic,
-    ordinary,
-    outliers_beside,
-    vary_bench,
-    vary_empty_bench,
-)
 from nlos_cam.dataset.reader import Dataset
 from nlos_cam.dataset.samples import OnProgress, cached_sensor, ignore
 from nlos_cam.errors import SceneError
@@ -57,7 +33,12 @@ VERSION = 2
 """Raise it when a seed makes another sample."""
 _STREAM = 5
 """Seeds these random numbers apart from those of datasets."""
-KINDS = {ORDINARY: ordinary, GENERIC: generic, **TRAINING_OUTLIERS, **HELD_OUT_OUTLIERS}
+KINDS = {
+    ORDINARY: outliers.ordinary,
+    GENERIC: outliers.generic,
+    **outliers.TRAINING_OUTLIERS,
+    **outliers.HELD_OUT_OUTLIERS,
+}
 MIN_CELLS = 8
 """Training leaves out outliers that change fewer cells of the maps: they hardly differ from an empty bench."""
 HELD_OUT_SHARE = 0.15
@@ -113,28 +94,28 @@ def _generator(kind: str, seed: int, stream: int) -> np.random.Generator:
     return np.random.default_rng([crc32(kind.encode()), seed, _STREAM, stream])
 
 
-def _stimulus(kind: str, seed: int, rig: Rig, sensor: SensorModel) -> Stimulus:
+def _stimulus(kind: str, seed: int, rig: Rig, sensor: SensorModel) -> outliers.Stimulus:
     bench_generator = _generator(kind, seed // SEEDS_PER_BENCH, 0)
     if kind == EMPTY:
-        return Stimulus(*vary_empty_bench(rig, sensor, bench_generator))
+        return outliers.Stimulus(*outliers.vary_empty_bench(rig, sensor, bench_generator))
     slight = kind in USUAL or seed // SEEDS_PER_BENCH % 2
-    bench = vary_bench(rig, sensor, SLIGHT, bench_generator) if slight else (rig, sensor)
-    return draw_outlier(KINDS[kind], _generator(kind, seed, 1), Stimulus(*bench))
+    bench = outliers.vary_bench(rig, sensor, outliers.SLIGHT, bench_generator) if slight else (rig, sensor)
+    return outliers.draw_outlier(KINDS[kind], _generator(kind, seed, 1), outliers.Stimulus(*bench))
 
 
-def _sense(stimulus: Stimulus, rendering: Rendering, noise: np.random.Generator) -> LidarMaps:
+def _sense(stimulus: outliers.Stimulus, rendering: Rendering, noise: np.random.Generator) -> LidarMaps:
     sensor = cached_sensor(stimulus.rig, stimulus.sensor)  # pyright: ignore[reportArgumentType]  frozen, so hashable
     images = sensor.expose(rendering.multi, noise)
     return maps_from_frame(images.frame(stimulus.rig.pinhole))
 
 
-def _truth(stimulus: Stimulus) -> NDArray[np.float16]:
+def _truth(stimulus: outliers.Stimulus) -> NDArray[np.float16]:
     empty = np.full((OBJECT_PIXELS, OBJECT_PIXELS), np.nan, np.float32)
     depth_m = empty if stimulus.depth_m is None else stimulus.depth_m
     return image_from_depth(depth_m, stimulus.box).astype(np.float16)
 
 
-def _visible_cells(stimulus: Stimulus, rendering: Rendering) -> int:
+def _visible_cells(stimulus: outliers.Stimulus, rendering: Rendering) -> int:
     """Return the number of cells whose depth differs from the bare wall's."""
     bare_m = render(replace(stimulus.scene, object_depth_m=None)).depth_m
     return int(np.count_nonzero(np.abs(rendering.depth_m - bare_m) > BESIDE_M))
@@ -157,7 +138,7 @@ def samples_on_disk(
     for kind, seeds in _pieces(counts, first_seed):
         path = folder / f"{about}-{kind.replace(' ', '_')}-{seeds.start}-{len(seeds)}.npz"
         try:
-            part = DoubtSamples(**read_arrays(path))
+            part = DoubtSamples(**models.read_arrays(path))
         except (OSError, ValueError, TypeError):  # absent, or damaged: it is made again
             part = make_samples(kind, seeds, rig, sensor, accuracy)
             with atomic_file(path) as unfinished, unfinished.open("wb") as file:
@@ -173,47 +154,49 @@ def _pieces(counts: Mapping[str, int], first_seed: int) -> Iterator[tuple[str, r
             yield kind, range(start, min(start + PIECE, first_seed + count))
 
 
-def counts_of(recipe: Recipe, share_generic: float = 0.0) -> dict[str, int]:
+def counts_of(recipe: models.Recipe, share_generic: float = 0.0) -> dict[str, int]:
     """Return the number of samples to render of each kind, for training objects with a share of generic shapes.
 
     Benches that deviate slightly have as many usual objects as outliers, so that the deviation does not give outliers
     away.
     """
-    per_kind = dict.fromkeys(outliers_beside(share_generic), recipe.outliers)
+    per_kind = dict.fromkeys(outliers.outliers_beside(share_generic), recipe.outliers)
     usual = sum(per_kind.values()) // 2
     shapes = {GENERIC: round(share_generic * usual)} if share_generic else {}
     return {EMPTY: recipe.empties, ORDINARY: usual - sum(shapes.values()), **shapes, **per_kind}
 
 
-def _doubt_set(pipeline: Reconstructor, ordinary_maps: MapSet, samples: DoubtSamples) -> DoubtSet:
+def _doubt_set(pipeline: models.Reconstructor, ordinary_maps: models.MapSet, samples: DoubtSamples) -> models.DoubtSet:
     """Return a dataset's maps of ordinary objects and the visible samples, with the pipeline's images of both."""
     nothing = samples.kind == EMPTY
     outside = ~nothing & ~np.isin(samples.kind, USUAL)
-    images = _images(pipeline, MapSet(samples.depth_m, samples.intensity, samples.image))
-    drawn = DoubtSet(samples.depth_m, samples.intensity, images, samples.image, nothing, outside)
+    images = _images(pipeline, models.MapSet(samples.depth_m, samples.intensity, samples.image))
+    drawn = models.DoubtSet(samples.depth_m, samples.intensity, images, samples.image, nothing, outside)
     drawn = drawn.where((samples.cells >= MIN_CELLS) | nothing)
     depth_m, intensity, truth = ordinary_maps.depth_m, ordinary_maps.intensity, ordinary_maps.image.astype(np.float16)
     no = np.zeros(len(truth), np.bool_)
-    usual = DoubtSet(depth_m, intensity, _images(pipeline, ordinary_maps), truth, no, no)
-    return DoubtSet(**{name: np.concatenate([values, vars(drawn)[name]]) for name, values in vars(usual).items()})
+    usual = models.DoubtSet(depth_m, intensity, _images(pipeline, ordinary_maps), truth, no, no)
+    return models.DoubtSet(
+        **{name: np.concatenate([values, vars(drawn)[name]]) for name, values in vars(usual).items()}
+    )
 
 
-def _images(pipeline: Reconstructor, maps: MapSet) -> NDArray[np.float16]:
-    pairs = zip(parts_of(maps.depth_m), parts_of(maps.intensity), strict=True)
+def _images(pipeline: models.Reconstructor, maps: models.MapSet) -> NDArray[np.float16]:
+    pairs = zip(models.parts_of(maps.depth_m), models.parts_of(maps.intensity), strict=True)
     return np.concatenate([pipeline(*pair) for pair in pairs]).astype(np.float16)
 
 
 def doubt_sets(
-    recipe: Recipe,
-    pipeline: Reconstructor,
+    recipe: models.Recipe,
+    pipeline: models.Reconstructor,
     datasets: tuple[Dataset, Dataset],
     folder: Path,
     on_progress: OnProgress = ignore,
-) -> list[DoubtSet]:
+) -> list[models.DoubtSet]:
     """Return the training set and the held-out set of an uncertainty network; rendered samples are kept in `folder`."""
     counts = counts_of(recipe, datasets[0].plan.objects.share_generic)
     held_out_counts = {kind: round(HELD_OUT_SHARE * count) for kind, count in counts.items()}
-    sets: list[DoubtSet] = []
+    sets: list[models.DoubtSet] = []
     for dataset, objects, kinds, seed in (
         (datasets[0], recipe.objects, counts, TRAINING_SEED),
         (datasets[1], recipe.held_out, held_out_counts, HELD_OUT_SEED),
@@ -222,17 +205,17 @@ def doubt_sets(
         samples = samples_on_disk(
             folder, kinds, seed, plan.rig, plan.sensor, accuracy=plan.accuracy, on_progress=on_progress
         )
-        sets.append(_doubt_set(pipeline, first_of(dataset.arrays(), objects), samples))
+        sets.append(_doubt_set(pipeline, models.first_of(dataset.arrays(), objects), samples))
     return sets
 
 
 def quality_set(
-    pipeline: Reconstructor,
-    uncertainty_model: UncertaintyModel,
+    pipeline: models.Reconstructor,
+    uncertainty_model: models.UncertaintyModel,
     dataset: Dataset,
     objects: int,
     on_progress: OnProgress,
-) -> QualitySet:
+) -> models.QualitySet:
     """Return figures and true quality of the reconstructions of a dataset's first objects.
 
     Raises SceneError where weights and dataset do not fit together.
@@ -244,17 +227,16 @@ def quality_set(
     for maps in dataset.chunks():
         if done == len(kinds):
             break
-        for part in parts_of(np.arange(min(len(maps.image), len(kinds) - done))):
+        for part in models.parts_of(np.arange(min(len(maps.image), len(kinds) - done))):
             depth_m, intensity, truth = maps.depth_m[part], maps.intensity[part], maps.image[part].astype(np.float32)
-            image, surface = ask(pipeline, depth_m, intensity)
-            figures.append(quality_features(image, uncertainty_model(depth_m, intensity, image), surface))
-            iou.append(silhouette_iou(image, truth).astype(np.float32))
+            image, surface = models.ask(pipeline, depth_m, intensity)
+            figures.append(models.quality_features(image, uncertainty_model(depth_m, intensity, image), surface))
+            iou.append(models.silhouette_iou(image, truth).astype(np.float32))
             error_v.append(shared_error_v(image, truth))
             done += len(part)
             on_progress(done, len(kinds))
     found = np.concatenate(iou), np.concatenate(error_v)
-    generic = ~np.isin(kinds, tuple(CATEGORIES))
-    return QualitySet(np.concatenate(figures), *found, kinds, generic)
+    return models.QualitySet(np.concatenate(figures), *found, kinds, ~np.isin(kinds, tuple(CATEGORIES)))
 
 
 def shared_error_v(image: Float32, truth: Float32) -> Float32:
@@ -264,7 +246,9 @@ def shared_error_v(image: Float32, truth: Float32) -> Float32:
     return np.where(count > 0, total / np.maximum(count, 1), np.nan).astype(np.float32)
 
 
-def check_doubt_data(recipe: Recipe, pipeline: Reconstructor, training: Dataset, held_out: Dataset) -> None:
+def check_doubt_data(
+    recipe: models.Recipe, pipeline: models.Reconstructor, training: Dataset, held_out: Dataset
+) -> None:
     """Raise SceneError where datasets, weights and recipe do not fit together."""
     if pipeline.record.input != "raw maps":
         raise SceneError(

@@ -91,12 +91,13 @@ def _unpacked(stored: h5py.Dataset, name: str, chunk_shape: tuple[int, ...], fil
     values = np.empty(shape, dtype)
     for chunk in chunks:
         mask, packed = stored.id.read_direct_chunk(chunk.chunk_offset)
-        content = _inflated(packed, chunk_bytes) if filters and not mask & 1 else packed
-        if len(content) != chunk_bytes:
+        if filters and not mask & 1:
+            packed = zlib.decompressobj().decompress(packed, chunk_bytes + 1)
+        if len(packed) != chunk_bytes:
             raise ValueError(f"a chunk of {name} does not unpack to its {chunk_bytes} bytes")
         place = tuple(slice(start, start + size) for start, size in zip(chunk.chunk_offset, chunk_shape, strict=True))
         target = values[place]
-        target[...] = np.frombuffer(content, dtype).reshape(chunk_shape)[tuple(map(slice, target.shape))]
+        target[...] = np.frombuffer(packed, dtype).reshape(chunk_shape)[tuple(map(slice, target.shape))]
     return values
 
 
@@ -110,8 +111,3 @@ def _chunks(stored: h5py.Dataset, count: int) -> list[Any]:
 
     stored.id.chunk_iter(take)
     return found
-
-
-def _inflated(packed: bytes, limit: int) -> bytes:
-    """Return the content of packed bytes, or what of it exceeds the limit by one byte."""
-    return zlib.decompressobj().decompress(packed, limit + 1)

@@ -13,6 +13,7 @@ from nlos_calibration.arrays import Float32
 from nlos_models import MapSet
 from pydantic import ValidationError
 
+from nlos_cam import objects as shapes
 from nlos_cam.dataset.build import SHARD
 from nlos_cam.dataset.plan import DatasetPlan, scene_row
 from nlos_cam.dataset.reader import MAP_CHANNELS
@@ -21,15 +22,6 @@ from nlos_cam.dataset.shards import SHARD_PATTERN, shard_path, store
 from nlos_cam.errors import DiskFullError, RecordingError
 from nlos_cam.files import atomic_directory
 from nlos_cam.frames import OBJECT_PIXELS, maps_from_frame
-from nlos_cam.objects import (
-    DEPTH_MAP_SUFFIX,
-    MESH_SUFFIXES,
-    benchmark_objects,
-    image_from_depth,
-    invisible_object_error,
-    object_box,
-    read_depth_map,
-)
 from nlos_cam.reconstruct import CalibratedRig, open_bench
 from nlos_cam.recording import ReplayCamera, Sidecar, load_sidecar, open_lidar_bag, sidecar_path
 from nlos_cam.render import HiddenObject, SceneFile
@@ -47,7 +39,7 @@ KnownObjects = Callable[[ObjectBox], Mapping[str, Float32]]
 
 def benchmark_depths(box: ObjectBox) -> Mapping[str, Float32]:
     """Return the depths (64, 64) over a box of the benchmark objects, by name."""
-    return {one.name: one.depth_m for one in benchmark_objects(box)}
+    return {one.name: one.depth_m for one in shapes.benchmark_objects(box)}
 
 
 def truth_depth_m(recording: Path, label: str, rig: Rig, known: Mapping[str, Float32]) -> Float32:
@@ -58,18 +50,19 @@ def truth_depth_m(recording: Path, label: str, rig: Rig, known: Mapping[str, Flo
     """
     for name in dict.fromkeys((recording.stem, Path(label).name)):
         if (file := _truth_file(recording.parent, name)) is not None:
-            return _depth_map(file) if file.suffix == DEPTH_MAP_SUFFIX else _placed(file, name, rig)
+            return _depth_map(file) if file.suffix == shapes.DEPTH_MAP_SUFFIX else _placed(file, name, rig)
     if label in known:
         return known[label]
     raise RecordingError(
         f"{recording} has the label {label!r}, which is not a benchmark object (such as {next(iter(known), 'cup-1')}), "
-        f"and no file describes it: add {label}{TRUTH_SUFFIX} (object, pose) or a depth map {label}{DEPTH_MAP_SUFFIX}"
+        f"and no file describes it: add {label}{TRUTH_SUFFIX} (object, pose) or a depth map "
+        f"{label}{shapes.DEPTH_MAP_SUFFIX}"
     )
 
 
 def _truth_file(folder: Path, name: str) -> Path | None:
     """Return the truth file of a name, if any. Raises RecordingError for two, or for a mesh without a pose."""
-    found = [path for end in (TRUTH_SUFFIX, DEPTH_MAP_SUFFIX) if (path := folder / f"{name}{end}").is_file()]
+    found = [path for end in (TRUTH_SUFFIX, shapes.DEPTH_MAP_SUFFIX) if (path := folder / f"{name}{end}").is_file()]
     if len(found) > 1:
         raise RecordingError(f"{found[0]} and {found[1].name} both describe {name!r}: remove one of them")
     if not found and (meshes := _meshes(folder, name)):
@@ -81,11 +74,11 @@ def _truth_file(folder: Path, name: str) -> Path | None:
 
 
 def _meshes(folder: Path, name: str) -> list[Path]:
-    return [path for end in MESH_SUFFIXES if (path := folder / f"{name}{end}").is_file()]
+    return [path for end in shapes.MESH_SUFFIXES if (path := folder / f"{name}{end}").is_file()]
 
 
 def _depth_map(path: Path) -> Float32:
-    depth_m = read_depth_map(path)
+    depth_m = shapes.read_depth_map(path)
     if depth_m.shape != (OBJECT_PIXELS, OBJECT_PIXELS):
         raise RecordingError(
             f"{path} has shape {depth_m.shape}: the depth map of a label needs {OBJECT_PIXELS} x {OBJECT_PIXELS} cells"
@@ -98,7 +91,7 @@ def _placed(path: Path, name: str, rig: Rig) -> Float32:
     hidden = _hidden(path, name)
     depth_m = SceneFile(name=hidden.label, rig=rig, object=hidden).scene_at(0).object_depth_m
     if depth_m is None or np.isnan(depth_m).all():
-        raise invisible_object_error(hidden.label, object_box(rig))
+        raise shapes.invisible_object_error(hidden.label, shapes.object_box(rig))
     return depth_m
 
 
@@ -159,7 +152,7 @@ def read_labelled(
 
     def objects_on(rig: Rig) -> Mapping[str, Float32]:
         if rig.checksum not in objects:
-            objects[rig.checksum] = known(object_box(rig))
+            objects[rig.checksum] = known(shapes.object_box(rig))
         return objects[rig.checksum]
 
     for path in recordings:
@@ -191,7 +184,7 @@ def _read(path: Path, objects_on: Callable[[Rig], Mapping[str, Float32]], wall: 
         raise RecordingError(f"{path} has no frame with any return: inspect it with `nlos-cam replay`")
     depth_m, intensity = (np.stack([getattr(one, name) for one in maps]) for name in ("depth_m", "intensity"))
     truths_m = np.repeat(truth_m[None], len(maps), axis=0)
-    image = image_from_depth(truths_m, object_box(bench.rig)).astype(np.float16)
+    image = shapes.image_from_depth(truths_m, shapes.object_box(bench.rig)).astype(np.float16)
     labels, names = (sidecar.label,) * len(maps), (path.name,) * len(maps)
     return Labelled(MapSet(depth_m, intensity, image), truths_m, labels, names, bench.rig)
 

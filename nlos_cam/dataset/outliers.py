@@ -15,21 +15,9 @@ from nlos_calibration import ObjectBox, Rig
 from nlos_calibration.arrays import Float32
 from trimesh.transformations import euler_matrix
 
+from nlos_cam import objects as shapes
 from nlos_cam.dataset.plan import move_lidar
 from nlos_cam.frames import OBJECT_PIXELS
-from nlos_cam.objects import (
-    CATEGORIES,
-    Pose,
-    box_width_m,
-    category_triangles,
-    generic_depth,
-    object_box,
-    orthographic_depth,
-    panel,
-    place,
-    post,
-    random_pose,
-)
 from nlos_cam.render import Scene, SensorModel, Surface, phong, retroreflective
 
 Generator = np.random.Generator
@@ -48,7 +36,7 @@ class Stimulus:
     @property
     def box(self) -> ObjectBox:
         """The rig's object box."""
-        return object_box(self.rig)
+        return shapes.object_box(self.rig)
 
     @property
     def scene(self) -> Scene:
@@ -62,9 +50,11 @@ OutlierKind = Callable[[Generator, Stimulus], Stimulus]
 
 def draw_object(generator: Generator, box: ObjectBox, **pose: float) -> Float32:
     """Return the depth map of an object of any category in a random pose, except for the given values."""
-    drawn = replace(random_pose(generator, box), **pose)
-    category = str(generator.choice(list(CATEGORIES)))
-    return orthographic_depth(place(category_triangles(category, int(generator.integers(2**31))), drawn, box), box)
+    drawn = replace(shapes.random_pose(generator, box), **pose)
+    category = str(generator.choice(list(shapes.CATEGORIES)))
+    return shapes.orthographic_depth(
+        shapes.place(shapes.category_triangles(category, int(generator.integers(2**31))), drawn, box), box
+    )
 
 
 def smooth_pattern(generator: Generator, across: int) -> Float32:
@@ -81,7 +71,7 @@ def ordinary(generator: Generator, stimulus: Stimulus) -> Stimulus:
 
 def generic(generator: Generator, stimulus: Stimulus) -> Stimulus:
     """Add a generic shape, as in training sets with a share of them."""
-    return replace(stimulus, depth_m=generic_depth(int(generator.integers(2**31)), stimulus.box)[1])
+    return replace(stimulus, depth_m=shapes.generic_depth(int(generator.integers(2**31)), stimulus.box)[1])
 
 
 class BenchSpread(NamedTuple):
@@ -108,7 +98,7 @@ NO_OCCLUDER_SHARE = 0.1
 
 def vary_bench(rig: Rig, sensor: SensorModel, spread: BenchSpread, generator: Generator) -> tuple[Rig, SensorModel]:
     """Return a rig and a sensor near the given ones."""
-    place, yaw, pitch, gain, offset = generator.uniform(-1, 1, 5).tolist()
+    shift, yaw, pitch, gain, offset = generator.uniform(-1, 1, 5).tolist()
     ambient, ripple, patch, texture = generator.uniform(0, 1, 4).tolist()
     changed = sensor.model_copy(
         update={
@@ -121,7 +111,7 @@ def vary_bench(rig: Rig, sensor: SensorModel, spread: BenchSpread, generator: Ge
         }
     )
     angles = yaw * spread.angle_deg, pitch * spread.angle_deg
-    return move_lidar(rig, place * spread.place_m, *angles), changed
+    return move_lidar(rig, shift * spread.place_m, *angles), changed
 
 
 def vary_empty_bench(rig: Rig, sensor: SensorModel, generator: Generator) -> tuple[Rig, SensorModel]:
@@ -136,14 +126,14 @@ def vary_empty_bench(rig: Rig, sensor: SensorModel, generator: Generator) -> tup
 
 def small(generator: Generator, stimulus: Stimulus) -> Stimulus:
     """Add an object of 15 to 35 % of the box."""
-    width_m = box_width_m(stimulus.box)
+    width_m = shapes.box_width_m(stimulus.box)
     size_m, (x_m, y_m) = width_m * generator.uniform(0.15, 0.35), generator.uniform(-0.3, 0.3, 2) * width_m
     return replace(stimulus, depth_m=draw_object(generator, stimulus.box, size_m=size_m, x_m=x_m, y_m=y_m))
 
 
 def large(generator: Generator, stimulus: Stimulus) -> Stimulus:
     """Add an object of 125 to 180 % of the box, whose sides are cut off."""
-    size_m = box_width_m(stimulus.box) * generator.uniform(1.25, 1.8)
+    size_m = shapes.box_width_m(stimulus.box) * generator.uniform(1.25, 1.8)
     return replace(stimulus, depth_m=draw_object(generator, stimulus.box, size_m=size_m))
 
 
@@ -161,8 +151,8 @@ def near(generator: Generator, stimulus: Stimulus) -> Stimulus:
 def half_out(generator: Generator, stimulus: Stimulus) -> Stimulus:
     """Add an object of ordinary size, 35 to 60 % of which lies beside the box."""
     box = stimulus.box
-    pose = random_pose(generator, box)
-    out_m = (box_width_m(box) + pose.size_m) / 2 - pose.size_m * generator.uniform(0.4, 0.65)
+    pose = shapes.random_pose(generator, box)
+    out_m = (shapes.box_width_m(box) + pose.size_m) / 2 - pose.size_m * generator.uniform(0.4, 0.65)
     angle = np.radians(90) * int(generator.integers(4))
     return replace(stimulus, depth_m=draw_object(generator, box, x_m=out_m * np.cos(angle), y_m=out_m * np.sin(angle)))
 
@@ -173,9 +163,9 @@ def several(generator: Generator, stimulus: Stimulus) -> Stimulus:
     count, start = int(generator.integers(2, 4)), generator.uniform(0, 2 * np.pi)
     depths_m = list[Float32]()
     for k in range(count):
-        angle, reach_m = start + 2 * np.pi * k / count, 0.3 * box_width_m(box)
+        angle, reach_m = start + 2 * np.pi * k / count, 0.3 * shapes.box_width_m(box)
         x_m, y_m = reach_m * np.cos(angle), reach_m * np.sin(angle)
-        size_m = box_width_m(box) * generator.uniform(0.25, 0.4)
+        size_m = shapes.box_width_m(box) * generator.uniform(0.25, 0.4)
         front_m = generator.uniform(0, 0.6) * (box.z_far_m - box.z_near_m)
         depths_m.append(draw_object(generator, box, size_m=size_m, x_m=x_m, y_m=y_m, front_m=front_m))
     return replace(stimulus, depth_m=np.fmin.reduce(depths_m))
@@ -199,7 +189,7 @@ def posts(generator: Generator, stimulus: Stimulus) -> Stimulus:
     """Add an object on a post, with another post above it."""
     depth_m = draw_object(generator, stimulus.box)
     for _ in range(2):
-        depth_m = np.where(np.isnan(depth_m), post(depth_m, generator), depth_m)[::-1]
+        depth_m = np.where(np.isnan(depth_m), shapes.post(depth_m, generator), depth_m)[::-1]
     return replace(stimulus, depth_m=np.ascontiguousarray(depth_m))
 
 
@@ -215,7 +205,7 @@ def plates(generator: Generator, stimulus: Stimulus) -> Stimulus:
     box, steps = stimulus.box, np.linspace(-0.5, 0.5, OBJECT_PIXELS)
     x, y = np.meshgrid(steps, -steps)
     slope_x, slope_y = generator.uniform(-1, 1, 2)
-    depth_m = generator.uniform(box.z_near_m, 0.8 * box.z_far_m) + box_width_m(box) * (slope_x * x + slope_y * y)
+    depth_m = generator.uniform(box.z_near_m, 0.8 * box.z_far_m) + shapes.box_width_m(box) * (slope_x * x + slope_y * y)
     half_x, half_y = generator.uniform(0.3, 0.5, 2)
     covered = (abs(x) < half_x) & (abs(y) < half_y) & (depth_m > 0.5 * box.z_near_m)
     return replace(stimulus, depth_m=np.where(covered, depth_m, np.nan).astype(np.float32))
@@ -281,7 +271,7 @@ def panels(generator: Generator, stimulus: Stimulus) -> Stimulus:
     """Add an object in front of a panel that fills most of the box."""
     box = stimulus.box
     depth_m = draw_object(generator, box)
-    return replace(stimulus, depth_m=np.where(np.isnan(depth_m), panel(depth_m, box, generator), depth_m))
+    return replace(stimulus, depth_m=np.where(np.isnan(depth_m), shapes.panel(depth_m, box, generator), depth_m))
 
 
 def noise_sheet(generator: Generator, stimulus: Stimulus) -> Stimulus:
@@ -306,8 +296,10 @@ def rings(generator: Generator, stimulus: Stimulus) -> Stimulus:
     box = stimulus.box
     ring = trimesh.creation.torus(1.0, generator.uniform(0.15, 0.35), major_sections=32, minor_sections=16)
     turn = euler_matrix(*np.radians(generator.uniform(-60, 60, 3)))[:3, :3]
-    pose = Pose(size_m=box_width_m(box) * generator.uniform(0.55, 0.9), front_m=generator.uniform(0, 0.1))
-    return replace(stimulus, depth_m=orthographic_depth(place(np.asarray(ring.triangles) @ turn.T, pose, box), box))
+    pose = shapes.Pose(size_m=shapes.box_width_m(box) * generator.uniform(0.55, 0.9), front_m=generator.uniform(0, 0.1))
+    return replace(
+        stimulus, depth_m=shapes.orthographic_depth(shapes.place(np.asarray(ring.triangles) @ turn.T, pose, box), box)
+    )
 
 
 def glossy(generator: Generator, stimulus: Stimulus) -> Stimulus:

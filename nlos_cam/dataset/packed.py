@@ -59,11 +59,7 @@ class PackedMaps:
     """Normalised maps and images of one or more datasets of one rig, in a folder that is theirs alone."""
 
     def __init__(
-        self,
-        datasets: Sequence[Path],
-        store: Path,
-        on_progress: OnProgress = ignore,
-        normal: CellNormal | None = None,
+        self, datasets: Sequence[Path], store: Path, on_progress: OnProgress = ignore, normal: CellNormal | None = None
     ) -> None:
         """Open or make the store: use `open_packed_maps`, which holds its claim meanwhile.
 

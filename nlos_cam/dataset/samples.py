@@ -14,21 +14,10 @@ from nlos_calibration import ObjectBox, Rig
 from nlos_calibration.arrays import Float32
 from numpy.typing import NDArray
 
+from nlos_cam import objects as shapes
 from nlos_cam.dataset.plan import DatasetPlan, Objects, scene_row
 from nlos_cam.errors import SceneError
 from nlos_cam.frames import LidarMaps
-from nlos_cam.objects import (
-    Coat,
-    MeshFile,
-    folder_objects,
-    generic_depth,
-    image_from_albedo,
-    image_from_depth,
-    mesh_depth,
-    object_depth,
-    paint,
-    read_mesh,
-)
 from nlos_cam.render import Radiometry, Scene, Sensor, SensorModel, Surface, render
 
 Samples = Mapping[str, NDArray[Any]]
@@ -61,19 +50,13 @@ def procedural_images(
     """
     images = list[NDArray[np.float16]]()
     for seed in range(first_seed, first_seed + count):
-        depth_m = object_depth(seed, box, categories, backgrounds=backgrounds)[1]
+        depth_m = shapes.object_depth(seed, box, categories, backgrounds=backgrounds)[1]
         images.append(_image(depth_m, box, _coat(seed, depth_m, textures)).astype(np.float16))
     return np.stack(images)
 
 
 def sense_object(
-    scene: Scene,
-    sensor: Sensor,
-    seed: int,
-    accuracy: str = "standard",
-    exposure: int = 0,
-    *,
-    expected: bool = False,
+    scene: Scene, sensor: Sensor, seed: int, accuracy: str = "standard", exposure: int = 0, *, expected: bool = False
 ) -> LidarMaps:
     """Return the maps of one rendered scene, by the sensor model and the reduction of live frames, or expected ones."""
     echoes = render(scene, accuracy).multi
@@ -117,16 +100,16 @@ def make_samples(plan: DatasetPlan, seeds: Sequence[int]) -> Samples:
     }
 
 
-def _coat(seed: int, depth_m: Float32, textures: Sequence[str]) -> Coat | None:
-    return paint(seed, depth_m, textures) if textures else None
+def _coat(seed: int, depth_m: Float32, textures: Sequence[str]) -> shapes.Coat | None:
+    return shapes.paint(seed, depth_m, textures) if textures else None
 
 
-def _image(depth_m: Float32, box: ObjectBox, coat: Coat | None) -> Float32:
-    return image_from_albedo(coat.albedo, depth_m) if coat else image_from_depth(depth_m, box)
+def _image(depth_m: Float32, box: ObjectBox, coat: shapes.Coat | None) -> Float32:
+    return shapes.image_from_albedo(coat.albedo, depth_m) if coat else shapes.image_from_depth(depth_m, box)
 
 
 def _sense(
-    plan: DatasetPlan, depth_m: Float32, coat: Coat | None, rig: Rig, model: SensorModel, seed: int
+    plan: DatasetPlan, depth_m: Float32, coat: shapes.Coat | None, rig: Rig, model: SensorModel, seed: int
 ) -> LidarMaps:
     scene = Scene(rig, depth_m, plan.material.surface, plan.radiometry, plan.jump_m, model.pulse_ns)
     sensor = cached_sensor(rig, model, plan.radiometry)  # pyright: ignore[reportArgumentType]  frozen, so hashable
@@ -149,32 +132,34 @@ def join_samples(parts: Sequence[Samples]) -> Samples:
 def hidden_object(objects: Objects, seed: int, box: ObjectBox) -> tuple[str, Float32]:
     """Return one random object: its category, family or mesh, and its depth map (64, 64) in metres, NaN background."""
     if objects.share_generic and np.random.default_rng([seed, _SHARE_STREAM]).random() < objects.share_generic:
-        return generic_depth(seed, box)
+        return shapes.generic_depth(seed, box)
     if not objects.meshes:
-        return object_depth(seed, box, objects.categories, backgrounds=objects.backgrounds)
+        return shapes.object_depth(seed, box, objects.categories, backgrounds=objects.backgrounds)
     if (folder := objects.folder) is None:
         raise SceneError("this dataset hides meshes: name their folder with --objects")
-    (name, _), depth_m = mesh_depth(seed, objects.meshes, box, read=lambda mesh: _unchanged(folder / mesh[0], mesh[1]))
+    (name, _), depth_m = shapes.mesh_depth(
+        seed, objects.meshes, box, read=lambda mesh: _unchanged(folder / mesh[0], mesh[1])
+    )
     return name, depth_m
 
 
 def objects_from_folder(folder: Path, on_progress: OnProgress = ignore) -> Objects:
     """Read the meshes of a folder and its subfolders. Raises SceneError for none, or one that cannot be used."""
-    paths, meshes = folder_objects(folder), list[tuple[str, str]]()
+    paths, meshes = shapes.folder_objects(folder), list[tuple[str, str]]()
     for path in paths:
         name = path.relative_to(folder).as_posix()
         try:
             name.encode()
         except UnicodeEncodeError as error:  # a shard stores names as UTF-8
             raise SceneError(f"the name of the mesh {name!a} is not UTF-8: rename it") from error
-        meshes.append((name, read_mesh(path).sha256))
+        meshes.append((name, shapes.read_mesh(path).sha256))
         on_progress(len(meshes), len(paths))
     return Objects((), tuple(meshes), folder=folder.resolve())
 
 
 @lru_cache(maxsize=16)
-def _unchanged(path: Path, sha256: str) -> MeshFile:
-    mesh = read_mesh(path)
+def _unchanged(path: Path, sha256: str) -> shapes.MeshFile:
+    mesh = shapes.read_mesh(path)
     if mesh.sha256 != sha256:
         raise SceneError(f"{path} changed since the dataset was started: restore it, or choose another --out")
     return mesh

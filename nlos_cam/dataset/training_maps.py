@@ -84,7 +84,6 @@ class Streamed:
 
 
 def _subtract(batch: MapBatch, bare: BareMaps) -> MapBatch:
-    """Return a batch less the bare wall, which is mirrored where the sample is."""
     depth_m, intensity = (
         torch.where(batch.mirrored[:, None, None], plain.flip(-2), plain) for plain in map(torch.from_numpy, bare)
     )

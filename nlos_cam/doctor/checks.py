@@ -253,7 +253,6 @@ def sdk(facts: Facts) -> Finding:
 
 
 def _load_fix(error: str, on: str) -> str:
-    """Return what to install for an error of the loader."""
     if "DLL" in error:
         return VC_RUNTIME
     if "GLIBC" in error:
@@ -280,8 +279,7 @@ def sdk_version(facts: Facts) -> Finding:
     fix = f"pip install {_wheel(facts.host.platform.system)}"
     if version_numbers(newest)[:2] >= REMOVED:
         return failed(
-            f"librealsense {newest} has no driver for the L515 (the last with it is 2.54.2): it reports no device",
-            fix,
+            f"librealsense {newest} has no driver for the L515 (the last with it is 2.54.2): it reports no device", fix
         )
     if version_numbers(newest)[:3] != TESTED:
         return warning(f"librealsense {newest} supports the L515, but only 2.54.2 is tested", fix)

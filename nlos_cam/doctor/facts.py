@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from importlib import metadata
 from typing import Any, Literal
 
@@ -149,21 +150,6 @@ class Check:
     fix: str
 
 
-def ok(detail: str) -> Finding:
-    """Return a success."""
-    return Finding("ok", detail)
-
-
-def skipped(reason: str) -> Finding:
-    """Return the reason why a check does not apply."""
-    return Finding("skipped", reason)
-
-
-def warning(detail: str, fix: str) -> Finding:
-    """Return a problem that a camera works with."""
-    return Finding("warning", detail, fix)
-
-
-def failed(detail: str, fix: str) -> Finding:
-    """Return a problem that keeps a camera from working."""
-    return Finding("failed", detail, fix)
+ok, skipped = partial(Finding, "ok"), partial(Finding, "skipped")
+warning, failed = partial(Finding, "warning"), partial(Finding, "failed")
+"""A camera works with what a warning names, and not with what has failed."""

@@ -119,7 +119,6 @@ def _camera(sys: Path, device: Path) -> KernelCamera:
 
 
 def _below(device: Path, folder: Path) -> list[Path]:
-    """Return the links of a folder whose targets lie below the device."""
     whole = os.path.realpath(device) + os.sep
     return [found for found in list_folder(folder) if os.path.realpath(found).startswith(whole)]
 

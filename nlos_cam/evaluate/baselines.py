@@ -1,7 +1,6 @@
 """Trivial baselines: background only, mean object, nearest training object."""
 
 import hashlib
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,22 +10,13 @@ from nlos_calibration.arrays import Float16, Float32
 from nlos_models import SMALLEST_SPREAD, MapSet, channel_statistics, split_and_stack
 from torch import Tensor
 
-from nlos_cam.dataset import (
-    TRAINING_SEED,
-    Dataset,
-    DatasetPlan,
-    Objects,
-    build_dataset,
-    open_dataset,
-    procedural_images,
-)
+from nlos_cam import dataset as data
+from nlos_cam.camera import OnProgress
 
 NEIGHBOURS = 2000
 """Training objects searched for the nearest neighbour, unless a training set is given."""
 FINGERPRINT_OBJECTS = 200
 """Objects whose images go into the cache key, so that a changed generator gets a new cache; all categories occur."""
-
-OnProgress = Callable[[int, int], None]
 
 
 def trivial_answers(count: int, mean: Float32) -> dict[str, Float32]:
@@ -40,7 +30,7 @@ def mean_image(images: Float16) -> Float32:
     return images.mean(0, dtype=np.float64).astype(np.float32)
 
 
-def answers_with_nearest(maps: MapSet, training: Dataset, on_progress: OnProgress) -> dict[str, Float32]:
+def answers_with_nearest(maps: MapSet, training: data.Dataset, on_progress: OnProgress) -> dict[str, Float32]:
     """Return the trivial answers and the image of the nearest training object; one part at a time is in memory.
 
     Nearest in the sum of squares over all cells of depth and intensity, each channel (left, right) minus its mean and
@@ -81,7 +71,7 @@ def _stacked(maps: MapSet) -> Tensor:
     return split_and_stack(torch.from_numpy(maps.depth_m), torch.from_numpy(maps.intensity))
 
 
-def _statistics(training: Dataset) -> tuple[Tensor, Tensor]:
+def _statistics(training: data.Dataset) -> tuple[Tensor, Tensor]:
     parts = list[Tensor]()
     for chunk in training.chunks():
         parts.append(_stacked(chunk))
@@ -90,19 +80,19 @@ def _statistics(training: Dataset) -> tuple[Tensor, Tensor]:
     return channel_statistics(torch.cat(parts))
 
 
-def training_maps(plan: DatasetPlan, cache: Path, workers: int, on_progress: OnProgress) -> Dataset:
+def training_maps(plan: data.DatasetPlan, cache: Path, workers: int, on_progress: OnProgress) -> data.Dataset:
     """Build the first NEIGHBOURS training objects on the plan's rig and sensor into the cache, once.
 
     An interrupted build resumes. The folder's name is a checksum of rig, sensor and objects.
     """
-    plan = replace(plan, first_seed=TRAINING_SEED, objects=Objects())
+    plan = replace(plan, first_seed=data.TRAINING_SEED, objects=data.Objects())
     folder = cache / "neighbours" / f"{_checksum(plan)}-{NEIGHBOURS}"
-    build_dataset(plan, NEIGHBOURS, folder, workers=workers, on_progress=on_progress)
-    return open_dataset(folder)
+    data.build_dataset(plan, NEIGHBOURS, folder, workers=workers, on_progress=on_progress)
+    return data.open_dataset(folder)
 
 
-def _checksum(plan: DatasetPlan) -> str:
+def _checksum(plan: data.DatasetPlan) -> str:
     """Return a checksum of the plan and of its first objects: another generator makes another training set."""
     digest = hashlib.sha256(plan.provenance.encode())
-    digest.update(procedural_images(plan.first_seed, FINGERPRINT_OBJECTS, plan.box).tobytes())
+    digest.update(data.procedural_images(plan.first_seed, FINGERPRINT_OBJECTS, plan.box).tobytes())
     return digest.hexdigest()[:16]

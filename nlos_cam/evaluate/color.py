@@ -10,11 +10,11 @@ from nlos_calibration.arrays import Float16, Float32
 from nlos_models import SIMULATION_ONLY, SMALLER_IS_BETTER, MapSet, brightness, color_metrics, surface
 
 from nlos_cam.dataset import sense_color
+from nlos_cam.evaluate.figures import ROWS
 from nlos_cam.evaluate.metrics import advantage, over_objects, plain
 from nlos_cam.objects import TEXTURES, image_from_albedo, paint
 from nlos_cam.render import Scene, Sensor, SensorModel, Surface
-
-ROWS = ("truth", "reconstruction", "difference")
+from nlos_cam.report import figure_of
 
 
 def painted_maps(
@@ -62,10 +62,8 @@ def figures_of_color(
 
 def draw_color_sheet(path: Path, image: Float32, truth: Float32) -> None:
     """Draw truth, reconstruction and absolute difference per channel, in color."""
-    from matplotlib.figure import Figure as Canvas
-
     count = len(truth)
-    canvas = Canvas(figsize=(count + 0.3, len(ROWS) + 0.6), layout="constrained")
+    canvas = figure_of(count + 0.3, len(ROWS) + 0.6)
     axes: Any = canvas.subplots(len(ROWS), count, squeeze=False)
     for row, (title, pictures) in enumerate(zip(ROWS, (truth, image, np.abs(image - truth)), strict=True)):
         for axis, picture in zip(axes[row], pictures, strict=True):

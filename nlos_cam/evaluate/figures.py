@@ -11,6 +11,7 @@ from nlos_models import GOOD_IOU
 from numpy.typing import NDArray
 
 from nlos_cam.evaluate.metrics import SMALLER_IS_BETTER, TARGETS, Bin, Figures, Interval, Predictions
+from nlos_cam.report import figure_of
 
 SHEET_COLUMNS = 18
 MAX_PER_SHEET = 54
@@ -41,7 +42,7 @@ def draw_sheet(path: Path, image: Float32, truth: Float32, titles: Sequence[str]
     shown = np.unique(np.linspace(0, len(truth) - 1, min(len(truth), MAX_PER_SHEET)).astype(int))
     columns = min(SHEET_COLUMNS, len(shown))
     wide_in = min(max(SHEET_IN / columns, 0.8), 1.6)
-    figure = _figure((wide_in * columns + 1.8, BLOCK / TILE * wide_in * -(-len(shown) // columns) + 0.2))
+    figure = figure_of(wide_in * columns + 1.8, BLOCK / TILE * wide_in * -(-len(shown) // columns) + 0.2)
     axis = figure.subplots()
     _mosaic(axis, image[shown], truth[shown], [titles[int(k)] for k in shown], columns, wide_in)
     _color_bars(figure, axis)
@@ -54,7 +55,7 @@ def draw_gallery(path: Path, image: Float32, truth: Float32, titles: Sequence[st
     worst = min(GALLERY, -(-len(order) // 2))
     rows = {"worst": order[:worst], "best": order[::-1][: min(GALLERY, len(order) - worst)]}
     rows = {title: chosen for title, chosen in rows.items() if len(chosen)}
-    figure = _figure((1.5 * worst + 2, 5.2 * len(rows)))
+    figure = figure_of(1.5 * worst + 2, 5.2 * len(rows))
     axes = figure.subplots(len(rows), 1, squeeze=False)[:, 0]
     for axis, (title, chosen) in zip(axes, rows.items(), strict=True):
         _mosaic(
@@ -69,12 +70,6 @@ def short(title: str) -> str:
     """Return a title that fits above its tile: of a held-out seed (2000000003) the last digits."""
     words = SEED.sub(lambda seed: str(int(seed[0]) % 10**6), title)
     return words if len(words) <= MAX_TITLE else f"{words[: MAX_TITLE - 1]}\N{HORIZONTAL ELLIPSIS}"
-
-
-def _figure(size: tuple[float, float]) -> Any:
-    from matplotlib.figure import Figure
-
-    return Figure(figsize=size, layout="constrained")
 
 
 def _mosaic(axis: Any, image: Float32, truth: Float32, titles: Sequence[str], columns: int, wide_in: float) -> None:
@@ -126,7 +121,7 @@ def _color_bars(figure: Any, axes: Any) -> None:
 def draw_categories(path: Path, categories: Mapping[str, Figures], overall: Figures) -> None:
     """Draw each metric per category with its interval, the mean of all objects and the target."""
     ordered = sorted(categories, key=lambda name: categories[name]["silhouette_iou"].value or 0.0)
-    figure = _figure((13, 1.4 + 0.24 * len(ordered)))
+    figure = figure_of(13, 1.4 + 0.24 * len(ordered))
     for axis, (metric, label) in zip(figure.subplots(1, 4, sharey=True), LABELS.items(), strict=True):
         _points(axis, [categories[name][metric] for name in ordered])
         if (mean := overall[metric].value) is not None:
@@ -151,7 +146,7 @@ def _points(axis: Any, figures: Sequence[Interval]) -> None:
 
 def draw_quality(path: Path, sets: Mapping[str, tuple[Predictions, Float64]]) -> None:
     """Draw the true IoU of each set's objects against the predicted one with its interval; trusted ones in green."""
-    figure = _figure((5 * len(sets), 4.6))
+    figure = figure_of(5 * len(sets), 4.6)
     for axis, (name, (predicted, iou)) in zip(
         figure.subplots(1, len(sets), squeeze=False)[0], sets.items(), strict=True
     ):
@@ -175,7 +170,7 @@ def draw_against_surface(
     curves: Mapping[str, Mapping[str, list[Bin]]],
 ) -> None:
     """Draw each object's error against size and detail of its surface, and means over bins with equal counts."""
-    figure = _figure((11, 7.5))
+    figure = figure_of(11, 7.5)
     axes = figure.subplots(len(errors), len(surfaces), squeeze=False)
     for row, (error_name, error) in zip(axes, errors.items(), strict=True):
         for axis, (name, value) in zip(row, surfaces.items(), strict=True):

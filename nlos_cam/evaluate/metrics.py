@@ -8,18 +8,10 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 import cv2
+import nlos_models as models
 import numpy as np
 from nlos_calibration import ObjectBox
 from nlos_calibration.arrays import Float32, Float64
-from nlos_models import (
-    GOOD_IOU,
-    MIN_V,
-    accuracy_mean_abs,
-    accuracy_within_2_percent,
-    foreground_rmse_mm,
-    silhouette_iou,
-    surface,
-)
 from numpy.typing import NDArray
 
 PerObject = dict[str, Float64]
@@ -52,16 +44,16 @@ Figures = dict[str, Interval]
 
 def mm_per_v(box: ObjectBox) -> float:
     """Return the depth in millimetres of one unit of v."""
-    return 1000 * (box.z_far_m - box.z_near_m) / (1 - MIN_V)
+    return 1000 * (box.z_far_m - box.z_near_m) / (1 - models.MIN_V)
 
 
 def per_object(image: Float32, truth: Float32, box: ObjectBox) -> PerObject:
     """Return every metric of images (n, 64, 64), per object."""
     return {
-        "silhouette_iou": silhouette_iou(image, truth),
-        "accuracy_mean_abs": accuracy_mean_abs(image, truth),
-        "accuracy_within_2_percent": accuracy_within_2_percent(image, truth),
-        "foreground_rmse_mm": foreground_rmse_mm(image, truth, mm_per_v(box)),
+        "silhouette_iou": models.silhouette_iou(image, truth),
+        "accuracy_mean_abs": models.accuracy_mean_abs(image, truth),
+        "accuracy_within_2_percent": models.accuracy_within_2_percent(image, truth),
+        "foreground_rmse_mm": models.foreground_rmse_mm(image, truth, mm_per_v(box)),
     }
 
 
@@ -155,7 +147,7 @@ QUALITY_TARGETS = {"correlation": 0.7, "trusted_good": 0.9}
 
 def quality_figures(predicted: Predictions, iou: Float64) -> dict[str, Any]:
     """Return how well the IoU (n,) was predicted, and how many trusted frames were good; None without any of them."""
-    good, trusted = iou >= GOOD_IOU, predicted.trusted
+    good, trusted = iou >= models.GOOD_IOU, predicted.trusted
     known = len(iou) > 2 and np.ptp(iou) > 0 and np.ptp(predicted.iou) > 0
     return {
         "correlation": float(np.corrcoef(predicted.iou, iou)[0, 1]) if known else None,
@@ -180,7 +172,7 @@ ZONES = ("core", "rim inside", "rim outside", "far background")
 def surface_cm2(truth: Float32, box: ObjectBox) -> Float64:
     """Return the surface area in cm² of images (n, 64, 64) as seen from the wall, (n,)."""
     width_cm, height_cm = _pitch_cm(truth, box)
-    return width_cm * height_cm * surface(truth).sum((-2, -1))
+    return width_cm * height_cm * models.surface(truth).sum((-2, -1))
 
 
 def detail_per_cm(truth: Float32, box: ObjectBox) -> Float64:
@@ -190,7 +182,7 @@ def detail_per_cm(truth: Float32, box: ObjectBox) -> Float64:
     """
     width_cm, height_cm = _pitch_cm(truth, box)
     padded = np.pad(truth, ((0, 0), (1, 1), (1, 1)))
-    mask, step = surface(padded), STEP_MM / mm_per_v(box)
+    mask, step = models.surface(padded), STEP_MM / mm_per_v(box)
     beside, below = (
         (np.diff(mask, axis=axis) | (_both(mask, axis) & (np.abs(np.diff(padded, axis=axis)) > step))).sum((-2, -1))
         for axis in (2, 1)
@@ -206,7 +198,6 @@ def _both(mask: NDArray[np.bool_], axis: int) -> NDArray[np.bool_]:
 
 
 def _pitch_cm(truth: Float32, box: ObjectBox) -> tuple[float, float]:
-    """Return width and height of a pixel in cm."""
     rows, columns = truth.shape[-2:]
     return 100 * (box.x_max_m - box.x_min_m) / columns, 100 * (box.y_max_m - box.y_min_m) / rows
 
@@ -265,7 +256,7 @@ class Zone:
 
 def error_by_zone(image: Float32, truth: Float32) -> dict[str, Zone]:
     """Divide the absolute error among core, inner and outer rim (two pixels each) and far background."""
-    zones = np.stack([_zones(mask) for mask in surface(truth)])
+    zones = np.stack([_zones(mask) for mask in models.surface(truth)])
     error = np.abs(image.astype(np.float64) - truth)
     total = error.sum()
     return {

@@ -14,6 +14,7 @@ from typing import Any, Literal, TypeVar
 import numba
 import numpy as np
 
+from nlos_cam import report
 from nlos_cam.errors import SceneError
 from nlos_cam.files import atomic_directory
 from nlos_cam.render import (
@@ -31,7 +32,6 @@ from nlos_cam.render import (
     render,
     three_bounce,
 )
-from nlos_cam.report import Bullets, Commands, Document, Picture, Section, Table, saved_picture, write_document
 
 TRADEOFF_REPORT = "tradeoff.html"
 INCOMPLETE = "Interrupted: some settings are missing."
@@ -191,20 +191,22 @@ def as_table(facts: RenderFacts, rows: list[RenderRow], planned: int) -> dict[st
     }
 
 
-def render_document(table: Mapping[str, Any], name: str, plot: Path | None = None) -> Document:
+def render_document(table: Mapping[str, Any], name: str, plot: Path | None = None) -> report.Document:
     """Return the report on a table about rendering an object called `name`."""
     front = f"Settings that no other beats in both time and error: {', '.join(table['pareto_front'])}."
     size = f"{table['patches']} patches, {table['beams_on_wall']} beams on the wall"
     slow = f"brute force {table['reference_seconds']:.3g} s"
-    parts: list[Section | Picture] = [
-        Section("", [Bullets("Note", [] if table["complete"] else [INCOMPLETE])]),
-        Section("Stops of the accuracy setting", [Table(HEAD, [_line(row) for row in table["stops"]]), front]),
-        Section("Ingredients", [Table(HEAD, [_line(row) for row in table["ingredients"]]), NOTES]),
-        Section("Next commands", [Commands([f"nlos-cam render {shlex.quote(name)} --max-error 0.005"])]),
+    parts: list[report.Section | report.Picture] = [
+        report.Section("", [report.Bullets("Note", [] if table["complete"] else [INCOMPLETE])]),
+        report.Section(
+            "Stops of the accuracy setting", [report.Table(HEAD, [_line(row) for row in table["stops"]]), front]
+        ),
+        report.Section("Ingredients", [report.Table(HEAD, [_line(row) for row in table["ingredients"]]), NOTES]),
+        report.Section("Next commands", [report.Commands([f"nlos-cam render {shlex.quote(name)} --max-error 0.005"])]),
     ]
     if plot:
-        parts.insert(2, saved_picture("Error against time", PLOT_CAPTION, plot))
-    return Document(f"Rendering {name}: accuracy against time", f"{table['machine']}; {size}; {slow}.", parts)
+        parts.insert(2, report.saved_picture("Error against time", PLOT_CAPTION, plot))
+    return report.Document(f"Rendering {name}: accuracy against time", f"{table['machine']}; {size}; {slow}.", parts)
 
 
 def _line(row: Mapping[str, Any]) -> tuple[str, ...]:
@@ -215,10 +217,10 @@ def _line(row: Mapping[str, Any]) -> tuple[str, ...]:
     return row["name"], f"{time_ms:.{1 if time_ms < 100 else 0}f}", f"{row['speedup']:.0f}", *errors, *bins, *depths
 
 
-def write_table(folder: Path, table: Mapping[str, Any], document: Document) -> None:
+def write_table(folder: Path, table: Mapping[str, Any], document: report.Document) -> None:
     """Write a trade-off's table as JSON, and its report."""
     (folder / "tradeoff.json").write_text(json.dumps(table, indent=2) + "\n", encoding="utf-8")
-    write_document(document, folder / TRADEOFF_REPORT)
+    report.write_document(document, folder / TRADEOFF_REPORT)
 
 
 def write_renders(folder: Path, table: dict[str, Any], rows: list[RenderRow], name: str) -> None:
@@ -231,9 +233,7 @@ def write_renders(folder: Path, table: dict[str, Any], rows: list[RenderRow], na
 
 def draw_renders(path: Path, rows: list[RenderRow], title: str) -> None:
     """Error against time, both logarithmic; what has no error stands on the lower edge."""
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(10, 6.5), layout="constrained")
+    figure = report.figure_of(10, 6.5)
     axis = figure.add_subplot()
     shown = [row for row in rows if row.part != "beams_per_cell"]
     floor = 0.5 * min((error for row in shown if (error := row.errors.intensity_error_p99) > 0), default=1e-6)

@@ -16,37 +16,9 @@ from nlos_calibration.arrays import Float32, Float64
 from nlos_models import GOOD_IOU, load_reconstructor, load_uncertainty_model, silhouette_iou
 
 from nlos_cam.evaluate import figures as pictures
-from nlos_cam.evaluate import metrics
+from nlos_cam.evaluate import metrics, subjects
 from nlos_cam.evaluate.figures import LABELS
-from nlos_cam.evaluate.metrics import (
-    SMALLER_IS_BETTER,
-    TARGETS,
-    Interval,
-    PerObject,
-    Predictions,
-    advantage,
-    over_objects,
-    per_category,
-    per_object,
-    plain,
-    targets_met,
-)
 from nlos_cam.evaluate.recognition import PER_KIND, recognised
-from nlos_cam.evaluate.subjects import (
-    HeldOutObjects,
-    Tracked,
-    answer_all,
-    bare_wall_for,
-    baseline_answers,
-    dataset_objects,
-    left_out_categories,
-    network_input,
-    notes_about,
-    predict_quality,
-    rendered_objects,
-    rig_of,
-    untracked,
-)
 from nlos_cam.files import atomic_directory, cache_folder
 from nlos_cam.objects import CATEGORIES
 from nlos_cam.reconstruct import Mirrored
@@ -82,7 +54,7 @@ class Unseen(NamedTuple):
     truth: Float32
     """(n, 64, 64)."""
     image: Float32
-    predicted: Predictions | None = None
+    predicted: metrics.Predictions | None = None
 
 
 @dataclass(frozen=True)
@@ -102,21 +74,18 @@ class Evaluation:
     """Categories that training left out."""
     unseen: Unseen | None = None
     """The second set of test objects; None beside other objects than the first."""
-    predicted: Predictions | None = None
+    predicted: metrics.Predictions | None = None
     """None without a quality model, or for weights of difference maps."""
 
     @cached_property
-    def ours(self) -> PerObject:
+    def ours(self) -> metrics.PerObject:
         """Return every metric of every object."""
-        return per_object(self.image, self.truth, self.box)
+        return metrics.per_object(self.image, self.truth, self.box)
 
     @cached_property
     def surfaces(self) -> dict[str, Float64]:
         """Return size and detail of the true surfaces, (n,) each."""
-        return {
-            SIZE: metrics.surface_cm2(self.truth, self.box),
-            DETAIL: metrics.detail_per_cm(self.truth, self.box),
-        }
+        return {SIZE: metrics.surface_cm2(self.truth, self.box), DETAIL: metrics.detail_per_cm(self.truth, self.box)}
 
     @cached_property
     def errors(self) -> dict[str, Float64]:
@@ -127,7 +96,7 @@ class Evaluation:
 
 def evaluate(
     weights: Path | None,
-    objects: HeldOutObjects | Path | None = None,
+    objects: subjects.HeldOutObjects | Path | None = None,
     *,
     rig: Rig | None = None,
     count: int | None = None,
@@ -135,7 +104,7 @@ def evaluate(
     training: Path | None = None,
     nearest: bool = True,
     mirror: bool = False,
-    tracked: Tracked = untracked,
+    tracked: subjects.Tracked = subjects.untracked,
 ) -> Evaluation:
     """Reconstruct held-out objects with weights (the shipped ones if None) and with the baselines.
 
@@ -148,23 +117,23 @@ def evaluate(
     record = reconstructor.record
     if mirror:
         reconstructor = Mirrored(reconstructor)
-    second: HeldOutObjects | None = None
+    second: subjects.HeldOutObjects | None = None
     if isinstance(objects, Path):
-        objects = dataset_objects(objects)
+        objects = subjects.dataset_objects(objects)
     elif objects is None:
-        rig = rig or rig_of(record)
-        second = None if count else rendered_objects(rig, tracked=tracked, test="unseen")
-        objects = rendered_objects(rig, count, tracked)
-    bare = bare_wall_for(record, objects.plan, wall)
-    guesses, searched = baseline_answers(objects, training, nearest=nearest, tracked=tracked)
+        rig = rig or subjects.rig_of(record)
+        second = None if count else subjects.rendered_objects(rig, tracked=tracked, test="unseen")
+        objects = subjects.rendered_objects(rig, count, tracked)
+    bare = subjects.bare_wall_for(record, objects.plan, wall)
+    guesses, searched = subjects.baseline_answers(objects, training, nearest=nearest, tracked=tracked)
     doubter = load_uncertainty_model(weights, cache_folder() / "onnx") if record.input == "raw maps" else None
-    maps = network_input(objects.maps, bare, objects.plan, record)
-    answers = answer_all(reconstructor, maps)
-    predicted, unseen = predict_quality(answers, maps, doubter, objects.plan.rig), None
+    maps = subjects.network_input(objects.maps, bare, objects.plan, record)
+    answers = subjects.answer_all(reconstructor, maps)
+    predicted, unseen = subjects.predict_quality(answers, maps, doubter, objects.plan.rig), None
     if second:
-        maps = network_input(second.maps, bare, second.plan, record)
-        others = answer_all(reconstructor, maps)
-        sure = predict_quality(others, maps, doubter, second.plan.rig)
+        maps = subjects.network_input(second.maps, bare, second.plan, record)
+        others = subjects.answer_all(reconstructor, maps)
+        sure = subjects.predict_quality(others, maps, doubter, second.plan.rig)
         unseen = Unseen(second.names, second.maps.image.astype(np.float32), others.image, sure)
     facts = {
         "what": objects.description,
@@ -173,9 +142,9 @@ def evaluate(
         "runtime": reconstructor.runtime,
         "input": record.input,
         "training_objects": len(searched) if searched else None,
-        "notes": notes_about(record, objects, searched),
+        "notes": subjects.notes_about(record, objects, searched),
     }
-    truth, left_out = objects.maps.image.astype(np.float32), left_out_categories(record)
+    truth, left_out = objects.maps.image.astype(np.float32), subjects.left_out_categories(record)
     box = objects.plan.box
     return Evaluation(
         objects.names, objects.categories, truth, answers.image, guesses, box, facts, left_out, unseen, predicted
@@ -185,15 +154,19 @@ def evaluate(
 def as_figures(evaluation: Evaluation) -> dict[str, Any]:
     """Return all figures, ready for JSON."""
     ours = evaluation.ours
-    theirs = {name: per_object(guess, evaluation.truth, evaluation.box) for name, guess in evaluation.guesses.items()}
-    overall = over_objects(ours)
+    theirs = {
+        name: metrics.per_object(guess, evaluation.truth, evaluation.box) for name, guess in evaluation.guesses.items()
+    }
+    overall = metrics.over_objects(ours)
     nearest = theirs.get("nearest_neighbour")
     return {
-        **plain(overall),
-        "baselines": {name: plain(over_objects(values)) for name, values in theirs.items()},
-        "advantage_over_nearest_neighbour": plain(advantage(ours, nearest)) if nearest else None,
-        "bars": targets_met(overall),
-        "per_category": {name: plain(figures) for name, figures in per_category(ours, evaluation.categories).items()},
+        **metrics.plain(overall),
+        "baselines": {name: metrics.plain(metrics.over_objects(values)) for name, values in theirs.items()},
+        "advantage_over_nearest_neighbour": metrics.plain(metrics.advantage(ours, nearest)) if nearest else None,
+        "bars": metrics.targets_met(overall),
+        "per_category": {
+            name: metrics.plain(figures) for name, figures in metrics.per_category(ours, evaluation.categories).items()
+        },
         "shown_and_left_out": _by_shown(evaluation),
         "rank_correlation": {
             f"{error_name} with {measure_name}": asdict(metrics.rank_correlation(measure, error))
@@ -204,7 +177,7 @@ def as_figures(evaluation: Evaluation) -> dict[str, Any]:
             name: asdict(zone) for name, zone in metrics.error_by_zone(evaluation.image, evaluation.truth).items()
         },
         "unseen": _unseen_figures(evaluation),
-        "quality": _quality(evaluation),
+        "quality": {name: metrics.quality_figures(*each) for name, each in _predicted_sets(evaluation).items()} or None,
         "recognised": _recognised(evaluation),
         "objects": len(evaluation.truth),
         **evaluation.facts,
@@ -212,15 +185,14 @@ def as_figures(evaluation: Evaluation) -> dict[str, Any]:
 
 
 def _unseen_figures(evaluation: Evaluation) -> dict[str, Any] | None:
-    """Return the figures of the second set of test objects, with their number."""
     if not (second := evaluation.unseen):
         return None
-    return plain(metrics.judge(second.image, second.truth, evaluation.box)) | {"objects": len(second.truth)}
+    return metrics.plain(metrics.judge(second.image, second.truth, evaluation.box)) | {"objects": len(second.truth)}
 
 
-def _predicted_sets(evaluation: Evaluation) -> dict[str, tuple[Predictions, Float64]]:
+def _predicted_sets(evaluation: Evaluation) -> dict[str, tuple[metrics.Predictions, Float64]]:
     """Return predicted and true quality of each set of objects, by its name; mixed objects also by share."""
-    sets, second = dict[str, tuple[Predictions, Float64]](), evaluation.unseen
+    sets, second = dict[str, tuple[metrics.Predictions, Float64]](), evaluation.unseen
     if predicted := evaluation.predicted:
         iou, kinds = evaluation.ours["silhouette_iou"], np.isin(evaluation.categories, tuple(CATEGORIES))
         sets["objects"] = predicted, iou
@@ -232,18 +204,15 @@ def _predicted_sets(evaluation: Evaluation) -> dict[str, tuple[Predictions, Floa
     return sets
 
 
-def _quality(evaluation: Evaluation) -> dict[str, Any] | None:
-    """Return the figures of predicted quality by set of objects; None without a quality model."""
-    return {name: metrics.quality_figures(*each) for name, each in _predicted_sets(evaluation).items()} or None
-
-
 def _recognised(evaluation: Evaluation) -> dict[str, Any] | None:
     """Return the shares of reconstructions, and of true images, recognised as their kind; None for other kinds."""
     if not set(evaluation.categories) <= CATEGORIES.keys():
         return None
     each = {"reconstructions": evaluation.image, "truth": evaluation.truth}
-    return plain(
-        over_objects({name: recognised(images, evaluation.categories, evaluation.box) for name, images in each.items()})
+    return metrics.plain(
+        metrics.over_objects(
+            {name: recognised(images, evaluation.categories, evaluation.box) for name, images in each.items()}
+        )
     )
 
 
@@ -252,7 +221,7 @@ def _by_shown(evaluation: Evaluation) -> dict[str, Any] | None:
     if not set(evaluation.left_out) & set(evaluation.categories):
         return None
     shown = ["left out" if category in evaluation.left_out else "shown" for category in evaluation.categories]
-    return {name: plain(figures) for name, figures in per_category(evaluation.ours, shown).items()}
+    return {name: metrics.plain(figures) for name, figures in metrics.per_category(evaluation.ours, shown).items()}
 
 
 def write_report(folder: Path, evaluation: Evaluation, figures: Mapping[str, Any]) -> None:
@@ -285,7 +254,9 @@ def _draw(folder: Path, evaluation: Evaluation) -> None:
     if second := evaluation.unseen:
         pictures.draw_sheet(folder / UNSEEN_SHEET, second.image, second.truth, second.names)
     pictures.draw_gallery(folder / "gallery.png", image, truth, names, ours["silhouette_iou"])
-    pictures.draw_categories(folder / "categories.png", per_category(ours, evaluation.categories), over_objects(ours))
+    pictures.draw_categories(
+        folder / "categories.png", metrics.per_category(ours, evaluation.categories), metrics.over_objects(ours)
+    )
     if sets := _predicted_sets(evaluation):
         pictures.draw_quality(folder / QUALITY, sets)
     curves = {
@@ -316,7 +287,10 @@ def document(figures: Mapping[str, Any], folder: Path) -> Document:
         [
             Section("", [Banner("good" if met == count else "doubtful", headline, advice)]),
             Section("", [Bullets("Note", figures["notes"])]),
-            Section("Metrics", [Table(head, [_row(figures, metric, baselines) for metric in TARGETS]), READ_WITH_CARE]),
+            Section(
+                "Metrics",
+                [Table(head, [_row(figures, metric, baselines) for metric in metrics.TARGETS]), READ_WITH_CARE],
+            ),
             saved_picture("Truth, reconstruction and difference", SHEET_CAPTION, folder / "sheet.png"),
             *_unseen(figures["unseen"], folder),
             *_quality_section(figures["quality"], folder),
@@ -334,7 +308,7 @@ def document(figures: Mapping[str, Any], folder: Path) -> Document:
 def _unseen(figures: Mapping[str, Any] | None, folder: Path) -> list[Section | Picture]:
     if not figures:
         return []
-    rows = [(LABELS[metric], format_interval(figures[metric])) for metric in TARGETS]
+    rows = [(LABELS[metric], format_interval(figures[metric])) for metric in metrics.TARGETS]
     title = f"{figures['objects']} objects of kinds that training never sees"
     table = Section(title, [Table(("metric", "these weights (95 % interval)"), rows)])
     return [table, saved_picture("Kinds never seen", SHEET_CAPTION, folder / UNSEEN_SHEET)]
@@ -370,10 +344,10 @@ def _next_commands(figures: Mapping[str, Any]) -> list[str]:
     return lines if figures["training_objects"] else [*lines, f"nlos-cam evaluate{chosen}"]
 
 
-def format_interval(figure: Mapping[str, float | None] | Interval, digits: int | None = None) -> str:
+def format_interval(figure: Mapping[str, float | None] | metrics.Interval, digits: int | None = None) -> str:
     """Format an estimate and its interval, by default with two digits of the half width, "0.696 (0.660 to 0.731)"."""
-    plain = asdict(figure) if isinstance(figure, Interval) else figure
-    value, low, high = (plain[name] for name in ("value", "low", "high"))
+    parts = asdict(figure) if isinstance(figure, metrics.Interval) else figure
+    value, low, high = (parts[name] for name in ("value", "low", "high"))
     if value is None or low is None or high is None:
         return "none"
     if digits is None:
@@ -383,7 +357,7 @@ def format_interval(figure: Mapping[str, float | None] | Interval, digits: int |
 
 def _row(figures: Mapping[str, Any], metric: str, baselines: Sequence[str]) -> tuple[str, ...]:
     bar = figures["bars"][metric]
-    target = f"{'at most' if metric in SMALLER_IS_BETTER else 'at least'} {bar['bar']:g}"
+    target = f"{'at most' if metric in metrics.SMALLER_IS_BETTER else 'at least'} {bar['bar']:g}"
     ours = format_interval(figures[metric])
     digits = len(ours.split(" ")[0].partition(".")[2])
     others = [format_interval(figures["baselines"][name][metric], digits).split(" ")[0] for name in baselines]

@@ -8,46 +8,25 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+import nlos_models as models
 import numpy as np
 import torch
 from nlos_calibration import ObjectBox, Rig, rig_named
 from nlos_calibration.arrays import Float32
-from nlos_models import (
-    OnnxReconstructor,
-    Reconstructor,
-    Sample,
-    TorchReconstructor,
-    load_cached,
-    load_network,
-    load_record,
-    network_export,
-    quantize,
-    refuse_color,
-    weights_folder,
-)
 
-from nlos_cam.camera import FRAMES_PER_S
+from nlos_cam.camera import FRAMES_PER_S, OnProgress
 from nlos_cam.dataset import TEST_SEED, TRAINING_SEED
 from nlos_cam.errors import SceneError
+from nlos_cam.evaluate import subjects
 from nlos_cam.evaluate.figures import LABELS
 from nlos_cam.evaluate.metrics import SMALLER_IS_BETTER, TARGETS, Figures, judge, plain
 from nlos_cam.evaluate.render_tradeoff import INCOMPLETE, undominated, write_table
-from nlos_cam.evaluate.subjects import (
-    Subject,
-    Tracked,
-    as_map_set,
-    echoes_of,
-    seeded_objects,
-    sense,
-    truth_of,
-    untracked,
-)
 from nlos_cam.files import atomic_directory
 from nlos_cam.frames import LidarMaps
 from nlos_cam.objects import benchmark_objects, object_box
 from nlos_cam.reconstruct import Mirrored
 from nlos_cam.render import MultiBounce
-from nlos_cam.report import Banner, Bullets, Commands, Document, Picture, Section, Table, saved_picture
+from nlos_cam.report import Banner, Bullets, Commands, Document, Picture, Section, Table, figure_of, saved_picture
 
 FRAMES = 1, 4, 16
 THREADS = 1, 2
@@ -63,8 +42,7 @@ AS_GOOD = {
 }
 """Losses that the recommended setting may have against float32 in torch."""
 
-OnProgress = Callable[[int, int], None]
-Make = Callable[[int], Reconstructor]
+Make = Callable[[int], models.Reconstructor]
 """Makes a reconstructor for a number of threads."""
 Clock = Callable[[], float]
 
@@ -107,21 +85,23 @@ class RuntimeBench:
     echoes: list[MultiBounce]
 
     @classmethod
-    def of(cls, subjects: Sequence[Subject], rig: Rig, box: ObjectBox, on_progress: OnProgress) -> "RuntimeBench":
+    def of(
+        cls, objects: Sequence[subjects.Subject], rig: Rig, box: ObjectBox, on_progress: OnProgress
+    ) -> "RuntimeBench":
         """Render the objects."""
-        return cls(rig, box, truth_of(subjects, box), echoes_of(subjects, rig, on_progress))
+        return cls(rig, box, subjects.truth_of(objects, box), subjects.echoes_of(objects, rig, on_progress))
 
 
 def open_runtime_bench(
-    weights: Mapping[str, Path | None], count: int | None = None, tracked: Tracked = untracked
+    weights: Mapping[str, Path | None], count: int | None = None, tracked: subjects.Tracked = subjects.untracked
 ) -> RuntimeBench:
     """Render the 54 test objects, or `count` random ones, on the rig of all these weights (None: the shipped ones).
 
     Raises SceneError if the weights are for different rigs or expect difference maps, CheckpointError for color.
     """
-    records = {name: load_record(weights_folder(folder)) for name, folder in weights.items()}
+    records = {name: models.load_record(models.weights_folder(folder)) for name, folder in weights.items()}
     for name, record in records.items():
-        refuse_color(record, weights[name])
+        models.refuse_color(record, weights[name])
     rigs = {record.rig_name for record in records.values()}
     if len(rigs) > 1:
         raise SceneError(f"the weights are for different rigs ({', '.join(sorted(rigs))}): compare weights of one rig")
@@ -129,9 +109,9 @@ def open_runtime_bench(
         raise SceneError(f"the weights expect {inputs.pop()} but the test maps are raw: use weights for raw maps")
     rig = rig_named(rigs.pop())
     box = object_box(rig)
-    subjects = seeded_objects(TEST_SEED, count, box) if count else benchmark_objects(box)
+    objects = subjects.seeded_objects(TEST_SEED, count, box) if count else benchmark_objects(box)
     with tracked("rendering") as on_progress:
-        return RuntimeBench.of(subjects, rig, box, on_progress)
+        return RuntimeBench.of(objects, rig, box, on_progress)
 
 
 def runtimes(weights: Path | None, rig: Rig, box: ObjectBox, cache: Path) -> dict[str, Make]:
@@ -139,27 +119,27 @@ def runtimes(weights: Path | None, rig: Rig, box: ObjectBox, cache: Path) -> dic
 
     8-bit networks are quantised when first made, with ranges calibrated on training objects.
     """
-    folder = weights_folder(weights)
-    record, (key, export) = load_record(folder), network_export(folder)
+    folder = models.weights_folder(weights)
+    record, (key, export) = models.load_record(folder), models.network_export(folder)
 
     def onnx(suffix: str, make_content: Callable[[bytes], bytes] = bytes) -> Make:
-        def make(threads: int) -> Reconstructor:
+        def make(threads: int) -> models.Reconstructor:
             def content() -> bytes:
-                return make_content(load_cached(cache / key, bytes, export))
+                return make_content(models.load_cached(cache / key, bytes, export))
 
             path = (cache / key).with_suffix(suffix)
-            return load_cached(path, lambda model: OnnxReconstructor(model, record, threads), content)
+            return models.load_cached(path, lambda model: models.OnnxReconstructor(model, record, threads), content)
 
         return make
 
     def in_torch(device: str, dtype: torch.dtype) -> Make:
-        def make(threads: int) -> Reconstructor:
+        def make(threads: int) -> models.Reconstructor:
             del threads  # torch has one number for all networks, set by `measure_runtimes`
-            return TorchReconstructor(load_network(weights)[0], record, device, dtype)
+            return models.TorchReconstructor(models.load_network(weights)[0], record, device, dtype)
 
         return make
 
-    def mirrored(threads: int) -> Reconstructor:
+    def mirrored(threads: int) -> models.Reconstructor:
         return Mirrored(onnx(".onnx")(threads))
 
     formats = {"float32": torch.float32, "bfloat16": torch.bfloat16}
@@ -168,17 +148,17 @@ def runtimes(weights: Path | None, rig: Rig, box: ObjectBox, cache: Path) -> dic
         **{f"torch {name}, {device}": in_torch(device, dtype) for device in devices for name, dtype in formats.items()},
         "ONNX Runtime float32": onnx(".onnx"),
         **({} if record.direct_recipe else {"ONNX Runtime float32, mirrored": mirrored}),  # a direct network is exact
-        "ONNX Runtime int8 weights": onnx(".dynamic-7.onnx", quantize),
+        "ONNX Runtime int8 weights": onnx(".dynamic-7.onnx", models.quantize),
         "ONNX Runtime int8": onnx(
-            f".static-7-{rig.checksum}.onnx", lambda model: quantize(model, calibration(rig, box))
+            f".static-7-{rig.checksum}.onnx", lambda model: models.quantize(model, calibration(rig, box))
         ),
     }
 
 
-def calibration(rig: Rig, box: ObjectBox) -> Iterator[Sample]:
+def calibration(rig: Rig, box: ObjectBox) -> Iterator[models.Sample]:
     """Yield maps of training objects, one at a time."""
-    subjects = seeded_objects(TRAINING_SEED, CALIBRATING, box)
-    for maps in sense(echoes_of(subjects, rig, lambda _done, _total: None), rig):
+    objects = subjects.seeded_objects(TRAINING_SEED, CALIBRATING, box)
+    for maps in subjects.sense(subjects.echoes_of(objects, rig, lambda _done, _total: None), rig):
         yield maps.depth_m[None], maps.intensity[None]
 
 
@@ -209,7 +189,7 @@ def measure_runtimes(
     maps: dict[int, list[LidarMaps]] = {}
     for setting in asked:
         if setting.frames not in maps:
-            maps[setting.frames] = sense(bench.echoes, bench.rig, frames=setting.frames)
+            maps[setting.frames] = subjects.sense(bench.echoes, bench.rig, frames=setting.frames)
         with _torch_threads(setting.threads):
             reconstructor = makes[setting.weights][setting.runtime](setting.threads)
             image, seconds = _timed(reconstructor, maps[setting.frames], bench.truth, clock)
@@ -228,10 +208,10 @@ def _torch_threads(count: int) -> Generator[None]:
 
 
 def _timed(
-    reconstructor: Reconstructor, maps: Sequence[LidarMaps], truth: Float32, clock: Clock
+    reconstructor: models.Reconstructor, maps: Sequence[LidarMaps], truth: Float32, clock: Clock
 ) -> tuple[Float32, list[float]]:
     """Return images of all maps and the seconds of every call but the first, which allocates."""
-    both = as_map_set(maps, truth)
+    both = subjects.as_map_set(maps, truth)
     reconstructor(both.depth_m[:1], both.intensity[:1])
     images: list[Float32] = []
     seconds: list[float] = []
@@ -346,9 +326,7 @@ def write_runtimes(folder: Path, table: Mapping[str, Any], rows: Sequence[Runtim
 
 def draw_runtimes(path: Path, rows: Sequence[RuntimeRow]) -> None:
     """Draw silhouette IoU against milliseconds per call, and against averaged frames."""
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(12, 5.5), layout="constrained")
+    figure = figure_of(12, 5.5)
     times, frames = figure.subplots(1, 2, width_ratios=(2, 1))
     front = pareto_front(rows)
     places = [row.milliseconds for row in front], [row.figures["silhouette_iou"].value for row in front]
@@ -368,7 +346,6 @@ def draw_runtimes(path: Path, rows: Sequence[RuntimeRow]) -> None:
 
 
 def _series(axis: Any, rows: Sequence[RuntimeRow]) -> None:
-    """Draw one runtime with its numbers of threads."""
     setting = rows[0].setting
     label = setting.runtime if setting.weights == "shipped" else f"{setting.weights}: {setting.runtime}"
     (line,) = axis.plot(
@@ -382,7 +359,6 @@ def _series(axis: Any, rows: Sequence[RuntimeRow]) -> None:
 
 
 def _against_frames(axis: Any, weights: str, rows: Sequence[RuntimeRow]) -> None:
-    """Draw the runtime that was measured with several frames."""
     tried = {row.setting.runtime for row in rows if row.setting.frames > 1}
     some = [row for row in rows if row.setting.runtime in tried and row.setting.threads == 1]
     ious = [row.figures["silhouette_iou"] for row in some]

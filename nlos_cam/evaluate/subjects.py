@@ -13,33 +13,14 @@ from nlos_calibration.arrays import Float32
 from nlos_calibration.errors import RecordFileError
 from nlos_models import Answer, CheckpointRecord, MapSet, Reconstructor, UncertaintyModel, ask, subtract_bare_wall
 
-from nlos_cam.camera import World
-from nlos_cam.dataset import (
-    TEST_SEED,
-    TRAINING_SEED,
-    BareMaps,
-    Dataset,
-    DatasetPlan,
-    RigSpread,
-    measured_bare_wall,
-    open_dataset,
-    procedural_images,
-    render_bare_wall,
-)
+from nlos_cam import dataset as data
+from nlos_cam import objects as shapes
+from nlos_cam.camera import OnProgress, World
 from nlos_cam.errors import SceneError
 from nlos_cam.evaluate import baselines as trivial
 from nlos_cam.evaluate.metrics import Predictions
 from nlos_cam.files import cache_folder
 from nlos_cam.frames import LidarMaps, MapMean, maps_from_frame
-from nlos_cam.objects import (
-    BenchmarkObject,
-    benchmark_objects,
-    depth_from_image,
-    image_from_depth,
-    object_box,
-    object_depth,
-    unseen_objects,
-)
 from nlos_cam.reconstruct import (
     FrameConditions,
     Reconstruction,
@@ -52,7 +33,6 @@ from nlos_cam.reconstruct import (
 )
 from nlos_cam.render import MultiBounce, Scene, SceneFile, SensorModel, render
 
-OnProgress = Callable[[int, int], None]
 Tracked = Callable[[str], AbstractContextManager[OnProgress]]
 """Opens a progress bar with a description; yields the function that takes (done, total)."""
 
@@ -80,20 +60,20 @@ class SeededObject:
     """(64, 64); NaN for background."""
 
 
-Subject = SeededObject | BenchmarkObject
+Subject = SeededObject | shapes.BenchmarkObject
 """Object with a known depth map, a category, and a name for tables and pictures."""
 
 
 def seeded_objects(first_seed: int, count: int, box: ObjectBox) -> list[SeededObject]:
     """Return random objects of consecutive seeds."""
     seeds = range(first_seed, first_seed + count)
-    objects = [(seed, *object_depth(seed, box)) for seed in seeds]
+    objects = [(seed, *shapes.object_depth(seed, box)) for seed in seeds]
     return [SeededObject(f"{category} {seed}", category, depth_m) for seed, category, depth_m in objects]
 
 
 def truth_of(subjects: Sequence[Subject], box: ObjectBox) -> Float32:
     """Return the true images v (n, 64, 64)."""
-    return np.stack([image_from_depth(subject.depth_m, box) for subject in subjects])
+    return np.stack([shapes.image_from_depth(subject.depth_m, box) for subject in subjects])
 
 
 def echoes_of(subjects: Sequence[Subject], rig: Rig, on_progress: OnProgress) -> list[MultiBounce]:
@@ -148,12 +128,12 @@ def predict_quality(
     """
     if uncertainty_model is None or uncertainty_model.quality is None:
         return None
-    rows, box = list[tuple[float, ...]](), object_box(rig)
+    rows, box = list[tuple[float, ...]](), shapes.object_box(rig)
     surfaces = [None] * len(answers.image) if answers.surface is None else answers.surface
     for depth_m, intensity, image, surface in zip(maps.depth_m, maps.intensity, answers.image, surfaces, strict=True):
         frame = LidarMaps(depth_m, intensity, ~np.isnan(depth_m))
         doubt = estimate_doubt(uncertainty_model, frame, image, box, surface)
-        found = Reconstruction(depth_from_image(image, box), np.eye(4), doubt.error_m, {}, doubt)
+        found = Reconstruction(shapes.depth_from_image(image, box), np.eye(4), doubt.error_m, {}, doubt)
         _, verdict = VerdictFilter(verdict_limits(uncertainty_model)).decide(found, FrameConditions())
         if quality := doubt.quality:
             trusted = quality.trusted and verdict is Verdict.SEEN
@@ -174,7 +154,7 @@ class HeldOutObjects:
     categories: list[str]
     maps: MapSet
     """Raw maps, whichever input the weights expect: the baselines compare these."""
-    plan: DatasetPlan
+    plan: data.DatasetPlan
 
 
 def rig_of(record: CheckpointRecord) -> Rig:
@@ -191,8 +171,8 @@ def rendered_objects(
     rig: Rig, count: int | None = None, tracked: Tracked = untracked, *, test: TestSet = "kinds"
 ) -> HeldOutObjects:
     """Render the 54 test objects of a set, or `count` random ones, with the simulated camera's noise on a rig."""
-    plan = DatasetPlan(rig, TEST_SEED)
-    fixed = benchmark_objects if test == "kinds" else unseen_objects
+    plan = data.DatasetPlan(rig, data.TEST_SEED)
+    fixed = shapes.benchmark_objects if test == "kinds" else shapes.unseen_objects
     subjects = seeded_objects(plan.first_seed, count, plan.box) if count else fixed(plan.box)
     with tracked("rendering test objects") as on_progress:
         echoes = echoes_of(subjects, rig, on_progress)
@@ -204,13 +184,13 @@ def rendered_objects(
 
 def dataset_objects(folder: Path) -> HeldOutObjects:
     """Return the objects and maps of a dataset."""
-    opened = open_dataset(folder)
+    opened = data.open_dataset(folder)
     categories = [str(category) for category in opened.column("category")]
     names = [f"{category} {seed}" for category, seed in zip(categories, opened.column("seed"), strict=True)]
     return HeldOutObjects(f"Maps of {folder}", names, categories, opened.arrays(), opened.plan)
 
 
-def bare_wall_for(record: CheckpointRecord, plan: DatasetPlan, wall: Path | None = None) -> BareMaps | None:
+def bare_wall_for(record: CheckpointRecord, plan: data.DatasetPlan, wall: Path | None = None) -> data.BareMaps | None:
     """Return the bare wall to subtract for difference maps, as in training; None if the weights expect raw maps.
 
     Raises SceneError if a measured wall was given for raw maps.
@@ -219,25 +199,25 @@ def bare_wall_for(record: CheckpointRecord, plan: DatasetPlan, wall: Path | None
         if wall:
             raise SceneError(f"--wall {wall} only applies to difference maps; these weights expect raw maps: omit it")
         return None
-    return measured_bare_wall(wall) if wall else render_bare_wall(plan)
+    return data.measured_bare_wall(wall) if wall else data.render_bare_wall(plan)
 
 
-def network_input(maps: MapSet, bare: BareMaps | None, plan: DatasetPlan, record: CheckpointRecord) -> MapSet:
+def network_input(maps: MapSet, bare: data.BareMaps | None, plan: data.DatasetPlan, record: CheckpointRecord) -> MapSet:
     """Return the maps that the network takes: minus the bare wall, or raw and aligned with the rig of the weights."""
     if bare:
         return subtract_bare_wall(maps, *bare)
-    return maps if plan.spread != RigSpread() else align_all(maps, plan.rig, record)
+    return maps if plan.spread != data.RigSpread() else align_all(maps, plan.rig, record)
 
 
 def baseline_answers(
     objects: HeldOutObjects, training: Path | None, *, nearest: bool, tracked: Tracked = untracked
-) -> tuple[dict[str, Float32], Dataset | None]:
+) -> tuple[dict[str, Float32], data.Dataset | None]:
     """Return the baselines' images by name, and the training objects searched for the nearest neighbour, if wanted."""
     if not nearest:
-        images = procedural_images(TRAINING_SEED, trivial.NEIGHBOURS, objects.plan.box)
+        images = data.procedural_images(data.TRAINING_SEED, trivial.NEIGHBOURS, objects.plan.box)
         return trivial.trivial_answers(len(objects.names), trivial.mean_image(images)), None
     if training:
-        opened = open_dataset(training)
+        opened = data.open_dataset(training)
     else:
         with tracked("rendering training objects for the nearest neighbour, once") as on_progress:
             opened = trivial.training_maps(objects.plan, cache_folder(), os.cpu_count() or 1, on_progress)
@@ -245,7 +225,7 @@ def baseline_answers(
         return trivial.answers_with_nearest(objects.maps, opened, on_progress), opened
 
 
-def notes_about(record: CheckpointRecord, objects: HeldOutObjects, training: Dataset | None) -> list[str]:
+def notes_about(record: CheckpointRecord, objects: HeldOutObjects, training: data.Dataset | None) -> list[str]:
     """List mismatches between weights, objects and baselines that a reader of the figures has to know."""
     rig, notes = objects.plan.rig, list[str]()
     if record.rig_checksum != rig.checksum:

@@ -9,29 +9,19 @@ from nlos_calibration.errors import CalibrationError
 from nlos_models.errors import ModelError
 
 from nlos_cam.errors import NlosCamError, RecordingError
-from nlos_cam.info.files import (
-    Description,
-    describe_bag,
-    describe_json,
-    describe_npz,
-    describe_page,
-    describe_rrd,
-    describe_shard,
-    describe_toml,
-    size_of,
-)
+from nlos_cam.info import files
 from nlos_cam.info.folders import FOLDERS
 from nlos_cam.recording import SAMPLE
 
-Describe = Callable[[Path, bool], Description | None]
+Describe = Callable[[Path, bool], files.Description | None]
 FILES: dict[str, tuple[str, Describe]] = {
-    ".bag": ("recording", describe_bag),
-    ".npz": ("arrays", describe_npz),
-    ".toml": ("record", describe_toml),
-    ".json": ("record", describe_json),
-    ".html": ("page", describe_page),
-    ".rrd": ("saved view", describe_rrd),
-    ".h5": ("dataset shard", describe_shard),
+    ".bag": ("recording", files.describe_bag),
+    ".npz": ("arrays", files.describe_npz),
+    ".toml": ("record", files.describe_toml),
+    ".json": ("record", files.describe_json),
+    ".html": ("page", files.describe_page),
+    ".rrd": ("saved view", files.describe_rrd),
+    ".h5": ("dataset shard", files.describe_shard),
 }
 """Word for a damaged file, and reader, by suffix."""
 KINDS = (
@@ -41,7 +31,7 @@ KINDS = (
 )
 
 
-def describe(path: Path, *, verify: bool = False) -> Description:
+def describe(path: Path, *, verify: bool = False) -> files.Description:
     """Return the description of a file or folder; `verify` reads all of it instead of its heads.
 
     The name "sample" stands for the packaged recording. A damaged one has a `problem`. Raises RecordingError where
@@ -61,17 +51,14 @@ def describe(path: Path, *, verify: bool = False) -> Description:
         try:
             found = reader(path, verify)
         except (NlosCamError, CalibrationError, ModelError) as error:
-            found = Description(kind, problem=" ".join(str(error).split()))
+            found = files.Description(kind, problem=" ".join(str(error).split()))
         except (LookupError, TypeError, ValueError, AttributeError) as error:  # fields that the program never wrote
-            found = Description(
+            found = files.Description(
                 kind, problem=f"{path} is damaged ({type(error).__name__} in its fields): make it again"
             )
         except OSError as error:
             raise RecordingError(f"{path} cannot be read: {error.strerror or error}") from error
         if found:
-            return replace(found, bytes=size_of(path), created=found.created or _file_date(path))
+            file_date = f"{datetime.fromtimestamp(path.stat().st_mtime, UTC):%Y-%m-%d %H:%M:%S} UTC (file's date)"
+            return replace(found, bytes=files.size_of(path), created=found.created or file_date)
     raise RecordingError(f"{path} is of no known kind. Known are {KINDS}")
-
-
-def _file_date(path: Path) -> str:
-    return f"{datetime.fromtimestamp(path.stat().st_mtime, UTC):%Y-%m-%d %H:%M:%S} UTC (file's date)"

@@ -15,7 +15,7 @@ from queue import Empty, Queue
 from typing import Any
 
 import numpy as np
-from nlos_calibration import MeasuredWall, WallRecord, new_wall_record
+from nlos_calibration import MeasuredWall, WallRecord
 from nlos_calibration.errors import CalibrationError, OccluderRefusedError
 from numpy.typing import NDArray
 
@@ -194,7 +194,6 @@ class RunControl:
         return self._camera, self._pipeline
 
     def _file(self, stem: str, suffix: str) -> Path:
-        """Return a new dated path in the folder."""
         path = self.folder / f"{stem}-{datetime.now().astimezone():%Y%m%d-%H%M%S-%f}"[:-3]
         return path.with_name(path.name + suffix)
 
@@ -324,12 +323,7 @@ def measure_bench(
         except OccluderRefusedError:  # a bare wall, without one
             pass
     fit, facts = calibrate.measure_by_depth(capture)
-    today, frames = datetime.now().astimezone().date(), capture.statistics.depth.frames
-    others = {**capture.facts(), **facts}
-    record = new_wall_record(
-        fit, capture.intrinsics, camera=capture.camera, frames=frames, created=today, others=others
-    )
-    return record, fit.inliers
+    return capture.record(fit, facts), fit.inliers
 
 
 class _PassingFrames:

@@ -3,7 +3,6 @@
 import time
 from collections.abc import Callable, Iterable, Iterator
 from threading import Event, Thread
-from types import TracebackType
 from typing import Self
 
 from nlos_cam.errors import CameraLostError
@@ -60,9 +59,7 @@ class FrameReader:
         self._thread.start()
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, _: object, error: object, __: object) -> None:
         self._queue.finish()
         self._thread.join(ABANDON_AFTER_S)
         if self._thread.is_alive():

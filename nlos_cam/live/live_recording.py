@@ -3,20 +3,11 @@
 from collections import Counter
 from pathlib import Path
 
+from nlos_cam import recording as recordings
 from nlos_cam.camera import FRAMES_PER_S, Camera, Recording
 from nlos_cam.errors import NlosCamError
 from nlos_cam.frames import Frame
 from nlos_cam.reconstruct import Clock
-from nlos_cam.recording import (
-    CaptureResult,
-    CaptureTarget,
-    QualityMeter,
-    SidecarFile,
-    State,
-    finalize,
-    sidecar_path,
-    verify,
-)
 
 
 class LiveRecording:
@@ -27,10 +18,13 @@ class LiveRecording:
 
     def __init__(self, camera: Camera, path: Path, label: str | None, clock: Clock) -> None:
         self.path, self.start_s = path, clock()
-        self._camera, self._target = camera, CaptureTarget(path, label)
+        self._camera, self._target = camera, recordings.CaptureTarget(path, label)
         if not hasattr(camera, "start_recording"):
             raise NlosCamError(f"{camera.uri} cannot be recorded: only a live camera (l515, sim) can")
-        self._sidecar, self._meter = SidecarFile(sidecar_path(path), camera, label=label), QualityMeter()
+        self._sidecar, self._meter = (
+            recordings.SidecarFile(recordings.sidecar_path(path), camera, label=label),
+            recordings.QualityMeter(),
+        )
         self._recording = Recording(path, optional=True, last=False)
         try:
             camera.start_recording(self._recording)  # type: ignore[attr-defined]  checked above
@@ -51,8 +45,8 @@ class LiveRecording:
         """
         sets = self._recording.sets
         self._camera.stop_recording()  # type: ignore[attr-defined]  it started one
-        state: State = "disk full" if self._recording.disk_full else "complete"
-        result = CaptureResult(
+        state: recordings.State = "disk full" if self._recording.disk_full else "complete"
+        result = recordings.CaptureResult(
             self._target,
             state,
             self._recording.sets or sets,
@@ -61,7 +55,7 @@ class LiveRecording:
             follows_another=True,
             events=Counter(self._camera.counts),
         )
-        final = finalize(result, verify)
+        final = recordings.finalize(result, recordings.verify)
         if final.error:
             raise final.error
         if not final.sets:

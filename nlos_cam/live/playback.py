@@ -11,6 +11,7 @@ from typing import Any
 
 from nlos_models import Reconstructor, UncertaintyModel
 
+from nlos_cam import reconstruct as pipelines
 from nlos_cam.camera import Camera
 from nlos_cam.errors import NlosCamError, RecordingError
 from nlos_cam.live.control import save_moment
@@ -18,14 +19,6 @@ from nlos_cam.live.frame_queue import FrameReader
 from nlos_cam.live.loop import iterate_batched
 from nlos_cam.live.replay_media import moment_of
 from nlos_cam.live.telemetry import with_telemetry
-from nlos_cam.reconstruct import (
-    CalibratedRig,
-    PeriodicPhysicsCheck,
-    Pipeline,
-    build_pipeline,
-    load_networks,
-    load_uncertainty,
-)
 from nlos_cam.view import PlaybackViewer
 
 
@@ -36,7 +29,13 @@ class Playback(PlaybackViewer):
     """
 
     def __init__(
-        self, camera: Camera, bench: CalibratedRig, *, folder: Path = Path(), host: str, port: int | None = None
+        self,
+        camera: Camera,
+        bench: pipelines.CalibratedRig,
+        *,
+        folder: Path = Path(),
+        host: str,
+        port: int | None = None,
     ) -> None:
         super().__init__(bench.rig, bench.measured, host=host, port=port, controls=self)
         self._camera, self._measured_bench, self._folder, self._exporting = camera, bench, folder, Lock()
@@ -61,12 +60,14 @@ class Playback(PlaybackViewer):
 
     @cached_property
     def _networks(self) -> tuple[Reconstructor, UncertaintyModel | None]:
-        return load_networks(), load_uncertainty()
+        return pipelines.load_networks(), pipelines.load_uncertainty()
 
-    def _pipeline(self, *, checks: bool) -> Pipeline:
+    def _pipeline(self, *, checks: bool) -> pipelines.Pipeline:
         network, uncertainty_model = self._networks
-        check = PeriodicPhysicsCheck(self._measured_bench.rig) if checks else None
-        return build_pipeline(self._measured_bench, network, uncertainty_model=uncertainty_model, checks=check)
+        check = pipelines.PeriodicPhysicsCheck(self._measured_bench.rig) if checks else None
+        return pipelines.build_pipeline(
+            self._measured_bench, network, uncertainty_model=uncertainty_model, checks=check
+        )
 
     def status(self) -> dict[str, Any]:
         """Return the state for the page."""

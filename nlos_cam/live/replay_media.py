@@ -13,6 +13,7 @@ from nlos_cam import view as view_package  # loads its heavy parts when they are
 from nlos_cam.live.object_files import ObjectFiles
 from nlos_cam.objects import object_box
 from nlos_cam.reconstruct import CalibratedRig, FrameResult
+from nlos_cam.report import figure_of
 from nlos_cam.view import MAX_UNCERTAINTY_M, Moment, Viewer
 
 VIEW, VIDEO, STILL, STILLS = "view.html", "replay.webm", "still-{:06d}.png", "still-*.png"
@@ -127,10 +128,8 @@ def draw_contact_sheet(path: Path, results: list[FrameResult]) -> None:
 
     The title of a column is its verdict; rows without any image are left out.
     """
-    from matplotlib.figure import Figure
-
     rows = _rows(results)
-    figure = Figure(figsize=(2.2 * len(results) + 1, 6.5 * len(rows) / 3), layout="constrained")
+    figure = figure_of(2.2 * len(results) + 1, 6.5 * len(rows) / 3)
     grid = figure.subplots(len(rows), len(results), squeeze=False)
     for axes, (title, (colormap, (low, high), images)) in zip(grid, rows.items(), strict=True):
         drawn = [axis.imshow(image, colormap, vmin=low, vmax=high) for axis, image in zip(axes, images, strict=True)]

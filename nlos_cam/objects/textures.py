@@ -56,11 +56,6 @@ def _along(generator: Generator, n: int) -> Float64:
     return x * np.cos(angle) + y * np.sin(angle)
 
 
-def _plain(generator: Generator, depth_m: Float32) -> Float64:
-    """Return one color everywhere."""
-    return np.broadcast_to(_colors(generator, 1)[0], (*depth_m.shape, 3))
-
-
 def _patches(generator: Generator, depth_m: Float32) -> Float64:
     """Return a Voronoi pattern of 2 to 4 colors: a cell has the color of its nearest point."""
     count, (x, y) = int(generator.integers(2, 5)), _grid(len(depth_m))
@@ -83,14 +78,13 @@ def _stripes(generator: Generator, depth_m: Float32) -> Float64:
 
 
 def _gradient(generator: Generator, depth_m: Float32) -> Float64:
-    """Return a gradient from one color to another across the object."""
     share = np.clip(0.5 + 0.7 * _along(generator, len(depth_m)), 0.0, 1.0)[..., None]
     start, end = _colors(generator, 2)
     return start + share * (end - start)
 
 
 TEXTURES: dict[str, Callable[[Generator, Float32], Float64]] = {
-    "plain": _plain,
+    "plain": lambda generator, depth_m: np.broadcast_to(_colors(generator, 1)[0], (*depth_m.shape, 3)),
     "patches": _patches,
     "layers": _layers,
     "stripes": _stripes,

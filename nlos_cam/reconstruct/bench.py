@@ -4,18 +4,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import nlos_calibration as walls
 import numpy as np
-from nlos_calibration import (
-    BareWall,
-    DriftCheck,
-    Intrinsics,
-    MeasuredWall,
-    Rig,
-    WallRecord,
-    load_measured,
-    load_rig,
-    wall_from_zero,
-)
 from nlos_calibration.errors import CalibrationError
 
 from nlos_cam.camera import Camera
@@ -42,14 +32,14 @@ class CalibratedRig:
     Stateful (drift): `observe` the frames in order, from one thread.
     """
 
-    def __init__(self, rig: Rig, measured: MeasuredWall | None = None, notes: tuple[str, ...] = ()) -> None:
+    def __init__(self, rig: walls.Rig, measured: walls.MeasuredWall | None = None, notes: tuple[str, ...] = ()) -> None:
         self.rig, self.measured = rig, measured
         self.notes = notes
         """Warnings that hold for every frame."""
-        self.reference: BareWall | None = measured.reference if measured else None
-        self._drift: DriftCheck | None = None
+        self.reference: walls.BareWall | None = measured.reference if measured else None
+        self._drift: walls.DriftCheck | None = None
         if measured and measured.reference:
-            self._drift = DriftCheck(measured.reference, wall_from_zero(measured.record))
+            self._drift = walls.DriftCheck(measured.reference, walls.wall_from_zero(measured.record))
 
     def update_temperatures(self, celsius: Mapping[str, float]) -> None:
         """Pass one reading of the device's temperatures to the drift check."""
@@ -80,7 +70,7 @@ class CalibratedRig:
         return replace(maps, depth_m=maps.depth_m + np.float32(offset_m)) if offset_m else maps
 
 
-def subtract_reference(maps: LidarMaps, reference: BareWall) -> LidarMaps:
+def subtract_reference(maps: LidarMaps, reference: walls.BareWall) -> LidarMaps:
     """Return the maps less those of the bare wall; intensity 0 where either has no depth."""
     depth_m = maps.depth_m - reference.map_depth_m
     valid = ~np.isnan(depth_m)
@@ -93,14 +83,14 @@ def open_bench(wall: Path | None, camera: Camera) -> CalibratedRig:
     Raises RecordFileError, and CalibrationError if the wall was measured with other intrinsics.
     """
     if wall is None:
-        return CalibratedRig(camera.rig if camera.rig and camera.rig.object_box else load_rig("paper-rig"))
-    measured = load_measured(wall)
+        return CalibratedRig(camera.rig if camera.rig and camera.rig.object_box else walls.load_rig("paper-rig"))
+    measured = walls.load_measured(wall)
     for intrinsics in [measured.record.rig.pinhole, *([measured.reference.intrinsics] if measured.reference else [])]:
         check_intrinsics(intrinsics, camera.intrinsics)
     return CalibratedRig(measured.record.rig, measured, _notes(measured.record, camera))
 
 
-def check_intrinsics(measured: Intrinsics, given: Intrinsics) -> None:
+def check_intrinsics(measured: walls.Intrinsics, given: walls.Intrinsics) -> None:
     """Raise CalibrationError if a camera's intrinsics `given` are not those that the wall was measured with."""
     if (measured.width, measured.height) != (given.width, given.height):
         raise CalibrationError(
@@ -117,7 +107,7 @@ def check_intrinsics(measured: Intrinsics, given: Intrinsics) -> None:
         )
 
 
-def _mismatch_pixels(one: Intrinsics, other: Intrinsics) -> float:
+def _mismatch_pixels(one: walls.Intrinsics, other: walls.Intrinsics) -> float:
     """Return the largest distance, along x or y, between a beam's pixels in the two.
 
     Pixel x of `one` is the beam (x - ppx) / fx, hence pixel ppx' + (x - ppx) fx' / fx of the other: linear in x, so the
@@ -128,7 +118,7 @@ def _mismatch_pixels(one: Intrinsics, other: Intrinsics) -> float:
     return max(abs(pixels) for pixels in along_x + along_y)
 
 
-def _notes(record: WallRecord, camera: Camera) -> tuple[str, ...]:
+def _notes(record: walls.WallRecord, camera: Camera) -> tuple[str, ...]:
     serial = camera.identity.get("serial", "")
     if not serial or not record.serial or serial == record.serial:
         return ()

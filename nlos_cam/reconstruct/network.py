@@ -154,11 +154,7 @@ def _run_network(batch: Sequence[LidarMaps], network: Network) -> Answer:
 
 
 def estimate_doubt(
-    uncertainty_model: UncertaintyModel,
-    maps: LidarMaps,
-    image: Float32,
-    box: ObjectBox,
-    surface: Float32 | None = None,
+    uncertainty_model: UncertaintyModel, maps: LidarMaps, image: Float32, box: ObjectBox, surface: Float32 | None = None
 ) -> Doubt:
     """Return the uncertainty of an image (64, 64) in v that networks made from maps.
 

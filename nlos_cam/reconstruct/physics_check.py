@@ -233,7 +233,6 @@ def check_reconstruction(
 
 @lru_cache(maxsize=4)
 def _bare(rig: Rig) -> Expected:
-    """Return the echoes of the empty bench."""
     return _expected(render(Scene(rig)), rig, None)
 
 
@@ -248,7 +247,7 @@ def _expected(rendering: Rendering, rig: Rig, bare: Expected | None) -> Expected
     return Expected(np.where(bounced, bare.direct_m, direct_m), np.where(bounced, bare.direct, direct), echo_m, echo)
 
 
-class PeriodicPhysicsCheck:
+class PeriodicPhysicsCheck(NullPhysicsCheck):
     """Physics check of the first of every `every` frames, in the caller's thread: reproducible to the bit.
 
     Calls `on_error` for the first check that fails.
@@ -266,12 +265,6 @@ class PeriodicPhysicsCheck:
         self._rig, self._every, self._offered = rig, every, 0
         self._accuracy: Stop = accuracy
         self._on_error, self._failed = on_error, False
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        pass
 
     def offer(self, frame_number: int, maps: LidarMaps, depth_m: Float32) -> None:
         """Check this frame if it is the first of its group."""

@@ -24,29 +24,7 @@ from rosbags.rosbag1.reader import Header, RecordType, read_uint32
 
 from nlos_cam.camera import Sample, repair_command
 from nlos_cam.errors import RecordingError
-from nlos_cam.recording import bag_messages
-from nlos_cam.recording.bag_messages import (
-    CAMERA,
-    ENCODINGS,
-    IMAGE,
-    INFO,
-    MAX_TEXT,
-    NUMBER,
-    PAIR,
-    TRANSFORM,
-    FrameMetadata,
-    sdk_name,
-)
-from nlos_cam.recording.rosbag import (
-    CHUNK_LIMIT,
-    FILE_HEADER_BYTES,
-    MAGIC,
-    MAX_CONNECTIONS,
-    BagFormatError,
-    number,
-    read_record,
-    reader,
-)
+from nlos_cam.recording import bag_messages, rosbag
 
 DEVICE = "/device_0"
 STREAM = re.compile(DEVICE + r"/sensor_([0-9]{1,3})/([A-Za-z_]{1,40})_([0-9]{1,3})(?=/image/data$)")
@@ -90,7 +68,7 @@ class StreamInfo:
     @property
     def format(self) -> str:
         """The SDK's name of the encoding: z16, y8, raw8, rgb8, ...; empty for one that we cannot read."""
-        return ENCODINGS[self.encoding].sdk_format if self.encoding in ENCODINGS else ""
+        return bag_messages.ENCODINGS[self.encoding].sdk_format if self.encoding in bag_messages.ENCODINGS else ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -140,12 +118,12 @@ class BagReader:
     def _read_index(self) -> None:
         found: dict[str, list[Entry]] = defaultdict(list)
         _check_topics(self.path)
-        with Reader(cast("Any", _BoundedPath(self.path))) as reader:
-            for connection in reader.connections:
-                index = reader.indexes.pop(connection.id)  # half a million tuples for ten minutes: keep one copy
+        with Reader(cast("Any", _BoundedPath(self.path))) as indexed:
+            for connection in indexed.connections:
+                index = indexed.indexes.pop(connection.id)  # half a million tuples for ten minutes: keep one copy
                 found[connection.topic].extend(Entry(*place, connection.id) for place in index)
                 if self.types.setdefault(connection.topic, connection.msgtype) != connection.msgtype:
-                    raise ValueError(f"messages of two types on {connection.topic[:MAX_TEXT]}")
+                    raise ValueError(f"messages of two types on {connection.topic[: bag_messages.MAX_TEXT]}")
         if not found:
             raise ValueError("its index is empty")
         self.entries = {topic: sorted(entries) for topic, entries in found.items()}
@@ -154,9 +132,12 @@ class BagReader:
         self.end_ns = max((entries[-1].time_ns for entries in self.entries.values() if entries), default=0)
 
     def _stream_info(self, sensor: str, kind: str, index: str, topic: str) -> StreamInfo:
-        encoding, frames_per_s = self._first(f"{topic}/info", INFO, lambda info: (info.encoding[:MAX_TEXT], info.fps))
-        pinhole = self._first(f"{topic}/info/camera_info", CAMERA, bag_messages.intrinsics_of)
-        name, frames = sdk_name(kind if index == "0" else f"{kind}_{index}"), len(self.entries[f"{topic}/image/data"])
+        encoding, frames_per_s = self._first(
+            f"{topic}/info", bag_messages.INFO, lambda info: (info.encoding[: bag_messages.MAX_TEXT], info.fps)
+        )
+        pinhole = self._first(f"{topic}/info/camera_info", bag_messages.CAMERA, bag_messages.intrinsics_of)
+        name = bag_messages.sdk_name(kind if index == "0" else f"{kind}_{index}")
+        frames = len(self.entries[f"{topic}/image/data"])
         return StreamInfo(name, topic, int(sensor), encoding, frames_per_s, pinhole, frames)
 
     def _first(self, topic: str, kind: str, convert: Callable[[Any], T]) -> T:
@@ -165,7 +146,7 @@ class BagReader:
         raise RecordingError(f"{self.path} is damaged (it has no {topic}): {repair_advice(self.path)}")
 
     def _all(self, topic: str) -> list[Any]:
-        return [self.read(topic, entry, PAIR) for entry in self.entries.get(topic, ())]
+        return [self.read(topic, entry, bag_messages.PAIR) for entry in self.entries.get(topic, ())]
 
     def check(self) -> None:
         """Read every message, in the order of the file. Raises RecordingError at the first damage."""
@@ -176,7 +157,7 @@ class BagReader:
                 raw = self.raw(entry)
                 if not bag_messages.is_known(self.types[topic]):
                     continue
-                message = bag_messages.parse(raw, self.types[topic], IMAGE if topic in images else "")
+                message = bag_messages.parse(raw, self.types[topic], bag_messages.IMAGE if topic in images else "")
                 if topic in images:
                     bag_messages.pixels(message, images[topic].encoding, images[topic].intrinsics)
 
@@ -234,14 +215,14 @@ class BagReader:
             pixels = bag_messages.pixels(image, info.encoding, info.intrinsics)
             return Sample(stream, image.header.seq, bag_messages.timestamp_s(image), pixels)
 
-        return self.read(f"{info.topic}/image/data", entry, IMAGE, convert)
+        return self.read(f"{info.topic}/image/data", entry, bag_messages.IMAGE, convert)
 
-    def metadata(self, stream: str, index: int) -> FrameMetadata:
+    def metadata(self, stream: str, index: int) -> bag_messages.FrameMetadata:
         """Return the metadata of a frame by its index in its stream."""
         frame, topic = self._frames(stream)[index], f"{self.streams[stream].topic}/image/metadata"
         entries = self.entries.get(topic, [])
         first, end = (side(entries, frame.time_ns, key=lambda e: e.time_ns) for side in (bisect_left, bisect_right))
-        pairs = [self.read(topic, entry, PAIR) for entry in entries[first:end]]
+        pairs = [self.read(topic, entry, bag_messages.PAIR) for entry in entries[first:end]]
         with self._locate(frame):
             return bag_messages.metadata(pairs)
 
@@ -253,13 +234,13 @@ class BagReader:
         sensor = self.streams[stream].sensor
         if sensor not in self._options:
             matches = [match for topic in self.entries if (match := OPTION.fullmatch(topic))]
-            names = {match[0]: sdk_name(match[2]) for match in matches if int(match[1]) == sensor}
+            names = {match[0]: bag_messages.sdk_name(match[2]) for match in matches if int(match[1]) == sensor}
             self._options[sensor] = _SensorOptions(self, names)
         return self._options[sensor].at(time_ns)
 
     def lens(self, stream: str) -> tuple[str, Float64]:
         """Return the distortion model of a stream, by the SDK's name, and its coefficients."""
-        return self._first(f"{self.streams[stream].topic}/info/camera_info", CAMERA, bag_messages.lens_of)
+        return self._first(f"{self.streams[stream].topic}/info/camera_info", bag_messages.CAMERA, bag_messages.lens_of)
 
     def pose(self, stream: str, other: str) -> Float64:
         """Return stream_from_other (4, 4): the pose of another stream's camera in the frame of this stream's.
@@ -277,7 +258,9 @@ class BagReader:
         start, poses = f"{self.streams[stream].topic}/tf/", dict[str, Float64]()
         for topic, entries in self.entries.items():
             if topic.startswith(start) and entries:
-                poses[topic.removeprefix(start)] = self.read(topic, entries[0], TRANSFORM, bag_messages.pose_of)
+                poses[topic.removeprefix(start)] = self.read(
+                    topic, entries[0], bag_messages.TRANSFORM, bag_messages.pose_of
+                )
         return poses
 
     def depth_unit_m(self) -> float:
@@ -309,7 +292,7 @@ class _SensorOptions:
             ahead = due > self._applied
             latest = {topic: entry for entry, topic in self._changes[self._applied if ahead else 0 : due]}
             read = {
-                self._names[topic]: self._bag.read(topic, entry, NUMBER, lambda number: float(number.data))
+                self._names[topic]: self._bag.read(topic, entry, bag_messages.NUMBER, lambda found: float(found.data))
                 for topic, entry in latest.items()
             }
             self._values, self._applied = bag_messages.finite(self._values | read if ahead else read), due
@@ -326,7 +309,7 @@ class _BoundedFile(BufferedReader):
 
     def read(self, size: int | None = -1, /) -> bytes:
         wanted = self._left if size is None or size < 0 else size
-        data = super().read(min(wanted, self._left, CHUNK_LIMIT))
+        data = super().read(min(wanted, self._left, rosbag.CHUNK_LIMIT))
         self._left, self._reads = self._left - len(data), self._reads - 1
         if self._reads < 0:
             raise ValueError("its index has more entries than a recording of its size")
@@ -349,7 +332,7 @@ class _BoundedPath:
 
 def _unpack(packed: bytes, compression: str, size: int) -> bytes:
     """Return a chunk's content. Raises ValueError where that has another size than declared, or an absurd one."""
-    if size > CHUNK_LIMIT:
+    if size > rosbag.CHUNK_LIMIT:
         raise ValueError(f"a chunk of {size} bytes")
     if compression == "none":
         content, whole = packed, True
@@ -364,9 +347,9 @@ def _unpack(packed: bytes, compression: str, size: int) -> bytes:
 
 def _check_topics(path: Path) -> None:
     """Raise OverflowError for a file header with absurdly many topics; rosbags reports a damaged one."""
-    with path.open("rb") as file, suppress(BagFormatError):
-        head = read_record(reader(file.read(FILE_HEADER_BYTES)), len(MAGIC))
-        if (topics := number(head.fields, "conn_count")) > MAX_CONNECTIONS:
+    with path.open("rb") as file, suppress(rosbag.BagFormatError):
+        head = rosbag.read_record(rosbag.reader(file.read(rosbag.FILE_HEADER_BYTES)), len(rosbag.MAGIC))
+        if (topics := rosbag.number(head.fields, "conn_count")) > rosbag.MAX_CONNECTIONS:
             raise OverflowError(f"it declares {topics} topics")
 
 
@@ -376,10 +359,10 @@ def _check_start(path: Path) -> None:
         problem = "is a directory" if path.is_dir() else "is not a file" if path.exists() else "does not exist"
         raise RecordingError(f"{path} {problem}: give the path of a .bag recording")
     with raise_as_recording_error(path, "cannot be read"), path.open("rb") as file:
-        start = file.read(len(MAGIC))
+        start = file.read(len(rosbag.MAGIC))
     if not start:
         raise RecordingError(f"{path} is empty: record it again")
-    if start != MAGIC:
+    if start != rosbag.MAGIC:
         raise RecordingError(f"{path} is not a .bag recording (it starts with {start!r}): give one made by `capture`")
 
 

@@ -156,12 +156,7 @@ class ExportOptions:
 
 
 def export_recording(
-    bag: BagReader,
-    out: Path,
-    options: ExportOptions,
-    *,
-    stop: Event,
-    on_frame: Callable[[], None] = lambda: None,
+    bag: BagReader, out: Path, options: ExportOptions, *, stop: Event, on_frame: Callable[[], None] = lambda: None
 ) -> ExportResult:
     """Write the selected frames of a recording into the directory `out`.
 

@@ -67,7 +67,8 @@ class ReplayCamera:
             raise
 
     def _frames(self, pairing: FrameSynchronizer, iteration: int) -> Iterator[Frame]:
-        clock = device_clock(self._bag)
+        wraps = self._bag.metadata("depth", 0).domain == "hardware_clock"  # the counter of a device's own clock
+        clock = ClockUnwrap().add if wraps else float
         for place in self._bag.order(FORMATS):
             sample = self._bag.sample(place.stream, place.index)
             self.arrived[sample.stream] += 1
@@ -110,12 +111,6 @@ def open_lidar_bag(path: Path) -> BagReader:
 def identity_of(bag: BagReader) -> dict[str, str]:
     """Return name, serial, firmware and usb_type of the recorded device, as far as recorded."""
     return {ours: bag.device[theirs] for ours, theirs in IDENTITY.items() if theirs in bag.device}
-
-
-def device_clock(bag: BagReader) -> Callable[[float], float]:
-    """Return a function that makes timestamps in order monotonic: the counter of a device's clock wraps."""
-    wraps = bag.metadata("depth", 0).domain == "hardware_clock"
-    return ClockUnwrap().add if wraps else float
 
 
 @dataclass(frozen=True)

@@ -11,17 +11,7 @@ from typing import BinaryIO
 from nlos_cam.camera import FORMATS, OnProgress
 from nlos_cam.errors import NlosCamError, OutputExistsError, RecordingError
 from nlos_cam.files import atomic_file
-from nlos_cam.recording.rosbag import (
-    ENTRY_BYTES,
-    FILE_HEADER_BYTES,
-    MAGIC,
-    SET_UP_TIME,
-    Connection,
-    pack_chunk_head,
-    pack_chunk_info,
-    pack_file_header,
-    pack_index,
-)
+from nlos_cam.recording import rosbag
 from nlos_cam.recording.salvage import Chunk, Damage, Scan, scan_bag
 
 FRAMES_TOPIC = re.compile(r"/([A-Za-z]+)_\d+/image/data$")
@@ -78,7 +68,7 @@ def _readable(scan: Scan) -> tuple[list[Chunk], list[Damage]]:
 class _IndexFilter:
     """Filter of chunk indexes: drops messages without a description, and repeated frames. Feed chunks in order."""
 
-    def __init__(self, connections: Mapping[int, Connection]) -> None:
+    def __init__(self, connections: Mapping[int, rosbag.Connection]) -> None:
         self.damages: dict[int, Damage] = {}
         """The first of each connection."""
         self._connections = connections
@@ -96,19 +86,19 @@ class _IndexFilter:
         if not FRAMES_TOPIC.search(self._connections[number].topic):
             return entries
         new: list[bytes] = []
-        for start in range(0, len(entries), ENTRY_BYTES):
+        for start in range(0, len(entries), rosbag.ENTRY_BYTES):
             frame = number, entries[start : start + 8]
             if frame not in self._frames:
                 self._frames.add(frame)
-                new.append(entries[start : start + ENTRY_BYTES])
-        if len(new) * ENTRY_BYTES < len(entries):
+                new.append(entries[start : start + rosbag.ENTRY_BYTES])
+        if len(new) * rosbag.ENTRY_BYTES < len(entries):
             why = f"frames of connection {number} that are there twice (used once)"
             self.damages.setdefault(number, Damage(at, 0, why))
         return b"".join(new)
 
 
 def _holds_frames(chunk: Chunk) -> bool:
-    return any(entries[-ENTRY_BYTES:-4] != SET_UP_TIME for entries in chunk.index.values())
+    return any(entries[-rosbag.ENTRY_BYTES : -4] != rosbag.SET_UP_TIME for entries in chunk.index.values())
 
 
 def _why_nothing(scan: Scan) -> str:
@@ -121,12 +111,12 @@ def _why_nothing(scan: Scan) -> str:
     return "it ends before the first frame"
 
 
-def _count_frames(chunks: list[Chunk], connections: Mapping[int, Connection]) -> dict[str, int]:
+def _count_frames(chunks: list[Chunk], connections: Mapping[int, rosbag.Connection]) -> dict[str, int]:
     frames = Counter(dict.fromkeys(FORMATS, 0))
     for chunk in chunks:
         for number, entries in chunk.index.items():
             if stream := FRAMES_TOPIC.search(connections[number].topic):
-                frames[stream[1].lower()] += len(entries) // ENTRY_BYTES
+                frames[stream[1].lower()] += len(entries) // rosbag.ENTRY_BYTES
     return dict(frames)
 
 
@@ -143,7 +133,7 @@ def _write(path: Path, out: Path, scan: Scan, report: OnProgress) -> None:
 
 def _check_space(out: Path, scan: Scan) -> None:
     index = sum(len(entries) + RECORD_BYTES for chunk in scan.chunks for entries in chunk.index.values())
-    needed = scan.bytes + index + RECORD_BYTES * len(scan.chunks) + 2 * FILE_HEADER_BYTES
+    needed = scan.bytes + index + RECORD_BYTES * len(scan.chunks) + 2 * rosbag.FILE_HEADER_BYTES
     free = shutil.disk_usage(out.parent).free
     if free < needed:
         raise NlosCamError(f"{out} needs {needed / 1e6:.3g} MB, but {free / 1e6:.3g} MB are free: choose another --out")
@@ -167,16 +157,18 @@ class _Writer:
 
     def _write_header(self, index_at: int) -> None:
         self._target.seek(0)
-        self._target.write(MAGIC + pack_file_header(len(self._scan.connections), len(self._scan.chunks), index_at))
+        self._target.write(
+            rosbag.MAGIC + rosbag.pack_file_header(len(self._scan.connections), len(self._scan.chunks), index_at)
+        )
 
     def _write_chunk(self, chunk: Chunk) -> bytes:
         """Write a chunk and its index; return its chunk info for the end of the file."""
         at = self._target.tell()
-        self._target.write(pack_chunk_head(chunk.compression, chunk.size, chunk.data_bytes))
+        self._target.write(rosbag.pack_chunk_head(chunk.compression, chunk.size, chunk.data_bytes))
         self._target.write(self._data(chunk) if chunk.content is None else chunk.content)
-        self._target.writelines(pack_index(number, entries) for number, entries in chunk.index.items())
+        self._target.writelines(rosbag.pack_index(number, entries) for number, entries in chunk.index.items())
         self._report(min(2 * self._scan.bytes, self._scan.bytes + self._target.tell()), 2 * self._scan.bytes)
-        return pack_chunk_info(at, chunk.index)
+        return rosbag.pack_chunk_info(at, chunk.index)
 
     def _data(self, chunk: Chunk) -> bytes:
         self._source.seek(chunk.data_at)

@@ -253,11 +253,7 @@ def pack_file_header(connections: int, chunks: int, index_at: int) -> bytes:
 
 def pack_chunk_head(compression: str, size: int, data_bytes: int) -> bytes:
     """Return a chunk up to its data; `size` counts the unpacked bytes."""
-    fields = {
-        "compression": compression.encode(),
-        "op": bytes([Op.CHUNK]),
-        "size": size.to_bytes(4, "little"),
-    }
+    fields = {"compression": compression.encode(), "op": bytes([Op.CHUNK]), "size": size.to_bytes(4, "little")}
     return pack_head(fields, data_bytes)
 
 

@@ -331,7 +331,6 @@ class _Batch:
         return [total.cpu().numpy()]
 
     def _feet(self, share: Float64) -> TorchPoints:
-        """Return the laser spots of the beams with a weight (n,) above 0."""
         job, lit = self.job, np.flatnonzero(share)
         weight = job.beam_weight[lit] * share[lit]
         return TorchPoints.of(

@@ -1,6 +1,7 @@
 """Echoes: of all light that comes back along a beam, the strongest bin (S5), after the pulse has spread it."""
 
 from dataclasses import dataclass
+from math import erf, sqrt
 
 import numba
 import numpy as np
@@ -127,11 +128,5 @@ def _pulse(pulse_ns: float, bin_m: float) -> Float64:
     sigma = pulse_bins(pulse_ns, bin_m)
     half = int(np.ceil(4 * sigma)) + 1
     edges = np.arange(-half, half + 2) - 0.5
-    kernel = np.diff([_normal(edge / sigma) for edge in edges])
+    kernel = np.diff([(1 + erf(edge / sigma / sqrt(2))) / 2 for edge in edges])
     return kernel / kernel.sum()
-
-
-def _normal(x: float) -> float:
-    from math import erf, sqrt
-
-    return (1 + erf(x / sqrt(2))) / 2

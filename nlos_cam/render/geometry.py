@@ -135,7 +135,7 @@ def _cast(rig: Rig, intrinsics: Intrinsics, lambertian: bool, occluder: bool) ->
         # The wall is the plane z = 0: lidar_z + t direction_z = 0, ahead of the lidar only for rays towards the wall.
         wall_length = np.where(direction[:, 2] < 0, -lidar[2] / direction[:, 2], np.inf)
         wall_point = lidar + wall_length[:, None] * direction
-        wall_length[~_inside(rig, wall_point)] = np.inf
+        wall_length[~rig.wall.contains(wall_point)] = np.inf
         stop_length = _occluder_length(rig, lidar, direction) if occluder else np.full_like(wall_length, np.inf)
     on_wall = wall_length < stop_length
     length = np.minimum(wall_length, stop_length)
@@ -164,11 +164,6 @@ def returned(rig: Rig, length_m: Float64, cosine: Float64, solid_angle: float) -
 def gate_bins(device: DeviceConstants) -> int:
     """Return the number of path-length bins that begin inside the gate; the last may reach beyond it."""
     return max(int(np.ceil(SPEED_OF_LIGHT_M_PER_S * device.gate_s / device.bin_m)), 1)
-
-
-def _inside(rig: Rig, point: Float64) -> Mask:
-    x, y, wall = point[:, 0], point[:, 1], rig.wall
-    return (x >= wall.x_min_m) & (x <= wall.x_max_m) & (y >= wall.y_min_m) & (y <= wall.y_max_m)
 
 
 def _occluder_length(rig: Rig, lidar: Float64, direction: Float64) -> Float64:
@@ -221,8 +216,7 @@ def relay_cells(rig: Rig, lidar_m: Float64, columns: int, rows: int) -> Relay:
     extent = rig.relay
     pitch_x, pitch_y = (extent.x_max_m - extent.x_min_m) / columns, (extent.y_max_m - extent.y_min_m) / rows
     x, y = np.meshgrid(
-        extent.x_min_m + (np.arange(columns) + 0.5) * pitch_x,
-        extent.y_min_m + (np.arange(rows) + 0.5) * pitch_y,
+        extent.x_min_m + (np.arange(columns) + 0.5) * pitch_x, extent.y_min_m + (np.arange(rows) + 0.5) * pitch_y
     )
     x, y = x.ravel().astype(np.float64), y.ravel().astype(np.float64)
     length = np.sqrt((x - lidar_m[0]) ** 2 + (y - lidar_m[1]) ** 2 + lidar_m[2] ** 2)

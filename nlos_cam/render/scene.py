@@ -85,5 +85,5 @@ def _check_depth(depth: Float32) -> None:
         where = "behind the wall" if surface.min() < 0 else "not finite"
         raise SceneError(
             f"object depth ranges from {surface.min():.3g} to {surface.max():.3g} m, {where}: every surface must "
-            "be finite and at least 0 m off the wall (use NaN for background)",
+            "be finite and at least 0 m off the wall (use NaN for background)"
         )

@@ -23,20 +23,8 @@ from pydantic import (
 )
 from pydantic_core import PydanticCustomError
 
+from nlos_cam import objects as shapes
 from nlos_cam.errors import SceneError, SceneFileError
-from nlos_cam.objects import (
-    CATEGORIES,
-    MeshFile,
-    Pose,
-    Up,
-    category_triangles,
-    invisible_object_error,
-    object_box,
-    orthographic_depth,
-    place,
-    read_mesh,
-    turn_upright,
-)
 from nlos_cam.render.material import Material
 from nlos_cam.render.patches import JUMP_M
 from nlos_cam.render.scene import Radiometry, Scene
@@ -44,18 +32,18 @@ from nlos_cam.render.sensor.model import SensorModel
 
 
 def _known(category: str) -> str:
-    if category not in CATEGORIES:
-        raise ValueError(f"no such category: choose one of {', '.join(CATEGORIES)}")
+    if category not in shapes.CATEGORIES:
+        raise ValueError(f"no such category: choose one of {', '.join(shapes.CATEGORIES)}")
     return category
 
 
-def _mesh(value: object) -> MeshFile:
-    if isinstance(value, MeshFile):
+def _mesh(value: object) -> shapes.MeshFile:
+    if isinstance(value, shapes.MeshFile):
         return value
     if not isinstance(value, str | Path):
         raise PydanticCustomError("mesh_file", "must be the path of a mesh")
     try:
-        return read_mesh(Path(value))
+        return shapes.read_mesh(Path(value))
     except SceneError as error:
         raise PydanticCustomError("mesh_file", "{problem}", {"problem": str(error)}) from error
 
@@ -71,7 +59,7 @@ def _within(low: float, high: float) -> AfterValidator:
     return AfterValidator(check)
 
 
-Mesh = Annotated[MeshFile, PlainValidator(_mesh), PlainSerializer(lambda mesh: str(mesh.path), str)]
+Mesh = Annotated[shapes.MeshFile, PlainValidator(_mesh), PlainSerializer(lambda mesh: str(mesh.path), str)]
 Size = Annotated[float, _within(0.001, 10)]
 Length = Annotated[float, _within(-10, 10)]
 Reach = Annotated[float, _within(0, 10)]
@@ -95,7 +83,7 @@ class HiddenObject(Record):
     """Distance from the box's near side to the object's nearest point."""
     file: Mesh | None = None
     """A .obj, .stl or .ply; in a scene file relative to its folder."""
-    up: Up = "y"
+    up: shapes.Up = "y"
     """Axis of the mesh's file that points up."""
     material: Material = Material()
 
@@ -117,7 +105,11 @@ class HiddenObject(Record):
     @property
     def triangles(self) -> Float64:
         """(n, 3, 3), before placing: y up, -z towards the wall."""
-        return turn_upright(self.file.triangles, self.up) if self.file else category_triangles(self.label, self.seed)
+        return (
+            shapes.turn_upright(self.file.triangles, self.up)
+            if self.file
+            else shapes.category_triangles(self.label, self.seed)
+        )
 
 
 class Motion(Record):
@@ -242,18 +234,18 @@ class SceneFile(Record):
             return self.bare
         if self.rig.object_box is None:
             raise SceneError(f"rig {self.rig.name!r} has no object_box for {self.hidden.label!r}: add one")
-        placed = place(self.hidden.triangles, self.pose_at(self.hidden, number), self.rig.object_box)
-        return replace(self.bare, object_depth_m=orthographic_depth(placed, self.rig.object_box))
+        placed = shapes.place(self.hidden.triangles, self.pose_at(self.hidden, number), self.rig.object_box)
+        return replace(self.bare, object_depth_m=shapes.orthographic_depth(placed, self.rig.object_box))
 
     def shows_at(self, number: float) -> bool:
         """Return whether the wall sees any of the object at an instant of the loop."""
         depth_m = self.scene_at(number).object_depth_m
         return depth_m is not None and bool(np.isfinite(depth_m).any())
 
-    def pose_at(self, rest: HiddenObject, number: float) -> Pose:
+    def pose_at(self, rest: HiddenObject, number: float) -> shapes.Pose:
         """Return the pose, at an instant of the loop, of an object whose pose at rest is `rest`."""
         turn, motion = 2 * pi * number / self.poses, self.motion
-        return Pose(
+        return shapes.Pose(
             tilt_x_rad=radians(rest.tilt_x_deg),
             tilt_y_rad=radians(rest.tilt_y_deg + motion.tilt_deg * sin(2 * turn)),
             turn_z_rad=radians(rest.turn_deg + motion.turn_deg * sin(turn)),
@@ -310,7 +302,7 @@ def load_scene(path: Path) -> SceneFile:
     except tomllib.TOMLDecodeError as error:
         raise SceneFileError(f"{path} cannot be read as a scene: {error}") from error
     if scene.hidden and not any(scene.shows_at(number) for number in range(scene.poses)):
-        raise invisible_object_error(scene.hidden.label, object_box(scene.rig))
+        raise shapes.invisible_object_error(scene.hidden.label, shapes.object_box(scene.rig))
     return scene
 
 

@@ -5,8 +5,8 @@ Red is nearer to the lidar than the plane, blue is behind it, as everywhere in t
 
 import cv2
 import numpy as np
-from nlos_calibration import Extent, MeasuredWall, WallRecord, footprint, wall_facts, wall_points_m
-from nlos_calibration.arrays import Float64, Mask, UInt8
+from nlos_calibration import MeasuredWall, WallRecord, footprint, wall_facts, wall_points_m
+from nlos_calibration.arrays import Float64, UInt8
 from numpy.typing import NDArray
 
 from nlos_cam.view.images import PICTURE_WIDTH, difference_rgb, noise_rgb, round_span, saturated_rgb
@@ -22,17 +22,12 @@ def outline_m(measured: MeasuredWall) -> Float64:
     """
     record = measured.record
     visible = footprint(np.array(record.wall_from_lidar), record.rig.pinhole, record.rig.wall)
-    corners_m = visible.corners_m[_within(visible.corners_m, record.rig.wall)]
+    corners_m = visible.corners_m[record.rig.wall.contains(visible.corners_m)]
     points_m = np.concatenate([visible.cells_m[visible.on_wall], corners_m])
     if len(points_m) == 0:
         return points_m
     hull_m = cv2.convexHull(points_m.astype(np.float32))[:, 0].astype(np.float64)
     return np.concatenate([hull_m, hull_m[:1]])
-
-
-def _within(points_m: Float64, wall: Extent) -> Mask:
-    x_m, y_m = points_m[..., 0], points_m[..., 1]
-    return (x_m >= wall.x_min_m) & (x_m <= wall.x_max_m) & (y_m >= wall.y_min_m) & (y_m <= wall.y_max_m)
 
 
 def wall_pictures(measured: MeasuredWall) -> dict[str, tuple[str, UInt8]]:
@@ -56,10 +51,8 @@ def wall_pictures(measured: MeasuredWall) -> dict[str, tuple[str, UInt8]]:
 
 def _block_max(values: NDArray[np.float32], step: int) -> NDArray[np.float32]:
     """Return the maximum of each block of `step` pixels, so that thinning keeps a single saturated pixel."""
-    height, width = (-(-size // step) * step for size in values.shape)
-    padded = np.zeros((height, width), np.float32)
-    padded[: values.shape[0], : values.shape[1]] = values
-    return padded.reshape(height // step, step, width // step, step).max(axis=(1, 3))
+    rows, columns = (np.arange(0, size, step) for size in values.shape)
+    return np.maximum.reduceat(np.maximum.reduceat(values, rows, axis=0), columns, axis=1)
 
 
 def calibration_facts(record: WallRecord) -> list[list[str]]:

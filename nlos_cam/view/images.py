@@ -6,7 +6,7 @@ from math import floor, log10
 import cv2
 import numpy as np
 from nlos_calibration import ObjectBox
-from nlos_calibration.arrays import Float32, UInt8
+from nlos_calibration.arrays import Float32, Mask, UInt8
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
@@ -33,17 +33,13 @@ FADED = 0.35
 def hidden_rgb(depth_m: Float32, box: ObjectBox) -> UInt8:
     """Return hidden depth (64, 64) as a picture (64, 64, 3): bright near the wall, dark background."""
     v = image_from_depth(depth_m, box)
-    rgb = _coloured(DARKEST + v * (255 - DARKEST), cv2.COLORMAP_INFERNO)
-    rgb[np.isnan(depth_m)] = BACKGROUND_RGB
-    return rgb
+    return _coloured(DARKEST + v * (255 - DARKEST), cv2.COLORMAP_INFERNO, np.isnan(depth_m))
 
 
 def lidar_rgb(depth_m: Float32, near_m: float, far_m: float) -> UInt8:
     """Return lidar depth (height, width) as a picture, red (near) to blue (far), dark without a return."""
     share = (depth_m - near_m) / max(far_m - near_m, 1e-6)
-    rgb = _coloured(np.nan_to_num(1.0 - np.clip(share, 0.0, 1.0)) * 255, cv2.COLORMAP_TURBO)
-    rgb[np.isnan(depth_m)] = BACKGROUND_RGB
-    return rgb
+    return _coloured(np.nan_to_num(1.0 - np.clip(share, 0.0, 1.0)) * 255, cv2.COLORMAP_TURBO, np.isnan(depth_m))
 
 
 def infrared_grey(ir: NDArray[np.uint8]) -> NDArray[np.uint8]:
@@ -54,9 +50,7 @@ def infrared_grey(ir: NDArray[np.uint8]) -> NDArray[np.uint8]:
 def uncertainty_rgb(uncertainty_m: Float32, depth_m: Float32) -> UInt8:
     """Return the uncertainty of hidden depth (64, 64) as a picture, bright where large, dark without surface."""
     share = np.clip(np.nan_to_num(uncertainty_m, nan=np.inf) / MAX_UNCERTAINTY_M, 0.0, 1.0)
-    rgb = _coloured(DARKEST + share * (255 - DARKEST), cv2.COLORMAP_VIRIDIS)
-    rgb[np.isnan(depth_m)] = BACKGROUND_RGB
-    return rgb
+    return _coloured(DARKEST + share * (255 - DARKEST), cv2.COLORMAP_VIRIDIS, np.isnan(depth_m))
 
 
 def relief_rgb(depth_m: Float32, box: ObjectBox) -> UInt8:
@@ -95,9 +89,8 @@ def difference_rgb(further: NDArray[np.floating], span: float) -> UInt8:
 
 def noise_rgb(noise: NDArray[np.floating], span: float) -> UInt8:
     """Return a spread as a picture, bright where large, dark for NaN."""
-    rgb = _coloured(DARKEST + np.clip(np.nan_to_num(noise) / span, 0.0, 1.0) * (255 - DARKEST), cv2.COLORMAP_INFERNO)
-    rgb[np.isnan(noise)] = BACKGROUND_RGB
-    return rgb
+    share = np.clip(np.nan_to_num(noise) / span, 0.0, 1.0)
+    return _coloured(DARKEST + share * (255 - DARKEST), cv2.COLORMAP_INFERNO, np.isnan(noise))
 
 
 def saturated_rgb(ir: NDArray[np.floating], saturated: NDArray[np.floating]) -> UInt8:
@@ -124,9 +117,11 @@ def change_span_m(difference_m: Float32) -> float:
     return QUIET_SPAN_M if few else round_span(changed_m, percent=75.0)
 
 
-def _coloured(values: NDArray[np.floating], colour_map: int) -> UInt8:
-    bgr = cv2.applyColorMap(values.astype(np.uint8), colour_map)
-    return np.ascontiguousarray(bgr[..., ::-1], dtype=np.uint8)
+def _coloured(values: NDArray[np.floating], colour_map: int, absent: Mask) -> UInt8:
+    """Return values of 0 to 255 in a map's colors, and the background's where they are absent."""
+    rgb = np.ascontiguousarray(cv2.applyColorMap(values.astype(np.uint8), colour_map)[..., ::-1], dtype=np.uint8)
+    rgb[absent] = BACKGROUND_RGB
+    return rgb
 
 
 BANNER_WIDTH, BANNER_HEIGHT = 880, 96

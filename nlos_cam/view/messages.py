@@ -175,7 +175,6 @@ class MomentPacker:
 
 
 def _quality(moment: Moment) -> dict[str, Any] | None:
-    """Return the predicted quality of a moment's reconstruction, ready for JSON."""
     if (doubt := moment.reconstruction.doubt) is None or (quality := doubt.quality) is None:
         return None
     iou = [round(share, 3) for share in quality.iou]

@@ -14,21 +14,8 @@ from PIL import Image, ImageDraw
 
 from nlos_cam.errors import NlosCamError
 from nlos_cam.objects import object_box
+from nlos_cam.view import images
 from nlos_cam.view.assessment import assess
-from nlos_cam.view.images import (
-    BACKGROUND_RGB,
-    MAX_UNCERTAINTY_M,
-    PALE_RGB,
-    banner_rgb,
-    depth_span_m,
-    dim_untrusted,
-    font,
-    hidden_rgb,
-    infrared_grey,
-    lidar_rgb,
-    relief_rgb,
-    uncertainty_rgb,
-)
 from nlos_cam.view.viewer import Moment
 
 WIDTH, HEIGHT = 1280, 720
@@ -48,7 +35,7 @@ class Still:
 
     def __init__(self, rig: Rig, first: Moment) -> None:
         self._box, self._begun_s = object_box(rig), first.published_s
-        self._span_m = depth_span_m(first.frame.depth_m)
+        self._span_m = images.depth_span_m(first.frame.depth_m)
         self._seen = first
 
     def rgb(self, moment: Moment, *, with_lidar: bool = True) -> UInt8:
@@ -67,30 +54,38 @@ class Still:
 
     def _draw_hidden(self, page: "_Page", moment: Moment) -> None:
         depth_m, box = moment.reconstruction.depth_m, self._box
-        rgb, assessment = hidden_rgb(depth_m, box), assess(moment)
+        rgb, assessment = images.hidden_rgb(depth_m, box), assess(moment)
         if not assessment.trusted:
-            rgb = dim_untrusted(rgb, assessment.headline, assessment.rgb, hatched=assessment.tone == "warning")
+            rgb = images.dim_untrusted(rgb, assessment.headline, assessment.rgb, hatched=assessment.tone == "warning")
         page.picture(LARGE_AT, "Hidden around the corner: reconstruction", rgb, (LARGE, LARGE))
         scale = np.linspace(box.z_near_m, box.z_far_m, BAR_STEPS, dtype=np.float32)[:, np.newaxis]
-        page.bar(LARGE_AT, LARGE, hidden_rgb(scale, box), f"{1e2 * box.z_near_m:.0f} cm", f"{1e2 * box.z_far_m:.0f} cm")
+        page.bar(
+            LARGE_AT,
+            LARGE,
+            images.hidden_rgb(scale, box),
+            f"{1e2 * box.z_near_m:.0f} cm",
+            f"{1e2 * box.z_far_m:.0f} cm",
+        )
         x, y = MIDDLE_AT
         if (uncertainty_m := moment.reconstruction.uncertainty_m) is not None:
-            page.picture(MIDDLE_AT, "Uncertainty", uncertainty_rgb(uncertainty_m, depth_m), (SMALL, SMALL))
-            scale = np.linspace(MAX_UNCERTAINTY_M, 0.0, BAR_STEPS, dtype=np.float32)[:, np.newaxis]
-            page.bar(MIDDLE_AT, SMALL, uncertainty_rgb(scale, scale), f"{1e3 * MAX_UNCERTAINTY_M:.0f} mm", "0")
+            page.picture(MIDDLE_AT, "Uncertainty", images.uncertainty_rgb(uncertainty_m, depth_m), (SMALL, SMALL))
+            scale = np.linspace(images.MAX_UNCERTAINTY_M, 0.0, BAR_STEPS, dtype=np.float32)[:, np.newaxis]
+            page.bar(
+                MIDDLE_AT, SMALL, images.uncertainty_rgb(scale, scale), f"{1e3 * images.MAX_UNCERTAINTY_M:.0f} mm", "0"
+            )
         else:
-            page.picture(MIDDLE_AT, "Relief", relief_rgb(depth_m, box), (SMALL, SMALL))
+            page.picture(MIDDLE_AT, "Relief", images.relief_rgb(depth_m, box), (SMALL, SMALL))
         below = (x, y + LOWER)
         if (truth_m := moment.frame.truth_depth_m) is not None:
-            page.picture(below, "Truth (simulated)", hidden_rgb(truth_m, box), (SMALL, SMALL))
+            page.picture(below, "Truth (simulated)", images.hidden_rgb(truth_m, box), (SMALL, SMALL))
         elif uncertainty_m is not None:
-            page.picture(below, "Relief", relief_rgb(depth_m, box), (SMALL, SMALL))
+            page.picture(below, "Relief", images.relief_rgb(depth_m, box), (SMALL, SMALL))
 
     def _draw_lidar(self, page: "_Page", moment: Moment) -> None:
         x, y = RIGHT_AT
         size = LIDAR_WIDTH, SMALL
-        page.picture((x, y), "What the lidar sees: depth", lidar_rgb(moment.frame.depth_m, *self._span_m), size)
-        infrared = np.repeat(infrared_grey(moment.frame.ir)[..., np.newaxis], 3, axis=-1)
+        page.picture((x, y), "What the lidar sees: depth", images.lidar_rgb(moment.frame.depth_m, *self._span_m), size)
+        infrared = np.repeat(images.infrared_grey(moment.frame.ir)[..., np.newaxis], 3, axis=-1)
         page.picture((x, y + LOWER), "Infrared", infrared, size)
 
 
@@ -105,23 +100,23 @@ class _Page:
     """Canvas of one picture."""
 
     def __init__(self) -> None:
-        self.image = Image.new("RGB", (WIDTH, HEIGHT), BACKGROUND_RGB)
+        self.image = Image.new("RGB", (WIDTH, HEIGHT), images.BACKGROUND_RGB)
         self._pen = ImageDraw.Draw(self.image)
 
     def banner(self, moment: Moment) -> None:
         assessment = assess(moment)
         self.image.paste(
-            Image.fromarray(banner_rgb(assessment.headline, assessment.detail, assessment.rgb)), (MARGIN, MARGIN)
+            Image.fromarray(images.banner_rgb(assessment.headline, assessment.detail, assessment.rgb)), (MARGIN, MARGIN)
         )
         x, y = WIDTH - MARGIN, MARGIN
-        self._pen.text((x, y + 34), "nlos-cam", fill=PALE_RGB, font=font(40), anchor="rm")
-        self._pen.text((x, y + 74), "seeing around a corner", fill=QUIET_RGB, font=font(21), anchor="rm")
+        self._pen.text((x, y + 34), "nlos-cam", fill=images.PALE_RGB, font=images.font(40), anchor="rm")
+        self._pen.text((x, y + 74), "seeing around a corner", fill=QUIET_RGB, font=images.font(21), anchor="rm")
 
     def picture(self, at: tuple[int, int], title: str, rgb: UInt8, size: tuple[int, int]) -> None:
         """Draw an image below its title, scaled to its panel."""
         (x, y), (width, height) = at, size
         self._pen.rectangle((x, y, x + width - 1, y + height - 1), fill=PANEL_RGB)
-        self._pen.text((x, y - TITLE / 2), title, fill=PALE_RGB, font=font(18), anchor="lm")
+        self._pen.text((x, y - TITLE / 2), title, fill=images.PALE_RGB, font=images.font(18), anchor="lm")
         fitted = _fitted(rgb, width, height)
         down, right = (height - fitted.shape[0]) // 2, (width - fitted.shape[1]) // 2
         self.image.paste(Image.fromarray(fitted), (x + right, y + down))
@@ -131,10 +126,10 @@ class _Page:
         x, y = at[0] + size + 10, at[1]
         self.image.paste(Image.fromarray(rgb).resize((BAR, size), Image.Resampling.BILINEAR), (x, y))
         for text, height, anchor in ((top, y, "lt"), (bottom, y + size, "lb")):
-            self._pen.text((x + BAR + 6, height), text, fill=QUIET_RGB, font=font(16), anchor=anchor)
+            self._pen.text((x + BAR + 6, height), text, fill=QUIET_RGB, font=images.font(16), anchor=anchor)
 
     def footer(self, text: str) -> None:
-        self._pen.text((MARGIN, HEIGHT - MARGIN), text, fill=QUIET_RGB, font=font(18), anchor="lm")
+        self._pen.text((MARGIN, HEIGHT - MARGIN), text, fill=QUIET_RGB, font=images.font(18), anchor="lm")
 
 
 def _fitted(rgb: UInt8, width: int, height: int) -> UInt8:

@@ -62,28 +62,10 @@ class Viewer(Protocol):
     def show(self, moment: Moment) -> None: ...
 
 
-class NullViewer:
-    """Viewer that shows nothing."""
-
-    address: str | None = None
-
-    def begin(self, *_: object) -> None:
-        """Do nothing."""
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        pass
-
-    def show(self, moment: Moment) -> None:
-        pass
-
-
 class Viewers:
     """Several viewers as one."""
 
-    def __init__(self, viewers: Sequence[Viewer]) -> None:
+    def __init__(self, viewers: Sequence[Viewer] = ()) -> None:
         self._viewers = viewers
         self._entered = ExitStack()
 
@@ -105,3 +87,10 @@ class Viewers:
     def show(self, moment: Moment) -> None:
         for viewer in self._viewers:
             viewer.show(moment)
+
+
+class NullViewer(Viewers):
+    """Viewer that shows nothing."""
+
+    def begin(self, *_: object) -> None:
+        """Do nothing."""

@@ -45,8 +45,8 @@ class HalfSurface(SheetNetwork):
 @pytest.fixture
 def opened(monkeypatch: pytest.MonkeyPatch) -> Open:
     """Open the stream of a given camera with networks that take no time."""
-    monkeypatch.setattr(api, "load_networks", lambda *_: HalfSurface())
-    monkeypatch.setattr(api, "load_uncertainty", lambda *_: FakeDoubter())
+    monkeypatch.setattr(api.reconstruct, "load_networks", lambda *_: HalfSurface())
+    monkeypatch.setattr(api.reconstruct, "load_uncertainty", lambda *_: FakeDoubter())
 
     def make(camera: Camera, uri: str = "bag:fake.bag", **options: Any) -> Stream:
         monkeypatch.setattr(api, "open_camera", lambda *_, **__: camera)

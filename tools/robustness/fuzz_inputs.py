@@ -196,7 +196,7 @@ def make_files(home: Path) -> None:
     command("capture", "sim:bare-wall", "--frames", "3", "--label", "cup", "--out", home / "short.bag")
     command("replay", home / "short.bag", "--out", home / "replayed")
     command("render", "cup", "--accuracy", "draft", "--out", home / "cup.npz")
-    scene = simulated_world.bare_wall_scene()
+    scene = simulated_world.renderer.bare_wall_scene()
     world = simulated_world.pack_loop(*(simulated_world.read_packaged(scene) or simulated_world.render_loop(scene)))
     load_cached(home / "worlds" / "0123456789ab.npz", bytes, lambda: world)
     angle = np.linspace(0, 2 * np.pi, 12, endpoint=False)

@@ -69,7 +69,7 @@ def test_world_from_the_cache_equals_the_rendered_one(
     monkeypatch.setenv("NLOS_CAM_CACHE", str(tmp_path))
     fresh = open_world(str(scene), lambda done, total: seen.append((done, total)))
     assert seen == [(1, 2), (2, 2)]
-    monkeypatch.setattr("nlos_cam.camera.simulated_world.render_scan", lambda *_: pytest.fail("rendered again"))
+    monkeypatch.setattr("nlos_cam.render.render_scan", lambda *_: pytest.fail("rendered again"))
     cached = open_world(str(scene), lambda done, total: seen.append((done, total)))
     assert len(seen) == 2
     for number in (0, 1, 5):
@@ -126,7 +126,7 @@ def test_packaged_loop_equals_the_renderers(shipped: SceneFile) -> None:
 
 def test_packaged_scenes_open_without_rendering_or_cache(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setenv("NLOS_CAM_CACHE", str(tmp_path))
-    monkeypatch.setattr("nlos_cam.camera.simulated_world.render_scan", lambda *_: pytest.fail("rendered"))
+    monkeypatch.setattr("nlos_cam.render.render_scan", lambda *_: pytest.fail("rendered"))
     for name in ("", "bare-wall"):
         assert open_world(name).images(0).depth_z16.any()
     assert not list(tmp_path.iterdir())

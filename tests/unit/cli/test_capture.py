@@ -38,7 +38,7 @@ def noise(monkeypatch: Patch, noise_world: Any, hurried_clock: Any) -> None:
 def lines(monkeypatch: Patch) -> list[str]:
     """Collect what the command prints for a person."""
     found: list[str] = []
-    monkeypatch.setattr(capture, "say", lambda text, **_: found.append(text))
+    monkeypatch.setattr(capture.common, "say", lambda text, **_: found.append(text))
     return found
 
 

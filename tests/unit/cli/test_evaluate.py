@@ -74,7 +74,7 @@ def guessing(monkeypatch: Patch) -> list[DatasetPlan]:
     monkeypatch.setattr(baselines, "training_maps", training_maps)
     monkeypatch.setattr(baselines, "NEIGHBOURS", 4)
     monkeypatch.setattr(report, "load_reconstructor", lambda *_: Guesser())
-    monkeypatch.setattr(subjects, "open_dataset", lambda _: Stored(HELD_OUT_SEED, 3))
+    monkeypatch.setattr(subjects.data, "open_dataset", lambda _: Stored(HELD_OUT_SEED, 3))
     return asked
 
 
@@ -102,7 +102,7 @@ def test_evaluate_writes_figures_of_dataset_beside_baselines(run: Run, monkeypat
 
 @pytest.mark.slow
 def test_evaluate_uses_test_set_without_dataset(run: Run, monkeypatch: Patch, guessing: list[DatasetPlan]) -> None:
-    monkeypatch.setattr(subjects, "benchmark_objects", lambda box: benchmark_objects(box)[:2])
+    monkeypatch.setattr(subjects.shapes, "benchmark_objects", lambda box: benchmark_objects(box)[:2])
     result = run(*JUDGE)
     assert (result["objects"], result["rig"], guessing[0].rig) == (2, RIG.name, RIG)
     assert list(result["per_category"]) == [benchmark_objects(DatasetPlan(RIG, 0).box)[0].category]
@@ -127,8 +127,8 @@ def test_evaluate_subtracts_bare_wall_for_the_weights_alone(
 ) -> None:
     network, blank = Guesser(maps), np.zeros((64, 80), np.float32)
     monkeypatch.setattr(report, "load_reconstructor", lambda *_: network)
-    monkeypatch.setattr(subjects, "render_bare_wall", lambda _: (blank + np.float32(0.25), blank))
-    monkeypatch.setattr(subjects, "measured_bare_wall", lambda _: (blank + np.float32(0.5), blank))
+    monkeypatch.setattr(subjects.data, "render_bare_wall", lambda _: (blank + np.float32(0.25), blank))
+    monkeypatch.setattr(subjects.data, "measured_bare_wall", lambda _: (blank + np.float32(0.5), blank))
     result, raw = run(*JUDGE, *STORED, *options), _maps(DatasetPlan(RIG, HELD_OUT_SEED), 3)
     np.testing.assert_allclose(np.stack(network.given), raw.depth_m - wall_m, atol=1e-6)
     assert result["input"] == maps

@@ -122,8 +122,8 @@ HARMS = {
 
 
 def _in_child(act: Callable[[Path], Any], path: Path) -> Any:
-    """Act in a forked process of its own."""
-    with ProcessPoolExecutor(1, multiprocessing.get_context("fork")) as pool:
+    """Act in a process of its own, forked by one without threads, whose locks a fork would keep locked."""
+    with ProcessPoolExecutor(1, multiprocessing.get_context("forkserver")) as pool:
         return pool.submit(act, path).result()
 
 

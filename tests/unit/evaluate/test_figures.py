@@ -22,8 +22,8 @@ from nlos_cam.objects.textures import TEXTURES
 @pytest.fixture
 def figures(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
     """The figures that are drawn."""
-    made, original = list[Any](), evaluate_pictures._figure
-    monkeypatch.setattr(evaluate_pictures, "_figure", lambda size: made.append(original(size)) or made[-1])
+    made, original = list[Any](), evaluate_pictures.figure_of
+    monkeypatch.setattr(evaluate_pictures, "figure_of", lambda *size: made.append(original(*size)) or made[-1])
     return made
 
 

@@ -101,7 +101,7 @@ def test_measure_takes_median_and_restores_threads() -> None:
 
 def test_calibration_uses_training_objects_alone(monkeypatch: pytest.MonkeyPatch) -> None:
     asked = Mock(side_effect=lambda first_seed, _, box: seeded_objects(first_seed, 2, box))
-    monkeypatch.setattr(runtime_tradeoff, "seeded_objects", asked)
+    monkeypatch.setattr(runtime_tradeoff.subjects, "seeded_objects", asked)
     shapes = [(depth.shape, intensity.shape) for depth, intensity in runtime_tradeoff.calibration(RIG, BOX)]
     assert shapes == [((1, 64, 80), (1, 64, 80))] * 2
     first_seed, count, _ = asked.call_args.args

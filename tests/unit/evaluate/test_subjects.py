@@ -162,9 +162,9 @@ def test_nearest_neighbour_weighs_channels_by_their_spread(images: np.ndarray, s
 def test_training_maps_are_cached_by_what_determines_them(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     built: list[tuple[DatasetPlan, int, Path]] = []
     shapes = {"images": np.zeros((2, 64, 64), np.float16)}
-    monkeypatch.setattr(baselines, "build_dataset", lambda *args, **_: built.append(args))
-    monkeypatch.setattr(baselines, "open_dataset", lambda folder: folder)
-    monkeypatch.setattr(baselines, "procedural_images", lambda *_: shapes["images"])
+    monkeypatch.setattr(baselines.data, "build_dataset", lambda *args, **_: built.append(args))
+    monkeypatch.setattr(baselines.data, "open_dataset", lambda folder: folder)
+    monkeypatch.setattr(baselines.data, "procedural_images", lambda *_: shapes["images"])
     monkeypatch.setattr(baselines, "NEIGHBOURS", 7)
     plan = DatasetPlan(RIG, TEST_SEED, objects=Objects(("cup",)))
     elsewhere = RIG.model_copy(update={"lidar": LidarPose(distance_m=0.3, yaw_deg=45)})

@@ -54,7 +54,7 @@ def test_reader_reads_each_compression(noise_bag: Path, rewritten: Any, compress
 
 
 def test_reader_unpacks_no_more_than_its_bound(noise_bag: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("nlos_cam.recording.bag_reader.CHUNK_LIMIT", 10_000)
+    monkeypatch.setattr("nlos_cam.recording.rosbag.CHUNK_LIMIT", 10_000)
     with pytest.raises(RecordingError, match="chunk"):
         BagReader(noise_bag)
 

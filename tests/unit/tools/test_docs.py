@@ -133,7 +133,7 @@ def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[list[str]]
     shutil.copytree(ROOT / "examples", tmp_path / "examples")
     monkeypatch.chdir(tmp_path)
     airplane = paper_scene().model_copy(update={"motion": Motion(poses=1)})  # is rendered once, not ninety times
-    monkeypatch.setattr(simulated_world, "paper_scene", lambda: airplane)
+    monkeypatch.setattr(simulated_world.renderer, "paper_scene", lambda: airplane)
 
     def call(words: list[str]) -> int:
         if words[0] == "nlos-cam":
