@@ -63,12 +63,9 @@ def maps_of(rig: Rig, depth_m: Float32 | None, model: SensorModel = QUIET, seed:
     return Sensor(rig, model).maps(render(Scene(rig, depth_m), "draft").multi, generator)
 
 
-@pytest.mark.parametrize("rig", BENCHES.values(), ids=BENCHES)
+@pytest.mark.parametrize("rig", list(BENCHES.values())[1:], ids=list(BENCHES)[1:])
 def test_bare_bench_looks_like_the_bare_training_rig(rig: Rig) -> None:
-    aligned = alignment(rig, trained(replaced := RIG.model_copy(update={"name": "paper-rig"})))
-    if rig == replaced:
-        assert aligned is None
-        return
+    aligned = alignment(rig, trained())
     assert aligned
     found, wanted = aligned.align(maps_of(rig, None)), maps_of(RIG, None)
     np.testing.assert_array_equal(found.valid, wanted.valid)
