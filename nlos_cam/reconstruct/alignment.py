@@ -14,16 +14,20 @@ Cells that the bench does not see past its occluder are extrapolated from their 
 """
 
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 from nlos_calibration import BareWall, ObjectBox, Occluder, Rig, load_rig
 from nlos_calibration.arrays import Float32, Float64, Int64, Mask
 from nlos_calibration.errors import RecordFileError
-from nlos_models import CheckpointRecord, MapSet
+from nlos_models import CheckpointRecord
 
 from nlos_cam.frames import MAP_COLUMNS, MAP_ROWS, LidarMaps
 from nlos_cam.objects import object_box
 from nlos_cam.render import SensorModel, cast
+
+if TYPE_CHECKING:  # it imports torch, which `live` does without
+    from nlos_models import MapSet
 
 SHAPE = MAP_ROWS, MAP_COLUMNS
 THREE_BOUNCES_M = 0.02
@@ -48,9 +52,7 @@ class MapAlignment:
     """
 
     def __init__(self, bench: Rig, trained: Rig, bare: BareWall | None = None) -> None:
-        box, wanted = object_box(bench), object_box(trained)
-        shift_m = np.array([box.x_min_m - wanted.x_min_m, box.y_min_m - wanted.y_min_m, 0.0])
-        bench = _with_occluder(bench, trained.occluder, shift_m[0])
+        bench, shift_m, spot_m = _spots_of(bench, trained)
         here = cast(bench, bench.pinhole.scaled(MAP_COLUMNS, MAP_ROWS), occluder=False)
         there = cast(trained, trained.pinhole.scaled(MAP_COLUMNS, MAP_ROWS))
         # Of the training rig: the cells that see the wall, and what its cells see with nothing hidden.
@@ -67,15 +69,12 @@ class MapAlignment:
         self._wall_m, self._path_per_depth = wall_m, (2 / here.cos_axis).reshape(SHAPE)
         with np.errstate(divide="ignore"):
             self._log_light = np.log(light)
-        spot_m = there.laser_spot_m[self._cells] + shift_m
         sees_wall = _cells_on_wall(bench)
         self._neighbors, self._share, self._nearest = _taken_from(bench, spot_m, sees_wall)
         # The last leg ends at the lidar too, from wherever on the wall that the lidar sees.
         seen = sees_wall.ravel()
-        last_m, wanted_m = (
-            here.length_m[seen],
-            np.linalg.norm(here.laser_spot_m[seen] - shift_m - there.lidar_m, axis=1),
-        )
+        last_m, away_m = here.length_m[seen], here.laser_spot_m[seen] - shift_m - there.lidar_m
+        wanted_m = np.linalg.norm(away_m, axis=1)
         first_m, its_m = np.linalg.norm(spot_m - here.lidar_m, axis=1), there.length_m[self._cells]
         self._longer_m = first_m - its_m + (wanted_m - last_m).mean()
         # Light on the wall does not fall with the distance that a narrow beam has come; the wall's own return does.
@@ -114,7 +113,7 @@ def alignment(bench: Rig, trained: CheckpointRecord, bare: BareWall | None = Non
     return MapAlignment(bench, rig, bare) if rig else None
 
 
-def align_all(maps: MapSet, bench: Rig, trained: CheckpointRecord) -> MapSet:
+def align_all(maps: "MapSet", bench: Rig, trained: CheckpointRecord) -> "MapSet":
     """Return the maps of a bench's samples as those of the rig of weights; as they are where `alignment` gives None."""
     if (aligned := alignment(bench, trained)) is None:
         return maps
@@ -129,7 +128,7 @@ def rig_to_align_with(bench: Rig, trained: CheckpointRecord) -> Rig | None:
     """Return the rig of weights where a bench's maps can be aligned with it and have to be.
 
     None where both are the same, where the rig of the weights is not known here, where the object boxes differ in size,
-    and for weights that expect difference maps.
+    where the bench's occluder hides more of the wall than can be extrapolated, and for difference maps.
     """
     if trained.input != "raw maps" or trained.rig_checksum == bench.checksum:
         return None
@@ -140,7 +139,36 @@ def rig_to_align_with(bench: Rig, trained: CheckpointRecord) -> Rig | None:
     if rig.checksum != trained.rig_checksum or not (bench.object_box and rig.object_box):
         return None
     apart_m = np.subtract(_size_m(bench.object_box), _size_m(rig.object_box))
-    return rig if np.abs(apart_m).max() <= SAME_BOX_M and _cells_on_wall(bench).any() else None
+    return rig if np.abs(apart_m).max() <= SAME_BOX_M and _is_in_view(bench, rig) else None
+
+
+def _is_in_view(bench: Rig, trained: Rig) -> bool:
+    """Return whether the bench sees the wall of the training rig to within BEYOND_CELLS of its occluder's edge."""
+    bench, _, spot_m = _spots_of(bench, trained)
+    sees_wall = _cells_on_wall(bench)
+    if not sees_wall.any():
+        return False
+    row, column = _cells_at(bench, spot_m)
+    some, last = np.flatnonzero(sees_wall.any(1)), MAP_COLUMNS - 1 - sees_wall[:, ::-1].argmax(1)
+    return bool((column - last[np.clip(np.rint(row).astype(int), some[0], some[-1])]).max() <= BEYOND_CELLS)
+
+
+def _spots_of(bench: Rig, trained: Rig) -> tuple[Rig, Float64, Float64]:
+    """Return the bench with an occluder, the move (3,) that lays the training rig's box on its own, and the training
+    rig's laser spots (n, 3) on the wall after that move.
+    """
+    box, wanted = object_box(bench), object_box(trained)
+    shift_m = np.array([box.x_min_m - wanted.x_min_m, box.y_min_m - wanted.y_min_m, 0.0])
+    there = cast(trained, trained.pinhole.scaled(MAP_COLUMNS, MAP_ROWS))
+    return _with_occluder(bench, trained.occluder, shift_m[0]), shift_m, there.laser_spot_m[there.on_wall] + shift_m
+
+
+def _cells_at(bench: Rig, spot_m: Float64) -> tuple[Float64, Float64]:
+    """Return the rows and columns (n,) of the bench's maps at which points (n, 3) lie, in parts of a cell."""
+    pinhole, pose = bench.pinhole.scaled(MAP_COLUMNS, MAP_ROWS), bench.wall_from_lidar
+    x, y, z = ((spot_m - pose[:3, 3]) @ pose[:3, :3]).T
+    z = np.maximum(z, 1e-9)  # points behind the lidar are far out of view
+    return pinhole.ppy + pinhole.fy * y / z, pinhole.ppx + pinhole.fx * x / z
 
 
 def _size_m(box: ObjectBox) -> tuple[float, ...]:
@@ -169,9 +197,7 @@ def _taken_from(
 
     Past the last cells that see the wall the shares extrapolate.
     """
-    pinhole, pose = bench.pinhole.scaled(MAP_COLUMNS, MAP_ROWS), bench.wall_from_lidar
-    ray = (spot_m - pose[:3, 3]) @ pose[:3, :3]
-    column, row = pinhole.ppx + pinhole.fx * ray[:, 0] / ray[:, 2], pinhole.ppy + pinhole.fy * ray[:, 1] / ray[:, 2]
+    row, column = _cells_at(bench, spot_m)
     some = np.flatnonzero(sees_wall.any(1))
     row = np.clip(row, some[0], some[-1])
     top = np.clip(np.floor(row).astype(int), some[0], max(some[-1] - 1, some[0]))
