@@ -225,6 +225,9 @@ def _rig_warnings(rig: Rig, trained: CheckpointRecord) -> list[str]:
             return []
         return [f"the networks were trained for another rig than {rig.name}: expect larger errors"]
     if difference := rig_difference(rig, training_rig):
-        aligned = "its maps are aligned with that rig's, " if rig_to_align_with(rig, trained) else ""
-        return [f"this rig differs from the training rig ({'; '.join(difference)}): {aligned}expect larger errors"]
+        aligned = "are aligned with that rig's, expect larger errors"
+        outcome = (
+            aligned if rig_to_align_with(rig, trained) else "cannot be aligned with that rig's, expect wrong shapes"
+        )
+        return [f"this rig differs from the training rig ({'; '.join(difference)}): its maps {outcome}"]
     return []
