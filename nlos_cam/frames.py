@@ -170,6 +170,7 @@ def _reduce_cells(
     depth: Float32,
     intensity: Float32,
 ) -> None:
+    """Fill in depth and intensity of every cell with valid samples."""
     bits, samples_m, middle, middle_m, counts = scratch
     rows, columns = depth.shape
     for i in range(rows):

@@ -293,6 +293,7 @@ def _check_fit(pose: BoardPose) -> None:
 
 
 def _check_print(pose: BoardPose) -> None:
+    """Raise BoardRefusedError for a stretch or bow beyond the errors of a print."""
     stretch, bows_m = float(pose.parameters[6]), pose.parameters[7:]
     if abs(stretch) > MAX_STRETCH:
         raise BoardRefusedError(
@@ -307,6 +308,7 @@ def _check_print(pose: BoardPose) -> None:
 
 
 def _check_certain(slopes: Float64, covariance: Float64) -> None:
+    """Raise BoardRefusedError if the corners leave the normal uncertain."""
     # the normal turns by at most distance x (change of the slopes), in the direction of the largest eigenvalue
     distance_m = 1.0 / float(np.linalg.norm(slopes))
     angle_std_deg = degrees(distance_m * sqrt(float(np.linalg.eigvalsh(covariance)[-1])))

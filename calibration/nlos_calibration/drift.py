@@ -246,6 +246,7 @@ class DriftCheck:
             self._reported = self.drift
 
     def _update_blindness(self) -> None:
+        """Begin or end the warning that too little of the wall is in view."""
         sharp = self.drift is not None and self.drift.sharp
         self._blind = max(self._blind - BLIND_ENDS, 0) if sharp else min(self._blind + 1, BLIND_FRAMES)
         if self._blind == 0:

@@ -274,6 +274,7 @@ def find_occluder(
 
 
 def _check_in_view(view: ClassifiedView) -> None:
+    """Refuse a view that an object fills, or with nothing in front of the wall."""
     if view.behind_share > MAX_BEHIND:
         raise OccluderRefusedError(
             f"{view.behind_share:.0%} of the depth is behind the wall ({MAX_BEHIND:.0%} allowed), by way of a hidden "
@@ -349,6 +350,7 @@ def _edge(hits_m: Float64, pixels: Mask, passed: Mask) -> Edge:
 
 
 def _check_edge(fit: OccluderFit) -> None:
+    """Refuse a gap that is too small or too uncertain, and a tilted edge."""
     if fit.gap_m < max(MIN_GAP_M, SURE_SIGMAS * fit.gap_std_m):
         gap = with_mm(fit.gap_m, fit.gap_std_m)
         raise OccluderRefusedError(f"the occluder touches the wall (gap {gap}): leave 0.05 to 0.20 m for the light")

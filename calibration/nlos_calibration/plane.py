@@ -210,6 +210,7 @@ def _residual_scale(points: _Points, slopes: Float64, scale: float) -> float:
 
 
 def _check_majority(inside: Mask, points: _Points, slopes: Float64) -> None:
+    """Raise WallRefusedError if fewer than half of the points are inliers."""
     if inside.mean() >= MIN_INLIER_FRACTION:
         return
     farther = _errors(points, slopes)[0] > 0.0
@@ -221,6 +222,7 @@ def _check_majority(inside: Mask, points: _Points, slopes: Float64) -> None:
 
 
 def _check_extent(rays: Float64, min_extent: float) -> None:
+    """Raise WallRefusedError if the inliers are in a line across the view."""
     # width along the minor principal axis; percentiles, since a few chance inliers beside a line do not make a plane
     centred = rays[:, :2] - rays[:, :2].mean(axis=0)
     narrow = np.linalg.eigh(centred.T @ centred)[1][:, 0]

@@ -229,6 +229,7 @@ def _too_little_wall(rig: Rig, view: Footprint) -> list[str]:
 
 
 def _occluder_position(occluder: Occluder, box: ObjectBox | None, tilt_deg: float, name: str) -> list[str]:
+    """Compare the occluder's gap, position and tilt with the paper's ranges."""
     problems: list[str] = []
     (low_m, high_m), gap_m = GAP_RANGE_M, occluder.z_min_m
     if not low_m - TOLERANCE_M <= gap_m <= high_m + TOLERANCE_M:

@@ -279,6 +279,7 @@ def fit_wall(
 
 
 def _check_depth(depth_m: Float64) -> None:
+    """Raise WallRefusedError for a map that is nearly empty or constant."""
     valid_m = depth_m[np.isfinite(depth_m)]
     share = len(valid_m) / depth_m.size
     if share < MIN_VALID_SHARE:

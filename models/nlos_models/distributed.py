@@ -90,6 +90,7 @@ def _return_errors(fabric: Fabric, work: Callable[..., Any], arguments: tuple[An
 
 
 def _end_all() -> None:
+    """Ask the processes to save and end, and wait for them."""
     children = multiprocessing.active_children()
     for child in children:
         child.terminate()

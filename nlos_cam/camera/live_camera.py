@@ -53,6 +53,7 @@ class LiveCamera:
         self._start_cured()
 
     def _clear_state(self) -> None:
+        """Reset counts and state to those of a camera not yet entered."""
         self.incomplete = self.dropped = 0
         self.counts.clear()
         self._past_incomplete = self._past_dropped = 0
@@ -72,6 +73,7 @@ class LiveCamera:
         """Note that no more frames are wanted."""
 
     def _is_connected(self) -> bool:
+        """Return True while the device is connected."""
         return True
 
     def _reconnect(self) -> Any | None:

@@ -206,6 +206,7 @@ class FrameSynchronizer:
         return FrameSet(number, depth.timestamp_s, depth.pixels, ir.pixels, confidence.pixels)
 
     def _decide(self, number: int) -> None:
+        """Decide every number before this one."""
         before, self._decided = self._decided, number
         if before is None:
             self._count_incomplete(lambda waiting: waiting < number)

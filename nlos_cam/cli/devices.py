@@ -66,6 +66,7 @@ def _sdk_seen(facts: diagnosis.Facts, device: diagnosis.UsbDevice) -> bool | Non
 
 
 def _uri(info: cameras.DeviceInfo | None) -> str:
+    """Return the value of `--camera` for a device; empty if it is not an L515."""
     return f"l515:{info.serial}" if info and "L515" in info.name else ""
 
 

@@ -196,6 +196,7 @@ def _known_error(error: Exception, command: str) -> NlosCamError | ModelError | 
 
 
 def _file_error(error: OSError) -> NlosCamError:
+    """Return the system's error about a file as one of ours."""
     if error.errno not in models.DISK_ERRORS:
         return RecordingError(
             f"{error.filename}: {error.strerror}: check that the file exists and that you have permission"

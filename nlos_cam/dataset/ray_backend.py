@@ -79,6 +79,7 @@ def make_piece(plan: DatasetPlan, piece: range, wanted: str) -> Samples:
 
 
 def _cause(error: Exception) -> NlosCamError:
+    """Return a worker's own error, or WorkersLostError."""
     cause = getattr(error, "cause", None)
     if isinstance(cause, NlosCamError):
         return cause

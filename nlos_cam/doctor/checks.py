@@ -253,6 +253,7 @@ def sdk(facts: Facts) -> Finding:
 
 
 def _load_fix(error: str, on: str) -> str:
+    """Return what to install for an error of the loader."""
     if "DLL" in error:
         return VC_RUNTIME
     if "GLIBC" in error:

@@ -346,6 +346,7 @@ def draw_runtimes(path: Path, rows: Sequence[RuntimeRow]) -> None:
 
 
 def _series(axis: Any, rows: Sequence[RuntimeRow]) -> None:
+    """Draw one runtime with its numbers of threads."""
     setting = rows[0].setting
     label = setting.runtime if setting.weights == "shipped" else f"{setting.weights}: {setting.runtime}"
     (line,) = axis.plot(
@@ -359,6 +360,7 @@ def _series(axis: Any, rows: Sequence[RuntimeRow]) -> None:
 
 
 def _against_frames(axis: Any, weights: str, rows: Sequence[RuntimeRow]) -> None:
+    """Draw the runtime that was measured with several frames."""
     tried = {row.setting.runtime for row in rows if row.setting.frames > 1}
     some = [row for row in rows if row.setting.runtime in tried and row.setting.threads == 1]
     ious = [row.figures["silhouette_iou"] for row in some]

@@ -26,7 +26,6 @@ from nlos_cam.reconstruct import (
     Reconstruction,
     Verdict,
     VerdictFilter,
-    align_all,
     estimate_doubt,
     rig_to_align_with,
     verdict_limits,
@@ -204,9 +203,7 @@ def bare_wall_for(record: CheckpointRecord, plan: data.DatasetPlan, wall: Path |
 
 def network_input(maps: MapSet, bare: data.BareMaps | None, plan: data.DatasetPlan, record: CheckpointRecord) -> MapSet:
     """Return the maps that the network takes: minus the bare wall, or raw and aligned with the rig of the weights."""
-    if bare:
-        return subtract_bare_wall(maps, *bare)
-    return maps if plan.spread != data.RigSpread() else align_all(maps, plan.rig, record)
+    return subtract_bare_wall(maps, *bare) if bare else data.align_maps(maps, plan, record)
 
 
 def baseline_answers(

@@ -21,10 +21,8 @@ class LiveRecording:
         self._camera, self._target = camera, recordings.CaptureTarget(path, label)
         if not hasattr(camera, "start_recording"):
             raise NlosCamError(f"{camera.uri} cannot be recorded: only a live camera (l515, sim) can")
-        self._sidecar, self._meter = (
-            recordings.SidecarFile(recordings.sidecar_path(path), camera, label=label),
-            recordings.QualityMeter(),
-        )
+        self._sidecar = recordings.SidecarFile(recordings.sidecar_path(path), camera, label=label)
+        self._meter = recordings.QualityMeter()
         self._recording = Recording(path, optional=True, last=False)
         try:
             camera.start_recording(self._recording)  # type: ignore[attr-defined]  checked above

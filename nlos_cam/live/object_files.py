@@ -84,6 +84,7 @@ DIMENSIONS = {
 
 
 def _read(path: Path) -> tuple[dict[str, Any], ObjectBox]:
+    """Return a replay's arrays and their object box."""
     try:
         arrays = read_arrays(path, DIMENSIONS)
         _check(arrays)

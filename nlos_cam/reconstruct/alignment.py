@@ -132,14 +132,19 @@ def rig_to_align_with(bench: Rig, trained: CheckpointRecord) -> Rig | None:
     """
     if trained.input != "raw maps" or trained.rig_checksum == bench.checksum:
         return None
-    try:
-        rig = load_rig(trained.rig_name)
-    except RecordFileError:  # trained for the rig of a file on another machine
-        return None
-    if rig.checksum != trained.rig_checksum or not (bench.object_box and rig.object_box):
+    if not (rig := training_rig(trained)) or not (bench.object_box and rig.object_box):
         return None
     apart_m = np.subtract(_size_m(bench.object_box), _size_m(rig.object_box))
     return rig if np.abs(apart_m).max() <= SAME_BOX_M and _is_in_view(bench, rig) else None
+
+
+def training_rig(trained: CheckpointRecord) -> Rig | None:
+    """Return the rig that weights were trained for; None where it is the rig of a file on another machine."""
+    try:
+        rig = load_rig(trained.rig_name)
+    except RecordFileError:
+        return None
+    return rig if rig.checksum == trained.rig_checksum else None
 
 
 def _is_in_view(bench: Rig, trained: Rig) -> bool:

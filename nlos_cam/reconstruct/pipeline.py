@@ -7,13 +7,13 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from nlos_calibration import Rig, load_rig, rig_difference
-from nlos_calibration.errors import CalibrationError, RecordFileError
+from nlos_calibration import Rig, rig_difference
+from nlos_calibration.errors import CalibrationError
 from nlos_models import CheckpointRecord, Reconstructor, UncertaintyModel, load_reconstructor, load_uncertainty_model
 
 from nlos_cam.files import cache_folder
 from nlos_cam.frames import Frame, LidarMaps, MapMean, maps_from_frame
-from nlos_cam.reconstruct.alignment import alignment, rig_to_align_with
+from nlos_cam.reconstruct.alignment import alignment, rig_to_align_with, training_rig
 from nlos_cam.reconstruct.bench import BenchObservation, CalibratedRig
 from nlos_cam.reconstruct.network import Clock, Network, Reconstruction, reconstruct_all
 from nlos_cam.reconstruct.physics_check import UNEXPLAINED, NullPhysicsCheck, PhysicsCheck, PhysicsCheckResult
@@ -216,15 +216,11 @@ def compatibility_warnings(
 
 
 def _rig_warnings(rig: Rig, trained: CheckpointRecord) -> list[str]:
-    try:
-        training_rig = load_rig(trained.rig_name)
-    except RecordFileError:  # trained for the rig of a file on another machine
-        training_rig = None
-    if training_rig is None or training_rig.checksum != trained.rig_checksum:
+    if (wanted := training_rig(trained)) is None:
         if trained.rig_checksum == rig.checksum:
             return []
         return [f"the networks were trained for another rig than {rig.name}: expect larger errors"]
-    if difference := rig_difference(rig, training_rig):
+    if difference := rig_difference(rig, wanted):
         aligned = "are aligned with that rig's, expect larger errors"
         outcome = (
             aligned if rig_to_align_with(rig, trained) else "cannot be aligned with that rig's, expect wrong shapes"

@@ -128,6 +128,7 @@ class CaptureSession:
         return CaptureResult(target, state, self._recording.sets, meter.quality(), sidecar, error, events=events)
 
     def _recorded(self, frames: Iterator[Frame]) -> Iterator[Frame]:
+        """Yield the frames that belong to the take, until it ends."""
         for frame in frames:
             if self._recording.covers(frame.timestamp_s):
                 yield frame

@@ -220,6 +220,7 @@ def _job(
 
 
 def _patches(facts: SceneFacts, verdicts: Plan, channel: int | None) -> Patches | None:
+    """Return the patches with tilt and BRDF as the plan includes them."""
     patches = facts.patches if channel is None or facts.patches is None else facts.patches_of(channel)
     if patches is not None and not included(verdicts, "tilt"):
         patches = patches.level()

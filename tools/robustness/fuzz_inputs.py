@@ -28,7 +28,7 @@ from nlos_cam.cli.main import main
 from nlos_cam.errors import NlosCamError
 from nlos_cam.objects import SurfaceMesh, read_depth_map, read_mesh
 from nlos_cam.recording import load_sidecar
-from nlos_cam.render import load_scene
+from nlos_cam.render import bare_wall_scene, load_scene
 
 ROOT = Path(__file__).parents[2]
 EXIT_CODES, MAX_LINES = {0, 1, 2, 3, 4}, 12
@@ -196,7 +196,7 @@ def make_files(home: Path) -> None:
     command("capture", "sim:bare-wall", "--frames", "3", "--label", "cup", "--out", home / "short.bag")
     command("replay", home / "short.bag", "--out", home / "replayed")
     command("render", "cup", "--accuracy", "draft", "--out", home / "cup.npz")
-    scene = simulated_world.renderer.bare_wall_scene()
+    scene = bare_wall_scene()
     world = simulated_world.pack_loop(*(simulated_world.read_packaged(scene) or simulated_world.render_loop(scene)))
     load_cached(home / "worlds" / "0123456789ab.npz", bytes, lambda: world)
     angle = np.linspace(0, 2 * np.pi, 12, endpoint=False)
