@@ -45,6 +45,7 @@ __all__ = [
     "atomic_file",
     "brightness",
     "channel_statistics",
+    "channels_of",
     "checksum_of_watched",
     "checksums_of",
     "claim",
@@ -111,7 +112,7 @@ __all__ = [
 
 from .checkpoint import load_encoder, load_network, load_pipeline, load_vae
 from .data import InMemory, MapBatch, MapNoise, MapSet, MapSource, WithNoise, as_batch, first_of, subtract_bare_wall
-from .direct import CellNormal, DirectNetwork
+from .direct import CellNormal, DirectNetwork, channels_of
 from .direct_training import NormalBatch, NormalSource, train_direct
 from .distributed import Accelerator, launch, open_fabric
 from .doubt_network import load_doubt

@@ -78,7 +78,7 @@ def load_network(folder: Path | None = None) -> tuple[RemappingNetwork | DirectN
     record = load_record(folder)
     if not record.direct_recipe:
         return load_pipeline(folder)
-    network = DirectNetwork(record.direct_recipe.direct)
+    network = DirectNetwork(record.direct_recipe.direct, color=record.color)
     load_part(folder / f"{DIRECT}.safetensors", network)
     return network.eval(), record
 

@@ -165,8 +165,9 @@ class WithNoise:
     def batches(self, batch: int, generator: torch.Generator) -> Iterator[MapBatch]:
         """Yield one epoch; a cell without a return keeps its intensity."""
         for plain in self.source.batches(batch, generator):
-            drawn = self.noise.add(plain.intensity, generator)
-            yield plain._replace(intensity=torch.where(plain.depth_m.isnan(), plain.intensity, drawn))
+            drawn, nowhere = self.noise.add(plain.intensity, generator), plain.depth_m.isnan()
+            nowhere = nowhere[:, None] if drawn.dim() == 4 else nowhere
+            yield plain._replace(intensity=torch.where(nowhere, plain.intensity, drawn))
 
 
 def first_of(maps: MapSet, count: int) -> MapSet:

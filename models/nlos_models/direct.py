@@ -71,23 +71,23 @@ class CellNormal(nn.Module):
     """Normalisation of each cell's depth and log intensity by median and spread over the training set, clipped.
 
     The frame's own gain is taken out of the intensity: the median ratio to the training set's medians over the quieter
-    half of the cells, which hardly any object changes.
+    half of the cells, which hardly any object changes. In color there are three intensities, and one gain.
     """
 
     median: Tensor
     spread: Tensor
 
-    def __init__(self) -> None:
+    def __init__(self, *, color: bool = False) -> None:
         super().__init__()
-        self.register_buffer("median", torch.zeros(2, ROWS, COLUMNS))
-        self.register_buffer("spread", torch.ones(2, ROWS, COLUMNS))
+        self.register_buffer("median", torch.zeros(channels_of(color=color), ROWS, COLUMNS))
+        self.register_buffer("spread", torch.ones(channels_of(color=color), ROWS, COLUMNS))
 
     def learn(self, depth_m: Tensor, intensity: Tensor) -> None:
         """Set the statistics to those of maps (n, 64, 80), averaged with the mirrored ones."""
         for channel, values in enumerate(_channels(depth_m, intensity).unbind(1)):
             median = values.nanmedian(0).values.nan_to_num()
             spread = (values - median).square().nanmean(0).sqrt().nan_to_num()
-            spread = spread.clamp(min=max(SMALLEST_SHARE * float(spread.median()), channel * MIN_LIGHT_SPREAD))
+            spread = spread.clamp(min=max(SMALLEST_SHARE * float(spread.median()), MIN_LIGHT_SPREAD * bool(channel)))
             self.median[channel] = (median + median.flip(0)) / 2
             self.spread[channel] = (spread + spread.flip(0)) / 2
 
@@ -101,10 +101,10 @@ class CellNormal(nn.Module):
         self.median[channels] += shifts[channels, None, None]
 
     def forward(self, depth_m: Tensor, intensity: Tensor) -> Tensor:
-        """Map maps (n, 64, 80) to (n, 2, 64, 80); a cell without a return is 0 in both channels."""
+        """Map maps (n, 64, 80) to (n, 2, 64, 80), in color (n, 4, 64, 80); a cell without a return is 0."""
         off = _channels(depth_m, intensity) - self.median
-        gain = self.log_gain(off[:, 1])
-        normal = (off - torch.stack([torch.zeros_like(gain), gain], dim=1)[:, :, None, None]) / self.spread
+        gain = self.log_gain(off[:, 1:].mean(1))[:, None, None, None]
+        normal = torch.cat([off[:, :1], off[:, 1:] - gain], dim=1) / self.spread
         return torch.where(torch.isnan(normal), 0.0, normal.clamp(-CLIP, CLIP))
 
     def log_gain(self, light: Tensor) -> Tensor:
@@ -112,7 +112,7 @@ class CellNormal(nn.Module):
 
         Medians are taken by sorting, which every runtime can do, with cells that do not count at the end.
         """
-        some, spread = light[..., ::GAIN_COLUMNS], self.spread[1, :, ::GAIN_COLUMNS]
+        some, spread = light[..., ::GAIN_COLUMNS], self.spread[1:, :, ::GAIN_COLUMNS].mean(0)
         quieter = spread <= spread.flatten().sort().values[(spread.numel() - 1) // 2]
         counts = quieter & ~torch.isnan(some)
         ordered = torch.where(counts, some, torch.inf).flatten(1).sort(dim=1).values
@@ -128,33 +128,43 @@ class CellNormal(nn.Module):
         Noise is the sensor's, drawn for the intensity of expected maps; the logarithm of the wall's reflectance
         (n, 64, 80) adds to that of the light, and a range offset (n,) to all depths.
         """
-        depth, light = normal.unbind(1)
-        returns = (depth != 0) | (light != 0)
-        counts = torch.expm1(light * self.spread[1] + self.median[1])
+        depth, light = normal[:, :1], normal[:, 1:]
+        returns = (normal != 0).any(dim=1, keepdim=True)
+        counts = torch.expm1(light * self.spread[1:] + self.median[1:])
         if log_reflectance is not None:
-            counts = counts * log_reflectance.exp()
+            counts = counts * log_reflectance.exp()[:, None]
         if noise is not None:
             counts = noise.add(counts)
         if offset_m is not None:
-            depth = depth + offset_m[:, None, None] / self.spread[0]
-        varied = torch.stack([depth, (torch.log1p(counts) - self.median[1]) / self.spread[1]], dim=1)
-        return torch.where(returns[:, None], varied.clamp(-CLIP, CLIP), normal)
+            depth = depth + offset_m[:, None, None, None] / self.spread[:1]
+        varied = torch.cat([depth, (torch.log1p(counts) - self.median[1:]) / self.spread[1:]], dim=1)
+        return torch.where(returns, varied.clamp(-CLIP, CLIP), normal)
+
+
+def channels_of(*, color: bool) -> int:
+    """Return the number of normalised channels: depth, and one intensity or three."""
+    return 4 if color else 2
 
 
 def _channels(depth_m: Tensor, intensity: Tensor) -> Tensor:
-    """Stack depth and log(1 + intensity) to (n, 2, 64, 80), NaN where there is no return."""
-    return torch.stack([depth_m, torch.where(torch.isnan(depth_m), depth_m, torch.log1p(intensity))], dim=1)
+    """Stack depth and log(1 + intensity) to (n, 2 or 4, 64, 80), NaN where there is no return."""
+    depth_m = depth_m[:, None]
+    light = torch.log1p(intensity if intensity.dim() == 4 else intensity[:, None])
+    return torch.cat([depth_m, torch.where(torch.isnan(depth_m), depth_m, light)], dim=1)
 
 
 class DirectNetwork(nn.Module):
-    """Network from maps (n, 64, 80) to images (n, 64, 64) in [0, 1] by two heads: is there a surface, and how deep."""
+    """Network from maps (n, 64, 80) to images (n, 64, 64) in [0, 1] by two heads: is there a surface, and how deep.
 
-    def __init__(self, size: DirectSize | None = None, dropout: float = 0.0) -> None:
+    In color intensities are (n, 3, 64, 80), images (n, 3, 64, 64), and the second head draws three albedos.
+    """
+
+    def __init__(self, size: DirectSize | None = None, dropout: float = 0.0, *, color: bool = False) -> None:
         super().__init__()
         self.size = size = size or DirectSize()
-        self.normal = CellNormal()
-        within = size.features // 2
-        self.patch = nn.Linear(2 * PATCH**2, within)
+        self.normal = CellNormal(color=color)
+        within, channels = size.features // 2, channels_of(color=color)
+        self.patch = nn.Linear(channels * PATCH**2, within)
         self.merge = nn.Linear(4 * within, size.features)
         self.into = MirrorLinear(SIDE_INPUTS * size.features, size.width)
         self.trunk = nn.Sequential(
@@ -177,18 +187,22 @@ class DirectNetwork(nn.Module):
             mixers += [Residual(size.token, over_tokens, 0.0, across=True), Residual(size.token, over_features, 0.0)]
         self.mixers = nn.Sequential(*mixers)
         self.norm = nn.LayerNorm(size.token)
-        self.heads = nn.Linear(size.token, 2 * TOKEN**2)
+        self.heads = nn.Linear(size.token, channels * TOKEN**2)
 
     def logits(self, normal: Tensor) -> Tensor:
-        """Map normalised maps (n, 2, 64, 80) to two logits (n, 2, 64, 64): of a surface, and of its v in [0.1, 1]."""
+        """Map normalised maps (n, 2, 64, 80) to two logits (n, 2, 64, 64): of a surface, and of its v in [0.1, 1].
+
+        In color four channels become four logits.
+        """
         sides = torch.stack([normal[..., : ROWS // 2, :], normal[..., ROWS // 2 :, :].flip(-2)], dim=1)
         x = functional.gelu(self.patch(_patches(sides, PATCH)))  # (n, 2, 8, 20, within)
         x = functional.gelu(self.merge(_patches(x.movedim(-1, 2), 2)))  # (n, 2, 4, 10, features)
         x = self.trunk(self.into(x.flatten(2)))
         x = self.out(x).unflatten(-1, self.place.shape) + self.place
         x = self.heads(self.norm(self.mixers(x)))  # (n, 2, 32, 128)
-        x = x.unflatten(-1, (2, TOKEN, TOKEN)).unflatten(2, SIDE_TOKENS)  # (n, side, row, column, head, y, x)
-        x = x.permute(0, 1, 4, 2, 5, 3, 6).reshape(-1, 2, 2, PIXELS // 2, PIXELS)
+        channels = normal.shape[1]
+        x = x.unflatten(-1, (channels, TOKEN, TOKEN)).unflatten(2, SIDE_TOKENS)  # (n, side, row, column, head, y, x)
+        x = x.permute(0, 1, 4, 2, 5, 3, 6).reshape(-1, 2, channels, PIXELS // 2, PIXELS)
         return torch.cat([x[:, 0], x[:, 1].flip(-2)], dim=-2)
 
     @property
@@ -215,28 +229,31 @@ def _patches(x: Tensor, side: int) -> Tensor:
 def image_from_logits(logits: Tensor) -> Tensor:
     """Return images (n, 64, 64) of logits (n, 2, 64, 64), each cut where its silhouette's expected overlap is largest.
 
+    Four logits, in color, make images (n, 3, 64, 64).
     Of a silhouette and pixels with probabilities p of a surface, the expected intersection over union is about the sum
     of p inside over the sum of p everywhere and 1 - p inside.
     """
-    share, depth = torch.sigmoid(logits.float()).unbind(1)
+    every = torch.sigmoid(logits.float())
+    share, values = every[:, 0], every[:, 1:] if every.shape[1] > 2 else every[:, 1]
     cuts = share.new_tensor(CUTS)
     above = share[:, None] > cuts[:, None, None]
     inside, area = (share[:, None] * above).sum((2, 3)), above.sum((2, 3))
     overlap = inside / (share.sum((1, 2))[:, None] + area - inside)
     surface = share > cuts[overlap.argmax(1)][:, None, None]
-    return torch.where(surface, MIN_V + (1 - MIN_V) * depth, 0.0)
+    return torch.where(surface if values.dim() == 3 else surface[:, None], MIN_V + (1 - MIN_V) * values, 0.0)
 
 
 def two_heads_error(logits: Tensor, truth: Tensor) -> Tensor:
     """Return the loss of logits (n, 2, 64, 64) against images (n, 64, 64): cross-entropy, overlap and depth.
 
     Cross-entropy of the silhouette, plus 0.5 (1 - soft intersection over union), plus 2 times the absolute error of v
-    over the surface; each is a mean over pixels or objects.
+    over the surface; each is a mean over pixels or objects. In color, (n, 4, 64, 64) against (n, 3, 64, 64), the error
+    of v is the mean of three.
     """
-    (occupied, depth), truth = logits.float().unbind(1), truth.float()
-    surface = (truth > 0).float()
+    logits, truth = logits.float(), truth.float() if truth.dim() == 4 else truth.float()[:, None]
+    occupied, values, surface = logits[:, 0], logits[:, 1:], (truth > 0).any(1).float()
     entropy = functional.binary_cross_entropy_with_logits(occupied, surface)
     share = torch.sigmoid(occupied)
     both, one = (share * surface).sum((1, 2)), (share + surface - share * surface).sum((1, 2))
-    off = (MIN_V + (1 - MIN_V) * torch.sigmoid(depth) - truth).abs() * surface
+    off = (MIN_V + (1 - MIN_V) * torch.sigmoid(values) - truth).abs().mean(1) * surface
     return entropy + 0.5 * (1 - (both + 1) / (one + 1)).mean() + 2 * off.sum() / surface.sum().clamp(min=1)

@@ -22,9 +22,9 @@ class NormalBatch(NamedTuple):
     """Batch of normalised maps with the images of the hidden objects."""
 
     normal: Tensor
-    """(b, 2, 64, 80), float16."""
+    """(b, 2, 64, 80), or in color (b, 4, 64, 80), float16."""
     image: Tensor
-    """(b, 64, 64), float16."""
+    """(b, 64, 64), or in color (b, 3, 64, 64), float16."""
 
 
 class NormalSource(Protocol):
@@ -53,7 +53,7 @@ def train_direct(
     first. Returns the network in eval mode, and its held-out figures.
     """
     torch.manual_seed(recipe.seed)
-    network = DirectNetwork(recipe.direct, recipe.dropout)
+    network = DirectNetwork(recipe.direct, recipe.dropout, color=recipe.colour)
     network.normal.load_state_dict(source.normal.state_dict())
     if start:
         network.load_state_dict(start.state_dict(), strict=False)

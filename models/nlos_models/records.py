@@ -49,7 +49,8 @@ class CheckpointRecord(BaseModel):
     @classmethod
     def _note_color(cls, note: str, info: ValidationInfo) -> str:
         del note
-        return SIMULATION_ONLY if _any_in_color(info.data.get("vae_recipe"), info.data.get("compressor_recipe")) else ""
+        recipes = (info.data.get(f"{task}_recipe") for task in ("vae", "compressor", "direct"))
+        return SIMULATION_ONLY if _any_in_color(*recipes) else ""
 
     @classmethod
     def of(cls, runs: Iterable[Recipe], rig: tuple[str, str], maps: MapKind = "raw maps") -> Self:
@@ -83,7 +84,7 @@ class CheckpointRecord(BaseModel):
     @property
     def color(self) -> bool:
         """True for weights of full color, which is simulation only."""
-        return _any_in_color(self.vae_recipe, self.compressor_recipe)
+        return _any_in_color(self.vae_recipe, self.compressor_recipe, self.direct_recipe)
 
 
 def _any_in_color(*recipes: Recipe | None) -> bool:

@@ -226,6 +226,7 @@ def direct_start(recipe: Recipe, weights: Path | None) -> tuple[DirectNetwork | 
     network, record = checkpoint.load_network(folder)
     if not isinstance(network, DirectNetwork):
         raise TrainingError(f"{folder} does not hold a direct network: choose other --weights")
+    _check_same_color(recipe, folder)
     size, wanted = network.size, recipe.direct
     grown = size.model_copy(update={"blocks": wanted.blocks, "mixers": wanted.mixers})
     if grown != wanted or wanted.blocks < size.blocks or wanted.mixers < size.mixers:

@@ -56,6 +56,9 @@ SpreadDeg = Annotated[
 GainSpread = Annotated[
     float, typer.Option("--gain-spread-percent", min=0, help="Largest change of the intensity gain, drawn per object.")
 ]
+ObjectsPerRig = Annotated[
+    int, typer.Option("--objects-per-rig", min=1, help="Objects that share a draw of the spreads: 100 render faster.")
+]
 Expected = Annotated[
     bool,
     typer.Option(
@@ -101,6 +104,7 @@ def build(
     rig_spread_mm: SpreadMm = 0.0,
     rig_spread_deg: SpreadDeg = 0.0,
     gain_spread_percent: GainSpread = 0.0,
+    objects_per_rig: ObjectsPerRig = 1,
     accuracy: AccuracyName = "standard",
     expected_maps: Expected = False,
     workers: Workers = os.cpu_count() or 1,
@@ -121,6 +125,7 @@ def build(
         spread=spread,
         textures=tuple(shapes.TEXTURES) if colour else (),
         expected=expected_maps,
+        objects_per_rig=objects_per_rig,
     )
     with common.progress(Rate()) as bar:
         checks, renders = (bar.add_task(name, total=None, visible=False) for name in ("checking shards", "rendering"))

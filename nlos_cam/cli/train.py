@@ -214,9 +214,11 @@ def direct(
     with ExitStack() as held:
         with tracked("packing maps") as on_progress:
             normal = start.normal if start else None
-            packed = data_sets.open_packed_maps(data, store or run.out / "packed", on_progress, normal)
+            packed = data_sets.open_packed_maps(
+                data, store or run.out / "packed", on_progress, normal, color=recipe.colour
+            )
             source = held.enter_context(packed)
-        held_out = models.first_of(data_sets.open_dataset(held_out_data).arrays(), recipe.held_out)
+        held_out = source.held_out(held_out_data, recipe.held_out)
         recipe = recipe.model_copy(update={"held_out": len(held_out.image)})
         rig = source.plan.rig
         record = models.record_run(recipe, run.out, (rig.name, rig.checksum), runs, weights)

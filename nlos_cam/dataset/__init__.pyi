@@ -21,7 +21,6 @@ __all__ = [
     "PackedMaps",
     "RigSpread",
     "Stimulus",
-    "align_maps",
     "build_dataset",
     "check_arrays",
     "check_doubt_data",
@@ -66,4 +65,4 @@ from .ray_backend import ray_farm
 from .reader import Dataset, open_dataset
 from .samples import objects_from_folder, procedural_images, sense_color, sense_object
 from .shards import PART_PATTERN, REQUIRED_ARRAYS, SHARD_PATTERN, check_arrays, read_head, shard_origin, shards_of
-from .training_maps import BareMaps, align_maps, measured_bare_wall, read_maps, render_bare_wall
+from .training_maps import BareMaps, measured_bare_wall, read_maps, render_bare_wall

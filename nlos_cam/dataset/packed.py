@@ -7,25 +7,26 @@ every epoch, so that an interrupted run sees the same batches again.
 import hashlib
 import json
 import operator
-from collections.abc import Generator, Iterator, Sequence
+from collections.abc import Generator, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
 import torch
-from nlos_models import CellNormal, MapNoise, NormalBatch, read_bounded
+from nlos_calibration import Rig
+from nlos_models import CellNormal, MapNoise, MapSet, NormalBatch, channels_of, first_of, read_bounded
 from nlos_models import read_arrays as read_npz
 
-from nlos_cam.dataset.plan import DatasetPlan
+from nlos_cam.dataset.plan import DatasetPlan, RigSpread
 from nlos_cam.dataset.reader import MAP_CHANNELS, open_dataset
 from nlos_cam.dataset.samples import OnProgress, ignore
-from nlos_cam.dataset.shards import SHARD_PATTERN, read_arrays, read_head
+from nlos_cam.dataset.shards import SHARD_PATTERN, Shard, read_arrays, read_head
 from nlos_cam.errors import RecordingError, SceneError
 from nlos_cam.files import atomic_file, claim
 from nlos_cam.frames import MAP_COLUMNS, MAP_ROWS, OBJECT_PIXELS
+from nlos_cam.reconstruct import align_samples
 
 INDEX, MAPS, IMAGES, CELLS = "index.json", "maps.f16", "images.f16", "cells.npz"
-ROW = {MAPS: (2, MAP_ROWS, MAP_COLUMNS), IMAGES: (OBJECT_PIXELS, OBJECT_PIXELS)}
 INDEX_LIMIT = 1 << 26
 """Bytes of the index: some hundred thousand shards."""
 STATISTICS_SHARDS = 40
@@ -59,14 +60,20 @@ class PackedMaps:
     """Normalised maps and images of one or more datasets of one rig, in a folder that is theirs alone."""
 
     def __init__(
-        self, datasets: Sequence[Path], store: Path, on_progress: OnProgress = ignore, normal: CellNormal | None = None
+        self,
+        datasets: Sequence[Path],
+        store: Path,
+        on_progress: OnProgress = ignore,
+        normal: CellNormal | None = None,
+        *,
+        color: bool = False,
     ) -> None:
         """Open or make the store: use `open_packed_maps`, which holds its claim meanwhile.
 
         Maps are normalised as `normal` does, by default by their own statistics. Raises RecordingError for no dataset,
         SceneError for datasets of two rigs or a store that is normalised otherwise.
         """
-        opened = [open_dataset(folder, expected=True) for folder in datasets]
+        opened = [open_dataset(folder, color=color, expected=True) for folder in datasets]
         self.plan: DatasetPlan = opened[0].plan
         """Of the first dataset."""
         if others := [one.folder for one in opened if one.plan.rig != self.plan.rig]:
@@ -75,15 +82,24 @@ class PackedMaps:
             raise SceneError(f"of {others[0]} and {datasets[0]} one holds expected maps, without noise: give one kind")
         self.noise: MapNoise | None = map_noise(self.plan) if self.plan.expected else None
         """To be drawn at each step of training."""
-        self._datasets, self._store, self.normal = list(datasets), store, CellNormal()
+        self._datasets, self._store, self.normal = list(datasets), store, CellNormal(color=color)
+        if color and self.plan.spread != RigSpread():
+            raise SceneError(
+                f"{datasets[0]} varies the rig, but maps in color are not aligned: build it without a spread"
+            )
+        self._color, pixels = color, (OBJECT_PIXELS, OBJECT_PIXELS)
+        self._rows = {
+            MAPS: (channels_of(color=color), MAP_ROWS, MAP_COLUMNS),
+            IMAGES: (3, *pixels) if color else pixels,
+        }
         self._index = _read_index(store)
         if not (store / CELLS).exists():
             if normal:
                 self.normal.load_state_dict(normal.state_dict())
             else:
-                heads = [shard for one in opened for shard in one.shards[:STATISTICS_SHARDS]]
-                some = [read_arrays(shard, MAP_CHANNELS[:2]) for shard in heads]
-                self.normal.learn(*(torch.from_numpy(np.concatenate(parts)) for parts in zip(*some, strict=True)))
+                some = [self._read(shard) for one in opened for shard in one.shards[:STATISTICS_SHARDS]]
+                depth_m, intensity = ([getattr(one, name) for one in some] for name in MAP_CHANNELS[:2])
+                self.normal.learn(*(torch.from_numpy(np.concatenate(parts)) for parts in (depth_m, intensity)))
             with atomic_file(store / CELLS) as part, part.open("wb") as file:
                 np.savez(file, **{name: values.numpy() for name, values in self.normal.state_dict().items()})
         try:
@@ -109,7 +125,7 @@ class PackedMaps:
         known = self._index["shards"]
         paths = [path for folder in self._datasets for path in sorted(folder.glob(SHARD_PATTERN))]
         new = [path for path in paths if str(path.resolve()) not in known]
-        for name, shape in ROW.items():
+        for name, shape in self._rows.items():
             path, size = self._store / name, 2 * len(self) * int(np.prod(shape))
             path.touch()
             if path.stat().st_size < size:
@@ -117,13 +133,12 @@ class PackedMaps:
             with path.open("r+b") as file:  # rows after the last indexed one are left by an interruption
                 file.truncate(size)
         for number, path in enumerate(new, 1):
-            head = read_head(path)
-            depth_m, intensity, image = read_arrays(head, MAP_CHANNELS)
-            normal = self.normal(torch.from_numpy(depth_m), torch.from_numpy(intensity)).half().numpy()
-            for name, values in ((MAPS, normal), (IMAGES, image.astype(np.float16))):
+            maps = self._read(read_head(path))
+            normal = self.normal(torch.from_numpy(maps.depth_m), torch.from_numpy(maps.intensity)).half().numpy()
+            for name, values in ((MAPS, normal), (IMAGES, maps.image.astype(np.float16))):
                 with (self._store / name).open("ab") as file:
                     file.write(np.ascontiguousarray(values).tobytes())
-            known[str(path.resolve())] = len(image)
+            known[str(path.resolve())] = len(maps.image)
             if number % 50 == 0 or number == len(new):
                 self._write_index()
             on_progress(number, len(new))
@@ -131,6 +146,15 @@ class PackedMaps:
     def _write_index(self) -> None:
         with atomic_file(self._store / INDEX) as part:
             part.write_text(json.dumps(self._index), encoding="utf-8")
+
+    def _read(self, shard: Shard) -> MapSet:
+        rigs = (shard.plan.bench_of(seed)[0] for seed in shard.seeds)
+        return _aligned(MapSet(*read_arrays(shard, MAP_CHANNELS)), rigs, self.plan.rig)
+
+    def held_out(self, folder: Path, count: int) -> MapSet:
+        """Return up to `count` samples of another dataset as the store has its own: as the plan's rig sees them."""
+        opened = open_dataset(folder, color=self._color)
+        return _aligned(first_of(opened.arrays(), count), opened.benches(), self.plan.rig)
 
     def batches(self, batch: int, generator: torch.Generator) -> Iterator[NormalBatch]:
         """Yield one pass over the objects in random order, without the last, smaller batch.
@@ -145,16 +169,29 @@ class PackedMaps:
         count = int(epochs[key])
         if count < batch:
             raise RecordingError(f"{count} objects are fewer than a batch of {batch}: build more, or lower batch")
-        files = [np.memmap(self._store / name, np.float16, "r", shape=(count, *shape)) for name, shape in ROW.items()]
+        files = [
+            np.memmap(self._store / name, np.float16, "r", shape=(count, *shape)) for name, shape in self._rows.items()
+        ]
         order = torch.randperm(count, generator=generator).numpy()
         for start in range(0, count - batch + 1, batch):
             rows = np.sort(order[start : start + batch])
             yield NormalBatch(*(torch.from_numpy(file[rows]) for file in files))
 
 
+def _aligned(maps: MapSet, benches: Iterable[Rig], rig: Rig) -> MapSet:
+    """Return samples as a rig sees them, less those of benches that cannot be aligned with it."""
+    maps, seen = align_samples(maps, benches, rig)
+    return MapSet(*(getattr(maps, name)[seen] for name in MAP_CHANNELS))
+
+
 @contextmanager
 def open_packed_maps(
-    datasets: Sequence[Path], store: Path, on_progress: OnProgress = ignore, normal: CellNormal | None = None
+    datasets: Sequence[Path],
+    store: Path,
+    on_progress: OnProgress = ignore,
+    normal: CellNormal | None = None,
+    *,
+    color: bool = False,
 ) -> Generator[PackedMaps]:
     """Open or make a store, and hold the right to write it until the end of the block.
 
@@ -162,4 +199,4 @@ def open_packed_maps(
     """
     store.mkdir(parents=True, exist_ok=True)
     with claim(store, inside=True):
-        yield PackedMaps(datasets, store, on_progress, normal)
+        yield PackedMaps(datasets, store, on_progress, normal, color=color)

@@ -77,7 +77,7 @@ class RigSpread(Record):
             raise SceneError(f"a gain spread of {self.gain_share:.0%} leaves no light: keep it below 100 %")
 
     def draw(self, rig: Rig, sensor: SensorModel, seed: int) -> tuple[Rig, SensorModel]:
-        """Return the rig and the sensor of one object; without a spread they are the given ones."""
+        """Return the rig and the sensor of one draw; without a spread they are the given ones."""
         if self == RigSpread():
             return rig, sensor
         distance, yaw, pitch, place, gap, gain = np.random.default_rng([seed, _RIG_STREAM]).uniform(-1, 1, 6).tolist()
@@ -133,6 +133,8 @@ class DatasetPlan:
     """Textures of the objects; with any of them the dataset is in color, which is simulation only."""
     expected: bool = False
     """Hold expected maps, without the sensor's noise, which training a direct network draws anew at each step."""
+    objects_per_rig: int = 1
+    """Consecutive seeds that share a draw of the spread, so that the renderer keeps what depends on the rig alone."""
 
     @classmethod
     def of_scene(cls, scene: SceneFile, first_seed: int, **others: Any) -> Self:
@@ -163,6 +165,8 @@ class DatasetPlan:
             del facts["textures"]  # older readers refuse unknown fields
         if not self.expected:
             del facts["expected"]  # likewise
+        if self.objects_per_rig == 1:
+            del facts["objects_per_rig"]
         if not self.objects.share_generic:
             del facts["objects"]["share_generic"]  # and checksums of older plans stay
         return json.dumps({**facts, "rig_checksum": self.rig.checksum})
@@ -180,6 +184,10 @@ class DatasetPlan:
         facts.setdefault("objects", FIRST_OBJECTS)
         return _PLAN.validate_python(facts)
 
+    def bench_of(self, seed: int) -> tuple[Rig, SensorModel]:
+        """Return the rig and the sensor of one object."""
+        return self.spread.draw(self.rig, self.sensor, seed // self.objects_per_rig)
+
     def differences(self, other: "DatasetPlan") -> list[str]:
         """Return the names of fields that differ; empty where both plans make the same bits."""
         names = [one.name for one in fields(self)]
@@ -191,8 +199,10 @@ class DatasetPlan:
         self.spread.check(self.rig)
         if self.textures and self.material.albedo != 1:
             raise SceneError("the scene's object has an albedo, but in color its albedo comes from textures: remove it")
-        if self.expected and (self.textures or self.sensor.wall_texture):
-            raise SceneError("expected maps are neither in color nor of a wall_texture: drop --expected-maps")
+        if self.objects_per_rig > 1 and self.spread == RigSpread():
+            raise SceneError("without a spread all objects share one rig: drop --objects-per-rig, or give a spread")
+        if self.expected and self.sensor.wall_texture:
+            raise SceneError("expected maps are not of a wall_texture: drop --expected-maps")
         if np.ndim(self.material.albedo):
             raise SceneError("the scene's object has three albedos, but datasets hold one intensity: give one albedo")
 

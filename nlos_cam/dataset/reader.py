@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from nlos_calibration import Rig
 from nlos_calibration.arrays import Int64
 from nlos_models import SIMULATION_ONLY, MapBatch, MapSet, as_batch
 from numpy.typing import NDArray
@@ -34,6 +35,10 @@ class Dataset:
     def column(self, name: str) -> NDArray[Any]:
         """Return an array over all samples: seed, category (n,), scene (n, 6), object_depth_m (n, 64, 64) or a map."""
         return np.concatenate([read_arrays(shard, [name])[0] for shard in self.shards])
+
+    def benches(self) -> Iterator[Rig]:
+        """Yield each sample's rig, in their order."""
+        return (self.plan.bench_of(seed)[0] for shard in self.shards for seed in shard.seeds)
 
     def arrays(self) -> MapSet:
         """Read all maps and images."""

@@ -64,7 +64,9 @@ def sense_object(
     return sensor.maps(echoes, generator)
 
 
-def sense_color(scene: Scene, sensor: Sensor, seed: int, accuracy: str = "standard") -> LidarMaps:
+def sense_color(
+    scene: Scene, sensor: Sensor, seed: int, accuracy: str = "standard", *, expected: bool = False
+) -> LidarMaps:
     """Return the maps of a scene whose albedo has three channels; intensity is (3, 64, 80). Simulation only.
 
     The simulated lidar has three lasers and one detector. It exposes each instant four times, each time with the same
@@ -73,14 +75,16 @@ def sense_color(scene: Scene, sensor: Sensor, seed: int, accuracy: str = "standa
     albedo = np.asarray(scene.surface.albedo)
     lights = (albedo.mean(-1), *np.moveaxis(albedo, -1, 0))
     scenes = (replace(scene, surface=Surface(light, scene.surface.brdf)) for light in lights)
-    white, *colors = (sense_object(one, sensor, seed, accuracy, exposure) for exposure, one in enumerate(scenes))
+    white, *colors = (
+        sense_object(one, sensor, seed, accuracy, exposure, expected=expected) for exposure, one in enumerate(scenes)
+    )
     return replace(white, intensity=np.stack([maps.intensity for maps in colors]))
 
 
 def make_samples(plan: DatasetPlan, seeds: Sequence[int]) -> Samples:
     """Return the samples of some seeds, with the same bits on any machine and in any order."""
     objects = [hidden_object(plan.objects, seed, plan.box) for seed in seeds]
-    rigs = [plan.spread.draw(plan.rig, plan.sensor, seed) for seed in seeds]
+    rigs = [plan.bench_of(seed) for seed in seeds]
     coats = [_coat(seed, depth_m, plan.textures) for seed, (_, depth_m) in zip(seeds, objects, strict=True)]
     maps = [
         _sense(plan, depth_m, coat, rig, model, seed)
@@ -115,7 +119,8 @@ def _sense(
     sensor = cached_sensor(rig, model, plan.radiometry)  # pyright: ignore[reportArgumentType]  frozen, so hashable
     if coat is None:
         return sense_object(scene, sensor, seed, plan.accuracy, expected=plan.expected)
-    return sense_color(replace(scene, surface=Surface(coat.albedo, plan.material.brdf)), sensor, seed, plan.accuracy)
+    painted = replace(scene, surface=Surface(coat.albedo, plan.material.brdf))
+    return sense_color(painted, sensor, seed, plan.accuracy, expected=plan.expected)
 
 
 @lru_cache(maxsize=1)

@@ -130,22 +130,17 @@ def read_maps(
     if bare:
         held_out = subtract_bare_wall(held_out, *bare)
     rig = plan.rig
-    if start and plan.spread == RigSpread():
-        rig, held_out = rig_to_align_with(rig, start) or rig, align_maps(held_out, plan, start)
+    if start:
+        rig, held_out = rig_to_align_with(rig, start) or rig, align_all(held_out, other.benches(), start)
     source: MapSource
     if stream:
         source = Streamed(dataset, dataset.column("image"), bare)
     else:
         maps = first_of(dataset.arrays(), recipe.objects)
         maps = subtract_bare_wall(maps, *bare) if bare else maps
-        source = InMemory(align_maps(maps, plan, start) if start else maps)
+        source = InMemory(align_all(maps, dataset.benches(), start) if start else maps)
     training = WithNoise(source, map_noise(plan)) if plan.expected else source
     return MapSplit(training, held_out, plan, (rig.name, rig.checksum))
-
-
-def align_maps(maps: MapSet, plan: DatasetPlan, trained: CheckpointRecord) -> MapSet:
-    """Return a dataset's maps aligned with the rig of weights; as they are where that is not possible or rigs vary."""
-    return maps if plan.spread != RigSpread() else align_all(maps, plan.rig, trained)
 
 
 def measured_bare_wall(path: Path) -> BareMaps:

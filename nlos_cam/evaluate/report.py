@@ -127,11 +127,11 @@ def evaluate(
     bare = subjects.bare_wall_for(record, objects.plan, wall)
     guesses, searched = subjects.baseline_answers(objects, training, nearest=nearest, tracked=tracked)
     doubter = load_uncertainty_model(weights, cache_folder() / "onnx") if record.input == "raw maps" else None
-    maps = subjects.network_input(objects.maps, bare, objects.plan, record)
+    maps = subjects.network_input(objects.maps, bare, objects.benches, record)
     answers = subjects.answer_all(reconstructor, maps)
     predicted, unseen = subjects.predict_quality(answers, maps, doubter, objects.plan.rig), None
     if second:
-        maps = subjects.network_input(second.maps, bare, second.plan, record)
+        maps = subjects.network_input(second.maps, bare, second.benches, record)
         others = subjects.answer_all(reconstructor, maps)
         sure = subjects.predict_quality(others, maps, doubter, second.plan.rig)
         unseen = Unseen(second.names, second.maps.image.astype(np.float32), others.image, sure)

@@ -1,7 +1,7 @@
 """Held-out objects as maps with sensor noise: the fixed test objects, random ones, or those of a dataset."""
 
 import os
-from collections.abc import Callable, Generator, Sequence
+from collections.abc import Callable, Generator, Iterable, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -26,6 +26,7 @@ from nlos_cam.reconstruct import (
     Reconstruction,
     Verdict,
     VerdictFilter,
+    align_all,
     estimate_doubt,
     rig_to_align_with,
     verdict_limits,
@@ -154,6 +155,8 @@ class HeldOutObjects:
     maps: MapSet
     """Raw maps, whichever input the weights expect: the baselines compare these."""
     plan: data.DatasetPlan
+    benches: list[Rig]
+    """The rig of each object."""
 
 
 def rig_of(record: CheckpointRecord) -> Rig:
@@ -178,7 +181,8 @@ def rendered_objects(
     maps = as_map_set(sense(echoes, rig), truth_of(subjects, plan.box))
     kind = "random objects" if count else TEST_SETS[test]
     description = f"{len(subjects)} held-out {kind}, with the sensor's noise"
-    return HeldOutObjects(description, [one.name for one in subjects], [one.category for one in subjects], maps, plan)
+    names, categories = [one.name for one in subjects], [one.category for one in subjects]
+    return HeldOutObjects(description, names, categories, maps, plan, [rig] * len(names))
 
 
 def dataset_objects(folder: Path) -> HeldOutObjects:
@@ -186,7 +190,7 @@ def dataset_objects(folder: Path) -> HeldOutObjects:
     opened = data.open_dataset(folder)
     categories = [str(category) for category in opened.column("category")]
     names = [f"{category} {seed}" for category, seed in zip(categories, opened.column("seed"), strict=True)]
-    return HeldOutObjects(f"Maps of {folder}", names, categories, opened.arrays(), opened.plan)
+    return HeldOutObjects(f"Maps of {folder}", names, categories, opened.arrays(), opened.plan, [*opened.benches()])
 
 
 def bare_wall_for(record: CheckpointRecord, plan: data.DatasetPlan, wall: Path | None = None) -> data.BareMaps | None:
@@ -201,9 +205,9 @@ def bare_wall_for(record: CheckpointRecord, plan: data.DatasetPlan, wall: Path |
     return data.measured_bare_wall(wall) if wall else data.render_bare_wall(plan)
 
 
-def network_input(maps: MapSet, bare: data.BareMaps | None, plan: data.DatasetPlan, record: CheckpointRecord) -> MapSet:
+def network_input(maps: MapSet, bare: data.BareMaps | None, benches: Iterable[Rig], record: CheckpointRecord) -> MapSet:
     """Return the maps that the network takes: minus the bare wall, or raw and aligned with the rig of the weights."""
-    return subtract_bare_wall(maps, *bare) if bare else data.align_maps(maps, plan, record)
+    return subtract_bare_wall(maps, *bare) if bare else align_all(maps, benches, record)
 
 
 def baseline_answers(
@@ -228,6 +232,8 @@ def notes_about(record: CheckpointRecord, objects: HeldOutObjects, training: dat
     if record.rig_checksum != rig.checksum:
         aligned = ", and aligned with it" if rig_to_align_with(rig, record) else ""
         notes.append(f"the weights were trained for rig {record.rig_name} but the maps are of rig {rig.name}{aligned}")
+    if objects.plan.spread != data.RigSpread():
+        notes.append(f"each object is on a rig of its own around {rig.name}, and aligned with it where possible")
     if training and training.plan.rig.checksum != rig.checksum:
         notes.append(f"the nearest neighbours come from {training.folder}, whose maps are of another rig")
     if unseen := sorted(set(left_out_categories(record)) & set(objects.categories)):

@@ -17,6 +17,7 @@ __all__ = [
     "Verdict",
     "VerdictFilter",
     "align_all",
+    "align_samples",
     "alignment",
     "build_pipeline",
     "check_intrinsics",
@@ -34,7 +35,7 @@ __all__ = [
     "verdict_limits",
 ]
 
-from .alignment import MapAlignment, align_all, alignment, rig_to_align_with
+from .alignment import MapAlignment, align_all, align_samples, alignment, rig_to_align_with
 from .bench import CalibratedRig, check_intrinsics, open_bench
 from .network import Clock, Mirrored, Quality, Reconstruction, estimate_doubt, reconstruct
 from .physics_check import (

@@ -13,6 +13,7 @@ each cell of the training rig takes what the bench measured at the cell's point 
 Cells that the bench does not see past its occluder are extrapolated from their neighbors, a few cells far.
 """
 
+from collections.abc import Iterable
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -37,6 +38,8 @@ SAME_ECHO_M = 0.08
 BEYOND_CELLS = 3
 """Columns over which maps are extrapolated at most, towards the occluder, where intensities rise; farther ones, and
 rows outside the view, repeat the last."""
+HIDDEN_CELLS = 3
+"""Columns that the bench's occluder may hide of those that the training rig sees."""
 BEAMS = 8
 """Beams along each axis of a cell that tell whether all of it sees the wall."""
 SAME_BOX_M = 0.001
@@ -113,29 +116,51 @@ def alignment(bench: Rig, trained: CheckpointRecord, bare: BareWall | None = Non
     return MapAlignment(bench, rig, bare) if rig else None
 
 
-def align_all(maps: "MapSet", bench: Rig, trained: CheckpointRecord) -> "MapSet":
-    """Return the maps of a bench's samples as those of the rig of weights; as they are where `alignment` gives None."""
-    if (aligned := alignment(bench, trained)) is None:
-        return maps
-    pairs = zip(maps.depth_m, maps.intensity, strict=True)
-    done = [aligned.align(LidarMaps(depth_m, light, np.isfinite(depth_m))) for depth_m, light in pairs]
-    return replace(
-        maps, depth_m=np.stack([one.depth_m for one in done]), intensity=np.stack([one.intensity for one in done])
-    )
+def align_all(maps: "MapSet", benches: Iterable[Rig], trained: CheckpointRecord) -> "MapSet":
+    """Return samples, each of its own bench, as the rig of weights sees them; as they are where that is not possible.
+
+    There may be more benches than samples.
+    """
+    wanted = training_rig(trained) if trained.input == "raw maps" else None
+    return align_samples(maps, benches, wanted)[0] if wanted else maps
+
+
+def align_samples(maps: "MapSet", benches: Iterable[Rig], wanted: Rig) -> tuple["MapSet", Mask]:
+    """Return samples, each of its own bench, as the rig `wanted` sees them, and a mask (n,) of those that it can see.
+
+    The others, of benches that cannot be aligned with it, stay as they are.
+    """
+    depth_m, intensity, seen = maps.depth_m.copy(), maps.intensity.copy(), np.ones(len(maps.image), bool)
+    bench, aligned, possible = wanted, None, True
+    for n, its_bench in zip(range(len(seen)), benches, strict=False):
+        if its_bench is not bench and its_bench != bench:  # samples of one bench follow each other
+            bench, possible = its_bench, its_bench == wanted or can_align(its_bench, wanted)
+            aligned = MapAlignment(bench, wanted) if possible and bench != wanted else None
+        seen[n] = possible
+        if aligned:
+            one = aligned.align(LidarMaps(depth_m[n], intensity[n], np.isfinite(depth_m[n])))
+            depth_m[n], intensity[n] = one.depth_m, one.intensity
+    return replace(maps, depth_m=depth_m, intensity=intensity), seen
 
 
 def rig_to_align_with(bench: Rig, trained: CheckpointRecord) -> Rig | None:
     """Return the rig of weights where a bench's maps can be aligned with it and have to be.
 
-    None where both are the same, where the rig of the weights is not known here, where the object boxes differ in size,
-    where the bench's occluder hides more of the wall than can be extrapolated, and for difference maps.
+    None where both are the same, where the rig of the weights is not known here, where `can_align` says no, and for
+    difference maps.
     """
     if trained.input != "raw maps" or trained.rig_checksum == bench.checksum:
         return None
-    if not (rig := training_rig(trained)) or not (bench.object_box and rig.object_box):
-        return None
-    apart_m = np.subtract(_size_m(bench.object_box), _size_m(rig.object_box))
-    return rig if np.abs(apart_m).max() <= SAME_BOX_M and _is_in_view(bench, rig) else None
+    rig = training_rig(trained)
+    return rig if rig and can_align(bench, rig) else None
+
+
+def can_align(bench: Rig, trained: Rig) -> bool:
+    """Return whether two rigs have object boxes of one size, and the bench's occluder hides little more of the wall."""
+    if not (bench.object_box and trained.object_box):
+        return False
+    apart_m = np.subtract(_size_m(bench.object_box), _size_m(trained.object_box))
+    return bool(np.abs(apart_m).max() <= SAME_BOX_M and _is_in_view(bench, trained))
 
 
 def training_rig(trained: CheckpointRecord) -> Rig | None:
@@ -148,14 +173,14 @@ def training_rig(trained: CheckpointRecord) -> Rig | None:
 
 
 def _is_in_view(bench: Rig, trained: Rig) -> bool:
-    """Return whether the bench sees the wall of the training rig to within BEYOND_CELLS of its occluder's edge."""
+    """Return whether the bench sees the wall of the training rig to within HIDDEN_CELLS of its occluder's edge."""
     bench, _, spot_m = _spots_of(bench, trained)
     sees_wall = _cells_on_wall(bench)
     if not sees_wall.any():
         return False
     row, column = _cells_at(bench, spot_m)
     some, last = np.flatnonzero(sees_wall.any(1)), MAP_COLUMNS - 1 - sees_wall[:, ::-1].argmax(1)
-    return bool((column - last[np.clip(np.rint(row).astype(int), some[0], some[-1])]).max() <= BEYOND_CELLS)
+    return bool((column - last[np.clip(np.rint(row).astype(int), some[0], some[-1])]).max() <= HIDDEN_CELLS)
 
 
 def _spots_of(bench: Rig, trained: Rig) -> tuple[Rig, Float64, Float64]:

@@ -1,6 +1,7 @@
 """Images of plates, simplified maps of them, and networks that learn from them in a moment."""
 
 from collections.abc import Iterator
+from itertools import repeat
 from pathlib import Path
 from typing import Any
 
@@ -69,6 +70,9 @@ class SmallDataset:
 
     def arrays(self) -> MapSet:
         return self._maps
+
+    def benches(self) -> Iterator[Any]:
+        return repeat(self.plan.rig, len(self))
 
     def column(self, name: str) -> Any:
         return getattr(self._maps, name)

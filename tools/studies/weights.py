@@ -11,6 +11,7 @@ import argparse
 import hashlib
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
+from itertools import repeat
 from pathlib import Path
 from typing import Any
 
@@ -128,11 +129,11 @@ def experiments(
         echoes = echoes_of([*subjects, *trained], rig, on_progress)
 
     def row(name: str, change: str, sensed: Any, images: Float32 = truth) -> Row:
-        maps = network_input(as_map_set(sensed, images), network.bare, network.plan, network.record)
+        maps = network_input(as_map_set(sensed, images), network.bare, repeat(rig), network.record)
         return Row(name, change, judge(run(network.pipeline, maps), maps.image, box), network.latent_error(maps))
 
     first = sense(echoes[:count], rig)
-    maps = network_input(as_map_set(first, truth), network.bare, network.plan, network.record)
+    maps = network_input(as_map_set(first, truth), network.bare, repeat(rig), network.record)
     yield row("as evaluated", "both steps, noise on, one frame", first)
     if (rebuilt := network.rebuilt(truth)) is not None:
         yield Row("VAE alone", "no compressor: the decoder on the true latent", judge(rebuilt, truth, box))
@@ -230,7 +231,7 @@ def cell(rig: Rig, subjects: Sequence[Subject], weights: Mapping[str, Judged]) -
     found = dict[str, Any]()
     for name, judged in weights.items():
         record = judged[0].record
-        found[name] = figures(*judged, network_input(maps, bare_wall_for(record, plan), plan, record))
+        found[name] = figures(*judged, network_input(maps, bare_wall_for(record, plan), repeat(plan.rig), record))
         if record.input == "raw maps":
             found[f"{name}, not aligned"] = figures(*judged, maps)
     return {

@@ -32,6 +32,7 @@ CHANGES: dict[str, Any] = {
     "rendering_version": 1,
     "textures": tuple(TEXTURES),
     "expected": True,
+    "objects_per_rig": 50,
 }
 
 
@@ -50,7 +51,7 @@ def test_plan_writes_later_fields_only_where_used_and_of_older_version_has_defau
     assert json.loads(replace(PLAN, textures=tuple(TEXTURES)).provenance)["note"] == SIMULATION_ONLY
     assert json.loads(mixed.provenance)["objects"]["share_generic"] == 0.5
     assert DatasetPlan.from_provenance(mixed.provenance) == mixed
-    assert not {"textures", "note", "expected"} & facts.keys()
+    assert not {"textures", "note", "expected", "objects_per_rig"} & facts.keys()
     assert "share_generic" not in facts["objects"]
     for name in ("objects", "spread", "radiometry", "jump_m", "material"):
         del facts[name]
@@ -102,6 +103,8 @@ def test_spread_draws_rigs_by_seed_uniformly_within_bounds_and_none_keeps_the_ri
     assert SPREAD.draw(RIG, SENSOR, 5) == SPREAD.draw(RIG, SENSOR, 5)
     assert SPREAD.draw(RIG, SENSOR, 5) != SPREAD.draw(RIG, SENSOR, 6)
     assert RigSpread().draw(RIG, SENSOR, 5) == (RIG, SENSOR)
+    shared = replace(PLAN, spread=SPREAD, objects_per_rig=5)
+    assert [shared.bench_of(seed) for seed in range(4, 7)] == [SPREAD.draw(RIG, SENSOR, draw) for draw in (0, 1, 1)]
     rig, sensor = SPREAD.draw(RIG.model_copy(update={"occluder": None}), SENSOR, 1)
     assert rig.occluder is None
     assert np.isnan(scene_row(rig, sensor)).tolist() == [False, False, False, True, True, False]
@@ -117,6 +120,7 @@ NEAR = RIG.model_copy(update={"occluder": RIG.occluder.model_copy(update={"x_m":
         ({"spread": RigSpread(angle_deg=45)}, "45 degrees"),
         ({"spread": RigSpread(gain_share=1.0)}, "100%"),
         ({"rig": NEAR, "spread": SPREAD}, "15 mm"),  # would move the occluder into the object box
+        ({"objects_per_rig": 2}, "--objects-per-rig"),
         ({"material": Material(albedo=(1, 0, 0))}, "one intensity"),
         ({"material": Material(albedo=0.5), "textures": tuple(TEXTURES)}, "textures"),
         ({"material": Material(albedo=(1.0, 0.5, 0.5)), "textures": tuple(TEXTURES)}, "textures"),

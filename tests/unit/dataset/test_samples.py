@@ -11,7 +11,7 @@ import torch
 import trimesh
 from nlos_calibration import load_rig
 from nlos_calibration.arrays import Float32
-from nlos_models import CellNormal
+from nlos_models import CellNormal, InMemory, MapSet, WithNoise
 
 from nlos_cam.dataset import objects_from_folder, procedural_images
 from nlos_cam.dataset import samples as dataset_samples
@@ -93,17 +93,24 @@ def test_expected_samples_differ_from_exposures_by_noise_alone_and_cells_without
     exposed, expected = (make_samples(replace(PLAN, expected=one), [3]) for one in (False, True))
     np.testing.assert_array_equal(exposed["image"], expected["image"])
     assert 0 < np.abs(exposed["intensity"] - expected["intensity"]).max() < 3
+    painted, bare = (make_samples(replace(COLOR, expected=one), [3]) for one in (False, True))
+    assert 0 < np.abs(painted["intensity"] - bare["intensity"]).max() < 3
+    maps = InMemory(MapSet(bare["depth_m"], bare["intensity"], bare["image"]))
+    (noisy,) = WithNoise(maps, map_noise(COLOR)).batches(1, torch.Generator().manual_seed(0))
+    plain = torch.from_numpy(bare["intensity"])
+    changed = (noisy.intensity != (plain.flip(-2) if noisy.mirrored else plain))[0]
+    assert changed[:, ~noisy.depth_m[0].isnan()].any(1).all()
+    assert not changed[:, noisy.depth_m[0].isnan()].any()
     reflectance, offset_m = torch.ones(1, 64, 80), torch.ones(1)
     assert not CellNormal().vary(torch.zeros(1, 2, 64, 80), map_noise(PLAN), reflectance, offset_m).any()
 
 
-def test_expected_maps_of_textured_walls_and_in_color_are_refused() -> None:
+def test_expected_maps_of_textured_walls_are_refused() -> None:
     textured = Sensor(RIG, SensorModel(wall_texture=0.1))
     with pytest.raises(SceneError, match="expected maps"):
         textured.maps(render(Scene(RIG, SHAPE), "draft").multi, None)
-    for plan in (replace(COLOR, expected=True), replace(PLAN, sensor=SensorModel(wall_texture=0.1), expected=True)):
-        with pytest.raises(SceneError, match="drop --expected-maps"):
-            plan.check()
+    with pytest.raises(SceneError, match="drop --expected-maps"):
+        replace(PLAN, sensor=SensorModel(wall_texture=0.1), expected=True).check()
 
 
 def test_objects_leave_categories_out_and_get_backgrounds_and_generic_shapes_by_their_share() -> None:

@@ -20,7 +20,9 @@ from nlos_cam.dataset.samples import Samples
 from nlos_cam.dataset.shards import shard_path, store
 from nlos_cam.dataset.training_maps import MapSplit, Streamed, read_maps, render_bare_wall
 from nlos_cam.errors import RecordingError, SceneError
-from nlos_cam.frames import maps_from_frame
+from nlos_cam.frames import LidarMaps, maps_from_frame
+from nlos_cam.reconstruct import MapAlignment
+from nlos_cam.reconstruct.alignment import can_align
 from nlos_cam.render import Scene, Sensor, render
 
 PLAN = DatasetPlan(load_rig("paper-rig"), 0)
@@ -174,6 +176,40 @@ def test_packed_maps_are_the_datasets_normalised(tmp_path: Path) -> None:
     assert len({image.tobytes() for image in images}) == 2 * SHARD
     for image, one in zip(images, maps, strict=True):
         np.testing.assert_array_equal(one, wanted[image.tobytes()])
+
+
+def test_maps_of_many_rigs_are_packed_as_the_one_rig_sees_them_and_others_left_out(tmp_path: Path) -> None:
+    varied = replace(PLAN, spread=RigSpread(angle_deg=40))
+    benches = [varied.bench_of(seed)[0] for seed in range(SHARD)]
+    seen = [can_align(bench, PLAN.rig) for bench in benches]
+    assert 0 < sum(seen) < SHARD
+    folder, samples = _add(tmp_path / "a", 0, varied), _samples(0)
+    with open_packed_maps([folder], tmp_path / "store") as packed:
+        assert len(packed) == sum(seen)
+        maps, images = _epoch(packed, 1, 1)
+        held_out = packed.held_out(folder, SHARD - 1)
+    assert len(held_out.image) == sum(seen[:-1])
+    for row in np.flatnonzero(seen):
+        one = LidarMaps(samples["depth_m"][row], samples["intensity"][row], np.isfinite(samples["depth_m"][row]))
+        aligned = MapAlignment(benches[row], PLAN.rig).align(one)
+        wanted = packed.normal(*(torch.from_numpy(part[None]) for part in (aligned.depth_m, aligned.intensity)))
+        found = maps[(images == samples["image"][row]).all((1, 2))]
+        np.testing.assert_array_equal(found, wanted.half().numpy())
+
+
+def test_maps_in_color_are_packed_with_three_intensities_of_one_rig(tmp_path: Path) -> None:
+    plan, samples = replace(PLAN, textures=("plain",)), _samples(0)
+    painted = {name: np.stack([samples[name]] * 3, 1) for name in ("intensity", "image")}
+    store_shard = {**samples, **painted, "texture": np.array(["plain"] * SHARD, object)}
+    for name, made in (("one", plan), ("many", replace(plan, spread=RigSpread(angle_deg=1)))):
+        (tmp_path / name).mkdir()
+        store(shard_path(tmp_path / name, 0), store_shard, made.provenance, "")
+    with open_packed_maps([tmp_path / "one"], tmp_path / "store", color=True) as packed:
+        maps, images = _epoch(packed, 1)
+        assert packed.held_out(tmp_path / "one", 2).intensity.shape == (2, 3, 64, 80)
+    assert (maps.shape[1:], images.shape[1:]) == ((4, 64, 80), (3, 64, 64))
+    with pytest.raises(SceneError, match="without a spread"):
+        open_packed_maps([tmp_path / "many"], tmp_path / "other", color=True).__enter__()
 
 
 def test_new_shards_enter_new_epochs_and_an_epoch_can_be_seen_again(tmp_path: Path) -> None:

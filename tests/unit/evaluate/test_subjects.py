@@ -12,13 +12,25 @@ from nlos_models import CheckpointRecord, MapSet, Recipe
 from small_maps import SmallDataset, small_maps
 
 from nlos_cam.camera.simulated_world import World
-from nlos_cam.dataset import TEST_SEED, TRAINING_SEED, DatasetPlan, Objects, procedural_images
+from nlos_cam.dataset import TEST_SEED, TRAINING_SEED, DatasetPlan, Objects, RigSpread, procedural_images
+from nlos_cam.dataset.samples import make_samples
+from nlos_cam.dataset.shards import shard_path, store
 from nlos_cam.errors import SceneError
 from nlos_cam.evaluate import QUIET, HeldOutObjects, as_map_set, baseline_answers, baselines, echoes_of, reconstruct_all
 from nlos_cam.evaluate.baselines import answers_with_nearest, mean_image, training_maps, trivial_answers
-from nlos_cam.evaluate.subjects import notes_about, rendered_objects, rig_of, seeded_objects, sense, truth_of
-from nlos_cam.frames import maps_from_frame
+from nlos_cam.evaluate.subjects import (
+    dataset_objects,
+    network_input,
+    notes_about,
+    rendered_objects,
+    rig_of,
+    seeded_objects,
+    sense,
+    truth_of,
+)
+from nlos_cam.frames import LidarMaps, maps_from_frame
 from nlos_cam.objects import CATEGORIES, benchmark_objects, image_from_depth, object_box, object_depth, unseen_objects
+from nlos_cam.reconstruct import MapAlignment
 from nlos_cam.render import MultiBounce, SceneFile
 
 RIG = load_rig("paper-rig")
@@ -26,7 +38,7 @@ BOX = object_box(RIG)
 PLAN = DatasetPlan(RIG, TEST_SEED)
 RECORD = CheckpointRecord(rig_name=RIG.name, rig_checksum=RIG.checksum)
 ELSEWHERE = replace(PLAN, rig=RIG.model_copy(update={"name": "elsewhere"}))
-JUDGED = HeldOutObjects("some", ["cup 1", "hat 2"], ["cup", "hat"], small_maps(2, 0), PLAN)
+JUDGED = HeldOutObjects("some", ["cup 1", "hat 2"], ["cup", "hat"], small_maps(2, 0), PLAN, [PLAN.rig] * 2)
 
 
 @pytest.fixture(scope="module")
@@ -54,6 +66,23 @@ def test_seeded_objects_are_those_of_their_seeds_and_second_set_is_of_other_kind
     names = {one.category for one in unseen}
     assert (len(unseen), len(names), names & CATEGORIES.keys()) == (54, 18, set())
     assert min(int(np.isfinite(one.depth_m).sum()) for one in unseen) > 150
+
+
+def test_each_object_of_a_dataset_of_many_rigs_is_aligned_from_its_own(tmp_path: Path) -> None:
+    plan = DatasetPlan(RIG, 0, accuracy="draft", spread=RigSpread(place_m=0.005, angle_deg=2), objects_per_rig=2)
+    samples = make_samples(plan, range(3))
+    store(shard_path(tmp_path, 0), samples, plan.provenance, "")
+    found = dataset_objects(tmp_path)
+    assert found.benches == [plan.bench_of(seed)[0] for seed in range(3)]
+    assert found.benches[0] == found.benches[1] != found.benches[2]
+    aligned = network_input(found.maps, None, found.benches, RECORD)
+    for n, bench in enumerate(found.benches):
+        seen = LidarMaps(samples["depth_m"][n], samples["intensity"][n], np.isfinite(samples["depth_m"][n]))
+        wanted = MapAlignment(bench, RIG).align(seen)
+        np.testing.assert_array_equal(aligned.depth_m[n], wanted.depth_m)
+        np.testing.assert_array_equal(aligned.intensity[n], wanted.intensity)
+    (note,) = notes_about(RECORD, found, None)
+    assert "a rig of its own" in note
 
 
 def test_sense_repeats_matches_simulated_camera_and_averages_noise_down_with_frames(echoes: list[MultiBounce]) -> None:

@@ -10,14 +10,15 @@ import pytest
 import torch
 from nlos_models import direct
 from nlos_models.checkpoint import load_network, load_pipeline, save_direct
-from nlos_models.data import InMemory, MapNoise, as_images
+from nlos_models.data import InMemory, MapNoise, MapSet, as_images
 from nlos_models.direct import CellNormal, DirectNetwork, image_from_logits, two_heads_error
 from nlos_models.direct_training import NormalBatch, _stains, train_direct, transfer_direct
 from nlos_models.distributed import open_fabric
 from nlos_models.errors import CheckpointError, TrainingError
 from nlos_models.export import TorchReconstructor, export_folder
 from nlos_models.inference import load_reconstructor
-from nlos_models.recipe import DirectSize, Recipe
+from nlos_models.metrics import color_metrics
+from nlos_models.recipe import SIMULATION_ONLY, DirectSize, Recipe
 from nlos_models.records import CheckpointRecord, load_record
 from nlos_models.runs import TrainingRun, direct_start, record_run, run_transfer, transfer_start
 from nlos_models.tasks import figures_of
@@ -42,11 +43,18 @@ def _recipe(**changes: object) -> Recipe:
     return Recipe.model_validate(facts | changes)
 
 
+def _painted(maps: MapSet) -> MapSet:
+    """Return the same objects in one color each, green twice as bright as red, in maps as in images."""
+    share = np.array([0.4, 0.8, 0.6], np.float32)[:, None, None]
+    return MapSet(maps.depth_m, maps.intensity[:, None] * share, (maps.image[:, None] * share).astype(np.float16))
+
+
 class Source:
     """Twelve objects, fewer than an epoch's samples."""
 
-    def __init__(self) -> None:
-        self.maps, self.normal = small_maps(12, 0), CellNormal()
+    def __init__(self, maps: MapSet | None = None) -> None:
+        self.maps = maps or small_maps(12, 0)
+        self.normal = CellNormal(color=self.maps.image.ndim == 4)
         self.noise: MapNoise | None = None
         depth_m, intensity = (torch.from_numpy(values) for values in (self.maps.depth_m, self.maps.intensity))
         self.normal.learn(depth_m, intensity)
@@ -137,6 +145,29 @@ def test_image_is_cut_where_the_expected_overlap_is_largest() -> None:
     share[1, 20:40, 40:44] = 0.4
     images = image_from_logits(torch.stack([torch.logit(share), torch.zeros_like(share)], dim=1))
     assert [int((image > 0).sum()) for image in images] == [400, 480, 0]
+
+
+def test_color_is_learnt_by_the_same_two_heads(tmp_path: Path) -> None:
+    recipe, source = _recipe(colour=True, epochs=25, dropout=0.0, average=0.0), Source(_painted(small_maps(12, 0)))
+    network, figures = train_direct(recipe, source, _painted(small_maps(4, 1)), tmp_path)
+    made = reconstruct(network, source.maps)
+    assert made.shape == source.maps.image.shape
+    found = color_metrics(made, source.maps.image.astype(np.float32))
+    assert "held_out_colour_error" in figures
+    assert found["silhouette_iou"].mean() > 0.5
+    assert found["colour_error"].mean() < 0.2
+    normal = source.batch.normal[:3].float()
+    torch.testing.assert_close(network.logits(normal.flip(-2)), network.logits(normal).flip(-2), rtol=0, atol=1e-5)
+    varied = network.normal.vary(normal, None, torch.full((3, 64, 80), 0.3), torch.full((3,), 0.01))
+    moved, returns = (varied - normal) * network.normal.spread, (normal != 0).any(1) & (varied.abs() < 5).all(1)
+    torch.testing.assert_close(moved[:, 0][returns], torch.full_like(moved[:, 0][returns], 0.01), atol=1e-4, rtol=0)
+    assert float(moved[:, 1:].median()) >= 0
+    save_direct(tmp_path, network, CheckpointRecord.of([recipe], ("paper-rig", "0" * 64)))
+    again, record = load_network(tmp_path)
+    assert (record.note, record.color) == (SIMULATION_ONLY, True)
+    assert float((np.abs(reconstruct(again, source.maps) - made) < 0.02).mean()) > 0.999  # float16 moves an edge
+    with pytest.raises(TrainingError, match="simulation only"):
+        direct_start(_recipe(start="weights"), tmp_path)
 
 
 def _train(folder: Path, running: Running | None = None, **changes: object) -> tuple[DirectNetwork, Scores]:
