@@ -10,7 +10,7 @@ SI 1 and by what a bench built with a ruler is off, while occluder and object bo
 import argparse
 import hashlib
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, astuple, dataclass
 from itertools import repeat
 from pathlib import Path
 from typing import Any
@@ -207,14 +207,20 @@ BENCHES = [
 """What a bench built with a ruler is off by; the last is that of examples/bench.toml."""
 
 
+OFF = Place(0.001, 0.2, 0.2, 0.001, 0.001)
+"""Error of a bench's record."""
+
 Judged = tuple[Reconstructor, UncertaintyModel | None]
 
 
-def cell(rig: Rig, subjects: Sequence[Subject], weights: Mapping[str, Judged]) -> dict[str, Any]:
-    """Return the figures of all weights on one rig, with maps aligned with their own rig and without.
+def cell(place: Place, rig: Rig, subjects: Sequence[Subject], weights: Mapping[str, Judged]) -> dict[str, Any]:
+    """Return the figures of all weights with a rig's lidar elsewhere, with maps aligned with their own rig and without.
 
-    Difference maps are relative to the rig's own bare wall. `outside` is the share of objects that are flagged.
+    They are also aligned by a record that is off. Difference maps are relative to the rig's own bare wall. `outside` is
+    the share of objects that are flagged.
     """
+    apart = zip(astuple(place), astuple(OFF), strict=True)
+    rig, believed = place.rig(rig), Place(*(value + off for value, off in apart)).rig(rig)
     box, plan = object_box(rig), DatasetPlan(rig, TEST_SEED)
     truth = truth_of(subjects, box)
     maps = as_map_set(sense(echoes_of(subjects, rig, lambda *_: None), rig), truth)
@@ -222,6 +228,7 @@ def cell(rig: Rig, subjects: Sequence[Subject], weights: Mapping[str, Judged]) -
     def figures(network: Reconstructor, doubter: UncertaintyModel | None, taken: MapSet) -> dict[str, Any]:
         images = reconstruct_all(network, taken)
         found = plain(judge(images, truth, box))
+        found = {of: {end: value and round(value, 4) for end, value in one.items()} for of, one in found.items()}
         if doubter:
             seen = (LidarMaps(*pair, ~np.isnan(pair[0])) for pair in zip(taken.depth_m, taken.intensity, strict=True))
             doubts = [estimate_doubt(doubter, one, image, box) for one, image in zip(seen, images, strict=True)]
@@ -233,6 +240,7 @@ def cell(rig: Rig, subjects: Sequence[Subject], weights: Mapping[str, Judged]) -
         record = judged[0].record
         found[name] = figures(*judged, network_input(maps, bare_wall_for(record, plan), repeat(plan.rig), record))
         if record.input == "raw maps":
+            found[f"{name}, record off"] = figures(*judged, network_input(maps, None, repeat(believed), record))
             found[f"{name}, not aligned"] = figures(*judged, maps)
     return {
         "rig_checksum": rig.checksum,
@@ -253,7 +261,7 @@ def rigs(asked: argparse.Namespace) -> None:
     places = [*(Place(distance_m, yaw_deg) for distance_m in DISTANCES_M for yaw_deg in ANGLES_DEG), *BENCHES]
     files = [file for folder in folders.values() for file in sorted(weights_folder(folder).iterdir())]
     key = hashlib.sha256(b"".join(file.read_bytes() for file in files if file.is_file())).hexdigest()
-    measured = harness.collect("rigs", places, lambda place, _: cell(place.rig(rig), subjects, weights), key=key)
+    measured = harness.collect("rigs", places, lambda place, _: cell(place, rig, subjects, weights), key=key)
     cells, benches = measured[: -len(BENCHES)], measured[-len(BENCHES) :]
     harness.write("rig_map", {"objects": len(subjects), "cells": cells, "benches": benches}, asked.out)
     harness.save("rig_map", draw_rigs(cells, rig), asked.out, dpi=80)
@@ -266,7 +274,7 @@ def rigs(asked: argparse.Namespace) -> None:
 
 def draw_rigs(cells: Sequence[Mapping[str, Any]], rig: Rig) -> Figure:
     """Draw a heat map of each metric for each of the weights; the weights' own rig is framed."""
-    names = list(cells[0]["weights"])
+    names = [name for name in cells[0]["weights"] if "record off" not in name]
     distances, angles = (sorted({one[of] for one in cells}) for of in ("distance_m", "yaw_deg"))
     figure = Figure(figsize=(3.4 * len(TARGETS), 2.9 * len(names)), layout="constrained")
     for row, name in zip(figure.subplots(len(names), len(TARGETS), squeeze=False), names, strict=True):
