@@ -1,6 +1,6 @@
 """One command for a GPU: renders, trains, evaluates, and writes the weights in parts of at most 16 MB.
 
-`python tools/gpu_run.py --out DIR [--minutes 25] [--workers N] [--accelerator cuda]` builds a dataset in the
+`python tools/gpu_run.py --out DIR [--minutes 25] [--workers N] [--accelerator cuda]` builds datasets in the
 background, trains the direct network on its shards as they appear, then an encoder for the paper's decoder and the
 paper's compressor, each for a share of the time, and evaluates both networks. `python tools/gpu_run.py --join
 DIR/direct.00 --out WEIGHTS` puts weights together again. The same command resumes an interrupted run. Every step's log
@@ -30,6 +30,8 @@ KEPT_FIGURES = "silhouette_iou", "foreground_rmse_mm", "unseen", "recognised"
 SEED, HELD_OUT_SEED = 2_000_000, 10_000_000
 OBJECTS = 1_000_000
 """Upper limit of what is rendered; the time ends it earlier."""
+BENCHES = ("--rig-spread-mm", "10", "--rig-spread-deg", "5", "--objects-per-rig", "50")
+"""Half of the direct network's objects are on measured benches, and aligned with the one rig."""
 PROGRAM = (sys.executable, "-c", "import sys; from nlos_cam.cli import run; sys.argv[0] = 'nlos-cam'; run()")
 
 
@@ -54,12 +56,12 @@ def go(out: Path, name: str, arguments: Sequence[str], ends: Callable[[float], b
 
 
 @contextmanager
-def rendering(out: Path, workers: int) -> Generator[Path]:
-    """Build the training set in the background, from its first shards on; it ends with the block."""
-    folder = out / "training"
-    command = ["dataset", "build", "--out", str(folder), "--count", str(OBJECTS), "--seed", str(SEED)]
+def rendering(out: Path, name: str, seed: int, workers: int, more: Sequence[str] = ()) -> Generator[Path]:
+    """Build a training set in the background, from its first shards on; it ends with the block."""
+    folder = out / name
+    command = ["dataset", "build", "--out", str(folder), "--count", str(OBJECTS), "--seed", str(seed), *more]
     options = ["--accuracy", "draft", "--share-generic", "0.5", "--expected-maps", "--workers", str(workers)]
-    with (out / "rendering.log").open("a", encoding="utf-8") as log:
+    with (out / f"{name}.log").open("a", encoding="utf-8") as log:
         child = subprocess.Popen([*PROGRAM, *command, *options], stdout=log, stderr=log)
         try:
             yield folder
@@ -73,7 +75,7 @@ def wait_for(folder: Path, objects: int, limit_s: float) -> None:
     end_s = time.perf_counter() + limit_s
     while 100 * len(list(folder.glob("shard-*.h5"))) < objects:
         if time.perf_counter() > end_s:
-            raise SystemExit(f"{folder} has fewer than {objects} objects after {limit_s:.0f} s: see rendering.log")
+            raise SystemExit(f"{folder} has fewer than {objects} objects after {limit_s:.0f} s: see {folder}.log")
         time.sleep(1)
 
 
@@ -138,9 +140,14 @@ def train_and_judge(chosen: Namespace) -> None:
     held = ["--count", str(chosen.held_out), "--seed", str(HELD_OUT_SEED), "--accuracy", "draft"]
     shared = ["--share-generic", "0.5", "--workers", str(chosen.workers)]
     finish("held_out_s", go(out, "held-out", ["dataset", "build", "--out", str(held_out), *held, *shared]))
-    with rendering(out, chosen.workers) as training:
-        wait_for(training, chosen.first_objects, 0.2 * budget_s)
-        direct = ["--dataset", str(training), *common, "--store", str(out / "packed")]
+    half = max(1, chosen.workers // 2)
+    with (
+        rendering(out, "training", SEED, half) as training,
+        rendering(out, "benches", SEED + OBJECTS, half, BENCHES) as benches,
+    ):
+        for folder in (training, benches):
+            wait_for(folder, chosen.first_objects // 2, 0.2 * budget_s)
+        direct = ["--dataset", str(training), "--dataset", str(benches), *common, "--store", str(out / "packed")]
         recipe, timing = out / "direct.toml", out / "timing"
         if not recipe.exists():  # an interrupted run keeps its schedule
             trial = recipe_with(chosen.recipe, out / "timing.toml", epochs=10000)

@@ -50,7 +50,7 @@ def train_direct(
     """Train a direct network, from scratch or on from another's weights; a second call resumes.
 
     `start` has the source's normalisation. Where the recipe has more blocks or mixers, the new ones change nothing at
-    first. Returns the network in eval mode, and its held-out figures.
+    first. Returns the network in eval mode, with the recipe's blend of both, and its held-out figures.
     """
     torch.manual_seed(recipe.seed)
     network = DirectNetwork(recipe.direct, recipe.dropout, color=recipe.colour)
@@ -79,7 +79,19 @@ def train_direct(
         folder=folder,
         running=running,
     )
+    if start and recipe.blend < 1:
+        blend(network, start, recipe.blend)
+        figures = figures_of(run(network.eval(), held_out), held_out.image)
     return network.cpu().eval(), figures
+
+
+def blend(network: DirectNetwork, start: DirectNetwork, share: float) -> None:
+    """Replace a network's parameters by means with another's, of which its own have a share; new layers stay."""
+    theirs = dict(start.named_parameters())
+    with torch.no_grad():
+        for name, own in network.named_parameters():
+            if name in theirs:
+                own.lerp_(theirs[name].to(own.device), 1 - share)
 
 
 def transfer_direct(

@@ -86,6 +86,9 @@ class Recipe(BaseModel):
     """Direct network: each sample's wall has a reflectance whose logarithm varies by up to this standard deviation."""
     range_offset_m: float = Field(default=0.0, ge=0, le=0.1)
     """Direct network: standard deviation of the range offset of each sample's lidar."""
+    blend: float = Field(default=1.0, gt=0, le=1)
+    """Direct network that goes on from weights: share of the trained weights in their mean with those it started from,
+    which keeps what the new maps do not show (Wortsman et al. 2022, "Robust fine-tuning of zero-shot models")."""
     direct: DirectSize = DirectSize()
     """Size of a direct network."""
     image_loss: ImageLoss = "squared"
@@ -141,6 +144,8 @@ class Recipe(BaseModel):
             raise ValueError(f"steps = {self.steps!r} is for a compressor: a transfer keeps the decoder")
         if self.start == "weights" and (self.task == "transfer" or self.steps != "two"):
             raise ValueError("start = 'weights' is for a VAE, a two-step compressor or a direct network: drop it")
+        if self.blend != 1 and (self.task, self.start) != ("direct", "weights"):
+            raise ValueError("blend is for a direct network with start = 'weights': drop it")
         if self.start == "decoder" and self.task != "vae":
             raise ValueError("start = 'decoder' is for a VAE: drop it")
         if self.width != 1 and (self.colour or self.task != "compressor"):

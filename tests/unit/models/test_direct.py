@@ -197,6 +197,19 @@ def test_training_goes_on_from_weights_that_grow(weights: Path, tmp_path: Path) 
     assert direct_start(_recipe(), None) == (None, [])
 
 
+def test_blend_is_the_mean_of_the_trained_weights_and_those_before(weights: Path, tmp_path: Path) -> None:
+    start, _ = direct_start(_recipe(start="weights"), weights)
+    made = list[tuple[DirectNetwork, Scores]]()
+    for share in (1.0, 0.25):
+        recipe = _recipe(start="weights", blend=share)
+        made.append(train_direct(recipe, Source(), small_maps(4, 1), tmp_path / f"{share}", start=start))
+    (trained, plain), (blended, figures) = made
+    before, after = start.state_dict(), trained.state_dict()
+    for name, found in blended.state_dict().items():
+        torch.testing.assert_close(found, 0.75 * before[name] + 0.25 * after[name])
+    assert figures == figures_of(reconstruct(blended, small_maps(4, 1)), small_maps(4, 1).image) != plain
+
+
 def test_average_is_scored_and_kept_and_minutes_are_logged(tmp_path: Path) -> None:
     times = iter(range(0, 100000, 45))
     network, figures = _train(tmp_path, Running(clock=lambda: float(next(times))))

@@ -88,6 +88,7 @@ ONE = {"steps": "one", "latent_weight": 0, "image_weight": 1}
         ("compressor", {"start": "weights", **JOINT}, "start"),
         ("compressor", {"latent_warm_up": 0.1}, "latent_warm_up"),
         ("transfer", {"colour": True}, "simulation only"),
+        ("direct", {"blend": 0.5}, "blend"),
         ("compressor", {"colour": True, "maps": "difference maps"}, "simulation only"),
     ],
 )
