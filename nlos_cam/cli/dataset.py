@@ -57,7 +57,10 @@ GainSpread = Annotated[
     float, typer.Option("--gain-spread-percent", min=0, help="Largest change of the intensity gain, drawn per object.")
 ]
 ObjectsPerRig = Annotated[
-    int, typer.Option("--objects-per-rig", min=1, help="Objects that share a draw of the spreads: 50 render four times as fast.")
+    int,
+    typer.Option(
+        "--objects-per-rig", min=1, help="Objects that share a draw of the spreads; 50 render 4 times as fast."
+    ),
 ]
 Expected = Annotated[
     bool,

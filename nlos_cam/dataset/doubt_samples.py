@@ -2,7 +2,6 @@
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
 from pathlib import Path
 from zlib import crc32
 
@@ -14,14 +13,12 @@ from numpy.typing import NDArray
 
 from nlos_cam.dataset import outliers
 from nlos_cam.dataset.build import HELD_OUT_SEED, TRAINING_SEED
-from nlos_cam.dataset.plan import RigSpread
 from nlos_cam.dataset.reader import Dataset
 from nlos_cam.dataset.samples import OnProgress, cached_sensor, ignore
 from nlos_cam.errors import SceneError
 from nlos_cam.files import atomic_file
 from nlos_cam.frames import OBJECT_PIXELS, LidarMaps, maps_from_frame
 from nlos_cam.objects import CATEGORIES, image_from_depth
-from nlos_cam.reconstruct import MapAlignment, can_align
 from nlos_cam.render import Rendering, SensorModel, render
 
 EMPTY, ORDINARY, GENERIC = "empty", "ordinary", "generic"
@@ -32,9 +29,7 @@ BESIDE_M = 0.01
 """Depth differing from the bare wall's by more than this belongs to the object: the width of a path-length bin."""
 SEEDS_PER_BENCH = 10
 """Consecutive seeds on the same bench, whose sensor is computed once."""
-MEASURED = RigSpread(place_m=0.008, angle_deg=4.0)
-"""Deviations of a bench that was built with a ruler, and measured."""
-VERSION = 3
+VERSION = 2
 """Raise it when a seed makes another sample."""
 _STREAM = 5
 """Seeds these random numbers apart from those of datasets."""
@@ -78,14 +73,13 @@ def make_samples(
 ) -> DoubtSamples:
     """Return samples of one kind, the same bits for the same seeds; SEEDS_PER_BENCH consecutive ones share a bench.
 
-    Datasets hold ordinary objects on the given bench. Here a third of the benches was built with a ruler and measured:
-    maps of these are aligned with the given rig, as everywhere, by a record that is slightly off. Another third
-    deviates slightly, and for outliers the last third is the given bench. Empty benches may deviate widely.
+    Datasets hold ordinary objects on the given bench. Here these are on benches that deviate slightly, outliers on
+    such benches and the given one in turn, and empty benches may deviate widely.
     """
     stimuli = [_stimulus(kind, seed, rig, sensor) for seed in seeds]
     renderings = [render(stimulus.scene, accuracy) for stimulus in stimuli]
     noises = [_generator(kind, seed, 2) for seed in seeds]
-    maps = [_sense(*each, rig) for each in zip(stimuli, renderings, noises, strict=True)]
+    maps = [_sense(*each) for each in zip(stimuli, renderings, noises, strict=True)]
     return DoubtSamples(
         np.stack([one.depth_m for one in maps]),
         np.stack([one.intensity for one in maps]),
@@ -101,30 +95,18 @@ def _generator(kind: str, seed: int, stream: int) -> np.random.Generator:
 
 
 def _stimulus(kind: str, seed: int, rig: Rig, sensor: SensorModel) -> outliers.Stimulus:
-    number, record = seed // SEEDS_PER_BENCH, None
-    bench_generator = _generator(kind, number, 0)
-    if number % 3 == 2:
-        built = MEASURED.draw(rig, sensor, int(bench_generator.integers(2**31)))[0]
-        record = built if can_align(built, rig) else None
+    bench_generator = _generator(kind, seed // SEEDS_PER_BENCH, 0)
     if kind == EMPTY:
-        bench = outliers.vary_empty_bench(record or rig, sensor, bench_generator)
-        return outliers.Stimulus(*bench, record=record)
-    slight = kind in USUAL or number % 3
-    bench = outliers.vary_bench(record or rig, sensor, outliers.SLIGHT, bench_generator) if slight else (rig, sensor)
-    return outliers.draw_outlier(KINDS[kind], _generator(kind, seed, 1), outliers.Stimulus(*bench, record=record))
+        return outliers.Stimulus(*outliers.vary_empty_bench(rig, sensor, bench_generator))
+    slight = kind in USUAL or seed // SEEDS_PER_BENCH % 2
+    bench = outliers.vary_bench(rig, sensor, outliers.SLIGHT, bench_generator) if slight else (rig, sensor)
+    return outliers.draw_outlier(KINDS[kind], _generator(kind, seed, 1), outliers.Stimulus(*bench))
 
 
-def _sense(stimulus: outliers.Stimulus, rendering: Rendering, noise: np.random.Generator, wanted: Rig) -> LidarMaps:
+def _sense(stimulus: outliers.Stimulus, rendering: Rendering, noise: np.random.Generator) -> LidarMaps:
     sensor = cached_sensor(stimulus.rig, stimulus.sensor)  # pyright: ignore[reportArgumentType]  frozen, so hashable
-    maps = maps_from_frame(sensor.expose(rendering.multi, noise).frame(stimulus.rig.pinhole))
-    if not stimulus.record:
-        return maps
-    return _alignment(stimulus.record, wanted).align(maps)  # pyright: ignore[reportArgumentType]  hashable, as above
-
-
-@lru_cache(maxsize=1)
-def _alignment(bench: Rig, wanted: Rig) -> MapAlignment:
-    return MapAlignment(bench, wanted)
+    images = sensor.expose(rendering.multi, noise)
+    return maps_from_frame(images.frame(stimulus.rig.pinhole))
 
 
 def _truth(stimulus: outliers.Stimulus) -> NDArray[np.float16]:

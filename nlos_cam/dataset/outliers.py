@@ -32,8 +32,6 @@ class Stimulus:
     depth_m: Float32 | None = None
     """(64, 64), NaN for background; None for an empty bench."""
     surface: Surface = field(default_factory=Surface)
-    record: Rig | None = None
-    """The rig as it was measured, by which the maps are aligned; None where they are not."""
 
     @property
     def box(self) -> ObjectBox:

@@ -20,7 +20,6 @@ __all__ = [
     "align_samples",
     "alignment",
     "build_pipeline",
-    "can_align",
     "check_intrinsics",
     "check_reconstruction",
     "compatibility_warnings",
@@ -36,7 +35,7 @@ __all__ = [
     "verdict_limits",
 ]
 
-from .alignment import MapAlignment, align_all, align_samples, alignment, can_align, rig_to_align_with
+from .alignment import MapAlignment, align_all, align_samples, alignment, rig_to_align_with
 from .bench import CalibratedRig, check_intrinsics, open_bench
 from .network import Clock, Mirrored, Quality, Reconstruction, estimate_doubt, reconstruct
 from .physics_check import (

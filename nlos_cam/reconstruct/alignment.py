@@ -38,7 +38,7 @@ SAME_ECHO_M = 0.08
 BEYOND_CELLS = 3
 """Columns over which maps are extrapolated at most, towards the occluder, where intensities rise; farther ones, and
 rows outside the view, repeat the last."""
-HIDDEN_CELLS = 6
+HIDDEN_CELLS = 4
 """Columns that the bench's occluder may hide of those that the training rig sees."""
 BEAMS = 8
 """Beams along each axis of a cell that tell whether all of it sees the wall."""

@@ -21,7 +21,8 @@ from nlos_cam.dataset.shards import shard_path, store
 from nlos_cam.dataset.training_maps import MapSplit, Streamed, read_maps, render_bare_wall
 from nlos_cam.errors import RecordingError, SceneError
 from nlos_cam.frames import LidarMaps, maps_from_frame
-from nlos_cam.reconstruct import MapAlignment, can_align
+from nlos_cam.reconstruct import MapAlignment
+from nlos_cam.reconstruct.alignment import can_align
 from nlos_cam.render import Scene, Sensor, render
 
 PLAN = DatasetPlan(load_rig("paper-rig"), 0)
