@@ -156,11 +156,28 @@ def test_doubt_study_is_right_for_laplace_errors(tool: Tool, harness: ModuleType
     harness.save("reliability", doubt.draw({"test_objects": parts, "held_out_objects": parts}))
 
 
-def test_color_demonstration_passes_each_step_on_to_the_next(tool: Tool) -> None:
-    *builds, vae, compressor = tool("color").commands(Path("out"), "draft", 3, small=True)
-    assert all(command[:3] == ["dataset", "build", "--colour"] for command in builds)
-    options = dict(zip(compressor[2::2], compressor[3::2], strict=True))
-    assert options["--vae"] == vae[vae.index("--out") + 1]
+def test_color_study_judges_weights_and_vae(tool: Tool, tmp_path: Path, monkeypatch: Patch) -> None:
+    color, things = tool("color"), 6
+    truth = np.zeros((things, 3, 64, 64), np.float32)
+    truth[:, :, 20:40, 20:40] = 0.7
+    maps = MapSet(np.ones((things, 64, 80)), np.ones((things, 3, 64, 80)), truth)
+    replaced = {
+        "painted_maps": lambda *_: maps,
+        "load_network": lambda _: ("network", None),
+        "load_vae": lambda _: ("vae", None),
+        "run": lambda _network, given: given.image,
+        "rebuild": lambda _vae, image: np.zeros_like(image),
+        "open_dataset": lambda *_, **__: SimpleNamespace(column=lambda _: truth),
+    }
+    for name, fake in replaced.items():
+        monkeypatch.setattr(color, name, fake)
+    given = ["--weights", "w", "--vae", "v", "--dataset", "d", "--out", str(tmp_path)]
+    monkeypatch.setattr("sys.argv", ["color", *given])
+    color.main()
+    figures = json.loads((tmp_path / "figures.json").read_text(encoding="utf-8"))
+    assert figures["silhouette_iou"]["value"] == 1
+    assert figures["baselines"]["vae_alone"]["silhouette_iou"]["value"] == 0
+    assert {path.name for path in tmp_path.iterdir()} == {"figures.json", "sheet.png", "sheet-vae.png"}
 
 
 def test_word_check_counts_patterns_with_their_lines(tool: Tool, tmp_path: Path, monkeypatch: Patch) -> None:
