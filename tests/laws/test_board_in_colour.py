@@ -3,22 +3,10 @@
 from dataclasses import replace
 from pathlib import Path
 
+import board_trials
 import numpy as np
 import pytest
-from board_trials import (
-    A4,
-    CALIBRATION,
-    COLOR,
-    FLAT,
-    LENS,
-    ROOM,
-    BoardBench,
-    ColorCamera,
-    Coverage,
-    coverage,
-    random_bench,
-    random_camera,
-)
+from board_trials import A4, CALIBRATION, ROOM, BoardBench, ColorCamera, coverage
 from nlos_calibration import DepthMean, WallFit, fit_wall, load_rig
 from nlos_calibration.board_pose import BoardFit, PrintErrors
 from nlos_calibration.board_wall import EXACT, CameraErrors, wall_with_board
@@ -42,7 +30,7 @@ def recorded(path: Path, frames: int = 4) -> Path:
     images = [SensedImages(np.rint(each / DEPTH_UNIT_M).astype(np.uint16), dim, dim) for each in depth_m]
     grey = bench.frames(frames, generator)
     lidar = SoftwareLidar(rig.pinhole, load_sdk())
-    camera = SoftwareColour(lidar, COLOR, LENS, CALIBRATION.lidar_from_camera)
+    camera = SoftwareColour(lidar, board_trials.COLOR, board_trials.LENS, CALIBRATION.lidar_from_camera)
     return record_with_colour(path, lidar, camera, images, [np.repeat(each[..., np.newaxis], 3, 2) for each in grey])
 
 
@@ -66,18 +54,18 @@ def test_board_in_a_recordings_colour_gives_the_lidars_wall(tmp_path: Path) -> N
     assert (alone.yaw_deg, alone.pitch_deg) == pytest.approx((45.0, 0.0), abs=0.15)
 
 
-def coverage_in_color(count: int, sigma_px: float | None, seed: int, errors: CameraErrors) -> Coverage:
+def coverage_in_color(count: int, sigma_px: float | None, seed: int, errors: CameraErrors) -> board_trials.Coverage:
     """Fit random benches, prints and cameras: by corners with noise, or by 4 rendered frames if `sigma_px` is None."""
     generator, calibration = np.random.default_rng(seed), replace(CALIBRATION, errors=errors)
-    printed = FLAT if sigma_px is None else PrintErrors()
+    printed = board_trials.FLAT if sigma_px is None else PrintErrors()
 
     def fit(bench: BoardBench) -> BoardFit:
-        bench = replace(bench, camera=random_camera(generator, errors))
+        bench = replace(bench, camera=board_trials.random_camera(generator, errors))
         if sigma_px is None:
             return bench.fit_image(4, generator, calibration)
         return bench.fit_corners(sigma_px, generator, printed, calibration)
 
-    return coverage(count, lambda: random_bench(generator, printed, ROOM), fit)
+    return coverage(count, lambda: board_trials.random_bench(generator, printed, ROOM), fit)
 
 
 @pytest.mark.slow

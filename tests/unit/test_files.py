@@ -70,7 +70,7 @@ def test_atomic_directory_appears_when_it_is_whole(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == [out]
 
 
-def test_atomic_directory_refuses_one_that_appeared(tmp_path: Path) -> None:
+def test_atomic_directory_refuses_one_that_appeared_and_a_file(tmp_path: Path) -> None:
     def write() -> None:
         with atomic_directory(tmp_path / "out") as part:
             (part / "b.txt").write_text("b")
@@ -80,12 +80,14 @@ def test_atomic_directory_refuses_one_that_appeared(tmp_path: Path) -> None:
     with pytest.raises(OutputExistsError, match="appeared"):
         write()
     assert [path.name for path in (tmp_path / "out").iterdir()] == ["a.txt"]
+    (file := tmp_path / "mine.txt").write_text("precious")
+    with pytest.raises(OutputExistsError, match=r"mine\.txt"), atomic_directory(file):
+        pass
+    assert file.read_text() == "precious"
 
 
 @pytest.mark.parametrize("way", ["exchange", "no exchange", "no links", "current folder"])
-def test_atomic_directory_replaces_entries_of_the_same_name(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, way: str
-) -> None:
+def test_atomic_directory_replaces_entries_by_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, way: str) -> None:
     out = tmp_path / "out"
     for folder in ("inner", "kept/deep"):
         (out / folder).mkdir(parents=True)
@@ -139,10 +141,3 @@ def test_directory_is_old_or_new_whenever_its_writer_dies(tmp_path: Path) -> Non
             states.add(found)
     old, whole = "a/old b/old mine1/old mine2/old", "a/new b/new c/new"
     assert states == {old, f"{whole} mine1/old mine2/old", "", whole}
-
-
-def test_atomic_directory_refuses_to_replace_a_file(tmp_path: Path) -> None:
-    (tmp_path / "out").write_text("precious")
-    with pytest.raises(OutputExistsError, match="out"), atomic_directory(tmp_path / "out"):
-        pass
-    assert (tmp_path / "out").read_text() == "precious"

@@ -23,17 +23,13 @@ def _maps(depth_m: np.ndarray, ir: np.ndarray | int = 10) -> LidarMaps:
     return maps_from_frame(_frame(depth_m, ir))
 
 
-def _cell(k: int, pixels: int, cells: int) -> int:
-    return int((k + 0.5) * cells / pixels)
-
-
 @pytest.mark.parametrize(("pixels", "cells"), [(size[k], (MAP_ROWS, MAP_COLUMNS)[k]) for size in SIZES for k in (0, 1)])
 def test_edges_give_pixels_to_cells_that_hold_their_centres(pixels: int, cells: int) -> None:
     edges = _edges(pixels, cells)
     assert (edges[0], edges[-1], len(edges)) == (0, pixels, cells + 1)
     assert (np.diff(edges) >= 0).all()
     found = np.searchsorted(edges, np.arange(pixels), side="right") - 1
-    assert found.tolist() == [_cell(k, pixels, cells) for k in range(pixels)]
+    assert found.tolist() == [int((k + 0.5) * cells / pixels) for k in range(pixels)]
 
 
 @settings(max_examples=30, deadline=None, derandomize=True)

@@ -47,7 +47,7 @@ def test_queue_wakes_a_consumer_that_waits(act: str, expected: int | None) -> No
     assert in_threads(1, lambda: queue.take(60.0), lambda: getattr(queue, act)(*args)) == [expected]
 
 
-def test_finished_queue_gives_its_items_and_then_its_error() -> None:
+def test_finished_queue_gives_items_then_error_closed_nothing() -> None:
     queue = filled(1)
     queue.finish(ZeroDivisionError("far away"))
     queue.finish()
@@ -55,9 +55,6 @@ def test_finished_queue_gives_its_items_and_then_its_error() -> None:
     assert (queue.ended, queue.take(0.0), queue.ended) == (False, 1, True)
     with pytest.raises(ZeroDivisionError, match="far away"):
         queue.take(0.0)
-
-
-def test_closed_queue_is_empty_and_raises_nothing() -> None:
     queue = filled(1)
     queue.finish(ZeroDivisionError())
     queue.close()

@@ -13,18 +13,13 @@ DPI = 254
 PIXELS_PER_MM = DPI / 25.4
 
 
-@pytest.fixture(scope="module", params=list(BOARDS))
-def page(request: pytest.FixtureRequest) -> tuple[Paper, np.ndarray]:
-    """A sheet as printed, at ten dots per millimetre."""
-    figure = board_figure(request.param)
+@pytest.mark.parametrize("paper", BOARDS)
+def test_board_sheet_is_drawn_to_scale_with_a_bar_and_clear_margins(paper: Paper) -> None:
+    figure = board_figure(paper)
     figure.set_dpi(DPI)
     canvas = FigureCanvasAgg(figure)
     canvas.draw()
-    return request.param, np.asarray(canvas.buffer_rgba())[..., 0].copy()
-
-
-def test_board_sheet_is_drawn_to_scale_with_a_bar_and_clear_margins(page: tuple[Paper, np.ndarray]) -> None:
-    paper, dots = page
+    dots = np.asarray(canvas.buffer_rgba())[..., 0].copy()  # a sheet as printed, at ten dots per millimetre
     board, (left_mm, top_mm) = BOARDS[paper], pattern_origin_mm(paper)
     pixels, ids, _, markers = cv2.aruco.CharucoDetector(board.opencv_board).detectBoard(dots)
     assert len(markers) == board.squares_x * board.squares_y // 2

@@ -13,16 +13,10 @@ from nlos_calibration import Corners, Intrinsics
 from nlos_calibration.board_wall import BoardView, CameraErrors, undistorted
 from software_colour import BYTES_PER_PIXEL, SoftwareColour, SoftwareSdk, record_with_colour
 
+from nlos_cam import errors
 from nlos_cam.calibrate.color_view import SETTLING_FRAMES, TO_GRAY, capture_color_view
 from nlos_cam.camera import SoftwareLidar, load_sdk
-from nlos_cam.errors import (
-    CameraError,
-    CameraLostError,
-    CameraNotFoundError,
-    NlosCamError,
-    RecordingError,
-    StreamMissingError,
-)
+from nlos_cam.errors import CameraError, CameraNotFoundError, RecordingError
 from nlos_cam.render import SensedImages
 
 SMALL = Intrinsics(64, 48, 60.0, 61.0, 33.0, 22.0)
@@ -113,7 +107,7 @@ def test_color_view_refuses_unusable_recordings(noise_bag: Path, rewritten: Any,
             raw = raw.replace(b"rgb8\0" + struct.pack("<I", 96), b"rgb8\0" + struct.pack("<I", 48), 1)
         return [(time_ns, raw)]
 
-    with pytest.raises(StreamMissingError, match=r"noise\.bag.*color"):
+    with pytest.raises(errors.StreamMissingError, match=r"noise\.bag.*color"):
         capture_color_view(f"bag:{noise_bag}", 5)
     source = recorded(tmp_path / "a.bag", [5])
     path = rewritten(lambda topic, time, raw: [] if "Color_0/tf" in topic else [(time, raw)], source=source)
@@ -152,8 +146,8 @@ def test_color_view_closes_a_camera_it_refuses_or_that_fails() -> None:
     busy.start_error, lens.lens_model = RuntimeError("busy"), "inverse_brown_conrady"
     for lidar, error, word in (
         (FakeLidar(), CameraError, "colour"),
-        (lens, NlosCamError, "inverse_brown_conrady"),
-        (silent, CameraLostError, r"0\.2 s"),
+        (lens, errors.NlosCamError, "inverse_brown_conrady"),
+        (silent, errors.CameraLostError, r"0\.2 s"),
         (busy, CameraError, "busy"),
     ):
         with pytest.raises(error, match=word):

@@ -13,14 +13,8 @@ from nlos_calibration.rig import LidarPose, Occluder, Rig, load_rig
 from nlos_calibration.wall import wall_depth
 from nlos_calibration.wall_record import MeasuredWall, new_wall_record
 
-from nlos_cam.calibrate.measure import (
-    CELSIUS_EVERY,
-    CaptureStatistics,
-    collect_statistics,
-    fit_frame,
-    measure_by_depth,
-    measure_occluder,
-)
+from nlos_cam.calibrate import measure
+from nlos_cam.calibrate.measure import CaptureStatistics, collect_statistics, fit_frame, measure_occluder
 from nlos_cam.frames import Frame, maps_from_frame
 from nlos_cam.render.geometry import cast
 
@@ -52,7 +46,7 @@ def test_collect_statistics_averages_all_frames() -> None:
 
 
 def test_statistics_read_temperatures_now_and_then() -> None:
-    capture = collect_statistics(Warming(2 * CELSIUS_EVERY + 1, celsius=30.0), 1000)
+    capture = collect_statistics(Warming(2 * measure.CELSIUS_EVERY + 1, celsius=30.0), 1000)
     assert capture.facts()["temperatures_c"] == {"ldd_temperature": 32.0}
     assert capture.reference(ALL).celsius_span == {"ldd_temperature": 2.0}
     with pytest.raises(WallRefusedError, match="fake"):
@@ -80,7 +74,7 @@ def seen() -> CaptureStatistics:
 
 
 def measured(seen: CaptureStatistics, tape_m: float | None = None) -> MeasuredWall:
-    fit, facts = measure_by_depth(seen, tape_m)
+    fit, facts = measure.measure_by_depth(seen, tape_m)
     about = {"camera": "sim", "frames": 10, "created": date(2026, 1, 2)}
     return MeasuredWall(new_wall_record(fit, INTRINSICS, **about, others=facts), None)
 
@@ -150,9 +144,7 @@ def frame_of(rig: Rig, width: int, height: int) -> Frame:
 
 @pytest.mark.parametrize(("width", "height"), [(640, 480), (1024, 768), (100, 75)])
 @pytest.mark.parametrize(("distance_m", "yaw_deg"), [(0.2, 45.0), (0.15, 15.0), (0.3, -60.0)])
-def test_fit_frame_measures_the_wall_in_one_thinned_frame(
-    width: int, height: int, distance_m: float, yaw_deg: float
-) -> None:
+def test_fit_frame_measures_wall_in_a_thinned_frame(width: int, height: int, distance_m: float, yaw_deg: float) -> None:
     pose = LidarPose(distance_m=distance_m, yaw_deg=yaw_deg)
     seen = fit_frame(frame_of(RIG.model_copy(update={"lidar": pose}), width, height))
     assert seen.fit.distance_m == pytest.approx(distance_m, abs=max(0.0005, 4 * seen.fit.distance_std_m))

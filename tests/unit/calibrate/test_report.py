@@ -166,9 +166,7 @@ def files(tmp_path: Path) -> WallFiles:
 
 
 @pytest.mark.slow
-def test_written_wall_files_belong_together(
-    files: WallFiles, measured: Measured, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_wall_files_belong_together(files: WallFiles, measured: Measured, monkeypatch: pytest.MonkeyPatch) -> None:
     wall = bare_wall()
     record = write_record(files, measured().record, wall)
     loaded = load_measured(files.record)

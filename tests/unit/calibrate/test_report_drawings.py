@@ -29,9 +29,7 @@ def with_rig(record: WallRecord, **changes: object) -> WallRecord:
 @pytest.mark.parametrize(
     ("distance_m", "yaw_deg", "pitch_deg"), [(0.2, 45, 0), (0.35, 80, 5), (0.15, -60, -12), (1, 1, 0)]
 )
-def test_bench_picture_holds_the_whole_bench(
-    measured: Measured, distance_m: float, yaw_deg: float, pitch_deg: float
-) -> None:
+def test_picture_holds_the_whole_bench(measured: Measured, distance_m: float, yaw_deg: float, pitch_deg: float) -> None:
     rig = measured(distance_m, yaw_deg, pitch_deg).record.rig
     limits, box = drawn_limits(rig), rig.object_box
     near, far = (box.x_min_m, box.y_min_m, box.z_near_m), (box.x_max_m, box.y_max_m, box.z_far_m)

@@ -203,9 +203,7 @@ def test_reference_holds_means_saturation_and_temperatures_and_survives_a_file(t
         np.testing.assert_equal(getattr(read, name), value)
 
 
-def test_load_measured_needs_the_very_reference_that_its_record_names(
-    tmp_path: Path, record: WallRecord, wall: BareWall
-) -> None:
+def test_load_measured_needs_the_reference_of_its_record(tmp_path: Path, record: WallRecord, wall: BareWall) -> None:
     assert load_measured(written(tmp_path, record)).reference is None
     beside = tmp_path / "wall.npz"
     named = {"reference": "wall.npz", "reference_sha256": save_reference(beside, wall)}

@@ -64,9 +64,7 @@ def test_fit_wall_refuses_what_is_not_a_wall_in_view() -> None:
         (0.200, 75.5, "75.5 degrees .* 1 degree ", "towards"),
     ],
 )
-def test_judge_out_of_range_advises_how_far_to_move(
-    distance_m: float, facing_deg: float, amounts: str, way: str
-) -> None:
+def test_judge_out_of_range_advises_a_distance(distance_m: float, facing_deg: float, amounts: str, way: str) -> None:
     verdict, advice = judge(distance_m, facing_deg, FLAT, 0.0)
     assert verdict == "out of range"
     assert re.search(f"{amounts}.*{way}", advice)

@@ -215,9 +215,7 @@ def test_turn_down_falls_above_darkness_as_far_as_needed(range_: tuple[float, fl
 
 
 @pytest.mark.parametrize(("share", "tried"), [(0.0, []), (MAX_SATURATED, []), (None, []), (0.5, [83])])
-def test_turn_down_ends_at_a_good_or_no_image_or_a_power_that_does_not_take(
-    share: float | None, tried: list[float]
-) -> None:
+def test_turn_down_ends_at_good_or_no_image_or_a_stuck_power(share: float | None, tried: list[float]) -> None:
     put: list[float] = []
     settled = turn_down(93, PowerLimits(0, 100, 1), lambda: share, put.append)
     assert (settled.power, settled.saturated, put) == (93, share, tried)

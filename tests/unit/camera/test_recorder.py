@@ -32,9 +32,7 @@ def camera(noise_world: Any, hurried_clock: Any) -> Make:
     ("limit", "frames"),
     [({"frames": 1}, 1), ({"frames": 31}, 31), *(({"seconds": s}, n) for s, n in ((0.01, 1), (0.1, 3), (1.0, 30)))],
 )
-def test_recording_ends_after_its_frames_or_device_seconds(
-    camera: Make, tmp_path: Path, limit: dict[str, Any], frames: int
-) -> None:
+def test_recording_ends_at_frames_or_seconds(camera: Make, tmp_path: Path, limit: dict[str, Any], frames: int) -> None:
     path = tmp_path / "a.bag"
     path.write_text("an old file")
     recording = Recording(path, **limit)
@@ -160,11 +158,6 @@ def made(tmp_path: Path) -> SdkRecorder:
     return made
 
 
-def test_recorder_reports_a_place_that_cannot_be_written(tmp_path: Path) -> None:
-    with pytest.raises(RecordingError, match="no folder"):
-        SdkRecorder(tmp_path / "no folder" / "a.bag", "device", SDK)
-
-
 @pytest.mark.parametrize(("slow", "pauses"), [(0, 1), (3, 4), (10**6, MAX_FLUSHES)])
 def test_recorder_pauses_again_while_a_disk_is_behind(made: SdkRecorder, slow: int, pauses: int) -> None:
     fake = made._recorder
@@ -178,7 +171,9 @@ def test_recorder_pauses_again_while_a_disk_is_behind(made: SdkRecorder, slow: i
     assert fake.pauses == pauses
 
 
-def test_recorder_whose_file_grows_no_more_fails(made: SdkRecorder) -> None:
+def test_recorder_without_a_folder_or_whose_file_grows_no_more_fails(made: SdkRecorder, tmp_path: Path) -> None:
+    with pytest.raises(RecordingError, match="no folder"):
+        SdkRecorder(tmp_path / "no folder" / "a.bag", "device", SDK)
     for _ in range(10):  # now and then
         made.watch()
         CLOCK.wait(Event(), STILL_S / 2)

@@ -51,9 +51,7 @@ def test_backends_are_imported_late() -> None:
 @pytest.mark.parametrize(
     ("machine", "words"), [("x86_64", f"pip install {WHEEL}"), ("aarch64", r"linux aarch64.*Python 3\.11")]
 )
-def test_missing_wheel_says_what_to_do(
-    noise_bag: Path, monkeypatch: pytest.MonkeyPatch, machine: str, words: str
-) -> None:
+def test_missing_wheel_has_advice(noise_bag: Path, monkeypatch: pytest.MonkeyPatch, machine: str, words: str) -> None:
     assert load_sdk() is load_sdk()
     monkeypatch.setitem(sys.modules, "pyrealsense2", None)
     monkeypatch.setattr("nlos_cam.camera.sdk._preload_libusb", lambda: None)

@@ -256,12 +256,18 @@ def passed_on(continuity: Continuity, numbers: range, zero_s: float, arrived_s: 
     ]
 
 
-def test_continuity_passes_a_first_run_on_unchanged() -> None:
+def test_continuity_keeps_first_run_and_counts_missed_once() -> None:
     given = frame(7, 1.5)
     assert Continuity().add(given, arrived_s=99.0) is given
     continuity = Continuity()
     continuity.restart(counted=0)  # after a run without frames
     assert continuity.add(frame(4, 2.0), arrived_s=0.0).frame_number == 4
+    continuity = Continuity()
+    passed_on(continuity, range(1), zero_s=0.0, arrived_s=0.0)
+    continuity.restart(counted=20)
+    continuity.restart(counted=5)
+    passed_on(continuity, range(1), zero_s=1.0, arrived_s=1.0)
+    assert continuity.missed == 29 - 25
 
 
 @pytest.mark.parametrize("zero_s", [1009.0, 0.0, 500_000.0], ids=["host's clock", "restarted", "jumped"])
@@ -277,15 +283,6 @@ def test_numbers_and_seconds_rise_together_over_an_outage(zero_s: float) -> None
         assert (next_one.timestamp_s - one.timestamp_s) * 30 == pytest.approx(later, abs=0.01)
     assert after[0].timestamp_s - before[0].timestamp_s == pytest.approx(9.0)
     assert continuity.missed == after[0].frame_number - before[-1].frame_number - 1 == 240
-
-
-def test_continuity_counts_missed_numbers_once() -> None:
-    continuity = Continuity()
-    passed_on(continuity, range(1), zero_s=0.0, arrived_s=0.0)
-    continuity.restart(counted=20)
-    continuity.restart(counted=5)
-    passed_on(continuity, range(1), zero_s=1.0, arrived_s=1.0)
-    assert continuity.missed == 29 - 25
 
 
 @pytest.mark.parametrize(

@@ -68,9 +68,7 @@ def test_capture_numbers_and_labels_takes_and_pauses_between_them(run: Run, monk
 
 
 @pytest.mark.parametrize(("answer", "code", "takes"), [("\n", 0, 2), (KeyboardInterrupt, 130, 1)])
-def test_capture_asks_at_a_terminal_before_each_take(
-    run: Run, monkeypatch: Patch, answer: Any, code: int, takes: int
-) -> None:
+def test_terminal_is_asked_before_each_take(run: Run, monkeypatch: Patch, answer: Any, code: int, takes: int) -> None:
     def readline() -> str:
         if answer is KeyboardInterrupt:
             signal.raise_signal(signal.SIGINT)

@@ -99,9 +99,7 @@ def test_wrong_variable_is_a_usage_error() -> None:
         read_settings({"NLOS_CAM_VIEW_PORT": "many"})
 
 
-def test_config_shows_values_with_their_sources(
-    folders: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch, run: Run
-) -> None:
+def test_config_shows_values_and_sources(folders: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch, run: Run) -> None:
     (folders[0] / FILE).write_text(LIVE + 'cache = "c"', encoding="utf-8")
     monkeypatch.setenv("NLOS_CAM_WEIGHTS", "mine")
     settings = run("config")["settings"]
@@ -110,9 +108,7 @@ def test_config_shows_values_with_their_sources(
     assert settings["camera"]["source"] == FILE
 
 
-def test_settings_in_use_are_printed_with_verbose(
-    folders: tuple[Path, Path], live: list[dict[str, Any]], shown: Run
-) -> None:
+def test_verbose_prints_settings_in_use(folders: tuple[Path, Path], live: list[dict[str, Any]], shown: Run) -> None:
     (folders[0] / FILE).write_text(LIVE, encoding="utf-8")
     assert f"wall = bench.toml (from {FILE})" in shown("-v", "live").err
     assert len(live) == 1

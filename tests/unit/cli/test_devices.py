@@ -102,9 +102,7 @@ def test_doctor_prints_checks_and_each_fix_on_a_line(shown: Run, bench: Bench) -
     assert f"1 of {len(CHECKS)}" in out
 
 
-def test_doctor_writes_udev_rules_and_how_to_install_them(
-    shown: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_doctor_writes_udev_rules_and_installation(shown: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = tmp_path / "99-l515.rules"
     out, err = shown("doctor", "--write-udev", path, "--json")
     assert path.read_text(encoding="utf-8") == rules_text()

@@ -175,9 +175,7 @@ def test_live_budget_reports_whether_it_was_kept(opened: Opened, run: Run, monke
 
 @pytest.mark.usefixtures("walled")
 @pytest.mark.parametrize("command", [SIMULATED, REPLAY])
-def test_command_prints_begin_and_end_of_a_warning_once(
-    run: Run, monkeypatch: pytest.MonkeyPatch, command: list[str]
-) -> None:
+def test_begin_and_end_of_a_warning_print_once(run: Run, monkeypatch: pytest.MonkeyPatch, command: list[str]) -> None:
     monkeypatch.setattr("nlos_cam.live.frame_queue.QUEUE_FRAMES", 1000)
     report = run(*command, "--wall", "wall.toml")
     [(warning, frames)] = report["warnings"].items()
@@ -225,7 +223,7 @@ def test_summary_has_a_sentence_per_fact_and_stages_if_verbose() -> None:
     assert stages_lines == [[name, "1.0", "3.1"] for name in ("delivery", "network", "wait")]
 
 
-def test_view_serves_a_saved_view_until_interrupted_or_for_its_seconds(
+def test_view_serves_saved_view_until_interrupted_or_its_seconds(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     fetched: list[bytes] = []

@@ -71,9 +71,7 @@ def test_command_prints_its_sentence_or_one_json_object(does: Does, shown: Run, 
 
 
 @pytest.mark.parametrize(("kind", "code"), [(kind, code) for code, kinds in CODES.items() for kind in kinds])
-def test_foreseen_error_has_its_exit_code_and_one_line(
-    does: Does, shown: Run, run: Run, kind: type[Exception], code: int
-) -> None:
+def test_foreseen_error_has_code_and_line(does: Does, shown: Run, run: Run, kind: type[Exception], code: int) -> None:
     does(kind(message := "a depth of [3] m\nin [red]"))
     assert shown("act", code=code) == ("", "error: a depth of [3] m in [red]\n")
     assert run("act", code=code) == {"error": {"type": kind.__name__, "message": message}}
@@ -198,7 +196,7 @@ def leaves(app: typer.Typer, path: str = "") -> list[tuple[str, object]]:
     return found
 
 
-def test_help_names_every_command_and_all_take_json(shown: Run) -> None:
+def test_help_names_every_command_with_json_and_version(shown: Run) -> None:
     page = shown("--help").out
     named = "devices doctor capture calibrate live replay render dataset train evaluate tradeoff"
     assert not [name for name in {*named.split(), *COMMANDS} if name not in page]
@@ -206,6 +204,7 @@ def test_help_names_every_command_and_all_take_json(shown: Run) -> None:
     assert len(commands) >= 10
     for name, callback in commands:
         assert "json" in getattr(callback, "__annotations__", {}), name
+    assert shown("--version").out == shown("-V").out == f"nlos-cam {version('nlos-cam')}\n"
 
 
 @pytest.mark.parametrize("command", COMMANDS)
@@ -213,10 +212,6 @@ def test_command_table_names_the_right_module(command: str) -> None:
     names = {name for name, _ in leaves(build_app(command))}
     assert any(name.split()[0] == command for name in names)
     assert names <= {name for name, _ in leaves(build_app())}
-
-
-def test_version_is_that_of_the_package(shown: Run) -> None:
-    assert shown("--version").out == shown("-V").out == f"nlos-cam {version('nlos-cam')}\n"
 
 
 def test_option_help_has_placeholders_and_ranges_in_words(shown: Run) -> None:
@@ -315,9 +310,7 @@ def test_interruption_that_python_ignores_is_raised_again() -> None:
 
 
 @pytest.mark.parametrize(("command", "needed"), [("rigs", MIN_ADDRESS_BYTES), ("train", TORCH_ADDRESS_BYTES)])
-def test_too_little_address_space_is_one_line_before_libraries_load(
-    monkeypatch: Patch, shown: Run, command: str, needed: int
-) -> None:
+def test_little_address_space_is_one_line_at_once(monkeypatch: Patch, shown: Run, command: str, needed: int) -> None:
     monkeypatch.setattr(resource, "getrlimit", lambda _: (needed - 1, needed))
     assert f"is {(needed >> 20) - 1} MiB" in shown(command, "--help", code=1).err
     monkeypatch.setattr(resource, "getrlimit", lambda _: (needed, needed))

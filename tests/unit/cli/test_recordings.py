@@ -16,9 +16,7 @@ from nlos_cam.recording import repair_recording, verify
 Run = Callable[..., Any]
 
 
-def test_repair_reports_the_new_file_and_overwrites_when_asked(
-    run: Run, noise_bags: dict[str, Path], tmp_path: Path
-) -> None:
+def test_repair_reports_new_file_and_overwrites_if_asked(run: Run, noise_bags: dict[str, Path], tmp_path: Path) -> None:
     (out := tmp_path / "good.bag").write_bytes(b"mine")
     command = "repair", noise_bags["packed-unindexed"], "--out", out
     error = run(*command, code=1)["error"]

@@ -39,9 +39,7 @@ def rendered(run: Run) -> Run:
     return call
 
 
-def test_render_writes_maps_a_picture_and_reports_effects(
-    rendered: Run, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
+def test_render_writes_maps_picture_and_effects(rendered: Run, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.undo()  # the picture is drawn
     result, file = rendered("cup", "--out", out := tmp_path / "cup.npz", "--explain")
     assert (result["accuracy"], result["out"]) == ("draft", str(out))
@@ -153,9 +151,7 @@ def test_hidden_depth_takes_a_depth_map_as_it_is(capsys: pytest.CaptureFixture[s
     assert ("none [b].npy" in warning, warning.count("\n")) == (True, 1)
 
 
-def test_hidden_depth_warns_of_an_object_cut_or_flattened_by_the_box(
-    mesh: str, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_hidden_depth_warns_of_object_cut_or_flattened_by_box(mesh: str, capsys: pytest.CaptureFixture[str]) -> None:
     trimesh.creation.box(extents=(1, 0.2, 0.01)).export(plate := "plate [b].ply")
     half = hidden_depth(plate, RIG, {"size_m": 0.2, "x_m": 0.125})  # the box ends in its middle
     flat = hidden_depth(mesh, RIG, {"tilt_y_deg": 90, "front_m": 0.2})

@@ -83,9 +83,7 @@ def test_spread_chooses_frames_evenly(count: int, wanted: int) -> None:
     assert np.ptp(gaps) <= 2  # mirrored at both ends: neither end is left out
 
 
-def test_read_labelled_corrects_maps_by_a_wall_record_of_their_resolution(
-    labelled: Label, measured: Callable[..., Any], tmp_path: Path
-) -> None:
+def test_read_labelled_corrects_by_wall_record(labelled: Label, measured: Callable[..., Any], tmp_path: Path) -> None:
     def wall(**fields: Any) -> Path:
         (path := tmp_path / "wall.toml").write_text(dump_toml(measured(**fields).record), encoding="utf-8")
         return path

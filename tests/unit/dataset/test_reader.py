@@ -99,9 +99,7 @@ def test_processes_share_the_batches_of_one_process(data: Dataset, world: int) -
             next(data.batches(0, 0, 6, rank=rank, world=count))
 
 
-def test_samples_are_shuffled_within_buffer_and_shards_anywhere_and_each_is_read_once_into_two_buffers(
-    data: Dataset, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_samples_are_shuffled_and_read_once_into_two_buffers(data: Dataset, monkeypatch: pytest.MonkeyPatch) -> None:
     shards = np.array([row for some in _rows(data, batch=1) for row in some]) // SHARD
     blocks = [set(shards[k : k + 15].tolist()) for k in range(0, 30, 15)]
     assert any(len(block) == 3 for block in blocks)  # three shards of five samples, shuffled together

@@ -149,9 +149,7 @@ WSL = write("proc/version", "Linux version 6.6.87-microsoft-standard-WSL2")
         ([HIDE, SECOND], "hid-sensors sdk-camera", "sdk-camera", "hid-sensors|sudo modprobe -a hid_sensor_hub"),
     ],
 )  # fmt: skip
-def test_check_reports_a_fault_with_its_fix(
-    bench: Any, steps: list[Any], failures: str, check: str, words: str
-) -> None:
+def test_check_reports_fault_with_its_fix(bench: Any, steps: list[Any], failures: str, check: str, words: str) -> None:
     for step in steps:
         step(bench)
     checks, wanted = bench.checks(), [(*each.split(), "failed")[:2] for each in check.split(", ")]

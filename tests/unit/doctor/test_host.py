@@ -176,7 +176,7 @@ def test_real_process_that_has_a_file_open_is_found(tmp_path: Path) -> None:
 CLAUSE = re.compile(r'[A-Z]+(\{\w+\})?(==|:=|\+=)"[^"]*"')
 
 
-def test_rules_open_every_lidar_and_its_motion_sensors_and_are_well_formed() -> None:
+def test_rules_open_each_lidar_and_its_sensors_and_are_installed() -> None:
     lines = [line for line in rules_text().splitlines() if line and not line.startswith("#")]
     for product_id in LIDARS:
         [rule] = [line for line in lines if f'"{product_id:04x}"' in line and line.startswith('SUBSYSTEMS=="usb"')]
@@ -188,9 +188,6 @@ def test_rules_open_every_lidar_and_its_motion_sensors_and_are_well_formed() -> 
     for line in lines:
         assert all(CLAUSE.fullmatch(clause) for clause in line.split(", ")), line
     assert not LIDARS.keys() & OTHERS.keys()
-
-
-def test_commands_name_the_file_and_reload() -> None:
     assert f"--write-udev {FILE_NAME}" in WRITE_AND_INSTALL
     assert WRITE_AND_INSTALL.endswith(RELOAD)
     assert "'my rules'" in install_command("my rules")

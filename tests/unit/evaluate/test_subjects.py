@@ -17,17 +17,9 @@ from nlos_cam.dataset.samples import make_samples
 from nlos_cam.dataset.shards import shard_path, store
 from nlos_cam.errors import SceneError
 from nlos_cam.evaluate import QUIET, HeldOutObjects, as_map_set, baseline_answers, baselines, echoes_of, reconstruct_all
+from nlos_cam.evaluate import subjects as module
 from nlos_cam.evaluate.baselines import answers_with_nearest, mean_image, training_maps, trivial_answers
-from nlos_cam.evaluate.subjects import (
-    dataset_objects,
-    network_input,
-    notes_about,
-    rendered_objects,
-    rig_of,
-    seeded_objects,
-    sense,
-    truth_of,
-)
+from nlos_cam.evaluate.subjects import notes_about, rig_of, seeded_objects, sense, truth_of
 from nlos_cam.frames import LidarMaps, maps_from_frame
 from nlos_cam.objects import CATEGORIES, benchmark_objects, image_from_depth, object_box, object_depth, unseen_objects
 from nlos_cam.reconstruct import MapAlignment
@@ -50,15 +42,15 @@ def echoes() -> list[MultiBounce]:
 
 
 def test_seeded_objects_are_those_of_their_seeds_and_second_set_is_of_other_kinds_in_the_same_poses() -> None:
-    subjects = seeded_objects(TEST_SEED, 2, BOX)
-    for k, subject in enumerate(subjects):
+    seeded = seeded_objects(TEST_SEED, 2, BOX)
+    for k, subject in enumerate(seeded):
         category, depth_m = object_depth(TEST_SEED + k, BOX)
         assert subject.category == category
         assert category in subject.name
         np.testing.assert_array_equal(subject.depth_m, depth_m)
-        np.testing.assert_array_equal(truth_of(subjects, BOX)[k], image_from_depth(depth_m, BOX))
-    judged = rendered_objects(RIG, 1)
-    np.testing.assert_array_equal(judged.maps.image, truth_of(subjects[:1], BOX))
+        np.testing.assert_array_equal(truth_of(seeded, BOX)[k], image_from_depth(depth_m, BOX))
+    judged = module.rendered_objects(RIG, 1)
+    np.testing.assert_array_equal(judged.maps.image, truth_of(seeded[:1], BOX))
     assert judged.maps.depth_m.shape == (1, 64, 80)
     assert (len(judged.names), judged.plan) == (1, PLAN)
     kinds, unseen = benchmark_objects(BOX), unseen_objects(BOX)
@@ -72,10 +64,10 @@ def test_each_object_of_a_dataset_of_many_rigs_is_aligned_from_its_own(tmp_path:
     plan = DatasetPlan(RIG, 0, accuracy="draft", spread=RigSpread(place_m=0.005, angle_deg=2), objects_per_rig=2)
     samples = make_samples(plan, range(3))
     store(shard_path(tmp_path, 0), samples, plan.provenance, "")
-    found = dataset_objects(tmp_path)
+    found = module.dataset_objects(tmp_path)
     assert found.benches == [plan.bench_of(seed)[0] for seed in range(3)]
     assert found.benches[0] == found.benches[1] != found.benches[2]
-    aligned = network_input(found.maps, None, found.benches, RECORD)
+    aligned = module.network_input(found.maps, None, found.benches, RECORD)
     for n, bench in enumerate(found.benches):
         seen = LidarMaps(samples["depth_m"][n], samples["intensity"][n], np.isfinite(samples["depth_m"][n]))
         wanted = MapAlignment(bench, RIG).align(seen)

@@ -131,9 +131,7 @@ def test_load_pipeline_refuses_any_flipped_bit(folder: Path, saved: Path, seed: 
         *(("output.bias", torch.tensor([value]), "not finite") for value in (torch.nan, torch.inf)),
     ],
 )
-def test_load_pipeline_refuses_tensors_that_do_not_fit_or_are_not_finite(
-    folder: Path, name: str, value: torch.Tensor | None, word: str
-) -> None:
+def test_load_pipeline_refuses_unusable_tensors(folder: Path, name: str, value: torch.Tensor | None, word: str) -> None:
     tensors = {**load_file(path := folder / "decoder.safetensors"), name: value}
     _replace(path, save({name: tensor for name, tensor in tensors.items() if tensor is not None}))
     with pytest.raises(CheckpointError, match=word) as caught:

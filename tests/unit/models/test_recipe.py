@@ -92,9 +92,7 @@ ONE = {"steps": "one", "latent_weight": 0, "image_weight": 1}
         ("compressor", {"colour": True, "maps": "difference maps"}, "simulation only"),
     ],
 )
-def test_wrong_or_contradictory_recipe_is_refused_in_one_line_that_names_the_field(
-    tmp_path: Path, task: str, changes: dict[str, object], words: str
-) -> None:
+def test_wrong_recipe_is_refused_with_field(tmp_path: Path, task: str, changes: dict[str, object], words: str) -> None:
     facts = {**LEAST, "task": task, **changes}
     text = "\n".join(f"{name} = {json.dumps(value)}" for name, value in facts.items() if value is not None)
     (path := tmp_path / "recipe.toml").write_text(text, encoding="utf-8")

@@ -97,9 +97,7 @@ def test_start_refuses_weights_without_encoder_for_latent_loss_and_color_weights
             _start(recipe, weights)
 
 
-def test_transfer_starts_by_default_from_weights_that_its_loss_fits(
-    weights: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_transfer_default_weights_fit_its_loss(weights: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     size = {"features": 8, "width": 8, "blocks": 1, "token": 8, "mixers": 1}
     straight = small_recipe(task="direct", direct=size)
     save_direct(tmp_path / "direct", DirectNetwork(straight.direct), CheckpointRecord.of([straight], NAMED))

@@ -12,19 +12,11 @@ from nlos_calibration.arrays import Float32
 from nlos_models import MapSet
 from small_frames import SheetNetwork
 
+from nlos_cam import reconstruct
 from nlos_cam.evaluate import per_object
 from nlos_cam.frames import LidarMaps
 from nlos_cam.objects import benchmark_objects, image_from_depth, object_box
-from nlos_cam.reconstruct import (
-    Arrival,
-    CalibratedRig,
-    MapAlignment,
-    Pipeline,
-    align_all,
-    alignment,
-    load_networks,
-    rig_to_align_with,
-)
+from nlos_cam.reconstruct import Arrival, CalibratedRig, MapAlignment, alignment
 from nlos_cam.render import Scene, Sensor, SensorModel, render
 
 RIG = load_rig("paper-rig")
@@ -78,11 +70,11 @@ def test_bare_bench_looks_like_the_bare_training_rig(rig: Rig) -> None:
 
 def test_networks_keep_their_silhouettes_on_a_bench_built_with_a_ruler() -> None:
     truth, box = np.stack([image_from_depth(one.depth_m, object_box(RIG)) for one in THINGS]), object_box(RIG)
-    network, iou = load_networks(), dict[str, float]()
+    network, iou = reconstruct.load_networks(), dict[str, float]()
     for name, rig in BENCHES.items():
         seen = [maps_of(rig, one.depth_m, SensorModel(), 1) for one in THINGS]
         maps = MapSet(np.stack([one.depth_m for one in seen]), np.stack([one.intensity for one in seen]), truth)
-        for aligned, given in ((True, align_all(maps, repeat(rig), network.record)), (False, maps)):
+        for aligned, given in ((True, reconstruct.align_all(maps, repeat(rig), network.record)), (False, maps)):
             image = network(given.depth_m, given.intensity)
             iou[f"{name} {aligned}"] = float(per_object(image, truth, box)["silhouette_iou"].mean())
     for name in list(BENCHES)[1:]:
@@ -113,7 +105,7 @@ def test_what_cannot_be_aligned_is_left_alone() -> None:
     rig, box = BENCHES["all of it"], RIG.object_box
     assert box
     larger = rig.model_copy(update={"object_box": box.model_copy(update={"z_far_m": box.z_far_m + 0.05})})
-    assert rig_to_align_with(rig, trained()) == RIG
+    assert reconstruct.rig_to_align_with(rig, trained()) == RIG
     for other, record in (
         (RIG, trained()),
         (larger, trained()),
@@ -123,7 +115,7 @@ def test_what_cannot_be_aligned_is_left_alone() -> None:
         (rig, trained(rig_checksum="0" * 12)),
         *((bench(**lidar), trained()) for lidar in ({"distance_m": 0.25}, {"yaw_deg": 15.0})),  # see less of the wall
     ):
-        assert rig_to_align_with(other, record) is None
+        assert reconstruct.rig_to_align_with(other, record) is None
         assert alignment(other, record) is None
     maps = maps_of(rig, None)
     dark = LidarMaps(np.full_like(maps.depth_m, np.nan), np.zeros_like(maps.intensity), np.zeros_like(maps.valid))
@@ -146,7 +138,7 @@ def test_occluder_that_was_not_measured_is_taken_to_stand_as_in_training() -> No
 def test_pipeline_aligns_with_the_bench_that_it_has() -> None:
     rig = BENCHES["all of it"]
     for record, changed in ((trained(), True), (None, False)):
-        pipeline = Pipeline(CalibratedRig(rig), SheetNetwork(), trained=record)
+        pipeline = reconstruct.Pipeline(CalibratedRig(rig), SheetNetwork(), trained=record)
         prepared = pipeline.prepare(arrival(rig), lambda: 0.0, 0.0)
         assert np.array_equal(prepared.network_input.depth_m, prepared.corrected.depth_m, equal_nan=True) != changed
         pipeline.bench = CalibratedRig(RIG)

@@ -237,9 +237,7 @@ def test_reader_of_a_damaged_bag_raises_one_line(
 
 @pytest.mark.parametrize("kind", ["noise_bag", "noise_bag_uncompressed"])
 @pytest.mark.parametrize("field", [b"size=", b"count=", b"chunk_count=", b"conn_count=", b"index_pos=", b"chunk_pos="])
-def test_reader_does_not_allocate_an_absurd_size(
-    kind: str, field: bytes, request: pytest.FixtureRequest, tmp_path: Path
-) -> None:
+def test_absurd_size_is_not_allocated(kind: str, field: bytes, request: pytest.FixtureRequest, tmp_path: Path) -> None:
     content, path = request.getfixturevalue(kind).read_bytes(), tmp_path / "absurd.bag"
     for at in [found.end() for found in re.finditer(re.escape(field), content)][:3]:
         path.write_bytes(content[:at] + b"\xff\xff\xff\xff" + content[at + 4 :])

@@ -77,9 +77,7 @@ def with_data(bag: Bag, ending: str, change: Callable[[bytes], bytes]) -> None:
 @pytest.mark.parametrize(
     "ending", ["Depth_0/info", "Depth_0/info/camera_info", "Depth_0/image/data", "Depth_Units/value", "/device_0/info"]
 )
-def test_message_of_another_type_is_refused_in_a_line(
-    crafted: Callable[[Change], Path], ending: str, kind: str
-) -> None:
+def test_message_of_wrong_type_is_refused_in_a_line(crafted: Callable[[Change], Path], ending: str, kind: str) -> None:
     def change(bag: Bag) -> None:
         number = topic(bag, ending)
         bag.topics[number] = bag.topics[number][0], kind

@@ -42,9 +42,7 @@ def test_iterating_again_restarts_frames_and_counters(noise_bag: Path, reader: A
 
 
 @pytest.mark.parametrize("content", [b"", b"a text file\n", b"#ROSBAG V2.0\n", 0.1, 0.5, 0.99, "killed"])
-def test_replay_refuses_a_broken_file_in_one_line_with_its_repair(
-    noise_bag: Path, tmp_path: Path, content: bytes | float | str
-) -> None:
+def test_replay_refuses_broken_file_with_repair(noise_bag: Path, tmp_path: Path, content: bytes | float | str) -> None:
     whole, path = noise_bag.read_bytes(), tmp_path / "my run.bag"
     if isinstance(content, float):
         content = whole[: int(content * len(whole))]

@@ -37,9 +37,7 @@ def whys(found: RepairResult) -> str:
 
 
 @pytest.mark.parametrize("name", ["packed", "plain", "of an old SDK"])
-def test_repair_of_a_whole_recording_changes_no_byte(
-    noise_bags: Bags, request: pytest.FixtureRequest, tmp_path: Path, name: str
-) -> None:
+def test_repair_copies_a_whole_bag(noise_bags: Bags, request: pytest.FixtureRequest, tmp_path: Path, name: str) -> None:
     source = noise_bags[name] if name in noise_bags else request.getfixturevalue("real_bag")
     path, progress = shutil.copy2(source, tmp_path / "original.bag"), list[tuple[int, int]]()
     before, content = path.stat(), path.read_bytes()
@@ -53,9 +51,7 @@ def test_repair_of_a_whole_recording_changes_no_byte(
     assert progress[-1][0] == progress[-1][1] == 2 * before.st_size
 
 
-def test_repaired_bag_is_read_bit_for_bit_by_every_reader(
-    bag: Path, tmp_path: Path, tool: Callable[[str], ModuleType]
-) -> None:
+def test_every_reader_reads_repaired_bag_exactly(bag: Path, tmp_path: Path, tool: Callable[[str], ModuleType]) -> None:
     found = repair_recording(bag, tmp_path / "good.bag")
     twice = repair_recording(found.out, tmp_path / "twice.bag")
     assert twice.out.read_bytes() == found.out.read_bytes()

@@ -61,9 +61,7 @@ def test_pick_takes_cheapest_stop_within_bounds(max_error: float | None, max_sec
         (None, 0.0, ["rough"]),
     ],
 )
-def test_pick_names_the_nearest_stop_when_none_keeps_the_bounds(
-    max_error: float | None, max_seconds: float | None, words: list[str]
-) -> None:
+def test_pick_out_of_bounds_names_nearest(max_error: float | None, max_seconds: float | None, words: list[str]) -> None:
     with pytest.raises(SceneError) as refusal:
         pick(DIAL, max_error, max_seconds)
     assert all(word in str(refusal.value) for word in words)
@@ -144,14 +142,10 @@ def test_least_seconds_repeats_the_work() -> None:
 BIN_M = 0.01
 
 
-def _echoes() -> EchoMaps:
+def test_agreement_measures_intensity_bins_depth_and_lost_echoes() -> None:
     generator = np.random.default_rng(1)
     path = (generator.integers(40, 200, 100) + 0.5) * BIN_M
-    return EchoMaps(generator.uniform(1, 2, 100), path, path / 2)
-
-
-def test_agreement_measures_intensity_bins_and_depth() -> None:
-    truth = _echoes()
+    truth = EchoMaps(generator.uniform(1, 2, 100), path, path / 2)
     same, nothing = agreement(truth, truth, BIN_M), replace(truth, depth_m=np.full(100, np.nan))
     assert (same.bin_exact, same.bin_within_1) == (1.0, 1.0)
     assert max(same.intensity_error_max, same.depth_error_mm, same.depth_error_mean_mm) == 0
@@ -164,10 +158,6 @@ def test_agreement_measures_intensity_bins_and_depth() -> None:
     found = agreement(replace(truth, path_m=truth.path_m + step, depth_m=truth.depth_m + step), truth, BIN_M)
     np.testing.assert_allclose((found.bin_exact, found.bin_within_1), (0.5, 0.8))
     np.testing.assert_allclose(found.depth_error_mean_mm, 0.2 * 20 + 0.3 * 10)
-
-
-def test_agreement_counts_echoes_that_only_one_has() -> None:
-    truth = _echoes()
     lost = truth.path_m.copy()
     lost[:10] = np.nan
     assert agreement(replace(truth, path_m=lost), truth, BIN_M).bin_within_1 == pytest.approx(0.9)

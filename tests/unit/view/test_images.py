@@ -26,10 +26,13 @@ def flat(z_m: float) -> np.ndarray:
     return np.full((64, 64), z_m, np.float32)
 
 
-def test_hidden_depth_is_brighter_when_nearer_and_noise_when_larger() -> None:
+def test_pictures_are_brighter_when_nearer_noisier_or_of_more_counts() -> None:
     nearer = np.concatenate([images.hidden_rgb(flat(z_m), BOX)[:1, :1] for z_m in (np.nan, 0.4, 0.25, 0.13)], axis=1)
     for rgb in (nearer, images.noise_rgb(np.array([[np.nan, 0.0, 1.0, 2.0]]), 2.0)):
         assert (np.diff(rgb[0].sum(axis=-1).astype(int)) > 0).all()
+    grey = images.infrared_grey(np.arange(256, dtype=np.uint8)[None])[0].astype(int)
+    assert (grey[0], grey[255]) == (0, 255)
+    assert (np.diff(grey) >= 0).all()
 
 
 def test_depth_pictures_show_missing_depth_as_background() -> None:
@@ -38,12 +41,6 @@ def test_depth_pictures_show_missing_depth_as_background() -> None:
     depth_m = flat(0.3)
     depth_m[5, 6] = np.nan
     assert np.argwhere((images.lidar_rgb(depth_m, 0.1, 1.0) == images.BACKGROUND_RGB).all(axis=-1)).tolist() == [[5, 6]]
-
-
-def test_infrared_grey_keeps_order_and_ends_of_counts() -> None:
-    grey = images.infrared_grey(np.arange(256, dtype=np.uint8)[None])[0].astype(int)
-    assert (grey[0], grey[255]) == (0, 255)
-    assert (np.diff(grey) >= 0).all()
 
 
 def test_near_is_red_and_far_is_blue_and_a_difference_of_none_is_grey() -> None:
@@ -100,9 +97,7 @@ def test_uncertainty_rgb_is_brighter_the_larger_on_the_surface() -> None:
     assert (np.diff(brightness) >= -3).all()
     assert brightness[0] > sum(images.BACKGROUND_RGB)
     assert (rgb[1, 40:] == rgb[1, 63]).all()
-    assert (images.uncertainty_rgb(NOTHING, depth_m) == images.uncertainty_rgb(flat(1.0), depth_m)).all(), (
-        "unknown is the largest"
-    )
+    assert (images.uncertainty_rgb(NOTHING, depth_m) == images.uncertainty_rgb(flat(1.0), depth_m)).all()  # the largest
 
 
 def test_pictures_clip_values_beyond_their_span() -> None:
@@ -241,9 +236,6 @@ def test_still_shows_each_part_of_a_moment_in_its_panel_and_marks_a_doubted_reco
         *(({"banner", "reconstruction"}, {"verdict": verdict}) for verdict in Verdict if verdict is not Verdict.SEEN),
     ):
         assert changed(before, still.rgb(replace(one, **others))) == panels
-
-
-def test_still_of_a_bare_moment_has_no_surface() -> None:
     assert (panel(Still(RIG, moment(0)).rgb(moment(0, NOTHING)), "reconstruction") == images.BACKGROUND_RGB).all()
 
 

@@ -31,7 +31,7 @@ def status_of(address: str, path: str, **options: Any) -> int:
         return answer.status
 
 
-def test_server_sends_whole_files_and_forbids_other_origins(server: ViewServer) -> None:
+def test_server_sends_whole_files_and_refuses_any_other_request(server: ViewServer) -> None:
     assert urlsplit(server.address).hostname == server._server.server_address[0] == LOOPBACK
     for path, (kind, content) in ASSETS.items():
         with closing(ask(server.address, path + "?renderer=webgl")) as answer:
@@ -41,6 +41,8 @@ def test_server_sends_whole_files_and_forbids_other_origins(server: ViewServer) 
         with closing(ask(server.address, path, method="HEAD")) as answer:
             assert (answer.status, int(answer.headers["Content-Length"])) == (200, len(content))
             assert answer.read() == b""
+    assert status_of(server.address, "/../secret") == status_of(server.address, "/", method="POST") == 404
+    assert {status_of(server.address, "/", method=name) for name in ("PUT", "DELETE", "OPTIONS")} == {501}
 
 
 def test_server_closes_connections_beyond_its_limit(streams: Streams, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -87,11 +89,6 @@ def test_server_refuses_hosts_that_are_not_this_machine(streams: Streams) -> Non
     for host in ("no such host", "." * 300):
         with pytest.raises(NlosCamError, match=re.escape(host)):
             resolved(host)
-
-
-def test_server_refuses_other_paths_and_methods(server: ViewServer) -> None:
-    assert status_of(server.address, "/../secret") == status_of(server.address, "/", method="POST") == 404
-    assert {status_of(server.address, "/", method=name) for name in ("PUT", "DELETE", "OPTIONS")} == {501}
 
 
 def test_stream_lasts_until_it_is_ended(server: ViewServer, streams: Streams) -> None:

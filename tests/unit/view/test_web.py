@@ -54,7 +54,7 @@ def test_browsers_receive_bench_status_and_the_newest_moment(viewer: WebViewer) 
         assert found["bench"]["rig"] == RIG.name
 
 
-def test_bench_is_sent_again_once_it_was_measured() -> None:
+def test_measured_bench_is_sent_again_and_leaving_ends_streams() -> None:
     with WebViewer() as viewer:
         received = frames(viewer)
         assert next(each for each in received if each["kind"] == "status")["state"] == "running"
@@ -64,13 +64,6 @@ def test_bench_is_sent_again_once_it_was_measured() -> None:
         measured = next(each for each in received if each["kind"] == "bench")
         assert measured["calibration"][0][0] == "verdict"
         assert "wall_residual" in measured["arrays"]
-        received.close()
-
-
-def test_leaving_ends_streams_with_the_word_ended() -> None:
-    with WebViewer(RIG) as viewer:
-        received = frames(viewer)
-        next(received)
     assert list(received)[-1]["state"] == "ended"
 
 
@@ -218,16 +211,13 @@ def test_unpacked_message_is_the_packed_one(fields: dict[str, int], rows: int) -
         np.testing.assert_array_equal(found_arrays[name], array)
 
 
-def test_depth_bytes_keep_depth_to_a_step_and_holes() -> None:
+def test_bytes_keep_depth_to_a_step_and_differences_symmetric() -> None:
     depth_m = bump(0)
     counts = depth_bytes(depth_m, BOX.z_near_m, BOX.z_far_m)
     assert ((counts == 0) == np.isnan(depth_m)).all()
     step_m = (BOX.z_far_m - BOX.z_near_m) / 254
     found_m = BOX.z_near_m + (counts - 1.0) * step_m
     assert np.nanmax(np.abs(np.where(counts > 0, found_m, np.nan) - depth_m)) <= 0.51 * step_m
-
-
-def test_signed_bytes_are_symmetric_clipped_and_zero_for_nan() -> None:
     assert signed_bytes(np.array([-9.0, -1.0, 0.0, 1.0, 9.0, np.nan]), 1.0).tolist() == [1, 1, 128, 255, 255, 0]
 
 
@@ -243,15 +233,12 @@ def test_moment_message_holds_every_layer_and_lidar_pictures_if_requested() -> N
     assert {*arrays} - {*small} == {"lidar", "infrared", "change", "residual"}
 
 
-def test_uncertainty_is_sent_where_nothing_was_reconstructed() -> None:
+def test_moment_without_surface_sends_uncertainty_in_valid_json() -> None:
     shown = full_moment(0)
     empty = replace(shown, reconstruction=replace(shown.reconstruction, depth_m=NOTHING))
     _, arrays = unpack(MomentPacker(RIG).pack(empty))
     assert not arrays["depth"].any()
     assert arrays["error"].any()
-
-
-def test_bare_moment_and_odd_numbers_are_valid_json() -> None:
     shown = moment(0, NOTHING)
     dark = replace(shown, frame=replace(shown.frame, depth_m=np.full_like(shown.frame.depth_m, np.nan)))
     fields, arrays = unpack(MomentPacker(RIG).pack(dark))

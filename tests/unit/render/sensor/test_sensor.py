@@ -15,7 +15,7 @@ from pydantic import ValidationError
 from nlos_cam.errors import SceneError
 from nlos_cam.frames import maps_from_frame
 from nlos_cam.objects.placement import object_depth
-from nlos_cam.render import STOPS, MultiBounce, Radiometry, Rendering, Scene, Sensor, cast, render, sensor_effects
+from nlos_cam.render import STOPS, MultiBounce, Radiometry, Scene, Sensor, cast, render, sensor_effects
 from nlos_cam.render.geometry import SPEED_OF_LIGHT_M_PER_S
 from nlos_cam.render.sensor.bias import DepthBias, ripples, smooth_patches, texture
 from nlos_cam.render.sensor.cells import QUANTILES, draw_deviates, normal_quantiles
@@ -26,11 +26,6 @@ RIG, BARE = load_rig("paper-rig"), load_rig("bare-wall")
 QUIET = SensorModel(range_noise_m=0, range_noise_per_m=0, read_noise_counts=0, shot_noise=0, dead_share=0)
 DARK = np.zeros((64, 80), np.float32)
 NO_ECHO = MultiBounce(DARK, DARK, np.full_like(DARK, np.nan))
-
-
-@pytest.fixture(scope="module")
-def rendering() -> Rendering:
-    return render(Scene(RIG, object_depth(3, RIG.object_box)[1]))
 
 
 @pytest.mark.parametrize("counts", [48.0, 100.0])
@@ -220,10 +215,11 @@ def test_maps_without_noise_are_those_of_the_images_bit_for_bit(change: dict[str
             np.testing.assert_array_equal(getattr(found, name), getattr(expected, name))
 
 
-def test_maps_have_the_noise_of_the_images(rendering: Rendering) -> None:
+def test_maps_have_the_noise_of_the_images() -> None:
+    echoes = render(Scene(RIG, object_depth(3, RIG.object_box)[1])).multi
     sensor, frames = Sensor(RIG, SensorModel()), 40
-    exposed = [sensor.expose(rendering.multi, default_rng(k)).frame(RIG.pinhole) for k in range(frames)]
-    drawn = [sensor.maps(rendering.multi, default_rng(k)) for k in range(frames)]
+    exposed = [sensor.expose(echoes, default_rng(k)).frame(RIG.pinhole) for k in range(frames)]
+    drawn = [sensor.maps(echoes, default_rng(k)) for k in range(frames)]
     for name in ("depth_m", "intensity"):
         one, other = (np.stack([getattr(m, name) for m in maps]) for maps in (drawn, map(maps_from_frame, exposed)))
         variance = (one.var(0) + other.var(0)) / 2
