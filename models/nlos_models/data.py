@@ -81,6 +81,11 @@ class MapNoise:
         deviates = torch.randn(counts.shape, generator=generator, device=counts.device, dtype=counts.dtype)
         return (counts + self.deviation(counts) * deviates).clamp(min=0)
 
+    def expose(self, maps: "MapSet", seed: int) -> "MapSet":
+        """Return expected maps of depth as one exposure gives them; a cell without a return keeps its intensity."""
+        drawn = self.add(torch.from_numpy(maps.intensity), torch.Generator().manual_seed(seed)).numpy()
+        return replace(maps, intensity=np.where(np.isnan(maps.depth_m), maps.intensity, drawn))
+
 
 class MapBatch(NamedTuple):
     """Batch of maps, some of them mirrored."""

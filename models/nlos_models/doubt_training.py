@@ -18,7 +18,16 @@ from torch.nn import functional
 from nlos_models.arrays import Float16, Float32, Float64, Int64, Mask
 from nlos_models.data import flip_some, shuffled
 from nlos_models.doubt_network import MAX_ERROR_V, MIN_ERROR_V, DoubtNetwork, DoubtOutput
-from nlos_models.quality import GOOD_IOU, LEVELS, PRECISION, QualityEstimate, QualityModel, QualityRecord, normalised
+from nlos_models.quality import (
+    GOOD_IOU,
+    LEVELS,
+    OUTPUTS,
+    PRECISION,
+    QualityEstimate,
+    QualityModel,
+    QualityRecord,
+    normalised,
+)
 from nlos_models.recipe import Recipe
 from nlos_models.tasks import in_channels_last, parts_of
 from nlos_models.train import Running, Scores, fit
@@ -193,11 +202,12 @@ def _sigmoid(logits: Float64) -> Float64:
 
 FOLDS = 6
 """Groups of kinds that are left out in turn."""
-WIDTH, STEPS, BATCH, RATE, DECAY, DROPOUT = 32, 1200, 256, 5e-3, 1e-2, 0.1
+WIDTH, PASSES, MIN_STEPS, BATCH, RATE, DECAY = 32, 16, 1200, 256, 5e-3, 1e-2
+KINDS_WEIGHT = 0.2
 MIN_SPREAD = 1e-4
 """Of a figure that hardly differs between frames; it outlasts the rounding of the record."""
 MIN_TRUSTED = 20
-"""Fewest frames of left-out kinds from which a share of good ones is estimated."""
+"""Fewest frames of left-out objects from which a share of good ones is estimated."""
 CONFIDENCE = 1.645
 """Standard deviations of the one-sided 95 % limit (Wilson) that PRECISION is asked of."""
 
@@ -236,18 +246,30 @@ def left_out_folds(kinds: Sequence[str]) -> list[tuple[Int64, Int64]]:
     return folds
 
 
+def left_out_rows(count: int) -> list[tuple[Int64, Int64]]:
+    """Return (rows to fit, rows to judge) for each of FOLDS groups of rows at random, the same for a count."""
+    group = np.random.default_rng(0).integers(0, FOLDS, count)
+    return [(np.flatnonzero(group != fold), np.flatnonzero(group == fold)) for fold in range(FOLDS)]
+
+
 def fit_quality(samples: QualitySet, watches: str) -> QualityRecord:
-    """Fit a quality model; its threshold and figures come from kinds that were left out of further fits."""
-    count, outputs = len(samples.iou), len(LEVELS) + 2
-    raw = np.full((count, outputs), np.nan, np.float32)
-    for fitted, judged in left_out_folds(samples.kind.tolist()):
-        record = _fit(samples, fitted, watches)
-        raw[judged] = QualityModel(record).outputs(samples.figures[judged])
-    estimate = QualityEstimate.of(raw, None)
-    above = trusted_above(estimate.good, samples.iou >= GOOD_IOU, samples.generic)
-    figures = judged_figures(QualityEstimate.of(raw, above), samples)
+    """Fit a quality model; its threshold comes from objects, its figures from kinds, left out of further fits."""
+    good, count = samples.iou >= GOOD_IOU, len(samples.iou)
+    above = trusted_above(
+        QualityEstimate.of(_left_out(samples, left_out_rows(count), watches), None).good, good, samples.generic
+    )
+    outputs = _left_out(samples, left_out_folds(samples.kind.tolist()), watches)
+    figures = judged_figures(QualityEstimate.of(outputs, above), samples)
     whole = _fit(samples, np.arange(count), watches)
     return whole.model_copy(update={"trusted_above": above, "figures": figures})
+
+
+def _left_out(samples: QualitySet, folds: Sequence[tuple[Int64, Int64]], watches: str) -> Float32:
+    """Return the outputs (n, OUTPUTS) of models that were fitted without the objects they judge."""
+    outputs = np.full((len(samples.iou), OUTPUTS), np.nan, np.float32)
+    for fitted, judged in folds:
+        outputs[judged] = QualityModel(_fit(samples, fitted, watches)).outputs(samples.figures[judged])
+    return outputs
 
 
 def _fit(samples: QualitySet, rows: Int64, watches: str) -> QualityRecord:
@@ -256,21 +278,22 @@ def _fit(samples: QualitySet, rows: Int64, watches: str) -> QualityRecord:
     means, spreads = figures.mean(0), figures.std(0).clip(min=MIN_SPREAD)
     x = torch.from_numpy(normalised(figures, means, spreads))
     iou, error = torch.from_numpy(samples.iou[rows]), torch.from_numpy(samples.error_v[rows])
+    generic = torch.from_numpy(samples.generic[rows]).float()
     generator = torch.Generator().manual_seed(0)
     torch.manual_seed(0)
     network = nn.Sequential(
         nn.Linear(x.shape[1], WIDTH),
         nn.ReLU(),
-        nn.Dropout(DROPOUT),
         nn.Linear(WIDTH, WIDTH),
         nn.ReLU(),
-        nn.Linear(WIDTH, len(LEVELS) + 2),
+        nn.Linear(WIDTH, OUTPUTS),
     )
     optimizer = torch.optim.AdamW(network.parameters(), RATE, weight_decay=DECAY)
-    schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, RATE, STEPS)
-    for _ in range(STEPS):
+    steps = max(MIN_STEPS, PASSES * len(x) // BATCH)
+    schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, RATE, steps)
+    for _ in range(steps):
         some = torch.randint(0, len(x), (BATCH,), generator=generator)
-        loss = quality_loss(network(x[some]), iou[some], error[some])
+        loss = quality_loss(network(x[some]), iou[some], error[some], generic[some])
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()
@@ -283,12 +306,22 @@ def _fit(samples: QualitySet, rows: Int64, watches: str) -> QualityRecord:
     )
 
 
-def quality_loss(output: Tensor, iou: Tensor, error_v: Tensor) -> Tensor:
-    """Return the quantile losses of the IoU, the cross-entropy of a good one, and the error's Laplace likelihood."""
+def quality_loss(output: Tensor, iou: Tensor, error_v: Tensor, generic: Tensor) -> Tensor:
+    """Return the quantile losses of the IoU, the cross-entropies of the probabilities, and the error's likelihood.
+
+    In the quantiles one of the 18 kinds counts KINDS_WEIGHT: a user's object is seldom one.
+    Whether an outline is good is learnt apart for generic shapes and for the 18 kinds: a confident answer is nearly
+    always right on a kind that the networks have learnt, and often wrong on a shape that merely looks like one.
+    """
     level = torch.tensor(LEVELS)
     off = iou[:, None] - torch.sigmoid(output[:, : len(LEVELS)])
-    loss = 10 * torch.maximum(level * off, (level - 1) * off).mean()
-    loss = loss + functional.binary_cross_entropy_with_logits(output[:, -2], (iou >= GOOD_IOU).float())
+    good, kinds = (iou >= GOOD_IOU).float(), 1 - generic
+    weight = generic + KINDS_WEIGHT * kinds
+    loss = 10 * (torch.maximum(level * off, (level - 1) * off).mean(1) * weight).sum() / weight.sum()
+    shares = (good, generic), (good, kinds), (kinds, torch.ones_like(kinds))
+    for logit, (truth, counts) in zip(output[:, len(LEVELS) : -1].unbind(1), shares, strict=True):
+        entropy = functional.binary_cross_entropy_with_logits(logit, truth, reduction="none")
+        loss = loss + (entropy * counts).sum() / counts.sum().clamp(min=1)
     known = ~torch.isnan(error_v)
     log_error, error = output[known, -1], error_v[known]
     return loss + 0.3 * (log_error + error * torch.exp(-log_error)).mean()
@@ -297,13 +330,12 @@ def quality_loss(output: Tensor, iou: Tensor, error_v: Tensor) -> Tensor:
 def trusted_above(good: Float32, is_good: Mask, generic: Mask) -> float | None:
     """Return the least probability from which on at least PRECISION of each share's frames are good; None for none.
 
-    Judged by the lower 95 % limit over all frames, and by the share itself for generic shapes and for the 18 kinds.
+    Judged by the lower 95 % limit over all frames, over generic shapes and over the 18 kinds.
     """
     for above in np.unique(good.round(3)):
         chosen = good >= above
-        shares = [is_good[chosen & share] for share in (generic, ~generic)]
-        sure = chosen.sum() >= MIN_TRUSTED and lower_limit(is_good[chosen]) >= PRECISION
-        if sure and all(each.mean() >= PRECISION for each in shares if each.size):
+        shares = [is_good[chosen & share] for share in (np.ones_like(generic), generic, ~generic)]
+        if chosen.sum() >= MIN_TRUSTED and all(lower_limit(each) >= PRECISION for each in shares if each.size):
             return float(above)
     return None
 

@@ -12,7 +12,7 @@ from nlos_models import records
 from nlos_models.arrays import Float32
 from nlos_models.errors import CheckpointError, MissingExtraError, lacks_memory, require
 from nlos_models.files import TENSOR_LIMIT, load_cached, read_checked
-from nlos_models.quality import DOUBT_FILES, QualityModel, load_quality_model
+from nlos_models.quality import DOUBT_FILES, QualityModel, UncertaintyEstimate, load_quality_model
 from nlos_models.recipe import SIMULATION_ONLY
 
 MAP_SHAPE = (64, 80)
@@ -71,19 +71,6 @@ class OnnxReconstructor:
     def answer(self, depth_m: Float32, intensity: Float32) -> Answer:
         inputs = {"depth_m": np.ascontiguousarray(depth_m), "intensity": np.ascontiguousarray(intensity)}
         return Answer(*self._session.run(None, inputs))
-
-
-class UncertaintyEstimate(NamedTuple):
-    """Calibrated uncertainty of n reconstructions."""
-
-    p_empty: Float32
-    """(n,): probability that nothing is hidden."""
-    p_out_of_distribution: Float32
-    """(n,): probability that the hidden object is unlike the training objects."""
-    error_v: Float32
-    """(n, 64, 64): expected absolute error in v, given a surface."""
-    p_surface: Float32
-    """(n, 64, 64): probability that there is a surface."""
 
 
 class UncertaintyModel(Protocol):

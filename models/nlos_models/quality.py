@@ -9,7 +9,7 @@ import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Self
+from typing import NamedTuple, Self
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
@@ -18,9 +18,6 @@ from nlos_models.arrays import Float32, Mask
 from nlos_models.errors import CheckpointError, first_problem
 from nlos_models.files import TEXT_LIMIT, read_checked, write_checked
 from nlos_models.records import DOUBT, DOUBT_RECORD, checksum_of_watched
-
-if TYPE_CHECKING:
-    from nlos_models.inference import UncertaintyEstimate
 
 QUALITY = "quality.json"
 DOUBT_FILES = f"{DOUBT}.safetensors", DOUBT_RECORD
@@ -32,8 +29,27 @@ OUTLINES = 0.1, 0.3, 0.5, 0.7, 0.9
 """Probabilities of a surface whose outlines are compared with the image's."""
 FEATURES, WITH_SURFACE = 35, 54
 """Figures without and with the reconstructing network's own probability of a surface."""
+OUTPUTS = len(LEVELS) + 4
+"""Logits of the IoU's quantiles, of a good outline on any shape and on one of the 18 kinds, and of such a kind; then
+the logarithm of the depth error. Older records have two fewer, and do not tell the kinds apart."""
+KINDS_ODDS = 0.03
+"""Factor on the fit's odds of one of the 18 kinds: a user's object is seldom one, and the networks read kinds into
+other shapes."""
 CLIP = 4.0
 """Limit of a normalised figure, in spreads: a strange frame is not extrapolated to."""
+
+
+class UncertaintyEstimate(NamedTuple):
+    """Calibrated uncertainty of n reconstructions."""
+
+    p_empty: Float32
+    """(n,): probability that nothing is hidden."""
+    p_out_of_distribution: Float32
+    """(n,): probability that the hidden object is unlike the training objects."""
+    error_v: Float32
+    """(n, 64, 64): expected absolute error in v, given a surface."""
+    p_surface: Float32
+    """(n, 64, 64): probability that there is a surface."""
 
 
 class QualityRecord(BaseModel):
@@ -61,7 +77,7 @@ class QualityEstimate:
     iou: Float32
     """(n, 3): quantiles of the silhouette IoU at LEVELS, rising."""
     good: Float32
-    """(n,): probability that the IoU is at least GOOD_IOU."""
+    """(n,): probability that the IoU is at least GOOD_IOU, for an object that is seldom one of the 18 kinds."""
     error_v: Float32
     """(n,): expected mean absolute error of v where image and truth both have a surface."""
     trusted: Mask
@@ -69,8 +85,11 @@ class QualityEstimate:
 
     @classmethod
     def of(cls, outputs: Float32, trusted_above: float | None) -> Self:
-        """Return the estimate of a model's outputs (n, 5); without a threshold no frame is trusted."""
-        iou, good = np.sort(_sigmoid(outputs[:, : len(LEVELS)]), 1), _sigmoid(outputs[:, -2])
+        """Return the estimate of a model's outputs (n, OUTPUTS); without a threshold no frame is trusted."""
+        iou, good = np.sort(_sigmoid(outputs[:, : len(LEVELS)]), 1), _sigmoid(outputs[:, len(LEVELS)])
+        if outputs.shape[1] == OUTPUTS:
+            of_kind, known = _sigmoid(outputs[:, -3]), _sigmoid(outputs[:, -2] + np.float32(np.log(KINDS_ODDS)))
+            good = (known * of_kind + (1 - known) * good).astype(np.float32)
         return cls(iou, good, np.exp(outputs[:, -1]), good >= (np.inf if trusted_above is None else trusted_above))
 
 
@@ -84,7 +103,7 @@ class QualityModel:
         )
 
     def __call__(
-        self, image: Float32, estimate: "UncertaintyEstimate", surface: Float32 | None = None
+        self, image: Float32, estimate: UncertaintyEstimate, surface: Float32 | None = None
     ) -> QualityEstimate:
         """Return the quality of images (n, 64, 64) in v with their uncertainty.
 
@@ -98,7 +117,7 @@ class QualityModel:
         return QualityEstimate.of(self.outputs(figures), self.record.trusted_above)
 
     def outputs(self, figures: Float32) -> Float32:
-        """Return the network's outputs (n, 5) for figures of n frames: logits of LEVELS and `good`, log error."""
+        """Return the network's outputs (n, OUTPUTS) for figures of n frames."""
         x = normalised(figures, self._means, self._spreads)
         for number, layer in enumerate(self._layers):
             x = (np.maximum(x, 0.0) if number else x) @ layer[:-1] + layer[-1]
@@ -110,7 +129,7 @@ def normalised(figures: Float32, means: Float32, spreads: Float32) -> Float32:
     return ((figures - means) / spreads).clip(-CLIP, CLIP)
 
 
-def quality_features(image: Float32, estimate: "UncertaintyEstimate", surface: Float32 | None = None) -> Float32:
+def quality_features(image: Float32, estimate: UncertaintyEstimate, surface: Float32 | None = None) -> Float32:
     """Return the figures (n, FEATURES or WITH_SURFACE) that a quality is predicted from; all are finite.
 
     `surface` (n, 64, 64) is the reconstructing network's probability of a surface. Figures are the same for the
@@ -229,4 +248,4 @@ def _fits(record: QualityRecord) -> bool:
         if len(size) != 2 or size[0] != inputs + 1:
             return False
         inputs = size[1]
-    return inputs == len(LEVELS) + 2
+    return inputs in {OUTPUTS, OUTPUTS - 2}

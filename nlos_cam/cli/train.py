@@ -292,7 +292,9 @@ def quality(
     if doubter is None:
         raise SceneError(f"{weights} has no uncertainty network: train one with `train doubt`")
     with interrupted_by_signals(), tracked("reconstructing") as on_progress:
-        samples = data_sets.quality_set(pipeline, doubter, data_sets.open_dataset(data), objects, on_progress)
+        samples = data_sets.quality_set(
+            pipeline, doubter, data_sets.open_dataset(data, expected=True), objects, on_progress
+        )
     record = models.fit_quality(samples, models.quality_watches(weights))
     models.write_quality(weights, record)
     values = {name: value for name, value in record.figures.items() if name.startswith("all_")}

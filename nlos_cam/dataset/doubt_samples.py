@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from nlos_cam.dataset import outliers
 from nlos_cam.dataset.build import HELD_OUT_SEED, TRAINING_SEED
+from nlos_cam.dataset.packed import map_noise
 from nlos_cam.dataset.reader import Dataset
 from nlos_cam.dataset.samples import OnProgress, cached_sensor, ignore
 from nlos_cam.errors import SceneError
@@ -216,7 +217,7 @@ def quality_set(
     objects: int,
     on_progress: OnProgress,
 ) -> models.QualitySet:
-    """Return figures and true quality of the reconstructions of a dataset's first objects.
+    """Return figures and true quality of the reconstructions of a dataset's first objects; expected maps get noise.
 
     Raises SceneError where weights and dataset do not fit together.
     """
@@ -224,9 +225,11 @@ def quality_set(
         raise SceneError("the quality model needs raw maps of the weights' own rig: use another --dataset or --weights")
     figures, iou, error_v, done = list[Float32](), list[Float32](), list[Float32](), 0
     kinds = dataset.column("category").astype(np.str_)[:objects]
-    for maps in dataset.chunks():
+    noise = map_noise(dataset.plan) if dataset.plan.expected else None
+    for expected in dataset.chunks():
         if done == len(kinds):
             break
+        maps = noise.expose(expected, done) if noise else expected
         for part in models.parts_of(np.arange(min(len(maps.image), len(kinds) - done))):
             depth_m, intensity, truth = maps.depth_m[part], maps.intensity[part], maps.image[part].astype(np.float32)
             image, surface = models.ask(pipeline, depth_m, intensity)

@@ -127,9 +127,7 @@ def test_train_vae_leaves_out_categories_of_recipe(go: Run, folder: Path, monkey
     assert shown == [{*CATEGORIES, "0.25"} - {"car", "boat"}] * 2
 
 
-def test_interrupted_train_exits_130_and_resumes_to_same_weights(
-    go: Run, folder: Path, out: Path, monkeypatch: Patch
-) -> None:
+def test_interrupted_train_exits_130_and_resumes_exactly(go: Run, folder: Path, out: Path, monkeypatch: Patch) -> None:
     stop, messages = Event(), list[str]()
     stop.set()
     with monkeypatch.context() as patch:
@@ -159,9 +157,7 @@ def test_train_compressor_uses_shipped_vae_and_streams(
 
 
 @pytest.mark.slow
-def test_joint_weights_keep_encoder_and_one_step_weights_have_none(
-    go: Run, folder: Path, out: Path, monkeypatch: Patch
-) -> None:
+def test_joint_keeps_encoder_and_one_step_has_none(go: Run, folder: Path, out: Path, monkeypatch: Patch) -> None:
     monkeypatch.setattr(runs, "export_folder", models.export_folder)
     go("joint", "--weights", folder / "two")
     assert (out / "network.onnx").is_file()
@@ -269,7 +265,7 @@ def test_train_quality_replaces_a_damaged_model(tmp_path: Path, monkeypatch: Pat
     monkeypatch.setattr("nlos_models.load_reconstructor", lambda *_: None)
     monkeypatch.setattr("nlos_cam.dataset.open_dataset", lambda *_, **__: None)
     monkeypatch.setattr("nlos_cam.dataset.quality_set", lambda *_: known)
-    monkeypatch.setattr("nlos_models.doubt_training.STEPS", 20)
+    monkeypatch.setattr("nlos_models.doubt_training.MIN_STEPS", 20)
     answer = run("train", "quality", "--weights", weights, "--dataset", tmp_path)
     assert (answer["weights"], answer["objects"]) == (str(weights), 120)
     assert models.load_uncertainty_model(weights, tmp_path).quality.record.objects == 120

@@ -87,6 +87,10 @@ def test_expected_maps_with_drawn_noise_have_the_law_of_exposures() -> None:
     counts = torch.expm1(drawn[:, 1] + normal.median[1])
     ratio = intensity.std(0) / counts.std(0, correction=0).numpy()
     assert 0.97 < np.nanmedian(ratio) < 1.03
+    one = MapSet(*(each[None] for each in (expected.depth_m, expected.intensity, np.zeros((64, 64), np.float16))))
+    spread = np.stack([map_noise(PLAN).expose(one, seed).intensity[0] for seed in range(60)]).std(0)
+    assert 0.97 < np.median((intensity.std(0) / spread)[~np.isnan(expected.depth_m)]) < 1.03
+    np.testing.assert_array_equal(spread[np.isnan(expected.depth_m)], 0)
 
 
 def test_expected_samples_differ_from_exposures_by_noise_alone_and_cells_without_a_return_do_not_vary() -> None:

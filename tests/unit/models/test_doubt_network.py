@@ -228,7 +228,7 @@ def known_objects(count: int, best: float = 1.0) -> QualitySet:
 
 @pytest.fixture(autouse=True)
 def _short(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(doubt_training, "STEPS", 150)
+    monkeypatch.setattr(doubt_training, "MIN_STEPS", 150)
     monkeypatch.setattr(doubt_training, "FOLDS", 2)
 
 
@@ -295,6 +295,25 @@ def test_trust_needs_good_outlines_enough_frames_and_precision_in_both_shares() 
     record = fit_quality(samples := known_objects(200, best=0.7), "0" * 12)
     assert record.trusted_above is None
     assert not QualityEstimate.of(QualityModel(record).outputs(samples.figures), None).trusted.any()
+
+
+def test_good_outline_of_a_kind_counts_where_the_kind_is_sure_and_older_records_know_no_kinds() -> None:
+    outputs = np.zeros((3, quality.OUTPUTS), np.float32)
+    outputs[:, 3:6] = [(-9, 9, known) for known in (12, 0, -9)]
+    assert QualityEstimate.of(outputs, 0.9).trusted.tolist() == [True, False, False]
+    assert QualityEstimate.of(outputs, None).good[1] == pytest.approx(quality.KINDS_ODDS, rel=0.05)
+    older = QualityEstimate.of(outputs[:, [0, 1, 2, 4, 6]], 0.9)
+    assert older.trusted.all()
+
+
+def test_shape_that_looks_like_a_kind_is_not_trusted() -> None:
+    samples = known_objects(4000)
+    samples.iou[samples.generic] *= 0.7  # the same first figure, and never a good outline
+    samples.figures[:, 1] = np.where(samples.generic, -1, 1) + 0.3 * samples.figures[:, 1]
+    record = fit_quality(samples, "0" * 12)
+    found = QualityEstimate.of(QualityModel(record).outputs(samples.figures), record.trusted_above)
+    assert found.trusted[~samples.generic].sum() > 100
+    assert not found.trusted[samples.generic].any()
 
 
 def record_of(**values: object) -> QualityRecord:
