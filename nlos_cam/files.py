@@ -7,11 +7,11 @@ from collections.abc import Generator
 from contextlib import contextmanager
 from pathlib import Path
 
-from nlos_models import atomic_file, claim, load_cached, reservations, sync_folder
+from nlos_models import FileBusyError, atomic_file, claim, load_cached, reservations, sync_folder
 
 from nlos_cam.errors import OutputExistsError
 
-__all__ = ["atomic_directory", "atomic_file", "cache_folder", "claim", "load_cached", "reservations"]
+__all__ = ["FileBusyError", "atomic_directory", "atomic_file", "cache_folder", "claim", "load_cached", "reservations"]
 AT_FDCWD, RENAME_EXCHANGE = -100, 2
 """Of Linux' renameat2."""
 

@@ -44,9 +44,9 @@ __all__ = [
 ]
 
 from .l515 import DeviceInfo, connected, find_l515, shared_context
-from .protocol import Camera, WallClock
+from .protocol import Camera, OnProgress, WallClock
 from .recorder import RESERVE_BYTES, Recording, check_room, free_bytes, recording_s, repair_command
-from .registry import NAMES, SIMULATED, OnProgress, Reader, full_uri, open_camera
+from .registry import NAMES, SIMULATED, Reader, full_uri, open_camera
 from .sdk import MAC_WHEEL, WHEEL, load_sdk
 from .session import SampleQueue, Session, find_streams
 from .simulated import SimulatedCamera, SoftwareLidar

@@ -2,13 +2,16 @@
 
 import time
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from threading import Event
 from typing import Protocol, Self
 
 from nlos_calibration import Intrinsics, Rig
 
 from nlos_cam.frames import Frame
+
+OnProgress = Callable[[int, int], None]
+"""Called with the poses rendered so far and in all, while a simulated world is pre-rendered."""
 
 
 class Camera(Protocol):

@@ -14,11 +14,10 @@ from threading import Event
 from typing import Any
 
 from nlos_calibration import Intrinsics
-from nlos_models import FileBusyError
 
 from nlos_cam.camera.streams import BYTES_PER_PIXEL, FRAMES_PER_S, SAME_INSTANT_S, FrameSet
 from nlos_cam.errors import DiskFullError, OutputExistsError, RecordingError
-from nlos_cam.files import claim
+from nlos_cam.files import FileBusyError, claim
 
 RESERVE_BYTES = 200_000_000
 """Disk space that a recording leaves free: five seconds of 640 x 480, and its index."""

@@ -1,18 +1,14 @@
 """Cameras by name, from backends that are imported when used; simulation is never a silent fallback."""
 
-from collections.abc import Callable
 from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
-from nlos_cam.camera.protocol import Camera
+from nlos_cam.camera.protocol import Camera, OnProgress
 from nlos_cam.errors import NlosCamError, UnknownCameraError, did_you_mean
 
 if TYPE_CHECKING:
     from nlos_cam.camera.recorder import Recording
-
-OnProgress = Callable[[int, int], None]
-"""Called with the poses rendered so far and in all, while a simulated world is pre-rendered."""
 
 Reader = Literal["plain", "sdk"]
 

@@ -10,7 +10,7 @@ from nlos_calibration import Rig
 from nlos_calibration.arrays import Float32
 
 from nlos_cam import render as renderer
-from nlos_cam.camera.registry import OnProgress
+from nlos_cam.camera.protocol import OnProgress
 from nlos_cam.camera.streams import FRAMES_PER_S
 from nlos_cam.files import cache_folder, load_cached
 

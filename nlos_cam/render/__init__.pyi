@@ -74,12 +74,11 @@ from .accuracy_search import (
     least_seconds,
     sample_beams,
 )
-from .backend_numba import histograms
 from .backend_torch import device_named, histograms_of_all
 from .echoes import MultiBounce
 from .effects import EFFECTS, Effects, included
 from .geometry import cast
-from .glossy import glossy_basis
+from .glossy import glossy_basis, histograms
 from .gradients import DepthBound, Gradients, PoseFit, SceneVector, depth_bound, fit_pose, intensity_noise, moved
 from .job import TransportJob
 from .material import Material, Surface, phong, retroreflective

@@ -19,7 +19,6 @@ from nlos_calibration.arrays import Float32, Float64, Int32, Int64
 from numpy.typing import NDArray
 
 from nlos_cam.frames import inner, int64
-from nlos_cam.render.brdf_table import nodes, scattering
 from nlos_cam.render.echoes import MultiBounce, strongest, strongest_between
 from nlos_cam.render.interreflection import add_interreflection
 from nlos_cam.render.job import TransportJob
@@ -301,36 +300,20 @@ ROUNDED = np.float32(1.001)
 
 
 def histograms(job: TransportJob) -> Float32:
-    """Return histograms (n, bins) of I_multi over path length, for the job's beams.
+    """Return histograms (n, bins) of I_multi over path length, for the beams of a job without a BRDF.
 
     The result does not depend on the number of threads: one thread sums each histogram, patches in order.
     """
-    numba_job = NumbaJob(job)
-    if job.brdf is None:
-        return numba_job.histograms(np.empty((0, 0), np.float32), np.ones(len(job.laser_spot_m)))
-    from nlos_cam.render import glossy  # imports this file
-
-    if not job.more_bounces and (functions := glossy.glossy_basis(job, job.brdf)) is not None:
-        return glossy.histograms(numba_job, functions)
-    total = np.zeros((len(job.laser_spot_m), job.bins), np.float32)
-    for foot, share in nodes(job, job.brdf):
-        factor = scattering(job.brdf)(foot, job.patches.point_m, job.patches.normal, job.relay.x_m, job.relay.y_m)
-        total += numba_job.histograms(factor.astype(np.float32), share)
-    return total
+    return NumbaJob(job).histograms(np.empty((0, 0), np.float32), np.ones(len(job.laser_spot_m)))
 
 
 def echoes(job: TransportJob) -> MultiBounce:
     """Return the strongest bins (n,) of the job's beams: those of `histograms`, bit for bit, from a part of its work.
 
     Each beam sums its first bins alone, with a bound on all others; the few beams that the bound does not decide sum
-    the rest too. A BRDF without few eigenfunctions needs whole histograms.
+    the rest too.
     """
     numba_job = NumbaJob(job)
-    if job.brdf is not None:
-        from nlos_cam.render import glossy
-
-        functions = None if job.more_bounces else glossy.glossy_basis(job, job.brdf)
-        return glossy.echoes(numba_job, functions) if functions else strongest(histograms(job), job.bin_m)
     every = numba_job.feet(np.ones(len(job.laser_spot_m)))
     table = numba_job.tables(np.empty((0, 0), np.float32))
     winner, peak, second, sure = _strongest_in_window(every, *numba_job.sites, table, job.bins)

@@ -15,8 +15,9 @@ import numpy as np
 from nlos_calibration.arrays import Float32, Float64, Int64
 from numpy.typing import NDArray
 
+from nlos_cam.render import backend_numba
 from nlos_cam.render.backend_numba import ROUNDED, NumbaJob, NumbaTables, ends, returns
-from nlos_cam.render.brdf_table import scattered
+from nlos_cam.render.brdf_table import nodes, scattered, scattering
 from nlos_cam.render.echoes import MultiBounce, strongest
 from nlos_cam.render.job import TransportJob
 from nlos_cam.render.legs import (
@@ -297,7 +298,7 @@ def _sums(
     return begin.astype(np.int64), np.maximum(sums, 0), bound * np.float32(functions.largest)
 
 
-def histograms(numba_job: NumbaJob, functions: Basis, which: Any = slice(None)) -> Float32:
+def _histograms(numba_job: NumbaJob, functions: Basis, which: Any = slice(None)) -> Float32:
     """Return histograms (n, bins) of I_multi over path length, for some of the job's beams."""
     job, table = numba_job.job, numba_job.tables(np.empty((0, 0), np.float32))
     share = np.zeros(len(job.laser_spot_m))
@@ -310,8 +311,8 @@ def histograms(numba_job: NumbaJob, functions: Basis, which: Any = slice(None)) 
     return found
 
 
-def echoes(numba_job: NumbaJob, functions: Basis) -> MultiBounce:
-    """Return the strongest bins (n,) of the job's beams: those of `histograms`, bit for bit, for less work."""
+def _echoes(numba_job: NumbaJob, functions: Basis) -> MultiBounce:
+    """Return the strongest bins (n,) of the job's beams: those of `_histograms`, bit for bit, for less work."""
     job, table = numba_job.job, numba_job.tables(np.empty((0, 0), np.float32))
     begin, sums, bound = _sums(
         numba_job, numba_job.feet(np.ones(len(job.laser_spot_m))), table, functions, first_only=True
@@ -320,6 +321,34 @@ def echoes(numba_job: NumbaJob, functions: Basis) -> MultiBounce:
     found = strongest(np.where((at >= 0) & (at < job.bins), sums, 0), job.bin_m)
     found.path_m[:] = ((found.path_m / job.bin_m - 0.5).round() + begin + 0.5) * job.bin_m
     if (unsure := np.flatnonzero(bound * ROUNDED > found.runner_up)).size:
-        rest = strongest(histograms(numba_job, functions, unsure), job.bin_m)
+        rest = strongest(_histograms(numba_job, functions, unsure), job.bin_m)
         found.peak[unsure], found.runner_up[unsure], found.path_m[unsure] = rest.peak, rest.runner_up, rest.path_m
     return found
+
+
+def histograms(job: TransportJob) -> Float32:
+    """Return histograms (n, bins) of I_multi over path length, for the beams of a job with any BRDF or none.
+
+    A BRDF without few eigenfunctions has a table for each of some directions of incoming light instead.
+    """
+    if job.brdf is None:
+        return backend_numba.histograms(job)
+    numba_job = NumbaJob(job)
+    if not job.more_bounces and (functions := glossy_basis(job, job.brdf)) is not None:
+        return _histograms(numba_job, functions)
+    total = np.zeros((len(job.laser_spot_m), job.bins), np.float32)
+    for foot, share in nodes(job, job.brdf):
+        factor = scattering(job.brdf)(foot, job.patches.point_m, job.patches.normal, job.relay.x_m, job.relay.y_m)
+        total += numba_job.histograms(factor.astype(np.float32), share)
+    return total
+
+
+def echoes(job: TransportJob) -> MultiBounce:
+    """Return the strongest bins (n,) of the job's beams: those of `histograms`, bit for bit, from a part of its work.
+
+    A BRDF without few eigenfunctions needs whole histograms.
+    """
+    if job.brdf is None:
+        return backend_numba.echoes(job)
+    functions = None if job.more_bounces else glossy_basis(job, job.brdf)
+    return _echoes(NumbaJob(job), functions) if functions else strongest(histograms(job), job.bin_m)

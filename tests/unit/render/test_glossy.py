@@ -58,11 +58,11 @@ def test_a_lobe_too_sharp_for_the_limit_has_no_basis(monkeypatch: pytest.MonkeyP
 @pytest.mark.parametrize("sub_bins", [1, 8])
 def test_echoes_are_strongest_bins_of_histograms_bit_for_bit(sub_bins: int, monkeypatch: pytest.MonkeyPatch) -> None:
     job = replace(JOB.select(np.arange(0, len(JOB.length_m), 9)), accuracy=replace(COARSE, sub_bins=sub_bins))
-    whole = backend_numba.histograms(job)
+    whole = glossy.histograms(job)
     assert whole.min() >= 0
     monkeypatch.setattr(glossy, "TABLE_BYTES", 1)  # patches in several blocks
     for factor in (backend_numba.ROUNDED, np.float32(np.inf)):  # with bounds of infinity no window decides
         monkeypatch.setattr(glossy, "ROUNDED", factor)
-        found, best = backend_numba.echoes(job), strongest(whole, job.bin_m)
+        found, best = glossy.echoes(job), strongest(whole, job.bin_m)
         for name in ("peak", "runner_up", "path_m"):
             np.testing.assert_array_equal(getattr(found, name), getattr(best, name))
