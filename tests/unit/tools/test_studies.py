@@ -115,7 +115,7 @@ def test_rig_map_has_a_cell_for_every_place(tool: Tool, run: Read, weights: list
     table = run("weights rigs --weights", "rig_map", f"plate={weights[0]}")
     assert [(cell["distance_m"], cell["yaw_deg"]) for cell in table["cells"]] == [(0.2, 15.0), (0.2, 45.0)]
     assert set(table["cells"][0]["weights"]["plate"]) >= set(TARGETS)
-    assert [set(one["weights"]) for one in table["benches"]] == [{"plate", "plate, not aligned"}]
+    assert [set(one["weights"]) for one in table["benches"]] == [{"plate", "plate, record off", "plate, not aligned"}]
 
 
 def test_transfer_curve_trains_on_nested_sets(tool: Tool, monkeypatch: Patch) -> None:
