@@ -1,8 +1,10 @@
+from typing import Any
+
 import numpy as np
 import pytest
 from nlos_calibration import MeanNoise, depth_noise_m, load_rig
 from nlos_calibration.errors import OccluderRefusedError
-from nlos_calibration.occluder import MAX_BEHIND, OccluderFit, find_edge, find_occluder
+from nlos_calibration.occluder import MAX_BEHIND, OccluderFit, SheetFit, find_edge, find_occluder
 from numpy.typing import NDArray
 from synthetic_scenes import Sheet, ball, bench_depth
 
@@ -35,6 +37,18 @@ def fitted(seen: View, depth_m: NDArray[np.float64], **stds: float) -> OccluderF
 def found(sheet: Sheet | None, yaw_deg: float = 45.0, **stds: float) -> OccluderFit:
     seen = view(0.2, yaw_deg, 0.0, PINHOLE)
     return fitted(seen, noisy(bench_depth(seen, sheet)), **stds)
+
+
+def test_sheet_propagates_uncertainty_by_its_derivatives() -> None:
+    normal, step = np.array([2.0, 0.3, -0.4]), 1e-6
+    none: Any = None
+    sheets = [SheetFit(none, normal + shift, np.eye(3), np.array([0.1, 0.2, 0.9])) for shift in step * np.eye(4, 3, -1)]
+    for std, values in (
+        (sheets[0].x_std_m(0.3), [sheet.x_m(0.3) for sheet in sheets]),
+        (sheets[0].lean_std, [sheet.lean for sheet in sheets]),
+    ):
+        gradient = (np.array(values[1:]) - values[0]) / step
+        assert std == pytest.approx(np.linalg.norm(gradient), rel=1e-4)
 
 
 def test_find_occluder_finds_the_papers_to_half_a_pixel() -> None:
