@@ -81,10 +81,15 @@ class MapNoise:
         deviates = torch.randn(counts.shape, generator=generator, device=counts.device, dtype=counts.dtype)
         return (counts + self.deviation(counts) * deviates).clamp(min=0)
 
+    def draw(self, depth_m: Tensor, intensity: Tensor, generator: torch.Generator) -> Tensor:
+        """Return the intensities of expected maps with noise drawn; a cell without a return keeps its own."""
+        drawn, nowhere = self.add(intensity, generator), depth_m.isnan()
+        return torch.where(nowhere[:, None] if drawn.dim() == 4 else nowhere, intensity, drawn)
+
     def expose(self, maps: "MapSet", seed: int) -> "MapSet":
-        """Return expected maps of depth as one exposure gives them; a cell without a return keeps its intensity."""
-        drawn = self.add(torch.from_numpy(maps.intensity), torch.Generator().manual_seed(seed)).numpy()
-        return replace(maps, intensity=np.where(np.isnan(maps.depth_m), maps.intensity, drawn))
+        """Return expected maps as one exposure gives them."""
+        depth_m, intensity = torch.from_numpy(maps.depth_m), torch.from_numpy(maps.intensity)
+        return replace(maps, intensity=self.draw(depth_m, intensity, torch.Generator().manual_seed(seed)).numpy())
 
 
 class MapBatch(NamedTuple):
@@ -170,9 +175,7 @@ class WithNoise:
     def batches(self, batch: int, generator: torch.Generator) -> Iterator[MapBatch]:
         """Yield one epoch; a cell without a return keeps its intensity."""
         for plain in self.source.batches(batch, generator):
-            drawn, nowhere = self.noise.add(plain.intensity, generator), plain.depth_m.isnan()
-            nowhere = nowhere[:, None] if drawn.dim() == 4 else nowhere
-            yield plain._replace(intensity=torch.where(nowhere, plain.intensity, drawn))
+            yield plain._replace(intensity=self.noise.draw(plain.depth_m, plain.intensity, generator))
 
 
 def first_of(maps: MapSet, count: int) -> MapSet:

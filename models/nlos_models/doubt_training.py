@@ -201,9 +201,10 @@ def _sigmoid(logits: Float64) -> Float64:
 
 
 FOLDS = 6
-"""Groups of kinds that are left out in turn."""
+"""Groups of kinds, or of objects, that are left out in turn."""
 WIDTH, PASSES, MIN_STEPS, BATCH, RATE, DECAY = 32, 16, 1200, 256, 5e-3, 1e-2
 KINDS_WEIGHT = 0.2
+"""Of one of the 18 kinds in the quantiles of the IoU; a generic shape counts 1."""
 MIN_SPREAD = 1e-4
 """Of a figure that hardly differs between frames; it outlasts the rounding of the record."""
 MIN_TRUSTED = 20
