@@ -4,20 +4,19 @@ Workers make samples and one process writes them. A shard appears under its name
 again makes only missing or damaged shards. A sample depends on its seed alone, so any workers make equal shards.
 """
 
-import signal
 import time
+from collections import deque
 from collections.abc import Callable, Container, Generator, Iterable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
-from concurrent.futures.process import BrokenProcessPool
 from contextlib import closing
 from dataclasses import dataclass
-from multiprocessing import active_children, get_context
+from multiprocessing.connection import Connection
+from multiprocessing.connection import wait as wait_for_any
 from pathlib import Path
 
 from nlos_cam.dataset.plan import DatasetPlan
-from nlos_cam.dataset.samples import OnProgress, Samples, ignore, join_samples, make_samples
+from nlos_cam.dataset.samples import OnProgress, Samples, ignore, join_samples
 from nlos_cam.dataset.shards import SHARD_PATTERN, Shard, check_arrays, only_builder, read_head, shard_path, store
-from nlos_cam.dataset.worker import begin_worker
+from nlos_cam.dataset.worker import Worker
 from nlos_cam.errors import OutputExistsError, RecordingError, WorkersLostError
 
 TRAINING_SEED, HELD_OUT_SEED, TEST_SEED = 0, 10_000_000, 20_000_000
@@ -146,52 +145,29 @@ def _store_shards(
 
 
 def processes(workers: int) -> Farm:
-    """Return a farm of processes on this machine, which replaces dead workers as long as pieces get made."""
+    """Return a farm of processes on this machine; dead ones are replaced, until more than it has die in a row."""
 
     def make(plan: DatasetPlan, pieces: Sequence[range]) -> Pieces:
-        left = dict.fromkeys(pieces)
-        while left:
-            before = len(left)
-            try:
-                for piece, samples in _make_in_pool(plan, [*left], min(workers, len(left))):
-                    del left[piece]
-                    yield piece, samples
-            except BrokenProcessPool as error:
-                if len(left) == before:
-                    raise WorkersLostError(
-                        f"a worker exited ({error}) before producing {PIECE} objects: finished shards are kept; free "
-                        "memory or lower --workers, and build again"
-                    ) from error
+        left, farm, lost = deque(pieces), dict[Connection, Worker](), 0
+        try:
+            while left or farm:
+                while left and len(farm) < workers:
+                    worker = Worker(plan, left)
+                    farm[worker.pipe] = worker
+                for worker in [farm[pipe] for pipe in wait_for_any([*farm]) if isinstance(pipe, Connection)]:
+                    made = worker.take(left)
+                    lost = 0 if made else lost + 1
+                    if lost > workers:
+                        raise WorkersLostError(
+                            f"a worker exited (code {worker.end()}) before producing {PIECE} objects: finished shards "
+                            "are kept; free memory or lower --workers, and build again"
+                        )
+                    if not worker.asked:
+                        farm.pop(worker.pipe).end()
+                    if made:
+                        yield made
+        finally:
+            for worker in farm.values():
+                worker.end()
 
     return make
-
-
-def _make_in_pool(plan: DatasetPlan, pieces: Sequence[range], workers: int) -> Pieces:
-    others, broken = set(active_children()), False
-    with _open_pool(workers) as pool:
-        futures = {pool.submit(make_samples, plan, piece): piece for piece in pieces}
-        children = set(active_children()) - others
-        try:
-            for future in as_completed(futures):
-                piece, error = futures.pop(future), future.exception()
-                if isinstance(error, BrokenProcessPool):
-                    broken = True  # finished pieces may still follow
-                else:
-                    yield piece, future.result()
-        except BaseException:
-            for child in set(active_children()) - others:  # rather than wait for their pieces
-                child.terminate()
-            raise
-    if broken:
-        codes = [child.exitcode for child in children if child.exitcode not in (None, 0, -signal.SIGTERM)]
-        raise BrokenProcessPool(f"code {codes[0]}" if codes else "code unknown")
-
-
-def _open_pool(workers: int) -> ProcessPoolExecutor:
-    """Return a pool of processes. Raises WorkersLostError where the system has no place for its locks."""
-    try:
-        return ProcessPoolExecutor(workers, mp_context=get_context("spawn"), initializer=begin_worker)
-    except OSError as error:
-        raise WorkersLostError(
-            f"no worker can be started ({error.strerror}): they share locks in /dev/shm, so make that writable"
-        ) from error

@@ -1,12 +1,103 @@
-"""Start of a worker process: one thread, no reaction to Ctrl-C, and an end when its parent ends.
+"""Worker processes of a dataset: one thread, no reaction to Ctrl-C, and an end when their parent ends.
 
-Numpy must not be imported here: BLAS reads the number of its threads once, when numpy is imported.
+Each has a pipe of its own, so that one can be ended at any time: the executors of the standard library wait forever for
+the rest of an answer where a worker is ended while it sends one. Numpy must not be imported here: BLAS reads the number
+of its threads once, when numpy is imported.
 """
 
 import os
 import signal
-from multiprocessing import parent_process
+from collections import deque
+from contextlib import suppress
+from multiprocessing import get_context, parent_process
+from multiprocessing.connection import Connection
 from threading import Thread
+from traceback import format_exc
+from typing import TYPE_CHECKING
+
+from nlos_cam.errors import WorkersLostError
+
+if TYPE_CHECKING:
+    from nlos_cam.dataset.plan import DatasetPlan
+    from nlos_cam.dataset.samples import Samples
+
+CONTEXT = get_context("spawn")
+AHEAD = 2
+"""Pieces that a worker is asked for at a time: it makes the second while its parent stores the first."""
+END_S = 5.0
+
+
+class Worker:
+    """Process that makes pieces of a dataset, seen from its parent."""
+
+    def __init__(self, plan: "DatasetPlan", left: deque[range]) -> None:
+        """Start it with the first pieces that are left. Raises WorkersLostError where no process can be started."""
+        self.pipe, other = CONTEXT.Pipe()
+        self.asked = deque[range]()
+        self._process = CONTEXT.Process(target=make_pieces, args=(other,), daemon=True)
+        try:
+            self._process.start()
+        except OSError as error:
+            raise WorkersLostError(
+                f"no worker can be started ({error.strerror}): free memory or processes, or lower --workers"
+            ) from error
+        finally:
+            other.close()  # the pipe ends with the process
+        self._send(plan)
+        self._ask(left)
+
+    def take(self, left: deque[range]) -> "tuple[range, Samples] | None":
+        """Return the oldest piece that it was asked for, and ask for one more.
+
+        Returns None, and puts its pieces back, where the process has ended. Raises what making the piece raised.
+        """
+        try:
+            made = self.pipe.recv()
+        except (EOFError, OSError):
+            left.extendleft(reversed(self.asked))
+            self.asked.clear()
+            return None
+        if isinstance(made, Exception):
+            raise made
+        piece = self.asked.popleft()
+        self._ask(left)
+        return piece, made
+
+    def end(self) -> int | None:
+        """End the process, whatever it does, and return its exit code."""
+        if not self.asked:
+            self.pipe.close()  # nothing to do: it ends by itself
+            self._process.join(END_S)
+        self._process.terminate()
+        self._process.join()
+        self.pipe.close()
+        return self._process.exitcode
+
+    def _ask(self, left: deque[range]) -> None:
+        while left and len(self.asked) < AHEAD:
+            self.asked.append(left.popleft())
+            self._send(self.asked[-1])
+
+    def _send(self, message: object) -> None:
+        with suppress(OSError):  # it has ended: `take` will tell
+            self.pipe.send(message)
+
+
+def make_pieces(pipe: Connection) -> None:
+    """Make each piece that the parent asks for, as a worker, until the pipe is closed."""
+    begin_worker()
+    from nlos_cam.dataset.samples import make_samples
+
+    with suppress(EOFError, OSError):
+        plan = pipe.recv()
+        while True:
+            piece = pipe.recv()
+            try:
+                answer = make_samples(plan, piece)
+            except Exception as error:  # noqa: BLE001  whatever it was, the parent raises it
+                error.add_note(format_exc())
+                answer = error
+            pipe.send(answer)
 
 
 def begin_worker() -> None:

@@ -5,12 +5,10 @@ import os
 import signal
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
-from concurrent.futures import Executor, Future
-from concurrent.futures.process import BrokenProcessPool
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from importlib.util import find_spec
-from multiprocessing import active_children
+from multiprocessing import active_children, get_context
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -28,7 +26,7 @@ from nlos_cam.dataset import BuildReport, DatasetPlan, build_dataset, open_datas
 from nlos_cam.dataset import build as dataset
 from nlos_cam.dataset.build import processes
 from nlos_cam.dataset.ray_backend import PIECES_PER_CPU, RayFarm, make_piece
-from nlos_cam.dataset.samples import make_samples
+from nlos_cam.dataset.samples import Samples, make_samples
 from nlos_cam.dataset.shards import SHARD_PATTERN, only_builder, store
 from nlos_cam.errors import SceneError, WorkersLostError
 
@@ -189,37 +187,65 @@ def test_build_keeps_shards_if_object_fails_or_disk_is_full(tmp_path: Path, whol
     assert _bytes(tmp_path) == whole
 
 
-class InThisProcess(Executor):
-    """Process pool without processes, which breaks after a number of pieces."""
+def _dying(counter: Path, dies_at: Sequence[int]) -> Callable[[object, range], Samples]:
+    """Return a maker of samples whose process is killed at some of its calls, counted over all processes."""
 
-    dies_after: list[int]
+    def make(_: object, piece: range) -> Samples:
+        with counter.open("a", encoding="utf-8") as file:
+            file.write(".")
+        if counter.stat().st_size in dies_at:
+            os.kill(os.getpid(), signal.SIGKILL)
+        return samples_of(piece)
 
-    def __init__(self, *_: object, **__: object) -> None:
-        self.left = self.dies_after.pop(0)
-
-    def submit(self, work: Callable[..., Any], *arguments: Any) -> Future[Any]:
-        future: Future[Any] = Future()
-        self.left -= 1
-        if self.left >= 0:
-            future.set_result(work(*arguments))
-        else:
-            future.set_exception(BrokenProcessPool("killed"))
-        return future
+    return make
 
 
-def test_processes_replace_killed_workers_or_give_up(tmp_path: Path, whole: Shards, monkeypatch: Patch) -> None:
-    monkeypatch.setattr(dataset, "ProcessPoolExecutor", InThisProcess)
-    monkeypatch.setattr(dataset, "make_samples", lambda _, piece: samples_of(piece))
-    InThisProcess.dies_after = [7, 0, 1, 4, 100]
-    with pytest.raises(errors.WorkersLostError, match="--workers"):  # the second pool makes nothing
-        _build(tmp_path, processes(2))
-    assert 0 < len(_bytes(tmp_path)) <= 2
-    _build(tmp_path, processes(2))
-    assert _bytes(tmp_path) == whole
-    refusal = OSError(errno.EROFS, "Read-only file system")
-    monkeypatch.setattr(dataset, "ProcessPoolExecutor", Mock(side_effect=refusal))
-    with pytest.raises(errors.WorkersLostError, match=r"Read-only file system.*/dev/shm"):
-        build_dataset(PLAN, COUNT, tmp_path / "other", workers=1, on_progress=lambda *_: None)
+@pytest.fixture
+def _forked(monkeypatch: Patch) -> None:
+    monkeypatch.setattr(worker, "CONTEXT", get_context("fork"))
+    monkeypatch.setattr(worker, "begin_worker", lambda: None)
+
+
+@pytest.mark.usefixtures("_forked")
+@pytest.mark.parametrize("workers", [1, 2])
+def test_processes_replace_killed_workers_or_give_up(
+    tmp_path: Path, whole: Shards, monkeypatch: Patch, workers: int
+) -> None:
+    maker = "nlos_cam.dataset.samples.make_samples"
+    monkeypatch.setattr(maker, _dying(tmp_path / "calls", range(7, 100)))
+    with pytest.raises(errors.WorkersLostError, match=r"code -9\).*--workers"):
+        _build(tmp_path / "out", processes(workers))
+    assert _bytes(tmp_path / "out").items() <= whole.items()
+    monkeypatch.setattr(maker, _dying(tmp_path / "later", [2, 6]))
+    _build(tmp_path / "out", processes(workers))
+    assert _bytes(tmp_path / "out") == whole
+    assert not active_children()
+
+
+@pytest.mark.usefixtures("_forked")
+def test_processes_raise_what_a_worker_raised_and_say_where_none_can_start(tmp_path: Path, monkeypatch: Patch) -> None:
+    maker = "nlos_cam.dataset.samples.make_samples"
+    monkeypatch.setattr(maker, Mock(side_effect=SceneError("no such object")))
+    with pytest.raises(SceneError, match="no such object") as raised:
+        _build(tmp_path / "out", processes(2))
+    assert "make_samples" in raised.value.__notes__[0]  # where in the worker
+    refusal = Mock(side_effect=OSError(errno.EAGAIN, "Resource temporarily unavailable"))
+    monkeypatch.setattr(worker.CONTEXT.Process, "start", refusal)
+    with pytest.raises(errors.WorkersLostError, match="Resource temporarily unavailable"):
+        _build(tmp_path / "out", processes(2))
+    assert not active_children()
+
+
+@pytest.mark.usefixtures("_forked")
+def test_closing_ends_workers_while_they_send(monkeypatch: Patch) -> None:
+    def large(_: object, piece: range) -> Samples:
+        return {"depth_m": np.zeros((len(piece), 1_000_000))}  # more than a pipe holds
+
+    monkeypatch.setattr("nlos_cam.dataset.samples.make_samples", large)
+    made = processes(2)(PLAN, [range(k, k + 2) for k in range(0, 40, 2)])
+    next(made)
+    made.close()
+    assert not active_children()
 
 
 @pytest.mark.slow
@@ -271,7 +297,7 @@ LOCAL = """
 import numpy as np
 from nlos_calibration import load_rig
 from nlos_cam.dataset import DatasetPlan, ray_farm
-from nlos_cam.dataset.samples import make_samples
+from nlos_cam.dataset.samples import Samples, make_samples
 plan = DatasetPlan(load_rig("paper-rig"), 0, accuracy="draft")
 made = dict(ray_farm("local")(plan, [range(0, 1), range(1, 3)]))
 for piece, samples in made.items():
