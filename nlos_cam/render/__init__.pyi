@@ -84,8 +84,7 @@ from .job import TransportJob
 from .material import Material, Surface, phong, retroreflective
 from .patches import JUMP_M
 from .planning import prepare
-from .renderer import Rendering, render, render_all, three_bounce, transient
-from .scanning import render_scan
+from .renderer import Rendering, render, render_all, render_scan, three_bounce, transient
 from .scene import Radiometry, Scene
 from .scene_file import (
     RENDERING_VERSION,

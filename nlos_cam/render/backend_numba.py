@@ -3,23 +3,23 @@
 weight(p, s, q) = A(p, s) B(s, q) and length = (d1 + d2)(p, s) + (d3 + d4)(s, q) for beam p, patch s, relay cell q. So
 each patch gets one table of B over d3 + d4, counted in sub-bins, and each beam adds the table, shifted by d1 + d2 to
 the nearest sub-bin: n s + s q terms in place of n s q. The sums of sub-bins to bins are made in advance for each shift
-within a bin, so that a beam adds one row of a table per patch. Neither rounding is biased: a path lies anywhere within
-its sub-bin, and rounding to the nearest shift puts a bin's edge in the middle of a sub-bin.
+within a bin, so that a beam adds one row of a table per patch (`beam_sums`). Neither rounding is biased: a path lies
+anywhere within its sub-bin, and rounding to the nearest shift puts a bin's edge in the middle of a sub-bin.
 
 numba's cache depends on this file alone: after a change of a kernel that is imported here, delete __pycache__.
 """
 
 from functools import lru_cache
 from math import ceil, sqrt
-from typing import NamedTuple
 
 import numba
 import numpy as np
-from nlos_calibration.arrays import Float32, Float64, Int32, Int64
+from nlos_calibration.arrays import Float32, Float64, Int32
 from numpy.typing import NDArray
 
 from nlos_cam.frames import inner, int64
-from nlos_cam.render.echoes import MultiBounce, strongest, strongest_between
+from nlos_cam.render.beam_sums import NumbaGroups, NumbaTables, groups_of, shift_and_add, strongest_in_window
+from nlos_cam.render.echoes import MultiBounce, strongest
 from nlos_cam.render.interreflection import add_interreflection
 from nlos_cam.render.job import TransportJob
 from nlos_cam.render.legs import (
@@ -32,7 +32,6 @@ from nlos_cam.render.legs import (
     NumbaOptics,
     NumbaPoints,
     NumbaSurface,
-    add_rows,
     fill,
     judge,
     scratch,
@@ -43,21 +42,6 @@ LANES = 16
 """Bins by which the rows of tables are padded: whole widest vectors."""
 COUNTERS = 4
 """Histograms of a patch that are counted at once, by turns."""
-PATCH_BLOCK = 8
-"""Patches whose legs are computed before their rows are added."""
-
-
-class NumbaTables(NamedTuple):
-    """Tables of the patches (n): B over d3 + d4 in bins, for each shift within a bin."""
-
-    first: Int32
-    """(n,); bin at which a patch's rows start."""
-    rows: Float32
-    """Flat; n * per_bin rows of WINDOW zeros and `width` bins, then WINDOW zeros: a window reads beyond both ends."""
-    rest: Float32
-    """(n, width + 1); largest value of any shift from a bin of the row on."""
-    per_bin: int
-    width: int
 
 
 @numba.njit(cache=True, error_model="numpy", fastmath=FAST, inline="always")
@@ -137,168 +121,6 @@ def tables(first: Int32, histogram: Float32, per_bin: int) -> NumbaTables:
     return NumbaTables(first, rows.ravel(), rest, per_bin, width)
 
 
-@inner(error_model="numpy", fastmath=FAST)
-def ends(
-    start: int, count: int, feet: NumbaPoints, surface: NumbaSurface, optics: NumbaOptics, table: NumbaTables
-) -> tuple[Float32, int]:
-    """Return a bin (count,) before every path of each beam, and the bins from there to the last path of any beam."""
-    near, far = np.full(count, np.float32(np.inf)), np.zeros(count, np.float32)
-    at_x, at_y = feet.x_m[start : start + count], feet.y_m[start : start + count]
-    for s in range(len(table.first)):
-        x, y, z = surface.x_m[s], surface.y_m[s], surface.z_m[s]
-        begins = np.float32(table.first[s] * table.per_bin)
-        for i in range(count):
-            dx, dy = at_x[i] - x, at_y[i] - y
-            length = np.sqrt(dx * dx + dy * dy + z * z) * optics.inverse_bin + begins
-            near[i], far[i] = min(near[i], length), max(far[i], length)
-    spread, whole = 0, np.float32(1 / table.per_bin)
-    for i in range(count):
-        spread = max(spread, int((far[i] - near[i]) * whole))
-        # A beam's first path is d1 + min (d2 + d3 + d4) over the patches; one bin less covers rounding.
-        near[i] = np.floor((near[i] + feet.length_m[start + i] * optics.inverse_bin) * whole) - np.float32(1)
-    return near, spread + table.width + 3
-
-
-@numba.njit(cache=True, error_model="numpy", fastmath=FAST, inline="always")
-def _place(
-    legs: NumbaLegs, s: int, start: int, feet: NumbaPoints, surface: NumbaSurface, optics: NumbaOptics,
-    field: HeightField, verdict: int, begin: Float32, table: NumbaTables,
-    to: tuple[Float32, Float32, Float32],
-) -> tuple[np.float32, np.float32]:  # fmt: skip
-    """Fill in each leg's weight, row of the patch's table, and bin of the row at which the beam's window begins (`to`).
-
-    Return the sum of the weights and the smallest of those bins. All numbers are whole, and exact in float32.
-    """
-    total, least, count = np.float32(0), np.float32(np.inf), len(begin)
-    weight, row, ahead = to
-    fill(legs, s, surface, feet, start, count, verdict, optics, field, False)
-    strength, first, length_m = surface.strength[s], np.float32(table.first[s]), feet.length_m[start : start + count]
-    per_bin, whole, stride = np.float32(table.per_bin), np.float32(1 / table.per_bin), np.float32(WINDOW + table.width)
-    for i in range(count):
-        shift = np.floor((legs.length_m[i] + length_m[i]) * optics.inverse_bin + np.float32(0.5))
-        bins = np.floor(shift * whole)
-        weight[i] = legs.weight[i] * strength
-        row[i] = (shift - bins * per_bin) * stride
-        ahead[i] = begin[i] - bins - first
-        total += weight[i]
-        least = min(least, ahead[i])
-    return total, least
-
-
-@numba.njit(cache=True, error_model="numpy", fastmath=FAST, inline="always")
-def _add_block(
-    used: int, table: NumbaTables, row: Float32, ahead: Float32, base: Int64, weights: Float32, offsets: Int32,
-    sums: Float32,
-) -> None:  # fmt: skip
-    """Add the rows of some patches, placed by `_place`, to the windows (count, windows * WINDOW) of a tile's beams."""
-    count, bins, width = sums.shape[0], sums.shape[1], np.float32(table.width)
-    every, offset = sums.ravel(), offsets.reshape(PATCH_BLOCK, count)
-    for window in range(0, bins, WINDOW):
-        for j in range(used):
-            for i in range(count):
-                at = min(max(ahead[j, i] + np.float32(window), np.float32(-WINDOW)), width)
-                offset[j, i] = np.int32(row[j, i] + at)
-        for i in range(count):
-            add_rows(every, i * bins + window, table.rows, base, offsets, weights, i, count, used)
-
-
-@inner(error_model="numpy", fastmath=FAST)
-def _add_tile(
-    start: int, count: int, feet: NumbaPoints, surface: NumbaSurface, optics: NumbaOptics, field: HeightField,
-    table: NumbaTables, begin: Float32, sums: Float32,
-) -> Float32:  # fmt: skip
-    """Add every patch to the windows (count, windows * WINDOW) of some beams, from a bin (count,) of each beam on.
-
-    Return a bound (count,) on every bin beyond: at most each patch's largest value from there on, times its weight.
-    """
-    # Legs of some patches first, then the rows of each beam: rows and windows stay in the first cache
-    legs, bound = scratch(count), np.zeros(count, np.float32)
-    weights, offsets = np.empty(PATCH_BLOCK * count, np.float32), np.empty(PATCH_BLOCK * count, np.int32)
-    weight = weights.reshape(PATCH_BLOCK, count)
-    row, ahead = np.empty((PATCH_BLOCK, count), np.float32), np.empty((PATCH_BLOCK, count), np.float32)
-    base, used, bins = np.empty(PATCH_BLOCK, np.int64), 0, sums.shape[1]
-    tile = feet.bounds_m[start // BEAM_TILE : start // BEAM_TILE + 1]
-    verdicts = judge(int64(0), len(table.first), surface, tile, optics, field)
-    for s in range(len(table.first)):
-        total, least, verdict = np.float32(0), np.float32(0), verdicts[s, 0]
-        if verdict != DARK:
-            to = weight[used], row[used], ahead[used]
-            total, least = _place(legs, s, start, feet, surface, optics, field, verdict, begin, table, to)
-        if total > 0:
-            # h(k) = sum_s A(p, s) T_s(k - at_s): beyond the window each T_s is at most its largest value from there.
-            largest = table.rest[s, min(max(int(least) + bins, 0), table.width)]
-            for i in range(count):
-                bound[i] += weight[used, i] * largest
-            base[used] = s * table.per_bin * (WINDOW + table.width) + WINDOW
-            used += 1
-        if used < PATCH_BLOCK and s + 1 < len(table.first):
-            continue
-        _add_block(used, table, row, ahead, base, weights, offsets, sums)
-        used = 0
-    return bound
-
-
-@inner()
-def _sum_tile(
-    start: int, feet: NumbaPoints, surface: NumbaSurface, optics: NumbaOptics, field: HeightField, table: NumbaTables,
-    most: int,
-) -> tuple[Float32, Float32, Float32]:  # fmt: skip
-    """Return the first bin (count,) of a tile's beams, their sums from there on over `most` bins or all, and a bound.
-
-    The bound (count,) is on every bin beyond the sums.
-    """
-    count = min(BEAM_TILE, len(feet.x_m) - start)
-    begin, span = ends(start, count, feet, surface, optics, table)
-    sums = np.zeros((count, (min(span, most) + WINDOW - 1) // WINDOW * WINDOW), np.float32)
-    return begin, sums, _add_tile(start, count, feet, surface, optics, field, table, begin, sums)
-
-
-@numba.njit(cache=True, parallel=True)
-def shift_and_add(
-    tiles: Int64, feet: NumbaPoints, surface: NumbaSurface, optics: NumbaOptics, field: HeightField,
-    table: NumbaTables, bins: int,
-) -> Float32:  # fmt: skip
-    """Return histograms (k * BEAM_TILE, bins) of the beams of k tiles.
-
-    They are the sum of every patch's table, times A, shifted by d1 + d2. Beams are summed by whole tiles, so that their
-    bits do not depend on which are asked for.
-    """
-    histogram = np.zeros((len(tiles) * BEAM_TILE, bins), np.float32)
-    for k in numba.prange(len(tiles)):
-        begin, sums, _ = _sum_tile(tiles[k] * BEAM_TILE, feet, surface, optics, field, table, bins)
-        for i in range(len(begin)):
-            first = int(begin[i])
-            for j in range(max(-first, 0), min(sums.shape[1], bins - first)):
-                histogram[k * BEAM_TILE + i, first + j] = sums[i, j]
-    return histogram
-
-
-@numba.njit(cache=True, parallel=True)
-def _strongest_in_window(
-    feet: NumbaPoints, surface: NumbaSurface, optics: NumbaOptics, field: HeightField, table: NumbaTables, bins: int
-) -> tuple[NDArray[np.int64], Float32, Float32, NDArray[np.bool_]]:
-    """Return bin, value and runner-up (n,) of the strongest of each beam's first WINDOW bins, and if no other can win.
-
-    Light comes back strongest from the shortest paths, so the first window nearly always holds both bins.
-    """
-    beams = len(feet.x_m)
-    winner, peak, second = np.zeros(beams, np.int64), np.zeros(beams, np.float32), np.zeros(beams, np.float32)
-    sure = np.zeros(beams, np.bool_)
-    for tile in numba.prange((beams + BEAM_TILE - 1) // BEAM_TILE):
-        start = tile * BEAM_TILE
-        begin, sums, bound = _sum_tile(start, feet, surface, optics, field, table, int64(WINDOW))
-        for i in range(len(begin)):
-            first = int(begin[i])
-            best = strongest_between(sums[i], max(-first, 0), min(WINDOW, bins - first))
-            winner[start + i], peak[start + i], second[start + i] = best[0] + first, best[1], best[2]
-            sure[start + i] = bound[i] * ROUNDED <= best[2]
-    return winner[feet.place], peak[feet.place], second[feet.place], sure[feet.place]
-
-
-ROUNDED = np.float32(1.001)
-"""Factor on a bound, more than the rounding of its sum."""
-
-
 def histograms(job: TransportJob) -> Float32:
     """Return histograms (n, bins) of I_multi over path length, for the beams of a job without a BRDF.
 
@@ -316,7 +138,7 @@ def echoes(job: TransportJob) -> MultiBounce:
     numba_job = NumbaJob(job)
     every = numba_job.feet(np.ones(len(job.laser_spot_m)))
     table = numba_job.tables(np.empty((0, 0), np.float32))
-    winner, peak, second, sure = _strongest_in_window(every, *numba_job.sites, table, job.bins)
+    winner, peak, second, sure = strongest_in_window(every, *numba_job.sites, table, job.bins)
     path = np.where(peak > 0, (winner + 0.5) * job.bin_m, np.nan).astype(np.float32)
     found = MultiBounce(peak, second, path)
     if (unsure := np.flatnonzero(~sure)).size:
@@ -345,12 +167,13 @@ class NumbaJob:
         edge = np.float32(edge_x), np.float32(edge_z), np.float32(job.near_m**2)
         sectors = accuracy.sectors if job.field.shades else 0
         self.optics = NumbaOptics(*edge, job.lambertian, np.float32(accuracy.sub_bins / job.bin_m), sectors)
+        self.groups, self.centers = groups_of(self.surface, patches.diagonal_m)
         self.first, self.width = table_bins(job)
 
     @property
-    def sites(self) -> tuple[NumbaSurface, NumbaOptics, HeightField]:
+    def sites(self) -> tuple[NumbaSurface, NumbaGroups, NumbaSurface, NumbaOptics, HeightField]:
         """Arguments of the kernels that do not depend on beams and tables."""
-        return self.surface, self.optics, self.job.field
+        return self.surface, self.groups, self.centers, self.optics, self.job.field
 
     def feet(self, share: Float64) -> NumbaPoints:
         """Return the beams with a weight (n,) above 0."""
@@ -365,7 +188,7 @@ class NumbaJob:
         job, per_bin = self.job, self.job.accuracy.sub_bins
         if factor.size:
             factor = factor[:, np.argsort(self.relay.place)]
-        fine = sub_bins(self.surface, self.relay, *self.sites[1:], factor, self.first, per_bin, self.width)
+        fine = sub_bins(self.surface, self.relay, *self.sites[3:], factor, self.first, per_bin, self.width)
         return tables(self.first, add_interreflection(job, self.first, fine) if job.more_bounces else fine, per_bin)
 
     def histograms(self, factor: Float32, share: Float64) -> Float32:

@@ -16,7 +16,7 @@ from nlos_cam.render.geometry import NO_OCCLUDER, Beams, Relay, softened_leg
 from nlos_cam.render.interreflection import AROUND_M
 from nlos_cam.render.job import TransportJob
 from nlos_cam.render.patches import Patches
-from nlos_cam.render.visibility import BIAS_CELLS, HeightField, occluded
+from nlos_cam.render.visibility import BIAS_CELLS, HeightField
 
 SAMPLE_BEAMS, SAMPLE_CELLS = 160, 96
 CAUTION = 1.5
@@ -89,7 +89,7 @@ def _contiguous(
     return np.ascontiguousarray(x), np.ascontiguousarray(y), np.ascontiguousarray(weight), np.ascontiguousarray(hidden)
 
 
-@numba.njit(cache=True, parallel=True)
+@numba.njit(cache=True, parallel=True, error_model="numpy", fastmath={"contract", "reassoc", "nsz"})
 def _sums(
     points: Float64,
     normals: Float64,
@@ -108,26 +108,29 @@ def _sums(
     """Return sums (3, n) over points of the wall: light, its change by tilt, and light that the occluder cuts off."""
     sums = np.zeros((3, len(points)))
     for s in numba.prange(len(points)):
-        point, normal = points[s], normals[s]
+        point_x, point_y, z, area = points[s, 0], points[s, 1], points[s, 2], beta[s]
+        normal_x, normal_y, behind, softest = normals[s, 0], normals[s, 1], normals[s, 2] * z, soft[s]
+        seen, changed, cut, to_edge = 0.0, 0.0, 0.0, edge_x - point_x
         for w in range(len(x)):
-            dx, dy, z = x[w] - point[0], y[w] - point[1], point[2]
+            dx, dy = x[w] - point_x, y[w] - point_y
             squared = dx * dx + dy * dy + z * z
             length = max(np.sqrt(squared), 1e-12)  # where the object touches the wall
             at_wall = z / length
-            tilted = max(normal[0] * dx + normal[1] * dy - normal[2] * z, 0.0) / length
+            tilted = max(normal_x * dx + normal_y * dy - behind, 0.0) / length
             # Incident light goes with the patch's cosine and area; returned light goes with it in Lambertian
             # radiometry, and in the paper's only with the side that is lit. A level patch has cos = z / d and area /
             # beta.
             bent = (tilted if lambertian else (1.0 if tilted > 0 else 0.0)) if outgoing else tilted
-            level = (at_wall if lambertian else (1.0 if at_wall > 0 else 0.0)) if outgoing else at_wall / beta[s]
-            if outgoing or lambertian:
-                bent, level = bent * at_wall, level * at_wall
-            light = weight[w] / softened_leg(squared, soft[s], near_m)
-            if hidden[w] or occluded(point[0], z, x[w], 0.0, edge_x, edge_z):
-                sums[2, s] += light * bent
-            else:
-                sums[0, s] += light * bent
-                sums[1, s] += light * abs(bent - level)
+            level = (at_wall if lambertian else (1.0 if at_wall > 0 else 0.0)) if outgoing else at_wall / area
+            slant = at_wall if outgoing or lambertian else 1.0
+            light = weight[w] * slant / softened_leg(squared, softest, near_m)
+            # As in `visibility.occluded`, without its branch: the loop is made of vectors.
+            crosses = (to_edge * (edge_x - x[w]) < 0) & (z - to_edge / (dx if dx != 0 else 1.0) * z >= edge_z)
+            open_share = 0.0 if hidden[w] | crosses else 1.0
+            seen += open_share * light * bent
+            changed += open_share * light * abs(bent - level)
+            cut += (1.0 - open_share) * light * bent
+        sums[0, s], sums[1, s], sums[2, s] = seen, changed, cut
     return sums
 
 

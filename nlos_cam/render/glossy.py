@@ -16,7 +16,8 @@ from nlos_calibration.arrays import Float32, Float64, Int64
 from numpy.typing import NDArray
 
 from nlos_cam.render import backend_numba
-from nlos_cam.render.backend_numba import ROUNDED, NumbaJob, NumbaTables, ends, returns
+from nlos_cam.render.backend_numba import NumbaJob, returns
+from nlos_cam.render.beam_sums import ROUNDED, NumbaGroups, NumbaTables, ends
 from nlos_cam.render.brdf_table import nodes, scattered, scattering
 from nlos_cam.render.echoes import MultiBounce, strongest
 from nlos_cam.render.job import TransportJob
@@ -209,14 +210,16 @@ def _rows(
 
 
 @numba.njit(cache=True, parallel=True)
-def _begins(feet: NumbaPoints, surface: NumbaSurface, optics: NumbaOptics, table: NumbaTables) -> tuple[Float32, int]:
+def _begins(
+    feet: NumbaPoints, groups: NumbaGroups, centers: NumbaSurface, optics: NumbaOptics, table: NumbaTables
+) -> tuple[Float32, int]:
     """Return a bin (n,) before every path of each beam, and the bins from there to the last path of any."""
     beams = len(feet.x_m)
     tiles = (beams + BEAM_TILE - 1) // BEAM_TILE
     begin, bins = np.zeros(beams, np.float32), np.zeros(tiles, np.int64)
     for tile in numba.prange(tiles):
         start = tile * BEAM_TILE
-        near, bins[tile] = ends(start, min(BEAM_TILE, beams - start), feet, surface, optics, table)
+        near, bins[tile] = ends(start, min(BEAM_TILE, beams - start), feet, groups, centers, optics, table)
         for i in range(len(near)):
             begin[start + i] = near[i]
     return begin, bins.max()
@@ -279,8 +282,8 @@ def _sums(
     numba_job: NumbaJob, feet: NumbaPoints, table: NumbaTables, functions: Basis, *, first_only: bool
 ) -> tuple[Int64, Float32, Float32]:
     """Return the bin (n,) at which each beam's window begins, its sums (n, bins), and a bound (n,) on later bins."""
-    surface, optics, field = numba_job.sites
-    begin, bins = _begins(feet, surface, optics, table)
+    surface, groups, centers, optics, field = numba_job.sites
+    begin, bins = _begins(feet, groups, centers, optics, table)
     # No path of a patch begins before the window, so that its first bins hold all that the first window can meet.
     windows = 1 if first_only else -(-bins // WINDOW)
     span, rank = WINDOW + (WINDOW + 8 if first_only else table.width), len(functions.sign)

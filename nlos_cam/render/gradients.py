@@ -266,7 +266,7 @@ class Gradients:
     def _legs(self) -> tuple[NumbaPoints, NumbaSurface, NumbaPoints, NumbaOptics, HeightField]:
         """Arguments of the kernels: beams, patches, relay cells, optics, depth map."""
         single = NumbaJob(self.echo_job, tiled=False)
-        surface, optics, field = single.sites
+        surface, _, _, optics, field = single.sites
         return single.feet(np.ones(len(self._peak))), surface, single.relay, optics, field
 
     @cached_property

@@ -148,7 +148,7 @@ def past_edge(x: np.float32, z: np.float32, bounds_m: Float32, edge_x: np.float3
     return DARK if first and last and min(low, high) > edge_z + BACK_M else CUT
 
 
-@inner(error_model="numpy", fastmath=FAST)
+@numba.njit(cache=True, error_model="numpy", fastmath=FAST, inline="always")
 def cut(
     legs: NumbaLegs, s: int, surface: NumbaSurface, points: NumbaPoints, start: int, begin: int, count: int,
     optics: NumbaOptics,
@@ -165,21 +165,21 @@ def cut(
 
 
 @numba.njit(cache=True, error_model="numpy", fastmath=FAST, inline="always")
-def past_object(s: int, surface: NumbaSurface, bounds_m: Float32, optics: NumbaOptics, field: HeightField) -> int:
-    """Return FREE, MIXED or DARK for the legs from patch s to a tile (4,) past the rest of the object.
+def past_object(
+    s: int, surface: NumbaSurface, left: np.float32, right: np.float32, below: np.float32, above: np.float32,
+    pitches: tuple[np.float32, np.float32], sectors: int,
+) -> int:  # fmt: skip
+    """Return FREE, MIXED or DARK for the legs from patch s to a tile, whose ends are given from the patch on.
 
-    What holds at the tile's corners holds inside.
+    What holds at the tile's corners holds inside. `pitches` are the inverse ones of the depth map's cells.
     """
-    x, y, z = surface.x_m[s], surface.y_m[s], surface.z_m[s]
-    left, right, below, above = bounds_m[0] - x, bounds_m[1] - x, bounds_m[2] - y, bounds_m[3] - y
-    nx, ny, nothing, one = surface.normal_x[s], surface.normal_y[s], np.float32(0), np.float32(1)
+    z, nx, ny, nothing, one = surface.z_m[s], surface.normal_x[s], surface.normal_y[s], np.float32(0), np.float32(1)
     # Facing is linear over the tile.
     if max(nx * left, nx * right) + max(ny * below, ny * above) - surface.normal_z[s] * z < -BACK_M:
         return DARK
-    if optics.sectors == 0 or not surface.shaded[s]:
+    if sectors == 0 or not surface.shaded[s]:
         return FREE
-    inverse_x, inverse_y = np.float32(1 / field.pitch_x_m), np.float32(1 / field.pitch_y_m)
-    u_low, u_high, v_low, v_high = left * inverse_x, right * inverse_x, -above * inverse_y, -below * inverse_y
+    u_low, u_high, v_low, v_high = left * pitches[0], right * pitches[0], -above * pitches[1], -below * pitches[1]
     near_u, near_v = max(u_low, -u_high, nothing), max(v_low, -v_high, nothing)
     far_u, far_v = max(-u_low, u_high), max(-v_low, v_high)
     if z >= max(far_u, far_v) * surface.highest[s] * (one + SLACK):
@@ -192,10 +192,10 @@ def past_object(s: int, surface: NumbaSurface, bounds_m: Float32, optics: NumbaO
     # The tilt is the quotient of both axes: largest and smallest at corners. A sector more covers rounding.
     least = low / (major_high if low >= 0 else major_low)
     most = high / (major_low if high >= 0 else major_high)
-    half, face = np.float32(optics.sectors / 2), 0 if along_columns else 2
+    half, face = np.float32(sectors / 2), 0 if along_columns else 2
     face += 0 if (u_high if along_columns else v_high) > 0 else 1
-    first = face * optics.sectors + max(int(np.floor((least + one) * half)) - 1, 0)
-    last = face * optics.sectors + min(int(np.floor((most + one) * half)) + 1, optics.sectors - 1)
+    first = face * sectors + max(int(np.floor((least + one) * half)) - 1, 0)
+    last = face * sectors + min(int(np.floor((most + one) * half)) + 1, sectors - 1)
     highest, lowest = nothing, np.float32(np.inf)
     for sector in range(first, last + 1):
         highest, lowest = max(highest, surface.high[s, sector]), min(lowest, surface.low[s, sector])
@@ -210,11 +210,15 @@ def judge(
 ) -> NDArray[np.int8]:
     """Return verdicts (end - begin, tiles) on the legs from some patches to tiles (tiles, 4)."""
     verdicts = np.empty((end - begin, len(bounds_m)), np.int8)
+    pitches = np.float32(1 / field.pitch_x_m), np.float32(1 / field.pitch_y_m)
     for s in range(begin, end):
+        x, y = surface.x_m[s], surface.y_m[s]
         for tile in range(len(bounds_m)):
             bounds = bounds_m[tile]
-            by_edge = past_edge(surface.x_m[s], surface.z_m[s], bounds, optics.edge_x_m, optics.edge_z_m)
-            by_object = past_object(s, surface, bounds, optics, field)
+            by_edge = past_edge(x, surface.z_m[s], bounds, optics.edge_x_m, optics.edge_z_m)
+            by_object = past_object(
+                s, surface, bounds[0] - x, bounds[1] - x, bounds[2] - y, bounds[3] - y, pitches, optics.sectors
+            )
             dark = DARK in (by_edge, by_object)
             verdicts[s - begin, tile] = DARK if dark else by_edge + by_object
     return verdicts
@@ -253,7 +257,7 @@ def fill_all(
             block(verdicts[tile], legs, s, surface, points, int64(0), begin, count, optics, field)
 
 
-@inner(error_model="numpy", fastmath=FAST)
+@numba.njit(cache=True, error_model="numpy", fastmath=FAST, inline="always")
 def block(
     verdict: int, legs: NumbaLegs, s: int, surface: NumbaSurface, points: NumbaPoints, start: int, begin: int,
     count: int, optics: NumbaOptics, field: HeightField,
@@ -265,7 +269,7 @@ def block(
         shade(legs, s, surface, points, start, begin, count, optics, field)
 
 
-@inner(error_model="numpy", fastmath=FAST)
+@numba.njit(cache=True, error_model="numpy", fastmath=FAST, inline="always")
 def shade(
     legs: NumbaLegs, s: int, surface: NumbaSurface, points: NumbaPoints, start: int, begin: int, count: int,
     optics: NumbaOptics, field: HeightField,

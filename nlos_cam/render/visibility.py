@@ -159,7 +159,7 @@ def segment_blocked(
     return False
 
 
-@inner(error_model="numpy", fastmath={"contract"})
+@numba.njit(cache=True, error_model="numpy", fastmath={"contract", "nsz", "reassoc"}, inline="always")
 def _meet(
     row: Float32,
     offset: int,
@@ -179,18 +179,21 @@ def _meet(
     least, most, low, high, first, until = last[0], last[1], bounds[0], bounds[1], bounds[2], bounds[3]
     near, beyond = row[offset : offset + len(rise_m)], row[offset + 1 : offset + 1 + len(rise_m)]
     for c in range(len(rise_m)):
-        a, b = near[c], beyond[c]
+        a, b, until_now = near[c], beyond[c], until[c]
+        # Next to background the nearer of both cells stands for itself: either may be the smallest, none the largest.
         gap = (a == nothing) | (b == nothing)
         between = a + share * (b - a)
-        # Next to background the nearer of both cells stands for itself: either may be the smallest, none the largest.
-        smallest, largest = (min(a, b) if gap else between), (nothing if gap else between)
-        crossed = a if over else smallest
-        above = (rise_m[c] - min(least[c], smallest, crossed)) * inverse
+        smallest, largest = min(a, b) if gap else between, nothing if gap else between
+        least_now, most_now, before = least[c], most[c], low[c]
+        across, deepest = a if over else smallest, a if over else largest
+        above = (rise_m[c] - min(least_now, smallest, across)) * inverse
         high[c] = max(high[c], above)
-        low[c] = max(low[c], (rise_m[c] - max(most[c], largest, a if over else largest)) * inverse)
+        lowest = max(before, (rise_m[c] - max(most_now, largest, deepest)) * inverse)
+        low[c] = lowest
         # A step matters to a leg between the bounds if it may rise above the wall and above the lower bound.
-        first[c] = min(first[c], k if above > -TOUCH else nothing)
-        until[c] = k if above > low[c] - TOUCH else until[c]
+        matters = k if above > -TOUCH else nothing
+        first[c] = min(first[c], matters)
+        until[c] = k if above > lowest - TOUCH else until_now
         least[c], most[c] = smallest, largest
 
 

@@ -23,6 +23,7 @@ from nlos_cam import evaluate
 from nlos_cam import render as renderer
 from nlos_cam.files import cache_folder
 from nlos_cam.objects import object_box, object_depth
+from nlos_cam.render import beam_sums
 
 
 def tradeoff(_: argparse.Namespace) -> None:
@@ -110,8 +111,9 @@ def random_scene(generator: np.random.Generator) -> renderer.Scene:
 def soak_faults(seed: int) -> list[str]:
     """Return what is wrong with the histograms and echoes of a random scene; nothing if they keep every bound.
 
-    The fast renderer moves a path by at most a sub-bin, so a bin holds at least the reference's light that is a sub-bin
-    or more within it, and at most the light to a sub-bin outside. A winner must be the strongest for some such light.
+    The fast renderer moves a path by at most a sub-bin, and by two more where it joins patches. So a bin holds at least
+    the reference's light that is as much within it, and at most the light to as much outside, each by the weights'
+    change where patches are joined. A winner must be the strongest for some such light.
     """
     generator = np.random.default_rng([seed, 20])
     grid = ((8, 6), (24, 20))[int(generator.random() < 0.2)]  # the finer one has more than one tile of relay cells
@@ -127,18 +129,19 @@ def soak_faults(seed: int) -> list[str]:
     found, echo = renderer.histograms(job).astype(np.float64), renderer.backend_numba.echoes(job)
     exact = replace(job, accuracy=renderer.STOPS["reference"], bin_m=job.bin_m / fine, bins=job.bins * fine)
     below = np.pad(np.cumsum(renderer.backend_reference.histograms(exact), 1), [(0, 0), (1, 0)])
-    at, moved = np.arange(job.bins) * fine, fine // accuracy.sub_bins + 1
+    at, moved = np.arange(job.bins) * fine, 3 * fine // accuracy.sub_bins + 1
+    joined = float((1 + beam_sums.JOIN_COSINE) * beam_sums.JOIN_WEIGHT) / max(accuracy.sub_bins, 4)
 
     def light(start: Any, end: Any) -> Any:
         return below[:, np.clip(end, 0, below.shape[1] - 1)] - below[:, np.clip(start, 0, below.shape[1] - 1)]
 
     whole = below[:, -1:]
-    most = light(at - moved, at + fine + moved) + SHADE_EDGE * whole
-    least = np.maximum(light(at + moved, at + fine - moved), 0) - SHADE_EDGE * whole
+    most = light(at - moved, at + fine + moved) * (1 + joined) + SHADE_EDGE * whole
+    least = np.maximum(light(at + moved, at + fine - moved), 0) * (1 - joined) - SHADE_EDGE * whole
     faults = {
         "a number that is not finite": not np.isfinite(found).all() or not np.isfinite(echo.peak).all(),
         "negative light": (found < 0).any() or (echo.peak < 0).any(),
-        "more light than the reference": (found.sum(1) > whole[:, 0] * (1 + SHADE_EDGE)).any(),
+        "more light than the reference": (found.sum(1) > whole[:, 0] * (1 + joined + SHADE_EDGE)).any(),
         "a bin outside its bounds": (found > most).any() or (found < least).any(),
         "an echo other than the histogram's": not np.array_equal(echo.peak, found.max(1).astype(np.float32)),
     }

@@ -12,7 +12,7 @@ from hypothesis.extra.numpy import arrays
 from nlos_calibration.rig import load_rig
 
 from nlos_cam.objects import object_box, object_depth
-from nlos_cam.render import STOPS, Accuracy, Scene, Surface, backend_numba, phong, prepare, render, transient
+from nlos_cam.render import STOPS, Accuracy, Scene, Surface, backend_numba, beam_sums, phong, prepare, render, transient
 from nlos_cam.render.backend_numba import echoes, histograms
 from nlos_cam.render.brdf_table import MAX_NODES, node_count, nodes, scattered, scattering
 from nlos_cam.render.echoes import MultiBounce, compete, no_echoes, strongest
@@ -20,7 +20,7 @@ from nlos_cam.render.effects import Effect
 from nlos_cam.render.geometry import Beams
 from nlos_cam.render.job import TransportJob
 from nlos_cam.render.material import Brdf
-from nlos_cam.render.scanning import render_scan, scan_effect, slices
+from nlos_cam.render.renderer import render_scan, scan_effect, slices
 from nlos_cam.render.scene import Radiometry
 
 RIG = load_rig("paper-rig")
@@ -182,7 +182,25 @@ def test_node_count_grows_as_the_error_shrinks(job: TransportJob) -> None:
     assert count(1e-4, phong(0.5, 0.0, 10)) == 4
 
 
-@pytest.mark.parametrize("bound", [backend_numba.ROUNDED, np.float32(np.inf)])
+@pytest.mark.parametrize("radiometry", ["paper", "lambertian"])
+@pytest.mark.parametrize("stop", ["draft", "standard"])
+def test_joined_patches_move_light_by_less_than_a_bin_and_hardly_change_it(
+    stop: str, radiometry: Radiometry, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    job = prepare(Scene(RIG, object_depth(4, object_box(RIG))[1], radiometry=radiometry), STOPS[stop]).job
+    joined, groups_of = histograms(job).astype(np.float64), beam_sums.groups_of
+    monkeypatch.setattr(backend_numba, "groups_of", lambda surface, _: groups_of(surface, -1.0))  # each patch alone
+    alone = histograms(job).astype(np.float64)
+    below = [np.cumsum(each, axis=1) for each in (joined, alone)]
+    weight = float((1 + beam_sums.JOIN_COSINE) * beam_sums.JOIN_WEIGHT) / job.accuracy.sub_bins
+    assert (below[0][:, 1:] >= below[1][:, :-1] * (1 - weight)).all()
+    assert (below[0][:, :-1] <= below[1][:, 1:] * (1 + weight) + 1e-6 * below[1][:, -1:]).all()
+    np.testing.assert_allclose(below[0][:, -1], below[1][:, -1], rtol=0.05 * weight)
+    np.testing.assert_allclose(joined.max(1), alone.max(1), rtol=0.3 * weight)
+    assert np.abs(joined - alone).max() > 1e-4 * alone.max()
+
+
+@pytest.mark.parametrize("bound", [beam_sums.ROUNDED, np.float32(np.inf)])
 @pytest.mark.parametrize("radiometry", ["paper", "lambertian"])
 def test_echoes_are_the_strongest_bins_of_the_histograms_bit_for_bit(
     bound: np.float32, radiometry: Radiometry, monkeypatch: pytest.MonkeyPatch
@@ -190,13 +208,13 @@ def test_echoes_are_the_strongest_bins_of_the_histograms_bit_for_bit(
     job = prepare(Scene(RIG, object_depth(4, object_box(RIG))[1], radiometry=radiometry), STOPS["draft"]).job
     job = job.select(np.arange(0, len(job.laser_spot_m), 7))
     # With bounds of infinity no window decides, and every beam sums all of its bins.
-    window = backend_numba._strongest_in_window
+    window = backend_numba.strongest_in_window
 
     def undecided(*args: Any) -> Any:
         *found, sure = window(*args)
         return *found, sure & np.isfinite(bound)
 
-    monkeypatch.setattr(backend_numba, "_strongest_in_window", undecided)
+    monkeypatch.setattr(backend_numba, "strongest_in_window", undecided)
     found, whole = echoes(job), strongest(histograms(job), job.bin_m)
     for name in ("peak", "runner_up", "path_m"):
         np.testing.assert_array_equal(getattr(found, name), getattr(whole, name))

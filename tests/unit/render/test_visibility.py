@@ -9,11 +9,10 @@ from nlos_cam.errors import SceneError
 from nlos_cam.objects import cell_centers_m, object_box, object_depth
 from nlos_cam.render import Accuracy, Scene, Surface, TransportJob, interreflection, prepare, three_bounce
 from nlos_cam.render.backend_numba import NumbaJob
-from nlos_cam.render.energy_survey import occluded
 from nlos_cam.render.legs import DARK, FREE, NumbaOptics, NumbaSurface, judge
 from nlos_cam.render.line_of_sight import first_hits
 from nlos_cam.render.scene_facts import SceneFacts
-from nlos_cam.render.visibility import FACES, HeightField, blocked, height_field, horizon_table, visible
+from nlos_cam.render.visibility import FACES, HeightField, blocked, height_field, horizon_table, occluded, visible
 from nlos_cam.render.visibility import segment_blocked as between
 
 RIG = load_rig("paper-rig")
@@ -229,7 +228,7 @@ def test_verdict_on_a_tile_holds_for_each_leg(surface: str, edge: Occluder | Non
     assert job is not None
     single, where = NumbaJob(job), job.patches
     for points in (single.relay, single.feet(np.ones(len(job.laser_spot_m)))):
-        verdicts, each = _verdicts(single.surface, points.bounds_m, *single.sites[1:]), points.tile
+        verdicts, each = _verdicts(single.surface, points.bounds_m, *single.sites[3:]), points.tile
         for s in range(0, len(where.row), 41):
             point, normal = where.point_m[s], where.normal[s]
             place = np.repeat(np.arange(len(points.bounds_m)), each)[: len(points.x_m)]
