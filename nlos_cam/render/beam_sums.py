@@ -129,7 +129,7 @@ def ends(
     spread, whole = 0, np.float32(1 / table.per_bin)
     for i in range(count):
         spread = max(spread, int((far[i] - near[i]) * whole))
-        # A beam's first path is d1 + min (d2 + d3 + d4) over the patches; two bins less cover rounding and joining.
+        # A beam's first path is d1 + min (d2 + d3 + d4) over the patches; one bin less covers rounding.
         near[i] = np.floor((near[i] + feet.length_m[start + i] * optics.inverse_bin) * whole) - np.float32(1)
     return near, spread + table.width + 4
 
@@ -220,16 +220,29 @@ def _near_enough(
     )
 
 
+@numba.njit(cache=True, inline="always")
+def _first(g: int, groups: NumbaGroups, joins: Joins, table: NumbaTables) -> tuple[int, int]:
+    """Return the first bin of a group's joined rows, and the last at which a member's row starts; 0 without light."""
+    first, last, bits = int64(1 << 40), int64(0), _bits(table.per_bin)
+    for j in range(groups.begin[g], groups.begin[g + 1]):
+        if joins.ratio[j] > 0:
+            own = table.first[groups.member[j]]
+            first = min(first, own + (joins.shift[j] >> bits))
+            last = max(last, own + ((joins.shift[j] + table.per_bin - 1) >> bits))
+    return first, last
+
+
 @inner(error_model="numpy", fastmath=FAST)
 def _joins(
     verdicts: NDArray[np.int8], bounds_m: Float32, surface: NumbaSurface, groups: NumbaGroups, centers: NumbaSurface,
-    optics: NumbaOptics, per_bin: int,
+    optics: NumbaOptics, table: NumbaTables,
 ) -> Joins:  # fmt: skip
     """Return which groups a tile (4,) of beams joins: those whose free members it cannot tell apart."""
     count = len(groups.reach_m)
     joins = Joins(np.zeros(count, np.bool_), np.zeros(len(verdicts), np.int64), np.zeros(len(verdicts), np.float32))
     x, y = (bounds_m[0] + bounds_m[1]) / 2, (bounds_m[2] + bounds_m[3]) / 2
-    limit, nothing, half = JOIN_WEIGHT / np.float32(max(per_bin, 4)), np.float32(0), np.float32(0.5)
+    limit = JOIN_WEIGHT / np.float32(max(table.per_bin, 4))
+    nothing, half = np.float32(0), np.float32(0.5)
     for g in range(count):
         free, mixed = 0, 0
         for j in range(groups.begin[g], groups.begin[g + 1]):
@@ -253,7 +266,8 @@ def _joins(
                 alike &= (one > nothing) & (other > nothing) & (off <= JOIN_COSINE * limit * other * own_facing)
             joins.shift[j] = int64(np.floor((own_length - length) * optics.inverse_bin + half))
             joins.ratio[j] = surface.strength[s] * own_weight / weight
-        joins.joined[g] = alike
+        first, last = _first(g, groups, joins, table)
+        joins.joined[g] = alike and first <= last <= first + MARGIN
     return joins
 
 
@@ -283,18 +297,6 @@ def _build(
                 add_rows(rows, to, table.rows, base, offset, joins.ratio[begin:], int64(0), int64(1), int64(count))
 
 
-@numba.njit(cache=True, inline="always")
-def _first(g: int, groups: NumbaGroups, joins: Joins, table: NumbaTables) -> tuple[int, int]:
-    """Return the first bin of a group's joined rows, and the last one at which a member's row may start."""
-    first, last, bits = int64(1 << 40), int64(0), _bits(table.per_bin)
-    for j in range(groups.begin[g], groups.begin[g + 1]):
-        if joins.ratio[j] > 0:
-            own = table.first[groups.member[j]]
-            first = min(first, own + (joins.shift[j] >> bits))
-            last = max(last, own + ((joins.shift[j] + table.per_bin - 1) >> bits))
-    return first, last
-
-
 @inner(error_model="numpy", fastmath=FAST)
 def _add_joined(
     start: int, feet: NumbaPoints, groups: NumbaGroups, centers: NumbaSurface, joins: Joins, optics: NumbaOptics,
@@ -307,10 +309,7 @@ def _add_joined(
     rows, group = np.zeros(PATCH_BLOCK * size + 2 * WINDOW, np.float32), np.empty(PATCH_BLOCK, np.int64)
     for g in range(len(joins.joined)):
         if joins.joined[g]:
-            first, last = _first(g, groups, joins, table)
-            if last - first > MARGIN:
-                joins.joined[g] = False
-                continue
+            first = _first(g, groups, joins, table)[0]
             geometry(legs, g, centers, feet, start, count, optics, False)
             one, stride = np.float32(1), WINDOW + wide
             _, least = _place(legs, start, feet, optics, begin, per_bin, stride, one, first, used, block)
@@ -376,7 +375,7 @@ def _sum_tile(
     sums = np.zeros((count, (min(span, most) + WINDOW - 1) // WINDOW * WINDOW), np.float32)
     bound, tile = np.zeros(count, np.float32), feet.bounds_m[start // BEAM_TILE : start // BEAM_TILE + 1]
     verdicts = judge(int64(0), len(table.first), surface, tile, optics, field)[:, 0]
-    joins = _joins(verdicts, tile[0], surface, groups, centers, optics, table.per_bin)
+    joins = _joins(verdicts, tile[0], surface, groups, centers, optics, table)
     # Legs of some patches first, then the rows of each beam: rows and windows stay in the first cache
     _add_joined(start, feet, groups, centers, joins, optics, table, begin, sums, bound)
     _add_single(start, feet, surface, verdicts, groups, joins, optics, field, table, begin, sums, bound)
