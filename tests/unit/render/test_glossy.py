@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from nlos_calibration import load_rig
 
-from nlos_cam.render import Accuracy, Scene, backend_numba, glossy, prepare
+from nlos_cam.render import Accuracy, Scene, beam_sums, glossy, prepare
 from nlos_cam.render.brdf_table import scattered
 from nlos_cam.render.echoes import strongest
 from nlos_cam.render.material import Brdf, Surface, phong, retroreflective
@@ -61,7 +61,7 @@ def test_echoes_are_strongest_bins_of_histograms_bit_for_bit(sub_bins: int, monk
     whole = glossy.histograms(job)
     assert whole.min() >= 0
     monkeypatch.setattr(glossy, "TABLE_BYTES", 1)  # patches in several blocks
-    for factor in (backend_numba.ROUNDED, np.float32(np.inf)):  # with bounds of infinity no window decides
+    for factor in (beam_sums.ROUNDED, np.float32(np.inf)):  # with bounds of infinity no window decides
         monkeypatch.setattr(glossy, "ROUNDED", factor)
         found, best = glossy.echoes(job), strongest(whole, job.bin_m)
         for name in ("peak", "runner_up", "path_m"):
