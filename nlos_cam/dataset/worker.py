@@ -25,6 +25,7 @@ CONTEXT = get_context("spawn")
 AHEAD = 2
 """Pieces that a worker is asked for at a time: it makes the second while its parent stores the first."""
 END_S = 5.0
+"""Time for a worker without work to end by itself."""
 
 
 class Worker:
