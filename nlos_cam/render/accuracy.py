@@ -55,7 +55,7 @@ STOPS = {
     "draft": Accuracy(
         "draft", 40, 32, sub_bins=4, object_stride=2, finest_cells=64, scatter_error=3e-2, tolerance=3e-2
     ),
-    "standard": Accuracy("standard", finest_cells=96),
+    "standard": Accuracy("standard", finest_cells=96, scatter_error=1.5e-2),
     "fine": Accuracy("fine", sub_bins=64, scatter_error=1e-3, tolerance=1e-4),
     "reference": Accuracy("reference", sub_bins=0, tolerance=0.0),
 }

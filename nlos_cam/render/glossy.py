@@ -3,12 +3,13 @@
 An isotropic, reciprocal BRDF is a symmetric function of two directions, so it has eigenfunctions on the hemisphere
 about the normal: f(in, out) = sum_r l_r e_r(in) e_r(out), with e_r = g_r(x) cos(m phi) or g_r(x) sin(m phi) and x =
 sqrt(1 - cosine). S2 then factorizes again, once for each r: a patch has a table of B e_r for every r, and a beam adds
-them all with the weights l_r e_r. The largest terms come first, as many as keep the error within the accuracy's: about
-5 for each unit of a lobe's exponent. Reciprocity is exact, whatever the number of terms.
+them all with the weights l_r e_r. Many directions never occur, so the functions are mixed anew to be the eigenfunctions
+for the directions of sample paths, which takes half as many for the same error. They are looked up on a grid.
+Reciprocity is exact, whatever the number of terms and the grid.
 """
 
 from functools import lru_cache
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Self
 
 import numba
 import numpy as np
@@ -37,32 +38,46 @@ from nlos_cam.render.legs import (
 from nlos_cam.render.material import Brdf
 from nlos_cam.render.visibility import HeightField
 
-POINTS = 48, 96, 192
-"""Gauss points of x in the order in which they are tried."""
+STAGES = (48, 128), (48, 2048), (96, 2048), (192, 2048)
+"""Gauss points of x, and functions at most, in the order in which they are tried."""
 STEPS = 512
 """Steps of x in the table of the functions."""
-PROBES = 4096
-"""Paths on which the error is measured."""
-MAX_RANK = 2048
-TABLE_BYTES = 1 << 24
-"""Memory for the tables of the patches whose rows are added together."""
+SIDES = 32, 48, 64, 96, 128, 192, 256, 384
+"""Points along a side of the grid of directions, in the order in which they are tried."""
+PROBES = 2048
+"""Sample paths on which the error is measured."""
+PATHS, PATHS_AT_MOST = 32, 1 << 14
+"""Other sample paths for each function, for whose directions they are mixed: with fewer a lobe is learnt by heart."""
+TABLE_BYTES = 1 << 20
+"""Memory for the tables of the patches whose rows are added together: the second cache."""
+
+
+class Eigenfunctions(NamedTuple):
+    """Functions of one direction (R) about the normal, of an eigenfunction with m > 0 two."""
+
+    value: Float64
+    """(STEPS + 2, R); sqrt |l| g(x), the last row a copy for the upper end."""
+    harmonic: NDArray[np.int64]
+    """(R,); 2 m for cos(m phi), 2 m + 1 for sin(m phi)."""
+    sign: Float64
+    """(R,); of l."""
+
+    def first(self, count: int) -> Self:
+        """Return the largest functions alone."""
+        return self._replace(value=self.value[:, :count], harmonic=self.harmonic[:count], sign=self.sign[:count])
 
 
 class Basis(NamedTuple):
-    """Functions of one direction (R), of an eigenfunction with m > 0 two."""
+    """Functions of one direction (R) on a grid of the disc of x (cos phi, sin phi), from -1 to 1."""
 
     value: Float32
-    """(STEPS + 2, R); sqrt |l| g(x), the last row a copy for the upper end."""
-    harmonic: NDArray[np.int32]
-    """(R,); 2 m for cos(m phi), 2 m + 1 for sin(m phi)."""
+    """(side, side, R)."""
     sign: Float32
-    """(R,); of l."""
-    largest: float
-    """Largest value of the BRDF."""
+    """(R,)."""
 
 
 @lru_cache(maxsize=8)
-def eigenfunctions(brdf: Brdf, points: int) -> Basis:
+def eigenfunctions(brdf: Brdf, points: int) -> Eigenfunctions:
     """Return the functions of a BRDF, the largest |l| first, from a grid of `points` x and twice as many angles."""
     node, weight = np.polynomial.legendre.leggauss(points)
     x, turn = (node + 1) / 2, np.arange(points + 1) * np.pi / points
@@ -89,124 +104,229 @@ def eigenfunctions(brdf: Brdf, points: int) -> Basis:
     shape *= np.sqrt(np.abs(strength[which, k]))
     twice = np.repeat(np.arange(len(k)), np.where(orders[which] > 0, 2, 1))
     second = np.concatenate([[False], twice[1:] == twice[:-1]])
-    value = np.concatenate([shape, shape[-1:]])[:, twice].astype(np.float32)
-    sign = np.sign(strength[which, k])[twice].astype(np.float32)
-    return Basis(value, (2 * orders[which][twice] + second).astype(np.int32), sign, float(np.abs(f).max()))
+    value = np.concatenate([shape, shape[-1:]])[:, twice]
+    return Eigenfunctions(value, 2 * orders[which][twice] + second, np.sign(strength[which, k])[twice])
 
 
 def glossy_basis(job: TransportJob, brdf: Brdf) -> Basis | None:
     """Return the functions that keep a BRDF within the accuracy's error on sample paths; None if none do."""
-    generator, patches, relay = np.random.default_rng(0), job.patches, job.relay
-    s, q = generator.integers(len(patches.beta), size=PROBES), generator.integers(len(relay.x_m), size=PROBES)
-    spot = job.map_spots_m[generator.integers(len(job.map_spots_m), size=PROBES)]
-    cell = np.stack([relay.x_m[q], relay.y_m[q], np.zeros(PROBES)], 1)
-    point, normal = patches.point_m[s], patches.normal[s]
-    # Legs to the dark side of a patch carry no light.
-    lit = np.flatnonzero(np.all([((end - point) * normal).sum(1) > 0 for end in (spot, cell)], axis=0))
-    ends_m = spot[lit], cell[lit]
-    exact = scattered(brdf, ends_m[0], point[lit], normal[lit], ends_m[1])
-    for points in POINTS:
-        every = eigenfunctions(brdf, points)
-        one, other = (_at(every, end - point[lit], normal[lit]) for end in ends_m)
-        off = np.abs(np.cumsum(one * other * every.sign, 1) - exact[:, None])
-        enough = off.sum(0) <= job.accuracy.scatter_error * exact.sum()
-        # Errors need not fall with every term: one more than the last not good enough, and sines with their cosines.
-        rank = 1 + int(np.flatnonzero(~enough).max(initial=-1)) + 1
-        rank += rank < len(enough) and every.harmonic[rank] % 2
-        if rank <= min(len(enough), MAX_RANK):
-            first = np.ascontiguousarray(every.value[:, :rank])
-            # A truncated series may exceed the BRDF by its error.
-            largest = every.largest + float(off[:, rank - 1].max(initial=0))
-            return Basis(first, every.harmonic[:rank], every.sign[:rank], largest)
+    spot, point, normal, cell = _sample_paths(job, PROBES, seed=0)
+    exact = scattered(brdf, spot, point, normal, cell)
+    probes = [_on_disc(end - point, normal) for end in (spot, cell)]
+    limit = job.accuracy.scatter_error * exact.sum()
+    for points, most in STAGES:
+        every = eigenfunctions(brdf, points).first(most)
+        one, other = (_at(every, end) for end in probes)
+        if (rank := _rank(one * other * every.sign, exact, limit / 2)) <= len(every.sign):
+            mix, sign = _restricted(job, every.first(rank))
+            one, other = (end[:, :rank] @ mix for end in (one, other))
+            fewer = min(_rank(one * other * sign, exact, 0.8 * limit), len(sign))
+            return _on_grid(every.first(rank), mix[:, :fewer], sign[:fewer], probes, exact, limit)
     return None
 
 
-def _at(functions: Basis, to_wall: Float64, normal: Float64) -> Float64:
-    """Return the functions' values (n, R) for directions (n, 3) from patches with normals (n, 3)."""
-    out = np.empty((len(normal), len(functions.sign)), np.float32)
-    _fill(functions, to_wall.astype(np.float32), normal.astype(np.float32), out)
-    return out.astype(np.float64)
+def _sample_paths(job: TransportJob, count: int, seed: int) -> tuple[Float64, Float64, Float64, Float64]:
+    """Return spots, patches' points and normals, and relay cells (n, 3) of sample paths that may carry light."""
+    generator, patches, relay = np.random.default_rng(seed), job.patches, job.relay
+    s, q = generator.integers(len(patches.beta), size=count), generator.integers(len(relay.x_m), size=count)
+    spot = job.map_spots_m[generator.integers(len(job.map_spots_m), size=count)]
+    cell = np.stack([relay.x_m[q], relay.y_m[q], np.zeros(count)], 1)
+    point, normal = patches.point_m[s], patches.normal[s]
+    # Legs to the dark side of a patch carry no light.
+    lit = np.flatnonzero(np.all([((end - point) * normal).sum(1) > 0 for end in (spot, cell)], axis=0))
+    return spot[lit], point[lit], normal[lit], cell[lit]
 
 
-@numba.njit(cache=True, error_model="numpy", fastmath=FAST)
-def _evaluate(
-    functions: Basis, dx: np.float32, dy: np.float32, dz: np.float32, nx: np.float32, ny: np.float32, nz: np.float32,
-    harmonics: Float32, out: Float32,
-) -> None:  # fmt: skip
-    """Fill in the functions' values for the direction (dx, dy, dz) from a patch with that normal (nz <= 0)."""
-    one, tiny = np.float32(1), np.float32(1e-20)
-    inverse = one / np.sqrt(max(dx * dx + dy * dy + dz * dz, tiny))
-    cosine = (dx * nx + dy * ny + dz * nz) * inverse
-    # Tangents of the frame that the smallest rotation turns from the wall's: continuous for every normal with nz < 1.
-    share = (dx * nx + dy * ny) / (one - nz)
-    across, along = (dx + nx * dz - nx * share) * inverse, (dy + ny * dz - ny * share) * inverse
-    length = np.sqrt(max(across * across + along * along, tiny))
-    turn_x, turn_y = across / length, along / length
-    harmonics[0], harmonics[1] = one, np.float32(0)
-    for m in range(2, len(harmonics), 2):  # cos and sin of m phi by the addition theorem
-        harmonics[m] = harmonics[m - 2] * turn_x - harmonics[m - 1] * turn_y
-        harmonics[m + 1] = harmonics[m - 1] * turn_x + harmonics[m - 2] * turn_y
-    at = np.sqrt(min(max(one - cosine, np.float32(0)), one)) * np.float32(STEPS)
-    step = int(at)
-    ahead = at - np.float32(step)
-    low, high = functions.value[step], functions.value[step + 1]
-    for r in range(len(out)):
-        out[r] = (low[r] + ahead * (high[r] - low[r])) * harmonics[np.uint32(functions.harmonic[r])]
+def _rank(terms: Float64, exact: Float64, limit: float) -> int:
+    """Return how many terms (n, R) of a series are enough for a sum of errors; more than R if all are not."""
+    enough = np.abs(np.cumsum(terms, 1) - exact[:, None]).sum(0) <= limit
+    return 1 + int(np.flatnonzero(~enough).max(initial=-1)) + 1  # errors need not fall with every term
+
+
+def _restricted(job: TransportJob, functions: Eigenfunctions) -> tuple[Float64, Float64]:
+    """Return the mix (R, R) of functions that has the fewest terms for the directions of a job, and their signs.
+
+    These are the eigenfunctions of the same BRDF where a direction counts as often as it occurs: an object that sees
+    the wall under half of all directions needs half of the functions.
+    """
+    rank = len(functions.sign)
+    spot, point, normal, cell = _sample_paths(job, min(PATHS * rank, PATHS_AT_MOST), seed=1)
+    products = np.zeros((rank, rank))
+    for begin in range(0, len(point), PROBES):
+        some = slice(begin, begin + PROBES)
+        for end in (spot, cell):
+            value = _at(functions, _on_disc(end[some] - point[some], normal[some]))
+            products += value.T @ value
+    spread, axes = np.linalg.eigh(products)
+    root = axes * np.sqrt(np.maximum(spread, 0))
+    strength, vector = np.linalg.eigh((root.T * functions.sign) @ root)
+    some = np.abs(strength) > 1e-9 * np.abs(strength).max()
+    order = np.flatnonzero(some)[np.argsort(-np.abs(strength[some]), kind="stable")]
+    mix = (functions.sign[:, None] * root) @ vector[:, order] / np.sqrt(np.abs(strength[order]))
+    return mix, np.sign(strength[order])
+
+
+def _on_grid(
+    functions: Eigenfunctions, mix: Float64, sign: Float64, ends: list[Float64], exact: Float64, limit: float
+) -> Basis | None:
+    """Return mixed functions on the coarsest grid that keeps the sum of errors of paths; None if none does."""
+    for side in SIDES:
+        axis = np.linspace(-1, 1, side)
+        disc = np.stack(np.meshgrid(axis, axis, indexing="ij"), -1).reshape(-1, 2)
+        value = (_at(functions, disc) @ mix).reshape(side, side, -1)
+        # Between points that are a step h apart, straight lines lie h^2 / 12 f'' above a function, on average.
+        bent = [np.diff(value, 2, axis, value.take([0], axis), value.take([-1], axis)) for axis in (0, 1)]
+        basis = Basis((value - (bent[0] + bent[1]) / 12).astype(np.float32), sign.astype(np.float32))
+        one, other = (_looked_up(basis, end) for end in ends)
+        if np.abs((one * other * sign).sum(1) - exact).sum() <= limit:
+            return basis
+    return None
+
+
+def _on_disc(to_wall: Float64, normal: Float64) -> Float64:
+    """Return directions (n, 3) from patches with normals (n, 3) as x (cos phi, sin phi) (n, 2)."""
+    disc = np.empty((len(normal), 2), np.float32)
+    _fill_discs(to_wall.astype(np.float32), normal.astype(np.float32), disc)
+    return disc.astype(np.float64)
 
 
 @numba.njit(cache=True)
-def _fill(functions: Basis, to_wall: Float32, normal: Float32, out: Float32) -> None:
-    harmonics = np.zeros(2 + functions.harmonic.max() // 2 * 2, np.float32)
+def _fill_discs(to_wall: Float32, normal: Float32, disc: Float32) -> None:
+    for i in range(len(normal)):
+        disc[i] = _disc(to_wall[i, 0], to_wall[i, 1], to_wall[i, 2], normal[i, 0], normal[i, 1], normal[i, 2])
+
+
+def _at(functions: Eigenfunctions, disc: Float64) -> Float64:
+    """Return the functions' values (n, R) at points (n, 2) of the disc, or beyond its edge at the edge."""
+    at = np.minimum(np.hypot(*disc.T), 1) * STEPS
+    step, turn = at.astype(np.int64), np.arctan2(disc[:, 1], disc[:, 0])
+    low, high = functions.value[step], functions.value[step + 1]
+    angle = turn[:, None] * np.arange(functions.harmonic.max() // 2 + 1)
+    around = np.stack([np.cos(angle), np.sin(angle)], -1).reshape(len(disc), -1)
+    return (low + (at - step)[:, None] * (high - low)) * around[:, functions.harmonic]
+
+
+@numba.njit(cache=True, error_model="numpy", inline="always")
+def _disc(
+    dx: np.float32, dy: np.float32, dz: np.float32, nx: np.float32, ny: np.float32, nz: np.float32
+) -> tuple[np.float32, np.float32]:
+    """Return the direction (dx, dy, dz) from a patch with that normal (nz <= 0) as x (cos phi, sin phi)."""
+    one, tiny = np.float32(1), np.float32(1e-20)
+    inverse = one / np.sqrt(max(dx * dx + dy * dy + dz * dz, tiny))
+    cosine = max((dx * nx + dy * ny + dz * nz) * inverse, np.float32(0))
+    # Tangents of the frame that the smallest rotation turns from the wall's: continuous for every normal with nz < 1.
+    share = (dx * nx + dy * ny) / (one - nz)
+    scale = inverse / np.sqrt(one + cosine)  # sine^2 = (1 - cosine) (1 + cosine) = x^2 (1 + cosine)
+    return (dx + nx * dz - nx * share) * scale, (dy + ny * dz - ny * share) * scale
+
+
+@numba.njit(cache=True, error_model="numpy", fastmath=FAST, inline="always")
+def _values(functions: Basis, x: np.float32, y: np.float32, light: np.float32, out: Float32) -> np.float32:
+    """Fill in the functions' values at a point of the disc, times light; return the sum of their squares."""
+    last, rank = len(functions.value) - 2, len(out)
+    half, one, squares = np.float32(0.5), np.float32(1), np.float32(0)
+    at_x, at_y = (x * half + half) * np.float32(last + 1), (y * half + half) * np.float32(last + 1)
+    i, j = min(max(int(at_x), 0), last), min(max(int(at_y), 0), last)
+    x, y = min(max(at_x - np.float32(i), np.float32(0)), one), min(max(at_y - np.float32(j), np.float32(0)), one)
+    near, far = (one - x) * light, x * light
+    near_low, near_high, far_low, far_high = near * (one - y), near * y, far * (one - y), far * y
+    one_row, next_row = functions.value[i], functions.value[i + 1]
+    a, b, c, d = one_row[j], one_row[j + 1], next_row[j], next_row[j + 1]
+    for r in range(rank):
+        value = near_low * a[r] + near_high * b[r] + far_low * c[r] + far_high * d[r]
+        out[r] = value
+        squares += value * value
+    return squares
+
+
+@numba.njit(cache=True)
+def _fill(functions: Basis, disc: Float32, out: Float32) -> None:
     for i in range(len(out)):
-        x, y, z = to_wall[i]
-        nx, ny, nz = normal[i]
-        _evaluate(functions, x, y, z, nx, ny, nz, harmonics, out[i])
+        _values(functions, disc[i, 0], disc[i, 1], np.float32(1), out[i])
+
+
+def _looked_up(functions: Basis, disc: Float64) -> Float64:
+    """Return the values (n, R) at points (n, 2) of the disc, as the sums take them."""
+    out = np.zeros((len(disc), len(functions.sign)), np.float32)
+    _fill(functions, disc.astype(np.float32), out)
+    return out.astype(np.float64)
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _discs(
+    s: int, surface: NumbaSurface, points: NumbaPoints, start: int, count: int, disc_x: Float32, disc_y: Float32
+) -> None:
+    """Fill in where the legs from a patch to points of the wall meet its disc, vector by vector.
+
+    Without leave to contract products and sums, so that a leg's last bit does not depend on its place in the vectors.
+    """
+    x, y, z = surface.x_m[s], surface.y_m[s], surface.z_m[s]
+    nx, ny, nz = surface.normal_x[s], surface.normal_y[s], surface.normal_z[s]
+    at_x, at_y = points.x_m[start : start + count], points.y_m[start : start + count]
+    for i in range(count):
+        disc_x[i], disc_y[i] = _disc(at_x[i] - x, at_y[i] - y, -z, nx, ny, nz)
+
+
+@numba.njit(cache=True, error_model="numpy", fastmath=FAST)
+def _as_rows(counted: Float32, sign: Float32, rows: Float32, rest: Float32) -> None:
+    """Fill in rows, and norms from a bin on, from light in sub-bins (bins * per_bin, R), times each function."""
+    per_bin, rank, width, bins = rows.shape[0], rows.shape[1], rows.shape[2] - WINDOW, len(rest) - 1
+    total = np.zeros((len(counted) + 1, rank))  # float64, so that the difference of large sums keeps the small bins
+    for k in range(len(counted)):
+        for r in range(rank):
+            total[k + 1, r] = total[k, r] + counted[k, r]
+    for shift in range(per_bin):
+        for i in range(bins):
+            until, begin, squares = total[(i + 1) * per_bin - shift], total[max(i * per_bin - shift, 0)], 0.0
+            for r in range(rank):
+                squares += (until[r] - begin[r]) ** 2
+            rest[i] = max(rest[i], np.float32(np.sqrt(squares)))
+            if i < width:
+                for r in range(rank):
+                    rows[shift, r, WINDOW + i] = np.float32(until[r] - begin[r]) * sign[r]
+    for i in range(bins - 1, -1, -1):
+        rest[i] = max(rest[i], rest[i + 1])
 
 
 @numba.njit(cache=True, error_model="numpy", fastmath=FAST)
 def _patch_rows(
     s: int, surface: NumbaSurface, relay: NumbaPoints, optics: NumbaOptics, field: HeightField, functions: Basis,
-    start: np.float32, per_bin: int, rows: Float32,
+    start: np.float32, per_bin: int, rows: Float32, rest: Float32,
 ) -> None:  # fmt: skip
-    """Fill in the tables (per_bin, R, WINDOW + width) of one patch, from the sub-bin `start` on."""
-    rank, width, legs = rows.shape[1], rows.shape[2] - WINDOW, scratch(relay.tile)
-    harmonics = np.zeros(2 + functions.harmonic.max() // 2 * 2, np.float32)
-    values, total = np.empty(rank, np.float32), np.zeros((width * per_bin + 1, rank))
-    x, y, z = surface.x_m[s], surface.y_m[s], surface.z_m[s]
-    nx, ny, nz = surface.normal_x[s], surface.normal_y[s], surface.normal_z[s]
+    """Fill in the tables (per_bin, R, WINDOW + width) of one patch, from the sub-bin `start` on.
+
+    `rest` (bins + 1) is the largest norm over all functions, of any shift, from a bin on.
+    """
+    bins, legs = len(rest) - 1, scratch(relay.tile)
+    counted, value = np.zeros((bins * per_bin, rows.shape[1]), np.float32), np.empty(rows.shape[1], np.float32)
     verdicts = judge(s, s + 1, surface, relay.bounds_m, optics, field)[0]
+    disc_x, disc_y = np.empty(relay.tile, np.float32), np.empty(relay.tile, np.float32)
     for tile in range(len(verdicts)):
         count = returns(verdicts[tile], legs, s, tile * relay.tile, surface, relay, optics, field)
+        _discs(s, surface, relay, tile * relay.tile, count, disc_x, disc_y)
         for i in range(count):
-            at, weight, q = int(legs.length_m[i] - start), legs.weight[i], tile * relay.tile + i
-            if weight > 0 and at < width * per_bin:
-                _evaluate(functions, relay.x_m[q] - x, relay.y_m[q] - y, -z, nx, ny, nz, harmonics, values)
-                line = total[at + 1]
-                for r in range(rank):
-                    line[r] += weight * values[r]
-    for k in range(width * per_bin):
-        for r in range(rank):
-            total[k + 1, r] += total[k, r]
-    for shift in range(per_bin):
-        for i in range(width):
-            until, begin = total[(i + 1) * per_bin - shift], total[max(i * per_bin - shift, 0)]
-            for r in range(rank):
-                rows[shift, r, WINDOW + i] = np.float32(until[r] - begin[r]) * functions.sign[r]
+            at = int(legs.length_m[i] - start)
+            if legs.weight[i] > 0 and at < bins * per_bin:
+                _values(functions, disc_x[i], disc_y[i], legs.weight[i], value)
+                line = counted[at]
+                for r in range(len(value)):
+                    line[r] += value[r]
+    _as_rows(counted, functions.sign, rows, rest)
 
 
 @numba.njit(cache=True, parallel=True)
 def _rows(
     begin: int, surface: NumbaSurface, relay: NumbaPoints, optics: NumbaOptics, field: HeightField, functions: Basis,
-    first: NDArray[np.int32], per_bin: int, rows: Float32,
+    table: NumbaTables, rows: Float32,
 ) -> None:  # fmt: skip
     """Fill in the tables (patches, per_bin, R, WINDOW + width) of some patches: B times each function, as sums to bins.
 
-    Light beyond the width is left out.
+    Light beyond the width is in `table.rest` alone.
     """
     for j in numba.prange(len(rows)):
-        s = begin + j
-        start = np.float32(first[s] * per_bin)
-        _patch_rows(s, surface, relay, optics, field, functions, start, per_bin, rows[j])
+        s, per_bin = begin + j, table.per_bin
+        start = np.float32(table.first[s] * per_bin)
+        _patch_rows(s, surface, relay, optics, field, functions, start, per_bin, rows[j], table.rest[s])
 
 
 @numba.njit(cache=True, parallel=True)
@@ -236,33 +356,32 @@ def _add_tile(
     flat, every, width = rows.ravel(), sums.ravel(), span - WINDOW
     tile = feet.bounds_m[start // BEAM_TILE : start // BEAM_TILE + 1]
     verdicts = judge(patch, patch + len(rows), surface, tile, optics, field)
-    legs, harmonics = scratch(size), np.zeros(2 + functions.harmonic.max() // 2 * 2, np.float32)
+    legs, at, shift = scratch(size), np.empty(size, np.int32), np.empty(size, np.int32)
+    disc_x, disc_y = np.empty(size, np.float32), np.empty(size, np.float32)
     weight, offset, base = np.empty(rank, np.float32), np.empty(rank, np.int32), np.arange(rank) * span
     for j in range(len(rows)):
         s = patch + j
         if verdicts[j, 0] == DARK:
             continue
         fill(legs, s, surface, feet, start, size, verdicts[j, 0], optics, field, False)
-        x, y, z = surface.x_m[s], surface.y_m[s], surface.z_m[s]
-        nx, ny, nz = surface.normal_x[s], surface.normal_y[s], surface.normal_z[s]
+        _discs(s, surface, feet, start, size, disc_x, disc_y)
         for i in range(size):
-            light = legs.weight[i] * surface.strength[s]
-            if light == 0:
-                continue
-            at = int(np.floor((legs.length_m[i] + feet.length_m[start + i]) * optics.inverse_bin + np.float32(0.5)))
-            ahead = int(begin[start + i]) - at // per_bin - table.first[s]
-            bound[start + i] += light * table.rest[s, min(max(ahead + bins, 0), table.width)]
-            if ahead + bins <= 0:
-                continue
-            _evaluate(functions, feet.x_m[start + i] - x, feet.y_m[start + i] - y, -z, nx, ny, nz, harmonics, weight)
-            for r in range(rank):
-                weight[r] *= light
-            origin = (j * per_bin + at % per_bin) * rank * span + WINDOW
-            for window in range(0, bins, WINDOW):
-                if -WINDOW < ahead + window < width:
-                    for r in range(rank):
-                        offset[r] = origin + ahead + window
-                    add_rows(every, (start + i) * bins + window, flat, base, offset, weight, 0, 1, rank)
+            at[i] = np.int32((legs.length_m[i] + feet.length_m[start + i]) * optics.inverse_bin + np.float32(0.5))
+            shift[i] = at[i] % np.int32(per_bin)
+        # Beams of one shift go together: their rows stay in the first cache.
+        for now in range(per_bin):
+            origin = (j * per_bin + now) * rank * span + WINDOW
+            for i in range(size):
+                if shift[i] != now or legs.weight[i] == 0:
+                    continue
+                ahead, light = int(begin[start + i]) - at[i] // per_bin - table.first[s], legs.weight[i]
+                squares = _values(functions, disc_x[i], disc_y[i], light * surface.strength[s], weight)
+                # A sum of products is at most the product of both norms (Cauchy and Schwarz).
+                bound[start + i] += np.sqrt(squares) * table.rest[s, min(max(ahead + bins, 0), table.width)]
+                for window in range(0, bins, WINDOW):
+                    if -WINDOW < ahead + window < width:
+                        offset[:] = origin + ahead + window
+                        add_rows(every, (start + i) * bins + window, flat, base, offset, weight, 0, 1, rank)
 
 
 @numba.njit(cache=True, parallel=True)
@@ -279,10 +398,13 @@ def _add(
 
 
 def _sums(
-    numba_job: NumbaJob, feet: NumbaPoints, table: NumbaTables, functions: Basis, *, first_only: bool
+    numba_job: NumbaJob, feet: NumbaPoints, functions: Basis, *, first_only: bool
 ) -> tuple[Int64, Float32, Float32]:
     """Return the bin (n,) at which each beam's window begins, its sums (n, bins), and a bound (n,) on later bins."""
     surface, groups, centers, optics, field = numba_job.sites
+    rest = np.zeros((len(surface.x_m), numba_job.width + 1), np.float32)
+    per_bin = numba_job.job.accuracy.sub_bins
+    table = NumbaTables(numba_job.first, np.empty(0, np.float32), rest, per_bin, numba_job.width)
     begin, bins = _begins(feet, groups, centers, optics, table)
     # No path of a patch begins before the window, so that its first bins hold all that the first window can meet.
     windows = 1 if first_only else -(-bins // WINDOW)
@@ -294,19 +416,19 @@ def _sums(
         # A row is read up to a window beyond its end: into the next one's zeros, or those after the last.
         flat = np.zeros(min(block, patches - patch) * table.per_bin * rank * span + WINDOW, np.float32)
         rows = flat[:-WINDOW].reshape(-1, table.per_bin, rank, span)
-        _rows(patch, surface, numba_job.relay, optics, field, functions, table.first, table.per_bin, rows)
+        _rows(patch, surface, numba_job.relay, optics, field, functions, table, rows)
         _add(patch, feet, surface, optics, field, functions, table, begin, rows, sums, bound)
     # A truncated series may fall below 0 by its error where there is no light.
     begin, sums, bound = begin[feet.place], sums[feet.place], bound[feet.place]
-    return begin.astype(np.int64), np.maximum(sums, 0), bound * np.float32(functions.largest)
+    return begin.astype(np.int64), np.maximum(sums, 0), bound
 
 
 def _histograms(numba_job: NumbaJob, functions: Basis, which: Any = slice(None)) -> Float32:
     """Return histograms (n, bins) of I_multi over path length, for some of the job's beams."""
-    job, table = numba_job.job, numba_job.tables(np.empty((0, 0), np.float32))
+    job = numba_job.job
     share = np.zeros(len(job.laser_spot_m))
     share[which] = 1
-    begin, sums, _ = _sums(numba_job, numba_job.feet(share), table, functions, first_only=False)
+    begin, sums, _ = _sums(numba_job, numba_job.feet(share), functions, first_only=False)
     found = np.zeros((len(begin), job.bins), np.float32)
     at = begin[:, None] + np.arange(sums.shape[1])
     beam, k = np.nonzero((at >= 0) & (at < job.bins))
@@ -316,10 +438,8 @@ def _histograms(numba_job: NumbaJob, functions: Basis, which: Any = slice(None))
 
 def _echoes(numba_job: NumbaJob, functions: Basis) -> MultiBounce:
     """Return the strongest bins (n,) of the job's beams: those of `_histograms`, bit for bit, for less work."""
-    job, table = numba_job.job, numba_job.tables(np.empty((0, 0), np.float32))
-    begin, sums, bound = _sums(
-        numba_job, numba_job.feet(np.ones(len(job.laser_spot_m))), table, functions, first_only=True
-    )
+    job = numba_job.job
+    begin, sums, bound = _sums(numba_job, numba_job.feet(np.ones(len(job.laser_spot_m))), functions, first_only=True)
     at = begin[:, None] + np.arange(WINDOW)
     found = strongest(np.where((at >= 0) & (at < job.bins), sums, 0), job.bin_m)
     found.path_m[:] = ((found.path_m / job.bin_m - 0.5).round() + begin + 0.5) * job.bin_m

@@ -22,8 +22,11 @@ from nlos_calibration import Occluder, load_rig
 from nlos_cam import evaluate
 from nlos_cam import render as renderer
 from nlos_cam.files import cache_folder
-from nlos_cam.objects import object_box, object_depth
+from nlos_cam.objects import Pose, category_triangles, object_box, object_depth, orthographic_depth, place
 from nlos_cam.render import beam_sums
+from nlos_cam.render.effects import Effect
+from nlos_cam.render.planning import RenderProblem
+from nlos_cam.render.scene_facts import SceneFacts
 
 
 def tradeoff(_: argparse.Namespace) -> None:
@@ -82,10 +85,37 @@ def glossy(_: argparse.Namespace) -> None:
     harness.write("glossy", {"machine": evaluate.machine(), "renderings": rows, "ranks": ranks})
 
 
+def grids(_: argparse.Namespace) -> None:
+    """Measure time and error on finer depth maps of one airplane, with joined cells and with every cell a patch."""
+    empty, standard, rows = renderer.Scene(load_rig("paper-rig")), renderer.STOPS["standard"], list[dict[str, Any]]()
+    triangles = place(category_triangles("airplane", 20_000_003), Pose(), empty.box)
+    for cells in (52, 64, 96, 128, 192, 256, 320):
+        scene, exact = replace(empty, object_depth_m=orthographic_depth(triangles, empty.box, cells)), None
+        for kind, accuracy in (("joined", standard), ("every cell", replace(standard, finest_cells=0))):
+            job = renderer.prepare(scene, accuracy).job
+            if job is None:
+                raise SystemExit("the airplane has no three-bounce light")
+            some = np.arange(0, len(job.length_m), 60)
+            if exact is None:
+                whole = renderer.prepare(scene, renderer.STOPS["reference"]).job
+                exact = renderer.strongest(renderer.backend_reference.histograms(whole.select(some)), job.bin_m)
+            found = renderer.strongest(renderer.histograms(job.select(some)), job.bin_m)
+            off = np.abs(found.peak / exact.peak - 1)
+            row = {"cells": cells, "patches": kind, "count": len(job.patches.beta)}
+            row |= {"cpu_s": cpu_s(partial(renderer.render, scene, accuracy))}
+            row |= {"within_1": float((np.abs(found.path_m - exact.path_m) < 1.5 * job.bin_m).mean())}
+            rows.append(row | {"error_median": float(np.median(off)), "error_p99": float(np.percentile(off, 99))})
+            print(rows[-1], flush=True)
+    harness.write("grids", {"machine": evaluate.machine(), "rows": rows})
+
+
 SOAK_RIGS = [
     load_rig("paper-rig").model_copy(update={"occluder": edge})
     for edge in (None, *(Occluder(x_m=x, z_min_m=z) for x in (-0.3, 0.0, 0.43) for z in (0.05, 0.2)))
 ]
+SOAK_EFFECTS = "three-bounce", "direct", "line-of-sight", "occluder", "self-occlusion", "tilt"
+SOAK_PLAN = tuple(Effect(name, name in SOAK_EFFECTS, "soak", 0.0) for name in renderer.EFFECTS)
+"""Named without the verdicts on the scene, which take as long as its rendering."""
 SHADE_EDGE = 1e-3
 """Light of a bin, relative to the beam's, that legs on the very edge of a shadow may add or take in float32."""
 
@@ -118,8 +148,8 @@ def soak_faults(seed: int) -> list[str]:
     generator = np.random.default_rng([seed, 20])
     grid = ((8, 6), (24, 20))[int(generator.random() < 0.2)]  # the finer one has more than one tile of relay cells
     accuracy = renderer.Accuracy("soak", *grid, sub_bins=int(generator.choice([1, 4, 8, 64])))
-    effects = "three-bounce", "direct", "line-of-sight", "occluder", "self-occlusion", "tilt"
-    job = renderer.prepare(random_scene(generator), accuracy, effects).job
+    facts = SceneFacts(random_scene(generator), accuracy)
+    job = RenderProblem.of(facts, SOAK_PLAN).job
     if job is None:
         return []
     beams, fine = generator.integers(len(job.length_m), size=12), 64
@@ -213,7 +243,7 @@ def main() -> None:
     """Run the named measurement."""
     parser = harness.options(__doc__)
     commands = parser.add_subparsers(required=True)
-    for work in (tradeoff, glossy):
+    for work in (tradeoff, glossy, grids):
         commands.add_parser(work.__name__, help=work.__doc__).set_defaults(run=work)
     long = commands.add_parser("soak", help=soak.__doc__)
     long.set_defaults(run=soak)
