@@ -24,6 +24,7 @@ from nlos_cam import render as renderer
 from nlos_cam.files import cache_folder
 from nlos_cam.objects import Pose, category_triangles, object_box, object_depth, orthographic_depth, place
 from nlos_cam.render import beam_sums
+from nlos_cam.render.echoes import strongest
 from nlos_cam.render.effects import Effect
 from nlos_cam.render.planning import RenderProblem
 from nlos_cam.render.scene_facts import SceneFacts
@@ -89,7 +90,7 @@ def grids(_: argparse.Namespace) -> None:
     """Measure time and error on finer depth maps of one airplane, with joined cells and with every cell a patch."""
     empty, standard, rows = renderer.Scene(load_rig("paper-rig")), renderer.STOPS["standard"], list[dict[str, Any]]()
     triangles = place(category_triangles("airplane", 20_000_003), Pose(), empty.box)
-    for cells in (52, 64, 96, 128, 192, 256, 320):
+    for cells in (52, 64, 96, 128, 192, 256):
         scene, exact = replace(empty, object_depth_m=orthographic_depth(triangles, empty.box, cells)), None
         for kind, accuracy in (("joined", standard), ("every cell", replace(standard, finest_cells=0))):
             job = renderer.prepare(scene, accuracy).job
@@ -98,8 +99,8 @@ def grids(_: argparse.Namespace) -> None:
             some = np.arange(0, len(job.length_m), 60)
             if exact is None:
                 whole = renderer.prepare(scene, renderer.STOPS["reference"]).job
-                exact = renderer.strongest(renderer.backend_reference.histograms(whole.select(some)), job.bin_m)
-            found = renderer.strongest(renderer.histograms(job.select(some)), job.bin_m)
+                exact = strongest(renderer.backend_reference.histograms(whole.select(some)), job.bin_m)
+            found = strongest(renderer.histograms(job.select(some)), job.bin_m)
             off = np.abs(found.peak / exact.peak - 1)
             row = {"cells": cells, "patches": kind, "count": len(job.patches.beta)}
             row |= {"cpu_s": cpu_s(partial(renderer.render, scene, accuracy))}
