@@ -44,7 +44,7 @@ from nlos_cam.render import SensorModel
 BINS = 10
 LEVELS = 0.5, 0.68, 0.8, 0.9, 0.95
 FEWER = {"glossy": 0.25}
-"""Share of samples for kinds that take a hundred times as long to render; they are rendered at draft."""
+"""Share of samples for kinds that take longest to render; they are rendered at draft."""
 VISIBLE_CELLS = 8
 """Smallest number of map cells in which an object can be detected."""
 

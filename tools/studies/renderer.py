@@ -22,9 +22,8 @@ from nlos_calibration import Occluder, load_rig
 from nlos_cam import evaluate
 from nlos_cam import render as renderer
 from nlos_cam.files import cache_folder
-from nlos_cam.objects import Pose, category_triangles, object_box, object_depth, orthographic_depth, place
+from nlos_cam.objects import object_box, object_depth
 from nlos_cam.render import beam_sums
-from nlos_cam.render.echoes import strongest
 from nlos_cam.render.effects import Effect
 from nlos_cam.render.planning import RenderProblem
 from nlos_cam.render.scene_facts import SceneFacts
@@ -84,30 +83,6 @@ def glossy(_: argparse.Namespace) -> None:
         ]
     ]
     harness.write("glossy", {"machine": evaluate.machine(), "renderings": rows, "ranks": ranks})
-
-
-def grids(_: argparse.Namespace) -> None:
-    """Measure time and error on finer depth maps of one airplane, with joined cells and with every cell a patch."""
-    empty, standard, rows = renderer.Scene(load_rig("paper-rig")), renderer.STOPS["standard"], list[dict[str, Any]]()
-    triangles = place(category_triangles("airplane", 20_000_003), Pose(), empty.box)
-    for cells in (52, 64, 96, 128, 192, 256):
-        scene, exact = replace(empty, object_depth_m=orthographic_depth(triangles, empty.box, cells)), None
-        for kind, accuracy in (("joined", standard), ("every cell", replace(standard, finest_cells=0))):
-            job = renderer.prepare(scene, accuracy).job
-            if job is None:
-                raise SystemExit("the airplane has no three-bounce light")
-            some = np.arange(0, len(job.length_m), 60)
-            if exact is None:
-                whole = renderer.prepare(scene, renderer.STOPS["reference"]).job
-                exact = strongest(renderer.backend_reference.histograms(whole.select(some)), job.bin_m)
-            found = strongest(renderer.histograms(job.select(some)), job.bin_m)
-            off = np.abs(found.peak / exact.peak - 1)
-            row = {"cells": cells, "patches": kind, "count": len(job.patches.beta)}
-            row |= {"cpu_s": cpu_s(partial(renderer.render, scene, accuracy))}
-            row |= {"within_1": float((np.abs(found.path_m - exact.path_m) < 1.5 * job.bin_m).mean())}
-            rows.append(row | {"error_median": float(np.median(off)), "error_p99": float(np.percentile(off, 99))})
-            print(rows[-1], flush=True)
-    harness.write("grids", {"machine": evaluate.machine(), "rows": rows})
 
 
 SOAK_RIGS = [
@@ -244,7 +219,7 @@ def main() -> None:
     """Run the named measurement."""
     parser = harness.options(__doc__)
     commands = parser.add_subparsers(required=True)
-    for work in (tradeoff, glossy, grids):
+    for work in (tradeoff, glossy):
         commands.add_parser(work.__name__, help=work.__doc__).set_defaults(run=work)
     long = commands.add_parser("soak", help=soak.__doc__)
     long.set_defaults(run=soak)
