@@ -42,6 +42,8 @@ STAGES = (48, 128), (48, 2048), (96, 2048), (192, 2048)
 """Gauss points of x, and functions at most, in the order in which they are tried."""
 STEPS = 512
 """Steps of x in the table of the functions."""
+GRID_BYTES = 1 << 28
+"""Limit of the memory for a grid of directions."""
 SIDES = 32, 48, 64, 96, 128, 192, 256, 384
 """Points along a side of the grid of directions, in the order in which they are tried."""
 PROBES = 2048
@@ -171,9 +173,11 @@ def _on_grid(
 ) -> Basis | None:
     """Return mixed functions on the coarsest grid that keeps the sum of errors of paths; None if none does."""
     for side in SIDES:
+        if 4 * side**2 * len(sign) > GRID_BYTES:
+            break
         axis = np.linspace(-1, 1, side)
-        disc = np.stack(np.meshgrid(axis, axis, indexing="ij"), -1).reshape(-1, 2)
-        value = (_at(functions, disc) @ mix).reshape(side, side, -1)
+        lines = (np.stack([np.full(side, x), axis], -1) for x in axis)
+        value = np.stack([(_at(functions, line) @ mix).astype(np.float32) for line in lines])
         # Between points that are a step h apart, straight lines lie h^2 / 12 f'' above a function, on average.
         bent = [np.diff(value, 2, axis, value.take([0], axis), value.take([-1], axis)) for axis in (0, 1)]
         basis = Basis((value - (bent[0] + bent[1]) / 12).astype(np.float32), sign.astype(np.float32))
