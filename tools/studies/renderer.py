@@ -23,10 +23,7 @@ from nlos_cam import evaluate
 from nlos_cam import render as renderer
 from nlos_cam.files import cache_folder
 from nlos_cam.objects import object_box, object_depth
-from nlos_cam.render import beam_sums
-from nlos_cam.render.effects import Effect
-from nlos_cam.render.planning import RenderProblem
-from nlos_cam.render.scene_facts import SceneFacts
+from nlos_cam.render import beam_sums, effects, planning, scene_facts
 
 
 def tradeoff(_: argparse.Namespace) -> None:
@@ -90,7 +87,7 @@ SOAK_RIGS = [
     for edge in (None, *(Occluder(x_m=x, z_min_m=z) for x in (-0.3, 0.0, 0.43) for z in (0.05, 0.2)))
 ]
 SOAK_EFFECTS = "three-bounce", "direct", "line-of-sight", "occluder", "self-occlusion", "tilt"
-SOAK_PLAN = tuple(Effect(name, name in SOAK_EFFECTS, "soak", 0.0) for name in renderer.EFFECTS)
+SOAK_PLAN = tuple(effects.Effect(name, name in SOAK_EFFECTS, "soak", 0.0) for name in renderer.EFFECTS)
 """Named without the verdicts on the scene, which take as long as its rendering."""
 SHADE_EDGE = 1e-3
 """Light of a bin, relative to the beam's, that legs on the very edge of a shadow may add or take in float32."""
@@ -124,8 +121,8 @@ def soak_faults(seed: int) -> list[str]:
     generator = np.random.default_rng([seed, 20])
     grid = ((8, 6), (24, 20))[int(generator.random() < 0.2)]  # the finer one has more than one tile of relay cells
     accuracy = renderer.Accuracy("soak", *grid, sub_bins=int(generator.choice([1, 4, 8, 64])))
-    facts = SceneFacts(random_scene(generator), accuracy)
-    job = RenderProblem.of(facts, SOAK_PLAN).job
+    facts = scene_facts.SceneFacts(random_scene(generator), accuracy)
+    job = planning.RenderProblem.of(facts, SOAK_PLAN).job
     if job is None:
         return []
     beams, fine = generator.integers(len(job.length_m), size=12), 64
