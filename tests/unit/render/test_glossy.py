@@ -6,10 +6,9 @@ import numpy as np
 import pytest
 from nlos_calibration import load_rig
 
-from nlos_cam.render import Accuracy, Scene, beam_sums, glossy, prepare
-from nlos_cam.render.brdf_table import scattered
+from nlos_cam.render import Accuracy, Scene, Surface, beam_sums, glossy, phong, prepare, retroreflective
+from nlos_cam.render.brdf_table import Brdf, scattered
 from nlos_cam.render.echoes import strongest
-from nlos_cam.render.material import Brdf, Surface, phong, retroreflective
 
 pytestmark = pytest.mark.slow
 COARSE = Accuracy("coarse", relay_columns=8, relay_rows=6)
