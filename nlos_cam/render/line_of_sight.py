@@ -119,13 +119,14 @@ def direct_visibility(
     to_cells = np.stack([relay.x_m, relay.y_m, np.zeros_like(relay.x_m)], 1) - beams.lidar_m
     directions = np.concatenate([beams.direction, to_cells / relay.length_m[:, None]])
     lengths = np.concatenate([np.nan_to_num(beams.length_m, nan=np.inf), relay.length_m])
+    level = np.zeros((2, *depth_m.shape))  # slopes change a hit's cosine alone, and most scenes have no hit
+    hit, count = np.isfinite(first_hits(field, level, beams.lidar_m, directions, lengths)[0]), len(beams.length_m)
+    if not hit.any():
+        return None
     slope = np.stack(
         [slope_along(depth_m, 1, field.pitch_x_m, jump_m), -slope_along(depth_m, 0, field.pitch_y_m, jump_m)]
     )
     length, cosine, row, column = first_hits(field, slope, beams.lidar_m, directions, lengths)
-    hit, count = np.isfinite(length), len(beams.length_m)
-    if not hit.any():
-        return None
     if length[hit].min() <= 0:
         raise SceneError(f"the object surrounds the lidar, {beams.lidar_m[2]:g} m off the wall: move it or the lidar")
     which = np.flatnonzero(hit[:count])
