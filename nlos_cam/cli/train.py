@@ -287,6 +287,8 @@ def quality(
 ) -> None:
     """Fit the model that predicts the outline's overlap and the depth error; judged on kinds left out of the fit."""
     weights, graphs = models.weights_folder(weights), cache_folder() / "onnx"
+    if weights.resolve().parent == models.shipped_folder().resolve().parent:
+        raise SceneError(f"{weights} came with the program, and is not changed: give a copy of the folder")
     pipeline = models.load_reconstructor(weights, graphs)
     doubter = models.load_uncertainty_model(weights, graphs, quality=False)  # an old or damaged one is replaced
     if doubter is None:

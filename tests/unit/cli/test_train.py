@@ -255,12 +255,11 @@ def test_train_doubt_ignores_invisible_outliers(go: Run, folder: Path, monkeypat
     assert training.outside.sum() == (outliers & visible).sum() < outliers.sum()
 
 
-def test_train_quality_replaces_a_damaged_model(tmp_path: Path, monkeypatch: Patch, run: Run) -> None:
+def test_train_quality_replaces_a_damaged_model(tmp_path: Path, monkeypatch: Patch, run: Run, shown: Run) -> None:
     untrained_doubt(weights := tmp_path / "run", watched_weights(tmp_path / "watched"))
     (weights / "quality.json").write_text("{", encoding="utf-8")
     figures = np.random.default_rng(0).standard_normal((120, FEATURES)).astype(np.float32)
-    iou = 1 / (1 + np.exp(-figures[:, 0]))
-    kinds = np.array(["cup", "bowl", "rods", "blobs"] * 30)
+    iou, kinds = 1 / (1 + np.exp(-figures[:, 0])), np.array(["cup", "bowl", "rods", "blobs"] * 30)
     known = models.QualitySet(figures, iou, 0.2 - 0.1 * iou, kinds, np.arange(120) % 4 > 1)
     monkeypatch.setattr("nlos_models.load_reconstructor", lambda *_: None)
     monkeypatch.setattr("nlos_cam.dataset.open_dataset", lambda *_, **__: None)
@@ -269,6 +268,7 @@ def test_train_quality_replaces_a_damaged_model(tmp_path: Path, monkeypatch: Pat
     answer = run("train", "quality", "--weights", weights, "--dataset", tmp_path)
     assert (answer["weights"], answer["objects"]) == (str(weights), 120)
     assert models.load_uncertainty_model(weights, tmp_path).quality.record.objects == 120
+    assert "came with" in shown("train", "quality", "--weights", "paper", "--dataset", tmp_path, code=1).err
 
 
 def test_train_direct_refuses_a_store_in_use(tmp_path: Path, out: Path, shown: Run) -> None:
