@@ -165,7 +165,7 @@ def _restricted(job: TransportJob, functions: Eigenfunctions) -> tuple[Float64, 
     some = np.abs(strength) > 1e-9 * np.abs(strength).max()
     order = np.flatnonzero(some)[np.argsort(-np.abs(strength[some]), kind="stable")]
     mix = (functions.sign[:, None] * root) @ vector[:, order] / np.sqrt(np.abs(strength[order]))
-    # LAPACK's last digits depend on where its arrays lie in memory; in float32 the same scene has the same functions.
+    # Their last digits may differ between calls (test_repeatable saw it): rounded, a scene keeps its functions.
     return mix.astype(np.float32).astype(np.float64), np.sign(strength[order])
 
 
