@@ -8,7 +8,7 @@ unexport PYTHONDONTWRITEBYTECODE
 test test-all: export OMP_NUM_THREADS = 1
 test test-all: export OPENBLAS_NUM_THREADS = 1
 
-.PHONY: live test test-all check wheel docs
+.PHONY: live test test-all format check wheel docs
 
 # The base installation alone, without torch.
 live: .venv/.live
@@ -22,6 +22,11 @@ test: .venv/.test
 test-all: test
 	$(BIN)/python -m pytest -n 2 --dist loadfile -m 'slow and not bench' tests/laws tests/unit tests/contract
 	$(BIN)/python -m pytest tests/browser
+
+# Lay out the code as `make check` asks, and mend what the linter can mend.
+format: .venv/.test
+	$(BIN)/ruff check --fix-only .
+	$(BIN)/ruff format .
 
 check: .venv/.test
 	$(BIN)/python tools/checks/check.py
