@@ -1,4 +1,6 @@
-"""Printable ChArUco board of `nlos-cam board`: the pattern to exact scale, a scale bar, and printing advice."""
+"""Printable ChArUco board of `nlos-cam board`: the pattern to exact scale, a scale bar, and
+printing advice.
+"""
 
 from collections.abc import Iterator
 from io import BytesIO
@@ -15,10 +17,14 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from matplotlib.patches import PathPatch
 
-MM_PER_INCH, BAR_MM = 25.4, 100.0
+MM_PER_INCH = 25.4
+BAR_MM = 100.0
 TOP_MM = 7.0
 """White above the pattern. Printers leave a margin of 4 to 5 mm."""
-BAR_ABOVE_EDGE_MM, TEXT_ABOVE_EDGE_MM, TICK_MM, BAR_WIDTH_MM = 15.0, 5.5, 2.0, 0.35
+BAR_ABOVE_EDGE_MM = 15.0
+TEXT_ABOVE_EDGE_MM = 5.5
+TICK_MM = 2.0
+BAR_WIDTH_MM = 0.35
 TEXT_POINTS = 6.0
 
 Rectangle = tuple[float, float, float, float]
@@ -26,10 +32,13 @@ Rectangle = tuple[float, float, float, float]
 
 
 def board_figure(paper: Paper) -> "Figure":
-    """Return the sheet as a figure of the paper's size; coordinates are millimetres from its upper left corner."""
+    """Return the sheet as a figure of the paper's size; coordinates are millimetres from its upper
+    left corner.
+    """
     from matplotlib.figure import Figure
 
-    board, (width_mm, height_mm) = BOARDS[paper], PAPER_MM[paper]
+    board = BOARDS[paper]
+    width_mm, height_mm = PAPER_MM[paper]
     figure = Figure(figsize=(width_mm / MM_PER_INCH, height_mm / MM_PER_INCH))
     axes = figure.add_axes((0.0, 0.0, 1.0, 1.0))
     axes.set(xlim=(0.0, width_mm), ylim=(height_mm, 0.0))
@@ -58,7 +67,8 @@ def pattern_origin_mm(paper: Paper) -> tuple[float, float]:
 def bar_mm(paper: Paper) -> list[Rectangle]:
     """Return the scale bar and its ticks: 100 mm between the ticks' outer edges."""
     width_mm, height_mm = PAPER_MM[paper]
-    left_mm, line_mm = (width_mm - BAR_MM) / 2.0, height_mm - BAR_ABOVE_EDGE_MM
+    left_mm = (width_mm - BAR_MM) / 2.0
+    line_mm = height_mm - BAR_ABOVE_EDGE_MM
     tick_mm = line_mm - TICK_MM / 2.0
     return [
         (left_mm, line_mm - BAR_WIDTH_MM / 2.0, BAR_MM, BAR_WIDTH_MM),
@@ -68,17 +78,31 @@ def bar_mm(paper: Paper) -> list[Rectangle]:
 
 
 def black_cells(board: Board, left_mm: float, top_mm: float) -> Iterator[Rectangle]:
-    """Yield the black squares and marker cells of a pattern whose upper left corner is at (left_mm, top_mm)."""
+    """Yield the black squares and marker cells of a pattern whose upper left corner is at (left_mm,
+    top_mm).
+    """
     side_mm = board.square_mm
     for row in range(board.squares_y):
         for column in range(row % 2, board.squares_x, 2):
             yield left_mm + column * side_mm, top_mm + row * side_mm, side_mm, side_mm
-    size = board.opencv_dictionary.markerSize + 2  # with the marker's black border; one pixel for each cell
-    for marker, corners_m in zip(board.opencv_board.getIds(), board.opencv_board.getObjPoints(), strict=True):
-        cells = np.asarray(cv2.aruco.generateImageMarker(board.opencv_dictionary, int(marker), size))
-        cell_mm, (x_mm, y_mm) = board.marker_mm / len(cells), np.asarray(corners_m)[0, :2] * 1e3
+    size = (
+        board.opencv_dictionary.markerSize + 2
+    )  # with the marker's black border; one pixel for each cell
+    for marker, corners_m in zip(
+        board.opencv_board.getIds(), board.opencv_board.getObjPoints(), strict=True
+    ):
+        cells = np.asarray(
+            cv2.aruco.generateImageMarker(board.opencv_dictionary, int(marker), size)
+        )
+        cell_mm = board.marker_mm / len(cells)
+        x_mm, y_mm = np.asarray(corners_m)[0, :2] * 1e3
         for row, column in np.argwhere(cells == 0):
-            yield left_mm + float(x_mm) + column * cell_mm, top_mm + float(y_mm) + row * cell_mm, cell_mm, cell_mm
+            yield (
+                left_mm + float(x_mm) + column * cell_mm,
+                top_mm + float(y_mm) + row * cell_mm,
+                cell_mm,
+                cell_mm,
+            )
 
 
 def _patch(rectangles: list[Rectangle]) -> "PathPatch":
@@ -86,16 +110,22 @@ def _patch(rectangles: list[Rectangle]) -> "PathPatch":
     from matplotlib.path import Path as Outline
 
     outlines = [
-        Outline([(x, y), (x + w, y), (x + w, y + h), (x, y + h), (x, y)], closed=True) for x, y, w, h in rectangles
+        Outline([(x, y), (x + w, y), (x + w, y + h), (x, y + h), (x, y)], closed=True)
+        for x, y, w, h in rectangles
     ]
-    return PathPatch(Outline.make_compound_path(*outlines), facecolor="black", edgecolor="none", linewidth=0.0)
+    return PathPatch(
+        Outline.make_compound_path(*outlines), facecolor="black", edgecolor="none", linewidth=0.0
+    )
 
 
 def _text(board: Board, paper: Paper) -> str:
-    squares = f"{board.squares_x} x {board.squares_y} squares of {board.square_mm:g} mm, {board.dictionary}"
+    squares = (
+        f"{board.squares_x} x {board.squares_y} squares of {board.square_mm:g} mm,"
+        f" {board.dictionary}"
+    )
     return (
-        "Print at 100 % (not “fit to page”): this bar must measure 100 mm. If it measures B mm, give "
-        f"--square-mm {board.square_mm / BAR_MM:g} x B.\n"
-        "Use a laser printer: toner is black in infrared, dye ink is white. Glue the sheet flat on the near side of "
-        f"the wall.\nnlos-cam board, {paper}: {squares}"
+        "Print at 100 % (not “fit to page”): this bar must measure 100 mm. If it measures B mm,"
+        f" give --square-mm {board.square_mm / BAR_MM:g} x B.\nUse a laser printer: toner is black"
+        " in infrared, dye ink is white. Glue the sheet flat on the near side of the"
+        f" wall.\nnlos-cam board, {paper}: {squares}"
     )

@@ -1,7 +1,9 @@
-"""Color view of the board: mean gray image of the color camera beside the lidar, its lens and its pose.
+"""Color view of the board: mean gray image of the color camera beside the lidar, its lens and its
+pose.
 
-It is captured before the lidar runs: the wall stands still, so no frames are paired, and later the link has room for
-the depth. Not tried on a physical L515: checked against a software device and a D435's recording.
+It is captured before the lidar runs: the wall stands still, so no frames are paired, and later the
+link has room for the depth. Not tried on a physical L515: checked against a software device and a
+D435's recording.
 """
 
 from collections.abc import Callable, Mapping
@@ -21,7 +23,8 @@ from nlos_cam import camera as cameras
 from nlos_cam import errors
 from nlos_cam.recording import BagReader
 
-COLOR_STREAM, COLOR_FORMAT = "color", "rgb8"
+COLOR_STREAM = "color"
+COLOR_FORMAT = "rgb8"
 """The SDK's name of the stream, and the format requested from a live camera."""
 WANTED = COLOR_STREAM, COLOR_FORMAT, cameras.FRAMES_PER_S
 MAX_WIDTH_PX = 1280
@@ -49,21 +52,32 @@ class _LiveOptions:
 
 
 def capture_color_view(
-    uri: str, frames: int, *, on_frame: Callable[[], None] = lambda: None, sdk: Any = None, silence_s: float = SILENCE_S
+    uri: str,
+    frames: int,
+    *,
+    on_frame: Callable[[], None] = lambda: None,
+    sdk: Any = None,
+    silence_s: float = SILENCE_S,
 ) -> BoardView:
-    """Return the mean gray view over at most `frames` frames of the color camera of a recording or a live L515.
+    """Return the mean gray view over at most `frames` frames of the color camera of a recording or
+    a live L515.
 
-    A recording's last frames are used, when the exposure has settled; a live camera's frames after SETTLING_FRAMES,
-    and the camera is released. Raises StreamMissingError and RecordingError for a recording, CameraNotFoundError,
-    CameraLostError and CameraError for a live camera or one without color, NlosCamError for another lens model.
+    A recording's last frames are used, when the exposure has settled; a live camera's frames after
+    SETTLING_FRAMES, and the camera is released. Raises StreamMissingError and RecordingError for a
+    recording, CameraNotFoundError, CameraLostError and CameraError for a live camera or one without
+    color, NlosCamError for another lens model.
     """
     scheme, _, rest = uri.partition(":")
     if scheme == "bag" and rest:
         return _recorded(Path(rest), frames, on_frame)
     if scheme == "l515":
-        return _live(uri, rest, sdk or cameras.load_sdk(), _LiveOptions(frames, on_frame, silence_s))
+        return _live(
+            uri, rest, sdk or cameras.load_sdk(), _LiveOptions(frames, on_frame, silence_s)
+        )
     if scheme == "sim":
-        raise errors.CameraError(f"{uri}: the simulated lidar has no colour camera: use --board-in infrared")
+        raise errors.CameraError(
+            f"{uri}: the simulated lidar has no colour camera: use --board-in infrared"
+        )
     raise errors.CameraNotFoundError(f"no camera is called {uri!r}: use {cameras.NAMES}")
 
 
@@ -71,17 +85,21 @@ def _recorded(path: Path, frames: int, on_frame: Callable[[], None]) -> BoardVie
     bag = BagReader(path)
     if missing := [stream for stream in ("depth", COLOR_STREAM) if stream not in bag.streams]:
         raise errors.StreamMissingError(
-            f"{path} has no {' and no '.join(missing)} stream (it has {', '.join(sorted(bag.streams))}): record colour "
-            "beside depth, e.g. with realsense-viewer, or use --board-in infrared"
+            f"{path} has no {' and no '.join(missing)} stream (it has"
+            f" {', '.join(sorted(bag.streams))}): record colour beside depth, e.g. with"
+            " realsense-viewer, or use --board-in infrared"
         )
     info = bag.streams[COLOR_STREAM]
-    lens, pose = _lens(f"{path}", *bag.lens(COLOR_STREAM)), bag.pose("depth", COLOR_STREAM)
+    lens = _lens(f"{path}", *bag.lens(COLOR_STREAM))
+    pose = bag.pose("depth", COLOR_STREAM)
     mean = Moments(shape := (info.intrinsics.height, info.intrinsics.width))
     for index in range(max(info.frames - frames, 0), info.frames):
         pixels = bag.sample(COLOR_STREAM, index).pixels
         if info.format not in TO_GRAY or pixels.shape[:2] != shape:
             size = f"{pixels.shape[1]} x {pixels.shape[0]} {info.format}"
-            raise errors.RecordingError(f"{path} has unsupported colour images ({size}): use --board-in infrared")
+            raise errors.RecordingError(
+                f"{path} has unsupported colour images ({size}): use --board-in infrared"
+            )
         mean.add(TO_GRAY[info.format](pixels))
         on_frame()
     return BoardView(mean.mean(), info.intrinsics, lens, pose, "colour", CameraErrors())
@@ -94,7 +112,8 @@ def _live(uri: str, serial: str, sdk: Any, options: _LiveOptions) -> BoardView:
         depth = cameras.find_streams(device)[1].get("depth")
         if profile is None or depth is None:
             raise errors.CameraError(
-                f"{uri} offers no colour beside its depth at {cameras.FRAMES_PER_S} frames/s: use --board-in infrared"
+                f"{uri} offers no colour beside its depth at {cameras.FRAMES_PER_S} frames/s: use"
+                " --board-in infrared"
             )
         model = profile.as_video_stream_profile().get_intrinsics()
         lens = _lens(uri, model.model.name, np.array(model.coeffs))
@@ -102,13 +121,16 @@ def _live(uri: str, serial: str, sdk: Any, options: _LiveOptions) -> BoardView:
         image = _mean_of(uri, sensor, profile, options)
     except RuntimeError as error:
         raise errors.CameraError(
-            f"cannot open the colour camera of {uri} ({error}): close other programs that use it, or replug it"
+            f"cannot open the colour camera of {uri} ({error}): close other programs that use it,"
+            " or replug it"
         ) from error
     return BoardView(image, cameras.intrinsics_of(profile), lens, pose, "colour", CameraErrors())
 
 
 def _color_profile(device: Any) -> tuple[Any, Any]:
-    """Return the color sensor and its widest profile, up to MAX_WIDTH_PX; None, None without one."""
+    """Return the color sensor and its widest profile, up to MAX_WIDTH_PX; None, None without
+    one.
+    """
     best: tuple[int, Any, Any] = (0, None, None)
     for sensor in device.query_sensors():
         for profile in sensor.get_stream_profiles():
@@ -121,13 +143,19 @@ def _color_profile(device: Any) -> tuple[Any, Any]:
 
 
 def _lens(where: str, model: str, coefficients: Float64) -> Float64:
-    """Return the lens coefficients in OpenCV's order. Raises NlosCamError for an unsupported model."""
+    """Return the lens coefficients in OpenCV's order. Raises NlosCamError for an unsupported
+    model.
+    """
     if not coefficients.any():
         return np.zeros(5)
-    if model != "brown_conrady" or coefficients.shape != (5,) or not np.isfinite(coefficients).all():
+    if (
+        model != "brown_conrady"
+        or coefficients.shape != (5,)
+        or not np.isfinite(coefficients).all()
+    ):
         raise errors.NlosCamError(
-            f"{where}: unsupported distortion model for the colour stream: {model} {coefficients.tolist()}; "
-            "use --board-in infrared"
+            f"{where}: unsupported distortion model for the colour stream: {model}"
+            f" {coefficients.tolist()}; use --board-in infrared"
         )
     return coefficients.astype(np.float64)
 
@@ -143,10 +171,13 @@ def _pose(extrinsics: Any) -> Float64:
 def _mean_of(uri: str, sensor: Any, profile: Any, options: _LiveOptions) -> Float64:
     """Return the mean gray image (height, width) of a sensor; it streams only during the call."""
     size = cameras.intrinsics_of(profile)
-    mean, queue = Moments((size.height, size.width)), Queue[NDArray[Any]](maxsize=QUEUE_FRAMES)
+    mean = Moments((size.height, size.width))
+    queue = Queue[NDArray[Any]](maxsize=QUEUE_FRAMES)
 
     def keep(frame: Any) -> None:
-        with suppress(Full):  # never block the SDK: the scene stands still, so a later frame is as good
+        with suppress(
+            Full
+        ):  # never block the SDK: the scene stands still, so a later frame is as good
             queue.put_nowait(cameras.sample_from_sdk(frame).pixels)
 
     sensor.open([profile])
@@ -159,7 +190,8 @@ def _mean_of(uri: str, sensor: Any, profile: Any, options: _LiveOptions) -> Floa
                 options.on_frame()
     except Empty:
         raise errors.CameraLostError(
-            f"{uri} gave no colour frame for {options.silence_s:g} s: replug it, close other programs"
+            f"{uri} gave no colour frame for {options.silence_s:g} s: replug it, close other"
+            " programs"
         ) from None
     finally:
         for end in (sensor.stop, sensor.close):

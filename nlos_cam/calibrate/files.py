@@ -21,26 +21,35 @@ class WallFiles:
 
     @classmethod
     def beside(cls, record: Path, *, overwrite: bool) -> "WallFiles":
-        """Return the paths for a record. Raises OutputExistsError for an existing file without `overwrite`."""
+        """Return the paths for a record. Raises OutputExistsError for an existing file without
+        `overwrite`.
+        """
         files = cls(record, record.with_suffix(".npz"), record.with_suffix(".html"))
         if record in (files.reference, files.report):
-            raise OutputExistsError(f"{record} would be overwritten by the reference or the report: name it wall.toml")
+            raise OutputExistsError(
+                f"{record} would be overwritten by the reference or the report: name it wall.toml"
+            )
         for path in (files.reference, files.report):
             if path.is_dir() or (path.exists() and not overwrite):
-                raise OutputExistsError(f"{path} exists: choose another name, or add --overwrite to replace it")
+                raise OutputExistsError(
+                    f"{path} exists: choose another name, or add --overwrite to replace it"
+                )
         return files
 
 
 def write_record(files: WallFiles, record: WallRecord, reference: BareWall | None) -> WallRecord:
     """Write the three files and return the record, which names its reference.
 
-    They replace earlier ones only when all are complete, so an interrupted run leaves the earlier set whole.
+    They replace earlier ones only when all are complete, so an interrupted run leaves the earlier
+    set whole.
     """
     with ExitStack() as parts:
         record_part = parts.enter_context(atomic_file(files.record))
         if reference is not None:
             digest = save_reference(parts.enter_context(atomic_file(files.reference)), reference)
-            record = record.model_copy(update={"reference": files.reference.name, "reference_sha256": digest})
+            record = record.model_copy(
+                update={"reference": files.reference.name, "reference_sha256": digest}
+            )
         html = report_html(MeasuredWall(record, reference), files.record.name)
         parts.enter_context(atomic_file(files.report)).write_text(html, encoding="utf-8")
         record_part.write_text(dump_toml(record), encoding="utf-8")

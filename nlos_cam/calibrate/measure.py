@@ -1,4 +1,6 @@
-"""Measurement of a bench that stands still: statistics of a camera's frames, wall and occluder fitted to them."""
+"""Measurement of a bench that stands still: statistics of a camera's frames, wall and occluder
+fitted to them.
+"""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
@@ -33,13 +35,19 @@ class CaptureStatistics:
     settings: Mapping[str, float]
 
     def reference(self, inliers: NDArray[np.bool_]) -> walls.BareWall:
-        """Return the bench's reference for difference maps; `inliers` (height, width) are the pixels of the plane."""
+        """Return the bench's reference for difference maps; `inliers` (height, width) are the
+        pixels of the plane.
+        """
         return self.statistics.reference(inliers, serial=self.serial, settings=self.settings)
 
     def facts(self) -> dict[str, object]:
         """Return the record's fields about the device."""
         device = {"serial": self.serial, "firmware": self.firmware}
-        return {**device, "settings": dict(self.settings), "temperatures_c": self.statistics.celsius()}
+        return {
+            **device,
+            "settings": dict(self.settings),
+            "temperatures_c": self.statistics.celsius(),
+        }
 
     def record(
         self,
@@ -47,7 +55,9 @@ class CaptureStatistics:
         facts: Mapping[str, object],
         occluder: walls.OccluderRecord | None = None,
     ) -> walls.WallRecord:
-        """Return today's record of a wall; `facts` are further fields, as the measurements return them."""
+        """Return today's record of a wall; `facts` are further fields, as the measurements return
+        them.
+        """
         return walls.new_wall_record(
             fit,
             self.intrinsics,
@@ -59,9 +69,14 @@ class CaptureStatistics:
         )
 
 
-def collect_statistics(camera: Camera, frames: int, on_frame: Callable[[], None] = lambda: None) -> CaptureStatistics:
-    """Return the statistics of at most `frames` frames of an entered camera. Raises WallRefusedError without any."""
-    statistics, settings = walls.BareWallStatistics(camera.intrinsics), dict[str, float]()
+def collect_statistics(
+    camera: Camera, frames: int, on_frame: Callable[[], None] = lambda: None
+) -> CaptureStatistics:
+    """Return the statistics of at most `frames` frames of an entered camera. Raises
+    WallRefusedError without any.
+    """
+    statistics = walls.BareWallStatistics(camera.intrinsics)
+    settings = dict[str, float]()
     for number, frame in enumerate(islice(camera, frames)):
         maps = maps_from_frame(frame)
         statistics.add(frame.depth_m, frame.ir, maps.depth_m, maps.intensity)
@@ -70,26 +85,34 @@ def collect_statistics(camera: Camera, frames: int, on_frame: Callable[[], None]
             statistics.add_temperatures(camera.telemetry("_temperature"))
         on_frame()
     if statistics.depth.frames == 0:
-        raise WallRefusedError(f"{camera.uri} gave no frames: record the wall again, or use a live camera")
+        raise WallRefusedError(
+            f"{camera.uri} gave no frames: record the wall again, or use a live camera"
+        )
     serial, firmware = (camera.identity.get(name, "") for name in ("serial", "firmware"))
     return CaptureStatistics(camera.uri, statistics, camera.intrinsics, serial, firmware, settings)
 
 
 NEAR_WALL_M = 0.02
-"""Off the plane; with the occluder in place, pixels beyond are on the occluder or straddle its edge."""
+"""Off the plane; with the occluder in place, pixels beyond are on the occluder or straddle its
+edge.
+"""
 
 
 def measure_by_depth(
     capture: CaptureStatistics, tape_m: float | None = None
 ) -> tuple[walls.WallFit, dict[str, object]]:
-    """Fit the wall to its depth; return the fit and, with a distance by tape, the record's range-offset fields.
+    """Fit the wall to its depth; return the fit and, with a distance by tape, the record's
+    range-offset fields.
 
     Raises WallRefusedError, and CalibrationError where tape and lidar cannot both be right.
     """
-    depth_m, noise = capture.statistics.depth.mean_m(), capture.statistics.depth.noise()
+    depth_m = capture.statistics.depth.mean_m()
+    noise = capture.statistics.depth.noise()
 
     def fit_with(offset_m: float, origin_m: float) -> walls.WallFit:
-        return walls.fit_wall(depth_m + offset_m, capture.intrinsics, np.random.default_rng(0), noise, origin_m)
+        return walls.fit_wall(
+            depth_m + offset_m, capture.intrinsics, np.random.default_rng(0), noise, origin_m
+        )
 
     if tape_m is None:
         return fit_with(0.0, 0.0), {}
@@ -102,11 +125,16 @@ def measure_by_depth(
 
 
 def measure_by_board(
-    capture: CaptureStatistics, printed: walls.Board, square_mm: float | None, color: walls.BoardView | None = None
+    capture: CaptureStatistics,
+    printed: walls.Board,
+    square_mm: float | None,
+    color: walls.BoardView | None = None,
 ) -> tuple[walls.WallFit | walls.WallByBoard, dict[str, object]]:
-    """Fit the wall to its depth, unless that is refused, and to a printed board; return the fit and the board's record.
+    """Fit the wall to its depth, unless that is refused, and to a printed board; return the fit and
+    the board's record.
 
-    The board is searched in the mean infrared, unless there is a `color` view of it. Raises BoardRefusedError.
+    The board is searched in the mean infrared, unless there is a `color` view of it. Raises
+    BoardRefusedError.
     """
     try:
         depth = measure_by_depth(capture)[0]
@@ -122,23 +150,33 @@ def measure_by_board(
 def measure_occluder(
     capture: CaptureStatistics, bare: walls.MeasuredWall
 ) -> tuple[walls.WallRecord, NDArray[np.bool_]]:
-    """Find the occluder in front of a known bare wall; return the record with it, and the wall's pixels beside it.
+    """Find the occluder in front of a known bare wall; return the record with it, and the wall's
+    pixels beside it.
 
-    No object may be hidden yet. Raises OccluderRefusedError, CalibrationError for another camera, and WallRefusedError
-    if the lidar has moved since.
+    No object may be hidden yet. Raises OccluderRefusedError, CalibrationError for another camera,
+    and WallRefusedError if the lidar has moved since.
     """
-    record, statistics = bare.record, capture.statistics.depth
+    record = bare.record
+    statistics = capture.statistics.depth
     check_intrinsics(record.rig.pinhole, capture.intrinsics)
     if record.serial and capture.serial and record.serial != capture.serial:
         raise CalibrationError(
-            f"the bare wall was measured with the camera {record.serial}, this is {capture.serial}: use that camera, "
-            "or calibrate the bare wall with this one"
+            f"the bare wall was measured with the camera {record.serial}, this is {capture.serial}:"
+            " use that camera, or calibrate the bare wall with this one"
         )
     offset_m = walls.depth_offset_m(record)
-    depth_m, noise, pose = statistics.mean_m() + offset_m, statistics.noise(), walls.wall_from_zero(record)
-    stds = {"distance_std_m": record.distance_std_m or 0.0, "yaw_std_deg": record.yaw_std_deg or 0.0}
-    found = walls.find_occluder(depth_m, noise, capture.intrinsics, pose, np.random.default_rng(0), **stds)
-    # the wall is fitted again beside the occluder: if the lidar moved, the occluder's place would be wrong as well
+    depth_m = statistics.mean_m() + offset_m
+    noise = statistics.noise()
+    pose = walls.wall_from_zero(record)
+    stds = {
+        "distance_std_m": record.distance_std_m or 0.0,
+        "yaw_std_deg": record.yaw_std_deg or 0.0,
+    }
+    found = walls.find_occluder(
+        depth_m, noise, capture.intrinsics, pose, np.random.default_rng(0), **stds
+    )
+    # the wall is fitted again beside the occluder: if the lidar moved, the occluder's place would
+    # be wrong as well
     off_m = np.abs(walls.points_m(record, depth_m - offset_m, capture.intrinsics)[..., 2])
     beside = np.where((off_m < NEAR_WALL_M) & ~found.pixels, depth_m, np.nan)
     origin_m = record.range_offset_m - offset_m
@@ -146,18 +184,28 @@ def measure_occluder(
     _raise_if_moved(record, wall)
     found = replace(found, x_std_m=hypot(found.x_std_m, _edge_std_from_offset_m(record, found)))
     changes = walls.settings_changed(bare.reference, capture.settings) if bare.reference else ()
-    notes = [f"settings have changed since the bare wall was measured: {', '.join(changes)}"] if changes else []
-    return walls.with_occluder(record, replace(found, warnings=(*found.warnings, *notes))), wall.inliers
+    notes = (
+        [f"settings have changed since the bare wall was measured: {', '.join(changes)}"]
+        if changes
+        else []
+    )
+    return (
+        walls.with_occluder(record, replace(found, warnings=(*found.warnings, *notes))),
+        wall.inliers,
+    )
 
 
 def _edge_std_from_offset_m(record: walls.WallRecord, found: walls.OccluderFit) -> float:
-    """Return the standard uncertainty in metres of the occluder's place along the wall due to the range offset's.
+    """Return the standard uncertainty in metres of the occluder's place along the wall due to the
+    range offset's.
 
-    An offset of the origin moves the edge along the optical axis z: dx = z_x per metre. An offset of depth stretches
-    its ray p by 1 / (p . z): dx = p_x / (p . z). The wall turns with the lidar; the gap's share is in the distance's.
+    An offset of the origin moves the edge along the optical axis z: dx = z_x per metre. An offset
+    of depth stretches its ray p by 1 / (p . z): dx = p_x / (p . z). The wall turns with the lidar;
+    the gap's share is in the distance's.
     """
     pose = np.array(record.wall_from_lidar)
-    edge_m, axis = np.array([found.x_m, 0.0, found.gap_m]) - pose[:3, 3], pose[:3, 2]
+    edge_m = np.array([found.x_m, 0.0, found.gap_m]) - pose[:3, 3]
+    axis = pose[:3, 2]
     per_offset = edge_m[0] / (edge_m @ axis) if record.range_offset_cause == "depth" else axis[0]
     return abs(float(per_offset)) * (record.range_offset_std_m or 0.0)
 
@@ -165,23 +213,32 @@ def _edge_std_from_offset_m(record: walls.WallRecord, found: walls.OccluderFit) 
 def _raise_if_moved(record: walls.WallRecord, wall: walls.WallFit) -> None:
     """Raise WallRefusedError if the lidar has moved since `record`.
 
-    Yaw and pitch are compared, not the facing angle: on a wall faced obliquely, pitch hardly changes that.
+    Yaw and pitch are compared, not the facing angle: on a wall faced obliquely, pitch hardly
+    changes that.
     """
     apart_m = wall.distance_m - record.distance_m
-    yaw_deg, pitch_deg = wall.yaw_deg - record.yaw_deg, wall.pitch_deg - record.pitch_deg
+    yaw_deg = wall.yaw_deg - record.yaw_deg
+    pitch_deg = wall.pitch_deg - record.pitch_deg
     if (
-        max(abs(apart_m) / walls.TOLERANCE_M, abs(yaw_deg) / walls.TOLERANCE_DEG, abs(pitch_deg) / walls.TOLERANCE_DEG)
+        max(
+            abs(apart_m) / walls.TOLERANCE_M,
+            abs(yaw_deg) / walls.TOLERANCE_DEG,
+            abs(pitch_deg) / walls.TOLERANCE_DEG,
+        )
         > 1.0
     ):
         raise WallRefusedError(
-            f"the lidar has moved since the bare wall was measured: the wall is {1e3 * abs(apart_m):.1f} mm "
-            f"{'farther' if apart_m > 0 else 'nearer'}, the lidar turned by {yaw_deg:+z.2f} degrees in yaw and "
-            f"{pitch_deg:+z.2f} in pitch: calibrate the bare wall again, then put the occluder back"
+            "the lidar has moved since the bare wall was measured: the wall is"
+            f" {1e3 * abs(apart_m):.1f} mm {'farther' if apart_m > 0 else 'nearer'}, the lidar"
+            f" turned by {yaw_deg:+z.2f} degrees in yaw and {pitch_deg:+z.2f} in pitch: calibrate"
+            " the bare wall again, then put the occluder back"
         )
 
 
 MAX_FIT_COLUMNS = 160
-"""A single frame is thinned to about this width: the plane is still known to a tenth of a millimetre."""
+"""A single frame is thinned to about this width: the plane is still known to a tenth of a
+millimetre.
+"""
 
 
 @dataclass(frozen=True)
@@ -200,7 +257,9 @@ def fit_frame(frame: Frame) -> FrameFit:
     depth_m, intrinsics = thinned(frame.depth_m, frame.intrinsics)
     saturated = saturated_share(frame.ir)
     try:
-        return FrameFit(walls.fit_wall(depth_m, intrinsics, np.random.default_rng(0)), "", saturated)
+        return FrameFit(
+            walls.fit_wall(depth_m, intrinsics, np.random.default_rng(0)), "", saturated
+        )
     except WallRefusedError as error:
         return FrameFit(None, str(error), saturated)
 
@@ -211,4 +270,6 @@ def thinned(depth_m: Float32, intrinsics: walls.Intrinsics) -> tuple[Float32, wa
     first = step // 2
     few = depth_m[first::step, first::step]
     center = (intrinsics.ppx - first) / step, (intrinsics.ppy - first) / step
-    return few, walls.Intrinsics(few.shape[1], few.shape[0], intrinsics.fx / step, intrinsics.fy / step, *center)
+    return few, walls.Intrinsics(
+        few.shape[1], few.shape[0], intrinsics.fx / step, intrinsics.fy / step, *center
+    )

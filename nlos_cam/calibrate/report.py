@@ -1,4 +1,6 @@
-"""Report on a measured wall: one HTML file with verdict, ranges, pictures, quantities, device and use."""
+"""Report on a measured wall: one HTML file with verdict, ranges, pictures, quantities, device and
+use.
+"""
 
 import shlex
 from html import escape
@@ -9,18 +11,24 @@ from nlos_cam.calibrate.report_drawings import bench_picture, footprint_picture
 from nlos_cam.calibrate.report_maps import wall_maps
 from nlos_cam.report import Picture, bullets, commands, figure, page, pairs, table
 
-BAR_WIDTH, BAR_MARGIN = 640.0, 20.0
+BAR_WIDTH = 640.0
+BAR_MARGIN = 20.0
 VERDICTS = {
     "good": "✔ Good: the bench can be used",
     "out of range": "✘ Out of range: the wall is measured, but the bench has to be moved",
     "doubtful": "? Doubtful: the wall may be elsewhere than measured",
 }
 """Words and a sign beside the color, for readers who cannot tell the colors apart."""
-NO_MAPS = Picture("Maps of the wall", "This record names no reference of the bare wall: there are no maps to draw.")
+NO_MAPS = Picture(
+    "Maps of the wall",
+    "This record names no reference of the bare wall: there are no maps to draw.",
+)
 
 
 def report_html(wall: walls.MeasuredWall, record_file: str) -> str:
-    """Return the report on a wall whose record is called `record_file`: HTML that needs no other file, no network."""
+    """Return the report on a wall whose record is called `record_file`: HTML that needs no other
+    file, no network.
+    """
     record = wall.record
     maps = [NO_MAPS] if wall.reference is None else wall_maps(record, wall.reference)
     subtitle = f"{record.created}, {record.camera}, {record.frames} frames of the bare wall"
@@ -38,22 +46,31 @@ def report_html(wall: walls.MeasuredWall, record_file: str) -> str:
     return page(f"The bench as measured: {record_file}", subtitle, parts)
 
 
-def range_bar(name: str, value: float, allowed: tuple[float, float], tolerance: float, unit: str, end: float) -> str:
-    """Return a bar from 0 to `end` with the allowed range and a marker at the value, or at the bar's nearer end."""
+def range_bar(
+    name: str, value: float, allowed: tuple[float, float], tolerance: float, unit: str, end: float
+) -> str:
+    """Return a bar from 0 to `end` with the allowed range and a marker at the value, or at the
+    bar's nearer end.
+    """
     low, high = allowed
     inside = low - tolerance <= value <= high + tolerance
-    left, right, at = (BAR_MARGIN + BAR_WIDTH * each / end for each in (low, high, min(max(value, 0.0), end)))
-    marker, state = ("inside", "inside") if inside else ("outside", "too small" if value < low else "too large")
+    left, right, at = (
+        BAR_MARGIN + BAR_WIDTH * each / end for each in (low, high, min(max(value, 0.0), end))
+    )
+    marker, state = (
+        ("inside", "inside") if inside else ("outside", "too small" if value < low else "too large")
+    )
     label = escape(f"{name}: {value:.1f} {unit}, {state} ({low:.0f} to {high:.0f} {unit})")
     ends = "".join(
         f"<text x='{x:.0f}' y='46' text-anchor='middle'>{each:.0f} {unit}</text>"
         for x, each in ((left, low), (right, high))
     )
     return (
-        f"<p class='bar'><b>{label}</b></p><svg viewBox='0 0 680 52' role='img' aria-label='{label}'>"
-        f"<rect x='{BAR_MARGIN:.0f}' y='14' width='{BAR_WIDTH:.0f}' height='14' rx='7' class='rail'/>"
-        f"<rect x='{left:.1f}' y='14' width='{right - left:.1f}' height='14' class='allowed'/>{ends}"
-        f"<path d='M {at:.1f} 28 l -9 -24 h 18 z' class='{marker}'/></svg>"
+        f"<p class='bar'><b>{label}</b></p><svg viewBox='0 0 680 52' role='img'"
+        f" aria-label='{label}'><rect x='{BAR_MARGIN:.0f}' y='14' width='{BAR_WIDTH:.0f}'"
+        f" height='14' rx='7' class='rail'/><rect x='{left:.1f}' y='14' width='{right - left:.1f}'"
+        f" height='14' class='allowed'/>{ends}<path d='M {at:.1f} 28 l -9 -24 h 18 z'"
+        f" class='{marker}'/></svg>"
     )
 
 
@@ -61,14 +78,24 @@ def banner(record: walls.WallRecord) -> str:
     """Return verdict, advice and warnings."""
     name = record.verdict.replace(" ", "-")
     text = f"<p class='word'>{VERDICTS[record.verdict]}</p><p>{escape(record.advice)}</p>"
-    return f"<section class='verdict {name}'>{text}</section>{bullets('Note', record.warnings, 'warnings')}"
+    return (
+        "<section class='verdict"
+        f" {name}'>{text}</section>{bullets('Note', record.warnings, 'warnings')}"
+    )
 
 
 def ranges(record: walls.WallRecord) -> str:
     """Return bars that show this bench within the paper's ranges."""
     bars = [
         _bar_in_cm("distance", record.distance_m, walls.DISTANCE_RANGE_M, 45.0),
-        range_bar("facing angle", record.facing_deg, walls.FACING_RANGE_DEG, walls.TOLERANCE_DEG, "degrees", 90.0),
+        range_bar(
+            "facing angle",
+            record.facing_deg,
+            walls.FACING_RANGE_DEG,
+            walls.TOLERANCE_DEG,
+            "degrees",
+            90.0,
+        ),
     ]
     if record.occluder is not None:
         bars.append(_bar_in_cm("occluder's gap", record.occluder.gap_m, walls.GAP_RANGE_M, 30.0))
@@ -77,12 +104,18 @@ def ranges(record: walls.WallRecord) -> str:
 
 def _bar_in_cm(name: str, value_m: float, allowed_m: tuple[float, float], end_cm: float) -> str:
     low_cm, high_cm = (100.0 * end for end in allowed_m)
-    return range_bar(name, 100.0 * value_m, (low_cm, high_cm), 100.0 * walls.TOLERANCE_M, "cm", end_cm)
+    return range_bar(
+        name, 100.0 * value_m, (low_cm, high_cm), 100.0 * walls.TOLERANCE_M, "cm", end_cm
+    )
 
 
 def measures(record: walls.WallRecord) -> str:
     """Return the measured quantities with the half width of each 95 % interval."""
-    hint = "" if record.range_offset_std_m is not None else "<p>Range offset not measured: give --tape-m.</p>"
+    hint = (
+        ""
+        if record.range_offset_std_m is not None
+        else "<p>Range offset not measured: give --tape-m.</p>"
+    )
     rows = table(walls.wall_facts(record), ("", "measured (± 95 %)", "meaning"))
     return f"<section><h2>What was measured</h2>{rows}{hint}</section>"
 
@@ -109,13 +142,21 @@ def board(record: walls.WallRecord) -> str:
             for name, key in (("facing angle", "facing"), ("yaw", "yaw"), ("pitch", "pitch"))
         ),
     ]
-    used = {"both": "depth and board together", "depth": "the depth alone", "board": "the board alone"}[found.used]
-    printed = f"{found.printed.squares_x} x {found.printed.squares_y} squares of {found.printed.square_mm:.2f} mm"
+    used = {
+        "both": "depth and board together",
+        "depth": "the depth alone",
+        "board": "the board alone",
+    }[found.used]
+    printed = (
+        f"{found.printed.squares_x} x {found.printed.squares_y} squares of"
+        f" {found.printed.square_mm:.2f} mm"
+    )
     facts = (
-        f"{walls.board_agreement(found)} The record's plane is of {used}. {found.corners} corners of {printed} "
-        f"({'measured on the print' if found.measured else 'as drawn, not measured on the print'}), "
-        f"{found.residual_px:.2f} pixels RMS off; stretched by {100.0 * found.stretch:+z.2f} %, "
-        f"bowed by {1e3 * found.bow_m:+z.2f} mm."
+        f"{walls.board_agreement(found)} The record's plane is of {used}. {found.corners} corners"
+        f" of {printed}"
+        f" ({'measured on the print' if found.measured else 'as drawn, not measured on the print'}),"
+        f" {found.residual_px:.2f} pixels RMS off; stretched by {100.0 * found.stretch:+z.2f} %,"
+        f" bowed by {1e3 * found.bow_m:+z.2f} mm."
     )
     compared = table(rows, ("", "by the board (± 95 %)", "in the record"))
     causes = bullets("Possible causes", found.causes)
@@ -124,7 +165,8 @@ def board(record: walls.WallRecord) -> str:
 
 def device(wall: walls.MeasuredWall) -> str:
     """Return the camera, its settings and temperatures."""
-    record, reference = wall.record, wall.reference
+    record = wall.record
+    reference = wall.reference
     pinhole = record.rig.pinhole
     span = reference.celsius_span if reference is not None else {}
     facts = {
@@ -139,8 +181,12 @@ def device(wall: walls.MeasuredWall) -> str:
     }
     settings = {name: f"{value:g}" for name, value in record.settings.items()}
     parts = [("Device", facts), ("Temperatures", celsius), ("Settings", settings)]
-    tables = "".join(f"<div><h3>{name}</h3>{pairs(values)}</div>" for name, values in parts if values)
-    return f"<section><h2>What it was measured with</h2><div class='columns'>{tables}</div></section>"
+    tables = "".join(
+        f"<div><h3>{name}</h3>{pairs(values)}</div>" for name, values in parts if values
+    )
+    return (
+        f"<section><h2>What it was measured with</h2><div class='columns'>{tables}</div></section>"
+    )
 
 
 def usage(record: walls.WallRecord, record_file: str) -> str:
@@ -148,8 +194,14 @@ def usage(record: walls.WallRecord, record_file: str) -> str:
     facts = {"record": record_file, "rig's checksum": record.rig.checksum}
     if record.reference:
         facts |= {"bare wall's reference": record.reference, "its SHA-256": record.reference_sha256}
-    name, kind = shlex.quote(record_file), record.camera.split(":", maxsplit=1)[0]
+    name = shlex.quote(record_file)
+    kind = record.camera.split(":", maxsplit=1)[0]
     camera = {"sim": "sim", "bag": "l515"}.get(kind, shlex.quote(record.camera))
-    lines = commands([f"nlos-cam live --camera {camera} --wall {name}", f"nlos-cam render cup --rig {name}"])
-    use = "Keep the files together. The first command shows the hidden object live; the second renders for this bench."
+    lines = commands(
+        [f"nlos-cam live --camera {camera} --wall {name}", f"nlos-cam render cup --rig {name}"]
+    )
+    use = (
+        "Keep the files together. The first command shows the hidden object live; the second"
+        " renders for this bench."
+    )
     return f"<section><h2>Files and use</h2>{pairs(facts)}<p>{use}</p>{lines}</section>"

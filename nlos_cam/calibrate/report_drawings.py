@@ -1,4 +1,6 @@
-"""Drawings of the bench for the report: to scale from above and from the side; the wall from the front."""
+"""Drawings of the bench for the report: to scale from above and from the side; the wall from the
+front.
+"""
 
 from dataclasses import dataclass
 from math import atan2, cos, degrees, hypot, radians, sin
@@ -6,7 +8,16 @@ from typing import TYPE_CHECKING, Any
 
 import cv2
 import numpy as np
-from nlos_calibration import MAP_SHAPE, Extent, ObjectBox, Rig, WallRecord, corner_rays, footprint, on_plane
+from nlos_calibration import (
+    MAP_SHAPE,
+    Extent,
+    ObjectBox,
+    Rig,
+    WallRecord,
+    corner_rays,
+    footprint,
+    on_plane,
+)
 from nlos_calibration.arrays import Float64
 
 from nlos_cam.report import Picture, figure_of, png
@@ -17,12 +28,21 @@ if TYPE_CHECKING:
 Limits = tuple[float, float]
 Style = dict[str, Any]
 
-WALL, LIDAR, EDGE, VIEW, OCCLUDER, OBJECT = "0.35", "#08306b", "#4292c6", "#9ecae1", "#000000", "#d95f02"
-FAR_M, MARGIN_M = 2.5, 0.12
-MAX_X_DRAWN_M, MAX_Y_DRAWN_M = 0.9, 0.35
+WALL = "0.35"
+LIDAR = "#08306b"
+EDGE = "#4292c6"
+VIEW = "#9ecae1"
+OCCLUDER = "#000000"
+OBJECT = "#d95f02"
+FAR_M = 2.5
+MARGIN_M = 0.12
+MAX_X_DRAWN_M = 0.9
+MAX_Y_DRAWN_M = 0.35
 """Limits from the foot: an optical axis that meets the wall beyond them leaves the picture."""
 BENCH_WIDTH_IN = 11.0
-X, Y, Z = 0, 1, 2
+X = 0
+Y = 1
+Z = 2
 NAMES = {X: "x along the wall (m)", Y: "y up (m)", Z: "z from the wall (m)"}
 
 
@@ -36,25 +56,31 @@ class _Side:
     """True if the axis that goes up the page points down."""
 
 
-ABOVE, BESIDE = _Side(X, Z, turned=True), _Side(Z, Y, turned=False)
+ABOVE = _Side(X, Z, turned=True)
+BESIDE = _Side(Z, Y, turned=False)
 
 
 def bench_picture(record: WallRecord) -> Picture:
     """Return the bench from above and from the side, both to one scale."""
     limits = drawn_limits(record.rig)
     wide, tall, deep = (high - low for low, high in limits)
-    figure = figure_of(BENCH_WIDTH_IN, 0.86 * BENCH_WIDTH_IN * max(tall, deep) / (wide + deep) + 0.9)
+    figure = figure_of(
+        BENCH_WIDTH_IN, 0.86 * BENCH_WIDTH_IN * max(tall, deep) / (wide + deep) + 0.9
+    )
     above, beside = figure.subplots(1, 2, width_ratios=(wide, deep))
     for axis, side in ((above, ABOVE), (beside, BESIDE)):
         _draw(axis, side, record, limits)
     _dimension(above, record)
-    above.set_title(f"from above: {record.distance_m:.3f} m away, facing {record.facing_deg:.1f}°", fontsize=11)
+    above.set_title(
+        f"from above: {record.distance_m:.3f} m away, facing {record.facing_deg:.1f}°", fontsize=11
+    )
     beside.set_title(f"from the side: pitch {record.pitch_deg:+z.1f}°", fontsize=11)
     caption = (
-        "Both to the same scale. The dash-dotted line is the lidar's optical axis; the blue area is its field of view "
-        "without the occluder. Its dashed edges never meet the wall. From the side the hidden object (dashed) overlaps "
-        "the lidar: it stands beside it, behind the occluder. Light goes from the lidar to the wall, past "
-        f"the occluder's edge to the hidden object, and back the same way. {_occluder_source(record)}"
+        "Both to the same scale. The dash-dotted line is the lidar's optical axis; the blue area"
+        " is its field of view without the occluder. Its dashed edges never meet the wall. From"
+        " the side the hidden object (dashed) overlaps the lidar: it stands beside it, behind the"
+        " occluder. Light goes from the lidar to the wall, past the occluder's edge to the hidden"
+        f" object, and back the same way. {_occluder_source(record)}"
     )
     return Picture("The bench", caption, png(figure))
 
@@ -68,10 +94,14 @@ def _occluder_source(record: WallRecord) -> str:
 
 
 def drawn_limits(rig: Rig) -> tuple[Limits, Limits, Limits]:
-    """Return the drawn ranges of x, y and z: the whole bench, and the optical axis as far as it fits."""
+    """Return the drawn ranges of x, y and z: the whole bench, and the optical axis as far as it
+    fits.
+    """
     axis_end = _axis_end(rig)
     highest = float(np.clip(axis_end[Y], -MAX_Y_DRAWN_M, MAX_Y_DRAWN_M))
-    x, y, z = [0.0, axis_end[X]], [highest, -0.15, 0.15], [rig.lidar.distance_m + 0.05]
+    x = [0.0, axis_end[X]]
+    y = [highest, -0.15, 0.15]
+    z = [rig.lidar.distance_m + 0.05]
     for extent in (rig.object_box, rig.relay):
         if extent is not None:
             x += [extent.x_min_m, extent.x_max_m]
@@ -81,20 +111,29 @@ def drawn_limits(rig: Rig) -> tuple[Limits, Limits, Limits]:
     if rig.occluder is not None:
         x.append(rig.occluder.x_m)
         z.append(rig.occluder.z_min_m + 0.1)
-    return (min(x) - MARGIN_M, max(x) + MARGIN_M), (min(y) - 0.05, max(y) + 0.05), (-0.04, max(z) + 0.04)
+    return (
+        (min(x) - MARGIN_M, max(x) + MARGIN_M),
+        (min(y) - 0.05, max(y) + 0.05),
+        (-0.04, max(z) + 0.04),
+    )
 
 
 def _axis_end(rig: Rig) -> Float64:
     """Return the point where the optical axis meets the wall, or where it leaves the picture."""
-    along, distance_m = rig.wall_from_lidar[:3, 2], rig.lidar.distance_m
+    along = rig.wall_from_lidar[:3, 2]
+    distance_m = rig.lidar.distance_m
     aside = hypot(along[X], along[Y])
     reach_m = min(distance_m / -along[Z], MAX_X_DRAWN_M / aside if aside > 0.0 else FAR_M)
     return np.array([0.0, 0.0, distance_m]) + reach_m * along
 
 
-def _draw(axis: "Axes", side: _Side, record: WallRecord, limits: tuple[Limits, Limits, Limits]) -> None:
+def _draw(
+    axis: "Axes", side: _Side, record: WallRecord, limits: tuple[Limits, Limits, Limits]
+) -> None:
     rig = record.rig
-    axis.set(xlim=limits[side.across], ylim=limits[side.up][:: -1 if side.turned else 1], aspect="equal")
+    axis.set(
+        xlim=limits[side.across], ylim=limits[side.up][:: -1 if side.turned else 1], aspect="equal"
+    )
     axis.set(xlabel=NAMES[side.across], ylabel=NAMES[side.up])
     _view(axis, side, rig)
     _wall(axis, side)
@@ -115,16 +154,22 @@ def _wall(axis: "Axes", side: _Side) -> None:
 
     style: Style = {"facecolor": "0.85", "edgecolor": WALL, "hatch": "///", "linewidth": 1.5}
     across = Rectangle((-FAR_M, -1.0), 2.0 * FAR_M, 1.0, **style)
-    axis.add_patch(across if side is ABOVE else Rectangle((-1.0, -FAR_M), 1.0, 2.0 * FAR_M, **style))
+    axis.add_patch(
+        across if side is ABOVE else Rectangle((-1.0, -FAR_M), 1.0, 2.0 * FAR_M, **style)
+    )
 
 
 def _view(axis: "Axes", side: _Side, rig: Rig) -> None:
     """Draw the field of view: corner rays, the area between them, the optical axis."""
-    pose, drawn = rig.wall_from_lidar, [side.across, side.up]
+    pose = rig.wall_from_lidar
+    drawn = [side.across, side.up]
     start, corners = pose[:3, 3], [start := pose[:3, 3]]
     for edge in corner_rays(rig.pinhole) @ pose[:3, :3].T:
         end = start + edge * min(start[Z] / -edge[Z] if edge[Z] < 0.0 else FAR_M, FAR_M)
-        corners += [end, end * np.array([1.0, 1.0, 0.0])]  # and its foot on the wall, which rays over the wall cover
+        corners += [
+            end,
+            end * np.array([1.0, 1.0, 0.0]),
+        ]  # and its foot on the wall, which rays over the wall cover
         line = "-" if edge[Z] < 0.0 else "--"
         axis.plot(*np.stack([start, end])[:, drawn].T, color=EDGE, linewidth=1.0, linestyle=line)
     outline = cv2.convexHull(np.array(corners, np.float32)[:, drawn])[:, 0]
@@ -139,21 +184,36 @@ def _occluder_style(record: WallRecord) -> tuple[str, str]:
 
 
 def _occluder_from_above(axis: "Axes", record: WallRecord, low_m: float) -> None:
-    occluder, (line, label) = record.rig.occluder, _occluder_style(record)
+    occluder = record.rig.occluder
+    line, label = _occluder_style(record)
     if occluder is None:
         return
     lean = radians((record.occluder.tilt_deg if record.occluder else None) or 0.0)
     top = np.array([occluder.x_m, occluder.z_min_m])
     end = top + FAR_M * np.array([sin(lean), cos(lean)])
-    axis.plot(*np.stack([top, end]).T, color=OCCLUDER, linewidth=4.0 if record.occluder else 2.0, linestyle=line)
+    axis.plot(
+        *np.stack([top, end]).T,
+        color=OCCLUDER,
+        linewidth=4.0 if record.occluder else 2.0,
+        linestyle=line,
+    )
     arrow: Style = {"arrowstyle": "<->", "color": OCCLUDER, "shrinkA": 0, "shrinkB": 0}
     axis.annotate("", (occluder.x_m, 0.0), xytext=tuple(top), arrowprops=arrow)
-    axis.text(occluder.x_m + 0.01, 0.5 * occluder.z_min_m, f"gap {occluder.z_min_m:.3f} m", fontsize=9, va="center")
-    axis.text(occluder.x_m + 0.02, low_m - 0.01, label, fontsize=9, rotation=90, ha="left", va="bottom")
+    axis.text(
+        occluder.x_m + 0.01,
+        0.5 * occluder.z_min_m,
+        f"gap {occluder.z_min_m:.3f} m",
+        fontsize=9,
+        va="center",
+    )
+    axis.text(
+        occluder.x_m + 0.02, low_m - 0.01, label, fontsize=9, rotation=90, ha="left", va="bottom"
+    )
 
 
 def _occluder_from_the_side(axis: "Axes", record: WallRecord, high_m: float) -> None:
-    occluder, (line, label) = record.rig.occluder, _occluder_style(record)
+    occluder = record.rig.occluder
+    line, label = _occluder_style(record)
     if occluder is None:
         return
     if record.occluder is not None:
@@ -166,22 +226,46 @@ def _object(axis: "Axes", side: _Side, box: ObjectBox) -> None:
     from matplotlib.colors import to_rgba
     from matplotlib.patches import Rectangle
 
-    spans = {X: (box.x_min_m, box.x_max_m), Y: (box.y_min_m, box.y_max_m), Z: (box.z_near_m, box.z_far_m)}
-    (left, right), (low, high) = spans[side.across], spans[side.up]
-    # from the side the box lies behind the lidar and the occluder: dashed, with its distance from the lidar's plane
+    spans = {
+        X: (box.x_min_m, box.x_max_m),
+        Y: (box.y_min_m, box.y_max_m),
+        Z: (box.z_near_m, box.z_far_m),
+    }
+    left, right = spans[side.across]
+    low, high = spans[side.up]
+    # from the side the box lies behind the lidar and the occluder: dashed, with its distance from
+    # the lidar's plane
     behind = side is BESIDE
-    style: Style = {"facecolor": to_rgba(OBJECT, 0.07 if behind else 0.2), "edgecolor": OBJECT, "linewidth": 1.5}
-    axis.add_patch(Rectangle((left, low), right - left, high - low, linestyle="--" if behind else "-", **style))
-    style: Style = {"ha": "right", "va": "bottom" if side.turned else "top", "color": "#8c3b00", "fontsize": 9}
-    words = f"hidden object,\n{box.x_min_m:.2f} m to the\nside of the lidar" if behind else "hidden object"
+    style: Style = {
+        "facecolor": to_rgba(OBJECT, 0.07 if behind else 0.2),
+        "edgecolor": OBJECT,
+        "linewidth": 1.5,
+    }
+    axis.add_patch(
+        Rectangle((left, low), right - left, high - low, linestyle="--" if behind else "-", **style)
+    )
+    style: Style = {
+        "ha": "right",
+        "va": "bottom" if side.turned else "top",
+        "color": "#8c3b00",
+        "fontsize": 9,
+    }
+    words = (
+        f"hidden object,\n{box.x_min_m:.2f} m to the\nside of the lidar"
+        if behind
+        else "hidden object"
+    )
     axis.text(right - 0.008, high - 0.008, words, **style)
 
 
 def _dimension(axis: "Axes", record: WallRecord) -> None:
-    """Draw the perpendicular with its length, and its angle to the optical axis, in the view from above."""
+    """Draw the perpendicular with its length, and its angle to the optical axis, in the view from
+    above.
+    """
     from matplotlib.patches import Arc
 
-    distance_m, along = record.rig.lidar.distance_m, record.rig.wall_from_lidar[:3, 2]
+    distance_m = record.rig.lidar.distance_m
+    along = record.rig.wall_from_lidar[:3, 2]
     arrow: Style = {"arrowstyle": "<->", "color": LIDAR, "shrinkA": 0, "shrinkB": 5}
     axis.annotate("", (0.0, 0.0), xytext=(0.0, distance_m), arrowprops=arrow)
     axis.plot(0.0, 0.0, marker="o", markersize=5, color=LIDAR)
@@ -190,7 +274,8 @@ def _dimension(axis: "Axes", record: WallRecord) -> None:
     style: Style = {"fontsize": 10, "color": LIDAR, "va": "center", "bbox": box}
     aside_m = -0.012 if along[X] >= 0.0 else 0.012
     axis.text(aside_m, 0.4 * distance_m, f"{distance_m:.3f} m", ha=outer, **style)
-    drawn_deg, radius_m = degrees(atan2(along[X], -along[Z])), 0.45 * distance_m
+    drawn_deg = degrees(atan2(along[X], -along[Z]))
+    radius_m = 0.45 * distance_m
     first_deg, last_deg = sorted((-90.0, drawn_deg - 90.0))
     size_m = 2.0 * radius_m, 2.0 * radius_m
     axis.add_patch(Arc((0.0, distance_m), *size_m, theta1=first_deg, theta2=last_deg, color=LIDAR))
@@ -205,38 +290,66 @@ def _facing(record: WallRecord) -> str:
     return f"{record.facing_deg:.1f}°" + ("" if same else f"\n(yaw {record.yaw_deg:+z.1f}°)")
 
 
-RELAY, VISIBLE, VISIBLE_EDGE = "#1b9e77", "#c6dbef", "#6baed6"
+RELAY = "#1b9e77"
+VISIBLE = "#c6dbef"
+VISIBLE_EDGE = "#6baed6"
 CELLS_PER_LINE = 8
 FOOTPRINT_WIDTH_IN = 8.6
 MAX_CELL_M = 100.0
 
 
 def footprint_picture(record: WallRecord) -> Picture:
-    """Return the wall from the front: the lidar's field of view, the relay, the hidden object's box."""
+    """Return the wall from the front: the lidar's field of view, the relay, the hidden object's
+    box.
+    """
     rig = record.rig
     x, y, _ = drawn_limits(rig)
-    figure = figure_of(FOOTPRINT_WIDTH_IN, min(FOOTPRINT_WIDTH_IN * (y[1] - y[0]) / (x[1] - x[0]) + 1.0, 9.0))
+    figure = figure_of(
+        FOOTPRINT_WIDTH_IN, min(FOOTPRINT_WIDTH_IN * (y[1] - y[0]) / (x[1] - x[0]) + 1.0, 9.0)
+    )
     axis = figure.add_subplot()
     axis.set(xlim=x, ylim=y, aspect="equal", xlabel=NAMES[X], ylabel=NAMES[Y], facecolor="0.93")
     _cells(axis, rig)
     if not rig.wall.contains(np.column_stack([x, y])).all():
         _rectangle(axis, rig.wall, WALL, "-", "edge of the wall")
-    _rectangle(axis, rig.relay, RELAY, "-", "relay: the part of the wall that reflects light to and from the object")
+    _rectangle(
+        axis,
+        rig.relay,
+        RELAY,
+        "-",
+        "relay: the part of the wall that reflects light to and from the object",
+    )
     if rig.object_box is not None:
         _rectangle(axis, rig.object_box, OBJECT, "--", "hidden object's box, behind the occluder")
     if rig.occluder is not None:
         style = "-" if record.occluder is not None else "--"
-        axis.axvline(rig.occluder.x_m, color=OCCLUDER, linewidth=1.5, linestyle=style, label="occluder's edge")
+        axis.axvline(
+            rig.occluder.x_m,
+            color=OCCLUDER,
+            linewidth=1.5,
+            linestyle=style,
+            label="occluder's edge",
+        )
     marked: Style = {"color": LIDAR, "linestyle": "none"}
-    axis.plot(0.0, 0.0, marker="+", markersize=14, label="foot of the perpendicular from the lidar", **marked)
+    axis.plot(
+        0.0,
+        0.0,
+        marker="+",
+        markersize=14,
+        label="foot of the perpendicular from the lidar",
+        **marked,
+    )
     meets = on_plane(rig.wall_from_lidar, np.array([0.0, 0.0, 1.0]))
-    axis.plot(*meets, marker="x", markersize=10, label="where the optical axis meets the wall", **marked)
+    axis.plot(
+        *meets, marker="x", markersize=10, label="where the optical axis meets the wall", **marked
+    )
     figure.legend(loc="outside lower center", ncols=2, fontsize=9, frameon=False)
     share = footprint(rig.wall_from_lidar, rig.pinhole, rig.wall).share
     caption = (
-        f"The wall from the front. Blue is the lidar's field of view, with a line for every {CELLS_PER_LINE}th of "
-        f"the map's 64 x 80 cells; {100.0 * share:.0f} % of the cells meet the wall. Light returns only from where "
-        "blue and relay (green) overlap: the larger the overlap, the better."
+        "The wall from the front. Blue is the lidar's field of view, with a line for every"
+        f" {CELLS_PER_LINE}th of the map's 64 x 80 cells; {100.0 * share:.0f} % of the cells meet"
+        " the wall. Light returns only from where blue and relay (green) overlap: the larger the"
+        " overlap, the better."
     )
     return Picture("What the lidar sees of the wall", caption, png(figure))
 
@@ -250,10 +363,14 @@ def _cells(axis: "Axes", rig: Rig) -> None:
     y = (np.arange(0, rows + 1, CELLS_PER_LINE) - 0.5 - cells.ppy) / cells.fy
     rays = np.stack([*np.meshgrid(x, y), np.ones((len(y), len(x)))], axis=-1, dtype=np.float64)
     at_m = on_plane(rig.wall_from_lidar, rays)
-    quads = np.stack([at_m[:-1, :-1], at_m[:-1, 1:], at_m[1:, 1:], at_m[1:, :-1]], axis=2).reshape(-1, 4, 2)
+    quads = np.stack([at_m[:-1, :-1], at_m[:-1, 1:], at_m[1:, 1:], at_m[1:, :-1]], axis=2).reshape(
+        -1, 4, 2
+    )
     visible = quads[np.abs(quads).max(axis=(1, 2)) < MAX_CELL_M]  # False for NaN
     axis.add_collection(
-        PolyCollection(list(visible), facecolor=VISIBLE, edgecolor=VISIBLE_EDGE, linewidth=0.6, alpha=0.8)
+        PolyCollection(
+            list(visible), facecolor=VISIBLE, edgecolor=VISIBLE_EDGE, linewidth=0.6, alpha=0.8
+        )
     )
 
 
@@ -263,5 +380,11 @@ def _rectangle(axis: "Axes", extent: Extent, color: str, line: str, label: str) 
 
     size = extent.x_max_m - extent.x_min_m, extent.y_max_m - extent.y_min_m
     fill = to_rgba(color, 0.15 if line == "--" else 0.0)
-    style: Style = {"edgecolor": color, "facecolor": fill, "linestyle": line, "linewidth": 1.8, "label": label}
+    style: Style = {
+        "edgecolor": color,
+        "facecolor": fill,
+        "linestyle": line,
+        "linewidth": 1.8,
+        "label": label,
+    }
     axis.add_patch(Rectangle((extent.x_min_m, extent.y_min_m), *size, **style))
