@@ -20,10 +20,13 @@ NOT_OFFERED = "not offered by this firmware"
 
 
 class Options:
-    """Options of a running sensor, by the SDK's names; the SDK's refusals are returned as notes, not raised."""
+    """Options of a running sensor, by the SDK's names; the SDK's refusals are returned as notes,
+    not raised.
+    """
 
     def __init__(self, sensor: Any, sdk: Any) -> None:
-        self._sensor, self._sdk = sensor, sdk
+        self._sensor = sensor
+        self._sdk = sdk
 
     def limits(self, name: str) -> PowerLimits | None:
         """Return the range that the firmware reports; None where it reports none."""
@@ -42,7 +45,9 @@ class Options:
             return None
 
     def put(self, name: str, wanted: float) -> str:
-        """Set an option to the nearest allowed value, and return the `difference` or why it failed."""
+        """Set an option to the nearest allowed value, and return the `difference` or why it
+        failed.
+        """
         option = self._option(name)
         if not self._sensor.supports(option):
             return NOT_OFFERED
@@ -59,7 +64,11 @@ class Options:
         found = self.get(name)
         if found is None:
             return "cannot be read back"
-        return "" if abs(found - wanted) <= TOLERANCE else f"{wanted:g} was requested, {found:g} is read back"
+        return (
+            ""
+            if abs(found - wanted) <= TOLERANCE
+            else f"{wanted:g} was requested, {found:g} is read back"
+        )
 
     def put_all(self, wanted: Mapping[str, float]) -> dict[str, str]:
         """Set options in order, and return the differences by name."""
@@ -73,9 +82,13 @@ class Options:
 USB3_SIZE: Size = (640, 480)
 USB2_SIZE: Size = (320, 240)
 PRESET = {"global_time_enabled": 1.0, "visual_preset": 5.0}
-"""Timestamps on the host's clock, and short range, whose lower gain does not saturate near a wall."""
+"""Timestamps on the host's clock, and short range, whose lower gain does not saturate near a
+wall.
+"""
 MODES_OFF = ("alternate_ir", "enable_ir_reflectivity", "enable_max_usable_range")
-"""Modes in which IR is not intensity, or which set the preset to maximum range; not in every firmware."""
+"""Modes in which IR is not intensity, or which set the preset to maximum range; not in every
+firmware.
+"""
 NEAR_WALL = {
     "min_distance": 0.0,
     "confidence_threshold": 1.0,
@@ -84,7 +97,9 @@ NEAR_WALL = {
     "post_processing_sharpening": 0.0,
     "invalidation_bypass": 0.0,
 }
-"""Options for a wall at 0.15 to 0.30 m, after the short-range preset: starting values, to be tuned on a bench."""
+"""Options for a wall at 0.15 to 0.30 m, after the short-range preset: starting values, to be tuned
+on a bench.
+"""
 PRESET_SETTLES_S = 0.5
 LASER_POWER = "laser_power"
 SETS_IN_FLIGHT = 3
@@ -107,7 +122,9 @@ class DeviceInfo:
 
 @cache
 def shared_context(sdk: Any) -> Any:
-    """Return this process's one context, for discovery and streaming: two of them compete for a device."""
+    """Return this process's one context, for discovery and streaming: two of them compete for a
+    device.
+    """
     return sdk.context()
 
 
@@ -140,25 +157,39 @@ def _info(device: Any, sdk: Any) -> DeviceInfo:
 class L515Camera(LiveCamera):
     """L515 by serial number, or the only one; 640 x 480 at 30 frames/s, 320 x 240 on USB 2.
 
-    After the start it sets the options for a near wall and lowers the laser power until returns do not saturate; then
-    frames are delivered and recorded. `Frame.settings` holds the options as read back. Raises CameraNotFoundError.
+    After the start it sets the options for a near wall and lowers the laser power until returns do
+    not saturate; then frames are delivered and recorded. `Frame.settings` holds the options as read
+    back. Raises CameraNotFoundError.
     """
 
     differences: Mapping[str, str]
     """Options that differ from the wanted values, and how."""
 
     def __init__(
-        self, uri: str, serial: str, *, recording: Recording | None = None, sdk: Any = None, clock: Clock | None = None
+        self,
+        uri: str,
+        serial: str,
+        *,
+        recording: Recording | None = None,
+        sdk: Any = None,
+        clock: Clock | None = None,
     ) -> None:
         sdk = sdk or load_sdk()
         self._context = shared_context(sdk)
         device, info = find_l515(sdk, self._context, serial)
         size = USB2_SIZE if info.usb_type.startswith("2") else USB3_SIZE
         if size == USB2_SIZE:
-            log.warning("%s is on USB %s: only 320 x 240; turn the plug round or use a USB 3 cable", uri, info.usb_type)
-        self._serial, self.differences = info.serial, {}
+            log.warning(
+                "%s is on USB %s: only 320 x 240; turn the plug round or use a USB 3 cable",
+                uri,
+                info.usb_type,
+            )
+        self._serial = info.serial
+        self.differences = {}
         super().__init__(uri, device, size, sdk, recording, clock)
-        self.identity: Mapping[str, str] = {key: value for key, value in asdict(info).items() if value}
+        self.identity: Mapping[str, str] = {
+            key: value for key, value in asdict(info).items() if value
+        }
 
     def _clear_state(self) -> None:
         super()._clear_state()
@@ -166,7 +197,9 @@ class L515Camera(LiveCamera):
         """The power that did not saturate, for when the device comes back."""
 
     def _prepare(self, sensor: Any) -> None:
-        """Set the preset first, since it changes other options, and after the start, which resets it."""
+        """Set the preset first, since it changes other options, and after the start, which resets
+        it.
+        """
         options = Options(sensor, self._sdk)
         off = {name: 0.0 for name in MODES_OFF if options.get(name) not in {None, 0.0}}
         differences = self._put(options, off | PRESET) | self._put(options, NEAR_WALL)
@@ -177,28 +210,44 @@ class L515Camera(LiveCamera):
         self._turn_down(options)
 
     def _put(self, options: Options, wanted: Mapping[str, float]) -> dict[str, str]:
-        """Set options, again where they did not hold after settling, and return the differences by name."""
-        missing = {name: note for name, note in options.put_all(wanted).items() if note == NOT_OFFERED}
+        """Set options, again where they did not hold after settling, and return the differences by
+        name.
+        """
+        missing = {
+            name: note for name, note in options.put_all(wanted).items() if note == NOT_OFFERED
+        }
         self._clock.wait(self._left, PRESET_SETTLES_S)
         again = {name: value for name, value in wanted.items() if options.difference(name, value)}
-        return missing | options.put_all({name: value for name, value in again.items() if name not in missing})
+        return missing | options.put_all(
+            {name: value for name, value in again.items() if name not in missing}
+        )
 
     def _turn_down(self, options: Options) -> None:
-        """Lower the laser power until returns do not saturate, from its last power if the device came back."""
-        limits, preset = options.limits(LASER_POWER), options.get(LASER_POWER)
+        """Lower the laser power until returns do not saturate, from its last power if the device
+        came back.
+        """
+        limits = options.limits(LASER_POWER)
+        preset = options.get(LASER_POWER)
         if limits is None or preset is None:
             return
         power = preset if self._laser_power is None else self._laser_power
         if power != preset:
             options.put(LASER_POWER, power)
-        settled = turn_down(power, limits, self._saturated_share, lambda lower: not options.put(LASER_POWER, lower))
+        settled = turn_down(
+            power, limits, self._saturated_share, lambda lower: not options.put(LASER_POWER, lower)
+        )
         self._laser_power = settled.power
         if settled.power < power:
-            log.warning("%s: laser power lowered from %g to %g: returns saturated", self.uri, power, settled.power)
+            log.warning(
+                "%s: laser power lowered from %g to %g: returns saturated",
+                self.uri,
+                power,
+                settled.power,
+            )
         if (settled.saturated or 0.0) > MAX_SATURATED:
             log.warning(
-                "%s: %.1f %% of the infrared image is saturated at laser power %g: move away from the wall, or tilt "
-                "the camera by 5 to 15 degrees",
+                "%s: %.1f %% of the infrared image is saturated at laser power %g: move away from"
+                " the wall, or tilt the camera by 5 to 15 degrees",
                 self.uri,
                 100 * (settled.saturated or 0.0),
                 settled.power,
@@ -215,23 +264,30 @@ class L515Camera(LiveCamera):
         return sum(shares) / len(shares)
 
     def adjustable(self) -> list[dict[str, Any]]:
-        """Return name, value, min, max and step of laser power and near-wall options, as the firmware offers them."""
+        """Return name, value, min, max and step of laser power and near-wall options, as the
+        firmware offers them.
+        """
         with self._changing:
             options = Options(self._session.sensor, self._sdk) if self._session else None
             if options is None or self._session is None:
                 return []
             names = (LASER_POWER, *NEAR_WALL)
             found = [(name, options.get(name), options.limits(name)) for name in names]
-        offered = [(name, value, limits) for name, value, limits in found if limits and value is not None]
+        offered = [
+            (name, value, limits) for name, value, limits in found if limits and value is not None
+        ]
         return [{"name": name, "value": value, **asdict(limits)} for name, value, limits in offered]
 
     def set_option(self, name: str, value: float) -> str:
-        """Set one of the `adjustable` options to the nearest allowed value, and return the outcome in words.
+        """Set one of the `adjustable` options to the nearest allowed value, and return the outcome
+        in words.
 
         Raises CameraError where the firmware refuses it, or while the camera does not run.
         """
         if name != LASER_POWER and name not in NEAR_WALL:
-            raise CameraError(f"{name} cannot be set here: choose from {', '.join((LASER_POWER, *NEAR_WALL))}")
+            raise CameraError(
+                f"{name} cannot be set here: choose from {', '.join((LASER_POWER, *NEAR_WALL))}"
+            )
         with self._changing:
             if self._session is None:
                 raise CameraError(f"{self.uri} is not running: wait until it is back")
@@ -256,7 +312,9 @@ class L515Camera(LiveCamera):
 
 
 def find_l515(sdk: Any, context: Any, serial: str) -> tuple[Any, DeviceInfo]:
-    """Return the L515 with this serial number, or the only one. Raises CameraNotFoundError with advice."""
+    """Return the L515 with this serial number, or the only one. Raises CameraNotFoundError with
+    advice.
+    """
     there = connected(sdk, context)
     lidars = [(device, info) for device, info in there if "L515" in info.name]
     chosen = [(device, info) for device, info in lidars if serial in {"", info.serial}]
@@ -268,6 +326,7 @@ def find_l515(sdk: Any, context: Any, serial: str) -> tuple[Any, DeviceInfo]:
     present = ", ".join(f"{info.name} {info.serial}".strip() for _, info in there) or "no device"
     wanted = f"L515 with serial {serial}" if serial else "L515"
     raise CameraNotFoundError(
-        f"no {wanted} found (librealsense sees {present}): check the USB 3 cable and port, and run `nlos-cam doctor`, "
-        "which checks driver and permissions; without a camera, use --camera sim"
+        f"no {wanted} found (librealsense sees {present}): check the USB 3 cable and port, and run"
+        " `nlos-cam doctor`, which checks driver and permissions; without a camera, use"
+        " --camera sim"
     )

@@ -34,7 +34,9 @@ class Settled:
 
 
 def weaker(power: float, limits: PowerLimits) -> Iterator[float]:
-    """Yield the powers to try below this one, down to the weakest but 0, which turns the laser off."""
+    """Yield the powers to try below this one, down to the weakest but 0, which turns the laser
+    off.
+    """
     weakest = limits.min if limits.min > 0 else limits.min + limits.step
     stride = max(1, round((limits.max - limits.min) / STRIDES / limits.step)) * limits.step
     while power > weakest:
@@ -43,15 +45,20 @@ def weaker(power: float, limits: PowerLimits) -> Iterator[float]:
 
 
 def turn_down(
-    power: float, limits: PowerLimits, measure: Callable[[], float | None], put: Callable[[float], bool]
+    power: float,
+    limits: PowerLimits,
+    measure: Callable[[], float | None],
+    put: Callable[[float], bool],
 ) -> Settled:
     """Lower the power while more than MAX_SATURATED saturates, and no further.
 
-    `measure` returns the share that saturates now, None without frames; `put` sets a power and returns True if it held.
+    `measure` returns the share that saturates now, None without frames; `put` sets a power and
+    returns True if it held.
     """
     saturated = measure()
     for lower in weaker(power, limits):
         if saturated is None or saturated <= MAX_SATURATED or not put(lower):
             break
-        power, saturated = lower, measure()
+        power = lower
+        saturated = measure()
     return Settled(power, saturated)

@@ -23,18 +23,26 @@ log = logging.getLogger(__name__)
 
 
 class LiveCamera:
-    """Device that delivers frames from entering to leaving, and records them if a `Recording` is given.
+    """Device that delivers frames from entering to leaving, and records them if a `Recording` is
+    given.
 
-    Iterating goes on until any thread leaves the camera, or the recording is full. When no whole set comes for
-    `silence_s`, `Recovery` restarts the device and `Continuity` renumbers its frames; a recording is closed there,
-    whole, since the device restarts its numbers. Raises CameraLostError where recovery fails, or at once where that
-    recording is not `optional`. Subclasses override the methods that their device needs.
+    Iterating goes on until any thread leaves the camera, or the recording is full. When no whole
+    set comes for `silence_s`, `Recovery` restarts the device and `Continuity` renumbers its frames;
+    a recording is closed there, whole, since the device restarts its numbers. Raises
+    CameraLostError where recovery fails, or at once where that recording is not `optional`.
+    Subclasses override the methods that their device needs.
     """
 
     intrinsics: Intrinsics
 
     def __init__(
-        self, uri: str, device: Any, size: Size, sdk: Any, recording: Recording | None, clock: Clock | None = None
+        self,
+        uri: str,
+        device: Any,
+        size: Size,
+        sdk: Any,
+        recording: Recording | None,
+        clock: Clock | None = None,
     ) -> None:
         self.uri = uri
         self.rig: Rig | None = None
@@ -43,7 +51,10 @@ class LiveCamera:
         self.silence_s = 5.0
         self.replug_s = 60.0
         """Time to wait for a device that was unplugged."""
-        self._device, self._size, self._sdk, self._recording = device, size, sdk, recording
+        self._device = device
+        self._size = size
+        self._sdk = sdk
+        self._recording = recording
         self._clock: Clock = clock or WallClock()
         self._session: Session | None = None
         self._changing = RLock()
@@ -57,11 +68,14 @@ class LiveCamera:
         self.incomplete = self.dropped = 0
         self.counts.clear()
         self._past_incomplete = self._past_dropped = 0
-        self._past_counts, self._arrived = Counter[str](), Counter[str]()
+        self._past_counts = Counter[str]()
+        self._arrived = Counter[str]()
         self._continuity = Continuity()
         self._left = Event()
         self._recovery: Recovery | None = None
-        """Set only during a silence: it and the camera refer to each other, which would free a device late."""
+        """Set only during a silence: it and the camera refer to each other, which would free a
+        device late.
+        """
 
     def _prepare(self, sensor: Any) -> None:
         """Set up the running sensor; frames are delivered and recorded only after this."""
@@ -93,9 +107,13 @@ class LiveCamera:
             if not (missing := [stream for stream in FORMATS if stream not in profiles]):
                 return Session(sensor, profiles, SampleQueue(lossless=False, on_set=self._on_set))
         except RuntimeError as error:
-            raise CameraError(f"{self.uri} cannot be read ({error}): unplug it, wait 10 s, plug it in again") from error
+            raise CameraError(
+                f"{self.uri} cannot be read ({error}): unplug it, wait 10 s, plug it in again"
+            ) from error
         width, height = self._size
-        raise CameraError(f"{self.uri} offers no {' and no '.join(missing)} at {width} x {height}, 30 frames/s")
+        raise CameraError(
+            f"{self.uri} offers no {' and no '.join(missing)} at {width} x {height}, 30 frames/s"
+        )
 
     def _start_cured(self) -> None:
         """Start; if the device lost its calibration, once more after a reset."""
@@ -116,15 +134,21 @@ class LiveCamera:
             self._start_cured()
         except RuntimeError as error:
             self._abandon()
-            raise CameraError(f"{self.uri} does not start ({error}): close other programs, or replug it") from error
+            raise CameraError(
+                f"{self.uri} does not start ({error}): close other programs, or replug it"
+            ) from error
         except BaseException:
             self._abandon()
             raise
-        atexit.register(self._leave)  # the SDK's threads would crash a program that ends without leaving
+        atexit.register(
+            self._leave
+        )  # the SDK's threads would crash a program that ends without leaving
         return self
 
     def _start(self, device: Any | None = None) -> None:
-        """Start the streams, of another device if given; before entering, only check that they exist."""
+        """Start the streams, of another device if given; before entering, only check that they
+        exist.
+        """
         with self._changing:
             self._device = device or self._device
             session = self._new_session()
@@ -162,7 +186,8 @@ class LiveCamera:
     def _abandon(self) -> None:
         self._left.set()
         with self._changing:
-            self._entered, self._recovery = False, None
+            self._entered = False
+            self._recovery = None
             self._stop()
 
     def _stop(self) -> None:
@@ -188,7 +213,12 @@ class LiveCamera:
     def _count(self, inbox: SampleQueue) -> None:
         self.incomplete = self._past_incomplete + inbox.incomplete
         self.dropped = self._past_dropped + inbox.dropped + self._continuity.missed
-        self.counts.update({name: self._past_counts[name] + n - self.counts[name] for name, n in inbox.counts.items()})
+        self.counts.update(
+            {
+                name: self._past_counts[name] + n - self.counts[name]
+                for name, n in inbox.counts.items()
+            }
+        )
 
     def __iter__(self) -> Iterator[Frame]:
         if not self._entered:
@@ -223,7 +253,9 @@ class LiveCamera:
         self._stop()
         self._recording = None
         if not recording.optional:
-            raise CameraLostError(f"{silence}: the recording is closed, and whole; replug the camera and record again")
+            raise CameraLostError(
+                f"{silence}: the recording is closed, and whole; replug the camera and record again"
+            )
         log.warning("%s: the recording is closed, whole, after %d frames", silence, recording.sets)
 
     @property
@@ -232,16 +264,22 @@ class LiveCamera:
         return self._recording if self._recording and not self._recording.done else None
 
     def start_recording(self, recording: Recording) -> None:
-        """Record from the next set on; `recording` must not be its `last` take, so that frames go on after it.
+        """Record from the next set on; `recording` must not be its `last` take, so that frames go
+        on after it.
 
-        Raises CameraError while not running or while another recording runs, RecordingError if nothing can be written.
+        Raises CameraError while not running or while another recording runs, RecordingError if
+        nothing can be written.
         """
         with self._changing:
             if not self._session:
                 raise CameraError(f"{self.uri} is not running: wait for the first frame")
             if self.recording:
-                raise CameraError(f"{self.recording.path} is being recorded (--record) until the run ends")
-            self._recording = recording  # before it begins: the SDK's thread must pass it a set, as a boundary
+                raise CameraError(
+                    f"{self.recording.path} is being recorded (--record) until the run ends"
+                )
+            self._recording = (
+                recording  # before it begins: the SDK's thread must pass it a set, as a boundary
+            )
             try:
                 recording.join(self._device, self._sdk)
             except BaseException:
@@ -249,7 +287,9 @@ class LiveCamera:
                 raise
 
     def stop_recording(self) -> None:
-        """Close the recording, if any; frames go on. Raises DiskFullError without room, unless it is optional."""
+        """Close the recording, if any; frames go on. Raises DiskFullError without room, unless it
+        is optional.
+        """
         with self._changing:
             if recording := self._recording:
                 recording.stop()
@@ -260,6 +300,7 @@ class LiveCamera:
         return session.telemetry(ending) if (session := self._session) else {}
 
     def _on_set(self, found: FrameSet) -> None:
-        recording, session = self._recording, self._session
+        recording = self._recording
+        session = self._session
         if recording and session and recording.add(found):
             session.inbox.finish()

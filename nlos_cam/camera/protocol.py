@@ -15,12 +15,14 @@ OnProgress = Callable[[int, int], None]
 
 
 class Camera(Protocol):
-    """Source of Frames in SI units, started on entering and stopped on leaving, whatever happened inside.
+    """Source of Frames in SI units, started on entering and stopped on leaving, whatever happened
+    inside.
 
-    Any thread may leave, which ends an iteration; leaving again has no effect. Iterating yields frames until the source
-    ends: a recording's end is a normal end, a live camera goes on. Frames without all streams are counted in
-    `incomplete` and skipped; missing frame numbers are counted in `dropped`. Numbers and timestamps rise together, 30 a
-    second, also over an outage after which the device restarts its count: the outage's numbers count as dropped.
+    Any thread may leave, which ends an iteration; leaving again has no effect. Iterating yields
+    frames until the source ends: a recording's end is a normal end, a live camera goes on. Frames
+    without all streams are counted in `incomplete` and skipped; missing frame numbers are counted
+    in `dropped`. Numbers and timestamps rise together, 30 a second, also over an outage after which
+    the device restarts its count: the outage's numbers count as dropped.
     """
 
     uri: str
@@ -32,7 +34,9 @@ class Camera(Protocol):
     incomplete: int
     dropped: int
     counts: Counter[str]
-    """Other events by name, never zero: restarted, reset, replugged, and those of `FrameSynchronizer.counts`."""
+    """Other events by name, never zero: restarted, reset, replugged, and those of
+    `FrameSynchronizer.counts`.
+    """
 
     def __enter__(self) -> Self: ...
 
@@ -41,7 +45,8 @@ class Camera(Protocol):
     def __iter__(self) -> Iterator[Frame]: ...
 
     def telemetry(self, ending: str = "") -> Mapping[str, float]:
-        """Return the options that can be read now, temperatures among them, by the SDK's name; empty without any.
+        """Return the options that can be read now, temperatures among them, by the SDK's name;
+        empty without any.
 
         Each costs a real device a command on its link: limit them by the `ending` of their names.
         """

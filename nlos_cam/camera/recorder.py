@@ -1,4 +1,6 @@
-"""Recording of a live camera to .bag files, in one take or several, up to a length or until the disk is full."""
+"""Recording of a live camera to .bag files, in one take or several, up to a length or until the
+disk is full.
+"""
 
 import ctypes
 import gc
@@ -28,12 +30,16 @@ INDEX_SHARE = 1e-3
 
 
 def bytes_per_frame(intrinsics: Intrinsics) -> int:
-    """Return the uncompressed size of a frame of three streams; the compression is not known in advance."""
+    """Return the uncompressed size of a frame of three streams; the compression is not known in
+    advance.
+    """
     return intrinsics.width * intrinsics.height * sum(BYTES_PER_PIXEL.values())
 
 
 def free_bytes(path: Path) -> int:
-    """Return the free space of the disk of `path`, a file that need not exist in a folder that does."""
+    """Return the free space of the disk of `path`, a file that need not exist in a folder that
+    does.
+    """
     return shutil.disk_usage(path.absolute().parent).free
 
 
@@ -48,8 +54,9 @@ def check_room(path: Path, intrinsics: Intrinsics, frames: int, free: int) -> No
     if free < needed + RESERVE_BYTES:
         size = f"{intrinsics.width} x {intrinsics.height}"
         raise DiskFullError(
-            f"{path}: {frames} frames of {size} need up to {needed / 1e9:.2f} GB, {RESERVE_BYTES / 1e9:.1f} GB must "
-            f"stay free, and {free / 1e9:.2f} GB are free: free space, record less, or choose --out on another disk"
+            f"{path}: {frames} frames of {size} need up to {needed / 1e9:.2f} GB,"
+            f" {RESERVE_BYTES / 1e9:.1f} GB must stay free, and {free / 1e9:.2f} GB are free: free"
+            " space, record less, or choose --out on another disk"
         )
 
 
@@ -83,20 +90,27 @@ MAX_FLUSHES = 30
 class SdkRecorder:
     """librealsense's recorder of one device to one .bag, from construction to `close`.
 
-    The SDK's recorder ignores failed writes. Listening to its notifications from Python deadlocks when a device stops
-    or vanishes during one, so `watch` checks the file instead. Raises RecordingError where nothing can be written.
+    The SDK's recorder ignores failed writes. Listening to its notifications from Python deadlocks
+    when a device stops or vanishes during one, so `watch` checks the file instead. Raises
+    RecordingError where nothing can be written.
     """
 
-    def __init__(self, path: Path, device: Any, sdk: Any, *, now: Callable[[], float] = time.monotonic) -> None:
+    def __init__(
+        self, path: Path, device: Any, sdk: Any, *, now: Callable[[], float] = time.monotonic
+    ) -> None:
         self.path = path
         self.failure: str | None = None
         """Reason of a failed write."""
-        self._now, self._grew_s, self._bytes = now, now(), 0
+        self._now = now
+        self._grew_s = now()
+        self._bytes = 0
         try:
             path.unlink(missing_ok=True)
             self._recorder: Any = sdk.recorder(str(path), device)
         except (RuntimeError, OSError) as error:
-            raise RecordingError(f"{path} cannot be written ({error}): choose another --out") from error
+            raise RecordingError(
+                f"{path} cannot be written ({error}): choose another --out"
+            ) from error
 
     def watch(self) -> None:
         """Check that the file grows; call about once a second while frames come."""
@@ -133,11 +147,13 @@ class SdkRecorder:
 
     def _abandon(self) -> None:
         """Raise DiskFullError, and leave the file as it is."""
-        ctypes.pythonapi.Py_IncRef(ctypes.py_object(self._recorder))  # never deleted, not even at exit
+        ctypes.pythonapi.Py_IncRef(
+            ctypes.py_object(self._recorder)
+        )  # never deleted, not even at exit
         self._recorder = None
         raise DiskFullError(
-            f"{self.path} could not be completed ({self.failure}): free some space, and recover its frames with "
-            f"`{repair_command(self.path)}`"
+            f"{self.path} could not be completed ({self.failure}): free some space, and recover its"
+            f" frames with `{repair_command(self.path)}`"
         )
 
 
@@ -150,9 +166,9 @@ log = logging.getLogger(__name__)
 class Recording:
     """Recording of a camera to `path`, up to a number of `frames` or `seconds`, if given.
 
-    Give it to `open_camera`: the camera begins it on entering and closes it on leaving. One that is not the `last` take
-    leaves the camera running when it is full, until `next_take`. `add` is called on an SDK thread, the rest by the
-    thread that iterates over the camera.
+    Give it to `open_camera`: the camera begins it on entering and closes it on leaving. One that is
+    not the `last` take leaves the camera running when it is full, until `next_take`. `add` is
+    called on an SDK thread, the rest by the thread that iterates over the camera.
     """
 
     def __init__(
@@ -168,26 +184,38 @@ class Recording:
     ) -> None:
         self.path = path
         self.optional = optional
-        """True if the camera goes on without it when it ends early, by a silent device or a full disk."""
+        """True if the camera goes on without it when it ends early, by a silent device or a full
+        disk.
+        """
         self.sets = 0
         """Complete sets in this take so far, from the first that the camera yields."""
         self.started = False
         """True once the file is this take's, and no longer the one it replaces."""
         self.disk_full = False
         """True if it stopped for want of disk space."""
-        self._frames, self._seconds, self._last, self._free = frames, seconds, last, free
-        self._overwrite, self._claim = overwrite, ExitStack()
-        self._before_s, self._first_s, self._last_s = float("-inf"), 0.0, 0.0
-        self._stopping, self._paused = Event(), Event()
-        self._changing, self._at_boundary, self._changed = Event(), Event(), Event()
+        self._frames = frames
+        self._seconds = seconds
+        self._last = last
+        self._free = free
+        self._overwrite = overwrite
+        self._claim = ExitStack()
+        self._before_s = float("-inf")
+        self._first_s = 0.0
+        self._last_s = 0.0
+        self._stopping = Event()
+        self._paused = Event()
+        self._changing = Event()
+        self._at_boundary = Event()
+        self._changed = Event()
         self._source: tuple[Any, Any] = (None, None)
         self._recorder: SdkRecorder | None = None
 
     def begin(self, device: Any, sdk: Any) -> None:
         """Record the device's streams.
 
-        Raises RecordingError where nothing can be written, FileBusyError while another process writes the same file,
-        and, without `overwrite`, OutputExistsError where the file exists by now.
+        Raises RecordingError where nothing can be written, FileBusyError while another process
+        writes the same file, and, without `overwrite`, OutputExistsError where the file exists by
+        now.
         """
         self._source = device, sdk
         self._own()
@@ -202,26 +230,38 @@ class Recording:
         except FileBusyError:
             raise
         except OSError as error:
-            raise RecordingError(f"{self.path} cannot be written ({error.strerror}): choose another --out") from error
+            raise RecordingError(
+                f"{self.path} cannot be written ({error.strerror}): choose another --out"
+            ) from error
         if not self._overwrite and not self.started and self.path.exists():
             self._claim.close()
-            raise OutputExistsError(f"{self.path} exists by now: choose another --out, or add --overwrite")
+            raise OutputExistsError(
+                f"{self.path} exists by now: choose another --out, or add --overwrite"
+            )
 
     def join(self, device: Any, sdk: Any) -> None:
-        """Begin with the next set of a device that runs. Raises RecordingError where nothing can be written."""
+        """Begin with the next set of a device that runs. Raises RecordingError where nothing can be
+        written.
+        """
         self._source = device, sdk
         self.next_take(self.path, last=self._last)
 
     def next_take(self, path: Path, *, last: bool) -> None:
-        """Record to `path` from the next set on, with the same device and settings, after this take was closed.
+        """Record to `path` from the next set on, with the same device and settings, after this take
+        was closed.
 
         Raises RecordingError where nothing can be written.
         """
         self._at_boundary.clear()
         self._changed.clear()
         self._changing.set()
-        self._at_boundary.wait(BOUNDARY_WAIT_S)  # `add` holds the SDK's thread there: no set is cut in two
-        self.path, self.sets, self.started, self._last = path, 0, False, last
+        self._at_boundary.wait(
+            BOUNDARY_WAIT_S
+        )  # `add` holds the SDK's thread there: no set is cut in two
+        self.path = path
+        self.sets = 0
+        self.started = False
+        self._last = last
         try:
             self.begin(*self._source)
         finally:
@@ -231,7 +271,9 @@ class Recording:
             self._changed.set()
 
     def add(self, found: FrameSet) -> bool:
-        """Count a passing set, on an SDK thread; return True once no more is recorded, in this or a later take."""
+        """Count a passing set, on an SDK thread; return True once no more is recorded, in this or a
+        later take.
+        """
         if self._changing.is_set():
             self._before_s = found.timestamp_s
             self._at_boundary.set()
@@ -239,13 +281,19 @@ class Recording:
             return False
         if self._recorder and not self._paused.is_set():
             self._count(found, self._recorder)
-        return self._paused.is_set() and (self._last or self.disk_full) and not (self.disk_full and self.optional)
+        return (
+            self._paused.is_set()
+            and (self._last or self.disk_full)
+            and not (self.disk_full and self.optional)
+        )
 
     def _count(self, found: FrameSet, recorder: SdkRecorder) -> None:
         self._first_s = found.timestamp_s if self.sets == 0 else self._first_s
         self._last_s = found.timestamp_s
         self.sets += 1
-        self.disk_full = self.sets % FRAMES_PER_S == 1 and self._is_disk_full(recorder)  # checked once a second
+        self.disk_full = self.sets % FRAMES_PER_S == 1 and self._is_disk_full(
+            recorder
+        )  # checked once a second
         if self.disk_full or self._is_full(found.timestamp_s) or self._stopping.is_set():
             recorder.pause()  # queued behind the frames so far: none of them is lost
             self._paused.set()
@@ -260,7 +308,10 @@ class Recording:
         if self._frames is not None and self.sets >= self._frames:
             return True
         period_s = 2 * SAME_INSTANT_S
-        return self._seconds is not None and timestamp_s - self._first_s + period_s > self._seconds - SAME_INSTANT_S
+        return (
+            self._seconds is not None
+            and timestamp_s - self._first_s + period_s > self._seconds - SAME_INSTANT_S
+        )
 
     @property
     def done(self) -> bool:
@@ -268,7 +319,9 @@ class Recording:
         return self._paused.is_set()
 
     def covers(self, timestamp_s: float) -> bool:
-        """Return True if a frame is in this take: those yielded now may have queued since before it."""
+        """Return True if a frame is in this take: those yielded now may have queued since before
+        it.
+        """
         return self._before_s < timestamp_s and (not self.done or timestamp_s <= self._last_s)
 
     def stop(self) -> None:
@@ -279,8 +332,11 @@ class Recording:
             self._paused.set()
 
     def close(self) -> None:
-        """Write the index and close the file. Raises DiskFullError without room; if optional, warns instead."""
-        recorder, self._recorder = self._recorder, None
+        """Write the index and close the file. Raises DiskFullError without room; if optional, warns
+        instead.
+        """
+        recorder = self._recorder
+        self._recorder = None
         try:
             if recorder:
                 recorder.close()

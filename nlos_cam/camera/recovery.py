@@ -37,19 +37,27 @@ class Hooks:
 
 
 class Recovery:
-    """Recovery from one silence: restarts of the streams, then a reset, then an error; waits for an unplugged device.
+    """Recovery from one silence: restarts of the streams, then a reset, then an error; waits for an
+    unplugged device.
 
-    Stateful, for the thread that iterates over the camera. Counts `restarted`, `reset` and `replugged`. Every wait ends
-    when `left` is set.
+    Stateful, for the thread that iterates over the camera. Counts `restarted`, `reset` and
+    `replugged`. Every wait ends when `left` is set.
     """
 
-    def __init__(self, uri: str, hooks: Hooks, clock: Clock, left: Event, counts: Counter[str]) -> None:
-        self._uri, self._hooks, self._clock, self._left, self._counts = uri, hooks, clock, left, counts
+    def __init__(
+        self, uri: str, hooks: Hooks, clock: Clock, left: Event, counts: Counter[str]
+    ) -> None:
+        self._uri = uri
+        self._hooks = hooks
+        self._clock = clock
+        self._left = left
+        self._counts = counts
         self._tries = 0
         self._failure = ""
 
     def recover(self, silence: str, replug_s: float) -> None:
-        """Return once streams run or `left` is set; `silence` describes the failure for log and error.
+        """Return once streams run or `left` is set; `silence` describes the failure for log and
+        error.
 
         Raises CameraLostError. If no frame comes even so, call again for the next stage.
         """
@@ -71,13 +79,16 @@ class Recovery:
     def _try_next(self, silence: str) -> bool:
         self._tries += 1
         if self._tries <= len(BACK_OFF_S):
-            log.warning("%s: restarting its streams (%d of %d)", silence, self._tries, len(BACK_OFF_S))
+            log.warning(
+                "%s: restarting its streams (%d of %d)", silence, self._tries, len(BACK_OFF_S)
+            )
             return self._restart(BACK_OFF_S[self._tries - 1])
         if self._tries == len(BACK_OFF_S) + 1:
             return self.reset()
         raise CameraLostError(
-            f"{silence}, nor after {len(BACK_OFF_S)} restarts of its streams and a reset{self._reason()}: unplug it, "
-            "let it cool for a minute, plug it into another USB 3 port"
+            f"{silence}, nor after {len(BACK_OFF_S)} restarts of its streams and a"
+            f" reset{self._reason()}: unplug it, let it cool for a minute, plug it into another USB"
+            " 3 port"
         )
 
     def _restart(self, back_off_s: float) -> bool:
@@ -102,7 +113,11 @@ class Recovery:
         return self._starts_within(BACK_WITHIN_S)
 
     def _await_replug(self, silence: str, replug_s: float) -> bool:
-        log.warning("%s was unplugged: waiting up to %.0f s for it to be plugged in again", self._uri, replug_s)
+        log.warning(
+            "%s was unplugged: waiting up to %.0f s for it to be plugged in again",
+            self._uri,
+            replug_s,
+        )
         if self._starts_within(replug_s):
             self._counts["replugged"] += 1
             log.warning("%s is back", self._uri)
@@ -110,8 +125,8 @@ class Recovery:
         if self._left.is_set():
             return False
         raise CameraLostError(
-            f"{silence}: it was unplugged and did not start within {replug_s:.0f} s{self._reason()}: plug it into a "
-            "USB 3 port and start again"
+            f"{silence}: it was unplugged and did not start within {replug_s:.0f}"
+            f" s{self._reason()}: plug it into a USB 3 port and start again"
         )
 
     def _reason(self) -> str:

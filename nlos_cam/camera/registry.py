@@ -1,4 +1,6 @@
-"""Cameras by name, from backends that are imported when used; simulation is never a silent fallback."""
+"""Cameras by name, from backends that are imported when used; simulation is never a silent
+fallback.
+"""
 
 from importlib import import_module
 from pathlib import Path
@@ -26,19 +28,26 @@ NAMES = "l515, l515:SERIAL, sim, sim:bare-wall, sim:SCENE.toml or FILE.bag"
 
 
 def open_camera(
-    uri: str, *, on_progress: OnProgress | None = None, recording: "Recording | None" = None, reader: Reader = "plain"
+    uri: str,
+    *,
+    on_progress: OnProgress | None = None,
+    recording: "Recording | None" = None,
+    reader: Reader = "plain",
 ) -> Camera:
     """Find and check the camera of that name without starting it; a live one can be recorded.
 
-    `reader` chooses the reader of recordings: "plain" (built in) or "sdk" (librealsense). Raises CameraNotFoundError,
-    RecordingError, SceneError; NlosCamError for a recording of a recording; UnknownCameraError for a mistyped name.
+    `reader` chooses the reader of recordings: "plain" (built in) or "sdk" (librealsense). Raises
+    CameraNotFoundError, RecordingError, SceneError; NlosCamError for a recording of a recording;
+    UnknownCameraError for a mistyped name.
     """
     scheme, colon, rest = (uri := full_uri(uri)).partition(":")
     if colon and not rest:
         raise UnknownCameraError(f"no camera {uri!r}: leave out the colon, or use {NAMES}")
     if scheme == "bag" and rest:
         if recording:
-            raise NlosCamError(f"{uri} is already a recording: copy the file, or give a live camera (l515, sim)")
+            raise NlosCamError(
+                f"{uri} is already a recording: copy the file, or give a live camera (l515, sim)"
+            )
         module, name = REPLAY_BACKENDS[reader]
         return getattr(import_module(module), name)(Path(rest))
     if scheme == "sim":
@@ -49,14 +58,18 @@ def open_camera(
         if rest and not Path(rest).suffix and uri not in SIMULATED and not Path(rest).exists():
             known = [*SIMULATED, *(f"sim:{name}" for name in packaged_scenes())]
             if uri not in known:
-                raise UnknownCameraError(f"no camera {uri!r}.{did_you_mean(uri, known)} Use {NAMES}")
+                raise UnknownCameraError(
+                    f"no camera {uri!r}.{did_you_mean(uri, known)} Use {NAMES}"
+                )
         world = open_world(rest, on_progress)
         return SimulatedCamera(uri, world, recording=recording, faults=world.scene.faults)
     if scheme == "l515":
         from nlos_cam.camera.l515 import L515Camera
 
         return L515Camera(uri, rest, recording=recording)
-    raise UnknownCameraError(f"no camera {uri!r}.{did_you_mean(uri, ['l515', *SIMULATED])} Use {NAMES}")
+    raise UnknownCameraError(
+        f"no camera {uri!r}.{did_you_mean(uri, ['l515', *SIMULATED])} Use {NAMES}"
+    )
 
 
 def full_uri(uri: str) -> str:

@@ -8,15 +8,22 @@ from typing import Any
 
 from nlos_cam.errors import CameraError
 
-WHEEL, MAC_WHEEL = "pyrealsense2==2.54.2.5684", "pyrealsense2-macosx==2.54.2"
+WHEEL = "pyrealsense2==2.54.2.5684"
+MAC_WHEEL = "pyrealsense2-macosx==2.54.2"
 """The last wheels that support the L515; that for macOS is a community build."""
 
 
 def wheel_for(python: tuple[int, int], system: str, machine: str) -> str | None:
-    """Return the wheel to install, by `sys.platform` and `platform.machine()`; None where none supports the L515."""
+    """Return the wheel to install, by `sys.platform` and `platform.machine()`; None where none
+    supports the L515.
+    """
     if system == "darwin":
         return MAC_WHEEL if python < (3, 13) else None
-    return WHEEL if python < (3, 12) and (system, machine) in {("linux", "x86_64"), ("win32", "AMD64")} else None
+    return (
+        WHEEL
+        if python < (3, 12) and (system, machine) in {("linux", "x86_64"), ("win32", "AMD64")}
+        else None
+    )
 
 
 @cache
@@ -37,13 +44,16 @@ def _advice() -> str:
         return f"run `pip install {wheel} libusb-package`"
     (major, minor), system, machine = here
     return (
-        f"no wheel that supports the L515 exists for Python {major}.{minor} on {system} {machine}; use Python 3.11 on "
-        "Windows or Linux (x86_64) for cameras, simulated ones too; recordings can be replayed here"
+        f"no wheel that supports the L515 exists for Python {major}.{minor} on {system} {machine};"
+        " use Python 3.11 on Windows or Linux (x86_64) for cameras, simulated ones too; recordings"
+        " can be replayed here"
     )
 
 
 def _preload_libusb() -> None:
-    """Load libusb from its own wheel: librealsense's Linux wheel needs it and does not include it."""
+    """Load libusb from its own wheel: librealsense's Linux wheel needs it and does not include
+    it.
+    """
     import libusb_package
 
     ctypes.CDLL(str(libusb_package.get_library_path()), ctypes.RTLD_GLOBAL)

@@ -1,4 +1,6 @@
-"""One run of a device's three streams through the SDK's sensor API, for every backend, and its queue of sets."""
+"""One run of a device's three streams through the SDK's sensor API, for every backend, and its
+queue of sets.
+"""
 
 from collections import Counter
 from collections.abc import Callable, Mapping
@@ -20,16 +22,21 @@ CAPACITY = 8
 
 
 class SampleQueue:
-    """Queue of paired samples between the SDK's threads, which `put`, and the thread that iterates over a camera.
+    """Queue of paired samples between the SDK's threads, which `put`, and the thread that iterates
+    over a camera.
 
-    When full it drops and counts the oldest set, so that a live device never waits; a `lossless` one makes the SDK
-    wait, which pauses the playback of a recording. `on_set` is called on an SDK thread with every set.
+    When full it drops and counts the oldest set, so that a live device never waits; a `lossless`
+    one makes the SDK wait, which pauses the playback of a recording. `on_set` is called on an SDK
+    thread with every set.
     """
 
-    def __init__(self, *, lossless: bool, on_set: Callable[[streams.FrameSet], None] | None = None) -> None:
+    def __init__(
+        self, *, lossless: bool, on_set: Callable[[streams.FrameSet], None] | None = None
+    ) -> None:
         self.arrived: Counter[str] = Counter()
         """Samples so far, by stream."""
-        self._lossless, self._on_set = lossless, on_set
+        self._lossless = lossless
+        self._on_set = on_set
         self._pairing = streams.FrameSynchronizer()
         self._evicted = 0
         self._sets = BoundedQueue[streams.FrameSet](CAPACITY)
@@ -80,14 +87,20 @@ class SampleQueue:
             self._on_set(complete)
 
     def take(self, timeout_s: float) -> streams.FrameSet | None:
-        """Return the oldest set; None after the timeout or once `ended`. Raises the error given to `finish`."""
+        """Return the oldest set; None after the timeout or once `ended`. Raises the error given to
+        `finish`.
+        """
         return self._sets.take(timeout_s)
 
     def finish(self, error: Exception | None = None) -> None:
-        """Accept no more samples, optionally because of an error; sets that wait can still be taken."""
+        """Accept no more samples, optionally because of an error; sets that wait can still be
+        taken.
+        """
         with self._sets.changed:
             self._sets.finish(error)
-            if self._lossless:  # half a set is a loss at a recording's end, but normal when a live device is left
+            if (
+                self._lossless
+            ):  # half a set is a loss at a recording's end, but normal when a live device is left
                 self._pairing.finish()
 
     def close(self) -> None:
@@ -103,11 +116,19 @@ BOUNDARY_WAIT_S = 0.2
 
 
 def find_streams(device: Any, size: Size | None = None) -> tuple[Any, dict[str, Any]]:
-    """Return the sensor with most of the needed streams, and their profiles; at `size` and 30 frames/s, if given."""
+    """Return the sensor with most of the needed streams, and their profiles; at `size` and 30
+    frames/s, if given.
+    """
     best: tuple[Any, dict[str, Any]] = (None, {})
     for sensor in device.query_sensors():
-        profiles = [profile for profile in sensor.get_stream_profiles() if streams.is_needed(profile)]
-        found = {streams.stream_name(profile): profile for profile in profiles if size is None or _has(profile, size)}
+        profiles = [
+            profile for profile in sensor.get_stream_profiles() if streams.is_needed(profile)
+        ]
+        found = {
+            streams.stream_name(profile): profile
+            for profile in profiles
+            if size is None or _has(profile, size)
+        }
         best = max(best, (sensor, found), key=lambda pair: len(pair[1]))
     return best
 
@@ -118,7 +139,9 @@ def _has(profile: Any, size: Size) -> bool:
 
 
 def read_settings(sensor: Any, ending: str = "") -> dict[str, float]:
-    """Return every readable option whose name ends so, by the SDK's name; empty when the sensor is gone."""
+    """Return every readable option whose name ends so, by the SDK's name; empty when the sensor is
+    gone.
+    """
     settings: dict[str, float] = {}
     for option in sensor.get_supported_options():
         if not option.name.endswith(ending):
@@ -131,7 +154,8 @@ def read_settings(sensor: Any, ending: str = "") -> dict[str, float]:
 
 
 class Session:
-    """Three streams of one sensor, delivered to an inbox between `start` and `stop`, both called by the owner.
+    """Three streams of one sensor, delivered to an inbox between `start` and `stop`, both called by
+    the owner.
 
     Samples come on the SDK's threads. Errors are the SDK's RuntimeError.
     """
@@ -154,13 +178,18 @@ class Session:
         """Timestamp of the newest sample from before the settings held."""
         self._held_back = 0
 
-    def start(self, prepare: Callable[[Any], None] | None = None, ready: Callable[[], None] | None = None) -> None:
-        """Start the sensor, set it up with `prepare`, call `ready`, and deliver every frame from then on.
+    def start(
+        self, prepare: Callable[[Any], None] | None = None, ready: Callable[[], None] | None = None
+    ) -> None:
+        """Start the sensor, set it up with `prepare`, call `ready`, and deliver every frame from
+        then on.
 
         Raises RuntimeError when the device vanishes during this.
         """
         self._sensor.open(self._profiles)
-        self._listening = prepare is None  # a recording's first frame comes while `start` still runs
+        self._listening = (
+            prepare is None
+        )  # a recording's first frame comes while `start` still runs
         self._sensor.start(self._on_frame)
         if prepare:
             prepare(self._sensor)
@@ -168,14 +197,18 @@ class Session:
         if not self.settings:
             raise RuntimeError("it vanished while it was set up")
         if self._preview.arrived:
-            self.look(BOUNDARY_WAIT_S)  # else the first set of a recording would miss streams that came before
+            self.look(
+                BOUNDARY_WAIT_S
+            )  # else the first set of a recording would miss streams that came before
         if ready:
             ready()
         self._listening = True
         self._preview.close()
 
     def look(self, timeout_s: float) -> streams.FrameSet | None:
-        """Return the next set to come while the sensor is prepared; None after the timeout or `end_wait`."""
+        """Return the next set to come while the sensor is prepared; None after the timeout or
+        `end_wait`.
+        """
         while self._preview.take(0.0):
             pass
         return self._preview.take(timeout_s)
@@ -186,13 +219,18 @@ class Session:
 
     def _on_frame(self, frame: Any) -> None:
         sample = streams.sample_from_sdk(frame)
-        if frame.get_frame_timestamp_domain().name == "hardware_clock":  # it wraps, for each stream by itself
-            sample = replace(sample, timestamp_s=self._clocks[sample.stream].add(sample.timestamp_s))
+        if (
+            frame.get_frame_timestamp_domain().name == "hardware_clock"
+        ):  # it wraps, for each stream by itself
+            sample = replace(
+                sample, timestamp_s=self._clocks[sample.stream].add(sample.timestamp_s)
+            )
         inbox = self.inbox if self._is_heard(sample) else self._preview
         inbox.put(sample)
 
     def _is_heard(self, sample: streams.Sample) -> bool:
-        """Return False for samples of a set that began before the settings held, which would be incomplete.
+        """Return False for samples of a set that began before the settings held, which would be
+        incomplete.
 
         At most one set is held back, so that a device whose clock stands still is not silenced.
         """
@@ -209,7 +247,9 @@ class Session:
         return self._sensor
 
     def telemetry(self, ending: str = "") -> dict[str, float]:
-        """Return the options as they read now; empty when the device is gone or the session has stopped."""
+        """Return the options as they read now; empty when the device is gone or the session has
+        stopped.
+        """
         sensor = self._sensor
         try:
             return read_settings(sensor, ending) if sensor else {}
@@ -219,13 +259,18 @@ class Session:
     def stop(self) -> None:
         """Stop, close and release the sensor."""
         self.end_wait()
-        self.inbox.close()  # first: the SDK waits for its callbacks, and a callback may wait for room
+        # first: the SDK waits for its callbacks, and a callback may wait for room
+        self.inbox.close()
         for end in (self._sensor.stop, self._sensor.close):
-            with suppress(RuntimeError):  # a device that vanished or never started is already stopped
+            with suppress(
+                RuntimeError
+            ):  # a device that vanished or never started is already stopped
                 end()
         self._sensor = None
         self._profiles.clear()
 
     def frame(self, found: streams.FrameSet, truth_depth_m: Float32 | None = None) -> Frame:
         """Return a set in SI units."""
-        return streams.frame_in_si(found, self._unit_m, self.intrinsics, self.settings, truth_depth_m)
+        return streams.frame_in_si(
+            found, self._unit_m, self.intrinsics, self.settings, truth_depth_m
+        )

@@ -21,16 +21,18 @@ from nlos_cam.camera.streams import BYTES_PER_PIXEL, FORMATS, FRAMES_PER_S
 from nlos_cam.errors import CameraLostError
 from nlos_cam.render import DEPTH_UNIT_M, Fault, SensedImages
 
-NAME, SERIAL = "Simulated L515", "simulated"
+NAME = "Simulated L515"
+SERIAL = "simulated"
 SENSOR_NAME = "L500 Depth Sensor"
 
 
 class SoftwareLidar:
     """`rs.software_device` with the L515's depth sensor, which delivers the images pushed into it.
 
-    It has the L515's sensor name, streams, formats and depth unit, and streams at one size; with `has_other_size` also
-    at half the rows and columns. Timestamps are host time, or the device's with `has_own_clock`. Its options are the
-    depth unit and the temperatures `celsius`, by the SDK's names, which stay constant.
+    It has the L515's sensor name, streams, formats and depth unit, and streams at one size; with
+    `has_other_size` also at half the rows and columns. Timestamps are host time, or the device's
+    with `has_own_clock`. Its options are the depth unit and the temperatures `celsius`, by the
+    SDK's names, which stay constant.
     """
 
     def __init__(
@@ -62,44 +64,70 @@ class SoftwareLidar:
 
     def _add(self, stream: str, size: Intrinsics) -> Any:
         video = self._sdk.video_stream()
-        video.type, video.index, video.uid = getattr(self._sdk.stream, stream), 0, len(self._profiles)
-        video.width, video.height, video.fps = size.width, size.height, FRAMES_PER_S
-        video.bpp, video.fmt = BYTES_PER_PIXEL[stream], getattr(self._sdk.format, FORMATS[stream])
+        video.type = getattr(self._sdk.stream, stream)
+        video.index = 0
+        video.uid = len(self._profiles)
+        video.width = size.width
+        video.height = size.height
+        video.fps = FRAMES_PER_S
+        video.bpp = BYTES_PER_PIXEL[stream]
+        video.fmt = getattr(self._sdk.format, FORMATS[stream])
         video.intrinsics = self._sdk_intrinsics(size)
         is_default = video.uid < len(FORMATS)
         return self._sdk.video_stream_profile(self._sensor.add_video_stream(video, is_default))
 
     def _sdk_intrinsics(self, pinhole: Intrinsics) -> Any:
         lens = self._sdk.intrinsics()
-        lens.width, lens.height = pinhole.width, pinhole.height
-        lens.fx, lens.fy, lens.ppx, lens.ppy = pinhole.fx, pinhole.fy, pinhole.ppx, pinhole.ppy
-        lens.model, lens.coeffs = self._sdk.distortion.none, [0.0] * 5
+        lens.width = pinhole.width
+        lens.height = pinhole.height
+        lens.fx = pinhole.fx
+        lens.fy = pinhole.fy
+        lens.ppx = pinhole.ppx
+        lens.ppy = pinhole.ppy
+        lens.model = self._sdk.distortion.none
+        lens.coeffs = [0.0] * 5
         return lens
 
     def _register_extrinsics(self) -> None:
         """Declare that all streams share one origin; without it, playback fails."""
         same = self._sdk.extrinsics()
-        same.rotation, same.translation = np.eye(3).ravel().tolist(), [0.0] * 3
+        same.rotation = np.eye(3).ravel().tolist()
+        same.translation = [0.0] * 3
         for one in self._profiles.values():
             for other in self._profiles.values():
                 if one is not other:
                     one.register_extrinsics_to(other, same)
 
     def push(
-        self, number: int, timestamp_s: float, images: SensedImages, streams: Collection[str] = tuple(FORMATS)
+        self,
+        number: int,
+        timestamp_s: float,
+        images: SensedImages,
+        streams: Collection[str] = tuple(FORMATS),
     ) -> None:
-        """Deliver one instant on `streams`, at the size of its images; only while the sensor streams."""
-        pixels = {"depth": images.depth_z16, "infrared": images.ir, "confidence": images.confidence << 4}
+        """Deliver one instant on `streams`, at the size of its images; only while the sensor
+        streams.
+        """
+        pixels = {
+            "depth": images.depth_z16,
+            "infrared": images.ir,
+            "confidence": images.confidence << 4,
+        }
         for (stream, shape), profile in self._profiles.items():
             if stream in streams and shape == images.ir.shape:
                 self._push(profile, stream, number, timestamp_s, pixels[stream])
 
-    def _push(self, profile: Any, stream: str, number: int, timestamp_s: float, pixels: NDArray[Any]) -> None:
+    def _push(
+        self, profile: Any, stream: str, number: int, timestamp_s: float, pixels: NDArray[Any]
+    ) -> None:
         frame = self._sdk.software_video_frame()  # a new one each time: the SDK owns a pushed frame
-        frame.pixels, frame.bpp = np.ascontiguousarray(pixels), BYTES_PER_PIXEL[stream]
+        frame.pixels = np.ascontiguousarray(pixels)
+        frame.bpp = BYTES_PER_PIXEL[stream]
         frame.stride = pixels.shape[1] * BYTES_PER_PIXEL[stream]
-        frame.timestamp, frame.frame_number = timestamp_s * 1e3, number
-        frame.domain, frame.profile = self._domain, profile  # of its size: the SDK reads that number of pixels
+        frame.timestamp = timestamp_s * 1e3
+        frame.frame_number = number
+        frame.domain = self._domain
+        frame.profile = profile  # of its size: the SDK reads that number of pixels
         self._sensor.on_video_frame(frame)
 
 
@@ -109,8 +137,9 @@ JOIN_TIMEOUT_S = 5.0
 RESET_INSTANTS = FRAMES_PER_S
 """Instants for which a device that is reset is disconnected."""
 EXPOSED_AHEAD_S = 0.5 / FRAMES_PER_S
-"""Least time before a frame is due at which its exposure is computed: late, since a real device needs no processor for
-it and the last frame is still being reconstructed, and twice the time of the last exposure if that is longer."""
+"""Least time before a frame is due at which its exposure is computed: late, since a real device
+needs no processor for it and the last frame is still being reconstructed, and twice the time of the
+last exposure if that is longer."""
 REMEMBERED_EXPOSURES = 3000
 """Frames (100 s) whose computing time is remembered."""
 MAX_TRUTHS = 1000
@@ -118,12 +147,14 @@ MAX_TRUTHS = 1000
 
 
 class SimulatedCamera(LiveCamera):
-    """Camera on a world through librealsense's software device, at 30 frames/s, with the given `faults`.
+    """Camera on a world through librealsense's software device, at 30 frames/s, with the given
+    `faults`.
 
-    A thread of its own delivers frames while entered; the world goes on through faults of the device. Not modeled: the
-    seconds that a start takes, options and presets beyond depth unit and temperatures, other resolutions, the color
-    camera and motion sensors, per-frame metadata, clock drift and jitter, faults that are not given, and the cooling of
-    an unplugged device. For the images, see `World` and `Sensor`.
+    A thread of its own delivers frames while entered; the world goes on through faults of the
+    device. Not modeled: the seconds that a start takes, options and presets beyond depth unit and
+    temperatures, other resolutions, the color camera and motion sensors, per-frame metadata, clock
+    drift and jitter, faults that are not given, and the cooling of an unplugged device. For the
+    images, see `World` and `Sensor`.
     """
 
     def __init__(
@@ -135,16 +166,27 @@ class SimulatedCamera(LiveCamera):
         recording: Recording | None = None,
         faults: Sequence[Fault] = (),
     ) -> None:
-        self._world, self._clock, self._faults = world, clock or WallClock(), tuple(faults)
+        self._world = world
+        self._clock = clock or WallClock()
+        self._faults = tuple(faults)
         world.images(0)  # compile now: it would delay the first frames
         self.exposures_s = deque[float](maxlen=REMEMBERED_EXPOSURES)
-        """Seconds that the last frames' images took to compute: a real camera takes none of this machine's."""
+        """Seconds that the last frames' images took to compute: a real camera takes none of this
+        machine's.
+        """
         self._stopping = Event()
         self._thread: Thread | None = None
         self._start_s: float | None = None
         self._plug_in(0)
         pinhole = world.rig.pinhole
-        super().__init__(uri, self._lidar.device, (pinhole.width, pinhole.height), load_sdk(), recording, self._clock)
+        super().__init__(
+            uri,
+            self._lidar.device,
+            (pinhole.width, pinhole.height),
+            load_sdk(),
+            recording,
+            self._clock,
+        )
         self.rig: Rig | None = world.rig
         self.identity: Mapping[str, str] = {"name": NAME, "serial": SERIAL}
 
@@ -157,8 +199,10 @@ class SimulatedCamera(LiveCamera):
     def _plug_in(self, instant: int) -> None:
         self._model = model = FaultyDevice(self._faults, instant)
         self._instants: dict[int, int] = {}
-        pinhole, celsius = self._world.rig.pinhole, self._world.celsius(instant)
-        other_size, own_clock = model.has_other_size, model.has_own_clock
+        pinhole = self._world.rig.pinhole
+        celsius = self._world.celsius(instant)
+        other_size = model.has_other_size
+        own_clock = model.has_own_clock
         self._lidar = SoftwareLidar(
             pinhole, load_sdk(), celsius=celsius, has_other_size=other_size, has_own_clock=own_clock
         )
@@ -167,7 +211,9 @@ class SimulatedCamera(LiveCamera):
         first = self._instant() + 1 if self._start_s is not None else 0
         self._start_s = self._clock.now() if self._start_s is None else self._start_s
         self._stopping.clear()
-        self._thread = Thread(target=self._run, args=(inbox, first), name=f"world of {self.uri}", daemon=True)
+        self._thread = Thread(
+            target=self._run, args=(inbox, first), name=f"world of {self.uri}", daemon=True
+        )
         self._thread.start()
 
     def _end(self) -> None:
@@ -180,7 +226,11 @@ class SimulatedCamera(LiveCamera):
         self._thread = None
 
     def _instant(self) -> int:
-        return int((self._clock.now() - self._start_s) * FRAMES_PER_S) if self._start_s is not None else 0
+        return (
+            int((self._clock.now() - self._start_s) * FRAMES_PER_S)
+            if self._start_s is not None
+            else 0
+        )
 
     def _is_connected(self) -> bool:
         return self._model.is_connected(self._instant())
@@ -201,8 +251,11 @@ class SimulatedCamera(LiveCamera):
         return None if instant is None else self._world.truth_depth_m(instant)
 
     def telemetry(self, ending: str = "") -> Mapping[str, float]:
-        """Return the options with the temperatures of the present instant; the SDK's own stay constant."""
-        options, celsius = super().telemetry(ending), self._world.celsius(self._instant())
+        """Return the options with the temperatures of the present instant; the SDK's own stay
+        constant.
+        """
+        options = super().telemetry(ending)
+        celsius = self._world.celsius(self._instant())
         return {name: celsius.get(name, value) for name, value in options.items()}
 
     def _run(self, inbox: SampleQueue, first: int) -> None:
@@ -213,12 +266,14 @@ class SimulatedCamera(LiveCamera):
 
     def _deliver(self, instant: int) -> None:
         """Expose each instant ahead of time, and deliver the device's frames when it is due."""
-        start_s, ahead_s = self._start_s or 0.0, EXPOSED_AHEAD_S
+        start_s = self._start_s or 0.0
+        ahead_s = EXPOSED_AHEAD_S
         while True:
             due_s = start_s + instant / FRAMES_PER_S
             if self._clock.wait(self._stopping, due_s - ahead_s - self._clock.now()):
                 return
-            exposure_s, images = self._clock.now(), self._world.images(instant)
+            exposure_s = self._clock.now()
+            images = self._world.images(instant)
             self.exposures_s.append(self._clock.now() - exposure_s)
             ahead_s = max(EXPOSED_AHEAD_S, 2 * self.exposures_s[-1])
             if self._clock.wait(self._stopping, due_s - self._clock.now()):

@@ -1,4 +1,6 @@
-"""World of a simulated camera: a scene's loop of poses, pre-rendered and cached; the sensor model runs live."""
+"""World of a simulated camera: a scene's loop of poses, pre-rendered and cached; the sensor model
+runs live.
+"""
 
 from collections.abc import Iterable, Mapping
 from io import BytesIO
@@ -25,17 +27,23 @@ CELSIUS_ABOVE = {
     "apd_temperature": -5.0,
     "humidity_temperature": -8.0,
 }
-"""Offsets from the sensor's temperature, which is the laser driver's; names from the SDK, values assumed."""
+"""Offsets from the sensor's temperature, which is the laser driver's; names from the SDK, values
+assumed.
+"""
 
 
 class World:
     """Loop of instants that repeats with new noise, while the device keeps warming."""
 
     def __init__(
-        self, scene: renderer.SceneFile, echoes: list[renderer.MultiBounce], truths: list[Float32 | None]
+        self,
+        scene: renderer.SceneFile,
+        echoes: list[renderer.MultiBounce],
+        truths: list[Float32 | None],
     ) -> None:
         self.scene = scene
-        self._echoes, self._truths = echoes, truths
+        self._echoes = echoes
+        self._truths = truths
         self._sensor = renderer.Sensor(scene.rig, scene.sensor, scene.radiometry)
 
     @property
@@ -66,10 +74,11 @@ class World:
 
 
 def open_world(name: str, on_progress: OnProgress | None = None) -> World:
-    """Return the world of a scene: "" for the paper's rig with a moving object, "bare-wall", or as `load_scene`.
+    """Return the world of a scene: "" for the paper's rig with a moving object, "bare-wall", or as
+    `load_scene`.
 
-    The loops of the first two come with the package; others are rendered on first use and stored in the cache folder.
-    Raises SceneError for an invalid scene.
+    The loops of the first two come with the package; others are rendered on first use and stored in
+    the cache folder. Raises SceneError for an invalid scene.
     """
     scene = {"": renderer.paper_scene, "bare-wall": renderer.bare_wall_scene}.get(
         name, lambda: renderer.load_scene(Path(name))
@@ -83,7 +92,9 @@ def open_world(name: str, on_progress: OnProgress | None = None) -> World:
 
 
 def read_packaged(scene: renderer.SceneFile) -> Loop | None:
-    """Return the loop of a scene that comes with the package; None where it does not, or is damaged."""
+    """Return the loop of a scene that comes with the package; None where it does not, or is
+    damaged.
+    """
     try:
         return _unpack((WORLDS / f"{scene.checksum}.npz").read_bytes())
     except (OSError, ValueError, EOFError, KeyError, BadZipFile):
@@ -91,13 +102,17 @@ def read_packaged(scene: renderer.SceneFile) -> Loop | None:
 
 
 def render_loop(
-    scene: renderer.SceneFile, on_progress: OnProgress | None = None, poses: Iterable[int] | None = None
+    scene: renderer.SceneFile,
+    on_progress: OnProgress | None = None,
+    poses: Iterable[int] | None = None,
 ) -> Loop:
     """Render the poses of a scene's loop, by default all."""
     echoes: list[renderer.MultiBounce] = []
     truths: list[Float32] = []
     for number in range(scene.poses) if poses is None else poses:
-        echoes.append(renderer.render_scan(lambda share, start=number: scene.scene_at(start + share)).multi)
+        echoes.append(
+            renderer.render_scan(lambda share, start=number: scene.scene_at(start + share)).multi
+        )
         truth = scene.scene_at(number + 0.5).object_depth_m
         truths.append(np.zeros((0, 0), np.float32) if truth is None else truth)
         if on_progress:

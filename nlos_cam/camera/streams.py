@@ -1,4 +1,6 @@
-"""Streams that a lidar delivers through librealsense, and their pairing into sets and Frames in SI units."""
+"""Streams that a lidar delivers through librealsense, and their pairing into sets and Frames in SI
+units.
+"""
 
 from collections import Counter, deque
 from collections.abc import Callable, Mapping
@@ -20,15 +22,23 @@ FRAMES_PER_S = 30
 SAME_INSTANT_S = 0.5 / FRAMES_PER_S
 """Frames of one number whose timestamps differ by more were not exposed together."""
 CONSISTENT_SETS = 3
-"""Sets in a row whose streams lag by the same number of frames, before the numbers are corrected."""
+"""Sets in a row whose streams lag by the same number of frames, before the numbers are
+corrected.
+"""
 WAITING_SETS = 30
 """Numbers that may wait for a stream; beyond that, the one that waited longest is given up."""
 LATE_NUMBERS = 30
-"""A number at most this far behind the last decided one is late; one further back belongs to a restarted count."""
+"""A number at most this far behind the last decided one is late; one further back belongs to a
+restarted count.
+"""
 MAX_GAP = 300 * FRAMES_PER_S
-"""Numbers between two sets that count as dropped (5 minutes' worth); beyond a wider gap the count was restarted."""
+"""Numbers between two sets that count as dropped (5 minutes' worth); beyond a wider gap the count
+was restarted.
+"""
 STALL_S = 5 / FRAMES_PER_S
-"""Time between two sets beyond that between their numbers, from which on delivery counts as stalled."""
+"""Time between two sets beyond that between their numbers, from which on delivery counts as
+stalled.
+"""
 
 
 @dataclass(frozen=True)
@@ -66,7 +76,12 @@ def is_needed(profile: Any) -> bool:
 def sample_from_sdk(frame: Any) -> Sample:
     """Copy an SDK frame, so that the SDK can reuse its memory at once."""
     pixels = np.array(frame.get_data())
-    return Sample(stream_name(frame.get_profile()), frame.get_frame_number(), frame.get_timestamp() / 1e3, pixels)
+    return Sample(
+        stream_name(frame.get_profile()),
+        frame.get_frame_number(),
+        frame.get_timestamp() / 1e3,
+        pixels,
+    )
 
 
 def intrinsics_of(profile: Any) -> Intrinsics:
@@ -78,8 +93,9 @@ def intrinsics_of(profile: Any) -> Intrinsics:
 class StreamOffsets:
     """Offsets that make frame numbers mean the same instant on every stream.
 
-    librealsense counts the frames of each stream by itself where the kernel does not pass an L515's metadata on. A
-    stream that starts late or loses a frame is then behind the others' numbers until its restart.
+    librealsense counts the frames of each stream by itself where the kernel does not pass an L515's
+    metadata on. A stream that starts late or loses a frame is then behind the others' numbers until
+    its restart.
     """
 
     def __init__(self, frames_per_s: float) -> None:
@@ -95,11 +111,15 @@ class StreamOffsets:
 
     def note(self, times_s: Mapping[str, float]) -> None:
         """Learn from the timestamps of the frames of one number, by stream."""
-        # A stream that lost k frames gives number n to the frame that the others call n + k, so its frame n was
-        # exposed k periods after theirs: k is the lag in periods behind the earliest stream, rounded. Exposures of one
-        # instant differ by a fraction of a period, and a lag that does not repeat was a late timestamp, not a loss.
+        # A stream that lost k frames gives number n to the frame that the others call n + k, so its
+        # frame n was exposed k periods after theirs: k is the lag in periods behind the earliest
+        # stream, rounded. Exposures of one instant differ by a fraction of a period, and a lag that
+        # does not repeat was a late timestamp, not a loss.
         first_s = min(times_s.values())
-        lags = {stream: round((time_s - first_s) * self._frames_per_s) for stream, time_s in times_s.items()}
+        lags = {
+            stream: round((time_s - first_s) * self._frames_per_s)
+            for stream, time_s in times_s.items()
+        }
         self._repeats = self._repeats + 1 if lags == self._lags else 1
         self._lags = lags
         if self._repeats == CONSISTENT_SETS:
@@ -107,7 +127,9 @@ class StreamOffsets:
 
 
 class Occurrences:
-    """Counts of events by name, in frames: the same event on several streams of one frame counts once."""
+    """Counts of events by name, in frames: the same event on several streams of one frame counts
+    once.
+    """
 
     def __init__(self) -> None:
         self.counts: Counter[str] = Counter()
@@ -127,15 +149,16 @@ class Occurrences:
 class FrameSynchronizer:
     """Pairing of samples with one number and instant into sets, each once and in order.
 
-    Stateful, with bounded memory whatever comes; one thread at a time. Every number is decided once, in rising order,
-    as a set, incomplete or dropped. Samples must have `shape` (rows, columns), if given.
+    Stateful, with bounded memory whatever comes; one thread at a time. Every number is decided
+    once, in rising order, as a set, incomplete or dropped. Samples must have `shape` (rows,
+    columns), if given.
     """
 
-    # Each stream delivers in rising order. Once all three have delivered number n, whatever is to come below n is a
-    # late repeat, so a set decides every number before it: those with some samples are incomplete, those with none
-    # were dropped, and with b the last number decided before,
-    #     n - b - 1 = incomplete + dropped.
-    # A number that waits for WAITING_SETS others has lost a stream, and is decided without a set.
+    # Each stream delivers in rising order. Once all three have delivered number n, whatever is to
+    # come below n is a late repeat, so a set decides every number before it: those with some
+    # samples are incomplete, those with none were dropped, and with b the last number decided
+    # before, n - b - 1 = incomplete + dropped. A number that waits for WAITING_SETS others has lost
+    # a stream, and is decided without a set.
 
     def __init__(self, shape: tuple[int, int] | None = None) -> None:
         self.shape = shape
@@ -157,10 +180,10 @@ class FrameSynchronizer:
     def counts(self) -> Counter[str]:
         """Other events, by name.
 
-        duplicate: a sample came again. out_of_order: it came after its number was decided as incomplete or dropped.
-        wrong_size: it has another shape. stalled: nothing came for a while, though no number is missing. renumbered:
-        the device restarted its count. stray: no set, and without a finite time or far from all other numbers, so that
-        it is not `incomplete`.
+        duplicate: a sample came again. out_of_order: it came after its number was decided as
+        incomplete or dropped. wrong_size: it has another shape. stalled: nothing came for a while,
+        though no number is missing. renumbered: the device restarted its count. stray: no set, and
+        without a finite time or far from all other numbers, so that it is not `incomplete`.
         """
         return self._occurrences.counts
 
@@ -207,7 +230,8 @@ class FrameSynchronizer:
 
     def _decide(self, number: int) -> None:
         """Decide every number before this one."""
-        before, self._decided = self._decided, number
+        before = self._decided
+        self._decided = number
         if before is None:
             self._count_incomplete(lambda waiting: waiting < number)
         elif before < number <= before + MAX_GAP:
@@ -230,7 +254,11 @@ class FrameSynchronizer:
     def _give_up(self, number: int) -> None:
         """Decide a number without a set if it is the next in order; else discard it as stray."""
         after = self._decided
-        ahead = [waiting for waiting in self._waiting if after is None or after < waiting <= after + MAX_GAP]
+        ahead = [
+            waiting
+            for waiting in self._waiting
+            if after is None or after < waiting <= after + MAX_GAP
+        ]
         del self._waiting[number]
         if ahead and number == min(ahead):
             self._decide(number)
@@ -239,8 +267,8 @@ class FrameSynchronizer:
             self._occurrences.counts["stray"] += 1
 
     def _note_stall(self, number: int, timestamp_s: float) -> None:
-        # t = zero + n / rate with a constant zero while delivery is steady. A dropped frame raises t and n alike; a
-        # device that stands still raises t only, and zero with it.
+        # t = zero + n / rate with a constant zero while delivery is steady. A dropped frame raises
+        # t and n alike; a device that stands still raises t only, and zero with it.
         zero_s = timestamp_s - number / FRAMES_PER_S
         if self._zero_s is not None and zero_s - self._zero_s > STALL_S:
             self._occurrences.counts["stalled"] += 1
