@@ -7,10 +7,12 @@ from _signal import SIG_IGN, SIGINT, signal  # pyright: ignore[reportMissingImpo
 
 
 def run() -> None:
-    """Run the console script: its exit code is the command's, also where Ctrl-C comes while Python still imports.
+    """Run the console script: its exit code is the command's, also where Ctrl-C comes while Python
+    still imports.
 
-    Until the command handles signals itself, Ctrl-C leaves at once, with one line: nothing is open yet, and an
-    interrupted import would end in a traceback. After the command it does nothing: Python is ending anyway.
+    Until the command handles signals itself, Ctrl-C leaves at once, with one line: nothing is open
+    yet, and an interrupted import would end in a traceback. After the command it does nothing:
+    Python is ending anyway.
     """
     signal(SIGINT, _leave)
     from nlos_cam.cli.main import main

@@ -1,4 +1,6 @@
-"""`nlos-cam calibrate` measures the bench before its use; `nlos-cam board` prints a board for it."""
+"""`nlos-cam calibrate` measures the bench before its use; `nlos-cam board` prints a board for
+it.
+"""
 
 from __future__ import annotations
 
@@ -16,7 +18,17 @@ from rich.table import Table
 
 from nlos_cam import calibrate as bench
 from nlos_cam import camera as cameras
-from nlos_cam.cli.common import Camera, Json, Overwrite, finish, output_path, progress, say, stderr, tracked
+from nlos_cam.cli.common import (
+    Camera,
+    Json,
+    Overwrite,
+    finish,
+    output_path,
+    progress,
+    say,
+    stderr,
+    tracked,
+)
 
 if TYPE_CHECKING:
     import numpy as np
@@ -30,15 +42,29 @@ GAUGE_WIDTH = 31
 
 
 def format_result(record: walls.WallRecord, files: bench.WallFiles) -> str:
-    """Return quantities with 95 % intervals, the verdict, warnings and the files written, with Rich's markup."""
+    """Return quantities with 95 % intervals, the verdict, warnings and the files written, with
+    Rich's markup.
+    """
     rows = walls.wall_facts(record)
     wide, wider = (max(len(row[column]) for row in rows) for column in (0, 1))
-    lines = [f"{name:{wide}}  {value:{wider}}  [dim]{escape(meaning)}[/]" for name, value, meaning in rows]
+    lines = [
+        f"{name:{wide}}  {value:{wider}}  [dim]{escape(meaning)}[/]"
+        for name, value, meaning in rows
+    ]
     advice = record.advice[:1].upper() + record.advice[1:]
     lines.append(f"[bold {_color(record.verdict)}]Verdict: {record.verdict}.[/] {escape(advice)}.")
     lines += [f"Note: {escape(warning)}" for warning in record.warnings]
-    written = [str(files.record), *([files.reference.name] if record.reference else []), files.report.name]
-    return "\n".join([*lines, f"Wrote {escape(', '.join(written))}: open {escape(files.report.name)} for the report"])
+    written = [
+        str(files.record),
+        *([files.reference.name] if record.reference else []),
+        files.report.name,
+    ]
+    return "\n".join(
+        [
+            *lines,
+            f"Wrote {escape(', '.join(written))}: open {escape(files.report.name)} for the report",
+        ]
+    )
 
 
 def _color(verdict: str) -> str:
@@ -46,7 +72,9 @@ def _color(verdict: str) -> str:
 
 
 def watch_wall(camera: cameras.Camera, stop: Callable[[], bool]) -> bench.FrameFit | None:
-    """Show the wall fitted to every third frame of an entered camera, until it ends or `stop`; return the last fit."""
+    """Show the wall fitted to every third frame of an entered camera, until it ends or `stop`;
+    return the last fit.
+    """
     last: bench.FrameFit | None = None
     with Live(console=stderr, auto_refresh=False, transient=True) as live:
         for number, frame in enumerate(camera):
@@ -59,7 +87,9 @@ def watch_wall(camera: cameras.Camera, stop: Callable[[], bool]) -> bench.FrameF
 
 
 def until_enter() -> Callable[[], bool]:
-    """Return a function that is true once Enter was pressed or stdin ended; a daemon thread reads stdin."""
+    """Return a function that is true once Enter was pressed or stdin ended; a daemon thread reads
+    stdin.
+    """
     pressed = Event()
 
     def wait() -> None:
@@ -79,46 +109,77 @@ def panel(found: bench.FrameFit) -> Table:
         table.add_row("wall", f"[yellow]not measured:[/] {escape(found.refusal)}")
     else:
         fit = found.fit
-        table.add_row("distance", f"{1e3 * fit.distance_m:.1f} mm", gauge(fit.distance_m, *walls.DISTANCE_RANGE_M))
-        table.add_row("facing", f"{fit.facing_deg:.2f}°", gauge(fit.facing_deg, *walls.FACING_RANGE_DEG))
+        table.add_row(
+            "distance",
+            f"{1e3 * fit.distance_m:.1f} mm",
+            gauge(fit.distance_m, *walls.DISTANCE_RANGE_M),
+        )
+        table.add_row(
+            "facing", f"{fit.facing_deg:.2f}°", gauge(fit.facing_deg, *walls.FACING_RANGE_DEG)
+        )
         table.add_row("yaw, pitch", f"{fit.yaw_deg:+z.2f}°, {fit.pitch_deg:+z.2f}°")
         table.add_row("verdict", f"[{_color(fit.verdict)}]{fit.verdict}[/]", fit.advice)
     if found.saturated > MAX_SATURATED:
-        table.add_row("infrared", f"{found.saturated:.1%} saturated", "lower the laser's power, or move back")
+        table.add_row(
+            "infrared", f"{found.saturated:.1%} saturated", "lower the laser's power, or move back"
+        )
     return table
 
 
 def gauge(value: float, low: float, high: float) -> str:
-    """Return a scale from `low` to `high` with a mark at the value; an arrow at the end where it is beyond."""
+    """Return a scale from `low` to `high` with a mark at the value; an arrow at the end where it is
+    beyond.
+    """
     share = (value - low) / (high - low)
     place = round(min(max(share, 0.0), 1.0) * (GAUGE_WIDTH - 1))
     mark = "◀" if share < 0 else "▶" if share > 1 else "●"
     return f"{low:g} {'─' * place}{mark}{'─' * (GAUGE_WIDTH - 1 - place)} {high:g}"
 
 
-Wall = Annotated[bool, typer.Option("--wall", help="Measure the bare wall: no object, no occluder.")]
+Wall = Annotated[
+    bool, typer.Option("--wall", help="Measure the bare wall: no object, no occluder.")
+]
 Bag = Annotated[Path | None, typer.Option("--bag", help="Recording of the bare wall.")]
 BareRecord = Annotated[
-    Path | None, typer.Option("--occluder", help="Find the occluder in front of the wall of this record (wall.toml).")
+    Path | None,
+    typer.Option(
+        "--occluder", help="Find the occluder in front of the wall of this record (wall.toml)."
+    ),
 ]
 Frames = Annotated[int, typer.Option("--frames", min=1, help="Number of frames to average.")]
 Watch = Annotated[
-    bool, typer.Option("--watch", help="Show distance and angle live until Enter is pressed, then measure.")
+    bool,
+    typer.Option(
+        "--watch", help="Show distance and angle live until Enter is pressed, then measure."
+    ),
 ]
 Tape = Annotated[
     float | None,
     typer.Option(
-        "--tape-m", min=0.01, help="Distance measured by tape, in metres: front glass to wall, along its normal."
+        "--tape-m",
+        min=0.01,
+        help="Distance measured by tape, in metres: front glass to wall, along its normal.",
     ),
 ]
-ByBoard = Annotated[bool, typer.Option("--board", help="Also find a printed board (`nlos-cam board`).")]
-BoardIn = Annotated[
-    Light, typer.Option("--board-in", help="Image to find the board in; colour needs an L515, or a recording of it.")
+ByBoard = Annotated[
+    bool, typer.Option("--board", help="Also find a printed board (`nlos-cam board`).")
 ]
-OnPaper = Annotated[Paper | None, typer.Option("--paper", help="Paper of the printed board (default: a4).")]
+BoardIn = Annotated[
+    Light,
+    typer.Option(
+        "--board-in", help="Image to find the board in; colour needs an L515, or a recording of it."
+    ),
+]
+OnPaper = Annotated[
+    Paper | None, typer.Option("--paper", help="Paper of the printed board (default: a4).")
+]
 SquareMm = Annotated[
     float | None,
-    typer.Option("--square-mm", min=1.0, help="Measured side of the board's squares in mm: length of its bar x 0.3."),
+    typer.Option(
+        "--square-mm",
+        min=1.0,
+        help="Measured side of the board's squares in mm: length of its bar x 0.3.",
+    ),
 ]
 OccluderX = Annotated[
     float | None,
@@ -131,7 +192,9 @@ OccluderX = Annotated[
 OccluderGap = Annotated[
     float | None,
     typer.Option(
-        "--occluder-gap-m", min=0.001, help="Gap between occluder's edge and wall measured by hand, in metres."
+        "--occluder-gap-m",
+        min=0.001,
+        help="Gap between occluder's edge and wall measured by hand, in metres.",
     ),
 ]
 Out = Annotated[Path | None, typer.Option("--out", help="Record to write (TOML).")]
@@ -177,27 +240,38 @@ def calibrate(
     overwrite: Overwrite = False,
     json: Json = False,
 ) -> None:
-    """Measure the wall's distance and angle from frames of the bare wall, and write record, reference and report.
+    """Measure the wall's distance and angle from frames of the bare wall, and write record,
+    reference and report.
 
-    Beside the record wall.toml it writes wall.npz, the bare wall's reference for difference maps, and wall.html, the
-    report. Once the occluder stands, --occluder wall.toml finds it and takes a new reference, with no object hidden.
+    Beside the record wall.toml it writes wall.npz, the bare wall's reference for difference maps,
+    and wall.html, the report. Once the occluder stands, --occluder wall.toml finds it and takes a
+    new reference, with no object hidden.
     """
     uri = _source(camera, bag, wall=wall, occluder=occluder)
     if not board and (paper or square_mm or board_in == "colour"):
         raise typer.BadParameter("--paper, --square-mm and --board-in need --board")
     if board and tape_m is not None:
-        raise typer.BadParameter("give one of --tape-m and --board: each measures the lidar's range offset")
+        raise typer.BadParameter(
+            "give one of --tape-m and --board: each measures the lidar's range offset"
+        )
     by_hand = _entered(occluder_x_m, occluder_gap_m)
     if occluder and (board or tape_m is not None or by_hand):
         raise typer.BadParameter(
-            "--occluder uses a wall that was measured before: drop --board, --tape-m, --occluder-x-m, -gap-m"
+            "--occluder uses a wall that was measured before: drop --board, --tape-m,"
+            " --occluder-x-m, -gap-m"
         )
     if occluder and watch:
-        raise typer.BadParameter("--watch shows the bare wall: position the lidar with it first, then add the occluder")
+        raise typer.BadParameter(
+            "--watch shows the bare wall: position the lidar with it first, then add the occluder"
+        )
     if occluder and out and out.resolve() == occluder.resolve():
-        raise typer.BadParameter(f"--out {out} is the record of the bare wall, which stays: choose another name")
+        raise typer.BadParameter(
+            f"--out {out} is the record of the bare wall, which stays: choose another name"
+        )
     bare = walls.load_measured(occluder) if occluder else None
-    files = bench.WallFiles.beside(output_path(out, "wall", ".toml", overwrite=overwrite), overwrite=overwrite)
+    files = bench.WallFiles.beside(
+        output_path(out, "wall", ".toml", overwrite=overwrite), overwrite=overwrite
+    )
     if watch:
         say("Position the lidar. [bold]Enter[/] measures, Ctrl-C cancels.", marked=True)
         with _opened(uri) as source:
@@ -212,20 +286,29 @@ def calibrate(
         record, inliers = bench.measure_occluder(capture, bare)
     else:
         if board:
-            fit, facts = bench.measure_by_board(capture, walls.BOARDS[paper or "a4"], square_mm, color)
+            fit, facts = bench.measure_by_board(
+                capture, walls.BOARDS[paper or "a4"], square_mm, color
+            )
         else:
             fit, facts = bench.measure_by_depth(capture, tape_m)
-        record, inliers = capture.record(fit, facts, by_hand), fit.inliers if isinstance(fit, walls.WallFit) else None
-    record = bench.write_record(files, record, None if inliers is None else capture.reference(inliers))
+        record = capture.record(fit, facts, by_hand)
+        inliers = fit.inliers if isinstance(fit, walls.WallFit) else None
+    record = bench.write_record(
+        files, record, None if inliers is None else capture.reference(inliers)
+    )
     fields = record.model_dump(mode="json", include=JSON_FIELDS)
     result = fields | {"out": str(files.record), "report": str(files.report)}
     finish(result, as_json=json, text=format_result(record, files), marked=True)
 
 
 def _source(camera: str | None, bag: Path | None, *, wall: bool, occluder: Path | None) -> str:
-    """Return the URI to read from. Raises typer.BadParameter for arguments that are missing or contradict."""
+    """Return the URI to read from. Raises typer.BadParameter for arguments that are missing or
+    contradict.
+    """
     if wall == (occluder is not None):
-        raise typer.BadParameter("choose what to measure: --wall, or --occluder wall.toml once the wall is measured")
+        raise typer.BadParameter(
+            "choose what to measure: --wall, or --occluder wall.toml once the wall is measured"
+        )
     if bag is not None and camera is None:
         return f"bag:{bag}"
     if camera is not None and bag is None:
@@ -234,7 +317,9 @@ def _source(camera: str | None, bag: Path | None, *, wall: bool, occluder: Path 
 
 
 def _entered(x_m: float | None, gap_m: float | None) -> walls.OccluderRecord | None:
-    """Return the occluder measured by hand. Raises typer.BadParameter for one of its two numbers."""
+    """Return the occluder measured by hand. Raises typer.BadParameter for one of its two
+    numbers.
+    """
     if x_m is None and gap_m is None:
         return None
     if x_m is None or gap_m is None:
@@ -263,17 +348,26 @@ SheetOut = Annotated[Path | None, typer.Option("--out", help="PDF to write.")]
 OnSheet = Annotated[Paper, typer.Option("--paper", help="Paper size.")]
 
 
-def board(out: SheetOut = None, paper: OnSheet = "a4", overwrite: Overwrite = False, json: Json = False) -> None:
-    """Write a ChArUco board as a PDF to scale, to be glued to the wall for `nlos-cam calibrate --wall --board`."""
+def board(
+    out: SheetOut = None, paper: OnSheet = "a4", overwrite: Overwrite = False, json: Json = False
+) -> None:
+    """Write a ChArUco board as a PDF to scale, to be glued to the wall for `nlos-cam calibrate
+    --wall --board`.
+    """
     if out is not None and out.suffix != ".pdf":
         raise typer.BadParameter(f"--out {out}: choose a name that ends in .pdf")
     path = output_path(out, "board", ".pdf", overwrite=overwrite)
     bench.write_board_pdf(path, paper)
     printed = walls.BOARDS[paper]
     text = (
-        f"{printed.squares_x} x {printed.squares_y} squares of {printed.square_mm:g} mm on {paper}\n"
-        "Print at 100 % with a laser printer (dye ink is white in infrared), and check that the bar measures 100 mm.\n"
-        f"Wrote {path}"
+        f"{printed.squares_x} x {printed.squares_y} squares of {printed.square_mm:g} mm on"
+        f" {paper}\nPrint at 100 % with a laser printer (dye ink is white in infrared), and check"
+        f" that the bar measures 100 mm.\nWrote {path}"
     )
-    result = {"out": str(path), "paper": paper, "page_mm": list(walls.PAPER_MM[paper]), **printed.model_dump()}
+    result = {
+        "out": str(path),
+        "paper": paper,
+        "page_mm": list(walls.PAPER_MM[paper]),
+        **printed.model_dump(),
+    }
     finish(result, as_json=json, text=text)

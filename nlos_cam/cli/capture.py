@@ -31,8 +31,12 @@ PRE_RENDERING = "Pre-rendering the simulated scene (first run only, about 90 s)"
 
 
 def result_of(takes: Sequence[recordings.CaptureResult], *, several: bool) -> dict[str, Any]:
-    """Return the takes for JSON: one as it is, several as {"takes": [...]} with totals; with the error of the last."""
-    each = [_take_fields(take.target, take.state, take.summary, take.sidecar.path) for take in takes]
+    """Return the takes for JSON: one as it is, several as {"takes": [...]} with totals; with the
+    error of the last.
+    """
+    each = [
+        _take_fields(take.target, take.state, take.summary, take.sidecar.path) for take in takes
+    ]
     result = _with_totals(each) if several else each[0]
     if error := final_error(takes[-1]):
         result["error"] = {"type": type(error).__name__, "message": str(error)}
@@ -47,11 +51,16 @@ def empty_result(target: recordings.CaptureTarget, *, several: bool) -> dict[str
 
 
 def _with_totals(each: list[dict[str, Any]]) -> dict[str, Any]:
-    return {"takes": each} | {key: sum(one[key] or 0 for one in each) for key in ("frames", "dropped", "seconds")}
+    return {"takes": each} | {
+        key: sum(one[key] or 0 for one in each) for key in ("frames", "dropped", "seconds")
+    }
 
 
 def _take_fields(
-    target: recordings.CaptureTarget, state: recordings.State, summary: recordings.Summary, sidecar: Path
+    target: recordings.CaptureTarget,
+    state: recordings.State,
+    summary: recordings.Summary,
+    sidecar: Path,
 ) -> dict[str, Any]:
     fields: dict[str, Any] = {
         "frames": summary.frames,
@@ -67,12 +76,18 @@ def _take_fields(
 
 
 def final_error(take: recordings.CaptureResult) -> NlosCamError | None:
-    """Return the error that ended a take, with the number of frames saved; None if its limit or the user ended it."""
+    """Return the error that ended a take, with the number of frames saved; None if its limit or the
+    user ended it.
+    """
     if take.error is None:
         return None
     if take.sets and not take.verified:
         return take.error
-    saved = f"{take.verified.frames} frames are saved in {take.target.path}" if take.verified else NOTHING
+    saved = (
+        f"{take.verified.frames} frames are saved in {take.target.path}"
+        if take.verified
+        else NOTHING
+    )
     return type(take.error)(f"{take.error}; {saved}")
 
 
@@ -83,14 +98,17 @@ def format_take(take: recordings.CaptureResult) -> str:
         return f"{ending.rstrip('. ')} before the first frame; {NOTHING}"
     if take.verified is None:
         return f"{ending}Recorded {take.sets} frames; not verified\nWrote {take.target.path}"
-    size_mb, summary = take.target.path.stat().st_size / 1e6, take.summary
-    noise = "unknown" if summary.temporal_noise_mm is None else f"{summary.temporal_noise_mm:.2f} mm"
+    size_mb = take.target.path.stat().st_size / 1e6
+    summary = take.summary
+    noise = (
+        "unknown" if summary.temporal_noise_mm is None else f"{summary.temporal_noise_mm:.2f} mm"
+    )
     return (
-        f"{ending}Recorded {take.verified.frames} frames ({take.verified.seconds:.1f} s, {size_mb:.0f} MB)"
-        f"{'' if take.state == 'damaged' else '; verified'}\n"
-        f"{100 * (summary.saturated_share or 0.0):.2f} % saturated, "
-        f"{100 * (summary.invalid_share or 0.0):.1f} % missing depth, temporal noise {noise}\n"
-        f"Wrote {take.target.path}"
+        f"{ending}Recorded {take.verified.frames} frames ({take.verified.seconds:.1f} s,"
+        f" {size_mb:.0f}"
+        f" MB){'' if take.state == 'damaged' else '; verified'}\n{100 * (summary.saturated_share or 0.0):.2f}"
+        f" % saturated, {100 * (summary.invalid_share or 0.0):.1f} % missing depth, temporal noise"
+        f" {noise}\nWrote {take.target.path}"
     )
 
 
@@ -98,21 +116,36 @@ MAX_S = 1e9
 """Longer than any disk lasts; infinity cannot be converted to a number of frames."""
 Seconds = Annotated[
     float | None,
-    typer.Option("--seconds", min=0.03, max=MAX_S, help="Stop after this many seconds (default: run until Ctrl-C)."),
+    typer.Option(
+        "--seconds",
+        min=0.03,
+        max=MAX_S,
+        help="Stop after this many seconds (default: run until Ctrl-C).",
+    ),
 ]
 Frames = Annotated[int | None, typer.Option("--frames", min=1, help="Stop after this many frames.")]
-TakeCount = Annotated[int, typer.Option("--takes", min=1, max=9999, help="Number of takes: F-01.bag, F-02.bag, ...")]
+TakeCount = Annotated[
+    int, typer.Option("--takes", min=1, max=9999, help="Number of takes: F-01.bag, F-02.bag, ...")
+]
 Pause = Annotated[
     float | None,
     typer.Option(
-        "--pause-s", min=0.0, max=MAX_S, help="Seconds between takes (default: wait for Enter, at a terminal)."
+        "--pause-s",
+        min=0.0,
+        max=MAX_S,
+        help="Seconds between takes (default: wait for Enter, at a terminal).",
     ),
 ]
 Labels = Annotated[
     list[str] | None,
-    typer.Option("--label", help="Name of the recorded object, stored in F.json; with --takes, once or for each."),
+    typer.Option(
+        "--label",
+        help="Name of the recorded object, stored in F.json; with --takes, once or for each.",
+    ),
 ]
-Wall = Annotated[Path | None, typer.Option("--wall", help="Wall record of `calibrate --wall`, stored in F.json.")]
+Wall = Annotated[
+    Path | None, typer.Option("--wall", help="Wall record of `calibrate --wall`, stored in F.json.")
+]
 Out = Annotated[Path | None, typer.Option("--out", help="Recording to write (.bag).")]
 
 
@@ -128,23 +161,40 @@ def capture(
     overwrite: common.Overwrite = False,
     json: common.Json = False,
 ) -> None:
-    """Record depth, infrared and confidence to .bag until --seconds, --frames or Ctrl-C, and verify each file."""
+    """Record depth, infrared and confidence to .bag until --seconds, --frames or Ctrl-C, and verify
+    each file.
+    """
     targets = _targets(_base(seconds, frames, takes, out), takes, label or [], overwrite=overwrite)
     measured = recordings.load_measured_wall(wall) if wall else None
-    recording = cameras.Recording(targets[0].path, frames=frames, seconds=seconds, last=takes == 1, overwrite=overwrite)
+    recording = cameras.Recording(
+        targets[0].path, frames=frames, seconds=seconds, last=takes == 1, overwrite=overwrite
+    )
     try:
-        with common.interrupted_by_signals(), common.tracked(PRE_RENDERING, at_once=False) as on_progress:
+        with (
+            common.interrupted_by_signals(),
+            common.tracked(PRE_RENDERING, at_once=False) as on_progress,
+        ):
             source = cameras.open_camera(camera, on_progress=on_progress, recording=recording)
     except KeyboardInterrupt:
-        result, text = empty_result(targets[0], several=takes > 1), f"Interrupted before the first frame; {NOTHING}"
+        result = empty_result(targets[0], several=takes > 1)
+        text = f"Interrupted before the first frame; {NOTHING}"
         common.finish(result, as_json=json, text=text)
         common.exit_interrupted(NOTHING)
     limit = frames or (round(seconds * cameras.FRAMES_PER_S) if seconds else None)
     _check_disk(source, targets, limit)
     with common.stop_on_signals() as stop:
-        results = _record(recordings.CaptureSession(source, recording, targets, wall=measured), stop, limit, pause_s)
+        results = _record(
+            recordings.CaptureSession(source, recording, targets, wall=measured),
+            stop,
+            limit,
+            pause_s,
+        )
         interrupted = stop.is_set() or results[-1].state == "interrupted"
-    common.finish(result_of(results, several=takes > 1), as_json=json, text="\n".join(map(format_take, results)))
+    common.finish(
+        result_of(results, several=takes > 1),
+        as_json=json,
+        text="\n".join(map(format_take, results)),
+    )
     if error := final_error(results[-1]):
         common.say(f"[bold red]error:[/] {escape(str(error))}", marked=True)
         raise typer.Exit(error.exit_code)
@@ -153,7 +203,9 @@ def capture(
 
 
 def _base(seconds: float | None, frames: int | None, takes: int, out: Path | None) -> Path:
-    """Return the path before takes are numbered. Raises typer.BadParameter for options that contradict each other."""
+    """Return the path before takes are numbered. Raises typer.BadParameter for options that
+    contradict each other.
+    """
     if seconds is not None and frames is not None:
         raise typer.BadParameter("give either --seconds or --frames, not both")
     if takes > 1 and seconds is None and frames is None:
@@ -163,15 +215,25 @@ def _base(seconds: float | None, frames: int | None, takes: int, out: Path | Non
     return out or common.output_path(None, "capture", ".bag", overwrite=False)
 
 
-def _targets(base: Path, takes: int, labels: list[str], *, overwrite: bool) -> list[recordings.CaptureTarget]:
-    """Return file and label of each take. Raises OutputExistsError for a file that may not be overwritten."""
+def _targets(
+    base: Path, takes: int, labels: list[str], *, overwrite: bool
+) -> list[recordings.CaptureTarget]:
+    """Return file and label of each take. Raises OutputExistsError for a file that may not be
+    overwritten.
+    """
     if len(labels) not in {0, 1, takes}:
-        raise typer.BadParameter(f"{len(labels)} --label for {takes} takes: give one for all, or one for each")
+        raise typer.BadParameter(
+            f"{len(labels)} --label for {takes} takes: give one for all, or one for each"
+        )
     digits = max(2, len(str(takes)))
     numbered = [base.with_stem(f"{base.stem}-{number:0{digits}}") for number in range(1, takes + 1)]
     paths = numbered if takes > 1 else [base]
     targets = list(
-        map(recordings.CaptureTarget, paths, labels * takes if len(labels) == 1 else labels or [None] * takes)
+        map(
+            recordings.CaptureTarget,
+            paths,
+            labels * takes if len(labels) == 1 else labels or [None] * takes,
+        )
     )
     for target in targets:
         for path in (target.path, recordings.sidecar_path(target.path)):
@@ -179,14 +241,20 @@ def _targets(base: Path, takes: int, labels: list[str], *, overwrite: bool) -> l
     return targets
 
 
-def _check_disk(camera: cameras.Camera, targets: list[recordings.CaptureTarget], limit: int | None) -> None:
-    """Raise DiskFullError where the takes may not fit; without a limit of frames, print how long the disk lasts."""
+def _check_disk(
+    camera: cameras.Camera, targets: list[recordings.CaptureTarget], limit: int | None
+) -> None:
+    """Raise DiskFullError where the takes may not fit; without a limit of frames, print how long
+    the disk lasts.
+    """
     path, free = targets[0].path, cameras.free_bytes(targets[0].path)
     cameras.check_room(path, camera.intrinsics, (limit or 0) * len(targets), free)
     if limit is None:
         lasts_s = cameras.recording_s(camera.intrinsics, free)
         time = f"{int(lasts_s / 60)} minutes" if lasts_s >= 120 else f"{int(lasts_s)} s"
-        common.say(f"Disk space for at least {time} ({free / 1e9:.1f} GB free). Press Ctrl-C to stop.")
+        common.say(
+            f"Disk space for at least {time} ({free / 1e9:.1f} GB free). Press Ctrl-C to stop."
+        )
 
 
 def _record(
@@ -195,13 +263,17 @@ def _record(
     results: list[recordings.CaptureResult] = []
     with common.progress() as bar:
         task = bar.add_task("recording", total=limit)
-        with closing(session.record(stop, lambda sets: bar.update(task, completed=sets))) as recorded:
+        with closing(
+            session.record(stop, lambda sets: bar.update(task, completed=sets))
+        ) as recorded:
             for take in recorded:
                 result = recordings.finalize(take, partial(_verify, bar, take.sets))
                 results.append(result)
                 if dropped := result.summary.dropped:
                     common.say(
-                        f"[yellow]Warning:[/] {dropped} frames were dropped; the recording has gaps", marked=True
+                        f"[yellow]Warning:[/] {dropped} frames were dropped; the recording has"
+                        " gaps",
+                        marked=True,
                     )
                 if result.state != "complete" or stop.is_set():
                     break

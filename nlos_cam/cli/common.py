@@ -1,4 +1,6 @@
-"""Shared parts of the commands: output paths, results on stdout, progress and messages on stderr, signals."""
+"""Shared parts of the commands: output paths, results on stdout, progress and messages on stderr,
+signals.
+"""
 
 import json as json_module
 import os
@@ -37,7 +39,9 @@ Camera = Annotated[
     ),
 ]
 """Also taken as the option --camera: `shared_options` makes one value of the two."""
-Json = Annotated[bool, typer.Option("--json", help="Print one JSON object as the last line of stdout.")]
+Json = Annotated[
+    bool, typer.Option("--json", help="Print one JSON object as the last line of stdout.")
+]
 Overwrite = Annotated[bool, typer.Option("--overwrite", help="Overwrite the output if it exists.")]
 
 PAPER_RIG = "paper-rig"
@@ -62,8 +66,12 @@ class Detail:
 
 
 def set_detail(*, verbose: bool = False, quiet: bool = False) -> None:
-    """Print details and the package's log too, or (`quiet`) no messages but errors, from the start of a command."""
-    Detail.verbose, stderr.quiet, Detail.interruption = verbose, quiet, ""
+    """Print details and the package's log too, or (`quiet`) no messages but errors, from the start
+    of a command.
+    """
+    Detail.verbose = verbose
+    stderr.quiet = quiet
+    Detail.interruption = ""
     if verbose:
         import logging
 
@@ -73,7 +81,8 @@ def set_detail(*, verbose: bool = False, quiet: bool = False) -> None:
 
 def say_error(text: str) -> None:
     """Print an error in one line, also if quiet."""
-    stderr.quiet, line = False, " ".join(text.split())
+    stderr.quiet = False
+    line = " ".join(text.split())
     try:
         stderr.print(f"[bold red]error:[/] {escape(line)}", soft_wrap=True)
     except (MemoryError, ImportError):  # too little memory is left for rich
@@ -81,7 +90,9 @@ def say_error(text: str) -> None:
 
 
 def say_interrupted(kept: str = "nothing was written") -> None:
-    """Print that the command was interrupted and the results that it kept; the first call counts."""
+    """Print that the command was interrupted and the results that it kept; the first call
+    counts.
+    """
     if not Detail.interruption:
         Detail.interruption = f"interrupted: {kept}"
         say(Detail.interruption)
@@ -98,13 +109,16 @@ def say(text: str, *, marked: bool = False) -> None:
     stderr.print(text, soft_wrap=True, markup=marked)
 
 
-def finish(result: dict[str, Any], *, as_json: bool, text: str, note: str = "", marked: bool = False) -> None:
+def finish(
+    result: dict[str, Any], *, as_json: bool, text: str, note: str = "", marked: bool = False
+) -> None:
     """Print a command's result to stdout: one JSON object or a text; a note is added to either.
 
     `marked`: the text has Rich's markup.
     """
     if note:
-        result, text = {**result, "note": note}, f"{text} ({note})"
+        result = {**result, "note": note}
+        text = f"{text} ({note})"
     if as_json:
         print(json_module.dumps(result), flush=True)  # noqa: T201  stdout is the machine's
     else:
@@ -112,7 +126,9 @@ def finish(result: dict[str, Any], *, as_json: bool, text: str, note: str = "", 
 
 
 def show(table: Table) -> None:
-    """Print a table to stdout without its empty columns; on a narrow terminal, each row as a block of lines."""
+    """Print a table to stdout without its empty columns; on a narrow terminal, each row as a block
+    of lines.
+    """
     console = Console(highlight=False)
     table.columns = [column for column in table.columns if any(column.cells)]
     if console.width >= NARROW_COLUMNS:
@@ -126,8 +142,16 @@ def show(table: Table) -> None:
 
 @contextmanager
 def progress(*others: ProgressColumn, period_s: float = LINE_PERIOD_S) -> Generator[Progress]:
-    """Show a progress bar with further columns on stderr; where that is no terminal, a line every `period_s`."""
-    columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), *others, TimeElapsedColumn()
+    """Show a progress bar with further columns on stderr; where that is no terminal, a line every
+    `period_s`.
+    """
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        *others,
+        TimeElapsedColumn(),
+    )
     off = not stderr.is_terminal
     bar = Progress(*columns, TimeRemainingColumn(), console=stderr, transient=True, disable=off)
     with bar, _progress_lines(bar, period_s) if off else nullcontext():
@@ -157,7 +181,9 @@ def _progress_lines(bar: Progress, period_s: float) -> Generator[None]:
 
 @contextmanager
 def tracked(description: str, *, at_once: bool = True) -> Generator[Callable[[int, int], None]]:
-    """Show a progress bar, `at_once` or from the first step; yield the function that takes (done, total)."""
+    """Show a progress bar, `at_once` or from the first step; yield the function that takes (done,
+    total).
+    """
     with progress() as bar:
         task = bar.add_task(description, total=None, visible=at_once)
 
@@ -169,7 +195,8 @@ def tracked(description: str, *, at_once: bool = True) -> Generator[Callable[[in
 
 @contextmanager
 def stop_on_signals(note: str = "") -> Generator[Event]:
-    """Yield an event that Ctrl-C or SIGTERM sets within the block, so that the loop ends and results are printed.
+    """Yield an event that Ctrl-C or SIGTERM sets within the block, so that the loop ends and
+    results are printed.
 
     The first signal prints `note`, for loops whose end takes long.
     """
@@ -187,10 +214,11 @@ def stop_on_signals(note: str = "") -> Generator[Event]:
 
 @contextmanager
 def interrupted_by_signals(kept: str = "nothing was written") -> Generator[None]:
-    """Raise KeyboardInterrupt in the block on Ctrl-C or SIGTERM, also where a shell had them ignored.
+    """Raise KeyboardInterrupt in the block on Ctrl-C or SIGTERM, also where a shell had them
+    ignored.
 
-    It is raised at the end of the block too: a library may have swallowed it or turned it into another error. `kept`
-    completes the line "interrupted: ...", which the command line prints.
+    It is raised at the end of the block too: a library may have swallowed it or turned it into
+    another error. `kept` completes the line "interrupted: ...", which the command line prints.
     """
     interrupted = Event()
 
@@ -199,7 +227,8 @@ def interrupted_by_signals(kept: str = "nothing was written") -> Generator[None]
         raise KeyboardInterrupt(kept)
 
     def raise_again(ignored: Any, before: Any = sys.unraisablehook) -> None:
-        # Python ignores errors in destructors and weak references' callbacks, where a signal may happen to arrive.
+        # Python ignores errors in destructors and weak references' callbacks, where a signal may
+        # happen to arrive.
         if issubclass(ignored.exc_type, KeyboardInterrupt):
             Timer(0.05, os.kill, (os.getpid(), signal.SIGINT)).start()
         else:
@@ -218,7 +247,8 @@ def interrupted_by_signals(kept: str = "nothing was written") -> Generator[None]
 
 @contextmanager
 def _unraisable_hook(hook: Callable[[Any], None]) -> Generator[None]:
-    before, sys.unraisablehook = sys.unraisablehook, hook
+    before = sys.unraisablehook
+    sys.unraisablehook = hook
     try:
         yield
     finally:
@@ -231,7 +261,9 @@ def _on_signals(act: Callable[[], None]) -> Generator[None]:
         del number, frame
         act()
 
-    before = {number: signal.signal(number, on_signal) for number in (signal.SIGINT, signal.SIGTERM)}
+    before = {
+        number: signal.signal(number, on_signal) for number in (signal.SIGINT, signal.SIGTERM)
+    }
     try:
         yield
     finally:
@@ -242,20 +274,25 @@ def _on_signals(act: Callable[[], None]) -> Generator[None]:
 def output_path(out: Path | None, stem: str, suffix: str, *, overwrite: bool) -> Path:
     """Return the output path: `out`, or a dated name in the current folder.
 
-    It is reserved until `release_outputs`: raises FileBusyError, with the holder, where another process writes to it.
-    Without a suffix the output is a folder, which may exist if it is empty. Raises OutputExistsError if something would
-    be replaced without `overwrite`, or if the path cannot be written.
+    It is reserved until `release_outputs`: raises FileBusyError, with the holder, where another
+    process writes to it. Without a suffix the output is a folder, which may exist if it is empty.
+    Raises OutputExistsError if something would be replaced without `overwrite`, or if the path
+    cannot be written.
     """
     path = out or Path(f"{stem}-{datetime.now().astimezone():%Y%m%d-%H%M%S}{suffix}")
     if suffix and path.is_dir():
         raise OutputExistsError(f"{path} is a folder: name a {suffix} file in it")
     if not suffix and path.exists() and not path.is_dir():
-        raise OutputExistsError(f"{path} is a file, but --out must be a folder: choose another name")
+        raise OutputExistsError(
+            f"{path} is a file, but --out must be a folder: choose another name"
+        )
     _refuse_existing(path, overwrite=overwrite)
     if not path.parent.is_dir():
         raise OutputExistsError(f"the folder of {path} does not exist: create {path.parent} first")
     if not os.access(path.parent, os.W_OK):
-        raise OutputExistsError(f"the folder of {path} cannot be written to: choose another, or change its permissions")
+        raise OutputExistsError(
+            f"the folder of {path} cannot be written to: choose another, or change its permissions"
+        )
     from nlos_cam.files import reservations
 
     _outputs.enter_context(reservations())(path)
@@ -266,7 +303,9 @@ def output_path(out: Path | None, stem: str, suffix: str, *, overwrite: bool) ->
 
 def _refuse_existing(path: Path, *, overwrite: bool) -> None:
     if path.exists() and not overwrite and not (path.is_dir() and not any(path.iterdir())):
-        raise OutputExistsError(f"{path} exists: choose another name, or add --overwrite to replace it")
+        raise OutputExistsError(
+            f"{path} exists: choose another name, or add --overwrite to replace it"
+        )
 
 
 def release_outputs() -> None:

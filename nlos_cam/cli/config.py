@@ -1,6 +1,8 @@
-"""Settings from nlos-cam.toml and the environment, which commands use where an option is not given; `nlos-cam config`.
+"""Settings from nlos-cam.toml and the environment, which commands use where an option is not given;
+`nlos-cam config`.
 
-Precedence: option, environment variable, nlos-cam.toml in the current folder, then in the user's folder, default.
+Precedence: option, environment variable, nlos-cam.toml in the current folder, then in the user's
+folder, default.
 """
 
 import inspect
@@ -33,7 +35,9 @@ class Setting(NamedTuple):
 
 SETTINGS = {
     "camera": Setting(frozenset({"live", "capture", "calibrate"}), "sim", "CAMERA"),
-    "wall": Setting(frozenset({"live", "replay", "capture"}), None, "--wall, unless another CAMERA is given"),
+    "wall": Setting(
+        frozenset({"live", "replay", "capture"}), None, "--wall, unless another CAMERA is given"
+    ),
     "weights": Setting(frozenset({"live", "replay", "evaluate"}), None, "--weights"),
     "view_port": Setting(frozenset({"live", "view"}), None, "--view-port"),
     "cache": Setting(frozenset(), None, "folder for rendered scenes and exported networks"),
@@ -54,18 +58,26 @@ def variable(name: str) -> str:
 
 
 def read_settings(
-    environment: Mapping[str, str] = os.environ, folder: Path | None = None, user_folder: Path | None = None
+    environment: Mapping[str, str] = os.environ,
+    folder: Path | None = None,
+    user_folder: Path | None = None,
 ) -> dict[str, Value]:
-    """Return every setting. Raises RecordingError for a file that cannot be used, BadParameter for a variable."""
+    """Return every setting. Raises RecordingError for a file that cannot be used, BadParameter for
+    a variable.
+    """
     files = [(folder or Path()) / FILE, (user_folder or Path(typer.get_app_dir("nlos-cam"))) / FILE]
     read = [(path, _read_file(path)) for path in files]
     values: dict[str, Value] = {}
     for name, setting in SETTINGS.items():
         found = next(((content[name], path) for path, content in read if name in content), None)
         if text := environment.get(variable(name)):
-            values[name] = Value(_port_in(variable(name), text) if name == "view_port" else text, variable(name))
+            values[name] = Value(
+                _port_in(variable(name), text) if name == "view_port" else text, variable(name)
+            )
         else:
-            values[name] = Value(found[0], str(found[1])) if found else Value(setting.default, "default")
+            values[name] = (
+                Value(found[0], str(found[1])) if found else Value(setting.default, "default")
+            )
     return values
 
 
@@ -93,12 +105,15 @@ def _read_file(path: Path) -> dict[str, str | int]:
 def _checked(path: Path, name: str, value: object) -> str | int:
     if name not in SETTINGS:
         raise RecordingError(
-            f"{path}: no setting {name!r}.{did_you_mean(name, SETTINGS)} Choose from {', '.join(SETTINGS)}"
+            f"{path}: no setting {name!r}.{did_you_mean(name, SETTINGS)} Choose from"
+            f" {', '.join(SETTINGS)}"
         )
     if name == "view_port":
         if isinstance(value, int) and not isinstance(value, bool) and 1 <= value <= MAX_PORT:
             return value
-        raise RecordingError(f"{path}: view_port must be a whole number from 1 to {MAX_PORT} (got {value!r:.40})")
+        raise RecordingError(
+            f"{path}: view_port must be a whole number from 1 to {MAX_PORT} (got {value!r:.40})"
+        )
     if not isinstance(value, str) or not value:
         raise RecordingError(f"{path}: {name} must be a text in quotes (got {value!r:.40})")
     scheme, colon, rest = value.rpartition(":") if name == "camera" else ("", "", value)
@@ -106,24 +121,38 @@ def _checked(path: Path, name: str, value: object) -> str | int:
     return f"{scheme}{colon}{path.parent / Path(rest).expanduser()}" if is_path else value
 
 
-Verbose = Annotated[bool, typer.Option("--verbose", "-v", help="Also print details, such as the time of each stage.")]
-Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Print no messages and no progress; errors stay.")]
+Verbose = Annotated[
+    bool,
+    typer.Option("--verbose", "-v", help="Also print details, such as the time of each stage."),
+]
+Quiet = Annotated[
+    bool, typer.Option("--quiet", "-q", help="Print no messages and no progress; errors stay.")
+]
 CameraOption = Annotated[str | None, typer.Option("--camera", help="The same as CAMERA.")]
 
 
 def shared_options(name: str, command: Callable[..., None]) -> Callable[..., None]:
-    """Return a command with the options of all commands, settings for options that are not given, and one CAMERA."""
-    every = {each.name: each for each in inspect.signature(command, eval_str=True).parameters.values()}
+    """Return a command with the options of all commands, settings for options that are not given,
+    and one CAMERA.
+    """
+    every = {
+        each.name: each for each in inspect.signature(command, eval_str=True).parameters.values()
+    }
     keyword = inspect.Parameter.KEYWORD_ONLY
     if takes_camera := "camera" in every:
-        every["camera"] = every["camera"].replace(default=None, annotation=_optional(every["camera"].annotation))
-        every["camera_option"] = inspect.Parameter("camera_option", keyword, default=None, annotation=CameraOption)
+        every["camera"] = every["camera"].replace(
+            default=None, annotation=_optional(every["camera"].annotation)
+        )
+        every["camera_option"] = inspect.Parameter(
+            "camera_option", keyword, default=None, annotation=CameraOption
+        )
     every["verbose"] = inspect.Parameter("verbose", keyword, default=False, annotation=Verbose)
     every["quiet"] = inspect.Parameter("quiet", keyword, default=False, annotation=Quiet)
 
     @wraps(command)
     def run(**values: Any) -> None:
-        verbose, quiet = values.pop("verbose"), values.pop("quiet")
+        verbose = values.pop("verbose")
+        quiet = values.pop("quiet")
         if verbose and quiet:
             raise typer.BadParameter("--verbose and --quiet contradict each other: give one")
         set_detail(verbose=verbose, quiet=quiet)
@@ -147,7 +176,9 @@ def shared_options(name: str, command: Callable[..., None]) -> Callable[..., Non
 
 @contextmanager
 def _cache_at(setting: Value) -> Generator[None]:
-    """Set the environment variable of the cache, which child processes read too, within the block."""
+    """Set the environment variable of the cache, which child processes read too, within the
+    block.
+    """
     before = os.environ.get(variable("cache"))
     os.environ |= {variable("cache"): str(setting.value)} if setting.value else {}
     try:
@@ -163,14 +194,19 @@ def _optional(annotation: Any) -> Any:
 
 
 def _choose_camera(values: dict[str, Any], used: dict[str, Value]) -> None:
-    """Enter the camera of the argument, the option or the setting; another than the setting's has another wall."""
-    argument, option = values.pop("camera"), values.pop("camera_option")
+    """Enter the camera of the argument, the option or the setting; another than the setting's has
+    another wall.
+    """
+    argument = values.pop("camera")
+    option = values.pop("camera_option")
     if None not in {argument, option} and argument != option:
         raise typer.BadParameter(f"CAMERA is {argument!r} and --camera is {option!r}: give one")
     given = option if argument is None else argument
     if given is not None and given != used["camera"].value:
         used.pop("wall", None)
-    values["camera"] = used["camera"].value if given is None and values.get("bag") is None else given
+    values["camera"] = (
+        used["camera"].value if given is None and values.get("bag") is None else given
+    )
     if values["camera"] is not None:
         from nlos_cam.camera import full_uri
 
@@ -190,13 +226,20 @@ def _fill(values: dict[str, Any], used: Mapping[str, Value]) -> None:
 
 
 def config(json: Json = False) -> None:
-    """Show the settings of nlos-cam.toml and the environment, and the place that each comes from."""
+    """Show the settings of nlos-cam.toml and the environment, and the place that each comes
+    from.
+    """
     settings = read_settings()
     if not json:
         table = Table("setting", "value", "from", "stands for", box=None, pad_edge=False)
         for name, (value, source) in settings.items():
             table.add_row(name, "" if value is None else str(value), source, SETTINGS[name].meaning)
         show(table)
-    result = {name: {"value": value, "source": source} for name, (value, source) in settings.items()}
-    text = f"Set them in {FILE} (here or in {typer.get_app_dir('nlos-cam')}), or as {variable('camera')} and so on"
+    result = {
+        name: {"value": value, "source": source} for name, (value, source) in settings.items()
+    }
+    text = (
+        f"Set them in {FILE} (here or in {typer.get_app_dir('nlos-cam')}), or as"
+        f" {variable('camera')} and so on"
+    )
     finish({"settings": result}, as_json=json, text=text)

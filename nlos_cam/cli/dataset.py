@@ -24,64 +24,118 @@ PROCEDURAL = "procedural"
 Out = Annotated[Path, typer.Option("--out", help="Folder of the dataset; shards in it are kept.")]
 NewOut = Annotated[Path, typer.Option("--out", help="Folder of the dataset.")]
 Count = Annotated[int, typer.Option("--count", min=1, help="Total number of objects.")]
-Seed = Annotated[int, typer.Option("--seed", min=0, help="Seed of the first object; the others follow.")]
+Seed = Annotated[
+    int, typer.Option("--seed", min=0, help="Seed of the first object; the others follow.")
+]
 RigName = Annotated[
     str | None,
-    typer.Option("--rig", show_default=common.PAPER_RIG, help="Name of a packaged rig, or a rig's TOML file."),
+    typer.Option(
+        "--rig", show_default=common.PAPER_RIG, help="Name of a packaged rig, or a rig's TOML file."
+    ),
 ]
 SceneToml = Annotated[
     Path | None,
-    typer.Option("--scene", help="Scene file whose rig, sensor, radiometry and material to use, not its object."),
+    typer.Option(
+        "--scene",
+        help="Scene file whose rig, sensor, radiometry and material to use, not its object.",
+    ),
 ]
 HiddenObjects = Annotated[
-    str, typer.Option("--objects", help=f"`{PROCEDURAL}`, or a folder of meshes (.obj, .stl, .ply) and its subfolders.")
+    str,
+    typer.Option(
+        "--objects",
+        help=f"`{PROCEDURAL}`, or a folder of meshes (.obj, .stl, .ply) and its subfolders.",
+    ),
 ]
-LeftOut = Annotated[str, typer.Option("--without", help="Categories to leave out, separated by commas: hat,boat.")]
+LeftOut = Annotated[
+    str, typer.Option("--without", help="Categories to leave out, separated by commas: hat,boat.")
+]
 Backgrounds = Annotated[
-    float, typer.Option("--backgrounds", min=0, max=1, help="Share of objects with a post or a panel beside them.")
+    float,
+    typer.Option(
+        "--backgrounds", min=0, max=1, help="Share of objects with a post or a panel beside them."
+    ),
 ]
 ShareGeneric = Annotated[
     float,
-    typer.Option("--share-generic", min=0, max=1, help="Share of generic shapes (solids, strokes, blobs, pairs, ...)."),
+    typer.Option(
+        "--share-generic",
+        min=0,
+        max=1,
+        help="Share of generic shapes (solids, strokes, blobs, pairs, ...).",
+    ),
 ]
 Color = Annotated[
-    bool, typer.Option("--colour", help="Painted objects and maps in red, green and blue; simulation only.")
+    bool,
+    typer.Option(
+        "--colour", help="Painted objects and maps in red, green and blue; simulation only."
+    ),
 ]
 SpreadMm = Annotated[
-    float, typer.Option("--rig-spread-mm", min=0, help="Largest shift of lidar and occluder, drawn per object, in mm.")
+    float,
+    typer.Option(
+        "--rig-spread-mm",
+        min=0,
+        help="Largest shift of lidar and occluder, drawn per object, in mm.",
+    ),
 ]
 SpreadDeg = Annotated[
-    float, typer.Option("--rig-spread-deg", min=0, help="Largest turn of the lidar in yaw and pitch, drawn per object.")
+    float,
+    typer.Option(
+        "--rig-spread-deg",
+        min=0,
+        help="Largest turn of the lidar in yaw and pitch, drawn per object.",
+    ),
 ]
 GainSpread = Annotated[
-    float, typer.Option("--gain-spread-percent", min=0, help="Largest change of the intensity gain, drawn per object.")
+    float,
+    typer.Option(
+        "--gain-spread-percent",
+        min=0,
+        help="Largest change of the intensity gain, drawn per object.",
+    ),
 ]
 ObjectsPerRig = Annotated[
     int,
     typer.Option(
-        "--objects-per-rig", min=1, help="Objects that share a draw of the spreads; 50 render 4 times as fast."
+        "--objects-per-rig",
+        min=1,
+        help="Objects that share a draw of the spreads; 50 render 4 times as fast.",
     ),
 ]
 Expected = Annotated[
     bool,
     typer.Option(
-        "--expected-maps", help="Store maps without a draw of noise: `train direct` draws it anew at each step."
+        "--expected-maps",
+        help="Store maps without a draw of noise: `train direct` draws it anew at each step.",
     ),
 ]
 AccuracyName = Annotated[
-    Literal["draft", "standard", "fine", "reference"], typer.Option("--accuracy", help="Accuracy of the renderer.")
+    Literal["draft", "standard", "fine", "reference"],
+    typer.Option("--accuracy", help="Accuracy of the renderer."),
 ]
 Workers = Annotated[
-    int, typer.Option("--workers", min=1, show_default="as many as cores", help="Processes on this machine.")
+    int,
+    typer.Option(
+        "--workers", min=1, show_default="as many as cores", help="Processes on this machine."
+    ),
 ]
 RayAddress = Annotated[
-    str | None, typer.Option("--ray", help="Ray cluster to use instead: auto, HOST:PORT, ray://HOST:PORT, local.")
+    str | None,
+    typer.Option(
+        "--ray", help="Ray cluster to use instead: auto, HOST:PORT, ray://HOST:PORT, local."
+    ),
 ]
-Recordings = Annotated[Path, typer.Argument(metavar="DIR", help="Folder of recordings with labels.")]
+Recordings = Annotated[
+    Path, typer.Argument(metavar="DIR", help="Folder of recordings with labels.")
+]
 Wall = Annotated[
-    Path | None, typer.Option("--wall", help="Wall record of the bench, as for `live`: corrects the maps.")
+    Path | None,
+    typer.Option("--wall", help="Wall record of the bench, as for `live`: corrects the maps."),
 ]
-Frames = Annotated[int, typer.Option("--frames", min=1, help="Frames per recording, evenly spread over it.")]
+Frames = Annotated[
+    int, typer.Option("--frames", min=1, help="Frames per recording, evenly spread over it.")
+]
 
 
 def register(app: typer.Typer) -> None:
@@ -114,10 +168,14 @@ def build(
     ray: RayAddress = None,
     json: common.Json = False,
 ) -> None:
-    """Render random objects into HDF5 shards; give the same command again to resume after an interruption."""
+    """Render random objects into HDF5 shards; give the same command again to resume after an
+    interruption.
+    """
     if scene and rig is not None:
         raise typer.BadParameter(f"{scene} has its own rig: drop --rig")
-    spread = data.RigSpread(place_m=rig_spread_mm / 1e3, angle_deg=rig_spread_deg, gain_share=gain_spread_percent / 100)
+    spread = data.RigSpread(
+        place_m=rig_spread_mm / 1e3, angle_deg=rig_spread_deg, gain_share=gain_spread_percent / 100
+    )
     plan = data.DatasetPlan.of_scene(
         renderer.load_scene(scene)
         if scene
@@ -131,23 +189,36 @@ def build(
         objects_per_rig=objects_per_rig,
     )
     with common.progress(Rate()) as bar:
-        checks, renders = (bar.add_task(name, total=None, visible=False) for name in ("checking shards", "rendering"))
+        checks, renders = (
+            bar.add_task(name, total=None, visible=False)
+            for name in ("checking shards", "rendering")
+        )
         try:
             report = data.build_dataset(
                 plan,
                 count,
                 out,
                 workers=workers,
-                on_progress=lambda done, total: bar.update(renders, completed=done, total=total, visible=True),
-                on_check=lambda done, total: bar.update(checks, completed=done, total=total, visible=done < total),
+                on_progress=lambda done, total: bar.update(
+                    renders, completed=done, total=total, visible=True
+                ),
+                on_check=lambda done, total: bar.update(
+                    checks, completed=done, total=total, visible=done < total
+                ),
                 on_warning=common.say,
                 command=_command(context, "build"),
                 farm=data.ray_farm(ray) if ray else None,
             )
         except KeyboardInterrupt:
-            common.exit_interrupted(f"finished shards are kept in {out}; give the same command to resume")
+            common.exit_interrupted(
+                f"finished shards are kept in {out}; give the same command to resume"
+            )
     rate = report.objects_per_s
-    facts = {"objects": report.objects, "made": report.made, "damaged": [str(path) for path in report.damaged]}
+    facts = {
+        "objects": report.objects,
+        "made": report.made,
+        "damaged": [str(path) for path in report.damaged],
+    }
     result = {**facts, "seconds": report.seconds, "objects_per_s": rate, "out": str(out)}
     new = f" ({report.made} new, {rate:.1f} per second)" if rate else ""
     note = models.SIMULATION_ONLY if colour else ""
@@ -163,10 +234,12 @@ def label(
     overwrite: common.Overwrite = False,
     json: common.Json = False,
 ) -> None:
-    """Make a dataset from labelled recordings of known objects: maps of single frames, with the hidden depth.
+    """Make a dataset from labelled recordings of known objects: maps of single frames, with the
+    hidden depth.
 
-    A label is the name of a benchmark object, or of files beside the recordings: LABEL.truth.toml (the fields of a
-    scene file's object; by default of the mesh LABEL.stl, .obj or .ply), or LABEL.npy (a depth map).
+    A label is the name of a benchmark object, or of files beside the recordings: LABEL.truth.toml
+    (the fields of a scene file's object; by default of the mesh LABEL.stl, .obj or .ply), or
+    LABEL.npy (a depth map).
     """
     folder = common.output_path(out, "dataset", "", overwrite=overwrite)
     with common.tracked("reading recordings") as on_progress:
@@ -174,7 +247,9 @@ def label(
         labelled = data.label_recordings(
             recordings, folder, wall=wall, frames=frames, command=command, on_progress=on_progress
         )
-    samples, labels, files = len(labelled.label), sorted(set(labelled.label)), len(set(labelled.recording))
+    samples = len(labelled.label)
+    labels = sorted(set(labelled.label))
+    files = len(set(labelled.recording))
     rig = {"rig_name": labelled.rig.name, "rig_checksum": labelled.rig.checksum}
     result = {"out": str(folder), "samples": samples, "recordings": files, "labels": labels, **rig}
     text = f"{samples} samples of {len(labels)} objects from {files} recordings in {folder}"
@@ -182,7 +257,9 @@ def label(
 
 
 def _command(context: typer.Context, name: str) -> str:
-    """Return the command line to repeat: arguments, and all options except --json with their values."""
+    """Return the command line to repeat: arguments, and all options except --json with their
+    values.
+    """
     words = ["nlos-cam", "dataset", name]
     for parameter in context.command.params:
         value = context.params.get(str(parameter.name))
@@ -198,9 +275,13 @@ def _objects(objects: str, without: str, backgrounds: float, share_generic: floa
         left_out = [name.strip() for name in without.split(",") if name.strip()]
         return data.Objects.without(left_out, backgrounds, share_generic)
     if without or backgrounds:
-        raise typer.BadParameter("--without and --backgrounds are for procedural objects: drop them")
+        raise typer.BadParameter(
+            "--without and --backgrounds are for procedural objects: drop them"
+        )
     with common.tracked("reading meshes") as on_progress:
-        return replace(data.objects_from_folder(Path(objects), on_progress), share_generic=share_generic)
+        return replace(
+            data.objects_from_folder(Path(objects), on_progress), share_generic=share_generic
+        )
 
 
 class Rate(ProgressColumn):

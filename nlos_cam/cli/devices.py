@@ -1,4 +1,6 @@
-"""`nlos-cam devices` lists the cameras that librealsense and USB see; `nlos-cam doctor` explains why one is missing."""
+"""`nlos-cam devices` lists the cameras that librealsense and USB see; `nlos-cam doctor` explains
+why one is missing.
+"""
 
 from __future__ import annotations
 
@@ -35,19 +37,41 @@ def _result(facts: diagnosis.Facts) -> dict[str, Any]:
         for info in facts.sdk.devices
     ]
     simulated = [
-        {"name": name, "serial": "", "firmware": "", "usb_type": "", "uri": uri, "simulated": True, "usb_seen": None}
+        {
+            "name": name,
+            "serial": "",
+            "firmware": "",
+            "usb_type": "",
+            "uri": uri,
+            "simulated": True,
+            "usb_seen": None,
+        }
         for uri, name in cameras.SIMULATED.items()
     ]
     return {
         "devices": real + simulated,
-        "usb": [_usb(device) | {"sdk_seen": _sdk_seen(facts, device)} for device in facts.usb.devices],
+        "usb": [
+            _usb(device) | {"sdk_seen": _sdk_seen(facts, device)} for device in facts.usb.devices
+        ],
         "sdk_error": facts.sdk.error,
         "usb_error": facts.usb.error,
     }
 
 
 def _usb(device: diagnosis.UsbDevice) -> dict[str, Any]:
-    named = ("id", "kind", "meaning", "serial", "product", "firmware", "usb_type", "link", "port", "bus", "address")
+    named = (
+        "id",
+        "kind",
+        "meaning",
+        "serial",
+        "product",
+        "firmware",
+        "usb_type",
+        "link",
+        "port",
+        "bus",
+        "address",
+    )
     return {name: getattr(device, name) for name in named} | {
         "interfaces": list(device.interfaces),
         "error": device.error,
@@ -59,7 +83,9 @@ def _usb_seen(facts: diagnosis.Facts, pair: diagnosis.Pair) -> bool | None:
 
 
 def _sdk_seen(facts: diagnosis.Facts, device: diagnosis.UsbDevice) -> bool | None:
-    """Return whether the SDK lists a USB device; None if unknown: only cameras of the L515's family are paired."""
+    """Return whether the SDK lists a USB device; None if unknown: only cameras of the L515's family
+    are paired.
+    """
     if facts.sdk.error:
         return None
     return next((pair.sdk is not None for pair in facts.pairs if pair.usb is device), None)
@@ -71,17 +97,37 @@ def _uri(info: cameras.DeviceInfo | None) -> str:
 
 
 def _table(facts: diagnosis.Facts) -> Table:
-    table = Table("--camera", "name", "serial", "firmware", "link", "SDK", "USB", box=None, pad_edge=False)
+    table = Table(
+        "--camera", "name", "serial", "firmware", "link", "SDK", "USB", box=None, pad_edge=False
+    )
     for pair in facts.pairs:
-        visible = VISIBLE[None if facts.sdk.error else pair.sdk is not None], VISIBLE[_usb_seen(facts, pair)]
-        table.add_row(_uri(pair.sdk), *map(escape, (pair.name, pair.serial, pair.firmware, pair.link)), *visible)
+        visible = (
+            VISIBLE[None if facts.sdk.error else pair.sdk is not None],
+            VISIBLE[_usb_seen(facts, pair)],
+        )
+        table.add_row(
+            _uri(pair.sdk),
+            *map(escape, (pair.name, pair.serial, pair.firmware, pair.link)),
+            *visible,
+        )
     for device in facts.usb.of_kind("recovery") + facts.usb.of_kind("other"):
         table.add_row(
-            "", escape(device.meaning), escape(device.serial), device.firmware, device.link, "", VISIBLE[True]
+            "",
+            escape(device.meaning),
+            escape(device.serial),
+            device.firmware,
+            device.link,
+            "",
+            VISIBLE[True],
         )
     for info in facts.sdk.devices:
         if info not in facts.sdk.lidars:
-            table.add_row("", *map(escape, (info.name, info.serial, info.firmware, info.usb_type)), VISIBLE[True], "")
+            table.add_row(
+                "",
+                *map(escape, (info.name, info.serial, info.firmware, info.usb_type)),
+                VISIBLE[True],
+                "",
+            )
     for uri, name in cameras.SIMULATED.items():
         table.add_row(uri, escape(name))
     return table
@@ -95,18 +141,25 @@ def _device_notes(facts: diagnosis.Facts) -> str:
     if facts.usb.error:
         notes.append(f"[yellow]Cannot list USB devices:[/] {escape(facts.usb.error)}")
     if not facts.pairs:
-        notes.append("No L515 found by librealsense or on USB; the simulated cameras work without one")
+        notes.append(
+            "No L515 found by librealsense or on USB; the simulated cameras work without one"
+        )
     if notes or any(pair.usb is None or pair.sdk is None for pair in facts.pairs):
         notes.append("Run `nlos-cam doctor` for the cause and the fix")
     return "\n".join(notes) or "librealsense and USB list the same cameras"
 
 
 COLORS = {"ok": "green", "warning": "yellow", "failed": "bold red", "skipped": "dim"}
-WriteUdev = Annotated[Path | None, typer.Option("--write-udev", help="Write the udev rules for the L515 to this file.")]
+WriteUdev = Annotated[
+    Path | None,
+    typer.Option("--write-udev", help="Write the udev rules for the L515 to this file."),
+]
 
 
 def doctor(write_udev: WriteUdev = None, overwrite: Overwrite = False, json: Json = False) -> None:
-    """Check everything between a camera and this program, and print fixes; the exit code is 0 even if checks fail."""
+    """Check everything between a camera and this program, and print fixes; the exit code is 0 even
+    if checks fail.
+    """
     if write_udev is not None:
         _write(output_path(write_udev, "", ".rules", overwrite=overwrite))
     checks = diagnosis.diagnose(diagnosis.gather_facts())
@@ -131,7 +184,9 @@ def _write(path: Path) -> None:
 def _checks_table(checks: Sequence[diagnosis.Check]) -> Table:
     table = Table("", "check", "finding", box=None, pad_edge=False)
     for check in checks:
-        table.add_row(f"[{COLORS[check.status]}]{check.status}[/]", check.name, escape(check.detail))
+        table.add_row(
+            f"[{COLORS[check.status]}]{check.status}[/]", check.name, escape(check.detail)
+        )
     return table
 
 

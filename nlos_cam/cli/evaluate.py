@@ -10,32 +10,61 @@ import nlos_calibration as walls
 import typer
 
 from nlos_cam import evaluate as measure
-from nlos_cam.cli.common import Json, Overwrite, finish, interrupted_by_signals, output_path, say, tracked
+from nlos_cam.cli.common import (
+    Json,
+    Overwrite,
+    finish,
+    interrupted_by_signals,
+    output_path,
+    say,
+    tracked,
+)
 
 
 def evaluate(
-    out: Annotated[Path | None, typer.Option("--out", help="Folder for the report, figures and pictures.")] = None,
+    out: Annotated[
+        Path | None, typer.Option("--out", help="Folder for the report, figures and pictures.")
+    ] = None,
     data: Annotated[
-        Path | None, typer.Option("--dataset", help="Evaluate on these maps instead of the 54 test objects.")
+        Path | None,
+        typer.Option("--dataset", help="Evaluate on these maps instead of the 54 test objects."),
     ] = None,
     training: Annotated[
-        Path | None, typer.Option("--training", help="Training maps for the nearest neighbour (default: rendered).")
+        Path | None,
+        typer.Option(
+            "--training", help="Training maps for the nearest neighbour (default: rendered)."
+        ),
     ] = None,
     weights: Annotated[
-        Path | None, typer.Option("--weights", help="Folder of weights, paper, or direct (the default).")
+        Path | None,
+        typer.Option("--weights", help="Folder of weights, paper, or direct (the default)."),
     ] = None,
-    rig: Annotated[str | None, typer.Option("--rig", help="Rig by name or file (default: the weights' own).")] = None,
+    rig: Annotated[
+        str | None, typer.Option("--rig", help="Rig by name or file (default: the weights' own).")
+    ] = None,
     wall: Annotated[
-        Path | None, typer.Option("--wall", help="Bare wall for difference maps, wall.toml (default: rendered).")
+        Path | None,
+        typer.Option(
+            "--wall", help="Bare wall for difference maps, wall.toml (default: rendered)."
+        ),
     ] = None,
     count: Annotated[
-        int | None, typer.Option("--count", min=1, help="Number of random objects, instead of the 54 test objects.")
+        int | None,
+        typer.Option(
+            "--count", min=1, help="Number of random objects, instead of the 54 test objects."
+        ),
     ] = None,
     no_nearest: Annotated[
-        bool, typer.Option("--no-nearest", help="Omit the nearest neighbour, which renders 2000 objects once.")
+        bool,
+        typer.Option(
+            "--no-nearest", help="Omit the nearest neighbour, which renders 2000 objects once."
+        ),
     ] = False,
     mirror: Annotated[
-        bool, typer.Option("--mirror", help="Join the answer with the one to the mirrored maps; twice the time.")
+        bool,
+        typer.Option(
+            "--mirror", help="Join the answer with the one to the mirrored maps; twice the time."
+        ),
     ] = False,
     overwrite: Overwrite = False,
     json: Json = False,
@@ -44,8 +73,11 @@ def evaluate(
     if data and (count or rig):
         raise typer.BadParameter("--dataset has its own objects and rig: omit --count and --rig")
     if training and no_nearest:
-        raise typer.BadParameter("--training is searched for the nearest neighbour: omit it or --no-nearest")
-    folder, start_s = output_path(out, "evaluation", "", overwrite=overwrite), time.perf_counter()
+        raise typer.BadParameter(
+            "--training is searched for the nearest neighbour: omit it or --no-nearest"
+        )
+    folder = output_path(out, "evaluation", "", overwrite=overwrite)
+    start_s = time.perf_counter()
     with interrupted_by_signals():
         evaluation = measure.evaluate(
             weights,
@@ -60,7 +92,9 @@ def evaluate(
         )
     for note in evaluation.facts["notes"]:
         say(f"note: {note}")
-    figures: dict[str, Any] = measure.as_figures(evaluation) | {"seconds": time.perf_counter() - start_s}
+    figures: dict[str, Any] = measure.as_figures(evaluation) | {
+        "seconds": time.perf_counter() - start_s
+    }
     measure.write_report(folder, evaluation, figures)
     iou = measure.format_interval(figures["silhouette_iou"])
     text = f"Silhouette IoU {iou} on {figures['objects']} objects: open {folder / measure.REPORT}"

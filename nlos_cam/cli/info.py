@@ -1,4 +1,6 @@
-"""The command `info`: kind, origin, content and damage of a file or folder, and the commands to go on with."""
+"""The command `info`: kind, origin, content and damage of a file or folder, and the commands to go
+on with.
+"""
 
 from __future__ import annotations
 
@@ -16,8 +18,12 @@ UNITS = (1e9, "GB"), (1e6, "MB"), (1e3, "kB")
 
 
 def info(
-    path: Annotated[Path, typer.Argument(metavar="FILE", help="File or folder that nlos-cam wrote or reads.")],
-    verify: Annotated[bool, typer.Option("--verify", help="Read all of it, not its index or heads alone.")] = False,
+    path: Annotated[
+        Path, typer.Argument(metavar="FILE", help="File or folder that nlos-cam wrote or reads.")
+    ],
+    verify: Annotated[
+        bool, typer.Option("--verify", help="Read all of it, not its index or heads alone.")
+    ] = False,
     json: Json = False,
 ) -> None:
     """Describe a file or folder: kind, origin, content, whether it is whole, next commands."""
@@ -36,7 +42,9 @@ def _format(path: Path, found: inspect.Description) -> str:
     width = max(map(len, facts))
     lines = [f"{path}: {found.kind}, {_format_size(found.bytes)}"]
     lines += [f"  {name:{width}}  {value}" for name, value in facts.items() if value]
-    return "\n".join([*lines, *(["Next:"] if found.next else []), *(f"  {line}" for line in found.next)])
+    return "\n".join(
+        [*lines, *(["Next:"] if found.next else []), *(f"  {line}" for line in found.next)]
+    )
 
 
 def _format_size(size: int) -> str:

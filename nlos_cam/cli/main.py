@@ -19,34 +19,56 @@ from nlos_cam.cli.plain_help import plain_help
 from nlos_cam.cli.usage import usage_lines, usage_reason
 from nlos_cam.errors import DiskFullError, NlosCamError, RecordingError
 
-MIN_ADDRESS_BYTES, TORCH_ADDRESS_BYTES = 1 << 30, 3 << 29
-"""Least limit of address space, also of `train`: below it, the libraries of OpenCV or torch may end the process by a
-signal while they are loaded."""
+MIN_ADDRESS_BYTES = 1 << 30
+TORCH_ADDRESS_BYTES = 3 << 29
+"""Least limit of address space, also of `train`: below it, the libraries of OpenCV or torch may end
+the process by a signal while they are loaded."""
 
 
 class Command(NamedTuple):
-    """Row of the help page: the module of this package with the command's function, its group and its summary."""
+    """Row of the help page: the module of this package with the command's function, its group and
+    its summary.
+    """
 
     module: str
     group: str
     summary: str
 
 
-START, BENCH, RECORDINGS, SIMULATION = "Start here", "Bench", "Recordings", "Simulation and training"
+START = "Start here"
+BENCH = "Bench"
+RECORDINGS = "Recordings"
+SIMULATION = "Simulation and training"
 COMMANDS = {
     "demo": Command("live", START, "Show the live view of a simulated bench; no camera is needed."),
-    "live": Command("live", START, "Reconstruct a camera's frames live and show them in a browser."),
+    "live": Command(
+        "live", START, "Reconstruct a camera's frames live and show them in a browser."
+    ),
     "doctor": Command("devices", START, "Explain why a camera is not found, and how to fix it."),
     "devices": Command("devices", START, "List cameras, real and simulated."),
     "config": Command("config", START, "Show the settings of nlos-cam.toml and the environment."),
-    "calibrate": Command("calibrate", BENCH, "Measure a bare wall, a printed board or the occluder."),
+    "calibrate": Command(
+        "calibrate", BENCH, "Measure a bare wall, a printed board or the occluder."
+    ),
     "board": Command("calibrate", BENCH, "Write the calibration board as a PDF to print."),
-    "capture": Command("capture", RECORDINGS, "Record a camera to a .bag file and check the recording."),
-    "replay": Command("live", RECORDINGS, "Reconstruct every frame of a recording, and write results and pictures."),
-    "info": Command("info", RECORDINGS, "Describe a file or folder: kind, origin, content, whether it is whole."),
+    "capture": Command(
+        "capture", RECORDINGS, "Record a camera to a .bag file and check the recording."
+    ),
+    "replay": Command(
+        "live",
+        RECORDINGS,
+        "Reconstruct every frame of a recording, and write results and pictures.",
+    ),
+    "info": Command(
+        "info", RECORDINGS, "Describe a file or folder: kind, origin, content, whether it is whole."
+    ),
     "view": Command("view", RECORDINGS, "Open a saved view in a browser."),
-    "export": Command("recordings", RECORDINGS, "Export a recording as images, timestamps and point clouds."),
-    "repair": Command("recordings", RECORDINGS, "Recover the whole frames of a cut or damaged recording."),
+    "export": Command(
+        "recordings", RECORDINGS, "Export a recording as images, timestamps and point clouds."
+    ),
+    "repair": Command(
+        "recordings", RECORDINGS, "Recover the whole frames of a cut or damaged recording."
+    ),
     "render": Command("render", SIMULATION, "Render the lidar's report of a hidden object."),
     "scenes": Command("lists", SIMULATION, "List the packaged scenes: simulated benches."),
     "objects": Command("lists", SIMULATION, "List the kinds of hidden objects."),
@@ -54,8 +76,12 @@ COMMANDS = {
     "recipes": Command("lists", SIMULATION, "List the packaged training recipes."),
     "dataset": Command("dataset", SIMULATION, "Build training data, or label recordings."),
     "train": Command("train", SIMULATION, "Train networks from a recipe."),
-    "evaluate": Command("evaluate", SIMULATION, "Measure weights on held-out objects, beside trivial baselines."),
-    "tradeoff": Command("tradeoff", SIMULATION, "Measure accuracy against time, of rendering or reconstruction."),
+    "evaluate": Command(
+        "evaluate", SIMULATION, "Measure weights on held-out objects, beside trivial baselines."
+    ),
+    "tradeoff": Command(
+        "tradeoff", SIMULATION, "Measure accuracy against time, of rendering or reconstruction."
+    ),
 }
 """Every command in the order of the help page."""
 
@@ -79,17 +105,21 @@ def _print_version(wanted: bool) -> None:
 def _root(
     *,
     version: Annotated[
-        bool, typer.Option("--version", "-V", help="Print the version.", callback=_print_version, is_eager=True)
+        bool,
+        typer.Option(
+            "--version", "-V", help="Print the version.", callback=_print_version, is_eager=True
+        ),
     ] = False,
 ) -> None:
     """See around a corner with a consumer lidar."""
 
 
 def build_app(command: str | None = None) -> typer.Typer:
-    """Return the command tree: with one command, with all, or (for any other word) with the summaries of all.
+    """Return the command tree: with one command, with all, or (for any other word) with the
+    summaries of all.
 
-    Only the modules of its commands are imported, so that one command does not wait for the imports of others, and the
-    help page waits for none.
+    Only the modules of its commands are imported, so that one command does not wait for the imports
+    of others, and the help page waits for none.
     """
     app = _empty_app()
     if command is None or command in COMMANDS:
@@ -117,7 +147,8 @@ def _share_options(app: typer.Typer, group: str = "") -> None:
     for info in app.registered_commands:
         if command := info.callback:
             name = info.name or command.__name__
-            info.name, info.callback = name, shared_options(f"{group} {name}".strip(), command)
+            info.name = name
+            info.callback = shared_options(f"{group} {name}".strip(), command)
     for group_info in app.registered_groups:
         if group_info.typer_instance:
             _share_options(group_info.typer_instance, str(group_info.name))
@@ -149,7 +180,9 @@ def _run(command: str, arguments: list[str]) -> int:
     with common.interrupted_by_signals():
         if command in COMMANDS:
             _check_address_space(TORCH_ADDRESS_BYTES if command == "train" else MIN_ADDRESS_BYTES)
-        with common.stop_on_signals() as stop:  # an interrupted import can end in any error of any library
+        with (
+            common.stop_on_signals() as stop
+        ):  # an interrupted import can end in any error of any library
             app = build_app(None if COMPLETION in os.environ else command)
             tree = get_command(app)
             plain_help(tree)
@@ -163,10 +196,13 @@ def _run(command: str, arguments: list[str]) -> int:
 
 def _split(arguments: list[str]) -> tuple[str, list[str]]:
     """Return the command, and the arguments with the options for all commands moved behind it."""
-    place = next((i for i, argument in enumerate(arguments) if not argument.startswith("-")), len(arguments))
+    place = next(
+        (i for i, argument in enumerate(arguments) if not argument.startswith("-")), len(arguments)
+    )
     early = [argument for argument in arguments[:place] if argument in EVERYWHERE]
     before = [argument for argument in arguments[:place] if argument not in EVERYWHERE]
-    command, rest = "".join(arguments[place : place + 1]), arguments[place:]
+    command = "".join(arguments[place : place + 1])
+    rest = arguments[place:]
     words = 2 if command in GROUPS else 1
     return command, [*before, *rest[:words], *(early if len(rest) >= words else []), *rest[words:]]
 
@@ -179,18 +215,22 @@ def _check_address_space(needed: int) -> None:
         limit = resource.getrlimit(resource.RLIMIT_AS)[0]
         if limit != resource.RLIM_INFINITY and limit < needed:
             raise NlosCamError(
-                f"out of memory: the limit of address space is {limit >> 20} MiB, but {needed >> 20} MiB are needed: "
-                "raise it (ulimit -v)"
+                f"out of memory: the limit of address space is {limit >> 20} MiB, but"
+                f" {needed >> 20} MiB are needed: raise it (ulimit -v)"
             )
 
 
 def _known_error(error: Exception, command: str) -> NlosCamError | ModelError | None:
-    """Return a lack of memory, a missing extra or an error about a file as one of our errors; None for others."""
+    """Return a lack of memory, a missing extra or an error about a file as one of our errors; None
+    for others.
+    """
     if models.lacks_memory(error):  # also of a library while it is imported or works
         return NlosCamError("out of memory: close other programs, or raise the limit of this one")
     if isinstance(error, ModuleNotFoundError):
         return models.missing_extra(error, f"nlos-cam {command}")
-    if isinstance(error, OSError) and (error.errno in models.DISK_ERRORS or error.filename is not None):
+    if isinstance(error, OSError) and (
+        error.errno in models.DISK_ERRORS or error.filename is not None
+    ):
         return _file_error(error)
     return None
 
@@ -199,10 +239,13 @@ def _file_error(error: OSError) -> NlosCamError:
     """Return the system's error about a file as one of ours."""
     if error.errno not in models.DISK_ERRORS:
         return RecordingError(
-            f"{error.filename}: {error.strerror}: check that the file exists and that you have permission"
+            f"{error.filename}: {error.strerror}: check that the file exists and that you have"
+            " permission"
         )
     name = error.filename or " and ".join(map(str, common.reserved_outputs())) or "standard output"
-    return DiskFullError(f"{name} cannot be written ({error.strerror}): free some space or choose another folder")
+    return DiskFullError(
+        f"{name} cannot be written ({error.strerror}): free some space or choose another folder"
+    )
 
 
 def _report(error: NlosCamError | CalibrationError | ModelError, *, as_json: bool) -> int:

@@ -1,4 +1,6 @@
-"""Help pages with real placeholders (FILE, SECONDS) and ranges in words, for a typer command tree."""
+"""Help pages with real placeholders (FILE, SECONDS) and ranges in words, for a typer command
+tree.
+"""
 
 from collections.abc import Iterable
 from typing import Any
@@ -17,7 +19,8 @@ PLACEHOLDERS = {
 """Placeholder of an option by its parameter; others follow from the suffix or the type."""
 SUFFIXES = {"_ms": "MS", "_m": "METRES", "_mm": "MM", "_deg": "DEGREES", "_ns": "NS"}
 TYPES = {"path": "PATH", "int": "N", "float": "X", "str": "TEXT", "range": "N"}
-HUGE, TINY = 1e6, 0.05
+HUGE = 1e6
+TINY = 0.05
 """Bounds beyond these only guard against nonsense: they are left out of the help."""
 
 
@@ -39,7 +42,8 @@ def plain_help(command: Any) -> None:
 
 
 def _describe(parameter: Any) -> None:
-    low, high = getattr(parameter, "min", None), getattr(parameter, "max", None)
+    low = getattr(parameter, "min", None)
+    high = getattr(parameter, "max", None)
     if text := range_text(low, high):
         parameter.help = f"{(parameter.help or '').removesuffix('.')} ({text})."
     parameter._get_number_range_help_str = lambda: None  # noqa: SLF001  typer has no public way to leave "[x>=0.1]" out
@@ -53,12 +57,20 @@ def placeholder(parameter: Any) -> str | None:
         return None
     name = str(parameter.name)
     suffix = next((unit for end, unit in SUFFIXES.items() if name.endswith(end)), None)
-    kind = parameter.type_descriptor.path_type if parameter.type_descriptor.is_path else parameter.bare_type()
-    return PLACEHOLDERS.get(name) or suffix or TYPES.get(str(kind).split(" ")[-1], str(kind).upper())
+    kind = (
+        parameter.type_descriptor.path_type
+        if parameter.type_descriptor.is_path
+        else parameter.bare_type()
+    )
+    return (
+        PLACEHOLDERS.get(name) or suffix or TYPES.get(str(kind).split(" ")[-1], str(kind).upper())
+    )
 
 
 def range_text(low: float | None, high: float | None) -> str:
-    """Return a range in words, "1 to 65535" or "at least 0.1"; empty where only nonsense is excluded."""
+    """Return a range in words, "1 to 65535" or "at least 0.1"; empty where only nonsense is
+    excluded.
+    """
     shows_low = low is not None and not 0 < low < TINY
     shows_high = high is not None and high < HUGE
     if shows_low and shows_high:

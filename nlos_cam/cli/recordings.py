@@ -1,4 +1,6 @@
-"""`nlos-cam repair` and `nlos-cam export`: recover a damaged recording; write frames or hidden surfaces as files."""
+"""`nlos-cam repair` and `nlos-cam export`: recover a damaged recording; write frames or hidden
+surfaces as files.
+"""
 
 from __future__ import annotations
 
@@ -12,29 +14,44 @@ from nlos_cam import recording as bags
 from nlos_cam.cli import common
 from nlos_cam.errors import RecordingError
 
-DamagedBag = Annotated[Path, typer.Argument(metavar="F.BAG", help="Recording that was killed, cut short or damaged.")]
+DamagedBag = Annotated[
+    Path, typer.Argument(metavar="F.BAG", help="Recording that was killed, cut short or damaged.")
+]
 NewBag = Annotated[Path | None, typer.Option("--out", help="Recording to write (.bag).")]
 AnyBag = Annotated[
     Path,
-    typer.Argument(metavar="FILE", help="Recording of any RealSense camera, or with --object a reconstruction.npz."),
+    typer.Argument(
+        metavar="FILE",
+        help="Recording of any RealSense camera, or with --object a reconstruction.npz.",
+    ),
 ]
 Folder = Annotated[Path | None, typer.Option("--out", help="Folder to write.")]
 As = Annotated[
-    Literal["png", "npz"], typer.Option("--format", help="png: a 16-bit PNG per frame. npz: one file per stream.")
+    Literal["png", "npz"],
+    typer.Option("--format", help="png: a 16-bit PNG per frame. npz: one file per stream."),
 ]
 Ply = Annotated[
     bool,
-    typer.Option("--ply", help="Write a point cloud (PLY, metres, lidar frame) per frame, not for the first only."),
+    typer.Option(
+        "--ply",
+        help="Write a point cloud (PLY, metres, lidar frame) per frame, not for the first only.",
+    ),
 ]
-Streams = Annotated[str, typer.Option("--streams", help="Only these streams, separated by commas (default: all).")]
-Every = Annotated[int, typer.Option("--every", min=1, help="Only every Nth frame, by its number (default: 1).")]
+Streams = Annotated[
+    str, typer.Option("--streams", help="Only these streams, separated by commas (default: all).")
+]
+Every = Annotated[
+    int, typer.Option("--every", min=1, help="Only every Nth frame, by its number (default: 1).")
+]
 AsObject = Annotated[
     str,
     typer.Option(
         "--object",
         metavar="FORMATS",
-        help="Write each frame's hidden surface, wall frame, in metres: some of ply, glb, obj (meshes), csv, npz, "
-        "points (a PLY without faces), separated by commas.",
+        help=(
+            "Write each frame's hidden surface, wall frame, in metres: some of ply, glb, obj"
+            " (meshes), csv, npz, points (a PLY without faces), separated by commas."
+        ),
     ),
 ]
 MAX_REPORTED = 5
@@ -44,12 +61,21 @@ def object_formats(text: str) -> list[str]:
     """Return the formats of --object. Raises typer.BadParameter for an unknown one."""
     names = [name.strip() for name in text.split(",") if name.strip()]
     if unknown := [name for name in names if name not in loop.OBJECT_FORMATS]:
-        raise typer.BadParameter(f"--object {','.join(unknown)}: choose from {', '.join(loop.OBJECT_FORMATS)}")
+        raise typer.BadParameter(
+            f"--object {','.join(unknown)}: choose from {', '.join(loop.OBJECT_FORMATS)}"
+        )
     return names
 
 
-def repair(bag: DamagedBag, out: NewBag = None, overwrite: common.Overwrite = False, json: common.Json = False) -> None:
-    """Write the undamaged part of a recording, with a new index, to a new file; the original is not changed."""
+def repair(
+    bag: DamagedBag,
+    out: NewBag = None,
+    overwrite: common.Overwrite = False,
+    json: common.Json = False,
+) -> None:
+    """Write the undamaged part of a recording, with a new index, to a new file; the original is not
+    changed.
+    """
     if out is not None and out.suffix != ".bag":
         raise typer.BadParameter(f"--out {out}: the name of a recording must end in .bag")
     path = common.output_path(out, "repaired", ".bag", overwrite=overwrite)
@@ -68,7 +94,9 @@ def _format_repair(repaired: bags.RepairResult) -> str:
     frames = ", ".join(f"{count} {stream}" for stream, count in repaired.recovered_frames.items())
     lost = sum(damage.bytes for damage in repaired.damages)
     lines = [f"Recovered {frames} frames ({repaired.chunks} chunks); lost {lost} bytes"]
-    lines += [f"at byte {damage.position}: {damage.why}" for damage in repaired.damages[:MAX_REPORTED]]
+    lines += [
+        f"at byte {damage.position}: {damage.why}" for damage in repaired.damages[:MAX_REPORTED]
+    ]
     if (more := len(repaired.damages) - MAX_REPORTED) > 0:
         lines.append(f"and damage at {more} more places")
     return "\n".join([*lines, f"Wrote {repaired.out}"])
@@ -91,30 +119,48 @@ def export(
         _export_objects(bag, folder, object_formats(as_object), every, as_json=json)
         return
     names = [name.strip() for name in streams.split(",") if name.strip()]
-    options, recording = bags.ExportOptions(form, ply, names, every), bags.BagReader(bag)
-    total = sum(info.frames for name, info in recording.streams.items() if not names or name in names)
+    options = bags.ExportOptions(form, ply, names, every)
+    recording = bags.BagReader(bag)
+    total = sum(
+        info.frames for name, info in recording.streams.items() if not names or name in names
+    )
     with common.stop_on_signals() as stop, common.progress() as bar:
         task = bar.add_task("exporting", total=total)
-        exported = bags.export_recording(recording, folder, options, stop=stop, on_frame=lambda: bar.advance(task))
+        exported = bags.export_recording(
+            recording, folder, options, stop=stop, on_frame=lambda: bar.advance(task)
+        )
     if exported.damage:
         raise RecordingError(f"{exported.damage}; the frames before the damage are in {folder}")
     counts = dict(exported.frames)
     clouds = counts.pop("points", 0)
     text = ", ".join(f"{count} {name}" for name, count in counts.items()) + " images"
     text += f"; {clouds} point cloud{'' if clouds == 1 else 's'}" if clouds else ""
-    common.finish({"frames": exported.frames, "out": exported.out}, as_json=json, text=f"{text}\nWrote {exported.out}")
+    common.finish(
+        {"frames": exported.frames, "out": exported.out},
+        as_json=json,
+        text=f"{text}\nWrote {exported.out}",
+    )
     if stop.is_set():
         common.exit_interrupted(f"{exported.out} holds the frames until then")
 
 
-def _export_objects(result: Path, folder: Path, formats: list[str], every: int, *, as_json: bool) -> None:
+def _export_objects(
+    result: Path, folder: Path, formats: list[str], every: int, *, as_json: bool
+) -> None:
     if not formats:
-        raise typer.BadParameter(f"{result}: give the formats of its hidden surfaces, as in --object ply,glb,csv")
+        raise typer.BadParameter(
+            f"{result}: give the formats of its hidden surfaces, as in --object ply,glb,csv"
+        )
     if result.suffix == ".bag":
-        raise typer.BadParameter(f"--object needs a replay's result: nlos-cam replay {result} --object ply,glb,csv")
+        raise typer.BadParameter(
+            f"--object needs a replay's result: nlos-cam replay {result} --object ply,glb,csv"
+        )
     with common.stop_on_signals() as stop, common.tracked("exporting") as on_frame:
         count = loop.export_objects(result, folder, formats, every, stop=stop, on_frame=on_frame)
-    text = f"Hidden surfaces of {count} frame{'' if count == 1 else 's'} as {', '.join(formats)}\nWrote {folder}"
+    text = (
+        f"Hidden surfaces of {count} frame{'' if count == 1 else 's'} as"
+        f" {', '.join(formats)}\nWrote {folder}"
+    )
     common.finish({"frames": {"objects": count}, "out": str(folder)}, as_json=as_json, text=text)
     if stop.is_set():
         raise typer.Exit(common.INTERRUPTED)

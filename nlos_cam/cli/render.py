@@ -35,36 +35,61 @@ Stop = Annotated[
     typer.Option("--accuracy", help="Stop of the accuracy setting.", show_default="standard"),
 ]
 MaxError = Annotated[
-    float | None, typer.Option("--max-error", help="Use the fastest accuracy with this relative peak error or less.")
+    float | None,
+    typer.Option(
+        "--max-error", help="Use the fastest accuracy with this relative peak error or less."
+    ),
 ]
 MaxSeconds = Annotated[
-    float | None, typer.Option("--max-seconds", help="Use the best accuracy that renders within this many seconds.")
+    float | None,
+    typer.Option(
+        "--max-seconds", help="Use the best accuracy that renders within this many seconds."
+    ),
 ]
-BeamsPerCell = Annotated[int | None, typer.Option("--beams-per-cell", help="Beams along each axis of a map cell.")]
+BeamsPerCell = Annotated[
+    int | None, typer.Option("--beams-per-cell", help="Beams along each axis of a map cell.")
+]
 EffectNames = Annotated[
     str,
     typer.Option(
-        "--effects", help=f"auto (those that matter in the scene), or a list from: {', '.join(renderer.EFFECTS)}."
+        "--effects",
+        help=(
+            f"auto (those that matter in the scene), or a list from: {', '.join(renderer.EFFECTS)}."
+        ),
     ),
 ]
 Backend = Annotated[
-    Literal["cpu", "torch", "cuda"], typer.Option("--backend", help="Processor; torch runs the GPU code on the CPU.")
+    Literal["cpu", "torch", "cuda"],
+    typer.Option("--backend", help="Processor; torch runs the GPU code on the CPU."),
 ]
 RadiometryName = Annotated[
-    Literal["paper", "lambertian"] | None, typer.Option("--radiometry", help="S1 to S5, or the rendering equation.")
+    Literal["paper", "lambertian"] | None,
+    typer.Option("--radiometry", help="S1 to S5, or the rendering equation."),
 ]
 MaterialKind = Annotated[
-    Literal["lambertian", "phong", "retroreflective"] | None, typer.Option("--material", help="Kind of the surface.")
+    Literal["lambertian", "phong", "retroreflective"] | None,
+    typer.Option("--material", help="Kind of the surface."),
 ]
-Specular = Annotated[float | None, typer.Option("--specular", help="Share of the albedo in the specular lobe.")]
-Exponent = Annotated[float | None, typer.Option("--exponent", help="Exponent of the lobe; larger is narrower.")]
-Albedo = Annotated[str | None, typer.Option("--albedo", help="Albedo from 0 to 1: one number, or red,green,blue.")]
+Specular = Annotated[
+    float | None, typer.Option("--specular", help="Share of the albedo in the specular lobe.")
+]
+Exponent = Annotated[
+    float | None, typer.Option("--exponent", help="Exponent of the lobe; larger is narrower.")
+]
+Albedo = Annotated[
+    str | None, typer.Option("--albedo", help="Albedo from 0 to 1: one number, or red,green,blue.")
+]
 PulseNs = Annotated[
-    float | None, typer.Option("--pulse-ns", min=0, max=100, help="Full width of the pulse at half maximum, in ns.")
+    float | None,
+    typer.Option(
+        "--pulse-ns", min=0, max=100, help="Full width of the pulse at half maximum, in ns."
+    ),
 ]
 
 
-def scene_of(bare: renderer.Scene, material: dict[str, Any], options: dict[str, Any]) -> renderer.Scene:
+def scene_of(
+    bare: renderer.Scene, material: dict[str, Any], options: dict[str, Any]
+) -> renderer.Scene:
     """Return a scene with the options that are not None: fields of Material, and of Scene.
 
     Raises typer.BadParameter or SceneError with the field, the value and the range.
@@ -92,7 +117,9 @@ def _numbers(text: str) -> float | tuple[float, ...]:
     try:
         values = tuple(float(part) for part in text.split(","))
     except ValueError as error:
-        raise typer.BadParameter(f"--albedo takes 1 number or 3 with commas between, got {text!r}") from error
+        raise typer.BadParameter(
+            f"--albedo takes 1 number or 3 with commas between, got {text!r}"
+        ) from error
     return values[0] if len(values) == 1 else values
 
 
@@ -105,13 +132,18 @@ def accuracy_of(
     effects: renderer.Effects,
     backend: str,
 ) -> renderer.Accuracy:
-    """Return the setting of a stop, or the one that keeps a bound. Raises typer.BadParameter for both."""
+    """Return the setting of a stop, or the one that keeps a bound. Raises typer.BadParameter for
+    both.
+    """
     if max_error is None and max_seconds is None:
         setting = renderer.accuracy_named(stop or "standard")
-        return setting if beams_per_cell is None else replace(setting, beams_per_cell=beams_per_cell)
+        return (
+            setting if beams_per_cell is None else replace(setting, beams_per_cell=beams_per_cell)
+        )
     if stop is not None or beams_per_cell is not None:
         raise typer.BadParameter(
-            "--max-error and --max-seconds choose the accuracy: drop --accuracy and --beams-per-cell"
+            "--max-error and --max-seconds choose the accuracy: drop --accuracy and"
+            " --beams-per-cell"
         )
     say("Measuring every accuracy on this scene first (up to a minute)")
     return renderer.choose(scene, max_error, max_seconds, effects, backend).accuracy
@@ -119,42 +151,61 @@ def accuracy_of(
 
 def _option(field: str, text: str) -> Any:
     """Return an option named like a field of HiddenObject: None unless set."""
-    return typer.Option(f"--{field.replace('_', '-')}", help=text, show_default=str(DEFAULTS[field]))
+    return typer.Option(
+        f"--{field.replace('_', '-')}", help=text, show_default=str(DEFAULTS[field])
+    )
 
 
 Object = Annotated[
     str,
     typer.Argument(
-        metavar="OBJECT", help="A category's name, a mesh (.obj, .stl, .ply), a .npy depth map (n, n) in metres."
+        metavar="OBJECT",
+        help="A category's name, a mesh (.obj, .stl, .ply), a .npy depth map (n, n) in metres.",
     ),
 ]
 Seed = Annotated[int | None, _option("seed", "Number of the category's variation.")]
 UpAxis = Annotated[
-    Literal["y", "z"] | None, _option("up", "Axis of a mesh that points up; its -z (z up: its +y) faces the wall.")
+    Literal["y", "z"] | None,
+    _option("up", "Axis of a mesh that points up; its -z (z up: its +y) faces the wall."),
 ]
-Size = Annotated[float | None, _option("size_m", "Size in meters: the larger extent along x and y after turning.")]
-TiltX = Annotated[float | None, _option("tilt_x_deg", "Rotation about the wall's x in degrees, applied first.")]
-TiltY = Annotated[float | None, _option("tilt_y_deg", "Then about the wall's y (up): at 180 its back faces the wall.")]
+Size = Annotated[
+    float | None,
+    _option("size_m", "Size in meters: the larger extent along x and y after turning."),
+]
+TiltX = Annotated[
+    float | None, _option("tilt_x_deg", "Rotation about the wall's x in degrees, applied first.")
+]
+TiltY = Annotated[
+    float | None,
+    _option("tilt_y_deg", "Then about the wall's y (up): at 180 its back faces the wall."),
+]
 Turn = Annotated[float | None, _option("turn_deg", "Then about the wall's z.")]
-OffsetX = Annotated[float | None, _option("x_m", "Offset from the box's middle in meters, away from the lidar.")]
+OffsetX = Annotated[
+    float | None, _option("x_m", "Offset from the box's middle in meters, away from the lidar.")
+]
 OffsetY = Annotated[float | None, _option("y_m", "Offset from the box's middle in meters, up.")]
 Front = Annotated[
-    float | None, _option("front_m", "Gap in meters from the box to the object; deep objects are flattened.")
+    float | None,
+    _option("front_m", "Gap in meters from the box to the object; deep objects are flattened."),
 ]
 
 
 def hidden_depth(hidden: str, rig: walls.Rig, options: dict[str, Any]) -> Float32:
-    """Return the depth map (n, n) of OBJECT over the rig's object box; `options` are fields of HiddenObject, or None.
+    """Return the depth map (n, n) of OBJECT over the rig's object box; `options` are fields of
+    HiddenObject, or None.
 
-    Prints on stderr how the box changes it. Raises SceneError for an object that cannot be loaded or placed, and
-    typer.BadParameter for options that do not apply to it or are out of range.
+    Prints on stderr how the box changes it. Raises SceneError for an object that cannot be loaded
+    or placed, and typer.BadParameter for options that do not apply to it or are out of range.
     """
     from pydantic import ValidationError
 
-    given, kind = {name: value for name, value in options.items() if value is not None}, objects.object_kind(hidden)
+    given = {name: value for name, value in options.items() if value is not None}
+    kind = objects.object_kind(hidden)
     unused = {"category": {"up"}, "mesh": {"seed"}, "depth map": set(given)}[kind]
     if extra := [f"--{name.replace('_', '-')}" for name in given if name in unused]:
-        raise typer.BadParameter(f"{hidden} is a {kind}, to which {', '.join(extra)} does not apply: drop it")
+        raise typer.BadParameter(
+            f"{hidden} is a {kind}, to which {', '.join(extra)} does not apply: drop it"
+        )
     if kind == "depth map":
         loaded = objects.load_object(hidden, objects.object_box(rig))
     else:
@@ -174,11 +225,16 @@ def hidden_depth(hidden: str, rig: walls.Rig, options: dict[str, Any]) -> Float3
 
 def render(
     hidden: Object,
-    out: Annotated[Path | None, typer.Option("--out", help="Output (.npz), with a picture (.png) beside it.")] = None,
-    scene: Annotated[
-        Path | None, typer.Option("--scene", help="A scene.toml, of which OBJECT replaces the object.")
+    out: Annotated[
+        Path | None, typer.Option("--out", help="Output (.npz), with a picture (.png) beside it.")
     ] = None,
-    rig: Annotated[str, typer.Option("--rig", help="Name of a packaged rig, or a rig's TOML file.")] = "paper-rig",
+    scene: Annotated[
+        Path | None,
+        typer.Option("--scene", help="A scene.toml, of which OBJECT replaces the object."),
+    ] = None,
+    rig: Annotated[
+        str, typer.Option("--rig", help="Name of a packaged rig, or a rig's TOML file.")
+    ] = "paper-rig",
     accuracy: Stop = None,
     max_error: MaxError = None,
     max_seconds: MaxSeconds = None,
@@ -208,7 +264,9 @@ def render(
 ) -> None:
     """Render the maps that a lidar which reports its strongest echo gets of a hidden object."""
     if out is not None and out.suffix not in {"", ".npz", ".png"}:
-        raise typer.BadParameter(f"--out {out}: choose a name that ends in .npz; the picture has the same name in .png")
+        raise typer.BadParameter(
+            f"--out {out}: choose a name that ends in .npz; the picture has the same name in .png"
+        )
     path = output_path(out and out.with_suffix(".npz"), "render", ".npz", overwrite=overwrite)
     file = renderer.load_scene(scene) if scene else None
     bare = file.bare if file else renderer.Scene(walls.rig_named(rig))
@@ -218,15 +276,21 @@ def render(
     place = {"size_m": size_m, "x_m": x_m, "y_m": y_m, "front_m": front_m}
     depth_m = hidden_depth(hidden, bare.rig, {"seed": seed, "up": up, **angles, **place})
     target = replace(bare, object_depth_m=depth_m)
-    wanted: renderer.Effects = "auto" if effects == "auto" else [name for name in effects.split(",") if name]
+    wanted: renderer.Effects = (
+        "auto" if effects == "auto" else [name for name in effects.split(",") if name]
+    )
     setting = accuracy_of(accuracy, max_error, max_seconds, beams_per_cell, target, wanted, backend)
     start_s = time.perf_counter()
     rendering = renderer.render(target, setting, wanted, backend)
     seconds = time.perf_counter() - start_s
     _save(path, target, depth_m, rendering)
-    title = f"{hidden}{'' if seed is None else f' {seed}'} on {bare.rig.name}, accuracy {setting.name!r}"
+    title = (
+        f"{hidden}{'' if seed is None else f' {seed}'} on {bare.rig.name}, accuracy"
+        f" {setting.name!r}"
+    )
     _draw(path.with_suffix(".png"), title, depth_m, rendering)
-    sensor, measured = file.sensor if file else renderer.SensorModel(), explain and setting.sub_bins > 0
+    sensor = file.sensor if file else renderer.SensorModel()
+    measured = explain and setting.sub_bins > 0
     verdicts = _effects(target, rendering, sensor, backend, measured=measured)
     if explain:
         stderr.print(_table(verdicts))
@@ -235,7 +299,9 @@ def render(
     finish({**facts, "effects": verdicts, "out": str(path)}, as_json=json, text=text)
 
 
-def _save(path: Path, scene: renderer.Scene, depth_m: Float32, rendering: renderer.Rendering) -> None:
+def _save(
+    path: Path, scene: renderer.Scene, depth_m: Float32, rendering: renderer.Rendering
+) -> None:
     import numpy as np
 
     from nlos_cam.files import atomic_file
@@ -256,9 +322,16 @@ def _save(path: Path, scene: renderer.Scene, depth_m: Float32, rendering: render
 
 
 def _effects(
-    scene: renderer.Scene, rendering: renderer.Rendering, sensor: renderer.SensorModel, backend: str, *, measured: bool
+    scene: renderer.Scene,
+    rendering: renderer.Rendering,
+    sensor: renderer.SensorModel,
+    backend: str,
+    *,
+    measured: bool,
 ) -> list[dict[str, Any]]:
-    """Return the verdicts as facts, with the seconds that each effect of the renderer costs if `measured`."""
+    """Return the verdicts as facts, with the seconds that each effect of the renderer costs if
+    `measured`.
+    """
     seconds = renderer.costs(scene, rendering.accuracy, rendering.plan, backend) if measured else {}
     effects = *rendering.plan, *renderer.sensor_effects(sensor)
     return [{**asdict(effect), "seconds": seconds.get(effect.name)} for effect in effects]
@@ -269,7 +342,9 @@ def _table(effects: list[dict[str, Any]]) -> Table:
     for effect in effects:
         cost = "" if effect["seconds"] is None else f"{1000 * effect['seconds']:.1f} ms"
         figures = f"{effect['bound']:.2g}", cost
-        table.add_row(effect["name"], "yes" if effect["included"] else "no", effect["reason"], *figures)
+        table.add_row(
+            effect["name"], "yes" if effect["included"] else "no", effect["reason"], *figures
+        )
     return table
 
 

@@ -1,4 +1,6 @@
-"""The commands `tradeoff render` and `tradeoff reconstruct`: accuracy against time, measured on this machine."""
+"""The commands `tradeoff render` and `tradeoff reconstruct`: accuracy against time, measured on
+this machine.
+"""
 
 from __future__ import annotations
 
@@ -30,18 +32,26 @@ def register(app: typer.Typer) -> None:
 def render(
     out: Out = None,
     category: Annotated[
-        str | None, typer.Option("--object", help="Category, mesh or depth map to hide (default: an airplane).")
+        str | None,
+        typer.Option(
+            "--object", help="Category, mesh or depth map to hide (default: an airplane)."
+        ),
     ] = None,
-    seed: Annotated[int | None, typer.Option("--seed", min=0, help="Variation of the category.")] = None,
+    seed: Annotated[
+        int | None, typer.Option("--seed", min=0, help="Variation of the category.")
+    ] = None,
     overwrite: common.Overwrite = False,
     json: common.Json = False,
 ) -> None:
-    """Measure the renderer's accuracy stops and their ingredients against brute force (about 30 s)."""
+    """Measure the renderer's accuracy stops and their ingredients against brute force (about 30
+    s).
+    """
     if seed is not None and category is None:
         raise typer.BadParameter("--seed is the variation of an --object: give both")
     folder = common.output_path(out, "tradeoff", "", overwrite=overwrite)
     scene = _scene(category, seed or 0)
-    size, planned = measure.render_facts(scene), len(measure.render_settings(scene))
+    size = measure.render_facts(scene)
+    planned = len(measure.render_settings(scene))
     rows: list[measure.RenderRow] = []
     common.say("Rendering the reference first (slowest step, about 30 s)")
     interrupted = _collect(measure.measure_renders(scene), rows, planned)
@@ -55,17 +65,27 @@ def reconstruct(
     out: Out = None,
     weights: Annotated[
         list[Path] | None,
-        typer.Option("--weights", help="Folder of weights, paper, or direct (the default); repeat to compare."),
+        typer.Option(
+            "--weights",
+            help="Folder of weights, paper, or direct (the default); repeat to compare.",
+        ),
     ] = None,
     count: Annotated[
-        int | None, typer.Option("--count", min=1, help="Number of random objects, instead of the 54 test objects.")
+        int | None,
+        typer.Option(
+            "--count", min=1, help="Number of random objects, instead of the 54 test objects."
+        ),
     ] = None,
     overwrite: common.Overwrite = False,
     json: common.Json = False,
 ) -> None:
-    """Measure number formats, runtimes, threads and averaged frames on the test objects (1 to 2 minutes)."""
+    """Measure number formats, runtimes, threads and averaged frames on the test objects (1 to 2
+    minutes).
+    """
     folder = common.output_path(out, "tradeoff", "", overwrite=overwrite)
-    folders: dict[str, Path | None] = {str(path): path for path in weights} if weights else {"shipped": None}
+    folders: dict[str, Path | None] = (
+        {str(path): path for path in weights} if weights else {"shipped": None}
+    )
     rows: list[measure.RuntimeRow] = []
     with common.interrupted_by_signals():
         common.say("Rendering test objects, exporting and quantising networks first")
@@ -103,7 +123,13 @@ def _collect(measured: Iterator[R], rows: list[R], planned: int) -> bool:
 
 
 def _finish(
-    table: dict[str, object], folder: Path, done: int, planned: int, *, as_json: bool, interrupted: bool
+    table: dict[str, object],
+    folder: Path,
+    done: int,
+    planned: int,
+    *,
+    as_json: bool,
+    interrupted: bool,
 ) -> None:
     text = "Nothing measured"
     if done:

@@ -1,4 +1,6 @@
-"""`train vae|compressor|direct|transfer|doubt`: recipes to weights, with the options that these commands share."""
+"""`train vae|compressor|direct|transfer|doubt`: recipes to weights, with the options that these
+commands share.
+"""
 
 from __future__ import annotations
 
@@ -16,7 +18,16 @@ import typer
 
 from nlos_cam import dataset as data_sets
 from nlos_cam import objects as shapes
-from nlos_cam.cli.common import PAPER_RIG, Json, finish, interrupted_by_signals, progress, say, stop_on_signals, tracked
+from nlos_cam.cli.common import (
+    PAPER_RIG,
+    Json,
+    finish,
+    interrupted_by_signals,
+    progress,
+    say,
+    stop_on_signals,
+    tracked,
+)
 from nlos_cam.errors import SceneError
 from nlos_cam.files import cache_folder
 
@@ -26,14 +37,20 @@ if TYPE_CHECKING:
 SAMPLES = "samples"
 """Folder of rendered samples in the output folder of `train doubt`."""
 
-Budget = Annotated[float, typer.Option("--budget", min=1e-4, max=1.0, help="Share of the recipe's budget.")]
-Maps = Annotated[Path, typer.Option("--dataset", help="Training maps, from `dataset build` or `dataset label`.")]
+Budget = Annotated[
+    float, typer.Option("--budget", min=1e-4, max=1.0, help="Share of the recipe's budget.")
+]
+Maps = Annotated[
+    Path, typer.Option("--dataset", help="Training maps, from `dataset build` or `dataset label`.")
+]
 HeldOut = Annotated[Path, typer.Option("--held-out", help="Held-out maps, of other objects.")]
 Wall = Annotated[
-    Path | None, typer.Option("--wall", help="Bare wall for difference maps (wall.toml; default: rendered).")
+    Path | None,
+    typer.Option("--wall", help="Bare wall for difference maps (wall.toml; default: rendered)."),
 ]
 Weights = Annotated[
-    Path | None, typer.Option("--weights", help="Weights that the run starts from (default: the paper's).")
+    Path | None,
+    typer.Option("--weights", help="Weights that the run starts from (default: the paper's)."),
 ]
 
 
@@ -41,32 +58,51 @@ Weights = Annotated[
 class RunOptions:
     """Options that every `train` command has."""
 
-    recipe_file: Annotated[Path, typer.Option("--recipe", help="Training recipe (models/recipes).", show_default=False)]
+    recipe_file: Annotated[
+        Path, typer.Option("--recipe", help="Training recipe (models/recipes).", show_default=False)
+    ]
     out: Annotated[
-        Path, typer.Option("--out", help="Output folder: log, checkpoints, weights. An interrupted run resumes there.")
+        Path,
+        typer.Option(
+            "--out",
+            help="Output folder: log, checkpoints, weights. An interrupted run resumes there.",
+        ),
     ]
     objects: Annotated[
-        int | None, typer.Option("--objects", min=2, help="Number of training objects (default: the recipe's).")
+        int | None,
+        typer.Option(
+            "--objects", min=2, help="Number of training objects (default: the recipe's)."
+        ),
     ] = None
     devices: Annotated[
-        int, typer.Option("--devices", min=1, help="Number of processes, one per GPU or on the CPU.")
+        int,
+        typer.Option("--devices", min=1, help="Number of processes, one per GPU or on the CPU."),
     ] = 1
     accelerator: Annotated[
         Literal["auto", "cpu", "cuda"],
         typer.Option("--accelerator", help="Device; auto: a GPU if there is one, else the CPU."),
     ] = "auto"
-    tensorboard: Annotated[bool, typer.Option("--tensorboard", help="Also log for TensorBoard.")] = False
+    tensorboard: Annotated[
+        bool, typer.Option("--tensorboard", help="Also log for TensorBoard.")
+    ] = False
     compiled: Annotated[
-        bool, typer.Option("--compile", help="Run the networks through torch.compile; faster, needs a C++ compiler.")
+        bool,
+        typer.Option(
+            "--compile",
+            help="Run the networks through torch.compile; faster, needs a C++ compiler.",
+        ),
     ] = False
     json: Json = False
 
     def recipe(self, task: str, budget: float = 1.0) -> models.Recipe:
-        """Return the recipe at a share of its budget. Raises SceneError where it is for another task."""
+        """Return the recipe at a share of its budget. Raises SceneError where it is for another
+        task.
+        """
         recipe = models.load_recipe(self.recipe_file)
         if recipe.task != task:
             raise SceneError(
-                f"{self.recipe_file} is a recipe for {recipe.task!r}, not {task!r}: choose another --recipe"
+                f"{self.recipe_file} is a recipe for {recipe.task!r}, not {task!r}: choose another"
+                " --recipe"
             )
         if self.objects is not None:
             recipe = recipe.of_objects(self.objects)
@@ -76,30 +112,58 @@ class RunOptions:
         """Open the devices that the recipe is run on."""
         return models.open_fabric(recipe, accelerator=self.accelerator, devices=self.devices)
 
-    def training(self, recipe: models.Recipe, record: models.CheckpointRecord, origin: str) -> models.TrainingRun:
-        """Return a run with progress and interruption; `record` is that of its weights, `origin` a `digest_of`."""
-        return models.TrainingRun(recipe, self.out, record, origin, self.tensorboard, self.compiled, watched_run)
+    def training(
+        self, recipe: models.Recipe, record: models.CheckpointRecord, origin: str
+    ) -> models.TrainingRun:
+        """Return a run with progress and interruption; `record` is that of its weights, `origin` a
+        `digest_of`.
+        """
+        return models.TrainingRun(
+            recipe, self.out, record, origin, self.tensorboard, self.compiled, watched_run
+        )
 
-    def finish(self, recipe: models.Recipe, figures: models.Scores, before: models.Scores | None = None) -> None:
-        """End a command with the figures of its weights, and of those that a transfer started from."""
-        result, text = {"out": str(self.out), **figures}, f"weights in {self.out}: {_values(figures)}"
+    def finish(
+        self, recipe: models.Recipe, figures: models.Scores, before: models.Scores | None = None
+    ) -> None:
+        """End a command with the figures of its weights, and of those that a transfer started
+        from.
+        """
+        result = {"out": str(self.out), **figures}
+        text = f"weights in {self.out}: {_values(figures)}"
         if before is not None:
-            result, text = {**result, "before": before}, f"{text}; before: {_values(before)}"
-        finish(result, as_json=self.json, text=text, note=models.SIMULATION_ONLY if recipe.colour else "")
+            result = {**result, "before": before}
+            text = f"{text}; before: {_values(before)}"
+        finish(
+            result,
+            as_json=self.json,
+            text=text,
+            note=models.SIMULATION_ONLY if recipe.colour else "",
+        )
 
 
 @contextmanager
-def watched_run(running: models.Running, recipe: models.Recipe, name: str) -> Generator[models.Running]:
-    """Show a run's progress, in the leading process; Ctrl-C or SIGTERM ends it after the current step, saved."""
+def watched_run(
+    running: models.Running, recipe: models.Recipe, name: str
+) -> Generator[models.Running]:
+    """Show a run's progress, in the leading process; Ctrl-C or SIGTERM ends it after the current
+    step, saved.
+    """
     with progress() as bar, stop_on_signals("interrupting: saving after this step") as stop:
-        title = f"training the {name}" + (f" in color ({models.SIMULATION_ONLY})" if recipe.colour else "")
-        task = bar.add_task(title, total=None, visible=running.fabric is None or running.fabric.is_global_zero)
+        title = f"training the {name}" + (
+            f" in color ({models.SIMULATION_ONLY})" if recipe.colour else ""
+        )
+        task = bar.add_task(
+            title, total=None, visible=running.fabric is None or running.fabric.is_global_zero
+        )
 
         def on_step(done: int, total: int) -> None:
             bar.update(task, completed=done, total=total)
 
         def on_epoch(row: models.Scores) -> None:
-            text = f"epoch {row['epoch'] + 1:.0f} done, loss {row['loss']:.4g}, held out {row['held_out_loss']:.4g}"
+            text = (
+                f"epoch {row['epoch'] + 1:.0f} done, loss {row['loss']:.4g}, held out"
+                f" {row['held_out_loss']:.4g}"
+            )
             bar.update(task, description=f"{title}: {text}")
 
         yield replace(running, stop=stop.is_set, on_message=say, on_step=on_step, on_epoch=on_epoch)
@@ -112,9 +176,15 @@ def refuse_ignored(why: str, given: dict[str, bool]) -> None:
 
 
 def with_run_options(command: Callable[..., None]) -> Callable[..., None]:
-    """Replace a command's parameter `run` by the fields of RunOptions, so that typer sees each as an option."""
+    """Replace a command's parameter `run` by the fields of RunOptions, so that typer sees each as
+    an option.
+    """
     shared = inspect.signature(RunOptions, eval_str=True).parameters
-    own = [each for name, each in inspect.signature(command, eval_str=True).parameters.items() if name != "run"]
+    own = [
+        each
+        for name, each in inspect.signature(command, eval_str=True).parameters.items()
+        if name != "run"
+    ]
 
     @wraps(command)
     def expanded(**values: Any) -> None:
@@ -122,7 +192,9 @@ def with_run_options(command: Callable[..., None]) -> Callable[..., None]:
         try:
             command(run=run, **values)
         except KeyboardInterrupt as interruption:
-            raise KeyboardInterrupt(f"once training has begun, the same command resumes in {run.out}") from interruption
+            raise KeyboardInterrupt(
+                f"once training has begun, the same command resumes in {run.out}"
+            ) from interruption
 
     every = [each.replace(kind=inspect.Parameter.KEYWORD_ONLY) for each in (*shared.values(), *own)]
     expanded.__annotations__ = {each.name: each.annotation for each in every}
@@ -143,23 +215,37 @@ def vae(
     run: RunOptions,
     weights: Weights = None,
     rig_name: Annotated[
-        str, typer.Option("--rig", help="Rig whose object box the objects stand in: a packaged rig, or a TOML file.")
+        str,
+        typer.Option(
+            "--rig",
+            help="Rig whose object box the objects stand in: a packaged rig, or a TOML file.",
+        ),
     ] = PAPER_RIG,
     budget: Budget = 1.0,
 ) -> None:
     """Train a Res-VAE on procedural objects (SI 3)."""
-    recipe, rig = run.recipe("vae", budget), walls.rig_named(rig_name)
-    refuse_ignored('the recipe has start = "scratch"', {"--weights": bool(weights) and recipe.start == "scratch"})
+    recipe = run.recipe("vae", budget)
+    rig = walls.rig_named(rig_name)
+    refuse_ignored(
+        'the recipe has start = "scratch"',
+        {"--weights": bool(weights) and recipe.start == "scratch"},
+    )
     fabric = run.fabric(recipe)
     start, runs = models.vae_start(recipe, weights) if recipe.start != "scratch" else (None, [])
     record = models.record_run(recipe, run.out, (rig.name, rig.checksum), runs, weights)
     job = run.training(recipe, record, models.digest_of(start, rig.checksum))
     say(f"generating {recipe.objects + recipe.held_out} objects")
-    box, kinds = data_sets.DatasetPlan(rig, 0).box, data_sets.Objects.without(recipe.left_out).categories
+    box = data_sets.DatasetPlan(rig, 0).box
+    kinds = data_sets.Objects.without(recipe.left_out).categories
     textures = tuple(shapes.TEXTURES) if recipe.colour else ()
     images, held_out = (
-        data_sets.procedural_images(seed, count, box, kinds, backgrounds=recipe.backgrounds, textures=textures)
-        for seed, count in ((data_sets.TRAINING_SEED, recipe.objects), (data_sets.HELD_OUT_SEED, recipe.held_out))
+        data_sets.procedural_images(
+            seed, count, box, kinds, backgrounds=recipe.backgrounds, textures=textures
+        )
+        for seed, count in (
+            (data_sets.TRAINING_SEED, recipe.objects),
+            (data_sets.HELD_OUT_SEED, recipe.held_out),
+        )
     )
     run.finish(recipe, models.launch(fabric, models.run_vae, job, start, images, held_out))
 
@@ -168,47 +254,72 @@ def compressor(
     run: RunOptions,
     data: Maps,
     held_out_data: HeldOut,
-    vae_folder: Annotated[Path | None, typer.Option("--vae", help="Trained VAE (default: the paper's).")] = None,
+    vae_folder: Annotated[
+        Path | None, typer.Option("--vae", help="Trained VAE (default: the paper's).")
+    ] = None,
     weights: Weights = None,
     wall: Wall = None,
     stream: Annotated[
-        bool, typer.Option("--stream", help="Read maps from disk as needed, for datasets larger than memory.")
+        bool,
+        typer.Option(
+            "--stream", help="Read maps from disk as needed, for datasets larger than memory."
+        ),
     ] = False,
     budget: Budget = 1.0,
 ) -> None:
-    """Train a compressor onto the latent of a trained VAE (SI 4), or as the recipe's `steps` say."""
+    """Train a compressor onto the latent of a trained VAE (SI 4), or as the recipe's `steps`
+    say.
+    """
     recipe = run.recipe("compressor", budget)
     scratch = recipe.start != "weights" and recipe.steps != "two-then-joint"
     refuse_ignored("the recipe starts from scratch", {"--weights": bool(weights) and scratch})
-    refuse_ignored(f"the recipe has steps = {recipe.steps!r}", {"--vae": bool(vae_folder) and recipe.steps != "two"})
+    refuse_ignored(
+        f"the recipe has steps = {recipe.steps!r}",
+        {"--vae": bool(vae_folder) and recipe.steps != "two"},
+    )
     fabric = run.fabric(recipe)
     start, runs = models.compressor_start(recipe, vae_folder, weights)
     maps = data_sets.read_maps(recipe, data, held_out_data, wall, stream=stream)
     recipe = maps.limit_recipe(recipe)
     record = models.record_run(recipe, run.out, maps.rig, runs, weights, vae_folder)
     job = run.training(recipe, record, models.digest_of(start.vae, start.pipeline, maps.digest))
-    run.finish(recipe, models.launch(fabric, models.run_compressor, job, start, maps.training, maps.held_out))
+    run.finish(
+        recipe,
+        models.launch(fabric, models.run_compressor, job, start, maps.training, maps.held_out),
+    )
 
 
 def direct(
     run: RunOptions,
     data: Annotated[
         list[Path],
-        typer.Option("--dataset", help="Training maps; may be repeated. New shards are used as they appear."),
+        typer.Option(
+            "--dataset", help="Training maps; may be repeated. New shards are used as they appear."
+        ),
     ],
     held_out_data: HeldOut,
     weights: Annotated[
-        Path | None, typer.Option("--weights", help='Direct weights that a recipe with start = "weights" goes on from.')
+        Path | None,
+        typer.Option(
+            "--weights", help='Direct weights that a recipe with start = "weights" goes on from.'
+        ),
     ] = None,
     store: Annotated[
-        Path | None, typer.Option("--store", help="Folder of the packed maps, kept for other runs (default: in --out).")
+        Path | None,
+        typer.Option(
+            "--store", help="Folder of the packed maps, kept for other runs (default: in --out)."
+        ),
     ] = None,
 ) -> None:
     """Train a direct network: maps to images by two heads, without a latent; the project's own."""
     recipe = run.recipe("direct")
-    refuse_ignored("the recipe starts from scratch", {"--weights": bool(weights) and recipe.start == "scratch"})
+    refuse_ignored(
+        "the recipe starts from scratch", {"--weights": bool(weights) and recipe.start == "scratch"}
+    )
     if run.devices > 1:
-        raise SceneError(f"a direct network trains in one process, got --devices {run.devices}: drop it")
+        raise SceneError(
+            f"a direct network trains in one process, got --devices {run.devices}: drop it"
+        )
     fabric = run.fabric(recipe)
     start, runs = models.direct_start(recipe, weights)
     with ExitStack() as held:
@@ -222,7 +333,9 @@ def direct(
         recipe = recipe.model_copy(update={"held_out": len(held_out.image)})
         rig = source.plan.rig
         record = models.record_run(recipe, run.out, (rig.name, rig.checksum), runs, weights)
-        job = run.training(recipe, record, models.digest_of(start, source.digest) if start else source.digest)
+        job = run.training(
+            recipe, record, models.digest_of(start, source.digest) if start else source.digest
+        )
         run.finish(recipe, models.run_direct(fabric, job, start, source, held_out))
 
 
@@ -232,17 +345,28 @@ def transfer(
     held_out_data: HeldOut,
     weights: Annotated[
         Path | None,
-        typer.Option("--weights", help="Weights to fit (default: paper for a recipe with a latent, else direct)."),
+        typer.Option(
+            "--weights",
+            help="Weights to fit (default: paper for a recipe with a latent, else direct).",
+        ),
     ] = None,
     vae_folder: Annotated[
-        Path | None, typer.Option("--vae", help="VAE whose encoder gives the target latents (default: the weights').")
+        Path | None,
+        typer.Option(
+            "--vae", help="VAE whose encoder gives the target latents (default: the weights')."
+        ),
     ] = None,
     partial: Annotated[
-        bool, typer.Option("--partial", help="Load matching layers only, and report which ones were loaded.")
+        bool,
+        typer.Option(
+            "--partial", help="Load matching layers only, and report which ones were loaded."
+        ),
     ] = False,
     wall: Wall = None,
 ) -> None:
-    """Fine-tune synthetic weights on a bench's recordings (SI 4): all layers first, then the classifier alone."""
+    """Fine-tune synthetic weights on a bench's recordings (SI 4): all layers first, then the
+    classifier alone.
+    """
     recipe = run.recipe("transfer")
     fabric = run.fabric(recipe)
     pipeline, start = models.transfer_start(recipe, weights, partial=partial, on_report=say)
@@ -251,7 +375,9 @@ def transfer(
     recipe = maps.limit_recipe(recipe)
     record = models.record_run(recipe, run.out, maps.rig, start.runs, weights)
     job = run.training(recipe, record, models.digest_of(pipeline, encoder, maps.digest))
-    figures = models.launch(fabric, models.run_transfer, job, pipeline, encoder, maps.training, maps.held_out)
+    figures = models.launch(
+        fabric, models.run_transfer, job, pipeline, encoder, maps.training, maps.held_out
+    )
     run.finish(recipe, figures["after"], figures["before"])
 
 
@@ -260,11 +386,15 @@ def doubt(
     data: Maps,
     held_out_data: HeldOut,
     weights: Annotated[
-        Path | None, typer.Option("--weights", help="Weights whose images are judged (default: direct).")
+        Path | None,
+        typer.Option("--weights", help="Weights whose images are judged (default: direct)."),
     ] = None,
 ) -> None:
-    """Train the uncertainty ("doubt") network of trained weights; --out then holds a copy of these weights too."""
-    recipe, watched = run.recipe("doubt"), models.weights_folder(weights)
+    """Train the uncertainty ("doubt") network of trained weights; --out then holds a copy of these
+    weights too.
+    """
+    recipe = run.recipe("doubt")
+    watched = models.weights_folder(weights)
     fabric = run.fabric(recipe)
     pipeline = models.load_reconstructor(weights, cache_folder() / "onnx")
     datasets = data_sets.open_dataset(data), data_sets.open_dataset(held_out_data)
@@ -278,19 +408,32 @@ def doubt(
 
 
 def quality(
-    weights: Annotated[Path, typer.Option("--weights", help="Weights with an uncertainty network; gets quality.json.")],
+    weights: Annotated[
+        Path,
+        typer.Option("--weights", help="Weights with an uncertainty network; gets quality.json."),
+    ],
     data: Annotated[
-        Path, typer.Option("--dataset", help="Maps that the weights were not trained on, with generic shapes.")
+        Path,
+        typer.Option(
+            "--dataset", help="Maps that the weights were not trained on, with generic shapes."
+        ),
     ],
     objects: Annotated[int, typer.Option("--objects", min=100, help="Number of objects.")] = 6000,
     json: Json = False,
 ) -> None:
-    """Fit the model that predicts the outline's overlap and the depth error; judged on kinds left out of the fit."""
-    weights, graphs = models.weights_folder(weights), cache_folder() / "onnx"
+    """Fit the model that predicts the outline's overlap and the depth error; judged on kinds left
+    out of the fit.
+    """
+    weights = models.weights_folder(weights)
+    graphs = cache_folder() / "onnx"
     if weights.resolve().parent == models.shipped_folder().resolve().parent:
-        raise SceneError(f"{weights} came with the program, and is not changed: give a copy of the folder")
+        raise SceneError(
+            f"{weights} came with the program, and is not changed: give a copy of the folder"
+        )
     pipeline = models.load_reconstructor(weights, graphs)
-    doubter = models.load_uncertainty_model(weights, graphs, quality=False)  # an old or damaged one is replaced
+    doubter = models.load_uncertainty_model(
+        weights, graphs, quality=False
+    )  # an old or damaged one is replaced
     if doubter is None:
         raise SceneError(f"{weights} has no uncertainty network: train one with `train doubt`")
     with interrupted_by_signals(), tracked("reconstructing") as on_progress:
@@ -302,7 +445,11 @@ def quality(
     values = {name: value for name, value in record.figures.items() if name.startswith("all_")}
     text = f"quality model beside {weights}; on kinds left out: {_values(values)}"
     trusted = {"trusted_above": record.trusted_above}
-    finish({"weights": str(weights), "objects": record.objects, **trusted, **record.figures}, as_json=json, text=text)
+    finish(
+        {"weights": str(weights), "objects": record.objects, **trusted, **record.figures},
+        as_json=json,
+        text=text,
+    )
 
 
 def _values(figures: models.Scores) -> str:

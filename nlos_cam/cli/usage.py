@@ -1,4 +1,6 @@
-"""Wording of usage errors: the reason in our own words, and the help page to try; typer's speak of its internals."""
+"""Wording of usage errors: the reason in our own words, and the help page to try; typer's speak of
+its internals.
+"""
 
 from typing import Any
 
@@ -30,12 +32,17 @@ def _message_reason(error: typer.TyperException) -> str:
         return f"unexpected argument {extra.rstrip(').')!r}"
     names = list(getattr(getattr(context, "command", None), "commands", {}))
     if message.startswith(("No such command", "Missing command")) and context and context.parent:
-        return f"{message if message.endswith('?') else message.rstrip('.') + '.'} Choose from {', '.join(names)}"
+        return (
+            f"{message if message.endswith('?') else message.rstrip('.') + '.'} Choose from"
+            f" {', '.join(names)}"
+        )
     return message
 
 
 def usage_lines(error: typer.TyperException) -> tuple[str, str]:
-    """Return the usage line of the command in error, and the line that names its help; empty without a command."""
+    """Return the usage line of the command in error, and the line that names its help; empty
+    without a command.
+    """
     context: Any = getattr(error, "ctx", None)
     if context is None:
         return "", ""
@@ -54,15 +61,29 @@ def _name(parameter: Any) -> str:
 
 def _value_reason(parameter: Any, value: Any) -> str:
     """Return what a parameter takes, and the value that it got instead."""
-    kind, name = parameter.type_descriptor, _name(parameter)
+    kind = parameter.type_descriptor
+    name = _name(parameter)
     if kind.choices is not None:
         names = [str(choice) for choice in kind.choices]
-        return f"{name} must be {_listed(names)} (got {value!r}).{did_you_mean(str(value), names)}".rstrip(".")
-    low, high = getattr(parameter, "min", None), getattr(parameter, "max", None)
-    bounds = [f"{word} {bound:g}" for word, bound in (("from", low), ("to", high)) if bound is not None]
+        return f"{name} must be {_listed(names)} (got {value!r}).{did_you_mean(str(value), names)}".rstrip(
+            "."
+        )
+    low = getattr(parameter, "min", None)
+    high = getattr(parameter, "max", None)
+    bounds = [
+        f"{word} {bound:g}" for word, bound in (("from", low), ("to", high)) if bound is not None
+    ]
     if high is None and low is not None:
         bounds = [f"of at least {low:g}"]
-    return " ".join([name, "must be", NUMBERS.get(kind.annotation, "a valid value"), *bounds, f"(got {value!r})"])
+    return " ".join(
+        [
+            name,
+            "must be",
+            NUMBERS.get(kind.annotation, "a valid value"),
+            *bounds,
+            f"(got {value!r})",
+        ]
+    )
 
 
 def _lower(text: str) -> str:

@@ -18,7 +18,14 @@ from nlos_cam import camera as cameras
 from nlos_cam import live as loop
 from nlos_cam import reconstruct
 from nlos_cam import view as views
-from nlos_cam.cli.common import Json, exit_interrupted, finish, interrupted_by_signals, say, stop_on_signals
+from nlos_cam.cli.common import (
+    Json,
+    exit_interrupted,
+    finish,
+    interrupted_by_signals,
+    say,
+    stop_on_signals,
+)
 
 NoView = Annotated[bool, typer.Option("--no-view", help="Serve no live view.")]
 ViewPort = Annotated[
@@ -31,7 +38,10 @@ ViewPort = Annotated[
     ),
 ]
 ViewHost = Annotated[
-    str | None, typer.Option("--view-host", help="Address to serve the view on for other machines (0.0.0.0: all).")
+    str | None,
+    typer.Option(
+        "--view-host", help="Address to serve the view on for other machines (0.0.0.0: all)."
+    ),
 ]
 Open = Annotated[bool, typer.Option("--open", help="Open the view in the default browser.")]
 DESKTOPS = "DISPLAY", "WAYLAND_DISPLAY", "BROWSER"
@@ -40,13 +50,19 @@ DESKTOPS = "DISPLAY", "WAYLAND_DISPLAY", "BROWSER"
 def viewer_of(
     control: loop.RunControl, *, no_view: bool, host: str | None = None, port: int | None = None
 ) -> views.NullViewer | views.WebViewer:
-    """Return the viewer of a live run. Raises typer.BadParameter for a host or port together with --no-view."""
+    """Return the viewer of a live run. Raises typer.BadParameter for a host or port together with
+    --no-view.
+    """
     if no_view:
         if host is not None or port is not None:
             raise typer.BadParameter("--view-host and --view-port need a view: drop --no-view")
         return views.NullViewer()
-    control.thread_start = loop.yield_to_loop  # an ordinary thread could be stopped while it holds Python's lock
-    return views.WebViewer(host=host or views.LOOPBACK, port=port, controls=control, on_thread=loop.yield_to_loop)
+    control.thread_start = (
+        loop.yield_to_loop
+    )  # an ordinary thread could be stopped while it holds Python's lock
+    return views.WebViewer(
+        host=host or views.LOOPBACK, port=port, controls=control, on_thread=loop.yield_to_loop
+    )
 
 
 def each_of(*functions: Callable[[int, int], None]) -> Callable[[int, int], None]:
@@ -83,7 +99,9 @@ def announce_view(
 
 
 def opened_in_browser(address: str) -> bool:
-    """Open an address in the default browser; return False without a desktop, where a text browser would open."""
+    """Open an address in the default browser; return False without a desktop, where a text browser
+    would open.
+    """
     if sys.platform.startswith("linux") and not any(os.environ.get(name) for name in DESKTOPS):
         return False
     try:
@@ -93,17 +111,28 @@ def opened_in_browser(address: str) -> bool:
 
 
 SaveView = Annotated[
-    Path | None, typer.Option("--save-view", help="Save the view to this .html file, which any browser plays.")
+    Path | None,
+    typer.Option("--save-view", help="Save the view to this .html file, which any browser plays."),
 ]
 SaveReplayView = Annotated[
-    bool, typer.Option("--save-view", help="Save the view to DIR/view.html, which any browser plays.")
+    bool,
+    typer.Option("--save-view", help="Save the view to DIR/view.html, which any browser plays."),
 ]
-Stills = Annotated[int, typer.Option("--stills", min=0, max=100, help="Number of still pictures to write (PNG).")]
+Stills = Annotated[
+    int, typer.Option("--stills", min=0, max=100, help="Number of still pictures to write (PNG).")
+]
 Video = Annotated[bool, typer.Option("--video", help="Write a video, DIR/replay.webm.")]
-ViewFile = Annotated[Path, typer.Argument(metavar="FILE", help="Recording (.bag), or saved session (.html).")]
-Wall = Annotated[Path | None, typer.Option("--wall", help="Wall record of the recording's bench (wall.toml).")]
+ViewFile = Annotated[
+    Path, typer.Argument(metavar="FILE", help="Recording (.bag), or saved session (.html).")
+]
+Wall = Annotated[
+    Path | None, typer.Option("--wall", help="Wall record of the recording's bench (wall.toml).")
+]
 Seconds = Annotated[
-    float | None, typer.Option("--seconds", min=0.1, help="Stop after this many seconds (default: run until Ctrl-C).")
+    float | None,
+    typer.Option(
+        "--seconds", min=0.1, help="Stop after this many seconds (default: run until Ctrl-C)."
+    ),
 ]
 
 
@@ -116,15 +145,21 @@ def view(
     open_view: Open = False,
     json: Json = False,
 ) -> None:
-    """Play a recording or a saved session in a browser: play, pause, scrub, change the speed, export."""
+    """Play a recording or a saved session in a browser: play, pause, scrub, change the speed,
+    export.
+    """
     host = view_host or views.LOOPBACK
     announce = partial(announce_view, host=view_host, port=view_port, open_it=open_view)
     if file.suffix != ".bag" and wall is not None:
-        raise typer.BadParameter("--wall is for a recording (.bag): a saved session holds its pictures")
+        raise typer.BadParameter(
+            "--wall is for a recording (.bag): a saved session holds its pictures"
+        )
     if file.suffix == ".bag":
         with interrupted_by_signals():
             opened = cameras.open_camera(f"bag:{file}")
-            playback = loop.Playback(opened, reconstruct.open_bench(wall, opened), host=host, port=view_port)
+            playback = loop.Playback(
+                opened, reconstruct.open_bench(wall, opened), host=host, port=view_port
+            )
         with stop_on_signals() as stop, playback:
             announce(playback, what="recording")
             playback.reconstruct(stop)
@@ -142,7 +177,9 @@ def view(
 
 
 @contextmanager
-def saving(viewer: views.Viewer, bench: reconstruct.CalibratedRig, path: Path | None) -> Generator[views.Viewer]:
+def saving(
+    viewer: views.Viewer, bench: reconstruct.CalibratedRig, path: Path | None
+) -> Generator[views.Viewer]:
     """Yield an entered viewer, joined by one that saves the session to `path` if given."""
     if path is None:
         yield viewer
