@@ -49,8 +49,23 @@ __all__ = [
 ]
 
 from .build import HELD_OUT_SEED, TEST_SEED, TRAINING_SEED, BuildReport, build_dataset
-from .doubt_samples import EMPTY, GENERIC, ORDINARY, check_doubt_data, doubt_sets, quality_set, samples_on_disk
-from .labelled import FRAMES_PER_RECORDING, Labelled, label_recordings, list_recordings, read_labelled, write_shards
+from .doubt_samples import (
+    EMPTY,
+    GENERIC,
+    ORDINARY,
+    check_doubt_data,
+    doubt_sets,
+    quality_set,
+    samples_on_disk,
+)
+from .labelled import (
+    FRAMES_PER_RECORDING,
+    Labelled,
+    label_recordings,
+    list_recordings,
+    read_labelled,
+    write_shards,
+)
 from .outliers import (
     HELD_OUT_OUTLIERS,
     SHAPE_OUTLIERS,
@@ -64,5 +79,13 @@ from .plan import DatasetPlan, Objects, RigSpread
 from .ray_backend import ray_farm
 from .reader import Dataset, open_dataset
 from .samples import objects_from_folder, procedural_images, sense_color, sense_object
-from .shards import PART_PATTERN, REQUIRED_ARRAYS, SHARD_PATTERN, check_arrays, read_head, shard_origin, shards_of
+from .shards import (
+    PART_PATTERN,
+    REQUIRED_ARRAYS,
+    SHARD_PATTERN,
+    check_arrays,
+    read_head,
+    shard_origin,
+    shards_of,
+)
 from .training_maps import BareMaps, measured_bare_wall, read_maps, render_bare_wall

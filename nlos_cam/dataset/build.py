@@ -1,7 +1,9 @@
-"""Builder of datasets: random objects, rendered into HDF5 shards of lidar maps and images; resumable at any time.
+"""Builder of datasets: random objects, rendered into HDF5 shards of lidar maps and images;
+resumable at any time.
 
-Workers make samples and one process writes them. A shard appears under its name only when it is complete; building
-again makes only missing or damaged shards. A sample depends on its seed alone, so any workers make equal shards.
+Workers make samples and one process writes them. A shard appears under its name only when it is
+complete; building again makes only missing or damaged shards. A sample depends on its seed alone,
+so any workers make equal shards.
 """
 
 import time
@@ -15,11 +17,21 @@ from pathlib import Path
 
 from nlos_cam.dataset.plan import DatasetPlan
 from nlos_cam.dataset.samples import OnProgress, Samples, ignore, join_samples
-from nlos_cam.dataset.shards import SHARD_PATTERN, Shard, check_arrays, only_builder, read_head, shard_path, store
+from nlos_cam.dataset.shards import (
+    SHARD_PATTERN,
+    Shard,
+    check_arrays,
+    only_builder,
+    read_head,
+    shard_path,
+    store,
+)
 from nlos_cam.dataset.worker import Worker
 from nlos_cam.errors import OutputExistsError, RecordingError, WorkersLostError
 
-TRAINING_SEED, HELD_OUT_SEED, TEST_SEED = 0, 10_000_000, 20_000_000
+TRAINING_SEED = 0
+HELD_OUT_SEED = 10_000_000
+TEST_SEED = 20_000_000
 """First seeds: no training run reaches the seeds of held-out and test objects."""
 SHARD = 100
 """Objects in a shard: as many can be lost of each unfinished shard when a build is killed."""
@@ -28,7 +40,9 @@ PIECE = 10
 
 Pieces = Generator[tuple[range, Samples]]
 Farm = Callable[[DatasetPlan, Sequence[range]], Pieces]
-"""Makes the samples of ranges of seeds and yields them in any order; closing the generator ends its workers."""
+"""Makes the samples of ranges of seeds and yields them in any order; closing the generator ends its
+workers.
+"""
 
 
 @dataclass(frozen=True)
@@ -61,11 +75,12 @@ def build_dataset(
     command: str = "",
     farm: Farm | None = None,
 ) -> BuildReport:
-    """Bring a folder up to `count` objects, by `workers` processes on this machine or by another `farm`.
+    """Bring a folder up to `count` objects, by `workers` processes on this machine or by another
+    `farm`.
 
-    Raises OutputExistsError for a folder of other files, RecordingError for one with shards of another plan,
-    FolderBusyError where another build uses it,
-    and DiskFullError and WorkersLostError, with all finished shards kept.
+    Raises OutputExistsError for a folder of other files, RecordingError for one with shards of
+    another plan, FolderBusyError where another build uses it, and DiskFullError and
+    WorkersLostError, with all finished shards kept.
     """
     plan.check()
     if folder.is_dir() and not any(folder.glob(SHARD_PATTERN)) and any(folder.glob("[!.]*")):
@@ -83,7 +98,8 @@ def build_dataset(
         replaced = damaged.keys() & {shard_path(folder, seeds.start) for seeds in missing}
         for path, problem in damaged.items():
             on_warning(f"{path} is damaged and will be made again" if path in replaced else problem)
-        start_s, made = time.perf_counter(), sum(map(len, missing))
+        start_s = time.perf_counter()
+        made = sum(map(len, missing))
         done = count - made
         on_progress(done, count)
         pieces = [piece for seeds in missing for piece in _split(seeds, PIECE)]
@@ -100,8 +116,11 @@ def _split(seeds: range, size: int) -> Iterator[range]:
 
 
 def _find_damaged(folder: Path, plan: DatasetPlan, on_check: OnProgress) -> dict[Path, str]:
-    """Return the damaged shards with their problems. Raises RecordingError for shards of another plan."""
-    paths, damaged = sorted(folder.glob(SHARD_PATTERN)), dict[Path, str]()
+    """Return the damaged shards with their problems. Raises RecordingError for shards of another
+    plan.
+    """
+    paths = sorted(folder.glob(SHARD_PATTERN))
+    damaged = dict[Path, str]()
     for number, path in enumerate(paths, 1):
         try:
             head = read_head(path)
@@ -116,13 +135,19 @@ def _find_damaged(folder: Path, plan: DatasetPlan, on_check: OnProgress) -> dict
 
 def _check_same_plan(head: Shard, plan: DatasetPlan) -> None:
     if others := head.plan.differences(plan):
-        raise RecordingError(f"{head.path} is of a dataset with another {', '.join(others)}: choose another --out")
+        raise RecordingError(
+            f"{head.path} is of a dataset with another {', '.join(others)}: choose another --out"
+        )
     if (head.seeds.start - plan.first_seed) % SHARD or len(head.seeds) > SHARD:
-        raise RecordingError(f"{head.path} holds {len(head.seeds)} objects, not up to {SHARD}: choose another --out")
+        raise RecordingError(
+            f"{head.path} holds {len(head.seeds)} objects, not up to {SHARD}: choose another --out"
+        )
 
 
 def _holds(folder: Path, seeds: range, damaged: Container[Path]) -> bool:
-    """Return True for an intact shard with all of these objects; the last one of a smaller dataset has fewer."""
+    """Return True for an intact shard with all of these objects; the last one of a smaller dataset
+    has fewer.
+    """
     path = shard_path(folder, seeds.start)
     return path.exists() and path not in damaged and len(read_head(path).seeds) >= len(seeds)
 
@@ -145,22 +170,29 @@ def _store_shards(
 
 
 def processes(workers: int) -> Farm:
-    """Return a farm of processes on this machine; dead ones are replaced, until more than it has die in a row."""
+    """Return a farm of processes on this machine; dead ones are replaced, until more than it has
+    die in a row.
+    """
 
     def make(plan: DatasetPlan, pieces: Sequence[range]) -> Pieces:
-        left, farm, lost = deque(pieces), dict[Connection, Worker](), 0
+        left = deque(pieces)
+        farm = dict[Connection, Worker]()
+        lost = 0
         try:
             while left or farm:
                 while left and len(farm) < workers:
                     worker = Worker(plan, left)
                     farm[worker.pipe] = worker
-                for worker in [farm[pipe] for pipe in wait_for_any([*farm]) if isinstance(pipe, Connection)]:
+                for worker in [
+                    farm[pipe] for pipe in wait_for_any([*farm]) if isinstance(pipe, Connection)
+                ]:
                     made = worker.take(left)
                     lost = 0 if made else lost + 1
                     if lost > workers:
                         raise WorkersLostError(
-                            f"a worker exited (code {worker.end()}) before producing {PIECE} objects: finished shards "
-                            "are kept; free memory or lower --workers, and build again"
+                            f"a worker exited (code {worker.end()}) before producing {PIECE}"
+                            " objects: finished shards are kept; free memory or lower --workers,"
+                            " and build again"
                         )
                     if not worker.asked:
                         farm.pop(worker.pipe).end()

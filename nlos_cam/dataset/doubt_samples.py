@@ -1,4 +1,6 @@
-"""Samples of the uncertainty network: ordinary objects, empty benches and outliers by seed, cached on disk."""
+"""Samples of the uncertainty network: ordinary objects, empty benches and outliers by seed, cached
+on disk.
+"""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -22,12 +24,16 @@ from nlos_cam.frames import OBJECT_PIXELS, LidarMaps, maps_from_frame
 from nlos_cam.objects import CATEGORIES, image_from_depth
 from nlos_cam.render import Rendering, SensorModel, render
 
-EMPTY, ORDINARY, GENERIC = "empty", "ordinary", "generic"
+EMPTY = "empty"
+ORDINARY = "ordinary"
+GENERIC = "generic"
 USUAL = ORDINARY, GENERIC
 PIECE = 100
 """Samples in a file; a killed build loses at most as many."""
 BESIDE_M = 0.01
-"""Depth differing from the bare wall's by more than this belongs to the object: the width of a path-length bin."""
+"""Depth differing from the bare wall's by more than this belongs to the object: the width of a
+path-length bin.
+"""
 SEEDS_PER_BENCH = 10
 """Consecutive seeds on the same bench, whose sensor is computed once."""
 VERSION = 2
@@ -41,7 +47,9 @@ KINDS = {
     **outliers.HELD_OUT_OUTLIERS,
 }
 MIN_CELLS = 8
-"""Training leaves out outliers that change fewer cells of the maps: they hardly differ from an empty bench."""
+"""Training leaves out outliers that change fewer cells of the maps: they hardly differ from an
+empty bench.
+"""
 HELD_OUT_SHARE = 0.15
 """Held-out outliers and empty benches, relative to the number of training ones."""
 
@@ -57,7 +65,9 @@ class DoubtSamples:
     image: NDArray[np.float16]
     """(n, 64, 64); image v of the truth, 0 for background."""
     cells: NDArray[np.int32]
-    """(n,); number of map cells whose strongest return is the object's: with none it is invisible."""
+    """(n,); number of map cells whose strongest return is the object's: with none it is
+    invisible.
+    """
     kind: NDArray[np.str_]
     """(n,); EMPTY, ORDINARY, GENERIC, or a kind of outlier."""
 
@@ -72,10 +82,12 @@ class DoubtSamples:
 def make_samples(
     kind: str, seeds: Sequence[int], rig: Rig, sensor: SensorModel, accuracy: str = "draft"
 ) -> DoubtSamples:
-    """Return samples of one kind, the same bits for the same seeds; SEEDS_PER_BENCH consecutive ones share a bench.
+    """Return samples of one kind, the same bits for the same seeds; SEEDS_PER_BENCH consecutive
+    ones share a bench.
 
-    Datasets hold ordinary objects on the given bench. Here these are on benches that deviate slightly, outliers on
-    such benches and the given one in turn, and empty benches may deviate widely.
+    Datasets hold ordinary objects on the given bench. Here these are on benches that deviate
+    slightly, outliers on such benches and the given one in turn, and empty benches may deviate
+    widely.
     """
     stimuli = [_stimulus(kind, seed, rig, sensor) for seed in seeds]
     renderings = [render(stimulus.scene, accuracy) for stimulus in stimuli]
@@ -85,13 +97,17 @@ def make_samples(
         np.stack([one.depth_m for one in maps]),
         np.stack([one.intensity for one in maps]),
         np.stack([_truth(stimulus) for stimulus in stimuli]),
-        np.array([_visible_cells(*each) for each in zip(stimuli, renderings, strict=True)], np.int32),
+        np.array(
+            [_visible_cells(*each) for each in zip(stimuli, renderings, strict=True)], np.int32
+        ),
         np.array([kind] * len(seeds)),
     )
 
 
 def _generator(kind: str, seed: int, stream: int) -> np.random.Generator:
-    """Return a generator that differs between kinds: shared benches or noise would give outliers away."""
+    """Return a generator that differs between kinds: shared benches or noise would give outliers
+    away.
+    """
     return np.random.default_rng([crc32(kind.encode()), seed, _STREAM, stream])
 
 
@@ -100,11 +116,17 @@ def _stimulus(kind: str, seed: int, rig: Rig, sensor: SensorModel) -> outliers.S
     if kind == EMPTY:
         return outliers.Stimulus(*outliers.vary_empty_bench(rig, sensor, bench_generator))
     slight = kind in USUAL or seed // SEEDS_PER_BENCH % 2
-    bench = outliers.vary_bench(rig, sensor, outliers.SLIGHT, bench_generator) if slight else (rig, sensor)
+    bench = (
+        outliers.vary_bench(rig, sensor, outliers.SLIGHT, bench_generator)
+        if slight
+        else (rig, sensor)
+    )
     return outliers.draw_outlier(KINDS[kind], _generator(kind, seed, 1), outliers.Stimulus(*bench))
 
 
-def _sense(stimulus: outliers.Stimulus, rendering: Rendering, noise: np.random.Generator) -> LidarMaps:
+def _sense(
+    stimulus: outliers.Stimulus, rendering: Rendering, noise: np.random.Generator
+) -> LidarMaps:
     sensor = cached_sensor(stimulus.rig, stimulus.sensor)  # pyright: ignore[reportArgumentType]  frozen, so hashable
     images = sensor.expose(rendering.multi, noise)
     return maps_from_frame(images.frame(stimulus.rig.pinhole))
@@ -132,10 +154,14 @@ def samples_on_disk(
     accuracy: str = "draft",
     on_progress: OnProgress = ignore,
 ) -> DoubtSamples:
-    """Return `counts` samples of each kind; those missing in the folder are made and stored there."""
+    """Return `counts` samples of each kind; those missing in the folder are made and stored
+    there.
+    """
     folder.mkdir(parents=True, exist_ok=True)
     about = f"v{VERSION}-{rig.checksum}-{accuracy}"
-    done, total, parts = 0, sum(counts.values()), list[DoubtSamples]()
+    done = 0
+    total = sum(counts.values())
+    parts = list[DoubtSamples]()
     for kind, seeds in _pieces(counts, first_seed):
         path = folder / f"{about}-{kind.replace(' ', '_')}-{seeds.start}-{len(seeds)}.npz"
         try:
@@ -146,7 +172,9 @@ def samples_on_disk(
                 np.savez(file, **vars(part))
         parts.append(part)
         on_progress(done := done + len(seeds), total)
-    return DoubtSamples(**{name: np.concatenate([vars(part)[name] for part in parts]) for name in vars(parts[0])})
+    return DoubtSamples(
+        **{name: np.concatenate([vars(part)[name] for part in parts]) for name in vars(parts[0])}
+    )
 
 
 def _pieces(counts: Mapping[str, int], first_seed: int) -> Iterator[tuple[str, range]]:
@@ -156,10 +184,11 @@ def _pieces(counts: Mapping[str, int], first_seed: int) -> Iterator[tuple[str, r
 
 
 def counts_of(recipe: models.Recipe, share_generic: float = 0.0) -> dict[str, int]:
-    """Return the number of samples to render of each kind, for training objects with a share of generic shapes.
+    """Return the number of samples to render of each kind, for training objects with a share of
+    generic shapes.
 
-    Benches that deviate slightly have as many usual objects as outliers, so that the deviation does not give outliers
-    away.
+    Benches that deviate slightly have as many usual objects as outliers, so that the deviation does
+    not give outliers away.
     """
     per_kind = dict.fromkeys(outliers.outliers_beside(share_generic), recipe.outliers)
     usual = sum(per_kind.values()) // 2
@@ -167,18 +196,29 @@ def counts_of(recipe: models.Recipe, share_generic: float = 0.0) -> dict[str, in
     return {EMPTY: recipe.empties, ORDINARY: usual - sum(shapes.values()), **shapes, **per_kind}
 
 
-def _doubt_set(pipeline: models.Reconstructor, ordinary_maps: models.MapSet, samples: DoubtSamples) -> models.DoubtSet:
-    """Return a dataset's maps of ordinary objects and the visible samples, with the pipeline's images of both."""
+def _doubt_set(
+    pipeline: models.Reconstructor, ordinary_maps: models.MapSet, samples: DoubtSamples
+) -> models.DoubtSet:
+    """Return a dataset's maps of ordinary objects and the visible samples, with the pipeline's
+    images of both.
+    """
     nothing = samples.kind == EMPTY
     outside = ~nothing & ~np.isin(samples.kind, USUAL)
     images = _images(pipeline, models.MapSet(samples.depth_m, samples.intensity, samples.image))
-    drawn = models.DoubtSet(samples.depth_m, samples.intensity, images, samples.image, nothing, outside)
+    drawn = models.DoubtSet(
+        samples.depth_m, samples.intensity, images, samples.image, nothing, outside
+    )
     drawn = drawn.where((samples.cells >= MIN_CELLS) | nothing)
-    depth_m, intensity, truth = ordinary_maps.depth_m, ordinary_maps.intensity, ordinary_maps.image.astype(np.float16)
+    depth_m = ordinary_maps.depth_m
+    intensity = ordinary_maps.intensity
+    truth = ordinary_maps.image.astype(np.float16)
     no = np.zeros(len(truth), np.bool_)
     usual = models.DoubtSet(depth_m, intensity, _images(pipeline, ordinary_maps), truth, no, no)
     return models.DoubtSet(
-        **{name: np.concatenate([values, vars(drawn)[name]]) for name, values in vars(usual).items()}
+        **{
+            name: np.concatenate([values, vars(drawn)[name]])
+            for name, values in vars(usual).items()
+        }
     )
 
 
@@ -194,7 +234,9 @@ def doubt_sets(
     folder: Path,
     on_progress: OnProgress = ignore,
 ) -> list[models.DoubtSet]:
-    """Return the training set and the held-out set of an uncertainty network; rendered samples are kept in `folder`."""
+    """Return the training set and the held-out set of an uncertainty network; rendered samples are
+    kept in `folder`.
+    """
     counts = counts_of(recipe, datasets[0].plan.objects.share_generic)
     held_out_counts = {kind: round(HELD_OUT_SHARE * count) for kind, count in counts.items()}
     sets: list[models.DoubtSet] = []
@@ -204,7 +246,13 @@ def doubt_sets(
     ):
         plan = dataset.plan
         samples = samples_on_disk(
-            folder, kinds, seed, plan.rig, plan.sensor, accuracy=plan.accuracy, on_progress=on_progress
+            folder,
+            kinds,
+            seed,
+            plan.rig,
+            plan.sensor,
+            accuracy=plan.accuracy,
+            on_progress=on_progress,
         )
         sets.append(_doubt_set(pipeline, models.first_of(dataset.arrays(), objects), samples))
     return sets
@@ -217,13 +265,23 @@ def quality_set(
     objects: int,
     on_progress: OnProgress,
 ) -> models.QualitySet:
-    """Return figures and true quality of the reconstructions of a dataset's first objects; expected maps get noise.
+    """Return figures and true quality of the reconstructions of a dataset's first objects; expected
+    maps get noise.
 
     Raises SceneError where weights and dataset do not fit together.
     """
-    if pipeline.record.input != "raw maps" or dataset.plan.rig.checksum != pipeline.record.rig_checksum:
-        raise SceneError("the quality model needs raw maps of the weights' own rig: use another --dataset or --weights")
-    figures, iou, error_v, done = list[Float32](), list[Float32](), list[Float32](), 0
+    if (
+        pipeline.record.input != "raw maps"
+        or dataset.plan.rig.checksum != pipeline.record.rig_checksum
+    ):
+        raise SceneError(
+            "the quality model needs raw maps of the weights' own rig: use another --dataset or"
+            " --weights"
+        )
+    figures = list[Float32]()
+    iou = list[Float32]()
+    error_v = list[Float32]()
+    done = 0
     kinds = dataset.column("category").astype(np.str_)[:objects]
     noise = map_noise(dataset.plan) if dataset.plan.expected else None
     for expected in dataset.chunks():
@@ -231,21 +289,32 @@ def quality_set(
             break
         maps = noise.expose(expected, done) if noise else expected
         for part in models.parts_of(np.arange(min(len(maps.image), len(kinds) - done))):
-            depth_m, intensity, truth = maps.depth_m[part], maps.intensity[part], maps.image[part].astype(np.float32)
+            depth_m = maps.depth_m[part]
+            intensity = maps.intensity[part]
+            truth = maps.image[part].astype(np.float32)
             image, surface = models.ask(pipeline, depth_m, intensity)
-            figures.append(models.quality_features(image, uncertainty_model(depth_m, intensity, image), surface))
+            figures.append(
+                models.quality_features(
+                    image, uncertainty_model(depth_m, intensity, image), surface
+                )
+            )
             iou.append(models.silhouette_iou(image, truth).astype(np.float32))
             error_v.append(shared_error_v(image, truth))
             done += len(part)
             on_progress(done, len(kinds))
     found = np.concatenate(iou), np.concatenate(error_v)
-    return models.QualitySet(np.concatenate(figures), *found, kinds, ~np.isin(kinds, tuple(CATEGORIES)))
+    return models.QualitySet(
+        np.concatenate(figures), *found, kinds, ~np.isin(kinds, tuple(CATEGORIES))
+    )
 
 
 def shared_error_v(image: Float32, truth: Float32) -> Float32:
-    """Return the mean absolute error of v where images (n, 64, 64) and truths have a surface; NaN where none is."""
+    """Return the mean absolute error of v where images (n, 64, 64) and truths have a surface; NaN
+    where none is.
+    """
     shared = (image > 0) & (truth > 0)
-    total, count = (np.abs(image - truth) * shared).sum((1, 2)), shared.sum((1, 2))
+    total = (np.abs(image - truth) * shared).sum((1, 2))
+    count = shared.sum((1, 2))
     return np.where(count > 0, total / np.maximum(count, 1), np.nan).astype(np.float32)
 
 
@@ -255,11 +324,13 @@ def check_doubt_data(
     """Raise SceneError where datasets, weights and recipe do not fit together."""
     if pipeline.record.input != "raw maps":
         raise SceneError(
-            f"weights expect {pipeline.record.input}, but the uncertainty network needs raw maps: use others"
+            f"weights expect {pipeline.record.input}, but the uncertainty network needs raw maps:"
+            " use others"
         )
     if not training.plan.rig.checksum == held_out.plan.rig.checksum == pipeline.record.rig_checksum:
         raise SceneError(
-            "--dataset, --held-out and --weights are not all of one rig: use others, or build the maps again"
+            "--dataset, --held-out and --weights are not all of one rig: use others, or build the"
+            " maps again"
         )
     if len(training) < recipe.objects:
         count = f"--dataset holds {len(training)} objects, the recipe needs {recipe.objects}"

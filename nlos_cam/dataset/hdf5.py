@@ -1,7 +1,9 @@
-"""Bounded reading of HDF5: every size that a file declares is compared with the bytes it holds, before memory is taken.
+"""Bounded reading of HDF5: every size that a file declares is compared with the bytes it holds,
+before memory is taken.
 
-HDF5 itself takes memory for each declared chunk, also for those that are not stored, and unpacks a chunk to whatever
-length its bytes give. The door for arrays therefore reads the packed chunks and unpacks them here.
+HDF5 itself takes memory for each declared chunk, also for those that are not stored, and unpacks a
+chunk to whatever length its bytes give. The door for arrays therefore reads the packed chunks and
+unpacks them here.
 """
 
 import zlib
@@ -13,19 +15,25 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-MAX_ARRAY_BYTES, MAX_CHUNK_BYTES, MAX_RATIO = 1 << 30, 1 << 26, 1100
-"""Bounds on what an array may declare, in bytes and as a multiple of the bytes stored for it: gzip packs at most 1032
-to 1."""
+MAX_ARRAY_BYTES = 1 << 30
+MAX_CHUNK_BYTES = 1 << 26
+MAX_RATIO = 1100
+"""Bounds on what an array may declare, in bytes and as a multiple of the bytes stored for it: gzip
+packs at most 1032 to 1."""
 GZIP = 1
 """Number of HDF5's filter for gzip."""
-MAX_CHUNKS, ENTRY_BYTES = 1 << 16, 16
-"""Bounds on the number of chunks: as such, and by the bytes of a chunk's address and size in the file's index."""
+MAX_CHUNKS = 1 << 16
+ENTRY_BYTES = 16
+"""Bounds on the number of chunks: as such, and by the bytes of a chunk's address and size in the
+file's index.
+"""
 
 
 def read_array(file: h5py.File, name: str) -> NDArray[Any]:
     """Return an array of numbers or texts that lies in the file itself.
 
-    Raises ValueError where it is none, or declares more than the file holds; h5py raises many kinds for damage.
+    Raises ValueError where it is none, or declares more than the file holds; h5py raises many kinds
+    for damage.
     """
     stored = file[name] if isinstance(file.get(name, getlink=True), h5py.HardLink) else None
     if not isinstance(stored, h5py.Dataset) or stored.external or stored.is_virtual:
@@ -44,10 +52,11 @@ def read_array(file: h5py.File, name: str) -> NDArray[Any]:
 
 
 def read_text(holder: h5py.HLObject, name: str, default: str | None = None) -> str:
-    """Return a single text among an object's attributes, or the default where there is none of the name.
+    """Return a single text among an object's attributes, or the default where there is none of the
+    name.
 
-    Raises KeyError without a default, and ValueError for an attribute of another kind: each element of an array of
-    texts may be the same text of the file's whole length.
+    Raises KeyError without a default, and ValueError for an attribute of another kind: each element
+    of an array of texts may be the same text of the file's whole length.
     """
     if default is not None and name not in holder.attrs:
         return default
@@ -59,7 +68,8 @@ def read_text(holder: h5py.HLObject, name: str, default: str | None = None) -> s
 
 def _texts(stored: h5py.Dataset, name: str, file_bytes: int) -> NDArray[Any]:
     """Return texts, read one by one: a file may name one long text a million times."""
-    found, left = list[str](), file_bytes
+    found = list[str]()
+    left = file_bytes
     for row in np.ndindex(stored.shape):
         found.append(str(stored.asstr()[row]))
         left -= len(found[-1].encode())
@@ -70,9 +80,14 @@ def _texts(stored: h5py.Dataset, name: str, file_bytes: int) -> NDArray[Any]:
     return texts.reshape(stored.shape)
 
 
-def _unpacked(stored: h5py.Dataset, name: str, chunk_shape: tuple[int, ...], file_bytes: int) -> NDArray[Any]:
-    """Return an array whose chunks are packed by gzip or not at all; each of them has to be in the file."""
-    shape, dtype = stored.shape, stored.dtype
+def _unpacked(
+    stored: h5py.Dataset, name: str, chunk_shape: tuple[int, ...], file_bytes: int
+) -> NDArray[Any]:
+    """Return an array whose chunks are packed by gzip or not at all; each of them has to be in the
+    file.
+    """
+    shape = stored.shape
+    dtype = stored.dtype
     chunk_bytes = prod(chunk_shape) * dtype.itemsize
     count = prod(ceil(size / chunk) for size, chunk in zip(shape, chunk_shape, strict=True))
     declared = f"{name} declares {stored.nbytes} bytes, in {count} chunks of {chunk_bytes}"
@@ -86,7 +101,11 @@ def _unpacked(stored: h5py.Dataset, name: str, chunk_shape: tuple[int, ...], fil
         raise ValueError(f"{name} is packed in another way than by gzip")
     chunks = _chunks(stored, count)
     packed_bytes = sum(chunk.size for chunk in chunks)
-    if len(chunks) != count or packed_bytes > file_bytes or count * chunk_bytes > MAX_RATIO * packed_bytes:
+    if (
+        len(chunks) != count
+        or packed_bytes > file_bytes
+        or count * chunk_bytes > MAX_RATIO * packed_bytes
+    ):
         raise ValueError(f"{declared}, and holds {len(chunks)} of {packed_bytes} bytes")
     values = np.empty(shape, dtype)
     for chunk in chunks:
@@ -95,9 +114,14 @@ def _unpacked(stored: h5py.Dataset, name: str, chunk_shape: tuple[int, ...], fil
             packed = zlib.decompressobj().decompress(packed, chunk_bytes + 1)
         if len(packed) != chunk_bytes:
             raise ValueError(f"a chunk of {name} does not unpack to its {chunk_bytes} bytes")
-        place = tuple(slice(start, start + size) for start, size in zip(chunk.chunk_offset, chunk_shape, strict=True))
+        place = tuple(
+            slice(start, start + size)
+            for start, size in zip(chunk.chunk_offset, chunk_shape, strict=True)
+        )
         target = values[place]
-        target[...] = np.frombuffer(packed, dtype).reshape(chunk_shape)[tuple(map(slice, target.shape))]
+        target[...] = np.frombuffer(packed, dtype).reshape(chunk_shape)[
+            tuple(map(slice, target.shape))
+        ]
     return values
 
 

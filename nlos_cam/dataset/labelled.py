@@ -1,4 +1,6 @@
-"""Labelled recordings of known objects as a dataset: maps of their frames with the truth of each label."""
+"""Labelled recordings of known objects as a dataset: maps of their frames with the truth of each
+label.
+"""
 
 import tomllib
 from collections.abc import Callable, Mapping, Sequence
@@ -27,14 +29,18 @@ from nlos_cam.recording import ReplayCamera, Sidecar, load_sidecar, open_lidar_b
 from nlos_cam.render import HiddenObject, SceneFile
 
 TRUTH_SUFFIX = ".truth.toml"
-"""Suffix of a file with the fields of a scene file's [object]: the object, and its pose in the rig's object box."""
+"""Suffix of a file with the fields of a scene file's [object]: the object, and its pose in the
+rig's object box.
+"""
 FRAMES_PER_RECORDING = 8
 """Frames of a recording differ by their noise alone: more of them add little."""
 RECORDED = "recorded"
 """Accuracy of a plan whose samples were not rendered."""
 
 KnownObjects = Callable[[ObjectBox], Mapping[str, Float32]]
-"""Returns the depths (64, 64) over a box of the objects that need no file of their own, by label."""
+"""Returns the depths (64, 64) over a box of the objects that need no file of their own, by
+label.
+"""
 
 
 def benchmark_depths(box: ObjectBox) -> Mapping[str, Float32]:
@@ -43,32 +49,46 @@ def benchmark_depths(box: ObjectBox) -> Mapping[str, Float32]:
 
 
 def truth_depth_m(recording: Path, label: str, rig: Rig, known: Mapping[str, Float32]) -> Float32:
-    """Return the hidden depth (64, 64) of a labelled recording over the rig's object box, NaN for background.
+    """Return the hidden depth (64, 64) of a labelled recording over the rig's object box, NaN for
+    background.
 
-    It comes from a file beside the recording, NAME.truth.toml or NAME.npy, where NAME is the recording's or its
-    label; else from the `known` objects. Raises RecordingError for no truth or two, SceneError for an invalid one.
+    It comes from a file beside the recording, NAME.truth.toml or NAME.npy, where NAME is the
+    recording's or its label; else from the `known` objects. Raises RecordingError for no truth or
+    two, SceneError for an invalid one.
     """
     for name in dict.fromkeys((recording.stem, Path(label).name)):
         if (file := _truth_file(recording.parent, name)) is not None:
-            return _depth_map(file) if file.suffix == shapes.DEPTH_MAP_SUFFIX else _placed(file, name, rig)
+            return (
+                _depth_map(file)
+                if file.suffix == shapes.DEPTH_MAP_SUFFIX
+                else _placed(file, name, rig)
+            )
     if label in known:
         return known[label]
     raise RecordingError(
-        f"{recording} has the label {label!r}, which is not a benchmark object (such as {next(iter(known), 'cup-1')}), "
-        f"and no file describes it: add {label}{TRUTH_SUFFIX} (object, pose) or a depth map "
-        f"{label}{shapes.DEPTH_MAP_SUFFIX}"
+        f"{recording} has the label {label!r}, which is not a benchmark object (such as"
+        f" {next(iter(known), 'cup-1')}), and no file describes it: add {label}{TRUTH_SUFFIX}"
+        f" (object, pose) or a depth map {label}{shapes.DEPTH_MAP_SUFFIX}"
     )
 
 
 def _truth_file(folder: Path, name: str) -> Path | None:
-    """Return the truth file of a name, if any. Raises RecordingError for two, or for a mesh without a pose."""
-    found = [path for end in (TRUTH_SUFFIX, shapes.DEPTH_MAP_SUFFIX) if (path := folder / f"{name}{end}").is_file()]
+    """Return the truth file of a name, if any. Raises RecordingError for two, or for a mesh without
+    a pose.
+    """
+    found = [
+        path
+        for end in (TRUTH_SUFFIX, shapes.DEPTH_MAP_SUFFIX)
+        if (path := folder / f"{name}{end}").is_file()
+    ]
     if len(found) > 1:
-        raise RecordingError(f"{found[0]} and {found[1].name} both describe {name!r}: remove one of them")
+        raise RecordingError(
+            f"{found[0]} and {found[1].name} both describe {name!r}: remove one of them"
+        )
     if not found and (meshes := _meshes(folder, name)):
         raise RecordingError(
-            f"{meshes[0]} has no pose in the object box: write {name}{TRUTH_SUFFIX} beside it, with size_m, x_m, y_m, "
-            "front_m and its angles"
+            f"{meshes[0]} has no pose in the object box: write {name}{TRUTH_SUFFIX} beside it, with"
+            " size_m, x_m, y_m, front_m and its angles"
         )
     return found[0] if found else None
 
@@ -81,13 +101,16 @@ def _depth_map(path: Path) -> Float32:
     depth_m = shapes.read_depth_map(path)
     if depth_m.shape != (OBJECT_PIXELS, OBJECT_PIXELS):
         raise RecordingError(
-            f"{path} has shape {depth_m.shape}: the depth map of a label needs {OBJECT_PIXELS} x {OBJECT_PIXELS} cells"
+            f"{path} has shape {depth_m.shape}: the depth map of a label needs {OBJECT_PIXELS} x"
+            f" {OBJECT_PIXELS} cells"
         )
     return depth_m
 
 
 def _placed(path: Path, name: str, rig: Rig) -> Float32:
-    """Return the depth of a truth file's object; without `category` or `file` it is the mesh beside the truth file."""
+    """Return the depth of a truth file's object; without `category` or `file` it is the mesh beside
+    the truth file.
+    """
     hidden = _hidden(path, name)
     depth_m = SceneFile(name=hidden.label, rig=rig, object=hidden).scene_at(0).object_depth_m
     if depth_m is None or np.isnan(depth_m).all():
@@ -105,7 +128,9 @@ def _hidden(path: Path, name: str) -> HiddenObject:
             fields["file"] = str((path.parent / file).resolve())
         return HiddenObject.model_validate(fields)
     except ValidationError as error:
-        raise RecordingError(f"{path} does not describe a hidden object: {first_problem(error)}") from error
+        raise RecordingError(
+            f"{path} does not describe a hidden object: {first_problem(error)}"
+        ) from error
     except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
         raise RecordingError(f"{path} cannot be read as TOML: {error}") from error
 
@@ -127,10 +152,14 @@ class Labelled:
 
 
 def list_recordings(folder: Path) -> list[Path]:
-    """Return the recordings of a folder, sorted by name. Raises RecordingError where there is none."""
+    """Return the recordings of a folder, sorted by name. Raises RecordingError where there is
+    none.
+    """
     if paths := sorted(folder.glob("*.bag")):
         return paths
-    raise RecordingError(f"no recordings in {folder}: make some with `nlos-cam capture --label NAME --out F.bag`")
+    raise RecordingError(
+        f"no recordings in {folder}: make some with `nlos-cam capture --label NAME --out F.bag`"
+    )
 
 
 def read_labelled(
@@ -141,11 +170,13 @@ def read_labelled(
     frames: int = FRAMES_PER_RECORDING,
     on_progress: OnProgress = ignore,
 ) -> Labelled:
-    """Return maps of `frames` frames spread evenly over each recording, with the truth of their labels.
+    """Return maps of `frames` frames spread evenly over each recording, with the truth of their
+    labels.
 
-    Maps are of single frames, as in `live`, so that each has noise of its own. They are corrected by `wall`, the
-    bench's wall record; without one the rig is the sidecars', or the paper's. Frames without any return are left out.
-    Raises RecordingError for a recording without a label, a truth or a frame, and for recordings of two benches.
+    Maps are of single frames, as in `live`, so that each has noise of its own. They are corrected
+    by `wall`, the bench's wall record; without one the rig is the sidecars', or the paper's. Frames
+    without any return are left out. Raises RecordingError for a recording without a label, a truth
+    or a frame, and for recordings of two benches.
     """
     parts: list[Labelled] = []
     objects: dict[str, Mapping[str, Float32]] = {}
@@ -157,22 +188,25 @@ def read_labelled(
 
     for path in recordings:
         parts.append(_read(path, objects_on, wall, frames))
-        one, other = parts[0].rig, parts[-1].rig
+        one = parts[0].rig
+        other = parts[-1].rig
         if one != other:
             raise RecordingError(
-                f"{recordings[0]} and {path} are of two benches (rigs {one.name} {one.checksum} and {other.name} "
-                f"{other.checksum}): label one bench at a time, or give its --wall"
+                f"{recordings[0]} and {path} are of two benches (rigs {one.name} {one.checksum} and"
+                f" {other.name} {other.checksum}): label one bench at a time, or give its --wall"
             )
         on_progress(len(parts), len(recordings))
     return _join(parts)
 
 
-def _read(path: Path, objects_on: Callable[[Rig], Mapping[str, Float32]], wall: Path | None, frames: int) -> Labelled:
+def _read(
+    path: Path, objects_on: Callable[[Rig], Mapping[str, Float32]], wall: Path | None, frames: int
+) -> Labelled:
     sidecar = load_sidecar(sidecar_path(path))
     if not sidecar.label:
         raise RecordingError(
-            f"{path} has no label: record it with `nlos-cam capture --label NAME`, or write its name as label into "
-            f"{sidecar_path(path)}"
+            f"{path} has no label: record it with `nlos-cam capture --label NAME`, or write its"
+            f" name as label into {sidecar_path(path)}"
         )
     chosen = spread(open_lidar_bag(path).streams["depth"].frames, frames)
     with ReplayCamera(path) as camera:
@@ -181,16 +215,23 @@ def _read(path: Path, objects_on: Callable[[Rig], Mapping[str, Float32]], wall: 
         raw = (maps_from_frame(frame) for number, frame in enumerate(camera) if number in chosen)
         maps = [bench.correct_range(one) for one in raw if one.valid.any()]
     if not maps:
-        raise RecordingError(f"{path} has no frame with any return: inspect it with `nlos-cam replay`")
-    depth_m, intensity = (np.stack([getattr(one, name) for one in maps]) for name in ("depth_m", "intensity"))
+        raise RecordingError(
+            f"{path} has no frame with any return: inspect it with `nlos-cam replay`"
+        )
+    depth_m, intensity = (
+        np.stack([getattr(one, name) for one in maps]) for name in ("depth_m", "intensity")
+    )
     truths_m = np.repeat(truth_m[None], len(maps), axis=0)
     image = shapes.image_from_depth(truths_m, shapes.object_box(bench.rig)).astype(np.float16)
-    labels, names = (sidecar.label,) * len(maps), (path.name,) * len(maps)
+    labels = (sidecar.label,) * len(maps)
+    names = (path.name,) * len(maps)
     return Labelled(MapSet(depth_m, intensity, image), truths_m, labels, names, bench.rig)
 
 
 def spread(count: int, wanted: int) -> frozenset[int]:
-    """Return `wanted` of the numbers below `count`, evenly spread, or all of them if they are fewer."""
+    """Return `wanted` of the numbers below `count`, evenly spread, or all of them if they are
+    fewer.
+    """
     if wanted >= count:
         return frozenset(range(count))
     return frozenset(((np.arange(wanted) + 0.5) * count / wanted).astype(int).tolist())
@@ -201,15 +242,21 @@ def _bench(path: Path, sidecar: Sidecar, wall: Path | None, camera: ReplayCamera
         return open_bench(wall, camera)
     if sidecar.wall is not None:
         raise RecordingError(
-            f"{path} was captured with --wall {sidecar.wall.path}, which corrects its maps: give --wall here too"
+            f"{path} was captured with --wall {sidecar.wall.path}, which corrects its maps: give"
+            " --wall here too"
         )
-    return CalibratedRig(sidecar.rig if sidecar.rig and sidecar.rig.object_box else load_rig("paper-rig"))
+    return CalibratedRig(
+        sidecar.rig if sidecar.rig and sidecar.rig.object_box else load_rig("paper-rig")
+    )
 
 
 def _join(parts: Sequence[Labelled]) -> Labelled:
     maps = (np.concatenate([getattr(one.maps, name) for one in parts]) for name in MAP_CHANNELS)
     depth_m = np.concatenate([one.object_depth_m for one in parts])
-    labels, names = (tuple(chain(*texts)) for texts in ((one.label for one in parts), (one.recording for one in parts)))
+    labels, names = (
+        tuple(chain(*texts))
+        for texts in ((one.label for one in parts), (one.recording for one in parts))
+    )
     return Labelled(MapSet(*maps), depth_m, labels, names, parts[0].rig)
 
 
@@ -222,14 +269,19 @@ def label_recordings(
     command: str = "",
     on_progress: OnProgress = ignore,
 ) -> Labelled:
-    """Write a folder of labelled recordings as a dataset, and return its samples; see `read_labelled`."""
-    labelled = read_labelled(list_recordings(recordings), wall=wall, frames=frames, on_progress=on_progress)
+    """Write a folder of labelled recordings as a dataset, and return its samples; see
+    `read_labelled`.
+    """
+    labelled = read_labelled(
+        list_recordings(recordings), wall=wall, frames=frames, on_progress=on_progress
+    )
     write_shards(labelled, out, command)
     return labelled
 
 
 def write_shards(labelled: Labelled, folder: Path, command: str = "") -> None:
-    """Write samples as a dataset, with their numbers as seeds; earlier shards are replaced once all are on disk.
+    """Write samples as a dataset, with their numbers as seeds; earlier shards are replaced once all
+    are on disk.
 
     Raises DiskFullError where they do not fit, OutputExistsError where `folder` is a file.
     """
@@ -250,7 +302,8 @@ def write_shards(labelled: Labelled, folder: Path, command: str = "") -> None:
 
 
 def _samples(labelled: Labelled, plan: DatasetPlan) -> Samples:
-    maps, (*geometry, _) = labelled.maps, scene_row(plan.rig, plan.sensor)  # the gain of a real sensor is unknown
+    maps = labelled.maps
+    *geometry, _ = scene_row(plan.rig, plan.sensor)  # the gain of a real sensor is unknown
     return {
         "depth_m": maps.depth_m,
         "intensity": maps.intensity,

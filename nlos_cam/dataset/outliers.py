@@ -1,7 +1,9 @@
-"""Outliers: stimuli unlike the training objects, and variations of a bench, for the uncertainty network.
+"""Outliers: stimuli unlike the training objects, and variations of a bench, for the uncertainty
+network.
 
-Training objects are of one piece, 55 to 90 % of the box wide, in its nearest third, white and matt. Kinds of outliers
-are either in the training set or held out from it, so that the evaluation also covers kinds the network has not met.
+Training objects are of one piece, 55 to 90 % of the box wide, in its nearest third, white and matt.
+Kinds of outliers are either in the training set or held out from it, so that the evaluation also
+covers kinds the network has not met.
 """
 
 from collections.abc import Callable, Mapping
@@ -49,11 +51,16 @@ OutlierKind = Callable[[Generator, Stimulus], Stimulus]
 
 
 def draw_object(generator: Generator, box: ObjectBox, **pose: float) -> Float32:
-    """Return the depth map of an object of any category in a random pose, except for the given values."""
+    """Return the depth map of an object of any category in a random pose, except for the given
+    values.
+    """
     drawn = replace(shapes.random_pose(generator, box), **pose)
     category = str(generator.choice(list(shapes.CATEGORIES)))
     return shapes.orthographic_depth(
-        shapes.place(shapes.category_triangles(category, int(generator.integers(2**31))), drawn, box), box
+        shapes.place(
+            shapes.category_triangles(category, int(generator.integers(2**31))), drawn, box
+        ),
+        box,
     )
 
 
@@ -71,7 +78,9 @@ def ordinary(generator: Generator, stimulus: Stimulus) -> Stimulus:
 
 def generic(generator: Generator, stimulus: Stimulus) -> Stimulus:
     """Add a generic shape, as in training sets with a share of them."""
-    return replace(stimulus, depth_m=shapes.generic_depth(int(generator.integers(2**31)), stimulus.box)[1])
+    return replace(
+        stimulus, depth_m=shapes.generic_depth(int(generator.integers(2**31)), stimulus.box)[1]
+    )
 
 
 class BenchSpread(NamedTuple):
@@ -96,7 +105,9 @@ NO_OCCLUDER_SHARE = 0.1
 """Share of empty benches without an occluder: a bare wall."""
 
 
-def vary_bench(rig: Rig, sensor: SensorModel, spread: BenchSpread, generator: Generator) -> tuple[Rig, SensorModel]:
+def vary_bench(
+    rig: Rig, sensor: SensorModel, spread: BenchSpread, generator: Generator
+) -> tuple[Rig, SensorModel]:
     """Return a rig and a sensor near the given ones."""
     shift, yaw, pitch, gain, offset = generator.uniform(-1, 1, 5).tolist()
     ambient, ripple, patch, texture = generator.uniform(0, 1, 4).tolist()
@@ -114,8 +125,12 @@ def vary_bench(rig: Rig, sensor: SensorModel, spread: BenchSpread, generator: Ge
     return move_lidar(rig, shift * spread.place_m, *angles), changed
 
 
-def vary_empty_bench(rig: Rig, sensor: SensorModel, generator: Generator) -> tuple[Rig, SensorModel]:
-    """Return the rig and the sensor of an empty bench: the given ones, wide deviations, some without an occluder."""
+def vary_empty_bench(
+    rig: Rig, sensor: SensorModel, generator: Generator
+) -> tuple[Rig, SensorModel]:
+    """Return the rig and the sensor of an empty bench: the given ones, wide deviations, some
+    without an occluder.
+    """
     share = float(generator.choice([0.0, generator.random(), 1.0]))
     spread = BenchSpread(*(share * limit for limit in WIDE))
     bench, model = vary_bench(rig, sensor, spread, generator)
@@ -127,8 +142,11 @@ def vary_empty_bench(rig: Rig, sensor: SensorModel, generator: Generator) -> tup
 def small(generator: Generator, stimulus: Stimulus) -> Stimulus:
     """Add an object of 15 to 35 % of the box."""
     width_m = shapes.box_width_m(stimulus.box)
-    size_m, (x_m, y_m) = width_m * generator.uniform(0.15, 0.35), generator.uniform(-0.3, 0.3, 2) * width_m
-    return replace(stimulus, depth_m=draw_object(generator, stimulus.box, size_m=size_m, x_m=x_m, y_m=y_m))
+    size_m = width_m * generator.uniform(0.15, 0.35)
+    (x_m, y_m) = generator.uniform(-0.3, 0.3, 2) * width_m
+    return replace(
+        stimulus, depth_m=draw_object(generator, stimulus.box, size_m=size_m, x_m=x_m, y_m=y_m)
+    )
 
 
 def large(generator: Generator, stimulus: Stimulus) -> Stimulus:
@@ -139,12 +157,17 @@ def large(generator: Generator, stimulus: Stimulus) -> Stimulus:
 
 def far(generator: Generator, stimulus: Stimulus) -> Stimulus:
     """Add an object 0.12 to 0.35 m farther from the wall, most of it behind the box."""
-    return replace(stimulus, depth_m=draw_object(generator, stimulus.box) + np.float32(generator.uniform(0.12, 0.35)))
+    return replace(
+        stimulus,
+        depth_m=draw_object(generator, stimulus.box) + np.float32(generator.uniform(0.12, 0.35)),
+    )
 
 
 def near(generator: Generator, stimulus: Stimulus) -> Stimulus:
     """Add an object that sticks out of the box, 40 to 90 mm nearer to the wall."""
-    depth_m = draw_object(generator, stimulus.box, front_m=0.0) - np.float32(generator.uniform(0.04, 0.09))
+    depth_m = draw_object(generator, stimulus.box, front_m=0.0) - np.float32(
+        generator.uniform(0.04, 0.09)
+    )
     return replace(stimulus, depth_m=depth_m)
 
 
@@ -154,27 +177,37 @@ def half_out(generator: Generator, stimulus: Stimulus) -> Stimulus:
     pose = shapes.random_pose(generator, box)
     out_m = (shapes.box_width_m(box) + pose.size_m) / 2 - pose.size_m * generator.uniform(0.4, 0.65)
     angle = np.radians(90) * int(generator.integers(4))
-    return replace(stimulus, depth_m=draw_object(generator, box, x_m=out_m * np.cos(angle), y_m=out_m * np.sin(angle)))
+    return replace(
+        stimulus,
+        depth_m=draw_object(generator, box, x_m=out_m * np.cos(angle), y_m=out_m * np.sin(angle)),
+    )
 
 
 def several(generator: Generator, stimulus: Stimulus) -> Stimulus:
     """Add two or three separate objects."""
     box = stimulus.box
-    count, start = int(generator.integers(2, 4)), generator.uniform(0, 2 * np.pi)
+    count = int(generator.integers(2, 4))
+    start = generator.uniform(0, 2 * np.pi)
     depths_m = list[Float32]()
     for k in range(count):
-        angle, reach_m = start + 2 * np.pi * k / count, 0.3 * shapes.box_width_m(box)
-        x_m, y_m = reach_m * np.cos(angle), reach_m * np.sin(angle)
+        angle = start + 2 * np.pi * k / count
+        reach_m = 0.3 * shapes.box_width_m(box)
+        x_m = reach_m * np.cos(angle)
+        y_m = reach_m * np.sin(angle)
         size_m = shapes.box_width_m(box) * generator.uniform(0.25, 0.4)
         front_m = generator.uniform(0, 0.6) * (box.z_far_m - box.z_near_m)
-        depths_m.append(draw_object(generator, box, size_m=size_m, x_m=x_m, y_m=y_m, front_m=front_m))
+        depths_m.append(
+            draw_object(generator, box, size_m=size_m, x_m=x_m, y_m=y_m, front_m=front_m)
+        )
     return replace(stimulus, depth_m=np.fmin.reduce(depths_m))
 
 
 def blobs(generator: Generator, stimulus: Stimulus) -> Stimulus:
     """Add smooth random shapes of smooth random depth."""
     box = stimulus.box
-    covered = smooth_pattern(generator, int(generator.integers(3, 9))) > generator.uniform(0.35, 0.75)
+    covered = smooth_pattern(generator, int(generator.integers(3, 9))) > generator.uniform(
+        0.35, 0.75
+    )
     share = smooth_pattern(generator, int(generator.integers(3, 9))) * generator.uniform(0.3, 1.0)
     depth_m = box.z_near_m + share * np.float32(box.z_far_m - box.z_near_m)
     return replace(stimulus, depth_m=np.where(covered, depth_m, np.float32(np.nan)))
@@ -182,7 +215,9 @@ def blobs(generator: Generator, stimulus: Stimulus) -> Stimulus:
 
 def dim(generator: Generator, stimulus: Stimulus) -> Stimulus:
     """Add a grey or black object with an albedo of 0.05 to 0.4."""
-    return replace(ordinary(generator, stimulus), surface=Surface(float(generator.uniform(0.05, 0.4))))
+    return replace(
+        ordinary(generator, stimulus), surface=Surface(float(generator.uniform(0.05, 0.4)))
+    )
 
 
 def posts(generator: Generator, stimulus: Stimulus) -> Stimulus:
@@ -202,10 +237,13 @@ def tilted(generator: Generator, stimulus: Stimulus) -> Stimulus:
 
 def plates(generator: Generator, stimulus: Stimulus) -> Stimulus:
     """Add a large slanted plate without relief."""
-    box, steps = stimulus.box, np.linspace(-0.5, 0.5, OBJECT_PIXELS)
+    box = stimulus.box
+    steps = np.linspace(-0.5, 0.5, OBJECT_PIXELS)
     x, y = np.meshgrid(steps, -steps)
     slope_x, slope_y = generator.uniform(-1, 1, 2)
-    depth_m = generator.uniform(box.z_near_m, 0.8 * box.z_far_m) + shapes.box_width_m(box) * (slope_x * x + slope_y * y)
+    depth_m = generator.uniform(box.z_near_m, 0.8 * box.z_far_m) + shapes.box_width_m(box) * (
+        slope_x * x + slope_y * y
+    )
     half_x, half_y = generator.uniform(0.3, 0.5, 2)
     covered = (abs(x) < half_x) & (abs(y) < half_y) & (depth_m > 0.5 * box.z_near_m)
     return replace(stimulus, depth_m=np.where(covered, depth_m, np.nan).astype(np.float32))
@@ -221,15 +259,21 @@ def other_rig(generator: Generator, stimulus: Stimulus) -> Stimulus:
 def other_sensor(generator: Generator, stimulus: Stimulus) -> Stimulus:
     """Add an ordinary object, and multiply the gain by 0.3 to 0.65 or 1.6 to 3."""
     gain = float(generator.choice([generator.uniform(0.3, 0.65), generator.uniform(1.6, 3.0)]))
-    sensor = stimulus.sensor.model_copy(update={"bare_wall_counts": stimulus.sensor.bare_wall_counts * gain})
+    sensor = stimulus.sensor.model_copy(
+        update={"bare_wall_counts": stimulus.sensor.bare_wall_counts * gain}
+    )
     return replace(ordinary(generator, stimulus), sensor=sensor)
 
 
 def warped(generator: Generator, stimulus: Stimulus) -> Stimulus:
     """Add a warped object: every pixel is displaced by up to a sixth of the box, smoothly."""
-    whole_m, steps = draw_object(generator, stimulus.box), np.arange(OBJECT_PIXELS, dtype=np.float32)
+    whole_m = draw_object(generator, stimulus.box)
+    steps = np.arange(OBJECT_PIXELS, dtype=np.float32)
     x, y = np.meshgrid(steps, steps)
-    off = [(smooth_pattern(generator, 5) - np.float32(0.5)) * np.float32(OBJECT_PIXELS / 3) for _ in range(2)]
+    off = [
+        (smooth_pattern(generator, 5) - np.float32(0.5)) * np.float32(OBJECT_PIXELS / 3)
+        for _ in range(2)
+    ]
     bent = cv2.remap(whole_m, x + off[0], y + off[1], cv2.INTER_NEAREST, borderValue=float("nan"))
     return replace(stimulus, depth_m=bent.astype(np.float32))
 
@@ -245,20 +289,29 @@ def inside_out(generator: Generator, stimulus: Stimulus) -> Stimulus:
 def cut_out(generator: Generator, stimulus: Stimulus) -> Stimulus:
     """Add the flat silhouette of an object, with holes."""
     whole_m = draw_object(generator, stimulus.box)
-    holes = smooth_pattern(generator, int(generator.integers(4, 10))) > generator.uniform(0.45, 0.75)
+    holes = smooth_pattern(generator, int(generator.integers(4, 10))) > generator.uniform(
+        0.45, 0.75
+    )
     flat = np.where(holes | np.isnan(whole_m), np.nan, np.nanmedian(whole_m))
     return replace(stimulus, depth_m=flat.astype(np.float32))
 
 
 def scrambled(generator: Generator, stimulus: Stimulus) -> Stimulus:
     """Add an object cut into 3 x 3 or 4 x 4 tiles, shuffled."""
-    whole_m, n = draw_object(generator, stimulus.box), int(generator.choice([3, 4]))
+    whole_m = draw_object(generator, stimulus.box)
+    n = int(generator.choice([3, 4]))
     side = OBJECT_PIXELS // n
-    tiles = [whole_m[i * side : (i + 1) * side, j * side : (j + 1) * side] for i in range(n) for j in range(n)]
+    tiles = [
+        whole_m[i * side : (i + 1) * side, j * side : (j + 1) * side]
+        for i in range(n)
+        for j in range(n)
+    ]
     order = generator.permutation(n * n)
     mixed_m = np.block([[tiles[order[i * n + j]] for j in range(n)] for i in range(n)])
     margin = OBJECT_PIXELS - n * side
-    return replace(stimulus, depth_m=np.pad(mixed_m, (0, margin), constant_values=np.nan).astype(np.float32))
+    return replace(
+        stimulus, depth_m=np.pad(mixed_m, (0, margin), constant_values=np.nan).astype(np.float32)
+    )
 
 
 GLOSSY_LOBES = phong(0.1, 0.9, 80.0), retroreflective(0.1, 0.9, 80.0)
@@ -271,7 +324,10 @@ def panels(generator: Generator, stimulus: Stimulus) -> Stimulus:
     """Add an object in front of a panel that fills most of the box."""
     box = stimulus.box
     depth_m = draw_object(generator, box)
-    return replace(stimulus, depth_m=np.where(np.isnan(depth_m), shapes.panel(depth_m, box, generator), depth_m))
+    return replace(
+        stimulus,
+        depth_m=np.where(np.isnan(depth_m), shapes.panel(depth_m, box, generator), depth_m),
+    )
 
 
 def noise_sheet(generator: Generator, stimulus: Stimulus) -> Stimulus:
@@ -284,27 +340,43 @@ def noise_sheet(generator: Generator, stimulus: Stimulus) -> Stimulus:
 
 def bars(generator: Generator, stimulus: Stimulus) -> Stimulus:
     """Add a cage of parallel bars, upright or lying."""
-    box, period = stimulus.box, int(generator.integers(10, 24))
+    box = stimulus.box
+    period = int(generator.integers(10, 24))
     at = (np.arange(OBJECT_PIXELS) + int(generator.integers(period))) % period < max(2, period // 4)
-    depth_m = np.where(at, generator.uniform(box.z_near_m, 0.7 * box.z_far_m), np.nan).astype(np.float32)
+    depth_m = np.where(at, generator.uniform(box.z_near_m, 0.7 * box.z_far_m), np.nan).astype(
+        np.float32
+    )
     sheet = np.ascontiguousarray(np.broadcast_to(depth_m, (OBJECT_PIXELS, OBJECT_PIXELS)))
-    return replace(stimulus, depth_m=sheet if generator.random() < 0.5 else np.ascontiguousarray(sheet.T))
+    return replace(
+        stimulus, depth_m=sheet if generator.random() < 0.5 else np.ascontiguousarray(sheet.T)
+    )
 
 
 def rings(generator: Generator, stimulus: Stimulus) -> Stimulus:
     """Add a torus in any orientation."""
     box = stimulus.box
-    ring = trimesh.creation.torus(1.0, generator.uniform(0.15, 0.35), major_sections=32, minor_sections=16)
+    ring = trimesh.creation.torus(
+        1.0, generator.uniform(0.15, 0.35), major_sections=32, minor_sections=16
+    )
     turn = euler_matrix(*np.radians(generator.uniform(-60, 60, 3)))[:3, :3]
-    pose = shapes.Pose(size_m=shapes.box_width_m(box) * generator.uniform(0.55, 0.9), front_m=generator.uniform(0, 0.1))
+    pose = shapes.Pose(
+        size_m=shapes.box_width_m(box) * generator.uniform(0.55, 0.9),
+        front_m=generator.uniform(0, 0.1),
+    )
     return replace(
-        stimulus, depth_m=shapes.orthographic_depth(shapes.place(np.asarray(ring.triangles) @ turn.T, pose, box), box)
+        stimulus,
+        depth_m=shapes.orthographic_depth(
+            shapes.place(np.asarray(ring.triangles) @ turn.T, pose, box), box
+        ),
     )
 
 
 def glossy(generator: Generator, stimulus: Stimulus) -> Stimulus:
     """Add a mirror-like or a retroreflective object."""
-    return replace(ordinary(generator, stimulus), surface=Surface(1.0, GLOSSY_LOBES[int(generator.integers(2))]))
+    return replace(
+        ordinary(generator, stimulus),
+        surface=Surface(1.0, GLOSSY_LOBES[int(generator.integers(2))]),
+    )
 
 
 def two_tone(generator: Generator, stimulus: Stimulus) -> Stimulus:
@@ -319,17 +391,47 @@ def _by_name(*kinds: OutlierKind) -> Mapping[str, OutlierKind]:
 
 
 TRAINING_OUTLIERS = _by_name(
-    *(small, large, far, near, half_out, several, blobs, dim, posts, tilted, plates, other_rig, other_sensor),
+    *(
+        small,
+        large,
+        far,
+        near,
+        half_out,
+        several,
+        blobs,
+        dim,
+        posts,
+        tilted,
+        plates,
+        other_rig,
+        other_sensor,
+    ),
     *(warped, inside_out, cut_out, scrambled),
 )
 HELD_OUT_OUTLIERS = _by_name(panels, noise_sheet, bars, rings, glossy, two_tone)
-COVERED_BY_GENERIC = frozenset(_by_name(several, blobs, posts, tilted, plates, warped, inside_out, cut_out, scrambled))
-"""Training outliers that are ordinary to weights that saw generic shapes: several, turned any way, of any outline."""
-SHAPE_OUTLIERS = frozenset(
-    _by_name(blobs, posts, plates, warped, inside_out, cut_out, scrambled, panels, noise_sheet, bars, rings)
+COVERED_BY_GENERIC = frozenset(
+    _by_name(several, blobs, posts, tilted, plates, warped, inside_out, cut_out, scrambled)
 )
-"""Kinds with an unusual shape alone. All others are out of the training range in size, place, tilt, number, light, rig
-or sensor."""
+"""Training outliers that are ordinary to weights that saw generic shapes: several, turned any way,
+of any outline.
+"""
+SHAPE_OUTLIERS = frozenset(
+    _by_name(
+        blobs,
+        posts,
+        plates,
+        warped,
+        inside_out,
+        cut_out,
+        scrambled,
+        panels,
+        noise_sheet,
+        bars,
+        rings,
+    )
+)
+"""Kinds with an unusual shape alone. All others are out of the training range in size, place, tilt,
+number, light, rig or sensor."""
 
 
 def draw_outlier(kind: OutlierKind, generator: Generator, stimulus: Stimulus) -> Stimulus:
@@ -341,6 +443,8 @@ def draw_outlier(kind: OutlierKind, generator: Generator, stimulus: Stimulus) ->
 
 
 def outliers_beside(share_generic: float) -> Mapping[str, OutlierKind]:
-    """Return the training outliers for weights whose training objects had a share of generic shapes."""
+    """Return the training outliers for weights whose training objects had a share of generic
+    shapes.
+    """
     left_out = COVERED_BY_GENERIC if share_generic else frozenset[str]()
     return {name: kind for name, kind in TRAINING_OUTLIERS.items() if name not in left_out}

@@ -1,7 +1,8 @@
-"""Packed store of datasets for the direct network: normalised maps and images in float16, mapped into memory.
+"""Packed store of datasets for the direct network: normalised maps and images in float16, mapped
+into memory.
 
-A store grows: shards that appear in the datasets are added when an epoch begins. It keeps the number of objects of
-every epoch, so that an interrupted run sees the same batches again.
+A store grows: shards that appear in the datasets are added when an epoch begins. It keeps the
+number of objects of every epoch, so that an interrupted run sees the same batches again.
 """
 
 import hashlib
@@ -14,7 +15,15 @@ from pathlib import Path
 import numpy as np
 import torch
 from nlos_calibration import Rig
-from nlos_models import CellNormal, MapNoise, MapSet, NormalBatch, channels_of, first_of, read_bounded
+from nlos_models import (
+    CellNormal,
+    MapNoise,
+    MapSet,
+    NormalBatch,
+    channels_of,
+    first_of,
+    read_bounded,
+)
 from nlos_models import read_arrays as read_npz
 
 from nlos_cam.dataset.plan import DatasetPlan, RigSpread
@@ -26,7 +35,10 @@ from nlos_cam.files import atomic_file, claim
 from nlos_cam.frames import MAP_COLUMNS, MAP_ROWS, OBJECT_PIXELS
 from nlos_cam.reconstruct import align_samples
 
-INDEX, MAPS, IMAGES, CELLS = "index.json", "maps.f16", "images.f16", "cells.npz"
+INDEX = "index.json"
+MAPS = "maps.f16"
+IMAGES = "images.f16"
+CELLS = "cells.npz"
 INDEX_LIMIT = 1 << 26
 """Bytes of the index: some hundred thousand shards."""
 STATISTICS_SHARDS = 40
@@ -39,25 +51,31 @@ def _read_index(store: Path) -> dict[str, dict[str, int]]:
     try:
         found = json.loads(read_bounded(store / INDEX, INDEX_LIMIT))
         return {
-            kind: {str(key): operator.index(found[kind][key]) for key in found[kind]} for kind in ("shards", "epochs")
+            kind: {str(key): operator.index(found[kind][key]) for key in found[kind]}
+            for kind in ("shards", "epochs")
         }
     except (OSError, ValueError, TypeError, KeyError, RecursionError) as error:
         raise _damaged(store, INDEX) from error
 
 
 def _damaged(store: Path, name: str) -> RecordingError:
-    return RecordingError(f"{store / name} is damaged: delete {store}, the packed maps are then made again")
+    return RecordingError(
+        f"{store / name} is damaged: delete {store}, the packed maps are then made again"
+    )
 
 
 def map_noise(plan: DatasetPlan) -> MapNoise:
     """Return the noise of a map cell's intensity by the plan's sensor."""
-    sensor, pixels = plan.sensor, plan.rig.intrinsics.height * plan.rig.intrinsics.width
+    sensor = plan.sensor
+    pixels = plan.rig.intrinsics.height * plan.rig.intrinsics.width
     alive = (1 - sensor.dead_share) * pixels / (MAP_ROWS * MAP_COLUMNS)
     return MapNoise(sensor.read_noise_counts**2, sensor.shot_noise**2, sensor.ambient_counts, alive)
 
 
 class PackedMaps:
-    """Normalised maps and images of one or more datasets of one rig, in a folder that is theirs alone."""
+    """Normalised maps and images of one or more datasets of one rig, in a folder that is theirs
+    alone.
+    """
 
     def __init__(
         self,
@@ -70,24 +88,35 @@ class PackedMaps:
     ) -> None:
         """Open or make the store: use `open_packed_maps`, which holds its claim meanwhile.
 
-        Maps are normalised as `normal` does, by default by their own statistics. Raises RecordingError for no dataset,
-        SceneError for datasets of two rigs or a store that is normalised otherwise.
+        Maps are normalised as `normal` does, by default by their own statistics. Raises
+        RecordingError for no dataset, SceneError for datasets of two rigs or a store that is
+        normalised otherwise.
         """
         opened = [open_dataset(folder, color=color, expected=True) for folder in datasets]
         self.plan: DatasetPlan = opened[0].plan
         """Of the first dataset."""
         if others := [one.folder for one in opened if one.plan.rig != self.plan.rig]:
-            raise SceneError(f"{others[0]} and {datasets[0]} were rendered for different rigs: give datasets of one")
+            raise SceneError(
+                f"{others[0]} and {datasets[0]} were rendered for different rigs: give datasets"
+                " of one"
+            )
         if others := [one.folder for one in opened if one.plan.expected != self.plan.expected]:
-            raise SceneError(f"of {others[0]} and {datasets[0]} one holds expected maps, without noise: give one kind")
+            raise SceneError(
+                f"of {others[0]} and {datasets[0]} one holds expected maps, without noise: give one"
+                " kind"
+            )
         self.noise: MapNoise | None = map_noise(self.plan) if self.plan.expected else None
         """To be drawn at each step of training."""
-        self._datasets, self._store, self.normal = list(datasets), store, CellNormal(color=color)
+        self._datasets = list(datasets)
+        self._store = store
+        self.normal = CellNormal(color=color)
         if color and self.plan.spread != RigSpread():
             raise SceneError(
-                f"{datasets[0]} varies the rig, but maps in color are not aligned: build it without a spread"
+                f"{datasets[0]} varies the rig, but maps in color are not aligned: build it without"
+                " a spread"
             )
-        self._color, pixels = color, (OBJECT_PIXELS, OBJECT_PIXELS)
+        self._color = color
+        pixels = (OBJECT_PIXELS, OBJECT_PIXELS)
         self._rows = {
             MAPS: (channels_of(color=color), MAP_ROWS, MAP_COLUMNS),
             IMAGES: (3, *pixels) if color else pixels,
@@ -97,19 +126,34 @@ class PackedMaps:
             if normal:
                 self.normal.load_state_dict(normal.state_dict())
             else:
-                some = [self._read(shard) for one in opened for shard in one.shards[:STATISTICS_SHARDS]]
-                depth_m, intensity = ([getattr(one, name) for one in some] for name in MAP_CHANNELS[:2])
-                self.normal.learn(*(torch.from_numpy(np.concatenate(parts)) for parts in (depth_m, intensity)))
+                some = [
+                    self._read(shard) for one in opened for shard in one.shards[:STATISTICS_SHARDS]
+                ]
+                depth_m, intensity = (
+                    [getattr(one, name) for one in some] for name in MAP_CHANNELS[:2]
+                )
+                self.normal.learn(
+                    *(torch.from_numpy(np.concatenate(parts)) for parts in (depth_m, intensity))
+                )
             with atomic_file(store / CELLS) as part, part.open("wb") as file:
-                np.savez(file, **{name: values.numpy() for name, values in self.normal.state_dict().items()})
+                np.savez(
+                    file,
+                    **{name: values.numpy() for name, values in self.normal.state_dict().items()},
+                )
         try:
             cells = read_npz(store / CELLS)
-            self.normal.load_state_dict({name: torch.from_numpy(values) for name, values in cells.items()})
+            self.normal.load_state_dict(
+                {name: torch.from_numpy(values) for name, values in cells.items()}
+            )
         except (OSError, ValueError, TypeError, RuntimeError) as error:
             raise _damaged(store, CELLS) from error
         found = self.normal.state_dict()
-        if normal and any(not torch.equal(values, found[name]) for name, values in normal.state_dict().items()):
-            raise SceneError(f"{store} holds maps that are normalised for other weights: name another --store")
+        if normal and any(
+            not torch.equal(values, found[name]) for name, values in normal.state_dict().items()
+        ):
+            raise SceneError(
+                f"{store} holds maps that are normalised for other weights: name another --store"
+            )
         self.refresh(on_progress)
 
     def __len__(self) -> int:
@@ -118,7 +162,9 @@ class PackedMaps:
     @property
     def digest(self) -> str:
         """SHA-256 of the rig and of the cells' statistics: a run with others cannot be resumed."""
-        return hashlib.sha256(self.plan.rig.checksum.encode() + (self._store / CELLS).read_bytes()).hexdigest()
+        return hashlib.sha256(
+            self.plan.rig.checksum.encode() + (self._store / CELLS).read_bytes()
+        ).hexdigest()
 
     def refresh(self, on_progress: OnProgress = ignore) -> None:
         """Add the shards that appeared in the datasets since the last time."""
@@ -126,15 +172,22 @@ class PackedMaps:
         paths = [path for folder in self._datasets for path in sorted(folder.glob(SHARD_PATTERN))]
         new = [path for path in paths if str(path.resolve()) not in known]
         for name, shape in self._rows.items():
-            path, size = self._store / name, 2 * len(self) * int(np.prod(shape))
+            path = self._store / name
+            size = 2 * len(self) * int(np.prod(shape))
             path.touch()
             if path.stat().st_size < size:
                 raise _damaged(self._store, name)
-            with path.open("r+b") as file:  # rows after the last indexed one are left by an interruption
+            with path.open(
+                "r+b"
+            ) as file:  # rows after the last indexed one are left by an interruption
                 file.truncate(size)
         for number, path in enumerate(new, 1):
             maps = self._read(read_head(path))
-            normal = self.normal(torch.from_numpy(maps.depth_m), torch.from_numpy(maps.intensity)).half().numpy()
+            normal = (
+                self.normal(torch.from_numpy(maps.depth_m), torch.from_numpy(maps.intensity))
+                .half()
+                .numpy()
+            )
             for name, values in ((MAPS, normal), (IMAGES, maps.image.astype(np.float16))):
                 with (self._store / name).open("ab") as file:
                     file.write(np.ascontiguousarray(values).tobytes())
@@ -152,25 +205,32 @@ class PackedMaps:
         return _aligned(MapSet(*read_arrays(shard, MAP_CHANNELS)), rigs, self.plan.rig)
 
     def held_out(self, folder: Path, count: int) -> MapSet:
-        """Return up to `count` samples of another dataset as the store has its own: as the plan's rig sees them."""
+        """Return up to `count` samples of another dataset as the store has its own: as the plan's
+        rig sees them.
+        """
         opened = open_dataset(folder, color=self._color)
         return _aligned(first_of(opened.arrays(), count), opened.benches(), self.plan.rig)
 
     def batches(self, batch: int, generator: torch.Generator) -> Iterator[NormalBatch]:
         """Yield one pass over the objects in random order, without the last, smaller batch.
 
-        A generator's first pass adds new shards; a generator of the same seed sees the same objects again.
+        A generator's first pass adds new shards; a generator of the same seed sees the same objects
+        again.
         """
-        key, epochs = str(generator.initial_seed()), self._index["epochs"]
+        key = str(generator.initial_seed())
+        epochs = self._index["epochs"]
         if key not in epochs:
             self.refresh()
             epochs[key] = len(self)
             self._write_index()
         count = int(epochs[key])
         if count < batch:
-            raise RecordingError(f"{count} objects are fewer than a batch of {batch}: build more, or lower batch")
+            raise RecordingError(
+                f"{count} objects are fewer than a batch of {batch}: build more, or lower batch"
+            )
         files = [
-            np.memmap(self._store / name, np.float16, "r", shape=(count, *shape)) for name, shape in self._rows.items()
+            np.memmap(self._store / name, np.float16, "r", shape=(count, *shape))
+            for name, shape in self._rows.items()
         ]
         order = torch.randperm(count, generator=generator).numpy()
         for start in range(0, count - batch + 1, batch):

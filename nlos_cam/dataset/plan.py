@@ -1,4 +1,6 @@
-"""Plan of a dataset: rig and its variation, sensor, surface and objects; stored as JSON in every shard."""
+"""Plan of a dataset: rig and its variation, sensor, surface and objects; stored as JSON in every
+shard.
+"""
 
 import json
 from collections.abc import Sequence
@@ -51,7 +53,9 @@ def move_lidar(rig: Rig, place_m: float, yaw_deg: float, pitch_deg: float) -> Ri
 
 
 class RigSpread(Record):
-    """Largest deviation of each object's rig from the plan's; drawn uniformly, by the object's seed."""
+    """Largest deviation of each object's rig from the plan's; drawn uniformly, by the object's
+    seed.
+    """
 
     place_m: NotNegative = 0.0
     """Deviation of the lidar's distance, the occluder's x and its gap."""
@@ -62,37 +66,58 @@ class RigSpread(Record):
 
     def check(self, rig: Rig) -> None:
         """Raise SceneError where a draw could be an impossible rig."""
-        limit_m = min(rig.lidar.distance_m, rig.occluder.z_min_m if rig.occluder else rig.lidar.distance_m)
+        limit_m = min(
+            rig.lidar.distance_m, rig.occluder.z_min_m if rig.occluder else rig.lidar.distance_m
+        )
         if self.place_m >= limit_m:
-            raise SceneError(f"a spread of {self.place_m * 1e3:g} mm reaches the wall: keep it below {limit_m * 1e3:g}")
-        box, occluder = object_box(rig), rig.occluder
+            raise SceneError(
+                f"a spread of {self.place_m * 1e3:g} mm reaches the wall: keep it below"
+                f" {limit_m * 1e3:g}"
+            )
+        box = object_box(rig)
+        occluder = rig.occluder
         if occluder and occluder.x_m <= box.x_min_m < occluder.x_m + self.place_m:
             free_mm = f"{(box.x_min_m - occluder.x_m) * 1e3:g} mm"
             raise SceneError(
-                f"a spread of {self.place_m * 1e3:g} mm moves the occluder into the object box: keep it below {free_mm}"
+                f"a spread of {self.place_m * 1e3:g} mm moves the occluder into the object box:"
+                f" keep it below {free_mm}"
             )
         if self.angle_deg + max(abs(rig.lidar.yaw_deg), abs(rig.lidar.pitch_deg)) >= 90:
-            raise SceneError(f"a spread of {self.angle_deg:g} degrees turns the lidar away from the wall: lower it")
+            raise SceneError(
+                f"a spread of {self.angle_deg:g} degrees turns the lidar away from the wall:"
+                " lower it"
+            )
         if self.gain_share >= 1:
-            raise SceneError(f"a gain spread of {self.gain_share:.0%} leaves no light: keep it below 100 %")
+            raise SceneError(
+                f"a gain spread of {self.gain_share:.0%} leaves no light: keep it below 100 %"
+            )
 
     def draw(self, rig: Rig, sensor: SensorModel, seed: int) -> tuple[Rig, SensorModel]:
         """Return the rig and the sensor of one draw; without a spread they are the given ones."""
         if self == RigSpread():
             return rig, sensor
-        distance, yaw, pitch, place, gap, gain = np.random.default_rng([seed, _RIG_STREAM]).uniform(-1, 1, 6).tolist()
+        distance, yaw, pitch, place, gap, gain = (
+            np.random.default_rng([seed, _RIG_STREAM]).uniform(-1, 1, 6).tolist()
+        )
         occluder = rig.occluder
         if occluder:
-            shift = {"x_m": occluder.x_m + self.place_m * place, "z_min_m": occluder.z_min_m + self.place_m * gap}
+            shift = {
+                "x_m": occluder.x_m + self.place_m * place,
+                "z_min_m": occluder.z_min_m + self.place_m * gap,
+            }
             occluder = occluder.model_copy(update=shift)
-        drawn = move_lidar(rig, self.place_m * distance, self.angle_deg * yaw, self.angle_deg * pitch)
+        drawn = move_lidar(
+            rig, self.place_m * distance, self.angle_deg * yaw, self.angle_deg * pitch
+        )
         counts = {"bare_wall_counts": sensor.bare_wall_counts * (1 + self.gain_share * gain)}
         return drawn.model_copy(update={"occluder": occluder}), sensor.model_copy(update=counts)
 
 
 @dataclass(frozen=True)
 class Objects:
-    """Hidden objects: procedural ones of some categories, or the meshes of a folder, identified by their content."""
+    """Hidden objects: procedural ones of some categories, or the meshes of a folder, identified by
+    their content.
+    """
 
     categories: tuple[str, ...] = tuple(CATEGORIES)
     """A seed picks by position."""
@@ -107,8 +132,12 @@ class Objects:
     """Folder of the meshes on this machine."""
 
     @classmethod
-    def without(cls, left_out: Sequence[str], backgrounds: float = 0.0, share_generic: float = 0.0) -> Self:
-        """Return all categories but these. Raises SceneError for an unknown one, or if none is left."""
+    def without(
+        cls, left_out: Sequence[str], backgrounds: float = 0.0, share_generic: float = 0.0
+    ) -> Self:
+        """Return all categories but these. Raises SceneError for an unknown one, or if none is
+        left.
+        """
         dropped = [find_category(name).name for name in left_out]
         if not (categories := tuple(name for name in CATEGORIES if name not in dropped)):
             raise SceneError("--without leaves no object category: keep at least one")
@@ -130,15 +159,23 @@ class DatasetPlan:
     material: Material = field(default_factory=Material)
     rendering_version: int = RENDERING_VERSION
     textures: tuple[str, ...] = ()
-    """Textures of the objects; with any of them the dataset is in color, which is simulation only."""
+    """Textures of the objects; with any of them the dataset is in color, which is simulation
+    only.
+    """
     expected: bool = False
-    """Hold expected maps, without the sensor's noise, which training a direct network draws anew at each step."""
+    """Hold expected maps, without the sensor's noise, which training a direct network draws anew at
+    each step.
+    """
     objects_per_rig: int = 1
-    """Consecutive seeds that share a draw of the spread, so that the renderer keeps what depends on the rig alone."""
+    """Consecutive seeds that share a draw of the spread, so that the renderer keeps what depends on
+    the rig alone.
+    """
 
     @classmethod
     def of_scene(cls, scene: SceneFile, first_seed: int, **others: Any) -> Self:
-        """Return a plan with the rig, sensor, radiometry and material of a scene, but not its object."""
+        """Return a plan with the rig, sensor, radiometry and material of a scene, but not its
+        object.
+        """
         material = scene.hidden.material if scene.hidden else Material()
         return cls(
             scene.rig,
@@ -158,7 +195,9 @@ class DatasetPlan:
     @property
     def provenance(self) -> str:
         """Everything that decides the bits, as JSON."""
-        facts: dict[str, Any] = _PLAN.dump_python(self, mode="json", exclude={"objects": {"folder"}})
+        facts: dict[str, Any] = _PLAN.dump_python(
+            self, mode="json", exclude={"objects": {"folder"}}
+        )
         if self.textures:
             facts["note"] = SIMULATION_ONLY
         else:
@@ -191,20 +230,31 @@ class DatasetPlan:
     def differences(self, other: "DatasetPlan") -> list[str]:
         """Return the names of fields that differ; empty where both plans make the same bits."""
         names = [one.name for one in fields(self)]
-        return [name.replace("_", " ") for name in names if getattr(self, name) != getattr(other, name)]
+        return [
+            name.replace("_", " ") for name in names if getattr(self, name) != getattr(other, name)
+        ]
 
     def check(self) -> None:
         """Raise SceneError where no sample can be made by this plan."""
         _ = self.box
         self.spread.check(self.rig)
         if self.textures and self.material.albedo != 1:
-            raise SceneError("the scene's object has an albedo, but in color its albedo comes from textures: remove it")
+            raise SceneError(
+                "the scene's object has an albedo, but in color its albedo comes from textures:"
+                " remove it"
+            )
         if self.objects_per_rig > 1 and self.spread == RigSpread():
-            raise SceneError("without a spread all objects share one rig: drop --objects-per-rig, or give a spread")
+            raise SceneError(
+                "without a spread all objects share one rig: drop --objects-per-rig, or give a"
+                " spread"
+            )
         if self.expected and self.sensor.wall_texture:
             raise SceneError("expected maps are not of a wall_texture: drop --expected-maps")
         if np.ndim(self.material.albedo):
-            raise SceneError("the scene's object has three albedos, but datasets hold one intensity: give one albedo")
+            raise SceneError(
+                "the scene's object has three albedos, but datasets hold one intensity: give one"
+                " albedo"
+            )
 
 
 _PLAN = TypeAdapter(DatasetPlan)
@@ -214,4 +264,10 @@ def scene_row(rig: Rig, sensor: SensorModel) -> list[float]:
     """Return SCENE_COLUMNS of one object."""
     nowhere = float("nan")
     occluder = (rig.occluder.x_m, rig.occluder.z_min_m) if rig.occluder else (nowhere, nowhere)
-    return [rig.lidar.distance_m, rig.lidar.yaw_deg, rig.lidar.pitch_deg, *occluder, sensor.bare_wall_counts]
+    return [
+        rig.lidar.distance_m,
+        rig.lidar.yaw_deg,
+        rig.lidar.pitch_deg,
+        *occluder,
+        sensor.bare_wall_counts,
+    ]

@@ -1,6 +1,7 @@
 """Ray cluster as a farm: equal samples by the workers of many machines; a dead worker is replaced.
 
-Each machine needs this version of nlos-cam, and a folder of meshes at the same path. The caller writes the shards.
+Each machine needs this version of nlos-cam, and a folder of meshes at the same path. The caller
+writes the shards.
 """
 
 from collections.abc import Generator, Sequence
@@ -21,25 +22,35 @@ PIECES_PER_CPU = 3
 
 
 def ray_farm(address: str) -> "RayFarm":
-    """Return the farm of a cluster by its address: `auto`, HOST:PORT, ray://HOST:PORT, or `local` to start one.
+    """Return the farm of a cluster by its address: `auto`, HOST:PORT, ray://HOST:PORT, or `local`
+    to start one.
 
     Raises WorkersLostError where Ray is not installed.
     """
     try:
         import ray
     except ImportError as error:
-        raise WorkersLostError("--ray needs Ray, which is not installed: pip install 'nlos-cam[many]'") from error
+        raise WorkersLostError(
+            "--ray needs Ray, which is not installed: pip install 'nlos-cam[many]'"
+        ) from error
     return RayFarm(ray, address)
 
 
 class RayFarm:
-    """Farm on a Ray cluster: it connects when samples are requested, and disconnects when the generator is closed."""
+    """Farm on a Ray cluster: it connects when samples are requested, and disconnects when the
+    generator is closed.
+    """
 
     def __init__(self, ray: Any, address: str) -> None:
-        self._ray, self._address = ray, address
+        self._ray = ray
+        self._address = address
 
-    def __call__(self, plan: DatasetPlan, pieces: Sequence[range]) -> Generator[tuple[range, Samples]]:
-        """Yield the samples of ranges of seeds, in any order. Raises WorkersLostError where the cluster fails."""
+    def __call__(
+        self, plan: DatasetPlan, pieces: Sequence[range]
+    ) -> Generator[tuple[range, Samples]]:
+        """Yield the samples of ranges of seeds, in any order. Raises WorkersLostError where the
+        cluster fails.
+        """
         if not pieces:
             return
         self._connect()
@@ -55,12 +66,13 @@ class RayFarm:
             self._ray.init(address=self._address, log_to_driver=False, configure_logging=False)
         except (ConnectionError, ValueError, RuntimeError, OSError) as error:
             raise WorkersLostError(
-                f"no Ray cluster at {self._address!r} ({' '.join(str(error).split()):.120}): start one with "
-                "`ray start --head`, or omit --ray"
+                f"no Ray cluster at {self._address!r} ({' '.join(str(error).split()):.120}): start"
+                " one with `ray start --head`, or omit --ray"
             ) from error
 
     def _make(self, plan: DatasetPlan, pieces: Sequence[range]) -> Generator[tuple[range, Samples]]:
-        ray, remaining = self._ray, iter(pieces)
+        ray = self._ray
+        remaining = iter(pieces)
         work = ray.remote(num_cpus=1, max_retries=MAX_RETRIES)(make_piece)
         ahead = PIECES_PER_CPU * max(1, int(ray.cluster_resources().get("CPU", 1)))
         waiting = {work.remote(plan, piece, VERSION): piece for piece in islice(remaining, ahead)}
@@ -71,9 +83,14 @@ class RayFarm:
 
 
 def make_piece(plan: DatasetPlan, piece: range, wanted: str) -> Samples:
-    """Return samples, as a worker. Raises SceneError where this machine has another version than `wanted`."""
+    """Return samples, as a worker. Raises SceneError where this machine has another version than
+    `wanted`.
+    """
     if wanted != VERSION:
-        raise SceneError(f"a worker has nlos-cam {VERSION}, not {wanted}: install the same version on every machine")
+        raise SceneError(
+            f"a worker has nlos-cam {VERSION}, not {wanted}: install the same version on every"
+            " machine"
+        )
     use_one_thread()
     return make_samples(plan, piece)
 
@@ -84,4 +101,6 @@ def _cause(error: Exception) -> NlosCamError:
     if isinstance(cause, NlosCamError):
         return cause
     problem = " ".join(str(error).split())
-    return WorkersLostError(f"the Ray cluster failed ({problem:.200}): finished shards are kept; build again")
+    return WorkersLostError(
+        f"the Ray cluster failed ({problem:.200}): finished shards are kept; build again"
+    )

@@ -18,12 +18,16 @@ from nlos_cam.errors import RecordingError, SceneError
 
 MAP_CHANNELS = ("depth_m", "intensity", "image")
 BUFFER = 40
-"""Shards that are shuffled together and kept in memory (twice as many while a batch spans two such blocks)."""
+"""Shards that are shuffled together and kept in memory (twice as many while a batch spans two such
+blocks).
+"""
 
 
 @dataclass(frozen=True)
 class Dataset:
-    """Dataset in a folder: the heads of its shards, in the order of their seeds. Arrays are read when requested."""
+    """Dataset in a folder: the heads of its shards, in the order of their seeds. Arrays are read
+    when requested.
+    """
 
     folder: Path
     plan: DatasetPlan
@@ -33,7 +37,9 @@ class Dataset:
         return sum(len(shard.seeds) for shard in self.shards)
 
     def column(self, name: str) -> NDArray[Any]:
-        """Return an array over all samples: seed, category (n,), scene (n, 6), object_depth_m (n, 64, 64) or a map."""
+        """Return an array over all samples: seed, category (n,), scene (n, 6), object_depth_m (n,
+        64, 64) or a map.
+        """
         return np.concatenate([read_arrays(shard, [name])[0] for shard in self.shards])
 
     def benches(self) -> Iterator[Rig]:
@@ -42,21 +48,30 @@ class Dataset:
 
     def arrays(self) -> MapSet:
         """Read all maps and images."""
-        return MapSet(*(np.concatenate(parts) for parts in zip(*map(_maps, self.shards), strict=True)))
+        return MapSet(
+            *(np.concatenate(parts) for parts in zip(*map(_maps, self.shards), strict=True))
+        )
 
     def chunks(self) -> Iterator[MapSet]:
         """Yield all maps and images in order, one shard at a time."""
         for shard in self.shards:
             yield MapSet(*_maps(shard))
 
-    def batches(self, seed: int, epoch: int, batch: int, *, rank: int = 0, world: int = 1) -> Iterator[MapBatch]:
-        """Yield one epoch of batches, shuffled and mirrored at random, by seed and epoch alone; `row` is the dataset's.
+    def batches(
+        self, seed: int, epoch: int, batch: int, *, rank: int = 0, world: int = 1
+    ) -> Iterator[MapBatch]:
+        """Yield one epoch of batches, shuffled and mirrored at random, by seed and epoch alone;
+        `row` is the dataset's.
 
-        Each of `world` processes gets its share of every batch: together they see the batches of a single process. The
-        last, smaller batch is left out. Raises SceneError where a batch cannot be shared evenly.
+        Each of `world` processes gets its share of every batch: together they see the batches of a
+        single process. The last, smaller batch is left out. Raises SceneError where a batch cannot
+        be shared evenly.
         """
         if batch % world or not 0 <= rank < world <= len(self):
-            raise SceneError(f"a batch of {batch} cannot be shared by {world} processes: use a multiple of {world}")
+            raise SceneError(
+                f"a batch of {batch} cannot be shared by {world} processes: use a multiple of"
+                f" {world}"
+            )
         generator = np.random.default_rng([seed, epoch])
         blocks = self._shuffled_blocks(generator)
         order = np.concatenate([rows for _, rows in blocks])
@@ -66,9 +81,16 @@ class Dataset:
             rows = order[start : start + batch][rank::world]
             yield as_batch(window.take(rows), rows, mirrored[start : start + batch][rank::world])
 
-    def _shuffled_blocks(self, generator: np.random.Generator) -> list[tuple[NDArray[np.int64], Int64]]:
-        """Return blocks of BUFFER shards in random order, each with all its rows in random order."""
-        rows_of = [np.arange(end - len(shard.seeds), end) for shard, end in zip(self.shards, self.ends, strict=True)]
+    def _shuffled_blocks(
+        self, generator: np.random.Generator
+    ) -> list[tuple[NDArray[np.int64], Int64]]:
+        """Return blocks of BUFFER shards in random order, each with all its rows in random
+        order.
+        """
+        rows_of = [
+            np.arange(end - len(shard.seeds), end)
+            for shard, end in zip(self.shards, self.ends, strict=True)
+        ]
         order = generator.permutation(len(self.shards))
         blocks = [order[k : k + BUFFER] for k in range(0, len(order), BUFFER)]
         rows = [np.concatenate([rows_of[shard] for shard in some]) for some in blocks]
@@ -81,11 +103,16 @@ class Dataset:
 
 
 class _Window:
-    """Shards in memory during one epoch: each is read once, and dropped after the last batch of its block."""
+    """Shards in memory during one epoch: each is read once, and dropped after the last batch of its
+    block.
+    """
 
     def __init__(self, dataset: Dataset, blocks: list[NDArray[np.int64]]) -> None:
-        self._dataset, self._ends = dataset, dataset.ends
-        self._block = {int(shard): number for number, shards in enumerate(blocks) for shard in shards}
+        self._dataset = dataset
+        self._ends = dataset.ends
+        self._block = {
+            int(shard): number for number, shards in enumerate(blocks) for shard in shards
+        }
         self._held: dict[int, list[NDArray[Any]]] = {}
 
     def take(self, rows: Int64) -> MapSet:
@@ -93,7 +120,9 @@ class _Window:
         shards = np.searchsorted(self._ends, rows, side="right")
         wanted = [int(shard) for shard in np.unique(shards)]
         oldest = min((self._block[shard] for shard in wanted), default=0)
-        self._held = {shard: maps for shard, maps in self._held.items() if self._block[shard] >= oldest}
+        self._held = {
+            shard: maps for shard, maps in self._held.items() if self._block[shard] >= oldest
+        }
         for shard in wanted:
             if shard not in self._held:
                 self._held[shard] = _maps(self._dataset.shards[shard])
@@ -107,26 +136,35 @@ class _Window:
 
 
 def open_dataset(folder: Path, *, color: bool = False, expected: bool = False) -> Dataset:
-    """Open a folder's dataset, of depth or in color; one of expected maps only where `expected` maps will do.
+    """Open a folder's dataset, of depth or in color; one of expected maps only where `expected`
+    maps will do.
 
     Raises RecordingError where there is none, one of another kind, or shards of two datasets.
     """
     if not (shards := shards_of(folder)):
-        raise RecordingError(f"no dataset in {folder}: it holds no shard-*.h5; make one with `nlos-cam dataset build`")
+        raise RecordingError(
+            f"no dataset in {folder}: it holds no shard-*.h5; make one with `nlos-cam dataset"
+            " build`"
+        )
     plan = shards[0].plan
     for shard in shards[1:]:
         if shard.provenance != shards[0].provenance and shard.plan != plan:
-            raise RecordingError(f"{shard.path} is of another dataset than {shards[0].path.name}: remove one of them")
+            raise RecordingError(
+                f"{shard.path} is of another dataset than {shards[0].path.name}: remove one of them"
+            )
     if plan.textures and not color:
-        raise RecordingError(f"{folder} holds a dataset in color ({SIMULATION_ONLY}): give one of depth")
+        raise RecordingError(
+            f"{folder} holds a dataset in color ({SIMULATION_ONLY}): give one of depth"
+        )
     if plan.expected and not expected:
         raise RecordingError(
-            f"{folder} holds expected maps, to which only training on raw maps adds noise: make them without "
-            "--expected-maps"
+            f"{folder} holds expected maps, to which only training on raw maps adds noise: make"
+            " them without --expected-maps"
         )
     if color and not plan.textures:
         raise RecordingError(
-            f"{folder} holds a dataset of depth: make one in color with `nlos-cam dataset build --colour`"
+            f"{folder} holds a dataset of depth: make one in color with `nlos-cam dataset build"
+            " --colour`"
         )
     return Dataset(folder, plan, tuple(shards))
 

@@ -1,4 +1,5 @@
-"""Samples by seed: a hidden object, its rig, its rendering and its noise depend on the object's seed alone.
+"""Samples by seed: a hidden object, its rig, its rendering and its noise depend on the object's
+seed alone.
 
 Torch must not be imported here: workers do not need it, and its import takes seconds.
 """
@@ -21,11 +22,14 @@ from nlos_cam.frames import LidarMaps
 from nlos_cam.render import Radiometry, Scene, Sensor, SensorModel, Surface, render
 
 Samples = Mapping[str, NDArray[Any]]
-"""Arrays with one row per object: depth_m and intensity (n, 64, 80), image and object_depth_m (n, 64, 64), seed (n,),
-scene (n, 6), category (n,). In color intensity is (n, 3, 64, 80), image (n, 3, 64, 64), and there is texture (n,)."""
+"""Arrays with one row per object: depth_m and intensity (n, 64, 80), image and object_depth_m (n,
+64, 64), seed (n,), scene (n, 6), category (n,). In color intensity is (n, 3, 64, 80), image (n, 3,
+64, 64), and there is texture (n,)."""
 
 _SHARE_STREAM = 3
-"""Stream of an object's random numbers that decides whether it is generic; see `plan._RIG_STREAM`."""
+"""Stream of an object's random numbers that decides whether it is generic; see
+`plan._RIG_STREAM`.
+"""
 
 OnProgress = Callable[[int, int], None]
 """Callback with the count of finished items, and of all."""
@@ -44,7 +48,8 @@ def procedural_images(
     backgrounds: float = 0.0,
     textures: Sequence[str] = (),
 ) -> NDArray[np.float16]:
-    """Return images (count, 64, 64) of random objects without rendering, as a VAE needs them; see `object_depth`.
+    """Return images (count, 64, 64) of random objects without rendering, as a VAE needs them; see
+    `object_depth`.
 
     With textures, they are in color: (count, 3, 64, 64).
     """
@@ -56,27 +61,40 @@ def procedural_images(
 
 
 def sense_object(
-    scene: Scene, sensor: Sensor, seed: int, accuracy: str = "standard", exposure: int = 0, *, expected: bool = False
+    scene: Scene,
+    sensor: Sensor,
+    seed: int,
+    accuracy: str = "standard",
+    exposure: int = 0,
+    *,
+    expected: bool = False,
 ) -> LidarMaps:
-    """Return the maps of one rendered scene, by the sensor model and the reduction of live frames, or expected ones."""
+    """Return the maps of one rendered scene, by the sensor model and the reduction of live frames,
+    or expected ones.
+    """
     echoes = render(scene, accuracy).multi
-    generator = None if expected else np.random.default_rng([seed, 1, exposure])  # numpy: [seed, 1, 0] is [seed, 1]
+    generator = (
+        None if expected else np.random.default_rng([seed, 1, exposure])
+    )  # numpy: [seed, 1, 0] is [seed, 1]
     return sensor.maps(echoes, generator)
 
 
 def sense_color(
     scene: Scene, sensor: Sensor, seed: int, accuracy: str = "standard", *, expected: bool = False
 ) -> LidarMaps:
-    """Return the maps of a scene whose albedo has three channels; intensity is (3, 64, 80). Simulation only.
+    """Return the maps of a scene whose albedo has three channels; intensity is (3, 64, 80).
+    Simulation only.
 
-    The simulated lidar has three lasers and one detector. It exposes each instant four times, each time with the same
-    gain and new noise: in white (each laser at a third of its power) for the depth, and in red, green and blue.
+    The simulated lidar has three lasers and one detector. It exposes each instant four times, each
+    time with the same gain and new noise: in white (each laser at a third of its power) for the
+    depth, and in red, green and blue.
     """
     albedo = np.asarray(scene.surface.albedo)
     lights = (albedo.mean(-1), *np.moveaxis(albedo, -1, 0))
     scenes = (replace(scene, surface=Surface(light, scene.surface.brdf)) for light in lights)
     white, *colors = (
-        sense_object(one, sensor, seed, accuracy, exposure, expected=expected) for exposure, one in enumerate(scenes)
+        sense_object(one, sensor, seed, accuracy, exposure, expected=expected)
+        for exposure, one in enumerate(scenes)
     )
     return replace(white, intensity=np.stack([maps.intensity for maps in colors]))
 
@@ -85,12 +103,17 @@ def make_samples(plan: DatasetPlan, seeds: Sequence[int]) -> Samples:
     """Return the samples of some seeds, with the same bits on any machine and in any order."""
     objects = [hidden_object(plan.objects, seed, plan.box) for seed in seeds]
     rigs = [plan.bench_of(seed) for seed in seeds]
-    coats = [_coat(seed, depth_m, plan.textures) for seed, (_, depth_m) in zip(seeds, objects, strict=True)]
+    coats = [
+        _coat(seed, depth_m, plan.textures)
+        for seed, (_, depth_m) in zip(seeds, objects, strict=True)
+    ]
     maps = [
         _sense(plan, depth_m, coat, rig, model, seed)
         for (_, depth_m), coat, (rig, model), seed in zip(objects, coats, rigs, seeds, strict=True)
     ]
-    images = [_image(depth, plan.box, coat) for (_, depth), coat in zip(objects, coats, strict=True)]
+    images = [
+        _image(depth, plan.box, coat) for (_, depth), coat in zip(objects, coats, strict=True)
+    ]
     textures = [coat.texture for coat in coats if coat]
     return {
         "depth_m": np.stack([m.depth_m for m in maps]),
@@ -109,11 +132,20 @@ def _coat(seed: int, depth_m: Float32, textures: Sequence[str]) -> shapes.Coat |
 
 
 def _image(depth_m: Float32, box: ObjectBox, coat: shapes.Coat | None) -> Float32:
-    return shapes.image_from_albedo(coat.albedo, depth_m) if coat else shapes.image_from_depth(depth_m, box)
+    return (
+        shapes.image_from_albedo(coat.albedo, depth_m)
+        if coat
+        else shapes.image_from_depth(depth_m, box)
+    )
 
 
 def _sense(
-    plan: DatasetPlan, depth_m: Float32, coat: shapes.Coat | None, rig: Rig, model: SensorModel, seed: int
+    plan: DatasetPlan,
+    depth_m: Float32,
+    coat: shapes.Coat | None,
+    rig: Rig,
+    model: SensorModel,
+    seed: int,
 ) -> LidarMaps:
     scene = Scene(rig, depth_m, plan.material.surface, plan.radiometry, plan.jump_m, model.pulse_ns)
     sensor = cached_sensor(rig, model, plan.radiometry)  # pyright: ignore[reportArgumentType]  frozen, so hashable
@@ -135,8 +167,13 @@ def join_samples(parts: Sequence[Samples]) -> Samples:
 
 
 def hidden_object(objects: Objects, seed: int, box: ObjectBox) -> tuple[str, Float32]:
-    """Return one random object: its category, family or mesh, and its depth map (64, 64) in metres, NaN background."""
-    if objects.share_generic and np.random.default_rng([seed, _SHARE_STREAM]).random() < objects.share_generic:
+    """Return one random object: its category, family or mesh, and its depth map (64, 64) in metres,
+    NaN background.
+    """
+    if (
+        objects.share_generic
+        and np.random.default_rng([seed, _SHARE_STREAM]).random() < objects.share_generic
+    ):
         return shapes.generic_depth(seed, box)
     if not objects.meshes:
         return shapes.object_depth(seed, box, objects.categories, backgrounds=objects.backgrounds)
@@ -149,8 +186,11 @@ def hidden_object(objects: Objects, seed: int, box: ObjectBox) -> tuple[str, Flo
 
 
 def objects_from_folder(folder: Path, on_progress: OnProgress = ignore) -> Objects:
-    """Read the meshes of a folder and its subfolders. Raises SceneError for none, or one that cannot be used."""
-    paths, meshes = shapes.folder_objects(folder), list[tuple[str, str]]()
+    """Read the meshes of a folder and its subfolders. Raises SceneError for none, or one that
+    cannot be used.
+    """
+    paths = shapes.folder_objects(folder)
+    meshes = list[tuple[str, str]]()
     for path in paths:
         name = path.relative_to(folder).as_posix()
         try:
@@ -166,5 +206,7 @@ def objects_from_folder(folder: Path, on_progress: OnProgress = ignore) -> Objec
 def _unchanged(path: Path, sha256: str) -> shapes.MeshFile:
     mesh = shapes.read_mesh(path)
     if mesh.sha256 != sha256:
-        raise SceneError(f"{path} changed since the dataset was started: restore it, or choose another --out")
+        raise SceneError(
+            f"{path} changed since the dataset was started: restore it, or choose another --out"
+        )
     return mesh

@@ -1,4 +1,6 @@
-"""Shards of a dataset: HDF5 files of samples with their plan and checksums of all arrays, and the lock of a builder."""
+"""Shards of a dataset: HDF5 files of samples with their plan and checksums of all arrays, and the
+lock of a builder.
+"""
 
 import errno
 import hashlib
@@ -22,7 +24,8 @@ from nlos_cam.dataset.samples import Samples
 from nlos_cam.errors import DiskFullError, FolderBusyError, OutputExistsError, RecordingError
 from nlos_cam.files import atomic_file
 
-SHARD_PATTERN, PART_PATTERN = "shard-*.h5", "*shard-*.part"
+SHARD_PATTERN = "shard-*.h5"
+PART_PATTERN = "*shard-*.part"
 REQUIRED_ARRAYS = ("depth_m", "intensity", "image", "object_depth_m", "seed", "category", "scene")
 NO_ROOM = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
 """No space left, a quota reached, or a limit on the size of files."""
@@ -44,7 +47,9 @@ class Shard:
             return DatasetPlan.from_provenance(self.provenance)
         except ValueError as error:
             problem = " ".join(str(error).split())
-            raise RecordingError(f"{self.path} has a plan that cannot be read: {problem:.200}") from error
+            raise RecordingError(
+                f"{self.path} has a plan that cannot be read: {problem:.200}"
+            ) from error
 
 
 def shard_path(folder: Path, first_seed: int) -> Path:
@@ -53,12 +58,17 @@ def shard_path(folder: Path, first_seed: int) -> Path:
 
 
 def shards_of(folder: Path) -> list[Shard]:
-    """Return the heads of a folder's shards, in the order of their seeds. Raises RecordingError for a damaged one."""
-    heads = sorted((read_head(path) for path in folder.glob(SHARD_PATTERN)), key=lambda head: head.seeds.start)
+    """Return the heads of a folder's shards, in the order of their seeds. Raises RecordingError for
+    a damaged one.
+    """
+    heads = sorted(
+        (read_head(path) for path in folder.glob(SHARD_PATTERN)), key=lambda head: head.seeds.start
+    )
     for one, following in pairwise(heads):
         if following.seeds.start < one.seeds.stop:
             raise RecordingError(
-                f"{following.path} and {one.path.name} hold the same objects: they belong to two datasets; delete one"
+                f"{following.path} and {one.path.name} hold the same objects: they belong to two"
+                " datasets; delete one"
             )
     return heads
 
@@ -66,7 +76,8 @@ def shards_of(folder: Path) -> list[Shard]:
 def read_head(path: Path) -> Shard:
     """Return the head of a shard. Raises RecordingError where it cannot be read."""
     with open_shard(path) as file:
-        plan, seeds = read_text(file, "plan"), _checked(path, "seed", file)
+        plan = read_text(file, "plan")
+        seeds = _checked(path, "seed", file)
         if read_text(file, "plan_sha256", "") != _digest(plan.encode()):
             raise _damaged(path, "the checksum of its plan is missing or differs")
         consecutive = seeds.ndim == 1 and len(seeds) and (np.diff(seeds) == 1).all()
@@ -76,7 +87,9 @@ def read_head(path: Path) -> Shard:
 
 
 def shard_origin(path: Path) -> tuple[str, str]:
-    """Return the version of nlos-cam and the command that made a shard; "unknown" as far as it does not say."""
+    """Return the version of nlos-cam and the command that made a shard; "unknown" as far as it does
+    not say.
+    """
     with open_shard(path) as file:
         return read_text(file, "package_version", "unknown"), read_text(file, "command", "unknown")
 
@@ -87,7 +100,9 @@ def read_arrays(head: Shard, names: Sequence[str]) -> list[NDArray[Any]]:
         found = [_checked(head.path, name, file) for name in names]
     for name, values in zip(names, found, strict=True):
         if len(values) != len(head.seeds):
-            raise _damaged(head.path, f"{name} has {len(values)} rows for {len(head.seeds)} objects")
+            raise _damaged(
+                head.path, f"{name} has {len(values)} rows for {len(head.seeds)} objects"
+            )
     return found
 
 
@@ -109,7 +124,8 @@ def store(path: Path, samples: Samples, provenance: str, command: str) -> None:
     except OSError as error:
         if error.errno in NO_ROOM:
             raise DiskFullError(
-                f"no room for {path} ({error.strerror}): what was made so far is kept; make room and build again"
+                f"no room for {path} ({error.strerror}): what was made so far is kept; make room"
+                " and build again"
             ) from error
         raise
 
@@ -118,14 +134,18 @@ def _as_bytes(samples: Samples, provenance: str, command: str) -> bytes:
     memory = BytesIO()
     with h5py.File(memory, "w") as file:
         seeds = samples["seed"]
-        file.attrs.update({"plan": provenance, "plan_sha256": _digest(provenance.encode()), "command": command})
+        file.attrs.update(
+            {"plan": provenance, "plan_sha256": _digest(provenance.encode()), "command": command}
+        )
         file.attrs["package_version"] = version("nlos-cam")
         file.attrs.update({"first_seed": int(seeds[0]), "last_seed": int(seeds[-1])})
         for name, values in samples.items():
             if values.dtype == object:
                 stored = file.create_dataset(name, data=values, dtype=h5py.string_dtype())
             else:
-                stored = file.create_dataset(name, data=values, compression="gzip", compression_opts=1)
+                stored = file.create_dataset(
+                    name, data=values, compression="gzip", compression_opts=1
+                )
             stored.attrs["sha256"] = content_checksum(values)
         file["scene"].attrs["columns"] = SCENE_COLUMNS
     return memory.getvalue()
@@ -134,7 +154,11 @@ def _as_bytes(samples: Samples, provenance: str, command: str) -> bytes:
 def content_checksum(values: NDArray[Any]) -> str:
     """Return the SHA-256 of an array's type, shape and values."""
     kind = f"{values.dtype.str} {values.shape} ".encode()
-    content = "\0".join(values).encode() if values.dtype == object else np.ascontiguousarray(values).tobytes()
+    content = (
+        "\0".join(values).encode()
+        if values.dtype == object
+        else np.ascontiguousarray(values).tobytes()
+    )
     return _digest(kind + content)
 
 
@@ -173,8 +197,8 @@ def _damaged(path: Path, why: str) -> RecordingError:
 def only_builder(folder: Path) -> Generator[None]:
     """Hold the right to build in a folder, which the system releases when its holder dies.
 
-    Raises FolderBusyError, with the holder's process id, where another process has it, and OutputExistsError where the
-    folder cannot be written to.
+    Raises FolderBusyError, with the holder's process id, where another process has it, and
+    OutputExistsError where the folder cannot be written to.
     """
     try:
         with claim(folder, inside=True):

@@ -1,4 +1,6 @@
-"""Training maps of a recipe, in memory or streamed, and the bare wall that difference maps subtract."""
+"""Training maps of a recipe, in memory or streamed, and the bare wall that difference maps
+subtract.
+"""
 
 import hashlib
 from collections.abc import Iterator
@@ -52,7 +54,9 @@ class MapSplit(NamedTuple):
         return hashlib.sha256(self.rig[1].encode() + self.training.image.tobytes()).hexdigest()
 
     def limit_recipe(self, recipe: Recipe) -> Recipe:
-        """Return the recipe with the number of held-out objects available, which may be lower than it requests."""
+        """Return the recipe with the number of held-out objects available, which may be lower than
+        it requests.
+        """
         return recipe.model_copy(update={"held_out": len(self.held_out.image)})
 
 
@@ -67,12 +71,15 @@ class Streamed:
 
     def first(self, count: int) -> MapSet:
         """Return the first `count` objects, in memory."""
-        parts, rows = list[MapSet](), 0
+        parts = list[MapSet]()
+        rows = 0
         for chunk in self.dataset.chunks():
             parts.append(chunk)
             if (rows := rows + len(chunk.image)) >= count:
                 break
-        arrays = (np.concatenate([getattr(part, name) for part in parts])[:count] for name in MAP_CHANNELS)
+        arrays = (
+            np.concatenate([getattr(part, name) for part in parts])[:count] for name in MAP_CHANNELS
+        )
         maps = MapSet(*arrays)
         return subtract_bare_wall(maps, *self.bare) if self.bare else maps
 
@@ -86,7 +93,8 @@ class Streamed:
 def _subtract(batch: MapBatch, bare: BareMaps) -> MapBatch:
     """Return a batch less the bare wall, which is mirrored where the sample is."""
     depth_m, intensity = (
-        torch.where(batch.mirrored[:, None, None], plain.flip(-2), plain) for plain in map(torch.from_numpy, bare)
+        torch.where(batch.mirrored[:, None, None], plain.flip(-2), plain)
+        for plain in map(torch.from_numpy, bare)
     )
     difference_m = batch.depth_m - depth_m
     brighter = torch.where(torch.isnan(difference_m), 0.0, batch.intensity - intensity)
@@ -102,27 +110,38 @@ def read_maps(
     stream: bool = False,
     start: CheckpointRecord | None = None,
 ) -> MapSplit:
-    """Return the maps of a recipe. Raises SceneError where they are too few, of two rigs, or not held out.
+    """Return the maps of a recipe. Raises SceneError where they are too few, of two rigs, or not
+    held out.
 
-    To expected maps the sensor's noise is added, in each epoch another draw. A stream reads a whole dataset and keeps a
-    few shards in memory. Maps of another rig than that of the weights that a transfer has as its `start` are aligned
-    with it.
+    To expected maps the sensor's noise is added, in each epoch another draw. A stream reads a whole
+    dataset and keeps a few shards in memory. Maps of another rig than that of the weights that a
+    transfer has as its `start` are aligned with it.
     """
     if wall and recipe.maps == "raw maps":
-        raise SceneError(f"--wall {wall} only applies to difference maps; this recipe uses raw maps")
+        raise SceneError(
+            f"--wall {wall} only applies to difference maps; this recipe uses raw maps"
+        )
     if data.resolve() == held_out_data.resolve():
-        raise SceneError(f"--dataset and --held-out are the same folder ({data}): hold out different objects")
+        raise SceneError(
+            f"--dataset and --held-out are the same folder ({data}): hold out different objects"
+        )
     dataset = open_dataset(data, color=recipe.colour, expected=recipe.maps == "raw maps")
     other = open_dataset(held_out_data, color=recipe.colour)
-    plan, count = dataset.plan, len(dataset)
+    plan = dataset.plan
+    count = len(dataset)
     if count < recipe.objects:
         raise SceneError(
-            f"{data} holds {count} objects, the recipe needs {recipe.objects}: build more, or lower --objects"
+            f"{data} holds {count} objects, the recipe needs {recipe.objects}: build more, or lower"
+            " --objects"
         )
     if plan.rig != other.plan.rig:
-        raise SceneError(f"{data} and {held_out_data} were rendered for different rigs: build one of them again")
+        raise SceneError(
+            f"{data} and {held_out_data} were rendered for different rigs: build one of them again"
+        )
     if stream and count != recipe.objects:
-        raise SceneError(f"{data} holds {count} objects, and a stream reads all of them: give --objects {count}")
+        raise SceneError(
+            f"{data} holds {count} objects, and a stream reads all of them: give --objects {count}"
+        )
     bare = None
     if recipe.maps == "difference maps":
         bare = measured_bare_wall(wall) if wall else render_bare_wall(plan)
@@ -131,7 +150,8 @@ def read_maps(
         held_out = subtract_bare_wall(held_out, *bare)
     rig = plan.rig
     if start:
-        rig, held_out = rig_to_align_with(rig, start) or rig, align_all(held_out, other.benches(), start)
+        rig = rig_to_align_with(rig, start) or rig
+        held_out = align_all(held_out, other.benches(), start)
     source: MapSource
     if stream:
         source = Streamed(dataset, dataset.column("image"), bare)
@@ -144,20 +164,28 @@ def read_maps(
 
 
 def measured_bare_wall(path: Path) -> BareMaps:
-    """Return depth and intensity, each (64, 80), of the bare wall that `calibrate --wall` recorded."""
+    """Return depth and intensity, each (64, 80), of the bare wall that `calibrate --wall`
+    recorded.
+    """
     wall = load_measured(path).reference
     if wall is None:
-        raise SceneError(f"{path} has no bare-wall reference for difference maps: calibrate the wall again")
+        raise SceneError(
+            f"{path} has no bare-wall reference for difference maps: calibrate the wall again"
+        )
     return wall.map_depth_m, wall.map_intensity
 
 
 def render_bare_wall(plan: DatasetPlan, frames: int = BARE_WALL_FRAMES) -> BareMaps:
-    """Return depth and intensity, each (64, 80), of the rig with nothing hidden: the mean of some noisy frames.
+    """Return depth and intensity, each (64, 80), of the rig with nothing hidden: the mean of some
+    noisy frames.
 
     Raises SceneError where the rig varies between objects, which then have no bare wall in common.
     """
     if plan.spread != RigSpread():
-        raise SceneError("the rig of this dataset varies between objects: difference maps need one rig, or --wall")
+        raise SceneError(
+            "the rig of this dataset varies between objects: difference maps need one rig, or"
+            " --wall"
+        )
     sensor = Sensor(plan.rig, plan.sensor, plan.radiometry)
     echoes = render(Scene(plan.rig, radiometry=plan.radiometry), plan.accuracy).multi
     depth, intensity = (Moments((MAP_ROWS, MAP_COLUMNS)) for _ in range(2))

@@ -1,8 +1,9 @@
-"""Worker processes of a dataset: one thread, no reaction to Ctrl-C, and an end when their parent ends.
+"""Worker processes of a dataset: one thread, no reaction to Ctrl-C, and an end when their parent
+ends.
 
-Each has a pipe of its own, so that one can be ended at any time: the executors of the standard library wait forever for
-the rest of an answer where a worker is ended while it sends one. Numpy must not be imported here: BLAS reads the number
-of its threads once, when numpy is imported.
+Each has a pipe of its own, so that one can be ended at any time: the executors of the standard
+library wait forever for the rest of an answer where a worker is ended while it sends one. Numpy
+must not be imported here: BLAS reads the number of its threads once, when numpy is imported.
 """
 
 import os
@@ -23,7 +24,9 @@ if TYPE_CHECKING:
 
 CONTEXT = get_context("spawn")
 AHEAD = 2
-"""Pieces that a worker is asked for at a time: it makes the second while its parent stores the first."""
+"""Pieces that a worker is asked for at a time: it makes the second while its parent stores the
+first.
+"""
 END_S = 5.0
 """Time for a worker without work to end by itself."""
 
@@ -32,7 +35,9 @@ class Worker:
     """Process that makes pieces of a dataset, seen from its parent."""
 
     def __init__(self, plan: "DatasetPlan", left: deque[range]) -> None:
-        """Start it with the first pieces that are left. Raises WorkersLostError where no process can be started."""
+        """Start it with the first pieces that are left. Raises WorkersLostError where no process
+        can be started.
+        """
         self.pipe, other = CONTEXT.Pipe()
         self.asked = deque[range]()
         self._process = CONTEXT.Process(target=make_pieces, args=(other,), daemon=True)
@@ -40,7 +45,8 @@ class Worker:
             self._process.start()
         except OSError as error:
             raise WorkersLostError(
-                f"no worker can be started ({error.strerror}): free memory or processes, or lower --workers"
+                f"no worker can be started ({error.strerror}): free memory or processes, or lower"
+                " --workers"
             ) from error
         finally:
             other.close()  # the pipe ends with the process
@@ -50,7 +56,8 @@ class Worker:
     def take(self, left: deque[range]) -> "tuple[range, Samples] | None":
         """Return the oldest piece that it was asked for, and ask for one more.
 
-        Returns None, and puts its pieces back, where the process has ended. Raises what making the piece raised.
+        Returns None, and puts its pieces back, where the process has ended. Raises what making the
+        piece raised.
         """
         try:
             made = self.pipe.recv()
@@ -105,7 +112,9 @@ def begin_worker() -> None:
     """Set up this process as a worker, until it ends."""
     os.environ["OPENBLAS_NUM_THREADS"] = os.environ["MKL_NUM_THREADS"] = "1"
     use_one_thread()
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the whole group: the parent ends its workers
+    signal.signal(
+        signal.SIGINT, signal.SIG_IGN
+    )  # Ctrl-C reaches the whole group: the parent ends its workers
     Thread(target=end_with_parent, daemon=True).start()
 
 
@@ -117,7 +126,9 @@ def use_one_thread() -> None:
 
 
 def end_with_parent() -> None:
-    """Wait for the parent process to end, killed or not, then end this one, which would wait for work for ever."""
+    """Wait for the parent process to end, killed or not, then end this one, which would wait for
+    work for ever.
+    """
     if parent := parent_process():
         parent.join()
         os._exit(1)
