@@ -1,6 +1,8 @@
-"""Checks of everything between a camera and this program: Linux, librealsense and Python, USB, firmware.
+"""Checks of everything between a camera and this program: Linux, librealsense and Python, USB,
+firmware.
 
-Each check answers one question about the facts with a finding: status, detail and, unless all is well, a fix.
+Each check answers one question about the facts with a finding: status, detail and, unless all is
+well, a fix.
 """
 
 import re
@@ -11,8 +13,9 @@ from nlos_cam.doctor.host import L515, LIDARS, Host, KernelCamera
 from nlos_cam.doctor.udev import RELOAD, WRITE_AND_INSTALL
 
 CONTAINER_FIX = (
-    'start the container with `-v /dev:/dev -v /sys:/sys --device-cgroup-rule "c 81:* rmw" --device-cgroup-rule '
-    '"c 189:* rmw"`, and install the udev rules and kernel modules on the host'
+    'start the container with `-v /dev:/dev -v /sys:/sys --device-cgroup-rule "c 81:* rmw"'
+    ' --device-cgroup-rule "c 189:* rmw"`, and install the udev rules and kernel modules on the'
+    " host"
 )
 NOT_LINUX = "only Linux needs this"
 NO_CAMERA_IN_KERNEL = "the kernel sees no L515"
@@ -41,12 +44,15 @@ def container(facts: Facts) -> Finding:
         return ok("not in a container")
     if host.cameras and not facts.usb.of_kind("camera") + facts.usb.of_kind("recovery"):
         return failed(
-            f"running in a container ({host.container}); the host's L515 is not passed into it", CONTAINER_FIX
+            f"running in a container ({host.container}); the host's L515 is not passed into it",
+            CONTAINER_FIX,
         )
     if facts.pairs and not any(node.error for node in host.nodes):
         return ok(f"in a container ({host.container}) that shows the camera")
     return warning(
-        f"running in a container ({host.container}): a camera of the host shows only if it is passed in", CONTAINER_FIX
+        f"running in a container ({host.container}): a camera of the host shows only if it is"
+        " passed in",
+        CONTAINER_FIX,
     )
 
 
@@ -62,7 +68,9 @@ def udev_rules(facts: Facts) -> Finding:
     if host.platform.is_root:
         return warning("no udev rules for the L515: only root can open it", WRITE_AND_INSTALL)
     if host.nodes and not any(node.error for node in host.nodes):
-        return warning("no udev rules for the L515, though this user can open it now", WRITE_AND_INSTALL)
+        return warning(
+            "no udev rules for the L515, though this user can open it now", WRITE_AND_INSTALL
+        )
     return failed("no udev rules for the L515: it opens for root only", WRITE_AND_INSTALL)
 
 
@@ -95,13 +103,22 @@ def video_driver(facts: Facts) -> Finding:
     cameras = [camera for camera in facts.host.cameras if LIDARS[camera.product_id][0] == "camera"]
     if bare := [camera.port for camera in cameras if not camera.video_nodes]:
         state = facts.host.modules.get("uvcvideo", "unknown")
-        fix = "install a kernel with CONFIG_USB_VIDEO_CLASS" if state == "missing" else "sudo modprobe uvcvideo"
+        fix = (
+            "install a kernel with CONFIG_USB_VIDEO_CLASS"
+            if state == "missing"
+            else "sudo modprobe uvcvideo"
+        )
         return failed(f"the L515 at {', '.join(bare)} has no /dev/video* (uvcvideo: {state})", fix)
-    return ok(", ".join(node for camera in cameras for node in camera.video_nodes) or "none is needed in recovery mode")
+    return ok(
+        ", ".join(node for camera in cameras for node in camera.video_nodes)
+        or "none is needed in recovery mode"
+    )
 
 
 def hid_sensors(facts: Facts) -> Finding:
-    """Check that the kernel shows the motion sensors: without them librealsense does not list the camera."""
+    """Check that the kernel shows the motion sensors: without them librealsense does not list the
+    camera.
+    """
     if facts.host.platform.system != "linux":
         return skipped(NOT_LINUX)
     cameras = [camera for camera in facts.host.cameras if camera.product_id == L515]
@@ -117,31 +134,37 @@ def _without_sensors(facts: Facts, camera: KernelCamera) -> Finding:
     seen = ", ".join(camera.hid_sensors) or "none"
     drivers = ", ".join(camera.hid_devices) or "no HID device"
     detail = (
-        f"the L515 at {camera.port} shows fewer than {MIN_SENSORS} motion sensors ({seen}; {drivers}): librealsense "
-        "then does not list it"
+        f"the L515 at {camera.port} shows fewer than {MIN_SENSORS} motion sensors ({seen};"
+        f" {drivers}): librealsense then does not list it"
     )
     return failed(detail, _sensor_fix(facts, camera))
 
 
 def _sensor_fix(facts: Facts, camera: KernelCamera) -> str:
     host = facts.host
-    offers = next((device.interfaces for device in facts.usb.devices if device.port == camera.port), ())
+    offers = next(
+        (device.interfaces for device in facts.usb.devices if device.port == camera.port), ()
+    )
     if offers and "hid" not in offers:
         return (
-            "it has no HID interface: unplug it, wait 5 s, plug it in again; if that does not help, update its firmware"
+            "it has no HID interface: unplug it, wait 5 s, plug it in again; if that does not help,"
+            " update its firmware"
         )
     if host.container and not host.has_iio:
         return f"{CONTAINER_FIX}: this one hides /sys/bus/iio"
     if missing := [name for name in HID_MODULES if host.modules.get(name) == "missing"]:
         return (
-            f"this kernel has no {', '.join(missing)} (as on JetPack 6): install one with {HID_OPTIONS}, or "
-            "try librealsense 2.54.2 built with -DFORCE_RSUSB_BACKEND=ON, which reads USB without it"
+            f"this kernel has no {', '.join(missing)} (as on JetPack 6): install one with"
+            f" {HID_OPTIONS}, or try librealsense 2.54.2 built with -DFORCE_RSUSB_BACKEND=ON, which"
+            " reads USB without it"
         )
     return f"sudo modprobe -a {' '.join(HID_MODULES)}; then unplug the camera and plug it in again"
 
 
 def in_use(facts: Facts) -> Finding:
-    """Check that no other process has the camera open: librealsense serves one process at a time."""
+    """Check that no other process has the camera open: librealsense serves one process at a
+    time.
+    """
     if reason := _not_here(facts):
         return skipped(reason)
     held = {f"{one.name} (pid {one.pid})": one for one in facts.host.holders}
@@ -164,11 +187,15 @@ def metadata(facts: Facts) -> Finding:
     if on == "linux" and facts.host.patched_uvc:
         return ok("uvcvideo is librealsense's: frames carry the camera's clock and number")
     if on == "linux" and facts.host.modules.get("uvcvideo") in {"loaded", "built in"}:
-        return ok("uvcvideo is the kernel's own: frames carry this host's clock and the SDK's count, which does here")
+        return ok(
+            "uvcvideo is the kernel's own: frames carry this host's clock and the SDK's count,"
+            " which does here"
+        )
     if on == "windows":
         return ok(
-            "frames carry the camera's clock only once librealsense's scripts/realsense_metadata_win10.ps1 has run as "
-            "administrator; without it this host's clock does"
+            "frames carry the camera's clock only once librealsense's"
+            " scripts/realsense_metadata_win10.ps1 has run as administrator; without it this host's"
+            " clock does"
         )
     return skipped("uvcvideo is not loaded" if on == "linux" else "only Linux and Windows have it")
 
@@ -181,7 +208,9 @@ REMOVED = (2, 55)
 """First librealsense without the L515's driver; it reports no error."""
 SYSTEM_LIBRARIES = {"libusb-1.0": "libusb-1.0-0", "libudev": "libudev1", "libstdc++": "libstdc++6"}
 """Shared libraries that the Linux wheel loads, and the Debian packages that provide them."""
-VC_RUNTIME = "install Microsoft's Visual C++ runtime: https://aka.ms/vs/17/release/vc_redist.x64.exe"
+VC_RUNTIME = (
+    "install Microsoft's Visual C++ runtime: https://aka.ms/vs/17/release/vc_redist.x64.exe"
+)
 
 
 def _wheel(on: str) -> str:
@@ -201,7 +230,8 @@ def python(facts: Facts) -> Finding:
         return ok(f"{here}: librealsense runs here")
     if on.is_musl:
         return failed(
-            f"{here} with musl: librealsense's wheels are for glibc", "use a system with glibc (Debian, Ubuntu, Fedora)"
+            f"{here} with musl: librealsense's wheels are for glibc",
+            "use a system with glibc (Debian, Ubuntu, Fedora)",
         )
     newest = NEWEST_PYTHON.get(f"{on.system} {on.machine}") or NEWEST_PYTHON.get(on.system)
     if newest is None:
@@ -227,19 +257,21 @@ def system(facts: Facts) -> Finding:
 def _macos(facts: Facts) -> Finding:
     finding = warning if facts.sdk.lidars else failed
     return finding(
-        "macOS: simulation and recordings only; since macOS 12 librealsense needs root to reach a camera, and "
-        "often fails even then",
-        f"use the camera on Linux or Windows; to try it here anyway: `pip install {MAC_WHEEL}`, and run with sudo",
+        "macOS: simulation and recordings only; since macOS 12 librealsense needs root to reach a"
+        " camera, and often fails even then",
+        f"use the camera on Linux or Windows; to try it here anyway: `pip install {MAC_WHEEL}`, and"
+        " run with sudo",
     )
 
 
 def _wsl(facts: Facts) -> Finding:
     finding = warning if facts.pairs else failed
     return finding(
-        "WSL: a virtual machine that sees only the USB devices handed to it, with a kernel that may lack uvcvideo and "
-        "the HID sensors",
+        "WSL: a virtual machine that sees only the USB devices handed to it, with a kernel that may"
+        " lack uvcvideo and the HID sensors",
         "run nlos-cam on Windows itself; or, in PowerShell as administrator: `usbipd list`, "
-        "`usbipd bind --busid B`, `usbipd attach --wsl --busid B` with the camera's B from the list",
+        "`usbipd bind --busid B`, `usbipd attach --wsl --busid B` with the camera's B from the"
+        " list",
     )
 
 
@@ -248,7 +280,9 @@ def sdk(facts: Facts) -> Finding:
     if error := facts.sdk.load_error:
         return failed(error, _load_fix(error, facts.host.platform.system))
     if error := facts.sdk.query_error:
-        return failed(f"librealsense is loaded, but cannot list devices: {error}", _query_fix(error))
+        return failed(
+            f"librealsense is loaded, but cannot list devices: {error}", _query_fix(error)
+        )
     return ok(f"librealsense {facts.sdk.version or 'of unknown version'} is loaded")
 
 
@@ -258,18 +292,27 @@ def _load_fix(error: str, on: str) -> str:
         return VC_RUNTIME
     if "GLIBC" in error:
         return (
-            "the system's C library is too old for the wheel: use a newer release of the system (glibc 2.17 or later)"
+            "the system's C library is too old for the wheel: use a newer release of the system"
+            " (glibc 2.17 or later)"
         )
     for library, package in SYSTEM_LIBRARIES.items():
         if library in error:
-            return f"sudo apt install {package}" + (", or `pip install libusb-package`" if "usb" in library else "")
+            return f"sudo apt install {package}" + (
+                ", or `pip install libusb-package`" if "usb" in library else ""
+            )
     return f"pip install {_wheel(on)} libusb-package"
 
 
 def _query_fix(error: str) -> str:
     if "attribute" in error:  # a folder or file called pyrealsense2 shadows the wheel
-        return f"remove any folder or file of your own called pyrealsense2; `pip install --force-reinstall {WHEEL}`"
-    return "unplug the camera, wait 5 s, plug it in again; close realsense-viewer and whatever else uses it"
+        return (
+            "remove any folder or file of your own called pyrealsense2; `pip install"
+            f" --force-reinstall {WHEEL}`"
+        )
+    return (
+        "unplug the camera, wait 5 s, plug it in again; close realsense-viewer and whatever else"
+        " uses it"
+    )
 
 
 def sdk_version(facts: Facts) -> Finding:
@@ -280,7 +323,9 @@ def sdk_version(facts: Facts) -> Finding:
     fix = f"pip install {_wheel(facts.host.platform.system)}"
     if version_numbers(newest)[:2] >= REMOVED:
         return failed(
-            f"librealsense {newest} has no driver for the L515 (the last with it is 2.54.2): it reports no device", fix
+            f"librealsense {newest} has no driver for the L515 (the last with it is 2.54.2): it"
+            " reports no device",
+            fix,
         )
     if version_numbers(newest)[:3] != TESTED:
         return warning(f"librealsense {newest} supports the L515, but only 2.54.2 is tested", fix)
@@ -296,7 +341,9 @@ def sdk_alone(facts: Facts) -> Finding:
             f"{packages} are installed into one folder, and overwrite each other",
             f"pip uninstall -y {names} && pip install {_wheel(facts.host.platform.system)}",
         )
-    return ok(f"only {packages}") if packages else skipped("no package of librealsense is installed")
+    return (
+        ok(f"only {packages}") if packages else skipped("no package of librealsense is installed")
+    )
 
 
 def libusb(facts: Facts) -> Finding:
@@ -305,7 +352,11 @@ def libusb(facts: Facts) -> Finding:
         return failed(
             f"cannot list USB devices: {facts.usb.error}",
             "pip install pyusb libusb-package"
-            + (", or `sudo apt install libusb-1.0-0`" if facts.host.platform.system == "linux" else ""),
+            + (
+                ", or `sudo apt install libusb-1.0-0`"
+                if facts.host.platform.system == "linux"
+                else ""
+            ),
         )
     return ok(f"{facts.usb.total} USB devices are listed")
 
@@ -333,7 +384,9 @@ def usb_camera(facts: Facts) -> Finding:
             if facts.host.container
             else "unplug the camera and plug it in again: udev then makes its node"
         )
-        return failed(f"the kernel sees an L515 at {ports}, but /dev/bus/usb does not show it here", fix)
+        return failed(
+            f"the kernel sees an L515 at {ports}, but /dev/bus/usb does not show it here", fix
+        )
     if facts.sdk.lidars:
         return warning(
             "librealsense sees an L515 that USB does not show",
@@ -344,17 +397,22 @@ def usb_camera(facts: Facts) -> Finding:
 
 def _absent(facts: Facts) -> Finding:
     plug = (
-        "plug it straight into a USB 3 port with its own cable; `lsusb -d 8086:` should list it; without a camera, use "
-        "--camera sim"
+        "plug it straight into a USB 3 port with its own cable; `lsusb -d 8086:` should list it;"
+        " without a camera, use --camera sim"
     )
     if others := facts.usb.of_kind("other"):
         found = ", ".join(f"{device.label} ({device.id})" for device in others)
-        return failed(f"no L515 on USB, but another RealSense: {found}", f"an L515 is required: {plug}")
+        return failed(
+            f"no L515 on USB, but another RealSense: {found}", f"an L515 is required: {plug}"
+        )
     if not facts.usb.total:
         return failed(
-            "nothing is plugged in: USB shows no device at all", f"{plug}; in a virtual machine, pass USB to it"
+            "nothing is plugged in: USB shows no device at all",
+            f"{plug}; in a virtual machine, pass USB to it",
         )
-    return failed(f"nothing is plugged in: none of the {facts.usb.total} devices on USB is an L515", plug)
+    return failed(
+        f"nothing is plugged in: none of the {facts.usb.total} devices on USB is an L515", plug
+    )
 
 
 def recovery(facts: Facts) -> Finding:
@@ -363,8 +421,9 @@ def recovery(facts: Facts) -> Finding:
         return failed(
             ", ".join(f"{device.label} ({device.id})" for device in stuck)
             + ": it waits for firmware and delivers no frames",
-            "unplug it, wait 5 s, plug it into a USB 3 port; if it comes back like this: `rs-fw-update -r -f "
-            "Signed_Image_UVC_1_5_8_1.bin` of librealsense 2.54.2, or its realsense-viewer",
+            "unplug it, wait 5 s, plug it into a USB 3 port; if it comes back like this:"
+            " `rs-fw-update -r -f Signed_Image_UVC_1_5_8_1.bin` of librealsense 2.54.2, or its"
+            " realsense-viewer",
         )
     return ok(f"{len(facts.pairs)} in normal mode") if facts.pairs else skipped(NO_CAMERA)
 
@@ -375,23 +434,28 @@ def link(facts: Facts) -> Finding:
         return skipped(NO_CAMERA)
     if slow := [pair for pair in facts.pairs if pair.is_slow]:
         return warning(
-            f"{', '.join(pair.label for pair in slow)} is on USB 2: depth, infrared and confidence come at 320 x 240 "
-            "and 30 frames/s only, without max-usable-range and IR reflectivity",
-            "turn the USB-C plug round and push it in fully; use a USB 3 cable and a USB 3 port, without a hub; a "
-            "camera that stays on USB 2 with every cable and port is defective",
+            f"{', '.join(pair.label for pair in slow)} is on USB 2: depth, infrared and confidence"
+            " come at 320 x 240 and 30 frames/s only, without max-usable-range and IR"
+            " reflectivity",
+            "turn the USB-C plug round and push it in fully; use a USB 3 cable and a USB 3 port,"
+            " without a hub; a camera that stays on USB 2 with every cable and port is defective",
         )
     return ok(", ".join(f"{pair.label}: {pair.link}" for pair in facts.pairs))
 
 
 def firmware(facts: Facts) -> Finding:
-    """Check that librealsense 2.54.2 accepts the firmware of every camera and recommends no newer one."""
+    """Check that librealsense 2.54.2 accepts the firmware of every camera and recommends no newer
+    one.
+    """
     known = {pair.label: pair.firmware for pair in facts.pairs if pair.firmware}
     if not known:
         return skipped("no camera reports its firmware" if facts.pairs else NO_CAMERA)
     detail = ", ".join(f"{label}: {version}" for label, version in known.items())
     oldest = min(map(version_numbers, known.values()))
     if oldest < MIN_FIRMWARE[: len(oldest)]:
-        return failed(f"{detail}; librealsense accepts 1.5.1.3 and later", f"update to 1.5.8.1 {FLASH}")
+        return failed(
+            f"{detail}; librealsense accepts 1.5.1.3 and later", f"update to 1.5.8.1 {FLASH}"
+        )
     if oldest < BEST_FIRMWARE[: len(oldest)]:
         return warning(f"{detail}; librealsense recommends 1.5.8.1", f"update to 1.5.8.1 {FLASH}")
     return ok(detail)

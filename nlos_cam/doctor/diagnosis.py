@@ -1,4 +1,6 @@
-"""Diagnosis: every check in order, and the cause if USB shows a camera that librealsense does not."""
+"""Diagnosis: every check in order, and the cause if USB shows a camera that librealsense does
+not.
+"""
 
 from collections.abc import Callable
 
@@ -6,18 +8,21 @@ from nlos_cam.doctor import checks
 from nlos_cam.doctor.facts import Check, Facts, Finding, failed, ok, skipped, warning
 
 REPLUG = (
-    "unplug the camera, wait 5 s, plug it straight into a USB 3 port and run this again; if that does not help, run "
-    "with LRS_LOG_LEVEL=DEBUG in the environment and look for `partial enum`"
+    "unplug the camera, wait 5 s, plug it straight into a USB 3 port and run this again; if that"
+    " does not help, run with LRS_LOG_LEVEL=DEBUG in the environment and look for `partial enum`"
 )
 REPLUG_WINDOWS = (
-    "in the Device Manager uninstall every RealSense device together with its driver, unplug the camera and plug it in "
-    "again: Windows' own camera driver has to take it, not one of Zadig or of a vendor"
+    "in the Device Manager uninstall every RealSense device together with its driver, unplug the"
+    " camera and plug it in again: Windows' own camera driver has to take it, not one of Zadig or"
+    " of a vendor"
 )
 CAUSES = (
     *("sdk-version", "sdk-alone", "system", "container", "permissions"),
     *("video-driver", "hid-sensors", "in-use", "firmware"),
 )
-"""Checks whose failure can hide a camera from librealsense that USB shows, the likeliest cause first."""
+"""Checks whose failure can hide a camera from librealsense that USB shows, the likeliest cause
+first.
+"""
 
 
 def sdk_camera(facts: Facts) -> Finding:
@@ -43,13 +48,36 @@ def _hidden(facts: Facts, cameras: str) -> Finding:
         fix = REPLUG_WINDOWS if facts.host.platform.system == "windows" else REPLUG
         return failed(f"USB shows {cameras}, librealsense does not; no check found the cause", fix)
     reasons = "; ".join(f"{name}: {finding.detail}" for name, finding in causes.items())
-    return failed(f"USB shows {cameras}, librealsense does not: {reasons}", next(iter(causes.values())).fix)
+    return failed(
+        f"USB shows {cameras}, librealsense does not: {reasons}", next(iter(causes.values())).fix
+    )
 
 
 IN_ORDER: tuple[Callable[[Facts], Finding], ...] = (
-    *(checks.python, checks.system, checks.sdk, checks.sdk_version, checks.sdk_alone, checks.libusb),
-    *(checks.usb_camera, checks.recovery, checks.link, checks.container, checks.udev_rules, checks.permissions),
-    *(checks.video_driver, checks.hid_sensors, checks.in_use, sdk_camera, checks.firmware, checks.metadata),
+    *(
+        checks.python,
+        checks.system,
+        checks.sdk,
+        checks.sdk_version,
+        checks.sdk_alone,
+        checks.libusb,
+    ),
+    *(
+        checks.usb_camera,
+        checks.recovery,
+        checks.link,
+        checks.container,
+        checks.udev_rules,
+        checks.permissions,
+    ),
+    *(
+        checks.video_driver,
+        checks.hid_sensors,
+        checks.in_use,
+        sdk_camera,
+        checks.firmware,
+        checks.metadata,
+    ),
 )
 CHECKS = {check.__name__.replace("_", "-"): check for check in IN_ORDER}
 """Every check by its name, in the order of the output."""

@@ -1,4 +1,6 @@
-"""Facts for a diagnosis: the host, cameras seen by USB and by librealsense, and their pairing; findings of checks."""
+"""Facts for a diagnosis: the host, cameras seen by USB and by librealsense, and their pairing;
+findings of checks.
+"""
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
@@ -45,7 +47,9 @@ class Sdk:
 
 @dataclass(frozen=True)
 class Pair:
-    """Camera of the L515's family as listed by USB and by the SDK; None where one of them does not list it."""
+    """Camera of the L515's family as listed by USB and by the SDK; None where one of them does not
+    list it.
+    """
 
     usb: UsbDevice | None
     sdk: DeviceInfo | None
@@ -78,7 +82,9 @@ class Pair:
     @property
     def is_slow(self) -> bool:
         """True for a link of USB 2 or less."""
-        return self.usb.is_slow if self.usb else bool(self.sdk and self.sdk.usb_type.startswith("2"))
+        return (
+            self.usb.is_slow if self.usb else bool(self.sdk and self.sdk.usb_type.startswith("2"))
+        )
 
 
 @dataclass(frozen=True)
@@ -101,7 +107,8 @@ def gather_facts() -> Facts:
 
 
 def query_sdk(
-    load: Callable[[], Any] = load_sdk, installed: Callable[[], Iterable[Any]] = metadata.distributions
+    load: Callable[[], Any] = load_sdk,
+    installed: Callable[[], Iterable[Any]] = metadata.distributions,
 ) -> Sdk:
     """Load librealsense and list its devices; never raises."""
     names = {(str(one.name), str(one.version)) for one in installed()}
@@ -109,23 +116,37 @@ def query_sdk(
     try:
         sdk = load()
     except CameraError as error:
-        return Sdk(packages, load_error=str(error.__cause__ or error))  # the cause alone: the check adds the fix
+        return Sdk(
+            packages, load_error=str(error.__cause__ or error)
+        )  # the cause alone: the check adds the fix
     try:
         return Sdk(packages, devices=tuple(info for _, info in connected(sdk, shared_context(sdk))))
-    except (CameraError, RuntimeError, AttributeError) as error:  # AttributeError: a folder shadows the wheel
+    except (
+        CameraError,
+        RuntimeError,
+        AttributeError,
+    ) as error:  # AttributeError: a folder shadows the wheel
         return Sdk(packages, query_error=str(error))
 
 
 def match_devices(usb: Sequence[UsbDevice], sdk: Sequence[DeviceInfo]) -> list[Pair]:
-    """Pair cameras by serial number; those without one in order, if as many are left over on both sides."""
+    """Pair cameras by serial number; those without one in order, if as many are left over on both
+    sides.
+    """
     known = {device.serial: device for device in usb if device.serial}
     listed = {sdk_serial(info.serial): info for info in sdk}
     matched = [Pair(device, listed.get(serial)) for serial, device in known.items()]
     nameless = [device for device in usb if not device.serial]
     unmatched = [info for serial, info in listed.items() if serial not in known]
     if len(nameless) == len(unmatched):
-        return matched + [Pair(device, info) for device, info in zip(nameless, unmatched, strict=True)]
-    return matched + [Pair(device, None) for device in nameless] + [Pair(None, info) for info in unmatched]
+        return matched + [
+            Pair(device, info) for device, info in zip(nameless, unmatched, strict=True)
+        ]
+    return (
+        matched
+        + [Pair(device, None) for device in nameless]
+        + [Pair(None, info) for info in unmatched]
+    )
 
 
 Status = Literal["ok", "warning", "failed", "skipped"]
@@ -150,6 +171,8 @@ class Check:
     fix: str
 
 
-ok, skipped = partial(Finding, "ok"), partial(Finding, "skipped")
-warning, failed = partial(Finding, "warning"), partial(Finding, "failed")
+ok = partial(Finding, "ok")
+skipped = partial(Finding, "skipped")
+warning = partial(Finding, "warning")
+failed = partial(Finding, "failed")
 """A camera works with what a warning names, and not with what has failed."""

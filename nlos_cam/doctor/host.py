@@ -1,4 +1,6 @@
-"""Facts about this host: USB product ids, cameras the kernel has enumerated, modules, udev rules, device nodes."""
+"""Facts about this host: USB product ids, cameras the kernel has enumerated, modules, udev rules,
+device nodes.
+"""
 
 import os
 import platform
@@ -40,7 +42,9 @@ OTHERS = {
 
 @dataclass(frozen=True)
 class KernelCamera:
-    """Camera of the L515's family as the kernel has enumerated it; nodes are paths on the running system."""
+    """Camera of the L515's family as the kernel has enumerated it; nodes are paths on the running
+    system.
+    """
 
     port: str
     product_id: int
@@ -94,8 +98,12 @@ def path_exists(path: Path) -> bool:
 
 def kernel_cameras(root: Path = Path("/")) -> tuple[KernelCamera, ...]:
     """Return the cameras of the family that the kernel has enumerated; `root` holds `sys`."""
-    intel = [one for one in list_folder(root / "sys/bus/usb/devices") if _hex(one / "idVendor") == INTEL]
-    return tuple(_camera(root / "sys", device) for device in intel if _hex(device / "idProduct") in LIDARS)
+    intel = [
+        one for one in list_folder(root / "sys/bus/usb/devices") if _hex(one / "idVendor") == INTEL
+    ]
+    return tuple(
+        _camera(root / "sys", device) for device in intel if _hex(device / "idProduct") in LIDARS
+    )
 
 
 def _hex(path: Path) -> int:
@@ -112,9 +120,16 @@ def _camera(sys: Path, device: Path) -> KernelCamera:
         product_id=_hex(device / "idProduct"),
         serial=read_text(device / "serial"),
         usb_node=f"/dev/bus/usb/{bus}/{address}",
-        video_nodes=tuple(f"/dev/{found.name}" for found in _below(device, sys / "class/video4linux")),
-        hid_devices=tuple(f"{found.name} ({_driver(found)})" for found in _below(device, sys / "bus/hid/devices")),
-        hid_sensors=tuple(read_text(found / "name") or found.name for found in _below(device, sys / "bus/iio/devices")),
+        video_nodes=tuple(
+            f"/dev/{found.name}" for found in _below(device, sys / "class/video4linux")
+        ),
+        hid_devices=tuple(
+            f"{found.name} ({_driver(found)})" for found in _below(device, sys / "bus/hid/devices")
+        ),
+        hid_sensors=tuple(
+            read_text(found / "name") or found.name
+            for found in _below(device, sys / "bus/iio/devices")
+        ),
     )
 
 
@@ -129,7 +144,9 @@ def _driver(device: Path) -> str:
 
 
 def find_holders(nodes: Collection[str], root: Path = Path("/")) -> tuple[list[Holder], int]:
-    """Return other processes that have one of the nodes open, and the number of processes that deny access."""
+    """Return other processes that have one of the nodes open, and the number of processes that deny
+    access.
+    """
     found: set[Holder] = set()
     closed = 0
     for process in list_folder(root / "proc"):
@@ -142,7 +159,10 @@ def find_holders(nodes: Collection[str], root: Path = Path("/")) -> tuple[list[H
         except OSError:
             closed += 1
             continue
-        found |= {Holder(int(process.name), read_text(process / "comm"), node) for node in targets & set(nodes)}
+        found |= {
+            Holder(int(process.name), read_text(process / "comm"), node)
+            for node in targets & set(nodes)
+        }
     return sorted(found, key=lambda one: (one.pid, one.node)), closed
 
 
@@ -196,7 +216,9 @@ class Host:
     """Type of the container; empty outside one."""
     is_wsl: bool = False
     modules: Mapping[str, str] = field(default_factory=dict[str, str])
-    """Each of MODULES: loaded, built in, available or missing; unknown without the kernel's lists."""
+    """Each of MODULES: loaded, built in, available or missing; unknown without the kernel's
+    lists.
+    """
     has_iio: bool = False
     patched_uvc: bool = False
     """True for librealsense's uvcvideo, which passes on the frames' metadata."""
@@ -231,12 +253,18 @@ def _in_plugdev() -> bool:
 
 
 def open_node(path: str) -> None:
-    """Open a device for reading and writing, as the SDK would, and close it again. Raises OSError."""
+    """Open a device for reading and writing, as the SDK would, and close it again. Raises
+    OSError.
+    """
     os.close(os.open(path, os.O_RDWR | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_CLOEXEC", 0)))
 
 
-def read_host(root: Path = Path("/"), on: Platform | None = None, opening: Callable[[str], None] = open_node) -> Host:
-    """Return the facts about this host; never raises. `root` holds the system's `sys`, `proc`, `etc`, ..."""
+def read_host(
+    root: Path = Path("/"), on: Platform | None = None, opening: Callable[[str], None] = open_node
+) -> Host:
+    """Return the facts about this host; never raises. `root` holds the system's `sys`, `proc`,
+    `etc`, ...
+    """
     on = on or this_platform()
     if on.system != "linux":
         return Host(on)
@@ -264,25 +292,39 @@ def _container(root: Path) -> str:
     if path_exists(root / "run/.containerenv"):
         return "podman"
     environment = read_text(root / "proc/1/environ").split("\0")
-    named = [value for name, _, value in (entry.partition("=") for entry in environment) if name == "container"]
+    named = [
+        value
+        for name, _, value in (entry.partition("=") for entry in environment)
+        if name == "container"
+    ]
     groups = read_text(root / "proc/1/cgroup")
-    named += [read_text(root / "run/systemd/container"), *(name for word, name in CONTAINERS.items() if word in groups)]
+    named += [
+        read_text(root / "run/systemd/container"),
+        *(name for word, name in CONTAINERS.items() if word in groups),
+    ]
     return next((name for name in named if name), "")
 
 
 def _modules(root: Path) -> dict[str, str]:
     loaded = {line.split(" ")[0] for line in read_text(root / "proc/modules").splitlines()}
     folder = root / "lib/modules" / (read_text(root / "proc/sys/kernel/osrelease") or "unknown")
-    lists = {"built in": read_text(folder / "modules.builtin"), "available": read_text(folder / "modules.dep")}
+    lists = {
+        "built in": read_text(folder / "modules.builtin"),
+        "available": read_text(folder / "modules.dep"),
+    }
     return {name: _state(name, loaded, lists, root / "sys/module" / name) for name in MODULES}
 
 
 def _state(name: str, loaded: set[str], lists: Mapping[str, str], shown: Path) -> str:
-    """Return a module's state. Its file may have hyphens for underscores in its name, and be compressed."""
+    """Return a module's state. Its file may have hyphens for underscores in its name, and be
+    compressed.
+    """
     if name in loaded or path_exists(shown):
         return "loaded"
     files = (f"/{name}.ko", f"/{name.replace('_', '-')}.ko")
-    found = next((state for state, listed in lists.items() if any(file in listed for file in files)), "")
+    found = next(
+        (state for state, listed in lists.items() if any(file in listed for file in files)), ""
+    )
     return found or ("missing" if any(lists.values()) else "unknown")
 
 

@@ -1,4 +1,6 @@
-"""udev rules that let every user of a Linux machine open an L515; librealsense's wheel does not install them."""
+"""udev rules that let every user of a Linux machine open an L515; librealsense's wheel does not
+install them.
+"""
 
 from shlex import quote
 
@@ -24,14 +26,18 @@ def install_command(path: str) -> str:
 
 
 WRITE_AND_INSTALL = f"nlos-cam doctor --write-udev {FILE_NAME} && {install_command(FILE_NAME)}"
-"""Shell command that writes and installs the rules; they apply to a camera plugged in afterwards."""
+"""Shell command that writes and installs the rules; they apply to a camera plugged in
+afterwards.
+"""
 
 
 def rules_text() -> str:
     """Return the rules file: access to the camera's USB and video nodes and its motion sensors."""
     rule = '# {}\nSUBSYSTEMS=="usb", {}, MODE:="0666", GROUP:="plugdev"\n'
     access = [rule.format(name, _match(product_id)) for product_id, (_, name) in LIDARS.items()]
-    return "\n".join([HEAD.format(name=FILE_NAME, reload=RELOAD), *access, MOTION.format(match=_match(L515))])
+    return "\n".join(
+        [HEAD.format(name=FILE_NAME, reload=RELOAD), *access, MOTION.format(match=_match(L515))]
+    )
 
 
 def _match(product_id: int) -> str:

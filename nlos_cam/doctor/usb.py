@@ -86,22 +86,40 @@ class UsbScan:
 
 
 def scan_usb(backend: Any = None, root: Path = Path("/")) -> UsbScan:
-    """Return the RealSense cameras on USB; never raises. `root` holds `sys`, read where a device denies access."""
+    """Return the RealSense cameras on USB; never raises. `root` holds `sys`, read where a device
+    denies access.
+    """
     try:
         import libusb_package
         import usb.core
 
-        devices: Any = usb.core.find(find_all=True, backend=backend or libusb_package.get_libusb1_backend())
+        devices: Any = usb.core.find(
+            find_all=True, backend=backend or libusb_package.get_libusb1_backend()
+        )
         found = list(devices)
-    except (ImportError, OSError, ValueError, NotImplementedError) as error:  # no pyusb, no libusb, no USB
+    except (
+        ImportError,
+        OSError,
+        ValueError,
+        NotImplementedError,
+    ) as error:  # no pyusb, no libusb, no USB
         return UsbScan(error=str(error) or type(error).__name__)
-    known = [device for device in found if device.idVendor == INTEL and device.idProduct in {*LIDARS, *OTHERS}]
+    known = [
+        device
+        for device in found
+        if device.idVendor == INTEL and device.idProduct in {*LIDARS, *OTHERS}
+    ]
     return UsbScan(tuple(_describe(device, root) for device in known), len(found))
 
 
 def _describe(device: Any, root: Path) -> UsbDevice:
-    kind, meaning = LIDARS.get(device.idProduct) or ("other", f"RealSense {OTHERS[device.idProduct]}")
-    port = f"{device.bus}-{'.'.join(map(str, device.port_numbers))}" if device.port_numbers else ""  # as 2-1.4
+    kind, meaning = LIDARS.get(device.idProduct) or (
+        "other",
+        f"RealSense {OTHERS[device.idProduct]}",
+    )
+    port = (
+        f"{device.bus}-{'.'.join(map(str, device.port_numbers))}" if device.port_numbers else ""
+    )  # as 2-1.4
     serial, product, error = _strings(device)
     kernel = root / "sys/bus/usb/devices" / port
     return UsbDevice(
@@ -123,15 +141,21 @@ def _describe(device: Any, root: Path) -> UsbDevice:
 
 
 def _strings(device: Any) -> tuple[str, str, Exception | None]:
-    """Return serial number, product, and the error of reading them: permission, driver on Windows, unplugged."""
+    """Return serial number, product, and the error of reading them: permission, driver on Windows,
+    unplugged.
+    """
     import usb.util
 
     try:
-        languages = usb.util.get_langids(device)  # not device.langids, which hides a missing permission
+        languages = usb.util.get_langids(
+            device
+        )  # not device.langids, which hides a missing permission
         if not languages:
             return "", "", None
         indices = (device.iSerialNumber, device.iProduct)
-        serial, product = (usb.util.get_string(device, index, languages[0]) or "" for index in indices)
+        serial, product = (
+            usb.util.get_string(device, index, languages[0]) or "" for index in indices
+        )
     except (OSError, NotImplementedError, ValueError) as error:
         return "", "", error
     finally:
@@ -140,9 +164,13 @@ def _strings(device: Any) -> tuple[str, str, Exception | None]:
 
 
 def _interfaces(device: Any) -> tuple[str, ...]:
-    """Return the classes of all interfaces; none where the system does not provide the description."""
+    """Return the classes of all interfaces; none where the system does not provide the
+    description.
+    """
     try:
-        codes = {interface.bInterfaceClass for configuration in device for interface in configuration}
+        codes = {
+            interface.bInterfaceClass for configuration in device for interface in configuration
+        }
     except (OSError, NotImplementedError):
         return ()
     return tuple(CLASSES.get(code, f"0x{code:02x}") for code in sorted(codes))
@@ -151,11 +179,14 @@ def _interfaces(device: Any) -> tuple[str, ...]:
 def firmware_of(bcd_device: int) -> str:
     """Return the firmware version encoded in an L515's USB release number; empty for another form.
 
-    Major, a zero, minor and patch, a hexadecimal digit each: 0x1058 is 1.5.8. Inferred from three units (0x1058,
-    0x1052, 0x1041), where the second digit was always 0; the fourth part of a version is not encoded.
+    Major, a zero, minor and patch, a hexadecimal digit each: 0x1058 is 1.5.8. Inferred from three
+    units (0x1058, 0x1052, 0x1041), where the second digit was always 0; the fourth part of a
+    version is not encoded.
     """
     major, second, minor, patch = (bcd_device >> shift & 0xF for shift in (12, 8, 4, 0))
-    return "" if second or major == 0 or max(major, minor, patch) > 9 else f"{major}.{minor}.{patch}"
+    return (
+        "" if second or major == 0 or max(major, minor, patch) > 9 else f"{major}.{minor}.{patch}"
+    )
 
 
 def sdk_serial(serial: str) -> str:
