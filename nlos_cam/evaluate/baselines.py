@@ -16,13 +16,20 @@ from nlos_cam.camera import OnProgress
 NEIGHBOURS = 2000
 """Training objects searched for the nearest neighbour, unless a training set is given."""
 FINGERPRINT_OBJECTS = 200
-"""Objects whose images go into the cache key, so that a changed generator gets a new cache; all categories occur."""
+"""Objects whose images go into the cache key, so that a changed generator gets a new cache; all
+categories occur.
+"""
 
 
 def trivial_answers(count: int, mean: Float32) -> dict[str, Float32]:
-    """Return answers (count, 64, 64) that ignore the maps: background only, and the mean training image (64, 64)."""
+    """Return answers (count, 64, 64) that ignore the maps: background only, and the mean training
+    image (64, 64).
+    """
     shape = (count, *mean.shape)
-    return {"all_background": np.zeros(shape, np.float32), "mean_object": np.broadcast_to(mean, shape)}
+    return {
+        "all_background": np.zeros(shape, np.float32),
+        "mean_object": np.broadcast_to(mean, shape),
+    }
 
 
 def mean_image(images: Float16) -> Float32:
@@ -30,13 +37,19 @@ def mean_image(images: Float16) -> Float32:
     return images.mean(0, dtype=np.float64).astype(np.float32)
 
 
-def answers_with_nearest(maps: MapSet, training: data.Dataset, on_progress: OnProgress) -> dict[str, Float32]:
-    """Return the trivial answers and the image of the nearest training object; one part at a time is in memory.
+def answers_with_nearest(
+    maps: MapSet, training: data.Dataset, on_progress: OnProgress
+) -> dict[str, Float32]:
+    """Return the trivial answers and the image of the nearest training object; one part at a time
+    is in memory.
 
-    Nearest in the sum of squares over all cells of depth and intensity, each channel (left, right) minus its mean and
-    divided by its spread over the first NEIGHBOURS training objects. A cell without a return counts as average.
+    Nearest in the sum of squares over all cells of depth and intensity, each channel (left, right)
+    minus its mean and divided by its spread over the first NEIGHBOURS training objects. A cell
+    without a return counts as average.
     """
-    search, total, done = _Search(maps, *_statistics(training)), np.zeros(maps.image.shape[1:]), 0
+    search = _Search(maps, *_statistics(training))
+    total = np.zeros(maps.image.shape[1:])
+    done = 0
     for chunk in training.chunks():
         search.update(chunk)
         total += chunk.image.sum(0, dtype=np.float64)
@@ -50,7 +63,8 @@ class _Search:
     """Running search for the nearest training object of each map; single-threaded."""
 
     def __init__(self, maps: MapSet, mean: Tensor, spread: Tensor) -> None:
-        self._mean, self._scale = mean[:, None, None], spread.clamp(min=SMALLEST_SPREAD)[:, None, None]
+        self._mean = mean[:, None, None]
+        self._scale = spread.clamp(min=SMALLEST_SPREAD)[:, None, None]
         self._maps = self._normalised(maps)
         self._distance = torch.full((len(maps.image),), torch.inf)
         self.image = np.zeros(maps.image.shape, np.float32)
@@ -80,8 +94,11 @@ def _statistics(training: data.Dataset) -> tuple[Tensor, Tensor]:
     return channel_statistics(torch.cat(parts))
 
 
-def training_maps(plan: data.DatasetPlan, cache: Path, workers: int, on_progress: OnProgress) -> data.Dataset:
-    """Build the first NEIGHBOURS training objects on the plan's rig and sensor into the cache, once.
+def training_maps(
+    plan: data.DatasetPlan, cache: Path, workers: int, on_progress: OnProgress
+) -> data.Dataset:
+    """Build the first NEIGHBOURS training objects on the plan's rig and sensor into the cache,
+    once.
 
     An interrupted build resumes. The folder's name is a checksum of rig, sensor and objects.
     """
@@ -92,7 +109,9 @@ def training_maps(plan: data.DatasetPlan, cache: Path, workers: int, on_progress
 
 
 def _checksum(plan: data.DatasetPlan) -> str:
-    """Return a checksum of the plan and of its first objects: another generator makes another training set."""
+    """Return a checksum of the plan and of its first objects: another generator makes another
+    training set.
+    """
     digest = hashlib.sha256(plan.provenance.encode())
     digest.update(data.procedural_images(plan.first_seed, FINGERPRINT_OBJECTS, plan.box).tobytes())
     return digest.hexdigest()[:16]

@@ -1,4 +1,6 @@
-"""Judge reconstructions in colour (simulation only): figures by name, beside what needs no network, and a picture."""
+"""Judge reconstructions in colour (simulation only): figures by name, beside what needs no network,
+and a picture.
+"""
 
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -7,7 +9,14 @@ from typing import Any
 import numpy as np
 from nlos_calibration import Rig
 from nlos_calibration.arrays import Float16, Float32
-from nlos_models import SIMULATION_ONLY, SMALLER_IS_BETTER, MapSet, brightness, color_metrics, surface
+from nlos_models import (
+    SIMULATION_ONLY,
+    SMALLER_IS_BETTER,
+    MapSet,
+    brightness,
+    color_metrics,
+    surface,
+)
 
 from nlos_cam.dataset import sense_color
 from nlos_cam.evaluate.figures import ROWS
@@ -18,10 +27,16 @@ from nlos_cam.report import figure_of
 
 
 def painted_maps(
-    depths_m: Sequence[Float32], rig: Rig, first_seed: int, accuracy: str, on_progress: Callable[[int, int], None]
+    depths_m: Sequence[Float32],
+    rig: Rig,
+    first_seed: int,
+    accuracy: str,
+    on_progress: Callable[[int, int], None],
 ) -> MapSet:
     """Return noisy maps and true images of objects (64, 64), each painted from its own seed."""
-    sensor, maps, images = Sensor(rig, SensorModel()), list[tuple[Float32, Float32]](), list[Float32]()
+    sensor = Sensor(rig, SensorModel())
+    maps = list[tuple[Float32, Float32]]()
+    images = list[Float32]()
     for seed, depth_m in enumerate(depths_m, first_seed):
         albedo = paint(seed, depth_m, [*TEXTURES]).albedo
         seen = sense_color(Scene(rig, depth_m, Surface(albedo)), sensor, seed, accuracy)
@@ -33,10 +48,15 @@ def painted_maps(
 
 
 def color_baselines(image: Float32, training: Float16 | Float32) -> dict[str, Float32]:
-    """Return baselines (n, 3, 64, 64): background, mean training object, our silhouettes in the mean color."""
+    """Return baselines (n, 3, 64, 64): background, mean training object, our silhouettes in the
+    mean color.
+    """
     training = training.astype(np.float32)
-    trained, ours = surface(brightness(training)), surface(brightness(image))
-    mean_color = np.where(trained[:, None], training, 0.0).sum((0, 2, 3)) / max(int(trained.sum()), 1)
+    trained = surface(brightness(training))
+    ours = surface(brightness(image))
+    mean_color = np.where(trained[:, None], training, 0.0).sum((0, 2, 3)) / max(
+        int(trained.sum()), 1
+    )
     return {
         "all_background": np.zeros_like(image),
         "mean_object": np.broadcast_to(training.mean(0), image.shape).astype(np.float32),
@@ -47,8 +67,11 @@ def color_baselines(image: Float32, training: Float16 | Float32) -> dict[str, Fl
 def figures_of_color(
     image: Float32, truth: Float32, others: Mapping[str, Float32], training: Float16 | Float32
 ) -> dict[str, Any]:
-    """Return all figures of images (n, 3, 64, 64) with those of other answers and of the baselines, ready for JSON."""
-    guesses, ours = {**others, **color_baselines(image, training)}, color_metrics(image, truth)
+    """Return all figures of images (n, 3, 64, 64) with those of other answers and of the baselines,
+    ready for JSON.
+    """
+    guesses = {**others, **color_baselines(image, training)}
+    ours = color_metrics(image, truth)
     theirs = {name: color_metrics(guess, truth) for name, guess in guesses.items()}
     compared = ("mean_object", "mean_colour")
     return {
@@ -56,7 +79,9 @@ def figures_of_color(
         "objects": len(truth),
         **plain(over_objects(ours)),
         "baselines": {name: plain(over_objects(values)) for name, values in theirs.items()},
-        "better_than": {name: plain(advantage(ours, theirs[name], SMALLER_IS_BETTER)) for name in compared},
+        "better_than": {
+            name: plain(advantage(ours, theirs[name], SMALLER_IS_BETTER)) for name in compared
+        },
     }
 
 
@@ -65,7 +90,9 @@ def draw_color_sheet(path: Path, image: Float32, truth: Float32) -> None:
     count = len(truth)
     canvas = figure_of(count + 0.3, len(ROWS) + 0.6)
     axes: Any = canvas.subplots(len(ROWS), count, squeeze=False)
-    for row, (title, pictures) in enumerate(zip(ROWS, (truth, image, np.abs(image - truth)), strict=True)):
+    for row, (title, pictures) in enumerate(
+        zip(ROWS, (truth, image, np.abs(image - truth)), strict=True)
+    ):
         for axis, picture in zip(axes[row], pictures, strict=True):
             axis.imshow(np.clip(np.moveaxis(picture, 0, -1), 0, 1))
             axis.axis("off")

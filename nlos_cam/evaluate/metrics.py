@@ -82,11 +82,15 @@ def per_category(values: Mapping[str, Float64], categories: Sequence[str]) -> di
 
 
 def advantage(
-    ours: Mapping[str, Float64], theirs: Mapping[str, Float64], smaller_is_better: Collection[str] = SMALLER_IS_BETTER
+    ours: Mapping[str, Float64],
+    theirs: Mapping[str, Float64],
+    smaller_is_better: Collection[str] = SMALLER_IS_BETTER,
 ) -> Figures:
-    """Return the mean per-object advantage of ours over theirs; positive is better for every metric.
+    """Return the mean per-object advantage of ours over theirs; positive is better for every
+    metric.
 
-    The difference is significant if the interval excludes 0. Objects without a value in either are left out.
+    The difference is significant if the interval excludes 0. Objects without a value in either are
+    left out.
     """
     return {
         name: interval((-1 if name in smaller_is_better else 1) * (value - theirs[name]))
@@ -105,7 +109,9 @@ def interval(values: Float64) -> Interval:
 
 
 def resampled(count: int) -> NDArray[np.int64]:
-    """Return the object indices (RESAMPLES, count) of each bootstrap resample, from a fixed seed."""
+    """Return the object indices (RESAMPLES, count) of each bootstrap resample, from a fixed
+    seed.
+    """
     return np.random.default_rng(0).integers(0, count, (RESAMPLES, count))
 
 
@@ -113,7 +119,11 @@ def meets(name: str, figure: Interval) -> bool:
     """Return True if the estimate of a metric meets its target."""
     if figure.value is None:
         return False
-    return figure.value <= TARGETS[name] if name in SMALLER_IS_BETTER else figure.value >= TARGETS[name]
+    return (
+        figure.value <= TARGETS[name]
+        if name in SMALLER_IS_BETTER
+        else figure.value >= TARGETS[name]
+    )
 
 
 def targets_met(figures: Figures) -> dict[str, dict[str, Any]]:
@@ -142,18 +152,25 @@ class Predictions:
 
 
 QUALITY_TARGETS = {"correlation": 0.7, "trusted_good": 0.9}
-"""Lower limits: correlation of predicted with true IoU, and share of trusted frames with an IoU of GOOD_IOU."""
+"""Lower limits: correlation of predicted with true IoU, and share of trusted frames with an IoU of
+GOOD_IOU.
+"""
 
 
 def quality_figures(predicted: Predictions, iou: Float64) -> dict[str, Any]:
-    """Return how well the IoU (n,) was predicted, and how many trusted frames were good; None without any of them."""
-    good, trusted = iou >= models.GOOD_IOU, predicted.trusted
+    """Return how well the IoU (n,) was predicted, and how many trusted frames were good; None
+    without any of them.
+    """
+    good = iou >= models.GOOD_IOU
+    trusted = predicted.trusted
     known = len(iou) > 2 and np.ptp(iou) > 0 and np.ptp(predicted.iou) > 0
     return {
         "correlation": float(np.corrcoef(predicted.iou, iou)[0, 1]) if known else None,
         "mean_error": float(np.abs(predicted.iou - iou).mean()),
         "bias": float((predicted.iou - iou).mean()),
-        "within_80_percent_interval": float(((iou >= predicted.low) & (iou <= predicted.high)).mean()),
+        "within_80_percent_interval": float(
+            ((iou >= predicted.low) & (iou <= predicted.high)).mean()
+        ),
         "good": float(good.mean()),
         "trusted": float(trusted.mean()),
         "trusted_objects": int(trusted.sum()),
@@ -176,24 +193,33 @@ def surface_cm2(truth: Float32, box: ObjectBox) -> Float64:
 
 
 def detail_per_cm(truth: Float32, box: ObjectBox) -> Float64:
-    """Return the length of all edges (outline, holes, depth steps) per area of surface in 1/cm, (n,).
+    """Return the length of all edges (outline, holes, depth steps) per area of surface in 1/cm,
+    (n,).
 
     A square plate of side a has 4 / a. NaN without surface.
     """
     width_cm, height_cm = _pitch_cm(truth, box)
     padded = np.pad(truth, ((0, 0), (1, 1), (1, 1)))
-    mask, step = models.surface(padded), STEP_MM / mm_per_v(box)
+    mask = models.surface(padded)
+    step = STEP_MM / mm_per_v(box)
     beside, below = (
-        (np.diff(mask, axis=axis) | (_both(mask, axis) & (np.abs(np.diff(padded, axis=axis)) > step))).sum((-2, -1))
+        (
+            np.diff(mask, axis=axis)
+            | (_both(mask, axis) & (np.abs(np.diff(padded, axis=axis)) > step))
+        ).sum((-2, -1))
         for axis in (2, 1)
     )
     area = surface_cm2(truth, box)
-    return np.where(area > 0, (beside * height_cm + below * width_cm) / np.maximum(area, 1e-9), np.nan)
+    return np.where(
+        area > 0, (beside * height_cm + below * width_cm) / np.maximum(area, 1e-9), np.nan
+    )
 
 
 def _both(mask: NDArray[np.bool_], axis: int) -> NDArray[np.bool_]:
     """Return True where a pixel and its next neighbour along an axis are both in the mask."""
-    first, second = (np.take(mask, np.arange(start, mask.shape[axis] - 1 + start), axis) for start in (0, 1))
+    first, second = (
+        np.take(mask, np.arange(start, mask.shape[axis] - 1 + start), axis) for start in (0, 1)
+    )
     return first & second
 
 
@@ -213,16 +239,23 @@ class Bin:
 
 
 def curve(measure: Float64, error: Float64, bins: int = BINS) -> list[Bin]:
-    """Return the error over bins with equal counts of objects, in ascending order of `measure` (n,)."""
+    """Return the error over bins with equal counts of objects, in ascending order of `measure`
+    (n,).
+    """
     order = np.argsort(measure, kind="stable")
     parts = [part for part in np.array_split(order, bins) if part.size]
-    return [Bin(float(measure[p].min()), float(measure[p].max()), len(p), interval(error[p])) for p in parts]
+    return [
+        Bin(float(measure[p].min()), float(measure[p].max()), len(p), interval(error[p]))
+        for p in parts
+    ]
 
 
 def rank_correlation(measure: Float64, error: Float64) -> Interval:
-    """Return Spearman's correlation of error with `measure`, 1 if the error grows with it; NaN are left out.
+    """Return Spearman's correlation of error with `measure`, 1 if the error grows with it; NaN are
+    left out.
 
-    None for fewer than three objects, or if either is constant. Resamples keep the ranks of the whole set.
+    None for fewer than three objects, or if either is constant. Resamples keep the ranks of the
+    whole set.
     """
     valid = ~(np.isnan(measure) | np.isnan(error))
     if valid.sum() < 3 or np.ptp(measure[valid]) == 0 or np.ptp(error[valid]) == 0:
@@ -255,12 +288,17 @@ class Zone:
 
 
 def error_by_zone(image: Float32, truth: Float32) -> dict[str, Zone]:
-    """Divide the absolute error among core, inner and outer rim (two pixels each) and far background."""
+    """Divide the absolute error among core, inner and outer rim (two pixels each) and far
+    background.
+    """
     zones = np.stack([_zones(mask) for mask in models.surface(truth)])
     error = np.abs(image.astype(np.float64) - truth)
     total = error.sum()
     return {
-        name: Zone(float((zones == k).mean()), float(error[zones == k].sum() / total) if total > 0 else None)
+        name: Zone(
+            float((zones == k).mean()),
+            float(error[zones == k].sum() / total) if total > 0 else None,
+        )
         for k, name in enumerate(ZONES)
     }
 
@@ -268,7 +306,9 @@ def error_by_zone(image: Float32, truth: Float32) -> dict[str, Zone]:
 def _zones(mask: NDArray[np.bool_]) -> NDArray[np.int64]:
     """Return the index in ZONES of every pixel; background surrounds the image."""
     inside, outside = (
-        cv2.distanceTransform(np.pad(part.astype(np.uint8), 1, constant_values=beyond), cv2.DIST_L2, 5)[1:-1, 1:-1]
+        cv2.distanceTransform(
+            np.pad(part.astype(np.uint8), 1, constant_values=beyond), cv2.DIST_L2, 5
+        )[1:-1, 1:-1]
         for part, beyond in ((mask, 0), (~mask, 1))
     )
     near_surface = outside <= RIM_PIXELS if mask.any() else np.zeros_like(mask)

@@ -1,4 +1,6 @@
-"""Evaluation of weights on held-out objects, and its report: report.html, pictures, figures.json, objects.csv."""
+"""Evaluation of weights on held-out objects, and its report: report.html, pictures, figures.json,
+objects.csv.
+"""
 
 import csv
 import json
@@ -22,9 +24,21 @@ from nlos_cam.evaluate.recognition import PER_KIND, recognised
 from nlos_cam.files import atomic_directory, cache_folder
 from nlos_cam.objects import CATEGORIES
 from nlos_cam.reconstruct import Mirrored
-from nlos_cam.report import Banner, Bullets, Commands, Document, Picture, Section, Table, saved_picture, write_document
+from nlos_cam.report import (
+    Banner,
+    Bullets,
+    Commands,
+    Document,
+    Picture,
+    Section,
+    Table,
+    saved_picture,
+    write_document,
+)
 
-REPORT, UNSEEN_SHEET, QUALITY = "report.html", "sheet-unseen.png", "quality.png"
+REPORT = "report.html"
+UNSEEN_SHEET = "sheet-unseen.png"
+QUALITY = "quality.png"
 QUALITY_COLUMNS = {
     "correlation": "correlation with the true IoU",
     "mean_error": "mean error",
@@ -35,15 +49,19 @@ QUALITY_COLUMNS = {
     "trusted_good": "of these with that IoU",
 }
 """Titles of a quality's figures by name."""
-QUALITY_TARGETS_TEXT = "Wanted: a correlation of 0.7, and 0.9 of the frames shown in green with that IoU."
+QUALITY_TARGETS_TEXT = (
+    "Wanted: a correlation of 0.7, and 0.9 of the frames shown in green with that IoU."
+)
 SHIPPED = "the shipped ones"
-SIZE, DETAIL = "surface, cm²", "edges per surface, cm / cm²"
-SILHOUETTE_ERROR, DEPTH_ERROR = "1 - silhouette IoU", "foreground RMSE, mm"
+SIZE = "surface, cm²"
+DETAIL = "edges per surface, cm / cm²"
+SILHOUETTE_ERROR = "1 - silhouette IoU"
+DEPTH_ERROR = "foreground RMSE, mm"
 
 SHEET_CAPTION = "Bright is near the wall. In the difference, red is too near and blue too far."
 READ_WITH_CARE = (
-    "Means over objects; intervals by bootstrap over objects. Foreground RMSE is over pixels that are surface in both, "
-    "so it ignores missed parts: read it together with the silhouette IoU."
+    "Means over objects; intervals by bootstrap over objects. Foreground RMSE is over pixels that"
+    " are surface in both, so it ignores missed parts: read it together with the silhouette IoU."
 )
 
 
@@ -85,13 +103,19 @@ class Evaluation:
     @cached_property
     def surfaces(self) -> dict[str, Float64]:
         """Return size and detail of the true surfaces, (n,) each."""
-        return {SIZE: metrics.surface_cm2(self.truth, self.box), DETAIL: metrics.detail_per_cm(self.truth, self.box)}
+        return {
+            SIZE: metrics.surface_cm2(self.truth, self.box),
+            DETAIL: metrics.detail_per_cm(self.truth, self.box),
+        }
 
     @cached_property
     def errors(self) -> dict[str, Float64]:
         """Return the two errors that are correlated with size and detail, (n,) each."""
         ours = self.ours
-        return {SILHOUETTE_ERROR: 1 - ours["silhouette_iou"], DEPTH_ERROR: ours["foreground_rmse_mm"]}
+        return {
+            SILHOUETTE_ERROR: 1 - ours["silhouette_iou"],
+            DEPTH_ERROR: ours["foreground_rmse_mm"],
+        }
 
 
 def evaluate(
@@ -108,10 +132,11 @@ def evaluate(
 ) -> Evaluation:
     """Reconstruct held-out objects with weights (the shipped ones if None) and with the baselines.
 
-    The objects are those given, those of a dataset (a path), or rendered: the 54 test objects, or `count` random ones,
-    on `rig` (the weights' own if None). `wall` is the bare wall of difference maps. `training` names the maps searched
-    for the nearest neighbour, unless it is left out. `mirror` joins the answers to mirrored maps. `tracked` opens
-    progress bars. Raises SceneError, RecordingError.
+    The objects are those given, those of a dataset (a path), or rendered: the 54 test objects, or
+    `count` random ones, on `rig` (the weights' own if None). `wall` is the bare wall of difference
+    maps. `training` names the maps searched for the nearest neighbour, unless it is left out.
+    `mirror` joins the answers to mirrored maps. `tracked` opens progress bars. Raises SceneError,
+    RecordingError.
     """
     reconstructor = load_reconstructor(weights, cache_folder() / "onnx")
     record = reconstructor.record
@@ -125,11 +150,18 @@ def evaluate(
         second = None if count else subjects.rendered_objects(rig, tracked=tracked, test="unseen")
         objects = subjects.rendered_objects(rig, count, tracked)
     bare = subjects.bare_wall_for(record, objects.plan, wall)
-    guesses, searched = subjects.baseline_answers(objects, training, nearest=nearest, tracked=tracked)
-    doubter = load_uncertainty_model(weights, cache_folder() / "onnx") if record.input == "raw maps" else None
+    guesses, searched = subjects.baseline_answers(
+        objects, training, nearest=nearest, tracked=tracked
+    )
+    doubter = (
+        load_uncertainty_model(weights, cache_folder() / "onnx")
+        if record.input == "raw maps"
+        else None
+    )
     maps = subjects.network_input(objects.maps, bare, objects.benches, record)
     answers = subjects.answer_all(reconstructor, maps)
-    predicted, unseen = subjects.predict_quality(answers, maps, doubter, objects.plan.rig), None
+    predicted = subjects.predict_quality(answers, maps, doubter, objects.plan.rig)
+    unseen = None
     if second:
         maps = subjects.network_input(second.maps, bare, second.benches, record)
         others = subjects.answer_all(reconstructor, maps)
@@ -144,10 +176,20 @@ def evaluate(
         "training_objects": len(searched) if searched else None,
         "notes": subjects.notes_about(record, objects, searched),
     }
-    truth, left_out = objects.maps.image.astype(np.float32), subjects.left_out_categories(record)
+    truth = objects.maps.image.astype(np.float32)
+    left_out = subjects.left_out_categories(record)
     box = objects.plan.box
     return Evaluation(
-        objects.names, objects.categories, truth, answers.image, guesses, box, facts, left_out, unseen, predicted
+        objects.names,
+        objects.categories,
+        truth,
+        answers.image,
+        guesses,
+        box,
+        facts,
+        left_out,
+        unseen,
+        predicted,
     )
 
 
@@ -155,17 +197,23 @@ def as_figures(evaluation: Evaluation) -> dict[str, Any]:
     """Return all figures, ready for JSON."""
     ours = evaluation.ours
     theirs = {
-        name: metrics.per_object(guess, evaluation.truth, evaluation.box) for name, guess in evaluation.guesses.items()
+        name: metrics.per_object(guess, evaluation.truth, evaluation.box)
+        for name, guess in evaluation.guesses.items()
     }
     overall = metrics.over_objects(ours)
     nearest = theirs.get("nearest_neighbour")
     return {
         **metrics.plain(overall),
-        "baselines": {name: metrics.plain(metrics.over_objects(values)) for name, values in theirs.items()},
-        "advantage_over_nearest_neighbour": metrics.plain(metrics.advantage(ours, nearest)) if nearest else None,
+        "baselines": {
+            name: metrics.plain(metrics.over_objects(values)) for name, values in theirs.items()
+        },
+        "advantage_over_nearest_neighbour": (
+            metrics.plain(metrics.advantage(ours, nearest)) if nearest else None
+        ),
         "bars": metrics.targets_met(overall),
         "per_category": {
-            name: metrics.plain(figures) for name, figures in metrics.per_category(ours, evaluation.categories).items()
+            name: metrics.plain(figures)
+            for name, figures in metrics.per_category(ours, evaluation.categories).items()
         },
         "shown_and_left_out": _by_shown(evaluation),
         "rank_correlation": {
@@ -174,10 +222,17 @@ def as_figures(evaluation: Evaluation) -> dict[str, Any]:
             for measure_name, measure in evaluation.surfaces.items()
         },
         "where_the_error_is": {
-            name: asdict(zone) for name, zone in metrics.error_by_zone(evaluation.image, evaluation.truth).items()
+            name: asdict(zone)
+            for name, zone in metrics.error_by_zone(evaluation.image, evaluation.truth).items()
         },
         "unseen": _unseen_figures(evaluation),
-        "quality": {name: metrics.quality_figures(*each) for name, each in _predicted_sets(evaluation).items()} or None,
+        "quality": (
+            {
+                name: metrics.quality_figures(*each)
+                for name, each in _predicted_sets(evaluation).items()
+            }
+            or None
+        ),
         "recognised": _recognised(evaluation),
         "objects": len(evaluation.truth),
         **evaluation.facts,
@@ -187,14 +242,20 @@ def as_figures(evaluation: Evaluation) -> dict[str, Any]:
 def _unseen_figures(evaluation: Evaluation) -> dict[str, Any] | None:
     if not (second := evaluation.unseen):
         return None
-    return metrics.plain(metrics.judge(second.image, second.truth, evaluation.box)) | {"objects": len(second.truth)}
+    return metrics.plain(metrics.judge(second.image, second.truth, evaluation.box)) | {
+        "objects": len(second.truth)
+    }
 
 
 def _predicted_sets(evaluation: Evaluation) -> dict[str, tuple[metrics.Predictions, Float64]]:
-    """Return predicted and true quality of each set of objects, by its name; mixed objects also by share."""
-    sets, second = dict[str, tuple[metrics.Predictions, Float64]](), evaluation.unseen
+    """Return predicted and true quality of each set of objects, by its name; mixed objects also by
+    share.
+    """
+    sets = dict[str, tuple[metrics.Predictions, Float64]]()
+    second = evaluation.unseen
     if predicted := evaluation.predicted:
-        iou, kinds = evaluation.ours["silhouette_iou"], np.isin(evaluation.categories, tuple(CATEGORIES))
+        iou = evaluation.ours["silhouette_iou"]
+        kinds = np.isin(evaluation.categories, tuple(CATEGORIES))
         sets["objects"] = predicted, iou
         if kinds.any() and not kinds.all():
             sets |= {"the 18 kinds": (predicted.where(kinds), iou[kinds])}
@@ -205,23 +266,36 @@ def _predicted_sets(evaluation: Evaluation) -> dict[str, tuple[metrics.Predictio
 
 
 def _recognised(evaluation: Evaluation) -> dict[str, Any] | None:
-    """Return the shares of reconstructions, and of true images, recognised as their kind; None for other kinds."""
+    """Return the shares of reconstructions, and of true images, recognised as their kind; None for
+    other kinds.
+    """
     if not set(evaluation.categories) <= CATEGORIES.keys():
         return None
     each = {"reconstructions": evaluation.image, "truth": evaluation.truth}
     return metrics.plain(
         metrics.over_objects(
-            {name: recognised(images, evaluation.categories, evaluation.box) for name, images in each.items()}
+            {
+                name: recognised(images, evaluation.categories, evaluation.box)
+                for name, images in each.items()
+            }
         )
     )
 
 
 def _by_shown(evaluation: Evaluation) -> dict[str, Any] | None:
-    """Return the figures of left-out and of trained categories; None if none of these was left out."""
+    """Return the figures of left-out and of trained categories; None if none of these was left
+    out.
+    """
     if not set(evaluation.left_out) & set(evaluation.categories):
         return None
-    shown = ["left out" if category in evaluation.left_out else "shown" for category in evaluation.categories]
-    return {name: metrics.plain(figures) for name, figures in metrics.per_category(evaluation.ours, shown).items()}
+    shown = [
+        "left out" if category in evaluation.left_out else "shown"
+        for category in evaluation.categories
+    ]
+    return {
+        name: metrics.plain(figures)
+        for name, figures in metrics.per_category(evaluation.ours, shown).items()
+    }
 
 
 def write_report(folder: Path, evaluation: Evaluation, figures: Mapping[str, Any]) -> None:
@@ -243,36 +317,60 @@ def _write_objects(path: Path, evaluation: Evaluation) -> None:
     with path.open("w", encoding="utf-8", newline="") as file:
         rows = csv.writer(file)
         rows.writerow(["name", "category", *columns])
-        for k, (name, category) in enumerate(zip(evaluation.names, evaluation.categories, strict=True)):
+        for k, (name, category) in enumerate(
+            zip(evaluation.names, evaluation.categories, strict=True)
+        ):
             values = [float(column[k]) for column in columns.values()]
-            rows.writerow([name, category, *("" if np.isnan(value) else f"{value:.6g}" for value in values)])
+            rows.writerow(
+                [name, category, *("" if np.isnan(value) else f"{value:.6g}" for value in values)]
+            )
 
 
 def _draw(folder: Path, evaluation: Evaluation) -> None:
-    image, truth, names, ours = evaluation.image, evaluation.truth, evaluation.names, evaluation.ours
+    image = evaluation.image
+    truth = evaluation.truth
+    names = evaluation.names
+    ours = evaluation.ours
     pictures.draw_sheet(folder / "sheet.png", image, truth, names)
     if second := evaluation.unseen:
         pictures.draw_sheet(folder / UNSEEN_SHEET, second.image, second.truth, second.names)
     pictures.draw_gallery(folder / "gallery.png", image, truth, names, ours["silhouette_iou"])
     pictures.draw_categories(
-        folder / "categories.png", metrics.per_category(ours, evaluation.categories), metrics.over_objects(ours)
+        folder / "categories.png",
+        metrics.per_category(ours, evaluation.categories),
+        metrics.over_objects(ours),
     )
     if sets := _predicted_sets(evaluation):
         pictures.draw_quality(folder / QUALITY, sets)
     curves = {
-        measure_name: {error_name: metrics.curve(measure, error) for error_name, error in evaluation.errors.items()}
+        measure_name: {
+            error_name: metrics.curve(measure, error)
+            for error_name, error in evaluation.errors.items()
+        }
         for measure_name, measure in evaluation.surfaces.items()
     }
-    pictures.draw_against_surface(folder / "surface.png", evaluation.surfaces, evaluation.errors, curves)
+    pictures.draw_against_surface(
+        folder / "surface.png", evaluation.surfaces, evaluation.errors, curves
+    )
 
 
 def document(figures: Mapping[str, Any], folder: Path) -> Document:
     """Return the report from the figures, with the pictures that are in `folder`."""
     baselines = list(figures["baselines"])
-    met, count = sum(bar["met"] for bar in figures["bars"].values()), len(figures["bars"])
+    met = sum(bar["met"] for bar in figures["bars"].values())
+    count = len(figures["bars"])
     headline = f"Silhouette IoU {format_interval(figures['silhouette_iou'])}"
-    advice = f"{met} of {count} targets met, on {figures['objects']} objects. In brackets: 95 % interval over objects."
-    head = ("metric", "these weights (95 % interval)", "target", "met", *(name.replace("_", " ") for name in baselines))
+    advice = (
+        f"{met} of {count} targets met, on {figures['objects']} objects. In brackets: 95 % interval"
+        " over objects."
+    )
+    head = (
+        "metric",
+        "these weights (95 % interval)",
+        "target",
+        "met",
+        *(name.replace("_", " ") for name in baselines),
+    )
     details = [
         _against_nearest(figures["advantage_over_nearest_neighbour"], figures["training_objects"]),
         _shown(figures["shown_and_left_out"]),
@@ -282,22 +380,33 @@ def document(figures: Mapping[str, Any], folder: Path) -> Document:
     ]
     return Document(
         f"Reconstruction of {figures['objects']} hidden objects",
-        f"{figures['what']}. Weights: {figures['weights']} ({figures['input']}); rig: {figures['rig']}; "
-        f"{figures['runtime']}.",
+        f"{figures['what']}. Weights: {figures['weights']} ({figures['input']}); rig:"
+        f" {figures['rig']}; {figures['runtime']}.",
         [
             Section("", [Banner("good" if met == count else "doubtful", headline, advice)]),
             Section("", [Bullets("Note", figures["notes"])]),
             Section(
                 "Metrics",
-                [Table(head, [_row(figures, metric, baselines) for metric in metrics.TARGETS]), READ_WITH_CARE],
+                [
+                    Table(head, [_row(figures, metric, baselines) for metric in metrics.TARGETS]),
+                    READ_WITH_CARE,
+                ],
             ),
-            saved_picture("Truth, reconstruction and difference", SHEET_CAPTION, folder / "sheet.png"),
+            saved_picture(
+                "Truth, reconstruction and difference", SHEET_CAPTION, folder / "sheet.png"
+            ),
             *_unseen(figures["unseen"], folder),
             *_quality_section(figures["quality"], folder),
             Section("Where the error is", [text for text in details if text]),
-            saved_picture("Metrics by category", "Mean of each category with its interval.", folder / "categories.png"),
             saved_picture(
-                "Error against size and detail", _surface(figures["rank_correlation"]), folder / "surface.png"
+                "Metrics by category",
+                "Mean of each category with its interval.",
+                folder / "categories.png",
+            ),
+            saved_picture(
+                "Error against size and detail",
+                _surface(figures["rank_correlation"]),
+                folder / "surface.png",
             ),
             saved_picture("Worst and best silhouettes", SHEET_CAPTION, folder / "gallery.png"),
             Section("Next commands", [Commands(_next_commands(figures))]),
@@ -333,19 +442,25 @@ def _kinds(figures: Mapping[str, Any] | None) -> str:
         return ""
     ours, truth = (format_interval(figures[name]) for name in ("reconstructions", "truth"))
     return (
-        f"Share recognised as their kind, by the nearest of {PER_KIND} silhouettes of each of the 18 kinds: {ours} of "
-        f"the reconstructions, {truth} of the true silhouettes."
+        f"Share recognised as their kind, by the nearest of {PER_KIND} silhouettes of each of the"
+        f" 18 kinds: {ours} of the reconstructions, {truth} of the true silhouettes."
     )
 
 
 def _next_commands(figures: Mapping[str, Any]) -> list[str]:
-    chosen = "" if figures["weights"] == SHIPPED else f" --weights {shlex.quote(figures['weights'])}"
+    chosen = (
+        "" if figures["weights"] == SHIPPED else f" --weights {shlex.quote(figures['weights'])}"
+    )
     lines = [f"nlos-cam live --camera sim{chosen}", f"nlos-cam tradeoff reconstruct{chosen}"]
     return lines if figures["training_objects"] else [*lines, f"nlos-cam evaluate{chosen}"]
 
 
-def format_interval(figure: Mapping[str, float | None] | metrics.Interval, digits: int | None = None) -> str:
-    """Format an estimate and its interval, by default with two digits of the half width, "0.696 (0.660 to 0.731)"."""
+def format_interval(
+    figure: Mapping[str, float | None] | metrics.Interval, digits: int | None = None
+) -> str:
+    """Format an estimate and its interval, by default with two digits of the half width, "0.696
+    (0.660 to 0.731)".
+    """
     parts = asdict(figure) if isinstance(figure, metrics.Interval) else figure
     value, low, high = (parts[name] for name in ("value", "low", "high"))
     if value is None or low is None or high is None:
@@ -360,7 +475,10 @@ def _row(figures: Mapping[str, Any], metric: str, baselines: Sequence[str]) -> t
     target = f"{'at most' if metric in metrics.SMALLER_IS_BETTER else 'at least'} {bar['bar']:g}"
     ours = format_interval(figures[metric])
     digits = len(ours.split(" ")[0].partition(".")[2])
-    others = [format_interval(figures["baselines"][name][metric], digits).split(" ")[0] for name in baselines]
+    others = [
+        format_interval(figures["baselines"][name][metric], digits).split(" ")[0]
+        for name in baselines
+    ]
     return LABELS[metric], ours, target, "yes" if bar["met"] else "no", *others
 
 
@@ -369,16 +487,19 @@ def _against_nearest(figures: Mapping[str, Any] | None, among: int | None) -> st
         return ""
     parts = [f"{LABELS[metric]} {format_interval(figure)}" for metric, figure in figures.items()]
     return (
-        f"The nearest neighbour is the one of {among} training objects with the nearest maps (sum of squares over all "
-        "cells, each channel in units of its spread); the mean object is their mean. Advantage over the nearest "
-        f"neighbour per object, positive is better: {'; '.join(parts)}."
+        f"The nearest neighbour is the one of {among} training objects with the nearest maps (sum"
+        " of squares over all cells, each channel in units of its spread); the mean object is"
+        " their mean. Advantage over the nearest neighbour per object, positive is better:"
+        f" {'; '.join(parts)}."
     )
 
 
 def _shown(figures: Mapping[str, Any] | None) -> str:
     if not figures:
         return ""
-    parts = [f"{name} {format_interval(group['silhouette_iou'])}" for name, group in figures.items()]
+    parts = [
+        f"{name} {format_interval(group['silhouette_iou'])}" for name, group in figures.items()
+    ]
     return f"Silhouette IoU of categories in training and of left-out ones: {'; '.join(parts)}."
 
 
@@ -389,20 +510,28 @@ def _where(zones: Mapping[str, Any]) -> Table | str:
         (name, *(f"{100 * zone[share]:.0f} %" for share in ("share_of_error", "share_of_pixels")))
         for name, zone in zones.items()
     ]
-    return Table(("zone (the rim: 2 pixels either side of the true outline)", "absolute error", "pixels"), rows)
+    return Table(
+        ("zone (the rim: 2 pixels either side of the true outline)", "absolute error", "pixels"),
+        rows,
+    )
 
 
 def _categories(categories: Mapping[str, Any]) -> str:
-    ordered = sorted(categories, key=lambda name: categories[name]["silhouette_iou"]["value"] or 0.0)
+    ordered = sorted(
+        categories, key=lambda name: categories[name]["silhouette_iou"]["value"] or 0.0
+    )
     parts = [f"{name} {categories[name]['silhouette_iou']['value']:.2f}" for name in ordered]
     if len(parts) < 6:
         return f"Silhouette IoU by category: {', '.join(parts)}."
     return (
-        f"Silhouette IoU by category: worst {', '.join(parts[:3])}; best {', '.join(parts[-3:])}. With few objects "
-        "(three of each in the test set) the intervals tend to be too narrow."
+        f"Silhouette IoU by category: worst {', '.join(parts[:3])}; best {', '.join(parts[-3:])}."
+        " With few objects (three of each in the test set) the intervals tend to be too narrow."
     )
 
 
 def _surface(correlations: Mapping[str, Any]) -> str:
     parts = [f"{name} {format_interval(figure)}" for name, figure in correlations.items()]
-    return f"SI 6 reports the smallest errors on large or smooth objects. Rank correlations here: {'; '.join(parts)}."
+    return (
+        "SI 6 reports the smallest errors on large or smooth objects. Rank correlations here:"
+        f" {'; '.join(parts)}."
+    )

@@ -1,4 +1,6 @@
-"""Held-out objects as maps with sensor noise: the fixed test objects, random ones, or those of a dataset."""
+"""Held-out objects as maps with sensor noise: the fixed test objects, random ones, or those of a
+dataset.
+"""
 
 import os
 from collections.abc import Callable, Generator, Iterable, Sequence
@@ -11,7 +13,15 @@ import numpy as np
 from nlos_calibration import ObjectBox, Rig, rig_named
 from nlos_calibration.arrays import Float32
 from nlos_calibration.errors import RecordFileError
-from nlos_models import Answer, CheckpointRecord, MapSet, Reconstructor, UncertaintyModel, ask, subtract_bare_wall
+from nlos_models import (
+    Answer,
+    CheckpointRecord,
+    MapSet,
+    Reconstructor,
+    UncertaintyModel,
+    ask,
+    subtract_bare_wall,
+)
 
 from nlos_cam import dataset as data
 from nlos_cam import objects as shapes
@@ -45,8 +55,13 @@ def untracked(description: str) -> Generator[OnProgress]:
 
 
 TestSet = Literal["kinds", "unseen"]
-TEST_SETS: dict[TestSet, str] = {"kinds": "fixed test objects", "unseen": "fixed objects of kinds never seen"}
-QUIET = SensorModel(range_noise_m=0, range_noise_per_m=0, read_noise_counts=0, shot_noise=0, dead_share=0)
+TEST_SETS: dict[TestSet, str] = {
+    "kinds": "fixed test objects",
+    "unseen": "fixed objects of kinds never seen",
+}
+QUIET = SensorModel(
+    range_noise_m=0, range_noise_per_m=0, read_noise_counts=0, shot_noise=0, dead_share=0
+)
 """Sensor without noise or dead pixels; saturation and quantisation stay."""
 
 
@@ -68,7 +83,9 @@ def seeded_objects(first_seed: int, count: int, box: ObjectBox) -> list[SeededOb
     """Return random objects of consecutive seeds."""
     seeds = range(first_seed, first_seed + count)
     objects = [(seed, *shapes.object_depth(seed, box)) for seed in seeds]
-    return [SeededObject(f"{category} {seed}", category, depth_m) for seed, category, depth_m in objects]
+    return [
+        SeededObject(f"{category} {seed}", category, depth_m) for seed, category, depth_m in objects
+    ]
 
 
 def truth_of(subjects: Sequence[Subject], box: ObjectBox) -> Float32:
@@ -85,14 +102,20 @@ def echoes_of(subjects: Sequence[Subject], rig: Rig, on_progress: OnProgress) ->
     return echoes
 
 
-def sense(echoes: list[MultiBounce], rig: Rig, sensor: SensorModel | None = None, frames: int = 1) -> list[LidarMaps]:
-    """Return each object's maps as `live` forms them: sensor, reduction to cells, mean over `frames` frames.
+def sense(
+    echoes: list[MultiBounce], rig: Rig, sensor: SensorModel | None = None, frames: int = 1
+) -> list[LidarMaps]:
+    """Return each object's maps as `live` forms them: sensor, reduction to cells, mean over
+    `frames` frames.
 
     The frames equal the simulated camera's bit for bit, so that the same call gives the same maps.
     """
     scene = SceneFile(name="test objects", rig=rig, sensor=sensor or SensorModel())
     world = World(scene, echoes, [None])
-    return [_averaged(world, range(k, k + frames * len(echoes), len(echoes))) for k in range(len(echoes))]
+    return [
+        _averaged(world, range(k, k + frames * len(echoes), len(echoes)))
+        for k in range(len(echoes))
+    ]
 
 
 def _averaged(world: World, numbers: Sequence[int]) -> LidarMaps:
@@ -112,29 +135,43 @@ def reconstruct_all(reconstructor: Reconstructor, maps: MapSet) -> Float32:
 
 
 def answer_all(reconstructor: Reconstructor, maps: MapSet) -> Answer:
-    """Return images and, where the network has one, the probability of a surface, one object at a time."""
+    """Return images and, where the network has one, the probability of a surface, one object at a
+    time.
+    """
     pairs = zip(maps.depth_m, maps.intensity, strict=True)
     answers = [ask(reconstructor, depth_m[None], intensity[None]) for depth_m, intensity in pairs]
     surfaces = [answer.surface for answer in answers if answer.surface is not None]
-    return Answer(np.concatenate([answer.image for answer in answers]), np.concatenate(surfaces) if surfaces else None)
+    return Answer(
+        np.concatenate([answer.image for answer in answers]),
+        np.concatenate(surfaces) if surfaces else None,
+    )
 
 
 def predict_quality(
     answers: Answer, maps: MapSet, uncertainty_model: UncertaintyModel | None, rig: Rig
 ) -> Predictions | None:
-    """Return the predicted quality of a network's answers to raw maps; None without a quality model.
+    """Return the predicted quality of a network's answers to raw maps; None without a quality
+    model.
 
-    A frame is trusted as on the page: a detected object, on a verdict from this frame alone, of a trusted quality.
+    A frame is trusted as on the page: a detected object, on a verdict from this frame alone, of a
+    trusted quality.
     """
     if uncertainty_model is None or uncertainty_model.quality is None:
         return None
-    rows, box = list[tuple[float, ...]](), shapes.object_box(rig)
+    rows = list[tuple[float, ...]]()
+    box = shapes.object_box(rig)
     surfaces = [None] * len(answers.image) if answers.surface is None else answers.surface
-    for depth_m, intensity, image, surface in zip(maps.depth_m, maps.intensity, answers.image, surfaces, strict=True):
+    for depth_m, intensity, image, surface in zip(
+        maps.depth_m, maps.intensity, answers.image, surfaces, strict=True
+    ):
         frame = LidarMaps(depth_m, intensity, ~np.isnan(depth_m))
         doubt = estimate_doubt(uncertainty_model, frame, image, box, surface)
-        found = Reconstruction(shapes.depth_from_image(image, box), np.eye(4), doubt.error_m, {}, doubt)
-        _, verdict = VerdictFilter(verdict_limits(uncertainty_model)).decide(found, FrameConditions())
+        found = Reconstruction(
+            shapes.depth_from_image(image, box), np.eye(4), doubt.error_m, {}, doubt
+        )
+        _, verdict = VerdictFilter(verdict_limits(uncertainty_model)).decide(
+            found, FrameConditions()
+        )
         if quality := doubt.quality:
             trusted = quality.trusted and verdict is Verdict.SEEN
             rows.append((*quality.iou, 1e3 * quality.error_m, trusted))
@@ -160,19 +197,24 @@ class HeldOutObjects:
 
 
 def rig_of(record: CheckpointRecord) -> Rig:
-    """Return the rig that weights were trained for. Raises SceneError if it is neither packaged nor a file here."""
+    """Return the rig that weights were trained for. Raises SceneError if it is neither packaged nor
+    a file here.
+    """
     try:
         return rig_named(record.rig_name)
     except RecordFileError as error:
         raise SceneError(
-            f"the weights were trained for rig {record.rig_name!r}, which was not found ({error}): give one with --rig"
+            f"the weights were trained for rig {record.rig_name!r}, which was not found ({error}):"
+            " give one with --rig"
         ) from error
 
 
 def rendered_objects(
     rig: Rig, count: int | None = None, tracked: Tracked = untracked, *, test: TestSet = "kinds"
 ) -> HeldOutObjects:
-    """Render the 54 test objects of a set, or `count` random ones, with the simulated camera's noise on a rig."""
+    """Render the 54 test objects of a set, or `count` random ones, with the simulated camera's
+    noise on a rig.
+    """
     plan = data.DatasetPlan(rig, data.TEST_SEED)
     fixed = shapes.benchmark_objects if test == "kinds" else shapes.unseen_objects
     subjects = seeded_objects(plan.first_seed, count, plan.box) if count else fixed(plan.box)
@@ -181,7 +223,8 @@ def rendered_objects(
     maps = as_map_set(sense(echoes, rig), truth_of(subjects, plan.box))
     kind = "random objects" if count else TEST_SETS[test]
     description = f"{len(subjects)} held-out {kind}, with the sensor's noise"
-    names, categories = [one.name for one in subjects], [one.category for one in subjects]
+    names = [one.name for one in subjects]
+    categories = [one.category for one in subjects]
     return HeldOutObjects(description, names, categories, maps, plan, [rig] * len(names))
 
 
@@ -189,31 +232,48 @@ def dataset_objects(folder: Path) -> HeldOutObjects:
     """Return the objects and maps of a dataset."""
     opened = data.open_dataset(folder)
     categories = [str(category) for category in opened.column("category")]
-    names = [f"{category} {seed}" for category, seed in zip(categories, opened.column("seed"), strict=True)]
-    return HeldOutObjects(f"Maps of {folder}", names, categories, opened.arrays(), opened.plan, [*opened.benches()])
+    names = [
+        f"{category} {seed}"
+        for category, seed in zip(categories, opened.column("seed"), strict=True)
+    ]
+    return HeldOutObjects(
+        f"Maps of {folder}", names, categories, opened.arrays(), opened.plan, [*opened.benches()]
+    )
 
 
-def bare_wall_for(record: CheckpointRecord, plan: data.DatasetPlan, wall: Path | None = None) -> data.BareMaps | None:
-    """Return the bare wall to subtract for difference maps, as in training; None if the weights expect raw maps.
+def bare_wall_for(
+    record: CheckpointRecord, plan: data.DatasetPlan, wall: Path | None = None
+) -> data.BareMaps | None:
+    """Return the bare wall to subtract for difference maps, as in training; None if the weights
+    expect raw maps.
 
     Raises SceneError if a measured wall was given for raw maps.
     """
     if record.input == "raw maps":
         if wall:
-            raise SceneError(f"--wall {wall} only applies to difference maps; these weights expect raw maps: omit it")
+            raise SceneError(
+                f"--wall {wall} only applies to difference maps; these weights expect raw maps:"
+                " omit it"
+            )
         return None
     return data.measured_bare_wall(wall) if wall else data.render_bare_wall(plan)
 
 
-def network_input(maps: MapSet, bare: data.BareMaps | None, benches: Iterable[Rig], record: CheckpointRecord) -> MapSet:
-    """Return the maps that the network takes: minus the bare wall, or raw and aligned with the rig of the weights."""
+def network_input(
+    maps: MapSet, bare: data.BareMaps | None, benches: Iterable[Rig], record: CheckpointRecord
+) -> MapSet:
+    """Return the maps that the network takes: minus the bare wall, or raw and aligned with the rig
+    of the weights.
+    """
     return subtract_bare_wall(maps, *bare) if bare else align_all(maps, benches, record)
 
 
 def baseline_answers(
     objects: HeldOutObjects, training: Path | None, *, nearest: bool, tracked: Tracked = untracked
 ) -> tuple[dict[str, Float32], data.Dataset | None]:
-    """Return the baselines' images by name, and the training objects searched for the nearest neighbour, if wanted."""
+    """Return the baselines' images by name, and the training objects searched for the nearest
+    neighbour, if wanted.
+    """
     if not nearest:
         images = data.procedural_images(data.TRAINING_SEED, trivial.NEIGHBOURS, objects.plan.box)
         return trivial.trivial_answers(len(objects.names), trivial.mean_image(images)), None
@@ -221,21 +281,36 @@ def baseline_answers(
         opened = data.open_dataset(training)
     else:
         with tracked("rendering training objects for the nearest neighbour, once") as on_progress:
-            opened = trivial.training_maps(objects.plan, cache_folder(), os.cpu_count() or 1, on_progress)
+            opened = trivial.training_maps(
+                objects.plan, cache_folder(), os.cpu_count() or 1, on_progress
+            )
     with tracked("searching the nearest neighbours") as on_progress:
         return trivial.answers_with_nearest(objects.maps, opened, on_progress), opened
 
 
-def notes_about(record: CheckpointRecord, objects: HeldOutObjects, training: data.Dataset | None) -> list[str]:
-    """List mismatches between weights, objects and baselines that a reader of the figures has to know."""
-    rig, notes = objects.plan.rig, list[str]()
+def notes_about(
+    record: CheckpointRecord, objects: HeldOutObjects, training: data.Dataset | None
+) -> list[str]:
+    """List mismatches between weights, objects and baselines that a reader of the figures has to
+    know.
+    """
+    rig = objects.plan.rig
+    notes = list[str]()
     if record.rig_checksum != rig.checksum:
         aligned = ", and aligned with it" if rig_to_align_with(rig, record) else ""
-        notes.append(f"the weights were trained for rig {record.rig_name} but the maps are of rig {rig.name}{aligned}")
+        notes.append(
+            f"the weights were trained for rig {record.rig_name} but the maps are of rig"
+            f" {rig.name}{aligned}"
+        )
     if objects.plan.spread != data.RigSpread():
-        notes.append(f"each object is on a rig of its own around {rig.name}, and aligned with it where possible")
+        notes.append(
+            f"each object is on a rig of its own around {rig.name}, and aligned with it where"
+            " possible"
+        )
     if training and training.plan.rig.checksum != rig.checksum:
-        notes.append(f"the nearest neighbours come from {training.folder}, whose maps are of another rig")
+        notes.append(
+            f"the nearest neighbours come from {training.folder}, whose maps are of another rig"
+        )
     if unseen := sorted(set(left_out_categories(record)) & set(objects.categories)):
         notes.append(f"the weights' VAE was trained without {', '.join(unseen)}")
     return notes
