@@ -1,4 +1,6 @@
-"""Description of any file or folder that the program writes or reads: kind, origin, content, damage, next commands."""
+"""Description of any file or folder that the program writes or reads: kind, origin, content,
+damage, next commands.
+"""
 
 import lazy_loader
 

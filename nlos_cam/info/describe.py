@@ -25,17 +25,17 @@ FILES: dict[str, tuple[str, Describe]] = {
 }
 """Word for a damaged file, and reader, by suffix."""
 KINDS = (
-    "recordings (.bag) and their sidecars (.json), .npz files, saved views and reports (.html), wall, scene, rig and "
-    "recipe files (.toml), dataset shards (.h5), and the folders of datasets, training runs, weights, replays, "
-    "exports, evaluations and trade-offs"
+    "recordings (.bag) and their sidecars (.json), .npz files, saved views and reports (.html),"
+    " wall, scene, rig and recipe files (.toml), dataset shards (.h5), and the folders of datasets,"
+    " training runs, weights, replays, exports, evaluations and trade-offs"
 )
 
 
 def describe(path: Path, *, verify: bool = False) -> files.Description:
     """Return the description of a file or folder; `verify` reads all of it instead of its heads.
 
-    The name "sample" stands for the packaged recording. A damaged one has a `problem`. Raises RecordingError where
-    there is none, or it is of no known kind.
+    The name "sample" stands for the packaged recording. A damaged one has a `problem`. Raises
+    RecordingError where there is none, or it is of no known kind.
     """
     if not path.exists() and str(path) == SAMPLE.stem:
         path = SAMPLE
@@ -52,13 +52,22 @@ def describe(path: Path, *, verify: bool = False) -> files.Description:
             found = reader(path, verify)
         except (NlosCamError, CalibrationError, ModelError) as error:
             found = files.Description(kind, problem=" ".join(str(error).split()))
-        except (LookupError, TypeError, ValueError, AttributeError) as error:  # fields that the program never wrote
+        except (
+            LookupError,
+            TypeError,
+            ValueError,
+            AttributeError,
+        ) as error:  # fields that the program never wrote
             found = files.Description(
-                kind, problem=f"{path} is damaged ({type(error).__name__} in its fields): make it again"
+                kind,
+                problem=f"{path} is damaged ({type(error).__name__} in its fields): make it again",
             )
         except OSError as error:
             raise RecordingError(f"{path} cannot be read: {error.strerror or error}") from error
         if found:
-            file_date = f"{datetime.fromtimestamp(path.stat().st_mtime, UTC):%Y-%m-%d %H:%M:%S} UTC (file's date)"
+            file_date = (
+                f"{datetime.fromtimestamp(path.stat().st_mtime, UTC):%Y-%m-%d %H:%M:%S} UTC (file's"
+                " date)"
+            )
             return replace(found, bytes=files.size_of(path), created=found.created or file_date)
     raise RecordingError(f"{path} is of no known kind. Known are {KINDS}")

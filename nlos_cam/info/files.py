@@ -23,7 +23,9 @@ SESSION_MARK = b"nlos-cam session"
 
 @dataclass(frozen=True)
 class Description:
-    """Content of a file or folder in a few facts. A reader of a damaged one gives the facts that it could read."""
+    """Content of a file or folder in a few facts. A reader of a damaged one gives the facts that it
+    could read.
+    """
 
     kind: str
     facts: Mapping[str, str] = field(default_factory=dict[str, str])
@@ -67,25 +69,40 @@ def describe_bag(path: Path, verify: bool) -> Description:
     from nlos_cam.recording import BagReader, load_sidecar, sidecar_path
 
     bag = BagReader(path)
-    facts = {"device": " ".join(bag.device.get(name, "") for name in ("name", "serial_number")).strip() or "not known"}
-    if longest := max(bag.streams.values(), key=lambda info: info.frames if info.format else 0, default=None):
+    facts = {
+        "device": " ".join(bag.device.get(name, "") for name in ("name", "serial_number")).strip()
+        or "not known"
+    }
+    if longest := max(
+        bag.streams.values(), key=lambda info: info.frames if info.format else 0, default=None
+    ):
         ends_s = [bag.sample(longest.name, k).timestamp_s for k in (0, longest.frames - 1)]
         facts["duration"] = f"{max(ends_s[1] - ends_s[0], 0.0):.1f} s"
     for name, info in bag.streams.items():
         size = f"{info.intrinsics.width} x {info.intrinsics.height}"
         form = info.format or f"{info.encoding} (not readable)"
-        facts[name] = f"{count(info.frames, 'frame')}, {info.frames_per_s} per second, {size}, {form}"
+        facts[name] = (
+            f"{count(info.frames, 'frame')}, {info.frames_per_s} per second, {size}, {form}"
+        )
     created = made_by = ""
     if sidecar_path(path).exists():
         try:
             sidecar = load_sidecar(sidecar_path(path))
-            created, made_by = f"{sidecar.started:%Y-%m-%d %H:%M:%S} UTC", f"nlos-cam {sidecar.versions['nlos-cam']}"
-            facts |= {"label": sidecar.label or "none", "camera": sidecar.camera, "state": sidecar.state}
+            created = f"{sidecar.started:%Y-%m-%d %H:%M:%S} UTC"
+            made_by = f"nlos-cam {sidecar.versions['nlos-cam']}"
+            facts |= {
+                "label": sidecar.label or "none",
+                "camera": sidecar.camera,
+                "state": sidecar.state,
+            }
         except (RecordingError, KeyError) as error:
             facts["sidecar"] = f"not readable: {error}"
     problem = problem_of(bag.check) if verify else ""
     quoted = shlex.quote(str(path))
-    is_lidar = all(stream in bag.streams and bag.streams[stream].format == form for stream, form in FORMATS.items())
+    is_lidar = all(
+        stream in bag.streams and bag.streams[stream].format == form
+        for stream, form in FORMATS.items()
+    )
     following = [f"nlos-cam export {quoted}"]
     if is_lidar and not problem:
         following = [f"nlos-cam replay {quoted} --out replayed", *following]
@@ -110,7 +127,15 @@ ARRAYS = (
     ({"vertices_m", "faces"}, "mesh of a hidden surface"),
 )
 """Names that all files of a kind have."""
-COUNTED = {"frame_number", "timestamp_s", "verdict", "object_depth_m", "facts", "vertices_m", "faces"}
+COUNTED = {
+    "frame_number",
+    "timestamp_s",
+    "verdict",
+    "object_depth_m",
+    "facts",
+    "vertices_m",
+    "faces",
+}
 """Arrays that are read, each up to MAX_ARRAY_BYTES."""
 READ = COUNTED | {"rig_name", "rig_checksum", "radiometry"}
 MAX_ARRAY_BYTES = 256 << 20
@@ -121,11 +146,25 @@ def describe_npz(path: Path, verify: bool) -> Description:
     try:
         with ZipFile(path) as file:
             names = {Path(name).stem for name in file.namelist()}
-            if any(each.file_size > MAX_ARRAY_BYTES for each in file.infolist() if Path(each.filename).stem in COUNTED):
-                raise RecordingError(f"{path} holds more than {MAX_ARRAY_BYTES >> 20} MiB of numbers: make it again")
+            if any(
+                each.file_size > MAX_ARRAY_BYTES
+                for each in file.infolist()
+                if Path(each.filename).stem in COUNTED
+            ):
+                raise RecordingError(
+                    f"{path} holds more than {MAX_ARRAY_BYTES >> 20} MiB of numbers: make it again"
+                )
             bad = file.testzip() if verify else None
         kind, facts, following = _kind_of_arrays(path, names, read_arrays(path, names & READ))
-    except (BadZipFile, OSError, ValueError, LookupError, TypeError, NotImplementedError, zlib.error) as error:
+    except (
+        BadZipFile,
+        OSError,
+        ValueError,
+        LookupError,
+        TypeError,
+        NotImplementedError,
+        zlib.error,
+    ) as error:
         if isinstance(error, OSError) and error.errno:
             raise
         raise RecordingError(f"{path} is cut short or damaged ({error}): make it again") from error
@@ -134,19 +173,27 @@ def describe_npz(path: Path, verify: bool) -> Description:
     return Description(kind, facts, "", "", problem, checked, following)
 
 
-def _kind_of_arrays(path: Path, names: set[str], arrays: Any) -> tuple[str, dict[str, str], list[str]]:
+def _kind_of_arrays(
+    path: Path, names: set[str], arrays: Any
+) -> tuple[str, dict[str, str], list[str]]:
     """Return kind, facts and next commands. Raises what numpy raises for damaged arrays."""
-    quoted, following = shlex.quote(str(path)), list[str]()
+    quoted = shlex.quote(str(path))
+    following = list[str]()
     facts = {"rig": f"{arrays['rig_name']} {arrays['rig_checksum']}"} if "rig_name" in names else {}
     kind = next((kind for needed, kind in ARRAYS if needed <= names), "arrays of another program")
     facts |= _frames(arrays) if {"frame_number", "timestamp_s"} <= names else {}
     if kind == REPLAYED:
         verdicts, counts = np.unique(arrays["verdict"], return_counts=True)
-        facts["verdicts"] = ", ".join(f"{verdict or 'none'} {n}" for verdict, n in zip(verdicts, counts, strict=True))
+        facts["verdicts"] = ", ".join(
+            f"{verdict or 'none'} {n}" for verdict, n in zip(verdicts, counts, strict=True)
+        )
         following = [f"nlos-cam export {quoted} --object ply,glb,csv"]
     elif "object_depth_m" in names:
         known = np.isfinite(arrays["object_depth_m"])
-        facts |= {"radiometry": str(arrays["radiometry"]), "object": f"{known.sum()} of {known.size} pixels"}
+        facts |= {
+            "radiometry": str(arrays["radiometry"]),
+            "object": f"{known.sum()} of {known.size} pixels",
+        }
     elif "inliers" in names:
         known = json.loads(str(arrays["facts"]))
         facts |= {"frames": str(known.get("frames")), "serial": known.get("serial") or "not known"}
@@ -159,11 +206,15 @@ def _kind_of_arrays(path: Path, names: set[str], arrays: Any) -> tuple[str, dict
 
 
 def _frames(arrays: Any) -> dict[str, str]:
-    numbers, times_s = arrays["frame_number"], arrays["timestamp_s"]
+    numbers = arrays["frame_number"]
+    times_s = arrays["timestamp_s"]
     if not len(numbers):
         return {"frames": "none"}
     span_s = times_s[-1] - times_s[0]
-    return {"frames": f"{len(numbers)}, numbers {numbers[0]} to {numbers[-1]}", "duration": f"{span_s:.1f} s"}
+    return {
+        "frames": f"{len(numbers)}, numbers {numbers[0]} to {numbers[-1]}",
+        "duration": f"{span_s:.1f} s",
+    }
 
 
 def describe_toml(path: Path, _verify: bool) -> Description | None:
@@ -173,54 +224,89 @@ def describe_toml(path: Path, _verify: bool) -> Description | None:
     except UnicodeDecodeError as error:
         raise _binary(path) from error
     except tomllib.TOMLDecodeError as error:
-        raise RecordingError(f"{path} is not TOML ({error}): correct it, or write it again") from error
-    quoted, checked = shlex.quote(str(path)), "all fields"
+        raise RecordingError(
+            f"{path} is not TOML ({error}): correct it, or write it again"
+        ) from error
+    quoted = shlex.quote(str(path))
+    checked = "all fields"
     if {"created", "verdict"} & set(keys):
         return _wall(path, quoted)
     if "task" in keys:
         recipe = load_recipe(path)
         facts = {"task": recipe.task, "epochs": str(recipe.epochs)}
-        return Description("training recipe", facts, checked=checked, next=[f"nlos-cam train {recipe.task} --help"])
+        return Description(
+            "training recipe", facts, checked=checked, next=[f"nlos-cam train {recipe.task} --help"]
+        )
     if {"pinhole", "lidar"} & set(keys):
         rig = load_rig(str(path))
         facts = {"name": rig.name, "checksum": rig.checksum, **_pose(rig)}
-        return Description("rig", facts, checked=checked, next=[f"nlos-cam render cup --rig {quoted}"])
+        return Description(
+            "rig", facts, checked=checked, next=[f"nlos-cam render cup --rig {quoted}"]
+        )
     if {"rig", "object", "motion", "sensor", "faults", "radiometry"} & set(keys):
         from nlos_cam.render import load_scene
 
         scene = load_scene(path)
         facts = {"name": scene.name, "rig": scene.rig.name, "radiometry": scene.radiometry}
-        facts["frames"] = f"{count(scene.motion.poses, 'pose')}, repeated" if scene.motion else "one pose"
-        following = [f"nlos-cam live --camera sim:{quoted}", f"nlos-cam capture --camera sim:{quoted} --out run.bag"]
+        facts["frames"] = (
+            f"{count(scene.motion.poses, 'pose')}, repeated" if scene.motion else "one pose"
+        )
+        following = [
+            f"nlos-cam live --camera sim:{quoted}",
+            f"nlos-cam capture --camera sim:{quoted} --out run.bag",
+        ]
         return Description("scene of the simulated camera", facts, checked=checked, next=following)
     if path.name == "nlos-cam.toml":
-        return Description("settings", {key: str(value) for key, value in keys.items()}, next=["nlos-cam config"])
+        return Description(
+            "settings", {key: str(value) for key, value in keys.items()}, next=["nlos-cam config"]
+        )
     return None
 
 
 def _wall(path: Path, quoted: str) -> Description:
     record = load_wall(path)
-    facts = {"verdict": f"{record.verdict}: {record.advice}", "camera": record.camera, "frames": str(record.frames)}
-    facts |= {**_pose(record.rig), "occluder": record.occluder.source if record.occluder else "not measured"}
+    facts = {
+        "verdict": f"{record.verdict}: {record.advice}",
+        "camera": record.camera,
+        "frames": str(record.frames),
+    }
+    facts |= {
+        **_pose(record.rig),
+        "occluder": record.occluder.source if record.occluder else "not measured",
+    }
     problem = ""
     if record.reference:
         reference = path.with_name(record.reference)
         facts["reference"] = record.reference
-        problem = "" if reference.exists() else f"its reference {reference} is missing: put it back, or calibrate again"
+        problem = (
+            ""
+            if reference.exists()
+            else f"its reference {reference} is missing: put it back, or calibrate again"
+        )
     following = [f"nlos-cam live --camera l515 --wall {quoted}"]
     if record.occluder is None:
         following.append(f"nlos-cam calibrate --occluder {quoted} --camera l515 --out bench.toml")
     return Description(
-        "wall record", facts, str(record.created), "nlos-cam calibrate", problem, "all fields", following
+        "wall record",
+        facts,
+        str(record.created),
+        "nlos-cam calibrate",
+        problem,
+        "all fields",
+        following,
     )
 
 
 def _pose(rig: Any) -> dict[str, str]:
-    return {"lidar": f"{1e3 * rig.lidar.distance_m:.1f} mm from the wall, facing {rig.facing_deg:.2f}°"}
+    return {
+        "lidar": f"{1e3 * rig.lidar.distance_m:.1f} mm from the wall, facing {rig.facing_deg:.2f}°"
+    }
 
 
 def _text(path: Path) -> str:
-    """Return a file's text. Raises RecordingError for a binary file, and OSError for one too long for a record."""
+    """Return a file's text. Raises RecordingError for a binary file, and OSError for one too long
+    for a record.
+    """
     try:
         return read_bounded(path, MAX_TEXT_BYTES).decode()
     except UnicodeDecodeError as error:
@@ -246,7 +332,9 @@ def read_json(path: Path, text: str | bytes) -> Any:
     try:
         return json.loads(text)
     except (ValueError, RecursionError) as error:
-        raise RecordingError(f"{path} is not JSON ({error}): it is cut short or damaged; make it again") from error
+        raise RecordingError(
+            f"{path} is not JSON ({error}): it is cut short or damaged; make it again"
+        ) from error
 
 
 def describe_json(path: Path, verify: bool) -> Description | None:
@@ -263,7 +351,8 @@ def describe_json(path: Path, verify: bool) -> Description | None:
 def _sidecar(path: Path, verify: bool) -> Description:
     from nlos_cam.recording import load_sidecar
 
-    sidecar, bag = load_sidecar(path), path.with_suffix(".bag")
+    sidecar = load_sidecar(path)
+    bag = path.with_suffix(".bag")
     facts = {"camera": sidecar.camera, "state": sidecar.state, "label": sidecar.label or "none"}
     if sidecar.summary and sidecar.summary.frames is not None:
         facts["frames"] = f"{sidecar.summary.frames}, {sidecar.summary.dropped or 0} dropped"
@@ -275,7 +364,9 @@ def _sidecar(path: Path, verify: bool) -> Description:
     made_by = f"nlos-cam {sidecar.versions.get('nlos-cam', '')} capture"
     following = [] if problem else [f"nlos-cam info {shlex.quote(str(bag))}"]
     created = f"{sidecar.started:%Y-%m-%d %H:%M:%S} UTC"
-    return Description("sidecar of a recording", facts, created, made_by, problem, "all fields", following)
+    return Description(
+        "sidecar of a recording", facts, created, made_by, problem, "all fields", following
+    )
 
 
 def describe_page(path: Path, _verify: bool) -> Description | None:
@@ -285,7 +376,9 @@ def describe_page(path: Path, _verify: bool) -> Description | None:
         file.seek(max(path.stat().st_size - 64, 0))
         end = file.read()
     if SESSION_MARK in head:
-        return Description("saved view", checked="head", next=[f"nlos-cam view {shlex.quote(str(path))}"])
+        return Description(
+            "saved view", checked="head", next=[f"nlos-cam view {shlex.quote(str(path))}"]
+        )
     if b'<p class="under">' not in head:
         return None
     title = head.partition(b"<title>")[2].partition(b"</title>")[0].decode("utf-8", "replace")
@@ -312,6 +405,8 @@ def describe_shard(path: Path, verify: bool) -> Description:
     seeds = f"{len(head.seeds)}, seeds {head.seeds.start} to {head.seeds.stop - 1}"
     facts = {"objects": seeds, "rig": head.plan.rig.name}
     made_by = f"nlos-cam {version}: {command}"
-    checked = "checksums of all arrays" if verify else "checksums of plan and seeds; --verify reads all"
+    checked = (
+        "checksums of all arrays" if verify else "checksums of plan and seeds; --verify reads all"
+    )
     following = [f"nlos-cam info {shlex.quote(str(path.parent))}"]
     return Description("dataset shard", facts, "", made_by, problem, checked, following)

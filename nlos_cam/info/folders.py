@@ -17,11 +17,14 @@ def describe_dataset(folder: Path, verify: bool) -> Description:
     from nlos_cam.dataset import check_arrays, shard_origin, shards_of
 
     shards = shards_of(folder)
-    plan, (version, command) = shards[0].plan, shard_origin(shards[0].path)
-    objects, span = sum(len(shard.seeds) for shard in shards), shards[-1].seeds.stop - shards[0].seeds.start
+    plan = shards[0].plan
+    (version, command) = shard_origin(shards[0].path)
+    objects = sum(len(shard.seeds) for shard in shards)
+    span = shards[-1].seeds.stop - shards[0].seeds.start
     facts = {
         "objects": f"{objects} in {count(len(shards), 'shard')}",
-        "seeds": f"{shards[0].seeds.start} to {shards[-1].seeds.stop - 1}" + (", with gaps" if objects < span else ""),
+        "seeds": f"{shards[0].seeds.start} to {shards[-1].seeds.stop - 1}"
+        + (", with gaps" if objects < span else ""),
         "kind": "color" if plan.textures else "depth",
         "rig": plan.rig.name,
     }
@@ -30,24 +33,40 @@ def describe_dataset(folder: Path, verify: bool) -> Description:
     if others and not problem:
         facts["other plans"] = f"{count(len(others), 'shard')}, such as {min(others)}"
     quoted = shlex.quote(str(folder))
-    following = [f"nlos-cam evaluate --dataset {quoted}", f"nlos-cam train compressor --dataset {quoted} --help"]
-    checked = "checksums of all arrays" if verify else "checksums of plans and seeds; --verify reads all"
-    return Description("dataset", facts, "", f"nlos-cam {version}: {command}", problem, checked, following)
+    following = [
+        f"nlos-cam evaluate --dataset {quoted}",
+        f"nlos-cam train compressor --dataset {quoted} --help",
+    ]
+    checked = (
+        "checksums of all arrays" if verify else "checksums of plans and seeds; --verify reads all"
+    )
+    return Description(
+        "dataset", facts, "", f"nlos-cam {version}: {command}", problem, checked, following
+    )
 
 
 def describe_weights(folder: Path, _verify: bool) -> Description:
-    """Describe weights from their record; the checksums of their files, some 50 MB, are always compared."""
-    record, quoted = load_record(folder), shlex.quote(str(folder))
+    """Describe weights from their record; the checksums of their files, some 50 MB, are always
+    compared.
+    """
+    record = load_record(folder)
+    quoted = shlex.quote(str(folder))
     facts = {
         "rig": f"{record.rig_name} {record.rig_checksum}",
         "input": record.input,
-        "runs": ", ".join(f"{recipe.task} ({count(recipe.epochs, 'epoch')})" for recipe in record.runs) or "none",
+        "runs": ", ".join(
+            f"{recipe.task} ({count(recipe.epochs, 'epoch')})" for recipe in record.runs
+        )
+        or "none",
         "networks": ", ".join(sorted(path.stem for path in folder.glob("*.safetensors"))) or "none",
         "uncertainty": "yes" if (folder / "doubt.json").exists() else "no",
     }
     facts |= {name: f"{value:.3g}" for name, value in record.figures.items()}
     problem = _checksum_problem(folder)
-    following = [f"nlos-cam evaluate --weights {quoted}", f"nlos-cam live --camera sim --weights {quoted}"]
+    following = [
+        f"nlos-cam evaluate --weights {quoted}",
+        f"nlos-cam live --camera sim --weights {quoted}",
+    ]
     return Description("weights", facts, "", "", problem, f"checksums in {CHECKSUMS}", following)
 
 
@@ -58,7 +77,9 @@ def _checksum_problem(folder: Path) -> str:
         if not file.exists():
             return f"{file} is missing: copy the weights again"
         if hashlib.sha256(file.read_bytes()).hexdigest() != digest:
-            return f"{file} is damaged (its checksum differs from {CHECKSUMS}): copy the weights again"
+            return (
+                f"{file} is damaged (its checksum differs from {CHECKSUMS}): copy the weights again"
+            )
     return ""
 
 
@@ -67,9 +88,16 @@ def describe_run(folder: Path, _verify: bool) -> Description:
     with (folder / "log.csv").open(encoding="utf-8", newline="") as file:
         rows = [*csv.DictReader(file)]
     finished = (folder / "checkpoint.json").exists()
-    facts = {"epochs": str(len(rows)), "state": "finished" if finished else "not finished: the same command resumes"}
+    facts = {
+        "epochs": str(len(rows)),
+        "state": "finished" if finished else "not finished: the same command resumes",
+    }
     if rows:
-        facts |= {f"last {name}": value for name, value in rows[-1].items() if name and value and name != "epoch"}
+        facts |= {
+            f"last {name}": value
+            for name, value in rows[-1].items()
+            if name and value and name != "epoch"
+        }
     quoted = shlex.quote(str(folder))
     following = [f"nlos-cam evaluate --weights {quoted}"] if finished else []
     return Description("training run", facts, "", "", "", "log", following)
@@ -78,8 +106,20 @@ def describe_run(folder: Path, _verify: bool) -> Description:
 def describe_replay(folder: Path, verify: bool) -> Description:
     """Describe a replay from its result."""
     found = describe_npz(folder / "reconstruction.npz", verify)
-    page = [f"open {shlex.quote(str(folder / 'report.html'))}"] if (folder / "report.html").exists() else []
-    return Description("replay", found.facts, "", "nlos-cam replay", found.problem, found.checked, [*page, *found.next])
+    page = (
+        [f"open {shlex.quote(str(folder / 'report.html'))}"]
+        if (folder / "report.html").exists()
+        else []
+    )
+    return Description(
+        "replay",
+        found.facts,
+        "",
+        "nlos-cam replay",
+        found.problem,
+        found.checked,
+        [*page, *found.next],
+    )
 
 
 def describe_export(folder: Path, _verify: bool) -> Description:
@@ -89,7 +129,13 @@ def describe_export(folder: Path, _verify: bool) -> Description:
     facts = {"recording": str(record.get("recording")), "every": f"{record.get('every', 1)}. frame"}
     for name in streams:
         images = len([*(folder / name).glob("*.png")])
-        facts[name] = f"{images} images" if images else "arrays" if (folder / f"{name}.npz").exists() else "left out"
+        facts[name] = (
+            f"{images} images"
+            if images
+            else "arrays"
+            if (folder / f"{name}.npz").exists()
+            else "left out"
+        )
     facts["point clouds"] = str(len([*(folder / "points").glob("*.ply")]))
     return Description("export of a recording", facts, "", "nlos-cam export", "", "record")
 
@@ -97,10 +143,16 @@ def describe_export(folder: Path, _verify: bool) -> Description:
 def describe_figures(folder: Path, _verify: bool) -> Description:
     """Describe an evaluation from its figures."""
     figures = _json(folder / "figures.json")
-    facts = {name: str(figures[name]) for name in ("what", "objects", "weights", "rig", "runtime") if name in figures}
+    facts = {
+        name: str(figures[name])
+        for name in ("what", "objects", "weights", "rig", "runtime")
+        if name in figures
+    }
     if iou := figures.get("silhouette_iou"):
         facts["silhouette IoU"] = (
-            f"{iou['value']:.3f} ({iou['low']:.3f} to {iou['high']:.3f})" if iou["value"] else "none"
+            f"{iou['value']:.3f} ({iou['low']:.3f} to {iou['high']:.3f})"
+            if iou["value"]
+            else "none"
         )
     following = [f"open {shlex.quote(str(folder / 'report.html'))}"]
     return Description("evaluation", facts, "", "nlos-cam evaluate", "", "JSON", following)
@@ -109,7 +161,10 @@ def describe_figures(folder: Path, _verify: bool) -> Description:
 def describe_tradeoff(folder: Path, _verify: bool) -> Description:
     """Describe a trade-off from its table."""
     table = _json(folder / "tradeoff.json")
-    facts = {"machine": str(table.get("machine")), "complete": "yes" if table.get("complete") else "no: interrupted"}
+    facts = {
+        "machine": str(table.get("machine")),
+        "complete": "yes" if table.get("complete") else "no: interrupted",
+    }
     following = [f"open {shlex.quote(str(folder / 'tradeoff.html'))}"]
     return Description("trade-off", facts, "", "nlos-cam tradeoff", "", "JSON", following)
 
