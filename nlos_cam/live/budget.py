@@ -1,10 +1,12 @@
 """Latency budget (`--budget-ms`): the most accurate measured setting that meets it on this machine.
 
-    expected latency = hand-over + all but the networks, here + networks' 90th percentile in the table x how much slower
+    expected latency = hand-over + all but the networks, here + networks' 90th percentile in the
+    table x how much slower
                        this machine is + (n - 1) / 2 frame periods
 
-The last term is the age of a mean over n frames: its frames are 0 to n - 1 periods older than the newest, on average
-(n - 1) / 2. The table's accuracy was measured with objects at rest; moving ones blur as well.
+The last term is the age of a mean over n frames: its frames are 0 to n - 1 periods older than the
+newest, on average (n - 1) / 2. The table's accuracy was measured with objects at rest; moving ones
+blur as well.
 """
 
 import os
@@ -31,19 +33,27 @@ from nlos_cam.reconstruct import CalibratedRig, Clock, Pipeline
 
 TRADEOFF = "tradeoff.json"
 """Table written by `tradeoff reconstruct`; one is beside the shipped weights."""
-SHIPPED, ONNX_FLOAT32 = "shipped", "ONNX Runtime float32"
+SHIPPED = "shipped"
+ONNX_FLOAT32 = "ONNX Runtime float32"
 PERIOD_MS = 1000 / FRAMES_PER_S
 HANDOVER_MS = 2.4
-"""From a frame's timestamp to its processing: 95th percentile of delivery and queue in docs/live.json."""
+"""From a frame's timestamp to its processing: 95th percentile of delivery and queue in
+docs/live.json.
+"""
 BUSY_SHARE = 0.5
 """Share of each frame period for processing: the rest is for camera, view and other programs."""
-CALLS, LATE_PERCENT = 30, 95
+CALLS = 30
+LATE_PERCENT = 95
 """Calls timed on this machine, and the percentile taken of them."""
 
 BuildPipeline = Callable[[Reconstructor, int], Pipeline]
 """Networks and number of averaged frames to a pipeline."""
-Runtimes = Callable[[Path | None, Rig, ObjectBox, Path], Mapping[str, Callable[[int], Reconstructor]]]
-"""Weights, rig, object box and cache folder to loaders by runtime, which take a number of threads."""
+Runtimes = Callable[
+    [Path | None, Rig, ObjectBox, Path], Mapping[str, Callable[[int], Reconstructor]]
+]
+"""Weights, rig, object box and cache folder to loaders by runtime, which take a number of
+threads.
+"""
 
 
 class Metric(BaseModel):
@@ -120,26 +130,52 @@ class BudgetChoice:
 
     def describe(self) -> str:
         """Return the choice and its cost in accuracy in one line."""
-        setting, loss_mm = self.setting, self.setting.rmse_mm - self.best.rmse_mm
+        loss_mm = self.setting.rmse_mm - self.best.rmse_mm
+        setting = self.setting
         threads = f"{setting.threads} thread{'s' if setting.threads > 1 else ''}"
-        mean = f", mean of {setting.frames} frames ({setting.averaging_ms:.0f} ms)" if setting.frames > 1 else ""
-        cost = f"{loss_mm:.1f} mm above the best, {self.best.name}" if loss_mm > 0 else "the best of all settings"
+        mean = (
+            f", mean of {setting.frames} frames ({setting.averaging_ms:.0f} ms)"
+            if setting.frames > 1
+            else ""
+        )
+        cost = (
+            f"{loss_mm:.1f} mm above the best, {self.best.name}"
+            if loss_mm > 0
+            else "the best of all settings"
+        )
         return (
-            f"Budget {self.budget_ms:g} ms: {setting.runtime} on {threads}{mean}; expected p95 {self.expected_ms:.1f} "
-            f"ms; RMSE {setting.rmse_mm:.1f} mm, {cost}"
+            f"Budget {self.budget_ms:g} ms: {setting.runtime} on {threads}{mean}; expected p95"
+            f" {self.expected_ms:.1f} ms; RMSE {setting.rmse_mm:.1f} mm, {cost}"
         )
 
     def outcome(self, report: RunReport) -> dict[str, Any]:
-        """Return the choice and its result in a run, ready for JSON; `p95_ms` includes averaging."""
+        """Return the choice and its result in a run, ready for JSON; `p95_ms` includes
+        averaging.
+        """
         p95_ms = report.latency_ms["p95"] + self.setting.averaging_ms
-        setting = self.setting.model_dump(include={"name", "weights", "runtime", "threads", "frames"})
-        figures = {"expected_ms": self.expected_ms, "rmse_mm": self.setting.rmse_mm, "best_rmse_mm": self.best.rmse_mm}
-        return {"ms": self.budget_ms, **setting, **figures, "p95_ms": p95_ms, "kept": p95_ms <= self.budget_ms}
+        setting = self.setting.model_dump(
+            include={"name", "weights", "runtime", "threads", "frames"}
+        )
+        figures = {
+            "expected_ms": self.expected_ms,
+            "rmse_mm": self.setting.rmse_mm,
+            "best_rmse_mm": self.best.rmse_mm,
+        }
+        return {
+            "ms": self.budget_ms,
+            **setting,
+            **figures,
+            "p95_ms": p95_ms,
+            "kept": p95_ms <= self.budget_ms,
+        }
 
     def describe_outcome(self, report: RunReport) -> str:
         """Return whether a run met the budget in one line."""
         outcome = self.outcome(report)
-        return f"Budget {self.budget_ms:g} ms {'' if outcome['kept'] else 'NOT '}met: p95 {outcome['p95_ms']:.1f} ms"
+        return (
+            f"Budget {self.budget_ms:g} ms {'' if outcome['kept'] else 'NOT '}met: p95"
+            f" {outcome['p95_ms']:.1f} ms"
+        )
 
 
 def load_tradeoff(path: Path) -> list[Setting]:
@@ -150,15 +186,20 @@ def load_tradeoff(path: Path) -> list[Setting]:
     except (OSError, UnicodeDecodeError, ValidationError) as error:
         reason = error.strerror if isinstance(error, OSError) else "not a table of settings"
         raise RecordingError(
-            f"cannot read {file} ({reason}): measure these weights with `nlos-cam tradeoff reconstruct --out DIR`, "
-            "and give --tradeoff DIR"
+            f"cannot read {file} ({reason}): measure these weights with `nlos-cam tradeoff"
+            " reconstruct --out DIR`, and give --tradeoff DIR"
         ) from error
 
 
 def offer_settings(
-    control: RunControl, camera: Camera, bench: CalibratedRig, tradeoff: Path | None, weights: Path | None
+    control: RunControl,
+    camera: Camera,
+    bench: CalibratedRig,
+    tradeoff: Path | None,
+    weights: Path | None,
 ) -> None:
-    """Let a run's control choose between the measured settings in ONNX_FLOAT32; without a table, none.
+    """Let a run's control choose between the measured settings in ONNX_FLOAT32; without a table,
+    none.
 
     The other runtimes are slower and no more accurate, and take seconds to import.
     """
@@ -168,7 +209,10 @@ def offer_settings(
         return
     settings = {each.name: each for each in available if each.runtime == ONNX_FLOAT32}
     control.settings = [
-        (name, f"{name}: {each.milliseconds + each.averaging_ms:.0f} ms, error {each.rmse_mm:.1f} mm")
+        (
+            name,
+            f"{name}: {each.milliseconds + each.averaging_ms:.0f} ms, error {each.rmse_mm:.1f} mm",
+        )
         for name, each in settings.items()
     ]
 
@@ -183,18 +227,24 @@ def offer_settings(
 
 
 def available_settings(tradeoff: Path | None, weights: Path | None) -> list[Setting]:
-    """Return the measured settings that this machine can run. Raises RecordingError, and BudgetError without any."""
+    """Return the measured settings that this machine can run. Raises RecordingError, and
+    BudgetError without any.
+    """
     processors = os.cpu_count() or 1
     available = [
         setting
         for setting in load_tradeoff(tradeoff or weights_folder(weights))
         if setting.threads <= processors
-        and (setting.runtime == ONNX_FLOAT32 or find_spec("torch") is not None)  # others are made with torch
+        and (
+            setting.runtime == ONNX_FLOAT32 or find_spec("torch") is not None
+        )  # others are made with torch
         and ("cuda" not in setting.runtime or _has_cuda())
         and (setting.weights == SHIPPED or Path(setting.weights).is_dir())
     ]
     if not any(setting.frames == 1 for setting in available):
-        raise BudgetError("this machine can run no setting of the trade-off: measure with `tradeoff reconstruct`")
+        raise BudgetError(
+            "this machine can run no setting of the trade-off: measure with `tradeoff reconstruct`"
+        )
     return available
 
 
@@ -211,7 +261,8 @@ def keeping_pace(settings: Sequence[Setting], machine: Machine) -> list[Setting]
 
 
 def choose(settings: Sequence[Setting], machine: Machine, budget_ms: float) -> Setting:
-    """Return the most accurate setting that keeps pace and meets the budget. Raises BudgetError without any.
+    """Return the most accurate setting that keeps pace and meets the budget. Raises BudgetError
+    without any.
 
     Among equally accurate ones, that of the fewest threads, then the quickest.
     """
@@ -223,7 +274,14 @@ def choose(settings: Sequence[Setting], machine: Machine, budget_ms: float) -> S
             f"no setting meets a latency budget of {budget_ms:g} ms on this machine: the least is "
             f"{machine.expected_ms(quickest):.1f} ms ({quickest.name}); give a larger --budget-ms"
         )
-    return min(within, key=lambda setting: (round(setting.rmse_mm, 2), setting.threads, machine.expected_ms(setting)))
+    return min(
+        within,
+        key=lambda setting: (
+            round(setting.rmse_mm, 2),
+            setting.threads,
+            machine.expected_ms(setting),
+        ),
+    )
 
 
 def choose_within_budget(
@@ -233,16 +291,18 @@ def choose_within_budget(
     load: Callable[[Setting], Reconstructor],
     measure: Callable[[Pipeline], Timing],
 ) -> tuple[Reconstructor, BudgetChoice]:
-    """Return the networks of the setting that meets the budget: chosen from the table, then timed here.
+    """Return the networks of the setting that meets the budget: chosen from the table, then timed
+    here.
 
-    The table is scaled by its quickest setting with one frame and the fewest threads. A setting that is slower than
-    expected is replaced by the next best. Raises BudgetError if none is left.
+    The table is scaled by its quickest setting with one frame and the fewest threads. A setting
+    that is slower than expected is replaced by the next best. Raises BudgetError if none is left.
     """
     singles = (setting for setting in settings if setting.frames == 1)
     anchor = min(singles, key=lambda setting: (setting.threads, setting.milliseconds))
     timing = measure(build(load(anchor), 1))
     machine = Machine(timing.network_ms / anchor.milliseconds_p90, timing.rest_ms)
-    best, left = min(settings, key=lambda setting: setting.rmse_mm), list(settings)
+    best = min(settings, key=lambda setting: setting.rmse_mm)
+    left = list(settings)
     tried_ms: list[float] = []
     while left:
         try:
@@ -259,13 +319,15 @@ def choose_within_budget(
         tried_ms.append(expected_ms)
         left.remove(setting)
     raise BudgetError(
-        f"no setting met {budget_ms:g} ms when timed on this machine: the least was {min(tried_ms):.1f} ms; close "
-        "other programs, or give a larger --budget-ms"
+        f"no setting met {budget_ms:g} ms when timed on this machine: the least was"
+        f" {min(tried_ms):.1f} ms; close other programs, or give a larger --budget-ms"
     )
 
 
 def setting_loader(weights: Path | None, runtimes: Runtimes) -> Callable[[Setting], Reconstructor]:
-    """Return a function that loads a setting's networks; `weights` replace those that the table calls shipped."""
+    """Return a function that loads a setting's networks; `weights` replace those that the table
+    calls shipped.
+    """
 
     def load(setting: Setting) -> Reconstructor:
         folder = weights if setting.weights == SHIPPED else Path(setting.weights)
@@ -276,21 +338,30 @@ def setting_loader(weights: Path | None, runtimes: Runtimes) -> Callable[[Settin
             import torch  # takes seconds, and is not needed for ONNX Runtime
 
             torch.set_num_threads(setting.threads)
-        return runtimes(folder, rig, object_box(rig), cache_folder() / "onnx")[setting.runtime](setting.threads)
+        return runtimes(folder, rig, object_box(rig), cache_folder() / "onnx")[setting.runtime](
+            setting.threads
+        )
 
     return load
 
 
-def pipeline_timer(camera: Camera, clock: Clock = time.perf_counter) -> Callable[[Pipeline], Timing]:
-    """Return a function that times a pipeline on this machine, without its first call, which allocates."""
+def pipeline_timer(
+    camera: Camera, clock: Clock = time.perf_counter
+) -> Callable[[Pipeline], Timing]:
+    """Return a function that times a pipeline on this machine, without its first call, which
+    allocates.
+    """
 
     def measure(pipeline: Pipeline) -> Timing:
         warm_up(camera, pipeline)
-        network_s, rest_s = np.empty(CALLS), np.empty(CALLS)
+        network_s = np.empty(CALLS)
+        rest_s = np.empty(CALLS)
         for call in range(CALLS):
             start_s = clock()
             network_s[call] = warm_up(camera, pipeline, clock)["network"]
             rest_s[call] = clock() - start_s - network_s[call]
-        return Timing(*(1e3 * float(np.percentile(each, LATE_PERCENT)) for each in (network_s, rest_s)))
+        return Timing(
+            *(1e3 * float(np.percentile(each, LATE_PERCENT)) for each in (network_s, rest_s))
+        )
 
     return measure

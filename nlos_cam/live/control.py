@@ -1,4 +1,6 @@
-"""Controls and status of a live run: one object that the page, the command line and programs use alike."""
+"""Controls and status of a live run: one object that the page, the command line and programs use
+alike.
+"""
 
 from __future__ import annotations
 
@@ -42,17 +44,21 @@ log = logging.getLogger(__name__)
 
 
 class RunControl:
-    """Controls of one live run; every method may be called from any thread, and one command runs at a time.
+    """Controls of one live run; every method may be called from any thread, and one command runs at
+    a time.
 
-    A command returns its outcome in words, and raises NlosCamError with the reason if it fails. Files get dated names
-    in `folder`, and replace nothing. The loop calls `attach`, `watch`, `add` and `end`.
+    A command returns its outcome in words, and raises NlosCamError with the reason if it fails.
+    Files get dated names in `folder`, and replace nothing. The loop calls `attach`, `watch`, `add`
+    and `end`.
     """
 
     def __init__(self, uri: str = "", *, folder: Path = Path(), clock: Clock = time.time) -> None:
         self.folder = folder
         self.paused = False
         self.load_setting: Callable[[str], tuple[Any, int]] | None = None
-        """Loads the networks and number of averaged frames of a setting by name; None without other settings."""
+        """Loads the networks and number of averaged frames of a setting by name; None without other
+        settings.
+        """
         self.settings: Sequence[tuple[str, str]] = ()
         """Names of the settings, and their costs in words."""
         self.setting = ""
@@ -62,8 +68,10 @@ class RunControl:
         """Called in a command's thread before it works."""
         self.warnings: tuple[str, ...] = ()
         """Warnings about the run's pace."""
-        self._uri, self._clock = uri, clock
-        self._state, self._message = "connecting", ""
+        self._uri = uri
+        self._clock = clock
+        self._state = "connecting"
+        self._message = ""
         self._rendering_s: float | None = None
         """Time at which the pre-rendering of a simulated scene began."""
         self._camera: Camera | None = None
@@ -78,17 +86,24 @@ class RunControl:
         self._command = threading.Lock()
         named = self.record, self.stop_recording, self.snapshot, self.save_session, self.end_session
         named += self.pause, self.resume, self.take_reference, self.average
-        self._commands: dict[str, Callable[..., str]] = {command.__name__: command for command in named}
+        self._commands: dict[str, Callable[..., str]] = {
+            command.__name__: command for command in named
+        }
         self._commands |= {"setting": self.use_setting, "option": self.set_option}
 
     # ---- the loop's side
 
     def set_state(self, state: str, message: str = "") -> None:
-        """Set the state that the page shows: connecting, running, stalled, ended; with a message."""
-        self._state, self._message = state, message
+        """Set the state that the page shows: connecting, running, stalled, ended; with a
+        message.
+        """
+        self._state = state
+        self._message = message
 
     def show_progress(self, done: int, total: int) -> None:
-        """Show how far the pre-rendering of a simulated scene is, and when the first frame is to be expected."""
+        """Show how far the pre-rendering of a simulated scene is, and when the first frame is to be
+        expected.
+        """
         if done <= 1 or self._rendering_s is None:
             self._rendering_s = self._clock()
         left_s = (self._clock() - self._rendering_s) * (total - done) / max(done, 1)
@@ -97,12 +112,16 @@ class RunControl:
 
     def attach(self, camera: Camera, pipeline: Pipeline) -> None:
         """Take over an entered camera and the pipeline of its frames."""
-        self._camera, self._pipeline, self._uri = camera, pipeline, camera.uri
+        self._camera = camera
+        self._pipeline = pipeline
+        self._uri = camera.uri
         self._options = adjustable(camera)
         self.set_state("connecting", "waiting for the first frame")
 
     def watch(self, frames: Iterable[Frame]) -> Iterator[Frame]:
-        """Yield the camera's frames; in the reader's thread, those who record or measure see them pass."""
+        """Yield the camera's frames; in the reader's thread, those who record or measure see them
+        pass.
+        """
         for frame in frames:
             for tap in tuple(self._taps):
                 tap(frame)
@@ -110,14 +129,21 @@ class RunControl:
 
     def add(self, moment: Moment) -> None:
         """Take a new result, in the loop's thread."""
-        self._newest, self._state, self._message = moment, "running", ""
+        self._newest = moment
+        self._state = "running"
+        self._message = ""
         self._recent.append((moment.published_s, moment.latency_s))
         if session := self._session:
             session[0].show(moment)
 
     def end(self) -> None:
-        """Close what was begun, while the camera still runs; errors are logged, since the run ends anyway."""
-        for stop, open_now in ((self.stop_recording, self._recording), (self.end_session, self._session)):
+        """Close what was begun, while the camera still runs; errors are logged, since the run ends
+        anyway.
+        """
+        for stop, open_now in (
+            (self.stop_recording, self._recording),
+            (self.end_session, self._session),
+        ):
             if open_now:
                 try:
                     stop()
@@ -149,7 +175,10 @@ class RunControl:
 
     def status(self) -> dict[str, Any]:
         """Return the run's state, pace and controls, ready for JSON."""
-        now_s, recent, newest, pipeline = self._clock(), list(self._recent), self._newest, self._pipeline
+        now_s = self._clock()
+        recent = list(self._recent)
+        newest = self._newest
+        pipeline = self._pipeline
         state = "paused" if self.paused and self._state == "running" else self._state
         status: dict[str, Any] = {"state": state, "message": self._message, "camera": self._name}
         status["warnings"] = list(self.warnings)
@@ -160,15 +189,27 @@ class RunControl:
             pace = {"fps": (len(recent) - 1) / span_s if span_s > 0 else 0.0, "p50_ms": 1e3 * p50_s}
             age_s = now_s - newest.published_s + newest.latency_s
             status |= {name: round(float(value), 2) for name, value in pace.items()}
-            status |= {"p99_ms": round(1e3 * float(p99_s), 2), "age_s": round(age_s, 2), "dropped": newest.dropped}
+            status |= {
+                "p99_ms": round(1e3 * float(p99_s), 2),
+                "age_s": round(age_s, 2),
+                "dropped": newest.dropped,
+            }
         if self._camera and (simulated := camera_ms(self._camera)):
             status["camera_ms"] = round(simulated["p50"], 2)
         if self._camera and pipeline:
-            status["disk_s"] = round(recording_s(self._camera.intrinsics, free_bytes(self.folder / "any.bag")))
+            status["disk_s"] = round(
+                recording_s(self._camera.intrinsics, free_bytes(self.folder / "any.bag"))
+            )
         if recording := self._recording:
-            status["recording"] = {"path": str(recording.path), "seconds": round(now_s - recording.start_s, 1)}
+            status["recording"] = {
+                "path": str(recording.path),
+                "seconds": round(now_s - recording.start_s, 1),
+            }
         elif begun := getattr(self._camera, "recording", None):  # by --record: it ends with the run
-            status["recording"] = {"path": str(begun.path), "seconds": round(begun.sets / FRAMES_PER_S, 1)}
+            status["recording"] = {
+                "path": str(begun.path),
+                "seconds": round(begun.sets / FRAMES_PER_S, 1),
+            }
         status["control"] = {
             "commands": list(self._commands) if pipeline else [],
             "settings": list(self.settings),
@@ -178,13 +219,19 @@ class RunControl:
             "paused": self.paused,
             "recording": self._recording is not None,
             "saving": self._session is not None,
-            "note": "" if not pipeline or self._options else f"{self._name} has no laser or near-wall settings",
+            "note": (
+                ""
+                if not pipeline or self._options
+                else f"{self._name} has no laser or near-wall settings"
+            ),
         }
         return status
 
     @property
     def _name(self) -> str:
-        """The camera's name, of a file without its folder: it is on the page, which others may see."""
+        """The camera's name, of a file without its folder: it is on the page, which others may
+        see.
+        """
         scheme, colon, rest = self._uri.partition(":")
         return f"{scheme}{colon}{Path(rest).name}"
 
@@ -205,7 +252,9 @@ class RunControl:
         if self._recording:
             raise NlosCamError(f"{self._recording.path} is being recorded: stop it first")
         name = re.sub(r"[^\w.-]+", "-", str(label)).strip("-.")[:60]
-        self._recording = LiveRecording(camera, self._file(name or "live", ".bag"), str(label) or None, self._clock)
+        self._recording = LiveRecording(
+            camera, self._file(name or "live", ".bag"), str(label) or None, self._clock
+        )
         self._taps.append(self._recording.add)
         return f"recording {self._recording.path}"
 
@@ -213,12 +262,15 @@ class RunControl:
         """Close the recording, and read it back to verify it."""
         if not self._recording:
             raise NlosCamError("nothing is being recorded")
-        recording, self._recording = self._recording, None
+        recording = self._recording
+        self._recording = None
         self._taps.remove(recording.add)
         return recording.stop()
 
     def snapshot(self) -> str:
-        """Write the newest frame: picture (.png), arrays (.npz) and, if there is a surface, its mesh (.ply)."""
+        """Write the newest frame: picture (.png), arrays (.npz) and, if there is a surface, its
+        mesh (.ply).
+        """
         _, pipeline = self._attached()
         if (moment := self._newest) is None:
             raise NlosCamError("there is no frame yet: wait for the first one")
@@ -229,8 +281,11 @@ class RunControl:
         _, pipeline = self._attached()
         if self._session:
             raise NlosCamError(f"{self._session[0].path} is being saved: end it first")
-        bench, stack = pipeline.bench, ExitStack()
-        file = stack.enter_context(views.SessionFile(self._file("session", ".html"), bench.rig, bench.measured))
+        bench = pipeline.bench
+        stack = ExitStack()
+        file = stack.enter_context(
+            views.SessionFile(self._file("session", ".html"), bench.rig, bench.measured)
+        )
         self._session = file, stack
         return f"saving the session to {file.path}"
 
@@ -238,7 +293,8 @@ class RunControl:
         """Close the session's file."""
         if not self._session:
             raise NlosCamError("no session is being saved")
-        (file, stack), self._session = self._session, None
+        file, stack = self._session
+        self._session = None
         stack.close()
         return f"saved {file.kept} moments to {file.path}: any browser plays it"
 
@@ -258,13 +314,18 @@ class RunControl:
         if not 1 <= count <= 1000 or count != frames:
             raise NlosCamError(f"average {frames}: give a whole number from 1 to 1000")
         pipeline.average = count
-        return f"the mean of {count} frame{'s' if count > 1 else ''}, {(count - 1) / 2 / FRAMES_PER_S:.2f} s older"
+        return (
+            f"the mean of {count} frame{'s' if count > 1 else ''},"
+            f" {(count - 1) / 2 / FRAMES_PER_S:.2f} s older"
+        )
 
     def use_setting(self, name: str) -> str:
         """Use the networks of a measured setting of precision and speed."""
         _, pipeline = self._attached()
         if self.load_setting is None or name not in dict(self.settings):
-            raise NlosCamError(f"no setting {name!r}: choose from {', '.join(dict(self.settings)) or 'none here'}")
+            raise NlosCamError(
+                f"no setting {name!r}: choose from {', '.join(dict(self.settings)) or 'none here'}"
+            )
         pipeline.network, pipeline.average = self.load_setting(name)
         self.setting = name
         return dict(self.settings)[name]
@@ -274,16 +335,19 @@ class RunControl:
         camera, _ = self._attached()
         put = getattr(camera, "set_option", None)
         if put is None:
-            raise NlosCamError(f"{camera.uri} has no option {name}: laser and near-wall settings are an L515's")
+            raise NlosCamError(
+                f"{camera.uri} has no option {name}: laser and near-wall settings are an L515's"
+            )
         outcome = put(str(name), float(value))
         self._options = adjustable(camera)
         return outcome
 
     def take_reference(self, frames: int = REFERENCE_FRAMES) -> str:
-        """Measure the empty bench (nothing hidden) and use it as the reference of difference maps and drift.
+        """Measure the empty bench (nothing hidden) and use it as the reference of difference maps
+        and drift.
 
-        With a wall record the occluder is found again; without one the wall is measured as it is now. The record is
-        written beside the other files, for --wall.
+        With a wall record the occluder is found again; without one the wall is measured as it is
+        now. The record is written beside the other files, for --wall.
         """
         camera, pipeline = self._attached()
         passing: Any = _PassingFrames(camera)
@@ -296,16 +360,21 @@ class RunControl:
         record, inliers = measure_bench(capture, bench.measured)
         path = self._file("bench", ".toml")
         reference = capture.reference(inliers)
-        record = calibrate.write_record(calibrate.WallFiles.beside(path, overwrite=False), record, reference)
+        record = calibrate.write_record(
+            calibrate.WallFiles.beside(path, overwrite=False), record, reference
+        )
         pipeline.bench = CalibratedRig(bench.rig, MeasuredWall(record, reference), bench.notes)
         self.on_bench(pipeline.bench)
         return (
-            f"reference of {capture.statistics.depth.frames} frames ({record.verdict}: {record.advice}); wrote {path}"
+            f"reference of {capture.statistics.depth.frames} frames ({record.verdict}:"
+            f" {record.advice}); wrote {path}"
         )
 
 
 def adjustable(camera: Camera | None) -> list[dict[str, Any]]:
-    """Return name, value and range of the options that a camera lets one change; empty without any."""
+    """Return name, value and range of the options that a camera lets one change; empty without
+    any.
+    """
     options = getattr(camera, "adjustable", None)
     return options() if options else []
 
@@ -313,7 +382,8 @@ def adjustable(camera: Camera | None) -> list[dict[str, Any]]:
 def measure_bench(
     capture: calibrate.CaptureStatistics, measured: MeasuredWall | None
 ) -> tuple[WallRecord, NDArray[np.bool_]]:
-    """Return the record of an empty bench and the wall's pixels; the occluder is found if the wall was measured.
+    """Return the record of an empty bench and the wall's pixels; the occluder is found if the wall
+    was measured.
 
     Raises CalibrationError where the depth is not that of a wall.
     """
@@ -330,7 +400,9 @@ class _PassingFrames:
     """Camera-like source of the frames that pass through the run."""
 
     def __init__(self, camera: Camera) -> None:
-        self.uri, self.intrinsics, self.identity = camera.uri, camera.intrinsics, camera.identity
+        self.uri = camera.uri
+        self.intrinsics = camera.intrinsics
+        self.identity = camera.identity
         self.telemetry = camera.telemetry
         self.frames: Queue[Frame] = Queue()
 
@@ -339,16 +411,30 @@ class _PassingFrames:
             try:
                 yield self.frames.get(timeout=REFERENCE_TIMEOUT_S)
             except Empty:
-                raise NlosCamError(f"no frame for {REFERENCE_TIMEOUT_S:.0f} s: the camera has stalled") from None
+                raise NlosCamError(
+                    f"no frame for {REFERENCE_TIMEOUT_S:.0f} s: the camera has stalled"
+                ) from None
 
 
 def save_moment(path: Path, moment: Moment, pipeline: Pipeline) -> str:
-    """Write a moment's arrays to `path` (.npz), its picture and mesh beside it; return what was written."""
-    frame, found, box = moment.frame, moment.reconstruction, object_box(pipeline.bench.rig)
-    arrays: dict[str, Any] = {"depth_m": found.depth_m, "lidar_depth_m": frame.depth_m, "infrared": frame.ir}
+    """Write a moment's arrays to `path` (.npz), its picture and mesh beside it; return what was
+    written.
+    """
+    frame = moment.frame
+    found = moment.reconstruction
+    box = object_box(pipeline.bench.rig)
+    arrays: dict[str, Any] = {
+        "depth_m": found.depth_m,
+        "lidar_depth_m": frame.depth_m,
+        "infrared": frame.ir,
+    }
     optional = {"uncertainty_m": found.uncertainty_m, "truth_depth_m": frame.truth_depth_m}
     arrays |= {name: array for name, array in optional.items() if array is not None}
-    arrays |= {"frame_number": frame.frame_number, "timestamp_s": frame.timestamp_s, "verdict": moment.verdict or ""}
+    arrays |= {
+        "frame_number": frame.frame_number,
+        "timestamp_s": frame.timestamp_s,
+        "verdict": moment.verdict or "",
+    }
     with atomic_file(path) as part, part.open("wb") as file:
         np.savez_compressed(file, **arrays)
     views.Still(pipeline.bench.rig, moment).save(path.with_suffix(".png"), moment)

@@ -35,10 +35,11 @@ def log_line(moment: Moment) -> dict[str, Any]:
 
 
 class FrameLog:
-    """Log file, open while entered: .csv with a header, or one JSON object per line (.jsonl). Used by one thread.
+    """Log file, open while entered: .csv with a header, or one JSON object per line (.jsonl). Used
+    by one thread.
 
-    The columns of a .csv are those of its first line. A write error ends the log with a warning, not the run. Raises
-    OSError on entering if the file cannot be opened.
+    The columns of a .csv are those of its first line. A write error ends the log with a warning,
+    not the run. Raises OSError on entering if the file cannot be opened.
     """
 
     def __init__(self, path: Path) -> None:
@@ -52,7 +53,8 @@ class FrameLog:
         return self
 
     def __exit__(self, *_: object) -> None:
-        file, self._file = self._file, None
+        file = self._file
+        self._file = None
         if file is None:
             return
         try:
@@ -70,7 +72,12 @@ class FrameLog:
                 self._file.flush()
                 self._flushed_s = moment.published_s
         except OSError as error:
-            log.warning("%s: the log ends at frame %d (%s)", self._path, moment.frame.frame_number, error.strerror)
+            log.warning(
+                "%s: the log ends at frame %d (%s)",
+                self._path,
+                moment.frame.frame_number,
+                error.strerror,
+            )
             self.__exit__()
 
     def _write(self, file: IO[str], line: dict[str, Any]) -> None:
@@ -78,6 +85,8 @@ class FrameLog:
             file.write(json.dumps(line) + "\n")
             return
         if self._table is None:
-            self._table = csv.DictWriter(file, line.keys(), extrasaction="ignore", lineterminator="\n")
+            self._table = csv.DictWriter(
+                file, line.keys(), extrasaction="ignore", lineterminator="\n"
+            )
             self._table.writeheader()
         self._table.writerow(line)

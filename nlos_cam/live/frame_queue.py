@@ -17,7 +17,9 @@ JOIN_TIMEOUT_S = 10.0
 POLL_S = 0.1
 """Interval at which a wait checks for signals."""
 SAME_CLOCK_S = 10.0
-"""Timestamps this close to the host's time of day are host time; others have a zero of their own."""
+"""Timestamps this close to the host's time of day are host time; others have a zero of their
+own.
+"""
 
 
 def ignore(*_: object) -> None:
@@ -27,10 +29,11 @@ def ignore(*_: object) -> None:
 class FrameReader:
     """Thread that reads frames into a bounded queue while entered; iterate from one other thread.
 
-    A full queue drops its oldest frame and records its number, or, if `lossless`, blocks the camera. Iteration ends
-    with the frames, once `stop` is set, or once `should_stop` returns True, and raises the exception of the frames'
-    source. While no frame comes, it calls `on_idle` every POLL_S. Leaving calls `abandon_source` if the thread has not
-    ended after ABANDON_AFTER_S, and raises CameraLostError if that does not end it.
+    A full queue drops its oldest frame and records its number, or, if `lossless`, blocks the
+    camera. Iteration ends with the frames, once `stop` is set, or once `should_stop` returns True,
+    and raises the exception of the frames' source. While no frame comes, it calls `on_idle` every
+    POLL_S. Leaving calls `abandon_source` if the thread has not ended after ABANDON_AFTER_S, and
+    raises CameraLostError if that does not end it.
     """
 
     def __init__(
@@ -49,9 +52,13 @@ class FrameReader:
         self.newest_s: float | None = None
         """Arrival of the newest frame; None before the first."""
         self._shortest_delay_s = float("inf")
-        self._frames, self._lossless, self._clock = frames, lossless, clock
-        self._stop, self._should_stop = stop, should_stop
-        self._abandon_source, self._on_idle = abandon_source, on_idle
+        self._frames = frames
+        self._lossless = lossless
+        self._clock = clock
+        self._stop = stop
+        self._should_stop = should_stop
+        self._abandon_source = abandon_source
+        self._on_idle = on_idle
         self._queue = BoundedQueue[Arrival](QUEUE_FRAMES)
         self._thread = Thread(target=self._read, name="frame reader", daemon=True)
 
@@ -66,7 +73,9 @@ class FrameReader:
             self._abandon_source()
             self._thread.join(JOIN_TIMEOUT_S)
         if self._thread.is_alive() and error is None:
-            raise CameraLostError(f"the camera did not stop within {JOIN_TIMEOUT_S:.0f} s: replug it")
+            raise CameraLostError(
+                f"the camera did not stop within {JOIN_TIMEOUT_S:.0f} s: replug it"
+            )
 
     def __iter__(self) -> Iterator[Arrival]:
         while not self._is_done:
@@ -95,14 +104,18 @@ class FrameReader:
         while self._lossless and not self._queue.wait_for_room(POLL_S) and not self._stop.is_set():
             pass
         self.newest_s = arrival.arrived_s
-        self._shortest_delay_s = min(self._shortest_delay_s, arrival.arrived_s - arrival.frame.timestamp_s)
+        self._shortest_delay_s = min(
+            self._shortest_delay_s, arrival.arrived_s - arrival.frame.timestamp_s
+        )
         if (dropped := self._queue.put(arrival)) is not None:
             self.dropped.append(dropped.frame.frame_number)
         return not (self._queue.finished or self._stop.is_set())
 
     @property
     def offset_s(self) -> float:
-        """Host time less timestamp: 0 if timestamps are host time, else such that the fastest delivery took 0 s."""
+        """Host time less timestamp: 0 if timestamps are host time, else such that the fastest
+        delivery took 0 s.
+        """
         return 0.0 if abs(self._shortest_delay_s) < SAME_CLOCK_S else self._shortest_delay_s
 
     @property

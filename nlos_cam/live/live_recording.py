@@ -11,16 +11,21 @@ from nlos_cam.reconstruct import Clock
 
 
 class LiveRecording:
-    """Recording of a running camera from construction to `stop`; `add` gets its frames in the reader's thread.
+    """Recording of a running camera from construction to `stop`; `add` gets its frames in the
+    reader's thread.
 
     Raises NlosCamError for a camera that cannot be recorded, and the errors of `Recording`.
     """
 
     def __init__(self, camera: Camera, path: Path, label: str | None, clock: Clock) -> None:
-        self.path, self.start_s = path, clock()
-        self._camera, self._target = camera, recordings.CaptureTarget(path, label)
+        self.path = path
+        self.start_s = clock()
+        self._camera = camera
+        self._target = recordings.CaptureTarget(path, label)
         if not hasattr(camera, "start_recording"):
-            raise NlosCamError(f"{camera.uri} cannot be recorded: only a live camera (l515, sim) can")
+            raise NlosCamError(
+                f"{camera.uri} cannot be recorded: only a live camera (l515, sim) can"
+            )
         self._sidecar = recordings.SidecarFile(recordings.sidecar_path(path), camera, label=label)
         self._meter = recordings.QualityMeter()
         self._recording = Recording(path, optional=True, last=False)
@@ -59,4 +64,7 @@ class LiveRecording:
         if not final.sets:
             return "nothing was recorded: no frame came"
         full = "; the disk is full" if state == "disk full" else ""
-        return f"recorded {final.sets} frames ({final.sets / FRAMES_PER_S:.1f} s) to {self.path}; verified{full}"
+        return (
+            f"recorded {final.sets} frames ({final.sets / FRAMES_PER_S:.1f} s) to {self.path};"
+            f" verified{full}"
+        )

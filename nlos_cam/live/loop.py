@@ -1,4 +1,6 @@
-"""Live loop: a camera's frames through the pipeline to a viewer, with statistics and stall display."""
+"""Live loop: a camera's frames through the pipeline to a viewer, with statistics and stall
+display.
+"""
 
 import os
 import time
@@ -33,26 +35,42 @@ USUAL_DEPTH_M = 0.3
 BATCH_FRAMES = 4
 """Frames per batch of the networks in a replay: two thirds of the time per frame."""
 MAX_BATCHES_AHEAD = 2
-"""Batches in the networks while earlier ones are finished: about the duration of a physics check."""
+"""Batches in the networks while earlier ones are finished: about the duration of a physics
+check.
+"""
 
 OnFailure = Callable[[Frame, Exception, int], None]
-"""Called with a frame that failed, its error, and the number of failures in a row; raises to end the run."""
+"""Called with a frame that failed, its error, and the number of failures in a row; raises to end
+the run.
+"""
 
 
 class LiveDisplay:
-    """Display of results as moments, and of the last one again while the camera stalls. Used by the loop's thread."""
+    """Display of results as moments, and of the last one again while the camera stalls. Used by the
+    loop's thread.
+    """
 
     def __init__(
-        self, viewer: Viewer, count_dropped: Callable[[], int], reader: FrameReader, telemetry: Telemetry, clock: Clock
+        self,
+        viewer: Viewer,
+        count_dropped: Callable[[], int],
+        reader: FrameReader,
+        telemetry: Telemetry,
+        clock: Clock,
     ) -> None:
-        self._viewer, self._count_dropped, self._reader = viewer, count_dropped, reader
-        self._telemetry, self._clock = telemetry, clock
+        self._viewer = viewer
+        self._count_dropped = count_dropped
+        self._reader = reader
+        self._telemetry = telemetry
+        self._clock = clock
         self._last: Moment | None = None
 
     def show(self, result: FrameResult) -> Moment:
         """Show a result, and return its moment."""
         frame = result.frame
-        delivery = {} if result.arrived_s is None else {DELIVERY: self._age_s(frame, result.arrived_s)}
+        delivery = (
+            {} if result.arrived_s is None else {DELIVERY: self._age_s(frame, result.arrived_s)}
+        )
         self._last = moment = Moment(
             frame,
             result.reconstruction,
@@ -73,9 +91,14 @@ class LiveDisplay:
         """Show the last moment again, if any, with its present age."""
         if self._last is not None:
             now_s = self._clock()
-            age_s, dropped = self._age_s(self._last.frame, now_s), self._count_dropped()
+            age_s = self._age_s(self._last.frame, now_s)
+            dropped = self._count_dropped()
             stalled = Verdict.STALLED
-            self._viewer.show(replace(self._last, published_s=now_s, latency_s=age_s, verdict=stalled, dropped=dropped))
+            self._viewer.show(
+                replace(
+                    self._last, published_s=now_s, latency_s=age_s, verdict=stalled, dropped=dropped
+                )
+            )
 
     def _age_s(self, frame: Frame, now_s: float) -> float:
         return now_s - frame.timestamp_s - self._reader.offset_s
@@ -103,15 +126,22 @@ def pace(frames: Iterable[Frame], stop: Event, clock: Clock) -> Iterator[Frame]:
         yield frame
 
 
-def warm_up(camera: Camera, pipeline: Pipeline, clock: Clock = time.perf_counter) -> Mapping[str, float]:
+def warm_up(
+    camera: Camera, pipeline: Pipeline, clock: Clock = time.perf_counter
+) -> Mapping[str, float]:
     """Reconstruct a flat frame before the camera is entered, and return its seconds by stage.
 
     Compiling and allocating on first use would delay the first frame, and drop those after it.
     """
     shape = camera.intrinsics.height, camera.intrinsics.width
-    dark, flat = np.zeros(shape, np.uint8), np.full(shape, USUAL_DEPTH_M, np.float32)
-    maps = maps_from_frame(Frame(flat, dark, dark, timestamp_s=0.0, frame_number=0, intrinsics=camera.intrinsics))
-    return reconstruct(maps, pipeline.bench.rig, pipeline.network, clock, pipeline.uncertainty_model).timings_s
+    dark = np.zeros(shape, np.uint8)
+    flat = np.full(shape, USUAL_DEPTH_M, np.float32)
+    maps = maps_from_frame(
+        Frame(flat, dark, dark, timestamp_s=0.0, frame_number=0, intrinsics=camera.intrinsics)
+    )
+    return reconstruct(
+        maps, pipeline.bench.rig, pipeline.network, clock, pipeline.uncertainty_model
+    ).timings_s
 
 
 def run_live(
@@ -128,18 +158,23 @@ def run_live(
     on_moment: Callable[[Moment], None] = ignore,
     control: RunControl | None = None,
 ) -> RunReport:
-    """Reconstruct and show an entered camera's frames until it ends, `stop` is set, or `seconds` have passed.
+    """Reconstruct and show an entered camera's frames until it ends, `stop` is set, or `seconds`
+    have passed.
 
-    A `recorded` camera loses no frame and is shown at the speed of its recording. If the camera does not stop in time,
-    its context is closed from here. Frames that fail are counted. While no frame comes, the last one is shown again, as
-    stalled. `on_warning` is called when a warning begins and ends, `on_moment` for each result shown. While `control`
-    is paused, frames are read and not reconstructed. Raises the camera's errors, and NlosCamError if frame after frame
-    fails, after `on_error` has received the report.
+    A `recorded` camera loses no frame and is shown at the speed of its recording. If the camera
+    does not stop in time, its context is closed from here. Frames that fail are counted. While no
+    frame comes, the last one is shown again, as stalled. `on_warning` is called when a warning
+    begins and ends, `on_moment` for each result shown. While `control` is paused, frames are read
+    and not reconstructed. Raises the camera's errors, and NlosCamError if frame after frame fails,
+    after `on_error` has received the report.
     """
-    statistics, control = RunStatistics(on_warning), control or RunControl(clock=clock)
+    statistics = RunStatistics(on_warning)
+    control = control or RunControl(clock=clock)
     control.attach(camera, pipeline)
     frames, telemetry = with_telemetry(camera)
-    frames = control.watch(count_issues(pace(frames, stop, clock) if recorded else frames, statistics.issues))
+    frames = control.watch(
+        count_issues(pace(frames, stop, clock) if recorded else frames, statistics.issues)
+    )
 
     def should_stop() -> bool:
         return seconds is not None and statistics.duration_s(clock()) >= seconds
@@ -162,10 +197,14 @@ def run_live(
         abandon_source=lambda: camera.__exit__(None, None, None),
         on_idle=on_idle,
     )
-    display = LiveDisplay(viewer, lambda: sum(statistics.lost(camera, reader).values()), reader, telemetry, clock)
+    display = LiveDisplay(
+        viewer, lambda: sum(statistics.lost(camera, reader).values()), reader, telemetry, clock
+    )
     try:
         with reader, pipeline.checks:
-            results = iterate_results(reader, pipeline, clock, statistics.fail, telemetry, lambda: control.paused)
+            results = iterate_results(
+                reader, pipeline, clock, statistics.fail, telemetry, lambda: control.paused
+            )
             for result in results:
                 moment = display.show(result)
                 statistics.add(result, clock() - result.published_s)
@@ -194,8 +233,11 @@ def iterate_results(
     telemetry: Telemetry | None = None,
     is_paused: Callable[[], bool] = lambda: False,
 ) -> Generator[FrameResult]:
-    """Yield the result of every frame of an entered reader, in order; frames that come while paused have none."""
-    start_s, in_a_row = clock(), 0
+    """Yield the result of every frame of an entered reader, in order; frames that come while paused
+    have none.
+    """
+    start_s = clock()
+    in_a_row = 0
     for arrival in reader:
         if is_paused():
             start_s = clock()
@@ -213,11 +255,16 @@ def iterate_results(
 
 
 def iterate_batched(
-    reader: FrameReader, pipeline: Pipeline, clock: Clock = time.time, telemetry: Telemetry | None = None
+    reader: FrameReader,
+    pipeline: Pipeline,
+    clock: Clock = time.time,
+    telemetry: Telemetry | None = None,
 ) -> Generator[FrameResult]:
-    """Yield the same results in the same order, with several frames per call of the networks: for replays.
+    """Yield the same results in the same order, with several frames per call of the networks: for
+    replays.
 
-    Batches do not depend on timing, so the same frames give the same bits. The first error ends the iteration.
+    Batches do not depend on timing, so the same frames give the same bits. The first error ends the
+    iteration.
     """
     ahead = deque[tuple[Sequence[PreparedFrame], Future[list[Reconstruction]]]]()
 
@@ -239,7 +286,8 @@ def _batches(
     reader: FrameReader, pipeline: Pipeline, clock: Clock, telemetry: Telemetry | None
 ) -> Generator[Sequence[PreparedFrame]]:
     """Yield the prepared frames, BATCH_FRAMES at a time; fewer at the end."""
-    batch, start_s = list[PreparedFrame](), clock()
+    batch = list[PreparedFrame]()
+    start_s = clock()
     for arrival in reader:
         _update_temperatures(telemetry, arrival, pipeline)
         batch.append(pipeline.prepare(arrival, clock, start_s))

@@ -22,7 +22,9 @@ OBJECT_FORMATS = ("ply", "glb", "obj", "csv", "npz", "points")
 
 @dataclass
 class ObjectFiles:
-    """Writer of each frame's hidden surface, named by its number, in every format; skips frames without one."""
+    """Writer of each frame's hidden surface, named by its number, in every format; skips frames
+    without one.
+    """
 
     folder: Path
     box: ObjectBox
@@ -42,7 +44,9 @@ class ObjectFiles:
         for name in self.formats:
             points = name == "points"
             content = mesh.points_only.as_bytes(".ply") if points else mesh.as_bytes(f".{name}")
-            (self.folder / f"{number:06d}{'-points.ply' if points else f'.{name}'}").write_bytes(content)
+            (self.folder / f"{number:06d}{'-points.ply' if points else f'.{name}'}").write_bytes(
+                content
+            )
         self.written += 1
 
 
@@ -55,12 +59,16 @@ def export_objects(
     stop: Event,
     on_frame: Callable[[int, int], None] = ignore,
 ) -> int:
-    """Write the hidden surfaces of a replay's reconstruction.npz into the folder `out`; return their number.
+    """Write the hidden surfaces of a replay's reconstruction.npz into the folder `out`; return
+    their number.
 
-    Setting `stop` ends it early and keeps the files so far. Raises RecordingError for any other file.
+    Setting `stop` ends it early and keeps the files so far. Raises RecordingError for any other
+    file.
     """
     arrays, box = _read(result)
-    depth_m, uncertainty_m, numbers = (arrays[name] for name in ("depth_m", "uncertainty_m", "frame_number"))
+    depth_m, uncertainty_m, numbers = (
+        arrays[name] for name in ("depth_m", "uncertainty_m", "frame_number")
+    )
     with atomic_directory(out) as part:
         files = ObjectFiles(part, box, formats, every)
         for k, number in enumerate(numbers):
@@ -90,10 +98,13 @@ def _read(path: Path) -> tuple[dict[str, Any], ObjectBox]:
         _check(arrays)
         return arrays, _box(arrays, arrays["depth_m"].shape[1:])
     except FileNotFoundError as error:
-        raise RecordingError(f"{path} does not exist: give the reconstruction.npz of a replay") from error
+        raise RecordingError(
+            f"{path} does not exist: give the reconstruction.npz of a replay"
+        ) from error
     except (OSError, ValueError) as error:
         raise RecordingError(
-            f"{path} is not the reconstruction.npz of a replay: make one with `nlos-cam replay F.bag`"
+            f"{path} is not the reconstruction.npz of a replay: make one with `nlos-cam replay"
+            " F.bag`"
         ) from error
 
 
@@ -109,8 +120,12 @@ def _check(arrays: dict[str, Any]) -> None:
 
 
 def _box(arrays: dict[str, Any], shape: tuple[int, ...]) -> ObjectBox:
-    """Return the box of a depth map from the centre of its first pixel and the steps to the next column and row."""
-    (x_m, y_m), (right_m, down_m), (rows, columns) = arrays["origin_m"], arrays["pitch_m"], shape
+    """Return the box of a depth map from the centre of its first pixel and the steps to the next
+    column and row.
+    """
+    x_m, y_m = arrays["origin_m"]
+    right_m, down_m = arrays["pitch_m"]
+    rows, columns = shape
     return ObjectBox(
         x_min_m=x_m - right_m / 2,
         x_max_m=x_m + (columns - 0.5) * right_m,

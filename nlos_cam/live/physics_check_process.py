@@ -1,8 +1,9 @@
 """Physics checks in a separate process of low priority, which never delays the live loop.
 
-`python -m nlos_cam.live.physics_check_process` is that process. It reads rig and accuracy from stdin, then frames, each
-as a pickle, and answers each with a PhysicsCheckResult, or with a text if the check failed. It exits as soon as stdin
-closes, even during a check, so it never outlives its parent.
+`python -m nlos_cam.live.physics_check_process` is that process. It reads rig and accuracy from
+stdin, then frames, each as a pickle, and answers each with a PhysicsCheckResult, or with a text if
+the check failed. It exits as soon as stdin closes, even during a check, so it never outlives its
+parent.
 """
 
 import os
@@ -36,9 +37,9 @@ LOWEST_PRIORITY = 19
 class BackgroundPhysicsCheck:
     """Physics check of the newest frame about once a period, in a process of its own while entered.
 
-    `offer`, for one thread, returns at once: a frame that is due while another is checked waits, until a newer one
-    replaces it. A thread talks to the process. `on_error` is called for the first failed check, or if the process ends;
-    the loop continues without.
+    `offer`, for one thread, returns at once: a frame that is due while another is checked waits,
+    until a newer one replaces it. A thread talks to the process. `on_error` is called for the first
+    failed check, or if the process ends; the loop continues without.
     """
 
     def __init__(
@@ -54,8 +55,12 @@ class BackgroundPhysicsCheck:
         self.newest: PhysicsCheckResult | None = None
         self.dropped = 0
         """Due frames that a newer one replaced."""
-        self._setup, self._period_s, self._clock = (rig, accuracy), period_s, clock
-        self._on_error, self._reported, self._command = on_error, False, command
+        self._setup = (rig, accuracy)
+        self._period_s = period_s
+        self._clock = clock
+        self._on_error = on_error
+        self._reported = False
+        self._command = command
         self._due_s = -float("inf")
         self._queue = BoundedQueue[tuple[int, LidarMaps, Float32]](1)
         self.process: subprocess.Popen[bytes] | None = None
@@ -67,7 +72,9 @@ class BackgroundPhysicsCheck:
         except OSError as error:
             self._give_up(f"cannot start their process ({error.strerror})")
         else:
-            self._thread = Thread(target=self._run, args=(self.process,), name="physics check", daemon=True)
+            self._thread = Thread(
+                target=self._run, args=(self.process,), name="physics check", daemon=True
+            )
             self._thread.start()
         return self
 
@@ -103,7 +110,8 @@ class BackgroundPhysicsCheck:
                 self._give_up(f"their process ended ({process.returncode})")
 
     def _ask(self, process: subprocess.Popen[bytes]) -> None:
-        to_worker, from_worker = process.stdin, process.stdout
+        to_worker = process.stdin
+        from_worker = process.stdout
         if to_worker is None or from_worker is None:
             return
         _send(to_worker, self._setup)
@@ -126,14 +134,21 @@ class BackgroundPhysicsCheck:
 
 
 def _start(command: Sequence[str]) -> subprocess.Popen[bytes]:
-    """Start the process with one thread and our import path, in a group that Ctrl-C at the terminal does not reach."""
+    """Start the process with one thread and our import path, in a group that Ctrl-C at the terminal
+    does not reach.
+    """
     one_thread = {f"{name}_NUM_THREADS": "1" for name in ("NUMBA", "OMP", "OPENBLAS", "MKL")}
     path = os.pathsep.join(entry for entry in sys.path if entry)
-    group, flags = 0, 0
+    group = 0
+    flags = 0
     if sys.platform == "win32":
-        group, flags = None, subprocess.CREATE_NEW_PROCESS_GROUP | subprocess.BELOW_NORMAL_PRIORITY_CLASS
-    env, pipe = {**os.environ, **one_thread, "PYTHONPATH": path}, subprocess.PIPE
-    return subprocess.Popen([*command], stdin=pipe, stdout=pipe, env=env, process_group=group, creationflags=flags)
+        group = None
+        flags = subprocess.CREATE_NEW_PROCESS_GROUP | subprocess.BELOW_NORMAL_PRIORITY_CLASS
+    env = {**os.environ, **one_thread, "PYTHONPATH": path}
+    pipe = subprocess.PIPE
+    return subprocess.Popen(
+        [*command], stdin=pipe, stdout=pipe, env=env, process_group=group, creationflags=flags
+    )
 
 
 def _send(pipe: IO[bytes], message: object) -> None:
@@ -156,12 +171,16 @@ def serve(from_parent: IO[bytes], to_parent: IO[bytes], leave: Callable[[], None
     messages: SimpleQueue[Any] = SimpleQueue()
     Thread(target=_listen, args=(from_parent, messages, leave), daemon=True).start()
     rig, accuracy = messages.get()
-    from nlos_cam.reconstruct import check_reconstruction  # takes a second, during which stdin is already watched
+    from nlos_cam.reconstruct import (
+        check_reconstruction,
+    )  # takes a second, during which stdin is already watched
 
     while (message := messages.get()) is not None:
         frame_number, maps, depth_m = message
         try:
-            answer: object = check_reconstruction(maps, depth_m, rig, frame_number=frame_number, accuracy=accuracy)
+            answer: object = check_reconstruction(
+                maps, depth_m, rig, frame_number=frame_number, accuracy=accuracy
+            )
         except Exception as error:  # noqa: BLE001  whatever it was, it is reported, and the next frame is checked
             answer = f"{type(error).__name__}: {error}"
         with suppress(BrokenPipeError):
@@ -182,7 +201,8 @@ def main() -> None:
     drop_realtime_priority()
     if hasattr(os, "nice"):
         os.nice(LOWEST_PRIORITY)
-    answers, sys.stdout = sys.stdout.buffer, sys.stderr  # keeps prints out of the answers
+    answers = sys.stdout.buffer
+    sys.stdout = sys.stderr  # keeps prints out of the answers
     serve(sys.stdin.buffer, answers, leave=lambda: os._exit(0))
 
 

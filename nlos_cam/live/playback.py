@@ -1,4 +1,6 @@
-"""Recording in the page: reconstructed once as fast as possible, then played, scrubbed and exported."""
+"""Recording in the page: reconstructed once as fast as possible, then played, scrubbed and
+exported.
+"""
 
 from __future__ import annotations
 
@@ -38,13 +40,18 @@ class Playback(PlaybackViewer):
         port: int | None = None,
     ) -> None:
         super().__init__(bench.rig, bench.measured, host=host, port=port, controls=self)
-        self._camera, self._measured_bench, self._folder, self._exporting = camera, bench, folder, Lock()
+        self._camera = camera
+        self._measured_bench = bench
+        self._folder = folder
+        self._exporting = Lock()
         self.frames = 0
         """Frames reconstructed so far."""
         self._state = "loading the networks"
 
     def reconstruct(self, stop: Event) -> None:
-        """Reconstruct every frame until the end or `stop`. Raises RecordingError for a recording without a frame."""
+        """Reconstruct every frame until the end or `stop`. Raises RecordingError for a recording
+        without a frame.
+        """
         with self._camera as camera:
             frames, telemetry = with_telemetry(camera)
             pipeline = self._pipeline(checks=True)
@@ -54,7 +61,9 @@ class Playback(PlaybackViewer):
                     self.show(moment_of(result, telemetry.celsius))
                     self.frames += 1
         if not self.frames and not stop.is_set():
-            raise RecordingError(f"{camera.uri} has no frame with depth, infrared and confidence: record it again")
+            raise RecordingError(
+                f"{camera.uri} has no frame with depth, infrared and confidence: record it again"
+            )
         self.finish()
         self._state = "whole"
 
@@ -73,12 +82,22 @@ class Playback(PlaybackViewer):
         """Return the state for the page."""
         message = "" if self._state == "whole" else f"{self._state}, {self.frames} frames so far"
         control = {"commands": ["export"], "settings": [], "options": [], "note": ""}
-        return {"state": "recording", "message": message, "camera": self._camera.uri, "control": control}
+        return {
+            "state": "recording",
+            "message": message,
+            "camera": self._camera.uri,
+            "control": control,
+        }
 
     def run(self, command: str, arguments: Mapping[str, Any]) -> str:
-        """Export a frame by its number. Raises NlosCamError for another command, number, or while exporting."""
+        """Export a frame by its number. Raises NlosCamError for another command, number, or while
+        exporting.
+        """
         if command != "export" or not isinstance(number := arguments.get("frame"), int):
-            raise NlosCamError(f"no command {command!r} with {dict(arguments)!r}: this view exports a frame by number")
+            raise NlosCamError(
+                f"no command {command!r} with {dict(arguments)!r}: this view exports a frame by"
+                " number"
+            )
         with self._exporting:
             return self._export(number)
 

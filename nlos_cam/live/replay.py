@@ -1,4 +1,6 @@
-"""Replay of a whole recording to files: hidden depth, difference maps, contact sheet, media and a report."""
+"""Replay of a whole recording to files: hidden depth, difference maps, contact sheet, media and a
+report.
+"""
 
 import time
 from collections import Counter
@@ -28,7 +30,10 @@ from nlos_cam.objects import object_box
 from nlos_cam.reconstruct import CalibratedRig, Clock, FrameResult, Pipeline, Verdict
 from nlos_cam.report import write_document
 
-RESULT, DIFFERENCE, SHEET, REPORT = "reconstruction.npz", "difference.npz", "frames.png", "report.html"
+RESULT = "reconstruction.npz"
+DIFFERENCE = "difference.npz"
+SHEET = "frames.png"
+REPORT = "report.html"
 SHEET_FRAMES = 6
 
 
@@ -49,10 +54,14 @@ class ReplayReport:
 
 
 class _Stack:
-    """Arrays of one shape, written to a file one by one, so that an hour of them fits into memory."""
+    """Arrays of one shape, written to a file one by one, so that an hour of them fits into
+    memory.
+    """
 
     def __init__(self, file: IO[bytes], *shape: int) -> None:
-        self._file, self._shape, self._count = file, shape, 0
+        self._file = file
+        self._shape = shape
+        self._count = 0
 
     def add(self, array: NDArray[np.float32]) -> None:
         self._file.write(np.ascontiguousarray(array, np.float32).tobytes())
@@ -68,23 +77,33 @@ class _Results:
     """Collector of the frames' results; `new_file` opens a file for arrays."""
 
     def __init__(self, new_file: Callable[[], IO[bytes]], on_warning: OnWarning) -> None:
-        self.hidden_m, self.uncertainty_m = (_Stack(new_file(), OBJECT_PIXELS, OBJECT_PIXELS) for _ in range(2))
-        self.difference_m, self.difference_intensity = (_Stack(new_file(), MAP_ROWS, MAP_COLUMNS) for _ in range(2))
+        self.hidden_m, self.uncertainty_m = (
+            _Stack(new_file(), OBJECT_PIXELS, OBJECT_PIXELS) for _ in range(2)
+        )
+        self.difference_m, self.difference_intensity = (
+            _Stack(new_file(), MAP_ROWS, MAP_COLUMNS) for _ in range(2)
+        )
         self.timestamps_s: list[float] = []
         self.numbers: list[int] = []
         self.verdict_of_frame: list[str] = []
-        self.with_surface, self.uncertainty_mm = 0, list[float]()
+        self.with_surface = 0
+        self.uncertainty_mm = list[float]()
         self.verdicts: Counter[Verdict] = Counter()
-        self.quality, self.expected = QualityLog(), list[tuple[float, float]]()
+        self.quality = QualityLog()
+        self.expected = list[tuple[float, float]]()
         self.checks: dict[int, float] = {}
         """Scores by number of the checked frame."""
-        self.samples, self.warnings = FrameSampler(SHEET_FRAMES), WarningLog(on_warning)
+        self.samples = FrameSampler(SHEET_FRAMES)
+        self.warnings = WarningLog(on_warning)
 
     def add(self, result: FrameResult) -> None:
         reconstruction = result.reconstruction
-        depth_m, uncertainty_m = reconstruction.depth_m, reconstruction.uncertainty_m
+        depth_m = reconstruction.depth_m
+        uncertainty_m = reconstruction.uncertainty_m
         self.hidden_m.add(depth_m)
-        self.uncertainty_m.add(np.full_like(depth_m, np.nan) if uncertainty_m is None else uncertainty_m)
+        self.uncertainty_m.add(
+            np.full_like(depth_m, np.nan) if uncertainty_m is None else uncertainty_m
+        )
         if result.difference:
             self.difference_m.add(result.difference.depth_m)
             self.difference_intensity.add(result.difference.intensity)
@@ -116,13 +135,15 @@ def replay_recording(
     media: ReplayMedia | None = None,
     clock: Clock = time.time,
 ) -> ReplayReport:
-    """Reconstruct every frame of an entered recording into the folder `out`; files of the same names are replaced.
+    """Reconstruct every frame of an entered recording into the folder `out`; files of the same
+    names are replaced.
 
-    Difference maps are written if the bench has a reference; else those of an earlier replay are removed. Setting
-    `stop` ends the replay early and keeps its results. Raises RecordingError for a recording without a complete frame,
-    and the camera's errors.
+    Difference maps are written if the bench has a reference; else those of an earlier replay are
+    removed. Setting `stop` ends the replay early and keeps its results. Raises RecordingError for a
+    recording without a complete frame, and the camera's errors.
     """
-    start_s, bench = clock(), pipeline.bench
+    start_s = clock()
+    bench = pipeline.bench
     media = media or ReplayMedia(bench)
     with atomic_directory(out) as part, ExitStack() as files:
         results = _Results(lambda: files.enter_context(TemporaryFile(dir=part)), on_warning)
@@ -134,7 +155,9 @@ def replay_recording(
                 media.add(result, telemetry.celsius)
                 on_frame()
         if not results.numbers:
-            raise RecordingError(f"{camera.uri} has no frame with depth, infrared and confidence: record it again")
+            raise RecordingError(
+                f"{camera.uri} has no frame with depth, infrared and confidence: record it again"
+            )
         frame_fields = {
             "timestamp_s": np.array(results.timestamps_s),
             "frame_number": np.array(results.numbers, np.int64),
@@ -143,7 +166,9 @@ def replay_recording(
         }
         np.savez_compressed(part / RESULT, **frame_fields, **_hidden_fields(results, bench.rig))
         if bench.reference:
-            np.savez_compressed(part / DIFFERENCE, **frame_fields, **_difference_fields(results, bench))
+            np.savez_compressed(
+                part / DIFFERENCE, **frame_fields, **_difference_fields(results, bench)
+            )
         draw_contact_sheet(part / SHEET, results.samples.results())
         facts = _facts(camera, bench, results, interrupted=stop.is_set())
         write_document(replay_document(facts, part, out), part / REPORT)
@@ -170,8 +195,12 @@ def _hidden_fields(results: _Results, rig: Rig) -> dict[str, Any]:
         "verdict": np.array(results.verdict_of_frame, np.str_),
         "expected_iou": np.array(results.expected)[:, 0],
         "expected_error_m": np.array(results.expected)[:, 1],
-        "origin_m": np.array([box.x_min_m + pitch_x_m / 2, box.y_max_m - pitch_y_m / 2]),  # wall (x, y) of pixel (0, 0)
-        "pitch_m": np.array([pitch_x_m, -pitch_y_m]),  # wall (x, y) from one column, one row to the next
+        "origin_m": np.array(
+            [box.x_min_m + pitch_x_m / 2, box.y_max_m - pitch_y_m / 2]
+        ),  # wall (x, y) of pixel (0, 0)
+        "pitch_m": np.array(
+            [pitch_x_m, -pitch_y_m]
+        ),  # wall (x, y) from one column, one row to the next
         "z_near_m": box.z_near_m,
         "z_far_m": box.z_far_m,
         "check_frame_number": np.array([*results.checks], np.int64),
@@ -187,7 +216,9 @@ def _difference_fields(results: _Results, bench: CalibratedRig) -> dict[str, Any
     }
 
 
-def _facts(camera: Camera, bench: CalibratedRig, results: _Results, *, interrupted: bool) -> ReplayFacts:
+def _facts(
+    camera: Camera, bench: CalibratedRig, results: _Results, *, interrupted: bool
+) -> ReplayFacts:
     return ReplayFacts(
         camera,
         bench.rig,

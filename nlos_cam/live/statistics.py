@@ -25,7 +25,8 @@ MAX_FAILED_IN_A_ROW = 30
 """Failed frames in a row after which the cause cannot be the frames."""
 OUTSIDE_LATENCY = "wait", "view"
 """Stages before a frame's arrival and after its result; the latency consists of the others."""
-LATENCY, DELIVERY = "latency", "delivery"
+LATENCY = "latency"
+DELIVERY = "delivery"
 NUMBERS = re.compile(r"\d+(\.\d+)?")
 
 Percentiles = dict[str, float]
@@ -37,10 +38,13 @@ log = logging.getLogger(__name__)
 
 
 class StageTimes:
-    """Seconds by stage of the last frames, in memory of a fixed size; a stage may be missing from some frames."""
+    """Seconds by stage of the last frames, in memory of a fixed size; a stage may be missing from
+    some frames.
+    """
 
     def __init__(self, remembered: int = REMEMBERED) -> None:
-        self._remembered, self._next = remembered, 0
+        self._remembered = remembered
+        self._next = 0
         self._columns: dict[str, NDArray[np.float64]] = {}
 
     def add(self, seconds: Mapping[str, float]) -> None:
@@ -69,28 +73,37 @@ def percentiles_ms(seconds: NDArray[np.float64]) -> Percentiles:
     return {f"p{share}": 1e3 * float(value) for share, value in zip(SHARES, values, strict=True)}
 
 
-SLOW_FRAMES, MAX_SLOW_SHARE = 150, 0.02
-"""Of this many frames (5 s), the share dropped by slow processing above which there is a warning."""
+SLOW_FRAMES = 150
+MAX_SLOW_SHARE = 0.02
+"""Of this many frames (5 s), the share dropped by slow processing above which there is a
+warning.
+"""
 
 
 class PaceWatch:
-    """Detector of processing that is too slow, by the frames it drops; a warning begins and ends with it."""
+    """Detector of processing that is too slow, by the frames it drops; a warning begins and ends
+    with it.
+    """
 
     def __init__(self, on_warning: OnWarning) -> None:
         self.warnings: tuple[str, ...] = ()
-        self._on_warning, self._before = on_warning, (0, 0)
+        self._on_warning = on_warning
+        self._before = (0, 0)
 
     def update(self, frames: int, dropped: int) -> None:
-        """Take the numbers of frames with a result and of frames dropped so far; judged every SLOW_FRAMES."""
-        new, lost = frames - self._before[0], dropped - self._before[1]
+        """Take the numbers of frames with a result and of frames dropped so far; judged every
+        SLOW_FRAMES.
+        """
+        new = frames - self._before[0]
+        lost = dropped - self._before[1]
         if new + lost < SLOW_FRAMES:
             return
         self._before = frames, dropped
         slow = lost > MAX_SLOW_SHARE * (new + lost)
         text = (
-            f"processing is too slow: {lost} of the last {new + lost} frames were dropped; stop other programs "
-            "(another live run on these processors?), choose --budget-ms 30, or give each run processors of its own "
-            "(taskset)"
+            f"processing is too slow: {lost} of the last {new + lost} frames were dropped; stop"
+            " other programs (another live run on these processors?), choose --budget-ms 30, or"
+            " give each run processors of its own (taskset)"
         )
         if slow != bool(self.warnings):
             self._on_warning(text if slow else self.warnings[0], slow)
@@ -110,14 +123,17 @@ class StallWatch:
         self._shown_s = 0.0
 
     def update(self, now_s: float, newest_s: float | None) -> bool:
-        """Return whether to show the stall (again); `newest_s` is the newest frame's arrival, None before the first."""
+        """Return whether to show the stall (again); `newest_s` is the newest frame's arrival, None
+        before the first.
+        """
         if newest_s is None:
             return False
         self.frame_arrived(newest_s)
         if now_s - newest_s < STALLED_AFTER_S:
             return False
         if begins := self._since_s is None:
-            self._since_s, self.stalls = newest_s, self.stalls + 1
+            self._since_s = newest_s
+            self.stalls = self.stalls + 1
             self._on_stall(STALLED, True)
         if due := begins or now_s - self._shown_s >= STALLED_AFTER_S:
             self._shown_s = now_s
@@ -149,24 +165,32 @@ class WarningSpan:
 
 
 class WarningLog:
-    """Record of warnings by frame. Calls `on_warning` when one begins or ends, not when its numbers change."""
+    """Record of warnings by frame. Calls `on_warning` when one begins or ends, not when its numbers
+    change.
+    """
 
     def __init__(self, on_warning: OnWarning = ignore) -> None:
         self._spans: dict[str, WarningSpan] = {}
-        self._on_warning, self._present = on_warning, set[str]()
+        self._on_warning = on_warning
+        self._present = set[str]()
 
     def add(self, result: FrameResult) -> None:
-        number, before = result.frame.frame_number, self._present
+        number = result.frame.frame_number
+        before = self._present
         self._present = {self._count(warning, number) for warning in result.warnings}
         for subject, span in self._spans.items():
             if (begins := subject in self._present) != (subject in before):
                 self._on_warning(span.text, begins)
 
     def _count(self, warning: str, number: int) -> str:
-        """Count a frame for a warning, and return the warning's subject: its text without numbers."""
+        """Count a frame for a warning, and return the warning's subject: its text without
+        numbers.
+        """
         subject = NUMBERS.sub("", warning)
         span = self._spans.setdefault(subject, WarningSpan(warning, 0, number, number))
-        span.text, span.frames, span.last = warning, span.frames + 1, number
+        span.text = warning
+        span.frames = span.frames + 1
+        span.last = number
         return subject
 
     @property
@@ -191,11 +215,11 @@ class RunReport:
     latency_ms: Mapping[str, float]
     """p50, p95 and p99 from timestamp to result; see `FrameReader.offset_s` for the two clocks."""
     stages_ms: Mapping[str, float]
-    """Median by stage: delivery (from the timestamp to the reader), wait (for a frame), queue, maps, bench (difference
-    and drift), network, view (hand-over to the viewer)."""
+    """Median by stage: delivery (from the timestamp to the reader), wait (for a frame), queue,
+    maps, bench (difference and drift), network, view (hand-over to the viewer)."""
     counts: Mapping[str, int]
-    """Counts above 0, by name: the camera's own, incomplete and dropped_camera; dropped_loop: processing was too
-    slow; failed; blank, half_invalid, saturated (see `frame_issues`); stalls."""
+    """Counts above 0, by name: the camera's own, incomplete and dropped_camera; dropped_loop:
+    processing was too slow; failed; blank, half_invalid, saturated (see `frame_issues`); stalls."""
     warnings: Mapping[str, int] = field(default_factory=dict[str, int])
     """Number of frames by warning of the bench."""
     stages_percentiles_ms: Mapping[str, Percentiles] = field(default_factory=dict[str, Percentiles])
@@ -205,9 +229,13 @@ class RunReport:
     stalled_s: float = 0.0
     """Sum of the times without a frame; see `StallWatch`."""
     quality: Mapping[str, float] = field(default_factory=dict[str, float])
-    """Of the frames with an object: medians `expected_iou` and `expected_error_mm`, share `trusted`; empty without."""
+    """Of the frames with an object: medians `expected_iou` and `expected_error_mm`, share
+    `trusted`; empty without.
+    """
     camera_ms: Mapping[str, float] = field(default_factory=dict[str, float])
-    """p50, p95 and p99 of computing a simulated camera's images, beside the latency; empty for other cameras."""
+    """p50, p95 and p99 of computing a simulated camera's images, beside the latency; empty for
+    other cameras.
+    """
 
 
 class QualityLog:
@@ -219,8 +247,11 @@ class QualityLog:
     def add(self, result: FrameResult) -> None:
         doubt = result.reconstruction.doubt
         if result.verdict is Verdict.SEEN and doubt and (found := doubt.quality):
-            error_mm, trusted = 1e3 * found.error_m, float(found.trusted)
-            self._predicted.add({"expected_iou": found.iou[1], "expected_error_mm": error_mm, "trusted": trusted})
+            error_mm = 1e3 * found.error_m
+            trusted = float(found.trusted)
+            self._predicted.add(
+                {"expected_iou": found.iou[1], "expected_error_mm": error_mm, "trusted": trusted}
+            )
 
     @property
     def summary(self) -> dict[str, float]:
@@ -231,11 +262,14 @@ class QualityLog:
 
 
 class RunStatistics:
-    """Collector of a RunReport's numbers, in memory that does not grow with the frames. Used by the loop's thread."""
+    """Collector of a RunReport's numbers, in memory that does not grow with the frames. Used by the
+    loop's thread.
+    """
 
     def __init__(self, on_warning: OnWarning = ignore) -> None:
         self.warnings = WarningLog(on_warning)
-        self.stall, self.pace = StallWatch(on_warning), PaceWatch(on_warning)
+        self.stall = StallWatch(on_warning)
+        self.pace = PaceWatch(on_warning)
         self.frames = 0
         self.failed = 0
         """Frames whose processing raised an error."""
@@ -264,14 +298,17 @@ class RunStatistics:
             self.verdicts[result.verdict] += 1
 
     def fail(self, frame: Frame, error: Exception, in_a_row: int) -> None:
-        """Count a failed frame. Raises errors that are not the frame's, and NlosCamError after MAX_FAILED_IN_A_ROW."""
+        """Count a failed frame. Raises errors that are not the frame's, and NlosCamError after
+        MAX_FAILED_IN_A_ROW.
+        """
         if isinstance(error, NlosCamError):
             raise error
         self.failed += 1
         reason = f"{type(error).__name__}: {error}"
         if in_a_row >= MAX_FAILED_IN_A_ROW:
             raise NlosCamError(
-                f"{in_a_row} frames in a row failed ({reason}): record some with `capture` and report it"
+                f"{in_a_row} frames in a row failed ({reason}): record some with `capture` and"
+                " report it"
             ) from error
         log.warning("frame %d failed (%s)", frame.frame_number, reason)
 
@@ -291,7 +328,8 @@ class RunStatistics:
     def report(self, camera: Camera, reader: FrameReader) -> RunReport:
         stages = self._percentiles_ms(reader.offset_s)
         latency_ms = stages.pop(LATENCY)
-        duration_s, lost = self.duration_s(self._last_s), self.lost(camera, reader)
+        duration_s = self.duration_s(self._last_s)
+        lost = self.lost(camera, reader)
         counts = {**camera.counts, **lost, **self.issues, "stalls": self.stall.stalls}
         return RunReport(
             self.frames,
@@ -309,14 +347,20 @@ class RunStatistics:
         )
 
     def _percentiles_ms(self, offset_s: float) -> dict[str, Percentiles]:
-        """Return percentiles by stage, latency first; the loop's clock is `offset_s` later than the frames'."""
+        """Return percentiles by stage, latency first; the loop's clock is `offset_s` later than the
+        frames'.
+        """
         offsets_s = {LATENCY: offset_s, DELIVERY: offset_s}
         names = [LATENCY, *(name for name in self._times.stages if name != LATENCY)]
-        return {name: percentiles_ms(self._times.of(name) - offsets_s.get(name, 0.0)) for name in names}
+        return {
+            name: percentiles_ms(self._times.of(name) - offsets_s.get(name, 0.0)) for name in names
+        }
 
 
 def camera_ms(camera: Camera) -> Percentiles:
-    """Return percentiles of the time in which a simulated camera computes an image; empty for other cameras."""
+    """Return percentiles of the time in which a simulated camera computes an image; empty for other
+    cameras.
+    """
     exposures_s = getattr(camera, "exposures_s", None)
     return percentiles_ms(np.array(list(exposures_s))) if exposures_s else {}
 

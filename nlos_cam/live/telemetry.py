@@ -19,19 +19,24 @@ log = logging.getLogger(__name__)
 class Telemetry:
     """Periodic reader of temperatures; `read` takes the seconds since the first frame.
 
-    `watch` reads every `every_s` of the frames' time, in the thread that reads the frames: a real device needs time to
-    answer, and only the thread that restarts a device may ask it. `at` may be called from another thread.
+    `watch` reads every `every_s` of the frames' time, in the thread that reads the frames: a real
+    device needs time to answer, and only the thread that restarts a device may ask it. `at` may be
+    called from another thread.
     """
 
-    def __init__(self, read: Callable[[float], Celsius], every_s: float = TEMPERATURE_INTERVAL_S) -> None:
-        self._read, self._every_s = read, every_s
+    def __init__(
+        self, read: Callable[[float], Celsius], every_s: float = TEMPERATURE_INTERVAL_S
+    ) -> None:
+        self._read = read
+        self._every_s = every_s
         self._readings: deque[tuple[int, Celsius]] = deque()
         self.celsius: Celsius = {}
         """Last reading that `at` returned."""
 
     def watch(self, frames: Iterable[Frame]) -> Iterator[Frame]:
         """Yield the same frames, and read when due."""
-        first_s, due_s = None, float("-inf")
+        first_s = None
+        due_s = float("-inf")
         for frame in frames:
             if frame.timestamp_s >= due_s:
                 first_s = frame.timestamp_s if first_s is None else first_s
@@ -58,7 +63,11 @@ def telemetry_of(camera: Camera) -> Telemetry:
     except RecordingError as error:
         log.warning("no temperatures: %s", error)
         series = []
-    return Telemetry(lambda time_s: next((each.celsius for each in reversed(series) if each.time_s <= time_s), {}))
+    return Telemetry(
+        lambda time_s: next(
+            (each.celsius for each in reversed(series) if each.time_s <= time_s), {}
+        )
+    )
 
 
 def with_telemetry(camera: Camera) -> tuple[Iterator[Frame], Telemetry]:
