@@ -41,7 +41,13 @@ __all__ = [
 ]
 
 from .benchmark import OBJECTS_PER_CATEGORY, BenchmarkObject, benchmark_objects, unseen_objects
-from .depth_map import cell_centers_m, depth_from_image, image_from_depth, object_box, orthographic_depth
+from .depth_map import (
+    cell_centers_m,
+    depth_from_image,
+    image_from_depth,
+    object_box,
+    orthographic_depth,
+)
 from .generators import CATEGORIES, find_category
 from .generic import generic_depth
 from .loading import OBJECT_FILES, load_object, object_kind

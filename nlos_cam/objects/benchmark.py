@@ -1,8 +1,9 @@
-"""Two benchmarks of 54 fixed objects: of the 18 categories, with settings that no training seed can draw, and of 18
-kinds that training never sees.
+"""Two benchmarks of 54 fixed objects: of the 18 categories, with settings that no training seed can
+draw, and of 18 kinds that training never sees.
 
-Nothing here is random. Each setting that has a held-out interval takes its value from it (`generators.Setting`); other
-settings and the poses are spread evenly over the training ranges, and are the same in both benchmarks.
+Nothing here is random. Each setting that has a held-out interval takes its value from it
+(`generators.Setting`); other settings and the poses are spread evenly over the training ranges, and
+are the same in both benchmarks.
 """
 
 from collections.abc import Mapping
@@ -18,8 +19,8 @@ from nlos_cam.objects.unseen import KINDS
 
 OBJECTS_PER_CATEGORY = 3
 POSE_STEPS = (19, 7, 43, 13, 31, 25, 37)
-"""Coprime with 54, so that each quantity of a pose takes 54 evenly spaced values; among such sets, one with the lowest
-correlation between any two quantities (0.18)."""
+"""Coprime with 54, so that each quantity of a pose takes 54 evenly spaced values; among such sets,
+one with the lowest correlation between any two quantities (0.18)."""
 
 
 @dataclass(frozen=True)
@@ -42,30 +43,41 @@ class BenchmarkObject:
 
 def benchmark_objects(box: ObjectBox) -> list[BenchmarkObject]:
     """Return the 54 objects in the order of the categories, bit for bit the same in every run."""
-    return [_object(name, number, box) for name in CATEGORIES for number in range(OBJECTS_PER_CATEGORY)]
+    return [
+        _object(name, number, box) for name in CATEGORIES for number in range(OBJECTS_PER_CATEGORY)
+    ]
 
 
 def unseen_objects(box: ObjectBox) -> list[BenchmarkObject]:
-    """Return 54 objects of kinds that training never sees, three of each, bit for bit the same in every run."""
+    """Return 54 objects of kinds that training never sees, three of each, bit for bit the same in
+    every run.
+    """
     rows = ((name, make, k) for name, make in KINDS.items() for k in range(OBJECTS_PER_CATEGORY))
     return [_placed(name, k, {}, make(k), row, box) for row, (name, make, k) in enumerate(rows)]
 
 
 def _object(name: str, k: int, box: ObjectBox) -> BenchmarkObject:
-    kind, row = CATEGORIES[name], OBJECTS_PER_CATEGORY * list(CATEGORIES).index(name) + k
-    settings = kind.draw_held_out(_even(k, 1 + n % 2, OBJECTS_PER_CATEGORY) for n in range(len(kind.settings)))
+    kind = CATEGORIES[name]
+    row = OBJECTS_PER_CATEGORY * list(CATEGORIES).index(name) + k
+    settings = kind.draw_held_out(
+        _even(k, 1 + n % 2, OBJECTS_PER_CATEGORY) for n in range(len(kind.settings))
+    )
     return _placed(name, k, settings, kind.make(**settings), row, box)
 
 
 def _placed(
     name: str, k: int, settings: Mapping[str, float], shape: Float64, row: int, box: ObjectBox
 ) -> BenchmarkObject:
-    pose = pose_from_units([_even(row, step, OBJECTS_PER_CATEGORY * len(CATEGORIES)) for step in POSE_STEPS], box)
+    pose = pose_from_units(
+        [_even(row, step, OBJECTS_PER_CATEGORY * len(CATEGORIES)) for step in POSE_STEPS], box
+    )
     triangles = place(shape, pose, box)
     depth_m = orthographic_depth(triangles, box)
     return BenchmarkObject(f"{name}-{k + 1}", name, k + 1, settings, pose, triangles, depth_m)
 
 
 def _even(number: int, step: int, count: int) -> float:
-    """Return the middle of one of `count` parts of [0, 1]: a permutation of them if step and count are coprime."""
+    """Return the middle of one of `count` parts of [0, 1]: a permutation of them if step and count
+    are coprime.
+    """
     return (number * step % count + 0.5) / count

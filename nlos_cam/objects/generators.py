@@ -1,8 +1,8 @@
 """Generators of the 18 object categories of SI 1 of the paper, and the ranges of their settings.
 
-A generator builds a recognisable object as it stands (y up), in units of its own size, with its telling side towards
-the wall (-z). Each setting is a proportion with a range; some have a held-out interval, which no training seed draws
-and from which the benchmark takes its values.
+A generator builds a recognisable object as it stands (y up), in units of its own size, with its
+telling side towards the wall (-z). Each setting is a proportion with a range; some have a held-out
+interval, which no training seed draws and from which the benchmark takes its values.
 """
 
 from collections.abc import Callable, Iterable, Mapping
@@ -33,7 +33,9 @@ from nlos_cam.objects.primitives import (
 
 @dataclass(frozen=True)
 class Setting:
-    """Range of one proportion of an object, in units of its size, in degrees, or a count (the whole part)."""
+    """Range of one proportion of an object, in units of its size, in degrees, or a count (the whole
+    part).
+    """
 
     low: float
     high: float
@@ -58,7 +60,9 @@ class Setting:
         return max(pieces[1][0], value + (pieces[1][0] - pieces[0][1]))
 
     def draw_held_out(self, unit: float) -> float:
-        """Return the value at `unit` in ]0, 1[ of the held-out interval, or of the whole range if there is none."""
+        """Return the value at `unit` in ]0, 1[ of the held-out interval, or of the whole range if
+        there is none.
+        """
         if self.held_out is None:
             return self.draw(unit)
         low, high = self.held_out
@@ -79,15 +83,22 @@ class Category:
 
     def draw(self, units: Iterable[float]) -> dict[str, float]:
         """Return training settings from numbers in [0, 1], one for each."""
-        return {name: s.draw(unit) for (name, s), unit in zip(self.settings.items(), units, strict=True)}
+        return {
+            name: s.draw(unit) for (name, s), unit in zip(self.settings.items(), units, strict=True)
+        }
 
     def draw_held_out(self, units: Iterable[float]) -> dict[str, float]:
         """Return benchmark settings from numbers in ]0, 1[, one for each."""
-        return {name: s.draw_held_out(unit) for (name, s), unit in zip(self.settings.items(), units, strict=True)}
+        return {
+            name: s.draw_held_out(unit)
+            for (name, s), unit in zip(self.settings.items(), units, strict=True)
+        }
 
 
 def category(**settings: Setting) -> Callable[[Callable[..., Float64]], Category]:
-    """Return a decorator that makes a category from a generator function and the ranges of its arguments."""
+    """Return a decorator that makes a category from a generator function and the ranges of its
+    arguments.
+    """
     return lambda make: Category(make, settings)
 
 
@@ -108,7 +119,9 @@ def _at_corners(solid: Float64, x: float, y: float, z: float) -> list[Float64]:
 def computer(width: float, height: float, neck: float, reach: float, tip: float) -> Float64:
     """Build a screen set into its frame, on a neck and a foot, with a keyboard in front."""
     foot = -height / 2 - neck
-    screen = joined(frame(width, height, 0.07, 0.18), at(box(width - 0.1, height - 0.1, 0.04), z=0.06))
+    screen = joined(
+        frame(width, height, 0.07, 0.18), at(box(width - 0.1, height - 0.1, 0.04), z=0.06)
+    )
     stand = joined(at(box(0.16, neck, 0.08), y=foot + neck / 2), at(box(0.4, 0.04, 0.26), y=foot))
     keys = [at(box(width * 0.74, 0.06, 0.05), y=0.03, z=z) for z in (-0.09, 0.0, 0.09)]
     keyboard = turned(joined(box(width * 0.8, 0.05, 0.3), *keys), (1, 0, 0), -15)
@@ -123,10 +136,16 @@ def computer(width: float, height: float, neck: float, reach: float, tip: float)
     tip=Setting(-5, 15),
 )
 def cupboard(width: float, depth: float, shelves: float, ajar: float, tip: float) -> Float64:
-    """Build a cupboard on short legs: one door is shut, the other stands open and shows the shelves."""
-    leaf, rows = width / 2 - 0.02, int(shelves)
+    """Build a cupboard on short legs: one door is shut, the other stands open and shows the
+    shelves.
+    """
+    leaf = width / 2 - 0.02
+    rows = int(shelves)
     case = joined(frame(width, 0.9, 0.05, depth), at(box(width, 0.9, 0.03), z=depth / 2))
-    boards = [at(box(width - 0.04, 0.04, depth * 0.85), y=0.9 * (k / rows - 0.5), z=0.03) for k in range(1, rows)]
+    boards = [
+        at(box(width - 0.04, 0.04, depth * 0.85), y=0.9 * (k / rows - 0.5), z=0.03)
+        for k in range(1, rows)
+    ]
     middle = box(0.04, 0.9, depth)
     door = joined(at(box(leaf, 0.88, 0.04), leaf / 2), at(knob(0.035, 0.05), leaf * 0.85, z=-0.05))
     shut = at(door * (-1, 1, 1), width / 2, z=-depth / 2 - 0.02)
@@ -144,11 +163,19 @@ def cupboard(width: float, depth: float, shelves: float, ajar: float, tip: float
     tip=Setting(18, 36),
 )
 def oven(width: float, depth: float, window: float, knobs: float, tip: float) -> Float64:
-    """Build a cooker seen a little from above: hob with rings, knobs, handle, door with a recessed window."""
-    front, count = -depth / 2, int(knobs)
+    """Build a cooker seen a little from above: hob with rings, knobs, handle, door with a recessed
+    window.
+    """
+    front = -depth / 2
+    count = int(knobs)
     door = at(frame(width, 0.6, (0.6 - window) / 2, 0.14), y=-0.2, z=front + 0.07)
-    body = joined(at(box(width, 0.6, depth - 0.14), y=-0.2, z=0.07), at(box(width, 0.26, depth), y=0.23))
-    dials = [at(disc(0.05, 0.1), width * ((k + 0.5) / count - 0.5), 0.23, front - 0.05) for k in range(count)]
+    body = joined(
+        at(box(width, 0.6, depth - 0.14), y=-0.2, z=0.07), at(box(width, 0.26, depth), y=0.23)
+    )
+    dials = [
+        at(disc(0.05, 0.1), width * ((k + 0.5) / count - 0.5), 0.23, front - 0.05)
+        for k in range(count)
+    ]
     handle = at(box(width * 0.7, 0.05, 0.05), 0, 0.03, front - 0.08)
     ring_profile = [(0.05, 0), (0.05, 0.06), (0.12, 0.06), (0.12, 0)]
     rings = _at_corners(lathe(ring_profile), width / 4, 0.36, depth / 4)
@@ -163,7 +190,8 @@ def oven(width: float, depth: float, window: float, knobs: float, tip: float) ->
 )
 def soundbox(width: float, depth: float, woofer: float, tweeter: float) -> Float64:
     """Build a loudspeaker: a tall box with a large cone below and a small one above."""
-    low, high = _speaker(width, 0.6, woofer * width), _speaker(width, 0.4, tweeter * width)
+    low = _speaker(width, 0.6, woofer * width)
+    high = _speaker(width, 0.4, tweeter * width)
     fronts = joined(at(low, y=-0.2), at(high, y=0.3))
     return joined(at(fronts, z=-depth / 2), at(box(width, 1.0, depth - 0.28), z=0.14))
 
@@ -197,11 +225,16 @@ def table(width: float, depth: float, leg: float, height: float, tip: float) -> 
 )
 def birdhouse(width: float, height: float, depth: float, gable: float, hole: float) -> Float64:
     """Build a box with a gable roof, a round hole with a rim, and a perch below it."""
-    eaves, front, sunk = height / 2 - 0.1, -depth / 2, 0.2
+    eaves = height / 2 - 0.1
+    front = -depth / 2
+    sunk = 0.2
     house = at(box(width, height, depth - sunk), 0, -0.1, sunk / 2)
     face = at(pierced(width, height, hole, sunk), 0, -0.1, front + sunk / 2)
     rim = at(ring(hole + 0.02, 0.03), 0, -0.1, front)
-    roof = slab([(-0.62 * width - 0.06, eaves), (0.62 * width + 0.06, eaves), (0, eaves + gable)], depth + 0.14)
+    roof = slab(
+        [(-0.62 * width - 0.06, eaves), (0.62 * width + 0.06, eaves), (0, eaves + gable)],
+        depth + 0.14,
+    )
     perch = at(box(0.06, 0.06, 0.24), 0, -0.16 - hole, front - 0.1)
     return joined(house, face, rim, roof, perch)
 
@@ -215,9 +248,14 @@ def tower(radius: float, flare: float, turn: float) -> Float64:
     """Build a round tower with battlements."""
     head = radius * flare
     merlon = 0.45 * head
-    shaft = lathe([(0, 0.35), (head, 0.35), (head, 0.22), (radius, 0.14), (radius * 1.1, -0.5), (0, -0.5)])
+    shaft = lathe(
+        [(0, 0.35), (head, 0.35), (head, 0.22), (radius, 0.14), (radius * 1.1, -0.5), (0, -0.5)]
+    )
     around = np.linspace(0, 2 * np.pi, 6, endpoint=False) + turn
-    crown = [at(box(merlon, 0.15, merlon), 0.85 * head * np.cos(a), 0.42, 0.85 * head * np.sin(a)) for a in around]
+    crown = [
+        at(box(merlon, 0.15, merlon), 0.85 * head * np.cos(a), 0.42, 0.85 * head * np.sin(a))
+        for a in around
+    ]
     return joined(shaft, *crown)
 
 
@@ -231,7 +269,8 @@ def tower(radius: float, flare: float, turn: float) -> Float64:
 def baskets(bottom: float, height: float, handle: float, ribs: float, tip: float) -> Float64:
     """Build a round woven basket, tipped so that its hollow shows, with a tall handle."""
     rows = 2 * int(ribs) + 1
-    top, low = 0.44, -height
+    top = 0.44
+    low = -height
     weave = [
         (bottom + (top - bottom) * k / rows + (0.035 if k % 2 else 0.0), low + height * k / rows)
         for k in range(rows + 1)
@@ -241,7 +280,9 @@ def baskets(bottom: float, height: float, handle: float, ribs: float, tip: float
     return tipped(joined(shell, arch(top - 0.02, 0.04) * (1, handle, 1.4)), tip)
 
 
-@category(rim=Setting(0.4, 0.52, held_out=(0.44, 0.475)), waist=Setting(0.2, 0.28, held_out=(0.23, 0.255)))
+@category(
+    rim=Setting(0.4, 0.52, held_out=(0.44, 0.475)), waist=Setting(0.2, 0.28, held_out=(0.23, 0.255))
+)
 def bell(rim: float, waist: float) -> Float64:
     """Build a bell with a flared rim, a crown and a clapper."""
     crown = [(0, 0.34), (waist * 0.7, 0.32), (waist, 0.2)]
@@ -271,7 +312,12 @@ def bowl(depth: float, foot: float, tip: float) -> Float64:
 )
 def cup(radius: float, taper: float, height: float, handle: float, tip: float) -> Float64:
     """Build a mug with its handle to one side."""
-    wall = [(0, -height / 2), (radius * taper, -height / 2), (radius, height / 2), (radius - 0.06, height / 2)]
+    wall = [
+        (0, -height / 2),
+        (radius * taper, -height / 2),
+        (radius, height / 2),
+        (radius - 0.06, height / 2),
+    ]
     body = lathe([*wall, (radius * taper - 0.06, 0.08 - height / 2), (0, 0.08 - height / 2)])
     return tipped(joined(body, at(ring(height * handle, 0.055), radius * 0.95)), tip)
 
@@ -283,7 +329,12 @@ def cup(radius: float, taper: float, height: float, handle: float, tip: float) -
 )
 def hat(crown: float, height: float, tip: float) -> Float64:
     """Build a brimmed hat with its band, a little tipped."""
-    top = [(0, height - 0.03), (crown * 0.6, height), (crown * 0.85, height), (crown, height * 0.85)]
+    top = [
+        (0, height - 0.03),
+        (crown * 0.6, height),
+        (crown * 0.85, height),
+        (crown, height * 0.85),
+    ]
     band = [(crown * 1.06, 0.2), (crown * 1.2, 0.2), (crown * 1.24, 0.06)]
     return tipped(lathe([*top, *band, (0.42, 0.02), (0.5, 0.05), (0.5, 0.0), (0, -0.04)]), tip)
 
@@ -312,9 +363,14 @@ def airplane(body: float, span: float, chord: float, sweep: float, tail: float) 
     """Build an airplane seen from above. Keep it as it is: the default scene shows one."""
     fuselage = ellipsoid(body, 0.5, body)
     wings = [
-        slab([(0, 0.1), (0, 0.1 - chord), (s * span, -0.05 - sweep), (s * span, 0.05 - sweep)], 0.05) for s in SIDES
+        slab(
+            [(0, 0.1), (0, 0.1 - chord), (s * span, -0.05 - sweep), (s * span, 0.05 - sweep)], 0.05
+        )
+        for s in SIDES
     ]
-    tails = [slab([(0, -0.34), (0, -0.48), (s * tail, -0.5), (s * tail, -0.42)], 0.05) for s in SIDES]
+    tails = [
+        slab([(0, -0.34), (0, -0.48), (s * tail, -0.5), (s * tail, -0.42)], 0.05) for s in SIDES
+    ]
     fin = at(box(0.05, 0.14, 0.18), 0, -0.42, -0.1)
     return joined(fuselage, *wings, *tails, fin)
 
@@ -341,17 +397,28 @@ def boat(beam: float, sail: float, lead: float, lag: float) -> Float64:
     back=Setting(0.25, 0.44, held_out=(0.32, 0.37)),
     cabin=Setting(0.2, 0.26),
 )
-def car(height: float, wheel: float, width: float, front: float, back: float, cabin: float) -> Float64:
+def car(
+    height: float, wheel: float, width: float, front: float, back: float, cabin: float
+) -> Float64:
     """Build a car from the side: body, cabin with recessed windows, two wheels."""
     body = slab([(-0.5, -0.08), (-0.5, 0.04), (0.44, 0.04), (0.5, -0.02), (0.5, -0.08)], 2 * width)
     sill = at(box(1.0, height - 0.06, 2 * width), 0, -0.08 - (height - 0.06) / 2)
-    top, lean = 0.04 + cabin, 0.12
-    glass = slab([(-back, 0.04), (front, 0.04), (front - lean, top), (lean / 2 - back, top)], 1.2 * width)
-    roof = bar((lean / 2 - back - 0.01, top - 0.02), (front - lean + 0.01, top - 0.02), 0.05, 1.8 * width)
+    top = 0.04 + cabin
+    lean = 0.12
+    glass = slab(
+        [(-back, 0.04), (front, 0.04), (front - lean, top), (lean / 2 - back, top)], 1.2 * width
+    )
+    roof = bar(
+        (lean / 2 - back - 0.01, top - 0.02), (front - lean + 0.01, top - 0.02), 0.05, 1.8 * width
+    )
     middle = (front - back) / 2
     pillars = [
         bar(foot, (head, top - 0.02), 0.045, 1.8 * width)
-        for foot, head in (((-back, 0.04), lean / 2 - back), ((middle, 0.04), middle), ((front, 0.04), front - lean))
+        for foot, head in (
+            ((-back, 0.04), lean / 2 - back),
+            ((middle, 0.04), middle),
+            ((front, 0.04), front - lean),
+        )
     ]
     bottom = -0.02 - height
     wheels = [at(disc(wheel, 0.12), x, bottom, -width - 0.02) for x in (-0.29, 0.29)]
@@ -367,15 +434,25 @@ def car(height: float, wheel: float, width: float, front: float, back: float, ca
     bars=Setting(0.16, 0.26),
     tank=Setting(0.12, 0.17),
 )
-def motorcycle(wheel: float, tyre: float, base: float, rake: float, bars: float, tank: float) -> Float64:
-    """Build a motorcycle from the side: two open wheels, slanted fork, tank, seat, engine and exhaust."""
-    axle, head = -0.22, base - rake
+def motorcycle(
+    wheel: float, tyre: float, base: float, rake: float, bars: float, tank: float
+) -> Float64:
+    """Build a motorcycle from the side: two open wheels, slanted fork, tank, seat, engine and
+    exhaust.
+    """
+    axle = -0.22
+    head = base - rake
     wheels = [at(joined(ring(wheel, tyre), disc(0.05, 0.14)), s * base, axle) for s in SIDES]
     guards = [at(arch(wheel + 0.05, 0.03, 150), s * base, axle) * (1, 1, 2) for s in SIDES]
     fork = [at(bar((base, axle), (head, 0.16), 0.05, 0.05), z=z) for z in (-0.09, 0.09)]
-    handle = at(joined(box(0.05, 0.05, 2 * bars), bar((0, 0), (-0.12, 0.04), 0.04, 0.3)), head, 0.18)
+    handle = at(
+        joined(box(0.05, 0.05, 2 * bars), bar((0, 0), (-0.12, 0.04), 0.04, 0.3)), head, 0.18
+    )
     lamp = at(knob(0.06, 0.08), head + 0.06, 0.1)
-    frame = [bar((-base, axle), (0.02, -0.16), 0.05, 0.16), bar((-0.1, -0.2), (head, 0.08), 0.06, 0.08)]
+    frame = [
+        bar((-base, axle), (0.02, -0.16), 0.05, 0.16),
+        bar((-0.1, -0.2), (head, 0.08), 0.06, 0.08),
+    ]
     engine = joined(at(box(0.22, 0.17, 0.2), -0.01, -0.17), at(disc(0.07, 0.3), 0.0, -0.17))
     seat = slab([(-0.4, 0.08), (-0.36, 0.0), (0.0, -0.02), (0.0, 0.05), (-0.24, 0.05)], 0.2)
     exhaust = at(bar((0.02, -0.25), (-base - 0.14, -0.2), 0.055, 0.06), z=-0.14)
@@ -394,7 +471,15 @@ def rocket(radius: float, nose: float, fin: float) -> Float64:
     body = lathe([*tip, (radius, -0.4), (radius * 0.6, -0.5), (0, -0.5)])
     root = radius * 0.8
     fins = [
-        slab([(s * root, -0.1), (s * root, -0.42), (s * (radius + fin), -0.5), (s * (radius + fin), -0.34)], 0.06)
+        slab(
+            [
+                (s * root, -0.1),
+                (s * root, -0.42),
+                (s * (radius + fin), -0.5),
+                (s * (radius + fin), -0.34),
+            ],
+            0.06,
+        )
         for s in SIDES
     ]
     porthole = at(ring(radius * 0.45, 0.03), 0, 0.38 - nose, -radius)
@@ -412,8 +497,12 @@ CATEGORIES: dict[str, Category] = {
 
 
 def find_category(name: str) -> Category:
-    """Return a category by name. Raises UnknownNameError, with the nearest name, where there is none."""
+    """Return a category by name. Raises UnknownNameError, with the nearest name, where there is
+    none.
+    """
     if name in CATEGORIES:
         return CATEGORIES[name]
     choices = f"Choose from {', '.join(CATEGORIES)}"
-    raise UnknownNameError(f"no object category {name!r}.{did_you_mean(name, CATEGORIES)} {choices}")
+    raise UnknownNameError(
+        f"no object category {name!r}.{did_you_mean(name, CATEGORIES)} {choices}"
+    )

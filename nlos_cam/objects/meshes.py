@@ -1,6 +1,8 @@
-"""Files of hidden objects: triangle meshes (.obj, .stl, .ply), folders of meshes, and depth maps (.npy).
+"""Files of hidden objects: triangle meshes (.obj, .stl, .ply), folders of meshes, and depth maps
+(.npy).
 
-Mesh files are simplified before trimesh parses them, so that none of its optional packages is needed.
+Mesh files are simplified before trimesh parses them, so that none of its optional packages is
+needed.
 """
 
 from __future__ import annotations
@@ -44,7 +46,8 @@ class _MeshProblemError(ValueError):
 def plain(content: bytes, suffix: str) -> bytes:
     """Return a simpler .obj, .stl or .ply file with the same triangles.
 
-    Raises ValueError where a parser would misread it: a binary of the wrong length, a face of vertex 0.
+    Raises ValueError where a parser would misread it: a binary of the wrong length, a face of
+    vertex 0.
     """
     if suffix == ".ply":
         # As wireframe, edges would need scipy: rename them in the header.
@@ -61,7 +64,9 @@ def _checked_binary(content: bytes, suffix: str) -> bytes:
         raise _MeshProblemError("it is not text")
     faces = int.from_bytes(content[80:84], "little")
     if suffix == ".stl" and len(content) != 84 + 50 * faces:
-        raise _MeshProblemError(f"it has {len(content)} bytes, but its {faces} faces take {84 + 50 * faces}")
+        raise _MeshProblemError(
+            f"it has {len(content)} bytes, but its {faces} faces take {84 + 50 * faces}"
+        )
     return content
 
 
@@ -75,8 +80,11 @@ def _plain_obj(text: bytes) -> bytes:
 
 
 def _with_absolute_indices(text: bytes) -> bytes:
-    """Return a .obj text with absolute vertex numbers in place of relative ones (-1 is the latest vertex)."""
-    vertices, lines = 0, text.split(b"\n")
+    """Return a .obj text with absolute vertex numbers in place of relative ones (-1 is the latest
+    vertex).
+    """
+    vertices = 0
+    lines = text.split(b"\n")
     for k, line in enumerate(lines):
         if line.startswith(b"v "):
             vertices += 1
@@ -86,7 +94,9 @@ def _with_absolute_indices(text: bytes) -> bytes:
 
 
 def _absolute_index(vertices: int, relative: re.Match[bytes]) -> bytes:
-    return b" %d" % max(vertices + 1 - int(relative[1]), 0)  # before the first vertex: 0, which is refused
+    return b" %d" % max(
+        vertices + 1 - int(relative[1]), 0
+    )  # before the first vertex: 0, which is refused
 
 
 MESH_SUFFIXES = (".obj", ".stl", ".ply")
@@ -94,11 +104,14 @@ DEPTH_MAP_SUFFIX = ".npy"
 MAX_FACES = 2_000_000
 """Read in 2 s (binary .stl) to 16 s (text .ply) and placed in 4 s, on two busy cores."""
 MAX_BYTES = 2**28
-"""256 MiB: a text .stl takes 300 bytes per face, and four times as much memory while it is parsed."""
+"""256 MiB: a text .stl takes 300 bytes per face, and four times as much memory while it is
+parsed.
+"""
 MAX_COORDINATE = 1e30
 """Limit of a vertex's coordinates, in any unit: their squares stay finite."""
 _REDUCE = "reduce the mesh, or save it as binary"
-MIN_CELLS, MAX_CELLS = 8, 256
+MIN_CELLS = 8
+MAX_CELLS = 256
 MAX_DEPTH_M = 10.0
 """Larger than any bench, smaller than a depth map given in millimetres."""
 
@@ -117,13 +130,19 @@ class MeshFile:
 
 
 def read_mesh(path: Path) -> MeshFile:
-    """Return a mesh with all its parts. Raises SceneFileError for a file without a mesh that can be placed."""
+    """Return a mesh with all its parts. Raises SceneFileError for a file without a mesh that can be
+    placed.
+    """
     suffix = path.suffix.lower()
     if suffix not in MESH_SUFFIXES:
-        raise SceneFileError(f"{path} is not a mesh: give a file that ends in {', '.join(MESH_SUFFIXES)}")
+        raise SceneFileError(
+            f"{path} is not a mesh: give a file that ends in {', '.join(MESH_SUFFIXES)}"
+        )
     with _readable(path, f"{suffix} file", "export it again, as triangles"):
         if (size := path.stat().st_size) > MAX_BYTES:
-            raise SceneFileError(f"{path} has {size / 2**20:.0f} MiB, the limit is {MAX_BYTES >> 20} MiB: {_REDUCE}")
+            raise SceneFileError(
+                f"{path} has {size / 2**20:.0f} MiB, the limit is {MAX_BYTES >> 20} MiB: {_REDUCE}"
+            )
         content = path.read_bytes()
         parts = _parts(content, suffix)
         triangles = np.concatenate([np.empty((0, 3, 3)), *(_triangles(part) for part in parts)])
@@ -135,21 +154,31 @@ def read_mesh(path: Path) -> MeshFile:
 def turn_upright(triangles: Float64, up: Up) -> Float64:
     """Return triangles (n, 3, 3) turned so that the axis `up` of their file becomes y.
 
-    With z up, as in CAD and Blender, the file's +y turns towards the wall (-z), as in an export with y up.
+    With z up, as in CAD and Blender, the file's +y turns towards the wall (-z), as in an export
+    with y up.
     """
     return triangles if up == "y" else triangles[..., [0, 2, 1]] * (1, 1, -1)
 
 
 def read_depth_map(path: Path) -> Float32:
-    """Return a depth map (n, n) in metres over the object box, NaN for background, from numbers of any real type.
+    """Return a depth map (n, n) in metres over the object box, NaN for background, from numbers of
+    any real type.
 
     Raises SceneFileError where the file holds anything else.
     """
     with _readable(path, "depth map", "save one with numpy.save(file, depth_m)"):
-        stored = np.lib.format.open_memmap(path, mode="r")  # no pickles; a huge shape in the header costs nothing
+        stored = np.lib.format.open_memmap(
+            path, mode="r"
+        )  # no pickles; a huge shape in the header costs nothing
     if stored.dtype.kind not in "fiu":
-        raise SceneFileError(f"{path} holds {stored.dtype} values: a depth map holds real numbers, in metres")
-    if stored.ndim != 2 or stored.shape[0] != stored.shape[1] or not MIN_CELLS <= len(stored) <= MAX_CELLS:
+        raise SceneFileError(
+            f"{path} holds {stored.dtype} values: a depth map holds real numbers, in metres"
+        )
+    if (
+        stored.ndim != 2
+        or stored.shape[0] != stored.shape[1]
+        or not MIN_CELLS <= len(stored) <= MAX_CELLS
+    ):
         size = f"(n, n) with n from {MIN_CELLS} to {MAX_CELLS}"
         raise SceneFileError(f"{path} has shape {stored.shape}: a depth map has shape {size}")
     surface = stored[~np.isnan(stored)]
@@ -170,9 +199,13 @@ def _readable(path: Path, kind: str, advice: str) -> Generator[None]:
     except SceneError:
         raise
     except OSError as error:
-        raise SceneFileError(f"{path} cannot be read as a {kind}: {error.strerror or error}") from error
+        raise SceneFileError(
+            f"{path} cannot be read as a {kind}: {error.strerror or error}"
+        ) from error
     except Exception as error:
-        problem = f" ({error})" if isinstance(error, _MeshProblemError) else ""  # a parser's own words would not help
+        problem = (
+            f" ({error})" if isinstance(error, _MeshProblemError) else ""
+        )  # a parser's own words would not help
         raise SceneFileError(f"{path} is damaged or not a {kind}{problem}: {advice}") from error
 
 
@@ -192,7 +225,9 @@ def _strict() -> Generator[None]:
 
 
 def _parts(content: bytes, suffix: str) -> list[trimesh.Trimesh]:
-    """Return every mesh in a file, unprocessed. From a stream, trimesh cannot search for materials and textures."""
+    """Return every mesh in a file, unprocessed. From a stream, trimesh cannot search for materials
+    and textures.
+    """
     import trimesh
 
     with _strict():
@@ -215,7 +250,10 @@ def _problem(triangles: Float64) -> str:
     if len(triangles) > MAX_FACES:
         return f"has {len(triangles)} faces, the limit is {MAX_FACES}: {_REDUCE}"
     if not np.abs(triangles).max() <= MAX_COORDINATE:  # false for NaN too
-        return f"has a vertex that is NaN, infinite or beyond {MAX_COORDINATE:g}: repair or export it again"
+        return (
+            f"has a vertex that is NaN, infinite or beyond {MAX_COORDINATE:g}: repair or export it"
+            " again"
+        )
     extent = np.ptp(triangles.reshape(-1, 3), axis=0).max()
     normals = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
     if not np.abs(normals).max() > 1e-12 * extent**2:
@@ -231,25 +269,43 @@ Mesh = TypeVar("Mesh")
 def folder_objects(folder: Path) -> list[Path]:
     """Return the meshes (.obj, .stl, .ply) of a folder and its subfolders, sorted by relative path.
 
-    Files and folders that start with a dot are skipped. Raises SceneError where there is no such folder, or no mesh.
+    Files and folders that start with a dot are skipped. Raises SceneError where there is no such
+    folder, or no mesh.
     """
     if not folder.is_dir():
-        raise SceneError(f"no folder {folder}: give one that holds meshes ({', '.join(MESH_SUFFIXES)})")
-    found = [path for path in folder.rglob("*") if path.suffix.lower() in MESH_SUFFIXES and path.is_file()]
+        raise SceneError(
+            f"no folder {folder}: give one that holds meshes ({', '.join(MESH_SUFFIXES)})"
+        )
+    found = [
+        path
+        for path in folder.rglob("*")
+        if path.suffix.lower() in MESH_SUFFIXES and path.is_file()
+    ]
     meshes = {path.relative_to(folder).parts: path for path in found}
-    visible = [meshes[parts] for parts in sorted(meshes) if not any(part.startswith(".") for part in parts)]
+    visible = [
+        meshes[parts] for parts in sorted(meshes) if not any(part.startswith(".") for part in parts)
+    ]
     if not visible:
-        raise SceneError(f"no meshes in {folder} and its subfolders: add files that end in {', '.join(MESH_SUFFIXES)}")
+        raise SceneError(
+            f"no meshes in {folder} and its subfolders: add files that end in"
+            f" {', '.join(MESH_SUFFIXES)}"
+        )
     return visible
 
 
 def mesh_depth(
-    seed: int, meshes: Sequence[Mesh], box: ObjectBox, up: Up = "y", *, read: Callable[[Mesh], MeshFile]
+    seed: int,
+    meshes: Sequence[Mesh],
+    box: ObjectBox,
+    up: Up = "y",
+    *,
+    read: Callable[[Mesh], MeshFile],
 ) -> tuple[Mesh, Float32]:
-    """Return one of the meshes and its depth map (64, 64) in metres, NaN background; the seed picks mesh and pose.
+    """Return one of the meshes and its depth map (64, 64) in metres, NaN background; the seed picks
+    mesh and pose.
 
-    Poses are those of procedural objects, up to POSES of them until one shows a surface. Only the picked mesh is read.
-    Raises SceneError, with the file's name, where none does.
+    Poses are those of procedural objects, up to POSES of them until one shows a surface. Only the
+    picked mesh is read. Raises SceneError, with the file's name, where none does.
     """
     generator = np.random.default_rng([seed, OBJECT_PIXELS])
     picked = meshes[int(generator.integers(len(meshes)))]
@@ -260,6 +316,6 @@ def mesh_depth(
         if not np.isnan(depth_m).all():
             return picked, depth_m
     raise SceneError(
-        f"{mesh.path} shows no surface in any of {POSES} poses (thinner than a depth-map cell): make it thicker, "
-        "or remove it from the folder"
+        f"{mesh.path} shows no surface in any of {POSES} poses (thinner than a depth-map cell):"
+        " make it thicker, or remove it from the folder"
     )

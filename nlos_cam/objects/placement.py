@@ -1,4 +1,6 @@
-"""Placement of objects in the object box: poses, random objects, and the posts and panels beside some of them."""
+"""Placement of objects in the object box: poses, random objects, and the posts and panels beside
+some of them.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -19,7 +21,9 @@ POSE_UNITS = 7
 
 @dataclass(frozen=True)
 class Pose:
-    """Pose of an object in the box: angles about wall x, y and z in turn, size, and offsets from the box's middle."""
+    """Pose of an object in the box: angles about wall x, y and z in turn, size, and offsets from
+    the box's middle.
+    """
 
     tilt_x_rad: float = 0.0
     tilt_y_rad: float = 0.0
@@ -45,7 +49,9 @@ class BoxFit:
 
 
 def post(depth_m: Float32, generator: np.random.Generator) -> Float32:
-    """Return a flat post (rows, columns) from the object's underside to the bottom of the box, NaN elsewhere."""
+    """Return a flat post (rows, columns) from the object's underside to the bottom of the box, NaN
+    elsewhere.
+    """
     surface = ~np.isnan(depth_m)
     columns = np.flatnonzero(surface.any(axis=0))
     width = max(2, round(generator.uniform(0.1, 0.35) * len(columns)))
@@ -56,28 +62,39 @@ def post(depth_m: Float32, generator: np.random.Generator) -> Float32:
 
 
 def panel(depth_m: Float32, box: ObjectBox, generator: np.random.Generator) -> Float32:
-    """Return a panel (rows, columns) behind the object, parallel to the wall, over 60 to 100 % of the box's sides."""
+    """Return a panel (rows, columns) behind the object, parallel to the wall, over 60 to 100 % of
+    the box's sides.
+    """
     z_m = generator.uniform(np.nanmax(depth_m), box.z_far_m)
     rows, columns = (
-        np.abs((np.arange(cells) + 0.5) / cells - 0.5) <= generator.uniform(0.6, 1.0) / 2 for cells in depth_m.shape
+        np.abs((np.arange(cells) + 0.5) / cells - 0.5) <= generator.uniform(0.6, 1.0) / 2
+        for cells in depth_m.shape
     )
     return np.where(rows[:, None] & columns, z_m, np.nan).astype(np.float32)
 
 
 def add_background(depth_m: Float32, box: ObjectBox, generator: np.random.Generator) -> Float32:
-    """Return an object's depth map (rows, columns) with a random post or panel where it has no surface."""
-    behind = post(depth_m, generator) if generator.random() < 0.5 else panel(depth_m, box, generator)
+    """Return an object's depth map (rows, columns) with a random post or panel where it has no
+    surface.
+    """
+    behind = (
+        post(depth_m, generator) if generator.random() < 0.5 else panel(depth_m, box, generator)
+    )
     return np.where(np.isnan(depth_m), behind, depth_m)
 
 
 def category_triangles(category: str, seed: int) -> Float64:
-    """Return the triangles (n, 3, 3) of one variation of a category, in its own units. Raises SceneError if unknown."""
+    """Return the triangles (n, 3, 3) of one variation of a category, in its own units. Raises
+    SceneError if unknown.
+    """
     kind = find_category(category)
     return kind.make(**kind.draw(np.random.default_rng(seed).random(len(kind.settings))))
 
 
 def fit_in_box(triangles: Float64, pose: Pose, box: ObjectBox) -> BoxFit:
-    """Return the depth of a placed object, the room for it, and the share of it that the box cuts off."""
+    """Return the depth of a placed object, the room for it, and the share of it that the box cuts
+    off.
+    """
     depth_m = float(np.ptp(_turn_and_scale(triangles, pose)[:, 2]))
     return BoxFit(depth_m, _room_m(pose, box), share_outside(place(triangles, pose, box), box))
 
@@ -85,22 +102,27 @@ def fit_in_box(triangles: Float64, pose: Pose, box: ObjectBox) -> BoxFit:
 def place(triangles: Float64, pose: Pose, box: ObjectBox) -> Float64:
     """Return triangles (n, 3, 3) turned, scaled and moved into the box, in the wall frame.
 
-    An object deeper than the box is flattened along z; its silhouette stays. Raises SceneError where front_m lies
-    behind the box.
+    An object deeper than the box is flattened along z; its silhouette stays. Raises SceneError
+    where front_m lies behind the box.
     """
     points = _turn_and_scale(triangles, pose)
     points[:, 2] *= min(1.0, _room_m(pose, box) / max(np.ptp(points[:, 2]), 1e-9))
-    middle_x, middle_y = (box.x_min_m + box.x_max_m) / 2, (box.y_min_m + box.y_max_m) / 2
-    points += (middle_x + pose.x_m, middle_y + pose.y_m, box.z_near_m + pose.front_m - points[:, 2].min())
+    middle_x = (box.x_min_m + box.x_max_m) / 2
+    middle_y = (box.y_min_m + box.y_max_m) / 2
+    points += (
+        middle_x + pose.x_m,
+        middle_y + pose.y_m,
+        box.z_near_m + pose.front_m - points[:, 2].min(),
+    )
     return points.reshape(-1, 3, 3)
 
 
 def invisible_object_error(label: str, box: ObjectBox) -> SceneError:
     """Return the error of an object that has no surface in its depth map."""
     return SceneError(
-        f"{label} shows no surface in the object box (x {box.x_min_m:g} to {box.x_max_m:g} m, y {box.y_min_m:g} to "
-        f"{box.y_max_m:g} m): it lies outside, is edge on, or is smaller than a cell; change x_m, y_m, size_m or its "
-        "angles"
+        f"{label} shows no surface in the object box (x {box.x_min_m:g} to {box.x_max_m:g} m, y"
+        f" {box.y_min_m:g} to {box.y_max_m:g} m): it lies outside, is edge on, or is smaller than a"
+        " cell; change x_m, y_m, size_m or its angles"
     )
 
 
@@ -119,15 +141,18 @@ def _room_m(pose: Pose, box: ObjectBox) -> float:
     room_m = box.z_far_m - box.z_near_m - pose.front_m
     if room_m < 0:
         depth_m = room_m + pose.front_m
-        raise SceneError(f"front_m of {pose.front_m:g} m leaves the box, which is {depth_m:g} m deep: lower it")
+        raise SceneError(
+            f"front_m of {pose.front_m:g} m leaves the box, which is {depth_m:g} m deep: lower it"
+        )
     return room_m
 
 
 def pose_from_units(units: Sequence[float], box: ObjectBox) -> Pose:
     """Return the pose that seven numbers in [0, 1] decide; it keeps the whole object in the box.
 
-    In turn: size (55 to 90 % of the box), tilts (to 15 and 20 degrees), turn (to 35), offsets, and distance (the
-    object's front is in the nearest 35 % of the box). Random poses are uniform over all of these.
+    In turn: size (55 to 90 % of the box), tilts (to 15 and 20 degrees), turn (to 35), offsets, and
+    distance (the object's front is in the nearest 35 % of the box). Random poses are uniform over
+    all of these.
     """
     size, tilt_x, tilt_y, turn_z, right, up, front = units
     width_m = box_width_m(box)
@@ -150,23 +175,31 @@ def box_width_m(box: ObjectBox) -> float:
 
 
 def random_pose(generator: np.random.Generator, box: ObjectBox) -> Pose:
-    """Return a pose that keeps the whole object in the box, uniform over the poses of `pose_from_units`."""
+    """Return a pose that keeps the whole object in the box, uniform over the poses of
+    `pose_from_units`.
+    """
     return pose_from_units(generator.random(POSE_UNITS).tolist(), box)
 
 
 def object_depth(
     seed: int, box: ObjectBox, categories: Sequence[str] | None = None, *, backgrounds: float = 0.0
 ) -> tuple[str, Float32]:
-    """Return one random object, by the seed alone: its category and its depth map (64, 64) in metres, NaN background.
+    """Return one random object, by the seed alone: its category and its depth map (64, 64) in
+    metres, NaN background.
 
-    `categories` are those to choose from (default: all). `backgrounds` is the share of objects with a post or a panel
-    beside them; the objects themselves do not depend on it. Raises SceneError for no or an unknown category.
+    `categories` are those to choose from (default: all). `backgrounds` is the share of objects with
+    a post or a panel beside them; the objects themselves do not depend on it. Raises SceneError for
+    no or an unknown category.
     """
-    names = [find_category(name).name for name in (CATEGORIES if categories is None else categories)]
+    names = [
+        find_category(name).name for name in (CATEGORIES if categories is None else categories)
+    ]
     if not names:
         raise SceneError(f"no object category is left: choose from {', '.join(CATEGORIES)}")
     generator = np.random.default_rng([seed, OBJECT_PIXELS])
     category = str(generator.choice(names))
     triangles = category_triangles(category, int(generator.integers(2**31)))
     depth_m = orthographic_depth(place(triangles, random_pose(generator, box), box), box)
-    return category, add_background(depth_m, box, generator) if generator.random() < backgrounds else depth_m
+    return category, (
+        add_background(depth_m, box, generator) if generator.random() < backgrounds else depth_m
+    )

@@ -1,6 +1,8 @@
-"""Primitive solids of the object generators, as triangles (n, 3, 3): y is up, the wall lies towards -z.
+"""Primitive solids of the object generators, as triangles (n, 3, 3): y is up, the wall lies towards
+-z.
 
-trimesh takes longer to import than all else here, and no camera needs it: its users import it when they run.
+trimesh takes longer to import than all else here, and no camera needs it: its users import it when
+they run.
 """
 
 from collections.abc import Sequence
@@ -30,7 +32,9 @@ def turned(triangles: Float64, axis: Sequence[float], angle_deg: float) -> Float
 
 
 def tipped(triangles: Float64, angle_deg: float) -> Float64:
-    """Return the solid with its top tipped towards the wall, as if seen from above by that angle."""
+    """Return the solid with its top tipped towards the wall, as if seen from above by that
+    angle.
+    """
     return turned(triangles, (1, 0, 0), -angle_deg)
 
 
@@ -50,7 +54,9 @@ def ellipsoid(rx: float, ry: float, rz: float) -> Float64:
 
 
 def knob(radius: float, reach: float) -> Float64:
-    """Return an ellipsoid of half-depth `reach` along z, with a quarter of the faces of `ellipsoid`."""
+    """Return an ellipsoid of half-depth `reach` along z, with a quarter of the faces of
+    `ellipsoid`.
+    """
     return _unit_sphere(2) * (radius, radius, reach)
 
 
@@ -58,7 +64,11 @@ def lathe(profile: Sequence[Point]) -> Float64:
     """Return the solid that a profile of (radius, height) sweeps about the y axis."""
     angle = np.linspace(0, 2 * np.pi, SECTIONS + 1)[:, None]
     radius, height = np.asarray(profile, float).T
-    return _grid_surface(np.stack(np.broadcast_arrays(radius * np.cos(angle), height, radius * np.sin(angle)), axis=-1))
+    return _grid_surface(
+        np.stack(
+            np.broadcast_arrays(radius * np.cos(angle), height, radius * np.sin(angle)), axis=-1
+        )
+    )
 
 
 def disc(radius: float, thickness: float) -> Float64:
@@ -88,16 +98,24 @@ def slab(corners: Sequence[Point], thickness: float) -> Float64:
     front = np.column_stack([outline, np.full(n, -thickness / 2)])
     back = np.column_stack([outline, np.full(n, thickness / 2)])
     fan = [(0, k, k + 1) for k in range(1, n - 1)]
-    sides = [(k, (k + 1) % n, n + k) for k in range(n)] + [(n + k, (k + 1) % n, n + (k + 1) % n) for k in range(n)]
+    sides = [(k, (k + 1) % n, n + k) for k in range(n)] + [
+        (n + k, (k + 1) % n, n + (k + 1) % n) for k in range(n)
+    ]
     faces = fan + [(n + a, n + b, n + c) for a, b, c in fan] + sides
     return np.vstack([front, back])[np.asarray(faces)]
 
 
 def prism(outline: NDArray[np.float64], thickness: float, taper: float = 1.0) -> Float64:
-    """Return a star-shaped polygon (n, 2) about the origin with a thickness along z; its front is `taper` as wide."""
-    a, b = outline, np.roll(outline, -1, axis=0)
-    middle, half = np.zeros_like(a), thickness / 2
-    near = [np.pad(taper * points, ((0, 0), (0, 1)), constant_values=-half) for points in (a, b, middle)]
+    """Return a star-shaped polygon (n, 2) about the origin with a thickness along z; its front is
+    `taper` as wide.
+    """
+    a = outline
+    b = np.roll(outline, -1, axis=0)
+    middle = np.zeros_like(a)
+    half = thickness / 2
+    near = [
+        np.pad(taper * points, ((0, 0), (0, 1)), constant_values=-half) for points in (a, b, middle)
+    ]
     far = [np.pad(points, ((0, 0), (0, 1)), constant_values=half) for points in (a, b, middle)]
     sides = [[near[0], near[1], far[1]], [near[0], far[1], far[0]]]
     return np.concatenate([np.stack(corners, axis=1) for corners in (near, far, *sides)])
@@ -105,15 +123,20 @@ def prism(outline: NDArray[np.float64], thickness: float, taper: float = 1.0) ->
 
 def bar(start: Point, end: Point, width: float, thickness: float) -> Float64:
     """Return a straight bar in the x-y plane from one point to another."""
-    (x0, y0), (x1, y1) = start, end
+    (x0, y0) = start
+    (x1, y1) = end
     share = width / 2 / np.hypot(x1 - x0, y1 - y0)
-    u, v = (y0 - y1) * share, (x1 - x0) * share
+    u = (y0 - y1) * share
+    v = (x1 - x0) * share
     return slab([(x0 - u, y0 - v), (x0 + u, y0 + v), (x1 + u, y1 + v), (x1 - u, y1 - v)], thickness)
 
 
 def pierced(width: float, height: float, hole: float, thickness: float) -> Float64:
-    """Return a plate centred on the origin that faces the wall, with a hole of radius `hole` in its middle."""
-    # Rays from the centre hit the plate's rectangle where max(|x| / (width / 2), |y| / (height / 2)) is 1.
+    """Return a plate centred on the origin that faces the wall, with a hole of radius `hole` in its
+    middle.
+    """
+    # Rays from the centre hit the plate's rectangle where max(|x| / (width / 2), |y| / (height /
+    # 2)) is 1.
     angle = np.linspace(0, 2 * np.pi, SECTIONS + 1)
     circle = np.column_stack([np.cos(angle), np.sin(angle)])
     edge = circle / np.abs(circle / (width / 2, height / 2)).max(axis=1, keepdims=True)
@@ -121,14 +144,20 @@ def pierced(width: float, height: float, hole: float, thickness: float) -> Float
     for corner in corners:  # snap the nearest ray to the corner, which would otherwise be cut off
         edge[np.linalg.norm(edge - corner, axis=1).argmin()] = corner
     loops = [(hole * circle, -1), (edge, -1), (edge, 1), (hole * circle, 1), (hole * circle, -1)]
-    rings = [np.column_stack([loop, np.full(len(loop), side * thickness / 2)]) for loop, side in loops]
+    rings = [
+        np.column_stack([loop, np.full(len(loop), side * thickness / 2)]) for loop, side in loops
+    ]
     return _grid_surface(np.stack(rings, axis=1))
 
 
 def frame(width: float, height: float, border: float, thickness: float) -> Float64:
-    """Return a rectangular frame centred on the origin that faces the wall; its border lies inside."""
-    rail, post = box(width, border, thickness), box(border, height, thickness)
-    up, aside = (height - border) / 2, (width - border) / 2
+    """Return a rectangular frame centred on the origin that faces the wall; its border lies
+    inside.
+    """
+    rail = box(width, border, thickness)
+    post = box(border, height, thickness)
+    up = (height - border) / 2
+    aside = (width - border) / 2
     return joined(at(rail, y=up), at(rail, y=-up), at(post, aside), at(post, -aside))
 
 
@@ -147,6 +176,13 @@ def _unit_sphere(subdivisions: int) -> Float64:
 
 
 def _grid_surface(points: NDArray[np.float64]) -> Float64:
-    """Return the surface through a grid of points (rows, columns, 3): two triangles per grid cell."""
-    a, b, c, d = points[:-1, :-1], points[1:, :-1], points[1:, 1:], points[:-1, 1:]
-    return np.concatenate([np.stack([a, b, c], axis=2), np.stack([a, c, d], axis=2)]).reshape(-1, 3, 3)
+    """Return the surface through a grid of points (rows, columns, 3): two triangles per grid
+    cell.
+    """
+    a = points[:-1, :-1]
+    b = points[1:, :-1]
+    c = points[1:, 1:]
+    d = points[:-1, 1:]
+    return np.concatenate([np.stack([a, b, c], axis=2), np.stack([a, c, d], axis=2)]).reshape(
+        -1, 3, 3
+    )

@@ -1,7 +1,7 @@
 """Second set of test objects: 54 of 18 kinds that no training object resembles by construction.
 
-Each kind has three variants, given by `k` from 0 to 2. Nothing here is random, and nothing may serve for training.
-Objects stand with y up and face the wall (-z), in units of their own size.
+Each kind has three variants, given by `k` from 0 to 2. Nothing here is random, and nothing may
+serve for training. Objects stand with y up and face the wall (-z), in units of their own size.
 """
 
 from collections.abc import Callable, Sequence
@@ -44,7 +44,11 @@ def letter(k: int) -> Float64:
     strokes = (
         [[(-0.35, -0.5), (0.0, 0.5), (0.35, -0.5)], [(-0.2, -0.1), (0.2, -0.1)]],
         [leg, [(0.3, 0.5), (-0.3, -0.02), (0.32, -0.5)]],
-        [leg, [(-0.3, 0.5), (0.15, 0.5), (0.3, 0.27), (0.15, 0.02), (-0.3, 0.02)], [(0.0, 0.02), (0.32, -0.5)]],
+        [
+            leg,
+            [(-0.3, 0.5), (0.15, 0.5), (0.3, 0.27), (0.15, 0.02), (-0.3, 0.02)],
+            [(0.0, 0.02), (0.32, -0.5)],
+        ],
     )[k]
     return joined(*(_line(stroke, 0.14, 0.16) for stroke in strokes))
 
@@ -72,14 +76,16 @@ def tree(k: int) -> Float64:
     storeys = 2 + k
     tops = np.linspace(0.5, 0.12 - 0.06 * k, storeys)
     crowns = [
-        lathe([(0, top), (0.2 + 0.2 * n / storeys, top - 0.4), (0, top - 0.36)]) for n, top in enumerate(tops.tolist())
+        lathe([(0, top), (0.2 + 0.2 * n / storeys, top - 0.4), (0, top - 0.36)])
+        for n, top in enumerate(tops.tolist())
     ]
     return joined(*crowns, at(box(0.1, 0.3, 0.1), 0, -0.42))
 
 
 def hand(k: int) -> Float64:
     """Build an open hand: palm, four fingers, thumb."""
-    spread, parts = 8 + 6 * k, [ellipsoid(0.2, 0.24, 0.09)]
+    spread = 8 + 6 * k
+    parts = [ellipsoid(0.2, 0.24, 0.09)]
     for n, length in enumerate((0.2, 0.24, 0.23, 0.17)):
         finger = at(ellipsoid(0.05, length, 0.05), 0, length)
         parts.append(at(turned(finger, (0, 0, 1), spread * (1.5 - n)), 0.1 * (n - 1.5), 0.14))
@@ -105,7 +111,9 @@ def star(k: int) -> Float64:
     """Build a star of five to seven points with raised middle."""
     points = 5 + k
     angle = np.pi * np.arange(2 * points) / points + np.pi / 2
-    outline = np.where(np.arange(2 * points) % 2, 0.21, 0.5)[:, None] * np.column_stack([np.cos(angle), np.sin(angle)])
+    outline = np.where(np.arange(2 * points) % 2, 0.21, 0.5)[:, None] * np.column_stack(
+        [np.cos(angle), np.sin(angle)]
+    )
     return prism(outline, 0.24, 0.35)
 
 
@@ -113,7 +121,11 @@ def spiral(k: int) -> Float64:
     """Build a flat spiral of two turns and more."""
     angle = np.linspace(0, 2 * np.pi * (1.75 + 0.25 * k), 48)
     radius = 0.06 + 0.4 * angle / angle[-1]
-    return _line([*zip((radius * np.cos(angle)).tolist(), (radius * np.sin(angle)).tolist(), strict=True)], 0.085, 0.12)
+    return _line(
+        [*zip((radius * np.cos(angle)).tolist(), (radius * np.sin(angle)).tolist(), strict=True)],
+        0.085,
+        0.12,
+    )
 
 
 def ladder(k: int) -> Float64:
@@ -129,7 +141,9 @@ def umbrella(k: int) -> Float64:
     canopy = [(0.48 * np.sin(a), rise * np.cos(a)) for a in np.linspace(0, np.pi / 2, 8)]
     stick = bar((0, 0.05), (0, -0.5), 0.05, 0.05)
     crook = turned(arch(0.08, 0.025), (1, 0, 0), 180)
-    return tipped(joined(at(lathe([*canopy, (0, 0.02)]), 0, 0.1), stick, at(crook, 0.08, -0.5)), -5 * k)
+    return tipped(
+        joined(at(lathe([*canopy, (0, 0.02)]), 0, 0.1), stick, at(crook, 0.08, -0.5)), -5 * k
+    )
 
 
 def teapot(k: int) -> Float64:
@@ -159,13 +173,21 @@ def barbell(k: int) -> Float64:
 def windmill(k: int) -> Float64:
     """Build a windmill: tower, cap and four sails."""
     tower = lathe([(0, 0.1), (0.12, 0.1), (0.2, -0.5), (0, -0.5)])
-    sails = [turned(bar((0.04, 0.05), (0.42, 0.05), 0.11, 0.04), (0, 0, 1), 90 * n + 15 + 20 * k) for n in range(4)]
-    return joined(tower, at(ellipsoid(0.13, 0.1, 0.13), 0, 0.1), *(at(sail, 0, 0.12, -0.2) for sail in sails))
+    sails = [
+        turned(bar((0.04, 0.05), (0.42, 0.05), 0.11, 0.04), (0, 0, 1), 90 * n + 15 + 20 * k)
+        for n in range(4)
+    ]
+    return joined(
+        tower, at(ellipsoid(0.13, 0.1, 0.13), 0, 0.1), *(at(sail, 0, 0.12, -0.2) for sail in sails)
+    )
 
 
 def mushroom(k: int) -> Float64:
     """Build a mushroom with a domed cap."""
-    cap = [(0.42 * np.sin(a), 0.12 + (0.24 + 0.06 * k) * np.cos(a)) for a in np.linspace(0, np.pi / 2, 8)]
+    cap = [
+        (0.42 * np.sin(a), 0.12 + (0.24 + 0.06 * k) * np.cos(a))
+        for a in np.linspace(0, np.pi / 2, 8)
+    ]
     stem = [(0.13, 0.1), (0.11, -0.2), (0.17 + 0.02 * k, -0.45), (0, -0.45)]
     return tipped(lathe([*cap, (0.4, 0.08), *stem]), 8 * k)
 
@@ -173,22 +195,31 @@ def mushroom(k: int) -> Float64:
 def anchor(k: int) -> Float64:
     """Build an anchor: ring, stock, shank, arms with flukes."""
     arms = at(turned(arch(0.32 + 0.03 * k, 0.04), (0, 0, 1), 180), 0, -0.1)
-    tips = [at(slab([(-0.08, -0.03), (0.08, -0.03), (0, 0.12)], 0.07), s * (0.32 + 0.03 * k), -0.1) for s in SIDES]
+    tips = [
+        at(slab([(-0.08, -0.03), (0.08, -0.03), (0, 0.12)], 0.07), s * (0.32 + 0.03 * k), -0.1)
+        for s in SIDES
+    ]
     stock = at(box(0.4 + 0.06 * k, 0.07, 0.07), 0, 0.26)
-    return joined(arms, *tips, stock, bar((0, -0.45), (0, 0.38), 0.08, 0.08), at(ring(0.08, 0.03), 0, 0.45))
+    return joined(
+        arms, *tips, stock, bar((0, -0.45), (0, 0.38), 0.08, 0.08), at(ring(0.08, 0.03), 0, 0.45)
+    )
 
 
 def stairs(k: int) -> Float64:
     """Build a flight of three to five steps, turned aside."""
     steps = 3 + k
     side = 1.0 / steps
-    parts = [at(box(side, side * (n + 1), 0.5), side * (n + 0.5) - 0.5, side * (n + 1) / 2 - 0.5) for n in range(steps)]
+    parts = [
+        at(box(side, side * (n + 1), 0.5), side * (n + 0.5) - 0.5, side * (n + 1) / 2 - 0.5)
+        for n in range(steps)
+    ]
     return turned(joined(*parts), (0, 1, 0), 20 + 10 * k)
 
 
 def figure(k: int) -> Float64:
     """Build a standing person with arms raised by 20 to 100 degrees."""
-    lift, parts = 20 + 40 * k, [at(ellipsoid(0.09, 0.11, 0.1), 0, 0.4), at(ellipsoid(0.14, 0.24, 0.1), 0, 0.08)]
+    lift = 20 + 40 * k
+    parts = [at(ellipsoid(0.09, 0.11, 0.1), 0, 0.4), at(ellipsoid(0.14, 0.24, 0.1), 0, 0.08)]
     for s in SIDES:
         arm = turned(at(ellipsoid(0.05, 0.19, 0.05), 0, -0.17), (0, 0, 1), s * lift)
         leg = turned(at(ellipsoid(0.065, 0.22, 0.07), 0, -0.2), (0, 0, 1), s * 8)
