@@ -1,16 +1,20 @@
 """Maps of a measured bench as the networks' training rig would have seen them.
 
-Networks know one rig, to the millimetre: a cell at the occluder's edge that sees something else than in training is
-enough to mislead them. But wherever the lidar stands, a point of the wall lit by it returns the same paths beyond the
-point, so most of what a bench's maps differ by is known from its calibration. Object boxes are laid on each other, and
-each cell of the training rig takes what the bench measured at the cell's point of the wall:
+Networks know one rig, to the millimetre: a cell at the occluder's edge that sees something else
+than in training is enough to mislead them. But wherever the lidar stands, a point of the wall lit
+by it returns the same paths beyond the point, so most of what a bench's maps differ by is known
+from its calibration. Object boxes are laid on each other, and each cell of the training rig takes
+what the bench measured at the cell's point of the wall:
 
 - an echo of the wall is as much longer than the wall's distance there as on the bench;
-- an echo over three bounces, d1 + d2 + d3 + d4, changes by d1 to the point and by the mean change of d4;
-- intensities keep their ratio to the wall's own return, less the gain of the whole frame; over three bounces they do
+- an echo over three bounces, d1 + d2 + d3 + d4, changes by d1 to the point and by the mean change
+  of d4;
+- intensities keep their ratio to the wall's own return, less the gain of the whole frame; over
+  three bounces they do
   not fall with d1.
 
-Cells that the bench does not see past its occluder are extrapolated from their neighbors, a few cells far.
+Cells that the bench does not see past its occluder are extrapolated from their neighbors, a few
+cells far.
 """
 
 from collections.abc import Iterable
@@ -36,8 +40,8 @@ THREE_BOUNCES_M = 0.02
 SAME_ECHO_M = 0.08
 """Spread of four neighbors' paths below which they are of one echo, and interpolated."""
 BEYOND_CELLS = 3
-"""Columns over which maps are extrapolated at most, towards the occluder, where intensities rise; farther ones, and
-rows outside the view, repeat the last."""
+"""Columns over which maps are extrapolated at most, towards the occluder, where intensities rise;
+farther ones, and rows outside the view, repeat the last."""
 HIDDEN_CELLS = 4
 """Columns that the bench's occluder may hide of those that the training rig sees."""
 BEAMS = 8
@@ -49,45 +53,60 @@ MIN_COUNTS = 0.5
 
 
 class MapAlignment:
-    """Alignment of the maps of one bench with the rig that networks were trained for; see the module.
+    """Alignment of the maps of one bench with the rig that networks were trained for; see the
+    module.
 
-    With the bench's own bare wall, its reflectance and a constant error of range are taken out as well.
+    With the bench's own bare wall, its reflectance and a constant error of range are taken out as
+    well.
     """
 
     def __init__(self, bench: Rig, trained: Rig, bare: BareWall | None = None) -> None:
         bench, shift_m, spot_m = _spots_of(bench, trained)
         here = cast(bench, bench.pinhole.scaled(MAP_COLUMNS, MAP_ROWS), occluder=False)
         there = cast(trained, trained.pinhole.scaled(MAP_COLUMNS, MAP_ROWS))
-        # Of the training rig: the cells that see the wall, and what its cells see with nothing hidden.
+        # Of the training rig: the cells that see the wall, and what its cells see with nothing
+        # hidden.
         self._cells = np.flatnonzero(there.on_wall)
-        counts = SensorModel().bare_wall_counts / cast(trained, trained.pinhole, occluder=False).direct.max()
+        counts = (
+            SensorModel().bare_wall_counts
+            / cast(trained, trained.pinhole, occluder=False).direct.max()
+        )
         self._depth_m = (there.length_m * there.cos_axis).astype(np.float32)
         self._light = np.nan_to_num(there.direct * counts).astype(np.float32)
-        self._wall_path_m, self._half_cos = 2 * there.length_m[self._cells], there.cos_axis[self._cells] / 2
+        self._wall_path_m = 2 * there.length_m[self._cells]
+        self._half_cos = there.cos_axis[self._cells] / 2
         # Of the bench: the wall's own return, as measured or as the geometry has it.
-        wall_m, light = (here.length_m * here.cos_axis).reshape(SHAPE), here.direct.reshape(SHAPE)
+        wall_m = (here.length_m * here.cos_axis).reshape(SHAPE)
+        light = here.direct.reshape(SHAPE)
         if bare:
             known = (bare.map_intensity > 0) & np.isfinite(bare.map_depth_m)
-            wall_m, light = np.where(known, bare.map_depth_m, wall_m), np.where(known, bare.map_intensity, light)
-        self._wall_m, self._path_per_depth = wall_m, (2 / here.cos_axis).reshape(SHAPE)
+            wall_m = np.where(known, bare.map_depth_m, wall_m)
+            light = np.where(known, bare.map_intensity, light)
+        self._wall_m = wall_m
+        self._path_per_depth = (2 / here.cos_axis).reshape(SHAPE)
         with np.errstate(divide="ignore"):
             self._log_light = np.log(light)
         sees_wall = _cells_on_wall(bench)
         self._neighbors, self._share, self._nearest = _taken_from(bench, spot_m, sees_wall)
         # The last leg ends at the lidar too, from wherever on the wall that the lidar sees.
         seen = sees_wall.ravel()
-        last_m, away_m = here.length_m[seen], here.laser_spot_m[seen] - shift_m - there.lidar_m
+        last_m = here.length_m[seen]
+        away_m = here.laser_spot_m[seen] - shift_m - there.lidar_m
         wanted_m = np.linalg.norm(away_m, axis=1)
-        first_m, its_m = np.linalg.norm(spot_m - here.lidar_m, axis=1), there.length_m[self._cells]
+        first_m = np.linalg.norm(spot_m - here.lidar_m, axis=1)
+        its_m = there.length_m[self._cells]
         self._longer_m = first_m - its_m + (wanted_m - last_m).mean()
-        # Light on the wall does not fall with the distance that a narrow beam has come; the wall's own return does.
-        self._log_brighter = 2 * np.log(its_m / first_m) + np.log((wanted_m**-2).mean() / (last_m**-2).mean())
+        # Light on the wall does not fall with the distance that a narrow beam has come; the wall's
+        # own return does.
+        self._log_brighter = 2 * np.log(its_m / first_m) + np.log(
+            (wanted_m**-2).mean() / (last_m**-2).mean()
+        )
 
     def align(self, maps: LidarMaps, beyond_wall_m: Float32 | None = None) -> LidarMaps:
         """Return maps of the bench as those of the training rig.
 
-        `beyond_wall_m` (64, 80) are the depths less those of the bare wall, where they are known better than from
-        `maps`: without drift.
+        `beyond_wall_m` (64, 80) are the depths less those of the bare wall, where they are known
+        better than from `maps`: without drift.
         """
         beyond_m = maps.depth_m - self._wall_m if beyond_wall_m is None else beyond_wall_m
         path_m = beyond_m * self._path_per_depth
@@ -102,22 +121,29 @@ class MapAlignment:
         gain = np.median(ratio[of_wall]) if of_wall.any() else 0.0
         path_m = self._wall_path_m + np.where(of_wall, path_m, path_m + self._longer_m)
         ratio = np.where(of_wall, ratio, ratio + self._log_brighter)
-        depth_m, light = self._depth_m.copy(), self._light.copy()
+        depth_m = self._depth_m.copy()
+        light = self._light.copy()
         depth_m[self._cells] = path_m * self._half_cos
         light[self._cells] *= np.exp(ratio - gain)
-        depth_m, light = depth_m.reshape(SHAPE), light.reshape(SHAPE)
+        depth_m = depth_m.reshape(SHAPE)
+        light = light.reshape(SHAPE)
         valid = np.isfinite(depth_m)
         return LidarMaps(depth_m, np.where(valid, light, np.float32(0)), valid)
 
 
-def alignment(bench: Rig, trained: CheckpointRecord, bare: BareWall | None = None) -> MapAlignment | None:
-    """Return the alignment of a bench with the rig of weights; None where `rig_to_align_with` has none."""
+def alignment(
+    bench: Rig, trained: CheckpointRecord, bare: BareWall | None = None
+) -> MapAlignment | None:
+    """Return the alignment of a bench with the rig of weights; None where `rig_to_align_with` has
+    none.
+    """
     rig = rig_to_align_with(bench, trained)
     return MapAlignment(bench, rig, bare) if rig else None
 
 
 def align_all(maps: "MapSet", benches: Iterable[Rig], trained: CheckpointRecord) -> "MapSet":
-    """Return samples, each of its own bench, as the rig of weights sees them; as they are where that is not possible.
+    """Return samples, each of its own bench, as the rig of weights sees them; as they are where
+    that is not possible.
 
     There may be more benches than samples.
     """
@@ -126,28 +152,35 @@ def align_all(maps: "MapSet", benches: Iterable[Rig], trained: CheckpointRecord)
 
 
 def align_samples(maps: "MapSet", benches: Iterable[Rig], wanted: Rig) -> tuple["MapSet", Mask]:
-    """Return samples, each of its own bench, as the rig `wanted` sees them, and a mask (n,) of those that it can see.
+    """Return samples, each of its own bench, as the rig `wanted` sees them, and a mask (n,) of
+    those that it can see.
 
     The others, of benches that cannot be aligned with it, stay as they are.
     """
-    depth_m, intensity, seen = maps.depth_m.copy(), maps.intensity.copy(), np.ones(len(maps.image), bool)
-    bench, aligned, possible = wanted, None, True
+    depth_m = maps.depth_m.copy()
+    intensity = maps.intensity.copy()
+    seen = np.ones(len(maps.image), bool)
+    bench = wanted
+    aligned = None
+    possible = True
     for n, its_bench in zip(range(len(seen)), benches, strict=False):
         if its_bench is not bench and its_bench != bench:  # samples of one bench follow each other
-            bench, possible = its_bench, its_bench == wanted or can_align(its_bench, wanted)
+            bench = its_bench
+            possible = its_bench == wanted or can_align(its_bench, wanted)
             aligned = MapAlignment(bench, wanted) if possible and bench != wanted else None
         seen[n] = possible
         if aligned:
             one = aligned.align(LidarMaps(depth_m[n], intensity[n], np.isfinite(depth_m[n])))
-            depth_m[n], intensity[n] = one.depth_m, one.intensity
+            depth_m[n] = one.depth_m
+            intensity[n] = one.intensity
     return replace(maps, depth_m=depth_m, intensity=intensity), seen
 
 
 def rig_to_align_with(bench: Rig, trained: CheckpointRecord) -> Rig | None:
     """Return the rig of weights where a bench's maps can be aligned with it and have to be.
 
-    None where both are the same, where the rig of the weights is not known here, where `can_align` says no, and for
-    difference maps.
+    None where both are the same, where the rig of the weights is not known here, where `can_align`
+    says no, and for difference maps.
     """
     if trained.input != "raw maps" or trained.rig_checksum == bench.checksum:
         return None
@@ -156,7 +189,9 @@ def rig_to_align_with(bench: Rig, trained: CheckpointRecord) -> Rig | None:
 
 
 def can_align(bench: Rig, trained: Rig) -> bool:
-    """Return whether two rigs have object boxes of one size, and the bench's occluder hides little more of the wall."""
+    """Return whether two rigs have object boxes of one size, and the bench's occluder hides little
+    more of the wall.
+    """
     if not (bench.object_box and trained.object_box):
         return False
     apart_m = np.subtract(_size_m(bench.object_box), _size_m(trained.object_box))
@@ -164,7 +199,9 @@ def can_align(bench: Rig, trained: Rig) -> bool:
 
 
 def training_rig(trained: CheckpointRecord) -> Rig | None:
-    """Return the rig that weights were trained for; None where it is the rig of a file on another machine."""
+    """Return the rig that weights were trained for; None where it is the rig of a file on another
+    machine.
+    """
     try:
         rig = load_rig(trained.rig_name)
     except RecordFileError:
@@ -173,36 +210,51 @@ def training_rig(trained: CheckpointRecord) -> Rig | None:
 
 
 def _is_in_view(bench: Rig, trained: Rig) -> bool:
-    """Return whether the bench sees the wall of the training rig to within HIDDEN_CELLS of its occluder's edge."""
+    """Return whether the bench sees the wall of the training rig to within HIDDEN_CELLS of its
+    occluder's edge.
+    """
     bench, _, spot_m = _spots_of(bench, trained)
     sees_wall = _cells_on_wall(bench)
     if not sees_wall.any():
         return False
     row, column = _cells_at(bench, spot_m)
-    some, last = np.flatnonzero(sees_wall.any(1)), MAP_COLUMNS - 1 - sees_wall[:, ::-1].argmax(1)
-    return bool((column - last[np.clip(np.rint(row).astype(int), some[0], some[-1])]).max() <= HIDDEN_CELLS)
+    some = np.flatnonzero(sees_wall.any(1))
+    last = MAP_COLUMNS - 1 - sees_wall[:, ::-1].argmax(1)
+    return bool(
+        (column - last[np.clip(np.rint(row).astype(int), some[0], some[-1])]).max() <= HIDDEN_CELLS
+    )
 
 
 def _spots_of(bench: Rig, trained: Rig) -> tuple[Rig, Float64, Float64]:
-    """Return the bench with an occluder, the move (3,) that lays the training rig's box on its own, and the training
-    rig's laser spots (n, 3) on the wall after that move.
+    """Return the bench with an occluder, the move (3,) that lays the training rig's box on its own,
+    and the training rig's laser spots (n, 3) on the wall after that move.
     """
-    box, wanted = object_box(bench), object_box(trained)
+    box = object_box(bench)
+    wanted = object_box(trained)
     shift_m = np.array([box.x_min_m - wanted.x_min_m, box.y_min_m - wanted.y_min_m, 0.0])
     there = cast(trained, trained.pinhole.scaled(MAP_COLUMNS, MAP_ROWS))
-    return _with_occluder(bench, trained.occluder, shift_m[0]), shift_m, there.laser_spot_m[there.on_wall] + shift_m
+    return (
+        _with_occluder(bench, trained.occluder, shift_m[0]),
+        shift_m,
+        there.laser_spot_m[there.on_wall] + shift_m,
+    )
 
 
 def _cells_at(bench: Rig, spot_m: Float64) -> tuple[Float64, Float64]:
-    """Return the rows and columns (n,) of the bench's maps at which points (n, 3) lie, in parts of a cell."""
-    pinhole, pose = bench.pinhole.scaled(MAP_COLUMNS, MAP_ROWS), bench.wall_from_lidar
+    """Return the rows and columns (n,) of the bench's maps at which points (n, 3) lie, in parts of
+    a cell.
+    """
+    pinhole = bench.pinhole.scaled(MAP_COLUMNS, MAP_ROWS)
+    pose = bench.wall_from_lidar
     x, y, z = ((spot_m - pose[:3, 3]) @ pose[:3, :3]).T
     z = np.maximum(z, 1e-9)  # points behind the lidar are far out of view
     return pinhole.ppy + pinhole.fy * y / z, pinhole.ppx + pinhole.fx * x / z
 
 
 def _size_m(box: ObjectBox) -> tuple[float, ...]:
-    """Return a box's width, height, and distances from the wall: all but its place along the wall."""
+    """Return a box's width, height, and distances from the wall: all but its place along the
+    wall.
+    """
     return box.x_max_m - box.x_min_m, box.y_max_m - box.y_min_m, box.z_near_m, box.z_far_m
 
 
@@ -210,7 +262,9 @@ def _with_occluder(bench: Rig, usual: Occluder | None, along_m: float) -> Rig:
     """Return the bench, with the training rig's occluder where its own was not measured."""
     if bench.occluder or not usual:
         return bench
-    return bench.model_copy(update={"occluder": usual.model_copy(update={"x_m": usual.x_m + along_m})})
+    return bench.model_copy(
+        update={"occluder": usual.model_copy(update={"x_m": usual.x_m + along_m})}
+    )
 
 
 def _cells_on_wall(rig: Rig) -> Mask:
@@ -222,8 +276,8 @@ def _cells_on_wall(rig: Rig) -> Mask:
 def _taken_from(
     bench: Rig, spot_m: Float64, sees_wall: Mask
 ) -> tuple[tuple[Int64, Int64], Float64, tuple[Int64, Int64]]:
-    """Return the cells (4, n) around points (n, 3) of the wall, in the bench's wall frame, their shares (4, n), and the
-    nearest cells (n,).
+    """Return the cells (4, n) around points (n, 3) of the wall, in the bench's wall frame, their
+    shares (4, n), and the nearest cells (n,).
 
     Past the last cells that see the wall the shares extrapolate.
     """
@@ -231,14 +285,23 @@ def _taken_from(
     some = np.flatnonzero(sees_wall.any(1))
     row = np.clip(row, some[0], some[-1])
     top = np.clip(np.floor(row).astype(int), some[0], max(some[-1] - 1, some[0]))
-    first, last = sees_wall.argmax(1), MAP_COLUMNS - 1 - sees_wall[:, ::-1].argmax(1)
+    first = sees_wall.argmax(1)
+    last = MAP_COLUMNS - 1 - sees_wall[:, ::-1].argmax(1)
     bottom = np.minimum(top + 1, some[-1])
-    low, high = np.maximum(first[top], first[bottom]), np.minimum(last[top], last[bottom])
+    low = np.maximum(first[top], first[bottom])
+    high = np.minimum(last[top], last[bottom])
     column = np.clip(column, low - BEYOND_CELLS, high + BEYOND_CELLS)
     left = np.clip(np.floor(column).astype(int), low, np.maximum(high - 1, low))
     right = np.minimum(left + 1, MAP_COLUMNS - 1)
-    down, across = row - top, column - left
-    share = np.stack([(1 - across) * (1 - down), across * (1 - down), (1 - across) * down, across * down])
+    down = row - top
+    across = column - left
+    share = np.stack(
+        [(1 - across) * (1 - down), across * (1 - down), (1 - across) * down, across * down]
+    )
     neighbors = np.stack([top, top, bottom, bottom]), np.stack([left, right, left, right])
     nearest = np.clip(np.rint(row).astype(int), some[0], some[-1])
-    return neighbors, share, (nearest, np.clip(np.rint(column).astype(int), first[nearest], last[nearest]))
+    return (
+        neighbors,
+        share,
+        (nearest, np.clip(np.rint(column).astype(int), first[nearest], last[nearest])),
+    )

@@ -12,7 +12,9 @@ from nlos_cam.camera import Camera
 from nlos_cam.frames import Frame, LidarMaps
 
 MAX_INTRINSICS_MISMATCH_PX = 0.25
-"""Largest distance between a beam's pixels in two calibrations: 0.14 mm of depth at 0.25 m and 45 degrees."""
+"""Largest distance between a beam's pixels in two calibrations: 0.14 mm of depth at 0.25 m and 45
+degrees.
+"""
 
 
 @dataclass(frozen=True)
@@ -32,14 +34,22 @@ class CalibratedRig:
     Stateful (drift): `observe` the frames in order, from one thread.
     """
 
-    def __init__(self, rig: walls.Rig, measured: walls.MeasuredWall | None = None, notes: tuple[str, ...] = ()) -> None:
-        self.rig, self.measured = rig, measured
+    def __init__(
+        self,
+        rig: walls.Rig,
+        measured: walls.MeasuredWall | None = None,
+        notes: tuple[str, ...] = (),
+    ) -> None:
+        self.rig = rig
+        self.measured = measured
         self.notes = notes
         """Warnings that hold for every frame."""
         self.reference: walls.BareWall | None = measured.reference if measured else None
         self._drift: walls.DriftCheck | None = None
         if measured and measured.reference:
-            self._drift = walls.DriftCheck(measured.reference, walls.wall_from_zero(measured.record))
+            self._drift = walls.DriftCheck(
+                measured.reference, walls.wall_from_zero(measured.record)
+            )
 
     def update_temperatures(self, celsius: Mapping[str, float]) -> None:
         """Pass one reading of the device's temperatures to the drift check."""
@@ -47,7 +57,9 @@ class CalibratedRig:
             self._drift.update_temperatures(celsius)
 
     def observe(self, frame: Frame, maps: LidarMaps) -> BenchObservation:
-        """Return the difference of the maps, which may be a mean over frames, and the drift up to this frame."""
+        """Return the difference of the maps, which may be a mean over frames, and the drift up to
+        this frame.
+        """
         if self.reference is None or self._drift is None:
             return BenchObservation(None, self.notes)
         self._drift.observe(frame.depth_m, frame.settings)
@@ -55,7 +67,8 @@ class CalibratedRig:
         return BenchObservation(difference, self.notes + self._drift.warnings, self._drift.moved)
 
     def _subtract_drift(self, difference: LidarMaps) -> LidarMaps:
-        """Return the difference less the range drift of the last second, if all depths have drifted alike.
+        """Return the difference less the range drift of the last second, if all depths have drifted
+        alike.
 
         That removes most of the effect of a change of temperature (docs/calibration-measured.md).
         """
@@ -65,7 +78,9 @@ class CalibratedRig:
         return replace(difference, depth_m=difference.depth_m - np.float32(drift.range_m))
 
     def correct_range(self, maps: LidarMaps) -> LidarMaps:
-        """Return the maps with the measured range offset of the lidar (`range_offset`) added, if there is one."""
+        """Return the maps with the measured range offset of the lidar (`range_offset`) added, if
+        there is one.
+        """
         offset_m = self.measured.record.range_offset_m if self.measured else 0.0
         return replace(maps, depth_m=maps.depth_m + np.float32(offset_m)) if offset_m else maps
 
@@ -74,44 +89,54 @@ def subtract_reference(maps: LidarMaps, reference: walls.BareWall) -> LidarMaps:
     """Return the maps less those of the bare wall; intensity 0 where either has no depth."""
     depth_m = maps.depth_m - reference.map_depth_m
     valid = ~np.isnan(depth_m)
-    return LidarMaps(depth_m, np.where(valid, maps.intensity - reference.map_intensity, np.float32(0.0)), valid)
+    return LidarMaps(
+        depth_m, np.where(valid, maps.intensity - reference.map_intensity, np.float32(0.0)), valid
+    )
 
 
 def open_bench(wall: Path | None, camera: Camera) -> CalibratedRig:
-    """Return the bench of a wall record; without one, the camera's own if it has an object box, else the paper's.
+    """Return the bench of a wall record; without one, the camera's own if it has an object box,
+    else the paper's.
 
     Raises RecordFileError, and CalibrationError if the wall was measured with other intrinsics.
     """
     if wall is None:
-        return CalibratedRig(camera.rig if camera.rig and camera.rig.object_box else walls.load_rig("paper-rig"))
+        return CalibratedRig(
+            camera.rig if camera.rig and camera.rig.object_box else walls.load_rig("paper-rig")
+        )
     measured = walls.load_measured(wall)
-    for intrinsics in [measured.record.rig.pinhole, *([measured.reference.intrinsics] if measured.reference else [])]:
+    for intrinsics in [
+        measured.record.rig.pinhole,
+        *([measured.reference.intrinsics] if measured.reference else []),
+    ]:
         check_intrinsics(intrinsics, camera.intrinsics)
     return CalibratedRig(measured.record.rig, measured, _notes(measured.record, camera))
 
 
 def check_intrinsics(measured: walls.Intrinsics, given: walls.Intrinsics) -> None:
-    """Raise CalibrationError if a camera's intrinsics `given` are not those that the wall was measured with."""
+    """Raise CalibrationError if a camera's intrinsics `given` are not those that the wall was
+    measured with.
+    """
     if (measured.width, measured.height) != (given.width, given.height):
         raise CalibrationError(
-            f"the wall was measured at {measured.width}x{measured.height}, the camera delivers "
-            f"{given.width}x{given.height}: use the same USB port and cable (USB 2 halves the size), or calibrate the "
-            "wall again"
+            f"the wall was measured at {measured.width}x{measured.height}, the camera delivers"
+            f" {given.width}x{given.height}: use the same USB port and cable (USB 2 halves the"
+            " size), or calibrate the wall again"
         )
     mismatch = _mismatch_pixels(measured, given)
     if not mismatch <= MAX_INTRINSICS_MISMATCH_PX:  # NaN compares false
         raise CalibrationError(
-            f"the wall was measured with other intrinsics (fx {measured.fx:.2f}, ppx {measured.ppx:.2f}) than the "
-            f"camera's (fx {given.fx:.2f}, ppx {given.ppx:.2f}), {mismatch:.1f} pixels apart: calibrate the wall with "
-            "this camera"
+            f"the wall was measured with other intrinsics (fx {measured.fx:.2f}, ppx"
+            f" {measured.ppx:.2f}) than the camera's (fx {given.fx:.2f}, ppx {given.ppx:.2f}),"
+            f" {mismatch:.1f} pixels apart: calibrate the wall with this camera"
         )
 
 
 def _mismatch_pixels(one: walls.Intrinsics, other: walls.Intrinsics) -> float:
     """Return the largest distance, along x or y, between a beam's pixels in the two.
 
-    Pixel x of `one` is the beam (x - ppx) / fx, hence pixel ppx' + (x - ppx) fx' / fx of the other: linear in x, so the
-    largest distance is at an edge of the view.
+    Pixel x of `one` is the beam (x - ppx) / fx, hence pixel ppx' + (x - ppx) fx' / fx of the other:
+    linear in x, so the largest distance is at an edge of the view.
     """
     along_x = [other.ppx + (x - one.ppx) * other.fx / one.fx - x for x in (-0.5, one.width - 0.5)]
     along_y = [other.ppy + (y - one.ppy) * other.fy / one.fy - y for y in (-0.5, one.height - 0.5)]
@@ -122,4 +147,9 @@ def _notes(record: walls.WallRecord, camera: Camera) -> tuple[str, ...]:
     serial = camera.identity.get("serial", "")
     if not serial or not record.serial or serial == record.serial:
         return ()
-    return (f"the wall was measured with camera {record.serial}, this is {serial}: calibrate the wall with this one",)
+    return (
+        (
+            f"the wall was measured with camera {record.serial}, this is {serial}: calibrate the"
+            " wall with this one"
+        ),
+    )

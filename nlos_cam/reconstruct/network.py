@@ -19,14 +19,16 @@ Network = Callable[[Float32, Float32], Float32]
 
 
 class Mirrored:
-    """Reconstructor that joins its network's answer with the one to the mirrored maps, for twice the time.
+    """Reconstructor that joins its network's answer with the one to the mirrored maps, for twice
+    the time.
 
-    The paper's rig is symmetric about y = 0, the paper's networks are not. A pixel is surface if either answer has one
-    there; its v is the mean of those that have.
+    The paper's rig is symmetric about y = 0, the paper's networks are not. A pixel is surface if
+    either answer has one there; its v is the mean of those that have.
     """
 
     def __init__(self, network: Reconstructor) -> None:
-        self.record, self.runtime = network.record, f"{network.runtime}, with the mirrored maps"
+        self.record = network.record
+        self.runtime = f"{network.runtime}, with the mirrored maps"
         self._network = network
 
     def __call__(self, depth_m: Float32, intensity: Float32) -> Float32:
@@ -59,7 +61,9 @@ class Doubt:
     outside: float
     """Probability that the hidden object is out of distribution: unlike the training set."""
     error_m: Float32
-    """(64, 64): expected absolute error of the hidden depth if there is a surface; finite everywhere."""
+    """(64, 64): expected absolute error of the hidden depth if there is a surface; finite
+    everywhere.
+    """
     surface: Float32
     """(64, 64): probability that there is a surface."""
     quality: Quality | None = None
@@ -73,10 +77,12 @@ class Reconstruction:
     depth_m: Float32
     """(64, 64) over the object box: distance from the wall, NaN where there is no surface."""
     wall_from_object: NDArray[np.float64]
-    """(4, 4); the object frame has the wall's axes and its origin on the wall, before the middle of the box."""
+    """(4, 4); the object frame has the wall's axes and its origin on the wall, before the middle of
+    the box.
+    """
     uncertainty_m: Float32 | None
-    """(64, 64), finite everywhere: expected absolute error of `depth_m` if there is a surface; None without an
-    uncertainty model."""
+    """(64, 64), finite everywhere: expected absolute error of `depth_m` if there is a surface; None
+    without an uncertainty model."""
     timings_s: Mapping[str, float]
     """Seconds by stage."""
     doubt: Doubt | None = None
@@ -107,7 +113,9 @@ def reconstruct(
     clock: Clock = time.perf_counter,
     uncertainty_model: UncertaintyModel | None = None,
 ) -> Reconstruction:
-    """Return the hidden depth behind one frame's maps. Raises SceneError for a rig without an object box."""
+    """Return the hidden depth behind one frame's maps. Raises SceneError for a rig without an
+    object box.
+    """
     return reconstruct_all([maps], rig, network, clock, uncertainty_model)[0]
 
 
@@ -118,7 +126,8 @@ def reconstruct_all(
     clock: Clock = time.perf_counter,
     uncertainty_model: UncertaintyModel | None = None,
 ) -> list[Reconstruction]:
-    """Return the hidden depth behind each of several frames' maps, with an equal share of the networks' time each.
+    """Return the hidden depth behind each of several frames' maps, with an equal share of the
+    networks' time each.
 
     Raises SceneError for a rig without an object box.
     """
@@ -131,7 +140,9 @@ def reconstruct_all(
         result = Reconstruction(depth_from_image(image, box), box_pose(box), None, timings_s)
         if uncertainty_model is not None:
             start_s = clock()
-            doubt = estimate_doubt(uncertainty_model, maps, image, box, None if surfaces is None else surfaces[number])
+            doubt = estimate_doubt(
+                uncertainty_model, maps, image, box, None if surfaces is None else surfaces[number]
+            )
             timings = {**timings_s, "doubt": clock() - start_s}
             result = replace(result, uncertainty_m=doubt.error_m, timings_s=timings, doubt=doubt)
         results.append(result)
@@ -141,32 +152,51 @@ def reconstruct_all(
 def _run_network(batch: Sequence[LidarMaps], network: Network) -> Answer:
     """Return the images (n, 64, 64) in v of a batch; zero (no surface) for maps without any return.
 
-    The networks take a cell without a return for an average one, and would show an average object for such maps.
+    The networks take a cell without a return for an average one, and would show an average object
+    for such maps.
     """
-    images, surfaces = (np.zeros((len(batch), OBJECT_PIXELS, OBJECT_PIXELS), np.float32) for _ in range(2))
+    images, surfaces = (
+        np.zeros((len(batch), OBJECT_PIXELS, OBJECT_PIXELS), np.float32) for _ in range(2)
+    )
     found = None
     if valid := [index for index, maps in enumerate(batch) if maps.valid.any()]:
         depth_m = np.stack([batch[index].depth_m for index in valid])
-        images[valid], found = ask(network, depth_m, np.stack([batch[index].intensity for index in valid]))
+        images[valid], found = ask(
+            network, depth_m, np.stack([batch[index].intensity for index in valid])
+        )
         if found is not None:
             surfaces[valid] = found
     return Answer(images, None if found is None else surfaces)
 
 
 def estimate_doubt(
-    uncertainty_model: UncertaintyModel, maps: LidarMaps, image: Float32, box: ObjectBox, surface: Float32 | None = None
+    uncertainty_model: UncertaintyModel,
+    maps: LidarMaps,
+    image: Float32,
+    box: ObjectBox,
+    surface: Float32 | None = None,
 ) -> Doubt:
     """Return the uncertainty of an image (64, 64) in v that networks made from maps.
 
     `surface` (64, 64) is their own probability of a surface, if they have one.
     """
     said = uncertainty_model(*(array[None] for array in (maps.depth_m, maps.intensity, image)))
-    # v falls linearly from 1 at z_near to MIN_V at z_far, so an error of 1 in v is this many metres (depth_from_image)
+    # v falls linearly from 1 at z_near to MIN_V at z_far, so an error of 1 in v is this many metres
+    # (depth_from_image)
     metres_per_v = (box.z_far_m - box.z_near_m) / (1 - MIN_V)
-    error_m, quality = said.error_v[0] * metres_per_v, None
+    error_m = said.error_v[0] * metres_per_v
+    quality = None
     if uncertainty_model.quality and image.any():
-        found = uncertainty_model.quality(image[None], said, None if surface is None else surface[None])
+        found = uncertainty_model.quality(
+            image[None], said, None if surface is None else surface[None]
+        )
         low, middle, high = found.iou[0].tolist()
         error = float(found.error_v[0]) * metres_per_v
         quality = Quality((low, middle, high), float(found.good[0]), error, bool(found.trusted[0]))
-    return Doubt(float(said.p_empty[0]), float(said.p_out_of_distribution[0]), error_m, said.p_surface[0], quality)
+    return Doubt(
+        float(said.p_empty[0]),
+        float(said.p_out_of_distribution[0]),
+        error_m,
+        said.p_surface[0],
+        quality,
+    )

@@ -1,17 +1,19 @@
 """Physics check: a reconstruction rendered again and compared with the lidar's maps.
 
-Each cell returns one of two echoes, the stronger one (S5): that of the bare wall, or that of three bounces. If both are
-about as strong, a small error of the object swaps them and changes the depth by decimetres. So the measurement is
-compared with both, and the one that explains it better counts. With r = measured less expected and s a tolerance that
-covers the noise:
+Each cell returns one of two echoes, the stronger one (S5): that of the bare wall, or that of three
+bounces. If both are about as strong, a small error of the object swaps them and changes the depth
+by decimetres. So the measurement is compared with both, and the one that explains it better counts.
+With r = measured less expected and s a tolerance that covers the noise:
 
-    h = (depth r / s)^2 + (log intensity r / s)^2 + (log of how much the other echo is stronger / s)^2
-    cost = h / (1 + h)                          0 explained, 1 not at all; averaged over the cells
-    score = (cost - NOISE_COST) / (cost of the bare bench - NOISE_COST), the numerator at least 0, the denominator at
+    h = (depth r / s)^2 + (log intensity r / s)^2 + (log of how much the other echo is stronger /
+    s)^2 cost = h / (1 + h)                          0 explained, 1 not at all; averaged over the
+    cells score = (cost - NOISE_COST) / (cost of the bare bench - NOISE_COST), the numerator at
+    least 0, the denominator at
             least MIN_UNEXPLAINED
 
-Two unknowns are fitted: the device's gain, from the cells that show the bare wall, and the object's albedo, to within a
-factor of MAX_ALBEDO, as the one of least cost. A wider range of albedos would explain any missing object as a dark one.
+Two unknowns are fitted: the device's gain, from the cells that show the bare wall, and the object's
+albedo, to within a factor of MAX_ALBEDO, as the one of least cost. A wider range of albedos would
+explain any missing object as a dark one.
 """
 
 import logging
@@ -30,8 +32,8 @@ from nlos_cam.reconstruct.network import Clock
 from nlos_cam.render import Rendering, Scene, SensorModel, Stop, cast, render
 
 UNEXPLAINED = 0.84
-"""Score from which on the reconstruction does not explain the maps: 1 % of the 300 new objects that it was chosen on
-reach it (docs/physics-check.md)."""
+"""Score from which on the reconstruction does not explain the maps: 1 % of the 300 new objects that
+it was chosen on reach it (docs/physics-check.md)."""
 
 log = logging.getLogger(__name__)
 
@@ -43,7 +45,9 @@ def log_warning(text: str) -> None:
 
 def describe_failure(frame_number: int, reason: str) -> str:
     """Return one line on a failed check."""
-    return f"the physics check of frame {frame_number} failed ({reason}): the run continues without it"
+    return (
+        f"the physics check of frame {frame_number} failed ({reason}): the run continues without it"
+    )
 
 
 @dataclass(frozen=True)
@@ -56,7 +60,9 @@ class PhysicsCheckResult:
     residual_intensity: Float32
     """(64, 80): measured less rendered, in IR counts."""
     score: float
-    """0 if the maps are explained to within noise, 1 if no better than by an empty bench, more if worse."""
+    """0 if the maps are explained to within noise, 1 if no better than by an empty bench, more if
+    worse.
+    """
     seconds: float
     """Duration of the check."""
     albedo: float = 1.0
@@ -64,7 +70,9 @@ class PhysicsCheckResult:
 
 
 class PhysicsCheck(Protocol):
-    """Check of some of the frames offered to it, in the loop's thread or beside it, while entered."""
+    """Check of some of the frames offered to it, in the loop's thread or beside it, while
+    entered.
+    """
 
     newest: PhysicsCheckResult | None
     """None until there is one."""
@@ -98,12 +106,17 @@ WALL_TOLERANCE_M = 0.003
 ECHO_TOLERANCE_M = 0.01
 """Tolerance of a three-bounce echo's depth: two bins, and the smallest error of reconstructions."""
 LOG_TOLERANCE = 0.6
-"""Tolerance of an intensity's logarithm, a factor of 1.8: errors of a reconstruction's distance and slope."""
-MAX_ALBEDO, ALBEDOS = 4 / 3, 5
+"""Tolerance of an intensity's logarithm, a factor of 1.8: errors of a reconstruction's distance and
+slope.
+"""
+MAX_ALBEDO = 4 / 3
+ALBEDOS = 5
 NOISE_COST = 0.006
 """Cost of an explained bare bench: the sensor's noise, and cells of many pixels."""
 MIN_UNEXPLAINED = 0.02
-"""Smallest denominator of the score, for benches without an object; objects cost a bare bench 0.14 or more."""
+"""Smallest denominator of the score, for benches without an object; objects cost a bare bench 0.14
+or more.
+"""
 MIN_BARE_CELLS = 50
 """Cells showing the bare wall that are needed to fit the gain to them alone."""
 NOISE = SensorModel()
@@ -111,7 +124,9 @@ NOISE = SensorModel()
 
 @dataclass(frozen=True)
 class Expected:
-    """Two expected echoes of each cell (64, 80): depths along the optical axis, intensities in units of I0."""
+    """Two expected echoes of each cell (64, 80): depths along the optical axis, intensities in
+    units of I0.
+    """
 
     direct_m: Float64
     """NaN where there is no return."""
@@ -123,14 +138,20 @@ class Expected:
     @property
     def bare(self) -> "Expected":
         """The same without three-bounce echoes."""
-        return Expected(self.direct_m, self.direct, np.full_like(self.echo_m, np.nan), np.zeros_like(self.echo))
+        return Expected(
+            self.direct_m, self.direct, np.full_like(self.echo_m, np.nan), np.zeros_like(self.echo)
+        )
 
     def noiseless_maps(self, albedo: float, gain: float) -> tuple[Float32, Float32]:
-        """Return depth (NaN where there is no return) and intensity in counts, as measured without noise."""
+        """Return depth (NaN where there is no return) and intensity in counts, as measured without
+        noise.
+        """
         wins = albedo * self.echo > self.direct
         intensity = np.where(wins, albedo * self.echo, self.direct)
         depth_m = np.where(intensity > 0, np.where(wins, self.echo_m, self.direct_m), np.nan)
-        return depth_m.astype(np.float32), np.minimum(gain * intensity, SATURATED).astype(np.float32)
+        return depth_m.astype(np.float32), np.minimum(gain * intensity, SATURATED).astype(
+            np.float32
+        )
 
 
 @dataclass(frozen=True)
@@ -146,7 +167,11 @@ class Explanation:
 def explain(maps: LidarMaps, expected: Expected, bare: Expected) -> Explanation:
     """Return the best explanation of maps by an object, scored against that of the bare bench."""
     gain = fit_gain(maps, bare)
-    albedos = np.geomspace(1 / MAX_ALBEDO, MAX_ALBEDO, ALBEDOS) if (expected.echo > 0).any() else np.ones(1)
+    albedos = (
+        np.geomspace(1 / MAX_ALBEDO, MAX_ALBEDO, ALBEDOS)
+        if (expected.echo > 0).any()
+        else np.ones(1)
+    )
     costs = [mean_cost(maps, expected, gain, albedo) for albedo in albedos]
     best = int(np.argmin(costs))
     unexplained = max(mean_cost(maps, bare, gain, 1.0) - NOISE_COST, MIN_UNEXPLAINED)
@@ -154,7 +179,9 @@ def explain(maps: LidarMaps, expected: Expected, bare: Expected) -> Explanation:
 
 
 def fit_gain(maps: LidarMaps, bare: Expected) -> float:
-    """Return the counts for an intensity of I0: the median of the cells that show the bare wall, of all if too few."""
+    """Return the counts for an intensity of I0: the median of the cells that show the bare wall, of
+    all if too few.
+    """
     lit = maps.valid & (maps.intensity > 0) & (bare.direct > 0)
     shows_wall = lit & (np.abs(maps.depth_m - bare.direct_m) < 3 * WALL_TOLERANCE_M)
     cells = shows_wall if shows_wall.sum() >= MIN_BARE_CELLS else lit
@@ -167,9 +194,13 @@ def mean_cost(maps: LidarMaps, expected: Expected, gain: float, albedo: float) -
     measured_m = np.where(maps.valid, maps.depth_m, np.nan).astype(np.float64)
     light = _log(maps.intensity.astype(np.float64) / gain)  # in units of I0
     counts_of_i0 = NOISE.bare_wall_counts / max(float(expected.direct.max()), 1e-12)
-    lead, full_scale = _log(echo) - _log(expected.direct), np.log(SATURATED / gain)
-    off_wall, off_echo = measured_m - expected.direct_m, measured_m - expected.echo_m
-    wall = _misfit(off_wall / WALL_TOLERANCE_M, light, expected.direct, counts_of_i0, lead, full_scale)
+    lead = _log(echo) - _log(expected.direct)
+    full_scale = np.log(SATURATED / gain)
+    off_wall = measured_m - expected.direct_m
+    off_echo = measured_m - expected.echo_m
+    wall = _misfit(
+        off_wall / WALL_TOLERANCE_M, light, expected.direct, counts_of_i0, lead, full_scale
+    )
     bounced = _misfit(off_echo / ECHO_TOLERANCE_M, light, echo, counts_of_i0, -lead, full_scale)
     h = np.minimum(wall, bounced)
     # h / (1 + h) tends to 1 for h -> infinity, but inf / inf is NaN
@@ -179,19 +210,29 @@ def mean_cost(maps: LidarMaps, expected: Expected, gain: float, albedo: float) -
 
 
 def _misfit(
-    off: Float64, light: Float64, expected: Float64, counts_of_i0: float, lead: Float64, full_scale: float
+    off: Float64,
+    light: Float64,
+    expected: Float64,
+    counts_of_i0: float,
+    lead: Float64,
+    full_scale: float,
 ) -> Float64:
     """Return `h` of one of the two echoes; infinite where there is none, or nothing was measured.
 
-    `off` is the depth term's r / s, `light` the log of the measured intensity, `lead` the log of how much the other
-    echo is stronger.
+    `off` is the depth term's r / s, `light` the log of the measured intensity, `lead` the log of
+    how much the other echo is stronger.
     """
     counts = counts_of_i0 * expected
     with np.errstate(divide="ignore", invalid="ignore"):
-        # d(log n) = dn / n, so noise of variance read^2 + shot^2 n has variance (read^2 + shot^2 n) / n^2 in log n
-        variance = LOG_TOLERANCE**2 + (NOISE.read_noise_counts**2 + NOISE.shot_noise**2 * counts) / counts**2
+        # d(log n) = dn / n, so noise of variance read^2 + shot^2 n has variance (read^2 + shot^2 n)
+        # / n^2 in log n
+        variance = (
+            LOG_TOLERANCE**2
+            + (NOISE.read_noise_counts**2 + NOISE.shot_noise**2 * counts) / counts**2
+        )
         log_ratio = light - _log(expected)
-        # a saturated cell measures a lower limit of its light: only too little expected light is a misfit
+        # a saturated cell measures a lower limit of its light: only too little expected light is a
+        # misfit
         log_ratio = np.where(light >= full_scale, np.maximum(log_ratio, 0), log_ratio)
         h = off**2 + log_ratio**2 / variance + (np.maximum(lead, 0) / LOG_TOLERANCE) ** 2
     return np.where((expected > 0) & np.isfinite(h), h, np.inf)
@@ -217,12 +258,14 @@ def check_reconstruction(
 ) -> PhysicsCheckResult:
     """Render a hidden depth (64, 64) and compare the echoes with the lidar's maps.
 
-    Without a surface or an object box the bare bench is compared. The maps' depths include the range offset
-    (`CalibratedRig.correct_range`).
+    Without a surface or an object box the bare bench is compared. The maps' depths include the
+    range offset (`CalibratedRig.correct_range`).
     """
     start_s = clock()
     bare = _bare(rig)  # pyright: ignore[reportArgumentType]  frozen, so hashable
-    has_object = depth_m is not None and rig.object_box is not None and bool(np.isfinite(depth_m).any())
+    has_object = (
+        depth_m is not None and rig.object_box is not None and bool(np.isfinite(depth_m).any())
+    )
     expected = _expected(render(Scene(rig, depth_m), accuracy), rig, bare) if has_object else bare
     best = explain(maps, expected, bare)
     rendered_m, rendered = expected.noiseless_maps(best.albedo, best.gain)
@@ -237,18 +280,30 @@ def _bare(rig: Rig) -> Expected:
 
 
 def _expected(rendering: Rendering, rig: Rig, bare: Expected | None) -> Expected:
-    """Return both echoes of each cell; where three bounces won, the direct echo is the bare bench's."""
-    cos_axis = cast(rig, rig.pinhole.scaled(MAP_COLUMNS, MAP_ROWS)).cos_axis.reshape(MAP_ROWS, MAP_COLUMNS)
-    echo, echo_m = rendering.multi.peak.astype(np.float64), rendering.multi.path_m / 2 * cos_axis
-    direct, direct_m = rendering.intensity.astype(np.float64), rendering.depth_m.astype(np.float64)
+    """Return both echoes of each cell; where three bounces won, the direct echo is the bare
+    bench's.
+    """
+    cos_axis = cast(rig, rig.pinhole.scaled(MAP_COLUMNS, MAP_ROWS)).cos_axis.reshape(
+        MAP_ROWS, MAP_COLUMNS
+    )
+    echo = rendering.multi.peak.astype(np.float64)
+    echo_m = rendering.multi.path_m / 2 * cos_axis
+    direct = rendering.intensity.astype(np.float64)
+    direct_m = rendering.depth_m.astype(np.float64)
     if bare is None:
         return Expected(direct_m, direct, echo_m, echo)
     bounced = (rendering.intensity <= rendering.multi.peak) & (echo > 0)
-    return Expected(np.where(bounced, bare.direct_m, direct_m), np.where(bounced, bare.direct, direct), echo_m, echo)
+    return Expected(
+        np.where(bounced, bare.direct_m, direct_m),
+        np.where(bounced, bare.direct, direct),
+        echo_m,
+        echo,
+    )
 
 
 class PeriodicPhysicsCheck(NullPhysicsCheck):
-    """Physics check of the first of every `every` frames, in the caller's thread: reproducible to the bit.
+    """Physics check of the first of every `every` frames, in the caller's thread: reproducible to
+    the bit.
 
     Calls `on_error` for the first check that fails.
     """
@@ -262,9 +317,12 @@ class PeriodicPhysicsCheck(NullPhysicsCheck):
         on_error: Callable[[str], None] = log_warning,
     ) -> None:
         self.newest: PhysicsCheckResult | None = None
-        self._rig, self._every, self._offered = rig, every, 0
+        self._rig = rig
+        self._every = every
+        self._offered = 0
         self._accuracy: Stop = accuracy
-        self._on_error, self._failed = on_error, False
+        self._on_error = on_error
+        self._failed = False
 
     def offer(self, frame_number: int, maps: LidarMaps, depth_m: Float32) -> None:
         """Check this frame if it is the first of its group."""

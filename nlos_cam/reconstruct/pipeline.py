@@ -9,15 +9,32 @@ from pathlib import Path
 
 from nlos_calibration import Rig, rig_difference
 from nlos_calibration.errors import CalibrationError
-from nlos_models import CheckpointRecord, Reconstructor, UncertaintyModel, load_reconstructor, load_uncertainty_model
+from nlos_models import (
+    CheckpointRecord,
+    Reconstructor,
+    UncertaintyModel,
+    load_reconstructor,
+    load_uncertainty_model,
+)
 
 from nlos_cam.files import cache_folder
 from nlos_cam.frames import Frame, LidarMaps, MapMean, maps_from_frame
 from nlos_cam.reconstruct.alignment import alignment, rig_to_align_with, training_rig
 from nlos_cam.reconstruct.bench import BenchObservation, CalibratedRig
 from nlos_cam.reconstruct.network import Clock, Network, Reconstruction, reconstruct_all
-from nlos_cam.reconstruct.physics_check import UNEXPLAINED, NullPhysicsCheck, PhysicsCheck, PhysicsCheckResult
-from nlos_cam.reconstruct.verdict import FrameConditions, Verdict, VerdictFilter, VerdictLimits, frame_issues
+from nlos_cam.reconstruct.physics_check import (
+    UNEXPLAINED,
+    NullPhysicsCheck,
+    PhysicsCheck,
+    PhysicsCheckResult,
+)
+from nlos_cam.reconstruct.verdict import (
+    FrameConditions,
+    Verdict,
+    VerdictFilter,
+    VerdictLimits,
+    frame_issues,
+)
 
 
 @dataclass(frozen=True)
@@ -63,13 +80,15 @@ class PreparedFrame:
 
 
 class Pipeline:
-    """Per-frame reconstruction: frame -> maps -> difference maps -> networks -> uncertainty -> verdict.
+    """Per-frame reconstruction: frame -> maps -> difference maps -> networks -> uncertainty ->
+    verdict.
 
-    Maps are the mean of the last `average` frames; those of a bench other than the rig that networks were `trained` for
-    are aligned with it. An uncertainty model adds expected errors and a verdict, and removes the surface where nothing
-    is hidden. Stateful (running mean, drift, smoothed verdict): give `prepare` and `finish`
-    the frames in order, from one thread; `reconstruct` keeps no state. The caller enters `checks`. Raises
-    CalibrationError if the networks need difference maps and the bench has no reference.
+    Maps are the mean of the last `average` frames; those of a bench other than the rig that
+    networks were `trained` for are aligned with it. An uncertainty model adds expected errors and a
+    verdict, and removes the surface where nothing is hidden. Stateful (running mean, drift,
+    smoothed verdict): give `prepare` and `finish` the frames in order, from one thread;
+    `reconstruct` keeps no state. The caller enters `checks`. Raises CalibrationError if the
+    networks need difference maps and the bench has no reference.
     """
 
     def __init__(
@@ -85,21 +104,33 @@ class Pipeline:
     ) -> None:
         if uses_difference and bench.reference is None:
             raise CalibrationError(
-                "these weights expect difference maps: give --wall with a reference (calibrate the wall again)"
+                "these weights expect difference maps: give --wall with a reference (calibrate the"
+                " wall again)"
             )
-        self.network, self.uncertainty_model, self._trained = network, uncertainty_model, trained
+        self.network = network
+        self.uncertainty_model = uncertainty_model
+        self._trained = trained
         self.checks = checks or NullPhysicsCheck()
-        self._verdicts = VerdictFilter(verdict_limits(uncertainty_model) if uncertainty_model else None)
-        self._uses_difference, self.average, self.bench = uses_difference, average, bench
+        self._verdicts = VerdictFilter(
+            verdict_limits(uncertainty_model) if uncertainty_model else None
+        )
+        self._uses_difference = uses_difference
+        self.average = average
+        self.bench = bench
 
     @property
     def bench(self) -> CalibratedRig:
-        """Bench of the frames; setting it aligns their maps with the training rig again. Any thread may set it."""
+        """Bench of the frames; setting it aligns their maps with the training rig again. Any thread
+        may set it.
+        """
         return self._bench[0]
 
     @bench.setter
     def bench(self, bench: CalibratedRig) -> None:
-        self._bench = bench, alignment(bench.rig, self._trained, bench.reference) if self._trained else None
+        self._bench = (
+            bench,
+            alignment(bench.rig, self._trained, bench.reference) if self._trained else None,
+        )
 
     @property
     def average(self) -> int:
@@ -108,7 +139,8 @@ class Pipeline:
 
     @average.setter
     def average(self, frames: int) -> None:
-        self._average, self._mean = frames, MapMean(frames)
+        self._average = frames
+        self._mean = MapMean(frames)
 
     def process(self, arrival: Arrival, clock: Clock, start_s: float) -> FrameResult:
         """Return the result of one frame; `start_s` is when the loop began to wait for it."""
@@ -118,12 +150,14 @@ class Pipeline:
 
     def prepare(self, arrival: Arrival, clock: Clock, start_s: float) -> PreparedFrame:
         """Return the maps of a frame as the networks need them; call in frame order."""
-        taken_s, (bench, aligned) = clock(), self._bench  # another thread may replace it
+        taken_s = clock()
+        bench, aligned = self._bench  # another thread may replace it
         maps = maps_from_frame(arrival.frame)
         mapped_s = clock()
         maps = self._mean.add(maps)
         observation = bench.observe(arrival.frame, maps)
-        difference, corrected = observation.difference, bench.correct_range(maps)
+        difference = observation.difference
+        corrected = bench.correct_range(maps)
         network_input = difference if self._uses_difference and difference else corrected
         if aligned:
             network_input = aligned.align(corrected, difference.depth_m if difference else None)
@@ -133,13 +167,20 @@ class Pipeline:
         return PreparedFrame(arrival, maps, observation, corrected, network_input, stages_s)
 
     def reconstruct(self, frames: Sequence[PreparedFrame], clock: Clock) -> list[Reconstruction]:
-        """Return the reconstruction of each frame; reads and changes no state, so any thread may call it."""
+        """Return the reconstruction of each frame; reads and changes no state, so any thread may
+        call it.
+        """
         maps = [frame.network_input for frame in frames]
         return reconstruct_all(maps, self.bench.rig, self.network, clock, self.uncertainty_model)
 
-    def finish(self, prepared: PreparedFrame, reconstruction: Reconstruction, clock: Clock) -> FrameResult:
-        """Return the result of a frame with its verdict, and offer it to the physics check; call in frame order."""
-        frame, observation = prepared.arrival.frame, prepared.observation
+    def finish(
+        self, prepared: PreparedFrame, reconstruction: Reconstruction, clock: Clock
+    ) -> FrameResult:
+        """Return the result of a frame with its verdict, and offer it to the physics check; call in
+        frame order.
+        """
+        frame = prepared.arrival.frame
+        observation = prepared.observation
         conditions = frame_conditions(frame, observation, self.checks.newest)
         shown, verdict = self._verdicts.decide(reconstruction, conditions)
         self.checks.offer(frame.frame_number, prepared.corrected, shown.depth_m)
@@ -163,20 +204,28 @@ def verdict_limits(uncertainty_model: UncertaintyModel) -> VerdictLimits:
     return VerdictLimits(record.nothing_above, record.outside_above, UNEXPLAINED)
 
 
-def frame_conditions(frame: Frame, observation: BenchObservation, check: PhysicsCheckResult | None) -> FrameConditions:
-    """Return the conditions of a frame that affect its verdict; `check` is the newest physics check."""
+def frame_conditions(
+    frame: Frame, observation: BenchObservation, check: PhysicsCheckResult | None
+) -> FrameConditions:
+    """Return the conditions of a frame that affect its verdict; `check` is the newest physics
+    check.
+    """
     issues = frame_issues(frame)
     invalid = "blank" in issues or "half_invalid" in issues
     return FrameConditions("saturated" in issues, invalid, observation.moved, check)
 
 
 def load_networks(weights: Path | None = None) -> Reconstructor:
-    """Load the shipped networks, or those of a folder, exported to the cache once. Raises CheckpointError."""
+    """Load the shipped networks, or those of a folder, exported to the cache once. Raises
+    CheckpointError.
+    """
     return load_reconstructor(weights, cache_folder() / "onnx")
 
 
 def load_uncertainty(weights: Path | None = None) -> UncertaintyModel | None:
-    """Load the uncertainty model ("doubt network") beside the shipped weights, or of a folder; None without one."""
+    """Load the uncertainty model ("doubt network") beside the shipped weights, or of a folder; None
+    without one.
+    """
     return load_uncertainty_model(weights, cache_folder() / "onnx")
 
 
@@ -207,11 +256,13 @@ def compatibility_warnings(
     warnings = _rig_warnings(bench.rig, trained)
     if bench.measured and not bench.reference:
         warnings.append(
-            "this wall record has no reference: no difference maps, and a moved lidar goes unnoticed; calibrate the "
-            "wall again"
+            "this wall record has no reference: no difference maps, and a moved lidar goes"
+            " unnoticed; calibrate the wall again"
         )
     if not uncertainty_model:
-        warnings.append("these weights have no uncertainty model (`train doubt`): no uncertainty and no verdict")
+        warnings.append(
+            "these weights have no uncertainty model (`train doubt`): no uncertainty and no verdict"
+        )
     return warnings
 
 
@@ -223,7 +274,11 @@ def _rig_warnings(rig: Rig, trained: CheckpointRecord) -> list[str]:
     if difference := rig_difference(rig, wanted):
         aligned = "are aligned with that rig's, expect larger errors"
         outcome = (
-            aligned if rig_to_align_with(rig, trained) else "cannot be aligned with that rig's, expect wrong shapes"
+            aligned
+            if rig_to_align_with(rig, trained)
+            else "cannot be aligned with that rig's, expect wrong shapes"
         )
-        return [f"this rig differs from the training rig ({'; '.join(difference)}): its maps {outcome}"]
+        return [
+            f"this rig differs from the training rig ({'; '.join(difference)}): its maps {outcome}"
+        ]
     return []

@@ -11,16 +11,20 @@ from nlos_cam.reconstruct.network import Reconstruction
 from nlos_cam.reconstruct.physics_check import PhysicsCheckResult
 
 STEADY_FRAMES = 5
-"""Frames (0.17 s) over which the out-of-distribution probability is averaged, so that the verdict does not flicker."""
+"""Frames (0.17 s) over which the out-of-distribution probability is averaged, so that the verdict
+does not flicker.
+"""
 
 
 class Verdict(StrEnum):
-    """Reliability of one frame's reconstruction; if several verdicts hold, the last of them in this order is given.
+    """Reliability of one frame's reconstruction; if several verdicts hold, the last of them in this
+    order is given.
 
-    SEEN: there is an object like those of the training set. NOTHING: the bench is empty; no surface is shown. OUTSIDE:
-    the shape is shown but not reliable, because it is out of distribution (OOD), or the physics check does not explain
-    the maps by it, or there is no surface, or half of the frame has no depth. SATURATED, WALL_MOVED: the lidar's data
-    are not usable, whatever was reconstructed. STALLED: no newer frame has come.
+    SEEN: there is an object like those of the training set. NOTHING: the bench is empty; no surface
+    is shown. OUTSIDE: the shape is shown but not reliable, because it is out of distribution (OOD),
+    or the physics check does not explain the maps by it, or there is no surface, or half of the
+    frame has no depth. SATURATED, WALL_MOVED: the lidar's data are not usable, whatever was
+    reconstructed. STALLED: no newer frame has come.
     """
 
     SEEN = "object seen"
@@ -57,9 +61,9 @@ class FrameConditions:
 class VerdictFilter:
     """Decision of each frame's verdict. Stateful: give it the frames in order, from one thread.
 
-    The out-of-distribution probability is averaged over frames. That nothing is hidden is decided for each frame alone,
-    so an object that leaves disappears with the first frame without it. Without `limits` (no uncertainty model) only
-    the conditions of lidar and bench are considered.
+    The out-of-distribution probability is averaged over frames. That nothing is hidden is decided
+    for each frame alone, so an object that leaves disappears with the first frame without it.
+    Without `limits` (no uncertainty model) only the conditions of lidar and bench are considered.
     """
 
     def __init__(self, limits: VerdictLimits | None) -> None:
@@ -69,8 +73,16 @@ class VerdictFilter:
     def decide(
         self, reconstruction: Reconstruction, conditions: FrameConditions
     ) -> tuple[Reconstruction, Verdict | None]:
-        """Return the reconstruction to show, without surface if nothing is hidden, and the verdict."""
-        of_lidar = Verdict.WALL_MOVED if conditions.moved else Verdict.SATURATED if conditions.saturated else None
+        """Return the reconstruction to show, without surface if nothing is hidden, and the
+        verdict.
+        """
+        of_lidar = (
+            Verdict.WALL_MOVED
+            if conditions.moved
+            else Verdict.SATURATED
+            if conditions.saturated
+            else None
+        )
         if (limits := self._limits) is None or (doubt := reconstruction.doubt) is None:
             return reconstruction, of_lidar
         if doubt.nothing >= limits.nothing:
@@ -85,7 +97,9 @@ class VerdictFilter:
 
 
 def frame_issues(frame: Frame) -> list[str]:
-    """Return the issues of a frame: blank (no depth at all) or half_invalid (none in half of the pixels); saturated."""
+    """Return the issues of a frame: blank (no depth at all) or half_invalid (none in half of the
+    pixels); saturated.
+    """
     with_depth = np.count_nonzero(frame.depth_m > 0)  # NaN compares false
     issues: list[str] = []
     if with_depth == 0:
