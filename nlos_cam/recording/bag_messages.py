@@ -37,15 +37,26 @@ ENCODINGS = {
 }
 """By the name in the file."""
 STREAM_INFO = "uint32 fps\nstring encoding\nbool is_recommended\n"
-"""The one definition that ROS does not have. Never taken from the file: rosbags compiles definitions to Python."""
-INFO, CAMERA = "realsense_msgs/msg/StreamInfo", "sensor_msgs/msg/CameraInfo"
-IMAGE, NUMBER, PAIR = "sensor_msgs/msg/Image", "std_msgs/msg/Float32", "diagnostic_msgs/msg/KeyValue"
+"""The one definition that ROS does not have. Never taken from the file: rosbags compiles
+definitions to Python.
+"""
+INFO = "realsense_msgs/msg/StreamInfo"
+CAMERA = "sensor_msgs/msg/CameraInfo"
+IMAGE = "sensor_msgs/msg/Image"
+NUMBER = "std_msgs/msg/Float32"
+PAIR = "diagnostic_msgs/msg/KeyValue"
 TRANSFORM = "geometry_msgs/msg/Transform"
-MAX_PIXELS, MAX_TEXT = 1 << 23, 200
-"""Bounds on an image, four times the largest of a RealSense camera, and on the characters of a value."""
+MAX_PIXELS = 1 << 23
+MAX_TEXT = 200
+"""Bounds on an image, four times the largest of a RealSense camera, and on the characters of a
+value.
+"""
 TAIL_MARK = b"\x01\x00\x00\x001"
-"""The frame_id of an image with its depth unit after it, against its definition; since librealsense 2.49."""
-TAIL_BYTES, FRAME_ID_AT = 4, 12
+"""The frame_id of an image with its depth unit after it, against its definition; since librealsense
+2.49.
+"""
+TAIL_BYTES = 4
+FRAME_ID_AT = 12
 UNIT_TOLERANCE = 1e-3
 
 
@@ -57,7 +68,9 @@ def _types() -> Typestore:
 
 
 def is_known(message_type: str) -> bool:
-    """Return whether `parse` accepts messages of this type; librealsense defines a few that it does not."""
+    """Return whether `parse` accepts messages of this type; librealsense defines a few that it does
+    not.
+    """
     return message_type in _types().fielddefs
 
 
@@ -96,8 +109,8 @@ def timestamp_s(image: Any) -> float:
 def pixels(image: Any, encoding: str, intrinsics: Intrinsics) -> NDArray[Any]:
     """Return an image's values, (height, width) or (height, width, channels).
 
-    A device may deliver another size than its profile declares; such rows have no padding. Raises ValueError for an
-    image whose size, step and encoding contradict each other.
+    A device may deliver another size than its profile declares; such rows have no padding. Raises
+    ValueError for an image whose size, step and encoding contradict each other.
     """
     _, dtype, channels = ENCODINGS[encoding]
     row_bytes = image.width * channels * np.dtype(dtype).itemsize
@@ -105,7 +118,9 @@ def pixels(image: Any, encoding: str, intrinsics: Intrinsics) -> NDArray[Any]:
     if image.encoding != encoding or not (is_declared or image.step == row_bytes):
         raise ValueError(f"an image of {image.width} x {image.height} {image.encoding}")
     if image.data.nbytes != image.height * image.step or image.width * image.height == 0:
-        raise ValueError(f"an image of {image.width} x {image.height} with {image.data.nbytes} bytes")
+        raise ValueError(
+            f"an image of {image.width} x {image.height} with {image.data.nbytes} bytes"
+        )
     rows = image.data.reshape(image.height, image.step)
     values = np.array(rows[:, :row_bytes]).view(dtype)
     return values.reshape(image.height, image.width, *([channels] if channels > 1 else []))
@@ -118,7 +133,9 @@ def intrinsics_of(info: Any) -> Intrinsics:
     """
     numbers = [float(info.K[i]) for i in (0, 4, 2, 5)]
     if not 0 < info.width * info.height <= MAX_PIXELS or not all(map(isfinite, numbers)):
-        raise ValueError(f"a camera of {info.width} x {info.height} pixels with the pinhole {numbers}")
+        raise ValueError(
+            f"a camera of {info.width} x {info.height} pixels with the pinhole {numbers}"
+        )
     return Intrinsics(info.width, info.height, *numbers)
 
 
@@ -128,12 +145,16 @@ def lens_of(info: Any) -> tuple[str, Float64]:
 
 
 def pose_of(transform: Any) -> Float64:
-    """Return a Transform as a matrix (4, 4). Raises ValueError for a quaternion that is not of unit length."""
-    turn, shift = transform.rotation, transform.translation
+    """Return a Transform as a matrix (4, 4). Raises ValueError for a quaternion that is not of unit
+    length.
+    """
+    turn = transform.rotation
+    shift = transform.translation
     x, y, z, w = quaternion = np.array([turn.x, turn.y, turn.z, turn.w])
     if not abs(float(np.linalg.norm(quaternion)) - 1.0) < UNIT_TOLERANCE:
         raise ValueError(f"a rotation by the quaternion {quaternion.tolist()}")
-    # Rodrigues' formula with half angles: R = I + 2 w [v]x + 2 [v]x^2, where [v]x u = v x u and v = (x, y, z)
+    # Rodrigues' formula with half angles: R = I + 2 w [v]x + 2 [v]x^2, where [v]x u = v x u and v =
+    # (x, y, z)
     cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
     pose = np.eye(4)
     pose[:3, :3] += 2.0 * w * cross + 2.0 * cross @ cross
@@ -146,7 +167,9 @@ class FrameMetadata:
     """Metadata that the device sent with a frame."""
 
     domain: str
-    """Clock of the timestamp: hardware_clock, system_time or global_time; empty where not recorded."""
+    """Clock of the timestamp: hardware_clock, system_time or global_time; empty where not
+    recorded.
+    """
     values: dict[str, float]
     """By the SDK's name: frame_counter, frame_laser_power, ...; and system_time."""
 

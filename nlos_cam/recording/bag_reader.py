@@ -1,4 +1,6 @@
-"""Reader of librealsense recordings without librealsense: streams, frames by index, options, metadata."""
+"""Reader of librealsense recordings without librealsense: streams, frames by index, options,
+metadata.
+"""
 
 import re
 from bisect import bisect_left, bisect_right
@@ -30,13 +32,16 @@ DEVICE = "/device_0"
 STREAM = re.compile(DEVICE + r"/sensor_([0-9]{1,3})/([A-Za-z_]{1,40})_([0-9]{1,3})(?=/image/data$)")
 OPTION = re.compile(DEVICE + r"/sensor_([0-9]{1,3})/option/(.{1,80})/value")
 MAX_STREAMS = 64
-MIN_READS, BYTES_PER_READ = 2_000_000, 100
+MIN_READS = 2_000_000
+BYTES_PER_READ = 100
 """Bound on the reads of an index, two for each entry, so that it cannot fill the memory."""
 T = TypeVar("T")
 STATIC_NS = 1
 """The time that librealsense gives to values in force when the recording began."""
 SAMPLE = Path(__file__).parent / "sample.bag"
-"""Recording that comes with the package: eight frames of the simulated airplane; the name "sample" stands for it."""
+"""Recording that comes with the package: eight frames of the simulated airplane; the name "sample"
+stands for it.
+"""
 DECOMPRESSORS = {"lz4": LZ4FrameDecompressor, "bz2": BZ2Decompressor}
 
 
@@ -55,7 +60,9 @@ class StreamInfo:
     """Stream of a recording."""
 
     name: str
-    """The SDK's, with the index where that is not 0: depth, infrared, confidence, color, infrared_1."""
+    """The SDK's, with the index where that is not 0: depth, infrared, confidence, color,
+    infrared_1.
+    """
     topic: str
     sensor: int
     encoding: str
@@ -67,8 +74,14 @@ class StreamInfo:
 
     @property
     def format(self) -> str:
-        """The SDK's name of the encoding: z16, y8, raw8, rgb8, ...; empty for one that we cannot read."""
-        return bag_messages.ENCODINGS[self.encoding].sdk_format if self.encoding in bag_messages.ENCODINGS else ""
+        """The SDK's name of the encoding: z16, y8, raw8, rgb8, ...; empty for one that we cannot
+        read.
+        """
+        return (
+            bag_messages.ENCODINGS[self.encoding].sdk_format
+            if self.encoding in bag_messages.ENCODINGS
+            else ""
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,9 +98,9 @@ class Place:
 class BagReader:
     """Recording of any RealSense camera; frames are read on request.
 
-    Opening reads the index into memory. One chunk is cached and no file stays open, so there is nothing to close; for
-    one thread at a time. Numbers and timestamps equal those of librealsense's playback. Opening and every method raise
-    RecordingError, with the place of the damage.
+    Opening reads the index into memory. One chunk is cached and no file stays open, so there is
+    nothing to close; for one thread at a time. Numbers and timestamps equal those of librealsense's
+    playback. Opening and every method raise RecordingError, with the place of the damage.
     """
 
     def __init__(self, path: Path) -> None:
@@ -98,14 +111,19 @@ class BagReader:
         """Message type of each topic, in rosbags' spelling."""
         self.end_ns = 0
         """Time of the last message, on the recorder's clock."""
-        self._chunk_pos, self._chunk = -1, b""
+        self._chunk_pos = -1
+        self._chunk = b""
         self._options: dict[int, _SensorOptions] = {}
         _check_start(path)
         with raise_as_recording_error(path, "is cut short or damaged"):
             self._read_index()
         self.device: Mapping[str, str] = bag_messages.texts_of(self._all(f"{DEVICE}/info"))
         """By the SDK's names: name, serial_number, firmware_version, product_line, ..."""
-        matches = [match for topic, entries in self.entries.items() if entries and (match := STREAM.match(topic))]
+        matches = [
+            match
+            for topic, entries in self.entries.items()
+            if entries and (match := STREAM.match(topic))
+        ]
         with raise_as_recording_error(path, "is damaged"):
             if len(matches) > MAX_STREAMS:
                 raise ValueError(f"it has {len(matches)} streams")
@@ -120,22 +138,39 @@ class BagReader:
         _check_topics(self.path)
         with Reader(cast("Any", _BoundedPath(self.path))) as indexed:
             for connection in indexed.connections:
-                index = indexed.indexes.pop(connection.id)  # half a million tuples for ten minutes: keep one copy
+                index = indexed.indexes.pop(
+                    connection.id
+                )  # half a million tuples for ten minutes: keep one copy
                 found[connection.topic].extend(Entry(*place, connection.id) for place in index)
-                if self.types.setdefault(connection.topic, connection.msgtype) != connection.msgtype:
-                    raise ValueError(f"messages of two types on {connection.topic[: bag_messages.MAX_TEXT]}")
+                if (
+                    self.types.setdefault(connection.topic, connection.msgtype)
+                    != connection.msgtype
+                ):
+                    raise ValueError(
+                        f"messages of two types on {connection.topic[: bag_messages.MAX_TEXT]}"
+                    )
         if not found:
             raise ValueError("its index is empty")
         self.entries = {topic: sorted(entries) for topic, entries in found.items()}
-        if any(one[:3] == two[:3] for entries in self.entries.values() for one, two in pairwise(entries)):
+        if any(
+            one[:3] == two[:3]
+            for entries in self.entries.values()
+            for one, two in pairwise(entries)
+        ):
             raise ValueError("its index lists a message twice")
-        self.end_ns = max((entries[-1].time_ns for entries in self.entries.values() if entries), default=0)
+        self.end_ns = max(
+            (entries[-1].time_ns for entries in self.entries.values() if entries), default=0
+        )
 
     def _stream_info(self, sensor: str, kind: str, index: str, topic: str) -> StreamInfo:
         encoding, frames_per_s = self._first(
-            f"{topic}/info", bag_messages.INFO, lambda info: (info.encoding[: bag_messages.MAX_TEXT], info.fps)
+            f"{topic}/info",
+            bag_messages.INFO,
+            lambda info: (info.encoding[: bag_messages.MAX_TEXT], info.fps),
         )
-        pinhole = self._first(f"{topic}/info/camera_info", bag_messages.CAMERA, bag_messages.intrinsics_of)
+        pinhole = self._first(
+            f"{topic}/info/camera_info", bag_messages.CAMERA, bag_messages.intrinsics_of
+        )
         name = bag_messages.sdk_name(kind if index == "0" else f"{kind}_{index}")
         frames = len(self.entries[f"{topic}/image/data"])
         return StreamInfo(name, topic, int(sensor), encoding, frames_per_s, pinhole, frames)
@@ -143,42 +178,67 @@ class BagReader:
     def _first(self, topic: str, kind: str, convert: Callable[[Any], T]) -> T:
         if entries := self.entries.get(topic):
             return self.read(topic, entries[0], kind, convert)
-        raise RecordingError(f"{self.path} is damaged (it has no {topic}): {repair_advice(self.path)}")
+        raise RecordingError(
+            f"{self.path} is damaged (it has no {topic}): {repair_advice(self.path)}"
+        )
 
     def _all(self, topic: str) -> list[Any]:
         return [self.read(topic, entry, bag_messages.PAIR) for entry in self.entries.get(topic, ())]
 
     def check(self) -> None:
-        """Read every message, in the order of the file. Raises RecordingError at the first damage."""
+        """Read every message, in the order of the file. Raises RecordingError at the first
+        damage.
+        """
         images = {f"{info.topic}/image/data": info for info in self.streams.values() if info.format}
         messages = [(entry, topic) for topic, entries in self.entries.items() for entry in entries]
-        for entry, topic in sorted(messages, key=lambda message: (message[0].chunk_pos, message[0].offset)):
+        for entry, topic in sorted(
+            messages, key=lambda message: (message[0].chunk_pos, message[0].offset)
+        ):
             with self._locate(entry):
                 raw = self.raw(entry)
                 if not bag_messages.is_known(self.types[topic]):
                     continue
-                message = bag_messages.parse(raw, self.types[topic], bag_messages.IMAGE if topic in images else "")
+                message = bag_messages.parse(
+                    raw, self.types[topic], bag_messages.IMAGE if topic in images else ""
+                )
                 if topic in images:
                     bag_messages.pixels(message, images[topic].encoding, images[topic].intrinsics)
 
-    def read(self, topic: str, entry: Entry, kind: str = "", convert: Callable[[Any], Any] = lambda it: it) -> Any:
-        """Return a message as rosbags deserialises it, converted; it has to be of the type `kind`, if given."""
+    def read(
+        self,
+        topic: str,
+        entry: Entry,
+        kind: str = "",
+        convert: Callable[[Any], Any] = lambda it: it,
+    ) -> Any:
+        """Return a message as rosbags deserialises it, converted; it has to be of the type `kind`,
+        if given.
+        """
         with self._locate(entry):
             return convert(bag_messages.parse(self.raw(entry), self.types[topic], kind))
 
     def _locate(self, entry: Entry) -> AbstractContextManager[None]:
-        """Raise any exception within the block as a RecordingError that names this place in the recording."""
-        place = f"{entry.time_ns / 1e9:.1f} s into its {self.end_ns / 1e9:.1f} s, at byte {entry.chunk_pos}"
+        """Raise any exception within the block as a RecordingError that names this place in the
+        recording.
+        """
+        place = (
+            f"{entry.time_ns / 1e9:.1f} s into its {self.end_ns / 1e9:.1f} s, at byte"
+            f" {entry.chunk_pos}"
+        )
         return raise_as_recording_error(self.path, f"is damaged {place}")
 
     def raw(self, entry: Entry) -> memoryview:
         """Return a message's bytes. Damage can raise almost any exception."""
         if entry.chunk_pos != self._chunk_pos:
-            self._chunk, self._chunk_pos = self._read_chunk(entry.chunk_pos), entry.chunk_pos
+            self._chunk = self._read_chunk(entry.chunk_pos)
+            self._chunk_pos = entry.chunk_pos
         stream = BytesIO(self._chunk)
         stream.seek(entry.offset)
         header = Header.read(stream, RecordType.MSGDATA)
-        if (header.get_time("time"), header.get_uint32("conn")) != (entry.time_ns, entry.connection):
+        if (header.get_time("time"), header.get_uint32("conn")) != (
+            entry.time_ns,
+            entry.connection,
+        ):
             raise ValueError("the index leads to another message")
         size = read_uint32(stream)
         data = memoryview(self._chunk)[stream.tell() : stream.tell() + size]
@@ -207,9 +267,12 @@ class BagReader:
 
     def sample(self, stream: str, index: int) -> Sample:
         """Return a frame by its index in its stream. Raises IndexError beyond the last."""
-        info, entry = self.streams[stream], self._frames(stream)[index]
+        info = self.streams[stream]
+        entry = self._frames(stream)[index]
         if not info.format:
-            raise RecordingError(f"{self.path}: unsupported encoding of the {stream} stream: {info.encoding}")
+            raise RecordingError(
+                f"{self.path}: unsupported encoding of the {stream} stream: {info.encoding}"
+            )
 
         def convert(image: Any) -> Sample:
             pixels = bag_messages.pixels(image, info.encoding, info.intrinsics)
@@ -219,9 +282,13 @@ class BagReader:
 
     def metadata(self, stream: str, index: int) -> bag_messages.FrameMetadata:
         """Return the metadata of a frame by its index in its stream."""
-        frame, topic = self._frames(stream)[index], f"{self.streams[stream].topic}/image/metadata"
+        frame = self._frames(stream)[index]
+        topic = f"{self.streams[stream].topic}/image/metadata"
         entries = self.entries.get(topic, [])
-        first, end = (side(entries, frame.time_ns, key=lambda e: e.time_ns) for side in (bisect_left, bisect_right))
+        first, end = (
+            side(entries, frame.time_ns, key=lambda e: e.time_ns)
+            for side in (bisect_left, bisect_right)
+        )
         pairs = [self.read(topic, entry, bag_messages.PAIR) for entry in entries[first:end]]
         with self._locate(frame):
             return bag_messages.metadata(pairs)
@@ -234,28 +301,41 @@ class BagReader:
         sensor = self.streams[stream].sensor
         if sensor not in self._options:
             matches = [match for topic in self.entries if (match := OPTION.fullmatch(topic))]
-            names = {match[0]: bag_messages.sdk_name(match[2]) for match in matches if int(match[1]) == sensor}
+            names = {
+                match[0]: bag_messages.sdk_name(match[2])
+                for match in matches
+                if int(match[1]) == sensor
+            }
             self._options[sensor] = _SensorOptions(self, names)
         return self._options[sensor].at(time_ns)
 
     def lens(self, stream: str) -> tuple[str, Float64]:
         """Return the distortion model of a stream, by the SDK's name, and its coefficients."""
-        return self._first(f"{self.streams[stream].topic}/info/camera_info", bag_messages.CAMERA, bag_messages.lens_of)
+        return self._first(
+            f"{self.streams[stream].topic}/info/camera_info",
+            bag_messages.CAMERA,
+            bag_messages.lens_of,
+        )
 
     def pose(self, stream: str, other: str) -> Float64:
-        """Return stream_from_other (4, 4): the pose of another stream's camera in the frame of this stream's.
+        """Return stream_from_other (4, 4): the pose of another stream's camera in the frame of this
+        stream's.
 
         Raises RecordingError where the recording holds no common reference of the two.
         """
-        mine, others = self._poses(stream), self._poses(other)
+        mine = self._poses(stream)
+        others = self._poses(other)
         if not (groups := mine.keys() & others.keys()):
             raise RecordingError(f"{self.path} has no extrinsics between {stream} and {other}")
         group = min(groups)
         return mine[group] @ np.linalg.inv(others[group])
 
     def _poses(self, stream: str) -> dict[str, Float64]:
-        """Return stream_from_reference (4, 4) by group; the streams of a group share one reference."""
-        start, poses = f"{self.streams[stream].topic}/tf/", dict[str, Float64]()
+        """Return stream_from_reference (4, 4) by group; the streams of a group share one
+        reference.
+        """
+        start = f"{self.streams[stream].topic}/tf/"
+        poses = dict[str, Float64]()
         for topic, entries in self.entries.items():
             if topic.startswith(start) and entries:
                 poses[topic.removeprefix(start)] = self.read(
@@ -264,22 +344,30 @@ class BagReader:
         return poses
 
     def depth_unit_m(self) -> float:
-        """Return metres per depth count. Raises RecordingError where no positive unit is recorded."""
-        info, entry = self.streams["depth"], self._frames("depth")[0]
+        """Return metres per depth count. Raises RecordingError where no positive unit is
+        recorded.
+        """
+        info = self.streams["depth"]
+        entry = self._frames("depth")[0]
         with self._locate(entry):
             after_image = bag_messages.depth_unit_m(self.raw(entry))
         unit_m = self.settings().get("depth_units", after_image)
         if unit_m is None or not 0 < unit_m < inf:
-            raise RecordingError(f"{self.path}: {info.topic} has no valid depth unit ({unit_m}): record it again")
+            raise RecordingError(
+                f"{self.path}: {info.topic} has no valid depth unit ({unit_m}): record it again"
+            )
         return unit_m
 
 
 class _SensorOptions:
-    """Options of one sensor over time, from the messages that record their changes; caches the last values."""
+    """Options of one sensor over time, from the messages that record their changes; caches the last
+    values.
+    """
 
     def __init__(self, bag: BagReader, names: Mapping[str, str]) -> None:
         """Take the options' names by the topics of their values."""
-        self._bag, self._names = bag, names
+        self._bag = bag
+        self._names = names
         self._changes = sorted((entry, topic) for topic in names for entry in bag.entries[topic])
         self._applied = 0
         """Number of changes in `_values`."""
@@ -290,17 +378,24 @@ class _SensorOptions:
         due = bisect_right(self._changes, time_ns, key=lambda change: change[0].time_ns)
         if due != self._applied:
             ahead = due > self._applied
-            latest = {topic: entry for entry, topic in self._changes[self._applied if ahead else 0 : due]}
+            latest = {
+                topic: entry for entry, topic in self._changes[self._applied if ahead else 0 : due]
+            }
             read = {
-                self._names[topic]: self._bag.read(topic, entry, bag_messages.NUMBER, lambda found: float(found.data))
+                self._names[topic]: self._bag.read(
+                    topic, entry, bag_messages.NUMBER, lambda found: float(found.data)
+                )
                 for topic, entry in latest.items()
             }
-            self._values, self._applied = bag_messages.finite(self._values | read if ahead else read), due
+            self._values = bag_messages.finite(self._values | read if ahead else read)
+            self._applied = due
         return self._values
 
 
 class _BoundedFile(BufferedReader):
-    """File that returns at most its own size in total and a chunk at once, so that absurd lengths read short."""
+    """File that returns at most its own size in total and a chunk at once, so that absurd lengths
+    read short.
+    """
 
     def __init__(self, path: Path) -> None:
         super().__init__(FileIO(path))
@@ -310,7 +405,8 @@ class _BoundedFile(BufferedReader):
     def read(self, size: int | None = -1, /) -> bytes:
         wanted = self._left if size is None or size < 0 else size
         data = super().read(min(wanted, self._left, rosbag.CHUNK_LIMIT))
-        self._left, self._reads = self._left - len(data), self._reads - 1
+        self._left = self._left - len(data)
+        self._reads = self._reads - 1
         if self._reads < 0:
             raise ValueError("its index has more entries than a recording of its size")
         return data
@@ -331,14 +427,19 @@ class _BoundedPath:
 
 
 def _unpack(packed: bytes, compression: str, size: int) -> bytes:
-    """Return a chunk's content. Raises ValueError where that has another size than declared, or an absurd one."""
+    """Return a chunk's content. Raises ValueError where that has another size than declared, or an
+    absurd one.
+    """
     if size > rosbag.CHUNK_LIMIT:
         raise ValueError(f"a chunk of {size} bytes")
     if compression == "none":
-        content, whole = packed, True
+        content = packed
+        whole = True
     else:
         decompressor = DECOMPRESSORS[compression]()
-        content = cast("bytes", decompressor.decompress(packed, size + 1))  # one more: reach the checksum at the end
+        content = cast(
+            "bytes", decompressor.decompress(packed, size + 1)
+        )  # one more: reach the checksum at the end
         whole = decompressor.eof
     if len(content) != size or not whole:
         raise ValueError(f"a chunk of {size} bytes has {len(content)}")
@@ -346,29 +447,45 @@ def _unpack(packed: bytes, compression: str, size: int) -> bytes:
 
 
 def _check_topics(path: Path) -> None:
-    """Raise OverflowError for a file header with absurdly many topics; rosbags reports a damaged one."""
+    """Raise OverflowError for a file header with absurdly many topics; rosbags reports a damaged
+    one.
+    """
     with path.open("rb") as file, suppress(rosbag.BagFormatError):
-        head = rosbag.read_record(rosbag.reader(file.read(rosbag.FILE_HEADER_BYTES)), len(rosbag.MAGIC))
+        head = rosbag.read_record(
+            rosbag.reader(file.read(rosbag.FILE_HEADER_BYTES)), len(rosbag.MAGIC)
+        )
         if (topics := rosbag.number(head.fields, "conn_count")) > rosbag.MAX_CONNECTIONS:
             raise OverflowError(f"it declares {topics} topics")
 
 
 def _check_start(path: Path) -> None:
-    """Raise RecordingError for a path that is not a .bag, before rosbags reports it less clearly."""
+    """Raise RecordingError for a path that is not a .bag, before rosbags reports it less
+    clearly.
+    """
     if not path.is_file():  # opening a pipe would wait for a writer
-        problem = "is a directory" if path.is_dir() else "is not a file" if path.exists() else "does not exist"
+        problem = (
+            "is a directory"
+            if path.is_dir()
+            else "is not a file"
+            if path.exists()
+            else "does not exist"
+        )
         raise RecordingError(f"{path} {problem}: give the path of a .bag recording")
     with raise_as_recording_error(path, "cannot be read"), path.open("rb") as file:
         start = file.read(len(rosbag.MAGIC))
     if not start:
         raise RecordingError(f"{path} is empty: record it again")
     if start != rosbag.MAGIC:
-        raise RecordingError(f"{path} is not a .bag recording (it starts with {start!r}): give one made by `capture`")
+        raise RecordingError(
+            f"{path} is not a .bag recording (it starts with {start!r}): give one made by `capture`"
+        )
 
 
 @contextmanager
 def raise_as_recording_error(path: Path, problem: str) -> Generator[None]:
-    """Raise any exception within the block as a RecordingError of one line, with the command that repairs."""
+    """Raise any exception within the block as a RecordingError of one line, with the command that
+    repairs.
+    """
     try:
         yield
     except RecordingError:
@@ -378,7 +495,8 @@ def raise_as_recording_error(path: Path, problem: str) -> Generator[None]:
         if isinstance(error, OSError) and error.strerror:
             raise RecordingError(f"{path} cannot be read: {detail}") from error
         if "not indexed" in detail:
-            problem, detail = "was never closed", "the capture was killed, so it has no index"
+            problem = "was never closed"
+            detail = "the capture was killed, so it has no index"
         elif "index looks damaged" in detail:
             detail = "its index cannot be read"
         raise RecordingError(f"{path} {problem} ({detail}): {repair_advice(path)}") from error

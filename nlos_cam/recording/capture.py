@@ -14,7 +14,14 @@ from nlos_cam.errors import CameraError, DiskFullError, NlosCamError, RecordingE
 from nlos_cam.frames import Frame
 from nlos_cam.recording.playback import VerifyResult
 from nlos_cam.recording.quality import Quality, QualityMeter
-from nlos_cam.recording.sidecar import SidecarFile, State, Summary, WallFile, sidecar_path, summary_of
+from nlos_cam.recording.sidecar import (
+    SidecarFile,
+    State,
+    Summary,
+    WallFile,
+    sidecar_path,
+    summary_of,
+)
 
 
 @dataclass(frozen=True)
@@ -38,7 +45,9 @@ class CaptureResult:
     error: NlosCamError | None = None
     """Reason for its end, other than its limit or the user."""
     follows_another: bool = False
-    """Whether the device ran when it began: with several device threads, the first set may be in part before it."""
+    """Whether the device ran when it began: with several device threads, the first set may be in
+    part before it.
+    """
     events: Counter[str] = field(default_factory=Counter[str])
     verified: VerifyResult | None = None
     """Contents of the file, once verified."""
@@ -53,7 +62,8 @@ class CaptureResult:
 class CaptureSession:
     """Recorder of takes one after another while a camera runs, from one thread.
 
-    Takes a camera that was opened with `recording`, the first of the `targets`; `record` enters and leaves it.
+    Takes a camera that was opened with `recording`, the first of the `targets`; `record` enters and
+    leaves it.
     """
 
     def __init__(
@@ -65,13 +75,16 @@ class CaptureSession:
         wall: tuple[Rig, WallFile] | None = None,
     ) -> None:
         self.targets = targets
-        self._camera, self._recording, self._wall = camera, recording, wall
+        self._camera = camera
+        self._recording = recording
+        self._wall = wall
 
     def record(self, stop: Event, on_sets: Callable[[int], None]) -> Generator[CaptureResult]:
-        """Yield each take when its file is closed; the camera is left before the last one, and runs on before others.
+        """Yield each take when its file is closed; the camera is left before the last one, and runs
+        on before others.
 
-        `on_sets` gets the number of sets recorded so far. A take that ends before its limit is the last. Raises
-        CameraError where the camera does not start.
+        `on_sets` gets the number of sets recorded so far. A take that ends before its limit is the
+        last. Raises CameraError where the camera does not start.
         """
         take: CaptureResult | None = None
         try:
@@ -83,7 +96,9 @@ class CaptureSession:
                         yield take
                         take = None
                         self._recording.next_take(target.path, last=target is self.targets[-1])
-                    take = replace(self._take(target, frames, stop, on_sets), follows_another=number > 0)
+                    take = replace(
+                        self._take(target, frames, stop, on_sets), follows_another=number > 0
+                    )
                     if take.state != "complete":
                         break
         except DiskFullError as error:
@@ -91,7 +106,9 @@ class CaptureSession:
                 raise
             take = replace(take, state="disk full", error=error, closed=False)
         if take:
-            yield replace(take, sets=self._recording.sets)  # with the set that was in flight at its end
+            yield replace(
+                take, sets=self._recording.sets
+            )  # with the set that was in flight at its end
 
     def _enter(self, entered: ExitStack) -> Iterator[Frame]:
         try:
@@ -102,9 +119,15 @@ class CaptureSession:
             raise
 
     def _take(
-        self, target: CaptureTarget, frames: Iterator[Frame], stop: Event, on_sets: Callable[[int], None]
+        self,
+        target: CaptureTarget,
+        frames: Iterator[Frame],
+        stop: Event,
+        on_sets: Callable[[int], None],
     ) -> CaptureResult:
-        sidecar = SidecarFile(sidecar_path(target.path), self._camera, label=target.label, wall=self._wall)
+        sidecar = SidecarFile(
+            sidecar_path(target.path), self._camera, label=target.label, wall=self._wall
+        )
         meter = QualityMeter()
         state: State = "complete"
         error: NlosCamError | None = None
@@ -117,15 +140,18 @@ class CaptureSession:
                     state = "interrupted"
                     break
         except CameraError as lost:
-            state, error = "lost", lost
+            state = "lost"
+            error = lost
         if self._recording.disk_full:
             state = "disk full"
             error = DiskFullError(
-                f"less than {RESERVE_BYTES / 1e6:.0f} MB were left for {target.path}: free some, or choose an --out on "
-                "another disk"
+                f"less than {RESERVE_BYTES / 1e6:.0f} MB were left for {target.path}: free some, or"
+                " choose an --out on another disk"
             )
         events = Counter(self._camera.counts)
-        return CaptureResult(target, state, self._recording.sets, meter.quality(), sidecar, error, events=events)
+        return CaptureResult(
+            target, state, self._recording.sets, meter.quality(), sidecar, error, events=events
+        )
 
     def _recorded(self, frames: Iterator[Frame]) -> Iterator[Frame]:
         """Yield the frames that belong to the take, until it ends."""
@@ -136,8 +162,11 @@ class CaptureSession:
                 return
 
 
-def finalize(take: CaptureResult, read_back: Callable[[Path], VerifyResult | None]) -> CaptureResult:
-    """Verify a closed take with `read_back`, and write its outcome into the sidecar; delete one without any frame.
+def finalize(
+    take: CaptureResult, read_back: Callable[[Path], VerifyResult | None]
+) -> CaptureResult:
+    """Verify a closed take with `read_back`, and write its outcome into the sidecar; delete one
+    without any frame.
 
     `read_back` returns None when interrupted.
     """
@@ -160,12 +189,13 @@ def _verify(take: CaptureResult, read_back: Callable[[Path], VerifyResult | None
         return replace(take, state="damaged", error=error)
     if found is None:
         return replace(take, state="interrupted")
-    # Without metadata a reader pairs the streams differently, so that some recorded frames are in no set.
+    # Without metadata a reader pairs the streams differently, so that some recorded frames are in
+    # no set.
     recorded = max(found.frames, min(found.streams.values(), default=0))
     if recorded < take.sets - take.follows_another:
         error = RecordingError(
-            f"{take.target.path} holds {found.frames} of the {take.sets} frames that came: check the disk's free space "
-            "and speed, and record again"
+            f"{take.target.path} holds {found.frames} of the {take.sets} frames that came: check"
+            " the disk's free space and speed, and record again"
         )
         return replace(take, state="damaged", error=error, verified=found)
     return replace(take, verified=found)

@@ -1,4 +1,6 @@
-"""Export of a recording to files of other programs: PNG or NPZ per stream, timestamps, intrinsics, point clouds."""
+"""Export of a recording to files of other programs: PNG or NPZ per stream, timestamps, intrinsics,
+point clouds.
+"""
 
 import csv
 import json
@@ -29,10 +31,13 @@ TO_BGR = {"rgb8": cv2.COLOR_RGB2BGR, "rgba8": cv2.COLOR_RGBA2BGRA}
 
 
 class PngSink:
-    """Writer of one PNG per frame, named by its number (16 bit depth in raw units), and a table of timestamps."""
+    """Writer of one PNG per frame, named by its number (16 bit depth in raw units), and a table of
+    timestamps.
+    """
 
     def __init__(self, folder: Path, stream: str, encoding: str) -> None:
-        self._folder, self._encoding = folder / stream, encoding
+        self._folder = folder / stream
+        self._encoding = encoding
         self._folder.mkdir()
         self._table = (folder / f"{stream}.csv").open("w", newline="", encoding="utf-8")
         self._rows = csv.writer(self._table)
@@ -48,22 +53,28 @@ class PngSink:
         pixels = sample.pixels if code is None else cv2.cvtColor(sample.pixels, code)
         done, png = cv2.imencode(".png", pixels)
         if not done:
-            raise NlosCamError(f"{sample.stream} ({self._encoding}) cannot be written as PNG: use --format npz")
+            raise NlosCamError(
+                f"{sample.stream} ({self._encoding}) cannot be written as PNG: use --format npz"
+            )
         path.write_bytes(png.tobytes())
-        self._rows.writerow([f"{self._folder.name}/{path.name}", sample.number, f"{sample.timestamp_s:.6f}"])
+        self._rows.writerow(
+            [f"{self._folder.name}/{path.name}", sample.number, f"{sample.timestamp_s:.6f}"]
+        )
 
     def close(self) -> None:
         self._table.close()
 
 
 class NpzSink:
-    """Writer of one .npz with all frames of a stream: pixels (N, height, width), frame_number (N,), timestamp_s (N,).
+    """Writer of one .npz with all frames of a stream: pixels (N, height, width), frame_number (N,),
+    timestamp_s (N,).
 
     Collects pixels in a temporary file, not in memory.
     """
 
     def __init__(self, folder: Path, stream: str, constants: dict[str, Any]) -> None:
-        self._path, self._constants = folder / f"{stream}.npz", constants
+        self._path = folder / f"{stream}.npz"
+        self._constants = constants
         self._pixels: IO[bytes] = TemporaryFile(dir=folder)  # noqa: SIM115  closed in close()
         self._shape: tuple[int, ...] = ()
         self._type: np.dtype[Any] = np.dtype(np.uint8)
@@ -72,11 +83,12 @@ class NpzSink:
 
     def add(self, sample: Sample) -> None:
         """Take a frame. Raises RecordingError for one of another size than those before it."""
-        self._shape, self._type = self._shape or sample.pixels.shape, sample.pixels.dtype
+        self._shape = self._shape or sample.pixels.shape
+        self._type = sample.pixels.dtype
         if sample.pixels.shape != self._shape:
             raise RecordingError(
-                f"frame {sample.number} of {sample.stream} has shape {sample.pixels.shape}, those before have "
-                f"{self._shape}: use --format png"
+                f"frame {sample.number} of {sample.stream} has shape {sample.pixels.shape}, those"
+                f" before have {self._shape}: use --format png"
             )
         self._pixels.write(np.ascontiguousarray(sample.pixels).tobytes())
         self._numbers.append(sample.number)
@@ -85,7 +97,11 @@ class NpzSink:
     def close(self) -> None:
         self._pixels.flush()
         shape = len(self._numbers), *self._shape
-        pixels = np.memmap(self._pixels, self._type, "r", shape=shape) if self._numbers else np.zeros(shape, self._type)
+        pixels = (
+            np.memmap(self._pixels, self._type, "r", shape=shape)
+            if self._numbers
+            else np.zeros(shape, self._type)
+        )
         np.savez_compressed(
             self._path,
             pixels=pixels,
@@ -103,8 +119,13 @@ class PointSink:
     Points in metres in the lidar frame: x right, y down, z forward.
     """
 
-    def __init__(self, folder: Path, rays: Float64, unit_m: float, limit: int | None = None) -> None:
-        self._folder, self._rays, self._unit_m, self._limit = folder / POINTS, rays, unit_m, limit
+    def __init__(
+        self, folder: Path, rays: Float64, unit_m: float, limit: int | None = None
+    ) -> None:
+        self._folder = folder / POINTS
+        self._rays = rays
+        self._unit_m = unit_m
+        self._limit = limit
         self._folder.mkdir()
         self._pairing = FrameSynchronizer((rays.shape[0], rays.shape[1]))
         self.written = 0
@@ -148,7 +169,9 @@ class ExportOptions:
 
     format: Format = "png"
     points: bool = False
-    """A point cloud for each complete set; otherwise one for the first, when all streams are exported."""
+    """A point cloud for each complete set; otherwise one for the first, when all streams are
+    exported.
+    """
     streams: Collection[str] = ()
     """By name; empty for all."""
     every: int = 1
@@ -156,12 +179,17 @@ class ExportOptions:
 
 
 def export_recording(
-    bag: BagReader, out: Path, options: ExportOptions, *, stop: Event, on_frame: Callable[[], None] = lambda: None
+    bag: BagReader,
+    out: Path,
+    options: ExportOptions,
+    *,
+    stop: Event,
+    on_frame: Callable[[], None] = lambda: None,
 ) -> ExportResult:
     """Write the selected frames of a recording into the directory `out`.
 
-    Setting `stop` ends it early and keeps the frames so far, and so does damage within the recording. Raises
-    RecordingError for streams that the recording does not have.
+    Setting `stop` ends it early and keeps the frames so far, and so does damage within the
+    recording. Raises RecordingError for streams that the recording does not have.
     """
     streams = _streams(bag, options)
     written: Counter[str] = Counter(dict.fromkeys(streams, 0))
@@ -193,12 +221,18 @@ def export_recording(
 
 
 def _streams(bag: BagReader, options: ExportOptions) -> list[str]:
-    """Return the streams to write. Raises RecordingError for one that the recording does not have."""
+    """Return the streams to write. Raises RecordingError for one that the recording does not
+    have.
+    """
     present = [name for name, info in bag.streams.items() if info.format]
     if missing := sorted(set(options.streams) - set(present)):
-        raise RecordingError(f"{bag.path} has no {' and no '.join(missing)} stream: it has {', '.join(present)}")
+        raise RecordingError(
+            f"{bag.path} has no {' and no '.join(missing)} stream: it has {', '.join(present)}"
+        )
     if options.points and (missing := [stream for stream in FORMATS if stream not in present]):
-        raise RecordingError(f"{bag.path} has no {' and no '.join(missing)} stream: point clouds need all three")
+        raise RecordingError(
+            f"{bag.path} has no {' and no '.join(missing)} stream: point clouds need all three"
+        )
     return [name for name in present if not options.streams or name in options.streams]
 
 
@@ -220,7 +254,9 @@ def _points(bag: BagReader, options: ExportOptions, folder: Path) -> PointSink |
 
 
 def _info(bag: BagReader, options: ExportOptions) -> dict[str, Any]:
-    """Return facts of the whole recording for JSON: device, settings, intrinsics by stream, and its sidecar."""
+    """Return facts of the whole recording for JSON: device, settings, intrinsics by stream, and its
+    sidecar.
+    """
     streams = {
         name: {
             "format": info.format,

@@ -23,11 +23,12 @@ IDENTITY = {
 
 
 class ReplayCamera:
-    """Camera that plays a .bag as fast as it is read, from the first frame at each iteration, without drops.
+    """Camera that plays a .bag as fast as it is read, from the first frame at each iteration,
+    without drops.
 
-    No thread and no open file, so leaving the context only ends iterations. A frame's settings are those in force when
-    it was recorded. Raises RecordingError for a file that cannot be read, or at the damage; StreamMissingError without
-    depth, infrared or confidence.
+    No thread and no open file, so leaving the context only ends iterations. A frame's settings are
+    those in force when it was recorded. Raises RecordingError for a file that cannot be read, or at
+    the damage; StreamMissingError without depth, infrared or confidence.
     """
 
     def __init__(self, path: Path) -> None:
@@ -67,7 +68,9 @@ class ReplayCamera:
             raise
 
     def _frames(self, pairing: FrameSynchronizer, iteration: int) -> Iterator[Frame]:
-        wraps = self._bag.metadata("depth", 0).domain == "hardware_clock"  # the counter of a device's own clock
+        wraps = (
+            self._bag.metadata("depth", 0).domain == "hardware_clock"
+        )  # the counter of a device's own clock
         clock = ClockUnwrap().add if wraps else float
         for place in self._bag.order(FORMATS):
             sample = self._bag.sample(place.stream, place.index)
@@ -86,25 +89,33 @@ class ReplayCamera:
         self._count(pairing)
 
     def _count(self, pairing: FrameSynchronizer) -> None:
-        self.incomplete, self.dropped, self.counts = pairing.incomplete, pairing.dropped, pairing.counts
+        self.incomplete = pairing.incomplete
+        self.dropped = pairing.dropped
+        self.counts = pairing.counts
 
     def telemetry(self, ending: str = "") -> Mapping[str, float]:
         return {name: value for name, value in self._settings.items() if name.endswith(ending)}
 
 
 def open_lidar_bag(path: Path) -> BagReader:
-    """Open a recording of an L515. Raises StreamMissingError without one of its three streams, RecordingError."""
+    """Open a recording of an L515. Raises StreamMissingError without one of its three streams,
+    RecordingError.
+    """
     bag = BagReader(path)
     if not bag.streams:
         raise RecordingError(f"{path} holds no frames: record it again")
     present = {name: info.format for name, info in bag.streams.items()}
     if missing := [stream for stream, wanted in FORMATS.items() if present.get(stream) != wanted]:
         raise StreamMissingError(
-            f"{path} has no {' and no '.join(missing)} stream (it has {', '.join(sorted(present))}): record depth, "
-            "infrared and confidence with an L515, e.g. `nlos-cam capture --camera l515`"
+            f"{path} has no {' and no '.join(missing)} stream (it has"
+            f" {', '.join(sorted(present))}): record depth, infrared and confidence with an L515,"
+            " e.g. `nlos-cam capture --camera l515`"
         )
     if min((pinhole := bag.streams["depth"].intrinsics).fx, pinhole.fy) <= 0:
-        raise RecordingError(f"{path} is damaged (a focal length of {pinhole.fx:g} x {pinhole.fy:g}): record it again")
+        raise RecordingError(
+            f"{path} is damaged (a focal length of {pinhole.fx:g} x {pinhole.fy:g}): record it"
+            " again"
+        )
     return bag
 
 
@@ -129,10 +140,15 @@ class VerifyResult:
 
 def verify(path: Path, on_frame: Callable[[], None] = lambda: None) -> VerifyResult:
     """Read a recording from end to end and return its contents. Raises RecordingError at damage."""
-    frames, first_s, last_s = 0, 0.0, 0.0
+    frames = 0
+    first_s = 0.0
+    last_s = 0.0
     with ReplayCamera(path) as camera:
         for frame in camera:
-            first_s, last_s = first_s if frames else frame.timestamp_s, frame.timestamp_s
+            first_s = first_s if frames else frame.timestamp_s
+            last_s = frame.timestamp_s
             frames += 1
             on_frame()
-        return VerifyResult(frames, camera.dropped + camera.incomplete, last_s - first_s, dict(camera.arrived))
+        return VerifyResult(
+            frames, camera.dropped + camera.incomplete, last_s - first_s, dict(camera.arrived)
+        )

@@ -13,7 +13,9 @@ from nlos_cam.frames import SATURATED, Frame
 MIN_PAIRS = 8
 """Valid pairs of frames that a pixel's noise needs."""
 SAMPLED_EVERY = 8
-"""Spacing of the pixels, along rows and columns, from which the shift of the whole scene is estimated."""
+"""Spacing of the pixels, along rows and columns, from which the shift of the whole scene is
+estimated.
+"""
 
 
 @dataclass(frozen=True)
@@ -30,17 +32,22 @@ class Quality:
     temporal_noise_mm: float | None = None
     """Median over pixels of the standard deviation of depth in time.
 
-    For independent noise of standard deviation s, the difference of two frames has variance 2 s^2, so s is the root
-    mean square of a pixel's differences between consecutive frames over the root of 2. The median difference of each
-    pair of frames over the image is subtracted first, so that a push of the camera does not count as noise; slow drift
-    adds little. Pixels with 8 valid pairs or more.
+    For independent noise of standard deviation s, the difference of two frames has variance 2 s^2,
+    so s is the root mean square of a pixel's differences between consecutive frames over the root
+    of 2. The median difference of each pair of frames over the image is subtracted first, so that a
+    push of the camera does not count as noise; slow drift adds little. Pixels with 8 valid pairs or
+    more.
     """
     jitter_ms: float | None = None
-    """Standard deviation of the intervals between frames, relative to those of their numbers at 30 frames/s."""
+    """Standard deviation of the intervals between frames, relative to those of their numbers at 30
+    frames/s.
+    """
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _add_squares(depth_m: Float32, before_m: Float32, shift_m: float, squares: Float32, pairs: Float32) -> None:
+def _add_squares(
+    depth_m: Float32, before_m: Float32, shift_m: float, squares: Float32, pairs: Float32
+) -> None:
     """Add the squared differences of two frames to the sums of each pixel, where both are valid."""
     for i in range(depth_m.size):
         difference = depth_m[i] - before_m[i] - np.float32(shift_m)
@@ -69,14 +76,18 @@ class QualityMeter:
         if self._before:
             self._add_pair(self._before, frame)
         else:
-            self._squares, self._pairs = (np.zeros(frame.depth_m.size, np.float32) for _ in range(2))
+            self._squares, self._pairs = (
+                np.zeros(frame.depth_m.size, np.float32) for _ in range(2)
+            )
         self._before = frame
 
     def _add_pair(self, before: Frame, frame: Frame) -> None:
         numbers = frame.frame_number - before.frame_number
         self._lateness.add(frame.timestamp_s - before.timestamp_s - numbers / FRAMES_PER_S)
         shift_m = _shift_m(frame.depth_m, before.depth_m)
-        _add_squares(frame.depth_m.ravel(), before.depth_m.ravel(), shift_m, self._squares, self._pairs)
+        _add_squares(
+            frame.depth_m.ravel(), before.depth_m.ravel(), shift_m, self._squares, self._pairs
+        )
 
     def quality(self) -> Quality:
         """Return the quality of the frames so far."""
@@ -93,10 +104,14 @@ class QualityMeter:
 
 
 class _Spread:
-    """Running standard deviation of times, by Welford's update (numerically stable for large means)."""
+    """Running standard deviation of times, by Welford's update (numerically stable for large
+    means).
+    """
 
     def __init__(self) -> None:
-        self._count, self._mean_s, self._squares_s2 = 0, 0.0, 0.0
+        self._count = 0
+        self._mean_s = 0.0
+        self._squares_s2 = 0.0
 
     def add(self, time_s: float) -> None:
         self._count += 1

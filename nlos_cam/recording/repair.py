@@ -1,4 +1,6 @@
-"""Repair of a killed, cut or damaged recording: its undamaged chunks with a new index, in a new file."""
+"""Repair of a killed, cut or damaged recording: its undamaged chunks with a new index, in a new
+file.
+"""
 
 import re
 import shutil
@@ -33,21 +35,30 @@ class RepairResult:
     out: Path
 
 
-def repair_recording(path: Path, out: Path, report: OnProgress = lambda _done, _total: None) -> RepairResult:
-    """Write the undamaged part of the recording `path` to `out`, replacing it atomically; `path` is only read.
+def repair_recording(
+    path: Path, out: Path, report: OnProgress = lambda _done, _total: None
+) -> RepairResult:
+    """Write the undamaged part of the recording `path` to `out`, replacing it atomically; `path` is
+    only read.
 
-    Raises RecordingError where nothing can be recovered, OutputExistsError if both are the same file, NlosCamError
-    where `out` cannot be written.
+    Raises RecordingError where nothing can be recovered, OutputExistsError if both are the same
+    file, NlosCamError where `out` cannot be written.
     """
-    if path.exists() and not (path.is_file() or path.is_dir()):  # opening a pipe would wait for a writer
+    if path.exists() and not (
+        path.is_file() or path.is_dir()
+    ):  # opening a pipe would wait for a writer
         raise RecordingError(f"{path} is not a file: give the path of a .bag recording")
     try:
         same = out.exists() and out.samefile(path)
         scan = None if same else scan_bag(path, lambda done, total: report(done, 2 * total))
     except OSError as error:
-        raise RecordingError(f"{path} cannot be read ({error.strerror}): give the path of a .bag recording") from error
+        raise RecordingError(
+            f"{path} cannot be read ({error.strerror}): give the path of a .bag recording"
+        ) from error
     if scan is None:
-        raise OutputExistsError(f"{out} is the recording itself, which is never changed: choose another --out")
+        raise OutputExistsError(
+            f"{out} is the recording itself, which is never changed: choose another --out"
+        )
     chunks, damages = _readable(scan)
     if not any(_holds_frames(chunk) for chunk in chunks):
         raise RecordingError(f"{path} has nothing to recover: {_why_nothing(scan)}")
@@ -56,17 +67,23 @@ def repair_recording(path: Path, out: Path, report: OnProgress = lambda _done, _
 
 
 def _readable(scan: Scan) -> tuple[list[Chunk], list[Damage]]:
-    """Return the chunks, with each described message and each frame once in their indexes, and all damage."""
+    """Return the chunks, with each described message and each frame once in their indexes, and all
+    damage.
+    """
     described = _IndexFilter(scan.connections)
     chunks = [chunk for chunk in map(described.narrow, scan.chunks) if chunk.index]
     damages = [*scan.damages, *described.damages.values()]
-    if VERSION_TOPIC not in {scan.connections[number].topic.lower() for chunk in chunks for number in chunk.index}:
+    if VERSION_TOPIC not in {
+        scan.connections[number].topic.lower() for chunk in chunks for number in chunk.index
+    }:
         damages.append(Damage(0, 0, "stream descriptions missing: librealsense cannot play this"))
     return chunks, sorted(damages, key=lambda damage: damage.position)
 
 
 class _IndexFilter:
-    """Filter of chunk indexes: drops messages without a description, and repeated frames. Feed chunks in order."""
+    """Filter of chunk indexes: drops messages without a description, and repeated frames. Feed
+    chunks in order.
+    """
 
     def __init__(self, connections: Mapping[int, rosbag.Connection]) -> None:
         self.damages: dict[int, Damage] = {}
@@ -76,12 +93,19 @@ class _IndexFilter:
 
     def narrow(self, chunk: Chunk) -> Chunk:
         """Return a chunk with the readable part of its index."""
-        index = {number: self._filter(chunk.at, number, entries) for number, entries in chunk.index.items()}
-        return replace(chunk, index={number: entries for number, entries in index.items() if entries})
+        index = {
+            number: self._filter(chunk.at, number, entries)
+            for number, entries in chunk.index.items()
+        }
+        return replace(
+            chunk, index={number: entries for number, entries in index.items() if entries}
+        )
 
     def _filter(self, at: int, number: int, entries: bytes) -> bytes:
         if number not in self._connections:
-            self.damages.setdefault(number, Damage(at, 0, f"connection {number} without a description"))
+            self.damages.setdefault(
+                number, Damage(at, 0, f"connection {number} without a description")
+            )
             return b""
         if not FRAMES_TOPIC.search(self._connections[number].topic):
             return entries
@@ -98,7 +122,9 @@ class _IndexFilter:
 
 
 def _holds_frames(chunk: Chunk) -> bool:
-    return any(entries[-rosbag.ENTRY_BYTES : -4] != rosbag.SET_UP_TIME for entries in chunk.index.values())
+    return any(
+        entries[-rosbag.ENTRY_BYTES : -4] != rosbag.SET_UP_TIME for entries in chunk.index.values()
+    )
 
 
 def _why_nothing(scan: Scan) -> str:
@@ -111,7 +137,9 @@ def _why_nothing(scan: Scan) -> str:
     return "it ends before the first frame"
 
 
-def _count_frames(chunks: list[Chunk], connections: Mapping[int, rosbag.Connection]) -> dict[str, int]:
+def _count_frames(
+    chunks: list[Chunk], connections: Mapping[int, rosbag.Connection]
+) -> dict[str, int]:
     frames = Counter(dict.fromkeys(FORMATS, 0))
     for chunk in chunks:
         for number, entries in chunk.index.items():
@@ -128,29 +156,43 @@ def _write(path: Path, out: Path, scan: Scan, report: OnProgress) -> None:
     except OSError as error:
         if isinstance(error, NlosCamError):
             raise
-        raise NlosCamError(f"{out} cannot be written ({error.strerror}): choose another --out") from error
+        raise NlosCamError(
+            f"{out} cannot be written ({error.strerror}): choose another --out"
+        ) from error
 
 
 def _check_space(out: Path, scan: Scan) -> None:
-    index = sum(len(entries) + RECORD_BYTES for chunk in scan.chunks for entries in chunk.index.values())
+    index = sum(
+        len(entries) + RECORD_BYTES for chunk in scan.chunks for entries in chunk.index.values()
+    )
     needed = scan.bytes + index + RECORD_BYTES * len(scan.chunks) + 2 * rosbag.FILE_HEADER_BYTES
     free = shutil.disk_usage(out.parent).free
     if free < needed:
-        raise NlosCamError(f"{out} needs {needed / 1e6:.3g} MB, but {free / 1e6:.3g} MB are free: choose another --out")
+        raise NlosCamError(
+            f"{out} needs {needed / 1e6:.3g} MB, but {free / 1e6:.3g} MB are free: choose another"
+            " --out"
+        )
 
 
 class _Writer:
-    """Writer of a bag from the chunks and connections of a scan; the data of whole chunks are copied unchanged."""
+    """Writer of a bag from the chunks and connections of a scan; the data of whole chunks are
+    copied unchanged.
+    """
 
     def __init__(self, source: BinaryIO, target: BinaryIO, scan: Scan, report: OnProgress) -> None:
-        self._source, self._target, self._scan, self._report = source, target, scan, report
+        self._source = source
+        self._target = target
+        self._scan = scan
+        self._report = report
 
     def write(self) -> None:
         """Write the whole file."""
         self._write_header(0)
         infos = [self._write_chunk(chunk) for chunk in self._scan.chunks]
         index_at = self._target.tell()
-        connections = sorted(self._scan.connections.values(), key=lambda connection: connection.number)
+        connections = sorted(
+            self._scan.connections.values(), key=lambda connection: connection.number
+        )
         self._target.writelines([connection.record for connection in connections] + infos)
         self._write_header(index_at)
         self._report(2 * self._scan.bytes, 2 * self._scan.bytes)
@@ -158,7 +200,8 @@ class _Writer:
     def _write_header(self, index_at: int) -> None:
         self._target.seek(0)
         self._target.write(
-            rosbag.MAGIC + rosbag.pack_file_header(len(self._scan.connections), len(self._scan.chunks), index_at)
+            rosbag.MAGIC
+            + rosbag.pack_file_header(len(self._scan.connections), len(self._scan.chunks), index_at)
         )
 
     def _write_chunk(self, chunk: Chunk) -> bytes:
@@ -166,13 +209,19 @@ class _Writer:
         at = self._target.tell()
         self._target.write(rosbag.pack_chunk_head(chunk.compression, chunk.size, chunk.data_bytes))
         self._target.write(self._data(chunk) if chunk.content is None else chunk.content)
-        self._target.writelines(rosbag.pack_index(number, entries) for number, entries in chunk.index.items())
-        self._report(min(2 * self._scan.bytes, self._scan.bytes + self._target.tell()), 2 * self._scan.bytes)
+        self._target.writelines(
+            rosbag.pack_index(number, entries) for number, entries in chunk.index.items()
+        )
+        self._report(
+            min(2 * self._scan.bytes, self._scan.bytes + self._target.tell()), 2 * self._scan.bytes
+        )
         return rosbag.pack_chunk_info(at, chunk.index)
 
     def _data(self, chunk: Chunk) -> bytes:
         self._source.seek(chunk.data_at)
         data = self._source.read(chunk.data_bytes)
         if len(data) < chunk.data_bytes:
-            raise RecordingError(f"{self._source.name} shrank during the repair: repair it after writing has ended")
+            raise RecordingError(
+                f"{self._source.name} shrank during the repair: repair it after writing has ended"
+            )
         return data

@@ -1,7 +1,8 @@
-"""Records of a ROS bag (format 2.0): reading with every length checked, packing, and the contents of a chunk.
+"""Records of a ROS bag (format 2.0): reading with every length checked, packing, and the contents
+of a chunk.
 
-A record is a header of named fields and data, each after its length (wiki.ros.org/Bags/Format/2.0). Numbers are
-little-endian. The data of a chunk are records too, compressed as its header says.
+A record is a header of named fields and data, each after its length (wiki.ros.org/Bags/Format/2.0).
+Numbers are little-endian. The data of a chunk are records too, compressed as its header says.
 """
 
 import re
@@ -15,11 +16,15 @@ MAGIC = b"#ROSBAG V2.0\n"
 HEADER_LIMIT = 1 << 16
 """Bound on the bytes of a header; real ones have some hundred."""
 CHUNK_LIMIT = 64 << 20
-"""Bound on the bytes of an unpacked chunk; librealsense closes one after 768 KiB and the image that exceeds that."""
+"""Bound on the bytes of an unpacked chunk; librealsense closes one after 768 KiB and the image that
+exceeds that.
+"""
 FILE_HEADER_BYTES = 4096
 """Fields and padding of a file's first record."""
 ENTRY_BYTES = 12
-"""Index entry: a message's time (4 bytes of seconds, 4 of nanoseconds) and its offset in the unpacked chunk."""
+"""Index entry: a message's time (4 bytes of seconds, 4 of nanoseconds) and its offset in the
+unpacked chunk.
+"""
 SET_UP_TIME = struct.pack("<II", 0, 1)
 """The time that librealsense gives to all that describes the device, before any frame."""
 
@@ -41,12 +46,17 @@ class BagBudgetError(Exception):
 CUT = "file truncated"
 MAX_CONNECTIONS = 10_000
 """Bound on the topics of a file; librealsense writes some hundred."""
-MIN_WORK, BYTES_PER_WORK = 4_000_000, 8
-"""Bound on the work for a file: calls that read, and 4 KiB read or unpacked; a record takes four."""
+MIN_WORK = 4_000_000
+BYTES_PER_WORK = 8
+"""Bound on the work for a file: calls that read, and 4 KiB read or unpacked; a record takes
+four.
+"""
 
 
 class Budget:
-    """Work left for a file, from its size in bytes, so that crafted files end in bounded time and memory."""
+    """Work left for a file, from its size in bytes, so that crafted files end in bounded time and
+    memory.
+    """
 
     def __init__(self, file_bytes: int) -> None:
         self._left = MIN_WORK + file_bytes // BYTES_PER_WORK
@@ -60,7 +70,9 @@ class Budget:
 
 @dataclass(frozen=True, slots=True)
 class Source:
-    """Bytes to read; called with an offset and a number of bytes, it returns those, fewer at the end."""
+    """Bytes to read; called with an offset and a number of bytes, it returns those, fewer at the
+    end.
+    """
 
     fetch: Callable[[int, int], bytes]
     budget: Budget
@@ -93,7 +105,9 @@ class Op(IntEnum):
 
 @dataclass(frozen=True, slots=True)
 class BagRecord:
-    """Fields of a record, and the place of its data, which may extend beyond the end of the file."""
+    """Fields of a record, and the place of its data, which may extend beyond the end of the
+    file.
+    """
 
     op: Op
     fields: Fields
@@ -170,7 +184,9 @@ def _number(value: bytes, size: int) -> int:
 
 
 def number(fields: Fields, name: str, size: int = 4) -> int:
-    """Return a field as an unsigned number of `size` bytes. Raises BagFormatError for another size."""
+    """Return a field as an unsigned number of `size` bytes. Raises BagFormatError for another
+    size.
+    """
     return _number(_field(fields, name), size)
 
 
@@ -183,7 +199,9 @@ def text(fields: Fields, name: str) -> str:
 
 
 def message_key(record: BagRecord) -> tuple[int, bytes]:
-    """Return a message's connection number and time (8 bytes: seconds, nanoseconds). Raises BagFormatError."""
+    """Return a message's connection number and time (8 bytes: seconds, nanoseconds). Raises
+    BagFormatError.
+    """
     time = _field(record.fields, "time")
     if len(time) != len(SET_UP_TIME):
         raise BagFormatError("message with a damaged time")
@@ -191,7 +209,9 @@ def message_key(record: BagRecord) -> tuple[int, bytes]:
 
 
 def read_connection(read: Source, record: BagRecord) -> Connection:
-    """Return a connection record's content. Raises BagFormatError for one that readers of bags would refuse."""
+    """Return a connection record's content. Raises BagFormatError for one that readers of bags
+    would refuse.
+    """
     if record.data_bytes > HEADER_LIMIT:
         raise BagFormatError(f"implausible connection of {record.data_bytes} bytes")
     data = read(record.data_at, record.data_bytes)
@@ -200,12 +220,15 @@ def read_connection(read: Source, record: BagRecord) -> Connection:
     description = parse_fields(data)
     for name in description:
         text(description, name)
-    topic, kind = text(record.fields, "topic"), text(description, "type")
+    topic = text(record.fields, "topic")
+    kind = text(description, "type")
     if not topic.isprintable() or not topic.startswith("/") or not re.fullmatch(r"\w+/\w+", kind):
         raise BagFormatError("damaged description of a connection")
     _field(description, "message_definition")
     packed = pack_record(record.fields, data)
-    return Connection(number(record.fields, "conn"), topic, kind, _field(description, "md5sum"), packed)
+    return Connection(
+        number(record.fields, "conn"), topic, kind, _field(description, "md5sum"), packed
+    )
 
 
 def add_connection(connections: dict[int, Connection], found: Connection) -> None:
@@ -240,7 +263,9 @@ def pack_head(fields: Fields, data_bytes: int) -> bytes:
 
 
 def pack_file_header(connections: int, chunks: int, index_at: int) -> bytes:
-    """Return the first record of a file, padded to a fixed length so that it can be overwritten in place."""
+    """Return the first record of a file, padded to a fixed length so that it can be overwritten in
+    place.
+    """
     fields = {
         "chunk_count": chunks.to_bytes(4, "little"),
         "conn_count": connections.to_bytes(4, "little"),
@@ -253,7 +278,11 @@ def pack_file_header(connections: int, chunks: int, index_at: int) -> bytes:
 
 def pack_chunk_head(compression: str, size: int, data_bytes: int) -> bytes:
     """Return a chunk up to its data; `size` counts the unpacked bytes."""
-    fields = {"compression": compression.encode(), "op": bytes([Op.CHUNK]), "size": size.to_bytes(4, "little")}
+    fields = {
+        "compression": compression.encode(),
+        "op": bytes([Op.CHUNK]),
+        "size": size.to_bytes(4, "little"),
+    }
     return pack_head(fields, data_bytes)
 
 
@@ -269,10 +298,15 @@ def pack_index(connection: int, entries: bytes) -> bytes:
 
 
 def pack_chunk_info(chunk_at: int, index: Mapping[int, bytes]) -> bytes:
-    """Return the summary of a chunk: message counts by connection, and the time span, from its index entries."""
+    """Return the summary of a chunk: message counts by connection, and the time span, from its
+    index entries.
+    """
     ends = [(entries[:8], entries[-ENTRY_BYTES:-4]) for entries in index.values()]
     times = [struct.unpack("<II", time) for pair in ends for time in pair]
-    counts = [struct.pack("<II", connection, len(entries) // ENTRY_BYTES) for connection, entries in index.items()]
+    counts = [
+        struct.pack("<II", connection, len(entries) // ENTRY_BYTES)
+        for connection, entries in index.items()
+    ]
     fields = {
         "chunk_pos": chunk_at.to_bytes(8, "little"),
         "count": len(index).to_bytes(4, "little"),
@@ -309,11 +343,14 @@ class Content:
 def read_content(read: Source, at: int, end: int, expected_bytes: int) -> Content:
     """Return the connections and messages from `at` on.
 
-    They end after `expected_bytes`, if a record ends there, else at the first record of another kind, at most at `end`.
+    They end after `expected_bytes`, if a record ends there, else at the first record of another
+    kind, at most at `end`.
     """
     connections: dict[int, Connection] = {}
     entries: dict[int, list[bytes]] = {}
-    reached, ending, why = at, Ending.WHOLE, ""
+    reached = at
+    ending = Ending.WHOLE
+    why = ""
     try:
         for start, record in _confirmed(_records(read, at, end, expected_bytes)):
             if record.op is Op.CONNECTION:
@@ -323,16 +360,25 @@ def read_content(read: Source, at: int, end: int, expected_bytes: int) -> Conten
                 entries.setdefault(connection, []).append(time + (start - at).to_bytes(4, "little"))
             reached = record.end
     except BagCutError as error:
-        ending, why = Ending.CUT, str(error)
+        ending = Ending.CUT
+        why = str(error)
     except BagFormatError as error:
-        ending, why = Ending.BROKEN, str(error)
-    by_time = {number: sorted(found, key=lambda e: struct.unpack_from("<II", e)) for number, found in entries.items()}
+        ending = Ending.BROKEN
+        why = str(error)
+    by_time = {
+        number: sorted(found, key=lambda e: struct.unpack_from("<II", e))
+        for number, found in entries.items()
+    }
     index = {number: b"".join(by_time[number]) for number in sorted(by_time)}
     return Content(connections, index, reached - at, ending, why)
 
 
-def _records(read: Source, at: int, end: int, expected_bytes: int) -> Iterator[tuple[int, BagRecord]]:
-    """Yield messages and connections with their offsets. Raises BagFormatError where neither follows."""
+def _records(
+    read: Source, at: int, end: int, expected_bytes: int
+) -> Iterator[tuple[int, BagRecord]]:
+    """Yield messages and connections with their offsets. Raises BagFormatError where neither
+    follows.
+    """
     expected_end = at + expected_bytes
     while at != expected_end and read(at, 1):
         record = read_record(read, at)
@@ -363,7 +409,9 @@ def _confirmed(records: Iterator[tuple[int, BagRecord]]) -> Iterator[tuple[int, 
 
 
 def set_up_records(read: Source) -> Iterator[tuple[int, BagRecord]]:
-    """Yield the records that describe the device, and connections, with their offsets, up to the first damage."""
+    """Yield the records that describe the device, and connections, with their offsets, up to the
+    first damage.
+    """
     with suppress(BagFormatError):
         for start, record in _records(read, 0, CHUNK_LIMIT, CHUNK_LIMIT):
             if record.op is Op.CONNECTION or message_key(record)[1] == SET_UP_TIME:

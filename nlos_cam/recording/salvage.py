@@ -1,4 +1,6 @@
-"""Scan of a bag without its index: undamaged chunks, places of damage, and parts of broken chunks."""
+"""Scan of a bag without its index: undamaged chunks, places of damage, and parts of broken
+chunks.
+"""
 
 import re
 from bz2 import BZ2Decompressor
@@ -35,7 +37,8 @@ DECODERS = {b"lz4": LZ4FrameDecompressor, b"bz2": BZ2Decompressor}
 """Of compressed chunks; both mark the end of their data and hold checksums."""
 BZ2_WORK = 16
 """Work of unpacking bz2 in units of that of lz4."""
-MIN_PIECE_BYTES, MAX_PIECE_BYTES = 1 << 16, 4 << 20
+MIN_PIECE_BYTES = 1 << 16
+MAX_PIECE_BYTES = 4 << 20
 LZ4_MAGIC = b'\x04"M\x18'
 WORK_PER_CHUNK = 64
 """Work that a chunk in memory counts for, besides reading it."""
@@ -99,7 +102,8 @@ def _is_message(read: Source, at: int) -> bool:
 def examine(read: Source, at: int, record: BagRecord, file_end: int) -> Examined:
     """Unpack and check a chunk, given its record at `at`.
 
-    The lengths in its header are not trusted: packed data mark their own end, other data end with the last message.
+    The lengths in its header are not trusted: packed data mark their own end, other data end with
+    the last message.
     """
     compression = record.fields.get("compression", b"")
     if compression in DECODERS:
@@ -107,11 +111,19 @@ def examine(read: Source, at: int, record: BagRecord, file_end: int) -> Examined
     if compression == b"none":
         return _examine_plain(read, at, record)
     name = compression[:20].decode("utf-8", "replace")
-    return Examined(None, {}, record.data_at, Ending.BROKEN, f"unknown compression {name!r}, none of lz4, bz2, none")
+    return Examined(
+        None,
+        {},
+        record.data_at,
+        Ending.BROKEN,
+        f"unknown compression {name!r}, none of lz4, bz2, none",
+    )
 
 
 def _examine_plain(read: Source, at: int, record: BagRecord) -> Examined:
-    found = read_content(read, record.data_at, record.data_at + CHUNK_LIMIT, record.data_bytes or CHUNK_LIMIT)
+    found = read_content(
+        read, record.data_at, record.data_at + CHUNK_LIMIT, record.data_bytes or CHUNK_LIMIT
+    )
     end = record.data_at + found.bytes
     chunk = Chunk(at, "none", found.bytes, record.data_at, found.bytes, None, found.index)
     why = found.why or _wrong_lengths(record, end, found.bytes)
@@ -119,7 +131,9 @@ def _examine_plain(read: Source, at: int, record: BagRecord) -> Examined:
 
 
 def _examine_packed(read: Source, at: int, record: BagRecord, file_end: int) -> Examined:
-    piece_bytes = min(max(record.data_bytes, MIN_PIECE_BYTES), MAX_PIECE_BYTES)  # a whole chunk, if its length is sane
+    piece_bytes = min(
+        max(record.data_bytes, MIN_PIECE_BYTES), MAX_PIECE_BYTES
+    )  # a whole chunk, if its length is sane
     name = record.fields["compression"]
     unpacked, end, ending, why = unpack(read, record.data_at, file_end, piece_bytes, name)
     if ending is Ending.BROKEN:
@@ -127,10 +141,14 @@ def _examine_packed(read: Source, at: int, record: BagRecord, file_end: int) -> 
     found = read_content(read.over(unpacked), 0, len(unpacked), len(unpacked))
     if ending is Ending.CUT:
         chunk = Chunk(at, "none", found.bytes, 0, found.bytes, unpacked[: found.bytes], found.index)
-        return Examined(chunk if found.index else None, found.connections, record.data_at, ending, why)
+        return Examined(
+            chunk if found.index else None, found.connections, record.data_at, ending, why
+        )
     if found.why:
         return Examined(None, {}, record.data_at, Ending.BROKEN, found.why)
-    chunk = Chunk(at, name.decode(), len(unpacked), record.data_at, end - record.data_at, None, found.index)
+    chunk = Chunk(
+        at, name.decode(), len(unpacked), record.data_at, end - record.data_at, None, found.index
+    )
     why = _wrong_lengths(record, end, len(unpacked))
     return Examined(chunk if found.index else None, found.connections, end, ending, why)
 
@@ -148,11 +166,15 @@ def _wrong_lengths(record: BagRecord, end: int, size: int) -> str:
 def unpack(
     read: Source, at: int, end: int, piece_bytes: int, compression: bytes = b"lz4"
 ) -> tuple[bytes, int, Ending, str]:
-    """Return the content of the packed data at `at`, the offset of its end, its condition there, and the damage.
+    """Return the content of the packed data at `at`, the offset of its end, its condition there,
+    and the damage.
 
     Reads `piece_bytes` at a time and never unpacks more than CHUNK_LIMIT.
     """
-    decoder, parts, room, limit = DECODERS[compression](), list[bytes](), CHUNK_LIMIT, at + 2 * CHUNK_LIMIT
+    decoder = DECODERS[compression]()
+    parts = list[bytes]()
+    room = CHUNK_LIMIT
+    limit = at + 2 * CHUNK_LIMIT
     while not decoder.eof:
         piece = read(at, min(piece_bytes, end - at)) if decoder.needs_input else b""
         if decoder.needs_input and not piece:
@@ -163,7 +185,8 @@ def unpack(
             return b"".join(parts), at, Ending.BROKEN, "damaged data of a chunk"
         if compression == b"bz2":
             read.budget.spend(BZ2_WORK * len(parts[-1]) >> 12)
-        at, room = at + len(piece), room - len(parts[-1])
+        at = at + len(piece)
+        room = room - len(parts[-1])
         if room < 0 or at > limit:
             return b"", at, Ending.BROKEN, f"chunk of more than {CHUNK_LIMIT >> 20} MiB"
     return b"".join(parts), at - len(decoder.unused_data or b""), Ending.WHOLE, ""
@@ -172,22 +195,30 @@ def unpack(
 def salvage_set_up(
     read: Source, at: int, record: BagRecord, file_end: int
 ) -> tuple[Chunk | None, dict[int, Connection]]:
-    """Return the descriptions of device and streams, and connections, from a broken lz4 chunk, without its checksum.
+    """Return the descriptions of device and streams, and connections, from a broken lz4 chunk,
+    without its checksum.
 
-    A recording holds them once and no frame can be read without them; unlike frames, they are used unverified.
+    A recording holds them once and no frame can be read without them; unlike frames, they are used
+    unverified.
     """
     end = min(record.end, file_end) - LZ4_TAIL_BYTES
     unpacked = read.over(unpack(read, record.data_at, end, MIN_PIECE_BYTES)[0])
     connections = read_content(unpacked, 0, CHUNK_LIMIT, CHUNK_LIMIT).connections
-    content = b"".join(unpacked(start, found.end - start) for start, found in set_up_records(unpacked))
+    content = b"".join(
+        unpacked(start, found.end - start) for start, found in set_up_records(unpacked)
+    )
     index = read_content(read.over(content), 0, len(content), len(content)).index
-    return Chunk(at, "none", len(content), 0, len(content), content, index) if index else None, connections
+    return Chunk(
+        at, "none", len(content), 0, len(content), content, index
+    ) if index else None, connections
 
 
 WINDOW_BYTES = 1 << 20
 MAX_START_BYTES = 32
 """Bound on the bytes from the first of a record to the end of its match of RECORD_START."""
-RECORD_START = re.compile(rb"\x00\x00\x00(?:compression|conn|op|chunk_pos|chunk_count)=|" + re.escape(LZ4_MAGIC))
+RECORD_START = re.compile(
+    rb"\x00\x00\x00(?:compression|conn|op|chunk_pos|chunk_count)=|" + re.escape(LZ4_MAGIC)
+)
 """First field of a record, after the first byte of its length; or the data of an lz4 chunk."""
 BEFORE_FIELD_BYTES = 5
 """Bytes from the start of a record to its match of RECORD_START."""
@@ -216,19 +247,24 @@ class Scan:
 
 
 def scan_bag(path: Path, report: OnProgress = lambda _done, _total: None) -> Scan:
-    """Read a bag from end to end, one chunk at a time; report bytes. Raises OSError where it cannot be read."""
+    """Read a bag from end to end, one chunk at a time; report bytes. Raises OSError where it cannot
+    be read.
+    """
     with path.open("rb") as file:
         scanner = _Scanner(file, report)
         scanner.run()
     # connections in chunks are checked, so they take precedence over those at the end of the file
-    return Scan(scanner.end, scanner.chunks, scanner.trailing | scanner.connections, scanner.damages)
+    return Scan(
+        scanner.end, scanner.chunks, scanner.trailing | scanner.connections, scanner.damages
+    )
 
 
 class _Scanner:
     """Pass over a file from record to record, and after damage to the next plausible one."""
 
     def __init__(self, file: BinaryIO, report: OnProgress) -> None:
-        self._file, self._report = file, report
+        self._file = file
+        self._report = report
         self.end = file.seek(0, 2)
         self.read = Source(self._fetch, Budget(self.end))
         self.chunks: list[Chunk] = []
@@ -268,7 +304,9 @@ class _Scanner:
         return record.end
 
     def _take_other(self, record: BagRecord) -> None:
-        """Note a connection, pass over index records. Raises BagFormatError where they are damaged."""
+        """Note a connection, pass over index records. Raises BagFormatError where they are
+        damaged.
+        """
         if record.op is Op.CONNECTION:
             found = read_connection(self.read, record)
             if len(self.trailing) >= MAX_CONNECTIONS:
@@ -290,15 +328,21 @@ class _Scanner:
         elif found.chunk.content is None or resumed == self.end:
             self._take(at, found)
             lost_at = at if found.chunk.content else found.end
-            self.damages.append(Damage(lost_at, resumed - lost_at, f"{found.why} (undamaged messages recovered)"))
+            self.damages.append(
+                Damage(lost_at, resumed - lost_at, f"{found.why} (undamaged messages recovered)")
+            )
         else:
             self._drop_chunk(at, record, resumed, "damaged data of a chunk")
         return resumed
 
     def _take(self, at: int, found: Examined) -> bool:
         """Add a chunk; return False for one that contradicts others or repeats one."""
-        why, chunk = "", found.chunk
-        if any(n in self.connections and not self.connections[n].is_like(c) for n, c in found.connections.items()):
+        why = ""
+        chunk = found.chunk
+        if any(
+            n in self.connections and not self.connections[n].is_like(c)
+            for n, c in found.connections.items()
+        ):
             why = "chunk of another recording, with other topics"
         elif len(self.connections.keys() | found.connections) > MAX_CONNECTIONS:
             why = f"more than {MAX_CONNECTIONS} topics"
@@ -336,7 +380,9 @@ class _Scanner:
         """Return the offset of the next plausible record, or the end of the file."""
         for window_at in range(at, self.end, WINDOW_BYTES):
             self._report(window_at, self.end)
-            for match in RECORD_START.finditer(self.read(window_at, WINDOW_BYTES + MAX_START_BYTES)):
+            for match in RECORD_START.finditer(
+                self.read(window_at, WINDOW_BYTES + MAX_START_BYTES)
+            ):
                 before = 0 if match[0] == LZ4_MAGIC else BEFORE_FIELD_BYTES
                 start = window_at + match.start() - before
                 if start >= at and self._is_plausible(start):
@@ -357,13 +403,22 @@ class _Scanner:
         return False
 
     def _is_at_end(self, at: int) -> bool:
-        """Return whether a connection before this offset is one of the file's end; in a chunk, a message follows."""
+        """Return whether a connection before this offset is one of the file's end; in a chunk, a
+        message follows.
+        """
         return at == self.end or read_record(self.read, at).op in {Op.CONNECTION, Op.CHUNK_INFO}
 
     def _find_chunk(self, at: int) -> BagRecord | None:
-        """Return `find_chunk`, except messages visible in lz4 data: parts of those are stored elsewhere."""
+        """Return `find_chunk`, except messages visible in lz4 data: parts of those are stored
+        elsewhere.
+        """
         chunk = find_chunk(self.read, at)
-        if chunk and is_headless(chunk) and chunk.fields["compression"] == b"none" and not self._is_plain:
+        if (
+            chunk
+            and is_headless(chunk)
+            and chunk.fields["compression"] == b"none"
+            and not self._is_plain
+        ):
             raise BagFormatError("message outside of any chunk")
         return chunk
 

@@ -1,4 +1,6 @@
-"""Playback of a recording by librealsense (`--reader sdk`), with the same results as the built-in reader."""
+"""Playback of a recording by librealsense (`--reader sdk`), with the same results as the built-in
+reader.
+"""
 
 import atexit
 import gc
@@ -18,21 +20,26 @@ from nlos_cam.recording.salvage import scan_bag
 
 POLL_S = 0.05
 START_TIMEOUT_S = 30.0
-"""Before its first frame, a playback that has not begun has the same status as one that has ended."""
+"""Before its first frame, a playback that has not begun has the same status as one that has
+ended.
+"""
 
 
 class SdkReplayCamera:
-    """Camera that plays a .bag through librealsense, from the first frame at each iteration, without drops.
+    """Camera that plays a .bag through librealsense, from the first frame at each iteration,
+    without drops.
 
-    Use it as a context manager, which stops the SDK's threads; iterate in one thread. A frame's settings are those with
-    which the recording began. Since damaged files can crash or hang the SDK, opening reads every byte with the built-in
-    reader first. Raises what ReplayCamera raises, but on opening, and CameraError without the SDK.
+    Use it as a context manager, which stops the SDK's threads; iterate in one thread. A frame's
+    settings are those with which the recording began. Since damaged files can crash or hang the
+    SDK, opening reads every byte with the built-in reader first. Raises what ReplayCamera raises,
+    but on opening, and CameraError without the SDK.
     """
 
     def __init__(self, path: Path) -> None:
         self.uri = f"bag:{path}"
         self.rig: Rig | None = None
-        self._bag, self._sdk = open_lidar_bag(path), load_sdk()
+        self._bag = open_lidar_bag(path)
+        self._sdk = load_sdk()
         self._path = self._bag.path
         self._check_all()
         self.identity: Mapping[str, str] = identity_of(self._bag)
@@ -66,7 +73,9 @@ class SdkReplayCamera:
 
     def __enter__(self) -> Self:
         self._entered = True
-        atexit.register(self.__exit__)  # a program that ends inside the block would crash in the SDK's threads
+        atexit.register(
+            self.__exit__
+        )  # a program that ends inside the block would crash in the SDK's threads
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -95,30 +104,38 @@ class SdkReplayCamera:
             self._check_end(playback.get_position() / 1e9)
 
     def _check_end(self, reached_s: float) -> None:
-        """Raise RecordingError where fewer frames came than the index lists: the SDK ends silently at damage."""
+        """Raise RecordingError where fewer frames came than the index lists: the SDK ends silently
+        at damage.
+        """
         for stream in FORMATS:
-            listed, came = self._bag.streams[stream].frames, self.arrived[stream]
+            listed = self._bag.streams[stream].frames
+            came = self.arrived[stream]
             if came < listed:
                 raise self._damaged(
-                    f"is damaged {reached_s:.1f} s into its {self._bag.end_ns / 1e9:.1f} s: librealsense played "
-                    f"{came} of {listed} {stream} frames"
+                    f"is damaged {reached_s:.1f} s into its {self._bag.end_ns / 1e9:.1f} s:"
+                    f" librealsense played {came} of {listed} {stream} frames"
                 )
 
     def telemetry(self, ending: str = "") -> Mapping[str, float]:
         return self._session.telemetry(ending) if self._session else {}
 
     def _count(self, inbox: SampleQueue) -> None:
-        self.incomplete, self.dropped, self.arrived = inbox.incomplete, inbox.dropped, inbox.arrived
+        self.incomplete = inbox.incomplete
+        self.dropped = inbox.dropped
+        self.arrived = inbox.arrived
         self.counts = inbox.counts
 
     def _next(self, inbox: SampleQueue, playback: Any) -> FrameSet | None:
         waited_s = 0.0
         while (found := inbox.take(POLL_S)) is None and not inbox.ended:
             waited_s += POLL_S
-            # polled: a callback from one of the SDK's ending threads could deadlock with the interpreter
+            # polled: a callback from one of the SDK's ending threads could deadlock with the
+            # interpreter
             stopped = playback.current_status() == self._sdk.playback_status.stopped
             if stopped and inbox.arrived.total() > 0:
                 inbox.finish()
             elif waited_s > START_TIMEOUT_S:
-                raise RecordingError(f"{self._path} gave no frame in {START_TIMEOUT_S:.0f} s: record it again")
+                raise RecordingError(
+                    f"{self._path} gave no frame in {START_TIMEOUT_S:.0f} s: record it again"
+                )
         return found

@@ -1,4 +1,6 @@
-"""Sidecar of a recording, F.json beside F.bag: device, settings, temperatures, calibration, label, summary."""
+"""Sidecar of a recording, F.json beside F.bag: device, settings, temperatures, calibration, label,
+summary.
+"""
 
 import hashlib
 import platform
@@ -23,8 +25,8 @@ from nlos_cam.recording.playback import VerifyResult
 from nlos_cam.recording.quality import Quality
 
 State = Literal["recording", "complete", "interrupted", "lost", "disk full", "damaged"]
-"""recording: in progress, or killed. interrupted: by Ctrl-C. lost: the camera vanished. damaged: the file holds fewer
-frames than came.
+"""recording: in progress, or killed. interrupted: by Ctrl-C. lost: the camera vanished. damaged:
+the file holds fewer frames than came.
 """
 Share = Annotated[float, Field(ge=0, le=1)]
 Count = Annotated[int, Field(ge=0)]
@@ -32,7 +34,9 @@ PACKAGES = ("nlos-cam", "pyrealsense2")
 TEMPERATURE_INTERVAL_S = 10.0
 """Seconds between temperature readings, each of which rewrites the file."""
 MAX_TEMPERATURES = 1000
-"""Bound on the readings in the file; beyond it every other one is dropped, and the interval doubles."""
+"""Bound on the readings in the file; beyond it every other one is dropped, and the interval
+doubles.
+"""
 
 
 class Temperatures(Record):
@@ -107,7 +111,9 @@ def load_sidecar(path: Path) -> Sidecar:
     try:
         return Sidecar.model_validate_json(read_bounded(path, TEXT_LIMIT), strict=True)
     except FileNotFoundError as error:
-        raise RecordingError(f"no sidecar {path}: `nlos-cam capture` writes one beside each recording") from error
+        raise RecordingError(
+            f"no sidecar {path}: `nlos-cam capture` writes one beside each recording"
+        ) from error
     except ValidationError as error:
         raise RecordingError(f"{path} is not a sidecar: {first_problem(error)}") from error
     except (OSError, MemoryError) as error:
@@ -115,8 +121,13 @@ def load_sidecar(path: Path) -> Sidecar:
 
 
 def versions() -> dict[str, str]:
-    """Return the versions of this program, librealsense's Python package and Python, and the platform."""
-    found = {"python": platform.python_version(), "platform": f"{platform.system().lower()} {platform.machine()}"}
+    """Return the versions of this program, librealsense's Python package and Python, and the
+    platform.
+    """
+    found = {
+        "python": platform.python_version(),
+        "platform": f"{platform.system().lower()} {platform.machine()}",
+    }
     for package in PACKAGES:
         with suppress(PackageNotFoundError):  # librealsense has no package for some machines
             found[package] = version(package)
@@ -124,8 +135,12 @@ def versions() -> dict[str, str]:
 
 
 def load_measured_wall(path: Path) -> tuple[Rig, WallFile]:
-    """Return the rig of a wall record, and its path and checksum. Raises RecordFileError for any other file."""
-    return load_wall(path).rig, WallFile(path=str(path), sha256=hashlib.sha256(path.read_bytes()).hexdigest())
+    """Return the rig of a wall record, and its path and checksum. Raises RecordFileError for any
+    other file.
+    """
+    return load_wall(path).rig, WallFile(
+        path=str(path), sha256=hashlib.sha256(path.read_bytes()).hexdigest()
+    )
 
 
 def summary_of(found: VerifyResult | None, quality: Quality, events: Mapping[str, int]) -> Summary:
@@ -138,7 +153,8 @@ def summary_of(found: VerifyResult | None, quality: Quality, events: Mapping[str
 
 
 class SidecarFile:
-    """Sidecar during a recording; its file is replaced atomically at each update. For one thread; `finish` ends it.
+    """Sidecar during a recording; its file is replaced atomically at each update. For one thread;
+    `finish` ends it.
 
     Creating and finishing it raise DiskFullError where it cannot be written.
     """
@@ -154,7 +170,8 @@ class SidecarFile:
     ) -> None:
         self.path = path
         self._first_s: float | None = None
-        self._read_s, self._every_s = float("-inf"), TEMPERATURE_INTERVAL_S
+        self._read_s = float("-inf")
+        self._every_s = TEMPERATURE_INTERVAL_S
         self._camera = camera
         self._sidecar = Sidecar(
             label=label,
@@ -172,7 +189,9 @@ class SidecarFile:
         self._write()
 
     def on_frame(self, frame: Frame) -> None:
-        """Record the settings of the first frame, and the temperatures every TEMPERATURE_INTERVAL_S."""
+        """Record the settings of the first frame, and the temperatures every
+        TEMPERATURE_INTERVAL_S.
+        """
         if self._first_s is None:
             self._first_s = frame.timestamp_s
             self._sidecar = self._sidecar.model_copy(update={"settings": finite(frame.settings)})
@@ -188,7 +207,8 @@ class SidecarFile:
             return
         series = [*self._sidecar.temperatures, Temperatures(time_s=time_s, celsius=celsius)]
         if len(series) > MAX_TEMPERATURES:
-            series, self._every_s = series[::2], 2 * self._every_s
+            series = series[::2]
+            self._every_s = 2 * self._every_s
         self._sidecar = self._sidecar.model_copy(update={"temperatures": series})
 
     def finish(self, state: State, summary: Summary) -> None:
@@ -201,4 +221,6 @@ class SidecarFile:
             with atomic_file(self.path) as part:
                 part.write_text(self._sidecar.model_dump_json(indent=2) + "\n", encoding="utf-8")
         except OSError as error:
-            raise DiskFullError(f"{self.path} cannot be written ({error.strerror}): free some space") from error
+            raise DiskFullError(
+                f"{self.path} cannot be written ({error.strerror}): free some space"
+            ) from error
