@@ -79,7 +79,16 @@ from .echoes import MultiBounce
 from .effects import EFFECTS, Effects, included
 from .geometry import cast
 from .glossy import glossy_basis, histograms
-from .gradients import DepthBound, Gradients, PoseFit, SceneVector, depth_bound, fit_pose, intensity_noise, moved
+from .gradients import (
+    DepthBound,
+    Gradients,
+    PoseFit,
+    SceneVector,
+    depth_bound,
+    fit_pose,
+    intensity_noise,
+    moved,
+)
 from .job import TransportJob
 from .material import Material, Surface, phong, retroreflective
 from .patches import JUMP_M

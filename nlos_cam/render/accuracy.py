@@ -23,15 +23,21 @@ class Accuracy:
     object_stride: int = 1
     """Cells of the depth map, along each axis, that form one patch."""
     finest_cells: int = 0
-    """Cells along a side of a depth map; finer maps join cells so that patches keep their size, and 0 joins none."""
+    """Cells along a side of a depth map; finer maps join cells so that patches keep their size, and
+    0 joins none.
+    """
     sectors: int = 16
     """Sectors per face of the horizon tables: affects time, not the result."""
     beams_per_cell: int = 1
     """Beams along each axis of a map cell."""
     scatter_error: float = 5e-3
-    """Error (relative L1) of a BRDF's tables, which have as many nodes of incoming light as it takes."""
+    """Error (relative L1) of a BRDF's tables, which have as many nodes of incoming light as it
+    takes.
+    """
     tolerance: float = 1e-3
-    """Largest change (relative L1 of the transient) by all effects that a plan leaves out together."""
+    """Largest change (relative L1 of the transient) by all effects that a plan leaves out
+    together.
+    """
 
     def __post_init__(self) -> None:
         ranges = {
@@ -48,12 +54,22 @@ class Accuracy:
             if not least <= (value := getattr(self, field)) <= most:
                 raise SceneError(f"{field} is {value}: it must be from {least} to {most}")
         if self.sub_bins not in {0, 1, 2, 4, 8, 16, 32, 64}:
-            raise SceneError(f"sub_bins is {self.sub_bins}: it must be a power of two up to 64, or 0 for brute force")
+            raise SceneError(
+                f"sub_bins is {self.sub_bins}: it must be a power of two up to 64, or 0 for brute"
+                " force"
+            )
 
 
 STOPS = {
     "draft": Accuracy(
-        "draft", 40, 32, sub_bins=4, object_stride=2, finest_cells=64, scatter_error=3e-2, tolerance=3e-2
+        "draft",
+        40,
+        32,
+        sub_bins=4,
+        object_stride=2,
+        finest_cells=64,
+        scatter_error=3e-2,
+        tolerance=3e-2,
     ),
     "standard": Accuracy("standard", finest_cells=96, scatter_error=1.5e-2),
     "fine": Accuracy("fine", sub_bins=64, scatter_error=1e-3, tolerance=1e-4),
@@ -66,5 +82,7 @@ def accuracy_named(name: str | Accuracy) -> Accuracy:
     if isinstance(name, Accuracy):
         return name
     if name not in STOPS:
-        raise UnknownNameError(f"no accuracy {name!r}.{did_you_mean(name, STOPS)} Choose one of {', '.join(STOPS)}")
+        raise UnknownNameError(
+            f"no accuracy {name!r}.{did_you_mean(name, STOPS)} Choose one of {', '.join(STOPS)}"
+        )
     return STOPS[name]

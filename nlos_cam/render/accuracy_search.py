@@ -1,8 +1,10 @@
-"""Search for the cheapest accuracy within an error bound, or the most accurate within a time budget, on a given scene.
+"""Search for the cheapest accuracy within an error bound, or the most accurate within a time
+budget, on a given scene.
 
-Errors are measured: brute force on some beams, and every stop on the same. Times are extrapolated from two sizes of a
-small share of the beams, since planning and tables are paid once and beams one by one. The search costs about as much
-as three beams in a hundred by brute force; the budget is for the rendering after it.
+Errors are measured: brute force on some beams, and every stop on the same. Times are extrapolated
+from two sizes of a small share of the beams, since planning and tables are paid once and beams one
+by one. The search costs about as much as three beams in a hundred by brute force; the budget is for
+the rendering after it.
 """
 
 import time
@@ -41,7 +43,9 @@ class EchoMaps:
 
     @classmethod
     def of_beams(cls, rendering: Rendering) -> Self:
-        """Return the strongest three-bounce bin of each beam: stricter than maps, in which a direct return may win."""
+        """Return the strongest three-bounce bin of each beam: stricter than maps, in which a direct
+        return may win.
+        """
         multi = rendering.multi
         return cls(multi.peak.ravel(), multi.path_m.ravel(), rendering.depth_m.ravel())
 
@@ -74,7 +78,9 @@ class Agreement:
 
 
 def relative_error(found: Floating, truth: Floating) -> Floating:
-    """Return |found - truth| / truth (n,); where the truth is 0, 0 if nothing was found and else 1."""
+    """Return |found - truth| / truth (n,); where the truth is 0, 0 if nothing was found and else
+    1.
+    """
     off = np.abs(found - truth)
     return np.divide(off, truth, out=(off > 0).astype(off.dtype), where=truth > 0)
 
@@ -83,7 +89,9 @@ def agreement(found: EchoMaps, truth: EchoMaps, bin_m: float) -> Agreement:
     """Return the agreement of echoes (at least one) with the true ones."""
     error = relative_error(found.intensity, truth.intensity)
     bins = np.abs(found.path_m - truth.path_m) / bin_m
-    bins[np.isnan(found.path_m) & np.isnan(truth.path_m)] = 0  # NaN of one alone is in no bin of the other
+    bins[np.isnan(found.path_m) & np.isnan(truth.path_m)] = (
+        0  # NaN of one alone is in no bin of the other
+    )
     depth = 1000 * np.abs(found.depth_m - truth.depth_m)
     depth = depth[~np.isnan(depth)]
     return Agreement(
@@ -100,7 +108,9 @@ def agreement(found: EchoMaps, truth: EchoMaps, bin_m: float) -> Agreement:
 SAMPLE_BEAMS = 32
 """Smallest number of beams summed by brute force."""
 CAUTION = 1.5
-"""Factor on the largest error of a sample: at least the 99th percentile of all in nine draws of ten."""
+"""Factor on the largest error of a sample: at least the 99th percentile of all in nine draws of
+ten.
+"""
 SHARE = 4
 """One beam in SHARE is timed, and one in SHARE of those."""
 REPEATS = 3
@@ -113,7 +123,9 @@ class AccuracyChoice:
 
     accuracy: Accuracy
     predicted_error: float
-    """99th percentile of the relative error of the peak intensity, rather too large than too small."""
+    """99th percentile of the relative error of the peak intensity, rather too large than too
+    small.
+    """
     predicted_seconds: float
 
 
@@ -122,7 +134,9 @@ Stopwatch = Callable[[Work, int], float]
 """Function that returns the shortest of a number of runs of some work, in seconds."""
 
 
-def least_seconds(work: Work, repeats: int, clock: Callable[[], float] = time.perf_counter) -> float:
+def least_seconds(
+    work: Work, repeats: int, clock: Callable[[], float] = time.perf_counter
+) -> float:
     """Return the shortest of `repeats` runs by the clock, in seconds."""
     seconds: list[float] = []
     for _ in range(repeats):
@@ -142,9 +156,11 @@ def choose(
     stops: Collection[Accuracy] = tuple(STOPS.values()),
     stopwatch: Stopwatch = least_seconds,
 ) -> AccuracyChoice:
-    """Return the cheapest stop within `max_error`; with `max_seconds` alone, the most accurate within it.
+    """Return the cheapest stop within `max_error`; with `max_seconds` alone, the most accurate
+    within it.
 
-    Raises SceneError if no stop is, naming the nearest and its excess, and for bounds that are negative or not finite.
+    Raises SceneError if no stop is, naming the nearest and its excess, and for bounds that are
+    negative or not finite.
     """
     for name, value in (("max_error", max_error), ("max_seconds", max_seconds)):
         if value is not None and not 0 <= value < inf:
@@ -154,10 +170,17 @@ def choose(
     return pick(predict(scene, effects, backend, stops, stopwatch), max_error, max_seconds)
 
 
-def pick(choices: Collection[AccuracyChoice], max_error: float | None, max_seconds: float | None) -> AccuracyChoice:
+def pick(
+    choices: Collection[AccuracyChoice], max_error: float | None, max_seconds: float | None
+) -> AccuracyChoice:
     """Return the choice of `choose` among these."""
-    error, seconds = inf if max_error is None else max_error, inf if max_seconds is None else max_seconds
-    kept = [choice for choice in choices if choice.predicted_error <= error and choice.predicted_seconds <= seconds]
+    error = inf if max_error is None else max_error
+    seconds = inf if max_seconds is None else max_seconds
+    kept = [
+        choice
+        for choice in choices
+        if choice.predicted_error <= error and choice.predicted_seconds <= seconds
+    ]
     if not kept:
         raise SceneError(_nothing_keeps(choices, error, seconds))
     if max_error is None:
@@ -165,27 +188,37 @@ def pick(choices: Collection[AccuracyChoice], max_error: float | None, max_secon
     return min(kept, key=lambda choice: (choice.predicted_seconds, choice.predicted_error))
 
 
-def _nothing_keeps(choices: Collection[AccuracyChoice], max_error: float, max_seconds: float) -> str:
+def _nothing_keeps(
+    choices: Collection[AccuracyChoice], max_error: float, max_seconds: float
+) -> str:
     """Return the error message for bounds that no choice keeps, with the nearest."""
 
     def missed(choice: AccuracyChoice) -> float:
-        return max(choice.predicted_error / max(max_error, 1e-9), choice.predicted_seconds / max(max_seconds, 1e-9))
+        return max(
+            choice.predicted_error / max(max_error, 1e-9),
+            choice.predicted_seconds / max(max_seconds, 1e-9),
+        )
 
     nearest = min(choices, key=missed)
-    error, seconds = nearest.predicted_error, nearest.predicted_seconds
-    asked = [f"max_error {max_error:g}"] * (max_error < inf) + [f"max_seconds {max_seconds:g}"] * (max_seconds < inf)
+    error = nearest.predicted_error
+    seconds = nearest.predicted_seconds
+    asked = [f"max_error {max_error:g}"] * (max_error < inf) + [f"max_seconds {max_seconds:g}"] * (
+        max_seconds < inf
+    )
     over = [f"an error of {error:.3g} is {error - max_error:.3g} too large"] * (error > max_error)
     over += [f"{seconds:.3g} s is {seconds - max_seconds:.3g} s too long"] * (seconds > max_seconds)
     return (
-        f"no accuracy keeps {' and '.join(asked)}: the nearest is {nearest.accuracy.name}, where {' and '.join(over)}; "
-        "raise the limit by that"
+        f"no accuracy keeps {' and '.join(asked)}: the nearest is {nearest.accuracy.name}, where"
+        f" {' and '.join(over)}; raise the limit by that"
     )
 
 
 def predict(
     scene: Scene, effects: Effects, backend: str, stops: Collection[Accuracy], stopwatch: Stopwatch
 ) -> list[AccuracyChoice]:
-    """Return the predicted error and time of each stop. One must be brute force, and all cast one beam per cell."""
+    """Return the predicted error and time of each stop. One must be brute force, and all cast one
+    beam per cell.
+    """
     (brute,) = (stop for stop in stops if stop.sub_bins == 0)
     whole = prepare(scene, brute, effects)
     problem = prepare(scene, brute, _three_bounces_of(whole.plan))
@@ -213,28 +246,41 @@ def _three_bounces_of(plan: Plan) -> Effects:
 
 
 def sample_beams(lit: Int64, count: int) -> Int64:
-    """Return about `count` beams spread over the map: one from each strip, at random but always the same."""
+    """Return about `count` beams spread over the map: one from each strip, at random but always the
+    same.
+    """
     if len(lit) <= count:
         return lit
-    # Stratified: errors vary smoothly over the map, so one beam from each strip has less variance than free draws.
+    # Stratified: errors vary smoothly over the map, so one beam from each strip has less variance
+    # than free draws.
     edges = np.linspace(0, len(lit), count + 1)
     within = np.random.default_rng(0).random(count)
     return lit[(edges[:-1] + within * np.diff(edges)).astype(np.int64)]
 
 
 def _whole_rounds(beams: float, tile: int) -> int:
-    """Return the smallest number of beams, at least `beams`, that gives every thread the same number of tiles."""
+    """Return the smallest number of beams, at least `beams`, that gives every thread the same
+    number of tiles.
+    """
     # An incomplete round leaves threads idle, and its time would not grow with the beams in it.
     one_round = tile * numba.get_num_threads()
     return int(-(-beams // one_round)) * one_round
 
 
-def _seconds(scene: Scene, stop: Accuracy, effects: Effects, backend: str, lit: Int64, stopwatch: Stopwatch) -> float:
-    """Return the predicted seconds of a whole rendering, from the times of some beams and of some of those."""
+def _seconds(
+    scene: Scene, stop: Accuracy, effects: Effects, backend: str, lit: Int64, stopwatch: Stopwatch
+) -> float:
+    """Return the predicted seconds of a whole rendering, from the times of some beams and of some
+    of those.
+    """
     if stop.sub_bins == 0:
-        tile, repeats, beams = 1, 1, SAMPLE_BEAMS
+        tile = 1
+        repeats = 1
+        beams = SAMPLE_BEAMS
     else:
-        tile, repeats, beams = BEAM_TILE, REPEATS, len(lit) / SHARE
+        tile = BEAM_TILE
+        repeats = REPEATS
+        beams = len(lit) / SHARE
     few = sample_beams(lit, _whole_rounds(beams / SHARE, tile))
     many = sample_beams(lit, max(_whole_rounds(beams, tile), 2 * len(few)))
 
@@ -271,7 +317,9 @@ def costs(
     backend: str = "cpu",
     clock: Callable[[], float] = time.perf_counter,
 ) -> dict[str, float]:
-    """Return the seconds that each included effect adds to a rendering, by name; 0 for effects left out."""
+    """Return the seconds that each included effect adds to a rendering, by name; 0 for effects left
+    out.
+    """
     names = [effect.name for effect in plan if effect.included]
 
     def least(effects: list[str]) -> float:
@@ -279,5 +327,7 @@ def costs(
 
     least(names)  # compiles
     whole = least(names)
-    added = {name: max(whole - least([other for other in names if other != name]), 0.0) for name in names}
+    added = {
+        name: max(whole - least([other for other in names if other != name]), 0.0) for name in names
+    }
     return {effect.name: added.get(effect.name, 0.0) for effect in plan}

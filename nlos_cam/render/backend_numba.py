@@ -1,12 +1,14 @@
 """Fast backend for the CPU (numba, float32): S2 factorized at the object's patches.
 
-weight(p, s, q) = A(p, s) B(s, q) and length = (d1 + d2)(p, s) + (d3 + d4)(s, q) for beam p, patch s, relay cell q. So
-each patch gets one table of B over d3 + d4, counted in sub-bins, and each beam adds the table, shifted by d1 + d2 to
-the nearest sub-bin: n s + s q terms in place of n s q. The sums of sub-bins to bins are made in advance for each shift
-within a bin, so that a beam adds one row of a table per patch (`beam_sums`). Neither rounding is biased: a path lies
-anywhere within its sub-bin, and rounding to the nearest shift puts a bin's edge in the middle of a sub-bin.
+weight(p, s, q) = A(p, s) B(s, q) and length = (d1 + d2)(p, s) + (d3 + d4)(s, q) for beam p, patch
+s, relay cell q. So each patch gets one table of B over d3 + d4, counted in sub-bins, and each beam
+adds the table, shifted by d1 + d2 to the nearest sub-bin: n s + s q terms in place of n s q. The
+sums of sub-bins to bins are made in advance for each shift within a bin, so that a beam adds one
+row of a table per patch (`beam_sums`). Neither rounding is biased: a path lies anywhere within its
+sub-bin, and rounding to the nearest shift puts a bin's edge in the middle of a sub-bin.
 
-numba's cache depends on this file alone: after a change of a kernel that is imported here, delete __pycache__.
+numba's cache depends on this file alone: after a change of a kernel that is imported here, delete
+__pycache__.
 """
 
 from functools import lru_cache
@@ -18,7 +20,13 @@ from nlos_calibration.arrays import Float32, Float64, Int32
 from numpy.typing import NDArray
 
 from nlos_cam.frames import inner, int64
-from nlos_cam.render.beam_sums import NumbaGroups, NumbaTables, groups_of, shift_and_add, strongest_in_window
+from nlos_cam.render.beam_sums import (
+    NumbaGroups,
+    NumbaTables,
+    groups_of,
+    shift_and_add,
+    strongest_in_window,
+)
 from nlos_cam.render.echoes import MultiBounce, strongest
 from nlos_cam.render.interreflection import add_interreflection
 from nlos_cam.render.job import TransportJob
@@ -46,10 +54,17 @@ COUNTERS = 4
 
 @numba.njit(cache=True, error_model="numpy", fastmath=FAST, inline="always")
 def returns(
-    verdict: int, legs: NumbaLegs, s: int, start: int, surface: NumbaSurface, relay: NumbaPoints, optics: NumbaOptics,
+    verdict: int,
+    legs: NumbaLegs,
+    s: int,
+    start: int,
+    surface: NumbaSurface,
+    relay: NumbaPoints,
+    optics: NumbaOptics,
     field: HeightField,
-) -> int:  # fmt: skip
-    """Fill in B(s, q) of S2 for a patch and the cells of a tile, with d3 + d4 in sub-bins as the length.
+) -> int:
+    """Fill in B(s, q) of S2 for a patch and the cells of a tile, with d3 + d4 in sub-bins as the
+    length.
 
     Return the number of legs, 0 for a tile without light.
     """
@@ -64,13 +79,20 @@ def returns(
 
 @inner(error_model="numpy", fastmath=FAST)
 def _count(
-    s: int, surface: NumbaSurface, relay: NumbaPoints, optics: NumbaOptics, field: HeightField, factor: Float32,
-    start: np.float32, histogram: Float32,
-) -> None:  # fmt: skip
+    s: int,
+    surface: NumbaSurface,
+    relay: NumbaPoints,
+    optics: NumbaOptics,
+    field: HeightField,
+    factor: Float32,
+    start: np.float32,
+    histogram: Float32,
+) -> None:
     """Count B over d3 + d4 of one patch in sub-bins, from the sub-bin `start` on."""
     # Neighboring cells often share a sub-bin, and each sum there would wait for the one before.
     lanes = np.zeros((COUNTERS, len(histogram)), np.float32)
-    legs, verdicts = scratch(relay.tile), judge(s, s + 1, surface, relay.bounds_m, optics, field)[0]
+    legs = scratch(relay.tile)
+    verdicts = judge(s, s + 1, surface, relay.bounds_m, optics, field)[0]
     for tile in range(len(verdicts)):
         count = returns(verdicts[tile], legs, s, tile * relay.tile, surface, relay, optics, field)
         if len(factor):
@@ -86,34 +108,54 @@ def _count(
 
 @numba.njit(cache=True, parallel=True)
 def sub_bins(
-    surface: NumbaSurface, relay: NumbaPoints, optics: NumbaOptics, field: HeightField, factor: Float32,
-    first: Int32, per_bin: int, width: int,
-) -> Float32:  # fmt: skip
-    """Return histograms (n, width * per_bin) of B over d3 + d4 in sub-bins, each from a bin (n,) on.
+    surface: NumbaSurface,
+    relay: NumbaPoints,
+    optics: NumbaOptics,
+    field: HeightField,
+    factor: Float32,
+    first: Int32,
+    per_bin: int,
+    width: int,
+) -> Float32:
+    """Return histograms (n, width * per_bin) of B over d3 + d4 in sub-bins, each from a bin (n,)
+    on.
 
     A BRDF's `factor` (n, m) is in the order of the tiles, or empty.
     """
     histogram = np.zeros((len(first), width * per_bin), np.float32)
     for s in numba.prange(len(first)):
-        _count(int64(s), surface, relay, optics, field, factor, np.float32(first[s] * per_bin), histogram[s])
+        _count(
+            int64(s),
+            surface,
+            relay,
+            optics,
+            field,
+            factor,
+            np.float32(first[s] * per_bin),
+            histogram[s],
+        )
     return histogram
 
 
 @numba.njit(cache=True, parallel=True)
 def tables(first: Int32, histogram: Float32, per_bin: int) -> NumbaTables:
     """Return sub-bin histograms (n, width * per_bin) as sums to bins, for each shift."""
-    patches, width = len(histogram), histogram.shape[1] // per_bin
+    patches = len(histogram)
+    width = histogram.shape[1] // per_bin
     rows = np.zeros((patches * per_bin + 1, WINDOW + width), np.float32)
     rest = np.zeros((patches, width + 1), np.float32)
     for s in numba.prange(patches):
         below = np.zeros(width * per_bin + 1)
         for k in range(width * per_bin):
             below[k + 1] = below[k] + histogram[s, k]
-        # Bin i of the table for a shift is a difference of running sums, from sub-bin i per_bin - shift to
-        # (i + 1) per_bin - shift. The sums are float64, so that the difference of large sums keeps the small bins.
+        # Bin i of the table for a shift is a difference of running sums, from sub-bin i per_bin -
+        # shift to (i + 1) per_bin - shift. The sums are float64, so that the difference of large
+        # sums keeps the small bins.
         for shift in range(per_bin):
             for i in range(width):
-                value = np.float32(below[(i + 1) * per_bin - shift] - below[max(i * per_bin - shift, 0)])
+                value = np.float32(
+                    below[(i + 1) * per_bin - shift] - below[max(i * per_bin - shift, 0)]
+                )
                 rows[s * per_bin + shift, WINDOW + i] = value
                 rest[s, i] = max(rest[s, i], value)
         for i in range(width - 1, -1, -1):
@@ -122,18 +164,21 @@ def tables(first: Int32, histogram: Float32, per_bin: int) -> NumbaTables:
 
 
 def histograms(job: TransportJob) -> Float32:
-    """Return histograms (n, bins) of I_multi over path length, for the beams of a job without a BRDF.
+    """Return histograms (n, bins) of I_multi over path length, for the beams of a job without a
+    BRDF.
 
-    The result does not depend on the number of threads: one thread sums each histogram, patches in order.
+    The result does not depend on the number of threads: one thread sums each histogram, patches in
+    order.
     """
     return NumbaJob(job).histograms(np.empty((0, 0), np.float32), np.ones(len(job.laser_spot_m)))
 
 
 def echoes(job: TransportJob) -> MultiBounce:
-    """Return the strongest bins (n,) of the job's beams: those of `histograms`, bit for bit, from a part of its work.
+    """Return the strongest bins (n,) of the job's beams: those of `histograms`, bit for bit, from a
+    part of its work.
 
-    Each beam sums its first bins alone, with a bound on all others; the few beams that the bound does not decide sum
-    the rest too.
+    Each beam sums its first bins alone, with a bound on all others; the few beams that the bound
+    does not decide sum the rest too.
     """
     numba_job = NumbaJob(job)
     every = numba_job.feet(np.ones(len(job.laser_spot_m)))
@@ -145,7 +190,9 @@ def echoes(job: TransportJob) -> MultiBounce:
         tiles, which = np.unique(every.place[unsure] // BEAM_TILE, return_inverse=True)
         whole = shift_and_add(tiles.astype(np.int64), every, *numba_job.sites, table, job.bins)
         rest = strongest(whole[which * BEAM_TILE + every.place[unsure] % BEAM_TILE], job.bin_m)
-        found.peak[unsure], found.runner_up[unsure], found.path_m[unsure] = rest.peak, rest.runner_up, rest.path_m
+        found.peak[unsure] = rest.peak
+        found.runner_up[unsure] = rest.runner_up
+        found.path_m[unsure] = rest.path_m
     return found
 
 
@@ -153,12 +200,19 @@ class NumbaJob:
     """Job in float32, with everything that does not depend on the BRDF computed once."""
 
     def __init__(self, job: TransportJob, *, tiled: bool = True) -> None:
-        patches, relay = job.patches, job.relay
-        self.job, accuracy, self._tiled = job, job.accuracy, tiled
+        patches = job.patches
+        relay = job.relay
+        self.job = job
+        accuracy = job.accuracy
+        self._tiled = tiled
         geometry = *_columns(patches.point_m), *_columns(patches.normal), _single(job.soft_patch_m2)
         low, high, walk = horizons(job)
         highest = high.max(1, initial=0)
-        shaded = highest * reach_cells(job) > patches.point_m[:, 2] if job.field.shades else np.empty(0, np.bool_)
+        shaded = (
+            highest * reach_cells(job) > patches.point_m[:, 2]
+            if job.field.shades
+            else np.empty(0, np.bool_)
+        )
         sites = patches.row, patches.column, low, high, walk, highest, shaded
         self.surface = NumbaSurface(*geometry, _single(job.strength), *sites)
         columns = relay.x_m, relay.y_m, relay.length_m, job.relay_weight
@@ -166,7 +220,9 @@ class NumbaJob:
         edge_x, edge_z = job.edge_m
         edge = np.float32(edge_x), np.float32(edge_z), np.float32(job.near_m**2)
         sectors = accuracy.sectors if job.field.shades else 0
-        self.optics = NumbaOptics(*edge, job.lambertian, np.float32(accuracy.sub_bins / job.bin_m), sectors)
+        self.optics = NumbaOptics(
+            *edge, job.lambertian, np.float32(accuracy.sub_bins / job.bin_m), sectors
+        )
         self.groups, self.centers = groups_of(self.surface, patches.diagonal_m)
         self.first, self.width = table_bins(job)
 
@@ -177,25 +233,38 @@ class NumbaJob:
 
     def feet(self, share: Float64) -> NumbaPoints:
         """Return the beams with a weight (n,) above 0."""
-        some, job = np.flatnonzero(share), self.job
+        some = np.flatnonzero(share)
+        job = self.job
         x, y, _ = job.laser_spot_m[some].T
         return _points(
-            (x, y, job.length_m[some], job.beam_weight[some] * share[some]), 0.0, BEAM_TILE, tiled=self._tiled
+            (x, y, job.length_m[some], job.beam_weight[some] * share[some]),
+            0.0,
+            BEAM_TILE,
+            tiled=self._tiled,
         )
 
     def tables(self, factor: Float32) -> NumbaTables:
         """Return the patches' tables, with a BRDF's factor (n, m) or an empty one."""
-        job, per_bin = self.job, self.job.accuracy.sub_bins
+        per_bin = self.job.accuracy.sub_bins
+        job = self.job
         if factor.size:
             factor = factor[:, np.argsort(self.relay.place)]
-        fine = sub_bins(self.surface, self.relay, *self.sites[3:], factor, self.first, per_bin, self.width)
-        return tables(self.first, add_interreflection(job, self.first, fine) if job.more_bounces else fine, per_bin)
+        fine = sub_bins(
+            self.surface, self.relay, *self.sites[3:], factor, self.first, per_bin, self.width
+        )
+        return tables(
+            self.first,
+            add_interreflection(job, self.first, fine) if job.more_bounces else fine,
+            per_bin,
+        )
 
     def histograms(self, factor: Float32, share: Float64) -> Float32:
         """Return histograms (n, bins) of the beams, each with a weight (n,)."""
         bins = self.job.bins
         feet = self.feet(share)
-        found = shift_and_add(np.arange(len(feet.bounds_m)), feet, *self.sites, self.tables(factor), bins)[feet.place]
+        found = shift_and_add(
+            np.arange(len(feet.bounds_m)), feet, *self.sites, self.tables(factor), bins
+        )[feet.place]
         if len(found) == len(share):
             return found
         histogram = np.zeros((len(share), bins), np.float32)
@@ -214,24 +283,33 @@ def _points(
     x, y, *others = (_single(column) for column in columns)
     order, place, bounds_m = _tiles(x.tobytes(), y.tobytes(), tile, tiled=tiled)
     length, weight = (column[order] for column in others)
-    return NumbaPoints(x[order], y[order], length, weight, np.float32(soft_m2), place, bounds_m, tile)
+    return NumbaPoints(
+        x[order], y[order], length, weight, np.float32(soft_m2), place, bounds_m, tile
+    )
 
 
 @lru_cache(maxsize=8)
 def _tiles(x: bytes, y: bytes, size: int, *, tiled: bool) -> tuple[Int32, Int32, Float32]:
-    """Return the order of points in tiles, each point's place in it, and the tiles' bounds; kept, as rigs come again.
+    """Return the order of points in tiles, each point's place in it, and the tiles' bounds; kept,
+    as rigs come again.
 
-    Points are sorted along x, cut into strips, and sorted along y in each: whole tiles that are nearly square.
+    Points are sorted along x, cut into strips, and sorted along y in each: whole tiles that are
+    nearly square.
     """
-    at_x, at_y = np.frombuffer(x, np.float32), np.frombuffer(y, np.float32)
+    at_x = np.frombuffer(x, np.float32)
+    at_y = np.frombuffer(y, np.float32)
     count = len(at_x)
-    order, tiles = np.arange(count), -(-count // size)
+    order = np.arange(count)
+    tiles = -(-count // size)
     if tiled and tiles:
-        order, strip = np.argsort(at_x, kind="stable"), size * ceil(sqrt(tiles))
+        order = np.argsort(at_x, kind="stable")
+        strip = size * ceil(sqrt(tiles))
         strips = (order[begin : begin + strip] for begin in range(0, count, strip))
         order = np.concatenate([one[np.argsort(at_y[one], kind="stable")] for one in strips])
     ends = [slice(begin, begin + size) for begin in range(0, count, size)]
-    bounds = [[f(axis[order[end]]) for axis in (at_x, at_y) for f in (np.min, np.max)] for end in ends]
+    bounds = [
+        [f(axis[order[end]]) for axis in (at_x, at_y) for f in (np.min, np.max)] for end in ends
+    ]
     place = np.empty(count, np.int32)
     place[order] = np.arange(count)
     return order.astype(np.int32), place, np.array(bounds, np.float32).reshape(-1, 4)
@@ -243,16 +321,26 @@ def _columns(points: Float64) -> tuple[Float32, Float32, Float32]:
 
 def horizons(job: TransportJob) -> tuple[Float32, Float32, NDArray[np.uint8]]:
     """Return the `horizon_table` of the job's patches at its accuracy; empty if nothing shades."""
-    patches, field, accuracy = job.patches, job.field, job.accuracy
+    patches = job.patches
+    field = job.field
+    accuracy = job.accuracy
     if not field.shades:
-        return np.empty((0, 0), np.float32), np.empty((0, 0), np.float32), np.empty((0, 0, 2), np.uint8)
+        return (
+            np.empty((0, 0), np.float32),
+            np.empty((0, 0), np.float32),
+            np.empty((0, 0, 2), np.uint8),
+        )
     where = patches.row, patches.column, patches.point_m[:, 2].copy(), reach_cells(job)
     return horizon_table(field, *where, accuracy.sectors)
 
 
 def reach_cells(job: TransportJob) -> Float64:
-    """Return the longest leg (n,) from each patch along an axis to a beam's spot or a relay cell, in cells."""
-    point, field, relay = job.patches.point_m, job.field, job.relay
+    """Return the longest leg (n,) from each patch along an axis to a beam's spot or a relay cell,
+    in cells.
+    """
+    point = job.patches.point_m
+    field = job.field
+    relay = job.relay
     columns = (job.laser_spot_m[:, 0], relay.x_m), (job.laser_spot_m[:, 1], relay.y_m)
     low = [min(one.min() for one in axis) for axis in columns]
     high = [max(one.max() for one in axis) for axis in columns]
@@ -262,18 +350,23 @@ def reach_cells(job: TransportJob) -> Float64:
 
 
 def table_bins(job: TransportJob) -> tuple[Int32, int]:
-    """Return the bin (n,) before every d3 + d4 of each patch, and the bins from there to the longest of any patch.
+    """Return the bin (n,) before every d3 + d4 of each patch, and the bins from there to the
+    longest of any patch.
 
-    The bins are whole vectors. d3 + d4 is convex over the wall: longest at a corner of the relay, and never shorter
-    than the straight line to the mirror image of the lidar behind the wall (Heron).
+    The bins are whole vectors. d3 + d4 is convex over the wall: longest at a corner of the relay,
+    and never shorter than the straight line to the mirror image of the lidar behind the wall
+    (Heron).
     """
     x, y, z = job.patches.point_m.T
-    relay, lidar = job.relay, job.lidar_m
+    relay = job.relay
+    lidar = job.lidar_m
     longest = np.zeros_like(x)
     for corner_x in (relay.x_m.min(), relay.x_m.max()):
         for corner_y in (relay.y_m.min(), relay.y_m.max()):
             d3 = np.sqrt((x - corner_x) ** 2 + (y - corner_y) ** 2 + z**2)
-            longest = np.maximum(longest, d3 + np.linalg.norm([corner_x - lidar[0], corner_y - lidar[1], lidar[2]]))
+            longest = np.maximum(
+                longest, d3 + np.linalg.norm([corner_x - lidar[0], corner_y - lidar[1], lidar[2]])
+            )
     shortest = np.sqrt((x - lidar[0]) ** 2 + (y - lidar[1]) ** 2 + (z + lidar[2]) ** 2)
     bins = int((longest - shortest).max() / job.bin_m) + 3
     # A hundredth of a bin is far more than the rounding of float32.

@@ -1,7 +1,8 @@
-"""Reference backend, which defines the others: every three-bounce path by itself, in float64 (S2 to S4).
+"""Reference backend, which defines the others: every three-bounce path by itself, in float64 (S2 to
+S4).
 
-Slow on purpose (compiled, and still a minute or two for a whole map): each line is an equation. Interreflection is
-summed path by path too, for small scenes only.
+Slow on purpose (compiled, and still a minute or two for a whole map): each line is an equation.
+Interreflection is summed path by path too, for small scenes only.
 """
 
 from typing import NamedTuple
@@ -24,15 +25,17 @@ MAX_PATHS = 3e10
 def more_paths(job: TransportJob, incident: Float64, returned: Float64) -> Float64:
     """Return histograms (n, bins) of the paths that meet the object twice.
 
-    `incident` (n, patches) is the light of each beam that each patch gives on, `returned` (patches, m) the share of it
-    that reaches the lidar over each relay cell. Raises SceneError for more than MAX_PATHS.
+    `incident` (n, patches) is the light of each beam that each patch gives on, `returned` (patches,
+    m) the share of it that reaches the lidar over each relay cell. Raises SceneError for more than
+    MAX_PATHS.
     """
-    point, cells = job.patches.point_m, wall_cells(job)
+    point = job.patches.point_m
+    cells = wall_cells(job)
     count = incident.size * returned.size * len(cells)
     if count > MAX_PATHS:
         raise SceneError(
-            f"inter-reflection path by path would sum {count:.1g} paths (limit {MAX_PATHS:.0e}): choose fine, "
-            "or drop inter-reflection from the effects"
+            f"inter-reflection path by path would sum {count:.1g} paths (limit {MAX_PATHS:.0e}):"
+            " choose fine, or drop inter-reflection from the effects"
         )
     relay = np.stack([job.relay.x_m, job.relay.y_m, np.zeros_like(job.relay.x_m)], 1)
     there, back = wall_factors(job, cells)
@@ -41,7 +44,9 @@ def more_paths(job: TransportJob, incident: Float64, returned: Float64) -> Float
     d3 = np.linalg.norm(point[:, None] - relay, axis=-1) + job.relay.length_m
     to_wall = np.linalg.norm(point[:, None] - cells, axis=-1)
     factors = object_factors(job)
-    return _sum(incident, d2, returned, d3, factors, point, there, back, to_wall, job.bin_m, job.bins)
+    return _sum(
+        incident, d2, returned, d3, factors, point, there, back, to_wall, job.bin_m, job.bins
+    )
 
 
 @numba.njit(cache=True, parallel=True)
@@ -66,12 +71,14 @@ def _sum(
             for b in range(len(points)):
                 away = np.sqrt(((points[a] - points[b]) ** 2).sum())
                 for q in range(returned.shape[1]):
-                    ends, light = d2[p, a] + d3[b, q], incident[p, a] * returned[b, q]
+                    ends = d2[p, a] + d3[b, q]
+                    light = incident[p, a] * returned[b, q]
                     if light == 0:
                         continue
                     k = int(np.floor((ends + away) / bin_m))
                     if k < bins:
-                        # Spot -> a -> b -> relay cell, and below spot -> a -> wall -> b -> relay cell.
+                        # Spot -> a -> b -> relay cell, and below spot -> a -> wall -> b -> relay
+                        # cell.
                         histogram[p, k] += light * factors[a, b]
                     for w in range(there.shape[1]):
                         k = int(np.floor((ends + to_wall[a, w] + to_wall[b, w]) / bin_m))
@@ -107,22 +114,33 @@ class Cells(NamedTuple):
 
 
 @numba.njit(cache=True, parallel=True)
-def legs(patches: PatchArrays, x: Float64, y: Float64, edge_x: float, edge_z: float, field: HeightField) -> Mask:
-    """Return V (n, m) of the legs between patches and points of the wall: lit side, occluder, the object itself."""
+def legs(
+    patches: PatchArrays, x: Float64, y: Float64, edge_x: float, edge_z: float, field: HeightField
+) -> Mask:
+    """Return V (n, m) of the legs between patches and points of the wall: lit side, occluder, the
+    object itself.
+    """
     table = np.zeros((len(patches.row), len(x)), np.bool_)
     for s in numba.prange(len(patches.row)):
-        point, normal = patches.point_m[s], patches.normal[s]
+        point = patches.point_m[s]
+        normal = patches.normal[s]
         for w in range(len(x)):
             # The sheet is lit from one side only: n . (wall point - patch) > 0.
-            facing = normal[0] * (x[w] - point[0]) + normal[1] * (y[w] - point[1]) - normal[2] * point[2]
+            facing = (
+                normal[0] * (x[w] - point[0]) + normal[1] * (y[w] - point[1]) - normal[2] * point[2]
+            )
             if facing > 0 and not occluded(point[0], point[2], x[w], 0.0, edge_x, edge_z):
                 table[s, w] = visible(field, patches.row[s], patches.column[s], point, x[w], y[w])
     return table
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _incident(spot: Float64, patches: PatchArrays, s: int, near_m: float, lambertian: bool) -> float:
-    """Return the factors of S2 on the leg from a laser spot to a patch: the light that the patch gives on."""
+def _incident(
+    spot: Float64, patches: PatchArrays, s: int, near_m: float, lambertian: bool
+) -> float:
+    """Return the factors of S2 on the leg from a laser spot to a patch: the light that the patch
+    gives on.
+    """
     to_spot = spot - patches.point_m[s]
     d2 = np.sqrt((to_spot**2).sum())
     cos_2 = (patches.normal[s] * to_spot).sum() / d2
@@ -136,10 +154,16 @@ def _returned(
     patches: PatchArrays, s: int, cells: Cells, q: int, near_m: float, lambertian: bool
 ) -> tuple[float, float]:
     """Return the factors of S2 on the leg from a patch over a relay cell to the lidar, and d3."""
-    # Number by number: numba counts references to each array that is unpacked, ten times a path's own time.
-    px, py, z = patches.point_m[s, 0], patches.point_m[s, 1], patches.point_m[s, 2]
-    nx, ny, nz = patches.normal[s, 0], patches.normal[s, 1], patches.normal[s, 2]
-    dx, dy = cells.x_m[q] - px, cells.y_m[q] - py
+    # Number by number: numba counts references to each array that is unpacked, ten times a path's
+    # own time.
+    px = patches.point_m[s, 0]
+    py = patches.point_m[s, 1]
+    z = patches.point_m[s, 2]
+    nx = patches.normal[s, 0]
+    ny = patches.normal[s, 1]
+    nz = patches.normal[s, 2]
+    dx = cells.x_m[q] - px
+    dy = cells.y_m[q] - py
     facing = nx * dx + ny * dy - nz * z
     squared = dx**2 + dy**2 + z**2
     d3 = np.sqrt(squared)
@@ -158,7 +182,9 @@ def _paths(
     bin_m: float,
     bins: int,
 ) -> Float64:
-    """Return histograms (n, bins): for each path p, s, q its weight (S2) in the bin of its length (S4)."""
+    """Return histograms (n, bins): for each path p, s, q its weight (S2) in the bin of its length
+    (S4).
+    """
     histogram = np.zeros((len(spots.point_m), bins))
     for p in numba.prange(len(spots.point_m)):
         for s in range(len(patches.row)):
@@ -181,14 +207,18 @@ def _paths(
 
 
 @numba.njit(cache=True)
-def _ends(spots: Spots, patches: PatchArrays, cells: Cells, near_m: float, lambertian: bool) -> tuple[Float64, Float64]:
+def _ends(
+    spots: Spots, patches: PatchArrays, cells: Cells, near_m: float, lambertian: bool
+) -> tuple[Float64, Float64]:
     """Return both ends of every path: incident (beams, patches) and returned (patches, cells)."""
     incident = np.zeros((len(spots.point_m), len(patches.row)))
     returned = np.zeros((len(patches.row), len(cells.x_m)))
     for s in range(len(patches.row)):
         for p in range(len(spots.point_m)):
             if spots.lit[s, p]:
-                incident[p, s] = spots.weight[p] * _incident(spots.point_m[p], patches, s, near_m, lambertian)
+                incident[p, s] = spots.weight[p] * _incident(
+                    spots.point_m[p], patches, s, near_m, lambertian
+                )
         for q in range(len(cells.x_m)):
             if cells.visible[s, q]:
                 returned[s, q], _ = _returned(patches, s, cells, q, near_m, lambertian)
@@ -206,15 +236,22 @@ def histograms(job: TransportJob) -> Float64:
 
 
 def _three_bounces(job: TransportJob, cells: Cells) -> Float64:
-    """Return the three-bounce histograms in groups of beams so that Ctrl-C works; single beams with a BRDF."""
-    patches, count = job.patch_arrays, len(job.laser_spot_m)
-    histogram, group = np.zeros((count, job.bins)), BEAM_GROUP if job.brdf is None else 1
+    """Return the three-bounce histograms in groups of beams so that Ctrl-C works; single beams with
+    a BRDF.
+    """
+    patches = job.patch_arrays
+    count = len(job.laser_spot_m)
+    histogram = np.zeros((count, job.bins))
+    group = BEAM_GROUP if job.brdf is None else 1
     for which in (slice(start, start + group) for start in range(0, count, group)):
-        # A BRDF couples both legs at the patch: its factor depends on the spot, so each beam has a table of its own.
+        # A BRDF couples both legs at the patch: its factor depends on the spot, so each beam has a
+        # table of its own.
         factor = np.empty((0, 0))
         if job.brdf is not None:
             spot = job.laser_spot_m[which.start]
-            factor = scattering(job.brdf)(spot, patches.point_m, patches.normal, cells.x_m, cells.y_m)
+            factor = scattering(job.brdf)(
+                spot, patches.point_m, patches.normal, cells.x_m, cells.y_m
+            )
         settings = job.near_m, job.lambertian, job.bin_m, job.bins
         histogram[which] = _paths(_spots(job, which), patches, cells, factor, *settings)
     return histogram
@@ -222,7 +259,12 @@ def _three_bounces(job: TransportJob, cells: Cells) -> Float64:
 
 def _spots(job: TransportJob, which: slice) -> Spots:
     spot = np.ascontiguousarray(job.laser_spot_m[which])
-    return Spots(spot, job.length_m[which], job.beam_weight[which], _visible(job, spot[:, 0].copy(), spot[:, 1].copy()))
+    return Spots(
+        spot,
+        job.length_m[which],
+        job.beam_weight[which],
+        _visible(job, spot[:, 0].copy(), spot[:, 1].copy()),
+    )
 
 
 def _cells(job: TransportJob) -> Cells:

@@ -1,9 +1,10 @@
-"""Fast backend on tensors (torch, float32): the factorization of `backend_numba` for a batch, on GPU or CPU.
+"""Fast backend on tensors (torch, float32): the factorization of `backend_numba` for a batch, on
+GPU or CPU.
 
-Patches of all objects stand one after another. Their legs are computed by a few large kernels, the patches' tables are
-counted in integers, and each beam of an object sums windows of that object's tables, in place. No sum depends on the
-order in which threads arrive. Self-occlusion is the lookup of the bounds of `visibility` and its exact walk, for many
-legs at a time.
+Patches of all objects stand one after another. Their legs are computed by a few large kernels, the
+patches' tables are counted in integers, and each beam of an object sums windows of that object's
+tables, in place. No sum depends on the order in which threads arrive. Self-occlusion is the lookup
+of the bounds of `visibility` and its exact walk, for many legs at a time.
 """
 
 from collections.abc import Iterator, Sequence
@@ -26,7 +27,9 @@ from nlos_cam.render.visibility import FACES, bias_m
 
 
 class TorchFields(NamedTuple):
-    """Height fields of a batch, each turned so that a walk along any face goes up its rows; NaN all around."""
+    """Height fields of a batch, each turned so that a walk along any face goes up its rows; NaN all
+    around.
+    """
 
     depth_m: Tensor
     """Flat, in rows of `across` cells."""
@@ -62,26 +65,35 @@ class TorchSites(NamedTuple):
 
 
 def lay_out(jobs: Sequence[TransportJob], device: torch.device) -> tuple[TorchFields, TorchSites]:
-    """Return fields and sites of jobs on one grid; an object that shades nothing has bounds of 0."""
+    """Return fields and sites of jobs on one grid; an object that shades nothing has bounds of
+    0.
+    """
     fields = [job.field for job in jobs]
     size = len(fields[0].depth_m)
     steps = max(max(f.last_row - f.first_row, f.last_column - f.first_column) for f in fields)
     rows = torch.as_tensor(np.stack([f.depth_m for f in fields]))
     columns = rows.transpose(1, 2)
-    # A walk along -columns goes up the rows of the transposed, flipped map, and so on: one loop serves all four faces.
+    # A walk along -columns goes up the rows of the transposed, flipped map, and so on: one loop
+    # serves all four faces.
     faces = torch.stack([columns, columns.flip(1), rows, rows.flip(1)], 1)
     padded = pad(faces, (1, 1, 0, steps), value=torch.nan).flatten().to(device, torch.float32)
     scale = 1 / fields[0].pitch_x_m, -1 / fields[0].pitch_y_m
     sectors = jobs[0].accuracy.sectors
     shared = TorchFields(padded, size + 2, size + steps, steps, *scale, bias_m(fields[0]), sectors)
     sites = [_sites(job, index, shared, size) for index, job in enumerate(jobs)]
-    together = (torch.as_tensor(np.concatenate(column), device=device) for column in zip(*sites, strict=True))
+    together = (
+        torch.as_tensor(np.concatenate(column), device=device)
+        for column in zip(*sites, strict=True)
+    )
     return shared, TorchSites(*together)
 
 
-def _sites(job: TransportJob, index: int, fields: TorchFields, size: int) -> tuple[NDArray[Any], ...]:
+def _sites(
+    job: TransportJob, index: int, fields: TorchFields, size: int
+) -> tuple[NDArray[Any], ...]:
     """Return the columns of one object's sites: depth, low, high, start and across."""
-    row, column = job.patches.row, job.patches.column
+    row = job.patches.row
+    column = job.patches.column
     free = np.zeros((len(row), FACES * fields.sectors), np.float32)
     low, high = horizons(job)[:2] if job.field.shades else (free, free)
     along = np.stack([column, size - 1 - column, row, size - 1 - row], 1)
@@ -90,10 +102,15 @@ def _sites(job: TransportJob, index: int, fields: TorchFields, size: int) -> tup
     return job.patches.point_m[:, 2:].astype(np.float32), low, high, start, across
 
 
-def shade(weight: Tensor, dx_m: Tensor, dy_m: Tensor, sites: TorchSites, fields: TorchFields, chunk: int) -> None:
-    """Set the weight (n, m) of legs that the object blocks to 0: looked up if the bounds decide, else walked."""
+def shade(
+    weight: Tensor, dx_m: Tensor, dy_m: Tensor, sites: TorchSites, fields: TorchFields, chunk: int
+) -> None:
+    """Set the weight (n, m) of legs that the object blocks to 0: looked up if the bounds decide,
+    else walked.
+    """
     # Offsets in cells; the larger one gives the face, the ratio of both the sector.
-    u, v = dx_m * fields.columns_per_m, dy_m * fields.rows_per_m
+    u = dx_m * fields.columns_per_m
+    v = dy_m * fields.rows_per_m
     along_columns = u.abs() >= v.abs()
     far = torch.maximum(u.abs(), v.abs())
     tilt = torch.where(along_columns, v, u).div_(far.clamp(min=1e-20))
@@ -110,17 +127,27 @@ def shade(weight: Tensor, dx_m: Tensor, dy_m: Tensor, sites: TorchSites, fields:
 
 def _sector(tilt: Tensor, along_columns: Tensor, backward: Tensor, sectors: int) -> Tensor:
     """Return the index of the sector, of FACES * sectors, that holds each direction."""
-    inside = torch.add(sectors / 2, tilt, alpha=sectors / 2).clamp_(max=sectors - 1)  # floored when made whole
-    return (inside + torch.where(along_columns, 0.0, 2.0 * sectors) + backward * float(sectors)).long()
+    inside = torch.add(sectors / 2, tilt, alpha=sectors / 2).clamp_(
+        max=sectors - 1
+    )  # floored when made whole
+    return (
+        inside + torch.where(along_columns, 0.0, 2.0 * sectors) + backward * float(sectors)
+    ).long()
 
 
-def blocked(fields: TorchFields, sites: TorchSites, which: Tensor, sector: Tensor, tilt: Tensor, far: Tensor) -> Tensor:
-    """Return whether (k,) the object blocks legs from patches: `far` cells long, by `tilt` across per cell.
+def blocked(
+    fields: TorchFields, sites: TorchSites, which: Tensor, sector: Tensor, tilt: Tensor, far: Tensor
+) -> Tensor:
+    """Return whether (k,) the object blocks legs from patches: `far` cells long, by `tilt` across
+    per cell.
 
-    The walk of `visibility.blocked` with all steps side by side; beyond its last step there is only background.
+    The walk of `visibility.blocked` with all steps side by side; beyond its last step there is only
+    background.
     """
-    face, step = sector // fields.sectors, torch.arange(1, fields.steps + 1, device=tilt.device)
-    # Cell k of the walk: k rows up in the turned map, k tilt cells across, interpolated between two neighbors.
+    face = sector // fields.sectors
+    step = torch.arange(1, fields.steps + 1, device=tilt.device)
+    # Cell k of the walk: k rows up in the turned map, k tilt cells across, interpolated between two
+    # neighbors.
     across = sites.across[which, face][:, None] + tilt[:, None] * step
     below = across.floor()
     share = across - below
@@ -151,7 +178,9 @@ class TorchSurface(NamedTuple):
     def of(cls, jobs: Sequence[TransportJob], device: torch.device) -> "TorchSurface":
         """Return the patches of all jobs, one after another."""
         columns = [
-            np.column_stack([j.patches.point_m, j.patches.normal, j.soft_patch_m2, j.strength]).T[..., None]
+            np.column_stack([j.patches.point_m, j.patches.normal, j.soft_patch_m2, j.strength]).T[
+                ..., None
+            ]
             for j in jobs
         ]
         return cls(*torch.as_tensor(np.concatenate(columns, 1).astype(np.float32), device=device))
@@ -195,18 +224,29 @@ class TorchOptics(NamedTuple):
 
 
 def legs(
-    surface: TorchSurface, sites: TorchSites | None, wall: TorchPoints, optics: TorchOptics, *, outgoing: bool
+    surface: TorchSurface,
+    sites: TorchSites | None,
+    wall: TorchPoints,
+    optics: TorchOptics,
+    *,
+    outgoing: bool,
 ) -> tuple[Tensor, Tensor]:
-    """Return weights (n, m), 0 for blocked legs, and lengths (n, m) of the legs from patches to points of the wall.
+    """Return weights (n, m), 0 for blocked legs, and lengths (n, m) of the legs from patches to
+    points of the wall.
 
-    Towards the lidar (`outgoing`) the weight has the wall's cosine, from it the patch's; in Lambertian radiometry both.
+    Towards the lidar (`outgoing`) the weight has the wall's cosine, from it the patch's; in
+    Lambertian radiometry both.
     """
     z = surface.z_m
-    dx, dy = wall.x_m - surface.x_m, wall.y_m - surface.y_m
-    # d^2 = dx^2 + dy^2 + z^2 and n . (wall point - patch), with fused multiply-adds in place of temporary tensors.
+    dx = wall.x_m - surface.x_m
+    dy = wall.y_m - surface.y_m
+    # d^2 = dx^2 + dy^2 + z^2 and n . (wall point - patch), with fused multiply-adds in place of
+    # temporary tensors.
     squared = torch.addcmul(z * z, dx, dx).addcmul_(dy, dy)
     length = squared.sqrt()
-    facing = torch.addcmul(-surface.normal_z * z, surface.normal_x, dx).addcmul_(surface.normal_y, dy)
+    facing = torch.addcmul(-surface.normal_z * z, surface.normal_x, dx).addcmul_(
+        surface.normal_y, dy
+    )
     passes = facing > 0
     if np.isfinite(optics.edge_m[0]):
         passes &= ~_cut(surface, wall, optics.edge_m)
@@ -221,27 +261,42 @@ def legs(
 
 
 def _cut(surface: TorchSurface, wall: TorchPoints, edge_m: tuple[float, float]) -> Tensor:
-    """Return a mask (n, m) of the legs that the occluder blocks: for each patch, the wall from some x on.
+    """Return a mask (n, m) of the legs that the occluder blocks: for each patch, the wall from some
+    x on.
 
-    From a patch at distance d on this side of the edge to a wall point at distance t beyond it, the leg passes the edge
-    at height z t / (t + d). That is at least edge_z from t = edge_z d / (z - edge_z) on.
+    From a patch at distance d on this side of the edge to a wall point at distance t beyond it, the
+    leg passes the edge at height z t / (t + d). That is at least edge_z from t = edge_z d / (z -
+    edge_z) on.
     """
-    (edge_x, edge_z), z, d = edge_m, surface.z_m, surface.x_m - edge_m[0]
+    edge_x, edge_z = edge_m
+    z = surface.z_m
+    d = surface.x_m - edge_m[0]
     begins = torch.where((z > edge_z) & (d != 0), edge_z * d.abs() / (z - edge_z), torch.inf)
     return (edge_x - wall.x_m) * d.sign() >= begins
 
 
-def scattered(brdf: Brdf, laser_spot_m: Float64, surface: TorchSurface, wall: TorchPoints) -> Tensor:
-    """Return the factor (n, m) of a BRDF on the ways from one laser spot (3,) over patches to points of the wall."""
-    x, y, z = (float(place) - column for place, column in zip(laser_spot_m, surface[:3], strict=True))
+def scattered(
+    brdf: Brdf, laser_spot_m: Float64, surface: TorchSurface, wall: TorchPoints
+) -> Tensor:
+    """Return the factor (n, m) of a BRDF on the ways from one laser spot (3,) over patches to
+    points of the wall.
+    """
+    x, y, z = (
+        float(place) - column for place, column in zip(laser_spot_m, surface[:3], strict=True)
+    )
     d2 = (x * x + y * y + z * z).sqrt().clamp(min=1e-12)
-    x, y, z = x / d2, y / d2, z / d2
-    dx, dy, dz = wall.x_m - surface.x_m, wall.y_m - surface.y_m, -surface.z_m
+    x = x / d2
+    y = y / d2
+    z = z / d2
+    dx = wall.x_m - surface.x_m
+    dy = wall.y_m - surface.y_m
+    dz = -surface.z_m
     d3 = (dx * dx + dy * dy + dz * dz).sqrt().clamp(min=1e-12)
     cos_in = surface.normal_x * x + surface.normal_y * y + surface.normal_z * z
     cos_out = (surface.normal_x * dx + surface.normal_y * dy + surface.normal_z * dz) / d3
     cos_between = (x * dx + y * dy + z * dz) / d3
-    # Legs to the dark side have weight 0 already. Lengths are limited above 0 for objects that touch the wall.
+    # Legs to the dark side have weight 0 already. Lengths are limited above 0 for objects that
+    # touch the wall.
     value = brdf(cos_in.clamp(min=0), cos_out.clamp(min=0), cos_between)
     return torch.as_tensor(value, dtype=torch.float32, device=d3.device).expand(d3.shape)
 
@@ -257,10 +312,13 @@ WHOLE_STEPS = 2.0**44
 
 
 def device_named(backend: str) -> torch.device:
-    """Return the device of a backend: "torch" is the CPU, "cuda" the GPU. Raises SceneError if there is none."""
+    """Return the device of a backend: "torch" is the CPU, "cuda" the GPU. Raises SceneError if
+    there is none.
+    """
     if backend == "cuda" and not torch.cuda.is_available():
         raise SceneError(
-            "backend 'cuda' needs a CUDA device, and there is none: choose cpu, or torch for the same code on the CPU"
+            "backend 'cuda' needs a CUDA device, and there is none: choose cpu, or torch for the"
+            " same code on the CPU"
         )
     return torch.device("cuda" if backend == "cuda" else "cpu")
 
@@ -279,7 +337,9 @@ def histograms(job: TransportJob, device: torch.device) -> Float32:
 
 
 def histograms_of_all(jobs: Sequence[TransportJob], device: torch.device) -> list[Float32]:
-    """Return the histograms of many jobs; those that differ in the object alone are computed together."""
+    """Return the histograms of many jobs; those that differ in the object alone are computed
+    together.
+    """
     alike: dict[object, list[int]] = {}
     for index, job in enumerate(jobs):
         alike.setdefault(_shared(job) or index, []).append(index)
@@ -291,12 +351,18 @@ def histograms_of_all(jobs: Sequence[TransportJob], device: torch.device) -> lis
 
 
 def _shared(job: TransportJob) -> tuple[object, ...] | None:
-    """Return a key of all that jobs of one batch have in common; None for a job that is computed alone."""
+    """Return a key of all that jobs of one batch have in common; None for a job that is computed
+    alone.
+    """
     if job.brdf is not None or job.more_bounces:
         return None
-    relay, field = job.relay, job.field
+    relay = job.relay
+    field = job.field
     feet = job.laser_spot_m, job.length_m, job.beam_weight
-    columns = [column.tobytes() for column in (*feet, relay.x_m, relay.y_m, relay.length_m, job.relay_weight)]
+    columns = [
+        column.tobytes()
+        for column in (*feet, relay.x_m, relay.y_m, relay.length_m, job.relay_weight)
+    ]
     numbers = job.edge_m, job.near_m, job.soft_wall_m2, job.lambertian, job.bin_m, job.accuracy
     return *columns, *numbers, field.depth_m.shape, field.pitch_x_m, field.pitch_y_m
 
@@ -306,16 +372,29 @@ class _Batch:
 
     def __init__(self, jobs: Sequence[TransportJob], device: torch.device) -> None:
         job = self.job = jobs[0]
-        self.jobs, self.device, self.chunk = jobs, device, chunk_for(device)
-        fields, self.sites = lay_out(jobs, device) if any(j.field.shades for j in jobs) else (None, None)
+        self.jobs = jobs
+        self.device = device
+        self.chunk = chunk_for(device)
+        fields, self.sites = (
+            lay_out(jobs, device) if any(j.field.shades for j in jobs) else (None, None)
+        )
         self.surface = TorchSurface.of(jobs, device)
         relay = job.relay
-        self.relay = TorchPoints.of(relay.x_m, relay.y_m, relay.length_m, job.relay_weight, device=device)
+        self.relay = TorchPoints.of(
+            relay.x_m, relay.y_m, relay.length_m, job.relay_weight, device=device
+        )
         near = min(one.patches.point_m[:, 2].min() for one in jobs) < job.near_m
         self.optics = TorchOptics(
-            job.edge_m, bool(near), job.near_m**2, job.soft_wall_m2, job.lambertian, fields, self.chunk
+            job.edge_m,
+            bool(near),
+            job.near_m**2,
+            job.soft_wall_m2,
+            job.lambertian,
+            fields,
+            self.chunk,
         )
-        self.per_bin, self.width = job.accuracy.sub_bins, max(table_bins(one)[1] for one in jobs)
+        self.per_bin = job.accuracy.sub_bins
+        self.width = max(table_bins(one)[1] for one in jobs)
         self.per_m = self.per_bin / job.bin_m
 
     def histograms(self) -> list[Float32]:
@@ -331,10 +410,15 @@ class _Batch:
         return [total.cpu().numpy()]
 
     def _feet(self, share: Float64) -> TorchPoints:
-        job, lit = self.job, np.flatnonzero(share)
+        job = self.job
+        lit = np.flatnonzero(share)
         weight = job.beam_weight[lit] * share[lit]
         return TorchPoints.of(
-            job.laser_spot_m[lit, 0], job.laser_spot_m[lit, 1], job.length_m[lit], weight, device=self.device
+            job.laser_spot_m[lit, 0],
+            job.laser_spot_m[lit, 1],
+            job.length_m[lit],
+            weight,
+            device=self.device,
         )
 
     def _parts(self, points: int) -> Iterator[tuple[TorchSurface, TorchSites | None]]:
@@ -345,7 +429,9 @@ class _Batch:
             yield self.surface.part(*ends), self.sites.part(*ends) if self.sites else None
 
     def _tables(self, foot: Float64 | None) -> tuple[Tensor, Tensor]:
-        """Return first bins (n, 1) and tables (n, per_bin, width), for light from one spot or, for None, from any."""
+        """Return first bins (n, 1) and tables (n, per_bin, width), for light from one spot or, for
+        None, from any.
+        """
         counts = [self._counts(*part, foot) for part in self._parts(len(self.relay.x_m))]
         first, fine = (torch.cat(parts) for parts in zip(*counts, strict=True))
         if self.job.more_bounces:
@@ -353,8 +439,12 @@ class _Batch:
             fine = torch.as_tensor(more, device=self.device)
         return first, tables(fine, self.per_bin)
 
-    def _counts(self, surface: TorchSurface, sites: TorchSites | None, foot: Float64 | None) -> tuple[Tensor, Tensor]:
-        """Return the first bin (n, 1) of some patches, and B over d3 + d4 in sub-bins from there on."""
+    def _counts(
+        self, surface: TorchSurface, sites: TorchSites | None, foot: Float64 | None
+    ) -> tuple[Tensor, Tensor]:
+        """Return the first bin (n, 1) of some patches, and B over d3 + d4 in sub-bins from there
+        on.
+        """
         # B(s, q) over d3 + d4, counted from the patch's own first bin.
         weight, length = legs(surface, sites, self.relay, self.optics, outgoing=True)
         if foot is not None and self.job.brdf is not None:
@@ -364,19 +454,29 @@ class _Batch:
         return first, counted((at - first * self.per_bin).long(), weight, self.width * self.per_bin)
 
     def _sums(self, first: Tensor, table: Tensor, feet: TorchPoints) -> list[Tensor]:
-        """Return histograms (n, bins) of each job: the sum of its patches' tables, times A, shifted by d1 + d2."""
+        """Return histograms (n, bins) of each job: the sum of its patches' tables, times A, shifted
+        by d1 + d2.
+        """
         found = [torch.zeros((len(feet.x_m), job.bins), device=self.device) for job in self.jobs]
         sizes = [len(job.patches.beta) for job in self.jobs]
         count = max(self.chunk // len(first), 1)
         for start in range(0, len(feet.x_m), count):
             some = feet.part(start, start + count)
-            # A(p, s) over d1 + d2: the shift in whole bins and the row of the table, as in `backend_numba`.
+            # A(p, s) over d1 + d2: the shift in whole bins and the row of the table, as in
+            # `backend_numba`.
             weight, length = legs(self.surface, self.sites, some, self.optics, outgoing=False)
             sub_bin = torch.add(some.length_m * self.per_m + 0.5, length, alpha=self.per_m).int()
-            columns = table, sub_bin % self.per_bin, sub_bin // self.per_bin + first, weight * self.surface.strength
+            columns = (
+                table,
+                sub_bin % self.per_bin,
+                sub_bin // self.per_bin + first,
+                weight * self.surface.strength,
+            )
             by_job = zip(*(column.split(sizes) for column in columns), strict=True)
             for histogram, (rows, shift, at, a) in zip(found, by_job, strict=True):
-                histogram[start : start + count] = shifted_sum(rows, shift, at, a, histogram.shape[1])
+                histogram[start : start + count] = shifted_sum(
+                    rows, shift, at, a, histogram.shape[1]
+                )
         return found
 
 
@@ -385,24 +485,30 @@ def counted(at: Tensor, weight: Tensor, size: int) -> Tensor:
 
     Weights are rounded to whole steps: integers add up to the same in any order of a GPU's threads.
     """
-    # Integer addition is associative and float addition is not: atomic adds of integers give the same bits every time.
+    # Integer addition is associative and float addition is not: atomic adds of integers give the
+    # same bits every time.
     step = weight.amax(1, keepdim=True).double().clamp_(min=1e-300) / WHOLE_STEPS
     total = torch.zeros((len(at), size), dtype=torch.int64, device=at.device)
     return (total.scatter_add_(1, at, (weight / step).long()) * step).float()
 
 
 def tables(fine: Tensor, per_bin: int) -> Tensor:
-    """Return histograms in sub-bins (n, width * per_bin) as sums to bins (n, per_bin, width), one for each shift."""
-    # A moving sum of per_bin sub-bins with stride 1 has every bin of every shift: shift k takes those ending at k less.
+    """Return histograms in sub-bins (n, width * per_bin) as sums to bins (n, per_bin, width), one
+    for each shift.
+    """
+    # A moving sum of per_bin sub-bins with stride 1 has every bin of every shift: shift k takes
+    # those ending at k less.
     sums = avg_pool1d(pad(fine, (per_bin - 1, 0))[:, None], per_bin, 1)[:, 0] * per_bin
     return sums.unflatten(1, (-1, per_bin)).flip(2).transpose(1, 2)
 
 
 def shifted_sum(table: Tensor, shift: Tensor, at: Tensor, weight: Tensor, bins: int) -> Tensor:
-    """Return histograms (m, bins): each beam sums a row of every patch's table (n, per_bin, width), at a bin, weighted.
+    """Return histograms (m, bins): each beam sums a row of every patch's table (n, per_bin, width),
+    at a bin, weighted.
 
-    Zeros in front of each row, one for every bin that a patch may be late. So the contribution of a row to a beam's
-    histogram, counted from the bin of the earliest patch, is a window of the rows in memory: no copy is needed.
+    Zeros in front of each row, one for every bin that a patch may be late. So the contribution of a
+    row to a beam's histogram, counted from the bin of the earliest patch, is a window of the rows
+    in memory: no copy is needed.
     """
     earliest = at.amin(0)
     late = at - earliest
@@ -411,16 +517,22 @@ def shifted_sum(table: Tensor, shift: Tensor, at: Tensor, weight: Tensor, bins: 
     span = rows.shape[2]
     row = torch.arange(len(at), device=at.device)[:, None] * (rows.shape[1] * span) + most
     windows = pad(rows.flatten(), (0, most)).unfold(0, span, 1)
-    found = window_sums(windows, (row + (shift * span - late)).T.contiguous(), weight.T.contiguous())
+    found = window_sums(
+        windows, (row + (shift * span - late)).T.contiguous(), weight.T.contiguous()
+    )
     placed = torch.zeros((len(found), bins + span), device=at.device)
-    placed.scatter_(1, earliest.clamp(max=bins)[:, None].long() + torch.arange(span, device=at.device), found)
+    placed.scatter_(
+        1, earliest.clamp(max=bins)[:, None].long() + torch.arange(span, device=at.device), found
+    )
     return placed[:, :bins]
 
 
 def window_sums(windows: Tensor, start: Tensor, weight: Tensor) -> Tensor:
-    """Return weighted sums (m, span) of windows (k, span): for each of m its own n, `start` (m, n) and `weight` (m, n).
+    """Return weighted sums (m, span) of windows (k, span): for each of m its own n, `start` (m, n)
+    and `weight` (m, n).
 
-    On a GPU one thread makes each sum and reads the windows in place; on the CPU that kernel would copy them all.
+    On a GPU one thread makes each sum and reads the windows in place; on the CPU that kernel would
+    copy them all.
     """
     if windows.is_cuda:
         return embedding_bag(start, windows, per_sample_weights=weight, mode="sum")

@@ -1,11 +1,14 @@
-"""Sums of the patches' tables for each beam, compiled in float32: a tile of beams at a time, neighbors joined.
+"""Sums of the patches' tables for each beam, compiled in float32: a tile of beams at a time,
+neighbors joined.
 
-A beam adds one row of a table for each patch, shifted by its own path. Over a tile of beams, two neighboring patches
-differ in path by nearly the same length and in weight by nearly the same ratio. So the tile joins their tables first,
-and each beam adds one row for all of them. Patches are joined only where that moves no path by more than JOIN_SUB_BINS
-sub-bins, and half of one for rounding. The more sub-bins an accuracy has, the fewer patches are joined.
+A beam adds one row of a table for each patch, shifted by its own path. Over a tile of beams, two
+neighboring patches differ in path by nearly the same length and in weight by nearly the same ratio.
+So the tile joins their tables first, and each beam adds one row for all of them. Patches are joined
+only where that moves no path by more than JOIN_SUB_BINS sub-bins, and half of one for rounding. The
+more sub-bins an accuracy has, the fewer patches are joined.
 
-numba's cache depends on this file alone: after a change of a kernel that is imported here, delete __pycache__.
+numba's cache depends on this file alone: after a change of a kernel that is imported here, delete
+__pycache__.
 """
 
 from typing import NamedTuple
@@ -42,9 +45,13 @@ GROUP = 4
 JOIN_SUB_BINS = np.float32(1.5)
 """Sub-bins by which a path may move, at most, where patches are joined."""
 JOIN_WEIGHT = np.float32(0.25)
-"""Relative change of a leg's weight by distance where patches are joined, at most, times sub-bins per bin from 4 on."""
+"""Relative change of a leg's weight by distance where patches are joined, at most, times sub-bins
+per bin from 4 on.
+"""
 JOIN_COSINE = 4
-"""The change by a patch's cosine may be so many times as large: neighbors' tilts differ in any direction."""
+"""The change by a patch's cosine may be so many times as large: neighbors' tilts differ in any
+direction.
+"""
 MARGIN = 16
 """Bins by which the rows of joined tables are longer."""
 ROUNDED = np.float32(1.001)
@@ -57,7 +64,9 @@ class NumbaTables(NamedTuple):
     first: Int32
     """(n,); bin at which a patch's rows start."""
     rows: Float32
-    """Flat; n * per_bin rows of WINDOW zeros and `width` bins, then WINDOW zeros: a window reads beyond both ends."""
+    """Flat; n * per_bin rows of WINDOW zeros and `width` bins, then WINDOW zeros: a window reads
+    beyond both ends.
+    """
     rest: Float32
     """(n, width + 1); largest value of any shift from a bin of the row on."""
     per_bin: int
@@ -76,7 +85,9 @@ class NumbaGroups(NamedTuple):
 
 
 class Block(NamedTuple):
-    """Legs of up to PATCH_BLOCK patches or groups to a tile's beams, whose rows are not added yet."""
+    """Legs of up to PATCH_BLOCK patches or groups to a tile's beams, whose rows are not added
+    yet.
+    """
 
     weights: Float32
     """Flat; (PATCH_BLOCK, count)."""
@@ -94,43 +105,68 @@ class Joins(NamedTuple):
     joined: Mask
     """(k,)."""
     shift: Int64
-    """(n,), in the order of `member`; sub-bins by which a member's path is longer than its mean's."""
+    """(n,), in the order of `member`; sub-bins by which a member's path is longer than its
+    mean's.
+    """
     ratio: Float32
     """(n,), in that order; a member's weight over its mean's, 0 without light."""
 
 
 @numba.njit(cache=True, inline="always")
 def _block(count: int) -> Block:
-    row, ahead = np.empty((PATCH_BLOCK, count), np.int32), np.empty((PATCH_BLOCK, count), np.int32)
-    weights, offsets = np.empty(PATCH_BLOCK * count, np.float32), np.empty(PATCH_BLOCK * count, np.int32)
+    row = np.empty((PATCH_BLOCK, count), np.int32)
+    ahead = np.empty((PATCH_BLOCK, count), np.int32)
+    weights = np.empty(PATCH_BLOCK * count, np.float32)
+    offsets = np.empty(PATCH_BLOCK * count, np.int32)
     return Block(weights, offsets, row, ahead, np.empty(PATCH_BLOCK, np.int64))
 
 
 @inner(error_model="numpy", fastmath=FAST)
 def ends(
-    start: int, count: int, feet: NumbaPoints, groups: NumbaGroups, centers: NumbaSurface, optics: NumbaOptics,
+    start: int,
+    count: int,
+    feet: NumbaPoints,
+    groups: NumbaGroups,
+    centers: NumbaSurface,
+    optics: NumbaOptics,
     table: NumbaTables,
-) -> tuple[Float32, int]:  # fmt: skip
-    """Return a bin (count,) before every path of each beam, and the bins from there to the last path of any beam."""
-    near, far = np.full(count, np.float32(np.inf)), np.zeros(count, np.float32)
-    at_x, at_y = feet.x_m[start : start + count], feet.y_m[start : start + count]
+) -> tuple[Float32, int]:
+    """Return a bin (count,) before every path of each beam, and the bins from there to the last
+    path of any beam.
+    """
+    near = np.full(count, np.float32(np.inf))
+    far = np.zeros(count, np.float32)
+    at_x = feet.x_m[start : start + count]
+    at_y = feet.y_m[start : start + count]
     for g in range(len(groups.reach_m)):
-        x, y, z = centers.x_m[g], centers.y_m[g], centers.z_m[g]
-        first, last = table.first[groups.member[groups.begin[g]]], int64(0)
+        x = centers.x_m[g]
+        y = centers.y_m[g]
+        z = centers.z_m[g]
+        first = table.first[groups.member[groups.begin[g]]]
+        last = int64(0)
         for j in range(groups.begin[g], groups.begin[g + 1]):
-            first, last = min(first, table.first[groups.member[j]]), max(last, table.first[groups.member[j]])
+            first, last = (
+                min(first, table.first[groups.member[j]]),
+                max(last, table.first[groups.member[j]]),
+            )
         reach = groups.reach_m[g] * optics.inverse_bin
         soonest = np.float32(first * table.per_bin) - reach
         latest = np.float32(last * table.per_bin) + reach
         for i in range(count):
-            dx, dy = at_x[i] - x, at_y[i] - y
+            dx = at_x[i] - x
+            dy = at_y[i] - y
             length = np.sqrt(dx * dx + dy * dy + z * z) * optics.inverse_bin
-            near[i], far[i] = min(near[i], length + soonest), max(far[i], length + latest)
-    spread, whole = 0, np.float32(1 / table.per_bin)
+            near[i] = min(near[i], length + soonest)
+            far[i] = max(far[i], length + latest)
+    spread = 0
+    whole = np.float32(1 / table.per_bin)
     for i in range(count):
         spread = max(spread, int((far[i] - near[i]) * whole))
-        # A beam's first path is d1 + min (d2 + d3 + d4) over the patches; one bin less covers rounding.
-        near[i] = np.floor((near[i] + feet.length_m[start + i] * optics.inverse_bin) * whole) - np.float32(1)
+        # A beam's first path is d1 + min (d2 + d3 + d4) over the patches; one bin less covers
+        # rounding.
+        near[i] = np.floor(
+            (near[i] + feet.length_m[start + i] * optics.inverse_bin) * whole
+        ) - np.float32(1)
     return near, spread + table.width + 4
 
 
@@ -145,18 +181,36 @@ def _bits(number: int) -> int:
 
 @numba.njit(cache=True, error_model="numpy", fastmath=FAST, inline="always")
 def _place(
-    legs: NumbaLegs, start: int, feet: NumbaPoints, optics: NumbaOptics, begin: Int32, per_bin: int, stride: int,
-    strength: np.float32, first: int, used: int, block: Block,
-) -> tuple[np.float32, int]:  # fmt: skip
-    """Fill in each leg's weight, row of a table, and bin of the row at which the beam's window begins.
+    legs: NumbaLegs,
+    start: int,
+    feet: NumbaPoints,
+    optics: NumbaOptics,
+    begin: Int32,
+    per_bin: int,
+    stride: int,
+    strength: np.float32,
+    first: int,
+    used: int,
+    block: Block,
+) -> tuple[np.float32, int]:
+    """Fill in each leg's weight, row of a table, and bin of the row at which the beam's window
+    begins.
 
-    Return the sum of the weights, and the smallest of those bins. Numbers are 32 bits wide, so that the
-    loop is made of vectors: numba's own integers are wider, and floats have no smallest one without order.
+    Return the sum of the weights, and the smallest of those bins. Numbers are 32 bits wide, so that
+    the loop is made of vectors: numba's own integers are wider, and floats have no smallest one
+    without order.
     """
-    total, least, count = np.float32(0), np.int32(1 << 30), len(begin)
-    weight, row, ahead = block.weights[used * count : (used + 1) * count], block.row[used], block.ahead[used]
-    length_m, starts = feet.length_m[start : start + count], np.int32(first)
-    bits, mask, long = _bits(per_bin), np.int32(per_bin - 1), np.int32(stride)
+    total = np.float32(0)
+    least = np.int32(1 << 30)
+    count = len(begin)
+    weight = block.weights[used * count : (used + 1) * count]
+    row = block.row[used]
+    ahead = block.ahead[used]
+    length_m = feet.length_m[start : start + count]
+    starts = np.int32(first)
+    bits = _bits(per_bin)
+    mask = np.int32(per_bin - 1)
+    long = np.int32(stride)
     for i in range(count):
         shift = np.int32((legs.length_m[i] + length_m[i]) * optics.inverse_bin + np.float32(0.5))
         weight[i] = legs.weight[i] * strength
@@ -170,25 +224,45 @@ def _place(
 
 @numba.njit(cache=True, error_model="numpy", fastmath=FAST, inline="always")
 def _add_block(used: int, rows: Float32, row_bins: int, block: Block, sums: Float32) -> None:
-    """Add the rows of some patches, placed by `_place`, to the windows (count, windows * WINDOW) of a tile's beams."""
-    count, bins, width = sums.shape[0], sums.shape[1], np.int32(row_bins)
-    every, offset = sums.ravel(), block.offsets.reshape(PATCH_BLOCK, count)
+    """Add the rows of some patches, placed by `_place`, to the windows (count, windows * WINDOW) of
+    a tile's beams.
+    """
+    count = sums.shape[0]
+    bins = sums.shape[1]
+    width = np.int32(row_bins)
+    every = sums.ravel()
+    offset = block.offsets.reshape(PATCH_BLOCK, count)
     for window in range(0, bins, WINDOW):
-        ahead_of, before = np.int32(window), np.int32(-WINDOW)
+        ahead_of = np.int32(window)
+        before = np.int32(-WINDOW)
         for j in range(used):
             for i in range(count):
                 at = min(max(np.int32(block.ahead[j, i] + ahead_of), before), width)
                 offset[j, i] = np.int32(block.row[j, i] + at)
         for i in range(count):
-            add_rows(every, i * bins + window, rows, block.base, block.offsets, block.weights, i, count, used)
+            add_rows(
+                every,
+                i * bins + window,
+                rows,
+                block.base,
+                block.offsets,
+                block.weights,
+                i,
+                count,
+                used,
+            )
 
 
 @numba.njit(cache=True, error_model="numpy", fastmath=FAST, inline="always")
 def _leg(
     s: int, surface: NumbaSurface, x: np.float32, y: np.float32, optics: NumbaOptics
 ) -> tuple[np.float32, np.float32, np.float32]:
-    """Return length, facing and weight of the leg from a patch to a point (x, y) of the wall beyond near contact."""
-    dx, dy, z = x - surface.x_m[s], y - surface.y_m[s], surface.z_m[s]
+    """Return length, facing and weight of the leg from a patch to a point (x, y) of the wall beyond
+    near contact.
+    """
+    dx = x - surface.x_m[s]
+    dy = y - surface.y_m[s]
+    z = surface.z_m[s]
     squared = dx * dx + dy * dy + z * z
     length = np.sqrt(squared)
     facing = surface.normal_x[s] * dx + surface.normal_y[s] * dy - surface.normal_z[s] * z
@@ -198,17 +272,26 @@ def _leg(
 
 @numba.njit(cache=True, error_model="numpy", fastmath=FAST, inline="always")
 def _near_enough(
-    g: int, bounds_m: Float32, groups: NumbaGroups, centers: NumbaSurface, optics: NumbaOptics, limit: np.float32
+    g: int,
+    bounds_m: Float32,
+    groups: NumbaGroups,
+    centers: NumbaSurface,
+    optics: NumbaOptics,
+    limit: np.float32,
 ) -> bool:
     """Return whether joining a group moves no path of a tile (4,) by more than JOIN_SUB_BINS.
 
-    The gradient, over the wall, of the difference of two patches' paths is at most their distance over that to the
-    wall's point, and the relative one of their weights apart from the cosine at most four times that over the latter.
+    The gradient, over the wall, of the difference of two patches' paths is at most their distance
+    over that to the wall's point, and the relative one of their weights apart from the cosine at
+    most four times that over the latter.
     """
-    half_x, half_y, nothing = (bounds_m[1] - bounds_m[0]) / 2, (bounds_m[3] - bounds_m[2]) / 2, np.float32(0)
+    half_x = (bounds_m[1] - bounds_m[0]) / 2
+    half_y = (bounds_m[3] - bounds_m[2]) / 2
+    nothing = np.float32(0)
     out_x = max(abs(centers.x_m[g] - bounds_m[0] - half_x) - half_x, nothing)
     out_y = max(abs(centers.y_m[g] - bounds_m[2] - half_y) - half_y, nothing)
-    z, reach = centers.z_m[g], groups.reach_m[g]
+    z = centers.z_m[g]
+    reach = groups.reach_m[g]
     nearest = np.sqrt(out_x * out_x + out_y * out_y + z * z) - reach
     # moved_m = half the tile's diagonal times reach / nearest
     moving_m2 = np.sqrt(half_x * half_x + half_y * half_y) * reach
@@ -222,8 +305,12 @@ def _near_enough(
 
 @numba.njit(cache=True, inline="always")
 def _first(g: int, groups: NumbaGroups, joins: Joins, table: NumbaTables) -> tuple[int, int]:
-    """Return the first bin of a group's joined rows, and the last at which a member's row starts; 0 without light."""
-    first, last, bits = int64(1 << 40), int64(0), _bits(table.per_bin)
+    """Return the first bin of a group's joined rows, and the last at which a member's row starts; 0
+    without light.
+    """
+    first = int64(1 << 40)
+    last = int64(0)
+    bits = _bits(table.per_bin)
     for j in range(groups.begin[g], groups.begin[g + 1]):
         if joins.ratio[j] > 0:
             own = table.first[groups.member[j]]
@@ -234,17 +321,31 @@ def _first(g: int, groups: NumbaGroups, joins: Joins, table: NumbaTables) -> tup
 
 @inner(error_model="numpy", fastmath=FAST)
 def _joins(
-    verdicts: NDArray[np.int8], bounds_m: Float32, surface: NumbaSurface, groups: NumbaGroups, centers: NumbaSurface,
-    optics: NumbaOptics, table: NumbaTables,
-) -> Joins:  # fmt: skip
-    """Return which groups a tile (4,) of beams joins: those whose free members it cannot tell apart."""
+    verdicts: NDArray[np.int8],
+    bounds_m: Float32,
+    surface: NumbaSurface,
+    groups: NumbaGroups,
+    centers: NumbaSurface,
+    optics: NumbaOptics,
+    table: NumbaTables,
+) -> Joins:
+    """Return which groups a tile (4,) of beams joins: those whose free members it cannot tell
+    apart.
+    """
     count = len(groups.reach_m)
-    joins = Joins(np.zeros(count, np.bool_), np.zeros(len(verdicts), np.int64), np.zeros(len(verdicts), np.float32))
-    x, y = (bounds_m[0] + bounds_m[1]) / 2, (bounds_m[2] + bounds_m[3]) / 2
+    joins = Joins(
+        np.zeros(count, np.bool_),
+        np.zeros(len(verdicts), np.int64),
+        np.zeros(len(verdicts), np.float32),
+    )
+    x = (bounds_m[0] + bounds_m[1]) / 2
+    y = (bounds_m[2] + bounds_m[3]) / 2
     limit = JOIN_WEIGHT / np.float32(max(table.per_bin, 4))
-    nothing, half = np.float32(0), np.float32(0.5)
+    nothing = np.float32(0)
+    half = np.float32(0.5)
     for g in range(count):
-        free, mixed = 0, 0
+        free = 0
+        mixed = 0
         for j in range(groups.begin[g], groups.begin[g + 1]):
             verdict = verdicts[groups.member[j]]
             free += int(verdict == FREE)
@@ -258,12 +359,19 @@ def _joins(
             if verdicts[s] == DARK:
                 continue
             own_length, own_facing, own_weight = _leg(s, surface, x, y, optics)
-            # Facing is linear over the tile, and the quotient of two is largest and smallest at corners.
+            # Facing is linear over the tile, and the quotient of two is largest and smallest at
+            # corners.
             for corner in range(4):
-                to_x, to_y = bounds_m[corner & 1], bounds_m[2 + (corner >> 1)]
-                one, other = _leg(s, surface, to_x, to_y, optics)[1], _leg(g, centers, to_x, to_y, optics)[1]
+                to_x = bounds_m[corner & 1]
+                to_y = bounds_m[2 + (corner >> 1)]
+                one = _leg(s, surface, to_x, to_y, optics)[1]
+                other = _leg(g, centers, to_x, to_y, optics)[1]
                 off = abs(one * facing - other * own_facing)
-                alike &= (one > nothing) & (other > nothing) & (off <= JOIN_COSINE * limit * other * own_facing)
+                alike &= (
+                    (one > nothing)
+                    & (other > nothing)
+                    & (off <= JOIN_COSINE * limit * other * own_facing)
+                )
             joins.shift[j] = int64(np.floor((own_length - length) * optics.inverse_bin + half))
             joins.ratio[j] = surface.strength[s] * own_weight / weight
         first, last = _first(g, groups, joins, table)
@@ -273,55 +381,101 @@ def _joins(
 
 @inner(error_model="numpy", fastmath=FAST)
 def _build(
-    group: Int64, ahead: Int32, bins: int, groups: NumbaGroups, joins: Joins, table: NumbaTables, rows: Float32
+    group: Int64,
+    ahead: Int32,
+    bins: int,
+    groups: NumbaGroups,
+    joins: Joins,
+    table: NumbaTables,
+    rows: Float32,
 ) -> None:
-    """Fill in the joined rows of some groups, where windows of `bins` bins from `ahead` (k, count) on meet them."""
-    stride, wide, bits = WINDOW + table.width, table.width + MARGIN, _bits(table.per_bin)
-    base, offset, off = np.empty(GROUP, np.int64), np.empty(GROUP, np.int32), np.empty(GROUP, np.int64)
+    """Fill in the joined rows of some groups, where windows of `bins` bins from `ahead` (k, count)
+    on meet them.
+    """
+    stride = WINDOW + table.width
+    wide = table.width + MARGIN
+    bits = _bits(table.per_bin)
+    base = np.empty(GROUP, np.int64)
+    offset = np.empty(GROUP, np.int32)
+    off = np.empty(GROUP, np.int64)
     for k in range(len(group)):
-        begin, count = groups.begin[group[k]], groups.begin[group[k] + 1] - groups.begin[group[k]]
+        count = groups.begin[group[k] + 1] - groups.begin[group[k]]
+        begin = groups.begin[group[k]]
         first = _first(group[k], groups, joins, table)[0]
-        low, high = min(max(int64(ahead[k].min()), 0), wide), max(min(int64(ahead[k].max()) + bins, wide), 0)
+        low = min(max(int64(ahead[k].min()), 0), wide)
+        high = max(min(int64(ahead[k].max()) + bins, wide), 0)
         for r in range(table.per_bin):
             for j in range(count):
-                s, at = groups.member[begin + j], r + joins.shift[begin + j]
+                s = groups.member[begin + j]
+                at = r + joins.shift[begin + j]
                 off[j] = (at >> bits) + table.first[s] - first
                 base[j] = (s * table.per_bin + (at & (table.per_bin - 1))) * stride + WINDOW
-            # Beyond the members' last bins the sums are 0, so what lies there, before the next row, stays 0.
+            # Beyond the members' last bins the sums are 0, so what lies there, before the next row,
+            # stays 0.
             for window in range(low, high, WINDOW):
                 to = (k * table.per_bin + r) * (WINDOW + wide) + WINDOW + window
                 for j in range(count):
                     offset[j] = min(max(window - off[j], -WINDOW), table.width)
                 for i in range(WINDOW):
                     rows[to + i] = 0
-                add_rows(rows, to, table.rows, base, offset, joins.ratio[begin:], int64(0), int64(1), int64(count))
+                add_rows(
+                    rows,
+                    to,
+                    table.rows,
+                    base,
+                    offset,
+                    joins.ratio[begin:],
+                    int64(0),
+                    int64(1),
+                    int64(count),
+                )
 
 
 @inner(error_model="numpy", fastmath=FAST)
 def _add_joined(
-    start: int, feet: NumbaPoints, groups: NumbaGroups, centers: NumbaSurface, joins: Joins, optics: NumbaOptics,
-    table: NumbaTables, begin: Int32, sums: Float32, bound: Float32,
-) -> None:  # fmt: skip
-    """Add the joined groups to the windows of a tile's beams, and to the bound on every bin beyond."""
+    start: int,
+    feet: NumbaPoints,
+    groups: NumbaGroups,
+    centers: NumbaSurface,
+    joins: Joins,
+    optics: NumbaOptics,
+    table: NumbaTables,
+    begin: Int32,
+    sums: Float32,
+    bound: Float32,
+) -> None:
+    """Add the joined groups to the windows of a tile's beams, and to the bound on every bin
+    beyond.
+    """
     count, bins, per_bin, bits = len(begin), sums.shape[1], table.per_bin, _bits(table.per_bin)
-    legs, block, used, wide = scratch(count), _block(count), 0, table.width + MARGIN
+    legs = scratch(count)
+    block = _block(count)
+    used = 0
+    wide = table.width + MARGIN
     size = per_bin * (WINDOW + wide)
-    rows, group = np.zeros(PATCH_BLOCK * size + 2 * WINDOW, np.float32), np.empty(PATCH_BLOCK, np.int64)
+    rows = np.zeros(PATCH_BLOCK * size + 2 * WINDOW, np.float32)
+    group = np.empty(PATCH_BLOCK, np.int64)
     for g in range(len(joins.joined)):
         if joins.joined[g]:
             first = _first(g, groups, joins, table)[0]
             geometry(legs, g, centers, feet, start, count, optics, False)
-            one, stride = np.float32(1), WINDOW + wide
-            _, least = _place(legs, start, feet, optics, begin, per_bin, stride, one, first, used, block)
+            one = np.float32(1)
+            stride = WINDOW + wide
+            _, least = _place(
+                legs, start, feet, optics, begin, per_bin, stride, one, first, used, block
+            )
             largest = np.float32(0)
             for j in range(groups.begin[g], groups.begin[g + 1]):
                 s = groups.member[j]
                 off = table.first[s] + ((joins.shift[j] + per_bin - 1) >> bits) - first
-                largest += joins.ratio[j] * table.rest[s, min(max(least + bins - off, 0), table.width)]
+                largest += (
+                    joins.ratio[j] * table.rest[s, min(max(least + bins - off, 0), table.width)]
+                )
             weight = block.weights[used * count : (used + 1) * count]
             for i in range(count):
                 bound[i] += weight[i] * largest
-            block.base[used], group[used] = used * size + WINDOW, g
+            block.base[used] = used * size + WINDOW
+            group[used] = g
             used += 1
         if used == PATCH_BLOCK or (used and g + 1 == len(joins.joined)):
             _build(group[:used], block.ahead, bins, groups, joins, table, rows)
@@ -331,23 +485,54 @@ def _add_joined(
 
 @inner(error_model="numpy", fastmath=FAST)
 def _add_single(
-    start: int, feet: NumbaPoints, surface: NumbaSurface, verdicts: NDArray[np.int8], groups: NumbaGroups,
-    joins: Joins, optics: NumbaOptics, field: HeightField, table: NumbaTables, begin: Int32, sums: Float32,
+    start: int,
+    feet: NumbaPoints,
+    surface: NumbaSurface,
+    verdicts: NDArray[np.int8],
+    groups: NumbaGroups,
+    joins: Joins,
+    optics: NumbaOptics,
+    field: HeightField,
+    table: NumbaTables,
+    begin: Int32,
+    sums: Float32,
     bound: Float32,
-) -> None:  # fmt: skip
-    """Add the patches that are not joined to the windows of a tile's beams, and to the bound on every bin beyond."""
-    count, bins, stride = len(begin), sums.shape[1], WINDOW + table.width
-    legs, block, used = scratch(count), _block(count), 0
+) -> None:
+    """Add the patches that are not joined to the windows of a tile's beams, and to the bound on
+    every bin beyond.
+    """
+    count = len(begin)
+    bins = sums.shape[1]
+    stride = WINDOW + table.width
+    legs = scratch(count)
+    block = _block(count)
+    used = 0
     for g in range(len(joins.joined)):
-        for j in range(groups.begin[g], groups.begin[g + 1] if not joins.joined[g] else groups.begin[g]):
+        for j in range(
+            groups.begin[g], groups.begin[g + 1] if not joins.joined[g] else groups.begin[g]
+        ):
             s = int64(groups.member[j])
             if verdicts[s] == DARK:
                 continue
             fill(legs, s, surface, feet, start, count, int64(verdicts[s]), optics, field, False)
-            strength, first = np.float32(surface.strength[s]), int64(table.first[s])
-            total, least = _place(legs, start, feet, optics, begin, table.per_bin, stride, strength, first, used, block)
+            strength = np.float32(surface.strength[s])
+            first = int64(table.first[s])
+            total, least = _place(
+                legs,
+                start,
+                feet,
+                optics,
+                begin,
+                table.per_bin,
+                stride,
+                strength,
+                first,
+                used,
+                block,
+            )
             if total > 0:
-                # h(k) = sum_s A(p, s) T_s(k - at_s): beyond the window T_s is at most its largest value from there.
+                # h(k) = sum_s A(p, s) T_s(k - at_s): beyond the window T_s is at most its largest
+                # value from there.
                 largest = table.rest[s, min(max(least + bins, 0), table.width)]
                 weight = block.weights[used * count : (used + 1) * count]
                 for i in range(count):
@@ -362,10 +547,18 @@ def _add_single(
 
 @inner()
 def _sum_tile(
-    start: int, feet: NumbaPoints, surface: NumbaSurface, groups: NumbaGroups, centers: NumbaSurface,
-    optics: NumbaOptics, field: HeightField, table: NumbaTables, most: int,
-) -> tuple[Int32, Float32, Float32]:  # fmt: skip
-    """Return the first bin (count,) of a tile's beams, their sums from there on over `most` bins or all, and a bound.
+    start: int,
+    feet: NumbaPoints,
+    surface: NumbaSurface,
+    groups: NumbaGroups,
+    centers: NumbaSurface,
+    optics: NumbaOptics,
+    field: HeightField,
+    table: NumbaTables,
+    most: int,
+) -> tuple[Int32, Float32, Float32]:
+    """Return the first bin (count,) of a tile's beams, their sums from there on over `most` bins or
+    all, and a bound.
 
     The bound (count,) is on every bin beyond the sums.
     """
@@ -373,28 +566,41 @@ def _sum_tile(
     near, span = ends(start, count, feet, groups, centers, optics, table)
     begin = near.astype(np.int32)
     sums = np.zeros((count, (min(span, most) + WINDOW - 1) // WINDOW * WINDOW), np.float32)
-    bound, tile = np.zeros(count, np.float32), feet.bounds_m[start // BEAM_TILE : start // BEAM_TILE + 1]
+    bound = np.zeros(count, np.float32)
+    tile = feet.bounds_m[start // BEAM_TILE : start // BEAM_TILE + 1]
     verdicts = judge(int64(0), len(table.first), surface, tile, optics, field)[:, 0]
     joins = _joins(verdicts, tile[0], surface, groups, centers, optics, table)
-    # Legs of some patches first, then the rows of each beam: rows and windows stay in the first cache
+    # Legs of some patches first, then the rows of each beam: rows and windows stay in the first
+    # cache
     _add_joined(start, feet, groups, centers, joins, optics, table, begin, sums, bound)
-    _add_single(start, feet, surface, verdicts, groups, joins, optics, field, table, begin, sums, bound)
+    _add_single(
+        start, feet, surface, verdicts, groups, joins, optics, field, table, begin, sums, bound
+    )
     return begin, sums, bound
 
 
 @numba.njit(cache=True, parallel=True)
 def shift_and_add(
-    tiles: Int64, feet: NumbaPoints, surface: NumbaSurface, groups: NumbaGroups, centers: NumbaSurface,
-    optics: NumbaOptics, field: HeightField, table: NumbaTables, bins: int,
-) -> Float32:  # fmt: skip
+    tiles: Int64,
+    feet: NumbaPoints,
+    surface: NumbaSurface,
+    groups: NumbaGroups,
+    centers: NumbaSurface,
+    optics: NumbaOptics,
+    field: HeightField,
+    table: NumbaTables,
+    bins: int,
+) -> Float32:
     """Return histograms (k * BEAM_TILE, bins) of the beams of k tiles.
 
-    They are the sum of every patch's table, times A, shifted by d1 + d2. Beams are summed by whole tiles, so that their
-    bits do not depend on which are asked for.
+    They are the sum of every patch's table, times A, shifted by d1 + d2. Beams are summed by whole
+    tiles, so that their bits do not depend on which are asked for.
     """
     histogram = np.zeros((len(tiles) * BEAM_TILE, bins), np.float32)
     for k in numba.prange(len(tiles)):
-        begin, sums, _ = _sum_tile(tiles[k] * BEAM_TILE, feet, surface, groups, centers, optics, field, table, bins)
+        begin, sums, _ = _sum_tile(
+            tiles[k] * BEAM_TILE, feet, surface, groups, centers, optics, field, table, bins
+        )
         for i in range(len(begin)):
             first = int(begin[i])
             for j in range(max(-first, 0), min(sums.shape[1], bins - first)):
@@ -404,23 +610,37 @@ def shift_and_add(
 
 @numba.njit(cache=True, parallel=True)
 def strongest_in_window(
-    feet: NumbaPoints, surface: NumbaSurface, groups: NumbaGroups, centers: NumbaSurface, optics: NumbaOptics,
-    field: HeightField, table: NumbaTables, bins: int,
-) -> tuple[NDArray[np.int64], Float32, Float32, NDArray[np.bool_]]:  # fmt: skip
-    """Return bin, value and runner-up (n,) of the strongest of each beam's first WINDOW bins, and if no other can win.
+    feet: NumbaPoints,
+    surface: NumbaSurface,
+    groups: NumbaGroups,
+    centers: NumbaSurface,
+    optics: NumbaOptics,
+    field: HeightField,
+    table: NumbaTables,
+    bins: int,
+) -> tuple[NDArray[np.int64], Float32, Float32, NDArray[np.bool_]]:
+    """Return bin, value and runner-up (n,) of the strongest of each beam's first WINDOW bins, and
+    if no other can win.
 
-    Light comes back strongest from the shortest paths, so the first window nearly always holds both bins.
+    Light comes back strongest from the shortest paths, so the first window nearly always holds both
+    bins.
     """
     beams = len(feet.x_m)
-    winner, peak, second = np.zeros(beams, np.int64), np.zeros(beams, np.float32), np.zeros(beams, np.float32)
+    winner = np.zeros(beams, np.int64)
+    peak = np.zeros(beams, np.float32)
+    second = np.zeros(beams, np.float32)
     sure = np.zeros(beams, np.bool_)
     for tile in numba.prange((beams + BEAM_TILE - 1) // BEAM_TILE):
         start = tile * BEAM_TILE
-        begin, sums, bound = _sum_tile(start, feet, surface, groups, centers, optics, field, table, int64(WINDOW))
+        begin, sums, bound = _sum_tile(
+            start, feet, surface, groups, centers, optics, field, table, int64(WINDOW)
+        )
         for i in range(len(begin)):
             first = int(begin[i])
             best = strongest_between(sums[i], max(-first, 0), min(WINDOW, bins - first))
-            winner[start + i], peak[start + i], second[start + i] = best[0] + first, best[1], best[2]
+            winner[start + i] = best[0] + first
+            peak[start + i] = best[1]
+            second[start + i] = best[2]
             sure[start + i] = bound[i] * ROUNDED <= best[2]
     return winner[feet.place], peak[feet.place], second[feet.place], sure[feet.place]
 
@@ -428,25 +648,37 @@ def strongest_in_window(
 def groups_of(surface: NumbaSurface, diagonal_m: float) -> tuple[NumbaGroups, NumbaSurface]:
     """Return patches in groups of 2 x 2 neighbors, and the groups' means.
 
-    A group with a member farther from the mean than the diagonal of a cell, as across an edge, is broken up.
+    A group with a member farther from the mean than the diagonal of a cell, as across an edge, is
+    broken up.
     """
     which = np.unique((surface.row // 2) * (1 << 20) + surface.column // 2, return_inverse=True)[1]
     count, means, reach_m = _means(surface, which)
     if (far := reach_m[which] > diagonal_m).any():
-        which = np.unique(np.where(far, len(which) + np.arange(len(which)), which), return_inverse=True)[1]
+        which = np.unique(
+            np.where(far, len(which) + np.arange(len(which)), which), return_inverse=True
+        )[1]
         count, means, reach_m = _means(surface, which)
     begin = np.concatenate([[0], np.cumsum(count)]).astype(np.int32)
-    groups = NumbaGroups(np.argsort(which, kind="stable").astype(np.int32), begin, reach_m * ROUNDED)
+    groups = NumbaGroups(
+        np.argsort(which, kind="stable").astype(np.int32), begin, reach_m * ROUNDED
+    )
     # The kernels ask for a mean's place, normal and near contact alone.
     rest = {name: column[:0] for name, column in zip(surface._fields[7:], surface[7:], strict=True)}
     return groups, surface._replace(**rest, **dict(zip(surface._fields, means, strict=False)))
 
 
-def _means(surface: NumbaSurface, which: NDArray[np.intp]) -> tuple[NDArray[np.intp], list[Float32], Float32]:
-    """Return size and mean columns of the groups in which patches (n,) are, and the distance to the farthest member."""
-    columns, count = surface[:7], np.bincount(which)
+def _means(
+    surface: NumbaSurface, which: NDArray[np.intp]
+) -> tuple[NDArray[np.intp], list[Float32], Float32]:
+    """Return size and mean columns of the groups in which patches (n,) are, and the distance to the
+    farthest member.
+    """
+    columns = surface[:7]
+    count = np.bincount(which)
     means = [(np.bincount(which, column) / count).astype(np.float32) for column in columns]
-    squared = [np.square(column - mean[which]) for column, mean in zip(columns[:3], means[:3], strict=True)]
+    squared = [
+        np.square(column - mean[which]) for column, mean in zip(columns[:3], means[:3], strict=True)
+    ]
     reach_m = np.zeros(len(count), np.float32)
     np.maximum.at(reach_m, which, np.sqrt(np.sum(squared, axis=0)))
     return count, means, reach_m

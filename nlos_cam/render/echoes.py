@@ -1,4 +1,6 @@
-"""Echoes: of all light that comes back along a beam, the strongest bin (S5), after the pulse has spread it."""
+"""Echoes: of all light that comes back along a beam, the strongest bin (S5), after the pulse has
+spread it.
+"""
 
 from dataclasses import dataclass
 from math import erf, sqrt
@@ -15,7 +17,9 @@ SIGMAS_PER_FWHM = 1 / np.sqrt(8 * np.log(2))
 
 @dataclass(frozen=True)
 class MultiBounce:
-    """Strongest and second strongest bins of each beam: of three bounces, or of the whole waveform."""
+    """Strongest and second strongest bins of each beam: of three bounces, or of the whole
+    waveform.
+    """
 
     peak: Float32
     """(rows, columns); 0 if no path comes back."""
@@ -24,7 +28,9 @@ class MultiBounce:
     path_m: Float32
     """(rows, columns); path length at the center of the strongest bin, NaN if there is none."""
     direct_included: bool = False
-    """True if the waveform contains the direct return: a pulse with a width mixes it with the rest."""
+    """True if the waveform contains the direct return: a pulse with a width mixes it with the
+    rest.
+    """
 
     def reshape(self, shape: tuple[int, int]) -> "MultiBounce":
         """Return the echoes in the shape of an image."""
@@ -34,7 +40,9 @@ class MultiBounce:
     def spread_over(self, which: NDArray[np.bool_]) -> "MultiBounce":
         """Return the echoes (k,) of the beams in a mask as (n,), with no echo for the others."""
         every = no_echoes(len(which))
-        every.peak[which], every.runner_up[which], every.path_m[which] = self.peak, self.runner_up, self.path_m
+        every.peak[which] = self.peak
+        every.runner_up[which] = self.runner_up
+        every.path_m[which] = self.path_m
         return every
 
 
@@ -45,13 +53,21 @@ def no_echoes(count: int) -> MultiBounce:
 
 
 @numba.njit(cache=True)
-def strongest_between(histogram: NDArray[np.floating], start: int, end: int) -> tuple[int, np.float32, np.float32]:
-    """Return index and value of the strongest bin from `start` to before `end`, and the value of the second."""
-    best, second, at = np.float32(0), np.float32(0), 0
+def strongest_between(
+    histogram: NDArray[np.floating], start: int, end: int
+) -> tuple[int, np.float32, np.float32]:
+    """Return index and value of the strongest bin from `start` to before `end`, and the value of
+    the second.
+    """
+    best = np.float32(0)
+    second = np.float32(0)
+    at = 0
     for k in range(start, end):
         value = np.float32(histogram[k])
         if value > best:  # a tie stays with the shorter path
-            best, second, at = value, best, k
+            second = best
+            best = value
+            at = k
         elif value > second:
             second = value
     return at, best, second
@@ -60,22 +76,29 @@ def strongest_between(histogram: NDArray[np.floating], start: int, end: int) -> 
 @numba.njit(cache=True, parallel=True)
 def _two_strongest(histogram: NDArray[np.floating]) -> tuple[NDArray[np.int64], Float32, Float32]:
     rows, bins = histogram.shape
-    winner, peak, second = np.zeros(rows, np.int64), np.zeros(rows, np.float32), np.zeros(rows, np.float32)
+    winner = np.zeros(rows, np.int64)
+    peak = np.zeros(rows, np.float32)
+    second = np.zeros(rows, np.float32)
     for i in numba.prange(rows):
         winner[i], peak[i], second[i] = strongest_between(histogram[i], 0, bins)
     return winner, peak, second
 
 
 def strongest(histogram: NDArray[np.floating], bin_m: float) -> MultiBounce:
-    """Return the strongest and second strongest bins of histograms (n, bins); ties go to the shortest path."""
+    """Return the strongest and second strongest bins of histograms (n, bins); ties go to the
+    shortest path.
+    """
     winner, peak, second = _two_strongest(histogram)
     path = np.where(peak > 0, (winner + 0.5) * bin_m, np.nan).astype(np.float32)
     return MultiBounce(peak, second, path)
 
 
 def compete(beams: Beams, multi: MultiBounce) -> tuple[Float32, Float32, Float32]:
-    """Return depth, intensity and margin (rows, columns) of the strongest echoes (S5); ties go to the direct return."""
-    direct, peak = beams.direct.astype(np.float32).reshape(beams.shape), multi.peak
+    """Return depth, intensity and margin (rows, columns) of the strongest echoes (S5); ties go to
+    the direct return.
+    """
+    direct = beams.direct.astype(np.float32).reshape(beams.shape)
+    peak = multi.peak
     if multi.direct_included:
         direct = np.zeros_like(direct)
     wins = peak > direct
@@ -84,12 +107,16 @@ def compete(beams: Beams, multi: MultiBounce) -> tuple[Float32, Float32, Float32
     # The device divides every path by two, also one of three bounces (S5).
     length = np.where(wins, multi.path_m / 2, beams.length_m.reshape(beams.shape))
     depth = np.where(intensity > 0, length * beams.cos_axis.reshape(beams.shape), np.nan)
-    margin = np.where(intensity > 0, 1 - second / np.maximum(intensity, np.finfo(np.float32).tiny), 0)
+    margin = np.where(
+        intensity > 0, 1 - second / np.maximum(intensity, np.finfo(np.float32).tiny), 0
+    )
     return depth.astype(np.float32), intensity, margin.astype(np.float32)
 
 
 def add_direct(histogram: Float32, beams: Beams, bin_m: float) -> Float32:
-    """Return histograms (n, bins) with each beam's direct return in the bin of its path; more bins if it needs them."""
+    """Return histograms (n, bins) with each beam's direct return in the bin of its path; more bins
+    if it needs them.
+    """
     returns = np.flatnonzero(beams.direct > 0)
     # There and back along one leg: the path is 2 d1.
     at = np.floor(2 * beams.length_m[returns] / bin_m).astype(np.int64)
@@ -100,19 +127,24 @@ def add_direct(histogram: Float32, beams: Beams, bin_m: float) -> Float32:
 
 
 def pulse_bins(pulse_ns: float, bin_m: float) -> float:
-    """Return the standard deviation, in path-length bins, of a Gaussian pulse with that full width at half maximum."""
+    """Return the standard deviation, in path-length bins, of a Gaussian pulse with that full width
+    at half maximum.
+    """
     # A Gaussian is at half its maximum where x^2 = 2 ln(2) sigma^2, so FWHM = sqrt(8 ln 2) sigma.
     return pulse_ns * 1e-9 * SPEED_OF_LIGHT_M_PER_S * SIGMAS_PER_FWHM / bin_m
 
 
 def with_pulse(histogram: Float32, pulse_ns: float, bin_m: float) -> Float32:
-    """Return histograms (n, bins) convolved with the pulse; longer by its tail, so that no light is lost."""
+    """Return histograms (n, bins) convolved with the pulse; longer by its tail, so that no light is
+    lost.
+    """
     if pulse_ns == 0:
         return histogram
     kernel = _pulse(pulse_ns, bin_m)
     half = len(kernel) // 2
     size = histogram.shape[1] + 2 * half
-    # Convolution theorem; zero padding by the kernel's length keeps the end from wrapping to the start.
+    # Convolution theorem; zero padding by the kernel's length keeps the end from wrapping to the
+    # start.
     spectrum = np.fft.rfft(histogram.astype(np.float64), size, axis=1) * np.fft.rfft(kernel, size)
     wide = np.fft.irfft(spectrum, size, axis=1)[:, half:]  # what would come before time 0 is cut
     return np.maximum(wide, 0).astype(np.float32)
@@ -124,7 +156,9 @@ def peak_share(pulse_ns: float, bin_m: float) -> float:
 
 
 def _pulse(pulse_ns: float, bin_m: float) -> Float64:
-    """Return the pulse over the bins around its middle, normalized to 1: differences of the normal distribution."""
+    """Return the pulse over the bins around its middle, normalized to 1: differences of the normal
+    distribution.
+    """
     sigma = pulse_bins(pulse_ns, bin_m)
     half = int(np.ceil(4 * sigma)) + 1
     edges = np.arange(-half, half + 2) - 0.5

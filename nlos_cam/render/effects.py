@@ -1,4 +1,6 @@
-"""Effects of light transport: verdicts with bounds, gathered into a plan that the renderer follows."""
+"""Effects of light transport: verdicts with bounds, gathered into a plan that the renderer
+follows.
+"""
 
 from collections.abc import Collection
 from dataclasses import dataclass, replace
@@ -43,31 +45,44 @@ def included(verdicts: Plan, name: str) -> bool:
     return next(effect.included for effect in verdicts if effect.name == name)
 
 
-def decide(findings: Collection[tuple[str, float, str]], tolerance: float, effects: Effects = "auto") -> Plan:
-    """Return a plan from findings (name, bound, reason): omitted bounds sum to at most the tolerance, smallest first.
+def decide(
+    findings: Collection[tuple[str, float, str]], tolerance: float, effects: Effects = "auto"
+) -> Plan:
+    """Return a plan from findings (name, bound, reason): omitted bounds sum to at most the
+    tolerance, smallest first.
 
     `effects` names exactly those to include instead. Raises SceneError for an unknown name.
     """
     if effects != "auto":
         return _asked(findings, effects)
-    # Changes add up at most (triangle inequality of L1); taking the smallest bounds first leaves out the most effects.
-    spent, left_out = 0.0, set[str]()
+    # Changes add up at most (triangle inequality of L1); taking the smallest bounds first leaves
+    # out the most effects.
+    spent = 0.0
+    left_out = set[str]()
     for name, bound, _ in sorted(findings, key=lambda finding: finding[1]):
         spent += bound
         if spent > tolerance:
             break
         left_out.add(name)
-    return tuple(Effect(name, name not in left_out, reason, bound) for name, bound, reason in findings)
+    return tuple(
+        Effect(name, name not in left_out, reason, bound) for name, bound, reason in findings
+    )
 
 
 def _asked(findings: Collection[tuple[str, float, str]], effects: Collection[str]) -> Plan:
     names = {effects} if isinstance(effects, str) else set(effects)
     if unknown := names - set(EFFECTS):
         near = did_you_mean(min(unknown), EFFECTS)
-        raise UnknownNameError(f"no effect {min(unknown)!r}.{near} Choose from {', '.join(EFFECTS)}, or auto")
+        raise UnknownNameError(
+            f"no effect {min(unknown)!r}.{near} Choose from {', '.join(EFFECTS)}, or auto"
+        )
     if not names & {"direct", "three-bounce"}:
-        raise SceneError(f"effects {', '.join(sorted(names)) or 'none'}: no light arrives: add direct or three-bounce")
+        raise SceneError(
+            f"effects {', '.join(sorted(names)) or 'none'}: no light arrives: add direct or"
+            " three-bounce"
+        )
     verdicts = (Effect(name, name in names, reason, bound) for name, bound, reason in findings)
     return tuple(
-        replace(e, reason=f"{'requested' if e.included else 'left out on request'}; {e.reason}") for e in verdicts
+        replace(e, reason=f"{'requested' if e.included else 'left out on request'}; {e.reason}")
+        for e in verdicts
     )

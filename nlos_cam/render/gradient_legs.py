@@ -1,11 +1,14 @@
-"""Derivatives of legs, beams and slopes: the factorized transport, reversed and linearized (compiled, float32).
+"""Derivatives of legs, beams and slopes: the factorized transport, reversed and linearized
+(compiled, float32).
 
-A winner's intensity is h_p = sum_s a(p, s) [F_s(k + 1 - t) - F_s(k - t)]: for beam p, patch s, the winner's bin k and
-t = d1 + d2 in bins, with F_s the running sum of the returned light b(s, q) over d3 + d4. One pass over the patches,
-each with its table in the first cache, gives the derivative with respect to every leg. To have a smooth F_s, each relay
-cell spreads its light over the path lengths that its own size covers; the renderer counts it at its middle.
+A winner's intensity is h_p = sum_s a(p, s) [F_s(k + 1 - t) - F_s(k - t)]: for beam p, patch s, the
+winner's bin k and t = d1 + d2 in bins, with F_s the running sum of the returned light b(s, q) over
+d3 + d4. One pass over the patches, each with its table in the first cache, gives the derivative
+with respect to every leg. To have a smooth F_s, each relay cell spreads its light over the path
+lengths that its own size covers; the renderer counts it at its middle.
 
-numba's cache depends on this file alone: after a change of a kernel that is imported here, delete __pycache__.
+numba's cache depends on this file alone: after a change of a kernel that is imported here, delete
+__pycache__.
 """
 
 from dataclasses import dataclass
@@ -17,12 +20,22 @@ from nlos_calibration.arrays import Float32, Float64, Int32, Int64, Mask
 
 from nlos_cam.render.geometry import NEAR_DIAGONALS, softened, solid_angle
 from nlos_cam.render.job import TransportJob
-from nlos_cam.render.legs import FAST, NumbaLegs, NumbaOptics, NumbaPoints, NumbaSurface, fill_all, scratch
+from nlos_cam.render.legs import (
+    FAST,
+    NumbaLegs,
+    NumbaOptics,
+    NumbaPoints,
+    NumbaSurface,
+    fill_all,
+    scratch,
+)
 from nlos_cam.render.planning import RenderProblem
 from nlos_cam.render.visibility import HeightField
 
 CHUNKS = 16
-"""Parts of the patches, each summed by one thread: the result does not depend on the number of threads."""
+"""Parts of the patches, each summed by one thread: the result does not depend on the number of
+threads.
+"""
 
 
 class Winners(NamedTuple):
@@ -49,7 +62,9 @@ class PatchChange(NamedTuple):
 
 
 class PointChange(NamedTuple):
-    """Rates of change of the wall's points (n) and their legs to the lidar, or derivatives with respect to them."""
+    """Rates of change of the wall's points (n) and their legs to the lidar, or derivatives with
+    respect to them.
+    """
 
     x: Float32
     y: Float32
@@ -68,25 +83,40 @@ class _Table(NamedTuple):
 
 
 @numba.njit(cache=True, error_model="numpy", fastmath=FAST)
-def _spread(s: int, legs: NumbaLegs, surface: NumbaSurface, relay: NumbaPoints, inverse_bin: np.float32,
-            winners: Winners) -> _Table:  # fmt: skip
+def _spread(
+    s: int,
+    legs: NumbaLegs,
+    surface: NumbaSurface,
+    relay: NumbaPoints,
+    inverse_bin: np.float32,
+    winners: Winners,
+) -> _Table:
     """Return the sub-bins of d3 + d4 over which each relay cell spreads its light."""
-    x, y, half, one = surface.x_m[s], surface.y_m[s], np.float32(0.5), np.float32(1)
+    x = surface.x_m[s]
+    y = surface.y_m[s]
+    half = np.float32(0.5)
+    one = np.float32(1)
     cells = len(relay.x_m)
-    low, high = np.empty(cells, np.int32), np.empty(cells, np.int32)
-    first, last = np.float32(np.inf), np.float32(0)
+    low = np.empty(cells, np.int32)
+    high = np.empty(cells, np.int32)
+    first = np.float32(np.inf)
+    last = np.float32(0)
     scale = winners.pitch_m * inverse_bin
     for q in range(cells):
-        # The gradient of d3 + d4 over the wall, times the cell's side: a box with the variance of the cell's lengths.
-        to_patch, to_lidar = one / legs.length_m[q], one / relay.length_m[q]
+        # The gradient of d3 + d4 over the wall, times the cell's side: a box with the variance of
+        # the cell's lengths.
+        to_patch = one / legs.length_m[q]
+        to_lidar = one / relay.length_m[q]
         gx = (relay.x_m[q] - x) * to_patch + (relay.x_m[q] - winners.lidar_x_m) * to_lidar
         gy = (relay.y_m[q] - y) * to_patch + (relay.y_m[q] - winners.lidar_y_m) * to_lidar
         width = max(np.sqrt(gx * gx + gy * gy) * scale, one)
         at = (legs.length_m[q] + relay.length_m[q]) * inverse_bin
         start = np.floor(at - half * width + half)
         end = max(np.floor(at + half * width + half), start + one)
-        low[q], high[q] = np.int32(start), np.int32(end)
-        first, last = min(first, start), max(last, end)
+        low[q] = np.int32(start)
+        high[q] = np.int32(end)
+        first = min(first, start)
+        last = max(last, end)
     begin = int(first) - 2
     for q in range(cells):
         low[q] -= begin
@@ -96,44 +126,55 @@ def _spread(s: int, legs: NumbaLegs, surface: NumbaSurface, relay: NumbaPoints, 
 
 @numba.njit(cache=True)
 def _sums(table: _Table, values: Float32) -> tuple[Float32, Float32]:
-    """Return the running sum over sub-bins of values spread by a table, and its rate per sub-bin, at each edge."""
-    density, total, rate = (
-        np.zeros(table.size, np.float32),
-        np.zeros(table.size, np.float32),
-        np.zeros(table.size, np.float32),
-    )
+    """Return the running sum over sub-bins of values spread by a table, and its rate per sub-bin,
+    at each edge.
+    """
+    density = np.zeros(table.size, np.float32)
+    total = np.zeros(table.size, np.float32)
+    rate = np.zeros(table.size, np.float32)
     for q in range(len(values)):
         each = values[q] / np.float32(table.high[q] - table.low[q])
         density[table.low[q]] += each
         density[table.high[q]] -= each
-    level, running, before = 0.0, 0.0, 0.0
+    level = 0.0
+    running = 0.0
+    before = 0.0
     for i in range(table.size):
         level += density[i]
         total[i] = running
         rate[i] = 0.5 * (before + level)
-        running, before = running + level, level
+        running = running + level
+        before = level
     return total, rate
 
 
 @numba.njit(cache=True)
-def _means(table: _Table, edges: Float32, edge_rates: Float32, inverse_bin: np.float32) -> tuple[Float32, Float32]:
-    """Return for each relay cell the mean over its sub-bins of two functions that beams have left at edges.
+def _means(
+    table: _Table, edges: Float32, edge_rates: Float32, inverse_bin: np.float32
+) -> tuple[Float32, Float32]:
+    """Return for each relay cell the mean over its sub-bins of two functions that beams have left
+    at edges.
 
-    The first is the running sum of `edges`, the transpose of reading differences of `_sums`; the second is the
-    transpose of reading its rates, times sub-bins per meter, plus the running sum of `edge_rates`.
+    The first is the running sum of `edges`, the transpose of reading differences of `_sums`; the
+    second is the transpose of reading its rates, times sub-bins per meter, plus the running sum of
+    `edge_rates`.
     """
     size = table.size
-    value, rate = np.zeros(size + 1), np.zeros(size + 1)
-    level, other = 0.0, 0.0
+    value = np.zeros(size + 1)
+    rate = np.zeros(size + 1)
+    level = 0.0
+    other = 0.0
     for i in range(size):
         level += edges[i]
         other += edge_rates[i]
         following = edges[i + 1] if i + 1 < size else np.float32(0)
         value[i + 1] = value[i] + level
         rate[i + 1] = rate[i] + other + 0.5 * inverse_bin * (edges[i] + following)
-    values, rates = np.empty(len(table.low), np.float32), np.empty(len(table.low), np.float32)
+    values = np.empty(len(table.low), np.float32)
+    rates = np.empty(len(table.low), np.float32)
     for q in range(len(values)):
-        start, end = table.low[q], table.high[q]
+        start = table.low[q]
+        end = table.high[q]
         share = 1 / (end - start)
         values[q] = (value[end] - value[start]) * share
         rates[q] = (rate[end] - rate[start]) * share
@@ -144,13 +185,17 @@ def _means(table: _Table, edges: Float32, edge_rates: Float32, inverse_bin: np.f
 def _edges(
     legs: NumbaLegs, feet: NumbaPoints, table: _Table, winners: Winners, inverse_bin: np.float32
 ) -> tuple[Int32, Int32]:
-    """Return for each beam the edges of the table between which a path falls into the winner's bin."""
-    half, last = np.float32(0.5), np.float32(table.size - 1)
-    low, high = np.empty(len(legs.length_m), np.int32), np.empty(len(legs.length_m), np.int32)
+    """Return for each beam the edges of the table between which a path falls into the winner's
+    bin.
+    """
+    half = np.float32(0.5)
+    last = np.float32(table.size - 1)
+    low = np.empty(len(legs.length_m), np.int32)
+    high = np.empty(len(legs.length_m), np.int32)
     for p in range(len(low)):
-        at = np.floor(winners.edge[p] - (feet.length_m[p] + legs.length_m[p]) * inverse_bin + half) - np.float32(
-            table.begin
-        )
+        at = np.floor(
+            winners.edge[p] - (feet.length_m[p] + legs.length_m[p]) * inverse_bin + half
+        ) - np.float32(table.begin)
         low[p] = np.int32(min(max(at, np.float32(0)), last))
         high[p] = np.int32(min(max(at + np.float32(winners.per_bin), np.float32(0)), last))
     return low, high
@@ -158,36 +203,57 @@ def _edges(
 
 @numba.njit(cache=True, error_model="numpy", fastmath=FAST, inline="always")
 def _fall(squared: np.float32, soft: np.float32, optics: NumbaOptics) -> np.float32:
-    """Return minus twice the derivative of the logarithm of a leg's weight with respect to d^2, cosines' ends held."""
-    one, two = np.float32(1), np.float32(2)
+    """Return minus twice the derivative of the logarithm of a leg's weight with respect to d^2,
+    cosines' ends held.
+    """
+    one = np.float32(1)
+    two = np.float32(2)
     ramp = max(one - squared / optics.near_m2, np.float32(0))
     lengths = two if optics.lambertian else one  # cosines divide by d once or twice
-    return lengths / squared + two * (one - two * soft * ramp / optics.near_m2) / (squared + soft * ramp * ramp)
+    return lengths / squared + two * (one - two * soft * ramp / optics.near_m2) / (
+        squared + soft * ramp * ramp
+    )
 
 
 @numba.njit(cache=True, error_model="numpy", fastmath=FAST)
-def _pull_legs(s: int, surface: NumbaSurface, points: NumbaPoints, optics: NumbaOptics, outgoing: bool, light: Float32,
-               longer: Float32, patch: Float64, points_out: Float32) -> None:  # fmt: skip
-    """Add to a patch (6,) and its points (4, n) the derivative by way of each leg's weight and length.
+def _pull_legs(
+    s: int,
+    surface: NumbaSurface,
+    points: NumbaPoints,
+    optics: NumbaOptics,
+    outgoing: bool,
+    light: Float32,
+    longer: Float32,
+    patch: Float64,
+    points_out: Float32,
+) -> None:
+    """Add to a patch (6,) and its points (4, n) the derivative by way of each leg's weight and
+    length.
 
-    `light` and `longer` are the derivatives with respect to the logarithm of each leg's weight, and to its length.
+    `light` and `longer` are the derivatives with respect to the logarithm of each leg's weight, and
+    to its length.
     """
-    x, y, z = surface.x_m[s], surface.y_m[s], surface.z_m[s]
-    nx, ny, nz = surface.normal_x[s], surface.normal_y[s], surface.normal_z[s]
+    x = surface.x_m[s]
+    y = surface.y_m[s]
+    z = surface.z_m[s]
+    nx = surface.normal_x[s]
+    ny = surface.normal_y[s]
+    nz = surface.normal_z[s]
     soft = points.soft_m2 if outgoing else surface.soft_m2[s]
-    faces, nothing = optics.lambertian or not outgoing, np.float32(0)
-    total, facing, facing_x, facing_y, away, away_x, away_y = (
-        nothing,
-        nothing,
-        nothing,
-        nothing,
-        nothing,
-        nothing,
-        nothing,
-    )
+    faces = optics.lambertian or not outgoing
+    nothing = np.float32(0)
+    total = nothing
+    facing = nothing
+    facing_x = nothing
+    facing_y = nothing
+    away = nothing
+    away_x = nothing
+    away_y = nothing
     for i in range(len(light)):
-        # v = point - patch. With weight = [n . v] [z] f(v^2): d log / d patch = -n / n . v + fall v + e_z / z.
-        dx, dy = points.x_m[i] - x, points.y_m[i] - y
+        # v = point - patch. With weight = [n . v] [z] f(v^2): d log / d patch = -n / n . v + fall v
+        # + e_z / z.
+        dx = points.x_m[i] - x
+        dy = points.y_m[i] - y
         squared = dx * dx + dy * dy + z * z
         across = nx * dx + ny * dy - nz * z
         front = light[i] / across if faces and across > nothing else nothing
@@ -213,19 +279,37 @@ def _pull_legs(s: int, surface: NumbaSurface, points: NumbaPoints, optics: Numba
 
 
 @numba.njit(cache=True, error_model="numpy", fastmath=FAST)
-def _push_legs(s: int, surface: NumbaSurface, points: NumbaPoints, optics: NumbaOptics, outgoing: bool,
-               change: PatchChange, moved: PointChange, light: Float32, longer: Float32) -> None:  # fmt: skip
-    """Fill in the rates of each leg's logarithm of the weight and of its length: the transpose of `_pull_legs`."""
-    x, y, z = surface.x_m[s], surface.y_m[s], surface.z_m[s]
-    nx, ny, nz = surface.normal_x[s], surface.normal_y[s], surface.normal_z[s]
+def _push_legs(
+    s: int,
+    surface: NumbaSurface,
+    points: NumbaPoints,
+    optics: NumbaOptics,
+    outgoing: bool,
+    change: PatchChange,
+    moved: PointChange,
+    light: Float32,
+    longer: Float32,
+) -> None:
+    """Fill in the rates of each leg's logarithm of the weight and of its length: the transpose of
+    `_pull_legs`.
+    """
+    x = surface.x_m[s]
+    y = surface.y_m[s]
+    z = surface.z_m[s]
+    nx = surface.normal_x[s]
+    ny = surface.normal_y[s]
+    nz = surface.normal_z[s]
     px, py, pz = change.point[s]
     tx, ty, tz = change.normal[s]
     soft = points.soft_m2 if outgoing else surface.soft_m2[s]
-    faces, nothing = optics.lambertian or not outgoing, np.float32(0)
+    faces = optics.lambertian or not outgoing
+    nothing = np.float32(0)
     height = pz / z if outgoing or optics.lambertian else nothing
     for i in range(len(light)):
-        dx, dy = points.x_m[i] - x, points.y_m[i] - y
-        vx, vy = moved.x[i] - px, moved.y[i] - py
+        dx = points.x_m[i] - x
+        dy = points.y_m[i] - y
+        vx = moved.x[i] - px
+        vy = moved.y[i] - py
         squared = dx * dx + dy * dy + z * z
         across = nx * dx + ny * dy - nz * z
         along = dx * vx + dy * vy + z * pz
@@ -236,8 +320,14 @@ def _push_legs(s: int, surface: NumbaSurface, points: NumbaPoints, optics: Numba
 
 
 @numba.njit(cache=True)
-def _legs(s: int, points: NumbaPoints, outgoing: bool, surface: NumbaSurface, optics: NumbaOptics,
-          field: HeightField) -> NumbaLegs:  # fmt: skip
+def _legs(
+    s: int,
+    points: NumbaPoints,
+    outgoing: bool,
+    surface: NumbaSurface,
+    optics: NumbaOptics,
+    field: HeightField,
+) -> NumbaLegs:
     """Return the legs between patch `s` and all points, with their shadows."""
     legs = scratch(len(points.x_m))
     fill_all(legs, s, surface, points, optics, field, outgoing)
@@ -245,18 +335,32 @@ def _legs(s: int, points: NumbaPoints, outgoing: bool, surface: NumbaSurface, op
 
 
 @numba.njit(cache=True)
-def _pull_patch(s: int, feet: NumbaPoints, surface: NumbaSurface, relay: NumbaPoints, optics: NumbaOptics,
-                field: HeightField, winners: Winners, light: Float32, path: Float32, patch: Float64,
-                beams: Float32, cells: Float32) -> None:  # fmt: skip
-    back, there = _legs(s, relay, True, surface, optics, field), _legs(s, feet, False, surface, optics, field)
+def _pull_patch(
+    s: int,
+    feet: NumbaPoints,
+    surface: NumbaSurface,
+    relay: NumbaPoints,
+    optics: NumbaOptics,
+    field: HeightField,
+    winners: Winners,
+    light: Float32,
+    path: Float32,
+    patch: Float64,
+    beams: Float32,
+    cells: Float32,
+) -> None:
+    back = _legs(s, relay, True, surface, optics, field)
+    there = _legs(s, feet, False, surface, optics, field)
     table = _spread(s, back, surface, relay, optics.inverse_bin, winners)
     total, rate = _sums(table, back.weight)
     low, high = _edges(there, feet, table, winners, optics.inverse_bin)
-    edges, edge_rates = np.zeros(table.size, np.float32), np.zeros(table.size, np.float32)
+    edges = np.zeros(table.size, np.float32)
+    edge_rates = np.zeros(table.size, np.float32)
     strength = surface.strength[s]
     shorter = np.empty(len(low), np.float32)
     for p in range(len(low)):
-        a, inside = there.weight[p] * light[p], total[high[p]] - total[low[p]]
+        a = there.weight[p] * light[p]
+        inside = total[high[p]] - total[low[p]]
         b = there.weight[p] * strength * path[p]
         patch[6] += a * inside
         a *= strength
@@ -275,12 +379,21 @@ def _pull_patch(s: int, feet: NumbaPoints, surface: NumbaSurface, relay: NumbaPo
 
 
 @numba.njit(cache=True, parallel=True)
-def pull(feet: NumbaPoints, surface: NumbaSurface, relay: NumbaPoints, optics: NumbaOptics, field: HeightField,
-         winners: Winners, light: Float32, path: Float32) -> tuple[Float64, Float32, Float32]:  # fmt: skip
-    """Return the derivatives of sum(light * h) + sum(path * light-weighted path sums) with respect to every leg's ends.
+def pull(
+    feet: NumbaPoints,
+    surface: NumbaSurface,
+    relay: NumbaPoints,
+    optics: NumbaOptics,
+    field: HeightField,
+    winners: Winners,
+    light: Float32,
+    path: Float32,
+) -> tuple[Float64, Float32, Float32]:
+    """Return the derivatives of sum(light * h) + sum(path * light-weighted path sums) with respect
+    to every leg's ends.
 
-    They are those of the patches (n, 7: point, normal, strength), and by chunk those of the beams and the relay's cells
-    (chunks, 4, n: x, y, length, logarithm of the weight).
+    They are those of the patches (n, 7: point, normal, strength), and by chunk those of the beams
+    and the relay's cells (chunks, 4, n: x, y, length, logarithm of the weight).
     """
     count = len(surface.x_m)
     patches = np.zeros((count, 7))
@@ -289,53 +402,107 @@ def pull(feet: NumbaPoints, surface: NumbaSurface, relay: NumbaPoints, optics: N
     for chunk in numba.prange(CHUNKS):
         for s in range(chunk * count // CHUNKS, (chunk + 1) * count // CHUNKS):
             _pull_patch(
-                s, feet, surface, relay, optics, field, winners, light, path, patches[s], beams[chunk], cells[chunk]
+                s,
+                feet,
+                surface,
+                relay,
+                optics,
+                field,
+                winners,
+                light,
+                path,
+                patches[s],
+                beams[chunk],
+                cells[chunk],
             )
     return patches, beams, cells
 
 
 @numba.njit(cache=True)
-def _push_patch(s: int, feet: NumbaPoints, surface: NumbaSurface, relay: NumbaPoints, optics: NumbaOptics,
-                field: HeightField, winners: Winners, change: PatchChange, spots: PointChange, cells: PointChange,
-                light: Float32, path: Float32) -> None:  # fmt: skip
-    back, there = _legs(s, relay, True, surface, optics, field), _legs(s, feet, False, surface, optics, field)
+def _push_patch(
+    s: int,
+    feet: NumbaPoints,
+    surface: NumbaSurface,
+    relay: NumbaPoints,
+    optics: NumbaOptics,
+    field: HeightField,
+    winners: Winners,
+    change: PatchChange,
+    spots: PointChange,
+    cells: PointChange,
+    light: Float32,
+    path: Float32,
+) -> None:
+    back = _legs(s, relay, True, surface, optics, field)
+    there = _legs(s, feet, False, surface, optics, field)
     table = _spread(s, back, surface, relay, optics.inverse_bin, winners)
     total, rate = _sums(table, back.weight)
-    brighter, longer = np.empty_like(back.weight), np.empty_like(back.weight)
+    brighter = np.empty_like(back.weight)
+    longer = np.empty_like(back.weight)
     _push_legs(s, surface, relay, optics, True, change, cells, brighter, longer)
     for q in range(len(brighter)):
         brighter[q] *= back.weight[q]
         longer[q] *= back.weight[q]
     total_light, _ = _sums(table, brighter)
     total_path, rate_path = _sums(table, longer)
-    brighter, longer = np.empty_like(there.weight), np.empty_like(there.weight)
+    brighter = np.empty_like(there.weight)
+    longer = np.empty_like(there.weight)
     _push_legs(s, surface, feet, optics, False, change, spots, brighter, longer)
     low, high = _edges(there, feet, table, winners, optics.inverse_bin)
-    strength, stronger = surface.strength[s], change.strength[s]
+    stronger = change.strength[s]
+    strength = surface.strength[s]
     for p in range(len(low)):
-        a, i, j = there.weight[p] * strength, low[p], high[p]
+        a = there.weight[p] * strength
+        i = low[p]
+        j = high[p]
         inside = total[j] - total[i]
         crossing = longer[p] * (rate[j] - rate[i]) + rate_path[j] - rate_path[i]
-        light[p] += a * (brighter[p] * inside + total_light[j] - total_light[i] - crossing * optics.inverse_bin)
+        light[p] += a * (
+            brighter[p] * inside + total_light[j] - total_light[i] - crossing * optics.inverse_bin
+        )
         light[p] += there.weight[p] * stronger * inside
         path[p] += a * (longer[p] * inside + total_path[j] - total_path[i])
 
 
 @numba.njit(cache=True, parallel=True)
-def push(feet: NumbaPoints, surface: NumbaSurface, relay: NumbaPoints, optics: NumbaOptics, field: HeightField,
-         winners: Winners, change: PatchChange, spots: PointChange, cells: PointChange,
-         each: bool) -> tuple[Float32, Float32]:  # fmt: skip
+def push(
+    feet: NumbaPoints,
+    surface: NumbaSurface,
+    relay: NumbaPoints,
+    optics: NumbaOptics,
+    field: HeightField,
+    winners: Winners,
+    change: PatchChange,
+    spots: PointChange,
+    cells: PointChange,
+    each: bool,
+) -> tuple[Float32, Float32]:
     """Return the rates (rows, beams) of the winners' intensity and light-weighted path sums.
 
-    One row for each patch's own change (`each`), else one for each chunk of patches: their sum is the rate.
+    One row for each patch's own change (`each`), else one for each chunk of patches: their sum is
+    the rate.
     """
     count = len(surface.x_m)
     rows = count if each else CHUNKS
-    light, path = np.zeros((rows, len(feet.x_m)), np.float32), np.zeros((rows, len(feet.x_m)), np.float32)
+    light = np.zeros((rows, len(feet.x_m)), np.float32)
+    path = np.zeros((rows, len(feet.x_m)), np.float32)
     for chunk in numba.prange(CHUNKS):
         for s in range(chunk * count // CHUNKS, (chunk + 1) * count // CHUNKS):
             row = np.int64(s) if each else np.int64(chunk)
-            _push_patch(s, feet, surface, relay, optics, field, winners, change, spots, cells, light[row], path[row])
+            _push_patch(
+                s,
+                feet,
+                surface,
+                relay,
+                optics,
+                field,
+                winners,
+                change,
+                spots,
+                cells,
+                light[row],
+                path[row],
+            )
     return light, path
 
 
@@ -346,7 +513,9 @@ def softened_slope(squared_m2: Float64, soft_m2: Float64 | float, near_m: float)
 
 @dataclass(frozen=True)
 class BeamRates:
-    """Rates of the beams (n) for unit motions (6) of the lidar, along and about the wall frame's axes."""
+    """Rates of the beams (n) for unit motions (6) of the lidar, along and about the wall frame's
+    axes.
+    """
 
     spot: Float64
     """(6, n, 2); x and y."""
@@ -360,31 +529,48 @@ class BeamRates:
     @classmethod
     def of(cls, problem: RenderProblem, chosen: Mask) -> "BeamRates":
         """Return the rates of a problem's beams; those that miss the wall have none."""
-        beams, rig = problem.beams, problem.scene.rig
-        lit, shift, turn = beams.on_wall, np.eye(6)[:, None, :3], np.eye(6)[:, None, 3:]
+        beams = problem.beams
+        rig = problem.scene.rig
+        lit = beams.on_wall
+        shift = np.eye(6)[:, None, :3]
+        turn = np.eye(6)[:, None, 3:]
         length = np.where(lit, beams.length_m, 0.0)[:, None]
         rate = np.cross(turn, beams.direction[None])
         # The wall is z = 0: lidar_z + length direction_z = 0 stays true.
-        longer = -(shift[..., 2:] + length * rate[..., 2:]) / np.where(lit, beams.direction[:, 2], -1.0)[:, None]
-        spot = (shift + longer * beams.direction + length * rate)[..., :2]
-        longer, cosine = longer[..., 0] * lit, -rate[..., 2] * lit
-        # I_direct falls with softened(d1^2), as in `geometry.returned`.
-        cell_m2, squared = rig.device.receiver_cell_m2, beams.length_m[chosen] ** 2
-        soft, near_m = (
-            cell_m2 / solid_angle(lambertian=problem.scene.radiometry == "lambertian"),
-            NEAR_DIAGONALS * np.sqrt(2 * cell_m2),
+        longer = (
+            -(shift[..., 2:] + length * rate[..., 2:])
+            / np.where(lit, beams.direction[:, 2], -1.0)[:, None]
         )
-        fall = 2 * beams.length_m[chosen] * softened_slope(squared, soft, near_m) / softened(squared, soft, near_m)
-        direct = beams.direct[chosen] * (cosine[:, chosen] / beams.cos_incidence[chosen] - fall * longer[:, chosen])
+        spot = (shift + longer * beams.direction + length * rate)[..., :2]
+        longer = longer[..., 0] * lit
+        cosine = -rate[..., 2] * lit
+        # I_direct falls with softened(d1^2), as in `geometry.returned`.
+        cell_m2 = rig.device.receiver_cell_m2
+        squared = beams.length_m[chosen] ** 2
+        soft = cell_m2 / solid_angle(lambertian=problem.scene.radiometry == "lambertian")
+        near_m = NEAR_DIAGONALS * np.sqrt(2 * cell_m2)
+        fall = (
+            2
+            * beams.length_m[chosen]
+            * softened_slope(squared, soft, near_m)
+            / softened(squared, soft, near_m)
+        )
+        direct = beams.direct[chosen] * (
+            cosine[:, chosen] / beams.cos_incidence[chosen] - fall * longer[:, chosen]
+        )
         return cls(spot, longer, np.asarray(cosine, np.float64), direct)
 
 
 @dataclass(frozen=True)
 class Tilts:
-    """Slopes of a depth map's cells (n) as linear functions of their depths, as `patches.slope_along` has them."""
+    """Slopes of a depth map's cells (n) as linear functions of their depths, as
+    `patches.slope_along` has them.
+    """
 
     pairs: tuple[tuple[Int64, Int64], tuple[Int64, Int64]]
-    """For x and y, the cells (n,) whose depths are added and subtracted: twice the same for a cell without a slope."""
+    """For x and y, the cells (n,) whose depths are added and subtracted: twice the same for a cell
+    without a slope.
+    """
     pitch_m: tuple[float, float]
     normal: Float64
     beta: Float64
@@ -393,15 +579,19 @@ class Tilts:
     @classmethod
     def of(cls, job: TransportJob, jump_m: float, *, tilted: bool) -> "Tilts":
         """Return the slopes of a job's patches, none if the plan left the tilt out."""
-        patches, depth = job.patches, job.field.depth_m
+        patches = job.patches
+        depth = job.field.depth_m
         number = np.full(np.add(depth.shape, 2), -1)
         row, column, own = patches.row + 1, patches.column + 1, np.arange(len(patches.row))
         number[row, column] = own
         z = patches.point_m[:, 2]
         pairs: list[tuple[Int64, Int64]] = []
         for down, right in ((0, 1), (-1, 0)):  # rows run along -y
-            # Along an image's rows and columns the difference is forward, else backward: along y it is the other way.
-            forward, backward = (number[row + sign * abs(down), column + sign * right] for sign in (1, -1))
+            # Along an image's rows and columns the difference is forward, else backward: along y it
+            # is the other way.
+            forward, backward = (
+                number[row + sign * abs(down), column + sign * right] for sign in (1, -1)
+            )
             usable = [tilted & (n >= 0) & (np.abs(z[n] - z) <= jump_m) for n in (forward, backward)]
             after = np.where(usable[0], forward, own)
             before = np.where(usable[0], own, np.where(usable[1], backward, own))
@@ -419,10 +609,14 @@ class Tilts:
         # beta normal = (slope_x, slope_y, -1), so that beta' = normal . slopes'.
         rate = np.pad(slopes, ((0, 0), (0, 1)))
         steeper = (self.normal * rate).sum(-1)
-        return (rate - self.normal * steeper[:, None]) / self.beta[:, None], self.strength * steeper / self.beta
+        return (rate - self.normal * steeper[:, None]) / self.beta[
+            :, None
+        ], self.strength * steeper / self.beta
 
     def transposed(self, normal: Float64, strength: Float64) -> Float64:
-        """Return the derivative (n,) with respect to the depths, from that with respect to normals and strengths."""
+        """Return the derivative (n,) with respect to the depths, from that with respect to normals
+        and strengths.
+        """
         along = (self.normal * normal).sum(-1) - self.strength * strength
         slopes = ((normal - self.normal * along[:, None]) / self.beta[:, None])[:, :2]
         depth = np.zeros(len(self.beta))

@@ -1,11 +1,14 @@
-"""Derivatives of the reported intensity and path length with respect to a scene: depth, albedo, pose of lidar and wall.
+"""Derivatives of the reported intensity and path length with respect to a scene: depth, albedo,
+pose of lidar and wall.
 
-The winner of every beam is held: at a tie the reported echo jumps and has no derivative, so leave out beams whose
-`margin` is small. Also held are visibility (the light at a moving edge of a shadow is missing), which neighbors of the
-depth map are joined, and near-contact areas. The light that crosses the edges of the winner's bin is included.
+The winner of every beam is held: at a tie the reported echo jumps and has no derivative, so leave
+out beams whose `margin` is small. Also held are visibility (the light at a moving edge of a shadow
+is missing), which neighbors of the depth map are joined, and near-contact areas. The light that
+crosses the edges of the winner's bin is included.
 
-The reported path of a three-bounce winner is its bin's center, a step function. Its derivative here is the
-light-weighted mean rate of the path lengths in the bin: the mean of the steps as the echo moves through the bins.
+The reported path of a three-bounce winner is its bin's center, a step function. Its derivative here
+is the light-weighted mean rate of the path lengths in the bin: the mean of the steps as the echo
+moves through the bins.
 """
 
 from dataclasses import dataclass, replace
@@ -49,22 +52,30 @@ COVERED = {"direct", "three-bounce", "occluder", "self-occlusion", "tilt", "colo
 
 @dataclass(frozen=True)
 class SceneVector:
-    """A number for each parameter of a scene: rates of their change, or derivatives with respect to them."""
+    """A number for each parameter of a scene: rates of their change, or derivatives with respect to
+    them.
+    """
 
     depth_m: Float64 | None = None
     """(rows, columns); of the depth map, tilts following. 0 for background."""
     albedo: Float64 | None = None
     """(rows, columns)."""
     point_m: Float64 | None = None
-    """(n, 3); of the patches' centers in the wall frame, tilts held: along given directions, a product with them."""
+    """(n, 3); of the patches' centers in the wall frame, tilts held: along given directions, a
+    product with them.
+    """
     lidar: Float64 | None = None
-    """(6,); shift (m) and turn (rad) of the lidar along and about axes parallel to the wall frame's, at the lidar."""
+    """(6,); shift (m) and turn (rad) of the lidar along and about axes parallel to the wall
+    frame's, at the lidar.
+    """
     wall: Float64 | None = None
     """(6,); the same of the wall about its frame's origin, while lidar and object stay."""
 
 
 class MovedRig(Rig):
-    """Rig whose lidar has any pose, also one that the wall frame's definition leaves no number for."""
+    """Rig whose lidar has any pose, also one that the wall frame's definition leaves no number
+    for.
+    """
 
     pose: tuple[float, ...]
     """Rows of wall_from_lidar (4, 4), flattened."""
@@ -75,31 +86,48 @@ class MovedRig(Rig):
         return np.reshape(self.pose, (4, 4))
 
 
-def moved(problem: RenderProblem, lidar: Float64 | None = None, wall: Float64 | None = None) -> RenderProblem:
-    """Return a render problem after motions (6,), as in SceneVector, of the lidar, then of the wall.
+def moved(
+    problem: RenderProblem, lidar: Float64 | None = None, wall: Float64 | None = None
+) -> RenderProblem:
+    """Return a render problem after motions (6,), as in SceneVector, of the lidar, then of the
+    wall.
 
     The plan, what the object hides from itself, and the relay cells that the occluder hides stay.
     """
     shift, turn = _motion(lidar)
     back, turned = _motion(wall)
     pose = problem.scene.rig.wall_from_lidar.copy()
-    pose[:3, :3], pose[:3, 3] = turned.T @ turn @ pose[:3, :3], turned.T @ (pose[:3, 3] + shift - back)
+    pose[:3, :3], pose[:3, 3] = (
+        turned.T @ turn @ pose[:3, :3],
+        turned.T @ (pose[:3, 3] + shift - back),
+    )
     rig = MovedRig(**problem.scene.rig.model_dump(exclude={"pose"}), pose=tuple(pose.ravel()))
-    lambertian, job = problem.scene.radiometry == "lambertian", problem.job
+    lambertian = problem.scene.radiometry == "lambertian"
+    job = problem.job
     intrinsics = replace(problem.scene, rig=rig).intrinsics(problem.accuracy.beams_per_cell)
     beams = cast(rig, intrinsics, lambertian=lambertian, occluder=problem.includes("occluder"))
     beams = beams if problem.includes("direct") else beams.without_direct()
     if job is not None:
-        patches, lit = job.patches, beams.on_wall
-        patches = replace(patches, point_m=(patches.point_m - back) @ turned, normal=patches.normal @ turned)
-        length = np.sqrt((job.relay.x_m - pose[0, 3]) ** 2 + (job.relay.y_m - pose[1, 3]) ** 2 + pose[2, 3] ** 2)
+        patches = job.patches
+        lit = beams.on_wall
+        patches = replace(
+            patches, point_m=(patches.point_m - back) @ turned, normal=patches.normal @ turned
+        )
+        length = np.sqrt(
+            (job.relay.x_m - pose[0, 3]) ** 2 + (job.relay.y_m - pose[1, 3]) ** 2 + pose[2, 3] ** 2
+        )
         relay = replace(job.relay, length_m=length, cos_lidar=pose[2, 3] / length)
         columns = beams.laser_spot_m[lit], beams.length_m[lit], beams.cos_incidence[lit]
         names = "laser_spot_m", "length_m", "cos_incidence"
         job = replace(
-            job, patches=patches, relay=relay, lidar_m=beams.lidar_m, map_spots_m=columns[0],
-            bins=bins_of(beams, patches, relay, rig.device), **dict(zip(names, columns, strict=True)),
-        )  # fmt: skip
+            job,
+            patches=patches,
+            relay=relay,
+            lidar_m=beams.lidar_m,
+            map_spots_m=columns[0],
+            bins=bins_of(beams, patches, relay, rig.device),
+            **dict(zip(names, columns, strict=True)),
+        )
     return replace(problem, scene=replace(problem.scene, rig=rig), beams=beams, job=job)
 
 
@@ -108,61 +136,99 @@ def _motion(vector: Float64 | None) -> tuple[Float64, Float64]:
     shift, turn = (np.zeros(3), np.zeros(3)) if vector is None else (vector[:3], vector[3:])
     angle = float(np.linalg.norm(turn))
     cross = np.cross(np.eye(3), turn)  # rows e_i x turn: the matrix of turn x
-    return shift, np.eye(3) + np.sinc(angle / np.pi) * cross + 0.5 * np.sinc(angle / 2 / np.pi) ** 2 * cross @ cross
+    return (
+        shift,
+        np.eye(3)
+        + np.sinc(angle / np.pi) * cross
+        + 0.5 * np.sinc(angle / 2 / np.pi) ** 2 * cross @ cross,
+    )
 
 
 class Gradients:
-    """Winners of a scene with their derivatives: J v by `push`, J^T w by `pull`, and J for some parameters.
+    """Winners of a scene with their derivatives: J v by `push`, J^T w by `pull`, and J for some
+    parameters.
 
-    Maps are (rows, columns) of beams, as `render` has them at `beams_per_cell` 1. Raises SceneError for a scene with
-    an effect that is not COVERED, or an accuracy that joins cells (`draft`).
+    Maps are (rows, columns) of beams, as `render` has them at `beams_per_cell` 1. Raises SceneError
+    for a scene with an effect that is not COVERED, or an accuracy that joins cells (`draft`).
     """
 
     def __init__(
-        self, scene: Scene | RenderProblem, accuracy: str | Accuracy = "standard", effects: Effects = "auto"
+        self,
+        scene: Scene | RenderProblem,
+        accuracy: str | Accuracy = "standard",
+        effects: Effects = "auto",
     ) -> None:
         if isinstance(scene, RenderProblem):
             problem = scene
         else:
             problem = prepare(scene, replace(accuracy_named(accuracy), finest_cells=0), effects)
-        self.problem, beams = problem, problem.beams
+        self.problem = problem
+        beams = problem.beams
         if missing := sorted({effect.name for effect in problem.plan if effect.included} - COVERED):
-            raise SceneError(f"no gradients of the effect {missing[0]}: leave it out with `effects`")
-        job, depth_m = problem.job, problem.scene.object_depth_m
+            raise SceneError(
+                f"no gradients of the effect {missing[0]}: leave it out with `effects`"
+            )
+        job = problem.job
+        depth_m = problem.scene.object_depth_m
         if job is not None and depth_m is not None and len(job.field.depth_m) < len(depth_m):
-            raise SceneError(f"no gradients at accuracy {problem.accuracy.name!r}, which joins cells: choose fine")
-        echoes = (no_echoes(len(beams.on_wall)) if job is None else _echoes(job).spread_over(beams.on_wall)).reshape(
-            beams.shape
-        )
+            raise SceneError(
+                f"no gradients at accuracy {problem.accuracy.name!r}, which joins cells: choose"
+                " fine"
+            )
+        echoes = (
+            no_echoes(len(beams.on_wall))
+            if job is None
+            else _echoes(job).spread_over(beams.on_wall)
+        ).reshape(beams.shape)
         depth, self.intensity, self.margin = compete(beams, echoes)
         self.depth_m: Float32 = depth
         """(rows, columns); as the lidar reports it."""
-        self.three_bounce: Mask = beams.on_wall.reshape(beams.shape) & (echoes.peak > beams.direct.reshape(beams.shape))
+        self.three_bounce: Mask = beams.on_wall.reshape(beams.shape) & (
+            echoes.peak > beams.direct.reshape(beams.shape)
+        )
         """(rows, columns); beams that a three-bounce echo wins."""
-        self.direct: Mask = (beams.on_wall & (beams.direct > 0)).reshape(beams.shape) & ~self.three_bounce
-        """(rows, columns); beams that the wall's direct return wins. The others have no derivatives: 0 throughout."""
-        self._peak, self._path = echoes.peak[self.three_bounce], echoes.path_m[self.three_bounce]
+        self.direct: Mask = (beams.on_wall & (beams.direct > 0)).reshape(
+            beams.shape
+        ) & ~self.three_bounce
+        """(rows, columns); beams that the wall's direct return wins. The others have no
+        derivatives: 0 throughout.
+        """
+        self._peak = echoes.peak[self.three_bounce]
+        self._path = echoes.path_m[self.three_bounce]
 
     def pull(self, intensity: Float64 | None = None, path_m: Float64 | None = None) -> SceneVector:
-        """Return J^T w: the derivative of the sum of both reported maps times weights (rows, columns).
+        """Return J^T w: the derivative of the sum of both reported maps times weights (rows,
+        columns).
 
         About the cost of two renders, whatever the number of parameters.
         """
-        dark, job, problem = np.zeros(self.intensity.shape), self._maybe_job, self.problem
-        light, path = (dark if map_ is None else np.asarray(map_, np.float64) for map_ in (intensity, path_m))
+        dark = np.zeros(self.intensity.shape)
+        job = self._maybe_job
+        problem = self.problem
+        light, path = (
+            dark if map_ is None else np.asarray(map_, np.float64) for map_ in (intensity, path_m)
+        )
         lidar = np.zeros(6)
         if self.direct.any():
             rates = self._lidar_rates
             lidar += (
-                rates.direct * light[self.direct] + 2 * rates.length[:, self.direct.ravel()] * path[self.direct]
+                rates.direct * light[self.direct]
+                + 2 * rates.length[:, self.direct.ravel()] * path[self.direct]
             ).sum(1)
         to_lidar = _wall_as_lidar(problem.beams.lidar_m)
         if job is None:
-            return SceneVector(np.zeros((0, 0)), np.zeros((0, 0)), np.zeros((0, 3)), lidar, to_lidar.T @ lidar)
+            return SceneVector(
+                np.zeros((0, 0)), np.zeros((0, 0)), np.zeros((0, 3)), lidar, to_lidar.T @ lidar
+            )
         weights = light[self.three_bounce], path[self.three_bounce] / self._peak
-        by_patch, beams, cells = pull(*self._legs, self._winners, *(w.astype(np.float32) for w in weights))
-        beams, cells = beams.sum(0, np.float64), cells.sum(0, np.float64)
-        point, normal, strength = by_patch[:, :3], by_patch[:, 3:6], by_patch[:, 6]
+        by_patch, beams, cells = pull(
+            *self._legs, self._winners, *(w.astype(np.float32) for w in weights)
+        )
+        beams = beams.sum(0, np.float64)
+        cells = cells.sum(0, np.float64)
+        point = by_patch[:, :3]
+        normal = by_patch[:, 3:6]
+        strength = by_patch[:, 6]
         spots, relay = self._lidar_points
         lidar += np.einsum("mcn,cn->m", spots, beams) + np.einsum("mcn,cn->m", relay, cells)
         turned = np.cross(job.patches.point_m, point) + np.cross(job.patches.normal, normal)
@@ -172,20 +238,29 @@ class Gradients:
         return SceneVector(self.image(depth), self.image(albedo), point, lidar, wall)
 
     def push(self, change: SceneVector) -> tuple[Float64, Float64]:
-        """Return J v: the rates (rows, columns) of reported intensity and path (m) for rates of change of a scene."""
-        job, shape = self._maybe_job, self.intensity.shape
-        light, path = np.zeros(shape), np.zeros(shape)
+        """Return J v: the rates (rows, columns) of reported intensity and path (m) for rates of
+        change of a scene.
+        """
+        job = self._maybe_job
+        shape = self.intensity.shape
+        light = np.zeros(shape)
+        path = np.zeros(shape)
         wall = np.zeros(6) if change.wall is None else np.asarray(change.wall, np.float64)
-        lidar = _wall_as_lidar(self.problem.beams.lidar_m) @ wall + (0 if change.lidar is None else change.lidar)
+        lidar = _wall_as_lidar(self.problem.beams.lidar_m) @ wall + (
+            0 if change.lidar is None else change.lidar
+        )
         if lidar.any():
             rates = self._lidar_rates
             light[self.direct] = lidar @ rates.direct
             path[self.direct] = 2 * lidar @ rates.length[:, self.direct.ravel()]
         if job is not None:
             spots, relay = (
-                PointChange(*np.einsum("m,mcn->cn", lidar, rate).astype(np.float32)) for rate in self._lidar_points
+                PointChange(*np.einsum("m,mcn->cn", lidar, rate).astype(np.float32))
+                for rate in self._lidar_points
             )
-            found = push(*self._legs, self._winners, self._patch_change(change, wall), spots, relay, False)
+            found = push(
+                *self._legs, self._winners, self._patch_change(change, wall), spots, relay, False
+            )
             light[self.three_bounce], sums = (rows.sum(0, np.float64) for rows in found)
             path[self.three_bounce] = sums / self._peak
         return light, path
@@ -193,33 +268,42 @@ class Gradients:
     def jacobian(self, parameters: Parameters) -> tuple[Float32, Float32]:
         """Return the derivatives of intensity and path (m) as matrices.
 
-        By the pose of "lidar" or "wall" (rows * columns, 6); by "depth" or "albedo" (k, n) for the k beams of
-        `three_bounce` and the n cells with a surface, in the order of the image.
+        By the pose of "lidar" or "wall" (rows * columns, 6); by "depth" or "albedo" (k, n) for the
+        k beams of `three_bounce` and the n cells with a surface, in the order of the image.
         """
         if parameters in {"lidar", "wall"}:
             found = [self.push(SceneVector(**{parameters: unit})) for unit in np.eye(6)]
-            light, path = (np.stack([map_.ravel() for map_ in maps], -1) for maps in zip(*found, strict=True))
+            light, path = (
+                np.stack([map_.ravel() for map_ in maps], -1) for maps in zip(*found, strict=True)
+            )
             return light.astype(np.float32), path.astype(np.float32)
         if self._maybe_job is None:
             return np.zeros((0, 0), np.float32), np.zeros((0, 0), np.float32)
         if parameters == "albedo":
             nowhere = np.zeros_like(self.echo_job.patches.normal)
             return self._each(nowhere, nowhere, self.echo_job.patches.area_m2)
-        tilts, still = self._tilts, np.zeros(len(self._tilts.beta))
+        tilts = self._tilts
+        still = np.zeros(len(self._tilts.beta))
         up = np.tile([0.0, 0.0, 1.0], (len(still), 1))
         light, path = self._each(up, 0 * up, still)
         for axis, (more, less) in enumerate(tilts.pairs):
             steeper = np.zeros((len(still), 2))
             steeper[:, axis] = 1 / tilts.pitch_m[axis]
-            for total, part in zip((light, path), self._each(0 * up, *tilts.turned(steeper)), strict=True):
+            for total, part in zip(
+                (light, path), self._each(0 * up, *tilts.turned(steeper)), strict=True
+            ):
                 np.add.at(total.T, more, part.T)
                 np.subtract.at(total.T, less, part.T)
         return light, path
 
     def _each(self, point: Float64, normal: Float64, strength: Float64) -> tuple[Float32, Float32]:
         """Return the rates (k, n) of the winners for the change of each patch alone."""
-        change = PatchChange(*(np.ascontiguousarray(part, np.float32) for part in (point, normal, strength)))
-        spots, relay = (PointChange(*np.zeros(rate.shape[1:], np.float32)) for rate in self._lidar_points)
+        change = PatchChange(
+            *(np.ascontiguousarray(part, np.float32) for part in (point, normal, strength))
+        )
+        spots, relay = (
+            PointChange(*np.zeros(rate.shape[1:], np.float32)) for rate in self._lidar_points
+        )
         light, path = push(*self._legs, self._winners, change, spots, relay, True)
         return light.T, path.T / self._peak[:, None]
 
@@ -227,7 +311,8 @@ class Gradients:
         """Return the rates of the patches; the wall's motion moves them the other way."""
         patches = self.echo_job.patches
         point = -wall[:3] - np.cross(wall[3:], patches.point_m)
-        normal, strength = -np.cross(wall[3:], patches.normal), np.zeros(len(point))
+        normal = -np.cross(wall[3:], patches.normal)
+        strength = np.zeros(len(point))
         where = patches.row, patches.column
         if change.point_m is not None:
             point = point + change.point_m
@@ -235,10 +320,13 @@ class Gradients:
             rate = np.asarray(change.depth_m, np.float64)[where]
             point[:, 2] += rate
             turned, stronger = self._tilts.turned(self._tilts.slopes(rate))
-            normal, strength = normal + turned, strength + stronger
+            normal = normal + turned
+            strength = strength + stronger
         if change.albedo is not None:
             strength = strength + np.asarray(change.albedo, np.float64)[where] * patches.area_m2
-        return PatchChange(*(np.ascontiguousarray(part, np.float32) for part in (point, normal, strength)))
+        return PatchChange(
+            *(np.ascontiguousarray(part, np.float32) for part in (point, normal, strength))
+        )
 
     def image(self, values: Float64) -> Float64:
         """Return the patches' values as an image of the depth map, 0 for background."""
@@ -271,14 +359,17 @@ class Gradients:
 
     @cached_property
     def _winners(self) -> Winners:
-        job, per_bin = self.echo_job, self.echo_job.accuracy.sub_bins
+        job = self.echo_job
+        per_bin = self.echo_job.accuracy.sub_bins
         edge = (np.round(self._path / job.bin_m - 0.5) * per_bin).astype(np.float32)
         pitch = np.float32(job.relay.diagonal_m / np.sqrt(2))
         return Winners(edge, per_bin, np.float32(job.lidar_m[0]), np.float32(job.lidar_m[1]), pitch)
 
     @cached_property
     def _tilts(self) -> Tilts:
-        return Tilts.of(self.echo_job, self.problem.scene.jump_m, tilted=self.problem.includes("tilt"))
+        return Tilts.of(
+            self.echo_job, self.problem.scene.jump_m, tilted=self.problem.includes("tilt")
+        )
 
     @cached_property
     def _lidar_rates(self) -> BeamRates:
@@ -286,20 +377,31 @@ class Gradients:
 
     @cached_property
     def _lidar_points(self) -> tuple[Float64, Float64]:
-        """Rates of the winners' spots (6, 4, k) and of the relay's cells (6, 4, m) for unit motions of the lidar."""
-        job, wins, rates = self.echo_job, self.three_bounce.ravel(), self._lidar_rates
+        """Rates of the winners' spots (6, 4, k) and of the relay's cells (6, 4, m) for unit motions
+        of the lidar.
+        """
+        job = self.echo_job
+        wins = self.three_bounce.ravel()
+        rates = self._lidar_rates
         cosine = rates.cosine[:, wins] / job.cos_incidence
         spots = np.stack(
-            [*rates.spot[:, wins].transpose(2, 0, 1), rates.length[:, wins], 0 * cosine if job.lambertian else cosine],
+            [
+                *rates.spot[:, wins].transpose(2, 0, 1),
+                rates.length[:, wins],
+                0 * cosine if job.lambertian else cosine,
+            ],
             1,
         )
-        relay, squared = job.relay, job.relay.length_m**2
+        squared = job.relay.length_m**2
+        relay = job.relay
         away = job.lidar_m - np.stack([relay.x_m, relay.y_m, 0 * relay.x_m], -1)
         length = np.concatenate([away.T / relay.length_m, np.zeros((3, len(squared)))])
         light = -2 * relay.length_m * softened_slope(squared, job.soft_wall_m2, job.near_m) * length
         light /= softened(squared, job.soft_wall_m2, job.near_m)
         if job.lambertian:
-            light += np.array([0, 0, 1 / job.lidar_m[2], 0, 0, 0])[:, None] - length / relay.length_m
+            light += (
+                np.array([0, 0, 1 / job.lidar_m[2], 0, 0, 0])[:, None] - length / relay.length_m
+            )
         return spots, np.stack([0 * length, 0 * length, length, light], 1)
 
 
@@ -310,7 +412,9 @@ def _echoes(job: TransportJob) -> MultiBounce:
 
 
 def _wall_as_lidar(lidar_m: Float64) -> Float64:
-    """Return the matrix (6, 6) from a motion of the wall to the lidar's motion in the wall's frame."""
+    """Return the matrix (6, 6) from a motion of the wall to the lidar's motion in the wall's
+    frame.
+    """
     # A point x of the room has coordinates x - shift - turn x x after the wall has moved.
     matrix = -np.eye(6)
     matrix[:3, 3:] = np.cross(np.eye(3), lidar_m)
@@ -318,13 +422,17 @@ def _wall_as_lidar(lidar_m: Float64) -> Float64:
 
 
 def intensity_noise(gradients: Gradients, model: SensorModel, frames: int = 1) -> Float64:
-    """Return the standard deviation (rows, columns) of the intensities, as the mean over pixels and frames.
+    """Return the standard deviation (rows, columns) of the intensities, as the mean over pixels and
+    frames.
 
     Shot, read and quantization noise; infinite for saturated beams, which determine nothing.
     """
-    scene, shape = gradients.problem.scene, gradients.intensity.shape
+    scene = gradients.problem.scene
+    shape = gradients.intensity.shape
     bare = scene.rig.model_copy(update={"occluder": None})
-    brightest = cast(bare, scene.intrinsics(), lambertian=scene.radiometry == "lambertian").direct.max()
+    brightest = cast(
+        bare, scene.intrinsics(), lambertian=scene.radiometry == "lambertian"
+    ).direct.max()
     gain = model.bare_wall_counts / brightest
     counts = gain * gradients.intensity.astype(np.float64) + model.ambient_counts
     variance = model.read_noise_counts**2 + model.shot_noise**2 * counts + 1 / 12
@@ -334,39 +442,58 @@ def intensity_noise(gradients: Gradients, model: SensorModel, frames: int = 1) -
 
 @dataclass(frozen=True)
 class DepthBound:
-    """Standard deviations (rows, columns) in meters that no unbiased estimate of depth falls below; NaN outside."""
+    """Standard deviations (rows, columns) in meters that no unbiased estimate of depth falls below;
+    NaN outside.
+    """
 
     alone_m: Float64
     """Of each cell if all the others are known."""
     bound_m: Float64
     """Of each cell if all are unknown, each with a prior of `prior_m`."""
     modes_m: Float64
-    """(n,); of the patterns of depth that the echoes tell apart, the best determined first, without the prior."""
+    """(n,); of the patterns of depth that the echoes tell apart, the best determined first, without
+    the prior.
+    """
     determined: float
-    """Number of depths that the echoes determine beyond the prior: the trace of bound^-2 times information."""
+    """Number of depths that the echoes determine beyond the prior: the trace of bound^-2 times
+    information.
+    """
 
 
 def depth_bound(
-    gradients: Gradients, noise: Float64, prior_m: float = 0.05, block: int = 1, min_margin: float = 0.01
+    gradients: Gradients,
+    noise: Float64,
+    prior_m: float = 0.05,
+    block: int = 1,
+    min_margin: float = 0.01,
 ) -> DepthBound:
-    """Return the Cramer-Rao bound of an object's depth from the intensities of its echoes with known noise.
+    """Return the Cramer-Rao bound of an object's depth from the intensities of its echoes with
+    known noise.
 
-    `block` x `block` cells move as one. Beams below `min_margin` are left out: near a tie there is no derivative. The
-    reported path is a bin's center and carries no information about less than a bin, so it is not used.
+    `block` x `block` cells move as one. Beams below `min_margin` are left out: near a tie there is
+    no derivative. The reported path is a bin's center and carries no information about less than a
+    bin, so it is not used.
     """
-    job, wins = gradients.echo_job, gradients.three_bounce
+    job = gradients.echo_job
+    wins = gradients.three_bounce
     rates, _ = gradients.jacobian("depth")
     sure = (gradients.margin[wins] >= min_margin) & np.isfinite(noise[wins])
-    group = np.unique(job.patches.row // block * 1000 + job.patches.column // block, return_inverse=True)[1]
+    group = np.unique(
+        job.patches.row // block * 1000 + job.patches.column // block, return_inverse=True
+    )[1]
     scaled = np.zeros((int(sure.sum()), group.max() + 1))
     np.add.at(scaled.T, group, (rates[sure] / noise[wins][sure, None]).T)
     information = scaled.T @ scaled
     values = np.maximum(np.linalg.eigvalsh(information)[::-1], 1e-30)
     covariance = np.linalg.inv(information + np.eye(len(information)) / prior_m**2)
     alone, bound = (np.full(job.field.depth_m.shape, np.nan) for _ in range(2))
-    alone[job.patches.row, job.patches.column] = (1 / np.sqrt(np.maximum(np.diag(information), 1e-30)))[group]
+    alone[job.patches.row, job.patches.column] = (
+        1 / np.sqrt(np.maximum(np.diag(information), 1e-30))
+    )[group]
     bound[job.patches.row, job.patches.column] = np.sqrt(np.diag(covariance))[group]
-    return DepthBound(alone, bound, 1 / np.sqrt(values), float(np.sum(values / (values + prior_m**-2))))
+    return DepthBound(
+        alone, bound, 1 / np.sqrt(values), float(np.sum(values / (values + prior_m**-2)))
+    )
 
 
 @dataclass(frozen=True)
@@ -391,19 +518,30 @@ MAX_DAMPINGS = 12
 
 
 def fit_pose(
-    problem: RenderProblem, intensity: Float64, noise: Float64, body: Literal["lidar", "wall"] = "lidar", *,
-    prior: tuple[float, float] = (0.02, 0.02), min_margin: float = 0.01, model_error: float = 0.005, steps: int = 30,
-) -> PoseFit:  # fmt: skip
-    """Fit the pose of lidar or wall to the measured intensities (rows, columns) of a known object's echoes.
+    problem: RenderProblem,
+    intensity: Float64,
+    noise: Float64,
+    body: Literal["lidar", "wall"] = "lidar",
+    *,
+    prior: tuple[float, float] = (0.02, 0.02),
+    min_margin: float = 0.01,
+    model_error: float = 0.005,
+    steps: int = 30,
+) -> PoseFit:
+    """Fit the pose of lidar or wall to the measured intensities (rows, columns) of a known object's
+    echoes.
 
-    Robust least squares by Levenberg and Marquardt's method; `prior` is the standard deviation of shift (m) and turn
-    (rad) from the problem's pose, `model_error` a relative error of the renderer. Used are the beams that three bounces
-    win by `min_margin` in the measured pose. The wall's motions within its plane change nothing but shadows: the prior
-    alone decides them.
+    Robust least squares by Levenberg and Marquardt's method; `prior` is the standard deviation of
+    shift (m) and turn (rad) from the problem's pose, `model_error` a relative error of the
+    renderer. Used are the beams that three bounces win by `min_margin` in the measured pose. The
+    wall's motions within its plane change nothing but shadows: the prior alone decides them.
     """
-    # The strongest echo is continuous in the pose even where the winner changes, so the residual is too.
+    # The strongest echo is continuous in the pose even where the winner changes, so the residual is
+    # too.
     precision = np.repeat(np.array(prior) ** -2.0, 3)
-    motion, damping, iterations = np.zeros(6), 1e-3, 0
+    motion = np.zeros(6)
+    damping = 1e-3
+    iterations = 0
     now = Gradients(problem)
 
     def residual(at: Gradients) -> tuple[Float64, Float64, Mask]:
@@ -412,7 +550,8 @@ def fit_pose(
         return (intensity - at.intensity)[used] / deviation, deviation, used
 
     def loss(at: Gradients, shift: Float64) -> float:
-        # Cauchy's: a beam whose strongest echo is the wall's in one pose and the object's in the other counts little.
+        # Cauchy's: a beam whose strongest echo is the wall's in one pose and the object's in the
+        # other counts little.
         rest = residual(at)[0]
         each = OUTLIER**2 * np.log1p((rest / OUTLIER) ** 2)
         return float(each.mean() + precision @ shift**2 / rest.size) if rest.size else np.inf
@@ -428,12 +567,19 @@ def fit_pose(
         downhill = rates.T @ (weight * rest) - precision * motion
         before = cost
         for _ in range(MAX_DAMPINGS):
-            step = np.linalg.solve(normal + damping * np.diag(np.diag(normal)), downhill).astype(np.float64)
+            step = np.linalg.solve(normal + damping * np.diag(np.diag(normal)), downhill).astype(
+                np.float64
+            )
             following = Gradients(moved(now.problem, **{body: step}))
             if (found := loss(following, motion + step)) < cost:
-                now, motion, cost, damping = following, motion + step, found, damping / 5
+                now = following
+                motion = motion + step
+                cost = found
+                damping = damping / 5
                 break
             damping *= 5
         if before - cost < 1e-4 * before:
             break
-    return PoseFit(motion, np.sqrt(np.diag(np.linalg.inv(normal))), (first, cost), iterations, now.problem)
+    return PoseFit(
+        motion, np.sqrt(np.diag(np.linalg.inv(normal))), (first, cost), iterations, now.problem
+    )

@@ -1,8 +1,10 @@
-"""Interreflection: light that goes from patch to patch, directly or over the wall, before it comes back.
+"""Interreflection: light that goes from patch to patch, directly or over the wall, before it comes
+back.
 
-Both detours only delay the part of the path after the first patch. So they are added to the patches' tables: patch a
-gives, beside its own returns, those of every patch b that it lights, later by the detour's length and weaker by the
-form factor F(a, b). One detour is the next term of the Neumann series of the rendering equation (Kajiya 1986).
+Both detours only delay the part of the path after the first patch. So they are added to the
+patches' tables: patch a gives, beside its own returns, those of every patch b that it lights, later
+by the detour's length and weaker by the form factor F(a, b). One detour is the next term of the
+Neumann series of the rendering equation (Kajiya 1986).
 """
 
 import numba
@@ -20,7 +22,9 @@ WALL_CELLS = 24
 SAMPLE_PATCHES = 256
 """Patches, at most, from which the share of interreflection is estimated."""
 AROUND_M = 0.4
-"""Margin of that wall around the object: beyond, less than a hundredth of a patch's light arrives."""
+"""Margin of that wall around the object: beyond, less than a hundredth of a patch's light
+arrives.
+"""
 
 
 @numba.njit(cache=True)
@@ -38,12 +42,19 @@ def form_factor(
     leg = b - a
     squared = (leg**2).sum()
     length = np.sqrt(squared)
-    cos_out, cos_in = (normal_a * leg).sum(), -(normal_b * leg).sum()
+    cos_out = (normal_a * leg).sum()
+    cos_in = -(normal_b * leg).sum()
     if cos_out <= 0 or cos_in <= 0:
         return 0.0
-    # Receiving area x cosine / (solid angle x d^2), with the strength as albedo x area; the sender's cosine is part of
-    # the rendering equation only. near_m limits 1 / d^2 at contact as in S2.
-    factor = strength * cos_in / length / ((np.pi if lambertian else 2 * np.pi) * softened_leg(squared, soft, near_m))
+    # Receiving area x cosine / (solid angle x d^2), with the strength as albedo x area; the
+    # sender's cosine is part of the rendering equation only. near_m limits 1 / d^2 at contact as in
+    # S2.
+    factor = (
+        strength
+        * cos_in
+        / length
+        / ((np.pi if lambertian else 2 * np.pi) * softened_leg(squared, soft, near_m))
+    )
     return factor * cos_out / length if lambertian else factor
 
 
@@ -52,16 +63,26 @@ def _between_patches(
     a: int, b: int, patches: PatchArrays, field: HeightField, near_m: float, lambertian: bool
 ) -> float:
     """Return the form factor from patch a to patch b, 0 if the object stands between."""
-    points, normals, rows, columns = patches.point_m, patches.normal, patches.row, patches.column
-    strength, soft = patches.strength[b], patches.soft_m2[b]
-    factor = form_factor(points[a], normals[a], points[b], normals[b], strength, soft, near_m, lambertian)
-    if factor > 0 and segment_blocked(field, rows[a], columns[a], points[a, 2], rows[b], columns[b], points[b, 2]):
+    points = patches.point_m
+    normals = patches.normal
+    rows = patches.row
+    columns = patches.column
+    strength = patches.strength[b]
+    soft = patches.soft_m2[b]
+    factor = form_factor(
+        points[a], normals[a], points[b], normals[b], strength, soft, near_m, lambertian
+    )
+    if factor > 0 and segment_blocked(
+        field, rows[a], columns[a], points[a, 2], rows[b], columns[b], points[b, 2]
+    ):
         return 0.0
     return factor
 
 
 @numba.njit(cache=True, parallel=True)
-def patch_to_patch(patches: PatchArrays, field: HeightField, near_m: float, lambertian: bool) -> Float64:
+def patch_to_patch(
+    patches: PatchArrays, field: HeightField, near_m: float, lambertian: bool
+) -> Float64:
     """Return form factors (n, n) from patch to patch, 0 if the object stands between."""
     n = len(patches.row)
     table = np.zeros((n, n))
@@ -83,28 +104,39 @@ def patch_to_wall(
     near_m: float,
     lambertian: bool,
 ) -> tuple[Float64, Float64]:
-    """Return form factors (n, m) from patches to cells (m, 3) of the wall, and from the cells to the patches."""
-    there, back = np.zeros((len(patches.row), len(cells))), np.zeros((len(patches.row), len(cells)))
+    """Return form factors (n, m) from patches to cells (m, 3) of the wall, and from the cells to
+    the patches.
+    """
+    there = np.zeros((len(patches.row), len(cells)))
+    back = np.zeros((len(patches.row), len(cells)))
     up = np.array([0.0, 0.0, 1.0])
     for s in numba.prange(len(patches.row)):
-        point, normal = patches.point_m[s], patches.normal[s]
+        point = patches.point_m[s]
+        normal = patches.normal[s]
         for w in range(len(cells)):
-            x, y = cells[w, 0], cells[w, 1]
-            factor = form_factor(point, normal, cells[w], up, cell_m2, soft_wall, near_m, lambertian)
+            x = cells[w, 0]
+            y = cells[w, 1]
+            factor = form_factor(
+                point, normal, cells[w], up, cell_m2, soft_wall, near_m, lambertian
+            )
             if factor == 0 or occluded(point[0], point[2], x, 0.0, edge_x, edge_z):
                 continue
             if not visible(field, patches.row[s], patches.column[s], point, x, y):
                 continue
             there[s, w] = factor
-            strength, soft = patches.strength[s], patches.soft_m2[s]
-            back[s, w] = form_factor(cells[w], up, point, normal, strength, soft, near_m, lambertian)
+            strength = patches.strength[s]
+            soft = patches.soft_m2[s]
+            back[s, w] = form_factor(
+                cells[w], up, point, normal, strength, soft, near_m, lambertian
+            )
     return there, back
 
 
 @inner()
 def _add(target: Float32, at: int, weight: float, source: Float32) -> None:
     """Add a histogram to another from bin `at` on, scaled."""
-    start, scale = max(at, 0), np.float32(weight)
+    start = max(at, 0)
+    scale = np.float32(weight)
     for k in range(min(len(source), len(target) - start)):
         target[start + k] += scale * source[k]
 
@@ -120,11 +152,15 @@ def _over_the_object(
     histogram: Float32,
     width: int,
 ) -> Float32:
-    """Return histograms (n, width): for each patch those of every other, later by its distance and scaled by F."""
-    points, out = patches.point_m, np.zeros((len(patches.row), width), np.float32)
+    """Return histograms (n, width): for each patch those of every other, later by its distance and
+    scaled by F.
+    """
+    points = patches.point_m
+    out = np.zeros((len(patches.row), width), np.float32)
     for a in numba.prange(len(points)):
         for b in range(len(points)):
-            # Neumann series, one term: L(a) = E(a) + sum_b F(a, b) L(b), with L(b) on the right cut to its own returns.
+            # Neumann series, one term: L(a) = E(a) + sum_b F(a, b) L(b), with L(b) on the right cut
+            # to its own returns.
             factor = _between_patches(a, b, patches, field, near_m, lambertian)
             if factor > 0:
                 away = np.sqrt(((points[b] - points[a]) ** 2).sum())
@@ -134,7 +170,9 @@ def _over_the_object(
 
 @numba.njit(cache=True, parallel=True)
 def _carry(factor: Float64, steps: Int64, histogram: Float32, width: int) -> Float32:
-    """Return histograms (n, width): the sum of others (m, k), shifted by steps (n, m) and scaled by factors (n, m)."""
+    """Return histograms (n, width): the sum of others (m, k), shifted by steps (n, m) and scaled by
+    factors (n, m).
+    """
     out = np.zeros((len(factor), width), np.float32)
     for a in numba.prange(len(factor)):
         for b in range(factor.shape[1]):
@@ -144,22 +182,25 @@ def _carry(factor: Float64, steps: Int64, histogram: Float32, width: int) -> Flo
 
 
 def add_interreflection(job: TransportJob, first: NDArray[np.int32], histogram: Float32) -> Float32:
-    """Return the patches' sub-bin histograms (n, k), from their bins `first` (n,) on, with one more bounce.
+    """Return the patches' sub-bin histograms (n, k), from their bins `first` (n,) on, with one more
+    bounce.
 
     The histograms get wider by the longest detour.
     """
-    per_bin, point = job.accuracy.sub_bins, job.patches.point_m
-    per_m, start = per_bin / job.bin_m, first.astype(np.int64) * per_bin
+    per_bin = job.accuracy.sub_bins
+    point = job.patches.point_m
+    per_m = per_bin / job.bin_m
+    start = first.astype(np.int64) * per_bin
     cells = wall_cells(job)
     away = np.sqrt(sum((point[:, None, axis] - cells[None, :, axis]) ** 2 for axis in range(3)))
     there, back = wall_factors(job, cells)
     longest_m = 2 * away.max() + float(np.linalg.norm(np.ptp(point, axis=0)))
     width = histogram.shape[1] + per_bin * (int(longest_m / job.bin_m) + 2)
     steps = np.rint(away * per_m).astype(np.int64)
-    # Over the wall in two passes, n m each instead of n^2 m: first every wall cell collects the histograms of the
-    # patches that it lights, then every patch collects those of the cells. All are aligned to the earliest start in
-    # between.
-    # Patch b's sub-bins count from start[b], the wall's from the earliest start: b's come later by the difference.
+    # Over the wall in two passes, n m each instead of n^2 m: first every wall cell collects the
+    # histograms of the patches that it lights, then every patch collects those of the cells. All
+    # are aligned to the earliest start in between. Patch b's sub-bins count from start[b], the
+    # wall's from the earliest start: b's come later by the difference.
     on_wall = _carry(back.T.copy(), steps.T + start - start.min(), histogram, width)
     by_wall = _carry(there, steps + (start.min() - start)[:, None], on_wall, width)
     over_object = _over_the_object(*_object(job), per_m, start, histogram, width)
@@ -175,8 +216,12 @@ def object_factors(job: TransportJob) -> Float64:
     return patch_to_patch(*_object(job))
 
 
-def wall_factors(job: TransportJob, cells: Float64, patches: PatchArrays | None = None) -> tuple[Float64, Float64]:
-    """Return form factors (n, m) from the patches of a job, or from others, to cells of the wall (m, 3), and back."""
+def wall_factors(
+    job: TransportJob, cells: Float64, patches: PatchArrays | None = None
+) -> tuple[Float64, Float64]:
+    """Return form factors (n, m) from the patches of a job, or from others, to cells of the wall
+    (m, 3), and back.
+    """
     cell_m2 = wall_cell_m2(job)
     wall = cells, cell_m2, contact_m2(cell_m2, job.solid_angle), *job.edge_m
     return patch_to_wall(patches or job.patch_arrays, *wall, job.field, job.near_m, job.lambertian)
@@ -185,7 +230,8 @@ def wall_factors(job: TransportJob, cells: Float64, patches: PatchArrays | None 
 def _wall_extent(job: TransportJob) -> Float64:
     """Return the corners (2, 2), low and high x and y, of the wall for interreflection."""
     wall = np.array(job.wall_m)
-    low, high = job.patches.point_m[:, :2].min(0) - AROUND_M, job.patches.point_m[:, :2].max(0) + AROUND_M
+    low = job.patches.point_m[:, :2].min(0) - AROUND_M
+    high = job.patches.point_m[:, :2].max(0) + AROUND_M
     return np.stack([np.maximum(low, wall[[0, 2]]), np.minimum(high, wall[[1, 3]])])
 
 
@@ -203,16 +249,19 @@ def wall_cells(job: TransportJob) -> Float64:
 
 
 def interreflection_share(job: TransportJob, incident: Float64, returned: Float64) -> float:
-    """Return the energy of one more bounce over that of three bounces, estimated from a sample of the patches.
+    """Return the energy of one more bounce over that of three bounces, estimated from a sample of
+    the patches.
 
-    `incident` and `returned` (n,) are the light that each patch gives on, and the share of it that reaches the lidar.
+    `incident` and `returned` (n,) are the light that each patch gives on, and the share of it that
+    reaches the lidar.
     """
     step = -(-len(incident) // SAMPLE_PATCHES)
-    # Energy of three bounces: sum_a I_a R_a. With one more: sum_a I_a sum_b F(a, b) R_b. Every step-th patch stands for
-    # `step` of them, so its area counts `step` times.
+    # Energy of three bounces: sum_a I_a R_a. With one more: sum_a I_a sum_b F(a, b) R_b. Every
+    # step-th patch stands for `step` of them, so its area counts `step` times.
     patches = PatchArrays._make(column[::step].copy() for column in job.patch_arrays)
     patches = patches._replace(strength=step * patches.strength, soft_m2=step * patches.soft_m2)
-    incident, returned = incident[::step], returned[::step]
+    incident = incident[::step]
+    returned = returned[::step]
     over_object = patch_to_patch(patches, job.field, job.near_m, job.lambertian) @ returned
     there, back = wall_factors(job, wall_cells(job), patches)
     by_wall = there @ (back.T @ returned)

@@ -1,4 +1,6 @@
-"""Input of every backend: the transport of one render problem in float64, with the radiometry resolved to factors."""
+"""Input of every backend: the transport of one render problem in float64, with the radiometry
+resolved to factors.
+"""
 
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -30,7 +32,9 @@ class PatchArrays(NamedTuple):
 
 @dataclass(frozen=True)
 class TransportJob:
-    """Three-bounce transport of some beams: beams, patches, relay wall and all else that decides their histograms."""
+    """Three-bounce transport of some beams: beams, patches, relay wall and all else that decides
+    their histograms.
+    """
 
     laser_spot_m: Float64
     """(n, 3); points where the beams land on the wall."""
@@ -51,7 +55,9 @@ class TransportJob:
     bins: int
     accuracy: Accuracy
     map_spots_m: Float64
-    """(k, 3); laser spots of the whole map: BRDF tables are laid out among these, whichever beams are rendered."""
+    """(k, 3); laser spots of the whole map: BRDF tables are laid out among these, whichever beams
+    are rendered.
+    """
     wall_m: tuple[float, float, float, float]
     """(x_min, x_max, y_min, y_max) of the physical wall, for interreflection."""
     brdf: Brdf | None = None
@@ -61,7 +67,10 @@ class TransportJob:
 
     def select(self, which: NDArray[np.int64]) -> "TransportJob":
         """Return the job for some of its beams (indices)."""
-        beams = {name: getattr(self, name)[which] for name in ("laser_spot_m", "length_m", "cos_incidence")}
+        beams = {
+            name: getattr(self, name)[which]
+            for name in ("laser_spot_m", "length_m", "cos_incidence")
+        }
         return replace(self, **beams)
 
     @property
@@ -87,13 +96,18 @@ class TransportJob:
     @cached_property
     def beam_weight(self) -> Float64:
         """(n,); factors of S2 that depend on the beam alone."""
-        return (np.ones_like(self.cos_incidence) if self.lambertian else self.cos_incidence) / self.solid_angle
+        return (
+            np.ones_like(self.cos_incidence) if self.lambertian else self.cos_incidence
+        ) / self.solid_angle
 
     @cached_property
     def relay_weight(self) -> Float64:
-        """(m,); factors of S2 that depend on the relay cell alone: its area, and the leg from it to the lidar."""
-        # S2 falls with 1 / d^2 on each leg; from the wall back to the lidar that leg is fixed for a cell. Near contact
-        # the area of the cell bounds it (see `softened`), or a cell below the lidar would send back more than it got.
+        """(m,); factors of S2 that depend on the relay cell alone: its area, and the leg from it to
+        the lidar.
+        """
+        # S2 falls with 1 / d^2 on each leg; from the wall back to the lidar that leg is fixed for a
+        # cell. Near contact the area of the cell bounds it (see `softened`), or a cell below the
+        # lidar would send back more than it got.
         relay = self.relay
         squared = softened(relay.length_m**2, self.soft_wall_m2, self.near_m)
         weight = relay.cell_m2 / (self.solid_angle**2 * squared)
@@ -113,8 +127,14 @@ class TransportJob:
 
 def count_near_legs(job: TransportJob) -> int:
     """Return the number of legs between patches and wall that are shorter than near contact."""
-    reach, count = job.near_m**2, 0
+    reach = job.near_m**2
+    count = 0
     for point in job.patches.point_m[job.patches.point_m[:, 2] < job.near_m]:
-        for x, y in ((job.laser_spot_m[:, 0], job.laser_spot_m[:, 1]), (job.relay.x_m, job.relay.y_m)):
-            count += int((((x - point[0]) ** 2 + (y - point[1]) ** 2 + point[2] ** 2) < reach).sum())
+        for x, y in (
+            (job.laser_spot_m[:, 0], job.laser_spot_m[:, 1]),
+            (job.relay.x_m, job.relay.y_m),
+        ):
+            count += int(
+                (((x - point[0]) ** 2 + (y - point[1]) ** 2 + point[2] ** 2) < reach).sum()
+            )
     return count

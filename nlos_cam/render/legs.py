@@ -1,12 +1,15 @@
-"""Legs between patches and points of the wall, compiled in float32: weight, length, and what the object blocks.
+"""Legs between patches and points of the wall, compiled in float32: weight, length, and what the
+object blocks.
 
-One patch at a time with many points side by side, so that all but the walks of `shade` are vector operations.
+One patch at a time with many points side by side, so that all but the walks of `shade` are vector
+operations.
 
-Last, the transport's inner loop: the sum of weighted rows of a table into one window of bins that stays in vector
-registers. A compiled loop over rows that adds to an array in memory loads and stores every bin for every row. Here the
-bins are values of the compiler's own vectors, so each row costs one load and one multiply-add a vector. The rows are
-added in their order, bin by bin, so the result has the bits of the plain loop. On processors with narrower vectors or
-without a fused multiply-add the compiler splits the same operations.
+Last, the transport's inner loop: the sum of weighted rows of a table into one window of bins that
+stays in vector registers. A compiled loop over rows that adds to an array in memory loads and
+stores every bin for every row. Here the bins are values of the compiler's own vectors, so each row
+costs one load and one multiply-add a vector. The rows are added in their order, bin by bin, so the
+result has the bits of the plain loop. On processors with narrower vectors or without a fused
+multiply-add the compiler splits the same operations.
 """
 
 from collections.abc import Callable
@@ -25,11 +28,17 @@ from nlos_cam.render.visibility import HeightField, blocked
 
 FAST = {"contract", "reassoc", "nsz", "arcp"}
 BEAM_TILE = 128
-"""Beams of a thread that go together: their windows of bins and their legs to some patches fit in the first cache."""
+"""Beams of a thread that go together: their windows of bins and their legs to some patches fit in
+the first cache.
+"""
 RELAY_TILE = 256
 """Relay cells that go together."""
-FREE, MIXED, DARK = 0, 1, 2
-"""Verdicts on the legs from a patch to a tile past the object: free, some may be blocked, none carries light."""
+FREE = 0
+MIXED = 1
+DARK = 2
+"""Verdicts on the legs from a patch to a tile past the object: free, some may be blocked, none
+carries light.
+"""
 CUT = 4
 """Added to a verdict where the occluder's edge may block some legs."""
 
@@ -61,7 +70,9 @@ class NumbaSurface(NamedTuple):
 
 
 class NumbaPoints(NamedTuple):
-    """Points of the wall, laser spots or relay cells, with the leg from each to the lidar, in the order of tiles."""
+    """Points of the wall, laser spots or relay cells, with the leg from each to the lidar, in the
+    order of tiles.
+    """
 
     x_m: Float32
     y_m: Float32
@@ -112,17 +123,28 @@ def geometry(
     optics: NumbaOptics,
     outgoing: bool,
 ) -> None:
-    """Fill in the legs from patch s to points: weight before anything stands between, and length, vector by vector.
+    """Fill in the legs from patch s to points: weight before anything stands between, and length,
+    vector by vector.
 
-    Towards the lidar (`outgoing`) the weight has the wall's cosine, from it the patch's; in Lambertian radiometry both.
+    Towards the lidar (`outgoing`) the weight has the wall's cosine, from it the patch's; in
+    Lambertian radiometry both.
     """
-    x, y, z = surface.x_m[s], surface.y_m[s], surface.z_m[s]
-    nx, ny, nz = surface.normal_x[s], surface.normal_y[s], surface.normal_z[s]
+    x = surface.x_m[s]
+    y = surface.y_m[s]
+    z = surface.z_m[s]
+    nx = surface.normal_x[s]
+    ny = surface.normal_y[s]
+    nz = surface.normal_z[s]
     soft = points.soft_m2 if outgoing else surface.soft_m2[s]
-    nothing, one, end = np.float32(0), np.float32(1), start + count
-    at_x, at_y, light = points.x_m[start:end], points.y_m[start:end], points.weight[start:end]
+    nothing = np.float32(0)
+    one = np.float32(1)
+    end = start + count
+    at_x = points.x_m[start:end]
+    at_y = points.y_m[start:end]
+    light = points.weight[start:end]
     for i in range(count):
-        dx, dy = at_x[i] - x, at_y[i] - y
+        dx = at_x[i] - x
+        dy = at_y[i] - y
         squared = dx * dx + dy * dy + z * z
         length = np.sqrt(squared)
         facing = nx * dx + ny * dy - nz * z
@@ -137,12 +159,19 @@ def geometry(
 
 
 @numba.njit(cache=True, error_model="numpy", fastmath=FAST, inline="always")
-def past_edge(x: np.float32, z: np.float32, bounds_m: Float32, edge_x: np.float32, edge_z: np.float32) -> int:
-    """Return FREE, CUT or DARK for the legs from a patch to a tile (4,) past the occluder's edge."""
-    first, last = (x - edge_x) * (bounds_m[0] - edge_x) < 0, (x - edge_x) * (bounds_m[1] - edge_x) < 0
+def past_edge(
+    x: np.float32, z: np.float32, bounds_m: Float32, edge_x: np.float32, edge_z: np.float32
+) -> int:
+    """Return FREE, CUT or DARK for the legs from a patch to a tile (4,) past the occluder's
+    edge.
+    """
+    first = (x - edge_x) * (bounds_m[0] - edge_x) < 0
+    last = (x - edge_x) * (bounds_m[1] - edge_x) < 0
     # Between both ends the height at which a leg crosses the edge's plane is monotone.
-    to_edge, one = edge_x - x, np.float32(1)
-    low, high = z * (one - to_edge / (bounds_m[0] - x)), z * (one - to_edge / (bounds_m[1] - x))
+    to_edge = edge_x - x
+    one = np.float32(1)
+    low = z * (one - to_edge / (bounds_m[0] - x))
+    high = z * (one - to_edge / (bounds_m[1] - x))
     if not (first or last) or (first and last and max(low, high) < edge_z - BACK_M):
         return FREE
     return DARK if first and last and min(low, high) > edge_z + BACK_M else CUT
@@ -150,38 +179,71 @@ def past_edge(x: np.float32, z: np.float32, bounds_m: Float32, edge_x: np.float3
 
 @numba.njit(cache=True, error_model="numpy", fastmath=FAST, inline="always")
 def cut(
-    legs: NumbaLegs, s: int, surface: NumbaSurface, points: NumbaPoints, start: int, begin: int, count: int,
+    legs: NumbaLegs,
+    s: int,
+    surface: NumbaSurface,
+    points: NumbaPoints,
+    start: int,
+    begin: int,
+    count: int,
     optics: NumbaOptics,
-) -> None:  # fmt: skip
+) -> None:
     """Set the weight of legs that the occluder's edge cuts to 0; leg i goes to point start + i."""
-    x, z, edge_x, edge_z = surface.x_m[s], surface.z_m[s], optics.edge_x_m, optics.edge_z_m
-    to_edge, one = edge_x - x, np.float32(1)
-    at_x, weights = points.x_m[start + begin : start + begin + count], legs.weight[begin : begin + count]
+    x = surface.x_m[s]
+    z = surface.z_m[s]
+    edge_x = optics.edge_x_m
+    edge_z = optics.edge_z_m
+    to_edge = edge_x - x
+    one = np.float32(1)
+    at_x = points.x_m[start + begin : start + begin + count]
+    weights = legs.weight[begin : begin + count]
     for i in range(count):
-        # The leg runs from the patch at height z to the wall at 0. It crosses the edge's plane at the share to_edge /
-        # dx, at height z (1 - to_edge / dx), if patch and point lie on both sides of it.
+        # The leg runs from the patch at height z to the wall at 0. It crosses the edge's plane at
+        # the share to_edge / dx, at height z (1 - to_edge / dx), if patch and point lie on both
+        # sides of it.
         beyond = to_edge * (edge_x - at_x[i]) < 0
-        weights[i] = np.float32(0) if beyond & (z * (one - to_edge / (at_x[i] - x)) >= edge_z) else weights[i]
+        weights[i] = (
+            np.float32(0)
+            if beyond & (z * (one - to_edge / (at_x[i] - x)) >= edge_z)
+            else weights[i]
+        )
 
 
 @numba.njit(cache=True, error_model="numpy", fastmath=FAST, inline="always")
 def past_object(
-    s: int, surface: NumbaSurface, left: np.float32, right: np.float32, below: np.float32, above: np.float32,
-    pitches: tuple[np.float32, np.float32], sectors: int,
-) -> int:  # fmt: skip
-    """Return FREE, MIXED or DARK for the legs from patch s to a tile, whose ends are given from the patch on.
+    s: int,
+    surface: NumbaSurface,
+    left: np.float32,
+    right: np.float32,
+    below: np.float32,
+    above: np.float32,
+    pitches: tuple[np.float32, np.float32],
+    sectors: int,
+) -> int:
+    """Return FREE, MIXED or DARK for the legs from patch s to a tile, whose ends are given from the
+    patch on.
 
-    What holds at the tile's corners holds inside. `pitches` are the inverse ones of the depth map's cells.
+    What holds at the tile's corners holds inside. `pitches` are the inverse ones of the depth map's
+    cells.
     """
-    z, nx, ny, nothing, one = surface.z_m[s], surface.normal_x[s], surface.normal_y[s], np.float32(0), np.float32(1)
+    z = surface.z_m[s]
+    nx = surface.normal_x[s]
+    ny = surface.normal_y[s]
+    nothing = np.float32(0)
+    one = np.float32(1)
     # Facing is linear over the tile.
     if max(nx * left, nx * right) + max(ny * below, ny * above) - surface.normal_z[s] * z < -BACK_M:
         return DARK
     if sectors == 0 or not surface.shaded[s]:
         return FREE
-    u_low, u_high, v_low, v_high = left * pitches[0], right * pitches[0], -above * pitches[1], -below * pitches[1]
-    near_u, near_v = max(u_low, -u_high, nothing), max(v_low, -v_high, nothing)
-    far_u, far_v = max(-u_low, u_high), max(-v_low, v_high)
+    u_low = left * pitches[0]
+    u_high = right * pitches[0]
+    v_low = -above * pitches[1]
+    v_high = -below * pitches[1]
+    near_u = max(u_low, -u_high, nothing)
+    near_v = max(v_low, -v_high, nothing)
+    far_u = max(-u_low, u_high)
+    far_v = max(-v_low, v_high)
     if z >= max(far_u, far_v) * surface.highest[s] * (one + SLACK):
         return FREE
     along_columns = near_u > far_v
@@ -189,16 +251,20 @@ def past_object(
         return MIXED
     major_low, major_high = (near_u, far_u) if along_columns else (near_v, far_v)
     low, high = (v_low, v_high) if along_columns else (u_low, u_high)
-    # The tilt is the quotient of both axes: largest and smallest at corners. A sector more covers rounding.
+    # The tilt is the quotient of both axes: largest and smallest at corners. A sector more covers
+    # rounding.
     least = low / (major_high if low >= 0 else major_low)
     most = high / (major_low if high >= 0 else major_high)
-    half, face = np.float32(sectors / 2), 0 if along_columns else 2
+    half = np.float32(sectors / 2)
+    face = 0 if along_columns else 2
     face += 0 if (u_high if along_columns else v_high) > 0 else 1
     first = face * sectors + max(int(np.floor((least + one) * half)) - 1, 0)
     last = face * sectors + min(int(np.floor((most + one) * half)) + 1, sectors - 1)
-    highest, lowest = nothing, np.float32(np.inf)
+    highest = nothing
+    lowest = np.float32(np.inf)
     for sector in range(first, last + 1):
-        highest, lowest = max(highest, surface.high[s, sector]), min(lowest, surface.low[s, sector])
+        highest = max(highest, surface.high[s, sector])
+        lowest = min(lowest, surface.low[s, sector])
     if z >= major_high * highest * (one + SLACK):
         return FREE
     return DARK if z < major_low * lowest * (one - SLACK) else MIXED
@@ -206,18 +272,31 @@ def past_object(
 
 @inner(error_model="numpy", fastmath=FAST)
 def judge(
-    begin: int, end: int, surface: NumbaSurface, bounds_m: Float32, optics: NumbaOptics, field: HeightField
+    begin: int,
+    end: int,
+    surface: NumbaSurface,
+    bounds_m: Float32,
+    optics: NumbaOptics,
+    field: HeightField,
 ) -> NDArray[np.int8]:
     """Return verdicts (end - begin, tiles) on the legs from some patches to tiles (tiles, 4)."""
     verdicts = np.empty((end - begin, len(bounds_m)), np.int8)
     pitches = np.float32(1 / field.pitch_x_m), np.float32(1 / field.pitch_y_m)
     for s in range(begin, end):
-        x, y = surface.x_m[s], surface.y_m[s]
+        x = surface.x_m[s]
+        y = surface.y_m[s]
         for tile in range(len(bounds_m)):
             bounds = bounds_m[tile]
             by_edge = past_edge(x, surface.z_m[s], bounds, optics.edge_x_m, optics.edge_z_m)
             by_object = past_object(
-                s, surface, bounds[0] - x, bounds[1] - x, bounds[2] - y, bounds[3] - y, pitches, optics.sectors
+                s,
+                surface,
+                bounds[0] - x,
+                bounds[1] - x,
+                bounds[2] - y,
+                bounds[3] - y,
+                pitches,
+                optics.sectors,
             )
             dark = DARK in (by_edge, by_object)
             verdicts[s - begin, tile] = DARK if dark else by_edge + by_object
@@ -225,16 +304,26 @@ def judge(
 
 
 BACK_M = np.float32(1e-5)
-"""Height, above the rounding of float32, by which a tile lies behind a patch's plane before its legs are left out."""
+"""Height, above the rounding of float32, by which a tile lies behind a patch's plane before its
+legs are left out.
+"""
 SLACK = np.float32(1e-5)
 """Relative widening of the verdicts, above the rounding of float32."""
 
 
 @numba.njit(cache=True, error_model="numpy", fastmath=FAST, inline="always")
 def fill(
-    legs: NumbaLegs, s: int, surface: NumbaSurface, points: NumbaPoints, start: int, count: int, verdict: int,
-    optics: NumbaOptics, field: HeightField, outgoing: bool,
-) -> None:  # fmt: skip
+    legs: NumbaLegs,
+    s: int,
+    surface: NumbaSurface,
+    points: NumbaPoints,
+    start: int,
+    count: int,
+    verdict: int,
+    optics: NumbaOptics,
+    field: HeightField,
+    outgoing: bool,
+) -> None:
     """Fill in the legs from patch s to the points of a tile of that verdict, from `start` on."""
     geometry(legs, s, surface, points, start, count, optics, outgoing)
     if verdict != FREE:
@@ -243,14 +332,22 @@ def fill(
 
 @inner(error_model="numpy", fastmath=FAST)
 def fill_all(
-    legs: NumbaLegs, s: int, surface: NumbaSurface, points: NumbaPoints, optics: NumbaOptics, field: HeightField,
+    legs: NumbaLegs,
+    s: int,
+    surface: NumbaSurface,
+    points: NumbaPoints,
+    optics: NumbaOptics,
+    field: HeightField,
     outgoing: bool,
-) -> None:  # fmt: skip
-    """Fill in the legs from patch s to all points, with the lengths of legs that carry no light too."""
+) -> None:
+    """Fill in the legs from patch s to all points, with the lengths of legs that carry no light
+    too.
+    """
     geometry(legs, s, surface, points, 0, len(points.x_m), optics, outgoing)
     verdicts = judge(s, s + 1, surface, points.bounds_m, optics, field)[0]
     for tile in range(len(verdicts)):
-        begin, count = tile * points.tile, min(points.tile, len(points.x_m) - tile * points.tile)
+        begin = tile * points.tile
+        count = min(points.tile, len(points.x_m) - tile * points.tile)
         if verdicts[tile] == DARK:
             legs.weight[begin : begin + count] = 0
         elif verdicts[tile] != FREE:
@@ -259,10 +356,20 @@ def fill_all(
 
 @numba.njit(cache=True, error_model="numpy", fastmath=FAST, inline="always")
 def block(
-    verdict: int, legs: NumbaLegs, s: int, surface: NumbaSurface, points: NumbaPoints, start: int, begin: int,
-    count: int, optics: NumbaOptics, field: HeightField,
-) -> None:  # fmt: skip
-    """Set the weight of blocked legs to 0, for some legs from `begin` on; leg i goes to point start + i."""
+    verdict: int,
+    legs: NumbaLegs,
+    s: int,
+    surface: NumbaSurface,
+    points: NumbaPoints,
+    start: int,
+    begin: int,
+    count: int,
+    optics: NumbaOptics,
+    field: HeightField,
+) -> None:
+    """Set the weight of blocked legs to 0, for some legs from `begin` on; leg i goes to point start
+    + i.
+    """
     if verdict >= CUT:
         cut(legs, s, surface, points, start, begin, count, optics)
     if verdict != CUT:
@@ -271,28 +378,51 @@ def block(
 
 @numba.njit(cache=True, error_model="numpy", fastmath=FAST, inline="always")
 def shade(
-    legs: NumbaLegs, s: int, surface: NumbaSurface, points: NumbaPoints, start: int, begin: int, count: int,
-    optics: NumbaOptics, field: HeightField,
-) -> None:  # fmt: skip
-    """Set the weight of blocked legs to 0, for some legs from `begin` on; leg i goes to point start + i."""
-    x, y, z, high, low = surface.x_m[s], surface.y_m[s], surface.z_m[s], surface.high[s], surface.low[s]
-    nothing, one, two = np.float32(0), np.float32(1), np.float32(2)
-    inverse_x, inverse_y = np.float32(1 / field.pitch_x_m), np.float32(-1 / field.pitch_y_m)
-    half, last, faces = np.float32(optics.sectors / 2), np.float32(optics.sectors - 1), np.float32(optics.sectors)
-    at_x, at_y = points.x_m[start + begin : start + begin + count], points.y_m[start + begin : start + begin + count]
-    majors, sectors = legs.major[begin : begin + count], legs.sector[begin : begin + count]
+    legs: NumbaLegs,
+    s: int,
+    surface: NumbaSurface,
+    points: NumbaPoints,
+    start: int,
+    begin: int,
+    count: int,
+    optics: NumbaOptics,
+    field: HeightField,
+) -> None:
+    """Set the weight of blocked legs to 0, for some legs from `begin` on; leg i goes to point start
+    + i.
+    """
+    x = surface.x_m[s]
+    y = surface.y_m[s]
+    z = surface.z_m[s]
+    high = surface.high[s]
+    low = surface.low[s]
+    nothing = np.float32(0)
+    one = np.float32(1)
+    two = np.float32(2)
+    inverse_x = np.float32(1 / field.pitch_x_m)
+    inverse_y = np.float32(-1 / field.pitch_y_m)
+    half = np.float32(optics.sectors / 2)
+    last = np.float32(optics.sectors - 1)
+    faces = np.float32(optics.sectors)
+    at_x = points.x_m[start + begin : start + begin + count]
+    at_y = points.y_m[start + begin : start + begin + count]
+    majors = legs.major[begin : begin + count]
+    sectors = legs.sector[begin : begin + count]
     weights = legs.weight[begin : begin + count]
     for i in range(count):
-        # Sector of the horizon tables: the face by the major axis and its sign, then the tilt -1 to 1 in equal parts.
-        u, v = (at_x[i] - x) * inverse_x, (at_y[i] - y) * inverse_y
+        # Sector of the horizon tables: the face by the major axis and its sign, then the tilt -1 to
+        # 1 in equal parts.
+        u = (at_x[i] - x) * inverse_x
+        v = (at_y[i] - y) * inverse_y
         along_columns = abs(u) >= abs(v)
-        major, minor = (u if along_columns else v), (v if along_columns else u)
+        major = u if along_columns else v
+        minor = v if along_columns else u
         majors[i] = abs(major)
         inside = min((minor / max(abs(major), np.float32(1e-20)) + one) * half, last)
         face = (nothing if along_columns else two) + (nothing if major >= nothing else one)
         sectors[i] = np.int32(face * faces + np.floor(inside))
-    # Free above the upper bound of the horizon, blocked below the lower one; in between the leg is walked. The legs
-    # that are not free are listed without a branch, which would be mispredicted.
+    # Free above the upper bound of the horizon, blocked below the lower one; in between the leg is
+    # walked. The legs that are not free are listed without a branch, which would be mispredicted.
     listed = 0
     for i in range(count):
         legs.todo[listed] = i
@@ -310,14 +440,20 @@ def shade(
 
 @numba.njit(cache=True, inline="always")
 def scratch(count: int) -> NumbaLegs:
-    weight, length_m, major = np.empty(count, np.float32), np.empty(count, np.float32), np.empty(count, np.float32)
-    return NumbaLegs(weight, length_m, np.empty(count, np.int32), major, np.empty(count + 1, np.int32))
+    weight = np.empty(count, np.float32)
+    length_m = np.empty(count, np.float32)
+    major = np.empty(count, np.float32)
+    return NumbaLegs(
+        weight, length_m, np.empty(count, np.int32), major, np.empty(count + 1, np.int32)
+    )
 
 
 WINDOW = 32
 """Bins of one sum: four vectors of 8, enough to hide the latency of their multiply-adds."""
 VECTOR = 8
-"""32-bit numbers of one vector: wider ones cross a cache line at every odd start, and gain nothing."""
+"""32-bit numbers of one vector: wider ones cross a cache line at every odd start, and gain
+nothing.
+"""
 _INDEX = ir.IntType(64)
 
 
@@ -333,38 +469,50 @@ def _add_rows(
     step: Any,
     count: Any,
 ) -> tuple[Any, Callable[..., Any]]:
-    """Add `count` rows of WINDOW bins, times their weights, to sums[at : at + WINDOW]; all arrays are flat.
+    """Add `count` rows of WINDOW bins, times their weights, to sums[at : at + WINDOW]; all arrays
+    are flat.
 
-    Row j begins at table[base[j] + offset[first + j * step]] and has the weight weight[first + j * step].
+    Row j begins at table[base[j] + offset[first + j * step]] and has the weight weight[first + j *
+    step].
     """
     columns = sums, at, table, base, offset, weight, first, step, count
 
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         arrays = [
-            context.make_array(kind)(context, builder, arg).data if isinstance(kind, types.Array) else arg
+            context.make_array(kind)(context, builder, arg).data
+            if isinstance(kind, types.Array)
+            else arg
             for kind, arg in zip(signature.args, args, strict=True)
         ]
         target, place, rows, starts, offsets, weights, begin, stride, number = arrays
         vector = ir.VectorType(ir.FloatType(), VECTOR)
         name = f"llvm.fmuladd.v{VECTOR}f32"
-        multiply_add = cgutils.get_or_insert_function(builder.module, ir.FunctionType(vector, [vector] * 3), name)
-        undefined, same = ir.Constant(vector, ir.Undefined), ir.Constant(ir.VectorType(ir.IntType(32), VECTOR), None)
+        multiply_add = cgutils.get_or_insert_function(
+            builder.module, ir.FunctionType(vector, [vector] * 3), name
+        )
+        undefined = ir.Constant(vector, ir.Undefined)
+        same = ir.Constant(ir.VectorType(ir.IntType(32), VECTOR), None)
 
         def part(pointer: Any, k: int) -> Any:
             return builder.bitcast(builder.gep(pointer, [_INDEX(VECTOR * k)]), vector.as_pointer())
 
         target = builder.gep(target, [place])
-        # Independent accumulators: a multiply-add takes about four cycles, and a single chain of them would leave the
-        # unit idle while it waits for its own result. The compiler turns these variables into registers.
+        # Independent accumulators: a multiply-add takes about four cycles, and a single chain of
+        # them would leave the unit idle while it waits for its own result. The compiler turns these
+        # variables into registers.
         bins = [cgutils.alloca_once(builder, vector) for _ in range(WINDOW // VECTOR)]
         for k, variable in enumerate(bins):
             builder.store(builder.load(part(target, k), align=4), variable)
         with cgutils.for_range(builder, number, intp=_INDEX) as loop:
             j = builder.add(begin, builder.mul(loop.index, stride))
             offset_j = builder.sext(builder.load(builder.gep(offsets, [j])), _INDEX)
-            row = builder.gep(rows, [builder.add(builder.load(builder.gep(starts, [loop.index])), offset_j)])
+            row = builder.gep(
+                rows, [builder.add(builder.load(builder.gep(starts, [loop.index])), offset_j)]
+            )
             # Rows are aligned to a number, not to a vector: any shift in bins must be possible.
-            lone = builder.insert_element(undefined, builder.load(builder.gep(weights, [j])), ir.IntType(32)(0))
+            lone = builder.insert_element(
+                undefined, builder.load(builder.gep(weights, [j])), ir.IntType(32)(0)
+            )
             factor = builder.shuffle_vector(lone, undefined, same)
             for k, variable in enumerate(bins):
                 terms = factor, builder.load(part(row, k), align=4), builder.load(variable)

@@ -1,8 +1,9 @@
 """Material of a hidden surface: albedo and BRDF.
 
-A BRDF is given relative to a perfectly diffuse surface (pi f_r in the rendering equation), as a function of three
-cosines: incoming to normal, outgoing to normal, incoming to outgoing. Every isotropic BRDF can be written so. With
-arithmetic alone, the same function runs compiled on scalars, on arrays and on tensors.
+A BRDF is given relative to a perfectly diffuse surface (pi f_r in the rendering equation), as a
+function of three cosines: incoming to normal, outgoing to normal, incoming to outgoing. Every
+isotropic BRDF can be written so. With arithmetic alone, the same function runs compiled on scalars,
+on arrays and on tensors.
 """
 
 from collections.abc import Callable
@@ -22,9 +23,12 @@ Brdf = Callable[[Any, Any, Any], Any]
 
 
 def phong(diffuse: float, specular: float, exponent: float) -> Brdf:
-    """Return a lobe about the mirror direction, normalized: diffuse + specular <= 1 never gains energy."""
-    # Modified Phong (Lafortune and Willems 1994): (n + 2) / (2 pi) cos^n integrates to at most 1 with the cosine, and
-    # pi times it is relative to a diffuse surface. (x + |x|) / 2 is max(x, 0) on scalars, arrays and tensors alike.
+    """Return a lobe about the mirror direction, normalized: diffuse + specular <= 1 never gains
+    energy.
+    """
+    # Modified Phong (Lafortune and Willems 1994): (n + 2) / (2 pi) cos^n integrates to at most 1
+    # with the cosine, and pi times it is relative to a diffuse surface. (x + |x|) / 2 is max(x, 0)
+    # on scalars, arrays and tensors alike.
     gain = specular * (exponent + 2) / 2
 
     def brdf(cos_in: Any, cos_out: Any, cos_between: Any) -> Any:
@@ -51,13 +55,17 @@ class Material(Record):
     specular: float = Field(default=0.5, ge=0, le=1)
     """Share of the albedo in the lobe; the rest is diffuse. Ignored for a Lambertian surface."""
     exponent: float = Field(default=20.0, ge=1, le=2000)
-    """Exponent of the lobe's cosine: 20 is a lobe of about 30 degrees full width, 200 of about 10."""
+    """Exponent of the lobe's cosine: 20 is a lobe of about 30 degrees full width, 200 of about
+    10.
+    """
     albedo: float | tuple[float, float, float] = 1.0
     """One number, or three for red, green and blue."""
 
     @field_validator("albedo")
     @classmethod
-    def _check_albedo(cls, albedo: float | tuple[float, float, float]) -> float | tuple[float, float, float]:
+    def _check_albedo(
+        cls, albedo: float | tuple[float, float, float]
+    ) -> float | tuple[float, float, float]:
         if not all(0 <= value <= 1 for value in np.atleast_1d(albedo)):
             raise PydanticCustomError("albedo", "must be from 0 to 1")
         return albedo
@@ -79,7 +87,9 @@ class Material(Record):
 
 @dataclass(frozen=True)
 class Surface:
-    """Albedo and BRDF of a hidden object. Raises SceneError for an albedo of another shape or outside 0 to 1."""
+    """Albedo and BRDF of a hidden object. Raises SceneError for an albedo of another shape or
+    outside 0 to 1.
+    """
 
     albedo: NDArray[np.floating[Any]] | float = 1.0
     """(), (3,), or for each cell of the depth map (rows, columns) or (rows, columns, 3)."""
@@ -89,9 +99,14 @@ class Surface:
     def __post_init__(self) -> None:
         albedo = np.asarray(self.albedo)
         if albedo.size == 0 or albedo.ndim > 3 or (albedo.ndim in {1, 3} and albedo.shape[-1] != 3):
-            raise SceneError(f"albedo has shape {albedo.shape}: give one number, three, or one or three for each cell")
+            raise SceneError(
+                f"albedo has shape {albedo.shape}: give one number, three, or one or three for each"
+                " cell"
+            )
         if not (np.isfinite(albedo).all() and albedo.min() >= 0 and albedo.max() <= 1):
-            raise SceneError(f"albedo ranges from {albedo.min():g} to {albedo.max():g}: it must be from 0 to 1")
+            raise SceneError(
+                f"albedo ranges from {albedo.min():g} to {albedo.max():g}: it must be from 0 to 1"
+            )
 
     @property
     def colored(self) -> bool:
@@ -99,20 +114,29 @@ class Surface:
         return np.ndim(self.albedo) in {1, 3}
 
     def over(self, shape: tuple[int, ...]) -> NDArray[np.float64]:
-        """Return the albedo (rows, columns, channels) of a depth map's cells. Raises SceneError if shapes disagree."""
+        """Return the albedo (rows, columns, channels) of a depth map's cells. Raises SceneError if
+        shapes disagree.
+        """
         albedo = np.asarray(self.albedo, np.float64)
         if not self.colored:
             albedo = albedo[..., None]
         if albedo.ndim == 3 and albedo.shape[:2] != shape:
-            raise SceneError(f"albedo has {albedo.shape[:2]} cells but the depth map has {shape}: use one shape")
+            raise SceneError(
+                f"albedo has {albedo.shape[:2]} cells but the depth map has {shape}: use one shape"
+            )
         return np.broadcast_to(albedo, (*shape, albedo.shape[-1]))
 
 
 def brdf_range(brdf: Brdf) -> tuple[float, float]:
-    """Return the smallest and the largest value of a BRDF over the hemisphere, mirror and backward lobes included."""
+    """Return the smallest and the largest value of a BRDF over the hemisphere, mirror and backward
+    lobes included.
+    """
     theta = np.radians(np.linspace(0, 85, 18))
-    cos_in, cos_out, turn = np.meshgrid(np.cos(theta), np.cos(theta), np.linspace(0, np.pi, 13), indexing="ij")
-    # Spherical law of cosines for two directions at polar angles in and out, `turn` apart in azimuth.
+    cos_in, cos_out, turn = np.meshgrid(
+        np.cos(theta), np.cos(theta), np.linspace(0, np.pi, 13), indexing="ij"
+    )
+    # Spherical law of cosines for two directions at polar angles in and out, `turn` apart in
+    # azimuth.
     cos_between = cos_in * cos_out + np.sqrt((1 - cos_in**2) * (1 - cos_out**2)) * np.cos(turn)
     value = np.broadcast_to(brdf(cos_in, cos_out, cos_between), cos_in.shape)
     return float(value.min()), float(value.max())

@@ -1,4 +1,6 @@
-"""Patches: the hidden surface for the renderer, one patch for each cell of the depth map that holds a surface."""
+"""Patches: the hidden surface for the renderer, one patch for each cell of the depth map that holds
+a surface.
+"""
 
 from dataclasses import dataclass, replace
 
@@ -10,12 +12,16 @@ from numpy.typing import NDArray
 from nlos_cam.objects import cell_centers_m
 
 JUMP_M = 0.02
-"""Neighbors farther apart in depth than this are separate surfaces, which beta (S3) must not join by a curtain."""
+"""Neighbors farther apart in depth than this are separate surfaces, which beta (S3) must not join
+by a curtain.
+"""
 
 
 @dataclass(frozen=True)
 class Patches:
-    """Active cells of a hidden surface, one row each: center, normal towards the wall, beta (S3)."""
+    """Active cells of a hidden surface, one row each: center, normal towards the wall, beta
+    (S3).
+    """
 
     point_m: Float64
     """(n, 3)."""
@@ -24,7 +30,9 @@ class Patches:
     beta: Float64
     """(n,); true area over projected area."""
     albedo: Float64
-    """(n,); share of the light that a patch gives back, times the share of its cell that it fills."""
+    """(n,); share of the light that a patch gives back, times the share of its cell that it
+    fills.
+    """
     row: NDArray[np.int64]
     column: NDArray[np.int64]
     cell_m2: float
@@ -50,30 +58,44 @@ class Patches:
 
 
 def slope_along(depth: Float64, axis: int, pitch_m: float, jump_m: float = JUMP_M) -> Float64:
-    """Return the forward difference along an axis; backward at an edge or a jump; 0 without neighbors."""
-    step, slope = np.diff(depth, axis=axis), np.zeros_like(depth)
+    """Return the forward difference along an axis; backward at an edge or a jump; 0 without
+    neighbors.
+    """
+    step = np.diff(depth, axis=axis)
+    slope = np.zeros_like(depth)
     near = np.abs(step) <= jump_m  # not of NaN
-    before, after = (np.moveaxis(slope, axis, 0)[part] for part in (slice(None, -1), slice(1, None)))  # views
-    step, near = np.moveaxis(step, axis, 0), np.moveaxis(near, axis, 0)
+    before, after = (
+        np.moveaxis(slope, axis, 0)[part] for part in (slice(None, -1), slice(1, None))
+    )  # views
+    step = np.moveaxis(step, axis, 0)
+    near = np.moveaxis(near, axis, 0)
     after[near] = step[near]
     before[near] = step[near]
     return slope / pitch_m
 
 
-def make_patches(depth: Float64, box: ObjectBox, albedo: Float64, jump_m: float = JUMP_M) -> Patches:
-    """Return the patches of a depth map (rows, columns), NaN for background, with its cells' albedo (rows, columns)."""
+def make_patches(
+    depth: Float64, box: ObjectBox, albedo: Float64, jump_m: float = JUMP_M
+) -> Patches:
+    """Return the patches of a depth map (rows, columns), NaN for background, with its cells' albedo
+    (rows, columns).
+    """
     x_m, y_m = cell_centers_m(box, len(depth))
     pitch_x, pitch_y = cell_pitch_m(box, depth.shape)
-    row, column = (np.ascontiguousarray(index) for index in np.nonzero(~np.isnan(depth)))  # as those of `clustered`
+    row, column = (
+        np.ascontiguousarray(index) for index in np.nonzero(~np.isnan(depth))
+    )  # as those of `clustered`
     slope_x = slope_along(depth, 1, pitch_x, jump_m)[row, column]
     slope_y = -slope_along(depth, 0, pitch_y, jump_m)[row, column]  # rows run along -y
-    # The surface z(x, y) has tangents (1, 0, zx) and (0, 1, zy). Their cross product (-zx, -zy, 1) has the length of
-    # true over projected area; its negative points towards the wall.
+    # The surface z(x, y) has tangents (1, 0, zx) and (0, 1, zy). Their cross product (-zx, -zy, 1)
+    # has the length of true over projected area; its negative points towards the wall.
     beta = np.sqrt(1 + slope_x**2 + slope_y**2)  # S3, divided through by dx dy
     normal = np.stack([slope_x, slope_y, -np.ones_like(beta)], axis=-1) / beta[:, None]
     point = np.stack([x_m[column], y_m[row], depth[row, column]], axis=-1)
     diagonal_m = float(np.hypot(pitch_x, pitch_y))
-    return Patches(point, normal, beta, albedo[row, column], row, column, pitch_x * pitch_y, diagonal_m)
+    return Patches(
+        point, normal, beta, albedo[row, column], row, column, pitch_x * pitch_y, diagonal_m
+    )
 
 
 def cell_pitch_m(box: ObjectBox, shape: tuple[int, ...]) -> tuple[float, float]:
@@ -84,15 +106,17 @@ def cell_pitch_m(box: ObjectBox, shape: tuple[int, ...]) -> tuple[float, float]:
 def clustered(patches: Patches, stride: int, size: int) -> Patches:
     """Return blocks of stride x stride cells of a grid (size, size) as one patch each.
 
-    The light that a block receives is exact for its cells' own tilt, since S2 is linear in area times normal; the error
-    is that all its cells stand at their mean point.
+    The light that a block receives is exact for its cells' own tilt, since S2 is linear in area
+    times normal; the error is that all its cells stand at their mean point.
     """
     block = patches.row // stride * size + patches.column // stride
     found = np.unique(block, return_inverse=True, return_counts=True)
     blocks, which, count = (column.astype(np.int64) for column in found)
 
     def summed(columns: Float64) -> Float64:
-        return np.stack([np.bincount(which, column, len(blocks)).astype(np.float64) for column in columns.T], -1)
+        return np.stack(
+            [np.bincount(which, column, len(blocks)).astype(np.float64) for column in columns.T], -1
+        )
 
     area = summed((patches.albedo * patches.beta)[:, None] * patches.normal)
     albedo = summed(patches.albedo[:, None])[:, 0] / stride**2
@@ -112,7 +136,9 @@ def clustered(patches: Patches, stride: int, size: int) -> Patches:
 
 
 def coarser(depth: Float64, stride: int) -> Float64:
-    """Return the mean depth of blocks of stride x stride cells, NaN for blocks without a surface."""
+    """Return the mean depth of blocks of stride x stride cells, NaN for blocks without a
+    surface.
+    """
     size = len(depth) // stride
     blocks = depth.reshape(size, stride, size, stride)
     count = (~np.isnan(blocks)).sum((1, 3))

@@ -1,6 +1,7 @@
 """Plan of effects, and the render problem that results when the plan is applied to a scene.
 
-Each finding bounds the relative change (L1) of the transient if its effect is left out, from the scene's facts alone.
+Each finding bounds the relative change (L1) of the transient if its effect is left out, from the
+scene's facts alone.
 """
 
 from dataclasses import dataclass, replace
@@ -15,7 +16,14 @@ from nlos_cam.render.accuracy import Accuracy
 from nlos_cam.render.echoes import pulse_bins
 from nlos_cam.render.effects import Effects, Plan, decide, included
 from nlos_cam.render.energy_survey import CAUTION, occluder_meets, shaded
-from nlos_cam.render.geometry import NO_OCCLUDER, Beams, Relay, gate_bins, occluder_edge, solid_angle
+from nlos_cam.render.geometry import (
+    NO_OCCLUDER,
+    Beams,
+    Relay,
+    gate_bins,
+    occluder_edge,
+    solid_angle,
+)
 from nlos_cam.render.interreflection import AROUND_M
 from nlos_cam.render.job import TransportJob
 from nlos_cam.render.patches import Patches
@@ -28,7 +36,10 @@ Finding = tuple[str, float, str]
 
 def plan(facts: SceneFacts, effects: Effects = "auto") -> Plan:
     """Return the verdicts on all effects, in the order in which light meets them."""
-    findings = [verdict(facts) for verdict in (_direct, _three_bounce, _line_of_sight, _occluder, _self_occlusion)]
+    findings = [
+        verdict(facts)
+        for verdict in (_direct, _three_bounce, _line_of_sight, _occluder, _self_occlusion)
+    ]
     findings += [verdict(facts) for verdict in (_tilt, _brdf, _color, _interreflection, _pulse)]
     return decide(findings, facts.accuracy.tolerance, effects)
 
@@ -47,7 +58,8 @@ def _three_bounce(facts: SceneFacts) -> Finding:
 def _line_of_sight(facts: SceneFacts) -> Finding:
     if facts.line_of_sight is None:
         return "line-of-sight", 0.0, "no part of the object is visible to the lidar"
-    beams, cells = len(facts.line_of_sight.beam), int(facts.line_of_sight.hidden.sum())
+    beams = len(facts.line_of_sight.beam)
+    cells = int(facts.line_of_sight.hidden.sum())
     return "line-of-sight", 1.0, f"the object stops {beams} beams and hides {cells} relay cells"
 
 
@@ -61,7 +73,8 @@ def _occluder(facts: SceneFacts) -> Finding:
         return "occluder", 0.0, "no beam meets it, and nothing is hidden"
     if not occluder_meets(occluder_edge(facts.rig), facts.patches, beams, facts.relay):
         return "occluder", 0.0, "it blocks no leg"
-    # The survey samples points of the wall and may miss a thin shadow: one beam's share is the least that may be lost.
+    # The survey samples points of the wall and may miss a thin shadow: one beam's share is the
+    # least that may be lost.
     return "occluder", max(facts.light.occluder, 1 / len(beams.length_m)), "legs cross it"
 
 
@@ -71,10 +84,15 @@ def _self_occlusion(facts: SceneFacts) -> Finding:
     behind = shaded(facts.patches, facts.field)
     if not behind.any():
         return "self-occlusion", 0.0, "the surface is its own lower convex hull"
-    # The share is of the unshaded energy E; at worst all of it is lost, and the true energy is E (1 - share).
+    # The share is of the unshaded energy E; at worst all of it is lost, and the true energy is E (1
+    # - share).
     share = facts.light.share(facts.light.energy * behind)
     bound = min(share / (1 - share), 1.0) if share < 1 else 1.0
-    return "self-occlusion", bound, f"{int(behind.sum())} of {len(behind)} patches have another above their plane"
+    return (
+        "self-occlusion",
+        bound,
+        f"{int(behind.sum())} of {len(behind)} patches have another above their plane",
+    )
 
 
 def _tilt(facts: SceneFacts) -> Finding:
@@ -82,7 +100,8 @@ def _tilt(facts: SceneFacts) -> Finding:
         return "tilt", 0.0, "nothing to tilt"
     steepest = sqrt(max(float(facts.patches.beta.max()) ** 2 - 1, 0.0))  # beta^2 = 1 + slope^2 (S3)
     low, high = facts.brdf_range
-    # A lobe turns by twice the tilt, even out of view, which the cosines of the survey do not show: no bound but 1.
+    # A lobe turns by twice the tilt, even out of view, which the cosines of the survey do not show:
+    # no bound but 1.
     bound = facts.light.tilt if low == high else 1.0
     return "tilt", bound if steepest else 0.0, f"steepest slope {steepest:.3g}"
 
@@ -92,7 +111,8 @@ def _brdf(facts: SceneFacts) -> Finding:
     if facts.patches is None or brdf is None:
         return "brdf", 0.0, "the surface is Lambertian" if brdf is None else "nothing is hidden"
     low, high = facts.brdf_range
-    # Without the effect the mean m of both ends replaces the BRDF: |f - m| / f is largest at f = low.
+    # Without the effect the mean m of both ends replaces the BRDF: |f - m| / f is largest at f =
+    # low.
     bound = min((high - low) / (2 * low), 1.0) if low > 0 else float(high > 0)
     cost = "needs tables for every direction of incoming light, some dozens of times the cost"
     return "brdf", bound, f"the BRDF ranges from {low:.3g} to {high:.3g}: {cost}"
@@ -102,8 +122,8 @@ def _color(facts: SceneFacts) -> Finding:
     if facts.patches is None or not facts.scene.surface.colored:
         return "colour", 0.0, "the albedo has one channel"
     albedo = np.asarray(facts.scene.surface.albedo, np.float64)
-    # Light is linear in albedo: with the mean in place of a channel, each patch errs by |channel - mean| / mean, and a
-    # sum of patches by no more than the worst of them.
+    # Light is linear in albedo: with the mean in place of a channel, each patch errs by |channel -
+    # mean| / mean, and a sum of patches by no more than the worst of them.
     grey = albedo.mean(-1, keepdims=True)
     apart = float((np.abs(albedo - grey).max(-1) / np.where(grey > 0, grey, 1)[..., 0]).max())
     return "colour", min(apart, 1.0), f"channels differ by up to {apart:.3g} of their mean"
@@ -113,17 +133,30 @@ def _interreflection(facts: SceneFacts) -> Finding:
     if facts.patches is None:
         return "inter-reflection", 0.0, "nothing is hidden"
     if not facts.lambertian:
-        return "inter-reflection", 0.0, "S1 to S5 have no higher orders; only lambertian radiometry includes them"
+        return (
+            "inter-reflection",
+            0.0,
+            "S1 to S5 have no higher orders; only lambertian radiometry includes them",
+        )
     share = CAUTION * facts.interreflection
-    return "inter-reflection", min(share, 1.0), f"five bounces and object to object carry up to {share:.3g} of three"
+    return (
+        "inter-reflection",
+        min(share, 1.0),
+        f"five bounces and object to object carry up to {share:.3g} of three",
+    )
 
 
 def _pulse(facts: SceneFacts) -> Finding:
     if facts.scene.pulse_ns == 0:
         return "pulse", 0.0, "the pulse has no width"
     sigma = pulse_bins(facts.scene.pulse_ns, facts.rig.device.bin_m)
-    # A Gaussian moves a share of about sigma / bin of an echo over each edge of its bin; L1 counts it on both sides.
-    return "pulse", min(4 * sigma, 1.0), f"{facts.scene.pulse_ns:g} ns spread an echo by {sigma:.3g} bins"
+    # A Gaussian moves a share of about sigma / bin of an echo over each edge of its bin; L1 counts
+    # it on both sides.
+    return (
+        "pulse",
+        min(4 * sigma, 1.0),
+        f"{facts.scene.pulse_ns:g} ns spread an echo by {sigma:.3g} bins",
+    )
 
 
 MAX_BYTES = 4 << 30
@@ -132,7 +165,9 @@ MAX_BYTES = 4 << 30
 
 @dataclass(frozen=True)
 class RenderProblem:
-    """Scene with its plan applied: all that transport, echoes and maps need, handed forward as one value."""
+    """Scene with its plan applied: all that transport, echoes and maps need, handed forward as one
+    value.
+    """
 
     scene: Scene
     accuracy: Accuracy
@@ -140,14 +175,19 @@ class RenderProblem:
     beams: Beams
     """Beams of the rows to render."""
     job: TransportJob | None
-    """Three-bounce transport with the mean albedo, for the beams that light the wall; None if no path is possible."""
+    """Three-bounce transport with the mean albedo, for the beams that light the wall; None if no
+    path is possible.
+    """
     color_jobs: tuple[TransportJob | None, ...]
     """The same for red, green and blue if the plan includes color; else empty."""
 
     @classmethod
     def of(cls, facts: SceneFacts, verdicts: Plan, rows: tuple[int, int] | None = None) -> Self:
-        """Apply a plan to beams, wall and patches, for some rows of the map. Raises SceneError if it is too large."""
-        scene, per_cell = facts.scene, facts.accuracy.beams_per_cell
+        """Apply a plan to beams, wall and patches, for some rows of the map. Raises SceneError if
+        it is too large.
+        """
+        scene = facts.scene
+        per_cell = facts.accuracy.beams_per_cell
         with_occluder = included(verdicts, "occluder")
         edge_m = occluder_edge(scene.rig) if with_occluder else NO_OCCLUDER
         beams = facts.beams(occluder=with_occluder)
@@ -155,7 +195,9 @@ class RenderProblem:
         if included(verdicts, "line-of-sight") and (blocked := facts.line_of_sight) is not None:
             albedo = facts.albedo[blocked.row, blocked.column]
             solid = solid_angle(lambertian=facts.lambertian)
-            beams = beams.with_hits(scene.rig, blocked.beam, blocked.length_m, blocked.cosine, albedo, solid)
+            beams = beams.with_hits(
+                scene.rig, blocked.beam, blocked.length_m, blocked.cosine, albedo, solid
+            )
             hidden |= blocked.hidden
         if not included(verdicts, "direct"):
             beams = beams.without_direct()
@@ -166,7 +208,9 @@ class RenderProblem:
             _job(facts, verdicts, beams, (start, end), relay, edge_m, channel)
             for channel in (None, *range(3 if colored else 0))
         ]
-        return cls(scene, facts.accuracy, verdicts, beams.rows(start, end), jobs[0], tuple(jobs[1:]))
+        return cls(
+            scene, facts.accuracy, verdicts, beams.rows(start, end), jobs[0], tuple(jobs[1:])
+        )
 
     def includes(self, effect: str) -> bool:
         """Return whether the plan includes an effect."""
@@ -174,7 +218,9 @@ class RenderProblem:
 
 
 def prepare(scene: Scene, accuracy: Accuracy, effects: Effects = "auto") -> RenderProblem:
-    """Return the render problem of a scene with the effects that it calls for, or exactly those named."""
+    """Return the render problem of a scene with the effects that it calls for, or exactly those
+    named.
+    """
     facts = SceneFacts(scene, accuracy)
     return RenderProblem.of(facts, plan(facts, effects))
 
@@ -188,14 +234,18 @@ def _job(
     edge_m: tuple[float, float],
     channel: int | None,
 ) -> TransportJob | None:
-    """Return the transport of the beams in some rows with the albedo of one channel, or with the mean of all.
+    """Return the transport of the beams in some rows with the albedo of one channel, or with the
+    mean of all.
 
-    Bins and BRDF nodes come from the beams of the whole map, so that they do not depend on the rows.
+    Bins and BRDF nodes come from the beams of the whole map, so that they do not depend on the
+    rows.
     """
     ends = (row * beams.shape[1] for row in rows)
     wanted = np.zeros_like(beams.on_wall)
     wanted[slice(*ends)] = True
-    if not (included(verdicts, "three-bounce") and relay.x_m.size and (beams.on_wall & wanted).any()):
+    if not (
+        included(verdicts, "three-bounce") and relay.x_m.size and (beams.on_wall & wanted).any()
+    ):
         return None
     if (patches := _patches(facts, verdicts, channel)) is None:
         return None
@@ -204,7 +254,8 @@ def _job(
     if included(verdicts, "brdf"):
         job = replace(job, brdf=facts.scene.surface.brdf)
     if included(verdicts, "inter-reflection"):
-        # By way of another patch, or of the wall around it, a path gets longer by at most twice across that wall.
+        # By way of another patch, or of the wall around it, a path gets longer by at most twice
+        # across that wall.
         longer_m = 2 * np.linalg.norm(np.ptp(patches.point_m, axis=0) + 2 * AROUND_M)
         bins = min(job.bins + int(np.ceil(longer_m / job.bin_m)), gate_bins(facts.rig.device))
         job = replace(job, more_bounces=True, bins=bins)
@@ -213,17 +264,24 @@ def _job(
     size = len(job.laser_spot_m) * job.bins * (8 if job.accuracy.sub_bins == 0 else 4)
     if size > MAX_BYTES:
         raise SceneError(
-            f"{len(job.laser_spot_m)} beams of {job.bins} bins need {size / 2**30:.1f} GiB, at most {MAX_BYTES >> 30}: "
-            f"lower beams_per_cell ({job.accuracy.beams_per_cell}), widen bin_m ({job.bin_m:g}) or shorten gate_s"
+            f"{len(job.laser_spot_m)} beams of {job.bins} bins need {size / 2**30:.1f} GiB, at most"
+            f" {MAX_BYTES >> 30}: lower beams_per_cell ({job.accuracy.beams_per_cell}), widen bin_m"
+            f" ({job.bin_m:g}) or shorten gate_s"
         )
     return job
 
 
 def _patches(facts: SceneFacts, verdicts: Plan, channel: int | None) -> Patches | None:
     """Return the patches with tilt and BRDF as the plan includes them."""
-    patches = facts.patches if channel is None or facts.patches is None else facts.patches_of(channel)
+    patches = (
+        facts.patches if channel is None or facts.patches is None else facts.patches_of(channel)
+    )
     if patches is not None and not included(verdicts, "tilt"):
         patches = patches.level()
-    if patches is not None and facts.scene.surface.brdf is not None and not included(verdicts, "brdf"):
+    if (
+        patches is not None
+        and facts.scene.surface.brdf is not None
+        and not included(verdicts, "brdf")
+    ):
         patches = replace(patches, albedo=patches.albedo * np.mean(facts.brdf_range))
     return patches

@@ -1,6 +1,8 @@
-"""Renderer: a scene to the depth and intensity maps of a lidar that reports its strongest echo (S1 to S5).
+"""Renderer: a scene to the depth and intensity maps of a lidar that reports its strongest echo (S1
+to S5).
 
-`render_scan` follows the raster of the MEMS mirror: rows are scanned one after another while objects move.
+`render_scan` follows the raster of the MEMS mirror: rows are scanned one after another while
+objects move.
 """
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -17,7 +19,14 @@ from nlos_cam.errors import SceneError
 from nlos_cam.frames import MAP_COLUMNS, MAP_ROWS, WINNER_SPREAD_M
 from nlos_cam.render import backend_reference, glossy
 from nlos_cam.render.accuracy import Accuracy, accuracy_named
-from nlos_cam.render.echoes import MultiBounce, add_direct, compete, no_echoes, strongest, with_pulse
+from nlos_cam.render.echoes import (
+    MultiBounce,
+    add_direct,
+    compete,
+    no_echoes,
+    strongest,
+    with_pulse,
+)
 from nlos_cam.render.effects import Effect, Effects, Plan
 from nlos_cam.render.energy_survey import CAUTION
 from nlos_cam.render.geometry import gate_bins
@@ -45,7 +54,9 @@ class Rendering:
     """Maps that the lidar reports of a scene, free of sensor noise."""
 
     depth_m: Float32
-    """(64, 80); along the optical axis, NaN where nothing returns. Median of the beams in a cell."""
+    """(64, 80); along the optical axis, NaN where nothing returns. Median of the beams in a
+    cell.
+    """
     intensity: Float32
     """(64, 80); in units of I0. Mean of the beams in a cell within 1 cm of the median depth."""
     margin: Float32
@@ -55,7 +66,9 @@ class Rendering:
     plan: Plan
     accuracy: Accuracy
     near_legs: int
-    """Number of legs between patches and wall so short that the near-contact average replaced 1 / d^2."""
+    """Number of legs between patches and wall so short that the near-contact average replaced 1 /
+    d^2.
+    """
     color: Float32 | None = None
     """(64, 80, 3); intensity in each channel of the albedo, if it has three."""
 
@@ -77,22 +90,33 @@ def render(
 
 
 def render_all(
-    scenes: Iterable[Scene], accuracy: str | Accuracy = "standard", effects: Effects = "auto", backend: str = "cpu"
+    scenes: Iterable[Scene],
+    accuracy: str | Accuracy = "standard",
+    effects: Effects = "auto",
+    backend: str = "cpu",
 ) -> Iterator[Rendering]:
     """Yield the renderings of many scenes; torch works on batches of BATCH_OBJECTS."""
-    setting, rest = accuracy_named(accuracy), iter(scenes)
+    setting = accuracy_named(accuracy)
+    rest = iter(scenes)
     while batch := list(islice(rest, 1 if backend == "cpu" else BATCH_OBJECTS)):
         problems = [prepare(scene, setting, effects) for scene in batch]
-        for problem, echoes in zip(problems, _echoes_of_all(problems, setting, backend), strict=True):
+        for problem, echoes in zip(
+            problems, _echoes_of_all(problems, setting, backend), strict=True
+        ):
             yield _rendering(problem, echoes, backend)
 
 
 def transient(
-    scene: Scene, accuracy: str | Accuracy = "standard", effects: Effects = "auto", backend: str = "cpu"
+    scene: Scene,
+    accuracy: str | Accuracy = "standard",
+    effects: Effects = "auto",
+    backend: str = "cpu",
 ) -> Float32:
-    """Return all light that comes back, as histograms (64, 80, bins) over path length in bins of `device.bin_m`.
+    """Return all light that comes back, as histograms (64, 80, bins) over path length in bins of
+    `device.bin_m`.
 
-    With beams_per_cell k they are (64 k, 80 k, bins); with the color effect a channel axis (3) follows.
+    With beams_per_cell k they are (64 k, 80 k, bins); with the color effect a channel axis (3)
+    follows.
     """
     problem = prepare(scene, accuracy_named(accuracy), effects)
     jobs = problem.color_jobs or (problem.job,)
@@ -108,19 +132,26 @@ def three_bounce(
     backend: str = "cpu",
     chosen: NDArray[np.int64] | None = None,
 ) -> Histograms:
-    """Return the three-bounce histograms (n, bins) alone, of chosen beams (flat indices) or of all."""
+    """Return the three-bounce histograms (n, bins) alone, of chosen beams (flat indices) or of
+    all.
+    """
     problem = prepare(scene, accuracy_named(accuracy), effects)
     return beam_histograms(problem, problem.job, backend, chosen)
 
 
 def beam_histograms(
-    problem: RenderProblem, job: TransportJob | None, backend: str, chosen: NDArray[np.int64] | None = None
+    problem: RenderProblem,
+    job: TransportJob | None,
+    backend: str,
+    chosen: NDArray[np.int64] | None = None,
 ) -> Histograms:
-    """Return the three-bounce histograms of a problem's beams, or of the chosen; 0 for beams that miss the wall."""
+    """Return the three-bounce histograms of a problem's beams, or of the chosen; 0 for beams that
+    miss the wall.
+    """
     lit = problem.beams.on_wall
     chosen = np.arange(len(lit)) if chosen is None else chosen
-    # A job holds the beams that light the wall alone, in their order: the running count of lit beams is a beam's place
-    # among them.
+    # A job holds the beams that light the wall alone, in their order: the running count of lit
+    # beams is a beam's place among them.
     wanted = chosen[lit[chosen]]
     if job is None or not wanted.size:
         return np.zeros((len(chosen), job.bins if job else 1), np.float32)
@@ -129,9 +160,11 @@ def beam_histograms(
 
 
 def transport(job: TransportJob | None, backend: str) -> Histograms | None:
-    """Return the three-bounce histograms (n, bins) of a job's beams by one of the backends; None for no job.
+    """Return the three-bounce histograms (n, bins) of a job's beams by one of the backends; None
+    for no job.
 
-    An accuracy without sub-bins is the reference, on any backend. Raises SceneError if there is no such backend or GPU.
+    An accuracy without sub-bins is the reference, on any backend. Raises SceneError if there is no
+    such backend or GPU.
     """
     if job is None:
         return None
@@ -147,22 +180,27 @@ def transport(job: TransportJob | None, backend: str) -> Histograms | None:
 
 
 def _echoes(problem: RenderProblem, backend: str) -> MultiBounce:
-    """Return the strongest bins (n,) of all beams, from a part of the transport where the backend can do that."""
+    """Return the strongest bins (n,) of all beams, from a part of the transport where the backend
+    can do that.
+    """
     job = problem.job
-    # A pulse mixes neighbouring bins, so that the strongest bin before it may not be the strongest after it: only a
-    # waveform without one may be summed in part.
+    # A pulse mixes neighbouring bins, so that the strongest bin before it may not be the strongest
+    # after it: only a waveform without one may be summed in part.
     if backend == "cpu" and job and job.accuracy.sub_bins and not problem.includes("pulse"):
         return glossy.echoes(job).spread_over(problem.beams.on_wall)
     return _strongest(problem, transport(job, backend))
 
 
-def _echoes_of_all(problems: Sequence[RenderProblem], accuracy: Accuracy, backend: str) -> Iterable[MultiBounce]:
+def _echoes_of_all(
+    problems: Sequence[RenderProblem], accuracy: Accuracy, backend: str
+) -> Iterable[MultiBounce]:
     """Return the strongest bins of every problem, torch's in one batch."""
     if backend not in {"torch", "cuda"} or accuracy.sub_bins == 0:
         return [_echoes(problem, backend) for problem in problems]
     from nlos_cam.render import backend_torch
 
-    device, jobs = backend_torch.device_named(backend), [problem.job for problem in problems]
+    device = backend_torch.device_named(backend)
+    jobs = [problem.job for problem in problems]
     found = iter(backend_torch.histograms_of_all([job for job in jobs if job is not None], device))
     return [_strongest(problem, next(found) if problem.job else None) for problem in problems]
 
@@ -182,23 +220,32 @@ def _rendering(problem: RenderProblem, echoes: MultiBounce, backend: str) -> Ren
     depth, intensity, margin = compete(problem.beams, echoes)
     color = _color(problem, echoes, backend) if problem.color_jobs else None
     near = count_near_legs(problem.job) if problem.job else 0
-    return Rendering(*_cells(depth, intensity, margin), echoes, problem.plan, problem.accuracy, near, color)
+    return Rendering(
+        *_cells(depth, intensity, margin), echoes, problem.plan, problem.accuracy, near, color
+    )
 
 
 def _strongest(problem: RenderProblem, histograms: Histograms | None) -> MultiBounce:
-    """Return the strongest bins (n,) of all beams: of three bounces, or with a pulse of the whole waveform."""
-    lit, bin_m = problem.beams.on_wall, problem.scene.rig.device.bin_m
+    """Return the strongest bins (n,) of all beams: of three bounces, or with a pulse of the whole
+    waveform.
+    """
+    lit = problem.beams.on_wall
+    bin_m = problem.scene.rig.device.bin_m
     if problem.includes("pulse"):
         whole = _waveforms(problem, _spread_over(lit, histograms))
         return replace(strongest(whole, bin_m), direct_included=True)
-    return no_echoes(len(lit)) if histograms is None else strongest(histograms, bin_m).spread_over(lit)
+    return (
+        no_echoes(len(lit)) if histograms is None else strongest(histograms, bin_m).spread_over(lit)
+    )
 
 
 def _waveforms(problem: RenderProblem, histograms: Histograms) -> Float32:
-    """Return three-bounce histograms with direct returns added and the pulse applied, up to the gate."""
+    """Return three-bounce histograms with direct returns added and the pulse applied, up to the
+    gate.
+    """
     device = problem.scene.rig.device
-    # Convolution is linear, so one pulse over the sum of direct and three-bounce light stands for each echo's own; it
-    # comes before the gate, since light outside reaches in by the pulse's tail.
+    # Convolution is linear, so one pulse over the sum of direct and three-bounce light stands for
+    # each echo's own; it comes before the gate, since light outside reaches in by the pulse's tail.
     whole = add_direct(histograms.astype(np.float32, copy=False), problem.beams, device.bin_m)
     if problem.includes("pulse"):
         whole = with_pulse(whole, problem.scene.pulse_ns, device.bin_m)
@@ -206,10 +253,13 @@ def _waveforms(problem: RenderProblem, histograms: Histograms) -> Float32:
 
 
 def _color(problem: RenderProblem, echoes: MultiBounce, backend: str) -> Float32:
-    """Return the intensity (64, 80, 3) of each channel in the bin of the winning echo; the wall is white."""
-    bin_m, beams = problem.scene.rig.device.bin_m, np.arange(echoes.peak.size)
-    # The winner is chosen on the mean albedo, as a lidar of one wavelength would; the channels only share its bin.
-    # Choosing anew in each channel could give one beam three depths.
+    """Return the intensity (64, 80, 3) of each channel in the bin of the winning echo; the wall is
+    white.
+    """
+    bin_m = problem.scene.rig.device.bin_m
+    beams = np.arange(echoes.peak.size)
+    # The winner is chosen on the mean albedo, as a lidar of one wavelength would; the channels only
+    # share its bin. Choosing anew in each channel could give one beam three depths.
     wins = (echoes.peak.ravel() > problem.beams.direct) | echoes.direct_included
     at = np.nan_to_num(echoes.path_m.ravel() / bin_m, nan=0).astype(np.int64)
     channels: list[Float32] = []
@@ -217,7 +267,9 @@ def _color(problem: RenderProblem, echoes: MultiBounce, backend: str) -> Float32
         histogram = beam_histograms(problem, job, backend).astype(np.float32, copy=False)
         if echoes.direct_included:
             histogram = _waveforms(problem, histogram)
-        value = np.where(wins, histogram[beams, np.minimum(at, histogram.shape[1] - 1)], problem.beams.direct)
+        value = np.where(
+            wins, histogram[beams, np.minimum(at, histogram.shape[1] - 1)], problem.beams.direct
+        )
         channels.append(_cell_mean(value.reshape(echoes.peak.shape)).astype(np.float32))
     return np.stack(channels, -1)
 
@@ -237,11 +289,12 @@ def _cells(depth: Float32, intensity: Float32, margin: Float32) -> tuple[Float32
     """Reduce maps of beams to maps of cells, exactly as camera frames are reduced."""
     if depth.shape[1] == MAP_COLUMNS:
         return depth, intensity, margin
-    depths, values = _blocks(depth), _blocks(intensity)
+    depths = _blocks(depth)
+    values = _blocks(intensity)
     valid = ~np.isnan(depths)
     some = valid.any(-1)
-    # Median of depth, then mean of the intensities near it: a cell across an edge holds two echoes at two depths, and
-    # their mean depth would lie where there is nothing.
+    # Median of depth, then mean of the intensities near it: a cell across an edge holds two echoes
+    # at two depths, and their mean depth would lie where there is nothing.
     median = np.full(some.shape, np.nan, np.float32)
     median[some] = np.nanmedian(depths[some], axis=-1)
     near = valid & (np.abs(depths - median[..., None]) <= WINNER_SPREAD_M)
@@ -255,34 +308,50 @@ def _cells(depth: Float32, intensity: Float32, margin: Float32) -> tuple[Float32
 
 
 def scan_effect(scene_at: SceneAt, accuracy: str | Accuracy = "standard") -> Effect:
-    """Return the verdict on the raster: the change of the transient from the top row's instant to the bottom row's."""
-    # Only the ends of the scan are compared: an object that comes back within it would go unseen, but a scan lasts
-    # 1/30 s.
-    setting, first, last = accuracy_named(accuracy), scene_at(0.0), scene_at(1.0)
+    """Return the verdict on the raster: the change of the transient from the top row's instant to
+    the bottom row's.
+    """
+    # Only the ends of the scan are compared: an object that comes back within it would go unseen,
+    # but a scan lasts 1/30 s.
+    setting = accuracy_named(accuracy)
+    first = scene_at(0.0)
+    last = scene_at(1.0)
     change = 0.0 if _alike(first, last) else min(CAUTION * _change(first, last), 1.0)
-    reason = f"motion changes {change:.3g} of the transient during a scan" if change else "nothing moves"
+    reason = (
+        f"motion changes {change:.3g} of the transient during a scan" if change else "nothing moves"
+    )
     return Effect("scan-time", change > setting.tolerance, reason, change)
 
 
-def render_scan(scene_at: SceneAt, accuracy: str | Accuracy = "standard", effects: Effects = "auto") -> Rendering:
-    """Return one frame of a raster: slices of rows, each at the instant of its middle row; the first gives the plan."""
+def render_scan(
+    scene_at: SceneAt, accuracy: str | Accuracy = "standard", effects: Effects = "auto"
+) -> Rendering:
+    """Return one frame of a raster: slices of rows, each at the instant of its middle row; the
+    first gives the plan.
+    """
     setting = accuracy_named(accuracy)
     verdict = scan_effect(scene_at, setting)
     count = slices(verdict, setting)
     parts: list[Rendering] = []
     for rows in np.array_split(np.arange(MAP_ROWS), count):
-        # The middle of a slice makes the error of its timing odd in the row, so that it cancels to first order.
+        # The middle of a slice makes the error of its timing odd in the row, so that it cancels to
+        # first order.
         share = float(rows.mean() + 0.5) / MAP_ROWS if verdict.included else 0.0
-        parts.append(render(scene_at(share), setting, effects, rows=(int(rows[0]), int(rows[-1]) + 1)))
+        parts.append(
+            render(scene_at(share), setting, effects, rows=(int(rows[0]), int(rows[-1]) + 1))
+        )
     return _joined(parts, verdict)
 
 
 def slices(verdict: Effect, setting: Accuracy) -> int:
-    """Return the number of instants of a scan: within one, at most FINEST_SHARE or the tolerance changes."""
+    """Return the number of instants of a scan: within one, at most FINEST_SHARE or the tolerance
+    changes.
+    """
     if not verdict.included:
         return 1
-    # Change is taken as linear over the scan: a slice of 1 / n of the rows then changes 1 / n of the bound. Two slices
-    # are the fewest that show motion at all, and more than one a row there cannot be.
+    # Change is taken as linear over the scan: a slice of 1 / n of the rows then changes 1 / n of
+    # the bound. Two slices are the fewest that show motion at all, and more than one a row there
+    # cannot be.
     return int(np.clip(ceil(verdict.bound / max(setting.tolerance, FINEST_SHARE)), 2, MAP_ROWS))
 
 
@@ -292,7 +361,9 @@ def _joined(parts: list[Rendering], verdict: Effect) -> Rendering:
     def stacked(name: str, of: Callable[[Rendering], object] = lambda part: part) -> NDArray[Any]:
         return np.concatenate([getattr(of(part), name) for part in parts])
 
-    multi = {name: stacked(name, lambda part: part.multi) for name in ("peak", "runner_up", "path_m")}
+    multi = {
+        name: stacked(name, lambda part: part.multi) for name in ("peak", "runner_up", "path_m")
+    }
     return replace(
         parts[0],
         **{name: stacked(name) for name in ("depth_m", "intensity", "margin")},
@@ -314,7 +385,8 @@ def _change(first: Scene, last: Scene) -> float:
     count = first.cell_intrinsics.width * first.cell_intrinsics.height
     chosen = np.arange(count)[:: count // PROBES]
     one, other = (three_bounce(scene, "draft", chosen=chosen) for scene in (first, last))
-    # L1 over all bins, relative to the light: an echo that leaves one bin for the next counts as lost and as new.
+    # L1 over all bins, relative to the light: an echo that leaves one bin for the next counts as
+    # lost and as new.
     bins = max(one.shape[1], other.shape[1])
     one, other = (np.pad(part, [(0, 0), (0, bins - part.shape[1])]) for part in (one, other))
     whole = float(np.abs(other).sum())

@@ -14,11 +14,14 @@ from nlos_cam.render.material import Surface
 from nlos_cam.render.patches import JUMP_M, Patches, make_patches
 
 Radiometry = Literal["paper", "lambertian"]
-""""paper" is S1 to S5 to the letter, "lambertian" the rendering equation with every cosine for the same paths.
+""""paper" is S1 to S5 to the letter, "lambertian" the rendering equation with every cosine for the
+same paths.
 """
 MAX_PULSE_NS = 100
 FINEST_GRID = 256
-"""Cells along a side of a depth map: sixteen times the default's number, and tables within a gigabyte."""
+"""Cells along a side of a depth map: sixteen times the default's number, and tables within a
+gigabyte.
+"""
 
 
 @dataclass(frozen=True)
@@ -37,18 +40,25 @@ class Scene:
 
     def __post_init__(self) -> None:
         if self.radiometry not in get_args(Radiometry):
-            raise SceneError(f"no radiometry {self.radiometry!r}: choose one of {', '.join(get_args(Radiometry))}")
+            raise SceneError(
+                f"no radiometry {self.radiometry!r}: choose one of"
+                f" {', '.join(get_args(Radiometry))}"
+            )
         if not 0 <= self.jump_m < np.inf:
             raise SceneError(f"jump_m is {self.jump_m}: it must be finite and at least 0")
         if not 0 <= self.pulse_ns <= MAX_PULSE_NS:
-            raise SceneError(f"pulse_ns is {self.pulse_ns}: give 0 to {MAX_PULSE_NS} (30 m of path)")
+            raise SceneError(
+                f"pulse_ns is {self.pulse_ns}: give 0 to {MAX_PULSE_NS} (30 m of path)"
+            )
         if self.object_depth_m is not None:
             _check_depth(self.object_depth_m)
             self.surface.over(self.object_depth_m.shape)
             _ = self.box  # refuse a rig that has none
 
     def intrinsics(self, beams_per_cell: int = 1) -> Intrinsics:
-        """Return intrinsics with beams_per_cell x beams_per_cell beams, evenly spread over each map cell."""
+        """Return intrinsics with beams_per_cell x beams_per_cell beams, evenly spread over each map
+        cell.
+        """
         return self.rig.pinhole.scaled(MAP_COLUMNS * beams_per_cell, MAP_ROWS * beams_per_cell)
 
     @property
@@ -63,11 +73,15 @@ class Scene:
 
     @property
     def patches(self) -> Patches | None:
-        """Hidden surface as patches with the mean albedo of the channels; None if nothing is hidden."""
+        """Hidden surface as patches with the mean albedo of the channels; None if nothing is
+        hidden.
+        """
         return self.patches_of(None)
 
     def patches_of(self, channel: int | None) -> Patches | None:
-        """Return the patches with the albedo of one channel, None for the mean; None if nothing is hidden."""
+        """Return the patches with the albedo of one channel, None for the mean; None if nothing is
+        hidden.
+        """
         if self.object_depth_m is None or np.isnan(self.object_depth_m).all():
             return None
         every = self.surface.over(self.object_depth_m.shape)
@@ -77,13 +91,18 @@ class Scene:
 
 def _check_depth(depth: Float32) -> None:
     if depth.ndim != 2 or depth.shape[0] != depth.shape[1] or not 1 <= len(depth) <= FINEST_GRID:
-        raise SceneError(f"object depth has shape {depth.shape}: it must be (n, n) with n from 1 to {FINEST_GRID}")
+        raise SceneError(
+            f"object depth has shape {depth.shape}: it must be (n, n) with n from 1 to"
+            f" {FINEST_GRID}"
+        )
     if not np.issubdtype(depth.dtype, np.floating):
-        raise SceneError(f"object depth has type {depth.dtype}: use floating point, with NaN for background")
+        raise SceneError(
+            f"object depth has type {depth.dtype}: use floating point, with NaN for background"
+        )
     surface = depth[~np.isnan(depth)]
     if surface.size and not (np.isfinite(surface).all() and surface.min() >= 0):
         where = "behind the wall" if surface.min() < 0 else "not finite"
         raise SceneError(
-            f"object depth ranges from {surface.min():.3g} to {surface.max():.3g} m, {where}: every surface must "
-            "be finite and at least 0 m off the wall (use NaN for background)"
+            f"object depth ranges from {surface.min():.3g} to {surface.max():.3g} m, {where}: every"
+            " surface must be finite and at least 0 m off the wall (use NaN for background)"
         )

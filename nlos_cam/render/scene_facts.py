@@ -9,7 +9,15 @@ from nlos_calibration.arrays import Float64
 
 from nlos_cam.render.accuracy import Accuracy
 from nlos_cam.render.energy_survey import EnergySurvey, survey
-from nlos_cam.render.geometry import SPEED_OF_LIGHT_M_PER_S, Beams, Relay, cast, gate_bins, occluder_edge, relay_cells
+from nlos_cam.render.geometry import (
+    SPEED_OF_LIGHT_M_PER_S,
+    Beams,
+    Relay,
+    cast,
+    gate_bins,
+    occluder_edge,
+    relay_cells,
+)
 from nlos_cam.render.interreflection import interreflection_share
 from nlos_cam.render.job import TransportJob
 from nlos_cam.render.line_of_sight import DirectVisibility, direct_visibility
@@ -21,15 +29,20 @@ from nlos_cam.render.visibility import HeightField, height_field
 
 @dataclass(frozen=True)
 class SceneFacts:
-    """Scene and accuracy with everything that the plan of effects depends on, computed on first use."""
+    """Scene and accuracy with everything that the plan of effects depends on, computed on first
+    use.
+    """
 
     scene: Scene
     accuracy: Accuracy
 
     @property
     def albedo(self) -> Float64:
-        """Albedo (rows, columns) of the accuracy's grid: mean of the channels and of each block of cells."""
-        size, stride = len(self.depth_m), self.stride
+        """Albedo (rows, columns) of the accuracy's grid: mean of the channels and of each block of
+        cells.
+        """
+        size = len(self.depth_m)
+        stride = self.stride
         every = self.scene.surface.over((size * stride, size * stride)).mean(-1)
         return every.reshape(size, stride, size, stride).mean((1, 3))
 
@@ -44,14 +57,19 @@ class SceneFacts:
         return self.scene.rig
 
     def beams(self, *, occluder: bool = True) -> Beams:
-        """Return the beams as they land on occluder and wall, before the object stops any of them."""
+        """Return the beams as they land on occluder and wall, before the object stops any of
+        them.
+        """
         intrinsics = self.scene.intrinsics(self.accuracy.beams_per_cell)
         return cast(self.rig, intrinsics, lambertian=self.lambertian, occluder=occluder)
 
     @property
     def stride(self) -> int:
-        """Cells along each axis that form one patch: as the accuracy has it if that divides the depth map; else 1."""
-        depth, accuracy = self.scene.object_depth_m, self.accuracy
+        """Cells along each axis that form one patch: as the accuracy has it if that divides the
+        depth map; else 1.
+        """
+        depth = self.scene.object_depth_m
+        accuracy = self.accuracy
         if depth is None:
             return 1
         finer = len(depth) // accuracy.finest_cells if accuracy.finest_cells else 1
@@ -64,11 +82,17 @@ class SceneFacts:
         depth = self.scene.object_depth_m
         if depth is None:
             return np.empty((0, 0))
-        return coarser(depth.astype(np.float64), self.stride) if self.stride > 1 else depth.astype(np.float64)
+        return (
+            coarser(depth.astype(np.float64), self.stride)
+            if self.stride > 1
+            else depth.astype(np.float64)
+        )
 
     @cached_property
     def patches(self) -> Patches | None:
-        """Patches with the mean albedo; None if nothing is hidden inside the gate, or no beam lights the wall."""
+        """Patches with the mean albedo; None if nothing is hidden inside the gate, or no beam
+        lights the wall.
+        """
         if np.isnan(self.depth_m).all() or not self.beams().on_wall.any():
             return None
         if 2 * np.nanmin(self.depth_m) >= SPEED_OF_LIGHT_M_PER_S * self.rig.device.gate_s:
@@ -78,7 +102,11 @@ class SceneFacts:
     def patches_of(self, channel: int | None) -> Patches | None:
         """Return the patches with the albedo of one channel; None for the mean of the channels."""
         patches = self.scene.patches_of(channel)
-        return clustered(patches, self.stride, len(self.depth_m)) if patches and self.stride > 1 else patches
+        return (
+            clustered(patches, self.stride, len(self.depth_m))
+            if patches and self.stride > 1
+            else patches
+        )
 
     @cached_property
     def field(self) -> HeightField:
@@ -88,11 +116,15 @@ class SceneFacts:
     @cached_property
     def relay(self) -> Relay:
         """Whole relay wall, with nothing in front of it."""
-        return relay_cells(self.rig, self.beams().lidar_m, self.accuracy.relay_columns, self.accuracy.relay_rows)
+        return relay_cells(
+            self.rig, self.beams().lidar_m, self.accuracy.relay_columns, self.accuracy.relay_rows
+        )
 
     @cached_property
     def _whole_job(self) -> TransportJob | None:
-        """Transport with every effect included and the whole relay wall: the basis of the surveys."""
+        """Transport with every effect included and the whole relay wall: the basis of the
+        surveys.
+        """
         if self.patches is None:
             return None
         return self.job(self.beams(), self.patches, self.relay, occluder_edge(self.rig), self.field)
@@ -114,7 +146,9 @@ class SceneFacts:
         """Beams and relay cells that the object blocks from the lidar; None if it blocks none."""
         if np.isnan(self.depth_m).all():  # also for an empty map
             return None
-        return direct_visibility(self.beams(), self.relay, self.field, self.depth_m, self.scene.jump_m)
+        return direct_visibility(
+            self.beams(), self.relay, self.field, self.depth_m, self.scene.jump_m
+        )
 
     @cached_property
     def interreflection(self) -> float:
@@ -124,10 +158,19 @@ class SceneFacts:
         return interreflection_share(self._whole_job, self.light.incident, self.light.returned)
 
     def job(
-        self, beams: Beams, patches: Patches, relay: Relay, edge_m: tuple[float, float], field: HeightField
+        self,
+        beams: Beams,
+        patches: Patches,
+        relay: Relay,
+        edge_m: tuple[float, float],
+        field: HeightField,
     ) -> TransportJob:
-        """Return the transport of all beams that light the wall over the patches to the relay cells."""
-        (spots, length, cosine), device, wall = beams.lit, self.rig.device, self.rig.wall
+        """Return the transport of all beams that light the wall over the patches to the relay
+        cells.
+        """
+        (spots, length, cosine) = beams.lit
+        device = self.rig.device
+        wall = self.rig.wall
         return TransportJob(
             laser_spot_m=spots,
             length_m=length,
@@ -148,18 +191,32 @@ class SceneFacts:
 
 
 def bins_of(beams: Beams, patches: Patches, relay: Relay, device: DeviceConstants) -> int:
-    """Return the number of bins up to the gate or the longest three-bounce path, whichever is less."""
-    # The distance to a fixed point is a convex function, and so is a sum of two: over a box of patches or a rectangle
-    # of relay cells it is largest at a corner. The far corners (largest z) suffice, as the wall lies at z = 0.
+    """Return the number of bins up to the gate or the longest three-bounce path, whichever is
+    less.
+    """
+    # The distance to a fixed point is a convex function, and so is a sum of two: over a box of
+    # patches or a rectangle of relay cells it is largest at a corner. The far corners (largest z)
+    # suffice, as the wall lies at z = 0.
     x, y, z = ((column.min(), column.max()) for column in patches.point_m.T)
     # d1 + d2 is convex over the wall as well: longest for a beam at the edge of the map.
     spots, length = beams.outermost
-    ends = [(a, b) for a in (relay.x_m.min(), relay.x_m.max()) for b in (relay.y_m.min(), relay.y_m.max())]
-    there, back = 0.0, np.zeros(len(ends))
+    ends = [
+        (a, b)
+        for a in (relay.x_m.min(), relay.x_m.max())
+        for b in (relay.y_m.min(), relay.y_m.max())
+    ]
+    there = 0.0
+    back = np.zeros(len(ends))
     for corner_x, corner_y in ((a, b) for a in x for b in y):
-        to_corner = np.sqrt((spots[:, 0] - corner_x) ** 2 + (spots[:, 1] - corner_y) ** 2 + z[1] ** 2)
+        to_corner = np.sqrt(
+            (spots[:, 0] - corner_x) ** 2 + (spots[:, 1] - corner_y) ** 2 + z[1] ** 2
+        )
         there = max(there, float((length + to_corner).max()))
-        back = np.maximum(back, [np.sqrt((a - corner_x) ** 2 + (b - corner_y) ** 2 + z[1] ** 2) for a, b in ends])
+        back = np.maximum(
+            back, [np.sqrt((a - corner_x) ** 2 + (b - corner_y) ** 2 + z[1] ** 2) for a, b in ends]
+        )
     back += [np.linalg.norm(np.subtract((*end, 0.0), beams.lidar_m)) for end in ends]
-    longest_bin = int((there + back.max()) / device.bin_m)  # of a path on a bin's edge, the bin beyond it
+    longest_bin = int(
+        (there + back.max()) / device.bin_m
+    )  # of a path on a bin's edge, the bin beyond it
     return min(longest_bin + 2, gate_bins(device))  # one to spare: the fast renderers round lengths

@@ -1,4 +1,6 @@
-"""Scene files (`scene.toml`): rig, hidden object, motion, sensor model and faults as one validated record."""
+"""Scene files (`scene.toml`): rig, hidden object, motion, sensor model and faults as one validated
+record.
+"""
 
 import hashlib
 import tomllib
@@ -53,13 +55,17 @@ def _within(low: float, high: float) -> AfterValidator:
 
     def check(value: float) -> float:
         if not low <= value <= high:
-            raise PydanticCustomError("range", "must be from {low} to {high}", {"low": f"{low:g}", "high": f"{high:g}"})
+            raise PydanticCustomError(
+                "range", "must be from {low} to {high}", {"low": f"{low:g}", "high": f"{high:g}"}
+            )
         return value
 
     return AfterValidator(check)
 
 
-Mesh = Annotated[shapes.MeshFile, PlainValidator(_mesh), PlainSerializer(lambda mesh: str(mesh.path), str)]
+Mesh = Annotated[
+    shapes.MeshFile, PlainValidator(_mesh), PlainSerializer(lambda mesh: str(mesh.path), str)
+]
 Size = Annotated[float, _within(0.001, 10)]
 Length = Annotated[float, _within(-10, 10)]
 Reach = Annotated[float, _within(0, 10)]
@@ -67,13 +73,17 @@ Angle = Annotated[float, _within(-360, 360)]
 
 
 class HiddenObject(Record):
-    """Hidden object at rest: a variation of a procedural category, or a mesh from a file, and its pose."""
+    """Hidden object at rest: a variation of a procedural category, or a mesh from a file, and its
+    pose.
+    """
 
     category: Annotated[str, AfterValidator(_known)] | None = None
     seed: int = Field(default=0, ge=0)
     """Index of the category's variation."""
     size_m: Size = 0.18
-    """Larger of the extents along x and y after turning; the unit of a mesh's file does not matter."""
+    """Larger of the extents along x and y after turning; the unit of a mesh's file does not
+    matter.
+    """
     tilt_x_deg: Angle = 0.0
     tilt_y_deg: Angle = 0.0
     turn_deg: Angle = 0.0
@@ -92,7 +102,9 @@ class HiddenObject(Record):
         if (self.category is None) == (self.file is None):
             raise PydanticCustomError("one_thing", "give either category or file")
         if self.file and self.seed:
-            raise PydanticCustomError("seed", "seed applies to a category: a file has no variations")
+            raise PydanticCustomError(
+                "seed", "seed applies to a category: a file has no variations"
+            )
         if self.category and self.up != "y":
             raise PydanticCustomError("up", "up applies to a file: a category has y up")
         return self
@@ -113,7 +125,9 @@ class HiddenObject(Record):
 
 
 class Motion(Record):
-    """Closed loop of poses: each quantity oscillates by its amplitude, a whole number of times per loop."""
+    """Closed loop of poses: each quantity oscillates by its amplitude, a whole number of times per
+    loop.
+    """
 
     poses: int = Field(default=90, gt=0, le=3600)
     """Number of poses, at 30 per second: two minutes at most, all rendered ahead."""
@@ -141,25 +155,32 @@ FaultKind = Literal[
 class Fault(Record):
     """Fault of a simulated camera: `kind` names what it does to the frames.
 
-    stall: delivers nothing and stops counting. drops: counts on, but delivers nothing. duplicate: every frame twice.
-    out_of_order: every frame after its successor. all_zero: depth, infrared and confidence are black. saturated:
-    infrared is 255 everywhere. half_invalid: no depth in the lower half. wrong_size: half the rows and columns. unplug:
-    the device is gone, and counts from 0 when it is back. clock_wrap: timestamps of a hardware clock of 32 bits of
-    microseconds, which restarts at 0.
+    stall: delivers nothing and stops counting. drops: counts on, but delivers nothing. duplicate:
+    every frame twice. out_of_order: every frame after its successor. all_zero: depth, infrared and
+    confidence are black. saturated: infrared is 255 everywhere. half_invalid: no depth in the lower
+    half. wrong_size: half the rows and columns. unplug: the device is gone, and counts from 0 when
+    it is back. clock_wrap: timestamps of a hardware clock of 32 bits of microseconds, which
+    restarts at 0.
     """
 
     kind: FaultKind
     at_frame: int = Field(ge=0)
-    """First frame with the fault; there are 30 per second, counted from 0 when the camera is entered."""
+    """First frame with the fault; there are 30 per second, counted from 0 when the camera is
+    entered.
+    """
     frames: int = Field(default=1, gt=0)
-    """Number of frames: for stall and unplug their duration; for out_of_order the number that are late."""
+    """Number of frames: for stall and unplug their duration; for out_of_order the number that are
+    late.
+    """
     stream: Literal["depth", "infrared", "confidence"] | None = None
     """Only for drops: the stream that loses frames."""
 
     @model_validator(mode="after")
     def _check_kind(self) -> Self:
         if self.stream and self.kind != "drops":
-            raise PydanticCustomError("stream", "stream is for drops: {kind} affects all streams", {"kind": self.kind})
+            raise PydanticCustomError(
+                "stream", "stream is for drops: {kind} affects all streams", {"kind": self.kind}
+            )
         if self.kind == "clock_wrap" and "frames" in self.model_fields_set:
             raise PydanticCustomError("frames", "a clock_wrap happens at one frame: omit `frames`")
         return self
@@ -177,13 +198,15 @@ class Fault(Record):
 def one_wrap(faults: tuple[Fault, ...]) -> tuple[Fault, ...]:
     """Return the faults. Raises PydanticCustomError for more than one clock_wrap."""
     if sum(fault.kind == "clock_wrap" for fault in faults) > 1:
-        raise PydanticCustomError("clock_wrap", "a clock wraps every 71.6 minutes: give one clock_wrap")
+        raise PydanticCustomError(
+            "clock_wrap", "a clock wraps every 71.6 minutes: give one clock_wrap"
+        )
     return faults
 
 
 RENDERING_VERSION = 6
-"""Number to raise with any change of rendering results or of datasets' noise: cached worlds are rendered again, and
-datasets of another number are not continued.
+"""Number to raise with any change of rendering results or of datasets' noise: cached worlds are
+rendered again, and datasets of another number are not continued.
 """
 
 
@@ -226,16 +249,24 @@ class SceneFile(Record):
     def bare(self) -> Scene:
         """Scene without the object."""
         material = self.hidden.material if self.hidden else Material()
-        return Scene(self.rig, None, material.surface, self.radiometry, self.jump_m, self.sensor.pulse_ns)
+        return Scene(
+            self.rig, None, material.surface, self.radiometry, self.jump_m, self.sensor.pulse_ns
+        )
 
     def scene_at(self, number: float) -> Scene:
         """Return the scene at an instant of the loop; fractions lie between two poses."""
         if self.hidden is None:
             return self.bare
         if self.rig.object_box is None:
-            raise SceneError(f"rig {self.rig.name!r} has no object_box for {self.hidden.label!r}: add one")
-        placed = shapes.place(self.hidden.triangles, self.pose_at(self.hidden, number), self.rig.object_box)
-        return replace(self.bare, object_depth_m=shapes.orthographic_depth(placed, self.rig.object_box))
+            raise SceneError(
+                f"rig {self.rig.name!r} has no object_box for {self.hidden.label!r}: add one"
+            )
+        placed = shapes.place(
+            self.hidden.triangles, self.pose_at(self.hidden, number), self.rig.object_box
+        )
+        return replace(
+            self.bare, object_depth_m=shapes.orthographic_depth(placed, self.rig.object_box)
+        )
 
     def shows_at(self, number: float) -> bool:
         """Return whether the wall sees any of the object at an instant of the loop."""
@@ -244,7 +275,8 @@ class SceneFile(Record):
 
     def pose_at(self, rest: HiddenObject, number: float) -> shapes.Pose:
         """Return the pose, at an instant of the loop, of an object whose pose at rest is `rest`."""
-        turn, motion = 2 * pi * number / self.poses, self.motion
+        turn = 2 * pi * number / self.poses
+        motion = self.motion
         return shapes.Pose(
             tilt_x_rad=radians(rest.tilt_x_deg),
             tilt_y_rad=radians(rest.tilt_y_deg + motion.tilt_deg * sin(2 * turn)),
@@ -262,7 +294,9 @@ def paper_scene() -> SceneFile:
         name="paper",
         rig=load_rig("paper-rig"),
         object=HiddenObject(category="airplane", seed=20_000_003, size_m=0.19),
-        motion=Motion(poses=90, sway_x_m=0.02, sway_y_m=0.02, approach_m=0.05, turn_deg=32, tilt_deg=12),
+        motion=Motion(
+            poses=90, sway_x_m=0.02, sway_y_m=0.02, approach_m=0.05, turn_deg=32, tilt_deg=12
+        ),
     )
 
 
@@ -274,12 +308,16 @@ def bare_wall_scene() -> SceneFile:
 def packaged_scenes() -> dict[str, Path]:
     """Return the example scenes that come with the package (in a clone: examples) by name."""
     here = Path(__file__).parent
-    folder = next((folder for folder in (here / "scenes", here.parents[1] / "examples") if folder.is_dir()), here)
+    folder = next(
+        (folder for folder in (here / "scenes", here.parents[1] / "examples") if folder.is_dir()),
+        here,
+    )
     return {path.stem: path for path in sorted(folder.glob("*.toml"))}
 
 
 def load_scene(path: Path) -> SceneFile:
-    """Return a scene from TOML, or a packaged one by name; paths in it are relative to its own folder.
+    """Return a scene from TOML, or a packaged one by name; paths in it are relative to its own
+    folder.
 
     Raises SceneFileError with the first problem, SceneError for an object that cannot be seen.
     """
@@ -293,12 +331,18 @@ def load_scene(path: Path) -> SceneFile:
         raise SceneFileError(f"{path} is not a valid scene: rig: {error}") from error
     except ValidationError as error:
         if (kind := record_kind(content)) not in {"", "scene"}:
-            raise SceneFileError(f"{path} is a {kind}, not a scene: give the path of a scene.toml") from error
+            raise SceneFileError(
+                f"{path} is a {kind}, not a scene: give the path of a scene.toml"
+            ) from error
         raise SceneFileError(f"{path} is not a valid scene: {first_problem(error)}") from error
     except OSError as error:
-        raise SceneFileError(f"{path} cannot be read ({error.strerror}): give the path of a scene.toml") from error
+        raise SceneFileError(
+            f"{path} cannot be read ({error.strerror}): give the path of a scene.toml"
+        ) from error
     except UnicodeDecodeError as error:
-        raise SceneFileError(f"{path} is a binary file, not a scene: give the path of a scene.toml") from error
+        raise SceneFileError(
+            f"{path} is a binary file, not a scene: give the path of a scene.toml"
+        ) from error
     except tomllib.TOMLDecodeError as error:
         raise SceneFileError(f"{path} cannot be read as a scene: {error}") from error
     if scene.hidden and not any(scene.shows_at(number) for number in range(scene.poses)):
@@ -307,7 +351,9 @@ def load_scene(path: Path) -> SceneFile:
 
 
 def _from_folder(content: dict[str, Any], folder: Path) -> dict[str, Any]:
-    """Return a scene file's content with rig loaded and mesh path resolved, both relative to its folder."""
+    """Return a scene file's content with rig loaded and mesh path resolved, both relative to its
+    folder.
+    """
     if isinstance(rig := content.get("rig"), str):
         beside = folder / rig
         content["rig"] = rig_named(str(beside if beside.is_file() else rig)).model_dump()

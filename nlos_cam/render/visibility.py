@@ -1,13 +1,15 @@
 """Self-occlusion V: visibility of wall points from the patches of the hidden object.
 
-The object is opaque from its depth map away from the wall. Take a patch at depth z and a wall point u cells away along
-the major axis of the direction. The leg falls linearly from z to 0 over u cells, so after k cells it is at depth
-z - k z / u. A surface of depth z' there blocks it if z' + bias < z - k z / u, that is (z - z' - bias) / k > z / u.
-So each direction has one number, its horizon h = max_k (z - z' - bias) / k, and a leg is free if z >= u h. This is the
-horizon of height-field shading (Max, "Horizon mapping", 1988), taken per cell.
+The object is opaque from its depth map away from the wall. Take a patch at depth z and a wall point
+u cells away along the major axis of the direction. The leg falls linearly from z to 0 over u cells,
+so after k cells it is at depth z - k z / u. A surface of depth z' there blocks it if z' + bias < z
+- k z / u, that is (z - z' - bias) / k > z / u. So each direction has one number, its horizon h =
+max_k (z - z' - bias) / k, and a leg is free if z >= u h. This is the horizon of height-field
+shading (Max, "Horizon mapping", 1988), taken per cell.
 
-The reference walks the exact direction of every leg. The fast backends look up lower and upper bounds of h over sectors
-of directions (`horizon_table`) and walk only the legs between the bounds: the same answer for a fraction of the walks.
+The reference walks the exact direction of every leg. The fast backends look up lower and upper
+bounds of h over sectors of directions (`horizon_table`) and walk only the legs between the bounds:
+the same answer for a fraction of the walks.
 """
 
 from typing import NamedTuple
@@ -25,15 +27,21 @@ from nlos_cam.render.patches import cell_pitch_m
 FACES = 4
 """Major directions +columns, -columns, +rows, -rows, each with its own sectors."""
 BIAS_CELLS = 0.25
-"""Height in cells by which a cell must rise above a leg to block it: less is the roughness of the grid itself."""
+"""Height in cells by which a cell must rise above a leg to block it: less is the roughness of the
+grid itself.
+"""
 ROUNDING = 1e-5
 """Relative widening of the bounds, so that a leg on a bound in float32 is walked in float64."""
 TOUCH = np.float32(1e-5)
-"""Height in meters per cell, above the rounding of float32, by which a step may fail to matter and is walked."""
+"""Height in meters per cell, above the rounding of float32, by which a step may fail to matter and
+is walked.
+"""
 
 
 class HeightField(NamedTuple):
-    """Depth map laid out for walks along rays. NaN is background, which neither shades nor receives light."""
+    """Depth map laid out for walks along rays. NaN is background, which neither shades nor receives
+    light.
+    """
 
     depth_m: Float64
     """(n, n)."""
@@ -58,10 +66,20 @@ def height_field(depth_m: NDArray[np.floating], box: ObjectBox, *, shades: bool)
     x_m, y_m = cell_centers_m(box, len(depth_m))
     rows, columns = np.nonzero(~np.isnan(depth_m))
     nearest = float(np.nanmin(depth_m)) if rows.size else np.inf
-    ends = (int(rows.min()), int(rows.max()), int(columns.min()), int(columns.max())) if rows.size else (0, 0, 0, 0)
+    ends = (
+        (int(rows.min()), int(rows.max()), int(columns.min()), int(columns.max()))
+        if rows.size
+        else (0, 0, 0, 0)
+    )
     pitch = cell_pitch_m(box, depth_m.shape)
     return HeightField(
-        np.array(depth_m, np.float64, order="C"), float(x_m[0]), float(y_m[0]), *pitch, nearest, *ends, shades
+        np.array(depth_m, np.float64, order="C"),
+        float(x_m[0]),
+        float(y_m[0]),
+        *pitch,
+        nearest,
+        *ends,
+        shades,
     )
 
 
@@ -82,7 +100,9 @@ def bias_m(field: HeightField) -> float:
 
 @inner()
 def _depth(field: HeightField, along: int, across: int, along_columns: bool) -> float:
-    """Return the depth of a cell, given along and across the walk; NaN beyond the surface's ends across it."""
+    """Return the depth of a cell, given along and across the walk; NaN beyond the surface's ends
+    across it.
+    """
     first = field.first_row if along_columns else field.first_column
     last = field.last_row if along_columns else field.last_column
     if across < first or across > last:
@@ -92,10 +112,13 @@ def _depth(field: HeightField, along: int, across: int, along_columns: bool) -> 
 
 @inner()
 def _between(field: HeightField, along: int, across: float, along_columns: bool) -> float:
-    """Return the depth between two neighbors across the walk, interpolated; the nearer decides if one is background."""
+    """Return the depth between two neighbors across the walk, interpolated; the nearer decides if
+    one is background.
+    """
     low = int(np.floor(across))
     share = across - low
-    near, far = _depth(field, along, low, along_columns), _depth(field, along, low + 1, along_columns)
+    near = _depth(field, along, low, along_columns)
+    far = _depth(field, along, low + 1, along_columns)
     if np.isnan(near) or np.isnan(far):
         return near if share < 0.5 else far
     return near + share * (far - near)
@@ -111,9 +134,17 @@ def _steps(field: HeightField, start: int, forward: bool, along_columns: bool) -
 
 @numba.njit(cache=True)
 def blocked(
-    field: HeightField, row: int, column: int, depth_m: float, u: float, v: float, first: int = 1, last: int = 1 << 30
+    field: HeightField,
+    row: int,
+    column: int,
+    depth_m: float,
+    u: float,
+    v: float,
+    first: int = 1,
+    last: int = 1 << 30,
 ) -> bool:
-    """Return whether the object blocks the leg from a cell to the wall point u columns and v rows away.
+    """Return whether the object blocks the leg from a cell to the wall point u columns and v rows
+    away.
 
     Steps before `first` and after `last` are known not to block it.
     """
@@ -122,44 +153,71 @@ def blocked(
     if abs(major) < 1e-9:
         return False
     start, across = (column, row) if along_columns else (row, column)
-    tilt, step = minor / abs(major), 1 if major > 0 else -1
-    limit, bias = depth_m / abs(major), bias_m(field)
+    tilt = minor / abs(major)
+    step = 1 if major > 0 else -1
+    limit = depth_m / abs(major)
+    bias = bias_m(field)
     for k in range(first, min(_steps(field, start, major > 0, along_columns), last) + 1):
-        # The highest surface there is cannot reach the leg any more, nor can any farther away: 1 / k only falls.
+        # The highest surface there is cannot reach the leg any more, nor can any farther away: 1 /
+        # k only falls.
         if (depth_m - field.nearest_m - bias) / k <= limit:
             return False
-        if (depth_m - _between(field, start + k * step, across + k * tilt, along_columns) - bias) / k > limit:
+        if (
+            depth_m - _between(field, start + k * step, across + k * tilt, along_columns) - bias
+        ) / k > limit:
             return True
     return False
 
 
 @numba.njit(cache=True)
 def visible(field: HeightField, row: int, column: int, point: Float64, x: float, y: float) -> bool:
-    """Return whether a wall point (x, y) and the center (3,) of a patch see each other past the rest of the object."""
+    """Return whether a wall point (x, y) and the center (3,) of a patch see each other past the
+    rest of the object.
+    """
     if not field.shades:
         return True
-    return not blocked(field, row, column, point[2], (x - point[0]) / field.pitch_x_m, (point[1] - y) / field.pitch_y_m)
+    return not blocked(
+        field,
+        row,
+        column,
+        point[2],
+        (x - point[0]) / field.pitch_x_m,
+        (point[1] - y) / field.pitch_y_m,
+    )
 
 
 @numba.njit(cache=True)
 def segment_blocked(
-    field: HeightField, row: int, column: int, depth_m: float, to_row: int, to_column: int, to_depth_m: float
+    field: HeightField,
+    row: int,
+    column: int,
+    depth_m: float,
+    to_row: int,
+    to_column: int,
+    to_depth_m: float,
 ) -> bool:
     """Return whether the object stands between two of its own cells."""
-    across, down = to_column - column, to_row - row
+    across = to_column - column
+    down = to_row - row
     along_columns = abs(across) >= abs(down)
     start, start_across = (column, row) if along_columns else (row, column)
     major, minor = (across, down) if along_columns else (down, across)
-    count, bias = abs(major), bias_m(field)
+    count = abs(major)
+    bias = bias_m(field)
     for k in range(1, count):
-        depth = _between(field, start + k * major // count, start_across + k * minor / count, along_columns)
-        # Along a segment between two cells the limit is the segment's own depth, interpolated, in place of z - k z / u.
+        depth = _between(
+            field, start + k * major // count, start_across + k * minor / count, along_columns
+        )
+        # Along a segment between two cells the limit is the segment's own depth, interpolated, in
+        # place of z - k z / u.
         if depth < depth_m + (to_depth_m - depth_m) * k / count - bias:
             return True
     return False
 
 
-@numba.njit(cache=True, error_model="numpy", fastmath={"contract", "nsz", "reassoc"}, inline="always")
+@numba.njit(
+    cache=True, error_model="numpy", fastmath={"contract", "nsz", "reassoc"}, inline="always"
+)
 def _meet(
     row: Float32,
     offset: int,
@@ -170,71 +228,111 @@ def _meet(
     k: np.float32,
     bounds: Float32,
 ) -> None:
-    """Update a sector's bounds (4, n), those of `_line`, by the cells k steps on, for n neighbors at once.
+    """Update a sector's bounds (4, n), those of `_line`, by the cells k steps on, for n neighbors
+    at once.
 
-    `last` (2, n) holds the smallest and the largest depth in the direction where the sector begins; it is replaced by
-    those where it ends, `offset` cells across and a share of the next one. `over` is True if it crosses a cell.
+    `last` (2, n) holds the smallest and the largest depth in the direction where the sector begins;
+    it is replaced by those where it ends, `offset` cells across and a share of the next one. `over`
+    is True if it crosses a cell.
     """
-    nothing, inverse = np.float32(np.inf), np.float32(1) / k
-    least, most, low, high, first, until = last[0], last[1], bounds[0], bounds[1], bounds[2], bounds[3]
-    near, beyond = row[offset : offset + len(rise_m)], row[offset + 1 : offset + 1 + len(rise_m)]
+    nothing = np.float32(np.inf)
+    inverse = np.float32(1) / k
+    least = last[0]
+    most = last[1]
+    low = bounds[0]
+    high = bounds[1]
+    first = bounds[2]
+    until = bounds[3]
+    near = row[offset : offset + len(rise_m)]
+    beyond = row[offset + 1 : offset + 1 + len(rise_m)]
     for c in range(len(rise_m)):
-        a, b, until_now = near[c], beyond[c], until[c]
-        # Next to background the nearer of both cells stands for itself: either may be the smallest, none the largest.
+        a = near[c]
+        b = beyond[c]
+        until_now = until[c]
+        # Next to background the nearer of both cells stands for itself: either may be the smallest,
+        # none the largest.
         gap = (a == nothing) | (b == nothing)
         between = a + share * (b - a)
-        smallest, largest = min(a, b) if gap else between, nothing if gap else between
-        least_now, most_now, before = least[c], most[c], low[c]
-        across, deepest = a if over else smallest, a if over else largest
+        smallest = min(a, b) if gap else between
+        largest = nothing if gap else between
+        least_now = least[c]
+        most_now = most[c]
+        before = low[c]
+        across = a if over else smallest
+        deepest = a if over else largest
         above = (rise_m[c] - min(least_now, smallest, across)) * inverse
         high[c] = max(high[c], above)
         lowest = max(before, (rise_m[c] - max(most_now, largest, deepest)) * inverse)
         low[c] = lowest
-        # A step matters to a leg between the bounds if it may rise above the wall and above the lower bound.
+        # A step matters to a leg between the bounds if it may rise above the wall and above the
+        # lower bound.
         matters = k if above > -TOUCH else nothing
         first[c] = min(first[c], matters)
         until[c] = k if above > lowest - TOUCH else until_now
-        least[c], most[c] = smallest, largest
+        least[c] = smallest
+        most[c] = largest
 
 
 @inner(error_model="numpy")
-def _line(cells: Float32, margin: int, start: int, step: int, steps: int, rise_m: Float32, sectors: int) -> Float32:
-    """Return bounds (sectors, 4, n) of the horizons of n neighbors on a line: low, high, first and last step to walk.
+def _line(
+    cells: Float32, margin: int, start: int, step: int, steps: int, rise_m: Float32, sectors: int
+) -> Float32:
+    """Return bounds (sectors, 4, n) of the horizons of n neighbors on a line: low, high, first and
+    last step to walk.
 
-    `cells` (lines, margin + n + ...) is the depth map with inf for background, neighbors side by side.
+    `cells` (lines, margin + n + ...) is the depth map with inf for background, neighbors side by
+    side.
     """
     count = len(rise_m)
     bounds = np.zeros((sectors, 4, count), np.float32)
     bounds[:, 2] = np.inf
     last = np.empty((2, count), np.float32)
-    # After k cells a sector from a to b covers k a to k b across. Every direction in it has at least the term of the
-    # largest depth there and at most that of the smallest; the maximum over k keeps both orders. Depth is linear
-    # between cells, so its extremes lie in the sector's two directions and at the cells in between.
+    # After k cells a sector from a to b covers k a to k b across. Every direction in it has at
+    # least the term of the largest depth there and at most that of the smallest; the maximum over k
+    # keeps both orders. Depth is linear between cells, so its extremes lie in the sector's two
+    # directions and at the cells in between.
     for k in range(1, steps + 1):
-        row, before = cells[start + k * step], 0
+        row = cells[start + k * step]
+        before = 0
         for sector in range(sectors + 1):
             across = k * (2.0 * sector / sectors - 1.0)
             offset = int(np.floor(across))
             if sector == 0:
-                last[:] = np.inf  # before the first sector: what it adds is true of the first one too
+                last[:] = (
+                    np.inf
+                )  # before the first sector: what it adds is true of the first one too
             for cell in range(before + 1, offset if sector else before):
                 for c in range(count):
                     depth = row[margin + cell + c]
                     last[0, c], last[1, c] = min(last[0, c], depth), max(last[1, c], depth)
-            over, share = sector > 0 and offset > before, np.float32(across - offset)
-            _meet(row, margin + offset, share, over, rise_m, last, np.float32(k), bounds[max(sector - 1, 0)])
+            over = sector > 0 and offset > before
+            share = np.float32(across - offset)
+            _meet(
+                row,
+                margin + offset,
+                share,
+                over,
+                rise_m,
+                last,
+                np.float32(k),
+                bounds[max(sector - 1, 0)],
+            )
             before = offset
     return bounds
 
 
 @inner()
-def _side_by_side(field: HeightField, rows: Int64, columns: Int64, margin: int) -> tuple[Float32, Int64]:
-    """Return depths (2, n, n + 2 margin), inf for background, and the patch in each cell (2, n, n), -1 for none.
+def _side_by_side(
+    field: HeightField, rows: Int64, columns: Int64, margin: int
+) -> tuple[Float32, Int64]:
+    """Return depths (2, n, n + 2 margin), inf for background, and the patch in each cell (2, n, n),
+    -1 for none.
 
     Of both axes: first by column with rows side by side, then by row with columns side by side.
     """
     size = len(field.depth_m)
-    cells, patch = np.full((2, size, size + 2 * margin), np.inf, np.float32), np.full((2, size, size), -1)
+    cells = np.full((2, size, size + 2 * margin), np.inf, np.float32)
+    patch = np.full((2, size, size), -1)
     for s in range(len(rows)):
         patch[0, columns[s], rows[s]] = patch[1, rows[s], columns[s]] = s
     for i in range(size):
@@ -248,40 +346,50 @@ def _side_by_side(field: HeightField, rows: Int64, columns: Int64, margin: int) 
 def horizon_table(
     field: HeightField, rows: Int64, columns: Int64, depth_m: Float64, reach: Float64, sectors: int
 ) -> tuple[Float32, Float32, NDArray[np.uint8]]:
-    """Return lower and upper bounds (n, FACES * sectors) of the horizons of patches, for every sector of directions.
+    """Return lower and upper bounds (n, FACES * sectors) of the horizons of patches, for every
+    sector of directions.
 
     With them, first and last step (n, FACES * sectors, 2) of the walk of a leg between its bounds.
-    `reach` (n,) is the longest leg to the wall in cells: horizons that no leg can meet are left out. The patches of
-    a row or column go together, as a step in a direction takes all of them to neighbors again.
+    `reach` (n,) is the longest leg to the wall in cells: horizons that no leg can meet are left
+    out. The patches of a row or column go together, as a step in a direction takes all of them to
+    neighbors again.
     """
-    size, patches = len(field.depth_m), len(rows)
-    low, high = np.zeros((patches, FACES * sectors), np.float32), np.zeros((patches, FACES * sectors), np.float32)
-    walk, margin = np.zeros((patches, FACES * sectors, 2), np.uint8), size + 2
+    size = len(field.depth_m)
+    patches = len(rows)
+    low = np.zeros((patches, FACES * sectors), np.float32)
+    high = np.zeros((patches, FACES * sectors), np.float32)
+    walk = np.zeros((patches, FACES * sectors, 2), np.uint8)
+    margin = size + 2
     cells, patch = _side_by_side(field, rows, columns, margin)
     # Depths are float32 here: bounds give way by more than their rounding.
     slack_m = np.float32(1e-6 * depth_m.max())
     for line in numba.prange(2 * size):
-        axis, start = line // size, line % size
+        axis = line // size
+        start = line % size
         some = np.flatnonzero(patch[axis, start] >= 0)
         if not len(some):
             continue
-        first, which = some[0], patch[axis, start]
-        rise_m, steps = np.zeros(some[-1] + 1 - first, np.float32), 0.0
+        first = some[0]
+        which = patch[axis, start]
+        rise_m = np.zeros(some[-1] + 1 - first, np.float32)
+        steps = 0.0
         for c in some:
             s = which[c]
             above_m = depth_m[s] - bias_m(field)
             rise_m[c - first] = above_m
-            # No surface is nearer to the wall than nearest_m: after k steps a horizon is at most (above - nearest) / k,
-            # and below z / reach it blocks no leg that ends on the wall.
+            # No surface is nearer to the wall than nearest_m: after k steps a horizon is at most
+            # (above - nearest) / k, and below z / reach it blocks no leg that ends on the wall.
             steps = max(steps, (above_m - field.nearest_m) * reach[s] / depth_m[s])
         for back in range(2):
             count = int(min(_steps(field, start, back == 0, axis == 0), steps))
             bounds = _line(cells[axis], margin + first, start, 1 - 2 * back, count, rise_m, sectors)
             for c in some:
-                s, k = which[c], (2 * axis + back) * sectors
+                s = which[c]
+                k = (2 * axis + back) * sectors
                 for sector in range(sectors):
                     below, above, begin, end = bounds[sector, :, c - first]
                     low[s, k + sector] = max(below - slack_m, 0) * (1 - ROUNDING)
                     high[s, k + sector] = (above + slack_m) * (1 + ROUNDING)
-                    walk[s, k + sector, 0], walk[s, k + sector, 1] = min(begin, 255), end
+                    walk[s, k + sector, 0] = min(begin, 255)
+                    walk[s, k + sector, 1] = end
     return low, high, walk

@@ -1,12 +1,13 @@
 """Fixed patterns of the device and of the wall: depth bias of each pixel, and the wall's texture.
 
-Bias is an offset, ripples and drift with temperature, the same for anything in view. Drift is relative to the warm
-device: there the common drift is 0 and the patches are complete; at the start of a warm-up it is the reverse.
+Bias is an offset, ripples and drift with temperature, the same for anything in view. Drift is
+relative to the warm device: there the common drift is 0 and the patches are complete; at the start
+of a warm-up it is the reverse.
 
-Texture (grain, paint, dirt) is a factor of each pixel's light. The wall reflects a beam's direct return and the first
-bounce of all its three-bounce paths at one point: its reflectance there is a factor of the whole echo, and changes no
-winner (S1, S2, S5). Third bounces come from the whole relay wall, whose texture they average: not modeled, nor is
-gloss.
+Texture (grain, paint, dirt) is a factor of each pixel's light. The wall reflects a beam's direct
+return and the first bounce of all its three-bounce paths at one point: its reflectance there is a
+factor of the whole echo, and changes no winner (S1, S2, S5). Third bounces come from the whole
+relay wall, whose texture they average: not modeled, nor is gloss.
 """
 
 from math import inf
@@ -27,25 +28,37 @@ BIASES = {
 """Names of verdicts, with the fields of the model that call for them."""
 WAVES = 5.0
 """Number of ripples across the view."""
-RIPPLES_SEED, PATCHES_SEED = 1, 2
+RIPPLES_SEED = 1
+PATCHES_SEED = 2
 """Every simulated device has the same patterns."""
 NO_BIAS = np.zeros(0, np.float32)
 
 
 def ripples(shape: tuple[int, int], waves: float, generator: np.random.Generator) -> Float64:
-    """Return a wave (height, width) of amplitude 1 in a random direction, `waves` of it across the width."""
+    """Return a wave (height, width) of amplitude 1 in a random direction, `waves` of it across the
+    width.
+    """
     rows, columns = np.indices(shape) / shape[1]
     way, phase = generator.uniform(0.0, 2.0 * np.pi, 2)
     return np.sin(2.0 * np.pi * waves * (columns * np.cos(way) + rows * np.sin(way)) + phase)
 
 
-def smooth_patches(shape: tuple[int, int], generator: np.random.Generator, across: int = 12) -> Float64:
-    """Return a smooth pattern (height, width) of standard deviation 1, with about `across` patches across the width."""
+def smooth_patches(
+    shape: tuple[int, int], generator: np.random.Generator, across: int = 12
+) -> Float64:
+    """Return a smooth pattern (height, width) of standard deviation 1, with about `across` patches
+    across the width.
+    """
     height, width = shape
-    coarse = generator.standard_normal((across * height // width + 3, across + 3)).astype(np.float32)
-    rows, columns = np.linspace(1, coarse.shape[0] - 2, height), np.linspace(1, coarse.shape[1] - 2, width)
+    coarse = generator.standard_normal((across * height // width + 3, across + 3)).astype(
+        np.float32
+    )
+    rows = np.linspace(1, coarse.shape[0] - 2, height)
+    columns = np.linspace(1, coarse.shape[1] - 2, width)
     x, y = np.meshgrid(columns.astype(np.float32), rows.astype(np.float32))
-    pattern = cv2.remap(coarse, x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE).astype(np.float64)
+    pattern = cv2.remap(coarse, x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE).astype(
+        np.float64
+    )
     return pattern / pattern.std()
 
 
@@ -54,9 +67,11 @@ class DepthBias:
 
     def __init__(self, shape: tuple[int, int], model: SensorModel, verdicts: Plan) -> None:
         offset_m, ripple_m, patch_m, self._per_celsius_m = (
-            getattr(model, field) if included(verdicts, name) else 0.0 for name, field in BIASES.items()
+            getattr(model, field) if included(verdicts, name) else 0.0
+            for name, field in BIASES.items()
         )
-        self._warm_up, self._warm_celsius = model.warm_up, model.celsius_at(inf)
+        self._warm_up = model.warm_up
+        self._warm_celsius = model.celsius_at(inf)
         self._fixed_m = self._patches_m = NO_BIAS
         if offset_m or ripple_m or patch_m or self._per_celsius_m:
             wave = ripples(shape, WAVES, np.random.default_rng(RIPPLES_SEED))
@@ -66,7 +81,9 @@ class DepthBias:
             self._patches_m = (patch_m * (pattern - pattern.mean())).astype(np.float32).ravel()
 
     def at_m(self, celsius: float | None) -> Float32:
-        """Return the bias (n,) of each pixel's depth, at a temperature or in the warm device; empty for no bias."""
+        """Return the bias (n,) of each pixel's depth, at a temperature or in the warm device; empty
+        for no bias.
+        """
         celsius = self._warm_celsius if celsius is None else celsius
         bias_m = self._fixed_m
         if self._patches_m.size:
@@ -78,20 +95,25 @@ class DepthBias:
     def _warmth(self, celsius: float) -> float:
         """Return 0 at the start of the warm-up, 1 at its end."""
         warm = self._warm_up
-        return (celsius - warm.from_celsius) / (warm.to_celsius - warm.from_celsius) if warm else 1.0
+        return (
+            (celsius - warm.from_celsius) / (warm.to_celsius - warm.from_celsius) if warm else 1.0
+        )
 
 
 TEXTURE_SEED = 3
 """Every simulated wall has the same pattern."""
-STAINS, GRAINS = 5, 90
+STAINS = 5
+GRAINS = 90
 """Patches across the view: of paint and dirt, and of grain about as small as a cell of the maps."""
 EVEN = np.zeros(0, np.float32)
 
 
 def texture(shape: tuple[int, int], strength: float) -> Float32:
-    """Return each pixel's light (n,) relative to that of an even wall, 1 on average; empty for an even wall.
+    """Return each pixel's light (n,) relative to that of an even wall, 1 on average; empty for an
+    even wall.
 
-    `strength` is the standard deviation of its logarithm, whose variance is half stains, half grain.
+    `strength` is the standard deviation of its logarithm, whose variance is half stains, half
+    grain.
     """
     if not strength:
         return EVEN

@@ -1,9 +1,11 @@
-"""Maps of one exposure without its images: each cell draws its pixels' noise and reduces them while they are at hand.
+"""Maps of one exposure without its images: each cell draws its pixels' noise and reduces them while
+they are at hand.
 
-The law is that of `sensor.expose` and the reduction of frames: without noise the maps are the same bits, with noise
-every pixel has its own two deviates. They come from a counter, so that a cell's noise depends on the seed and the cell
-alone, and are quantiles of the normal distribution, looked up: drawing them took a third of a dataset's time.
-Expected maps spread the deviates of a cell's pixels evenly over the distribution instead of drawing them.
+The law is that of `sensor.expose` and the reduction of frames: without noise the maps are the same
+bits, with noise every pixel has its own two deviates. They come from a counter, so that a cell's
+noise depends on the seed and the cell alone, and are quantiles of the normal distribution, looked
+up: drawing them took a third of a dataset's time. Expected maps spread the deviates of a cell's
+pixels evenly over the distribution instead of drawing them.
 """
 
 from functools import lru_cache
@@ -20,23 +22,33 @@ from nlos_cam.render.sensor.model import DEPTH_UNIT_M, FARTHEST, MAX_CONFIDENCE
 
 QUANTILES = 1 << 16
 """Equally likely values of a deviate, up to 4.3 standard deviations."""
-GOLDEN, FIRST, SECOND = np.uint64(0x9E3779B97F4A7C15), np.uint64(0xBF58476D1CE4E5B9), np.uint64(0x94D049BB133111EB)
-"""Constants of SplitMix64 (Steele, Lea and Flood 2014): its outputs are mixed values of a counter."""
+GOLDEN = np.uint64(0x9E3779B97F4A7C15)
+FIRST = np.uint64(0xBF58476D1CE4E5B9)
+SECOND = np.uint64(0x94D049BB133111EB)
+"""Constants of SplitMix64 (Steele, Lea and Flood 2014): its outputs are mixed values of a
+counter.
+"""
 GOLDEN_SHARE = 0.6180339887498949
 """Multiples of the golden ratio's fraction are spread evenly, whatever their number."""
 
 
 @lru_cache(maxsize=1)
 def normal_quantiles() -> Float32:
-    """Return the middles of QUANTILES equally likely parts of the normal distribution, scaled to variance 1."""
+    """Return the middles of QUANTILES equally likely parts of the normal distribution, scaled to
+    variance 1.
+    """
     lower = np.array([NormalDist().inv_cdf((k + 0.5) / QUANTILES) for k in range(QUANTILES // 2)])
     every = np.concatenate([lower, -lower[::-1]])
     return (every / every.std()).astype(np.float32)
 
 
 @numba.njit(cache=True, error_model="numpy")
-def draw_deviates(seed: np.uint64, first: int, count: int, quantiles: Float32, light: Float32, ranges: Float32) -> None:
-    """Fill in two normal deviates for each of some pixels, numbers first to first + count of the seed's stream."""
+def draw_deviates(
+    seed: np.uint64, first: int, count: int, quantiles: Float32, light: Float32, ranges: Float32
+) -> None:
+    """Fill in two normal deviates for each of some pixels, numbers first to first + count of the
+    seed's stream.
+    """
     for i in range(count):
         word = seed + np.uint64(first + i) * GOLDEN
         word = (word ^ (word >> np.uint64(30))) * FIRST
@@ -48,14 +60,18 @@ def draw_deviates(seed: np.uint64, first: int, count: int, quantiles: Float32, l
 
 @numba.njit(cache=True, error_model="numpy")
 def spread_deviates(count: int, quantiles: Float32, light: Float32, ranges: Float32) -> None:
-    """Fill in two normal deviates for each of some pixels: evenly spread over the distribution, in two orders."""
+    """Fill in two normal deviates for each of some pixels: evenly spread over the distribution, in
+    two orders.
+    """
     for i in range(count):
         light[i] = quantiles[np.int64((i + 0.5) / count * QUANTILES)]
         ranges[i] = quantiles[np.int64((i + 0.5) * GOLDEN_SHARE % 1.0 * QUANTILES)]
 
 
 class PixelOrder(NamedTuple):
-    """Pixels in the order of their map cells, and in each of the echoes' cells: runs of pixels see the same echo."""
+    """Pixels in the order of their map cells, and in each of the echoes' cells: runs of pixels see
+    the same echo.
+    """
 
     pixel: Int64
     """(p,)."""
@@ -72,32 +88,54 @@ class PixelOrder(NamedTuple):
     def of(cls, cell: Int32, echo: Int32) -> "PixelOrder":
         """Return the order of pixels (p,) with their map cells and the cells of their echoes."""
         pixel = np.lexsort((echo, cell))
-        cells, echoes = cell[pixel], echo[pixel]
+        cells = cell[pixel]
+        echoes = echo[pixel]
         begins = np.flatnonzero(np.diff(cells, prepend=-1) | np.diff(echoes, prepend=-1))
         numbers = np.arange(cell.max() + 2)
         run_start = np.append(begins, pixel.size)
         first_run = np.searchsorted(cells[begins], numbers)
-        return cls(pixel, np.searchsorted(cells, numbers), first_run, run_start, echoes[begins].astype(np.int64))
+        return cls(
+            pixel,
+            np.searchsorted(cells, numbers),
+            first_run,
+            run_start,
+            echoes[begins].astype(np.int64),
+        )
 
 
 @numba.njit(cache=True, error_model="numpy", nogil=True)
 def expose_cells(
-    optics: Any, echoes: Any, order: PixelOrder, quantiles: Float32, seed: np.uint64, noisy: tuple[bool, bool],
-    bias_m: Float32, chain: Any, expected: bool,
-) -> tuple[Float32, Float32]:  # fmt: skip
-    """Return depth and intensity (n,) of n map cells, NaN and 0 without valid samples; of an even wall alone.
+    optics: Any,
+    echoes: Any,
+    order: PixelOrder,
+    quantiles: Float32,
+    seed: np.uint64,
+    noisy: tuple[bool, bool],
+    bias_m: Float32,
+    chain: Any,
+    expected: bool,
+) -> tuple[Float32, Float32]:
+    """Return depth and intensity (n,) of n map cells, NaN and 0 without valid samples; of an even
+    wall alone.
 
-    Arguments are those of `sensor.expose`, with the pixels in that order. `noisy` says whether light and range have
-    noise; `expected` spreads it in place of drawing it.
+    Arguments are those of `sensor.expose`, with the pixels in that order. `noisy` says whether
+    light and range have noise; `expected` spreads it in place of drawing it.
     """
-    cells, most = order.start.size - 1, np.diff(order.start).max()
-    depth, intensity = np.full(cells, np.nan, np.float32), np.zeros(cells, np.float32)
-    light, ranges = np.empty(most, np.float32), np.empty(most, np.float32)
-    bits, counts, middle = np.empty(most, np.int32), np.empty(most, np.uint8), np.empty(2, np.int32)
-    samples_m, middle_m = bits.view(np.float32), middle.view(np.float32)
+    cells = order.start.size - 1
+    most = np.diff(order.start).max()
+    depth = np.full(cells, np.nan, np.float32)
+    intensity = np.zeros(cells, np.float32)
+    light = np.empty(most, np.float32)
+    ranges = np.empty(most, np.float32)
+    bits = np.empty(most, np.int32)
+    counts = np.empty(most, np.uint8)
+    middle = np.empty(2, np.int32)
+    samples_m = bits.view(np.float32)
+    middle_m = middle.view(np.float32)
     spread = 0  # pixels over which the deviates are spread already
     for k in range(cells):
-        start, pixels = order.start[k], order.start[k + 1] - order.start[k]
+        pixels = order.start[k + 1] - order.start[k]
+        start = order.start[k]
         if expected:
             if pixels != spread:
                 spread_deviates(pixels, quantiles, light, ranges)
@@ -105,7 +143,9 @@ def expose_cells(
         elif noisy[0] or noisy[1]:
             draw_deviates(seed, start, pixels, quantiles, light, ranges)
         for run in range(order.first_run[k], order.first_run[k + 1]):
-            begin, end, c = order.run_start[run], order.run_start[run + 1], order.run_echo[run]
+            begin = order.run_start[run]
+            end = order.run_start[run + 1]
+            c = order.run_echo[run]
             some = slice(begin - start, end - start)
             echo = echoes.peak[c], echoes.runner_up[c], echoes.surety[c], echoes.path_m[c]
             _light(begin, optics, echo, light[some], noisy[0], chain, counts[some])
@@ -116,22 +156,32 @@ def expose_cells(
             bits[i] = bits[i] if is_return else NO_SAMPLE
             valid += np.int32(is_return)
         if valid:
-            found = reduce_cell(bits[:pixels], samples_m[:pixels], counts[:pixels], valid, middle, middle_m)
+            found = reduce_cell(
+                bits[:pixels], samples_m[:pixels], counts[:pixels], valid, middle, middle_m
+            )
             depth[k], intensity[k] = found
     return depth, intensity
 
 
-# Two loops over few arrays each: the compiler turns no loop into vector operations that has more pairs of arrays than
-# it is willing to check for overlap.
+# Two loops over few arrays each: the compiler turns no loop into vector operations that has more
+# pairs of arrays than it is willing to check for overlap.
 
 
 @inner(error_model="numpy")
 def _light(
-    start: int, optics: Any, echo: tuple[Any, Any, Any, Any], deviates: Float32, noisy: bool, chain: Any,
+    start: int,
+    optics: Any,
+    echo: tuple[Any, Any, Any, Any],
+    deviates: Float32,
+    noisy: bool,
+    chain: Any,
     counts: NDArray[np.uint8],
-) -> None:  # fmt: skip
-    """Fill in the counts of some pixels that see one echo: the light of `sensor.expose`, without branches."""
-    peak, direct = echo[0], optics.direct[start : start + counts.size]
+) -> None:
+    """Fill in the counts of some pixels that see one echo: the light of `sensor.expose`, without
+    branches.
+    """
+    peak = echo[0]
+    direct = optics.direct[start : start + counts.size]
     for k in range(counts.size):
         intensity = max(peak, direct[k])
         light = chain.gain * intensity + chain.ambient_counts
@@ -143,20 +193,39 @@ def _light(
 
 @inner(error_model="numpy")
 def _range(
-    start: int, optics: Any, echo: tuple[Any, Any, Any, Any], deviates: Float32, noisy: bool, bias_m: Float32,
-    chain: Any, depth_m: Float32,
-) -> None:  # fmt: skip
-    """Fill in the depth of some pixels that see one echo, 0 for none: the range of `sensor.expose`, likewise."""
-    biased, dying, end = bias_m.size > 0, optics.dead.size > 0, start + depth_m.size
-    direct, sureties = optics.direct[start:end], optics.surety[start:end]
-    lengths_m, cos_axis = optics.length_m[start:end], optics.cos_axis[start:end]
-    off_m, dead = bias_m[start:end], optics.dead[start:end]  # empty where there is none
-    peak, runner_up, echo_surety, half_m = echo[0], echo[1], echo[2], echo[3] / 2
+    start: int,
+    optics: Any,
+    echo: tuple[Any, Any, Any, Any],
+    deviates: Float32,
+    noisy: bool,
+    bias_m: Float32,
+    chain: Any,
+    depth_m: Float32,
+) -> None:
+    """Fill in the depth of some pixels that see one echo, 0 for none: the range of `sensor.expose`,
+    likewise.
+    """
+    biased = bias_m.size > 0
+    dying = optics.dead.size > 0
+    end = start + depth_m.size
+    direct = optics.direct[start:end]
+    sureties = optics.surety[start:end]
+    lengths_m = optics.length_m[start:end]
+    cos_axis = optics.cos_axis[start:end]
+    off_m = bias_m[start:end]
+    dead = optics.dead[start:end]  # empty where there is none
+    peak = echo[0]
+    runner_up = echo[1]
+    echo_surety = echo[2]
+    half_m = echo[3] / 2
     for k in range(depth_m.size):
-        own, own_surety, own_m = direct[k], sureties[k], lengths_m[k]  # loads outside of choices
+        own = direct[k]
+        own_surety = sureties[k]
+        own_m = lengths_m[k]  # loads outside of choices
         wins = peak > own
         intensity = peak if wins else own
-        surety, length_m = echo_surety if wins else own_surety, half_m if wins else own_m
+        surety = echo_surety if wins else own_surety
+        length_m = half_m if wins else own_m
         second = max(min(own, peak), runner_up)
         sure = MAX_CONFIDENCE * (surety * (0.5 + 0.5 * (1 - second / intensity))) + 0.5 >= 1
         depth = np.float64(length_m * cos_axis[k])

@@ -37,7 +37,8 @@ class WarmUp(Record):
 
 
 class SensorModel(Record):
-    """Gain, pulse, ambient light, noise and bias. With all but the gain at 0, saturation and quantization remain.
+    """Gain, pulse, ambient light, noise and bias. With all but the gain at 0, saturation and
+    quantization remain.
 
     Light is counted in IR counts before saturation, which are linear in it.
     """
@@ -45,25 +46,31 @@ class SensorModel(Record):
     bare_wall_counts: float = Field(default=48.0, gt=0, le=1e6)
     """IR counts of the brightest bare-wall return: fixes the gain."""
     pulse_ns: float = Field(default=0.0, ge=0, le=100, allow_inf_nan=False)
-    """Full width of the laser's pulse at half maximum. 1 ns is 0.3 m of path; 0 is shorter than any bin."""
+    """Full width of the laser's pulse at half maximum. 1 ns is 0.3 m of path; 0 is shorter than any
+    bin.
+    """
     wall_texture: float = Field(default=0.0, ge=0, le=1)
-    """Standard deviation, over the view, of the logarithm of the wall's reflectance, whose mean is 1."""
+    """Standard deviation, over the view, of the logarithm of the wall's reflectance, whose mean is
+    1.
+    """
     ambient_counts: float = Field(default=0.0, ge=0, lt=SATURATED, allow_inf_nan=False)
-    """Steady light on the detector beside the echo. The device subtracts its mean: the data sheet calls the IR the
-    intensity of the reflected laser, not the scene's. Its shot noise remains, it takes up counts of the 8 bits, which
-    saturate that much earlier, and it lowers the confidence.
+    """Steady light on the detector beside the echo. The device subtracts its mean: the data sheet
+    calls the IR the intensity of the reflected laser, not the scene's. Its shot noise remains, it
+    takes up counts of the 8 bits, which saturate that much earlier, and it lowers the confidence.
     """
     range_noise_m: float = Field(default=0.0005, ge=0, le=10)
     range_noise_per_m: float = Field(default=0.002, ge=0, le=1)
     """Standard deviation of range: range_noise_m plus this for each meter of depth."""
     read_noise_counts: float = Field(default=0.7, ge=0, le=SATURATED)
     shot_noise: float = Field(default=0.3, ge=0, le=SATURATED)
-    """Standard deviation over the square root of the counts: 1 / shot_noise^2 photoelectrons per count."""
+    """Standard deviation over the square root of the counts: 1 / shot_noise^2 photoelectrons per
+    count.
+    """
     dead_share: float = Field(default=0.002, ge=0, lt=1)
     """Share of pixels that never give depth; the same pixels in every frame."""
     range_offset_m: float = Field(default=0.0, ge=-1, le=1)
-    """Amount missing from every depth, as in a wall's record: true depth = the lidar's depth + range_offset_m. The data
-    sheet's 4.5 mm, the sign of which is disputed.
+    """Amount missing from every depth, as in a wall's record: true depth = the lidar's depth +
+    range_offset_m. The data sheet's 4.5 mm, the sign of which is disputed.
     """
     ripple_m: float = Field(default=0.0, ge=0, le=1)
     """Amplitude of a fixed wave of the depth across the view."""
@@ -81,4 +88,6 @@ class SensorModel(Record):
         """Return the device's temperature a number of seconds after its start."""
         if (warm := self.warm_up) is None:
             return STEADY_CELSIUS
-        return warm.to_celsius - (warm.to_celsius - warm.from_celsius) * exp(-seconds / warm.time_constant_s)
+        return warm.to_celsius - (warm.to_celsius - warm.from_celsius) * exp(
+            -seconds / warm.time_constant_s
+        )

@@ -1,14 +1,15 @@
 """Sensor: from echoes to the three images that a device delivers, by an ordered chain of stages.
 
-    echo (S5) -> wall texture -> gain -> ambient light -> shot and read noise -> saturation -> 8 bits            IR
-    signal above the noise, winner above the second -> 4 bits                                    confidence
-    path / 2 x cos(beam, optical axis) -> bias -> range noise -> 0.25 mm -> dead pixels          depth
+    echo (S5) -> wall texture -> gain -> ambient light -> shot and read noise -> saturation -> 8
+    bits            IR signal above the noise, winner above the second -> 4 bits
+    confidence path / 2 x cos(beam, optical axis) -> bias -> range noise -> 0.25 mm -> dead pixels
+    depth
 
-Shot and read noise are independent, so one deviate with the root of their summed variances carries both. A pixel
-without an echo is black: the device measures the amplitude of the echo that it finds.
+Shot and read noise are independent, so one deviate with the root of their summed variances carries
+both. A pixel without an echo is black: the device measures the amplitude of the echo that it finds.
 
-Not modeled: mixed edges, and IR and confidence that change with temperature. The raster's scan time and a pulse's width
-belong to the renderer.
+Not modeled: mixed edges, and IR and confidence that change with temperature. The raster's scan time
+and a pulse's width belong to the renderer.
 """
 
 from dataclasses import dataclass
@@ -22,7 +23,15 @@ from nlos_calibration.arrays import Float32, Float64, UInt8
 from numpy.typing import NDArray
 
 from nlos_cam.errors import SceneError
-from nlos_cam.frames import MAP_COLUMNS, MAP_ROWS, SATURATED, Frame, LidarMaps, inner, maps_from_frame
+from nlos_cam.frames import (
+    MAP_COLUMNS,
+    MAP_ROWS,
+    SATURATED,
+    Frame,
+    LidarMaps,
+    inner,
+    maps_from_frame,
+)
 from nlos_cam.render.echoes import peak_share
 from nlos_cam.render.effects import Effect, included
 from nlos_cam.render.geometry import Beams, cast
@@ -31,7 +40,13 @@ from nlos_cam.render.scene import Radiometry
 from nlos_cam.render.sensor.bias import DepthBias, texture
 from nlos_cam.render.sensor.cells import PixelOrder, expose_cells, normal_quantiles
 from nlos_cam.render.sensor.effects import sensor_effects
-from nlos_cam.render.sensor.model import DEPTH_UNIT_M, FARTHEST, MAX_CONFIDENCE, SURE_COUNTS, SensorModel
+from nlos_cam.render.sensor.model import (
+    DEPTH_UNIT_M,
+    FARTHEST,
+    MAX_CONFIDENCE,
+    SURE_COUNTS,
+    SensorModel,
+)
 
 
 class Chain(NamedTuple):
@@ -48,7 +63,9 @@ class Chain(NamedTuple):
 
 
 class PixelOptics(NamedTuple):
-    """Properties of each pixel (n,) that do not depend on the hidden object: its direct return and its direction."""
+    """Properties of each pixel (n,) that do not depend on the hidden object: its direct return and
+    its direction.
+    """
 
     direct: Float32
     """In units of I0."""
@@ -73,9 +90,15 @@ class CellEchoes(NamedTuple):
 
 
 @inner()
-def compete(optics: PixelOptics, pixel: int, echoes: CellEchoes, cell: int) -> tuple[float, float, float, float]:
-    """Return intensity, surety and length of the stronger of direct return and cell's echo (S5), and the second."""
-    own, peak, runner_up = optics.direct[pixel], echoes.peak[cell], echoes.runner_up[cell]
+def compete(
+    optics: PixelOptics, pixel: int, echoes: CellEchoes, cell: int
+) -> tuple[float, float, float, float]:
+    """Return intensity, surety and length of the stronger of direct return and cell's echo (S5),
+    and the second.
+    """
+    own = optics.direct[pixel]
+    peak = echoes.peak[cell]
+    runner_up = echoes.runner_up[cell]
     if peak > own:
         return peak, echoes.surety[cell], echoes.path_m[cell] / 2, max(own, runner_up)
     return own, optics.surety[pixel], optics.length_m[pixel], max(peak, runner_up)
@@ -83,13 +106,17 @@ def compete(optics: PixelOptics, pixel: int, echoes: CellEchoes, cell: int) -> t
 
 @inner()
 def noise_counts(light_counts: float, chain: Chain) -> float:
-    """Return the standard deviation of shot and read noise for an amount of light, ambient light included."""
+    """Return the standard deviation of shot and read noise for an amount of light, ambient light
+    included.
+    """
     return np.sqrt(chain.read_variance + chain.shot_variance * light_counts)
 
 
 @inner()
 def saturate(light_counts: float, chain: Chain) -> float:
-    """Return the light cut at full scale together with the ambient light, of which the mean is then subtracted."""
+    """Return the light cut at full scale together with the ambient light, of which the mean is then
+    subtracted.
+    """
     return min(light_counts, SATURATED) - chain.ambient_counts
 
 
@@ -101,7 +128,9 @@ def quantise(value: float, most: int) -> int:
 
 @inner()
 def sure(counts: float, chain: Chain) -> float:
-    """Return from 0 to 1 how far a signal stands above the noise, dimmed by the noise that ambient light adds."""
+    """Return from 0 to 1 how far a signal stands above the noise, dimmed by the noise that ambient
+    light adds.
+    """
     if chain.ambient_counts > 0:
         noise = noise_counts(counts + chain.ambient_counts, chain)
         if noise > 0:
@@ -135,7 +164,9 @@ def expose(
     ir: UInt8,
     confidence: UInt8,
 ) -> None:
-    """Fill in depth, IR and confidence (n,) of n pixels, each with its map cell; empty deviates are no noise."""
+    """Fill in depth, IR and confidence (n,) of n pixels, each with its map cell; empty deviates are
+    no noise.
+    """
     for i in range(z16.size):
         intensity, surety, length_m, second = compete(optics, i, echoes, cell[i])
         if intensity <= 0:
@@ -149,7 +180,9 @@ def expose(
             light += light_deviates[i] * noise_counts(light, chain)
         ir[i] = quantise(saturate(light, chain), SATURATED)
         # half of the signal's own surety is the winner's lead
-        confidence[i] = int(MAX_CONFIDENCE * (surety * (0.5 + 0.5 * (1 - second / intensity))) + 0.5)
+        confidence[i] = int(
+            MAX_CONFIDENCE * (surety * (0.5 + 0.5 * (1 - second / intensity))) + 0.5
+        )
         if confidence[i] == 0 or (optics.dead.size and optics.dead[i]):
             continue
         depth_m = length_m * optics.cos_axis[i]
@@ -176,20 +209,34 @@ class SensedImages:
 
     def frame(self, intrinsics: Intrinsics) -> Frame:
         """Return the images in SI units, as a camera yields them."""
-        depth_m = np.where(self.depth_z16 == 0, np.float32(np.nan), self.depth_z16 * np.float32(DEPTH_UNIT_M))
-        return Frame(depth_m, self.ir, self.confidence, timestamp_s=0.0, frame_number=0, intrinsics=intrinsics)
+        depth_m = np.where(
+            self.depth_z16 == 0, np.float32(np.nan), self.depth_z16 * np.float32(DEPTH_UNIT_M)
+        )
+        return Frame(
+            depth_m,
+            self.ir,
+            self.confidence,
+            timestamp_s=0.0,
+            frame_number=0,
+            intrinsics=intrinsics,
+        )
 
 
 class Sensor:
-    """Sensor on a rig, with all that depends on neither object nor frame computed once; safe to share among threads."""
+    """Sensor on a rig, with all that depends on neither object nor frame computed once; safe to
+    share among threads.
+    """
 
     def __init__(self, rig: Rig, model: SensorModel, radiometry: Radiometry = "paper") -> None:
         self.rig = rig
-        verdicts, lambertian = sensor_effects(model), radiometry == "lambertian"
+        verdicts = sensor_effects(model)
+        lambertian = radiometry == "lambertian"
         self._chain = _chain(rig, model, verdicts, lambertian=lambertian)
         direct = cast(rig, rig.pinhole, lambertian=lambertian)
         shape = (rig.intrinsics.height, rig.intrinsics.width)
-        reflectance = texture(shape, model.wall_texture if included(verdicts, "wall texture") else 0.0)
+        reflectance = texture(
+            shape, model.wall_texture if included(verdicts, "wall texture") else 0.0
+        )
         dead_share = model.dead_share if included(verdicts, "dead pixels") else 0.0
         self._optics = _optics(direct, self._chain, dead_share, reflectance)
         self._echoes_only = self._optics._replace(direct=np.zeros_like(self._optics.direct))
@@ -203,54 +250,83 @@ class Sensor:
     ) -> SensedImages:
         """Return the images of one instant, with the generator's noise.
 
-        Maps (64 k, 80 k) hold k x k beams for each cell. `celsius` is the device's temperature (default: warm).
+        Maps (64 k, 80 k) hold k x k beams for each cell. `celsius` is the device's temperature
+        (default: warm).
         """
         shape = (self.rig.intrinsics.height, self.rig.intrinsics.width)
         cell = cell_of_pixels(shape, multi.peak.shape)
-        light, ranges = (self._deviates(generator, wanted=wanted) for wanted in (self._lights, self._ranges))
+        light, ranges = (
+            self._deviates(generator, wanted=wanted) for wanted in (self._lights, self._ranges)
+        )
         optics = self._echoes_only if multi.direct_included else self._optics
-        echoes, bias_m = _echoes(multi, self._chain), self._bias.at_m(celsius)
-        z16, ir, confidence = np.zeros(shape, np.uint16), np.zeros(shape, np.uint8), np.zeros(shape, np.uint8)
+        echoes = _echoes(multi, self._chain)
+        bias_m = self._bias.at_m(celsius)
+        z16 = np.zeros(shape, np.uint16)
+        ir = np.zeros(shape, np.uint8)
+        confidence = np.zeros(shape, np.uint8)
         images = z16.ravel(), ir.ravel(), confidence.ravel()  # views
         expose(optics, echoes, cell, light, ranges, bias_m, self._chain, *images)
         return SensedImages(z16, ir, confidence)
 
     def maps(self, multi: MultiBounce, generator: np.random.Generator | None) -> LidarMaps:
-        """Return the maps of one exposure of the warm device: `expose` and the reduction of frames, in less time.
+        """Return the maps of one exposure of the warm device: `expose` and the reduction of frames,
+        in less time.
 
-        The noise has the law of `expose`, not its deviates. A textured wall takes the long way. Without a generator the
-        maps are the expected ones, without a draw of noise. Raises SceneError for those of a textured wall.
+        The noise has the law of `expose`, not its deviates. A textured wall takes the long way.
+        Without a generator the maps are the expected ones, without a draw of noise. Raises
+        SceneError for those of a textured wall.
         """
         if self._optics.texture.size:
             if generator is None:
-                raise SceneError("expected maps are not available for a wall_texture: set it to 0, or draw the noise")
+                raise SceneError(
+                    "expected maps are not available for a wall_texture: set it to 0, or draw the"
+                    " noise"
+                )
             return maps_from_frame(self.expose(multi, generator).frame(self.rig.pinhole))
         order, optics = self._in_order(multi.peak.shape)
-        optics = optics._replace(direct=np.zeros_like(optics.direct)) if multi.direct_included else optics
+        optics = (
+            optics._replace(direct=np.zeros_like(optics.direct))
+            if multi.direct_included
+            else optics
+        )
         seed = generator.integers(1 << 64, dtype=np.uint64) if generator else np.uint64(0)
         bias_m = self._bias.at_m(None)
         noise = normal_quantiles(), seed, (self._lights, self._ranges)
         bias_m = bias_m[order.pixel] if bias_m.size else bias_m
         expected = generator is None
-        found = expose_cells(optics, _echoes(multi, self._chain), order, *noise, bias_m, self._chain, expected)
+        found = expose_cells(
+            optics, _echoes(multi, self._chain), order, *noise, bias_m, self._chain, expected
+        )
         depth_m, intensity = (column.reshape(MAP_ROWS, MAP_COLUMNS) for column in found)
         return LidarMaps(depth_m, intensity, ~np.isnan(depth_m))
 
     def _in_order(self, echoes: tuple[int, ...]) -> tuple[PixelOrder, PixelOptics]:
-        """Return the order of the pixels for echo maps of that shape, with the optics in it; the last is kept."""
+        """Return the order of the pixels for echo maps of that shape, with the optics in it; the
+        last is kept.
+        """
         if self._ordered is None or self._ordered[0] != echoes:
             image = self.rig.intrinsics.height, self.rig.intrinsics.width
             maps = (MAP_ROWS, MAP_COLUMNS), (echoes[0], echoes[1])
             order = PixelOrder.of(*(cell_of_pixels(image, shape) for shape in maps))
-            self._ordered = echoes, order, PixelOptics._make(c[order.pixel] if c.size else c for c in self._optics)
+            self._ordered = (
+                echoes,
+                order,
+                PixelOptics._make(c[order.pixel] if c.size else c for c in self._optics),
+            )
         return self._ordered[1:]
 
     def _deviates(self, generator: np.random.Generator, *, wanted: bool) -> Float32:
         """Return one normal deviate per pixel, or none: noise that is left out is not drawn."""
-        return generator.standard_normal(self._optics.direct.size, np.float32) if wanted else NO_DEVIATES
+        return (
+            generator.standard_normal(self._optics.direct.size, np.float32)
+            if wanted
+            else NO_DEVIATES
+        )
 
 
-def _chain(rig: Rig, model: SensorModel, verdicts: tuple[Effect, ...], *, lambertian: bool) -> Chain:
+def _chain(
+    rig: Rig, model: SensorModel, verdicts: tuple[Effect, ...], *, lambertian: bool
+) -> Chain:
     """Return the stages' constants, with 0 for each stage that the verdicts leave out."""
 
     def called_for(name: str, value: float) -> float:
@@ -258,7 +334,9 @@ def _chain(rig: Rig, model: SensorModel, verdicts: tuple[Effect, ...], *, lamber
 
     bare = rig.model_copy(update={"occluder": None})
     brightest = float(cast(bare, bare.pinhole, lambertian=lambertian).direct.max())
-    brightest *= peak_share(model.pulse_ns, rig.device.bin_m)  # the waveform's peak, as a renderer with a pulse has it
+    brightest *= peak_share(
+        model.pulse_ns, rig.device.bin_m
+    )  # the waveform's peak, as a renderer with a pulse has it
     return Chain(
         gain=model.bare_wall_counts / brightest if brightest > 0 else 0.0,
         ambient_counts=called_for("ambient light", model.ambient_counts),
@@ -271,25 +349,36 @@ def _chain(rig: Rig, model: SensorModel, verdicts: tuple[Effect, ...], *, lamber
 
 def _optics(beams: Beams, chain: Chain, dead_share: float, reflectance: Float32) -> PixelOptics:
     direct = beams.direct.astype(np.float32)
-    surety, length_m = signal_surety(direct, chain), beams.length_m.astype(np.float32)
+    surety = signal_surety(direct, chain)
+    length_m = beams.length_m.astype(np.float32)
     dead = np.random.default_rng(0).random(direct.size if dead_share else 0) < dead_share
-    return PixelOptics(direct, surety, length_m, beams.cos_axis.astype(np.float32), dead, reflectance)
+    return PixelOptics(
+        direct, surety, length_m, beams.cos_axis.astype(np.float32), dead, reflectance
+    )
 
 
 def _echoes(multi: MultiBounce, chain: Chain) -> CellEchoes:
     """Return the echoes flattened, without intensities that are not finite."""
     peak, runner_up = (
-        np.where((map_ > 0) & (map_ < np.inf), map_, np.float32(0)).ravel() for map_ in (multi.peak, multi.runner_up)
+        np.where((map_ > 0) & (map_ < np.inf), map_, np.float32(0)).ravel()
+        for map_ in (multi.peak, multi.runner_up)
     )
-    return CellEchoes(peak, signal_surety(peak, chain), np.minimum(runner_up, peak), multi.path_m.ravel())
+    return CellEchoes(
+        peak, signal_surety(peak, chain), np.minimum(runner_up, peak), multi.path_m.ravel()
+    )
 
 
 @lru_cache(maxsize=4)
 def cell_of_pixels(image: tuple[int, int], maps: tuple[int, int]) -> NDArray[np.int32]:
-    """Return the flat index of each pixel's map cell, for (64 k, 80 k) cells. Raises SceneError for other shapes."""
-    (height, width), (rows, columns) = image, maps
+    """Return the flat index of each pixel's map cell, for (64 k, 80 k) cells. Raises SceneError for
+    other shapes.
+    """
+    height, width = image
+    rows, columns = maps
     if rows < MAP_ROWS or rows % MAP_ROWS or columns * MAP_ROWS != rows * MAP_COLUMNS:
-        raise SceneError(f"echo maps have shape {maps}: it must be (64 k, 80 k) for k x k beams in each map cell")
+        raise SceneError(
+            f"echo maps have shape {maps}: it must be (64 k, 80 k) for k x k beams in each map cell"
+        )
     row = (np.arange(height) + 0.5) * rows // height
     column = (np.arange(width) + 0.5) * columns // width
     return (row[:, None] * columns + column).astype(np.int32).ravel()
