@@ -20,5 +20,26 @@ __all__ = [
     "write_document",
 ]
 
-from .document import Banner, Bullets, Commands, Document, Facts, Section, State, Table, write_document
-from .html import Picture, bullets, commands, figure, figure_of, page, pairs, png, saved_picture, table
+from .document import (
+    Banner,
+    Bullets,
+    Commands,
+    Document,
+    Facts,
+    Section,
+    State,
+    Table,
+    write_document,
+)
+from .html import (
+    Picture,
+    bullets,
+    commands,
+    figure,
+    figure_of,
+    page,
+    pairs,
+    png,
+    saved_picture,
+    table,
+)

@@ -116,7 +116,11 @@ def _block_html(block: Block) -> str:
 
 def _part_markdown(part: Section | Picture) -> list[str]:
     if isinstance(part, Picture):
-        return [f"## {part.title}", f"![{part.title}]({part.file})" if part.file else "", part.caption]
+        return [
+            f"## {part.title}",
+            f"![{part.title}]({part.file})" if part.file else "",
+            part.caption,
+        ]
     return [f"## {part.title}" if part.title else "", *map(_block_markdown, part.blocks)]
 
 

@@ -57,7 +57,9 @@ PAGE = Template("""<!DOCTYPE html>
 
 @dataclass(frozen=True)
 class Picture:
-    """Picture of a report; `png` is None where there is nothing to draw, and the caption says why."""
+    """Picture of a report; `png` is None where there is nothing to draw, and the caption says
+    why.
+    """
 
     title: str
     caption: str
@@ -68,7 +70,9 @@ class Picture:
     @property
     def is_wide(self) -> bool:
         """True if a narrow screen should scroll the picture instead of shrinking it."""
-        return self.png is not None and int.from_bytes(self.png[16:20], "big") > WIDE_PIXELS  # its header's width
+        return (
+            self.png is not None and int.from_bytes(self.png[16:20], "big") > WIDE_PIXELS
+        )  # its header's width
 
 
 def saved_picture(title: str, caption: str, path: Path) -> Picture:
@@ -92,11 +96,14 @@ def png(figure: "Figure") -> bytes:
 
 def page(title: str, subtitle: str, parts: Iterable[str]) -> str:
     """Return a self-contained document; title and subtitle are text, the parts HTML."""
-    return PAGE.substitute(title=escape(title), under=escape(subtitle), style=STYLE, body="\n".join(parts))
+    return PAGE.substitute(
+        title=escape(title), under=escape(subtitle), style=STYLE, body="\n".join(parts)
+    )
 
 
 def figure(picture: Picture) -> str:
-    title, caption = escape(picture.title), escape(picture.caption)
+    title = escape(picture.title)
+    caption = escape(picture.caption)
     if picture.png is None:
         return f"<section><h2>{title}</h2><p>{caption}</p></section>"
     data = base64.b64encode(picture.png).decode("ascii")
@@ -106,7 +113,9 @@ def figure(picture: Picture) -> str:
     return f"<figure><h2>{title}</h2>{image}<figcaption>{caption}</figcaption></figure>"
 
 
-def table(rows: Iterable[tuple[str, ...]], head: tuple[str, ...], css_class: str = "numbers") -> str:
+def table(
+    rows: Iterable[tuple[str, ...]], head: tuple[str, ...], css_class: str = "numbers"
+) -> str:
     """Return rows of text as a table; the first cell names the row."""
     top = "".join(f"<th>{escape(cell)}</th>" for cell in head)
     body = f"<thead><tr>{top}</tr></thead><tbody>{''.join(map(_row, rows))}</tbody>"
@@ -125,7 +134,11 @@ def _row(cells: tuple[str, ...]) -> str:
 def bullets(name: str, items: Iterable[str], css_class: str = "") -> str:
     """Return a list of sentences under a heading; empty where there are none."""
     entries = "".join(f"<li>{escape(item)}</li>" for item in items)
-    return f"<section class='{css_class}'><h3>{escape(name)}</h3><ul>{entries}</ul></section>" if entries else ""
+    return (
+        f"<section class='{css_class}'><h3>{escape(name)}</h3><ul>{entries}</ul></section>"
+        if entries
+        else ""
+    )
 
 
 def commands(lines: Iterable[str]) -> str:
