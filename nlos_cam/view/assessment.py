@@ -16,7 +16,9 @@ RGB: dict[Tone, tuple[int, int, int]] = {
     "warning": (255, 180, 60),
     "alarm": (255, 110, 90),
 }
-"""Color by tone; only "good" is green, for frames of which at least 90 % have an outline that is 75 % right."""
+"""Color by tone; only "good" is green, for frames of which at least 90 % have an outline that is 75
+% right.
+"""
 
 
 @dataclass(frozen=True)
@@ -36,7 +38,11 @@ class Assessment:
 
 WORDS: dict[Verdict | None, tuple[str, str, Tone]] = {
     Verdict.NOTHING: ("Nothing detected", "the returning light is that of an empty box", "quiet"),
-    Verdict.OUTSIDE: ("Shape not reliable", "unlike the training data, or not explained by physics", "warning"),
+    Verdict.OUTSIDE: (
+        "Shape not reliable",
+        "unlike the training data, or not explained by physics",
+        "warning",
+    ),
     Verdict.SATURATED: ("Sensor saturated", "lower the laser power or shade the light", "alarm"),
     Verdict.WALL_MOVED: ("Wall or lidar have moved", "calibrate the wall again", "alarm"),
     Verdict.STALLED: ("Camera stalled", "no new frame: the pictures are old", "alarm"),
@@ -45,29 +51,42 @@ WORDS: dict[Verdict | None, tuple[str, str, Tone]] = {
 
 
 def assess(moment: Moment) -> Assessment:
-    """Return a moment's assessment; for a detected object, the share of its outline expected right and the depth error.
+    """Return a moment's assessment; for a detected object, the share of its outline expected right
+    and the depth error.
 
-    Both come from the quality model, with the interval that holds 80 % of like frames; it was fitted to known objects,
-    of which none of the shown kind may have been (docs/doubt.md). Without one they are the uncertainty model's own.
+    Both come from the quality model, with the interval that holds 80 % of like frames; it was
+    fitted to known objects, of which none of the shown kind may have been (docs/doubt.md). Without
+    one they are the uncertainty model's own.
     """
-    verdict, found = moment.verdict, moment.reconstruction
+    verdict = moment.verdict
+    found = moment.reconstruction
     if verdict is not Verdict.SEEN:
         headline, detail, tone = WORDS[verdict]
         return Assessment(headline, detail, tone, trusted=verdict is None)
     if found.doubt and (quality := found.doubt.quality):
         low, typical, high = (f"{share:.0%}" for share in quality.iou)
         tone: Tone = "good" if quality.trusted else "estimate"
-        detail = f"outline typically {typical} right ({low} to {high}), depth to {1e3 * quality.error_m:.0f} mm"
+        detail = (
+            f"outline typically {typical} right ({low} to {high}), depth to"
+            f" {1e3 * quality.error_m:.0f} mm"
+        )
         return Assessment("Object detected", detail, tone, trusted=True)
-    overlap, error_m = expected_overlap(found), expected_error_m(found)
+    overlap = expected_overlap(found)
+    error_m = expected_error_m(found)
     if overlap is None or error_m is None:
-        return Assessment("Object detected", "no estimate of the shape's error", "estimate", trusted=True)
-    detail = f"outline about {overlap:.0%} right, depth to about {1e3 * error_m:.0f} mm (the model's own estimate)"
+        return Assessment(
+            "Object detected", "no estimate of the shape's error", "estimate", trusted=True
+        )
+    detail = (
+        f"outline about {overlap:.0%} right, depth to about {1e3 * error_m:.0f} mm (the model's own"
+        " estimate)"
+    )
     return Assessment("Object detected", detail, "estimate", trusted=True)
 
 
 def expected_overlap(found: Reconstruction) -> float | None:
-    """Return the expected silhouette IoU from the probability p of a surface per pixel; None without p or a surface.
+    """Return the expected silhouette IoU from the probability p of a surface per pixel; None
+    without p or a surface.
 
     With the reconstructed mask M: intersection = sum of p over M, union = |M| + sum of p outside M.
     """
@@ -79,7 +98,9 @@ def expected_overlap(found: Reconstruction) -> float | None:
 
 
 def expected_error_m(found: Reconstruction) -> float | None:
-    """Return the median expected depth error in metres over the reconstructed surface; None without one."""
+    """Return the median expected depth error in metres over the reconstructed surface; None without
+    one.
+    """
     mask = np.isfinite(found.depth_m)
     if found.uncertainty_m is None or not mask.any():
         return None

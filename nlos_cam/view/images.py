@@ -17,12 +17,16 @@ BACKGROUND_RGB = (13, 16, 17)
 PICTURE_WIDTH = 320
 """Columns to which lidar pictures are thinned."""
 DARKEST = 60
-"""Where in the colour map the farthest surface starts, so that it stands out from the background."""
+"""Where in the colour map the farthest surface starts, so that it stands out from the
+background.
+"""
 DIVERGING_RGB = (255, 150, 60), (70, 155, 130), (50, 160, 255)
 """Colors of nearer, expected and farther depth."""
 SATURATED_RGB = (255, 0, 200)
 ROUND_STEPS = 1.0, 2.0, 3.0, 5.0, 10.0
-CHANGED_M, FEW_CHANGED, QUIET_SPAN_M = 0.01, 0.02, 0.02
+CHANGED_M = 0.01
+FEW_CHANGED = 0.02
+QUIET_SPAN_M = 0.02
 """Differences below are noise and ripples; if few cells differ by more, the span shows these."""
 MAX_UNCERTAINTY_M = 0.03
 """Uncertainty drawn brightest; the object box is 0.28 m deep."""
@@ -31,24 +35,34 @@ FADED = 0.35
 
 
 def hidden_rgb(depth_m: Float32, box: ObjectBox) -> UInt8:
-    """Return hidden depth (64, 64) as a picture (64, 64, 3): bright near the wall, dark background."""
+    """Return hidden depth (64, 64) as a picture (64, 64, 3): bright near the wall, dark
+    background.
+    """
     v = image_from_depth(depth_m, box)
     return _coloured(DARKEST + v * (255 - DARKEST), cv2.COLORMAP_INFERNO, np.isnan(depth_m))
 
 
 def lidar_rgb(depth_m: Float32, near_m: float, far_m: float) -> UInt8:
-    """Return lidar depth (height, width) as a picture, red (near) to blue (far), dark without a return."""
+    """Return lidar depth (height, width) as a picture, red (near) to blue (far), dark without a
+    return.
+    """
     share = (depth_m - near_m) / max(far_m - near_m, 1e-6)
-    return _coloured(np.nan_to_num(1.0 - np.clip(share, 0.0, 1.0)) * 255, cv2.COLORMAP_TURBO, np.isnan(depth_m))
+    return _coloured(
+        np.nan_to_num(1.0 - np.clip(share, 0.0, 1.0)) * 255, cv2.COLORMAP_TURBO, np.isnan(depth_m)
+    )
 
 
 def infrared_grey(ir: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Return IR counts (height, width) as grey under a square root, so that weak returns are visible too."""
+    """Return IR counts (height, width) as grey under a square root, so that weak returns are
+    visible too.
+    """
     return np.sqrt(ir * np.float32(255.0)).astype(np.uint8)
 
 
 def uncertainty_rgb(uncertainty_m: Float32, depth_m: Float32) -> UInt8:
-    """Return the uncertainty of hidden depth (64, 64) as a picture, bright where large, dark without surface."""
+    """Return the uncertainty of hidden depth (64, 64) as a picture, bright where large, dark
+    without surface.
+    """
     share = np.clip(np.nan_to_num(uncertainty_m, nan=np.inf) / MAX_UNCERTAINTY_M, 0.0, 1.0)
     return _coloured(DARKEST + share * (255 - DARKEST), cv2.COLORMAP_VIRIDIS, np.isnan(depth_m))
 
@@ -57,7 +71,9 @@ def relief_rgb(depth_m: Float32, box: ObjectBox) -> UInt8:
     """Return hidden depth (64, 64) as a relief lit from the top left."""
     pitch_m = (box.x_max_m - box.x_min_m) / depth_m.shape[1]
     down, right = np.gradient(np.nan_to_num(depth_m, nan=box.z_far_m), pitch_m)
-    facing = (1.0 - 0.7 * right - 0.7 * down) / np.sqrt((1.0 + right**2 + down**2) * (1.0 + 2 * 0.7**2))
+    facing = (1.0 - 0.7 * right - 0.7 * down) / np.sqrt(
+        (1.0 + right**2 + down**2) * (1.0 + 2 * 0.7**2)
+    )
     shade = 0.25 + 0.75 * np.clip(facing, 0.0, 1.0)[..., np.newaxis]
     rgb = (hidden_rgb(depth_m, box) * shade).astype(np.uint8)
     rgb[np.isnan(depth_m)] = BACKGROUND_RGB
@@ -80,9 +96,13 @@ def depth_span_m(depth_m: Float32) -> tuple[float, float]:
 
 
 def difference_rgb(further: NDArray[np.floating], span: float) -> UInt8:
-    """Return a depth difference as a picture: blue farther, red nearer, grey as expected, dark for NaN."""
+    """Return a depth difference as a picture: blue farther, red nearer, grey as expected, dark for
+    NaN.
+    """
     share = np.clip(np.nan_to_num(further) / span, -1.0, 1.0)
-    rgb = np.stack([np.interp(share, (-1.0, 0.0, 1.0), stops) for stops in DIVERGING_RGB], axis=-1).astype(np.uint8)
+    rgb = np.stack(
+        [np.interp(share, (-1.0, 0.0, 1.0), stops) for stops in DIVERGING_RGB], axis=-1
+    ).astype(np.uint8)
     rgb[np.isnan(further)] = BACKGROUND_RGB
     return rgb
 
@@ -100,14 +120,20 @@ def saturated_rgb(ir: NDArray[np.floating], saturated: NDArray[np.floating]) -> 
     return rgb
 
 
-def round_span(values: NDArray[np.floating], percent: float = 95.0, otherwise: float = 1.0) -> float:
-    """Return 1, 2, 3, 5 or 10 times a power of ten above most magnitudes; `otherwise` if all are zero or NaN."""
+def round_span(
+    values: NDArray[np.floating], percent: float = 95.0, otherwise: float = 1.0
+) -> float:
+    """Return 1, 2, 3, 5 or 10 times a power of ten above most magnitudes; `otherwise` if all are
+    zero or NaN.
+    """
     seen = np.abs(values[np.isfinite(values)])
     most = float(np.percentile(seen, percent)) if seen.size else 0.0
     if most <= 0.0:
         return otherwise
     power = 10.0 ** floor(log10(most))
-    return float(f"{next(step * power for step in ROUND_STEPS if most <= step * power * (1 + 1e-6)):g}")
+    return float(
+        f"{next(step * power for step in ROUND_STEPS if most <= step * power * (1 + 1e-6)):g}"
+    )
 
 
 def change_span_m(difference_m: Float32) -> float:
@@ -119,15 +145,19 @@ def change_span_m(difference_m: Float32) -> float:
 
 def _coloured(values: NDArray[np.floating], colour_map: int, absent: Mask) -> UInt8:
     """Return values of 0 to 255 in a map's colors, and the background's where they are absent."""
-    rgb = np.ascontiguousarray(cv2.applyColorMap(values.astype(np.uint8), colour_map)[..., ::-1], dtype=np.uint8)
+    rgb = np.ascontiguousarray(
+        cv2.applyColorMap(values.astype(np.uint8), colour_map)[..., ::-1], dtype=np.uint8
+    )
     rgb[absent] = BACKGROUND_RGB
     return rgb
 
 
-BANNER_WIDTH, BANNER_HEIGHT = 880, 96
+BANNER_WIDTH = 880
+BANNER_HEIGHT = 96
 NOTED_PIXELS = 512
 HATCH_PIXELS = 32
-HATCH_ALPHA, FRAME_ALPHA = 70, 255
+HATCH_ALPHA = 70
+FRAME_ALPHA = 255
 DIM = 0.16
 """Share of the verdict's color in the banner's background."""
 PALE_RGB = (214, 224, 230)
@@ -145,8 +175,12 @@ def banner_rgb(headline: str, detail: str, rgb: tuple[int, int, int]) -> UInt8:
 
 
 def dim_untrusted(rgb: UInt8, note: str, note_rgb: tuple[int, int, int], *, hatched: bool) -> UInt8:
-    """Return an untrusted reconstruction (512, 512, 3) of (64, 64, 3): faded, framed and labelled."""
-    large = faded(rgb).repeat(NOTED_PIXELS // len(rgb), axis=0).repeat(NOTED_PIXELS // len(rgb), axis=1)
+    """Return an untrusted reconstruction (512, 512, 3) of (64, 64, 3): faded, framed and
+    labelled.
+    """
+    large = (
+        faded(rgb).repeat(NOTED_PIXELS // len(rgb), axis=0).repeat(NOTED_PIXELS // len(rgb), axis=1)
+    )
     over = note_rgba(note, note_rgb, hatched=hatched)
     alpha = over[..., 3:].astype(np.uint16)
     return ((over[..., :3] * alpha + large * (255 - alpha)) // 255).astype(np.uint8)
@@ -156,14 +190,17 @@ def dim_untrusted(rgb: UInt8, note: str, note_rgb: tuple[int, int, int], *, hatc
 def note_rgba(note: str, rgb: tuple[int, int, int], *, hatched: bool) -> NDArray[np.uint8]:
     """Return the overlay of an untrusted picture (512, 512, 4)."""
     image = Image.new("RGBA", (NOTED_PIXELS, NOTED_PIXELS), (0, 0, 0, 0))
-    pen, end = ImageDraw.Draw(image), NOTED_PIXELS
+    pen = ImageDraw.Draw(image)
+    end = NOTED_PIXELS
     if hatched:
         for start in range(-end, end, HATCH_PIXELS):
             pen.line((start, end, start + end, 0), fill=(*rgb, HATCH_ALPHA), width=3)
     pen.rectangle((0, 0, end - 1, end - 1), outline=(*rgb, FRAME_ALPHA), width=6)
     middle = (end / 2, end - 44 if hatched else end / 2)
     left, top, right, bottom = pen.textbbox(middle, note, font=font(36), anchor="mm")
-    pen.rounded_rectangle((left - 16, top - 12, right + 16, bottom + 12), 10, fill=(*BACKGROUND_RGB, 235))
+    pen.rounded_rectangle(
+        (left - 16, top - 12, right + 16, bottom + 12), 10, fill=(*BACKGROUND_RGB, 235)
+    )
     pen.text(middle, note, fill=rgb, font=font(36), anchor="mm")
     return np.asarray(image)
 

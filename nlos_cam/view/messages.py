@@ -1,7 +1,8 @@
 """Messages of the page: the bench, each moment and the run's status as JSON with arrays of bytes.
 
-A message is `<II` (bytes that follow, bytes of JSON), the JSON, then its arrays one after another. Quantities are
-quantised to a byte each; the JSON gives the scales, and the page draws colors, contours and meshes from them.
+A message is `<II` (bytes that follow, bytes of JSON), the JSON, then its arrays one after another.
+Quantities are quantised to a byte each; the JSON gives the scales, and the page draws colors,
+contours and meshes from them.
 """
 
 import json
@@ -29,9 +30,17 @@ RESIDUAL_SPAN_M = 0.02
 """Of the physics check; the lidar's own noise is a tenth of it."""
 PICTURE_WIDTH = 214
 """Columns to which lidar pictures are thinned; the networks see 80."""
-OCCLUDER_HEIGHT_M, MARGIN_M, FRUSTUM_M = 0.3, 0.1, 0.12
-"""Lengths in metres drawn of endless parts, around the relay wall, and of the lidar's field of view."""
-COLOR_MAPS = {"depth": cv2.COLORMAP_INFERNO, "error": cv2.COLORMAP_VIRIDIS, "lidar": cv2.COLORMAP_TURBO}
+OCCLUDER_HEIGHT_M = 0.3
+MARGIN_M = 0.1
+FRUSTUM_M = 0.12
+"""Lengths in metres drawn of endless parts, around the relay wall, and of the lidar's field of
+view.
+"""
+COLOR_MAPS = {
+    "depth": cv2.COLORMAP_INFERNO,
+    "error": cv2.COLORMAP_VIRIDIS,
+    "lidar": cv2.COLORMAP_TURBO,
+}
 
 Arrays = Mapping[str, NDArray[np.uint8]]
 Corners = list[list[float]]
@@ -39,7 +48,9 @@ Corners = list[list[float]]
 
 def pack(fields: Mapping[str, Any], arrays: Arrays | None = None) -> bytes:
     """Return a message; each array's name, shape and place are added to the fields."""
-    places, blobs, at = dict[str, list[int]](), list[bytes](), 0
+    places = dict[str, list[int]]()
+    blobs = list[bytes]()
+    at = 0
     for name, array in (arrays or {}).items():
         places[name] = [at, *array.shape]
         blobs.append(np.ascontiguousarray(array).tobytes())
@@ -52,22 +63,33 @@ def unpack(message: bytes) -> tuple[dict[str, Any], dict[str, NDArray[np.uint8]]
     """Return the fields and arrays of a message; the reverse of `pack`."""
     _, size = HEAD.unpack_from(message)
     fields = json.loads(message[HEAD.size : HEAD.size + size])
-    body, arrays = memoryview(message)[HEAD.size + size :], dict[str, NDArray[np.uint8]]()
+    body = memoryview(message)[HEAD.size + size :]
+    arrays = dict[str, NDArray[np.uint8]]()
     for name, (at, *shape) in fields.pop("arrays").items():
         arrays[name] = np.frombuffer(body, np.uint8, int(np.prod(shape)), at).reshape(shape)
     return fields, arrays
 
 
 def bench_message(rig: Rig, measured: MeasuredWall | None = None) -> bytes:
-    """Return the message of the bench: outlines in the wall frame in metres, scales, color maps, calibration."""
-    box, relay = object_box(rig), rig.relay
-    low, high = (relay.x_min_m - MARGIN_M, relay.y_min_m), (relay.x_max_m + MARGIN_M, relay.y_max_m)
-    parts: dict[str, Any] = {"wall": [[x_m, y_m, 0.0] for x_m, y_m in _around(low[0], high[0], low[1], high[1])]}
+    """Return the message of the bench: outlines in the wall frame in metres, scales, color maps,
+    calibration.
+    """
+    box = object_box(rig)
+    relay = rig.relay
+    low = (relay.x_min_m - MARGIN_M, relay.y_min_m)
+    high = (relay.x_max_m + MARGIN_M, relay.y_max_m)
+    parts: dict[str, Any] = {
+        "wall": [[x_m, y_m, 0.0] for x_m, y_m in _around(low[0], high[0], low[1], high[1])]
+    }
     if rig.occluder is not None:
         gap_m = rig.occluder.z_min_m
         sides = _around(low[1], high[1], gap_m, gap_m + OCCLUDER_HEIGHT_M)
         parts["occluder"] = [[rig.occluder.x_m, y_m, z_m] for y_m, z_m in sides]
-    parts |= {"lidar": rig.wall_from_lidar[:3, 3].tolist(), "frustum": _frustum(rig), "light": _light_path(rig, box)}
+    parts |= {
+        "lidar": rig.wall_from_lidar[:3, 3].tolist(),
+        "frustum": _frustum(rig),
+        "light": _light_path(rig, box),
+    }
     fields: dict[str, Any] = {
         "kind": "bench",
         "rig": rig.name,
@@ -91,7 +113,9 @@ def bench_message(rig: Rig, measured: MeasuredWall | None = None) -> bytes:
 def color_maps() -> dict[str, NDArray[np.uint8]]:
     """Return the color maps (256, 3), the same as in stills and videos."""
     ramp = np.arange(256, dtype=np.uint8)[:, np.newaxis]
-    colored = {name: cv2.applyColorMap(ramp, number)[:, 0, ::-1] for name, number in COLOR_MAPS.items()}
+    colored = {
+        name: cv2.applyColorMap(ramp, number)[:, 0, ::-1] for name, number in COLOR_MAPS.items()
+    }
     return {f"map_{name}": np.ascontiguousarray(rgb, np.uint8) for name, rgb in colored.items()}
 
 
@@ -101,16 +125,21 @@ def _around(a: float, b: float, c: float, d: float) -> list[tuple[float, float]]
 
 def _frustum(rig: Rig) -> Corners:
     """Return the corners (4, 3) of the field of view at FRUSTUM_M before the lidar."""
-    pinhole, pose = rig.pinhole, rig.wall_from_lidar
+    pinhole = rig.pinhole
+    pose = rig.wall_from_lidar
     pixels = np.array(_around(0.0, pinhole.width, 0.0, pinhole.height))
-    rays = np.column_stack([(pixels - [pinhole.ppx, pinhole.ppy]) / [pinhole.fx, pinhole.fy], np.ones(4)])
+    rays = np.column_stack(
+        [(pixels - [pinhole.ppx, pinhole.ppy]) / [pinhole.fx, pinhole.fy], np.ones(4)]
+    )
     return (pose[:3, 3] + FRUSTUM_M * rays @ pose[:3, :3].T).tolist()
 
 
 def _light_path(rig: Rig, box: ObjectBox) -> Corners:
     """Return the path (5, 3) of one three-bounce echo: lidar, wall, hidden object, wall, lidar."""
     eye: Float64 = rig.wall_from_lidar[:3, 3]
-    middle = np.array([(box.x_min_m + box.x_max_m) / 2, (box.y_min_m + box.y_max_m) / 2, box.z_near_m])
+    middle = np.array(
+        [(box.x_min_m + box.x_max_m) / 2, (box.y_min_m + box.y_max_m) / 2, box.z_near_m]
+    )
     there, back = (np.array([middle[0] * 0.6, y_m, 0.0]) for y_m in (-0.04, 0.04))
     return np.stack([eye, there, middle, back, eye]).tolist()
 
@@ -119,18 +148,25 @@ class MomentPacker:
     """Packer of one run's moments; the first one's ranges of depth and change hold for all."""
 
     def __init__(self, rig: Rig, *, picture_width: int = PICTURE_WIDTH) -> None:
-        self._box, self._width = object_box(rig), picture_width
+        self._box = object_box(rig)
+        self._width = picture_width
         self._start_s: float | None = None
-        self._span_m, self._change_span_m = (0.0, 1.0), 0.0
+        self._span_m = (0.0, 1.0)
+        self._change_span_m = 0.0
 
     def pack(self, moment: Moment, *, with_lidar: bool = True) -> bytes:
-        """Return a moment's message; the pictures of the lidar's view, most of its bytes, only if requested."""
+        """Return a moment's message; the pictures of the lidar's view, most of its bytes, only if
+        requested.
+        """
         if self._start_s is None:
-            self._start_s, self._span_m = moment.published_s, depth_span_m(moment.frame.depth_m)
+            self._start_s = moment.published_s
+            self._span_m = depth_span_m(moment.frame.depth_m)
         arrays = self._hidden(moment)
         if with_lidar:
             if moment.difference is not None:
-                self._change_span_m = self._change_span_m or change_span_m(moment.difference.depth_m)
+                self._change_span_m = self._change_span_m or change_span_m(
+                    moment.difference.depth_m
+                )
                 arrays["change"] = signed_bytes(moment.difference.depth_m, self._change_span_m)
             if moment.check:
                 arrays["residual"] = signed_bytes(moment.check.residual_depth_m, RESIDUAL_SPAN_M)
@@ -140,26 +176,35 @@ class MomentPacker:
         return pack(self._fields(moment, self._start_s), arrays)
 
     def _hidden(self, moment: Moment) -> dict[str, NDArray[np.uint8]]:
-        span_m, found = (self._box.z_near_m, self._box.z_far_m), moment.reconstruction
+        span_m = (self._box.z_near_m, self._box.z_far_m)
+        found = moment.reconstruction
         arrays = {"depth": depth_bytes(found.depth_m, *span_m)}
         if moment.frame.truth_depth_m is not None:
             arrays["truth"] = depth_bytes(moment.frame.truth_depth_m, *span_m)
         if found.uncertainty_m is not None:
-            arrays["error"] = np.clip(np.rint(found.uncertainty_m / ERROR_STEP_M), 0, 255).astype(np.uint8)
+            arrays["error"] = np.clip(np.rint(found.uncertainty_m / ERROR_STEP_M), 0, 255).astype(
+                np.uint8
+            )
         if found.doubt is not None:
             arrays["surface"] = np.rint(255 * np.clip(found.doubt.surface, 0, 1)).astype(np.uint8)
         return arrays
 
     def _fields(self, moment: Moment, start_s: float) -> dict[str, Any]:
-        assessment, check = assess(moment), moment.check
+        assessment = assess(moment)
+        check = moment.check
         return {
             "kind": "moment",
             "frame": moment.frame.frame_number,
             "time_s": round(moment.published_s - start_s, 4),
             "latency_ms": round(1e3 * moment.latency_s, 2),
-            "stages_ms": {name: round(1e3 * seconds, 2) for name, seconds in moment.stages_s.items()},
+            "stages_ms": {
+                name: round(1e3 * seconds, 2) for name, seconds in moment.stages_s.items()
+            },
             "dropped": moment.dropped,
-            "celsius": {name.removesuffix("_temperature"): round(value, 1) for name, value in moment.celsius.items()},
+            "celsius": {
+                name.removesuffix("_temperature"): round(value, 1)
+                for name, value in moment.celsius.items()
+            },
             "verdict": moment.verdict,
             "headline": assessment.headline,
             "detail": assessment.detail,
@@ -170,7 +215,9 @@ class MomentPacker:
             "lidar_span_m": self._span_m,
             "change_span_m": self._change_span_m,
             "residual_span_m": RESIDUAL_SPAN_M,
-            "score": None if check is None or not np.isfinite(check.score) else round(check.score, 3),
+            "score": None
+            if check is None or not np.isfinite(check.score)
+            else round(check.score, 3),
         }
 
 

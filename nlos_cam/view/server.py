@@ -1,8 +1,10 @@
-"""Web server of the view: fixed files, one endless stream per browser, and commands; on the loopback by default.
+"""Web server of the view: fixed files, one endless stream per browser, and commands; on the
+loopback by default.
 
-The view has no password, therefore: foreign host names are refused (DNS rebinding would let a page elsewhere read the
-view through a visitor's browser), requests that another site's page makes are refused, a command needs the token of
-the printed address, streams and connections are limited, and a browser that sends or reads too slowly is cut.
+The view has no password, therefore: foreign host names are refused (DNS rebinding would let a page
+elsewhere read the view through a visitor's browser), requests that another site's page makes are
+refused, a command needs the token of the printed address, streams and connections are limited, and
+a browser that sends or reads too slowly is cut.
 """
 
 import hmac
@@ -25,7 +27,8 @@ from typing import Any
 from nlos_cam.errors import NlosCamError
 
 LOOPBACK = "127.0.0.1"
-STREAM_PATH, COMMAND_PATH = "/stream", "/command"
+STREAM_PATH = "/stream"
+COMMAND_PATH = "/command"
 TIMEOUT_S = 5.0
 """Seconds for a whole request, and for each piece of an answer, after which a browser is cut."""
 PIECE_BYTES = 1 << 18
@@ -33,14 +36,18 @@ MAX_REQUEST_BYTES = 1 << 16
 MAX_STREAMS = 8
 """Browsers that watch at once."""
 MAX_CONNECTIONS = 32
-"""Connections at once; a further one takes the place of the oldest whose request is not whole yet, or is closed."""
+"""Connections at once; a further one takes the place of the oldest whose request is not whole yet,
+or is closed.
+"""
 CLOSE_AFTER_S = 1.0
 """Seconds that ended streams have before their connections are cut."""
 POLICY = (
     "default-src 'self'; script-src 'self' 'unsafe-inline'; style-src 'self' 'unsafe-inline'; "
     "img-src 'self' data: blob:; frame-ancestors 'self'"
 )
-"""The browser itself refuses to fetch anything from elsewhere, or to show the view inside another's page."""
+"""The browser itself refuses to fetch anything from elsewhere, or to show the view inside another's
+page.
+"""
 HEADERS = {
     "Content-Security-Policy": POLICY,
     "Cache-Control": "no-store",
@@ -53,7 +60,9 @@ Send = Callable[[bytes], None]
 Assets = Mapping[str, tuple[str, bytes]]
 """Content type and bytes by path."""
 Command = Callable[[str, Mapping[str, Any]], str]
-"""Runs a command by name with its arguments and returns its outcome in words. Raises NlosCamError with the reason."""
+"""Runs a command by name with its arguments and returns its outcome in words. Raises NlosCamError
+with the reason.
+"""
 
 
 @dataclass(frozen=True)
@@ -77,7 +86,8 @@ class Handler(BaseHTTPRequestHandler):
     served: Served
     streams: BoundedSemaphore
     timeout = TIMEOUT_S
-    server_version, sys_version = "nlos-cam", ""
+    server_version = "nlos-cam"
+    sys_version = ""
 
     def setup(self) -> None:
         super().setup()
@@ -85,15 +95,23 @@ class Handler(BaseHTTPRequestHandler):
         self.server.request_read(self.request)  # type: ignore[attr-defined]
 
     def _whole_request(self) -> bytes:
-        """Read one request within TIMEOUT_S in all: a byte now and then would else hold a connection for ever."""
-        deadline_s, content, needed = time.monotonic() + TIMEOUT_S, b"", 1
+        """Read one request within TIMEOUT_S in all: a byte now and then would else hold a
+        connection for ever.
+        """
+        deadline_s = time.monotonic() + TIMEOUT_S
+        content = b""
+        needed = 1
         while len(content) < needed:
             self.request.settimeout(max(deadline_s - time.monotonic(), 1e-3))
             if not (more := self.request.recv(1 << 14)):
                 break
             content += more
             head, end, _ = content.partition(b"\r\n\r\n")
-            length = re.search(rb"\r\ncontent-length: *(\d{1,9})\r\n", head.lower() + b"\r\n") if end else None
+            length = (
+                re.search(rb"\r\ncontent-length: *(\d{1,9})\r\n", head.lower() + b"\r\n")
+                if end
+                else None
+            )
             needed = len(head) + 4 + int(length[1]) if length else len(content) + (not end)
             if max(len(content), needed if end else 0) > MAX_REQUEST_BYTES:
                 break
@@ -113,21 +131,31 @@ class Handler(BaseHTTPRequestHandler):
         path = self.path.partition("?")[0]
         try:
             if not self.served.known(self.headers.get("Host", "")):
-                self._say(HTTPStatus.FORBIDDEN, "this is not a name of the machine: open the address that it printed")
+                self._say(
+                    HTTPStatus.FORBIDDEN,
+                    "this is not a name of the machine: open the address that it printed",
+                )
             elif self._is_foreign(path):
-                self._say(HTTPStatus.FORBIDDEN, "a page of another site may not ask: open the address yourself")
+                self._say(
+                    HTTPStatus.FORBIDDEN,
+                    "a page of another site may not ask: open the address yourself",
+                )
             else:
                 answer(path)
         except OSError:
             self.close_connection = True  # the browser left, which is its right
 
     def _is_foreign(self, path: str) -> bool:
-        """Return True for a request made by another site's page, unless it only leads a person to the page."""
+        """Return True for a request made by another site's page, unless it only leads a person to
+        the page.
+        """
         origin = self.headers.get("Origin")
         if origin is not None and origin.partition("://")[2] != self.headers.get("Host", ""):
             return True
         visits = path == "/" and self.headers.get("Sec-Fetch-Mode", "navigate") == "navigate"
-        return self.headers.get("Sec-Fetch-Site", "none") not in {"none", "same-origin"} and not visits
+        return (
+            self.headers.get("Sec-Fetch-Site", "none") not in {"none", "same-origin"} and not visits
+        )
 
     def _get(self, path: str) -> None:
         if path == STREAM_PATH:
@@ -142,7 +170,10 @@ class Handler(BaseHTTPRequestHandler):
     def _answer_stream(self) -> None:
         if not self.streams.acquire(blocking=False):
             most = self.served.max_streams
-            self._say(HTTPStatus.SERVICE_UNAVAILABLE, f"{most} browsers watch already: close one to watch here")
+            self._say(
+                HTTPStatus.SERVICE_UNAVAILABLE,
+                f"{most} browsers watch already: close one to watch here",
+            )
             return
         try:
             self._begin(HTTPStatus.OK, "application/octet-stream")
@@ -155,14 +186,22 @@ class Handler(BaseHTTPRequestHandler):
         run = self.served.command
         if path != COMMAND_PATH or run is None:
             self._say(HTTPStatus.NOT_FOUND, "this view has no controls")
-        elif not hmac.compare_digest(self.headers.get("X-Token", "").encode(), self.served.token.encode()):
-            self._say(HTTPStatus.FORBIDDEN, "read-only: open the address that was printed, with its token, to control")
+        elif not hmac.compare_digest(
+            self.headers.get("X-Token", "").encode(), self.served.token.encode()
+        ):
+            self._say(
+                HTTPStatus.FORBIDDEN,
+                "read-only: open the address that was printed, with its token, to control",
+            )
         else:
             try:
                 request = json.loads(self.rfile.read())
-                name, arguments = str(request.pop("command")), dict[str, Any](request)
+                name = str(request.pop("command"))
+                arguments = dict[str, Any](request)
             except (ValueError, TypeError, KeyError, AttributeError, RecursionError):
-                self._say(HTTPStatus.BAD_REQUEST, 'not a command: send {"command": NAME, ...} as JSON')
+                self._say(
+                    HTTPStatus.BAD_REQUEST, 'not a command: send {"command": NAME, ...} as JSON'
+                )
                 return
             try:
                 self._say(HTTPStatus.OK, run(name, arguments))
@@ -171,7 +210,9 @@ class Handler(BaseHTTPRequestHandler):
             except OSError:
                 raise
             except Exception as error:  # noqa: BLE001  whatever it was, the page says it, and the run goes on
-                self._say(HTTPStatus.INTERNAL_SERVER_ERROR, f"unforeseen {type(error).__name__}: {error}")
+                self._say(
+                    HTTPStatus.INTERNAL_SERVER_ERROR, f"unforeseen {type(error).__name__}: {error}"
+                )
 
     def _say(self, status: HTTPStatus, text: str) -> None:
         content = f"{text}\n".encode()
@@ -190,7 +231,9 @@ class Handler(BaseHTTPRequestHandler):
     def _send(self, content: bytes) -> None:
         if self.command != "HEAD":
             for start in range(0, len(content), PIECE_BYTES):
-                self.wfile.write(content[start : start + PIECE_BYTES])  # the timeout holds for a whole piece
+                self.wfile.write(
+                    content[start : start + PIECE_BYTES]
+                )  # the timeout holds for a whole piece
 
     def log_message(self, format: str, *args: object) -> None:  # noqa: A002  the name http.server uses
         pass
@@ -203,12 +246,16 @@ HOST = re.compile(r"(?:\[(?P<six>[0-9a-f:.%]+)\]|(?P<name>[^\[\]:]*))(?::\d{1,5}
 
 
 def resolved(host: str) -> tuple[socket.AddressFamily, str]:
-    """Return family and address of a host to listen on. Raises NlosCamError for a name without an address."""
+    """Return family and address of a host to listen on. Raises NlosCamError for a name without an
+    address.
+    """
     try:
         found = socket.getaddrinfo(host, None, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)
     except (OSError, UnicodeError) as error:
         reason = "it has no address" if isinstance(error, OSError) else "it is no host name"
-        raise NlosCamError(f"--view-host {host}: {reason}; give a name or address of this machine") from error
+        raise NlosCamError(
+            f"--view-host {host}: {reason}; give a name or address of this machine"
+        ) from error
     family, *_, address = found[0]
     return family, str(address[0])
 
@@ -228,13 +275,15 @@ def exposed(host: str, port: int) -> str:
         return ""
     where = "any address of this machine" if address in EVERYWHERE else address
     return (
-        f"anyone who can reach {where} at port {port} sees the bench's pictures and depth, unencrypted and without a "
-        "password; controls need the token in the address"
+        f"anyone who can reach {where} at port {port} sees the bench's pictures and depth,"
+        " unencrypted and without a password; controls need the token in the address"
     )
 
 
 def names_of(host: str, address: str) -> Callable[[str], bool]:
-    """Return the check of a Host header: this machine's names, or an address (which no name server can forge)."""
+    """Return the check of a Host header: this machine's names, or an address (which no name server
+    can forge).
+    """
     names = LOCAL_NAMES | {host.lower(), socket.gethostname().lower()}
     local_only = is_loopback(address)
 
@@ -246,7 +295,9 @@ def names_of(host: str, address: str) -> Callable[[str], bool]:
 
 
 def name_in(header: str) -> str:
-    """Return the host of a Host header without its port, which differs behind a forwarded port; empty if malformed."""
+    """Return the host of a Host header without its port, which differs behind a forwarded port;
+    empty if malformed.
+    """
     found = HOST.fullmatch(header.strip().lower())
     return (found["six"] or found["name"] or "") if found else ""
 
@@ -284,7 +335,8 @@ class _Threads(ThreadingHTTPServer):
     def server_bind(self) -> None:
         """Bind without a name lookup of this machine, which may take long."""
         TCPServer.server_bind(self)
-        self.server_name, self.server_port = str(self.server_address[0]), self.server_address[1]
+        self.server_name = str(self.server_address[0])
+        self.server_port = self.server_address[1]
 
     def process_request(self, request: Any, client_address: Any) -> None:
         if not self._room.acquire(blocking=False) and not self._cut_unread():
@@ -295,7 +347,9 @@ class _Threads(ThreadingHTTPServer):
         super().process_request(request, client_address)
 
     def _cut_unread(self) -> bool:
-        """Cut the oldest connection whose request is not whole, and take its place; return False without one."""
+        """Cut the oldest connection whose request is not whole, and take its place; return False
+        without one.
+        """
         with self._changed:
             unread = next((request for request, is_read in self._open.items() if not is_read), None)
             if unread is not None:
@@ -332,21 +386,28 @@ class _Threads(ThreadingHTTPServer):
 class ViewServer:
     """Server that runs from its construction until `close`, in its own thread.
 
-    Takes the preferred port, or any free one if that is busy, unless `exact`. Raises NlosCamError if it cannot listen.
+    Takes the preferred port, or any free one if that is busy, unless `exact`. Raises NlosCamError
+    if it cannot listen.
     """
 
-    def __init__(self, served: Served, preferred_port: int, *, host: str = LOOPBACK, exact: bool = False) -> None:
+    def __init__(
+        self, served: Served, preferred_port: int, *, host: str = LOOPBACK, exact: bool = False
+    ) -> None:
         family, self._host = resolved(host)
         members = {
             "served": replace(served, known=names_of(host, self._host)),
             "streams": BoundedSemaphore(served.max_streams),
         }
-        self._server = self._listening(family, preferred_port, type("ViewHandler", (Handler,), members), exact=exact)
+        self._server = self._listening(
+            family, preferred_port, type("ViewHandler", (Handler,), members), exact=exact
+        )
         self.port: int = self._server.server_address[1]
         self._thread = Thread(target=self._server.serve_forever, args=(0.1,), name="view server")
         self._thread.start()
 
-    def _listening(self, family: socket.AddressFamily, port: int, handler: Any, *, exact: bool) -> _Threads:
+    def _listening(
+        self, family: socket.AddressFamily, port: int, handler: Any, *, exact: bool
+    ) -> _Threads:
         try:
             try:
                 return _Threads(family, self._host, port, handler)
@@ -355,8 +416,12 @@ class ViewServer:
                     raise
                 return _Threads(family, self._host, 0, handler)
         except OSError as error:
-            problem = f"the view cannot be served at {address_of(self._host, port)} ({error.strerror})"
-            raise NlosCamError(f"{problem}: choose another --view-port or --view-host, or drop them") from error
+            problem = (
+                f"the view cannot be served at {address_of(self._host, port)} ({error.strerror})"
+            )
+            raise NlosCamError(
+                f"{problem}: choose another --view-port or --view-host, or drop them"
+            ) from error
 
     @property
     def address(self) -> str:

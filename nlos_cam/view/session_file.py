@@ -1,4 +1,6 @@
-"""Saved sessions: one HTML file with the page and every kept moment, which any browser plays without installation."""
+"""Saved sessions: one HTML file with the page and every kept moment, which any browser plays
+without installation.
+"""
 
 import base64
 import zlib
@@ -17,7 +19,9 @@ from nlos_cam.view.viewer import Moment
 PERIOD_S = 0.1
 """Seconds between saved moments, by their own clock."""
 SLACK_S = 0.01
-"""Frames come at 30 per second: every third is kept, and not every fourth because of a thousandth."""
+"""Frames come at 30 per second: every third is kept, and not every fourth because of a
+thousandth.
+"""
 CHUNK_S = 1.0
 """Seconds of moments compressed together, and that a kill may cost."""
 LIDAR_S = 1.0
@@ -31,7 +35,9 @@ SESSION_SUFFIX = ".html"
 
 
 def page_html(mode: str) -> str:
-    """Return the page with its scripts inside; `mode` is "live", "recorded" (streamed) or "session" (in the file)."""
+    """Return the page with its scripts inside; `mode` is "live", "recorded" (streamed) or "session"
+    (in the file).
+    """
     folder = resources.files("nlos_cam.view")
     page = (folder / "page.html").read_text(encoding="utf-8")
     for name in ("bench.js", "pictures.js", "page.js"):
@@ -44,14 +50,18 @@ class Chunks:
     """Packer of moments into chunks: messages of CHUNK_S, compressed together."""
 
     def __init__(self, packer: MomentPacker) -> None:
-        self._packer, self._messages = packer, list[bytes]()
+        self._packer = packer
+        self._messages = list[bytes]()
         self._times_s: list[float] = []
-        self._lidar_due_s, self._start_s = float("-inf"), None
+        self._lidar_due_s = float("-inf")
+        self._start_s = None
 
     def add(self, moment: Moment) -> bytes | None:
         """Add a moment, and return the chunk before it if that is complete."""
         now_s = moment.published_s
-        complete = self.rest() if self._times_s and now_s - self._times_s[0] >= CHUNK_S - SLACK_S else None
+        complete = (
+            self.rest() if self._times_s and now_s - self._times_s[0] >= CHUNK_S - SLACK_S else None
+        )
         if with_lidar := now_s >= self._lidar_due_s or not self._messages:
             self._lidar_due_s = now_s + LIDAR_S - SLACK_S
         self._messages.append(self._packer.pack(moment, with_lidar=with_lidar))
@@ -65,20 +75,23 @@ class Chunks:
         start_s = self._start_s = self._times_s[0] if self._start_s is None else self._start_s
         times_s = [round(each - start_s, 4) for each in self._times_s]
         data = np.frombuffer(zlib.compress(b"".join(self._messages)), np.uint8)
-        self._messages, self._times_s = [], []
+        self._messages = []
+        self._times_s = []
         return pack({"kind": "chunk", "times_s": times_s}, {"data": data})
 
 
 class SessionFile:
     """Writer of ten moments per second to an HTML file, in its own thread while entered.
 
-    A moment that finds the queue full is skipped, or waited for with `keeps_all`. An existing file is replaced. After a
-    kill the file lacks its last second and plays.
+    A moment that finds the queue full is skipped, or waited for with `keeps_all`. An existing file
+    is replaced. After a kill the file lacks its last second and plays.
     """
 
     address: str | None = None
 
-    def __init__(self, path: Path, rig: Rig, measured: MeasuredWall | None = None, *, keeps_all: bool = False) -> None:
+    def __init__(
+        self, path: Path, rig: Rig, measured: MeasuredWall | None = None, *, keeps_all: bool = False
+    ) -> None:
         self.path = path
         self.kept = 0
         """Moments written."""
@@ -86,7 +99,8 @@ class SessionFile:
         """Moments that were due and did not fit."""
         self.full = False
         """True if the file ended before the run."""
-        self._bench, self._keeps_all = bench_message(rig, measured), keeps_all
+        self._bench = bench_message(rig, measured)
+        self._keeps_all = keeps_all
         self._chunks = Chunks(MomentPacker(rig, picture_width=PICTURE_WIDTH))
         self._queue = BoundedQueue[Moment](QUEUE_MOMENTS)
         self._due_s = float("-inf")
@@ -94,7 +108,9 @@ class SessionFile:
         self._thread = Thread(target=self._write, name="saved session")
 
     def __enter__(self) -> Self:
-        self.path.open("wb").close()  # a path that cannot be written to is an error now, not in the thread
+        self.path.open(
+            "wb"
+        ).close()  # a path that cannot be written to is an error now, not in the thread
         self._thread.start()
         return self
 
@@ -109,7 +125,9 @@ class SessionFile:
         if self.full or moment.published_s < self._due_s:
             return
         self._due_s = moment.published_s + PERIOD_S - SLACK_S
-        while self._keeps_all and self._thread.is_alive() and not self._queue.wait_for_room(CHUNK_S):
+        while (
+            self._keeps_all and self._thread.is_alive() and not self._queue.wait_for_room(CHUNK_S)
+        ):
             pass
         if self._queue.wait_for_room(0.0):
             self._queue.put(moment)

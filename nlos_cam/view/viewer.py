@@ -48,7 +48,9 @@ class Controls(Protocol):
 
 
 class Viewer(Protocol):
-    """Viewer of the newest moment. `show` returns at once: a viewer may skip moments and never slows the loop."""
+    """Viewer of the newest moment. `show` returns at once: a viewer may skip moments and never
+    slows the loop.
+    """
 
     @property
     def address(self) -> str | None:

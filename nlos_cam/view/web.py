@@ -1,4 +1,6 @@
-"""Live view, and view of a recording or a saved session, in a browser, through a web server on the loopback."""
+"""Live view, and view of a recording or a saved session, in a browser, through a web server on the
+loopback.
+"""
 
 import secrets
 import tempfile
@@ -21,7 +23,9 @@ PREFERRED_PORT = 9090
 PERIOD_S = 1 / 12
 """Seconds between moments sent."""
 PATIENCE_S = 0.05
-"""Seconds to wait for the next moment: packing that begins with a moment ends before the loop's next frame."""
+"""Seconds to wait for the next moment: packing that begins with a moment ends before the loop's
+next frame.
+"""
 STATUS_S = 0.5
 """Seconds between messages of the status, also without moments."""
 ENDED = pack({"kind": "status", "state": "ended"})
@@ -44,10 +48,14 @@ class Website:
 
     mode = "live"
 
-    def __init__(self, *, host: str = LOOPBACK, port: int | None = None, controls: Controls | None = None) -> None:
+    def __init__(
+        self, *, host: str = LOOPBACK, port: int | None = None, controls: Controls | None = None
+    ) -> None:
         """Prepare a server at `port`, or without one at 9090 or the next free port."""
         self.address: str | None = None
-        self._host, self._port, self._controls = host, port, controls
+        self._host = host
+        self._port = port
+        self._controls = controls
         self._token = secrets.token_urlsafe(12)
 
     def __enter__(self) -> Self:
@@ -73,7 +81,9 @@ class Website:
 
 
 class WebViewer(Website):
-    """Live view. A thread of its own packs the newest moment once for all browsers, and only if there is one."""
+    """Live view. A thread of its own packs the newest moment once for all browsers, and only if
+    there is one.
+    """
 
     def __init__(
         self,
@@ -86,11 +96,17 @@ class WebViewer(Website):
         controls: Controls | None = None,
         on_thread: Callable[[], None] = lambda: None,
     ) -> None:
-        """Prepare the view; without a rig it shows the status until `begin`. `on_thread` is called as threads work."""
+        """Prepare the view; without a rig it shows the status until `begin`. `on_thread` is called
+        as threads work.
+        """
         super().__init__(host=host, port=port, controls=controls)
-        self._on_thread, self._clock = on_thread, clock
-        self._moments, self._packets = LatestValue[Moment](), LatestValue[Packet]()
-        self._closed, self._watching, self._lock = Event(), 0, Lock()
+        self._on_thread = on_thread
+        self._clock = clock
+        self._moments = LatestValue[Moment]()
+        self._packets = LatestValue[Packet]()
+        self._closed = Event()
+        self._watching = 0
+        self._lock = Lock()
         self._bench: tuple[int, bytes] = (0, b"")
         self._packer: MomentPacker | None = None
         self._thread = Thread(target=self._pack_all, name="view")
@@ -99,7 +115,8 @@ class WebViewer(Website):
 
     def begin(self, rig: Rig, measured: MeasuredWall | None = None) -> None:
         """Show this bench from now on."""
-        self._bench, self._packer = (self._bench[0] + 1, bench_message(rig, measured)), MomentPacker(rig)
+        self._bench = (self._bench[0] + 1, bench_message(rig, measured))
+        self._packer = MomentPacker(rig)
 
     def __enter__(self) -> Self:
         super().__enter__()
@@ -118,7 +135,9 @@ class WebViewer(Website):
         self._moments.put(moment)
 
     def _pack_all(self) -> None:
-        seen, statuses, status_s = 0, 0, float("-inf")
+        seen = 0
+        statuses = 0
+        status_s = float("-inf")
         packed = status = (0, b"")
         while not self._closed.is_set():
             self._on_thread()
@@ -133,7 +152,8 @@ class WebViewer(Website):
             if newest is not None and self._packer:
                 packed = seen, self._packer.pack(newest[1])
             if newest is None or start_s - status_s >= STATUS_S:
-                status_s, statuses = start_s, statuses + 1
+                status_s = start_s
+                statuses = statuses + 1
                 status = statuses, self._status()
             self._packets.put(Packet(self._bench, packed, status))
             self._closed.wait(max(0.0, start_s + PERIOD_S - self._clock()))
@@ -147,12 +167,19 @@ class WebViewer(Website):
             self._watching += 1
         try:
             send(pack({"kind": "hello", "mode": self.mode}))
-            sent, count = Packet(), 0
+            sent = Packet()
+            count = 0
             while not self._closed.is_set():
                 self._on_thread()
                 if newest := self._packets.after(count, STATUS_S):
                     count, packet = newest
-                    send(b"".join(new[1] for new, old in zip(packet, sent, strict=True) if new[0] != old[0]))
+                    send(
+                        b"".join(
+                            new[1]
+                            for new, old in zip(packet, sent, strict=True)
+                            if new[0] != old[0]
+                        )
+                    )
                     sent = packet
             send(ENDED)
         finally:
@@ -161,9 +188,11 @@ class WebViewer(Website):
 
 
 class PlaybackViewer(Website):
-    """View of a recording while it is reconstructed: every moment stays, and the page plays, pauses and scrubs.
+    """View of a recording while it is reconstructed: every moment stays, and the page plays, pauses
+    and scrubs.
 
-    The moments are kept in a temporary file. `show` must get them all, in order; `finish` when there are no more.
+    The moments are kept in a temporary file. `show` must get them all, in order; `finish` when
+    there are no more.
     """
 
     mode = "recorded"
@@ -178,8 +207,10 @@ class PlaybackViewer(Website):
         controls: Controls | None = None,
     ) -> None:
         super().__init__(host=host, port=port, controls=controls)
-        self._bench, self._chunks = bench_message(rig, measured), Chunks(MomentPacker(rig))
-        self._changed, self._closed = Condition(), False
+        self._bench = bench_message(rig, measured)
+        self._chunks = Chunks(MomentPacker(rig))
+        self._changed = Condition()
+        self._closed = False
         self._ends = [0]
         """End of each chunk in the file, after a zero."""
 
@@ -216,7 +247,9 @@ class PlaybackViewer(Website):
         send(ENDED)
 
     def _kept(self) -> Iterator[bytes]:
-        """Yield the chunks as they come, and nothing every STATUS_S while none comes, until the view closes."""
+        """Yield the chunks as they come, and nothing every STATUS_S while none comes, until the
+        view closes.
+        """
         sent = 0
         while not self._closed:
             with self._changed:
@@ -225,12 +258,15 @@ class PlaybackViewer(Website):
                 chunk = b""
                 if len(self._ends) > sent + 1 and not self._closed:
                     self._file.seek(self._ends[sent])
-                    chunk, sent = self._file.read(self._ends[sent + 1] - self._ends[sent]), sent + 1
+                    chunk = self._file.read(self._ends[sent + 1] - self._ends[sent])
+                    sent = sent + 1
             yield chunk
 
 
 class RecordedView(Website):
-    """View of a session saved as one HTML file, served while entered. Raises RecordingError for another file."""
+    """View of a session saved as one HTML file, served while entered. Raises RecordingError for
+    another file.
+    """
 
     mode = "recorded"
 
@@ -239,7 +275,9 @@ class RecordedView(Website):
         try:
             self._content = path.read_bytes()
         except OSError as error:
-            raise RecordingError(f"{path} cannot be read ({error.strerror}): name a saved session (.html)") from error
+            raise RecordingError(
+                f"{path} cannot be read ({error.strerror}): name a saved session (.html)"
+            ) from error
         if self._content.startswith(b"RRF"):
             raise RecordingError(
                 f"{path} was saved by an earlier version, for the Rerun viewer: open it with "
@@ -247,7 +285,8 @@ class RecordedView(Website):
             )
         if SESSION_MARK not in self._content[:1000]:
             raise RecordingError(
-                f"{path} is no saved session: make one with `live --save-view` or `replay --save-view`"
+                f"{path} is no saved session: make one with `live --save-view` or `replay"
+                " --save-view`"
             )
 
     def _assets(self) -> Assets:
