@@ -1,6 +1,8 @@
 """See around a corner with a consumer lidar."""
 
-TYPE_CHECKING = False  # as type checkers take it; `typing` costs a tenth of the time of `nlos-cam --version`
+TYPE_CHECKING = (
+    False  # as type checkers take it; `typing` costs a tenth of the time of `nlos-cam --version`
+)
 if TYPE_CHECKING:
     from nlos_cam.api import Glimpse, Stream
     from nlos_cam.api import open_stream as open  # noqa: A004  as gzip.open: always called as nlos_cam.open

@@ -38,7 +38,9 @@ class Glimpse:
     """Result of one frame: the hidden surface with its uncertainty and verdict."""
 
     step: reconstruct.FrameResult
-    """Everything else about the frame: the frame itself, the reconstruction's pose, timings, the physics check."""
+    """Everything else about the frame: the frame itself, the reconstruction's pose, timings, the
+    physics check.
+    """
     box: ObjectBox
     """Box in which objects are reconstructed, in the wall frame."""
 
@@ -46,7 +48,8 @@ class Glimpse:
     def depth_m(self) -> Float32:
         """(64, 64) over the box: distance from the wall, NaN where there is no surface.
 
-        Column j grows with wall x (away from the lidar's foot), row i with wall -y (row 0 is the top).
+        Column j grows with wall x (away from the lidar's foot), row i with wall -y (row 0 is the
+        top).
         """
         return self.step.reconstruction.depth_m
 
@@ -57,7 +60,9 @@ class Glimpse:
 
     @property
     def verdict(self) -> reconstruct.Verdict | None:
-        """Reliability of the reconstruction, such as "object seen"; None without an uncertainty model."""
+        """Reliability of the reconstruction, such as "object seen"; None without an uncertainty
+        model.
+        """
         return self.step.verdict
 
     @property
@@ -67,13 +72,17 @@ class Glimpse:
 
     @property
     def points_m(self) -> Float32:
-        """(n, 3): points of the hidden surface in the wall frame, x along the wall, y up, z into the room."""
+        """(n, 3): points of the hidden surface in the wall frame, x along the wall, y up, z into
+        the room.
+        """
         x_m, y_m = np.meshgrid(*cell_centers_m(self.box))
         points_m = np.stack([x_m, y_m, self.depth_m], -1).astype(np.float32)
         return points_m[np.isfinite(self.depth_m)]
 
     def to_mesh(self) -> SurfaceMesh:
-        """Return the hidden surface as a mesh in the wall frame; its `save` writes .ply, .glb, .obj, .csv or .npz."""
+        """Return the hidden surface as a mesh in the wall frame; its `save` writes .ply, .glb,
+        .obj, .csv or .npz.
+        """
         return mesh_from_depth(self.depth_m, self.box, self.uncertainty_m)
 
     @property
@@ -103,11 +112,12 @@ class Glimpse:
 
 
 class Stream:
-    """Frames of a camera with their results. Entering starts the camera; leaving stops it, also after an error.
+    """Frames of a camera with their results. Entering starts the camera; leaving stops it, also
+    after an error.
 
-    Iterate from one thread while entered; a second loop continues with the next frames. A live camera does not wait: if
-    frames come faster than they are taken, the oldest are dropped and counted. A recording waits and loses none. Raises
-    the camera's errors.
+    Iterate from one thread while entered; a second loop continues with the next frames. A live
+    camera does not wait: if frames come faster than they are taken, the oldest are dropped and
+    counted. A recording waits and loses none. Raises the camera's errors.
     """
 
     def __init__(
@@ -122,9 +132,12 @@ class Stream:
         self.camera = camera
         self.notes = notes
         """Mismatches between networks and bench: expect larger errors if there are any."""
-        self._pipeline, self._lossless, self._clock = pipeline, lossless, clock
+        self._pipeline = pipeline
+        self._lossless = lossless
+        self._clock = clock
         self._box = object_box(self.rig)
-        self._statistics, self._entered = RunStatistics(), ExitStack()
+        self._statistics = RunStatistics()
+        self._entered = ExitStack()
         self._reader: FrameReader | None = None
 
     @property
@@ -148,11 +161,16 @@ class Stream:
             abandon_source=lambda: camera.__exit__(None, None, None),
         )
         self._reader = self._entered.enter_context(reader)
-        self._results = iterate_results(reader, self._pipeline, self._clock, self._statistics.fail, telemetry)
+        self._results = iterate_results(
+            reader, self._pipeline, self._clock, self._statistics.fail, telemetry
+        )
         return self
 
     def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
     ) -> None:
         self._entered.__exit__(kind, error, trace)
 
@@ -161,7 +179,9 @@ class Stream:
 
     def __next__(self) -> Glimpse:
         if self._reader is None:
-            raise NlosCamError("the camera has not been started: loop inside `with nlos_cam.open(...) as stream:`")
+            raise NlosCamError(
+                "the camera has not been started: loop inside `with nlos_cam.open(...) as stream:`"
+            )
         return Glimpse(next(self._results), self._box)
 
 
@@ -174,19 +194,24 @@ def open_stream(
     on_progress: OnProgress | None = None,
     clock: reconstruct.Clock = time.time,
 ) -> Stream:
-    """Open a camera and load the networks, without starting the camera yet; call it as `nlos_cam.open`.
+    """Open a camera and load the networks, without starting the camera yet; call it as
+    `nlos_cam.open`.
 
-    `uri` is `l515`, `l515:SERIAL`, `sim`, `sim:bare-wall`, `sim:scene.toml` or `bag:run.bag`; `wall` a record of
-    `calibrate --wall`, `weights` a folder of other weights than the shipped ones; maps are the mean of the last
-    `average` frames. `on_progress` is called while a simulated scene is pre-rendered, which takes time on its first
-    run. Raises the errors of `nlos_cam.errors`; RecordFileError and CalibrationError for the wall, CheckpointError for
-    the weights.
+    `uri` is `l515`, `l515:SERIAL`, `sim`, `sim:bare-wall`, `sim:scene.toml` or `bag:run.bag`;
+    `wall` a record of `calibrate --wall`, `weights` a folder of other weights than the shipped
+    ones; maps are the mean of the last `average` frames. `on_progress` is called while a simulated
+    scene is pre-rendered, which takes time on its first run. Raises the errors of
+    `nlos_cam.errors`; RecordFileError and CalibrationError for the wall, CheckpointError for the
+    weights.
     """
     camera = open_camera(uri, on_progress=on_progress)
     bench = reconstruct.open_bench(Path(wall) if wall else None, camera)
     folder = Path(weights) if weights else None
-    network, uncertainty_model = reconstruct.load_networks(folder), reconstruct.load_uncertainty(folder)
-    pipeline = reconstruct.build_pipeline(bench, network, average, uncertainty_model=uncertainty_model)
+    network = reconstruct.load_networks(folder)
+    uncertainty_model = reconstruct.load_uncertainty(folder)
+    pipeline = reconstruct.build_pipeline(
+        bench, network, average, uncertainty_model=uncertainty_model
+    )
     warm_up(camera, pipeline)
     notes = tuple(reconstruct.compatibility_warnings(bench, network.record, uncertainty_model))
     return Stream(camera, pipeline, lossless=uri.startswith("bag:"), notes=notes, clock=clock)

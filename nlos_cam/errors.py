@@ -1,23 +1,25 @@
-"""Tree of the errors that nlos-cam raises on purpose, with exit codes and an example message of each.
+"""Tree of the errors that nlos-cam raises on purpose, with exit codes and an example message of
+each.
 
-    NlosCamError                     exit 1   root; one clear line: what was wrong, the value, what to do
-    ├── SceneError (ValueError)      exit 1   a scene, object or accuracy that cannot be rendered
-    │   ├── SceneFileError           exit 4   a scene, mesh or depth map that is missing or unreadable
-    │   └── UnknownNameError         exit 2   no object, scene or setting of that name
+    NlosCamError                     exit 1   root; one clear line: what was wrong, the value, what
+    to do ├── SceneError (ValueError)      exit 1   a scene, object or accuracy that cannot be
+    rendered │   ├── SceneFileError           exit 4   a scene, mesh or depth map that is missing or
+    unreadable │   └── UnknownNameError         exit 2   no object, scene or setting of that name
     ├── BudgetError (ValueError)     exit 1   a latency budget that no setting meets on this machine
-    ├── OutputExistsError (FileExistsError)  exit 1   --out exists and --overwrite was not given
-    ├── DiskFullError (OSError)      exit 1   too little disk space for the output, or none left
-    ├── FolderBusyError (BlockingIOError)  exit 1   another process writes to the folder
-    ├── WorkersLostError (ChildProcessError)  exit 1   worker processes that cannot start, or that keep dying
-    ├── CameraError (OSError)        exit 3   a device that is missing or does not respond as it should
-    │   ├── CameraNotFoundError      exit 3   no such device
-    │   │   └── UnknownCameraError   exit 2   a mistyped name of a camera
-    │   └── CameraLostError          exit 3   a device that vanished or went silent while in use
-    └── RecordingError (OSError)     exit 4   a recording, dataset or record that cannot be read
+    ├── OutputExistsError (FileExistsError)  exit 1   --out exists and --overwrite was not given ├──
+    DiskFullError (OSError)      exit 1   too little disk space for the output, or none left ├──
+    FolderBusyError (BlockingIOError)  exit 1   another process writes to the folder ├──
+    WorkersLostError (ChildProcessError)  exit 1   worker processes that cannot start, or that keep
+    dying ├── CameraError (OSError)        exit 3   a device that is missing or does not respond as
+    it should │   ├── CameraNotFoundError      exit 3   no such device │   │   └──
+    UnknownCameraError   exit 2   a mistyped name of a camera │   └── CameraLostError          exit
+    3   a device that vanished or went silent while in use └── RecordingError (OSError)     exit 4
+    a recording, dataset or record that cannot be read
         └── StreamMissingError       exit 4   a readable recording without a stream that is needed
 
-OutputExistsError is also the one of `nlos_models`, which atomic writes raise: to catch both, name that one.
-`nlos_calibration.errors` and `nlos_models.errors` hold their packages' roots; the command line catches all three.
+OutputExistsError is also the one of `nlos_models`, which atomic writes raise: to catch both, name
+that one. `nlos_calibration.errors` and `nlos_models.errors` hold their packages' roots; the command
+line catches all three.
 """
 
 from collections.abc import Iterable
@@ -32,11 +34,15 @@ class NlosCamError(Exception):
 
 
 class SceneError(NlosCamError, ValueError):
-    """Scene, object or accuracy that cannot be rendered: "no object 'cupp': did you mean 'cup'?"."""
+    """Scene, object or accuracy that cannot be rendered: "no object 'cupp': did you mean
+    'cup'?".
+    """
 
 
 class SceneFileError(SceneError):
-    """Scene, mesh or depth-map file that is missing or unreadable: "a.toml is a wall record, not a scene"."""
+    """Scene, mesh or depth-map file that is missing or unreadable: "a.toml is a wall record, not a
+    scene".
+    """
 
     exit_code = 4
 
@@ -48,33 +54,47 @@ class UnknownNameError(SceneError):
 
 
 class BudgetError(NlosCamError, ValueError):
-    """Latency budget that no setting meets on this machine: "--budget-ms 5: the fastest setting takes 9.1 ms"."""
+    """Latency budget that no setting meets on this machine: "--budget-ms 5: the fastest setting
+    takes 9.1 ms".
+    """
 
 
 class OutputExistsError(NlosCamError, models.OutputExistsError):
-    """Output path that exists: "run.bag exists: choose another name, or add --overwrite to replace it"."""
+    """Output path that exists: "run.bag exists: choose another name, or add --overwrite to replace
+    it".
+    """
 
 
 class DiskFullError(NlosCamError, OSError):
-    """Disk with too little free space: "run.json cannot be written (No space left on device): free some space"."""
+    """Disk with too little free space: "run.json cannot be written (No space left on device): free
+    some space".
+    """
 
 
 class FolderBusyError(NlosCamError, BlockingIOError):
-    """Folder that another process writes to: "data is being written by another build: wait until it has ended"."""
+    """Folder that another process writes to: "data is being written by another build: wait until it
+    has ended".
+    """
 
 
 class WorkersLostError(NlosCamError, ChildProcessError):
-    """Worker processes that cannot start, or keep dying: "a worker exited (code -9) before producing objects"."""
+    """Worker processes that cannot start, or keep dying: "a worker exited (code -9) before
+    producing objects".
+    """
 
 
 class CameraError(NlosCamError, OSError):
-    """Camera that does not respond as it should: "l515 does not start (busy): close other programs that use it"."""
+    """Camera that does not respond as it should: "l515 does not start (busy): close other programs
+    that use it".
+    """
 
     exit_code = 3
 
 
 class CameraNotFoundError(CameraError):
-    """Camera that is not connected: "no L515 found (librealsense sees no device): check the USB 3 cable and port"."""
+    """Camera that is not connected: "no L515 found (librealsense sees no device): check the USB 3
+    cable and port".
+    """
 
 
 class UnknownCameraError(CameraNotFoundError):
@@ -84,17 +104,23 @@ class UnknownCameraError(CameraNotFoundError):
 
 
 class CameraLostError(CameraError):
-    """Camera that vanished or went silent while in use: "l515 did not stop within 5 s: replug it"."""
+    """Camera that vanished or went silent while in use: "l515 did not stop within 5 s: replug
+    it".
+    """
 
 
 class RecordingError(NlosCamError, OSError):
-    """Recording, dataset or record that cannot be read: "run.bag is damaged (no index): run `nlos-cam repair`"."""
+    """Recording, dataset or record that cannot be read: "run.bag is damaged (no index): run
+    `nlos-cam repair`".
+    """
 
     exit_code = 4
 
 
 class StreamMissingError(RecordingError):
-    """Recording without a stream that is needed: "run.bag has no infrared stream (it has color, depth)"."""
+    """Recording without a stream that is needed: "run.bag has no infrared stream (it has color,
+    depth)".
+    """
 
 
 def did_you_mean(name: str, names: Iterable[str]) -> str:

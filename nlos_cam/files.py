@@ -1,4 +1,6 @@
-"""Atomic writes of results (see also nlos_models.files), and the location of the cache directory."""
+"""Atomic writes of results (see also nlos_models.files), and the location of the cache
+directory.
+"""
 
 import ctypes
 import os
@@ -11,20 +13,32 @@ from nlos_models import FileBusyError, atomic_file, claim, load_cached, reservat
 
 from nlos_cam.errors import OutputExistsError
 
-__all__ = ["FileBusyError", "atomic_directory", "atomic_file", "cache_folder", "claim", "load_cached", "reservations"]
-AT_FDCWD, RENAME_EXCHANGE = -100, 2
+__all__ = [
+    "FileBusyError",
+    "atomic_directory",
+    "atomic_file",
+    "cache_folder",
+    "claim",
+    "load_cached",
+    "reservations",
+]
+AT_FDCWD = -100
+RENAME_EXCHANGE = 2
 """Of Linux' renameat2."""
 
 
 @contextmanager
 def atomic_directory(out: Path) -> Generator[Path]:
-    """Yield an empty directory; on success flush it to disk and let it take the place of `out` in one rename.
+    """Yield an empty directory; on success flush it to disk and let it take the place of `out` in
+    one rename.
 
-    Entries of `out` with other names stay. Raises OutputExistsError where `out` is a file, or appeared meanwhile, and
-    FileBusyError while another process writes it.
+    Entries of `out` with other names stay. Raises OutputExistsError where `out` is a file, or
+    appeared meanwhile, and FileBusyError while another process writes it.
     """
     if out.exists() and not out.is_dir():
-        raise OutputExistsError(f"{out} is a file, but --out must be a directory: choose another name")
+        raise OutputExistsError(
+            f"{out} is a file, but --out must be a directory: choose another name"
+        )
     out, existed = out.resolve(), out.exists()
     with claim(out) as folder:
         part = folder / out.name
@@ -52,7 +66,9 @@ def _rename_new(part: Path, out: Path) -> None:
     except OSError as error:
         if not out.exists():
             raise
-        raise OutputExistsError(f"{out} appeared while it was being written: choose another name") from error
+        raise OutputExistsError(
+            f"{out} appeared while it was being written: choose another name"
+        ) from error
 
 
 def _replace_directory(part: Path, out: Path, folder: Path) -> None:
@@ -61,14 +77,18 @@ def _replace_directory(part: Path, out: Path, folder: Path) -> None:
     fixed = Path.cwd().is_relative_to(out) or any(entry.is_mount() for entry in (out, *others))
     if not fixed and _link_all(others, part) and _exchange(part, out):
         return
-    for name in replaced:  # entry by entry where the directory itself has to stay, or the system cannot exchange two
+    for name in (
+        replaced
+    ):  # entry by entry where the directory itself has to stay, or the system cannot exchange two
         if (out / name).is_dir():
             (out / name).rename(folder / f"old {name}")
         (part / name).replace(out / name)
 
 
 def _link_all(entries: list[Path], target: Path) -> bool:
-    """Link entries into a second directory, so that either is whole; return False where the file system cannot."""
+    """Link entries into a second directory, so that either is whole; return False where the file
+    system cannot.
+    """
     try:
         for entry in entries:
             if entry.is_dir() and not entry.is_symlink():

@@ -10,8 +10,9 @@ T = TypeVar("T")
 class BoundedQueue(Generic[T]):
     """Bounded queue between threads; with a capacity of 1, a slot for the newest item.
 
-    `put` drops the oldest item of a full queue; a producer that must lose none calls `wait_for_room` first. The
-    producer ends the queue with `finish`, the consumer with `close`. Every method may be called from any thread.
+    `put` drops the oldest item of a full queue; a producer that must lose none calls
+    `wait_for_room` first. The producer ends the queue with `finish`, the consumer with `close`.
+    Every method may be called from any thread.
     """
 
     def __init__(self, capacity: int) -> None:
@@ -38,7 +39,9 @@ class BoundedQueue(Generic[T]):
             )
 
     def put(self, item: T) -> T | None:
-        """Append an item, and return the one that it pushed out of a full queue; without effect once ended."""
+        """Append an item, and return the one that it pushed out of a full queue; without effect
+        once ended.
+        """
         with self.changed:
             if self.finished or self.closed:
                 return None
@@ -48,12 +51,20 @@ class BoundedQueue(Generic[T]):
             return dropped
 
     def wait_for_item(self, timeout_s: float | None = None) -> bool:
-        """Wait until an item can be taken, or the queue has ended; return False after the timeout."""
+        """Wait until an item can be taken, or the queue has ended; return False after the
+        timeout.
+        """
         with self.changed:
-            return bool(self.changed.wait_for(lambda: self._items or self.finished or self.closed, timeout_s))
+            return bool(
+                self.changed.wait_for(
+                    lambda: self._items or self.finished or self.closed, timeout_s
+                )
+            )
 
     def take(self, timeout_s: float | None = None) -> T | None:
-        """Return the oldest item; None after the timeout or once ended. Raise the producer's error after its items."""
+        """Return the oldest item; None after the timeout or once ended. Raise the producer's error
+        after its items.
+        """
         with self.changed:
             if self.wait_for_item(timeout_s) and self._items:
                 self.changed.notify_all()
@@ -63,9 +74,12 @@ class BoundedQueue(Generic[T]):
             return None
 
     def finish(self, error: BaseException | None = None) -> None:
-        """Accept no more items, optionally because of an error; those that wait can still be taken."""
+        """Accept no more items, optionally because of an error; those that wait can still be
+        taken.
+        """
         with self.changed:
-            self.finished, self._error = True, self._error or error
+            self.finished = True
+            self._error = self._error or error
             self.changed.notify_all()
 
     def close(self) -> None:
@@ -77,7 +91,9 @@ class BoundedQueue(Generic[T]):
 
 
 class LatestValue(Generic[T]):
-    """Slot for the newest value, watched by any number of readers: slow ones skip values, writers never wait."""
+    """Slot for the newest value, watched by any number of readers: slow ones skip values, writers
+    never wait.
+    """
 
     def __init__(self) -> None:
         self._changed = Condition()
@@ -91,7 +107,8 @@ class LatestValue(Generic[T]):
 
     def put(self, value: T) -> None:
         with self._changed:
-            self._value, self._count = value, self._count + 1
+            self._value = value
+            self._count = self._count + 1
             self._changed.notify_all()
 
     def close(self) -> None:
@@ -101,7 +118,9 @@ class LatestValue(Generic[T]):
             self._changed.notify_all()
 
     def after(self, count: int, timeout_s: float) -> tuple[int, T] | None:
-        """Return the newest value and its count, once that exceeds `count`; None if closed or after the timeout."""
+        """Return the newest value and its count, once that exceeds `count`; None if closed or after
+        the timeout.
+        """
         with self._changed:
             self._changed.wait_for(lambda: self._closed or self._count > count, timeout_s)
             if self._closed or self._count <= count or self._value is None:
@@ -109,7 +128,9 @@ class LatestValue(Generic[T]):
             return self._count, self._value
 
     def fresh(self, count: int, patience_s: float, timeout_s: float) -> tuple[int, T] | None:
-        """Return the next value rather than the present one, if it comes within `patience_s`; else as `after`."""
+        """Return the next value rather than the present one, if it comes within `patience_s`; else
+        as `after`.
+        """
         with self._changed:
             present = self._count
             if present > count:
