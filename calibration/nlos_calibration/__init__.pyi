@@ -90,7 +90,15 @@ from .board_pose import PrintErrors, fit_board
 from .board_wall import BoardRecord, BoardView, CameraErrors, WallByBoard, wall_with_board
 from .drift import WINDOW_FRAMES, Drift, DriftCheck, settings_changed
 from .geometry import Intrinsics, facing_angle_rad, normal_from_angles, wall_from_plane
-from .noise import INTERVAL_STDS, QUANTUM_M, DepthMean, MeanNoise, depth_noise_m, with_degrees, with_mm
+from .noise import (
+    INTERVAL_STDS,
+    QUANTUM_M,
+    DepthMean,
+    MeanNoise,
+    depth_noise_m,
+    with_degrees,
+    with_mm,
+)
 from .occluder import OccluderFit, find_occluder
 from .range_offset import fit_with_tape_distance
 from .reference import FULL_SCALE, BareWall, BareWallStatistics, Moments, save_reference
@@ -113,7 +121,15 @@ from .rig import (
     read_toml,
     record_kind,
 )
-from .rig_check import GAP_RANGE_M, MAP_SHAPE, corner_rays, footprint, lidar_visible_share, on_plane, rig_difference
+from .rig_check import (
+    GAP_RANGE_M,
+    MAP_SHAPE,
+    corner_rays,
+    footprint,
+    lidar_visible_share,
+    on_plane,
+    rig_difference,
+)
 from .summary import board_agreement, wall_facts
 from .wall import (
     DISTANCE_RANGE_M,

@@ -1,10 +1,11 @@
 """Printed ChArUco board on the wall: dimensions, pattern, and its corners in an image.
 
-Board frame: origin at the pattern's upper left corner, x to the right, y down, z into the paper, as in OpenCV.
+Board frame: origin at the pattern's upper left corner, x to the right, y down, z into the paper, as
+in OpenCV.
 
-Corners are detected once in the mean of many frames, not as the mean of many detections: the noise falls equally, dim
-corners appear that no single frame shows, and sampling errors of the pixels stay visible in the residuals, where many
-detections would repeat them.
+Corners are detected once in the mean of many frames, not as the mean of many detections: the noise
+falls equally, dim corners appear that no single frame shows, and sampling errors of the pixels stay
+visible in the residuals, where many detections would repeat them.
 """
 
 from dataclasses import dataclass
@@ -22,7 +23,11 @@ from nlos_calibration.rig import Positive, Record
 Dictionary = Literal["DICT_4X4_50", "DICT_4X4_100", "DICT_4X4_250"]
 Paper = Literal["a4", "a3", "letter"]
 
-PAPER_MM: dict[Paper, tuple[float, float]] = {"a4": (210.0, 297.0), "a3": (297.0, 420.0), "letter": (215.9, 279.4)}
+PAPER_MM: dict[Paper, tuple[float, float]] = {
+    "a4": (210.0, 297.0),
+    "a3": (297.0, 420.0),
+    "letter": (215.9, 279.4),
+}
 
 
 class Board(Record):
@@ -39,9 +44,13 @@ class Board(Record):
     def _printable(self) -> Self:
         if self.marker_mm >= self.square_mm:
             raise ValueError("a board needs marker_mm < square_mm: markers stand in white squares")
-        markers, known = self.squares_x * self.squares_y // 2, len(self.opencv_dictionary.bytesList)
+        markers = self.squares_x * self.squares_y // 2
+        known = len(self.opencv_dictionary.bytesList)
         if markers > known:
-            raise ValueError(f"{self.squares_x} x {self.squares_y} squares need {markers} markers, there are {known}")
+            raise ValueError(
+                f"{self.squares_x} x {self.squares_y} squares need {markers} markers, there are"
+                f" {known}"
+            )
         return self
 
     @property
@@ -53,7 +62,9 @@ class Board(Record):
     def opencv_board(self) -> cv2.aruco.CharucoBoard:
         """Board for OpenCV, in metres."""
         size = self.squares_x, self.squares_y
-        return cv2.aruco.CharucoBoard(size, self.square_mm * 1e-3, self.marker_mm * 1e-3, self.opencv_dictionary)
+        return cv2.aruco.CharucoBoard(
+            size, self.square_mm * 1e-3, self.marker_mm * 1e-3, self.opencv_dictionary
+        )
 
     @property
     def size_mm(self) -> tuple[float, float]:
@@ -68,21 +79,30 @@ class Board(Record):
     def measured(self, square_mm: float) -> "Board":
         """Return the same board with squares that measure `square_mm` on paper."""
         return self.model_copy(
-            update={"square_mm": square_mm, "marker_mm": self.marker_mm * square_mm / self.square_mm}
+            update={
+                "square_mm": square_mm,
+                "marker_mm": self.marker_mm * square_mm / self.square_mm,
+            }
         )
 
     def pattern(self, pixels_per_square: int) -> UInt8:
-        """Return the pattern without margin (squares_y k, squares_x k), 0 is black; each square has k x k pixels."""
+        """Return the pattern without margin (squares_y k, squares_x k), 0 is black; each square has
+        k x k pixels.
+        """
         size = self.squares_x * pixels_per_square, self.squares_y * pixels_per_square
         return np.asarray(self.opencv_board.generateImage(size), np.uint8)
 
 
 BOARDS: dict[Paper, Board] = {
     "a4": Board(squares_x=6, squares_y=9, square_mm=30.0, marker_mm=22.5),
-    "a3": Board(squares_x=9, squares_y=13, square_mm=30.0, marker_mm=22.5, dictionary="DICT_4X4_100"),
+    "a3": Board(
+        squares_x=9, squares_y=13, square_mm=30.0, marker_mm=22.5, dictionary="DICT_4X4_100"
+    ),
     "letter": Board(squares_x=6, squares_y=8, square_mm=30.0, marker_mm=22.5),
 }
-"""Squares of 30 mm: larger ones leave too few corners in view at 0.15 m, the laser spot blurs smaller ones."""
+"""Squares of 30 mm: larger ones leave too few corners in view at 0.15 m, the laser spot blurs
+smaller ones.
+"""
 
 
 Light = Literal["infrared", "colour"]
@@ -90,11 +110,17 @@ Light = Literal["infrared", "colour"]
 MIN_CORNERS = 8
 """With fewer corners, the residuals hardly test the pose."""
 BRIGHTEST_QUANTILE = 0.9995
-CONTRAST_LIMIT, CONTRAST_TILES = 4.0, (8, 8)
+CONTRAST_LIMIT = 4.0
+CONTRAST_TILES = (8, 8)
 REMEDIES: dict[Light, str] = {
-    "infrared": "place it where the view is bright, print it with toner (dye ink is white in infrared), and lower the "
-    "laser power if it is washed out",
-    "colour": "place it in the view of the colour camera too, and light the room evenly, without gloss on the paper",
+    "infrared": (
+        "place it where the view is bright, print it with toner (dye ink is white in infrared), and"
+        " lower the laser power if it is washed out"
+    ),
+    "colour": (
+        "place it in the view of the colour camera too, and light the room evenly, without gloss on"
+        " the paper"
+    ),
 }
 """Advice where no marker is read."""
 
@@ -109,8 +135,11 @@ class Corners:
     """(n, 2); x, y in pixel centres."""
 
 
-def find_corners(image: NDArray[np.floating] | UInt8, board: Board, light: Light = "infrared") -> Corners:
-    """Detect the corners of `board` in an image (height, width) of any gain; `light` selects the advice in an error.
+def find_corners(
+    image: NDArray[np.floating] | UInt8, board: Board, light: Light = "infrared"
+) -> Corners:
+    """Detect the corners of `board` in an image (height, width) of any gain; `light` selects the
+    advice in an error.
 
     Raises BoardRefusedError where fewer than MIN_CORNERS are found, or where the image is mirrored.
     """
@@ -119,12 +148,16 @@ def find_corners(image: NDArray[np.floating] | UInt8, board: Board, light: Light
     if len(corners.ids) >= MIN_CORNERS:
         return corners
     if len(_detect(np.ascontiguousarray(even[:, ::-1]), board)[0].ids) >= MIN_CORNERS:
-        raise BoardRefusedError("the board is mirrored: flip the image, or print the board without mirroring")
+        raise BoardRefusedError(
+            "the board is mirrored: flip the image, or print the board without mirroring"
+        )
     raise BoardRefusedError(_too_few(len(corners.ids), markers, board, light))
 
 
 def even_contrast(image: NDArray[np.floating] | UInt8) -> UInt8:
-    """Return the image (height, width) in 8 bits with its local contrast equalised (CLAHE): dim parts become clear."""
+    """Return the image (height, width) in 8 bits with its local contrast equalised (CLAHE): dim
+    parts become clear.
+    """
     brightest = float(np.quantile(image, BRIGHTEST_QUANTILE))
     fine = np.clip(image / max(brightest, 1e-9) * 65535.0, 0.0, 65535.0).astype(np.uint16)
     even = np.asarray(cv2.createCLAHE(CONTRAST_LIMIT, CONTRAST_TILES).apply(fine), np.uint16)
@@ -138,7 +171,10 @@ def _detect(image: UInt8, board: Board) -> tuple[Corners, int]:
     count = 0 if markers is None else len(markers)
     if ids is None:
         return Corners(np.zeros(0, np.int64), np.zeros((0, 2))), count
-    return Corners(np.asarray(ids, np.int64).ravel(), np.asarray(pixels, np.float64).reshape(-1, 2)), count
+    return (
+        Corners(np.asarray(ids, np.int64).ravel(), np.asarray(pixels, np.float64).reshape(-1, 2)),
+        count,
+    )
 
 
 def _too_few(corners: int, markers: int, board: Board, light: Light) -> str:
@@ -146,6 +182,6 @@ def _too_few(corners: int, markers: int, board: Board, light: Light) -> str:
     if markers == 0:
         return f"no board of {size} is visible in {light}: {REMEDIES[light]}"
     return (
-        f"{corners} corners of a board of {size} are visible ({markers} markers), {MIN_CORNERS} needed: move more of "
-        "it to the near, bright side of the view, or average more frames"
+        f"{corners} corners of a board of {size} are visible ({markers} markers), {MIN_CORNERS}"
+        " needed: move more of it to the near, bright side of the view, or average more frames"
     )

@@ -1,9 +1,11 @@
-"""Plane of a printed board from its corners in an image, with covariance; or a refusal with its reason.
+"""Plane of a printed board from its corners in an image, with covariance; or a refusal with its
+reason.
 
-The pose is found by least squares over the corners, together with the errors of printer and glue: a print that is 0.2 %
-too wide for its height turns the plane by 0.2 degrees, one whose middle stands 0.5 mm off the wall shifts it by 1 mm.
-So stretch and bows are unknowns too, each with a prior of its expected size. The plane is expressed as slopes =
--normal / distance_m, like the depth's; its covariance adds that of the print's scale, which no image shows.
+The pose is found by least squares over the corners, together with the errors of printer and glue: a
+print that is 0.2 % too wide for its height turns the plane by 0.2 degrees, one whose middle stands
+0.5 mm off the wall shifts it by 1 mm. So stretch and bows are unknowns too, each with a prior of
+its expected size. The plane is expressed as slopes = -normal / distance_m, like the depth's; its
+covariance adds that of the print's scale, which no image shows.
 """
 
 from dataclasses import dataclass, replace
@@ -23,7 +25,8 @@ UNKNOWNS = 9
 AMBIGUOUS_CHI2 = 25.0
 """A second pose is excluded only if it is worse by five standard deviations."""
 SAME_NORMAL_DEG = 0.5
-MAX_STEPS, SETTLED = 50, 1e-10
+MAX_STEPS = 50
+SETTLED = 1e-10
 
 
 @dataclass(frozen=True)
@@ -39,7 +42,9 @@ class CornerObservations:
     size_m: Float64
     """(2,); width and height of the drawing."""
     print_std: Float64
-    """(3,); standard deviations of the print's stretch (width over height) and of its bows along x and y (m)."""
+    """(3,); standard deviations of the print's stretch (width over height) and of its bows along x
+    and y (m).
+    """
     variance_px2: float
     """Variance of a coordinate."""
 
@@ -63,11 +68,16 @@ class BoardPose:
         return cv2.Rodrigues(self.parameters[:3])[0][:, 2].astype(np.float64)
 
     def slopes(self) -> tuple[Float64, Float64]:
-        """Return the slopes n / (n . t) of the plane with normal n through t, and their covariance."""
+        """Return the slopes n / (n . t) of the plane with normal n through t, and their
+        covariance.
+        """
         # with h = n . t: d slopes / d n = I / h - n t' / h^2, d slopes / d t = -n n' / h^2
         by_turn = cv2.Rodrigues(self.parameters[:3])[1]
-        normal, shift = self.normal, self.parameters[3:6]
-        normal_by_turn = by_turn.reshape(3, 3, 3)[:, :, 2].T  # OpenCV: d matrix[i, j] / d turn[k] at [k, 3 i + j]
+        normal = self.normal
+        shift = self.parameters[3:6]
+        normal_by_turn = by_turn.reshape(3, 3, 3)[
+            :, :, 2
+        ].T  # OpenCV: d matrix[i, j] / d turn[k] at [k, 3 i + j]
         height = float(normal @ shift)
         by_normal = (np.eye(3) - np.outer(normal, shift) / height) / height
         by_pose = np.hstack([by_normal @ normal_by_turn, -np.outer(normal, normal) / height**2])
@@ -75,26 +85,36 @@ class BoardPose:
 
 
 def solve_pose(corners: CornerObservations) -> BoardPose:
-    """Return the better of the two poses of a distant plane. Raises BoardRefusedError if both fit equally well."""
-    # A homography of weak perspective has two poses, mirror images about the line of sight; IPPE (Collins and Bartoli,
-    # 2014) returns both. Each is refined, and the second must be excluded by its residuals.
+    """Return the better of the two poses of a distant plane. Raises BoardRefusedError if both fit
+    equally well.
+    """
+    # A homography of weak perspective has two poses, mirror images about the line of sight; IPPE
+    # (Collins and Bartoli, 2014) returns both. Each is refined, and the second must be excluded by
+    # its residuals.
     _, turns, shifts, _ = cv2.solvePnPGeneric(
         corners.points_m, corners.pixels, corners.camera, None, flags=cv2.SOLVEPNP_IPPE
     )
-    starts = [np.append(np.concatenate([turn, shift]), np.zeros(3)) for turn, shift in zip(turns, shifts, strict=True)]
-    best, *others = sorted((refine_pose(corners, one.astype(np.float64)) for one in starts), key=lambda pose: pose.chi2)
+    starts = [
+        np.append(np.concatenate([turn, shift]), np.zeros(3))
+        for turn, shift in zip(turns, shifts, strict=True)
+    ]
+    best, *others = sorted(
+        (refine_pose(corners, one.astype(np.float64)) for one in starts), key=lambda pose: pose.chi2
+    )
     for other in others:
         apart_deg = degrees(np.arccos(np.clip(float(best.normal @ other.normal), -1.0, 1.0)))
         if apart_deg > SAME_NORMAL_DEG and other.chi2 - best.chi2 < AMBIGUOUS_CHI2:
             raise BoardRefusedError(
-                f"two poses, {apart_deg:.0f} degrees apart, explain the board equally well: bring it closer, or use a "
-                "larger one"
+                f"two poses, {apart_deg:.0f} degrees apart, explain the board equally well: bring"
+                " it closer, or use a larger one"
             )
     return best
 
 
 def refine_pose(corners: CornerObservations, parameters: Float64) -> BoardPose:
-    """Refine `parameters` (9,) by Gauss-Newton steps, damped where they do not improve (Levenberg-Marquardt)."""
+    """Refine `parameters` (9,) by Gauss-Newton steps, damped where they do not improve
+    (Levenberg-Marquardt).
+    """
     rows, errors = _linear(corners, parameters)
     damping = 0.0
     for _ in range(MAX_STEPS):
@@ -105,37 +125,56 @@ def refine_pose(corners: CornerObservations, parameters: Float64) -> BoardPose:
         if gain < 0.0:
             damping = max(10.0 * damping, 1e-3)
             continue
-        parameters, rows, errors, damping = parameters + step, new_rows, new_errors, 0.1 * damping
+        parameters = parameters + step
+        rows = new_rows
+        errors = new_errors
+        damping = 0.1 * damping
         if gain <= SETTLED * float(errors @ errors):
             break
     errors_px = errors[:-3].reshape(-1, 2) * sqrt(corners.variance_px2)
-    return BoardPose(parameters, errors_px, float(errors @ errors), np.linalg.inv(rows.T @ rows).astype(np.float64))
+    return BoardPose(
+        parameters,
+        errors_px,
+        float(errors @ errors),
+        np.linalg.inv(rows.T @ rows).astype(np.float64),
+    )
 
 
 def _linear(corners: CornerObservations, parameters: Float64) -> tuple[Float64, Float64]:
-    """Return Jacobian (2 n + 3, 9) and residuals (2 n + 3,) at the parameters, in standard deviations."""
-    # The chain rule takes print errors to pixels: a corner moved by dp on the board moves by R dp in the camera, as a
-    # translation would, whose pixel derivative OpenCV returns. Three more rows are the priors: stretch and bows are 0
-    # within `print_std`.
+    """Return Jacobian (2 n + 3, 9) and residuals (2 n + 3,) at the parameters, in standard
+    deviations.
+    """
+    # The chain rule takes print errors to pixels: a corner moved by dp on the board moves by R dp
+    # in the camera, as a translation would, whose pixel derivative OpenCV returns. Three more rows
+    # are the priors: stretch and bows are 0 within `print_std`.
     points_m, by_print = _printed(corners, parameters[6:])
-    pixels, by_pose = cv2.projectPoints(points_m, parameters[:3], parameters[3:6], corners.camera, None)[:2]
+    pixels, by_pose = cv2.projectPoints(
+        points_m, parameters[:3], parameters[3:6], corners.camera, None
+    )[:2]
     moved_m = cv2.Rodrigues(parameters[:3])[0] @ by_print
     by_print_px = (by_pose[:, 3:6].reshape(-1, 2, 3) @ moved_m).reshape(-1, 3)
     sigma_px = sqrt(corners.variance_px2)
     priors = np.hstack([np.zeros((3, 6)), np.diag(1.0 / corners.print_std)])
     rows = np.vstack([np.hstack([by_pose[:, :6], by_print_px]) / sigma_px, priors])
-    errors = np.append((corners.pixels - pixels.reshape(-1, 2)).ravel() / sigma_px, -parameters[6:] / corners.print_std)
+    errors = np.append(
+        (corners.pixels - pixels.reshape(-1, 2)).ravel() / sigma_px,
+        -parameters[6:] / corners.print_std,
+    )
     return rows.astype(np.float64), errors
 
 
 def _printed(corners: CornerObservations, deformation: Float64) -> tuple[Float64, Float64]:
-    """Return corners (n, 3) of a stretched and bowed print, and their derivatives (n, 3, 3) by stretch and bows."""
-    # x grows by exp(s / 2) and y shrinks by it, so that the area, which is the scale, stays; a bow is a parabola that
-    # is 0 at the sheet's edges and stands off the wall, against the board's z, by its height in the middle
+    """Return corners (n, 3) of a stretched and bowed print, and their derivatives (n, 3, 3) by
+    stretch and bows.
+    """
+    # x grows by exp(s / 2) and y shrinks by it, so that the area, which is the scale, stays; a bow
+    # is a parabola that is 0 at the sheet's edges and stands off the wall, against the board's z,
+    # by its height in the middle
     across, down = (2.0 * corners.points_m[:, :2] / corners.size_m - 1.0).T
     heights = np.stack([1.0 - across**2, 1.0 - down**2])
     wide = np.exp(0.5 * deformation[0])
-    x_m, y_m = wide * corners.points_m[:, 0], corners.points_m[:, 1] / wide
+    x_m = wide * corners.points_m[:, 0]
+    y_m = corners.points_m[:, 1] / wide
     points_m = np.column_stack([x_m, y_m, -deformation[1:] @ heights])
     by_print = np.zeros((len(points_m), 3, 3))
     by_print[:, :2, 0] = points_m[:, :2] * [0.5, -0.5]
@@ -143,20 +182,24 @@ def _printed(corners: CornerObservations, deformation: Float64) -> tuple[Float64
     return points_m, by_print
 
 
-OUTLIER_SIGMAS, SIGMA_FLOOR_PX = 5.0, 0.02
-MIN_SQUARES, MAGSAC_PX = 0, 1.0
+OUTLIER_SIGMAS = 5.0
+SIGMA_FLOOR_PX = 0.02
+MIN_SQUARES = 0
+MAGSAC_PX = 1.0
 MIN_GOOD_SHARE = 0.7
 """Inliers as a share of the detected corners; more outliers are no accident."""
 MAX_RESIDUAL_PX = 0.6
 """RMS of a coordinate: the corners of one dim frame stay below half of that."""
 MISFIT_CHI2 = 25.0
 """Largest advantage of a free homography over the pose, in variances."""
-MAX_STRETCH, MAX_BOW_M = 0.015, 0.0015
+MAX_STRETCH = 0.015
+MAX_BOW_M = 0.0015
 """Beyond the errors of a printer and of a sheet that was glued on."""
 MAX_ANGLE_STD_DEG = 1.0
 """Exceeded by a board seen edge on, or a few corners close together."""
 LINE_MESSAGE = (
-    "the board's corners are in a line, as of a board seen edge on, or mirrored: turn the lidar towards the wall"
+    "the board's corners are in a line, as of a board seen edge on, or mirrored: turn the lidar"
+    " towards the wall"
 )
 
 
@@ -191,12 +234,18 @@ class BoardFit:
 
 
 def fit_board(
-    corners: Corners, board: Board, intrinsics: Intrinsics, printed: PrintErrors | None = None, focal_std: float = 0.0
+    corners: Corners,
+    board: Board,
+    intrinsics: Intrinsics,
+    printed: PrintErrors | None = None,
+    focal_std: float = 0.0,
 ) -> BoardFit:
-    """Fit the plane of `board` to its corners in the image of a pinhole, in the frame of that camera.
+    """Fit the plane of `board` to its corners in the image of a pinhole, in the frame of that
+    camera.
 
-    `focal_std` is the relative uncertainty of its focal length. Raises BoardRefusedError where the corners are not
-    those of a flat print of the right proportions, and where they do not determine the plane.
+    `focal_std` is the relative uncertainty of its focal length. Raises BoardRefusedError where the
+    corners are not those of a flat print of the right proportions, and where they do not determine
+    the plane.
     """
     printed = printed or PrintErrors()
     observed = _observations(corners, board, intrinsics, printed)
@@ -210,8 +259,11 @@ def fit_board(
     _check_certain(slopes, covariance)
     return BoardFit(
         slopes=slopes,
-        # a print larger by a share moves the plane away by that share: the slopes change along themselves
-        covariance=covariance + printed.scale_std**2 * np.outer(slopes, slopes) + np.outer(by_focal, by_focal),
+        # a print larger by a share moves the plane away by that share: the slopes change along
+        # themselves
+        covariance=covariance
+        + printed.scale_std**2 * np.outer(slopes, slopes)
+        + np.outer(by_focal, by_focal),
         corners=len(observed.pixels),
         residual_px=float(np.sqrt(np.mean(pose.errors_px**2))),
         stretch=float(np.expm1(pose.parameters[6])),
@@ -219,11 +271,14 @@ def fit_board(
     )
 
 
-def _observations(corners: Corners, board: Board, intrinsics: Intrinsics, printed: PrintErrors) -> CornerObservations:
+def _observations(
+    corners: Corners, board: Board, intrinsics: Intrinsics, printed: PrintErrors
+) -> CornerObservations:
     """Return the corners that lie on one plane."""
     points_m = board.corners_m[corners.ids]
     good = _inliers(points_m, corners.pixels)
-    points_m, pixels = points_m[good], corners.pixels[good]
+    points_m = points_m[good]
+    pixels = corners.pixels[good]
     return CornerObservations(
         points_m=points_m,
         pixels=pixels,
@@ -235,14 +290,16 @@ def _observations(corners: Corners, board: Board, intrinsics: Intrinsics, printe
 
 
 def _inliers(points_m: Float64, pixels: Float64) -> Mask:
-    """Return the corners on one plane with most others: the detector now and then takes an edge for a corner."""
+    """Return the corners on one plane with most others: the detector now and then takes an edge for
+    a corner.
+    """
     errors_px = np.linalg.norm(_homography_errors_px(points_m, pixels, cv2.USAC_MAGSAC), axis=1)
     sigma_px = max(float(np.median(errors_px)) / sqrt(2.0) / MEDIAN_PER_SIGMA, SIGMA_FLOOR_PX)
     good = errors_px < OUTLIER_SIGMAS * sigma_px
     if good.sum() < max(MIN_CORNERS, MIN_GOOD_SHARE * len(good)):
         raise BoardRefusedError(
-            f"only {good.sum()} of {len(good)} corners lie on one plane: make sure that the board is flat on the wall, "
-            "and keep the lidar still"
+            f"only {good.sum()} of {len(good)} corners lie on one plane: make sure that the board"
+            " is flat on the wall, and keep the lidar still"
         )
     return good
 
@@ -252,24 +309,30 @@ def _homography_errors_px(points_m: Float64, pixels: Float64, method: int) -> Fl
     found: tuple[Any, ...] = cv2.findHomography(points_m[:, :2], pixels, method, MAGSAC_PX)
     if found[0] is None:  # OpenCV's types do not say so
         raise BoardRefusedError(LINE_MESSAGE)
-    return pixels - np.asarray(cv2.perspectiveTransform(points_m[np.newaxis, :, :2], found[0])[0], np.float64)
+    return pixels - np.asarray(
+        cv2.perspectiveTransform(points_m[np.newaxis, :, :2], found[0])[0], np.float64
+    )
 
 
 def _plane_variance_px2(points_m: Float64, pixels: Float64) -> float:
-    """Return the variance of the homography's residuals. Raises BoardRefusedError where it exceeds noise."""
+    """Return the variance of the homography's residuals. Raises BoardRefusedError where it exceeds
+    noise.
+    """
     variance_px2 = _variance_px2(_homography_errors_px(points_m, pixels, MIN_SQUARES), spent=8)
     if variance_px2 > MAX_RESIDUAL_PX**2:
         raise BoardRefusedError(
-            f"the board is not flat: its corners are {sqrt(variance_px2):.2f} pixels RMS off a plane, "
-            f"{MAX_RESIDUAL_PX:g} allowed; glue it to the wall or to a stiff plate, and keep lidar and board still"
+            f"the board is not flat: its corners are {sqrt(variance_px2):.2f} pixels RMS off a"
+            f" plane, {MAX_RESIDUAL_PX:g} allowed; glue it to the wall or to a stiff plate, and"
+            " keep lidar and board still"
         )
     return variance_px2
 
 
 def _variance_px2(errors_px: Float64, spent: int) -> float:
     """Return the variance of a coordinate from the residuals of a model with `spent` parameters."""
-    # Student's t with k degrees of freedom has the variance k / (k - 2): dividing the sum of squares by k - 2 instead
-    # of k makes normal intervals as wide as they must be where few corners estimate the noise
+    # Student's t with k degrees of freedom has the variance k / (k - 2): dividing the sum of
+    # squares by k - 2 instead of k makes normal intervals as wide as they must be where few corners
+    # estimate the noise
     return max(float((errors_px**2).sum()) / (errors_px.size - spent - 2), SIGMA_FLOOR_PX**2)
 
 
@@ -277,8 +340,12 @@ def _by_focal(corners: CornerObservations, pose: BoardPose, focal_std: float) ->
     """Return the change of the slopes (3,) for a focal length longer by its uncertainty."""
     if focal_std == 0.0:
         return np.zeros(3)
-    longer = corners.camera + np.diag(np.diag(corners.camera)) * focal_std * np.array([1.0, 1.0, 0.0])
-    return refine_pose(replace(corners, camera=longer), pose.parameters).slopes()[0] - pose.slopes()[0]
+    longer = corners.camera + np.diag(np.diag(corners.camera)) * focal_std * np.array(
+        [1.0, 1.0, 0.0]
+    )
+    return (
+        refine_pose(replace(corners, camera=longer), pose.parameters).slopes()[0] - pose.slopes()[0]
+    )
 
 
 def _check_fit(pose: BoardPose) -> None:
@@ -286,34 +353,37 @@ def _check_fit(pose: BoardPose) -> None:
     free = pose.errors_px.size - 8
     if pose.chi2 > free + MISFIT_CHI2:
         raise BoardRefusedError(
-            f"the squares do not fit: the residuals of a pose are {sqrt(pose.chi2 / free):.1f} times those of a free "
-            "plane; make sure that the print is neither stretched nor skewed, and that the intrinsics are this "
-            "camera's"
+            f"the squares do not fit: the residuals of a pose are {sqrt(pose.chi2 / free):.1f}"
+            " times those of a free plane; make sure that the print is neither stretched nor"
+            " skewed, and that the intrinsics are this camera's"
         )
 
 
 def _check_print(pose: BoardPose) -> None:
     """Raise BoardRefusedError for a stretch or bow beyond the errors of a print."""
-    stretch, bows_m = float(pose.parameters[6]), pose.parameters[7:]
+    stretch = float(pose.parameters[6])
+    bows_m = pose.parameters[7:]
     if abs(stretch) > MAX_STRETCH:
         raise BoardRefusedError(
-            f"the squares do not fit: they are {100.0 * stretch:+.1f} % wider than high; print without stretching, and "
-            "use this camera's intrinsics"
+            f"the squares do not fit: they are {100.0 * stretch:+.1f} % wider than high; print"
+            " without stretching, and use this camera's intrinsics"
         )
     if float(np.abs(bows_m).max()) > MAX_BOW_M:
         raise BoardRefusedError(
-            f"the board is not flat: its middle stands {1e3 * float(bows_m.sum()):+.1f} mm off the wall; glue it to "
-            "the wall or to a stiff plate"
+            f"the board is not flat: its middle stands {1e3 * float(bows_m.sum()):+.1f} mm off the"
+            " wall; glue it to the wall or to a stiff plate"
         )
 
 
 def _check_certain(slopes: Float64, covariance: Float64) -> None:
     """Raise BoardRefusedError if the corners leave the normal uncertain."""
-    # the normal turns by at most distance x (change of the slopes), in the direction of the largest eigenvalue
+    # the normal turns by at most distance x (change of the slopes), in the direction of the largest
+    # eigenvalue
     distance_m = 1.0 / float(np.linalg.norm(slopes))
     angle_std_deg = degrees(distance_m * sqrt(float(np.linalg.eigvalsh(covariance)[-1])))
     if angle_std_deg > MAX_ANGLE_STD_DEG:
         raise BoardRefusedError(
-            f"the board determines the wall's angle only to {angle_std_deg:.1f} degrees, {MAX_ANGLE_STD_DEG:g} needed: "
-            "it is too far away, edge on, or mostly out of view; move it to the near side of the view"
+            f"the board determines the wall's angle only to {angle_std_deg:.1f} degrees,"
+            f" {MAX_ANGLE_STD_DEG:g} needed: it is too far away, edge on, or mostly out of view;"
+            " move it to the near side of the view"
         )

@@ -1,10 +1,12 @@
-"""Wall from depth and a printed board together: one pose, one verdict, and the board's part of the record.
+"""Wall from depth and a printed board together: one pose, one verdict, and the board's part of the
+record.
 
-Infrared shares the lidar's pinhole. Another camera has a distorting lens and a pose of its own: its plane is fitted in
-its own frame, and moved to the lidar's together with its covariance.
+Infrared shares the lidar's pinhole. Another camera has a distorting lens and a pose of its own: its
+plane is fitted in its own frame, and moved to the lidar's together with its covariance.
 
-Depth and board each give slopes = -normal / distance_m (3,) with a covariance. Where they agree, they are averaged by
-weight. Where they do not, an average would be neither: one is used, and the likely causes are listed with amounts.
+Depth and board each give slopes = -normal / distance_m (3,) with a covariance. Where they agree,
+they are averaged by weight. Where they do not, an average would be neither: one is used, and the
+likely causes are listed with amounts.
 """
 
 from dataclasses import dataclass, field, replace
@@ -28,9 +30,11 @@ UNDISTORTED = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-9)
 
 @dataclass(frozen=True)
 class CameraErrors:
-    """Standard uncertainties of a color camera's calibration: assumed, since its maker publishes none.
+    """Standard uncertainties of a color camera's calibration: assumed, since its maker publishes
+    none.
 
-    Owners of the L515 saw color and depth 4 to 5 pixels apart at 4 m, which is a turn of 0.3 degrees.
+    Owners of the L515 saw color and depth 4 to 5 pixels apart at 4 m, which is a turn of 0.3
+    degrees.
     """
 
     turn_std_deg: float = 0.2
@@ -42,7 +46,9 @@ class CameraErrors:
 
 
 EXACT = CameraErrors(0.0, 0.0, 0.0)
-"""Errors of the lidar's infrared: it shares the pinhole with the depth, so that both have the same errors."""
+"""Errors of the lidar's infrared: it shares the pinhole with the depth, so that both have the same
+errors.
+"""
 
 
 @dataclass(frozen=True)
@@ -60,13 +66,19 @@ class BoardView:
     errors: CameraErrors = EXACT
 
 
-def fit_in_lidar(corners: Corners, board: Board, view: BoardView, printed: PrintErrors | None = None) -> BoardFit:
+def fit_in_lidar(
+    corners: Corners, board: Board, view: BoardView, printed: PrintErrors | None = None
+) -> BoardFit:
     """Fit the plane of `board` in the lidar frame to corners detected in the image of a view.
 
     Raises BoardRefusedError as `fit_board` does, and where the lidar would be behind the plane.
     """
-    fit = fit_board(undistorted(corners, view), board, view.intrinsics, printed, focal_std=view.errors.focal_std)
-    slopes, covariance = plane_in_lidar(fit.slopes, fit.covariance, view.lidar_from_camera, view.errors)
+    fit = fit_board(
+        undistorted(corners, view), board, view.intrinsics, printed, focal_std=view.errors.focal_std
+    )
+    slopes, covariance = plane_in_lidar(
+        fit.slopes, fit.covariance, view.lidar_from_camera, view.errors
+    )
     return replace(fit, slopes=slopes, covariance=covariance)
 
 
@@ -75,32 +87,40 @@ def undistorted(corners: Corners, view: BoardView) -> Corners:
     if not view.distortion.any():
         return corners
     points = corners.pixels.reshape(-1, 1, 2)
-    straight = cv2.undistortImagePoints(points, view.intrinsics.matrix, view.distortion, None, UNDISTORTED)
+    straight = cv2.undistortImagePoints(
+        points, view.intrinsics.matrix, view.distortion, None, UNDISTORTED
+    )
     return replace(corners, pixels=np.asarray(straight, np.float64).reshape(-1, 2))
 
 
 def plane_in_lidar(
     slopes: Float64, covariance: Float64, lidar_from_camera: Float64, errors: CameraErrors
 ) -> tuple[Float64, Float64]:
-    """Move a plane slopes . p = 1 from the camera's to the lidar's frame: slopes (3,) and covariance (3, 3).
+    """Move a plane slopes . p = 1 from the camera's to the lidar's frame: slopes (3,) and
+    covariance (3, 3).
 
     Raises BoardRefusedError where the plane runs between camera and lidar.
     """
-    # With u = R slopes and t the camera's position, p_camera = R' (p - t) gives u . (p - t) = 1, so the lidar's slopes
-    # are v = u / h with h = 1 + u . t. Derivatives: dv/du = (I - v t') / h, dv/dt = -u u' / h^2 = -v v', and a small
-    # turn w changes u by w x u. Errors of turn and position have equal, independent axes.
-    turn, place_m = lidar_from_camera[:3, :3], lidar_from_camera[:3, 3]
+    # With u = R slopes and t the camera's position, p_camera = R' (p - t) gives u . (p - t) = 1, so
+    # the lidar's slopes are v = u / h with h = 1 + u . t. Derivatives: dv/du = (I - v t') / h,
+    # dv/dt = -u u' / h^2 = -v v', and a small turn w changes u by w x u. Errors of turn and
+    # position have equal, independent axes.
+    turn = lidar_from_camera[:3, :3]
+    place_m = lidar_from_camera[:3, 3]
     turned = turn @ slopes
     height = 1.0 + float(turned @ place_m)
     if height <= 0.0:
         raise BoardRefusedError(
-            "the board's wall runs between color camera and lidar: check the pose of one to the other"
+            "the board's wall runs between color camera and lidar: check the pose of one to the"
+            " other"
         )
     moved = turned / height
     by_turned = (np.eye(3) - np.outer(moved, place_m)) / height
     x, y, z = turned
     cross = np.array([[0.0, z, -y], [-z, 0.0, x], [y, -x, 0.0]])  # d (w x u) / d w
-    by_slopes, by_angle, by_place = by_turned @ turn, by_turned @ cross, -np.outer(moved, moved)
+    by_slopes = by_turned @ turn
+    by_angle = by_turned @ cross
+    by_place = -np.outer(moved, moved)
     angle_std = radians(errors.turn_std_deg)
     return moved, (
         by_slopes @ covariance @ by_slopes.T
@@ -113,7 +133,8 @@ Used = Literal["both", "depth", "board"]
 
 AGREE_SIGMAS = 4.0
 """Chance alone puts two planes farther apart once in 900 times (chi-square of three unknowns)."""
-MAX_OFFSET_M, MAX_SCALE = 0.03, 0.2
+MAX_OFFSET_M = 0.03
+MAX_SCALE = 0.2
 """Largest plausible range offset of a lidar, and scale error of a printer."""
 
 
@@ -139,7 +160,9 @@ class UncertainPlane:
 
 @dataclass(frozen=True)
 class Disagreement:
-    """Difference of the board's plane from the depth's, with its size in joint standard uncertainties."""
+    """Difference of the board's plane from the depth's, with its size in joint standard
+    uncertainties.
+    """
 
     distance_m: float
     """The board's less the depth's."""
@@ -163,28 +186,35 @@ class Combined:
 
 
 def combine(depth: UncertainPlane, board: UncertainPlane, *, measured: bool) -> Combined:
-    """Average both planes where they agree; else use the board's if its squares were `measured`, or the depth's."""
+    """Average both planes where they agree; else use the board's if its squares were `measured`, or
+    the depth's.
+    """
     apart = disagreement(depth, board)
     if apart.sigmas <= AGREE_SIGMAS:
-        # Weighting by inverse covariances, written in Kalman's form: it needs no inverse of the depth's covariance,
-        # which may be zero.
+        # Weighting by inverse covariances, written in Kalman's form: it needs no inverse of the
+        # depth's covariance, which may be zero.
         gain = depth.covariance @ np.linalg.inv(depth.covariance + board.covariance)
         slopes = depth.slopes + gain @ (board.slopes - depth.slopes)
         average = UncertainPlane(slopes, depth.covariance - gain @ depth.covariance)
         return Combined(average, "both", apart, ())
     used: Used = "board" if measured else "depth"
-    return Combined(board if measured else depth, used, apart, _causes(depth, board, apart, measured=measured))
+    return Combined(
+        board if measured else depth, used, apart, _causes(depth, board, apart, measured=measured)
+    )
 
 
 def disagreement(depth: UncertainPlane, board: UncertainPlane) -> Disagreement:
     """Compare two planes, also in units of their joint uncertainty."""
-    # 1 / |slopes| is the distance and their direction the normal, so the part of the difference along the slopes is a
-    # change of distance, and the two parts across them are a change of angle. The null space of a row is the last
-    # right singular vectors of its decomposition.
-    difference, covariance = board.slopes - depth.slopes, board.covariance + depth.covariance
+    # 1 / |slopes| is the distance and their direction the normal, so the part of the difference
+    # along the slopes is a change of distance, and the two parts across them are a change of angle.
+    # The null space of a row is the last right singular vectors of its decomposition.
+    difference = board.slopes - depth.slopes
+    covariance = board.covariance + depth.covariance
     along = depth.distance_m * depth.slopes
     across = np.linalg.svd(along[np.newaxis])[2][1:]
-    angle_rad = np.arctan2(np.linalg.norm(np.cross(depth.normal, board.normal)), depth.normal @ board.normal)
+    angle_rad = np.arctan2(
+        np.linalg.norm(np.cross(depth.normal, board.normal)), depth.normal @ board.normal
+    )
     return Disagreement(
         distance_m=board.distance_m - depth.distance_m,
         angle_deg=degrees(angle_rad),
@@ -200,32 +230,43 @@ def _sigmas(axes: Float64, difference: Float64, covariance: Float64) -> float:
     return sqrt(max(float(off @ np.linalg.solve(axes @ covariance @ axes.T, off)), 0.0))
 
 
-def _causes(depth: UncertainPlane, board: UncertainPlane, apart: Disagreement, *, measured: bool) -> tuple[str, ...]:
-    """Return the usual causes of a disagreement that could explain this one, each with its amount."""
+def _causes(
+    depth: UncertainPlane, board: UncertainPlane, apart: Disagreement, *, measured: bool
+) -> tuple[str, ...]:
+    """Return the usual causes of a disagreement that could explain this one, each with its
+    amount.
+    """
     causes: list[str] = []
-    scale = depth.distance_m / board.distance_m  # a board's distance is proportional to the assumed size of its squares
-    offset_m = apart.distance_m / max(-float(depth.normal[2]), 1e-3)  # along the axis, longer than along the normal
+    scale = (
+        depth.distance_m / board.distance_m
+    )  # a board's distance is proportional to the assumed size of its squares
+    offset_m = apart.distance_m / max(
+        -float(depth.normal[2]), 1e-3
+    )  # along the axis, longer than along the normal
     if apart.distance_sigmas > AGREE_SIGMAS:
         if abs(scale - 1.0) <= MAX_SCALE and not measured:
             causes.append(
-                f"the print's scale: squares of {100.0 * scale:.1f} % of their size would explain the distance; "
-                "measure the printed bar and give --square-mm"
+                f"the print's scale: squares of {100.0 * scale:.1f} % of their size would explain"
+                " the distance; measure the printed bar and give --square-mm"
             )
         if abs(offset_m) <= MAX_OFFSET_M:
             causes.append(
-                f"the lidar's range offset: {1e3 * offset_m:+.1f} mm along its axis would explain the distance; "
-                "measure with a tape and give --tape-m"
+                f"the lidar's range offset: {1e3 * offset_m:+.1f} mm along its axis would explain"
+                " the distance; measure with a tape and give --tape-m"
             )
     if apart.angle_sigmas > AGREE_SIGMAS:
         causes.append(
-            f"the angle: the normals are {apart.angle_deg:.2f} degrees apart; glue the board flat on the same wall, "
-            "and let the lidar warm up (ripples turn the depth's plane)"
+            f"the angle: the normals are {apart.angle_deg:.2f} degrees apart; glue the board flat"
+            " on the same wall, and let the lidar warm up (ripples turn the depth's plane)"
         )
-    return tuple(causes) or ("distance and angle together: none of the usual causes fits; measure again",)
+    return tuple(causes) or (
+        "distance and angle together: none of the usual causes fits; measure again",
+    )
 
 
 COLOR_POSE_CAUSE = (
-    "the color camera's factory pose against the lidar, which may have shifted: measure in infrared to compare"
+    "the color camera's factory pose against the lidar, which may have shifted: measure in infrared"
+    " to compare"
 )
 """A further cause of a disagreement, where the board was seen in color."""
 
@@ -264,7 +305,9 @@ class BoardRecord(Record):
     used: Used
     """Source of the record's pose."""
     disagreement_m: Finite | None = None
-    """The board's distance less the depth's; None, like all of the disagreement, where the depth was refused."""
+    """The board's distance less the depth's; None, like all of the disagreement, where the depth
+    was refused.
+    """
     disagreement_deg: NotNegative | None = None
     disagreement_sigmas: NotNegative | None = None
     causes: tuple[str, ...] = ()
@@ -278,7 +321,8 @@ def wall_with_board(
 ) -> tuple[WallFit | WallByBoard, BoardRecord]:
     """Measure the wall from its depth (or the reason why that was refused) and a view of a board.
 
-    `measured` states that the board's squares were measured by hand. Raises BoardRefusedError for an unusable view.
+    `measured` states that the board's squares were measured by hand. Raises BoardRefusedError for
+    an unusable view.
     """
     fit = fit_in_lidar(find_corners(view.image, board, view.light), board, view)
     plane = UncertainPlane(fit.slopes, fit.covariance)
@@ -313,25 +357,34 @@ def _by_board(plane: UncertainPlane, refusal: WallRefusedError) -> WallByBoard:
     doubt = f"the plane is the board's alone, since the depth was refused: {refusal}"
     problems = out_of_range(measures.distance_m, measures.facing_deg)
     pose = wall_from_plane(plane.normal, plane.distance_m)
-    return WallByBoard(**vars(measures), wall_from_lidar=pose, verdict="doubtful", advice="; ".join([doubt, *problems]))
+    return WallByBoard(
+        **vars(measures),
+        wall_from_lidar=pose,
+        verdict="doubtful",
+        advice="; ".join([doubt, *problems]),
+    )
 
 
 def _by_both(depth: WallFit, both: Combined) -> WallFit:
     """Return the depth's wall with the combined plane, and the verdict on both."""
     measures = measures_of(both.plane.slopes, both.plane.covariance)
     problems = out_of_range(measures.distance_m, measures.facing_deg)
-    verdict, advice = depth.verdict, depth.advice
+    verdict = depth.verdict
+    advice = depth.advice
     if both.causes:
         apart = both.disagreement
         conflict = (
-            f"depth and board disagree by {1e3 * apart.distance_m:+.1f} mm and {apart.angle_deg:.2f} degrees "
-            f"({apart.sigmas:.0f} standard deviations), the {both.used}'s plane is used; likely causes: "
-            + " | ".join(both.causes)
+            f"depth and board disagree by {1e3 * apart.distance_m:+.1f} mm and"
+            f" {apart.angle_deg:.2f} degrees ({apart.sigmas:.0f} standard deviations), the"
+            f" {both.used}'s plane is used; likely causes: " + " | ".join(both.causes)
         )
-        verdict, advice = "doubtful", "; ".join([conflict, *problems])
+        verdict = "doubtful"
+        advice = "; ".join([conflict, *problems])
     elif verdict != "doubtful":
         verdict = "out of range" if problems else "good"
         advice = "; ".join(problems) or f"{depth.advice}; depth and board agree"
     pose = wall_from_plane(both.plane.normal, both.plane.distance_m)
-    fitted = replace(depth, **vars(measures), wall_from_lidar=pose, covariance=both.plane.covariance)
+    fitted = replace(
+        depth, **vars(measures), wall_from_lidar=pose, covariance=both.plane.covariance
+    )
     return replace(fitted, verdict=verdict, advice=advice)

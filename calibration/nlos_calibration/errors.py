@@ -1,10 +1,10 @@
 """Errors of the calibration package.
 
-CalibrationError (ValueError)    exit 1   root
-├── WallRefusedError             exit 1   "only 31.0% of the depth lies on one plane (50% needed), ..."
-├── BoardRefusedError            exit 1   "4 corners of a board of 6 x 9 squares of 30 mm are seen, 8 needed: ..."
-├── OccluderRefusedError         exit 1   "the occluder touches the wall (gap 1.2 mm, known to 2.0 mm): ..."
-└── RecordFileError              exit 4   "wall.toml is not a wall record: frames: must be greater than 0 (got 0)"
+CalibrationError (ValueError)    exit 1   root ├── WallRefusedError             exit 1   "only 31.0%
+of the depth lies on one plane (50% needed), ..." ├── BoardRefusedError            exit 1   "4
+corners of a board of 6 x 9 squares of 30 mm are seen, 8 needed: ..." ├── OccluderRefusedError
+exit 1   "the occluder touches the wall (gap 1.2 mm, known to 2.0 mm): ..." └── RecordFileError
+exit 4   "wall.toml is not a wall record: frames: must be greater than 0 (got 0)"
     └── UnknownRigError          exit 2   "no rig 'paper-rgi'. Did you mean 'paper-rig'?"
 """
 
@@ -20,11 +20,15 @@ class WallRefusedError(CalibrationError):
 
 
 class BoardRefusedError(CalibrationError):
-    """The image shows no board whose plane can be trusted; the message gives the reason and the remedy."""
+    """The image shows no board whose plane can be trusted; the message gives the reason and the
+    remedy.
+    """
 
 
 class OccluderRefusedError(CalibrationError):
-    """The depth shows no occluder whose position can be trusted; the message gives the reason and the remedy."""
+    """The depth shows no occluder whose position can be trusted; the message gives the reason and
+    the remedy.
+    """
 
 
 class RecordFileError(CalibrationError):

@@ -1,9 +1,9 @@
 """Wall frame, lidar frame, the pose between them, and pinhole rays of the lidar.
 
-Wall frame: origin at the foot of the perpendicular from the lidar to the wall, z into the room, x = the lidar's x axis
-projected on the wall, y = z cross x. Lidar frame: x right, y down, z along the optical axis. A wall plane in the lidar
-frame (unit normal towards the lidar, distance) therefore defines a complete pose.
-The pinhole has no distortion: the L515's depth model has none.
+Wall frame: origin at the foot of the perpendicular from the lidar to the wall, z into the room, x =
+the lidar's x axis projected on the wall, y = z cross x. Lidar frame: x right, y down, z along the
+optical axis. A wall plane in the lidar frame (unit normal towards the lidar, distance) therefore
+defines a complete pose. The pinhole has no distortion: the L515's depth model has none.
 """
 
 from dataclasses import dataclass
@@ -15,12 +15,22 @@ from nlos_calibration.arrays import Float64
 
 
 def normal_from_angles(yaw_rad: float, pitch_rad: float) -> Float64:
-    """Return the wall's normal (3,) in the lidar frame; positive yaw turns the axis to wall +x, positive pitch up."""
-    return np.array([np.sin(yaw_rad) * np.cos(pitch_rad), -np.sin(pitch_rad), -np.cos(yaw_rad) * np.cos(pitch_rad)])
+    """Return the wall's normal (3,) in the lidar frame; positive yaw turns the axis to wall +x,
+    positive pitch up.
+    """
+    return np.array(
+        [
+            np.sin(yaw_rad) * np.cos(pitch_rad),
+            -np.sin(pitch_rad),
+            -np.cos(yaw_rad) * np.cos(pitch_rad),
+        ]
+    )
 
 
 def angles_from_normal(normal_lidar: Float64) -> tuple[float, float]:
-    """Return (yaw_rad, pitch_rad) of a wall with the unit normal `normal_lidar` (3,) in the lidar frame."""
+    """Return (yaw_rad, pitch_rad) of a wall with the unit normal `normal_lidar` (3,) in the lidar
+    frame.
+    """
     x, y, z = normal_lidar
     return float(np.arctan2(x, -z)), float(np.arcsin(np.clip(-y, -1.0, 1.0)))
 
@@ -32,28 +42,39 @@ def plane_from_slopes(slopes: Float64) -> tuple[Float64, float]:
 
 
 def plane_gradients(normal: Float64, distance_m: float) -> tuple[Float64, Float64]:
-    """Return the derivatives of a plane's distance (3,) and normal (3, 3) with respect to its slopes."""
-    # distance = 1 / |s|, so its gradient is -s / |s|^3 = distance^2 normal: only a change along the normal moves it;
-    # normal = -s / |s|, so it turns by -distance times the part of the change across the normal
+    """Return the derivatives of a plane's distance (3,) and normal (3, 3) with respect to its
+    slopes.
+    """
+    # distance = 1 / |s|, so its gradient is -s / |s|^3 = distance^2 normal: only a change along the
+    # normal moves it; normal = -s / |s|, so it turns by -distance times the part of the change
+    # across the normal
     return distance_m**2 * normal, -distance_m * (np.eye(3) - np.outer(normal, normal))
 
 
 def propagated_std(gradient: Float64, covariance: Float64) -> float:
-    """Return sqrt(g' C g), to first order the standard uncertainty of a quantity with gradient g (n,)."""
+    """Return sqrt(g' C g), to first order the standard uncertainty of a quantity with gradient g
+    (n,).
+    """
     return sqrt(max(float(gradient @ covariance @ gradient), 0.0))
 
 
 def wall_from_plane(normal_lidar: Float64, distance_m: float) -> Float64:
-    """Return the pose wall_from_lidar (4, 4) of a plane normal . p + distance_m = 0, the normal (3,) to the lidar.
+    """Return the pose wall_from_lidar (4, 4) of a plane normal . p + distance_m = 0, the normal
+    (3,) to the lidar.
 
-    Raises ValueError where the lidar's x axis is the normal itself, which leaves the wall's x undefined.
+    Raises ValueError where the lidar's x axis is the normal itself, which leaves the wall's x
+    undefined.
     """
-    # The rows of the rotation are the wall's axes in the lidar frame: z = normal, x = the lidar's x without its
-    # component along z (one Gram-Schmidt step), y = z cross x. The lidar is at wall (0, 0, distance).
+    # The rows of the rotation are the wall's axes in the lidar frame: z = normal, x = the lidar's x
+    # without its component along z (one Gram-Schmidt step), y = z cross x. The lidar is at wall (0,
+    # 0, distance).
     z_axis = normal_lidar / np.linalg.norm(normal_lidar)
     x_axis = np.array([1.0, 0.0, 0.0]) - z_axis[0] * z_axis
     if np.linalg.norm(x_axis) < 1e-9:
-        message = "the lidar's x axis is along the wall's normal: the wall frame's x is undefined; turn the lidar"
+        message = (
+            "the lidar's x axis is along the wall's normal: the wall frame's x is undefined; turn"
+            " the lidar"
+        )
         raise ValueError(message)
     x_axis /= np.linalg.norm(x_axis)
     pose = np.eye(4)
@@ -69,7 +90,9 @@ def facing_angle_rad(wall_from_lidar: Float64) -> float:
 
 @dataclass(frozen=True)
 class Intrinsics:
-    """Pinhole intrinsics in pixels, as in librealsense: (ppx, ppy) in pixel centres, x right, y down."""
+    """Pinhole intrinsics in pixels, as in librealsense: (ppx, ppy) in pixel centres, x right, y
+    down.
+    """
 
     width: int
     height: int
@@ -81,8 +104,10 @@ class Intrinsics:
     def scaled(self, width: int, height: int) -> "Intrinsics":
         """Return the intrinsics of the same field of view at another resolution."""
         # pixel (0, 0) is centred on (0, 0), so the image's edge, which must stay, is at -0.5
-        sx, sy = width / self.width, height / self.height
-        ppx, ppy = (self.ppx + 0.5) * sx - 0.5, (self.ppy + 0.5) * sy - 0.5
+        sx = width / self.width
+        sy = height / self.height
+        ppx = (self.ppx + 0.5) * sx - 0.5
+        ppy = (self.ppy + 0.5) * sy - 0.5
         return Intrinsics(width, height, self.fx * sx, self.fy * sy, ppx, ppy)
 
     @property
@@ -91,7 +116,9 @@ class Intrinsics:
         return np.array([[self.fx, 0.0, self.ppx], [0.0, self.fy, self.ppy], [0.0, 0.0, 1.0]])
 
     def rays(self) -> Float64:
-        """Return rays (height, width, 3) in the lidar frame with unit z: a point is depth_m * ray."""
+        """Return rays (height, width, 3) in the lidar frame with unit z: a point is depth_m *
+        ray.
+        """
         x = (np.arange(self.width) - self.ppx) / self.fx
         y = (np.arange(self.height) - self.ppy) / self.fy
         grid_x, grid_y = np.meshgrid(x, y)

@@ -1,4 +1,5 @@
-"""Range noise of the lidar: of one sample and of the mean over many frames, with streaming statistics of depth.
+"""Range noise of the lidar: of one sample and of the mean over many frames, with streaming
+statistics of depth.
 
 And 95 % intervals as text: as many digits as the interval justifies, and one unit.
 """
@@ -14,7 +15,8 @@ from nlos_calibration.arrays import Float64, Int64, Mask
 
 Depth = TypeVar("Depth", float, Float64)
 
-NOISE_FLOOR_M, NOISE_PER_METRE = 0.0005, 0.002
+NOISE_FLOOR_M = 0.0005
+NOISE_PER_METRE = 0.002
 """Standard deviation of one depth sample: constant part, and increase per metre of depth."""
 QUANTUM_M = 0.00025
 """Depth unit of the L515."""
@@ -22,12 +24,16 @@ MIN_SPREAD_SAMPLES = 4
 """Samples needed for a standard deviation to be used."""
 STATISTICS_POINTS = 20_000
 """Points that medians and percentiles are computed from."""
-MEDIAN_PER_SIGMA, SCATTER_PER_MEDIAN = 0.67449, 1.4826
+MEDIAN_PER_SIGMA = 0.67449
+SCATTER_PER_MEDIAN = 1.4826
 """Median of |x| of a normal distribution over its standard deviation, and the inverse."""
 INTERVAL_STDS = 1.96
 """Half the width of a 95 % interval, in standard uncertainties."""
-MAX_DECIMALS_MM, MAX_DECIMALS_DEG = 2, 3
-"""Finest digits printed, however small the interval: an interval below one unit of them is printed as one unit."""
+MAX_DECIMALS_MM = 2
+MAX_DECIMALS_DEG = 3
+"""Finest digits printed, however small the interval: an interval below one unit of them is printed
+as one unit.
+"""
 
 
 def depth_noise_m(depth_m: Depth) -> Depth:
@@ -37,9 +43,11 @@ def depth_noise_m(depth_m: Depth) -> Depth:
 
 @dataclass(frozen=True)
 class MeanNoise:
-    """Noise model of a pixel's mean depth: sample noise over the root of the number of samples, plus rounding.
+    """Noise model of a pixel's mean depth: sample noise over the root of the number of samples,
+    plus rounding.
 
-    Ripples of the lidar are not noise: they appear in the residuals, which scale the covariance (`flatness`).
+    Ripples of the lidar are not noise: they appear in the residuals, which scale the covariance
+    (`flatness`).
     """
 
     samples: Float64 = field(default_factory=lambda: np.ones(1))
@@ -51,10 +59,13 @@ class MeanNoise:
 
     def of(self, depth_m: Float64) -> Float64:
         """Return the standard deviation (N,) of means at `depth_m` (N,)."""
-        # Noise dithers the rounding: the mean of rounded samples errs by a sawtooth of the depth, convolved with the
-        # noise. The Gaussian's transform damps its first harmonic by exp(-2 pi^2 (sigma / quantum)^2), starting from
-        # the uniform quantum / sqrt(12): all of it without noise, nothing at the nominal noise of two quanta.
-        rounding_m = QUANTUM_M / sqrt(12) * exp(-2 * (pi * self.scale * NOISE_FLOOR_M / QUANTUM_M) ** 2)
+        # Noise dithers the rounding: the mean of rounded samples errs by a sawtooth of the depth,
+        # convolved with the noise. The Gaussian's transform damps its first harmonic by exp(-2 pi^2
+        # (sigma / quantum)^2), starting from the uniform quantum / sqrt(12): all of it without
+        # noise, nothing at the nominal noise of two quanta.
+        rounding_m = (
+            QUANTUM_M / sqrt(12) * exp(-2 * (pi * self.scale * NOISE_FLOOR_M / QUANTUM_M) ** 2)
+        )
         return np.sqrt(self.scale**2 * depth_noise_m(depth_m) ** 2 / self.samples + rounding_m**2)
 
     def at(self, points: Mask | slice) -> "MeanNoise":
@@ -63,17 +74,19 @@ class MeanNoise:
 
 
 def measured_noise(depth_m: Float64, spread_m: Float64, samples: Int64) -> MeanNoise:
-    """Measure the noise of means at `depth_m` (N,) of `samples` (N,) from their standard deviations `spread_m` (N,).
+    """Measure the noise of means at `depth_m` (N,) of `samples` (N,) from their standard deviations
+    `spread_m` (N,).
 
-    The scale is a median over the points, since a few flicker; it stays nominal where no point has enough samples.
+    The scale is a median over the points, since a few flicker; it stays nominal where no point has
+    enough samples.
     """
     known = np.flatnonzero(np.isfinite(depth_m) & (samples >= MIN_SPREAD_SAMPLES))
     known = known[:: max(len(known) // STATISTICS_POINTS, 1)]
     averaged = np.maximum(samples, 1).astype(np.float64)
     if len(known) == 0:
         return MeanNoise(averaged)
-    # the median of chi-square with k = n - 1 degrees of freedom is k (1 - 2 / (9 k))^3 (Wilson and Hilferty, 1931),
-    # so the median of sample variances is that factor below the true variance
+    # the median of chi-square with k = n - 1 degrees of freedom is k (1 - 2 / (9 k))^3 (Wilson and
+    # Hilferty, 1931), so the median of sample variances is that factor below the true variance
     unbiased = (1.0 - 2.0 / (9.0 * (averaged[known] - 1.0))) ** 3
     variance = np.median((spread_m[known] / depth_noise_m(depth_m[known])) ** 2 / unbiased)
     return MeanNoise(averaged, sqrt(float(variance)), measured=True)
@@ -82,14 +95,17 @@ def measured_noise(depth_m: Float64, spread_m: Float64, samples: Int64) -> MeanN
 FIRST_FRAMES = 5
 """Number of frames whose median later samples are compared with."""
 STRAY_SIGMAS = 20.0
-"""Samples farther than this (in nominal noise) from that median are echoes of another surface. The limit is wide on
-purpose: at four times the nominal noise it rejects no true sample, and strays within it widen the measured spread."""
+"""Samples farther than this (in nominal noise) from that median are echoes of another surface. The
+limit is wide on purpose: at four times the nominal noise it rejects no true sample, and strays
+within it widen the measured spread."""
 
 
 class DepthMean:
-    """Streaming mean and standard deviation of each pixel's depth, without flicker. Holds sums, not the frames.
+    """Streaming mean and standard deviation of each pixel's depth, without flicker. Holds sums, not
+    the frames.
 
-    The sums are of deviations from the median of the first frames; samples far from it are ignored. One thread.
+    The sums are of deviations from the median of the first frames; samples far from it are ignored.
+    One thread.
     """
 
     def __init__(self, height: int, width: int) -> None:
@@ -97,11 +113,16 @@ class DepthMean:
         self._first: list[Float64] = []
         self._median_m: Float64 | None = None
         self._count = np.zeros((height, width), np.int64)
-        self._sum_m, self._squares_m2 = np.zeros((height, width)), np.zeros((height, width))
+        self._sum_m = np.zeros((height, width))
+        self._squares_m2 = np.zeros((height, width))
 
     def add(self, depth_m: NDArray[np.floating]) -> None:
-        """Add one frame (height, width); NaN, infinite and non-positive samples count as no return."""
-        valid_m = np.where(np.isfinite(depth_m) & (depth_m > 0.0), depth_m, np.nan).astype(np.float64)
+        """Add one frame (height, width); NaN, infinite and non-positive samples count as no
+        return.
+        """
+        valid_m = np.where(np.isfinite(depth_m) & (depth_m > 0.0), depth_m, np.nan).astype(
+            np.float64
+        )
         self.frames += 1
         if self._median_m is not None:
             self._accumulate(valid_m, self._median_m)
@@ -111,12 +132,16 @@ class DepthMean:
             self._settle_median_m()
 
     def mean_m(self) -> Float64:
-        """Return the mean depth (height, width); NaN where fewer than half of the frames had a return."""
+        """Return the mean depth (height, width); NaN where fewer than half of the frames had a
+        return.
+        """
         mean_m = self._settle_median_m() + self._sum_m / np.maximum(self._count, 1)
         return np.where(2 * self._count >= max(self.frames, 1), mean_m, np.nan)
 
     def spread_m(self) -> Float64:
-        """Return the standard deviation of a sample (height, width); NaN where there are fewer than two."""
+        """Return the standard deviation of a sample (height, width); NaN where there are fewer than
+        two.
+        """
         self._settle_median_m()
         freedom = np.where(self._count > 1, self._count - 1.0, np.nan)
         squares_m2 = self._squares_m2 - self._sum_m**2 / np.maximum(self._count, 1)
@@ -132,9 +157,15 @@ class DepthMean:
         return measured_noise(self.mean_m().ravel(), self.spread_m().ravel(), self.count().ravel())
 
     def _settle_median_m(self) -> Float64:
-        """Return the median of the first frames, and fix it once these are complete or a result is asked for."""
+        """Return the median of the first frames, and fix it once these are complete or a result is
+        asked for.
+        """
         if self._median_m is None:
-            self._median_m = _median(np.stack(self._first)) if self._first else np.full(self._count.shape, np.nan)
+            self._median_m = (
+                _median(np.stack(self._first))
+                if self._first
+                else np.full(self._count.shape, np.nan)
+            )
             for depth_m in self._first:
                 self._accumulate(depth_m, self._median_m)
             self._first.clear()
@@ -150,7 +181,9 @@ class DepthMean:
 
 
 def _median(frames_m: Float64) -> Float64:
-    """Return each pixel's median over frames (n, height, width), ignoring NaN; the upper one of an even number."""
+    """Return each pixel's median over frames (n, height, width), ignoring NaN; the upper one of an
+    even number.
+    """
     ordered = np.sort(frames_m, axis=0)  # NaN last
     middle = np.isfinite(frames_m).sum(axis=0) // 2
     return np.take_along_axis(ordered, middle[np.newaxis], axis=0)[0]
@@ -167,11 +200,13 @@ def with_degrees(value_deg: float, std_deg: float | None, sign: str = "") -> str
 
 
 def _with_interval(value: float, std: float | None, max_decimals: int, sign: str) -> str:
-    """Return a value and the half width of its 95 % interval; without a standard uncertainty the value alone."""
+    """Return a value and the half width of its 95 % interval; without a standard uncertainty the
+    value alone.
+    """
     if std is None:
         return f"{value:{sign}z.{max_decimals - 1}f}"
     half = max(INTERVAL_STDS * std, 10.0**-max_decimals)
-    # one significant digit of the half width, two where it begins with 1: none after the point from 2 to 20, one from
-    # 0.2 to 2, ...
+    # one significant digit of the half width, two where it begins with 1: none after the point from
+    # 2 to 20, one from 0.2 to 2, ...
     decimals = min(max(-floor(log10(half / 2.0)), 0), max_decimals)
     return f"{value:{sign}z.{decimals}f} ± {half:.{decimals}f}"

@@ -1,7 +1,8 @@
-"""Occluder from a mean depth map of the bench with it in place: its sheet, its edge and gap, or a refusal.
+"""Occluder from a mean depth map of the bench with it in place: its sheet, its edge and gap, or a
+refusal.
 
-Three steps: the pixels in front of the wall; the plane of their sheet in the wall frame; and its edge, where row by row
-the line of sight passes from the wall to the sheet.
+Three steps: the pixels in front of the wall; the plane of their sheet in the wall frame; and its
+edge, where row by row the line of sight passes from the wall to the sheet.
 """
 
 from dataclasses import dataclass, field
@@ -18,9 +19,13 @@ from nlos_calibration.noise import SCATTER_PER_MEDIAN, MeanNoise, depth_noise_m,
 from nlos_calibration.plane import GATE_SIGMAS, PlaneFit, fit_depth, plane_depth_m
 
 WALL_BAND_M = 0.004
-"""Distance of a wall point from the plane by errors of the wall's pose and the lidar's ripples, beside noise."""
+"""Distance of a wall point from the plane by errors of the wall's pose and the lidar's ripples,
+beside noise.
+"""
 NEIGHBOURS = 4.5 / 9.0
-"""A pixel counts as in front of the wall if more than this share of its 3 x 3 block is: scattered outliers are not."""
+"""A pixel counts as in front of the wall if more than this share of its 3 x 3 block is: scattered
+outliers are not.
+"""
 
 
 @dataclass(frozen=True)
@@ -30,7 +35,9 @@ class ClassifiedView:
     depth_m: Float64
     """(height, width); NaN is no return."""
     sigma_m: Float64
-    """(height, width); noise of one sample, since ripples do not fall with the number of samples."""
+    """(height, width); noise of one sample, since ripples do not fall with the number of
+    samples.
+    """
     rays: Float64
     """(height, width, 3); of unit depth, in the lidar frame."""
     pose: Float64
@@ -87,7 +94,9 @@ class SheetFit:
     @property
     def tilt_std_deg(self) -> float:
         """Upper limit of the standard uncertainty of `tilt_deg`."""
-        twist_std = propagated_std(np.array([-self.twist, -1.0, 0.0]) / self.normal[0], self.covariance)
+        twist_std = propagated_std(
+            np.array([-self.twist, -1.0, 0.0]) / self.normal[0], self.covariance
+        )
         return degrees(hypot(self.lean_std, twist_std))
 
     def x_m(self, z_m: float) -> float:
@@ -100,32 +109,48 @@ class SheetFit:
         return propagated_std(gradient, self.covariance)
 
     def hit_points_m(self, view: ClassifiedView) -> Float64:
-        """Return each ray's intersection with the plane (height, width, 3), far away where there is none."""
-        return view.pose[:3, 3] + view.direction * plane_depth_m(view.rays, self.plane.slopes)[..., np.newaxis]
+        """Return each ray's intersection with the plane (height, width, 3), far away where there is
+        none.
+        """
+        return (
+            view.pose[:3, 3]
+            + view.direction * plane_depth_m(view.rays, self.plane.slopes)[..., np.newaxis]
+        )
 
     def matching_pixels(self, view: ClassifiedView) -> Mask:
         """Return the pixels (height, width) with a depth that fits the plane."""
-        return np.abs(view.depth_m - plane_depth_m(view.rays, self.plane.slopes)) <= GATE_SIGMAS * view.sigma_m
+        return (
+            np.abs(view.depth_m - plane_depth_m(view.rays, self.plane.slopes))
+            <= GATE_SIGMAS * view.sigma_m
+        )
 
 
-def classify(depth_m: Float64, noise: MeanNoise, intrinsics: Intrinsics, pose: Float64) -> ClassifiedView:
-    """Classify pixels as before, on or behind the wall, by more than noise and the wall's own error."""
-    # the height over the wall is z of the point depth x ray in the wall frame; its noise is that of the depth times
-    # the ray's component along the normal
+def classify(
+    depth_m: Float64, noise: MeanNoise, intrinsics: Intrinsics, pose: Float64
+) -> ClassifiedView:
+    """Classify pixels as before, on or behind the wall, by more than noise and the wall's own
+    error.
+    """
+    # the height over the wall is z of the point depth x ray in the wall frame; its noise is that of
+    # the depth times the ray's component along the normal
     depth_m = np.where(np.isfinite(depth_m) & (depth_m > 0.0), depth_m, np.nan)
     rays = intrinsics.rays()
     along = rays @ pose[2, :3]
     sigma_m = max(noise.scale, 1.0) * depth_noise_m(depth_m)
-    height_m, band_m = pose[2, 3] + depth_m * along, WALL_BAND_M + GATE_SIGMAS * sigma_m * np.abs(along)
+    height_m = pose[2, 3] + depth_m * along
+    band_m = WALL_BAND_M + GATE_SIGMAS * sigma_m * np.abs(along)
     near = (height_m > band_m).astype(np.float32)
     together = cv2.boxFilter(near, -1, (3, 3), borderType=cv2.BORDER_REPLICATE) > NEIGHBOURS
     behind = float((height_m < -band_m).sum() / max(int(np.isfinite(depth_m).sum()), 1))
-    return ClassifiedView(depth_m, sigma_m, rays, pose, (near > 0) & together, height_m <= band_m, behind)
+    return ClassifiedView(
+        depth_m, sigma_m, rays, pose, (near > 0) & together, height_m <= band_m, behind
+    )
 
 
 MIN_ROW_PIXELS = 2
 """Sheet pixels in a row of the image that shows the sheet: fewer may be strays."""
-GATE_SCATTERS, REFITS = 3.0, 8
+GATE_SCATTERS = 3.0
+REFITS = 8
 
 
 @dataclass(frozen=True)
@@ -134,64 +159,87 @@ class Edge:
 
     gap_m: float
     gap_std_m: float
-    """Resolution of the view or scatter of the rows; neither falls with the number of rows, whose errors are shared."""
+    """Resolution of the view or scatter of the rows; neither falls with the number of rows, whose
+    errors are shared.
+    """
     slope: float
     rows: int
     """Number of image rows that show the edge."""
 
 
 def find_edge(hits_m: Float64, sheet: Mask, passed: Mask) -> Edge | None:
-    """Find the edge, from each ray's intersection with the sheet's plane (height, width, 3); None if it is not visible.
+    """Find the edge, from each ray's intersection with the sheet's plane (height, width, 3); None
+    if it is not visible.
 
-    `sheet` are pixels that return from the sheet, `passed` those whose beams went by it. A pixel that mixes both, reads
-    anything or nothing is neither: the edge lies between the last that passed and the first that did not. Heights must
-    grow along each row.
+    `sheet` are pixels that return from the sheet, `passed` those whose beams went by it. A pixel
+    that mixes both, reads anything or nothing is neither: the edge lies between the last that
+    passed and the first that did not. Heights must grow along each row.
     """
-    # Each row votes +1 for a pixel that passed and -1 for the sheet. The running sum of votes at a column is, up to a
-    # constant, the number of pixels that an edge there would classify correctly; its maximum is the best edge, also
-    # among strays. The plateau of the maximum is the bracket of undecided pixels around the edge.
-    height_m, y_m = hits_m[..., 2], hits_m[..., 1]
+    # Each row votes +1 for a pixel that passed and -1 for the sheet. The running sum of votes at a
+    # column is, up to a constant, the number of pixels that an edge there would classify correctly;
+    # its maximum is the best edge, also among strays. The plateau of the maximum is the bracket of
+    # undecided pixels around the edge.
+    height_m = hits_m[..., 2]
+    y_m = hits_m[..., 1]
     middle_m = np.median(height_m[sheet])  # beams above it passed another edge of the sheet
     votes = np.where(height_m > middle_m, 0, passed.astype(np.int64) - sheet)
     balance = np.cumsum(votes, axis=1)
     best = balance == balance.max(axis=1, keepdims=True)
-    last, first = best.argmax(axis=1), votes.shape[1] - best[:, ::-1].argmax(axis=1)
+    last = best.argmax(axis=1)
+    first = votes.shape[1] - best[:, ::-1].argmax(axis=1)
     visible = (balance.max(axis=1) > 0) & (first < votes.shape[1])
     beyond = np.arange(votes.shape[1]) >= first[:, np.newaxis]
     visible &= ((votes < 0) & beyond).sum(axis=1) >= MIN_ROW_PIXELS
     if not visible.any():
         return None
     rows = np.flatnonzero(visible)
-    low_m, high_m = height_m[rows, last[rows]], height_m[rows, first[rows]]
+    low_m = height_m[rows, last[rows]]
+    high_m = height_m[rows, first[rows]]
     across_m = (y_m[rows, last[rows]] + y_m[rows, first[rows]]) / 2.0
     return _line(across_m, (low_m + high_m) / 2.0, high_m - low_m)
 
 
 def _line(y_m: Float64, z_m: Float64, width_m: Float64) -> Edge:
-    """Fit a line through the middles of brackets that are `width_m` wide, without rows far off it."""
-    # the edge is uniform in its bracket, with the standard deviation width / sqrt(12); rows weigh by 1 / width
-    line, inside = np.array([np.median(z_m), 0.0]), np.ones(len(z_m), np.bool_)
-    terms, resolution_m = np.column_stack([np.ones_like(y_m), y_m]), float(np.median(width_m)) / sqrt(12.0)
+    """Fit a line through the middles of brackets that are `width_m` wide, without rows far off
+    it.
+    """
+    # the edge is uniform in its bracket, with the standard deviation width / sqrt(12); rows weigh
+    # by 1 / width
+    line = np.array([np.median(z_m), 0.0])
+    inside = np.ones(len(z_m), np.bool_)
+    terms = np.column_stack([np.ones_like(y_m), y_m])
+    resolution_m = float(np.median(width_m)) / sqrt(12.0)
     for _ in range(REFITS):
         off_m = z_m - terms @ line
         scatter_m = max(SCATTER_PER_MEDIAN * float(np.median(np.abs(off_m))), resolution_m)
         inside = np.abs(off_m) <= GATE_SCATTERS * scatter_m
-        line = np.linalg.lstsq(terms[inside] / width_m[inside, None], z_m[inside] / width_m[inside])[0]
+        line = np.linalg.lstsq(
+            terms[inside] / width_m[inside, None], z_m[inside] / width_m[inside]
+        )[0]
     scatter_m = float(np.sqrt(np.mean((z_m - terms @ line)[inside] ** 2)))
     return Edge(float(line[0]), max(resolution_m, scatter_m), float(line[1]), len(z_m))
 
 
-MIN_SHARE, MIN_PIXELS, MIN_COLUMNS = 0.002, 100, 4
-"""Smallest share of the view, number of pixels and columns of an occluder; fewer columns leave its tilt open."""
-MIN_ON_SHEET, WARN_ON_SHEET_SHARE = 0.7, 0.95
+MIN_SHARE = 0.002
+MIN_PIXELS = 100
+MIN_COLUMNS = 4
+"""Smallest share of the view, number of pixels and columns of an occluder; fewer columns leave its
+tilt open.
+"""
+MIN_ON_SHEET = 0.7
+WARN_ON_SHEET_SHARE = 0.95
 """Sheet pixels as a share of those in front of the wall."""
 MAX_UNEVEN_M = 0.003
 """RMS off its plane, beyond noise: more than the lidar's ripples."""
 MIN_ROWS = 0.6
 """Share of the rows in which an endless sheet would be visible."""
-MAX_BEHIND, WARN_BEHIND_SHARE = 0.5, 0.02
-"""Depths behind the wall as a share of all: light by way of a hidden object. A few leave the sheet visible."""
-MAX_TILT_DEG, SURE_SIGMAS = 5.0, 2.0
+MAX_BEHIND = 0.5
+WARN_BEHIND_SHARE = 0.02
+"""Depths behind the wall as a share of all: light by way of a hidden object. A few leave the sheet
+visible.
+"""
+MAX_TILT_DEG = 5.0
+SURE_SIGMAS = 2.0
 MIN_GAP_M = 0.005
 """Beside `WALL_BAND_M`, a smaller gap cannot be told from none."""
 MAX_GAP_STD_M = 0.005
@@ -203,7 +251,9 @@ BY_HAND = "enter its position and gap by hand (--occluder-x-m, --occluder-gap-m)
 
 @dataclass(frozen=True, eq=False)
 class OccluderFit:
-    """A detected sheet x = x_m, z >= gap_m of the wall frame; 1.96 of the *_std hold 95 % or more."""
+    """A detected sheet x = x_m, z >= gap_m of the wall frame; 1.96 of the *_std hold 95 % or
+    more.
+    """
 
     x_m: float
     """Position of the edge, at y = 0."""
@@ -236,24 +286,28 @@ def find_occluder(
     distance_std_m: float = 0.0,
     yaw_std_deg: float = 0.0,
 ) -> OccluderFit:
-    """Find the occluder in a mean depth map (height, width) of the bench with it in place and nothing hidden.
+    """Find the occluder in a mean depth map (height, width) of the bench with it in place and
+    nothing hidden.
 
-    `noise` is that of the flattened map; the depth has the corrections of the one that the wall was fitted to, and
-    *_std are the uncertainties of the wall's pose (4, 4). Raises OccluderRefusedError without a sheet whose edge can be
-    trusted.
+    `noise` is that of the flattened map; the depth has the corrections of the one that the wall was
+    fitted to, and *_std are the uncertainties of the wall's pose (4, 4). Raises
+    OccluderRefusedError without a sheet whose edge can be trusted.
     """
     view = classify(depth_m, noise, intrinsics, wall_from_lidar)
     _check_in_view(view)
     sheet = _sheet(view, noise, generator)
-    hits_m, pixels = sheet.hit_points_m(view), sheet.plane.inliers.reshape(depth_m.shape)
+    hits_m = sheet.hit_points_m(view)
+    pixels = sheet.plane.inliers.reshape(depth_m.shape)
     _check_upright(sheet, float(np.median(hits_m[pixels][:, 2])))
     # pixels that fit both, where the sheet comes near the wall, are neither
     edge = _edge(hits_m, pixels, view.passed & ~sheet.matching_pixels(view))
-    x_m, x_std_m, yaw_std = sheet.x_m(edge.gap_m), sheet.x_std_m(edge.gap_m), radians(yaw_std_deg)
+    x_m = sheet.x_m(edge.gap_m)
+    x_std_m = sheet.x_std_m(edge.gap_m)
+    yaw_std = radians(yaw_std_deg)
     above_m = wall_from_lidar[2, 3] - edge.gap_m
-    # The beam that grazes the edge is known; it falls by above / x, so that a sheet farther by dx has its edge lower by
-    # dx above / x. An error of the wall's yaw turns the edge about the lidar, by x dyaw in z and above dyaw in x. The
-    # contributions are independent and add in squares.
+    # The beam that grazes the edge is known; it falls by above / x, so that a sheet farther by dx
+    # has its edge lower by dx above / x. An error of the wall's yaw turns the edge about the lidar,
+    # by x dyaw in z and above dyaw in x. The contributions are independent and add in squares.
     gap_std_m = hypot(edge.gap_std_m, above_m / x_m * x_std_m, distance_std_m, x_m * yaw_std)
     fit = OccluderFit(
         x_m=x_m,
@@ -277,24 +331,26 @@ def _check_in_view(view: ClassifiedView) -> None:
     """Refuse a view that an object fills, or with nothing in front of the wall."""
     if view.behind_share > MAX_BEHIND:
         raise OccluderRefusedError(
-            f"{view.behind_share:.0%} of the depth is behind the wall ({MAX_BEHIND:.0%} allowed), by way of a hidden "
-            "object: remove the object, leave the occluder, and record again"
+            f"{view.behind_share:.0%} of the depth is behind the wall ({MAX_BEHIND:.0%} allowed),"
+            " by way of a hidden object: remove the object, leave the occluder, and record again"
         )
     if view.near.sum() >= max(MIN_SHARE * view.near.size, MIN_PIXELS):
         columns = np.median(view.near.sum(axis=1)[view.near.any(axis=1)])
         if columns >= MIN_COLUMNS:
             return
         raise OccluderRefusedError(
-            f"the occluder fills {columns:.0f} columns of the view, {MIN_COLUMNS} needed: turn the lidar towards the "
-            f"occluder, or {BY_HAND}"
+            f"the occluder fills {columns:.0f} columns of the view, {MIN_COLUMNS} needed: turn the"
+            f" lidar towards the occluder, or {BY_HAND}"
         )
     # x at which the farthest beam of the middle row is as near to the wall as an edge might be
     x, z = (view.direction[len(view.direction) // 2, :, axis] for axis in (0, 2))
-    reach_m = np.inf if (z >= 0.0).any() else (x / -z).max() * max(view.pose[2, 3] - REACH_HEIGHT_M, 0.0)
+    reach_m = (
+        np.inf if (z >= 0.0).any() else (x / -z).max() * max(view.pose[2, 3] - REACH_HEIGHT_M, 0.0)
+    )
     reach = f"reach to x = {reach_m:.2f} m" if np.isfinite(reach_m) else "reach without end"
     raise OccluderRefusedError(
-        f"no occluder is in view: {REACH_HEIGHT_M:.2f} m off the wall the beams of this pose {reach} and meet "
-        f"nothing in front of the wall: move it into their way, or {BY_HAND}"
+        f"no occluder is in view: {REACH_HEIGHT_M:.2f} m off the wall the beams of this pose"
+        f" {reach} and meet nothing in front of the wall: move it into their way, or {BY_HAND}"
     )
 
 
@@ -302,38 +358,51 @@ def _sheet(view: ClassifiedView, noise: MeanNoise, generator: np.random.Generato
     """Fit the plane of most pixels in front of the wall, and refuse anything that is not flat."""
     near_m = np.where(view.near, view.depth_m, np.nan)
     try:
-        plane = fit_depth(view.rays.reshape(-1, 3), near_m.ravel(), generator, noise, min_extent=0.0)
+        plane = fit_depth(
+            view.rays.reshape(-1, 3), near_m.ravel(), generator, noise, min_extent=0.0
+        )
     except WallRefusedError as error:
         raise OccluderRefusedError(_no_sheet("its points lie on no plane")) from error
     if plane.inlier_fraction < MIN_ON_SHEET:
         raise OccluderRefusedError(_no_sheet(f"{plane.inlier_fraction:.0%} of it lie on a plane"))
-    turn, rippled = view.pose[:3, :3], ripples(plane, view.rays)
+    turn = view.pose[:3, :3]
+    rippled = ripples(plane, view.rays)
     if rippled.rms_m > MAX_UNEVEN_M:
         raise OccluderRefusedError(_no_sheet(f"{rippled.rms_m * 1e3:.1f} mm RMS off a plane"))
-    return SheetFit(plane, turn @ plane.slopes, turn @ rippled.covariance @ turn.T, view.pose[:3, 3])
+    return SheetFit(
+        plane, turn @ plane.slopes, turn @ rippled.covariance @ turn.T, view.pose[:3, 3]
+    )
 
 
 def _no_sheet(why: str) -> str:
-    return f"the object in front of the wall is not a flat sheet ({why}): remove all but the occluder, or {BY_HAND}"
+    return (
+        f"the object in front of the wall is not a flat sheet ({why}): remove all but the occluder,"
+        f" or {BY_HAND}"
+    )
 
 
 def _check_upright(sheet: SheetFit, middle_m: float) -> None:
     """Refuse a sheet that leans, or stands where no object can be hidden behind it."""
     if sheet.tilt_deg - SURE_SIGMAS * sheet.tilt_std_deg > MAX_TILT_DEG:
-        lean_deg, twist_deg = degrees(np.arctan(sheet.lean)), degrees(np.arctan(sheet.twist))
+        lean_deg = degrees(np.arctan(sheet.lean))
+        twist_deg = degrees(np.arctan(sheet.twist))
         raise OccluderRefusedError(
-            f"the occluder is {sheet.tilt_deg:.1f} degrees off the plane x = const ({MAX_TILT_DEG:.0f} allowed): it "
-            f"leans by {lean_deg:+.1f} and is twisted by {twist_deg:+.1f}; set it upright on the wall and level with it"
+            f"the occluder is {sheet.tilt_deg:.1f} degrees off the plane x = const"
+            f" ({MAX_TILT_DEG:.0f} allowed): it leans by {lean_deg:+.1f} and is twisted by"
+            f" {twist_deg:+.1f}; set it upright on the wall and level with it"
         )
     if (x_m := sheet.x_m(middle_m)) <= 0.0:
         raise OccluderRefusedError(
-            f"the occluder stands at x = {x_m:.3f} m, on the wrong side of the lidar: the hidden object must be at "
-            "positive x, to the lidar's right; mirror the bench or turn the lidar upside down"
+            f"the occluder stands at x = {x_m:.3f} m, on the wrong side of the lidar: the hidden"
+            " object must be at positive x, to the lidar's right; mirror the bench or turn the"
+            " lidar upside down"
         )
 
 
 def _edge(hits_m: Float64, pixels: Mask, passed: Mask) -> Edge:
-    """Find the sheet's edge; refuse one that is out of view, touches the wall, or ends in the middle of the view."""
+    """Find the sheet's edge; refuse one that is out of view, touches the wall, or ends in the
+    middle of the view.
+    """
     lowest_m, middle_m = np.percentile(hits_m[pixels][:, 2], (5.0, 50.0))
     expected = hits_m[..., 2].max(axis=1) > middle_m
     rows = pixels.sum(axis=1) >= MIN_ROW_PIXELS
@@ -343,8 +412,8 @@ def _edge(hits_m: Float64, pixels: Mask, passed: Mask) -> Edge:
     edge = find_edge(hits_m, pixels, passed)
     if edge is None or edge.rows < MIN_ROWS * rows.sum():
         raise OccluderRefusedError(
-            f"the occluder's edge is out of view: the sheet is visible from {lowest_m:.3f} m off the wall on, without "
-            f"wall beside it; turn the lidar away from it, or {BY_HAND}"
+            f"the occluder's edge is out of view: the sheet is visible from {lowest_m:.3f} m off"
+            f" the wall on, without wall beside it; turn the lidar away from it, or {BY_HAND}"
         )
     return edge
 
@@ -353,21 +422,26 @@ def _check_edge(fit: OccluderFit) -> None:
     """Refuse a gap that is too small or too uncertain, and a tilted edge."""
     if fit.gap_m < max(MIN_GAP_M, SURE_SIGMAS * fit.gap_std_m):
         gap = with_mm(fit.gap_m, fit.gap_std_m)
-        raise OccluderRefusedError(f"the occluder touches the wall (gap {gap}): leave 0.05 to 0.20 m for the light")
+        raise OccluderRefusedError(
+            f"the occluder touches the wall (gap {gap}): leave 0.05 to 0.20 m for the light"
+        )
     if fit.gap_std_m > MAX_GAP_STD_M:
         raise OccluderRefusedError(
-            f"the occluder's edge, {fit.gap_m:.2f} m off the wall, is uncertain by {fit.gap_std_m * 1e3:.0f} mm "
-            f"({MAX_GAP_STD_M * 1e3:.0f} mm allowed): too few pixels beside it have depth; {BY_HAND}"
+            f"the occluder's edge, {fit.gap_m:.2f} m off the wall, is uncertain by"
+            f" {fit.gap_std_m * 1e3:.0f} mm ({MAX_GAP_STD_M * 1e3:.0f} mm allowed): too few pixels"
+            f" beside it have depth; {BY_HAND}"
         )
     if abs(fit.edge_deg) > MAX_TILT_DEG:
         raise OccluderRefusedError(
-            f"the occluder's edge is {abs(fit.edge_deg):.1f} degrees off the wall ({MAX_TILT_DEG:.0f} allowed): make "
-            "the gap the same from top to bottom"
+            f"the occluder's edge is {abs(fit.edge_deg):.1f} degrees off the wall"
+            f" ({MAX_TILT_DEG:.0f} allowed): make the gap the same from top to bottom"
         )
 
 
 def _doubt(view: ClassifiedView) -> str:
-    """Return the sign of a hidden object in the view, whose echoes the reference then holds too; else empty."""
+    """Return the sign of a hidden object in the view, whose echoes the reference then holds too;
+    else empty.
+    """
     if view.behind_share <= WARN_BEHIND_SHARE:
         return ""
     return f"an object seems to be hidden ({view.behind_share:.0%} of the depth is behind the wall)"
@@ -378,5 +452,8 @@ def _warnings(sheet: SheetFit) -> tuple[str, ...]:
     lines: list[str] = []
     if sheet.plane.inlier_fraction < WARN_ON_SHEET_SHARE:
         off = 1.0 - sheet.plane.inlier_fraction
-        lines.append(f"{off:.0%} of the pixels in front of the wall are not on the occluder: remove everything else")
+        lines.append(
+            f"{off:.0%} of the pixels in front of the wall are not on the occluder: remove"
+            " everything else"
+        )
     return tuple(lines)

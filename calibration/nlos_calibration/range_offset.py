@@ -1,13 +1,16 @@
 """Range offset of the lidar from a distance measured by tape, and its effect on the pose.
 
-Sign: true depth = the lidar's depth + offset_m, along the optical axis; the truth counts from the front glass. The tape
-goes from the point of the glass on the optical axis to the wall, along the wall's normal. The data sheet puts 4.5 mm
-between the glass and the zero of depth, and its readers disagree about the sign: so it is measured.
+Sign: true depth = the lidar's depth + offset_m, along the optical axis; the truth counts from the
+front glass. The tape goes from the point of the glass on the optical axis to the wall, along the
+wall's normal. The data sheet puts 4.5 mm between the glass and the zero of depth, and its readers
+disagree about the sign: so it is measured.
 
 Two causes look alike where the wall is faced squarely; on an oblique wall the flatter one is right:
-origin: the beams meet in the zero of depth, which lies offset_m before the glass. The measured wall is flat; the pose's
+origin: the beams meet in the zero of depth, which lies offset_m before the glass. The measured wall
+is flat; the pose's
     origin moves along the optical axis, and the distance by offset_m x cos(facing).
-depth: the beams meet in the glass, and every depth is too short by offset_m. That bends and turns an oblique wall
+depth: the beams meet in the glass, and every depth is too short by offset_m. That bends and turns
+an oblique wall
     (by 0.2 degrees at 45 degrees and 4.5 mm); the corrected depths are fitted again.
 """
 
@@ -23,11 +26,14 @@ TAPE_STD_M = 0.0005
 """Standard uncertainty of a tape read by eye."""
 MAX_OFFSET_M = 0.03
 """A larger offset is a misreading."""
-AGREED_M, MAX_STEPS = 1e-6, 8
+AGREED_M = 1e-6
+MAX_STEPS = 8
 
 Cause = Literal["origin", "depth"]
 FitWith = Callable[[float, float], WallFit]
-"""Fit of the wall with (offset_m added to each depth, the pose's origin origin_m behind the zero of depth)."""
+"""Fit of the wall with (offset_m added to each depth, the pose's origin origin_m behind the zero of
+depth).
+"""
 
 
 @dataclass(frozen=True)
@@ -47,25 +53,31 @@ def fit_with_tape_distance(fit_with: FitWith, tape_m: float) -> TapedWall:
 
     Raises CalibrationError where tape and lidar cannot both be right.
     """
-    # an origin that moves back along the optical axis moves away from the wall by cos(facing) of that: exact. A depth
-    # offset also bends an oblique wall, so its effect on the distance is found numerically.
+    # an origin that moves back along the optical axis moves away from the wall by cos(facing) of
+    # that: exact. A depth offset also bends an oblique wall, so its effect on the distance is found
+    # numerically.
     plain = fit_with(0.0, 0.0)
     axis_share = cos(radians(plain.facing_deg))
     origin_m = (tape_m - plain.distance_m) / axis_share
     if abs(origin_m) > MAX_OFFSET_M:
         raise CalibrationError(
-            f"the tape reads {tape_m * 1e3:.1f} mm and the lidar {plain.distance_m * 1e3:.1f} mm, an offset of "
-            f"{abs(origin_m) * 1e3:.0f} mm ({MAX_OFFSET_M * 1e3:.0f} mm allowed): measure from the front glass to the "
-            "wall, along the wall's normal"
+            f"the tape reads {tape_m * 1e3:.1f} mm and the lidar {plain.distance_m * 1e3:.1f} mm,"
+            f" an offset of {abs(origin_m) * 1e3:.0f} mm ({MAX_OFFSET_M * 1e3:.0f} mm allowed):"
+            " measure from the front glass to the wall, along the wall's normal"
         )
     moved = _taped(fit_with(0.0, origin_m), origin_m, axis_share, "origin")
     corrected = _corrected(fit_with, plain, origin_m, tape_m)
     return corrected if corrected is not None and corrected.fit.bend_deg < plain.bend_deg else moved
 
 
-def _corrected(fit_with: FitWith, plain: WallFit, offset_m: float, tape_m: float) -> TapedWall | None:
-    """Solve distance(offset) = tape_m by the secant method; None where no correction leaves a wall there."""
-    before, step_m = plain, offset_m
+def _corrected(
+    fit_with: FitWith, plain: WallFit, offset_m: float, tape_m: float
+) -> TapedWall | None:
+    """Solve distance(offset) = tape_m by the secant method; None where no correction leaves a wall
+    there.
+    """
+    before = plain
+    step_m = offset_m
     for _ in range(MAX_STEPS):
         try:
             fit = fit_with(offset_m, 0.0)
@@ -74,7 +86,8 @@ def _corrected(fit_with: FitWith, plain: WallFit, offset_m: float, tape_m: float
         effect = (fit.distance_m - before.distance_m) / step_m if step_m else 1.0
         if effect <= 0.0:
             return None
-        before, step_m = fit, (tape_m - fit.distance_m) / effect
+        before = fit
+        step_m = (tape_m - fit.distance_m) / effect
         if abs(step_m) < AGREED_M:
             return _taped(fit, offset_m, effect, "depth")
         offset_m += step_m
@@ -83,6 +96,7 @@ def _corrected(fit_with: FitWith, plain: WallFit, offset_m: float, tape_m: float
 
 def _taped(fit: WallFit, offset_m: float, effect: float, cause: Cause) -> TapedWall:
     """Return the result; `effect` is the change of distance per change of offset."""
-    # offset = (tape - distance) / effect, so the two independent uncertainties add in squares and divide by the effect
+    # offset = (tape - distance) / effect, so the two independent uncertainties add in squares and
+    # divide by the effect
     std_m = hypot(TAPE_STD_M, fit.distance_std_m) / effect
     return TapedWall(replace(fit, distance_std_m=TAPE_STD_M), offset_m, std_m, cause)

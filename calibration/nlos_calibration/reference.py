@@ -1,4 +1,6 @@
-"""Bare-wall reference: mean and spread of every pixel and map cell over many frames, and the file that holds them."""
+"""Bare-wall reference: mean and spread of every pixel and map cell over many frames, and the file
+that holds them.
+"""
 
 import hashlib
 import json
@@ -21,7 +23,9 @@ from nlos_calibration.rig_check import MAP_SHAPE
 FULL_SCALE = 255
 """IR counts of a saturated pixel."""
 MAX_BYTES = 1 << 28
-"""Bound on a reference file, and on its unpacked content: one of 640 x 480 pixels has some 20 MB."""
+"""Bound on a reference file, and on its unpacked content: one of 640 x 480 pixels has some 20
+MB.
+"""
 
 
 class Moments:
@@ -29,11 +33,13 @@ class Moments:
 
     def __init__(self, shape: tuple[int, int]) -> None:
         self.count = np.zeros(shape, np.int64)
-        self._mean, self._squares = np.zeros(shape), np.zeros(shape)
+        self._mean = np.zeros(shape)
+        self._squares = np.zeros(shape)
 
     def add(self, values: NDArray[Any]) -> None:
         """Add one array of the shape."""
-        # Welford's update (1962): the sum of squares grows by (x - old mean) (x - new mean), free of cancellation
+        # Welford's update (1962): the sum of squares grows by (x - old mean) (x - new mean), free
+        # of cancellation
         known = np.isfinite(values)
         self.count += known
         off = np.where(known, values - self._mean, 0.0)
@@ -51,7 +57,9 @@ class Moments:
 
 @dataclass(frozen=True, eq=False)
 class BareWall:
-    """Statistics of the lidar's frames with nothing hidden: the reference that difference maps are formed from."""
+    """Statistics of the lidar's frames with nothing hidden: the reference that difference maps are
+    formed from.
+    """
 
     depth_m: Float32
     """(height, width); the mean, NaN where fewer than half of the frames had a return."""
@@ -93,11 +101,15 @@ class BareWallStatistics:
         self.depth = DepthMean(*shape)
         """Mean depth, which the wall's plane is fitted to."""
         self._intrinsics = intrinsics
-        self._ir, self._saturated = Moments(shape), np.zeros(shape)
-        self._map_depth, self._map_intensity = Moments(MAP_SHAPE), Moments(MAP_SHAPE)
+        self._ir = Moments(shape)
+        self._saturated = np.zeros(shape)
+        self._map_depth = Moments(MAP_SHAPE)
+        self._map_intensity = Moments(MAP_SHAPE)
         self._celsius: dict[str, list[float]] = {}
 
-    def add(self, depth_m: Float32, ir: UInt8, map_depth_m: Float32, map_intensity: Float32) -> None:
+    def add(
+        self, depth_m: Float32, ir: UInt8, map_depth_m: Float32, map_intensity: Float32
+    ) -> None:
         """Add one frame (height, width) and its maps (64, 80)."""
         self.depth.add(depth_m)
         self._ir.add(ir)
@@ -119,7 +131,9 @@ class BareWallStatistics:
         return {name: float(np.mean(values)) for name, values in sorted(self._celsius.items())}
 
     def reference(self, inliers: Mask, *, serial: str, settings: Mapping[str, float]) -> BareWall:
-        """Return the statistics so far; `inliers` (height, width) are the pixels of the wall's plane fit."""
+        """Return the statistics so far; `inliers` (height, width) are the pixels of the wall's
+        plane fit.
+        """
         statistics = {
             "depth_m": self.depth.mean_m(),
             "depth_std_m": self.depth.spread_m(),
@@ -139,7 +153,9 @@ class BareWallStatistics:
             serial=serial,
             settings=dict(settings),
             celsius=self.celsius(),
-            celsius_span={name: max(values) - min(values) for name, values in sorted(self._celsius.items())},
+            celsius_span={
+                name: max(values) - min(values) for name, values in sorted(self._celsius.items())
+            },
         )
 
 
@@ -153,19 +169,22 @@ def save_reference(path: Path, wall: BareWall) -> str:
 
 
 def load_reference(path: Path, sha256: str) -> BareWall:
-    """Read the reference that a record names. Raises RecordFileError if it is missing, damaged or another record's."""
+    """Read the reference that a record names. Raises RecordFileError if it is missing, damaged or
+    another record's.
+    """
     advice = "calibrate the wall again"
     try:
         content = path.read_bytes() if path.stat().st_size <= MAX_BYTES else b""
         digest = hashlib.sha256(content).hexdigest()
     except OSError as error:
         raise RecordFileError(
-            f"cannot read the bare-wall reference {path} ({error.strerror}): keep it beside its record, or {advice}"
+            f"cannot read the bare-wall reference {path} ({error.strerror}): keep it beside its"
+            f" record, or {advice}"
         ) from error
     if digest != sha256:
         raise RecordFileError(
-            f"{path} is not the reference that the record was written with (SHA-256 {digest[:12]}, not {sha256[:12]}): "
-            f"restore the original file, or {advice}"
+            f"{path} is not the reference that the record was written with (SHA-256 {digest[:12]},"
+            f" not {sha256[:12]}): restore the original file, or {advice}"
         )
     try:
         _check_unpacked_size(content)
@@ -175,7 +194,9 @@ def load_reference(path: Path, sha256: str) -> BareWall:
         return BareWall(**arrays, **(facts | {"intrinsics": Intrinsics(**facts["intrinsics"])}))
     except Exception as error:  # numpy, zipfile and JSON raise almost anything for crafted bytes
         reason = " ".join(str(error).split()) or type(error).__name__
-        raise RecordFileError(f"{path} is not a bare-wall reference ({reason:.200}): {advice}") from error
+        raise RecordFileError(
+            f"{path} is not a bare-wall reference ({reason:.200}): {advice}"
+        ) from error
 
 
 def _check_unpacked_size(content: bytes) -> None:

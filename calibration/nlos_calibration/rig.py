@@ -1,4 +1,6 @@
-"""Rig record: lidar pose and intrinsics, wall, occluder, object box and device constants, as validated TOML."""
+"""Rig record: lidar pose and intrinsics, wall, occluder, object box and device constants, as
+validated TOML.
+"""
 
 import hashlib
 import re
@@ -16,7 +18,12 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from nlos_calibration.errors import RecordFileError, UnknownRigError
-from nlos_calibration.geometry import Intrinsics, facing_angle_rad, normal_from_angles, wall_from_plane
+from nlos_calibration.geometry import (
+    Intrinsics,
+    facing_angle_rad,
+    normal_from_angles,
+    wall_from_plane,
+)
 
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 Finite = Annotated[float, Field(allow_inf_nan=False)]
@@ -62,12 +69,20 @@ class Extent(Record):
 
     def contains(self, points_m: NDArray[np.float64]) -> NDArray[np.bool_]:
         """Return the mask (...) of the points (..., 2 or 3) whose wall x and y lie within it."""
-        x_m, y_m = points_m[..., 0], points_m[..., 1]
-        return (x_m >= self.x_min_m) & (x_m <= self.x_max_m) & (y_m >= self.y_min_m) & (y_m <= self.y_max_m)
+        x_m = points_m[..., 0]
+        y_m = points_m[..., 1]
+        return (
+            (x_m >= self.x_min_m)
+            & (x_m <= self.x_max_m)
+            & (y_m >= self.y_min_m)
+            & (y_m <= self.y_max_m)
+        )
 
 
 class ObjectBox(Extent):
-    """Box that holds the hidden object: an extent, and the depths of v = 1 (near) and v = 0.1 (far)."""
+    """Box that holds the hidden object: an extent, and the depths of v = 1 (near) and v = 0.1
+    (far).
+    """
 
     z_near_m: Positive
     z_far_m: Positive
@@ -98,11 +113,15 @@ class OccluderRecord(Record):
     """None, like gap_std_m and tilt_deg, if entered by hand."""
     gap_std_m: NotNegative | None = None
     tilt_deg: Finite | None = None
-    """Tilt of the sheet against the plane x = x_m, about wall y; positive leans away from the lidar."""
+    """Tilt of the sheet against the plane x = x_m, about wall y; positive leans away from the
+    lidar.
+    """
 
 
 class LidarPose(Record):
-    """The lidar's pose in the wall frame: the three numbers that the frame's definition leaves free."""
+    """The lidar's pose in the wall frame: the three numbers that the frame's definition leaves
+    free.
+    """
 
     distance_m: Positive
     yaw_deg: Annotated[float, Field(gt=-90, lt=90)]
@@ -112,7 +131,9 @@ class LidarPose(Record):
 
 
 class PinholeRecord(Record):
-    """Pinhole intrinsics in pixels; the default is a field of view of 70 x 55 degrees at 640 x 480."""
+    """Pinhole intrinsics in pixels; the default is a field of view of 70 x 55 degrees at 640 x
+    480.
+    """
 
     width: Annotated[int, Field(gt=0)] = 640
     height: Annotated[int, Field(gt=0)] = 480
@@ -172,19 +193,29 @@ class Rig(Record):
 def first_problem(error: ValidationError) -> str:
     """Return the first problem of a validation as one line: field, problem, value."""
     problem = error.errors()[0]
-    field, text, value = ".".join(str(part) for part in problem["loc"]), problem["msg"], problem["input"]
+    field = ".".join(str(part) for part in problem["loc"])
+    text = problem["msg"]
+    value = problem["input"]
     for library, plain in WORDING.items():
         text = re.sub(library, plain, text)
     if isinstance(value, dict):  # a rule among fields: the values of those that its message names
-        given = {name: got for name, got in value.items() if re.search(rf"\b{re.escape(str(name))}\b", text)}
-        got = ", ".join(f"{name} = {got!r:.40}" for name, got in given.items() if str(got) not in text)
+        given = {
+            name: got
+            for name, got in value.items()
+            if re.search(rf"\b{re.escape(str(name))}\b", text)
+        }
+        got = ", ".join(
+            f"{name} = {got!r:.40}" for name, got in given.items() if str(got) not in text
+        )
     else:
         got = "" if isinstance(value, list) else f"{value!r:.80}"
     return f"{field or 'record'}: {text}{f' (got {got})' if got else ''}"
 
 
 def record_kind(content: Mapping[str, object]) -> str:
-    """Return the kind of file that a TOML document is, by a field that only this kind has; empty if unknown."""
+    """Return the kind of file that a TOML document is, by a field that only this kind has; empty if
+    unknown.
+    """
     return next((kind for field, kind in KINDS.items() if field in content), "")
 
 
@@ -198,13 +229,18 @@ def load_rig(name_or_path: str | Path) -> Rig:
 
     Raises RecordFileError where it cannot be read, UnknownRigError for a name that no rig has.
     """
-    packaged, source = {path.stem: path for path in packaged_rigs()}, Path(name_or_path)
+    packaged = {path.stem: path for path in packaged_rigs()}
+    source = Path(name_or_path)
     if str(name_or_path) in packaged:
         source = packaged[str(name_or_path)]
     elif not source.exists() and str(name_or_path) == source.stem:
         names = [*packaged]
-        near = "".join(f" Did you mean {name!r}?" for name in get_close_matches(source.stem, names, 1))
-        raise UnknownRigError(f"no rig {source.stem!r}.{near} Give {' or '.join(names)}, or a rig's TOML file")
+        near = "".join(
+            f" Did you mean {name!r}?" for name in get_close_matches(source.stem, names, 1)
+        )
+        raise UnknownRigError(
+            f"no rig {source.stem!r}.{near} Give {' or '.join(names)}, or a rig's TOML file"
+        )
     return read_record(source, Rig, "rig", "give a packaged name (paper-rig) or a file")
 
 
@@ -223,7 +259,9 @@ def read_toml(source: Traversable) -> dict[str, Any]:
 
 
 def read_record(source: Traversable, model: type[R], kind: str, advice: str) -> R:
-    """Read a validated record from a TOML file. Raises RecordFileError, with `advice` if there is no such file."""
+    """Read a validated record from a TOML file. Raises RecordFileError, with `advice` if there is
+    no such file.
+    """
     content: dict[str, object] = {}
     try:
         content = read_toml(source)

@@ -1,6 +1,8 @@
-"""Checks of a whole rig: difference from another rig, footprint on the wall, lines of sight to the hidden object.
+"""Checks of a whole rig: difference from another rig, footprint on the wall, lines of sight to the
+hidden object.
 
-The lidar must not see the object's box past the occluder, and the lit wall must. Each problem comes with its remedy.
+The lidar must not see the object's box past the occluder, and the lit wall must. Each problem comes
+with its remedy.
 """
 
 from collections.abc import Callable
@@ -16,10 +18,18 @@ from nlos_calibration.wall import FACING_RANGE_DEG, TOLERANCE_DEG, TOLERANCE_M, 
 
 
 def rig_difference(rig: Rig, other: Rig) -> tuple[str, ...]:
-    """Return the differences of `rig` from `other` beyond calibration error, each with its amount."""
-    lidar, theirs = rig.lidar, other.lidar
+    """Return the differences of `rig` from `other` beyond calibration error, each with its
+    amount.
+    """
+    theirs = other.lidar
+    lidar = rig.lidar
     lines = [
-        _moved("the lidar", lidar.distance_m - theirs.distance_m, "farther from the wall", "closer to the wall"),
+        _moved(
+            "the lidar",
+            lidar.distance_m - theirs.distance_m,
+            "farther from the wall",
+            "closer to the wall",
+        ),
         _turned("yaw", lidar.yaw_deg - theirs.yaw_deg),
         _turned("pitch", lidar.pitch_deg - theirs.pitch_deg),
         *_occluder(rig, other),
@@ -31,7 +41,11 @@ def rig_difference(rig: Rig, other: Rig) -> tuple[str, ...]:
 
 
 def _moved(part: str, by_m: float, more: str, less: str) -> str:
-    return f"{part} {abs(by_m) * 1e3:.0f} mm {more if by_m > 0 else less}" if abs(by_m) > TOLERANCE_M else ""
+    return (
+        f"{part} {abs(by_m) * 1e3:.0f} mm {more if by_m > 0 else less}"
+        if abs(by_m) > TOLERANCE_M
+        else ""
+    )
 
 
 def _turned(angle: str, by_deg: float) -> str:
@@ -39,20 +53,27 @@ def _turned(angle: str, by_deg: float) -> str:
 
 
 def _occluder(rig: Rig, other: Rig) -> tuple[str, ...]:
-    here, there = rig.occluder, other.occluder
+    here = rig.occluder
+    there = other.occluder
     if here is None or there is None:
         return () if here is there else ("no occluder" if here is None else "an occluder",)
-    place = _moved("the occluder", here.x_m - there.x_m, "farther along the wall", "nearer along the wall")
+    place = _moved(
+        "the occluder", here.x_m - there.x_m, "farther along the wall", "nearer along the wall"
+    )
     return place, _moved("its gap", here.z_min_m - there.z_min_m, "wider", "narrower")
 
 
 def _field(here: Intrinsics, there: Intrinsics) -> str:
     (across, down), (across_there, down_there) = (
-        [degrees(atan(far) - atan(near)) for near, far in _view_edges(pinhole)] for pinhole in (here, there)
+        [degrees(atan(far) - atan(near)) for near, far in _view_edges(pinhole)]
+        for pinhole in (here, there)
     )
     if max(abs(across - across_there), abs(down - down_there)) <= TOLERANCE_DEG:
         return ""
-    return f"a field of view of {across:.1f} x {down:.1f} degrees, not {across_there:.1f} x {down_there:.1f}"
+    return (
+        f"a field of view of {across:.1f} x {down:.1f} degrees, not {across_there:.1f} x"
+        f" {down_there:.1f}"
+    )
 
 
 MAP_SHAPE = 64, 80
@@ -61,7 +82,9 @@ MAP_SHAPE = 64, 80
 
 @dataclass(frozen=True)
 class Footprint:
-    """The lidar's view on the wall plane, in the wall frame's x and y; NaN where a beam never meets it."""
+    """The lidar's view on the wall plane, in the wall frame's x and y; NaN where a beam never meets
+    it.
+    """
 
     corners_m: Float64
     """(4, 2); of the view: upper left, upper right, lower right, lower left."""
@@ -77,17 +100,26 @@ class Footprint:
 
 
 def footprint(
-    wall_from_lidar: Float64, intrinsics: Intrinsics, wall: Extent, shape: tuple[int, int] = MAP_SHAPE
+    wall_from_lidar: Float64,
+    intrinsics: Intrinsics,
+    wall: Extent,
+    shape: tuple[int, int] = MAP_SHAPE,
 ) -> Footprint:
     """Return the footprint of a map of `shape` cells seen from the pose (4, 4)."""
     cells_m = on_plane(wall_from_lidar, intrinsics.scaled(shape[1], shape[0]).rays())
-    return Footprint(on_plane(wall_from_lidar, corner_rays(intrinsics)), cells_m, wall.contains(cells_m))
+    return Footprint(
+        on_plane(wall_from_lidar, corner_rays(intrinsics)), cells_m, wall.contains(cells_m)
+    )
 
 
 def corner_rays(intrinsics: Intrinsics) -> Float64:
-    """Return the rays (4, 3) of unit z through the view's corners: upper left, upper right, lower right, lower left."""
+    """Return the rays (4, 3) of unit z through the view's corners: upper left, upper right, lower
+    right, lower left.
+    """
     (left, right), (top, bottom) = _view_edges(intrinsics)
-    return np.array([[left, top, 1.0], [right, top, 1.0], [right, bottom, 1.0], [left, bottom, 1.0]])
+    return np.array(
+        [[left, top, 1.0], [right, top, 1.0], [right, bottom, 1.0], [left, bottom, 1.0]]
+    )
 
 
 def _view_edges(intrinsics: Intrinsics) -> tuple[Float64, Float64]:
@@ -98,7 +130,9 @@ def _view_edges(intrinsics: Intrinsics) -> tuple[Float64, Float64]:
 
 
 def on_plane(wall_from_lidar: Float64, rays: Float64) -> Float64:
-    """Return wall x and y (..., 2) where rays (..., 3) in the lidar frame meet the wall plane; NaN without hit."""
+    """Return wall x and y (..., 2) where rays (..., 3) in the lidar frame meet the wall plane; NaN
+    without hit.
+    """
     directions = rays @ wall_from_lidar[:3, :3].T
     origin = wall_from_lidar[:3, 3]
     towards = np.where(directions[..., 2] < 0.0, -directions[..., 2], np.nan)
@@ -110,25 +144,35 @@ SLICES = 24
 
 
 def lidar_visible_share(rig: Rig, box: ObjectBox) -> float:
-    """Return the share of the box's volume that is in the lidar's field of view and not behind the occluder."""
-    # A plane through the lidar cuts each slice y = const of the box along a line. The occluder, endless in y, and the
-    # four sides of the field of view are such planes: the visible part of a slice is a convex polygon.
+    """Return the share of the box's volume that is in the lidar's field of view and not behind the
+    occluder.
+    """
+    # A plane through the lidar cuts each slice y = const of the box along a line. The occluder,
+    # endless in y, and the four sides of the field of view are such planes: the visible part of a
+    # slice is a convex polygon.
     middles = (np.arange(SLICES) + 0.5) / SLICES
     slices_m = box.y_min_m + middles * (box.y_max_m - box.y_min_m)
     past = [_past_edge(rig.occluder, (0.0, rig.lidar.distance_m))] if rig.occluder else []
-    return float(np.mean([_visible_share(box, [*past, *_field_half_planes(rig, y_m)]) for y_m in slices_m]))
+    return float(
+        np.mean([_visible_share(box, [*past, *_field_half_planes(rig, y_m)]) for y_m in slices_m])
+    )
 
 
 def wall_visible_share(rig: Rig, box: ObjectBox, view: Footprint) -> float:
-    """Return the share of the box's volume in sight of the lit wall, from the cell that sees most of it."""
-    # from a cell at x before the sheet, the line of sight past the edge rises by gap / (x_m - x): the farthest lit cell
-    # sees all that any other does
+    """Return the share of the box's volume in sight of the lit wall, from the cell that sees most
+    of it.
+    """
+    # from a cell at x before the sheet, the line of sight past the edge rises by gap / (x_m - x):
+    # the farthest lit cell sees all that any other does
     x_m = view.cells_m[..., 0][view.on_wall]
     occluder = rig.occluder
     if occluder is not None:
-        # a cell at x beyond the sheet is lit if the beam, at z = distance (1 - x_m / x) there, passes below the edge
+        # a cell at x beyond the sheet is lit if the beam, at z = distance (1 - x_m / x) there,
+        # passes below the edge
         distance_m = rig.lidar.distance_m
-        x_m = x_m[(x_m <= occluder.x_m) | (distance_m * (x_m - occluder.x_m) < occluder.z_min_m * x_m)]
+        x_m = x_m[
+            (x_m <= occluder.x_m) | (distance_m * (x_m - occluder.x_m) < occluder.z_min_m * x_m)
+        ]
     if len(x_m) == 0:
         return 0.0
     farthest_m = float(x_m.max())
@@ -138,25 +182,35 @@ def wall_visible_share(rig: Rig, box: ObjectBox, view: Footprint) -> float:
 
 
 def _past_edge(occluder: Occluder, eye: tuple[float, float]) -> Float64:
-    """Return the half plane a x + b z + c >= 0 as (a, b, c), visible below the edge from an eye (x, z)."""
-    # The line from the eye to (x, z) meets the sheet at eye_z + (z - eye_z) run / (x - eye_x), visible if that is below
-    # the edge: (z - eye_z) run <= rise (x - eye_x).
-    run_m, rise_m = occluder.x_m - eye[0], occluder.z_min_m - eye[1]
+    """Return the half plane a x + b z + c >= 0 as (a, b, c), visible below the edge from an eye (x,
+    z).
+    """
+    # The line from the eye to (x, z) meets the sheet at eye_z + (z - eye_z) run / (x - eye_x),
+    # visible if that is below the edge: (z - eye_z) run <= rise (x - eye_x).
+    run_m = occluder.x_m - eye[0]
+    rise_m = occluder.z_min_m - eye[1]
     return np.array([rise_m, -run_m, run_m * eye[1] - rise_m * eye[0]])
 
 
 def _field_half_planes(rig: Rig, y_m: float) -> list[Float64]:
-    """Return the half planes (a, b, c) in a slice at y that the four sides of the field of view leave."""
-    pose, ((left, right), (top, bottom)) = rig.wall_from_lidar, _view_edges(rig.pinhole)
-    inward = np.array([[1.0, 0.0, -left], [-1.0, 0.0, right], [0.0, 1.0, -top], [0.0, -1.0, bottom]])
-    # a side n . q >= 0 of the lidar frame is (R n) . (p - t) >= 0 in the wall frame, a line in x and z at fixed y
+    """Return the half planes (a, b, c) in a slice at y that the four sides of the field of view
+    leave.
+    """
+    pose = rig.wall_from_lidar
+    (left, right), (top, bottom) = _view_edges(rig.pinhole)
+    inward = np.array(
+        [[1.0, 0.0, -left], [-1.0, 0.0, right], [0.0, 1.0, -top], [0.0, -1.0, bottom]]
+    )
+    # a side n . q >= 0 of the lidar frame is (R n) . (p - t) >= 0 in the wall frame, a line in x
+    # and z at fixed y
     sides = inward @ pose[:3, :3].T
     return [np.array([x, z, y * y_m - side @ pose[:3, 3]]) for side in sides for x, y, z in [side]]
 
 
 def _visible_share(box: ObjectBox, half_planes: list[Float64]) -> float:
     """Return the share of the box's cross-section in x and z that is inside all half planes."""
-    x, z = (box.x_min_m, box.x_max_m), (box.z_near_m, box.z_far_m)
+    x = (box.x_min_m, box.x_max_m)
+    z = (box.z_near_m, box.z_far_m)
     corners = np.array([[x[0], z[0]], [x[1], z[0]], [x[1], z[1]], [x[0], z[1]]])
     left = corners
     for half_plane in half_planes:
@@ -165,10 +219,14 @@ def _visible_share(box: ObjectBox, half_planes: list[Float64]) -> float:
 
 
 def _cut(corners: Float64, half_plane: Float64) -> Float64:
-    """Cut a convex polygon (n, 2) by a half plane (Sutherland and Hodgman, 1974); (0, 2) where nothing is left."""
+    """Cut a convex polygon (n, 2) by a half plane (Sutherland and Hodgman, 1974); (0, 2) where
+    nothing is left.
+    """
     inside = corners @ half_plane[:2] + half_plane[2]
     points: list[Float64] = []
-    for here, there, at, to in zip(corners, np.roll(corners, -1, 0), inside, np.roll(inside, -1), strict=True):
+    for here, there, at, to in zip(
+        corners, np.roll(corners, -1, 0), inside, np.roll(inside, -1), strict=True
+    ):
         if at >= 0.0:
             points.append(here)
         if (at >= 0.0) != (to >= 0.0):
@@ -187,22 +245,31 @@ GAP_RANGE_M = 0.05, 0.20
 PAPER_X_M = 0.20
 WARN_TILT_DEG = 2.0
 MIN_SHARE = 0.55
-"""Share of the map's cells on the wall. The paper's rig has 57 % in its worst pose: 75 degrees, 0.30 m."""
+"""Share of the map's cells on the wall. The paper's rig has 57 % in its worst pose: 75 degrees,
+0.30 m.
+"""
 MAX_LEAK = 0.001
 """Share of the box in the lidar's sight: less is within the error of a calibrated edge."""
 MIN_SEEN = 0.5
-"""Share of the box in sight of some part of the lit wall; the paper's rig has all of it, at any angle."""
-FARTHEST_CM, FARTHEST_DEG = 20, 90
+"""Share of the box in sight of some part of the lit wall; the paper's rig has all of it, at any
+angle.
+"""
+FARTHEST_CM = 20
+FARTHEST_DEG = 90
 """Largest move and turn that is advised."""
 
 
 def judge_rig(rig: Rig, view: Footprint, occluder: OccluderRecord | None) -> tuple[str, ...]:
     """Return the problems that keep the rig from working like the paper's, each with its remedy.
 
-    `occluder` is the source of the rig's; None where the paper's is assumed. Distance and angle are not repeated here:
-    see `out_of_range`.
+    `occluder` is the source of the rig's; None where the paper's is assumed. Distance and angle are
+    not repeated here: see `out_of_range`.
     """
-    name = "the occluder" if occluder or not rig.occluder else "the occluder (not measured, the paper's is assumed)"
+    name = (
+        "the occluder"
+        if occluder or not rig.occluder
+        else "the occluder (not measured, the paper's is assumed)"
+    )
     problems = _too_little_wall(rig, view)
     if rig.occluder is not None:
         tilt_deg = occluder.tilt_deg if occluder else None
@@ -220,34 +287,46 @@ def combined(verdict: Verdict, advice: str, problems: tuple[str, ...]) -> tuple[
 
 
 def _too_little_wall(rig: Rig, view: Footprint) -> list[str]:
-    """Report a map that is mostly off the wall; beyond the paper's angles `out_of_range` already advises to turn."""
+    """Report a map that is mostly off the wall; beyond the paper's angles `out_of_range` already
+    advises to turn.
+    """
     if view.share >= MIN_SHARE or rig.facing_deg > FACING_RANGE_DEG[1] + TOLERANCE_DEG:
         return []
-    turn = _first(FARTHEST_DEG, lambda degrees: _footprint(_turned_to_wall(rig, degrees)).share >= MIN_SHARE)
+    turn = _first(
+        FARTHEST_DEG, lambda degrees: _footprint(_turned_to_wall(rig, degrees)).share >= MIN_SHARE
+    )
     cure = f"turn the lidar {_degrees(turn)} towards the wall" if turn else "use a larger wall"
     return [f"{view.share:.0%} of the map's cells meet the wall, {MIN_SHARE:.0%} needed: {cure}"]
 
 
-def _occluder_position(occluder: Occluder, box: ObjectBox | None, tilt_deg: float, name: str) -> list[str]:
+def _occluder_position(
+    occluder: Occluder, box: ObjectBox | None, tilt_deg: float, name: str
+) -> list[str]:
     """Compare the occluder's gap, position and tilt with the paper's ranges."""
     problems: list[str] = []
-    (low_m, high_m), gap_m = GAP_RANGE_M, occluder.z_min_m
+    low_m, high_m = GAP_RANGE_M
+    gap_m = occluder.z_min_m
     if not low_m - TOLERANCE_M <= gap_m <= high_m + TOLERANCE_M:
         short = gap_m < low_m
-        by_cm, way = at_least(100.0 * (low_m - gap_m if short else gap_m - high_m)), "away from" if short else "towards"
+        by_cm = at_least(100.0 * (low_m - gap_m if short else gap_m - high_m))
+        way = "away from" if short else "towards"
         needed = f"{low_m:.2f} to {high_m:.2f} needed"
-        problems.append(f"{name} has a gap of {gap_m:.3f} m, {needed}: move it {by_cm} cm {way} the wall")
+        problems.append(
+            f"{name} has a gap of {gap_m:.3f} m, {needed}: move it {by_cm} cm {way} the wall"
+        )
     if not _between(occluder, box):
         way = "away from" if occluder.x_m < PAPER_X_M else "towards"
         by_cm = at_least(100.0 * abs(occluder.x_m - PAPER_X_M))
         ends = f"the lidar at 0 and the object{f' from {box.x_min_m:.3f} m on' if box else ''}"
         problems.append(
-            f"{name} stands at x = {occluder.x_m:.3f} m, not between {ends}: move it {by_cm} cm {way} the lidar, to "
-            f"the paper's {PAPER_X_M:.2f} m"
+            f"{name} stands at x = {occluder.x_m:.3f} m, not between {ends}: move it {by_cm} cm"
+            f" {way} the lidar, to the paper's {PAPER_X_M:.2f} m"
         )
     if abs(tilt_deg) > WARN_TILT_DEG:
         way = "towards the lidar" if tilt_deg > 0.0 else "away from the lidar"
-        problems.append(f"{name} leans by {tilt_deg:+.1f} degrees, 0 assumed: tilt its upper end back {way}")
+        problems.append(
+            f"{name} leans by {tilt_deg:+.1f} degrees, 0 assumed: tilt its upper end back {way}"
+        )
     return problems
 
 
@@ -257,7 +336,9 @@ def _between(occluder: Occluder | None, box: ObjectBox | None) -> bool:
 
 
 def _leak(rig: Rig, box: ObjectBox, name: str) -> list[str]:
-    """Report an object in the lidar's own sight, with the smallest move of the occluder that hides it."""
+    """Report an object in the lidar's own sight, with the smallest move of the occluder that hides
+    it.
+    """
     if (share := lidar_visible_share(rig, box)) <= MAX_LEAK:
         return []
     problem = f"the lidar itself sees {share:.1%} of the object's box"
@@ -276,10 +357,14 @@ def _leak(rig: Rig, box: ObjectBox, name: str) -> list[str]:
 
 
 def _aperture(rig: Rig, box: ObjectBox, view: Footprint, name: str) -> list[str]:
-    """Report a box out of sight of the lit wall, with the smallest turn or move that opens the way."""
+    """Report a box out of sight of the lit wall, with the smallest turn or move that opens the
+    way.
+    """
     if (share := wall_visible_share(rig, box, view)) >= MIN_SEEN:
         return []
-    problem = f"the lit wall sees {share:.1%} of the object's box past {name}, {MIN_SEEN:.0%} needed"
+    problem = (
+        f"the lit wall sees {share:.1%} of the object's box past {name}, {MIN_SEEN:.0%} needed"
+    )
 
     def turned(degrees: int) -> bool:
         if (yaw_deg := rig.lidar.yaw_deg + degrees) > FACING_RANGE_DEG[1]:
@@ -294,7 +379,10 @@ def _aperture(rig: Rig, box: ObjectBox, view: Footprint, name: str) -> list[str]
     if by_deg := _first(FARTHEST_DEG, turned):
         return [f"{problem}: turn the lidar {_degrees(by_deg)} towards the occluder"]
     by_cm = _first(FARTHEST_CM, opened)
-    return [f"{problem}: " + (f"move the occluder {by_cm} cm away from the wall" if by_cm else "use a larger wall")]
+    return [
+        f"{problem}: "
+        + (f"move the occluder {by_cm} cm away from the wall" if by_cm else "use a larger wall")
+    ]
 
 
 def rig_with_occluder(rig: Rig, x_m: float, gap_m: float) -> Rig:
@@ -303,17 +391,22 @@ def rig_with_occluder(rig: Rig, x_m: float, gap_m: float) -> Rig:
 
 
 def _with_occluder_moved(rig: Rig, x_cm: int, z_cm: int) -> Rig | None:
-    """Return the rig with its occluder moved; None where that is past the lidar or out of the paper's gaps."""
+    """Return the rig with its occluder moved; None where that is past the lidar or out of the
+    paper's gaps.
+    """
     if rig.occluder is None:
         return None
-    x_m, gap_m = rig.occluder.x_m + x_cm / 100.0, rig.occluder.z_min_m + z_cm / 100.0
+    x_m = rig.occluder.x_m + x_cm / 100.0
+    gap_m = rig.occluder.z_min_m + z_cm / 100.0
     if x_m <= 0.0 or not GAP_RANGE_M[0] <= gap_m <= GAP_RANGE_M[1]:
         return None
     return rig_with_occluder(rig, x_m, gap_m)
 
 
 def _turned_to_wall(rig: Rig, degrees: int) -> Rig:
-    """Return the rig with its lidar turned by `degrees` towards the wall's normal, at most onto it."""
+    """Return the rig with its lidar turned by `degrees` towards the wall's normal, at most onto
+    it.
+    """
     left = max(1.0 - degrees / max(rig.facing_deg, 1e-9), 0.0)
     return _posed(rig, left * rig.lidar.yaw_deg, left * rig.lidar.pitch_deg)
 

@@ -1,7 +1,9 @@
-"""Wall measurement from the mean of depth frames: plane, pose, uncertainty and a verdict; or a refusal with its reason.
+"""Wall measurement from the mean of depth frames: plane, pose, uncertainty and a verdict; or a
+refusal with its reason.
 
-Uncertainties of distance and angles are propagated to first order from the covariance of the plane's slopes. The
-verdict compares distance, angle and flatness with the paper's ranges, and advises by how much to move.
+Uncertainties of distance and angles are propagated to first order from the covariance of the
+plane's slopes. The verdict compares distance, angle and flatness with the paper's ranges, and
+advises by how much to move.
 """
 
 from dataclasses import dataclass, field, replace
@@ -19,38 +21,54 @@ from nlos_calibration.noise import STATISTICS_POINTS, MeanNoise, depth_noise_m
 from nlos_calibration.plane import GATE_SIGMAS, fit_depth, plane_depth_m
 
 Verdict = Literal["good", "out of range", "doubtful"]
-"""Doubtful: the plane may be off by more than `TOLERANCE_M` or `TOLERANCE_DEG`, and the depth alone cannot decide."""
+"""Doubtful: the plane may be off by more than `TOLERANCE_M` or `TOLERANCE_DEG`, and the depth alone
+cannot decide.
+"""
 
-DISTANCE_RANGE_M, FACING_RANGE_DEG = (0.15, 0.30), (15.0, 75.0)
+DISTANCE_RANGE_M = (0.15, 0.30)
+FACING_RANGE_DEG = (15.0, 75.0)
 """The paper's ranges (SI 1)."""
-TOLERANCE_M, TOLERANCE_DEG = 0.001, 0.2
-"""Tolerated error: a wall on the edge of a range is inside, a smaller shift by a bend is ignored."""
-DOUBTED_TOLERANCES, REFUSED_TOLERANCES = 0.7, 5.0
-"""Difference between half of the view and the whole, in tolerances. From the second on (5 mm or 1 degree, a bend of 2
-degrees) the wall is refused; less could also be ripples of the lidar, 1 or 2 mm high and half a view wide, which are
-only reported. Doubt begins below one tolerance, since a half that bends itself shows too little."""
-DOUBTED_RIPPLE_M, MAX_RIPPLE_M = 0.0009, 0.002
-"""RMS normal to the wall. The L515's ripples are a millimetre or two high; two panes 2 mm apart are 1 mm off a plane
-between them."""
-WARN_RIPPLE_M, WARN_NOISE_SCALE = 0.0003, 2.0
+TOLERANCE_M = 0.001
+TOLERANCE_DEG = 0.2
+"""Tolerated error: a wall on the edge of a range is inside, a smaller shift by a bend is
+ignored.
+"""
+DOUBTED_TOLERANCES = 0.7
+REFUSED_TOLERANCES = 5.0
+"""Difference between half of the view and the whole, in tolerances. From the second on (5 mm or 1
+degree, a bend of 2 degrees) the wall is refused; less could also be ripples of the lidar, 1 or 2 mm
+high and half a view wide, which are only reported. Doubt begins below one tolerance, since a half
+that bends itself shows too little."""
+DOUBTED_RIPPLE_M = 0.0009
+MAX_RIPPLE_M = 0.002
+"""RMS normal to the wall. The L515's ripples are a millimetre or two high; two panes 2 mm apart are
+1 mm off a plane between them."""
+WARN_RIPPLE_M = 0.0003
+WARN_NOISE_SCALE = 2.0
 
 
 def check_flat(flat: Flatness, ripple_m: float) -> None:
-    """Refuse a wall that surely bends, curves or steps, unless a range offset of the lidar explains it."""
-    sure_m, sure_deg = flat.bend_m - SURE_SIGMAS * flat.bend_std_m, flat.bend_deg - SURE_SIGMAS * flat.bend_std_deg
+    """Refuse a wall that surely bends, curves or steps, unless a range offset of the lidar explains
+    it.
+    """
+    sure_m = flat.bend_m - SURE_SIGMAS * flat.bend_std_m
+    sure_deg = flat.bend_deg - SURE_SIGMAS * flat.bend_std_deg
     if _tolerances(sure_m, sure_deg) > REFUSED_TOLERANCES and not _explained_by_offset(flat):
         raise WallRefusedError(
-            f"the wall is not one flat wall: half of the view differs from the whole by {_amounts(flat)}, as of a "
-            "bend, a curve or a step; use a flat wall, or move so that only one is in view"
+            "the wall is not one flat wall: half of the view differs from the whole by"
+            f" {_amounts(flat)}, as of a bend, a curve or a step; use a flat wall, or move so that"
+            " only one is in view"
         )
     if ripple_m > MAX_RIPPLE_M:
         raise WallRefusedError(
-            f"the wall is not flat: parts are {ripple_m * 1e3:.1f} mm RMS off the plane, {MAX_RIPPLE_M * 1e3:.1f} "
-            "mm allowed; use a flat, matt wall and let the lidar warm up"
+            f"the wall is not flat: parts are {ripple_m * 1e3:.1f} mm RMS off the plane,"
+            f" {MAX_RIPPLE_M * 1e3:.1f} mm allowed; use a flat, matt wall and let the lidar warm up"
         )
 
 
-def judge(distance_m: float, facing_deg: float, flat: Flatness, ripple_m: float) -> tuple[Verdict, str]:
+def judge(
+    distance_m: float, facing_deg: float, flat: Flatness, ripple_m: float
+) -> tuple[Verdict, str]:
     """Return the verdict, and one sentence with its reason or the remedy."""
     doubts = _doubts(flat, ripple_m)
     if not doubts:
@@ -69,9 +87,14 @@ def warnings(ripple_m: float, noise_scale: float) -> tuple[str, ...]:
     """Return remarks on ripples and noise that leave the verdict unchanged."""
     lines: list[str] = []
     if ripple_m > WARN_RIPPLE_M:
-        lines.append(f"the depth has ripples of {ripple_m * 1e3:.1f} mm RMS: the uncertainties include them")
+        lines.append(
+            f"the depth has ripples of {ripple_m * 1e3:.1f} mm RMS: the uncertainties include them"
+        )
     if noise_scale > WARN_NOISE_SCALE:
-        lines.append(f"depth is {noise_scale:.1f} times as noisy as nominal: let the lidar warm up, dim the light")
+        lines.append(
+            f"depth is {noise_scale:.1f} times as noisy as nominal: let the lidar warm up, dim the"
+            " light"
+        )
     return tuple(lines)
 
 
@@ -91,32 +114,57 @@ def _doubts(flat: Flatness, ripple_m: float) -> list[str]:
     """Return the reason why the fitted plane may not be the wall's; empty if there is none."""
     bent = _tolerances(flat.bend_m, flat.bend_deg) > DOUBTED_TOLERANCES
     if bent and _explained_by_offset(flat):
-        why = f"a range offset of {flat.offset_m * 1e3:+.1f} mm would make the wall flat (or the wall is curved): "
+        why = (
+            f"a range offset of {flat.offset_m * 1e3:+.1f} mm would make the wall flat (or the wall"
+            " is curved): "
+        )
         return [why + "measure the distance with a tape and give it with --tape-m"]
     if ripple_m > DOUBTED_RIPPLE_M:
-        why = f"parts of the wall are {ripple_m * 1e3:.1f} mm RMS off the plane: ripples of the lidar, or a wall "
+        why = (
+            f"parts of the wall are {ripple_m * 1e3:.1f} mm RMS off the plane: ripples of the"
+            " lidar, or a wall "
+        )
         return [why + "that is not flat; use a flat, matt wall and let the lidar warm up"]
     if not bent:
         return []
-    if flat.bend_m <= SURE_SIGMAS * flat.bend_std_m and flat.bend_deg <= SURE_SIGMAS * flat.bend_std_deg:
-        return [f"noise leaves {_amounts(flat)} between half of the view and the whole: average more frames"]
-    why = f"half of the view differs from the whole by {_amounts(flat)}: a bent wall, or ripples of the lidar; "
+    if (
+        flat.bend_m <= SURE_SIGMAS * flat.bend_std_m
+        and flat.bend_deg <= SURE_SIGMAS * flat.bend_std_deg
+    ):
+        return [
+            (
+                f"noise leaves {_amounts(flat)} between half of the view and the whole: average more"
+                " frames"
+            )
+        ]
+    why = (
+        f"half of the view differs from the whole by {_amounts(flat)}: a bent wall, or ripples of"
+        " the lidar; "
+    )
     return [why + "use a flat wall and let the lidar warm up"]
 
 
 def out_of_range(distance_m: float, facing_deg: float) -> list[str]:
-    """Return a line for each of distance and angle that is outside the paper's ranges, with the move that cures it."""
+    """Return a line for each of distance and angle that is outside the paper's ranges, with the
+    move that cures it.
+    """
     problems: list[str] = []
     low, high = DISTANCE_RANGE_M
     if not low - TOLERANCE_M <= distance_m <= high + TOLERANCE_M:
-        excess_m, way = (low - distance_m, "back") if distance_m < low else (distance_m - high, "closer")
+        excess_m, way = (
+            (low - distance_m, "back") if distance_m < low else (distance_m - high, "closer")
+        )
         problems.append(
-            f"{distance_m:.3f} m is outside {low:.2f} to {high:.2f} m: move the lidar {at_least(100.0 * excess_m)} cm "
-            f"{way}"
+            f"{distance_m:.3f} m is outside {low:.2f} to {high:.2f} m: move the lidar"
+            f" {at_least(100.0 * excess_m)} cm {way}"
         )
     low, high = FACING_RANGE_DEG
     if not low - TOLERANCE_DEG <= facing_deg <= high + TOLERANCE_DEG:
-        excess, way = (low - facing_deg, "aside") if facing_deg < low else (facing_deg - high, "towards the wall")
+        excess, way = (
+            (low - facing_deg, "aside")
+            if facing_deg < low
+            else (facing_deg - high, "towards the wall")
+        )
         turn = at_least(excess)
         problems.append(
             f"{facing_deg:.1f} degrees is outside {low:.0f} to {high:.0f}: turn the lidar {turn} "
@@ -132,7 +180,9 @@ def at_least(amount: float) -> int:
 
 @dataclass(frozen=True)
 class WallMeasures:
-    """Distance and angles of a plane 1 / z = slopes . ray, with standard uncertainties; 1.96 of them hold 95 %."""
+    """Distance and angles of a plane 1 / z = slopes . ray, with standard uncertainties; 1.96 of
+    them hold 95 %.
+    """
 
     distance_m: float
     yaw_deg: float
@@ -151,7 +201,8 @@ def measures_of(slopes: Float64, covariance: Float64) -> WallMeasures:
     turn = across @ covariance @ across.T
     # yaw = atan2(x, -z) has the gradient (-z, 0, x) / (x^2 + z^2) over the normal, pitch = asin(-y) that of
     # -y / sqrt(1 - y^2) = -y / sqrt(x^2 + z^2)
-    x, z = normal[0], normal[2]
+    x = normal[0]
+    z = normal[2]
     level = x**2 + z**2
     yaw_rad, pitch_rad = geometry.angles_from_normal(normal)
     return WallMeasures(
@@ -161,7 +212,9 @@ def measures_of(slopes: Float64, covariance: Float64) -> WallMeasures:
         facing_deg=degrees(_facing_rad(normal)),
         distance_std_m=geometry.propagated_std(along, covariance),
         yaw_std_deg=degrees(geometry.propagated_std(np.array([-z, 0.0, x]) / level, turn)),
-        pitch_std_deg=degrees(geometry.propagated_std(np.array([0.0, -1.0, 0.0]) / sqrt(level), turn)),
+        pitch_std_deg=degrees(
+            geometry.propagated_std(np.array([0.0, -1.0, 0.0]) / sqrt(level), turn)
+        ),
         facing_std_deg=degrees(_facing_std_rad(normal, turn)),
     )
 
@@ -172,11 +225,15 @@ def _facing_rad(normal: Float64) -> float:
 
 
 def _facing_std_rad(normal: Float64, turn: Float64) -> float:
-    """Return the standard uncertainty of the facing angle, `turn` (3, 3) being the normal's covariance."""
-    # A turn towards the axis changes the facing angle f one for one. A turn aside by s changes it to sqrt(f^2 + s^2):
-    # by nothing while s << f, by s itself at f = 0, with the standard deviation s^2 / sqrt(f^2 + s^2) in between.
-    # There f is measured too large by about s, so the smallest f that s allows is used.
-    facing_rad, sideways = _facing_rad(normal), float(np.hypot(normal[0], normal[1]))
+    """Return the standard uncertainty of the facing angle, `turn` (3, 3) being the normal's
+    covariance.
+    """
+    # A turn towards the axis changes the facing angle f one for one. A turn aside by s changes it
+    # to sqrt(f^2 + s^2): by nothing while s << f, by s itself at f = 0, with the standard deviation
+    # s^2 / sqrt(f^2 + s^2) in between. There f is measured too large by about s, so the smallest f
+    # that s allows is used.
+    facing_rad = _facing_rad(normal)
+    sideways = float(np.hypot(normal[0], normal[1]))
     x, y = normal[:2] / sideways if sideways > 0.0 else (1.0, 0.0)
     towards = np.array([x * -normal[2], y * -normal[2], sideways])
     aside = np.array([-y, x, 0.0])
@@ -188,20 +245,25 @@ def _facing_std_rad(normal: Float64, turn: Float64) -> float:
 
 MIN_VALID_SHARE = 0.05
 STUCK_SHARE = 0.5
-"""Share of identical depths of a stuck lidar: noise spreads those of a true wall, even one that is faced squarely."""
-BLOCK_PIXELS, SEEN_IN_BLOCK, STRAY_IN_BLOCK = 4, 0.75, 0.875
+"""Share of identical depths of a stuck lidar: noise spreads those of a true wall, even one that is
+faced squarely.
+"""
+BLOCK_PIXELS = 4
+SEEN_IN_BLOCK = 0.75
+STRAY_IN_BLOCK = 0.875
 MAX_STRAY_SHARE = 0.05
-"""Scattered outliers are noise; blocks that stray together are another surface or another light path. At 40 % of
-scattered outliers a full block strays by chance once in 8,000, and one where the wall itself gives no return once in
-200."""
+"""Scattered outliers are noise; blocks that stray together are another surface or another light
+path. At 40 % of scattered outliers a full block strays by chance once in 8,000, and one where the
+wall itself gives no return once in 200."""
 
 
 @dataclass(frozen=True)
 class WallFit(WallMeasures):
-    """Measured wall: pose, uncertainty, quality of the depth, and whether the paper's method works from there.
+    """Measured wall: pose, uncertainty, quality of the depth, and whether the paper's method works
+    from there.
 
-    The standard uncertainties (*_std) include noise and ripples visible in the residuals, but no error that all depths
-    share: for that see `range_offset`.
+    The standard uncertainties (*_std) include noise and ripples visible in the residuals, but no
+    error that all depths share: for that see `range_offset`.
     """
 
     wall_from_lidar: Float64
@@ -211,7 +273,9 @@ class WallFit(WallMeasures):
     residual_m: float
     """RMS distance of the inliers from the plane."""
     noise_scale: float
-    """Noise of a depth sample over nominal: from the spread over frames; for one frame from the residuals."""
+    """Noise of a depth sample over nominal: from the spread over frames; for one frame from the
+    residuals.
+    """
     inlier_fraction: float
     inliers: Mask = field(repr=False)
     """(height, width); pixels of the plane fit."""
@@ -227,7 +291,9 @@ class WallFit(WallMeasures):
 
 
 def wall_depth(wall_from_lidar: Float64, intrinsics: geometry.Intrinsics) -> Float64:
-    """Return the depth (height, width) in metres of a bare, endless wall; inf where a beam never meets it."""
+    """Return the depth (height, width) in metres of a bare, endless wall; inf where a beam never
+    meets it.
+    """
     # depth x ray . normal + distance = 0, with the normal the third row of the rotation
     away = -(intrinsics.rays() @ wall_from_lidar[2, :3])
     depth_m = np.full(away.shape, np.inf)
@@ -241,21 +307,25 @@ def fit_wall(
     noise: MeanNoise | None = None,
     origin_m: float = 0.0,
 ) -> WallFit:
-    """Measure the wall from a mean depth map (height, width); NaN, infinite and non-positive depths are no return.
+    """Measure the wall from a mean depth map (height, width); NaN, infinite and non-positive depths
+    are no return.
 
-    `noise` is that of the flattened map (`DepthMean.noise`), by default of one frame. The pose is that of a point
-    `origin_m` behind the zero of depth on the optical axis (`range_offset`). Raises WallRefusedError where the depth is
-    not that of one bare, flat wall.
+    `noise` is that of the flattened map (`DepthMean.noise`), by default of one frame. The pose is
+    that of a point `origin_m` behind the zero of depth on the optical axis (`range_offset`). Raises
+    WallRefusedError where the depth is not that of one bare, flat wall.
     """
     depth_m = np.where(np.isfinite(depth_m) & (depth_m > 0.0), depth_m, np.nan).astype(np.float64)
     _check_depth(depth_m)
     rays = intrinsics.rays()
     plane = fit_depth(rays.reshape(-1, 3), depth_m.ravel(), generator, noise)
     if plane.normal[2] >= 0.0:
-        raise WallRefusedError("the optical axis never meets the wall's plane: turn the lidar towards the wall")
+        raise WallRefusedError(
+            "the optical axis never meets the wall's plane: turn the lidar towards the wall"
+        )
     scale = noise.scale if noise is not None and noise.measured else plane.noise_scale
     _check_one_surface(depth_m, plane_depth_m(rays, plane.slopes))
-    flat, rippled = flatness(plane, rays), ripples(plane, rays)
+    flat = flatness(plane, rays)
+    rippled = ripples(plane, rays)
     check_flat(flat, rippled.rms_m)
     measures = measures_of(plane.slopes, rippled.covariance)
     # the origin is at -origin_m z, farther from the plane by the normal's component along that
@@ -284,24 +354,29 @@ def _check_depth(depth_m: Float64) -> None:
     share = len(valid_m) / depth_m.size
     if share < MIN_VALID_SHARE:
         raise WallRefusedError(
-            f"{share:.1%} of the pixels have depth, {MIN_VALID_SHARE:.0%} needed: is the lens free and the wall near?"
+            f"{share:.1%} of the pixels have depth, {MIN_VALID_SHARE:.0%} needed: is the lens free"
+            " and the wall near?"
         )
     some_m = valid_m[:: max(len(valid_m) // STATISTICS_POINTS, 1)]
     values_m, times = np.unique(some_m, return_counts=True)
     if times.max() >= STUCK_SHARE * len(some_m):
         raise WallRefusedError(
-            f"{times.max() / len(some_m):.0%} of the view reads {values_m[times.argmax()]:.5f} m, as if the lidar were "
-            "stuck: restart it"
+            f"{times.max() / len(some_m):.0%} of the view reads {values_m[times.argmax()]:.5f} m,"
+            " as if the lidar were stuck: restart it"
         )
 
 
 def _check_one_surface(depth_m: Float64, expected_m: Float64) -> None:
-    """Raise WallRefusedError for a map in which blocks of pixels stray from the wall together; NaN is ignored."""
+    """Raise WallRefusedError for a map in which blocks of pixels stray from the wall together; NaN
+    is ignored.
+    """
     gate_m = GATE_SIGMAS * depth_noise_m(depth_m)
     valid = np.isfinite(depth_m)
     behind = valid & (depth_m - expected_m > gate_m)
     before = valid & (expected_m - depth_m > gate_m)
-    returns, returns_behind, returns_before = (block_sums(mask, BLOCK_PIXELS) for mask in (valid, behind, before))
+    returns, returns_behind, returns_before = (
+        block_sums(mask, BLOCK_PIXELS) for mask in (valid, behind, before)
+    )
     blocks = returns >= SEEN_IN_BLOCK * BLOCK_PIXELS**2
     total = max(int(blocks.sum()), 1)
     stray = blocks & (returns_behind + returns_before >= STRAY_IN_BLOCK * returns)
@@ -310,6 +385,7 @@ def _check_one_surface(depth_m: Float64, expected_m: Float64) -> None:
     far = (stray & (returns_behind >= returns_before)).sum() / total
     near = stray.sum() / total - far
     raise WallRefusedError(
-        f"this does not look like a bare wall: {far:.0%} of the view is behind the wall's plane (light by way of a "
-        f"hidden object?), {near:.0%} in front of it (an occluder?): remove everything in front of the wall"
+        f"this does not look like a bare wall: {far:.0%} of the view is behind the wall's plane"
+        f" (light by way of a hidden object?), {near:.0%} in front of it (an occluder?): remove"
+        " everything in front of the wall"
     )

@@ -1,4 +1,6 @@
-"""Record of a measured wall, `wall.toml`: measurement, uncertainty, device and rig, with the reference beside it."""
+"""Record of a measured wall, `wall.toml`: measurement, uncertainty, device and rig, with the
+reference beside it.
+"""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -33,19 +35,24 @@ from nlos_calibration.wall import Verdict, WallFit, range_verdict
 Row = tuple[Finite, Finite, Finite, Finite]
 POSE_TOLERANCE = 1e-6
 VERSION = 3
-"""Version 2 added uncertainties, flatness, device, board, reference and offset; version 3 temperatures, footprint and
-occluder. All have defaults."""
+"""Version 2 added uncertainties, flatness, device, board, reference and offset; version 3
+temperatures, footprint and occluder. All have defaults."""
 
 
 def _upgraded(version: Any) -> Any:
     """Return the current version for an older one; raise ValueError for a newer one."""
     if isinstance(version, int) and version > VERSION:
-        raise ValueError(f"written by a newer nlos-cam, this one reads up to {VERSION}: update it, or measure again")
+        raise ValueError(
+            f"written by a newer nlos-cam, this one reads up to {VERSION}: update it, or measure"
+            " again"
+        )
     return VERSION if version in (1, 2) else version
 
 
 class WallRecord(Record):
-    """A measured wall. Occluder and object box of `rig` may be edited by hand, its lidar pose is the measurement."""
+    """A measured wall. Occluder and object box of `rig` may be edited by hand, its lidar pose is
+    the measurement.
+    """
 
     schema_version: Annotated[Literal[3], BeforeValidator(_upgraded)] = VERSION
     created: date
@@ -76,7 +83,9 @@ class WallRecord(Record):
     """None where the offset was not measured."""
     range_offset_cause: Cause | None = None
     residual_m: NotNegative | None = None
-    """None, like the further results of the depth, where that was refused and the plane is the board's alone."""
+    """None, like the further results of the depth, where that was refused and the plane is the
+    board's alone.
+    """
     noise_scale: NotNegative | None = None
     """Noise of a depth sample over nominal."""
     inlier_fraction: Annotated[float, Field(ge=0, le=1)] | None = None
@@ -100,11 +109,19 @@ class WallRecord(Record):
     @model_validator(mode="after")
     def _one_pose(self) -> Self:
         """Check that the pose, which is stored in three forms, is the same in all."""
-        lidar = LidarPose(distance_m=self.distance_m, yaw_deg=self.yaw_deg, pitch_deg=self.pitch_deg)
+        lidar = LidarPose(
+            distance_m=self.distance_m, yaw_deg=self.yaw_deg, pitch_deg=self.pitch_deg
+        )
         if lidar != self.rig.lidar:
-            raise ValueError("rig.lidar differs from distance_m, yaw_deg and pitch_deg: measure the wall again")
-        if not np.allclose(self.wall_from_lidar, self.rig.wall_from_lidar, rtol=0.0, atol=POSE_TOLERANCE):
-            raise ValueError("wall_from_lidar differs from the pose of rig.lidar: measure the wall again")
+            raise ValueError(
+                "rig.lidar differs from distance_m, yaw_deg and pitch_deg: measure the wall again"
+            )
+        if not np.allclose(
+            self.wall_from_lidar, self.rig.wall_from_lidar, rtol=0.0, atol=POSE_TOLERANCE
+        ):
+            raise ValueError(
+                "wall_from_lidar differs from the pose of rig.lidar: measure the wall again"
+            )
         return self
 
 
@@ -118,21 +135,30 @@ def new_wall_record(
     occluder: OccluderRecord | None = None,
     others: Mapping[str, object] | None = None,
 ) -> WallRecord:
-    """Return the record of `fit`; its rig is the paper's with the measured pose and the camera's intrinsics.
+    """Return the record of `fit`; its rig is the paper's with the measured pose and the camera's
+    intrinsics.
 
-    Without `occluder` the paper's is assumed. `others` are further fields: of the device, the board, the reference and
-    the range offset.
+    Without `occluder` the paper's is assumed. `others` are further fields: of the device, the
+    board, the reference and the range offset.
     """
     lidar = LidarPose(distance_m=fit.distance_m, yaw_deg=fit.yaw_deg, pitch_deg=fit.pitch_deg)
     pinhole = PinholeRecord.model_validate(vars(intrinsics))
-    rig = load_rig("paper-rig").model_copy(update={"name": "measured", "lidar": lidar, "intrinsics": pinhole})
+    rig = load_rig("paper-rig").model_copy(
+        update={"name": "measured", "lidar": lidar, "intrinsics": pinhole}
+    )
     rig = rig_with_occluder(rig, occluder.x_m, occluder.gap_m) if occluder else rig
     view = footprint(fit.wall_from_lidar, intrinsics, rig.wall)
     measured = {name: value for name, value in vars(fit).items() if name in WallRecord.model_fields}
-    measured |= {"wall_from_lidar": fit.wall_from_lidar.tolist(), "footprint_share": view.share, "occluder": occluder}
+    measured |= {
+        "wall_from_lidar": fit.wall_from_lidar.tolist(),
+        "footprint_share": view.share,
+        "occluder": occluder,
+    }
     verdict, advice = combined(fit.verdict, fit.advice, judge_rig(rig, view, occluder))
     measured |= {"verdict": verdict, "advice": advice, **(others or {})}
-    return WallRecord.model_validate(measured | {"camera": camera, "frames": frames, "created": created, "rig": rig})
+    return WallRecord.model_validate(
+        measured | {"camera": camera, "frames": frames, "created": created, "rig": rig}
+    )
 
 
 UNUSABLE = "do not use this record"
@@ -144,30 +170,46 @@ def with_occluder(record: WallRecord, fit: OccluderFit) -> WallRecord:
     Signs of a hidden object make it doubtful. Doubts about the wall itself stay; remarks on the
     previous occluder, the paper's or an earlier one, go.
     """
-    measured = {name: value for name, value in vars(fit).items() if name in OccluderRecord.model_fields}
+    measured = {
+        name: value for name, value in vars(fit).items() if name in OccluderRecord.model_fields
+    }
     occluder = OccluderRecord(source="detected", **measured)
     rig = rig_with_occluder(record.rig, occluder.x_m, occluder.gap_m)
     pose = np.array(record.wall_from_lidar)
     if record.verdict == "doubtful" and not record.advice.startswith(UNUSABLE):
-        assumed = judge_rig(record.rig, footprint(pose, record.rig.pinhole, record.rig.wall), record.occluder)
-        wall = record.verdict, record.advice.removesuffix("".join(f"; {problem}" for problem in assumed))
+        assumed = judge_rig(
+            record.rig, footprint(pose, record.rig.pinhole, record.rig.wall), record.occluder
+        )
+        wall = (
+            record.verdict,
+            record.advice.removesuffix("".join(f"; {problem}" for problem in assumed)),
+        )
     else:
         wall = range_verdict(record.distance_m, record.facing_deg)
-    verdict, advice = combined(*wall, judge_rig(rig, footprint(pose, rig.pinhole, rig.wall), occluder))
+    verdict, advice = combined(
+        *wall, judge_rig(rig, footprint(pose, rig.pinhole, rig.wall), occluder)
+    )
     if fit.doubt:
-        verdict, advice = "doubtful", f"{UNUSABLE}: {fit.doubt}; remove the object and measure again"
+        verdict = "doubtful"
+        advice = f"{UNUSABLE}: {fit.doubt}; remove the object and measure again"
     changed = {"occluder": occluder, "rig": rig, "verdict": verdict, "advice": advice}
     changed |= {"warnings": tuple(dict.fromkeys((*record.warnings, *fit.warnings)))}
     return WallRecord.model_validate(record.model_dump() | changed)
 
 
 def load_wall(path: Path) -> WallRecord:
-    """Read a `wall.toml` of this version or an older one. Raises RecordFileError with the first problem."""
-    return read_record(path, WallRecord, "wall record", "write one with `nlos-cam calibrate --wall`")
+    """Read a `wall.toml` of this version or an older one. Raises RecordFileError with the first
+    problem.
+    """
+    return read_record(
+        path, WallRecord, "wall record", "write one with `nlos-cam calibrate --wall`"
+    )
 
 
 def rig_named(name: str) -> Rig:
-    """Return a packaged rig by name, or the rig of a file: a rig.toml, or the wall.toml that `calibrate` writes."""
+    """Return a packaged rig by name, or the rig of a file: a rig.toml, or the wall.toml that
+    `calibrate` writes.
+    """
     path = Path(name)
     if path.is_file() and "schema_version" in path.read_text(encoding="utf-8", errors="replace"):
         return load_wall(path).rig
@@ -184,31 +226,46 @@ class MeasuredWall:
 
 
 def load_measured(path: Path) -> MeasuredWall:
-    """Read a `wall.toml` and its reference. Raises RecordFileError if one cannot be read, or they do not match."""
+    """Read a `wall.toml` and its reference. Raises RecordFileError if one cannot be read, or they
+    do not match.
+    """
     record = load_wall(path)
     named = record.reference
-    return MeasuredWall(record, load_reference(path.parent / named, record.reference_sha256) if named else None)
+    return MeasuredWall(
+        record, load_reference(path.parent / named, record.reference_sha256) if named else None
+    )
 
 
 def wall_points_m(record: WallRecord, reference: BareWall) -> Float64:
-    """Return the reference's pixels (height, width, 3) in the wall frame, where z is the distance off the plane."""
+    """Return the reference's pixels (height, width, 3) in the wall frame, where z is the distance
+    off the plane.
+    """
     return points_m(record, reference.depth_m.astype(np.float64), reference.intrinsics)
 
 
 def points_m(record: WallRecord, depth_m: Float64, intrinsics: Intrinsics) -> Float64:
-    """Return depths (height, width) as points (height, width, 3) in the wall frame, range offset included."""
+    """Return depths (height, width) as points (height, width, 3) in the wall frame, range offset
+    included.
+    """
     pose = wall_from_zero(record)
-    # p = R (depth x ray) + t, with the offset added to the depth or, through the pose, to the origin
-    return ((depth_m[..., np.newaxis] + depth_offset_m(record)) * intrinsics.rays()) @ pose[:3, :3].T + pose[:3, 3]
+    # p = R (depth x ray) + t, with the offset added to the depth or, through the pose, to the
+    # origin
+    return ((depth_m[..., np.newaxis] + depth_offset_m(record)) * intrinsics.rays()) @ pose[
+        :3, :3
+    ].T + pose[:3, 3]
 
 
 def depth_offset_m(record: WallRecord) -> float:
-    """Return the length to add to each depth: the range offset if its cause is the depth, else 0."""
+    """Return the length to add to each depth: the range offset if its cause is the depth, else
+    0.
+    """
     return record.range_offset_m if record.range_offset_cause == "depth" else 0.0
 
 
 def wall_from_zero(record: WallRecord) -> Float64:
-    """Return the pose (4, 4) of the point where the beams meet, which an offset of the origin puts before the glass."""
+    """Return the pose (4, 4) of the point where the beams meet, which an offset of the origin puts
+    before the glass.
+    """
     pose = np.array(record.wall_from_lidar)
     pose[:3, 3] += (record.range_offset_m - depth_offset_m(record)) * pose[:3, 2]
     return pose
