@@ -1,4 +1,6 @@
-"""Networks: the compressor and VAE of the paper, uncertainty, training, checkpoints and inference."""
+"""Networks: the compressor and VAE of the paper, uncertainty, training, checkpoints and
+inference.
+"""
 
 import lazy_loader
 

@@ -111,7 +111,17 @@ __all__ = [
 ]
 
 from .checkpoint import load_encoder, load_network, load_pipeline, load_vae
-from .data import InMemory, MapBatch, MapNoise, MapSet, MapSource, WithNoise, as_batch, first_of, subtract_bare_wall
+from .data import (
+    InMemory,
+    MapBatch,
+    MapNoise,
+    MapSet,
+    MapSource,
+    WithNoise,
+    as_batch,
+    first_of,
+    subtract_bare_wall,
+)
 from .direct import CellNormal, DirectNetwork, channels_of
 from .direct_training import NormalBatch, NormalSource, train_direct
 from .distributed import Accelerator, launch, open_fabric
@@ -158,7 +168,14 @@ from .metrics import (
     silhouette_iou,
     surface,
 )
-from .pipeline import SMALLEST_SPREAD, Preprocess, channel_statistics, cut_silhouette, lift_edges, split_and_stack
+from .pipeline import (
+    SMALLEST_SPREAD,
+    Preprocess,
+    channel_statistics,
+    cut_silhouette,
+    lift_edges,
+    split_and_stack,
+)
 from .quality import GOOD_IOU, QualityRecord, quality_features, quality_watches, write_quality
 from .recipe import SIMULATION_ONLY, Recipe, load_recipe, packaged_recipes
 from .records import (

@@ -1,4 +1,6 @@
-"""Checkpoints: one float16 safetensors file per network, beside a JSON record of runs, rig and held-out figures."""
+"""Checkpoints: one float16 safetensors file per network, beside a JSON record of runs, rig and
+held-out figures.
+"""
 
 import json
 from collections.abc import Mapping
@@ -32,7 +34,9 @@ FULL = frozenset({"mean", "median", "spread", "bare_depth_m", "bare_intensity"})
 
 
 class LoadReport(NamedTuple):
-    """Names of the tensors that a file and a network share or not; the network keeps its own where they do not fit."""
+    """Names of the tensors that a file and a network share or not; the network keeps its own where
+    they do not fit.
+    """
 
     loaded: list[str]
     missing: list[str]
@@ -44,7 +48,10 @@ class LoadReport(NamedTuple):
 
     def __str__(self) -> str:
         rest = {name: names for name, names in self._asdict().items() if name != "loaded" and names}
-        counts = [f"{len(names)} {name.replace('_', ' ')} ({', '.join(names[:3])})" for name, names in rest.items()]
+        counts = [
+            f"{len(names)} {name.replace('_', ' ')} ({', '.join(names[:3])})"
+            for name, names in rest.items()
+        ]
         return f"{len(self.loaded)} tensors loaded; " + (", ".join(counts) or "all fit")
 
 
@@ -54,7 +61,10 @@ def save_vae(folder: Path, vae: ResVae, record: CheckpointRecord) -> None:
 
 
 def save_pipeline(
-    folder: Path, pipeline: RemappingNetwork, record: CheckpointRecord, encoder: Encoder | None = None
+    folder: Path,
+    pipeline: RemappingNetwork,
+    record: CheckpointRecord,
+    encoder: Encoder | None = None,
 ) -> None:
     """Write compressor, preprocessing statistics, decoder and record into a folder.
 
@@ -69,8 +79,11 @@ def save_direct(folder: Path, network: DirectNetwork, record: CheckpointRecord) 
     _save(folder, {DIRECT: network}, record)
 
 
-def load_network(folder: Path | None = None) -> tuple[RemappingNetwork | DirectNetwork, CheckpointRecord]:
-    """Return the network from maps to images in a folder (default: the direct one), in eval mode, with its record.
+def load_network(
+    folder: Path | None = None,
+) -> tuple[RemappingNetwork | DirectNetwork, CheckpointRecord]:
+    """Return the network from maps to images in a folder (default: the direct one), in eval mode,
+    with its record.
 
     Raises CheckpointError.
     """
@@ -84,13 +97,16 @@ def load_network(folder: Path | None = None) -> tuple[RemappingNetwork | DirectN
 
 
 def load_vae(folder: Path | None = None) -> tuple[ResVae, CheckpointRecord]:
-    """Return a Res-VAE (default: the paper's) in eval mode, with its record. Raises CheckpointError."""
+    """Return a Res-VAE (default: the paper's) in eval mode, with its record. Raises
+    CheckpointError.
+    """
     folder = weights_folder(folder, PAPER)
     record = load_record(folder)
     if not (folder / ENCODER).exists() and folder == shipped_folder(PAPER):
         raise CheckpointError(
-            "the paper's weights come without their encoder (21 MB), which only training needs: make it again with "
-            "`nlos-cam train vae --recipe vae-encoder --out DIR`, and give --vae DIR"
+            "the paper's weights come without their encoder (21 MB), which only training needs:"
+            " make it again with `nlos-cam train vae --recipe vae-encoder --out DIR`, and give"
+            " --vae DIR"
         )
     vae = new_vae(color=record.color)
     for name, module in (("encoder", vae.encoder), ("decoder", vae.decoder)):
@@ -99,25 +115,35 @@ def load_vae(folder: Path | None = None) -> tuple[ResVae, CheckpointRecord]:
 
 
 def load_pipeline(folder: Path | None = None) -> tuple[RemappingNetwork, CheckpointRecord]:
-    """Return a pipeline in eval mode (default: the paper's), with its record. Raises CheckpointError."""
+    """Return a pipeline in eval mode (default: the paper's), with its record. Raises
+    CheckpointError.
+    """
     return _load_pipeline(weights_folder(folder, PAPER), PIPELINE_PARTS)
 
 
 def load_pipeline_partly(folder: Path) -> tuple[RemappingNetwork, CheckpointRecord, LoadReport]:
-    """Return a pipeline with the compressor's matching tensors, its record, and a report; the rest is random.
+    """Return a pipeline with the compressor's matching tensors, its record, and a report; the rest
+    is random.
 
-    Raises CheckpointError where no tensor of the compressor fits, or one of the other networks does not.
+    Raises CheckpointError where no tensor of the compressor fits, or one of the other networks does
+    not.
     """
     pipeline, record = _load_pipeline(folder, ("preprocess", "decoder"))
     return pipeline, record, load_fitting(folder / "compressor.safetensors", pipeline.compressor)
 
 
-def _load_pipeline(folder: Path, names: tuple[str, ...]) -> tuple[RemappingNetwork, CheckpointRecord]:
+def _load_pipeline(
+    folder: Path, names: tuple[str, ...]
+) -> tuple[RemappingNetwork, CheckpointRecord]:
     record = load_record(folder)
     if record.direct_recipe:
-        raise CheckpointError(f"{folder} holds a direct network: name weights from `train compressor`")
+        raise CheckpointError(
+            f"{folder} holds a direct network: name weights from `train compressor`"
+        )
     if not (folder / "compressor.safetensors").exists() and (folder / ENCODER).exists():
-        raise CheckpointError(f"{folder} holds a VAE without a compressor: name weights from `train compressor`")
+        raise CheckpointError(
+            f"{folder} holds a VAE without a compressor: name weights from `train compressor`"
+        )
     pipeline = new_pipeline(color=record.color, width=record.width)
     for name in names:
         load_part(folder / f"{name}.safetensors", getattr(pipeline, name))
@@ -125,7 +151,9 @@ def _load_pipeline(folder: Path, names: tuple[str, ...]) -> tuple[RemappingNetwo
 
 
 def load_encoder(folder: Path | None = None) -> Encoder | None:
-    """Return the encoder beside a pipeline's weights (default: the paper's), in eval mode, or None without one."""
+    """Return the encoder beside a pipeline's weights (default: the paper's), in eval mode, or None
+    without one.
+    """
     folder = weights_folder(folder, PAPER)
     path = folder / ENCODER
     if not path.exists():
@@ -136,19 +164,25 @@ def load_encoder(folder: Path | None = None) -> Encoder | None:
 
 
 def load_fitting(path: Path, module: nn.Module) -> LoadReport:
-    """Load the tensors that a network has in the same shape. Raises CheckpointError where there are none."""
-    tensors, own = _read_tensors(path), module.state_dict()
+    """Load the tensors that a network has in the same shape. Raises CheckpointError where there are
+    none.
+    """
+    tensors = _read_tensors(path)
+    own = module.state_dict()
     shared = sorted(tensors.keys() & own.keys())
     fitting = [name for name in shared if tensors[name].shape == own[name].shape]
     if not fitting:
         raise CheckpointError(f"{path} holds no tensor that fits this network: name other weights")
     module.load_state_dict({name: tensors[name] for name in fitting}, strict=False)
-    missing, left_over = sorted(own.keys() - tensors.keys()), sorted(tensors.keys() - own.keys())
+    missing = sorted(own.keys() - tensors.keys())
+    left_over = sorted(tensors.keys() - own.keys())
     return LoadReport(fitting, missing, left_over, sorted(set(shared) - set(fitting)))
 
 
 def _save(folder: Path, parts: dict[str, nn.Module], record: CheckpointRecord) -> None:
-    unset = {name for name in ("note", "direct_recipe") if not getattr(record, name)}  # older readers refuse these
+    unset = {
+        name for name in ("note", "direct_recipe") if not getattr(record, name)
+    }  # older readers refuse these
     text = json.dumps(record.model_dump(mode="json", exclude=unset), indent=2)
     save_parts(folder, parts, {RECORD: text})
 
@@ -162,7 +196,9 @@ def save_parts(folder: Path, parts: Mapping[str, nn.Module], texts: Mapping[str,
     try:
         write_checked(folder, files | {name: f"{text}\n".encode() for name, text in texts.items()})
     except (OSError, SafetensorError) as error:
-        raise CheckpointError(f"cannot write weights to {folder} ({error}): free some space and run again") from error
+        raise CheckpointError(
+            f"cannot write weights to {folder} ({error}): free some space and run again"
+        ) from error
 
 
 def _pack(module: nn.Module) -> bytes:
@@ -171,20 +207,29 @@ def _pack(module: nn.Module) -> bytes:
 
 def _to_half(name: str, tensor: torch.Tensor) -> torch.Tensor:
     if not tensor.is_floating_point() or "running" in name or name.rpartition(".")[2] in FULL:
-        return tensor.contiguous()  # statistics are few, and float16 would flush the smallest to zero
+        return (
+            tensor.contiguous()
+        )  # statistics are few, and float16 would flush the smallest to zero
     half = tensor.half().contiguous()
     if not torch.isfinite(half).all():
-        raise CheckpointError(f"{name} does not fit into float16 (largest {tensor.abs().max():.3g}): training diverged")
+        raise CheckpointError(
+            f"{name} does not fit into float16 (largest {tensor.abs().max():.3g}): training"
+            " diverged"
+        )
     return half
 
 
 def load_part(path: Path, module: nn.Module) -> None:
-    """Load a network strictly. Raises CheckpointError where a tensor is missing, left over or of another shape."""
+    """Load a network strictly. Raises CheckpointError where a tensor is missing, left over or of
+    another shape.
+    """
     tensors = _read_tensors(path)
     try:
         module.load_state_dict(tensors)
     except RuntimeError as error:
-        raise CheckpointError(f"{path} does not fit this network: {str(error).splitlines()[-1].strip()}") from error
+        raise CheckpointError(
+            f"{path} does not fit this network: {str(error).splitlines()[-1].strip()}"
+        ) from error
 
 
 def _read_tensors(path: Path) -> dict[str, torch.Tensor]:
@@ -192,7 +237,11 @@ def _read_tensors(path: Path) -> dict[str, torch.Tensor]:
         tensors = load(read_checked(path, TENSOR_LIMIT))
     except (OSError, ValueError, SafetensorError, MemoryError) as error:
         raise CheckpointError(f"{path} cannot be read as weights: {describe(error)}") from error
-    floats = {key: value.float() if value.is_floating_point() else value for key, value in tensors.items()}
+    floats = {
+        key: value.float() if value.is_floating_point() else value for key, value in tensors.items()
+    }
     if bad := [key for key, value in floats.items() if not torch.isfinite(value).all()]:
-        raise CheckpointError(f"{path} cannot be used as weights: {bad[0]} is not finite; train or copy them again")
+        raise CheckpointError(
+            f"{path} cannot be used as weights: {bad[0]} is not finite; train or copy them again"
+        )
     return floats

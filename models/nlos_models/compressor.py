@@ -1,23 +1,35 @@
 """Compressors from maps to latents (SI 4): MobileNetV2 for depth, ResNet50 for color.
 
-MobileNetV2 has 4 input channels and 256 outputs (Table S2; 2,552,096 parameters). ResNet50 has 8 input channels and 512
-outputs (24,572,800 parameters; SI's 24,557,120 is the count for 3 inputs), with bottlenecks 3-4-6-3 (He et al., "Deep
-Residual Learning for Image Recognition", 2015, table 1) and the stride in the 3 x 3 convolution, as is common; the
-number of parameters is the same.
+MobileNetV2 has 4 input channels and 256 outputs (Table S2; 2,552,096 parameters). ResNet50 has 8
+input channels and 512 outputs (24,572,800 parameters; SI's 24,557,120 is the count for 3 inputs),
+with bottlenecks 3-4-6-3 (He et al., "Deep Residual Learning for Image Recognition", 2015, table 1)
+and the stride in the 3 x 3 convolution, as is common; the number of parameters is the same.
 """
 
 import torch
 from torch import Tensor, nn
 
 INPUT_CHANNELS = 4
-STEM, HEAD, OUTPUTS = 32, 1280, 256
-STAGES = ((1, 16, 1, 1), (6, 24, 2, 2), (6, 32, 3, 2), (6, 64, 4, 2), (6, 96, 3, 1), (6, 160, 3, 2), (6, 320, 1, 1))
+STEM = 32
+HEAD = 1280
+OUTPUTS = 256
+STAGES = (
+    (1, 16, 1, 1),
+    (6, 24, 2, 2),
+    (6, 32, 3, 2),
+    (6, 64, 4, 2),
+    (6, 96, 3, 1),
+    (6, 160, 3, 2),
+    (6, 320, 1, 1),
+)
 """Table S2: expansion, channels, repeats, stride of the first."""
 DROPOUT = 0.5
 
 
 class Filter(nn.Conv2d):
-    """Convolution that a CPU runs in float32 where it strides over single channels: bfloat16 is slow there."""
+    """Convolution that a CPU runs in float32 where it strides over single channels: bfloat16 is
+    slow there.
+    """
 
     def forward(self, input: Tensor) -> Tensor:  # noqa: A002  nn.Conv2d's name
         """Map (n, in, h, w) to (n, out, h', w')."""
@@ -27,7 +39,9 @@ class Filter(nn.Conv2d):
             return super().forward(input.float())
 
 
-def conv_norm(channels_in: int, channels_out: int, kernel: int, stride: int = 1, groups: int = 1) -> list[nn.Module]:
+def conv_norm(
+    channels_in: int, channels_out: int, kernel: int, stride: int = 1, groups: int = 1
+) -> list[nn.Module]:
     """Return a padded convolution and its batch norm; only the stride changes the image's size."""
     padding = kernel // 2
     conv = Filter(channels_in, channels_out, kernel, stride, padding, groups=groups, bias=False)
@@ -35,7 +49,9 @@ def conv_norm(channels_in: int, channels_out: int, kernel: int, stride: int = 1,
 
 
 class InvertedResidual(nn.Module):
-    """Residual block: expand, filter each channel, project; its input is added where the shapes agree."""
+    """Residual block: expand, filter each channel, project; its input is added where the shapes
+    agree.
+    """
 
     def __init__(self, channels_in: int, channels_out: int, stride: int, expansion: int) -> None:
         super().__init__()
@@ -51,7 +67,9 @@ class InvertedResidual(nn.Module):
 
 
 def _scale_channels(channels: int, width: float) -> int:
-    """Return the channels of a layer in a network of this width: a multiple of 8, by MobileNetV2's rule."""
+    """Return the channels of a layer in a network of this width: a multiple of 8, by MobileNetV2's
+    rule.
+    """
     return max(8, int(channels * width + 4) // 8 * 8)
 
 
@@ -67,7 +85,9 @@ def _features(width: float) -> nn.Sequential:
 
 
 class Compressor(nn.Module):
-    """MobileNetV2 from stacked maps (n, 4, 100, 100) to latents (n, 256); `width` scales all layers but the last."""
+    """MobileNetV2 from stacked maps (n, 4, 100, 100) to latents (n, 256); `width` scales all layers
+    but the last.
+    """
 
     def __init__(self, dropout: float = DROPOUT, width: float = 1.0) -> None:
         super().__init__()
@@ -79,7 +99,8 @@ class Compressor(nn.Module):
         return self.classifier(self.features(stacked).mean((2, 3)))
 
 
-COLOR_INPUT_CHANNELS, COLOR_OUTPUTS = 8, 512
+COLOR_INPUT_CHANNELS = 8
+COLOR_OUTPUTS = 512
 COLOR_STEM = 64
 COLOR_STAGES = ((64, 3, 1), (128, 4, 2), (256, 6, 2), (512, 3, 2))
 """Inner channels, repeats, stride of the first."""
@@ -88,7 +109,9 @@ WIDENED = 4
 
 
 class Bottleneck(nn.Module):
-    """Residual block: narrow, filter, widen; its input is added, projected where the shapes differ."""
+    """Residual block: narrow, filter, widen; its input is added, projected where the shapes
+    differ.
+    """
 
     def __init__(self, channels_in: int, within: int, stride: int) -> None:
         super().__init__()
@@ -101,7 +124,9 @@ class Bottleneck(nn.Module):
             *conv_norm(within, out, 1),
         )
         same = stride == 1 and channels_in == out
-        self.shortcut = nn.Identity() if same else nn.Sequential(*conv_norm(channels_in, out, 1, stride))
+        self.shortcut = (
+            nn.Identity() if same else nn.Sequential(*conv_norm(channels_in, out, 1, stride))
+        )
 
     def forward(self, x: Tensor) -> Tensor:
         """Map (n, in, h, w) to (n, 4 within, h / stride, w / stride)."""
@@ -109,7 +134,11 @@ class Bottleneck(nn.Module):
 
 
 def _color_features(channels: int) -> nn.Sequential:
-    layers: list[nn.Module] = [*conv_norm(channels, COLOR_STEM, 7, 2), nn.ReLU(), nn.MaxPool2d(3, 2, padding=1)]
+    layers: list[nn.Module] = [
+        *conv_norm(channels, COLOR_STEM, 7, 2),
+        nn.ReLU(),
+        nn.MaxPool2d(3, 2, padding=1),
+    ]
     channels = COLOR_STEM
     for within, repeats, stride in COLOR_STAGES:
         for repeat in range(repeats):
@@ -122,11 +151,16 @@ class ResNet50(nn.Module):
     """ResNet50 from stacked maps (n, channels, 100, 100) to latents (n, outputs)."""
 
     def __init__(
-        self, channels: int = COLOR_INPUT_CHANNELS, outputs: int = COLOR_OUTPUTS, dropout: float = 0.0
+        self,
+        channels: int = COLOR_INPUT_CHANNELS,
+        outputs: int = COLOR_OUTPUTS,
+        dropout: float = 0.0,
     ) -> None:
         super().__init__()
         self.features = _color_features(channels)
-        self.classifier = nn.Sequential(nn.Dropout(dropout), nn.Linear(WIDENED * COLOR_STAGES[-1][0], outputs))
+        self.classifier = nn.Sequential(
+            nn.Dropout(dropout), nn.Linear(WIDENED * COLOR_STAGES[-1][0], outputs)
+        )
 
     def forward(self, stacked: Tensor) -> Tensor:
         """Map (n, channels, 100, 100) to (n, outputs)."""

@@ -12,14 +12,18 @@ from torch import Tensor
 from nlos_models.arrays import Float16, Float32
 
 STATISTICS_OBJECTS = 10_000
-"""Objects for the channels' mean and spread; their sampling error is far below the noise that training adds."""
+"""Objects for the channels' mean and spread; their sampling error is far below the noise that
+training adds.
+"""
 ROUNDING_VARIANCE = 1 / 12
 """Of a pixel's whole counts, in counts squared."""
 
 
 @dataclass(frozen=True)
 class MapSet:
-    """Lidar maps with the images of the hidden objects: a compressor's training samples, in memory."""
+    """Lidar maps with the images of the hidden objects: a compressor's training samples, in
+    memory.
+    """
 
     depth_m: Float32
     """(n, 64, 80); NaN where there is no return."""
@@ -30,7 +34,9 @@ class MapSet:
 
 
 def shuffled(count: int, batch: int, generator: torch.Generator) -> Iterator[Tensor]:
-    """Yield the index batches of one epoch, without the last, smaller one: a batch norm needs several samples."""
+    """Yield the index batches of one epoch, without the last, smaller one: a batch norm needs
+    several samples.
+    """
     order = torch.randperm(count, generator=generator)
     for start in range(0, count - min(batch, count) + 1, batch):
         yield order[start : start + batch]
@@ -39,15 +45,17 @@ def shuffled(count: int, batch: int, generator: torch.Generator) -> Iterator[Ten
 def flip_some(tensors: list[Tensor], flips: Tensor) -> list[Tensor]:
     """Mirror the flagged samples (n,) top to bottom in every tensor (n, ..., rows, columns).
 
-    The rig is symmetric about y = 0: the maps of a mirrored object are the object's maps, mirrored. So these are
-    samples that could have been rendered.
+    The rig is symmetric about y = 0: the maps of a mirrored object are the object's maps, mirrored.
+    So these are samples that could have been rendered.
     """
     chosen = flips.bool()
     return [torch.where(chosen.view(-1, *[1] * (t.ndim - 1)), t.flip(-2), t) for t in tensors]
 
 
 def as_images(images: Float16 | Float32) -> Tensor:
-    """Return images (n, 64, 64) as float32 (n, 1, 64, 64) for networks; color images have their channels already."""
+    """Return images (n, 64, 64) as float32 (n, 1, 64, 64) for networks; color images have their
+    channels already.
+    """
     tensor = torch.from_numpy(images.astype(np.float32))
     return tensor[:, None] if tensor.ndim == 3 else tensor
 
@@ -78,18 +86,27 @@ class MapNoise:
 
     def add(self, counts: Tensor, generator: torch.Generator | None = None) -> Tensor:
         """Return intensities with noise drawn for each, in counts, none below 0."""
-        deviates = torch.randn(counts.shape, generator=generator, device=counts.device, dtype=counts.dtype)
+        deviates = torch.randn(
+            counts.shape, generator=generator, device=counts.device, dtype=counts.dtype
+        )
         return (counts + self.deviation(counts) * deviates).clamp(min=0)
 
     def draw(self, depth_m: Tensor, intensity: Tensor, generator: torch.Generator) -> Tensor:
-        """Return the intensities of expected maps with noise drawn; a cell without a return keeps its own."""
-        drawn, nowhere = self.add(intensity, generator), depth_m.isnan()
+        """Return the intensities of expected maps with noise drawn; a cell without a return keeps
+        its own.
+        """
+        drawn = self.add(intensity, generator)
+        nowhere = depth_m.isnan()
         return torch.where(nowhere[:, None] if drawn.dim() == 4 else nowhere, intensity, drawn)
 
     def expose(self, maps: "MapSet", seed: int) -> "MapSet":
         """Return expected maps as one exposure gives them."""
-        depth_m, intensity = torch.from_numpy(maps.depth_m), torch.from_numpy(maps.intensity)
-        return replace(maps, intensity=self.draw(depth_m, intensity, torch.Generator().manual_seed(seed)).numpy())
+        depth_m = torch.from_numpy(maps.depth_m)
+        intensity = torch.from_numpy(maps.intensity)
+        return replace(
+            maps,
+            intensity=self.draw(depth_m, intensity, torch.Generator().manual_seed(seed)).numpy(),
+        )
 
 
 class MapBatch(NamedTuple):
@@ -108,9 +125,13 @@ class MapBatch(NamedTuple):
 
 
 def as_batch(maps: MapSet, row: NDArray[np.int64], mirrored: NDArray[np.bool_]) -> MapBatch:
-    """Return samples (b,) as a batch, the flagged ones mirrored; `row` are their indices in the whole set."""
-    depth, intensity = torch.from_numpy(maps.depth_m), torch.from_numpy(maps.intensity)
-    image, flips = as_images(maps.image), torch.from_numpy(mirrored)
+    """Return samples (b,) as a batch, the flagged ones mirrored; `row` are their indices in the
+    whole set.
+    """
+    depth = torch.from_numpy(maps.depth_m)
+    intensity = torch.from_numpy(maps.intensity)
+    image = as_images(maps.image)
+    flips = torch.from_numpy(mirrored)
     depth, intensity, image = flip_some([depth, intensity, image], flips)
     return MapBatch(depth, intensity, image, torch.from_numpy(row), flips)
 
@@ -136,7 +157,9 @@ class MapSource(Protocol):
         ...
 
     def batches(self, batch: int, generator: torch.Generator) -> Iterable[MapBatch]:
-        """Return one epoch, shuffled and mirrored by the generator alone: the same generator, the same epoch."""
+        """Return one epoch, shuffled and mirrored by the generator alone: the same generator, the
+        same epoch.
+        """
         ...
 
 
@@ -159,7 +182,9 @@ class InMemory:
 
 @dataclass(frozen=True)
 class WithNoise:
-    """Map source of expected maps, to whose batches the sensor's noise is added, in each epoch another draw."""
+    """Map source of expected maps, to whose batches the sensor's noise is added, in each epoch
+    another draw.
+    """
 
     source: MapSource
     noise: MapNoise
@@ -175,16 +200,29 @@ class WithNoise:
     def batches(self, batch: int, generator: torch.Generator) -> Iterator[MapBatch]:
         """Yield one epoch; a cell without a return keeps its intensity."""
         for plain in self.source.batches(batch, generator):
-            yield plain._replace(intensity=self.noise.draw(plain.depth_m, plain.intensity, generator))
+            yield plain._replace(
+                intensity=self.noise.draw(plain.depth_m, plain.intensity, generator)
+            )
 
 
 def first_of(maps: MapSet, count: int) -> MapSet:
     """Return the first `count` objects of a map set, or all if there are fewer."""
-    return replace(maps, depth_m=maps.depth_m[:count], intensity=maps.intensity[:count], image=maps.image[:count])
+    return replace(
+        maps,
+        depth_m=maps.depth_m[:count],
+        intensity=maps.intensity[:count],
+        image=maps.image[:count],
+    )
 
 
 def subtract_bare_wall(maps: MapSet, depth_m: Float32, intensity: Float32) -> MapSet:
-    """Return difference maps: maps minus the bare wall's (64, 80); a cell has a return where both have one."""
+    """Return difference maps: maps minus the bare wall's (64, 80); a cell has a return where both
+    have one.
+    """
     difference_m = maps.depth_m - depth_m
     valid = ~np.isnan(difference_m)
-    return replace(maps, depth_m=difference_m, intensity=np.where(valid, maps.intensity - intensity, np.float32(0.0)))
+    return replace(
+        maps,
+        depth_m=difference_m,
+        intensity=np.where(valid, maps.intensity - intensity, np.float32(0.0)),
+    )

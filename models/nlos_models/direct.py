@@ -1,8 +1,10 @@
-"""Direct network from maps to images: the project's own, beside the paper's pipeline; no latent, two heads.
+"""Direct network from maps to images: the project's own, beside the paper's pipeline; no latent,
+two heads.
 
-The rig is symmetric about y = 0, and so is the network: the answer to mirrored maps is the mirrored answer, exactly.
-Maps are folded into two sides, top and bottom, the bottom one upside down; each layer treats both sides alike. All
-layers are matrix products, which a CPU trains 14 times as fast as MobileNetV2's convolutions.
+The rig is symmetric about y = 0, and so is the network: the answer to mirrored maps is the mirrored
+answer, exactly. Maps are folded into two sides, top and bottom, the bottom one upside down; each
+layer treats both sides alike. All layers are matrix products, which a CPU trains 14 times as fast
+as MobileNetV2's convolutions.
 """
 
 import torch
@@ -13,19 +15,29 @@ from nlos_models.data import MapNoise
 from nlos_models.metrics import MIN_V
 from nlos_models.recipe import DirectSize
 
-ROWS, COLUMNS = 64, 80
+ROWS = 64
+COLUMNS = 80
 PIXELS = 64
 CLIP = 5.0
 """Limit of a normalised cell, in spreads."""
 CUTS = 0.3, 0.34, 0.38, 0.42, 0.46, 0.5
-"""Probabilities of a surface that an image may be cut at; lower ones would cost more of the mean absolute error."""
+"""Probabilities of a surface that an image may be cut at; lower ones would cost more of the mean
+absolute error.
+"""
 SMALLEST_SHARE = 0.3
-"""Smallest spread of a cell, as a share of the median spread: quiet cells would otherwise show noise alone."""
+"""Smallest spread of a cell, as a share of the median spread: quiet cells would otherwise show
+noise alone.
+"""
 MIN_LIGHT_SPREAD = 0.04
-"""Of the log intensity: the reflectance of a real wall varies by some percent, which the renderer's does not."""
+"""Of the log intensity: the reflectance of a real wall varies by some percent, which the renderer's
+does not.
+"""
 GAIN_COLUMNS = 4
-"""Every so many columns give cells that tell a frame's gain; all rows, so that mirrored maps have the same gain."""
-PATCH, TOKEN = 4, 8
+"""Every so many columns give cells that tell a frame's gain; all rows, so that mirrored maps have
+the same gain.
+"""
+PATCH = 4
+TOKEN = 8
 """Cells of a patch's side, and pixels of an output token's side; patches are merged two by two."""
 SIDE_PATCHES = (ROWS // 2 // PATCH, COLUMNS // PATCH)
 SIDE_INPUTS = SIDE_PATCHES[0] * SIDE_PATCHES[1] // 4
@@ -35,26 +47,39 @@ SIDE_TOKENS = (PIXELS // 2 // TOKEN, PIXELS // TOKEN)
 class MirrorLinear(nn.Module):
     """Linear layer (b, 2, ..., in) to (b, 2, ..., out) that commutes with swapping the two sides.
 
-    Such a layer acts on the sum and on the difference of the sides apart: half the products of a full one.
+    Such a layer acts on the sum and on the difference of the sides apart: half the products of a
+    full one.
     """
 
     def __init__(self, inputs: int, outputs: int) -> None:
         super().__init__()
-        self.even, self.odd = nn.Linear(inputs, outputs), nn.Linear(inputs, outputs, bias=False)
+        self.even = nn.Linear(inputs, outputs)
+        self.odd = nn.Linear(inputs, outputs, bias=False)
 
     def forward(self, sides: Tensor) -> Tensor:
         """Map both sides."""
         top, bottom = sides.unbind(1)
-        even, odd = self.even(0.7 * (top + bottom)), self.odd(0.7 * (top - bottom))
+        even = self.even(0.7 * (top + bottom))
+        odd = self.odd(0.7 * (top - bottom))
         return 0.7 * torch.stack([even + odd, even - odd], dim=1)
 
 
 class Residual(nn.Module):
-    """Residual block: layer norm, two layers with GELU between them, dropout; the last layer starts at zero."""
+    """Residual block: layer norm, two layers with GELU between them, dropout; the last layer starts
+    at zero.
+    """
 
-    def __init__(self, norm: int, layers: tuple[nn.Module, nn.Module], dropout: float, *, across: bool = False) -> None:
+    def __init__(
+        self,
+        norm: int,
+        layers: tuple[nn.Module, nn.Module],
+        dropout: float,
+        *,
+        across: bool = False,
+    ) -> None:
         super().__init__()
-        self.norm, self.across = nn.LayerNorm(norm), across
+        self.norm = nn.LayerNorm(norm)
+        self.across = across
         self.first, self.second, self.dropout = *layers, nn.Dropout(dropout)
         for parameter in self.second.parameters():
             nn.init.zeros_(parameter)
@@ -68,10 +93,12 @@ class Residual(nn.Module):
 
 
 class CellNormal(nn.Module):
-    """Normalisation of each cell's depth and log intensity by median and spread over the training set, clipped.
+    """Normalisation of each cell's depth and log intensity by median and spread over the training
+    set, clipped.
 
-    The frame's own gain is taken out of the intensity: the median ratio to the training set's medians over the quieter
-    half of the cells, which hardly any object changes. In color there are three intensities, and one gain.
+    The frame's own gain is taken out of the intensity: the median ratio to the training set's
+    medians over the quieter half of the cells, which hardly any object changes. In color there are
+    three intensities, and one gain.
     """
 
     median: Tensor
@@ -87,32 +114,41 @@ class CellNormal(nn.Module):
         for channel, values in enumerate(_channels(depth_m, intensity).unbind(1)):
             median = values.nanmedian(0).values.nan_to_num()
             spread = (values - median).square().nanmean(0).sqrt().nan_to_num()
-            spread = spread.clamp(min=max(SMALLEST_SHARE * float(spread.median()), MIN_LIGHT_SPREAD * bool(channel)))
+            spread = spread.clamp(
+                min=max(SMALLEST_SHARE * float(spread.median()), MIN_LIGHT_SPREAD * bool(channel))
+            )
             self.median[channel] = (median + median.flip(0)) / 2
             self.spread[channel] = (spread + spread.flip(0)) / 2
 
     def shift(self, depth_m: Tensor, intensity: Tensor, channels: slice = slice(None)) -> None:
-        """Shift the medians of some or all channels as maps (n, 64, 80) of another bench ask for: its offset, its gain.
+        """Shift the medians of some or all channels as maps (n, 64, 80) of another bench ask for:
+        its offset, its gain.
 
-        One number a channel, the median over the cells: a few objects do not tell each cell's own median.
+        One number a channel, the median over the cells: a few objects do not tell each cell's own
+        median.
         """
         medians = _channels(depth_m, intensity).nanmedian(0).values
         shifts = (medians - self.median).flatten(1).nanmedian(1).values.nan_to_num()
         self.median[channels] += shifts[channels, None, None]
 
     def forward(self, depth_m: Tensor, intensity: Tensor) -> Tensor:
-        """Map maps (n, 64, 80) to (n, 2, 64, 80), in color (n, 4, 64, 80); a cell without a return is 0."""
+        """Map maps (n, 64, 80) to (n, 2, 64, 80), in color (n, 4, 64, 80); a cell without a return
+        is 0.
+        """
         off = _channels(depth_m, intensity) - self.median
         gain = self.log_gain(off[:, 1:].mean(1))[:, None, None, None]
         normal = torch.cat([off[:, :1], off[:, 1:] - gain], dim=1) / self.spread
         return torch.where(torch.isnan(normal), 0.0, normal.clamp(-CLIP, CLIP))
 
     def log_gain(self, light: Tensor) -> Tensor:
-        """Return the logarithm of each frame's gain (n,), of log intensities (n, 64, 80) less the medians; 0 for none.
+        """Return the logarithm of each frame's gain (n,), of log intensities (n, 64, 80) less the
+        medians; 0 for none.
 
-        Medians are taken by sorting, which every runtime can do, with cells that do not count at the end.
+        Medians are taken by sorting, which every runtime can do, with cells that do not count at
+        the end.
         """
-        some, spread = light[..., ::GAIN_COLUMNS], self.spread[1:, :, ::GAIN_COLUMNS].mean(0)
+        some = light[..., ::GAIN_COLUMNS]
+        spread = self.spread[1:, :, ::GAIN_COLUMNS].mean(0)
         quieter = spread <= spread.flatten().sort().values[(spread.numel() - 1) // 2]
         counts = quieter & ~torch.isnan(some)
         ordered = torch.where(counts, some, torch.inf).flatten(1).sort(dim=1).values
@@ -121,14 +157,20 @@ class CellNormal(nn.Module):
         return torch.where(number > 0, middle, 0.0)[:, 0]
 
     def vary(
-        self, normal: Tensor, noise: MapNoise | None, log_reflectance: Tensor | None, offset_m: Tensor | None
+        self,
+        normal: Tensor,
+        noise: MapNoise | None,
+        log_reflectance: Tensor | None,
+        offset_m: Tensor | None,
     ) -> Tensor:
-        """Return the maps (n, 2, 64, 80), normalised as `forward` does, as another bench or moment would give them.
+        """Return the maps (n, 2, 64, 80), normalised as `forward` does, as another bench or moment
+        would give them.
 
-        Noise is the sensor's, drawn for the intensity of expected maps; the logarithm of the wall's reflectance
-        (n, 64, 80) adds to that of the light, and a range offset (n,) to all depths.
+        Noise is the sensor's, drawn for the intensity of expected maps; the logarithm of the wall's
+        reflectance (n, 64, 80) adds to that of the light, and a range offset (n,) to all depths.
         """
-        depth, light = normal[:, :1], normal[:, 1:]
+        depth = normal[:, :1]
+        light = normal[:, 1:]
         returns = (normal != 0).any(dim=1, keepdim=True)
         counts = torch.expm1(light * self.spread[1:] + self.median[1:])
         if log_reflectance is not None:
@@ -137,7 +179,9 @@ class CellNormal(nn.Module):
             counts = noise.add(counts)
         if offset_m is not None:
             depth = depth + offset_m[:, None, None, None] / self.spread[:1]
-        varied = torch.cat([depth, (torch.log1p(counts) - self.median[1:]) / self.spread[1:]], dim=1)
+        varied = torch.cat(
+            [depth, (torch.log1p(counts) - self.median[1:]) / self.spread[1:]], dim=1
+        )
         return torch.where(returns, varied.clamp(-CLIP, CLIP), normal)
 
 
@@ -154,16 +198,21 @@ def _channels(depth_m: Tensor, intensity: Tensor) -> Tensor:
 
 
 class DirectNetwork(nn.Module):
-    """Network from maps (n, 64, 80) to images (n, 64, 64) in [0, 1] by two heads: is there a surface, and how deep.
+    """Network from maps (n, 64, 80) to images (n, 64, 64) in [0, 1] by two heads: is there a
+    surface, and how deep.
 
-    In color intensities are (n, 3, 64, 80), images (n, 3, 64, 64), and the second head draws three albedos.
+    In color intensities are (n, 3, 64, 80), images (n, 3, 64, 64), and the second head draws three
+    albedos.
     """
 
-    def __init__(self, size: DirectSize | None = None, dropout: float = 0.0, *, color: bool = False) -> None:
+    def __init__(
+        self, size: DirectSize | None = None, dropout: float = 0.0, *, color: bool = False
+    ) -> None:
         super().__init__()
         self.size = size = size or DirectSize()
         self.normal = CellNormal(color=color)
-        within, channels = size.features // 2, channels_of(color=color)
+        within = size.features // 2
+        channels = channels_of(color=color)
         self.patch = nn.Linear(channels * PATCH**2, within)
         self.merge = nn.Linear(4 * within, size.features)
         self.into = MirrorLinear(SIDE_INPUTS * size.features, size.width)
@@ -171,7 +220,10 @@ class DirectNetwork(nn.Module):
             *(
                 Residual(
                     size.width,
-                    (MirrorLinear(size.width, 2 * size.width), MirrorLinear(2 * size.width, size.width)),
+                    (
+                        MirrorLinear(size.width, 2 * size.width),
+                        MirrorLinear(2 * size.width, size.width),
+                    ),
                     dropout,
                 )
                 for _ in range(size.blocks)
@@ -183,25 +235,36 @@ class DirectNetwork(nn.Module):
         mixers = list[nn.Module]()
         for _ in range(size.mixers):
             over_tokens = MirrorLinear(tokens, 2 * tokens), MirrorLinear(2 * tokens, tokens)
-            over_features = nn.Linear(size.token, 2 * size.token), nn.Linear(2 * size.token, size.token)
-            mixers += [Residual(size.token, over_tokens, 0.0, across=True), Residual(size.token, over_features, 0.0)]
+            over_features = (
+                nn.Linear(size.token, 2 * size.token),
+                nn.Linear(2 * size.token, size.token),
+            )
+            mixers += [
+                Residual(size.token, over_tokens, 0.0, across=True),
+                Residual(size.token, over_features, 0.0),
+            ]
         self.mixers = nn.Sequential(*mixers)
         self.norm = nn.LayerNorm(size.token)
         self.heads = nn.Linear(size.token, channels * TOKEN**2)
 
     def logits(self, normal: Tensor) -> Tensor:
-        """Map normalised maps (n, 2, 64, 80) to two logits (n, 2, 64, 64): of a surface, and of its v in [0.1, 1].
+        """Map normalised maps (n, 2, 64, 80) to two logits (n, 2, 64, 64): of a surface, and of its
+        v in [0.1, 1].
 
         In color four channels become four logits.
         """
-        sides = torch.stack([normal[..., : ROWS // 2, :], normal[..., ROWS // 2 :, :].flip(-2)], dim=1)
+        sides = torch.stack(
+            [normal[..., : ROWS // 2, :], normal[..., ROWS // 2 :, :].flip(-2)], dim=1
+        )
         x = functional.gelu(self.patch(_patches(sides, PATCH)))  # (n, 2, 8, 20, within)
         x = functional.gelu(self.merge(_patches(x.movedim(-1, 2), 2)))  # (n, 2, 4, 10, features)
         x = self.trunk(self.into(x.flatten(2)))
         x = self.out(x).unflatten(-1, self.place.shape) + self.place
         x = self.heads(self.norm(self.mixers(x)))  # (n, 2, 32, 128)
         channels = normal.shape[1]
-        x = x.unflatten(-1, (channels, TOKEN, TOKEN)).unflatten(2, SIDE_TOKENS)  # (n, side, row, column, head, y, x)
+        x = x.unflatten(-1, (channels, TOKEN, TOKEN)).unflatten(
+            2, SIDE_TOKENS
+        )  # (n, side, row, column, head, y, x)
         x = x.permute(0, 1, 4, 2, 5, 3, 6).reshape(-1, 2, channels, PIXELS // 2, PIXELS)
         return torch.cat([x[:, 0], x[:, 1].flip(-2)], dim=-2)
 
@@ -221,39 +284,55 @@ class DirectNetwork(nn.Module):
 
 
 def _patches(x: Tensor, side: int) -> Tensor:
-    """Cut (n, 2, channels, rows, columns) into patches: (n, 2, rows / side, columns / side, channels * side**2)."""
+    """Cut (n, 2, channels, rows, columns) into patches: (n, 2, rows / side, columns / side,
+    channels * side**2).
+    """
     x = x.unflatten(-1, (-1, side)).unflatten(3, (-1, side))  # (n, 2, c, row, y, column, x)
     return x.permute(0, 1, 3, 5, 2, 4, 6).flatten(4)
 
 
 def image_from_logits(logits: Tensor) -> Tensor:
-    """Return images (n, 64, 64) of logits (n, 2, 64, 64), each cut where its silhouette's expected overlap is largest.
+    """Return images (n, 64, 64) of logits (n, 2, 64, 64), each cut where its silhouette's expected
+    overlap is largest.
 
-    Four logits, in color, make images (n, 3, 64, 64).
-    Of a silhouette and pixels with probabilities p of a surface, the expected intersection over union is about the sum
-    of p inside over the sum of p everywhere and 1 - p inside.
+    Four logits, in color, make images (n, 3, 64, 64). Of a silhouette and pixels with probabilities
+    p of a surface, the expected intersection over union is about the sum of p inside over the sum
+    of p everywhere and 1 - p inside.
     """
     every = torch.sigmoid(logits.float())
-    share, values = every[:, 0], every[:, 1:] if every.shape[1] > 2 else every[:, 1]
+    share = every[:, 0]
+    values = every[:, 1:] if every.shape[1] > 2 else every[:, 1]
     cuts = share.new_tensor(CUTS)
     above = share[:, None] > cuts[:, None, None]
-    inside, area = (share[:, None] * above).sum((2, 3)), above.sum((2, 3))
+    inside = (share[:, None] * above).sum((2, 3))
+    area = above.sum((2, 3))
     overlap = inside / (share.sum((1, 2))[:, None] + area - inside)
     surface = share > cuts[overlap.argmax(1)][:, None, None]
-    return torch.where(surface if values.dim() == 3 else surface[:, None], MIN_V + (1 - MIN_V) * values, 0.0)
+    return torch.where(
+        surface if values.dim() == 3 else surface[:, None], MIN_V + (1 - MIN_V) * values, 0.0
+    )
 
 
 def two_heads_error(logits: Tensor, truth: Tensor) -> Tensor:
-    """Return the loss of logits (n, 2, 64, 64) against images (n, 64, 64): cross-entropy, overlap and depth.
+    """Return the loss of logits (n, 2, 64, 64) against images (n, 64, 64): cross-entropy, overlap
+    and depth.
 
-    Cross-entropy of the silhouette, plus 0.5 (1 - soft intersection over union), plus 2 times the absolute error of v
-    over the surface; each is a mean over pixels or objects. In color, (n, 4, 64, 64) against (n, 3, 64, 64), the error
-    of v is the mean of three.
+    Cross-entropy of the silhouette, plus 0.5 (1 - soft intersection over union), plus 2 times the
+    absolute error of v over the surface; each is a mean over pixels or objects. In color, (n, 4,
+    64, 64) against (n, 3, 64, 64), the error of v is the mean of three.
     """
-    logits, truth = logits.float(), truth.float() if truth.dim() == 4 else truth.float()[:, None]
-    occupied, values, surface = logits[:, 0], logits[:, 1:], (truth > 0).any(1).float()
+    logits = logits.float()
+    truth = truth.float() if truth.dim() == 4 else truth.float()[:, None]
+    occupied = logits[:, 0]
+    values = logits[:, 1:]
+    surface = (truth > 0).any(1).float()
     entropy = functional.binary_cross_entropy_with_logits(occupied, surface)
     share = torch.sigmoid(occupied)
-    both, one = (share * surface).sum((1, 2)), (share + surface - share * surface).sum((1, 2))
+    both = (share * surface).sum((1, 2))
+    one = (share + surface - share * surface).sum((1, 2))
     off = (MIN_V + (1 - MIN_V) * torch.sigmoid(values) - truth).abs().mean(1) * surface
-    return entropy + 0.5 * (1 - (both + 1) / (one + 1)).mean() + 2 * off.sum() / surface.sum().clamp(min=1)
+    return (
+        entropy
+        + 0.5 * (1 - (both + 1) / (one + 1)).mean()
+        + 2 * off.sum() / surface.sum().clamp(min=1)
+    )

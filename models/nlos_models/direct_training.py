@@ -1,4 +1,6 @@
-"""Training of the direct network, and its transfer to a bench: noise drawn at each step, two heads."""
+"""Training of the direct network, and its transfer to a bench: noise drawn at each step, two
+heads.
+"""
 
 from collections.abc import Iterable
 from pathlib import Path
@@ -35,7 +37,9 @@ class NormalSource(Protocol):
     """Noise to draw at each step, of expected maps; None for maps that have theirs."""
 
     def batches(self, batch: int, generator: torch.Generator) -> Iterable[NormalBatch]:
-        """Return all objects that are there, shuffled; the same generator returns the same ones again."""
+        """Return all objects that are there, shuffled; the same generator returns the same ones
+        again.
+        """
         ...
 
 
@@ -49,8 +53,9 @@ def train_direct(
 ) -> tuple[DirectNetwork, Scores]:
     """Train a direct network, from scratch or on from another's weights; a second call resumes.
 
-    `start` has the source's normalisation. Where the recipe has more blocks or mixers, the new ones change nothing at
-    first. Returns the network in eval mode, with the recipe's blend of both, and its held-out figures.
+    `start` has the source's normalisation. Where the recipe has more blocks or mixers, the new ones
+    change nothing at first. Returns the network in eval mode, with the recipe's blend of both, and
+    its held-out figures.
     """
     torch.manual_seed(recipe.seed)
     network = DirectNetwork(recipe.direct, recipe.dropout, color=recipe.colour)
@@ -67,7 +72,9 @@ def train_direct(
 
     def loss(batch: NormalBatch, _: float) -> Tensor:
         normal = _varied(recipe, network.normal, batch.normal.float(), source.noise)
-        return two_heads_error(logits(normal + recipe.noise * torch.randn_like(normal)), batch.image)
+        return two_heads_error(
+            logits(normal + recipe.noise * torch.randn_like(normal)), batch.image
+        )
 
     figures = fit(
         network,
@@ -86,7 +93,9 @@ def train_direct(
 
 
 def blend(network: DirectNetwork, start: DirectNetwork, share: float) -> None:
-    """Replace a network's parameters by means with another's, of which its own have a share; new layers stay."""
+    """Replace a network's parameters by means with another's, of which its own have a share; new
+    layers stay.
+    """
     theirs = dict(start.named_parameters())
     with torch.no_grad():
         for name, own in network.named_parameters():
@@ -102,7 +111,8 @@ def transfer_direct(
     folder: Path,
     running: Running | None = None,
 ) -> tuple[DirectNetwork, Scores]:
-    """Fine-tune a direct network in place on recordings' maps: all layers, then the heads; a second call resumes.
+    """Fine-tune a direct network in place on recordings' maps: all layers, then the heads; a second
+    call resumes.
 
     Returns it in eval mode, and its held-out figures.
     """
@@ -112,13 +122,19 @@ def transfer_direct(
     if recipe.statistics != "kept":
         seen = maps.first(STATISTICS_OBJECTS)
         channels = slice(1, None) if recipe.statistics == "own intensity" else slice(None)
-        network.normal.shift(torch.from_numpy(seen.depth_m), torch.from_numpy(seen.intensity), channels)
+        network.normal.shift(
+            torch.from_numpy(seen.depth_m), torch.from_numpy(seen.intensity), channels
+        )
 
     def loss(batch: MapBatch, _: float) -> Tensor:
         normal = network.normal(batch.depth_m, batch.intensity)
-        return two_heads_error(network.logits(normal + recipe.noise * torch.randn_like(normal)), batch.image[:, 0])
+        return two_heads_error(
+            network.logits(normal + recipe.noise * torch.randn_like(normal)), batch.image[:, 0]
+        )
 
-    def fit_phase(phase: Recipe, phase_folder: Path, running: Running, *, last_layers: bool) -> Scores:
+    def fit_phase(
+        phase: Recipe, phase_folder: Path, running: Running, *, last_layers: bool
+    ) -> Scores:
         network.requires_grad_(not last_layers)
         for layer in network.last_layers:
             layer.requires_grad_(requires_grad=True)
@@ -138,7 +154,9 @@ def transfer_direct(
 
 
 def _varied(recipe: Recipe, cells: CellNormal, normal: Tensor, noise: MapNoise | None) -> Tensor:
-    """Return normalised maps (n, 2, 64, 80) with noise, and on walls and with range offsets as the recipe has them."""
+    """Return normalised maps (n, 2, 64, 80) with noise, and on walls and with range offsets as the
+    recipe has them.
+    """
     reflectance = offset_m = None
     if recipe.wall_texture:
         strength = recipe.wall_texture * torch.rand(len(normal), 1, 1, device=normal.device)
@@ -151,14 +169,20 @@ def _varied(recipe: Recipe, cells: CellNormal, normal: Tensor, noise: MapNoise |
 
 
 def _stains(count: int, device: torch.device) -> Tensor:
-    """Return patterns (count, 64, 80) of mean 0 and variance 1: half stains of some cells, half grain."""
+    """Return patterns (count, 64, 80) of mean 0 and variance 1: half stains of some cells, half
+    grain.
+    """
     coarse = torch.randn(count, 1, *STAINS, device=device)
-    stains = functional.interpolate(coarse, (ROWS, COLUMNS), mode="bilinear", align_corners=True)[:, 0]
+    stains = functional.interpolate(coarse, (ROWS, COLUMNS), mode="bilinear", align_corners=True)[
+        :, 0
+    ]
     stains = stains / stains.std((1, 2), keepdim=True)
     return (stains + torch.randn_like(stains)) * 0.5**0.5
 
 
-def repeat(source: NormalSource, batch: int, steps: int, generator: torch.Generator) -> Iterable[NormalBatch]:
+def repeat(
+    source: NormalSource, batch: int, steps: int, generator: torch.Generator
+) -> Iterable[NormalBatch]:
     """Yield `steps` batches; where the objects run out they come again in another order."""
     while steps:
         for one in source.batches(batch, generator):

@@ -1,4 +1,6 @@
-"""Devices and processes of a training run: launch, errors across processes, seeds and shares of a batch."""
+"""Devices and processes of a training run: launch, errors across processes, seeds and shares of a
+batch.
+"""
 
 import multiprocessing
 from collections.abc import Callable
@@ -20,11 +22,14 @@ Loss = Callable[[Any, float], Tensor]
 
 
 class LossStep(nn.Module):
-    """Loss in the place of a module's forward pass, so that several processes average the gradients behind it."""
+    """Loss in the place of a module's forward pass, so that several processes average the gradients
+    behind it.
+    """
 
     def __init__(self, module: nn.Module, loss: Loss) -> None:
         super().__init__()
-        self.module, self._loss = module, loss
+        self.module = module
+        self._loss = loss
 
     def forward(self, batch: Any, done: float) -> Tensor:
         """Return the loss of one batch, given the share of the run's steps that is done."""
@@ -34,15 +39,21 @@ class LossStep(nn.Module):
 def open_fabric(recipe: Recipe, *, accelerator: Accelerator = "auto", devices: int = 1) -> Fabric:
     """Return a fabric of `devices` processes, one per GPU or all on the CPU.
 
-    Raises TrainingError where there are fewer GPUs, RecipeError where the processes cannot share a batch evenly.
+    Raises TrainingError where there are fewer GPUs, RecipeError where the processes cannot share a
+    batch evenly.
     """
     if recipe.batch % devices:
-        raise RecipeError(f"a batch of {recipe.batch} cannot be shared evenly by {devices} processes: change either")
+        raise RecipeError(
+            f"a batch of {recipe.batch} cannot be shared evenly by {devices} processes: change"
+            " either"
+        )
     if accelerator == "auto":
         accelerator = "cuda" if torch.cuda.is_available() else "cpu"
     gpus = torch.cuda.device_count()
     if accelerator == "cuda" and devices > gpus:
-        requested = f"{devices} GPU{'s' if devices > 1 else ''} requested, {gpus or 'none'} available"
+        requested = (
+            f"{devices} GPU{'s' if devices > 1 else ''} requested, {gpus or 'none'} available"
+        )
         raise TrainingError(f"{requested}: choose fewer --devices, or --accelerator cpu")
     strategy = "ddp_spawn" if devices > 1 else "auto"
     precision = precision_on(accelerator, recipe)
@@ -50,9 +61,11 @@ def open_fabric(recipe: Recipe, *, accelerator: Accelerator = "auto", devices: i
 
 
 def precision_on(device: str, recipe: Recipe) -> Precision:
-    """Return the recipe's precision, or float32 on a CPU without wide vectors, where bfloat16 is emulated.
+    """Return the recipe's precision, or float32 on a CPU without wide vectors, where bfloat16 is
+    emulated.
 
-    Measured on two threads of an AMD EPYC without AVX-512: 25 samples per second in bfloat16, 235 in float32.
+    Measured on two threads of an AMD EPYC without AVX-512: 25 samples per second in bfloat16, 235
+    in float32.
     """
     emulated = device == "cpu" and torch.backends.cpu.get_cpu_capability() in {"DEFAULT", "AVX2"}
     return "32-true" if emulated else recipe.precision
@@ -61,8 +74,9 @@ def precision_on(device: str, recipe: Recipe) -> Precision:
 def launch(fabric: Fabric, work: Callable[..., Any], *arguments: Any) -> Any:
     """Run `work(fabric, *arguments)` in every process and return the leading one's result.
 
-    With several processes, work, arguments and result have to be picklable. Errors of this package are raised as they
-    are; an interruption is passed on to all processes, waited for, and raised as KeyboardInterrupt.
+    With several processes, work, arguments and result have to be picklable. Errors of this package
+    are raised as they are; an interruption is passed on to all processes, waited for, and raised as
+    KeyboardInterrupt.
     """
     if fabric.world_size == 1:
         return work(fabric, *arguments)
@@ -70,7 +84,9 @@ def launch(fabric: Fabric, work: Callable[..., Any], *arguments: Any) -> Any:
         result = fabric.launch(partial(_return_errors, work=work, arguments=arguments))
     except (ProcessRaisedException, ProcessExitedException) as error:
         last_line = str(error).strip().splitlines()[-1]
-        raise TrainingError(f"a training process ended early ({last_line}): repeat the command to resume") from error
+        raise TrainingError(
+            f"a training process ended early ({last_line}): repeat the command to resume"
+        ) from error
     except KeyboardInterrupt:
         _end_all()
         raise
@@ -80,7 +96,9 @@ def launch(fabric: Fabric, work: Callable[..., Any], *arguments: Any) -> Any:
 
 
 def _return_errors(fabric: Fabric, work: Callable[..., Any], arguments: tuple[Any, ...]) -> Any:
-    """Run in each process; return expected errors, since raised ones reach the parent only as a traceback's text."""
+    """Run in each process; return expected errors, since raised ones reach the parent only as a
+    traceback's text.
+    """
     try:
         return work(fabric, *arguments)
     except (ValueError, OSError, KeyboardInterrupt) as error:
@@ -99,12 +117,18 @@ def _end_all() -> None:
 
 
 def seed_of(*parts: int) -> int:
-    """Return a seed for a tuple of numbers; their count goes in too, since numpy ignores zeros at the end."""
-    return int(np.random.SeedSequence([*parts, len(parts)]).generate_state(1, np.uint64)[0] >> np.uint64(1))
+    """Return a seed for a tuple of numbers; their count goes in too, since numpy ignores zeros at
+    the end.
+    """
+    return int(
+        np.random.SeedSequence([*parts, len(parts)]).generate_state(1, np.uint64)[0] >> np.uint64(1)
+    )
 
 
 def share_of(batch: Any, rank: int, world: int) -> Any:
-    """Return the share of a batch (a tensor, or a tuple of them) that belongs to process `rank` of `world`."""
+    """Return the share of a batch (a tensor, or a tuple of them) that belongs to process `rank` of
+    `world`.
+    """
     if world == 1:
         return batch
     if isinstance(batch, Tensor):

@@ -1,7 +1,8 @@
-"""Uncertainty ("doubt") network: maps and the image reconstructed from them in, expected error and verdicts out.
+"""Uncertainty ("doubt") network: maps and the image reconstructed from them in, expected error and
+verdicts out.
 
-Our own, not the paper's; about 200,000 parameters. Its inputs are the maps' differences from the bare wall's, at a
-coarse and at a fine scale, and the image; the two branches meet at 8 x 8.
+Our own, not the paper's; about 200,000 parameters. Its inputs are the maps' differences from the
+bare wall's, at a coarse and at a fine scale, and the image; the two branches meet at 8 x 8.
 """
 
 import json
@@ -21,8 +22,11 @@ from nlos_models.inference import MAP_SHAPE
 
 DEPTH_SCALES_M = (0.1, 0.005)
 INTENSITY_SCALES = (10.0, 1.0)
-"""Scales of the differences from the bare wall: coarse for the hidden object, fine for the question if there is one."""
-MIN_ERROR_V, MAX_ERROR_V = 1e-3, 1.0
+"""Scales of the differences from the bare wall: coarse for the hidden object, fine for the question
+if there is one.
+"""
+MIN_ERROR_V = 1e-3
+MAX_ERROR_V = 1.0
 """Range of an expected error."""
 
 
@@ -44,7 +48,9 @@ def _down(channels_in: int, channels_out: int, stride: int = 2) -> nn.Sequential
 
 
 class _Up(nn.Module):
-    """Upsampling block: narrow, double the size, join with the features of that size on the way down."""
+    """Upsampling block: narrow, double the size, join with the features of that size on the way
+    down.
+    """
 
     def __init__(self, channels_in: int, channels_out: int) -> None:
         super().__init__()
@@ -66,7 +72,9 @@ class DoubtNetwork(nn.Module):
         super().__init__()
         self.register_buffer("bare_depth_m", torch.zeros(MAP_SHAPE))
         self.register_buffer("bare_intensity", torch.zeros(MAP_SHAPE))
-        self.maps = nn.Sequential(_down(5, 16), _down(16, 32), _down(32, 64), _down(64, 64, stride=1))
+        self.maps = nn.Sequential(
+            _down(5, 16), _down(16, 32), _down(32, 64), _down(64, 64, stride=1)
+        )
         self.image = nn.ModuleList([_down(1, 16), _down(16, 32), _down(32, 64)])
         self.meet = _down(128, 64, stride=1)
         self.ups = nn.ModuleList([_Up(64, 32), _Up(32, 16)])
@@ -74,12 +82,16 @@ class DoubtNetwork(nn.Module):
         self.frame = nn.Sequential(nn.Linear(256, 64), nn.ReLU(), nn.Dropout(0.2), nn.Linear(64, 2))
 
     def learn_bare(self, depth_m: Tensor, intensity: Tensor) -> None:
-        """Set the bare wall to each cell's median over maps (n, 64, 80) of benches with nothing hidden."""
+        """Set the bare wall to each cell's median over maps (n, 64, 80) of benches with nothing
+        hidden.
+        """
         self.bare_depth_m.copy_(torch.nan_to_num(depth_m.nanmedian(0).values))
         self.bare_intensity.copy_(intensity.median(0).values)
 
     def features(self, depth_m: Tensor, intensity: Tensor) -> Tensor:
-        """Return (n, 5, 64, 80): differences from the bare wall, each from -1 to 1, and 1 for cells without return."""
+        """Return (n, 5, 64, 80): differences from the bare wall, each from -1 to 1, and 1 for cells
+        without return.
+        """
         invalid = torch.isnan(depth_m)
         farther_m = torch.where(invalid, 0.0, depth_m - self.bare_depth_m)
         brighter = torch.where(invalid, 0.0, intensity - self.bare_intensity)
@@ -88,14 +100,20 @@ class DoubtNetwork(nn.Module):
         return torch.stack([*features, invalid.to(depth_m.dtype)], 1)
 
     def forward(self, depth_m: Tensor, intensity: Tensor, image: Tensor) -> DoubtOutput:
-        """Return the raw outputs for maps (n, 64, 80) with NaN for no return and images (n, 64, 64) in [0, 1]."""
+        """Return the raw outputs for maps (n, 64, 80) with NaN for no return and images (n, 64, 64)
+        in [0, 1].
+        """
         from_maps = self.maps(self.features(depth_m, intensity))
         levels = [image[:, None]]
         for down in self.image:
             levels.append(down(levels[-1]))
-        joint = self.meet(torch.cat([functional.interpolate(from_maps, (8, 8), mode="bilinear"), levels[3]], 1))
+        joint = self.meet(
+            torch.cat([functional.interpolate(from_maps, (8, 8), mode="bilinear"), levels[3]], 1)
+        )
         fine = self.ups[1](self.ups[0](joint, levels[2]), levels[1])
-        pixels = self.pixels(torch.cat([functional.interpolate(fine, scale_factor=2.0), levels[0]], 1))
+        pixels = self.pixels(
+            torch.cat([functional.interpolate(fine, scale_factor=2.0), levels[0]], 1)
+        )
         pooled = [part for x in (from_maps, joint) for part in (x.mean((2, 3)), x.amax((2, 3)))]
         logits = self.frame(torch.cat(pooled, 1))
         return DoubtOutput(logits[:, 0], logits[:, 1], pixels[:, 0] - 3.0, pixels[:, 1])
@@ -107,24 +125,35 @@ class CalibratedDoubt(nn.Module):
     temperature: Tensor
     error_scale: Tensor
 
-    def __init__(self, network: DoubtNetwork, temperatures: tuple[float, float], error_scale: float) -> None:
+    def __init__(
+        self, network: DoubtNetwork, temperatures: tuple[float, float], error_scale: float
+    ) -> None:
         super().__init__()
         self.network = network
         self.register_buffer("temperature", torch.tensor(temperatures))
         self.register_buffer("error_scale", torch.tensor(error_scale))
 
-    def forward(self, depth_m: Tensor, intensity: Tensor, image: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    def forward(
+        self, depth_m: Tensor, intensity: Tensor, image: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Return the four arrays of `inference.UncertaintyEstimate`."""
         raw = self.network(depth_m, intensity, image)
-        nothing, outside = raw.nothing / self.temperature[0], raw.outside / self.temperature[1]
+        nothing = raw.nothing / self.temperature[0]
+        outside = raw.outside / self.temperature[1]
         error_v = (self.error_scale * raw.log_error.exp()).clamp(MIN_ERROR_V, MAX_ERROR_V)
         return torch.sigmoid(nothing), torch.sigmoid(outside), error_v, torch.sigmoid(raw.surface)
 
 
-def save_doubt(folder: Path, network: DoubtNetwork, record: records.DoubtRecord, watched: Path) -> None:
-    """Write an uncertainty network and its record into a folder, with a copy of the watched weights from elsewhere."""
+def save_doubt(
+    folder: Path, network: DoubtNetwork, record: records.DoubtRecord, watched: Path
+) -> None:
+    """Write an uncertainty network and its record into a folder, with a copy of the watched weights
+    from elsewhere.
+    """
     if records.checksum_of_watched(watched) != record.watches:
-        raise CheckpointError(f"{watched} changed during the training of its uncertainty network: train again")
+        raise CheckpointError(
+            f"{watched} changed during the training of its uncertainty network: train again"
+        )
     text = json.dumps(record.model_dump(mode="json"), indent=2)
     save_parts(folder, {records.DOUBT: network}, {records.DOUBT_RECORD: text})
     if folder.resolve() != watched.resolve():
@@ -133,7 +162,8 @@ def save_doubt(folder: Path, network: DoubtNetwork, record: records.DoubtRecord,
 
 
 def load_doubt(folder: Path) -> tuple[CalibratedDoubt, records.DoubtRecord] | None:
-    """Return the calibrated uncertainty network beside a pipeline's weights in eval mode, or None where there is none.
+    """Return the calibrated uncertainty network beside a pipeline's weights in eval mode, or None
+    where there is none.
 
     Raises CheckpointError where it cannot be read or watches other weights.
     """

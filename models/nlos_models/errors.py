@@ -1,12 +1,14 @@
-"""Errors of the models package, and of a missing extra "train", whose libraries the base installation leaves out.
+"""Errors of the models package, and of a missing extra "train", whose libraries the base
+installation leaves out.
 
-ModelError (ValueError)                  exit 1   root
-├── MissingExtraError (ImportError)      exit 1   'training needs torch: pip install "nlos-cam[train]"'
-├── TrainingError                        exit 1   "the loss is nan in epoch 3: choose a smaller learning_rate"
-├── OutputExistsError (FileExistsError)  exit 1   "runs/a holds weights from another run: choose another --out"
-├── FileBusyError (BlockingIOError)      exit 1   "a.bag is being written by process 7 on lab: wait for it, ..."
-├── CheckpointError                      exit 4   "decoder.safetensors cannot be read as weights: ..."
-└── RecipeError                          exit 4   "recipe.toml: batch: must be greater than 1 (got 1)"
+ModelError (ValueError)                  exit 1   root ├── MissingExtraError (ImportError)      exit
+1   'training needs torch: pip install "nlos-cam[train]"' ├── TrainingError
+exit 1   "the loss is nan in epoch 3: choose a smaller learning_rate" ├── OutputExistsError
+(FileExistsError)  exit 1   "runs/a holds weights from another run: choose another --out" ├──
+FileBusyError (BlockingIOError)      exit 1   "a.bag is being written by process 7 on lab: wait for
+it, ..." ├── CheckpointError                      exit 4   "decoder.safetensors cannot be read as
+weights: ..." └── RecipeError                          exit 4   "recipe.toml: batch: must be greater
+than 1 (got 1)"
     └── UnknownRecipeError               exit 2   "no recipe 'vea'. Did you mean 'vae'?"
 """
 
@@ -15,11 +17,15 @@ from importlib import import_module
 from typing import Any
 
 OUT_OF_MEMORY = "failed to map", "bad_alloc", "allocate memory"
-"""Words of the errors of libraries that do not fit into the memory that is left, or of their work."""
+"""Words of the errors of libraries that do not fit into the memory that is left, or of their
+work.
+"""
 
 
 def lacks_memory(error: BaseException) -> bool:
-    """Return whether an error or its cause says that memory is short: Python's own, or one of a library in C++."""
+    """Return whether an error or its cause says that memory is short: Python's own, or one of a
+    library in C++.
+    """
     if isinstance(error, MemoryError) or any(words in str(error) for words in OUT_OF_MEMORY):
         return True
     return error.__cause__ is not None and lacks_memory(error.__cause__)
@@ -75,12 +81,20 @@ WORDING = {
 def first_problem(error: Any) -> str:
     """Return the first problem of pydantic's ValidationError as one line: field, problem, value."""
     problem = error.errors()[0]
-    field, text, value = ".".join(map(str, problem["loc"])), problem["msg"], problem["input"]
+    field = ".".join(map(str, problem["loc"]))
+    text = problem["msg"]
+    value = problem["input"]
     for library, plain in WORDING.items():
         text = re.sub(library, plain, text)
     if isinstance(value, dict):  # a rule among fields: the values of those that its message names
-        given = {name: got for name, got in value.items() if re.search(rf"\b{re.escape(str(name))}\b", text)}
-        got = ", ".join(f"{name} = {got!r:.40}" for name, got in given.items() if str(got) not in text)
+        given = {
+            name: got
+            for name, got in value.items()
+            if re.search(rf"\b{re.escape(str(name))}\b", text)
+        }
+        got = ", ".join(
+            f"{name} = {got!r:.40}" for name, got in given.items() if str(got) not in text
+        )
     else:
         got = "" if isinstance(value, list) or not field else f"{value!r:.80}"
     text += f" (got {got})" if got else ""
@@ -92,11 +106,14 @@ TRAIN = frozenset({"h5py", "lightning_fabric", "onnx", "onnxscript", "tensorboar
 
 
 class MissingExtraError(ModelError, ImportError):
-    """Library of an extra that is not installed: 'training needs torch: pip install "nlos-cam[train]"'."""
+    """Library of an extra that is not installed: 'training needs torch: pip install
+    "nlos-cam[train]"'.
+    """
 
 
 def require(module: str, purpose: str) -> Any:
-    """Return a module; `purpose` is the subject of the message if it, or an import in it, is missing from the extra.
+    """Return a module; `purpose` is the subject of the message if it, or an import in it, is
+    missing from the extra.
 
     Raises MissingExtraError with the command that installs the extra.
     """
@@ -108,9 +125,13 @@ def require(module: str, purpose: str) -> Any:
         raise
 
 
-def missing_extra(error: ModuleNotFoundError, purpose: str = "this command") -> MissingExtraError | None:
+def missing_extra(
+    error: ModuleNotFoundError, purpose: str = "this command"
+) -> MissingExtraError | None:
     """Return a failed import as the error of a missing extra; None for other modules."""
     name = (error.name or "").partition(".")[0]
     if name not in TRAIN:
         return None
-    return MissingExtraError(f'{purpose} needs {name}, which is not installed: pip install "nlos-cam[train]"')
+    return MissingExtraError(
+        f'{purpose} needs {name}, which is not installed: pip install "nlos-cam[train]"'
+    )

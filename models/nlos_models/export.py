@@ -1,4 +1,6 @@
-"""Export of networks to ONNX with torch: graphs that point into a checkpoint's tensors, and 8-bit networks."""
+"""Export of networks to ONNX with torch: graphs that point into a checkpoint's tensors, and 8-bit
+networks.
+"""
 
 import hashlib
 import json
@@ -28,7 +30,8 @@ from nlos_models.pipeline import RemappingNetwork
 from nlos_models.recipe import SIMULATION_ONLY
 from nlos_models.records import DOUBT, CheckpointRecord, checksum_of_watched, watched_files
 
-OPSET, IR_VERSION = 18, 10
+OPSET = 18
+IR_VERSION = 10
 """ONNX Runtime 1.20 reads both."""
 NORM_EPSILON = np.float32(1e-5)
 """Of torch's batch norms."""
@@ -44,8 +47,11 @@ class TorchReconstructor:
         device: str,
         dtype: torch.dtype = torch.float32,
     ) -> None:
-        self.record, self.runtime = record, f"torch on {device}"
-        self._network, self._device, self._dtype = _Answering(pipeline.to(device).eval()), device, dtype
+        self.record = record
+        self.runtime = f"torch on {device}"
+        self._network = _Answering(pipeline.to(device).eval())
+        self._device = device
+        self._dtype = dtype
 
     def __call__(self, depth_m: Float32, intensity: Float32) -> Float32:
         return self.answer(depth_m, intensity).image
@@ -53,7 +59,10 @@ class TorchReconstructor:
     def answer(self, depth_m: Float32, intensity: Float32) -> inference.Answer:
         mixed = torch.autocast(self._device, self._dtype, enabled=self._dtype != torch.float32)
         with torch.inference_mode(), mixed:
-            maps = [torch.from_numpy(np.ascontiguousarray(m)).to(self._device) for m in (depth_m, intensity)]
+            maps = [
+                torch.from_numpy(np.ascontiguousarray(m)).to(self._device)
+                for m in (depth_m, intensity)
+            ]
             return inference.Answer(*(each.float().cpu().numpy() for each in self._network(*maps)))
 
 
@@ -85,14 +94,20 @@ DOUBT_OUTPUTS = list(inference.UncertaintyEstimate._fields)
 
 
 def export_folder(folder: Path) -> list[Path]:
-    """Write the ONNX graphs of a checkpoint folder's networks beside their tensors, for inference without torch.
+    """Write the ONNX graphs of a checkpoint folder's networks beside their tensors, for inference
+    without torch.
 
     Raises CheckpointError where the weights cannot be read or are for color.
     """
     network, record = load_network(folder)
     inference.refuse_color(record, folder)
-    files, answering = watched_files(folder), _Answering(network)
-    names = {"": files[0]} if record.direct_recipe else {f"{name.partition('.')[0]}.": name for name in files}
+    files = watched_files(folder)
+    answering = _Answering(network)
+    names = (
+        {"": files[0]}
+        if record.direct_recipe
+        else {f"{name.partition('.')[0]}.": name for name in files}
+    )
     parts = {f"network.{prefix}": name for prefix, name in names.items()}
     graphs = {
         inference.NETWORK_ONNX: _linked_graph(
@@ -128,19 +143,27 @@ def doubt_export(folder: Path) -> Export:
 
 
 def export_onnx(pipeline: RemappingNetwork | DirectNetwork) -> bytes:
-    """Return the pipeline, preprocessing included, as an ONNX file for any batch size. Raises ModelError for color."""
+    """Return the pipeline, preprocessing included, as an ONNX file for any batch size. Raises
+    ModelError for color.
+    """
     if isinstance(pipeline, RemappingNetwork) and pipeline.intensities > 1:
-        raise ModelError(f"color networks ({SIMULATION_ONLY}) cannot be exported: use them in torch")
+        raise ModelError(
+            f"color networks ({SIMULATION_ONLY}) cannot be exported: use them in torch"
+        )
     answering = _Answering(pipeline)
     return write_onnx(answering, inference.NETWORK_INPUTS, answering.outputs)
 
 
-def write_onnx(network: nn.Module, inputs: Mapping[str, tuple[int, int]], outputs: list[str]) -> bytes:
+def write_onnx(
+    network: nn.Module, inputs: Mapping[str, tuple[int, int]], outputs: list[str]
+) -> bytes:
     """Return a network as an ONNX file for any batch size n; inputs are (n, *shape) by name."""
     return _as_onnx(network, inputs, outputs).SerializeToString()
 
 
-def _as_onnx(network: nn.Module, inputs: Mapping[str, tuple[int, int]], outputs: list[str]) -> onnx.ModelProto:
+def _as_onnx(
+    network: nn.Module, inputs: Mapping[str, tuple[int, int]], outputs: list[str]
+) -> onnx.ModelProto:
     for noisy in ("onnxscript", "torch.onnx"):
         logging.getLogger(noisy).setLevel(logging.ERROR)
     with warnings.catch_warnings():
@@ -156,7 +179,9 @@ def _as_onnx(network: nn.Module, inputs: Mapping[str, tuple[int, int]], outputs:
             verbose=False,
         )
     if program is None:
-        raise ModelError("torch's exporter returned no ONNX program: install a torch between 2.6 and 2.13")
+        raise ModelError(
+            "torch's exporter returned no ONNX program: install a torch between 2.6 and 2.13"
+        )
     model = program.model_proto
     model.ir_version = IR_VERSION
     return model
@@ -176,14 +201,19 @@ class _StoredTensor(NamedTuple):
 
 
 def _stored(path: Path, prefix: str) -> Iterator[tuple[str, _StoredTensor]]:
-    """Yield the tensors of a safetensors file: the header's length (8 bytes), the header (JSON), then the tensors."""
+    """Yield the tensors of a safetensors file: the header's length (8 bytes), the header (JSON),
+    then the tensors.
+    """
     content = path.read_bytes()
     start = 8 + int.from_bytes(content[:8], "little")
     for name, entry in json.loads(content[8:start]).items():
         if name != "__metadata__" and entry["dtype"] in KINDS:
             first, last = (start + offset for offset in entry["data_offsets"])
             values = np.frombuffer(content[first:last], KINDS[entry["dtype"]])
-            yield prefix + name, _StoredTensor(values.reshape(entry["shape"]), path.name, first, last - first)
+            yield (
+                prefix + name,
+                _StoredTensor(values.reshape(entry["shape"]), path.name, first, last - first),
+            )
 
 
 def _linked_graph(
@@ -194,16 +224,21 @@ def _linked_graph(
     parts: Mapping[str, str],
     sources: Sequence[str],
 ) -> bytes:
-    """Return an ONNX file whose large weights are external data in the safetensors files of a folder.
+    """Return an ONNX file whose large weights are external data in the safetensors files of a
+    folder.
 
-    `parts` has the file of tensors by the prefix of their names in the network; `sources` go into the checksum.
+    `parts` has the file of tensors by the prefix of their names in the network; `sources` go into
+    the checksum.
     """
-    model, stored = _as_onnx(network, inputs, outputs), dict[str, _StoredTensor]()
+    model = _as_onnx(network, inputs, outputs)
+    stored = dict[str, _StoredTensor]()
     for prefix, name in parts.items():
         stored.update(_stored(folder / name, prefix))
     initializers = {initializer.name: initializer for initializer in model.graph.initializer}
     nodes = list[onnx.NodeProto]()
-    halves = {name: tensor.values for name, tensor in stored.items() if tensor.values.dtype == np.float16}
+    halves = {
+        name: tensor.values for name, tensor in stored.items() if tensor.values.dtype == np.float16
+    }
     turned = {_key(values.T): name for name, values in halves.items() if values.ndim == 2}
     for name, initializer in sorted(initializers.items()):
         values = numpy_helper.to_array(initializer)
@@ -231,7 +266,9 @@ def _key(values: NDArray[Any]) -> tuple[tuple[int, ...], bytes]:
     return values.shape, np.ascontiguousarray(values, np.float32).tobytes()
 
 
-def _linked_turned(name: str, tensor: _StoredTensor) -> tuple[list[TensorProto], list[onnx.NodeProto]]:
+def _linked_turned(
+    name: str, tensor: _StoredTensor
+) -> tuple[list[TensorProto], list[onnx.NodeProto]]:
     """Return the initializer and nodes of a weight that the exporter has transposed."""
     nodes = [
         helper.make_node("Cast", [f"{name}.half"], [f"{name}.plain"], to=TensorProto.FLOAT),
@@ -243,7 +280,11 @@ def _linked_turned(name: str, tensor: _StoredTensor) -> tuple[list[TensorProto],
 def _external(name: str, tensor: _StoredTensor) -> TensorProto:
     external = TensorProto(name=name, data_type=TensorProto.FLOAT16, dims=tensor.values.shape)
     external.data_location = TensorProto.EXTERNAL
-    for key, value in (("location", tensor.location), ("offset", tensor.offset), ("length", tensor.length)):
+    for key, value in (
+        ("location", tensor.location),
+        ("offset", tensor.offset),
+        ("length", tensor.length),
+    ):
         external.external_data.add(key=key, value=str(value))
     return external
 
@@ -251,22 +292,27 @@ def _external(name: str, tensor: _StoredTensor) -> TensorProto:
 def _linked(
     name: str, exported: NDArray[Any], stored: Mapping[str, _StoredTensor]
 ) -> tuple[list[TensorProto], list[onnx.NodeProto]] | None:
-    """Return the initializers and nodes that make an exported weight from its stored float16; None for small ones.
+    """Return the initializers and nodes that make an exported weight from its stored float16; None
+    for small ones.
 
-    The exporter multiplies the weights of a convolution by gamma / sqrt(variance + epsilon) of the batch norm after it.
-    The same product is left to ONNX Runtime, which computes constants once, when it opens the graph.
+    The exporter multiplies the weights of a convolution by gamma / sqrt(variance + epsilon) of the
+    batch norm after it. The same product is left to ONNX Runtime, which computes constants once,
+    when it opens the graph.
     """
-    tensor, half = stored[name], f"{name}.half"
+    tensor = stored[name]
+    half = f"{name}.half"
     if tensor.values.dtype != np.float16 or tensor.values.ndim == 1:
         return None
-    external, plain = _external(half, tensor), tensor.values.astype(np.float32)
+    external = _external(half, tensor)
+    plain = tensor.values.astype(np.float32)
     if np.array_equal(exported, plain):
         return [external], [helper.make_node("Cast", [half], [name], to=TensorProto.FLOAT)]
     module, _, index = name.removesuffix(".weight").rpartition(".")
     norm = f"{module}.{int(index) + 1}" if index.isdecimal() else ""
     if f"{norm}.running_var" not in stored:
         return None
-    gamma, variance = stored[f"{norm}.weight"].values, stored[f"{norm}.running_var"].values
+    gamma = stored[f"{norm}.weight"].values
+    variance = stored[f"{norm}.running_var"].values
     scale = gamma.astype(np.float32) / np.sqrt(variance + NORM_EPSILON)
     factor = scale.reshape(-1, *[1] * (plain.ndim - 1))
     if not np.array_equal(exported, plain * factor):
@@ -279,7 +325,9 @@ def _linked(
 
 
 def checksum_of(network: nn.Module) -> str:
-    """Return a checksum of all that an exported network depends on: exporter, weights and this package's code."""
+    """Return a checksum of all that an exported network depends on: exporter, weights and this
+    package's code.
+    """
     digest = hashlib.sha256(f"{torch.__version__} {OPSET}".encode())
     for source in sorted(Path(__file__).parent.glob("*.py")):
         digest.update(source.read_bytes())
@@ -291,32 +339,43 @@ def checksum_of(network: nn.Module) -> str:
 Sample = tuple[Float32, Float32]
 """Depth and intensity maps, each (n, 64, 80)."""
 QUANTIZED = ["Conv", "MatMul", "Gemm"]
-"""Operators with nearly all of the work; the rest is preprocessing, activations and the silhouette."""
+"""Operators with nearly all of the work; the rest is preprocessing, activations and the
+silhouette.
+"""
 
 
 def quantize(model: bytes, samples: Iterable[Sample] | None = None) -> bytes:
-    """Return an ONNX file with weights in 8 bits; given samples, also with activations in 8 bits of their ranges.
+    """Return an ONNX file with weights in 8 bits; given samples, also with activations in 8 bits of
+    their ranges.
 
-    The weights take 7 of the 8 bits: on a processor without VNNI instructions, ONNX Runtime adds two products of 8 by
-    8 bits in 16 bits, which saturate (measured there: a mean error of 17 % of the picture's spread in place of 3 %).
-    Raises ModelError where ONNX Runtime fails.
+    The weights take 7 of the 8 bits: on a processor without VNNI instructions, ONNX Runtime adds
+    two products of 8 by 8 bits in 16 bits, which saturate (measured there: a mean error of 17 % of
+    the picture's spread in place of 3 %). Raises ModelError where ONNX Runtime fails.
     """
     from onnxruntime import quantization
 
     plain = onnx.load_from_string(model)
-    del plain.graph.value_info[:]  # shapes from the exporter; they are wrong after the quantizer transposes a Gemm
+    del plain.graph.value_info[
+        :
+    ]  # shapes from the exporter; they are wrong after the quantizer transposes a Gemm
     options: dict[str, Any] = {"op_types_to_quantize": QUANTIZED, "reduce_range": True}
-    logging.getLogger().addFilter(_is_no_advice)  # advice to preprocess the model, sent through the root logger
+    logging.getLogger().addFilter(
+        _is_no_advice
+    )  # advice to preprocess the model, sent through the root logger
     try:
         with TemporaryDirectory() as folder:
             part = Path(folder) / "quantized.onnx"
             if samples is None:
                 quantization.quantize_dynamic(plain, part, **options)
             else:
-                quantization.quantize_static(plain, part, _reader(samples), per_channel=True, **options)
+                quantization.quantize_static(
+                    plain, part, _reader(samples), per_channel=True, **options
+                )
             return part.read_bytes()
     except (RuntimeError, ValueError, OSError) as error:
-        raise ModelError(f"the network cannot be quantised to 8 bits ({error}): use it as it is") from error
+        raise ModelError(
+            f"the network cannot be quantised to 8 bits ({error}): use it as it is"
+        ) from error
     finally:
         logging.getLogger().removeFilter(_is_no_advice)
 
@@ -336,6 +395,8 @@ def _reader(samples: Iterable[Sample]) -> Any:
 
         def get_next(self) -> Any:
             sample = next(self._rest, None)
-            return None if sample is None else dict(zip(("depth_m", "intensity"), sample, strict=True))
+            return (
+                None if sample is None else dict(zip(("depth_m", "intensity"), sample, strict=True))
+            )
 
     return Reader()

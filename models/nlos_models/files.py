@@ -1,4 +1,6 @@
-"""Files: atomic and exclusive writes, claims that name their holder, a cache with checksums, and bounded reading."""
+"""Files: atomic and exclusive writes, claims that name their holder, a cache with checksums, and
+bounded reading.
+"""
 
 import errno
 import glob
@@ -24,14 +26,22 @@ from nlos_models.errors import FileBusyError, OutputExistsError
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-CLAIM, LOCK, HOLDER = ".{}.part", "lock", "holder"
+CLAIM = ".{}.part"
+LOCK = "lock"
+HOLDER = "holder"
 DISK_ERRORS = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EIO}
-"""Errors of a disk that is full, beyond a quota or a limit, read-only or broken; their file is named."""
+"""Errors of a disk that is full, beyond a quota or a limit, read-only or broken; their file is
+named.
+"""
 TRIES = 5
 """Attempts at a claim that another process gives up at the same moment."""
 DIGEST_DIGITS = 16
-TEXT_LIMIT, TENSOR_LIMIT, ARRAYS_LIMIT = 1 << 20, 4 << 30, 2 << 30
-"""Bounds in bytes of a text file (TOML, JSON), of a file of tensors, and of the arrays unpacked from one .npz file."""
+TEXT_LIMIT = 1 << 20
+TENSOR_LIMIT = 4 << 30
+ARRAYS_LIMIT = 2 << 30
+"""Bounds in bytes of a text file (TOML, JSON), of a file of tensors, and of the arrays unpacked
+from one .npz file.
+"""
 DEEP_KEY = re.compile(r"(?<![^\s.=,#{}\[\]])(?:[^\s.=,#{}\[\]]++[ \t]*+\.[ \t]*+){100}")
 """Key of a hundred parts in TOML: tomllib takes minutes for some thousands."""
 
@@ -44,12 +54,13 @@ _reserved: set[Path] = set()
 
 @contextmanager
 def claim(path: Path, *, inside: bool = False) -> Generator[Path]:
-    """Hold the right to write `path`, and yield an empty folder beside it (or `inside` it) for unfinished parts.
+    """Hold the right to write `path`, and yield an empty folder beside it (or `inside` it) for
+    unfinished parts.
 
-    The folder is removed at the end.
-    The system releases the claim of a process that dies; leftovers of killed processes in the same folder go with the
-    first claim in it. Raises FileBusyError, with the holder, while another process has the claim; OSError where the
-    folder cannot be written to.
+    The folder is removed at the end. The system releases the claim of a process that dies;
+    leftovers of killed processes in the same folder go with the first claim in it. Raises
+    FileBusyError, with the holder, while another process has the claim; OSError where the folder
+    cannot be written to.
     """
     path = _place(path)
     folder = path / CLAIM.format("claim") if inside else path.with_name(CLAIM.format(path.name))
@@ -66,7 +77,8 @@ def claim(path: Path, *, inside: bool = False) -> Generator[Path]:
                 yield folder
     except OSError as error:
         if error.errno in DISK_ERRORS and folder.name in str(error.filename or folder.name):
-            error.filename, error.filename2 = str(path), None
+            error.filename = str(path)
+            error.filename2 = None
         raise
 
 
@@ -83,11 +95,15 @@ def _new_claim(path: Path, folder: Path) -> Generator[None]:
         if lock := _acquire(folder):
             break
     else:
-        raise FileBusyError(f"{path} is being written by {_holder(folder)}: wait for it, or choose another name")
+        raise FileBusyError(
+            f"{path} is being written by {_holder(folder)}: wait for it, or choose another name"
+        )
     try:
         _empty(folder)
         with suppress(OSError):  # a full disk is reported when a part is written
-            (folder / HOLDER).write_text(f"process {os.getpid()} on {platform.node()}", encoding="utf-8")
+            (folder / HOLDER).write_text(
+                f"process {os.getpid()} on {platform.node()}", encoding="utf-8"
+            )
         yield
     finally:
         shutil.rmtree(folder, ignore_errors=True)
@@ -100,7 +116,9 @@ def _new_claim(path: Path, folder: Path) -> Generator[None]:
 
 @contextmanager
 def reservations() -> Generator[Callable[[Path], None]]:
-    """Yield a function that claims paths until the end of the block; claims of this process within it share them."""
+    """Yield a function that claims paths until the end of the block; claims of this process within
+    it share them.
+    """
     with ExitStack() as held:
 
         def reserve(path: Path) -> None:
@@ -154,10 +172,12 @@ def _sweep(folder: Path) -> None:
 
 @contextmanager
 def atomic_file(path: Path, *, exclusive: bool = False) -> Generator[Path]:
-    """Yield a path to write to; on success flush that file to disk and rename it to `path`, else delete it.
+    """Yield a path to write to; on success flush that file to disk and rename it to `path`, else
+    delete it.
 
-    Readers see the old file or the whole new one, also after a power cut or a full disk. If `exclusive`, raises
-    OutputExistsError where `path` exists by then. Raises FileBusyError while another process writes the same file.
+    Readers see the old file or the whole new one, also after a power cut or a full disk. If
+    `exclusive`, raises OutputExistsError where `path` exists by then. Raises FileBusyError while
+    another process writes the same file.
     """
     with claim(path) as folder:
         part = folder / path.name
@@ -172,7 +192,9 @@ def atomic_file(path: Path, *, exclusive: bool = False) -> Generator[Path]:
 
 
 def link_exclusively(part: Path, path: Path) -> None:
-    """Give a file a second name. Raises OutputExistsError where that exists, also if it appeared just now."""
+    """Give a file a second name. Raises OutputExistsError where that exists, also if it appeared
+    just now.
+    """
     try:
         try:
             os.link(part, path)
@@ -196,16 +218,19 @@ def sync_folder(folder: Path) -> None:
 
 
 def load_cached(path: Path, read: Callable[[bytes], T], make: Callable[[], bytes]) -> T:
-    """Return `read` of a cache entry's content; where the entry `path` is absent, make and store its content first.
+    """Return `read` of a cache entry's content; where the entry `path` is absent, make and store
+    its content first.
 
-    An entry's file has a checksum of its name and content before the suffix. A damaged or foreign one counts as absent
-    and is replaced; a cache that cannot be used is a warning.
+    An entry's file has a checksum of its name and content before the suffix. A damaged or foreign
+    one counts as absent and is replaced; a cache that cannot be used is a warning.
     """
     if (content := _read_entry(path)) is not None:
         try:
             return read(content)
         except Exception as error:  # noqa: BLE001  an entry of another version, say: it can be made again
-            log.warning("%s cannot be used (%s): making it again", path, " ".join(str(error).split())[:200])
+            log.warning(
+                "%s cannot be used (%s): making it again", path, " ".join(str(error).split())[:200]
+            )
     content = make()
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -213,12 +238,18 @@ def load_cached(path: Path, read: Callable[[bytes], T], make: Callable[[], bytes
     except FileBusyError:
         pass  # another process stores the same
     except OSError as error:
-        log.warning("%s cannot be written (%s): continuing without a cache; set NLOS_CAM_CACHE", path, error.strerror)
+        log.warning(
+            "%s cannot be written (%s): continuing without a cache; set NLOS_CAM_CACHE",
+            path,
+            error.strerror,
+        )
     return read(content)
 
 
 def store_entry(path: Path, content: bytes) -> None:
-    """Store the content of a cache entry in place of any other of its name. Raises OSError, FileBusyError."""
+    """Store the content of a cache entry in place of any other of its name. Raises OSError,
+    FileBusyError.
+    """
     kept = path.with_name(_entry_name(path, content))
     with atomic_file(kept) as part:
         part.write_bytes(content)
@@ -244,8 +275,12 @@ def _entry_name(path: Path, content: bytes) -> str:
 
 
 def read_bounded(path: Path, limit: int) -> bytes:
-    """Return the bytes of a regular file. Raises OSError where it is none, or longer than `limit` bytes."""
-    if path.exists() and not path.is_file():  # opening a pipe would wait for a writer, a device may never end
+    """Return the bytes of a regular file. Raises OSError where it is none, or longer than `limit`
+    bytes.
+    """
+    if (
+        path.exists() and not path.is_file()
+    ):  # opening a pipe would wait for a writer, a device may never end
         raise OSError(errno.EINVAL, "not a regular file", str(path))
     with path.open("rb") as file:
         content = file.read(min(limit, path.stat().st_size) + 1)
@@ -264,15 +299,19 @@ def read_toml(path: Path) -> dict[str, Any]:
         raise tomllib.TOMLDecodeError(describe(error)) from error
 
 
-def read_arrays(path: Path, names: Iterable[str] | None = None, limit: int = ARRAYS_LIMIT) -> "dict[str, NDArray[Any]]":
+def read_arrays(
+    path: Path, names: Iterable[str] | None = None, limit: int = ARRAYS_LIMIT
+) -> "dict[str, NDArray[Any]]":
     """Return arrays of an .npz file by name (None: all of them), without pickles.
 
-    Raises OSError, or ValueError where one is missing or damaged, where a header declares another size than the bytes
-    that follow it, or where they unpack to more than `limit` bytes.
+    Raises OSError, or ValueError where one is missing or damaged, where a header declares another
+    size than the bytes that follow it, or where they unpack to more than `limit` bytes.
     """
     try:
         with ZipFile(path) as file:
-            chosen = [each.removesuffix(".npy") for each in file.namelist()] if names is None else names
+            chosen = (
+                [each.removesuffix(".npy") for each in file.namelist()] if names is None else names
+            )
             infos = {name: file.getinfo(f"{name}.npy") for name in chosen}
             if sum(info.file_size for info in infos.values()) <= limit:
                 return {name: _array(file.read(info)) for name, info in infos.items()}
@@ -302,29 +341,43 @@ CHECKSUMS = "SHA256SUMS"
 
 
 def checksums_of(folder: Path) -> dict[str, str]:
-    """Return the checksums in a folder's SHA256SUMS by file name; none where there is no such file. Raises OSError."""
+    """Return the checksums in a folder's SHA256SUMS by file name; none where there is no such file.
+    Raises OSError.
+    """
     try:
         lines = read_bounded(folder / CHECKSUMS, TEXT_LIMIT).decode("utf-8", "replace").splitlines()
     except FileNotFoundError:
         return {}
-    return {name.strip().lstrip("*"): digest for digest, _, name in (line.partition(" ") for line in lines)}
+    return {
+        name.strip().lstrip("*"): digest
+        for digest, _, name in (line.partition(" ") for line in lines)
+    }
 
 
 def read_checked(path: Path, limit: int) -> bytes:
-    """Return a file's bytes. Raises OSError as `read_bounded` does, and ValueError against its folder's SHA256SUMS."""
+    """Return a file's bytes. Raises OSError as `read_bounded` does, and ValueError against its
+    folder's SHA256SUMS.
+    """
     content = read_bounded(path, limit)
-    if checksums_of(path.parent).get(path.name, found := hashlib.sha256(content).hexdigest()) != found:
+    if (
+        checksums_of(path.parent).get(path.name, found := hashlib.sha256(content).hexdigest())
+        != found
+    ):
         raise ValueError(f"damaged: its checksum differs from {CHECKSUMS}")
     return content
 
 
 def write_checked(folder: Path, contents: Mapping[str, bytes]) -> None:
-    """Write files by name into a folder, each atomically, with their checksums. Raises OSError, FileBusyError.
+    """Write files by name into a folder, each atomically, with their checksums. Raises OSError,
+    FileBusyError.
 
-    The checksums come first: a kill in between leaves files that do not match them, not a mixture that does.
+    The checksums come first: a kill in between leaves files that do not match them, not a mixture
+    that does.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    sums = {name: digest for name, digest in checksums_of(folder).items() if (folder / name).is_file()}
+    sums = {
+        name: digest for name, digest in checksums_of(folder).items() if (folder / name).is_file()
+    }
     sums |= {name: hashlib.sha256(content).hexdigest() for name, content in contents.items()}
     text = "".join(f"{digest}  {name}\n" for name, digest in sorted(sums.items()))
     for name, content in {CHECKSUMS: text.encode(), **contents}.items():
@@ -333,7 +386,9 @@ def write_checked(folder: Path, contents: Mapping[str, bytes]) -> None:
 
 
 def describe(error: Exception) -> str:
-    """Return the reason of an exception in one line: the system's words, or the library's without its lines."""
+    """Return the reason of an exception in one line: the system's words, or the library's without
+    its lines.
+    """
     if isinstance(error, RecursionError):
         return "it is nested too deeply"
     if isinstance(error, MemoryError):

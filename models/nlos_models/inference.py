@@ -1,4 +1,6 @@
-"""Inference from maps to images and uncertainty in ONNX Runtime on a CPU, without torch; with a GPU, in torch."""
+"""Inference from maps to images and uncertainty in ONNX Runtime on a CPU, without torch; with a
+GPU, in torch.
+"""
 
 import ctypes
 import sys
@@ -18,8 +20,11 @@ from nlos_models.recipe import SIMULATION_ONLY
 MAP_SHAPE = (64, 80)
 NETWORK_INPUTS = {"depth_m": MAP_SHAPE, "intensity": MAP_SHAPE}
 DOUBT_INPUTS = {**NETWORK_INPUTS, "image": (64, 64)}
-NETWORK_ONNX, DOUBT_ONNX = "network.onnx", "doubt.onnx"
-"""Graphs beside a checkpoint's tensors, which they point into as ONNX external data: nothing is stored twice."""
+NETWORK_ONNX = "network.onnx"
+DOUBT_ONNX = "doubt.onnx"
+"""Graphs beside a checkpoint's tensors, which they point into as ONNX external data: nothing is
+stored twice.
+"""
 CHECKSUM = "weights"
 """Key of the graph's metadata with the checksum of the files that it was made from."""
 
@@ -40,7 +45,9 @@ class Reconstructor(Protocol):
     runtime: str
 
     def __call__(self, depth_m: Float32, intensity: Float32) -> Float32:
-        """Return the images (n, 64, 64) in [0, 1] of maps (n, 64, 80) with NaN depth where there is no return."""
+        """Return the images (n, 64, 64) in [0, 1] of maps (n, 64, 80) with NaN depth where there is
+        no return.
+        """
         ...
 
 
@@ -49,27 +56,41 @@ class _HasSurface(Protocol):
     def answer(self, depth_m: Float32, intensity: Float32) -> Answer: ...
 
 
-def ask(network: Callable[[Float32, Float32], Float32], depth_m: Float32, intensity: Float32) -> Answer:
-    """Return a network's answer to maps (n, 64, 80), with the probability of a surface where its `answer` has one."""
+def ask(
+    network: Callable[[Float32, Float32], Float32], depth_m: Float32, intensity: Float32
+) -> Answer:
+    """Return a network's answer to maps (n, 64, 80), with the probability of a surface where its
+    `answer` has one.
+    """
     if isinstance(network, _HasSurface):
         return network.answer(depth_m, intensity)
     return Answer(network(depth_m, intensity))
 
 
 class OnnxReconstructor:
-    """Pipeline in ONNX Runtime on the CPU, about five times faster than torch there for one frame."""
+    """Pipeline in ONNX Runtime on the CPU, about five times faster than torch there for one
+    frame.
+    """
 
     def __init__(
-        self, model: Path | bytes, record: records.CheckpointRecord, threads: int = 1, checksum: str = ""
+        self,
+        model: Path | bytes,
+        record: records.CheckpointRecord,
+        threads: int = 1,
+        checksum: str = "",
     ) -> None:
-        self.record, self.runtime = record, "ONNX Runtime on cpu"
+        self.record = record
+        self.runtime = "ONNX Runtime on cpu"
         self._session = open_session(model, threads, checksum)
 
     def __call__(self, depth_m: Float32, intensity: Float32) -> Float32:
         return self.answer(depth_m, intensity).image
 
     def answer(self, depth_m: Float32, intensity: Float32) -> Answer:
-        inputs = {"depth_m": np.ascontiguousarray(depth_m), "intensity": np.ascontiguousarray(intensity)}
+        inputs = {
+            "depth_m": np.ascontiguousarray(depth_m),
+            "intensity": np.ascontiguousarray(intensity),
+        }
         return Answer(*self._session.run(None, inputs))
 
 
@@ -81,32 +102,42 @@ class UncertaintyModel(Protocol):
     """None for weights without a quality model."""
 
     def __call__(self, depth_m: Float32, intensity: Float32, image: Float32) -> UncertaintyEstimate:
-        """Return the uncertainty of images (n, 64, 64) reconstructed from maps (n, 64, 80) with NaN for no return."""
+        """Return the uncertainty of images (n, 64, 64) reconstructed from maps (n, 64, 80) with NaN
+        for no return.
+        """
         ...
 
 
 class OnnxUncertaintyModel:
     """Uncertainty network in ONNX Runtime, on one thread of the CPU unless set otherwise."""
 
-    def __init__(self, model: Path | bytes, record: records.DoubtRecord, threads: int = 1, checksum: str = "") -> None:
-        self.record, self._session = record, open_session(model, threads, checksum)
+    def __init__(
+        self, model: Path | bytes, record: records.DoubtRecord, threads: int = 1, checksum: str = ""
+    ) -> None:
+        self.record = record
+        self._session = open_session(model, threads, checksum)
         self.quality: QualityModel | None = None
 
     def __call__(self, depth_m: Float32, intensity: Float32, image: Float32) -> UncertaintyEstimate:
         arrays = (np.ascontiguousarray(array, np.float32) for array in (depth_m, intensity, image))
-        return UncertaintyEstimate(*self._session.run(None, dict(zip(DOUBT_INPUTS, arrays, strict=True))))
+        return UncertaintyEstimate(
+            *self._session.run(None, dict(zip(DOUBT_INPUTS, arrays, strict=True)))
+        )
 
 
 def open_session(model: Path | bytes, threads: int = 1, checksum: str = "") -> Any:
     """Open an ONNX file, or its content, in ONNX Runtime on the CPU.
 
-    Raises CheckpointError where it cannot be read, or was made from other weights than those of `checksum`.
+    Raises CheckpointError where it cannot be read, or was made from other weights than those of
+    `checksum`.
     """
     try:
         import onnxruntime
     except ImportError as error:  # also where its libraries do not fit into the memory that is left
         reason = " ".join(str(error).split())
-        raise MissingExtraError(f"ONNX Runtime cannot be loaded ({reason}): free memory or install it again") from error
+        raise MissingExtraError(
+            f"ONNX Runtime cannot be loaded ({reason}): free memory or install it again"
+        ) from error
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = threads
     options.log_severity_level = 4  # errors are raised too
@@ -114,22 +145,28 @@ def open_session(model: Path | bytes, threads: int = 1, checksum: str = "") -> A
     try:
         if isinstance(model, Path):
             read_checked(model, TENSOR_LIMIT)
-        source = model if isinstance(model, bytes) else str(model)  # by its path: it points into the weights beside it
+        source = (
+            model if isinstance(model, bytes) else str(model)
+        )  # by its path: it points into the weights beside it
         session = onnxruntime.InferenceSession(source, options, providers=["CPUExecutionProvider"])
     except Exception as error:  # ONNX Runtime's errors share no class below Exception
         if lacks_memory(error):
             raise MemoryError(str(error)) from error
         raise CheckpointError(f"{name} cannot be read as a network: export it again") from error
     if checksum and session.get_modelmeta().custom_metadata_map.get(CHECKSUM) != checksum:
-        raise CheckpointError(f"{name} was made from other weights than those beside it: export it again")
+        raise CheckpointError(
+            f"{name} was made from other weights than those beside it: export it again"
+        )
     return session
 
 
 def load_reconstructor(folder: Path | None, cache: Path, threads: int = 1) -> Reconstructor:
-    """Load a checkpoint folder's weights (None: the shipped ones) on a GPU if there is one, else in ONNX Runtime.
+    """Load a checkpoint folder's weights (None: the shipped ones) on a GPU if there is one, else in
+    ONNX Runtime.
 
-    `threads` are ONNX Runtime's. Weights without a valid graph beside them are exported into the folder `cache`, which
-    takes torch. Raises CheckpointError where they cannot be read or are for color, MissingExtraError without torch.
+    `threads` are ONNX Runtime's. Weights without a valid graph beside them are exported into the
+    folder `cache`, which takes torch. Raises CheckpointError where they cannot be read or are for
+    color, MissingExtraError without torch.
     """
     folder = records.weights_folder(folder)
     record = records.load_record(folder)
@@ -137,18 +174,27 @@ def load_reconstructor(folder: Path | None, cache: Path, threads: int = 1) -> Re
     if _has_cuda():
         return require("nlos_models.export", "inference on a GPU").load_torch_reconstructor(folder)
     try:
-        return OnnxReconstructor(folder / NETWORK_ONNX, record, threads, records.checksum_of_watched(folder))
+        return OnnxReconstructor(
+            folder / NETWORK_ONNX, record, threads, records.checksum_of_watched(folder)
+        )
     except CheckpointError as error:
         key, export = _exporter(error).network_export(folder)
-        return load_cached(cache / key, lambda model: OnnxReconstructor(model, record, threads), export)
+        return load_cached(
+            cache / key, lambda model: OnnxReconstructor(model, record, threads), export
+        )
 
 
-def load_uncertainty_model(folder: Path | None, cache: Path, *, quality: bool = True) -> UncertaintyModel | None:
-    """Load the uncertainty network beside the weights in a folder (None: the shipped ones); None where there is none.
+def load_uncertainty_model(
+    folder: Path | None, cache: Path, *, quality: bool = True
+) -> UncertaintyModel | None:
+    """Load the uncertainty network beside the weights in a folder (None: the shipped ones); None
+    where there is none.
 
-    With it comes the quality model that watches it, if there is one; without `quality` that file is not read.
+    With it comes the quality model that watches it, if there is one; without `quality` that file is
+    not read.
 
-    Without a valid graph it is exported as by `load_reconstructor`. Raises CheckpointError, MissingExtraError.
+    Without a valid graph it is exported as by `load_reconstructor`. Raises CheckpointError,
+    MissingExtraError.
     """
     folder = records.weights_folder(folder)
     if (record := records.load_doubt_record(folder)) is None:
@@ -168,8 +214,8 @@ def refuse_color(record: records.CheckpointRecord, folder: Path | None) -> None:
     """Raise CheckpointError for color weights: exports and runtimes are for depth."""
     if record.color:
         raise CheckpointError(
-            f"{folder} holds weights for full color ({SIMULATION_ONLY}): name weights for depth, or evaluate these "
-            "with tools/studies/color.py"
+            f"{folder} holds weights for full color ({SIMULATION_ONLY}): name weights for depth, or"
+            " evaluate these with tools/studies/color.py"
         )
 
 
@@ -182,7 +228,9 @@ def _exporter(error: CheckpointError) -> Any:
 
 
 def _has_cuda() -> bool:
-    """Return whether torch can use a GPU; torch is imported only where NVIDIA's driver is installed."""
+    """Return whether torch can use a GPU; torch is imported only where NVIDIA's driver is
+    installed.
+    """
     try:
         ctypes.CDLL("nvcuda.dll" if sys.platform == "win32" else "libcuda.so.1")
     except OSError:

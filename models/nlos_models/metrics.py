@@ -1,4 +1,6 @@
-"""Image metrics, one value per object: of depth images v in [0, 1] (background below 0.05) and of color images."""
+"""Image metrics, one value per object: of depth images v in [0, 1] (background below 0.05) and of
+color images.
+"""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,7 +30,8 @@ def accuracy_within_2_percent(image: Float32, truth: Float32) -> Float64:
 
 def silhouette_iou(image: Float32, truth: Float32) -> Float64:
     """Return intersection over union of the surface masks, (n,); 1 where both are empty."""
-    found, true = surface(image), surface(truth)
+    found = surface(image)
+    true = surface(truth)
     union = (found | true).sum((-2, -1))
     return np.where(union > 0, (found & true).sum((-2, -1)) / np.maximum(union, 1), 1.0)
 
@@ -51,7 +54,9 @@ SMALLER_IS_BETTER = frozenset({"root_mean_square_error", "colour_error"})
 
 
 def brightness(image: Float32) -> Float32:
-    """Return the brightest channel (..., 64, 64) of color images (..., 3, 64, 64), which defines their surface."""
+    """Return the brightest channel (..., 64, 64) of color images (..., 3, 64, 64), which defines
+    their surface.
+    """
     return image.max(-3)
 
 
@@ -66,14 +71,20 @@ def color_accuracy_mean_abs(image: Float32, truth: Float32) -> Float64:
 
 
 def root_mean_square_error(image: Float32, truth: Float32) -> Float64:
-    """Return the RMS of v - v_true over all pixels and channels, (n,); the mean object is its best constant answer."""
+    """Return the RMS of v - v_true over all pixels and channels, (n,); the mean object is its best
+    constant answer.
+    """
     return np.sqrt(np.square(image.astype(np.float64) - truth).mean((-3, -2, -1)))
 
 
 def color_error(image: Float32, truth: Float32) -> Float64:
-    """Return the mean |albedo error| over channels and pixels with surface in both, (n,); NaN where they share none."""
+    """Return the mean |albedo error| over channels and pixels with surface in both, (n,); NaN where
+    they share none.
+    """
     both = surface(brightness(image)) & surface(brightness(truth))
-    apart = np.abs(np.maximum(image, BLACK_V).astype(np.float64) - np.maximum(truth, BLACK_V)) / (1 - BLACK_V)
+    apart = np.abs(np.maximum(image, BLACK_V).astype(np.float64) - np.maximum(truth, BLACK_V)) / (
+        1 - BLACK_V
+    )
     count = both.sum((-2, -1))
     total = np.where(both, apart.mean(-3), 0.0).sum((-2, -1))
     return np.where(count > 0, total / np.maximum(count, 1), np.nan)

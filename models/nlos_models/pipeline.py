@@ -1,14 +1,16 @@
-"""Reconstruction network from lidar maps to hidden images: preprocessing, compressor, decoder, silhouette (SI 3, 4).
+"""Reconstruction network from lidar maps to hidden images: preprocessing, compressor, decoder,
+silhouette (SI 3, 4).
 
-Split-and-stack cuts maps (64, 80) into four channels: left depth, right depth, left intensity, right intensity. Columns
-0 to 39 are left, nearer the lidar. In color, which is simulation only, three intensities follow the depth: 8 channels.
-A color image (n, 3, 64, 64) holds the hidden object's albedo in red, green and blue: 0 for background, else from 0.1
-(black) to 1 (white) in each channel.
+Split-and-stack cuts maps (64, 80) into four channels: left depth, right depth, left intensity,
+right intensity. Columns 0 to 39 are left, nearer the lidar. In color, which is simulation only,
+three intensities follow the depth: 8 channels. A color image (n, 3, 64, 64) holds the hidden
+object's albedo in red, green and blue: 0 for background, else from 0.1 (black) to 1 (white) in each
+channel.
 
-Silhouette: a network trained on squared error answers with the mean of all images that are possible, so that a pixel
-near the outline has a fraction of the surface's v. The convention v < 0.05 would count nearly all of them as surface,
-much too far away. So a pixel is kept only if it reaches KEPT_SHARE of the brightest pixel around it, and is then lifted
-to the surface's own v.
+Silhouette: a network trained on squared error answers with the mean of all images that are
+possible, so that a pixel near the outline has a fraction of the surface's v. The convention v <
+0.05 would count nearly all of them as surface, much too far away. So a pixel is kept only if it
+reaches KEPT_SHARE of the brightest pixel around it, and is then lifted to the surface's own v.
 """
 
 import torch
@@ -30,7 +32,8 @@ def stacked_channels(intensities: int = 1) -> int:
 
 
 def split_and_stack(depth_m: Tensor, intensity: Tensor) -> Tensor:
-    """Stack depth (n, 64, 80) and intensity (n, 64, 80) or (n, k, 64, 80) to (n, 2 + 2 k, 64, 40): left, right in turn.
+    """Stack depth (n, 64, 80) and intensity (n, 64, 80) or (n, k, 64, 80) to (n, 2 + 2 k, 64, 40):
+    left, right in turn.
 
     A cell without a return (NaN depth) is NaN in all of its channels.
     """
@@ -42,7 +45,9 @@ def split_and_stack(depth_m: Tensor, intensity: Tensor) -> Tensor:
 
 
 def channel_statistics(stacked: Tensor) -> tuple[Tensor, Tensor]:
-    """Return mean and standard deviation (channels,) of stacked maps (n, channels, 64, 40) over valid cells."""
+    """Return mean and standard deviation (channels,) of stacked maps (n, channels, 64, 40) over
+    valid cells.
+    """
     values = stacked.transpose(0, 1).flatten(1).double()
     valid = ~torch.isnan(values)
     count = valid.sum(1).clamp(min=1)
@@ -52,7 +57,9 @@ def channel_statistics(stacked: Tensor) -> tuple[Tensor, Tensor]:
 
 
 class Preprocess(nn.Module):
-    """Preprocessing: normalise each channel, add SI 4's noise to the left ones in training, resize to 100 x 100."""
+    """Preprocessing: normalise each channel, add SI 4's noise to the left ones in training, resize
+    to 100 x 100.
+    """
 
     mean: Tensor
     spread: Tensor
@@ -64,13 +71,17 @@ class Preprocess(nn.Module):
         self.register_buffer("spread", torch.ones(stacked_channels(intensities)))
 
     def learn(self, stacked: Tensor, channels: slice = slice(None)) -> None:
-        """Set the statistics of all or some channels to those of stacked maps (n, channels, 64, 40)."""
+        """Set the statistics of all or some channels to those of stacked maps (n, channels, 64,
+        40).
+        """
         mean, spread = channel_statistics(stacked)
         self.mean[channels] = mean[channels]
         self.spread[channels] = spread[channels]
 
     def forward(self, depth_m: Tensor, intensity: Tensor) -> Tensor:
-        """Map maps (n, 64, 80) to (n, channels, 100, 100); invalid cells get the channel's mean (0, normalised)."""
+        """Map maps (n, 64, 80) to (n, channels, 100, 100); invalid cells get the channel's mean (0,
+        normalised).
+        """
         stacked = split_and_stack(depth_m, intensity)
         scale = self.spread.clamp(min=SMALLEST_SPREAD)
         normal = (stacked - self.mean[:, None, None]) / scale[:, None, None]
@@ -78,7 +89,9 @@ class Preprocess(nn.Module):
         if self.training:
             for channel in range(0, normal.shape[1], 2):
                 normal[:, channel] += self.left_noise * torch.randn_like(normal[:, channel])
-        return functional.interpolate(normal, (RESIZED, RESIZED), mode="bilinear", align_corners=False)
+        return functional.interpolate(
+            normal, (RESIZED, RESIZED), mode="bilinear", align_corners=False
+        )
 
 
 WINDOW = 13
@@ -89,7 +102,9 @@ KEPT_SHARE = 0.4
 
 
 def cut_silhouette(image: Tensor) -> Tensor:
-    """Set the background of decoded images (n, channels, h, w) to 0, judging each pixel by its brightest channel."""
+    """Set the background of decoded images (n, channels, h, w) to 0, judging each pixel by its
+    brightest channel.
+    """
     bright = image.amax(1, keepdim=True)
     brightest = functional.max_pool2d(bright, WINDOW, stride=1, padding=WINDOW // 2)
     kept = (bright >= KEPT_SHARE * brightest) & (bright >= MIN_V)
@@ -97,19 +112,27 @@ def cut_silhouette(image: Tensor) -> Tensor:
 
 
 def lift_edges(image: Tensor) -> Tensor:
-    """Raise decoded images (n, 1, h, w) to the smoothed maximum around each pixel; no pixel gets darker."""
+    """Raise decoded images (n, 1, h, w) to the smoothed maximum around each pixel; no pixel gets
+    darker.
+    """
     pad = LIFT_WINDOW // 2
     brightest = functional.max_pool2d(image, LIFT_WINDOW, stride=1, padding=pad)
-    return torch.maximum(image, functional.avg_pool2d(brightest, LIFT_WINDOW, 1, pad, count_include_pad=False))
+    return torch.maximum(
+        image, functional.avg_pool2d(brightest, LIFT_WINDOW, 1, pad, count_include_pad=False)
+    )
 
 
 class RemappingNetwork(nn.Module):
-    """Network from maps (n, 64, 80) to images (n, 64, 64) in [0, 1]: preprocessing, compressor, decoder, silhouette.
+    """Network from maps (n, 64, 80) to images (n, 64, 64) in [0, 1]: preprocessing, compressor,
+    decoder, silhouette.
 
-    In color (simulation only: the L515's laser is infrared) intensities are (n, 3, 64, 80), images (n, 3, 64, 64).
+    In color (simulation only: the L515's laser is infrared) intensities are (n, 3, 64, 80), images
+    (n, 3, 64, 64).
     """
 
-    def __init__(self, compressor: nn.Module, decoder: Decoder, left_noise: float = 0.2, intensities: int = 1) -> None:
+    def __init__(
+        self, compressor: nn.Module, decoder: Decoder, left_noise: float = 0.2, intensities: int = 1
+    ) -> None:
         super().__init__()
         self.intensities = intensities
         self.preprocess = Preprocess(left_noise, intensities)
@@ -117,11 +140,15 @@ class RemappingNetwork(nn.Module):
         self.decoder = decoder
 
     def latent(self, depth_m: Tensor, intensity: Tensor) -> Tensor:
-        """Return the latents (n, latent) of maps (n, 64, 80) with NaN depth where there is no return."""
+        """Return the latents (n, latent) of maps (n, 64, 80) with NaN depth where there is no
+        return.
+        """
         return self.compressor(self.preprocess(depth_m, intensity))
 
     def forward(self, depth_m: Tensor, intensity: Tensor) -> Tensor:
-        """Return the images of maps; edges of depth are lifted, edges of color are not: colors would mix."""
+        """Return the images of maps; edges of depth are lifted, edges of color are not: colors
+        would mix.
+        """
         image = self.decoder(self.latent(depth_m, intensity))
         cut = cut_silhouette(image)
         if image.shape[1] > 1:
@@ -133,7 +160,9 @@ CHANNELS = 3
 
 
 def new_vae(*, color: bool) -> ResVae:
-    """Return an untrained Res-VAE for 64 x 64 images with a latent of 256, or for 64 x 64 x 3 with 512 (SI 3)."""
+    """Return an untrained Res-VAE for 64 x 64 images with a latent of 256, or for 64 x 64 x 3 with
+    512 (SI 3).
+    """
     return ResVae(CHANNELS, COLOR_OUTPUTS) if color else ResVae()
 
 
@@ -145,7 +174,9 @@ def new_pipeline(
     left_noise: float = 0.2,
     width: float = 1.0,
 ) -> RemappingNetwork:
-    """Return an untrained compressor (MobileNetV2, for color ResNet50; SI 4) before a decoder (default: untrained)."""
+    """Return an untrained compressor (MobileNetV2, for color ResNet50; SI 4) before a decoder
+    (default: untrained).
+    """
     if not color:
         return RemappingNetwork(Compressor(dropout, width), decoder or Decoder(), left_noise)
     return RemappingNetwork(

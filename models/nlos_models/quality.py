@@ -1,8 +1,9 @@
-"""Quality of one reconstruction, predicted from its image and uncertainty: overlap of the outline, and depth error.
+"""Quality of one reconstruction, predicted from its image and uncertainty: overlap of the outline,
+and depth error.
 
-A small network in numpy on some fifty figures of the image, of the uncertainty network's answer and, where the
-reconstructing network has one, of its own probability of a surface, fitted to reconstructions of known objects by
-`train quality` (`doubt_training`).
+A small network in numpy on some fifty figures of the image, of the uncertainty network's answer
+and, where the reconstructing network has one, of its own probability of a surface, fitted to
+reconstructions of known objects by `train quality` (`doubt_training`).
 """
 
 import json
@@ -21,20 +22,25 @@ from nlos_models.records import DOUBT, DOUBT_RECORD, checksum_of_watched
 
 QUALITY = "quality.json"
 DOUBT_FILES = f"{DOUBT}.safetensors", DOUBT_RECORD
-GOOD_IOU, PRECISION = 0.75, 0.9
-"""A frame is trusted where its silhouette IoU is at least the first in at least the second of like frames."""
+GOOD_IOU = 0.75
+PRECISION = 0.9
+"""A frame is trusted where its silhouette IoU is at least the first in at least the second of like
+frames.
+"""
 LEVELS = 0.1, 0.5, 0.9
 """Quantiles of the predicted IoU."""
 OUTLINES = 0.1, 0.3, 0.5, 0.7, 0.9
 """Probabilities of a surface whose outlines are compared with the image's."""
-FEATURES, WITH_SURFACE = 35, 54
+FEATURES = 35
+WITH_SURFACE = 54
 """Figures without and with the reconstructing network's own probability of a surface."""
 OUTPUTS = len(LEVELS) + 4
-"""Logits of the IoU's quantiles, of a good outline on any shape and on one of the 18 kinds, and of such a kind; then
-the logarithm of the depth error. Older records have two fewer, and do not tell the kinds apart."""
+"""Logits of the IoU's quantiles, of a good outline on any shape and on one of the 18 kinds, and of
+such a kind; then the logarithm of the depth error. Older records have two fewer, and do not tell
+the kinds apart."""
 KINDS_ODDS = 0.03
-"""Factor on the fit's odds of one of the 18 kinds: a user's object is seldom one, and the networks read kinds into
-other shapes."""
+"""Factor on the fit's odds of one of the 18 kinds: a user's object is seldom one, and the networks
+read kinds into other shapes."""
 CLIP = 4.0
 """Limit of a normalised figure, in spreads: a strange frame is not extrapolated to."""
 
@@ -77,7 +83,9 @@ class QualityEstimate:
     iou: Float32
     """(n, 3): quantiles of the silhouette IoU at LEVELS, rising."""
     good: Float32
-    """(n,): probability that the IoU is at least GOOD_IOU, for an object that is seldom one of the 18 kinds."""
+    """(n,): probability that the IoU is at least GOOD_IOU, for an object that is seldom one of the
+    18 kinds.
+    """
     error_v: Float32
     """(n,): expected mean absolute error of v where image and truth both have a surface."""
     trusted: Mask
@@ -85,12 +93,21 @@ class QualityEstimate:
 
     @classmethod
     def of(cls, outputs: Float32, trusted_above: float | None) -> Self:
-        """Return the estimate of a model's outputs (n, OUTPUTS); without a threshold no frame is trusted."""
-        iou, good = np.sort(_sigmoid(outputs[:, : len(LEVELS)]), 1), _sigmoid(outputs[:, len(LEVELS)])
+        """Return the estimate of a model's outputs (n, OUTPUTS); without a threshold no frame is
+        trusted.
+        """
+        iou = np.sort(_sigmoid(outputs[:, : len(LEVELS)]), 1)
+        good = _sigmoid(outputs[:, len(LEVELS)])
         if outputs.shape[1] == OUTPUTS:
-            of_kind, known = _sigmoid(outputs[:, -3]), _sigmoid(outputs[:, -2] + np.float32(np.log(KINDS_ODDS)))
+            of_kind = _sigmoid(outputs[:, -3])
+            known = _sigmoid(outputs[:, -2] + np.float32(np.log(KINDS_ODDS)))
             good = (known * of_kind + (1 - known) * good).astype(np.float32)
-        return cls(iou, good, np.exp(outputs[:, -1]), good >= (np.inf if trusted_above is None else trusted_above))
+        return cls(
+            iou,
+            good,
+            np.exp(outputs[:, -1]),
+            good >= (np.inf if trusted_above is None else trusted_above),
+        )
 
 
 class QualityModel:
@@ -107,7 +124,8 @@ class QualityModel:
     ) -> QualityEstimate:
         """Return the quality of images (n, 64, 64) in v with their uncertainty.
 
-        A model that was fitted with a network's probability of a surface takes the estimate's where none is given.
+        A model that was fitted with a network's probability of a surface takes the estimate's where
+        none is given.
         """
         if len(self._means) == FEATURES:
             surface = None
@@ -129,11 +147,15 @@ def normalised(figures: Float32, means: Float32, spreads: Float32) -> Float32:
     return ((figures - means) / spreads).clip(-CLIP, CLIP)
 
 
-def quality_features(image: Float32, estimate: UncertaintyEstimate, surface: Float32 | None = None) -> Float32:
-    """Return the figures (n, FEATURES or WITH_SURFACE) that a quality is predicted from; all are finite.
+def quality_features(
+    image: Float32, estimate: UncertaintyEstimate, surface: Float32 | None = None
+) -> Float32:
+    """Return the figures (n, FEATURES or WITH_SURFACE) that a quality is predicted from; all are
+    finite.
 
-    `surface` (n, 64, 64) is the reconstructing network's probability of a surface. Figures are the same for the
-    mirrored image. All sums over pixels are divided by the area of the image's surface.
+    `surface` (n, 64, 64) is the reconstructing network's probability of a surface. Figures are the
+    same for the mirrored image. All sums over pixels are divided by the area of the image's
+    surface.
     """
     mask = image > 0
     m, v, error = (_flat(np.asarray(each, np.float32)) for each in (mask, image, estimate.error_v))
@@ -152,20 +174,33 @@ def quality_features(image: Float32, estimate: UncertaintyEstimate, surface: Flo
     found += [rim / np.sqrt(area), rim / area, *_slopes(image, mask, area), *_place(mask, area)]
     found += [_logit(estimate.p_out_of_distribution), _logit(estimate.p_empty)]
     if surface is not None:
-        own, apart = _flat(surface), np.abs(_flat(surface) - p)
+        own = _flat(surface)
+        apart = np.abs(_flat(surface) - p)
         sharp = share(own**2) / np.maximum(share(own), 1e-4)
         found += [*_outline(m, own, area), share(apart), share(apart * m), sharp]
     return np.stack(found, 1).astype(np.float32)
 
 
 def _outline(m: Float32, p: Float32, area: Float32) -> list[Float32]:
-    """Return how an image's surface (n, 4096) fits probabilities of one: expected overlap, and outlines compared."""
-    inside, beside, unsure = (p * m).sum(1) / area, (p * (1 - m)).sum(1) / area, p * (1 - p)
+    """Return how an image's surface (n, 4096) fits probabilities of one: expected overlap, and
+    outlines compared.
+    """
+    inside = (p * m).sum(1) / area
+    beside = (p * (1 - m)).sum(1) / area
+    unsure = p * (1 - p)
     overlap = inside / (1 + beside)
-    found = [overlap, _logit(overlap), inside, beside, unsure.sum(1) / area, (unsure * m).sum(1) / area]
+    found = [
+        overlap,
+        _logit(overlap),
+        inside,
+        beside,
+        unsure.sum(1) / area,
+        (unsure * m).sum(1) / area,
+    ]
     for level in OUTLINES:
         above = (p > level).astype(np.float32)
-        joint, size = (above * m).sum(1), above.sum(1)
+        joint = (above * m).sum(1)
+        size = above.sum(1)
         found += [joint / np.maximum(size + m.sum(1) - joint, 1.0), size / area]
     return found
 
@@ -182,14 +217,24 @@ def _slopes(image: Float32, mask: Mask, area: Float32) -> list[Float32]:
 
 
 def _place(mask: Mask, area: Float32) -> list[Float32]:
-    """Return place and extent of the surface: distance from the rig's plane of symmetry, column, spreads, fill."""
+    """Return place and extent of the surface: distance from the rig's plane of symmetry, column,
+    spreads, fill.
+    """
     pixels = np.arange(mask.shape[1], dtype=np.float32)
     rows, columns = (mask.sum(axis).astype(np.float32) for axis in (2, 1))
-    row, column = (rows @ pixels) / area, (columns @ pixels) / area
+    row = (rows @ pixels) / area
+    column = (columns @ pixels) / area
     high = np.sqrt(np.maximum((rows @ pixels**2) / area - row**2, 0.0))
     wide = np.sqrt(np.maximum((columns @ pixels**2) / area - column**2, 0.0))
     middle = (mask.shape[1] - 1) / 2
-    return [np.abs(row - middle), column, high, wide, high / np.maximum(wide, 1.0), area / np.maximum(high * wide, 1.0)]
+    return [
+        np.abs(row - middle),
+        column,
+        high,
+        wide,
+        high / np.maximum(wide, 1.0),
+        area / np.maximum(high * wide, 1.0),
+    ]
 
 
 def _logit(p: Float32) -> Float32:
@@ -202,12 +247,16 @@ def _sigmoid(x: Float32) -> Float32:
 
 
 def quality_watches(folder: Path) -> str:
-    """Return the checksum of the uncertainty network in a folder, which a quality model is bound to."""
+    """Return the checksum of the uncertainty network in a folder, which a quality model is bound
+    to.
+    """
     return checksum_of_watched(folder, DOUBT_FILES)
 
 
 def write_quality(folder: Path, record: QualityRecord) -> None:
-    """Write a quality model beside the weights that it watches, with its checksum. Raises OSError, FileBusyError."""
+    """Write a quality model beside the weights that it watches, with its checksum. Raises OSError,
+    FileBusyError.
+    """
     write_checked(folder, {QUALITY: (json.dumps(record.model_dump(mode="json")) + "\n").encode()})
 
 
@@ -235,14 +284,21 @@ def load_quality_model(folder: Path) -> QualityModel | None:
 
 
 def _fits(record: QualityRecord) -> bool:
-    """Return True if the layers take the normalised figures, and each the outputs of the one before."""
+    """Return True if the layers take the normalised figures, and each the outputs of the one
+    before.
+    """
     sizes: Sequence[tuple[int, ...]] = []
     try:
         sizes = [np.asarray(layer, np.float32).shape for layer in record.layers]
     except ValueError:  # rows of different lengths
         return False
     inputs = len(record.means)
-    if not sizes or inputs not in {FEATURES, WITH_SURFACE} or inputs != len(record.spreads) or min(record.spreads) <= 0:
+    if (
+        not sizes
+        or inputs not in {FEATURES, WITH_SURFACE}
+        or inputs != len(record.spreads)
+        or min(record.spreads) <= 0
+    ):
         return False
     for size in sizes:
         if len(size) != 2 or size[0] != inputs + 1:

@@ -1,4 +1,6 @@
-"""Records of checkpoints, read without torch: runs, rig and held-out figures of weights and of uncertainty networks."""
+"""Records of checkpoints, read without torch: runs, rig and held-out figures of weights and of
+uncertainty networks.
+"""
 
 import hashlib
 from collections.abc import Iterable, Sequence
@@ -14,15 +16,20 @@ from nlos_models.recipe import SIMULATION_ONLY, MapKind, Recipe
 
 RECORD = "checkpoint.json"
 DIRECT, PAPER = SHIPPED = "direct", "paper"
-"""Names of the weights that come with the package, the default ones first; DIRECT.safetensors is a direct network."""
+"""Names of the weights that come with the package, the default ones first; DIRECT.safetensors is a
+direct network.
+"""
 ENCODER = "encoder.safetensors"
 """File that only training reads: the shipped weights come without it."""
-DOUBT, DOUBT_RECORD = "doubt", "doubt.json"
+DOUBT = "doubt"
+DOUBT_RECORD = "doubt.json"
 WATCHED = "compressor.safetensors", "preprocess.safetensors", "decoder.safetensors"
 
 
 class CheckpointRecord(BaseModel):
-    """Origin of a checkpoint's tensors: rig, kind of maps, recipes of the runs, and held-out figures."""
+    """Origin of a checkpoint's tensors: rig, kind of maps, recipes of the runs, and held-out
+    figures.
+    """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -54,15 +61,19 @@ class CheckpointRecord(BaseModel):
 
     @classmethod
     def of(cls, runs: Iterable[Recipe], rig: tuple[str, str], maps: MapKind = "raw maps") -> Self:
-        """Return the record of the weights that these runs made, the oldest first; `rig` is its (name, checksum)."""
-        last, earlier = dict[str, Recipe](), list[Recipe]()
+        """Return the record of the weights that these runs made, the oldest first; `rig` is its
+        (name, checksum).
+        """
+        last = dict[str, Recipe]()
+        earlier = list[Recipe]()
         for recipe in runs:
             replaced = ("compressor", "transfer") if recipe.task == "compressor" else (recipe.task,)
             earlier += [last.pop(task) for task in replaced if task in last]
             last[recipe.task] = recipe
         recipes = {f"{task}_recipe": recipe for task, recipe in last.items()}
         return cls.model_validate(
-            {"rig_name": rig[0], "rig_checksum": rig[1], "input": maps, "earlier": earlier} | recipes
+            {"rig_name": rig[0], "rig_checksum": rig[1], "input": maps, "earlier": earlier}
+            | recipes
         )
 
     @property
@@ -74,7 +85,11 @@ class CheckpointRecord(BaseModel):
     @property
     def vae_runs(self) -> list[Recipe]:
         """Recipes of the runs that trained the encoder or decoder."""
-        return [recipe for recipe in self.runs if recipe.task == "vae" or recipe.steps == "two-then-joint"]
+        return [
+            recipe
+            for recipe in self.runs
+            if recipe.task == "vae" or recipe.steps == "two-then-joint"
+        ]
 
     @property
     def width(self) -> float:
@@ -97,29 +112,41 @@ def shipped_folder(name: str = DIRECT) -> Path:
 
 
 def weights_folder(weights: Path | None, default: str = DIRECT) -> Path:
-    """Return the folder of weights: the package's for None, and for a name in SHIPPED unless a folder has that name."""
+    """Return the folder of weights: the package's for None, and for a name in SHIPPED unless a
+    folder has that name.
+    """
     if weights is None:
         return shipped_folder(default)
-    return shipped_folder(str(weights)) if str(weights) in SHIPPED and not weights.exists() else weights
+    return (
+        shipped_folder(str(weights))
+        if str(weights) in SHIPPED and not weights.exists()
+        else weights
+    )
 
 
 def load_record(folder: Path) -> CheckpointRecord:
-    """Return the record of a checkpoint folder. Raises CheckpointError where it is missing or not a record."""
+    """Return the record of a checkpoint folder. Raises CheckpointError where it is missing or not a
+    record.
+    """
     try:
         return CheckpointRecord.model_validate_json(read_checked(folder / RECORD, TEXT_LIMIT))
     except OSError as error:
         if folder == shipped_folder(PAPER):
             raise CheckpointError(
-                "the paper's weights (27 MB) are in the repository, not in the installed package: install from a "
-                "clone, or name a folder of weights"
+                "the paper's weights (27 MB) are in the repository, not in the installed package:"
+                " install from a clone, or name a folder of weights"
             ) from error
         raise CheckpointError(
             f"no checkpoint in {folder} ({RECORD} cannot be read): name a folder of weights"
         ) from error
     except ValidationError as error:
-        raise CheckpointError(f"{folder / RECORD} is not a checkpoint's record: {first_problem(error)}") from error
+        raise CheckpointError(
+            f"{folder / RECORD} is not a checkpoint's record: {first_problem(error)}"
+        ) from error
     except ValueError as error:
-        raise CheckpointError(f"{folder / RECORD} is {error}: copy or train the weights again") from error
+        raise CheckpointError(
+            f"{folder / RECORD} is {error}: copy or train the weights again"
+        ) from error
 
 
 class DoubtRecord(BaseModel):
@@ -139,19 +166,25 @@ class DoubtRecord(BaseModel):
     nothing_above: float = Field(default=0.5, ge=0, le=1)
     """Lowest probability of the verdict that nothing is hidden."""
     outside_above: float = Field(default=0.5, ge=0, le=1)
-    """Lowest probability of the verdict that a frame is out of distribution (outside the trained range)."""
+    """Lowest probability of the verdict that a frame is out of distribution (outside the trained
+    range).
+    """
     figures: dict[str, float] = {}
     """Held-out figures at the end of training and of the calibration."""
 
 
 def watched_files(folder: Path) -> tuple[str, ...]:
-    """Return the names of the files with the weights that make images: of a direct network, or of a pipeline."""
+    """Return the names of the files with the weights that make images: of a direct network, or of a
+    pipeline.
+    """
     direct = f"{DIRECT}.safetensors"
     return (direct,) if (folder / direct).exists() else WATCHED
 
 
 def checksum_of_watched(folder: Path, names: Sequence[str] = ()) -> str:
-    """Return a checksum, 12 hexadecimal digits, of files: by default `watched_files`. Raises CheckpointError."""
+    """Return a checksum, 12 hexadecimal digits, of files: by default `watched_files`. Raises
+    CheckpointError.
+    """
     digest = hashlib.sha256()
     for name in names or watched_files(folder):
         try:
@@ -164,7 +197,8 @@ def checksum_of_watched(folder: Path, names: Sequence[str] = ()) -> str:
 
 
 def load_doubt_record(folder: Path) -> DoubtRecord | None:
-    """Return the record of the uncertainty network beside a pipeline's weights, or None where there is none.
+    """Return the record of the uncertainty network beside a pipeline's weights, or None where there
+    is none.
 
     Raises CheckpointError where it cannot be read or watches other weights.
     """
@@ -174,14 +208,18 @@ def load_doubt_record(folder: Path) -> DoubtRecord | None:
     try:
         record = DoubtRecord.model_validate_json(read_checked(path, TEXT_LIMIT))
     except OSError as error:
-        raise CheckpointError(f"{path} cannot be read: train it again with `train doubt`") from error
+        raise CheckpointError(
+            f"{path} cannot be read: train it again with `train doubt`"
+        ) from error
     except ValidationError as error:
-        raise CheckpointError(f"{path} is not an uncertainty network's record: {first_problem(error)}") from error
+        raise CheckpointError(
+            f"{path} is not an uncertainty network's record: {first_problem(error)}"
+        ) from error
     except ValueError as error:
         raise CheckpointError(f"{path} is {error}: train it again with `train doubt`") from error
     if record.watches != (found := checksum_of_watched(folder)):
         raise CheckpointError(
-            f"{path} watches other weights ({record.watches}) than those beside it ({found}): train it again with "
-            "`train doubt`, or remove it"
+            f"{path} watches other weights ({record.watches}) than those beside it ({found}): train"
+            " it again with `train doubt`, or remove it"
         )
     return record

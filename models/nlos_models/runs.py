@@ -1,4 +1,6 @@
-"""Training runs: starting weights, output folder and record, and one function per task that trains and saves."""
+"""Training runs: starting weights, output folder and record, and one function per task that trains
+and saves.
+"""
 
 from collections.abc import Callable, Generator
 from contextlib import AbstractContextManager, ExitStack, contextmanager
@@ -44,7 +46,9 @@ def unwatched(running: Running, recipe: Recipe, name: str) -> Generator[Running]
 
 
 Watch = Callable[[Running, Recipe, str], AbstractContextManager[Running]]
-"""Adds progress and interruption to a run, given its name; called in each process, so it has to be picklable."""
+"""Adds progress and interruption to a run, given its name; called in each process, so it has to be
+picklable.
+"""
 
 
 @dataclass(frozen=True)
@@ -63,8 +67,12 @@ class TrainingRun:
 
     @contextmanager
     def watched(self, fabric: Fabric, name: str) -> Generator[Running]:
-        """Open progress and interruption for a run of this name. Raises FileBusyError where another run has `out`."""
-        running = Running(fabric, tensorboard=self.tensorboard, compiled=self.compiled, origin=self.origin)
+        """Open progress and interruption for a run of this name. Raises FileBusyError where another
+        run has `out`.
+        """
+        running = Running(
+            fabric, tensorboard=self.tensorboard, compiled=self.compiled, origin=self.origin
+        )
         with ExitStack() as held:
             if fabric.is_global_zero:
                 self.out.mkdir(parents=True, exist_ok=True)
@@ -79,23 +87,29 @@ class TrainingRun:
 def record_run(
     recipe: Recipe, out: Path, rig: tuple[str, str], before: list[Recipe], *starts: Path | None
 ) -> CheckpointRecord:
-    """Return the record of the weights that a recipe makes after the runs `before`; `rig` is its (name, checksum).
+    """Return the record of the weights that a recipe makes after the runs `before`; `rig` is its
+    (name, checksum).
 
-    Raises OutputExistsError where the run would write over a file, over a folder that it starts from, or over other
-    weights.
+    Raises OutputExistsError where the run would write over a file, over a folder that it starts
+    from, or over other weights.
     """
     record = CheckpointRecord.of([*before, recipe], rig, recipe.maps)
     if out.exists() and not out.is_dir():
-        raise OutputExistsError(f"{out} is a file, but --out must be a directory: choose another --out")
+        raise OutputExistsError(
+            f"{out} is a file, but --out must be a directory: choose another --out"
+        )
     if out.resolve() in {start.resolve() for start in starts if start}:
-        raise OutputExistsError(f"{out} holds the weights that this run starts from: choose another --out")
+        raise OutputExistsError(
+            f"{out} holds the weights that this run starts from: choose another --out"
+        )
     if (out / RECORD).exists() and load_record(out).model_copy(update={"figures": {}}) != record:
         raise OutputExistsError(f"{out} holds weights from another run: choose another --out")
     return record
 
 
 def record_doubt_run(recipe: Recipe, out: Path, watched: Path, kinds: list[str]) -> DoubtRecord:
-    """Return the record of an uncertainty network that watches the weights in a folder and learns kinds of outliers.
+    """Return the record of an uncertainty network that watches the weights in a folder and learns
+    kinds of outliers.
 
     Raises OutputExistsError where `out` is that folder or holds an uncertainty network.
     """
@@ -104,7 +118,9 @@ def record_doubt_run(recipe: Recipe, out: Path, watched: Path, kinds: list[str])
     return DoubtRecord(watches=checksum_of_watched(watched), recipe=recipe, learnt=kinds)
 
 
-def run_vae(fabric: Fabric, training: TrainingRun, start: ResVae | None, images: Float16, held_out: Float16) -> Scores:
+def run_vae(
+    fabric: Fabric, training: TrainingRun, start: ResVae | None, images: Float16, held_out: Float16
+) -> Scores:
     """Train a VAE and save it; return its held-out figures."""
     with training.watched(fabric, "VAE") as running:
         vae, figures = train_vae(training.recipe, images, held_out, training.out, running, start)
@@ -113,7 +129,9 @@ def run_vae(fabric: Fabric, training: TrainingRun, start: ResVae | None, images:
     return figures
 
 
-def run_compressor(fabric: Fabric, training: TrainingRun, start: Start, maps: MapSource, held_out: MapSet) -> Scores:
+def run_compressor(
+    fabric: Fabric, training: TrainingRun, start: Start, maps: MapSource, held_out: MapSet
+) -> Scores:
     """Train a compressor and save it with its decoder; return its held-out figures."""
     recipe = training.recipe
     with training.watched(fabric, "compressor") as running:
@@ -126,11 +144,17 @@ def run_compressor(fabric: Fabric, training: TrainingRun, start: Start, maps: Ma
 
 
 def run_direct(
-    fabric: Fabric, training: TrainingRun, start: DirectNetwork | None, source: NormalSource, held_out: MapSet
+    fabric: Fabric,
+    training: TrainingRun,
+    start: DirectNetwork | None,
+    source: NormalSource,
+    held_out: MapSet,
 ) -> Scores:
     """Train a direct network and save it; return its held-out figures."""
     with training.watched(fabric, "direct network") as running:
-        network, figures = train_direct(training.recipe, source, held_out, training.out, running, start)
+        network, figures = train_direct(
+            training.recipe, source, held_out, training.out, running, start
+        )
     checkpoint.save_direct(training.out, network, training.with_figures(figures))
     _export(training)
     return figures
@@ -144,13 +168,19 @@ def run_transfer(
     maps: MapSource,
     held_out: MapSet,
 ) -> dict[str, Scores]:
-    """Fine-tune weights on recordings and save them; return their held-out figures before and after."""
+    """Fine-tune weights on recordings and save them; return their held-out figures before and
+    after.
+    """
     before = figures_of(run(network.to(fabric.device).eval(), held_out), held_out.image)
     with training.watched(fabric, "transfer") as running:
         if isinstance(network, DirectNetwork):
-            network, after = transfer_direct(training.recipe, network, maps, held_out, training.out, running)
+            network, after = transfer_direct(
+                training.recipe, network, maps, held_out, training.out, running
+            )
         else:
-            network, after = train_transfer(training.recipe, network, encoder, maps, held_out, training.out, running)
+            network, after = train_transfer(
+                training.recipe, network, encoder, maps, held_out, training.out, running
+            )
     if fabric.is_global_zero:
         if isinstance(network, DirectNetwork):
             checkpoint.save_direct(training.out, network, training.with_figures(after))
@@ -161,9 +191,16 @@ def run_transfer(
 
 
 def run_doubt(
-    fabric: Fabric, training: TrainingRun, about: DoubtRecord, watched: Path, samples: DoubtSet, held_out: DoubtSet
+    fabric: Fabric,
+    training: TrainingRun,
+    about: DoubtRecord,
+    watched: Path,
+    samples: DoubtSet,
+    held_out: DoubtSet,
 ) -> Scores:
-    """Train, calibrate and save an uncertainty network beside the weights it watches; return its held-out figures."""
+    """Train, calibrate and save an uncertainty network beside the weights it watches; return its
+    held-out figures.
+    """
     with training.watched(fabric, "uncertainty network") as running:
         network, figures = train_doubt(training.recipe, samples, held_out, training.out, running)
     fitted = calibrate(network, held_out)
@@ -175,7 +212,9 @@ def run_doubt(
 
 
 def _export(training: TrainingRun) -> None:
-    """Write the graphs for inference without torch beside new weights; those of color stay in torch."""
+    """Write the graphs for inference without torch beside new weights; those of color stay in
+    torch.
+    """
     if not training.record.color:
         export_folder(training.out)
 
@@ -186,15 +225,20 @@ def vae_start(recipe: Recipe, weights: Path | None) -> tuple[ResVae, list[Recipe
     folder = weights_folder(weights, PAPER)
     if recipe.start == "decoder":
         torch.manual_seed(recipe.seed)
-        vae, (pipeline, record) = new_vae(color=recipe.colour), checkpoint.load_pipeline(folder)
+        vae = new_vae(color=recipe.colour)
+        pipeline, record = checkpoint.load_pipeline(folder)
         vae.decoder = pipeline.decoder
     else:
         vae, record = checkpoint.load_vae(folder)
     return vae, record.vae_runs
 
 
-def compressor_start(recipe: Recipe, vae_folder: Path | None, weights: Path | None) -> tuple[Start, list[Recipe]]:
-    """Load the networks that the recipe's steps start from and the runs that made them; none for steps = "one"."""
+def compressor_start(
+    recipe: Recipe, vae_folder: Path | None, weights: Path | None
+) -> tuple[Start, list[Recipe]]:
+    """Load the networks that the recipe's steps start from and the runs that made them; none for
+    steps = "one".
+    """
     if recipe.steps == "one":
         return Start(), []
     if recipe.steps == "two":
@@ -207,16 +251,19 @@ def compressor_start(recipe: Recipe, vae_folder: Path | None, weights: Path | No
     if not (encoder := checkpoint.load_encoder(weights)):
         if recipe.latent_weight:
             raise TrainingError(
-                f"{weights_folder(weights, PAPER)} has no encoder to aim at: set latent_weight = 0 in the recipe"
+                f"{weights_folder(weights, PAPER)} has no encoder to aim at: set latent_weight = 0"
+                " in the recipe"
             )
         return Start(None, pipeline), runs
     vae = new_vae(color=recipe.colour)
-    vae.encoder, vae.decoder = encoder, pipeline.decoder
+    vae.encoder = encoder
+    vae.decoder = pipeline.decoder
     return Start(vae, pipeline), runs
 
 
 def direct_start(recipe: Recipe, weights: Path | None) -> tuple[DirectNetwork | None, list[Recipe]]:
-    """Load the direct network that a recipe goes on from (default: the shipped one) and the runs that made it.
+    """Load the direct network that a recipe goes on from (default: the shipped one) and the runs
+    that made it.
 
     Raises TrainingError for weights of another network, or one that the recipe's cannot hold.
     """
@@ -227,10 +274,13 @@ def direct_start(recipe: Recipe, weights: Path | None) -> tuple[DirectNetwork | 
     if not isinstance(network, DirectNetwork):
         raise TrainingError(f"{folder} does not hold a direct network: choose other --weights")
     _check_same_color(recipe, folder)
-    size, wanted = network.size, recipe.direct
+    size = network.size
+    wanted = recipe.direct
     grown = size.model_copy(update={"blocks": wanted.blocks, "mixers": wanted.mixers})
     if grown != wanted or wanted.blocks < size.blocks or wanted.mixers < size.mixers:
-        raise TrainingError(f"{folder} holds a network that is not a part of the recipe's: {size} against {wanted}")
+        raise TrainingError(
+            f"{folder} holds a network that is not a part of the recipe's: {size} against {wanted}"
+        )
     return network, record.runs
 
 
@@ -239,9 +289,9 @@ def transfer_start(
 ) -> tuple[RemappingNetwork | DirectNetwork, CheckpointRecord]:
     """Load the networks that a transfer starts from and their record.
 
-    By default they are the paper's where the recipe aims at a latent, else the direct ones. If `partial`, only matching
-    layers of the compressor are loaded, `on_report` is called with a summary of them, and the others are initialised
-    from the recipe's seed.
+    By default they are the paper's where the recipe aims at a latent, else the direct ones. If
+    `partial`, only matching layers of the compressor are loaded, `on_report` is called with a
+    summary of them, and the others are initialised from the recipe's seed.
     """
     folder = weights_folder(weights, PAPER if recipe.latent_weight else DIRECT)
     _check_fits(recipe, folder)
@@ -260,8 +310,11 @@ def _pipeline_start(recipe: Recipe, weights: Path | None) -> tuple[RemappingNetw
 
 
 def _check_fits(recipe: Recipe, folder: Path | None) -> None:
-    """Raise TrainingError unless weights and recipe agree in color, maps, latent and the compressor's width."""
-    record, wrong = _check_same_color(recipe, folder), ""
+    """Raise TrainingError unless weights and recipe agree in color, maps, latent and the
+    compressor's width.
+    """
+    record = _check_same_color(recipe, folder)
+    wrong = ""
     if record.input != recipe.maps:
         wrong = f"weights expect {record.input} but the recipe uses {recipe.maps}"
     elif recipe.task == "transfer" and recipe.latent_weight and record.direct_recipe:
@@ -273,12 +326,17 @@ def _check_fits(recipe: Recipe, folder: Path | None) -> None:
 
 
 def _check_same_color(recipe: Recipe, folder: Path | None) -> CheckpointRecord:
-    """Return the weights' record; raise TrainingError unless weights and recipe are both of depth or both in color."""
+    """Return the weights' record; raise TrainingError unless weights and recipe are both of depth
+    or both in color.
+    """
     record = load_record(weights_folder(folder, PAPER))
     if record.color != recipe.colour:
-        holds, wants = (f"color ({SIMULATION_ONLY})" if color else "depth" for color in (record.color, recipe.colour))
+        holds, wants = (
+            f"color ({SIMULATION_ONLY})" if color else "depth"
+            for color in (record.color, recipe.colour)
+        )
         raise TrainingError(
-            f"{weights_folder(folder, PAPER)} holds weights for {holds} but the recipe is for {wants}: name others "
-            "with --vae or --weights"
+            f"{weights_folder(folder, PAPER)} holds weights for {holds} but the recipe is for"
+            f" {wants}: name others with --vae or --weights"
         )
     return record

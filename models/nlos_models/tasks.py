@@ -1,4 +1,6 @@
-"""Training tasks of the method: VAE on images, compressor onto the VAE's latent, and transfer to a bench (SI 3, 4)."""
+"""Training tasks of the method: VAE on images, compressor onto the VAE's latent, and transfer to a
+bench (SI 3, 4).
+"""
 
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
@@ -12,26 +14,51 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from nlos_models.arrays import Float16, Float32
-from nlos_models.data import STATISTICS_OBJECTS, MapBatch, MapSet, MapSource, as_images, image_batches
+from nlos_models.data import (
+    STATISTICS_OBJECTS,
+    MapBatch,
+    MapSet,
+    MapSource,
+    as_images,
+    image_batches,
+)
 from nlos_models.errors import TrainingError
 from nlos_models.metrics import color_error, color_silhouette_iou, silhouette_iou
-from nlos_models.pipeline import RemappingNetwork, cut_silhouette, new_pipeline, new_vae, split_and_stack
+from nlos_models.pipeline import (
+    RemappingNetwork,
+    cut_silhouette,
+    new_pipeline,
+    new_vae,
+    split_and_stack,
+)
 from nlos_models.recipe import Recipe
 from nlos_models.train import Running, Scores, fit
-from nlos_models.vae import Encoder, ResVae, image_error, kl_divergence, latent_error, variational_share
+from nlos_models.vae import (
+    Encoder,
+    ResVae,
+    image_error,
+    kl_divergence,
+    latent_error,
+    variational_share,
+)
 
 SCORING_BATCH = 100
-ALL_LAYERS, CLASSIFIER = "all-layers", "classifier"
+ALL_LAYERS = "all-layers"
+CLASSIFIER = "classifier"
 """Folders of a transfer's two phases."""
 CHANNELS = {"own": slice(None), "own intensity": slice(2, None)}
-"""Channels that take the recordings' statistics: depth is in metres on every bench, intensity in a device's counts."""
+"""Channels that take the recordings' statistics: depth is in metres on every bench, intensity in a
+device's counts.
+"""
 
 Module = TypeVar("Module", bound=nn.Module)
 
 
 @dataclass(frozen=True)
 class Remapping:
-    """A pipeline with the maps that it is trained on, by the latents of a frozen encoder, by images, or by both."""
+    """A pipeline with the maps that it is trained on, by the latents of a frozen encoder, by
+    images, or by both.
+    """
 
     pipeline: RemappingNetwork
     encoder: Encoder | None
@@ -45,18 +72,23 @@ class Remapping:
         stacked = split_and_stack(torch.from_numpy(maps.depth_m), torch.from_numpy(maps.intensity))
         self.pipeline.preprocess.learn(stacked, channels)
 
-    def fit(self, recipe: Recipe, frozen: Iterable[nn.Module], folder: Path, running: Running) -> Scores:
+    def fit(
+        self, recipe: Recipe, frozen: Iterable[nn.Module], folder: Path, running: Running
+    ) -> Scores:
         """Train all of the pipeline except its frozen parts; a second call resumes.
 
-        Frozen parts keep their weights and run in eval mode, so that their batch norms keep their statistics too.
+        Frozen parts keep their weights and run in eval mode, so that their batch norms keep their
+        statistics too.
         """
-        still, fabric = list(frozen), running.fabric_for(recipe)
+        still = list(frozen)
+        fabric = running.fabric_for(recipe)
         self.pipeline.requires_grad_(requires_grad=True)
         for part in still:
             part.requires_grad_(requires_grad=False)
         pipeline = in_channels_last(self.pipeline).to(fabric.device)
         targets = self._targets(recipe, fabric)
-        encode, decode = running.maybe_compile(pipeline.latent), running.maybe_compile(pipeline.decoder)
+        encode = running.maybe_compile(pipeline.latent)
+        decode = running.maybe_compile(pipeline.decoder)
 
         def loss(batch: MapBatch, _: float) -> Tensor:
             for part in still:
@@ -68,7 +100,9 @@ class Remapping:
                 target = torch.where(batch.mirrored[:, None, None], mirrored, straight)
                 value = value + recipe.latent_weight * latent_error(latent, *target.unbind(1))
             if recipe.image_weight:
-                error = image_error(decode(latent), batch.image, recipe.surface_weight, recipe.image_loss)
+                error = image_error(
+                    decode(latent), batch.image, recipe.surface_weight, recipe.image_loss
+                )
                 value = value + recipe.image_weight * error
             return value
 
@@ -84,23 +118,34 @@ class Remapping:
         )
 
     def _targets(self, recipe: Recipe, fabric: Fabric) -> list[Tensor]:
-        """Return the latents (n, 2, latent) of the images and of their mirror images; none without a latent loss."""
+        """Return the latents (n, 2, latent) of the images and of their mirror images; none without
+        a latent loss.
+        """
         if not recipe.latent_weight:
             return []
         if self.encoder is None:
             raise TrainingError(
-                "these weights have no encoder to aim at: set latent_weight = 0, or name a VAE (--vae); that of the "
-                "paper's weights is made again by `nlos-cam train vae --recipe vae-encoder --out DIR`"
+                "these weights have no encoder to aim at: set latent_weight = 0, or name a VAE"
+                " (--vae); that of the paper's weights is made again by `nlos-cam train vae"
+                " --recipe vae-encoder --out DIR`"
             )
-        encoder = in_channels_last(self.encoder).to(fabric.device).requires_grad_(requires_grad=False).eval()
+        encoder = (
+            in_channels_last(self.encoder)
+            .to(fabric.device)
+            .requires_grad_(requires_grad=False)
+            .eval()
+        )
         with fabric.autocast():
             return [
-                latents_of(encoder, images).float() for images in (self.source.image, self.source.image[..., ::-1, :])
+                latents_of(encoder, images).float()
+                for images in (self.source.image, self.source.image[..., ::-1, :])
             ]
 
 
 def in_channels_last(module: Module) -> Module:
-    """Return the module with its convolutions' weights in the layout that CPUs and GPUs run fastest."""
+    """Return the module with its convolutions' weights in the layout that CPUs and GPUs run
+    fastest.
+    """
     return module.to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue] (torch's stub omits it)
 
 
@@ -114,7 +159,9 @@ def set_for_training(pipeline: RemappingNetwork, recipe: Recipe) -> None:
 
 @torch.inference_mode()
 def run(pipeline: nn.Module, maps: MapSet) -> Float32:
-    """Return the images (n, 64, 64), in color (n, 3, 64, 64), that a pipeline in eval mode reconstructs from maps."""
+    """Return the images (n, 64, 64), in color (n, 3, 64, 64), that a pipeline in eval mode
+    reconstructs from maps.
+    """
     device = next(pipeline.parameters()).device
     pairs = zip(parts_of(maps.depth_m), parts_of(maps.intensity), strict=True)
     parts = (pipeline(*(torch.from_numpy(part).to(device) for part in pair)) for pair in pairs)
@@ -123,7 +170,9 @@ def run(pipeline: nn.Module, maps: MapSet) -> Float32:
 
 @torch.no_grad()
 def latents_of(encoder: Encoder, images: Float16 | Float32) -> Tensor:
-    """Return mean and log-variance (n, 2, latent) of images (n, 64, 64) or (n, 3, 64, 64), on the encoder's device."""
+    """Return mean and log-variance (n, 2, latent) of images (n, 64, 64) or (n, 3, 64, 64), on the
+    encoder's device.
+    """
     device = next(encoder.parameters()).device
     parts = (as_images(part).to(device) for part in parts_of(images))
     return torch.cat([torch.stack(encoder(part), dim=1) for part in parts])
@@ -135,17 +184,25 @@ def parts_of(arrays: NDArray[Any]) -> list[NDArray[Any]]:
 
 
 def figures_of(image: Float32, truth: Float16 | Float32) -> Scores:
-    """Return the squared error, summed over pixels, and silhouette IoU, averaged over images (n, 64, 64).
+    """Return the squared error, summed over pixels, and silhouette IoU, averaged over images (n,
+    64, 64).
 
-    For color images (n, 3, 64, 64) also the color error: 1 if no object shares a pixel with its ground truth.
+    For color images (n, 3, 64, 64) also the color error: 1 if no object shares a pixel with its
+    ground truth.
     """
     truth = truth.astype(np.float32)
     error = float(np.square(image - truth).sum(tuple(range(1, truth.ndim))).mean())
     if truth.ndim == 3:
-        return {"held_out_loss": error, "held_out_iou": float(np.mean(silhouette_iou(image, truth)))}
+        return {
+            "held_out_loss": error,
+            "held_out_iou": float(np.mean(silhouette_iou(image, truth))),
+        }
     color = color_error(image, truth)
     shared = color[~np.isnan(color)]
-    figures = {"held_out_loss": error, "held_out_iou": float(np.mean(color_silhouette_iou(image, truth)))}
+    figures = {
+        "held_out_loss": error,
+        "held_out_iou": float(np.mean(color_silhouette_iou(image, truth))),
+    }
     return {**figures, "held_out_colour_error": float(shared.mean()) if shared.size else 1.0}
 
 
@@ -157,18 +214,22 @@ def train_vae(
     running: Running | None = None,
     start: ResVae | None = None,
 ) -> tuple[ResVae, Scores]:
-    """Train a Res-VAE (SI 3), from `start` if given, on images (n, 64, 64) or (n, 3, 64, 64) in [0, 1].
+    """Train a Res-VAE (SI 3), from `start` if given, on images (n, 64, 64) or (n, 3, 64, 64) in [0,
+    1].
 
     A second call resumes. Returns the network in eval mode and its held-out figures.
     """
     torch.manual_seed(recipe.seed)
     running = running or Running()
     vae = in_channels_last(start or new_vae(color=recipe.colour))
-    forward, kept = running.maybe_compile(vae), recipe.start == "decoder"
+    forward = running.maybe_compile(vae)
+    kept = recipe.start == "decoder"
     vae.decoder.requires_grad_(not kept)
 
     def loss(image: Tensor, done: float) -> Tensor:
-        vae.decoder.train(not kept)  # a decoder that is kept keeps the statistics of its batch norms too
+        vae.decoder.train(
+            not kept
+        )  # a decoder that is kept keeps the statistics of its batch norms too
         if recipe.augmentation == "turns":
             image = turn_some(image, torch.randint(4, (len(image),), device=image.device))
         image = image.contiguous(memory_format=torch.channels_last)
@@ -198,16 +259,24 @@ class Start:
     vae: ResVae | None = None
     """Source of the target latents and of the decoder; None for steps = "one"."""
     pipeline: RemappingNetwork | None = None
-    """Two-step weights, for steps = "two-then-joint" (its decoder is the VAE's) or start = "weights"."""
+    """Two-step weights, for steps = "two-then-joint" (its decoder is the VAE's) or start =
+    "weights".
+    """
 
 
 def train_compressor(
-    recipe: Recipe, start: Start, maps: MapSource, held_out: MapSet, folder: Path, running: Running | None = None
+    recipe: Recipe,
+    start: Start,
+    maps: MapSource,
+    held_out: MapSet,
+    folder: Path,
+    running: Running | None = None,
 ) -> tuple[RemappingNetwork, Scores]:
-    """Train a compressor by the recipe's `steps` (SI 4: onto the latent of a frozen VAE); a second call resumes.
+    """Train a compressor by the recipe's `steps` (SI 4: onto the latent of a frozen VAE); a second
+    call resumes.
 
-    Returns the pipeline in eval mode and its held-out figures. Raises TrainingError where these steps need a network
-    that `start` does not hold.
+    Returns the pipeline in eval mode and its held-out figures. Raises TrainingError where these
+    steps need a network that `start` does not hold.
     """
     torch.manual_seed(recipe.seed)
     pipeline = _starting_pipeline(recipe, start)
@@ -222,33 +291,46 @@ def train_compressor(
 def _starting_pipeline(recipe: Recipe, start: Start) -> RemappingNetwork:
     if recipe.steps == "one":
         return new_pipeline(
-            color=recipe.colour, dropout=recipe.dropout, left_noise=recipe.left_noise, width=recipe.width
+            color=recipe.colour,
+            dropout=recipe.dropout,
+            left_noise=recipe.left_noise,
+            width=recipe.width,
         )
     if recipe.steps == "two-then-joint":
         if start.pipeline is None:
-            raise TrainingError("steps = 'two-then-joint' starts from two-step weights: name them (--weights)")
+            raise TrainingError(
+                "steps = 'two-then-joint' starts from two-step weights: name them (--weights)"
+            )
         pipeline = start.pipeline
     else:
         if start.vae is None:
             raise TrainingError("steps = 'two' needs a trained VAE: name one (--vae)")
-        pipeline = start.pipeline or new_pipeline(start.vae.decoder, color=recipe.colour, width=recipe.width)
+        pipeline = start.pipeline or new_pipeline(
+            start.vae.decoder, color=recipe.colour, width=recipe.width
+        )
         pipeline.decoder = start.vae.decoder
     set_for_training(pipeline, recipe)
     return pipeline
 
 
 def turn_some(images: Tensor, quarters: Tensor) -> Tensor:
-    """Rotate images (n, channels, 64, 64) by quarter turns (n,); with the mirror, these are SI 3's turns and flips."""
+    """Rotate images (n, channels, 64, 64) by quarter turns (n,); with the mirror, these are SI 3's
+    turns and flips.
+    """
     turned = torch.stack([images.rot90(k, (-2, -1)) for k in range(4)])
     return turned[quarters, torch.arange(len(images), device=images.device)]
 
 
 @torch.inference_mode()
 def rebuild(vae: ResVae, images: Float16 | Float32) -> Float32:
-    """Return images (n, 64, 64) or (n, 3, 64, 64) encoded and decoded by a VAE, with the pipeline's silhouette cut."""
+    """Return images (n, 64, 64) or (n, 3, 64, 64) encoded and decoded by a VAE, with the pipeline's
+    silhouette cut.
+    """
     device = next(vae.parameters()).device
     means = (vae.encoder(as_images(part).to(device))[0] for part in parts_of(images))
-    decoded = np.concatenate([cut_silhouette(vae.decoder(mean)).float().cpu().numpy() for mean in means])
+    decoded = np.concatenate(
+        [cut_silhouette(vae.decoder(mean)).float().cpu().numpy() for mean in means]
+    )
     return decoded.reshape(images.shape)
 
 
@@ -261,11 +343,12 @@ def train_transfer(
     folder: Path,
     running: Running | None = None,
 ) -> tuple[RemappingNetwork, Scores]:
-    """Fine-tune a pipeline in place on recordings' maps (SI 4); the decoder stays as it is. A second call resumes.
+    """Fine-tune a pipeline in place on recordings' maps (SI 4); the decoder stays as it is. A
+    second call resumes.
 
-    The first phase trains all layers of the compressor, and batch norms take the recordings' statistics; the second
-    freezes these with the features and trains the classifier alone. Returns the pipeline in eval mode and its held-out
-    figures.
+    The first phase trains all layers of the compressor, and batch norms take the recordings'
+    statistics; the second freezes these with the features and trains the classifier alone. Returns
+    the pipeline in eval mode and its held-out figures.
     """
     torch.manual_seed(recipe.seed)
     set_for_training(pipeline, recipe)
@@ -273,7 +356,9 @@ def train_transfer(
     if recipe.statistics != "kept":
         remapping.learn_statistics(CHANNELS[recipe.statistics])
 
-    def fit_phase(phase: Recipe, phase_folder: Path, running: Running, *, last_layers: bool) -> Scores:
+    def fit_phase(
+        phase: Recipe, phase_folder: Path, running: Running, *, last_layers: bool
+    ) -> Scores:
         features = [pipeline.compressor.get_submodule("features")] if last_layers else []
         return remapping.fit(phase, [pipeline.decoder, *features], phase_folder, running)
 
@@ -284,11 +369,17 @@ def train_transfer(
 class FitPhase(Protocol):
     """Training of one phase of a transfer: of all layers, or of the last ones alone."""
 
-    def __call__(self, phase: Recipe, phase_folder: Path, running: Running, *, last_layers: bool) -> Scores: ...
+    def __call__(
+        self, phase: Recipe, phase_folder: Path, running: Running, *, last_layers: bool
+    ) -> Scores: ...
 
 
-def in_two_phases(recipe: Recipe, samples: int, folder: Path, running: Running, fit_phase: FitPhase) -> Scores:
-    """Train all layers for `all_layers_epochs`, then the last ones (SI 4); return the last phase's figures."""
+def in_two_phases(
+    recipe: Recipe, samples: int, folder: Path, running: Running, fit_phase: FitPhase
+) -> Scores:
+    """Train all layers for `all_layers_epochs`, then the last ones (SI 4); return the last phase's
+    figures.
+    """
     steps = samples // recipe.batch
     before = recipe.all_layers_epochs * steps
     total = before + recipe.epochs * steps

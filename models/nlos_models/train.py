@@ -1,9 +1,11 @@
-"""Training loop with exact resume, on one or several processes, and the files of a run: checkpoints and logs.
+"""Training loop with exact resume, on one or several processes, and the files of a run: checkpoints
+and logs.
 
-The order of the batches follows from the recipe's seed and the epoch; the noise of a step from these, the step and the
-process. So no state of a random generator is saved, and a run killed at any moment resumes to the same weights. Each
-process takes its share of every batch: several processes differ from one only in their noise, in the samples behind
-their batch norms, and in the order of sums.
+The order of the batches follows from the recipe's seed and the epoch; the noise of a step from
+these, the step and the process. So no state of a random generator is saved, and a run killed at any
+moment resumes to the same weights. Each process takes its share of every batch: several processes
+differ from one only in their noise, in the samples behind their batch norms, and in the order of
+sums.
 """
 
 import csv
@@ -28,7 +30,11 @@ from nlos_models.errors import CheckpointError, ModelError, RecipeError, Trainin
 from nlos_models.files import TENSOR_LIMIT, atomic_file, read_bounded
 from nlos_models.recipe import Recipe, has_ended, schedule_of
 
-LAST, PREVIOUS, BEST, LOG, MINUTES = "last.ckpt", "previous.ckpt", "best.ckpt", "log.csv", "minutes.log"
+LAST = "last.ckpt"
+PREVIOUS = "previous.ckpt"
+BEST = "best.ckpt"
+LOG = "log.csv"
+MINUTES = "minutes.log"
 MINUTE_S = 60.0
 """Interval between lines of MINUTES."""
 DIGEST = hashlib.sha256().digest_size
@@ -50,7 +56,9 @@ Network = TypeVar("Network", bound=Callable[..., Any])
 
 
 def write_last(folder: Path, state: State) -> None:
-    """Write the run's last state; the one before it becomes the previous state. Raises TrainingError."""
+    """Write the run's last state; the one before it becomes the previous state. Raises
+    TrainingError.
+    """
     _write(folder / LAST, _pack(state), folder / PREVIOUS)
 
 
@@ -69,7 +77,8 @@ def write_log(folder: Path, rows: list[Scores]) -> None:
 
 
 def read_last(folder: Path, on_message: OnMessage) -> State | None:
-    """Return the newest intact state, or None before the first; a damaged last state is reported and skipped.
+    """Return the newest intact state, or None before the first; a damaged last state is reported
+    and skipped.
 
     Raises CheckpointError where there are states and all of them are damaged.
     """
@@ -78,11 +87,15 @@ def read_last(folder: Path, on_message: OnMessage) -> State | None:
         if path.exists():
             if (state := _unpack(path)) is not None:
                 if damaged:
-                    on_message(f"{damaged[0]} is damaged: resuming from {path.name}, a few minutes earlier")
+                    on_message(
+                        f"{damaged[0]} is damaged: resuming from {path.name}, a few minutes earlier"
+                    )
                 return state
             damaged.append(path)
     if damaged:
-        raise CheckpointError(f"{' and '.join(map(str, damaged))} damaged: delete {folder}, or choose another --out")
+        raise CheckpointError(
+            f"{' and '.join(map(str, damaged))} damaged: delete {folder}, or choose another --out"
+        )
     return None
 
 
@@ -90,12 +103,16 @@ def read_best(folder: Path) -> State:
     """Return the best state. Raises CheckpointError where it is missing or damaged."""
     state = _unpack(folder / BEST) if (folder / BEST).exists() else None
     if state is None:
-        raise CheckpointError(f"{folder / BEST} is missing or damaged: train again into another --out")
+        raise CheckpointError(
+            f"{folder / BEST} is missing or damaged: train again into another --out"
+        )
     return state
 
 
 def digest_of(*parts: nn.Module | str | None) -> str:
-    """Return the SHA-256 of a run's starting point: every bit of its networks, and texts such as checksums of data."""
+    """Return the SHA-256 of a run's starting point: every bit of its networks, and texts such as
+    checksums of data.
+    """
     digest = hashlib.sha256()
     for part in parts:
         tensors = part.state_dict() if isinstance(part, nn.Module) else {str(part): torch.zeros(0)}
@@ -136,12 +153,14 @@ def _write(path: Path, content: bytes, previous: Path | None = None) -> None:
     except OSError as error:
         reason = error.strerror or error
         raise TrainingError(
-            f"{path} cannot be written ({reason}): free some space and repeat the command, which resumes the run"
+            f"{path} cannot be written ({reason}): free some space and repeat the command, which"
+            " resumes the run"
         ) from error
 
 
 class TensorBoardLog:
-    """TensorBoard event file of one start of a run; hides rows that an earlier start logged from `epoch` on.
+    """TensorBoard event file of one start of a run; hides rows that an earlier start logged from
+    `epoch` on.
 
     Starts a writer thread; `fit` closes it. Raises TrainingError without the package tensorboard.
     """
@@ -151,7 +170,8 @@ class TensorBoardLog:
             from torch.utils.tensorboard.writer import SummaryWriter
         except ImportError as error:
             raise TrainingError(
-                "TensorBoard logs need the package tensorboard: pip install 'nlos-cam[train]', or drop --tensorboard"
+                "TensorBoard logs need the package tensorboard: pip install 'nlos-cam[train]', or"
+                " drop --tensorboard"
             ) from error
         self._writer: Any = SummaryWriter(str(folder / "tensorboard"), purge_step=epoch)
 
@@ -168,7 +188,8 @@ class TensorBoardLog:
 
 
 def compile_network(network: Network) -> Network:
-    """Wrap a network, or a part of one, in torch.compile; it is compiled on its first forward and backward pass.
+    """Wrap a network, or a part of one, in torch.compile; it is compiled on its first forward and
+    backward pass.
 
     Random numbers are drawn as without compilation, so that a run may be resumed either way.
     """
@@ -177,7 +198,9 @@ def compile_network(network: Network) -> Network:
 
 @contextmanager
 def explain_compile_errors() -> Generator[None]:
-    """Raise TrainingError where torch.compile fails in a step forwards and back; other errors pass."""
+    """Raise TrainingError where torch.compile fails in a step forwards and back; other errors
+    pass.
+    """
     try:
         yield
     except RuntimeError as error:
@@ -185,7 +208,8 @@ def explain_compile_errors() -> Generator[None]:
             raise
         reason = str(getattr(error, "inner_exception", error)).strip().splitlines()[0]
         raise TrainingError(
-            f"--compile does not work here ({reason}): install a C++ compiler (g++), or drop --compile"
+            f"--compile does not work here ({reason}): install a C++ compiler (g++), or drop"
+            " --compile"
         ) from error
 
 
@@ -195,12 +219,16 @@ def _ignore(*_: object) -> None:
 
 @dataclass(frozen=True)
 class Running:
-    """Circumstances of a run; of these, only the number of processes and rounding change the weights."""
+    """Circumstances of a run; of these, only the number of processes and rounding change the
+    weights.
+    """
 
     fabric: Fabric | None = None
     """Launched; None: one device, a GPU if there is one."""
     stop: Callable[[], bool] = lambda: False
-    """Called after each step; if it returns true, the run is saved and ends with KeyboardInterrupt."""
+    """Called after each step; if it returns true, the run is saved and ends with
+    KeyboardInterrupt.
+    """
     on_message: OnMessage = _ignore
     on_step: OnStep = _ignore
     on_epoch: Callable[[Scores], None] = _ignore
@@ -234,14 +262,18 @@ def fit(
     folder: Path,
     running: Running | None = None,
 ) -> Scores:
-    """Train `module` in place, resuming the run in `folder`; return the figures of the epoch that the recipe keeps.
+    """Train `module` in place, resuming the run in `folder`; return the figures of the epoch that
+    the recipe keeps.
 
-    `loss` has to run the module; `score` returns at least held_out_loss. Raises TrainingError where the run cannot
-    continue, KeyboardInterrupt where it was stopped.
+    `loss` has to run the module; `score` returns at least held_out_loss. Raises TrainingError where
+    the run cannot continue, KeyboardInterrupt where it was stopped.
     """
     running = running or Running()
     run = _Run(module, recipe, steps_per_epoch, loss, folder, running)
-    fabric, leads, rank, world = run.fabric, run.leads, run.fabric.global_rank, run.fabric.world_size
+    leads = run.leads
+    rank = run.fabric.global_rank
+    world = run.fabric.world_size
+    fabric = run.fabric
     board = TensorBoardLog(folder, run.epoch) if leads and running.tensorboard else None
     with closing(board) if board else nullcontext():
         while run.has_epochs_left:
@@ -270,10 +302,15 @@ def fit(
                 if leads and (stop or running.clock() - run.saved_s >= running.checkpoint_s):
                     run.save()
                 if stop:
-                    run.report(f"stopped in epoch {run.epoch}: the same command resumes from step {run.step}")
+                    run.report(
+                        f"stopped in epoch {run.epoch}: the same command resumes from step"
+                        f" {run.step}"
+                    )
                     raise KeyboardInterrupt
 
-            train_loss = _finite("loss", float(run.over_all(run.total / max(run.step, 1), "mean")), run.epoch)
+            train_loss = _finite(
+                "loss", float(run.over_all(run.total / max(run.step, 1), "mean")), run.epoch
+            )
             module.eval()
             with run.averaged():
                 figures: Scores = fabric.broadcast(score() if leads else {})
@@ -289,36 +326,60 @@ def fit(
 
 def _finite(name: str, value: float, epoch: int) -> float:
     if not math.isfinite(value):
-        raise TrainingError(f"the {name} is {value} in epoch {epoch}: choose a smaller learning_rate")
+        raise TrainingError(
+            f"the {name} is {value} in epoch {epoch}: choose a smaller learning_rate"
+        )
     return value
 
 
 class _Run:
-    """State of a run as a checkpoint holds it: module, optimizer, schedule, counters and log; owned by `fit`.
+    """State of a run as a checkpoint holds it: module, optimizer, schedule, counters and log; owned
+    by `fit`.
 
-    Opening it resumes the run in `folder`. Raises RecipeError where another recipe or origin made that run.
+    Opening it resumes the run in `folder`. Raises RecipeError where another recipe or origin made
+    that run.
     """
 
     def __init__(
-        self, module: nn.Module, recipe: Recipe, steps: int, loss: Loss, folder: Path, running: Running
+        self,
+        module: nn.Module,
+        recipe: Recipe,
+        steps: int,
+        loss: Loss,
+        folder: Path,
+        running: Running,
     ) -> None:
         if steps < 1:
-            raise RecipeError(f"fewer training objects than a batch of {recipe.batch}: choose more, or a smaller batch")
-        self.module, self.recipe, self.folder, self._running = module, recipe, folder, running
+            raise RecipeError(
+                f"fewer training objects than a batch of {recipe.batch}: choose more, or a smaller"
+                " batch"
+            )
+        self.module = module
+        self.recipe = recipe
+        self.folder = folder
+        self._running = running
         self.fabric = running.fabric_for(recipe)
         self.leads = self.fabric.is_global_zero
         if precision_on(self.fabric.device.type, recipe) != recipe.precision:
-            self.report("this processor emulates bfloat16: training in float32, which is several times faster here")
+            self.report(
+                "this processor emulates bfloat16: training in float32, which is several times"
+                " faster here"
+            )
         free = [p for p in module.parameters() if p.requires_grad]
         kind = torch.optim.AdamW if recipe.weight_decay else torch.optim.Adam
-        self.optimizer = kind(free, recipe.learning_rate, recipe.betas, weight_decay=recipe.weight_decay)
+        self.optimizer = kind(
+            free, recipe.learning_rate, recipe.betas, weight_decay=recipe.weight_decay
+        )
         self.average = [p.detach().clone() for p in free] if recipe.average else []
         """Moving average of the free parameters, in their order."""
         self._free = free
         self.forward, self.stepper = self.fabric.setup(LossStep(module, loss), self.optimizer)
-        self._steps, self.steps_in_all = steps, recipe.epochs * steps
+        self._steps = steps
+        self.steps_in_all = recipe.epochs * steps
         self.schedule = schedule_of(recipe, self.optimizer, self.steps_in_all)
-        self.epoch, self.step, self.rows = 0, 0, list[Scores]()
+        self.epoch = 0
+        self.step = 0
+        self.rows = list[Scores]()
         self.total = torch.zeros((), device=self.fabric.device)
         """Sum of the epoch's losses so far."""
         if self.leads:
@@ -350,7 +411,9 @@ class _Run:
         return cast("Tensor", self.fabric.all_reduce(value, reduce_op=how))
 
     def any_process_asks(self, *, stop: bool) -> bool:
-        """Return the same answer in every process: true where one of them asks to stop at a step of agreement."""
+        """Return the same answer in every process: true where one of them asks to stop at a step of
+        agreement.
+        """
         if self.fabric.world_size == 1:
             return stop
         if self.steps_done % STOP_CHECK_STEPS:
@@ -358,7 +421,9 @@ class _Run:
         return bool(self.over_all(torch.tensor(float(stop), device=self.fabric.device), "sum"))
 
     def take_average(self) -> None:
-        """Move the average of the weights towards them; early on by more, so that it forgets the first ones."""
+        """Move the average of the weights towards them; early on by more, so that it forgets the
+        first ones.
+        """
         if self.average:
             decay = min(self.recipe.average, self.steps_done / (self.steps_done + 10))
             for average, own in zip(self.average, self._free, strict=True):
@@ -366,7 +431,9 @@ class _Run:
 
     @contextmanager
     def averaged(self) -> Generator[None]:
-        """Put the averaged weights into the module, if there are any; put its own back afterwards."""
+        """Put the averaged weights into the module, if there are any; put its own back
+        afterwards.
+        """
         self._swap()
         try:
             yield
@@ -378,28 +445,40 @@ class _Run:
             own.data, average.data = average.data, own.data
 
     def log_minute(self) -> None:
-        """Append a line to MINUTES: steps done, rate, mean loss of the epoch so far, samples per second."""
+        """Append a line to MINUTES: steps done, rate, mean loss of the epoch so far, samples per
+        second.
+        """
         seconds = self._running.clock() - self._minute_s
         if seconds < MINUTE_S:
             return
         pace = (self.steps_done - self._minute_steps) * self.recipe.batch / seconds
-        line = f"{time.strftime('%Y-%m-%dT%H:%M:%S')} epoch {self.epoch} step {self.steps_done}/{self.steps_in_all}"
+        line = (
+            f"{time.strftime('%Y-%m-%dT%H:%M:%S')} epoch {self.epoch} step"
+            f" {self.steps_done}/{self.steps_in_all}"
+        )
         mean = float(self.total) / max(self.step, 1)
         with (self.folder / MINUTES).open("a", encoding="utf-8") as file:
             file.write(f"{line} rate {self._rate:.3g} loss {mean:.4g} samples/s {pace:.0f}\n")
-        self._minute_s, self._minute_steps = self._running.clock(), self.steps_done
+        self._minute_s = self._running.clock()
+        self._minute_steps = self.steps_done
 
     def keep_best(self, figures: Scores) -> None:
         """Write the module as the best state if its held-out loss is the smallest so far."""
-        if self.leads and all(figures["held_out_loss"] < earlier["held_out_loss"] for earlier in self.rows):
+        if self.leads and all(
+            figures["held_out_loss"] < earlier["held_out_loss"] for earlier in self.rows
+        ):
             write_best(self.folder, {"epoch": self.epoch, "module": self.module.state_dict()})
 
     def end_epoch(self, loss: float, figures: Scores, seconds: float) -> None:
         """Log the epoch, step a plateau's schedule, and save the state."""
-        self.rows.append({"epoch": self.epoch, "rate": self._rate, "loss": loss, **figures, "seconds": seconds})
+        self.rows.append(
+            {"epoch": self.epoch, "rate": self._rate, "loss": loss, **figures, "seconds": seconds}
+        )
         if self.recipe.schedule == "plateau":
             self.schedule.step(figures["held_out_loss"])
-        self.epoch, self.step, self.total = self.epoch + 1, 0, torch.zeros_like(self.total)
+        self.epoch = self.epoch + 1
+        self.step = 0
+        self.total = torch.zeros_like(self.total)
         if self.leads:
             write_log(self.folder, self.rows)
             self.save()
@@ -413,11 +492,17 @@ class _Run:
             best = read_best(self.folder)
             self.module.load_state_dict(best["module"])
             row = self.rows[best["epoch"]]
-        return {name: value for name, value in row.items() if name not in {"epoch", "rate", "loss", "seconds"}}
+        return {
+            name: value
+            for name, value in row.items()
+            if name not in {"epoch", "rate", "loss", "seconds"}
+        }
 
     def save(self) -> None:
         """Write the last state."""
-        parts = {name: getattr(self, name).state_dict() for name in ("module", "optimizer", "schedule")}
+        parts = {
+            name: getattr(self, name).state_dict() for name in ("module", "optimizer", "schedule")
+        }
         facts = {"epoch": self.epoch, "step": self.step, "total": self.total, "rows": self.rows}
         facts |= {"average": self.average} if self.average else {}
         source = {"recipe": self.recipe.model_dump_json(), "origin": self._running.origin}
@@ -433,15 +518,23 @@ class _Run:
         except ModelError:
             raise
         except Exception as error:  # its parts have other types than ours
-            raise CheckpointError(f"{self.folder} holds no state of such a run: choose another --out") from error
+            raise CheckpointError(
+                f"{self.folder} holds no state of such a run: choose another --out"
+            ) from error
 
     def _restore(self, state: State) -> None:
         if not self.recipe.trains_like(Recipe.model_validate_json(state["recipe"])):
             raise RecipeError(f"{self.folder} holds a run of another recipe: choose another --out")
-        if state.get("origin", self._running.origin) != self._running.origin:  # states of old runs have no origin
-            raise RecipeError(f"{self.folder} holds a run from other weights or objects: choose another --out")
+        if (
+            state.get("origin", self._running.origin) != self._running.origin
+        ):  # states of old runs have no origin
+            raise RecipeError(
+                f"{self.folder} holds a run from other weights or objects: choose another --out"
+            )
         for name in ("module", "optimizer", "schedule"):
             getattr(self, name).load_state_dict(state[name])
-        self.epoch, self.step, self.rows = state["epoch"], state["step"], state["rows"]
+        self.epoch = state["epoch"]
+        self.step = state["step"]
+        self.rows = state["rows"]
         self.total = state["total"].to(self.fabric.device)
         self.average = state.get("average", self.average)

@@ -1,9 +1,11 @@
-"""Res-VAE between images (n, channels, 64, 64) in [0, 1] and latents (SI 3, Table S1), and the losses of both.
+"""Res-VAE between images (n, channels, 64, 64) in [0, 1] and latents (SI 3, Table S1), and the
+losses of both.
 
-Depth images have one channel and a latent of 256, color images three and 512; 512 channels then enter Table S1. Our
-choices where the paper is silent: ReLU between convolutions, a sigmoid at the output, and the encoder as the decoder's
-mirror (average pooling for upsampling, 1 x 1 convolutions for mean and log-variance). SI states no reduction of the
-losses: here pixels and latent entries are summed, samples averaged.
+Depth images have one channel and a latent of 256, color images three and 512; 512 channels then
+enter Table S1. Our choices where the paper is silent: ReLU between convolutions, a sigmoid at the
+output, and the encoder as the decoder's mirror (average pooling for upsampling, 1 x 1 convolutions
+for mean and log-variance). SI states no reduction of the losses: here pixels and latent entries are
+summed, samples averaged.
 """
 
 import torch
@@ -12,8 +14,17 @@ from torch import Tensor, nn
 from nlos_models.recipe import ImageLoss
 
 LATENT = 256
-UP_BLOCKS = ((256, 256, 512), (512, 256, 512), (512, 128, 256), (256, 64, 128), (128, 32, 64), (64, 16, 32))
-"""Table S1: input, inner and output channels of each residual block; the first takes the latent's size as input."""
+UP_BLOCKS = (
+    (256, 256, 512),
+    (512, 256, 512),
+    (512, 128, 256),
+    (256, 64, 128),
+    (128, 32, 64),
+    (64, 16, 32),
+)
+"""Table S1: input, inner and output channels of each residual block; the first takes the latent's
+size as input.
+"""
 LOG_VARIANCE_LIMIT = 10.0
 """exp() of larger values overflows float16."""
 
@@ -28,9 +39,13 @@ def _up_blocks(latent: int) -> list[tuple[int, int, int]]:
 
 
 class ResBlock(nn.Module):
-    """Residual block: two convolutions beside a convolved shortcut, then a change of resolution by two."""
+    """Residual block: two convolutions beside a convolved shortcut, then a change of resolution by
+    two.
+    """
 
-    def __init__(self, channels_in: int, within: int, channels_out: int, resample: nn.Module) -> None:
+    def __init__(
+        self, channels_in: int, within: int, channels_out: int, resample: nn.Module
+    ) -> None:
         super().__init__()
         self.main = nn.Sequential(
             _conv(channels_in, within),
@@ -52,7 +67,10 @@ class Decoder(nn.Module):
 
     def __init__(self, channels: int = 1, latent: int = LATENT) -> None:
         super().__init__()
-        up = [ResBlock(*block, nn.Upsample(scale_factor=2, mode="nearest")) for block in _up_blocks(latent)]
+        up = [
+            ResBlock(*block, nn.Upsample(scale_factor=2, mode="nearest"))
+            for block in _up_blocks(latent)
+        ]
         self.blocks = nn.Sequential(*up)
         self.output = _conv(UP_BLOCKS[-1][-1], channels)
 
@@ -67,7 +85,10 @@ class Encoder(nn.Module):
     def __init__(self, channels: int = 1, latent: int = LATENT) -> None:
         super().__init__()
         self.input = _conv(channels, UP_BLOCKS[-1][-1])
-        down = [ResBlock(out, within, into, nn.AvgPool2d(2)) for into, within, out in reversed(_up_blocks(latent))]
+        down = [
+            ResBlock(out, within, into, nn.AvgPool2d(2))
+            for into, within, out in reversed(_up_blocks(latent))
+        ]
         self.blocks = nn.Sequential(*down)
         self.mean = nn.Conv2d(latent, latent, 1)
         self.log_variance = nn.Conv2d(latent, latent, 1)
@@ -89,18 +110,24 @@ class ResVae(nn.Module):
         self.decoder = Decoder(channels, latent)
 
     def forward(self, image: Tensor, noise: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Map images (n, channels, 64, 64) and standard normal noise (n, latent) to image, mean and log-variance."""
+        """Map images (n, channels, 64, 64) and standard normal noise (n, latent) to image, mean and
+        log-variance.
+        """
         mean, log_variance = self.encoder(image)
         return self.decoder(mean + noise * torch.exp(0.5 * log_variance)), mean, log_variance
 
 
-def image_error(image: Tensor, truth: Tensor, surface_weight: float = 1.0, kind: ImageLoss = "squared") -> Tensor:
-    """Return the error of images (n, channels, 64, 64), summed over pixels and channels, averaged over the batch.
+def image_error(
+    image: Tensor, truth: Tensor, surface_weight: float = 1.0, kind: ImageLoss = "squared"
+) -> Tensor:
+    """Return the error of images (n, channels, 64, 64), summed over pixels and channels, averaged
+    over the batch.
 
-    Suppose that a pixel is a surface at v with probability p, else background (0), and that w is `surface_weight`. The
-    expected squared error p w (x - v)^2 + (1 - p) x^2 is least at x = w p v / (1 - p + w p): for w = 1 at p v, so that
-    an uncertain outline looks like a larger distance, less so for w > 1. The expected absolute error is least at x = v
-    where w p > 1 - p and at x = 0 elsewhere: the outline stays sharp.
+    Suppose that a pixel is a surface at v with probability p, else background (0), and that w is
+    `surface_weight`. The expected squared error p w (x - v)^2 + (1 - p) x^2 is least at x = w p v /
+    (1 - p + w p): for w = 1 at p v, so that an uncertain outline looks like a larger distance, less
+    so for w > 1. The expected absolute error is least at x = v where w p > 1 - p and at x = 0
+    elsewhere: the outline stays sharp.
     """
     truth = truth.float()
     off = image.float() - truth
@@ -111,22 +138,27 @@ def image_error(image: Tensor, truth: Tensor, surface_weight: float = 1.0, kind:
 def kl_divergence(mean: Tensor, log_variance: Tensor) -> Tensor:
     """Return KL(q || N(0, 1)) of latents (n, latent), summed over entries, averaged over the batch.
 
-    For q = N(m, s^2) each entry has (m^2 + s^2 - 1 - log s^2) / 2 (Kingma and Welling, 2013, appendix B).
+    For q = N(m, s^2) each entry has (m^2 + s^2 - 1 - log s^2) / 2 (Kingma and Welling, 2013,
+    appendix B).
     """
-    mean, log_variance = mean.float(), log_variance.float()
+    mean = mean.float()
+    log_variance = log_variance.float()
     return 0.5 * (mean.square() + log_variance.exp() - 1 - log_variance).sum(1).mean()
 
 
 def variational_share(done: float, warm_up: float) -> float:
-    """Return the weight of a VAE's noise and divergence after a share `done` of its run: 1 without a warm-up.
+    """Return the weight of a VAE's noise and divergence after a share `done` of its run: 1 without
+    a warm-up.
 
-    With one, the VAE is a plain autoencoder for that share of the run; over an equal share the weight then rises to 1.
+    With one, the VAE is a plain autoencoder for that share of the run; over an equal share the
+    weight then rises to 1.
     """
     return min(1.0, max(0.0, done / warm_up - 1)) if warm_up else 1.0
 
 
 def latent_error(latent: Tensor, mean: Tensor, log_variance: Tensor) -> Tensor:
-    """Return the squared error of latents (n, latent) in units of the encoder's variance, averaged over the batch.
+    """Return the squared error of latents (n, latent) in units of the encoder's variance, averaged
+    over the batch.
 
     Entries that the encoder leaves close to its prior have a variance near 1 and weigh little.
     """
