@@ -1,4 +1,6 @@
-"""Measure the bare wall in a recording, write its record: `python examples/calibrate_bag.py RUN.BAG [WALL.toml]`"""
+"""Measure the bare wall in a recording, write its record: `python examples/calibrate_bag.py RUN.BAG
+[WALL.toml]`
+"""
 
 import sys
 from datetime import datetime
@@ -11,15 +13,21 @@ from nlos_cam.camera import open_camera
 
 
 def main(bag: Path, out: Path) -> None:
-    """Fit the wall to 60 frames, print its distance and angle, and write record, reference and report."""
+    """Fit the wall to 60 frames, print its distance and angle, and write record, reference and
+    report.
+    """
     with open_camera(f"bag:{bag}") as camera:
         result = collect_statistics(camera, 60)
     fit, facts = measure_by_depth(result)
     about = {"camera": result.camera, "frames": result.statistics.depth.frames}
-    today, others = datetime.now().astimezone().date(), result.facts() | facts
+    today = datetime.now().astimezone().date()
+    others = result.facts() | facts
     record = new_wall_record(fit, result.intrinsics, **about, created=today, others=others)
     write_record(WallFiles.beside(out, overwrite=False), record, result.reference(fit.inliers))
-    print(f"{1e3 * record.distance_m:.1f} mm to the wall, {record.facing_deg:.2f} degrees: {record.verdict}")
+    print(
+        f"{1e3 * record.distance_m:.1f} mm to the wall, {record.facing_deg:.2f} degrees:"
+        f" {record.verdict}"
+    )
 
 
 if __name__ == "__main__":

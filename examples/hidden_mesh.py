@@ -1,4 +1,6 @@
-"""Save the most certain frame of a recording as a mesh: `python examples/hidden_mesh.py RUN.BAG [OUT.glb]`"""
+"""Save the most certain frame of a recording as a mesh: `python examples/hidden_mesh.py RUN.BAG
+[OUT.glb]`
+"""
 
 import sys
 from pathlib import Path
@@ -9,8 +11,11 @@ import nlos_cam
 
 
 def main(bag: Path, out: Path) -> None:
-    """Write the surface with the smallest median uncertainty; the suffix may be .glb, .ply, .obj, .csv or .npz."""
-    best, best_m = None, np.inf
+    """Write the surface with the smallest median uncertainty; the suffix may be .glb, .ply, .obj,
+    .csv or .npz.
+    """
+    best = None
+    best_m = np.inf
     with nlos_cam.open(f"bag:{bag}") as stream:
         for result in stream:
             seen = np.isfinite(result.depth_m)
@@ -21,7 +26,10 @@ def main(bag: Path, out: Path) -> None:
         sys.exit(f"{bag}: no frame shows a hidden surface with an uncertainty")
     mesh = best.to_mesh()
     mesh.save(out)
-    print(f"{out}: frame {best.frame_number}, {len(mesh.faces)} triangles, median uncertainty {1e3 * best_m:.0f} mm")
+    print(
+        f"{out}: frame {best.frame_number}, {len(mesh.faces)} triangles, median uncertainty"
+        f" {1e3 * best_m:.0f} mm"
+    )
 
 
 if __name__ == "__main__":

@@ -1,4 +1,6 @@
-"""Hide an object, render its lidar maps, reconstruct it: `python examples/hide_and_seek.py [CATEGORY [SEED]]`"""
+"""Hide an object, render its lidar maps, reconstruct it: `python examples/hide_and_seek.py
+[CATEGORY [SEED]]`
+"""
 
 import sys
 
@@ -12,14 +14,20 @@ from nlos_cam.render import Scene, Sensor, SensorModel
 
 
 def main(category: str = "cup", seed: int = 0) -> None:
-    """Print the overlap of the true and the reconstructed silhouette, and the mean error of depth."""
+    """Print the overlap of the true and the reconstructed silhouette, and the mean error of
+    depth.
+    """
     rig = load_rig("paper-rig")
     truth_m = load_object(category, object_box(rig), Pose(size_m=0.18), seed=seed).depth_m
     maps = sense_object(Scene(rig, truth_m), Sensor(rig, SensorModel()), seed)
     result_m = reconstruct(maps, rig, load_networks()).depth_m
-    both, either = np.isfinite(truth_m) & np.isfinite(result_m), np.isfinite(truth_m) | np.isfinite(result_m)
+    both = np.isfinite(truth_m) & np.isfinite(result_m)
+    either = np.isfinite(truth_m) | np.isfinite(result_m)
     print(f"{category} {seed}: silhouettes overlap by {both.sum() / either.sum():.0%}")
-    print(f"mean depth error where both have a surface: {1e3 * np.abs(result_m - truth_m)[both].mean():.0f} mm")
+    print(
+        "mean depth error where both have a surface:"
+        f" {1e3 * np.abs(result_m - truth_m)[both].mean():.0f} mm"
+    )
 
 
 if __name__ == "__main__":

@@ -1,4 +1,6 @@
-"""Measure weights on each category of objects: `python examples/judge_weights.py [OBJECTS [WEIGHTS]]`"""
+"""Measure weights on each category of objects: `python examples/judge_weights.py [OBJECTS
+[WEIGHTS]]`
+"""
 
 import sys
 from pathlib import Path
@@ -16,8 +18,11 @@ FIRST_SEED = 20_000_000
 
 
 def main(count: int = 36, weights: Path | None = None) -> None:
-    """Print the mean silhouette IoU of each category, over random objects that training never draws."""
-    network, rig = load_networks(weights), load_rig("paper-rig")
+    """Print the mean silhouette IoU of each category, over random objects that training never
+    draws.
+    """
+    network = load_networks(weights)
+    rig = load_rig("paper-rig")
     objects = seeded_objects(FIRST_SEED, count, object_box(rig))
     truth = truth_of(objects, object_box(rig))
     maps = as_map_set(sense(echoes_of(objects, rig, lambda *_: None), rig), truth)

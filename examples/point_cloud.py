@@ -1,4 +1,6 @@
-"""Turn a recording into one point cloud of the hidden object: `python examples/point_cloud.py RUN.BAG [OUT.ply]`"""
+"""Turn a recording into one point cloud of the hidden object: `python examples/point_cloud.py
+RUN.BAG [OUT.ply]`
+"""
 
 import sys
 from pathlib import Path
@@ -10,7 +12,9 @@ import nlos_cam
 
 
 def main(bag: Path, out: Path) -> None:
-    """Write every frame's surface as points in the wall frame, in metres; later frames are lighter."""
+    """Write every frame's surface as points in the wall frame, in metres; later frames are
+    lighter.
+    """
     with nlos_cam.open(f"bag:{bag}") as stream:
         clouds = [result.points_m for result in stream]
     greys = np.linspace(0, 255, len(clouds)).repeat([len(points) for points in clouds])
