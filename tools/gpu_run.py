@@ -1,10 +1,12 @@
-"""One command for a GPU: renders, trains, evaluates, and writes the weights in parts of at most 16 MB.
+"""One command for a GPU: renders, trains, evaluates, and writes the weights in parts of at most 16
+MB.
 
-`python tools/gpu_run.py --out DIR [--minutes 25] [--workers N] [--accelerator cuda]` builds datasets in the
-background, trains the direct network on its shards as they appear, then an encoder for the paper's decoder and the
-paper's compressor, each for a share of the time, and evaluates both networks. `python tools/gpu_run.py --join
-DIR/direct.00 --out WEIGHTS` puts weights together again. The same command resumes an interrupted run. Every step's log
-is in DIR/NAME.log, times and figures in DIR/run.json.
+`python tools/gpu_run.py --out DIR [--minutes 25] [--workers N] [--accelerator cuda]` builds
+datasets in the background, trains the direct network on its shards as they appear, then an encoder
+for the paper's decoder and the paper's compressor, each for a share of the time, and evaluates both
+networks. `python tools/gpu_run.py --join DIR/direct.00 --out WEIGHTS` puts weights together again.
+The same command resumes an interrupted run. Every step's log is in DIR/NAME.log, times and figures
+in DIR/run.json.
 """
 
 import json
@@ -23,20 +25,33 @@ from pathlib import Path
 ROOT = Path(__file__).parents[1]
 RECIPES = ROOT / "models" / "recipes"
 PART_BYTES = 16 * 10**6
-DIRECT_SHARE, COMPRESSOR_SHARE, TIMING_SHARE = 0.5, 0.2, 0.15
-"""Shares of the time: for training each network, and at most for timing the direct one; the rest is for all else."""
+DIRECT_SHARE = 0.5
+COMPRESSOR_SHARE = 0.2
+TIMING_SHARE = 0.15
+"""Shares of the time: for training each network, and at most for timing the direct one; the rest is
+for all else.
+"""
 TIMING_EPOCHS = 3
 KEPT_FIGURES = "silhouette_iou", "foreground_rmse_mm", "unseen", "recognised"
-SEED, HELD_OUT_SEED = 2_000_000, 10_000_000
+SEED = 2_000_000
+HELD_OUT_SEED = 10_000_000
 OBJECTS = 1_000_000
 """Upper limit of what is rendered; the time ends it earlier."""
 BENCHES = ("--rig-spread-mm", "10", "--rig-spread-deg", "5", "--objects-per-rig", "50")
 """Half of the direct network's objects are on measured benches, and aligned with the one rig."""
-PROGRAM = (sys.executable, "-c", "import sys; from nlos_cam.cli import run; sys.argv[0] = 'nlos-cam'; run()")
+PROGRAM = (
+    sys.executable,
+    "-c",
+    "import sys; from nlos_cam.cli import run; sys.argv[0] = 'nlos-cam'; run()",
+)
 
 
-def go(out: Path, name: str, arguments: Sequence[str], ends: Callable[[float], bool] = lambda _: False) -> float:
-    """Run nlos-cam with arguments, log it, and return its seconds; once `ends(seconds)`, interrupt it: it saves."""
+def go(
+    out: Path, name: str, arguments: Sequence[str], ends: Callable[[float], bool] = lambda _: False
+) -> float:
+    """Run nlos-cam with arguments, log it, and return its seconds; once `ends(seconds)`, interrupt
+    it: it saves.
+    """
     start_s = time.perf_counter()
     with (out / f"{name}.log").open("a", encoding="utf-8") as log:
         log.write(f"nlos-cam {' '.join(arguments)}\n")
@@ -56,11 +71,31 @@ def go(out: Path, name: str, arguments: Sequence[str], ends: Callable[[float], b
 
 
 @contextmanager
-def rendering(out: Path, name: str, seed: int, workers: int, more: Sequence[str] = ()) -> Generator[Path]:
+def rendering(
+    out: Path, name: str, seed: int, workers: int, more: Sequence[str] = ()
+) -> Generator[Path]:
     """Build a training set in the background, from its first shards on; it ends with the block."""
     folder = out / name
-    command = ["dataset", "build", "--out", str(folder), "--count", str(OBJECTS), "--seed", str(seed), *more]
-    options = ["--accuracy", "draft", "--share-generic", "0.5", "--expected-maps", "--workers", str(workers)]
+    command = [
+        "dataset",
+        "build",
+        "--out",
+        str(folder),
+        "--count",
+        str(OBJECTS),
+        "--seed",
+        str(seed),
+        *more,
+    ]
+    options = [
+        "--accuracy",
+        "draft",
+        "--share-generic",
+        "0.5",
+        "--expected-maps",
+        "--workers",
+        str(workers),
+    ]
     with (out / f"{name}.log").open("a", encoding="utf-8") as log:
         child = subprocess.Popen([*PROGRAM, *command, *options], stdout=log, stderr=log)
         try:
@@ -75,7 +110,9 @@ def wait_for(folder: Path, objects: int, limit_s: float) -> None:
     end_s = time.perf_counter() + limit_s
     while 100 * len(list(folder.glob("shard-*.h5"))) < objects:
         if time.perf_counter() > end_s:
-            raise SystemExit(f"{folder} has fewer than {objects} objects after {limit_s:.0f} s: see {folder}.log")
+            raise SystemExit(
+                f"{folder} has fewer than {objects} objects after {limit_s:.0f} s: see {folder}.log"
+            )
         time.sleep(1)
 
 
@@ -95,7 +132,9 @@ def epoch_seconds(log: Path) -> list[float]:
 
 
 def epochs_within(seconds: float, log: Path) -> int:
-    """Return the epochs that fit, by the fastest of the epochs in a training log (the first one starts slowly)."""
+    """Return the epochs that fit, by the fastest of the epochs in a training log (the first one
+    starts slowly).
+    """
     if not (each := epoch_seconds(log)):
         raise SystemExit(f"{log} has no epoch: give more --minutes")
     return max(2, int(0.95 * seconds / min(each)))
@@ -119,7 +158,11 @@ def write_parts(folder: Path, names: Sequence[str], target: Path) -> list[Path]:
 def join_parts(first: Path, out: Path) -> None:
     """Put weights in parts together again, into the folder `out`."""
     whole = out.with_suffix(".joining")
-    whole.write_bytes(b"".join(part.read_bytes() for part in sorted(first.parent.glob(f"{first.stem}.[0-9][0-9]"))))
+    whole.write_bytes(
+        b"".join(
+            part.read_bytes() for part in sorted(first.parent.glob(f"{first.stem}.[0-9][0-9]"))
+        )
+    )
     with zipfile.ZipFile(whole) as archive:
         archive.extractall(out)
     whole.unlink()
@@ -127,7 +170,9 @@ def join_parts(first: Path, out: Path) -> None:
 
 def train_and_judge(chosen: Namespace) -> None:
     """Run all steps within the time."""
-    out, start_s, budget_s = chosen.out, time.perf_counter(), 60 * chosen.minutes
+    out = chosen.out
+    start_s = time.perf_counter()
+    budget_s = 60 * chosen.minutes
     out.mkdir(parents=True, exist_ok=True)
     facts: dict[str, object] = {"minutes": chosen.minutes, "workers": chosen.workers}
 
@@ -135,11 +180,15 @@ def train_and_judge(chosen: Namespace) -> None:
         facts[name] = value
         (out / "run.json").write_text(json.dumps(facts, indent=2) + "\n", encoding="utf-8")
 
-    held_out, weights = out / "held-out", {"direct": out / "direct", "compressor": out / "compressor"}
+    held_out = out / "held-out"
+    weights = {"direct": out / "direct", "compressor": out / "compressor"}
     common = ["--held-out", str(held_out), "--accelerator", chosen.accelerator]
     held = ["--count", str(chosen.held_out), "--seed", str(HELD_OUT_SEED), "--accuracy", "draft"]
     shared = ["--share-generic", "0.5", "--workers", str(chosen.workers)]
-    finish("held_out_s", go(out, "held-out", ["dataset", "build", "--out", str(held_out), *held, *shared]))
+    finish(
+        "held_out_s",
+        go(out, "held-out", ["dataset", "build", "--out", str(held_out), *held, *shared]),
+    )
     half = max(1, chosen.workers // 2)
     with (
         rendering(out, "training", SEED, half) as training,
@@ -147,39 +196,87 @@ def train_and_judge(chosen: Namespace) -> None:
     ):
         for folder in (training, benches):
             wait_for(folder, chosen.first_objects // 2, 0.2 * budget_s)
-        direct = ["--dataset", str(training), "--dataset", str(benches), *common, "--store", str(out / "packed")]
-        recipe, timing = out / "direct.toml", out / "timing"
+        direct = [
+            "--dataset",
+            str(training),
+            "--dataset",
+            str(benches),
+            *common,
+            "--store",
+            str(out / "packed"),
+        ]
+        recipe = out / "direct.toml"
+        timing = out / "timing"
         if not recipe.exists():  # an interrupted run keeps its schedule
             trial = recipe_with(chosen.recipe, out / "timing.toml", epochs=10000)
             arguments = ["train", "direct", "--recipe", str(trial), "--out", str(timing), *direct]
 
             def timed(s: float) -> bool:
-                return len(epoch_seconds(timing / "log.csv")) >= TIMING_EPOCHS or s > TIMING_SHARE * budget_s
+                return (
+                    len(epoch_seconds(timing / "log.csv")) >= TIMING_EPOCHS
+                    or s > TIMING_SHARE * budget_s
+                )
 
             finish("timing_s", go(out, "timing", arguments, timed))
             epochs = epochs_within(DIRECT_SHARE * budget_s, timing / "log.csv")
             recipe_with(chosen.recipe, recipe, epochs=epochs)
-        arguments = ["train", "direct", "--recipe", str(recipe), "--out", str(weights["direct"]), *direct]
+        arguments = [
+            "train",
+            "direct",
+            "--recipe",
+            str(recipe),
+            "--out",
+            str(weights["direct"]),
+            *direct,
+        ]
         finish("direct_s", go(out, "direct", arguments))
     objects = 100 * len(list(training.glob("shard-*.h5")))
     finish("objects", objects)
-    end_s = time.perf_counter() + min(COMPRESSOR_SHARE * budget_s, budget_s - (time.perf_counter() - start_s))
+    end_s = time.perf_counter() + min(
+        COMPRESSOR_SHARE * budget_s, budget_s - (time.perf_counter() - start_s)
+    )
     encoder = ["train", "vae", "--recipe", str(chosen.encoder), "--out", str(out / "encoder")]
     finish("encoder_s", go(out, "encoder", [*encoder, "--accelerator", chosen.accelerator]))
     if (left_s := end_s - time.perf_counter()) > 0:
         epochs = chosen.compressor_epochs
-        ready = recipe_with(chosen.compressor, out / "compressor.toml", objects=objects, epochs=epochs)
-        paper = ["train", "compressor", "--recipe", str(ready), "--vae", str(out / "encoder"), *common]
+        ready = recipe_with(
+            chosen.compressor, out / "compressor.toml", objects=objects, epochs=epochs
+        )
+        paper = [
+            "train",
+            "compressor",
+            "--recipe",
+            str(ready),
+            "--vae",
+            str(out / "encoder"),
+            *common,
+        ]
         arguments = [*paper, "--dataset", str(training), "--out", str(weights["compressor"])]
         finish("compressor_s", go(out, "compressor", arguments, lambda s: s > left_s))
     for name, folder in weights.items():
         if (folder / "checkpoint.json").exists():
-            judged = ["evaluate", "--weights", str(folder), "--out", str(out / f"{name}-figures"), "--no-nearest"]
+            judged = [
+                "evaluate",
+                "--weights",
+                str(folder),
+                "--out",
+                str(out / f"{name}-figures"),
+                "--no-nearest",
+            ]
             go(out, f"{name}-evaluate", [*judged, "--overwrite"])
-            figures = json.loads((out / f"{name}-figures" / "figures.json").read_text(encoding="utf-8"))
+            figures = json.loads(
+                (out / f"{name}-figures" / "figures.json").read_text(encoding="utf-8")
+            )
             finish(name, {key: figures[key] for key in KEPT_FIGURES})
-            kept = sorted(path.name for path in folder.iterdir() if path.suffix in {".safetensors", ".json", ".onnx"})
-            finish(f"{name}_parts", [part.name for part in write_parts(folder, kept, out / f"{name}.zip")])
+            kept = sorted(
+                path.name
+                for path in folder.iterdir()
+                if path.suffix in {".safetensors", ".json", ".onnx"}
+            )
+            finish(
+                f"{name}_parts",
+                [part.name for part in write_parts(folder, kept, out / f"{name}.zip")],
+            )
     finish("total_s", time.perf_counter() - start_s)
 
 
@@ -193,7 +290,9 @@ def options() -> ArgumentParser:
     parser.add_argument("--accelerator", default="auto")
     parser.add_argument("--recipe", type=Path, default=RECIPES / "paper-rig-direct-gpu.toml")
     parser.add_argument("--encoder", type=Path, default=RECIPES / "paper-rig-vae-encoder.toml")
-    parser.add_argument("--compressor", type=Path, default=RECIPES / "paper-rig-compressor-gpu.toml")
+    parser.add_argument(
+        "--compressor", type=Path, default=RECIPES / "paper-rig-compressor-gpu.toml"
+    )
     parser.add_argument("--compressor-epochs", type=int, default=20)
     parser.add_argument("--held-out", type=int, default=1000)
     parser.add_argument("--first-objects", type=int, default=4000)

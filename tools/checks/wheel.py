@@ -1,6 +1,8 @@
-"""Build the wheel and the sdist, install the wheel alone into a new environment, and use it from an empty folder.
+"""Build the wheel and the sdist, install the wheel alone into a new environment, and use it from an
+empty folder.
 
-Prints one JSON object with sizes and times, and fails where a command does, where torch is needed, or above the limits.
+Prints one JSON object with sizes and times, and fails where a command does, where torch is needed,
+or above the limits.
 
     .venv/bin/python tools/checks/wheel.py
 """
@@ -15,7 +17,8 @@ from tempfile import TemporaryDirectory
 from venv import EnvBuilder
 
 ROOT = Path(__file__).parents[2]
-MAX_WHEEL_MB, MAX_INSTALL_MB = 30.0, 800.0
+MAX_WHEEL_MB = 30.0
+MAX_INSTALL_MB = 800.0
 COMMANDS: tuple[tuple[str, ...], ...] = (
     ("--version",),
     ("doctor",),
@@ -26,7 +29,9 @@ COMMANDS: tuple[tuple[str, ...], ...] = (
     ("recipes",),
     ("scenes",),
 )
-"""The first run of `live` has an empty cache and no compiled code, as on a fresh machine; the second has both."""
+"""The first run of `live` has an empty cache and no compiled code, as on a fresh machine; the
+second has both.
+"""
 EXTRA = "train", "vae", "--recipe", "vae", "--out", "weights"
 """A command that needs the extra "train"."""
 SIZES = """
@@ -45,7 +50,11 @@ INSTALLER = {"pip", "setuptools"}
 
 def build(out: Path) -> Path:
     """Build sdist and wheel into a folder; return the wheel."""
-    subprocess.run([sys.executable, "-m", "build", "--outdir", out, ROOT], check=True, stdout=subprocess.DEVNULL)
+    subprocess.run(
+        [sys.executable, "-m", "build", "--outdir", out, ROOT],
+        check=True,
+        stdout=subprocess.DEVNULL,
+    )
     (wheel,) = out.glob("*.whl")
     return wheel
 
@@ -58,14 +67,24 @@ def install(wheel: Path, environment: Path) -> Path:
     return programs
 
 
-def run(programs: Path, arguments: tuple[str, ...], folder: Path) -> tuple[subprocess.CompletedProcess[str], Times]:
-    """Run a command in a folder, with a cache below it; return the outcome and the seconds it took."""
-    start_s, before = time.perf_counter(), os.times()
+def run(
+    programs: Path, arguments: tuple[str, ...], folder: Path
+) -> tuple[subprocess.CompletedProcess[str], Times]:
+    """Run a command in a folder, with a cache below it; return the outcome and the seconds it
+    took.
+    """
+    start_s = time.perf_counter()
+    before = os.times()
     settings = {**os.environ, "NLOS_CAM_CACHE": str(folder / "cache")}
     command = [str(programs / "nlos-cam"), *arguments]
-    done = subprocess.run(command, cwd=folder, env=settings, capture_output=True, text=True, check=False)
-    wall_s, after = time.perf_counter() - start_s, os.times()
-    cpu_s = after.children_user + after.children_system - before.children_user - before.children_system
+    done = subprocess.run(
+        command, cwd=folder, env=settings, capture_output=True, text=True, check=False
+    )
+    wall_s = time.perf_counter() - start_s
+    after = os.times()
+    cpu_s = (
+        after.children_user + after.children_system - before.children_user - before.children_system
+    )
     return done, {"wall": round(wall_s, 1), "cpu": round(cpu_s, 1)}
 
 
@@ -82,9 +101,15 @@ def main() -> int:
         for arguments in COMMANDS:
             done, seconds[" ".join(arguments)] = run(programs, arguments, parts["empty"])
             if done.returncode:
-                failures.append(f"{' '.join(arguments)}: exit {done.returncode}: {done.stderr[-500:]}")
+                failures.append(
+                    f"{' '.join(arguments)}: exit {done.returncode}: {done.stderr[-500:]}"
+                )
         done, _ = run(programs, EXTRA, parts["empty"])
-        if done.returncode != 1 or 'pip install "nlos-cam[train]"' not in done.stderr or "Traceback" in done.stderr:
+        if (
+            done.returncode != 1
+            or 'pip install "nlos-cam[train]"' not in done.stderr
+            or "Traceback" in done.stderr
+        ):
             failures.append(f"{' '.join(EXTRA)}: exit {done.returncode}: {done.stderr[-500:]}")
         wheel_mb = wheel.stat().st_size / 1e6
     installed_mb = sum(size for name, size in sizes.items() if name not in INSTALLER)

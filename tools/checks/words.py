@@ -1,7 +1,7 @@
 """Check that docstrings and docs use the field's words: rates of five prose patterns per package.
 
-Prints one line per package and exits with 1 where a rate is above its limit, naming the lines to rewrite. Options set
-the limits: `--begin` in percent of docstrings, the others per 1,000 words.
+Prints one line per package and exits with 1 where a rate is above its limit, naming the lines to
+rewrite. Options set the limits: `--begin` in percent of docstrings, the others per 1,000 words.
 """
 
 import argparse
@@ -37,15 +37,22 @@ Text = tuple[str, int, str]
 
 
 def scan(folder: Path) -> tuple[list[Text], list[str]]:
-    """Return the docstrings below a folder, and the lines that define a MOST_, LEAST_ or SOME_ name."""
-    docs, names = list[Text](), list[str]()
+    """Return the docstrings below a folder, and the lines that define a MOST_, LEAST_ or SOME_
+    name.
+    """
+    docs = list[Text]()
+    names = list[str]()
     for path in sorted(folder.rglob("*.py")):
         file = str(path.relative_to(ROOT))
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
             if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef):
                 if doc := ast.get_docstring(node, clean=False):
                     docs.append((file, node.body[0].lineno, doc))
-            elif isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store) and NAME.match(node.id):
+            elif (
+                isinstance(node, ast.Name)
+                and isinstance(node.ctx, ast.Store)
+                and NAME.match(node.id)
+            ):
                 names.append(f"{file}:{node.lineno}: {node.id}")
     return docs, names
 
@@ -55,10 +62,15 @@ def matches(pattern: str, texts: list[Text]) -> Iterator[str]:
     for file, first, text in texts:
         for found in re.finditer(pattern, text, re.IGNORECASE):
             line = first + text.count("\n", 0, found.start())
-            yield f"{file}:{line}: {' '.join(text[max(found.start() - 30, 0) : found.end() + 30].split())}"
+            yield (
+                f"{file}:{line}:"
+                f" {' '.join(text[max(found.start() - 30, 0) : found.end() + 30].split())}"
+            )
 
 
-def findings(texts: list[Text], names: list[str], *, docstrings: bool) -> dict[str, tuple[float, list[str]]]:
+def findings(
+    texts: list[Text], names: list[str], *, docstrings: bool
+) -> dict[str, tuple[float, list[str]]]:
     """Return rate and lines of each pattern; `begin` and `names` only of code."""
     words = max(1, sum(len(text.split()) for *_, text in texts))
     found = {key: list(matches(pattern, texts)) for key, pattern in PATTERNS.items()}
@@ -66,23 +78,39 @@ def findings(texts: list[Text], names: list[str], *, docstrings: bool) -> dict[s
     if not docstrings:
         return rates
     begin = [f"{file}:{line}: {text[:60]}" for file, line, text in texts if OPENING.match(text)]
-    return {"begin": (100 * len(begin) / max(1, len(texts)), begin), **rates, "names": (float(len(names)), names)}
+    return {
+        "begin": (100 * len(begin) / max(1, len(texts)), begin),
+        **rates,
+        "names": (float(len(names)), names),
+    }
 
 
 def pages() -> list[Text]:
     """Return the Markdown pages without their code."""
     paths = [path for pattern in PAGES for path in sorted(ROOT.glob(pattern))]
-    blank = {path: FENCE.sub(lambda m: "\n" * m[0].count("\n"), path.read_text(encoding="utf-8")) for path in paths}
+    blank = {
+        path: FENCE.sub(lambda m: "\n" * m[0].count("\n"), path.read_text(encoding="utf-8"))
+        for path in paths
+    }
     return [(str(path.relative_to(ROOT)), 1, text) for path, text in blank.items()]
 
 
 def main() -> int:
     """Print the rates of every package; return 1 where one is above its limit."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     for key, limit in LIMITS.items():
-        parser.add_argument(f"--{key}", type=float, default=limit, help="highest rate allowed (default: %(default)s)")
+        parser.add_argument(
+            f"--{key}",
+            type=float,
+            default=limit,
+            help="highest rate allowed (default: %(default)s)",
+        )
     limits = vars(parser.parse_args())
-    every = {name: findings(*scan(ROOT / folder), docstrings=True) for name, folder in PACKAGES.items()}
+    every = {
+        name: findings(*scan(ROOT / folder), docstrings=True) for name, folder in PACKAGES.items()
+    }
     every["docs"] = findings(pages(), [], docstrings=False)
     failed = False
     for name, found in every.items():

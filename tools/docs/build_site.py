@@ -1,7 +1,9 @@
-"""Docs builder: builds site/ and refuses broken links, anchors, files, and pages that fetch from other sites.
+"""Docs builder: builds site/ and refuses broken links, anchors, files, and pages that fetch from
+other sites.
 
-`make docs` runs it. `--check` builds into a temporary folder: a gate of tools/checks/check.py. Addresses of other sites
-are checked for their form only, without a network. mkdocs.yml names this file as its hook.
+`make docs` runs it. `--check` builds into a temporary folder: a gate of tools/checks/check.py.
+Addresses of other sites are checked for their form only, without a network. mkdocs.yml names this
+file as its hook.
 """
 
 import os
@@ -20,7 +22,14 @@ import markdown
 ROOT = Path(__file__).parents[2]
 OUTSIDE = ("README.md", "CHANGELOG.md", "models/cards/*.md", "calibration/records/*.md")
 """Pages beside docs/, which MkDocs does not read."""
-FETCHING = {"script": "src", "img": "src", "iframe": "src", "link": "href", "source": "src", "video": "src"}
+FETCHING = {
+    "script": "src",
+    "img": "src",
+    "iframe": "src",
+    "link": "href",
+    "source": "src",
+    "video": "src",
+}
 """Elements that a browser follows by itself, and their attribute."""
 ADDRESS = re.compile(r"https://[a-z0-9.-]+\.[a-z]{2,}(/\S*)?")
 
@@ -40,14 +49,22 @@ class Page(HTMLParser):
         given = {name: value for name, value in attrs if value}
         self.anchors |= {given[name] for name in ("id", "name") if name in given}
         self.links += [given[name] for name in ("href", "src") if name in given]
-        if tag in FETCHING and FETCHING[tag] in given and given.get("rel") not in {"canonical", "prev", "next"}:
+        if (
+            tag in FETCHING
+            and FETCHING[tag] in given
+            and given.get("rel") not in {"canonical", "prev", "next"}
+        ):
             self.fetched.append(given[FETCHING[tag]])
 
 
 def page_of(path: Path) -> Page:
     """Parse a page of Markdown or HTML."""
     text = path.read_text(encoding="utf-8")
-    return Page(markdown.markdown(text, extensions=["toc", "tables", "fenced_code"]) if path.suffix == ".md" else text)
+    return Page(
+        markdown.markdown(text, extensions=["toc", "tables", "fenced_code"])
+        if path.suffix == ".md"
+        else text
+    )
 
 
 def broken_in(path: Path) -> Iterator[str]:
@@ -61,7 +78,11 @@ def broken_in(path: Path) -> Iterator[str]:
         target = path.parent / unquote(parts.path) if parts.path else path
         if not target.exists():
             yield f"{link} leads to no file"
-        elif parts.fragment and target.suffix == ".md" and parts.fragment not in page_of(target).anchors:
+        elif (
+            parts.fragment
+            and target.suffix == ".md"
+            and parts.fragment not in page_of(target).anchors
+        ):
             yield f"{link} leads to no heading of {target.name}"
 
 
@@ -93,9 +114,16 @@ def build(site: Path, root: Path = ROOT) -> list[str]:
         "--site-dir",
         site,
     ]  # --quiet is not strict
-    quiet = {**os.environ, "NO_MKDOCS_2_WARNING": "1"}  # Material's advertisement of what comes after it
+    quiet = {
+        **os.environ,
+        "NO_MKDOCS_2_WARNING": "1",
+    }  # Material's advertisement of what comes after it
     ended = subprocess.run(run, cwd=root, env=quiet, capture_output=True, text=True, check=False)
-    warned = [line for line in (ended.stdout + ended.stderr).splitlines() if line.strip() and "INFO" not in line]
+    warned = [
+        line
+        for line in (ended.stdout + ended.stderr).splitlines()
+        if line.strip() and "INFO" not in line
+    ]
     return warned or ([f"mkdocs ended with {ended.returncode}"] if ended.returncode else [])
 
 
@@ -105,14 +133,18 @@ def problems(site: Path, root: Path = ROOT) -> list[str]:
 
 
 def on_config(config: Any) -> Any:
-    """Add decisions, newest first, and pages without a place of their own to the navigation; MkDocs calls this hook."""
+    """Add decisions, newest first, and pages without a place of their own to the navigation; MkDocs
+    calls this hook.
+    """
     docs = Path(config["docs_dir"])
     named = set(_paths(config["nav"]))
     left = sorted(path.relative_to(docs).as_posix() for path in docs.rglob("*.md"))
     left = [path for path in left if path not in named]
     decisions = sorted((path for path in left if path.startswith("decisions/")), reverse=True)
     others = [path for path in left if not path.startswith("decisions/")]
-    config["nav"] += [{title: pages} for title, pages in (("More", others), ("Decisions", decisions)) if pages]
+    config["nav"] += [
+        {title: pages} for title, pages in (("More", others), ("Decisions", decisions)) if pages
+    ]
     return config
 
 
@@ -132,7 +164,10 @@ def main() -> int:
             found = problems(Path(folder))
     else:
         found = problems(ROOT / "site")
-    print("\n".join(found) or ("the docs are whole" if "--check" in sys.argv else f"{ROOT / 'site' / 'index.html'}"))
+    print(
+        "\n".join(found)
+        or ("the docs are whole" if "--check" in sys.argv else f"{ROOT / 'site' / 'index.html'}")
+    )
     return 1 if found else 0
 
 

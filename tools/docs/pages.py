@@ -1,7 +1,9 @@
-"""Generated parts of the docs: every command and option, our row of the comparison, and the gallery's tables.
+"""Generated parts of the docs: every command and option, our row of the comparison, and the
+gallery's tables.
 
-`python tools/docs/pages.py [commands] [comparison] [gallery] [--check]`: all without names; `--check` only compares.
-Run it after `nlos-cam evaluate`, `nlos-cam tradeoff reconstruct` and tools/studies/weights.py limits.
+`python tools/docs/pages.py [commands] [comparison] [gallery] [--check]`: all without names;
+`--check` only compares. Run it after `nlos-cam evaluate`, `nlos-cam tradeoff reconstruct` and
+tools/studies/weights.py limits.
 """
 
 import argparse
@@ -73,10 +75,20 @@ def option_row(parameter: Any) -> str:
 
 def section(name: str, command: Any) -> str:
     """Return a command's purpose and options."""
-    shared = [option for parameter in command.params for option in parameter.opts if option in EVERYWHERE]
-    rows = [option_row(parameter) for parameter in command.params if not set(parameter.opts) & EVERYWHERE.keys()]
+    shared = [
+        option for parameter in command.params for option in parameter.opts if option in EVERYWHERE
+    ]
+    rows = [
+        option_row(parameter)
+        for parameter in command.params
+        if not set(parameter.opts) & EVERYWHERE.keys()
+    ]
     table = ["| option | takes | default | |", "| --- | --- | --- | --- |", *rows] if rows else []
-    also = f"Also: {', '.join(f'`{option}` ({EVERYWHERE[option]})' for option in sorted(shared))}." if shared else ""
+    also = (
+        f"Also: {', '.join(f'`{option}` ({EVERYWHERE[option]})' for option in sorted(shared))}."
+        if shared
+        else ""
+    )
     parts = f"## {name}", " ".join(command.help.split()), "\n".join(table), also
     return "\n\n".join(part for part in parts if part)
 
@@ -84,7 +96,10 @@ def section(name: str, command: Any) -> str:
 def commands_page() -> str:
     """Return docs/commands.md."""
     app = typer.main.get_command(build_app())
-    return "\n\n".join([HEAD.rstrip(), *(section(name, command) for name, command in commands(app))]) + "\n"
+    return (
+        "\n\n".join([HEAD.rstrip(), *(section(name, command) for name, command in commands(app))])
+        + "\n"
+    )
 
 
 def comparison_row(figures: Mapping[str, Any], cost: Mapping[str, Any]) -> str:
@@ -98,7 +113,11 @@ def comparison_row(figures: Mapping[str, Any], cost: Mapping[str, Any]) -> str:
         f"{pick['milliseconds']:.0f} ms ({pick['name']}; {cost['machine']})",
         "depth map 64 x 64 of one object",
     )
-    head = "| system | light and detector | collection | computation | what comes out |\n" + "| --- " * 5 + "|"
+    head = (
+        "| system | light and detector | collection | computation | what comes out |\n"
+        + "| --- " * 5
+        + "|"
+    )
     behind = f"On {figures['objects']} objects never trained on, mean and 95 % interval: {metrics}."
     return f"{head}\n| {' | '.join(cells)} |\n\n{behind}\n"
 
@@ -107,7 +126,10 @@ def by_kind(figures: Mapping[str, Any]) -> str:
     """Return the table of figures for every kind of object, the worst first."""
     kinds: dict[str, Any] = figures["per_category"]
     worst_first = sorted(kinds, key=lambda kind: kinds[kind]["silhouette_iou"]["value"])
-    cells = {kind: " | ".join(format_interval(kinds[kind][name]) for name in TARGETS) for kind in worst_first}
+    cells = {
+        kind: " | ".join(format_interval(kinds[kind][name]) for name in TARGETS)
+        for kind in worst_first
+    }
     rows = [f"| {kind} | {values} |" for kind, values in cells.items()]
     targets = f"| **target** | {' | '.join(f'{bar:g}' for bar in TARGETS.values())} |"
     mean = f"| **all 54** | {' | '.join(format_interval(figures[name]) for name in TARGETS)} |"
@@ -119,7 +141,8 @@ def by_limit(limits: Mapping[str, Any]) -> str:
     """Return the table of figures with one possible limit removed at a time."""
     names = "silhouette_iou", "foreground_rmse_mm"
     rows = [
-        f"| {row['name']} | {row['tells']} | {' | '.join(format_interval(row['figures'][name]) for name in names)} |"
+        f"| {row['name']} | {row['tells']} |"
+        f" {' | '.join(format_interval(row['figures'][name]) for name in names)} |"
         for row in limits["rows"]
     ]
     return "\n".join([f"| what | how | {' | '.join(names)} |", "| --- " * 4 + "|", *rows]) + "\n"
@@ -129,7 +152,9 @@ def filled(text: str, tables: Mapping[str, str]) -> str:
     """Return a page with its tables, each between `<!-- name -->` and the next `<!-- end`."""
     for name, table in tables.items():
         place = re.compile(rf"(?<=<!-- {name} -->\n).*?(?=<!-- end)", re.DOTALL)
-        text = place.sub(lambda _, new=table: new, text, count=1)  # an empty place would match twice
+        text = place.sub(
+            lambda _, new=table: new, text, count=1
+        )  # an empty place would match twice
     return text
 
 
@@ -156,13 +181,18 @@ PAGES = {"commands": commands_page, "comparison": comparison_page, "gallery": ga
 
 def main() -> int:
     """Write the pages, or with `--check` name those that are out of date and return 1."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("names", nargs="*", metavar="PAGE", help=f"some of {', '.join(PAGES)} (default: all)")
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument(
+        "names", nargs="*", metavar="PAGE", help=f"some of {', '.join(PAGES)} (default: all)"
+    )
     parser.add_argument("--check", action="store_true", help="compare only")
     asked = parser.parse_args()
     stale = list[str]()
     for name in asked.names or PAGES:
-        path, current = DOCS / f"{name}.md", PAGES[name]()
+        path = DOCS / f"{name}.md"
+        current = PAGES[name]()
         if not path.exists() or path.read_text(encoding="utf-8") != current:
             stale.append(name)
             if not asked.check:

@@ -1,8 +1,10 @@
-"""Screenshots of the view's page in a headless Chromium, one for each situation: docs/images/page-*.webp.
+"""Screenshots of the view's page in a headless Chromium, one for each situation:
+docs/images/page-*.webp.
 
-`python tools/docs/screenshots.py [SITUATION ...]`, from the repository, runs the program on simulated scenes: object,
-nothing, outside (out of distribution), calibrated, moved (the wall), stalled, ended, phone. Prints the
-seconds from opening each page to its first drawn moment. Needs Chromium and the dev extra.
+`python tools/docs/screenshots.py [SITUATION ...]`, from the repository, runs the program on
+simulated scenes: object, nothing, outside (out of distribution), calibrated, moved (the wall),
+stalled, ended, phone. Prints the seconds from opening each page to its first drawn moment. Needs
+Chromium and the dev extra.
 """
 
 import argparse
@@ -24,7 +26,14 @@ from playwright.sync_api import sync_playwright
 
 CHROMIUM = shutil.which("chromium") or "/usr/bin/chromium"
 FLAGS = [
-    *("--headless", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-sync"),
+    *(
+        "--headless",
+        "--no-sandbox",
+        "--disable-gpu",
+        "--disable-quic",
+        "--no-first-run",
+        "--disable-sync",
+    ),
     *("--disable-background-networking", "--disable-component-update"),
 ]
 IMAGES = Path("docs/images")
@@ -35,11 +44,23 @@ ASIDE = f"{CUP}size_m = 0.06\nx_m = 0.08\n"
 UNPLUG = '[[faults]]\nkind = "unplug"\nat_frame = 300\nframes = 900\n'
 SITUATIONS: dict[str, tuple[list[str], str, str]] = {
     "object": (["live", "sim"], "", "Object detected"),
-    "nothing": (["live", "sim:{folder}/nothing.toml"], 'name = "empty"\nrig = "paper-rig"\n', "Nothing detected"),
-    "outside": (["live", "sim:{folder}/outside.toml"], f'name = "outside"\n{ASIDE}', "Shape not reliable"),
+    "nothing": (
+        ["live", "sim:{folder}/nothing.toml"],
+        'name = "empty"\nrig = "paper-rig"\n',
+        "Nothing detected",
+    ),
+    "outside": (
+        ["live", "sim:{folder}/outside.toml"],
+        f'name = "outside"\n{ASIDE}',
+        "Shape not reliable",
+    ),
     "calibrated": (["live", "sim", "--wall", "{folder}/wall.toml"], "", "Object detected"),
     "moved": (["live", "sim", "--wall", "{folder}/wall.toml"], "", "Wall or lidar have moved"),
-    "stalled": (["live", "sim:{folder}/stalled.toml"], f'name = "stalled"\n{CUP}{UNPLUG}', "Camera stalled"),
+    "stalled": (
+        ["live", "sim:{folder}/stalled.toml"],
+        f'name = "stalled"\n{CUP}{UNPLUG}',
+        "Camera stalled",
+    ),
     "ended": (["live", "sim", "--seconds", "12"], "", "The run has ended"),
     "phone": (["live", "sim"], "", "Object detected"),
 }
@@ -52,7 +73,9 @@ WALL_YAW_DEG = {"calibrated": 45.0, "moved": 43.0}
 def main() -> None:
     """Take the pictures."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
-    parser.add_argument("situations", nargs="*", help=f"some of {', '.join(SITUATIONS)} (default: all)")
+    parser.add_argument(
+        "situations", nargs="*", help=f"some of {', '.join(SITUATIONS)} (default: all)"
+    )
     parser.add_argument("--out", type=Path, default=IMAGES, help="folder of the pictures")
     options = parser.parse_args()
     with (
@@ -66,17 +89,33 @@ def main() -> None:
             if name in WALL_YAW_DEG:
                 _measure_wall(Path(folder), WALL_YAW_DEG[name])
             with _program([each.format(folder=folder) for each in arguments]) as address:
-                _take(browser, address, headline, options.out / f"page-{name}.webp", SIZES.get(name, (1280, 800)))
+                _take(
+                    browser,
+                    address,
+                    headline,
+                    options.out / f"page-{name}.webp",
+                    SIZES.get(name, (1280, 800)),
+                )
 
 
 def _measure_wall(folder: Path, yaw_deg: float) -> None:
     """Write the record of a bare wall that the simulated lidar faces at this angle."""
     rig = load_rig("bare-wall")
-    turned = rig.model_copy(update={"name": "turned", "lidar": rig.lidar.model_copy(update={"yaw_deg": yaw_deg})})
+    turned = rig.model_copy(
+        update={"name": "turned", "lidar": rig.lidar.model_copy(update={"yaw_deg": yaw_deg})}
+    )
     (folder / "rig.toml").write_text(dump_toml(turned))
     scene = folder / "scene.toml"
     scene.write_text('name = "turned"\nrig = "rig.toml"\n')
-    command = [*PROGRAM, "calibrate", "--wall", "--camera", f"sim:{scene}", "--out", str(folder / "wall.toml")]
+    command = [
+        *PROGRAM,
+        "calibrate",
+        "--wall",
+        "--camera",
+        f"sim:{scene}",
+        "--out",
+        str(folder / "wall.toml"),
+    ]
     subprocess.run([*command, "--overwrite"], check=True, capture_output=True)
 
 

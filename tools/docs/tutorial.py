@@ -1,4 +1,6 @@
-"""Tutorial check: runs every command of docs/tutorial.md in order and writes the answers into it (no arguments)."""
+"""Tutorial check: runs every command of docs/tutorial.md in order and writes the answers into it
+(no arguments).
+"""
 
 import os
 import re
@@ -20,12 +22,16 @@ PROGRESS = re.compile(r"[a-z][\w ]*: (?:\d+/\d+, )?\d+ s")
 """A line of progress, which only a slow machine prints."""
 
 Runner = Callable[[list[str]], str]
-"""Runs one command, given as its words, and returns its output. Raises CalledProcessError where it fails."""
+"""Runs one command, given as its words, and returns its output. Raises CalledProcessError where it
+fails.
+"""
 
 
 def commands_of(text: str) -> list[list[str]]:
     """Return every command of a page in order, as words."""
-    return [shlex.split(line) for step in STEP.finditer(text) for line in step["commands"].splitlines()]
+    return [
+        shlex.split(line) for step in STEP.finditer(text) for line in step["commands"].splitlines()
+    ]
 
 
 def answered(text: str, run: Runner) -> str:
@@ -53,7 +59,9 @@ def run_in(folder: Path) -> Runner:
 
     def run(words: list[str]) -> str:
         wide = {**os.environ, "COLUMNS": str(WIDTH), "PYTHONPATH": paths}
-        ended = subprocess.run(as_program(words), cwd=folder, env=wide, capture_output=True, text=True, check=True)
+        ended = subprocess.run(
+            as_program(words), cwd=folder, env=wide, capture_output=True, text=True, check=True
+        )
         lines = [line.rstrip() for line in (ended.stderr + ended.stdout).splitlines()]
         return "".join(f"{line}\n" for line in lines if line and not PROGRESS.fullmatch(line))
 

@@ -1,4 +1,5 @@
-"""Write the generated files of the wheel: graphs of the shipped weights, loops of the packaged scenes, the sample.
+"""Write the generated files of the wheel: graphs of the shipped weights, loops of the packaged
+scenes, the sample.
 
 Each is committed, and a test holds graphs and loops equal to their source.
 
@@ -11,21 +12,37 @@ from pathlib import Path
 
 from nlos_models import SHIPPED, export_folder, shipped_folder
 
-from nlos_cam.camera import WORLDS, Recording, SimulatedCamera, World, pack_loop, read_packaged, render_loop
+from nlos_cam.camera import (
+    WORLDS,
+    Recording,
+    SimulatedCamera,
+    World,
+    pack_loop,
+    read_packaged,
+    render_loop,
+)
 from nlos_cam.recording import SAMPLE
 from nlos_cam.render import bare_wall_scene, paper_scene
 
-EVERY, WIDTH, HEIGHT = 12, 320, 240
-"""Of the sample recording, which stays below 2 MB: every twelfth pose, in the smallest of the L515's depth modes."""
+EVERY = 12
+WIDTH = 320
+HEIGHT = 240
+"""Of the sample recording, which stays below 2 MB: every twelfth pose, in the smallest of the
+L515's depth modes.
+"""
 
 
 def write_graphs() -> list[Path]:
-    """Export the shipped weights as ONNX graphs that point into their tensors; takes the extra "train"."""
+    """Export the shipped weights as ONNX graphs that point into their tensors; takes the extra
+    "train".
+    """
     return [path for name in SHIPPED for path in export_folder(shipped_folder(name))]
 
 
 def write_worlds() -> list[Path]:
-    """Render the loops of the packaged scenes, in two minutes on two cores; those of earlier renderings go."""
+    """Render the loops of the packaged scenes, in two minutes on two cores; those of earlier
+    renderings go.
+    """
     WORLDS.mkdir(exist_ok=True)
     scenes = paper_scene(), bare_wall_scene()
     loops = {f"{scene.checksum}.npz": pack_loop(*render_loop(scene, _report)) for scene in scenes}
@@ -44,7 +61,9 @@ def write_sample() -> list[Path]:
     rig = scene.rig.model_copy(update={"intrinsics": scene.rig.intrinsics.model_copy(update=size)})
     world = World(scene.model_copy(update={"rig": rig}), echoes[::EVERY], list(truths[::EVERY]))
     SAMPLE.unlink(missing_ok=True)
-    with SimulatedCamera("sim", world, recording=Recording(SAMPLE, frames=len(echoes[::EVERY]))) as camera:
+    with SimulatedCamera(
+        "sim", world, recording=Recording(SAMPLE, frames=len(echoes[::EVERY]))
+    ) as camera:
         for _ in camera:
             pass
     return [SAMPLE]
@@ -57,7 +76,9 @@ def _report(done: int, total: int) -> None:
 PARTS = {"graphs": write_graphs, "worlds": write_worlds, "sample": write_sample}
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("parts", nargs="+", choices=PARTS)
     for part in parser.parse_args().parts:
         for path in PARTS[part]():

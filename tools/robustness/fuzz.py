@@ -1,9 +1,10 @@
 """Damaged files of every format through everything that reads them: docs/fuzz.json.
 
-`fuzz.py [--count N] [--minutes M] [--only NAME] [--first NUMBER] [--out FILE] [--keep FOLDER] [--files FOLDER]`.
-Each case runs in a process forked from one that has loaded the program, and has 30 s of processor time and, with the
-program, 1 GiB. A case is known by its input and number, which make the same damage again. A second call resumes. A bad
-case is printed; its file stays in --keep. Exits with 1 where a case is bad.
+`fuzz.py [--count N] [--minutes M] [--only NAME] [--first NUMBER] [--out FILE] [--keep FOLDER]
+[--files FOLDER]`. Each case runs in a process forked from one that has loaded the program, and has
+30 s of processor time and, with the program, 1 GiB. A case is known by its input and number, which
+make the same damage again. A second call resumes. A bad case is printed; its file stays in --keep.
+Exits with 1 where a case is bad.
 """
 
 import argparse
@@ -43,9 +44,12 @@ from nlos_cam.files import atomic_file
 
 DOCS = Path(__file__).parents[2] / "docs"
 GROUPS = "light", "torch"
-MEMORY_BYTES, TIMEOUT_S, WALL_TIMEOUT_S, STILL_S = 1 << 30, 30.0, 600.0, 0.5
-"""Memory of a case with the loaded program; its processor time; and the time on the clock of a busy machine in which it
-spends less than STILL_S of processor time where it waits for ever."""
+MEMORY_BYTES = 1 << 30
+TIMEOUT_S = 30.0
+WALL_TIMEOUT_S = 600.0
+STILL_S = 0.5
+"""Memory of a case with the loaded program; its processor time; and the time on the clock of a busy
+machine in which it spends less than STILL_S of processor time where it waits for ever."""
 OURS = NlosCamError, CalibrationError, ModelError
 MAX_KEPT_BYTES = 20_000
 GOOD = "done", "refused"
@@ -65,30 +69,46 @@ class Verdict(NamedTuple):
     """That the case imported."""
 
 
-def judge(action: Callable[[], None], memory_bytes: int = MEMORY_BYTES, timeout_s: float = TIMEOUT_S) -> Verdict:
+def judge(
+    action: Callable[[], None], memory_bytes: int = MEMORY_BYTES, timeout_s: float = TIMEOUT_S
+) -> Verdict:
     """Run an action in a forked process and return how it ended."""
     read_end, write_end = os.pipe()
     if (pid := os.fork()) == 0:
         os.close(read_end)
         try:
-            pages, resident = map(int, Path("/proc/self/statm").read_text(encoding="ascii").split()[:2])
-            limit = max(memory_bytes + (pages - resident) * resource.getpagesize(), memory_bytes // 4)
+            pages, resident = map(
+                int, Path("/proc/self/statm").read_text(encoding="ascii").split()[:2]
+            )
+            limit = max(
+                memory_bytes + (pages - resident) * resource.getpagesize(), memory_bytes // 4
+            )
             resource.setrlimit(resource.RLIMIT_AS, (limit, resource.RLIM_INFINITY))
             seconds = max(int(timeout_s), 1)
             resource.setrlimit(resource.RLIMIT_CPU, (seconds, seconds))
             before = set(sys.modules)
             kind, details = _end_of(action)
-            resource.setrlimit(resource.RLIMIT_AS, (resource.RLIM_INFINITY,) * 2)  # the answer needs some too
-            os.write(write_end, json.dumps([kind, details, sorted(set(sys.modules) - before)]).encode()[:ANSWER_BYTES])
+            resource.setrlimit(
+                resource.RLIMIT_AS, (resource.RLIM_INFINITY,) * 2
+            )  # the answer needs some too
+            os.write(
+                write_end,
+                json.dumps([kind, details, sorted(set(sys.modules) - before)]).encode()[
+                    :ANSWER_BYTES
+                ],
+            )
         finally:
             os._exit(0)
     os.close(write_end)
-    if is_late := _stands_still(pid, read_end, WALL_TIMEOUT_S if timeout_s >= TIMEOUT_S else timeout_s):
+    if is_late := _stands_still(
+        pid, read_end, WALL_TIMEOUT_S if timeout_s >= TIMEOUT_S else timeout_s
+    ):
         os.kill(pid, signal.SIGKILL)
     answer = b"".join(iter(partial(os.read, read_end, 1 << 16), b""))
     os.close(read_end)
     _, status, usage = os.wait4(pid, 0)
-    mib, cpu_s = usage.ru_maxrss >> 10, usage.ru_utime + usage.ru_stime
+    mib = usage.ru_maxrss >> 10
+    cpu_s = usage.ru_utime + usage.ru_stime
     if is_late or (not answer and cpu_s > 0.9 * timeout_s):
         return Verdict("hang", f"no answer after {cpu_s:.0f} s of processor time", mib, cpu_s)
     if not answer:
@@ -98,10 +118,14 @@ def judge(action: Callable[[], None], memory_bytes: int = MEMORY_BYTES, timeout_
 
 
 def _stands_still(pid: int, answer: int, wall_s: float) -> bool:
-    """Wait for a process's answer; return True where it spends no processor time for `wall_s` on the clock."""
+    """Wait for a process's answer; return True where it spends no processor time for `wall_s` on
+    the clock.
+    """
     spent_s = -STILL_S
     while not select.select([answer], [], [], wall_s)[0]:
-        ticks = Path(f"/proc/{pid}/stat").read_text(encoding="ascii").rpartition(")")[2].split()[11:13]
+        ticks = (
+            Path(f"/proc/{pid}/stat").read_text(encoding="ascii").rpartition(")")[2].split()[11:13]
+        )
         if (now_s := sum(map(int, ticks)) / os.sysconf("SC_CLK_TCK")) < spent_s + STILL_S:
             return True
         spent_s = now_s
@@ -112,7 +136,11 @@ def _end_of(action: Callable[[], None]) -> tuple[str, str]:
     try:
         action()
     except OURS as error:
-        return ("unexpected", f"several lines: {error}") if "\n" in str(error) else ("refused", str(error)[:300])
+        return (
+            ("unexpected", f"several lines: {error}")
+            if "\n" in str(error)
+            else ("refused", str(error)[:300])
+        )
     except WrongResultError as error:
         return "wrong", str(error)[:300]
     except MemoryError as error:
@@ -124,7 +152,9 @@ def _end_of(action: Callable[[], None]) -> tuple[str, str]:
 
 @dataclass
 class Findings:
-    """Counts of all cases so far by input and verdict, their largest memory and time, and the bad ones."""
+    """Counts of all cases so far by input and verdict, their largest memory and time, and the bad
+    ones.
+    """
 
     by_input: dict[str, dict[str, int]] = field(default_factory=dict)
     most_mib: dict[str, int] = field(default_factory=dict)
@@ -140,9 +170,11 @@ class Findings:
 
     def replaced(self, other: "Findings", names: list[str]) -> "Findings":
         """Return these findings with those of some inputs from another object."""
-        mine, theirs = vars(self), vars(other)
+        mine = vars(self)
+        theirs = vars(other)
         merged = {
-            key: {**mine[key], **{name: theirs[key][name] for name in names if name in theirs[key]}} for key in COUNTS
+            key: {**mine[key], **{name: theirs[key][name] for name in names if name in theirs[key]}}
+            for key in COUNTS
         }
         rows = [row for row in self.bad if row["input"] not in names]
         return Findings(**merged, bad=[*rows, *(row for row in other.bad if row["input"] in names)])
@@ -151,7 +183,11 @@ class Findings:
         """Return everything for JSON."""
         verdicts = sum(map(Counter, self.by_input.values()), Counter[str]())
         limits = {"timeout_cpu_s": TIMEOUT_S, "memory_mib": MEMORY_BYTES >> 20}
-        totals = {"cases": verdicts.total(), "inputs": len(self.by_input), "verdicts": dict(verdicts)}
+        totals = {
+            "cases": verdicts.total(),
+            "inputs": len(self.by_input),
+            "verdicts": dict(verdicts),
+        }
         return {"machine": machine(), **limits, **totals, **vars(self)}
 
 
@@ -162,24 +198,35 @@ def read_findings(path: Path) -> Findings:
 
 
 def fuzz_one(name: str, each: Input, number: int, keep: Path) -> tuple[Verdict, str]:
-    """Damage and judge one input; keep the file of a bad case. Return the verdict and the ways of the damage."""
+    """Damage and judge one input; keep the file of a bad case. Return the verdict and the ways of
+    the damage.
+    """
     random = np.random.default_rng([number, crc32(name.encode())])
     path, action = each
     with tempfile.TemporaryDirectory() as folder:
-        home, out = Path(folder) / "in", Path(folder) / "out"
+        home = Path(folder) / "in"
+        out = Path(folder) / "out"
         shutil.copytree(path.parent, home, copy_function=link_or_copy)
         out.mkdir()
         try:
             ways, content = mutate(path, path.read_bytes(), random)
-        except (ValueError, OSError, TypeError, KeyError) as error:  # the library refuses to write such a file
-            ways, content = f"none ({error!r:.50})", path.read_bytes()
+        except (
+            ValueError,
+            OSError,
+            TypeError,
+            KeyError,
+        ) as error:  # the library refuses to write such a file
+            ways = f"none ({error!r:.50})"
+            content = path.read_bytes()
         target = home / path.name
         target.unlink()  # its links elsewhere stay whole
         target.write_bytes(content)
         if (sums := checksums_of(home)) and random.random() < 0.5:
             (home / CHECKSUMS).unlink()
             sums[path.name] = sha256(content).hexdigest()
-            (home / CHECKSUMS).write_text("".join(f"{digest}  {key}\n" for key, digest in sums.items()))
+            (home / CHECKSUMS).write_text(
+                "".join(f"{digest}  {key}\n" for key, digest in sums.items())
+            )
             ways += "+checksum"
         verdict = judge(partial(action, target, out, random))
         if verdict.kind not in GOOD:
@@ -194,27 +241,44 @@ def fuzz_one(name: str, each: Input, number: int, keep: Path) -> tuple[Verdict, 
 
 def fuzz(group: str, home: Path, chosen: argparse.Namespace) -> None:
     """Judge the cases of a group's inputs, in turn, and write the findings now and then."""
-    findings, until_s, written_s = read_findings(chosen.out), time.monotonic() + 60 * chosen.minutes, 0.0
+    findings = read_findings(chosen.out)
+    until_s = time.monotonic() + 60 * chosen.minutes
+    written_s = 0.0
     os.environ["NLOS_CAM_CACHE"] = str(home / "cache")
-    numba.config.THREADING_LAYER = "workqueue"  # GNU OpenMP ends a forked process whose parent has used it
+    numba.config.THREADING_LAYER = (
+        "workqueue"  # GNU OpenMP ends a forked process whose parent has used it
+    )
     build_app()
     if group == "torch":
-        import_module("torch").set_num_threads(1)  # a forked process has none of its parent's threads
+        import_module("torch").set_num_threads(
+            1
+        )  # a forked process has none of its parent's threads
     inputs = {name: each for name, each in make_inputs(home, group).items() if chosen.only in name}
 
     def write() -> None:
         with suppress(FileBusyError), atomic_file(chosen.out) as part:
-            both = read_findings(chosen.out).replaced(findings, [*inputs])  # the other group writes there too
+            both = read_findings(chosen.out).replaced(
+                findings, [*inputs]
+            )  # the other group writes there too
             part.write_text(json.dumps(both.facts(), indent=1) + "\n", encoding="utf-8")
 
     for number in range(chosen.first, chosen.first + chosen.count):
         for name, each in inputs.items():
-            if number < chosen.first + sum(findings.by_input.get(name, {}).values()) or time.monotonic() > until_s:
+            if (
+                number < chosen.first + sum(findings.by_input.get(name, {}).values())
+                or time.monotonic() > until_s
+            ):
                 continue
             verdict, ways = fuzz_one(name, each, number, chosen.keep)
             findings.add(name, verdict)
             if verdict.kind not in GOOD:
-                row = {"input": name, "number": number, "ways": ways, "verdict": verdict.kind, "why": verdict.details}
+                row = {
+                    "input": name,
+                    "number": number,
+                    "ways": ways,
+                    "verdict": verdict.kind,
+                    "why": verdict.details,
+                }
                 findings.bad.append(row)
             if time.monotonic() > written_s + 30 or verdict.kind not in GOOD:
                 write()
@@ -223,8 +287,12 @@ def fuzz(group: str, home: Path, chosen: argparse.Namespace) -> None:
 
 
 def main() -> int:
-    """Make the files, then judge each group's inputs in a process of its own; return 1 after a bad case."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    """Make the files, then judge each group's inputs in a process of its own; return 1 after a bad
+    case.
+    """
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--count", type=int, default=400, help="cases of each input")
     parser.add_argument("--first", type=int, default=0, help="number of the first one")
     parser.add_argument("--minutes", type=float, default=1e6, help="limit of each group's time")
@@ -232,7 +300,9 @@ def main() -> int:
     parser.add_argument("--group", default="", help=f"only {' or '.join(GROUPS)}")
     parser.add_argument("--out", type=Path, default=DOCS / "fuzz.json")
     parser.add_argument("--keep", type=Path, default=Path(tempfile.gettempdir()))
-    parser.add_argument("--files", type=Path, help="folder of the whole files, kept for the next call")
+    parser.add_argument(
+        "--files", type=Path, help="folder of the whole files, kept for the next call"
+    )
     chosen = parser.parse_args()
     for needed in (chosen.keep, chosen.files):
         if needed:
@@ -241,7 +311,9 @@ def main() -> int:
     with tempfile.TemporaryDirectory() as folder:
         chosen.files = chosen.files or Path(folder)
         made = [] if (chosen.files / DONE).exists() else [partial(make_files, chosen.files)]
-        groups = [partial(fuzz, group, chosen.files, chosen) for group in GROUPS if chosen.group in group]
+        groups = [
+            partial(fuzz, group, chosen.files, chosen) for group in GROUPS if chosen.group in group
+        ]
         for steps in (made, groups):
             processes = [spawn.Process(target=step) for step in steps]
             for process in processes:

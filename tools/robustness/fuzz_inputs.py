@@ -1,6 +1,8 @@
-"""Whole files of every format that nlos-cam reads, and for each the actions that read it when damaged.
+"""Whole files of every format that nlos-cam reads, and for each the actions that read it when
+damaged.
 
-Inputs of the group "light" are read without torch, those of "torch" with it: a process holds one group.
+Inputs of the group "light" are read without torch, those of "torch" with it: a process holds one
+group.
 """
 
 import hashlib
@@ -31,19 +33,27 @@ from nlos_cam.recording import load_sidecar
 from nlos_cam.render import bare_wall_scene, load_scene
 
 ROOT = Path(__file__).parents[2]
-EXIT_CODES, MAX_LINES = {0, 1, 2, 3, 4}, 12
+EXIT_CODES = {0, 1, 2, 3, 4}
+MAX_LINES = 12
 PROGRESS = re.compile(r": (\d+/\d+.*)?\d+ s$")
 """Lines that a slow command prints now and then."""
 DONE = "done"
 """File that marks a complete folder of files."""
 RARE = 0.05
 """Share of the recordings that also go through the slow commands."""
-SCENE = 'name = "a"\nrig = "paper-rig"\n[object]\ncategory = "cup"\nsize_m = 0.1\n[motion]\nposes = 2\nturn_deg = 9\n'
-SETTINGS = 'camera = "sim"\nwall = "wall.toml"\nweights = "runs"\nview_port = 9000\ncache = "cache"\n'
+SCENE = (
+    'name = "a"\nrig = "paper-rig"\n[object]\ncategory = "cup"\nsize_m = 0.1\n[motion]\nposes ='
+    " 2\nturn_deg = 9\n"
+)
+SETTINGS = (
+    'camera = "sim"\nwall = "wall.toml"\nweights = "runs"\nview_port = 9000\ncache = "cache"\n'
+)
 DATASET_ARRAYS = "depth_m", "intensity", "image", "seed"
 
 Action = Callable[[Path, Path, np.random.Generator], None]
-"""Reads a damaged file, may write into an empty folder; raises an error of the project's trees, or nothing."""
+"""Reads a damaged file, may write into an empty folder; raises an error of the project's trees, or
+nothing.
+"""
 
 
 class Input(NamedTuple):
@@ -58,13 +68,18 @@ class WrongResultError(AssertionError):
 
 
 def command(*arguments: str | Path) -> dict[str, Any] | None:
-    """Run a command; return its JSON object, or None where it refused in a line. Raises AssertionError otherwise."""
-    out, err = io.StringIO(), io.StringIO()
+    """Run a command; return its JSON object, or None where it refused in a line. Raises
+    AssertionError otherwise.
+    """
+    out = io.StringIO()
+    err = io.StringIO()
     with redirect_stdout(out), redirect_stderr(err):
         code = main([*map(str, arguments), "--json"])
     lines = [line for line in err.getvalue().splitlines() if not PROGRESS.search(line)]
     if code not in EXIT_CODES or len(lines) > MAX_LINES or "Traceback" in err.getvalue():
-        raise AssertionError(f"{arguments[0]} ends with {code} and {len(lines)} lines: {err.getvalue()[-300:]}")
+        raise AssertionError(
+            f"{arguments[0]} ends with {code} and {len(lines)} lines: {err.getvalue()[-300:]}"
+        )
     if "out of memory" in err.getvalue():
         raise MemoryError(err.getvalue()[-300:])
     result = json.loads(out.getvalue().splitlines()[-1], parse_constant=_refuse_constant)
@@ -81,10 +96,16 @@ def _refuse(count: int) -> None:
 
 
 def read_recording(path: Path, folder: Path, random: np.random.Generator) -> None:
-    """Export, repair and describe a recording, now and then replay it, measure the wall, and check the results."""
-    exported, refused = command("export", path, "--out", folder / "export", "--ply"), 0
+    """Export, repair and describe a recording, now and then replay it, measure the wall, and check
+    the results.
+    """
+    exported = command("export", path, "--out", folder / "export", "--ply")
+    refused = 0
     if exported:
-        json.loads((folder / "export" / "export.json").read_text(encoding="utf-8"), parse_constant=_refuse_constant)
+        json.loads(
+            (folder / "export" / "export.json").read_text(encoding="utf-8"),
+            parse_constant=_refuse_constant,
+        )
         for stream, count in exported["frames"].items():
             if len(list((folder / "export" / stream).iterdir())) != count:
                 raise WrongResultError(f"reported {count} {stream}, and wrote others")
@@ -94,7 +115,9 @@ def read_recording(path: Path, folder: Path, random: np.random.Generator) -> Non
             images = [each for each in reader.connections if each.topic.endswith("/image/data")]
             found = [(each.topic, time_ns) for each, time_ns, _ in reader.messages(images)]
         if sum(repaired["recovered_frames"].values()) != len(found):
-            raise WrongResultError(f"repair claims {repaired['recovered_frames']}, {len(found)} can be read")
+            raise WrongResultError(
+                f"repair claims {repaired['recovered_frames']}, {len(found)} can be read"
+            )
     refused += repaired is None
     refused += command("info", path) is None
     if random.random() < RARE:
@@ -107,7 +130,9 @@ def read_recording(path: Path, folder: Path, random: np.random.Generator) -> Non
     _refuse(refused)
 
 
-def read_text(path: Path, _folder: Path, _random: np.random.Generator, load: Callable[[Path], Any]) -> None:
+def read_text(
+    path: Path, _folder: Path, _random: np.random.Generator, load: Callable[[Path], Any]
+) -> None:
     """Describe a file of any kind, and load it."""
     command("info", path)
     load(path)
@@ -126,8 +151,11 @@ def read_replayed(path: Path, folder: Path, _random: np.random.Generator) -> Non
 
 
 def read_cache(path: Path, _folder: Path, _random: np.random.Generator, content: bytes) -> None:
-    """Read a cached world whose file may be damaged: it has to be as made, and whole the next time."""
-    entry, made = path.with_name("0123456789ab.npz"), list[int]()
+    """Read a cached world whose file may be damaged: it has to be as made, and whole the next
+    time.
+    """
+    entry = path.with_name("0123456789ab.npz")
+    made = list[int]()
 
     def make() -> bytes:
         made.append(1)
@@ -136,12 +164,16 @@ def read_cache(path: Path, _folder: Path, _random: np.random.Generator, content:
     wanted = simulated_world._unpack(content)  # noqa: SLF001  what the cache's reader makes of it
     for _ in range(2):
         echoes, truths = load_cached(entry, simulated_world._unpack, make)  # noqa: SLF001
-        same = [np.array_equal(one.peak, two.peak) for one, two in zip(echoes, wanted[0], strict=True)]
+        same = [
+            np.array_equal(one.peak, two.peak) for one, two in zip(echoes, wanted[0], strict=True)
+        ]
         if not all(same) or len(truths) != len(wanted[1]) or len(made) > 1:
             raise WrongResultError("another world came out of the cache, or the damage stayed")
 
 
-def read_shard(path: Path, _folder: Path, _random: np.random.Generator, whole: dict[str, Any]) -> None:
+def read_shard(
+    path: Path, _folder: Path, _random: np.random.Generator, whole: dict[str, Any]
+) -> None:
     """Read a dataset of one shard; any array that comes out has to be the original's."""
     from nlos_cam.dataset import open_dataset, shards
 
@@ -150,7 +182,9 @@ def read_shard(path: Path, _folder: Path, _random: np.random.Generator, whole: d
         shards.check_arrays(head)
     found = open_dataset(path.parent)
     for name in DATASET_ARRAYS:
-        if not np.array_equal(found.column(name), whole[name], equal_nan=whole[name].dtype.kind == "f"):
+        if not np.array_equal(
+            found.column(name), whole[name], equal_nan=whole[name].dtype.kind == "f"
+        ):
             raise WrongResultError(f"{name} differs and was accepted")
 
 
@@ -187,17 +221,34 @@ def read_label(path: Path, _folder: Path, _random: np.random.Generator) -> None:
 
 
 def make_files(home: Path) -> None:
-    """Write the whole files that commands make, into an empty folder; to be called in a process of its own."""
+    """Write the whole files that commands make, into an empty folder; to be called in a process of
+    its own.
+    """
     os.environ["NLOS_CAM_CACHE"] = str(home / "cache")
     for name in ("packed", "plain"):
         record(home / f"{name}.bag", packed=name == "packed", frames=4)
-    command("dataset", "build", "--count", "3", "--accuracy", "draft", "--workers", "1", "--out", home / "data")
+    command(
+        "dataset",
+        "build",
+        "--count",
+        "3",
+        "--accuracy",
+        "draft",
+        "--workers",
+        "1",
+        "--out",
+        home / "data",
+    )
     command("calibrate", "--wall", "sim:bare-wall", "--frames", "8", "--out", home / "wall.toml")
-    command("capture", "sim:bare-wall", "--frames", "3", "--label", "cup", "--out", home / "short.bag")
+    command(
+        "capture", "sim:bare-wall", "--frames", "3", "--label", "cup", "--out", home / "short.bag"
+    )
     command("replay", home / "short.bag", "--out", home / "replayed")
     command("render", "cup", "--accuracy", "draft", "--out", home / "cup.npz")
     scene = bare_wall_scene()
-    world = simulated_world.pack_loop(*(simulated_world.read_packaged(scene) or simulated_world.render_loop(scene)))
+    world = simulated_world.pack_loop(
+        *(simulated_world.read_packaged(scene) or simulated_world.render_loop(scene))
+    )
     load_cached(home / "worlds" / "0123456789ab.npz", bytes, lambda: world)
     angle = np.linspace(0, 2 * np.pi, 12, endpoint=False)
     vertices_m = np.stack([np.cos(angle), np.sin(angle), 0.3 * np.cos(3 * angle)], axis=1)
@@ -219,8 +270,11 @@ def link_or_copy(source: str, target: str) -> None:
 
 
 def make_inputs(home: Path, group: str) -> dict[str, Input]:
-    """Return the inputs of a group by name, each in a folder of its own beside the files of `make_files`."""
-    inputs, places = dict[str, Input](), home / group
+    """Return the inputs of a group by name, each in a folder of its own beside the files of
+    `make_files`.
+    """
+    inputs = dict[str, Input]()
+    places = home / group
     shutil.rmtree(places, ignore_errors=True)
     places.mkdir()
 
@@ -247,7 +301,10 @@ def make_inputs(home: Path, group: str) -> dict[str, Input]:
         "rig.toml": (next(ROOT.rglob("rigs/paper-rig.toml")), load_rig),
         "recipe.toml": (next((ROOT / "models/recipes").glob("*vae*.toml")), load_recipe),
         "scene.toml": (SCENE.encode(), load_scene),
-        "nlos-cam.toml": (SETTINGS.encode(), lambda path: read_settings({}, path.parent, path.parent)),
+        "nlos-cam.toml": (
+            SETTINGS.encode(),
+            lambda path: read_settings({}, path.parent, path.parent),
+        ),
         "sidecar.json": (home / "short.json", load_sidecar),
         "rendering.npz": (home / "cup.npz", lambda _: None),
         "depth.npy": (home / "depth.npy", read_depth_map),
@@ -259,7 +316,12 @@ def make_inputs(home: Path, group: str) -> dict[str, Input]:
     entry = next((home / "worlds").iterdir())
     place("world.npz", entry, partial(read_cache, content=entry.read_bytes()))
     for name in ("checkpoint.json", "doubt.json"):
-        place(name, weights / name, partial(read_text, load=lambda path: load_record(path.parent)), weights)
+        place(
+            name,
+            weights / name,
+            partial(read_text, load=lambda path: load_record(path.parent)),
+            weights,
+        )
     describe = partial(read_text, load=lambda path: command("info", path.parent))
     place("figures.json", ROOT / "docs" / "figures.json", describe)
     return inputs

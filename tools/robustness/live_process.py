@@ -1,4 +1,6 @@
-"""Live run in a process of its own, as a person starts it; and processes on Linux as /proc lists them."""
+"""Live run in a process of its own, as a person starts it; and processes on Linux as /proc lists
+them.
+"""
 
 import os
 import re
@@ -10,20 +12,29 @@ from pathlib import Path
 from threading import Event, Thread
 from typing import Self
 
-PROGRAM = "import sys; from nlos_cam.cli import run; print('begun', file=sys.stderr, flush=True); run()"
+PROGRAM = (
+    "import sys; from nlos_cam.cli import run; print('begun', file=sys.stderr, flush=True); run()"
+)
 ADDRESS = re.compile(r"http://127\.0\.0\.1:\d+/")
 
 
 class LiveProcess:
-    """`nlos-cam live` in a session of its own, whose output is read as it comes. Leaving kills its processes."""
+    """`nlos-cam live` in a session of its own, whose output is read as it comes. Leaving kills its
+    processes.
+    """
 
     def __init__(self, arguments: Sequence[str]) -> None:
-        command, pipe = [sys.executable, "-c", PROGRAM, "live", *arguments], subprocess.PIPE
-        self.process = subprocess.Popen(command, stdout=pipe, stderr=pipe, text=True, start_new_session=True)
+        command = [sys.executable, "-c", PROGRAM, "live", *arguments]
+        pipe = subprocess.PIPE
+        self.process = subprocess.Popen(
+            command, stdout=pipe, stderr=pipe, text=True, start_new_session=True
+        )
         self.said: list[str] = []
         """Lines of stderr."""
-        self.address, self.stdout = "", ""
-        self._begun, self._addressed = Event(), Event()
+        self.address = ""
+        self.stdout = ""
+        self._begun = Event()
+        self._addressed = Event()
         self._readers = [Thread(target=self._read_stderr), Thread(target=self._read_stdout)]
         for reader in self._readers:
             reader.start()
@@ -60,13 +71,17 @@ class LiveProcess:
             raise TimeoutError(f"the program did not begin within {timeout_s:.0f} s")
 
     def wait_for_address(self, timeout_s: float) -> str:
-        """Return the address of the view; empty where the program ended first. Raises TimeoutError."""
+        """Return the address of the view; empty where the program ended first. Raises
+        TimeoutError.
+        """
         if not self._addressed.wait(timeout_s):
             raise TimeoutError(f"no address was printed within {timeout_s:.0f} s")
         return self.address
 
     def ended_within(self, timeout_s: float) -> float | None:
-        """Return the seconds until the program ended and its output was read; None if it did not end."""
+        """Return the seconds until the program ended and its output was read; None if it did not
+        end.
+        """
         start_s = time.monotonic()
         try:
             self.process.wait(timeout_s)
@@ -92,7 +107,9 @@ def children_of(pid: int) -> list[int]:
 def session_of(pid: int) -> int | None:
     """Return the session of a process; None for one that has ended."""
     try:
-        state, _, _, session = Path(f"/proc/{pid}/stat").read_text(encoding="utf-8").rpartition(")")[2].split()[:4]
+        state, _, _, session = (
+            Path(f"/proc/{pid}/stat").read_text(encoding="utf-8").rpartition(")")[2].split()[:4]
+        )
     except OSError:
         return None
     return None if state == "Z" else int(session)

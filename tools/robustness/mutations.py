@@ -1,6 +1,8 @@
-"""Damage of every format that nlos-cam reads: consistent changes (lengths, counts, checksums right), and raw bytes.
+"""Damage of every format that nlos-cam reads: consistent changes (lengths, counts, checksums
+right), and raw bytes.
 
-`mutate(path, content, random)` changes a file's content by its suffix. The same random generator gives the same damage.
+`mutate(path, content, random)` changes a file's content by its suffix. The same random generator
+gives the same damage.
 """
 
 import hashlib
@@ -22,16 +24,45 @@ import torch
 from nlos_cam.recording import rosbag
 
 Random = np.random.Generator
-NUMBERS = (0, 1, 2, 3, 0x7F, 0xFF, 0x7FFF, 0xFFFF, 30_000, 1 << 20, 1 << 24, 0x7FFFFFFF, 0x80000000, 0xFFFFFFFF)
+NUMBERS = (
+    0,
+    1,
+    2,
+    3,
+    0x7F,
+    0xFF,
+    0x7FFF,
+    0xFFFF,
+    30_000,
+    1 << 20,
+    1 << 24,
+    0x7FFFFFFF,
+    0x80000000,
+    0xFFFFFFFF,
+)
 FLOATS = (0.0, -1.0, 1e-300, 1e30, 1e308, float("inf"), float("-inf"), float("nan"))
-TEXTS = ("", "nan", "-1", "1e999", "9" * 5000, "../../../evil", "/etc/passwd", "\x00", "\x1b[2J", "ä" * 300, "mono8")
+TEXTS = (
+    "",
+    "nan",
+    "-1",
+    "1e999",
+    "9" * 5000,
+    "../../../evil",
+    "/etc/passwd",
+    "\x00",
+    "\x1b[2J",
+    "ä" * 300,
+    "mono8",
+)
 TYPES = ["std_msgs/String", "std_msgs/Float32", "sensor_msgs/Image", "sensor_msgs/CameraInfo"]
 TYPES += ["diagnostic_msgs/KeyValue", "geometry_msgs/Transform", "realsense_msgs/StreamInfo"]
 TYPES += ["sensor_msgs/PointCloud2", "evil_msgs/Unknown"]
 SENSORS = "0", "1", "99", "9" * 5000, "-1", "٣"
 DEPTH = 20_000
 LENGTH = re.compile(rb"(?s)....(?=(?:compression|conn|count|index_pos|op|size|topic|time)=)")
-"""The length of a record's field; what is 4 bytes before it may be the length of the record's header."""
+"""The length of a record's field; what is 4 bytes before it may be the length of the record's
+header.
+"""
 ABSURD = (0, 1, 0x7FFFFFFF, 0x80000000, 0xFFFFFFFF, 0xFFFFFFF0)
 
 
@@ -89,7 +120,15 @@ def swap(content: bytearray, random: Random) -> None:
     content[first:] = content[second:third] + content[first:second] + content[third:]
 
 
-WAYS: tuple[Callable[[bytearray, Random], None], ...] = (cut, flip, set_lengths, zero, remove, repeat, swap)
+WAYS: tuple[Callable[[bytearray, Random], None], ...] = (
+    cut,
+    flip,
+    set_lengths,
+    zero,
+    remove,
+    repeat,
+    swap,
+)
 
 
 @dataclass(frozen=True)
@@ -112,7 +151,9 @@ class Bag:
 
 def read_bag(content: bytes) -> Bag:
     """Return a whole bag's messages in the order of the file."""
-    read, at, bag = rosbag.reader(content), len(rosbag.MAGIC), Bag({}, [])
+    read = rosbag.reader(content)
+    at = len(rosbag.MAGIC)
+    bag = Bag({}, [])
     while at < len(content):
         record = rosbag.read_record(read, at)
         at = record.end
@@ -120,7 +161,8 @@ def read_bag(content: bytes) -> Bag:
             continue
         data = content[record.data_at : record.end]
         data = lz4.frame.decompress(data) if record.fields["compression"] == b"lz4" else data
-        chunk, place = rosbag.reader(data), 0
+        chunk = rosbag.reader(data)
+        place = 0
         while place < len(data):
             inner = rosbag.read_record(chunk, place)
             place = inner.end
@@ -130,25 +172,36 @@ def read_bag(content: bytes) -> Bag:
             else:
                 number, time = rosbag.message_key(inner)
                 seconds, nanoseconds = struct.unpack("<II", time)
-                bag.messages.append(Message(number, (seconds, nanoseconds), data[inner.data_at : inner.end]))
+                bag.messages.append(
+                    Message(number, (seconds, nanoseconds), data[inner.data_at : inner.end])
+                )
     return bag
 
 
 def write_bag(bag: Bag, random: Random, *, packed: bool) -> bytes:
-    """Return the bag as a file whose lengths, counts and index are right; now and then it lists messages twice."""
-    out, infos = io.BytesIO(), list[bytes]()
+    """Return the bag as a file whose lengths, counts and index are right; now and then it lists
+    messages twice.
+    """
+    out = io.BytesIO()
+    infos = list[bytes]()
     connections = b"".join(_connection(number, *names) for number, names in bag.topics.items())
     out.write(rosbag.MAGIC + rosbag.pack_file_header(0, 0, 0))
     for start in range(0, len(bag.messages), 40):
-        content, entries = bytearray(connections if start == 0 else b""), dict[int, list[bytes]]()
+        content = bytearray(connections if start == 0 else b"")
+        entries = dict[int, list[bytes]]()
         for message in bag.messages[start : start + 40]:
             time = struct.pack("<II", *message.time)
-            entries.setdefault(message.connection, []).append(time + len(content).to_bytes(4, "little"))
+            entries.setdefault(message.connection, []).append(
+                time + len(content).to_bytes(4, "little")
+            )
             fields = {"conn": message.connection.to_bytes(4, "little"), "op": b"\x02", "time": time}
             content += rosbag.pack_record(fields, message.data)
-        at, repeats = out.tell(), 1000 if random.random() < 0.01 else 1
+        at = out.tell()
+        repeats = 1000 if random.random() < 0.01 else 1
         data = lz4.frame.compress(bytes(content)) if packed else bytes(content)
-        out.write(rosbag.pack_chunk_head("lz4" if packed else "none", len(content), len(data)) + data)
+        out.write(
+            rosbag.pack_chunk_head("lz4" if packed else "none", len(content), len(data)) + data
+        )
         index = {number: b"".join(found) * repeats for number, found in entries.items()}
         out.write(b"".join(rosbag.pack_index(number, found) for number, found in index.items()))
         infos.append(rosbag.pack_chunk_info(at, index))
@@ -162,7 +215,9 @@ def write_bag(bag: Bag, random: Random, *, packed: bool) -> bytes:
 def _connection(number: int, topic: str, kind: str) -> bytes:
     about = {"type": kind.encode(), "md5sum": b"0" * 32, "message_definition": b"byte x"}
     data = rosbag.pack_head(about, 0)[4:-4]
-    return rosbag.pack_record({"conn": number.to_bytes(4, "little"), "op": b"\x07", "topic": topic.encode()}, data)
+    return rosbag.pack_record(
+        {"conn": number.to_bytes(4, "little"), "op": b"\x07", "topic": topic.encode()}, data
+    )
 
 
 def change_type(bag: Bag, random: Random) -> None:
@@ -173,10 +228,14 @@ def change_type(bag: Bag, random: Random) -> None:
 
 def change_topic(bag: Bag, random: Random) -> None:
     """Swap two topics, or rename one: another sensor, a path, a stream of another name."""
-    one, other = pick(random, list(bag.topics)), pick(random, list(bag.topics))
+    one = pick(random, list(bag.topics))
+    other = pick(random, list(bag.topics))
     topic, kind = bag.topics[one]
     if random.random() < 0.4:
-        bag.topics[one], bag.topics[other] = (bag.topics[other][0], kind), (topic, bag.topics[other][1])
+        bag.topics[one], bag.topics[other] = (
+            (bag.topics[other][0], kind),
+            (topic, bag.topics[other][1]),
+        )
     elif random.random() < 0.6:
         bag.topics[one] = topic.replace("sensor_0", f"sensor_{pick(random, SENSORS)}"), kind
     else:
@@ -185,12 +244,17 @@ def change_topic(bag: Bag, random: Random) -> None:
 
 
 def share_topic(bag: Bag, random: Random) -> None:
-    """Add a second connection for a topic, of the same or another type, and spread the messages over both."""
-    one, new = pick(random, list(bag.topics)), max(bag.topics) + 1
+    """Add a second connection for a topic, of the same or another type, and spread the messages
+    over both.
+    """
+    one = pick(random, list(bag.topics))
+    new = max(bag.topics) + 1
     topic, kind = bag.topics[one]
     bag.topics[new] = topic, pick(random, [kind, *TYPES])
     bag.messages = [
-        replace(message, connection=new) if message.connection == one and random.random() < 0.5 else message
+        replace(message, connection=new)
+        if message.connection == one and random.random() < 0.5
+        else message
         for message in bag.messages
     ]
 
@@ -212,14 +276,18 @@ def change_messages(bag: Bag, random: Random) -> None:
         bag.messages = [message for message in bag.messages if message.connection != gone]
     else:
         counts = random.choice([0, 1] if way == "drop" else [1, 2], len(bag.messages))
-        bag.messages = [m for m, count in zip(bag.messages, counts, strict=True) for _ in range(int(count))]
+        bag.messages = [
+            m for m, count in zip(bag.messages, counts, strict=True) for _ in range(int(count))
+        ]
 
 
 def change_times(bag: Bag, random: Random) -> None:
     """Change the times of some messages, or of all."""
     share = pick(random, (0.05, 1.0))
     bag.messages = [
-        replace(m, time=(pick(random, NUMBERS), pick(random, NUMBERS))) if random.random() < share else m
+        replace(m, time=(pick(random, NUMBERS), pick(random, NUMBERS)))
+        if random.random() < share
+        else m
         for m in bag.messages
     ]
 
@@ -227,10 +295,18 @@ def change_times(bag: Bag, random: Random) -> None:
 def change_number(bag: Bag, random: Random) -> None:
     """Put another number into some messages of one topic, at the same place in each."""
     kind = pick(random, list(bag.topics))
-    at, size = int(random.integers(64)) * int(random.integers(1, 3)), pick(random, (1, 4, 8))
-    value = struct.pack("<d", pick(random, FLOATS))[:size] if size == 8 else pick(random, NUMBERS).to_bytes(4, "little")
+    at = int(random.integers(64)) * int(random.integers(1, 3))
+    size = pick(random, (1, 4, 8))
+    value = (
+        struct.pack("<d", pick(random, FLOATS))[:size]
+        if size == 8
+        else pick(random, NUMBERS).to_bytes(4, "little")
+    )
     bag.messages = [
-        replace(m, data=(m.data[:at] + value[:size] + m.data[at + size :])[: max(len(m.data), at + size)])
+        replace(
+            m,
+            data=(m.data[:at] + value[:size] + m.data[at + size :])[: max(len(m.data), at + size)],
+        )
         if m.connection == kind
         else m
         for m in bag.messages
@@ -239,11 +315,17 @@ def change_number(bag: Bag, random: Random) -> None:
 
 def change_size(bag: Bag, random: Random) -> None:
     """Declare another size of images or cameras, with as many bytes as that takes, or without."""
-    images = [n for n, (_, kind) in bag.topics.items() if kind in {"sensor_msgs/Image", "sensor_msgs/CameraInfo"}]
+    images = [
+        n
+        for n, (_, kind) in bag.topics.items()
+        if kind in {"sensor_msgs/Image", "sensor_msgs/CameraInfo"}
+    ]
     if not images:
         return
-    chosen, (height, width) = pick(random, images), (pick(random, (0, 1, 7, 60, 240, 30_000)) for _ in range(2))
-    is_whole, changed = random.random() < 0.5 and height * width < 1 << 20, list[Message]()
+    chosen = pick(random, images)
+    (height, width) = (pick(random, (0, 1, 7, 60, 240, 30_000)) for _ in range(2))
+    is_whole = random.random() < 0.5 and height * width < 1 << 20
+    changed = list[Message]()
     for m in bag.messages:
         data = m.data
         if m.connection == chosen and len(data) > 24:
@@ -253,7 +335,9 @@ def change_size(bag: Bag, random: Random) -> None:
             if is_whole and bag.topics[chosen][1] == "sensor_msgs/Image":
                 name_end = at + 12 + int.from_bytes(data[at + 8 : at + 12], "little")
                 pixel_bytes = pick(random, (1, 2))
-                head = data[: name_end + 1] + struct.pack("<II", width * pixel_bytes, width * height * pixel_bytes)
+                head = data[: name_end + 1] + struct.pack(
+                    "<II", width * pixel_bytes, width * height * pixel_bytes
+                )
                 data = head + bytes(width * height * pixel_bytes)
         changed.append(replace(m, data=data))
     bag.messages = changed
@@ -263,7 +347,10 @@ def change_text(bag: Bag, random: Random) -> None:
     """Put other strings into KeyValue and StreamInfo messages, with their lengths."""
     for k, m in enumerate(bag.messages):
         kind = bag.topics[m.connection][1]
-        if kind not in {"diagnostic_msgs/KeyValue", "realsense_msgs/StreamInfo"} or random.random() < 0.6:
+        if (
+            kind not in {"diagnostic_msgs/KeyValue", "realsense_msgs/StreamInfo"}
+            or random.random() < 0.6
+        ):
             continue
         text = pick(random, TEXTS).encode()
         packed = len(text).to_bytes(4, "little") + text
@@ -278,10 +365,13 @@ BAG_WAYS += (change_number, change_size, change_text)
 
 def mutate_bag(content: bytes, random: Random) -> tuple[str, bytes]:
     """Change a whole bag in one to three consistent ways."""
-    bag, ways = read_bag(content), [pick(random, BAG_WAYS) for _ in range(int(random.integers(1, 4)))]
+    bag = read_bag(content)
+    ways = [pick(random, BAG_WAYS) for _ in range(int(random.integers(1, 4)))]
     for way in ways:
         way(bag, random)
-    return "+".join(way.__name__ for way in ways), write_bag(bag, random, packed=bool(random.random() < 0.3))
+    return "+".join(way.__name__ for way in ways), write_bag(
+        bag, random, packed=bool(random.random() < 0.3)
+    )
 
 
 def mutate_shard(content: bytes, random: Random) -> tuple[str, bytes]:
@@ -290,7 +380,8 @@ def mutate_shard(content: bytes, random: Random) -> tuple[str, bytes]:
     with h5py.File(memory, "r+") as file:
         name = pick(random, list(file))
         way = pick(random, ("value", "shape", "type", "link", "gone", "attribute", "sum"))
-        values, checksum = file[name][:], file[name].attrs["sha256"]
+        values = file[name][:]
+        checksum = file[name].attrs["sha256"]
         if way in {"value", "sum"} and values.dtype.kind in "fiu":
             values.ravel()[int(random.integers(values.size))] = pick(random, (0, 1, 77))
             file[name][:] = values
@@ -301,25 +392,38 @@ def mutate_shard(content: bytes, random: Random) -> tuple[str, bytes]:
         else:
             del file[name]
             if way == "link":
-                links = h5py.ExternalLink("/etc/passwd", "/x"), h5py.SoftLink("/seed"), h5py.SoftLink("/no")
+                links = (
+                    h5py.ExternalLink("/etc/passwd", "/x"),
+                    h5py.SoftLink("/seed"),
+                    h5py.SoftLink("/no"),
+                )
                 file[name] = pick(random, links)
             elif way != "gone":
                 shape = (int(pick(random, NUMBERS)),) if way == "shape" else (3,)
-                kind = "f4" if way == "shape" else pick(random, ("c16", h5py.ref_dtype, h5py.string_dtype(), "i1"))
+                kind = (
+                    "f4"
+                    if way == "shape"
+                    else pick(random, ("c16", h5py.ref_dtype, h5py.string_dtype(), "i1"))
+                )
                 chunks = (min(max(shape[0], 1), pick(random, (1, 1 << 20))),)
-                file.create_dataset(name, shape, kind, chunks=chunks, compression="gzip").attrs["sha256"] = checksum
+                file.create_dataset(name, shape, kind, chunks=chunks, compression="gzip").attrs[
+                    "sha256"
+                ] = checksum
     return way, memory.getvalue()
 
 
 def mutate_tensors(content: bytes, random: Random) -> tuple[str, bytes]:
     """Change the header of a safetensors file with its length right again, or its tensors."""
     start = 8 + int.from_bytes(content[:8], "little")
-    header, data = json.loads(content[8:start]), bytearray(content[start:])
+    header = json.loads(content[8:start])
+    data = bytearray(content[start:])
     way = pick(random, ("header", "bits", "fill"))
     if way == "header":
         entry = header[pick(random, [name for name in header if name != "__metadata__"])]
         key = pick(random, list(entry))
-        entry[key] = pick(random, ("F16", "F64", "BOOL", [0, 1 << 62], [1 << 40], [-1], None, [], {}, "x" * 1000))
+        entry[key] = pick(
+            random, ("F16", "F64", "BOOL", [0, 1 << 62], [1 << 40], [-1], None, [], {}, "x" * 1000)
+        )
     elif way == "bits":
         for at in random.integers(len(data), size=int(random.integers(1, 20))):
             data[at] ^= 1 << int(random.integers(8))
@@ -330,18 +434,26 @@ def mutate_tensors(content: bytes, random: Random) -> tuple[str, bytes]:
 
 
 def mutate_arrays(content: bytes, random: Random) -> tuple[str, bytes]:
-    """Change one array of an .npz file, packed again: values, shape, type, or a header that lies."""
+    """Change one array of an .npz file, packed again: values, shape, type, or a header that
+    lies.
+    """
     with np.load(io.BytesIO(content)) as file:
         arrays = dict(file)
-    name, way = pick(random, list(arrays)), pick(random, ("value", "shape", "type", "object", "gone", "lie"))
-    values, out = arrays[name], io.BytesIO()
+    name = pick(random, list(arrays))
+    way = pick(random, ("value", "shape", "type", "object", "gone", "lie"))
+    values = arrays[name]
+    out = io.BytesIO()
     if way == "gone":
         del arrays[name]
     elif way == "value":
         is_number = values.dtype.kind in "fiu"
-        arrays[name] = np.full_like(values, pick(random, (0, 1, 7))) if is_number else np.array("[" * 900)
+        arrays[name] = (
+            np.full_like(values, pick(random, (0, 1, 7))) if is_number else np.array("[" * 900)
+        )
     elif way == "shape":
-        arrays[name] = pick(random, (values.ravel(), values[None], np.zeros(0, values.dtype), np.zeros((3, 3))))
+        arrays[name] = pick(
+            random, (values.ravel(), values[None], np.zeros(0, values.dtype), np.zeros((3, 3)))
+        )
     elif way == "type":
         arrays[name] = np.array(pick(random, ("text", b"bytes", 5, [1j], [True])))
     np.savez(out, **({**arrays, name: np.array([{}], object)} if way == "object" else arrays))
@@ -352,7 +464,8 @@ def mutate_arrays(content: bytes, random: Random) -> tuple[str, bytes]:
 
 def mutate_text(content: bytes, random: Random) -> tuple[str, bytes]:
     """Change TOML or JSON: values, names, lines, nesting, length."""
-    lines, way = content.decode().splitlines(), pick(random, ("value",) * 3 + ("gone", "twice", "nest", "long"))
+    lines = content.decode().splitlines()
+    way = pick(random, ("value",) * 3 + ("gone", "twice", "nest", "long"))
     at = int(random.integers(max(len(lines), 1)))
     start, mark, value = lines[at].partition(": " if content.startswith(b"{") else " = ")
     if way == "value" and mark:
@@ -375,7 +488,9 @@ HEADER_BYTES = 4096
 
 
 def mutate_numbers(content: bytes, random: Random) -> tuple[str, bytes]:
-    """Put other numbers into the text or the header of a mesh or an array, or another count into a binary one."""
+    """Put other numbers into the text or the header of a mesh or an array, or another count into a
+    binary one.
+    """
     bad = bytearray(content)
     if content[:80] == bytes(80):  # a binary .stl
         bad[80:84] = pick(random, NUMBERS).to_bytes(4, "little")
@@ -394,12 +509,15 @@ class _Evil:
 
 
 def mutate_state(content: bytes, random: Random) -> tuple[str, bytes]:
-    """Replace a run's state by another with its digest: other types, hostile pickles, other parts."""
+    """Replace a run's state by another with its digest: other types, hostile pickles, other
+    parts.
+    """
     state = torch.load(io.BytesIO(content[32:]), weights_only=True)
     key = pick(random, list(state))
     other = {**state, key: pick(random, (None, 5, "x", [], {}))}
     bad: tuple[Any, ...] = (5, None, [], "x", other, _Evil(), {key: state[key]})
-    out, chosen = io.BytesIO(), int(random.integers(len(bad) + 1))
+    out = io.BytesIO()
+    chosen = int(random.integers(len(bad) + 1))
     if chosen < len(bad):
         torch.save(bad[chosen], out)
     else:
@@ -420,7 +538,9 @@ FORMATS: Mapping[str, Callable[[bytes, Random], tuple[str, bytes]]] = {
 
 
 def mutate(path: Path, content: bytes, random: Random) -> tuple[str, bytes]:
-    """Return the ways taken and the content, changed by the rules of its format (mostly), or as bytes."""
+    """Return the ways taken and the content, changed by the rules of its format (mostly), or as
+    bytes.
+    """
     if (change := FORMATS.get(path.suffix)) and random.random() < 0.8:
         return change(content, random)
     bad = bytearray(content)

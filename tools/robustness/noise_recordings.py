@@ -9,15 +9,18 @@ from nlos_calibration import load_rig
 from nlos_cam.camera import SoftwareLidar, load_sdk
 from nlos_cam.render import SensedImages
 
-WIDTH, HEIGHT = 160, 120
+WIDTH = 160
+HEIGHT = 120
 FRAMES = 40
 """Of 77 kB each: several chunks."""
 
 
 def noise(number: int) -> SensedImages:
     """Frame `number`, the same each time."""
-    generator, shape = np.random.default_rng(number), (HEIGHT, WIDTH)
-    depth, ir = generator.integers(0, 65536, shape, np.uint16), generator.integers(0, 256, shape, np.uint8)
+    generator = np.random.default_rng(number)
+    shape = (HEIGHT, WIDTH)
+    depth = generator.integers(0, 65536, shape, np.uint16)
+    ir = generator.integers(0, 256, shape, np.uint8)
     return SensedImages(depth, ir, generator.integers(0, 16, shape, np.uint8))
 
 

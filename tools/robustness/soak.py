@@ -1,8 +1,9 @@
 """Hours of `live` with a watcher that comes and goes: docs/soak.json and docs/images/soak.png.
 
-`soak.py [--minutes M] [--camera URI] [--watcher visits|stays|none] [--out FILE]`. Once a minute it notes memory,
-threads and descriptors of the process, and latency and drops of that minute's frames. The files are written after each
-minute. A minute should have a p99 of at most 15 ms without a watcher, 18 ms with one, and no frame dropped.
+`soak.py [--minutes M] [--camera URI] [--watcher visits|stays|none] [--out FILE]`. Once a minute it
+notes memory, threads and descriptors of the process, and latency and drops of that minute's frames.
+The files are written after each minute. A minute should have a p99 of at most 15 ms without a
+watcher, 18 ms with one, and no frame dropped.
 """
 
 import argparse
@@ -25,11 +26,15 @@ from matplotlib.figure import Figure
 from nlos_cam.evaluate import machine
 
 DOCS = Path(__file__).parents[2] / "docs"
-START_TIMEOUT_S, END_TIMEOUT_S, MINUTE_S = 300.0, 60.0, 60.0
-WATCH_S, PAUSE_S = 20.0, 10.0
+START_TIMEOUT_S = 300.0
+END_TIMEOUT_S = 60.0
+MINUTE_S = 60.0
+WATCH_S = 20.0
+PAUSE_S = 10.0
 WATCHERS = {"visits": WATCH_S, "stays": float("inf"), "none": 0.0}
 """Length of a visit in seconds."""
-LATENCY, DROPPED = "latency_ms", "dropped"
+LATENCY = "latency_ms"
+DROPPED = "dropped"
 """Columns of the frame log, by part of their name."""
 
 
@@ -66,7 +71,10 @@ def watch(address: str, stop: Event, visits: list[int], visit_s: float) -> None:
 
 def state_of(pid: int) -> tuple[float, int, int]:
     """Return memory in MiB, threads and descriptors of a process."""
-    status = dict(line.split(":", 1) for line in Path(f"/proc/{pid}/status").read_text(encoding="ascii").splitlines())
+    status = dict(
+        line.split(":", 1)
+        for line in Path(f"/proc/{pid}/status").read_text(encoding="ascii").splitlines()
+    )
     descriptors = len(list(Path(f"/proc/{pid}/fd").iterdir()))
     return int(status["VmRSS"].split()[0]) / 1024, int(status["Threads"]), descriptors
 
@@ -75,7 +83,9 @@ class FrameLog:
     """Rows of a growing frame log, each read once."""
 
     def __init__(self, path: Path) -> None:
-        self._path, self._names, self._read = path, list[str](), 0
+        self._path = path
+        self._names = list[str]()
+        self._read = 0
 
     def rows(self) -> list[dict[str, str]]:
         """Return the whole rows since the last call."""
@@ -96,9 +106,12 @@ def _column(rows: list[dict[str, str]], part: str) -> list[float]:
     return [float(row[name]) for row in rows if name and row[name]]
 
 
-def summarize(number: int, state: tuple[float, int, int], rows: list[dict[str, str]], watchers: int) -> Minute:
+def summarize(
+    number: int, state: tuple[float, int, int], rows: list[dict[str, str]], watchers: int
+) -> Minute:
     """Return one minute's line."""
-    latency_ms, dropped = _column(rows, LATENCY) or [0.0], _column(rows, DROPPED) or [0.0]
+    latency_ms = _column(rows, LATENCY) or [0.0]
+    dropped = _column(rows, DROPPED) or [0.0]
     p50, p99 = (float(value) for value in np.percentile(latency_ms, [50, 99]))
     return Minute(number, *state, len(rows), p50, p99, dropped[-1], watchers)
 
@@ -117,31 +130,44 @@ def draw(minutes: list[Minute], path: Path) -> None:
 
 def main() -> int:
     """Soak; write after each minute; return the exit code of the run."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--minutes", type=int, default=120)
     parser.add_argument("--camera", default="sim")
     parser.add_argument("--watcher", choices=WATCHERS, default="visits")
     parser.add_argument("--out", type=Path, default=DOCS / "soak.json")
     chosen = parser.parse_args()
-    minutes, visits, stop = list[Minute](), list[int](), Event()
+    minutes = list[Minute]()
+    visits = list[int]()
+    stop = Event()
     with tempfile.TemporaryDirectory() as folder:
         log = Path(folder) / "frames.csv"
         seconds = MINUTE_S * chosen.minutes + MINUTE_S / 2
         visit_s = WATCHERS[chosen.watcher]
-        options = ["--seconds", str(seconds), "--log", str(log), "--json"] + ["--no-view"] * (not visit_s)
+        options = ["--seconds", str(seconds), "--log", str(log), "--json"] + ["--no-view"] * (
+            not visit_s
+        )
         with LiveProcess([chosen.camera, *options]) as run:
             while not log.exists() and run.process.poll() is None:
                 time.sleep(1.0)
             if visit_s:
                 address = run.wait_for_address(START_TIMEOUT_S)
                 Thread(target=watch, args=(address, stop, visits, visit_s), daemon=True).start()
-            frames, start_s = FrameLog(log), time.monotonic()
+            frames = FrameLog(log)
+            start_s = time.monotonic()
             for number in range(1, chosen.minutes + 1):
                 time.sleep(max(start_s + MINUTE_S * number - time.monotonic(), 0))
                 if run.process.poll() is not None:
                     break
-                minutes.append(summarize(number, state_of(run.process.pid), frames.rows(), len(visits)))
-                facts = {"machine": machine(), "camera": chosen.camera, "minutes": list(map(asdict, minutes))}
+                minutes.append(
+                    summarize(number, state_of(run.process.pid), frames.rows(), len(visits))
+                )
+                facts = {
+                    "machine": machine(),
+                    "camera": chosen.camera,
+                    "minutes": list(map(asdict, minutes)),
+                }
                 chosen.out.write_text(json.dumps(facts, indent=1) + "\n", encoding="utf-8")
                 draw(minutes, DOCS / "images" / f"{chosen.out.stem}.png")
                 print(minutes[-1], file=sys.stderr)

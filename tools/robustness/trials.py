@@ -1,4 +1,6 @@
-"""Commands under attack: their table, processes that begin with the program loaded, and counts that grow by trials."""
+"""Commands under attack: their table, processes that begin with the program loaded, and counts that
+grow by trials.
+"""
 
 import argparse
 import json
@@ -44,11 +46,17 @@ batch = 4
 learning_rate = 1e-3
 direct = {features = 4, width = 8, blocks = 1, token = 4, mixers = 1}
 """
-SCENE = 'name = "a"\nrig = "paper-rig"\n[object]\ncategory = "cup"\nsize_m = 0.1\n[motion]\nposes = 1\nturn_deg = 9\n'
+SCENE = (
+    'name = "a"\nrig = "paper-rig"\n[object]\ncategory = "cup"\nsize_m = 0.1\n[motion]\nposes ='
+    " 1\nturn_deg = 9\n"
+)
 BUILD = "dataset build --count 12 --workers 2 --accuracy draft --out"
 CACHE = "capture sim:{inputs}/scene.toml --frames 2 --out {folder}"
 SAVE = "live sim:bare-wall --no-view --seconds 2 --save-view"
-TRAIN = "train direct --recipe {inputs}/small.toml --dataset {inputs}/data --held-out {inputs}/data --out"
+TRAIN = (
+    "train direct --recipe {inputs}/small.toml --dataset {inputs}/data --held-out {inputs}/data"
+    " --out"
+)
 
 Row = dict[str, Any]
 
@@ -57,13 +65,16 @@ Row = dict[str, Any]
 class Command:
     """Command line, its output, and the check of that.
 
-    {folder} stands for an empty folder and {inputs} for one with recording, recipe, scene, dataset and trained weights.
+    {folder} stands for an empty folder and {inputs} for one with recording, recipe, scene, dataset
+    and trained weights.
     """
 
     arguments: str
     output: str
     is_whole: Callable[[Path, Path], object]
-    """Called with the output and the folder of inputs; raises any error where the output is not whole."""
+    """Called with the output and the folder of inputs; raises any error where the output is not
+    whole.
+    """
     again: str = "--overwrite"
     """Option of the run after the kill."""
     keeps: str = ""
@@ -94,9 +105,14 @@ def _session(path: Path, _: Path) -> object:
 
 
 def check_session(content: bytes) -> int:
-    """Return the number of whole messages in a saved session. Raises ValueError where it does not play."""
-    begin, end = element(b"").split(b"</")[0], b"</" + element(b"").split(b"</")[1]
-    messages = [unpack(b64decode(each.split(b"<")[0])) for each in content.split(begin)[1:] if end in each]
+    """Return the number of whole messages in a saved session. Raises ValueError where it does not
+    play.
+    """
+    begin = element(b"").split(b"</")[0]
+    end = b"</" + element(b"").split(b"</")[1]
+    messages = [
+        unpack(b64decode(each.split(b"<")[0])) for each in content.split(begin)[1:] if end in each
+    ]
     if SESSION_MARK not in content[:1000] or not messages:
         raise ValueError("no saved session")
     return len(messages)
@@ -104,14 +120,17 @@ def check_session(content: bytes) -> int:
 
 def differing(one: Path, other: Path) -> list[str]:
     """Return the arrays of two datasets that differ in any bit."""
-    left, right = open_dataset(one), open_dataset(other)
+    left = open_dataset(one)
+    right = open_dataset(other)
     return [name for name in REQUIRED_ARRAYS if not _same(left.column(name), right.column(name))]
 
 
 def _same(one: np.ndarray, other: np.ndarray) -> bool:
     if one.dtype == object:
         return one.tolist() == other.tolist()
-    return one.dtype == other.dtype and one.shape == other.shape and one.tobytes() == other.tobytes()
+    return (
+        one.dtype == other.dtype and one.shape == other.shape and one.tobytes() == other.tobytes()
+    )
 
 
 def _dataset(path: Path, inputs: Path) -> None:
@@ -138,21 +157,36 @@ def _cached(path: Path, inputs: Path) -> None:
 
 RESUMED: dict[str, Any] = {"again": "", "is_atomic": False, "both_may_win": True}
 COMMANDS = {
-    "capture": Command("capture sim:bare-wall --frames 8 --out {folder}/a.bag", "a.bag", _capture, is_atomic=False),
-    "export": Command("export {inputs}/noise.bag --out {folder}/out", "out", _folder("export.json", "depth.csv")),
-    "repair": Command("repair {inputs}/noise.bag --out {folder}/a.bag", "a.bag", lambda path, _: verify(path)),
+    "capture": Command(
+        "capture sim:bare-wall --frames 8 --out {folder}/a.bag", "a.bag", _capture, is_atomic=False
+    ),
+    "export": Command(
+        "export {inputs}/noise.bag --out {folder}/out", "out", _folder("export.json", "depth.csv")
+    ),
+    "repair": Command(
+        "repair {inputs}/noise.bag --out {folder}/a.bag", "a.bag", lambda path, _: verify(path)
+    ),
     "replay": Command("replay {inputs}/noise.bag --out {folder}/out", "out", _folder("report.md")),
     "save session": Command(f"{SAVE} {{folder}}/a.html", "a.html", _session, is_atomic=False),
     "render": Command("render cup --accuracy draft --out {folder}/a.npz", "a.npz", _file),
-    "dataset build": Command(f"{BUILD} {{folder}}/data", "data", _dataset, keeps=SHARD_PATTERN, **RESUMED),
+    "dataset build": Command(
+        f"{BUILD} {{folder}}/data", "data", _dataset, keeps=SHARD_PATTERN, **RESUMED
+    ),
     "train": Command(f"{TRAIN} {{folder}}/run", "run", _run, **RESUMED),
     "cache": Command(f"{CACHE}/a.bag", ".", _cached, other=f"{CACHE}/b.bag", both_may_win=True),
-    "port": Command("live sim:bare-wall --view-port 18765", ".", lambda path, _: path.stat(), again="", endless=True),
+    "port": Command(
+        "live sim:bare-wall --view-port 18765",
+        ".",
+        lambda path, _: path.stat(),
+        again="",
+        endless=True,
+    ),
 }
 
 
 class Forked:
-    """Command in a process forked from one that has loaded the program: a random moment falls into its work.
+    """Command in a process forked from one that has loaded the program: a random moment falls into
+    its work.
 
     Its current folder and cache lie in `folder`. The methods are those of `subprocess.Popen`.
     """
@@ -162,12 +196,15 @@ class Forked:
         self._said = said
         self._process.start()
         self.pid = self._process.pid or 0
-        self.kill, self.terminate = self._process.kill, self._process.terminate
+        self.kill = self._process.kill
+        self.terminate = self._process.terminate
 
     @property
     def said(self) -> str:
         """Everything that the command has printed so far."""
-        return self._said.read_text(encoding="utf-8", errors="replace") if self._said.exists() else ""
+        return (
+            self._said.read_text(encoding="utf-8", errors="replace") if self._said.exists() else ""
+        )
 
     def poll(self) -> int | None:
         """Return the exit code; None while the command runs."""
@@ -192,7 +229,9 @@ def _main(arguments: list[str], folder: Path, said: Path) -> None:
 
 
 def in_fork(act: Callable[[], T]) -> T:
-    """Return the result of a function in a forked process: the threads of libraries that it starts end there."""
+    """Return the result of a function in a forked process: the threads of libraries that it starts
+    end there.
+    """
     receive, send = FORK.Pipe(duplex=False)
     process = FORK.Process(target=lambda: send.send(act()))
     process.start()
@@ -207,7 +246,14 @@ def load_program() -> None:
     """Import the libraries that commands import when they run."""
     build.SHARD = SHARD
     build_app()
-    for name in ("torch", "onnxruntime", "pyrealsense2", "h5py", "matplotlib.figure", "nlos_models.train"):
+    for name in (
+        "torch",
+        "onnxruntime",
+        "pyrealsense2",
+        "h5py",
+        "matplotlib.figure",
+        "nlos_models.train",
+    ):
         import_module(name)
 
 
@@ -217,9 +263,16 @@ def line_of(arguments: str, folder: Path, inputs: Path, *options: str) -> list[s
 
 
 @contextmanager
-def started(command: Command, folder: Path, inputs: Path, *options: str, name: str = "first") -> Generator[Forked]:
+def started(
+    command: Command, folder: Path, inputs: Path, *options: str, name: str = "first"
+) -> Generator[Forked]:
     """Start a command; kill it at the end of the block if it still runs."""
-    line = line_of(command.other if name == "second" and command.other else command.arguments, folder, inputs, *options)
+    line = line_of(
+        command.other if name == "second" and command.other else command.arguments,
+        folder,
+        inputs,
+        *options,
+    )
     process = Forked(line, folder, folder.with_name(f"{folder.name}.{name}"))
     try:
         yield process
@@ -269,17 +322,25 @@ def problem_of(command: Command, folder: Path, inputs: Path) -> str:
 def finished_parts(command: Command, folder: Path) -> dict[str, int]:
     """Return the time of the last change of each finished part of an output, in ns."""
     output = folder / command.output
-    return {path.name: path.stat().st_mtime_ns for path in output.glob(command.keeps)} if command.keeps else {}
+    return (
+        {path.name: path.stat().st_mtime_ns for path in output.glob(command.keeps)}
+        if command.keeps
+        else {}
+    )
 
 
 def leftovers(folder: Path) -> list[str]:
     """Return the entries that no finished command leaves."""
-    return [str(path.relative_to(folder)) for path in folder.rglob("*") if path.name.endswith(".part")]
+    return [
+        str(path.relative_to(folder)) for path in folder.rglob("*") if path.name.endswith(".part")
+    ]
 
 
 @contextmanager
 def inputs_of(chosen: argparse.Namespace) -> Generator[Path]:
-    """Yield a folder with the inputs of all commands: the one that was chosen, filled if it is empty, or a new one."""
+    """Yield a folder with the inputs of all commands: the one that was chosen, filled if it is
+    empty, or a new one.
+    """
     with tempfile.TemporaryDirectory() as name:
         folder = Path(chosen.inputs or name).resolve()
         folder.mkdir(parents=True, exist_ok=True)
@@ -301,40 +362,59 @@ def make_inputs(folder: Path) -> None:
 
 
 def options(about: str | None, file: str, **counts: int) -> argparse.ArgumentParser:
-    """Return the parser of a tool that repeats trials: its counts, and the options of all such tools."""
-    parser = argparse.ArgumentParser(description=about, formatter_class=argparse.RawDescriptionHelpFormatter)
+    """Return the parser of a tool that repeats trials: its counts, and the options of all such
+    tools.
+    """
+    parser = argparse.ArgumentParser(
+        description=about, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     for name, count in counts.items():
         parser.add_argument(f"--{name}", type=int, default=count)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--only", default="", help="only commands with this in their name")
     parser.add_argument("--out", type=Path, default=DOCS / file)
-    parser.add_argument("--inputs", type=Path, help="folder of the commands' inputs, kept for the next call")
+    parser.add_argument(
+        "--inputs", type=Path, help="folder of the commands' inputs, kept for the next call"
+    )
     return parser
 
 
 class Results:
-    """Rows of trials in a JSON file, which is written after each; a second call of a tool resumes there."""
+    """Rows of trials in a JSON file, which is written after each; a second call of a tool resumes
+    there.
+    """
 
     def __init__(self, path: Path, seed: int) -> None:
-        self._path, self._seed = path, seed
+        self._path = path
+        self._seed = seed
         self.facts: dict[str, Any] = {"machine": in_fork(machine)}  # it starts numba's threads
         if path.exists():
             self.facts = json.loads(path.read_text(encoding="utf-8"))
 
-    def repeat(self, name: str, kind: str, count: int, trial: Callable[[random.Random], Row]) -> None:
+    def repeat(
+        self, name: str, kind: str, count: int, trial: Callable[[random.Random], Row]
+    ) -> None:
         """Append the rows of trials until there are `count`; each has random numbers of its own."""
         rows = self.facts.setdefault(name, {}).setdefault(kind, [])
         while len(rows) < count:
             try:
                 row = trial(random.Random(f"{self._seed} {name} {kind} {len(rows)}"))  # noqa: S311
-            except (OSError, RuntimeError, subprocess.SubprocessError) as error:  # a process ended, or never does
+            except (
+                OSError,
+                RuntimeError,
+                subprocess.SubprocessError,
+            ) as error:  # a process ended, or never does
                 row = {"wrong": f"{error!r:.300}"}
             rows.append({key: value for key, value in row.items() if value != ""})
             print(name, kind, len(rows), rows[-1], flush=True)
-            self._path.write_text(json.dumps(self.facts, separators=(",", ":")) + "\n", encoding="utf-8")
+            self._path.write_text(
+                json.dumps(self.facts, separators=(",", ":")) + "\n", encoding="utf-8"
+            )
 
     @property
     def findings(self) -> list[Row]:
         """Rows with something wrong."""
         tables = [kinds for kinds in self.facts.values() if isinstance(kinds, dict)]
-        return [row for kinds in tables for rows in kinds.values() for row in rows if "wrong" in row]
+        return [
+            row for kinds in tables for rows in kinds.values() for row in rows if "wrong" in row
+        ]

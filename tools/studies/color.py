@@ -1,7 +1,8 @@
-"""Full colour (simulation only: the L515's laser is infrared): judge weights on the 54 test objects, painted.
+"""Full colour (simulation only: the L515's laser is infrared): judge weights on the 54 test
+objects, painted.
 
-Writes figures.json and sheet.png, and sheet-vae.png of a VAE alone, into a folder. The commands that train weights are
-in docs/colour.md.
+Writes figures.json and sheet.png, and sheet-vae.png of a VAE alone, into a folder. The commands
+that train weights are in docs/colour.md.
 """
 
 import argparse
@@ -20,10 +21,16 @@ from nlos_cam.objects import OBJECTS_PER_CATEGORY, benchmark_objects, object_box
 
 def main() -> None:
     """Render, reconstruct, judge."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--weights", type=Path, required=True, help="from `train direct` or `train compressor`")
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument(
+        "--weights", type=Path, required=True, help="from `train direct` or `train compressor`"
+    )
     parser.add_argument("--vae", type=Path, help="to be judged too, given the images themselves")
-    parser.add_argument("--dataset", type=Path, required=True, help="training objects, whose mean is a baseline")
+    parser.add_argument(
+        "--dataset", type=Path, required=True, help="training objects, whose mean is a baseline"
+    )
     parser.add_argument("--accuracy", default="standard", help="of the renderer")
     parser.add_argument("--out", type=Path, required=True)
     given = parser.parse_args()
@@ -31,12 +38,15 @@ def main() -> None:
     depths = [one.depth_m for one in benchmark_objects(object_box(rig))]
     with tracked("rendering test objects in colour") as on_progress:
         maps = painted_maps(depths, rig, TEST_SEED, given.accuracy, on_progress)
-    truth, image = maps.image.astype(np.float32), run(load_network(given.weights)[0], maps)
+    truth = maps.image.astype(np.float32)
+    image = run(load_network(given.weights)[0], maps)
     alone = {"vae_alone": rebuild(load_vae(given.vae)[0], maps.image)} if given.vae else {}
     given.out.mkdir(parents=True, exist_ok=True)
     sheets = {"sheet": image, "sheet-vae": alone["vae_alone"]} if alone else {"sheet": image}
     for name, made in sheets.items():
-        draw_color_sheet(given.out / f"{name}.png", made[::OBJECTS_PER_CATEGORY], truth[::OBJECTS_PER_CATEGORY])
+        draw_color_sheet(
+            given.out / f"{name}.png", made[::OBJECTS_PER_CATEGORY], truth[::OBJECTS_PER_CATEGORY]
+        )
     training = open_dataset(given.dataset, color=True, expected=True).column("image")
     figures = json.dumps(figures_of_color(image, truth, alone, training), indent=2)
     (given.out / "figures.json").write_text(f"{figures}\n", encoding="utf-8")

@@ -1,10 +1,13 @@
-"""Direct networks side by side, each trained for equal processor seconds: docs/direct_ablations.json and .md.
+"""Direct networks side by side, each trained for equal processor seconds:
+docs/direct_ablations.json and .md.
 
-And a learning curve over runs of one recipe with other budgets: docs/direct_curve.json, docs/images/direct_curve.png.
+And a learning curve over runs of one recipe with other budgets: docs/direct_curve.json,
+docs/images/direct_curve.png.
 
-`python tools/studies/direct.py --store DIR --dataset DIR --held-out DIR [--samples N] [NAME:field=value,...]`:
-variants of models/recipes/paper-rig-direct.toml, compared with the first. One thread; results are appended. Variants
-and --weights NAME=DIR whose names begin with "curve" make the curve.
+`python tools/studies/direct.py --store DIR --dataset DIR --held-out DIR [--samples N]
+[NAME:field=value,...]`: variants of models/recipes/paper-rig-direct.toml, compared with the first.
+One thread; results are appended. Variants and --weights NAME=DIR whose names begin with "curve"
+make the curve.
 """
 
 import json
@@ -21,10 +24,28 @@ import numpy as np
 import torch
 from matplotlib.figure import Figure
 from nlos_calibration import rig_named
-from nlos_models import DirectNetwork, MapSet, Recipe, Running, first_of, load_network, load_recipe, run, train_direct
+from nlos_models import (
+    DirectNetwork,
+    MapSet,
+    Recipe,
+    Running,
+    first_of,
+    load_network,
+    load_recipe,
+    run,
+    train_direct,
+)
 
 from nlos_cam.dataset import PackedMaps, open_dataset, open_packed_maps
-from nlos_cam.evaluate import TARGETS, advantage, format_interval, over_objects, per_object, plain, rendered_objects
+from nlos_cam.evaluate import (
+    TARGETS,
+    advantage,
+    format_interval,
+    over_objects,
+    per_object,
+    plain,
+    rendered_objects,
+)
 
 RECIPE = harness.ROOT / "models" / "recipes" / "paper-rig-direct.toml"
 PACE_STEPS = 8
@@ -33,9 +54,12 @@ object; positive is better. Each variant had the same processor seconds on one t
 
 
 def variant(text: str, base: Recipe) -> tuple[str, Recipe]:
-    """Return name and recipe of "NAME:field=value,direct.field=value": values as JSON, or plain words."""
+    """Return name and recipe of "NAME:field=value,direct.field=value": values as JSON, or plain
+    words.
+    """
     name, _, changes = text.partition(":")
-    fields, size = dict[str, Any](), dict[str, Any]()
+    fields = dict[str, Any]()
+    size = dict[str, Any]()
     for change in filter(None, changes.split(",")):
         key, _, value = change.partition("=")
         try:
@@ -57,14 +81,20 @@ def pace(recipe: Recipe, source: PackedMaps, held_out: MapSet) -> float:
     return recipe.batch * (len(marks) - 2) / (marks[-1] - marks[1])
 
 
-def measure(name: str, recipe: Recipe, source: PackedMaps, sets: dict[str, MapSet], given: Namespace) -> dict[str, Any]:
-    """Train a variant for some processor seconds, or samples; return its facts and metrics on each set, per object."""
+def measure(
+    name: str, recipe: Recipe, source: PackedMaps, sets: dict[str, MapSet], given: Namespace
+) -> dict[str, Any]:
+    """Train a variant for some processor seconds, or samples; return its facts and metrics on each
+    set, per object.
+    """
     rate = pace(recipe, source, sets["held_out"])
     steps = max(10, int(given.samples or rate * given.cpu_seconds) // recipe.batch)
     timed = recipe.model_copy(update={"objects": steps * recipe.batch, "epochs": 1})
     start_s = time.process_time()
     with TemporaryDirectory() as folder:
-        network, _ = train_direct(timed, source, sets["held_out"], Path(folder), Running(checkpoint_s=1e9))
+        network, _ = train_direct(
+            timed, source, sets["held_out"], Path(folder), Running(checkpoint_s=1e9)
+        )
     spent_s = time.process_time() - start_s
     facts = {"name": name, "objects": len(source), "samples": steps * recipe.batch}
     return facts | _judge(network, source, sets) | {"samples_per_s": rate, "cpu_seconds": spent_s}
@@ -76,7 +106,9 @@ def _judge(network: DirectNetwork, source: PackedMaps, sets: dict[str, MapSet]) 
         key: per_object(run(network, maps), maps.image.astype(np.float32), source.plan.box)
         for key, maps in sets.items()
     }
-    plain_values = {key: {metric: each.tolist() for metric, each in one.items()} for key, one in values.items()}
+    plain_values = {
+        key: {metric: each.tolist() for metric, each in one.items()} for key, one in values.items()
+    }
     return {"parameters": sum(p.numel() for p in network.parameters()), "values": plain_values}
 
 
@@ -92,10 +124,11 @@ def judged(text: str, source: PackedMaps, sets: dict[str, MapSet]) -> dict[str, 
 
 
 def extrapolate(rows: list[dict[str, Any]], key: str, wanted: float) -> dict[str, Any]:
-    """Fit 1 - IoU = k samples^-a to runs with other budgets; return a and the samples for the wanted IoU.
+    """Fit 1 - IoU = k samples^-a to runs with other budgets; return a and the samples for the
+    wanted IoU.
 
-    Intervals by bootstrap over objects, the same ones in all runs: they leave out that another seed differs, and that
-    the law may not hold so far away.
+    Intervals by bootstrap over objects, the same ones in all runs: they leave out that another seed
+    differs, and that the law may not hold so far away.
     """
     samples = np.log([row["samples"] for row in rows])
     lost = 1 - np.array([row["values"][key]["silhouette_iou"] for row in rows])
@@ -117,10 +150,20 @@ def draw_curve(rows: list[dict[str, Any]]) -> Figure:
     axes = figure.subplots()
     samples = np.array([row["samples"] for row in rows])
     for key in rows[0]["values"]:
-        each = [over_objects({"iou": np.array(row["values"][key]["silhouette_iou"])})["iou"] for row in rows]
-        values, low, high = (np.array([getattr(one, part) for one in each]) for part in ("value", "low", "high"))
+        each = [
+            over_objects({"iou": np.array(row["values"][key]["silhouette_iou"])})["iou"]
+            for row in rows
+        ]
+        values, low, high = (
+            np.array([getattr(one, part) for one in each]) for part in ("value", "low", "high")
+        )
         axes.errorbar(
-            samples, values, [values - low, high - values], marker="o", capsize=3, label=key.replace("_", " ")
+            samples,
+            values,
+            [values - low, high - values],
+            marker="o",
+            capsize=3,
+            label=key.replace("_", " "),
         )
     axes.set(xscale="log", xlabel="samples seen", ylabel="silhouette IoU")
     axes.legend()
@@ -135,7 +178,8 @@ def as_markdown(rows: list[dict[str, Any]]) -> str:
         lines = list[list[str]]()
         for row in rows:
             values = {metric: np.array(each) for metric, each in row["values"][key].items()}
-            figures, better = over_objects(values), plain(advantage(values, first))
+            figures = over_objects(values)
+            better = plain(advantage(values, first))
             lines.append(
                 [
                     row["name"],
@@ -146,7 +190,14 @@ def as_markdown(rows: list[dict[str, Any]]) -> str:
                     harness.difference(better["silhouette_iou"]),
                 ]
             )
-        head = ["variant", "million parameters", "samples/CPU s", "samples", *TARGETS, f"IoU against {rows[0]['name']}"]
+        head = [
+            "variant",
+            "million parameters",
+            "samples/CPU s",
+            "samples",
+            *TARGETS,
+            f"IoU against {rows[0]['name']}",
+        ]
         parts += [f"## {key.replace('_', ' ')}", harness.table(head, lines)]
     return "\n\n".join([*parts, NOTES]) + "\n"
 
@@ -159,7 +210,8 @@ def main(chosen: Namespace) -> None:
 
 def compare(chosen: Namespace, source: PackedMaps) -> None:
     """Train the variants on packed maps and write the tables after each."""
-    base, rig = load_recipe(RECIPE), rig_named("paper-rig")
+    base = load_recipe(RECIPE)
+    rig = rig_named("paper-rig")
     sets = {
         "kinds": rendered_objects(rig).maps,
         "unseen": rendered_objects(rig, test="unseen").maps,
@@ -169,22 +221,39 @@ def compare(chosen: Namespace, source: PackedMaps) -> None:
     path = chosen.out / "direct_ablations.json"
     rows = json.loads(path.read_text(encoding="utf-8")) if path.exists() else []
     jobs = [partial(judged, text, source, sets) for text in chosen.weights]
-    jobs += [partial(measure, *variant(text, base), source, sets, chosen) for text in chosen.variant]
+    jobs += [
+        partial(measure, *variant(text, base), source, sets, chosen) for text in chosen.variant
+    ]
     for job in jobs:
         row = job()
         rows = [*(one for one in rows if one["name"] != row["name"]), row]
         name = row["name"]
         path.write_text(json.dumps(rows), encoding="utf-8")
         (chosen.out / "direct_ablations.md").write_text(as_markdown(rows), encoding="utf-8")
-        figures = {key: over_objects({m: np.array(v) for m, v in rows[-1]["values"][key].items()}) for key in sets}
+        figures = {
+            key: over_objects({m: np.array(v) for m, v in rows[-1]["values"][key].items()})
+            for key in sets
+        }
         print(name, row["samples"], row["samples_per_s"], flush=True)
         for key, each in figures.items():
-            print("  ", key, {metric: format_interval(figure) for metric, figure in each.items()}, flush=True)
-    curve = sorted((row for row in rows if row["name"].startswith("curve")), key=itemgetter("samples"))
+            print(
+                "  ",
+                key,
+                {metric: format_interval(figure) for metric, figure in each.items()},
+                flush=True,
+            )
+    curve = sorted(
+        (row for row in rows if row["name"].startswith("curve")), key=itemgetter("samples")
+    )
     if len(curve) > 1:
-        fits = {key: extrapolate(curve, key, wanted) for key, wanted in {"kinds": 0.85, "unseen": 0.72}.items()}
+        fits = {
+            key: extrapolate(curve, key, wanted)
+            for key, wanted in {"kinds": 0.85, "unseen": 0.72}.items()
+        }
         facts = [{key: row[key] for key in ("name", "samples", "objects")} for row in curve]
-        (chosen.out / "direct_curve.json").write_text(json.dumps({"runs": facts, **fits}, indent=2), encoding="utf-8")
+        (chosen.out / "direct_curve.json").write_text(
+            json.dumps({"runs": facts, **fits}, indent=2), encoding="utf-8"
+        )
         (chosen.out / "images").mkdir(exist_ok=True)
         draw_curve(curve).savefig(chosen.out / "images" / "direct_curve.png", dpi=110)
         print(fits)

@@ -1,8 +1,9 @@
 """Calibration of the uncertainty network: docs/doubt.json and docs/images/reliability.png.
 
-Expected against observed error on the 54 test objects and on held-out ones; objects shown on empty benches; detection
-of outliers, of kinds in the training set and of others. `--weights DIR` names other weights than the shipped ones,
-`--count N` and `--empty N` set the samples of each kind, `--samples DIR` is the folder of the rendered samples.
+Expected against observed error on the 54 test objects and on held-out ones; objects shown on empty
+benches; detection of outliers, of kinds in the training set and of others. `--weights DIR` names
+other weights than the shipped ones, `--count N` and `--empty N` set the samples of each kind,
+`--samples DIR` is the folder of the rendered samples.
 """
 
 import json
@@ -18,7 +19,13 @@ import numpy as np
 from matplotlib.figure import Figure
 from nlos_calibration import Rig
 from nlos_calibration.arrays import Float64
-from nlos_models import Reconstructor, UncertaintyModel, load_reconstructor, load_uncertainty_model, weights_folder
+from nlos_models import (
+    Reconstructor,
+    UncertaintyModel,
+    load_reconstructor,
+    load_uncertainty_model,
+    weights_folder,
+)
 from numpy.typing import NDArray
 
 from nlos_cam.cli.common import tracked
@@ -38,7 +45,14 @@ from nlos_cam.evaluate import echoes_of, rig_of, sense, truth_of
 from nlos_cam.files import cache_folder
 from nlos_cam.frames import LidarMaps
 from nlos_cam.objects import benchmark_objects, depth_from_image, object_box
-from nlos_cam.reconstruct import FrameConditions, Reconstruction, Verdict, VerdictFilter, reconstruct, verdict_limits
+from nlos_cam.reconstruct import (
+    FrameConditions,
+    Reconstruction,
+    Verdict,
+    VerdictFilter,
+    reconstruct,
+    verdict_limits,
+)
 from nlos_cam.render import SensorModel
 
 BINS = 10
@@ -62,8 +76,11 @@ class Pipeline:
     """Pipeline of `live` for single frames, without a memory."""
 
     def __init__(self, rig: Rig, network: Reconstructor, doubter: UncertaintyModel) -> None:
-        self.rig, self.limits, self.learnt = rig, verdict_limits(doubter), doubter.record.learnt
-        self._network, self._doubter = network, doubter
+        self.rig = rig
+        self.limits = verdict_limits(doubter)
+        self.learnt = doubter.record.learnt
+        self._network = network
+        self._doubter = doubter
 
     def answer(self, depth_m: NDArray[np.float32], intensity: NDArray[np.float32]) -> Answer:
         """Return the answer to maps (64, 80)."""
@@ -80,8 +97,11 @@ def verdicts_of(answers: Sequence[Answer]) -> dict[str, int]:
 
 
 def errors_of(answers: Sequence[Answer], truth_m: NDArray[np.float32]) -> tuple[Float64, Float64]:
-    """Return expected and observed absolute error in metres (pixels,), where image and truth have surface."""
-    expected, observed = list[Float64](), list[Float64]()
+    """Return expected and observed absolute error in metres (pixels,), where image and truth have
+    surface.
+    """
+    expected = list[Float64]()
+    observed = list[Float64]()
     for one, true_m in zip(answers, truth_m, strict=True):
         off_m = np.abs(one.found.depth_m - true_m)
         there = ~np.isnan(off_m)
@@ -94,14 +114,23 @@ def reliability(expected: Float64, observed: Float64, bins: int = BINS) -> list[
     """Return the means of both in bins of equal size, by expected error."""
     order = np.array_split(np.argsort(expected), bins)
     return [
-        {"expected_mm": 1e3 * expected[some].mean(), "observed_mm": 1e3 * observed[some].mean(), "pixels": len(some)}
+        {
+            "expected_mm": 1e3 * expected[some].mean(),
+            "observed_mm": 1e3 * observed[some].mean(),
+            "pixels": len(some),
+        }
         for some in order
     ]
 
 
 def coverage(expected: Float64, observed: Float64) -> list[dict[str, float]]:
-    """Return the coverage of stated intervals; a Laplace interval has the half width -ln(1 - level) times the error."""
-    return [{"level": level, "observed": float((observed <= -np.log(1 - level) * expected).mean())} for level in LEVELS]
+    """Return the coverage of stated intervals; a Laplace interval has the half width -ln(1 - level)
+    times the error.
+    """
+    return [
+        {"level": level, "observed": float((observed <= -np.log(1 - level) * expected).mean())}
+        for level in LEVELS
+    ]
 
 
 def rank_correlation(one: Float64, other: Float64) -> float:
@@ -113,16 +142,22 @@ def of_objects(answers: Sequence[Answer], truth: NDArray[np.floating], rig: Rig)
     """Summarize ordinary objects: false alarms, and quality of the uncertainty."""
     truth_m = depth_from_image(np.asarray(truth, np.float32), object_box(rig))
     expected, observed = errors_of(answers, truth_m)
-    per_object = [errors_of([one], true_m[None]) for one, true_m in zip(answers, truth_m, strict=True)]
+    per_object = [
+        errors_of([one], true_m[None]) for one, true_m in zip(answers, truth_m, strict=True)
+    ]
     both = [(e.mean(), o.mean()) for e, o in per_object if e.size]
-    surface, there = (
-        np.concatenate([one.found.doubt.surface.ravel() for one in answers if one.found.doubt]).astype(np.float64),
-        (np.asarray(truth) > 0).ravel().astype(np.float64),
-    )
+    surface = np.concatenate(
+        [one.found.doubt.surface.ravel() for one in answers if one.found.doubt]
+    ).astype(np.float64)
+    there = (np.asarray(truth) > 0).ravel().astype(np.float64)
     return {
         "verdicts": verdicts_of(answers),
-        "told_outside": harness.wilson(sum(one.verdict == Verdict.OUTSIDE for one in answers), len(answers)),
-        "told_nothing": harness.wilson(sum(one.verdict == Verdict.NOTHING for one in answers), len(answers)),
+        "told_outside": harness.wilson(
+            sum(one.verdict == Verdict.OUTSIDE for one in answers), len(answers)
+        ),
+        "told_nothing": harness.wilson(
+            sum(one.verdict == Verdict.NOTHING for one in answers), len(answers)
+        ),
         "expected_mm": 1e3 * expected.mean(),
         "observed_mm": 1e3 * observed.mean(),
         "rank_correlation_of_pixels": rank_correlation(expected, observed),
@@ -130,8 +165,15 @@ def of_objects(answers: Sequence[Answer], truth: NDArray[np.floating], rig: Rig)
         "reliability": reliability(expected, observed),
         "coverage": coverage(expected, observed),
         "surface": [
-            {"expected": float(surface[some].mean()), "observed": float(there[some].mean()), "pixels": len(some)}
-            for some in (np.flatnonzero((surface >= k / BINS) & (surface <= (k + 1) / BINS)) for k in range(BINS))
+            {
+                "expected": float(surface[some].mean()),
+                "observed": float(there[some].mean()),
+                "pixels": len(some),
+            }
+            for some in (
+                np.flatnonzero((surface >= k / BINS) & (surface <= (k + 1) / BINS))
+                for k in range(BINS)
+            )
             if len(some)
         ],
     }
@@ -149,16 +191,26 @@ def of_outliers(answers: Sequence[Answer], cells: NDArray[np.int32]) -> dict[str
     }
 
 
-def study(pipeline: Pipeline, held_out: Path, samples: Path, count: int, empty: int, start: int) -> dict[str, Any]:
-    """Run the study; rows of the held-out maps before `start` were used in calibration and are skipped."""
-    rig, sensor = pipeline.rig, SensorModel()
+def study(
+    pipeline: Pipeline, held_out: Path, samples: Path, count: int, empty: int, start: int
+) -> dict[str, Any]:
+    """Run the study; rows of the held-out maps before `start` were used in calibration and are
+    skipped.
+    """
+    rig = pipeline.rig
+    sensor = SensorModel()
     with tracked("rendering the test objects") as on_progress:
         subjects = benchmark_objects(object_box(rig))
         maps = sense(echoes_of(subjects, rig, on_progress), rig)
     answers = [pipeline.answer(one.depth_m, one.intensity) for one in maps]
-    result: dict[str, Any] = {"test_objects": of_objects(answers, truth_of(subjects, object_box(rig)), rig)}
+    result: dict[str, Any] = {
+        "test_objects": of_objects(answers, truth_of(subjects, object_box(rig)), rig)
+    }
     usual = open_dataset(held_out).arrays()
-    answers = [pipeline.answer(*pair) for pair in zip(usual.depth_m[start:], usual.intensity[start:], strict=True)]
+    answers = [
+        pipeline.answer(*pair)
+        for pair in zip(usual.depth_m[start:], usual.intensity[start:], strict=True)
+    ]
     result["held_out_objects"] = of_objects(answers, usual.image[start:], rig)
     for kind in (EMPTY, ORDINARY, GENERIC, *TRAINING_OUTLIERS, *HELD_OUT_OUTLIERS):
         wanted = {kind: empty if kind == EMPTY else math.ceil(count * FEWER.get(kind, 1.0))}
@@ -172,7 +224,9 @@ def study(pipeline: Pipeline, held_out: Path, samples: Path, count: int, empty: 
                 accuracy="draft" if kind in FEWER else "standard",
                 on_progress=on_progress,
             )
-        answers = [pipeline.answer(*pair) for pair in zip(made.depth_m, made.intensity, strict=True)]
+        answers = [
+            pipeline.answer(*pair) for pair in zip(made.depth_m, made.intensity, strict=True)
+        ]
         if kind == EMPTY:
             false = harness.wilson(sum(one.shows for one in answers), len(answers))
             result["empty"] = {"false_objects": false, "verdicts": verdicts_of(answers)}
@@ -190,7 +244,9 @@ def flagged_by_sort(learnt: Mapping[str, Any], never_learnt: Mapping[str, Any]) 
     sorts = {
         "learnt": learnt,
         "never_learnt": never_learnt,
-        "learnt_out_of_range": {name: kind for name, kind in learnt.items() if name not in SHAPE_OUTLIERS},
+        "learnt_out_of_range": {
+            name: kind for name, kind in learnt.items() if name not in SHAPE_OUTLIERS
+        },
         "out_of_range": {name: kind for name, kind in both.items() if name not in SHAPE_OUTLIERS},
         "unlike_in_shape": {name: kind for name, kind in both.items() if name in SHAPE_OUTLIERS},
     }
@@ -246,14 +302,22 @@ def main() -> None:
         network = load_reconstructor(asked.weights, cache_folder() / "onnx")
         doubter = load_uncertainty_model(asked.weights, cache_folder() / "onnx")
         if doubter is None:
-            raise SceneError(f"{weights_folder(asked.weights)} has no doubt network: train one with `train doubt`")
+            raise SceneError(
+                f"{weights_folder(asked.weights)} has no doubt network: train one with `train"
+                " doubt`"
+            )
         pipeline = Pipeline(rig_of(network.record), network, doubter)
         start = doubter.record.recipe.held_out
         result = study(pipeline, asked.held_out, asked.samples, asked.count, asked.empty, start)
     result["limits"] = {"nothing": pipeline.limits.nothing, "outside": pipeline.limits.outside}
     harness.write("doubt", result, asked.out)
     harness.save("reliability", draw(result), asked.out, dpi=110)
-    print(json.dumps({name: found for name, found in result.items() if name == "empty" or "flagged" in name}, indent=2))
+    print(
+        json.dumps(
+            {name: found for name, found in result.items() if name == "empty" or "flagged" in name},
+            indent=2,
+        )
+    )
 
 
 if __name__ == "__main__":

@@ -1,7 +1,9 @@
-"""Harness of the studies: a grid of settings times seeds gives records, and from them tables, a figure and a JSON.
+"""Harness of the studies: a grid of settings times seeds gives records, and from them tables, a
+figure and a JSON.
 
-A study names its settings and a function that measures one of them; `collect` runs the grid with a progress bar and
-resumes where an interrupted run stopped. `write` and `save` put the results into docs/, `table` prints Markdown.
+A study names its settings and a function that measures one of them; `collect` runs the grid with a
+progress bar and resumes where an interrupted run stopped. `write` and `save` put the results into
+docs/, `table` prints Markdown.
 """
 
 import hashlib
@@ -42,17 +44,25 @@ def collect(
     seeds: int = 1,
     key: str = "",
 ) -> list[Record]:
-    """Measure every setting (dataclass instances) with every seed; return one record each, settings outermost.
+    """Measure every setting (dataclass instances) with every seed; return one record each, settings
+    outermost.
 
-    Every record holds the setting's fields, `seed` and the measured values. Finished records are appended to a file in
-    the cache until all are there; a second call of the same study, key and state of the code resumes from it.
+    Every record holds the setting's fields, `seed` and the measured values. Finished records are
+    appended to a file in the cache until all are there; a second call of the same study, key and
+    state of the code resumes from it.
     """
     store = cache_folder() / "studies" / f"{name}-{fingerprint(settings, seeds, key)}.jsonl"
     store.parent.mkdir(parents=True, exist_ok=True)
-    done = [json.loads(line) for line in store.read_text(encoding="utf-8").splitlines()] if store.exists() else []
+    done = (
+        [json.loads(line) for line in store.read_text(encoding="utf-8").splitlines()]
+        if store.exists()
+        else []
+    )
     grid = [(i, seed) for i in range(len(settings)) for seed in range(seeds)]
     with progress() as bar, store.open("a", encoding="utf-8") as file:
-        for i, seed in bar.track(grid[len(done) :], total=len(grid), completed=len(done), description=name):
+        for i, seed in bar.track(
+            grid[len(done) :], total=len(grid), completed=len(done), description=name
+        ):
             measured = measure(settings[i], np.random.default_rng([i, seed]))
             line = json.dumps(asdict(settings[i]) | {"seed": seed} | dict(measured))
             file.write(line + "\n")
@@ -71,10 +81,17 @@ def fingerprint(settings: Sequence[Any], seeds: int, key: str = "") -> str:
 
 def wilson(count: int, of: int) -> dict[str, Any]:
     """Return a share and its 95 % interval by Wilson's score."""
-    z, share = 1.96, count / of
+    z = 1.96
+    share = count / of
     middle = (share + z * z / (2 * of)) / (1 + z * z / of)
     half = z / (1 + z * z / of) * np.sqrt(share * (1 - share) / of + z * z / (4 * of * of))
-    return {"count": count, "of": of, "share": share, "low": max(0.0, middle - half), "high": min(1.0, middle + half)}
+    return {
+        "count": count,
+        "of": of,
+        "share": share,
+        "low": max(0.0, middle - half),
+        "high": min(1.0, middle + half),
+    }
 
 
 def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
@@ -84,7 +101,8 @@ def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
 
 def difference(figure: Mapping[str, float | None]) -> str:
     """Format a difference with its interval, in bold where the interval excludes 0."""
-    low, high = figure["low"], figure["high"]
+    low = figure["low"]
+    high = figure["high"]
     apart = low is not None and high is not None and not low <= 0 <= high
     return f"**{format_interval(figure)}**" if apart else format_interval(figure)
 

@@ -1,13 +1,16 @@
-"""Transfer to a bench: its recordings, figures on it and on the paper's rig, and the learning curve over recordings.
+"""Transfer to a bench: its recordings, figures on it and on the paper's rig, and the learning curve
+over recordings.
 
-python tools/studies/transfer.py record DIR [--scene examples/bench.toml] [--frames 8]
-python tools/studies/transfer.py figures DIR [--weights W]      docs/transfer.json
-python tools/studies/transfer.py curve DIR RUNS --recipe direct-transfer [--weights W]  docs/transfer_curve.json, .png
+python tools/studies/transfer.py record DIR [--scene examples/bench.toml] [--frames 8] python
+tools/studies/transfer.py figures DIR [--weights W]      docs/transfer.json python
+tools/studies/transfer.py curve DIR RUNS --recipe direct-transfer [--weights W]
+docs/transfer_curve.json, .png
 
-DIR holds the 54 test objects as labelled recordings of a simulated bench, for adaptation, validation and judging: of 8
-frames of 640 x 480 they take 0.4 GB and two minutes, and a second call resumes. Frames of a bench at rest differ by
-their noise alone, so that more of them would add little; a person's recordings of a few seconds have more. One frame of
-each of 18 objects that no run trains on is judged. RUNS holds the trainings, which resume.
+DIR holds the 54 test objects as labelled recordings of a simulated bench, for adaptation,
+validation and judging: of 8 frames of 640 x 480 they take 0.4 GB and two minutes, and a second call
+resumes. Frames of a bench at rest differ by their noise alone, so that more of them would add
+little; a person's recordings of a few seconds have more. One frame of each of 18 objects that no
+run trains on is judged. RUNS holds the trainings, which resume.
 """
 
 import argparse
@@ -34,16 +37,35 @@ from nlos_cam.errors import NlosCamError, RecordingError
 from nlos_cam.evaluate import mm_per_v, over_objects, per_object, plain, reconstruct_all
 from nlos_cam.files import cache_folder
 from nlos_cam.frames import maps_from_frame
-from nlos_cam.objects import CATEGORIES, BenchmarkObject, benchmark_objects, image_from_depth, object_box
+from nlos_cam.objects import (
+    CATEGORIES,
+    BenchmarkObject,
+    benchmark_objects,
+    image_from_depth,
+    object_box,
+)
 from nlos_cam.reconstruct import align_all
-from nlos_cam.recording import CaptureSession, CaptureTarget, finalize, load_sidecar, sidecar_path, verify
+from nlos_cam.recording import (
+    CaptureSession,
+    CaptureTarget,
+    finalize,
+    load_sidecar,
+    sidecar_path,
+    verify,
+)
 from nlos_cam.render import Scene, SceneFile, SensedImages, Sensor, SensorModel, load_scene, render
 
 SCENE = Path(__file__).parents[2] / "examples" / "bench.toml"
-ADAPTATION, VALIDATION, HELD_OUT = "adaptation", "validation", "held-out"
+ADAPTATION = "adaptation"
+VALIDATION = "validation"
+HELD_OUT = "held-out"
 """30 objects, 6 for the training's schedule, and 18 for judging: no object is in two parts."""
-HELD_OUT_NUMBER, VALIDATION_NUMBER, VALIDATION_EVERY = 3, 2, 3
-"""Of each category's three objects, one is held out; of every third category, another is for validation."""
+HELD_OUT_NUMBER = 3
+VALIDATION_NUMBER = 2
+VALIDATION_EVERY = 3
+"""Of each category's three objects, one is held out; of every third category, another is for
+validation.
+"""
 FRAMES = 8
 BETWEEN_S = 30.0
 """Time between starts of recordings, in which the object is changed and the lidar warms."""
@@ -115,21 +137,33 @@ def part_of(thing: BenchmarkObject) -> str:
 
 
 def takes(things: Sequence[BenchmarkObject], folder: Path) -> list[Take]:
-    """Return one take of each object, in order: F/adaptation/cup-1.bag, F/held-out/cup-3.bag, ..."""
+    """Return one take of each object, in order: F/adaptation/cup-1.bag, F/held-out/cup-3.bag,
+    ...
+    """
     apart = round(BETWEEN_S * FRAMES_PER_S)
-    return [Take(thing, folder / part_of(thing) / f"{thing.name}.bag", k * apart) for k, thing in enumerate(things)]
+    return [
+        Take(thing, folder / part_of(thing) / f"{thing.name}.bag", k * apart)
+        for k, thing in enumerate(things)
+    ]
 
 
 def record(take: Take, scene: SceneFile, frames: int) -> None:
-    """Make one recording and its sidecar, and read it back. Raises the error that ended it, if one did."""
+    """Make one recording and its sidecar, and read it back. Raises the error that ended it, if one
+    did.
+    """
     take.path.parent.mkdir(parents=True, exist_ok=True)
     sidecar_path(take.path).unlink(missing_ok=True)  # until it is there, nothing is whole
     np.save(take.truth, take.thing.depth_m)
     bare = scene.bare
-    shown = Scene(scene.rig, take.thing.depth_m, bare.surface, scene.radiometry, scene.jump_m, bare.pulse_ns)
+    shown = Scene(
+        scene.rig, take.thing.depth_m, bare.surface, scene.radiometry, scene.jump_m, bare.pulse_ns
+    )
     recording = Recording(take.path, frames=frames)
     camera = SimulatedCamera(
-        f"sim:{scene.rig.name}", Later(scene, shown, take.since), clock=HurriedClock(), recording=recording
+        f"sim:{scene.rig.name}",
+        Later(scene, shown, take.since),
+        clock=HurriedClock(),
+        recording=recording,
     )
     job = CaptureTarget(take.path, take.thing.name)
     for made in CaptureSession(camera, recording, [job]).record(Event(), lambda _: None):
@@ -164,7 +198,9 @@ def record_bench(asked: argparse.Namespace) -> None:
 
 
 def judge(reconstructor: Reconstructor, maps: MapSet, box: ObjectBox) -> dict[str, Any]:
-    """Return the metrics by name over samples, each {value, low, high}, and the number of samples."""
+    """Return the metrics by name over samples, each {value, low, high}, and the number of
+    samples.
+    """
     image, truth = reconstruct_all(reconstructor, maps), maps.image.astype(np.float32)
     too_far_mm = mm_per_v(box) * too_far(image, truth)
     values = {**per_object(image, truth, box), "foreground_too_far_mm": too_far_mm}
@@ -190,20 +226,34 @@ def paper_box() -> ObjectBox:
 def on_paper_rig(on_progress: OnProgress) -> dict[str, MapSet]:
     """Render each part of the test set on the paper's rig, with the sensor's noise."""
     rig = load_rig("paper-rig")
-    box, sensor = object_box(rig), Sensor(rig, SensorModel())
+    box = object_box(rig)
+    sensor = Sensor(rig, SensorModel())
     parts: dict[str, list[tuple[Float32, Float32, Float32]]] = {part: [] for part in PARTS}
     for number, thing in enumerate(things := benchmark_objects(box)):
-        images = sensor.expose(render(Scene(rig, thing.depth_m)).multi, np.random.default_rng([number, 1]))
+        images = sensor.expose(
+            render(Scene(rig, thing.depth_m)).multi, np.random.default_rng([number, 1])
+        )
         maps = maps_from_frame(images.frame(rig.pinhole))
-        parts[part_of(thing)].append((maps.depth_m, maps.intensity, image_from_depth(thing.depth_m, box)))
+        parts[part_of(thing)].append(
+            (maps.depth_m, maps.intensity, image_from_depth(thing.depth_m, box))
+        )
         on_progress(number + 1, len(things))
-    return {part: MapSet(*map(np.stack, zip(*samples, strict=True))) for part, samples in parts.items()}
+    return {
+        part: MapSet(*map(np.stack, zip(*samples, strict=True))) for part, samples in parts.items()
+    }
 
 
-def on_bench(folder: Path, trained: CheckpointRecord, on_progress: OnProgress) -> dict[str, dict[str, MapSet]]:
-    """Read one frame of each recording of each folder: aligned with the rig of weights, and as measured."""
+def on_bench(
+    folder: Path, trained: CheckpointRecord, on_progress: OnProgress
+) -> dict[str, dict[str, MapSet]]:
+    """Read one frame of each recording of each folder: aligned with the rig of weights, and as
+    measured.
+    """
     found = {part: list_recordings(folder / part) for part in PARTS}
-    read = {part: read_labelled(paths, frames=1, on_progress=on_progress) for part, paths in found.items()}
+    read = {
+        part: read_labelled(paths, frames=1, on_progress=on_progress)
+        for part, paths in found.items()
+    }
     aligned = {part: align_all(one.maps, one.rig, trained) for part, one in read.items()}
     return {"bench": aligned, "bench, not aligned": {part: one.maps for part, one in read.items()}}
 
@@ -217,18 +267,25 @@ def figures(asked: argparse.Namespace) -> None:
         rigs |= on_bench(asked.folder, reconstructor.record, on_progress)
     box = paper_box()
     found = {
-        rig: {part: judge(reconstructor, maps, box) for part, maps in parts.items()} for rig, parts in rigs.items()
+        rig: {part: judge(reconstructor, maps, box) for part, maps in parts.items()}
+        for rig, parts in rigs.items()
     }
     harness.write("transfer", {"weights": str(asked.weights or "shipped"), **found}, asked.out)
     for rig, parts in found.items():
         for part, one in parts.items():
-            iou, rmse_mm = one["silhouette_iou"]["value"], one["foreground_rmse_mm"]["value"]
-            print(f"{rig} {part}: {one['objects']} objects, silhouette IoU {iou:.3f}, foreground RMSE {rmse_mm:.1f} mm")
+            iou = one["silhouette_iou"]["value"]
+            rmse_mm = one["foreground_rmse_mm"]["value"]
+            print(
+                f"{rig} {part}: {one['objects']} objects, silhouette IoU {iou:.3f}, foreground RMSE"
+                f" {rmse_mm:.1f} mm"
+            )
 
 
 @dataclass(frozen=True)
 class Lesson:
-    """Data, number of frames (not recordings) and run folder of one training; a second call resumes there."""
+    """Data, number of frames (not recordings) and run folder of one training; a second call resumes
+    there.
+    """
 
     dataset: Path
     validation: Path
@@ -250,7 +307,9 @@ class Point:
 
 
 def commanded(task: str, recipe: Path, *others: object) -> Trainer:
-    """Return `nlos-cam train TASK` as a trainer, which raises NlosCamError where the command fails."""
+    """Return `nlos-cam train TASK` as a trainer, which raises NlosCamError where the command
+    fails.
+    """
 
     def train(lesson: Lesson) -> Path:
         given = {
@@ -260,16 +319,28 @@ def commanded(task: str, recipe: Path, *others: object) -> Trainer:
             "--objects": lesson.samples,
             "--out": lesson.out,
         }
-        arguments = ["train", task, *(str(part) for pair in given.items() for part in pair), *map(str, others)]
+        arguments = [
+            "train",
+            task,
+            *(str(part) for pair in given.items() for part in pair),
+            *map(str, others),
+        ]
         if code := nlos_cam(arguments):
-            raise NlosCamError(f"nlos-cam {' '.join(arguments)} ended with {code}: see above; run this again to go on")
+            raise NlosCamError(
+                f"nlos-cam {' '.join(arguments)} ended with {code}: see above; run this again to"
+                " go on"
+            )
         return lesson.out
 
     return train
 
 
-def nested(recordings: Sequence[Path], counts: Sequence[int], seed: int = 0) -> dict[int, list[Path]]:
-    """Return for each count that number of recordings, at most all, in a random order: each set is within the next."""
+def nested(
+    recordings: Sequence[Path], counts: Sequence[int], seed: int = 0
+) -> dict[int, list[Path]]:
+    """Return for each count that number of recordings, at most all, in a random order: each set is
+    within the next.
+    """
     order = np.random.default_rng(seed).permutation(len(recordings))
     sizes = sorted({min(count, len(recordings)) for count in counts})
     return {size: [recordings[k] for k in order[:size]] for size in sizes}
@@ -310,11 +381,15 @@ def _reached(lesson: Lesson, trainer: Trainer, held_out: Labelled) -> dict[str, 
 
 def _judged(weights: Path | None, held_out: Labelled) -> dict[str, Any]:
     reconstructor = load_reconstructor(weights, cache_folder() / "onnx")
-    return judge(reconstructor, align_all(held_out.maps, held_out.rig, reconstructor.record), paper_box())
+    return judge(
+        reconstructor, align_all(held_out.maps, held_out.rig, reconstructor.record), paper_box()
+    )
 
 
 def draw(points: Sequence[Point]) -> Figure:
-    """Draw foreground RMSE and silhouette IoU against the number of recordings, with their intervals."""
+    """Draw foreground RMSE and silhouette IoU against the number of recordings, with their
+    intervals.
+    """
     figure = Figure(figsize=(9, 3.6), layout="constrained")
     named = {"foreground_rmse_mm": "foreground RMSE, mm", "silhouette_iou": "silhouette IoU"}
     for axis, (metric, title) in zip(figure.subplots(1, 2), named.items(), strict=True):
@@ -322,7 +397,9 @@ def draw(points: Sequence[Point]) -> Figure:
         axis.axhline(start, color="grey", linestyle=":", label="before")
         for trainer in dict.fromkeys(point.trainer for point in points[1:]):
             own = [point for point in points if point.trainer == trainer]
-            ends = [[point.figures[metric][part] for part in ("value", "low", "high")] for point in own]
+            ends = [
+                [point.figures[metric][part] for part in ("value", "low", "high")] for point in own
+            ]
             value, low, high = np.array(ends, float).T
             at = [point.recordings for point in own]
             axis.plot(at, value, marker="o", label=trainer)
@@ -335,7 +412,8 @@ def draw(points: Sequence[Point]) -> Figure:
 def run_curve(asked: argparse.Namespace) -> None:
     """Train on growing numbers of recordings, and judge."""
     given = ["--weights", asked.weights] if asked.weights else []
-    trainers, points = {"transfer": commanded("transfer", asked.recipe, *given)}, list[Point]()
+    trainers = {"transfer": commanded("transfer", asked.recipe, *given)}
+    points = list[Point]()
     for point in curve(asked.folder, asked.runs, trainers, asked.weights, asked.counts):
         points.append(point)
         names = "foreground_rmse_mm", "foreground_too_far_mm", "silhouette_iou"
@@ -362,7 +440,9 @@ def main() -> None:
             part.add_argument("runs", type=Path)
             part.add_argument("--recipe", type=Path, required=True)
             part.add_argument("--counts", type=int, nargs="+", default=COUNTS)
-        part.add_argument("--weights", type=Path, help="initial weights (default: the shipped ones)")
+        part.add_argument(
+            "--weights", type=Path, help="initial weights (default: the shipped ones)"
+        )
         part.add_argument("--out", type=Path, help="folder of the results (default: docs)")
     asked = parser.parse_args()
     asked.run(asked)

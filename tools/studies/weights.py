@@ -1,10 +1,12 @@
 """Weights: the limits of their figures, and their range of rigs.
 
-python tools/studies/weights.py limits [--weights DIR] [--frames 10 100]   docs/limits.json
-python tools/studies/weights.py rigs [--weights [NAME=]DIR ...]            docs/rig_map.json and images/rig_map.png
+python tools/studies/weights.py limits [--weights DIR] [--frames 10 100]   docs/limits.json python
+tools/studies/weights.py rigs [--weights [NAME=]DIR ...]            docs/rig_map.json and
+images/rig_map.png
 
-`limits` evaluates with one thing removed or added at a time. `rigs` moves the lidar over the distances and angles of
-SI 1 and by what a bench built with a ruler is off, while occluder and object box stay, and resumes.
+`limits` evaluates with one thing removed or added at a time. `rigs` moves the lidar over the
+distances and angles of SI 1 and by what a bench built with a ruler is off, while occluder and
+object box stay, and resumes.
 """
 
 import argparse
@@ -66,12 +68,15 @@ from nlos_cam.objects import benchmark_objects, object_box
 from nlos_cam.reconstruct import estimate_doubt
 
 FRAMES = 10, 100
-DISTANCES_M, ANGLES_DEG = (0.15, 0.2, 0.25, 0.3), (15.0, 30.0, 45.0, 60.0, 75.0)
+DISTANCES_M = (0.15, 0.2, 0.25, 0.3)
+ANGLES_DEG = (15.0, 30.0, 45.0, 60.0, 75.0)
 
 
 @dataclass(frozen=True)
 class Row:
-    """Figures of one experiment; the latent error is in units of the encoder's spread, None without an encoder."""
+    """Figures of one experiment; the latent error is in units of the encoder's spread, None without
+    an encoder.
+    """
 
     name: str
     tells: str
@@ -86,7 +91,9 @@ class Network:
     def __init__(self, folder: Path) -> None:
         self.pipeline, self.record = load_pipeline(folder)
         recipe = self.record.compressor_recipe
-        joint = recipe and recipe.steps == "two-then-joint"  # its decoder has left the encoder's latent
+        joint = (
+            recipe and recipe.steps == "two-then-joint"
+        )  # its decoder has left the encoder's latent
         self.encoder = None if joint else load_encoder(folder)
         self.rig = rig_of(self.record)
         self.plan = DatasetPlan(self.rig, TEST_SEED)
@@ -99,7 +106,9 @@ class Network:
 
     @torch.inference_mode()
     def rebuilt(self, truth: Float32) -> Float32 | None:
-        """Return the image of the true latent, cut and lifted as the pipeline does; None without an encoder."""
+        """Return the image of the true latent, cut and lifted as the pipeline does; None without an
+        encoder.
+        """
         if self.encoder is None:
             return None
         image = self.pipeline.decoder(self.encoder(torch.from_numpy(truth)[:, None])[0])
@@ -109,43 +118,68 @@ class Network:
     def latent_error(self, maps: MapSet) -> float | None:
         """Return the error of the compressor's latent; None without an encoder."""
         truth = torch.from_numpy(maps.image)[:, None]
-        return None if self.encoder is None else float(latent_error(self._latent(maps), *self.encoder(truth)))
+        return (
+            None
+            if self.encoder is None
+            else float(latent_error(self._latent(maps), *self.encoder(truth)))
+        )
 
     def _latent(self, maps: MapSet) -> torch.Tensor:
-        return self.pipeline.latent(torch.from_numpy(maps.depth_m), torch.from_numpy(maps.intensity))
+        return self.pipeline.latent(
+            torch.from_numpy(maps.depth_m), torch.from_numpy(maps.intensity)
+        )
 
 
 def experiments(
-    folder: Path, subjects: Sequence[Subject], trained: Sequence[Subject], frames: Sequence[int] = FRAMES
+    folder: Path,
+    subjects: Sequence[Subject],
+    trained: Sequence[Subject],
+    frames: Sequence[int] = FRAMES,
 ) -> Iterator[Row]:
     """Yield one row per experiment; `trained` are objects of the training set.
 
-    Weights trained in one step, or jointly at last, have no latent of the VAE: its experiments are left out.
+    Weights trained in one step, or jointly at last, have no latent of the VAE: its experiments are
+    left out.
     """
     network = Network(folder)
     rig, box = network.rig, object_box(network.rig)
-    truth, count = truth_of(subjects, box), len(subjects)
+    truth = truth_of(subjects, box)
+    count = len(subjects)
     with tracked("rendering") as on_progress:
         echoes = echoes_of([*subjects, *trained], rig, on_progress)
 
     def row(name: str, change: str, sensed: Any, images: Float32 = truth) -> Row:
         maps = network_input(as_map_set(sensed, images), network.bare, repeat(rig), network.record)
-        return Row(name, change, judge(run(network.pipeline, maps), maps.image, box), network.latent_error(maps))
+        return Row(
+            name,
+            change,
+            judge(run(network.pipeline, maps), maps.image, box),
+            network.latent_error(maps),
+        )
 
     first = sense(echoes[:count], rig)
     maps = network_input(as_map_set(first, truth), network.bare, repeat(rig), network.record)
     yield row("as evaluated", "both steps, noise on, one frame", first)
     if (rebuilt := network.rebuilt(truth)) is not None:
-        yield Row("VAE alone", "no compressor: the decoder on the true latent", judge(rebuilt, truth, box))
+        yield Row(
+            "VAE alone", "no compressor: the decoder on the true latent", judge(rebuilt, truth, box)
+        )
         against = judge(run(network.pipeline, maps), rebuilt, box)
-        yield Row("compressor alone", "no VAE error: against the decoder's image of the true latent", against)
+        yield Row(
+            "compressor alone",
+            "no VAE error: against the decoder's image of the true latent",
+            against,
+        )
     raw = judge(network.raw_image(maps), truth, box)
     yield Row("no silhouette step", "the decoder's image, neither cut nor lifted", raw)
     yield row("noise off", "no noise, no dead pixels", sense(echoes[:count], rig, QUIET))
     for number in frames:
         yield row(f"{number} frames", "averaged", sense(echoes[:count], rig, frames=number))
     yield row(
-        "training's objects", "by their seeds, with other noise", sense(echoes[count:], rig), truth_of(trained, box)
+        "training's objects",
+        "by their seeds, with other noise",
+        sense(echoes[count:], rig),
+        truth_of(trained, box),
     )
 
 
@@ -155,7 +189,9 @@ def limits(asked: argparse.Namespace) -> None:
     subjects = benchmark_objects(box)
     trained = seeded_objects(TRAINING_SEED, len(subjects), box)
     rows = [*experiments(asked.weights, subjects, trained, asked.frames)]
-    harness.write("limits", {"objects": len(subjects), "rows": [asdict(row) for row in rows]}, asked.out)
+    harness.write(
+        "limits", {"objects": len(subjects), "rows": [asdict(row) for row in rows]}, asked.out
+    )
     print(limits_table(rows))
 
 
@@ -180,18 +216,30 @@ class Place:
     up_m: float = 0.0
 
     def rig(self, rig: Rig) -> Rig:
-        """Return the rig with its lidar here; positions on the wall are relative to the lidar's foot."""
+        """Return the rig with its lidar here; positions on the wall are relative to the lidar's
+        foot.
+        """
         lidar = rig.lidar.model_copy(
-            update={"distance_m": self.distance_m, "yaw_deg": self.yaw_deg, "pitch_deg": self.pitch_deg}
+            update={
+                "distance_m": self.distance_m,
+                "yaw_deg": self.yaw_deg,
+                "pitch_deg": self.pitch_deg,
+            }
         )
         update: dict[str, Any] = {"name": f"{rig.name} with another lidar's place", "lidar": lidar}
         for part in ("wall", "relay", "object_box"):
             extent = getattr(rig, part)
-            ends = {f"x_{end}_m": getattr(extent, f"x_{end}_m") - self.aside_m for end in ("min", "max")}
-            ends |= {f"y_{end}_m": getattr(extent, f"y_{end}_m") - self.up_m for end in ("min", "max")}
+            ends = {
+                f"x_{end}_m": getattr(extent, f"x_{end}_m") - self.aside_m for end in ("min", "max")
+            }
+            ends |= {
+                f"y_{end}_m": getattr(extent, f"y_{end}_m") - self.up_m for end in ("min", "max")
+            }
             update[part] = extent.model_copy(update=ends)
         if rig.occluder:
-            update["occluder"] = rig.occluder.model_copy(update={"x_m": rig.occluder.x_m - self.aside_m})
+            update["occluder"] = rig.occluder.model_copy(
+                update={"x_m": rig.occluder.x_m - self.aside_m}
+            )
         return rig.model_copy(update=update)
 
 
@@ -213,34 +261,55 @@ OFF = Place(0.001, 0.2, 0.2, 0.001, 0.001)
 Judged = tuple[Reconstructor, UncertaintyModel | None]
 
 
-def cell(place: Place, rig: Rig, subjects: Sequence[Subject], weights: Mapping[str, Judged]) -> dict[str, Any]:
-    """Return the figures of all weights with a rig's lidar elsewhere, with maps aligned with their own rig and without.
+def cell(
+    place: Place, rig: Rig, subjects: Sequence[Subject], weights: Mapping[str, Judged]
+) -> dict[str, Any]:
+    """Return the figures of all weights with a rig's lidar elsewhere, with maps aligned with their
+    own rig and without.
 
-    They are also aligned by a record that is off. Difference maps are relative to the rig's own bare wall. `outside` is
-    the share of objects that are flagged.
+    They are also aligned by a record that is off. Difference maps are relative to the rig's own
+    bare wall. `outside` is the share of objects that are flagged.
     """
     apart = zip(astuple(place), astuple(OFF), strict=True)
     rig, believed = place.rig(rig), Place(*(value + off for value, off in apart)).rig(rig)
-    box, plan = object_box(rig), DatasetPlan(rig, TEST_SEED)
+    box = object_box(rig)
+    plan = DatasetPlan(rig, TEST_SEED)
     truth = truth_of(subjects, box)
     maps = as_map_set(sense(echoes_of(subjects, rig, lambda *_: None), rig), truth)
 
-    def figures(network: Reconstructor, doubter: UncertaintyModel | None, taken: MapSet) -> dict[str, Any]:
+    def figures(
+        network: Reconstructor, doubter: UncertaintyModel | None, taken: MapSet
+    ) -> dict[str, Any]:
         images = reconstruct_all(network, taken)
         found = plain(judge(images, truth, box))
-        found = {of: {end: value and round(value, 4) for end, value in one.items()} for of, one in found.items()}
+        found = {
+            of: {end: value and round(value, 4) for end, value in one.items()}
+            for of, one in found.items()
+        }
         if doubter:
-            seen = (LidarMaps(*pair, ~np.isnan(pair[0])) for pair in zip(taken.depth_m, taken.intensity, strict=True))
-            doubts = [estimate_doubt(doubter, one, image, box) for one, image in zip(seen, images, strict=True)]
-            found["outside"] = float(np.mean([doubt.outside > doubter.record.outside_above for doubt in doubts]))
+            seen = (
+                LidarMaps(*pair, ~np.isnan(pair[0]))
+                for pair in zip(taken.depth_m, taken.intensity, strict=True)
+            )
+            doubts = [
+                estimate_doubt(doubter, one, image, box)
+                for one, image in zip(seen, images, strict=True)
+            ]
+            found["outside"] = float(
+                np.mean([doubt.outside > doubter.record.outside_above for doubt in doubts])
+            )
         return found
 
     found = dict[str, Any]()
     for name, judged in weights.items():
         record = judged[0].record
-        found[name] = figures(*judged, network_input(maps, bare_wall_for(record, plan), repeat(plan.rig), record))
+        found[name] = figures(
+            *judged, network_input(maps, bare_wall_for(record, plan), repeat(plan.rig), record)
+        )
         if record.input == "raw maps":
-            found[f"{name}, record off"] = figures(*judged, network_input(maps, None, repeat(believed), record))
+            found[f"{name}, record off"] = figures(
+                *judged, network_input(maps, None, repeat(believed), record)
+            )
             found[f"{name}, not aligned"] = figures(*judged, maps)
     return {
         "rig_checksum": rig.checksum,
@@ -253,23 +322,43 @@ def cell(place: Place, rig: Rig, subjects: Sequence[Subject], weights: Mapping[s
 def rigs(asked: argparse.Namespace) -> None:
     """Map the figures of weights over the rigs of SI 1."""
     folders: dict[str, Path | None] = harness.by_name(asked.weights) or {"shipped": None}
-    graphs, weights = cache_folder() / "onnx", dict[str, Judged]()
+    graphs = cache_folder() / "onnx"
+    weights = dict[str, Judged]()
     for name, folder in folders.items():
-        weights[name] = load_reconstructor(folder, graphs), load_uncertainty_model(folder, graphs, quality=False)
+        weights[name] = (
+            load_reconstructor(folder, graphs),
+            load_uncertainty_model(folder, graphs, quality=False),
+        )
     rig = load_rig(asked.rig)
     subjects = benchmark_objects(object_box(rig))
-    places = [*(Place(distance_m, yaw_deg) for distance_m in DISTANCES_M for yaw_deg in ANGLES_DEG), *BENCHES]
-    files = [file for folder in folders.values() for file in sorted(weights_folder(folder).iterdir())]
-    key = hashlib.sha256(b"".join(file.read_bytes() for file in files if file.is_file())).hexdigest()
-    measured = harness.collect("rigs", places, lambda place, _: cell(place, rig, subjects, weights), key=key)
-    cells, benches = measured[: -len(BENCHES)], measured[-len(BENCHES) :]
-    harness.write("rig_map", {"objects": len(subjects), "cells": cells, "benches": benches}, asked.out)
+    places = [
+        *(Place(distance_m, yaw_deg) for distance_m in DISTANCES_M for yaw_deg in ANGLES_DEG),
+        *BENCHES,
+    ]
+    files = [
+        file for folder in folders.values() for file in sorted(weights_folder(folder).iterdir())
+    ]
+    key = hashlib.sha256(
+        b"".join(file.read_bytes() for file in files if file.is_file())
+    ).hexdigest()
+    measured = harness.collect(
+        "rigs", places, lambda place, _: cell(place, rig, subjects, weights), key=key
+    )
+    cells = measured[: -len(BENCHES)]
+    benches = measured[-len(BENCHES) :]
+    harness.write(
+        "rig_map", {"objects": len(subjects), "cells": cells, "benches": benches}, asked.out
+    )
     harness.save("rig_map", draw_rigs(cells, rig), asked.out, dpi=80)
     for one in measured:
         print({key: one[key] for key in asdict(Place())})
         for name, figures in one["weights"].items():
-            iou, rmse_mm = figures["silhouette_iou"]["value"], figures["foreground_rmse_mm"]["value"]
-            print(f"    {name}: IoU {iou:.3f}, RMSE {rmse_mm:.0f} mm, flagged {figures.get('outside')}")
+            iou = figures["silhouette_iou"]["value"]
+            rmse_mm = figures["foreground_rmse_mm"]["value"]
+            print(
+                f"    {name}: IoU {iou:.3f}, RMSE {rmse_mm:.0f} mm, flagged"
+                f" {figures.get('outside')}"
+            )
 
 
 def draw_rigs(cells: Sequence[Mapping[str, Any]], rig: Rig) -> Figure:
@@ -277,7 +366,9 @@ def draw_rigs(cells: Sequence[Mapping[str, Any]], rig: Rig) -> Figure:
     names = [name for name in cells[0]["weights"] if "record off" not in name]
     distances, angles = (sorted({one[of] for one in cells}) for of in ("distance_m", "yaw_deg"))
     figure = Figure(figsize=(3.4 * len(TARGETS), 2.9 * len(names)), layout="constrained")
-    for row, name in zip(figure.subplots(len(names), len(TARGETS), squeeze=False), names, strict=True):
+    for row, name in zip(
+        figure.subplots(len(names), len(TARGETS), squeeze=False), names, strict=True
+    ):
         for axis, metric in zip(row, TARGETS, strict=True):
             values = np.full((len(distances), len(angles)), np.nan)
             for one in cells:
@@ -285,10 +376,20 @@ def draw_rigs(cells: Sequence[Mapping[str, Any]], rig: Rig) -> Figure:
                 value = one["weights"][name][metric]["value"]
                 values[at] = np.nan if value is None else value
             draw_heat(axis, values, metric)
-            axis.set(xticks=range(len(angles)), xticklabels=[f"{angle:g}" for angle in angles], xlabel="angle, degrees")
-            axis.set(yticks=range(len(distances)), yticklabels=[f"{distance:g}" for distance in distances])
+            axis.set(
+                xticks=range(len(angles)),
+                xticklabels=[f"{angle:g}" for angle in angles],
+                xlabel="angle, degrees",
+            )
+            axis.set(
+                yticks=range(len(distances)),
+                yticklabels=[f"{distance:g}" for distance in distances],
+            )
             if rig.lidar.distance_m in distances and rig.lidar.yaw_deg in angles:
-                corner = angles.index(rig.lidar.yaw_deg) - 0.5, distances.index(rig.lidar.distance_m) - 0.5
+                corner = (
+                    angles.index(rig.lidar.yaw_deg) - 0.5,
+                    distances.index(rig.lidar.distance_m) - 0.5,
+                )
                 axis.add_patch(Rectangle(corner, 1, 1, fill=False, edgecolor="red", linewidth=2))
         row[0].set_ylabel(f"{name}\ndistance, m")
     return figure
@@ -302,7 +403,9 @@ def draw_heat(axis: Any, values: Any, metric: str) -> None:
     axis.imshow(values, cmap="viridis_r" if smaller else "viridis", aspect="auto", origin="lower")
     for (i, j), value in np.ndenumerate(values):
         bright = (value - low) / max(high - low, 1e-9)
-        ink = "white" if (1 - bright if smaller else bright) <= 0.55 else "black"  # cells without a value are white
+        ink = (
+            "white" if (1 - bright if smaller else bright) <= 0.55 else "black"
+        )  # cells without a value are white
         words = "none" if np.isnan(value) else f"{value:.0f}" if smaller else f"{value:.2f}"
         axis.text(j, i, words, ha="center", va="center", fontsize=8, color=ink)
     axis.set_title(metric.replace("_", " "), fontsize=9)
@@ -312,10 +415,15 @@ def main() -> None:
     """Run the named study."""
     parser = harness.options(__doc__)
     commands = parser.add_subparsers(required=True)
-    parts = {work.__name__: commands.add_parser(work.__name__, help=work.__doc__) for work in (limits, rigs)}
+    parts = {
+        work.__name__: commands.add_parser(work.__name__, help=work.__doc__)
+        for work in (limits, rigs)
+    }
     for work in (limits, rigs):
         parts[work.__name__].set_defaults(run=work)
-        parts[work.__name__].add_argument("--out", type=Path, help="folder of the results (default: docs)")
+        parts[work.__name__].add_argument(
+            "--out", type=Path, help="folder of the results (default: docs)"
+        )
     parts["limits"].add_argument("--weights", type=Path, default=shipped_folder("paper"))
     parts["limits"].add_argument("--frames", type=int, nargs="*", default=list(FRAMES))
     parts["rigs"].add_argument("--weights", type=harness.named, action="append", default=[])
