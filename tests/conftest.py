@@ -26,22 +26,29 @@ def nothing_left_running() -> Iterator[None]:
 
 
 class NoiseWorld:
-    """Small world of noise, in which a frame's number determines its bits; it ends with an error at one of them."""
+    """Small world of noise, in which a frame's number determines its bits; it ends with an error at
+    one of them.
+    """
 
-    width, height = 64, 48
+    width = 64
+    height = 48
     fails_at: int | None = None
     error: Exception = ZeroDivisionError("the world ended")
 
     def __init__(self) -> None:
         rig = load_rig("paper-rig")
         small = rig.pinhole.scaled(self.width, self.height)
-        self.rig: Rig = rig.model_copy(update={"intrinsics": rig.intrinsics.model_copy(update=vars(small))})
+        self.rig: Rig = rig.model_copy(
+            update={"intrinsics": rig.intrinsics.model_copy(update=vars(small))}
+        )
 
     def images(self, number: int) -> SensedImages:
         if number == self.fails_at:
             raise self.error
-        noise, shape = np.random.default_rng(number), (self.height, self.width)
-        depth, ir = noise.integers(0, 65536, shape, np.uint16), noise.integers(0, 256, shape, np.uint8)
+        noise = np.random.default_rng(number)
+        shape = (self.height, self.width)
+        depth = noise.integers(0, 65536, shape, np.uint16)
+        ir = noise.integers(0, 256, shape, np.uint8)
         depth[0, :8] = 0
         return SensedImages(depth, ir, noise.integers(0, 16, shape, np.uint8))
 
@@ -77,9 +84,13 @@ def hurried_clock() -> type[HurriedClock]:
 
 
 def record_noise(path: Path, frames: int, world: Any = None) -> Path:
-    """Record the first frames of a world, a NoiseWorld if none is given, without waiting for real time."""
+    """Record the first frames of a world, a NoiseWorld if none is given, without waiting for real
+    time.
+    """
     recording = Recording(path, frames=frames)
-    with SimulatedCamera("sim:noise", world or NoiseWorld(), clock=HurriedClock(), recording=recording) as camera:
+    with SimulatedCamera(
+        "sim:noise", world or NoiseWorld(), clock=HurriedClock(), recording=recording
+    ) as camera:
         for _ in camera:
             pass
     return path
@@ -101,9 +112,13 @@ def fake_camera() -> Callable[..., L515Camera]:
     """Make an L515Camera on a fake SDK with these lidars and a clock that moves only by waiting."""
 
     def make(
-        *lidars: FakeLidar, serial: str = "", clock: NapClock | None = None, recording: Recording | None = None
+        *lidars: FakeLidar,
+        serial: str = "",
+        clock: NapClock | None = None,
+        recording: Recording | None = None,
     ) -> L515Camera:
-        uri, sdk = f"l515:{serial}".rstrip(":"), FakeSdk(*lidars)
+        uri = f"l515:{serial}".rstrip(":")
+        sdk = FakeSdk(*lidars)
         return L515Camera(uri, serial, sdk=sdk, clock=clock or NapClock(), recording=recording)
 
     return make

@@ -1,4 +1,6 @@
-"""Seconds of the dial's quick stops on the default scene: `pytest tests/bench -m bench --benchmark-enable`."""
+"""Seconds of the dial's quick stops on the default scene: `pytest tests/bench -m bench
+--benchmark-enable`.
+"""
 
 import pytest
 from pytest_benchmark.fixture import BenchmarkFixture

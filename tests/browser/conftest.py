@@ -21,7 +21,9 @@ def chromium() -> Iterator[Any]:
 
 @pytest.fixture
 def browser(chromium: Any) -> Iterator[Any]:
-    """The shared Chromium; pages that a test leaves open are closed: they would watch the next test's view as well."""
+    """The shared Chromium; pages that a test leaves open are closed: they would watch the next
+    test's view as well.
+    """
     yield chromium
     for context in chromium.contexts:
         context.close()

@@ -1,4 +1,6 @@
-"""`nlos-cam live --camera sim` and `nlos-cam view run.bag` in a headless Chromium, every control with its effect."""
+"""`nlos-cam live --camera sim` and `nlos-cam view run.bag` in a headless Chromium, every control
+with its effect.
+"""
 
 import os
 import re
@@ -27,7 +29,12 @@ class Program:
     def __init__(self, folder: Path, *arguments: str) -> None:
         program = [sys.executable, "-c", "from nlos_cam.cli import run; run()", *arguments]
         self.process = subprocess.Popen(
-            program, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True, start_new_session=True, cwd=folder
+            program,
+            stderr=subprocess.PIPE,
+            stdout=subprocess.DEVNULL,
+            text=True,
+            start_new_session=True,
+            cwd=folder,
         )
         self.address = self._address()
 
@@ -69,7 +76,9 @@ def only(folder: Path, pattern: str) -> Path:
     return path
 
 
-def test_controls_of_a_live_run_do_what_they_say(start: Callable[..., Program], browser: Any, tmp_path: Path) -> None:
+def test_controls_of_a_live_run_do_what_they_say(
+    start: Callable[..., Program], browser: Any, tmp_path: Path
+) -> None:
     program = start("live", "--camera", "sim")
     page = Page(browser, program.address).drawn()  # printed before networks and camera are there
     Page(browser, program.address).drawn().close()
@@ -94,7 +103,9 @@ def test_controls_of_a_live_run_do_what_they_say(start: Callable[..., Program], 
 
     change_run(page)
     save_session(page, browser, tmp_path)
-    assert "bare wall" in page.click("#reference"), "with an object hidden, the reference is refused, and why"
+    assert "bare wall" in page.click("#reference"), (
+        "with an object hidden, the reference is refused, and why"
+    )
     assert page.page.evaluate("document.querySelector('#answer').className") == "failed"
     assert page.hosts == {"127.0.0.1"}, "the page fetched from elsewhere"
     assert page.errors == []
@@ -142,7 +153,9 @@ def test_page_without_the_token_is_read_only(start: Callable[..., Program], brow
     assert "Read-only" in page.page.inner_text("#answer")
 
 
-def test_empty_bench_is_taken_as_reference(start: Callable[..., Program], browser: Any, tmp_path: Path) -> None:
+def test_empty_bench_is_taken_as_reference(
+    start: Callable[..., Program], browser: Any, tmp_path: Path
+) -> None:
     program = start("live", "--camera", "sim:bare-wall")
     page = Page(browser, program.address).drawn()
     assert "change" not in page.state()["arrays"]
@@ -155,13 +168,30 @@ def test_empty_bench_is_taken_as_reference(start: Callable[..., Program], browse
 def test_recording_opens_plays_and_exports_in_the_page(
     start: Callable[..., Program], browser: Any, tmp_path: Path
 ) -> None:
-    capture = [sys.executable, "-c", "from nlos_cam.cli import run; run()", "capture", "--camera", "sim"]
-    subprocess.run([*capture, "--seconds", "2", "--out", "run.bag"], check=True, cwd=tmp_path, capture_output=True)
+    capture = [
+        sys.executable,
+        "-c",
+        "from nlos_cam.cli import run; run()",
+        "capture",
+        "--camera",
+        "sim",
+    ]
+    subprocess.run(
+        [*capture, "--seconds", "2", "--out", "run.bag"],
+        check=True,
+        cwd=tmp_path,
+        capture_output=True,
+    )
     page = Page(browser, start("view", "run.bag").address).drawn()
     page.wait_until(lambda: not page.state()["status"].get("message"), "the whole recording")
     assert page.state()["end"] == pytest.approx(2.0, abs=0.3)
-    page.page.evaluate("(t => { t.value = 1; t.dispatchEvent(new Event('input')); })(document.querySelector('#time'))")
-    page.wait_until(lambda: page.state()["time_s"] == pytest.approx(1.0, abs=0.1), "the frame at 1 s")
+    page.page.evaluate(
+        "(t => { t.value = 1; t.dispatchEvent(new Event('input'));"
+        " })(document.querySelector('#time'))"
+    )
+    page.wait_until(
+        lambda: page.state()["time_s"] == pytest.approx(1.0, abs=0.1), "the frame at 1 s"
+    )
     frame = page.state()["frame"]
     page.page.click("#play")
     page.wait_until(lambda: page.state()["frame"] > frame, "it plays")

@@ -23,12 +23,23 @@ pytestmark = [pytest.mark.browser, pytest.mark.slow, pytest.mark.timeout(6 * DEA
 
 SIZES = (1280, 800), (390, 844)
 LAYERS = {"depth", "truth", "error", "change", "residual", "lidar", "infrared"}
-NAMES = {"relay wall", "lidar", "occluder", "object box", "hidden surface", "bounce 1", "bounce 2", "bounce 3"}
+NAMES = {
+    "relay wall",
+    "lidar",
+    "occluder",
+    "object box",
+    "hidden surface",
+    "bounce 1",
+    "bounce 2",
+    "bounce 3",
+}
 
 
 @pytest.mark.parametrize("size", SIZES)
 @pytest.mark.parametrize("calibrated", [False, True])
-def test_page_shows_every_layer_name_and_new_moment(browser: Any, calibrated: bool, size: tuple[int, int]) -> None:
+def test_page_shows_every_layer_name_and_new_moment(
+    browser: Any, calibrated: bool, size: tuple[int, int]
+) -> None:
     with WebViewer(RIG, exact_wall() if calibrated else None) as viewer:
         for first in (0, 10):  # the page is opened again
             viewer.show(full_moment(first))
@@ -37,11 +48,16 @@ def test_page_shows_every_layer_name_and_new_moment(browser: Any, calibrated: bo
             assert set(page.state()["labels"]) == NAMES
             assert page.state()["quads"] > 100
             viewer.show(full_moment(first + 5, Verdict.OUTSIDE))
-            page.wait_until(lambda page=page, number=first + 5: page.state()["frame"] == number, "the next moment")
+            page.wait_until(
+                lambda page=page, number=first + 5: page.state()["frame"] == number,
+                "the next moment",
+            )
             assert page.state()["headline"] == "Shape not reliable"
             viewer.show(full_moment(first + 6, Verdict.NOTHING))
             page.wait_until(lambda page=page: page.state()["quads"] == 0, "an empty bench")
-            assert page.page.evaluate("document.documentElement.scrollWidth") <= size[0], "nothing is beside the page"
+            assert page.page.evaluate("document.documentElement.scrollWidth") <= size[0], (
+                "nothing is beside the page"
+            )
             assert page.errors == []
             page.close()
         page = Page(browser, viewer.address or "").drawn()
@@ -94,12 +110,17 @@ def test_refused_page_goes_on_by_itself_and_a_hidden_one_makes_room(browser: Any
         for watcher in watchers:
             watcher.close()
         page.page.evaluate(
-            "Object.defineProperty(document, 'hidden', { get: () => window.away, configurable: true });"
-            "window.away = true; document.dispatchEvent(new Event('visibilitychange'))"
+            "Object.defineProperty(document, 'hidden', { get: () => window.away, configurable: true"
+            " });window.away = true; document.dispatchEvent(new Event('visibilitychange'))"
         )
-        page.wait_until(lambda: "out of sight" in page.state()["status"].get("message", ""), "it leaves its stream")
+        page.wait_until(
+            lambda: "out of sight" in page.state()["status"].get("message", ""),
+            "it leaves its stream",
+        )
         viewer.show(full_moment(30))
-        page.page.evaluate("window.away = false; document.dispatchEvent(new Event('visibilitychange'))")
+        page.page.evaluate(
+            "window.away = false; document.dispatchEvent(new Event('visibilitychange'))"
+        )
         page.wait_until(lambda: page.state()["frame"] == 30, "it goes on when it is looked at")
         assert page.errors == []
         page.close()
@@ -135,7 +156,10 @@ def test_playback_plays_scrubs_and_changes_speed(browser: Any) -> None:
 
 def play_through(page: Page) -> None:
     """Scrub to the middle, play at eight times the speed to the end, and pause."""
-    page.page.evaluate("(t => { t.value = 15; t.dispatchEvent(new Event('input')); })(document.querySelector('#time'))")
+    page.page.evaluate(
+        "(t => { t.value = 15; t.dispatchEvent(new Event('input'));"
+        " })(document.querySelector('#time'))"
+    )
     page.wait_until(lambda: page.state()["frame"] == 30, "the frame at 15 s")
     page.page.select_option("#speed", "8")
     page.page.click("#play")
@@ -149,7 +173,9 @@ def play_through(page: Page) -> None:
 def resources() -> tuple[int, int, float]:
     """Return this process's OS threads, file descriptors, and resident memory in MiB."""
     pages = int(Path("/proc/self/statm").read_text().split()[1])
-    threads, descriptors = (len(list(Path(f"/proc/self/{kind}").iterdir())) for kind in ("task", "fd"))
+    threads, descriptors = (
+        len(list(Path(f"/proc/self/{kind}").iterdir())) for kind in ("task", "fd")
+    )
     return threads, descriptors, pages * os.sysconf("SC_PAGESIZE") / 2**20
 
 

@@ -13,7 +13,15 @@ from fake_librealsense import FakeSdk
 from fake_lidar import FakeLidar
 from small_frames import assert_exposed
 
-from nlos_cam.camera import Camera, Recording, connected, load_sdk, open_camera, open_world, shared_context
+from nlos_cam.camera import (
+    Camera,
+    Recording,
+    connected,
+    load_sdk,
+    open_camera,
+    open_world,
+    shared_context,
+)
 from nlos_cam.errors import CameraError, NlosCamError
 from nlos_cam.frames import Frame
 
@@ -41,7 +49,14 @@ def bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(
-    params=["sim", "sim:bare-wall", "bag", "bag-sdk", FAKE_L515, pytest.param("l515", marks=pytest.mark.hardware)]
+    params=[
+        "sim",
+        "sim:bare-wall",
+        "bag",
+        "bag-sdk",
+        FAKE_L515,
+        pytest.param("l515", marks=pytest.mark.hardware),
+    ]
 )
 def opens(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
     """Arguments of `open_camera`."""
@@ -70,7 +85,11 @@ def test_frames_have_the_shapes_types_units_and_settings_of_the_protocol(camera:
     shape = camera.intrinsics.height, camera.intrinsics.width
     for frame in look(camera):
         assert frame.depth_m.shape == frame.ir.shape == frame.confidence.shape == shape
-        assert (frame.depth_m.dtype, frame.ir.dtype, frame.confidence.dtype) == (np.float32, np.uint8, np.uint8)
+        assert (frame.depth_m.dtype, frame.ir.dtype, frame.confidence.dtype) == (
+            np.float32,
+            np.uint8,
+            np.uint8,
+        )
         assert frame.intrinsics == camera.intrinsics
         seen = frame.depth_m[~np.isnan(frame.depth_m)]
         assert seen.size > 0.5 * frame.depth_m.size
@@ -108,7 +127,9 @@ def test_frames_hold_the_truth_where_it_is_known(camera: Camera) -> None:
     if camera.uri != "sim":
         assert frame.truth_depth_m is None
     else:
-        np.testing.assert_array_equal(frame.truth_depth_m, open_world("").truth_depth_m(frame.frame_number))
+        np.testing.assert_array_equal(
+            frame.truth_depth_m, open_world("").truth_depth_m(frame.frame_number)
+        )
         assert frame.truth_depth_m.shape == (64, 64)
 
 
@@ -132,7 +153,10 @@ def test_process_that_used_a_camera_ends_cleanly(opens: dict[str, Any]) -> None:
     if opens["uri"] == FAKE_L515:
         pytest.skip("the fake SDK is in this process only")
     ended = subprocess.run(  # noqa: PLW1510  the code is what is tested
-        [sys.executable, "-c", ENDS_CLEANLY, json.dumps(opens)], capture_output=True, text=True, timeout=120
+        [sys.executable, "-c", ENDS_CLEANLY, json.dumps(opens)],
+        capture_output=True,
+        text=True,
+        timeout=120,
     )
     assert (ended.returncode, ended.stdout, ended.stderr) == (0, "3\n", "")
 

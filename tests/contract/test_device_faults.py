@@ -1,7 +1,8 @@
-"""More than fifty faults of a device, each in front of librealsense itself: the camera goes on, or ends in one line.
+"""More than fifty faults of a device, each in front of librealsense itself: the camera goes on, or
+ends in one line.
 
-Each stream may be late, missing, doubled, out of order, of another size, frozen, or wrong in number, time or content;
-the device may vanish or fail in each call of the SDK, once or for good.
+Each stream may be late, missing, doubled, out of order, of another size, frozen, or wrong in
+number, time or content; the device may vanish or fail in each call of the SDK, once or for good.
 """
 
 from collections.abc import Callable
@@ -15,22 +16,32 @@ from nlos_cam.camera import FORMATS, SimulatedCamera, SoftwareLidar, simulated
 from nlos_cam.errors import CameraError
 from nlos_cam.frames import Frame
 
-FROM, UNTIL, WANTED = 5, 9, 30
+FROM = 5
+UNTIL = 9
+WANTED = 30
 """Numbers with the fault (from, until), and frames to be read."""
 Push = tuple[int, float, np.ndarray]
 """Number, timestamp in s, and pixels of one frame of a stream."""
 
 
 class Tampered(SoftwareLidar):
-    """Device whose `streams` pass through `tamper`, which returns what is pushed instead of each frame."""
+    """Device whose `streams` pass through `tamper`, which returns what is pushed instead of each
+    frame.
+    """
 
     streams: tuple[str, ...] = ()
     tamper: Callable[[int, float, np.ndarray, list[Push]], list[Push]]
 
-    def _push(self, profile: Any, stream: str, number: int, timestamp_s: float, pixels: np.ndarray) -> None:
+    def _push(
+        self, profile: Any, stream: str, number: int, timestamp_s: float, pixels: np.ndarray
+    ) -> None:
         held = self.__dict__.setdefault("held", {}).setdefault(stream, [])
         is_bad = stream in self.streams and FROM <= number < UNTIL
-        frames = type(self).tamper(number, timestamp_s, pixels, held) if is_bad else [(number, timestamp_s, pixels)]
+        frames = (
+            type(self).tamper(number, timestamp_s, pixels, held)
+            if is_bad
+            else [(number, timestamp_s, pixels)]
+        )
         if not is_bad and held:
             frames = [*frames, *held]
             held.clear()
@@ -55,20 +66,32 @@ WAYS: dict[str, Callable[[int, float, np.ndarray, list[Push]], list[Push]]] = {
     "black": lambda n, t, p, _: [(n, t, np.zeros_like(p))],
     "saturated": lambda n, t, p, _: [(n, t, np.full_like(p, np.iinfo(p.dtype).max))],
 }
-CALLS = ("open", "start", "get_supported_options", "get_option", "get_stream_profiles", "query_sensors")
+CALLS = (
+    "open",
+    "start",
+    "get_supported_options",
+    "get_option",
+    "get_stream_profiles",
+    "query_sensors",
+)
 
 
 class Proxy:
     """SDK object that fails in one method, from a number of calls on, for so many calls."""
 
     def __init__(self, inner: Any, method: str, calls: list[int], failing: range) -> None:
-        self._inner, self._method, self._calls, self._failing = inner, method, calls, failing
+        self._inner = inner
+        self._method = method
+        self._calls = calls
+        self._failing = failing
 
     def __getattr__(self, name: str) -> Any:
         value = getattr(self._inner, name)
         if name == "query_sensors":
             self._note(name)
-            return lambda: [Proxy(each, self._method, self._calls, self._failing) for each in value()]
+            return lambda: [
+                Proxy(each, self._method, self._calls, self._failing) for each in value()
+            ]
         if not callable(value):
             return value
 
@@ -97,7 +120,8 @@ def camera(noise_world: Any, hurried_clock: Any) -> Callable[[], SimulatedCamera
 
 def outcome(make: Callable[[], SimulatedCamera]) -> list[Frame] | str:
     """Return the frames that come, or the line with which the camera ends; both are checked."""
-    frames, line = list[Frame](), ""
+    frames = list[Frame]()
+    line = ""
     try:
         with make() as source:
             frames += islice(source, WANTED)
@@ -110,14 +134,21 @@ def outcome(make: Callable[[], SimulatedCamera]) -> list[Frame] | str:
     shape = frames[0].intrinsics.height, frames[0].intrinsics.width
     assert all(image.shape == shape for f in frames for image in (f.depth_m, f.ir, f.confidence))
     in_order = all(one.frame_number < two.frame_number for one, two in pairwise(frames))
-    assert in_order or source.counts["renumbered"], "numbers go back, and no restart of the count is reported"
+    assert in_order or source.counts["renumbered"], (
+        "numbers go back, and no restart of the count is reported"
+    )
     return frames
 
 
-@pytest.mark.parametrize("streams", [*((stream,) for stream in FORMATS), tuple(FORMATS)], ids="+".join)
+@pytest.mark.parametrize(
+    "streams", [*((stream,) for stream in FORMATS), tuple(FORMATS)], ids="+".join
+)
 @pytest.mark.parametrize("way", WAYS)
 def test_camera_goes_on_after_a_fault_of_its_streams(
-    camera: Callable[[], SimulatedCamera], monkeypatch: pytest.MonkeyPatch, way: str, streams: tuple[str, ...]
+    camera: Callable[[], SimulatedCamera],
+    monkeypatch: pytest.MonkeyPatch,
+    way: str,
+    streams: tuple[str, ...],
 ) -> None:
     device = type("Device", (Tampered,), {"streams": streams, "tamper": staticmethod(WAYS[way])})
     monkeypatch.setattr(simulated, "SoftwareLidar", device)

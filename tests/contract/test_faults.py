@@ -1,4 +1,6 @@
-"""The live loop over every fault of the simulated device, with librealsense in between: it goes on, and counts."""
+"""The live loop over every fault of the simulated device, with librealsense in between: it goes on,
+and counts.
+"""
 
 from collections.abc import Callable, Iterator
 from itertools import pairwise
@@ -31,7 +33,9 @@ Make = Callable[..., SimulatedCamera]
 
 @pytest.fixture
 def camera(noise_world: Any, hurried_clock: Any, monkeypatch: pytest.MonkeyPatch) -> Make:
-    """Make a camera in a world without saturated noise, which drops nothing because the machine is slow."""
+    """Make a camera in a world without saturated noise, which drops nothing because the machine is
+    slow.
+    """
     monkeypatch.setattr(session, "CAPACITY", PLENTY)
     monkeypatch.setattr(frame_queue, "QUEUE_FRAMES", PLENTY)
 
@@ -40,9 +44,13 @@ def camera(noise_world: Any, hurried_clock: Any, monkeypatch: pytest.MonkeyPatch
             noise = super().images(number)
             return SensedImages(noise.depth_z16 | 1, noise.ir // 2, noise.confidence)
 
-    def make(*faults: Fault, clock: Any = None, recording: Recording | None = None) -> SimulatedCamera:
+    def make(
+        *faults: Fault, clock: Any = None, recording: Recording | None = None
+    ) -> SimulatedCamera:
         clock = clock or hurried_clock()
-        made = SimulatedCamera("sim:quiet", QuietWorld(), clock=clock, faults=faults, recording=recording)
+        made = SimulatedCamera(
+            "sim:quiet", QuietWorld(), clock=clock, faults=faults, recording=recording
+        )
         made.silence_s = 0.5  # of real time: an outage is that long, and no other pause should be
         return made
 
@@ -53,7 +61,8 @@ class Until:
     """A camera that ends at the LAST, or a later, instant of its world."""
 
     def __init__(self, camera: SimulatedCamera, last: int = LAST) -> None:
-        self.camera, self.last = camera, last
+        self.camera = camera
+        self.last = last
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self.camera, name)
@@ -69,12 +78,16 @@ def instant_of(frame: Frame) -> int:
     return int(frame.truth_depth_m[0, 0])
 
 
-def live(camera: SimulatedCamera, last: int = LAST, **options: Any) -> tuple[list[Moment], RunReport]:
+def live(
+    camera: SimulatedCamera, last: int = LAST, **options: Any
+) -> tuple[list[Moment], RunReport]:
     viewer = ListViewer()
     with camera:
         processing = Pipeline(CalibratedRig(RIG), sheet_network)
         report = run_live(Until(camera, last), processing, viewer, stop=Event(), **options)  # type: ignore[arg-type]
-    moments = [moment for moment in viewer.moments if moment.verdict != Verdict.STALLED]  # the last one, shown again
+    moments = [
+        moment for moment in viewer.moments if moment.verdict != Verdict.STALLED
+    ]  # the last one, shown again
     assert report.frames == len(moments)
     return moments, report
 
@@ -99,22 +112,30 @@ def fault(kind: Any, frames: int = 3, **options: Any) -> Fault:
         (fault("wrong_size"), [5, 6, 7], {"wrong_size": 3, "incomplete": 3}),
         (Fault(kind="clock_wrap", at_frame=5), [], {}),
     ],
-    ids=lambda value: f"{value.kind} {value.stream or ''}".strip() if isinstance(value, Fault) else "",
+    ids=lambda value: (
+        f"{value.kind} {value.stream or ''}".strip() if isinstance(value, Fault) else ""
+    ),
 )
 def test_passing_fault_is_survived_and_counted(
     camera: Make, befalls: Fault, missing: list[int], counts: dict[str, int]
 ) -> None:
     moments, report = live(camera(befalls))
-    assert [instant_of(moment.frame) for moment in moments] == [n for n in range(LAST + 1) if n not in missing]
+    assert [instant_of(moment.frame) for moment in moments] == [
+        n for n in range(LAST + 1) if n not in missing
+    ]
     assert report.counts == counts
     for one, next_one in pairwise(moments):
         rise_s = next_one.frame.timestamp_s - one.frame.timestamp_s
-        assert rise_s * 30 == pytest.approx(instant_of(next_one.frame) - instant_of(one.frame), abs=1e-3)
+        assert rise_s * 30 == pytest.approx(
+            instant_of(next_one.frame) - instant_of(one.frame), abs=1e-3
+        )
 
 
 def test_frame_without_depth_shows_nothing(camera: Make) -> None:
     moments, _ = live(camera(fault("all_zero")))
-    shown = [instant_of(each.frame) for each in moments if np.isfinite(each.reconstruction.depth_m).any()]
+    shown = [
+        instant_of(each.frame) for each in moments if np.isfinite(each.reconstruction.depth_m).any()
+    ]
     assert shown == [n for n in range(LAST + 1) if n not in {5, 6, 7}]
 
 
@@ -154,14 +175,18 @@ def test_long_stall_restarts_the_streams(camera: Make, hurried_clock: Any) -> No
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("kind", "words", "counts"), [("unplug", "unplugged", {}), ("stall", "3 restarts", {"restarted": 3, "reset": 1})]
+    ("kind", "words", "counts"),
+    [("unplug", "unplugged", {}), ("stall", "3 restarts", {"restarted": 3, "reset": 1})],
 )
 def test_device_that_stays_away_ends_the_run_with_its_counts(
     camera: Make, kind: Any, words: str, counts: dict[str, int]
 ) -> None:
     until_then: list[RunReport] = []
     with pytest.raises(CameraLostError, match=words) as error:
-        live(camera(fault(kind, FOREVER), Fault(kind="duplicate", at_frame=2)), on_error=until_then.append)
+        live(
+            camera(fault(kind, FOREVER), Fault(kind="duplicate", at_frame=2)),
+            on_error=until_then.append,
+        )
     assert "\n" not in str(error.value)
     assert until_then[0].frames == 5
     assert until_then[0].counts.pop("stalls") >= 1  # type: ignore[attr-defined]
@@ -190,15 +215,25 @@ RECORDED = [
 
 @pytest.mark.slow
 @pytest.mark.parametrize("reader", [ReplayCamera, SdkReplayCamera])
-def test_recording_of_faults_replays_as_it_was_captured(camera: Make, tmp_path: Path, reader: Any) -> None:
+def test_recording_of_faults_replays_as_it_was_captured(
+    camera: Make, tmp_path: Path, reader: Any
+) -> None:
     recording = Recording(tmp_path / "faulty.bag", frames=40)
     with camera(*RECORDED, recording=recording) as recorded:
         seen = list(recorded)
     with reader(recording.path) as replayed:
         again = list(replayed)
     assert [frame.frame_number for frame in again] == [frame.frame_number for frame in seen]
-    np.testing.assert_allclose([f.timestamp_s for f in again], [f.timestamp_s for f in seen], atol=1e-6)
+    np.testing.assert_allclose(
+        [f.timestamp_s for f in again], [f.timestamp_s for f in seen], atol=1e-6
+    )
     for one, other in zip(seen, again, strict=True):
         np.testing.assert_array_equal(one.depth_m, other.depth_m)
-    assert replayed.counts == recorded.counts == {"duplicate": 1, "out_of_order": 1, "wrong_size": 1, "stalled": 1}
-    assert (replayed.incomplete, replayed.dropped) == (recorded.incomplete, recorded.dropped) == (2, 3)
+    assert (
+        replayed.counts
+        == recorded.counts
+        == {"duplicate": 1, "out_of_order": 1, "wrong_size": 1, "stalled": 1}
+    )
+    assert (
+        (replayed.incomplete, replayed.dropped) == (recorded.incomplete, recorded.dropped) == (2, 3)
+    )

@@ -17,7 +17,10 @@ PASSING = [
     {"kind": "all_zero", "at_frame": 20, "frames": 10},
     {"kind": "unplug", "at_frame": 40, "frames": 30},
 ]
-LASTING = [{"kind": "duplicate", "at_frame": 10}, {"kind": "unplug", "at_frame": 20, "frames": 1_000_000}]
+LASTING = [
+    {"kind": "duplicate", "at_frame": 10},
+    {"kind": "unplug", "at_frame": 20, "frames": 1_000_000},
+]
 
 
 @pytest.fixture
@@ -26,7 +29,8 @@ def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
 
     def opened(uri: str, **options: Any) -> Any:
         camera: Any = open_camera(uri, **options)
-        camera.silence_s, camera.replug_s = 0.5, 2.0
+        camera.silence_s = 0.5
+        camera.replug_s = 2.0
         return camera
 
     monkeypatch.setattr("nlos_cam.camera.open_camera", opened)
@@ -45,7 +49,15 @@ def run(folder: Path, faults: list[dict[str, Any]], *options: str) -> int:
 def test_live_goes_on_and_counts_faults(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert run(tmp_path, PASSING, "--seconds", "4", "--json") == 0
     report = json.loads(capsys.readouterr().out.splitlines()[-1])
-    seen = {"duplicate", "wrong_size", "incomplete", "blank", "replugged", "dropped_camera", "stalls"}
+    seen = {
+        "duplicate",
+        "wrong_size",
+        "incomplete",
+        "blank",
+        "replugged",
+        "dropped_camera",
+        "stalls",
+    }
     assert seen <= set(report["counts"])
     assert report["stalled_s"] >= 0.9
     assert report["counts"]["replugged"] == 1
@@ -54,7 +66,9 @@ def test_live_goes_on_and_counts_faults(tmp_path: Path, capsys: pytest.CaptureFi
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("impatient")
-def test_live_ends_with_counts_when_the_device_stays_away(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_live_ends_with_counts_when_the_device_stays_away(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert run(tmp_path, LASTING, "--json") == 3
     captured = capsys.readouterr()
     error = json.loads(captured.out)["error"]

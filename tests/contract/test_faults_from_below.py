@@ -1,6 +1,8 @@
-"""Faults of the system below every command that writes: limits of size, descriptors and memory, bad disks, clock jumps.
+"""Faults of the system below every command that writes: limits of size, descriptors and memory, bad
+disks, clock jumps.
 
-Each command ends well, or with one line that names its output; nothing half-written stays under the output's name.
+Each command ends well, or with one line that names its output; nothing half-written stays under the
+output's name.
 """
 
 import os
@@ -63,16 +65,26 @@ COMMANDS = EXPORT, REPAIR, RENDER, BOARD
 START = "import resource, sys; from nlos_cam.cli import run; {limit}; run()"
 
 
-def ending(command: str, bag: Path, out: Path, limit: str = "", **variables: str) -> tuple[int, str]:
-    """Run a command in a process under a limit, with environment variables; return its exit code and stderr.
+def ending(
+    command: str, bag: Path, out: Path, limit: str = "", **variables: str
+) -> tuple[int, str]:
+    """Run a command in a process under a limit, with environment variables; return its exit code
+    and stderr.
 
-    A fork of the tests would not do: OpenMP refuses to run in the child of a process that has used it.
+    A fork of the tests would not do: OpenMP refuses to run in the child of a process that has used
+    it.
     """
     out.mkdir(exist_ok=True)
     words = [*command.format(bag=bag, out=out).split(), "--json"]
     start = [sys.executable, "-c", START.format(limit=limit or "None"), *words]
-    environment = {**os.environ, "PYTHONDONTWRITEBYTECODE": "1", **variables}  # a limit would cut compiled modules
-    ended = subprocess.run(start, env=environment, capture_output=True, text=True, timeout=250, check=False)
+    environment = {
+        **os.environ,
+        "PYTHONDONTWRITEBYTECODE": "1",
+        **variables,
+    }  # a limit would cut compiled modules
+    ended = subprocess.run(
+        start, env=environment, capture_output=True, text=True, timeout=250, check=False
+    )
     return ended.returncode, ended.stderr
 
 
@@ -84,7 +96,10 @@ def test_full_disk_is_one_line_and_leaves_nothing(
 ) -> None:
     out = tmp_path / "out"
     code, said = ending(
-        command, noise_bag, out, f"resource.setrlimit(resource.RLIMIT_FSIZE, ({limit_bytes}, {limit_bytes}))"
+        command,
+        noise_bag,
+        out,
+        f"resource.setrlimit(resource.RLIMIT_FSIZE, ({limit_bytes}, {limit_bytes}))",
     )
     if code == 0:
         assert all(path.stat().st_size <= limit_bytes for path in out.rglob("*") if path.is_file())
@@ -93,20 +108,28 @@ def test_full_disk_is_one_line_and_leaves_nothing(
     assert len(said.strip().splitlines()) <= 2
     assert str(out) in said
     assert "a file cannot" not in said
-    left = [path for path in out.iterdir() if path.suffix != ".npz" or not np.load(path)["depth_m"].any()]
+    left = [
+        path
+        for path in out.iterdir()
+        if path.suffix != ".npz" or not np.load(path)["depth_m"].any()
+    ]
     assert left == [], "the maps may be there, whole, without their picture"
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("command", COMMANDS)
 def test_sixty_four_descriptors_are_enough(noise_bag: Path, tmp_path: Path, command: str) -> None:
-    code, said = ending(command, noise_bag, tmp_path / "out", "resource.setrlimit(resource.RLIMIT_NOFILE, (64, 64))")
+    code, said = ending(
+        command, noise_bag, tmp_path / "out", "resource.setrlimit(resource.RLIMIT_NOFILE, (64, 64))"
+    )
     assert code == 0, said
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("command", [EXPORT, REPAIR, BOARD])
-def test_folder_that_cannot_be_written_is_one_line(noise_bag: Path, tmp_path: Path, command: str) -> None:
+def test_folder_that_cannot_be_written_is_one_line(
+    noise_bag: Path, tmp_path: Path, command: str
+) -> None:
     code, said = ending(command.replace("{out}", "/proc"), noise_bag, tmp_path)
     assert code in {1, 4}
     assert "/proc" in said
@@ -119,14 +142,22 @@ def shim(tmp_path_factory: pytest.TempPathFactory) -> str:
         pytest.skip("needs a C compiler")
     folder = tmp_path_factory.mktemp("shim")
     (folder / "shim.c").write_text(SHIM, encoding="utf-8")
-    subprocess.run([compiler, "-shared", "-fPIC", "-o", "shim.so", "shim.c", "-ldl"], cwd=folder, check=True)
+    subprocess.run(
+        [compiler, "-shared", "-fPIC", "-o", "shim.so", "shim.c", "-ldl"], cwd=folder, check=True
+    )
     return str(folder / "shim.so")
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("write", [1, 2, 5])
-def test_disk_error_is_one_line_and_leaves_nothing(shim: str, noise_bag: Path, tmp_path: Path, write: int) -> None:
-    variables = {"LD_PRELOAD": shim, "SHIM_FOLDER": str(out := tmp_path / "out"), "SHIM_FAIL_AT": str(write)}
+def test_disk_error_is_one_line_and_leaves_nothing(
+    shim: str, noise_bag: Path, tmp_path: Path, write: int
+) -> None:
+    variables = {
+        "LD_PRELOAD": shim,
+        "SHIM_FOLDER": str(out := tmp_path / "out"),
+        "SHIM_FAIL_AT": str(write),
+    }
     code, said = ending(REPAIR, noise_bag, out, **variables)
     assert code == 1, said
     assert "Input/output error" in said
@@ -135,7 +166,9 @@ def test_disk_error_is_one_line_and_leaves_nothing(shim: str, noise_bag: Path, t
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("variables", [{"SHIM_SHORT": "1"}, {"SHIM_JUMP_S": "100000000"}, {"SHIM_JUMP_S": "-90000"}])
+@pytest.mark.parametrize(
+    "variables", [{"SHIM_SHORT": "1"}, {"SHIM_JUMP_S": "100000000"}, {"SHIM_JUMP_S": "-90000"}]
+)
 def test_short_writes_and_clock_jumps_change_nothing(
     shim: str, noise_bag: Path, tmp_path: Path, variables: dict[str, str]
 ) -> None:

@@ -14,13 +14,18 @@ from nlos_cam.errors import RecordingError
 from nlos_cam.recording import BagReader, repair_recording
 
 pytestmark = [
-    pytest.mark.skipif(not Path("/proc/self/stat").is_file(), reason="lists processes as Linux does"),
+    pytest.mark.skipif(
+        not Path("/proc/self/stat").is_file(), reason="lists processes as Linux does"
+    ),
     pytest.mark.slow,
     pytest.mark.timeout(900),
 ]
-EARLY_S, LATE_S = 0.5, 8.0
+EARLY_S = 0.5
+LATE_S = 8.0
 """Seconds after the process begins: during its start, and mostly while it runs."""
-WATCHED_S, RUN_S, TIMEOUT_S = 2.0, 12.0, 300.0
+WATCHED_S = 2.0
+RUN_S = 12.0
+TIMEOUT_S = 300.0
 INTERRUPTED = 130
 SCENE = 'name = "a wall"\nrig = "bare-wall"\n'
 UNPLUG = '[[faults]]\nkind = "unplug"\nat_frame = 5\nframes = 1_000_000\n'
@@ -34,7 +39,9 @@ with urllib.request.urlopen(sys.argv[1].partition("#")[0] + "stream") as stream:
 
 
 def watch_and_be_killed(address: str) -> None:
-    with subprocess.Popen([sys.executable, "-c", WATCHER, address], stdout=subprocess.PIPE) as watcher:
+    with subprocess.Popen(
+        [sys.executable, "-c", WATCHER, address], stdout=subprocess.PIPE
+    ) as watcher:
         assert watcher.stdout
         watcher.stdout.readline()
         time.sleep(WATCHED_S)
@@ -42,11 +49,16 @@ def watch_and_be_killed(address: str) -> None:
 
 
 def frames_in(bag: Path) -> int:
-    """Count the frames of the shortest stream. Raises RecordingError where it can be neither read nor repaired."""
+    """Count the frames of the shortest stream. Raises RecordingError where it can be neither read
+    nor repaired.
+    """
     try:
         return min((info.frames for info in BagReader(bag).streams.values()), default=0)
     except RecordingError:
-        return min(repair_recording(bag, bag.with_name("repaired.bag")).recovered_frames.values(), default=0)
+        return min(
+            repair_recording(bag, bag.with_name("repaired.bag")).recovered_frames.values(),
+            default=0,
+        )
 
 
 @pytest.mark.parametrize(
@@ -61,11 +73,15 @@ def frames_in(bag: Path) -> int:
 def test_interrupted_live_leaves_no_process_or_partial_file(
     tmp_path: Path, kind: str, after_s: float, view: bool
 ) -> None:
-    scene, bag, log = tmp_path / "scene.toml", tmp_path / "run.bag", tmp_path / "run.csv"
+    scene = tmp_path / "scene.toml"
+    bag = tmp_path / "run.bag"
+    log = tmp_path / "run.csv"
     scene.write_text(SCENE + UNPLUG * kind.startswith("unplugged"), encoding="utf-8")
     is_watched = kind == "viewer killed"
     options = ["--seconds", str(RUN_S)] * is_watched + ["--no-view"] * (not view)
-    with LiveProcess([f"sim:{scene}", "--json", "--record", str(bag), "--log", str(log), *options]) as run:
+    with LiveProcess(
+        [f"sim:{scene}", "--json", "--record", str(bag), "--log", str(log), *options]
+    ) as run:
         run.wait_until_begun(TIMEOUT_S)
         if is_watched:
             watch_and_be_killed(run.wait_for_address(TIMEOUT_S))

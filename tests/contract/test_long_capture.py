@@ -1,4 +1,6 @@
-"""Thirty seconds of `nlos-cam capture` in a process of its own: its frames, its memory, and both readers."""
+"""Thirty seconds of `nlos-cam capture` in a process of its own: its frames, its memory, and both
+readers.
+"""
 
 import json
 import re
@@ -26,15 +28,30 @@ Long = tuple[dict[str, Any], list[float], Path]
 
 @pytest.fixture(scope="module")
 def long(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Long]:
-    """Capture, and return the JSON report, anonymous memory in MiB once a second of recording, and the recording."""
-    path, memory_mib, written = tmp_path_factory.mktemp("long") / "long.bag", list[float](), -1
-    arguments = ["capture", "sim:bare-wall", "--seconds", str(SECONDS), "--json", "--out", str(path)]
-    command, pipe = [sys.executable, "-c", "from nlos_cam.cli import run; run()", *arguments], subprocess.PIPE
+    """Capture, and return the JSON report, anonymous memory in MiB once a second of recording, and
+    the recording.
+    """
+    path = tmp_path_factory.mktemp("long") / "long.bag"
+    memory_mib = list[float]()
+    written = -1
+    arguments = [
+        "capture",
+        "sim:bare-wall",
+        "--seconds",
+        str(SECONDS),
+        "--json",
+        "--out",
+        str(path),
+    ]
+    command = [sys.executable, "-c", "from nlos_cam.cli import run; run()", *arguments]
+    pipe = subprocess.PIPE
     with subprocess.Popen(command, stdout=pipe, stderr=pipe, text=True) as process:
         status = Path(f"/proc/{process.pid}/status")
         while process.poll() is None:
             time.sleep(1.0)
-            if path.exists() and path.stat().st_size > written and status.exists():  # it grows until it is read back
+            if (
+                path.exists() and path.stat().st_size > written and status.exists()
+            ):  # it grows until it is read back
                 written = path.stat().st_size
                 if kib := re.search(r"RssAnon:\s+(\d+)", status.read_text(encoding="ascii")):
                     memory_mib.append(int(kib[1]) / 1024)
@@ -46,7 +63,8 @@ def long(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Long]:
 
 def digest_of(path: Path, reader: Reader) -> tuple[int, str]:
     """Return the number of a recording's frames, and a digest of every bit of them in order."""
-    digest, frames = blake2b(digest_size=16), 0
+    digest = blake2b(digest_size=16)
+    frames = 0
     with open_camera(f"bag:{path}", reader=reader) as camera:
         for frame in camera:
             digest.update(f"{frame.frame_number} {frame.timestamp_s:.6f}".encode())
@@ -66,7 +84,9 @@ def test_long_capture_holds_every_frame_and_counts_gaps(long: Long) -> None:
     assert report["seconds"] == pytest.approx((numbers - 1) / 30, abs=0.01)
 
 
-@pytest.mark.skipif(not Path("/proc/self/status").is_file(), reason="reads memory as Linux reports it")
+@pytest.mark.skipif(
+    not Path("/proc/self/status").is_file(), reason="reads memory as Linux reports it"
+)
 def test_long_capture_keeps_memory_flat(long: Long) -> None:
     memory_mib = long[1]
     assert len(memory_mib) > SECONDS / 2
@@ -76,6 +96,7 @@ def test_long_capture_keeps_memory_flat(long: Long) -> None:
 
 def test_long_capture_reads_alike_with_both_readers(long: Long) -> None:
     report, _, path = long
-    plain, sdk = digest_of(path, "plain"), digest_of(path, "sdk")
+    plain = digest_of(path, "plain")
+    sdk = digest_of(path, "sdk")
     assert plain == sdk
     assert plain[0] == report["frames"]

@@ -1,4 +1,6 @@
-"""Page of the view in a headless Chromium, asked for its own state: no test depends on how fast it draws."""
+"""Page of the view in a headless Chromium, asked for its own state: no test depends on how fast it
+draws.
+"""
 
 import time
 from collections.abc import Callable
@@ -58,7 +60,9 @@ class Page:
 
     def click(self, selector: str) -> str:
         """Click a control, and return the command's answer."""
-        return self.answer(lambda: self.page.evaluate(f"document.querySelector('{selector}').click()"))
+        return self.answer(
+            lambda: self.page.evaluate(f"document.querySelector('{selector}').click()")
+        )
 
     def close(self) -> None:
         self.page.close()

@@ -1,4 +1,6 @@
-"""A bench with an L515 on it: a fake USB under the real pyusb, a fake Linux as a tree of files, and a fake SDK."""
+"""A bench with an L515 on it: a fake USB under the real pyusb, a fake Linux as a tree of files, and
+a fake SDK.
+"""
 
 import errno
 from array import array
@@ -22,7 +24,9 @@ LINUX = Platform("linux", "x86_64", (3, 11), in_plugdev=True)
 
 
 class FakeUsb(IBackend):
-    """A bus of `fake_device`s behind pyusb's interface to libusb; `meddled` notes calls that would change a device."""
+    """A bus of `fake_device`s behind pyusb's interface to libusb; `meddled` notes calls that would
+    change a device.
+    """
 
     def __init__(self, *devices: SimpleNamespace) -> None:
         self.devices = list(devices)
@@ -41,15 +45,32 @@ class FakeUsb(IBackend):
     def get_configuration_descriptor(self, dev: SimpleNamespace, config: int) -> SimpleNamespace:
         if dev.hides:
             raise dev.hides
-        fields = ("bLength", "bDescriptorType", "wTotalLength", "iConfiguration", "bmAttributes", "bMaxPower")
-        values = dict.fromkeys(fields, 0) | {"bConfigurationValue": config + 1, "extra_descriptors": []}
+        fields = (
+            "bLength",
+            "bDescriptorType",
+            "wTotalLength",
+            "iConfiguration",
+            "bmAttributes",
+            "bMaxPower",
+        )
+        values = dict.fromkeys(fields, 0) | {
+            "bConfigurationValue": config + 1,
+            "extra_descriptors": [],
+        }
         return SimpleNamespace(**values, bNumInterfaces=len(dev.classes))
 
-    def get_interface_descriptor(self, dev: SimpleNamespace, intf: int, alt: int, config: int) -> SimpleNamespace:
+    def get_interface_descriptor(
+        self, dev: SimpleNamespace, intf: int, alt: int, config: int
+    ) -> SimpleNamespace:
         if alt or config or intf >= len(dev.classes):
             raise IndexError
-        fields = "bLength bDescriptorType bNumEndpoints bInterfaceSubClass bInterfaceProtocol iInterface"
-        values = dict.fromkeys(fields.split(), 0) | {"bInterfaceNumber": intf, "bAlternateSetting": 0}
+        fields = (
+            "bLength bDescriptorType bNumEndpoints bInterfaceSubClass bInterfaceProtocol iInterface"
+        )
+        values = dict.fromkeys(fields.split(), 0) | {
+            "bInterfaceNumber": intf,
+            "bAlternateSetting": 0,
+        }
         values |= {"extra_descriptors": []}
         return SimpleNamespace(**values, bInterfaceClass=dev.classes[intf])
 
@@ -64,10 +85,21 @@ class FakeUsb(IBackend):
         self.open_handles -= 1
 
     def ctrl_transfer(
-        self, dev_handle: Any, bmRequestType: int, bRequest: int, wValue: int, wIndex: int, data: Any, timeout: int
+        self,
+        dev_handle: Any,
+        bmRequestType: int,
+        bRequest: int,
+        wValue: int,
+        wIndex: int,
+        data: Any,
+        timeout: int,
     ) -> int:
         del timeout
-        assert (bmRequestType, bRequest, wValue >> 8) == (0x80, 0x06, 3)  # reads a string, and does nothing else
+        assert (bmRequestType, bRequest, wValue >> 8) == (
+            0x80,
+            0x06,
+            3,
+        )  # reads a string, and does nothing else
         index = wValue & 0xFF
         assert wIndex == (0x0409 if index else 0)
         body = dev_handle.strings[index].encode("utf-16-le") if index else b"\x09\x04"
@@ -85,14 +117,46 @@ class FakeUsb(IBackend):
         self.meddled.append(f"detach {intf} of {dev_handle}")
 
 
-def fake_device(product: int = 0x0B64, serial: str = "00000000F0246262", **changes: Any) -> SimpleNamespace:
-    """Make an L515 with firmware 1.5.8 on USB 3, except for the changes; `shut` is raised on opening."""
-    values: dict[str, Any] = {"bLength": 18, "bDescriptorType": 1, "bMaxPacketSize0": 9, "bNumConfigurations": 1}
-    values |= {"bDeviceClass": 0xEF, "bDeviceSubClass": 2, "bDeviceProtocol": 1, "classes": L515_CLASSES}
-    values |= {"idVendor": 0x8086, "idProduct": product, "bcdUSB": 0x0320, "bcdDevice": 0x1058, "speed": 4}
-    values |= {"bus": 2, "address": 3, "port_number": 1, "port_numbers": (1,), "shut": None, "hides": None}
+def fake_device(
+    product: int = 0x0B64, serial: str = "00000000F0246262", **changes: Any
+) -> SimpleNamespace:
+    """Make an L515 with firmware 1.5.8 on USB 3, except for the changes; `shut` is raised on
+    opening.
+    """
+    values: dict[str, Any] = {
+        "bLength": 18,
+        "bDescriptorType": 1,
+        "bMaxPacketSize0": 9,
+        "bNumConfigurations": 1,
+    }
+    values |= {
+        "bDeviceClass": 0xEF,
+        "bDeviceSubClass": 2,
+        "bDeviceProtocol": 1,
+        "classes": L515_CLASSES,
+    }
+    values |= {
+        "idVendor": 0x8086,
+        "idProduct": product,
+        "bcdUSB": 0x0320,
+        "bcdDevice": 0x1058,
+        "speed": 4,
+    }
+    values |= {
+        "bus": 2,
+        "address": 3,
+        "port_number": 1,
+        "port_numbers": (1,),
+        "shut": None,
+        "hides": None,
+    }
     strings = "Intel(R) RealSense(TM) Camera", "Intel(R) RealSense(TM) 515", serial
-    values |= {"iManufacturer": 1, "iProduct": 2, "iSerialNumber": 3, "strings": dict(enumerate(strings, start=1))}
+    values |= {
+        "iManufacturer": 1,
+        "iProduct": 2,
+        "iSerialNumber": 3,
+        "strings": dict(enumerate(strings, start=1)),
+    }
     return SimpleNamespace(**values | changes)
 
 
@@ -116,18 +180,29 @@ class FakeLinux:
         link.parent.mkdir(parents=True, exist_ok=True)
         link.symlink_to(target)
 
-    def plug(self, port: str = "2-1", product: str = "0b64", address: int = 3, hid: int = 2, video: int = 2) -> None:
+    def plug(
+        self,
+        port: str = "2-1",
+        product: str = "0b64",
+        address: int = 3,
+        hid: int = 2,
+        video: int = 2,
+    ) -> None:
         """Plug in a camera with `hid` motion sensors and `video` nodes."""
         device = self.root / f"sys/devices/pci0000:00/usb2/{port}"
         values = {"idVendor": "8086", "idProduct": product, "busnum": "2", "devnum": str(address)}
-        for name, content in (values | {"serial": "00000000F0246262", "product": "RealSense"}).items():
+        for name, content in (
+            values | {"serial": "00000000F0246262", "product": "RealSense"}
+        ).items():
             self.write(f"{device.relative_to(self.root)}/{name}", f"{content}\n")
         self.link(f"sys/bus/usb/devices/{port}", device)
         for number in range(video):
             node = self._part(device, f"{port}:1.0/video4linux/video{address}{number}")
             self.link(f"sys/class/video4linux/{node.name}", node)
         for number, name in zip(range(hid), ("accel_3d", "gyro_3d"), strict=False):
-            sensor = self._part(device, f"{port}:1.6/0003:8086:0B64.{address}/iio:device{address}{number}")
+            sensor = self._part(
+                device, f"{port}:1.6/0003:8086:0B64.{address}/iio:device{address}{number}"
+            )
             self.write(f"{sensor.relative_to(self.root)}/name", f"{name}\n")
             self.link(f"sys/bus/iio/devices/{sensor.name}", sensor)
         hub = self._part(device, f"{port}:1.6/0003:8086:0B64.{address}")
@@ -155,7 +230,9 @@ class FakeLinux:
 
 
 class Bench:
-    """A healthy L515 on a healthy Linux, for faults to be added; `facts` and `checks` come from the real code."""
+    """A healthy L515 on a healthy Linux, for faults to be added; `facts` and `checks` come from the
+    real code.
+    """
 
     def __init__(self, root: Path) -> None:
         self.usb = FakeUsb(fake_device())
@@ -205,15 +282,21 @@ class Bench:
 
     def load_sdk(self) -> Any:
         if self.sdk_error:
-            raise CameraError(f"librealsense cannot be loaded ({self.sdk_error})") from self.sdk_error
+            raise CameraError(
+                f"librealsense cannot be loaded ({self.sdk_error})"
+            ) from self.sdk_error
         sdk = FakeSdk()
         sdk.lidars = self.sdk_devices
         return sdk
 
     def facts(self) -> Facts:
         host = read_host(self.linux.root, self.platform, self.open_node)
-        packages = [SimpleNamespace(name=name, version=version) for name, version in self.installed.items()]
-        return Facts(host, scan_usb(self.usb, self.linux.root), query_sdk(self.load_sdk, lambda: packages))
+        packages = [
+            SimpleNamespace(name=name, version=version) for name, version in self.installed.items()
+        ]
+        return Facts(
+            host, scan_usb(self.usb, self.linux.root), query_sdk(self.load_sdk, lambda: packages)
+        )
 
     def checks(self) -> dict[str, Check]:
         return {check.name: check for check in diagnose(self.facts())}

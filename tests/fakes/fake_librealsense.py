@@ -1,7 +1,7 @@
 """Fake of the parts of pyrealsense2 that the camera package uses, over fake lidars.
 
-Devices and sensors are handles on a `FakeLidar` that fail once it was unplugged, as librealsense's do.
-tests/unit/camera/test_fake_librealsense.py holds the names against the real module.
+Devices and sensors are handles on a `FakeLidar` that fail once it was unplugged, as librealsense's
+do. tests/unit/camera/test_fake_librealsense.py holds the names against the real module.
 """
 
 from collections.abc import Callable
@@ -20,10 +20,17 @@ class FakeSensor:
     """Handle on the lidar's depth or color sensor."""
 
     def __init__(self, lidar: FakeLidar, generation: int, *, colour: bool = False) -> None:
-        self.lidar, self.generation = lidar, generation
-        smallest = slice(-1, None) if lidar.info.get("usb_type_descriptor", "").startswith("2") else slice(None)
+        self.lidar = lidar
+        self.generation = generation
+        smallest = (
+            slice(-1, None)
+            if lidar.info.get("usb_type_descriptor", "").startswith("2")
+            else slice(None)
+        )
         sizes, streams = (COLOUR_SIZES, ("color",)) if colour else (SIZES, lidar.streams)
-        self.profiles = [FakeProfile(stream, size, lidar) for size in sizes[smallest] for stream in streams]
+        self.profiles = [
+            FakeProfile(stream, size, lidar) for size in sizes[smallest] for stream in streams
+        ]
 
     def _check(self) -> None:
         if not self.lidar.plugged or self.generation != self.lidar.generation:
@@ -82,7 +89,8 @@ class FakeDevice:
     """Handle on the lidar, valid until it is unplugged."""
 
     def __init__(self, lidar: FakeLidar, generation: int) -> None:
-        self.lidar, self.generation = lidar, generation
+        self.lidar = lidar
+        self.generation = generation
 
     def supports(self, key: str) -> bool:
         return key in self.lidar.info
@@ -94,7 +102,11 @@ class FakeDevice:
         if self.generation != self.lidar.generation:
             raise RuntimeError(GONE)
         depth = FakeSensor(self.lidar, self.generation)
-        return [depth, FakeSensor(self.lidar, self.generation, colour=True)] if self.lidar.colour else [depth]
+        return (
+            [depth, FakeSensor(self.lidar, self.generation, colour=True)]
+            if self.lidar.colour
+            else [depth]
+        )
 
     def hardware_reset(self) -> None:
         """Leave the bus and come back with a calibration."""
@@ -102,7 +114,8 @@ class FakeDevice:
             raise RuntimeError("hwmon command 0x20 failed. Error type: no device")
         self.lidar.did.append("reset")
         self.lidar.unplug()
-        self.lidar.uncalibrated, self.lidar.back_after = False, self.lidar.reset_takes
+        self.lidar.uncalibrated = False
+        self.lidar.back_after = self.lidar.reset_takes
 
 
 class FakeRecorder:
@@ -131,7 +144,8 @@ class Names:
     """Enumeration whose members are their own names; records the names in use."""
 
     def __init__(self, make: Callable[[str], Any]) -> None:
-        self.make, self.asked = make, set[str]()
+        self.make = make
+        self.asked = set[str]()
 
     def __getattr__(self, name: str) -> Any:
         self.asked.add(name)
@@ -144,8 +158,10 @@ class FakeSdk:
     recorder = FakeRecorder
 
     def __init__(self, *lidars: FakeLidar) -> None:
-        self.camera_info, self.option = Names(str), Names(lambda name: Named(name=name))
-        self.lidars, self.contexts = list(lidars), 0
+        self.camera_info = Names(str)
+        self.option = Names(lambda name: Named(name=name))
+        self.lidars = list(lidars)
+        self.contexts = 0
 
     def context(self) -> FakeContext:
         self.contexts += 1

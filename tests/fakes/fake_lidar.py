@@ -12,7 +12,9 @@ from nlos_cam.camera.l515 import NEAR_WALL
 from nlos_cam.camera.streams import FORMATS
 from nlos_cam.render.sensor.sensor import DEPTH_UNIT_M
 
-COLOUR_FROM_DEPTH = np.array([[1.0, 0.0, 0.0, 0.0], [0.0, 0.6, 0.8, 0.014], [0.0, -0.8, 0.6, -0.007]])
+COLOUR_FROM_DEPTH = np.array(
+    [[1.0, 0.0, 0.0, 0.0], [0.0, 0.6, 0.8, 0.014], [0.0, -0.8, 0.6, -0.007]]
+)
 """Pose of the color camera: far from the L515's, so that no test passes by chance."""
 LENS = [0.15, -0.5, -0.001, 0.0006, 0.47]
 Named = SimpleNamespace  # a member of one of the SDK's enumerations
@@ -20,10 +22,14 @@ PACE_S = 0.002
 
 
 class NapClock:
-    """Clock that moves only by waiting, and records each wait; `hook` is called before, with the number of earlier."""
+    """Clock that moves only by waiting, and records each wait; `hook` is called before, with the
+    number of earlier.
+    """
 
     def __init__(self, hook: Callable[[int], object] = lambda _: None) -> None:
-        self.time_s, self.naps, self.hook = 1e9, list[float](), hook
+        self.time_s = 1e9
+        self.naps = list[float]()
+        self.hook = hook
 
     def now(self) -> float:
         return self.time_s
@@ -37,7 +43,9 @@ class NapClock:
 
 class FakeProfile:
     def __init__(self, stream: str, size: tuple[int, int], lidar: "FakeLidar") -> None:
-        self.stream, self.size, self.lidar = stream, size, lidar
+        self.stream = stream
+        self.size = size
+        self.lidar = lidar
 
     def stream_type(self) -> Named:
         return Named(name=self.stream)
@@ -61,17 +69,24 @@ class FakeProfile:
         width, height = self.size
         if self.lidar.uncalibrated:
             raise RuntimeError(f"intrinsics for resolution {width},{height} doesn't exist")
-        made = SimpleNamespace(width=width, height=height, fx=460.0, fy=461.0, ppx=width / 2, ppy=height / 2)
-        made.model, made.coeffs = Named(name="none"), [0.0] * 5
+        made = SimpleNamespace(
+            width=width, height=height, fx=460.0, fy=461.0, ppx=width / 2, ppy=height / 2
+        )
+        made.model = Named(name="none")
+        made.coeffs = [0.0] * 5
         if self.stream == "color":
-            made.model, made.coeffs = Named(name=self.lidar.lens_model), LENS
+            made.model = Named(name=self.lidar.lens_model)
+            made.coeffs = LENS
         return made
 
     def get_extrinsics_to(self, other: "FakeProfile") -> SimpleNamespace:
         """Return the extrinsics from color to depth, the only ones in use."""
         assert (self.stream, other.stream) == ("color", "depth")
-        turn, shift = COLOUR_FROM_DEPTH[:, :3], COLOUR_FROM_DEPTH[:, 3]
-        return SimpleNamespace(rotation=turn.ravel().tolist(), translation=(-turn.T @ shift).tolist())
+        turn = COLOUR_FROM_DEPTH[:, :3]
+        shift = COLOUR_FROM_DEPTH[:, 3]
+        return SimpleNamespace(
+            rotation=turn.ravel().tolist(), translation=(-turn.T @ shift).tolist()
+        )
 
 
 @dataclass(frozen=True)
@@ -99,10 +114,11 @@ class FakeFrame:
 
 
 class FakeLidar:
-    """L515 on USB. Each start of its sensor uses the next of `runs`: a number of frames, from number 0.
+    """L515 on USB. Each start of its sensor uses the next of `runs`: a number of frames, from
+    number 0.
 
-    While it `flaps` more than once, it repeats the first run. Without `runs` it delivers one frame on starting, and
-    then those of each call of `deliver`.
+    While it `flaps` more than once, it repeats the first run. Without `runs` it delivers one frame
+    on starting, and then those of each call of `deliver`.
     """
 
     def __init__(
@@ -116,7 +132,8 @@ class FakeLidar:
     ) -> None:
         self.info = {"name": name, "serial_number": serial, "usb_type_descriptor": usb}
         self.info["firmware_version"] = "01.05.08.01"
-        self.streams, self.runs = streams, list(runs) if runs is not None else None
+        self.streams = streams
+        self.runs = list(runs) if runs is not None else None
         factory = {"depth_units": DEPTH_UNIT_M, "visual_preset": 4.0, "global_time_enabled": 0.0}
         self.factory = factory | dict.fromkeys(NEAR_WALL, 9.0) | options
         self.options = dict(self.factory)
@@ -130,25 +147,34 @@ class FakeLidar:
         self.uncalibrated = False
         self.reset_takes = 2
         """Number of look-ups until it is back after a reset."""
-        self.plugged, self.generation = True, 0
+        self.plugged = True
+        self.generation = 0
         self.flaps = 0
-        """Number of times that it will be unplugged at the end of a run, and plugged in after two look-ups."""
+        """Number of times that it will be unplugged at the end of a run, and plugged in after two
+        look-ups.
+        """
         self.back_after = 0
         """Number of look-ups after which an unplugged device is plugged in; never, if 0."""
         self.saturated_share: Callable[[float], float] = lambda _: 0.0
         """Share of infrared pixels at 255, by laser power."""
-        self.zero_ms, self.period_ms = 0.0, 1000 / 30
+        self.zero_ms = 0.0
+        self.period_ms = 1000 / 30
         self.colour: Callable[[int], int] | None = None
-        """Gray level of the color image by frame number; None without a color camera. One sensor runs at a time."""
+        """Gray level of the color image by frame number; None without a color camera. One sensor
+        runs at a time.
+        """
         self.lens_model = "brown_conrady"
         self._callback: Callable[[FakeFrame], None] | None = None
-        self._stopping, self._thread = Event(), None
+        self._stopping = Event()
+        self._thread = None
 
     def unplug(self) -> None:
         self.did.append("unplugged")
-        self.plugged, self.generation = False, self.generation + 1
+        self.plugged = False
+        self.generation = self.generation + 1
         self._stopping.set()
-        self._callback, self.options = None, dict(self.factory)
+        self._callback = None
+        self.options = dict(self.factory)
 
     def plug_in(self) -> None:
         self.plugged = True
@@ -170,7 +196,9 @@ class FakeLidar:
             return
         self._stopping = stopping = Event()
         frames = 0 if not self.runs else self.runs[0] if self.flaps > 1 else self.runs.pop(0)
-        self._thread = Thread(target=self._run, args=(frames, stopping), name="fake SDK", daemon=True)
+        self._thread = Thread(
+            target=self._run, args=(frames, stopping), name="fake SDK", daemon=True
+        )
         self._thread.start()
 
     def _run(self, frames: int, stopping: Event) -> None:
@@ -179,7 +207,8 @@ class FakeLidar:
                 return
             self.deliver(range(number, number + 1))
         if self.flaps and frames and not stopping.wait(PACE_S):
-            self.flaps, self.back_after = self.flaps - 1, 2
+            self.flaps = self.flaps - 1
+            self.back_after = 2
             self.unplug()
 
     def deliver(self, numbers: range, streams: tuple[str, ...] = (*FORMATS, "color")) -> None:
@@ -187,12 +216,16 @@ class FakeLidar:
             for profile in self.opened:
                 if self._callback and profile.stream in streams:
                     taken_ms = self.zero_ms + number * self.period_ms
-                    self._callback(FakeFrame(profile, number, taken_ms, self._pixels(profile, number)))
+                    self._callback(
+                        FakeFrame(profile, number, taken_ms, self._pixels(profile, number))
+                    )
 
     def _pixels(self, profile: FakeProfile, number: int) -> np.ndarray:
         if profile.stream == "color" and self.colour:
             return np.full((*profile.size[::-1], 3), self.colour(number), np.uint8)
-        pixels = np.full(profile.size[::-1], 240, np.uint16 if profile.stream == "depth" else np.uint8)
+        pixels = np.full(
+            profile.size[::-1], 240, np.uint16 if profile.stream == "depth" else np.uint8
+        )
         if profile.stream == "infrared":
             share = self.saturated_share(self.options.get("laser_power", 0.0))
             pixels.ravel()[: round(share * pixels.size)] = 255

@@ -1,4 +1,6 @@
-"""A measured wall, small and made up: frames of it, a reference from some of them, and its record on disk."""
+"""A measured wall, small and made up: frames of it, a reference from some of them, and its record
+on disk.
+"""
 
 from collections.abc import Mapping
 from dataclasses import replace
@@ -51,7 +53,9 @@ def bare_wall() -> BareWall:
     return statistics.reference(FIT.inliers, serial=SERIAL, settings={"laser_power": 40.0})
 
 
-def write_wall(path: Path, reference: BareWall | None = None, intrinsics: Intrinsics = SMALL, **others: Any) -> Path:
+def write_wall(
+    path: Path, reference: BareWall | None = None, intrinsics: Intrinsics = SMALL, **others: Any
+) -> Path:
     """A record, and the reference beside it if there is one."""
     if reference:
         npz = path.with_suffix(".npz")
@@ -69,12 +73,17 @@ def measured_wall(folder: Path) -> MeasuredWall:
 class WallCamera(FrameCamera):
     """Frames of the bare wall; those of the numbers in `moved` are of a lidar 10 mm nearer."""
 
-    def __init__(self, frames: int, moved: range = range(0), celsius: float = 40.0, period_s: float = 1 / 30) -> None:
+    def __init__(
+        self, frames: int, moved: range = range(0), celsius: float = 40.0, period_s: float = 1 / 30
+    ) -> None:
         def make(number: int) -> Frame:
-            return replace(wall_frame(number, 0.01 * (number in moved)), timestamp_s=number * period_s)
+            return replace(
+                wall_frame(number, 0.01 * (number in moved)), timestamp_s=number * period_s
+            )
 
         super().__init__(frames, make=make)
-        self._celsius, self.asked = celsius, 0
+        self._celsius = celsius
+        self.asked = 0
 
     def telemetry(self, ending: str = "") -> Mapping[str, float]:
         self.asked += 1

@@ -22,11 +22,17 @@ def bump(number: int) -> np.ndarray:
     """A round hill that goes from left to right, a pixel each frame; nothing around it."""
     y, x = np.mgrid[:64, :64]
     height = 1.0 - np.hypot(x - 20 - number % 24, y - 32) / 16
-    return np.where(height > 0, 0.3 - 0.1 * np.sqrt(np.clip(height, 0.0, 1.0)), np.nan).astype(np.float32)
+    return np.where(height > 0, 0.3 - 0.1 * np.sqrt(np.clip(height, 0.0, 1.0)), np.nan).astype(
+        np.float32
+    )
 
 
 def moment(
-    number: int, hidden_m: np.ndarray | None = None, *, size: tuple[int, int] = (64, 80), **fields: Any
+    number: int,
+    hidden_m: np.ndarray | None = None,
+    *,
+    size: tuple[int, int] = (64, 80),
+    **fields: Any,
 ) -> Moment:
     """Frame `number`, of which only the reconstruction is known; `fields` replace the moment's."""
     depth_m = np.random.default_rng(number).uniform(0.2, 1.0, size).astype(np.float32)
@@ -37,7 +43,9 @@ def moment(
     return replace(Moment(frame, made, number / 30, 0.02), **fields)
 
 
-def full_moment(number: int, verdict: Verdict = Verdict.SEEN, size: tuple[int, int] = (64, 80)) -> Moment:
+def full_moment(
+    number: int, verdict: Verdict = Verdict.SEEN, size: tuple[int, int] = (64, 80)
+) -> Moment:
     """All that a moment can hold."""
     hidden_m = NOTHING if verdict is Verdict.NOTHING else bump(number)
     plain = moment(number, hidden_m, size=size)
@@ -50,7 +58,12 @@ def full_moment(number: int, verdict: Verdict = Verdict.SEEN, size: tuple[int, i
         difference=LidarMaps(cells, cells, np.isfinite(cells)),
         verdict=verdict,
         check=PhysicsCheckResult(number - number % 30, cells, cells, 0.2 + 0.1 * (number % 3), 0.5),
-        stages_s={"wait": 0.02, "maps": 0.002, "bench": 0.0001, "network": 0.009 + 0.001 * (number % 4)},
+        stages_s={
+            "wait": 0.02,
+            "maps": 0.002,
+            "bench": 0.0001,
+            "network": 0.009 + 0.001 * (number % 4),
+        },
         dropped=number // 50,
         celsius={"ldd_temperature": 40.0 + number / 100, "mc_temperature": 35.0},
     )

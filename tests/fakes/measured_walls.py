@@ -1,4 +1,6 @@
-"""A measured wall made up in a moment: the paper's pose, and a reference that lies on its plane to the last bit."""
+"""A measured wall made up in a moment: the paper's pose, and a reference that lies on its plane to
+the last bit.
+"""
 
 from datetime import date
 from typing import Any
@@ -12,11 +14,22 @@ from nlos_calibration.rig import PinholeRecord, load_rig
 from nlos_calibration.wall import wall_depth
 from nlos_calibration.wall_record import MeasuredWall, WallRecord
 
-WIDTH, HEIGHT = 96, 72
+WIDTH = 96
+HEIGHT = 72
 ANGLES = "yaw", "pitch", "facing"
-SEEN = {"corners": 24, "residual_px": 0.07, "stretch": 0.001, "bow_m": 0.0002, "causes": ("printed at 97 %",)}
+SEEN = {
+    "corners": 24,
+    "residual_px": 0.07,
+    "stretch": 0.001,
+    "bow_m": 0.0002,
+    "causes": ("printed at 97 %",),
+}
 APART = {"disagreement_m": 0.0034, "disagreement_deg": 0.117, "disagreement_sigmas": 6.5}
-PLACE = {"distance_m": 0.2034, "distance_std_m": 0.0005, **{f"{angle}_deg": 40.1 for angle in ANGLES}}
+PLACE = {
+    "distance_m": 0.2034,
+    "distance_std_m": 0.0005,
+    **{f"{angle}_deg": 40.1 for angle in ANGLES},
+}
 PLACE |= {f"{angle}_std_deg": 0.02 for angle in ANGLES}
 BOARD = BoardRecord(printed=BOARDS["a4"], measured=True, used="depth", **SEEN, **APART, **PLACE)  # type: ignore[arg-type]
 
@@ -26,10 +39,27 @@ def exact_wall(**fields: Any) -> MeasuredWall:
     rig = load_rig("paper-rig")
     small = rig.pinhole.scaled(WIDTH, HEIGHT)
     rig = rig.model_copy(update={"intrinsics": PinholeRecord.model_validate(vars(small))})
-    found: dict[str, Any] = {"distance_m": 0.2, "facing_deg": 45.0, "yaw_deg": 45.0, "pitch_deg": 0.0}
-    found |= {"distance_std_m": 0.0001, "facing_std_deg": 0.01, "yaw_std_deg": 0.01, "pitch_std_deg": 0.02}
-    found |= {"verdict": "good", "advice": "distance and angle are inside the paper's ranges", "rig": rig}
-    found |= {"wall_from_lidar": rig.wall_from_lidar.tolist(), "temperatures_c": {"ldd_temperature": 41.7}}
+    found: dict[str, Any] = {
+        "distance_m": 0.2,
+        "facing_deg": 45.0,
+        "yaw_deg": 45.0,
+        "pitch_deg": 0.0,
+    }
+    found |= {
+        "distance_std_m": 0.0001,
+        "facing_std_deg": 0.01,
+        "yaw_std_deg": 0.01,
+        "pitch_std_deg": 0.02,
+    }
+    found |= {
+        "verdict": "good",
+        "advice": "distance and angle are inside the paper's ranges",
+        "rig": rig,
+    }
+    found |= {
+        "wall_from_lidar": rig.wall_from_lidar.tolist(),
+        "temperatures_c": {"ldd_temperature": 41.7},
+    }
     record = WallRecord(created=date(2026, 11, 22), camera="made-up", frames=30, **found)
     if "reference" in fields:
         return MeasuredWall(record, fields["reference"])
@@ -38,7 +68,8 @@ def exact_wall(**fields: Any) -> MeasuredWall:
 
 def exact_reference(pose: np.ndarray, intrinsics: Intrinsics, fields: dict[str, Any]) -> BareWall:
     """Reference of a wall at a pose, to the last bit; `fields` replace its own."""
-    shape, cells = (intrinsics.height, intrinsics.width), (64, 80)
+    shape = (intrinsics.height, intrinsics.width)
+    cells = (64, 80)
     exact: dict[str, Any] = {
         "depth_m": wall_depth(pose, intrinsics).astype(np.float32),
         "depth_std_m": np.full(shape, 0.0005, np.float32),

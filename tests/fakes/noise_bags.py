@@ -1,4 +1,6 @@
-"""Small recordings of noise: packed or not, closed or without their index, as a kill leaves them."""
+"""Small recordings of noise: packed or not, closed or without their index, as a kill leaves
+them.
+"""
 
 import re
 from pathlib import Path
@@ -18,7 +20,10 @@ def without_index(content: bytes) -> bytes:
 
 def make_all(folder: Path) -> dict[str, Path]:
     """One of each kind, by name."""
-    made = {name: record(folder / f"{name}.bag", packed=name == "packed") for name in ("packed", "plain")}
+    made = {
+        name: record(folder / f"{name}.bag", packed=name == "packed")
+        for name in ("packed", "plain")
+    }
     for name, path in list(made.items()):
         unindexed = folder / f"{name}-unindexed.bag"
         unindexed.write_bytes(without_index(path.read_bytes()))

@@ -1,4 +1,6 @@
-"""Process that records noise: arguments are PATH, FRAMES and, as if a disk were full, the largest bytes of a file."""
+"""Process that records noise: arguments are PATH, FRAMES and, as if a disk were full, the largest
+bytes of a file.
+"""
 
 import sys
 from pathlib import Path

@@ -3,7 +3,15 @@
 from dataclasses import dataclass
 
 import numpy as np
-from nlos_calibration import INTERVAL_STDS, DepthMean, Intrinsics, LidarPose, Occluder, PinholeRecord, load_rig
+from nlos_calibration import (
+    INTERVAL_STDS,
+    DepthMean,
+    Intrinsics,
+    LidarPose,
+    Occluder,
+    PinholeRecord,
+    load_rig,
+)
 from nlos_calibration.errors import OccluderRefusedError
 from nlos_calibration.occluder import MIN_COLUMNS, find_occluder
 from synthetic_scenes import Sheet, bench_depth
@@ -18,7 +26,10 @@ NO_ECHO = MultiBounce(DARK, DARK, np.full((64, 80), np.nan, np.float32))
 PAPER = load_rig("paper-rig")
 PINHOLE = PAPER.pinhole.scaled(96, 72)
 PITCHES_DEG = -12.0, 0.0, 0.0, 8.0
-IN_VIEW, BARELY, NOT_IN_VIEW, EDGE_HIDDEN = "in view", "barely in view", "out of view", "edge out of view"
+IN_VIEW = "in view"
+BARELY = "barely in view"
+NOT_IN_VIEW = "out of view"
+EDGE_HIDDEN = "edge out of view"
 
 
 @dataclass(frozen=True)
@@ -56,23 +67,31 @@ class Outcome:
 
 def draw(setting: Setting, generator: Generator) -> tuple[View, Sheet]:
     """Return a bench near the setting, at random against the pixels' grid."""
-    yaw_deg, distance_m = setting.facing_deg + generator.uniform(-1.0, 1.0), generator.uniform(-0.005, 0.005)
+    yaw_deg = setting.facing_deg + generator.uniform(-1.0, 1.0)
+    distance_m = generator.uniform(-0.005, 0.005)
     lean_deg, twist_deg, edge_deg = generator.uniform(-setting.lean_deg, setting.lean_deg, 3)
-    x_m, gap_m = setting.x_m + generator.uniform(-0.01, 0.01), setting.gap_m + generator.uniform(-0.005, 0.005)
-    seen = view(setting.distance_m + distance_m, yaw_deg, float(generator.choice(PITCHES_DEG)), PINHOLE)
+    x_m = setting.x_m + generator.uniform(-0.01, 0.01)
+    gap_m = setting.gap_m + generator.uniform(-0.005, 0.005)
+    seen = view(
+        setting.distance_m + distance_m, yaw_deg, float(generator.choice(PITCHES_DEG)), PINHOLE
+    )
     return seen, Sheet(x_m, gap_m, lean_deg, twist_deg, edge_deg)
 
 
 def trial(setting: Setting, generator: Generator) -> Outcome:
     """Draw a bench near the setting and find its occluder."""
     seen, sheet = draw(setting, generator)
-    depth_m = with_outliers(bench_depth(seen, sheet, beams=setting.beams), setting.outliers, generator)
+    depth_m = with_outliers(
+        bench_depth(seen, sheet, beams=setting.beams), setting.outliers, generator
+    )
     mean = depth_statistics(depth_m, generator, frames=setting.frames, noise=setting.noise)
     return outcome(seen, sheet, mean, generator)
 
 
 def simulated_trial(setting: Setting, generator: Generator, pinhole: Intrinsics) -> Outcome:
-    """Find an upright occluder in frames of the renderer's beams and the simulated camera's sensor."""
+    """Find an upright occluder in frames of the renderer's beams and the simulated camera's
+    sensor.
+    """
     sheet = Sheet((drawn := draw(setting, generator))[1].x_m, drawn[1].gap_m)
     rig = PAPER.model_copy(
         update={
@@ -81,7 +100,8 @@ def simulated_trial(setting: Setting, generator: Generator, pinhole: Intrinsics)
             "occluder": Occluder(x_m=sheet.x_m, z_min_m=sheet.gap_m),
         }
     )
-    sensor, mean = Sensor(rig, SensorModel()), DepthMean(pinhole.height, pinhole.width)
+    sensor = Sensor(rig, SensorModel())
+    mean = DepthMean(pinhole.height, pinhole.width)
     for _ in range(setting.frames):
         mean.add(sensor.expose(NO_ECHO, generator).frame(pinhole).depth_m)
     return outcome(View(rig.wall_from_lidar, pinhole), sheet, mean, generator)
@@ -99,5 +119,7 @@ def outcome(seen: View, sheet: Sheet, mean: DepthMean, generator: Generator) -> 
         return Outcome(shown, refused=str(error))
     errors = fit.x_m - sheet.x_m, fit.gap_m - sheet.gap_m, fit.tilt_deg - sheet.lean_deg
     stds = fit.x_std_m, fit.gap_std_m, fit.tilt_std_deg
-    x, gap, tilt = (abs(error) <= INTERVAL_STDS * std for error, std in zip(errors, stds, strict=True))
+    x, gap, tilt = (
+        abs(error) <= INTERVAL_STDS * std for error, std in zip(errors, stds, strict=True)
+    )
     return Outcome(shown, "", *errors, inside=(x, gap, tilt))

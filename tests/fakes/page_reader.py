@@ -11,19 +11,25 @@ PNG = "data:image/png;base64,"
 
 
 class PageReader(HTMLParser):
-    """Reader of a page as a browser: its text, its pictures, and everything it would fetch or run."""
+    """Reader of a page as a browser: its text, its pictures, and everything it would fetch or
+    run.
+    """
 
     def __init__(self, page: str) -> None:
         super().__init__(convert_charrefs=True)
         self.open: list[str] = []
-        self.text, self.pictures, self.fetched = "", list[str](), list[str]()
+        self.text = ""
+        self.pictures = list[str]()
+        self.fetched = list[str]()
         self.feed(page)
         self.close()
 
     def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
         for name, value in attrs:
             if name in {"src", "href", "srcset", "data", "action"} or name.startswith("on"):
-                (self.pictures if (value or "").startswith(PNG) else self.fetched).append(value or "")
+                (self.pictures if (value or "").startswith(PNG) else self.fetched).append(
+                    value or ""
+                )
         if tag in {"script", "link", "iframe", "object", "embed", "base"}:
             self.fetched.append(tag)
         if tag not in VOID:

@@ -35,13 +35,17 @@ def sheet_network(*_: np.ndarray) -> np.ndarray:
 
 
 class SheetNetwork:
-    """Network, trained on the paper's rig, that shows a sheet and keeps the depth maps that it is given."""
+    """Network, trained on the paper's rig, that shows a sheet and keeps the depth maps that it is
+    given.
+    """
 
     runtime = "nothing at all"
 
     def __init__(self) -> None:
         self.given: list[np.ndarray] = []
-        self.record = SimpleNamespace(rig_name=RIG.name, rig_checksum=RIG.checksum, input="raw maps")
+        self.record = SimpleNamespace(
+            rig_name=RIG.name, rig_checksum=RIG.checksum, input="raw maps"
+        )
 
     def __call__(self, depth_m: np.ndarray, intensity: np.ndarray) -> np.ndarray:
         assert depth_m.shape == intensity.shape == (len(depth_m), 64, 80)
@@ -51,14 +55,20 @@ class SheetNetwork:
 
 def small_frame(number: int, offset_s: float = 0.0) -> Frame:
     """Make frame `number` of 30 a second, at constant depth; its timestamp starts at `offset_s`."""
-    depth_m, ir = np.full((64, 80), 0.3, np.float32), np.full((64, 80), 9, np.uint8)
+    depth_m = np.full((64, 80), 0.3, np.float32)
+    ir = np.full((64, 80), 9, np.uint8)
     return Frame(depth_m, ir, ir, offset_s + number / 30, number, SMALL)
 
 
 class FrameCamera:
-    """Camera of `count` frames (None: no end); calls `on_frame` before each, and sets `closed` when it is closed."""
+    """Camera of `count` frames (None: no end); calls `on_frame` before each, and sets `closed` when
+    it is closed.
+    """
 
-    intrinsics, rig, incomplete, dropped = SMALL, None, 0, 0
+    intrinsics = SMALL
+    rig = None
+    incomplete = 0
+    dropped = 0
 
     def __init__(
         self,
@@ -68,9 +78,13 @@ class FrameCamera:
         make: Callable[[int], Frame] = small_frame,
         uri: str = "bag:fake.bag",
     ) -> None:
-        self.uri, self.identity, self.counts = uri, {"serial": SERIAL}, Counter[str]()
+        self.uri = uri
+        self.identity = {"serial": SERIAL}
+        self.counts = Counter[str]()
         self.closed = Event()
-        self._count, self._on_frame, self._make = count, on_frame, make
+        self._count = count
+        self._on_frame = on_frame
+        self._make = make
 
     def __enter__(self) -> Self:
         return self

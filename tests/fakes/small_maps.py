@@ -22,7 +22,8 @@ HARD_MAPS = ("constant", "all zero", "saturated", "half invalid", "all invalid")
 
 def small_images(count: int, seed: int) -> Float16:
     """Return images (n, 64, 64) of one bright square each."""
-    generator, images = np.random.default_rng(seed), np.zeros((count, 64, 64), np.float16)
+    generator = np.random.default_rng(seed)
+    images = np.zeros((count, 64, 64), np.float16)
     for image in images:
         row, column = generator.integers(8, 30, 2)
         image[row : row + 24, column : column + 24] = generator.uniform(0.3, 1)
@@ -38,7 +39,9 @@ def small_maps(count: int, seed: int) -> MapSet:
 
 
 def noise_maps(count: int) -> tuple[Float32, Float32]:
-    """Return depth and intensity (n, 64, 80) of noise by their count; a tenth of the cells have no return."""
+    """Return depth and intensity (n, 64, 80) of noise by their count; a tenth of the cells have no
+    return.
+    """
     generator = np.random.default_rng(count)
     depth = generator.uniform(0.2, 0.8, (count, 64, 80)).astype(np.float32)
     depth[generator.random(depth.shape) < 0.1] = np.nan
@@ -46,10 +49,14 @@ def noise_maps(count: int) -> tuple[Float32, Float32]:
 
 
 def hard_maps(name: str, channels: tuple[int, ...] = ()) -> tuple[Tensor, Tensor]:
-    """Return depth (1, 64, 80) and intensity (1, *channels, 64, 80) at an extreme that a camera can deliver."""
-    depth, intensity = torch.full((1, 64, 80), 0.3), torch.full((1, *channels, 64, 80), 10.0)
+    """Return depth (1, 64, 80) and intensity (1, *channels, 64, 80) at an extreme that a camera can
+    deliver.
+    """
+    depth = torch.full((1, 64, 80), 0.3)
+    intensity = torch.full((1, *channels, 64, 80), 10.0)
     if name == "all zero":
-        depth, intensity = torch.zeros_like(depth), torch.zeros_like(intensity)
+        depth = torch.zeros_like(depth)
+        intensity = torch.zeros_like(intensity)
     if name == "saturated":
         intensity[:] = 255.0
     if name == "half invalid":
@@ -63,7 +70,8 @@ class SmallDataset:
     """Stand-in for a dataset of two shards on disk."""
 
     def __init__(self, maps: MapSet, plan: Any) -> None:
-        self._maps, self.plan = maps, plan
+        self._maps = maps
+        self.plan = plan
 
     def __len__(self) -> int:
         return len(self._maps.image)
@@ -78,7 +86,8 @@ class SmallDataset:
         return getattr(self._maps, name)
 
     def chunks(self) -> Iterator[MapSet]:
-        maps, half = self._maps, len(self) // 2
+        maps = self._maps
+        half = len(self) // 2
         for part in (slice(half), slice(half, None)):
             yield MapSet(maps.depth_m[part], maps.intensity[part], maps.image[part])
 
@@ -92,7 +101,8 @@ class SmallEncoder(nn.Module):
     def __init__(self) -> None:
         super().__init__()
         self.norm = nn.BatchNorm1d(64)
-        self.mean, self.log_variance = nn.Linear(64, LATENT), nn.Linear(64, LATENT)
+        self.mean = nn.Linear(64, LATENT)
+        self.log_variance = nn.Linear(64, LATENT)
 
     def forward(self, image: Tensor) -> tuple[Tensor, Tensor]:
         features = self.norm(functional.avg_pool2d(image, 8).flatten(1))
@@ -104,7 +114,8 @@ class SmallDecoder(nn.Module):
 
     def __init__(self) -> None:
         super().__init__()
-        self.norm, self.output = nn.BatchNorm1d(LATENT), nn.Linear(LATENT, 64)
+        self.norm = nn.BatchNorm1d(LATENT)
+        self.output = nn.Linear(LATENT, 64)
 
     def forward(self, latent: Tensor) -> Tensor:
         coarse = self.output(self.norm(latent)).view(-1, 1, 8, 8)
@@ -118,7 +129,8 @@ class SmallVae(nn.Module):
 
     def __init__(self) -> None:
         super().__init__()
-        self.encoder, self.decoder = SmallEncoder(), SmallDecoder()
+        self.encoder = SmallEncoder()
+        self.decoder = SmallDecoder()
 
     def forward(self, image: Tensor, noise: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         mean, log_variance = self.encoder(image)
@@ -126,12 +138,16 @@ class SmallVae(nn.Module):
 
 
 class SmallCompressor(nn.Module):
-    """Stand-in for Compressor of any width: features with a batch norm, then dropout and a linear classifier."""
+    """Stand-in for Compressor of any width: features with a batch norm, then dropout and a linear
+    classifier.
+    """
 
     def __init__(self, dropout: float = 0.5, width: float = 1.0) -> None:  # noqa: ARG002  small is small
         super().__init__()
         conv = nn.Conv2d(4, 4, 5, stride=5)
-        self.features = nn.Sequential(conv, nn.BatchNorm2d(4), nn.ReLU(), nn.AvgPool2d(4), nn.Flatten())
+        self.features = nn.Sequential(
+            conv, nn.BatchNorm2d(4), nn.ReLU(), nn.AvgPool2d(4), nn.Flatten()
+        )
         self.classifier = nn.Sequential(nn.Dropout(dropout), nn.Linear(100, LATENT))
 
     def forward(self, stacked: Tensor) -> Tensor:
@@ -140,15 +156,29 @@ class SmallCompressor(nn.Module):
 
 def use_small_networks(patch: pytest.MonkeyPatch, *modules: object) -> None:
     """Replace the networks by small ones, also in modules that import the classes."""
-    small_ones = {"ResVae": SmallVae, "Encoder": SmallEncoder, "Decoder": SmallDecoder, "Compressor": SmallCompressor}
+    small_ones = {
+        "ResVae": SmallVae,
+        "Encoder": SmallEncoder,
+        "Decoder": SmallDecoder,
+        "Compressor": SmallCompressor,
+    }
     for module in (networks, *modules):
         for name, small in small_ones.items():
             patch.setattr(module, name, small, raising=False)
 
 
 def untrained_weights(folder: Path, *, rig: Any, seed: int = 0, **recipe: Any) -> None:
-    """Write a checkpoint of untrained small networks (see `use_small_networks`) with this recipe."""
-    facts = {"objects": 10, "held_out": 2, "epochs": 1, "batch": 2, "learning_rate": 1e-3, "image_weight": 1.0}
+    """Write a checkpoint of untrained small networks (see `use_small_networks`) with this
+    recipe.
+    """
+    facts = {
+        "objects": 10,
+        "held_out": 2,
+        "epochs": 1,
+        "batch": 2,
+        "learning_rate": 1e-3,
+        "image_weight": 1.0,
+    }
     facts |= {"latent_weight": 0.0} if recipe.get("steps") == "one" else {}
     made = Recipe.model_validate({"task": "compressor", **facts, **recipe})
     record = checkpoint.CheckpointRecord(

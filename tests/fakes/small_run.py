@@ -1,4 +1,6 @@
-"""Training runs that take a moment: in this process, in a process that is killed, or in several processes."""
+"""Training runs that take a moment: in this process, in a process that is killed, or in several
+processes.
+"""
 
 import csv
 import os
@@ -13,20 +15,31 @@ from nlos_models import Recipe, train
 from nlos_models.train import Running, fit
 from torch import Tensor, nn
 
-SAMPLES, BATCH = 24, 4
+SAMPLES = 24
+BATCH = 4
 STEPS = SAMPLES // BATCH
 
 
 def small_recipe(**changes: object) -> Recipe:
     """Return a recipe of four epochs of six steps, with these changes."""
-    facts = {"task": "vae", "objects": SAMPLES, "held_out": 4, "epochs": 4, "batch": BATCH, "learning_rate": 1e-2}
+    facts = {
+        "task": "vae",
+        "objects": SAMPLES,
+        "held_out": 4,
+        "epochs": 4,
+        "batch": BATCH,
+        "learning_rate": 1e-2,
+    }
     return Recipe.model_validate(facts | changes)
 
 
 def log_rows(folder: Path) -> list[dict[str, str]]:
     """Return the rows of a run's log.csv without the column that depends on the clock."""
     with (folder / "log.csv").open(encoding="utf-8") as file:
-        return [{key: value for key, value in row.items() if key != "seconds"} for row in csv.DictReader(file)]
+        return [
+            {key: value for key, value in row.items() if key != "seconds"}
+            for row in csv.DictReader(file)
+        ]
 
 
 def state_of(module: nn.Module) -> dict[str, Tensor]:
@@ -51,11 +64,16 @@ def stop_halfway(step: int, total: int) -> None:
 
 
 class SmallRun:
-    """Regression with noise and, unless `plain`, dropout and a batch norm: all state that resuming must restore."""
+    """Regression with noise and, unless `plain`, dropout and a batch norm: all state that resuming
+    must restore.
+    """
 
     def __init__(self, recipe: Recipe, folder: Path, *, plain: bool = False) -> None:
         torch.manual_seed(7)
-        self.recipe, self.folder, self.steps, self.scored = recipe, folder, list[tuple[int, int]](), 0
+        self.recipe = recipe
+        self.folder = folder
+        self.steps = list[tuple[int, int]]()
+        self.scored = 0
         self.done = list[float]()
         """The share of the run that the loss was given at each step."""
         self.x = torch.rand(SAMPLES, 3)
@@ -110,7 +128,8 @@ class Executioner:
     """Counter of the moments of a run; kills its process at one of them."""
 
     def __init__(self, moment: int | None = None) -> None:
-        self.seen, self.moment = 0, moment
+        self.seen = 0
+        self.moment = moment
 
     def __call__(self) -> None:
         """Count one more moment."""
@@ -120,11 +139,17 @@ class Executioner:
 
 
 def run_watched(recipe: Recipe, folder: Path, executioner: Executioner) -> SmallRun:
-    """Train with a checkpoint after each step; moments are before a step, during a write and before a rename."""
-    run, fsync, replace = SmallRun(recipe, folder), os.fsync, Path.replace
+    """Train with a checkpoint after each step; moments are before a step, during a write and before
+    a rename.
+    """
+    run = SmallRun(recipe, folder)
+    fsync = os.fsync
+    replace = Path.replace
 
     def watched_fsync(file: int) -> None:
-        os.ftruncate(file, os.fstat(file).st_size // 2) if executioner.seen + 1 == executioner.moment else None
+        os.ftruncate(
+            file, os.fstat(file).st_size // 2
+        ) if executioner.seen + 1 == executioner.moment else None
         executioner()
         fsync(file)
 
@@ -132,11 +157,13 @@ def run_watched(recipe: Recipe, folder: Path, executioner: Executioner) -> Small
         executioner()
         return replace(path, target)
 
-    train.os.fsync, Path.replace = watched_fsync, watched_replace  # type: ignore[method-assign]
+    train.os.fsync = watched_fsync
+    Path.replace = watched_replace  # type: ignore[method-assign]
     try:
         run.go(stop=lambda: bool(executioner()), checkpoint_s=0.0)
     finally:
-        train.os.fsync, Path.replace = fsync, replace  # type: ignore[method-assign]
+        train.os.fsync = fsync
+        Path.replace = replace  # type: ignore[method-assign]
     return run
 
 
@@ -147,11 +174,14 @@ def be_killed(recipe_json: str, folder: str, moment: int) -> None:
 
 
 def on_two(fabric: Fabric, folder: Path) -> dict[str, Any]:
-    """Run in each of two processes: train once in one go, and once stopped by the other process and resumed."""
+    """Run in each of two processes: train once in one go, and once stopped by the other process and
+    resumed.
+    """
     recipe = small_recipe(epochs=3, schedule="one-cycle")
     whole = SmallRun(recipe, folder / "whole", plain=True)
     figures = whole.go(fabric=fabric)
-    stopped, messages = SmallRun(recipe, folder / "stopped", plain=True), list[str]()
+    stopped = SmallRun(recipe, folder / "stopped", plain=True)
+    messages = list[str]()
     try:
         stopped.go(fabric=fabric, stop=lambda: fabric.global_rank == 1, on_message=messages.append)
     except KeyboardInterrupt:

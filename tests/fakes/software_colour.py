@@ -1,4 +1,6 @@
-"""A SoftwareLidar in front of a program, a colour camera beside it in the same device, and recordings of both."""
+"""A SoftwareLidar in front of a program, a colour camera beside it in the same device, and
+recordings of both.
+"""
 
 import gc
 from pathlib import Path
@@ -13,7 +15,9 @@ from nlos_cam.render import SensedImages
 
 
 class SoftwareSdk:
-    """Stands for pyrealsense2: its context sees the software device of one lidar, and nothing else."""
+    """Stands for pyrealsense2: its context sees the software device of one lidar, and nothing
+    else.
+    """
 
     def __init__(self, pinhole: Intrinsics) -> None:
         self.sdk = load_sdk()
@@ -34,7 +38,9 @@ BYTES_PER_PIXEL = {"rgb8": 3, "bgr8": 3, "rgba8": 4, "bgra8": 4, "yuyv": 2, "uyv
 
 
 class SoftwareColour:
-    """The L515's RGB sensor as librealsense sees it: delivers what is pushed into it while it streams."""
+    """The L515's RGB sensor as librealsense sees it: delivers what is pushed into it while it
+    streams.
+    """
 
     def __init__(
         self,
@@ -44,35 +50,57 @@ class SoftwareColour:
         lidar_from_colour: NDArray[np.float64],
         form: str = "rgb8",
     ) -> None:
-        self._sdk, self._bytes = load_sdk(), BYTES_PER_PIXEL[form]
+        self._sdk = load_sdk()
+        self._bytes = BYTES_PER_PIXEL[form]
         self.sensor: Any = lidar.device.add_sensor("RGB Camera")
         made = self._sdk.video_stream()
-        made.type, made.index, made.uid = self._sdk.stream.color, 0, 100
-        made.width, made.height, made.fps = pinhole.width, pinhole.height, FRAMES_PER_S
-        made.bpp, made.fmt = self._bytes, getattr(self._sdk.format, form)
+        made.type = self._sdk.stream.color
+        made.index = 0
+        made.uid = 100
+        made.width = pinhole.width
+        made.height = pinhole.height
+        made.fps = FRAMES_PER_S
+        made.bpp = self._bytes
+        made.fmt = getattr(self._sdk.format, form)
         made.intrinsics = lidar._sdk_intrinsics(pinhole)
-        made.intrinsics.model, made.intrinsics.coeffs = self._sdk.distortion.brown_conrady, lens.tolist()
+        made.intrinsics.model = self._sdk.distortion.brown_conrady
+        made.intrinsics.coeffs = lens.tolist()
         self.profile: Any = self._sdk.video_stream_profile(self.sensor.add_video_stream(made, True))
         for other in lidar._profiles.values():
             self.profile.register_extrinsics_to(other, self._extrinsics(lidar_from_colour))
-            other.register_extrinsics_to(self.profile, self._extrinsics(np.linalg.inv(lidar_from_colour)))
+            other.register_extrinsics_to(
+                self.profile, self._extrinsics(np.linalg.inv(lidar_from_colour))
+            )
 
     def _extrinsics(self, pose: NDArray[np.float64]) -> Any:
         made = self._sdk.extrinsics()
-        made.rotation, made.translation = pose[:3, :3].T.ravel().tolist(), pose[:3, 3].tolist()
+        made.rotation = pose[:3, :3].T.ravel().tolist()
+        made.translation = pose[:3, 3].tolist()
         return made
 
     def push(self, number: int, pixels: NDArray[np.uint8]) -> None:
-        """Deliver one frame, only while the sensor streams: as many bytes per pixel as its format has."""
-        frame = self._sdk.software_video_frame()  # a new one each time: a pushed frame belongs to the SDK
-        frame.pixels, frame.bpp, frame.stride = np.ascontiguousarray(pixels), self._bytes, pixels.shape[1] * self._bytes
-        frame.timestamp, frame.frame_number = 1e12 + number * 1e3 / FRAMES_PER_S, number
-        frame.domain, frame.profile = self._sdk.timestamp_domain.global_time, self.profile
+        """Deliver one frame, only while the sensor streams: as many bytes per pixel as its format
+        has.
+        """
+        frame = (
+            self._sdk.software_video_frame()
+        )  # a new one each time: a pushed frame belongs to the SDK
+        frame.pixels = np.ascontiguousarray(pixels)
+        frame.bpp = self._bytes
+        frame.stride = pixels.shape[1] * self._bytes
+        frame.timestamp = 1e12 + number * 1e3 / FRAMES_PER_S
+        frame.frame_number = number
+        frame.domain = self._sdk.timestamp_domain.global_time
+        frame.profile = self.profile
         self.sensor.on_video_frame(frame)
 
 
 def record_with_colour(
-    path: Path, lidar: SoftwareLidar, colour: SoftwareColour, images: list[SensedImages], seen: list[NDArray[np.uint8]]
+    path: Path,
+    lidar: SoftwareLidar,
+    colour: SoftwareColour,
+    images: list[SensedImages],
+    seen: list[NDArray[np.uint8]],
 ) -> Path:
     """A recording of depth, infrared and confidence, then of colour, as librealsense writes it."""
     recorder = load_sdk().recorder(str(path), lidar.device)

@@ -1,8 +1,10 @@
-"""Synthetic benches with an occluder, printed boards and drifting streams, beside the walls of `calibrate.synthetic`.
+"""Synthetic benches with an occluder, printed boards and drifting streams, beside the walls of
+`calibrate.synthetic`.
 
-The image of a board has perspective, pixel area, the laser's spot, falloff with distance and incidence, toner that
-reflects, a print that is scaled and stretched, gain, saturation, shot and read noise, 8 bits. Not modelled: speckle,
-gloss, a mirror that scans unevenly, bowed paper (only in `corners_px`).
+The image of a board has perspective, pixel area, the laser's spot, falloff with distance and
+incidence, toner that reflects, a print that is scaled and stretched, gain, saturation, shot and
+read noise, 8 bits. Not modelled: speckle, gloss, a mirror that scans unevenly, bowed paper (only in
+`corners_px`).
 """
 
 from collections.abc import Callable
@@ -12,7 +14,15 @@ from typing import Any
 
 import cv2
 import numpy as np
-from nlos_calibration import BareWall, Board, DriftCheck, Intrinsics, depth_noise_m, load_rig, wall_depth
+from nlos_calibration import (
+    BareWall,
+    Board,
+    DriftCheck,
+    Intrinsics,
+    depth_noise_m,
+    load_rig,
+    wall_depth,
+)
 from nlos_calibration.arrays import Float64
 from nlos_calibration.wall_tracker import watched_pixels
 from numpy.typing import NDArray
@@ -44,7 +54,8 @@ class Sheet:
 def bench_depth(seen: View, occluding_sheet: Sheet | None, *, beams: int = 1) -> Float64:
     """Return the depth (height, width) of wall and sheet, inf where a ray meets neither.
 
-    A pixel reads the mean of its `beams`, so on the edge it lies between sheet and wall (a flying pixel).
+    A pixel reads the mean of its `beams`, so on the edge it lies between sheet and wall (a flying
+    pixel).
     """
     pinhole = seen.pinhole.scaled(seen.pinhole.width * beams, seen.pinhole.height)
     rays = pinhole.rays() @ seen.pose[:3, :3].T
@@ -52,14 +63,21 @@ def bench_depth(seen: View, occluding_sheet: Sheet | None, *, beams: int = 1) ->
     with np.errstate(divide="ignore", invalid="ignore"):
         wall_m = np.where(rays[..., 2] < 0.0, -lidar[2] / rays[..., 2], np.inf)
         wall_m[wall_m * rays[..., 0] > WALL_EXTENT_M] = np.inf
-        depth_m = wall_m if occluding_sheet is None else np.minimum(wall_m, _sheet_depth(occluding_sheet, lidar, rays))
+        depth_m = (
+            wall_m
+            if occluding_sheet is None
+            else np.minimum(wall_m, _sheet_depth(occluding_sheet, lidar, rays))
+        )
     return depth_m.reshape(pinhole.height, seen.pinhole.width, beams).mean(axis=-1)
 
 
 def _sheet_depth(occluding_sheet: Sheet, lidar: Float64, rays: Float64) -> Float64:
-    """Return the depth along each ray to the sheet: t with normal . (lidar + t ray - edge) = 0; inf without a hit."""
+    """Return the depth along each ray to the sheet: t with normal . (lidar + t ray - edge) = 0; inf
+    without a hit.
+    """
     lean, twist = np.tan(np.radians([occluding_sheet.lean_deg, occluding_sheet.twist_deg]))
-    normal, edge = np.array([1.0, -twist, -lean]), np.array([occluding_sheet.x_m, 0.0, occluding_sheet.gap_m])
+    normal = np.array([1.0, -twist, -lean])
+    edge = np.array([occluding_sheet.x_m, 0.0, occluding_sheet.gap_m])
     depth_m = (normal @ (edge - lidar)) / (rays @ normal)
     y, z = (lidar[axis] + depth_m * rays[..., axis] for axis in (1, 2))
     above_m = z - occluding_sheet.gap_m - np.tan(np.radians(occluding_sheet.edge_deg)) * y
@@ -76,10 +94,13 @@ def ball(seen: View, centre_m: tuple[float, float, float], radius_m: float) -> F
     """Return the depth (height, width) of a ball in the wall frame, inf beside it."""
     rays = seen.pinhole.rays() @ seen.pose[:3, :3].T
     towards = np.asarray(centre_m) - seen.pose[:3, 3]
-    square, along = (rays**2).sum(axis=-1), rays @ towards
+    square = (rays**2).sum(axis=-1)
+    along = rays @ towards
     # |t ray - towards|^2 = radius^2, solved for the smaller t
     inside = along**2 - square * (towards @ towards - radius_m**2)
-    return np.where((inside > 0.0) & (along > 0.0), (along - np.sqrt(np.maximum(inside, 0.0))) / square, np.inf)
+    return np.where(
+        (inside > 0.0) & (along > 0.0), (along - np.sqrt(np.maximum(inside, 0.0))) / square, np.inf
+    )
 
 
 TEXTURE_PER_SQUARE = 240
@@ -98,12 +119,16 @@ class Illumination:
     read_noise_counts: float = 0.7
     shot_noise: float = 0.3
     spot_mm: float = 1.0
-    """Full width at half maximum of the laser's spot; assumed: no value is published for the L515."""
+    """Full width at half maximum of the laser's spot; assumed: no value is published for the
+    L515.
+    """
 
 
 @dataclass(frozen=True)
 class Placement:
-    """Placement of a printed board on the wall: middle, rotation, and the printer's scale errors."""
+    """Placement of a printed board on the wall: middle, rotation, and the printer's scale
+    errors.
+    """
 
     x_m: float
     y_m: float = 0.0
@@ -114,25 +139,39 @@ class Placement:
     """Ratio of width to height."""
 
     def wall_from_board(self, board: Board) -> Float64:
-        """Return the matrix (4, 3) from points (x, y, 1) of the drawing to points (x, y, z, 1) of the wall."""
-        cos, sin = np.cos(self.turn_rad), np.sin(self.turn_rad)
-        turn = np.array([[cos, sin], [sin, -cos]]) * self.scale * np.sqrt([self.stretch, 1.0 / self.stretch])
+        """Return the matrix (4, 3) from points (x, y, 1) of the drawing to points (x, y, z, 1) of
+        the wall.
+        """
+        cos = np.cos(self.turn_rad)
+        sin = np.sin(self.turn_rad)
+        turn = (
+            np.array([[cos, sin], [sin, -cos]])
+            * self.scale
+            * np.sqrt([self.stretch, 1.0 / self.stretch])
+        )
         origin_m = np.array([self.x_m, self.y_m]) - turn @ board.size_mm * 0.5e-3
-        return np.array([[*turn[0], origin_m[0]], [*turn[1], origin_m[1]], [0.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+        return np.array(
+            [[*turn[0], origin_m[0]], [*turn[1], origin_m[1]], [0.0, 0.0, 0.0], [0.0, 0.0, 1.0]]
+        )
 
 
 def at_near_edge(board: Board, seen: View) -> Placement:
-    """Return an upright board at the edge of the lidar's view, on the side where the wall is near."""
+    """Return an upright board at the edge of the lidar's view, on the side where the wall is
+    near.
+    """
     ray = np.array([(EDGE_PX - seen.pinhole.ppx) / seen.pinhole.fx, 0.0, 1.0])
     direction = seen.pose[:3, :3] @ ray
     edge_m = float(-direction[0] / direction[2] * seen.pose[2, 3])
     return Placement(edge_m + board.size_mm[0] * 0.5e-3)
 
 
-def corners_px(board: Board, seen: View, placed: Placement, bow_m: tuple[float, float] = (0.0, 0.0)) -> Float64:
+def corners_px(
+    board: Board, seen: View, placed: Placement, bow_m: tuple[float, float] = (0.0, 0.0)
+) -> Float64:
     """Return the true places of the chessboard corners (n, 2) in pixels, also outside the image.
 
-    `bow_m` is the height of the sheet's middle above the wall, for a bow along its x and its y axis.
+    `bow_m` is the height of the sheet's middle above the wall, for a bow along its x and its y
+    axis.
     """
     flat = np.column_stack([board.corners_m[:, :2], np.ones(len(board.corners_m))])
     wall_m = placed.wall_from_board(board) @ flat.T
@@ -142,10 +181,15 @@ def corners_px(board: Board, seen: View, placed: Placement, bow_m: tuple[float, 
     return np.column_stack([lidar.fx * x_m / z_m + lidar.ppx, lidar.fy * y_m / z_m + lidar.ppy])
 
 
-def clean_infrared(board: Board, seen: View, placed: Placement, light: Illumination | None = None) -> Float64:
-    """Return the mean counts (height, width) before saturation, noise and rounding; the wall around is white."""
+def clean_infrared(
+    board: Board, seen: View, placed: Placement, light: Illumination | None = None
+) -> Float64:
+    """Return the mean counts (height, width) before saturation, noise and rounding; the wall around
+    is white.
+    """
     light = light or Illumination()
-    rays, distance_m = seen.pinhole.rays(), float(seen.pose[2, 3])
+    rays = seen.pinhole.rays()
+    distance_m = float(seen.pose[2, 3])
     away = -(rays @ seen.pose[2, :3])
     # irradiance cos(incidence) / length^2, where cos(incidence) = distance / length
     length_m = distance_m * np.linalg.norm(rays, axis=-1) / np.maximum(away, 1e-6)
@@ -155,7 +199,9 @@ def clean_infrared(board: Board, seen: View, placed: Placement, light: Illuminat
         return counts
     # 2.355 = 2 sqrt(2 ln 2): full width at half maximum over sigma
     sigma_px = light.spot_mm * 1e-3 / 2.355 / float(np.quantile(length_m, 0.25)) * seen.pinhole.fx
-    return cv2.GaussianBlur(counts, (0, 0), sigma_px, borderType=cv2.BORDER_REPLICATE).astype(np.float64)
+    return cv2.GaussianBlur(counts, (0, 0), sigma_px, borderType=cv2.BORDER_REPLICATE).astype(
+        np.float64
+    )
 
 
 def infrared_frames(
@@ -172,15 +218,21 @@ def infrared_frames(
 def _texture(board: Board) -> NDArray[np.float32]:
     """Return the pattern's albedo with a margin of one square of paper."""
     pattern = board.pattern(TEXTURE_PER_SQUARE).astype(np.float32) / 255.0
-    return np.pad(TONER + (1.0 - TONER) * pattern, TEXTURE_PER_SQUARE, constant_values=1.0).astype(np.float32)
+    return np.pad(TONER + (1.0 - TONER) * pattern, TEXTURE_PER_SQUARE, constant_values=1.0).astype(
+        np.float32
+    )
 
 
 def _albedo(board: Board, seen: View, placed: Placement) -> Float64:
     """Return the albedo (height, width), averaged over each pixel's area."""
-    fine = seen.pinhole.scaled(SUPERSAMPLED * seen.pinhole.width, SUPERSAMPLED * seen.pinhole.height)
+    fine = seen.pinhole.scaled(
+        SUPERSAMPLED * seen.pinhole.width, SUPERSAMPLED * seen.pinhole.height
+    )
     texel_m = board.square_mm * 1e-3 / TEXTURE_PER_SQUARE
     first_m = (0.5 - TEXTURE_PER_SQUARE) * texel_m
-    board_from_texture = np.array([[texel_m, 0.0, first_m], [0.0, texel_m, first_m], [0.0, 0.0, 1.0]])
+    board_from_texture = np.array(
+        [[texel_m, 0.0, first_m], [0.0, texel_m, first_m], [0.0, 0.0, 1.0]]
+    )
     lidar_from_board = (np.linalg.inv(seen.pose) @ placed.wall_from_board(board))[:3]
     warp = fine.matrix @ lidar_from_board @ board_from_texture
     texture = _texture(board)
@@ -207,20 +259,34 @@ def wall_from_lidar(pose: WallPose) -> Float64:
 
 
 def noisy_depth(depth_m: Float64, generator: np.random.Generator) -> Float64:
-    """Return one frame of `depth_m`: noise of 0.5 mm plus 2 mm per metre, steps of 0.25 mm, dead samples."""
+    """Return one frame of `depth_m`: noise of 0.5 mm plus 2 mm per metre, steps of 0.25 mm, dead
+    samples.
+    """
     noisy_m = depth_m + generator.standard_normal(depth_m.shape) * (0.0005 + 0.002 * depth_m)
-    return np.where(generator.random(depth_m.shape) < DEAD, np.nan, np.round(noisy_m / 0.00025) * 0.00025)
+    return np.where(
+        generator.random(depth_m.shape) < DEAD, np.nan, np.round(noisy_m / 0.00025) * 0.00025
+    )
 
 
-def reference_of_wall(pose: WallPose, intrinsics: Intrinsics, generator: np.random.Generator, **facts: Any) -> BareWall:
-    """Return the reference that `BareWallStatistics` would yield, without its frames; `facts` replace fields."""
+def reference_of_wall(
+    pose: WallPose, intrinsics: Intrinsics, generator: np.random.Generator, **facts: Any
+) -> BareWall:
+    """Return the reference that `BareWallStatistics` would yield, without its frames; `facts`
+    replace fields.
+    """
     depth_m = wall_depth(wall_from_lidar(pose), intrinsics)
     inliers = depth_m < WALL_ENDS_M
     depth_m[~inliers] = np.nan
     noise_m = depth_noise_m(depth_m)
-    mean_m = depth_m + noise_m / np.sqrt(REFERENCE_FRAMES) * generator.standard_normal(depth_m.shape)
-    images = {"depth_m": mean_m, "depth_std_m": noise_m} | dict.fromkeys(("ir", "ir_std"), np.full(depth_m.shape, 40.0))
-    maps = dict.fromkeys(("map_depth_m", "map_depth_std_m", "map_intensity", "map_intensity_std"), np.zeros((64, 80)))
+    mean_m = depth_m + noise_m / np.sqrt(REFERENCE_FRAMES) * generator.standard_normal(
+        depth_m.shape
+    )
+    images = {"depth_m": mean_m, "depth_std_m": noise_m} | dict.fromkeys(
+        ("ir", "ir_std"), np.full(depth_m.shape, 40.0)
+    )
+    maps = dict.fromkeys(
+        ("map_depth_m", "map_depth_std_m", "map_intensity", "map_intensity_std"), np.zeros((64, 80))
+    )
     arrays = images | maps | {"saturated": np.zeros(depth_m.shape)}
     fields: dict[str, Any] = {name: array.astype(np.float32) for name, array in arrays.items()}
     fields |= {"inliers": inliers, "frames": REFERENCE_FRAMES, "intrinsics": intrinsics}
@@ -228,13 +294,16 @@ def reference_of_wall(pose: WallPose, intrinsics: Intrinsics, generator: np.rand
 
 
 class WallStream:
-    """Frames of a wall after its calibration, fed to a drift check. Stateful; deterministic for a seed.
+    """Frames of a wall after its calibration, fed to a drift check. Stateful; deterministic for a
+    seed.
 
     Only watched pixels have depth, to be fast.
     """
 
     def __init__(self, pose: WallPose, intrinsics: Intrinsics = SMALL, seed: int = 0) -> None:
-        self.pose, self.intrinsics, self.frames = pose, intrinsics, 0
+        self.pose = pose
+        self.intrinsics = intrinsics
+        self.frames = 0
         self._generator = np.random.default_rng(seed)
         self.reference = reference_of_wall(pose, intrinsics, self._generator)
         self.check = DriftCheck(self.reference, wall_from_lidar(pose))
@@ -244,20 +313,29 @@ class WallStream:
         """Places (N, 2) of the watched pixels in the view, 0 to 1."""
         self._frame = np.full((intrinsics.height, intrinsics.width), np.nan, np.float32)
 
-    def moved(self, distance_m: float = 0.0, yaw_deg: float = 0.0, pitch_deg: float = 0.0) -> WallPose:
+    def moved(
+        self, distance_m: float = 0.0, yaw_deg: float = 0.0, pitch_deg: float = 0.0
+    ) -> WallPose:
         """Return the first pose plus a change."""
         return self.pose[0] + distance_m, self.pose[1] + yaw_deg, self.pose[2] + pitch_deg
 
-    def show(self, pose: WallPose, count: int = 1, hide: DepthChange = lambda depth_m, _: depth_m) -> int | None:
-        """Feed `count` frames from a pose; return the number of the frame with the first warning, None without one."""
-        depth_m, first = self.depth_from(pose), None
+    def show(
+        self, pose: WallPose, count: int = 1, hide: DepthChange = lambda depth_m, _: depth_m
+    ) -> int | None:
+        """Feed `count` frames from a pose; return the number of the frame with the first warning,
+        None without one.
+        """
+        depth_m = self.depth_from(pose)
+        first = None
         for number in range(1, count + 1):
             self.look(hide(depth_m, self.frames))
             first = number if first is None and self.check.warnings else first
         return first
 
     def depth_from(self, pose: WallPose) -> Float64:
-        """Return the depth of the watched pixels (N,) without noise; NaN where a beam misses the wall."""
+        """Return the depth of the watched pixels (N,) without noise; NaN where a beam misses the
+        wall.
+        """
         depth_m = wall_depth(wall_from_lidar(pose), self.intrinsics).ravel()[self.pixels]
         return np.where(np.isfinite(depth_m), depth_m, np.nan)
 
@@ -269,16 +347,20 @@ class WallStream:
 
 
 def multipath(places: Float64, share: float, seed: int, *, beyond: bool = False) -> DepthChange:
-    """Return multipath by a moving object: a share of the pixels reads 3 to 40 cm too far, smoothly.
+    """Return multipath by a moving object: a share of the pixels reads 3 to 40 cm too far,
+    smoothly.
 
     The pixels form moving patches, or lie `beyond` a line that sways.
     """
     generator = np.random.default_rng(seed)
     waves = generator.uniform(1, 6, (4, 2)) * generator.choice([-1, 1], (4, 2))
-    phases, speeds = generator.uniform(0, 2 * np.pi, 4), generator.uniform(0.02, 0.2, 4)
+    phases = generator.uniform(0, 2 * np.pi, 4)
+    speeds = generator.uniform(0.02, 0.2, 4)
 
     def hide(depth_m: Float64, number: int) -> Float64:
-        where, length, *_ = np.sin(places @ waves.T + phases + speeds * number).T.reshape(2, 2, -1).sum(axis=1)
+        where, length, *_ = (
+            np.sin(places @ waves.T + phases + speeds * number).T.reshape(2, 2, -1).sum(axis=1)
+        )
         if beyond:
             where = places[:, 0] + 0.05 * np.sin(3.0 * places[:, 1] + speeds[0] * number)
         far = where > np.quantile(where, 1.0 - share)
@@ -293,7 +375,9 @@ def chained(first: DepthChange, second: DepthChange) -> DepthChange:
 
 
 def occluding_sheet(places: Float64, nearest: float) -> DepthChange:
-    """Return an occluder from place `nearest` (0 to 1) of the view on: 5 to 50 cm shorter, by half at most."""
+    """Return an occluder from place `nearest` (0 to 1) of the view on: 5 to 50 cm shorter, by half
+    at most.
+    """
 
     def hide(depth_m: Float64, _: int) -> Float64:
         into = np.clip((places[:, 0] - nearest) / (1.0 - nearest), 0.0, 1.0)

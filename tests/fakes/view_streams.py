@@ -1,4 +1,6 @@
-"""What a view's server serves in tests: two files and a stream that lasts; and how a browser asks for them."""
+"""What a view's server serves in tests: two files and a stream that lasts; and how a browser asks
+for them.
+"""
 
 import base64
 import zlib
@@ -16,10 +18,15 @@ EVERYWHERE = "0.0.0.0"  # noqa: S104  on purpose: what it exposes is tested
 ASSETS = {"/": ("text/html", b"<p>page</p>"), "/file.wasm": ("application/wasm", bytes(5_000_000))}
 
 
-def ask(address: str, path: str, *, method: str = "GET", host: str | None = None, **headers: str) -> HTTPResponse:
-    """Send a request; underscores in the names of further headers are hyphens, and `body` is its body."""
+def ask(
+    address: str, path: str, *, method: str = "GET", host: str | None = None, **headers: str
+) -> HTTPResponse:
+    """Send a request; underscores in the names of further headers are hyphens, and `body` is its
+    body.
+    """
     parts = urlsplit(address)
-    connection, body = HTTPConnection(parts.netloc, timeout=10.0), headers.pop("body", None)
+    connection = HTTPConnection(parts.netloc, timeout=10.0)
+    body = headers.pop("body", None)
     sent = {name.replace("_", "-"): value for name, value in headers.items()}
     connection.request(method, path, body, sent if host is None else {"Host": host, **sent})
     return connection.getresponse()
@@ -27,7 +34,8 @@ def ask(address: str, path: str, *, method: str = "GET", host: str | None = None
 
 def messages_in(stream: bytes) -> Sequence[bytes]:
     """Return the whole messages of a stream; a cut last one is left out."""
-    found, at = list[bytes](), 0
+    found = list[bytes]()
+    at = 0
     while at + HEAD.size <= len(stream):
         end = at + 4 + HEAD.unpack_from(stream, at)[0]
         if end > len(stream):
@@ -40,7 +48,9 @@ def messages_in(stream: bytes) -> Sequence[bytes]:
 def messages_of(page: bytes) -> list[bytes]:
     """Return the messages in a saved session."""
     parts = page.split(b'<script type="text/x-message">')[1:]
-    return [base64.b64decode(part.partition(b"</script>")[0]) for part in parts if b"</script>" in part]
+    return [
+        base64.b64decode(part.partition(b"</script>")[0]) for part in parts if b"</script>" in part
+    ]
 
 
 def messages(answer: HTTPResponse) -> Iterator[dict[str, Any]]:
@@ -57,7 +67,11 @@ def messages(answer: HTTPResponse) -> Iterator[dict[str, Any]]:
 def saved_moments(path: Path) -> list[dict[str, Any]]:
     """Return the moments of a saved session, without their arrays."""
     chunks = (unpack(message) for message in messages_of(path.read_bytes()))
-    data = [zlib.decompress(arrays["data"].tobytes()) for fields, arrays in chunks if fields["kind"] == "chunk"]
+    data = [
+        zlib.decompress(arrays["data"].tobytes())
+        for fields, arrays in chunks
+        if fields["kind"] == "chunk"
+    ]
     return [unpack(message)[0] for message in messages_in(b"".join(data))]
 
 
@@ -65,7 +79,8 @@ class Streams:
     """Sends a count every 10 ms until told to end; notes how each stream ended."""
 
     def __init__(self) -> None:
-        self.end, self.ended = Event(), Event()
+        self.end = Event()
+        self.ended = Event()
         self.error: OSError | None = None
 
     def __call__(self, send: Send) -> None:

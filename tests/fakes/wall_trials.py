@@ -13,14 +13,19 @@ from nlos_cam.calibrate import View, depth_statistics, patchy, rippled, view, wi
 
 Generator = np.random.Generator
 
-DISTANCES_M, FACING_DEG, PITCHES_DEG = (0.15, 0.20, 0.25, 0.30), (15.0, 30.0, 45.0, 60.0, 75.0), (-12.0, 0.0, 8.0)
+DISTANCES_M = (0.15, 0.20, 0.25, 0.30)
+FACING_DEG = (15.0, 30.0, 45.0, 60.0, 75.0)
+PITCHES_DEG = (-12.0, 0.0, 8.0)
 PINHOLE = load_rig("bare-wall").pinhole.scaled(80, 60)
 
 
 def without_return(seen: View, generator: Generator) -> Float64:
-    """Leave out the returns of 20 to 70 % of the image, on one side of a line in a random direction."""
+    """Leave out the returns of 20 to 70 % of the image, on one side of a line in a random
+    direction.
+    """
     rows, columns = np.indices(seen.depth_m.shape) / seen.depth_m.shape[1]
-    way, share = generator.uniform(0.0, 2.0 * np.pi), generator.uniform(0.2, 0.7)
+    way = generator.uniform(0.0, 2.0 * np.pi)
+    share = generator.uniform(0.2, 0.7)
     along = columns * np.cos(way) + rows * np.sin(way)
     return np.where(along > np.quantile(along, 1.0 - share), np.nan, seen.depth_m)
 
@@ -35,7 +40,9 @@ SCENES: dict[str, Callable[[View, Generator], Float64]] = {
 
 @dataclass(frozen=True)
 class Setting:
-    """Scene (a key of SCENES), noise over the nominal, shares of outliers and flicker, and frames."""
+    """Scene (a key of SCENES), noise over the nominal, shares of outliers and flicker, and
+    frames.
+    """
 
     scene: str = "bare"
     noise: float = 1.0
@@ -46,7 +53,8 @@ class Setting:
 
 def random_view(generator: Generator) -> View:
     """Return a view of a wall on the grid of distances and angles, turned to either side."""
-    distance_m, facing_deg = generator.choice(DISTANCES_M), generator.choice(FACING_DEG)
+    distance_m = generator.choice(DISTANCES_M)
+    facing_deg = generator.choice(FACING_DEG)
     pitch_deg = generator.choice([pitch for pitch in PITCHES_DEG if abs(pitch) < facing_deg])
     # cos(facing) = cos(yaw) cos(pitch)
     yaw_deg = np.degrees(np.arccos(np.cos(np.radians(facing_deg)) / np.cos(np.radians(pitch_deg))))
@@ -55,16 +63,21 @@ def random_view(generator: Generator) -> View:
 
 
 def trial(setting: Setting, generator: Generator) -> dict[str, Any] | None:
-    """Draw a wall and measure it; return errors and what lies inside its 95 % interval, None where it is refused."""
+    """Draw a wall and measure it; return errors and what lies inside its 95 % interval, None where
+    it is refused.
+    """
     seen = random_view(generator)
     depth_m = with_outliers(SCENES[setting.scene](seen, generator), setting.outliers, generator)
-    mean = depth_statistics(depth_m, generator, frames=setting.frames, noise=setting.noise, flicker=setting.flicker)
+    mean = depth_statistics(
+        depth_m, generator, frames=setting.frames, noise=setting.noise, flicker=setting.flicker
+    )
     try:
         fit = fit_wall(mean.mean_m(), seen.pinhole, generator, mean.noise())
     except WallRefusedError:
         return None
     normal = seen.pose[2, :3]
-    yaw_deg, pitch_deg = np.degrees(np.arctan2(normal[0], -normal[2])), np.degrees(np.arcsin(-normal[1]))
+    yaw_deg = np.degrees(np.arctan2(normal[0], -normal[2]))
+    pitch_deg = np.degrees(np.arcsin(-normal[1]))
     errors = (
         (fit.distance_m - seen.pose[2, 3], fit.distance_std_m),
         (fit.facing_deg - seen.facing_deg, fit.facing_std_deg),

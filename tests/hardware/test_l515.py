@@ -1,9 +1,10 @@
 """Behavior that only a real L515 can show.
 
-Bench: one L515 (firmware 1.5.8.1) on USB 3, 0.2 m from a bare matt white wall, turned 45 degrees to it, nothing
-else within 1 m; no other program using it. A person pulls the cable when a test asks (run with `-s` and
-NLOS_CAM_AT_THE_BENCH=1); one test needs a second L515, one NLOS_CAM_TEN_MINUTES=1 and 20 GB.
-Run with `pytest -m hardware`; tests skip where something they need is missing.
+Bench: one L515 (firmware 1.5.8.1) on USB 3, 0.2 m from a bare matt white wall, turned 45 degrees to
+it, nothing else within 1 m; no other program using it. A person pulls the cable when a test asks
+(run with `-s` and NLOS_CAM_AT_THE_BENCH=1); one test needs a second L515, one
+NLOS_CAM_TEN_MINUTES=1 and 20 GB. Run with `pytest -m hardware`; tests skip where something they
+need is missing.
 """
 
 import os
@@ -109,7 +110,9 @@ def test_recording_holds_every_frame_and_its_settings(camera: Camera, tmp_path: 
     }
 
 
-def test_camera_survives_a_pulled_cable(camera: Camera, at_the_bench: Callable[[str], None]) -> None:
+def test_camera_survives_a_pulled_cable(
+    camera: Camera, at_the_bench: Callable[[str], None]
+) -> None:
     with camera:
         before = list(islice(camera, 30))
         at_the_bench("pull the L515's cable, wait 10 s, plug it into the same port")
@@ -122,7 +125,9 @@ def test_camera_survives_a_pulled_cable(camera: Camera, at_the_bench: Callable[[
     assert all(one.frame_number < next_one.frame_number for one, next_one in pairwise(frames))
     assert all(one.timestamp_s < next_one.timestamp_s for one, next_one in pairwise(frames))
     assert camera.dropped > 5 * 30
-    assert frames[-1].settings == pytest.approx(before[-1].settings, abs=10.0)  # temperatures and noise drift
+    assert frames[-1].settings == pytest.approx(
+        before[-1].settings, abs=10.0
+    )  # temperatures and noise drift
 
 
 def test_recording_of_a_pulled_cable_can_be_read(

@@ -1,4 +1,6 @@
-"""The implementations that laws of the renderer are held against, and a setting that the brute force can bear."""
+"""The implementations that laws of the renderer are held against, and a setting that the brute
+force can bear.
+"""
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -20,18 +22,30 @@ class Implementation:
     name: str
 
     def _how(self, accuracy: Accuracy) -> tuple[Accuracy, str]:
-        return (replace(accuracy, sub_bins=0), "cpu") if self.name == "reference" else (accuracy, self.name)
+        return (
+            (replace(accuracy, sub_bins=0), "cpu")
+            if self.name == "reference"
+            else (accuracy, self.name)
+        )
 
-    def transient(self, scene: Scene, effects: Effects = "auto", accuracy: Accuracy = COARSE) -> np.ndarray:
+    def transient(
+        self, scene: Scene, effects: Effects = "auto", accuracy: Accuracy = COARSE
+    ) -> np.ndarray:
         setting, backend = self._how(accuracy)
         return renderer.transient(scene, setting, effects, backend)
 
-    def render(self, scene: Scene, effects: Effects = "auto", accuracy: Accuracy = COARSE) -> renderer.Rendering:
+    def render(
+        self, scene: Scene, effects: Effects = "auto", accuracy: Accuracy = COARSE
+    ) -> renderer.Rendering:
         setting, backend = self._how(accuracy)
         return renderer.render(scene, setting, effects, backend)
 
     def three_bounce(
-        self, scene: Scene, chosen: np.ndarray | None = None, effects: Effects = "auto", accuracy: Accuracy = COARSE
+        self,
+        scene: Scene,
+        chosen: np.ndarray | None = None,
+        effects: Effects = "auto",
+        accuracy: Accuracy = COARSE,
     ) -> np.ndarray:
         setting, backend = self._how(accuracy)
         return renderer.three_bounce(scene, setting, effects, backend, chosen)

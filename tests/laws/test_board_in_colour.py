@@ -1,4 +1,6 @@
-"""A board seen by the color camera gives the lidar's wall, as certainly as the camera is calibrated."""
+"""A board seen by the color camera gives the lidar's wall, as certainly as the camera is
+calibrated.
+"""
 
 from dataclasses import replace
 from pathlib import Path
@@ -21,21 +23,32 @@ from nlos_cam.render import DEPTH_UNIT_M, SensedImages
 
 
 def recorded(path: Path, frames: int = 4) -> Path:
-    """Record the rig's bare wall with a board on it: depth, infrared without the board, and colour."""
-    rig, generator = load_rig("bare-wall"), np.random.default_rng(0)
+    """Record the rig's bare wall with a board on it: depth, infrared without the board, and
+    colour.
+    """
+    rig = load_rig("bare-wall")
+    generator = np.random.default_rng(0)
     seen = View(rig.wall_from_lidar, rig.pinhole)
     bench = BoardBench(A4, seen, at_near_edge(A4, seen), ROOM, ColorCamera())
     depth_m = [np.nan_to_num(depth_frame(seen.depth_m, generator)) for _ in range(frames)]
     dim = np.full(depth_m[0].shape, 15, np.uint8)
-    images = [SensedImages(np.rint(each / DEPTH_UNIT_M).astype(np.uint16), dim, dim) for each in depth_m]
+    images = [
+        SensedImages(np.rint(each / DEPTH_UNIT_M).astype(np.uint16), dim, dim) for each in depth_m
+    ]
     grey = bench.frames(frames, generator)
     lidar = SoftwareLidar(rig.pinhole, load_sdk())
-    camera = SoftwareColour(lidar, board_trials.COLOR, board_trials.LENS, CALIBRATION.lidar_from_camera)
-    return record_with_colour(path, lidar, camera, images, [np.repeat(each[..., np.newaxis], 3, 2) for each in grey])
+    camera = SoftwareColour(
+        lidar, board_trials.COLOR, board_trials.LENS, CALIBRATION.lidar_from_camera
+    )
+    return record_with_colour(
+        path, lidar, camera, images, [np.repeat(each[..., np.newaxis], 3, 2) for each in grey]
+    )
 
 
 def test_board_in_a_recordings_colour_gives_the_lidars_wall(tmp_path: Path) -> None:
-    """From a .bag by librealsense's recorder to the wall, by pixels, lens and pose; beside depth and alone."""
+    """From a .bag by librealsense's recorder to the wall, by pixels, lens and pose; beside depth
+    and alone.
+    """
     uri = f"bag:{recorded(tmp_path / 'board.bag')}"
     view = capture_color_view(uri, 30)
     with open_camera(uri) as camera:
@@ -54,9 +67,14 @@ def test_board_in_a_recordings_colour_gives_the_lidars_wall(tmp_path: Path) -> N
     assert (alone.yaw_deg, alone.pitch_deg) == pytest.approx((45.0, 0.0), abs=0.15)
 
 
-def coverage_in_color(count: int, sigma_px: float | None, seed: int, errors: CameraErrors) -> board_trials.Coverage:
-    """Fit random benches, prints and cameras: by corners with noise, or by 4 rendered frames if `sigma_px` is None."""
-    generator, calibration = np.random.default_rng(seed), replace(CALIBRATION, errors=errors)
+def coverage_in_color(
+    count: int, sigma_px: float | None, seed: int, errors: CameraErrors
+) -> board_trials.Coverage:
+    """Fit random benches, prints and cameras: by corners with noise, or by 4 rendered frames if
+    `sigma_px` is None.
+    """
+    generator = np.random.default_rng(seed)
+    calibration = replace(CALIBRATION, errors=errors)
     printed = board_trials.FLAT if sigma_px is None else PrintErrors()
 
     def fit(bench: BoardBench) -> BoardFit:
@@ -71,11 +89,19 @@ def coverage_in_color(count: int, sigma_px: float | None, seed: int, errors: Cam
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "errors",
-    [CameraErrors(), EXACT, CameraErrors(0.0, 0.0, 0.003), CameraErrors(1.0, 0.0, 0.0), CameraErrors(0.0, 0.005, 0.0)],
+    [
+        CameraErrors(),
+        EXACT,
+        CameraErrors(0.0, 0.0, 0.003),
+        CameraErrors(1.0, 0.0, 0.0),
+        CameraErrors(0.0, 0.005, 0.0),
+    ],
     ids=["all", "none", "focal length", "turn", "shift"],
 )
 def test_board_in_colour_interval_holds_the_truth_as_stated(errors: CameraErrors) -> None:
-    """For each calibration error by itself: it would not, were that error left out of the uncertainty."""
+    """For each calibration error by itself: it would not, were that error left out of the
+    uncertainty.
+    """
     found = coverage_in_color(300, 0.05, 7, errors)
     assert found.refused <= 3
     assert ((found.inside > 0.91) & (found.inside < 0.985)).all()
@@ -83,7 +109,9 @@ def test_board_in_colour_interval_holds_the_truth_as_stated(errors: CameraErrors
 
 @pytest.mark.slow
 def test_rendered_board_in_colour_interval_holds_the_truth() -> None:
-    """Of 15 benches, three quantities each: pooled, a share of 95 % is found above 84 % but once in 1000."""
+    """Of 15 benches, three quantities each: pooled, a share of 95 % is found above 84 % but once in
+    1000.
+    """
     found = coverage_in_color(15, None, 8, CameraErrors())
     assert found.refused <= 1
     assert found.inside.mean() > 0.84

@@ -1,4 +1,6 @@
-"""Laws of accuracy: refining any grid converges, and the stops keep their promised errors against brute force."""
+"""Laws of accuracy: refining any grid converges, and the stops keep their promised errors against
+brute force.
+"""
 
 from dataclasses import replace
 from itertools import pairwise
@@ -9,7 +11,16 @@ import pytest
 from nlos_calibration import load_rig
 
 from nlos_cam.objects import object_depth
-from nlos_cam.render import STOPS, Accuracy, Scene, histograms, prepare, render, three_bounce, transient
+from nlos_cam.render import (
+    STOPS,
+    Accuracy,
+    Scene,
+    histograms,
+    prepare,
+    render,
+    three_bounce,
+    transient,
+)
 
 RIG = load_rig("paper-rig")
 SOME = np.arange(5120)[::23]
@@ -53,7 +64,8 @@ def _beams(per_cell: int) -> np.ndarray:
 def test_finer_depth_maps_keep_the_size_of_patches_and_the_error() -> None:
     scene = Scene(RIG, _hill(192), jump_m=0.5)
     standard = replace(STOPS["standard"], relay_columns=40, relay_rows=32)
-    joined, apart = prepare(scene, standard).job, prepare(scene, replace(standard, finest_cells=0)).job
+    joined = prepare(scene, standard).job
+    apart = prepare(scene, replace(standard, finest_cells=0)).job
     assert joined is not None
     assert apart is not None
     assert len(apart.patches.beta) == 192**2
@@ -70,17 +82,23 @@ def test_finer_depth_maps_keep_the_size_of_patches_and_the_error() -> None:
 )
 def test_refining_a_grid_changes_less_each_time(grid: Any, sizes: tuple[int, ...]) -> None:
     found = [grid(size) for size in sizes]
-    steps = [float(np.abs(finer - coarser).sum() / finer.sum()) for coarser, finer in pairwise(found)]
+    steps = [
+        float(np.abs(finer - coarser).sum() / finer.sum()) for coarser, finer in pairwise(found)
+    ]
     assert all(later < earlier for earlier, later in pairwise(steps)), steps
     assert 0 < steps[-1] < 0.5 * steps[0]
     assert steps[-1] < 0.05
 
 
 def test_refining_sub_bins_converges_to_brute_force() -> None:
-    base, scene = Accuracy("coarse", relay_columns=20, relay_rows=16), Scene(RIG, _hill(16))
+    base = Accuracy("coarse", relay_columns=20, relay_rows=16)
+    scene = Scene(RIG, _hill(16))
     exact = three_bounce(scene, replace(base, sub_bins=0), chosen=SOME)
     errors = [
-        float(np.abs(three_bounce(scene, replace(base, sub_bins=n), chosen=SOME) - exact).sum() / exact.sum())
+        float(
+            np.abs(three_bounce(scene, replace(base, sub_bins=n), chosen=SOME) - exact).sum()
+            / exact.sum()
+        )
         for n in (1, 4, 16, 64)
     ]
     assert all(later < 0.7 * earlier for earlier, later in pairwise(errors)), errors
@@ -89,7 +107,9 @@ def test_refining_sub_bins_converges_to_brute_force() -> None:
 def test_share_of_winning_echoes_does_not_drift_with_the_grid() -> None:
     shares: list[float] = []
     for cells in (20, 40, 80, 160):
-        rendering = render(Scene(RIG, _hill(32)), replace(STOPS["draft"], relay_columns=cells, relay_rows=cells))
+        rendering = render(
+            Scene(RIG, _hill(32)), replace(STOPS["draft"], relay_columns=cells, relay_rows=cells)
+        )
         direct = render(Scene(RIG)).intensity
         shares.append(float((rendering.intensity > direct).mean()))
     assert 0.1 < shares[-1] < 0.95
@@ -111,12 +131,15 @@ def case(request: pytest.FixtureRequest) -> Case:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("stop", "median", "p99"), [("standard", 3e-3, 1e-2), ("fine", 1e-3, 1e-3)])
+@pytest.mark.parametrize(
+    ("stop", "median", "p99"), [("standard", 3e-3, 1e-2), ("fine", 1e-3, 1e-3)]
+)
 def test_stop_keeps_its_promised_error(case: Case, stop: str, median: float, p99: float) -> None:
     """Relative error of the peak and its offset in bins, beam by beam."""
     scene, chosen, slow = case
     fast = three_bounce(scene, stop, chosen=chosen)
-    error, off = np.abs(fast.max(1) - slow.max(1)) / slow.max(1), np.abs(fast.argmax(1) - slow.argmax(1))
+    error = np.abs(fast.max(1) - slow.max(1)) / slow.max(1)
+    off = np.abs(fast.argmax(1) - slow.argmax(1))
     assert np.median(error) < median
     assert np.quantile(error, 0.99) < p99
     assert (off <= 1).mean() >= 0.995
@@ -144,5 +167,7 @@ def test_float32_light_is_within_1e_5_of_float64(case: Case) -> None:
 
 def test_sectors_do_not_change_a_bit_of_the_result(case: Case) -> None:
     scene, chosen, _ = case
-    few, many = (three_bounce(scene, replace(STOPS["draft"], sectors=n), chosen=chosen) for n in (1, 16))
+    few, many = (
+        three_bounce(scene, replace(STOPS["draft"], sectors=n), chosen=chosen) for n in (1, 16)
+    )
     np.testing.assert_array_equal(few, many)

@@ -7,7 +7,13 @@ import pytest
 from nlos_calibration import load_rig
 from nlos_models import load_reconstructor, load_uncertainty_model
 
-from nlos_cam.dataset.outliers import TRAINING_OUTLIERS, Stimulus, draw_outlier, ordinary, vary_empty_bench
+from nlos_cam.dataset.outliers import (
+    TRAINING_OUTLIERS,
+    Stimulus,
+    draw_outlier,
+    ordinary,
+    vary_empty_bench,
+)
 from nlos_cam.evaluate import echoes_of, sense
 from nlos_cam.files import cache_folder
 from nlos_cam.frames import Frame
@@ -30,7 +36,8 @@ def processing() -> Pipeline:
 
 def frames_of(stimulus: Stimulus, count: int, seed: int) -> list[Frame]:
     """Return frames of one scene with different noise."""
-    sensor, echoes = Sensor(stimulus.rig, stimulus.sensor), render(stimulus.scene, "draft").multi
+    sensor = Sensor(stimulus.rig, stimulus.sensor)
+    echoes = render(stimulus.scene, "draft").multi
     noises = (np.random.default_rng([seed, number]) for number in range(count))
     return [sensor.expose(echoes, noise).frame(stimulus.rig.pinhole) for noise in noises]
 
@@ -49,13 +56,20 @@ def test_empty_bench_never_shows_an_object(processing: Pipeline, seed: int) -> N
 
 def test_known_objects_are_seen_with_honest_expected_errors(processing: Pipeline) -> None:
     subjects = benchmark_objects(object_box(RIG))[::3]
-    expected, observed, verdicts = list[float](), list[float](), list[Verdict | None]()
-    for subject, maps in zip(subjects, sense(echoes_of(subjects, RIG, lambda *_: None), RIG), strict=True):
+    expected = list[float]()
+    observed = list[float]()
+    verdicts = list[Verdict | None]()
+    for subject, maps in zip(
+        subjects, sense(echoes_of(subjects, RIG, lambda *_: None), RIG), strict=True
+    ):
         ir = np.clip(np.round(maps.intensity), 0, 255).astype(np.uint8)
-        frame = Frame(maps.depth_m, ir, ir, 0.0, 0, RIG.pinhole.scaled(80, 64))  # of one pixel per cell
+        frame = Frame(
+            maps.depth_m, ir, ir, 0.0, 0, RIG.pinhole.scaled(80, 64)
+        )  # of one pixel per cell
         step = steps_of(processing, [frame] * 5)[-1]
         verdicts.append(step.verdict)
-        uncertainty_m, off_m = step.reconstruction.uncertainty_m, step.reconstruction.depth_m - subject.depth_m
+        uncertainty_m = step.reconstruction.uncertainty_m
+        off_m = step.reconstruction.depth_m - subject.depth_m
         assert np.isfinite(uncertainty_m).all()
         assert uncertainty_m.min() > 0
         there = ~np.isnan(off_m)
@@ -72,13 +86,19 @@ def test_known_objects_are_seen_with_honest_expected_errors(processing: Pipeline
 def test_plain_outliers_are_reported_as_unusual(processing: Pipeline, name: str) -> None:
     verdicts = list[Verdict | None]()
     for seed in range(8):
-        shown = draw_outlier(TRAINING_OUTLIERS[name], np.random.default_rng([seed, 78]), Stimulus(RIG, SensorModel()))
+        shown = draw_outlier(
+            TRAINING_OUTLIERS[name], np.random.default_rng([seed, 78]), Stimulus(RIG, SensorModel())
+        )
         verdicts.append(steps_of(processing, frames_of(shown, 5, seed))[-1].verdict)
     assert verdicts.count(Verdict.OUTSIDE) + verdicts.count(Verdict.SATURATED) >= 6
 
 
 def test_object_shows_in_its_first_frame_and_not_after(processing: Pipeline) -> None:
     stimulus = ordinary(np.random.default_rng(5), Stimulus(RIG, SensorModel()))
-    with_it, without = frames_of(stimulus, 1, 0), frames_of(Stimulus(RIG, SensorModel()), 1, 0)
-    shown = [step.reconstruction.has_surface for step in steps_of(processing, [*without, *with_it, *without])]
+    with_it = frames_of(stimulus, 1, 0)
+    without = frames_of(Stimulus(RIG, SensorModel()), 1, 0)
+    shown = [
+        step.reconstruction.has_surface
+        for step in steps_of(processing, [*without, *with_it, *without])
+    ]
     assert shown == [False, True, False]

@@ -1,14 +1,32 @@
-"""A check of drift is silent while the lidar stands, whatever is in the way, and warns when it moves."""
+"""A check of drift is silent while the lidar stands, whatever is in the way, and warns when it
+moves.
+"""
 
 import numpy as np
 import pytest
 from nlos_calibration import TOLERANCE_DEG, TOLERANCE_M, Intrinsics, wall_depth
 from nlos_calibration.drift import BLIND_FRAMES, WINDOW_FRAMES
-from synthetic_scenes import PINHOLE, SMALL, WallPose, WallStream, chained, multipath, noisy_depth, occluding_sheet
+from synthetic_scenes import (
+    PINHOLE,
+    SMALL,
+    WallPose,
+    WallStream,
+    chained,
+    multipath,
+    noisy_depth,
+    occluding_sheet,
+)
 
 from nlos_cam.calibrate import view
 
-POSES = [(0.2, 45.0, 0.0), (0.15, 15.0, 0.0), (0.3, 70.0, -8.0), (0.3, 15.0, 5.0), (0.2, -60.0, 10.0), (0.2, 0.0, 0.0)]
+POSES = [
+    (0.2, 45.0, 0.0),
+    (0.15, 15.0, 0.0),
+    (0.3, 70.0, -8.0),
+    (0.3, 15.0, 5.0),
+    (0.2, -60.0, 10.0),
+    (0.2, 0.0, 0.0),
+]
 SHIFTS = [(0.002, 0.0, 0.0), (-0.002, 0.0, 0.0), (0.0, 0.5, 0.0), (0.0, -0.5, 0.0), (0.0, 0.0, 0.5)]
 TOLD_FRAMES = 60
 SIGMAS = 4.5
@@ -60,14 +78,19 @@ def test_drift_check_is_silent_at_detours_beyond_the_wall(pose: WallPose, seed: 
 def test_drift_check_is_silent_at_detours_across_the_wall(pose: WallPose, seed: int) -> None:
     """Detours behind an occluder have any depth, also the wall's."""
     stream = WallStream(pose, seed=seed)
-    hide = chained(occluding_sheet(stream.places, 0.3), multipath(stream.places, 0.8, seed, beyond=seed % 2 == 0))
+    hide = chained(
+        occluding_sheet(stream.places, 0.3),
+        multipath(stream.places, 0.8, seed, beyond=seed % 2 == 0),
+    )
     assert stream.show(pose, 200, hide) is None
 
 
 @poses
 @pytest.mark.parametrize("shift", SHIFTS)
 @pytest.mark.parametrize("share", [0.0, 0.3, 0.6])
-def test_drift_check_measures_a_knock_beside_an_object(pose: WallPose, shift: WallPose, share: float) -> None:
+def test_drift_check_measures_a_knock_beside_an_object(
+    pose: WallPose, shift: WallPose, share: float
+) -> None:
     stream = WallStream(pose, seed=3)
     hide = [multipath(stream.places, share, 5)] if share else []
     assert stream.show(pose, 40, *hide) is None
@@ -76,7 +99,9 @@ def test_drift_check_measures_a_knock_beside_an_object(pose: WallPose, shift: Wa
     assert_right(stream, shift)
 
 
-@pytest.mark.parametrize("shift", [(0.01, 0.0, 0.0), (0.0, -5.0, 0.0), (0.03, 5.0, -3.0), (-0.02, -8.0, 2.0)])
+@pytest.mark.parametrize(
+    "shift", [(0.01, 0.0, 0.0), (0.0, -5.0, 0.0), (0.03, 5.0, -3.0), (-0.02, -8.0, 2.0)]
+)
 @pytest.mark.parametrize("pose", POSES[:2])
 def test_drift_check_measures_a_large_move_beside_both(pose: WallPose, shift: WallPose) -> None:
     stream = WallStream(pose, seed=4)
@@ -114,12 +139,17 @@ def test_drift_check_separates_a_move_from_a_range_drift(pose: WallPose) -> None
     assert "moved" in line
 
 
-@pytest.mark.parametrize("offset_m", [0.7 * TOLERANCE_M, TOLERANCE_M, 1.1 * TOLERANCE_M, 1.5 * TOLERANCE_M])
+@pytest.mark.parametrize(
+    "offset_m", [0.7 * TOLERANCE_M, TOLERANCE_M, 1.1 * TOLERANCE_M, 1.5 * TOLERANCE_M]
+)
 def test_drift_check_warnings_do_not_flicker(offset_m: float) -> None:
     """Neither at the limit nor while a drift grows slowly."""
-    stream, seen = WallStream(POSES[0], seed=8), [()]
+    stream = WallStream(POSES[0], seed=8)
+    seen = [()]
     for _ in range(600):
-        stream.show(stream.pose, 1, lambda depth_m, number: depth_m + offset_m * min(number / 300, 1.0))
+        stream.show(
+            stream.pose, 1, lambda depth_m, number: depth_m + offset_m * min(number / 300, 1.0)
+        )
         if seen[-1] != stream.check.warnings:
             seen.append(stream.check.warnings)
     assert len(seen) <= 2
@@ -128,7 +158,10 @@ def test_drift_check_warnings_do_not_flicker(offset_m: float) -> None:
 def test_drift_check_warns_of_a_wall_out_of_view_until_back() -> None:
     stream = WallStream(POSES[0], seed=9)
     stream.show(stream.pose, 40)
-    assert stream.show(stream.pose, BLIND_FRAMES - 1, lambda depth_m, _: np.full_like(depth_m, np.nan)) is None
+    assert (
+        stream.show(stream.pose, BLIND_FRAMES - 1, lambda depth_m, _: np.full_like(depth_m, np.nan))
+        is None
+    )
     assert stream.check.drift is None
     assert stream.check.wall_share == 0.0
     assert stream.show(stream.pose, 60, multipath(stream.places, 0.97, 1)) is not None
@@ -148,7 +181,8 @@ def test_drift_check_keeps_its_warning_while_the_wall_is_hidden() -> None:
 
 def test_drift_check_measures_whole_frames_with_holes() -> None:
     """As from a camera: every pixel has depth, except whole columns and whole frames."""
-    stream, generator = WallStream(POSES[0], PINHOLE, seed=11), np.random.default_rng(1)
+    stream = WallStream(POSES[0], PINHOLE, seed=11)
+    generator = np.random.default_rng(1)
     depth_m = wall_depth(view(*stream.moved(0.002), PINHOLE).pose, PINHOLE)
     depth_m[:, 200:400] = np.nan
     for number in range(40):

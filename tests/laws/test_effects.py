@@ -1,4 +1,6 @@
-"""Laws of effects: each matters where the plan calls for it and not elsewhere (relative L1 of the transient)."""
+"""Laws of effects: each matters where the plan calls for it and not elsewhere (relative L1 of the
+transient).
+"""
 
 from dataclasses import replace
 from typing import Any
@@ -19,11 +21,15 @@ pytestmark = pytest.mark.slow
 RIG = load_rig("paper-rig")
 OPEN = load_rig("bare-wall").model_copy(update={"object_box": RIG.object_box})
 BEHIND = OPEN.model_copy(update={"occluder": Occluder(x_m=-3.0, z_min_m=0.05)})
-BLIND = RIG.model_copy(update={"device": RIG.device.model_copy(update={"gate_s": 0.1 / SPEED_OF_LIGHT_M_PER_S})})
+BLIND = RIG.model_copy(
+    update={"device": RIG.device.model_copy(update={"gate_s": 0.1 / SPEED_OF_LIGHT_M_PER_S})}
+)
 COARSE = Accuracy("coarse", relay_columns=8, relay_rows=6)
 SOME = np.arange(5120)[::61]
-SHINY, NEARLY_DULL = phong(0.4, 0.6, 10), phong(1.0, 1e-5, 1)
-COLOURED, GREY = np.array([1.0, 0.5, 0.2]), np.array([0.5, 0.5, 0.5])
+SHINY = phong(0.4, 0.6, 10)
+NEARLY_DULL = phong(1.0, 1e-5, 1)
+COLOURED = np.array([1.0, 0.5, 0.2])
+GREY = np.array([0.5, 0.5, 0.5])
 
 
 def _plate(slope: float = 0.0, z_m: float = 0.25) -> np.ndarray:
@@ -56,12 +62,16 @@ NOT_CALLED_FOR = {
     "tilt": Scene(RIG, _plate(1e-4)),
     "brdf": Scene(RIG, _plate(), Surface(1.0, NEARLY_DULL)),
     "colour": Scene(RIG, _plate(), Surface(GREY)),
-    "inter-reflection": Scene(RIG, depth_map(64, np.nan, ((30, 30), 0.39)), radiometry="lambertian"),
+    "inter-reflection": Scene(
+        RIG, depth_map(64, np.nan, ((30, 30), 0.39)), radiometry="lambertian"
+    ),
     "pulse": Scene(RIG, _plate(), pulse_ns=1e-5),
 }
 
 
-def _with(implementation: Any, scene: Scene, names: set[str], accuracy: Accuracy = COARSE) -> np.ndarray:
+def _with(
+    implementation: Any, scene: Scene, names: set[str], accuracy: Accuracy = COARSE
+) -> np.ndarray:
     if scene.surface.brdf is not None:  # beam by beam in the brute force: some of them will do
         return implementation.three_bounce(scene, SOME, names, accuracy)[None, ..., None]
     found = implementation.transient(scene, names, accuracy)
@@ -71,10 +81,14 @@ def _with(implementation: Any, scene: Scene, names: set[str], accuracy: Accuracy
 def _change(other: np.ndarray, whole: np.ndarray) -> float:
     """Relative L1 of other to whole, where there is any light."""
     bins = max(other.shape[2], whole.shape[2])
-    other, whole = (np.pad(part, [(0, 0), (0, 0), (0, bins - part.shape[2]), (0, 0)]) for part in (other, whole))
+    other, whole = (
+        np.pad(part, [(0, 0), (0, 0), (0, bins - part.shape[2]), (0, 0)]) for part in (other, whole)
+    )
     other, whole = np.broadcast_arrays(other, whole)
     light = float(whole.sum(dtype=np.float64))
-    return float(np.abs(other - whole).sum(dtype=np.float64)) / light if light else float(other.any())
+    return (
+        float(np.abs(other - whole).sum(dtype=np.float64)) / light if light else float(other.any())
+    )
 
 
 def _left_out(scene: Scene, accuracy: Accuracy = COARSE) -> set[str]:
@@ -85,22 +99,32 @@ def _left_out(scene: Scene, accuracy: Accuracy = COARSE) -> set[str]:
 def test_effect_called_for_changes_more_than_the_tolerance(implementation: Any, name: str) -> None:
     scene = CALLED_FOR[name]
     if name == "inter-reflection" and implementation.name == "reference":
-        scene = replace(scene, object_depth_m=_bowl()[3:6, 3:6])  # path by path it is for a few patches only
-    accuracy = replace(COARSE, relay_columns=3, relay_rows=3) if name == "inter-reflection" else COARSE
+        scene = replace(
+            scene, object_depth_m=_bowl()[3:6, 3:6]
+        )  # path by path it is for a few patches only
+    accuracy = (
+        replace(COARSE, relay_columns=3, relay_rows=3) if name == "inter-reflection" else COARSE
+    )
     chosen = set(EFFECTS) - _left_out(scene, accuracy)
     assert name in chosen
     whole = _with(implementation, scene, chosen, accuracy)
-    assert _change(_with(implementation, scene, chosen - {name}, accuracy), whole) > COARSE.tolerance
+    assert (
+        _change(_with(implementation, scene, chosen - {name}, accuracy), whole) > COARSE.tolerance
+    )
 
 
 @pytest.mark.parametrize("name", EFFECTS)
-def test_effect_not_called_for_changes_less_than_the_tolerance(implementation: Any, name: str) -> None:
+def test_effect_not_called_for_changes_less_than_the_tolerance(
+    implementation: Any, name: str
+) -> None:
     scene = NOT_CALLED_FOR[name]
     left_out = _left_out(scene)
     assert name in left_out
     chosen = set(EFFECTS) - left_out
     forced = _with(implementation, scene, chosen | {name})
-    lit = bool(chosen & {"direct", "three-bounce"})  # without either there is no light, and a rendering is refused
+    lit = bool(
+        chosen & {"direct", "three-bounce"}
+    )  # without either there is no light, and a rendering is refused
     whole = _with(implementation, scene, chosen) if lit else np.zeros_like(forced)
     assert _change(forced, whole) <= COARSE.tolerance
 
@@ -124,7 +148,9 @@ scenes = st.builds(
     Scene,
     rig=st.sampled_from([RIG, OPEN, BEHIND]),
     object_depth_m=depths,
-    surface=st.sampled_from([Surface(), Surface(0.5), Surface(COLOURED), Surface(np.array([1, 0.99, 1]))]),
+    surface=st.sampled_from(
+        [Surface(), Surface(0.5), Surface(COLOURED), Surface(np.array([1, 0.99, 1]))]
+    ),
     radiometry=st.sampled_from(["paper", "lambertian"]),
     jump_m=st.sampled_from([0.02, 0.5]),
     pulse_ns=st.sampled_from([0.0, 1e-3, 1e-2]),
@@ -140,16 +166,23 @@ def test_plan_leaves_out_bounds_within_the_tolerance(scene: Scene, stop: str) ->
     assert all(0 <= effect.bound <= 1 and effect.reason for effect in verdicts)
 
 
-# S1 to S5 have no higher orders: in the paper's radiometry inter-reflection is outside of what bounds are about
+# S1 to S5 have no higher orders: in the paper's radiometry inter-reflection is outside of what
+# bounds are about
 BOUNDED = tuple(name for name in EFFECTS if name not in {"direct", "three-bounce"})
 
 
 @settings(max_examples=12, deadline=None, derandomize=True)
-@given(scene=scenes, name=st.sampled_from(BOUNDED), cells=st.sampled_from([(8, 6), (3, 11), (1, 1)]))
-def test_bound_is_never_below_the_change_without_the_effect(scene: Scene, name: str, cells: tuple[int, int]) -> None:
+@given(
+    scene=scenes, name=st.sampled_from(BOUNDED), cells=st.sampled_from([(8, 6), (3, 11), (1, 1)])
+)
+def test_bound_is_never_below_the_change_without_the_effect(
+    scene: Scene, name: str, cells: tuple[int, int]
+) -> None:
     accuracy = replace(COARSE, relay_columns=cells[0], relay_rows=cells[1])
     every = set(EFFECTS) - ({"inter-reflection"} if scene.radiometry == "paper" else set())
-    bound = next(effect.bound for effect in plan(SceneFacts(scene, accuracy)) if effect.name == name)
+    bound = next(
+        effect.bound for effect in plan(SceneFacts(scene, accuracy)) if effect.name == name
+    )
     if bound < 1:
         whole, without = (transient(scene, accuracy, names) for names in (every, every - {name}))
         whole, without = (part if part.ndim == 4 else part[..., None] for part in (whole, without))
@@ -161,5 +194,7 @@ def test_bound_of_a_brdf_counts_its_replacement() -> None:
     verdicts = plan(SceneFacts(scene, COARSE))
     assert included(verdicts, "brdf")
     bound = next(effect.bound for effect in verdicts if effect.name == "brdf")
-    whole, without = (transient(scene, COARSE, names) for names in (set(EFFECTS), set(EFFECTS) - {"brdf"}))
+    whole, without = (
+        transient(scene, COARSE, names) for names in (set(EFFECTS), set(EFFECTS) - {"brdf"})
+    )
     assert _change(without[..., None], whole[..., None]) <= bound

@@ -21,7 +21,8 @@ FEW = Accuracy("few", relay_columns=4, relay_rows=4)
 MAX_EFFECTS = sorted(set(EFFECTS) - {"inter-reflection", "pulse"})
 
 
-CLIFF, ONE_PIXEL = depth_map(8, 0.38, (np.s_[:, :4], 0.13)), depth_map(8, np.nan, ((3, 5), 0.2))
+CLIFF = depth_map(8, 0.38, (np.s_[:, :4], 0.13))
+ONE_PIXEL = depth_map(8, np.nan, ((3, 5), 0.2))
 OBJECTS = {
     **{f"touching from {z_m} m": depth_map(8, z_m) for z_m in (0.0, 1e-30, 1e-9, 1e-4, 0.01)},
     "half touching": np.linspace(0, 0.2, 64, dtype=np.float32).reshape(8, 8),
@@ -58,17 +59,23 @@ def test_hard_objects_give_bounded_maps(implementation: Any, name: str, radiomet
 
 @pytest.mark.parametrize("distance_m", [0.15, 0.3])
 @pytest.mark.parametrize("yaw_deg", [15.0, 75.0, 89.9, -75.0, 54.999])
-def test_grazing_lidars_give_bounded_maps(implementation: Any, distance_m: float, yaw_deg: float) -> None:
+def test_grazing_lidars_give_bounded_maps(
+    implementation: Any, distance_m: float, yaw_deg: float
+) -> None:
     """At 55 degrees the outermost beams go along the wall; beyond it some never meet it."""
     for rig in (RIG, OPEN):
-        rendering = implementation.render(Scene(_lidar(distance_m, yaw_deg, rig), ONE_PIXEL), accuracy=FEW)
+        rendering = implementation.render(
+            Scene(_lidar(distance_m, yaw_deg, rig), ONE_PIXEL), accuracy=FEW
+        )
         _check(rendering)
     lost = np.isnan(rendering.depth_m)
     assert lost.any() or abs(yaw_deg) < 60
 
 
 def test_beam_along_the_wall_has_no_return(implementation: Any) -> None:
-    """An axis turned by 90 degrees less half a pixel: a column of beams runs exactly along the wall."""
+    """An axis turned by 90 degrees less half a pixel: a column of beams runs exactly along the
+    wall.
+    """
     pinhole = OPEN.pinhole.scaled(80, 64)
     angle = np.degrees(np.arctan((79 - pinhole.ppx) / pinhole.fx))
     rendering = implementation.render(Scene(_lidar(0.2, 90 - angle, OPEN), ONE_PIXEL), accuracy=FEW)
@@ -80,7 +87,8 @@ def test_beam_along_the_wall_has_no_return(implementation: Any) -> None:
 def test_gate_ends_the_histogram(implementation: Any, gate_m: float) -> None:
     device = RIG.device.model_copy(update={"gate_s": gate_m / SPEED_OF_LIGHT_M_PER_S})
     scene = Scene(RIG.model_copy(update={"device": device}), depth_map(8, 0.2))
-    rendering, whole = implementation.render(scene, accuracy=FEW), implementation.transient(scene, accuracy=FEW)
+    rendering = implementation.render(scene, accuracy=FEW)
+    whole = implementation.transient(scene, accuracy=FEW)
     _check(rendering)
     if gate_m < 0.2:
         assert not whole.any()
@@ -89,33 +97,46 @@ def test_gate_ends_the_histogram(implementation: Any, gate_m: float) -> None:
     heard = np.isfinite(rendering.multi.path_m)
     assert (rendering.multi.path_m[heard] < gate_m + RIG.device.bin_m).all()
     # transient and render keep the same last bin
-    np.testing.assert_allclose(rendering.multi.peak[heard], whole[heard].max(-1), rtol=1e-6 if gate_m < 1 else 1)
+    np.testing.assert_allclose(
+        rendering.multi.peak[heard], whole[heard].max(-1), rtol=1e-6 if gate_m < 1 else 1
+    )
 
 
 def test_path_on_the_edge_of_a_bin_is_kept(implementation: Any) -> None:
     """The longest path of all beams ends exactly at the last bin."""
-    depth, one = depth_map(8, np.nan, ((3, 3), 0.25)), replace(FEW, relay_columns=1, relay_rows=1)
+    depth = depth_map(8, np.nan, ((3, 3), 0.25))
+    one = replace(FEW, relay_columns=1, relay_rows=1)
     job = prepare(Scene(OPEN, depth), one, ["three-bounce"]).job
     cell = np.array([job.relay.x_m[0], job.relay.y_m[0], 0])
     point = job.patches.point_m[0]
-    path = job.length_m + np.linalg.norm(job.laser_spot_m - point, axis=1) + np.linalg.norm(cell - point)
+    path = (
+        job.length_m
+        + np.linalg.norm(job.laser_spot_m - point, axis=1)
+        + np.linalg.norm(cell - point)
+    )
     longest = float((path + job.relay.length_m[0]).max())
     for bins in (50, 64, 100):
         device = OPEN.device.model_copy(update={"bin_m": longest / bins})
         rig = OPEN.model_copy(update={"device": device})
-        found = implementation.three_bounce(Scene(rig, depth), effects=["three-bounce"], accuracy=one)
+        found = implementation.three_bounce(
+            Scene(rig, depth), effects=["three-bounce"], accuracy=one
+        )
         assert (found > 0).any(1).sum() == len(job.laser_spot_m)
 
 
 def test_histogram_holds_a_ratio_of_a_million_to_one(implementation: Any) -> None:
     """A patch with an albedo of 1e-6 stays as bright as alone beside a white one."""
-    alone, albedo = depth_map(8, np.nan, ((6, 6), 0.4)), np.full((8, 8), 1e-6)
+    alone = depth_map(8, np.nan, ((6, 6), 0.4))
+    albedo = np.full((8, 8), 1e-6)
     depth = depth_map(8, np.nan, ((6, 6), 0.4), ((1, 1), 0.14))
     albedo[1, 1] = 1.0
-    effects, some = ["three-bounce", "occluder"], np.arange(5120)[::61]
+    effects = ["three-bounce", "occluder"]
+    some = np.arange(5120)[::61]
     both = implementation.three_bounce(Scene(RIG, depth, Surface(albedo)), some, effects, FEW)
     dim = implementation.three_bounce(Scene(RIG, alone, Surface(albedo)), some, effects, FEW)
-    only = implementation.three_bounce(Scene(RIG, depth, Surface(np.where(albedo < 1, 0, 1.0))), some, effects, FEW)
+    only = implementation.three_bounce(
+        Scene(RIG, depth, Surface(np.where(albedo < 1, 0, 1.0))), some, effects, FEW
+    )
     own = (dim > 0) & (only[:, : dim.shape[1]] == 0)
     assert own.sum() > 100
     assert both.max() > 1e6 * both[:, : dim.shape[1]][own].max()
@@ -124,13 +145,17 @@ def test_histogram_holds_a_ratio_of_a_million_to_one(implementation: Any) -> Non
 
 @pytest.mark.parametrize("dtype", [np.float16, np.float32, np.float64, ">f4", np.longdouble])
 @pytest.mark.parametrize("layout", ["C", "F", "strided", "read-only"])
-def test_dtype_and_layout_do_not_change_the_result(implementation: Any, dtype: Any, layout: str) -> None:
+def test_dtype_and_layout_do_not_change_the_result(
+    implementation: Any, dtype: Any, layout: str
+) -> None:
     plain = CLIFF.astype(np.float16)
     depth = plain.astype(dtype, order="F" if layout == "F" else "C")
     if layout == "strided":
         depth = np.repeat(np.repeat(depth, 2, 0), 3, 1)[::2, ::3]
     depth.flags.writeable = layout != "read-only"
-    expected = implementation.three_bounce(Scene(RIG, plain.astype(np.float32)), np.arange(5120)[::401], accuracy=FEW)
+    expected = implementation.three_bounce(
+        Scene(RIG, plain.astype(np.float32)), np.arange(5120)[::401], accuracy=FEW
+    )
     found = implementation.three_bounce(Scene(RIG, depth), np.arange(5120)[::401], accuracy=FEW)
     np.testing.assert_array_equal(found, expected)
 
@@ -141,7 +166,9 @@ def test_scene_refuses_depths_that_cannot_be(bad: float) -> None:
         Scene(RIG, depth_map(8, 0.2, ((3, 3), bad)))
 
 
-values = st.one_of(st.just(np.nan), st.floats(0, 0.5, width=32), st.sampled_from([0.0, 1e-38, 1e-9, 5.0]))
+values = st.one_of(
+    st.just(np.nan), st.floats(0, 0.5, width=32), st.sampled_from([0.0, 1e-38, 1e-9, 5.0])
+)
 grids = st.integers(1, 6).flatmap(lambda n: st.lists(values, min_size=n * n, max_size=n * n))
 
 

@@ -11,7 +11,16 @@ from nlos_calibration import Occluder, load_rig
 
 from nlos_cam.errors import SceneError
 from nlos_cam.objects import cell_centers_m, object_box, object_depth
-from nlos_cam.render import EFFECTS, Accuracy, Material, Scene, Surface, render, render_all, three_bounce
+from nlos_cam.render import (
+    EFFECTS,
+    Accuracy,
+    Material,
+    Scene,
+    Surface,
+    render,
+    render_all,
+    three_bounce,
+)
 
 pytestmark = pytest.mark.slow
 RIG = load_rig("paper-rig")
@@ -20,7 +29,9 @@ SMALL = Accuracy("small", relay_columns=12, relay_rows=10, sub_bins=1)
 FEW = 12
 """Number of beams rendered by brute force."""
 ROUNDING = 5e-5
-"""Relative L1 between implementations in float32: a leg on the edge of a shadow may fall on either side."""
+"""Relative L1 between implementations in float32: a leg on the edge of a shadow may fall on either
+side.
+"""
 NO_GPU = pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
 
 
@@ -33,15 +44,20 @@ def _plane(size: int = 22) -> np.ndarray:
 
 
 COLUMN_X_M = float(cell_centers_m(object_box(RIG), 32)[0][9])
-NEAR, PIXEL = depth_map(32, np.nan, (np.s_[10:20, 10:20], 0.004)), depth_map(32, np.nan, ((15, 15), 0.3))
+NEAR = depth_map(32, np.nan, (np.s_[10:20, 10:20], 0.004))
+PIXEL = depth_map(32, np.nan, ((15, 15), 0.3))
 SCENES = {
     "object": Scene(RIG, _object()),
     "draughty object": Scene(RIG, _object(3)),
     "lambertian": Scene(RIG, _object(), radiometry="lambertian"),
     "no occluder": Scene(RIG.model_copy(update={"occluder": None}), _object()),
     "tilted plane": Scene(RIG, _plane()),
-    "occluder in front": Scene(RIG.model_copy(update={"occluder": Occluder(x_m=0.43, z_min_m=0.1)}), _plane()),
-    "occluder on a column": Scene(RIG.model_copy(update={"occluder": Occluder(x_m=COLUMN_X_M, z_min_m=0.1)}), _plane()),
+    "occluder in front": Scene(
+        RIG.model_copy(update={"occluder": Occluder(x_m=0.43, z_min_m=0.1)}), _plane()
+    ),
+    "occluder on a column": Scene(
+        RIG.model_copy(update={"occluder": Occluder(x_m=COLUMN_X_M, z_min_m=0.1)}), _plane()
+    ),
     "near contact": Scene(RIG, NEAR),
     "near contact, lambertian": Scene(RIG, NEAR, radiometry="lambertian"),
     "coloured": Scene(RIG, _object(), Surface(np.array([0.9, 0.5, 0.1]))),
@@ -49,19 +65,31 @@ SCENES = {
     "full grid": Scene(RIG, depth_map(32, 0.38, (np.s_[:, 12:14], 0.15))),
     "phong": Scene(RIG, _plane(8), Material(kind="phong", exponent=3).surface),
     "retroreflective": Scene(RIG, PIXEL, Material(kind="retroreflective").surface),
-    "inter-reflection": Scene(RIG, depth_map(4, 0.15, (np.s_[1:3, 1:3], 0.32)), radiometry="lambertian"),
+    "inter-reflection": Scene(
+        RIG, depth_map(4, 0.15, (np.s_[1:3, 1:3], 0.32)), radiometry="lambertian"
+    ),
 }
-MANY_PATCHES, FEW_PATCHES = 2e-3, 1.5e-2
-"""Relative L1 from the reference: few patches do not average out paths that fall into the next bin."""
-FEW_OR_TABULATED = {k for k in SCENES if "near" in k or "pixel" in k} | {"phong", "retroreflective", "inter-reflection"}
+MANY_PATCHES = 2e-3
+FEW_PATCHES = 1.5e-2
+"""Relative L1 from the reference: few patches do not average out paths that fall into the next
+bin.
+"""
+FEW_OR_TABULATED = {k for k in SCENES if "near" in k or "pixel" in k} | {
+    "phong",
+    "retroreflective",
+    "inter-reflection",
+}
 THREE_BOUNCE = frozenset(EFFECTS) - {"inter-reflection", "pulse"}
 
 
 def _histograms(kind: str, backend: str) -> np.ndarray:
-    scene, accuracy = SCENES[kind], QUICK if backend != "reference" else replace(QUICK, sub_bins=0)
+    scene = SCENES[kind]
+    accuracy = QUICK if backend != "reference" else replace(QUICK, sub_bins=0)
     chosen = np.arange(0, 5120, 5120 // FEW)
     wanted = THREE_BOUNCE | ({kind} & {"inter-reflection"})
-    return three_bounce(scene, accuracy, wanted, "cpu" if backend == "reference" else backend, chosen)
+    return three_bounce(
+        scene, accuracy, wanted, "cpu" if backend == "reference" else backend, chosen
+    )
 
 
 _kept = cache(_histograms)
@@ -70,17 +98,25 @@ _kept = cache(_histograms)
 @pytest.mark.parametrize("backend", ["cpu", "torch", pytest.param("cuda", marks=NO_GPU)])
 @pytest.mark.parametrize("kind", SCENES)
 def test_backend_agrees_with_the_reference(kind: str, backend: str) -> None:
-    found, slow = _kept(kind, backend), _kept(kind, "reference")
+    found = _kept(kind, backend)
+    slow = _kept(kind, "reference")
     assert slow.sum() > 0
-    assert np.abs(found - slow).sum() < (FEW_PATCHES if kind in FEW_OR_TABULATED else MANY_PATCHES) * slow.sum()
-    np.testing.assert_allclose(found.sum(), slow.sum(), rtol=QUICK.scatter_error if SCENES[kind].surface.brdf else 1e-5)
+    assert (
+        np.abs(found - slow).sum()
+        < (FEW_PATCHES if kind in FEW_OR_TABULATED else MANY_PATCHES) * slow.sum()
+    )
+    np.testing.assert_allclose(
+        found.sum(), slow.sum(), rtol=QUICK.scatter_error if SCENES[kind].surface.brdf else 1e-5
+    )
 
 
 @pytest.mark.parametrize("backend", ["torch", pytest.param("cuda", marks=NO_GPU)])
 @pytest.mark.parametrize("kind", SCENES)
 def test_torch_and_numba_differ_by_rounding(kind: str, backend: str) -> None:
-    found, other = _kept(kind, backend), _kept(kind, "cpu")
-    # A BRDF is interpolated between spots by torch and expanded by numba: each is within the accuracy's error.
+    found = _kept(kind, backend)
+    other = _kept(kind, "cpu")
+    # A BRDF is interpolated between spots by torch and expanded by numba: each is within the
+    # accuracy's error.
     limit = ROUNDING if SCENES[kind].surface.brdf is None else 2 * QUICK.scatter_error
     assert np.abs(found - other).sum() < limit * other.sum()
 
@@ -94,12 +130,22 @@ def test_torch_is_repeatable(backend: str) -> None:
 def test_batch_renders_each_scene_as_alone(backend: str) -> None:
     """To the last bit on the CPU, also of a batch of one."""
     coloured = Scene(RIG, PIXEL, Surface(np.array([0.9, 0.5, 0.1])))
-    open_rig, lambertian = SCENES["no occluder"].rig, Scene(RIG, _object(size=16), radiometry="lambertian")
-    scenes = [Scene(RIG, _object(size=16)), Scene(RIG), coloured, Scene(open_rig, PIXEL), SCENES["one pixel"]]
+    open_rig = SCENES["no occluder"].rig
+    lambertian = Scene(RIG, _object(size=16), radiometry="lambertian")
+    scenes = [
+        Scene(RIG, _object(size=16)),
+        Scene(RIG),
+        coloured,
+        Scene(open_rig, PIXEL),
+        SCENES["one pixel"],
+    ]
     for batch in ([*scenes, lambertian], scenes[:1]):
         for scene, rendering in zip(batch, render_all(batch, SMALL, backend=backend), strict=True):
             alone = render(scene, SMALL, backend=backend)
-            for one, same in ((rendering.multi.peak, alone.multi.peak), (rendering.intensity, alone.intensity)):
+            for one, same in (
+                (rendering.multi.peak, alone.multi.peak),
+                (rendering.intensity, alone.intensity),
+            ):
                 np.testing.assert_allclose(one, same, rtol=0 if backend == "cpu" else 1e-5)
             assert (rendering.color is None) == (alone.color is None) == (scene is not coloured)
 

@@ -1,4 +1,6 @@
-"""Laws of meshes: format, unit, axes and order of faces do not change the depth map, which is itself a mesh."""
+"""Laws of meshes: format, unit, axes and order of faces do not change the depth map, which is
+itself a mesh.
+"""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -32,7 +34,9 @@ Triangles = np.ndarray
 
 
 def _mesh(triangles: Triangles) -> trimesh.Trimesh:
-    return trimesh.Trimesh(triangles.reshape(-1, 3), np.arange(3 * len(triangles)).reshape(-1, 3), process=False)
+    return trimesh.Trimesh(
+        triangles.reshape(-1, 3), np.arange(3 * len(triangles)).reshape(-1, 3), process=False
+    )
 
 
 def _depth(triangles: Triangles, pose: Pose = POSE) -> np.ndarray:
@@ -40,7 +44,9 @@ def _depth(triangles: Triangles, pose: Pose = POSE) -> np.ndarray:
 
 
 def _assert_same(depth: np.ndarray, other: np.ndarray) -> None:
-    """The same but for rounding: it may decide a few cells that an edge runs through, and no others."""
+    """The same but for rounding: it may decide a few cells that an edge runs through, and no
+    others.
+    """
     differs = ~np.isclose(depth, other, rtol=0, atol=SINGLE_M, equal_nan=True)
     assert differs.sum() <= 3
     assert np.isfinite(depth).sum() > 100
@@ -66,8 +72,12 @@ def test_unit_of_a_file_does_not_matter(tmp_path: Path, name: str, unit: float) 
 
 
 @settings(max_examples=25, deadline=None)
-@given(st.floats(-6, 6), st.tuples(*[st.floats(-1e3, 1e3)] * 3), st.sampled_from(sorted(CATEGORIES)))
-def test_scale_and_origin_of_a_mesh_do_not_matter(exponent: float, origin: tuple[float, ...], category: str) -> None:
+@given(
+    st.floats(-6, 6), st.tuples(*[st.floats(-1e3, 1e3)] * 3), st.sampled_from(sorted(CATEGORIES))
+)
+def test_scale_and_origin_of_a_mesh_do_not_matter(
+    exponent: float, origin: tuple[float, ...], category: str
+) -> None:
     triangles = category_triangles(category, 5)
     _assert_same(_depth((triangles + origin) * 10.0**exponent), _depth(triangles))
 
@@ -77,7 +87,8 @@ def test_quarter_turn_about_z_turns_the_depth_map(category: str) -> None:
     """Counter-clockwise, as the map shows x to the right and y up."""
     triangles = category_triangles(category, 2)
     quarter = triangles @ rotation_matrix(np.pi / 2, (0, 0, 1))[:3, :3].T
-    still, turned = Pose(size_m=0.2), Pose(size_m=0.2, turn_z_rad=np.pi / 2)
+    still = Pose(size_m=0.2)
+    turned = Pose(size_m=0.2, turn_z_rad=np.pi / 2)
     _assert_same(_depth(triangles, turned), np.rot90(_depth(triangles, still)))
     _assert_same(_depth(quarter, still), np.rot90(_depth(triangles, still)))
 
@@ -88,7 +99,9 @@ def test_winding_order_and_repetition_of_faces_do_not_matter(seed: int, category
     generator = np.random.default_rng(seed)
     triangles = category_triangles(category, 4)
     corners = generator.permuted(np.tile(np.arange(3), (len(triangles), 1)), axis=1)
-    shuffled = np.take_along_axis(triangles, corners[..., None], axis=1)[generator.permutation(len(triangles))]
+    shuffled = np.take_along_axis(triangles, corners[..., None], axis=1)[
+        generator.permutation(len(triangles))
+    ]
     _assert_same(_depth(np.concatenate([shuffled, shuffled[:50]])), _depth(triangles))
 
 
@@ -98,14 +111,17 @@ def test_mesh_with_z_up_equals_the_same_with_y_up(tmp_path: Path) -> None:
     (tmp_path / "thing.stl").write_bytes(EXPORTS["binary.stl"](_mesh(z_up)))
     read = read_mesh(tmp_path / "thing.stl").triangles
     _assert_same(_depth(turn_upright(read, "z")), _depth(triangles))
-    assert not np.allclose(_depth(turn_upright(read, "y")), _depth(triangles), atol=1e-3, equal_nan=True)
+    assert not np.allclose(
+        _depth(turn_upright(read, "y")), _depth(triangles), atol=1e-3, equal_nan=True
+    )
 
 
 def _plates(depth_m: np.ndarray) -> Triangles:
     """A level plate over each cell of a depth map that is surface."""
     pixels = len(depth_m)
     x, y = cell_centers_m(BOX, pixels)
-    half_x, half_y = (x[1] - x[0]) / 2, (y[0] - y[1]) / 2
+    half_x = (x[1] - x[0]) / 2
+    half_y = (y[0] - y[1]) / 2
     row, column = np.nonzero(~np.isnan(depth_m))
     signs = np.array([[(-1, -1), (1, -1), (1, 1)], [(-1, -1), (1, 1), (-1, 1)]])
     corners = np.empty((len(row), 2, 3, 3))
@@ -116,18 +132,27 @@ def _plates(depth_m: np.ndarray) -> Triangles:
 
 
 def _sheet(depth_m: np.ndarray) -> Triangles:
-    """The surface through the centres of the cells: two triangles for every four neighbours that are surface."""
+    """The surface through the centres of the cells: two triangles for every four neighbours that
+    are surface.
+    """
     x, y = np.meshgrid(*cell_centers_m(BOX, len(depth_m)))
     point = np.stack([x, y, depth_m], axis=-1)
-    a, b, c, d = point[:-1, :-1], point[:-1, 1:], point[1:, 1:], point[1:, :-1]
-    both = np.stack([np.stack([a, b, c], axis=2), np.stack([a, c, d], axis=2)], axis=2).reshape(-1, 3, 3)
+    a = point[:-1, :-1]
+    b = point[:-1, 1:]
+    c = point[1:, 1:]
+    d = point[1:, :-1]
+    both = np.stack([np.stack([a, b, c], axis=2), np.stack([a, c, d], axis=2)], axis=2).reshape(
+        -1, 3, 3
+    )
     return both[~np.isnan(both).any(axis=(1, 2))]
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("pixels", [8, 64, 256])
 @pytest.mark.parametrize("name", [None, *EXPORTS])
-def test_plates_of_a_depth_map_rasterize_back_to_it(tmp_path: Path, pixels: int, name: str | None) -> None:
+def test_plates_of_a_depth_map_rasterize_back_to_it(
+    tmp_path: Path, pixels: int, name: str | None
+) -> None:
     """Within single precision, cell by cell: no map is too ragged."""
     generator = np.random.default_rng(pixels)
     depth = generator.uniform(BOX.z_near_m, BOX.z_far_m, (pixels, pixels)).astype(np.float32)
@@ -152,5 +177,7 @@ def test_sheet_through_a_depth_map_rasterizes_back_to_it() -> None:
 
 def test_placing_a_placed_mesh_moves_nothing() -> None:
     placed = place(category_triangles("hat", 2), POSE, BOX)
-    again = place(placed, Pose(size_m=POSE.size_m, x_m=POSE.x_m, y_m=POSE.y_m, front_m=POSE.front_m), BOX)
+    again = place(
+        placed, Pose(size_m=POSE.size_m, x_m=POSE.x_m, y_m=POSE.y_m, front_m=POSE.front_m), BOX
+    )
     np.testing.assert_allclose(again, placed, atol=1e-12)

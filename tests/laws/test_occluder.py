@@ -1,4 +1,6 @@
-"""An occluder in view is found where it stands, within its stated uncertainty; elsewhere none is found."""
+"""An occluder in view is found where it stands, within its stated uncertainty; elsewhere none is
+found.
+"""
 
 import numpy as np
 import pytest
@@ -20,9 +22,14 @@ LOOKS = {
 @pytest.mark.slow
 @pytest.mark.parametrize("look", LOOKS)
 def test_occluder_interval_holds_the_truth_as_often_as_stated(look: str) -> None:
-    """80 benches each: a share of 95 % is found below 86 % once in 500. A gap's is of a pixel, uniform: 100 %."""
+    """80 benches each: a share of 95 % is found below 86 % once in 500. A gap's is of a pixel,
+    uniform: 100 %.
+    """
     uniform = np.random.default_rng(11).uniform
-    drawn_of = [uniform(low, high, 80) for low, high in ((0.15, 0.3), (35.0, 70.0), (0.12, 0.22), (0.05, 0.12))]
+    drawn_of = [
+        uniform(low, high, 80)
+        for low, high in ((0.15, 0.3), (35.0, 70.0), (0.12, 0.22), (0.05, 0.12))
+    ]
     settings = [Setting(*values, **LOOKS[look]) for values in zip(*drawn_of, strict=True)]
     outcomes = [trial(setting, np.random.default_rng([3, n])) for n, setting in enumerate(settings)]
     found = [one for one in outcomes if not one.refused]
@@ -54,14 +61,21 @@ def test_occluder_of_more_frames_has_a_surer_sheet_but_same_edge() -> None:
         fit = find_occluder(mean.mean_m(), mean.noise(), seen.pinhole, seen.pose, generator)
         return fit.x_std_m, fit.gap_std_m
 
-    (x_few, gap_few), (x_many, gap_many) = stds(4), stds(64)
+    (x_few, gap_few) = stds(4)
+    (x_many, gap_many) = stds(64)
     assert x_many < 0.5 * x_few
     assert gap_many == pytest.approx(gap_few, rel=0.2)
 
 
-@pytest.mark.parametrize(("facing_deg", "x_m", "gap_m"), [(45.0, 0.2, 0.1), (60.0, 0.15, 0.06), (40.0, 0.12, 0.13)])
-def test_occluder_of_the_simulated_camera_is_found(facing_deg: float, x_m: float, gap_m: float) -> None:
-    one = simulated_trial(Setting(0.2, facing_deg, x_m, gap_m, frames=4), np.random.default_rng(2), SENSOR)
+@pytest.mark.parametrize(
+    ("facing_deg", "x_m", "gap_m"), [(45.0, 0.2, 0.1), (60.0, 0.15, 0.06), (40.0, 0.12, 0.13)]
+)
+def test_occluder_of_the_simulated_camera_is_found(
+    facing_deg: float, x_m: float, gap_m: float
+) -> None:
+    one = simulated_trial(
+        Setting(0.2, facing_deg, x_m, gap_m, frames=4), np.random.default_rng(2), SENSOR
+    )
     assert not one.refused
     assert abs(one.x_error_m) < 1e-3
     assert abs(one.gap_error_m) < 2e-3

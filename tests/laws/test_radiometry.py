@@ -1,4 +1,6 @@
-"""Laws of radiometry on every backend: materials, contact with the wall, pulse width, findings of the paper."""
+"""Laws of radiometry on every backend: materials, contact with the wall, pulse width, findings of
+the paper.
+"""
 
 from dataclasses import replace
 from typing import Any
@@ -50,7 +52,9 @@ def test_lambertian_third_bounce_wins_no_beam(objects: list[np.ndarray]) -> None
 
 
 def test_receiver_cell_scales_only_the_direct_return() -> None:
-    wide = RIG.model_copy(update={"device": RIG.device.model_copy(update={"receiver_cell_m2": 2e-4})})
+    wide = RIG.model_copy(
+        update={"device": RIG.device.model_copy(update={"receiver_cell_m2": 2e-4})}
+    )
     depth = np.full((8, 8), 0.25, np.float32)
     one, other = (three_bounce(Scene(rig, depth), "draft") for rig in (RIG, wide))
     np.testing.assert_array_equal(one, other)
@@ -66,7 +70,9 @@ BRUTE_FORCE = replace(COARSE, sub_bins=0)
 
 def _given_back(brdf: Brdf, cos_in: float) -> float:
     """The integral of f cos / pi over the hemisphere of outgoing light."""
-    cos_out, turn = np.meshgrid((np.arange(2000) + 0.5) / 2000, np.linspace(0, np.pi, 2001)[1:] - np.pi / 4000)
+    cos_out, turn = np.meshgrid(
+        (np.arange(2000) + 0.5) / 2000, np.linspace(0, np.pi, 2001)[1:] - np.pi / 4000
+    )
     across = np.sqrt((1 - cos_in**2) * (1 - cos_out**2)) * np.cos(turn)
     return float(2 * (brdf(cos_in, cos_out, cos_in * cos_out + across) * cos_out).mean())
 
@@ -92,7 +98,9 @@ cosines = st.floats(0.01, 1.0)
 @pytest.mark.parametrize("kind", KINDS)
 @settings(deadline=None, derandomize=True)
 @given(cos_in=cosines, cos_out=cosines, turn=st.floats(0, np.pi))
-def test_brdf_is_reciprocal_and_never_negative(kind: Any, cos_in: float, cos_out: float, turn: float) -> None:
+def test_brdf_is_reciprocal_and_never_negative(
+    kind: Any, cos_in: float, cos_out: float, turn: float
+) -> None:
     between = cos_in * cos_out + np.sqrt((1 - cos_in**2) * (1 - cos_out**2)) * np.cos(turn)
     brdf = kind(0.3, 0.7, 20)
     assert brdf(cos_in, cos_out, between) == pytest.approx(brdf(cos_out, cos_in, between))
@@ -102,8 +110,12 @@ def test_brdf_is_reciprocal_and_never_negative(kind: Any, cos_in: float, cos_out
 def test_brdf_is_brightest_in_its_own_direction() -> None:
     """At 45 degrees a mirror sends light onward and a retroreflector sends it back."""
     half = np.cos(np.pi / 4)
-    onward, back = (half, half, 0.0), (half, half, 1.0)
-    for brdf, bright, dark in ((phong(0, 1, 20), onward, back), (retroreflective(0, 1, 20), back, onward)):
+    onward = (half, half, 0.0)
+    back = (half, half, 1.0)
+    for brdf, bright, dark in (
+        (phong(0, 1, 20), onward, back),
+        (retroreflective(0, 1, 20), back, onward),
+    ):
         assert brdf(*bright) > 10
         assert brdf(*dark) < 0.1
 
@@ -113,7 +125,9 @@ def test_phong_without_its_lobe_is_lambertian(implementation: Any) -> None:
     """The effects are named because the plan would leave the BRDF out."""
     depth = np.random.default_rng(0).uniform(0.2, 0.3, (6, 6)).astype(np.float32)
     effects = ["three-bounce", "occluder", "tilt", "brdf"]
-    dull = implementation.three_bounce(Scene(RIG, depth, Surface(1.0, phong(0.6, 0.0, 20))), SOME, effects)
+    dull = implementation.three_bounce(
+        Scene(RIG, depth, Surface(1.0, phong(0.6, 0.0, 20))), SOME, effects
+    )
     plain = implementation.three_bounce(Scene(RIG, depth, Surface(0.6)), SOME, effects)
     np.testing.assert_allclose(dull, plain, rtol=1e-4, atol=1e-6 * plain.max())
 
@@ -121,8 +135,11 @@ def test_phong_without_its_lobe_is_lambertian(implementation: Any) -> None:
 @pytest.mark.slow
 def test_brdf_tables_agree_with_brute_force() -> None:
     depth = np.random.default_rng(0).uniform(0.2, 0.3, (6, 6)).astype(np.float32)
-    scene, effects = Scene(RIG, depth, Surface(1.0, phong(0.4, 0.6, 10))), ["three-bounce", "occluder", "tilt", "brdf"]
-    found, exact = (three_bounce(scene, each, effects, chosen=SOME).sum(1) for each in (COARSE, BRUTE_FORCE))
+    scene = Scene(RIG, depth, Surface(1.0, phong(0.4, 0.6, 10)))
+    effects = ["three-bounce", "occluder", "tilt", "brdf"]
+    found, exact = (
+        three_bounce(scene, each, effects, chosen=SOME).sum(1) for each in (COARSE, BRUTE_FORCE)
+    )
     dull = three_bounce(scene, BRUTE_FORCE, effects[:-1], chosen=SOME).sum(1)
     assert np.abs(found - exact).sum() < 1e-2 * exact.sum()
     assert np.abs(exact - dull).sum() > 0.05 * dull.sum()
@@ -139,8 +156,12 @@ CELLS = np.arange(-60, 61)
     longer=st.floats(1.0, 2.0),
     lambertian=st.booleans(),
 )
-def test_plane_takes_no_more_than_was_sent(height: float, x: float, y: float, longer: float, lambertian: bool) -> None:
-    """Light from a point at any height over a plane of cells, each `longer` times as long as its width of 1."""
+def test_plane_takes_no_more_than_was_sent(
+    height: float, x: float, y: float, longer: float, lambertian: bool
+) -> None:
+    """Light from a point at any height over a plane of cells, each `longer` times as long as its
+    width of 1.
+    """
     solid_angle = np.pi if lambertian else 2 * np.pi
     squared = (CELLS[:, None] - x) ** 2 + ((CELLS - y) * longer) ** 2 + height**2
     cosine = height / np.sqrt(squared)
@@ -158,13 +179,18 @@ def test_softening_fades_out_at_the_near_distance() -> None:
 
 
 def test_far_object_has_no_near_legs() -> None:
-    assert render(Scene(RIG, depth_map(64, np.nan, (np.s_[20:40, 20:40], 0.3))), "draft").near_legs == 0
+    assert (
+        render(Scene(RIG, depth_map(64, np.nan, (np.s_[20:40, 20:40], 0.3))), "draft").near_legs
+        == 0
+    )
 
 
 @settings(deadline=None, derandomize=True)
 @given(distance_m=st.floats(1e-6, 1.0))
 def test_lidar_on_the_wall_gets_no_more_than_it_sent(distance_m: float) -> None:
-    rig = RIG.model_copy(update={"lidar": LidarPose(distance_m=distance_m, yaw_deg=45), "occluder": None})
+    rig = RIG.model_copy(
+        update={"lidar": LidarPose(distance_m=distance_m, yaw_deg=45), "occluder": None}
+    )
     for lambertian in (False, True):
         direct = cast(rig, Scene(rig).cell_intrinsics, lambertian=lambertian).direct
         assert np.isfinite(direct).all()
@@ -190,7 +216,9 @@ def test_pulse_keeps_energy_and_lowers_the_peak(implementation: Any) -> None:
 def test_pulse_of_zero_width_changes_nothing(implementation: Any) -> None:
     scene = Scene(RIG, DEPTH, pulse_ns=0.0)
     effects = ["direct", "three-bounce", "occluder"]
-    with_it, without = (implementation.transient(scene, names) for names in ([*effects, "pulse"], effects))
+    with_it, without = (
+        implementation.transient(scene, names) for names in ([*effects, "pulse"], effects)
+    )
     np.testing.assert_array_equal(with_it, without)
 
 
@@ -199,14 +227,17 @@ def test_pulse_spreads_an_echo_into_a_gaussian(pulse_ns: float) -> None:
     one = np.zeros((1, 400), np.float32)
     one[0, 200] = 2.0
     wide = with_pulse(one, pulse_ns, BIN_M)[0].astype(np.float64)
-    at, sigma = np.arange(len(wide)) - 200, pulse_bins(pulse_ns, BIN_M)
+    at = np.arange(len(wide)) - 200
+    sigma = pulse_bins(pulse_ns, BIN_M)
     assert wide.sum() == pytest.approx(2)
     assert (wide * at).sum() == pytest.approx(0, abs=1e-3)
     if sigma > 1:  # plus the variance of a bin
         assert (wide * at**2).sum() / 2 == pytest.approx(sigma**2 + 1 / 12, rel=1e-2)
     assert wide.argmax() == 200
     assert len(wide) > 400 + 3 * sigma  # room for the tail
-    assert pulse_ns < 1 or (wide >= wide.max() / 2).sum() * BIN_M == pytest.approx(0.30 * pulse_ns, abs=0.011)
+    assert pulse_ns < 1 or (wide >= wide.max() / 2).sum() * BIN_M == pytest.approx(
+        0.30 * pulse_ns, abs=0.011
+    )
 
 
 def test_wide_pulse_mixes_direct_return_and_echoes(implementation: Any) -> None:

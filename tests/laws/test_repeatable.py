@@ -1,4 +1,6 @@
-"""Laws of repeatability: the same bits again, on any number of threads, and in any part of the whole."""
+"""Laws of repeatability: the same bits again, on any number of threads, and in any part of the
+whole.
+"""
 
 from dataclasses import replace
 from typing import Any
@@ -37,26 +39,34 @@ def test_result_repeats_again_and_on_one_thread(implementation: Any, name: str) 
     first = implementation.three_bounce(SCENES[name], DISTANT, _effects(name), FEW)
     numba.set_num_threads(numba.config.NUMBA_NUM_THREADS)
     for _ in range(2):
-        np.testing.assert_array_equal(implementation.three_bounce(SCENES[name], DISTANT, _effects(name), FEW), first)
+        np.testing.assert_array_equal(
+            implementation.three_bounce(SCENES[name], DISTANT, _effects(name), FEW), first
+        )
     assert first.any()
 
 
 @pytest.fixture(scope="module")
 def whole(implementation: Any) -> dict[str, np.ndarray]:
     chosen = {name: EVERY if name in {"plain", "lambertian"} else DISTANT for name in SCENES}
-    return {name: implementation.three_bounce(one, chosen[name], _effects(name), FEW) for name, one in SCENES.items()}
+    return {
+        name: implementation.three_bounce(one, chosen[name], _effects(name), FEW)
+        for name, one in SCENES.items()
+    }
 
 
 @settings(max_examples=10, deadline=None, derandomize=True)
 @given(name=st.sampled_from(sorted(SCENES)), start=st.integers(0, 5000), step=st.integers(1, 900))
-def test_beams_do_not_depend_on_other_beams(implementation: Any, whole: Any, name: str, start: int, step: int) -> None:
+def test_beams_do_not_depend_on_other_beams(
+    implementation: Any, whole: Any, name: str, start: int, step: int
+) -> None:
     known = whole[name]
     if len(known) == len(EVERY):
         some = EVERY[start::step]
         expected = known[some]
     else:
         places = np.arange(len(DISTANT))[start % len(DISTANT) :: step]
-        some, expected = DISTANT[places], known[places]
+        some = DISTANT[places]
+        expected = known[places]
     found = implementation.three_bounce(SCENES[name], some, _effects(name), FEW)
     np.testing.assert_array_equal(found, expected)
 
@@ -68,8 +78,11 @@ ROUGHLY = replace(FEW, scatter_error=0.5, beams_per_cell=2)
     ("name", "accuracy", "rows"),
     [("plain", COARSE, (17, 40)), ("lambertian", COARSE, (17, 40)), ("shiny", ROUGHLY, (30, 33))],
 )
-def test_rows_alone_equal_rows_of_the_whole(name: str, accuracy: Accuracy, rows: tuple[int, int]) -> None:
-    every, part = render(SCENES[name], accuracy), render(SCENES[name], accuracy, rows=rows)
+def test_rows_alone_equal_rows_of_the_whole(
+    name: str, accuracy: Accuracy, rows: tuple[int, int]
+) -> None:
+    every = render(SCENES[name], accuracy)
+    part = render(SCENES[name], accuracy, rows=rows)
     for image in ("intensity", "depth_m", "margin"):
         np.testing.assert_array_equal(getattr(part, image), getattr(every, image)[slice(*rows)])
 

@@ -12,13 +12,27 @@ from numpy.random import default_rng
 from nlos_cam.frames import SATURATED
 from nlos_cam.objects import object_depth
 from nlos_cam.render import MultiBounce, Rendering, Scene, SensedImages, Sensor, cast, render
-from nlos_cam.render.sensor.bias import PATCHES_SEED, RIPPLES_SEED, WAVES, ripples, smooth_patches, texture
+from nlos_cam.render.sensor.bias import (
+    PATCHES_SEED,
+    RIPPLES_SEED,
+    WAVES,
+    ripples,
+    smooth_patches,
+    texture,
+)
 from nlos_cam.render.sensor.model import DEPTH_UNIT_M, MAX_CONFIDENCE, SensorModel, WarmUp
 
-QUIET = SensorModel(range_noise_m=0, range_noise_per_m=0, read_noise_counts=0, shot_noise=0, dead_share=0)
+QUIET = SensorModel(
+    range_noise_m=0, range_noise_per_m=0, read_noise_counts=0, shot_noise=0, dead_share=0
+)
 RICH = SensorModel(ambient_counts=40, read_noise_counts=1.5, dead_share=0)
 BIAS: dict[str, object] = {"warm_up": WarmUp(from_celsius=25, to_celsius=45, time_constant_s=600)}
-BIAS |= {"range_offset_m": 0.0045, "ripple_m": 0.002, "patch_drift_m": 0.001, "drift_m_per_celsius": 0.0002}
+BIAS |= {
+    "range_offset_m": 0.0045,
+    "ripple_m": 0.002,
+    "patch_drift_m": 0.001,
+    "drift_m_per_celsius": 0.0002,
+}
 BIASED = RICH.model_copy(update=BIAS)
 CELSIUS = 30.0
 ROUGH = BIASED.model_copy(update={"wall_texture": 0.3})
@@ -31,7 +45,8 @@ def _at_map_size(rig: Rig) -> Rig:
     return rig.model_copy(update={"intrinsics": cells})
 
 
-RIG, BARE = _at_map_size(load_rig("paper-rig")), _at_map_size(load_rig("bare-wall"))
+RIG = _at_map_size(load_rig("paper-rig"))
+BARE = _at_map_size(load_rig("bare-wall"))
 BRIGHTEST = float(cast(BARE, BARE.pinhole).direct.max())
 
 
@@ -43,7 +58,8 @@ def _echo(counts: np.ndarray | float, path_m: np.ndarray | float = 1.0) -> Multi
 
 
 def _frames(model: SensorModel, echo: MultiBounce) -> list[SensedImages]:
-    sensor, generator = Sensor(BARE, model), default_rng(1)
+    sensor = Sensor(BARE, model)
+    generator = default_rng(1)
     return [sensor.expose(echo, generator) for _ in range(FRAMES)]
 
 
@@ -68,26 +84,45 @@ def _bias_m(model: SensorModel) -> np.ndarray:
     """At CELSIUS, a quarter of the way from cold to warm."""
     wave = ripples((64, 80), WAVES, default_rng(RIPPLES_SEED)).ravel()
     pattern = smooth_patches((64, 80), default_rng(PATCHES_SEED)).ravel()
-    drift_m = 0.25 * model.patch_drift_m * (pattern - pattern.mean()) - 15 * model.drift_m_per_celsius
+    drift_m = (
+        0.25 * model.patch_drift_m * (pattern - pattern.mean()) - 15 * model.drift_m_per_celsius
+    )
     return model.ripple_m * wave - model.range_offset_m + drift_m
 
 
 @pytest.mark.parametrize(
-    "model", [SensorModel(), RICH, BIASED, ROUGH, QUIET], ids=["default", "rich", "biased", "rough", "quiet"]
+    "model",
+    [SensorModel(), RICH, BIASED, ROUGH, QUIET],
+    ids=["default", "rich", "biased", "rough", "quiet"],
 )
 def test_sensor_equals_plain_float64_array_steps(rendering: Rendering, model: SensorModel) -> None:
     """The same chain written as plain array steps, in float64."""
     fast = Sensor(RIG, model).expose(rendering.multi, default_rng(3), celsius=CELSIUS)
-    multi, beams, generator = rendering.multi, cast(RIG, RIG.pinhole), default_rng(3)
-    peak, runner_up, path = (each.ravel().astype(float) for each in (multi.peak, multi.runner_up, multi.path_m))
-    one, other = (generator.standard_normal(peak.size, np.float32) if model != QUIET else 0 for _ in range(2))
-    intensity, second = np.maximum(peak, beams.direct), np.maximum(np.minimum(peak, beams.direct), runner_up)
-    counts = 48 / BRIGHTEST * intensity * (texture((64, 80), model.wall_texture) if model.wall_texture else 1)
-    read, shot = model.read_noise_counts**2, model.shot_noise**2
+    multi = rendering.multi
+    beams = cast(RIG, RIG.pinhole)
+    generator = default_rng(3)
+    peak, runner_up, path = (
+        each.ravel().astype(float) for each in (multi.peak, multi.runner_up, multi.path_m)
+    )
+    one, other = (
+        generator.standard_normal(peak.size, np.float32) if model != QUIET else 0 for _ in range(2)
+    )
+    intensity = np.maximum(peak, beams.direct)
+    second = np.maximum(np.minimum(peak, beams.direct), runner_up)
+    counts = (
+        48
+        / BRIGHTEST
+        * intensity
+        * (texture((64, 80), model.wall_texture) if model.wall_texture else 1)
+    )
+    read = model.read_noise_counts**2
+    shot = model.shot_noise**2
     alone, noise = (np.sqrt(read + shot * (counts + light)) for light in (0, model.ambient_counts))
     seen = np.minimum(counts + model.ambient_counts + one * noise, SATURATED) - model.ambient_counts
     certain = counts * (alone / noise if model.ambient_counts else 1)
-    confidence = 15 * (1 - np.exp(-certain / 6)) * (1 - 0.5 * second / np.maximum(intensity, 1e-30)) + 0.5
+    confidence = (
+        15 * (1 - np.exp(-certain / 6)) * (1 - 0.5 * second / np.maximum(intensity, 1e-30)) + 0.5
+    )
     depth = np.where(peak > beams.direct, path / 2, beams.length_m) * beams.cos_axis
     depth += _bias_m(model)
     depth += other * (model.range_noise_m + model.range_noise_per_m * depth)
@@ -95,7 +130,11 @@ def test_sensor_equals_plain_float64_array_steps(rendering: Rendering, model: Se
     kept = (intensity > 0) & (confidence >= 1) & ~dead
     z16 = np.where(kept, np.nan_to_num(depth) / DEPTH_UNIT_M + 0.5, 0)
     ir = np.where(intensity > 0, np.clip(seen + 0.5, 0, SATURATED), 0)
-    pairs = (fast.depth_z16, z16), (fast.ir, ir), (fast.confidence, np.where(intensity > 0, confidence, 0))
+    pairs = (
+        (fast.depth_z16, z16),
+        (fast.ir, ir),
+        (fast.confidence, np.where(intensity > 0, confidence, 0)),
+    )
     for image, slow in pairs:
         apart = np.abs(image.ravel() - np.floor(slow))
         assert (apart == 0).mean() > 0.999  # float32 against float64 falls to either side of a tie
@@ -105,7 +144,8 @@ def test_sensor_equals_plain_float64_array_steps(rendering: Rendering, model: Se
 @pytest.mark.parametrize("path_m", [0.4, 1.0, 3.0])
 def test_bias_is_the_same_for_near_and_far_returns(path_m: float) -> None:
     plain = QUIET.model_copy(update=BIAS)
-    echo, free = _echo(60.0, path_m), Sensor(BARE, QUIET)
+    echo = _echo(60.0, path_m)
+    free = Sensor(BARE, QUIET)
     apart = [
         sensor.expose(echo, default_rng(1), celsius=CELSIUS).depth_z16.astype(float)
         - free.expose(echo, default_rng(2)).depth_z16
@@ -117,13 +157,17 @@ def test_bias_is_the_same_for_near_and_far_returns(path_m: float) -> None:
 
 @pytest.mark.parametrize("counts", [15.0, 60.3, 120.0])
 @pytest.mark.parametrize("ambient", [0.0, 40.0, 90.0])
-def test_mean_is_free_of_noise_and_variance_read_plus_shot_plus_ambient_noise(counts: float, ambient: float) -> None:
+def test_mean_is_free_of_noise_and_variance_read_plus_shot_plus_ambient_noise(
+    counts: float, ambient: float
+) -> None:
     frames = _frames(RICH.model_copy(update={"ambient_counts": ambient}), echo := _echo(counts))
     variance = 1.5**2 + 0.3**2 * (counts + ambient) + 1 / 12  # the last: rounding to whole counts
     assert np.var([f.ir for f in frames]) == pytest.approx(variance, rel=0.01)
     assert np.mean([f.ir for f in frames]) == pytest.approx(counts, abs=0.03)
     truth = Sensor(BARE, QUIET).expose(echo, default_rng(0)).depth_z16.astype(float)
-    assert (np.mean([f.depth_z16 for f in frames], axis=0) - truth).mean() == pytest.approx(0, abs=0.1)
+    assert (np.mean([f.depth_z16 for f in frames], axis=0) - truth).mean() == pytest.approx(
+        0, abs=0.1
+    )
 
 
 def test_noise_is_white_and_independent_of_range_noise() -> None:
@@ -148,9 +192,13 @@ def test_ir_rises_with_intensity_and_saturates(ambient: float) -> None:
 
 
 @pytest.mark.parametrize("model", [SensorModel(), QUIET], ids=["default", "quiet"])
-def test_confidence_never_rises_with_ambient_light(rendering: Rendering, model: SensorModel) -> None:
+def test_confidence_never_rises_with_ambient_light(
+    rendering: Rendering, model: SensorModel
+) -> None:
     images = [
-        Sensor(RIG, model.model_copy(update={"ambient_counts": ambient})).expose(rendering.multi, default_rng(0))
+        Sensor(RIG, model.model_copy(update={"ambient_counts": ambient})).expose(
+            rendering.multi, default_rng(0)
+        )
         for ambient in (0.0, 1e-9, 5.0, 40.0, 150.0, 254.9)
     ]
     for darker, brighter in pairwise(images):
@@ -162,7 +210,9 @@ def test_confidence_never_rises_with_ambient_light(rendering: Rendering, model: 
 def test_more_ambient_light_leaves_fewer_depths() -> None:
     faint = _echo(np.geomspace(0.1, 10, 5120).reshape(64, 80))
     models = [SensorModel(ambient_counts=ambient) for ambient in (0.0, 20.0, 200.0)]
-    depths = [(Sensor(BARE, model).expose(faint, default_rng(0)).depth_z16 > 0).sum() for model in models]
+    depths = [
+        (Sensor(BARE, model).expose(faint, default_rng(0)).depth_z16 > 0).sum() for model in models
+    ]
     assert depths[0] > depths[1] > depths[2] > 0
 
 
@@ -192,10 +242,13 @@ def test_any_input_gives_a_possible_image(seed: int, included: bool, model: Sens
     generator = default_rng(seed)
     spread = (10 ** generator.uniform(-9, 3, 5120)).astype(np.float32)
     peak, runner_up, path = (
-        np.where(generator.random(5120) < 0.5, spread, generator.choice(ODD, 5120)).reshape(64, 80) for _ in range(3)
+        np.where(generator.random(5120) < 0.5, spread, generator.choice(ODD, 5120)).reshape(64, 80)
+        for _ in range(3)
     )
     multi = MultiBounce(peak, runner_up, path, direct_included=included)
-    one, same = (Sensor(RIG, model).expose(multi, default_rng(seed), celsius=CELSIUS) for _ in range(2))
+    one, same = (
+        Sensor(RIG, model).expose(multi, default_rng(seed), celsius=CELSIUS) for _ in range(2)
+    )
     for name in ("depth_z16", "ir", "confidence"):
         np.testing.assert_array_equal(getattr(one, name), getattr(same, name))
     assert one.confidence.max() <= MAX_CONFIDENCE

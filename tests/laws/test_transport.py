@@ -1,4 +1,6 @@
-"""Laws of transport on every backend: energy, reciprocity, causality, symmetry, scaling, superposition."""
+"""Laws of transport on every backend: energy, reciprocity, causality, symmetry, scaling,
+superposition.
+"""
 
 from dataclasses import replace
 from typing import Any
@@ -10,7 +12,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from nlos_calibration import load_rig
 
-from nlos_cam.render import EFFECTS, Accuracy, Radiometry, Scene, Surface, TransportJob, phong, prepare
+from nlos_cam.render import (
+    EFFECTS,
+    Accuracy,
+    Radiometry,
+    Scene,
+    Surface,
+    TransportJob,
+    phong,
+    prepare,
+)
 from nlos_cam.render.geometry import Relay
 
 RIG = load_rig("paper-rig")
@@ -34,7 +45,9 @@ def _job(scene: Scene, accuracy: Accuracy = COARSE) -> TransportJob:
 
 
 def _arrived(implementation: Any, job: TransportJob) -> np.ndarray:
-    """Share of the light of each laser spot that arrives on the relay wall, before the leg to the detector."""
+    """Share of the light of each laser spot that arrives on the relay wall, before the leg to the
+    detector.
+    """
     far_m = 10.0
     there = np.full_like(job.relay.x_m, far_m)
     relay = replace(job.relay, length_m=there, cos_lidar=np.ones_like(there))
@@ -46,7 +59,9 @@ def _arrived(implementation: Any, job: TransportJob) -> np.ndarray:
 @pytest.mark.slow
 @pytest.mark.parametrize("radiometry", RADIOMETRIES)
 @settings(max_examples=8, deadline=None, derandomize=True)
-@given(base_m=st.floats(1e-3, 0.4), rough_m=st.sampled_from([0.0, 0.01, 0.1]), seed=st.integers(0, 99))
+@given(
+    base_m=st.floats(1e-3, 0.4), rough_m=st.sampled_from([0.0, 0.01, 0.1]), seed=st.integers(0, 99)
+)
 def test_relay_receives_less_light_than_left_the_spot(
     implementation: Any, radiometry: Radiometry, base_m: float, rough_m: float, seed: int
 ) -> None:
@@ -60,22 +75,36 @@ def test_relay_receives_less_light_than_left_the_spot(
 
 def _swapped(job: TransportJob) -> TransportJob:
     """The same with the feet where the relay cells were and the other way round."""
-    relay, foot = job.relay, job.laser_spot_m
-    there = Relay(*foot[:, :2].T.copy(), job.length_m, np.ones(len(foot)), relay.cell_m2, relay.diagonal_m)
+    relay = job.relay
+    foot = job.laser_spot_m
+    there = Relay(
+        *foot[:, :2].T.copy(), job.length_m, np.ones(len(foot)), relay.cell_m2, relay.diagonal_m
+    )
     feet = np.stack([relay.x_m, relay.y_m, np.zeros_like(relay.x_m)], 1)
-    return replace(job, laser_spot_m=feet, length_m=relay.length_m, cos_incidence=np.ones(len(feet)), relay=there)
+    return replace(
+        job,
+        laser_spot_m=feet,
+        length_m=relay.length_m,
+        cos_incidence=np.ones(len(feet)),
+        relay=there,
+    )
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("brdf", [None, PHONG], ids=["diffuse", "phong"])
 def test_transport_is_reciprocal(implementation: Any, brdf: Any) -> None:
-    """Light from spot p over the object to cell q equals that from q to p, with the same delay (Lambertian)."""
+    """Light from spot p over the object to cell q equals that from q to p, with the same delay
+    (Lambertian).
+    """
     scene = Scene(OPEN, _rough(1, 0.25, 0.35), Surface(0.7, brdf), "lambertian", jump_m=0.5)
     job = _job(scene, replace(COARSE, relay_columns=40, relay_rows=40))
     assert job.near_m < 0.25  # near contact depends on the direction
-    job = replace(job, relay=job.relay.select(np.arange(len(job.relay.x_m)) == 905)).select(np.array([1500]))
+    job = replace(job, relay=job.relay.select(np.arange(len(job.relay.x_m)) == 905)).select(
+        np.array([1500])
+    )
     job = replace(job, map_spots_m=job.laser_spot_m)
-    there, back = job, _swapped(job)
+    there = job
+    back = _swapped(job)
     back = replace(back, map_spots_m=back.laser_spot_m)
     sent = implementation.histograms(there)[0] / there.relay_weight[0]
     returned = implementation.histograms(back)[0] / back.relay_weight[0]
@@ -88,7 +117,9 @@ def test_transport_is_reciprocal(implementation: Any, brdf: Any) -> None:
 def test_echoes_lie_between_shortest_and_longest_path(implementation: Any) -> None:
     scene = Scene(RIG, _rough(2))
     job = _job(scene).select(np.arange(0, 2700, 50))
-    histogram, point, relay = implementation.histograms(job), job.patches.point_m, job.relay
+    histogram = implementation.histograms(job)
+    point = job.patches.point_m
+    relay = job.relay
     d2 = np.linalg.norm(job.laser_spot_m[:, None] - point, axis=-1)
     cells = np.stack([relay.x_m, relay.y_m, np.zeros_like(relay.x_m)], 1)
     rest = np.linalg.norm(point[:, None] - cells, axis=-1) + relay.length_m
@@ -106,16 +137,20 @@ def test_single_path_has_its_bin_and_the_weight_of_s2(implementation: Any) -> No
     scene = Scene(OPEN, depth_map(8, np.nan, ((3, 3), 0.3)))
     job = _job(scene, replace(COARSE, relay_columns=40, relay_rows=40, sub_bins=64))
     job = replace(job, relay=job.relay.select(np.arange(len(job.relay.x_m)) == 905))
-    foot, point, relay = job.laser_spot_m, job.patches.point_m[0], job.relay
+    foot = job.laser_spot_m
+    point = job.patches.point_m[0]
+    relay = job.relay
     cell = np.array([relay.x_m[0], relay.y_m[0], 0])
-    d2, d3 = np.linalg.norm(foot - point, axis=1), np.linalg.norm(cell - point)
+    d2 = np.linalg.norm(foot - point, axis=1)
+    d3 = np.linalg.norm(cell - point)
     path = (job.length_m + d2 + d3 + relay.length_m[0]) / BIN_M
     histogram = implementation.histograms(job)
     assert ((histogram > 0).sum(1) == 1).all()
     clear = np.abs(path - np.rint(path)) > 0.02
     assert clear.any()
     np.testing.assert_array_equal(histogram.argmax(1)[clear], np.floor(path[clear]))
-    cos_2, cos_3 = 0.3 / d2, 0.3 / d3
+    cos_2 = 0.3 / d2
+    cos_3 = 0.3 / d3
     expected = job.cos_incidence * cos_2 * cos_3 * relay.cell_m2 * job.patches.cell_m2
     expected /= (2 * np.pi) ** 3 * d2**2 * d3**2 * relay.length_m[0] ** 2  # S2
     assert min(d2.min(), d3, relay.length_m[0]) > job.near_m
@@ -145,7 +180,9 @@ def test_albedo_of_each_cell_weighs_that_cell(implementation: Any) -> None:
     albedo = np.zeros((8, 8))
     albedo[:, :4] = 1
     left = np.where(albedo > 0, _rough(4), np.nan).astype(np.float32)
-    without = [name for name in EFFECTS if name not in {"self-occlusion", "tilt", "inter-reflection"}]
+    without = [
+        name for name in EFFECTS if name not in {"self-occlusion", "tilt", "inter-reflection"}
+    ]
     painted = implementation.three_bounce(Scene(RIG, _rough(4), Surface(albedo)), SOME, without)
     cut = implementation.three_bounce(Scene(RIG, left), SOME, without)
     bins = min(painted.shape[1], cut.shape[1])
@@ -154,7 +191,8 @@ def test_albedo_of_each_cell_weighs_that_cell(implementation: Any) -> None:
 
 
 def test_parts_that_do_not_shade_each_other_add_up(implementation: Any) -> None:
-    left, right = (np.s_[1:4, 1:3], 0.22), (np.s_[5:7, 5:8], 0.22)
+    left = (np.s_[1:4, 1:3], 0.22)
+    right = (np.s_[5:7, 5:8], 0.22)
     whole = implementation.three_bounce(Scene(RIG, depth_map(8, np.nan, left, right)), SOME)
     parts = np.zeros_like(whole)
     for part in (depth_map(8, np.nan, left), depth_map(8, np.nan, right)):
@@ -164,15 +202,20 @@ def test_parts_that_do_not_shade_each_other_add_up(implementation: Any) -> None:
 
 
 def test_front_part_shades_the_part_behind_it(implementation: Any) -> None:
-    behind, front = (np.s_[2:6, 5:8], 0.35), (np.s_[2:6, 2:5], 0.14)
-    scenes = [Scene(RIG, depth_map(8, np.nan, *parts)) for parts in ([behind], [front], [behind, front])]
+    behind = (np.s_[2:6, 5:8], 0.35)
+    front = (np.s_[2:6, 2:5], 0.14)
+    scenes = [
+        Scene(RIG, depth_map(8, np.nan, *parts)) for parts in ([behind], [front], [behind, front])
+    ]
     *apart, together = (implementation.three_bounce(scene, SOME).sum() for scene in scenes)
     assert together < 0.98 * sum(apart)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("radiometry", RADIOMETRIES)
-def test_transient_is_three_bounces_plus_the_direct_return(implementation: Any, radiometry: Radiometry) -> None:
+def test_transient_is_three_bounces_plus_the_direct_return(
+    implementation: Any, radiometry: Radiometry
+) -> None:
     scene = Scene(RIG, _rough(5), radiometry=radiometry)
     three = implementation.three_bounce(scene, effects=ALL_BUT_MORE)
     whole = implementation.transient(scene, ALL_BUT_MORE).reshape(5120, -1)

@@ -36,9 +36,12 @@ def assert_close(fit: WallFit, wall: View) -> None:
 @pytest.mark.parametrize("pitch_deg", [-12.0, 0.0, 8.0])
 @pytest.mark.parametrize("yaw_deg", [-45.0, 15.0, 30.0, 45.0, 60.0, 74.0])
 @pytest.mark.parametrize("distance_m", [0.15, 0.20, 0.30])
-def test_wall_fit_measures_every_wall_of_the_papers_ranges(distance_m: float, yaw_deg: float, pitch_deg: float) -> None:
+def test_wall_fit_measures_every_wall_of_the_papers_ranges(
+    distance_m: float, yaw_deg: float, pitch_deg: float
+) -> None:
     wall = view(distance_m, yaw_deg, pitch_deg, PINHOLE)
-    fit, again = measured(wall.depth_m), measured(wall.depth_m)
+    fit = measured(wall.depth_m)
+    again = measured(wall.depth_m)
     assert_close(fit, wall)
     assert fit.verdict == "good"
     np.testing.assert_array_equal(again.wall_from_lidar, fit.wall_from_lidar)
@@ -56,18 +59,27 @@ def test_wall_fit_needs_one_frame_even_with_dead_pixels(
 
 @few
 @given(distances_m, yaws_deg, pitches_deg, st.floats(0.0, 0.4), st.integers(0, 1000))
-def test_wall_fit_allows_outliers(distance_m: float, yaw_deg: float, pitch_deg: float, share: float, seed: int) -> None:
+def test_wall_fit_allows_outliers(
+    distance_m: float, yaw_deg: float, pitch_deg: float, share: float, seed: int
+) -> None:
     wall = view(distance_m, yaw_deg, pitch_deg, PINHOLE)
-    generator, shape = np.random.default_rng(seed), wall.depth_m.shape
+    generator = np.random.default_rng(seed)
+    shape = wall.depth_m.shape
     stray = generator.random(shape) < share  # also where no wall is met
-    assert_close(measured(np.where(stray, generator.uniform(0.05, 2.0, shape), wall.depth_m), seed), wall)
+    assert_close(
+        measured(np.where(stray, generator.uniform(0.05, 2.0, shape), wall.depth_m), seed), wall
+    )
 
 
 @few
 @given(distances_m, st.floats(-80.0, 80.0), st.floats(-80.0, 80.0))
-def test_wall_pose_and_angles_are_inverse(distance_m: float, yaw_deg: float, pitch_deg: float) -> None:
+def test_wall_pose_and_angles_are_inverse(
+    distance_m: float, yaw_deg: float, pitch_deg: float
+) -> None:
     pose = view(distance_m, yaw_deg, pitch_deg, PINHOLE).pose
-    assert np.degrees(angles_from_normal(pose[2, :3])) == pytest.approx((yaw_deg, pitch_deg), abs=1e-9)
+    assert np.degrees(angles_from_normal(pose[2, :3])) == pytest.approx(
+        (yaw_deg, pitch_deg), abs=1e-9
+    )
     np.testing.assert_allclose(wall_from_plane(pose[2, :3], pose[2, 3]), pose, atol=1e-12)
 
 
@@ -78,11 +90,23 @@ def test_wall_pose_and_angles_are_inverse(distance_m: float, yaw_deg: float, pit
     st.floats(-3.0, 3.0),
     st.tuples(st.floats(-0.05, 0.05), st.floats(-0.05, 0.05), st.floats(0.0, 0.1)),
 )
-def test_fit_moves_with_its_points(yaw_rad: float, pitch_rad: float, roll_rad: float, shift: tuple[float, ...]) -> None:
+def test_fit_moves_with_its_points(
+    yaw_rad: float, pitch_rad: float, roll_rad: float, shift: tuple[float, ...]
+) -> None:
     wall = view(0.2, 20.0, 5.0, PINHOLE.scaled(40, 30))
     points = (PINHOLE.scaled(40, 30).rays() * wall.depth_m[..., np.newaxis]).reshape(-1, 3)
-    roll = np.array([[np.cos(roll_rad), -np.sin(roll_rad), 0], [np.sin(roll_rad), np.cos(roll_rad), 0], [0, 0, 1]])
-    turn = roll @ view(1.0, *np.degrees((yaw_rad, pitch_rad)), PINHOLE).pose[:3, :3] @ np.diag([1.0, -1.0, -1.0])
+    roll = np.array(
+        [
+            [np.cos(roll_rad), -np.sin(roll_rad), 0],
+            [np.sin(roll_rad), np.cos(roll_rad), 0],
+            [0, 0, 1],
+        ]
+    )
+    turn = (
+        roll
+        @ view(1.0, *np.degrees((yaw_rad, pitch_rad)), PINHOLE).pose[:3, :3]
+        @ np.diag([1.0, -1.0, -1.0])
+    )
     points = points @ turn.T + shift
     fit = fit_depth(points / points[:, 2:], points[:, 2], np.random.default_rng(0))
     normal = turn @ wall.pose[2, :3]
@@ -92,27 +116,38 @@ def test_fit_moves_with_its_points(yaw_rad: float, pitch_rad: float, roll_rad: f
 
 @few
 @given(distances_m, st.floats(-60.0, 60.0), st.floats(15.0, 120.0))
-def test_wall_fit_refuses_two_walls_in_a_corner(distance_m: float, yaw_deg: float, bend_deg: float) -> None:
-    """The second wall turns `bend_deg` from the first along an edge through the middle of the view."""
+def test_wall_fit_refuses_two_walls_in_a_corner(
+    distance_m: float, yaw_deg: float, bend_deg: float
+) -> None:
+    """The second wall turns `bend_deg` from the first along an edge through the middle of the
+    view.
+    """
     first = view(distance_m, yaw_deg, 0.0, PINHOLE).depth_m
     middle_m = first[:, 80:81]
-    second = middle_m / (1.0 + np.arange(-80, 80) / PINHOLE.fx * np.tan(np.radians(bend_deg / 2.0 + 8.0)))
+    second = middle_m / (
+        1.0 + np.arange(-80, 80) / PINHOLE.fx * np.tan(np.radians(bend_deg / 2.0 + 8.0))
+    )
     corner = np.where(np.arange(160) < 80, first, np.where(second > 0.0, second, np.nan))
     with pytest.raises(WallRefusedError):
         measured(corner)
 
 
 def three_bounce_depth() -> tuple[Float64, Float64, Float64]:
-    """Return (wall, occluder, three-bounce) depth of the paper's rig with a point in its object box."""
+    """Return (wall, occluder, three-bounce) depth of the paper's rig with a point in its object
+    box.
+    """
     rig = load_rig("paper-rig")
-    pose, rays = rig.wall_from_lidar, PINHOLE.rays()
-    lidar, directions = pose[:3, 3], rays @ pose[:3, :3].T
+    pose = rig.wall_from_lidar
+    rays = PINHOLE.rays()
+    lidar = pose[:3, 3]
+    directions = rays @ pose[:3, :3].T
     wall_m = wall_depth(pose, PINHOLE)
     along = np.where(directions[..., 0] > 0.0, directions[..., 0], np.nan)
     occluder_m = 0.2 / along
     occluder_m[lidar[2] + occluder_m * directions[..., 2] < 0.1] = np.nan
     seen = np.where(wall_m < LONGEST_DEPTH_M, wall_m, np.nan)
-    spots, point = lidar + seen[..., np.newaxis] * directions, np.array([0.45, 0.0, 0.25])
+    spots = lidar + seen[..., np.newaxis] * directions
+    point = np.array([0.45, 0.0, 0.25])
     one_way = np.linalg.norm(spots - lidar, axis=-1) + np.linalg.norm(spots - point, axis=-1)
     shortest_back = 0.3 + 0.35
     binned_m = (np.floor((one_way + shortest_back) / 0.01) + 0.5) * 0.01 / 2.0

@@ -1,4 +1,6 @@
-"""A wall that is not one bare flat wall is refused with its reason, or doubted; it is never called good."""
+"""A wall that is not one bare flat wall is refused with its reason, or doubted; it is never called
+good.
+"""
 
 from collections.abc import Callable
 from functools import partial
@@ -9,7 +11,17 @@ from nlos_calibration import WallFit, fit_wall, load_rig
 from nlos_calibration.arrays import Float64
 from nlos_calibration.errors import WallRefusedError
 
-from nlos_cam.calibrate import bent, curved, depth_statistics, patch, rippled, stepped, view, window, with_outliers
+from nlos_cam.calibrate import (
+    bent,
+    curved,
+    depth_statistics,
+    patch,
+    rippled,
+    stepped,
+    view,
+    window,
+    with_outliers,
+)
 from nlos_cam.calibrate.synthetic import View
 
 PINHOLE = load_rig("bare-wall").pinhole.scaled(160, 120)
@@ -55,10 +67,17 @@ def hidden(seen: View, share: float, factor: float = 1.0, short_m: float = 0.0) 
     ("change", "word"),
     [
         (partial(only, rows=[10, 60, 110], columns=[20, 140, 60]), r"0\.0%"),
-        *((partial(only, rows=slice(None), columns=slice(70, 70 + width)), "line") for width in (9, 12)),
+        *(
+            (partial(only, rows=slice(None), columns=slice(70, 70 + width)), "line")
+            for width in (9, 12)
+        ),
         *((partial(window, gap_m=gap_m), r"plane|in front") for gap_m in (0.01, 0.05, 0.3)),
-        *((partial(hidden, share=share, factor=3.0), "behind") for share in (0.15, 0.4)),  # a mirror
-        *((partial(hidden, share=0.2, short_m=short_m), "in front") for short_m in (0.02, 0.05)),  # saturated
+        *(
+            (partial(hidden, share=share, factor=3.0), "behind") for share in (0.15, 0.4)
+        ),  # a mirror
+        *(
+            (partial(hidden, share=0.2, short_m=short_m), "in front") for short_m in (0.02, 0.05)
+        ),  # saturated
     ],
 )
 def test_wall_of_three_points_in_a_slit_a_window_a_mirror_or_a_saturated_patch_is_refused(
@@ -70,7 +89,9 @@ def test_wall_of_three_points_in_a_slit_a_window_a_mirror_or_a_saturated_patch_i
 
 @pytest.mark.parametrize("frames", [1, 8])
 @pytest.mark.parametrize("noise", [1.0, 4.0])
-def test_wall_with_sixty_percent_of_outliers_is_refused(seen: View, noise: float, frames: int) -> None:
+def test_wall_with_sixty_percent_of_outliers_is_refused(
+    seen: View, noise: float, frames: int
+) -> None:
     stray = with_outliers(seen.depth_m, 0.6, np.random.default_rng(3))
     with pytest.raises(WallRefusedError, match="plane"):
         measured(stray, frames=frames, noise=noise)
@@ -104,9 +125,15 @@ def test_wall_faced_squarely_is_measured(frames: int) -> None:
 @pytest.mark.parametrize("share", [0.25, 0.5])
 @pytest.mark.parametrize("bend_deg", [-60.0, -20.0, -8.0, -4.0, 4.0, 8.0, 20.0, 45.0])
 @pytest.mark.parametrize("direction_rad", [0.0, 0.8, 1.6])
-def test_two_walls_in_a_corner_are_refused_or_doubted(direction_rad: float, bend_deg: float, share: float) -> None:
-    """From 8 degrees refused; from 4 refused, unless the bend looks like an offset of the range, and then doubted."""
-    fit = measured_unless_refused(bent(view(0.2, 20.0, 5.0, PINHOLE), bend_deg, share, direction_rad)[0])
+def test_two_walls_in_a_corner_are_refused_or_doubted(
+    direction_rad: float, bend_deg: float, share: float
+) -> None:
+    """From 8 degrees refused; from 4 refused, unless the bend looks like an offset of the range,
+    and then doubted.
+    """
+    fit = measured_unless_refused(
+        bent(view(0.2, 20.0, 5.0, PINHOLE), bend_deg, share, direction_rad)[0]
+    )
     assert fit is None or (abs(bend_deg) < 8.0 and fit.verdict == "doubtful")
 
 
@@ -127,7 +154,9 @@ def test_curved_wall_is_refused_or_doubted(seen: View, radius_m: float) -> None:
 
 @pytest.mark.parametrize("height_m", [-0.02, -0.003, 0.003, 0.02])
 @pytest.mark.parametrize("direction_rad", [0.0, 0.8, 1.6, 2.4])
-def test_wall_with_a_step_is_refused_or_doubted(seen: View, height_m: float, direction_rad: float) -> None:
+def test_wall_with_a_step_is_refused_or_doubted(
+    seen: View, height_m: float, direction_rad: float
+) -> None:
     fit = measured_unless_refused(stepped(seen, height_m, 0.4, direction_rad))
     assert fit is None or fit.verdict == "doubtful"
 
@@ -138,7 +167,9 @@ def test_window_just_behind_its_frame_is_doubted(seen: View) -> None:
 
 @pytest.mark.parametrize("short_m", [0.001, 0.002, 0.004])
 @pytest.mark.parametrize("share", [0.03, 0.1, 0.3])
-def test_wall_with_slight_saturation_is_doubted_or_right(seen: View, share: float, short_m: float) -> None:
+def test_wall_with_slight_saturation_is_doubted_or_right(
+    seen: View, share: float, short_m: float
+) -> None:
     fit = measured_unless_refused(hidden(seen, share, short_m=short_m))
     distance_m = pytest.approx(seen.pose[2, 3], abs=0.001)
     assert fit is None or fit.verdict == "doubtful" or fit.distance_m == distance_m
@@ -146,7 +177,9 @@ def test_wall_with_slight_saturation_is_doubted_or_right(seen: View, share: floa
 
 @pytest.mark.parametrize("amplitude_m", [0.0005, 0.001, 0.002])
 @pytest.mark.parametrize("waves", [3.0, 8.0])
-def test_wall_with_ripples_of_the_lidar_is_measured(seen: View, amplitude_m: float, waves: float) -> None:
+def test_wall_with_ripples_of_the_lidar_is_measured(
+    seen: View, amplitude_m: float, waves: float
+) -> None:
     fit = measured(rippled(seen, amplitude_m, waves, np.random.default_rng(1)))
     assert is_right(fit, seen.pose)
     assert fit.verdict == "good" or amplitude_m > 0.001

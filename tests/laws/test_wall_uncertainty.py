@@ -1,4 +1,6 @@
-"""The wall fit's stated uncertainty holds as often as it says, for any noise and number of frames."""
+"""The wall fit's stated uncertainty holds as often as it says, for any noise and number of
+frames.
+"""
 
 from typing import Any
 
@@ -23,7 +25,9 @@ def inside(count: int, at_least: int, **setting: Any) -> Any:
 @pytest.mark.parametrize("frames", [1, 6, 20])
 @pytest.mark.parametrize("noise", [0.5, 1.0, 4.0])
 def test_wall_interval_holds_the_truth_as_often_as_stated(noise: float, frames: int) -> None:
-    """120 trials each: a share of 95 % is found between 89 and 99.5 % but for once in a thousand."""
+    """120 trials each: a share of 95 % is found between 89 and 99.5 % but for once in a
+    thousand.
+    """
     found = inside(120, 110, noise=noise, frames=frames)
     assert (found.mean(axis=0) >= 0.88).all()
     assert found.mean() <= 0.985
@@ -32,13 +36,24 @@ def test_wall_interval_holds_the_truth_as_often_as_stated(noise: float, frames: 
 @pytest.mark.parametrize(
     ("count", "at_least", "share", "setting"),
     [
-        *((120, 80, 0.87, {"scene": s, "outliers": o, "frames": 6}) for s in ("bare", "no return") for o in (0.2, 0.4)),
-        (300, 0, 0.86, {"scene": "rippled", "frames": 20}),  # what neighbouring pixels have in common
+        *(
+            (120, 80, 0.87, {"scene": s, "outliers": o, "frames": 6})
+            for s in ("bare", "no return")
+            for o in (0.2, 0.4)
+        ),
+        (
+            300,
+            0,
+            0.86,
+            {"scene": "rippled", "frames": 20},
+        ),  # what neighbouring pixels have in common
         (300, 0, 0.86, {"scene": "patchy", "frames": 20}),
         (80, 0, 0.87, {"flicker": 0.05, "frames": 20}),
     ],
 )
-def test_interval_allows_outliers_ripples_and_flicker(count: int, at_least: int, share: float, setting: dict) -> None:
+def test_interval_allows_outliers_ripples_and_flicker(
+    count: int, at_least: int, share: float, setting: dict
+) -> None:
     assert (inside(count, at_least, **setting).mean(axis=0) >= share).all()
 
 

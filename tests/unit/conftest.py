@@ -38,7 +38,9 @@ def tool() -> Iterator[Callable[[str], ModuleType]]:
 
 @pytest.fixture(scope="session")
 def noise_bags(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
-    """Forty frames of noise, recorded "packed" and "plain", and each of them "-unindexed" as a kill leaves it."""
+    """Forty frames of noise, recorded "packed" and "plain", and each of them "-unindexed" as a kill
+    leaves it.
+    """
     return make_all(tmp_path_factory.mktemp("noise"))
 
 
@@ -71,13 +73,17 @@ Edit = Callable[[str, int, bytes], Iterable[tuple[int, bytes]]]
 
 
 def rewrite(source: Path, target: Path, edit: Edit, compression: str | None = None) -> Path:
-    """A recording whose messages (topic, time in ns, bytes) are those that `edit` makes of another's."""
+    """A recording whose messages (topic, time in ns, bytes) are those that `edit` makes of
+    another's.
+    """
     writer = Writer(target)
     if compression:
         writer.set_compression(Writer.CompressionFormat[compression])
     with Reader(source) as reader, writer:
         made = {
-            found.id: writer.add_connection(found.topic, found.msgtype, msgdef=found.msgdef.data, md5sum=found.digest)
+            found.id: writer.add_connection(
+                found.topic, found.msgtype, msgdef=found.msgdef.data, md5sum=found.digest
+            )
             for found in reader.connections
         }
         for connection, time_ns, raw in reader.messages():
@@ -102,18 +108,36 @@ def noise_bag_uncompressed(noise_bag: Path, tmp_path_factory: pytest.TempPathFac
 
 
 def fitted_wall(
-    distance_m: float = 0.2, yaw_deg: float = 40.0, pitch_deg: float = 3.0, *, width: int = 64, **others: Any
+    distance_m: float = 0.2,
+    yaw_deg: float = 40.0,
+    pitch_deg: float = 3.0,
+    *,
+    width: int = 64,
+    **others: Any,
 ) -> MeasuredWall:
-    """A wall as it is measured without noise, by 60 frames of an even light; `others` are fields of its record."""
+    """A wall as it is measured without noise, by 60 frames of an even light; `others` are fields of
+    its record.
+    """
     pinhole = load_rig("paper-rig").pinhole.scaled(width, 3 * width // 4)
-    pose = wall_from_plane(normal_from_angles(np.radians(yaw_deg), np.radians(pitch_deg)), distance_m)
+    pose = wall_from_plane(
+        normal_from_angles(np.radians(yaw_deg), np.radians(pitch_deg)), distance_m
+    )
     depth_m = wall_depth(pose, pinhole)
     depth_m[depth_m > 9.0] = np.nan
     fit = fit_wall(depth_m, pinhole, np.random.default_rng(0))
-    seen = {"depth_m": depth_m.astype(np.float32), "depth_std_m": depth_noise_m(depth_m).astype(np.float32)}
-    seen |= {"ir": np.full(depth_m.shape, 48, np.float32), "inliers": np.isfinite(depth_m), "frames": 60}
+    seen = {
+        "depth_m": depth_m.astype(np.float32),
+        "depth_std_m": depth_noise_m(depth_m).astype(np.float32),
+    }
+    seen |= {
+        "ir": np.full(depth_m.shape, 48, np.float32),
+        "inliers": np.isfinite(depth_m),
+        "frames": 60,
+    }
     fields = {"noise_scale": 1.0, **others}
-    record = new_wall_record(fit, pinhole, camera="l515:f0246262", frames=60, created=date(2026, 1, 31), others=fields)
+    record = new_wall_record(
+        fit, pinhole, camera="l515:f0246262", frames=60, created=date(2026, 1, 31), others=fields
+    )
     return MeasuredWall(record, exact_reference(pose, pinhole, seen))
 
 
@@ -124,10 +148,15 @@ def measured() -> Callable[..., MeasuredWall]:
 
 @pytest.fixture(scope="module")
 def narrow_networks() -> Iterator[None]:
-    """Res-VAE and ResNet50 with a sixteenth of their channels: all that their widths decide is time."""
+    """Res-VAE and ResNet50 with a sixteenth of their channels: all that their widths decide is
+    time.
+    """
     with pytest.MonkeyPatch.context() as patch:
         (into, within, out), *rest = vae.UP_BLOCKS
-        narrow = [(into, within // 16, out // 16), *(tuple(width // 16 for width in block) for block in rest)]
+        narrow = [
+            (into, within // 16, out // 16),
+            *(tuple(width // 16 for width in block) for block in rest),
+        ]
         patch.setattr(vae, "UP_BLOCKS", tuple(narrow))
         stages = tuple((within // 16, *others) for within, *others in compressor.COLOR_STAGES)
         patch.setattr(compressor, "COLOR_STAGES", stages)

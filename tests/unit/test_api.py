@@ -1,4 +1,6 @@
-"""Python API: the frames of the commands, late imports, and cameras that are started and stopped."""
+"""Python API: the frames of the commands, late imports, and cameras that are started and
+stopped.
+"""
 
 import doctest
 import json
@@ -94,12 +96,17 @@ def test_points_are_surface_in_wall_frame(opened: Open) -> None:
         seen = next(stream)
     box = stream.rig.object_box
     assert (seen.points_m.shape, seen.points_m.dtype) == ((64 * 32, 3), np.float32)
-    middle_x_m, pitch_y_m = (box.x_min_m + box.x_max_m) / 2, (box.y_max_m - box.y_min_m) / 64
+    middle_x_m = (box.x_min_m + box.x_max_m) / 2
+    pitch_y_m = (box.y_max_m - box.y_min_m) / 64
     assert seen.points_m[:, 0].min() > box.x_min_m
     assert seen.points_m[:, 0].max() < middle_x_m
-    np.testing.assert_allclose(seen.points_m[[0, -1], 1], [box.y_max_m - pitch_y_m / 2, box.y_min_m + pitch_y_m / 2])
+    np.testing.assert_allclose(
+        seen.points_m[[0, -1], 1], [box.y_max_m - pitch_y_m / 2, box.y_min_m + pitch_y_m / 2]
+    )
     np.testing.assert_array_equal(seen.points_m[:, 2], seen.depth_m[np.isfinite(seen.depth_m)])
-    assert {*map(tuple, seen.points_m)} <= {*map(tuple, seen.to_mesh().vertices_m.astype(np.float32))}
+    assert {*map(tuple, seen.points_m)} <= {
+        *map(tuple, seen.to_mesh().vertices_m.astype(np.float32))
+    }
 
 
 class WatchedCamera(WallCamera):
@@ -134,13 +141,16 @@ def test_stream_of_live_camera_drops_and_counts_old_frames(opened: Open) -> None
 
 
 def test_stream_applies_wall_and_average(opened: Open, tmp_path: Path) -> None:
-    wall, camera = write_wall(tmp_path / "wall.toml", bare_wall()), WallCamera(80, moved=range(40, 80))
+    wall = write_wall(tmp_path / "wall.toml", bare_wall())
+    camera = WallCamera(80, moved=range(40, 80))
     assert camera.identity["serial"] == SERIAL
     with opened(camera, wall=str(wall), average=4) as stream:
         seen = list(stream)
     assert stream.rig.name == "measured"
     assert [bool(seen[number].warnings) for number in (20, -1)] == [False, True]
-    single, mean = (np.nanstd(one.difference.depth_m) for one in (seen[0], seen[30]) if one.difference)
+    single, mean = (
+        np.nanstd(one.difference.depth_m) for one in (seen[0], seen[30]) if one.difference
+    )
     assert mean < 0.75 * single
 
 
@@ -152,12 +162,18 @@ def test_stream_applies_wall_and_average(opened: Open, tmp_path: Path) -> None:
         ("bag:noise", {"weights": "none"}, CheckpointError),
     ],
 )
-def test_open_raises_package_errors(noise_bag: Path, uri: str, options: dict[str, str], error: type) -> None:
+def test_open_raises_package_errors(
+    noise_bag: Path, uri: str, options: dict[str, str], error: type
+) -> None:
     with pytest.raises(error):
         nlos_cam.open(uri.replace("noise", str(noise_bag)), **options)
 
 
 def test_package_exports_glimpse_stream_and_open() -> None:
-    assert (nlos_cam.Glimpse, nlos_cam.Stream, nlos_cam.open) == (api.Glimpse, Stream, api.open_stream)
+    assert (nlos_cam.Glimpse, nlos_cam.Stream, nlos_cam.open) == (
+        api.Glimpse,
+        Stream,
+        api.open_stream,
+    )
     with pytest.raises(AttributeError, match="close"):
         nlos_cam.close  # type: ignore[attr-defined]  # noqa: B018  looked up, which is what raises

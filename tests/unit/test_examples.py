@@ -16,7 +16,9 @@ from nlos_cam.dataset.samples import Samples, make_samples
 from nlos_cam.render import load_scene
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
-SCENE = 'name = "still"\nrig = "paper-rig"\nobject = { category = "cup", seed = 4, size_m = 0.17 }\n'
+SCENE = (
+    'name = "still"\nrig = "paper-rig"\nobject = { category = "cup", seed = 4, size_m = 0.17 }\n'
+)
 RIG = load_rig("paper-rig")
 Run = Callable[..., str]
 Record = Callable[[str, int], Path]
@@ -47,12 +49,15 @@ def run(folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFix
 @pytest.fixture
 def recording(folder: Path, recorded: Callable[..., Path]) -> Record:
     """Record the first frames of a scene."""
-    return lambda name, frames: recorded(folder / f"{Path(name).stem}.bag", frames, open_world(name))
+    return lambda name, frames: recorded(
+        folder / f"{Path(name).stem}.bag", frames, open_world(name)
+    )
 
 
 @pytest.mark.slow
 def test_live_depth_and_point_cloud_find_the_cup(run: Run, recording: Record, folder: Path) -> None:
-    bag, box = recording("still.toml", 3), RIG.object_box
+    bag = recording("still.toml", 3)
+    box = RIG.object_box
     assert box is not None
     lines = run("live_depth", f"bag:{bag}").splitlines()
     assert len(lines) == 3
@@ -72,14 +77,18 @@ def test_live_depth_and_point_cloud_find_the_cup(run: Run, recording: Record, fo
 
 @pytest.mark.slow
 def test_hide_and_seek_overlaps_more_than_chance(run: Run) -> None:
-    overlap, off_mm = (int(figure) for figure in re.findall(r"(\d+)(?:%| mm)", run("hide_and_seek", "cup", "4")))
+    overlap, off_mm = (
+        int(figure) for figure in re.findall(r"(\d+)(?:%| mm)", run("hide_and_seek", "cup", "4"))
+    )
     assert overlap > 40
     assert off_mm < 60
 
 
 @pytest.mark.slow
 def test_calibrate_bag_writes_readable_record(run: Run, recording: Record, folder: Path) -> None:
-    assert run("calibrate_bag", str(recording("bare-wall", 6))).startswith("200.0 mm to the wall, 45.00 degrees: good")
+    assert run("calibrate_bag", str(recording("bare-wall", 6))).startswith(
+        "200.0 mm to the wall, 45.00 degrees: good"
+    )
     measured = load_measured(folder / "wall.toml")
     assert measured.record.frames == 6
     assert measured.reference is not None
@@ -87,7 +96,10 @@ def test_calibrate_bag_writes_readable_record(run: Run, recording: Record, folde
 
 @pytest.mark.slow
 def test_judge_weights_prints_each_category(run: Run) -> None:
-    counted = [re.fullmatch(r"\S+ +([01]\.\d\d) over (\d)", line) for line in run("judge_weights", "3").splitlines()]
+    counted = [
+        re.fullmatch(r"\S+ +([01]\.\d\d) over (\d)", line)
+        for line in run("judge_weights", "3").splitlines()
+    ]
     assert sum(int(found[2]) for found in counted if found) == 3
 
 
@@ -99,7 +111,9 @@ def in_this_process(plan: DatasetPlan, pieces: Sequence[range]) -> Generator[tup
 @pytest.mark.slow
 def test_own_training_reduces_the_loss(run: Run, folder: Path) -> None:
     plan = DatasetPlan(RIG, 0, accuracy="draft")
-    build_dataset(plan, 24, folder / "data", workers=1, on_progress=lambda *_: None, farm=in_this_process)
+    build_dataset(
+        plan, 24, folder / "data", workers=1, on_progress=lambda *_: None, farm=in_this_process
+    )
     losses = [float(line.split()[-1]) for line in run("own_training", "data", "3").splitlines()]
     assert len(losses) == 3
     assert losses[-1] < losses[0]

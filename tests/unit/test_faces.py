@@ -1,4 +1,6 @@
-"""Packages' faces: every name loads, the documented ones are there, and other packages import from faces only."""
+"""Packages' faces: every name loads, the documented ones are there, and other packages import from
+faces only.
+"""
 
 import ast
 import importlib
@@ -30,14 +32,23 @@ def documented() -> Iterator[tuple[str, str]]:
 
 def package_of(module: str) -> str:
     """Return the package with a face that a module belongs to, or the module itself."""
-    return max((face for face in FACES if f"{module}.".startswith(f"{face}.")), key=len, default=module)
+    return max(
+        (face for face in FACES if f"{module}.".startswith(f"{face}.")), key=len, default=module
+    )
 
 
 def modules() -> Iterator[tuple[Path, str]]:
-    """Yield the product's files, the examples and the tools, with the module's name (of a script: its own)."""
+    """Yield the product's files, the examples and the tools, with the module's name (of a script:
+    its own).
+    """
     for source in SOURCES:
         for path in source.rglob("*.py"):
-            yield path, ".".join(path.relative_to(source.parent).with_suffix("").parts).removesuffix(".__init__")
+            yield (
+                path,
+                ".".join(path.relative_to(source.parent).with_suffix("").parts).removesuffix(
+                    ".__init__"
+                ),
+            )
     for folder in ("examples", "tools"):
         yield from ((path, path.stem) for path in (ROOT / folder).rglob("*.py"))
 
@@ -71,6 +82,11 @@ def test_packages_import_each_other_by_faces_only() -> None:
 
 
 def test_importing_faces_imports_nothing_heavy() -> None:
-    program = f"import sys, {', '.join(FACES)}; print(*{{'torch', 'numba', 'cv2', 'rerun', 'h5py'}} & {{*sys.modules}})"
-    found = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True).stdout
+    program = (
+        f"import sys, {', '.join(FACES)}; print(*{{'torch', 'numba', 'cv2', 'rerun', 'h5py'}} &"
+        " {*sys.modules})"
+    )
+    found = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, check=True
+    ).stdout
     assert found.strip() == ""

@@ -33,8 +33,11 @@ def test_cache_folder_is_chosen_by_variables(
     assert not cache_folder().exists()
 
 
-def test_atomic_file_appears_when_it_is_on_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    out, synced = tmp_path / "out.txt", list[int]()
+def test_atomic_file_appears_when_it_is_on_disk(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out = tmp_path / "out.txt"
+    synced = list[int]()
     out.write_text("old")
     monkeypatch.setattr("nlos_models.files.os.fsync", synced.append)
     with atomic_file(out) as part:
@@ -46,9 +49,14 @@ def test_atomic_file_appears_when_it_is_on_disk(tmp_path: Path, monkeypatch: pyt
 
 
 @pytest.mark.parametrize("error", [ZeroDivisionError, KeyboardInterrupt])
-def test_atomic_writes_leave_nothing_after_an_error(tmp_path: Path, error: type[BaseException]) -> None:
+def test_atomic_writes_leave_nothing_after_an_error(
+    tmp_path: Path, error: type[BaseException]
+) -> None:
     def write() -> None:
-        with atomic_directory(tmp_path / "folder") as folder, atomic_file(tmp_path / "file") as file:
+        with (
+            atomic_directory(tmp_path / "folder") as folder,
+            atomic_file(tmp_path / "file") as file,
+        ):
             (folder / "a.txt").write_text("a")
             file.write_text("b")
             raise error
@@ -87,7 +95,9 @@ def test_atomic_directory_refuses_one_that_appeared_and_a_file(tmp_path: Path) -
 
 
 @pytest.mark.parametrize("way", ["exchange", "no exchange", "no links", "current folder"])
-def test_atomic_directory_replaces_entries_by_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, way: str) -> None:
+def test_atomic_directory_replaces_entries_by_name(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, way: str
+) -> None:
     out = tmp_path / "out"
     for folder in ("inner", "kept/deep"):
         (out / folder).mkdir(parents=True)
@@ -108,8 +118,11 @@ def test_atomic_directory_replaces_entries_by_name(tmp_path: Path, monkeypatch: 
 
 
 def overwrite_and_die(out: Path, calls: int) -> None:
-    """Write a directory over another, and die before the call of the system with this number that renames or links."""
-    left, (rename, link, replace) = iter(range(calls)), (Path.rename, os.link, Path.replace)
+    """Write a directory over another, and die before the call of the system with this number that
+    renames or links.
+    """
+    left = iter(range(calls))
+    (rename, link, replace) = (Path.rename, os.link, Path.replace)
 
     def dying(call: Callable[..., Any]) -> Callable[..., Any]:
         def act(*arguments: Any, **options: Any) -> Any:
@@ -119,7 +132,9 @@ def overwrite_and_die(out: Path, calls: int) -> None:
 
         return act
 
-    Path.rename, os.link, Path.replace = dying(rename), dying(link), dying(replace)  # type: ignore[method-assign]
+    Path.rename = dying(rename)
+    os.link = dying(link)
+    Path.replace = dying(replace)  # type: ignore[method-assign]
     with atomic_directory(out) as part:
         for name in "abc":
             (part / name).mkdir()
@@ -127,7 +142,8 @@ def overwrite_and_die(out: Path, calls: int) -> None:
 
 
 def test_directory_is_old_or_new_whenever_its_writer_dies(tmp_path: Path) -> None:
-    fork, states = multiprocessing.get_context("fork"), set[str]()
+    fork = multiprocessing.get_context("fork")
+    states = set[str]()
     for existed in (True, False):
         for calls in range(4):
             out = tmp_path / f"{existed}{calls}"
@@ -137,7 +153,12 @@ def test_directory_is_old_or_new_whenever_its_writer_dies(tmp_path: Path) -> Non
             process = fork.Process(target=overwrite_and_die, args=(out, calls))
             process.start()
             process.join()
-            found = " ".join(sorted(f"{path.parent.name}/{path.name}" for path in out.rglob("*") if path.is_file()))
+            found = " ".join(
+                sorted(
+                    f"{path.parent.name}/{path.name}" for path in out.rglob("*") if path.is_file()
+                )
+            )
             states.add(found)
-    old, whole = "a/old b/old mine1/old mine2/old", "a/new b/new c/new"
+    old = "a/old b/old mine1/old mine2/old"
+    whole = "a/new b/new c/new"
     assert states == {old, f"{whole} mine1/old mine2/old", "", whole}

@@ -1,4 +1,6 @@
-"""Frames to maps: which pixel falls in which cell, and the values of a cell; and running means of maps."""
+"""Frames to maps: which pixel falls in which cell, and the values of a cell; and running means of
+maps.
+"""
 
 import numpy as np
 import pytest
@@ -6,7 +8,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from nlos_calibration.geometry import Intrinsics
 
-from nlos_cam.frames import MAP_COLUMNS, MAP_ROWS, Frame, LidarMaps, MapMean, _edges, maps_from_frame
+from nlos_cam.frames import (
+    MAP_COLUMNS,
+    MAP_ROWS,
+    Frame,
+    LidarMaps,
+    MapMean,
+    _edges,
+    maps_from_frame,
+)
 from nlos_cam.render.sensor.sensor import cell_of_pixels
 
 SIZES = [(480, 640), (240, 320), (768, 1024), (64, 80), (100, 90), (32, 40)]
@@ -23,7 +33,9 @@ def _maps(depth_m: np.ndarray, ir: np.ndarray | int = 10) -> LidarMaps:
     return maps_from_frame(_frame(depth_m, ir))
 
 
-@pytest.mark.parametrize(("pixels", "cells"), [(size[k], (MAP_ROWS, MAP_COLUMNS)[k]) for size in SIZES for k in (0, 1)])
+@pytest.mark.parametrize(
+    ("pixels", "cells"), [(size[k], (MAP_ROWS, MAP_COLUMNS)[k]) for size in SIZES for k in (0, 1)]
+)
 def test_edges_give_pixels_to_cells_that_hold_their_centres(pixels: int, cells: int) -> None:
     edges = _edges(pixels, cells)
     assert (edges[0], edges[-1], len(edges)) == (0, pixels, cells + 1)
@@ -33,7 +45,9 @@ def test_edges_give_pixels_to_cells_that_hold_their_centres(pixels: int, cells: 
 
 
 @settings(max_examples=30, deadline=None, derandomize=True)
-@given(seed=st.integers(0, 2**16), valid=st.integers(0, 60), values=st.sampled_from([1, 2, 5, 1000]))
+@given(
+    seed=st.integers(0, 2**16), valid=st.integers(0, 60), values=st.sampled_from([1, 2, 5, 1000])
+)
 def test_median_equals_numpys_for_every_count_and_tie(seed: int, valid: int, values: int) -> None:
     generator = np.random.default_rng(seed)
     cells = np.full((64 * 80, 60), np.nan, np.float32)
@@ -43,15 +57,23 @@ def test_median_equals_numpys_for_every_count_and_tie(seed: int, valid: int, val
     whole = np.concatenate([cells, np.full((64 * 80, 4), np.nan, np.float32)], axis=1)
     depth = whole.reshape(64, 80, 8, 8).transpose(0, 2, 1, 3).reshape(512, 640)
     maps = _maps(depth)
-    expected = np.median(cells[:, :, None][~np.isnan(cells)].reshape(64 * 80, valid), axis=1) if valid else np.nan
+    expected = (
+        np.median(cells[:, :, None][~np.isnan(cells)].reshape(64 * 80, valid), axis=1)
+        if valid
+        else np.nan
+    )
     np.testing.assert_allclose(maps.depth_m.ravel(), expected, rtol=1e-6)
 
 
 def test_intensity_is_the_mean_over_samples_near_the_median() -> None:
-    depth, ir = np.full((512, 640), 0.5), np.full((512, 640), 20, np.uint8)
-    depth[:8, :3], ir[:8, :3] = 0.8, 200  # another winner in 24 of the first cell's 64 pixels
-    depth[0, 7], ir[0, 7] = 0.509, 60
-    depth[1, 7], ir[1, 7] = 0.511, 240
+    depth = np.full((512, 640), 0.5)
+    ir = np.full((512, 640), 20, np.uint8)
+    depth[:8, :3] = 0.8
+    ir[:8, :3] = 200  # another winner in 24 of the first cell's 64 pixels
+    depth[0, 7] = 0.509
+    ir[0, 7] = 60
+    depth[1, 7] = 0.511
+    ir[1, 7] = 240
     maps = _maps(depth, ir)
     assert maps.depth_m[0, 0] == np.float32(0.5)
     assert maps.intensity[0, 0] == pytest.approx((38 * 20 + 60) / 39)
@@ -59,8 +81,10 @@ def test_intensity_is_the_mean_over_samples_near_the_median() -> None:
 
 
 def test_two_balanced_winners_give_an_intensity() -> None:
-    depth, ir = np.full((512, 640), 0.4), np.full((512, 640), 10, np.uint8)
-    depth[:, ::2], ir[:, ::2] = 0.8, 30
+    depth = np.full((512, 640), 0.4)
+    ir = np.full((512, 640), 10, np.uint8)
+    depth[:, ::2] = 0.8
+    ir[:, ::2] = 30
     maps = _maps(depth, ir)
     assert maps.valid.all()
     assert ((maps.depth_m >= np.float32(0.4)) & (maps.depth_m <= np.float32(0.8))).all()
@@ -69,8 +93,10 @@ def test_two_balanced_winners_give_an_intensity() -> None:
 
 @pytest.mark.parametrize("nothing", [np.nan, 0.0, -0.1, np.inf, -np.inf])
 def test_invalid_depth_does_not_count_in_a_cell(nothing: float) -> None:
-    depth, ir = np.full((480, 640), 0.5), np.full((480, 640), 10, np.uint8)
-    depth[::2], ir[::2] = nothing, 255
+    depth = np.full((480, 640), 0.5)
+    ir = np.full((480, 640), 10, np.uint8)
+    depth[::2] = nothing
+    ir[::2] = 255
     depth[:15, :8] = nothing  # two whole cells
     maps = _maps(depth, ir)
     assert maps.depth_m.shape == maps.intensity.shape == maps.valid.shape == (MAP_ROWS, MAP_COLUMNS)
@@ -82,7 +108,9 @@ def test_invalid_depth_does_not_count_in_a_cell(nothing: float) -> None:
 
 @settings(max_examples=15, deadline=None, derandomize=True)
 @given(seed=st.integers(0, 2**16), size=st.sampled_from(SIZES[:4]), share=st.floats(0, 1))
-def test_maps_stay_within_the_range_of_the_frame(seed: int, size: tuple[int, int], share: float) -> None:
+def test_maps_stay_within_the_range_of_the_frame(
+    seed: int, size: tuple[int, int], share: float
+) -> None:
     generator = np.random.default_rng(seed)
     depth = generator.uniform(0.1, 9, size).astype(np.float32)
     depth[generator.random(size) < share] = np.nan
@@ -109,16 +137,23 @@ def noise(number: int, valid_share: float = 0.8) -> LidarMaps:
     depth_m = (0.00025 * generator.integers(1, 40_000, (64, 80))).astype(np.float32)
     depth_m[generator.random((64, 80)) > valid_share] = np.nan
     valid = ~np.isnan(depth_m)
-    return LidarMaps(depth_m, np.where(valid, generator.uniform(1, 255, (64, 80)), 0.0).astype(np.float32), valid)
+    return LidarMaps(
+        depth_m, np.where(valid, generator.uniform(1, 255, (64, 80)), 0.0).astype(np.float32), valid
+    )
 
 
 def mean_of(maps: list[LidarMaps]) -> LidarMaps:
     """Compute the mean by its definition."""
     valid = np.stack([each.valid for each in maps])
-    count, seen = valid.sum(axis=0), valid.any(axis=0)
+    count = valid.sum(axis=0)
+    seen = valid.any(axis=0)
     depth_m = np.stack([each.depth_m for each in maps]).astype(np.float64).sum(axis=0, where=valid)
-    intensity = np.stack([each.intensity for each in maps]).astype(np.float64).sum(axis=0, where=valid)
-    depth_m, intensity = (np.where(seen, total / np.maximum(count, 1), np.nan) for total in (depth_m, intensity))
+    intensity = (
+        np.stack([each.intensity for each in maps]).astype(np.float64).sum(axis=0, where=valid)
+    )
+    depth_m, intensity = (
+        np.where(seen, total / np.maximum(count, 1), np.nan) for total in (depth_m, intensity)
+    )
     return LidarMaps(depth_m.astype(np.float32), np.nan_to_num(intensity).astype(np.float32), seen)
 
 
@@ -132,7 +167,8 @@ def assert_equal(one: LidarMaps, other: LidarMaps) -> None:
 @pytest.mark.parametrize("frames", [1, 2, 5])
 @pytest.mark.parametrize("valid_share", [1.0, 0.5, 0.05])
 def test_map_mean_is_over_the_last_valid_values(frames: int, valid_share: float) -> None:
-    mean, given = MapMean(frames), [noise(number, valid_share) for number in range(12)]
+    mean = MapMean(frames)
+    given = [noise(number, valid_share) for number in range(12)]
     for number, maps in enumerate(given):
         found = mean.add(maps)
         assert_equal(found, mean_of(given[max(0, number + 1 - frames) : number + 1]))
@@ -140,14 +176,17 @@ def test_map_mean_is_over_the_last_valid_values(frames: int, valid_share: float)
 
 
 def test_map_mean_accumulates_no_error() -> None:
-    mean, given = MapMean(7), [noise(number) for number in range(50)]
+    mean = MapMean(7)
+    given = [noise(number) for number in range(50)]
     for turn in range(4000):
         found = mean.add(given[turn % 50])
     assert_equal(found, mean_of([given[turn % 50] for turn in range(3993, 4000)]))
 
 
 def test_map_mean_neither_changes_nor_keeps_its_input() -> None:
-    mean, maps, again = MapMean(2), noise(3), noise(3)
+    mean = MapMean(2)
+    maps = noise(3)
+    again = noise(3)
     first = mean.add(maps)
     kept = first.depth_m.copy()
     maps.depth_m[:] = 9.0

@@ -78,7 +78,8 @@ def test_latest_value_wakes_every_waiting_reader() -> None:
 
 
 def test_latest_value_prefers_one_that_comes_soon() -> None:
-    slot, read = LatestValue[str](), Event()
+    slot = LatestValue[str]()
+    read = Event()
     slot.put("there")
     assert slot.fresh(0, 0.01, 0.0) == (1, "there")
     assert slot.fresh(1, 60.0, 0.01) is None

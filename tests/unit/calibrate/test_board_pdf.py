@@ -7,7 +7,14 @@ import pytest
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from nlos_calibration.board import BOARDS, PAPER_MM, Board, Paper
 
-from nlos_cam.calibrate.board_pdf import BAR_MM, bar_mm, black_cells, board_figure, pattern_origin_mm, write_board_pdf
+from nlos_cam.calibrate.board_pdf import (
+    BAR_MM,
+    bar_mm,
+    black_cells,
+    board_figure,
+    pattern_origin_mm,
+    write_board_pdf,
+)
 
 DPI = 254
 PIXELS_PER_MM = DPI / 25.4
@@ -19,8 +26,11 @@ def test_board_sheet_is_drawn_to_scale_with_a_bar_and_clear_margins(paper: Paper
     figure.set_dpi(DPI)
     canvas = FigureCanvasAgg(figure)
     canvas.draw()
-    dots = np.asarray(canvas.buffer_rgba())[..., 0].copy()  # a sheet as printed, at ten dots per millimetre
-    board, (left_mm, top_mm) = BOARDS[paper], pattern_origin_mm(paper)
+    dots = np.asarray(canvas.buffer_rgba())[
+        ..., 0
+    ].copy()  # a sheet as printed, at ten dots per millimetre
+    board = BOARDS[paper]
+    (left_mm, top_mm) = pattern_origin_mm(paper)
     pixels, ids, _, markers = cv2.aruco.CharucoDetector(board.opencv_board).detectBoard(dots)
     assert len(markers) == board.squares_x * board.squares_y // 2
     assert len(ids) == len(board.corners_m)
@@ -39,7 +49,8 @@ def test_board_sheet_is_drawn_to_scale_with_a_bar_and_clear_margins(paper: Paper
 
 
 def test_black_cells_are_those_that_opencv_draws() -> None:
-    board, k = Board(squares_x=4, squares_y=5, square_mm=24.0, marker_mm=18.0), 48
+    board = Board(squares_x=4, squares_y=5, square_mm=24.0, marker_mm=18.0)
+    k = 48
     drawn = np.full((5 * k, 4 * k), 255, np.uint8)
     for left, top, width, height in black_cells(board, 0.0, 0.0):
         rows, columns = ((start, start + size) for start, size in ((top, height), (left, width)))

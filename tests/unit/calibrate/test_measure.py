@@ -14,7 +14,12 @@ from nlos_calibration.wall import wall_depth
 from nlos_calibration.wall_record import MeasuredWall, new_wall_record
 
 from nlos_cam.calibrate import measure
-from nlos_cam.calibrate.measure import CaptureStatistics, collect_statistics, fit_frame, measure_occluder
+from nlos_cam.calibrate.measure import (
+    CaptureStatistics,
+    collect_statistics,
+    fit_frame,
+    measure_occluder,
+)
 from nlos_cam.frames import Frame, maps_from_frame
 from nlos_cam.render.geometry import cast
 
@@ -39,7 +44,9 @@ def test_collect_statistics_averages_all_frames() -> None:
     depths_m = [frame.depth_m.astype(np.float64) for frame in frames]
     counts = [np.where(each.valid, each.intensity, np.nan) for each in maps]
     np.testing.assert_allclose(wall.depth_m, np.mean(depths_m, axis=0), rtol=1e-6)
-    np.testing.assert_allclose(wall.map_depth_m, np.mean([each.depth_m for each in maps], axis=0), rtol=1e-6)
+    np.testing.assert_allclose(
+        wall.map_depth_m, np.mean([each.depth_m for each in maps], axis=0), rtol=1e-6
+    )
     np.testing.assert_allclose(wall.map_intensity, np.mean(counts, axis=0), rtol=1e-6)
     assert (wall.frames, wall.serial, wall.settings) == (20, SERIAL, {"laser_power": 40.0})
     assert collect_statistics(Warming(10), 4).statistics.depth.frames == 4
@@ -53,9 +60,13 @@ def test_statistics_read_temperatures_now_and_then() -> None:
         collect_statistics(Warming(0), 1000)
 
 
-def seen_of(depth_m: np.ndarray, frames: int, intrinsics: Intrinsics = INTRINSICS, seed: int = 0) -> CaptureStatistics:
-    statistics, dark = BareWallStatistics(intrinsics), np.zeros(depth_m.shape, np.uint8)
-    cells, generator = np.full((64, 80), 0.2, np.float32), np.random.default_rng(seed)
+def seen_of(
+    depth_m: np.ndarray, frames: int, intrinsics: Intrinsics = INTRINSICS, seed: int = 0
+) -> CaptureStatistics:
+    statistics = BareWallStatistics(intrinsics)
+    dark = np.zeros(depth_m.shape, np.uint8)
+    cells = np.full((64, 80), 0.2, np.float32)
+    generator = np.random.default_rng(seed)
     for _ in range(frames):
         noise_m = generator.standard_normal(depth_m.shape) * (0.0005 + 0.002 * depth_m)
         statistics.add((depth_m + noise_m).astype(np.float32), dark, cells, cells)
@@ -63,9 +74,16 @@ def seen_of(depth_m: np.ndarray, frames: int, intrinsics: Intrinsics = INTRINSIC
 
 
 def bench_seen(intrinsics: Intrinsics = INTRINSICS, **changes: object) -> CaptureStatistics:
-    """Return statistics of the paper's rig with its occluder and no hidden object, rendered by its beams."""
+    """Return statistics of the paper's rig with its occluder and no hidden object, rendered by its
+    beams.
+    """
     beams = cast(BENCH.model_copy(update=changes), intrinsics)
-    return seen_of((beams.length_m * beams.cos_axis).reshape(intrinsics.height, intrinsics.width), 20, intrinsics, 1)
+    return seen_of(
+        (beams.length_m * beams.cos_axis).reshape(intrinsics.height, intrinsics.width),
+        20,
+        intrinsics,
+        1,
+    )
 
 
 @pytest.fixture(scope="module")
@@ -85,14 +103,18 @@ def bare(seen: CaptureStatistics) -> MeasuredWall:
 
 
 @pytest.mark.parametrize(("x_m", "gap_m"), [(0.2, 0.1), (0.22, 0.08), (0.19, 0.11)])
-def test_measure_occluder_finds_it_beside_the_known_wall(bare: MeasuredWall, x_m: float, gap_m: float) -> None:
+def test_measure_occluder_finds_it_beside_the_known_wall(
+    bare: MeasuredWall, x_m: float, gap_m: float
+) -> None:
     seen = bench_seen(occluder=Occluder(x_m=x_m, z_min_m=gap_m))
     record, inliers = measure_occluder(seen, bare)
     assert (record.occluder.source, record.verdict) == ("detected", "good")
     assert (record.occluder.x_m, record.occluder.gap_m) == pytest.approx((x_m, gap_m), abs=0.002)
     assert record.rig.occluder == Occluder(x_m=record.occluder.x_m, z_min_m=record.occluder.gap_m)
     assert record.rig.lidar == bare.record.rig.lidar
-    far = np.abs(wall_depth(RIG.wall_from_lidar, INTRINSICS) - seen.statistics.depth.mean_m()) > 0.02
+    far = (
+        np.abs(wall_depth(RIG.wall_from_lidar, INTRINSICS) - seen.statistics.depth.mean_m()) > 0.02
+    )
     assert 0.1 < far.mean() < 0.5
     assert not (inliers & far).any()
     assert inliers[~far].mean() > 0.95
@@ -102,16 +124,23 @@ def test_measure_occluder_finds_it_beside_the_known_wall(bare: MeasuredWall, x_m
     ("lidar", "amount"),
     [
         (LidarPose(distance_m=0.203, yaw_deg=45.0), r"3\.0 mm"),
-        (LidarPose(distance_m=0.2, yaw_deg=45.0, pitch_deg=1.0), r"\+1\.00"),  # facing the wall at 45 degrees as before
+        (
+            LidarPose(distance_m=0.2, yaw_deg=45.0, pitch_deg=1.0),
+            r"\+1\.00",
+        ),  # facing the wall at 45 degrees as before
     ],
 )
-def test_measure_occluder_refuses_a_lidar_that_moved(bare: MeasuredWall, lidar: LidarPose, amount: str) -> None:
+def test_measure_occluder_refuses_a_lidar_that_moved(
+    bare: MeasuredWall, lidar: LidarPose, amount: str
+) -> None:
     with pytest.raises(WallRefusedError, match=amount):
         measure_occluder(bench_seen(lidar=lidar), bare)
 
 
 def test_measure_occluder_is_not_moved_by_an_origin_offset(seen: CaptureStatistics) -> None:
-    """The beams meet 4 sqrt(2) mm before the glass at 45 degrees: x and distance of the glass are 4 mm from theirs."""
+    """The beams meet 4 sqrt(2) mm before the glass at 45 degrees: x and distance of the glass are 4
+    mm from theirs.
+    """
     wall = measured(seen, 0.204)
     assert wall.record.range_offset_cause == "origin"
     record, _ = measure_occluder(bench_seen(), wall)
@@ -120,7 +149,9 @@ def test_measure_occluder_is_not_moved_by_an_origin_offset(seen: CaptureStatisti
     assert record.occluder.x_std_m == pytest.approx(0.0005, rel=0.02)  # the tape's
 
 
-def test_measure_occluder_notices_another_camera_and_settings(bare: MeasuredWall, seen: CaptureStatistics) -> None:
+def test_measure_occluder_notices_another_camera_and_settings(
+    bare: MeasuredWall, seen: CaptureStatistics
+) -> None:
     with pytest.raises(CalibrationError, match=r"160x120.*80x60"):
         measure_occluder(bench_seen(RIG.pinhole.scaled(80, 60)), bare)
     now = replace(bench_seen(), serial="f2", settings={"laser_power": 40.0})
@@ -144,16 +175,22 @@ def frame_of(rig: Rig, width: int, height: int) -> Frame:
 
 @pytest.mark.parametrize(("width", "height"), [(640, 480), (1024, 768), (100, 75)])
 @pytest.mark.parametrize(("distance_m", "yaw_deg"), [(0.2, 45.0), (0.15, 15.0), (0.3, -60.0)])
-def test_fit_frame_measures_wall_in_a_thinned_frame(width: int, height: int, distance_m: float, yaw_deg: float) -> None:
+def test_fit_frame_measures_wall_in_a_thinned_frame(
+    width: int, height: int, distance_m: float, yaw_deg: float
+) -> None:
     pose = LidarPose(distance_m=distance_m, yaw_deg=yaw_deg)
     seen = fit_frame(frame_of(RIG.model_copy(update={"lidar": pose}), width, height))
-    assert seen.fit.distance_m == pytest.approx(distance_m, abs=max(0.0005, 4 * seen.fit.distance_std_m))
+    assert seen.fit.distance_m == pytest.approx(
+        distance_m, abs=max(0.0005, 4 * seen.fit.distance_std_m)
+    )
     assert seen.fit.yaw_deg == pytest.approx(yaw_deg, abs=max(0.1, 4 * seen.fit.yaw_std_deg))
 
 
 def test_fit_frame_reports_refusal_and_saturation() -> None:
     frame = frame_of(RIG, 640, 480)
-    seen = fit_frame(replace(frame, depth_m=np.full_like(frame.depth_m, np.nan), ir=np.full_like(frame.ir, 255)))
+    seen = fit_frame(
+        replace(frame, depth_m=np.full_like(frame.depth_m, np.nan), ir=np.full_like(frame.ir, 255))
+    )
     assert seen.fit is None
     assert "0.0%" in seen.refusal
     assert seen.saturated == 1.0

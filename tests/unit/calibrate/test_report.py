@@ -30,7 +30,13 @@ def recorded(measured: Measured, **fields: object) -> WallRecord:
 def test_report_is_self_contained(measured: Measured) -> None:
     found = read(measured(warnings=("ripples of 0.5 mm RMS", "noise > 2 & rising")))
     assert len(found.pictures) == 6
-    for words in ("Good", "2026-01-31", "l515:f0246262", "ripples of 0.5 mm RMS", "noise > 2 & rising"):
+    for words in (
+        "Good",
+        "2026-01-31",
+        "l515:f0246262",
+        "ripples of 0.5 mm RMS",
+        "noise > 2 & rising",
+    ):
         assert words in found.text
 
 
@@ -38,7 +44,9 @@ def test_report_is_self_contained(measured: Measured) -> None:
 def test_report_escapes_hostile_names(measured: Measured) -> None:
     hostile = "<img src=http://evil/x onerror=alert(1)> & \"'"
     wall = measured(serial=hostile, firmware=hostile, reference=hostile, settings={hostile: 1.0})
-    changed = wall.record.model_copy(update={"camera": hostile, "advice": hostile, "warnings": (hostile,)})
+    changed = wall.record.model_copy(
+        update={"camera": hostile, "advice": hostile, "warnings": (hostile,)}
+    )
     found = read(MeasuredWall(changed, wall.reference), f"{hostile}.toml")
     assert found.text.count(hostile) >= 8
 
@@ -47,14 +55,19 @@ def test_report_shows_maps_only_of_a_reference_with_depth(measured: Measured) ->
     wall = measured()
     assert len(read(MeasuredWall(wall.record, None)).pictures) == 2
     nothing = np.full_like(wall.reference.depth_m, np.nan)
-    depth_less = replace(wall.reference, depth_m=nothing, depth_std_m=nothing, inliers=nothing > 0.0)
-    gone = dict.fromkeys(("residual_m", "noise_scale", "inlier_fraction", "ripple_m", "bend_m", "bend_deg"))
+    depth_less = replace(
+        wall.reference, depth_m=nothing, depth_std_m=nothing, inliers=nothing > 0.0
+    )
+    gone = dict.fromkeys(
+        ("residual_m", "noise_scale", "inlier_fraction", "ripple_m", "bend_m", "bend_deg")
+    )
     assert len(read(MeasuredWall(wall.record.model_copy(update=gone), depth_less)).pictures) == 3
 
 
 @pytest.mark.slow
 def test_report_of_noise_stays_small(measured: Measured) -> None:
-    wall, noise = measured(width=640), np.random.default_rng(0)
+    wall = measured(width=640)
+    noise = np.random.default_rng(0)
     shape = wall.reference.depth_m.shape
     loud = replace(
         wall.reference,
@@ -91,7 +104,8 @@ def test_range_bar_marker_is_where_the_value_is() -> None:
 
 
 @pytest.mark.parametrize(
-    ("value", "drawn"), [(14.85, "outside"), (14.95, "inside"), (30.05, "inside"), (31.0, "outside")]
+    ("value", "drawn"),
+    [(14.85, "outside"), (14.95, "inside"), (30.05, "inside"), (31.0, "outside")],
 )
 def test_range_bar_shows_whether_the_value_is_inside(value: float, drawn: str) -> None:
     html = report.range_bar("distance", value, (15.0, 30.0), 0.1, "cm", 45.0)
@@ -101,7 +115,11 @@ def test_range_bar_shows_whether_the_value_is_inside(value: float, drawn: str) -
 
 @pytest.mark.parametrize("verdict", ["good", "out of range", "doubtful"])
 def test_report_banner_holds_verdict_advice_and_warnings(measured: Measured, verdict: str) -> None:
-    fields = {"verdict": verdict, "advice": "move <4 cm> back", "warnings": ("ripples & noise", "cold")}
+    fields = {
+        "verdict": verdict,
+        "advice": "move <4 cm> back",
+        "warnings": ("ripples & noise", "cold"),
+    }
     banner = report.banner(recorded(measured, **fields))
     assert f"class='verdict {verdict.replace(' ', '-')}'" in banner
     for sentence in (verdict, "move <4 cm> back", "ripples & noise", "cold"):
@@ -124,22 +142,36 @@ def test_report_measures_are_the_summarys_rows(measured: Measured) -> None:
     for cell in (cell for row in wall_facts(record) for cell in row):
         assert cell in html
     assert "--tape-m" in html
-    assert "--tape-m" not in report.measures(record.model_copy(update={"range_offset_std_m": 0.001}))
+    assert "--tape-m" not in report.measures(
+        record.model_copy(update={"range_offset_std_m": 0.001})
+    )
 
 
 def test_report_compares_the_board_with_the_record(measured: Measured) -> None:
     assert not report.board(measured().record)
     html = unescape(report.board(recorded(measured, board=BOARD)))
-    for words in ("203.4 ± 1.0 mm", "200.", "40.10 ± 0.04°", "+3.40 mm", "0.117°", "6.5", "at 97 %"):
+    for words in (
+        "203.4 ± 1.0 mm",
+        "200.",
+        "40.10 ± 0.04°",
+        "+3.40 mm",
+        "0.117°",
+        "6.5",
+        "at 97 %",
+    ):
         assert words in html
     alone = {"used": "board", "disagreement_m": None, "depth_refused": "a <mirror>"}
-    assert "a <mirror>" in unescape(report.board(recorded(measured, board=BOARD.model_copy(update=alone))))
+    assert "a <mirror>" in unescape(
+        report.board(recorded(measured, board=BOARD.model_copy(update=alone)))
+    )
 
 
 def test_report_device_has_temperatures_and_settings(measured: Measured) -> None:
     device = {"serial": "f0246262", "firmware": "1.5.8.1", "settings": {"laser_power": 80.0}}
     wall = measured(**device, temperatures_c={"LLD": 41.26})
-    html = report.device(MeasuredWall(wall.record, replace(wall.reference, celsius_span={"LLD": 1.5})))
+    html = report.device(
+        MeasuredWall(wall.record, replace(wall.reference, celsius_span={"LLD": 1.5}))
+    )
     for words in ("f0246262", "1.5.8.1", "laser_power", "80", "41.3 °C", "1.5", "64 x 48"):
         assert words in html
     assert "°C" not in report.device(MeasuredWall(measured().record, None))
@@ -153,11 +185,17 @@ def test_report_device_has_temperatures_and_settings(measured: Measured) -> None
         ("bag:my wall.bag", "my wall.toml", "live --camera l515 --wall 'my wall.toml'"),
     ],
 )
-def test_report_commands_can_be_pasted(measured: Measured, camera: str, record_file: str, live: str) -> None:
-    record = measured(reference="wall.npz", reference_sha256="ab" * 32).record.model_copy(update={"camera": camera})
+def test_report_commands_can_be_pasted(
+    measured: Measured, camera: str, record_file: str, live: str
+) -> None:
+    record = measured(reference="wall.npz", reference_sha256="ab" * 32).record.model_copy(
+        update={"camera": camera}
+    )
     html = unescape(report.usage(record, record_file))
     assert f"nlos-cam {live}\n" in html
-    assert all(words in html for words in ("render cup --rig", "wall.npz", "ab" * 32, record.rig.checksum))
+    assert all(
+        words in html for words in ("render cup --rig", "wall.npz", "ab" * 32, record.rig.checksum)
+    )
 
 
 @pytest.fixture
@@ -166,7 +204,9 @@ def files(tmp_path: Path) -> WallFiles:
 
 
 @pytest.mark.slow
-def test_wall_files_belong_together(files: WallFiles, measured: Measured, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_wall_files_belong_together(
+    files: WallFiles, measured: Measured, monkeypatch: pytest.MonkeyPatch
+) -> None:
     wall = bare_wall()
     record = write_record(files, measured().record, wall)
     loaded = load_measured(files.record)

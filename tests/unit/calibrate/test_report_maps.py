@@ -7,7 +7,14 @@ import pytest
 from nlos_calibration import MeasuredWall, depth_noise_m, wall_depth
 from page_reader import decoded
 
-from nlos_cam.calibrate.report_maps import block_majority, block_side, expected_std_m, in_blocks, residual_m, wall_maps
+from nlos_cam.calibrate.report_maps import (
+    block_majority,
+    block_side,
+    expected_std_m,
+    in_blocks,
+    residual_m,
+    wall_maps,
+)
 from nlos_cam.report import Picture, figure_of, png
 
 FLOAT32_M = 1e-6
@@ -20,19 +27,26 @@ def wall(measured: Callable[..., MeasuredWall]) -> MeasuredWall:
 
 def maps(wall: MeasuredWall, **changes: np.ndarray) -> list[Picture]:
     """Return residual, spread, noise and infrared of a wall some of whose maps are others."""
-    typed = {name: values if values.dtype == bool else values.astype(np.float32) for name, values in changes.items()}
+    typed = {
+        name: values if values.dtype == bool else values.astype(np.float32)
+        for name, values in changes.items()
+    }
     return wall_maps(wall.record, replace(wall.reference, **typed))
 
 
 def red_and_blue(picture: Picture) -> tuple[float, float]:
-    """Return the shares of the picture, without its colour bar, that are clearly red and clearly blue."""
+    """Return the shares of the picture, without its colour bar, that are clearly red and clearly
+    blue.
+    """
     image = decoded(picture.png)
     image = image[:, : int(0.82 * image.shape[1])]
     redness = image[..., 0] - image[..., 2]
     return float((redness > 90).mean()), float((redness < -90).mean())
 
 
-def test_wall_maps_of_an_exact_plane_are_pale_and_name_it_if_it_is_the_boards(wall: MeasuredWall) -> None:
+def test_wall_maps_of_an_exact_plane_are_pale_and_name_it_if_it_is_the_boards(
+    wall: MeasuredWall,
+) -> None:
     residual, spread, noise, infrared = maps(wall)
     assert red_and_blue(residual) == (0.0, 0.0)
     assert not re.search("%|board", residual.caption)
@@ -56,7 +70,8 @@ def test_residual_map_is_red_behind_the_plane_else_blue(wall: MeasuredWall, bump
 
 @pytest.mark.slow
 def test_residual_map_stripes_what_was_left_out(wall: MeasuredWall) -> None:
-    depth_m, inliers = wall.reference.depth_m.copy(), wall.reference.inliers.copy()
+    depth_m = wall.reference.depth_m.copy()
+    inliers = wall.reference.inliers.copy()
     depth_m[:, 16:32] += 0.01
     inliers[:, 16:32] = False
     depth_m[:12] = np.nan
@@ -80,7 +95,13 @@ def test_spread_map_separates_ripples_from_noise(wall: MeasuredWall) -> None:
 
 def test_wall_maps_without_data_have_no_picture(wall: MeasuredWall) -> None:
     nothing = np.full_like(wall.reference.depth_m, np.nan)
-    shown = maps(wall, depth_m=nothing, depth_std_m=nothing, ir=nothing, inliers=np.zeros(nothing.shape, bool))
+    shown = maps(
+        wall,
+        depth_m=nothing,
+        depth_std_m=nothing,
+        ir=nothing,
+        inliers=np.zeros(nothing.shape, bool),
+    )
     assert [picture.png for picture in shown] == [None] * 4
     assert all(picture.caption.endswith(".") for picture in shown)
     residual, _, noise, _ = maps(wall, depth_std_m=nothing)
@@ -89,14 +110,17 @@ def test_wall_maps_without_data_have_no_picture(wall: MeasuredWall) -> None:
 
 @pytest.mark.slow
 def test_infrared_map_draws_saturation_if_any(wall: MeasuredWall) -> None:
-    bare, share = maps(wall)[3], np.zeros_like(wall.reference.saturated)
+    bare = maps(wall)[3]
+    share = np.zeros_like(wall.reference.saturated)
     assert "48 of 255" in bare.caption
-    share[:, :16], share[:, :8] = 0.1, 0.9
+    share[:, :16] = 0.1
+    share[:, :8] = 0.9
     blinded = maps(wall, saturated=share)[3]
     assert "25.0 %" in blinded.caption
     assert "12.5 %" in blinded.caption
     assert decoded(blinded.png).shape[1] > decoded(bare.png).shape[1]
-    share[:], share[5, 5] = 0.0, 1.0
+    share[:] = 0.0
+    share[5, 5] = 1.0
     assert "0.1 %" in maps(wall, saturated=share)[3].caption
 
 
@@ -105,12 +129,16 @@ def seen(wall: MeasuredWall, depth_m: np.ndarray, **others: object) -> np.ndarra
     return residual_m(wall.record.model_copy(update=others), reference)
 
 
-@pytest.mark.parametrize(("distance_m", "yaw_deg", "pitch_deg"), [(0.15, 15.0, 0.0), (0.2, -45.0, 10.0), (0.3, 75, -5)])
+@pytest.mark.parametrize(
+    ("distance_m", "yaw_deg", "pitch_deg"), [(0.15, 15.0, 0.0), (0.2, -45.0, 10.0), (0.3, 75, -5)]
+)
 def test_residual_is_the_height_above_the_plane(
     measured: Callable[..., MeasuredWall], distance_m: float, yaw_deg: float, pitch_deg: float
 ) -> None:
     wall = measured(distance_m, yaw_deg, pitch_deg)
-    reference, part, moved = wall.reference, np.s_[10:20, 10:20], np.array(wall.record.wall_from_lidar)
+    reference = wall.reference
+    part = np.s_[10:20, 10:20]
+    moved = np.array(wall.record.wall_from_lidar)
     depth_m, near = reference.depth_m.astype(np.float64), reference.depth_m < 2.0
     for bump_m in (0.0, 0.004, -0.004):
         moved[2, 3] = wall.record.distance_m + bump_m
@@ -123,7 +151,9 @@ def test_residual_is_the_height_above_the_plane(
 
 @pytest.mark.parametrize("cause", ["depth", "origin"])
 @pytest.mark.parametrize("offset_m", [0.0045, -0.0045])
-def test_residual_allows_for_the_range_offset(wall: MeasuredWall, offset_m: float, cause: str) -> None:
+def test_residual_allows_for_the_range_offset(
+    wall: MeasuredWall, offset_m: float, cause: str
+) -> None:
     reference = wall.reference
     depth_m = reference.depth_m.astype(np.float64) - offset_m
     if cause == "origin":

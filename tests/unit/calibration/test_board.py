@@ -6,7 +6,14 @@ import numpy as np
 import pytest
 from nlos_calibration.arrays import Float64
 from nlos_calibration.board import BOARDS, MIN_CORNERS, Board, Corners, find_corners
-from nlos_calibration.board_pose import CornerObservations, PrintErrors, _linear, fit_board, refine_pose, solve_pose
+from nlos_calibration.board_pose import (
+    CornerObservations,
+    PrintErrors,
+    _linear,
+    fit_board,
+    refine_pose,
+    solve_pose,
+)
 from nlos_calibration.errors import BoardRefusedError
 from nlos_calibration.geometry import Intrinsics, normal_from_angles, wall_from_plane
 from nlos_calibration.rig import load_rig
@@ -21,7 +28,8 @@ TRUE = np.array([0.1, 0.7, 0.05, -0.11, -0.13, 0.30, 0.004, 0.0005, -0.0003])
 """Parameters of an oblique pose of a stretched and bowed print."""
 A4 = BOARDS["a4"]
 PINHOLE = Intrinsics(640, 480, 457.0, 461.0, 319.5, 239.5)
-NORMAL, DISTANCE_M = normal_from_angles(np.radians(45.0), np.radians(5.0)), 0.2
+NORMAL = normal_from_angles(np.radians(45.0), np.radians(5.0))
+DISTANCE_M = 0.2
 RIG = load_rig("bare-wall")
 
 
@@ -44,7 +52,11 @@ def test_measured_board_is_the_same_board_scaled() -> None:
 
 @pytest.mark.parametrize(
     ("changed", "problem"),
-    [({"marker_mm": 20.0}, "marker_mm"), ({"squares_x": 11, "squares_y": 11}, "60"), ({"color": "red"}, "color")],
+    [
+        ({"marker_mm": 20.0}, "marker_mm"),
+        ({"squares_x": 11, "squares_y": 11}, "60"),
+        ({"color": "red"}, "color"),
+    ],
 )
 def test_board_that_cannot_exist_is_refused(changed: dict[str, object], problem: str) -> None:
     small = {"squares_x": 4, "squares_y": 5, "square_mm": 20.0, "marker_mm": 15.0}
@@ -52,8 +64,12 @@ def test_board_that_cannot_exist_is_refused(changed: dict[str, object], problem:
         Board.model_validate(small | changed)
 
 
-@pytest.mark.parametrize(("counts", "least", "error_px"), [(None, 25, 0.15), (6.0, 20, 0.3), (600.0, 20, 0.3)])
-def test_find_corners_locates_them_at_any_brightness(counts: float | None, least: int, error_px: float) -> None:
+@pytest.mark.parametrize(
+    ("counts", "least", "error_px"), [(None, 25, 0.15), (6.0, 20, 0.3), (600.0, 20, 0.3)]
+)
+def test_find_corners_locates_them_at_any_brightness(
+    counts: float | None, least: int, error_px: float
+) -> None:
     clean, true_px = of_bench() if counts is None else of_bench(brightest_counts=counts)
     found = find_corners(mean_of(clean), A4)
     assert len(found.ids) >= least
@@ -90,10 +106,14 @@ def test_find_corners_refuses_mirrored_hidden_and_other_boards() -> None:
     with pytest.raises(BoardRefusedError, match=rf"^\d corners .*{MIN_CORNERS} "):
         find_corners(hidden, A4)
     with pytest.raises(BoardRefusedError):
-        find_corners(clean, BOARDS["a3"].model_copy(update={"dictionary": "DICT_4X4_250", "squares_x": 5}))
+        find_corners(
+            clean, BOARDS["a3"].model_copy(update={"dictionary": "DICT_4X4_250", "squares_x": 5})
+        )
 
 
-def seen_of(parameters: Float64, sigma_px: float, generator: np.random.Generator) -> CornerObservations:
+def seen_of(
+    parameters: Float64, sigma_px: float, generator: np.random.Generator
+) -> CornerObservations:
     drawn = CornerObservations(
         *(A4.corners_m, np.zeros((40, 2)), PINHOLE.matrix),
         *(np.array(A4.size_mm) * 1e-3, PRINT_STD, max(sigma_px, 1e-3) ** 2),
@@ -102,7 +122,9 @@ def seen_of(parameters: Float64, sigma_px: float, generator: np.random.Generator
     return replace(drawn, pixels=pixels + sigma_px * generator.standard_normal(pixels.shape))
 
 
-def projected(points_m: Float64, distance_m: float = DISTANCE_M, normal: Float64 = NORMAL) -> Float64:
+def projected(
+    points_m: Float64, distance_m: float = DISTANCE_M, normal: Float64 = NORMAL
+) -> Float64:
     """Return the pixels of points (n, 3) of a board on the wall (z points into the wall)."""
     right, up, _ = wall_from_plane(normal, distance_m)[:3, :3]
     middle_m = 0.8 * distance_m / -normal[2] * np.array([0.0, 0.0, 1.0])
@@ -113,7 +135,9 @@ def projected(points_m: Float64, distance_m: float = DISTANCE_M, normal: Float64
     return seen[:, :2] / seen[:, 2:]
 
 
-def corners(points_m: Float64 | None = None, sigma_px: float = 0.05, seed: int = 0, **where: float) -> Corners:
+def corners(
+    points_m: Float64 | None = None, sigma_px: float = 0.05, seed: int = 0, **where: float
+) -> Corners:
     pixels = projected(A4.corners_m if points_m is None else points_m, **where)
     noise_px = sigma_px * np.random.default_rng(seed).standard_normal(pixels.shape)
     return Corners(np.arange(len(pixels)), pixels + noise_px)
@@ -142,10 +166,15 @@ def test_board_pose_slopes_and_covariance_are_those_of_its_plane() -> None:
     slopes, covariance = pose.slopes()
     corner_m = cv2.Rodrigues(pose.parameters[:3])[0] @ [0.1, 0.2, 0.0] + pose.parameters[3:6]
     assert slopes @ corner_m == pytest.approx(1.0)  # points p of the plane have slopes . p = 1
-    step, by_pose = 1e-7, np.zeros((3, 6))
+    step = 1e-7
+    by_pose = np.zeros((3, 6))
     for k in range(6):
-        by_pose[:, k] = (replace(pose, parameters=pose.parameters + step * np.eye(9)[k]).slopes()[0] - slopes) / step
-    np.testing.assert_allclose(covariance, by_pose @ pose.covariance[:6, :6] @ by_pose.T, rtol=1e-4, atol=1e-8)
+        by_pose[:, k] = (
+            replace(pose, parameters=pose.parameters + step * np.eye(9)[k]).slopes()[0] - slopes
+        ) / step
+    np.testing.assert_allclose(
+        covariance, by_pose @ pose.covariance[:6, :6] @ by_pose.T, rtol=1e-4, atol=1e-8
+    )
 
 
 def test_fit_board_of_exact_corners_is_exact() -> None:
@@ -178,20 +207,28 @@ def test_fit_board_of_a_scaled_print_shifts_only_the_distance(scale: float) -> N
     wall = measures(found)
     assert wall.distance_m == pytest.approx(DISTANCE_M / scale, rel=0.01)
     assert wall.yaw_deg == pytest.approx(45.0, abs=0.2)
-    assert measures(found, A4.measured(30.0 * scale)).distance_m == pytest.approx(DISTANCE_M, rel=0.003)
+    assert measures(found, A4.measured(30.0 * scale)).distance_m == pytest.approx(
+        DISTANCE_M, rel=0.003
+    )
 
 
 def test_fit_board_scale_uncertainty_is_one_of_the_distance() -> None:
     exact, ruled = (measures(corners(), printed=PrintErrors(scale_std=std)) for std in (0.0, 0.01))
-    assert ruled.distance_std_m == pytest.approx(np.hypot(exact.distance_std_m, 0.01 * exact.distance_m))
+    assert ruled.distance_std_m == pytest.approx(
+        np.hypot(exact.distance_std_m, 0.01 * exact.distance_m)
+    )
     assert ruled.yaw_std_deg == pytest.approx(exact.yaw_std_deg)
 
 
 def test_fit_board_covariance_holds_the_focal_length_error() -> None:
-    exact, unsure = (fit_board(corners(sigma_px=0.0), A4, PINHOLE, focal_std=std) for std in (0.0, 1e-4))
+    exact, unsure = (
+        fit_board(corners(sigma_px=0.0), A4, PINHOLE, focal_std=std) for std in (0.0, 1e-4)
+    )
     longer = replace(PINHOLE, fx=PINHOLE.fx * 1.0001, fy=PINHOLE.fy * 1.0001)
     change = fit_board(corners(sigma_px=0.0), A4, longer).slopes - exact.slopes
-    np.testing.assert_allclose(unsure.covariance - exact.covariance, np.outer(change, change), rtol=0.02, atol=1e-11)
+    np.testing.assert_allclose(
+        unsure.covariance - exact.covariance, np.outer(change, change), rtol=0.02, atol=1e-11
+    )
     assert np.linalg.norm(change) > 1e-5
 
 
@@ -217,7 +254,9 @@ def test_fit_board_refuses_wrong_intrinsics_and_weak_views() -> None:
         fit_board(found, A4, Intrinsics(640, 480, 457.0, 520.0, 300.0, 200.0))
     column = found.ids % 5 == 2
     tiny = A4.measured(1.0)
-    far = projected(tiny.corners_m + np.array([0.0875, 0.131, 0.0]), 0.4, normal_from_angles(0.5, 0.0))
+    far = projected(
+        tiny.corners_m + np.array([0.0875, 0.131, 0.0]), 0.4, normal_from_angles(0.5, 0.0)
+    )
     edge_on = projected(A4.corners_m, 0.02, normal_from_angles(np.radians(89.0), 0.0))
     noise = np.random.default_rng(0).standard_normal(edge_on.shape)
     for board, weak in (

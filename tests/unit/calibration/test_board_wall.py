@@ -6,9 +6,24 @@ import cv2
 import numpy as np
 import pytest
 from board_trials import CALIBRATION, ColorCamera, bench_at, through_lens
-from nlos_calibration import BOARDS, Corners, Light, PrintErrors, board_wall, load_rig, normal_from_angles
+from nlos_calibration import (
+    BOARDS,
+    Corners,
+    Light,
+    PrintErrors,
+    board_wall,
+    load_rig,
+    normal_from_angles,
+)
 from nlos_calibration.arrays import Float64
-from nlos_calibration.board_wall import EXACT, BoardView, UncertainPlane, combine, plane_in_lidar, wall_with_board
+from nlos_calibration.board_wall import (
+    EXACT,
+    BoardView,
+    UncertainPlane,
+    combine,
+    plane_in_lidar,
+    wall_with_board,
+)
 from nlos_calibration.errors import BoardRefusedError, WallRefusedError
 from nlos_calibration.wall import WallFit, WallMeasures, fit_wall, measures_of
 from synthetic_scenes import at_near_edge, clean_infrared, corners_px, infrared_frames
@@ -16,7 +31,8 @@ from synthetic_scenes import at_near_edge, clean_infrared, corners_px, infrared_
 from nlos_cam.calibrate import View, depth_statistics
 
 RIG = load_rig("bare-wall")
-PINHOLE, A4 = RIG.pinhole, BOARDS["a4"]
+PINHOLE = RIG.pinhole
+A4 = BOARDS["a4"]
 SLOPES = np.array([1.2, -0.4, 3.5])
 POSE = np.eye(4)
 POSE[:3, :3] = cv2.Rodrigues(np.array([0.1, -0.3, 0.05]))[0]
@@ -34,10 +50,14 @@ def test_plane_in_lidar_moves_plane_and_covariance_or_is_refused_between_camera_
     there = points @ POSE[:3, :3].T + POSE[:3, 3]
     np.testing.assert_allclose(there @ moved(SLOPES), 1.0, rtol=1e-12)
     steps = 1e-6 * np.eye(3)
-    by_slopes = np.stack([(moved(SLOPES + step) - moved(SLOPES - step)) / 2e-6 for step in steps], axis=1)
+    by_slopes = np.stack(
+        [(moved(SLOPES + step) - moved(SLOPES - step)) / 2e-6 for step in steps], axis=1
+    )
     root = np.random.default_rng(1).standard_normal((3, 3)) * 1e-3
     covariance = plane_in_lidar(SLOPES, root @ root.T, POSE, EXACT)[1]
-    np.testing.assert_allclose(covariance, by_slopes @ root @ root.T @ by_slopes.T, rtol=1e-5, atol=1e-12)
+    np.testing.assert_allclose(
+        covariance, by_slopes @ root @ root.T @ by_slopes.T, rtol=1e-5, atol=1e-12
+    )
     behind = POSE.copy()
     behind[:3, 3] = POSE[:3, :3] @ (-2.0 * SLOPES / (SLOPES @ SLOPES))
     with pytest.raises(BoardRefusedError, match="between"):
@@ -55,7 +75,9 @@ def test_fit_in_lidar_of_exact_corners_needs_lens_and_pose() -> None:
         return measures_of(fit.slopes, fit.covariance)
 
     exact = found(errors=EXACT)
-    assert (exact.distance_m, exact.yaw_deg, exact.pitch_deg) == pytest.approx((0.25, 40.0, 5.0), abs=1e-4)
+    assert (exact.distance_m, exact.yaw_deg, exact.pitch_deg) == pytest.approx(
+        (0.25, 40.0, 5.0), abs=1e-4
+    )
     for wrong in (found(distortion=np.zeros(5)), found(lidar_from_camera=np.eye(4))):
         assert abs(wrong.distance_m - 0.25) > 3.0 * wrong.distance_std_m
 
@@ -76,10 +98,17 @@ def depth() -> WallFit:
     return fit_wall(mean.mean_m(), PINHOLE, np.random.default_rng(0), mean.noise())
 
 
-def test_wall_with_board_combines_planes_that_agree_and_keeps_a_doubt_of_the_depth(depth: WallFit) -> None:
+def test_wall_with_board_combines_planes_that_agree_and_keeps_a_doubt_of_the_depth(
+    depth: WallFit,
+) -> None:
     fit, record = wall_with_board(depth, infrared(), A4, measured=False)
     assert isinstance(fit, WallFit)
-    assert (fit.verdict, record.used, record.causes, record.depth_refused) == ("good", "both", (), "")
+    assert (fit.verdict, record.used, record.causes, record.depth_refused) == (
+        "good",
+        "both",
+        (),
+        "",
+    )
     assert (fit.distance_m, fit.facing_deg) == pytest.approx((0.2, 45.0), abs=0.02)
     assert fit.distance_std_m <= depth.distance_std_m
     assert record.disagreement_m == pytest.approx(record.distance_m - depth.distance_m)
@@ -91,7 +120,9 @@ def test_wall_with_board_combines_planes_that_agree_and_keeps_a_doubt_of_the_dep
 
 
 @pytest.mark.parametrize(("measured", "used"), [(False, "depth"), (True, "board")])
-def test_wall_with_board_doubts_a_print_at_97_percent(depth: WallFit, measured: bool, used: str) -> None:
+def test_wall_with_board_doubts_a_print_at_97_percent(
+    depth: WallFit, measured: bool, used: str
+) -> None:
     fit, record = wall_with_board(depth, infrared(0.97), A4, measured=measured)
     assert (fit.verdict, record.used) == ("doubtful", used)
     assert record.disagreement_m == pytest.approx(0.2 / 0.97 - 0.2, abs=5e-4)
@@ -101,7 +132,9 @@ def test_wall_with_board_doubts_a_print_at_97_percent(depth: WallFit, measured: 
 
 
 @pytest.mark.parametrize("light", ["infrared", "colour"])
-def test_wall_with_board_in_colour_may_blame_the_colour_camera(depth: WallFit, light: Light) -> None:
+def test_wall_with_board_in_colour_may_blame_the_colour_camera(
+    depth: WallFit, light: Light
+) -> None:
     fit, record = wall_with_board(depth, replace(infrared(0.97), light=light), A4, measured=False)
     assert record.seen_in == light
     for text in (fit.advice, record.causes[-1]):
@@ -126,17 +159,23 @@ def test_wall_with_board_doubts_board_alone_and_gives_advice() -> None:
 
 
 def test_wall_with_board_refusal_names_the_light(depth: WallFit) -> None:
-    for view, light in ((BoardView(np.full((480, 640), 40.0), PINHOLE), "infrared"), (CALIBRATION, "colour")):
+    for view, light in (
+        (BoardView(np.full((480, 640), 40.0), PINHOLE), "infrared"),
+        (CALIBRATION, "colour"),
+    ):
         with pytest.raises(BoardRefusedError, match=light):
             wall_with_board(depth, view, A4, measured=False)
 
 
-def plane(distance_m: float, yaw_deg: float = 45.0, *, std_m: float = 1e-4, std_deg: float = 0.02) -> UncertainPlane:
+def plane(
+    distance_m: float, yaw_deg: float = 45.0, *, std_m: float = 1e-4, std_deg: float = 0.02
+) -> UncertainPlane:
     normal = normal_from_angles(np.radians(yaw_deg), 0.1)
     along = np.outer(normal, normal)
     covariance = (std_m / distance_m**2) ** 2 * along
     return UncertainPlane(
-        -normal / distance_m, covariance + (np.radians(std_deg) / distance_m) ** 2 * (np.eye(3) - along)
+        -normal / distance_m,
+        covariance + (np.radians(std_deg) / distance_m) ** 2 * (np.eye(3) - along),
     )
 
 
@@ -157,7 +196,8 @@ def test_combine_of_equal_planes_halves_the_covariance_and_keeps_an_exact_plane(
 
 
 def test_combine_takes_each_quantity_from_the_better_plane() -> None:
-    depth, board = plane(0.2, 45.0, std_m=1e-5, std_deg=1.0), plane(0.2005, 45.5, std_m=1e-3, std_deg=0.01)
+    depth = plane(0.2, 45.0, std_m=1e-5, std_deg=1.0)
+    board = plane(0.2005, 45.5, std_m=1e-3, std_deg=0.01)
     both = combine(depth, board, measured=False)
     assert both.plane.distance_m == pytest.approx(0.2, abs=2e-5)
     assert both.plane.normal @ board.normal == pytest.approx(1.0, abs=1e-7)
@@ -179,13 +219,18 @@ def test_disagreement_has_distance_angle_and_sigmas() -> None:
 
 
 def test_combine_rarely_disagrees_by_chance_and_holds_the_truth_as_often_as_stated() -> None:
-    generator, depth, board = np.random.default_rng(0), plane(0.2), plane(0.2, std_m=5e-4, std_deg=0.05)
-    sigmas, inside = list[float](), list[bool]()
+    generator = np.random.default_rng(0)
+    depth = plane(0.2)
+    board = plane(0.2, std_m=5e-4, std_deg=0.05)
+    sigmas = list[float]()
+    inside = list[bool]()
     for _ in range(1000):
         both = combine(shaken(depth, generator), shaken(board, generator), measured=False)
         sigmas.append(both.disagreement.sigmas)
         off = both.plane.slopes - depth.slopes
-        inside.append(off @ np.linalg.solve(both.plane.covariance, off) < 7.815)  # 95 % of a chi-square of three
+        inside.append(
+            off @ np.linalg.solve(both.plane.covariance, off) < 7.815
+        )  # 95 % of a chi-square of three
     assert np.mean(np.square(sigmas)) == pytest.approx(3.0, rel=0.1)
     assert np.mean(np.array(sigmas) > board_wall.AGREE_SIGMAS) < 0.004
     assert np.mean(inside) == pytest.approx(0.95, abs=0.02)

@@ -7,12 +7,23 @@ from nlos_calibration import WINDOW_FRAMES, BareWall, Drift, DriftCheck, setting
 from nlos_calibration.drift import MIN_FRAMES, MIN_PIXELS, TOLERANCE_C, DriftWindow
 from nlos_calibration.errors import CalibrationError
 from nlos_calibration.wall import measures_of, wall_depth
-from nlos_calibration.wall_tracker import GRID, WallObservation, WallTrack, noise_scale, watched_pixels
+from nlos_calibration.wall_tracker import (
+    GRID,
+    WallObservation,
+    WallTrack,
+    noise_scale,
+    watched_pixels,
+)
 from synthetic_scenes import SMALL, WallPose, reference_of_wall, wall_from_lidar
 
 TINY = SMALL.scaled(32, 24)
 POSE: WallPose = (0.2, 45.0, 0.0)
-SETTINGS = {"laser_power": 60.0, "depth_units": 0.00025, "ldd_temperature": 31.0, "noise_estimation": 7.0}
+SETTINGS = {
+    "laser_power": 60.0,
+    "depth_units": 0.00025,
+    "ldd_temperature": 31.0,
+    "noise_estimation": 7.0,
+}
 MANY = 10**6
 STILL = Drift(0.0, 0.0, 0.0, 0.0, 1e-5, 0.01, 0.01, 1e-5, uniform=False)
 
@@ -45,7 +56,9 @@ def check(wall: BareWall) -> DriftCheck:
         ({"only_this_firmware_tells": 1.0}, []),
     ],
 )
-def test_settings_changed_names_settings_only(wall: BareWall, change: dict[str, float], settings: list[str]) -> None:
+def test_settings_changed_names_settings_only(
+    wall: BareWall, change: dict[str, float], settings: list[str]
+) -> None:
     assert [line.split()[0] for line in settings_changed(wall, SETTINGS | change)] == settings
 
 
@@ -62,7 +75,11 @@ def test_drift_check_warns_of_a_changed_setting(wall: BareWall, check: DriftChec
 
 
 def test_drift_check_warns_of_a_known_temperature_beyond_tolerance(check: DriftCheck) -> None:
-    unknown = {"apd_temperature": -9999.0, "another_temperature": 99.0, "ldd_temperature": float("nan")}
+    unknown = {
+        "apd_temperature": -9999.0,
+        "another_temperature": 99.0,
+        "ldd_temperature": float("nan"),
+    }
     for celsius in (unknown, {"ldd_temperature": 40.0, "apd_temperature": 37.0}):  # within its span
         check.update_temperatures(celsius)
         assert check.warnings == ()
@@ -110,7 +127,8 @@ def filled(sights: np.ndarray, reference_frames: int = MANY) -> DriftWindow:
 
 def sights(count: int, seed: int = 0) -> np.ndarray:
     """Return measurements of a wall 2 mm farther, each uncertain by 0.1 mm and 0.05 degrees."""
-    middle, spread = np.array([0.002, 0.0, 0.0, 0.0027, 50.0]), np.array([1e-4, 0.05, 0.05, 1e-4, 5.0])
+    middle = np.array([0.002, 0.0, 0.0, 0.0027, 50.0])
+    spread = np.array([1e-4, 0.05, 0.05, 1e-4, 5.0])
     return middle + spread * np.random.default_rng(seed).standard_normal((count, 5))
 
 
@@ -143,7 +161,9 @@ def test_drift_is_measured_in_tolerances(drift: Drift, tolerances: float) -> Non
 
 
 def test_drift_text_holds_amounts_and_uncertainties() -> None:
-    moved = str(replace(STILL, distance_m=0.0018, distance_std_m=0.0002, yaw_deg=-0.3, pitch_deg=0.4))
+    moved = str(
+        replace(STILL, distance_m=0.0018, distance_std_m=0.0002, yaw_deg=-0.3, pitch_deg=0.4)
+    )
     assert "1.8 ± 0.4 mm" in moved
     assert "0.500 ± 0.020°" in moved
     assert "1.30 ± 0.02 mm" in str(replace(STILL, range_m=-0.0013, uniform=True))
@@ -163,7 +183,8 @@ def cells(pixels: np.ndarray) -> np.ndarray:
 
 
 def test_watched_pixels_are_a_good_one_of_each_cell(tilted: BareWall) -> None:
-    before, worse = watched_pixels(tilted), replace(tilted)
+    before = watched_pixels(tilted)
+    worse = replace(tilted)
     np.testing.assert_array_equal(cells(before), np.unique(cells(np.flatnonzero(tilted.inliers))))
     for number, (field, value) in enumerate(
         {"depth_m": np.nan, "depth_std_m": 0.01, "saturated": 0.1, "inliers": False}.items()
@@ -177,17 +198,25 @@ def test_watched_pixels_are_a_good_one_of_each_cell(tilted: BareWall) -> None:
 
 
 def test_noise_scale_is_that_of_the_reference(tilted: BareWall) -> None:
-    assert noise_scale(replace(tilted, depth_std_m=2.0 * tilted.depth_std_m)) == pytest.approx(2.0, rel=0.05)
+    assert noise_scale(replace(tilted, depth_std_m=2.0 * tilted.depth_std_m)) == pytest.approx(
+        2.0, rel=0.05
+    )
     single = replace(tilted, depth_std_m=np.full_like(tilted.depth_std_m, np.nan), frames=1)
     np.testing.assert_array_equal(watched_pixels(single), watched_pixels(tilted))
     assert noise_scale(single) == 1.0
 
 
-@pytest.mark.parametrize("shift", [(0.0, 0.0, 0.0), (0.001, 0.2, -0.2), (-0.004, 1.0, 2.0), (0.03, -6.0, 5.0)])
+@pytest.mark.parametrize(
+    "shift", [(0.0, 0.0, 0.0), (0.001, 0.2, -0.2), (-0.004, 1.0, 2.0), (0.03, -6.0, 5.0)]
+)
 def test_wall_track_finds_an_exact_pose_exactly(tilted: BareWall, shift: WallPose) -> None:
-    exact = replace(tilted, depth_m=np.where(tilted.inliers, wall_depth(wall_from_lidar(TILTED), SMALL), np.nan))
+    exact = replace(
+        tilted, depth_m=np.where(tilted.inliers, wall_depth(wall_from_lidar(TILTED), SMALL), np.nan)
+    )
     pose = wall_from_lidar((TILTED[0] + shift[0], TILTED[1] + shift[1], TILTED[2] + shift[2]))
-    track, frame, sight = WallTrack(exact, wall_from_lidar(TILTED)), wall_depth(pose, SMALL).astype(np.float32), None
+    track = WallTrack(exact, wall_from_lidar(TILTED))
+    frame = wall_depth(pose, SMALL).astype(np.float32)
+    sight = None
     for _ in range(60):
         sight = track.follow(frame)
     now = measures_of(-pose[2, :3] / pose[2, 3], np.zeros((3, 3)))

@@ -17,7 +17,9 @@ def test_wall_pose_is_rigid_above_the_origin_and_level(angles: tuple[float, floa
     np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-12)
     assert np.linalg.det(rotation) == pytest.approx(1.0)
     np.testing.assert_allclose(pose @ [0.0, 0.0, 0.0, 1.0], [0.0, 0.0, 0.23, 1.0], atol=1e-12)
-    assert pose[1, 0] == pytest.approx(0.0, abs=1e-12)  # the lidar's x axis has no component along wall y
+    assert pose[1, 0] == pytest.approx(
+        0.0, abs=1e-12
+    )  # the lidar's x axis has no component along wall y
     assert pose[0, 0] > 0.0
     assert facing_angle_rad(pose) == pytest.approx(np.arccos(-normal[2]), abs=1e-7)
     np.testing.assert_allclose(wall_from_plane(3.0 * normal, 0.23), pose, atol=1e-12)
@@ -34,12 +36,16 @@ def test_wall_pose_has_up_as_y_and_positive_angles_to_x_and_y() -> None:
 
 def test_intrinsics_project_each_ray_back_to_its_pixel() -> None:
     rays = PINHOLE.rays()
-    np.testing.assert_allclose(rays[..., 0] * PINHOLE.fx + PINHOLE.ppx, np.tile(np.arange(640), (480, 1)), atol=1e-9)
+    np.testing.assert_allclose(
+        rays[..., 0] * PINHOLE.fx + PINHOLE.ppx, np.tile(np.arange(640), (480, 1)), atol=1e-9
+    )
     np.testing.assert_allclose(rays[:, 0, 1] * PINHOLE.fy + PINHOLE.ppy, np.arange(480), atol=1e-9)
     assert (rays[..., 2] == 1.0).all()
     seen = 0.7 * rays[::97, ::89].reshape(-1, 3) @ PINHOLE.matrix.T
     columns, rows = np.meshgrid(np.arange(640)[::89], np.arange(480)[::97])
-    np.testing.assert_allclose(seen[:, :2] / seen[:, 2:], np.column_stack([columns.ravel(), rows.ravel()]), atol=1e-9)
+    np.testing.assert_allclose(
+        seen[:, :2] / seen[:, 2:], np.column_stack([columns.ravel(), rows.ravel()]), atol=1e-9
+    )
 
 
 @pytest.mark.parametrize("size", [(80, 64), (1024, 768), (640, 480)])
@@ -47,5 +53,7 @@ def test_scaled_intrinsics_keep_the_edges_of_the_field(size: tuple[int, int]) ->
     scaled = PINHOLE.scaled(*size)
     for whole, part in ((PINHOLE, scaled), (scaled, PINHOLE)):
         assert (-0.5 - part.ppx) / part.fx == pytest.approx((-0.5 - whole.ppx) / whole.fx)
-        assert (part.height - 0.5 - part.ppy) / part.fy == pytest.approx((whole.height - 0.5 - whole.ppy) / whole.fy)
+        assert (part.height - 0.5 - part.ppy) / part.fy == pytest.approx(
+            (whole.height - 0.5 - whole.ppy) / whole.fy
+        )
     assert scaled.scaled(640, 480).ppx == pytest.approx(PINHOLE.ppx)

@@ -14,8 +14,11 @@ PAPER = load_rig("paper-rig")
 PINHOLE = PAPER.pinhole.scaled(160, 120)
 NOISE = MeanNoise(np.full(1, 30.0))
 PIXEL_M = 0.25 * 0.9 / PINHOLE.fx
-"""Height on the paper's sheet, at its edge, that one pixel covers: 0.2 m / sin^2 for each radian."""
-ROWS, COLUMNS = 40, 100
+"""Height on the paper's sheet, at its edge, that one pixel covers: 0.2 m / sin^2 for each
+radian.
+"""
+ROWS = 40
+COLUMNS = 100
 PITCH_M = 0.002
 Y_M = np.linspace(-0.1, 0.1, ROWS)
 
@@ -27,7 +30,9 @@ def seen() -> View:
 
 def noisy(depth_m: NDArray[np.float64], seed: int = 0) -> NDArray[np.float64]:
     seen_m = np.where(depth_m < 9.0, depth_m, np.nan)
-    return seen_m + np.random.default_rng(seed).normal(0.0, 30**-0.5, depth_m.shape) * depth_noise_m(seen_m)
+    return seen_m + np.random.default_rng(seed).normal(
+        0.0, 30**-0.5, depth_m.shape
+    ) * depth_noise_m(seen_m)
 
 
 def fitted(seen: View, depth_m: NDArray[np.float64], **stds: float) -> OccluderFit:
@@ -40,9 +45,13 @@ def found(sheet: Sheet | None, yaw_deg: float = 45.0, **stds: float) -> Occluder
 
 
 def test_sheet_propagates_uncertainty_by_its_derivatives() -> None:
-    normal, step = np.array([2.0, 0.3, -0.4]), 1e-6
+    normal = np.array([2.0, 0.3, -0.4])
+    step = 1e-6
     none: Any = None
-    sheets = [SheetFit(none, normal + shift, np.eye(3), np.array([0.1, 0.2, 0.9])) for shift in step * np.eye(4, 3, -1)]
+    sheets = [
+        SheetFit(none, normal + shift, np.eye(3), np.array([0.1, 0.2, 0.9]))
+        for shift in step * np.eye(4, 3, -1)
+    ]
     for std, values in (
         (sheets[0].x_std_m(0.3), [sheet.x_m(0.3) for sheet in sheets]),
         (sheets[0].lean_std, [sheet.lean for sheet in sheets]),
@@ -70,7 +79,8 @@ def test_find_occluder_measures_lean_twist_and_edge() -> None:
 
 
 def test_find_occluder_uncertainty_holds_that_of_the_wall() -> None:
-    plain, less_sure = found(Sheet()), found(Sheet(), distance_std_m=0.003, yaw_std_deg=0.5)
+    plain = found(Sheet())
+    less_sure = found(Sheet(), distance_std_m=0.003, yaw_std_deg=0.5)
     turn = np.radians(0.5)
     assert less_sure.x_std_m == pytest.approx(np.hypot(plain.x_std_m, 0.1 * turn), rel=0.02)
     expected = np.sqrt(plain.gap_std_m**2 + 0.003**2 + (0.2 * turn) ** 2)
@@ -125,7 +135,9 @@ def test_find_occluder_warns_of_a_finger_beside_the_sheet(seen: View) -> None:
         (70.0, Sheet(x_m=0.12, gap_m=0.22), r"\d+ mm"),
     ],
 )
-def test_find_occluder_refuses_a_sheet_it_cannot_trust(yaw_deg: float, sheet: Sheet | None, why: str) -> None:
+def test_find_occluder_refuses_a_sheet_it_cannot_trust(
+    yaw_deg: float, sheet: Sheet | None, why: str
+) -> None:
     with pytest.raises(OccluderRefusedError, match=why):
         found(sheet, yaw_deg)
 
@@ -161,6 +173,8 @@ def test_find_edge_allows_for_raggedness_strays_and_upper_end() -> None:
     assert strewn.gap_std_m < 2 * PITCH_M
     ragged = find_edge(met(), *labels(0.06 + np.random.default_rng(0).normal(0.0, 0.004, ROWS)))
     assert ragged.gap_std_m == pytest.approx(0.004, rel=0.3)
-    mixed = find_edge(met(), np.roll(sheet, 1, axis=1) & sheet, np.roll(passed, -1, axis=1) & passed)
+    mixed = find_edge(
+        met(), np.roll(sheet, 1, axis=1) & sheet, np.roll(passed, -1, axis=1) & passed
+    )
     assert mixed.gap_std_m == pytest.approx(3 * PITCH_M / np.sqrt(12))
     assert find_edge(met(), sheet, np.zeros_like(passed)) is None

@@ -10,13 +10,28 @@ from hypothesis import strategies as st
 from nlos_calibration.errors import RecordFileError
 from nlos_calibration.geometry import Intrinsics
 from nlos_calibration.occluder import OccluderFit
-from nlos_calibration.reference import BareWall, BareWallStatistics, Moments, load_reference, save_reference
+from nlos_calibration.reference import (
+    BareWall,
+    BareWallStatistics,
+    Moments,
+    load_reference,
+    save_reference,
+)
 from nlos_calibration.rig import ObjectBox, Occluder, dump_toml, load_rig
-from nlos_calibration.wall_record import VERSION, MeasuredWall, WallRecord, load_measured, load_wall, with_occluder
+from nlos_calibration.wall_record import (
+    VERSION,
+    MeasuredWall,
+    WallRecord,
+    load_measured,
+    load_wall,
+    with_occluder,
+)
 
 EXAMPLE = Path(__file__).parents[3] / "calibration/records/wall.toml"
 SMALL = Intrinsics(16, 12, 11.4, 11.5, 7.5, 5.5)
-SHAPE, CELLS, FRAMES = (12, 16), (64, 80), 20
+SHAPE = (12, 16)
+CELLS = (64, 80)
+FRAMES = 20
 
 
 @pytest.fixture
@@ -31,7 +46,8 @@ def written(folder: Path, record: WallRecord) -> Path:
 
 
 def test_paper_rig_is_that_of_the_paper_and_bare_wall_without_its_bench() -> None:
-    rig, bare = load_rig("paper-rig"), load_rig("bare-wall")
+    rig = load_rig("paper-rig")
+    bare = load_rig("bare-wall")
     assert rig.wall_from_lidar[2, 3] == 0.2
     assert rig.facing_deg == pytest.approx(45.0)
     assert (rig.occluder.x_m, rig.occluder.z_min_m) == (0.2, 0.1)
@@ -61,7 +77,9 @@ def test_wall_record_survives_a_file(tmp_path: Path, record: WallRecord) -> None
         "range_offset_std_m": 0.0005,
     }
     box = ObjectBox(x_min_m=0.3, x_max_m=0.5, y_min_m=-0.1, y_max_m=0.1, z_near_m=0.15, z_far_m=0.3)
-    rig = record.rig.model_copy(update={"occluder": Occluder(x_m=0.25, z_min_m=0.08), "object_box": box})
+    rig = record.rig.model_copy(
+        update={"occluder": Occluder(x_m=0.25, z_min_m=0.08), "object_box": box}
+    )
     for one in (record, record.model_copy(update=others), record.model_copy(update={"rig": rig})):
         assert load_wall(written(tmp_path, one)) == one
 
@@ -75,9 +93,15 @@ def test_wall_record_rig_is_the_papers_as_measured(record: WallRecord) -> None:
     assert len({record.rig.checksum, paper.checksum, moved.checksum}) == 3
 
 
-def test_with_occluder_doubts_a_sheet_too_near_or_beside_an_object_until_measured_again(record: WallRecord) -> None:
-    fit = OccluderFit(0.2, 1e-4, 0.03, 1e-3, 0.0, 0.1, 0.0, 0.0, 1e-4, np.zeros((2, 2), np.bool_), ("a stray",))
-    first = with_occluder(record.model_copy(update={"verdict": "doubtful", "advice": "average more frames"}), fit)
+def test_with_occluder_doubts_a_sheet_too_near_or_beside_an_object_until_measured_again(
+    record: WallRecord,
+) -> None:
+    fit = OccluderFit(
+        0.2, 1e-4, 0.03, 1e-3, 0.0, 0.1, 0.0, 0.0, 1e-4, np.zeros((2, 2), np.bool_), ("a stray",)
+    )
+    first = with_occluder(
+        record.model_copy(update={"verdict": "doubtful", "advice": "average more frames"}), fit
+    )
     assert first.verdict == "doubtful"
     assert first.advice.startswith("average more frames; ")
     assert "0.030 m" in first.advice
@@ -114,12 +138,27 @@ MATRIX_END = "0.0,\n        0.0,\n        0.0,\n        "
     [
         (load_rig, "distance_m = 0.2", "distance_m = -0.2", r"lidar.distance_m: .*\(got "),
         (load_rig, "yaw_deg = 45.0", "yaw_degrees = 45.0", "lidar.yaw_deg: is missing"),
-        (load_rig, "x_max_m = 0.575", "x_max_m = 0.1", r"object_box: .*x_min_m < x_max_m .*\(got .*x_max_m = 0.1"),
-        (load_rig, "z_far_m = 0.4", "z_far_m = 0.1", r"box: .*z_near_m < z_far_m \(got .*, z_far_m = 0.1\)"),
+        (
+            load_rig,
+            "x_max_m = 0.575",
+            "x_max_m = 0.1",
+            r"object_box: .*x_min_m < x_max_m .*\(got .*x_max_m = 0.1",
+        ),
+        (
+            load_rig,
+            "z_far_m = 0.4",
+            "z_far_m = 0.1",
+            r"box: .*z_near_m < z_far_m \(got .*, z_far_m = 0.1\)",
+        ),
         (load_rig, 'name = "paper-rig"', 'name = "paper-rig"\nroof = 1', r"roof: .*\(got "),
         (load_wall, "schema_version = 3", "schema_version = 4", "3.*got 4"),
         (load_wall, "schema_version = 3", "schema_version = 0", "schema_version: .*got 0"),
-        (load_wall, 'reference_sha256 = ""', 'reference_sha256 = "abc"', "reference_sha256: .*got 'abc'"),
+        (
+            load_wall,
+            'reference_sha256 = ""',
+            'reference_sha256 = "abc"',
+            "reference_sha256: .*got 'abc'",
+        ),
         (load_wall, "frames = 60", "frames = 60\nmood = 1", "mood: .*got 1"),
         (load_wall, "pitch_deg = ", "pitch_deg = 1", r"rig\.lidar"),
         (load_wall, "\ndistance_m = 0.2", "\ndistance_m = 0.3", r"rig\.lidar"),
@@ -127,9 +166,15 @@ MATRIX_END = "0.0,\n        0.0,\n        0.0,\n        "
     ],
 )
 def test_file_error_names_field_and_value_in_one_line(
-    tmp_path: Path, record: WallRecord, load: Callable[[Path], object], old: str, new: str, problem: str
+    tmp_path: Path,
+    record: WallRecord,
+    load: Callable[[Path], object],
+    old: str,
+    new: str,
+    problem: str,
 ) -> None:
-    text, path = dump_toml(record if load is load_wall else load_rig("paper-rig")), tmp_path / "file.toml"
+    text = dump_toml(record if load is load_wall else load_rig("paper-rig"))
+    path = tmp_path / "file.toml"
     assert old in text
     path.write_text(text.replace(old, new, 1), encoding="utf-8")
     with pytest.raises(RecordFileError, match=problem) as caught:
@@ -142,7 +187,11 @@ def test_file_error_names_field_and_value_in_one_line(
 def test_file_of_another_kind_or_none_is_refused(tmp_path: Path, content: bytes) -> None:
     path = tmp_path / "wall.toml"
     path.write_bytes(content)
-    for read, word in ((path, r"wall\.toml"), (tmp_path / "none.toml", "calibrate --wall"), (tmp_path, tmp_path.name)):
+    for read, word in (
+        (path, r"wall\.toml"),
+        (tmp_path / "none.toml", "calibrate --wall"),
+        (tmp_path, tmp_path.name),
+    ):
         with pytest.raises(RecordFileError, match=word):
             load_wall(read)
     for name in ("no-such-rig", "."):
@@ -164,12 +213,15 @@ def wall() -> BareWall:
     for _ in range(FRAMES):
         depth_m = (0.2 + 0.001 * generator.standard_normal(SHAPE)).astype(np.float32)
         ir = generator.integers(40, 50, SHAPE).astype(np.uint8)
-        ir[0, 0], depth_m[0, 1] = 255, np.nan
+        ir[0, 0] = 255
+        depth_m[0, 1] = np.nan
         statistics.add(depth_m, ir, np.full(CELLS, 0.2, np.float32), np.full(CELLS, 45, np.float32))
     for celsius in (30.0, 32.0):
         statistics.add_temperatures({"ldd_temperature": celsius})
     statistics.add_temperatures({})
-    return statistics.reference(np.ones(SHAPE, np.bool_), serial="f1", settings={"laser_power": 40.0})
+    return statistics.reference(
+        np.ones(SHAPE, np.bool_), serial="f1", settings={"laser_power": 40.0}
+    )
 
 
 @given(st.floats(-1e6, 1e6), st.floats(1e-3, 1e3), st.integers(2, 40))
@@ -190,7 +242,9 @@ def test_moments_leave_out_nan() -> None:
     np.testing.assert_array_equal(moments.spread(), [[np.sqrt(2.0), np.nan]])
 
 
-def test_reference_holds_means_saturation_and_temperatures_and_survives_a_file(tmp_path: Path, wall: BareWall) -> None:
+def test_reference_holds_means_saturation_and_temperatures_and_survives_a_file(
+    tmp_path: Path, wall: BareWall
+) -> None:
     assert wall.frames == FRAMES
     assert wall.saturated[0, 0] == wall.saturated.sum() == 1.0
     assert np.isnan(wall.depth_m[0, 1])
@@ -203,7 +257,9 @@ def test_reference_holds_means_saturation_and_temperatures_and_survives_a_file(t
         np.testing.assert_equal(getattr(read, name), value)
 
 
-def test_load_measured_needs_the_reference_of_its_record(tmp_path: Path, record: WallRecord, wall: BareWall) -> None:
+def test_load_measured_needs_the_reference_of_its_record(
+    tmp_path: Path, record: WallRecord, wall: BareWall
+) -> None:
     assert load_measured(written(tmp_path, record)).reference is None
     beside = tmp_path / "wall.npz"
     named = {"reference": "wall.npz", "reference_sha256": save_reference(beside, wall)}

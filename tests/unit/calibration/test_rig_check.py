@@ -4,8 +4,23 @@ import numpy as np
 import pytest
 from nlos_calibration import rig_check
 from nlos_calibration.geometry import wall_from_plane
-from nlos_calibration.rig import DeviceConstants, Extent, LidarPose, ObjectBox, Occluder, PinholeRecord, Rig, load_rig
-from nlos_calibration.rig_check import combined, judge_rig, lidar_visible_share, rig_difference, wall_visible_share
+from nlos_calibration.rig import (
+    DeviceConstants,
+    Extent,
+    LidarPose,
+    ObjectBox,
+    Occluder,
+    PinholeRecord,
+    Rig,
+    load_rig,
+)
+from nlos_calibration.rig_check import (
+    combined,
+    judge_rig,
+    lidar_visible_share,
+    rig_difference,
+    wall_visible_share,
+)
 from nlos_calibration.wall_record import OccluderRecord
 from numpy.typing import NDArray
 
@@ -19,7 +34,11 @@ def changed(**fields: object) -> Rig:
 
 
 def rig(
-    x_m: float = 0.2, gap_m: float = 0.1, distance_m: float = 0.2, yaw_deg: float = 45.0, pitch_deg: float = 0.0
+    x_m: float = 0.2,
+    gap_m: float = 0.1,
+    distance_m: float = 0.2,
+    yaw_deg: float = 45.0,
+    pitch_deg: float = 0.0,
 ) -> Rig:
     lidar = LidarPose(distance_m=distance_m, yaw_deg=yaw_deg, pitch_deg=pitch_deg)
     return changed(lidar=lidar, occluder=Occluder(x_m=x_m, z_min_m=gap_m))
@@ -34,7 +53,9 @@ def seen_by(bench: Rig) -> rig_check.Footprint:
     return rig_check.footprint(bench.wall_from_lidar, bench.pinhole, bench.wall)
 
 
-def problems(bench: Rig, *, tilt_deg: float | None = None, measured: bool = True) -> tuple[str, ...]:
+def problems(
+    bench: Rig, *, tilt_deg: float | None = None, measured: bool = True
+) -> tuple[str, ...]:
     if not measured or bench.occluder is None:
         return judge_rig(bench, seen_by(bench), None)
     at = bench.occluder
@@ -50,17 +71,27 @@ def amount(told: str, unit: str) -> int:
 @pytest.mark.parametrize(
     "bench",
     [
-        *(rig(distance_m=m, yaw_deg=deg) for m in (0.15, 0.2, 0.3) for deg in (15.0, 30.0, 45.0, 60.0, 75.0)),
+        *(
+            rig(distance_m=m, yaw_deg=deg)
+            for m in (0.15, 0.2, 0.3)
+            for deg in (15.0, 30.0, 45.0, 60.0, 75.0)
+        ),
         *(load_rig("bare-wall"), rig(distance_m=0.36), rig(yaw_deg=79.0, distance_m=0.3)),
     ],
 )
-def test_judge_rig_finds_no_problems_in_the_papers_poses_and_those_that_the_wall_judges(bench: Rig) -> None:
+def test_judge_rig_finds_no_problems_in_the_papers_poses_and_those_that_the_wall_judges(
+    bench: Rig,
+) -> None:
     assert problems(bench) == problems(bench, measured=False) == ()
 
 
 @pytest.mark.parametrize(
     ("gap_m", "advice"),
-    [(0.032, r"0\.032 m.* 2 cm away"), (0.23, r"0\.230 m.* 3 cm towards"), (0.0485, r"0\.04[89] m")],
+    [
+        (0.032, r"0\.032 m.* 2 cm away"),
+        (0.23, r"0\.230 m.* 3 cm towards"),
+        (0.0485, r"0\.04[89] m"),
+    ],
 )
 def test_judge_rig_advises_on_a_gap_out_of_range(gap_m: float, advice: str) -> None:
     assert any(re.search(advice, told) for told in problems(rig(gap_m=gap_m)))
@@ -75,14 +106,18 @@ def test_judge_rig_advises_on_a_gap_out_of_range(gap_m: float, advice: str) -> N
         *((0.2, 3.0, "+3.0 degrees", "towards"), (0.2, -3.0, "-3.0 degrees", "away")),
     ],
 )
-def test_judge_rig_advises_on_a_misplaced_sheet(x_m: float, tilt_deg: float | None, fault: str, move: str) -> None:
+def test_judge_rig_advises_on_a_misplaced_sheet(
+    x_m: float, tilt_deg: float | None, fault: str, move: str
+) -> None:
     (told,) = problems(rig(x_m), tilt_deg=tilt_deg)
     assert fault in told
     assert move in told
     assert tilt_deg is None or problems(rig(), tilt_deg=tilt_deg / 2) == ()
 
 
-@pytest.mark.parametrize("bench", [rig(gap_m=0.2), rig(0.3, 0.15), rig(gap_m=0.18, distance_m=0.15, yaw_deg=70.0)])
+@pytest.mark.parametrize(
+    "bench", [rig(gap_m=0.2), rig(0.3, 0.15), rig(gap_m=0.18, distance_m=0.15, yaw_deg=70.0)]
+)
 def test_judge_rig_advises_the_least_move_that_hides(bench: Rig) -> None:
     (told,) = problems(bench)
     assert re.search(r"\d+\.\d%", told)
@@ -101,9 +136,17 @@ def low_box(x_min_m: float) -> object:
 
 
 def test_judge_rig_moves_sheet_or_object_if_no_gap_hides_it() -> None:
-    (told,) = problems(rig(0.32, 0.06, distance_m=0.3, yaw_deg=50.0).model_copy(update={"object_box": low_box(0.33)}))
+    (told,) = problems(
+        rig(0.32, 0.06, distance_m=0.3, yaw_deg=50.0).model_copy(
+            update={"object_box": low_box(0.33)}
+        )
+    )
     assert "cm towards the lidar" in told
-    (told,) = problems(rig(0.05, 0.055, distance_m=0.05, yaw_deg=70.0).model_copy(update={"object_box": low_box(0.1)}))
+    (told,) = problems(
+        rig(0.05, 0.055, distance_m=0.05, yaw_deg=70.0).model_copy(
+            update={"object_box": low_box(0.1)}
+        )
+    )
     assert "move the object" in told
     (told,) = problems(rig(yaw_deg=70.0).model_copy(update={"occluder": None}))
     assert "0.20 m" in told
@@ -138,17 +181,23 @@ def test_judge_rig_advises_the_least_turn_onto_the_wall() -> None:
 
 def test_combined_verdict_joins_wall_and_rig() -> None:
     assert combined("good", "all is well", ()) == ("good", "all is well")
-    assert combined("good", "all is well", ("a: b", "c: d")) == ("out of range", "all is well; a: b; c: d")
+    assert combined("good", "all is well", ("a: b", "c: d")) == (
+        "out of range",
+        "all is well; a: b; c: d",
+    )
     assert combined("doubtful", "bent", ("a: b",)) == ("doubtful", "bent; a: b")
     assert combined("out of range", "far", ("a: b",)) == ("out of range", "far; a: b")
 
 
 def points_in_box(count: int) -> NDArray[np.float64]:
-    low, high = (BOX.x_min_m, BOX.y_min_m, BOX.z_near_m), (BOX.x_max_m, BOX.y_max_m, BOX.z_far_m)
+    low = (BOX.x_min_m, BOX.y_min_m, BOX.z_near_m)
+    high = (BOX.x_max_m, BOX.y_max_m, BOX.z_far_m)
     return np.random.default_rng(0).uniform(low, high, (count, 3))
 
 
-def passes(rig: Rig, eye_m: NDArray[np.float64], points_m: NDArray[np.float64]) -> NDArray[np.bool_]:
+def passes(
+    rig: Rig, eye_m: NDArray[np.float64], points_m: NDArray[np.float64]
+) -> NDArray[np.bool_]:
     """Return whether the straight line from the eye (3,) to points (n, 3) misses the occluder."""
     share = (rig.occluder.x_m - eye_m[0]) / (points_m[:, 0] - eye_m[0])
     return eye_m[2] + share * (points_m[:, 2] - eye_m[2]) < rig.occluder.z_min_m
@@ -165,24 +214,36 @@ def passes(rig: Rig, eye_m: NDArray[np.float64], points_m: NDArray[np.float64]) 
     ],
 )
 def test_lidar_sees_the_share_of_sampled_points(bench: Rig) -> None:
-    points_m, pose, pinhole = points_in_box(40_000), bench.wall_from_lidar, bench.pinhole
+    points_m = points_in_box(40_000)
+    pose = bench.wall_from_lidar
+    pinhole = bench.pinhole
     seen = (points_m - pose[:3, 3]) @ pose[:3, :3]
     with np.errstate(divide="ignore"):
-        column, row = pinhole.fx * seen[:, 0] / seen[:, 2] + pinhole.ppx, pinhole.fy * seen[:, 1] / seen[:, 2]
+        column = pinhole.fx * seen[:, 0] / seen[:, 2] + pinhole.ppx
+        row = pinhole.fy * seen[:, 1] / seen[:, 2]
     row = row + pinhole.ppy
     inside = (seen[:, 2] > 0) & (column > -0.5) & (column < 639.5) & (row > -0.5) & (row < 479.5)
     share = (inside & passes(bench, pose[:3, 3], points_m)).mean()
     assert lidar_visible_share(bench, BOX) == pytest.approx(share, abs=0.008)
 
 
-@pytest.mark.parametrize("bench", [rig(0.2, 0.1, yaw_deg=-45.0), rig(0.3, 0.05, 0.15, 15.0), rig(0.2, 0.1)])
+@pytest.mark.parametrize(
+    "bench", [rig(0.2, 0.1, yaw_deg=-45.0), rig(0.3, 0.05, 0.15, 15.0), rig(0.2, 0.1)]
+)
 def test_wall_sees_as_much_as_its_best_lit_cell(bench: Rig) -> None:
     seen = seen_by(bench)
     cells = seen.cells_m[32][seen.on_wall[32]]
-    points_m, lidar_m = points_in_box(4000), bench.wall_from_lidar[:3, 3]
+    points_m = points_in_box(4000)
+    lidar_m = bench.wall_from_lidar[:3, 3]
     feet_m = np.column_stack([cells, np.zeros(len(cells))])
-    lit = [foot for foot in feet_m if foot[0] <= bench.occluder.x_m or passes(bench, lidar_m, foot[np.newaxis])[0]]
-    best = max((passes(bench, foot, points_m) | (foot[0] >= bench.occluder.x_m)).mean() for foot in lit)
+    lit = [
+        foot
+        for foot in feet_m
+        if foot[0] <= bench.occluder.x_m or passes(bench, lidar_m, foot[np.newaxis])[0]
+    ]
+    best = max(
+        (passes(bench, foot, points_m) | (foot[0] >= bench.occluder.x_m)).mean() for foot in lit
+    )
     assert wall_visible_share(bench, BOX, seen) == pytest.approx(best, abs=0.03)
 
 
@@ -197,15 +258,20 @@ def test_wall_sees_nothing_from_unlit_wall() -> None:
 
 def test_footprint_is_the_field_of_view_along_the_beams() -> None:
     seen = seen_by(on_wall(rig(yaw_deg=0.0), *WALL))
-    wide, tall = 0.2 * np.tan(np.radians(35.0)), 0.2 * np.tan(np.radians(27.5))
+    wide = 0.2 * np.tan(np.radians(35.0))
+    tall = 0.2 * np.tan(np.radians(27.5))
     expected = [[-wide, tall], [wide, tall], [wide, -tall], [-wide, -tall]]
     np.testing.assert_allclose(seen.corners_m, expected, atol=1e-6)
     assert seen.cells_m.shape == (64, 80, 2)
     assert seen.share == 1.0
     bench = on_wall(rig(yaw_deg=40.0, pitch_deg=10.0), *WALL)
-    world = np.concatenate([seen_by(bench).cells_m, np.zeros((64, 80, 1)), np.ones((64, 80, 1))], axis=-1)
+    world = np.concatenate(
+        [seen_by(bench).cells_m, np.zeros((64, 80, 1)), np.ones((64, 80, 1))], axis=-1
+    )
     lidar = (world @ np.linalg.inv(bench.wall_from_lidar).T)[..., :3]
-    np.testing.assert_allclose(lidar / lidar[..., 2:], bench.pinhole.scaled(80, 64).rays(), atol=1e-9)
+    np.testing.assert_allclose(
+        lidar / lidar[..., 2:], bench.pinhole.scaled(80, 64).rays(), atol=1e-9
+    )
 
 
 def test_footprint_of_beams_that_miss_the_wall_is_nan() -> None:
@@ -226,7 +292,9 @@ def test_rig_difference_ignores_calibration_error_and_size() -> None:
         assert rig_difference(rig, PAPER) == ()
 
 
-SMALL_BOX = ObjectBox(x_min_m=0.3, x_max_m=0.5, y_min_m=-0.1, y_max_m=0.1, z_near_m=0.1, z_far_m=0.4)
+SMALL_BOX = ObjectBox(
+    x_min_m=0.3, x_max_m=0.5, y_min_m=-0.1, y_max_m=0.1, z_near_m=0.1, z_far_m=0.4
+)
 
 
 @pytest.mark.parametrize(

@@ -17,7 +17,12 @@ def values(**fields: Any) -> dict[str, str]:
 @pytest.mark.parametrize(
     ("std_m", "text"),
     [
-        *((1e-9, "200.00 ± 0.01 mm"), (0.0, "200.00 ± 0.01 mm"), (1e-4, "200.00 ± 0.20 mm"), (5e-4, "200.0 ± 1.0 mm")),
+        *(
+            (1e-9, "200.00 ± 0.01 mm"),
+            (0.0, "200.00 ± 0.01 mm"),
+            (1e-4, "200.00 ± 0.20 mm"),
+            (5e-4, "200.0 ± 1.0 mm"),
+        ),
         *((0.0016, "200 ± 3 mm"), (0.008, "200 ± 16 mm"), (None, "200.0 mm")),
     ],
 )
@@ -50,9 +55,13 @@ def test_facts_hold_quantities_with_intervals() -> None:
 
 
 def test_facts_hold_offset_board_occluder_and_footprint() -> None:
-    found = OccluderRecord(source="detected", x_m=0.21, gap_m=0.09, x_std_m=0.001, gap_std_m=0.001, tilt_deg=-1.5)
+    found = OccluderRecord(
+        source="detected", x_m=0.21, gap_m=0.09, x_std_m=0.001, gap_std_m=0.001, tilt_deg=-1.5
+    )
     warm = {"ldd_temperature": 40.0, "apd_temperature": 35.5}
-    facts = values(**OFFSET, occluder=found, board=BOARD, footprint_share=0.875, temperatures_c=warm)
+    facts = values(
+        **OFFSET, occluder=found, board=BOARD, footprint_share=0.875, temperatures_c=warm
+    )
     assert facts["range offset"] == "-4.5 ± 1.0 mm"
     assert (facts["occluder's edge (detected)"], facts["occluder's gap (detected)"]) == (
         "210.0 ± 2.0 mm",
@@ -71,6 +80,10 @@ def test_facts_hold_offset_board_occluder_and_footprint() -> None:
 )
 def test_facts_compare_board_with_depth(apart: dict[str, Any], words: str) -> None:
     board = BOARD.model_copy(update={"depth_refused": "mirror", **apart})
-    [meaning] = [row[2] for row in wall_facts(RECORD.model_copy(update={"board": board})) if row[0] == "printed board"]
+    [meaning] = [
+        row[2]
+        for row in wall_facts(RECORD.model_copy(update={"board": board}))
+        if row[0] == "printed board"
+    ]
     assert words in meaning
     assert "24 corners; used: depth" in meaning

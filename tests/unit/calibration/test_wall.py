@@ -10,7 +10,15 @@ from nlos_calibration.errors import CalibrationError, WallRefusedError
 from nlos_calibration.flatness import Flatness, Ripples, flatness, ripples
 from nlos_calibration.plane import PlaneFit, fit_depth
 from nlos_calibration.range_offset import TAPE_STD_M, FitWith, fit_with_tape_distance
-from nlos_calibration.wall import WallFit, WallMeasures, check_flat, fit_wall, judge, measures_of, warnings
+from nlos_calibration.wall import (
+    WallFit,
+    WallMeasures,
+    check_flat,
+    fit_wall,
+    judge,
+    measures_of,
+    warnings,
+)
 
 from nlos_cam.calibrate import view
 
@@ -19,7 +27,13 @@ RAYS = PINHOLE.rays()
 COLUMN = np.broadcast_to(np.arange(160), (120, 160))
 ROW = np.broadcast_to(np.arange(120)[:, np.newaxis], (120, 160))
 FLAT = Flatness(
-    bend_m=0.0, bend_deg=0.0, bend_std_m=1e-5, bend_std_deg=0.001, offset_m=0.0, offset_bend_m=0.0, offset_bend_deg=0.0
+    bend_m=0.0,
+    bend_deg=0.0,
+    bend_std_m=1e-5,
+    bend_std_deg=0.001,
+    offset_m=0.0,
+    offset_bend_m=0.0,
+    offset_bend_deg=0.0,
 )
 OFFSET = replace(FLAT, bend_m=0.006, bend_deg=0.5, offset_m=0.0045)
 SPREAD = np.array([[4.0, 1.0, -0.5], [1.0, 2.0, 0.3], [-0.5, 0.3, 1.0]])
@@ -31,17 +45,24 @@ def bare(distance_m: float = 0.2, yaw_deg: float = 45.0, pitch_deg: float = 0.0)
 
 
 def test_wall_depth_lies_on_the_wall_or_is_infinite() -> None:
-    depth_m, wall_from_lidar = bare(0.23, 30.0, 10.0), view(0.23, 30.0, 10.0, PINHOLE).pose
+    depth_m = bare(0.23, 30.0, 10.0)
+    wall_from_lidar = view(0.23, 30.0, 10.0, PINHOLE).pose
     points = PINHOLE.rays() * depth_m[..., np.newaxis]
-    np.testing.assert_allclose(points @ wall_from_lidar[2, :3] + wall_from_lidar[2, 3], 0.0, atol=1e-12)
+    np.testing.assert_allclose(
+        points @ wall_from_lidar[2, :3] + wall_from_lidar[2, 3], 0.0, atol=1e-12
+    )
     assert np.isinf(view(0.2, 75.0, 0.0, PINHOLE).depth_m[:, -1]).all()
 
 
 def test_fit_wall_of_exact_depth_is_exact() -> None:
     fit = fit_wall(bare(0.23, 30.0, -10.0), PINHOLE, np.random.default_rng(0))
-    np.testing.assert_allclose(fit.wall_from_lidar, view(0.23, 30.0, -10.0, PINHOLE).pose, atol=1e-9)
+    np.testing.assert_allclose(
+        fit.wall_from_lidar, view(0.23, 30.0, -10.0, PINHOLE).pose, atol=1e-9
+    )
     assert (fit.yaw_deg, fit.pitch_deg) == pytest.approx((30.0, -10.0))
-    assert fit.facing_deg == pytest.approx(np.degrees(np.arccos(np.cos(np.radians(30)) * np.cos(np.radians(10)))))
+    assert fit.facing_deg == pytest.approx(
+        np.degrees(np.arccos(np.cos(np.radians(30)) * np.cos(np.radians(10))))
+    )
     assert (fit.verdict, fit.inlier_fraction) == ("good", 1.0)
     assert fit.residual_m < 1e-9
 
@@ -64,7 +85,9 @@ def test_fit_wall_refuses_what_is_not_a_wall_in_view() -> None:
         (0.200, 75.5, "75.5 degrees .* 1 degree ", "towards"),
     ],
 )
-def test_judge_out_of_range_advises_a_distance(distance_m: float, facing_deg: float, amounts: str, way: str) -> None:
+def test_judge_out_of_range_advises_a_distance(
+    distance_m: float, facing_deg: float, amounts: str, way: str
+) -> None:
     verdict, advice = judge(distance_m, facing_deg, FLAT, 0.0)
     assert verdict == "out of range"
     assert re.search(f"{amounts}.*{way}", advice)
@@ -74,13 +97,16 @@ def test_judge_out_of_range_advises_a_distance(distance_m: float, facing_deg: fl
 @pytest.mark.parametrize("facing_deg", [3.3, 14.2, 76.1, 88.0])
 def test_judge_advice_when_followed_leads_into_range(distance_m: float, facing_deg: float) -> None:
     _, advice = judge(distance_m, facing_deg, FLAT, 0.0)
-    (by_cm,), by_deg = re.findall(r" (\d+) cm", advice), int(re.findall(r" (\d+) degree", advice)[-1])
+    (by_cm,) = re.findall(r" (\d+) cm", advice)
+    by_deg = int(re.findall(r" (\d+) degree", advice)[-1])
     moved_m = distance_m + (1 if distance_m < 0.15 else -1) * int(by_cm) / 100.0
     turned_deg = facing_deg + (1 if facing_deg < 15.0 else -1) * by_deg
     assert judge(moved_m, turned_deg, FLAT, 0.0)[0] == "good"
 
 
-@pytest.mark.parametrize(("distance_m", "facing_deg"), [(0.15, 15.0), (0.3, 75.0), (0.1495, 14.9), (0.3005, 75.1)])
+@pytest.mark.parametrize(
+    ("distance_m", "facing_deg"), [(0.15, 15.0), (0.3, 75.0), (0.1495, 14.9), (0.3005, 75.1)]
+)
 def test_judge_ranges_include_ends_and_tolerance(distance_m: float, facing_deg: float) -> None:
     assert judge(distance_m, facing_deg, FLAT, 0.0)[0] == "good"
 
@@ -95,7 +121,9 @@ def test_judge_ranges_include_ends_and_tolerance(distance_m: float, facing_deg: 
         (OFFSET, 0.0, ["+4.5 mm", "--tape-m"]),
     ],
 )
-def test_judge_doubts_what_may_be_another_plane(flat: Flatness, ripple_m: float, amounts: list[str]) -> None:
+def test_judge_doubts_what_may_be_another_plane(
+    flat: Flatness, ripple_m: float, amounts: list[str]
+) -> None:
     check_flat(flat, ripple_m)
     verdict, advice = judge(0.11, 45.0, flat, ripple_m)
     assert verdict == "doubtful"
@@ -104,11 +132,20 @@ def test_judge_doubts_what_may_be_another_plane(flat: Flatness, ripple_m: float,
 
 
 def test_check_flat_refuses_what_surely_is_not_one_plane() -> None:
-    refused = [replace(FLAT, bend_deg=1.2), replace(FLAT, bend_m=0.006), replace(OFFSET, offset_bend_deg=0.4)]
-    for flat, ripple_m, amount in [*((flat, 0.0, "mm") for flat in refused), (FLAT, 0.0025, r"2\.5 mm")]:
+    refused = [
+        replace(FLAT, bend_deg=1.2),
+        replace(FLAT, bend_m=0.006),
+        replace(OFFSET, offset_bend_deg=0.4),
+    ]
+    for flat, ripple_m, amount in [
+        *((flat, 0.0, "mm") for flat in refused),
+        (FLAT, 0.0025, r"2\.5 mm"),
+    ]:
         with pytest.raises(WallRefusedError, match=amount):
             check_flat(flat, ripple_m)
-    check_flat(replace(FLAT, bend_m=0.006, bend_deg=1.2, bend_std_m=0.002, bend_std_deg=0.5), 0.0)  # noise alone
+    check_flat(
+        replace(FLAT, bend_m=0.006, bend_deg=1.2, bend_std_m=0.002, bend_std_deg=0.5), 0.0
+    )  # noise alone
 
 
 def test_warnings_of_ripples_and_noise_keep_the_verdict() -> None:
@@ -128,10 +165,14 @@ def drawn(slopes: Float64, covariance: Float64, count: int = 4000) -> list[WallM
     return [measures_of(one, covariance) for one in some]
 
 
-@pytest.mark.parametrize(("yaw_deg", "pitch_deg"), [(45.0, 0.0), (-60.0, 10.0), (15.0, -12.0), (74.0, 3.0)])
+@pytest.mark.parametrize(
+    ("yaw_deg", "pitch_deg"), [(45.0, 0.0), (-60.0, 10.0), (15.0, -12.0), (74.0, 3.0)]
+)
 def test_measures_of_uncertainties_are_the_spread(yaw_deg: float, pitch_deg: float) -> None:
-    slopes, covariance = slopes_of(yaw_deg, pitch_deg), 1e-6 * SPREAD
-    told, others = measures_of(slopes, covariance), drawn(slopes, covariance)
+    slopes = slopes_of(yaw_deg, pitch_deg)
+    covariance = 1e-6 * SPREAD
+    told = measures_of(slopes, covariance)
+    others = drawn(slopes, covariance)
     for name in ("distance_m", "yaw_deg", "pitch_deg", "facing_deg"):
         stem, unit = name.rsplit("_", 1)
         spread = float(np.std([getattr(other, name) for other in others]))
@@ -140,10 +181,18 @@ def test_measures_of_uncertainties_are_the_spread(yaw_deg: float, pitch_deg: flo
 
 @pytest.mark.parametrize("facing_deg", [0.0, 0.3, 5.0])
 @pytest.mark.parametrize("shape", [np.eye(3), SPREAD])
-def test_measures_of_a_wall_faced_squarely_reach_back_to_zero(facing_deg: float, shape: Float64) -> None:
-    """Near 0 the angle cannot be negative: the estimate is too large, and its interval must reach back to 0."""
-    slopes, covariance = slopes_of(facing_deg, 0.0), 1e-4 * shape  # tenths of a degree
-    inside = [abs(one.facing_deg - facing_deg) <= 1.96 * one.facing_std_deg for one in drawn(slopes, covariance)]
+def test_measures_of_a_wall_faced_squarely_reach_back_to_zero(
+    facing_deg: float, shape: Float64
+) -> None:
+    """Near 0 the angle cannot be negative: the estimate is too large, and its interval must reach
+    back to 0.
+    """
+    slopes = slopes_of(facing_deg, 0.0)
+    covariance = 1e-4 * shape  # tenths of a degree
+    inside = [
+        abs(one.facing_deg - facing_deg) <= 1.96 * one.facing_std_deg
+        for one in drawn(slopes, covariance)
+    ]
     assert 0.93 <= np.mean(inside) <= 0.99
 
 
@@ -151,7 +200,13 @@ WALL_M = view(0.2, 20.0, 6.0, PINHOLE).depth_m
 
 
 def plane_of(depth_m: Float64, *, noise: float = 1.0, seed: int = 0) -> PlaneFit:
-    noisy_m = depth_m + noise * depth_noise_m(WALL_M) * np.random.default_rng(seed).standard_normal(depth_m.shape) / 5
+    noisy_m = (
+        depth_m
+        + noise
+        * depth_noise_m(WALL_M)
+        * np.random.default_rng(seed).standard_normal(depth_m.shape)
+        / 5
+    )
     samples = MeanNoise(np.full(depth_m.size, 25.0))
     return fit_depth(RAYS.reshape(-1, 3), noisy_m.ravel(), np.random.default_rng(0), samples)
 
@@ -173,7 +228,9 @@ def test_flatness_of_noise_has_no_bend(yaw_deg: float, noise: float) -> None:
 
 
 def test_flatness_bend_is_the_angle_that_each_side_turns() -> None:
-    """Two walls that meet in the middle of the view, 2 degrees apart: each is 1 degree off the mean."""
+    """Two walls that meet in the middle of the view, 2 degrees apart: each is 1 degree off the
+    mean.
+    """
     slope = np.tan(np.radians(2.0)) * (np.maximum(COLUMN - 80, 0) / PINHOLE.fx) * 0.2
     flat = judged(WALL_M + slope)
     assert flat.bend_deg == pytest.approx(1.0, abs=0.35)
@@ -206,9 +263,13 @@ def test_ripples_are_rarely_found_in_independent_noise() -> None:
 def test_ripples_have_their_size_and_widen_the_covariance(amplitude_m: float) -> None:
     wave_m = amplitude_m * np.sin(2.0 * np.pi * COLUMN / 27.0)
     found = rippled(wave_m)
-    assert found.rms_m == pytest.approx(amplitude_m / np.sqrt(2.0), rel=0.15)  # the wall is nearly faced squarely
+    assert found.rms_m == pytest.approx(
+        amplitude_m / np.sqrt(2.0), rel=0.15
+    )  # the wall is nearly faced squarely
     assert found.correlation > 10.0
-    grown = np.linalg.eigvalsh(found.covariance - found.correlation * plane_of(WALL_M + wave_m).covariance)
+    grown = np.linalg.eigvalsh(
+        found.covariance - found.correlation * plane_of(WALL_M + wave_m).covariance
+    )
     assert grown.min() > -1e-9 * np.abs(found.covariance).max()
 
 
@@ -225,8 +286,12 @@ PITCH_DEG = 3.0
 
 
 def read_as(depth_m: Float64) -> FitWith:
-    """Return the wall fit, by offset, of a lidar that reads `depth_m` with a fifth of one sample's noise."""
-    noisy_m = depth_m + 0.2 * depth_noise_m(depth_m) * np.random.default_rng(0).standard_normal(depth_m.shape)
+    """Return the wall fit, by offset, of a lidar that reads `depth_m` with a fifth of one sample's
+    noise.
+    """
+    noisy_m = depth_m + 0.2 * depth_noise_m(depth_m) * np.random.default_rng(0).standard_normal(
+        depth_m.shape
+    )
 
     def fit_with(offset_m: float, origin_m: float) -> WallFit:
         return fit_wall(noisy_m + offset_m, PINHOLE, np.random.default_rng(0), origin_m=origin_m)
@@ -237,17 +302,23 @@ def read_as(depth_m: Float64) -> FitWith:
 @pytest.mark.parametrize("offset_m", [-0.0045, 0.003])
 @pytest.mark.parametrize("yaw_deg", [20.0, 45.0, 65.0])
 def test_tape_offset_is_added_to_depth_that_is_too_short(yaw_deg: float, offset_m: float) -> None:
-    """The beams meet at the front glass and every depth lacks the offset: the corrected pose is the true one."""
+    """The beams meet at the front glass and every depth lacks the offset: the corrected pose is the
+    true one.
+    """
     taped = fit_with_tape_distance(read_as(bare(0.2, yaw_deg, PITCH_DEG) - offset_m), 0.2)
     assert taped.cause == "depth"
     assert taped.offset_m == pytest.approx(offset_m, abs=3e-5)
-    np.testing.assert_allclose(taped.fit.wall_from_lidar, view(0.2, yaw_deg, PITCH_DEG, PINHOLE).pose, atol=3e-4)
+    np.testing.assert_allclose(
+        taped.fit.wall_from_lidar, view(0.2, yaw_deg, PITCH_DEG, PINHOLE).pose, atol=3e-4
+    )
     assert taped.fit.verdict == "good"
 
 
 @pytest.mark.parametrize("offset_m", [-0.0045, 0.0045])
 @pytest.mark.parametrize("yaw_deg", [20.0, 45.0, 65.0])
-def test_tape_offset_of_the_origin_moves_the_pose_along_the_axis(yaw_deg: float, offset_m: float) -> None:
+def test_tape_offset_of_the_origin_moves_the_pose_along_the_axis(
+    yaw_deg: float, offset_m: float
+) -> None:
     """Depth is right, but its zero lies offset_m nearer to the wall than the front glass."""
     true = view(0.2, yaw_deg, PITCH_DEG, PINHOLE).pose
     cosine = -true[2, 2]
@@ -270,7 +341,8 @@ def test_tape_that_agrees_changes_only_the_uncertainty() -> None:
 
 def test_tape_offset_is_less_certain_on_an_oblique_wall() -> None:
     squarely, obliquely = (
-        fit_with_tape_distance(read_as(bare(0.2, yaw_deg, PITCH_DEG)), 0.201) for yaw_deg in (20.0, 65.0)
+        fit_with_tape_distance(read_as(bare(0.2, yaw_deg, PITCH_DEG)), 0.201)
+        for yaw_deg in (20.0, 65.0)
     )
     assert squarely.offset_std_m == pytest.approx(TAPE_STD_M / np.cos(np.radians(20.0)), rel=0.02)
     assert obliquely.offset_std_m > 1.5 * squarely.offset_std_m

@@ -22,19 +22,25 @@ from nlos_cam.camera.l515 import L515Camera
     ],
 )
 def test_every_method_of_a_fake_is_one_of_the_sdk(fake: type, real: str) -> None:
-    methods = {name for name, _ in inspect.getmembers(fake, inspect.isfunction) if not name.startswith("_")}
+    methods = {
+        name for name, _ in inspect.getmembers(fake, inspect.isfunction) if not name.startswith("_")
+    }
     assert methods <= set(dir(getattr(load_sdk(), real)))
 
 
 def test_every_name_that_a_camera_uses_is_one_of_the_sdk() -> None:
-    sdk, real = FakeSdk(FakeLidar(usb="2.1", runs=(10**6,), laser_power=93.0)), load_sdk()
+    sdk = FakeSdk(FakeLidar(usb="2.1", runs=(10**6,), laser_power=93.0))
+    real = load_sdk()
     with L515Camera("l515", "", sdk=sdk, clock=NapClock()) as camera:
         next(iter(camera))
     assert {"laser_power", "visual_preset", "min_distance"} <= sdk.option.asked
     assert all(hasattr(real.option, name) for name in sdk.option.asked)
     assert all(hasattr(real.camera_info, name) for name in sdk.camera_info.asked)
     assert hasattr(real.timestamp_domain, FakeFrame.domain)
-    assert all(hasattr(real.stream, stream) and hasattr(real.format, form) for stream, form in FORMATS.items())
+    assert all(
+        hasattr(real.stream, stream) and hasattr(real.format, form)
+        for stream, form in FORMATS.items()
+    )
 
 
 def test_options_of_fake_and_sdk_look_and_fail_alike(noise_world: Any) -> None:
@@ -51,7 +57,8 @@ def test_options_of_fake_and_sdk_look_and_fail_alike(noise_world: Any) -> None:
 
 
 def test_handle_fails_once_its_lidar_was_unplugged() -> None:
-    lidar, option = FakeLidar(laser_power=93.0), FakeSdk().option
+    lidar = FakeLidar(laser_power=93.0)
+    option = FakeSdk().option
     device = FakeDevice(lidar, lidar.generation)
     [sensor] = device.query_sensors()
     sensor.set_option(option.laser_power, 12.0)
@@ -67,7 +74,8 @@ def test_handle_fails_once_its_lidar_was_unplugged() -> None:
 
 
 def test_color_camera_is_described_as_the_sdk_does() -> None:
-    sdk, lidar = load_sdk(), FakeLidar(runs=(3,))
+    sdk = load_sdk()
+    lidar = FakeLidar(runs=(3,))
     assert len(FakeDevice(lidar, 0).query_sensors()) == 1
     lidar.colour = lambda number: 50 * number
     depth, color = FakeDevice(lidar, 0).query_sensors()

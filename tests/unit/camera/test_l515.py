@@ -41,12 +41,16 @@ def test_usb_link_decides_the_resolution(
     device = FakeLidar(usb=usb)
     with fake_camera(device) as camera:
         assert (camera.intrinsics.width, camera.intrinsics.height) == size
-        assert [(profile.stream, profile.size) for profile in device.opened] == [(one, size) for one in FORMATS]
+        assert [(profile.stream, profile.size) for profile in device.opened] == [
+            (one, size) for one in FORMATS
+        ]
     assert ("USB 2.1" in caplog.text) == (usb == "2.1")
     assert usb == "2.1" or not caplog.records  # settings that take are not logged
 
 
-def test_settings_that_do_not_take_are_logged_once(fake_camera: Make, caplog: pytest.LogCaptureFixture) -> None:
+def test_settings_that_do_not_take_are_logged_once(
+    fake_camera: Make, caplog: pytest.LogCaptureFixture
+) -> None:
     lidar = FakeLidar()
     lidar.stubborn = {"min_distance"}
     lidar.refused = {"noise_filtering"}
@@ -54,12 +58,20 @@ def test_settings_that_do_not_take_are_logged_once(fake_camera: Make, caplog: py
     camera = fake_camera(lidar)
     for _ in range(2):
         with camera:
-            assert set(camera.differences) == {"min_distance", "noise_filtering", "invalidation_bypass"}
+            assert set(camera.differences) == {
+                "min_distance",
+                "noise_filtering",
+                "invalidation_bypass",
+            }
             lidar.deliver(range(1, 2))
             frame = next(iter(camera))
             assert frame.settings == lidar.options  # as read back
             assert frame.settings["min_distance"] == 9.0
-    for name, word in (("min_distance", "9"), ("noise_filtering", "out of range"), ("invalidation_bypass", "")):
+    for name, word in (
+        ("min_distance", "9"),
+        ("noise_filtering", "out of range"),
+        ("invalidation_bypass", ""),
+    ):
         [record] = [record for record in caplog.records if name in record.message]
         assert word in record.message
 
@@ -87,11 +99,17 @@ def test_setting_that_takes_late_is_set_once_more(fake_camera: Make) -> None:
     assert (lidar.did.count("min_distance"), lidar.did.count("noise_filtering")) == (2, 1)
 
 
-@pytest.mark.parametrize(("name", "nap", "wanted"), [("visual_preset", 0, 5.0), ("min_distance", 1, 0.0)])
-def test_setting_that_the_start_resets_is_set_again(fake_camera: Make, name: str, nap: int, wanted: float) -> None:
+@pytest.mark.parametrize(
+    ("name", "nap", "wanted"), [("visual_preset", 0, 5.0), ("min_distance", 1, 0.0)]
+)
+def test_setting_that_the_start_resets_is_set_again(
+    fake_camera: Make, name: str, nap: int, wanted: float
+) -> None:
     lidar = FakeLidar()
     reset = {name: lidar.factory[name]}
-    with fake_camera(lidar, clock=NapClock(lambda naps: lidar.options.update(reset if naps == nap else {}))) as camera:
+    with fake_camera(
+        lidar, clock=NapClock(lambda naps: lidar.options.update(reset if naps == nap else {}))
+    ) as camera:
         assert camera.differences == {}
     assert lidar.options[name] == wanted
 
@@ -104,7 +122,9 @@ def test_modes_that_alter_infrared_are_turned_off(fake_camera: Make) -> None:
         assert not {"enable_max_usable_range", "enable_ir_reflectivity"} & set(lidar.did)
 
 
-@pytest.mark.parametrize(("threshold", "found"), [(100.0, 93.0), (60.0, 53.0), (53.0, 53.0), (20.0, 13.0), (-1.0, 1.0)])
+@pytest.mark.parametrize(
+    ("threshold", "found"), [(100.0, 93.0), (60.0, 53.0), (53.0, 53.0), (20.0, 13.0), (-1.0, 1.0)]
+)
 def test_laser_is_turned_down_until_little_saturates(
     fake_camera: Make, caplog: pytest.LogCaptureFixture, threshold: float, found: float
 ) -> None:
@@ -114,8 +134,12 @@ def test_laser_is_turned_down_until_little_saturates(
         frame = next(iter(camera))
     assert frame.settings["laser_power"] == found
     if found > 1.0:
-        assert np.count_nonzero(frame.ir == 255) <= 0.001 * frame.ir.size  # none from before it was found
-    assert ("laser power 1:" in caplog.text) == ("2.0 %" in caplog.text) == (found == 1.0)  # with advice
+        assert (
+            np.count_nonzero(frame.ir == 255) <= 0.001 * frame.ir.size
+        )  # none from before it was found
+    assert (
+        ("laser power 1:" in caplog.text) == ("2.0 %" in caplog.text) == (found == 1.0)
+    )  # with advice
     assert ("lowered" in caplog.text) == (found < 93.0)
 
 
@@ -134,7 +158,9 @@ def test_laser_power_is_kept_when_a_device_comes_back(fake_camera: Make) -> None
 
 def test_two_cameras_share_a_context_and_keep_their_devices() -> None:
     sdk = FakeSdk(*(FakeLidar(serial, usb="2.1", runs=ENDLESS) for serial in ("f1", "f2")))
-    made = [L515Camera(f"l515:{serial}", serial, sdk=sdk, clock=NapClock()) for serial in ("f1", "f2")]
+    made = [
+        L515Camera(f"l515:{serial}", serial, sdk=sdk, clock=NapClock()) for serial in ("f1", "f2")
+    ]
     with made[0] as first, made[1] as second:
         for camera, serial in ((first, "f1"), (second, "f2")):
             assert camera.identity["serial"] == serial
@@ -142,7 +168,9 @@ def test_two_cameras_share_a_context_and_keep_their_devices() -> None:
     assert sdk.contexts == 1
 
 
-def test_identity_and_telemetry_omit_what_is_not_reported_or_measured_yet(fake_camera: Make) -> None:
+def test_identity_and_telemetry_omit_what_is_not_reported_or_measured_yet(
+    fake_camera: Make,
+) -> None:
     lidar = FakeLidar(apd_temperature=-9999.0, ldd_temperature=41.5)
     del lidar.info["usb_type_descriptor"]
     camera = fake_camera(lidar)
@@ -161,7 +189,8 @@ def test_identity_and_telemetry_omit_what_is_not_reported_or_measured_yet(fake_c
 
 
 @pytest.mark.parametrize(
-    ("wanted", "value"), [(0.0, 190.0), (194.0, 190.0), (197.0, 200.0), (9000.0, 6000.0), (200.0, 200.0)]
+    ("wanted", "value"),
+    [(0.0, 190.0), (194.0, 190.0), (197.0, 200.0), (9000.0, 6000.0), (200.0, 200.0)],
 )
 def test_option_is_set_to_the_nearest_value_in_range(wanted: float, value: float) -> None:
     lidar = FakeLidar(laser_power=93.0)
@@ -185,7 +214,9 @@ def test_options_are_changed_while_the_camera_runs(fake_camera: Make) -> None:
         assert {"laser_power", *NEAR_WALL} == set(offered)
         limits = offered["laser_power"]
         assert limits["min"] < limits["max"]
-        assert "laser_power is" in camera.set_option("laser_power", limits["min"] + 2 * limits["step"])
+        assert "laser_power is" in camera.set_option(
+            "laser_power", limits["min"] + 2 * limits["step"]
+        )
         assert lidar.options["laser_power"] == limits["min"] + 2 * limits["step"]
         assert "nearest" in camera.set_option("laser_power", 1e6)
         assert lidar.options["laser_power"] == limits["max"]
@@ -198,11 +229,17 @@ def test_options_are_changed_while_the_camera_runs(fake_camera: Make) -> None:
 
 @pytest.mark.parametrize("range_", [(0, 100, 1), (5, 95, 5), (0, 100, 30), (1, 3, 1), (0, 1, 0.01)])
 @pytest.mark.parametrize("part", [0.0, 0.15, 0.5, 0.77, 1.0, 2.0])
-def test_turn_down_falls_above_darkness_as_far_as_needed(range_: tuple[float, float, float], part: float) -> None:
+def test_turn_down_falls_above_darkness_as_far_as_needed(
+    range_: tuple[float, float, float], part: float
+) -> None:
     limits = PowerLimits(*range_)
-    threshold, tried = limits.min + part * (limits.max - limits.min), [limits.max]
+    threshold = limits.min + part * (limits.max - limits.min)
+    tried = [limits.max]
     settled = turn_down(
-        limits.max, limits, lambda: 0.5 if tried[-1] > threshold else 0.0, lambda power: not tried.append(power)
+        limits.max,
+        limits,
+        lambda: 0.5 if tried[-1] > threshold else 0.0,
+        lambda power: not tried.append(power),
     )
     assert settled.power == tried[-1]
     assert len(tried) <= STRIDES + 2
@@ -214,8 +251,12 @@ def test_turn_down_falls_above_darkness_as_far_as_needed(range_: tuple[float, fl
     assert settled.power <= threshold or not list(weaker(settled.power, limits))
 
 
-@pytest.mark.parametrize(("share", "tried"), [(0.0, []), (MAX_SATURATED, []), (None, []), (0.5, [83])])
-def test_turn_down_ends_at_good_or_no_image_or_a_stuck_power(share: float | None, tried: list[float]) -> None:
+@pytest.mark.parametrize(
+    ("share", "tried"), [(0.0, []), (MAX_SATURATED, []), (None, []), (0.5, [83])]
+)
+def test_turn_down_ends_at_good_or_no_image_or_a_stuck_power(
+    share: float | None, tried: list[float]
+) -> None:
     put: list[float] = []
     settled = turn_down(93, PowerLimits(0, 100, 1), lambda: share, put.append)
     assert (settled.power, settled.saturated, put) == (93, share, tried)

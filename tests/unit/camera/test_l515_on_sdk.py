@@ -13,7 +13,10 @@ from nlos_cam.recording.playback import ReplayCamera, verify
 from nlos_cam.render.sensor.sensor import SensedImages
 
 SATURATES_ABOVE = 60.0
-RANGES = dict.fromkeys(NEAR_WALL, (0.0, 6.0)) | {"visual_preset": (0.0, 6.0), "laser_power": (0.0, 100.0)}
+RANGES = dict.fromkeys(NEAR_WALL, (0.0, 6.0)) | {
+    "visual_preset": (0.0, 6.0),
+    "laser_power": (0.0, 100.0),
+}
 
 
 class Desk(SoftwareSdk):
@@ -21,13 +24,18 @@ class Desk(SoftwareSdk):
         pinhole = load_rig("paper-rig").pinhole
         super().__init__(pinhole)
         for name, (low, high) in RANGES.items():
-            self.lidar._sensor.add_option(getattr(self.sdk.option, name), self._range(low, high), True)
+            self.lidar._sensor.add_option(
+                getattr(self.sdk.option, name), self._range(low, high), True
+            )
         self.plug_in()
         self.even = np.ones((pinhole.height, pinhole.width), np.uint8)
 
     def _range(self, low: float, high: float) -> Any:
         made = self.sdk.option_range()
-        made.min, made.max, made.step, made.default = low, high, 1.0, high
+        made.min = low
+        made.max = high
+        made.step = 1.0
+        made.default = high
         return made
 
     def deliver(self, stop: threading.Event) -> None:
@@ -35,7 +43,11 @@ class Desk(SoftwareSdk):
         while not stop.wait(0.03):
             power = self.lidar._sensor.get_option(self.sdk.option.laser_power)
             ir = (255 if power > SATURATES_ABOVE else 48) * self.even
-            self.lidar.push(number, 1e9 + number / 30, SensedImages(np.uint16(800) * self.even, ir, 15 * self.even))
+            self.lidar.push(
+                number,
+                1e9 + number / 30,
+                SensedImages(np.uint16(800) * self.even, ir, 15 * self.even),
+            )
             number += 1
 
 
@@ -45,7 +57,8 @@ class Delivering(L515Camera):
     thread: threading.Thread | None = None
 
     def __init__(self, desk: Desk, recording: Recording) -> None:
-        self.desk, self.stop = desk, threading.Event()
+        self.desk = desk
+        self.stop = threading.Event()
         super().__init__("l515", "", sdk=desk, clock=NapClock(), recording=recording)
 
     def _prepare(self, sensor: Any) -> None:
@@ -72,5 +85,9 @@ def test_settings_take_on_librealsense_before_its_recording_which_is_whole(tmp_p
     assert found.streams == dict.fromkeys(("depth", "infrared", "confidence"), found.frames)
     with ReplayCamera(recording.path) as replayed:
         frames = list(replayed)
-    assert {name: frames[0].settings[name] for name in RANGES} == {name: settings[name] for name in RANGES}
-    assert all(frame.ir.max() == 48 for frame in frames)  # none from before the laser was turned down
+    assert {name: frames[0].settings[name] for name in RANGES} == {
+        name: settings[name] for name in RANGES
+    }
+    assert all(
+        frame.ir.max() == 48 for frame in frames
+    )  # none from before the laser was turned down

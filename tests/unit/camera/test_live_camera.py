@@ -32,7 +32,9 @@ def rises(frames: list[Frame]) -> bool:
         (next_one.frame_number - one.frame_number, next_one.timestamp_s - one.timestamp_s)
         for one, next_one in pairwise(frames)
     ]
-    return all(count > 0 and seconds * 30 == pytest.approx(count, abs=0.5) for count, seconds in steps)
+    return all(
+        count > 0 and seconds * 30 == pytest.approx(count, abs=0.5) for count, seconds in steps
+    )
 
 
 def holes(frames: list[Frame]) -> int:
@@ -52,10 +54,13 @@ def test_frames_are_in_metres_and_levels_and_none_is_early(fake_camera: Make) ->
     assert frames[0].truth_depth_m is None
 
 
-def test_device_without_a_stream_or_unit_or_that_fails_at_the_start_is_an_error(fake_camera: Make) -> None:
+def test_device_without_a_stream_or_unit_or_that_fails_at_the_start_is_an_error(
+    fake_camera: Make,
+) -> None:
     with pytest.raises(CameraError, match=r"confidence.*640 x 480"):
         fake_camera(FakeLidar(streams=("depth", "infrared")))
-    device, vanishing = FakeLidar(), FakeLidar()
+    device = FakeLidar()
+    vanishing = FakeLidar()
     device.start_error = RuntimeError("failed to set power state")
     with pytest.raises(CameraError, match="failed to set power state"):
         fake_camera(device).__enter__()
@@ -78,7 +83,9 @@ def test_device_without_a_stream_or_unit_or_that_fails_at_the_start_is_an_error(
     ],
     ids=["restart", "reset", "restarts", "replug", "replugs"],
 )
-def test_silent_device_delivers_again_as_set(fake_camera: Make, runs: tuple[int, ...], counts: dict[str, int]) -> None:
+def test_silent_device_delivers_again_as_set(
+    fake_camera: Make, runs: tuple[int, ...], counts: dict[str, int]
+) -> None:
     lidar = FakeLidar(usb="2.1", runs=runs)
     lidar.flaps = flaps = counts.get("replugged", 0)
     with impatient(fake_camera(lidar)) as camera:
@@ -97,7 +104,9 @@ def test_device_that_nothing_helps_is_lost_with_counts(fake_camera: Make) -> Non
     lidar = FakeLidar(usb="2.1", runs=(30,))
     with (
         impatient(fake_camera(lidar)) as camera,
-        pytest.raises(CameraLostError, match=r"(\d+) depth, \1 infrared, \1 confidence.*3 restarts"),
+        pytest.raises(
+            CameraLostError, match=r"(\d+) depth, \1 infrared, \1 confidence.*3 restarts"
+        ),
     ):
         list(camera)
     assert lidar.did[-1] == "close"
@@ -117,8 +126,11 @@ def test_frames_of_some_streams_count_as_incomplete(fake_camera: Make) -> None:
     assert rises(seen)
 
 
-def test_device_that_stays_away_or_is_slow_is_lost(fake_camera: Make, caplog: pytest.LogCaptureFixture) -> None:
-    lidar, other = FakeLidar("f1"), FakeLidar("f2")
+def test_device_that_stays_away_or_is_slow_is_lost(
+    fake_camera: Make, caplog: pytest.LogCaptureFixture
+) -> None:
+    lidar = FakeLidar("f1")
+    other = FakeLidar("f2")
     with impatient(fake_camera(lidar, other, serial="f1")) as camera:
         lidar.unplug()
         with pytest.raises(CameraLostError, match="60 s"):
@@ -136,7 +148,8 @@ def test_device_that_stays_away_or_is_slow_is_lost(fake_camera: Make, caplog: py
 
 
 def test_lost_calibration_is_cured_by_one_reset_or_an_error(fake_camera: Make) -> None:
-    cured, broken = FakeLidar(), FakeLidar()
+    cured = FakeLidar()
+    broken = FakeLidar()
     cured.uncalibrated = broken.uncalibrated = True
     camera = fake_camera(cured)
     assert (camera.counts, camera.intrinsics.width) == ({"reset": 1}, 640)
@@ -146,7 +159,8 @@ def test_lost_calibration_is_cured_by_one_reset_or_an_error(fake_camera: Make) -
 
 
 def test_leaving_ends_a_recovery_and_may_be_repeated(fake_camera: Make) -> None:
-    lidar, waits = FakeLidar(), Event()
+    lidar = FakeLidar()
+    waits = Event()
 
     class RealPace(WallClock):
         def wait(self, stop: Event, seconds: float) -> bool:
@@ -175,14 +189,20 @@ def test_recording_of_a_lost_device_ends_whole(
     noise_world: Make, hurried_clock: Any, kind: Any, optional: bool, tmp_path: Path, caplog: Any
 ) -> None:
     class Impatient(hurried_clock):
-        """Waits for the next frame of its world only; any longer wait lasts until the fault is over."""
+        """Waits for the next frame of its world only; any longer wait lasts until the fault is
+        over.
+        """
 
         def wait(self, stop: Event, seconds: float) -> bool:
             return super().wait(stop, seconds if seconds < 0.2 else 100.0)
 
-    recording, fault = Recording(tmp_path / "run.bag", optional=optional), Fault(kind=kind, at_frame=15, frames=2000)
-    simulated = SimulatedCamera("sim", noise_world(), clock=Impatient(), recording=recording, faults=[fault])
-    simulated.silence_s, simulated.replug_s = 0.5, 1000.0
+    recording = Recording(tmp_path / "run.bag", optional=optional)
+    fault = Fault(kind=kind, at_frame=15, frames=2000)
+    simulated = SimulatedCamera(
+        "sim", noise_world(), clock=Impatient(), recording=recording, faults=[fault]
+    )
+    simulated.silence_s = 0.5
+    simulated.replug_s = 1000.0
     if optional:  # the camera goes on
         with simulated as camera:
             numbers = [frame.frame_number for frame in islice(camera, 40)]
@@ -199,21 +219,47 @@ def test_recording_of_a_lost_device_ends_whole(
     assert found.dropped == 0
 
 
-def test_recording_without_a_frame_restarts_with_the_streams(fake_camera: Make, tmp_path: Path) -> None:
-    lidar, recording = FakeLidar(usb="2.1", runs=(0, 0, ENDLESS)), Recording(tmp_path / "run.bag", frames=5)
+def test_recording_without_a_frame_restarts_with_the_streams(
+    fake_camera: Make, tmp_path: Path
+) -> None:
+    lidar = FakeLidar(usb="2.1", runs=(0, 0, ENDLESS))
+    recording = Recording(tmp_path / "run.bag", frames=5)
     with impatient(fake_camera(lidar, recording=recording)) as camera:
         assert len(list(camera)) == recording.sets == 5
         assert camera.counts == {"restarted": 2}
         assert camera.dropped == camera.incomplete == 0
-    assert [did for did in lidar.did if did in {"start", "record", "stop"}] == ["start", "record", "stop"] * 3
+    assert [did for did in lidar.did if did in {"start", "record", "stop"}] == [
+        "start",
+        "record",
+        "stop",
+    ] * 3
 
 
 class Device:
-    def __init__(self, there: Callable[[float], bool] = lambda _: True, failing: tuple[str, ...] = ()) -> None:
-        self.clock, self.left, self.counts, self.did = NapClock(), Event(), Counter[str](), list[str]()
-        self.zero_s, self.there, self.failing = self.clock.now(), there, list(failing)
-        stop, reset = (lambda: self.did.append("stop")), (lambda: self.did.append("reset"))
-        hooks = Hooks(self.start, stop, self.is_connected, lambda: "device" if self.is_connected() else None, reset)
+    def __init__(
+        self, there: Callable[[float], bool] = lambda _: True, failing: tuple[str, ...] = ()
+    ) -> None:
+        self.clock = NapClock()
+        self.left = Event()
+        self.counts = Counter[str]()
+        self.did = list[str]()
+        self.zero_s = self.clock.now()
+        self.there = there
+        self.failing = list(failing)
+
+        def stop() -> None:
+            self.did.append("stop")
+
+        def reset() -> None:
+            self.did.append("reset")
+
+        hooks = Hooks(
+            self.start,
+            stop,
+            self.is_connected,
+            lambda: "device" if self.is_connected() else None,
+            reset,
+        )
         self.recovery = Recovery("l515", hooks, self.clock, self.left, self.counts)
 
     @property
@@ -244,7 +290,9 @@ def test_recovery_restarts_with_back_off_then_resets_then_ends() -> None:
     assert device.counts == {"restarted": 3, "reset": 1}
 
 
-def test_failed_restart_is_followed_by_the_next_at_once_and_by_a_reset_if_intrinsics_are_lost() -> None:
+def test_failed_restart_is_followed_by_the_next_at_once_and_by_a_reset_if_intrinsics_are_lost() -> (
+    None
+):
     device = Device(failing=("busy", "busy"))
     device.recover()
     assert device.counts == {"restarted": 3}
@@ -269,7 +317,9 @@ def test_reset_waits_until_the_device_was_gone_and_is_back() -> None:
 
 
 @pytest.mark.parametrize(("back_s", "failing"), [(40.0, ()), (2.0, ("not yet", "not yet"))])
-def test_unplugged_device_is_started_when_it_is_back(back_s: float, failing: tuple[str, ...]) -> None:
+def test_unplugged_device_is_started_when_it_is_back(
+    back_s: float, failing: tuple[str, ...]
+) -> None:
     device = Device(there=lambda now_s: now_s > back_s, failing=failing)
     device.recover()
     assert device.counts == {"replugged": 1}

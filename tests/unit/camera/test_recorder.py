@@ -13,8 +13,23 @@ from fake_lidar import NapClock
 from nlos_calibration import Intrinsics
 from nlos_models import FileBusyError
 
-from nlos_cam.camera import FORMATS, RESERVE_BYTES, Recording, SimulatedCamera, check_room, free_bytes, recording_s
-from nlos_cam.camera.recorder import FLUSH_S, MAX_FLUSHES, STILL_S, SdkRecorder, bytes_per_frame, can_grow
+from nlos_cam.camera import (
+    FORMATS,
+    RESERVE_BYTES,
+    Recording,
+    SimulatedCamera,
+    check_room,
+    free_bytes,
+    recording_s,
+)
+from nlos_cam.camera.recorder import (
+    FLUSH_S,
+    MAX_FLUSHES,
+    STILL_S,
+    SdkRecorder,
+    bytes_per_frame,
+    can_grow,
+)
 from nlos_cam.camera.session import CAPACITY
 from nlos_cam.errors import DiskFullError, OutputExistsError, RecordingError
 from nlos_cam.recording import ReplayCamera, verify
@@ -25,14 +40,22 @@ Make = Callable[[Recording], SimulatedCamera]
 
 @pytest.fixture
 def camera(noise_world: Any, hurried_clock: Any) -> Make:
-    return lambda recording: SimulatedCamera("sim", noise_world(), clock=hurried_clock(), recording=recording)
+    return lambda recording: SimulatedCamera(
+        "sim", noise_world(), clock=hurried_clock(), recording=recording
+    )
 
 
 @pytest.mark.parametrize(
     ("limit", "frames"),
-    [({"frames": 1}, 1), ({"frames": 31}, 31), *(({"seconds": s}, n) for s, n in ((0.01, 1), (0.1, 3), (1.0, 30)))],
+    [
+        ({"frames": 1}, 1),
+        ({"frames": 31}, 31),
+        *(({"seconds": s}, n) for s, n in ((0.01, 1), (0.1, 3), (1.0, 30))),
+    ],
 )
-def test_recording_ends_at_frames_or_seconds(camera: Make, tmp_path: Path, limit: dict[str, Any], frames: int) -> None:
+def test_recording_ends_at_frames_or_seconds(
+    camera: Make, tmp_path: Path, limit: dict[str, Any], frames: int
+) -> None:
     path = tmp_path / "a.bag"
     path.write_text("an old file")
     recording = Recording(path, **limit)
@@ -40,7 +63,12 @@ def test_recording_ends_at_frames_or_seconds(camera: Make, tmp_path: Path, limit
         for _ in source:
             pass
     found = verify(path)
-    assert (found.frames, found.dropped, recording.sets, set(found.streams.values())) == (frames, 0, frames, {frames})
+    assert (found.frames, found.dropped, recording.sets, set(found.streams.values())) == (
+        frames,
+        0,
+        frames,
+        {frames},
+    )
 
 
 def test_slow_reader_costs_the_recording_nothing(camera: Make, tmp_path: Path) -> None:
@@ -55,9 +83,12 @@ def test_slow_reader_costs_the_recording_nothing(camera: Make, tmp_path: Path) -
 
 
 @pytest.mark.parametrize("limit", [{"frames": 6}, {"seconds": 0.2}])
-def test_takes_follow_each_other_on_a_running_camera(camera: Make, tmp_path: Path, limit: dict[str, Any]) -> None:
+def test_takes_follow_each_other_on_a_running_camera(
+    camera: Make, tmp_path: Path, limit: dict[str, Any]
+) -> None:
     paths = [tmp_path / f"{number}.bag" for number in range(3)]
-    recording, numbers = Recording(paths[0], **limit, last=False), list[int]()
+    recording = Recording(paths[0], **limit, last=False)
+    numbers = list[int]()
     with camera(recording) as source:
         frames = iter(source)
         for path in paths:
@@ -84,11 +115,17 @@ def test_recordings_of_one_path_refuse_each_other(camera: Make, tmp_path: Path) 
     with camera(Recording(path, frames=3)) as source:
         list(source)
         before = path.read_bytes()
-        with pytest.raises(FileBusyError, match=f"process {os.getpid()}"), camera(Recording(path, frames=1)):
+        with (
+            pytest.raises(FileBusyError, match=f"process {os.getpid()}"),
+            camera(Recording(path, frames=1)),
+        ):
             pytest.fail("two recordings of one file")
         assert path.read_bytes() == before
     assert verify(path).frames == 3
-    with pytest.raises(OutputExistsError, match="exists"), camera(Recording(path, frames=1, overwrite=False)):
+    with (
+        pytest.raises(OutputExistsError, match="exists"),
+        camera(Recording(path, frames=1, overwrite=False)),
+    ):
         pytest.fail("a recording was replaced")
     assert verify(path).frames == 3
     assert [entry.name for entry in tmp_path.iterdir()] == ["a.bag"]
@@ -105,7 +142,9 @@ def test_only_the_last_take_ends_the_iteration(camera: Make, tmp_path: Path) -> 
     assert recording.sets == 3
 
 
-def test_next_take_starts_though_no_frame_comes(camera: Make, tmp_path: Path, monkeypatch: Any) -> None:
+def test_next_take_starts_though_no_frame_comes(
+    camera: Make, tmp_path: Path, monkeypatch: Any
+) -> None:
     monkeypatch.setattr("nlos_cam.camera.recorder.BOUNDARY_WAIT_S", 0.01)
     recording = Recording(tmp_path / "a.bag", frames=1, last=False)
     with camera(recording) as source:
@@ -120,7 +159,11 @@ def test_next_take_starts_though_no_frame_comes(camera: Make, tmp_path: Path, mo
 
 @pytest.mark.parametrize("ending", ["little space", "no index"])
 def test_camera_goes_on_without_an_optional_recording(
-    camera: Make, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, ending: str
+    camera: Make,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+    ending: str,
 ) -> None:
     if ending == "no index":
         monkeypatch.setattr("nlos_cam.camera.recorder.can_grow", lambda *_: False)
@@ -138,7 +181,8 @@ class FakeRecorder:
 
     def __init__(self, path: str, device: Any) -> None:
         Path(path).write_bytes(b"recorded")
-        self.device, self.pauses = device, 0
+        self.device = device
+        self.pauses = 0
         self.on_pause: Callable[[], None] = lambda: None
 
     def pause(self) -> None:
@@ -146,7 +190,8 @@ class FakeRecorder:
         self.on_pause()
 
 
-SDK, CLOCK = SimpleNamespace(recorder=FakeRecorder), NapClock()
+SDK = SimpleNamespace(recorder=FakeRecorder)
+CLOCK = NapClock()
 
 
 @pytest.fixture
@@ -159,7 +204,9 @@ def made(tmp_path: Path) -> SdkRecorder:
 
 
 @pytest.mark.parametrize(("slow", "pauses"), [(0, 1), (3, 4), (10**6, MAX_FLUSHES)])
-def test_recorder_pauses_again_while_a_disk_is_behind(made: SdkRecorder, slow: int, pauses: int) -> None:
+def test_recorder_pauses_again_while_a_disk_is_behind(
+    made: SdkRecorder, slow: int, pauses: int
+) -> None:
     fake = made._recorder
     fake.on_pause = lambda: CLOCK.wait(Event(), FLUSH_S + 1 if fake.pauses <= slow else 1.0)
     if pauses == MAX_FLUSHES:
@@ -171,7 +218,9 @@ def test_recorder_pauses_again_while_a_disk_is_behind(made: SdkRecorder, slow: i
     assert fake.pauses == pauses
 
 
-def test_recorder_without_a_folder_or_whose_file_grows_no_more_fails(made: SdkRecorder, tmp_path: Path) -> None:
+def test_recorder_without_a_folder_or_whose_file_grows_no_more_fails(
+    made: SdkRecorder, tmp_path: Path
+) -> None:
     with pytest.raises(RecordingError, match="no folder"):
         SdkRecorder(tmp_path / "no folder" / "a.bag", "device", SDK)
     for _ in range(10):  # now and then
@@ -184,7 +233,9 @@ def test_recorder_without_a_folder_or_whose_file_grows_no_more_fails(made: SdkRe
     assert made.failure is None
     CLOCK.wait(Event(), STILL_S + 1)
     made.watch()
-    with pytest.raises(DiskFullError, match=r"nlos-cam repair .*a\.bag --out .*a-repaired\.bag") as raised:
+    with pytest.raises(
+        DiskFullError, match=r"nlos-cam repair .*a\.bag --out .*a-repaired\.bag"
+    ) as raised:
         made.close()
     assert "\n" not in str(raised.value)
 
@@ -194,33 +245,50 @@ def test_recorder_without_a_folder_or_whose_file_grows_no_more_fails(made: SdkRe
 def test_librealsense_at_a_file_size_limit_keeps_whole_chunks(tmp_path: Path, limit: int) -> None:
     pytest.importorskip("resource")
     path = tmp_path / "a.bag"
-    run = [sys.executable, Path(__file__).parents[2] / "fakes/noise_process.py", path, "200", str(limit)]
+    run = [
+        sys.executable,
+        Path(__file__).parents[2] / "fakes/noise_process.py",
+        path,
+        "200",
+        str(limit),
+    ]
     ended = subprocess.run(run, capture_output=True, text=True, timeout=120)  # noqa: PLW1510  the code is what is tested
     assert (ended.returncode, ended.stderr) == (0, "")
     assert ended.stdout.count("\n") == 1
     assert f"nlos-cam repair {path} --out" in ended.stdout
     assert path.stat().st_size <= limit
-    assert sum(chunk.compression == "lz4" for chunk in scan_bag(path).chunks) == limit // 800_000  # a cut one is not
+    assert (
+        sum(chunk.compression == "lz4" for chunk in scan_bag(path).chunks) == limit // 800_000
+    )  # a cut one is not
 
 
-VGA, SMALL = Intrinsics(640, 480, 460.0, 460.0, 320.0, 240.0), Intrinsics(64, 48, 46.0, 46.0, 32.0, 24.0)
+VGA = Intrinsics(640, 480, 460.0, 460.0, 320.0, 240.0)
+SMALL = Intrinsics(64, 48, 46.0, 46.0, 32.0, 24.0)
 
 
-def test_bytes_per_frame_bounds_a_recording(noise_world: type, recorded: Any, tmp_path: Path) -> None:
-    images, frames = noise_world().images(0), 200
+def test_bytes_per_frame_bounds_a_recording(
+    noise_world: type, recorded: Any, tmp_path: Path
+) -> None:
+    images = noise_world().images(0)
+    frames = 200
     streams = images.depth_z16, images.ir, images.confidence
     assert len(streams) == len(FORMATS)
     assert bytes_per_frame(SMALL) == sum(pixels.nbytes for pixels in streams)
     size = recorded(tmp_path / "noise.bag", frames).stat().st_size
-    overhead = 3 * 600 * frames  # metadata and index of a stream's frame, which count where frames are this small
+    overhead = (
+        3 * 600 * frames
+    )  # metadata and index of a stream's frame, which count where frames are this small
     assert 0.5 * frames * bytes_per_frame(SMALL) < size < frames * bytes_per_frame(SMALL) + overhead
 
 
 @pytest.mark.parametrize("seconds", [0, 1, 10, 600])
-def test_check_room_needs_frames_and_a_reserve(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, seconds: int) -> None:
+def test_check_room_needs_frames_and_a_reserve(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, seconds: int
+) -> None:
     monkeypatch.chdir(tmp_path)
     assert free_bytes(tmp_path / "none.bag") > 0 < free_bytes(Path("none.bag"))
-    path, free = tmp_path / "a.bag", RESERVE_BYTES + 30 * seconds * bytes_per_frame(VGA)
+    path = tmp_path / "a.bag"
+    free = RESERVE_BYTES + 30 * seconds * bytes_per_frame(VGA)
     assert recording_s(VGA, free) == seconds
     assert recording_s(VGA, 0) == 0
     check_room(path, VGA, 30 * seconds, free)
@@ -239,6 +307,8 @@ def test_can_grow_finds_a_limit_and_changes_nothing(tmp_path: Path) -> None:
         "resource.setrlimit(resource.RLIMIT_FSIZE, (5000, 5000))\n"
         "path = pathlib.Path(sys.argv[1])\nprint(can_grow(path, 4000), can_grow(path, 6000))"
     )
-    ended = subprocess.run([sys.executable, "-c", program, path], capture_output=True, text=True, check=True)
+    ended = subprocess.run(
+        [sys.executable, "-c", program, path], capture_output=True, text=True, check=True
+    )
     assert ended.stdout == "True False\n"
     assert path.read_bytes() == b"precious"

@@ -20,20 +20,28 @@ print(*sys.modules.keys() & {"pyrealsense2", "nlos_cam.camera.l515", "nlos_cam.c
 
 @pytest.mark.parametrize("uri", ["", "webcam", "bag", "bag:", "L515", "/dev/video0", "sims"])
 def test_unknown_camera_is_an_error_with_the_known_ones(uri: str) -> None:
-    with pytest.raises(CameraNotFoundError, match=r"l515, l515:SERIAL, sim, sim:bare-wall") as raised:
+    with pytest.raises(
+        CameraNotFoundError, match=r"l515, l515:SERIAL, sim, sim:bare-wall"
+    ) as raised:
         open_camera(uri)
     assert repr(uri) in str(raised.value)
 
 
-@pytest.mark.parametrize(("reader", "kind"), [("plain", "ReplayCamera"), ("sdk", "SdkReplayCamera")])
-def test_reader_and_path_choose_the_playback(noise_bag: Path, tmp_path: Path, reader: Any, kind: str) -> None:
+@pytest.mark.parametrize(
+    ("reader", "kind"), [("plain", "ReplayCamera"), ("sdk", "SdkReplayCamera")]
+)
+def test_reader_and_path_choose_the_playback(
+    noise_bag: Path, tmp_path: Path, reader: Any, kind: str
+) -> None:
     path = tmp_path / "a:b.bag"
     path.write_bytes(noise_bag.read_bytes())
     camera = open_camera(f"bag:{path}", reader=reader)
     assert (type(camera).__name__, camera.uri) == (kind, f"bag:{path}")
 
 
-def test_worlds_can_be_opened_and_report_progress(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_worlds_can_be_opened_and_report_progress(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     for uri in SIMULATED:
         assert open_camera(uri).uri == uri
     monkeypatch.setenv("NLOS_CAM_CACHE", str(tmp_path))
@@ -44,14 +52,19 @@ def test_worlds_can_be_opened_and_report_progress(tmp_path: Path, monkeypatch: p
 
 
 def test_backends_are_imported_late() -> None:
-    ended = subprocess.run([sys.executable, "-c", LATE], capture_output=True, text=True, check=True, timeout=120)
+    ended = subprocess.run(
+        [sys.executable, "-c", LATE], capture_output=True, text=True, check=True, timeout=120
+    )
     assert ended.stdout.strip() == ""
 
 
 @pytest.mark.parametrize(
-    ("machine", "words"), [("x86_64", f"pip install {WHEEL}"), ("aarch64", r"linux aarch64.*Python 3\.11")]
+    ("machine", "words"),
+    [("x86_64", f"pip install {WHEEL}"), ("aarch64", r"linux aarch64.*Python 3\.11")],
 )
-def test_missing_wheel_has_advice(noise_bag: Path, monkeypatch: pytest.MonkeyPatch, machine: str, words: str) -> None:
+def test_missing_wheel_has_advice(
+    noise_bag: Path, monkeypatch: pytest.MonkeyPatch, machine: str, words: str
+) -> None:
     assert load_sdk() is load_sdk()
     monkeypatch.setitem(sys.modules, "pyrealsense2", None)
     monkeypatch.setattr("nlos_cam.camera.sdk._preload_libusb", lambda: None)
@@ -71,7 +84,9 @@ def test_missing_wheel_has_advice(noise_bag: Path, monkeypatch: pytest.MonkeyPat
 @pytest.mark.parametrize("system", ["linux", "win32", "darwin"])
 @pytest.mark.parametrize("machine", ["x86_64", "aarch64", "AMD64", "ARM64", "arm64"])
 def test_wheel_is_the_one_that_the_package_requires(system: str, machine: str, minor: int) -> None:
-    project = tomllib.loads((Path(__file__).parents[3] / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    project = tomllib.loads(
+        (Path(__file__).parents[3] / "pyproject.toml").read_text(encoding="utf-8")
+    )["project"]
     there = {"python_version": f"3.{minor}", "sys_platform": system, "platform_machine": machine}
     asked = [
         f"{found.name}{found.specifier}"

@@ -62,13 +62,17 @@ def test_finish_counts_half_a_set_of_a_recording(lossless: bool) -> None:
 
 def test_read_settings_omits_what_cannot_be_read_or_was_not_measured_yet() -> None:
     sensor = FakeSensor(FakeLidar(apd_temperature=-9999.0, ldd_temperature=40.0), 0)
-    listed = [SimpleNamespace(name=name) for name in ("not_while_idle", "apd_temperature", "ldd_temperature")]
+    listed = [
+        SimpleNamespace(name=name)
+        for name in ("not_while_idle", "apd_temperature", "ldd_temperature")
+    ]
     sensor.get_supported_options = lambda: listed
     assert read_settings(sensor) == {"ldd_temperature": 40.0}
 
 
 def test_find_streams_takes_the_sensor_with_most_streams() -> None:
-    partial, whole = FakeSensor(FakeLidar(streams=("infrared",)), 0), FakeSensor(FakeLidar(), 0)
+    partial = FakeSensor(FakeLidar(streams=("infrared",)), 0)
+    whole = FakeSensor(FakeLidar(), 0)
     sensor, profiles = find_streams(SimpleNamespace(query_sensors=lambda: [partial, whole]))
     assert sensor is whole
     assert set(profiles) == set(FORMATS)
@@ -80,7 +84,8 @@ def session_of(lidar: FakeLidar) -> Session:
 
 
 def test_look_returns_the_next_set_while_preparing_or_none_by_timeout_or_end() -> None:
-    lidar, found = FakeLidar(usb="2.1"), list[Any]()
+    lidar = FakeLidar(usb="2.1")
+    found = list[Any]()
     session = session_of(lidar)
 
     def prepare(_: object) -> None:
@@ -101,7 +106,8 @@ def test_look_returns_the_next_set_while_preparing_or_none_by_timeout_or_end() -
 def test_set_from_before_the_settings_is_not_delivered(clock_stands: bool) -> None:
     """A clock that stands still holds no more than one set back."""
     lidar = FakeLidar(usb="2.1")
-    session, begun = session_of(lidar), ("depth",)
+    session = session_of(lidar)
+    begun = ("depth",)
     if clock_stands:
         lidar.period_ms = 0.0
         session.start(lambda _: None)

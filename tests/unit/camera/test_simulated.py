@@ -16,7 +16,12 @@ from nlos_cam.camera import FORMATS, Recording, load_sdk
 from nlos_cam.camera.fault_injection import Delivery, FaultyDevice
 from nlos_cam.camera.protocol import WallClock
 from nlos_cam.camera.session import read_settings
-from nlos_cam.camera.simulated import EXPOSED_AHEAD_S, MAX_LATE_FRAMES, SimulatedCamera, SoftwareLidar
+from nlos_cam.camera.simulated import (
+    EXPOSED_AHEAD_S,
+    MAX_LATE_FRAMES,
+    SimulatedCamera,
+    SoftwareLidar,
+)
 from nlos_cam.camera.streams import intrinsics_of, is_needed, stream_name
 from nlos_cam.recording import ReplayCamera
 from nlos_cam.render import Fault, SensedImages
@@ -26,10 +31,15 @@ Timed = Callable[..., tuple[SimulatedCamera, dict[int, float]]]
 
 @pytest.fixture
 def timed(noise_world: Any, hurried_clock: Any) -> Timed:
-    """Make a camera whose world takes a time by frame number, and the times at which its exposures start."""
+    """Make a camera whose world takes a time by frame number, and the times at which its exposures
+    start.
+    """
 
-    def make(takes_s: Callable[[int], float], **options: Any) -> tuple[SimulatedCamera, dict[int, float]]:
-        clock, start_s = hurried_clock(0.0), dict[int, float]()
+    def make(
+        takes_s: Callable[[int], float], **options: Any
+    ) -> tuple[SimulatedCamera, dict[int, float]]:
+        clock = hurried_clock(0.0)
+        start_s = dict[int, float]()
 
         class World(noise_world):
             def images(self, number: int) -> Any:
@@ -48,13 +58,21 @@ def test_frames_are_exposed_late_but_in_time(timed: Timed, takes_s: float, ahead
     with camera:
         assert len(list(islice(camera, 6))) == 6
     for number in range(2, 6):
-        assert takes_s + number / 30 - start_s[number] == pytest.approx(ahead_s, abs=1e-6)  # compiling took once more
+        assert takes_s + number / 30 - start_s[number] == pytest.approx(
+            ahead_s, abs=1e-6
+        )  # compiling took once more
 
 
-@pytest.mark.parametrize(("late_frames", "dropped"), [(0.9 * MAX_LATE_FRAMES, 0), (3 * MAX_LATE_FRAMES, 1)])
-def test_late_world_catches_up_or_drops_numbers(timed: Timed, tmp_path: Path, late_frames: float, dropped: int) -> None:
+@pytest.mark.parametrize(
+    ("late_frames", "dropped"), [(0.9 * MAX_LATE_FRAMES, 0), (3 * MAX_LATE_FRAMES, 1)]
+)
+def test_late_world_catches_up_or_drops_numbers(
+    timed: Timed, tmp_path: Path, late_frames: float, dropped: int
+) -> None:
     recording = Recording(tmp_path / "late.bag", frames=40)
-    with timed(lambda number: late_frames / 30 if number == 3 else 0.0, recording=recording)[0] as camera:
+    with timed(lambda number: late_frames / 30 if number == 3 else 0.0, recording=recording)[
+        0
+    ] as camera:
         assert list(camera)
     with ReplayCamera(recording.path) as replayed:
         gaps = np.diff([-1, *(frame.frame_number for frame in replayed)]) - 1
@@ -91,7 +109,9 @@ def test_telemetry_holds_the_temperatures_of_the_instant(noise_world: Any, noise
         assert replayed.telemetry("_temperature") == {"ldd_temperature": 20.0}
 
 
-@pytest.mark.skipif(not Path("/proc/self/task").is_dir(), reason="counts native threads, as Linux lists them")
+@pytest.mark.skipif(
+    not Path("/proc/self/task").is_dir(), reason="counts native threads, as Linux lists them"
+)
 def test_native_threads_do_not_pile_up(noise_world: Any, hurried_clock: Any) -> None:
     def run() -> int:
         with SimulatedCamera("sim", noise_world(), clock=hurried_clock()) as camera:
@@ -103,10 +123,14 @@ def test_native_threads_do_not_pile_up(noise_world: Any, hurried_clock: Any) -> 
 
 
 def test_software_lidar_looks_like_an_l515() -> None:
-    sdk, pinhole = load_sdk(), load_rig("paper-rig").pinhole
+    sdk = load_sdk()
+    pinhole = load_rig("paper-rig").pinhole
     celsius = {"ldd_temperature": 41.5, "apd_temperature": 36.25}
-    info, lidar = sdk.camera_info, SoftwareLidar(pinhole, sdk, celsius=celsius)
-    names = [lidar.device.get_info(key) for key in (info.name, info.serial_number, info.product_line)]
+    info = sdk.camera_info
+    lidar = SoftwareLidar(pinhole, sdk, celsius=celsius)
+    names = [
+        lidar.device.get_info(key) for key in (info.name, info.serial_number, info.product_line)
+    ]
     assert names == ["Simulated L515", "simulated", "L500"]
     [sensor] = lidar.device.query_sensors()
     assert sensor.get_info(info.name) == "L500 Depth Sensor"
@@ -126,7 +150,8 @@ def test_software_lidar_looks_like_an_l515() -> None:
 
 
 def test_wall_clock_never_goes_back_and_waits_until_stopped() -> None:
-    clock, stop = WallClock(), Event()
+    clock = WallClock()
+    stop = Event()
     before = time.time()
     times = [clock.now() for _ in range(100)]
     assert times == sorted(times)
@@ -139,13 +164,17 @@ def test_wall_clock_never_goes_back_and_waits_until_stopped() -> None:
 def images(instant: int) -> SensedImages:
     """Make images of 4 x 6 pixels that hold their instant."""
     return SensedImages(
-        np.full((4, 6), 1000 + instant, np.uint16), np.full((4, 6), 100, np.uint8), np.full((4, 6), 9, np.uint8)
+        np.full((4, 6), 1000 + instant, np.uint16),
+        np.full((4, 6), 100, np.uint8),
+        np.full((4, 6), 9, np.uint8),
     )
 
 
 def handed(*faults: Fault, until: int) -> list[Delivery]:
     device = FaultyDevice(faults)
-    return [found for instant in range(until) for found in device.deliver(instant, 1e9, images(instant))]
+    return [
+        found for instant in range(until) for found in device.deliver(instant, 1e9, images(instant))
+    ]
 
 
 @given(st.integers(0, 1000))
@@ -166,6 +195,8 @@ def test_image_faults_spoil_images_as_named_and_add_up() -> None:
     assert (spoiled("saturated").ir == 255).all()
     assert np.count_nonzero(spoiled("half_invalid").depth_z16) == 12
     assert spoiled("wrong_size").depth_z16.shape == spoiled("wrong_size").ir.shape == (2, 3)
-    assert [each.images.ir.max() for each in handed(Fault(kind="saturated", at_frame=1), until=3)] == [100, 255, 100]
+    assert [
+        each.images.ir.max() for each in handed(Fault(kind="saturated", at_frame=1), until=3)
+    ] == [100, 255, 100]
     both = spoiled("half_invalid", "saturated")
     assert (np.count_nonzero(both.depth_z16), both.ir.min()) == (12, 255)

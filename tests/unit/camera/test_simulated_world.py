@@ -42,7 +42,9 @@ def world(scene: Path) -> World:
     return open_world(str(scene))
 
 
-def test_world_frame_is_bit_identical_by_number_and_repeats_the_loop_with_other_noise(world: World) -> None:
+def test_world_frame_is_bit_identical_by_number_and_repeats_the_loop_with_other_noise(
+    world: World,
+) -> None:
     first, second, again, later = (world.images(number) for number in (0, 1, 2, 7))
     assert _equal(world.images(7), later)
     assert not _equal(first, second)
@@ -78,20 +80,25 @@ def test_world_from_the_cache_equals_the_rendered_one(
     (entry,) = (tmp_path / "worlds").iterdir()
     assert entry.name.startswith(fresh.scene.checksum)
     other = tmp_path / "scene.toml"
-    other.write_text(scene.read_text(encoding="utf-8") + "sensor = { dead_share = 0.5 }\n", encoding="utf-8")
+    other.write_text(
+        scene.read_text(encoding="utf-8") + "sensor = { dead_share = 0.5 }\n", encoding="utf-8"
+    )
     harmed = open_world(str(other)).images(0)  # another sensor, the same rendering
     assert (harmed.depth_z16 > 0).sum() < 0.7 * (world.images(0).depth_z16 > 0).sum()
 
 
 def test_world_warms_and_drifts_by_the_frame_number_beyond_the_loop(tmp_path: Path) -> None:
     (tmp_path / "warming.toml").write_text(WARMING, encoding="utf-8")
-    warming, numbers = open_world(str(tmp_path / "warming.toml")), (0, 18_000, 180_000)
+    warming = open_world(str(tmp_path / "warming.toml"))
+    numbers = (0, 18_000, 180_000)
     assert warming.scene.poses == 1
     after = [warming.celsius(number) for number in numbers]
     ldd = [celsius["ldd_temperature"] for celsius in after]
     assert ldd == pytest.approx([25.0, 45 - 20 / np.e, 45.0], abs=0.01)
     for celsius in after:
-        assert set(celsius) == {f"{part}_temperature" for part in ("ldd", "mc", "ma", "apd", "humidity")}
+        assert set(celsius) == {
+            f"{part}_temperature" for part in ("ldd", "mc", "ma", "apd", "humidity")
+        }
         assert {name: celsius[name] - after[0][name] for name in celsius} == pytest.approx(
             dict.fromkeys(celsius, celsius["ldd_temperature"] - 25.0)
         )
@@ -104,13 +111,16 @@ def test_world_warms_and_drifts_by_the_frame_number_beyond_the_loop(tmp_path: Pa
 def test_world_with_a_wide_pulse_survives_the_cache(world: World, tmp_path: Path) -> None:
     wide = tmp_path / "wide.toml"
     wide.write_text(SCENE + "sensor = { pulse_ns = 1.0 }\n", encoding="utf-8")
-    rendered, cached = open_world(str(wide)), open_world(str(wide))
+    rendered = open_world(str(wide))
+    cached = open_world(str(wide))
     assert _equal(rendered.images(0), cached.images(0))
     assert not np.array_equal(rendered.images(0).ir, world.images(0).ir)
 
 
 @pytest.mark.parametrize(
-    "shipped", [pytest.param(paper_scene(), marks=pytest.mark.slow), bare_wall_scene()], ids=["paper", "bare-wall"]
+    "shipped",
+    [pytest.param(paper_scene(), marks=pytest.mark.slow), bare_wall_scene()],
+    ids=["paper", "bare-wall"],
 )
 def test_packaged_loop_equals_the_renderers(shipped: SceneFile) -> None:
     packaged = read_packaged(shipped)
@@ -119,12 +129,18 @@ def test_packaged_loop_equals_the_renderers(shipped: SceneFile) -> None:
     (rendered,), (truth_m,) = render_loop(shipped, poses=[number])
     echoes = packaged[0][number]
     np.testing.assert_array_equal(packaged[1][number], truth_m)
-    np.testing.assert_allclose(echoes.peak, rendered.peak, rtol=1e-4)  # processors contract sums differently
-    np.testing.assert_allclose(echoes.runner_up, rendered.runner_up, rtol=1e-4, atol=1e-4 * rendered.peak.max())
+    np.testing.assert_allclose(
+        echoes.peak, rendered.peak, rtol=1e-4
+    )  # processors contract sums differently
+    np.testing.assert_allclose(
+        echoes.runner_up, rendered.runner_up, rtol=1e-4, atol=1e-4 * rendered.peak.max()
+    )
     assert (np.nan_to_num(echoes.path_m) == np.nan_to_num(rendered.path_m)).mean() > 0.999
 
 
-def test_packaged_scenes_open_without_rendering_or_cache(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_packaged_scenes_open_without_rendering_or_cache(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
     monkeypatch.setenv("NLOS_CAM_CACHE", str(tmp_path))
     monkeypatch.setattr("nlos_cam.render.render_scan", lambda *_: pytest.fail("rendered"))
     for name in ("", "bare-wall"):
@@ -132,7 +148,9 @@ def test_packaged_scenes_open_without_rendering_or_cache(monkeypatch: pytest.Mon
     assert not list(tmp_path.iterdir())
 
 
-def test_damaged_packaged_loop_counts_as_absent(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_damaged_packaged_loop_counts_as_absent(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
     monkeypatch.setattr("nlos_cam.camera.simulated_world.WORLDS", tmp_path)
     assert read_packaged(paper_scene()) is None
     for content in (b"", b"damaged"):

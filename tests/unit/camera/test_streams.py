@@ -36,30 +36,43 @@ def numbers_of(found: list[FrameSet]) -> list[int]:
 
 @pytest.mark.slow
 @given(
-    st.lists(st.sets(st.sampled_from(STREAMS)), max_size=WAITING_SETS).filter(lambda sets: len(sets) > 0),
+    st.lists(st.sets(st.sampled_from(STREAMS)), max_size=WAITING_SETS).filter(
+        lambda sets: len(sets) > 0
+    ),
     st.permutations(STREAMS),
 )
 def test_pairing_completes_or_counts_every_number(came: list[set[str]], order: list[str]) -> None:
     pairing = FrameSynchronizer()
-    samples = [sample(stream, number) for number, streams in enumerate(came) for stream in order if stream in streams]
+    samples = [
+        sample(stream, number)
+        for number, streams in enumerate(came)
+        for stream in order
+        if stream in streams
+    ]
     found = paired(pairing, samples)
     pairing.finish()
     assert numbers_of(found) == [number for number, streams in enumerate(came) if len(streams) == 3]
     assert pairing.incomplete == sum(0 < len(streams) < 3 for streams in came)
     if found:
         came_until = max(number for number, streams in enumerate(came) if streams)
-        assert pairing.dropped == sum(len(streams) == 0 for streams in came[found[0].number : came_until])
+        assert pairing.dropped == sum(
+            len(streams) == 0 for streams in came[found[0].number : came_until]
+        )
     assert not pairing.counts
 
 
 @st.composite
 def deliveries(draw: st.DrawFn) -> list[Sample]:
-    """Draw what a poor link delivers: samples dropped, repeated and late, of each stream on its own."""
+    """Draw what a poor link delivers: samples dropped, repeated and late, of each stream on its
+    own.
+    """
     sent: list[tuple[float, Sample]] = []
     for number in range(draw(st.integers(1, 25))):
         for stream in STREAMS:
             copies = draw(st.sampled_from((1, 1, 1, 1, 0, 2)))
-            delays = draw(st.lists(st.sampled_from((0, 0, 0, 1.5, 4.5)), min_size=copies, max_size=copies))
+            delays = draw(
+                st.lists(st.sampled_from((0, 0, 0, 1.5, 4.5)), min_size=copies, max_size=copies)
+            )
             sent += [(number + delay, sample(stream, number)) for delay in delays]
     return [one for _, one in sorted(sent, key=lambda pair: pair[0])]
 
@@ -81,13 +94,17 @@ def test_pairing_gives_each_set_once_and_counts_the_rest(samples: list[Sample]) 
     first = sets[0] if sets else min(in_time, default=0)
     expected = range(first, max(in_time, default=-1) + 1)
     assert pairing.incomplete == len(in_time.keys() - set(sets))
-    assert len(sets) + pairing.incomplete + pairing.dropped == len(expected) + sum(number < first for number in in_time)
+    assert len(sets) + pairing.incomplete + pairing.dropped == len(expected) + sum(
+        number < first for number in in_time
+    )
     again = [Counter(came) - Counter(STREAMS) for came in in_time.values()]
     again += [Counter(came) for number, came in late.items() if number in sets]
     passed_over = [Counter(came) for number, came in late.items() if number not in sets]
     assert pairing.counts["out_of_order"] == sum(max(streams.values()) for streams in passed_over)
     if not late:
-        assert pairing.counts["duplicate"] == sum(max(streams.values(), default=0) for streams in again)
+        assert pairing.counts["duplicate"] == sum(
+            max(streams.values(), default=0) for streams in again
+        )
     assert (pairing.counts["duplicate"] > 0) == any(again)
 
 
@@ -105,7 +122,9 @@ def test_pairing_does_not_depend_on_which_stream_is_ahead(data: st.DataObject) -
 
 
 def test_pairing_puts_each_stream_in_its_place_once_in_time() -> None:
-    samples = [Sample(stream, 7, 0.0, np.full((1, 1), place)) for place, stream in enumerate(STREAMS)]
+    samples = [
+        Sample(stream, 7, 0.0, np.full((1, 1), place)) for place, stream in enumerate(STREAMS)
+    ]
     [found] = paired(FrameSynchronizer(), reversed(samples))
     assert (found.depth_z16[0, 0], found.ir[0, 0], found.confidence_raw8[0, 0]) == (0, 1, 2)
     pairing = FrameSynchronizer()
@@ -117,27 +136,42 @@ def test_pairing_puts_each_stream_in_its_place_once_in_time() -> None:
 
 @pytest.mark.slow
 @given(st.lists(st.tuples(st.sampled_from(STREAMS), st.integers(0, 2**40)), max_size=300))
-def test_pairing_bounds_memory_and_delivers_despite_wild_numbers(wild: list[tuple[str, int]]) -> None:
+def test_pairing_bounds_memory_and_delivers_despite_wild_numbers(
+    wild: list[tuple[str, int]],
+) -> None:
     pairing = FrameSynchronizer()
     found: list[FrameSet] = []
     for number in range(1000, 1100):
         found += paired(pairing, whole(number))
-        found += paired(pairing, [sample(*one) for one in wild[3 * (number - 1000) : 3 * (number - 999)]])
+        found += paired(
+            pairing, [sample(*one) for one in wild[3 * (number - 1000) : 3 * (number - 999)]]
+        )
         assert len(pairing._waiting) <= WAITING_SETS
         assert len(pairing._occurrences._streams) <= WAITING_SETS
     assert set(numbers_of(found)) >= set(range(1000, 1100))
 
 
 def of_another_shape(number: int, *streams: str) -> list[Sample]:
-    return [sample(stream, number, shape=(2, 1) if stream in streams else SHAPE) for stream in STREAMS]
+    return [
+        sample(stream, number, shape=(2, 1) if stream in streams else SHAPE) for stream in STREAMS
+    ]
 
 
 @pytest.mark.parametrize(
     ("samples", "numbers", "counts", "incomplete", "dropped"),
     [
-        *((whole(0, 100, 100 - late), [0, 100], {"out_of_order": 1}, 0, 99) for late in (1, LATE_NUMBERS)),
         *(
-            ([*whole(1), *of_another_shape(2, *streams), *whole(3)], [1, 3], {"wrong_size": 1}, 1, 0)
+            (whole(0, 100, 100 - late), [0, 100], {"out_of_order": 1}, 0, 99)
+            for late in (1, LATE_NUMBERS)
+        ),
+        *(
+            (
+                [*whole(1), *of_another_shape(2, *streams), *whole(3)],
+                [1, 3],
+                {"wrong_size": 1},
+                1,
+                0,
+            )
             for streams in (STREAMS, ("depth",))
         ),
         *((whole(0, 1 + gap), [0, 1 + gap], {}, 0, gap) for gap in (0, 1, 7, MAX_GAP - 1)),
@@ -157,7 +191,13 @@ def of_another_shape(number: int, *streams: str) -> list[Sample]:
             for pause_s, counts in ((0.1, {}), (0.2, {"stalled": 1}), (5.0, {"stalled": 1}))
         ),
         *(
-            ([*whole(5), *whole(6)[:2], *again * copies, *whole(6)[2:]], [5, 6], {"duplicate": copies}, 0, 0)
+            (
+                [*whole(5), *whole(6)[:2], *again * copies, *whole(6)[2:]],
+                [5, 6],
+                {"duplicate": copies},
+                0,
+                0,
+            )
             for copies in (1, 2)
             for again in (whole(5), whole(5)[1:2], whole(6)[:2], whole(6)[1:2])
         ),
@@ -179,25 +219,41 @@ def counted_apart(instants: range, lost: dict[str, int]) -> Iterator[Sample]:
         for stream in STREAMS:
             if lost.get(stream) != instant:
                 counts[stream] += 1
-                yield Sample(stream, counts[stream], instant / FRAMES_PER_S + JITTER_S[stream], np.zeros(SHAPE))
+                yield Sample(
+                    stream,
+                    counts[stream],
+                    instant / FRAMES_PER_S + JITTER_S[stream],
+                    np.zeros(SHAPE),
+                )
 
 
 @pytest.mark.parametrize("stream", STREAMS)
 @pytest.mark.parametrize("instant", [0, 20])
 def test_pairing_realigns_a_stream_that_lost_a_frame(stream: str, instant: int) -> None:
     pairing = FrameSynchronizer()
-    found = [one for sample in counted_apart(range(60), {stream: instant}) if (one := pairing.add(sample))]
+    found = [
+        one
+        for sample in counted_apart(range(60), {stream: instant})
+        if (one := pairing.add(sample))
+    ]
     assert len(found) == 60 - 1 - CONSISTENT_SETS
     assert pairing.incomplete == 60 - len(found)
     assert pairing.counts == {}
-    numbers, times_s = (np.array([getattr(one, name) for one in found]) for name in ("number", "timestamp_s"))
-    np.testing.assert_allclose(times_s - times_s[-1], (numbers - numbers[-1]) / FRAMES_PER_S, atol=1e-9)
+    numbers, times_s = (
+        np.array([getattr(one, name) for one in found]) for name in ("number", "timestamp_s")
+    )
+    np.testing.assert_allclose(
+        times_s - times_s[-1], (numbers - numbers[-1]) / FRAMES_PER_S, atol=1e-9
+    )
 
 
 def test_frame_in_si_has_metres_levels_and_nan() -> None:
-    depth, ir = np.array([[0, 4000, 65535]], np.uint16), np.array([[0, 48, 255]], np.uint8)
-    raw, truth_m = np.array([[0, 0x70, 0xF0]], np.uint8), np.ones((64, 64), np.float32)
-    pinhole, settings = Intrinsics(3, 1, 1.0, 1.0, 1.0, 0.5), {"laser_power": 93.0}
+    depth = np.array([[0, 4000, 65535]], np.uint16)
+    ir = np.array([[0, 48, 255]], np.uint8)
+    raw = np.array([[0, 0x70, 0xF0]], np.uint8)
+    truth_m = np.ones((64, 64), np.float32)
+    pinhole = Intrinsics(3, 1, 1.0, 1.0, 1.0, 0.5)
+    settings = {"laser_power": 93.0}
     frame = frame_in_si(FrameSet(9, 1.5, depth, ir, raw), 0.00025, pinhole, settings, truth_m)
     np.testing.assert_allclose(frame.depth_m, [[np.nan, 1.0, 16.38375]], rtol=1e-6)
     assert frame.depth_m.dtype == np.float32
@@ -219,13 +275,17 @@ def unwrapped(timestamps_s: list[float], period_s: float = WRAP_PERIOD_S) -> lis
     first_s=st.floats(0.0, WRAP_PERIOD_S),
     gaps_s=st.lists(st.floats(-STEP_BACK_S / 2, WRAP_PERIOD_S - 2 * STEP_BACK_S), max_size=20),
 )
-def test_unwrap_gives_the_times_of_a_clock_without_wraps(first_s: float, gaps_s: list[float]) -> None:
+def test_unwrap_gives_the_times_of_a_clock_without_wraps(
+    first_s: float, gaps_s: list[float]
+) -> None:
     true_s = [first_s]
     for gap_s in gaps_s:
         true_s.append(max(max(true_s) + gap_s, first_s))
     found_s = unwrapped([each_s % WRAP_PERIOD_S for each_s in true_s])
     offset_s = first_s - first_s % WRAP_PERIOD_S
-    assert all(abs(found - true + offset_s) < 1e-6 for found, true in zip(found_s, true_s, strict=True))
+    assert all(
+        abs(found - true + offset_s) < 1e-6 for found, true in zip(found_s, true_s, strict=True)
+    )
 
 
 @pytest.mark.parametrize(
@@ -233,12 +293,18 @@ def test_unwrap_gives_the_times_of_a_clock_without_wraps(first_s: float, gaps_s:
     [
         ([0.1, 1 / 3, 5.0, 5.0, 1.7e9], WRAP_PERIOD_S, [0.1, 1 / 3, 5.0, 5.0, 1.7e9]),
         ([100.0, 99.9, 100.1, 41.0], WRAP_PERIOD_S, [100.0, 99.9, 100.1, 41.0]),
-        ([WRAP_PERIOD_S - 0.001, 0.001] * 2, WRAP_PERIOD_S, [WRAP_PERIOD_S - 0.001, WRAP_PERIOD_S + 0.001] * 2),
+        (
+            [WRAP_PERIOD_S - 0.001, 0.001] * 2,
+            WRAP_PERIOD_S,
+            [WRAP_PERIOD_S - 0.001, WRAP_PERIOD_S + 0.001] * 2,
+        ),
         ([90.0, 20.0, 85.0, 10.0], 100.0, [90.0, 120.0, 185.0, 210.0]),
     ],
     ids=["rising", "small steps back", "streams beside a wrap", "two wraps"],
 )
-def test_unwrap_adds_a_period_at_each_wrap(stamps_s: list[float], period_s: float, expected_s: list[float]) -> None:
+def test_unwrap_adds_a_period_at_each_wrap(
+    stamps_s: list[float], period_s: float, expected_s: list[float]
+) -> None:
     assert unwrapped(stamps_s, period_s) == expected_s
 
 
@@ -248,8 +314,12 @@ def frame(number: int, timestamp_s: float) -> Frame:
     return Frame(nothing.astype(np.float32), nothing, nothing, timestamp_s, number, pinhole)
 
 
-def passed_on(continuity: Continuity, numbers: range, zero_s: float, arrived_s: float) -> list[Frame]:
-    """Add a run at 30 frames/s whose number 0 is of `zero_s` (device clock); its first came at `arrived_s` (ours)."""
+def passed_on(
+    continuity: Continuity, numbers: range, zero_s: float, arrived_s: float
+) -> list[Frame]:
+    """Add a run at 30 frames/s whose number 0 is of `zero_s` (device clock); its first came at
+    `arrived_s` (ours).
+    """
     return [
         continuity.add(frame(number, zero_s + number / 30), arrived_s + (number - numbers[0]) / 30)
         for number in numbers
@@ -270,7 +340,9 @@ def test_continuity_keeps_first_run_and_counts_missed_once() -> None:
     assert continuity.missed == 29 - 25
 
 
-@pytest.mark.parametrize("zero_s", [1009.0, 0.0, 500_000.0], ids=["host's clock", "restarted", "jumped"])
+@pytest.mark.parametrize(
+    "zero_s", [1009.0, 0.0, 500_000.0], ids=["host's clock", "restarted", "jumped"]
+)
 def test_numbers_and_seconds_rise_together_over_an_outage(zero_s: float) -> None:
     """The second run starts nine seconds after the first, whatever the device's clock says."""
     continuity = Continuity()
@@ -290,7 +362,9 @@ def test_numbers_and_seconds_rise_together_over_an_outage(zero_s: float) -> None
     [(0.0, 4 / 30, 5, 10 + 5 / 30), (19.3, 9.0, 279, 19.3)],
     ids=["the next run follows at once", "the device's clock agrees with the host's"],
 )
-def test_continuity_splices_the_next_run(device_s: float, arrived_s: float, number: int, timestamp_s: float) -> None:
+def test_continuity_splices_the_next_run(
+    device_s: float, arrived_s: float, number: int, timestamp_s: float
+) -> None:
     continuity = Continuity()
     passed_on(continuity, range(5), zero_s=10.0, arrived_s=0.0)
     continuity.restart(counted=0)

@@ -10,7 +10,16 @@ from typing import Any
 
 import numpy as np
 import pytest
-from nlos_calibration import BOARDS, Board, Occluder, OccluderRecord, load_measured, load_rig, load_wall, wall_depth
+from nlos_calibration import (
+    BOARDS,
+    Board,
+    Occluder,
+    OccluderRecord,
+    load_measured,
+    load_rig,
+    load_wall,
+    wall_depth,
+)
 from rich.console import Console
 from small_frames import FrameCamera
 from synthetic_scenes import at_near_edge, clean_infrared, infrared_frames
@@ -20,21 +29,27 @@ from nlos_cam.cli.calibrate import EVERY, gauge, panel, until_enter, watch_wall
 from nlos_cam.frames import Frame
 from nlos_cam.render.sensor.sensor import DEPTH_UNIT_M, SensedImages
 
-RIG, A4, OUT = load_rig("bare-wall"), BOARDS["a4"], Path("wall.toml")
+RIG = load_rig("bare-wall")
+A4 = BOARDS["a4"]
+OUT = Path("wall.toml")
 BARE = "calibrate", "--wall", "--camera", "sim:bare-wall"
 WALL = *BARE, "--out", OUT
 Run = Callable[..., Any]
 
 
 class FakeCamera(FrameCamera):
-    """A camera of 10 frames of the bare wall; `scale` moves the wall, `patch` puts part of the view behind it."""
+    """A camera of 10 frames of the bare wall; `scale` moves the wall, `patch` puts part of the view
+    behind it.
+    """
 
     intrinsics = RIG.pinhole.scaled(160, 120)
 
     def __init__(self, frames: int = 10) -> None:
         super().__init__(frames, make=self._frame, uri="sim")
         self.identity |= {"name": "L515", "firmware": "1.5.8.1"}
-        self.scale, self.patch, self.taken = 1.0, 1.0, 0
+        self.scale = 1.0
+        self.patch = 1.0
+        self.taken = 0
 
     @property
     def depth_m(self) -> np.ndarray:
@@ -46,8 +61,17 @@ class FakeCamera(FrameCamera):
         return {"ldd_temperature": 40.0} if "ldd_temperature".endswith(ending) else {}
 
     def _frame(self, number: int) -> Frame:
-        self.taken, counts = self.taken + 1, np.zeros((120, 160), np.uint8)
-        return Frame(self.depth_m, counts, counts, number / 30.0, number, self.intrinsics, {"laser_power": 80.0})
+        self.taken = self.taken + 1
+        counts = np.zeros((120, 160), np.uint8)
+        return Frame(
+            self.depth_m,
+            counts,
+            counts,
+            number / 30.0,
+            number,
+            self.intrinsics,
+            {"laser_power": 80.0},
+        )
 
 
 @pytest.fixture
@@ -61,7 +85,9 @@ def camera(monkeypatch: pytest.MonkeyPatch) -> FakeCamera:
         return camera
 
     monkeypatch.setattr("nlos_cam.camera.open_camera", open_fake)
-    monkeypatch.setattr("nlos_cam.calibrate.files.report_html", lambda *_: "")  # it takes a second to draw
+    monkeypatch.setattr(
+        "nlos_cam.calibrate.files.report_html", lambda *_: ""
+    )  # it takes a second to draw
     return camera
 
 
@@ -71,11 +97,26 @@ def assert_has(text: str, *parts: str) -> None:
 
 @pytest.mark.usefixtures("camera")
 def test_calibrate_json_is_what_the_record_holds(run: Run) -> None:
-    result, record = run(*WALL), load_wall(OUT)
+    result = run(*WALL)
+    record = load_wall(OUT)
     assert (result.pop("out"), result.pop("report")) == ("wall.toml", "wall.html")
     assert result == record.model_dump(mode="json", include=set(result))
-    assert set(result) >= {"distance_m", "facing_deg", "residual_m", "inlier_fraction", "verdict", "advice", "frames"}
-    assert set(result) >= {"distance_std_m", "facing_std_deg", "yaw_std_deg", "pitch_std_deg", "range_offset_m"}
+    assert set(result) >= {
+        "distance_m",
+        "facing_deg",
+        "residual_m",
+        "inlier_fraction",
+        "verdict",
+        "advice",
+        "frames",
+    }
+    assert set(result) >= {
+        "distance_std_m",
+        "facing_std_deg",
+        "yaw_std_deg",
+        "pitch_std_deg",
+        "range_offset_m",
+    }
     assert (result["distance_m"], result["facing_deg"]) == pytest.approx((0.2, 45.0), abs=1e-6)
     assert (record.camera, record.frames, record.verdict) == ("sim:bare-wall", 10, "good")
     assert abs((record.created - datetime.now().astimezone().date()).days) <= 1
@@ -86,25 +127,45 @@ def test_calibrate_json_is_what_the_record_holds(run: Run) -> None:
 
 def test_calibrate_writes_device_and_reference(camera: FakeCamera, shown: Run) -> None:
     printed = shown("calibrate", "--wall", "--camera", "l515", "--out", OUT).out
-    record, reference = load_wall(OUT), load_measured(OUT).reference
-    assert (record.serial, record.firmware, record.settings) == ("f0246262", "1.5.8.1", {"laser_power": 80.0})
+    record = load_wall(OUT)
+    reference = load_measured(OUT).reference
+    assert (record.serial, record.firmware, record.settings) == (
+        "f0246262",
+        "1.5.8.1",
+        {"laser_power": 80.0},
+    )
     assert (record.temperatures_c, record.footprint_share) == ({"ldd_temperature": 40.0}, 1.0)
     assert record.reference == "wall.npz"
     assert (reference.frames, reference.settings) == (10, {"laser_power": 80.0})
     np.testing.assert_allclose(reference.depth_m, camera.depth_m, rtol=1e-6)
     assert reference.inliers.mean() == pytest.approx(record.inlier_fraction)
-    assert_has(printed, "200.00 ± 0.0", "45.00", " mm RMS", "Verdict: good", "wall.npz", "open wall.html")
+    assert_has(
+        printed, "200.00 ± 0.0", "45.00", " mm RMS", "Verdict: good", "wall.npz", "open wall.html"
+    )
 
 
 @pytest.mark.slow
 def test_calibrate_finds_the_occluder_on_a_simulated_bench(run: Run) -> None:
     Path("empty.toml").write_text('name = "empty bench"\nrig = "paper-rig"\n', encoding="utf-8")
     run(*WALL, "--frames", "20")
-    bench = "calibrate", "--occluder", OUT, "--camera", "sim:empty.toml", "--frames", "20", "--out", "bench.toml"
+    bench = (
+        "calibrate",
+        "--occluder",
+        OUT,
+        "--camera",
+        "sim:empty.toml",
+        "--frames",
+        "20",
+        "--out",
+        "bench.toml",
+    )
     result = run(*bench)
     assert result["occluder"]["source"] == "detected"
-    assert (result["occluder"]["x_m"], result["occluder"]["gap_m"]) == pytest.approx((0.2, 0.1), abs=0.001)
-    before, after = load_measured(OUT), load_measured(Path("bench.toml"))
+    assert (result["occluder"]["x_m"], result["occluder"]["gap_m"]) == pytest.approx(
+        (0.2, 0.1), abs=0.001
+    )
+    before = load_measured(OUT)
+    after = load_measured(Path("bench.toml"))
     assert (after.record.distance_m, result["reference"]) == (before.record.distance_m, "bench.npz")
     assert after.reference.inliers.mean() < 0.8
     run(*bench, code=1)
@@ -113,7 +174,9 @@ def test_calibrate_finds_the_occluder_on_a_simulated_bench(run: Run) -> None:
 
 def test_calibrate_takes_frames_and_the_entered_occluder(camera: FakeCamera, shown: Run) -> None:
     entered = "--occluder-x-m", "0.25", "--occluder-gap-m", "0.08"
-    printed = shown("calibrate", "--wall", "--bag", "run.bag", "--frames", "3", *entered, "--out", OUT).out
+    printed = shown(
+        "calibrate", "--wall", "--bag", "run.bag", "--frames", "3", *entered, "--out", OUT
+    ).out
     record = load_wall(OUT)
     assert camera.uri == "bag:run.bag"
     assert camera.taken == record.frames == 3
@@ -150,7 +213,12 @@ def test_calibrate_moves_by_tape_and_reports_out_of_range(camera: FakeCamera, sh
     ids=["patch", "no frames", "tape"],
 )
 def test_calibrate_that_is_refused_writes_nothing(
-    run: Run, camera: FakeCamera, options: tuple[str, ...], changed: dict[str, Any], error: str, value: str
+    run: Run,
+    camera: FakeCamera,
+    options: tuple[str, ...],
+    changed: dict[str, Any],
+    error: str,
+    value: str,
 ) -> None:
     vars(camera).update(changed)
     refused = run(*WALL, *options, code=1)["error"]
@@ -186,8 +254,12 @@ def record(noise_world: Any, recorded: Callable[..., Path]) -> Callable[..., Pat
 
         def images(self, number: int) -> SensedImages:
             generator = np.random.default_rng(number)
-            noise_m = generator.standard_normal(self._depth_m.shape) * (0.0005 + 0.002 * self._depth_m)
-            depth = np.where(self._depth_m > 0.0, np.rint((self._depth_m + noise_m) / DEPTH_UNIT_M), 0.0)
+            noise_m = generator.standard_normal(self._depth_m.shape) * (
+                0.0005 + 0.002 * self._depth_m
+            )
+            depth = np.where(
+                self._depth_m > 0.0, np.rint((self._depth_m + noise_m) / DEPTH_UNIT_M), 0.0
+            )
             ir = infrared_frames(self._clean, generator, 1)[0]
             return SensedImages(depth.astype(np.uint16), ir, np.full(ir.shape, 15, np.uint8))
 
@@ -205,7 +277,12 @@ def test_calibrate_board_uses_depth_and_board(record: Run, run: Run, shown: Run)
     assert board["corners"] >= 20
     assert board["distance_m"] == pytest.approx(0.2, abs=3 * board["distance_std_m"])
     assert abs(board["disagreement_m"]) < 0.002
-    assert_has(shown(*arguments, "--overwrite").out, "printed board", f"{board['corners']} corners", "used: both")
+    assert_has(
+        shown(*arguments, "--overwrite").out,
+        "printed board",
+        f"{board['corners']} corners",
+        "used: both",
+    )
 
 
 @pytest.mark.slow
@@ -213,7 +290,11 @@ def test_calibrate_board_replaces_depth_that_is_refused(record: Run, run: Run) -
     arguments = "calibrate", "--wall", "--bag", record(step_m=0.05), "--out", OUT
     run(*arguments, code=1)
     result = run(*arguments, "--board", "--square-mm", "30")
-    assert (result["verdict"], result["board"]["used"], result["board"]["measured"]) == ("doubtful", "board", True)
+    assert (result["verdict"], result["board"]["used"], result["board"]["measured"]) == (
+        "doubtful",
+        "board",
+        True,
+    )
     assert result["board"] == load_wall(OUT).model_dump(mode="json")["board"]
     assert result["residual_m"] is None
     assert result["board"]["depth_refused"]
@@ -244,9 +325,12 @@ def test_watch_ends_with_the_camera_or_on_request() -> None:
 
 
 @pytest.mark.parametrize("typed", ["\n", ""])
-def test_until_enter_ends_on_enter_or_end_of_input(monkeypatch: pytest.MonkeyPatch, typed: str) -> None:
+def test_until_enter_ends_on_enter_or_end_of_input(
+    monkeypatch: pytest.MonkeyPatch, typed: str
+) -> None:
     monkeypatch.setattr("sys.stdin", StringIO(typed))
-    stopped, deadline = until_enter(), time.monotonic() + 30.0
+    stopped = until_enter()
+    deadline = time.monotonic() + 30.0
     while not stopped():
         assert time.monotonic() < deadline
 
@@ -259,11 +343,17 @@ def test_gauge_points_to_where_a_value_lies() -> None:
     assert len({len(gauge(value, 0.15, 0.3)) for value in (0.0, 0.2, 1.0)}) == 1
 
 
-def test_board_json_is_the_board_that_was_printed_with_a_note_how_to_print(run: Run, shown: Run) -> None:
+def test_board_json_is_the_board_that_was_printed_with_a_note_how_to_print(
+    run: Run, shown: Run
+) -> None:
     command = "board", "--out", "board.pdf", "--overwrite"
     for paper, board in BOARDS.items():
         result = run(*command, "--paper", paper)
         assert Path("board.pdf").read_bytes().startswith(b"%PDF")
-        assert (result.pop("out"), result.pop("paper"), len(result.pop("page_mm"))) == ("board.pdf", paper, 2)
+        assert (result.pop("out"), result.pop("paper"), len(result.pop("page_mm"))) == (
+            "board.pdf",
+            paper,
+            2,
+        )
         assert Board.model_validate(result) == board
     assert_has(shown(*command).out, "6 x 9", "30 mm", "a4", "100 %", "board.pdf")

@@ -19,7 +19,8 @@ from nlos_cam.recording import CaptureResult, CaptureTarget, VerifyResult, load_
 from nlos_cam.recording.quality import Quality
 
 Patch = pytest.MonkeyPatch
-Run, OUT = Callable[..., Any], Path("a.bag")
+Run = Callable[..., Any]
+OUT = Path("a.bag")
 CAPTURE = "capture", "--camera", "sim", "--out", OUT
 
 
@@ -44,18 +45,30 @@ def lines(monkeypatch: Patch) -> list[str]:
 
 def test_capture_json_reports_the_file(run: Run) -> None:
     found = run(*CAPTURE, "--frames", "9", "--label", "a cup")
-    assert (found["frames"], found["dropped"], found["seconds"], found["out"]) == (9, 0, 0.267, "a.bag")
+    assert (found["frames"], found["dropped"], found["seconds"], found["out"]) == (
+        9,
+        0,
+        0.267,
+        "a.bag",
+    )
     assert (found["state"], found["sidecar"]) == ("complete", "a.json")
     assert verify(OUT).streams == found["streams"] == {"depth": 9, "infrared": 9, "confidence": 9}
     assert found["label"] == load_sidecar(Path("a.json")).label == "a cup"
     by_time = run("capture", "--seconds", "1")
-    assert (by_time["frames"], Path(by_time["out"]).exists()) == (30, True)  # a second of device time, a default name
+    assert (by_time["frames"], Path(by_time["out"]).exists()) == (
+        30,
+        True,
+    )  # a second of device time, a default name
 
 
 @pytest.mark.slow
-def test_capture_numbers_and_labels_takes_and_pauses_between_them(run: Run, monkeypatch: Patch) -> None:
+def test_capture_numbers_and_labels_takes_and_pauses_between_them(
+    run: Run, monkeypatch: Patch
+) -> None:
     paused: list[float | None] = []
-    monkeypatch.setattr(capture, "_pause", lambda _bar, _stop, pause_s, _text: paused.append(pause_s))
+    monkeypatch.setattr(
+        capture, "_pause", lambda _bar, _stop, pause_s, _text: paused.append(pause_s)
+    )
     labels = "--label", "a cup", "--label", "a ball", "--label", "a box"
     found = run(*CAPTURE, "--takes", "3", "--frames", "4", "--pause-s", "7", *labels)
     assert (found["frames"], found["dropped"], paused) == (12, 0, [7.0, 7.0])
@@ -68,13 +81,17 @@ def test_capture_numbers_and_labels_takes_and_pauses_between_them(run: Run, monk
 
 
 @pytest.mark.parametrize(("answer", "code", "takes"), [("\n", 0, 2), (KeyboardInterrupt, 130, 1)])
-def test_terminal_is_asked_before_each_take(run: Run, monkeypatch: Patch, answer: Any, code: int, takes: int) -> None:
+def test_terminal_is_asked_before_each_take(
+    run: Run, monkeypatch: Patch, answer: Any, code: int, takes: int
+) -> None:
     def readline() -> str:
         if answer is KeyboardInterrupt:
             signal.raise_signal(signal.SIGINT)
         return answer
 
-    monkeypatch.setattr(capture.sys, "stdin", SimpleNamespace(isatty=lambda: True, readline=readline))
+    monkeypatch.setattr(
+        capture.sys, "stdin", SimpleNamespace(isatty=lambda: True, readline=readline)
+    )
     found = run(*CAPTURE, "--takes", "2", "--frames", "2", code=code)
     assert [take["state"] for take in found["takes"]] == ["complete"] * takes
 
@@ -99,11 +116,17 @@ def test_capture_checks_disk_space_before_writing(run: Run, monkeypatch: Patch) 
     assert run(*CAPTURE, "--takes", "2", "--frames", "5")["frames"] == 10
 
 
-def test_capture_without_a_limit_reports_remaining_time(run: Run, monkeypatch: Patch, lines: list[str]) -> None:
+def test_capture_without_a_limit_reports_remaining_time(
+    run: Run, monkeypatch: Patch, lines: list[str]
+) -> None:
     beside = SimpleNamespace(path=Path("a.json"))
-    ended = CaptureResult(CaptureTarget(OUT), "interrupted", 0, Quality(), beside)  # before the first frame
+    ended = CaptureResult(
+        CaptureTarget(OUT), "interrupted", 0, Quality(), beside
+    )  # before the first frame
     monkeypatch.setattr("nlos_cam.camera.free_bytes", lambda _: 200_000_000 + 64 * 48 * 4 * 30 * 90)
-    monkeypatch.setattr("nlos_cam.recording.CaptureSession.record", lambda *_: (one for one in [ended]))
+    monkeypatch.setattr(
+        "nlos_cam.recording.CaptureSession.record", lambda *_: (one for one in [ended])
+    )
     run(*CAPTURE, code=130)
     assert "at least 90 s" in lines[0]
 
@@ -145,12 +168,16 @@ def test_capture_ended_by_a_signal_loses_no_data(asked: signal.Signals) -> None:
         finally:
             process.kill()
     beside = load_sidecar(Path("a.json"))
-    assert (beside.camera, beside.settings["depth_units"]) == ("sim:bare-wall", pytest.approx(0.00025))
+    assert (beside.camera, beside.settings["depth_units"]) == (
+        "sim:bare-wall",
+        pytest.approx(0.00025),
+    )
     if asked == signal.SIGKILL:  # what is on the disk can be repaired
         assert (process.returncode, beside.state, stdout) == (-9, "recording", "")
         return
     assert (process.returncode, beside.state) == (130, "interrupted")
-    found, report = verify(OUT), json.loads(stdout)
+    found = verify(OUT)
+    report = json.loads(stdout)
     assert found.frames == report["frames"] > 0
     assert set(found.streams.values()) == {found.frames}
 
@@ -170,7 +197,13 @@ def take(**changes: Any) -> CaptureResult:
 def test_result_holds_the_fields_of_one_take_and_totals_of_several() -> None:
     found = result_of([take(target=CaptureTarget(OUT, "a cup"))], several=False)
     shares = {"saturated_share": 0.001, "invalid_share": 0.25, "temporal_noise_mm": 1.234}
-    named = {"out": "a.bag", "state": "complete", "streams": STREAMS, "sidecar": "a.json", "label": "a cup"}
+    named = {
+        "out": "a.bag",
+        "state": "complete",
+        "streams": STREAMS,
+        "sidecar": "a.json",
+        "label": "a cup",
+    }
     assert found == {"frames": 30, "dropped": 1, "seconds": 1.0, **shares, **named}
     found = result_of([take(), take()], several=True)
     assert [one["frames"] for one in found["takes"]] == [30, 30]
@@ -185,7 +218,9 @@ def test_error_of_a_take_says_what_is_saved() -> None:
     error = result_of([lost], several=False)["error"]
     assert (error["type"], error["message"]) == ("CameraLostError", str(final_error(lost)))
     assert isinstance(final_error(lost), CameraLostError)
-    assert all(word in error["message"] for word in ("l515 vanished: replug it", "30 frames", "a.bag"))
+    assert all(
+        word in error["message"] for word in ("l515 vanished: replug it", "30 frames", "a.bag")
+    )
     assert "frames" not in str(final_error(take(state="lost", sets=0, verified=None, error=LOST)))
     full = take(state="disk full", verified=None, closed=False, error=DiskFullError("repair it"))
     assert str(final_error(full)) == "repair it"
@@ -199,13 +234,19 @@ def test_lines_at_the_terminal_hold_the_figures() -> None:
     assert "unknown" in format_take(take(quality=Quality(1, 0.0, 0.0)))
     assert "verified" not in format_take(take(state="damaged"))
     for changes in ({}, {"verified": None}):
-        assert format_take(take(state="interrupted", **changes)).startswith("Interrupted. Recorded 30 frames")
+        assert format_take(take(state="interrupted", **changes)).startswith(
+            "Interrupted. Recorded 30 frames"
+        )
     assert format_take(take(state="lost", sets=0, verified=None)).startswith("Camera lost before")
 
 
 @pytest.mark.parametrize("several", [[], ["--takes", "3", "--frames", "2"]])
-def test_capture_interrupted_before_start_has_the_same_fields(run: Run, monkeypatch: Patch, several: list[str]) -> None:
-    monkeypatch.setattr("nlos_cam.camera.open_camera", lambda *_, **__: signal.raise_signal(signal.SIGINT))
+def test_capture_interrupted_before_start_has_the_same_fields(
+    run: Run, monkeypatch: Patch, several: list[str]
+) -> None:
+    monkeypatch.setattr(
+        "nlos_cam.camera.open_camera", lambda *_, **__: signal.raise_signal(signal.SIGINT)
+    )
     found = run(*CAPTURE, *several, code=130)
     assert list(Path().iterdir()) == []
     assert set(found) == set(result_of([take()], several=bool(several)))

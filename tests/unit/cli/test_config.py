@@ -1,4 +1,6 @@
-"""Settings: option before environment before the folder's file before the user's; unknown keys are refused."""
+"""Settings: option before environment before the folder's file before the user's; unknown keys are
+refused.
+"""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -20,7 +22,8 @@ LIVE = """camera = "sim:scene.toml"\nwall = "bench.toml"\nview_port = 9300\n"""
 @pytest.fixture(autouse=True)
 def folders(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[Path, Path]:
     """An empty current folder, and an empty folder of the user's."""
-    here, users = tmp_path / "here", tmp_path / "users"
+    here = tmp_path / "here"
+    users = tmp_path / "users"
     for folder in (here, users / "nlos-cam"):
         folder.mkdir(parents=True)
     monkeypatch.chdir(here)
@@ -35,7 +38,9 @@ def live(monkeypatch: pytest.MonkeyPatch) -> list[dict[str, Any]]:
     """The values that a command named live was called with."""
     calls: list[dict[str, Any]] = []
 
-    def command(camera: Camera = "sim", wall: Path | None = None, view_port: int | None = None) -> None:
+    def command(
+        camera: Camera = "sim", wall: Path | None = None, view_port: int | None = None
+    ) -> None:
         calls.append({"camera": camera, "wall": wall, "view_port": view_port})
 
     def build_app(_: str | None) -> typer.Typer:
@@ -69,7 +74,9 @@ def test_precedence_is_option_environment_folder_user_default(
     ]
 
 
-@pytest.mark.parametrize("words", [["sim:a"], ["--camera", "sim:a"], ["sim:a", "--camera", "sim:a"]])
+@pytest.mark.parametrize(
+    "words", [["sim:a"], ["--camera", "sim:a"], ["sim:a", "--camera", "sim:a"]]
+)
 def test_camera_is_an_argument_and_an_option(live: list[dict[str, Any]], words: list[str]) -> None:
     assert main(["live", *words]) == 0
     assert live[0]["camera"] == "sim:a"
@@ -87,7 +94,9 @@ WRONG |= {"view_port = 0": "65535", 'view_port = "9090"': "whole number"}
 
 
 @pytest.mark.parametrize(("text", "word"), WRONG.items())
-def test_wrong_file_is_refused_with_its_name(folders: tuple[Path, Path], text: str, word: str) -> None:
+def test_wrong_file_is_refused_with_its_name(
+    folders: tuple[Path, Path], text: str, word: str
+) -> None:
     (folders[0] / FILE).write_text(text, encoding="utf-8")
     with pytest.raises(RecordingError, match=word) as caught:
         read_settings({})
@@ -99,7 +108,9 @@ def test_wrong_variable_is_a_usage_error() -> None:
         read_settings({"NLOS_CAM_VIEW_PORT": "many"})
 
 
-def test_config_shows_values_and_sources(folders: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch, run: Run) -> None:
+def test_config_shows_values_and_sources(
+    folders: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch, run: Run
+) -> None:
     (folders[0] / FILE).write_text(LIVE + 'cache = "c"', encoding="utf-8")
     monkeypatch.setenv("NLOS_CAM_WEIGHTS", "mine")
     settings = run("config")["settings"]
@@ -108,7 +119,9 @@ def test_config_shows_values_and_sources(folders: tuple[Path, Path], monkeypatch
     assert settings["camera"]["source"] == FILE
 
 
-def test_verbose_prints_settings_in_use(folders: tuple[Path, Path], live: list[dict[str, Any]], shown: Run) -> None:
+def test_verbose_prints_settings_in_use(
+    folders: tuple[Path, Path], live: list[dict[str, Any]], shown: Run
+) -> None:
     (folders[0] / FILE).write_text(LIVE, encoding="utf-8")
     assert f"wall = bench.toml (from {FILE})" in shown("-v", "live").err
     assert len(live) == 1

@@ -1,4 +1,6 @@
-"""`dataset build` turns options into a plan and shards; `dataset label` turns labelled recordings into a dataset."""
+"""`dataset build` turns options into a plan and shards; `dataset label` turns labelled recordings
+into a dataset.
+"""
 
 import json
 import shutil
@@ -62,13 +64,29 @@ def test_build_reports_and_resumes(tmp_path: Path, built: Run) -> None:
 
 def test_build_options_set_plan_and_are_stored_as_command(tmp_path: Path, built: Run) -> None:
     spread = ["--rig-spread-mm", "10", "--rig-spread-deg", "3", "--gain-spread-percent", "20"]
-    others = ["--without", "hat, boat", "--backgrounds", "0.25", "--accuracy", "draft", "--seed", "7"]
+    others = [
+        "--without",
+        "hat, boat",
+        "--backgrounds",
+        "0.25",
+        "--accuracy",
+        "draft",
+        "--seed",
+        "7",
+    ]
     built(folder := tmp_path / "a b", *spread, *others, "--expected-maps", "--workers", "1")
     plan = open_dataset(folder, expected=True).plan
     assert plan.spread == RigSpread(place_m=0.01, angle_deg=3, gain_share=0.2)
     assert set(CATEGORIES) - set(plan.objects.categories) == {"hat", "boat"}
-    assert (plan.objects.backgrounds, plan.accuracy, plan.first_seed, plan.expected) == (0.25, "draft", 7, True)
-    assert _command(folder).startswith(f"nlos-cam dataset build --out '{folder}' --count 4 --seed 7 ")
+    assert (plan.objects.backgrounds, plan.accuracy, plan.first_seed, plan.expected) == (
+        0.25,
+        "draft",
+        7,
+        True,
+    )
+    assert _command(folder).startswith(
+        f"nlos-cam dataset build --out '{folder}' --count 4 --seed 7 "
+    )
     assert " --without 'hat, boat' " in _command(folder)
     assert _command(folder).endswith(" --workers 1")
 
@@ -79,9 +97,13 @@ def test_build_in_color_is_noted_as_simulation_only(tmp_path: Path, built: Run) 
     assert "textures" in built(tmp_path, code=4)["error"]["message"]
 
 
-def test_build_takes_rig_and_sensor_of_scene_and_hides_meshes_of_folder(tmp_path: Path, built: Run) -> None:
+def test_build_takes_rig_and_sensor_of_scene_and_hides_meshes_of_folder(
+    tmp_path: Path, built: Run
+) -> None:
     scene = tmp_path / "scene.toml"
-    scene.write_text('name = "s"\nrig = "paper-rig"\n[sensor]\nambient_counts = 20.0\n', encoding="utf-8")
+    scene.write_text(
+        'name = "s"\nrig = "paper-rig"\n[sensor]\nambient_counts = 20.0\n', encoding="utf-8"
+    )
     trimesh.creation.box((1, 1, 1)).export(tmp_path / "cube.stl")
     built(tmp_path / "d", "--scene", scene, "--objects", tmp_path)
     plan = open_dataset(tmp_path / "d").plan
@@ -98,7 +120,9 @@ def test_build_reports_damaged_shard(tmp_path: Path, built: Run, shown: Run) -> 
     assert len(read_head(shard).seeds) == 4
 
 
-def test_build_without_ray_names_the_extra(tmp_path: Path, built: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_build_without_ray_names_the_extra(
+    tmp_path: Path, built: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setitem(sys.modules, "ray", None)
     assert "nlos-cam[many]" in built(tmp_path / "d", "--ray", "auto", code=1)["error"]["message"]
 
@@ -115,7 +139,9 @@ def test_rate_is_objects_per_second_once_known() -> None:
 
 @pytest.fixture
 def recordings(noise_bag: Path, tmp_path: Path) -> Path:
-    """Two recordings with a depth map for each: one named after its label, one after its recording."""
+    """Two recordings with a depth map for each: one named after its label, one after its
+    recording.
+    """
     (folder := tmp_path / "recordings").mkdir()
     for name, label, truth, depth_m in (("a", "mug", "mug", 0.2), ("b", "jug", "b", 0.3)):
         shutil.copy(noise_bag, bag := folder / f"{name}.bag")
@@ -131,7 +157,8 @@ def label(recordings: Path, tmp_path: Path, run: Run) -> Run:
 
 def test_label_makes_dataset_of_single_frames(label: Run, tmp_path: Path) -> None:
     result = label("--frames", "3")
-    maps, plan = (data := open_dataset(out := tmp_path / "my data")).arrays(), data.plan
+    maps = (data := open_dataset(out := tmp_path / "my data")).arrays()
+    plan = data.plan
     assert len(maps.image) == result["samples"] == 6
     assert (result["recordings"], result["labels"], result["out"]) == (2, ["jug", "mug"], str(out))
     assert (result["rig_name"], result["rig_checksum"]) == (plan.rig.name, plan.rig.checksum)
@@ -139,14 +166,18 @@ def test_label_makes_dataset_of_single_frames(label: Run, tmp_path: Path) -> Non
     assert maps.image[0, 0, 0] > maps.image[5, 0, 0]
 
 
-def test_label_replaces_dataset_only_with_overwrite(label: Run, recordings: Path, tmp_path: Path) -> None:
+def test_label_replaces_dataset_only_with_overwrite(
+    label: Run, recordings: Path, tmp_path: Path
+) -> None:
     out = tmp_path / "my data"
     label("--frames", "2")
     assert label("--frames", "1", code=1)["error"]["type"] == "OutputExistsError"
     assert len(open_dataset(out).arrays().image) == 4
     label("--frames", "1", "--overwrite")
     assert len(open_dataset(out).arrays().image) == 2
-    assert _command(out) == f"nlos-cam dataset label {recordings} --out '{out}' --frames 1 --overwrite"
+    assert (
+        _command(out) == f"nlos-cam dataset label {recordings} --out '{out}' --frames 1 --overwrite"
+    )
     (recordings / "b.npy").unlink()
     error = label("--overwrite", code=4)["error"]
     assert (error["type"], "'jug'" in error["message"]) == ("RecordingError", True)

@@ -32,21 +32,38 @@ def test_devices_lists_usb_and_sdk(run: Run, shown: Run, bench: Bench) -> None:
     assert [one["usb_seen"] for one in found] == [True, None, None, None]
     assert {"name", "serial", "firmware", "usb_type"} < set(found[0])
     one, other = made["usb"]
-    names = "id kind meaning serial product firmware usb_type link port bus address interfaces error sdk_seen"
+    names = (
+        "id kind meaning serial product firmware usb_type link port bus address interfaces error"
+        " sdk_seen"
+    )
     assert list(one) == names.split()
-    assert (one["id"], one["serial"], one["firmware"], one["sdk_seen"]) == ("8086:0b64", "f0246262", "1.5.8", True)
+    assert (one["id"], one["serial"], one["firmware"], one["sdk_seen"]) == (
+        "8086:0b64",
+        "f0246262",
+        "1.5.8",
+        True,
+    )
     assert one["interfaces"] == ["hid", "video", "vendor"]
     assert (other["id"], other["kind"], other["sdk_seen"]) == ("8086:0b55", "recovery", None)
     bench.usb.devices[1] = fake_device(0x0AD3, serial="77", port_numbers=(2,))
     table = shown("devices").out
-    for word in ("l515:f0246262", "01.05.08.01", "5 Gbit/s (USB 3)", "D435", "RealSense D415", "sim:bare-wall"):
+    for word in (
+        "l515:f0246262",
+        "01.05.08.01",
+        "5 Gbit/s (USB 3)",
+        "D435",
+        "RealSense D415",
+        "sim:bare-wall",
+    ):
         assert word in table
     assert "doctor" not in table
 
 
 def test_camera_seen_by_one_side_points_to_the_doctor(run: Run, shown: Run, bench: Bench) -> None:
     def row() -> list[str]:
-        return next(line for line in shown("devices").out.splitlines() if "f0246262" in line).split()
+        return next(
+            line for line in shown("devices").out.splitlines() if "f0246262" in line
+        ).split()
 
     assert row()[-2:] == ["yes", "yes"]
     bench.hide()
@@ -61,14 +78,20 @@ def test_camera_seen_by_one_side_points_to_the_doctor(run: Run, shown: Run, benc
     assert "no l515" in shown("devices").out.lower()
 
 
-def test_devices_lists_usb_and_simulation_without_the_sdk(run: Run, shown: Run, bench: Bench) -> None:
+def test_devices_lists_usb_and_simulation_without_the_sdk(
+    run: Run, shown: Run, bench: Bench
+) -> None:
     bench.sdk_error = ImportError("No module named 'pyrealsense2'")
-    found, table = run("devices"), shown("devices").out
+    found = run("devices")
+    table = shown("devices").out
     assert [one["uri"] for one in found["devices"]] == ["sim", "sim:bare-wall"]
     assert [one["sdk_seen"] for one in found["usb"]] == [None]
     assert found["sdk_error"] == "No module named 'pyrealsense2'"
     assert found["sdk_error"] in table
-    assert next(line for line in table.splitlines() if "f0246262" in line).split()[-2] not in {"yes", "no"}
+    assert next(line for line in table.splitlines() if "f0246262" in line).split()[-2] not in {
+        "yes",
+        "no",
+    }
 
 
 def test_devices_lists_the_sdk_without_usb(run: Run, shown: Run, bench: Bench) -> None:
@@ -88,7 +111,9 @@ def test_doctor_json_lists_every_check(run: Run, shown: Run, bench: Bench) -> No
     assert shown("doctor", "--json").err == ""  # a failed check is no error of the command
     found = run("doctor")
     assert not found["ok"]
-    assert [check["name"] for check in found["checks"] if check["status"] == "failed"] == ["usb-camera"]
+    assert [check["name"] for check in found["checks"] if check["status"] == "failed"] == [
+        "usb-camera"
+    ]
 
 
 def test_doctor_prints_checks_and_each_fix_on_a_line(shown: Run, bench: Bench) -> None:
@@ -102,7 +127,9 @@ def test_doctor_prints_checks_and_each_fix_on_a_line(shown: Run, bench: Bench) -
     assert f"1 of {len(CHECKS)}" in out
 
 
-def test_doctor_writes_udev_rules_and_installation(shown: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_doctor_writes_udev_rules_and_installation(
+    shown: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     path = tmp_path / "99-l515.rules"
     out, err = shown("doctor", "--write-udev", path, "--json")
     assert path.read_text(encoding="utf-8") == rules_text()
@@ -113,5 +140,7 @@ def test_doctor_writes_udev_rules_and_installation(shown: Run, tmp_path: Path, m
     assert path.read_text(encoding="utf-8") == "mine"
     shown("doctor", "--write-udev", path, "--overwrite")
     assert path.read_text(encoding="utf-8") == rules_text()
-    monkeypatch.setattr(Path, "write_text", Mock(side_effect=PermissionError(13, "Permission denied")))
+    monkeypatch.setattr(
+        Path, "write_text", Mock(side_effect=PermissionError(13, "Permission denied"))
+    )
     assert "Permission denied" in shown("doctor", "--write-udev", tmp_path / "a.rules", code=1).err

@@ -1,4 +1,6 @@
-"""`evaluate` judges weights on objects or a dataset; `tradeoff` measures settings, and keeps its rows at Ctrl-C."""
+"""`evaluate` judges weights on objects or a dataset; `tradeoff` measures settings, and keeps its
+rows at Ctrl-C.
+"""
 
 import json
 import signal
@@ -18,25 +20,43 @@ from small_maps import SmallDataset
 
 from nlos_cam import evaluate
 from nlos_cam.dataset import HELD_OUT_SEED, TRAINING_SEED, DatasetPlan, procedural_images
-from nlos_cam.evaluate import TARGETS, baselines, measure_renders, render_settings, report, runtime_tradeoff, subjects
+from nlos_cam.evaluate import (
+    TARGETS,
+    baselines,
+    measure_renders,
+    render_settings,
+    report,
+    runtime_tradeoff,
+    subjects,
+)
 from nlos_cam.objects import benchmark_objects
 from nlos_cam.render import STOPS, Scene, paper_scene, render
 
 RIG = load_rig("paper-rig")
-Patch, Run, OUT = pytest.MonkeyPatch, Callable[..., Any], Path("cost")
+Patch = pytest.MonkeyPatch
+Run = Callable[..., Any]
+OUT = Path("cost")
 JUDGE, RENDER, RECONSTRUCT = (
     (*command.split(), "--out", out)
-    for command, out in (("evaluate", "figures"), ("tradeoff render", OUT), ("tradeoff reconstruct", OUT))
+    for command, out in (
+        ("evaluate", "figures"),
+        ("tradeoff render", OUT),
+        ("tradeoff reconstruct", OUT),
+    )
 )
 STORED = ["--dataset", "held-out", "--training", "held-out"]
 
 
 class Guesser(SheetNetwork):
-    """Network that answers everything with the same plate, and keeps the depth maps it was given."""
+    """Network that answers everything with the same plate, and keeps the depth maps it was
+    given.
+    """
 
     def __init__(self, eats: str = "raw maps") -> None:
         super().__init__()
-        vars(self.record).update(input=eats, compressor_recipe=None, vae_recipe=SimpleNamespace(left_out=["cup"]))
+        vars(self.record).update(
+            input=eats, compressor_recipe=None, vae_recipe=SimpleNamespace(left_out=["cup"])
+        )
 
     def __call__(self, depth_m: np.ndarray, intensity: np.ndarray) -> np.ndarray:
         inside = np.abs(np.arange(64) - 31.5) < 16
@@ -64,7 +84,9 @@ class Stored(SmallDataset):
 
 @pytest.fixture(autouse=True)
 def guessing(monkeypatch: Patch) -> list[DatasetPlan]:
-    """A guesser as weights, a dataset, and training objects that are not rendered; their plans are kept."""
+    """A guesser as weights, a dataset, and training objects that are not rendered; their plans are
+    kept.
+    """
     asked: list[DatasetPlan] = []
 
     def training_maps(plan: DatasetPlan, *_: object) -> Stored:
@@ -85,15 +107,20 @@ def unwritten(monkeypatch: Patch) -> None:
 
 
 def test_evaluate_writes_figures_of_dataset_beside_baselines(run: Run, monkeypatch: Patch) -> None:
-    result, out = run(*JUDGE, *STORED), Path("figures")
+    result = run(*JUDGE, *STORED)
+    out = Path("figures")
     assert {*TARGETS, "baselines", "per_category", "objects", "seconds", "out"} < set(result)
     assert (result["objects"], result["training_objects"]) == (3, 3)
     assert set(result["baselines"]) == {"all_background", "mean_object", "nearest_neighbour"}
-    assert result["baselines"]["nearest_neighbour"]["silhouette_iou"]["value"] == 1  # it is the set itself
+    assert (
+        result["baselines"]["nearest_neighbour"]["silhouette_iou"]["value"] == 1
+    )  # it is the set itself
     assert set(result["per_category"]) == {"cup", "hat"}
     assert set(result["shown_and_left_out"]) == {"shown", "left out"}
     assert ["cup" in note for note in result["notes"]] == [True]
-    assert json.loads((out / "figures.json").read_text("utf-8")) == {k: v for k, v in result.items() if k != "out"}
+    assert json.loads((out / "figures.json").read_text("utf-8")) == {
+        k: v for k, v in result.items() if k != "out"
+    }
     assert "\nhat 1," in (out / "objects.csv").read_text("utf-8")
     assert run(*JUDGE, *STORED, code=1)["error"]["type"] == "OutputExistsError"
     monkeypatch.setattr("nlos_cam.evaluate.write_report", lambda *_: None)
@@ -101,8 +128,12 @@ def test_evaluate_writes_figures_of_dataset_beside_baselines(run: Run, monkeypat
 
 
 @pytest.mark.slow
-def test_evaluate_uses_test_set_without_dataset(run: Run, monkeypatch: Patch, guessing: list[DatasetPlan]) -> None:
-    monkeypatch.setattr(subjects.shapes, "benchmark_objects", lambda box: benchmark_objects(box)[:2])
+def test_evaluate_uses_test_set_without_dataset(
+    run: Run, monkeypatch: Patch, guessing: list[DatasetPlan]
+) -> None:
+    monkeypatch.setattr(
+        subjects.shapes, "benchmark_objects", lambda box: benchmark_objects(box)[:2]
+    )
     result = run(*JUDGE)
     assert (result["objects"], result["rig"], guessing[0].rig) == (2, RIG.name, RIG)
     assert list(result["per_category"]) == [benchmark_objects(DatasetPlan(RIG, 0).box)[0].category]
@@ -120,16 +151,26 @@ def test_evaluate_count_uses_seeded_objects(run: Run, guessing: list[DatasetPlan
 @pytest.mark.usefixtures("unwritten")
 @pytest.mark.parametrize(
     ("maps", "options", "wall_m"),
-    [("raw maps", [], 0), ("difference maps", [], 0.25), ("difference maps", ["--wall", "wall.toml"], 0.5)],
+    [
+        ("raw maps", [], 0),
+        ("difference maps", [], 0.25),
+        ("difference maps", ["--wall", "wall.toml"], 0.5),
+    ],
 )
 def test_evaluate_subtracts_bare_wall_for_the_weights_alone(
     run: Run, monkeypatch: Patch, maps: str, options: list[str], wall_m: float
 ) -> None:
-    network, blank = Guesser(maps), np.zeros((64, 80), np.float32)
+    network = Guesser(maps)
+    blank = np.zeros((64, 80), np.float32)
     monkeypatch.setattr(report, "load_reconstructor", lambda *_: network)
-    monkeypatch.setattr(subjects.data, "render_bare_wall", lambda _: (blank + np.float32(0.25), blank))
-    monkeypatch.setattr(subjects.data, "measured_bare_wall", lambda _: (blank + np.float32(0.5), blank))
-    result, raw = run(*JUDGE, *STORED, *options), _maps(DatasetPlan(RIG, HELD_OUT_SEED), 3)
+    monkeypatch.setattr(
+        subjects.data, "render_bare_wall", lambda _: (blank + np.float32(0.25), blank)
+    )
+    monkeypatch.setattr(
+        subjects.data, "measured_bare_wall", lambda _: (blank + np.float32(0.5), blank)
+    )
+    result = run(*JUDGE, *STORED, *options)
+    raw = _maps(DatasetPlan(RIG, HELD_OUT_SEED), 3)
     np.testing.assert_allclose(np.stack(network.given), raw.depth_m - wall_m, atol=1e-6)
     assert result["input"] == maps
     assert result["baselines"]["nearest_neighbour"]["silhouette_iou"]["value"] == 1
@@ -157,7 +198,9 @@ def small(monkeypatch: Patch) -> list[Scene]:
 
     def measured(scene: Scene) -> Iterator[evaluate.RenderRow]:
         asked.append(scene)
-        return islice(measure_renders(shrunk(scene), SMALL, lambda work, _: (work(), 0.5)[1]), FIRST)
+        return islice(
+            measure_renders(shrunk(scene), SMALL, lambda work, _: (work(), 0.5)[1]), FIRST
+        )
 
     monkeypatch.setattr("nlos_cam.evaluate.measure_renders", measured)
     settings = lambda scene: render_settings(shrunk(scene), SMALL)[:FIRST]  # noqa: E731
@@ -168,7 +211,9 @@ def small(monkeypatch: Patch) -> list[Scene]:
 @pytest.fixture
 def plates(monkeypatch: Patch) -> None:
     """Two runtimes that answer with a plate, for any weights."""
-    made = {name: lambda _: sheet_network for name in ("torch float32, cpu", "ONNX Runtime float32")}
+    made = {
+        name: lambda _: sheet_network for name in ("torch float32, cpu", "ONNX Runtime float32")
+    }
     monkeypatch.setattr("nlos_cam.evaluate.runtimes", lambda *_: made)
     monkeypatch.setattr(runtime_tradeoff, "MIN_CALLS", 2)
 
@@ -176,10 +221,14 @@ def plates(monkeypatch: Patch) -> None:
 def _assert_written(result: dict[str, Any]) -> None:
     assert result["out"] == str(OUT)
     assert {path.name for path in OUT.iterdir()} == FILES
-    assert json.loads((OUT / "tradeoff.json").read_text()) == {k: v for k, v in result.items() if k != "out"}
+    assert json.loads((OUT / "tradeoff.json").read_text()) == {
+        k: v for k, v in result.items() if k != "out"
+    }
 
 
-def test_tradeoff_render_writes_table_and_plot_and_overwrites_when_asked(run: Run, small: list[Scene]) -> None:
+def test_tradeoff_render_writes_table_and_plot_and_overwrites_when_asked(
+    run: Run, small: list[Scene]
+) -> None:
     OUT.mkdir()
     (precious := OUT / "tradeoff.md").write_text("precious")
     assert run(*RENDER, code=1)["error"]["type"] == "OutputExistsError"
@@ -238,14 +287,19 @@ def test_tradeoff_keeps_rows_measured_before_signal(
     assert signal.getsignal(number) == before
     if rows:
         _assert_written(result)
-        assert (result["complete"], len(result.get("stops", result.get("settings")))) == (False, rows)
+        assert (result["complete"], len(result.get("stops", result.get("settings")))) == (
+            False,
+            rows,
+        )
     else:
         assert result["out"] is None
         assert not list(Path().iterdir())
 
 
 def test_tradeoff_refuses_color_weights_before_rendering(run: Run) -> None:
-    recipe = Recipe(task="vae", colour=True, objects=2, held_out=1, epochs=1, batch=2, learning_rate=1e-3)
+    recipe = Recipe(
+        task="vae", colour=True, objects=2, held_out=1, epochs=1, batch=2, learning_rate=1e-3
+    )
     record = CheckpointRecord.of([recipe], ("paper-rig", "0"))
     (weights := Path("color")).mkdir()
     (weights / "checkpoint.json").write_text(record.model_dump_json(), encoding="utf-8")

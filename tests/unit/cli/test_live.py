@@ -31,12 +31,16 @@ from nlos_cam.reconstruct.verdict import Verdict
 from nlos_cam.view import NullViewer, SessionFile
 
 TIMES = {"p50": 1.04, "p95": 2.0, "p99": 3.06}
-RECORDED, REPLAY = ["live", "--camera", "bag:fake", "--no-view"], ["replay", "run.bag", "--out", "out"]
-SIMULATED, WALLED = ["live", "--camera", "sim", "--no-view"], [*REPLAY, "--overwrite", "--wall"]
+RECORDED = ["live", "--camera", "bag:fake", "--no-view"]
+REPLAY = ["replay", "run.bag", "--out", "out"]
+SIMULATED = ["live", "--camera", "sim", "--no-view"]
+WALLED = [*REPLAY, "--overwrite", "--wall"]
 
 
 class Opened:
-    """Opener of `camera`, or of one with `count` frames that calls `on_frame` before each; keeps the calls."""
+    """Opener of `camera`, or of one with `count` frames that calls `on_frame` before each; keeps
+    the calls.
+    """
 
     def __init__(self) -> None:
         self.calls: list[tuple[str, dict[str, Any]]] = []
@@ -44,12 +48,16 @@ class Opened:
         self.on_open: Callable[[], None] = lambda: None
         self.count: int | None = 20
         self.camera: Recorded | WallCamera | None = None
-        self.network, self.doubter = SheetNetwork(), FakeDoubter()
+        self.network = SheetNetwork()
+        self.doubter = FakeDoubter()
 
     def __call__(self, uri: str, **options: Any) -> FrameCamera | WallCamera:
         self.calls.append((uri, options))
         self.on_open()
-        quick: Any = {"uri": uri, "make": lambda number: replace(small_frame(number), timestamp_s=number / 1000)}
+        quick: Any = {
+            "uri": uri,
+            "make": lambda number: replace(small_frame(number), timestamp_s=number / 1000),
+        }
         return self.camera or FrameCamera(self.count, self.on_frame, **quick)
 
 
@@ -59,7 +67,9 @@ def opened(monkeypatch: pytest.MonkeyPatch) -> Iterator[Opened]:
     monkeypatch.setattr("nlos_cam.camera.open_camera", opened)
     monkeypatch.setattr("nlos_cam.reconstruct.load_networks", lambda *_: opened.network)
     monkeypatch.setattr("nlos_cam.reconstruct.load_uncertainty", lambda *_: opened.doubter)
-    monkeypatch.setattr("nlos_cam.live.replay.draw_contact_sheet", lambda path, *_: path.touch())  # takes a second
+    monkeypatch.setattr(
+        "nlos_cam.live.replay.draw_contact_sheet", lambda path, *_: path.touch()
+    )  # takes a second
     before = signal.getsignal(signal.SIGINT)
     yield opened
     assert signal.getsignal(signal.SIGINT) == before
@@ -68,9 +78,12 @@ def opened(monkeypatch: pytest.MonkeyPatch) -> Iterator[Opened]:
 @pytest.fixture
 def walled(opened: Opened, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Opened:
     """Camera on a measured wall, wall.toml, that is moved for a while."""
-    monkeypatch.setattr("nlos_cam.live.loop.os.cpu_count", lambda: 1)  # the network is given maps in order
+    monkeypatch.setattr(
+        "nlos_cam.live.loop.os.cpu_count", lambda: 1
+    )  # the network is given maps in order
     write_wall(tmp_path / "wall.toml", bare_wall())
-    opened.camera, opened.doubter = WallCamera(100, moved=range(30, 60)), None
+    opened.camera = WallCamera(100, moved=range(30, 60))
+    opened.doubter = None
     return opened
 
 
@@ -82,14 +95,32 @@ def test_live_json_and_log_have_their_fields(run: Run) -> None:
     arguments = [*RECORDED, "--log", "log.csv"]
     report = run(*arguments)
     fields = ("frames", "fps", "dropped", "latency_ms", "stages_ms", "counts", "warnings")
-    assert set(report) == {*fields, "stages_percentiles_ms", "verdicts", "stalled_s", "quality", "camera_ms"}
+    assert set(report) == {
+        *fields,
+        "stages_percentiles_ms",
+        "verdicts",
+        "stalled_s",
+        "quality",
+        "camera_ms",
+    }
     assert (report["frames"], report["dropped"]) == (20, 0)
     assert report["verdicts"] == {Verdict.SEEN.value: 20}
     assert set(report["latency_ms"]) == {"p50", "p95", "p99"}
-    assert set(report["stages_ms"]) == {"delivery", "wait", "queue", "maps", "bench", "network", "doubt", "view"}
+    assert set(report["stages_ms"]) == {
+        "delivery",
+        "wait",
+        "queue",
+        "maps",
+        "bench",
+        "network",
+        "doubt",
+        "view",
+    }
     header, *lines = Path("log.csv").read_text(encoding="utf-8").splitlines()
     assert [int(line.split(",")[0]) for line in lines] == list(range(20))
-    assert {"latency_ms", "delivery_ms", "queue_ms", "network_ms", "dropped", "verdict"} <= set(header.split(","))
+    assert {"latency_ms", "delivery_ms", "queue_ms", "network_ms", "dropped", "verdict"} <= set(
+        header.split(",")
+    )
     run(*arguments, code=1)
     assert "http://127.0.0.1:" in run("live", "--camera", "bag:fake").err
 
@@ -115,7 +146,9 @@ def test_live_saves_its_view_and_overwrites_only_when_asked(opened: Opened, run:
 def test_replay_saves_view_stills_and_video(opened: Opened, run: Run) -> None:
     opened.camera = Recorded(12)
     run(*REPLAY, "--save-view", "--stills", "2", "--video")
-    assert {"view.html", "replay.webm", "still-000000.png"} < {file.name for file in Path("out").iterdir()}
+    assert {"view.html", "replay.webm", "still-000000.png"} < {
+        file.name for file in Path("out").iterdir()
+    }
 
 
 def test_live_record_overwrites_only_when_asked(opened: Opened, run: Run) -> None:
@@ -143,12 +176,18 @@ def test_replay_writes_its_folder_and_one_json_object(opened: Opened, run: Run) 
     assert "training rig" not in report.err
     run(*REPLAY, code=1)
     run(*REPLAY, "--overwrite", "--reader", "sdk")
-    assert opened.calls == [("bag:run.bag", {"reader": "plain"}), ("bag:run.bag", {"reader": "sdk"})]
+    assert opened.calls == [
+        ("bag:run.bag", {"reader": "plain"}),
+        ("bag:run.bag", {"reader": "sdk"}),
+    ]
 
 
 @pytest.mark.parametrize("command", [RECORDED, REPLAY])
-def test_interrupted_command_keeps_its_results(opened: Opened, run: Run, command: list[str]) -> None:
-    opened.count, opened.on_frame = None, lambda number: number == 10 and os.kill(os.getpid(), signal.SIGINT)
+def test_interrupted_command_keeps_its_results(
+    opened: Opened, run: Run, command: list[str]
+) -> None:
+    opened.count = None
+    opened.on_frame = lambda number: number == 10 and os.kill(os.getpid(), signal.SIGINT)
     report = run(*command, code=130)
     if command is REPLAY:
         with np.load("out/reconstruction.npz") as file:
@@ -157,7 +196,9 @@ def test_interrupted_command_keeps_its_results(opened: Opened, run: Run, command
 
 
 @pytest.mark.parametrize("command", [SIMULATED, ["replay", "a.bag"]])
-def test_interrupt_while_a_camera_opens_begins_no_run(opened: Opened, run: Run, command: list[str]) -> None:
+def test_interrupt_while_a_camera_opens_begins_no_run(
+    opened: Opened, run: Run, command: list[str]
+) -> None:
     def swallow() -> None:
         with suppress(KeyboardInterrupt):
             signal.raise_signal(signal.SIGINT)
@@ -166,7 +207,9 @@ def test_interrupt_while_a_camera_opens_begins_no_run(opened: Opened, run: Run, 
     assert run(*command, code=130) == {}
 
 
-def test_live_budget_reports_whether_it_was_kept(opened: Opened, run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_live_budget_reports_whether_it_was_kept(
+    opened: Opened, run: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr("nlos_cam.live.setting_loader", lambda *_: lambda _: opened.network)
     report = run(*RECORDED, "--budget-ms", "100000")
     assert report["budget"]["kept"]
@@ -175,7 +218,9 @@ def test_live_budget_reports_whether_it_was_kept(opened: Opened, run: Run, monke
 
 @pytest.mark.usefixtures("walled")
 @pytest.mark.parametrize("command", [SIMULATED, REPLAY])
-def test_begin_and_end_of_a_warning_print_once(run: Run, monkeypatch: pytest.MonkeyPatch, command: list[str]) -> None:
+def test_begin_and_end_of_a_warning_print_once(
+    run: Run, monkeypatch: pytest.MonkeyPatch, command: list[str]
+) -> None:
     monkeypatch.setattr("nlos_cam.live.frame_queue.QUEUE_FRAMES", 1000)
     report = run(*command, "--wall", "wall.toml")
     [(warning, frames)] = report["warnings"].items()
@@ -193,14 +238,16 @@ def test_average_is_over_as_many_frames_as_asked(walled: Opened) -> None:
 
 
 def test_weights_of_difference_maps_need_a_wall(walled: Opened, run: Run) -> None:
-    walled.camera, walled.network.record.input = WallCamera(21), "difference maps"
+    walled.camera = WallCamera(21)
+    walled.network.record.input = "difference maps"
     run(*WALLED, "wall.toml")
     assert abs(np.nanmean(walled.network.given[20])) < 1e-3
     assert "--wall" in run(*SIMULATED, code=1)["error"]["message"]
 
 
 def test_summary_has_a_sentence_per_fact_and_stages_if_verbose() -> None:
-    latency_ms, stages = {"p50": 9.0, "p95": 14.0, "p99": 21.0}, {"wait": TIMES, "delivery": TIMES, "network": TIMES}
+    latency_ms = {"p50": 9.0, "p95": 14.0, "p99": 21.0}
+    stages = {"wait": TIMES, "delivery": TIMES, "network": TIMES}
     plain = RunReport(10, 29.97, 0, latency_ms, {}, {}, stages_percentiles_ms=stages)
     assert len(summary(plain).splitlines()) == 2
     full = replace(
@@ -213,7 +260,10 @@ def test_summary_has_a_sentence_per_fact_and_stages_if_verbose() -> None:
     )
     assert summary(full).splitlines()[2:] == [
         "Dropped 5 frames: 2 at the camera, 3 because processing was too slow",
-        "Warning: 33% of the frames dropped, median latency 9 ms: close other programs, or give --budget-ms",
+        (
+            "Warning: 33% of the frames dropped, median latency 9 ms: close other programs, or give"
+            " --budget-ms"
+        ),
         "Object detected in 7 of 10 frames, nothing there in 3",
         "Irregular: 1 blank",
         "Stalled for 1.2 s without a frame",
@@ -248,13 +298,21 @@ def printed(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     return lines
 
 
-def serve(*, no_view: bool = False, host: str | None = None, port: int | None = None, open_it: bool = False) -> None:
+def serve(
+    *,
+    no_view: bool = False,
+    host: str | None = None,
+    port: int | None = None,
+    open_it: bool = False,
+) -> None:
     """Serve a view with these options, print where, and end it."""
     with viewer_of(RunControl(), no_view=no_view, host=host, port=port) as viewer:
         announce_view(viewer, host=host, port=port, open_it=open_it)
 
 
-def test_view_on_all_addresses_notes_who_can_see_it_and_no_view_serves_nothing(printed: list[str]) -> None:
+def test_view_on_all_addresses_notes_who_can_see_it_and_no_view_serves_nothing(
+    printed: list[str],
+) -> None:
     serve(host=EVERYWHERE)
     serve(no_view=True, open_it=True)
     line, note, without = printed
@@ -267,7 +325,9 @@ def test_view_on_all_addresses_notes_who_can_see_it_and_no_view_serves_nothing(p
             viewer_of(RunControl(), no_view=True, **place)
 
 
-def test_view_moves_from_a_taken_port_unless_asked_for(printed: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_view_moves_from_a_taken_port_unless_asked_for(
+    printed: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
     with socket.create_server(("127.0.0.1", 0)) as other:
         port = other.getsockname()[1]
         for module in ("nlos_cam.view", "nlos_cam.view.web"):
@@ -285,7 +345,9 @@ def test_view_opens_a_browser_or_notes_that_it_cannot(
     printed: list[str], monkeypatch: pytest.MonkeyPatch, opens: bool
 ) -> None:
     asked: list[str] = []
-    monkeypatch.setattr("nlos_cam.cli.view.opened_in_browser", lambda address: asked.append(address) or opens)
+    monkeypatch.setattr(
+        "nlos_cam.cli.view.opened_in_browser", lambda address: asked.append(address) or opens
+    )
     serve(open_it=True)
     assert asked[0].startswith("http://127.0.0.1:")
     assert ["browser" in line for line in printed[1:]] == [True] * (not opens)

@@ -1,4 +1,6 @@
-"""Frame of the command line: exit codes, one line for an error, one JSON object for a machine, outputs kept safe."""
+"""Frame of the command line: exit codes, one line for an error, one JSON object for a machine,
+outputs kept safe.
+"""
 
 import errno
 import inspect
@@ -30,17 +32,38 @@ from nlos_cam.cli import common
 from nlos_cam.cli import main as module
 from nlos_cam.cli import run as run_script
 from nlos_cam.cli.common import Json, finish, say, say_error
-from nlos_cam.cli.main import COMMANDS, MIN_ADDRESS_BYTES, TORCH_ADDRESS_BYTES, _share_options, build_app, main
+from nlos_cam.cli.main import (
+    COMMANDS,
+    MIN_ADDRESS_BYTES,
+    TORCH_ADDRESS_BYTES,
+    _share_options,
+    build_app,
+    main,
+)
 from nlos_cam.cli.plain_help import plain_help, range_text
 
 CODES = {
-    1: (errors.SceneError, errors.OutputExistsError, WallRefusedError, CalibrationError, ModelError),
+    1: (
+        errors.SceneError,
+        errors.OutputExistsError,
+        WallRefusedError,
+        CalibrationError,
+        ModelError,
+    ),
     3: (errors.CameraNotFoundError, errors.CameraLostError),
-    4: (errors.RecordingError, errors.StreamMissingError, RecordFileError, CheckpointError, RecipeError),
+    4: (
+        errors.RecordingError,
+        errors.StreamMissingError,
+        RecordFileError,
+        CheckpointError,
+        RecipeError,
+    ),
 }
-Act, Run = Callable[[], object], Callable[..., Any]
+Act = Callable[[], object]
+Run = Callable[..., Any]
 Does = Callable[[Act | BaseException], None]
-Capsys, Patch = pytest.CaptureFixture[str], pytest.MonkeyPatch
+Capsys = pytest.CaptureFixture[str]
+Patch = pytest.MonkeyPatch
 
 
 @pytest.fixture
@@ -70,18 +93,24 @@ def test_command_prints_its_sentence_or_one_json_object(does: Does, shown: Run, 
     assert run("act", "--count", "3") == {"count": 3}
 
 
-@pytest.mark.parametrize(("kind", "code"), [(kind, code) for code, kinds in CODES.items() for kind in kinds])
-def test_foreseen_error_has_code_and_line(does: Does, shown: Run, run: Run, kind: type[Exception], code: int) -> None:
+@pytest.mark.parametrize(
+    ("kind", "code"), [(kind, code) for code, kinds in CODES.items() for kind in kinds]
+)
+def test_foreseen_error_has_code_and_line(
+    does: Does, shown: Run, run: Run, kind: type[Exception], code: int
+) -> None:
     does(kind(message := "a depth of [3] m\nin [red]"))
     assert shown("act", code=code) == ("", "error: a depth of [3] m in [red]\n")
     assert run("act", code=code) == {"error": {"type": kind.__name__, "message": message}}
 
 
-DISK, FILE = (errno.ENOSPC, errno.EROFS, errno.EIO), (errno.EACCES, errno.ENOENT, errno.EISDIR)
+DISK = (errno.ENOSPC, errno.EROFS, errno.EIO)
+FILE = (errno.EACCES, errno.ENOENT, errno.EISDIR)
 
 
 @pytest.mark.parametrize(
-    ("code", "kind"), [*((c, "DiskFullError") for c in DISK), *((c, "RecordingError") for c in FILE)]
+    ("code", "kind"),
+    [*((c, "DiskFullError") for c in DISK), *((c, "RecordingError") for c in FILE)],
 )
 def test_system_error_names_file_and_reason(does: Does, run: Run, code: int, kind: str) -> None:
     does(OSError(code, os.strerror(code), "out/F.npz"))
@@ -91,7 +120,9 @@ def test_system_error_names_file_and_reason(does: Does, run: Run, code: int, kin
     assert os.strerror(code) in error["message"]
 
 
-@pytest.mark.parametrize("bug", [OSError(errno.EINVAL, "without a file"), ZeroDivisionError("a bug")])
+@pytest.mark.parametrize(
+    "bug", [OSError(errno.EINVAL, "without a file"), ZeroDivisionError("a bug")]
+)
 def test_unforeseen_error_is_not_hidden(does: Does, bug: Exception) -> None:
     does(bug)
     with pytest.raises(type(bug)):
@@ -115,7 +146,9 @@ def _inner_block() -> None:
         signal.raise_signal(signal.SIGINT)
 
 
-@pytest.mark.parametrize("act", [_inner_block, lambda: common.exit_interrupted("two rows are kept")])
+@pytest.mark.parametrize(
+    "act", [_inner_block, lambda: common.exit_interrupted("two rows are kept")]
+)
 def test_interrupted_command_says_once_what_it_kept(does: Does, shown: Run, act: Act) -> None:
     does(act)
     assert shown("act", code=130).err == "interrupted: two rows are kept\n"
@@ -141,7 +174,9 @@ def test_quiet_prints_results_and_errors_only(does: Does, shown: Run) -> None:
 
 
 @pytest.mark.parametrize("act", [KeyboardInterrupt(), typer.Abort(), _swallowed, _made_an_error])
-def test_ctrl_c_exits_with_130_even_if_a_library_catches_it(does: Does, shown: Run, act: Any) -> None:
+def test_ctrl_c_exits_with_130_even_if_a_library_catches_it(
+    does: Does, shown: Run, act: Any
+) -> None:
     does(act)
     assert "Traceback" not in shown("act", code=130).err
 
@@ -176,11 +211,20 @@ def test_console_script_exits_with_the_code(does: Does, monkeypatch: Patch, caps
     assert "no device" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("module_name", ["nlos_cam.cli.main", "typing", "typer", "rich.console", "rich.table"])
+@pytest.mark.parametrize(
+    "module_name", ["nlos_cam.cli.main", "typing", "typer", "rich.console", "rich.table"]
+)
 def test_interruption_while_python_imports_is_one_line(module_name: str) -> None:
-    """The signal comes at the import of a module: before, between and after those of the command line itself."""
-    interrupt = f"lambda event, found: event == 'import' and found[0] == {module_name!r} and signal.raise_signal(2)"
-    program = f"import signal, sys; sys.addaudithook({interrupt}); from nlos_cam.cli import run; run()"
+    """The signal comes at the import of a module: before, between and after those of the command
+    line itself.
+    """
+    interrupt = (
+        f"lambda event, found: event == 'import' and found[0] == {module_name!r} and"
+        " signal.raise_signal(2)"
+    )
+    program = (
+        f"import signal, sys; sys.addaudithook({interrupt}); from nlos_cam.cli import run; run()"
+    )
     line = [sys.executable, "-c", program, "scenes"]
     ended = subprocess.run(line, check=False, capture_output=True, text=True, timeout=120)
     assert (ended.returncode, ended.stdout) == (130, "")
@@ -190,7 +234,10 @@ def test_interruption_while_python_imports_is_one_line(module_name: str) -> None
 
 def leaves(app: typer.Typer, path: str = "") -> list[tuple[str, object]]:
     commands = app.registered_commands
-    found = [(f"{path} {c.name or getattr(c.callback, '__name__', None)}".strip(), c.callback) for c in commands]
+    found = [
+        (f"{path} {c.name or getattr(c.callback, '__name__', None)}".strip(), c.callback)
+        for c in commands
+    ]
     for group in app.registered_groups:
         found += leaves(group.typer_instance, f"{path} {group.name}".strip())
     return found
@@ -218,7 +265,11 @@ def test_option_help_has_placeholders_and_ranges_in_words(shown: Run) -> None:
     tree = get_command(build_app("capture"))
     plain_help(tree)
     options = {parameter.name: parameter for parameter in tree.commands["capture"].params}  # type: ignore[attr-defined]
-    assert (options["seconds"].metavar, options["takes"].metavar, options["overwrite"].metavar) == ("SECONDS", "N", "")
+    assert (options["seconds"].metavar, options["takes"].metavar, options["overwrite"].metavar) == (
+        "SECONDS",
+        "N",
+        "",
+    )
     assert options["takes"].help.endswith("(1 to 9999).")
     assert not {"<bool>", "<=", ">="} & {*shown("capture", "--help").out.replace("[", " ").split()}
     texts = {(1, 65535): "1 to 65535", (0.1, None): "at least 0.1", (None, 5): "at most 5"}
@@ -251,7 +302,10 @@ def test_printed_text_is_literal_unless_marked(capsys: Capsys) -> None:
     finish({}, as_json=False, text="[bold]good[/]", marked=True)
     say("kept in [red]")
     say_error("a:smile:b")
-    assert capsys.readouterr() == ("wrote runs/[bold]x\ngood\n", "kept in [red]\nerror: a:smile:b\n")
+    assert capsys.readouterr() == (
+        "wrote runs/[bold]x\ngood\n",
+        "kept in [red]\nerror: a:smile:b\n",
+    )
 
 
 HEAVY = {"torch", "numba", "cv2", "onnxruntime", "rerun", "matplotlib", "h5py", "numpy"}
@@ -261,18 +315,25 @@ def test_help_groups_commands_and_imports_nothing_heavy() -> None:
     """The page of the groups, which needs no command's module, and the page of every command."""
     tree = get_command(build_app())
     groups = {name: [*getattr(each, "commands", {})] for name, each in tree.commands.items()}  # type: ignore[attr-defined]
-    lines = [[name, *below] for name, parts in groups.items() for below in ([[]] + [[part] for part in parts])]
+    lines = [
+        [name, *below]
+        for name, parts in groups.items()
+        for below in [[]] + [[part] for part in parts]
+    ]
     assert len(lines) > len(COMMANDS)
     program = (
         "import sys; from nlos_cam.cli.main import main; "
         "print([main(line) for line in ([], ['-h'], ['--help'])], *sys.modules); "
         f"print([main([*line, '--help']) for line in {lines}], *sys.modules)"
     )
-    ended = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True, timeout=120)
+    ended = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, check=True, timeout=120
+    )
     pages, separator, rest = ended.stdout.partition("[0, 0, 0] ")
     assert separator
     assert all(pages.count(row.group) >= 3 for row in COMMANDS.values())
-    first, last = rest.partition("\n")[0], rest.rstrip().rpartition("\n")[2]
+    first = rest.partition("\n")[0]
+    last = rest.rstrip().rpartition("\n")[2]
     assert not {f"nlos_cam.cli.{name}" for name in ("capture", "live", "train")} & {*first.split()}
     assert last.count("0, ") + 1 == len(lines)
     assert not HEAVY & {*first.split(), *last.split()}
@@ -309,8 +370,12 @@ def test_interruption_that_python_ignores_is_raised_again() -> None:
     assert sys.unraisablehook is hook
 
 
-@pytest.mark.parametrize(("command", "needed"), [("rigs", MIN_ADDRESS_BYTES), ("train", TORCH_ADDRESS_BYTES)])
-def test_little_address_space_is_one_line_at_once(monkeypatch: Patch, shown: Run, command: str, needed: int) -> None:
+@pytest.mark.parametrize(
+    ("command", "needed"), [("rigs", MIN_ADDRESS_BYTES), ("train", TORCH_ADDRESS_BYTES)]
+)
+def test_little_address_space_is_one_line_at_once(
+    monkeypatch: Patch, shown: Run, command: str, needed: int
+) -> None:
     monkeypatch.setattr(resource, "getrlimit", lambda _: (needed - 1, needed))
     assert f"is {(needed >> 20) - 1} MiB" in shown(command, "--help", code=1).err
     monkeypatch.setattr(resource, "getrlimit", lambda _: (needed, needed))
@@ -327,7 +392,10 @@ def test_error_is_printed_without_rich_where_memory_is_short(
 
 
 NO_MAP = ImportError("a.so: failed to map segment from shared object")
-FAILED = [RuntimeError(f"export failed\n{reason}") for reason in ("std::bad_alloc", "cannot allocate memory")]
+FAILED = [
+    RuntimeError(f"export failed\n{reason}")
+    for reason in ("std::bad_alloc", "cannot allocate memory")
+]
 
 
 @pytest.mark.parametrize("error", [*FAILED, NO_MAP, MemoryError(), RuntimeError("of one")], ids=str)

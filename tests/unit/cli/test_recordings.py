@@ -1,4 +1,6 @@
-"""`repair`, `export` and `info` of files: outputs kept safe, damage is exit code 4, facts and next commands."""
+"""`repair`, `export` and `info` of files: outputs kept safe, damage is exit code 4, facts and next
+commands.
+"""
 
 import os
 import signal
@@ -16,7 +18,9 @@ from nlos_cam.recording import repair_recording, verify
 Run = Callable[..., Any]
 
 
-def test_repair_reports_new_file_and_overwrites_if_asked(run: Run, noise_bags: dict[str, Path], tmp_path: Path) -> None:
+def test_repair_reports_new_file_and_overwrites_if_asked(
+    run: Run, noise_bags: dict[str, Path], tmp_path: Path
+) -> None:
     (out := tmp_path / "good.bag").write_bytes(b"mine")
     command = "repair", noise_bags["packed-unindexed"], "--out", out
     error = run(*command, code=1)["error"]
@@ -61,18 +65,25 @@ def test_repair_interrupted_is_exit_code_130_without_output(
     assert list(tmp_path.iterdir()) == []
 
 
-def test_export_reports_what_was_written_and_overwrites_when_asked(noise_bag: Path, tmp_path: Path, run: Run) -> None:
+def test_export_reports_what_was_written_and_overwrites_when_asked(
+    noise_bag: Path, tmp_path: Path, run: Run
+) -> None:
     (tmp_path / "depth.csv").write_text("precious")
     command = "export", noise_bag, "--out", tmp_path, "--ply", "--every", "10"
     run(*command, code=1)
     assert (tmp_path / "depth.csv").read_text() == "precious"
     found = run(*command, "--overwrite")
     assert (tmp_path / "depth.csv").read_text() != "precious"
-    assert found == {"frames": {"depth": 2, "infrared": 2, "confidence": 2, "points": 2}, "out": str(tmp_path)}
+    assert found == {
+        "frames": {"depth": 2, "infrared": 2, "confidence": 2, "points": 2},
+        "out": str(tmp_path),
+    }
     assert len(list((tmp_path / "points").glob("*.ply"))) == 2
 
 
-def test_export_of_wrong_streams_or_damage_is_exit_code_4(noise_bag: Path, tmp_path: Path, shown: Run) -> None:
+def test_export_of_wrong_streams_or_damage_is_exit_code_4(
+    noise_bag: Path, tmp_path: Path, shown: Run
+) -> None:
     out = "--out", tmp_path / "out"
     assert "color" in shown("export", noise_bag, "--streams", "color", *out, code=4).err
     assert list(tmp_path.iterdir()) == []
@@ -91,20 +102,30 @@ def test_export_writes_hidden_surfaces_of_a_replay(tmp_path: Path, run: Run) -> 
     np.savez(result, depth_m=depth_m, uncertainty_m=depth_m, frame_number=[5, 6], **box)  # pyright: ignore[reportArgumentType]
     export = "export", result, "--out", tmp_path / "out", "--object"
     assert run(*export, "glb,points")["frames"] == {"objects": 1}
-    assert {file.name for file in (tmp_path / "out").iterdir()} == {"000005.glb", "000005-points.ply"}
+    assert {file.name for file in (tmp_path / "out").iterdir()} == {
+        "000005.glb",
+        "000005-points.ply",
+    }
     for formats, word in (("", "--object ply"), ("ply,fbx", "fbx")):
         assert word in run(*export, formats, "--overwrite", code=2).err
 
 
 def test_info_prints_facts_and_next_commands(noise_bag: Path, shown: Run) -> None:
     printed = shown("info", noise_bag, "--verify").out
-    for words in ("recording of a lidar", "20 frames", "yes (checked: every message)", f"nlos-cam replay {noise_bag}"):
+    for words in (
+        "recording of a lidar",
+        "20 frames",
+        "yes (checked: every message)",
+        f"nlos-cam replay {noise_bag}",
+    ):
         assert words in printed
     texts = {0: "0 bytes", 999: "999 bytes", 1_780_000: "1.78 MB", 48 * 10**9: "48 GB"}
     assert {size: _format_size(size) for size in texts} == texts
 
 
-def test_info_of_damaged_or_unknown_file_is_exit_code_4(noise_bag: Path, tmp_path: Path, run: Run, shown: Run) -> None:
+def test_info_of_damaged_or_unknown_file_is_exit_code_4(
+    noise_bag: Path, tmp_path: Path, run: Run, shown: Run
+) -> None:
     (cut := tmp_path / "cut.bag").write_bytes(noise_bag.read_bytes()[:9_000])
     found = run("info", cut, code=4)
     assert not found["whole"]

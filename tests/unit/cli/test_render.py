@@ -1,4 +1,6 @@
-"""`render`: objects to files of maps, options that reach the scene or the accuracy, and exit codes."""
+"""`render`: objects to files of maps, options that reach the scene or the accuracy, and exit
+codes.
+"""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -11,7 +13,15 @@ from nlos_calibration.rig import Rig, dump_toml, load_rig
 
 from nlos_cam.cli.render import hidden_depth
 from nlos_cam.objects.placement import object_depth
-from nlos_cam.render import EFFECTS, HiddenObject, Scene, SceneFile, SensorModel, render, sensor_effects
+from nlos_cam.render import (
+    EFFECTS,
+    HiddenObject,
+    Scene,
+    SceneFile,
+    SensorModel,
+    render,
+    sensor_effects,
+)
 
 Run = Callable[..., Any]
 DRAFT = "--accuracy", "draft", "--out", "maps.npz", "--overwrite"
@@ -28,7 +38,9 @@ def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture
 def rendered(run: Run) -> Run:
-    """Render in draft unless a bound is given; returns the JSON result and the contents of the file."""
+    """Render in draft unless a bound is given; returns the JSON result and the contents of the
+    file.
+    """
 
     def call(hidden: object, *options: object) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
         chosen = DRAFT[2:] if any(str(option).startswith("--max") for option in options) else DRAFT
@@ -39,13 +51,17 @@ def rendered(run: Run) -> Run:
     return call
 
 
-def test_render_writes_maps_picture_and_effects(rendered: Run, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_render_writes_maps_picture_and_effects(
+    rendered: Run, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
     monkeypatch.undo()  # the picture is drawn
     result, file = rendered("cup", "--out", out := tmp_path / "cup.npz", "--explain")
     assert (result["accuracy"], result["out"]) == ("draft", str(out))
     assert result["seconds"] > 0
     assert [effect["name"] for effect in result["effects"]] == NAMES
-    assert all(set(e) == {"name", "included", "reason", "bound", "seconds"} for e in result["effects"])
+    assert all(
+        set(e) == {"name", "included", "reason", "bound", "seconds"} for e in result["effects"]
+    )
     assert "self-occlusion" in result.err
     assert out.with_suffix(".png").read_bytes().startswith(b"\x89PNG")
     assert file["depth_m"].shape == file["intensity"].shape == file["margin"].shape == (64, 80)
@@ -69,8 +85,12 @@ def test_render_places_its_object_as_a_scene_file_does(mesh: str, rendered: Run,
     name, only = {"category": ("hat", {"seed": 4}), "file": (mesh, {"up": "z"})}[kind]
     pose = {"size_m": 0.15, "tilt_x_deg": -10.0, "tilt_y_deg": 200.0, "turn_deg": 30.0}
     fields = {**pose, "x_m": -0.01, "y_m": 0.02, "front_m": 0.05, **only}
-    options = [text for field, value in fields.items() for text in (f"--{field.replace('_', '-')}", value)]
-    np.testing.assert_array_equal(rendered(name, *options)[1]["object_depth_m"], _of_scene(**{kind: name, **fields}))
+    options = [
+        text for field, value in fields.items() for text in (f"--{field.replace('_', '-')}", value)
+    ]
+    np.testing.assert_array_equal(
+        rendered(name, *options)[1]["object_depth_m"], _of_scene(**{kind: name, **fields})
+    )
 
 
 def test_render_takes_the_rig_of_a_scene_and_reports_its_file(rendered: Run) -> None:
@@ -115,7 +135,9 @@ def test_render_takes_effects_radiometry_pulse_and_beams(plate: str, rendered: R
     plain, sharp = rendered(plate)
     _, lambertian = rendered(plate, "--radiometry", "lambertian")
     assert (str(sharp["radiometry"]), str(lambertian["radiometry"])) == ("paper", "lambertian")
-    assert lambertian["intensity"].max() > 1.5 * sharp["intensity"].max()  # 1/pi in place of 1/(2 pi)
+    assert (
+        lambertian["intensity"].max() > 1.5 * sharp["intensity"].max()
+    )  # 1/pi in place of 1/(2 pi)
     wide, blurred = rendered(plate, "--pulse-ns", "1")
     assert "pulse" in _included(wide) - _included(plain)
     for _, other in ((wide, blurred), rendered(plate, "--beams-per-cell", "2")):
@@ -124,8 +146,15 @@ def test_render_takes_effects_radiometry_pulse_and_beams(plate: str, rendered: R
 
 @pytest.mark.slow
 def test_render_chooses_an_accuracy_within_a_bound(plate: str, rendered: Run) -> None:
-    assert rendered(plate, "--max-error", "0.9")[0]["accuracy"] in {"draft", "standard", "fine", "reference"}
-    assert rendered(plate, "--max-seconds", "1000")[0]["accuracy"] == "reference"  # time for everything
+    assert rendered(plate, "--max-error", "0.9")[0]["accuracy"] in {
+        "draft",
+        "standard",
+        "fine",
+        "reference",
+    }
+    assert (
+        rendered(plate, "--max-seconds", "1000")[0]["accuracy"] == "reference"
+    )  # time for everything
 
 
 @pytest.fixture
@@ -151,7 +180,9 @@ def test_hidden_depth_takes_a_depth_map_as_it_is(capsys: pytest.CaptureFixture[s
     assert ("none [b].npy" in warning, warning.count("\n")) == (True, 1)
 
 
-def test_hidden_depth_warns_of_object_cut_or_flattened_by_box(mesh: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_hidden_depth_warns_of_object_cut_or_flattened_by_box(
+    mesh: str, capsys: pytest.CaptureFixture[str]
+) -> None:
     trimesh.creation.box(extents=(1, 0.2, 0.01)).export(plate := "plate [b].ply")
     half = hidden_depth(plate, RIG, {"size_m": 0.2, "x_m": 0.125})  # the box ends in its middle
     flat = hidden_depth(mesh, RIG, {"tilt_y_deg": 90, "front_m": 0.2})

@@ -41,35 +41,56 @@ RECIPES = {
     "doubt": 'task = "doubt"\noutliers = 7\nempties = 14\n' + BASE,
 }
 FIGURES = {"held_out_loss", "held_out_iou"}
-Patch, Run = pytest.MonkeyPatch, Callable[..., Any]
+Patch = pytest.MonkeyPatch
+Run = Callable[..., Any]
 
 
-def _doubt_samples(_: Path, counts: dict[str, int], seed: int, *__: object, **___: object) -> DoubtSamples:
+def _doubt_samples(
+    _: Path, counts: dict[str, int], seed: int, *__: object, **___: object
+) -> DoubtSamples:
     """Return samples of which every fourth cannot be seen."""
     kinds = [kind for kind, count in counts.items() for _ in range(count)]
     maps = small_maps(len(kinds), seed % 97)
     cells = np.where(np.arange(len(kinds)) % 4 == 0, 0, 100).astype(np.int32)
-    return DoubtSamples(maps.depth_m, maps.intensity, maps.image.astype(np.float16), cells, np.array(kinds))
+    return DoubtSamples(
+        maps.depth_m, maps.intensity, maps.image.astype(np.float16), cells, np.array(kinds)
+    )
 
 
 def _arguments(folder: Path, recipe: str, out: Path, *options: object) -> list[str]:
     task = recipe if recipe in {"vae", "transfer", "doubt"} else "compressor"
     maps = [] if task == "vae" else ["--dataset", "data", "--held-out", "held-out"]
-    return ["train", task, "--recipe", str(folder / f"{recipe}.toml"), "--out", str(out), *maps, *map(str, options)]
+    return [
+        "train",
+        task,
+        "--recipe",
+        str(folder / f"{recipe}.toml"),
+        "--out",
+        str(out),
+        *maps,
+        *map(str, options),
+    ]
 
 
 @pytest.fixture(autouse=True, scope="module")
 def exported(tmp_path_factory: pytest.TempPathFactory) -> Iterator[list[Path]]:
-    """Small networks and datasets; the folders of weights whose graphs are not exported, since that takes seconds."""
+    """Small networks and datasets; the folders of weights whose graphs are not exported, since that
+    takes seconds.
+    """
     folders = list[Path]()
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(runs, "export_folder", folders.append)
         use_small_networks(patch, models.tasks, models.checkpoint, runs)
         counts = {"data": 8, "held-out": 4}
-        sets = {name: SmallDataset(small_maps(count, len(name)), PLAN) for name, count in counts.items()}
+        sets = {
+            name: SmallDataset(small_maps(count, len(name)), PLAN) for name, count in counts.items()
+        }
         for module in ("nlos_cam.dataset", "nlos_cam.dataset.training_maps"):
             patch.setattr(f"{module}.open_dataset", lambda of, **_: sets[of.name])
-        patch.setattr("nlos_cam.dataset.procedural_images", lambda seed, count, *_, **__: small_images(count, seed))
+        patch.setattr(
+            "nlos_cam.dataset.procedural_images",
+            lambda seed, count, *_, **__: small_images(count, seed),
+        )
         patch.setattr(doubt_samples, "samples_on_disk", _doubt_samples)
         patch.setenv("NLOS_CAM_CACHE", str(tmp_path_factory.mktemp("cache")))
         yield folders
@@ -88,7 +109,9 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def go(folder: Path, out: Path, run: Run) -> Run:
-    return lambda recipe, *options, code=0: run(*_arguments(folder, recipe, out, *options), code=code)
+    return lambda recipe, *options, code=0: run(
+        *_arguments(folder, recipe, out, *options), code=code
+    )
 
 
 def _same(one: Path, other: Path, *parts: str) -> list[bool]:
@@ -97,7 +120,8 @@ def _same(one: Path, other: Path, *parts: str) -> list[bool]:
 
 
 def test_train_vae_answers_with_folder_and_figures(go: Run, out: Path) -> None:
-    answer, record = go("vae"), load_record(out)
+    answer = go("vae")
+    record = load_record(out)
     assert (set(answer), answer["out"]) == ({"out", *FIGURES}, str(out))
     assert record.figures == {name: answer[name] for name in FIGURES}
     assert (record.rig_name, record.rig_checksum) == (RIG.name, RIG.checksum)
@@ -106,7 +130,9 @@ def test_train_vae_answers_with_folder_and_figures(go: Run, out: Path) -> None:
 
 def test_train_follows_shared_options(go: Run, out: Path, monkeypatch: Patch) -> None:
     compiled: list[object] = []
-    monkeypatch.setattr(models.train, "compile_network", lambda network: compiled.append(network) or network)
+    monkeypatch.setattr(
+        models.train, "compile_network", lambda network: compiled.append(network) or network
+    )
     go("vae", "--budget", "0.5", "--objects", "6", "--compile")
     assert len(compiled) == 1
     recipe = load_record(out).vae_recipe
@@ -114,21 +140,36 @@ def test_train_follows_shared_options(go: Run, out: Path, monkeypatch: Patch) ->
     assert "0.5" in recipe.deviations[-1]
 
 
-def test_train_vae_leaves_out_categories_of_recipe(go: Run, folder: Path, monkeypatch: Patch) -> None:
+def test_train_vae_leaves_out_categories_of_recipe(
+    go: Run, folder: Path, monkeypatch: Patch
+) -> None:
     shown: list[set[str]] = []
 
-    def images(seed: int, count: int, _: object, kinds: tuple[str, ...], *, backgrounds: float, **__: object) -> Any:
+    def images(
+        seed: int,
+        count: int,
+        _: object,
+        kinds: tuple[str, ...],
+        *,
+        backgrounds: float,
+        **__: object,
+    ) -> Any:
         shown.append({*kinds, f"{backgrounds}"})
         return small_images(count, seed)
 
     monkeypatch.setattr("nlos_cam.dataset.procedural_images", images)
-    (folder / "left-out.toml").write_text(RECIPES["vae"] + 'left_out = ["car", "boat"]\nbackgrounds = 0.25\n')
+    (folder / "left-out.toml").write_text(
+        RECIPES["vae"] + 'left_out = ["car", "boat"]\nbackgrounds = 0.25\n'
+    )
     go("vae", "--recipe", folder / "left-out.toml")
     assert shown == [{*CATEGORIES, "0.25"} - {"car", "boat"}] * 2
 
 
-def test_interrupted_train_exits_130_and_resumes_exactly(go: Run, folder: Path, out: Path, monkeypatch: Patch) -> None:
-    stop, messages = Event(), list[str]()
+def test_interrupted_train_exits_130_and_resumes_exactly(
+    go: Run, folder: Path, out: Path, monkeypatch: Patch
+) -> None:
+    stop = Event()
+    messages = list[str]()
     stop.set()
     with monkeypatch.context() as patch:
         patch.setattr(command, "stop_on_signals", lambda _: nullcontext(stop))
@@ -149,7 +190,11 @@ def test_train_compressor_uses_shipped_vae_and_streams(
     assert _same(out, folder / "two", "compressor") == [True]
     record = load_record(out)
     assert [run.task for run in record.runs] == ["vae", "compressor"]
-    assert (record.rig_name, record.rig_checksum, record.input) == ("bench", PLAN.rig.checksum, "raw maps")
+    assert (record.rig_name, record.rig_checksum, record.input) == (
+        "bench",
+        PLAN.rig.checksum,
+        "raw maps",
+    )
     assert _same(out, folder / "vae", "encoder", "decoder") == [True, True]
     shutil.rmtree(out)
     go("two", "--stream")
@@ -157,7 +202,9 @@ def test_train_compressor_uses_shipped_vae_and_streams(
 
 
 @pytest.mark.slow
-def test_joint_keeps_encoder_and_one_step_has_none(go: Run, folder: Path, out: Path, monkeypatch: Patch) -> None:
+def test_joint_keeps_encoder_and_one_step_has_none(
+    go: Run, folder: Path, out: Path, monkeypatch: Patch
+) -> None:
     monkeypatch.setattr(runs, "export_folder", models.export_folder)
     go("joint", "--weights", folder / "two")
     assert (out / "network.onnx").is_file()
@@ -169,20 +216,30 @@ def test_joint_keeps_encoder_and_one_step_has_none(go: Run, folder: Path, out: P
 
 
 @pytest.mark.slow
-def test_train_on_difference_maps_records_input(go: Run, folder: Path, out: Path, monkeypatch: Patch) -> None:
+def test_train_on_difference_maps_records_input(
+    go: Run, folder: Path, out: Path, monkeypatch: Patch
+) -> None:
     flat = np.zeros((64, 80), np.float32)
     monkeypatch.setattr(training_maps, "render_bare_wall", lambda _: (flat, flat + 3))
     go("difference", "--vae", folder / "vae")
     assert load_record(out).input == "difference maps"
-    raw, difference = (load_file(where / "preprocess.safetensors") for where in (folder / "two", out))
-    torch.testing.assert_close(raw["mean"] - difference["mean"], torch.tensor([0.0, 0.0, 3.0, 3.0]), atol=1e-4, rtol=0)
+    raw, difference = (
+        load_file(where / "preprocess.safetensors") for where in (folder / "two", out)
+    )
+    torch.testing.assert_close(
+        raw["mean"] - difference["mean"], torch.tensor([0.0, 0.0, 3.0, 3.0]), atol=1e-4, rtol=0
+    )
 
 
 @pytest.mark.slow
-def test_train_transfer_reports_both_figures_and_keeps_decoder(go: Run, folder: Path, out: Path) -> None:
+def test_train_transfer_reports_both_figures_and_keeps_decoder(
+    go: Run, folder: Path, out: Path
+) -> None:
     tensors = load_file(folder / "two" / "compressor.safetensors")
     other = Path(shutil.copytree(folder / "two", out.with_name("other")))
-    save_file({**tensors, "classifier.1.weight": torch.zeros(7, 100)}, other / "compressor.safetensors")
+    save_file(
+        {**tensors, "classifier.1.weight": torch.zeros(7, 100)}, other / "compressor.safetensors"
+    )
     (other / "SHA256SUMS").unlink()
     go("transfer", "--weights", other, code=4)
     answer = go("transfer", "--weights", other, "--partial")
@@ -226,20 +283,34 @@ def test_train_doubt_writes_weights_with_doubt_once(go: Run, folder: Path, out: 
     assert record.learnt == list(TRAINING_OUTLIERS)
     assert record.figures == {"held_out_loss": answer["held_out_loss"]}
     for again in (out, weights):
-        assert "--out" in go("doubt", "--weights", weights, "--out", again, code=1)["error"]["message"]
+        assert (
+            "--out" in go("doubt", "--weights", weights, "--out", again, code=1)["error"]["message"]
+        )
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("maps", "x_max_m", "objects", "word"),
-    [("difference maps", None, 8, "raw maps"), ("raw maps", 3.0, 8, "rig"), ("raw maps", None, 9, "9")],
+    [
+        ("difference maps", None, 8, "raw maps"),
+        ("raw maps", 3.0, 8, "rig"),
+        ("raw maps", None, 9, "9"),
+    ],
 )
 def test_train_doubt_refuses_other_maps_or_rig(
     go: Run, tmp_path: Path, maps: str, x_max_m: float | None, objects: int, word: str
 ) -> None:
-    wall = PLAN.rig.wall if x_max_m is None else load_rig("bare-wall").wall.model_copy(update={"x_max_m": x_max_m})
-    untrained_weights(others := tmp_path / "others", rig=PLAN.rig.model_copy(update={"wall": wall}), maps=maps)
-    assert word in go("doubt", "--weights", others, "--objects", objects, code=1)["error"]["message"]
+    wall = (
+        PLAN.rig.wall
+        if x_max_m is None
+        else load_rig("bare-wall").wall.model_copy(update={"x_max_m": x_max_m})
+    )
+    untrained_weights(
+        others := tmp_path / "others", rig=PLAN.rig.model_copy(update={"wall": wall}), maps=maps
+    )
+    assert (
+        word in go("doubt", "--weights", others, "--objects", objects, code=1)["error"]["message"]
+    )
 
 
 @pytest.mark.slow
@@ -247,19 +318,28 @@ def test_train_doubt_ignores_invisible_outliers(go: Run, folder: Path, monkeypat
     sets = list[Any]()
     monkeypatch.setattr("nlos_models.run_doubt", lambda *every: sets.extend(every[-2:]) or {})
     go("doubt", "--weights", folder / "two")
-    training, per_kind = sets[0], dict.fromkeys(TRAINING_OUTLIERS, 7)
-    every = _doubt_samples(Path(), {EMPTY: 14, ORDINARY: 7 * len(TRAINING_OUTLIERS) // 2, **per_kind}, 0)
-    outliers, visible = ~np.isin(every.kind, [EMPTY, ORDINARY]), every.cells > 0
+    training = sets[0]
+    per_kind = dict.fromkeys(TRAINING_OUTLIERS, 7)
+    every = _doubt_samples(
+        Path(), {EMPTY: 14, ORDINARY: 7 * len(TRAINING_OUTLIERS) // 2, **per_kind}, 0
+    )
+    outliers = ~np.isin(every.kind, [EMPTY, ORDINARY])
+    visible = every.cells > 0
     assert training.nothing.sum() == 14
-    assert (~training.nothing & ~training.outside).sum() == 8 + ((every.kind == ORDINARY) & visible).sum()
+    assert (~training.nothing & ~training.outside).sum() == 8 + (
+        (every.kind == ORDINARY) & visible
+    ).sum()
     assert training.outside.sum() == (outliers & visible).sum() < outliers.sum()
 
 
-def test_train_quality_replaces_a_damaged_model(tmp_path: Path, monkeypatch: Patch, run: Run, shown: Run) -> None:
+def test_train_quality_replaces_a_damaged_model(
+    tmp_path: Path, monkeypatch: Patch, run: Run, shown: Run
+) -> None:
     untrained_doubt(weights := tmp_path / "run", watched_weights(tmp_path / "watched"))
     (weights / "quality.json").write_text("{", encoding="utf-8")
     figures = np.random.default_rng(0).standard_normal((120, FEATURES)).astype(np.float32)
-    iou, kinds = 1 / (1 + np.exp(-figures[:, 0])), np.array(["cup", "bowl", "rods", "blobs"] * 30)
+    iou = 1 / (1 + np.exp(-figures[:, 0]))
+    kinds = np.array(["cup", "bowl", "rods", "blobs"] * 30)
     known = models.QualitySet(figures, iou, 0.2 - 0.1 * iou, kinds, np.arange(120) % 4 > 1)
     monkeypatch.setattr("nlos_models.load_reconstructor", lambda *_: None)
     monkeypatch.setattr("nlos_cam.dataset.open_dataset", lambda *_, **__: None)
@@ -268,7 +348,10 @@ def test_train_quality_replaces_a_damaged_model(tmp_path: Path, monkeypatch: Pat
     answer = run("train", "quality", "--weights", weights, "--dataset", tmp_path)
     assert (answer["weights"], answer["objects"]) == (str(weights), 120)
     assert models.load_uncertainty_model(weights, tmp_path).quality.record.objects == 120
-    assert "came with" in shown("train", "quality", "--weights", "paper", "--dataset", tmp_path, code=1).err
+    assert (
+        "came with"
+        in shown("train", "quality", "--weights", "paper", "--dataset", tmp_path, code=1).err
+    )
 
 
 def test_train_direct_refuses_a_store_in_use(tmp_path: Path, out: Path, shown: Run) -> None:
@@ -276,4 +359,7 @@ def test_train_direct_refuses_a_store_in_use(tmp_path: Path, out: Path, shown: R
     (store := tmp_path / "store").mkdir()
     maps = "--dataset", tmp_path, "--held-out", tmp_path, "--store", store
     with claim(store, inside=True):
-        assert "being written" in shown("train", "direct", "--recipe", recipe, "--out", out, *maps, code=1).err
+        assert (
+            "being written"
+            in shown("train", "direct", "--recipe", recipe, "--out", out, *maps, code=1).err
+        )

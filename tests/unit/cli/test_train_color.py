@@ -1,4 +1,6 @@
-"""`train` on rendered datasets, in color and of depth: both steps, streams, and refused combinations of the two."""
+"""`train` on rendered datasets, in color and of depth: both steps, streams, and refused
+combinations of the two.
+"""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -7,7 +9,15 @@ from typing import Any
 import pytest
 import torch
 from nlos_calibration import load_rig
-from nlos_models import SIMULATION_ONLY, load_encoder, load_pipeline, load_reconstructor, load_record, load_vae, run
+from nlos_models import (
+    SIMULATION_ONLY,
+    load_encoder,
+    load_pipeline,
+    load_reconstructor,
+    load_record,
+    load_vae,
+    run,
+)
 from nlos_models.errors import CheckpointError
 from small_run import log_rows
 
@@ -41,20 +51,44 @@ def folder(one_thread: None, tmp_path_factory: pytest.TempPathFactory) -> Path:
         for seed, of in ((40, name), (50, f"{name}-held-out")):
             plan = DatasetPlan(load_rig("paper-rig"), seed, accuracy="draft", textures=textures)
             (folder / of).mkdir()
-            store(shard_path(folder / of, seed), make_samples(plan, range(seed, seed + 2)), plan.provenance, "")
+            store(
+                shard_path(folder / of, seed),
+                make_samples(plan, range(seed, seed + 2)),
+                plan.provenance,
+                "",
+            )
     for name, text in RECIPES.items():
         (folder / f"{name}.toml").write_text(text + BASE, encoding="utf-8")
     for name in ("vae", "vae-of-depth"):
-        assert main(["train", "vae", "--recipe", str(folder / f"{name}.toml"), "--out", str(folder / name)]) == 0
+        assert (
+            main(
+                [
+                    "train",
+                    "vae",
+                    "--recipe",
+                    str(folder / f"{name}.toml"),
+                    "--out",
+                    str(folder / name),
+                ]
+            )
+            == 0
+        )
     return folder
 
 
 @pytest.fixture
 def go(folder: Path, out: Path, run: Run) -> Run:
     def train(recipe: str, *flags: str, data: str = "data", code: int = 0, **options: str) -> Any:
-        named = {"recipe": f"{recipe}.toml", "dataset": data, "held-out": f"{data}-held-out", **options}
+        named = {
+            "recipe": f"{recipe}.toml",
+            "dataset": data,
+            "held-out": f"{data}-held-out",
+            **options,
+        }
         paths = [part for name, value in named.items() for part in (f"--{name}", folder / value)]
-        return run("train", recipe.split("-", maxsplit=1)[0], "--out", out, *paths, *flags, code=code)
+        return run(
+            "train", recipe.split("-", maxsplit=1)[0], "--out", out, *paths, *flags, code=code
+        )
 
     return train
 
@@ -66,14 +100,17 @@ def test_color_training_notes_simulation_and_continues(go: Run, folder: Path, ou
     pipeline, record = load_pipeline(out)
     held_out = open_dataset(folder / "data-held-out", color=True).arrays()
     assert run(pipeline, held_out).shape == held_out.image.shape == (2, 3, 64, 64)
-    encoder, vae = load_encoder(out), load_vae(folder / "vae")[0]
+    encoder = load_encoder(out)
+    vae = load_vae(folder / "vae")[0]
     torch.testing.assert_close(encoder.state_dict(), vae.encoder.state_dict(), rtol=0, atol=0)
     with pytest.raises(CheckpointError, match="simulation only"):
         load_reconstructor(out, out.with_name("onnx"))
     for log in (log_rows(out), log_rows(folder / "vae")):
         assert float(log[-1]["loss"]) < float(log[0]["loss"])
     assert set(record.figures) == {"held_out_loss", "held_out_iou", "held_out_colour_error"}
-    assert record.figures == {name: value for name, value in answer.items() if name not in {"out", "note"}}
+    assert record.figures == {
+        name: value for name, value in answer.items() if name not in {"out", "note"}
+    }
     assert (record.color, record.note) == (True, SIMULATION_ONLY)
     assert record.vae_recipe == load_record(folder / "vae").vae_recipe
     assert go("compressor", vae="vae") == answer  # it had finished

@@ -19,7 +19,9 @@ if not {{"live", "demo", "capture", "calibrate"}} & {{*sys.argv}}:
 from nlos_cam.cli.main import main
 sys.exit(main(sys.argv[1:]))
 """
-"""A module that is None cannot be imported. Commands that open no camera do without the SDK, too."""
+"""A module that is None cannot be imported. Commands that open no camera do without the SDK,
+too.
+"""
 
 
 @pytest.mark.slow
@@ -39,7 +41,9 @@ sys.exit(main(sys.argv[1:]))
         ("render cup --backend torch --out cup.npz", True),
     ],
 )
-def test_command_runs_without_the_extra_or_names_it_in_one_line(tmp_path: Path, line: str, needs_it: bool) -> None:
+def test_command_runs_without_the_extra_or_names_it_in_one_line(
+    tmp_path: Path, line: str, needs_it: bool
+) -> None:
     command = [sys.executable, "-c", PROGRAM, *line.split()]
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
     assert done.returncode == needs_it, done.stderr
@@ -51,9 +55,16 @@ def test_command_runs_without_the_extra_or_names_it_in_one_line(tmp_path: Path, 
 
 @pytest.mark.parametrize(
     ("kind", "name"),
-    [("scenes", "sim:empty"), ("objects", "airplane"), ("rigs", "paper-rig"), ("recipes", "transfer")],
+    [
+        ("scenes", "sim:empty"),
+        ("objects", "airplane"),
+        ("rigs", "paper-rig"),
+        ("recipes", "transfer"),
+    ],
 )
-def test_list_has_a_name_and_a_line_for_each(kind: str, name: str, shown: Callable[..., Any]) -> None:
+def test_list_has_a_name_and_a_line_for_each(
+    kind: str, name: str, shown: Callable[..., Any]
+) -> None:
     rows = [line.split(maxsplit=1) for line in shown(kind).out.splitlines() if line]
     assert name in {row[0] for row in rows}
     assert all(len(row) == 2 for row in rows)

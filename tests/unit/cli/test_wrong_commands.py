@@ -1,4 +1,6 @@
-"""Wrong command lines: each ends with its exit code and one line that names the fault; nothing is written."""
+"""Wrong command lines: each ends with its exit code and one line that names the fault; nothing is
+written.
+"""
 
 import json
 import shlex
@@ -9,7 +11,16 @@ import pytest
 
 from nlos_cam.cli.main import main
 
-INTERNALS = "Traceback", "Input should", "Value error", "codec", "Errno", "{'", "validation error", "<class"
+INTERNALS = (
+    "Traceback",
+    "Input should",
+    "Value error",
+    "codec",
+    "Errno",
+    "{'",
+    "validation error",
+    "<class",
+)
 """Phrases of the interpreter and of libraries, which say nothing to a user."""
 SCENES = {
     "scene.toml": 'name = "cup"\nrig = "paper-rig"\n[object]\ncategory = "cup"\n',
@@ -172,7 +183,10 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with every kind of unusable file, whose name has a space and an accent."""
     folder = tmp_path_factory.mktemp("wröng files")
     noise = b"\x85\xff" + np.random.default_rng(5).bytes(5000)
-    contents = {name: text.encode() for name, text in SCENES.items()} | {"binary.toml": noise, "random.bag": noise}
+    contents = {name: text.encode() for name, text in SCENES.items()} | {
+        "binary.toml": noise,
+        "random.bag": noise,
+    }
     contents |= dict.fromkeys(("zero.bag", "taken.npz", "taken.pdf"), b"")
     for name, content in (contents | dict.fromkeys(("words.npy", "words.stl"), b"hello")).items():
         (folder / name).write_bytes(content)
@@ -191,7 +205,12 @@ def _listing(folder: Path) -> dict[str, int]:
 
 @pytest.mark.parametrize(("code", "line", "word"), CASES)
 def test_wrong_command_has_its_exit_code_and_one_line(
-    folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], code: int, line: str, word: str
+    folder: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    code: int,
+    line: str,
+    word: str,
 ) -> None:
     monkeypatch.chdir(folder)
     monkeypatch.setenv("XDG_CONFIG_HOME", str(folder))

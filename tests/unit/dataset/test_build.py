@@ -1,4 +1,6 @@
-"""Dataset builds: equal shards for any workers, order or interruption, in processes or by Ray; damage is rebuilt."""
+"""Dataset builds: equal shards for any workers, order or interruption, in processes or by Ray;
+damage is rebuilt.
+"""
 
 import errno
 import os
@@ -22,7 +24,14 @@ from nlos_calibration import load_rig
 
 import nlos_cam
 from nlos_cam import errors
-from nlos_cam.dataset import BuildReport, DatasetPlan, build_dataset, open_dataset, ray_backend, worker
+from nlos_cam.dataset import (
+    BuildReport,
+    DatasetPlan,
+    build_dataset,
+    open_dataset,
+    ray_backend,
+    worker,
+)
 from nlos_cam.dataset import build as dataset
 from nlos_cam.dataset.build import processes
 from nlos_cam.dataset.ray_backend import PIECES_PER_CPU, RayFarm, make_piece
@@ -32,7 +41,8 @@ from nlos_cam.errors import SceneError, WorkersLostError
 
 Patch = pytest.MonkeyPatch
 PLAN = DatasetPlan(load_rig("paper-rig"), 40, accuracy="draft")
-COUNT, LAST = 23, "shard-000000060.h5"  # the last shard holds three objects, the others five
+COUNT = 23
+LAST = "shard-000000060.h5"  # the last shard holds three objects, the others five
 BLAS = "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"
 PARENT = """
 import multiprocessing, time
@@ -67,7 +77,9 @@ def _build(folder: Path, farm: Any = None, count: int = COUNT, **others: Any) ->
 
 
 def _bytes(folder: Path) -> Shards:
-    return {path.name: path.read_bytes() for path in folder.glob("*") if not path.name.startswith(".")}
+    return {
+        path.name: path.read_bytes() for path in folder.glob("*") if not path.name.startswith(".")
+    }
 
 
 @pytest.fixture(scope="module")
@@ -94,14 +106,19 @@ def test_build_stores_samples_in_seed_order(tmp_path: Path) -> None:
     assert (len(found), found.plan) == (COUNT, PLAN)
     for name, values in samples_of(range(40, 40 + COUNT)).items():
         np.testing.assert_array_equal(found.column(name), values)
-    assert seen == [(done, COUNT) for done in (0, 2, 4, 5, 7, 9, 10, 12, 14, 15, 17, 19, 20, 22, 23)]
+    assert seen == [
+        (done, COUNT) for done in (0, 2, 4, 5, 7, 9, 10, 12, 14, 15, 17, 19, 20, 22, 23)
+    ]
 
 
 @pytest.mark.parametrize("after", [0, 1, 2, 3, 7, 11, 13])
 @pytest.mark.parametrize("order", [None, 3])
-def test_interrupted_build_resumes(tmp_path: Path, whole: Shards, after: int, order: int | None) -> None:
+def test_interrupted_build_resumes(
+    tmp_path: Path, whole: Shards, after: int, order: int | None
+) -> None:
     """Every finished shard is kept, and no sample is made twice."""
-    farm, rest = FakeFarm(order, fails_after=after), FakeFarm()
+    farm = FakeFarm(order, fails_after=after)
+    rest = FakeFarm()
     with pytest.raises(KeyboardInterrupt):
         _build(tmp_path, farm)
     assert farm.closed
@@ -112,7 +129,12 @@ def test_interrupted_build_resumes(tmp_path: Path, whole: Shards, after: int, or
     built = _build(tmp_path, rest)
     assert _bytes(tmp_path) == whole
     again = [seed for piece in rest.made for seed in piece]
-    assert len(again) == len(set(again)) == built.made == COUNT - sum(3 if name == LAST else 5 for name in kept)
+    assert (
+        len(again)
+        == len(set(again))
+        == built.made
+        == COUNT - sum(3 if name == LAST else 5 for name in kept)
+    )
 
 
 @pytest.mark.parametrize(
@@ -122,7 +144,8 @@ def test_interrupted_build_resumes(tmp_path: Path, whole: Shards, after: int, or
 def test_build_replaces_only_damaged_shards_it_needs(
     finished: Path, whole: Shards, name: str, keep: float, count: int, made: int
 ) -> None:
-    told, path = list[str](), finished / name
+    told = list[str]()
+    path = finished / name
     path.write_bytes(whole[name][: int(keep * len(whole[name]))])
     built = _build(finished, count=count, on_warning=told.append)
     assert [str(path) in line for line in told] == [True]
@@ -131,20 +154,25 @@ def test_build_replaces_only_damaged_shards_it_needs(
 
 
 @pytest.mark.parametrize("first", [1, 5, 7, 22])
-def test_build_grows_dataset_to_count_and_leaves_finished_one_alone(tmp_path: Path, whole: Shards, first: int) -> None:
+def test_build_grows_dataset_to_count_and_leaves_finished_one_alone(
+    tmp_path: Path, whole: Shards, first: int
+) -> None:
     """7 objects leave a shard half full, which a larger count must fill."""
     _build(tmp_path, count=first)
     assert len(open_dataset(tmp_path)) == first
     assert _build(tmp_path).made == COUNT - first // 5 * 5
     assert _bytes(tmp_path) == whole
-    farm, checked = FakeFarm(), list[tuple[int, int]]()
+    farm = FakeFarm()
+    checked = list[tuple[int, int]]()
     built = _build(tmp_path, farm, on_check=lambda *at: checked.append(at))
     assert (farm.made, built.made) == ([], 0)
     assert checked == [(k, 5) for k in range(1, 6)]
     assert _bytes(tmp_path) == whole
 
 
-def test_build_refuses_another_plan_shard_size_or_program(finished: Path, whole: Shards, monkeypatch: Patch) -> None:
+def test_build_refuses_another_plan_shard_size_or_program(
+    finished: Path, whole: Shards, monkeypatch: Patch
+) -> None:
     other = replace(PLAN, accuracy="fine", rig=PLAN.rig.model_copy(update={"name": "other"}))
     with pytest.raises(errors.RecordingError, match=r"rig.*accuracy"):
         _build(finished, plan=other)
@@ -171,13 +199,16 @@ def test_build_locks_its_folder_and_refuses_a_file(tmp_path: Path) -> None:
         _build(tmp_path / "file")
 
 
-def test_build_keeps_shards_if_object_fails_or_disk_is_full(tmp_path: Path, whole: Shards, monkeypatch: Patch) -> None:
+def test_build_keeps_shards_if_object_fails_or_disk_is_full(
+    tmp_path: Path, whole: Shards, monkeypatch: Patch
+) -> None:
     farm = FakeFarm(fails_after=4, error=errors.SceneError("cup.stl shows nothing"))
     with pytest.raises(errors.SceneError, match=r"cup\.stl"):
         _build(tmp_path, farm)
     assert farm.closed
     assert len(_bytes(tmp_path)) == 1
-    farm, stores = FakeFarm(), iter([store, store, Mock(side_effect=errors.DiskFullError("full")), *[store] * 9])
+    farm = FakeFarm()
+    stores = iter([store, store, Mock(side_effect=errors.DiskFullError("full")), *[store] * 9])
     monkeypatch.setattr(dataset, "store", lambda *given: next(stores)(*given))  # noqa: PLW0108  another each time
     with pytest.raises(errors.DiskFullError):
         _build(tmp_path, farm)
@@ -188,7 +219,9 @@ def test_build_keeps_shards_if_object_fails_or_disk_is_full(tmp_path: Path, whol
 
 
 def _dying(counter: Path, dies_at: Sequence[int]) -> Callable[[object, range], Samples]:
-    """Return a maker of samples whose process is killed at some of its calls, counted over all processes."""
+    """Return a maker of samples whose process is killed at some of its calls, counted over all
+    processes.
+    """
 
     def make(_: object, piece: range) -> Samples:
         with counter.open("a", encoding="utf-8") as file:
@@ -207,7 +240,9 @@ def _forked(monkeypatch: Patch) -> None:
 
 
 @pytest.mark.usefixtures("_forked")
-@pytest.mark.parametrize(("workers", "least"), [(1, 2), (2, 0)])  # two may leave gaps in every shard
+@pytest.mark.parametrize(
+    ("workers", "least"), [(1, 2), (2, 0)]
+)  # two may leave gaps in every shard
 def test_processes_replace_killed_workers_or_give_up(
     tmp_path: Path, whole: Shards, monkeypatch: Patch, workers: int, least: int
 ) -> None:
@@ -224,7 +259,9 @@ def test_processes_replace_killed_workers_or_give_up(
 
 
 @pytest.mark.usefixtures("_forked")
-def test_processes_raise_what_a_worker_raised_and_say_where_none_can_start(tmp_path: Path, monkeypatch: Patch) -> None:
+def test_processes_raise_what_a_worker_raised_and_say_where_none_can_start(
+    tmp_path: Path, monkeypatch: Patch
+) -> None:
     maker = "nlos_cam.dataset.samples.make_samples"
     monkeypatch.setattr(maker, Mock(side_effect=SceneError("no such object")))
     with pytest.raises(SceneError, match="no such object") as raised:
@@ -259,7 +296,9 @@ def test_processes_make_the_samples_of_one_process(tmp_path: Path) -> None:
 
 @pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
 def test_worker_ends_with_killed_parent() -> None:
-    with subprocess.Popen([sys.executable, "-c", PARENT], stdout=subprocess.PIPE, text=True) as parent:
+    with subprocess.Popen(
+        [sys.executable, "-c", PARENT], stdout=subprocess.PIPE, text=True
+    ) as parent:
         assert parent.stdout.readline().strip().isdigit()
         parent.send_signal(signal.SIGKILL)
         parent.wait()
@@ -270,7 +309,8 @@ def test_worker_has_one_thread_and_ignores_interrupts(monkeypatch: Patch) -> Non
     monkeypatch.setattr(worker, "parent_process", lambda: None)
     for name in BLAS:
         monkeypatch.setenv(name, "2")
-    threads, handler = numba.get_num_threads(), signal.getsignal(signal.SIGINT)
+    threads = numba.get_num_threads()
+    handler = signal.getsignal(signal.SIGINT)
     try:
         worker.begin_worker()
         assert numba.get_num_threads() == 1
@@ -284,7 +324,10 @@ def test_worker_has_one_thread_and_ignores_interrupts(monkeypatch: Patch) -> Non
 @pytest.mark.parametrize(
     ("modules", "without"),
     [
-        ("nlos_cam.cli.main, nlos_cam.dataset.worker", "numpy"),  # BLAS counts processors at import: after begin_worker
+        (
+            "nlos_cam.cli.main, nlos_cam.dataset.worker",
+            "numpy",
+        ),  # BLAS counts processors at import: after begin_worker
         pytest.param("nlos_cam.dataset.samples", "torch", marks=pytest.mark.slow),
     ],
 )
@@ -319,7 +362,9 @@ class FakeRay:
     cluster_resources = Mock(return_value={"CPU": 2.0})
 
     def __init__(self, fails: RayError | None = None) -> None:
-        self.fails, self.running, self.most_waiting = fails, False, 0
+        self.fails = fails
+        self.running = False
+        self.most_waiting = 0
 
     def init(self, address: str, **_: object) -> None:
         if address == "nowhere":
@@ -387,5 +432,7 @@ def test_ray_farm_raises_error_of_missing_cluster_and_of_failed_lost_or_other_wo
 @pytest.mark.skipif(find_spec("ray") is None, reason="needs Ray (the extra `many`)")
 def test_local_cluster_makes_equal_samples() -> None:
     """Runs in a process of its own, since Ray leaves threads behind."""
-    done = subprocess.run([sys.executable, "-c", LOCAL], capture_output=True, text=True, check=False, timeout=280)
+    done = subprocess.run(
+        [sys.executable, "-c", LOCAL], capture_output=True, text=True, check=False, timeout=280
+    )
     assert done.returncode == 0, done.stdout + done.stderr

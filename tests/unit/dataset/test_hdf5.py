@@ -1,4 +1,6 @@
-"""Shards are read as written or refused by name, in memory by the file's size; one builder at a time holds a folder."""
+"""Shards are read as written or refused by name, in memory by the file's size; one builder at a
+time holds a folder.
+"""
 
 import multiprocessing
 import os
@@ -21,14 +23,23 @@ from nlos_calibration import load_rig
 import nlos_cam
 from nlos_cam.dataset.hdf5 import read_array
 from nlos_cam.dataset.plan import DatasetPlan
-from nlos_cam.dataset.shards import check_arrays, only_builder, read_arrays, read_head, shard_path, shards_of, store
+from nlos_cam.dataset.shards import (
+    check_arrays,
+    only_builder,
+    read_arrays,
+    read_head,
+    shard_path,
+    shards_of,
+    store,
+)
 from nlos_cam.errors import DiskFullError, OutputExistsError, RecordingError
 
 SEEDS = range(40, 43)
 PLAN = DatasetPlan(load_rig("paper-rig"), SEEDS.start)
 MAX_GROWTH_MIB = 64
 """Memory for a shard of at most 600 kB, with the pages that a forked process writes to."""
-TEXT_BYTES, ROWS = 60_000, 4000
+TEXT_BYTES = 60_000
+ROWS = 4000
 
 
 def _stored(folder: Path, seeds: range = SEEDS) -> Path:
@@ -56,23 +67,30 @@ def _declare(**options: Any) -> Callable[[h5py.File], object]:
 
 def _bomb(file: h5py.File) -> None:
     """Give a chunk of 4 KiB bytes that unpack to 256 MiB."""
-    image = _replace(file, "image", shape=(1 << 10,), dtype="f4", chunks=(1 << 10,), compression="gzip")
+    image = _replace(
+        file, "image", shape=(1 << 10,), dtype="f4", chunks=(1 << 10,), compression="gzip"
+    )
     image.id.write_direct_chunk((0,), zlib.compress(bytes(1 << 28)))
 
 
 def _one_text_in_all_rows(file: h5py.File) -> None:
     texts = ["x" * TEXT_BYTES, *"y" * (ROWS - 1)]
     rows = _replace(file, "category", data=texts, dtype=h5py.string_dtype()).id
-    path, start, size = Path(file.filename), rows.get_offset(), rows.get_storage_size()
+    path = Path(file.filename)
+    start = rows.get_offset()
+    size = rows.get_storage_size()
     file.close()
     content = bytearray(path.read_bytes())
-    content[start : start + size] = content[start : start + size // ROWS] * ROWS  # the address of the first text
+    content[start : start + size] = (
+        content[start : start + size // ROWS] * ROWS
+    )  # the address of the first text
     path.write_bytes(content)
 
 
 def _crafted(file: h5py.File, harm: str) -> None:
     """Change a shard consistently, as no accident does."""
-    image, other = file["image"][:], shutil.copy(file.filename, Path(file.filename).with_name("other.h5"))
+    image = file["image"][:]
+    other = shutil.copy(file.filename, Path(file.filename).with_name("other.h5"))
     if harm == "no checksum":
         del file["image"].attrs["sha256"]
         file["image"][:] = 0
@@ -87,7 +105,13 @@ def _crafted(file: h5py.File, harm: str) -> None:
         file.move("image", "moved")
         file["image"] = h5py.SoftLink("/moved")
     elif harm == "external storage":
-        _replace(file, "image", shape=image.shape, dtype=image.dtype, external=[(str(other), 0, image.nbytes)])
+        _replace(
+            file,
+            "image",
+            shape=image.shape,
+            dtype=image.dtype,
+            external=[(str(other), 0, image.nbytes)],
+        )
     else:
         layout = h5py.VirtualLayout(image.shape, image.dtype)
         layout[:] = h5py.VirtualSource(str(other), "image", image.shape)
@@ -101,13 +125,26 @@ def _without_seeds(file: h5py.File, other: str) -> None:
     if other == "group":
         file.create_group("seed")
     else:
-        file["seed"] = np.dtype(int) if other == "type" else np.array(["a", "b"], h5py.string_dtype())
+        file["seed"] = (
+            np.dtype(int) if other == "type" else np.array(["a", "b"], h5py.string_dtype())
+        )
 
 
-CRAFTED = "no checksum", "no plan checksum", "plan of two texts", "external link", "soft link", "external storage"
+CRAFTED = (
+    "no checksum",
+    "no plan checksum",
+    "plan of two texts",
+    "external link",
+    "soft link",
+    "external storage",
+)
 HARMS = {
-    "chunk for each number": _declare(shape=(1 << 18,), dtype="f4", chunks=(1,), compression="gzip"),
-    "chunks that are absent": _declare(shape=(1 << 40,), dtype="f4", chunks=(1 << 20,), compression="gzip"),
+    "chunk for each number": _declare(
+        shape=(1 << 18,), dtype="f4", chunks=(1,), compression="gzip"
+    ),
+    "chunks that are absent": _declare(
+        shape=(1 << 40,), dtype="f4", chunks=(1 << 20,), compression="gzip"
+    ),
     "plain chunks that are absent": _declare(shape=(1 << 24,), dtype="f4", chunks=(1 << 20,)),
     "numbers that are absent": _declare(shape=(1 << 24,), dtype="f4"),
     "chunk beyond the array": _declare(shape=(3,), maxshape=(None,), dtype="f4", chunks=(1 << 28,)),
@@ -117,12 +154,17 @@ HARMS = {
     "one text in all rows": _one_text_in_all_rows,
     "references": _declare(shape=(3,), dtype=h5py.ref_dtype),
     **{harm: partial(_crafted, harm=harm) for harm in (*CRAFTED, "virtual")},
-    **{f"{other} instead of seeds": partial(_without_seeds, other=other) for other in ("group", "type", "words")},
+    **{
+        f"{other} instead of seeds": partial(_without_seeds, other=other)
+        for other in ("group", "type", "words")
+    },
 }
 
 
 def _in_child(act: Callable[[Path], Any], path: Path) -> Any:
-    """Act in a process of its own, forked by one without threads, whose locks a fork would keep locked."""
+    """Act in a process of its own, forked by one without threads, whose locks a fork would keep
+    locked.
+    """
     with ProcessPoolExecutor(1, multiprocessing.get_context("forkserver")) as pool:
         return pool.submit(act, path).result()
 
@@ -146,7 +188,9 @@ def test_crafted_shard_is_refused_within_little_memory(shard: Path, harm: str) -
 @pytest.mark.parametrize("shape", [(7,), (5, 3, 4), (33, 65)])
 @pytest.mark.parametrize("kind", ["f8", ">i2", "u1", "f2"])
 @pytest.mark.parametrize("storage", [{}, {"chunks": True}, {"compression": "gzip"}])
-def test_read_array_returns_what_was_stored(tmp_path: Path, shape: tuple[int, ...], kind: str, storage: dict) -> None:
+def test_read_array_returns_what_was_stored(
+    tmp_path: Path, shape: tuple[int, ...], kind: str, storage: dict
+) -> None:
     values = np.random.default_rng(1).integers(0, 100, shape).astype(kind)
     with h5py.File(tmp_path / "a.h5", "w") as file:
         file.create_dataset("a", data=values, **storage)
@@ -158,17 +202,22 @@ def test_read_array_returns_what_was_stored(tmp_path: Path, shape: tuple[int, ..
         assert read_array(file, "texts").tolist() == ["", "ä", "b\nc"]
 
 
-def test_lack_of_memory_or_permission_does_not_count_as_damage(shard: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_lack_of_memory_or_permission_does_not_count_as_damage(
+    shard: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(np, "empty", Mock(side_effect=MemoryError))
     with pytest.raises(MemoryError):
         read_head(shard)
-    monkeypatch.setattr(Path, "mkdir", Mock(side_effect=PermissionError(13, "Permission denied", str(shard))))
+    monkeypatch.setattr(
+        Path, "mkdir", Mock(side_effect=PermissionError(13, "Permission denied", str(shard)))
+    )
     with pytest.raises(OutputExistsError, match=str(shard.parent)), only_builder(shard.parent):
         pass
 
 
 def _assert_as_stored(path: Path) -> None:
-    head, samples = read_head(path), samples_of(SEEDS)
+    head = read_head(path)
+    samples = samples_of(SEEDS)
     assert (head.seeds, head.plan) == (SEEDS, PLAN)
     for values, found in zip(samples.values(), read_arrays(head, list(samples)), strict=True):
         assert found.dtype == values.dtype
@@ -182,14 +231,20 @@ def test_shard_is_read_as_stored_and_describes_itself(tmp_path: Path) -> None:
     with h5py.File(path) as file:
         facts = dict(file.attrs)
     assert (facts["first_seed"], facts["last_seed"]) == (40, 42)
-    assert (facts["package_version"], facts["command"]) == (nlos_cam.__version__, "nlos-cam dataset build")
+    assert (facts["package_version"], facts["command"]) == (
+        nlos_cam.__version__,
+        "nlos-cam dataset build",
+    )
     assert PLAN.rig.checksum in facts["plan"]
 
 
 def test_shard_with_flipped_bit_is_damaged_or_unchanged(tmp_path: Path) -> None:
-    """A flip in padding or in a time stamp changes nothing that is read; any other flip is an error."""
+    """A flip in padding or in a time stamp changes nothing that is read; any other flip is an
+    error.
+    """
     path = _stored(tmp_path)
-    whole, refusals = path.read_bytes(), list[str]()
+    whole = path.read_bytes()
+    refusals = list[str]()
     for place in np.random.default_rng(0).integers(0, len(whole), 100):
         harmed = bytearray(whole)
         harmed[place] ^= 1 << int(place) % 8
@@ -221,7 +276,9 @@ def _fill_disk(folder: Path) -> None:
         _stored(folder)
 
 
-def test_full_disk_and_ctrl_c_keep_the_earlier_shard_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_full_disk_and_ctrl_c_keep_the_earlier_shard_alone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     path = _stored(tmp_path)
     before = path.read_bytes()
     _in_child(_fill_disk, tmp_path)

@@ -1,4 +1,6 @@
-"""Labelled recordings as a dataset: maps of their frames, ground truth by label, shards that read as written."""
+"""Labelled recordings as a dataset: maps of their frames, ground truth by label, shards that read
+as written.
+"""
 
 import shutil
 from collections.abc import Callable
@@ -31,7 +33,10 @@ from nlos_cam.recording.sidecar import WallFile
 RIG = load_rig("paper-rig")
 BOX = object_box(RIG)
 SLOPE = np.linspace(BOX.z_near_m, BOX.z_far_m, 4096, dtype=np.float32).reshape(64, 64)
-KNOWN = {"slope": SLOPE, "half": np.where(np.arange(64) < 32, np.float32(0.2), np.float32(np.nan)) + 0 * SLOPE}
+KNOWN = {
+    "slope": SLOPE,
+    "half": np.where(np.arange(64) < 32, np.float32(0.2), np.float32(np.nan)) + 0 * SLOPE,
+}
 known = Mock(return_value=KNOWN)
 CUP = np.full((64, 64), 0.2, np.float32)
 BALL = trimesh.creation.icosphere(subdivisions=3)
@@ -58,11 +63,16 @@ def labelled(noise_bag: Path, tmp_path: Path) -> Label:
     return make
 
 
-def test_read_labelled_pairs_frames_with_truth_of_their_label(labelled: Label, noise_world: Any) -> None:
-    progress, world = list[tuple[int, int]](), noise_world()
+def test_read_labelled_pairs_frames_with_truth_of_their_label(
+    labelled: Label, noise_world: Any
+) -> None:
+    progress = list[tuple[int, int]]()
+    world = noise_world()
     paths = [labelled("a"), labelled("b", "half")]
     found = read_labelled(paths, known=known, frames=4, on_progress=lambda *at: progress.append(at))
-    frames = [maps_from_frame(world.images(number).frame(world.rig.pinhole)) for number in (2, 7, 12, 17)]
+    frames = [
+        maps_from_frame(world.images(number).frame(world.rig.pinhole)) for number in (2, 7, 12, 17)
+    ]
     np.testing.assert_array_equal(found.maps.depth_m[:4], [maps.depth_m for maps in frames])
     np.testing.assert_array_equal(found.maps.intensity[:4], [maps.intensity for maps in frames])
     assert found.label == ("slope",) * 4 + ("half",) * 4
@@ -70,7 +80,9 @@ def test_read_labelled_pairs_frames_with_truth_of_their_label(labelled: Label, n
     assert found.rig == RIG
     for k, label in enumerate(found.label):
         np.testing.assert_array_equal(found.object_depth_m[k], KNOWN[label])
-        np.testing.assert_array_equal(found.maps.image[k], image_from_depth(KNOWN[label], BOX).astype(np.float16))
+        np.testing.assert_array_equal(
+            found.maps.image[k], image_from_depth(KNOWN[label], BOX).astype(np.float16)
+        )
     assert progress == [(1, 2), (2, 2)]
 
 
@@ -83,9 +95,13 @@ def test_spread_chooses_frames_evenly(count: int, wanted: int) -> None:
     assert np.ptp(gaps) <= 2  # mirrored at both ends: neither end is left out
 
 
-def test_read_labelled_corrects_by_wall_record(labelled: Label, measured: Callable[..., Any], tmp_path: Path) -> None:
+def test_read_labelled_corrects_by_wall_record(
+    labelled: Label, measured: Callable[..., Any], tmp_path: Path
+) -> None:
     def wall(**fields: Any) -> Path:
-        (path := tmp_path / "wall.toml").write_text(dump_toml(measured(**fields).record), encoding="utf-8")
+        (path := tmp_path / "wall.toml").write_text(
+            dump_toml(measured(**fields).record), encoding="utf-8"
+        )
         return path
 
     path = labelled("a", wall=(RIG, WallFile(path="there/wall.toml", sha256="")))
@@ -101,7 +117,8 @@ def test_read_labelled_corrects_by_wall_record(labelled: Label, measured: Callab
 
 
 def test_read_labelled_uses_the_one_rig_of_the_sidecars(labelled: Label) -> None:
-    own, bare = RIG.model_copy(update={"name": "own"}), load_rig("bare-wall")
+    own = RIG.model_copy(update={"name": "own"})
+    bare = load_rig("bare-wall")
     for rig, used in ((own, own), (bare, RIG)):
         path = _sidecar(labelled("a"), rig, label="slope")
         assert read_labelled([path], known=known, frames=1).rig == used
@@ -111,7 +128,9 @@ def test_read_labelled_uses_the_one_rig_of_the_sidecars(labelled: Label) -> None
 
 
 @pytest.mark.parametrize(("label", "word"), [(None, "--label"), ("", "--label"), ("mug", "mug")])
-def test_read_labelled_refuses_missing_or_unknown_label(labelled: Label, label: str | None, word: str) -> None:
+def test_read_labelled_refuses_missing_or_unknown_label(
+    labelled: Label, label: str | None, word: str
+) -> None:
     path = labelled("a", label)
     with pytest.raises(RecordingError, match=rf"a\.bag.*{word}"):
         read_labelled([path], known=known)
@@ -121,7 +140,9 @@ def test_read_labelled_refuses_missing_or_unknown_label(labelled: Label, label: 
 
 
 @pytest.mark.parametrize("dark_from", [2, 0])
-def test_dark_frames_are_skipped(noise_world: Any, hurried_clock: Any, tmp_path: Path, dark_from: int) -> None:
+def test_dark_frames_are_skipped(
+    noise_world: Any, hurried_clock: Any, tmp_path: Path, dark_from: int
+) -> None:
     class Dark(noise_world):
         def images(self, number: int) -> Any:
             seen = super().images(number)
@@ -129,7 +150,9 @@ def test_dark_frames_are_skipped(noise_world: Any, hurried_clock: Any, tmp_path:
             return seen
 
     path = tmp_path / "dark.bag"
-    with SimulatedCamera("sim:dark", Dark(), clock=hurried_clock(), recording=Recording(path, frames=4)) as camera:
+    with SimulatedCamera(
+        "sim:dark", Dark(), clock=hurried_clock(), recording=Recording(path, frames=4)
+    ) as camera:
         assert len(list(camera)) >= 1
     _sidecar(path, label="slope")
     if dark_from:
@@ -148,7 +171,10 @@ def _write_truth(folder: Path, text: str) -> None:
 
 
 def test_truth_is_depth_map_of_recording_then_of_label_then_its_test_object(tmp_path: Path) -> None:
-    np.save(tmp_path / "cup-1.npy", of_label := np.where(np.eye(64) > 0, np.float32(0.3), np.float32(np.nan)))
+    np.save(
+        tmp_path / "cup-1.npy",
+        of_label := np.where(np.eye(64) > 0, np.float32(0.3), np.float32(np.nan)),
+    )
     np.testing.assert_array_equal(_truth(tmp_path, "cup-1"), of_label)
     np.save(tmp_path / "F.npy", of_recording := np.full((64, 64), 0.25, np.float32))
     np.testing.assert_array_equal(_truth(tmp_path, "cup-1"), of_recording)
@@ -156,7 +182,9 @@ def test_truth_is_depth_map_of_recording_then_of_label_then_its_test_object(tmp_
     assert _truth(Path("nowhere"), "cup-1") is CUP
     objects = benchmark_depths(BOX)
     assert list(objects) == [thing.name for thing in fixed_set(BOX)]
-    np.testing.assert_array_equal(objects["cup-2"], next(o.depth_m for o in fixed_set(BOX) if o.name == "cup-2"))
+    np.testing.assert_array_equal(
+        objects["cup-2"], next(o.depth_m for o in fixed_set(BOX) if o.name == "cup-2")
+    )
 
 
 @pytest.mark.parametrize("named", [True, False])
@@ -164,7 +192,8 @@ def test_truth_of_mesh_stands_at_its_pose(tmp_path: Path, named: bool) -> None:
     BALL.export(tmp_path / ("print.stl" if named else "mug.stl"))
     file = 'file = "print.stl"\n' if named else ""
     _write_truth(tmp_path, f"{file}size_m = 0.1\nx_m = 0.05\ny_m = -0.03\nfront_m = 0.06\n")
-    depth_m, (x_m, y_m) = _truth(tmp_path), cell_centers_m(BOX)
+    depth_m = _truth(tmp_path)
+    (x_m, y_m) = cell_centers_m(BOX)
     rows, columns = np.nonzero(~np.isnan(depth_m))
     assert x_m[columns].mean() == pytest.approx(0.45 + 0.05, abs=0.002)
     assert y_m[rows].mean() == pytest.approx(-0.03, abs=0.002)
@@ -184,7 +213,9 @@ def test_truth_of_mesh_stands_at_its_pose(tmp_path: Path, named: bool) -> None:
         ('category = "cup"\nx_m = 1.0', SceneError, "cup"),  # beside the object box
     ],
 )
-def test_truth_file_names_its_problem(tmp_path: Path, text: str, kind: type[NlosCamError], word: str) -> None:
+def test_truth_file_names_its_problem(
+    tmp_path: Path, text: str, kind: type[NlosCamError], word: str
+) -> None:
     _write_truth(tmp_path, 'category = "cup"\nseed = 3\nsize_m = 0.15\n')
     assert np.isfinite(_truth(tmp_path)).any()
     _write_truth(tmp_path, text)
@@ -192,7 +223,9 @@ def test_truth_file_names_its_problem(tmp_path: Path, text: str, kind: type[Nlos
         _truth(tmp_path)
 
 
-def test_truth_is_refused_where_files_are_missing_doubled_elsewhere_or_of_another_size(tmp_path: Path) -> None:
+def test_truth_is_refused_where_files_are_missing_doubled_elsewhere_or_of_another_size(
+    tmp_path: Path,
+) -> None:
     with pytest.raises(RecordingError, match=r"mug\.truth\.toml.*mug\.npy"):
         _truth(tmp_path)
     (tmp_path / "a").mkdir()
@@ -217,14 +250,19 @@ def _samples(count: int) -> Labelled:
     depth_m[:, 0, 0] = np.nan
     truth_m = generator.uniform(0.12, 0.4, (count, 64, 64)).astype(np.float32)
     names = tuple(f"cup-{k}" for k in range(count))
-    return Labelled(MapSet(depth_m, intensity, truth_m.astype(np.float16)), truth_m, names, names, RIG)
+    return Labelled(
+        MapSet(depth_m, intensity, truth_m.astype(np.float16)), truth_m, names, names, RIG
+    )
 
 
 @pytest.mark.parametrize("count", [3, SHARD + 7])
 def test_labelled_shards_are_read_as_written_and_not_extended(tmp_path: Path, count: int) -> None:
-    write_shards(_samples(SHARD + 5), tmp_path)  # a larger dataset, which the next replaces as a whole
+    write_shards(
+        _samples(SHARD + 5), tmp_path
+    )  # a larger dataset, which the next replaces as a whole
     write_shards(samples := _samples(count), tmp_path)
-    maps, plan = (data := open_dataset(tmp_path)).arrays(), data.plan
+    maps = (data := open_dataset(tmp_path)).arrays()
+    plan = data.plan
     for name in ("depth_m", "intensity", "image"):
         np.testing.assert_array_equal(getattr(maps, name), getattr(samples.maps, name))
     assert tuple(data.column("category")) == samples.label
@@ -236,7 +274,8 @@ def test_labelled_shards_are_read_as_written_and_not_extended(tmp_path: Path, co
 
 
 def test_labelled_shards_survive_full_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    out, stores = tmp_path / "data", iter([store, Mock(side_effect=DiskFullError("full"))])
+    out = tmp_path / "data"
+    stores = iter([store, Mock(side_effect=DiskFullError("full"))])
     write_shards(_samples(SHARD + 7), out)
     before = {path.name: path.read_bytes() for path in out.iterdir()}
     monkeypatch.setattr(labelled_shards, "store", lambda *given: next(stores)(*given))  # noqa: PLW0108  another each time

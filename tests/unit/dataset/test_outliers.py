@@ -1,4 +1,6 @@
-"""Outliers lie outside training's range, varied rigs within theirs; doubt samples are cached and follow their seeds."""
+"""Outliers lie outside training's range, varied rigs within theirs; doubt samples are cached and
+follow their seeds.
+"""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -9,21 +11,46 @@ import pytest
 from nlos_calibration import load_rig
 from small_run import small_recipe
 
-from nlos_cam.dataset import HELD_OUT_OUTLIERS, SHAPE_OUTLIERS, TRAINING_OUTLIERS, Stimulus, doubt_samples, outliers
-from nlos_cam.dataset.doubt_samples import EMPTY, GENERIC, ORDINARY, SEEDS_PER_BENCH, _stimulus, make_samples
-from nlos_cam.dataset.outliers import SLIGHT, WIDE, BenchSpread, draw_outlier, ordinary, vary_bench, vary_empty_bench
+from nlos_cam.dataset import (
+    HELD_OUT_OUTLIERS,
+    SHAPE_OUTLIERS,
+    TRAINING_OUTLIERS,
+    Stimulus,
+    doubt_samples,
+    outliers,
+)
+from nlos_cam.dataset.doubt_samples import (
+    EMPTY,
+    GENERIC,
+    ORDINARY,
+    SEEDS_PER_BENCH,
+    _stimulus,
+    make_samples,
+)
+from nlos_cam.dataset.outliers import (
+    SLIGHT,
+    WIDE,
+    BenchSpread,
+    draw_outlier,
+    ordinary,
+    vary_bench,
+    vary_empty_bench,
+)
 from nlos_cam.dataset.plan import move_lidar
 from nlos_cam.objects import object_box
 from nlos_cam.render import SensorModel
 
-RIG, SENSOR = load_rig("paper-rig"), SensorModel()
+RIG = load_rig("paper-rig")
+SENSOR = SensorModel()
 BOX = object_box(RIG)
 PLAIN = Stimulus(RIG, SENSOR)
 SEEDS = range(6)
 
 
 def made(name: str, seed: int) -> Stimulus:
-    return draw_outlier({**TRAINING_OUTLIERS, **HELD_OUT_OUTLIERS}[name], np.random.default_rng(seed), PLAIN)
+    return draw_outlier(
+        {**TRAINING_OUTLIERS, **HELD_OUT_OUTLIERS}[name], np.random.default_rng(seed), PLAIN
+    )
 
 
 def touches_edge(stimulus: Stimulus) -> bool:
@@ -32,9 +59,12 @@ def touches_edge(stimulus: Stimulus) -> bool:
 
 
 @pytest.mark.parametrize("name", [*TRAINING_OUTLIERS, *HELD_OUT_OUTLIERS])
-def test_outlier_shows_surface_before_wall_outside_by_its_own_measure_and_repeats_by_seed(name: str) -> None:
+def test_outlier_shows_surface_before_wall_outside_by_its_own_measure_and_repeats_by_seed(
+    name: str,
+) -> None:
     for seed in SEEDS:
-        one, again = made(name, seed), made(name, seed)
+        one = made(name, seed)
+        again = made(name, seed)
         np.testing.assert_array_equal(one.depth_m, again.depth_m)
         surface_m = one.depth_m[np.isfinite(one.depth_m)]
         assert surface_m.size >= outliers.MIN_PIXELS
@@ -51,7 +81,16 @@ def test_outlier_kinds_to_learn_and_judge_differ_and_exclude_shapes_that_weights
     assert {*TRAINING_OUTLIERS, *HELD_OUT_OUTLIERS} > SHAPE_OUTLIERS
     assert outliers.outliers_beside(0.0) == TRAINING_OUTLIERS
     learnt = set(outliers.outliers_beside(0.5))
-    assert learnt == {"small", "large", "far", "near", "half out", "dim", "other rig", "other sensor"}
+    assert learnt == {
+        "small",
+        "large",
+        "far",
+        "near",
+        "half out",
+        "dim",
+        "other rig",
+        "other sensor",
+    }
 
 
 OUTSIDE: dict[str, Callable[[Stimulus], bool]] = {
@@ -92,7 +131,9 @@ def test_varied_rig_lies_within_its_spread(spread: BenchSpread) -> None:
         assert any(spread) or (rig, sensor) == (RIG, SENSOR)
 
 
-def test_moved_rig_differs_in_lidar_pose_alone_and_empty_benches_are_plain_wide_or_without_occluder() -> None:
+def test_moved_rig_differs_in_lidar_pose_alone_and_empty_benches_are_plain_wide_or_without_occluder() -> (
+    None
+):
     other = move_lidar(RIG, 0.01, 2.0, -3.0)
     assert other.lidar.distance_m == pytest.approx(RIG.lidar.distance_m + 0.01)
     assert other.facing_deg == pytest.approx(47.0, abs=0.2)
@@ -104,7 +145,9 @@ def test_moved_rig_differs_in_lidar_pose_alone_and_empty_benches_are_plain_wide_
 
 
 def test_sample_shows_its_object_or_an_empty_bench_and_depends_on_its_seed_alone() -> None:
-    empty, ordinary, plates = (make_samples(kind, range(2), RIG, SENSOR) for kind in (EMPTY, ORDINARY, "plates"))
+    empty, ordinary, plates = (
+        make_samples(kind, range(2), RIG, SENSOR) for kind in (EMPTY, ORDINARY, "plates")
+    )
     assert not empty.image.any()
     assert not empty.cells.any()
     for shown in (ordinary, plates):
@@ -116,17 +159,23 @@ def test_sample_shows_its_object_or_an_empty_bench_and_depends_on_its_seed_alone
     np.testing.assert_array_equal(alone.intensity[0], ordinary.intensity[1])
 
 
-def test_ordinary_and_half_of_outlier_benches_lie_slightly_off_and_kinds_share_no_bench_and_no_noise() -> None:
+def test_ordinary_and_half_of_outlier_benches_lie_slightly_off_and_kinds_share_no_bench_and_no_noise() -> (
+    None
+):
     """A shared bench would let a network tell outliers from ordinary objects."""
     seeds = 0, SEEDS_PER_BENCH - 1, SEEDS_PER_BENCH
-    ordinary, plates = ([_stimulus(kind, seed, RIG, SENSOR).rig for seed in seeds] for kind in (ORDINARY, "plates"))
+    ordinary, plates = (
+        [_stimulus(kind, seed, RIG, SENSOR).rig for seed in seeds] for kind in (ORDINARY, "plates")
+    )
     assert [rig == RIG for rig in plates] == [True, True, False]
     assert RIG not in ordinary
     assert ordinary[0] == ordinary[1] != ordinary[2]
     kinds = [EMPTY, ORDINARY, *TRAINING_OUTLIERS, *HELD_OUT_OUTLIERS]
     for of in range(3):
         assert len({doubt_samples._generator(kind, 3, of).bytes(8) for kind in kinds}) == len(kinds)
-    slight = [_stimulus(kind, SEEDS_PER_BENCH, RIG, SENSOR) for kind in ("plates", "blobs", ORDINARY)]
+    slight = [
+        _stimulus(kind, SEEDS_PER_BENCH, RIG, SENSOR) for kind in ("plates", "blobs", ORDINARY)
+    ]
     assert len({stimulus.rig.checksum for stimulus in slight}) == 3
     assert len({stimulus.sensor.bare_wall_counts for stimulus in slight}) == 3
 
@@ -143,20 +192,25 @@ def test_usual_objects_are_as_many_as_outliers_with_generic_shapes_by_their_shar
     assert _stimulus(GENERIC, 0, RIG, SENSOR).rig != RIG
 
 
-def test_samples_on_disk_makes_only_missing_samples(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_samples_on_disk_makes_only_missing_samples(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     made = list[tuple[str, int]]()
 
     def quick(kind: str, seeds: range, *_: object) -> doubt_samples.DoubtSamples:
         made.append((kind, seeds.start))
         maps = np.zeros((len(seeds), 2, 2), np.float32)
         kinds = np.array([kind] * len(seeds))
-        return doubt_samples.DoubtSamples(maps, maps, maps.astype(np.float16), np.array(seeds, np.int32), kinds)
+        return doubt_samples.DoubtSamples(
+            maps, maps, maps.astype(np.float16), np.array(seeds, np.int32), kinds
+        )
 
     monkeypatch.setattr(doubt_samples, "make_samples", quick)
     samples_on_disk = doubt_samples.samples_on_disk
     first = samples_on_disk(tmp_path, {EMPTY: 150}, 7, RIG, SENSOR)
     assert made == [(EMPTY, 7), (EMPTY, 107)]
-    told, asked = list[tuple[int, int]](), {EMPTY: 150, "far": 20}
+    told = list[tuple[int, int]]()
+    asked = {EMPTY: 150, "far": 20}
     both = samples_on_disk(tmp_path, asked, 7, RIG, SENSOR, on_progress=lambda *at: told.append(at))
     assert made[2:] == [("far", 7)]
     np.testing.assert_array_equal(both.cells[:150], first.cells)

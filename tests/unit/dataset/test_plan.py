@@ -1,4 +1,6 @@
-"""Dataset plans: equal after writing and reading, older plans at their defaults, drawn rigs within their bounds."""
+"""Dataset plans: equal after writing and reading, older plans at their defaults, drawn rigs within
+their bounds.
+"""
 
 import json
 from dataclasses import replace
@@ -11,12 +13,20 @@ from nlos_calibration import load_rig
 from nlos_models import SIMULATION_ONLY
 from pydantic import ValidationError
 
-from nlos_cam.dataset.plan import FIRST_OBJECTS, SCENE_COLUMNS, DatasetPlan, Objects, RigSpread, scene_row
+from nlos_cam.dataset.plan import (
+    FIRST_OBJECTS,
+    SCENE_COLUMNS,
+    DatasetPlan,
+    Objects,
+    RigSpread,
+    scene_row,
+)
 from nlos_cam.errors import SceneError
 from nlos_cam.objects import CATEGORIES, TEXTURES
 from nlos_cam.render import Material, SceneFile, SensorModel
 
-RIG, SENSOR = load_rig("paper-rig"), SensorModel()
+RIG = load_rig("paper-rig")
+SENSOR = SensorModel()
 PLAN = DatasetPlan(RIG, 7)
 SPREAD = RigSpread(place_m=0.02, angle_deg=5, gain_share=0.3)
 CHANGES: dict[str, Any] = {
@@ -47,7 +57,8 @@ def test_plan_survives_json_and_names_the_field_that_differs(name: str) -> None:
 
 def test_plan_writes_later_fields_only_where_used_and_of_older_version_has_defaults() -> None:
     """Checksums of older plans stay."""
-    mixed, facts = replace(PLAN, objects=Objects(share_generic=0.5)), json.loads(PLAN.provenance)
+    mixed = replace(PLAN, objects=Objects(share_generic=0.5))
+    facts = json.loads(PLAN.provenance)
     assert json.loads(replace(PLAN, textures=tuple(TEXTURES)).provenance)["note"] == SIMULATION_ONLY
     assert json.loads(mixed.provenance)["objects"]["share_generic"] == 0.5
     assert DatasetPlan.from_provenance(mixed.provenance) == mixed
@@ -66,7 +77,12 @@ def test_plan_writes_later_fields_only_where_used_and_of_older_version_has_defau
 
 @pytest.mark.parametrize(
     ("text", "word"),
-    [("", "."), ("{}", "."), ('{"rig": 1}', "."), (json.dumps(json.loads(PLAN.provenance) | {"lens": 2}), "lens")],
+    [
+        ("", "."),
+        ("{}", "."),
+        ('{"rig": 1}', "."),
+        (json.dumps(json.loads(PLAN.provenance) | {"lens": 2}), "lens"),
+    ],
 )
 def test_plan_refuses_other_json_and_newer_plans(text: str, word: str) -> None:
     with pytest.raises(ValueError, match=word):
@@ -83,7 +99,12 @@ def test_objects_without_leaves_categories_out() -> None:
 
 def test_plan_of_scene_takes_all_but_the_object() -> None:
     hidden = {"category": "cup", "material": {"kind": "phong"}}
-    facts = {"rig": "paper-rig", "radiometry": "lambertian", "jump_m": 0.03, "sensor": {"pulse_ns": 1.0}}
+    facts = {
+        "rig": "paper-rig",
+        "radiometry": "lambertian",
+        "jump_m": 0.03,
+        "sensor": {"pulse_ns": 1.0},
+    }
     scene = SceneFile.model_validate({"name": "s", "object": hidden, **facts})
     plan = DatasetPlan.of_scene(scene, 3, accuracy="draft")
     assert (plan.rig, plan.first_seed, plan.accuracy) == (scene.rig, 3, "draft")
@@ -104,7 +125,9 @@ def test_spread_draws_rigs_by_seed_uniformly_within_bounds_and_none_keeps_the_ri
     assert SPREAD.draw(RIG, SENSOR, 5) != SPREAD.draw(RIG, SENSOR, 6)
     assert RigSpread().draw(RIG, SENSOR, 5) == (RIG, SENSOR)
     shared = replace(PLAN, spread=SPREAD, objects_per_rig=5)
-    assert [shared.bench_of(seed) for seed in range(4, 7)] == [SPREAD.draw(RIG, SENSOR, draw) for draw in (0, 1, 1)]
+    assert [shared.bench_of(seed) for seed in range(4, 7)] == [
+        SPREAD.draw(RIG, SENSOR, draw) for draw in (0, 1, 1)
+    ]
     rig, sensor = SPREAD.draw(RIG.model_copy(update={"occluder": None}), SENSOR, 1)
     assert rig.occluder is None
     assert np.isnan(scene_row(rig, sensor)).tolist() == [False, False, False, True, True, False]

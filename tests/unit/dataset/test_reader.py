@@ -1,4 +1,6 @@
-"""Dataset reader: equal samples in memory and streamed; an epoch depends on seed and epoch alone."""
+"""Dataset reader: equal samples in memory and streamed; an epoch depends on seed and epoch
+alone.
+"""
 
 import shutil
 from dataclasses import replace
@@ -18,7 +20,8 @@ from nlos_cam.dataset.shards import shard_path, store
 from nlos_cam.errors import RecordingError, SceneError
 
 PLAN = DatasetPlan(load_rig("paper-rig"), 40)
-COUNT, SHARD = 43, 5
+COUNT = 43
+SHARD = 5
 
 
 @pytest.fixture(autouse=True)
@@ -40,7 +43,9 @@ def data(folder: Path) -> Dataset:
     return open_dataset(folder)
 
 
-def _rows(data: Dataset, seed: int = 0, epoch: int = 0, batch: int = 4, **others: int) -> list[list[int]]:
+def _rows(
+    data: Dataset, seed: int = 0, epoch: int = 0, batch: int = 4, **others: int
+) -> list[list[int]]:
     return [found.row.tolist() for found in data.batches(seed, epoch, batch, **others)]
 
 
@@ -50,11 +55,14 @@ def _assert_as_stored(found: MapBatch) -> None:
         turn = slice(None, None, -1 if mirrored else 1)
         np.testing.assert_array_equal(found.depth_m[k], samples["depth_m"][k][turn])
         np.testing.assert_array_equal(found.intensity[k], samples["intensity"][k][turn])
-        np.testing.assert_array_equal(found.image[k, 0], samples["image"][k][turn].astype(np.float32))
+        np.testing.assert_array_equal(
+            found.image[k, 0], samples["image"][k][turn].astype(np.float32)
+        )
 
 
 def test_dataset_is_read_as_stored(data: Dataset) -> None:
-    maps, plan = data.arrays(), data.plan
+    maps = data.arrays()
+    plan = data.plan
     assert (len(data), plan) == (COUNT, PLAN)
     for name in MAP_CHANNELS:
         np.testing.assert_array_equal(getattr(maps, name), samples_of(range(40, 40 + COUNT))[name])
@@ -64,7 +72,8 @@ def test_dataset_is_read_as_stored(data: Dataset) -> None:
 
 @pytest.mark.parametrize("batch", [1, 4, 7, 43, 100])
 def test_epoch_holds_samples_once_without_last_partial_batch(data: Dataset, batch: int) -> None:
-    size, rows = min(batch, COUNT), _rows(data, batch=batch)
+    size = min(batch, COUNT)
+    rows = _rows(data, batch=batch)
     assert {len(some) for some in rows} == {size}
     every = [row for some in rows for row in some]
     assert len(every) == len(set(every)) == COUNT // size * size
@@ -99,13 +108,21 @@ def test_processes_share_the_batches_of_one_process(data: Dataset, world: int) -
             next(data.batches(0, 0, 6, rank=rank, world=count))
 
 
-def test_samples_are_shuffled_and_read_once_into_two_buffers(data: Dataset, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_samples_are_shuffled_and_read_once_into_two_buffers(
+    data: Dataset, monkeypatch: pytest.MonkeyPatch
+) -> None:
     shards = np.array([row for some in _rows(data, batch=1) for row in some]) // SHARD
     blocks = [set(shards[k : k + 15].tolist()) for k in range(0, 30, 15)]
-    assert any(len(block) == 3 for block in blocks)  # three shards of five samples, shuffled together
+    assert any(
+        len(block) == 3 for block in blocks
+    )  # three shards of five samples, shuffled together
     assert shards.tolist() != sorted(shards.tolist())
-    assert len({len(list(run)) for run in np.split(shards, np.flatnonzero(np.diff(shards)) + 1)}) > 1
-    read, held, original_take = Mock(wraps=_maps), list[int](), _Window.take
+    assert (
+        len({len(list(run)) for run in np.split(shards, np.flatnonzero(np.diff(shards)) + 1)}) > 1
+    )
+    read = Mock(wraps=_maps)
+    held = list[int]()
+    original_take = _Window.take
 
     def take(window: _Window, rows: np.ndarray) -> MapSet:
         found = original_take(window, rows)
@@ -116,7 +133,11 @@ def test_samples_are_shuffled_and_read_once_into_two_buffers(data: Dataset, monk
     monkeypatch.setattr(_Window, "take", take)
     assert len(_rows(data, batch=1)) == COUNT == len(held)
     assert max(held) <= 2 * reader.BUFFER
-    assert read.call_count == len({call.args[0].path for call in read.call_args_list}) == len(data.shards)
+    assert (
+        read.call_count
+        == len({call.args[0].path for call in read.call_args_list})
+        == len(data.shards)
+    )
 
 
 @pytest.mark.parametrize("way", ["arrays", "batches", "chunks"])
@@ -131,7 +152,9 @@ def test_reader_names_damaged_shard(folder: Path, tmp_path: Path, way: str) -> N
     assert "\n" not in str(caught.value)
 
 
-def test_reader_refuses_no_dataset_shards_of_two_and_unasked_expected_maps(tmp_path: Path, folder: Path) -> None:
+def test_reader_refuses_no_dataset_shards_of_two_and_unasked_expected_maps(
+    tmp_path: Path, folder: Path
+) -> None:
     with pytest.raises(RecordingError, match="nlos-cam dataset build"):
         open_dataset(tmp_path)
     store(shard_path(tmp_path, 40), samples_of([40]), replace(PLAN, expected=True).provenance, "")

@@ -1,4 +1,6 @@
-"""Training maps of a recipe, in memory, streamed or packed, and the bare wall that difference maps subtract."""
+"""Training maps of a recipe, in memory, streamed or packed, and the bare wall that difference maps
+subtract.
+"""
 
 from dataclasses import replace
 from pathlib import Path
@@ -15,7 +17,15 @@ from small_maps import SmallDataset, small_maps
 from small_run import small_recipe
 
 from nlos_cam.dataset import DatasetPlan, RigSpread, training_maps
-from nlos_cam.dataset.packed import CELLS, IMAGES, INDEX, MAPS, PackedMaps, map_noise, open_packed_maps
+from nlos_cam.dataset.packed import (
+    CELLS,
+    IMAGES,
+    INDEX,
+    MAPS,
+    PackedMaps,
+    map_noise,
+    open_packed_maps,
+)
 from nlos_cam.dataset.samples import Samples
 from nlos_cam.dataset.shards import shard_path, store
 from nlos_cam.dataset.training_maps import MapSplit, Streamed, read_maps, render_bare_wall
@@ -42,9 +52,16 @@ def _datasets(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def _read(
-    data: str = "data", other: str = "other", wall: Path | None = None, *, stream: bool = False, **changes: object
+    data: str = "data",
+    other: str = "other",
+    wall: Path | None = None,
+    *,
+    stream: bool = False,
+    **changes: object,
 ) -> MapSplit:
-    return read_maps(RECIPE.model_copy(update=changes), Path(data), Path(other), wall, stream=stream)
+    return read_maps(
+        RECIPE.model_copy(update=changes), Path(data), Path(other), wall, stream=stream
+    )
 
 
 def test_read_maps_takes_first_objects_of_recipe_and_a_digest_of_objects_and_rig() -> None:
@@ -64,15 +81,22 @@ def test_expected_maps_get_noise_anew_in_each_epoch(stream: bool) -> None:
     """Of its stated deviation, in the intensity alone; the same generator draws the same again."""
 
     def first(data: str, seed: int) -> MapBatch:
-        batches = _read(data, stream=stream, objects=6).training.batches(6, torch.Generator().manual_seed(seed))
+        batches = _read(data, stream=stream, objects=6).training.batches(
+            6, torch.Generator().manual_seed(seed)
+        )
         return next(iter(batches))
 
-    one, other, same, plain = first("expected", 1), first("expected", 2), first("expected", 1), first("expecte*", 1)
+    one = first("expected", 1)
+    other = first("expected", 2)
+    same = first("expected", 1)
+    plain = first("expecte*", 1)
     assert all(torch.equal(mine, its) for mine, its in zip(one[1:], same[1:], strict=True))
     assert torch.equal(one.row, plain.row)
     torch.testing.assert_close(one.depth_m, plain.depth_m, equal_nan=True, rtol=0, atol=0)
     bright = plain.intensity > 10  # no noise is cut off at 0
-    off = (one.intensity - plain.intensity)[bright] / map_noise(PLAN).deviation(plain.intensity[bright])
+    off = (one.intensity - plain.intensity)[bright] / map_noise(PLAN).deviation(
+        plain.intensity[bright]
+    )
     assert abs(float(off.mean())) < 0.05
     assert 0.95 < float(off.std()) < 1.05
     assert not torch.equal(one.intensity, other.intensity)
@@ -87,14 +111,18 @@ def test_expected_maps_get_noise_anew_in_each_epoch(stream: bool) -> None:
         ("other", None, True, "--objects 6"),
     ],
 )
-def test_read_maps_refuses_what_does_not_fit(held_out: str, wall: Path | None, stream: bool, word: str) -> None:
+def test_read_maps_refuses_what_does_not_fit(
+    held_out: str, wall: Path | None, stream: bool, word: str
+) -> None:
     with pytest.raises(SceneError, match=word):
         _read("data", held_out, wall, stream=stream)
 
 
 def test_rendered_bare_wall_cancels_a_frame_of_bare_wall_of_the_one_rig() -> None:
     depth_m, intensity = render_bare_wall(PLAN, frames=8)
-    images = Sensor(PLAN.rig, PLAN.sensor).expose(render(Scene(PLAN.rig)).multi, np.random.default_rng(99))
+    images = Sensor(PLAN.rig, PLAN.sensor).expose(
+        render(Scene(PLAN.rig)).multi, np.random.default_rng(99)
+    )
     maps = maps_from_frame(images.frame(PLAN.rig.pinhole))
     valid = maps.valid & ~np.isnan(depth_m)
     assert valid.mean() > 0.5
@@ -106,13 +134,20 @@ def test_rendered_bare_wall_cancels_a_frame_of_bare_wall_of_the_one_rig() -> Non
 
 
 @pytest.mark.parametrize("wall", [None, WALL])
-def test_difference_maps_subtract_rendered_or_measured_wall(monkeypatch: pytest.MonkeyPatch, wall: Path | None) -> None:
+def test_difference_maps_subtract_rendered_or_measured_wall(
+    monkeypatch: pytest.MonkeyPatch, wall: Path | None
+) -> None:
     flat = np.zeros((64, 80), np.float32)
-    measured = SimpleNamespace(reference=SimpleNamespace(map_depth_m=flat + 0.5, map_intensity=flat + 2))
+    measured = SimpleNamespace(
+        reference=SimpleNamespace(map_depth_m=flat + 0.5, map_intensity=flat + 2)
+    )
     monkeypatch.setattr(training_maps, "render_bare_wall", lambda _: (flat + 0.25, flat + 1))
     monkeypatch.setattr(training_maps, "load_measured", lambda _: measured)
     made = _read(wall=wall, maps="difference maps")
-    for maps, raw in ((made.training.first(4), small_maps(6, 4)), (made.held_out, small_maps(6, 5))):
+    for maps, raw in (
+        (made.training.first(4), small_maps(6, 4)),
+        (made.held_out, small_maps(6, 5)),
+    ):
         difference = raw.intensity[: len(maps.image)] - maps.intensity
         np.testing.assert_allclose(difference[~np.isnan(maps.depth_m)], 2.0 if wall else 1.0)
         nearer_m = (raw.depth_m[: len(maps.image)] - maps.depth_m)[~np.isnan(maps.depth_m)]
@@ -123,13 +158,16 @@ def test_difference_maps_subtract_rendered_or_measured_wall(monkeypatch: pytest.
 
 
 def test_streamed_maps_equal_maps_in_memory() -> None:
-    maps, generator = small_maps(8, 0), np.random.default_rng(0)
+    maps = small_maps(8, 0)
+    generator = np.random.default_rng(0)
     bare = tuple(generator.random((64, 80), np.float32) for _ in range(2))
-    stream, whole = Streamed(SmallDataset(maps, PLAN), maps.image, bare), subtract_bare_wall(maps, *bare)
+    stream = Streamed(SmallDataset(maps, PLAN), maps.image, bare)
+    whole = subtract_bare_wall(maps, *bare)
     batches, again = (list(stream.batches(4, torch.Generator().manual_seed(3))) for _ in "ab")
     for batch, same in zip(batches, again, strict=True):
         wanted = [torch.from_numpy(part)[batch.row] for part in (whole.depth_m, whole.intensity)]
-        found, wanted = [batch.depth_m, batch.intensity], flip_some(wanted, batch.mirrored)
+        found = [batch.depth_m, batch.intensity]
+        wanted = flip_some(wanted, batch.mirrored)
         torch.testing.assert_close(found, wanted, rtol=0, atol=0, equal_nan=True)
         assert torch.equal(batch.row, same.row)
         assert torch.equal(batch.mirrored, same.mirrored)
@@ -148,7 +186,11 @@ def _samples(first: int) -> Samples:
     sizes = {"depth_m": (64, 80), "intensity": (64, 80), "image": (64, 64)}
     arrays = {name: noise.random((SHARD, *size), np.float32) for name, size in sizes.items()}
     arrays["depth_m"][:, 0, 0] = np.nan
-    return {**samples_of(range(first, first + SHARD)), **arrays, "image": arrays["image"].astype(np.float16)}
+    return {
+        **samples_of(range(first, first + SHARD)),
+        **arrays,
+        "image": arrays["image"].astype(np.float16),
+    }
 
 
 def _add(folder: Path, first: int, plan: DatasetPlan = PLAN) -> Path:
@@ -169,36 +211,48 @@ def test_packed_maps_are_the_datasets_normalised(tmp_path: Path) -> None:
         wanted = dict[bytes, np.ndarray]()
         for first in (0, 20):
             samples = _samples(first)
-            normal = packed.normal(*(torch.from_numpy(samples[name]) for name in ("depth_m", "intensity")))
+            normal = packed.normal(
+                *(torch.from_numpy(samples[name]) for name in ("depth_m", "intensity"))
+            )
             normal = normal.half().numpy()
-            wanted |= {image.tobytes(): one for image, one in zip(samples["image"], normal, strict=True)}
+            wanted |= {
+                image.tobytes(): one for image, one in zip(samples["image"], normal, strict=True)
+            }
         maps, images = _epoch(packed, 1)
     assert len({image.tobytes() for image in images}) == 2 * SHARD
     for image, one in zip(images, maps, strict=True):
         np.testing.assert_array_equal(one, wanted[image.tobytes()])
 
 
-def test_maps_of_many_rigs_are_packed_as_the_one_rig_sees_them_and_others_left_out(tmp_path: Path) -> None:
+def test_maps_of_many_rigs_are_packed_as_the_one_rig_sees_them_and_others_left_out(
+    tmp_path: Path,
+) -> None:
     varied = replace(PLAN, spread=RigSpread(angle_deg=40))
     benches = [varied.bench_of(seed)[0] for seed in range(SHARD)]
     seen = [can_align(bench, PLAN.rig) for bench in benches]
     assert 0 < sum(seen) < SHARD
-    folder, samples = _add(tmp_path / "a", 0, varied), _samples(0)
+    folder = _add(tmp_path / "a", 0, varied)
+    samples = _samples(0)
     with open_packed_maps([folder], tmp_path / "store") as packed:
         assert len(packed) == sum(seen)
         maps, images = _epoch(packed, 1, 1)
         held_out = packed.held_out(folder, SHARD - 1)
     assert len(held_out.image) == sum(seen[:-1])
     for row in np.flatnonzero(seen):
-        one = LidarMaps(samples["depth_m"][row], samples["intensity"][row], np.isfinite(samples["depth_m"][row]))
+        one = LidarMaps(
+            samples["depth_m"][row], samples["intensity"][row], np.isfinite(samples["depth_m"][row])
+        )
         aligned = MapAlignment(benches[row], PLAN.rig).align(one)
-        wanted = packed.normal(*(torch.from_numpy(part[None]) for part in (aligned.depth_m, aligned.intensity)))
+        wanted = packed.normal(
+            *(torch.from_numpy(part[None]) for part in (aligned.depth_m, aligned.intensity))
+        )
         found = maps[(images == samples["image"][row]).all((1, 2))]
         np.testing.assert_array_equal(found, wanted.half().numpy())
 
 
 def test_maps_in_color_are_packed_with_three_intensities_of_one_rig(tmp_path: Path) -> None:
-    plan, samples = replace(PLAN, textures=("plain",)), _samples(0)
+    plan = replace(PLAN, textures=("plain",))
+    samples = _samples(0)
     painted = {name: np.stack([samples[name]] * 3, 1) for name in ("intensity", "image")}
     store_shard = {**samples, **painted, "texture": np.array(["plain"] * SHARD, object)}
     for name, made in (("one", plan), ("many", replace(plan, spread=RigSpread(angle_deg=1)))):
@@ -228,7 +282,9 @@ def test_new_shards_enter_new_epochs_and_an_epoch_can_be_seen_again(tmp_path: Pa
 
 
 def test_store_keeps_the_normalisation_of_given_weights(tmp_path: Path) -> None:
-    folder, store_folder, given = _add(tmp_path / "a", 0), tmp_path / "store", CellNormal()
+    folder = _add(tmp_path / "a", 0)
+    store_folder = tmp_path / "store"
+    given = CellNormal()
     given.median += 0.5
     with open_packed_maps([folder], store_folder, normal=given) as packed:
         assert torch.equal(packed.normal.median, given.median)
@@ -242,8 +298,12 @@ def test_store_keeps_the_normalisation_of_given_weights(tmp_path: Path) -> None:
 
 
 def test_open_packed_maps_refuses_a_store_in_use(tmp_path: Path) -> None:
-    folder, store_folder = _add(tmp_path / "a", 0), tmp_path / "store"
-    with open_packed_maps([folder], store_folder), pytest.raises(FileBusyError, match="store is being written"):
+    folder = _add(tmp_path / "a", 0)
+    store_folder = tmp_path / "store"
+    with (
+        open_packed_maps([folder], store_folder),
+        pytest.raises(FileBusyError, match="store is being written"),
+    ):
         open_packed_maps([folder], store_folder).__enter__()
     with pytest.raises(ZeroDivisionError), open_packed_maps([folder], store_folder):
         raise ZeroDivisionError
@@ -261,8 +321,11 @@ def test_damaged_store_is_refused(tmp_path: Path, name: str) -> None:
         open_packed_maps([folder], tmp_path / "store").__enter__()
 
 
-def test_expected_maps_have_noise_to_draw_and_mixed_datasets_or_too_few_objects_are_refused(tmp_path: Path) -> None:
-    plain, expected = _add(tmp_path / "a", 0), _add(tmp_path / "b", 20, replace(PLAN, expected=True))
+def test_expected_maps_have_noise_to_draw_and_mixed_datasets_or_too_few_objects_are_refused(
+    tmp_path: Path,
+) -> None:
+    plain = _add(tmp_path / "a", 0)
+    expected = _add(tmp_path / "b", 20, replace(PLAN, expected=True))
     for folder, wanted in ((plain, None), (expected, map_noise(PLAN))):
         with open_packed_maps([folder], tmp_path / f"store of {folder.name}") as packed:
             assert packed.noise == wanted

@@ -1,7 +1,8 @@
-"""Each check on a bench with one fault: the checks that fail, and the detail and fix of one of them.
+"""Each check on a bench with one fault: the checks that fail, and the detail and fix of one of
+them.
 
-A case: steps that cause the fault, names of the checks that fail, checks with their status ("failed" if none
-is given), and words of the detail and fix of the first of them.
+A case: steps that cause the fault, names of the checks that fail, checks with their status
+("failed" if none is given), and words of the detail and fix of the first of them.
 """
 
 from functools import partial
@@ -20,7 +21,16 @@ from nlos_cam.doctor.diagnosis import REPLUG
 
 DENIED = usb.core.USBError("Access denied (insufficient permissions)", -3, 13)
 LINUX_ONLY = ("container", "udev-rules", "permissions", "video-driver", "hid-sensors", "in-use")
-CAMERA_ONLY = ("recovery", "link", "permissions", "video-driver", "hid-sensors", "in-use", "sdk-camera", "firmware")
+CAMERA_ONLY = (
+    "recovery",
+    "link",
+    "permissions",
+    "video-driver",
+    "hid-sensors",
+    "in-use",
+    "sdk-camera",
+    "firmware",
+)
 
 
 def linux(name: str, *arguments: Any) -> Any:
@@ -45,8 +55,12 @@ def all_of(status: str, *names: str) -> str:
     return ", ".join(f"{name} {status}" for name in names)
 
 
-UNPLUG, HIDE, NO_RULES, REFUSE = do("unplug"), do("hide"), do("remove_rules"), do("refuse")
-DOCKER, NO_USB = write(".dockerenv", ""), put("usb.devices", [])
+UNPLUG = do("unplug")
+HIDE = do("hide")
+NO_RULES = do("remove_rules")
+REFUSE = do("refuse")
+DOCKER = write(".dockerenv", "")
+NO_USB = put("usb.devices", [])
 SECOND = do("plug_second", hid=0)
 NO_SDK = put("sdk_error", ImportError("No module named 'pyrealsense2'"))
 WSL = write("proc/version", "Linux version 6.6.87-microsoft-standard-WSL2")
@@ -149,11 +163,16 @@ WSL = write("proc/version", "Linux version 6.6.87-microsoft-standard-WSL2")
         ([HIDE, SECOND], "hid-sensors sdk-camera", "sdk-camera", "hid-sensors|sudo modprobe -a hid_sensor_hub"),
     ],
 )  # fmt: skip
-def test_check_reports_fault_with_its_fix(bench: Any, steps: list[Any], failures: str, check: str, words: str) -> None:
+def test_check_reports_fault_with_its_fix(
+    bench: Any, steps: list[Any], failures: str, check: str, words: str
+) -> None:
     for step in steps:
         step(bench)
-    checks, wanted = bench.checks(), [(*each.split(), "failed")[:2] for each in check.split(", ")]
-    assert {each.name for each in checks.values() if each.status == "failed"} == set(failures.split())
+    checks = bench.checks()
+    wanted = [(*each.split(), "failed")[:2] for each in check.split(", ")]
+    assert {each.name for each in checks.values() if each.status == "failed"} == set(
+        failures.split()
+    )
     assert [(name, checks[name].status) for name, _ in wanted] == wanted
     first = checks[wanted[0][0]]
     for word in words.split("|"):
@@ -191,9 +210,20 @@ def test_sdk_without_the_l515_is_why_it_is_not_seen(bench: Any, version: str) ->
 @pytest.mark.parametrize(
     ("firmware", "status"),
     [
-        *(("01.05.08.01", "ok"), ("01.05.10.00", "ok"), ("01.05.08.00", "warning"), ("01.05.01.03", "warning")),
+        *(
+            ("01.05.08.01", "ok"),
+            ("01.05.10.00", "ok"),
+            ("01.05.08.00", "warning"),
+            ("01.05.01.03", "warning"),
+        ),
         *(("01.05.01.02", "failed"), ("01.04.01.02", "failed")),
-        *((0x1058, "ok"), (0x1052, "warning"), (0x1041, "failed"), (0x2F00, "skipped"), (0, "skipped")),
+        *(
+            (0x1058, "ok"),
+            (0x1052, "warning"),
+            (0x1041, "failed"),
+            (0x2F00, "skipped"),
+            (0, "skipped"),
+        ),
     ],
 )
 def test_firmware_is_judged_by_sdk_or_usb(bench: Any, firmware: str | int, status: str) -> None:

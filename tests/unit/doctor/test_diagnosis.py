@@ -17,31 +17,69 @@ from nlos_cam.doctor.usb import UsbDevice, UsbScan
 from nlos_cam.errors import CameraError
 
 NAMES = (
-    "python system sdk sdk-version sdk-alone libusb usb-camera recovery link container udev-rules permissions "
-    "video-driver hid-sensors in-use sdk-camera firmware metadata"
+    "python system sdk sdk-version sdk-alone libusb usb-camera recovery link container udev-rules"
+    " permissions video-driver hid-sensors in-use sdk-camera firmware metadata"
 )
 words = st.sampled_from(
-    ["", "x", "2.54.2", "f0246262", "01.05.08.01", "L515", "linux", "windows", "darwin", "hid", "2-1"]
+    [
+        "",
+        "x",
+        "2.54.2",
+        "f0246262",
+        "01.05.08.01",
+        "L515",
+        "linux",
+        "windows",
+        "darwin",
+        "hid",
+        "2-1",
+    ]
 )
 listed = st.tuples(st.builds(DeviceInfo, words, words, words, words)) | st.just(())
-sdks = st.builds(Sdk, st.lists(st.tuples(words, words), max_size=2).map(tuple), words, words, listed)
+sdks = st.builds(
+    Sdk, st.lists(st.tuples(words, words), max_size=2).map(tuple), words, words, listed
+)
 devices = st.builds(
     UsbDevice,
-    product_id=st.sampled_from([0x0B64, 0x0B55, 0x0B07]), kind=st.sampled_from(["camera", "recovery", "other"]),
-    meaning=words, bus=st.none(), address=st.none(), port=words, bcd_usb=st.integers(0, 0xFFFF),
-    speed=st.none() | st.integers(-1, 9), firmware=words, serial=words, product=words,
-    interfaces=st.tuples(words), error=words, denied=st.booleans(),
-)  # fmt: skip
-ids, texts = st.sampled_from([0x0B64, 0x0B55]), st.tuples(words)
+    product_id=st.sampled_from([0x0B64, 0x0B55, 0x0B07]),
+    kind=st.sampled_from(["camera", "recovery", "other"]),
+    meaning=words,
+    bus=st.none(),
+    address=st.none(),
+    port=words,
+    bcd_usb=st.integers(0, 0xFFFF),
+    speed=st.none() | st.integers(-1, 9),
+    firmware=words,
+    serial=words,
+    product=words,
+    interfaces=st.tuples(words),
+    error=words,
+    denied=st.booleans(),
+)
+ids = st.sampled_from([0x0B64, 0x0B55])
+texts = st.tuples(words)
 cameras = st.builds(KernelCamera, words, ids, words, words, texts, st.just(()), texts)
 hosts = st.builds(
     Host,
-    st.builds(Platform, words, words, st.tuples(st.integers(2, 4), st.integers(0, 20)), st.booleans(), st.booleans()),
-    words, st.booleans(), st.dictionaries(st.sampled_from(MODULES), words), st.booleans(), st.booleans(),
-    st.just(()) | st.tuples(cameras), st.just(()) | st.tuples(words),
+    st.builds(
+        Platform,
+        words,
+        words,
+        st.tuples(st.integers(2, 4), st.integers(0, 20)),
+        st.booleans(),
+        st.booleans(),
+    ),
+    words,
+    st.booleans(),
+    st.dictionaries(st.sampled_from(MODULES), words),
+    st.booleans(),
+    st.booleans(),
+    st.just(()) | st.tuples(cameras),
+    st.just(()) | st.tuples(words),
     st.just(()) | st.tuples(st.builds(Node, words, words)),
-    st.just(()) | st.tuples(st.builds(Holder, st.integers(1, 9), words, words)), st.integers(0, 2),
-)  # fmt: skip
+    st.just(()) | st.tuples(st.builds(Holder, st.integers(1, 9), words, words)),
+    st.integers(0, 2),
+)
 scans = st.builds(UsbScan, st.lists(devices, max_size=2).map(tuple), st.integers(0, 5), words)
 
 
@@ -113,16 +151,25 @@ def test_sdk_facts_hold_version_and_devices(bench: Any) -> None:
 
 
 def test_sdk_that_cannot_load_keeps_the_error(bench: Any) -> None:
-    assert query_sdk(Mock(side_effect=CameraError("no such luck")), list).load_error == "no such luck"
+    assert (
+        query_sdk(Mock(side_effect=CameraError("no such luck")), list).load_error == "no such luck"
+    )
     bench.sdk_error = ImportError("No module named 'pyrealsense2'")
     sdk = bench.facts().sdk
-    assert (sdk.load_error, sdk.error, sdk.devices) == (str(bench.sdk_error), str(bench.sdk_error), ())
+    assert (sdk.load_error, sdk.error, sdk.devices) == (
+        str(bench.sdk_error),
+        str(bench.sdk_error),
+        (),
+    )
 
 
 def test_pair_matches_serials_whatever_their_zeros(bench: Any) -> None:
     assert matched(bench) == [("f0246262", None)]
     assert matched(bench, "f9") == [("f0246262", None), (None, "f9")]
-    bench.usb.devices = [fake_device(serial="00000000F1"), fake_device(serial="00000000F2", address=4)]
+    bench.usb.devices = [
+        fake_device(serial="00000000F1"),
+        fake_device(serial="00000000F2", address=4),
+    ]
     assert matched(bench, "f2", "00000000f1") == [("f1", "00000000f1"), ("f2", "f2")]
     bench.put_on_usb(0x0B55)
     assert [one.usb for one in bench.facts().pairs] == [None]  # one in recovery mode is no camera
@@ -139,8 +186,16 @@ def test_pair_gives_the_last_device_to_a_camera_without_serial(bench: Any) -> No
 
 def test_pair_prefers_what_the_sdk_reports(bench: Any) -> None:
     [both] = bench.facts().pairs
-    assert (both.name, both.serial, both.firmware) == ("Intel RealSense L515", "f0246262", "01.05.08.01")
-    assert (both.link, both.is_slow, both.label) == ("5 Gbit/s (USB 3)", False, "L515 f0246262 at 2-1")
+    assert (both.name, both.serial, both.firmware) == (
+        "Intel RealSense L515",
+        "f0246262",
+        "01.05.08.01",
+    )
+    assert (both.link, both.is_slow, both.label) == (
+        "5 Gbit/s (USB 3)",
+        False,
+        "L515 f0246262 at 2-1",
+    )
     alone = Pair(both.usb, None)
     assert (alone.name, alone.serial, alone.firmware) == ("L515", "f0246262", "1.5.8")
     seen = Pair(None, info("f1", usb="2.1"))

@@ -1,4 +1,6 @@
-"""What is read of a host: files and processes of Linux, udev rules, and USB, by the real pyusb on a fake bus."""
+"""What is read of a host: files and processes of Linux, udev rules, and USB, by the real pyusb on a
+fake bus.
+"""
 
 import errno
 import inspect
@@ -27,8 +29,21 @@ from nlos_cam.doctor.udev import FILE_NAME, RELOAD, WRITE_AND_INSTALL, install_c
 from nlos_cam.doctor.usb import SPEEDS, UsbDevice, firmware_of, scan_usb, sdk_serial
 
 LINUX = host.Platform("linux", "x86_64", (3, 11))
-READ = (".dockerenv", "proc/modules", "proc/1/cgroup", "proc/1/environ", "proc/version", "proc/sys/kernel/osrelease")
-ODD = (*READ, "sys/bus/usb/devices/2-1", "sys/bus/usb/devices/2-1/idVendor", "proc/77/fd", "etc/udev/rules.d/a.rules")
+READ = (
+    ".dockerenv",
+    "proc/modules",
+    "proc/1/cgroup",
+    "proc/1/environ",
+    "proc/version",
+    "proc/sys/kernel/osrelease",
+)
+ODD = (
+    *READ,
+    "sys/bus/usb/devices/2-1",
+    "sys/bus/usb/devices/2-1/idVendor",
+    "proc/77/fd",
+    "etc/udev/rules.d/a.rules",
+)
 HOLDS = "import sys; file = open(sys.argv[1]); print('open', flush=True); sys.stdin.read()"
 
 
@@ -59,7 +74,9 @@ def test_this_host_and_platform_can_be_read(tmp_path: Path) -> None:
         ("proc/1/environ", "PATH=/container\0", ""),
     ],
 )
-def test_container_is_known_by_its_files(bench: Any, tmp_path: Path, path: str, content: str, kind: str) -> None:
+def test_container_is_known_by_its_files(
+    bench: Any, tmp_path: Path, path: str, content: str, kind: str
+) -> None:
     bench.linux.write(path, content)
     assert look(tmp_path).container == kind
 
@@ -67,7 +84,9 @@ def test_container_is_known_by_its_files(bench: Any, tmp_path: Path, path: str, 
 def test_module_is_loaded_built_in_available_or_missing(bench: Any, tmp_path: Path) -> None:
     bench.linux.load("uvcvideo")
     bench.linux.write("lib/modules/6.8.0/modules.builtin", "kernel/drivers/hid/hid-sensor-hub.ko\n")
-    bench.linux.write("lib/modules/6.8.0/modules.dep", "kernel/drivers/iio/hid-sensor-accel-3d.ko.xz: a.ko\n")
+    bench.linux.write(
+        "lib/modules/6.8.0/modules.dep", "kernel/drivers/iio/hid-sensor-accel-3d.ko.xz: a.ko\n"
+    )
     assert list(look(tmp_path).modules.values()) == ["loaded", "built in", "available", "missing"]
     bench.linux.load()
     bench.linux.write("sys/module/hid_sensor_hub/uevent", "")
@@ -110,9 +129,13 @@ def test_open_node_opens_and_closes_the_file(tmp_path: Path) -> None:
         host.open_node(str(tmp_path / "absent"))
 
 
-@settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(
+    max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
+)
 @given(odd=st.dictionaries(st.sampled_from(ODD), st.binary(max_size=40) | st.none()))
-def test_read_host_accepts_any_files(tmp_path_factory: pytest.TempPathFactory, odd: dict[str, bytes | None]) -> None:
+def test_read_host_accepts_any_files(
+    tmp_path_factory: pytest.TempPathFactory, odd: dict[str, bytes | None]
+) -> None:
     root = tmp_path_factory.mktemp("odd")
     for path, content in odd.items():
         if any(parent.is_file() for parent in (root / path).parents) or (root / path).exists():
@@ -131,7 +154,9 @@ def test_kernel_cameras_hold_what_hangs_on_each_port(bench: Any, tmp_path: Path)
     assert found.nodes == ("/dev/bus/usb/002/003", "/dev/video30", "/dev/video31")
     assert found.hid_sensors == ("accel_3d", "gyro_3d")
     assert found.hid_devices == ("0003:8086:0B64.3 (hid-sensor-hub)",)
-    bench.linux.plug("2-1.4", address=7, hid=0, video=1)  # behind a hub whose name begins like the other's
+    bench.linux.plug(
+        "2-1.4", address=7, hid=0, video=1
+    )  # behind a hub whose name begins like the other's
     one, other = host.kernel_cameras(tmp_path)
     assert (one.port, len(one.hid_sensors), len(one.video_nodes)) == ("2-1", 2, 2)
     assert (other.port, other.hid_sensors, other.video_nodes) == ("2-1.4", (), ("/dev/video70",))
@@ -142,13 +167,20 @@ def test_odd_files_are_empty_and_odd_folders_hold_nothing(tmp_path: Path) -> Non
     assert host.find_holders(["/dev/video0"], tmp_path) == ([], 0)
     (tmp_path / "binary").write_bytes(b"\xff\xfe 1 ")
     assert host.read_text(tmp_path / "binary").endswith("1")
-    assert host.read_text(tmp_path) == host.read_text(tmp_path / "absent") == host.read_text(Path("nul\0byte")) == ""
+    assert (
+        host.read_text(tmp_path)
+        == host.read_text(tmp_path / "absent")
+        == host.read_text(Path("nul\0byte"))
+        == ""
+    )
     assert host.list_folder(tmp_path / "binary") == host.list_folder(tmp_path / "absent") == []
     (tmp_path / "loop").symlink_to(tmp_path / "loop")
     assert not host.path_exists(tmp_path / "loop")
 
 
-def test_process_that_holds_a_node_is_named_where_there_is_a_camera(bench: Any, tmp_path: Path) -> None:
+def test_process_that_holds_a_node_is_named_where_there_is_a_camera(
+    bench: Any, tmp_path: Path
+) -> None:
     bench.linux.process(41, "realsense-viewer", "/dev/null", "/dev/video30", "/dev/video31")
     bench.linux.process(42, "bash", "/dev/tty")
     bench.linux.write("proc/43/fd", "stands for a folder that may not be listed")
@@ -162,7 +194,9 @@ def test_process_that_holds_a_node_is_named_where_there_is_a_camera(bench: Any, 
 def test_real_process_that_has_a_file_open_is_found(tmp_path: Path) -> None:
     held = tmp_path / "video0"
     held.touch()
-    with subprocess.Popen([sys.executable, "-c", HOLDS, held], stdin=subprocess.PIPE, stdout=subprocess.PIPE) as other:
+    with subprocess.Popen(
+        [sys.executable, "-c", HOLDS, held], stdin=subprocess.PIPE, stdout=subprocess.PIPE
+    ) as other:
         assert other.stdout
         other.stdout.readline()
         with held.open():  # ours is left out
@@ -179,12 +213,18 @@ CLAUSE = re.compile(r'[A-Z]+(\{\w+\})?(==|:=|\+=)"[^"]*"')
 def test_rules_open_each_lidar_and_its_sensors_and_are_installed() -> None:
     lines = [line for line in rules_text().splitlines() if line and not line.startswith("#")]
     for product_id in LIDARS:
-        [rule] = [line for line in lines if f'"{product_id:04x}"' in line and line.startswith('SUBSYSTEMS=="usb"')]
+        [rule] = [
+            line
+            for line in lines
+            if f'"{product_id:04x}"' in line and line.startswith('SUBSYSTEMS=="usb"')
+        ]
         assert 'ATTRS{idVendor}=="8086"' in rule
         assert 'MODE:="0666"' in rule
     sensors = [line for line in lines if not line.startswith("SUBSYSTEMS")]
     assert [line.split(",")[0] for line in sensors] == ['KERNEL=="iio*"', 'DRIVER=="hid_sensor*"']
-    assert all('ATTRS{idProduct}=="0b64"' in line and "chmod -R 0777 /sys/%p" in line for line in sensors)
+    assert all(
+        'ATTRS{idProduct}=="0b64"' in line and "chmod -R 0777 /sys/%p" in line for line in sensors
+    )
     for line in lines:
         assert all(CLAUSE.fullmatch(clause) for clause in line.split(", ")), line
     assert not LIDARS.keys() & OTHERS.keys()
@@ -214,8 +254,16 @@ def test_l515_has_every_field_that_usb_knows(seen: Scan) -> None:
     [found, nowhere] = seen(fake_device(), fake_device(serial="", port_numbers=None))
     assert (found.id, found.kind, found.meaning) == ("8086:0b64", "camera", "L515")
     assert (found.bus, found.address, found.port) == (2, 3, "2-1")
-    assert (found.usb_type, found.link, found.is_slow) == ("3.2", SPEEDS[usb.util.SPEED_SUPER], False)
-    assert (found.firmware, found.serial, found.product) == ("1.5.8", "f0246262", "Intel(R) RealSense(TM) 515")
+    assert (found.usb_type, found.link, found.is_slow) == (
+        "3.2",
+        SPEEDS[usb.util.SPEED_SUPER],
+        False,
+    )
+    assert (found.firmware, found.serial, found.product) == (
+        "1.5.8",
+        "f0246262",
+        "Intel(R) RealSense(TM) 515",
+    )
     assert found.interfaces == ("hid", "video", "vendor")
     assert (found.error, found.denied) == ("", False)
     assert (found.label, nowhere.label) == ("L515 f0246262 at 2-1", "L515")
@@ -223,10 +271,20 @@ def test_l515_has_every_field_that_usb_knows(seen: Scan) -> None:
 
 def test_realsense_products_are_known(seen: Scan) -> None:
     for product, kind, word in (
-        *((0x0B64, "camera", "L515"), (0x0B3D, "camera", "pre-production"), (0x0B0D, "camera", "L500")),
-        *((0x0B55, "recovery", "recovery"), (0x0ADC, "recovery", "USB 2"), (0x0B07, "other", "D435")),
+        *(
+            (0x0B64, "camera", "L515"),
+            (0x0B3D, "camera", "pre-production"),
+            (0x0B0D, "camera", "L500"),
+        ),
+        *(
+            (0x0B55, "recovery", "recovery"),
+            (0x0ADC, "recovery", "USB 2"),
+            (0x0B07, "other", "D435"),
+        ),
     ):
-        [found] = seen(fake_device(product), fake_device(0x1234), fake_device(idVendor=0x046D))  # strangers are counted
+        [found] = seen(
+            fake_device(product), fake_device(0x1234), fake_device(idVendor=0x046D)
+        )  # strangers are counted
         assert (found.kind, word in found.meaning) == (kind, True)
 
 
@@ -244,7 +302,11 @@ def test_firmware_and_serial_are_read_as_the_sdk_writes_them() -> None:
     known = {0x1058: "1.5.8", 0x1052: "1.5.2", 0x1041: "1.4.1", 0x1099: "1.9.9"}
     expected = known | dict.fromkeys((0x1158, 0x0058, 0x105A), "")
     assert {number: firmware_of(number) for number in expected} == expected
-    for serial, written in {"00000000F0246262": "f0246262", "00000000f0140727": "f0140727", "": ""}.items():
+    for serial, written in {
+        "00000000F0246262": "f0246262",
+        "00000000f0140727": "f0140727",
+        "": "",
+    }.items():
         assert sdk_serial(serial) == written == sdk_serial(written)
 
 
@@ -255,7 +317,9 @@ def test_serial_comes_from_the_kernel_without_permission(seen: Scan) -> None:
     assert "hid" in found.interfaces
 
 
-@pytest.mark.parametrize("refusal", [NotImplementedError("no driver"), usb.core.USBError("gone", -4, 19)])
+@pytest.mark.parametrize(
+    "refusal", [NotImplementedError("no driver"), usb.core.USBError("gone", -4, 19)]
+)
 def test_other_refusals_are_no_lack_of_permission(seen: Scan, refusal: Exception) -> None:
     """As by a driver of Windows, or of a device that left."""
     [found] = seen(fake_device(shut=refusal, hides=refusal, port_numbers=None))
@@ -276,7 +340,9 @@ def test_scan_closes_every_device_and_claims_none(bench: Any, seen: Scan, tmp_pa
     assert "Input/Output Error" in scan_usb(bench.usb, tmp_path).error
 
 
-def test_scan_of_the_real_bus_reports_a_missing_libusb_or_package(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_scan_of_the_real_bus_reports_a_missing_libusb_or_package(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     found = scan_usb()
     assert found.error == ""
     assert len(found.devices) <= found.total

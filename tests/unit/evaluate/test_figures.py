@@ -1,4 +1,6 @@
-"""Figures of an evaluation: every object is on the sheet, in the colors of its values; and evaluations in color."""
+"""Figures of an evaluation: every object is on the sheet, in the colors of its values; and
+evaluations in color.
+"""
 
 from pathlib import Path
 from typing import Any
@@ -13,8 +15,22 @@ from nlos_models.recipe import SIMULATION_ONLY
 from nlos_cam.dataset.plan import DatasetPlan
 from nlos_cam.dataset.samples import make_samples
 from nlos_cam.evaluate import figures as evaluate_pictures
-from nlos_cam.evaluate.color import color_baselines, draw_color_sheet, figures_of_color, painted_maps
-from nlos_cam.evaluate.figures import BLOCK, DIFFERENCE, HEAD, ROWS, TILE, VALUE, draw_gallery, draw_sheet
+from nlos_cam.evaluate.color import (
+    color_baselines,
+    draw_color_sheet,
+    figures_of_color,
+    painted_maps,
+)
+from nlos_cam.evaluate.figures import (
+    BLOCK,
+    DIFFERENCE,
+    HEAD,
+    ROWS,
+    TILE,
+    VALUE,
+    draw_gallery,
+    draw_sheet,
+)
 from nlos_cam.evaluate.metrics import TARGETS, over_objects
 from nlos_cam.objects.textures import TEXTURES
 
@@ -22,8 +38,11 @@ from nlos_cam.objects.textures import TEXTURES
 @pytest.fixture
 def figures(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
     """The figures that are drawn."""
-    made, original = list[Any](), evaluate_pictures.figure_of
-    monkeypatch.setattr(evaluate_pictures, "figure_of", lambda *size: made.append(original(*size)) or made[-1])
+    made = list[Any]()
+    original = evaluate_pictures.figure_of
+    monkeypatch.setattr(
+        evaluate_pictures, "figure_of", lambda *size: made.append(original(*size)) or made[-1]
+    )
     return made
 
 
@@ -32,25 +51,41 @@ def _images(count: int) -> np.ndarray:
 
 
 def _titles(figure: Any) -> list[str]:
-    return [text.get_text() for axis in figure.axes for text in axis.texts if text.get_text() not in ROWS]
+    return [
+        text.get_text()
+        for axis in figure.axes
+        for text in axis.texts
+        if text.get_text() not in ROWS
+    ]
 
 
 def test_mosaic_shows_truth_reconstruction_and_difference() -> None:
-    truth, image = _images(5), _images(5)[::-1].copy()
+    truth = _images(5)
+    image = _images(5)[::-1].copy()
     canvas = evaluate_pictures.mosaic(image, truth, columns=3)
     assert canvas.shape == (2 * BLOCK, 3 * TILE, 3)
     for k in range(5):
-        top, left = k // 3 * BLOCK + HEAD, k % 3 * TILE
+        top = k // 3 * BLOCK + HEAD
+        left = k % 3 * TILE
         tiles = [canvas[top + row * TILE :, left:][:64, :64] for row in range(3)]
-        rows = zip(tiles, (truth[k], image[k], image[k] - truth[k]), (VALUE, VALUE, DIFFERENCE), strict=True)
+        rows = zip(
+            tiles,
+            (truth[k], image[k], image[k] - truth[k]),
+            (VALUE, VALUE, DIFFERENCE),
+            strict=True,
+        )
         for tile, picture, (name, low, high) in rows:
-            expected = colormaps[name]((picture - low) / (high - low), bytes=True)[..., :3].astype(int)
+            expected = colormaps[name]((picture - low) / (high - low), bytes=True)[..., :3].astype(
+                int
+            )
             assert np.abs(expected - tile).max() <= 3
     assert (canvas[BLOCK:, 2 * TILE :] == 255).all()
 
 
 @pytest.mark.parametrize("count", [1, 4, 7, pytest.param(54, marks=pytest.mark.slow), 130])
-def test_sheet_names_up_to_54_objects_without_overlap(tmp_path: Path, figures: list[Any], count: int) -> None:
+def test_sheet_names_up_to_54_objects_without_overlap(
+    tmp_path: Path, figures: list[Any], count: int
+) -> None:
     names = [f"headphones {2_000_000_000 + k}" for k in range(count)]
     draw_sheet(tmp_path / "sheet.png", _images(count), _images(count), names)
     assert (tmp_path / "sheet.png").read_bytes().startswith(b"\x89PNG")
@@ -64,7 +99,9 @@ def test_sheet_names_up_to_54_objects_without_overlap(tmp_path: Path, figures: l
 
 
 @pytest.mark.parametrize("count", [1, 2, 5, 20])
-def test_gallery_shows_the_worst_and_the_best_each_once(tmp_path: Path, figures: list[Any], count: int) -> None:
+def test_gallery_shows_the_worst_and_the_best_each_once(
+    tmp_path: Path, figures: list[Any], count: int
+) -> None:
     iou = np.random.default_rng(0).permutation(count) / 20
     names = [f"hat {2_000_000_000 + k}" for k in range(count)]
     draw_gallery(tmp_path / "gallery.png", _images(count), _images(count), names, iou)
@@ -75,11 +112,17 @@ def test_gallery_shows_the_worst_and_the_best_each_once(tmp_path: Path, figures:
 
 def test_categories_are_drawn_from_worst_to_best(tmp_path: Path, figures: list[Any]) -> None:
     levels = {"cup": 0.9, "hat": 0.5}
-    by = {kind: over_objects({name: np.array([level] * 2) for name in TARGETS}) for kind, level in levels.items()}
+    by = {
+        kind: over_objects({name: np.array([level] * 2) for name in TARGETS})
+        for kind, level in levels.items()
+    }
     evaluate_pictures.draw_categories(tmp_path / "categories.png", by, by["cup"])
     axis = figures[0].axes[0]
     assert [label.get_text() for label in axis.get_yticklabels()] == ["hat", "cup"]
-    assert [text.get_text().count("0.9") for text in axis.get_legend().texts] == [1, 1]  # the estimate and the bar
+    assert [text.get_text().count("0.9") for text in axis.get_legend().texts] == [
+        1,
+        1,
+    ]  # the estimate and the bar
     nothing = {"cup": over_objects({name: np.array([np.nan]) for name in TARGETS})}
     evaluate_pictures.draw_categories(tmp_path / "empty.png", nothing, nothing["cup"])
     assert (tmp_path / "empty.png").read_bytes().startswith(b"\x89PNG")
@@ -93,11 +136,19 @@ NO_VALUE = {"value": None, "low": None, "high": None}
 
 def test_color_figures_score_truth_and_background_and_name_baselines_and_simulation() -> None:
     perfect, nothing = (figures_of_color(image, TRUTH, {}, TRUTH) for image in (TRUTH, NOTHING))
-    assert perfect["silhouette_iou"] == perfect["accuracy_mean_abs"] == {"value": 1.0, "low": 1.0, "high": 1.0}
+    assert (
+        perfect["silhouette_iou"]
+        == perfect["accuracy_mean_abs"]
+        == {"value": 1.0, "low": 1.0, "high": 1.0}
+    )
     assert perfect["colour_error"] == {"value": 0.0, "low": 0.0, "high": 0.0}
     assert (nothing["silhouette_iou"]["value"], nothing["colour_error"]) == (0.0, NO_VALUE)
     figures = figures_of_color(TRUTH, TRUTH, {"other": NOTHING}, TRUTH)
-    assert (figures["note"], figures["objects"], figures["silhouette_iou"]["value"]) == (SIMULATION_ONLY, 2, 1.0)
+    assert (figures["note"], figures["objects"], figures["silhouette_iou"]["value"]) == (
+        SIMULATION_ONLY,
+        2,
+        1.0,
+    )
     assert set(figures["baselines"]) == {"other", "all_background", "mean_object", "mean_colour"}
     by, painted = (figures["better_than"].pop(name) for name in ("mean_object", "mean_colour"))
     assert not figures["better_than"]
@@ -112,8 +163,11 @@ def test_color_figures_score_truth_and_background_and_name_baselines_and_simulat
 
 def test_painted_maps_match_dataset_samples() -> None:
     plan = DatasetPlan(load_rig("paper-rig"), 40, accuracy="draft", textures=tuple(TEXTURES))
-    samples, seen = make_samples(plan, [40]), list[tuple[int, int]]()
-    maps = painted_maps([*samples["object_depth_m"]], plan.rig, 40, "draft", lambda *at: seen.append(at))
+    samples = make_samples(plan, [40])
+    seen = list[tuple[int, int]]()
+    maps = painted_maps(
+        [*samples["object_depth_m"]], plan.rig, 40, "draft", lambda *at: seen.append(at)
+    )
     np.testing.assert_array_equal(maps.depth_m, samples["depth_m"])
     np.testing.assert_array_equal(maps.intensity, samples["intensity"])
     np.testing.assert_array_equal(maps.image.astype(np.float16), samples["image"])

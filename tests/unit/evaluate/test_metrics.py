@@ -1,4 +1,6 @@
-"""Evaluation metrics, their confidence intervals, the error by size, detail and place, and recognised kinds."""
+"""Evaluation metrics, their confidence intervals, the error by size, detail and place, and
+recognised kinds.
+"""
 
 from itertools import pairwise
 
@@ -8,15 +10,33 @@ from nlos_calibration import load_rig
 
 from nlos_cam.dataset import procedural_images
 from nlos_cam.evaluate import TARGETS, advantage, judge, metrics, over_objects, per_object
-from nlos_cam.evaluate.metrics import detail_per_cm, error_by_zone, interval, meets, rank_correlation, surface_cm2
+from nlos_cam.evaluate.metrics import (
+    detail_per_cm,
+    error_by_zone,
+    interval,
+    meets,
+    rank_correlation,
+    surface_cm2,
+)
 from nlos_cam.evaluate.recognition import recognise, recognised
-from nlos_cam.objects import CATEGORIES, category_triangles, image_from_depth, object_box, orthographic_depth
+from nlos_cam.objects import (
+    CATEGORIES,
+    category_triangles,
+    image_from_depth,
+    object_box,
+    orthographic_depth,
+)
 from nlos_cam.objects.depth_map import depth_from_image
 from nlos_cam.objects.placement import Pose, place
 
 BOX = object_box(load_rig("paper-rig"))
 PITCH_CM = 25 / 64
-PERFECT = {"silhouette_iou": 1, "accuracy_mean_abs": 1, "accuracy_within_2_percent": 1, "foreground_rmse_mm": 0}
+PERFECT = {
+    "silhouette_iou": 1,
+    "accuracy_mean_abs": 1,
+    "accuracy_within_2_percent": 1,
+    "foreground_rmse_mm": 0,
+}
 EMPTY = np.zeros((1, 64, 64), np.float32)
 
 
@@ -36,22 +56,33 @@ def test_judge_scores_perfect_image_without_uncertainty(images: np.ndarray) -> N
 def test_foreground_rmse_is_that_of_the_depth_live_shows(images: np.ndarray, seed: int) -> None:
     guess = np.random.default_rng(seed).random(images.shape).astype(np.float32)
     guess[:, ::2] *= 0.15  # background, and depths beyond the box
-    apart_mm = 1000 * (depth_from_image(guess, BOX).astype(np.float64) - depth_from_image(images, BOX))
+    apart_mm = 1000 * (
+        depth_from_image(guess, BOX).astype(np.float64) - depth_from_image(images, BOX)
+    )
     expected = np.sqrt(np.nanmean(np.square(apart_mm), axis=(1, 2)))
-    np.testing.assert_allclose(per_object(guess, images, BOX)["foreground_rmse_mm"], expected, rtol=1e-4)
+    np.testing.assert_allclose(
+        per_object(guess, images, BOX)["foreground_rmse_mm"], expected, rtol=1e-4
+    )
 
 
-def test_interval_covers_the_truth_at_its_confidence_repeats_and_shrinks_with_root_of_object_count() -> None:
+def test_interval_covers_the_truth_at_its_confidence_repeats_and_shrinks_with_root_of_object_count() -> (
+    None
+):
     values = np.random.default_rng(1).random(50)
     found = interval(values)
     assert found.value == pytest.approx(values.mean())
     assert found.low < found.value < found.high
     assert interval(values) == found
-    for some, expected in (([np.nan] * 2, None), ([0.5], 0.5), ([np.nan, 2], 2)):  # without a value, left out
+    for some, expected in (
+        ([np.nan] * 2, None),
+        ([0.5], 0.5),
+        ([np.nan, 2], 2),
+    ):  # without a value, left out
         found = interval(np.array(some))
         assert found.value == found.low == found.high == expected
     values = np.random.default_rng(2).normal(size=1600)
-    wide, narrow = interval(values[:100]), interval(values)
+    wide = interval(values[:100])
+    narrow = interval(values)
     assert (wide.high - wide.low) / (narrow.high - narrow.low) == pytest.approx(4, rel=0.3)
     assert narrow.high - narrow.low == pytest.approx(2 * 1.96 / 40, rel=0.15)
     generator = np.random.default_rng(3)
@@ -62,22 +93,38 @@ def test_interval_covers_the_truth_at_its_confidence_repeats_and_shrinks_with_ro
 def test_categories_average_to_the_whole(images: np.ndarray) -> None:
     categories = ["cup"] * 2 + ["hat"] * 7 + ["car"] * 3
     values = per_object(0.9 * np.roll(images, 3, axis=2), images, BOX)
-    by, whole = metrics.per_category(values, categories), over_objects(values)
+    by = metrics.per_category(values, categories)
+    whole = over_objects(values)
     assert list(by) == ["cup", "hat", "car"]
     for name in TARGETS:
-        weighed = sum(categories.count(category) * by[category][name].value for category in by) / len(images)
+        weighed = sum(
+            categories.count(category) * by[category][name].value for category in by
+        ) / len(images)
         assert weighed == pytest.approx(whole[name].value)
 
 
-def test_advantage_is_positive_for_the_better_image_and_bar_is_met_from_its_better_side(images: np.ndarray) -> None:
-    good, bad = (per_object(share * np.roll(images, by, 2), images, BOX) for share, by in ((0.99, 1), (0.9, 9)))
+def test_advantage_is_positive_for_the_better_image_and_bar_is_met_from_its_better_side(
+    images: np.ndarray,
+) -> None:
+    good, bad = (
+        per_object(share * np.roll(images, by, 2), images, BOX)
+        for share, by in ((0.99, 1), (0.9, 9))
+    )
     for name in TARGETS:
-        gained, lost = advantage(good, bad)[name], advantage(bad, good)[name]
+        gained = advantage(good, bad)[name]
+        lost = advantage(bad, good)[name]
         assert gained.value > 0
         assert gained.value == pytest.approx(-lost.value)
         assert advantage(good, good)[name].value == 0
-    for name, values in {"silhouette_iou": (0.95, 0.85), "foreground_rmse_mm": (7.9, 8.1, np.nan)}.items():
-        assert [meets(name, interval(np.array([value]))) for value in values] == [True, False, False][: len(values)]
+    for name, values in {
+        "silhouette_iou": (0.95, 0.85),
+        "foreground_rmse_mm": (7.9, 8.1, np.nan),
+    }.items():
+        assert [meets(name, interval(np.array([value]))) for value in values] == [
+            True,
+            False,
+            False,
+        ][: len(values)]
 
 
 def plate(side: int, v: float = 0.6, start: int = 10) -> np.ndarray:
@@ -88,7 +135,8 @@ def plate(side: int, v: float = 0.6, start: int = 10) -> np.ndarray:
 
 @pytest.mark.parametrize("side", [4, 20, 64])
 def test_surface_and_detail_of_square_plate(side: int) -> None:
-    image, edge_cm = plate(side, start=0), side * PITCH_CM
+    image = plate(side, start=0)
+    edge_cm = side * PITCH_CM
     assert surface_cm2(image, BOX)[0] == pytest.approx(edge_cm**2)
     assert detail_per_cm(image, BOX)[0] == pytest.approx(4 / edge_cm)
     assert surface_cm2(EMPTY, BOX)[0] == 0
@@ -104,11 +152,15 @@ def test_detail_grows_with_holes_and_steps_not_slopes() -> None:
     sloping[:, 10:30, 10:30] += np.linspace(0, 0.3, 20, dtype=np.float32)
     base = detail_per_cm(whole, BOX)[0]
     assert detail_per_cm(holed, BOX)[0] > base
-    assert detail_per_cm(stepped, BOX)[0] == pytest.approx(base + 20 * PITCH_CM / (20 * PITCH_CM) ** 2)
+    assert detail_per_cm(stepped, BOX)[0] == pytest.approx(
+        base + 20 * PITCH_CM / (20 * PITCH_CM) ** 2
+    )
     assert detail_per_cm(sloping, BOX)[0] == pytest.approx(base)
 
 
-def test_curve_bins_every_object_once_and_follows_error_and_rank_correlation_is_of_order_alone() -> None:
+def test_curve_bins_every_object_once_and_follows_error_and_rank_correlation_is_of_order_alone() -> (
+    None
+):
     like = np.random.default_rng(0).random(54)
     bins = metrics.curve(like, 10 * like)
     assert sum(one.objects for one in bins) == 54
@@ -120,17 +172,30 @@ def test_curve_bins_every_object_once_and_follows_error_and_rank_correlation_is_
     with_gaps = np.where(like > 0.9, np.nan, like)
     pairs = (like, np.exp(9 * like)), (like, -(like**3)), (coarse, coarse**3), (like, with_gaps)
     assert [rank_correlation(*pair).value for pair in pairs] == pytest.approx([1, -1, 1, 1])
-    assert rank_correlation(coarse[order], like[order]).value == pytest.approx(rank_correlation(coarse, like).value)
-    assert rank_correlation(like, np.ones(54)).value is rank_correlation(like[:2], like[:2]).value is None
+    assert rank_correlation(coarse[order], like[order]).value == pytest.approx(
+        rank_correlation(coarse, like).value
+    )
+    assert (
+        rank_correlation(like, np.ones(54)).value
+        is rank_correlation(like[:2], like[:2]).value
+        is None
+    )
     none = rank_correlation(like, np.random.default_rng(2).random(54))
     assert none.low < 0 < none.high
 
 
 @pytest.mark.parametrize(
     ("at", "zone"),
-    [((20, 20), "core"), ((10, 20), "rim inside"), ((8, 20), "rim outside"), ((50, 50), "far background")],
+    [
+        ((20, 20), "core"),
+        ((10, 20), "rim inside"),
+        ((8, 20), "rim outside"),
+        ((50, 50), "far background"),
+    ],
 )
-def test_zones_locate_an_error_and_share_none_of_a_perfect_image(at: tuple[int, int], zone: str) -> None:
+def test_zones_locate_an_error_and_share_none_of_a_perfect_image(
+    at: tuple[int, int], zone: str
+) -> None:
     truth = plate(20)
     image = truth.copy()
     image[0][at] += 0.2
@@ -162,8 +227,14 @@ def _images(pose: Pose, seed: int) -> np.ndarray:
 
 def test_kinds_are_recognised_in_any_place_and_size_but_not_as_another_or_without_surface() -> None:
     kinds = list(CATEGORIES)
-    for pose in (Pose(size_m=0.2), Pose(size_m=0.12, x_m=0.05, y_m=-0.04), Pose(turn_z_rad=0.3, tilt_y_rad=0.2)):
+    for pose in (
+        Pose(size_m=0.2),
+        Pose(size_m=0.12, x_m=0.05, y_m=-0.04),
+        Pose(turn_z_rad=0.3, tilt_y_rad=0.2),
+    ):
         assert recognised(_images(pose, 1000), kinds, BOX).mean() > 0.8
-    images = np.stack([np.zeros((64, 64), np.float32), _images(Pose(), 7)[list(CATEGORIES).index("cup")]])
+    images = np.stack(
+        [np.zeros((64, 64), np.float32), _images(Pose(), 7)[list(CATEGORIES).index("cup")]]
+    )
     assert recognise(images, BOX) == ["", "cup"]
     np.testing.assert_array_equal(recognised(images, ["cup", "rocket"], BOX), [0, 0])

@@ -1,4 +1,6 @@
-"""Evaluation folder: JSON whose names scripts depend on, a table of objects, pictures, and the report."""
+"""Evaluation folder: JSON whose names scripts depend on, a table of objects, pictures, and the
+report.
+"""
 
 import csv
 import json
@@ -16,12 +18,25 @@ from page_reader import read_page
 from nlos_cam.dataset import procedural_images
 from nlos_cam.evaluate import LABELS, report
 from nlos_cam.evaluate.metrics import TARGETS, Interval, Predictions
-from nlos_cam.evaluate.report import Evaluation, Unseen, as_figures, document, format_interval, write_report
+from nlos_cam.evaluate.report import (
+    Evaluation,
+    Unseen,
+    as_figures,
+    document,
+    format_interval,
+    write_report,
+)
 from nlos_cam.objects import object_box, object_depth
 from nlos_cam.report import figure_of, png
 
 BOX = object_box(load_rig("paper-rig"))
-FACTS = {"what": "Some objects", "weights": "mine", "rig": "paper-rig", "runtime": "none", "input": "raw maps"}
+FACTS = {
+    "what": "Some objects",
+    "weights": "mine",
+    "rig": "paper-rig",
+    "runtime": "none",
+    "input": "raw maps",
+}
 FACTS |= {"training_objects": 99, "notes": ["they are few"]}
 PICTURES = {"sheet.png", "gallery.png", "categories.png", "surface.png"}
 FILES = {"report.html", "report.md", "figures.json", "objects.csv", *PICTURES}
@@ -31,8 +46,12 @@ FILES = {"report.html", "report.md", "figures.json", "objects.csv", *PICTURES}
 def _judgement(count: int = 7, *, guesses: bool = True) -> Evaluation:
     truth = procedural_images(0, count, BOX).astype(np.float32)
     image = (0.95 * np.roll(truth, 2, axis=2)).astype(np.float32)
-    others = {"all_background": np.zeros_like(truth), "nearest_neighbour": np.roll(truth, 1, axis=0)}
-    categories, names = [f"kind {k % 3}" for k in range(count)], [f"object {k}" for k in range(count)]
+    others = {
+        "all_background": np.zeros_like(truth),
+        "nearest_neighbour": np.roll(truth, 1, axis=0),
+    }
+    categories = [f"kind {k % 3}" for k in range(count)]
+    names = [f"object {k}" for k in range(count)]
     return Evaluation(names, categories, truth, image, others if guesses else {}, BOX, FACTS)
 
 
@@ -59,7 +78,9 @@ def undrawn(drawn: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Pictures of one inch, for tests of the text beside them."""
     small = (drawn / "sheet.png").read_bytes()
     for name in ("sheet", "gallery", "categories", "against_surface"):
-        monkeypatch.setattr(report.pictures, f"draw_{name}", lambda path, *_: path.write_bytes(small))
+        monkeypatch.setattr(
+            report.pictures, f"draw_{name}", lambda path, *_: path.write_bytes(small)
+        )
 
 
 def _rows(folder: Path) -> list[dict[str, str]]:
@@ -76,7 +97,9 @@ def test_figures_have_names_that_scripts_depend_on() -> None:
     assert figures["objects"] == 7
     assert figures["baselines"]["all_background"]["foreground_rmse_mm"]["value"] is None
     assert figures["advantage_over_nearest_neighbour"]["silhouette_iou"]["value"] > 0
-    assert sum(zone["share_of_error"] for zone in figures["where_the_error_is"].values()) == pytest.approx(1)
+    assert sum(
+        zone["share_of_error"] for zone in figures["where_the_error_is"].values()
+    ) == pytest.approx(1)
 
 
 @pytest.mark.usefixtures("undrawn")
@@ -85,9 +108,16 @@ def test_predicted_quality_is_reported_by_set_and_share_with_a_picture(tmp_path:
     iou = made.ours["silhouette_iou"]
     predicted = Predictions(iou - 0.1, iou, iou + 0.1, iou, iou > np.median(iou))
     unseen = Unseen(made.names, made.truth, made.image, predicted)
-    mixed = replace(made, categories=["cup", *made.categories[1:]], predicted=predicted, unseen=unseen)
+    mixed = replace(
+        made, categories=["cup", *made.categories[1:]], predicted=predicted, unseen=unseen
+    )
     figures = _figures(mixed)
-    assert set(figures["quality"]) == {"objects", "the 18 kinds", "generic shapes", "kinds never seen"}
+    assert set(figures["quality"]) == {
+        "objects",
+        "the 18 kinds",
+        "generic shapes",
+        "kinds never seen",
+    }
     assert figures["quality"]["objects"]["correlation"] == pytest.approx(1)
     write_report(tmp_path / "out", mixed, figures)
     text = (tmp_path / "out" / "report.md").read_text(encoding="utf-8")
@@ -98,10 +128,18 @@ def test_predicted_quality_is_reported_by_set_and_share_with_a_picture(tmp_path:
 
 def test_report_contains_metrics_pictures_notes_and_the_bars_that_are_met(drawn: Path) -> None:
     made = document(_usual(), drawn)
-    page, text = read_page(made.as_html()), made.as_markdown()
+    page = read_page(made.as_html())
+    text = made.as_markdown()
     assert len(page.pictures) == 4
     assert all(f"({name})" in text for name in PICTURES)
-    for words in (*LABELS.values(), "0 of 4 targets met", "nearest neighbour", "99", "they are few", "nlos-cam live"):
+    for words in (
+        *LABELS.values(),
+        "0 of 4 targets met",
+        "nearest neighbour",
+        "99",
+        "they are few",
+        "nlos-cam live",
+    ):
         assert words in page.text
         assert words in text
     assert "nearest" not in document(_usual(guesses=False), drawn).as_markdown()
@@ -113,7 +151,8 @@ def test_report_contains_metrics_pictures_notes_and_the_bars_that_are_met(drawn:
 
 @pytest.mark.parametrize("count", [1, 7])
 def test_folder_is_complete_for_any_number_of_objects(tmp_path: Path, count: int) -> None:
-    judgement, out = _judgement(count), tmp_path / "out"
+    judgement = _judgement(count)
+    out = tmp_path / "out"
     figures = _figures(judgement)
     write_report(out, judgement, figures)
     assert {path.name for path in out.iterdir()} == FILES
@@ -127,7 +166,9 @@ def test_figures_separate_categories_left_out_of_training(drawn: Path) -> None:
     whole = _judgement()
     assert _usual()["shown_and_left_out"] is None
     blind = np.array([kind == "kind 1" for kind in whole.categories])[:, None, None]
-    guessed = _figures(replace(whole, image=np.where(blind, 0, whole.image), left_out=["kind 1", "kind 9"]))
+    guessed = _figures(
+        replace(whole, image=np.where(blind, 0, whole.image), left_out=["kind 1", "kind 9"])
+    )
     by = guessed["shown_and_left_out"]
     assert by["left out"]["silhouette_iou"]["value"] == 0
     assert by["shown"]["silhouette_iou"]["value"] > guessed["silhouette_iou"]["value"] > 0
@@ -139,7 +180,9 @@ def test_second_set_and_recognition_have_their_figures(tmp_path: Path) -> None:
     whole = _judgement(3)
     assert _usual()["unseen"] is _usual()["recognised"] is None
     kinds = replace(whole, categories=[object_depth(seed, BOX)[0] for seed in range(3)])
-    both = replace(kinds, unseen=Unseen(["a", "b"], whole.truth[:2], np.zeros_like(whole.truth[:2])))
+    both = replace(
+        kinds, unseen=Unseen(["a", "b"], whole.truth[:2], np.zeros_like(whole.truth[:2]))
+    )
     figures = _figures(both)
     assert figures["unseen"]["silhouette_iou"]["value"] == 0
     assert figures["unseen"]["objects"] == 2
@@ -152,7 +195,9 @@ def test_second_set_and_recognition_have_their_figures(tmp_path: Path) -> None:
 
 
 @pytest.mark.usefixtures("undrawn")
-def test_interrupted_write_leaves_earlier_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_interrupted_write_leaves_earlier_folder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     (out := tmp_path / "out").mkdir()
     (out / "report.md").write_text("earlier")
     monkeypatch.setattr(report.pictures, "draw_gallery", Mock(side_effect=KeyboardInterrupt))
@@ -179,5 +224,7 @@ def test_object_without_value_has_an_empty_field(tmp_path: Path) -> None:
         ((0.0, 0.0, 0.0), "0.000 (0.000 to 0.000)"),
     ],
 )
-def test_interval_has_two_digits_of_its_half_width(values: tuple[float, float, float], text: str) -> None:
+def test_interval_has_two_digits_of_its_half_width(
+    values: tuple[float, float, float], text: str
+) -> None:
     assert format_interval(Interval(*values)) == text

@@ -7,8 +7,11 @@ from nlos_models.doubt_network import CalibratedDoubt, DoubtNetwork
 
 
 def test_fake_doubter_answers_in_the_shapes_of_a_real_network() -> None:
-    maps, image = np.full((1, 64, 80), 0.3, np.float32), np.zeros((1, 64, 64), np.float32)
-    real = CalibratedDoubt(DoubtNetwork(), (1.0, 1.0), 1.0).eval()(*(torch.from_numpy(a) for a in (maps, maps, image)))
+    maps = np.full((1, 64, 80), 0.3, np.float32)
+    image = np.zeros((1, 64, 64), np.float32)
+    real = CalibratedDoubt(DoubtNetwork(), (1.0, 1.0), 1.0).eval()(
+        *(torch.from_numpy(a) for a in (maps, maps, image))
+    )
     said = FakeDoubter(lambda *_: (0.25, 0.75))(maps, maps, image)
     assert [part.shape for part in said] == [tuple(part.shape) for part in real]
     assert (float(said.p_empty[0]), float(said.p_out_of_distribution[0])) == (0.25, 0.75)

@@ -12,9 +12,12 @@ PIECES = [range(2), range(2, 4), range(4, 5)]
 
 
 def test_fake_samples_have_names_and_types_of_real_ones() -> None:
-    real, fake = make_samples(PLAN, range(1)), samples_of(range(1))
+    real = make_samples(PLAN, range(1))
+    fake = samples_of(range(1))
     types = {name: values.dtype for name, values in fake.items()}
-    assert {name: values.dtype for name, values in real.items()} == types | {"scene": np.dtype(np.float64)}
+    assert {name: values.dtype for name, values in real.items()} == types | {
+        "scene": np.dtype(np.float64)
+    }
 
 
 def test_fake_farm_makes_every_piece_once_in_its_order() -> None:

@@ -1,4 +1,6 @@
-"""Stand-ins for networks have the shapes and parts of the real ones, and small maps show the small images."""
+"""Stand-ins for networks have the shapes and parts of the real ones, and small maps show the small
+images.
+"""
 
 from pathlib import Path
 
@@ -18,7 +20,10 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 
 def _shapes(vae: nn.Module, compressor: nn.Module) -> list[torch.Size]:
     rebuilt, mean, log_variance = vae.eval()(torch.rand(2, 1, 64, 64), torch.zeros(2, 256))
-    return [tensor.shape for tensor in (rebuilt, mean, log_variance, compressor.eval()(torch.rand(2, 4, 100, 100)))]
+    return [
+        tensor.shape
+        for tensor in (rebuilt, mean, log_variance, compressor.eval()(torch.rand(2, 4, 100, 100)))
+    ]
 
 
 @torch.no_grad()
@@ -29,7 +34,9 @@ def test_small_networks_have_shapes_and_parts_of_real_ones() -> None:
         assert isinstance(compressor.features, nn.Module)
         assert (dropout.p, linear.out_features) == (0.25, 256)
     for vae in (small.SmallVae(), ResVae()):
-        assert any(isinstance(part, nn.BatchNorm1d | nn.BatchNorm2d) for part in vae.decoder.modules())
+        assert any(
+            isinstance(part, nn.BatchNorm1d | nn.BatchNorm2d) for part in vae.decoder.modules()
+        )
         assert vae.decoder.output.weight.requires_grad
 
 
@@ -42,12 +49,16 @@ def test_small_maps_show_their_images_and_nothing_else(seed: int) -> None:
 
 
 @pytest.mark.parametrize("steps", ["two", "one"])
-def test_untrained_weights_load_and_differ_by_seed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, steps: str) -> None:
+def test_untrained_weights_load_and_differ_by_seed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, steps: str
+) -> None:
     rig = load_rig("paper-rig")
     watched = watched_weights(tmp_path / "watched")
     for seed in (0, 1):
         untrained_doubt(tmp_path / f"doubt{seed}", watched, seed)
-        small.untrained_weights(tmp_path / str(seed), rig=rig, seed=seed, steps=steps, maps="difference maps")
+        small.untrained_weights(
+            tmp_path / str(seed), rig=rig, seed=seed, steps=steps, maps="difference maps"
+        )
     small.use_small_networks(monkeypatch, checkpoint)
     (one, record), (other, _) = (checkpoint.load_pipeline(tmp_path / name) for name in "01")
     assert (record.rig_checksum, record.input) == (rig.checksum, "difference maps")
@@ -64,7 +75,9 @@ def test_untrained_weights_load_and_differ_by_seed(tmp_path: Path, monkeypatch: 
 
 @pytest.mark.parametrize("channels", [(), (3,)])
 def test_hard_maps_have_the_named_extremes(channels: tuple[int, ...]) -> None:
-    depth, intensity = zip(*(small.hard_maps(name, channels) for name in small.HARD_MAPS), strict=True)
+    depth, intensity = zip(
+        *(small.hard_maps(name, channels) for name in small.HARD_MAPS), strict=True
+    )
     assert [float(d.isnan().float().mean()) for d in depth] == [0, 0, 0, 0.5, 1]
     assert [float(i.max()) for i in intensity] == [10, 0, 255, 10, 10]
     assert {i.shape for i in intensity} == {(1, *channels, 64, 80)}
@@ -76,5 +89,6 @@ def test_small_doubt_set_has_all_kinds_and_varying_errors() -> None:
     assert not (some.nothing & some.outside).any()
     assert not some.truth[some.nothing].any()
     off = np.abs(some.made.astype(float) - some.truth)
-    dark, bright = (off[(some.truth > 0) & (some.truth.astype(float) < 0.5)], off[some.truth.astype(float) > 0.5])
+    dark = off[(some.truth > 0) & (some.truth.astype(float) < 0.5)]
+    bright = off[some.truth.astype(float) > 0.5]
     assert dark.min() > 5 * bright.max() > 0

@@ -1,4 +1,6 @@
-"""Description of files and folders: every kind is known, whole or damaged, and no content ends in another error."""
+"""Description of files and folders: every kind is known, whole or damaged, and no content ends in
+another error.
+"""
 
 import hashlib
 import json
@@ -24,9 +26,19 @@ from nlos_cam.recording import BagReader, ExportOptions, export_recording
 from nlos_cam.report import Document
 
 RIG = load_rig("paper-rig")
-FRAMES = {"frame_number": [3, 4], "timestamp_s": [0.0, 0.1], "rig_name": "paper-rig", "rig_checksum": "abc"}
+FRAMES = {
+    "frame_number": [3, 4],
+    "timestamp_s": [0.0, 0.1],
+    "rig_name": "paper-rig",
+    "rig_checksum": "abc",
+}
 ARRAYS = {
-    "result of a replay": {**FRAMES, "depth_m": [1.0], "verdict": ["object seen", ""], "origin_m": [0.0, 0.0]},
+    "result of a replay": {
+        **FRAMES,
+        "depth_m": [1.0],
+        "verdict": ["object seen", ""],
+        "origin_m": [0.0, 0.0],
+    },
     "difference maps of a replay": {**FRAMES, "depth_m": [1.0], "reference_sha256": "abc"},
     "rendering": {"object_depth_m": [np.nan, 1.0], "margin": [1.0], "radiometry": "paper"},
     "exported stream": {**FRAMES, "pixels": [[1]], "encoding": "z16"},
@@ -36,7 +48,9 @@ ARRAYS = {
 
 
 @pytest.fixture(scope="module")
-def files(tmp_path_factory: pytest.TempPathFactory, noise_bag: Path, measured: Callable) -> dict[str, Path]:
+def files(
+    tmp_path_factory: pytest.TempPathFactory, noise_bag: Path, measured: Callable
+) -> dict[str, Path]:
     """A file or folder of every kind, by its kind."""
     folder = tmp_path_factory.mktemp("kinds")
     made = {kind: folder / f"{k}.npz" for k, kind in enumerate(ARRAYS)}
@@ -44,15 +58,23 @@ def files(tmp_path_factory: pytest.TempPathFactory, noise_bag: Path, measured: C
         np.savez(path, **ARRAYS[kind])  # pyright: ignore[reportArgumentType]
     (folder / "data").mkdir()
     made["dataset shard"] = shard_path(folder / "data", 40)
-    store(made["dataset shard"], samples_of(range(40, 43)), DatasetPlan(RIG, 40).provenance, "nlos-cam dataset build")
+    store(
+        made["dataset shard"],
+        samples_of(range(40, 43)),
+        DatasetPlan(RIG, 40).provenance,
+        "nlos-cam dataset build",
+    )
     made["dataset"] = folder / "data"
     made["wall record"] = folder / "wall.toml"
     wall = measured()
-    write_record(WallFiles.beside(made["wall record"], overwrite=False), wall.record, wall.reference)
+    write_record(
+        WallFiles.beside(made["wall record"], overwrite=False), wall.record, wall.reference
+    )
     made["reference of a bare wall"] = folder / "wall.npz"
     made["recording of a lidar"] = noise_bag
     made["export of a recording"] = folder / "exported"
-    bag, options = BagReader(noise_bag), ExportOptions(every=10)
+    bag = BagReader(noise_bag)
+    options = ExportOptions(every=10)
     export_recording(bag, made["export of a recording"], options, stop=Event())
     made["report"] = folder / "report.html"
     made["report"].write_text(Document("a", "b", []).as_html())
@@ -73,8 +95,22 @@ def files(tmp_path_factory: pytest.TempPathFactory, noise_bag: Path, measured: C
 
 KINDS = [
     *ARRAYS,
-    *("dataset shard", "dataset", "wall record", "reference of a bare wall", "recording of a lidar", "report"),
-    *("export of a recording", "scene of the simulated camera", "weights", "evaluation", "trade-off", "training run"),
+    *(
+        "dataset shard",
+        "dataset",
+        "wall record",
+        "reference of a bare wall",
+        "recording of a lidar",
+        "report",
+    ),
+    *(
+        "export of a recording",
+        "scene of the simulated camera",
+        "weights",
+        "evaluation",
+        "trade-off",
+        "training run",
+    ),
     *("figures of an evaluation", "table of a trade-off"),
 ]
 
@@ -88,7 +124,9 @@ def test_every_kind_is_known_and_whole(files: dict[str, Path], kind: str, verify
     assert all(line.split(" ")[0] in {"nlos-cam", "open"} for line in found.next)
 
 
-def test_facts_are_those_of_the_content_and_a_view_names_its_program(files: dict[str, Path], tmp_path: Path) -> None:
+def test_facts_are_those_of_the_content_and_a_view_names_its_program(
+    files: dict[str, Path], tmp_path: Path
+) -> None:
     (path := tmp_path / "view.rrd").write_bytes(b"RRF2....")
     assert describe(path).next[-1] == f"rerun {path}"
     bag = describe(files["recording of a lidar"])
@@ -102,12 +140,16 @@ def test_facts_are_those_of_the_content_and_a_view_names_its_program(files: dict
     assert describe(files["wall record"]).facts["verdict"].startswith("good")
 
 
-def test_pipes_and_arrays_that_would_fill_memory_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_pipes_and_arrays_that_would_fill_memory_are_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     os.mkfifo(tmp_path / "wall.toml")
     with pytest.raises(RecordingError, match="neither a file"):
         describe(tmp_path / "wall.toml")
     monkeypatch.setattr("nlos_cam.info.files.MAX_ARRAY_BYTES", 1000)
-    np.savez_compressed(tmp_path / "bomb.npz", vertices_m=np.zeros((1000, 3)), faces=np.zeros((1, 3)))
+    np.savez_compressed(
+        tmp_path / "bomb.npz", vertices_m=np.zeros((1000, 3)), faces=np.zeros((1, 3))
+    )
     assert "bomb.npz holds more" in describe(tmp_path / "bomb.npz").problem
 
 
@@ -115,19 +157,24 @@ DAMAGES: dict[str, Callable[[bytes], bytes]] = {
     "cut": lambda content: content[: len(content) // 2],
     "empty": lambda _: b"",
     "noise": lambda content: np.random.default_rng(0).bytes(min(len(content), 10_000)),
-    "flipped": lambda content: bytes(byte ^ (at % 97 == 0) for at, byte in enumerate(content[:200_000])),
+    "flipped": lambda content: bytes(
+        byte ^ (at % 97 == 0) for at, byte in enumerate(content[:200_000])
+    ),
 }
 
 
 @pytest.mark.parametrize("damage", DAMAGES)
 @pytest.mark.parametrize("kind", KINDS)
-def test_damaged_file_has_one_line_that_says_so(files: dict[str, Path], tmp_path: Path, kind: str, damage: str) -> None:
+def test_damaged_file_has_one_line_that_says_so(
+    files: dict[str, Path], tmp_path: Path, kind: str, damage: str
+) -> None:
     if files[kind].is_dir():
         marks = {"dataset": "shard-*.h5", "weights": "checkpoint.json", "training run": "log.csv"}
         source = next(files[kind].glob(marks.get(kind, "*.json")))
         place = tmp_path
     else:
-        source, place = files[kind], tmp_path / files[kind].name
+        source = files[kind]
+        place = tmp_path / files[kind].name
     (tmp_path / source.name).write_bytes(DAMAGES[damage](source.read_bytes()))
     try:
         found = describe(place, verify=True)
@@ -139,7 +186,9 @@ def test_damaged_file_has_one_line_that_says_so(files: dict[str, Path], tmp_path
         assert str(place) in found.problem or source.name in found.problem
 
 
-def test_weights_unlike_checksums_and_lone_wall_records_are_damaged(files: dict[str, Path], tmp_path: Path) -> None:
+def test_weights_unlike_checksums_and_lone_wall_records_are_damaged(
+    files: dict[str, Path], tmp_path: Path
+) -> None:
     (tmp_path / "wall.toml").write_bytes(files["wall record"].read_bytes())
     assert "wall.npz is missing" in describe(tmp_path / "wall.toml").problem
     (tmp_path / "checkpoint.json").write_bytes((shipped_folder() / "checkpoint.json").read_bytes())
@@ -152,7 +201,9 @@ def test_weights_unlike_checksums_and_lone_wall_records_are_damaged(files: dict[
     assert "a.safetensors is missing" in describe(tmp_path).problem
 
 
-@pytest.mark.parametrize("name", ["thesis.txt", "a.npy", "folder", "notes.toml", "list.json", "page.html", "view.rrd"])
+@pytest.mark.parametrize(
+    "name", ["thesis.txt", "a.npy", "folder", "notes.toml", "list.json", "page.html", "view.rrd"]
+)
 def test_unknown_file_names_the_known_kinds(tmp_path: Path, name: str) -> None:
     path = tmp_path / name
     path.mkdir() if name == "folder" else path.write_text("[]" if name == "list.json" else "")
@@ -175,7 +226,9 @@ def test_command_prints_json_without_importing_torch(files: dict[str, Path]) -> 
         "print(code, *{'torch', 'matplotlib', 'h5py'} & {*sys.modules})"
     )
     run = [sys.executable, "-c", program, "info", str(files["recording of a lidar"]), "--json"]
-    answer, ended = subprocess.run(run, capture_output=True, text=True, check=True).stdout.splitlines()
+    answer, ended = subprocess.run(
+        run, capture_output=True, text=True, check=True
+    ).stdout.splitlines()
     assert ended == "0"
     found = json.loads(answer)
     size = files["recording of a lidar"].stat().st_size

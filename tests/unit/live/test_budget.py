@@ -13,20 +13,42 @@ from nlos_models import shipped_folder
 from small_frames import FrameCamera, sheet_network
 
 from nlos_cam.errors import BudgetError, RecordingError
-from nlos_cam.live import SHIPPED, BudgetChoice, available_settings, budget, choose_within_budget, pipeline_timer
-from nlos_cam.live.budget import HANDOVER_MS, PERIOD_MS, Machine, Setting, Timing, choose, keeping_pace, load_tradeoff
+from nlos_cam.live import (
+    SHIPPED,
+    BudgetChoice,
+    available_settings,
+    budget,
+    choose_within_budget,
+    pipeline_timer,
+)
+from nlos_cam.live.budget import (
+    HANDOVER_MS,
+    PERIOD_MS,
+    Machine,
+    Setting,
+    Timing,
+    choose,
+    keeping_pace,
+    load_tradeoff,
+)
 from nlos_cam.reconstruct import CalibratedRig, Pipeline
 
 AS_MEASURED = Machine(slower=1.0, rest_ms=1.0)
 
 
-def setting(rmse_mm: float | None, ms: float, frames: int = 1, threads: int = 1, **others: Any) -> Setting:
+def setting(
+    rmse_mm: float | None, ms: float, frames: int = 1, threads: int = 1, **others: Any
+) -> Setting:
     fixed: dict[str, Any] = {"name": f"{rmse_mm} mm, {ms} ms", "weights": SHIPPED, "runtime": "any"}
     times = {"milliseconds": ms, "milliseconds_p90": ms, "threads": threads, "frames": frames}
-    return Setting.model_validate({**fixed, **times, "foreground_rmse_mm": {"value": rmse_mm}, **others})
+    return Setting.model_validate(
+        {**fixed, **times, "foreground_rmse_mm": {"value": rmse_mm}, **others}
+    )
 
 
-rmses, times, counts = st.none() | st.floats(1.0, 99.0), st.floats(0.5, 60.0), (st.integers(1, 16), st.integers(1, 4))
+rmses = st.none() | st.floats(1.0, 99.0)
+times = st.floats(0.5, 60.0)
+counts = (st.integers(1, 16), st.integers(1, 4))
 some_settings = st.lists(st.builds(setting, rmses, times, *counts), min_size=1, max_size=12)
 
 
@@ -52,30 +74,40 @@ def test_choose_is_no_less_accurate_with_a_larger_budget(
     least_ms = min(map(AS_MEASURED.expected_ms, keeping_pace(settings, AS_MEASURED)))
     assert choose(settings, AS_MEASURED, least_ms) in settings
     if budget_ms >= least_ms:
-        tight, wide = (choose(settings, AS_MEASURED, limit) for limit in (budget_ms, more * budget_ms))
+        tight, wide = (
+            choose(settings, AS_MEASURED, limit) for limit in (budget_ms, more * budget_ms)
+        )
         assert wide.rmse_mm <= tight.rmse_mm + 0.01
 
 
 def test_choose_weighs_pace_speed_of_the_machine_and_threads() -> None:
-    quick, slow = setting(20.0, 4.0), setting(10.0, budget.BUSY_SHARE * PERIOD_MS)
+    quick = setting(20.0, 4.0)
+    slow = setting(10.0, budget.BUSY_SHARE * PERIOD_MS)
     assert choose([slow, quick], AS_MEASURED, 1e6) == quick
     assert choose([slow, setting(20.0, 99.0)], AS_MEASURED, 1e6) == slow
     settings = [setting(10.0, 12.0), setting(20.0, 2.0)]
     assert choose(settings, AS_MEASURED, 20.0).rmse_mm == 10.0
     assert choose(settings, Machine(slower=3.0, rest_ms=1.0), 20.0).rmse_mm == 20.0
-    one, two = setting(20.0, 6.0), setting(20.0, 3.0, threads=2)
+    one = setting(20.0, 6.0)
+    two = setting(20.0, 3.0, threads=2)
     assert choose([two, one], AS_MEASURED, 20.0) == one
     assert choose([two, one], AS_MEASURED, 8.0) == two
-    assert AS_MEASURED.expected_ms(setting(1.0, 5.0, frames=3)) == pytest.approx(HANDOVER_MS + 1.0 + 5.0 + PERIOD_MS)
+    assert AS_MEASURED.expected_ms(setting(1.0, 5.0, frames=3)) == pytest.approx(
+        HANDOVER_MS + 1.0 + 5.0 + PERIOD_MS
+    )
 
 
 def test_shipped_weights_have_a_tradeoff_table() -> None:
     settings = load_tradeoff(shipped_folder())
     assert {one.frames for one in settings} > {1}
-    assert choose(settings, Machine(1.0, 2.0), 50.0).rmse_mm <= 1.2 * min(one.rmse_mm for one in settings)
+    assert choose(settings, Machine(1.0, 2.0), 50.0).rmse_mm <= 1.2 * min(
+        one.rmse_mm for one in settings
+    )
 
 
-@pytest.mark.parametrize("content", [None, b"", b"[]", b'{"settings": []}', b'{"settings": [{"name": "x"}]}', b"\xff"])
+@pytest.mark.parametrize(
+    "content", [None, b"", b"[]", b'{"settings": []}', b'{"settings": [{"name": "x"}]}', b"\xff"]
+)
 def test_load_tradeoff_refuses_other_files(tmp_path: Path, content: bytes | None) -> None:
     if content is not None:
         (tmp_path / "tradeoff.json").write_bytes(content)
@@ -86,17 +118,24 @@ def test_load_tradeoff_refuses_other_files(tmp_path: Path, content: bytes | None
     assert load_tradeoff(tmp_path) == load_tradeoff(file) == [setting(3.0, 2.0)]
 
 
-QUICK, GOOD = setting(20.0, 2.0, runtime="quick"), setting(15.0, 8.0, runtime="good")
+QUICK = setting(20.0, 2.0, runtime="quick")
+GOOD = setting(15.0, 8.0, runtime="good")
 MEAN = setting(12.0, 2.0, frames=4, runtime="mean")
 ALL = [GOOD, QUICK, MEAN]
 
 
-def chosen(budget_ms: float, slower: float = 1.0, **late_ms: float) -> tuple[BudgetChoice, list[Setting]]:
-    """Choice on a machine `slower` than the table's and, by runtime, later than it first was; and what was loaded."""
+def chosen(
+    budget_ms: float, slower: float = 1.0, **late_ms: float
+) -> tuple[BudgetChoice, list[Setting]]:
+    """Choice on a machine `slower` than the table's and, by runtime, later than it first was; and
+    what was loaded.
+    """
     loaded: list[Any] = []
 
     def measure(made: Any) -> Timing:
-        return Timing(slower * made.milliseconds_p90 + late_ms.get(made.runtime, 0.0) * (len(loaded) > 1), 1.0)
+        return Timing(
+            slower * made.milliseconds_p90 + late_ms.get(made.runtime, 0.0) * (len(loaded) > 1), 1.0
+        )
 
     building: Any = lambda network, _: network, lambda wanted: loaded.append(wanted) or wanted
     _, choice = choose_within_budget(budget_ms, ALL, *building, measure)  # type: ignore[arg-type]
@@ -115,7 +154,10 @@ def test_within_budget_takes_the_most_accurate_that_fits_as_measured_and_names_i
         assert (loaded, choice.setting, choice.best) == (loads, loads[-1], MEAN)
         assert choice.expected_ms <= budget_ms
         assert all(text in choice.describe() for text in texts)
-    for budget_ms, machine, least_ms in ((5.0, {"slower": 4.0}, 9), (15.0, {"good": 99.0, "quick": 10.0}, 13)):
+    for budget_ms, machine, least_ms in (
+        (5.0, {"slower": 4.0}, 9),
+        (15.0, {"good": 99.0, "quick": 10.0}, 13),
+    ):
         with pytest.raises(BudgetError, match=rf"{re.escape(str(HANDOVER_MS + least_ms))} ms"):
             chosen(budget_ms, **machine)
 
@@ -141,8 +183,11 @@ def test_available_settings_leaves_out_what_cannot_run(monkeypatch: pytest.Monke
 
 
 def test_timer_measures_late_calls_without_the_first() -> None:
-    ticks, shapes = count_up(0.004, 0.004), list[tuple[int, ...]]()
-    pipeline = Pipeline(CalibratedRig(RIG), lambda depth_m, _: shapes.append(depth_m.shape) or sheet_network())
+    ticks = count_up(0.004, 0.004)
+    shapes = list[tuple[int, ...]]()
+    pipeline = Pipeline(
+        CalibratedRig(RIG), lambda depth_m, _: shapes.append(depth_m.shape) or sheet_network()
+    )
     timed = pipeline_timer(FrameCamera(0), lambda: next(ticks))(pipeline)
     assert shapes == [(1, 64, 80)] * (budget.CALLS + 1)
     assert (timed.network_ms, timed.rest_ms) == pytest.approx((4.0, 8.0))

@@ -53,7 +53,10 @@ def test_status_says_honestly_what_the_run_waits_for(tmp_path: Path) -> None:
     assert "first frame" in control.status()["message"]
     control.add(moment(0))
     control.set_state("stalled", "no frame for 3 s")
-    assert (control.status()["state"], control.status()["message"]) == ("stalled", "no frame for 3 s")
+    assert (control.status()["state"], control.status()["message"]) == (
+        "stalled",
+        "no frame for 3 s",
+    )
     control.add(moment(1))
     assert control.status()["state"] == "running"
     control.end()
@@ -87,7 +90,8 @@ def test_average_and_setting_change_the_pipeline(control: RunControl) -> None:
     control.run("average", {"frames": 4})
     assert pipeline.average == control.status()["control"]["average"] == 4
     other: Any = object()
-    control.settings, control.load_setting = [("fast", "fast: 3 ms, error 22 mm")], lambda _: (other, 1)
+    control.settings = [("fast", "fast: 3 ms, error 22 mm")]
+    control.load_setting = lambda _: (other, 1)
     assert "22 mm" in control.run("setting", {"name": "fast"})
     assert pipeline.network is other
     assert pipeline.average == 1
@@ -123,7 +127,8 @@ def test_commands_before_the_first_frame_say_to_wait(tmp_path: Path) -> None:
 
 
 def test_one_command_runs_at_a_time(control: RunControl) -> None:
-    entered, leave = Event(), Event()
+    entered = Event()
+    leave = Event()
     control.thread_start = lambda: entered.set() or leave.wait(60.0)
     thread = threading.Thread(target=control.run, args=("pause", {}))
     thread.start()
@@ -141,8 +146,12 @@ def run(camera: FrameCamera, control: RunControl) -> RunReport:
 
 
 def test_paused_run_reads_frames_and_reconstructs_none(tmp_path: Path) -> None:
-    control, commands = RunControl(folder=tmp_path), {5: "pause", 15: "resume"}
-    report = run(FrameCamera(30, lambda number: number in commands and control.run(commands[number], {})), control)
+    control = RunControl(folder=tmp_path)
+    commands = {5: "pause", 15: "resume"}
+    report = run(
+        FrameCamera(30, lambda number: number in commands and control.run(commands[number], {})),
+        control,
+    )
     assert 14 <= report.frames <= 26
     assert report.dropped == 0
 
@@ -155,9 +164,13 @@ def test_run_ends_what_was_begun(tmp_path: Path) -> None:
 
 
 def test_reference_is_taken_from_the_passing_frames(tmp_path: Path) -> None:
-    control, benches, told = RunControl(folder=tmp_path), list[CalibratedRig](), list[str]()
+    control = RunControl(folder=tmp_path)
+    benches = list[CalibratedRig]()
+    told = list[str]()
     control.on_bench = benches.append
-    command = threading.Thread(target=lambda: told.append(control.run("take_reference", {"frames": 8})))
+    command = threading.Thread(
+        target=lambda: told.append(control.run("take_reference", {"frames": 8}))
+    )
 
     def act(number: int) -> None:
         if number == 3:

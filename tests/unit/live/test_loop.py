@@ -25,12 +25,15 @@ RIG = load_rig("paper-rig")
 PERIOD_S = 1 / 30
 
 
-def pipeline(network: Callable[..., np.ndarray] = sheet_network, wall: MeasuredWall | None = None) -> Pipeline:
+def pipeline(
+    network: Callable[..., np.ndarray] = sheet_network, wall: MeasuredWall | None = None
+) -> Pipeline:
     return Pipeline(CalibratedRig(RIG, wall), network)
 
 
 def test_pace_yields_frames_at_their_timestamps() -> None:
-    waits_s, now_s = [], [100.0]
+    waits_s = []
+    now_s = [100.0]
 
     class Waits(Event):
         def wait(self, timeout: float | None = None) -> bool:
@@ -38,7 +41,8 @@ def test_pace_yields_frames_at_their_timestamps() -> None:
             now_s[0] += timeout or 0.0
             return self.is_set()
 
-    stop, given = Waits(), []
+    stop = Waits()
+    given = []
     for each in pace(map(small_frame, (0, 1, 4, 2)), stop, lambda: now_s[0]):
         given.append(each.frame_number)
         now_s[0] += 0.01
@@ -49,12 +53,17 @@ def test_pace_yields_frames_at_their_timestamps() -> None:
 
 
 class Lockstep(ListViewer):
-    """Viewer, camera and clock in one step: a frame arrives 5 ms after its timestamp, once the last was shown."""
+    """Viewer, camera and clock in one step: a frame arrives 5 ms after its timestamp, once the last
+    was shown.
+    """
 
     def __init__(self, count: int, offset_s: float) -> None:
         super().__init__()
-        self._now_s, self._shown = 0.0, threading.Semaphore(1)
-        self.camera = FrameCamera(count, self._on_frame, make=lambda number: small_frame(number, offset_s))
+        self._now_s = 0.0
+        self._shown = threading.Semaphore(1)
+        self.camera = FrameCamera(
+            count, self._on_frame, make=lambda number: small_frame(number, offset_s)
+        )
 
     def _on_frame(self, number: int) -> None:
         while not self._shown.acquire(timeout=0.05) and not self.camera.closed.is_set():
@@ -75,22 +84,41 @@ def test_run_live_reports_latency_on_any_clock(offset_s: float, delivery_ms: flo
     report = run_live(lockstep.camera, pipeline(), lockstep, stop=Event(), clock=lockstep.clock)
     assert report.frames == len(lockstep.moments) == 31
     assert report.dropped == 0
-    assert set(report.stages_ms) == {"delivery", "wait", "queue", "maps", "bench", "network", "view"}
+    assert set(report.stages_ms) == {
+        "delivery",
+        "wait",
+        "queue",
+        "maps",
+        "bench",
+        "network",
+        "view",
+    }
     assert set(report.latency_ms) == {"p50", "p95", "p99"}
     assert report.latency_ms["p50"] <= report.latency_ms["p95"] <= report.latency_ms["p99"]
-    assert {name: times["p50"] for name, times in report.stages_percentiles_ms.items()} == report.stages_ms
+    assert {
+        name: times["p50"] for name, times in report.stages_percentiles_ms.items()
+    } == report.stages_ms
     assert report.stages_ms["delivery"] == pytest.approx(delivery_ms, abs=1.0)
     assert report.latency_ms["p50"] == pytest.approx(delivery_ms, abs=1.0)
     assert report.fps == pytest.approx(30.0, rel=0.04)
     for moment in lockstep.moments[-5:]:  # once the fastest delivery is known
-        parts_s = sum(seconds for stage, seconds in moment.stages_s.items() if stage not in OUTSIDE_LATENCY)
+        parts_s = sum(
+            seconds for stage, seconds in moment.stages_s.items() if stage not in OUTSIDE_LATENCY
+        )
         assert 0.0 <= parts_s <= moment.latency_s + 1e-6
 
 
 def test_run_live_warns_while_the_lidar_is_moved(tmp_path: Path) -> None:
-    begins, viewer, clock = list[tuple[str, bool]](), ListViewer(), count_up(1.0)
-    camera, method = WallCamera(150, moved=range(30, 80)), pipeline(wall=measured_wall(tmp_path))
-    run: Any = {"stop": Event(), "recorded": True, "clock": lambda: next(clock)}  # the recording is never ahead of it
+    begins = list[tuple[str, bool]]()
+    viewer = ListViewer()
+    clock = count_up(1.0)
+    camera = WallCamera(150, moved=range(30, 80))
+    method = pipeline(wall=measured_wall(tmp_path))
+    run: Any = {
+        "stop": Event(),
+        "recorded": True,
+        "clock": lambda: next(clock),
+    }  # the recording is never ahead of it
     report = run_live(camera, method, viewer, **run, on_warning=lambda *about: begins.append(about))
     [(warning, frames)] = report.warnings.items()
     assert [each for _, each in begins] == [True, False]
@@ -102,11 +130,21 @@ def test_run_live_warns_while_the_lidar_is_moved(tmp_path: Path) -> None:
 
 
 def test_run_live_counts_and_survives_failed_frames(caplog: pytest.LogCaptureFixture) -> None:
-    viewer, logged, sheet = ListViewer(), list[Moment](), sheet_network()
+    viewer = ListViewer()
+    logged = list[Moment]()
+    sheet = sheet_network()
     network = Mock(
-        spec=sheet_network, side_effect=[*[sheet] * 3, *[ZeroDivisionError("an odd frame")] * 2, *[sheet] * 5]
+        spec=sheet_network,
+        side_effect=[*[sheet] * 3, *[ZeroDivisionError("an odd frame")] * 2, *[sheet] * 5],
     )
-    report = run_live(FrameCamera(10), pipeline(network), viewer, stop=Event(), recorded=True, on_moment=logged.append)
+    report = run_live(
+        FrameCamera(10),
+        pipeline(network),
+        viewer,
+        stop=Event(),
+        recorded=True,
+        on_moment=logged.append,
+    )
     assert [moment.frame.frame_number for moment in viewer.moments] == [0, 1, 2, 5, 6, 7, 8, 9]
     assert [moment.dropped for moment in viewer.moments] == [0, 0, 0, 2, 2, 2, 2, 2]
     assert logged == viewer.moments
@@ -121,14 +159,18 @@ def test_run_live_reports_before_it_raises_the_cameras_error() -> None:
     reports = list[RunReport]()
     camera.counts = Counter(restarted=3)
     with pytest.raises(CameraLostError, match="unplugged"):
-        run_live(camera, pipeline(), NullViewer(), stop=Event(), recorded=True, on_error=reports.append)
+        run_live(
+            camera, pipeline(), NullViewer(), stop=Event(), recorded=True, on_error=reports.append
+        )
     [report] = reports
     assert (report.frames, report.counts) == (2, {"restarted": 3})
 
 
 def test_run_live_ends_in_time_without_further_frames(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("nlos_cam.live.frame_queue.ABANDON_AFTER_S", 0.01)
-    shown, now_s, viewer = Event(), [0.0], ListViewer()
+    shown = Event()
+    now_s = [0.0]
+    viewer = ListViewer()
     viewer.show = lambda _: shown.set()  # type: ignore[method-assign]
 
     def on_frame(number: int) -> None:
@@ -138,22 +180,29 @@ def test_run_live_ends_in_time_without_further_frames(monkeypatch: pytest.Monkey
             assert camera.closed.wait(60.0)
 
     camera = FrameCamera(None, on_frame)
-    report = run_live(camera, pipeline(), viewer, stop=Event(), seconds=500.0, clock=lambda: now_s[-1])
+    report = run_live(
+        camera, pipeline(), viewer, stop=Event(), seconds=500.0, clock=lambda: now_s[-1]
+    )
     assert camera.closed.is_set()
     assert report.frames <= 5
 
 
 class Stalling(ListViewer):
-    """Viewer whose camera yields nothing between frames 4 and 5 until the stall was shown twice; 40 degrees warm.
+    """Viewer whose camera yields nothing between frames 4 and 5 until the stall was shown twice; 40
+    degrees warm.
 
     The clock goes on by 0.3 s whenever it is read during the stall.
     """
 
     def __init__(self) -> None:
         super().__init__()
-        self.now_s, self.stalling = 100.0, False
-        self._shown, self._shown_twice = Event(), Event()
-        self.camera = FrameCamera(10, self._on_frame, make=lambda number: small_frame(number, 100.0))
+        self.now_s = 100.0
+        self.stalling = False
+        self._shown = Event()
+        self._shown_twice = Event()
+        self.camera = FrameCamera(
+            10, self._on_frame, make=lambda number: small_frame(number, 100.0)
+        )
         self.camera.telemetry = lambda _="": {"ldd_temperature": 40.0}  # type: ignore[method-assign]
 
     def _on_frame(self, number: int) -> None:
@@ -176,10 +225,17 @@ class Stalling(ListViewer):
 
 
 def test_run_live_shows_a_stall_with_the_last_moment() -> None:
-    viewer, begins = Stalling(), list[tuple[str, bool]]()
+    viewer = Stalling()
+    begins = list[tuple[str, bool]]()
     run: Any = {"stop": Event(), "recorded": True, "clock": viewer.clock}
-    report = run_live(viewer.camera, pipeline(), viewer, **run, on_warning=lambda *about: begins.append(about))
-    frames = [moment.frame.frame_number for moment in viewer.moments if moment.verdict is not Verdict.STALLED]
+    report = run_live(
+        viewer.camera, pipeline(), viewer, **run, on_warning=lambda *about: begins.append(about)
+    )
+    frames = [
+        moment.frame.frame_number
+        for moment in viewer.moments
+        if moment.verdict is not Verdict.STALLED
+    ]
     assert frames == list(range(10))
     again = [moment for moment in viewer.moments if moment.verdict is Verdict.STALLED]
     assert len(again) >= 2

@@ -19,10 +19,17 @@ from nlos_cam.reconstruct.physics_check import check_reconstruction
 
 RIG = load_rig("bare-wall")
 NOTHING = np.full((64, 64), np.nan, np.float32)
-DARK = LidarMaps(np.full((64, 80), np.nan, np.float32), np.zeros((64, 80), np.float32), np.zeros((64, 80), np.bool_))
+DARK = LidarMaps(
+    np.full((64, 80), np.nan, np.float32),
+    np.zeros((64, 80), np.float32),
+    np.zeros((64, 80), np.bool_),
+)
 SILENT = "import sys; sys.stdin.buffer.read()"
 GONE = "import sys; sys.exit(3)"
-DEAF = "import signal, time; signal.signal(signal.SIGTERM, signal.SIG_IGN); print(flush=True); time.sleep(600)"
+DEAF = (
+    "import signal, time; signal.signal(signal.SIGTERM, signal.SIG_IGN); print(flush=True);"
+    " time.sleep(600)"
+)
 REFUSES = """
 import pickle, sys
 pickle.load(sys.stdin.buffer)
@@ -66,8 +73,11 @@ def test_background_check_equals_a_check_in_this_process() -> None:
 
 
 def test_background_checks_take_the_newest_frame_once_a_period() -> None:
-    now_s, steps = 100.0, [(1.9, False, 0), (0.2, True, 0), (1.0, True, 0), (1.5, True, 1)]
-    with BackgroundPhysicsCheck(RIG, period_s=2.0, clock=lambda: now_s, command=python(SILENT)) as checks:
+    now_s = 100.0
+    steps = [(1.9, False, 0), (0.2, True, 0), (1.0, True, 0), (1.5, True, 1)]
+    with BackgroundPhysicsCheck(
+        RIG, period_s=2.0, clock=lambda: now_s, command=python(SILENT)
+    ) as checks:
         checks.offer(1, DARK, NOTHING)
         wait_until(lambda: not checks.waits)
         for number, (later_s, waits, dropped) in enumerate(steps, 2):
@@ -79,7 +89,12 @@ def test_background_checks_take_the_newest_frame_once_a_period() -> None:
 def background(command: tuple[str, ...]) -> tuple[BackgroundPhysicsCheck, list[str]]:
     """Checks in a process of that command, always due, and the errors that they report."""
     errors = list[str]()
-    run: Any = {"period_s": 0.0, "clock": lambda: 100.0, "command": command, "on_error": errors.append}
+    run: Any = {
+        "period_s": 0.0,
+        "clock": lambda: 100.0,
+        "command": command,
+        "on_error": errors.append,
+    }
     return BackgroundPhysicsCheck(RIG, **run), errors
 
 
@@ -91,12 +106,16 @@ def test_background_checks_never_wait_for_their_process() -> None:
         assert checks.dropped >= 1000 - 3
         assert checks.newest is None
         if sys.platform != "win32":
-            assert os.getpgid(checks.process.pid) != os.getpgrp(), "Ctrl-C at the terminal reaches it"
+            assert os.getpgid(checks.process.pid) != os.getpgrp(), (
+                "Ctrl-C at the terminal reaches it"
+            )
     assert checks.process.returncode is not None
     assert not errors, "its end by us is no error"
 
 
-def test_background_checks_kill_a_process_that_will_not_end(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_background_checks_kill_a_process_that_will_not_end(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     monkeypatch.setattr("nlos_cam.live.physics_check_process.END_WITHIN_S", 0.2)
     with BackgroundPhysicsCheck(RIG, command=python(DEAF)) as checks:
         checks.offer(0, DARK, NOTHING)
@@ -133,7 +152,10 @@ def test_background_checks_report_a_missing_process_once(command: tuple[str, ...
 def test_background_process_ends_with_a_killed_parent() -> None:
     # the process holds our pipe as long as it lives: `run` returns only once it has ended
     done = subprocess.run(
-        python(PARENT), capture_output=True, check=False, env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
+        python(PARENT),
+        capture_output=True,
+        check=False,
+        env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)},
     )
     assert done.returncode == -9
     assert int(done.stdout) > 0
@@ -164,8 +186,11 @@ def test_worker_leaves_when_its_parent_is_gone(end: bytes) -> None:
     assert len(answers((1, DARK, NOTHING), end=end)) == 1
 
 
-def test_worker_is_nice_and_keeps_prints_out_of_its_answers(monkeypatch: pytest.MonkeyPatch) -> None:
-    niced, served = [], []
+def test_worker_is_nice_and_keeps_prints_out_of_its_answers(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    niced = []
+    served = []
     monkeypatch.setattr(os, "nice", niced.append, raising=False)
     for name in ("stdin", "stdout", "stderr"):
         monkeypatch.setattr(sys, name, SimpleNamespace(buffer=name))

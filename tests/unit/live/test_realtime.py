@@ -10,14 +10,17 @@ import pytest
 from nlos_cam.live import low_latency_interpreter, realtime_priority, yield_to_loop
 from nlos_cam.live.realtime import DRAWING, LOOP, ORDINARY, SWITCH_S, TASKS, drop_realtime_priority
 
-OTHER, ROUND_ROBIN = 0, 2
+OTHER = 0
+ROUND_ROBIN = 2
 
 
 class System:
     """Linux's schedules by thread: `missing` has ended, and real-time priority needs `may`."""
 
     def __init__(self, tasks: Path, *names: str) -> None:
-        self.tasks, self.may, self.missing = tasks, True, ""
+        self.tasks = tasks
+        self.may = True
+        self.missing = ""
         self.schedules = dict.fromkeys(names, (OTHER, ORDINARY))
         for name in names:
             (tasks / name).mkdir(parents=True)
@@ -52,7 +55,9 @@ def test_realtime_priority_holds_for_all_threads_until_it_is_left(system: System
     assert set(system.schedules.values()) == {(OTHER, ORDINARY)}
 
 
-def test_realtime_priority_changes_nothing_where_not_possible(system: System, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_realtime_priority_changes_nothing_where_not_possible(
+    system: System, monkeypatch: pytest.MonkeyPatch
+) -> None:
     system.missing = "7"
     with realtime_priority() as allowed:
         assert allowed
@@ -80,7 +85,9 @@ def test_drawing_goes_after_the_loop_and_before_the_rest(system: System) -> None
 
 @pytest.mark.skipif(not TASKS.is_dir(), reason="this system has no /proc/self/task")
 def test_realtime_priority_restores_the_threads_of_this_process() -> None:
-    ended, began, found = Event(), Event(), list[int]()
+    ended = Event()
+    began = Event()
+    found = list[int]()
 
     def work() -> None:
         began.set()
@@ -105,7 +112,8 @@ class Loop:
 
 
 def test_interpreter_collects_once_and_shortens_turns_until_left() -> None:
-    before_s, earlier = sys.getswitchinterval(), weakref.ref(Loop())
+    before_s = sys.getswitchinterval()
+    earlier = weakref.ref(Loop())
     with pytest.raises(ZeroDivisionError), low_latency_interpreter():  # noqa: PT012  an error leaves it too
         assert sys.getswitchinterval() == pytest.approx(SWITCH_S, rel=0.01)
         assert earlier() is None

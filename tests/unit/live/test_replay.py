@@ -27,7 +27,8 @@ from nlos_cam.reconstruct import CalibratedRig, FrameResult, PeriodicPhysicsChec
 
 TEXT = "report.md"
 NAMES = {REPORT, RESULT, SHEET, TEXT}
-BENCH, BOX = CalibratedRig(RIG), object_box(RIG)
+BENCH = CalibratedRig(RIG)
+BOX = object_box(RIG)
 FULL = full_moment(0)
 STEP = FrameResult(FULL.frame, maps_from_frame(FULL.frame), FULL.reconstruction, 0.0, {})
 
@@ -39,14 +40,18 @@ def left_half(depth_m: np.ndarray, *_: np.ndarray) -> np.ndarray:
 
 def noise_frame(number: int) -> Frame:
     depth_m = np.random.default_rng(number).uniform(0.1, 1.0, (64, 80)).astype(np.float32)
-    return Frame(depth_m, np.full((64, 80), 9, np.uint8), depth_m, 5.0 + number / 30, 100 + number, SMALL)
+    return Frame(
+        depth_m, np.full((64, 80), 9, np.uint8), depth_m, 5.0 + number / 30, 100 + number, SMALL
+    )
 
 
 def replayed_noise(out: Path, count: int = 2, **options: Any) -> ReplayReport:
     """Replay `count` frames of noise without a wall; the camera counts duplicates."""
     camera = FrameCamera(count, make=noise_frame)
     camera.counts.update(duplicate=2, out_of_order=1)
-    return replay_recording(camera, out=out, **{"pipeline": Pipeline(BENCH, left_half), "stop": Event(), **options})
+    return replay_recording(
+        camera, out=out, **{"pipeline": Pipeline(BENCH, left_half), "stop": Event(), **options}
+    )
 
 
 def replayed_wall(tmp_path: Path, camera: WallCamera, out: str = "out") -> Path:
@@ -56,7 +61,8 @@ def replayed_wall(tmp_path: Path, camera: WallCamera, out: str = "out") -> Path:
 
 
 def test_replay_writes_every_frame_with_number_time_and_place(tmp_path: Path) -> None:
-    counted, out = [], tmp_path / "out"
+    counted = []
+    out = tmp_path / "out"
     report = replayed_noise(out, 12, on_frame=lambda: counted.append(1))
     assert (report.frames, report.out, len(counted)) == (12, str(out), 12)
     with np.load(out / RESULT) as file:
@@ -85,9 +91,15 @@ def test_replay_writes_every_frame_with_number_time_and_place(tmp_path: Path) ->
 def test_replay_writes_uncertainty_and_verdict_of_each_frame(tmp_path: Path) -> None:
     says = iter([(0.0, 0.0), (0.9, 0.0), (0.0, 0.9)])
     doubter = FakeDoubter(lambda *_: next(says), error_v=0.1)
-    replayed_noise(tmp_path / "out", 3, pipeline=Pipeline(BENCH, left_half, uncertainty_model=doubter))
+    replayed_noise(
+        tmp_path / "out", 3, pipeline=Pipeline(BENCH, left_half, uncertainty_model=doubter)
+    )
     with np.load(tmp_path / "out" / RESULT) as file:
-        assert file["verdict"].tolist() == ["object seen", "nothing there", "outside the trained range"]
+        assert file["verdict"].tolist() == [
+            "object seen",
+            "nothing there",
+            "outside the trained range",
+        ]
         assert np.isfinite(file["depth_m"]).any((1, 2)).tolist() == [True, False, True]
         assert file["uncertainty_m"].shape == (3, 64, 64)
         np.testing.assert_allclose(file["uncertainty_m"], 0.1 * 0.28 / 0.9, rtol=1e-5)
@@ -110,8 +122,11 @@ def test_replay_with_checks_is_reproducible_to_the_bit(tmp_path: Path) -> None:
 
 
 def test_interrupted_replay_keeps_its_results(tmp_path: Path) -> None:
-    stop, done = Event(), count_up(1)
-    report = replayed_noise(tmp_path / "out", 1000, stop=stop, on_frame=lambda: next(done) == 7 and stop.set())
+    stop = Event()
+    done = count_up(1)
+    report = replayed_noise(
+        tmp_path / "out", 1000, stop=stop, on_frame=lambda: next(done) == 7 and stop.set()
+    )
     assert report.frames == BATCH_FRAMES * (MAX_BATCHES_AHEAD + 2)
     with np.load(tmp_path / "out" / RESULT) as result:
         assert result["frame_number"].tolist() == list(range(100, 100 + report.frames))
@@ -145,7 +160,9 @@ def test_replay_writes_difference_maps_and_their_reference(tmp_path: Path) -> No
         np.testing.assert_allclose(file["timestamp_s"], np.arange(9) / 30)
         assert str(file["reference_sha256"]) == wall.record.reference_sha256
         assert (str(file["rig_name"]), str(file["rig_checksum"])) == (RIG.name, RIG.checksum)
-        np.testing.assert_array_equal(file["depth_m"][5], wall_frame(5).depth_m - wall.reference.map_depth_m)
+        np.testing.assert_array_equal(
+            file["depth_m"][5], wall_frame(5).depth_m - wall.reference.map_depth_m
+        )
     text = (out / TEXT).read_text()
     assert DIFFERENCE in text
     assert "20 frames" in text
@@ -159,15 +176,22 @@ def test_replay_reports_warnings_with_their_frames(tmp_path: Path) -> None:
     texts = []
     for out in ("a", "b"):
         camera = WallCamera(100, moved=range(30, 60), celsius=80.0)
-        texts.append((replayed_wall(tmp_path, camera, out) / TEXT).read_text().replace(f"/{out}/", "/"))
+        texts.append(
+            (replayed_wall(tmp_path, camera, out) / TEXT).read_text().replace(f"/{out}/", "/")
+        )
     assert texts[0] == texts[1]
-    warnings = [tuple(map(int, re.findall(r"\d+", line)[:3])) for line in texts[0].splitlines() if "warning" in line]
+    warnings = [
+        tuple(map(int, re.findall(r"\d+", line)[:3]))
+        for line in texts[0].splitlines()
+        if "warning" in line
+    ]
     assert (100, 0, 99) in warnings
     assert any(first in range(30, 60) for _, first, _ in warnings)
 
 
 def replayed(out: Path, count: int, **asked: Any) -> set[str]:
-    media, pipeline = ReplayMedia(BENCH, **asked), Pipeline(BENCH, SheetNetwork())
+    media = ReplayMedia(BENCH, **asked)
+    pipeline = Pipeline(BENCH, SheetNetwork())
     replay_recording(Recorded(count), pipeline, out, stop=Event(), media=media)
     return {file.name for file in out.iterdir()}
 
@@ -180,11 +204,14 @@ def test_replay_makes_view_video_and_stills_as_asked(tmp_path: Path) -> None:
     assert len(numbers) == 3
     assert numbers[0] == 0
     assert numbers[-1] >= 20
-    video, frames = cv2.VideoCapture(str(tmp_path / "out" / VIDEO)), 0
+    video = cv2.VideoCapture(str(tmp_path / "out" / VIDEO))
+    frames = 0
     while video.read()[0]:
         frames += 1
     assert frames == 15
-    assert [each["frame"] for each in saved_moments(tmp_path / "out" / VIEW)] == list(range(0, 30, 3))
+    assert [each["frame"] for each in saved_moments(tmp_path / "out" / VIEW)] == list(
+        range(0, 30, 3)
+    )
     assert (tmp_path / "plain" / RESULT).read_bytes() == (tmp_path / "out" / RESULT).read_bytes()
     assert VIDEO in (tmp_path / "out" / REPORT).read_text(encoding="utf-8")
 
@@ -232,13 +259,17 @@ def wall_step(number: int, difference: LidarMaps | None = None) -> FrameResult:
     return FrameResult(frame, maps_from_frame(frame), NOTHING, 0.0, {}, difference)
 
 
-def test_sheet_has_a_row_per_map_and_a_column_per_frame(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_sheet_has_a_row_per_map_and_a_column_per_frame(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     saved: list[Any] = []
     monkeypatch.setattr(Figure, "savefig", lambda figure, *_, **__: saved.append(figure))
 
     def titles(steps: list[FrameResult]) -> list[str]:
         draw_contact_sheet(tmp_path / "sheet.png", steps)
-        return [title for axis in saved[-1].axes if (title := axis.get_ylabel() or axis.get_title())]
+        return [
+            title for axis in saved[-1].axes if (title := axis.get_ylabel() or axis.get_title())
+        ]
 
     plain = ["lidar depth (m)", "infrared (counts)", "hidden depth (m)"]
     assert titles([wall_step(3), wall_step(9)]) == ["frame 3", "frame 9", *plain]
@@ -258,7 +289,8 @@ def replay(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_export_of_result_equals_files_of_replay(replay: Path, tmp_path: Path) -> None:
-    made, exported = replay / "object", tmp_path / "exported"
+    made = replay / "object"
+    exported = tmp_path / "exported"
     assert export_objects(replay / RESULT, exported, OBJECT_FORMATS, 3, stop=Event()) == 3
     names = [sorted(file.name for file in folder.iterdir()) for folder in (made, exported)]
     assert names[0] == names[1]
@@ -269,11 +301,15 @@ def test_export_of_result_equals_files_of_replay(replay: Path, tmp_path: Path) -
     np.testing.assert_array_equal(vertices[0], mesh_from_depth(depth_m, BOX).vertices_m)
 
 
-def test_export_stops_when_asked_and_skips_frames_without_surface(replay: Path, tmp_path: Path) -> None:
+def test_export_stops_when_asked_and_skips_frames_without_surface(
+    replay: Path, tmp_path: Path
+) -> None:
     (stop := Event()).set()
     assert export_objects(replay / RESULT, tmp_path / "a", ["ply"], stop=stop) == 0
     with np.load(replay / RESULT) as file:
-        np.savez(tmp_path / "empty.npz", **{**file, "depth_m": np.full_like(file["depth_m"], np.nan)})
+        np.savez(
+            tmp_path / "empty.npz", **{**file, "depth_m": np.full_like(file["depth_m"], np.nan)}
+        )
     assert export_objects(tmp_path / "empty.npz", tmp_path / "b", ["ply"], stop=Event()) == 0
 
 
@@ -292,7 +328,9 @@ BAD = {"pitch_m": [0.1], "z_far_m": 0.0, "frame_number": [1, 2], "z_near_m": [[]
 
 
 @pytest.mark.parametrize(("name", "value"), [("depth_m", "text"), ("depth_m", 1.0), *BAD.items()])
-def test_export_refuses_arrays_that_contradict(replay: Path, tmp_path: Path, name: str, value: object) -> None:
+def test_export_refuses_arrays_that_contradict(
+    replay: Path, tmp_path: Path, name: str, value: object
+) -> None:
     with np.load(replay / RESULT) as file:
         np.savez(tmp_path / "bad.npz", **{**file, name: np.array(value)})
     with pytest.raises(RecordingError, match="not the reconstruction"):

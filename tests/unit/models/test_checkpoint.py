@@ -1,4 +1,6 @@
-"""Checkpoints: float16 round trips, strict loading, errors that name the file, and the record of training runs."""
+"""Checkpoints: float16 round trips, strict loading, errors that name the file, and the record of
+training runs.
+"""
 
 import json
 from pathlib import Path
@@ -23,7 +25,9 @@ RUNS = {f"v{seed}": small_recipe(seed=seed) for seed in range(3)}
 RUNS |= {f"c{seed}": small_recipe(task="compressor", seed=seed) for seed in range(2)}
 RUNS |= {f"t{seed}": small_recipe(task="transfer", seed=seed) for seed in range(2)}
 RUNS["j"] = small_recipe(task="compressor", seed=9, steps="two-then-joint", image_weight=1.0)
-RECORD = checkpoint.CheckpointRecord.of([RUNS["v0"]], RIG).model_copy(update={"figures": {"held_out_iou": 0.5}})
+RECORD = checkpoint.CheckpointRecord.of([RUNS["v0"]], RIG).model_copy(
+    update={"figures": {"held_out_iou": 0.5}}
+)
 PARTS = ("compressor", "preprocess", "decoder")
 
 
@@ -72,9 +76,12 @@ def test_pipeline_round_trip_is_float16_with_exact_statistics(tmp_path: Path, wi
     assert record == saved
     assert not loaded.training
     for name, tensor in pipeline.state_dict().items():
-        back, exact = loaded.state_dict()[name], "running" in name or "preprocess" in name
+        back = loaded.state_dict()[name]
+        exact = "running" in name or "preprocess" in name
         assert back.dtype == tensor.dtype
-        torch.testing.assert_close(back, tensor, rtol=0 if exact else 1e-3, atol=0 if exact else 1e-7)
+        torch.testing.assert_close(
+            back, tensor, rtol=0 if exact else 1e-3, atol=0 if exact else 1e-7
+        )
     tensors = load_file(tmp_path / "decoder.safetensors")
     assert tensors["output.weight"].dtype == torch.float16
     assert all(t.dtype == torch.float32 for name, t in tensors.items() if "running" in name)
@@ -83,7 +90,8 @@ def test_pipeline_round_trip_is_float16_with_exact_statistics(tmp_path: Path, wi
 @pytest.mark.parametrize("color", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_vae_round_trip_keeps_weights_and_bytes(tmp_path: Path, color: bool) -> None:
     torch.manual_seed(0)
-    vae, saved = new_vae(color=color), checkpoint.CheckpointRecord.of([small_recipe(colour=color)], RIG)
+    vae = new_vae(color=color)
+    saved = checkpoint.CheckpointRecord.of([small_recipe(colour=color)], RIG)
     checkpoint.save_vae(tmp_path / "one", vae, saved)
     loaded, record = checkpoint.load_vae(tmp_path / "one")
     checkpoint.save_vae(tmp_path / "two", loaded, record)
@@ -91,7 +99,9 @@ def test_vae_round_trip_keeps_weights_and_bytes(tmp_path: Path, color: bool) -> 
     assert not loaded.training
     torch.testing.assert_close(loaded.state_dict(), vae.state_dict(), rtol=1e-3, atol=1e-7)
     for name in ("encoder", "decoder"):
-        first, second = ((tmp_path / n / f"{name}.safetensors").read_bytes() for n in ("one", "two"))
+        first, second = (
+            (tmp_path / n / f"{name}.safetensors").read_bytes() for n in ("one", "two")
+        )
         assert first == second
     checkpoint.save_vae(tmp_path / "two", new_vae(color=not color), saved)
     with pytest.raises(CheckpointError, match="encoder"):
@@ -100,7 +110,9 @@ def test_vae_round_trip_keeps_weights_and_bytes(tmp_path: Path, color: bool) -> 
 
 @pytest.mark.parametrize("part", PARTS)
 @pytest.mark.parametrize("content", [None, b"", b"not tensors", b"\xff" * 64, "truncated"], ids=str)
-def test_load_pipeline_names_missing_or_corrupt_file(folder: Path, part: str, content: bytes | str | None) -> None:
+def test_load_pipeline_names_missing_or_corrupt_file(
+    folder: Path, part: str, content: bytes | str | None
+) -> None:
     path = folder / f"{part}.safetensors"
     whole = path.read_bytes()
     path.unlink()
@@ -131,7 +143,9 @@ def test_load_pipeline_refuses_any_flipped_bit(folder: Path, saved: Path, seed: 
         *(("output.bias", torch.tensor([value]), "not finite") for value in (torch.nan, torch.inf)),
     ],
 )
-def test_load_pipeline_refuses_unusable_tensors(folder: Path, name: str, value: torch.Tensor | None, word: str) -> None:
+def test_load_pipeline_refuses_unusable_tensors(
+    folder: Path, name: str, value: torch.Tensor | None, word: str
+) -> None:
     tensors = {**load_file(path := folder / "decoder.safetensors"), name: value}
     _replace(path, save({name: tensor for name, tensor in tensors.items() if tensor is not None}))
     with pytest.raises(CheckpointError, match=word) as caught:
@@ -151,7 +165,9 @@ RECORD_JSON = RECORD.model_dump(mode="json")
         ({name: value for name, value in RECORD_JSON.items() if name != "rig_name"}, "rig_name"),
     ],
 )
-def test_load_record_names_corrupt_file_or_wrong_field(tmp_path: Path, content: bytes | dict, word: str) -> None:
+def test_load_record_names_corrupt_file_or_wrong_field(
+    tmp_path: Path, content: bytes | dict, word: str
+) -> None:
     text = content if isinstance(content, bytes) else json.dumps(content).encode()
     (tmp_path / "checkpoint.json").write_bytes(text)
     with pytest.raises(CheckpointError, match=word):
@@ -162,13 +178,18 @@ def test_load_fitting_loads_matching_tensors_and_reports_rest(folder: Path) -> N
     path = folder / "decoder.safetensors"
     tensors = load_file(path)
     del tensors["output.bias"]
-    _replace(path, save({**tensors, "output.weight": torch.zeros(2), "output.more": torch.zeros(1)}))
+    _replace(
+        path, save({**tensors, "output.weight": torch.zeros(2), "output.more": torch.zeros(1)})
+    )
     decoder = Decoder()
     own = state_of(decoder)
     report = checkpoint.load_fitting(path, decoder)
     assert report[1:] == (["output.bias"], ["output.more"], ["output.weight"])
     assert set(report.loaded) == own.keys() - {"output.bias", "output.weight"}
-    assert all(name in str(report) for name in (f"{len(report.loaded)}", "output.bias", "output.more", "output.weight"))
+    assert all(
+        name in str(report)
+        for name in (f"{len(report.loaded)}", "output.bias", "output.more", "output.weight")
+    )
     for name, tensor in decoder.state_dict().items():
         wanted = tensors[name] if name in report.loaded else own[name]
         assert torch.equal(tensor.float(), wanted.float()), name
@@ -184,12 +205,16 @@ def test_load_pipeline_partly_is_strict_but_for_compressor(folder: Path) -> None
             checkpoint.load_pipeline_partly(folder)
 
 
-def test_save_refuses_weights_beyond_float16_or_on_full_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_save_refuses_weights_beyond_float16_or_on_full_disk(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     for value in (1e6, torch.nan, torch.inf):
         nn.init.constant_((decoder := Decoder()).output.weight, value)
         with pytest.raises(CheckpointError, match=r"output\.weight"):
             checkpoint.save_pipeline(tmp_path, RemappingNetwork(Compressor(), decoder), RECORD)
-    monkeypatch.setattr(checkpoint, "write_checked", Mock(side_effect=OSError(28, "No space left on device")))
+    monkeypatch.setattr(
+        checkpoint, "write_checked", Mock(side_effect=OSError(28, "No space left on device"))
+    )
     with pytest.raises(CheckpointError, match="No space left"):
         checkpoint.save_vae(tmp_path, ResVae(), RECORD)
 
@@ -208,8 +233,12 @@ def test_save_refuses_weights_beyond_float16_or_on_full_disk(tmp_path: Path, mon
         ("v0 c0 t0 j", ["v0", "j", ""], "c0 t0"),
     ],
 )
-def test_record_names_last_run_of_each_task_and_keeps_others(runs: str, named: list[str], earlier: str) -> None:
-    record = checkpoint.CheckpointRecord.of([RUNS[name] for name in runs.split()], RIG, "difference maps")
+def test_record_names_last_run_of_each_task_and_keeps_others(
+    runs: str, named: list[str], earlier: str
+) -> None:
+    record = checkpoint.CheckpointRecord.of(
+        [RUNS[name] for name in runs.split()], RIG, "difference maps"
+    )
     latest = [record.vae_recipe, record.compressor_recipe, record.transfer_recipe]
     assert latest == [RUNS.get(name) for name in named]
     assert record.earlier == [RUNS[name] for name in earlier.split()]
@@ -219,7 +248,9 @@ def test_record_names_last_run_of_each_task_and_keeps_others(runs: str, named: l
 
 
 def test_record_vae_runs_include_runs_that_train_decoder() -> None:
-    record = checkpoint.CheckpointRecord.of([RUNS[name] for name in ("v0", "v1", "c0", "j", "t0")], RIG)
+    record = checkpoint.CheckpointRecord.of(
+        [RUNS[name] for name in ("v0", "v1", "c0", "j", "t0")], RIG
+    )
     assert record.vae_runs == [RUNS[name] for name in ("v0", "v1", "j")]
     written_before_earlier = RECORD.model_dump(mode="json", exclude={"earlier"})
     assert checkpoint.CheckpointRecord.model_validate(written_before_earlier).runs == [RUNS["v0"]]
@@ -231,6 +262,9 @@ def test_record_in_color_notes_simulation_only() -> None:
         record = checkpoint.CheckpointRecord.of(some, RIG)
         assert (record.color, record.note) == (True, SIMULATION_ONLY)
         assert checkpoint.CheckpointRecord.model_validate_json(record.model_dump_json()) == record
-        assert checkpoint.CheckpointRecord.model_validate(record.model_dump(exclude={"note"})) == record
+        assert (
+            checkpoint.CheckpointRecord.model_validate(record.model_dump(exclude={"note"}))
+            == record
+        )
     depth = checkpoint.CheckpointRecord.of([RUNS["v0"], RUNS["c0"]], RIG)
     assert (depth.color, depth.note) == (False, "")

@@ -1,4 +1,6 @@
-"""The direct network: mirror symmetry, its places of pixels, its loss, exact resuming, and its checkpoint."""
+"""The direct network: mirror symmetry, its places of pixels, its loss, exact resuming, and its
+checkpoint.
+"""
 
 import io
 from collections.abc import Iterable
@@ -36,17 +38,34 @@ SIZE = DirectSize(features=8, width=8, blocks=1, token=8, mixers=1)
 
 def _recipe(**changes: object) -> Recipe:
     facts = {
-        "task": "direct", "objects": 16, "held_out": 4, "epochs": 2, "batch": 4, "learning_rate": 3e-3,
-        "schedule": "cosine", "warm_up_steps": 2, "weight_decay": 0.05, "average": 0.9, "gradient_limit": 1.0,
-        "dropout": 0.1, "noise": 0.02, "direct": SIZE,
-    }  # fmt: skip
+        "task": "direct",
+        "objects": 16,
+        "held_out": 4,
+        "epochs": 2,
+        "batch": 4,
+        "learning_rate": 3e-3,
+        "schedule": "cosine",
+        "warm_up_steps": 2,
+        "weight_decay": 0.05,
+        "average": 0.9,
+        "gradient_limit": 1.0,
+        "dropout": 0.1,
+        "noise": 0.02,
+        "direct": SIZE,
+    }
     return Recipe.model_validate(facts | changes)
 
 
 def _painted(maps: MapSet) -> MapSet:
-    """Return the same objects in one color each, green twice as bright as red, in maps as in images."""
+    """Return the same objects in one color each, green twice as bright as red, in maps as in
+    images.
+    """
     share = np.array([0.4, 0.8, 0.6], np.float32)[:, None, None]
-    return MapSet(maps.depth_m, maps.intensity[:, None] * share, (maps.image[:, None] * share).astype(np.float16))
+    return MapSet(
+        maps.depth_m,
+        maps.intensity[:, None] * share,
+        (maps.image[:, None] * share).astype(np.float16),
+    )
 
 
 class Source:
@@ -56,9 +75,13 @@ class Source:
         self.maps = maps or small_maps(12, 0)
         self.normal = CellNormal(color=self.maps.image.ndim == 4)
         self.noise: MapNoise | None = None
-        depth_m, intensity = (torch.from_numpy(values) for values in (self.maps.depth_m, self.maps.intensity))
+        depth_m, intensity = (
+            torch.from_numpy(values) for values in (self.maps.depth_m, self.maps.intensity)
+        )
         self.normal.learn(depth_m, intensity)
-        self.batch = NormalBatch(self.normal(depth_m, intensity).half(), torch.from_numpy(self.maps.image))
+        self.batch = NormalBatch(
+            self.normal(depth_m, intensity).half(), torch.from_numpy(self.maps.image)
+        )
 
     def batches(self, batch: int, generator: torch.Generator) -> Iterable[NormalBatch]:
         for rows in torch.randperm(12, generator=generator).split(batch):
@@ -66,7 +89,9 @@ class Source:
 
 
 def _shaken() -> DirectNetwork:
-    """Return a network for these maps, of random parameters: residual blocks would otherwise start as nothing."""
+    """Return a network for these maps, of random parameters: residual blocks would otherwise start
+    as nothing.
+    """
     network = DirectNetwork(SIZE)
     network.normal.load_state_dict(Source().normal.state_dict())
     torch.manual_seed(1)
@@ -76,21 +101,27 @@ def _shaken() -> DirectNetwork:
 
 
 def test_answer_to_mirrored_maps_is_the_mirrored_answer_by_linear_layers_of_both_sides() -> None:
-    network, normal = _shaken(), torch.randn(3, 2, 64, 80)
+    network = _shaken()
+    normal = torch.randn(3, 2, 64, 80)
     logits = network.logits(normal)
     torch.testing.assert_close(network.logits(normal.flip(-2)), logits.flip(-2), rtol=0, atol=1e-5)
     assert float(logits.detach().std()) > 0.1
     assert (logits - logits.flip(-2)).abs().max() > 0.1
-    layer, sides = direct.MirrorLinear(5, 3), torch.randn(4, 2, 5)
-    own, other = (layer.even.weight + layer.odd.weight) / 2, (layer.even.weight - layer.odd.weight) / 2
+    layer = direct.MirrorLinear(5, 3)
+    sides = torch.randn(4, 2, 5)
+    own = (layer.even.weight + layer.odd.weight) / 2
+    other = (layer.even.weight - layer.odd.weight) / 2
     top = 0.98 * (sides[:, 0] @ own.T + sides[:, 1] @ other.T) + 0.7 * layer.even.bias
     torch.testing.assert_close(layer(sides)[:, 0], top)
 
 
 @pytest.mark.parametrize(("row", "column"), [(0, 0), (9, 21), (40, 63), (63, 5)])
 def test_each_pixel_has_its_place(row: int, column: int) -> None:
-    """A head's bias moves the same pixel of every token: its rows count down above, up below the middle."""
-    network, normal = _shaken(), torch.zeros(1, 2, 64, 80)
+    """A head's bias moves the same pixel of every token: its rows count down above, up below the
+    middle.
+    """
+    network = _shaken()
+    normal = torch.zeros(1, 2, 64, 80)
     plain = network.logits(normal)
     within = (row if row < 32 else 63 - row) % 8
     with torch.no_grad():
@@ -101,23 +132,30 @@ def test_each_pixel_has_its_place(row: int, column: int) -> None:
 
 
 def test_cells_are_normalised_symmetrically_clipped_and_without_the_gain_of_a_frame() -> None:
-    maps, normal = small_maps(40, 0), CellNormal()
-    depth_m, intensity = torch.from_numpy(maps.depth_m.copy()), torch.from_numpy(maps.intensity)
+    maps = small_maps(40, 0)
+    normal = CellNormal()
+    depth_m = torch.from_numpy(maps.depth_m.copy())
+    intensity = torch.from_numpy(maps.intensity)
     depth_m[:, 3, 7] = torch.nan
     normal.learn(depth_m, intensity)
     values = normal(depth_m, intensity)
     assert (values[:, :, 3, 7] == 0).all()
     assert values.abs().max() <= direct.CLIP
     torch.testing.assert_close(normal(depth_m.flip(-2), intensity.flip(-2)), values.flip(-2))
-    normal, generator = CellNormal(), torch.Generator().manual_seed(0)
+    normal = CellNormal()
+    generator = torch.Generator().manual_seed(0)
     depth_m = 0.3 + 0.01 * torch.randn(30, 64, 80, generator=generator)
-    busy = torch.linspace(0, 0.2, 80) * torch.randn(30, 64, 80, generator=generator)  # columns differ more and more
+    busy = torch.linspace(0, 0.2, 80) * torch.randn(
+        30, 64, 80, generator=generator
+    )  # columns differ more and more
     intensity = 20 * torch.exp(busy)
     normal.learn(depth_m, intensity)
     assert float(normal.spread[1].min()) == pytest.approx(direct.MIN_LIGHT_SPREAD)
     for gain in (-1.0, 0.05, 0.7):
         brighter = torch.expm1(torch.log1p(intensity) + gain)
-        torch.testing.assert_close(normal(depth_m, brighter), normal(depth_m, intensity), atol=1e-3, rtol=0)
+        torch.testing.assert_close(
+            normal(depth_m, brighter), normal(depth_m, intensity), atol=1e-3, rtol=0
+        )
     assert not normal(torch.full_like(depth_m, torch.nan), intensity).any()
 
 
@@ -137,7 +175,9 @@ def test_loss_is_least_at_the_truth() -> None:
 
 
 def test_image_is_cut_where_the_expected_overlap_is_largest() -> None:
-    """An object of which much is unsure is shown larger than one that is sure; nothing stays nothing."""
+    """An object of which much is unsure is shown larger than one that is sure; nothing stays
+    nothing.
+    """
     share = torch.full((3, 64, 64), 0.01)
     share[:2, 20:40, 20:40] = 0.9
     share[0, 20:40, 40:44] = 0.4
@@ -148,7 +188,8 @@ def test_image_is_cut_where_the_expected_overlap_is_largest() -> None:
 
 
 def test_color_is_learnt_by_the_same_two_heads(tmp_path: Path) -> None:
-    recipe, source = _recipe(colour=True, epochs=25, dropout=0.0, average=0.0), Source(_painted(small_maps(12, 0)))
+    recipe = _recipe(colour=True, epochs=25, dropout=0.0, average=0.0)
+    source = Source(_painted(small_maps(12, 0)))
     network, figures = train_direct(recipe, source, _painted(small_maps(4, 1)), tmp_path)
     made = reconstruct(network, source.maps)
     assert made.shape == source.maps.image.shape
@@ -157,20 +198,29 @@ def test_color_is_learnt_by_the_same_two_heads(tmp_path: Path) -> None:
     assert found["silhouette_iou"].mean() > 0.5
     assert found["colour_error"].mean() < 0.2
     normal = source.batch.normal[:3].float()
-    torch.testing.assert_close(network.logits(normal.flip(-2)), network.logits(normal).flip(-2), rtol=0, atol=1e-5)
+    torch.testing.assert_close(
+        network.logits(normal.flip(-2)), network.logits(normal).flip(-2), rtol=0, atol=1e-5
+    )
     varied = network.normal.vary(normal, None, torch.full((3, 64, 80), 0.3), torch.full((3,), 0.01))
-    moved, returns = (varied - normal) * network.normal.spread, (normal != 0).any(1) & (varied.abs() < 5).all(1)
-    torch.testing.assert_close(moved[:, 0][returns], torch.full_like(moved[:, 0][returns], 0.01), atol=1e-4, rtol=0)
+    moved = (varied - normal) * network.normal.spread
+    returns = (normal != 0).any(1) & (varied.abs() < 5).all(1)
+    torch.testing.assert_close(
+        moved[:, 0][returns], torch.full_like(moved[:, 0][returns], 0.01), atol=1e-4, rtol=0
+    )
     assert float(moved[:, 1:].median()) >= 0
     save_direct(tmp_path, network, CheckpointRecord.of([recipe], ("paper-rig", "0" * 64)))
     again, record = load_network(tmp_path)
     assert (record.note, record.color) == (SIMULATION_ONLY, True)
-    assert float((np.abs(reconstruct(again, source.maps) - made) < 0.02).mean()) > 0.999  # float16 moves an edge
+    assert (
+        float((np.abs(reconstruct(again, source.maps) - made) < 0.02).mean()) > 0.999
+    )  # float16 moves an edge
     with pytest.raises(TrainingError, match="simulation only"):
         direct_start(_recipe(start="weights"), tmp_path)
 
 
-def _train(folder: Path, running: Running | None = None, **changes: object) -> tuple[DirectNetwork, Scores]:
+def _train(
+    folder: Path, running: Running | None = None, **changes: object
+) -> tuple[DirectNetwork, Scores]:
     return train_direct(_recipe(**changes), Source(), small_maps(4, 1), folder, running)
 
 
@@ -181,33 +231,55 @@ def test_run_stopped_halfway_resumes_exactly_and_follows_its_recipe(tmp_path: Pa
     resumed, again = _train(tmp_path / "cut")
     assert not changed_tensors(whole.state_dict(), resumed.state_dict())
     assert figures == again
-    for name, changes in (("plain", {"average": 0.0}), ("varied", {"wall_texture": 0.05, "range_offset_m": 0.05})):
-        assert changed_tensors(whole.state_dict(), _train(tmp_path / name, **changes)[0].state_dict())
+    for name, changes in (
+        ("plain", {"average": 0.0}),
+        ("varied", {"wall_texture": 0.05, "range_offset_m": 0.05}),
+    ):
+        assert changed_tensors(
+            whole.state_dict(), _train(tmp_path / name, **changes)[0].state_dict()
+        )
 
 
 def test_training_goes_on_from_weights_that_grow(weights: Path, tmp_path: Path) -> None:
-    """More blocks and mixers begin as nothing: the first epoch of no learning has the weights' own answers."""
+    """More blocks and mixers begin as nothing: the first epoch of no learning has the weights' own
+    answers.
+    """
     recipe = _recipe(
-        start="weights", learning_rate=1e-7, dropout=0.0, epochs=1, direct=SIZE.model_copy(update={"mixers": 3})
+        start="weights",
+        learning_rate=1e-7,
+        dropout=0.0,
+        epochs=1,
+        direct=SIZE.model_copy(update={"mixers": 3}),
     )
     start, runs = direct_start(recipe, weights)
     assert runs == [_recipe()]
     grown, _ = train_direct(recipe, Source(), small_maps(4, 1), tmp_path, start=start)
-    np.testing.assert_allclose(reconstruct(grown, Source().maps), reconstruct(start, Source().maps), atol=1e-3)
+    np.testing.assert_allclose(
+        reconstruct(grown, Source().maps), reconstruct(start, Source().maps), atol=1e-3
+    )
     assert direct_start(_recipe(), None) == (None, [])
 
 
-def test_blend_is_the_mean_of_the_trained_weights_and_those_before(weights: Path, tmp_path: Path) -> None:
+def test_blend_is_the_mean_of_the_trained_weights_and_those_before(
+    weights: Path, tmp_path: Path
+) -> None:
     start, _ = direct_start(_recipe(start="weights"), weights)
     made = list[tuple[DirectNetwork, Scores]]()
     for share in (1.0, 0.25):
         recipe = _recipe(start="weights", blend=share)
-        made.append(train_direct(recipe, Source(), small_maps(4, 1), tmp_path / f"{share}", start=start))
+        made.append(
+            train_direct(recipe, Source(), small_maps(4, 1), tmp_path / f"{share}", start=start)
+        )
     (trained, plain), (blended, figures) = made
-    before, after = start.state_dict(), trained.state_dict()
+    before = start.state_dict()
+    after = trained.state_dict()
     for name, found in blended.state_dict().items():
         torch.testing.assert_close(found, 0.75 * before[name] + 0.25 * after[name])
-    assert figures == figures_of(reconstruct(blended, small_maps(4, 1)), small_maps(4, 1).image) != plain
+    assert (
+        figures
+        == figures_of(reconstruct(blended, small_maps(4, 1)), small_maps(4, 1).image)
+        != plain
+    )
 
 
 def test_average_is_scored_and_kept_and_minutes_are_logged(tmp_path: Path) -> None:
@@ -245,14 +317,20 @@ def test_weights_are_exported_and_kept_apart_from_a_pipeline(weights: Path, tmp_
     assert ((told.image > 0) <= (told.surface > direct.CUTS[0])).all()
     assert not [*tmp_path.iterdir()]
     stored = onnx.load(weights / "network.onnx", load_external_data=False).graph.initializer
-    inline = [each.name for each in stored if len(each.dims) == 2 and each.data_location != TensorProto.EXTERNAL]
+    inline = [
+        each.name
+        for each in stored
+        if len(each.dims) == 2 and each.data_location != TensorProto.EXTERNAL
+    ]
     assert not inline  # no matrix is stored twice, the transposed ones included
     with pytest.raises(CheckpointError, match="direct network"):
         load_pipeline(weights)
 
 
 @pytest.mark.parametrize("change", [{"width": 16}, {"mixers": 0}])
-def test_start_refuses_weights_that_the_recipe_cannot_hold(weights: Path, change: dict[str, int]) -> None:
+def test_start_refuses_weights_that_the_recipe_cannot_hold(
+    weights: Path, change: dict[str, int]
+) -> None:
     recipe = _recipe(start="weights", direct=SIZE.model_copy(update=change))
     with pytest.raises(TrainingError, match="not a part of the recipe's"):
         direct_start(recipe, weights)
@@ -260,14 +338,23 @@ def test_start_refuses_weights_that_the_recipe_cannot_hold(weights: Path, change
         direct_start(recipe, Path("paper"))
 
 
-def test_varied_maps_are_those_of_another_wall_with_stains_of_variance_1_and_of_another_range() -> None:
+def test_varied_maps_are_those_of_another_wall_with_stains_of_variance_1_and_of_another_range() -> (
+    None
+):
     """Stains and an offset on normalised maps are what they would be on the maps themselves."""
-    maps, normal = small_maps(40, 0), CellNormal()
-    depth_m, intensity = torch.from_numpy(maps.depth_m), torch.from_numpy(maps.intensity)
+    maps = small_maps(40, 0)
+    normal = CellNormal()
+    depth_m = torch.from_numpy(maps.depth_m)
+    intensity = torch.from_numpy(maps.intensity)
     normal.learn(depth_m, intensity)
-    reflectance, offset_m = _stains(40, torch.device("cpu")) * 0.05, torch.linspace(-3e-3, 3e-3, 40)
-    reflectance -= normal.log_gain(reflectance.expand(40, 64, 80))[:, None, None]  # a frame's gain is taken out
-    measured = normal(depth_m + offset_m[:, None, None], torch.expm1(torch.log1p(intensity)) * reflectance.exp())
+    reflectance = _stains(40, torch.device("cpu")) * 0.05
+    offset_m = torch.linspace(-3e-3, 3e-3, 40)
+    reflectance -= normal.log_gain(reflectance.expand(40, 64, 80))[
+        :, None, None
+    ]  # a frame's gain is taken out
+    measured = normal(
+        depth_m + offset_m[:, None, None], torch.expm1(torch.log1p(intensity)) * reflectance.exp()
+    )
     varied = normal.vary(normal(depth_m, intensity), None, reflectance, offset_m)
     assert float((measured - varied).abs().median()) < 0.02
     torch.testing.assert_close(normal.vary(varied, None, None, None), varied, atol=1e-4, rtol=0)
@@ -279,8 +366,11 @@ def test_varied_maps_are_those_of_another_wall_with_stains_of_variance_1_and_of_
 
 
 def test_shift_follows_another_bench_and_nothing_else() -> None:
-    maps, normal, shifted = small_maps(40, 0), CellNormal(), CellNormal()
-    depth_m, intensity = torch.from_numpy(maps.depth_m), torch.from_numpy(maps.intensity)
+    maps = small_maps(40, 0)
+    normal = CellNormal()
+    shifted = CellNormal()
+    depth_m = torch.from_numpy(maps.depth_m)
+    intensity = torch.from_numpy(maps.intensity)
     normal.learn(depth_m, intensity)
     shifted.load_state_dict(normal.state_dict())
     shifted.shift(depth_m, intensity)
@@ -297,13 +387,26 @@ def test_shift_follows_another_bench_and_nothing_else() -> None:
 def test_transfer_learns_the_bench_in_two_phases_and_resumes(tmp_path: Path) -> None:
     def go(folder: Path, running: Running | None = None) -> tuple[DirectNetwork, float]:
         recipe = _recipe(**TRANSFER, all_layers_epochs=12, epochs=3, average=0.0)
-        after, figures = transfer_direct(recipe, _shaken(), InMemory(Source().maps), small_maps(4, 1), folder, running)
+        after, figures = transfer_direct(
+            recipe, _shaken(), InMemory(Source().maps), small_maps(4, 1), folder, running
+        )
         return after, figures["held_out_loss"]
 
     network, loss = go(tmp_path / "whole")
-    assert loss < figures_of(reconstruct(_shaken(), small_maps(4, 1)), small_maps(4, 1).image)["held_out_loss"]
-    first = torch.load(io.BytesIO((tmp_path / "whole" / "all-layers" / LAST).read_bytes()[32:]), weights_only=True)
-    last = {name for name, values in network.state_dict().items() if not torch.equal(values, first["module"][name])}
+    assert (
+        loss
+        < figures_of(reconstruct(_shaken(), small_maps(4, 1)), small_maps(4, 1).image)[
+            "held_out_loss"
+        ]
+    )
+    first = torch.load(
+        io.BytesIO((tmp_path / "whole" / "all-layers" / LAST).read_bytes()[32:]), weights_only=True
+    )
+    last = {
+        name
+        for name, values in network.state_dict().items()
+        if not torch.equal(values, first["module"][name])
+    }
     assert {name.partition(".")[0] for name in last} <= {"norm", "heads"}
     with pytest.raises(KeyboardInterrupt):
         go(tmp_path / "cut", Running(stop=iter([False] * 20 + [True]).__next__))
@@ -318,9 +421,12 @@ def test_transfer_of_direct_weights_is_saved_with_both_runs(weights: Path, tmp_p
     network, start = transfer_start(recipe, weights, partial=False, on_report=pytest.fail)
     record = record_run(recipe, tmp_path / "out", ("paper-rig", "0" * 64), start.runs, weights)
     job = TrainingRun(recipe, tmp_path / "out", record)
-    figures = run_transfer(open_fabric(recipe), job, network, None, InMemory(Source().maps), small_maps(4, 1))
+    figures = run_transfer(
+        open_fabric(recipe), job, network, None, InMemory(Source().maps), small_maps(4, 1)
+    )
     assert set(figures) == {"before", "after"}
     assert load_record(tmp_path / "out").runs == [*start.runs, recipe]
-    maps, (loaded, _) = Source().maps, load_network(tmp_path / "out")
+    maps = Source().maps
+    (loaded, _) = load_network(tmp_path / "out")
     images = load_reconstructor(tmp_path / "out", tmp_path)(maps.depth_m, maps.intensity)
     np.testing.assert_allclose(images, reconstruct(loaded, maps), atol=1e-5)

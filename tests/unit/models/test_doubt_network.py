@@ -1,4 +1,6 @@
-"""Uncertainty ("doubt") network: features, training, calibration, predicted quality, and files beside the weights."""
+"""Uncertainty ("doubt") network: features, training, calibration, predicted quality, and files
+beside the weights.
+"""
 
 from pathlib import Path
 from typing import Any
@@ -7,9 +9,29 @@ import numpy as np
 import pytest
 import torch
 from fake_doubter import RECIPE
-from nlos_models import DoubtRecord, Running, doubt_network, doubt_training, load_uncertainty_model, quality, records
-from nlos_models.doubt_network import MAX_ERROR_V, MIN_ERROR_V, CalibratedDoubt, DoubtNetwork, DoubtOutput
-from nlos_models.doubt_training import QualitySet, families, fit_quality, left_out_folds, trusted_above
+from nlos_models import (
+    DoubtRecord,
+    Running,
+    doubt_network,
+    doubt_training,
+    load_uncertainty_model,
+    quality,
+    records,
+)
+from nlos_models.doubt_network import (
+    MAX_ERROR_V,
+    MIN_ERROR_V,
+    CalibratedDoubt,
+    DoubtNetwork,
+    DoubtOutput,
+)
+from nlos_models.doubt_training import (
+    QualitySet,
+    families,
+    fit_quality,
+    left_out_folds,
+    trusted_above,
+)
 from nlos_models.errors import CheckpointError
 from nlos_models.inference import UncertaintyEstimate
 from nlos_models.quality import QualityEstimate, QualityModel, QualityRecord, quality_features
@@ -25,21 +47,33 @@ def network() -> DoubtNetwork:
     return DoubtNetwork().eval().requires_grad_(requires_grad=False)
 
 
-def test_features_are_zero_at_the_median_bare_wall_and_mark_a_cell_without_return(network: DoubtNetwork) -> None:
+def test_features_are_zero_at_the_median_bare_wall_and_mark_a_cell_without_return(
+    network: DoubtNetwork,
+) -> None:
     generator = torch.Generator().manual_seed(0)
-    bare_m, counts = torch.rand(64, 80, generator=generator), 40 * torch.rand(64, 80, generator=generator)
+    bare_m = torch.rand(64, 80, generator=generator)
+    counts = 40 * torch.rand(64, 80, generator=generator)
     depth_m = bare_m.repeat(5, 1, 1)
-    depth_m[0], depth_m[1, 0, 0] = bare_m + 0.3, torch.nan
+    depth_m[0] = bare_m + 0.3
+    depth_m[1, 0, 0] = torch.nan
     network.learn_bare(depth_m, counts.repeat(5, 1, 1))
     assert float(network.features(bare_m[None], counts[None]).abs().max()) == 0.0
     assert float(network.features(bare_m[None] + 0.05, counts[None] + 5)[:, :4].min()) > 0.4
     bare_m[3, 4] = torch.nan
-    assert network.features(bare_m[None], counts[None] + 9)[0, :, 3, 4].tolist() == [0.0, 0.0, 0.0, 0.0, 1.0]
+    assert network.features(bare_m[None], counts[None] + 9)[0, :, 3, 4].tolist() == [
+        0.0,
+        0.0,
+        0.0,
+        0.0,
+        1.0,
+    ]
 
 
 @pytest.mark.parametrize("name", HARD_MAPS)
 @pytest.mark.parametrize("v", [0.0, 1.0])
-def test_doubt_of_hard_maps_is_finite_and_in_range(network: DoubtNetwork, name: str, v: float) -> None:
+def test_doubt_of_hard_maps_is_finite_and_in_range(
+    network: DoubtNetwork, name: str, v: float
+) -> None:
     calibrated = CalibratedDoubt(network, (1.0, 2.0), 3.0).eval()
     nothing, outside, error_v, surface = calibrated(*hard_maps(name), torch.full((1, 64, 64), v))
     for probability in (nothing, outside, surface):
@@ -50,41 +84,66 @@ def test_doubt_of_hard_maps_is_finite_and_in_range(network: DoubtNetwork, name: 
 
 
 def test_calibration_scales_error_and_divides_logits(network: DoubtNetwork) -> None:
-    maps, image = hard_maps("saturated"), torch.full((1, 64, 64), 0.5)
-    plain, scaled = (CalibratedDoubt(network, t, s).eval()(*maps, image) for t, s in (((1, 1), 1), ((2, 4), 1.5)))
+    maps = hard_maps("saturated")
+    image = torch.full((1, 64, 64), 0.5)
+    plain, scaled = (
+        CalibratedDoubt(network, t, s).eval()(*maps, image) for t, s in (((1, 1), 1), ((2, 4), 1.5))
+    )
     torch.testing.assert_close(scaled[2], 1.5 * plain[2])
     for one, other, divisor in zip(plain[:2], scaled[:2], (2.0, 4.0), strict=True):
         torch.testing.assert_close(torch.logit(other) * divisor, torch.logit(one))
 
 
 QUICK = RECIPE.model_copy(
-    update={"objects": 128, "epochs": 8, "batch": 16, "learning_rate": 5e-3, "schedule": "one-cycle"}
+    update={
+        "objects": 128,
+        "epochs": 8,
+        "batch": 16,
+        "learning_rate": 5e-3,
+        "schedule": "one-cycle",
+    }
 )
 
 
 def _train(folder: Path, steps: list[int], **running: Any) -> DoubtNetwork:
     counted = Running(on_step=lambda done, _: steps.append(done), **running)
-    return doubt_training.train_doubt(QUICK, small_doubt_set(128, 0), small_doubt_set(32, 1), folder, counted)[0]
+    return doubt_training.train_doubt(
+        QUICK, small_doubt_set(128, 0), small_doubt_set(32, 1), folder, counted
+    )[0]
 
 
 @pytest.mark.slow
-def test_doubt_run_resumes_exactly_and_learns_what_is_empty_unusual_or_uncertain(tmp_path: Path) -> None:
-    steps, trained, fresh = list[int](), _train(tmp_path / "whole", []), small_doubt_set(64, 2)
+def test_doubt_run_resumes_exactly_and_learns_what_is_empty_unusual_or_uncertain(
+    tmp_path: Path,
+) -> None:
+    steps = list[int]()
+    trained = _train(tmp_path / "whole", [])
+    fresh = small_doubt_set(64, 2)
     with pytest.raises(KeyboardInterrupt):
         _train(tmp_path / "stopped", steps, stop=lambda: len(steps) == 11)
-    torch.testing.assert_close(_train(tmp_path / "stopped", steps).state_dict(), trained.state_dict())
+    torch.testing.assert_close(
+        _train(tmp_path / "stopped", steps).state_dict(), trained.state_dict()
+    )
     assert steps == list(range(1, 65))
     said = doubt_training.predict(trained, fresh)
     assert ((said.nothing.numpy() > 0) == fresh.nothing).mean() > 0.9
     there = ~fresh.nothing
     assert np.corrcoef(said.outside.numpy()[there], fresh.outside[there])[0, 1] > 0.8
-    dark, bright = (said.log_error.numpy()[fresh.truth == value].mean() for value in np.float16([DARK_V, 0.8]))
+    dark, bright = (
+        said.log_error.numpy()[fresh.truth == value].mean() for value in np.float16([DARK_V, 0.8])
+    )
     assert dark > bright + 0.3
     some = small_doubt_set(200, 3)
-    fitted, said = doubt_training.calibrate(trained, some), doubt_training.predict(trained, some)
-    nothing, outside = (torch.sigmoid(part / t).numpy() for part, t in zip(said[:2], fitted.temperatures, strict=True))
+    fitted = doubt_training.calibrate(trained, some)
+    said = doubt_training.predict(trained, some)
+    nothing, outside = (
+        torch.sigmoid(part / t).numpy()
+        for part, t in zip(said[:2], fitted.temperatures, strict=True)
+    )
     usual = ~some.nothing & ~some.outside
-    assert (outside[usual] > fitted.outside_above + 1e-6).mean() <= doubt_training.MAX_FALSE_ALARMS + 1 / usual.sum()
+    assert (
+        outside[usual] > fitted.outside_above + 1e-6
+    ).mean() <= doubt_training.MAX_FALSE_ALARMS + 1 / usual.sum()
     assert (nothing[some.nothing] < fitted.nothing_above).mean() <= 1 / some.nothing.sum()
     assert fitted.nothing_above <= 0.5
     assert fitted.error_scale > 0
@@ -92,17 +151,23 @@ def test_doubt_run_resumes_exactly_and_learns_what_is_empty_unusual_or_uncertain
 
 def test_doubt_loss_is_least_at_mean_error_of_pixels_in_both_images() -> None:
     some = small_doubt_set(64, 0)
-    there, empty = (doubt_training.as_doubt_batch(some.where(rows)) for rows in (~some.nothing, some.nothing))
+    there, empty = (
+        doubt_training.as_doubt_batch(some.where(rows)) for rows in (~some.nothing, some.nothing)
+    )
 
     def loss(batch: doubt_training.DoubtBatch, log_error: float) -> float:
-        flat, pixels = torch.zeros(len(batch.made)), torch.zeros_like(batch.made)
-        return float(doubt_training.doubt_loss(DoubtOutput(flat, flat, pixels + log_error, pixels), batch))
+        flat = torch.zeros(len(batch.made))
+        pixels = torch.zeros_like(batch.made)
+        return float(
+            doubt_training.doubt_loss(DoubtOutput(flat, flat, pixels + log_error, pixels), batch)
+        )
 
     shared = (there.truth > 0) & (there.made > 0)
     mean = float((there.made - there.truth).abs()[shared].mean().log())
     assert loss(there, mean) < min(loss(there, mean - 0.2), loss(there, mean + 0.2))
     assert loss(empty, -3.0) == loss(empty, 1.0)
-    made, truth = np.array([[[0.5, 0.5], [0.0, 0.0]]]), np.array([[[0.25, 0.0], [0.5, 0.0]]])
+    made = np.array([[[0.5, 0.5], [0.0, 0.0]]])
+    truth = np.array([[[0.25, 0.0], [0.5, 0.0]]])
     known, error = doubt_training.shared_errors(made, truth)
     assert known.tolist() == [[[True, False], [False, False]]]
     assert error.tolist() == [0.25]
@@ -122,7 +187,9 @@ def test_error_scale_undoes_factor_in_any_unit(factor: float, unit: float) -> No
     expected = np.random.default_rng(1).uniform(0.01, 0.2, 20_000)
     error = np.abs(np.random.default_rng(0).laplace(0.0, expected))
     scale = doubt_training.error_scale(expected, error)
-    assert factor * doubt_training.error_scale(factor * unit * expected, unit * error) == pytest.approx(scale)
+    assert factor * doubt_training.error_scale(
+        factor * unit * expected, unit * error
+    ) == pytest.approx(scale)
     assert scale == pytest.approx(1.0, rel=0.03)
 
 
@@ -145,7 +212,9 @@ def record(tmp_path: Path, watched: Path) -> DoubtRecord:
     return untrained_doubt(tmp_path / "run", watched)
 
 
-def test_doubt_is_restored_with_the_weights_that_it_watches(tmp_path: Path, watched: Path, record: DoubtRecord) -> None:
+def test_doubt_is_restored_with_the_weights_that_it_watches(
+    tmp_path: Path, watched: Path, record: DoubtRecord
+) -> None:
     network, found = doubt_network.load_doubt(tmp_path / "run")
     assert found == record
     assert not network.training
@@ -168,14 +237,19 @@ def test_doubt_is_restored_with_the_weights_that_it_watches(tmp_path: Path, watc
         *((records.DOUBT_RECORD, text) for text in (b"{", b'{"watches": "x"}', b"\xff")),
     ],
 )
-def test_load_doubt_refuses_other_weights_or_damaged_record(tmp_path: Path, name: str, content: bytes) -> None:
+def test_load_doubt_refuses_other_weights_or_damaged_record(
+    tmp_path: Path, name: str, content: bytes
+) -> None:
     (tmp_path / "run" / name).write_bytes(content)
     with pytest.raises(CheckpointError, match=records.DOUBT_RECORD):
         doubt_network.load_doubt(tmp_path / "run")
 
 
-def test_saved_bare_wall_is_exact_and_watched_weights_stay(tmp_path: Path, watched: Path, record: DoubtRecord) -> None:
-    network, wall_m = doubt_network.load_doubt(tmp_path / "run")[0].network, 0.3 + 1e-4 * torch.rand(5, 64, 80)
+def test_saved_bare_wall_is_exact_and_watched_weights_stay(
+    tmp_path: Path, watched: Path, record: DoubtRecord
+) -> None:
+    network = doubt_network.load_doubt(tmp_path / "run")[0].network
+    wall_m = 0.3 + 1e-4 * torch.rand(5, 64, 80)
     network.learn_bare(wall_m, wall_m)
     doubt_network.save_doubt(tmp_path / "second", network, record, watched)
     again = doubt_network.load_doubt(tmp_path / "second")[0].network
@@ -186,8 +260,11 @@ def test_saved_bare_wall_is_exact_and_watched_weights_stay(tmp_path: Path, watch
 
 
 @pytest.mark.slow
-def test_doubter_onnx_equals_torch_and_is_exported_once(tmp_path: Path, record: DoubtRecord) -> None:
-    folder, cache = tmp_path / "run", tmp_path / "cache"
+def test_doubter_onnx_equals_torch_and_is_exported_once(
+    tmp_path: Path, record: DoubtRecord
+) -> None:
+    folder = tmp_path / "run"
+    cache = tmp_path / "cache"
     doubter = load_uncertainty_model(folder, cache)
     (model,) = cache.glob("doubt-*.onnx")
     written_ns = model.stat().st_mtime_ns
@@ -212,18 +289,26 @@ def frames(count: int, seed: int = 0) -> tuple[np.ndarray, UncertaintyEstimate]:
     images = np.zeros((count, 64, 64), np.float32)
     for image in images:
         row, column = generator.integers(5, 30, 2)
-        image[row : row + 20, column : column + generator.integers(8, 30)] = generator.uniform(0.2, 0.9)
+        image[row : row + 20, column : column + generator.integers(8, 30)] = generator.uniform(
+            0.2, 0.9
+        )
     p, error = (generator.random(images.shape).astype(np.float32) for _ in range(2))
-    return images, UncertaintyEstimate(*(generator.random(count).astype(np.float32) for _ in range(2)), error, p)
+    return images, UncertaintyEstimate(
+        *(generator.random(count).astype(np.float32) for _ in range(2)), error, p
+    )
 
 
 def known_objects(count: int, best: float = 1.0) -> QualitySet:
-    """Return objects whose IoU, up to `best`, is their first figure's, and whose error falls with it."""
+    """Return objects whose IoU, up to `best`, is their first figure's, and whose error falls with
+    it.
+    """
     generator = np.random.default_rng(1)
     figures = generator.standard_normal((count, quality.FEATURES)).astype(np.float32)
     iou = best / (1 + np.exp(-2 * figures[:, 0]))
     kind = np.array([KINDS[k % len(KINDS)] for k in range(count)])
-    return QualitySet(figures, iou, (0.2 - 0.1 * iou).astype(np.float32), kind, np.arange(count) % len(KINDS) > 1)
+    return QualitySet(
+        figures, iou, (0.2 - 0.1 * iou).astype(np.float32), kind, np.arange(count) % len(KINDS) > 1
+    )
 
 
 @pytest.fixture(autouse=True)
@@ -232,12 +317,16 @@ def _short(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(doubt_training, "FOLDS", 2)
 
 
-def test_figures_are_those_of_the_mirrored_frame_and_of_a_frame_alone_and_finite_without_a_surface() -> None:
+def test_figures_are_those_of_the_mirrored_frame_and_of_a_frame_alone_and_finite_without_a_surface() -> (
+    None
+):
     images, said = frames(4)
     turned = said._replace(error_v=said.error_v[:, ::-1], p_surface=said.p_surface[:, ::-1])
     figures = quality_features(images, said)
     assert figures.shape == (4, quality.FEATURES)
-    np.testing.assert_allclose(quality_features(images[:, ::-1], turned), figures, rtol=1e-4, atol=1e-4)
+    np.testing.assert_allclose(
+        quality_features(images[:, ::-1], turned), figures, rtol=1e-4, atol=1e-4
+    )
     alone = quality_features(images[1:2], UncertaintyEstimate(*(part[1:2] for part in said)))
     np.testing.assert_allclose(alone[0], figures[1], rtol=1e-4, atol=1e-5)
     assert np.isfinite(quality_features(np.zeros_like(images), said)).all()
@@ -249,12 +338,23 @@ def test_figures_are_those_of_the_mirrored_frame_and_of_a_frame_alone_and_finite
     assert np.isfinite(quality_features(np.zeros_like(images), said, np.zeros_like(images))).all()
 
 
-def test_model_takes_a_network_s_own_probability_of_a_surface_where_it_was_fitted_with_one() -> None:
-    """Without one it takes the uncertainty network's, and a model that was fitted without one leaves it out."""
-    (images, said), own, models = frames(3), np.full((3, 64, 64), 0.5, np.float32), list[QualityModel]()
-    for count in (quality.FEATURES, quality.WITH_SURFACE):  # whose outputs are the sum of small figures
+def test_model_takes_a_network_s_own_probability_of_a_surface_where_it_was_fitted_with_one() -> (
+    None
+):
+    """Without one it takes the uncertainty network's, and a model that was fitted without one
+    leaves it out.
+    """
+    images, said = frames(3)
+    own = np.full((3, 64, 64), 0.5, np.float32)
+    models = list[QualityModel]()
+    for count in (
+        quality.FEATURES,
+        quality.WITH_SURFACE,
+    ):  # whose outputs are the sum of small figures
         layers = np.vstack([np.full((count, 5), 0.1), np.zeros((1, 5))])[None].tolist()
-        models.append(QualityModel(record_of(means=[0.0] * count, spreads=[10.0] * count, layers=layers)))
+        models.append(
+            QualityModel(record_of(means=[0.0] * count, spreads=[10.0] * count, layers=layers))
+        )
     plain, wide = models
     np.testing.assert_array_equal(plain(images, said, own).iou, plain(images, said).iou)
     np.testing.assert_array_equal(wide(images, said, said.p_surface).iou, wide(images, said).iou)
@@ -271,7 +371,9 @@ def test_no_family_is_both_fitted_and_judged_and_every_row_is_judged_once() -> N
     assert sorted(judged) == list(range(len(kinds)))
 
 
-def test_fit_predicts_the_quality_of_kinds_that_it_never_saw_also_by_a_figure_that_never_differs() -> None:
+def test_fit_predicts_the_quality_of_kinds_that_it_never_saw_also_by_a_figure_that_never_differs() -> (
+    None
+):
     samples = known_objects(600)
     samples.figures[:, 5] = 1.0
     record = QualityRecord.model_validate_json(fit_quality(samples, "0" * 12).model_dump_json())
@@ -297,7 +399,9 @@ def test_trust_needs_good_outlines_enough_frames_and_precision_in_both_shares() 
     assert not QualityEstimate.of(QualityModel(record).outputs(samples.figures), None).trusted.any()
 
 
-def test_good_outline_of_a_kind_counts_where_the_kind_is_sure_and_older_records_know_no_kinds() -> None:
+def test_good_outline_of_a_kind_counts_where_the_kind_is_sure_and_older_records_know_no_kinds() -> (
+    None
+):
     outputs = np.zeros((3, quality.OUTPUTS), np.float32)
     outputs[:, 3:6] = [(-9, 9, known) for known in (12, 0, -9)]
     assert QualityEstimate.of(outputs, 0.9).trusted.tolist() == [True, False, False]
@@ -317,7 +421,12 @@ def test_shape_that_looks_like_a_kind_is_not_trusted() -> None:
 
 
 def record_of(**values: object) -> QualityRecord:
-    plain = {"means": [0.0] * quality.FEATURES, "spreads": [1.0] * quality.FEATURES, "objects": 1, "watches": "?"}
+    plain = {
+        "means": [0.0] * quality.FEATURES,
+        "spreads": [1.0] * quality.FEATURES,
+        "objects": 1,
+        "watches": "?",
+    }
     layers = np.zeros((1, quality.FEATURES + 1, 5)).tolist()
     return QualityRecord.model_validate({**plain, "layers": layers, **values})
 
@@ -331,11 +440,16 @@ def test_model_is_bound_to_its_uncertainty_network(tmp_path: Path) -> None:
     assert loaded.quality.record == record
     assert loaded.quality(*frames(2)).iou == pytest.approx(np.full((2, 3), 0.5))
     text = (folder / quality.QUALITY).read_text()
-    for spoiled, reason in ((text[:-9], "damaged"), (text.replace(record.watches, "0" * 12), "damaged")):
+    for spoiled, reason in (
+        (text[:-9], "damaged"),
+        (text.replace(record.watches, "0" * 12), "damaged"),
+    ):
         (folder / quality.QUALITY).write_text(spoiled)
         with pytest.raises(CheckpointError, match=reason):
             load_uncertainty_model(folder, tmp_path)
-        assert load_uncertainty_model(folder, tmp_path, quality=False).quality is None  # to fit it again
+        assert (
+            load_uncertainty_model(folder, tmp_path, quality=False).quality is None
+        )  # to fit it again
 
 
 @pytest.mark.parametrize(
@@ -348,8 +462,12 @@ def test_model_is_bound_to_its_uncertainty_network(tmp_path: Path) -> None:
         ({"spreads": [0.0] * quality.FEATURES}, "do not fit"),
     ],
 )
-def test_file_that_does_not_fit_is_refused(tmp_path: Path, values: dict[str, object], reason: str) -> None:
+def test_file_that_does_not_fit_is_refused(
+    tmp_path: Path, values: dict[str, object], reason: str
+) -> None:
     untrained_doubt(folder := tmp_path / "run", watched_weights(tmp_path / "watched"))
-    quality.write_quality(folder, record_of(**{"watches": quality.quality_watches(folder), **values}))
+    quality.write_quality(
+        folder, record_of(**{"watches": quality.quality_watches(folder), **values})
+    )
     with pytest.raises(CheckpointError, match=reason):
         quality.load_quality_model(folder)

@@ -1,4 +1,6 @@
-"""Laws of atomic writes, claims, cache entries and checked files, also with processes killed or racing."""
+"""Laws of atomic writes, claims, cache entries and checked files, also with processes killed or
+racing.
+"""
 
 import multiprocessing
 import os
@@ -16,18 +18,30 @@ import pytest
 from nlos_calibration import read_toml as read_record
 from nlos_models import files
 from nlos_models.errors import FileBusyError, OutputExistsError
-from nlos_models.files import atomic_file, claim, load_cached, read_arrays, read_bounded, read_checked
+from nlos_models.files import (
+    atomic_file,
+    claim,
+    load_cached,
+    read_arrays,
+    read_bounded,
+    read_checked,
+)
 
 FORK = multiprocessing.get_context("fork")
 
 
-def test_exclusive_write_refuses_a_file_that_appeared(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_exclusive_write_refuses_a_file_that_appeared(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     path = tmp_path / "a.txt"
     for link in (os.link, Mock(side_effect=OSError(95, "no links"))):
         monkeypatch.setattr(os, "link", link)
         with atomic_file(path, exclusive=True) as part:
             part.write_text("first", encoding="utf-8")
-        with pytest.raises(OutputExistsError, match=r"a\.txt exists"), atomic_file(path, exclusive=True) as part:
+        with (
+            pytest.raises(OutputExistsError, match=r"a\.txt exists"),
+            atomic_file(path, exclusive=True) as part,
+        ):
             part.write_text("second", encoding="utf-8")
         assert path.read_text(encoding="utf-8") == "first"
         path.unlink()
@@ -35,7 +49,11 @@ def test_exclusive_write_refuses_a_file_that_appeared(tmp_path: Path, monkeypatc
 
 
 def test_claim_refuses_a_second_writer_and_names_the_first(tmp_path: Path) -> None:
-    with claim(tmp_path / "a"), pytest.raises(FileBusyError, match=f"process {os.getpid()} on "), claim(tmp_path / "a"):
+    with (
+        claim(tmp_path / "a"),
+        pytest.raises(FileBusyError, match=f"process {os.getpid()} on "),
+        claim(tmp_path / "a"),
+    ):
         pytest.fail("two writers")
     with claim(tmp_path / "a") as folder:
         assert folder.is_dir()
@@ -45,7 +63,9 @@ def test_claim_refuses_a_second_writer_and_names_the_first(tmp_path: Path) -> No
 def test_reserved_path_is_written_by_its_process_alone(tmp_path: Path) -> None:
     with files.reservations() as reserve:
         reserve(tmp_path / "a")
-        process = FORK.Process(target=race, args=(tmp_path / "a", *(parts := (FORK.Barrier(1), FORK.SimpleQueue())), 1))
+        process = FORK.Process(
+            target=race, args=(tmp_path / "a", *(parts := (FORK.Barrier(1), FORK.SimpleQueue())), 1)
+        )
         files._reserved, held = set(), files._reserved
         process.start()
         process.join()
@@ -66,7 +86,9 @@ def hold(path: Path, ready: Any) -> None:
         threading.Event().wait(60)
 
 
-def test_next_claim_removes_parts_of_the_killed_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_next_claim_removes_parts_of_the_killed_alone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     ready = FORK.Event()
     process = FORK.Process(target=hold, args=(tmp_path / "a", ready))
     process.start()
@@ -99,8 +121,12 @@ def race(path: Path, start: Any, results: Any, number: int) -> None:
 
 def test_one_of_many_racing_writers_wins(tmp_path: Path) -> None:
     for turn in range(10):
-        path, start, results = tmp_path / f"{turn}.txt", FORK.Barrier(4), FORK.SimpleQueue()
-        racers = [FORK.Process(target=race, args=(path, start, results, number)) for number in range(4)]
+        path = tmp_path / f"{turn}.txt"
+        start = FORK.Barrier(4)
+        results = FORK.SimpleQueue()
+        racers = [
+            FORK.Process(target=race, args=(path, start, results, number)) for number in range(4)
+        ]
         for racer in racers:
             racer.start()
         for racer in racers:
@@ -110,9 +136,14 @@ def test_one_of_many_racing_writers_wins(tmp_path: Path) -> None:
     assert len(list(tmp_path.iterdir())) == 10
 
 
-def test_claim_is_tried_again_where_its_folder_goes_meanwhile(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The holder before may end between the two looks of mkdir(exist_ok=True): by the claim, or by its lock."""
-    make, removed = Path.mkdir, iter([True, False, True, False, False])
+def test_claim_is_tried_again_where_its_folder_goes_meanwhile(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The holder before may end between the two looks of mkdir(exist_ok=True): by the claim, or by
+    its lock.
+    """
+    make = Path.mkdir
+    removed = iter([True, False, True, False, False])
 
     def mkdir(folder: Path, *arguments: Any, **options: Any) -> None:
         if next(removed):
@@ -134,8 +165,11 @@ def upper(content: bytes) -> str:
 
 
 @pytest.mark.parametrize("damage", [b"", b"cont", b"cOntent", b"\xff\xfe", None])
-def test_damaged_or_foreign_cache_entry_counts_as_absent(tmp_path: Path, damage: bytes | None) -> None:
-    entry, make = tmp_path / "cache" / "world.npz", Mock(return_value=b"content")
+def test_damaged_or_foreign_cache_entry_counts_as_absent(
+    tmp_path: Path, damage: bytes | None
+) -> None:
+    entry = tmp_path / "cache" / "world.npz"
+    make = Mock(return_value=b"content")
     assert [load_cached(entry, upper, make) for _ in range(3)] == ["CONTENT"] * 3
     make.assert_called_once()
     (file,) = entry.parent.iterdir()
@@ -151,7 +185,9 @@ def test_damaged_or_foreign_cache_entry_counts_as_absent(tmp_path: Path, damage:
 
 
 @pytest.mark.parametrize("place", ["file/below", "/proc/none"])
-def test_unusable_cache_or_entry_is_a_warning(tmp_path: Path, caplog: pytest.LogCaptureFixture, place: str) -> None:
+def test_unusable_cache_or_entry_is_a_warning(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, place: str
+) -> None:
     (tmp_path / "file").write_bytes(b"")
     assert load_cached(tmp_path / place / "a.npz", upper, lambda: b"made") == "MADE"
     assert "NLOS_CAM_CACHE" in caplog.text
@@ -181,7 +217,13 @@ def test_bounded_read_refuses_long_files_and_pipes(tmp_path: Path) -> None:
 
 
 def test_describe_gives_one_line() -> None:
-    errors = [RecursionError(), MemoryError(), OSError(28, "No space left on device"), ValueError("a\n b"), KeyError()]
+    errors = [
+        RecursionError(),
+        MemoryError(),
+        OSError(28, "No space left on device"),
+        ValueError("a\n b"),
+        KeyError(),
+    ]
     assert [files.describe(error) for error in errors] == [
         "it is nested too deeply",
         "it needs more memory than there is",
@@ -208,7 +250,9 @@ def _lying(folder: Path, edit: Callable[[bytes], bytes]) -> Path:
         lambda _: b"",
     ],
 )
-def test_read_arrays_refuses_a_header_that_lies(tmp_path: Path, edit: Callable[[bytes], bytes]) -> None:
+def test_read_arrays_refuses_a_header_that_lies(
+    tmp_path: Path, edit: Callable[[bytes], bytes]
+) -> None:
     with pytest.raises(ValueError, match=r"^.+$"):
         read_arrays(_lying(tmp_path, edit), ["depth_m"])
 
@@ -227,7 +271,9 @@ def test_read_arrays_returns_what_was_saved_within_its_limit(tmp_path: Path) -> 
 
 @pytest.mark.parametrize("read", [files.read_toml, read_record])
 @pytest.mark.parametrize("part", ["a.", "a . ", '{"a":', "{a = ", "[", "a ", '"a.'])
-def test_deep_toml_is_refused_without_much_work(tmp_path: Path, read: Callable[[Path], object], part: str) -> None:
+def test_deep_toml_is_refused_without_much_work(
+    tmp_path: Path, read: Callable[[Path], object], part: str
+) -> None:
     path = tmp_path / "a.toml"
     path.write_text(f"x = 1\n{part * 100_000}a = 1\n")  # minutes, where work grows as the square
     with pytest.raises(TOMLDecodeError):

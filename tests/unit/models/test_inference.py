@@ -17,10 +17,21 @@ from nlos_models.compressor import Compressor
 from nlos_models.doubt_network import load_doubt
 from nlos_models.errors import CheckpointError, MissingExtraError, ModelError
 from nlos_models.export import TorchReconstructor, quantize
-from nlos_models.inference import OnnxReconstructor, Reconstructor, load_reconstructor, load_uncertainty_model
+from nlos_models.inference import (
+    OnnxReconstructor,
+    Reconstructor,
+    load_reconstructor,
+    load_uncertainty_model,
+)
 from nlos_models.metrics import MIN_V
 from nlos_models.pipeline import RemappingNetwork, split_and_stack
-from nlos_models.records import SHIPPED, CheckpointRecord, checksum_of_watched, shipped_folder, weights_folder
+from nlos_models.records import (
+    SHIPPED,
+    CheckpointRecord,
+    checksum_of_watched,
+    shipped_folder,
+    weights_folder,
+)
 from nlos_models.vae import Decoder
 from onnx import TensorProto, numpy_helper
 from small_maps import HARD_MAPS, hard_maps, noise_maps
@@ -44,20 +55,27 @@ def _no_gpu() -> Iterator[None]:
 @pytest.fixture(scope="module")
 def pipeline() -> RemappingNetwork:
     torch.manual_seed(0)
-    made, maps = RemappingNetwork(Compressor(), Decoder()), [torch.from_numpy(m) for m in noise_maps(8)]
+    made = RemappingNetwork(Compressor(), Decoder())
+    maps = [torch.from_numpy(m) for m in noise_maps(8)]
     made.preprocess.learn(split_and_stack(*maps))
     with torch.no_grad():
         made.train()(*maps)  # statistics that are not those of a new network
         features = made.eval().decoder.blocks(made.latent(*maps)[:, :, None, None])
-        logits, output = made.decoder.output(features), made.decoder.output
-        output.bias.copy_(2 * (output.bias - logits.mean()) / logits.std())  # an image with contrast: it has edges
+        logits = made.decoder.output(features)
+        output = made.decoder.output
+        output.bias.copy_(
+            2 * (output.bias - logits.mean()) / logits.std()
+        )  # an image with contrast: it has edges
         output.weight.mul_(2 / logits.std())
     return made
 
 
 @pytest.fixture(scope="module")
-def folders(pipeline: RemappingNetwork, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
-    weights, cache = tmp_path_factory.mktemp("weights"), tmp_path_factory.mktemp("cache")
+def folders(
+    pipeline: RemappingNetwork, tmp_path_factory: pytest.TempPathFactory
+) -> tuple[Path, Path]:
+    weights = tmp_path_factory.mktemp("weights")
+    cache = tmp_path_factory.mktemp("cache")
     save_pipeline(weights, pipeline, RECORD)
     return weights, cache
 
@@ -95,7 +113,9 @@ def test_onnx_reconstruction_equals_torch_is_exported_once_and_of_hard_maps_a_po
         assert ((image == 0) | ((image >= MIN_V) & (image <= 1))).all(), name
 
 
-def test_color_networks_are_not_exported_and_exports_are_named_by_weights(pipeline: RemappingNetwork) -> None:
+def test_color_networks_are_not_exported_and_exports_are_named_by_weights(
+    pipeline: RemappingNetwork,
+) -> None:
     color = RemappingNetwork(pipeline.compressor, Decoder(3, 512), intensities=3)
     with pytest.raises(ModelError, match="simulation only"):
         export.export_onnx(color)
@@ -125,16 +145,31 @@ def _samples(seed: int) -> list[tuple[np.ndarray, ...]]:
 
 @pytest.mark.parametrize("static", [False, True])
 def test_quantized_network_is_nearly_exact_for_any_batch_or_one_of_our_errors(static: bool) -> None:
-    made, generator = onnx.parser.parse_model(GRAPH), np.random.default_rng(0)
-    kernel, mix = (generator.normal(size=size).astype(np.float32) for size in ((8, 1, 3, 3), (1, 8, 1, 1)))
+    made = onnx.parser.parse_model(GRAPH)
+    generator = np.random.default_rng(0)
+    kernel, mix = (
+        generator.normal(size=size).astype(np.float32) for size in ((8, 1, 3, 3), (1, 8, 1, 1))
+    )
     constants = {"kernel": kernel, "mix": mix, "axes": np.array([1])}
-    made.graph.initializer.extend(numpy_helper.from_array(array, name) for name, array in constants.items())
+    made.graph.initializer.extend(
+        numpy_helper.from_array(array, name) for name, array in constants.items()
+    )
     model = made.SerializeToString()
     small = quantize(model, _samples(0) if static else None)
-    weights = {tensor.name: tensor.data_type for tensor in onnx.load_from_string(small).graph.initializer}
+    weights = {
+        tensor.name: tensor.data_type for tensor in onnx.load_from_string(small).graph.initializer
+    }
     assert {TensorProto.INT8, TensorProto.UINT8} & set(weights.values())
-    maps = dict(zip(("depth_m", "intensity"), map(np.concatenate, zip(*_samples(1), strict=True)), strict=True))
-    exact, nearly = (inference.open_session(network).run(None, maps)[0] for network in (model, small))
+    maps = dict(
+        zip(
+            ("depth_m", "intensity"),
+            map(np.concatenate, zip(*_samples(1), strict=True)),
+            strict=True,
+        )
+    )
+    exact, nearly = (
+        inference.open_session(network).run(None, maps)[0] for network in (model, small)
+    )
     assert nearly.shape == exact.shape == (4, 1, 64, 80)
     assert 0 < np.abs(nearly - exact).mean() < 0.05 * exact.std()
     with pytest.raises(ModelError, match="8 bits"):
@@ -142,8 +177,11 @@ def test_quantized_network_is_nearly_exact_for_any_batch_or_one_of_our_errors(st
 
 
 @pytest.mark.slow
-def test_linked_graphs_equal_full_exports_bit_for_bit(folders: tuple[Path, Path], pair: Pair, tmp_path: Path) -> None:
-    weights, maps = Path(shutil.copytree(folders[0], tmp_path / "weights")), noise_maps(3)
+def test_linked_graphs_equal_full_exports_bit_for_bit(
+    folders: tuple[Path, Path], pair: Pair, tmp_path: Path
+) -> None:
+    weights = Path(shutil.copytree(folders[0], tmp_path / "weights"))
+    maps = noise_maps(3)
     (graph,) = export.export_folder(weights)
     assert graph.stat().st_size < 400_000
     linked = load_reconstructor(weights, tmp_path / "unused")
@@ -159,15 +197,22 @@ def test_linked_graphs_equal_full_exports_bit_for_bit(folders: tuple[Path, Path]
 @pytest.mark.slow
 @pytest.mark.parametrize("name", SHIPPED)
 def test_shipped_graphs_equal_shipped_checkpoint_in_torch(name: str) -> None:
-    """The images to within 1e-4, and at most a handful of pixels on the other side of the silhouette's threshold."""
+    """The images to within 1e-4, and at most a handful of pixels on the other side of the
+    silhouette's threshold.
+    """
     rows, columns = np.mgrid[:64, :80]  # of a slanted wall, with a brighter patch that moves
     patch = np.exp(-(((rows - 32) / 12) ** 2) - ((columns - 30) / 15) ** 2)
     depth_m = np.stack([0.2 + 0.004 * columns + 0.01 * k for k in range(3)]).astype(np.float32)
-    maps = depth_m, np.stack([10 + 30 * np.roll(patch, 6 * k, 1) for k in range(3)]).astype(np.float32)
+    maps = (
+        depth_m,
+        np.stack([10 + 30 * np.roll(patch, 6 * k, 1) for k in range(3)]).astype(np.float32),
+    )
     shipped = shipped_folder(name)
-    network, doubt = load_reconstructor(shipped, Path("unused")), load_uncertainty_model(shipped, Path("unused"))
+    network = load_reconstructor(shipped, Path("unused"))
+    doubt = load_uncertainty_model(shipped, Path("unused"))
     assert isinstance(network, OnnxReconstructor)
-    mine, its = network(*maps), TorchReconstructor(*load_network(shipped), "cpu")(*maps)
+    mine = network(*maps)
+    its = TorchReconstructor(*load_network(shipped), "cpu")(*maps)
     both = (mine > 0) & (its > 0)
     assert ((mine > 0) != (its > 0)).sum((1, 2)).max() <= HANDFUL
     assert both.mean() > 0
@@ -179,7 +224,9 @@ def test_shipped_graphs_equal_shipped_checkpoint_in_torch(name: str) -> None:
         np.testing.assert_allclose(said, wanted, rtol=1e-3, atol=1e-5)
 
 
-def test_weights_without_graph_need_torch_in_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_weights_without_graph_need_torch_in_one_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     for path in shipped_folder().glob("*.*"):
         if path.suffix != ".onnx":
             (tmp_path / path.name).symlink_to(path)
@@ -190,14 +237,18 @@ def test_weights_without_graph_need_torch_in_one_line(tmp_path: Path, monkeypatc
     without_torch = Mock(side_effect=ModuleNotFoundError("No module named 'torch'", name="torch"))
     monkeypatch.setattr(errors, "import_module", without_torch)
     for load in (load_reconstructor, load_uncertainty_model):
-        with pytest.raises(MissingExtraError, match=r"onnx.* torch.*pip install \"nlos-cam\[train\]\"") as found:
+        with pytest.raises(
+            MissingExtraError, match=r"onnx.* torch.*pip install \"nlos-cam\[train\]\""
+        ) as found:
             load(tmp_path, tmp_path / "cache")
         assert "\n" not in str(found.value)
     with pytest.raises(MissingExtraError, match="training needs torch"):
         errors.require("nlos_models.train", "training")
 
 
-def test_paper_weights_name_what_they_or_their_package_lack(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_paper_weights_name_what_they_or_their_package_lack(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     with pytest.raises(CheckpointError, match=r"encoder.*train vae --recipe vae-encoder"):
         checkpoint.load_vae()
     assert checkpoint.load_encoder() is None
@@ -208,7 +259,9 @@ def test_paper_weights_name_what_they_or_their_package_lack(tmp_path: Path, monk
         load_reconstructor(tmp_path / "other", tmp_path)
 
 
-def test_weights_by_name_give_way_to_a_folder_of_that_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_weights_by_name_give_way_to_a_folder_of_that_name(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.chdir(tmp_path)
     assert weights_folder(None) == shipped_folder() == weights_folder(Path("direct"))
     name = Path("paper")

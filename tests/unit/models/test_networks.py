@@ -1,4 +1,6 @@
-"""Compressors and Res-VAE: published tables, to the parameter, and finite outputs at the ends of the number range."""
+"""Compressors and Res-VAE: published tables, to the parameter, and finite outputs at the ends of
+the number range.
+"""
 
 import pytest
 import torch
@@ -35,10 +37,14 @@ def _channels(module: nn.Module) -> tuple[tuple[int, int], ...]:
 
 
 @pytest.mark.parametrize("width", [0.35, 0.5, 1.0, 1.4])
-def test_compressor_matches_table_s2_and_width_scales_channels_in_steps_of_eight(width: float) -> None:
+def test_compressor_matches_table_s2_and_width_scales_channels_in_steps_of_eight(
+    width: float,
+) -> None:
     compressor = Compressor(width=width).eval()
     table = ((16, 1, 1), (24, 2, 2), (32, 3, 2), (64, 4, 2), (96, 3, 1), (160, 3, 2), (320, 1, 1))
-    expected = [(out, stride if k == 0 else 1) for out, repeats, stride in table for k in range(repeats)]
+    expected = [
+        (out, stride if k == 0 else 1) for out, repeats, stride in table for k in range(repeats)
+    ]
     blocks = [_convolutions(m) for m in compressor.features if isinstance(m, InvertedResidual)]
     for block, (full, stride) in zip(blocks, expected, strict=True):
         out = block[-1].out_channels
@@ -51,9 +57,14 @@ def test_compressor_matches_table_s2_and_width_scales_channels_in_steps_of_eight
 
 @torch.no_grad()
 def test_blocks_pass_input_on_only_where_shapes_agree() -> None:
-    residual = [InvertedResidual(16, out, stride, 6).residual for out, stride in ((16, 1), (24, 1), (16, 2))]
+    residual = [
+        InvertedResidual(16, out, stride, 6).residual for out, stride in ((16, 1), (24, 1), (16, 2))
+    ]
     assert residual == [True, False, False]
-    shortcuts = [Bottleneck(channels, 64, stride).shortcut for channels, stride in ((256, 1), (64, 1), (256, 2))]
+    shortcuts = [
+        Bottleneck(channels, 64, stride).shortcut
+        for channels, stride in ((256, 1), (64, 1), (256, 2))
+    ]
     assert [isinstance(shortcut, nn.Identity) for shortcut in shortcuts] == [True, False, False]
     block = Bottleneck(256, 64, 1).eval()
     nn.init.zeros_(block.main[-1].weight)
@@ -87,14 +98,17 @@ def _norms(block: nn.Module) -> tuple[int, ...]:
 
 def test_decoder_matches_table_s1_and_encoder_mirrors_it(vae: ResVae) -> None:
     assert tuple(_channels(block) for block in vae.decoder.blocks) == TABLE_S1
-    assert [_norms(block) for block in vae.decoder.blocks] == [(first[1], second[1]) for first, second, _ in TABLE_S1]
+    assert [_norms(block) for block in vae.decoder.blocks] == [
+        (first[1], second[1]) for first, second, _ in TABLE_S1
+    ]
     assert _channels(vae.decoder.output) == ((32, 1),)
 
     def ends(block: nn.Module) -> tuple[int, int]:
         assert isinstance(block, ResBlock)
         return block.shortcut.in_channels, block.shortcut.out_channels
 
-    down, up = list(vae.encoder.blocks), list(vae.decoder.blocks)[::-1]
+    down = list(vae.encoder.blocks)
+    up = list(vae.decoder.blocks)[::-1]
     assert [ends(block) for block in down] == [ends(block)[::-1] for block in up]
     assert [_norms(block)[0] for block in down] == [_norms(block)[0] for block in up]
     for conv in (conv for block in (*down, *up) for conv in _convolutions(block)):
@@ -126,7 +140,9 @@ def test_decoder_is_in_range_and_independent_of_batch(vae: ResVae) -> None:
 @torch.inference_mode()
 @pytest.mark.parametrize("value", [torch.finfo(torch.float16).max, 1e30, -1e30])
 @pytest.mark.parametrize("precision", [torch.float32, torch.float16])
-def test_log_variance_is_limited_to_finite_exponentials(value: float, precision: torch.dtype) -> None:
+def test_log_variance_is_limited_to_finite_exponentials(
+    value: float, precision: torch.dtype
+) -> None:
     encoder = Encoder().eval()
     nn.init.constant_(encoder.log_variance.weight, 0.0)
     nn.init.constant_(encoder.log_variance.bias, value)
@@ -150,7 +166,8 @@ def test_vae_trains_in_bfloat16() -> None:
 def test_shipped_weights_load_bit_for_bit_with_record() -> None:
     loaded, record = checkpoint.load_pipeline()
     for part in ("compressor", "preprocess", "decoder"):
-        stored, tensors = load_file(shipped_folder("paper") / f"{part}.safetensors"), getattr(loaded, part).state_dict()
+        stored = load_file(shipped_folder("paper") / f"{part}.safetensors")
+        tensors = getattr(loaded, part).state_dict()
         assert tensors.keys() == stored.keys()
         for name, tensor in stored.items():
             assert torch.equal(tensors[name], tensor.to(tensors[name].dtype)), name

@@ -1,12 +1,36 @@
-"""From lidar maps to hidden images: batches of maps, split and stack, normalisation, networks, silhouettes."""
+"""From lidar maps to hidden images: batches of maps, split and stack, normalisation, networks,
+silhouettes.
+"""
 
 import numpy as np
 import pytest
 import torch
-from nlos_models import MIN_V, Preprocess, channel_statistics, cut_silhouette, lift_edges, split_and_stack
+from nlos_models import (
+    MIN_V,
+    Preprocess,
+    channel_statistics,
+    cut_silhouette,
+    lift_edges,
+    split_and_stack,
+)
 from nlos_models.compressor import Compressor, ResNet50
-from nlos_models.data import InMemory, first_of, flip_some, image_batches, map_batches, shuffled, subtract_bare_wall
-from nlos_models.pipeline import KEPT_SHARE, WINDOW, RemappingNetwork, new_pipeline, new_vae, stacked_channels
+from nlos_models.data import (
+    InMemory,
+    first_of,
+    flip_some,
+    image_batches,
+    map_batches,
+    shuffled,
+    subtract_bare_wall,
+)
+from nlos_models.pipeline import (
+    KEPT_SHARE,
+    WINDOW,
+    RemappingNetwork,
+    new_pipeline,
+    new_vae,
+    stacked_channels,
+)
 from small_maps import HARD_MAPS, hard_maps, small_maps
 from torch import Tensor
 
@@ -27,12 +51,20 @@ def _fitted(maps: tuple[Tensor, Tensor], intensities: int = 1) -> Preprocess:
     return preprocess
 
 
-def test_split_and_stack_puts_halves_missing_returns_and_each_color_in_documented_channels() -> None:
+def test_split_and_stack_puts_halves_missing_returns_and_each_color_in_documented_channels() -> (
+    None
+):
     column = torch.arange(80.0).expand(1, 64, 80)
-    left, right = column[0, :, :40], column[0, :, 40:]
-    assert torch.equal(split_and_stack(column, 100 + column)[0], torch.stack([left, right, 100 + left, 100 + right]))
-    depth, intensity = torch.ones(1, 64, 80), torch.ones(1, 64, 80)
-    depth[0, 5, 10], depth[0, 6, 70] = torch.nan, torch.nan
+    left = column[0, :, :40]
+    right = column[0, :, 40:]
+    assert torch.equal(
+        split_and_stack(column, 100 + column)[0],
+        torch.stack([left, right, 100 + left, 100 + right]),
+    )
+    depth = torch.ones(1, 64, 80)
+    intensity = torch.ones(1, 64, 80)
+    depth[0, 5, 10] = torch.nan
+    depth[0, 6, 70] = torch.nan
     missing = torch.isnan(split_and_stack(depth, intensity))[0].nonzero().tolist()
     assert missing == [[0, 5, 10], [1, 6, 30], [2, 5, 10], [3, 6, 30]]
     depth, intensity = _maps(colors=3)
@@ -46,7 +78,8 @@ def test_split_and_stack_puts_halves_missing_returns_and_each_color_in_documente
 
 @pytest.mark.parametrize("colors", [0, 3])
 def test_split_and_stack_commutes_with_mirroring(colors: int) -> None:
-    maps, flips = _maps(colors=colors), torch.tensor([True, False, True])
+    maps = _maps(colors=colors)
+    flips = torch.tensor([True, False, True])
     before = split_and_stack(*flip_some(list(maps), flips))
     (after,) = flip_some([split_and_stack(*maps)], flips)
     torch.testing.assert_close(before, after, rtol=0, atol=0, equal_nan=True)
@@ -65,7 +98,8 @@ def test_channel_statistics_ignore_missing_returns() -> None:
 @pytest.mark.parametrize("colors", [0, 3])
 def test_preprocess_noise_falls_on_left_channels_in_training(colors: int) -> None:
     torch.manual_seed(0)
-    maps, preprocess = _maps(8, colors), Preprocess(left_noise=0.2, intensities=max(colors, 1))
+    maps = _maps(8, colors)
+    preprocess = Preprocess(left_noise=0.2, intensities=max(colors, 1))
     before = [part.clone() for part in maps]
     quiet = preprocess.eval()(*maps)
     noise = preprocess.train()(*maps) - quiet
@@ -80,18 +114,24 @@ def test_preprocess_noise_falls_on_left_channels_in_training(colors: int) -> Non
 
 def test_preprocess_gives_missing_return_the_channel_mean() -> None:
     depth, intensity = _maps()
-    preprocess, hole = _fitted((depth, intensity)), torch.isnan(depth)
+    preprocess = _fitted((depth, intensity))
+    hole = torch.isnan(depth)
     mean = preprocess.mean
-    depth_mean, intensity_mean = (torch.cat([m.expand(40), n.expand(40)]) for m, n in (mean[:2], mean[2:]))
+    depth_mean, intensity_mean = (
+        torch.cat([m.expand(40), n.expand(40)]) for m, n in (mean[:2], mean[2:])
+    )
     filled = torch.where(hole, depth_mean, depth), torch.where(hole, intensity_mean, intensity)
     torch.testing.assert_close(preprocess(depth, intensity), preprocess(*filled), atol=1e-5, rtol=0)
-    assert torch.equal(preprocess(depth, intensity), preprocess(depth, torch.where(hole, 1e6, intensity)))
+    assert torch.equal(
+        preprocess(depth, intensity), preprocess(depth, torch.where(hole, 1e6, intensity))
+    )
 
 
 @pytest.mark.parametrize("name", HARD_MAPS)
 @pytest.mark.parametrize("colors", [0, 3])
 def test_preprocess_of_hard_maps_is_finite(name: str, colors: int) -> None:
-    hard, others = hard_maps(name, (colors,) if colors else ()), _maps(colors=colors)
+    hard = hard_maps(name, (colors,) if colors else ())
+    others = _maps(colors=colors)
     for learnt, maps in ((hard, hard), (others, hard), (hard, others)):
         out = _fitted(learnt, max(colors, 1))(*maps)
         assert out.shape == (len(maps[0]), 8 if colors else 4, 100, 100)
@@ -107,7 +147,9 @@ def pipeline() -> RemappingNetwork:
 @torch.inference_mode()
 @pytest.mark.parametrize("name", HARD_MAPS)
 @pytest.mark.parametrize("bfloat16", [False, True])
-def test_pipeline_makes_possible_image_of_hard_maps(pipeline: RemappingNetwork, name: str, bfloat16: bool) -> None:
+def test_pipeline_makes_possible_image_of_hard_maps(
+    pipeline: RemappingNetwork, name: str, bfloat16: bool
+) -> None:
     with torch.autocast("cpu", torch.bfloat16, enabled=bfloat16):
         image = pipeline(*hard_maps(name))
     assert image.shape == (1, 64, 64)
@@ -116,9 +158,12 @@ def test_pipeline_makes_possible_image_of_hard_maps(pipeline: RemappingNetwork, 
 
 @torch.inference_mode()
 def test_pipeline_latent_depends_on_neither_batch_nor_layout(pipeline: RemappingNetwork) -> None:
-    depth, intensity = torch.rand(3, 64, 80), 50 * torch.rand(3, 64, 80)
+    depth = torch.rand(3, 64, 80)
+    intensity = 50 * torch.rand(3, 64, 80)
     latents = pipeline.latent(depth, intensity)
-    alone = torch.cat([pipeline.latent(d[None], i[None]) for d, i in zip(depth, intensity, strict=True)])
+    alone = torch.cat(
+        [pipeline.latent(d[None], i[None]) for d, i in zip(depth, intensity, strict=True)]
+    )
     torch.testing.assert_close(latents, alone, atol=1e-4, rtol=1e-3)
     strided = (part.transpose(1, 2).contiguous().transpose(1, 2) for part in (depth, intensity))
     torch.testing.assert_close(pipeline.latent(*strided), latents, atol=1e-5, rtol=1e-4)
@@ -139,8 +184,11 @@ def test_new_pipeline_is_of_depth_or_color(color: bool, channels: int, latent: i
     assert made.preprocess.left_noise == 0.1
 
 
-def test_cut_silhouette_clears_faint_skirt_beside_surface_of_any_color_and_all_of_a_faint_image() -> None:
-    image, faint = torch.zeros(1, 1, 64, 64), 0.9 * KEPT_SHARE * 0.9
+def test_cut_silhouette_clears_faint_skirt_beside_surface_of_any_color_and_all_of_a_faint_image() -> (
+    None
+):
+    image = torch.zeros(1, 1, 64, 64)
+    faint = 0.9 * KEPT_SHARE * 0.9
     image[..., 10:30, 10:20] = 0.9
     image[..., 10:30, 20:23] = faint
     image[..., 50:60, 50:60] = faint
@@ -151,7 +199,9 @@ def test_cut_silhouette_clears_faint_skirt_beside_surface_of_any_color_and_all_o
     assert WINDOW < 30
     for value in (0.0, 0.05, MIN_V, 1.0):
         image = torch.full((1, 1, 64, 64), value)
-        assert torch.equal(cut_silhouette(image), image if value >= MIN_V else torch.zeros_like(image))
+        assert torch.equal(
+            cut_silhouette(image), image if value >= MIN_V else torch.zeros_like(image)
+        )
     image = torch.zeros(1, 3, 64, 64)
     image[0, :, 10:40, 10:40] = torch.tensor([0.9, 0.02, 0.5])[:, None, None]
     image[0, :, 10:40, 40:43] = torch.tensor([0.3, 0.35, 0.3])[:, None, None]
@@ -189,7 +239,8 @@ def test_shuffled_batches_are_whole_and_repeat_no_sample(count: int, batch: int)
 
 
 def test_flip_some_mirrors_flagged_samples_and_undoes_itself() -> None:
-    maps, images = torch.rand(3, 64, 80), torch.rand(3, 1, 64, 64)
+    maps = torch.rand(3, 64, 80)
+    images = torch.rand(3, 1, 64, 64)
     flips = torch.tensor([True, False, True])
     mirrored_maps, mirrored_images = flip_some([maps, images], flips)
     assert torch.equal(mirrored_maps[1], maps[1])
@@ -211,9 +262,13 @@ def test_map_batches_mirror_maps_with_their_images_and_first_maps_are_at_most_al
     maps = small_maps(8, 0)
     batches = list(map_batches(maps, 4, torch.Generator().manual_seed(0)))
     for batch in batches:
-        parts = [torch.from_numpy(part)[batch.row] for part in (maps.depth_m, maps.intensity, maps.image[:, None])]
+        parts = [
+            torch.from_numpy(part)[batch.row]
+            for part in (maps.depth_m, maps.intensity, maps.image[:, None])
+        ]
         depth_m, intensity, image = flip_some(parts, batch.mirrored)
-        found, wanted = [batch.depth_m, batch.intensity, batch.image], [depth_m, intensity, image.float()]
+        found = [batch.depth_m, batch.intensity, batch.image]
+        wanted = [depth_m, intensity, image.float()]
         torch.testing.assert_close(found, wanted, rtol=0, atol=0, equal_nan=True)
     assert sorted(torch.cat([batch.row for batch in batches]).tolist()) == list(range(8))
     assert 0 < torch.cat([batch.mirrored for batch in batches]).sum() < 8
@@ -224,7 +279,8 @@ def test_map_batches_mirror_maps_with_their_images_and_first_maps_are_at_most_al
 
 def test_difference_maps_subtract_bare_wall_where_both_return() -> None:
     maps = small_maps(3, 0)
-    depth, intensity = np.full((64, 80), 0.125, np.float32), np.full((64, 80), 4.0, np.float32)
+    depth = np.full((64, 80), 0.125, np.float32)
+    intensity = np.full((64, 80), 4.0, np.float32)
     depth[30] = np.nan
     difference = subtract_bare_wall(maps, depth, intensity)
     valid = ~np.isnan(maps.depth_m) & ~np.isnan(depth)

@@ -1,4 +1,6 @@
-"""Training recipes: the committed ones, budgets, refusals that name the field, and learning-rate schedules."""
+"""Training recipes: the committed ones, budgets, refusals that name the field, and learning-rate
+schedules.
+"""
 
 import json
 from pathlib import Path
@@ -17,37 +19,74 @@ RECIPES = Path(__file__).parents[3] / "models" / "recipes"
 
 @pytest.mark.parametrize("path", sorted(RECIPES.glob("*.toml")), ids=lambda path: path.stem)
 def test_committed_recipes_load_by_path_or_name_and_state_deviations(path: Path) -> None:
-    recipe, name = load_recipe(path), path.stem.removeprefix("paper-rig-")
+    recipe = load_recipe(path)
+    name = path.stem.removeprefix("paper-rig-")
     assert recipe.task in path.stem
     assert recipe.deviations
-    assert load_recipe(packaged_recipes()[name]) == load_recipe(Path(name)) == load_recipe(Path(path.stem)) == recipe
+    assert (
+        load_recipe(packaged_recipes()[name])
+        == load_recipe(Path(name))
+        == load_recipe(Path(path.stem))
+        == recipe
+    )
 
 
 def test_si_recipes_have_the_values_of_the_paper() -> None:
-    vae, compressor, transfer = (load_recipe(RECIPES / f"si-{task}.toml") for task in ("vae", "compressor", "transfer"))
+    vae, compressor, transfer = (
+        load_recipe(RECIPES / f"si-{task}.toml") for task in ("vae", "compressor", "transfer")
+    )
     assert {recipe.schedule for recipe in (vae, compressor, transfer)} == {"plateau"}
-    assert (vae.learning_rate, vae.betas, vae.kl_weight, vae.augmentation) == (1e-3, (0.5, 0.999), 0.05, "turns")
+    assert (vae.learning_rate, vae.betas, vae.kl_weight, vae.augmentation) == (
+        1e-3,
+        (0.5, 0.999),
+        0.05,
+        "turns",
+    )
     assert (compressor.learning_rate, compressor.left_noise, compressor.dropout) == (0.01, 0.2, 0.5)
-    assert (compressor.latent_weight, compressor.image_weight, compressor.steps) == (1.0, 0.0, "two")
+    assert (compressor.latent_weight, compressor.image_weight, compressor.steps) == (
+        1.0,
+        0.0,
+        "two",
+    )
     assert 3 <= transfer.all_layers_epochs <= 5
     assert (transfer.learning_rate, transfer.epochs, transfer.statistics) == (1e-3, 10, "kept")
     for task in ("vae", "compressor"):
         for scale, schedule in (("", "plateau"), ("-small", "one-cycle")):
             recipe = load_recipe(RECIPES / f"colour-{task}{scale}.toml")
-            assert (recipe.task, recipe.colour, recipe.kl_weight, recipe.schedule) == (task, True, 0.03, schedule)
+            assert (recipe.task, recipe.colour, recipe.kl_weight, recipe.schedule) == (
+                task,
+                True,
+                0.03,
+                schedule,
+            )
 
 
 @pytest.mark.parametrize("name", ["difference", "one-step"])
 def test_compared_recipes_have_the_same_budget(name: str) -> None:
-    one, other = (load_recipe(RECIPES / f"paper-rig-compressor-{part}gpu.toml") for part in ("", f"{name}-"))
-    for field in ("objects", "held_out", "epochs", "batch", "learning_rate", "schedule", "dropout", "seed", "keep"):
+    one, other = (
+        load_recipe(RECIPES / f"paper-rig-compressor-{part}gpu.toml") for part in ("", f"{name}-")
+    )
+    for field in (
+        "objects",
+        "held_out",
+        "epochs",
+        "batch",
+        "learning_rate",
+        "schedule",
+        "dropout",
+        "seed",
+        "keep",
+    ):
         assert getattr(one, field) == getattr(other, field)
 
 
 @pytest.mark.parametrize(
-    ("share", "epochs", "objects"), [(1.0, 34, 6000), (0.1, 3, 6000), (0.5, 17, 6000), (0.01, 1, 2040), (0.0001, 1, 64)]
+    ("share", "epochs", "objects"),
+    [(1.0, 34, 6000), (0.1, 3, 6000), (0.5, 17, 6000), (0.01, 1, 2040), (0.0001, 1, 64)],
 )
-def test_scaled_recipe_has_share_of_objects_times_epochs(share: float, epochs: int, objects: int) -> None:
+def test_scaled_recipe_has_share_of_objects_times_epochs(
+    share: float, epochs: int, objects: int
+) -> None:
     scaled = small_recipe(objects=6000, epochs=34, batch=64, deviations=["a"]).scaled(share)
     assert (scaled.epochs, scaled.objects) == (epochs, objects)
     assert scaled.deviations[0] == "a"
@@ -92,9 +131,13 @@ ONE = {"steps": "one", "latent_weight": 0, "image_weight": 1}
         ("compressor", {"colour": True, "maps": "difference maps"}, "simulation only"),
     ],
 )
-def test_wrong_recipe_is_refused_with_field(tmp_path: Path, task: str, changes: dict[str, object], words: str) -> None:
+def test_wrong_recipe_is_refused_with_field(
+    tmp_path: Path, task: str, changes: dict[str, object], words: str
+) -> None:
     facts = {**LEAST, "task": task, **changes}
-    text = "\n".join(f"{name} = {json.dumps(value)}" for name, value in facts.items() if value is not None)
+    text = "\n".join(
+        f"{name} = {json.dumps(value)}" for name, value in facts.items() if value is not None
+    )
     (path := tmp_path / "recipe.toml").write_text(text, encoding="utf-8")
     with pytest.raises(RecipeError, match=words) as caught:
         load_recipe(path)
@@ -103,7 +146,9 @@ def test_wrong_recipe_is_refused_with_field(tmp_path: Path, task: str, changes: 
 
 
 @pytest.mark.parametrize("content", [b"task = ", b"\xff\xfe\x00", b"", None])
-def test_load_recipe_names_unreadable_file_or_similar_name(tmp_path: Path, content: bytes | None) -> None:
+def test_load_recipe_names_unreadable_file_or_similar_name(
+    tmp_path: Path, content: bytes | None
+) -> None:
     path = tmp_path / "recipe.toml"
     if content is not None:
         path.write_bytes(content)
@@ -121,8 +166,10 @@ def _optimizer(rate: float) -> torch.optim.Optimizer:
 
 @pytest.mark.parametrize("rate", [1e-2, 2e-3, 1e-3, 1.3e-8])
 def test_plateau_schedule_ends_without_progress(rate: float) -> None:
-    recipe, optimizer = small_recipe(schedule="plateau", learning_rate=rate), _optimizer(rate)
-    schedule, rates = schedule_of(recipe, optimizer, 1), [rate]
+    recipe = small_recipe(schedule="plateau", learning_rate=rate)
+    optimizer = _optimizer(rate)
+    schedule = schedule_of(recipe, optimizer, 1)
+    rates = [rate]
     while not has_ended(recipe, rates[-1]):
         assert len(rates) < 100
         schedule.step(1.0)
@@ -133,8 +180,10 @@ def test_plateau_schedule_ends_without_progress(rate: float) -> None:
 
 
 def test_one_cycle_schedule_rises_to_rate_and_falls_to_end() -> None:
-    recipe, optimizer = small_recipe(schedule="one-cycle", learning_rate=1e-3), _optimizer(1e-3)
-    schedule, rates = schedule_of(recipe, optimizer, 101), list[float]()
+    recipe = small_recipe(schedule="one-cycle", learning_rate=1e-3)
+    optimizer = _optimizer(1e-3)
+    schedule = schedule_of(recipe, optimizer, 101)
+    rates = list[float]()
     for _ in range(100):
         rates.append(optimizer.param_groups[0]["lr"])
         optimizer.step()

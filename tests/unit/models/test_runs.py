@@ -1,4 +1,6 @@
-"""Training runs: the weights and earlier runs that they start from, and outputs that are not overwritten."""
+"""Training runs: the weights and earlier runs that they start from, and outputs that are not
+overwritten.
+"""
 
 from functools import partial
 from pathlib import Path
@@ -20,7 +22,9 @@ from small_run import changed_tensors, small_recipe
 
 RIG = load_rig("paper-rig")
 NAMED = (RIG.name, RIG.checksum)
-VAE, OTHER_VAE, TWO = small_recipe(), small_recipe(seed=1), small_recipe(task="compressor")
+VAE = small_recipe()
+OTHER_VAE = small_recipe(seed=1)
+TWO = small_recipe(task="compressor")
 AGAIN = small_recipe(task="compressor", start="weights", seed=1)
 JOINT = small_recipe(task="compressor", steps="two-then-joint", image_weight=1.0)
 TRANSFER = small_recipe(task="transfer")
@@ -38,11 +42,15 @@ def weights(tmp_path: Path) -> Path:
     torch.manual_seed(1)
     vae = SmallVae()
     record = CheckpointRecord.of([VAE, TWO], NAMED)
-    save_pipeline(tmp_path / "two", RemappingNetwork(SmallCompressor(), vae.decoder), record, vae.encoder)
+    save_pipeline(
+        tmp_path / "two", RemappingNetwork(SmallCompressor(), vae.decoder), record, vae.encoder
+    )
     return tmp_path / "two"
 
 
-def test_vae_start_lists_runs_of_vae_alone_and_leaves_an_encoder_that_is_missing_untrained(weights: Path) -> None:
+def test_vae_start_lists_runs_of_vae_alone_and_leaves_an_encoder_that_is_missing_untrained(
+    weights: Path,
+) -> None:
     stored = load_file(weights / "decoder.safetensors")["output.weight"].float()
     whole = vae_start(VAE, weights)
     (weights / "encoder.safetensors").unlink()
@@ -61,30 +69,43 @@ def test_compressor_start_lists_runs_of_weights_and_vae(weights: Path, tmp_path:
     assert runs == [VAE, TWO, OTHER_VAE]
     assert not torch.equal(start.vae.decoder.output.weight, start.pipeline.decoder.output.weight)
     assert compressor_start(AGAIN, weights, weights)[1] == [TWO, VAE]
-    start, runs = compressor_start(small_recipe(task="compressor", steps="one", **IMAGES_ALONE), None, None)
+    start, runs = compressor_start(
+        small_recipe(task="compressor", steps="one", **IMAGES_ALONE), None, None
+    )
     assert (start.vae, start.pipeline, runs) == (None, None, [])
 
 
 def _start(recipe: Recipe, weights: Path) -> object:
     if recipe.task == "transfer":
         return transfer_start(recipe, weights, partial=False, on_report=pytest.fail)
-    return vae_start(recipe, weights) if recipe.task == "vae" else compressor_start(recipe, weights, weights)
+    return (
+        vae_start(recipe, weights)
+        if recipe.task == "vae"
+        else compressor_start(recipe, weights, weights)
+    )
 
 
 @pytest.mark.parametrize(
     ("recipe", "changes", "words"),
     [
-        *((recipe, {"maps": "difference maps"}, "raw maps.* difference maps") for recipe in (AGAIN, JOINT, TRANSFER)),
+        *(
+            (recipe, {"maps": "difference maps"}, "raw maps.* difference maps")
+            for recipe in (AGAIN, JOINT, TRANSFER)
+        ),
         *((recipe, {"width": 0.5}, r"1 .*0\.5") for recipe in (AGAIN, JOINT)),
         *((recipe, {"colour": True}, "simulation only") for recipe in (VAE, AGAIN, JOINT)),
     ],
 )
-def test_start_refuses_weights_of_other_kind(weights: Path, recipe: Recipe, changes: dict, words: str) -> None:
+def test_start_refuses_weights_of_other_kind(
+    weights: Path, recipe: Recipe, changes: dict, words: str
+) -> None:
     with pytest.raises(TrainingError, match=words):
         _start(recipe.model_copy(update=changes), weights)
 
 
-def test_start_refuses_weights_without_encoder_for_latent_loss_and_color_weights_for_depth(weights: Path) -> None:
+def test_start_refuses_weights_without_encoder_for_latent_loss_and_color_weights_for_depth(
+    weights: Path,
+) -> None:
     (weights / "encoder.safetensors").unlink()
     with pytest.raises(TrainingError, match="encoder"):
         _start(JOINT, weights)
@@ -97,10 +118,14 @@ def test_start_refuses_weights_without_encoder_for_latent_loss_and_color_weights
             _start(recipe, weights)
 
 
-def test_transfer_default_weights_fit_its_loss(weights: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_transfer_default_weights_fit_its_loss(
+    weights: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     size = {"features": 8, "width": 8, "blocks": 1, "token": 8, "mixers": 1}
     straight = small_recipe(task="direct", direct=size)
-    save_direct(tmp_path / "direct", DirectNetwork(straight.direct), CheckpointRecord.of([straight], NAMED))
+    save_direct(
+        tmp_path / "direct", DirectNetwork(straight.direct), CheckpointRecord.of([straight], NAMED)
+    )
     shipped = {"paper": weights, "direct": tmp_path / "direct"}
     monkeypatch.setattr(runs, "weights_folder", lambda given, default: given or shipped[default])
     start = partial(transfer_start, partial=False, on_report=pytest.fail)
@@ -111,7 +136,8 @@ def test_transfer_default_weights_fit_its_loss(weights: Path, tmp_path: Path, mo
 
 
 def test_partial_start_fills_missing_tensors_by_seed(weights: Path) -> None:
-    tensors, messages = load_file(weights / "compressor.safetensors"), list[str]()
+    tensors = load_file(weights / "compressor.safetensors")
+    messages = list[str]()
     missing = tensors.pop("classifier.1.weight")
     save_file({**tensors, "more": missing}, weights / "compressor.safetensors")
     (weights / CHECKSUMS).unlink()
@@ -132,8 +158,12 @@ def _record(out: Path, *recipes: Recipe, starts: tuple[Path | None, ...] = ()) -
 
 
 @pytest.mark.parametrize("recipes", [(VAE,), (OTHER_VAE,), (OTHER_VAE, VAE)])
-def test_record_run_refuses_weights_of_another_run(tmp_path: Path, recipes: tuple[Recipe, ...]) -> None:
-    record = _record(tmp_path, VAE, OTHER_VAE).model_copy(update={"figures": {"held_out_loss": 1.5}})
+def test_record_run_refuses_weights_of_another_run(
+    tmp_path: Path, recipes: tuple[Recipe, ...]
+) -> None:
+    record = _record(tmp_path, VAE, OTHER_VAE).model_copy(
+        update={"figures": {"held_out_loss": 1.5}}
+    )
     (tmp_path / "checkpoint.json").write_text(record.model_dump_json(), encoding="utf-8")
     _record(tmp_path, VAE, OTHER_VAE)  # the same run may be repeated
     with pytest.raises(OutputExistsError, match="--out"):

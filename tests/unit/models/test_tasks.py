@@ -1,4 +1,6 @@
-"""Training tasks on a few images: VAE, compressor and transfer learn, resume exactly and freeze what they should."""
+"""Training tasks on a few images: VAE, compressor and transfer learn, resume exactly and freeze
+what they should.
+"""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -17,7 +19,8 @@ from torch import Tensor
 pytestmark = pytest.mark.usefixtures("one_thread")
 
 Patch = pytest.MonkeyPatch
-COUNT, BATCH = 16, 8
+COUNT = 16
+BATCH = 8
 STEPS = COUNT // BATCH
 CLASSIFIER_TENSORS = {"compressor.classifier.1.weight", "compressor.classifier.1.bias"}
 
@@ -35,22 +38,36 @@ def _seeded() -> None:
 
 
 def _recipe(task: str, **changes: object) -> Recipe:
-    facts = {"objects": COUNT, "epochs": 2, "batch": BATCH, "learning_rate": 1e-3, "schedule": "one-cycle"}
+    facts = {
+        "objects": COUNT,
+        "epochs": 2,
+        "batch": BATCH,
+        "learning_rate": 1e-3,
+        "schedule": "one-cycle",
+    }
     return small_recipe(task=task, **(facts | changes))
 
 
 def _statistics(maps: object) -> tuple[Tensor, Tensor]:
-    return channel_statistics(split_and_stack(torch.from_numpy(maps.depth_m), torch.from_numpy(maps.intensity)))
+    return channel_statistics(
+        split_and_stack(torch.from_numpy(maps.depth_m), torch.from_numpy(maps.intensity))
+    )
 
 
 Trained = tuple[SmallVae, Scores, Path]
 
 
-def _vae(recipe: Recipe, folder: Path, start: object = None, **running: object) -> tuple[SmallVae, Scores]:
-    return tasks.train_vae(recipe, small_images(COUNT, 0), small_images(4, 1), folder, Running(**running), start)
+def _vae(
+    recipe: Recipe, folder: Path, start: object = None, **running: object
+) -> tuple[SmallVae, Scores]:
+    return tasks.train_vae(
+        recipe, small_images(COUNT, 0), small_images(4, 1), folder, Running(**running), start
+    )
 
 
-def _compressor(recipe: Recipe, start: tasks.Start, folder: Path, **running: object) -> tuple[RemappingNetwork, Scores]:
+def _compressor(
+    recipe: Recipe, start: tasks.Start, folder: Path, **running: object
+) -> tuple[RemappingNetwork, Scores]:
     maps = InMemory(small_maps(COUNT, 0)), small_maps(4, 1)
     return tasks.train_compressor(recipe, start, *maps, folder, Running(**running))
 
@@ -61,7 +78,9 @@ def trained(tmp_path_factory: pytest.TempPathFactory) -> Trained:
     return *_vae(_recipe("vae"), folder), folder
 
 
-def test_vae_loss_falls_figures_are_of_last_epoch_and_resumed_run_equals_it(trained: Trained, tmp_path: Path) -> None:
+def test_vae_loss_falls_figures_are_of_last_epoch_and_resumed_run_equals_it(
+    trained: Trained, tmp_path: Path
+) -> None:
     vae, figures, folder = trained
     log = log_rows(folder)
     assert float(log[-1]["loss"]) < float(log[0]["loss"])
@@ -85,10 +104,14 @@ def test_vae_warm_up_ignores_divergence(tmp_path: Path) -> None:
     assert [one == other for one, other in zip(*losses, strict=True)] == [True, True, False, False]
 
 
-def test_vae_continues_from_weights_or_trains_encoder_for_a_kept_decoder(trained: Trained, tmp_path: Path) -> None:
+def test_vae_continues_from_weights_or_trains_encoder_for_a_kept_decoder(
+    trained: Trained, tmp_path: Path
+) -> None:
     start = SmallVae()
     start.load_state_dict(before := state_of(trained[0]))
-    vae, figures = _vae(_recipe("vae", start="weights", epochs=1, learning_rate=1e-7), tmp_path, start=start)
+    vae, figures = _vae(
+        _recipe("vae", start="weights", epochs=1, learning_rate=1e-7), tmp_path, start=start
+    )
     for name, tensor in vae.named_parameters():  # at this rate they stay close
         torch.testing.assert_close(tensor.data, before[name], rtol=0, atol=1e-5)
     assert changed_tensors(before, vae.state_dict())
@@ -101,7 +124,9 @@ def test_vae_continues_from_weights_or_trains_encoder_for_a_kept_decoder(trained
     assert changed_tensors(encoder, vae.encoder.state_dict())
 
 
-def test_compressor_keeps_vae_frozen_and_learns_statistics(trained: Trained, tmp_path: Path) -> None:
+def test_compressor_keeps_vae_frozen_and_learns_statistics(
+    trained: Trained, tmp_path: Path
+) -> None:
     before = state_of(trained[0])
     recipe = _recipe("compressor", epochs=1, image_weight=1.0, left_noise=0.1)
     pipeline, _ = _compressor(recipe, tasks.Start(trained[0]), tmp_path)
@@ -123,27 +148,43 @@ def test_one_step_training_trains_own_decoder(tmp_path: Path) -> None:
     assert float(log[-1]["loss"]) < float(log[0]["loss"])
 
 
-def test_joint_training_moves_both_networks_but_not_encoder(trained: Trained, tmp_path: Path) -> None:
+def test_joint_training_moves_both_networks_but_not_encoder(
+    trained: Trained, tmp_path: Path
+) -> None:
     vae = SmallVae()
     vae.load_state_dict(state_of(trained[0]))
     two = RemappingNetwork(SmallCompressor(), vae.decoder)
     two.preprocess.mean.fill_(0.25)
-    before, encoder = state_of(two), state_of(vae.encoder)
-    recipe = _recipe("compressor", steps="two-then-joint", epochs=1, image_weight=1.0, dropout=0.2, learning_rate=1e-6)
+    before = state_of(two)
+    encoder = state_of(vae.encoder)
+    recipe = _recipe(
+        "compressor",
+        steps="two-then-joint",
+        epochs=1,
+        image_weight=1.0,
+        dropout=0.2,
+        learning_rate=1e-6,
+    )
     joint, _ = _compressor(recipe, tasks.Start(vae, two), tmp_path)
     after = joint.state_dict()
     for part in ("compressor.classifier.1.weight", "decoder.output.weight"):
         assert not torch.equal(after[part], before[part])
-        torch.testing.assert_close(after[part], before[part], rtol=0, atol=1e-5)  # at this rate it stays close
+        torch.testing.assert_close(
+            after[part], before[part], rtol=0, atol=1e-5
+        )  # at this rate it stays close
     assert torch.equal(after["preprocess.mean"], before["preprocess.mean"])
     assert not changed_tensors(encoder, vae.encoder.state_dict())
     assert joint.compressor.classifier[0].p == 0.2
 
 
-def test_compressor_continues_from_weights_with_decoder_of_vae(trained: Trained, tmp_path: Path) -> None:
+def test_compressor_continues_from_weights_with_decoder_of_vae(
+    trained: Trained, tmp_path: Path
+) -> None:
     earlier = RemappingNetwork(SmallCompressor(), SmallVae().decoder)
     before = state_of(earlier.compressor)
-    recipe = _recipe("compressor", start="weights", epochs=1, image_weight=1.0, learning_rate=1e-7, dropout=0.2)
+    recipe = _recipe(
+        "compressor", start="weights", epochs=1, image_weight=1.0, learning_rate=1e-7, dropout=0.2
+    )
     pipeline, _ = _compressor(recipe, tasks.Start(trained[0], earlier), tmp_path)
     for name, tensor in pipeline.compressor.named_parameters():
         torch.testing.assert_close(tensor.data, before[name], rtol=0, atol=1e-5)
@@ -151,10 +192,16 @@ def test_compressor_continues_from_weights_with_decoder_of_vae(trained: Trained,
     assert pipeline.compressor.classifier[0].p == 0.2
 
 
-def test_compiled_networks_are_the_trained_ones(trained: Trained, tmp_path: Path, monkeypatch: Patch) -> None:
+def test_compiled_networks_are_the_trained_ones(
+    trained: Trained, tmp_path: Path, monkeypatch: Patch
+) -> None:
     compiled: list[object] = []
-    monkeypatch.setattr(train, "compile_network", lambda network: compiled.append(network) or network)
-    plain, quick = (_vae(_recipe("vae", epochs=1), tmp_path / f"{on}", compiled=on)[0] for on in (False, True))
+    monkeypatch.setattr(
+        train, "compile_network", lambda network: compiled.append(network) or network
+    )
+    plain, quick = (
+        _vae(_recipe("vae", epochs=1), tmp_path / f"{on}", compiled=on)[0] for on in (False, True)
+    )
     assert compiled == [quick]
     assert not changed_tensors(plain.state_dict(), quick.state_dict())
     recipe = _recipe("compressor", epochs=1, image_weight=1.0)
@@ -173,9 +220,13 @@ def test_turn_some_with_mirror_gives_all_eight_views() -> None:
 
 
 @pytest.mark.parametrize(("augmentation", "turns"), [("mirror", []), ("turns", [0, 1, 2, 3])])
-def test_vae_turns_images_by_recipe(tmp_path: Path, monkeypatch: Patch, augmentation: str, turns: list[int]) -> None:
+def test_vae_turns_images_by_recipe(
+    tmp_path: Path, monkeypatch: Patch, augmentation: str, turns: list[int]
+) -> None:
     quarters: list[int] = []
-    monkeypatch.setattr(tasks, "turn_some", lambda images, turns: quarters.extend(turns.tolist()) or images)
+    monkeypatch.setattr(
+        tasks, "turn_some", lambda images, turns: quarters.extend(turns.tolist()) or images
+    )
     _vae(_recipe("vae", epochs=1, augmentation=augmentation), tmp_path)
     assert sorted(set(quarters)) == turns
     assert len(quarters) == (COUNT if turns else 0)
@@ -183,15 +234,22 @@ def test_vae_turns_images_by_recipe(tmp_path: Path, monkeypatch: Patch, augmenta
 
 @torch.no_grad()
 def test_images_and_latents_in_parts_equal_those_at_once(monkeypatch: Patch) -> None:
-    pipeline, maps = RemappingNetwork(SmallCompressor(), SmallVae().decoder).eval(), small_maps(8, 3)
-    whole, encoder = tasks.run(pipeline, maps), SmallVae().eval().encoder
+    pipeline = RemappingNetwork(SmallCompressor(), SmallVae().decoder).eval()
+    maps = small_maps(8, 3)
+    whole = tasks.run(pipeline, maps)
+    encoder = SmallVae().eval().encoder
     assert whole.shape == (8, 64, 64)
     monkeypatch.setattr(tasks, "SCORING_BATCH", 3)
     np.testing.assert_allclose(tasks.run(pipeline, maps), whole, atol=1e-5)
-    straight, mirrored = tasks.latents_of(encoder, maps.image), tasks.latents_of(encoder, maps.image[:, ::-1])
+    straight = tasks.latents_of(encoder, maps.image)
+    mirrored = tasks.latents_of(encoder, maps.image[:, ::-1])
     for batch in map_batches(maps, 4, torch.Generator().manual_seed(0)):
-        chosen = torch.where(batch.mirrored[:, None, None], mirrored[batch.row], straight[batch.row])
-        torch.testing.assert_close(chosen, torch.stack(encoder(batch.image), dim=1), atol=1e-5, rtol=1e-4)
+        chosen = torch.where(
+            batch.mirrored[:, None, None], mirrored[batch.row], straight[batch.row]
+        )
+        torch.testing.assert_close(
+            chosen, torch.stack(encoder(batch.image), dim=1), atol=1e-5, rtol=1e-4
+        )
 
 
 def test_figures_are_mean_squared_error_sum_and_iou() -> None:
@@ -203,7 +261,11 @@ def test_figures_are_mean_squared_error_sum_and_iou() -> None:
     assert figures["held_out_loss"] == pytest.approx(0.09 / 3)
     assert figures["held_out_iou"] < 1
     color = np.stack([truth, 0.9 * truth, 0.5 * truth], axis=1)
-    assert list(tasks.figures_of(color.astype(np.float32), color).values()) == [0.0, 1.0, 0.0]  # loss, IoU, color error
+    assert list(tasks.figures_of(color.astype(np.float32), color).values()) == [
+        0.0,
+        1.0,
+        0.0,
+    ]  # loss, IoU, color error
     nothing = tasks.figures_of(np.zeros_like(color, np.float32), color)
     assert (nothing["held_out_iou"], nothing["held_out_colour_error"]) == (0.0, 1.0)
 
@@ -213,8 +275,10 @@ def _first_loss(folder: Path, encoder: bool = True, **changes: float) -> float:
     vae = SmallVae().eval()
     still = {"objects": 8, "epochs": 1, "dropout": 0.0, "left_noise": 0.0, "schedule": "plateau"}
     recipe = _recipe("compressor").model_copy(update={**still, **changes})
-    pipeline, source = RemappingNetwork(SmallCompressor(), vae.decoder), InMemory(small_maps(8, 0))
-    task, rows = tasks.Remapping(pipeline, vae.encoder if encoder else None, source, small_maps(4, 1)), list[Scores]()
+    pipeline = RemappingNetwork(SmallCompressor(), vae.decoder)
+    source = InMemory(small_maps(8, 0))
+    task = tasks.Remapping(pipeline, vae.encoder if encoder else None, source, small_maps(4, 1))
+    rows = list[Scores]()
     task.fit(recipe, [vae.decoder], folder, Running(on_epoch=rows.append))
     return rows[0]["loss"]
 
@@ -222,7 +286,9 @@ def _first_loss(folder: Path, encoder: bool = True, **changes: float) -> float:
 def test_loss_weights_latent_image_and_surface(tmp_path: Path) -> None:
     weights = ((1.0, 0.0, 1.0), (0.0, 1.0, 1.0), (2.0, 3.0, 1.0), (0.0, 1.0, 2.0), (0.0, 1.0, 3.0))
     names = ("latent_weight", "image_weight", "surface_weight")
-    losses = [_first_loss(tmp_path / f"{each}", **dict(zip(names, each, strict=True))) for each in weights]
+    losses = [
+        _first_loss(tmp_path / f"{each}", **dict(zip(names, each, strict=True))) for each in weights
+    ]
     latent, image, both, twice, thrice = losses
     assert both == pytest.approx(2 * latent + 3 * image, rel=1e-4)
     assert thrice - twice == pytest.approx(twice - image, rel=1e-4)
@@ -234,10 +300,13 @@ class Bench:
 
     def __init__(self, folder: Path) -> None:
         torch.manual_seed(5)
-        self.vae, self.folder, self.steps = SmallVae().eval(), folder, list[tuple[int, int]]()
+        self.vae = SmallVae().eval()
+        self.folder = folder
+        self.steps = list[tuple[int, int]]()
         self.pipeline = RemappingNetwork(SmallCompressor(), self.vae.decoder).eval()
         self.pipeline.preprocess.mean.fill_(0.25)
-        self.maps, self.held_out = small_maps(COUNT, 0), small_maps(4, 1)
+        self.maps = small_maps(COUNT, 0)
+        self.held_out = small_maps(4, 1)
 
     def go(self, fail_at: int | None = None, **changes: object) -> Scores:
         def on_step(done: int, total: int) -> None:
@@ -245,25 +314,36 @@ class Bench:
             if done == fail_at:
                 raise Stopped
 
-        recipe = _recipe("transfer", **({"epochs": 3, "all_layers_epochs": 2, "image_weight": 1.0} | changes))
+        recipe = _recipe(
+            "transfer", **({"epochs": 3, "all_layers_epochs": 2, "image_weight": 1.0} | changes)
+        )
         recipe = recipe.model_copy(update={"schedule": "plateau"})
-        source, encoder, running = InMemory(self.maps), self.vae.encoder, Running(on_step=on_step)
-        return tasks.train_transfer(recipe, self.pipeline, encoder, source, self.held_out, self.folder, running)[1]
+        source = InMemory(self.maps)
+        encoder = self.vae.encoder
+        running = Running(on_step=on_step)
+        return tasks.train_transfer(
+            recipe, self.pipeline, encoder, source, self.held_out, self.folder, running
+        )[1]
 
     @property
     def state(self) -> dict[str, Tensor]:
         return state_of(self.pipeline)
 
 
-def test_transfer_changes_all_of_compressor_and_then_its_classifier_alone(tmp_path: Path, monkeypatch: Patch) -> None:
+def test_transfer_changes_all_of_compressor_and_then_its_classifier_alone(
+    tmp_path: Path, monkeypatch: Patch
+) -> None:
     bench = Bench(tmp_path / "second")
-    before, fit = bench.state, tasks.Remapping.fit
+    before = bench.state
+    fit = tasks.Remapping.fit
     bench.go(all_layers_epochs=0, epochs=1, dropout=0.25, left_noise=0.125)
     assert changed_tensors(before, bench.state) == CLASSIFIER_TENSORS
     assert bench.pipeline.compressor.classifier[0].p == 0.25
     assert bench.pipeline.preprocess.left_noise == 0.125
 
-    def first_alone(self: tasks.Remapping, recipe: Recipe, frozen: list, folder: Path, *rest: object) -> object:
+    def first_alone(
+        self: tasks.Remapping, recipe: Recipe, frozen: list, folder: Path, *rest: object
+    ) -> object:
         return fit(self, recipe, frozen, folder, *rest) if folder.name == tasks.ALL_LAYERS else {}
 
     monkeypatch.setattr(tasks.Remapping, "fit", first_alone)
@@ -291,7 +371,8 @@ def test_transfer_phases_have_epochs_and_rates_of_recipe_and_resume_exactly(tmp_
 
 
 def test_transfer_second_phase_starts_from_best_epoch(tmp_path: Path, monkeypatch: Patch) -> None:
-    losses, found = iter([2.0, 1.0, 3.0, *[9.0] * 9]), list[dict[str, Tensor]]()
+    losses = iter([2.0, 1.0, 3.0, *[9.0] * 9])
+    found = list[dict[str, Tensor]]()
     bench = Bench(tmp_path)
 
     def figures(*_: object) -> Scores:
@@ -305,18 +386,26 @@ def test_transfer_second_phase_starts_from_best_epoch(tmp_path: Path, monkeypatc
     assert last > after_best
 
 
-@pytest.mark.parametrize(("statistics", "own"), [("kept", []), ("own", [0, 1, 2, 3]), ("own intensity", [2, 3])])
-def test_transfer_normalises_maps_by_recipe(tmp_path: Path, statistics: str, own: list[int]) -> None:
+@pytest.mark.parametrize(
+    ("statistics", "own"), [("kept", []), ("own", [0, 1, 2, 3]), ("own intensity", [2, 3])]
+)
+def test_transfer_normalises_maps_by_recipe(
+    tmp_path: Path, statistics: str, own: list[int]
+) -> None:
     bench = Bench(tmp_path)
     wanted = [torch.full((4,), 0.25), torch.ones(4)]
     for values, theirs in zip(wanted, _statistics(bench.maps), strict=True):
         values[own] = theirs[own]
     bench.go(statistics=statistics, all_layers_epochs=0, epochs=1)
-    assert all(map(torch.equal, (bench.pipeline.preprocess.mean, bench.pipeline.preprocess.spread), wanted))
+    assert all(
+        map(torch.equal, (bench.pipeline.preprocess.mean, bench.pipeline.preprocess.spread), wanted)
+    )
 
 
 @pytest.mark.parametrize(("steps", "word"), [("two", "--vae"), ("two-then-joint", "--weights")])
-def test_compressor_training_names_missing_start_or_encoder(tmp_path: Path, steps: str, word: str) -> None:
+def test_compressor_training_names_missing_start_or_encoder(
+    tmp_path: Path, steps: str, word: str
+) -> None:
     with pytest.raises(TrainingError, match=word):
         _compressor(_recipe("compressor", steps=steps, image_weight=1.0), tasks.Start(), tmp_path)
     with pytest.raises(TrainingError, match="encoder"):

@@ -1,4 +1,6 @@
-"""The training loop on a tiny network: exact resuming after any stop, the run's files, several processes."""
+"""The training loop on a tiny network: exact resuming after any stop, the run's files, several
+processes.
+"""
 
 import copy
 import errno
@@ -62,7 +64,9 @@ def test_run_killed_at_random_moments_equals_uninterrupted(tmp_path: Path) -> No
     whole = small_run.run_watched(recipe, tmp_path / "whole", clerk)
     moments = random.Random(0).sample(range(2, clerk.seen // 2), 4)  # noqa: S311  each start resumes the last one
     context = multiprocessing.get_context("forkserver")
-    context.set_forkserver_preload(["nlos_models.train", "pytest"])  # each process begins with them imported
+    context.set_forkserver_preload(
+        ["nlos_models.train", "pytest"]
+    )  # each process begins with them imported
     ends: list[int | None] = []
     for moment in moments:
         facts = recipe.model_dump_json(), str(tmp_path / "killed"), moment
@@ -75,8 +79,12 @@ def test_run_killed_at_random_moments_equals_uninterrupted(tmp_path: Path) -> No
     _assert_same(_trained(tmp_path / "killed", schedule="one-cycle", epochs=2), whole)
 
 
-def test_stopped_run_names_step_and_resumes_there_and_failed_run_from_its_last_checkpoint(tmp_path: Path) -> None:
-    whole, calls, messages = _trained(tmp_path / "whole"), count(1), list[str]()
+def test_stopped_run_names_step_and_resumes_there_and_failed_run_from_its_last_checkpoint(
+    tmp_path: Path,
+) -> None:
+    whole = _trained(tmp_path / "whole")
+    calls = count(1)
+    messages = list[str]()
     run = SmallRun(whole.recipe, tmp_path / "stopped")
     with pytest.raises(KeyboardInterrupt):
         run.go(stop=lambda: next(calls) == STEPS + 2, on_message=messages.append)
@@ -84,14 +92,19 @@ def test_stopped_run_names_step_and_resumes_there_and_failed_run_from_its_last_c
     again = _trained(tmp_path / "stopped")
     assert again.steps[0] == (STEPS + 3, 4 * STEPS)
     _assert_same(again, whole)
-    run, seconds = SmallRun(small_recipe(epochs=1), tmp_path / "failed"), count(0.0, 1.0)
+    run = SmallRun(small_recipe(epochs=1), tmp_path / "failed")
+    seconds = count(0.0, 1.0)
     with pytest.raises(Stopped):
-        run.go(fail_at=5, clock=lambda: next(seconds), checkpoint_s=2.5)  # saved after steps 2 and 4
+        run.go(
+            fail_at=5, clock=lambda: next(seconds), checkpoint_s=2.5
+        )  # saved after steps 2 and 4
     assert _trained(tmp_path / "failed", epochs=1).steps[0][0] in {3, 4, 5}
 
 
 @pytest.mark.parametrize("precision", ["32-true", "bf16-mixed"])
-def test_held_out_loss_falls(tmp_path: Path, precision: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_held_out_loss_falls(
+    tmp_path: Path, precision: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(torch.backends.cpu, "get_cpu_capability", lambda: "AVX512")
     log = _trained(tmp_path, epochs=10, precision=precision).log
     assert [int(row["epoch"]) for row in log] == list(range(10))
@@ -99,7 +112,8 @@ def test_held_out_loss_falls(tmp_path: Path, precision: str, monkeypatch: pytest
 
 
 def test_progress_counts_steps_and_finished_run_is_not_repeated(tmp_path: Path) -> None:
-    (run, again), epochs = (SmallRun(small_recipe(), tmp_path) for _ in range(2)), list[dict[str, float]]()
+    (run, again) = (SmallRun(small_recipe(), tmp_path) for _ in range(2))
+    epochs = list[dict[str, float]]()
     figures = run.go(on_epoch=epochs.append)
     assert run.steps == [(k + 1, 4 * STEPS) for k in range(4 * STEPS)]
     assert run.done == [k / (4 * STEPS) for k in range(4 * STEPS)]
@@ -129,7 +143,9 @@ def test_run_of_other_recipe_or_origin_or_of_few_objects_is_refused(tmp_path: Pa
     SmallRun(run.recipe, tmp_path).go(origin="those weights")
 
 
-def test_keep_best_restores_first_best_epoch(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_keep_best_restores_first_best_epoch(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     judged = list[dict[str, Tensor]]()
 
     def score(run: SmallRun) -> dict[str, float]:
@@ -144,7 +160,9 @@ def test_keep_best_restores_first_best_epoch(tmp_path: Path, monkeypatch: pytest
     assert not changed_tensors(judged[3], last.net.state_dict())
 
 
-def test_plateau_run_ends_with_its_rate_and_stays_ended(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_plateau_run_ends_with_its_rate_and_stays_ended(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(schedule, "PLATEAU_PATIENCE", 0)
     monkeypatch.setattr(schedule, "SMALLEST_RATE", 2e-3)
     monkeypatch.setattr(SmallRun, "score", lambda _: {"held_out_loss": 1.0})
@@ -168,7 +186,11 @@ def test_diverged_run_keeps_earlier_epochs(tmp_path: Path, monkeypatch: pytest.M
 
 
 def _state(step: int) -> dict[str, object]:
-    return {"step": step, "module": {"weight": torch.arange(4.0) + step}, "rows": [{"loss": float(step)}]}
+    return {
+        "step": step,
+        "module": {"weight": torch.arange(4.0) + step},
+        "rows": [{"loss": float(step)}],
+    }
 
 
 def _damage(path: Path, how: str) -> None:
@@ -191,7 +213,9 @@ def test_read_last_returns_last_state_written(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("how", ["cut", "flipped", "empty"])
-def test_read_last_falls_back_to_previous_state_and_read_best_refuses(tmp_path: Path, how: str) -> None:
+def test_read_last_falls_back_to_previous_state_and_read_best_refuses(
+    tmp_path: Path, how: str
+) -> None:
     with pytest.raises(CheckpointError, match=train.BEST):
         train.read_best(tmp_path)
     train.write_best(tmp_path, _state(3))
@@ -215,8 +239,13 @@ def test_read_last_falls_back_to_previous_state_and_read_best_refuses(tmp_path: 
 def test_full_disk_keeps_earlier_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     train.write_last(tmp_path, _state(1))
     train.write_log(tmp_path, [{"loss": 1.0}])
-    monkeypatch.setattr(os, "fsync", Mock(side_effect=OSError(errno.ENOSPC, "No space left on device")))
-    for write in (lambda: train.write_last(tmp_path, _state(2)), lambda: train.write_log(tmp_path, [{"loss": 2.0}])):
+    monkeypatch.setattr(
+        os, "fsync", Mock(side_effect=OSError(errno.ENOSPC, "No space left on device"))
+    )
+    for write in (
+        lambda: train.write_last(tmp_path, _state(2)),
+        lambda: train.write_log(tmp_path, [{"loss": 2.0}]),
+    ):
         with pytest.raises(TrainingError, match="No space left on device"):
             write()
     assert train.read_last(tmp_path, pytest.fail)["step"] == 1
@@ -226,7 +255,8 @@ def test_full_disk_keeps_earlier_files(tmp_path: Path, monkeypatch: pytest.Monke
 
 def test_digest_depends_on_every_bit_and_order() -> None:
     torch.manual_seed(0)
-    net, digest = nn.Linear(3, 2), train.digest_of
+    net = nn.Linear(3, 2)
+    digest = train.digest_of
     digests = {digest(), digest("a"), digest("b"), digest(None), before := digest(net)}
     assert digest(copy.deepcopy(net)) == before
     net.bias.data[0] += 1e-3
@@ -243,7 +273,9 @@ def test_tensorboard_logs_figures_of_each_epoch(tmp_path: Path) -> None:
     assert set(events.Tags()["scalars"]) == {"rate", "loss", "held_out_loss", "seconds"}
     drawn = events.Scalars("held_out_loss")
     assert [event.step for event in drawn] == [0, 1, 2, 3]
-    assert [event.value for event in drawn] == pytest.approx([float(row["held_out_loss"]) for row in run.log])
+    assert [event.value for event in drawn] == pytest.approx(
+        [float(row["held_out_loss"]) for row in run.log]
+    )
 
 
 def test_missing_tensorboard_names_extra(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -261,11 +293,17 @@ def compiler() -> Iterator[None]:
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(not any(map(shutil.which, filter(None, config.cpp.cxx))), reason="torch.compile needs a compiler")
+@pytest.mark.skipif(
+    not any(map(shutil.which, filter(None, config.cpp.cxx))),
+    reason="torch.compile needs a compiler",
+)
 @pytest.mark.filterwarnings("ignore::DeprecationWarning:torch")
 @pytest.mark.usefixtures("compiler")
 def test_compiled_part_has_loss_and_gradients_of_plain_one() -> None:
-    linear, dropout, x, found = nn.Linear(3, 2), nn.Dropout(0.5), torch.rand(8, 3), []
+    linear = nn.Linear(3, 2)
+    dropout = nn.Dropout(0.5)
+    x = torch.rand(8, 3)
+    found = []
 
     def noisy(x: Tensor) -> Tensor:
         return dropout(linear(x + 0.2 * torch.randn_like(x)))
@@ -287,12 +325,22 @@ NO_GRADIENTS = Mock(side_effect=InductorError(RuntimeError("No g++\nand more"), 
 
 
 @pytest.mark.usefixtures("compiler")
-@pytest.mark.parametrize("network", [torch.compile(nn.Linear(3, 2), backend=_no_compiler), NO_GRADIENTS])
-def test_failed_compilation_is_one_line_and_not_blamed_for_errors_of_the_network(network: nn.Module) -> None:
-    with pytest.raises(TrainingError, match=r"--compile .*No g\+\+") as caught, train.explain_compile_errors():
+@pytest.mark.parametrize(
+    "network", [torch.compile(nn.Linear(3, 2), backend=_no_compiler), NO_GRADIENTS]
+)
+def test_failed_compilation_is_one_line_and_not_blamed_for_errors_of_the_network(
+    network: nn.Module,
+) -> None:
+    with (
+        pytest.raises(TrainingError, match=r"--compile .*No g\+\+") as caught,
+        train.explain_compile_errors(),
+    ):
         network(torch.rand(1, 3))
     assert "\n" not in str(caught.value)
-    with pytest.raises(RuntimeError, match="shapes cannot be multiplied"), train.explain_compile_errors():
+    with (
+        pytest.raises(RuntimeError, match="shapes cannot be multiplied"),
+        train.explain_compile_errors(),
+    ):
         nn.Linear(3, 2)(torch.rand(1, 4))
 
 
@@ -308,11 +356,15 @@ class Hostile:
     [5, [1], Hostile(), {"recipe": 3}, {"recipe": "{}", "epoch": "a"}],
     ids=["number", "list", "hostile", "recipe", "epoch"],
 )
-def test_state_of_another_kind_is_refused(tmp_path: Path, state: Any, capsys: pytest.CaptureFixture[str]) -> None:
+def test_state_of_another_kind_is_refused(
+    tmp_path: Path, state: Any, capsys: pytest.CaptureFixture[str]
+) -> None:
     content = io.BytesIO()
     torch.save(state, content)
     for name in (train.LAST, train.PREVIOUS):
-        (tmp_path / name).write_bytes(hashlib.sha256(content.getvalue()).digest() + content.getvalue())
+        (tmp_path / name).write_bytes(
+            hashlib.sha256(content.getvalue()).digest() + content.getvalue()
+        )
     with pytest.raises(CheckpointError, match=str(tmp_path)) as caught:
         SmallRun(small_recipe(), tmp_path).go()
     assert "\n" not in str(caught.value)
@@ -322,7 +374,10 @@ def test_state_of_another_kind_is_refused(tmp_path: Path, state: Any, capsys: py
 def test_processes_share_a_batch_without_repeating_samples_and_have_seeds_of_their_own() -> None:
     batch = NormalBatch(torch.arange(12).reshape(6, 2), torch.arange(6))
     shares = [share_of(batch, rank, 3) for rank in range(3)]
-    assert all(type(share) is NormalBatch and len(share.normal) == len(share.image) == 2 for share in shares)
+    assert all(
+        type(share) is NormalBatch and len(share.normal) == len(share.image) == 2
+        for share in shares
+    )
     assert sorted(torch.cat([share.image for share in shares]).tolist()) == list(range(6))
     for share in shares:
         assert torch.equal(share.normal, batch.normal[share.image])
@@ -336,7 +391,9 @@ def test_processes_share_a_batch_without_repeating_samples_and_have_seeds_of_the
 
 @pytest.mark.slow
 def test_two_processes_end_with_weights_of_one(tmp_path: Path) -> None:
-    made: dict[str, Any] = launch(open_fabric(small_recipe(), accelerator="cpu", devices=2), small_run.on_two, tmp_path)
+    made: dict[str, Any] = launch(
+        open_fabric(small_recipe(), accelerator="cpu", devices=2), small_run.on_two, tmp_path
+    )
     alone = SmallRun(small_recipe(epochs=3, schedule="one-cycle"), tmp_path / "alone", plain=True)
     figures = alone.go(fabric=open_fabric(small_recipe(), accelerator="cpu"))
     together = SmallRun(alone.recipe, tmp_path / "whole", plain=True)
@@ -344,7 +401,9 @@ def test_two_processes_end_with_weights_of_one(tmp_path: Path) -> None:
         torch.testing.assert_close(torch.tensor(made["net"][name]), tensor, rtol=1e-4, atol=1e-6)
     assert made["figures"] == pytest.approx(figures, rel=1e-4)
     for mine, its in zip(alone.log, together.log, strict=True):
-        assert {k: float(v) for k, v in mine.items()} == pytest.approx({k: float(v) for k, v in its.items()}, rel=1e-4)
+        assert {k: float(v) for k, v in mine.items()} == pytest.approx(
+            {k: float(v) for k, v in its.items()}, rel=1e-4
+        )
     assert made["scored"] == 3  # only the leading process evaluates
     told, interrupted = made["messages"]
     assert ("step 4" in told, interrupted) == (True, "interrupted")
@@ -360,9 +419,12 @@ def test_open_fabric_refuses_uneven_batch_and_missing_gpus(monkeypatch: pytest.M
 
 
 @pytest.mark.parametrize(("vectors", "made"), [("AVX2", "32-true"), ("AVX512", "bf16-mixed")])
-def test_cpu_that_emulates_bfloat16_trains_in_float32(monkeypatch: pytest.MonkeyPatch, vectors: str, made: str) -> None:
+def test_cpu_that_emulates_bfloat16_trains_in_float32(
+    monkeypatch: pytest.MonkeyPatch, vectors: str, made: str
+) -> None:
     monkeypatch.setattr(torch.backends.cpu, "get_cpu_capability", lambda: vectors)
-    halves, singles = small_recipe(precision="bf16-mixed"), small_recipe()
+    halves = small_recipe(precision="bf16-mixed")
+    singles = small_recipe()
     assert precision_on("cpu", halves) == made
     assert precision_on("cuda", halves) == "bf16-mixed"
     assert precision_on("cpu", singles) == "32-true"
@@ -374,7 +436,10 @@ KILLED = ProcessExitedException("process 1 terminated with signal SIGKILL", 1, 7
 @pytest.mark.parametrize(
     ("error", "raised"),
     [
-        *((error, type(error)) for error in (KeyboardInterrupt(), RecipeError("a"), ZeroDivisionError(), OSError("b"))),
+        *(
+            (error, type(error))
+            for error in (KeyboardInterrupt(), RecipeError("a"), ZeroDivisionError(), OSError("b"))
+        ),
         (KILLED, TrainingError),
     ],
 )

@@ -9,7 +9,14 @@ from nlos_calibration import ObjectBox, load_rig
 from nlos_models import BLACK_V
 from nlos_models.pipeline import KEPT_SHARE
 
-from nlos_cam.objects import TEXTURES, cell_centers_m, depth_from_image, image_from_albedo, object_depth, paint
+from nlos_cam.objects import (
+    TEXTURES,
+    cell_centers_m,
+    depth_from_image,
+    image_from_albedo,
+    object_depth,
+    paint,
+)
 from nlos_cam.objects.depth_map import image_from_depth, orthographic_depth, share_outside
 from nlos_cam.render import Surface
 
@@ -19,7 +26,10 @@ X, Y = np.meshgrid(*cell_centers_m(BOX))
 
 def _quad(z: tuple[float, float, float, float], low: float = -1.0, high: float = 1.0) -> np.ndarray:
     """Two triangles over a square; z at (low, low), (high, low), (high, high), (low, high)."""
-    a, b, c, d = ((x, y, k) for (x, y), k in zip([(low, low), (high, low), (high, high), (low, high)], z, strict=True))
+    a, b, c, d = (
+        (x, y, k)
+        for (x, y), k in zip([(low, low), (high, low), (high, high), (low, high)], z, strict=True)
+    )
     return np.array([[a, b, c], [a, c, d]])
 
 
@@ -35,19 +45,23 @@ def test_tilted_plane_has_its_depth_at_every_cell_center() -> None:
 @pytest.mark.parametrize("corner", [0.0, 0.1, 1 / 3, 0.123456789])
 def test_triangles_sharing_an_edge_leave_no_hole(corner: float) -> None:
     """The shared edge runs through the centres of many cells."""
-    middle_x, middle_y = X[31, 31] + corner * 0.01, Y[31, 31]
+    middle_x = X[31, 31] + corner * 0.01
+    middle_y = Y[31, 31]
     ring = [(-3, -3), (3, -3), (3, 3), (-3, 3), (-3, -3)]
     fan = [[(middle_x, middle_y, 0.3), (*a, 0.3), (*b, 0.3)] for a, b in pairwise(ring)]
     assert np.isfinite(orthographic_depth(np.array(fan, float), BOX)).all()
 
 
 def test_sphere_and_box_show_their_near_side_in_the_cells_they_cover() -> None:
-    radius, centre = 0.2, (0.3, 0.05, 0.4)
+    radius = 0.2
+    centre = (0.3, 0.05, 0.4)
     depth = orthographic_depth(_triangles(trimesh.creation.icosphere(5, radius), centre), BOX)
     from_axis = np.hypot(X - centre[0], Y - centre[1])
     assert np.isnan(depth[from_axis > radius]).all()
     inside = from_axis < 0.95 * radius
-    np.testing.assert_allclose(depth[inside], centre[2] - np.sqrt(radius**2 - from_axis[inside] ** 2), atol=1e-3)
+    np.testing.assert_allclose(
+        depth[inside], centre[2] - np.sqrt(radius**2 - from_axis[inside] ** 2), atol=1e-3
+    )
     solid = trimesh.creation.box(extents=(0.2, 0.1, 0.08))
     depth = orthographic_depth(_triangles(solid, (0.32, 0.1, 0.3)), BOX)
     inside = (np.abs(X - 0.32) < 0.1) & (np.abs(Y - 0.1) < 0.05)
@@ -64,14 +78,19 @@ def test_edge_on_distant_or_no_triangles_leave_no_depth() -> None:
 
 @pytest.mark.parametrize("share", [0.0, 0.1, 0.5, 0.9, 1.0])
 @pytest.mark.parametrize("side", [(1, 0), (-1, 0), (0, 1), (0, -1)])
-def test_share_outside_is_the_part_of_a_plate_beyond_the_box(share: float, side: tuple[int, int]) -> None:
+def test_share_outside_is_the_part_of_a_plate_beyond_the_box(
+    share: float, side: tuple[int, int]
+) -> None:
     plate = trimesh.creation.box(extents=(0.1, 0.1, 0.01))
     x, y = (s * (0.32 - 0.05 + 0.1 * share) for s in side)
-    assert share_outside(_triangles(plate, (0.32 + x, y, 0.3)), BOX) == pytest.approx(share, abs=0.01)
+    assert share_outside(_triangles(plate, (0.32 + x, y, 0.3)), BOX) == pytest.approx(
+        share, abs=0.01
+    )
 
 
 def test_share_outside_counts_the_silhouette_once_and_no_edges() -> None:
-    inside, outside = _quad((0.3, 0.3, 0.3, 0.3), 0.1, 0.2), _quad((0.3, 0.3, 0.3, 0.3), 0.65, 0.75)
+    inside = _quad((0.3, 0.3, 0.3, 0.3), 0.1, 0.2)
+    outside = _quad((0.3, 0.3, 0.3, 0.3), 0.65, 0.75)
     layers = [outside + np.array((0, 0, 0.1 * k)) for k in range(4)]
     assert share_outside(np.concatenate([inside, *layers]), BOX) == pytest.approx(0.5)
     edge_on = (3.0, -1, 0.2), (3.0, 1, 0.2), (3.0, 0, 0.5)
@@ -86,9 +105,12 @@ PAPER = load_rig("paper-rig").object_box
 
 
 def test_image_maps_near_to_1_far_to_a_tenth_and_background_to_0() -> None:
-    near, far = PAPER.z_near_m, PAPER.z_far_m
+    near = PAPER.z_near_m
+    far = PAPER.z_far_m
     depth = np.array([near, far, (near + far) / 2, np.nan, near - 0.05, far + 1, np.inf])
-    np.testing.assert_allclose(image_from_depth(depth, PAPER), [1.0, 0.1, 0.55, 0.0, 1.0, 0.1, 0.1], rtol=1e-6)
+    np.testing.assert_allclose(
+        image_from_depth(depth, PAPER), [1.0, 0.1, 0.55, 0.0, 1.0, 0.1, 0.1], rtol=1e-6
+    )
     depth = depth_from_image(np.array([0.0, 0.049, 0.051, 0.1]), PAPER)
     assert np.isnan(depth).tolist() == [True, True, False, False]
     np.testing.assert_allclose(depth[2:], PAPER.z_far_m, rtol=1e-6)
@@ -108,9 +130,13 @@ def test_depth_survives_the_image_and_back(near: float, deep: float, seed: int) 
 def test_image_survives_the_depth_map_and_back_in_float16() -> None:
     image = np.linspace(0.1, 1, 4096, dtype=np.float32).reshape(64, 64)
     image[:10] = 0
-    np.testing.assert_allclose(image_from_depth(depth_from_image(image, PAPER), PAPER), image, atol=1e-6)
+    np.testing.assert_allclose(
+        image_from_depth(depth_from_image(image, PAPER), PAPER), image, atol=1e-6
+    )
     half = image.astype(np.float16)
-    np.testing.assert_allclose(image_from_depth(depth_from_image(half, PAPER), PAPER), half, atol=2e-3)
+    np.testing.assert_allclose(
+        image_from_depth(depth_from_image(half, PAPER), PAPER), half, atol=2e-3
+    )
 
 
 def test_cell_centers_grow_with_wall_x_and_against_wall_y() -> None:
@@ -118,8 +144,12 @@ def test_cell_centers_grow_with_wall_x_and_against_wall_y() -> None:
     pitch = (PAPER.x_max_m - PAPER.x_min_m) / 64
     np.testing.assert_allclose(np.diff(x_m), pitch)
     np.testing.assert_allclose(np.diff(y_m), -pitch)
-    np.testing.assert_allclose([x_m[0], x_m[-1]], [PAPER.x_min_m + pitch / 2, PAPER.x_max_m - pitch / 2])
-    np.testing.assert_allclose([y_m[0], y_m[-1]], [PAPER.y_max_m - pitch / 2, PAPER.y_min_m + pitch / 2])
+    np.testing.assert_allclose(
+        [x_m[0], x_m[-1]], [PAPER.x_min_m + pitch / 2, PAPER.x_max_m - pitch / 2]
+    )
+    np.testing.assert_allclose(
+        [y_m[0], y_m[-1]], [PAPER.y_max_m - pitch / 2, PAPER.y_min_m + pitch / 2]
+    )
 
 
 THING = object_depth(1, PAPER)[1]
@@ -158,9 +188,12 @@ def test_textures_have_the_colors_of_their_names() -> None:
 
 def test_image_is_the_albedo_on_the_surface_and_0_beside_it() -> None:
     albedo = paint(2, THING, [*TEXTURES]).albedo
-    image, hidden = image_from_albedo(albedo, THING), np.isnan(THING)
+    image = image_from_albedo(albedo, THING)
+    hidden = np.isnan(THING)
     assert image.shape == (3, 64, 64)
     black = image_from_albedo(np.zeros((64, 64, 3)), np.full((64, 64), 0.2))
     np.testing.assert_allclose(black, BLACK_V, atol=1e-6)  # no background
     assert (image[:, hidden] == 0).all()
-    np.testing.assert_allclose(image[:, ~hidden].T, BLACK_V + (1 - BLACK_V) * albedo[~hidden], atol=1e-6)
+    np.testing.assert_allclose(
+        image[:, ~hidden].T, BLACK_V + (1 - BLACK_V) * albedo[~hidden], atol=1e-6
+    )

@@ -22,7 +22,9 @@ SEEDS = (*range(47), 10_000_000, 20_000_000, 2**31 - 1)
 
 
 def straight_view(kind: Category, **changed: float) -> NDArray[np.float32]:
-    """Return the depth map of a category that fills the paper's box, its settings in the middle but for those given."""
+    """Return the depth map of a category that fills the paper's box, its settings in the middle but
+    for those given.
+    """
     drawn = kind.draw([0.5] * len(kind.settings)) | changed
     return orthographic_depth(place(kind.make(**drawn), Pose(size_m=0.24, front_m=0.0), BOX), BOX)
 
@@ -65,7 +67,9 @@ def test_hollow_is_deeper_than_its_rim(kind: str) -> None:
 
 
 @pytest.mark.parametrize("category", CATEGORIES)
-def test_category_makes_one_object_of_unit_size_per_seed_that_fits_its_box_and_shows(category: str) -> None:
+def test_category_makes_one_object_of_unit_size_per_seed_that_fits_its_box_and_shows(
+    category: str,
+) -> None:
     meshes = {seed: category_triangles(category, seed) for seed in SEEDS}
     np.testing.assert_array_equal(category_triangles(category, SEEDS[-1]), meshes[SEEDS[-1]])
     assert len({mesh.tobytes() for mesh in meshes.values()}) == len(SEEDS)
@@ -73,7 +77,8 @@ def test_category_makes_one_object_of_unit_size_per_seed_that_fits_its_box_and_s
         assert 0.5 < np.ptp(mesh.reshape(-1, 3), axis=0).max() < 1.5
         placed = place(mesh, random_pose(np.random.default_rng(seed), BOX), BOX)
         assert np.isfinite(placed).all()
-        low, high = placed.reshape(-1, 3).min(0), placed.reshape(-1, 3).max(0)
+        low = placed.reshape(-1, 3).min(0)
+        high = placed.reshape(-1, 3).max(0)
         assert (low >= np.array([BOX.x_min_m, BOX.y_min_m, BOX.z_near_m]) - 1e-9).all()
         assert (high <= np.array([BOX.x_max_m, BOX.y_max_m, BOX.z_far_m]) + 1e-9).all()
         surface = np.isfinite(orthographic_depth(placed, BOX))
@@ -85,8 +90,10 @@ def test_category_makes_one_object_of_unit_size_per_seed_that_fits_its_box_and_s
 @pytest.mark.parametrize("category", CATEGORIES)
 def test_category_settings_all_change_the_depth_map(category: str) -> None:
     """No setting changes only a part that is hidden behind another."""
-    kind, pose = CATEGORIES[category], random_pose(np.random.default_rng(4), BOX)
-    pose, middle = replace(pose, size_m=0.2, x_m=0, y_m=0), [0.5] * len(kind.settings)
+    kind = CATEGORIES[category]
+    pose = random_pose(np.random.default_rng(4), BOX)
+    pose = replace(pose, size_m=0.2, x_m=0, y_m=0)
+    middle = [0.5] * len(kind.settings)
     picture = orthographic_depth(place(kind.make(**kind.draw(middle)), pose, BOX), BOX)
     for n in range(len(middle)):
         units = [*middle[:n], 0.95, *middle[n + 1 :]]
@@ -105,18 +112,26 @@ e9436516 1007c23a d80bea10 f102da95 de848140 c5348870
 
 
 def test_categories_are_those_of_the_paper_and_a_seed_makes_what_it_has_always_made() -> None:
-    """Datasets name their objects by seeds: a changed shape, or another order, would make others of them."""
+    """Datasets name their objects by seeds: a changed shape, or another order, would make others of
+    them.
+    """
     assert list(CATEGORIES) == [kind.name for kind in CATEGORIES.values()] == NAMES.split()
     meshes = [np.round(category_triangles(name, 0), 9) + 0.0 for name in CATEGORIES]
     found = [hashlib.sha256(mesh.tobytes()).hexdigest()[:8] for mesh in meshes]
-    assert dict(zip(CATEGORIES, found, strict=True)) == dict(zip(CATEGORIES, DIGESTS.split(), strict=True))
+    assert dict(zip(CATEGORIES, found, strict=True)) == dict(
+        zip(CATEGORIES, DIGESTS.split(), strict=True)
+    )
     hidden = np.round(paper_scene().hidden.triangles, 9)
-    assert hashlib.sha256(hidden.tobytes()).hexdigest()[:16] == "1ab023dab17e054a", "the README's airplane"
+    assert hashlib.sha256(hidden.tobytes()).hexdigest()[:16] == "1ab023dab17e054a", (
+        "the README's airplane"
+    )
 
 
 UNIT = st.floats(0, 1)
 ENDS = st.integers(-500, 500).map(lambda tenths: tenths / 10)
-SETTINGS = {f"{name}.{key}": s for name, kind in CATEGORIES.items() for key, s in kind.settings.items()}
+SETTINGS = {
+    f"{name}.{key}": s for name, kind in CATEGORIES.items() for key, s in kind.settings.items()
+}
 
 
 @st.composite
@@ -134,14 +149,20 @@ def _settings(draw: st.DrawFn) -> Setting:
 def test_setting_never_draws_held_out_values(setting: Setting, unit: float) -> None:
     value = setting.draw(unit)
     assert any(low - 1e-12 <= value <= high + 1e-12 for low, high in setting.training_intervals)
-    if setting.held_out and setting.low < setting.held_out[0] and setting.held_out[1] < setting.high:
+    if (
+        setting.held_out
+        and setting.low < setting.held_out[0]
+        and setting.held_out[1] < setting.high
+    ):
         low, high = setting.held_out
         assert not low < value < high
 
 
 @pytest.mark.parametrize("name", SETTINGS)
 def test_category_setting_steps_over_its_held_out_interval(name: str) -> None:
-    """A seed reaches a setting only through one number in [0, 1], in which it is monotonic: true of every seed."""
+    """A seed reaches a setting only through one number in [0, 1], in which it is monotonic: true of
+    every seed.
+    """
     setting = SETTINGS[name]
     low, high = setting.held_out or (np.inf, np.inf)
     drawn = [setting.draw(unit) for unit in np.linspace(0, 1, 501)]
@@ -150,7 +171,8 @@ def test_category_setting_steps_over_its_held_out_interval(name: str) -> None:
     assert drawn == sorted(drawn)
     assert below + above == list(range(501))
     if below and above:  # bisect to the very numbers where it steps over what is held out
-        under, over = below[-1] / 500, above[0] / 500
+        under = below[-1] / 500
+        over = above[0] / 500
         while under < (middle := (under + over) / 2) < over:
             under, over = (middle, over) if setting.draw(middle) <= low else (under, middle)
         assert setting.draw(under) <= low < high <= setting.draw(over)
@@ -165,7 +187,9 @@ def test_setting_draws_grow_evenly_from_end_to_end(setting: Setting) -> None:
     total = sum(high - low for low, high in setting.training_intervals)
     steps = np.diff([setting.draw(u) for u in np.linspace(0, 1, 20)])
     assert (steps >= -1e-12).all()
-    assert np.sort(steps)[:-1] == pytest.approx(total / 19, abs=1e-9), "all but the step over the gap"
+    assert np.sort(steps)[:-1] == pytest.approx(total / 19, abs=1e-9), (
+        "all but the step over the gap"
+    )
 
 
 @settings(max_examples=50, deadline=None)
@@ -199,7 +223,9 @@ def test_category_decorator_keeps_name_and_setting_order() -> None:
         crate.draw([0.5])
 
 
-def test_generic_shape_follows_from_the_seed_stands_in_the_box_and_is_of_every_family_in_its_share() -> None:
+def test_generic_shape_follows_from_the_seed_stands_in_the_box_and_is_of_every_family_in_its_share() -> (
+    None
+):
     shapes = [generic_depth(seed, BOX) for seed in range(400)]
     for seed in (3, 90):
         np.testing.assert_array_equal(generic_depth(seed, BOX)[1], shapes[seed][1])
@@ -221,7 +247,10 @@ def _middle(solid: Float64) -> np.ndarray:
 
 
 def _area(solid: Float64) -> float:
-    return float(np.linalg.norm(np.cross(solid[:, 1] - solid[:, 0], solid[:, 2] - solid[:, 0]), axis=1).sum() / 2)
+    return float(
+        np.linalg.norm(np.cross(solid[:, 1] - solid[:, 0], solid[:, 2] - solid[:, 0]), axis=1).sum()
+        / 2
+    )
 
 
 SOLIDS = [
@@ -231,11 +260,16 @@ SOLIDS = [
     (solids.ring(0.2, 0.05), [0.5, 0.5, 0.1]),
     (solids.disc(0.2, 0.05), [0.4, 0.4, 0.05]),
     (solids.pierced(0.5, 0.4, 0.1, 0.05), [0.5, 0.4, 0.05]),
-    (solids.at(solids.slab([(0, 0), (0.4, 0), (0.4, 0.3), (0, 0.3)], 0.1), -0.2, -0.15), [0.4, 0.3, 0.1]),
+    (
+        solids.at(solids.slab([(0, 0), (0.4, 0), (0.4, 0.3), (0, 0.3)], 0.1), -0.2, -0.15),
+        [0.4, 0.3, 0.1],
+    ),
 ]
 
 
-@pytest.mark.parametrize(("solid", "extents"), [*SOLIDS, (solids.frame(0.5, 0.4, 0.1, 0.05), [0.5, 0.4, 0.05])])
+@pytest.mark.parametrize(
+    ("solid", "extents"), [*SOLIDS, (solids.frame(0.5, 0.4, 0.1, 0.05), [0.5, 0.4, 0.05])]
+)
 def test_solid_has_its_size_and_is_centered(solid: Float64, extents: list[float]) -> None:
     assert np.ptp(solid.reshape(-1, 3), axis=0).tolist() == pytest.approx(extents, rel=0.02)
     np.testing.assert_allclose(_middle(solid), 0, atol=1e-3)
@@ -271,10 +305,14 @@ def test_arch_is_part_of_a_ring_from_the_x_axis_on(angle: float) -> None:
     ],
 )
 def test_solid_is_closed(solid: Float64) -> None:
-    """Every edge belongs to two triangles, except edges that collapse to a point on a lathe's axis."""
+    """Every edge belongs to two triangles, except edges that collapse to a point on a lathe's
+    axis.
+    """
     corners, index = np.unique(np.round(solid.reshape(-1, 3), 9), axis=0, return_inverse=True)
     faces = index.reshape(-1, 3)
-    faces = faces[(faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 2] != faces[:, 0])]
+    faces = faces[
+        (faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 2] != faces[:, 0])
+    ]
     edges = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1)
     _, times = np.unique(edges, axis=0, return_counts=True)
     assert len(corners) > 4
@@ -285,20 +323,31 @@ MOVED = [
     (solids.at(solids.box(1, 1, 1), 1, 2, 3), [1, 2, 3]),
     (solids.bar((0.1, 0.2), (0.4, 0.6), 0.06, 0.1), [0.25, 0.4, 0]),
     (solids.turned(solids.at(solids.box(1, 1, 1), x=2), (0, 0, 1), 90), [0, 2, 0]),
-    (solids.tipped(solids.at(solids.box(0.1, 0.1, 0.1), y=1), 30), [0, np.sqrt(3) / 2, -0.5]),  # towards the wall
+    (
+        solids.tipped(solids.at(solids.box(0.1, 0.1, 0.1), y=1), 30),
+        [0, np.sqrt(3) / 2, -0.5],
+    ),  # towards the wall
     (solids.joined(solids.box(1, 1, 1), solids.at(solids.box(1, 1, 1), 5)), [2.5, 0, 0]),
 ]
 
 
-@pytest.mark.parametrize(("solid", "middle"), MOVED, ids=["at", "bar", "turned", "tipped", "joined"])
+@pytest.mark.parametrize(
+    ("solid", "middle"), MOVED, ids=["at", "bar", "turned", "tipped", "joined"]
+)
 def test_solid_is_moved_to_its_place(solid: Float64, middle: list[float]) -> None:
     np.testing.assert_allclose(_middle(solid), middle, atol=1e-12)
 
 
 @pytest.mark.parametrize("taper", [0.0, 0.5, 1.0])
 def test_prism_has_the_volume_of_its_frustum(taper: float) -> None:
-    """By the divergence theorem; side faces point one way, so the sign is that of the outline's turn."""
+    """By the divergence theorem; side faces point one way, so the sign is that of the outline's
+    turn.
+    """
     angle = np.linspace(0, 2 * np.pi, 5)[:-1]
-    a, b, c = np.moveaxis(solids.prism(np.column_stack([np.cos(angle), np.sin(angle)]), 3.0, taper), 1, 0)
+    a, b, c = np.moveaxis(
+        solids.prism(np.column_stack([np.cos(angle), np.sin(angle)]), 3.0, taper), 1, 0
+    )
     area_z = 0.5 * np.abs(np.cross(b - a, c - a)[:, 2])
-    assert area_z.sum() == pytest.approx(2 + 2 * taper**2 + 2 * (1 - taper**2))  # base, front, and sides seen along z
+    assert area_z.sum() == pytest.approx(
+        2 + 2 * taper**2 + 2 * (1 - taper**2)
+    )  # base, front, and sides seen along z

@@ -21,7 +21,15 @@ from nlos_cam.errors import NlosCamError, SceneError
 from nlos_cam.objects import find_category, load_object
 from nlos_cam.objects import meshes as files
 from nlos_cam.objects.depth_map import cell_centers_m, object_box, orthographic_depth
-from nlos_cam.objects.meshes import POSES, MeshFile, folder_objects, mesh_depth, plain, read_depth_map, read_mesh
+from nlos_cam.objects.meshes import (
+    POSES,
+    MeshFile,
+    folder_objects,
+    mesh_depth,
+    plain,
+    read_depth_map,
+    read_mesh,
+)
 from nlos_cam.objects.placement import Pose, category_triangles, place, random_pose
 from nlos_cam.objects.surface_mesh import JUMP_M, SurfaceMesh, mesh_from_depth
 
@@ -77,7 +85,9 @@ def _read(folder: Path, name: str, content: bytes) -> MeshFile:
 
 @pytest.mark.parametrize("name", EXPORTS)
 @pytest.mark.parametrize("letters", ["lower", "upper"])
-def test_read_mesh_gives_the_same_triangles_for_every_format(tmp_path: Path, name: str, letters: str) -> None:
+def test_read_mesh_gives_the_same_triangles_for_every_format(
+    tmp_path: Path, name: str, letters: str
+) -> None:
     mesh = _read(tmp_path, getattr(name, letters)(), EXPORTS[name])
     np.testing.assert_allclose(mesh.triangles, SOLID.triangles, atol=1e-6)
 
@@ -85,8 +95,14 @@ def test_read_mesh_gives_the_same_triangles_for_every_format(tmp_path: Path, nam
 def test_read_mesh_needs_no_optional_package(tmp_path: Path) -> None:
     """Reads materials, textures, edges and non-ASCII names without any optional package."""
     names = [str(_write(tmp_path, name, content)) for name, content in EXPORTS.items()]
-    faces = b"mtllib none.mtl\nusemtl fa\xe7ade\nvt 0 0\nvn 0 0 1\nf 1/1/1 2/1/1 3/1/1\nf 1//1 3//1 4//1\n"
-    names += [str(_write(tmp_path, "square.obj", VERTICES + faces)), str(_write(tmp_path, "square.ply", PLY))]
+    faces = (
+        b"mtllib none.mtl\nusemtl fa\xe7ade\nvt 0 0\nvn 0 0 1\nf 1/1/1 2/1/1 3/1/1\nf 1//1 3//1"
+        b" 4//1\n"
+    )
+    names += [
+        str(_write(tmp_path, "square.obj", VERTICES + faces)),
+        str(_write(tmp_path, "square.ply", PLY)),
+    ]
     command = [sys.executable, "-c", WITHOUT_EXTRAS, *names]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert (done.stdout.split(), done.stderr) == ([str(len(SOLID.faces))] * 5 + ["2", "2"], "")
@@ -94,10 +110,15 @@ def test_read_mesh_needs_no_optional_package(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(("warning", "is_damage"), [(UNREADABLE, True), ("old fashioned", False)])
 def test_read_mesh_silences_the_parser_and_refuses_unreadable_numbers(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch, warning: str, is_damage: bool
+    tmp_path: Path,
+    caplog: pytest.LogCaptureFixture,
+    monkeypatch: pytest.MonkeyPatch,
+    warning: str,
+    is_damage: bool,
 ) -> None:
     """An older numpy only warns about unreadable numbers and returns those before them."""
-    before, load = logging.getLogger("trimesh").level, trimesh.load_scene
+    before = logging.getLogger("trimesh").level
+    load = trimesh.load_scene
 
     def wordy(*arguments: object, **named: object) -> object:
         logging.getLogger("trimesh").error("look at me")
@@ -123,8 +144,13 @@ def test_read_mesh_silences_the_parser_and_refuses_unreadable_numbers(
         (b"v nan inf 1e300\nf 1 2 3\n", [[0, 1, 2]]),  # a vertex of no face
     ],
 )
-def test_read_mesh_joins_faces_of_every_kind(tmp_path: Path, faces: bytes, corners: list[list[int]]) -> None:
-    triangles = {t.tobytes() for t in np.sort(_read(tmp_path, "thing.obj", VERTICES + faces).triangles, axis=1)}
+def test_read_mesh_joins_faces_of_every_kind(
+    tmp_path: Path, faces: bytes, corners: list[list[int]]
+) -> None:
+    triangles = {
+        t.tobytes()
+        for t in np.sort(_read(tmp_path, "thing.obj", VERTICES + faces).triangles, axis=1)
+    }
     assert triangles == {t.tobytes() for t in np.sort(SQUARE[np.array(corners)], axis=1)}
 
 
@@ -132,7 +158,9 @@ def test_read_mesh_joins_parts_and_equals_by_path_and_content(tmp_path: Path) ->
     other = b"v 5 0 0\nv 6 0 0\nv 6 1 0\nf -3 -2 -1\n"
     mesh = _read(tmp_path, "thing.obj", VERTICES + b"f -4 -3 -2\n" + other)
     assert sorted(mesh.triangles[..., 0].max(1)) == [1, 6]
-    assert len(_read(tmp_path, "two.stl", EXPORTS["text.stl"] * 2).triangles) == 2 * len(SOLID.faces)
+    assert len(_read(tmp_path, "two.stl", EXPORTS["text.stl"] * 2).triangles) == 2 * len(
+        SOLID.faces
+    )
     mesh = _read(tmp_path, "thing.stl", EXPORTS["binary.stl"])
     assert _read(tmp_path, "thing.stl", EXPORTS["binary.stl"]) == mesh
     assert _read(tmp_path, "other.stl", EXPORTS["binary.stl"]).sha256 == mesh.sha256
@@ -145,7 +173,10 @@ def test_read_mesh_joins_parts_and_equals_by_path_and_content(tmp_path: Path) ->
         ("thing.glb", b"glTF", ".ply"),
         ("points.ply", trimesh.PointCloud(SQUARE).export(file_type="ply"), "faces"),
         ("short.stl", EXPORTS["text.stl"][:900], "faces"),
-        *[(name, content, "faces") for name, content in (("a.obj", VERTICES), ("a.obj", b""), ("a.stl", b""))],
+        *[
+            (name, content, "faces")
+            for name, content in (("a.obj", VERTICES), ("a.obj", b""), ("a.stl", b""))
+        ],
         ("none.stl", bytes(84), "faces"),
         ("empty.ply", b"", ".ply"),
         ("cut.stl", EXPORTS["binary.stl"][:900], "900"),
@@ -154,14 +185,25 @@ def test_read_mesh_joins_parts_and_equals_by_path_and_content(tmp_path: Path) ->
         ("word.obj", VERTICES.replace(b"v 1", b"v one") + b"f 1 2 3\n", ""),
         ("wide.obj", "v 0 0 0".encode("utf-16"), ""),
         ("word.stl", EXPORTS["text.stl"].replace(b"vertex ", b"vertex x", 1), ""),
-        *[("face.obj", VERTICES + b"f " + face, "") for face in (b"1 2 9", b"1 2 -5", b"1/1 0/2 3/3", b"1 00 2")],
+        *[
+            ("face.obj", VERTICES + b"f " + face, "")
+            for face in (b"1 2 9", b"1 2 -5", b"1/1 0/2 3/3", b"1 00 2")
+        ],
         *[("face.ply", PLY.replace(b"3 0 2 3", face), "") for face in (b"3 0 2 4", b"3 0 2 -1")],
-        *[("far.obj", VERTICES + b"v " + x + b" 0 0\nf 1 2 5\n", "NaN") for x in (b"nan", b"1e200")],
+        *[
+            ("far.obj", VERTICES + b"v " + x + b" 0 0\nf 1 2 5\n", "NaN")
+            for x in (b"nan", b"1e200")
+        ],
         ("inf.ply", PLY.replace(b"1 1 0 1", b"1 inf 0 1"), "NaN"),
-        *[("flat.obj", VERTICES + b"v 2 0 0\nf " + face, "area") for face in (b"1 2 5\n", b"2 2 2\n")],
+        *[
+            ("flat.obj", VERTICES + b"v 2 0 0\nf " + face, "area")
+            for face in (b"1 2 5\n", b"2 2 2\n")
+        ],
     ],
 )
-def test_read_mesh_refuses_damaged_files(tmp_path: Path, name: str, content: bytes, word: str) -> None:
+def test_read_mesh_refuses_damaged_files(
+    tmp_path: Path, name: str, content: bytes, word: str
+) -> None:
     _assert_refused(_write(tmp_path, name, content), word)
 
 
@@ -173,7 +215,9 @@ def test_reader_names_a_missing_file_and_a_folder(tmp_path: Path, name: str) -> 
     _assert_refused(tmp_path / name, "directory", read)
 
 
-@pytest.mark.parametrize(("limit", "value", "word"), [("MAX_FACES", 89, "89"), ("MAX_BYTES", 99, "MiB")])
+@pytest.mark.parametrize(
+    ("limit", "value", "word"), [("MAX_FACES", 89, "89"), ("MAX_BYTES", 99, "MiB")]
+)
 def test_read_mesh_refuses_too_large_files(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, limit: str, value: int, word: str
 ) -> None:
@@ -183,7 +227,9 @@ def test_read_mesh_refuses_too_large_files(
 
 @settings(max_examples=60, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(st.sampled_from(sorted(EXPORTS)), st.data())
-def test_read_mesh_raises_scene_errors_only_on_damage(tmp_path: Path, name: str, data: st.DataObject) -> None:
+def test_read_mesh_raises_scene_errors_only_on_damage(
+    tmp_path: Path, name: str, data: st.DataObject
+) -> None:
     content = bytearray(EXPORTS[name])
     place = data.draw(st.integers(0, len(content) - 1))
     content[place : place + data.draw(st.integers(0, 40))] = data.draw(st.binary(max_size=40))
@@ -216,15 +262,24 @@ def test_plain_makes_odd_obj_text_usual(odd: bytes, usual: bytes) -> None:
 
 def test_plain_renames_ply_edges_and_keeps_binary_bodies() -> None:
     body = b"\n\0element edge 7"
-    assert plain(b"ply\nelement edge 2\nend_header" + body, ".ply") == b"ply\nelement wire 2\nend_header" + body
+    assert (
+        plain(b"ply\nelement edge 2\nend_header" + body, ".ply")
+        == b"ply\nelement wire 2\nend_header" + body
+    )
     stl = bytes(80) + (1).to_bytes(4, "little") + b"\t#\xe7\r\n" * 10
     assert plain(stl, ".stl") == stl
 
 
-@pytest.mark.parametrize("dtype", ["f2", "f4", "f8", "g", ">f4", "i1", "u1", "i2", ">i4", "i8", "u8"])
+@pytest.mark.parametrize(
+    "dtype", ["f2", "f4", "f8", "g", ">f4", "i1", "u1", "i2", ">i4", "i8", "u8"]
+)
 @pytest.mark.parametrize("size", [8, 64, 256])
-def test_read_depth_map_takes_every_real_type_and_size(tmp_path: Path, dtype: str, size: int) -> None:
-    depth = np.arange(size * size).reshape(size, size) % 4 / (1 if np.dtype(dtype).kind in "iu" else 8)
+def test_read_depth_map_takes_every_real_type_and_size(
+    tmp_path: Path, dtype: str, size: int
+) -> None:
+    depth = (
+        np.arange(size * size).reshape(size, size) % 4 / (1 if np.dtype(dtype).kind in "iu" else 8)
+    )
     if dtype == "f2":
         depth[:] = np.nan  # an empty object
     np.save(tmp_path / "map.npy", depth.astype(dtype, order="F" if dtype == "f8" else "C"))
@@ -287,7 +342,9 @@ def _save(path: Path, mesh: trimesh.Trimesh = TORUS) -> Path:
     return path
 
 
-def test_folder_objects_finds_meshes_in_a_fixed_order_and_refuses_missing_empty_and_file_paths(tmp_path: Path) -> None:
+def test_folder_objects_finds_meshes_in_a_fixed_order_and_refuses_missing_empty_and_file_paths(
+    tmp_path: Path,
+) -> None:
     tmp_path /= ".cache"  # a hidden folder named on purpose is searched
     names = ["b.obj", "a/z.STL", "a/deep/er/y.ply", "c/x.stl"]
     for name in names:
@@ -331,10 +388,15 @@ def test_mesh_depth_names_a_broken_or_invisible_mesh(tmp_path: Path) -> None:
         mesh_depth(0, [_save(tmp_path / "needle.ply", needle)], BOX, read=read_mesh)
 
 
-def test_mesh_depth_draws_another_pose_for_an_edge_on_sheet(monkeypatch: pytest.MonkeyPatch) -> None:
-    along_the_sight, others = Pose(), (random_pose(np.random.default_rng(seed), BOX) for seed in range(POSES))
+def test_mesh_depth_draws_another_pose_for_an_edge_on_sheet(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    along_the_sight = Pose()
+    others = (random_pose(np.random.default_rng(seed), BOX) for seed in range(POSES))
     monkeypatch.setattr(files, "random_pose", drawn := Mock(side_effect=[along_the_sight, *others]))
-    lying = np.array([[[0, 0, 0], [1, 0, 0], [0, 0, 1]], [[1, 0, 0], [1, 0, 1], [0, 0, 1]]], np.float64)
+    lying = np.array(
+        [[[0, 0, 0], [1, 0, 0], [0, 0, 1]], [[1, 0, 0], [1, 0, 1], [0, 0, 1]]], np.float64
+    )
     _, depth_m = mesh_depth(3, ["sheet"], BOX, read=lambda name: MeshFile(Path(name), "", lying))
     assert 1 < drawn.call_count <= POSES
     assert np.isfinite(depth_m).any()
@@ -352,10 +414,14 @@ def test_load_object_places_a_category_and_a_mesh_alike(tmp_path: Path) -> None:
     loaded = load_object("cup", BOX, POSE, seed=4)
     np.testing.assert_array_equal(loaded.depth_m, expected)
     assert loaded.warnings == ()
-    np.testing.assert_allclose(load_object(str(tmp_path / "cup.stl"), BOX, POSE).depth_m, expected, atol=1e-4)
+    np.testing.assert_allclose(
+        load_object(str(tmp_path / "cup.stl"), BOX, POSE).depth_m, expected, atol=1e-4
+    )
 
 
-@pytest.mark.parametrize(("name", "hint"), [("cupp", "Did you mean 'cup'?"), ("teapot", "tower"), ("cup.glb", ".stl")])
+@pytest.mark.parametrize(
+    ("name", "hint"), [("cupp", "Did you mean 'cup'?"), ("teapot", "tower"), ("cup.glb", ".stl")]
+)
 def test_load_object_suggests_the_nearest_category(name: str, hint: str) -> None:
     with pytest.raises(SceneError) as caught:
         load_object(name, BOX)
@@ -368,7 +434,9 @@ def test_load_object_suggests_the_nearest_category(name: str, hint: str) -> None
 @pytest.mark.parametrize(
     ("name", "arguments"), [("cup", {"up": "z"}), ("a.stl", {"seed": 1}), ("a.npy", {"pose": POSE})]
 )
-def test_load_object_refuses_arguments_that_do_not_apply(name: str, arguments: dict[str, object]) -> None:
+def test_load_object_refuses_arguments_that_do_not_apply(
+    name: str, arguments: dict[str, object]
+) -> None:
     with pytest.raises(SceneError, match="seed is for categories"):
         load_object(name, BOX, **arguments)  # type: ignore[arg-type]
 
@@ -380,9 +448,13 @@ def test_load_object_refuses_a_plate_seen_edge_on(tmp_path: Path) -> None:
         load_object(str(plate), BOX, Pose(tilt_y_rad=np.pi / 2))
 
 
-SMALL_BOX = ObjectBox(x_min_m=0.0, x_max_m=0.16, y_min_m=-0.1, y_max_m=0.06, z_near_m=0.1, z_far_m=0.6)
+SMALL_BOX = ObjectBox(
+    x_min_m=0.0, x_max_m=0.16, y_min_m=-0.1, y_max_m=0.06, z_near_m=0.1, z_far_m=0.6
+)
 NAN = np.float32(np.nan)
-DEPTHS = arrays(np.float32, (8, 8), elements=st.one_of(st.just(NAN), st.floats(0.125, 0.25, width=32)))
+DEPTHS = arrays(
+    np.float32, (8, 8), elements=st.one_of(st.just(NAN), st.floats(0.125, 0.25, width=32))
+)
 ERROR_M = np.linspace(0.001, 0.05, 64, dtype=np.float32).reshape(8, 8)
 
 
@@ -390,12 +462,16 @@ def slope() -> np.ndarray:
     """Return a tilted plane with a hole, a line one cell wide and a single cell."""
     depth_m = np.full((8, 8), NAN)
     depth_m[:4, :5] = 0.2 + 0.004 * np.arange(20, dtype=np.float32).reshape(4, 5)
-    depth_m[1, 1], depth_m[6, :4], depth_m[7, 7] = NAN, 0.3, 0.15
+    depth_m[1, 1] = NAN
+    depth_m[6, :4] = 0.3
+    depth_m[7, 7] = 0.15
     return depth_m
 
 
 def sampled(mesh: SurfaceMesh) -> np.ndarray:
-    """Return the mesh's depth at the cells' centres; triangles grow by 1e-7 so that a centre on an edge is inside."""
+    """Return the mesh's depth at the cells' centres; triangles grow by 1e-7 so that a centre on an
+    edge is inside.
+    """
     triangles_m = mesh.vertices_m[mesh.faces]
     middle_m = triangles_m.mean(axis=1, keepdims=True)
     return orthographic_depth(middle_m + (1 + 1e-7) * (triangles_m - middle_m), SMALL_BOX, 8)
@@ -435,7 +511,9 @@ def test_glb_holds_the_mesh_and_its_uncertainty(tmp_path: Path) -> None:
     (read,) = trimesh.load_scene(tmp_path / "mesh.glb", process=False).geometry.values()
     np.testing.assert_allclose(read.vertices, mesh.vertices_m, atol=1e-6)
     np.testing.assert_array_equal(read.faces, mesh.faces)
-    np.testing.assert_array_equal(read.vertex_attributes["_uncertainty_m"].ravel(), mesh.uncertainty_m)
+    np.testing.assert_array_equal(
+        read.vertex_attributes["_uncertainty_m"].ravel(), mesh.uncertainty_m
+    )
     assert read.visual.material.doubleSided
 
 
@@ -446,7 +524,9 @@ def test_points_are_saved_without_faces(tmp_path: Path) -> None:
     np.testing.assert_allclose(read[:, 0], mesh.vertices_m, atol=1e-6)
     mesh.save(str(tmp_path / "points.csv"))
     rows = [*csv.DictReader((tmp_path / "points.csv").read_text(encoding="utf-8").splitlines())]
-    np.testing.assert_allclose([float(row["z_m"]) for row in rows], mesh.vertices_m[:, 2], atol=1e-5)
+    np.testing.assert_allclose(
+        [float(row["z_m"]) for row in rows], mesh.vertices_m[:, 2], atol=1e-5
+    )
     assert {row["uncertainty_m"] for row in rows} == {""}
     mesh_from_depth(slope(), SMALL_BOX, ERROR_M).save(tmp_path / "mesh.npz")
     with np.load(tmp_path / "mesh.npz") as arrays_read:
@@ -454,8 +534,12 @@ def test_points_are_saved_without_faces(tmp_path: Path) -> None:
         assert len(arrays_read["uncertainty_m"]) == len(mesh.vertices_m)
 
 
-@pytest.mark.parametrize(("name", "depth_m", "word"), [("a.fbx", 0.2, ".glb"), ("a.ply", NAN, "no surface")])
-def test_mesh_that_cannot_be_saved_is_refused(tmp_path: Path, name: str, depth_m: float, word: str) -> None:
+@pytest.mark.parametrize(
+    ("name", "depth_m", "word"), [("a.fbx", 0.2, ".glb"), ("a.ply", NAN, "no surface")]
+)
+def test_mesh_that_cannot_be_saved_is_refused(
+    tmp_path: Path, name: str, depth_m: float, word: str
+) -> None:
     with pytest.raises(NlosCamError, match=word):
         mesh_from_depth(np.full((8, 8), depth_m, np.float32), SMALL_BOX).save(tmp_path / name)
     assert not any(tmp_path.iterdir())

@@ -7,7 +7,14 @@ from nlos_cam.dataset import HELD_OUT_SEED, TEST_SEED, TRAINING_SEED
 from nlos_cam.errors import SceneError
 from nlos_cam.objects import CATEGORIES, object_box, object_depth, panel, place, post, random_pose
 from nlos_cam.objects.benchmark import BenchmarkObject, benchmark_objects
-from nlos_cam.objects.placement import POSE_UNITS, Pose, add_background, category_triangles, fit_in_box, pose_from_units
+from nlos_cam.objects.placement import (
+    POSE_UNITS,
+    Pose,
+    add_background,
+    category_triangles,
+    fit_in_box,
+    pose_from_units,
+)
 
 BOX = object_box(load_rig("paper-rig"))
 CUP = category_triangles("cup", 0)
@@ -18,7 +25,9 @@ def _points(pose: Pose, box: ObjectBox = BOX) -> np.ndarray:
 
 
 def test_place_gives_size_offset_and_a_front_within_the_box() -> None:
-    points = _points(Pose(turn_z_rad=0.4, tilt_x_rad=0.2, size_m=0.15, x_m=0.02, y_m=-0.03, front_m=0.04))
+    points = _points(
+        Pose(turn_z_rad=0.4, tilt_x_rad=0.2, size_m=0.15, x_m=0.02, y_m=-0.03, front_m=0.04)
+    )
     assert np.ptp(points[:, :2], axis=0).max() == pytest.approx(0.15)
     middle = (points.min(0) + points.max(0)) / 2
     np.testing.assert_allclose(middle[:2], [0.45 + 0.02, -0.03], atol=1e-12)
@@ -29,7 +38,8 @@ def test_place_gives_size_offset_and_a_front_within_the_box() -> None:
 
 
 def test_deep_mesh_is_flattened_and_fit_reports_it() -> None:
-    inside, beside = fit_in_box(CUP, Pose(size_m=0.2), BOX), fit_in_box(CUP, Pose(size_m=0.2, x_m=0.25), BOX)
+    inside = fit_in_box(CUP, Pose(size_m=0.2), BOX)
+    beside = fit_in_box(CUP, Pose(size_m=0.2, x_m=0.25), BOX)
     assert inside.outside == 0
     assert beside.outside == 1
     assert inside.depth_m == pytest.approx(np.ptp(_points(Pose(size_m=0.2))[:, 2]))
@@ -37,7 +47,8 @@ def test_deep_mesh_is_flattened_and_fit_reports_it() -> None:
     shallow = BOX.model_copy(update={"z_far_m": BOX.z_near_m + 0.06})
     flattened = fit_in_box(CUP, Pose(size_m=0.2), shallow)
     assert flattened.depth_m == inside.depth_m > flattened.room_m == pytest.approx(0.03)
-    deep, flat = _points(Pose()), _points(Pose(), shallow)
+    deep = _points(Pose())
+    flat = _points(Pose(), shallow)
     assert flat[:, 2].max() == pytest.approx(shallow.z_far_m)
     np.testing.assert_allclose(flat[:, :2], deep[:, :2])
 
@@ -58,7 +69,10 @@ def test_object_depth_draws_all_or_the_chosen_categories_but_not_none_or_unknown
 def test_backgrounds_come_at_their_share_behind_the_same_objects() -> None:
     """Each object has its own background from some share on, and keeps it at any larger share."""
     seeds = range(40)
-    alone, some, each = ([object_depth(seed, BOX, backgrounds=share)[1] for seed in seeds] for share in (0.0, 0.3, 1.0))
+    alone, some, each = (
+        [object_depth(seed, BOX, backgrounds=share)[1] for seed in seeds]
+        for share in (0.0, 0.3, 1.0)
+    )
     has = [not np.array_equal(a, s, equal_nan=True) for a, s in zip(alone, some, strict=True)]
     assert 4 <= sum(has) <= 20
     for thing, with_some, with_each, seed_has in zip(alone, some, each, has, strict=True):
@@ -68,9 +82,13 @@ def test_backgrounds_come_at_their_share_behind_the_same_objects() -> None:
 
 
 def test_random_pose_is_of_seven_random_numbers_from_end_to_end_of_training_in_the_box() -> None:
-    least, most = pose_from_units([0.0] * POSE_UNITS, BOX), pose_from_units([1.0] * POSE_UNITS, BOX)
+    least = pose_from_units([0.0] * POSE_UNITS, BOX)
+    most = pose_from_units([1.0] * POSE_UNITS, BOX)
     assert (least.size_m, most.size_m) == (pytest.approx(0.55 * 0.25), pytest.approx(0.9 * 0.25))
-    assert (least.turn_z_rad, most.turn_z_rad) == (pytest.approx(-np.radians(35)), pytest.approx(np.radians(35)))
+    assert (least.turn_z_rad, most.turn_z_rad) == (
+        pytest.approx(-np.radians(35)),
+        pytest.approx(np.radians(35)),
+    )
     assert (least.front_m, most.front_m) == (0, pytest.approx(0.35 * 0.28))
     for pose in (least, most):
         assert abs(pose.x_m) + pose.size_m / 2 == pytest.approx(0.125)
@@ -97,7 +115,10 @@ def test_background_leaves_the_object_and_stays_in_the_box(seed: int) -> None:
 
 
 def test_background_is_a_post_or_a_panel() -> None:
-    shares = [np.isfinite(add_background(OBJECTS[0], BOX, np.random.default_rng(seed))).mean() for seed in range(20)]
+    shares = [
+        np.isfinite(add_background(OBJECTS[0], BOX, np.random.default_rng(seed))).mean()
+        for seed in range(20)
+    ]
     assert min(shares) < np.isfinite(OBJECTS[0]).mean() + 0.1
     assert max(shares) > 0.4
 
@@ -109,14 +130,19 @@ def test_post_is_level_from_the_underside_to_the_bottom(thing: Float32) -> None:
     for column in np.flatnonzero(below.any(axis=0)):
         lowest = np.flatnonzero(surface[:, column]).max()
         np.testing.assert_array_equal(np.flatnonzero(below[:, column]), np.arange(lowest + 1, 64))
-    assert np.ptp(post(thing, np.random.default_rng(1))[below]) == 0 if below.any() else surface[-1].any()
+    assert (
+        np.ptp(post(thing, np.random.default_rng(1))[below]) == 0
+        if below.any()
+        else surface[-1].any()
+    )
 
 
 @pytest.mark.parametrize("thing", OBJECTS)
 def test_panel_is_a_rectangle_behind_the_object(thing: Float32) -> None:
     board = panel(thing, BOX, np.random.default_rng(2))
     there = ~np.isnan(board)
-    rows, columns = there.any(axis=1), there.any(axis=0)
+    rows = there.any(axis=1)
+    columns = there.any(axis=0)
     np.testing.assert_array_equal(there, rows[:, None] & columns)
     assert 36 <= rows.sum() <= 64
     assert 36 <= columns.sum() <= 64
@@ -129,7 +155,9 @@ BENCHMARK = benchmark_objects(BOX)
 
 def test_benchmark_has_the_same_three_named_objects_per_category_each_time_inside_the_box() -> None:
     assert len(BENCHMARK) == len({thing.name for thing in BENCHMARK}) == 54
-    assert [(thing.category, thing.number) for thing in BENCHMARK] == [(c, k) for c in CATEGORIES for k in (1, 2, 3)]
+    assert [(thing.category, thing.number) for thing in BENCHMARK] == [
+        (c, k) for c in CATEGORIES for k in (1, 2, 3)
+    ]
     assert BENCHMARK[0].name == "airplane-1"
     again = benchmark_objects(BOX)
     assert again == BENCHMARK
@@ -137,7 +165,8 @@ def test_benchmark_has_the_same_three_named_objects_per_category_each_time_insid
         assert thing.depth_m.tobytes() == same.depth_m.tobytes()
         assert thing.triangles.tobytes() == same.triangles.tobytes()
     for thing in BENCHMARK:
-        low, high = thing.triangles.reshape(-1, 3).min(0), thing.triangles.reshape(-1, 3).max(0)
+        low = thing.triangles.reshape(-1, 3).min(0)
+        high = thing.triangles.reshape(-1, 3).max(0)
         assert (low >= np.array([BOX.x_min_m, BOX.y_min_m, BOX.z_near_m]) - 1e-9).all()
         assert (high <= np.array([BOX.x_max_m, BOX.y_max_m, BOX.z_far_m]) + 1e-9).all()
         assert thing.depth_m.shape == (64, 64)
@@ -167,15 +196,26 @@ def test_benchmark_spreads_settings_evenly_within_category(category: str) -> Non
 
 
 def test_benchmark_poses_cover_the_training_range_evenly_and_uncorrelated() -> None:
-    spans = {"size_m": (0.25 * 0.55, 0.25 * 0.9), "front_m": (0, 0.35 * 0.28), "x_m": (-1, 1), "y_m": (-1, 1)}
+    spans = {
+        "size_m": (0.25 * 0.55, 0.25 * 0.9),
+        "front_m": (0, 0.35 * 0.28),
+        "x_m": (-1, 1),
+        "y_m": (-1, 1),
+    }
     spans |= {
         f"{name}_rad": (-np.radians(deg), np.radians(deg))
         for name, deg in (("tilt_x", 15), ("tilt_y", 20), ("turn_z", 35))
     }
     assert set(spans) == set(Pose.__dataclass_fields__)
     for name, (low, high) in spans.items():
-        spare = [(0.25 - thing.pose.size_m) / 2 if name in {"x_m", "y_m"} else 1 for thing in BENCHMARK]
-        values = [getattr(thing.pose, name) / room for thing, room in zip(BENCHMARK, spare, strict=True)]
-        np.testing.assert_allclose(np.sort(values), low + (high - low) * (np.arange(54) + 0.5) / 54, atol=1e-9)
+        spare = [
+            (0.25 - thing.pose.size_m) / 2 if name in {"x_m", "y_m"} else 1 for thing in BENCHMARK
+        ]
+        values = [
+            getattr(thing.pose, name) / room for thing, room in zip(BENCHMARK, spare, strict=True)
+        ]
+        np.testing.assert_allclose(
+            np.sort(values), low + (high - low) * (np.arange(54) + 0.5) / 54, atol=1e-9
+        )
     table = np.array([[k, *vars(thing.pose).values()] for k, thing in enumerate(BENCHMARK)])
     assert np.abs(np.corrcoef(table.T) - np.eye(8)).max() < 0.25

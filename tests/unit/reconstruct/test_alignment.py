@@ -21,15 +21,21 @@ from nlos_cam.render import Scene, Sensor, SensorModel, render
 
 RIG = load_rig("paper-rig")
 THINGS = benchmark_objects(object_box(RIG))[1::9]
-QUIET = SensorModel(range_noise_m=0, range_noise_per_m=0, read_noise_counts=0, shot_noise=0, dead_share=0)
+QUIET = SensorModel(
+    range_noise_m=0, range_noise_per_m=0, read_noise_counts=0, shot_noise=0, dead_share=0
+)
 
 
 def trained(rig: Rig = RIG, **changes: Any) -> Any:
-    return SimpleNamespace(**{"rig_name": rig.name, "rig_checksum": rig.checksum, "input": "raw maps"} | changes)
+    return SimpleNamespace(
+        **{"rig_name": rig.name, "rig_checksum": rig.checksum, "input": "raw maps"} | changes
+    )
 
 
 def bench(along_m: float = 0.0, up_m: float = 0.0, **lidar: float) -> Rig:
-    """Return the paper's rig with its lidar elsewhere: positions on the wall are relative to the lidar's foot."""
+    """Return the paper's rig with its lidar elsewhere: positions on the wall are relative to the
+    lidar's foot.
+    """
     moved = {
         part: extent.model_copy(
             update={"x_min_m": extent.x_min_m - along_m, "x_max_m": extent.x_max_m - along_m}
@@ -40,7 +46,9 @@ def bench(along_m: float = 0.0, up_m: float = 0.0, **lidar: float) -> Rig:
     }
     assert RIG.occluder
     edge = RIG.occluder.model_copy(update={"x_m": RIG.occluder.x_m - along_m})
-    return RIG.model_copy(update={**moved, "occluder": edge, "lidar": RIG.lidar.model_copy(update=lidar)})
+    return RIG.model_copy(
+        update={**moved, "occluder": edge, "lidar": RIG.lidar.model_copy(update=lidar)}
+    )
 
 
 BENCHES = {
@@ -52,42 +60,61 @@ BENCHES = {
 }
 
 
-def maps_of(rig: Rig, depth_m: Float32 | None, model: SensorModel = QUIET, seed: int | None = None) -> LidarMaps:
-    generator = None if seed is None and not model.wall_texture else np.random.default_rng(seed or 0)
+def maps_of(
+    rig: Rig, depth_m: Float32 | None, model: SensorModel = QUIET, seed: int | None = None
+) -> LidarMaps:
+    generator = (
+        None if seed is None and not model.wall_texture else np.random.default_rng(seed or 0)
+    )
     return Sensor(rig, model).maps(render(Scene(rig, depth_m), "draft").multi, generator)
 
 
 @pytest.mark.parametrize("rig", list(BENCHES.values())[1:], ids=list(BENCHES)[1:])
 def test_bare_bench_looks_like_the_bare_training_rig(rig: Rig) -> None:
     aligned = MapAlignment(rig, RIG)
-    found, wanted = aligned.align(maps_of(rig, None)), maps_of(RIG, None)
+    found = aligned.align(maps_of(rig, None))
+    wanted = maps_of(RIG, None)
     np.testing.assert_array_equal(found.valid, wanted.valid)
     # Cells are compared but for the column at the occluder's edge, which sees both it and the wall.
-    off_m, ratio = np.abs(found.depth_m - wanted.depth_m), found.intensity / wanted.intensity
+    off_m = np.abs(found.depth_m - wanted.depth_m)
+    ratio = found.intensity / wanted.intensity
     assert np.quantile(off_m, 0.98) < 1e-3
     assert np.quantile(np.abs(np.log(ratio)), 0.95) < 0.04
 
 
 def test_networks_keep_their_silhouettes_on_a_bench_built_with_a_ruler() -> None:
-    truth, box = np.stack([image_from_depth(one.depth_m, object_box(RIG)) for one in THINGS]), object_box(RIG)
-    network, iou = reconstruct.load_networks(), dict[str, float]()
+    truth = np.stack([image_from_depth(one.depth_m, object_box(RIG)) for one in THINGS])
+    box = object_box(RIG)
+    network = reconstruct.load_networks()
+    iou = dict[str, float]()
     for name, rig in BENCHES.items():
         seen = [maps_of(rig, one.depth_m, SensorModel(), 1) for one in THINGS]
-        maps = MapSet(np.stack([one.depth_m for one in seen]), np.stack([one.intensity for one in seen]), truth)
-        for aligned, given in ((True, reconstruct.align_all(maps, repeat(rig), network.record)), (False, maps)):
+        maps = MapSet(
+            np.stack([one.depth_m for one in seen]),
+            np.stack([one.intensity for one in seen]),
+            truth,
+        )
+        for aligned, given in (
+            (True, reconstruct.align_all(maps, repeat(rig), network.record)),
+            (False, maps),
+        ):
             image = network(given.depth_m, given.intensity)
             iou[f"{name} {aligned}"] = float(per_object(image, truth, box)["silhouette_iou"].mean())
     for name in list(BENCHES)[1:]:
-        assert iou[f"{name} True"] > max(iou["as trained False"] - 0.08, iou[f"{name} False"] + 0.2), iou
+        assert iou[f"{name} True"] > max(
+            iou["as trained False"] - 0.08, iou[f"{name} False"] + 0.2
+        ), iou
 
 
 @pytest.mark.parametrize(("gain", "offset_m"), [(0.8, 0.0), (1.0, 0.004), (1.3, -0.003)])
 def test_bare_wall_takes_reflectance_gain_and_offset_out(gain: float, offset_m: float) -> None:
-    rig, depth_m = BENCHES["all of it"], THINGS[0].depth_m
+    rig = BENCHES["all of it"]
+    depth_m = THINGS[0].depth_m
     painted = QUIET.model_copy(update={"wall_texture": 0.1, "range_offset_m": offset_m})
     empty = maps_of(rig, None, painted)
     reference: Any = SimpleNamespace(map_depth_m=empty.depth_m, map_intensity=empty.intensity)
-    aligned, plain = alignment(rig, trained(), reference), alignment(rig, trained())
+    aligned = alignment(rig, trained(), reference)
+    plain = alignment(rig, trained())
     assert aligned
     assert plain
     seen = maps_of(rig, depth_m, painted)
@@ -102,9 +129,12 @@ def test_bare_wall_takes_reflectance_gain_and_offset_out(gain: float, offset_m: 
 
 
 def test_what_cannot_be_aligned_is_left_alone() -> None:
-    rig, box = BENCHES["all of it"], RIG.object_box
+    rig = BENCHES["all of it"]
+    box = RIG.object_box
     assert box
-    larger = rig.model_copy(update={"object_box": box.model_copy(update={"z_far_m": box.z_far_m + 0.05})})
+    larger = rig.model_copy(
+        update={"object_box": box.model_copy(update={"z_far_m": box.z_far_m + 0.05})}
+    )
     assert reconstruct.rig_to_align_with(rig, trained()) == RIG
     for other, record in (
         (RIG, trained()),
@@ -113,23 +143,30 @@ def test_what_cannot_be_aligned_is_left_alone() -> None:
         (rig, trained(input="difference maps")),
         (rig, trained(rig_name="somebody else's")),
         (rig, trained(rig_checksum="0" * 12)),
-        *((bench(**lidar), trained()) for lidar in ({"distance_m": 0.25}, {"yaw_deg": 15.0})),  # see less of the wall
+        *(
+            (bench(**lidar), trained()) for lidar in ({"distance_m": 0.25}, {"yaw_deg": 15.0})
+        ),  # see less of the wall
     ):
         assert reconstruct.rig_to_align_with(other, record) is None
         assert alignment(other, record) is None
     maps = maps_of(rig, None)
-    dark = LidarMaps(np.full_like(maps.depth_m, np.nan), np.zeros_like(maps.intensity), np.zeros_like(maps.valid))
+    dark = LidarMaps(
+        np.full_like(maps.depth_m, np.nan), np.zeros_like(maps.intensity), np.zeros_like(maps.valid)
+    )
     assert not MapAlignment(rig, RIG).align(dark).valid[:, :50].any()
 
 
 def arrival(rig: Rig) -> Arrival:
     echoes = render(Scene(rig, None), "draft").multi
-    return Arrival(Sensor(rig, QUIET).expose(echoes, np.random.default_rng(0)).frame(rig.pinhole), 0.0)
+    return Arrival(
+        Sensor(rig, QUIET).expose(echoes, np.random.default_rng(0)).frame(rig.pinhole), 0.0
+    )
 
 
 def test_occluder_that_was_not_measured_is_taken_to_stand_as_in_training() -> None:
     rig = BENCHES["lidar 5 mm aside and up"]
-    seen, records = maps_of(rig, THINGS[0].depth_m), (rig, rig.model_copy(update={"occluder": None}))
+    seen = maps_of(rig, THINGS[0].depth_m)
+    records = (rig, rig.model_copy(update={"occluder": None}))
     found, wanted = (alignment(one, trained()).align(seen) for one in records)  # type: ignore[union-attr]
     np.testing.assert_allclose(found.depth_m, wanted.depth_m)
     np.testing.assert_allclose(found.intensity, wanted.intensity)
@@ -140,7 +177,12 @@ def test_pipeline_aligns_with_the_bench_that_it_has() -> None:
     for record, changed in ((trained(), True), (None, False)):
         pipeline = reconstruct.Pipeline(CalibratedRig(rig), SheetNetwork(), trained=record)
         prepared = pipeline.prepare(arrival(rig), lambda: 0.0, 0.0)
-        assert np.array_equal(prepared.network_input.depth_m, prepared.corrected.depth_m, equal_nan=True) != changed
+        assert (
+            np.array_equal(
+                prepared.network_input.depth_m, prepared.corrected.depth_m, equal_nan=True
+            )
+            != changed
+        )
         pipeline.bench = CalibratedRig(RIG)
         prepared = pipeline.prepare(arrival(RIG), lambda: 0.0, 0.0)
         np.testing.assert_array_equal(prepared.network_input.depth_m, prepared.corrected.depth_m)

@@ -13,7 +13,14 @@ from nlos_cam.frames import LidarMaps
 from nlos_cam.live import run_live
 from nlos_cam.objects import object_box, object_depth
 from nlos_cam.reconstruct import CalibratedRig, PeriodicPhysicsCheck, Pipeline, check_reconstruction
-from nlos_cam.reconstruct.physics_check import Expected, describe_failure, explain, fit_gain, log_warning, mean_cost
+from nlos_cam.reconstruct.physics_check import (
+    Expected,
+    describe_failure,
+    explain,
+    fit_gain,
+    log_warning,
+    mean_cost,
+)
 from nlos_cam.render import Scene, render
 
 SHAPE = 64, 80
@@ -23,13 +30,17 @@ WALL_M = np.broadcast_to(np.linspace(0.2, 0.6, 80), SHAPE)
 
 
 def expected_object(echo_m: float = 0.5, strength: float = 4.0) -> Expected:
-    """A wall; on the right half an object's echo, so many times as strong as the wall's own return."""
+    """A wall; on the right half an object's echo, so many times as strong as the wall's own
+    return.
+    """
     direct = np.full(SHAPE, 3e-4)
     echo = np.where(RIGHT, strength * direct, 0.0)
     return Expected(WALL_M, direct, np.where(echo > 0, echo_m + np.zeros(SHAPE), np.nan), echo)
 
 
-def maps_of(expected: Expected, *, noise_m: float = 0.0, albedo: float = 1.0, gain: float = GAIN) -> LidarMaps:
+def maps_of(
+    expected: Expected, *, noise_m: float = 0.0, albedo: float = 1.0, gain: float = GAIN
+) -> LidarMaps:
     depth_m, intensity = expected.noiseless_maps(albedo, gain)
     noise = np.random.default_rng(0).normal(0, 1, SHAPE).astype(np.float32)
     return LidarMaps(depth_m + np.float32(noise_m) * noise, intensity, np.isfinite(depth_m))
@@ -40,7 +51,8 @@ def score(seen: LidarMaps, expected: Expected) -> float:
 
 
 def test_score_is_0_of_expected_maps_1_of_an_empty_bench_and_more_of_an_object_not_there() -> None:
-    scene, nothing = expected_object(), Expected(np.full(SHAPE, np.nan), np.zeros(SHAPE), *[np.zeros(SHAPE)] * 2)
+    scene = expected_object()
+    nothing = Expected(np.full(SHAPE, np.nan), np.zeros(SHAPE), *[np.zeros(SHAPE)] * 2)
     assert score(maps_of(scene), scene) == pytest.approx(0.0, abs=1e-6)
     assert score(maps_of(scene, noise_m=1e-4), scene) < 0.1
     assert score(maps_of(scene), scene.bare) == 1.0
@@ -60,7 +72,8 @@ def test_score_rises_with_the_distance_from_the_object() -> None:
 
 @pytest.mark.parametrize("albedo", [0.75, 1.0, (4 / 3) ** 0.5])
 def test_explain_fits_gain_and_albedo(albedo: float) -> None:
-    maps, scene = maps_of(expected_object(), albedo=albedo), expected_object()
+    maps = maps_of(expected_object(), albedo=albedo)
+    scene = expected_object()
     best = explain(maps, scene, scene.bare)
     assert best.albedo == pytest.approx(albedo, rel=1e-6)
     assert best.score == pytest.approx(0.0, abs=1e-6)
@@ -77,18 +90,28 @@ def test_fitted_gain_uses_the_wall_where_it_is_visible() -> None:
     assert fit_gain(replace(seen, valid=np.zeros(SHAPE, np.bool_)), expected_object().bare) == 1.0
 
 
-def test_mean_cost_counts_cells_that_wrongly_return_and_lets_equal_echoes_swap_and_full_scale_hide_light() -> None:
+def test_mean_cost_counts_cells_that_wrongly_return_and_lets_equal_echoes_swap_and_full_scale_hide_light() -> (
+    None
+):
     wall = expected_object().bare
-    close, clear = (mean_cost(maps_of(wall), expected_object(strength=by), GAIN, 1.0) for by in (1.1, 10.0))
+    close, clear = (
+        mean_cost(maps_of(wall), expected_object(strength=by), GAIN, 1.0) for by in (1.1, 10.0)
+    )
     assert close < 0.05
     assert clear > 0.4
-    half = replace(wall, direct=np.where(RIGHT, 0.0, wall.direct), direct_m=np.where(RIGHT, np.nan, wall.direct_m))
+    half = replace(
+        wall,
+        direct=np.where(RIGHT, 0.0, wall.direct),
+        direct_m=np.where(RIGHT, np.nan, wall.direct_m),
+    )
     assert mean_cost(maps_of(wall), half, GAIN, 1.0) == pytest.approx(0.5, abs=1e-3)
     assert mean_cost(maps_of(half), wall, GAIN, 1.0) == pytest.approx(0.5, abs=1e-3)
     assert mean_cost(maps_of(half), half, GAIN, 1.0) == pytest.approx(0.0, abs=1e-6)
     bright = maps_of(expected_object(strength=1000.0))
     assert bright.intensity.max() == 255
-    assert mean_cost(bright, expected_object(strength=1000.0), GAIN, 1.0) == pytest.approx(0.0, abs=1e-6)
+    assert mean_cost(bright, expected_object(strength=1000.0), GAIN, 1.0) == pytest.approx(
+        0.0, abs=1e-6
+    )
     dim = mean_cost(bright, expected_object(strength=1.5), GAIN, 1.0)
     assert dim > 0.1
 
@@ -105,7 +128,9 @@ def hidden(seed: int) -> Float32:
 
 @cache
 def seen(seed: int | None, noise: int = 0) -> LidarMaps:
-    """What a lidar gives of an object, or of the bare bench, with the noise of the 60 pixels that make a cell."""
+    """What a lidar gives of an object, or of the bare bench, with the noise of the 60 pixels that
+    make a cell.
+    """
     rendering = render(Scene(RIG, None if seed is None else hidden(seed)), "standard")
     generator = np.random.default_rng(noise)
     depth_m = rendering.depth_m + generator.normal(0, 1e-4, (64, 80)).astype(np.float32)
@@ -116,13 +141,18 @@ def seen(seed: int | None, noise: int = 0) -> LidarMaps:
 @pytest.mark.slow
 def test_check_scores_the_true_object_best() -> None:
     for seed in SEEDS:
-        scores = {one: check_reconstruction(seen(seed), hidden(one), RIG, accuracy="draft").score for one in SEEDS}
+        scores = {
+            one: check_reconstruction(seen(seed), hidden(one), RIG, accuracy="draft").score
+            for one in SEEDS
+        }
         assert min(scores, key=lambda other: scores[other]) == seed
         assert scores[seed] < 0.5 * min(score for other, score in scores.items() if other != seed)
 
 
 def test_check_explains_the_true_object_to_within_noise() -> None:
-    found = check_reconstruction(seen(SEEDS[0]), hidden(SEEDS[0]), RIG, clock=iter([5.0, 7.5]).__next__)
+    found = check_reconstruction(
+        seen(SEEDS[0]), hidden(SEEDS[0]), RIG, clock=iter([5.0, 7.5]).__next__
+    )
     assert found.score < 0.05
     assert np.nanquantile(np.abs(found.residual_depth_m), 0.95) < 2e-3
     assert np.nanquantile(np.abs(found.residual_intensity), 0.95) < 3
@@ -132,8 +162,12 @@ def test_check_explains_the_true_object_to_within_noise() -> None:
 
 def test_check_renders_the_bare_bench_once(monkeypatch: pytest.MonkeyPatch) -> None:
     assert check_reconstruction(seen(None), hidden(SEEDS[0]), RIG).score > 1.0
-    maps, nan_m, dark = seen(SEEDS[0]), np.full((64, 80), np.nan, np.float32), np.zeros((64, 80), np.float32)
-    monkeypatch.setattr("nlos_cam.reconstruct.physics_check.render", lambda *_: pytest.fail("rendered again"))
+    maps = seen(SEEDS[0])
+    nan_m = np.full((64, 80), np.nan, np.float32)
+    dark = np.zeros((64, 80), np.float32)
+    monkeypatch.setattr(
+        "nlos_cam.reconstruct.physics_check.render", lambda *_: pytest.fail("rendered again")
+    )
     assert check_reconstruction(seen(None), EMPTY, RIG).score < 0.05
     assert check_reconstruction(maps, EMPTY, RIG).score == 1.0
     blank = check_reconstruction(LidarMaps(nan_m, dark, dark > 0), EMPTY, RIG)
@@ -144,13 +178,16 @@ def test_check_renders_the_bare_bench_once(monkeypatch: pytest.MonkeyPatch) -> N
 def test_check_works_on_a_rig_without_object_box() -> None:
     bare = load_rig("bare-wall")
     rendering = render(Scene(bare))
-    maps = LidarMaps(rendering.depth_m, rendering.intensity * np.float32(1e5), np.isfinite(rendering.depth_m))
+    maps = LidarMaps(
+        rendering.depth_m, rendering.intensity * np.float32(1e5), np.isfinite(rendering.depth_m)
+    )
     assert check_reconstruction(maps, None, bare).score < 1e-3
     assert check_reconstruction(maps, hidden(SEEDS[0]), bare).score < 1e-3
 
 
 def test_periodic_check_is_independent_of_earlier_frames() -> None:
-    forwards, backwards = {}, {}
+    forwards = {}
+    backwards = {}
     for found, order in ((forwards, SEEDS), (backwards, SEEDS[::-1])):
         checks = PeriodicPhysicsCheck(RIG, every=1, accuracy="draft")
         for seed in order:
@@ -158,7 +195,9 @@ def test_periodic_check_is_independent_of_earlier_frames() -> None:
             found[seed] = checks.newest
     for seed in SEEDS:
         assert (forwards[seed].frame_number, forwards[seed].score) == (seed, backwards[seed].score)
-        np.testing.assert_array_equal(forwards[seed].residual_depth_m, backwards[seed].residual_depth_m)
+        np.testing.assert_array_equal(
+            forwards[seed].residual_depth_m, backwards[seed].residual_depth_m
+        )
 
 
 def test_periodic_check_reports_a_failure_once(caplog: pytest.LogCaptureFixture) -> None:
@@ -174,7 +213,8 @@ def test_periodic_check_reports_a_failure_once(caplog: pytest.LogCaptureFixture)
 
 
 def test_live_loop_shows_the_newest_check_with_each_frame() -> None:
-    viewer, checks = ListViewer(), PeriodicPhysicsCheck(RIG, every=2, accuracy="draft")
+    viewer = ListViewer()
+    checks = PeriodicPhysicsCheck(RIG, every=2, accuracy="draft")
     pipeline = Pipeline(CalibratedRig(RIG), sheet_network, checks=checks)
     run_live(WallCamera(5, period_s=0.0), pipeline, viewer, stop=Event(), recorded=True)
     assert [moment.check.frame_number for moment in viewer.moments] == [0, 0, 2, 2, 4]

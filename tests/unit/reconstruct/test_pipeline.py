@@ -9,7 +9,17 @@ from typing import Any
 import numpy as np
 import pytest
 from fake_doubter import FakeDoubter
-from fake_wall import RIG, SERIAL, SMALL, WallCamera, bare_wall, measured_wall, other_intrinsics, wall_frame, write_wall
+from fake_wall import (
+    RIG,
+    SERIAL,
+    SMALL,
+    WallCamera,
+    bare_wall,
+    measured_wall,
+    other_intrinsics,
+    wall_frame,
+    write_wall,
+)
 from nlos_calibration.errors import CalibrationError, RecordFileError
 from nlos_calibration.geometry import Intrinsics
 from nlos_calibration.rig import load_rig
@@ -17,9 +27,28 @@ from small_frames import SheetNetwork, sheet_network
 
 from nlos_cam.frames import LidarMaps, maps_from_frame
 from nlos_cam.live import FrameReader
-from nlos_cam.live.loop import BATCH_FRAMES, MAX_BATCHES_AHEAD, iterate_batched, iterate_results, with_telemetry
-from nlos_cam.reconstruct import Clock, FrameConditions, FrameResult, Pipeline, Verdict, build_pipeline, load_networks
-from nlos_cam.reconstruct.bench import BenchObservation, CalibratedRig, open_bench, subtract_reference
+from nlos_cam.live.loop import (
+    BATCH_FRAMES,
+    MAX_BATCHES_AHEAD,
+    iterate_batched,
+    iterate_results,
+    with_telemetry,
+)
+from nlos_cam.reconstruct import (
+    Clock,
+    FrameConditions,
+    FrameResult,
+    Pipeline,
+    Verdict,
+    build_pipeline,
+    load_networks,
+)
+from nlos_cam.reconstruct.bench import (
+    BenchObservation,
+    CalibratedRig,
+    open_bench,
+    subtract_reference,
+)
 from nlos_cam.reconstruct.physics_check import PeriodicPhysicsCheck, PhysicsCheckResult
 from nlos_cam.reconstruct.pipeline import compatibility_warnings, frame_conditions
 
@@ -29,7 +58,10 @@ def all_steps(
 ) -> list[FrameResult]:
     """Results of a camera's frames: one by one, or `ahead` in batches."""
     frames, telemetry = with_telemetry(camera)
-    with FrameReader(frames, lossless=True, stop=Event(), clock=lambda: 0.0) as reader, pipeline.checks:
+    with (
+        FrameReader(frames, lossless=True, stop=Event(), clock=lambda: 0.0) as reader,
+        pipeline.checks,
+    ):
         if ahead:
             return list(iterate_batched(reader, pipeline, clock, telemetry))
         return list(iterate_results(reader, pipeline, clock, telemetry=telemetry))
@@ -42,7 +74,9 @@ def walled(tmp_path: Path) -> CalibratedRig:
 
 def test_steps_time_every_stage_with_the_given_clock() -> None:
     ticks = iter(range(10_000))
-    done = all_steps(Pipeline(CalibratedRig(RIG), sheet_network), WallCamera(3), lambda: float(next(ticks)))
+    done = all_steps(
+        Pipeline(CalibratedRig(RIG), sheet_network), WallCamera(3), lambda: float(next(ticks))
+    )
     assert [step.frame.frame_number for step in done] == [0, 1, 2]
     for step in done:
         stages_s = dict(step.stages_s)
@@ -53,7 +87,9 @@ def test_steps_time_every_stage_with_the_given_clock() -> None:
 def test_pipeline_feeds_the_mean_of_raw_or_difference_maps(walled: CalibratedRig) -> None:
     noting = SheetNetwork()
     for uses_difference in (False, True):
-        done = all_steps(Pipeline(walled, noting, uses_difference=uses_difference, average=4), WallCamera(6))
+        done = all_steps(
+            Pipeline(walled, noting, uses_difference=uses_difference, average=4), WallCamera(6)
+        )
     mean_m = np.mean([wall_frame(number).depth_m for number in range(2, 6)], axis=0)
     np.testing.assert_allclose(noting.given[5], mean_m, atol=1e-6)
     np.testing.assert_allclose(noting.given[11], mean_m - walled.reference.map_depth_m, atol=1e-6)
@@ -64,15 +100,20 @@ def test_pipeline_feeds_the_mean_of_raw_or_difference_maps(walled: CalibratedRig
 
 
 @pytest.mark.parametrize("offset_m", [0.0, 0.0045])
-def test_pipeline_adds_the_measured_offset_to_raw_maps(walled: CalibratedRig, offset_m: float) -> None:
-    noting, record = SheetNetwork(), walled.measured.record.model_copy(update={"range_offset_m": offset_m})
+def test_pipeline_adds_the_measured_offset_to_raw_maps(
+    walled: CalibratedRig, offset_m: float
+) -> None:
+    noting = SheetNetwork()
+    record = walled.measured.record.model_copy(update={"range_offset_m": offset_m})
     bench = CalibratedRig(RIG, replace(walled.measured, record=record))
     (step,) = all_steps(Pipeline(bench, noting), WallCamera(1))
     np.testing.assert_array_equal(noting.given[0], step.maps.depth_m + np.float32(offset_m))
 
 
 def test_pipeline_watches_drift_in_the_frame_not_the_mean(walled: CalibratedRig) -> None:
-    done = all_steps(Pipeline(walled, sheet_network, average=1000), WallCamera(100, moved=range(50, 100)))
+    done = all_steps(
+        Pipeline(walled, sheet_network, average=1000), WallCamera(100, moved=range(50, 100))
+    )
     assert not any(step.warnings for step in done[:50])
     assert done[-1].warnings
 
@@ -82,7 +123,9 @@ def test_telemetry_is_read_periodically_with_or_without_wall(walled: CalibratedR
         camera = WallCamera(25, celsius=80.0, period_s=1.0)
         done = all_steps(Pipeline(bench, sheet_network), camera)
         assert camera.asked == 3
-        assert all(bool(step.warnings) == (bench is walled) for step in done), "too hot from the first frame on"
+        assert all(bool(step.warnings) == (bench is walled) for step in done), (
+            "too hot from the first frame on"
+        )
 
 
 CALLS = count_up()
@@ -100,12 +143,21 @@ def test_batched_results_equal_results_in_turn(tmp_path: Path, count: int) -> No
     for ahead in (False, True):
         checks = PeriodicPhysicsCheck(RIG, every=5, accuracy="draft")
         bench = CalibratedRig(RIG, measured_wall(tmp_path))
-        pipeline = Pipeline(bench, looking, average=3, uncertainty_model=FakeDoubter(), checks=checks)
+        pipeline = Pipeline(
+            bench, looking, average=3, uncertainty_model=FakeDoubter(), checks=checks
+        )
         done.append(all_steps(pipeline, WallCamera(count, moved=range(count // 2)), ahead=ahead))
     assert [step.frame.frame_number for step in done[1]] == list(range(count))
     for one, other in zip(*done, strict=True):
-        assert (one.verdict, one.warnings, one.arrived_s) == (other.verdict, other.warnings, other.arrived_s)
-        assert (one.check.frame_number, one.check.score) == (other.check.frame_number, other.check.score)
+        assert (one.verdict, one.warnings, one.arrived_s) == (
+            other.verdict,
+            other.warnings,
+            other.arrived_s,
+        )
+        assert (one.check.frame_number, one.check.score) == (
+            other.check.frame_number,
+            other.check.score,
+        )
         for name in ("maps", "reconstruction", "difference"):
             np.testing.assert_array_equal(getattr(one, name).depth_m, getattr(other, name).depth_m)
 
@@ -124,8 +176,11 @@ def test_results_raise_the_error_of_a_frame(ahead: bool, count: int) -> None:
 
 
 @pytest.mark.parametrize(("nothing", "verdict"), [(0.9, Verdict.NOTHING), (0.0, Verdict.SEEN)])
-def test_result_shows_what_its_verdict_says(walled: CalibratedRig, nothing: float, verdict: Verdict) -> None:
-    noting, doubter = SheetNetwork(), FakeDoubter(lambda *_: (nothing, 0.0))
+def test_result_shows_what_its_verdict_says(
+    walled: CalibratedRig, nothing: float, verdict: Verdict
+) -> None:
+    noting = SheetNetwork()
+    doubter = FakeDoubter(lambda *_: (nothing, 0.0))
     pipeline = Pipeline(walled, noting, uses_difference=True, average=3, uncertainty_model=doubter)
     done = all_steps(pipeline, WallCamera(100, moved=range(50, 100)))
     for step, asked, given in zip(done[:50], doubter.asked, noting.given, strict=False):
@@ -139,8 +194,12 @@ def test_result_shows_what_its_verdict_says(walled: CalibratedRig, nothing: floa
 @pytest.mark.parametrize("missing", [0, 40, 80])
 @pytest.mark.parametrize("saturated", [False, True])
 def test_frame_conditions_follow_frame_issues_and_bench(missing: int, saturated: bool) -> None:
-    depth_m = np.where(np.arange(80) < missing, np.float32(np.nan), np.float32(0.3)) * np.ones((64, 1), np.float32)
-    frame = replace(wall_frame(0), depth_m=depth_m, ir=np.full((64, 80), 255 if saturated else 9, np.uint8))
+    depth_m = np.where(np.arange(80) < missing, np.float32(np.nan), np.float32(0.3)) * np.ones(
+        (64, 1), np.float32
+    )
+    frame = replace(
+        wall_frame(0), depth_m=depth_m, ir=np.full((64, 80), 255 if saturated else 9, np.uint8)
+    )
     check = PhysicsCheckResult(0, depth_m, depth_m, score=1.0, seconds=0.0)
     conditions = frame_conditions(frame, BenchObservation(None, (), moved=saturated), check)
     assert conditions == FrameConditions(saturated, missing > 0, moved=saturated, check=check)
@@ -149,11 +208,15 @@ def test_frame_conditions_follow_frame_issues_and_bench(missing: int, saturated:
 DOUBTER: Any = object()
 
 
-def trained(rig_name: str = RIG.name, rig_checksum: str = RIG.checksum, eats: str = "raw maps") -> Any:
+def trained(
+    rig_name: str = RIG.name, rig_checksum: str = RIG.checksum, eats: str = "raw maps"
+) -> Any:
     return SimpleNamespace(rig_name=rig_name, rig_checksum=rig_checksum, input=eats)
 
 
-def test_warnings_name_what_differs_from_training_and_a_wall_without_reference(walled: CalibratedRig) -> None:
+def test_warnings_name_what_differs_from_training_and_a_wall_without_reference(
+    walled: CalibratedRig,
+) -> None:
     farther = RIG.model_copy(update={"lidar": RIG.lidar.model_copy(update={"distance_m": 0.3})})
     assert compatibility_warnings(CalibratedRig(RIG), trained(), DOUBTER) == []
     (note,) = compatibility_warnings(CalibratedRig(farther), trained(), DOUBTER)
@@ -169,7 +232,9 @@ def test_warnings_name_what_differs_from_training_and_a_wall_without_reference(w
 
 
 @pytest.mark.parametrize("eats", ["raw maps", "difference maps"])
-def test_build_pipeline_feeds_the_networks_their_kind_of_maps(walled: CalibratedRig, eats: str) -> None:
+def test_build_pipeline_feeds_the_networks_their_kind_of_maps(
+    walled: CalibratedRig, eats: str
+) -> None:
     network = SheetNetwork()
     network.record = trained(eats=eats)
     pipeline: Any = build_pipeline(walled, network, average=7)
@@ -180,16 +245,22 @@ def test_build_pipeline_feeds_the_networks_their_kind_of_maps(walled: Calibrated
     assert len(pipeline._mean._last) == 7
 
 
-def test_load_networks_exports_into_the_cache(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_load_networks_exports_into_the_cache(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
     asked: list[Any] = []
     monkeypatch.setenv("NLOS_CAM_CACHE", str(tmp_path))
-    monkeypatch.setattr("nlos_cam.reconstruct.pipeline.load_reconstructor", lambda *given: asked.append(given) or np)
+    monkeypatch.setattr(
+        "nlos_cam.reconstruct.pipeline.load_reconstructor", lambda *given: asked.append(given) or np
+    )
     assert load_networks(Path("mine")) is np
     assert asked == [(Path("mine"), tmp_path / "onnx")]
 
 
 def camera(intrinsics: Intrinsics = SMALL, **others: Any) -> Any:
-    return SimpleNamespace(**{"intrinsics": intrinsics, "rig": None, "identity": {"serial": SERIAL}, **others})
+    return SimpleNamespace(
+        **{"intrinsics": intrinsics, "rig": None, "identity": {"serial": SERIAL}, **others}
+    )
 
 
 @pytest.fixture
@@ -202,7 +273,9 @@ def observe(bench: CalibratedRig, number: int = 0, nearer_m: float = 0.0) -> Ben
     return bench.observe(frame, maps_from_frame(frame))
 
 
-def test_open_bench_takes_rig_and_reference_from_a_record_or_the_rig_of_the_camera(wall: Path, tmp_path: Path) -> None:
+def test_open_bench_takes_rig_and_reference_from_a_record_or_the_rig_of_the_camera(
+    wall: Path, tmp_path: Path
+) -> None:
     own = RIG.model_copy(update={"name": "own"})
     assert open_bench(None, camera(rig=own)).rig is own
     assert open_bench(None, camera(rig=load_rig("bare-wall"))).rig == RIG
@@ -212,7 +285,11 @@ def test_open_bench_takes_rig_and_reference_from_a_record_or_the_rig_of_the_came
     assert bench.rig == RIG
     assert (look.difference, look.warnings, bench.reference) == (None, (), None)
     bench = open_bench(wall, camera())
-    assert (bench.rig.name, bench.reference.frames, bench.measured.record.serial) == ("measured", 20, SERIAL)
+    assert (bench.rig.name, bench.reference.frames, bench.measured.record.serial) == (
+        "measured",
+        20,
+        SERIAL,
+    )
     bare = open_bench(write_wall(tmp_path / "bare.toml"), camera())
     assert bare.rig.name == "measured"
     assert observe(bare).difference is None
@@ -284,7 +361,9 @@ def test_open_bench_refuses_other_intrinsics(tmp_path: Path, reference: bool) ->
 
 @pytest.mark.parametrize(("serial", "warned"), [("f9", True), ("", False), (SERIAL, False)])
 def test_open_bench_warns_of_another_camera(wall: Path, serial: str, warned: bool) -> None:
-    warnings = observe(open_bench(wall, camera(identity={"serial": serial} if serial else {}))).warnings
+    warnings = observe(
+        open_bench(wall, camera(identity={"serial": serial} if serial else {}))
+    ).warnings
     assert len(warnings) == warned
     assert all(SERIAL in warning and serial in warning for warning in warnings)
 

@@ -18,7 +18,15 @@ from rosbags.rosbag1 import Reader
 from nlos_cam.camera.sdk import load_sdk
 from nlos_cam.errors import RecordingError
 from nlos_cam.recording import BagReader, verify
-from nlos_cam.recording.bag_messages import ENCODINGS, lens_of, metadata, parse, pixels, pose_of, sdk_name
+from nlos_cam.recording.bag_messages import (
+    ENCODINGS,
+    lens_of,
+    metadata,
+    parse,
+    pixels,
+    pose_of,
+    sdk_name,
+)
 from nlos_cam.recording.rosbag import CHUNK_LIMIT
 
 
@@ -29,7 +37,8 @@ def bag(request: pytest.FixtureRequest) -> BagReader:
 
 def contents(bag: BagReader) -> dict[str, list[tuple[int, bytes]]]:
     return {
-        topic: [(entry.time_ns, bytes(bag.raw(entry))) for entry in entries] for topic, entries in bag.entries.items()
+        topic: [(entry.time_ns, bytes(bag.raw(entry))) for entry in entries]
+        for topic, entries in bag.entries.items()
     }
 
 
@@ -53,7 +62,9 @@ def test_reader_reads_each_compression(noise_bag: Path, rewritten: Any, compress
     assert contents(BagReader(path)) == contents(BagReader(noise_bag))
 
 
-def test_reader_unpacks_no_more_than_its_bound(noise_bag: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_reader_unpacks_no_more_than_its_bound(
+    noise_bag: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr("nlos_cam.recording.rosbag.CHUNK_LIMIT", 10_000)
     with pytest.raises(RecordingError, match="chunk"):
         BagReader(noise_bag)
@@ -61,7 +72,11 @@ def test_reader_unpacks_no_more_than_its_bound(noise_bag: Path, monkeypatch: pyt
 
 def test_damage_is_reported_with_its_place_and_the_repair(noise_bag: Path, tmp_path: Path) -> None:
     where = noise_bag.read_bytes().index(b"compression=lz4") + 1000
-    path = changed(noise_bag, tmp_path / "damaged.bag", lambda old: old[:where] + bytes(100) + old[where + 100 :])
+    path = changed(
+        noise_bag,
+        tmp_path / "damaged.bag",
+        lambda old: old[:where] + bytes(100) + old[where + 100 :],
+    )
     position = BagReader(noise_bag).entries["/file_version"][0].chunk_pos
     with pytest.raises(RecordingError, match=rf"0\.0 s .* byte {position}") as raised:
         BagReader(path)
@@ -70,11 +85,15 @@ def test_damage_is_reported_with_its_place_and_the_repair(noise_bag: Path, tmp_p
 
 def test_reader_refuses_a_wrong_or_empty_index(noise_bag: Path, tmp_path: Path) -> None:
     bag = BagReader(noise_bag)
-    one, other = (bag.entries[f"/device_0/sensor_0/{name}_0/image/data"][0] for name in ("Depth", "Infrared"))
+    one, other = (
+        bag.entries[f"/device_0/sensor_0/{name}_0/image/data"][0] for name in ("Depth", "Infrared")
+    )
     with pytest.raises(RecordingError, match="index"):
         bag.read("/file_version", one._replace(offset=other.offset))
     none = re.compile(rb"(?s)(chunk_count=).{4}")
-    path = changed(noise_bag, tmp_path / "nothing.bag", lambda old: none.sub(rb"\1" + bytes(4), old, count=1))
+    path = changed(
+        noise_bag, tmp_path / "nothing.bag", lambda old: none.sub(rb"\1" + bytes(4), old, count=1)
+    )
     with pytest.raises(RecordingError, match=r"nothing\.bag"):
         BagReader(path)
 
@@ -82,7 +101,9 @@ def test_reader_refuses_a_wrong_or_empty_index(noise_bag: Path, tmp_path: Path) 
 def test_reader_keeps_no_file_open_and_reports_its_loss(noise_bag: Path, tmp_path: Path) -> None:
     path = changed(noise_bag, tmp_path / "gone.bag", bytes)
     bag = BagReader(path)
-    if (open_files := Path("/proc/self/fd")).is_dir():  # only Linux lists the open files of a process
+    if (
+        open_files := Path("/proc/self/fd")
+    ).is_dir():  # only Linux lists the open files of a process
         assert path not in {each.readlink() for each in open_files.iterdir() if each.is_symlink()}
     path.unlink()
     bag._chunk_pos = -1
@@ -95,11 +116,17 @@ def test_frames_come_in_recorded_order_and_by_index(bag: BagReader) -> None:
     places = list(bag.order(bag.streams))
     assert all(one.time_ns <= other.time_ns for one, other in pairwise(places))
     for stream, info in bag.streams.items():
-        assert [place.index for place in places if place.stream == stream] == list(range(info.frames))
+        assert [place.index for place in places if place.stream == stream] == list(
+            range(info.frames)
+        )
     assert places[-1].time_ns <= bag.end_ns
     for place, sample in reversed(list(zip(places, bag.samples(bag.streams), strict=True))):
         again = bag.sample(place.stream, place.index)
-        assert (again.stream, again.number, again.timestamp_s) == (sample.stream, sample.number, sample.timestamp_s)
+        assert (again.stream, again.number, again.timestamp_s) == (
+            sample.stream,
+            sample.number,
+            sample.timestamp_s,
+        )
         np.testing.assert_array_equal(again.pixels, sample.pixels)
 
 
@@ -111,19 +138,29 @@ def test_sample_owns_its_pixels_and_ends_at_the_last(noise_bag: Path) -> None:
         bag.sample("depth", 20)
 
 
-def with_unit(*, option: bool, tail_m: float | None) -> Callable[[str, int, bytes], list[tuple[int, bytes]]]:
-    """Put the depth unit into an option, after the images (librealsense before 2.49 did not), or nowhere."""
+def with_unit(
+    *, option: bool, tail_m: float | None
+) -> Callable[[str, int, bytes], list[tuple[int, bytes]]]:
+    """Put the depth unit into an option, after the images (librealsense before 2.49 did not), or
+    nowhere.
+    """
 
     def edit(topic: str, time_ns: int, raw: bytes) -> list[tuple[int, bytes]]:
         if topic.endswith("/image/data"):
-            raw = raw[:16] + b"0" + raw[17:-4] if tail_m is None else raw[:-4] + struct.pack("<f", tail_m)
+            raw = (
+                raw[:16] + b"0" + raw[17:-4]
+                if tail_m is None
+                else raw[:-4] + struct.pack("<f", tail_m)
+            )
         return [(time_ns, raw)] if option or "/Depth_Units/value" not in topic else []
 
     return edit
 
 
 @pytest.mark.parametrize(("option", "tail_m"), [(True, None), (True, 0.5), (False, 0.00025)])
-def test_depth_unit_is_an_option_or_follows_the_images(rewritten: Any, option: bool, tail_m: float | None) -> None:
+def test_depth_unit_is_an_option_or_follows_the_images(
+    rewritten: Any, option: bool, tail_m: float | None
+) -> None:
     path = rewritten(with_unit(option=option, tail_m=tail_m))
     assert BagReader(path).depth_unit_m() == pytest.approx(0.00025)
 
@@ -136,7 +173,13 @@ def test_bag_without_a_depth_unit_is_an_error(rewritten: Any, tail_m: float | No
 
 def test_bag_without_intrinsics_is_an_error(rewritten: Any) -> None:
     with pytest.raises(RecordingError, match="camera_info"):
-        BagReader(rewritten(lambda topic, time_ns, raw: [] if topic.endswith("camera_info") else [(time_ns, raw)]))
+        BagReader(
+            rewritten(
+                lambda topic, time_ns, raw: (
+                    [] if topic.endswith("camera_info") else [(time_ns, raw)]
+                )
+            )
+        )
 
 
 def test_unknown_encoding_is_an_error_when_read(rewritten: Any) -> None:
@@ -147,20 +190,31 @@ def test_unknown_encoding_is_an_error_when_read(rewritten: Any) -> None:
         bag.sample("infrared", 0)
 
 
-def test_streams_of_one_kind_differ_by_their_index(noise_bag_uncompressed: Path, tmp_path: Path) -> None:
+def test_streams_of_one_kind_differ_by_their_index(
+    noise_bag_uncompressed: Path, tmp_path: Path
+) -> None:
     path = tmp_path / "stereo.bag"
-    bag = BagReader(changed(noise_bag_uncompressed, path, lambda old: old.replace(b"Infrared_0", b"Infrared_2")))
+    bag = BagReader(
+        changed(noise_bag_uncompressed, path, lambda old: old.replace(b"Infrared_0", b"Infrared_2"))
+    )
     assert set(bag.streams) == {"depth", "infrared_2", "confidence"}
     assert bag.sample("infrared_2", 19).number == 19
 
 
-@pytest.mark.parametrize("topic", ["/sensor_0/info", "/Depth_Units/description", "/Infrared_0/tf/1", "/image/data"])
-def test_check_finds_damage_in_any_message(noise_bag_uncompressed: Path, tmp_path: Path, topic: str) -> None:
+@pytest.mark.parametrize(
+    "topic", ["/sensor_0/info", "/Depth_Units/description", "/Infrared_0/tf/1", "/image/data"]
+)
+def test_check_finds_damage_in_any_message(
+    noise_bag_uncompressed: Path, tmp_path: Path, topic: str
+) -> None:
     bag = BagReader(noise_bag_uncompressed)
     name = next(name for name in bag.entries if name.endswith(topic))
-    content, message = noise_bag_uncompressed.read_bytes(), bytes(bag.raw(bag.entries[name][-1]))
+    content = noise_bag_uncompressed.read_bytes()
+    message = bytes(bag.raw(bag.entries[name][-1]))
     where = content.rindex(message) - 4  # its length
-    path = changed(bag.path, tmp_path / "damaged.bag", lambda old: old[:where] + b"\xff\xff" + old[where + 2 :])
+    path = changed(
+        bag.path, tmp_path / "damaged.bag", lambda old: old[:where] + b"\xff\xff" + old[where + 2 :]
+    )
     with pytest.raises(RecordingError, match=r"damaged\.bag"):
         BagReader(path).check()
 
@@ -175,8 +229,11 @@ def test_check_finds_an_image_smaller_than_its_header(rewritten: Any) -> None:
 
 
 def test_check_passes_over_unknown_types(noise_bag_uncompressed: Path, tmp_path: Path) -> None:
-    old, new = b"geometry_msgs/Transform", b"realsense_msgs/Transfor"
-    path = changed(noise_bag_uncompressed, tmp_path / "other.bag", lambda content: content.replace(old, new))
+    old = b"geometry_msgs/Transform"
+    new = b"realsense_msgs/Transfor"
+    path = changed(
+        noise_bag_uncompressed, tmp_path / "other.bag", lambda content: content.replace(old, new)
+    )
     BagReader(path).check()
 
 
@@ -216,12 +273,16 @@ def read_all(path: Path) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ["noise_bag", "noise_bag_uncompressed"])
 @given(seed=st.integers(0, 2**32 - 1))
-@settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(
+    max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
+)
 def test_reader_of_a_damaged_bag_raises_one_line(
     kind: str, seed: int, request: pytest.FixtureRequest, tool: Any, tmp_path: Path
 ) -> None:
-    content, path = bytearray(request.getfixturevalue(kind).read_bytes()), tmp_path / "damaged.bag"
-    ways, random = tool("mutations").WAYS, np.random.default_rng(seed)
+    content = bytearray(request.getfixturevalue(kind).read_bytes())
+    path = tmp_path / "damaged.bag"
+    ways = tool("mutations").WAYS
+    random = np.random.default_rng(seed)
     for _ in range(random.integers(1, 4)):
         if content:
             ways[random.integers(len(ways))](content, random)
@@ -236,9 +297,14 @@ def test_reader_of_a_damaged_bag_raises_one_line(
 
 
 @pytest.mark.parametrize("kind", ["noise_bag", "noise_bag_uncompressed"])
-@pytest.mark.parametrize("field", [b"size=", b"count=", b"chunk_count=", b"conn_count=", b"index_pos=", b"chunk_pos="])
-def test_absurd_size_is_not_allocated(kind: str, field: bytes, request: pytest.FixtureRequest, tmp_path: Path) -> None:
-    content, path = request.getfixturevalue(kind).read_bytes(), tmp_path / "absurd.bag"
+@pytest.mark.parametrize(
+    "field", [b"size=", b"count=", b"chunk_count=", b"conn_count=", b"index_pos=", b"chunk_pos="]
+)
+def test_absurd_size_is_not_allocated(
+    kind: str, field: bytes, request: pytest.FixtureRequest, tmp_path: Path
+) -> None:
+    content = request.getfixturevalue(kind).read_bytes()
+    path = tmp_path / "absurd.bag"
     for at in [found.end() for found in re.finditer(re.escape(field), content)][:3]:
         path.write_bytes(content[:at] + b"\xff\xff\xff\xff" + content[at + 4 :])
         tracemalloc.start()
@@ -250,7 +316,9 @@ def test_absurd_size_is_not_allocated(kind: str, field: bytes, request: pytest.F
 
 
 def parsed_image(values: bytes = bytes(range(6))) -> Any:
-    """An image of 3 x 2 as librealsense writes it: the version of the format stands where ROS has the frame_id."""
+    """An image of 3 x 2 as librealsense writes it: the version of the format stands where ROS has
+    the frame_id.
+    """
     header = struct.pack("<IIII", 7, 12, 345_678_901, 1) + b"0" + struct.pack("<III", 2, 3, 5)
     raw = header + b"mono8\0" + struct.pack("<II", 3, len(values)) + values
     return parse(memoryview(raw), "sensor_msgs/msg/Image")
@@ -260,7 +328,15 @@ PINHOLE = Intrinsics(3, 2, 1.0, 1.0, 1.0, 1.0)
 
 
 @pytest.mark.parametrize(
-    "changed", [{"width": 2}, {"width": 4}, {"height": 3}, {"width": 6, "step": 6}, {"encoding": "8UC1"}, {"step": 4}]
+    "changed",
+    [
+        {"width": 2},
+        {"width": 4},
+        {"height": 3},
+        {"width": 6, "step": 6},
+        {"encoding": "8UC1"},
+        {"step": 4},
+    ],
 )
 def test_pixels_refuses_an_image_that_contradicts_itself(changed: dict[str, object]) -> None:
     image = parsed_image()
@@ -281,7 +357,9 @@ def test_encodings_are_formats_of_the_sdk(encoding: str) -> None:
     assert found.sdk_format in load_sdk().format.__members__
     bytes_per_pixel = found.channels * np.dtype(found.dtype).itemsize
     values = np.arange(6 * bytes_per_pixel, dtype=np.uint8)
-    image = SimpleNamespace(encoding=encoding, width=3, height=2, step=3 * bytes_per_pixel, data=values)
+    image = SimpleNamespace(
+        encoding=encoding, width=3, height=2, step=3 * bytes_per_pixel, data=values
+    )
     result = pixels(image, encoding, PINHOLE)
     assert result.shape == ((2, 3) if found.channels == 1 else (2, 3, found.channels))
     assert result.tobytes() == values.tobytes()
@@ -302,9 +380,14 @@ def test_sdk_name_gives_names_of_the_sdk() -> None:
 def test_metadata_and_lens_are_parsed() -> None:
     pairs = {"system_time": "15.25", "timestamp_domain": "System Time", "Frame Counter": "169"}
     found = metadata([SimpleNamespace(key=key, value=value) for key, value in pairs.items()])
-    assert (found.domain, found.values) == ("system_time", {"system_time": 15.25, "frame_counter": 169.0})
+    assert (found.domain, found.values) == (
+        "system_time",
+        {"system_time": 15.25, "frame_counter": 169.0},
+    )
     assert not metadata([]).domain
-    model, coefficients = lens_of(SimpleNamespace(distortion_model="Brown Conrady", D=[0.1, 0.2, 0.3, 0.4, 0.5]))
+    model, coefficients = lens_of(
+        SimpleNamespace(distortion_model="Brown Conrady", D=[0.1, 0.2, 0.3, 0.4, 0.5])
+    )
     assert (model, list(coefficients)) == ("brown_conrady", [0.1, 0.2, 0.3, 0.4, 0.5])
 
 
@@ -312,20 +395,27 @@ SHIFT_M = 0.1, 0.2, -0.3
 
 
 def transform(*quaternion: float) -> SimpleNamespace:
-    rotation, shift = (SimpleNamespace(**dict(zip("xyzw", values, strict=False))) for values in (quaternion, SHIFT_M))
+    rotation, shift = (
+        SimpleNamespace(**dict(zip("xyzw", values, strict=False)))
+        for values in (quaternion, SHIFT_M)
+    )
     return SimpleNamespace(rotation=rotation, translation=shift)
 
 
 def test_pose_of_accepts_either_sign_of_a_quaternion() -> None:
-    axis, angle = np.array([0.6, 0.0, -0.8]), 0.7
+    axis = np.array([0.6, 0.0, -0.8])
+    angle = 0.7
     expected = np.eye(4)
-    expected[:3, :3], expected[:3, 3] = cv2.Rodrigues(axis * angle)[0], SHIFT_M
+    expected[:3, :3] = cv2.Rodrigues(axis * angle)[0]
+    expected[:3, 3] = SHIFT_M
     quaternion = np.append(np.sin(angle / 2) * axis, np.cos(angle / 2))
     for sign in (1.0, -1.0):
         np.testing.assert_allclose(pose_of(transform(*(sign * quaternion))), expected, atol=1e-12)
 
 
-@pytest.mark.parametrize("quaternion", [(0.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 2.0), (float("nan"), 0.0, 0.0, 1.0)])
+@pytest.mark.parametrize(
+    "quaternion", [(0.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 2.0), (float("nan"), 0.0, 0.0, 1.0)]
+)
 def test_pose_of_refuses_a_quaternion_not_of_unit_length(quaternion: tuple[float, ...]) -> None:
     with pytest.raises(ValueError, match="quaternion"):
         pose_of(transform(*quaternion))

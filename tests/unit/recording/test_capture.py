@@ -26,11 +26,16 @@ def world(noise_world: Any) -> Any:
 
 
 @pytest.fixture
-def session(world: Any, hurried_clock: Any, tmp_path: Path) -> Callable[..., tuple[CaptureSession, SimulatedCamera]]:
+def session(
+    world: Any, hurried_clock: Any, tmp_path: Path
+) -> Callable[..., tuple[CaptureSession, SimulatedCamera]]:
     """Make a session of takes 0.bag, 1.bag, ... of a NoiseWorld, and its camera."""
 
     def make(count: int = 1, **limits: Any) -> tuple[CaptureSession, SimulatedCamera]:
-        targets = [CaptureTarget(tmp_path / f"{number}.bag", label=f"object {number}") for number in range(count)]
+        targets = [
+            CaptureTarget(tmp_path / f"{number}.bag", label=f"object {number}")
+            for number in range(count)
+        ]
         recording = Recording(targets[0].path, last=count == 1, **limits)
         camera = SimulatedCamera("sim", world, clock=hurried_clock(), recording=recording)
         return CaptureSession(camera, recording, targets), camera
@@ -42,7 +47,9 @@ def session(world: Any, hurried_clock: Any, tmp_path: Path) -> Callable[..., tup
 def run(session: Any) -> Run:
     """Record takes of a NoiseWorld and finalize each; stop, as by Ctrl-C, after `stop_at` sets."""
 
-    def call(count: int = 1, stop_at: int | None = None, read_back: Any = verify, **limits: Any) -> list[CaptureResult]:
+    def call(
+        count: int = 1, stop_at: int | None = None, read_back: Any = verify, **limits: Any
+    ) -> list[CaptureResult]:
         stop = Event()
 
         def on_sets(sets: int) -> None:
@@ -72,7 +79,9 @@ def test_take_holds_what_came_and_its_sidecar_agrees(run: Run, noise_world: Any)
     images = [noise_world().images(number) for number in range(5)]
     assert take.quality.saturated_share == sum((image.ir == 255).mean() for image in images) / 5
     assert take.quality.invalid_share == sum((image.depth_z16 == 0).mean() for image in images) / 5
-    assert take.quality.confidence_mean == pytest.approx(sum(image.confidence.mean() for image in images) / 5)
+    assert take.quality.confidence_mean == pytest.approx(
+        sum(image.confidence.mean() for image in images) / 5
+    )
 
 
 @pytest.mark.slow
@@ -99,7 +108,14 @@ def test_takes_have_own_files_and_follow_each_other(run: Run, tmp_path: Path) ->
     ],
 )
 def test_take_that_ends_early_is_whole_and_the_last(
-    run: Run, world: Any, tmp_path: Path, vanishes_at: int, limits: dict[str, Any], state: str, sets: range, error: str
+    run: Run,
+    world: Any,
+    tmp_path: Path,
+    vanishes_at: int,
+    limits: dict[str, Any],
+    state: str,
+    sets: range,
+    error: str,
 ) -> None:
     world.fails_at = vanishes_at
     (take,) = run(count=3, frames=500, **limits)
@@ -110,7 +126,9 @@ def test_take_that_ends_early_is_whole_and_the_last(
     assert not (tmp_path / "1.bag").exists()
 
 
-def test_take_without_a_frame_or_a_start_leaves_no_file(session: Any, world: Any, tmp_path: Path) -> None:
+def test_take_without_a_frame_or_a_start_leaves_no_file(
+    session: Any, world: Any, tmp_path: Path
+) -> None:
     def fail(_: Any) -> None:
         raise CameraLostError("sim does not start: replug it")
 
@@ -127,7 +145,9 @@ def test_take_without_a_frame_or_a_start_leaves_no_file(session: Any, world: Any
 
 
 @pytest.mark.parametrize("indexed", [True, False])
-def test_sidecar_that_cannot_be_written_hides_no_other_error(run: Run, monkeypatch: Patch, indexed: bool) -> None:
+def test_sidecar_that_cannot_be_written_hides_no_other_error(
+    run: Run, monkeypatch: Patch, indexed: bool
+) -> None:
     def full(*_: Any) -> None:
         raise DiskFullError("0.json cannot be written")
 
@@ -139,14 +159,23 @@ def test_sidecar_that_cannot_be_written_hides_no_other_error(run: Run, monkeypat
 
 
 @pytest.mark.parametrize("count", [1, 2])
-def test_take_whose_file_cannot_be_closed_is_not_read_back(run: Run, monkeypatch: Patch, count: int) -> None:
+def test_take_whose_file_cannot_be_closed_is_not_read_back(
+    run: Run, monkeypatch: Patch, count: int
+) -> None:
     monkeypatch.setattr("nlos_cam.camera.recorder.can_grow", lambda *_: False)
     (take,) = run(count=count, frames=4, read_back=lambda _: pytest.fail("it has no index"))
-    assert (take.state, saved_state(take), take.closed, take.verified) == ("disk full", "disk full", False, None)
+    assert (take.state, saved_state(take), take.closed, take.verified) == (
+        "disk full",
+        "disk full",
+        False,
+        None,
+    )
     assert "nlos-cam repair" in str(take.error)
     summary = load_sidecar(take.sidecar.path).summary
     assert summary.frames is None
-    assert summary.frames_seen in range(1, 5)  # a slow machine may notice the full disk before the last frame
+    assert summary.frames_seen in range(
+        1, 5
+    )  # a slow machine may notice the full disk before the last frame
 
 
 def test_take_whose_reading_back_fails_is_damaged(run: Run) -> None:
@@ -163,11 +192,19 @@ def test_take_with_missing_frames_in_its_file_is_damaged(run: Run) -> None:
     assert (take.state, saved_state(take)) == ("damaged", "damaged")
     assert "3 of the 5" in str(take.error)
     whole, short = ({"depth": 5, "infrared": 5, "confidence": count} for count in (5, 4))
-    for streams, state in ((whole, "complete"), (short, "damaged")):  # frames that are in no set are no damage
-        (take,) = run(frames=5, read_back=lambda _, streams=streams: VerifyResult(2, 3, 0.1, streams))
+    for streams, state in (
+        (whole, "complete"),
+        (short, "damaged"),
+    ):  # frames that are in no set are no damage
+        (take,) = run(
+            frames=5, read_back=lambda _, streams=streams: VerifyResult(2, 3, 0.1, streams)
+        )
         assert take.state == state
     takes = run(count=2, frames=5, read_back=lambda _: VerifyResult(4, 0, 0.1, {}))
-    assert [take.state for take in takes] == ["damaged", "complete"]  # a first set may have been on its way
+    assert [take.state for take in takes] == [
+        "damaged",
+        "complete",
+    ]  # a first set may have been on its way
 
 
 def test_closing_between_takes_stops_the_camera(session: Any, tmp_path: Path) -> None:

@@ -1,4 +1,6 @@
-"""Recordings that are whole but wrong, as no accident makes them: each ends in frames or in one line, within bounds."""
+"""Recordings that are whole but wrong, as no accident makes them: each ends in frames or in one
+line, within bounds.
+"""
 
 import json
 import resource
@@ -14,17 +16,28 @@ import pytest
 from mutations import BAG_WAYS, Bag, Message, mutate_bag, read_bag, write_bag
 
 from nlos_cam.errors import RecordingError
-from nlos_cam.recording import BagReader, ExportOptions, ReplayCamera, export_recording, repair_recording
+from nlos_cam.recording import (
+    BagReader,
+    ExportOptions,
+    ReplayCamera,
+    export_recording,
+    repair_recording,
+)
 from nlos_cam.recording.rosbag import MAGIC, pack_chunk_head, pack_file_header, pack_record
 
-OWN_TYPES = ("Depth_0/info/camera_info", "sensor_msgs/CameraInfo"), ("/device_0/info", "diagnostic_msgs/KeyValue")
+OWN_TYPES = (
+    ("Depth_0/info/camera_info", "sensor_msgs/CameraInfo"),
+    ("/device_0/info", "diagnostic_msgs/KeyValue"),
+)
 HUGE = struct.pack("<II", 30_000, 30_000)
 Change = Callable[[Bag], None]
 
 
 @pytest.fixture
 def crafted(noise_bags: dict[str, Path], tmp_path: Path) -> Callable[[Change], Path]:
-    """Return the path of a short recording, changed and then written with right lengths and index."""
+    """Return the path of a short recording, changed and then written with right lengths and
+    index.
+    """
 
     def craft(change: Change) -> Path:
         bag = read_bag(noise_bags["plain"].read_bytes())
@@ -65,19 +78,34 @@ def assert_refused(path: Path, word: str) -> None:
 
 
 def rename(bag: Bag, old: str, new: str) -> None:
-    bag.topics = {number: (name.replace(old, new), kind) for number, (name, kind) in bag.topics.items()}
+    bag.topics = {
+        number: (name.replace(old, new), kind) for number, (name, kind) in bag.topics.items()
+    }
 
 
 def with_data(bag: Bag, ending: str, change: Callable[[bytes], bytes]) -> None:
     number = topic(bag, ending)
-    bag.messages = [replace(m, data=change(m.data)) if m.connection == number else m for m in bag.messages]
+    bag.messages = [
+        replace(m, data=change(m.data)) if m.connection == number else m for m in bag.messages
+    ]
 
 
-@pytest.mark.parametrize("kind", ["std_msgs/String", "sensor_msgs/CameraInfo", "diagnostic_msgs/KeyValue"])
 @pytest.mark.parametrize(
-    "ending", ["Depth_0/info", "Depth_0/info/camera_info", "Depth_0/image/data", "Depth_Units/value", "/device_0/info"]
+    "kind", ["std_msgs/String", "sensor_msgs/CameraInfo", "diagnostic_msgs/KeyValue"]
 )
-def test_message_of_wrong_type_is_refused_in_a_line(crafted: Callable[[Change], Path], ending: str, kind: str) -> None:
+@pytest.mark.parametrize(
+    "ending",
+    [
+        "Depth_0/info",
+        "Depth_0/info/camera_info",
+        "Depth_0/image/data",
+        "Depth_Units/value",
+        "/device_0/info",
+    ],
+)
+def test_message_of_wrong_type_is_refused_in_a_line(
+    crafted: Callable[[Change], Path], ending: str, kind: str
+) -> None:
     def change(bag: Bag) -> None:
         number = topic(bag, ending)
         bag.topics[number] = bag.topics[number][0], kind
@@ -88,18 +116,38 @@ def test_message_of_wrong_type_is_refused_in_a_line(crafted: Callable[[Change], 
 @pytest.mark.parametrize(
     ("change", "word"),
     [
-        (lambda bag: with_data(bag, "Depth_0/info/camera_info", lambda d: d[:16] + HUGE + d[24:]), "30000 x 30000"),
-        (lambda bag: with_data(bag, "Depth_0/image/data", lambda data: data[:-9]), "sequence length"),
+        (
+            lambda bag: with_data(
+                bag, "Depth_0/info/camera_info", lambda d: d[:16] + HUGE + d[24:]
+            ),
+            "30000 x 30000",
+        ),
+        (
+            lambda bag: with_data(bag, "Depth_0/image/data", lambda data: data[:-9]),
+            "sequence length",
+        ),
         (lambda bag: bag.topics.update({999: bag.topics[topic(bag, "Depth_0/image/data")]}), ""),
-        (lambda bag: bag.topics.update(dict.fromkeys(range(500, 20_000), ("/x", "std_msgs/String"))), "topics"),
-        (lambda bag: rename(bag, "sensor_0", "sensor_" + "9" * 5000), "point clouds need all"),  # they are no streams
+        (
+            lambda bag: bag.topics.update(
+                dict.fromkeys(range(500, 20_000), ("/x", "std_msgs/String"))
+            ),
+            "topics",
+        ),
+        (
+            lambda bag: rename(bag, "sensor_0", "sensor_" + "9" * 5000),
+            "point clouds need all",
+        ),  # they are no streams
     ],
 )
-def test_absurd_recording_is_refused_in_a_line(crafted: Callable[[Change], Path], change: Change, word: str) -> None:
+def test_absurd_recording_is_refused_in_a_line(
+    crafted: Callable[[Change], Path], change: Change, word: str
+) -> None:
     assert_refused(crafted(change), word)
 
 
-def test_index_that_lists_messages_again_and_again_is_refused(crafted: Callable[[Change], Path]) -> None:
+def test_index_that_lists_messages_again_and_again_is_refused(
+    crafted: Callable[[Change], Path],
+) -> None:
     path = crafted(lambda _: None)
     bag = read_bag(path.read_bytes())
 
@@ -115,8 +163,14 @@ def test_index_that_lists_messages_again_and_again_is_refused(crafted: Callable[
 
 
 def test_export_holds_no_number_that_json_lacks(crafted: Callable[[Change], Path]) -> None:
-    path = crafted(lambda bag: with_data(bag, "Frames_Queue_Size/value", lambda _: struct.pack("<f", float("nan"))))
-    path.with_suffix(".json").write_text('{"settings": {"a": NaN, "b": 1e999, "c": 1.5}}', encoding="utf-8")
+    path = crafted(
+        lambda bag: with_data(
+            bag, "Frames_Queue_Size/value", lambda _: struct.pack("<f", float("nan"))
+        )
+    )
+    path.with_suffix(".json").write_text(
+        '{"settings": {"a": NaN, "b": 1e999, "c": 1.5}}', encoding="utf-8"
+    )
     use(path)
     text = (path.parent / "export" / "export.json").read_text(encoding="utf-8")
     facts = json.loads(text, parse_constant=pytest.fail)
@@ -125,7 +179,9 @@ def test_export_holds_no_number_that_json_lacks(crafted: Callable[[Change], Path
 
 
 @pytest.mark.parametrize("text", ["[" * 100_000, '{"a":' * 100_000, " " * (2 << 20), "\x00"])
-def test_export_ignores_a_sidecar_that_is_none(crafted: Callable[[Change], Path], text: str) -> None:
+def test_export_ignores_a_sidecar_that_is_none(
+    crafted: Callable[[Change], Path], text: str
+) -> None:
     path = crafted(lambda _: None)
     path.with_suffix(".json").write_text(text, encoding="utf-8")
     use(path)
@@ -143,7 +199,9 @@ def test_texts_of_a_device_are_printable_and_bounded(crafted: Callable[[Change],
 
 
 def bomb(kind: str) -> bytes:
-    about = pack_record({"type": b"std_msgs/String", "md5sum": b"0" * 32, "message_definition": b"s"}, b"")[4:-4]
+    about = pack_record(
+        {"type": b"std_msgs/String", "md5sum": b"0" * 32, "message_definition": b"s"}, b""
+    )[4:-4]
 
     def connection(number: int) -> bytes:
         fields = {"conn": number.to_bytes(4, "little"), "op": b"\x07", "topic": b"/t%d" % number}
@@ -174,10 +232,14 @@ def test_repair_of_a_bomb_is_bounded_in_work_and_memory(tmp_path: Path, kind: st
 
 
 @pytest.mark.parametrize("seed", range(12))
-def test_consistent_mutation_ends_in_frames_or_a_line(noise_bags: dict[str, Path], tmp_path: Path, seed: int) -> None:
+def test_consistent_mutation_ends_in_frames_or_a_line(
+    noise_bags: dict[str, Path], tmp_path: Path, seed: int
+) -> None:
     path = tmp_path / "mutated.bag"
     ways, content = mutate_bag(noise_bags["packed"].read_bytes(), np.random.default_rng(seed))
-    assert (ways, content) == mutate_bag(noise_bags["packed"].read_bytes(), np.random.default_rng(seed))
+    assert (ways, content) == mutate_bag(
+        noise_bags["packed"].read_bytes(), np.random.default_rng(seed)
+    )
     assert set(ways.split("+")) <= {way.__name__ for way in BAG_WAYS}
     path.write_bytes(content)
     assert "\n" not in line_of(lambda: use(path))

@@ -33,11 +33,16 @@ def test_export_writes_every_bit_into_png(noise_bag: Path, tmp_path: Path) -> No
     made = exported(noise_bag, tmp_path / "out")
     assert made.frames == dict.fromkeys(FORMATS, FRAMES) | {"points": 1}
     info = json.loads((tmp_path / "out" / INFO).read_text())
-    assert (info["device"]["name"], info["depth_unit_m"]) == ("Simulated L515", pytest.approx(0.00025))
+    assert (info["device"]["name"], info["depth_unit_m"]) == (
+        "Simulated L515",
+        pytest.approx(0.00025),
+    )
     assert (set(info["streams"]), info["capture"]) == (set(FORMATS), None)
     assert info["streams"]["depth"]["intrinsics"]["height"] == 48
     for stream in FORMATS:
-        for row, sample in zip(rows(tmp_path / "out", stream), samples(noise_bag, stream), strict=True):
+        for row, sample in zip(
+            rows(tmp_path / "out", stream), samples(noise_bag, stream), strict=True
+        ):
             pixels = cv2.imread(str(tmp_path / "out" / row["file"]), cv2.IMREAD_UNCHANGED)
             np.testing.assert_array_equal(pixels, sample.pixels)
             assert pixels.dtype == sample.pixels.dtype
@@ -51,11 +56,21 @@ def test_export_writes_every_bit_into_npz(noise_bag: Path, tmp_path: Path) -> No
         expected = samples(noise_bag, stream)
         with np.load(tmp_path / "out" / f"{stream}.npz") as found:
             np.testing.assert_array_equal(found["pixels"], [sample.pixels for sample in expected])
-            np.testing.assert_array_equal(found["frame_number"], [sample.number for sample in expected])
-            np.testing.assert_array_equal(found["timestamp_s"], [sample.timestamp_s for sample in expected])
+            np.testing.assert_array_equal(
+                found["frame_number"], [sample.number for sample in expected]
+            )
+            np.testing.assert_array_equal(
+                found["timestamp_s"], [sample.timestamp_s for sample in expected]
+            )
             assert (found["width"], found["fx"]) == (64, pytest.approx(45.7, abs=0.1))
             assert ("depth_unit_m" in found) == (stream == "depth")
-    assert sorted(path.suffix for path in (tmp_path / "out").iterdir()) == ["", ".json", ".npz", ".npz", ".npz"]
+    assert sorted(path.suffix for path in (tmp_path / "out").iterdir()) == [
+        "",
+        ".json",
+        ".npz",
+        ".npz",
+        ".npz",
+    ]
 
 
 def test_export_points_are_depth_along_the_rays(noise_bag: Path, tmp_path: Path) -> None:
@@ -74,11 +89,17 @@ def test_export_writes_only_chosen_streams_and_frames(noise_bag: Path, tmp_path:
     assert made.frames == {"infrared": 4}
     assert not (tmp_path / "out" / "points").exists()
     assert not (tmp_path / "out" / "depth").exists()
-    assert [row["frame_number"] for row in rows(tmp_path / "out", "infrared")] == ["0", "6", "12", "18"]
+    assert [row["frame_number"] for row in rows(tmp_path / "out", "infrared")] == [
+        "0",
+        "6",
+        "12",
+        "18",
+    ]
 
 
 def test_export_that_is_stopped_keeps_written_frames(noise_bag: Path, tmp_path: Path) -> None:
-    stop, seen = Event(), []
+    stop = Event()
+    seen = []
 
     def after_six() -> None:
         seen.append(1)
@@ -86,7 +107,11 @@ def test_export_that_is_stopped_keeps_written_frames(noise_bag: Path, tmp_path: 
             stop.set()
 
     made = export_recording(
-        BagReader(noise_bag), tmp_path / "out", ExportOptions(format="npz"), stop=stop, on_frame=after_six
+        BagReader(noise_bag),
+        tmp_path / "out",
+        ExportOptions(format="npz"),
+        stop=stop,
+        on_frame=after_six,
     )
     assert made.frames == {"depth": 2, "infrared": 2, "confidence": 2, "points": 1}
     with np.load(tmp_path / "out" / "depth.npz") as found:
@@ -103,7 +128,9 @@ def test_export_keeps_the_frames_before_damage(damaged: Path, tmp_path: Path) ->
 def test_export_of_another_camera_writes_its_streams(real_bag: Path, tmp_path: Path) -> None:
     made = exported(real_bag, tmp_path / "out")
     assert made.frames == {"depth": 2, "color": 1}
-    depth = cv2.imread(str(tmp_path / "out" / rows(tmp_path / "out", "depth")[0]["file"]), cv2.IMREAD_UNCHANGED)
+    depth = cv2.imread(
+        str(tmp_path / "out" / rows(tmp_path / "out", "depth")[0]["file"]), cv2.IMREAD_UNCHANGED
+    )
     colour = cv2.imread(str(tmp_path / "out" / rows(tmp_path / "out", "color")[0]["file"]))
     assert (depth.dtype, depth.shape, colour.shape) == (np.uint16, (480, 640), (480, 640, 3))
     rgb = samples(real_bag, "color")[0].pixels

@@ -17,14 +17,19 @@ from nlos_cam.recording import ReplayCamera, repair_recording, verify
 
 
 def test_replay_returns_every_recorded_bit(noise_bag: Path, noise_world: Any) -> None:
-    world, threads = noise_world(), threading.active_count()
+    world = noise_world()
+    threads = threading.active_count()
     with ReplayCamera(noise_bag) as camera:
         for count, frame in enumerate(camera):
             assert frame.frame_number == count
             assert threading.active_count() == threads
             assert_exposed(frame, world.images(count))
     found = verify(noise_bag)
-    assert (found.frames, found.dropped, found.seconds) == (count + 1, 0, pytest.approx(19 / 30, abs=1e-3))
+    assert (found.frames, found.dropped, found.seconds) == (
+        count + 1,
+        0,
+        pytest.approx(19 / 30, abs=1e-3),
+    )
     assert found.streams == {"depth": 20, "infrared": 20, "confidence": 20}
     assert camera.identity == {"name": "Simulated L515", "serial": "simulated"}
 
@@ -41,9 +46,14 @@ def test_iterating_again_restarts_frames_and_counters(noise_bag: Path, reader: A
         assert list(first) == []
 
 
-@pytest.mark.parametrize("content", [b"", b"a text file\n", b"#ROSBAG V2.0\n", 0.1, 0.5, 0.99, "killed"])
-def test_replay_refuses_broken_file_with_repair(noise_bag: Path, tmp_path: Path, content: bytes | float | str) -> None:
-    whole, path = noise_bag.read_bytes(), tmp_path / "my run.bag"
+@pytest.mark.parametrize(
+    "content", [b"", b"a text file\n", b"#ROSBAG V2.0\n", 0.1, 0.5, 0.99, "killed"]
+)
+def test_replay_refuses_broken_file_with_repair(
+    noise_bag: Path, tmp_path: Path, content: bytes | float | str
+) -> None:
+    whole = noise_bag.read_bytes()
+    path = tmp_path / "my run.bag"
     if isinstance(content, float):
         content = whole[: int(content * len(whole))]
     elif isinstance(content, str):  # the header's index_pos is 0
@@ -57,8 +67,12 @@ def test_replay_refuses_broken_file_with_repair(noise_bag: Path, tmp_path: Path,
     assert ("nlos-cam repair" in str(raised.value)) == content.startswith(b"#ROSBAG")
 
 
-@pytest.mark.parametrize("read", [ReplayCamera, lambda path: repair_recording(path, path.with_name("good.bag"))])
-def test_missing_paths_folders_and_pipes_are_refused(tmp_path: Path, read: Callable[[Path], object]) -> None:
+@pytest.mark.parametrize(
+    "read", [ReplayCamera, lambda path: repair_recording(path, path.with_name("good.bag"))]
+)
+def test_missing_paths_folders_and_pipes_are_refused(
+    tmp_path: Path, read: Callable[[Path], object]
+) -> None:
     paths = [tmp_path / "none.bag", tmp_path]
     if sys.platform != "win32":  # pipes have names
         os.mkfifo(tmp_path / "pipe.bag")
@@ -70,7 +84,10 @@ def test_missing_paths_folders_and_pipes_are_refused(tmp_path: Path, read: Calla
 
 def test_replay_gives_the_frames_before_damage(damaged: Path) -> None:
     frames: list[int] = []
-    with ReplayCamera(damaged) as camera, pytest.raises(RecordingError, match=r"\d+\.\d s") as raised:
+    with (
+        ReplayCamera(damaged) as camera,
+        pytest.raises(RecordingError, match=r"\d+\.\d s") as raised,
+    ):
         frames.extend(frame.frame_number for frame in camera)
     assert f"`nlos-cam repair {damaged} --out damaged-repaired.bag`" in str(raised.value)
     assert frames == list(range(len(frames)))
@@ -81,7 +98,8 @@ def test_replay_gives_the_frames_before_damage(damaged: Path) -> None:
 
 
 def test_settings_are_those_at_the_time_of_the_frame(rewritten: Any) -> None:
-    value, changed_ns = "/device_0/sensor_0/option/Frames_Queue_Size/value", 5_000_000
+    value = "/device_0/sensor_0/option/Frames_Queue_Size/value"
+    changed_ns = 5_000_000
 
     def changing(topic: str, time_ns: int, raw: bytes) -> list[tuple[int, bytes]]:
         number = int.from_bytes(raw[:4], "little")
@@ -96,7 +114,9 @@ def test_settings_are_those_at_the_time_of_the_frame(rewritten: Any) -> None:
 
 
 @pytest.mark.parametrize("missing", [("infrared", "confidence"), ("confidence",), ("depth",)])
-def test_replay_names_missing_streams(noise_bag_uncompressed: Path, tmp_path: Path, missing: tuple[str, ...]) -> None:
+def test_replay_names_missing_streams(
+    noise_bag_uncompressed: Path, tmp_path: Path, missing: tuple[str, ...]
+) -> None:
     content = noise_bag_uncompressed.read_bytes()
     for stream in missing:  # as of another camera
         content = content.replace(f"{stream.title()}_0".encode(), f"{stream.title()}_2".encode())
@@ -107,7 +127,9 @@ def test_replay_names_missing_streams(noise_bag_uncompressed: Path, tmp_path: Pa
         assert (f"no {stream}" in str(raised.value)) == (stream in missing)
 
 
-def test_replay_refuses_a_recording_of_no_frames(noise_world: Any, hurried_clock: Any, tmp_path: Path) -> None:
+def test_replay_refuses_a_recording_of_no_frames(
+    noise_world: Any, hurried_clock: Any, tmp_path: Path
+) -> None:
     path = tmp_path / "nothing.bag"
     camera = SimulatedCamera("sim", noise_world(), clock=hurried_clock(), recording=Recording(path))
     camera._world.fails_at = 0

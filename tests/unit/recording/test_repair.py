@@ -37,12 +37,18 @@ def whys(found: RepairResult) -> str:
 
 
 @pytest.mark.parametrize("name", ["packed", "plain", "of an old SDK"])
-def test_repair_copies_a_whole_bag(noise_bags: Bags, request: pytest.FixtureRequest, tmp_path: Path, name: str) -> None:
+def test_repair_copies_a_whole_bag(
+    noise_bags: Bags, request: pytest.FixtureRequest, tmp_path: Path, name: str
+) -> None:
     source = noise_bags[name] if name in noise_bags else request.getfixturevalue("real_bag")
-    path, progress = shutil.copy2(source, tmp_path / "original.bag"), list[tuple[int, int]]()
-    before, content = path.stat(), path.read_bytes()
+    path = shutil.copy2(source, tmp_path / "original.bag")
+    progress = list[tuple[int, int]]()
+    before = path.stat()
+    content = path.read_bytes()
     path.chmod(0o400)
-    found = repair_recording(path, tmp_path / "good.bag", lambda done, total: progress.append((done, total)))
+    found = repair_recording(
+        path, tmp_path / "good.bag", lambda done, total: progress.append((done, total))
+    )
     old = {"depth": 2, "infrared": 0, "confidence": 0, "color": 1}
     assert (found.recovered_frames, found.damages) == (ALL if name in noise_bags else old, [])
     assert (tmp_path / "good.bag").read_bytes() == path.read_bytes() == content
@@ -51,27 +57,38 @@ def test_repair_copies_a_whole_bag(noise_bags: Bags, request: pytest.FixtureRequ
     assert progress[-1][0] == progress[-1][1] == 2 * before.st_size
 
 
-def test_every_reader_reads_repaired_bag_exactly(bag: Path, tmp_path: Path, tool: Callable[[str], ModuleType]) -> None:
+def test_every_reader_reads_repaired_bag_exactly(
+    bag: Path, tmp_path: Path, tool: Callable[[str], ModuleType]
+) -> None:
     found = repair_recording(bag, tmp_path / "good.bag")
     twice = repair_recording(found.out, tmp_path / "twice.bag")
     assert twice.out.read_bytes() == found.out.read_bytes()
     assert (twice.recovered_frames, twice.damages) == (found.recovered_frames, [])
     assert verify(found.out).streams == found.recovered_frames
     with Reader(found.out) as reader:
-        images = [connection for connection in reader.connections if connection.topic.endswith("/image/data")]
+        images = [
+            connection
+            for connection in reader.connections
+            if connection.topic.endswith("/image/data")
+        ]
         assert sum(1 for _ in reader.messages(images)) == sum(found.recovered_frames.values())
         assert sum(1 for _ in reader.messages()) == reader.message_count
     noise = tool("noise_recordings").noise
     with SdkReplayCamera(found.out) as camera:
         frames = list(camera)
-    assert [frame.frame_number for frame in frames] == list(range(min(found.recovered_frames.values())))
+    assert [frame.frame_number for frame in frames] == list(
+        range(min(found.recovered_frames.values()))
+    )
     for frame in frames:
         assert_exposed(frame, noise(frame.frame_number))
 
 
 @pytest.mark.parametrize("name", ["packed", "plain"])
-def test_repair_recovers_more_where_more_is_left(noise_bags: Bags, tmp_path: Path, name: str) -> None:
-    content, frames = noise_bags[name].read_bytes(), list[int]()
+def test_repair_recovers_more_where_more_is_left(
+    noise_bags: Bags, tmp_path: Path, name: str
+) -> None:
+    content = noise_bags[name].read_bytes()
+    frames = list[int]()
     for share in (0.4, 0.6, 0.8, 1.0):
         found = repaired(tmp_path, content[: int(share * len(content))])
         frames.append(found.recovered_frames["depth"])
@@ -82,7 +99,8 @@ def test_repair_recovers_more_where_more_is_left(noise_bags: Bags, tmp_path: Pat
 
 
 def test_repair_takes_messages_of_an_unfinished_chunk(noise_bags: Bags, tmp_path: Path) -> None:
-    whole, killed = noise_bags["plain"], noise_bags["plain-unindexed"]
+    whole = noise_bags["plain"]
+    killed = noise_bags["plain-unindexed"]
     lost = whole.stat().st_size - killed.stat().st_size
     found = repair_recording(killed, tmp_path / "good.bag")
     assert sum(found.recovered_frames.values()) > 3 * 40 - lost // 19_000
@@ -91,7 +109,9 @@ def test_repair_takes_messages_of_an_unfinished_chunk(noise_bags: Bags, tmp_path
 
 def test_repair_takes_repeated_frames_once(noise_bags: Bags, tmp_path: Path) -> None:
     content = noise_bags["plain"].read_bytes()
-    start, end = (content.index(b"\x04\0\0\0op=\x02", after) - 17 for after in (2_000_000, 2_500_000))
+    start, end = (
+        content.index(b"\x04\0\0\0op=\x02", after) - 17 for after in (2_000_000, 2_500_000)
+    )
     found = repaired(tmp_path, content[:end] + content[start:end] + content[end:])
     assert found.recovered_frames == verify(found.out).streams == ALL
     assert "twice" in whys(found)
@@ -103,7 +123,9 @@ def test_repair_leaves_out_messages_without_description(noise_bags: Bags, tmp_pa
     found = repaired(tmp_path, content[:described] + b"tonic" + content[described + 5 :])
     assert found.recovered_frames["infrared"] == 0
     assert found.recovered_frames["depth"] > 30
-    assert len(found.damages) > len(repair_recording(noise_bags["plain-unindexed"], tmp_path / "other.bag").damages)
+    assert len(found.damages) > len(
+        repair_recording(noise_bags["plain-unindexed"], tmp_path / "other.bag").damages
+    )
 
 
 def test_repair_warns_where_librealsense_will_not_play(noise_bags: Bags, tmp_path: Path) -> None:
@@ -119,7 +141,13 @@ def test_repair_warns_where_librealsense_will_not_play(noise_bags: Bags, tmp_pat
 def test_repair_refuses_a_file_without_frames(noise_bags: Bags, tmp_path: Path) -> None:
     content = noise_bags["plain"].read_bytes()
     first = content.index(b"\x04\0\0\0op=\x07", content.index(b"/option/Depth_Units/description"))
-    other = b"", b"a text file\n", bytes(3 << 20), b"\0\0\0op=" * 9999, b"#ROSBAG V2.0\n" + bytes(9000)
+    other = (
+        b"",
+        b"a text file\n",
+        bytes(3 << 20),
+        b"\0\0\0op=" * 9999,
+        b"#ROSBAG V2.0\n" + bytes(9000),
+    )
     for part in (*other, content[:first]):
         with pytest.raises(RecordingError, match=r"bad\.bag") as raised:
             repaired(tmp_path, part)
@@ -160,7 +188,9 @@ def test_repair_refuses_a_full_disk_and_a_missing_folder(
 ) -> None:
     with pytest.raises(NlosCamError, match="nowhere"):
         repair_recording(noise_bags["plain"], tmp_path / "nowhere" / "good.bag")
-    monkeypatch.setattr("nlos_cam.recording.repair.shutil.disk_usage", lambda _: SimpleNamespace(free=1_500_000))
+    monkeypatch.setattr(
+        "nlos_cam.recording.repair.shutil.disk_usage", lambda _: SimpleNamespace(free=1_500_000)
+    )
     with pytest.raises(NlosCamError, match=r"\d+ MB.* 1\.5 MB") as raised:
         repair_recording(noise_bags["plain"], tmp_path / "good.bag")
     assert not isinstance(raised.value, RecordingError)
@@ -187,7 +217,9 @@ def chunks_in(path: Path) -> Iterator[bytes]:
 
 @pytest.mark.slow
 def test_repair_recovers_every_chunk_of_a_killed_capture(noise_world: Any, tmp_path: Path) -> None:
-    path, out, world = tmp_path / "killed.bag", tmp_path / "repaired.bag", noise_world()
+    path = tmp_path / "killed.bag"
+    out = tmp_path / "repaired.bag"
+    world = noise_world()
     with subprocess.Popen([sys.executable, PROGRAM, path, str(10**9)]) as capture:
         while not (path.exists() and path.stat().st_size) and capture.poll() is None:
             time.sleep(0.01)
@@ -202,9 +234,15 @@ def test_repair_recovers_every_chunk_of_a_killed_capture(noise_world: Any, tmp_p
     with SdkReplayCamera(out) as camera:
         for frame in camera:
             assert_exposed(frame, world.images(frame.frame_number))
-        assert {stream: camera.arrived[stream] for stream in found.recovered_frames} == found.recovered_frames
+        assert {
+            stream: camera.arrived[stream] for stream in found.recovered_frames
+        } == found.recovered_frames
 
 
 def test_naive_reader_finds_the_chunks_of_an_unfinished_recording(noise_bags: Bags) -> None:
     for name in ("packed", "plain"):
-        assert list(chunks_in(noise_bags[f"{name}-unindexed"])) == [*chunks_in(noise_bags[name])][:-1] != []
+        assert (
+            list(chunks_in(noise_bags[f"{name}-unindexed"]))
+            == [*chunks_in(noise_bags[name])][:-1]
+            != []
+        )

@@ -10,10 +10,22 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from nlos_cam.recording import rosbag
-from nlos_cam.recording.rosbag import BagFormatError, Ending, Op, pack_record, read_connection, read_record, reader
+from nlos_cam.recording.rosbag import (
+    BagFormatError,
+    Ending,
+    Op,
+    pack_record,
+    read_connection,
+    read_record,
+    reader,
+)
 from nlos_cam.recording.salvage import Scan, examine, find_chunk, scan_bag, unpack
 
-DESCRIPTION = {"type": b"std_msgs/String", "md5sum": b"0" * 32, "message_definition": b"string data"}
+DESCRIPTION = {
+    "type": b"std_msgs/String",
+    "md5sum": b"0" * 32,
+    "message_definition": b"string data",
+}
 SET_UP_S = (0, 1)
 FIRST_CHUNK_AT = 4117
 MESSAGE = b"\x04\0\0\0op=\x02"
@@ -35,18 +47,26 @@ def message(time: tuple[int, int], data: bytes = b"data", conn: int = 0) -> byte
 
 
 def packed(content: bytes) -> bytes:
-    options = {"block_size": lz4.frame.BLOCKSIZE_MAX64KB, "block_linked": False, "content_checksum": True}
+    options = {
+        "block_size": lz4.frame.BLOCKSIZE_MAX64KB,
+        "block_linked": False,
+        "content_checksum": True,
+    }
     return lz4.frame.compress(content, **options)
 
 
 CONNECTION = connection(b"/topic", 0)
 NOISE = np.random.default_rng(0).bytes(90_000)
-CONTENT = CONNECTION + message(SET_UP_S) + b"".join(message((1, number), NOISE) for number in (3, 1, 2))
+CONTENT = (
+    CONNECTION + message(SET_UP_S) + b"".join(message((1, number), NOISE) for number in (3, 1, 2))
+)
 AFTER = rosbag.pack_index(0, bytes(12))
 DATA = {"lz4": packed(CONTENT), "bz2": bz2.compress(CONTENT), "none": CONTENT}
 
 
-def examined(data: bytes, compression: str = "lz4", size: int = len(CONTENT), length: int | None = None) -> tuple:
+def examined(
+    data: bytes, compression: str = "lz4", size: int = len(CONTENT), length: int | None = None
+) -> tuple:
     """Examine a chunk of that data; returns what was found and the file that it is in."""
     file = rosbag.pack_chunk_head(compression, size, len(data) if length is None else length) + data
     found = find_chunk(reader(file), 0)
@@ -57,7 +77,9 @@ def examined(data: bytes, compression: str = "lz4", size: int = len(CONTENT), le
 @pytest.mark.parametrize("compression", DATA)
 @pytest.mark.parametrize("length", [0, 1, 1000, 10**6, 0xFFFFFFFF])
 @pytest.mark.parametrize("size", [0, len(CONTENT), 0xFFFFFFFF])
-def test_examine_ignores_a_wrong_length_in_the_header(compression: str, length: int, size: int) -> None:
+def test_examine_ignores_a_wrong_length_in_the_header(
+    compression: str, length: int, size: int
+) -> None:
     found, file = examined(DATA[compression] + AFTER, compression, size, length)
     assert (found.ending, found.end) == (Ending.WHOLE, len(file) - len(AFTER))
     assert found.why
@@ -68,7 +90,9 @@ def test_examine_ignores_a_wrong_length_in_the_header(compression: str, length: 
 
 @pytest.mark.parametrize("compression", ["lz4", "bz2"])
 def test_examine_never_accepts_a_flipped_bit_of_packed_data(compression: str) -> None:
-    for at in np.random.default_rng(1).integers(7, len(DATA[compression]), 50 if compression == "lz4" else 8):
+    for at in np.random.default_rng(1).integers(
+        7, len(DATA[compression]), 50 if compression == "lz4" else 8
+    ):
         bad = bytearray(DATA[compression])
         bad[at] ^= 1
         found, _ = examined(bytes(bad), compression)
@@ -77,7 +101,8 @@ def test_examine_never_accepts_a_flipped_bit_of_packed_data(compression: str) ->
 
 @pytest.mark.parametrize("compression", ["lz4", "none"])
 def test_examine_keeps_whole_messages_of_a_cut_chunk(compression: str) -> None:
-    data, block = DATA[compression], 1 << 16 if compression == "lz4" else 1
+    data = DATA[compression]
+    block = 1 << 16 if compression == "lz4" else 1
     for length in (len(data) - 20, 190_000, 100_000):
         found, file = examined(data[:length], compression, 0, 0)
         chunk = found.chunk
@@ -115,7 +140,8 @@ def bag(request: pytest.FixtureRequest, noise_bags: dict[str, Path]) -> Path:
 
 
 def chunk_places(content: bytes) -> list[tuple[int, int]]:
-    places, at = list[tuple[int, int]](), FIRST_CHUNK_AT
+    places = list[tuple[int, int]]()
+    at = FIRST_CHUNK_AT
     while at < len(content):
         record = read_record(reader(content), at)
         if record.op is Op.CHUNK:
@@ -142,7 +168,8 @@ def count(scan: Scan) -> int:
 
 
 def test_scan_of_a_whole_bag_finds_every_chunk_and_index(bag: Path, scanned: Scanned) -> None:
-    content, progress = bag.read_bytes(), list[tuple[int, int]]()
+    content = bag.read_bytes()
+    progress = list[tuple[int, int]]()
     scan = scan_bag(bag, lambda done, total: progress.append((done, total)))
     assert progress == sorted(progress)
     assert progress[-1] == (scan.bytes, scan.bytes) == (len(content), len(content))
@@ -151,21 +178,28 @@ def test_scan_of_a_whole_bag_finds_every_chunk_and_index(bag: Path, scanned: Sca
     assert [chunk.at for chunk in scan.chunks] == [at for at, _ in places]
     assert len(scan.chunks) > 3
     assert {connection.topic for connection in scan.connections.values()} >= {
-        f"/device_0/sensor_0/{stream}_0/image/data" for stream in ("Depth", "Infrared", "Confidence")
+        f"/device_0/sensor_0/{stream}_0/image/data"
+        for stream in ("Depth", "Infrared", "Confidence")
     }
     for (_, end), chunk in zip(places, scan.chunks, strict=True):
-        written = b"".join(rosbag.pack_index(number, entries) for number, entries in chunk.index.items())
+        written = b"".join(
+            rosbag.pack_index(number, entries) for number, entries in chunk.index.items()
+        )
         assert content[end:].startswith(written)
     short = scanned(content[: places[-1][1]])
     assert (short.chunks, short.connections, short.damages) == (scan.chunks, scan.connections, [])
-    assert [damage.bytes > 0 for damage in scanned(content[:-1]).damages] == [True]  # the index is cut
+    assert [damage.bytes > 0 for damage in scanned(content[:-1]).damages] == [
+        True
+    ]  # the index is cut
 
 
 def test_scan_loses_only_the_damaged_chunk(noise_bags: dict[str, Path], scanned: Scanned) -> None:
     whole = noise_bags["packed"].read_bytes()
     before = indexes(scan_bag(noise_bags["packed"]))
     for number, (at, end) in enumerate(chunk_places(whole)[1:], start=1):
-        assert number > 1 or whole.count(MESSAGE, at, end) > 1  # though messages show in packed noise
+        assert (
+            number > 1 or whole.count(MESSAGE, at, end) > 1
+        )  # though messages show in packed noise
         content = bytearray(whole)
         content[(at + end) // 2] ^= 16
         scan = scanned(bytes(content))
@@ -173,22 +207,28 @@ def test_scan_loses_only_the_damaged_chunk(noise_bags: dict[str, Path], scanned:
         assert [(damage.position, damage.bytes) for damage in scan.damages] == [(at, end - at)]
 
 
-def test_scan_loses_little_of_a_plain_chunk_and_takes_no_foreign(noise_bags: dict[str, Path], scanned: Scanned) -> None:
-    whole, expected = noise_bags["plain"].read_bytes(), scan_bag(noise_bags["plain"])
+def test_scan_loses_little_of_a_plain_chunk_and_takes_no_foreign(
+    noise_bags: dict[str, Path], scanned: Scanned
+) -> None:
+    whole = noise_bags["plain"].read_bytes()
+    expected = scan_bag(noise_bags["plain"])
     at, end = chunk_places(whole)[1]
     middle = whole.index(MESSAGE, (at + end) // 2)
     scan = scanned(whole[:middle] + bytes(8) + whole[middle + 8 :])
     assert 1 <= count(expected) - count(scan) <= 2
     assert len(scan.damages) == 1
     at, end = chunk_places(whole)[0]
-    scan = scanned(whole[:end] + whole[at:end].replace(b"topic=/device_0", b"topic=/device_1") + whole[end:])
+    scan = scanned(
+        whole[:end] + whole[at:end].replace(b"topic=/device_0", b"topic=/device_1") + whole[end:]
+    )
     assert indexes(scan) == indexes(expected)
     assert ["topics" in damage.why for damage in scan.damages] == [True]
 
 
 def test_scan_bridges_lost_headers_ranges_and_repeats(bag: Path, scanned: Scanned) -> None:
     whole = bag.read_bytes()
-    expected, places = indexes(scan_bag(bag)), chunk_places(whole)
+    expected = indexes(scan_bag(bag))
+    places = chunk_places(whole)
     at = places[2][0]
     scan = scanned(whole[:at] + bytes(40) + whole[at + 40 :])
     assert indexes(scan) == expected
@@ -201,9 +241,14 @@ def test_scan_bridges_lost_headers_ranges_and_repeats(bag: Path, scanned: Scanne
     assert ["twice" in damage.why for damage in scan.damages] == [True]
 
 
-def test_scan_finds_connections_without_the_first_chunk(noise_bags: dict[str, Path], scanned: Scanned) -> None:
-    whole, expected = noise_bags["packed"].read_bytes(), scan_bag(noise_bags["packed"]).connections
-    assert scanned(whole[:FIRST_CHUNK_AT] + whole[chunk_places(whole)[1][0] :]).connections == expected
+def test_scan_finds_connections_without_the_first_chunk(
+    noise_bags: dict[str, Path], scanned: Scanned
+) -> None:
+    whole = noise_bags["packed"].read_bytes()
+    expected = scan_bag(noise_bags["packed"]).connections
+    assert (
+        scanned(whole[:FIRST_CHUNK_AT] + whole[chunk_places(whole)[1][0] :]).connections == expected
+    )
     content = bytearray(noise_bags["packed-unindexed"].read_bytes())
     content[400_000] ^= 1  # within the first chunk, and no copy at the end of the file
     scan = scanned(bytes(content))
@@ -213,8 +258,11 @@ def test_scan_finds_connections_without_the_first_chunk(noise_bags: dict[str, Pa
     assert count(scan) > 0.5 * count(scan_bag(noise_bags["packed-unindexed"]))
 
 
-def test_scan_finds_a_record_across_windows(bag: Path, scanned: Scanned, monkeypatch: pytest.MonkeyPatch) -> None:
-    whole, expected = bag.read_bytes(), indexes(scan_bag(bag))[1:3]
+def test_scan_finds_a_record_across_windows(
+    bag: Path, scanned: Scanned, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    whole = bag.read_bytes()
+    expected = indexes(scan_bag(bag))[1:3]
     _, (start, _), (_, end), *_ = chunk_places(whole)
     for window in range(40, 90):
         monkeypatch.setattr("nlos_cam.recording.salvage.WINDOW_BYTES", window)
@@ -222,7 +270,9 @@ def test_scan_finds_a_record_across_windows(bag: Path, scanned: Scanned, monkeyp
 
 
 NAMES = st.text(st.characters(codec="ascii", exclude_characters="="), min_size=1, max_size=9)
-FIELDS = st.dictionaries(NAMES.filter(lambda name: name != "op"), st.binary(max_size=30), max_size=5)
+FIELDS = st.dictionaries(
+    NAMES.filter(lambda name: name != "op"), st.binary(max_size=30), max_size=5
+)
 
 
 def read_of(content: bytes) -> tuple[rosbag.Source, rosbag.BagRecord]:
@@ -230,7 +280,9 @@ def read_of(content: bytes) -> tuple[rosbag.Source, rosbag.BagRecord]:
 
 
 @given(FIELDS, st.sampled_from(Op), st.binary(max_size=50), st.binary(max_size=9))
-def test_read_record_returns_what_was_packed(fields: dict[str, bytes], op: Op, data: bytes, before: bytes) -> None:
+def test_read_record_returns_what_was_packed(
+    fields: dict[str, bytes], op: Op, data: bytes, before: bytes
+) -> None:
     content = before + pack_record({**fields, "op": bytes([op])}, data)
     record = read_record(reader(content), len(before))
     assert (record.op, dict(record.fields)) == (op, {**fields, "op": bytes([op])})
@@ -288,8 +340,13 @@ def test_read_record_does_not_read_an_absurd_header() -> None:
         connection(type=b"String"),
         connection(callerid=b"\xff"),
         connection()[:-1],
-        pack_record({"conn": bytes(4), "op": b"\x07", "topic": b"/a"}, described({"type": b"a/b", "md5sum": b""})),
-        pack_record({"conn": bytes(4), "op": b"\x07", "topic": b"/a"}, bytes(rosbag.HEADER_LIMIT + 1)),
+        pack_record(
+            {"conn": bytes(4), "op": b"\x07", "topic": b"/a"},
+            described({"type": b"a/b", "md5sum": b""}),
+        ),
+        pack_record(
+            {"conn": bytes(4), "op": b"\x07", "topic": b"/a"}, bytes(rosbag.HEADER_LIMIT + 1)
+        ),
     ],
 )
 def test_read_connection_refuses_malformed_records(content: bytes) -> None:
@@ -298,18 +355,25 @@ def test_read_connection_refuses_malformed_records(content: bytes) -> None:
 
 
 def test_check_bookkeeping_refuses_impossible_lengths() -> None:
-    index, info = rosbag.pack_index(3, bytes(24)), rosbag.pack_chunk_info(4117, {3: bytes(24), 5: bytes(12)})
+    index = rosbag.pack_index(3, bytes(24))
+    info = rosbag.pack_chunk_info(4117, {3: bytes(24), 5: bytes(12)})
     for whole in (index, info, rosbag.pack_file_header(1, 2, 3)):
         rosbag.check_bookkeeping(*read_of(whole))
     fields = {"count": bytes([9, 0, 0, 0]), "conn": bytes(4)}
-    for op, data in ((4, bytes(24)), (6, bytes(24)), (3, b"data"), (3, bytes(rosbag.HEADER_LIMIT + 1))):
+    for op, data in (
+        (4, bytes(24)),
+        (6, bytes(24)),
+        (3, b"data"),
+        (3, bytes(rosbag.HEADER_LIMIT + 1)),
+    ):
         with pytest.raises(BagFormatError):
             rosbag.check_bookkeeping(*read_of(pack_record({**fields, "op": bytes([op])}, data)))
 
 
 ONE = message((0, 500), bytes(50))
 NO_TIME, NO_CONNECTION = (
-    pack_record({"conn": bytes(4), "op": b"\x02", "time": bytes(8), field: b"1"}, b"") for field in ("time", "conn")
+    pack_record({"conn": bytes(4), "op": b"\x02", "time": bytes(8), field: b"1"}, b"")
+    for field in ("time", "conn")
 )
 
 
@@ -330,8 +394,16 @@ def test_read_content_keeps_messages_before_damage(content: bytes, ending: Endin
 
 
 def test_set_up_records_finds_connections_and_first_messages() -> None:
-    first, second = connection(b"/1", 1), connection(b"/2", 2)
-    content = first + message((0, 1), conn=1) + message((0, 2), conn=1) + second + message((0, 1), conn=2)
+    first = connection(b"/1", 1)
+    second = connection(b"/2", 2)
+    content = (
+        first + message((0, 1), conn=1) + message((0, 2), conn=1) + second + message((0, 1), conn=2)
+    )
     found = list(rosbag.set_up_records(reader(content + b"damage")))
-    assert [record.op for _, record in found] == [Op.CONNECTION, Op.MESSAGE, Op.CONNECTION, Op.MESSAGE]
+    assert [record.op for _, record in found] == [
+        Op.CONNECTION,
+        Op.MESSAGE,
+        Op.CONNECTION,
+        Op.MESSAGE,
+    ]
     assert (found[0][0], found[-1][1].end) == (0, len(content))

@@ -14,7 +14,13 @@ from nlos_calibration.errors import RecordFileError
 
 from nlos_cam.errors import DiskFullError, RecordingError
 from nlos_cam.frames import Frame
-from nlos_cam.recording import TEMPERATURE_INTERVAL_S, SidecarFile, VerifyResult, load_sidecar, sidecar_path
+from nlos_cam.recording import (
+    TEMPERATURE_INTERVAL_S,
+    SidecarFile,
+    VerifyResult,
+    load_sidecar,
+    sidecar_path,
+)
 from nlos_cam.recording.quality import MIN_PAIRS, Quality, QualityMeter
 from nlos_cam.recording.sidecar import load_measured_wall, summary_of, versions
 
@@ -22,7 +28,9 @@ PINHOLE = Intrinsics(64, 48, 46.0, 46.0, 32.0, 24.0)
 DARK = np.zeros((48, 64), np.uint8)
 WHEN = datetime(2026, 1, 2, 3, 4, 5, tzinfo=UTC)
 SEEN = Quality(9, 0.25, 0.5, 7.0, 1.5, 0.1)
-READ = VerifyResult(frames=9, dropped=2, seconds=0.5, streams={"depth": 9, "infrared": 9, "confidence": 9})
+READ = VerifyResult(
+    frames=9, dropped=2, seconds=0.5, streams={"depth": 9, "infrared": 9, "confidence": 9}
+)
 
 
 @dataclass
@@ -30,13 +38,19 @@ class Warm:
     uri: str = "l515"
     intrinsics: Intrinsics = PINHOLE
     rig: Rig | None = None
-    identity: Mapping[str, str] = field(default_factory=lambda: {"name": "L515", "serial": "f0246262"})
+    identity: Mapping[str, str] = field(
+        default_factory=lambda: {"name": "L515", "serial": "f0246262"}
+    )
     counts: Counter[str] = field(default_factory=Counter[str])
     celsius: float = 30.0
 
     def telemetry(self, ending: str = "") -> Mapping[str, float]:
         self.celsius += 1.0
-        fields = {"laser_power": 40.0, "ldd_temperature": self.celsius, "broken_temperature": float("nan")}
+        fields = {
+            "laser_power": 40.0,
+            "ldd_temperature": self.celsius,
+            "broken_temperature": float("nan"),
+        }
         return {name: value for name, value in fields.items() if name.endswith(ending)}
 
 
@@ -51,8 +65,14 @@ def path(tmp_path: Path) -> Path:
 
 def test_sidecar_exists_from_the_start_of_a_recording(path: Path) -> None:
     SidecarFile(path, Warm(), label="a cup", started=WHEN)
-    found, fields = load_sidecar(path), json.loads(path.read_text())
-    assert (found.label, found.camera, found.state, found.summary) == ("a cup", "l515", "recording", None)
+    found = load_sidecar(path)
+    fields = json.loads(path.read_text())
+    assert (found.label, found.camera, found.state, found.summary) == (
+        "a cup",
+        "l515",
+        "recording",
+        None,
+    )
     assert found.device == {"name": "L515", "serial": "f0246262"}
     assert (found.started, found.intrinsics.fx, found.settings["laser_power"]) == (WHEN, 46.0, 40.0)
     assert (fields["label"], fields["camera"], fields["started"][-1]) == ("a cup", "l515", "Z")
@@ -95,7 +115,11 @@ def test_sidecar_ends_with_the_first_frames_settings_a_state_and_a_summary(path:
     found = load_sidecar(path)
     assert (found.state, found.summary, found.settings) == ("lost", expected, {"laser_power": 31.0})
     assert (expected.frames, expected.dropped, expected.frames_per_s) == (9, 2, 16.0)
-    assert (expected.saturated_share, expected.temporal_noise_mm, expected.events) == (0.25, 1.5, {"restarted": 1})
+    assert (expected.saturated_share, expected.temporal_noise_mm, expected.events) == (
+        0.25,
+        1.5,
+        {"restarted": 1},
+    )
 
 
 def test_summary_writes_unknown_values_as_null(path: Path) -> None:
@@ -125,7 +149,8 @@ def test_sidecar_stays_whole_on_a_full_disk(path: Path, monkeypatch: pytest.Monk
 def test_sidecar_prefers_the_rig_of_a_measured_wall(
     path: Path, tmp_path: Path, measured: Callable[..., MeasuredWall]
 ) -> None:
-    bench, record = load_rig("bare-wall"), measured().record
+    bench = load_rig("bare-wall")
+    record = measured().record
     wall_toml = tmp_path / "wall.toml"
     wall_toml.write_text(dump_toml(record))
     SidecarFile(path, Warm(rig=bench))
@@ -147,9 +172,15 @@ def test_versions_name_the_program_and_no_machine() -> None:
 
 @pytest.mark.parametrize(
     ("changed", "key"),
-    [({"colour": "red"}, "colour"), ({"schema_version": 2}, "schema_version"), ({"label": ...}, "label")],
+    [
+        ({"colour": "red"}, "colour"),
+        ({"schema_version": 2}, "schema_version"),
+        ({"label": ...}, "label"),
+    ],
 )
-def test_load_sidecar_names_the_wrong_field_in_one_line(path: Path, changed: dict[str, Any], key: str) -> None:
+def test_load_sidecar_names_the_wrong_field_in_one_line(
+    path: Path, changed: dict[str, Any], key: str
+) -> None:
     SidecarFile(path, Warm())
     fields = json.loads(path.read_text()) | changed
     path.write_text(json.dumps({name: value for name, value in fields.items() if value is not ...}))
@@ -176,7 +207,10 @@ def noisy(sigma_mm: float = 1.0, count: int = FRAMES, seed: int = 0) -> list[Fra
     """Make frames of a flat scene at 0.3 m with Gaussian noise in depth."""
     generator = np.random.default_rng(seed)
     depth_m = (0.3 + generator.normal(0.0, sigma_mm / 1e3, (count, 48, 64))).astype(np.float32)
-    return [Frame(depth_m[number], DARK, DARK, 1e9 + number / 30, number, PINHOLE) for number in range(count)]
+    return [
+        Frame(depth_m[number], DARK, DARK, 1e9 + number / 30, number, PINHOLE)
+        for number in range(count)
+    ]
 
 
 def quality_of(frames: list[Frame]) -> Quality:
@@ -188,20 +222,32 @@ def quality_of(frames: list[Frame]) -> Quality:
 
 @pytest.mark.parametrize("sigma_mm", [0.0, 0.3, 1.0, 8.0])
 def test_noise_is_the_known_standard_deviation(sigma_mm: float) -> None:
-    assert quality_of(noisy(sigma_mm)).temporal_noise_mm == pytest.approx(sigma_mm, rel=0.04, abs=0.0)
+    assert quality_of(noisy(sigma_mm)).temporal_noise_mm == pytest.approx(
+        sigma_mm, rel=0.04, abs=0.0
+    )
 
 
-@pytest.mark.parametrize(("spoil", "tolerance"), [("push", 0.02), ("drift", 0.02), ("moves", 0.1), ("invalid", 0.02)])
-def test_noise_ignores_a_push_a_drift_moving_and_invalid_parts(spoil: str, tolerance: float) -> None:
+@pytest.mark.parametrize(
+    ("spoil", "tolerance"), [("push", 0.02), ("drift", 0.02), ("moves", 0.1), ("invalid", 0.02)]
+)
+def test_noise_ignores_a_push_a_drift_moving_and_invalid_parts(
+    spoil: str, tolerance: float
+) -> None:
     frames = noisy()
     for number, frame in enumerate(frames):
         if spoil in {"push", "drift"}:
-            frame.depth_m[:] += np.float32(0.1 * (number > 30) if spoil == "push" else 0.0005 * number)
+            frame.depth_m[:] += np.float32(
+                0.1 * (number > 30) if spoil == "push" else 0.0005 * number
+            )
         elif spoil == "moves":
             frame.depth_m[:, : 4 * (1 + number % 2)] += np.float32(0.2)
         else:
-            frame.depth_m[:10] = frame.depth_m[10 + number % 2] = np.nan  # never valid; never twice in a row
-    assert quality_of(frames).temporal_noise_mm == pytest.approx(quality_of(noisy()).temporal_noise_mm, rel=tolerance)
+            frame.depth_m[:10] = frame.depth_m[10 + number % 2] = (
+                np.nan
+            )  # never valid; never twice in a row
+    assert quality_of(frames).temporal_noise_mm == pytest.approx(
+        quality_of(noisy()).temporal_noise_mm, rel=tolerance
+    )
 
 
 @pytest.mark.parametrize("spoil", ["too few", "all invalid", "nothing twice"])
@@ -216,7 +262,10 @@ def test_noise_is_none_where_too_little_is_valid(spoil: str) -> None:
 def test_jitter_is_the_spread_of_intervals() -> None:
     on_time = [frame for frame in noisy() if frame.frame_number % 7]  # some are missing
     assert quality_of(on_time).jitter_ms == pytest.approx(0.0, abs=1e-3)
-    late = [replace(frame, timestamp_s=frame.timestamp_s + 0.002 * (frame.frame_number % 2)) for frame in noisy()]
+    late = [
+        replace(frame, timestamp_s=frame.timestamp_s + 0.002 * (frame.frame_number % 2))
+        for frame in noisy()
+    ]
     assert quality_of(late).jitter_ms == pytest.approx(2.0, rel=0.01)
 
 

@@ -9,8 +9,25 @@ from depth_maps import depth_map
 from nlos_calibration import load_rig
 
 from nlos_cam.errors import SceneError
-from nlos_cam.render import STOPS, EchoMaps, Scene, Surface, Work, agreement, choose, costs, least_seconds, prepare
-from nlos_cam.render.accuracy_search import AccuracyChoice, beam_histograms, pick, predict, relative_error
+from nlos_cam.render import (
+    STOPS,
+    EchoMaps,
+    Scene,
+    Surface,
+    Work,
+    agreement,
+    choose,
+    costs,
+    least_seconds,
+    prepare,
+)
+from nlos_cam.render.accuracy_search import (
+    AccuracyChoice,
+    beam_histograms,
+    pick,
+    predict,
+    relative_error,
+)
 from nlos_cam.render.renderer import render, three_bounce
 
 RIG = load_rig("paper-rig")
@@ -27,7 +44,9 @@ def _scene(**more: object) -> Scene:
 
 
 def by_rows(fixed_s: float, each_s: float) -> Callable[[Work, int], float]:
-    """Stopwatch with a fixed cost and a cost per beam; brute force (float64) takes 1000 times as long."""
+    """Stopwatch with a fixed cost and a cost per beam; brute force (float64) takes 1000 times as
+    long.
+    """
 
     def stopwatch(work: Work, repeats: int) -> float:
         assert repeats >= 1
@@ -37,18 +56,37 @@ def by_rows(fixed_s: float, each_s: float) -> Callable[[Work, int], float]:
     return stopwatch
 
 
-FIGURES = ("rough", 0.03, 0.005), ("middling", 0.003, 0.02), ("good", 0.0005, 0.03), ("exact", 0.0, 20.0)
-DIAL = [AccuracyChoice(replace(STOPS["standard"], name=name), *figures) for name, *figures in FIGURES]
+FIGURES = (
+    ("rough", 0.03, 0.005),
+    ("middling", 0.003, 0.02),
+    ("good", 0.0005, 0.03),
+    ("exact", 0.0, 20.0),
+)
+DIAL = [
+    AccuracyChoice(replace(STOPS["standard"], name=name), *figures) for name, *figures in FIGURES
+]
 
 
 @pytest.mark.parametrize(
     ("max_error", "max_seconds", "name"),
     [
-        *[(0.05, None, "rough"), (0.01, None, "middling"), (0.001, None, "good"), (0.0, None, "exact")],
-        *[(None, 0.025, "middling"), (None, 100.0, "exact"), (0.05, 100.0, "rough"), (0.001, 0.03, "good")],
+        *[
+            (0.05, None, "rough"),
+            (0.01, None, "middling"),
+            (0.001, None, "good"),
+            (0.0, None, "exact"),
+        ],
+        *[
+            (None, 0.025, "middling"),
+            (None, 100.0, "exact"),
+            (0.05, 100.0, "rough"),
+            (0.001, 0.03, "good"),
+        ],
     ],
 )
-def test_pick_takes_cheapest_stop_within_bounds(max_error: float | None, max_seconds: float | None, name: str) -> None:
+def test_pick_takes_cheapest_stop_within_bounds(
+    max_error: float | None, max_seconds: float | None, name: str
+) -> None:
     assert pick(DIAL, max_error, max_seconds).accuracy.name == name
 
 
@@ -61,7 +99,9 @@ def test_pick_takes_cheapest_stop_within_bounds(max_error: float | None, max_sec
         (None, 0.0, ["rough"]),
     ],
 )
-def test_pick_out_of_bounds_names_nearest(max_error: float | None, max_seconds: float | None, words: list[str]) -> None:
+def test_pick_out_of_bounds_names_nearest(
+    max_error: float | None, max_seconds: float | None, words: list[str]
+) -> None:
     with pytest.raises(SceneError) as refusal:
         pick(DIAL, max_error, max_seconds)
     assert all(word in str(refusal.value) for word in words)
@@ -72,14 +112,23 @@ def test_predict_scales_seconds_to_all_beams() -> None:
     scene = _scene()
     found = predict(scene, "auto", "cpu", SMALL, by_rows(2.0, 0.001))
     expected = 2 + 0.001 * prepare(scene, SMALL[-1], "auto").beams.on_wall.sum()
-    np.testing.assert_allclose([c.predicted_seconds for c in found], [*[expected] * 3, 1000 * expected])
-    assert all(c.predicted_error == 0 for c in predict(Scene(RIG), "auto", "cpu", SMALL, by_rows(1.0, 0.0)))
+    np.testing.assert_allclose(
+        [c.predicted_seconds for c in found], [*[expected] * 3, 1000 * expected]
+    )
+    assert all(
+        c.predicted_error == 0 for c in predict(Scene(RIG), "auto", "cpu", SMALL, by_rows(1.0, 0.0))
+    )
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("albedo", "renderings"), [(np.ones(3), 1), (np.array([0.2, 1.0, 1.0]), 4)])
-def test_predict_times_each_color_channel(albedo: np.ndarray, renderings: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    watch, counted = Mock(return_value=1.0), Mock(wraps=beam_histograms)
+@pytest.mark.parametrize(
+    ("albedo", "renderings"), [(np.ones(3), 1), (np.array([0.2, 1.0, 1.0]), 4)]
+)
+def test_predict_times_each_color_channel(
+    albedo: np.ndarray, renderings: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    watch = Mock(return_value=1.0)
+    counted = Mock(wraps=beam_histograms)
     predict(_scene(surface=Surface(albedo)), "auto", "cpu", SMALL, watch)
     monkeypatch.setattr("nlos_cam.render.accuracy_search.beam_histograms", counted)
     watch.call_args_list[0].args[0]()
@@ -88,13 +137,22 @@ def test_predict_times_each_color_channel(albedo: np.ndarray, renderings: int, m
 
 def test_predict_times_the_pulse_and_only_the_named_effects() -> None:
     found: list[np.ndarray] = []
-    for scene, effects in ((_scene(), "auto"), (_scene(pulse_ns=1.0), "auto"), (_scene(), ["direct"])):
+    for scene, effects in (
+        (_scene(), "auto"),
+        (_scene(pulse_ns=1.0), "auto"),
+        (_scene(), ["direct"]),
+    ):
         choices = predict(scene, effects, "cpu", SMALL, lambda work, _: found.append(work()) or 1.0)
     sharp, wide, direct = (found[k * len(found) // 3 : (k + 1) * len(found) // 3] for k in range(3))
     assert all(one.shape[1] < other.shape[1] for one, other in zip(sharp, wide, strict=True))
     assert not any(histogram.any() for histogram in direct)  # no third bounce is rendered
     assert all(choice.predicted_error == 0 for choice in choices)
-    assert choose(_scene(), 0.0, effects=["direct"], stops=SMALL, stopwatch=by_rows(1, 0)).accuracy.name != "reference"
+    assert (
+        choose(
+            _scene(), 0.0, effects=["direct"], stops=SMALL, stopwatch=by_rows(1, 0)
+        ).accuracy.name
+        != "reference"
+    )
 
 
 def test_predicted_error_is_near_that_of_all_beams() -> None:
@@ -110,13 +168,19 @@ def test_predicted_error_is_near_that_of_all_beams() -> None:
 
 @pytest.mark.slow
 def test_choose_keeps_the_bounds() -> None:
-    scene, watch = _scene(), by_rows(1, 0.001)
-    errors = {c.accuracy.name: c.predicted_error for c in predict(scene, "auto", "cpu", SMALL, watch)}
+    scene = _scene()
+    watch = by_rows(1, 0.001)
+    errors = {
+        c.accuracy.name: c.predicted_error for c in predict(scene, "auto", "cpu", SMALL, watch)
+    }
     assert errors["reference"] == 0
     assert errors["draft"] > errors["standard"] > errors["fine"] > 0
     within = choose(scene, max_error=errors["standard"], stops=SMALL, stopwatch=by_rows(1, 0.001))
     assert within.accuracy.name in {"standard", "fine"}  # equal seconds: the better of equals
-    assert choose(scene, max_error=errors["fine"] / 2, stops=SMALL, stopwatch=watch).accuracy.name == "reference"
+    assert (
+        choose(scene, max_error=errors["fine"] / 2, stops=SMALL, stopwatch=watch).accuracy.name
+        == "reference"
+    )
     assert choose(scene, max_seconds=10.0, stops=SMALL, stopwatch=watch).accuracy.name == "fine"
 
 
@@ -129,7 +193,9 @@ def test_choose_keeps_the_bounds() -> None:
         ({"max_error": 0.1, "backend": "abacus"}, "abacus"),
     ],
 )
-def test_choose_refuses_bad_or_missing_bounds_and_backends(options: dict[str, Any], word: str) -> None:
+def test_choose_refuses_bad_or_missing_bounds_and_backends(
+    options: dict[str, Any], word: str
+) -> None:
     with pytest.raises(SceneError, match=word):
         choose(_scene(), stops=SMALL, stopwatch=by_rows(1, 1), **options)
 
@@ -146,16 +212,21 @@ def test_agreement_measures_intensity_bins_depth_and_lost_echoes() -> None:
     generator = np.random.default_rng(1)
     path = (generator.integers(40, 200, 100) + 0.5) * BIN_M
     truth = EchoMaps(generator.uniform(1, 2, 100), path, path / 2)
-    same, nothing = agreement(truth, truth, BIN_M), replace(truth, depth_m=np.full(100, np.nan))
+    same = agreement(truth, truth, BIN_M)
+    nothing = replace(truth, depth_m=np.full(100, np.nan))
     assert (same.bin_exact, same.bin_within_1) == (1.0, 1.0)
     assert max(same.intensity_error_max, same.depth_error_mm, same.depth_error_mean_mm) == 0
     assert agreement(nothing, truth, BIN_M).depth_error_mm == 0
-    off, step = np.linspace(0, 0.1, 100), np.zeros(100)
+    off = np.linspace(0, 0.1, 100)
+    step = np.zeros(100)
     found = agreement(replace(truth, intensity=truth.intensity * (1 + off)), truth, BIN_M)
     errors = (found.intensity_error_median, found.intensity_error_p99, found.intensity_error_max)
     np.testing.assert_allclose(errors, (np.median(off), np.quantile(off, 0.99), 0.1))
-    step[:20], step[20:50] = 2 * BIN_M, -BIN_M
-    found = agreement(replace(truth, path_m=truth.path_m + step, depth_m=truth.depth_m + step), truth, BIN_M)
+    step[:20] = 2 * BIN_M
+    step[20:50] = -BIN_M
+    found = agreement(
+        replace(truth, path_m=truth.path_m + step, depth_m=truth.depth_m + step), truth, BIN_M
+    )
     np.testing.assert_allclose((found.bin_exact, found.bin_within_1), (0.5, 0.8))
     np.testing.assert_allclose(found.depth_error_mean_mm, 0.2 * 20 + 0.3 * 10)
     lost = truth.path_m.copy()
@@ -163,13 +234,16 @@ def test_agreement_measures_intensity_bins_depth_and_lost_echoes() -> None:
     assert agreement(replace(truth, path_m=lost), truth, BIN_M).bin_within_1 == pytest.approx(0.9)
     both = replace(truth, path_m=lost)
     assert agreement(both, both, BIN_M).bin_exact == 1
-    np.testing.assert_array_equal(relative_error(np.array([0.0, 1.0, 0.0]), np.array([0.0, 0.0, 2.0])), [0, 1, 1])
+    np.testing.assert_array_equal(
+        relative_error(np.array([0.0, 1.0, 0.0]), np.array([0.0, 0.0, 2.0])), [0, 1, 1]
+    )
 
 
 def test_echoes_of_cells_are_those_of_beams_that_win() -> None:
     scene = _scene()
     rendering = render(scene, "draft")
-    cells, beams = EchoMaps.of_cells(rendering, scene), EchoMaps.of_beams(rendering)
+    cells = EchoMaps.of_cells(rendering, scene)
+    beams = EchoMaps.of_beams(rendering)
     wins = cells.intensity == beams.intensity
     assert wins.sum() > 500
     np.testing.assert_allclose(cells.path_m[wins], beams.path_m[wins], rtol=1e-5)
@@ -180,7 +254,8 @@ PRICES = {"direct": 0.5, "three-bounce": 8.0, "self-occlusion": 4.0, "tilt": 1.0
 
 def test_costs_are_the_seconds_that_each_effect_adds(monkeypatch: pytest.MonkeyPatch) -> None:
     scene = _scene()
-    plan, now = render(scene).plan, [0.0]
+    plan = render(scene).plan
+    now = [0.0]
 
     def priced(_scene: Scene, _accuracy: str, effects: list[str], _backend: str) -> None:
         now[0] += sum(PRICES[name] for name in effects)

@@ -4,9 +4,17 @@ from nlos_calibration.geometry import Intrinsics
 from nlos_calibration.rig import Extent, LidarPose, Rig, load_rig
 
 from nlos_cam.render import cast
-from nlos_cam.render.geometry import NO_OCCLUDER, SPEED_OF_LIGHT_M_PER_S, behind, gate_bins, occluder_edge, relay_cells
+from nlos_cam.render.geometry import (
+    NO_OCCLUDER,
+    SPEED_OF_LIGHT_M_PER_S,
+    behind,
+    gate_bins,
+    occluder_edge,
+    relay_cells,
+)
 
-BARE, PAPER = load_rig("bare-wall"), load_rig("paper-rig")
+BARE = load_rig("bare-wall")
+PAPER = load_rig("paper-rig")
 
 
 def _cells(rig: Rig) -> Intrinsics:
@@ -14,12 +22,16 @@ def _cells(rig: Rig) -> Intrinsics:
 
 
 def _lidar(**pose: float) -> Rig:
-    return BARE.model_copy(update={"lidar": LidarPose.model_validate({"distance_m": 0.2, "yaw_deg": 45.0} | pose)})
+    return BARE.model_copy(
+        update={"lidar": LidarPose.model_validate({"distance_m": 0.2, "yaw_deg": 45.0} | pose)}
+    )
 
 
 @pytest.mark.parametrize("yaw_deg", [0.0, 15.0, 45.0, -45.0])
 @pytest.mark.parametrize("pitch_deg", [0.0, 10.0])
-def test_beams_land_on_the_wall_along_the_rays_of_their_pixels(yaw_deg: float, pitch_deg: float) -> None:
+def test_beams_land_on_the_wall_along_the_rays_of_their_pixels(
+    yaw_deg: float, pitch_deg: float
+) -> None:
     rig = _lidar(yaw_deg=yaw_deg, pitch_deg=pitch_deg)
     beams = cast(rig, _cells(rig))
     np.testing.assert_allclose(beams.laser_spot_m[beams.on_wall, 2], 0, atol=1e-12)
@@ -28,7 +40,9 @@ def test_beams_land_on_the_wall_along_the_rays_of_their_pixels(yaw_deg: float, p
     rays = _cells(rig).rays().reshape(-1, 3)[beams.on_wall]
     np.testing.assert_allclose(back / back[:, 2:], rays, atol=1e-9)
     np.testing.assert_allclose(np.linalg.norm(back, axis=1), beams.length_m[beams.on_wall])
-    np.testing.assert_allclose(back[:, 2] / np.linalg.norm(back, axis=1), beams.cos_axis[beams.on_wall])
+    np.testing.assert_allclose(
+        back[:, 2] / np.linalg.norm(back, axis=1), beams.cos_axis[beams.on_wall]
+    )
 
 
 def test_direct_return_scales_with_distance_and_receiver_cell() -> None:
@@ -38,25 +52,35 @@ def test_direct_return_scales_with_distance_and_receiver_cell() -> None:
     np.testing.assert_allclose(far.direct[both], near.direct[both] / 4)
     device = BARE.device.model_copy(update={"receiver_cell_m2": 3e-4})
     beams = cast(BARE, _cells(BARE))
-    np.testing.assert_allclose(cast(BARE.model_copy(update={"device": device}), _cells(BARE)).direct, 3 * beams.direct)
-    fine, coarse = cast(BARE, BARE.pinhole.scaled(243, 195)), cast(BARE, BARE.pinhole.scaled(81, 65))
-    np.testing.assert_allclose(fine.direct.reshape(195, 243)[1::3, 1::3].ravel(), coarse.direct, rtol=1e-9)
+    np.testing.assert_allclose(
+        cast(BARE.model_copy(update={"device": device}), _cells(BARE)).direct, 3 * beams.direct
+    )
+    fine = cast(BARE, BARE.pinhole.scaled(243, 195))
+    coarse = cast(BARE, BARE.pinhole.scaled(81, 65))
+    np.testing.assert_allclose(
+        fine.direct.reshape(195, 243)[1::3, 1::3].ravel(), coarse.direct, rtol=1e-9
+    )
 
 
 def test_beams_end_at_the_wall_edge_and_at_the_occluder() -> None:
-    small = BARE.model_copy(update={"wall": Extent(x_min_m=0, x_max_m=0.3, y_min_m=-0.1, y_max_m=0.1)})
+    small = BARE.model_copy(
+        update={"wall": Extent(x_min_m=0, x_max_m=0.3, y_min_m=-0.1, y_max_m=0.1)}
+    )
     beams = cast(small, _cells(small))
     feet = beams.laser_spot_m[beams.on_wall]
     assert (np.abs(feet - (0.15, 0, 0)) <= (0.15, 0.1, 1e-9)).all()
     assert np.isnan(beams.length_m[~beams.on_wall]).all()
-    beams, free = cast(PAPER, _cells(PAPER)), cast(BARE, _cells(BARE))
+    beams = cast(PAPER, _cells(PAPER))
+    free = cast(BARE, _cells(BARE))
     stopped = np.isfinite(beams.length_m) & ~beams.on_wall
     assert stopped.any()
     np.testing.assert_allclose(beams.laser_spot_m[stopped, 0], 0.2)
     assert (beams.laser_spot_m[stopped, 2] >= 0.1).all()
     reached = beams.on_wall
     np.testing.assert_allclose(beams.length_m[reached], free.length_m[reached])
-    degrees = np.degrees(np.arctan2(beams.laser_spot_m[stopped, 0], 0.2 - beams.laser_spot_m[stopped, 2]))
+    degrees = np.degrees(
+        np.arctan2(beams.laser_spot_m[stopped, 0], 0.2 - beams.laser_spot_m[stopped, 2])
+    )
     assert degrees.min() > 63
 
 
@@ -72,7 +96,9 @@ def test_direct_return_after_the_gate_is_not_received() -> None:
 
 def test_beams_met_takes_the_place_of_the_wall() -> None:
     beams = cast(BARE, _cells(BARE))
-    met = beams.with_hits(BARE, np.array([7]), np.array([0.1]), np.array([0.5]), np.array([0.25]), 2 * np.pi)
+    met = beams.with_hits(
+        BARE, np.array([7]), np.array([0.1]), np.array([0.5]), np.array([0.25]), 2 * np.pi
+    )
     assert not met.on_wall[7]
     np.testing.assert_allclose(met.laser_spot_m[7], beams.lidar_m + 0.1 * beams.direction[7])
     assert met.direct[7] == pytest.approx(0.25 * 0.5 * 1e-4 / (2 * np.pi * 0.01), rel=0.02)
@@ -120,5 +146,6 @@ def test_relay_cells_and_points_behind_the_edge_are_hidden() -> None:
     assert occluder_edge(BARE) == NO_OCCLUDER
     assert not relay.behind(NO_OCCLUDER, LIDAR_M).any()
     assert relay.behind((0.2, 1e-6), LIDAR_M).sum() == (relay.x_m > 0.2).sum()
-    x, z = np.array([0.4, 0.4, 0.1, 0.0]), np.array([0.3, -0.1, 0.3, 0.3])
+    x = np.array([0.4, 0.4, 0.1, 0.0])
+    z = np.array([0.3, -0.1, 0.3, 0.3])
     np.testing.assert_array_equal(behind((0.2, 0.1), x, z, LIDAR_M), [True, False, False, False])

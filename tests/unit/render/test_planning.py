@@ -13,14 +13,21 @@ from nlos_calibration import load_rig
 from nlos_cam.errors import SceneError
 from nlos_cam.objects import object_box, object_depth
 from nlos_cam.render import Radiometry, Scene, Surface, phong
-from nlos_cam.render.accuracy import MAX_BEAMS_PER_CELL, MAX_RELAY_CELLS, STOPS, Accuracy, accuracy_named
+from nlos_cam.render.accuracy import (
+    MAX_BEAMS_PER_CELL,
+    MAX_RELAY_CELLS,
+    STOPS,
+    Accuracy,
+    accuracy_named,
+)
 from nlos_cam.render.effects import EFFECTS, decide, included
 from nlos_cam.render.energy_survey import CAUTION, EnergySurvey
 from nlos_cam.render.geometry import NO_OCCLUDER, SPEED_OF_LIGHT_M_PER_S
 from nlos_cam.render.planning import RenderProblem, plan, prepare
 from nlos_cam.render.scene_facts import SceneFacts
 
-RIG, BARE = load_rig("paper-rig"), load_rig("bare-wall")
+RIG = load_rig("paper-rig")
+BARE = load_rig("bare-wall")
 
 
 def _called_for(scene: Scene, stop: str = "standard") -> set[str]:
@@ -34,7 +41,10 @@ def _plate(slope: float = 0.0) -> np.ndarray:
 @pytest.mark.parametrize(
     ("scene", "effects"),
     [
-        (Scene(RIG, object_depth(3, object_box(RIG))[1]), {"three-bounce", "occluder", "self-occlusion", "tilt"}),
+        (
+            Scene(RIG, object_depth(3, object_box(RIG))[1]),
+            {"three-bounce", "occluder", "self-occlusion", "tilt"},
+        ),
         (Scene(BARE), set()),
         (Scene(RIG), {"occluder"}),
         (Scene(RIG, depth_map(8)), {"occluder"}),
@@ -81,14 +91,18 @@ def test_problem_holds_every_effect_and_drops_those_left_out() -> None:
     assert not _without("colour").color_jobs
     assert _without("tilt").job.patches.beta.max() == 1
     assert not _without("self-occlusion").job.field.shades
-    open_job, short, dull = (_without(name).job for name in ("occluder", "inter-reflection", "brdf"))
+    open_job, short, dull = (
+        _without(name).job for name in ("occluder", "inter-reflection", "brdf")
+    )
     assert open_job.edge_m == NO_OCCLUDER
     assert len(open_job.relay.x_m) == 48
     assert len(open_job.laser_spot_m) > len(whole.laser_spot_m)
     assert not short.more_bounces
     assert short.bins < whole.bins
     assert dull.brdf is None
-    assert dull.patches.albedo.mean() == pytest.approx(0.6 * (0.5 + 0.5 + 0.5 * 2.5) / 2)  # the middle of its range
+    assert dull.patches.albedo.mean() == pytest.approx(
+        0.6 * (0.5 + 0.5 + 0.5 * 2.5) / 2
+    )  # the middle of its range
 
 
 def test_prepare_refuses_histograms_that_do_not_fit() -> None:
@@ -101,7 +115,8 @@ def test_prepare_refuses_histograms_that_do_not_fit() -> None:
 @pytest.mark.parametrize("radiometry", ["paper", "lambertian"])
 def test_job_weights_are_the_factors_of_s2(radiometry: Radiometry) -> None:
     job = prepare(Scene(RIG, DEPTH, Surface(0.5), radiometry), COARSE).job
-    relay, solid = job.relay, np.pi if radiometry == "lambertian" else 2 * np.pi
+    relay = job.relay
+    solid = np.pi if radiometry == "lambertian" else 2 * np.pi
     np.testing.assert_allclose(job.strength, 0.5 * job.patches.beta * job.patches.cell_m2)
     far = relay.length_m > job.near_m
     expected = relay.cell_m2 / (solid**2 * relay.length_m**2)
@@ -118,12 +133,16 @@ bounds = st.lists(st.floats(0, 1), min_size=len(EFFECTS), max_size=len(EFFECTS))
 
 
 def _findings(values: list[float]) -> list[tuple[str, float, str]]:
-    return [(name, bound, f"because of {name}") for name, bound in zip(EFFECTS, values, strict=True)]
+    return [
+        (name, bound, f"because of {name}") for name, bound in zip(EFFECTS, values, strict=True)
+    ]
 
 
 @settings(deadline=None, derandomize=True)
 @given(values=bounds, tolerance=st.floats(0, 1))
-def test_decide_leaves_out_bounds_up_to_the_tolerance(values: list[float], tolerance: float) -> None:
+def test_decide_leaves_out_bounds_up_to_the_tolerance(
+    values: list[float], tolerance: float
+) -> None:
     plan = decide(_findings(values), tolerance)
     assert tuple(effect.name for effect in plan) == EFFECTS
     out, kept = ([e.bound for e in plan if e.included == wanted] for wanted in (False, True))
@@ -142,7 +161,9 @@ def test_decide_includes_exactly_the_named_effects(asked: Collection[str]) -> No
 
 
 def test_decide_takes_names_and_leaves_out_zero_bounds() -> None:
-    assert {e.name for e in decide(_findings([1.0] * len(EFFECTS)), 0.0, "direct") if e.included} == {"direct"}
+    assert {
+        e.name for e in decide(_findings([1.0] * len(EFFECTS)), 0.0, "direct") if e.included
+    } == {"direct"}
     with pytest.raises(SceneError, match="no light arrives"):
         decide(_findings([1.0] * len(EFFECTS)), 0.0, [])
     with pytest.raises(SceneError, match="fog"):
@@ -166,7 +187,12 @@ def test_accuracy_named_finds_stops_in_order_and_keeps_settings() -> None:
 @pytest.mark.parametrize(
     ("field", "value"),
     [
-        *[("relay_columns", 0), ("relay_rows", MAX_RELAY_CELLS + 1), ("object_stride", 0), ("sectors", 0)],
+        *[
+            ("relay_columns", 0),
+            ("relay_rows", MAX_RELAY_CELLS + 1),
+            ("object_stride", 0),
+            ("sectors", 0),
+        ],
         *[("beams_per_cell", MAX_BEAMS_PER_CELL + 1), ("scatter_error", 0.0)],
         *[("tolerance", value) for value in (-1e-9, float("nan"))],
         *[("sub_bins", value) for value in (3, 128, -1)],
@@ -178,7 +204,8 @@ def test_accuracy_refuses_values_out_of_range_by_field(field: str, value: float)
 
 
 def test_survey_share_is_cautious_and_at_most_1() -> None:
-    two, none = np.ones(2), np.zeros(2)
+    two = np.ones(2)
+    none = np.zeros(2)
     for ratio in (1.0, 4.0):
         found = EnergySurvey(two, two, none, none, none, none, uneven=ratio)
         assert found.share(np.array([0.1, 0.0])) == pytest.approx(ratio * CAUTION * 0.05)
@@ -199,9 +226,15 @@ def test_survey_bounds_the_energy_of_a_patch_on_the_wall(z_m: float) -> None:
 LEVEL = np.full((8, 8), 0.25, np.float32)
 
 
-@pytest.mark.parametrize(("cells", "stride", "blocks"), [(8, 2, 4), (8, 1, 8), (7, 2, 7), (8, 4, 2)])
-def test_facts_take_blocks_where_the_stride_divides_the_grid(cells: int, stride: int, blocks: int) -> None:
-    scene = Scene(RIG, LEVEL[:cells, :cells], Surface(np.linspace(0, 1, cells**2).reshape(cells, cells)))
+@pytest.mark.parametrize(
+    ("cells", "stride", "blocks"), [(8, 2, 4), (8, 1, 8), (7, 2, 7), (8, 4, 2)]
+)
+def test_facts_take_blocks_where_the_stride_divides_the_grid(
+    cells: int, stride: int, blocks: int
+) -> None:
+    scene = Scene(
+        RIG, LEVEL[:cells, :cells], Surface(np.linspace(0, 1, cells**2).reshape(cells, cells))
+    )
     facts = SceneFacts(scene, replace(COARSE, object_stride=stride))
     assert facts.depth_m.shape == facts.albedo.shape == (blocks, blocks)
     assert len(facts.patches.beta) == blocks**2
@@ -214,5 +247,7 @@ def test_facts_have_no_patches_of_empty_boxes_or_beyond_the_gate() -> None:
         assert facts.patches is facts.light is facts.line_of_sight is None
         assert facts.interreflection == 0
     device = RIG.device.model_copy(update={"gate_s": 0.4999 / SPEED_OF_LIGHT_M_PER_S})
-    assert SceneFacts(Scene(RIG.model_copy(update={"device": device}), LEVEL), COARSE).patches is None
+    assert (
+        SceneFacts(Scene(RIG.model_copy(update={"device": device}), LEVEL), COARSE).patches is None
+    )
     assert SceneFacts(Scene(RIG, LEVEL), COARSE).patches is not None

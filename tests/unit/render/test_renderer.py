@@ -12,7 +12,18 @@ from hypothesis.extra.numpy import arrays
 from nlos_calibration.rig import load_rig
 
 from nlos_cam.objects import object_box, object_depth
-from nlos_cam.render import STOPS, Accuracy, Scene, Surface, backend_numba, beam_sums, phong, prepare, render, transient
+from nlos_cam.render import (
+    STOPS,
+    Accuracy,
+    Scene,
+    Surface,
+    backend_numba,
+    beam_sums,
+    phong,
+    prepare,
+    render,
+    transient,
+)
 from nlos_cam.render.backend_numba import echoes, histograms
 from nlos_cam.render.brdf_table import MAX_NODES, node_count, nodes, scattered, scattering
 from nlos_cam.render.echoes import MultiBounce, compete, no_echoes, strongest
@@ -36,7 +47,10 @@ def test_rendering_has_maps_of_cells_and_echoes_of_beams() -> None:
             assert image.dtype == np.float32
         assert rendering.multi.peak.shape == (64 * beams, 80 * beams)
         assert rendering.color is None
-        assert transient(Scene(RIG, DEPTH), replace(COARSE, beams_per_cell=beams)).shape[:2] == (64 * beams, 80 * beams)
+        assert transient(Scene(RIG, DEPTH), replace(COARSE, beams_per_cell=beams)).shape[:2] == (
+            64 * beams,
+            80 * beams,
+        )
 
 
 def test_cell_takes_the_median_depth_of_its_beams() -> None:
@@ -54,9 +68,14 @@ def test_color_is_the_winning_echo_in_each_channel() -> None:
     assert wins.any()
     assert not wins.all()
     np.testing.assert_allclose(
-        rendering.color[wins], rendering.intensity[wins, None] * albedo / albedo.mean(), rtol=1e-5, atol=1e-30
+        rendering.color[wins],
+        rendering.intensity[wins, None] * albedo / albedo.mean(),
+        rtol=1e-5,
+        atol=1e-30,
     )
-    np.testing.assert_allclose(rendering.color[~wins], np.repeat(rendering.intensity[~wins, None], 3, 1), rtol=1e-6)
+    np.testing.assert_allclose(
+        rendering.color[~wins], np.repeat(rendering.intensity[~wins, None], 3, 1), rtol=1e-6
+    )
 
 
 BIN_M = 0.01
@@ -64,7 +83,9 @@ BIN_M = 0.01
 
 def _multi(peak: list[float], runner_up: list[float], path_m: float = 2.0) -> MultiBounce:
     paths = np.full(len(peak), path_m, np.float32)
-    return MultiBounce(np.array(peak, np.float32), np.array(runner_up, np.float32), paths).reshape((1, len(peak)))
+    return MultiBounce(np.array(peak, np.float32), np.array(runner_up, np.float32), paths).reshape(
+        (1, len(peak))
+    )
 
 
 @settings(deadline=None, derandomize=True)
@@ -74,7 +95,9 @@ def test_strongest_finds_the_two_highest_bins(histogram: np.ndarray) -> None:
     ordered = np.sort(histogram, axis=1)
     np.testing.assert_array_equal(found.peak, ordered[:, -1])
     np.testing.assert_array_equal(found.runner_up, ordered[:, -2])
-    expected = np.where(found.peak > 0, (histogram.argmax(1) + 0.5) * BIN_M, np.nan)  # the first of equals
+    expected = np.where(
+        found.peak > 0, (histogram.argmax(1) + 0.5) * BIN_M, np.nan
+    )  # the first of equals
     np.testing.assert_allclose(found.path_m, expected, rtol=1e-6)
 
 
@@ -84,15 +107,29 @@ def test_strongest_finds_the_two_highest_bins(histogram: np.ndarray) -> None:
         ([0.4, 0.1], _multi([0.2, 0.2], [0.1, 0.15]), [0.25, 0.5], [0.4, 0.2], [0.5, 0.25]),
         ([0.25], _multi([0.25], [0.0]), [0.25], [0.25], [0.0]),  # a tie goes to the direct return
         ([0.0, 0.1], no_echoes(2).reshape((1, 2)), [np.nan, 0.25], [0.0, 0.1], [0.0, 1.0]),
-        ([0.4], replace(_multi([0.2], [0.05]), direct_included=True), [0.5], [0.2], [0.75]),  # counted once
+        (
+            [0.4],
+            replace(_multi([0.2], [0.05]), direct_included=True),
+            [0.5],
+            [0.2],
+            [0.75],
+        ),  # counted once
     ],
     ids=["stronger", "tie", "nothing", "included"],
 )
 def test_compete_takes_the_stronger_return(
-    direct: list[float], multi: MultiBounce, depth_m: list[float], intensity: list[float], margin: list[float]
+    direct: list[float],
+    multi: MultiBounce,
+    depth_m: list[float],
+    intensity: list[float],
+    margin: list[float],
 ) -> None:
-    n, half, foot = len(direct), np.full(len(direct), 0.5), np.zeros((len(direct), 3))
-    beams = Beams((1, n), foot, foot, half, half, half, np.ones(n, np.bool_), np.array(direct), np.zeros(3))
+    n = len(direct)
+    half = np.full(len(direct), 0.5)
+    foot = np.zeros((len(direct), 3))
+    beams = Beams(
+        (1, n), foot, foot, half, half, half, np.ones(n, np.bool_), np.array(direct), np.zeros(3)
+    )
     for found, expected in zip(compete(beams, multi), (depth_m, intensity, margin), strict=True):
         np.testing.assert_allclose(found[0], expected, rtol=1e-6)
 
@@ -111,7 +148,8 @@ def test_scan_of_a_still_scene_is_one_rendering() -> None:
     assert scan_effect(_still).bound == 0
     bare = Scene(load_rig("bare-wall"))
     assert not scan_effect(lambda _share: bare).included
-    scan, instant = render_scan(_still), render(_still(0.0))
+    scan = render_scan(_still)
+    instant = render(_still(0.0))
     np.testing.assert_array_equal(scan.depth_m, instant.depth_m)
     np.testing.assert_array_equal(scan.multi.peak, instant.multi.peak)
     assert scan.plan[-1].name == "scan-time"
@@ -120,7 +158,8 @@ def test_scan_of_a_still_scene_is_one_rendering() -> None:
 def test_scan_effect_is_called_for_by_motion_above_the_tolerance() -> None:
     verdict = scan_effect(_plate)
     assert verdict.included
-    scan, instant = render_scan(_plate).multi.peak, render(_plate(0.0)).multi.peak
+    scan = render_scan(_plate).multi.peak
+    instant = render(_plate(0.0)).multi.peak
     change = np.abs(scan - instant).sum() / scan.sum()
     assert STOPS["standard"].tolerance < change <= verdict.bound
     hardly = scan_effect(lambda share: _plate(share * 1e-4), "draft")
@@ -130,7 +169,8 @@ def test_scan_effect_is_called_for_by_motion_above_the_tolerance() -> None:
 
 @pytest.mark.slow
 def test_scan_slice_is_the_rendering_of_its_instant() -> None:
-    scan, count = render_scan(_plate), slices(scan_effect(_plate), STOPS["standard"])
+    scan = render_scan(_plate)
+    count = slices(scan_effect(_plate), STOPS["standard"])
     rows = np.array_split(np.arange(64), count)[0]
     instant = render(_plate(float(rows.mean() + 0.5) / 64))
     np.testing.assert_array_equal(scan.depth_m[rows], instant.depth_m[rows])
@@ -139,8 +179,13 @@ def test_scan_slice_is_the_rendering_of_its_instant() -> None:
 
 @pytest.mark.parametrize(("bound", "count"), [(0.01, 2), (0.1, 5), (1.0, 50)])
 def test_slices_grow_with_the_motion(bound: float, count: int) -> None:
-    assert slices(Effect("scan-time", included=True, reason="", bound=bound), STOPS["standard"]) == count
-    assert slices(Effect("scan-time", included=False, reason="", bound=bound), STOPS["standard"]) == 1
+    assert (
+        slices(Effect("scan-time", included=True, reason="", bound=bound), STOPS["standard"])
+        == count
+    )
+    assert (
+        slices(Effect("scan-time", included=False, reason="", bound=bound), STOPS["standard"]) == 1
+    )
 
 
 BRDF = phong(0.4, 0.6, 10)
@@ -149,16 +194,23 @@ BRDF = phong(0.4, 0.6, 10)
 @pytest.fixture(scope="module")
 def job() -> TransportJob:
     depth = np.random.default_rng(0).uniform(0.1, 0.3, (4, 4)).astype(np.float32)
-    return prepare(Scene(load_rig("paper-rig"), depth, Surface(1.0, BRDF), jump_m=0.5), COARSE, "auto").job
+    return prepare(
+        Scene(load_rig("paper-rig"), depth, Surface(1.0, BRDF), jump_m=0.5), COARSE, "auto"
+    ).job
 
 
 @pytest.mark.slow
 def test_scattering_compiled_and_plain_agree_leg_by_leg(job: TransportJob) -> None:
-    patches, relay, foot = job.patches, job.relay, job.laser_spot_m[1000]
+    patches = job.patches
+    relay = job.relay
+    foot = job.laser_spot_m[1000]
     table = scattering(BRDF)(foot, patches.point_m, patches.normal, relay.x_m, relay.y_m)
     out = np.stack([relay.x_m, relay.y_m, np.zeros_like(relay.x_m)], 1)
     for s in range(len(patches.beta)):
-        same = (np.broadcast_to(column, out.shape) for column in (foot, patches.point_m[s], patches.normal[s]))
+        same = (
+            np.broadcast_to(column, out.shape)
+            for column in (foot, patches.point_m[s], patches.normal[s])
+        )
         np.testing.assert_allclose(table[s], scattered(BRDF, *same, out), rtol=1e-9)
     assert table.min() >= 0.4
     assert table.max() > 0.5
@@ -187,9 +239,14 @@ def test_node_count_grows_as_the_error_shrinks(job: TransportJob) -> None:
 def test_joined_patches_move_light_by_less_than_a_bin_and_hardly_change_it(
     stop: str, radiometry: Radiometry, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    job = prepare(Scene(RIG, object_depth(4, object_box(RIG))[1], radiometry=radiometry), STOPS[stop]).job
-    joined, groups_of = histograms(job).astype(np.float64), beam_sums.groups_of
-    monkeypatch.setattr(backend_numba, "groups_of", lambda surface, _: groups_of(surface, -1.0))  # each patch alone
+    job = prepare(
+        Scene(RIG, object_depth(4, object_box(RIG))[1], radiometry=radiometry), STOPS[stop]
+    ).job
+    joined = histograms(job).astype(np.float64)
+    groups_of = beam_sums.groups_of
+    monkeypatch.setattr(
+        backend_numba, "groups_of", lambda surface, _: groups_of(surface, -1.0)
+    )  # each patch alone
     alone = histograms(job).astype(np.float64)
     below = [np.cumsum(each, axis=1) for each in (joined, alone)]
     weight = float((1 + beam_sums.JOIN_COSINE) * beam_sums.JOIN_WEIGHT) / job.accuracy.sub_bins
@@ -205,7 +262,9 @@ def test_joined_patches_move_light_by_less_than_a_bin_and_hardly_change_it(
 def test_echoes_are_the_strongest_bins_of_the_histograms_bit_for_bit(
     bound: np.float32, radiometry: Radiometry, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    job = prepare(Scene(RIG, object_depth(4, object_box(RIG))[1], radiometry=radiometry), STOPS["draft"]).job
+    job = prepare(
+        Scene(RIG, object_depth(4, object_box(RIG))[1], radiometry=radiometry), STOPS["draft"]
+    ).job
     job = job.select(np.arange(0, len(job.laser_spot_m), 7))
     # With bounds of infinity no window decides, and every beam sums all of its bins.
     window = backend_numba.strongest_in_window
@@ -215,6 +274,7 @@ def test_echoes_are_the_strongest_bins_of_the_histograms_bit_for_bit(
         return *found, sure & np.isfinite(bound)
 
     monkeypatch.setattr(backend_numba, "strongest_in_window", undecided)
-    found, whole = echoes(job), strongest(histograms(job), job.bin_m)
+    found = echoes(job)
+    whole = strongest(histograms(job), job.bin_m)
     for name in ("peak", "runner_up", "path_m"):
         np.testing.assert_array_equal(getattr(found, name), getattr(whole, name))

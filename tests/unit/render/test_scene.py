@@ -27,8 +27,15 @@ def _depth(z_m: float = 0.25, cells: int = 8) -> np.ndarray:
             ({"object_depth_m": np.full(shape, 0.3, np.float32)}, "256")
             for shape in ((7, 8), (8,), (1, 8, 8), (0, 0), (FINEST_GRID + 1, FINEST_GRID + 1))
         ],
-        *[({"object_depth_m": np.ones((8, 8), kind)}, kind) for kind in ("int64", "bool", "complex128")],
-        *[({name: value}, name) for name in ("jump_m", "pulse_ns") for value in (-1e-9, np.inf, np.nan)],
+        *[
+            ({"object_depth_m": np.ones((8, 8), kind)}, kind)
+            for kind in ("int64", "bool", "complex128")
+        ],
+        *[
+            ({name: value}, name)
+            for name in ("jump_m", "pulse_ns")
+            for value in (-1e-9, np.inf, np.nan)
+        ],
         ({"radiometry": "gothic"}, "gothic"),
         ({"object_depth_m": _depth(), "surface": Surface(np.ones((5, 5)))}, "5"),
         ({"object_depth_m": _depth(), "rig": load_rig("bare-wall")}, "object_box"),
@@ -40,7 +47,11 @@ def test_scene_refuses_values_that_cannot_be(fields: dict[str, Any], word: str) 
 
 
 def test_scene_has_patches_where_an_object_is() -> None:
-    for empty in (Scene(RIG), Scene(load_rig("bare-wall")), Scene(RIG, np.full((8, 8), np.nan, np.float32))):
+    for empty in (
+        Scene(RIG),
+        Scene(load_rig("bare-wall")),
+        Scene(RIG, np.full((8, 8), np.nan, np.float32)),
+    ):
         assert empty.patches is None
     touching = Scene(RIG, _depth(0.0)).patches
     assert len(touching.beta) == 12
@@ -48,7 +59,16 @@ def test_scene_has_patches_where_an_object_is() -> None:
 
 @pytest.mark.parametrize(
     "albedo",
-    [-0.1, 1.1, np.nan, np.inf, np.array([0.5, 2.0, 0.5]), np.ones(2), np.ones((4, 4, 2)), np.ones((1, 4, 4, 3))],
+    [
+        -0.1,
+        1.1,
+        np.nan,
+        np.inf,
+        np.array([0.5, 2.0, 0.5]),
+        np.ones(2),
+        np.ones((4, 4, 2)),
+        np.ones((1, 4, 4, 3)),
+    ],
 )
 def test_surface_refuses_albedos_out_of_range_or_shape(albedo: float | np.ndarray) -> None:
     with pytest.raises(SceneError, match="albedo"):
@@ -108,7 +128,9 @@ def test_patches_of_a_plane_have_its_normal_and_area(slope_x: float, slope_y: fl
     beta = np.sqrt(1 + slope_x**2 + slope_y**2)
     np.testing.assert_allclose(patches.beta, beta)
     np.testing.assert_allclose(patches.area_m2, beta * PITCH**2)
-    np.testing.assert_allclose(patches.slope, np.broadcast_to([slope_x, slope_y], patches.slope.shape), atol=1e-9)
+    np.testing.assert_allclose(
+        patches.slope, np.broadcast_to([slope_x, slope_y], patches.slope.shape), atol=1e-9
+    )
     expected = np.broadcast_to(np.array([slope_x, slope_y, -1]) / beta, patches.normal.shape)
     np.testing.assert_allclose(patches.normal, expected, atol=1e-9)
     level = patches.level()
@@ -136,7 +158,9 @@ def test_clustered_keeps_area_albedo_and_tilt(stride: int) -> None:
     np.testing.assert_allclose(given[1].sum(0), given[0].sum(0))
     np.testing.assert_allclose(np.linalg.norm(blocks.normal, axis=1), 1)
     assert blocks.cell_m2 == pytest.approx(stride**2 * patches.cell_m2)
-    np.testing.assert_allclose(blocks.point_m[:, 2], coarser(depth, stride)[blocks.row, blocks.column])
+    np.testing.assert_allclose(
+        blocks.point_m[:, 2], coarser(depth, stride)[blocks.row, blocks.column]
+    )
     black = clustered(_patches(_patches_depth(), 0.0), 2, 32)
     assert (black.albedo == 0).all()
     assert np.isfinite(black.normal).all()
@@ -145,5 +169,7 @@ def test_clustered_keeps_area_albedo_and_tilt(stride: int) -> None:
 
 def test_coarser_map_is_the_mean_of_the_surface() -> None:
     depth = np.full((4, 4), np.nan)
-    depth[0, 0], depth[0, 1], depth[3, 3] = 1.0, 2.0, 5.0
+    depth[0, 0] = 1.0
+    depth[0, 1] = 2.0
+    depth[3, 3] = 5.0
     np.testing.assert_array_equal(coarser(depth, 2), [[1.5, np.nan], [np.nan, 5.0]])

@@ -12,7 +12,15 @@ from pydantic import ValidationError
 
 from nlos_cam.errors import SceneError
 from nlos_cam.objects.meshes import read_mesh
-from nlos_cam.render import Fault, HiddenObject, SceneFile, SensorModel, bare_wall_scene, load_scene, paper_scene
+from nlos_cam.render import (
+    Fault,
+    HiddenObject,
+    SceneFile,
+    SensorModel,
+    bare_wall_scene,
+    load_scene,
+    paper_scene,
+)
 from nlos_cam.render.scene_file import Motion, one_wrap, packaged_scenes
 
 CUP = """
@@ -50,7 +58,9 @@ def test_load_scene_reads_object_rig_and_faults(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("make", [paper_scene, bare_wall_scene], ids=["paper", "bare wall"])
 @pytest.mark.parametrize("by_alias", [True, False])
-def test_scene_survives_a_file(tmp_path: Path, make: Callable[[], SceneFile], by_alias: bool) -> None:
+def test_scene_survives_a_file(
+    tmp_path: Path, make: Callable[[], SceneFile], by_alias: bool
+) -> None:
     scene = make()
     text = tomli_w.dumps(scene.model_dump(mode="json", by_alias=by_alias, exclude_none=True))
     assert ("object" in tomllib.loads(text)) == (by_alias and scene.hidden is not None)
@@ -117,9 +127,14 @@ def test_checksum_ignores_name_and_sensor_except_the_pulse() -> None:
 def test_material_and_radiometry_reach_the_scene(tmp_path: Path) -> None:
     text = CUP.replace("[object]", 'radiometry = "lambertian"\njump_m = 0.05\n[object]')
     text = text.replace("[motion]", '[object.material]\nkind = "phong"\nalbedo = 0.5\n[motion]')
-    scene, plain = _load(tmp_path, text), _load(tmp_path, CUP)
+    scene = _load(tmp_path, text)
+    plain = _load(tmp_path, CUP)
     at = scene.scene_at(0)
-    assert (at.radiometry, at.jump_m, float(np.asarray(at.surface.albedo))) == ("lambertian", 0.05, 0.5)
+    assert (at.radiometry, at.jump_m, float(np.asarray(at.surface.albedo))) == (
+        "lambertian",
+        0.05,
+        0.5,
+    )
     assert at.surface.brdf is not None
     assert scene.checksum != plain.checksum
     assert plain.scene_at(0).surface.brdf is None
@@ -155,13 +170,18 @@ def test_scene_has_one_pose_without_an_object_and_needs_a_box() -> None:
 
 
 def test_rig_path_is_absolute_or_relative_to_the_scene(tmp_path: Path) -> None:
-    (tmp_path / "bench.toml").write_text(dump_toml(load_rig("paper-rig").model_copy(update={"name": "bench"})))
+    (tmp_path / "bench.toml").write_text(
+        dump_toml(load_rig("paper-rig").model_copy(update={"name": "bench"}))
+    )
     for path in ("bench.toml", str(tmp_path / "bench.toml")):
         assert _load(tmp_path, f'name = "mine"\nrig = "{path}"\n').rig.name == "bench"
 
 
 def test_scene_may_show_its_object_in_part_of_the_loop(tmp_path: Path) -> None:
-    scene = _load(tmp_path, CUP.replace("size_m = 0.15", "x_m = 0.25").replace("sway_x_m = 0.03", "sway_x_m = 0.2"))
+    scene = _load(
+        tmp_path,
+        CUP.replace("size_m = 0.15", "x_m = 0.25").replace("sway_x_m = 0.03", "sway_x_m = 0.2"),
+    )
     assert [scene.shows_at(0), scene.shows_at(6)] == [False, True]
 
 
@@ -176,7 +196,9 @@ def _wedge(folder: Path, height: float = 0.6) -> Path:
     return folder / "things" / "wedge.stl"
 
 
-def test_mesh_is_relative_to_its_scene_and_survives_elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_mesh_is_relative_to_its_scene_and_survives_elsewhere(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     path = _wedge(tmp_path)
     monkeypatch.chdir(tmp_path.parent)
     scene = _load(tmp_path, WEDGE)
@@ -190,9 +212,13 @@ def test_mesh_is_relative_to_its_scene_and_survives_elsewhere(tmp_path: Path, mo
     assert again.checksum == scene.checksum
 
 
-def test_checksum_holds_content_and_axes_of_a_mesh_as_it_was_loaded_not_its_path(tmp_path: Path) -> None:
-    path, scene = _wedge(tmp_path), _load(tmp_path, WEDGE)
-    first, depth = scene.checksum, scene.scene_at(1).object_depth_m
+def test_checksum_holds_content_and_axes_of_a_mesh_as_it_was_loaded_not_its_path(
+    tmp_path: Path,
+) -> None:
+    path = _wedge(tmp_path)
+    scene = _load(tmp_path, WEDGE)
+    first = scene.checksum
+    depth = scene.scene_at(1).object_depth_m
     assert _load(tmp_path, WEDGE.replace('wedge.stl"', 'wedge.stl"\nup = "z"')).checksum != first
     assert _load(tmp_path, CUP).checksum != first
     path.rename(tmp_path / "moved.stl")
@@ -223,7 +249,9 @@ def test_fault_refuses_fields_that_make_no_sense(fields: dict[str, Any], word: s
         SceneFile.model_validate({**dict(bare_wall_scene()), "faults": wraps})
 
 
-@pytest.mark.parametrize(("kind", "frames"), [("stall", [5, 6, 7]), ("out_of_order", [5, 6, 7, 8, 9, 10])])
+@pytest.mark.parametrize(
+    ("kind", "frames"), [("stall", [5, 6, 7]), ("out_of_order", [5, 6, 7, 8, 9, 10])]
+)
 def test_fault_lasts_from_its_frame_on(kind: Any, frames: list[int]) -> None:
     fault = Fault(kind=kind, at_frame=5, frames=3)
     assert [frame for frame in range(20) if fault.befalls(frame)] == frames

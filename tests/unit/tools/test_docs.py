@@ -1,4 +1,6 @@
-"""The docs: broken links are found, generated pages are current, pictures are drawn, the tutorial's commands run."""
+"""The docs: broken links are found, generated pages are current, pictures are drawn, the tutorial's
+commands run.
+"""
 
 import runpy
 import shutil
@@ -54,7 +56,9 @@ def written(tmp_path: Path) -> Callable[..., Path]:
 
 
 @pytest.mark.slow
-def test_whole_docs_have_no_problem_and_every_page_a_place(tool: Tool, written: Callable[..., Path]) -> None:
+def test_whole_docs_have_no_problem_and_every_page_a_place(
+    tool: Tool, written: Callable[..., Path]
+) -> None:
     root = written()
     assert tool("build_site").problems(root / "site", root) == []
     start = (root / "site" / "index.html").read_text(encoding="utf-8")
@@ -75,10 +79,16 @@ def test_whole_docs_have_no_problem_and_every_page_a_place(tool: Tool, written: 
         ("README.md", "[gone](#gone)", "leads to no heading of README.md"),
         ("README.md", "[plain](http://example.org)", "not a full https address"),
         ("README.md", "[cut](https://)", "not a full https address"),
-        ("docs/index.md", '# Start\n\n<script src="https://cdn.example.org/a.js"></script>\n', "cdn.example.org"),
+        (
+            "docs/index.md",
+            '# Start\n\n<script src="https://cdn.example.org/a.js"></script>\n',
+            "cdn.example.org",
+        ),
     ],
 )
-def test_each_way_to_break_is_told(tool: Tool, written: Callable[..., Path], page: str, text: str, told: str) -> None:
+def test_each_way_to_break_is_told(
+    tool: Tool, written: Callable[..., Path], page: str, text: str, told: str
+) -> None:
     root = written({page: text})
     assert any(told in problem for problem in tool("build_site").problems(root / "site", root))
 
@@ -89,13 +99,19 @@ def test_the_gate_and_make_run_it(tool: Tool) -> None:
 
 
 def test_every_command_is_in_the_table_of_what_they_answer(tool: Tool) -> None:
-    pages, text = tool("pages"), (ROOT / "docs" / "reference.md").read_text(encoding="utf-8")
-    names = [name.removeprefix("nlos-cam ") for name, _ in pages.commands(typer.main.get_command(pages.build_app()))]
+    pages = tool("pages")
+    text = (ROOT / "docs" / "reference.md").read_text(encoding="utf-8")
+    names = [
+        name.removeprefix("nlos-cam ")
+        for name, _ in pages.commands(typer.main.get_command(pages.build_app()))
+    ]
     assert len(names) > 15
     assert [name for name in names if f"| `{name}" not in text] == []
 
 
-@pytest.mark.parametrize("name", [pytest.param("commands", marks=pytest.mark.slow), "comparison", "gallery"])
+@pytest.mark.parametrize(
+    "name", [pytest.param("commands", marks=pytest.mark.slow), "comparison", "gallery"]
+)
 def test_page_has_every_command_and_the_measured_figures(tool: Tool, name: str) -> None:
     page = (tool("pages").DOCS / f"{name}.md").read_text(encoding="utf-8")
     assert tool("pages").PAGES[name]() == page, f"run `python tools/docs/pages.py {name}`"
@@ -120,7 +136,10 @@ def test_things_unlike_training_lie_in_the_box_and_are_drawn(tool: Tool, tmp_pat
         assert thing.depth_m.shape == (64, 64)
         assert 0.12 <= np.nanmin(thing.depth_m) <= np.nanmax(thing.depth_m) <= 0.4
     image = truth = np.stack([np.eye(64, dtype=np.float32), np.zeros((64, 64), np.float32)])
-    gallery.draw_pairs(tmp_path / "a.png", [("a row", [things[-1], nothing], image, truth, np.array([1.0, np.nan]))])
+    gallery.draw_pairs(
+        tmp_path / "a.png",
+        [("a row", [things[-1], nothing], image, truth, np.array([1.0, np.nan]))],
+    )
     assert (tmp_path / "a.png").stat().st_size > 1000
 
 
@@ -129,10 +148,14 @@ SHORTER = {"--seconds": "0.5", "--count": "2", "--every": "5"}
 
 @pytest.fixture
 def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[list[str]], int]:
-    """Run one command in an empty folder with the examples, in this process, for less long and without a browser."""
+    """Run one command in an empty folder with the examples, in this process, for less long and
+    without a browser.
+    """
     shutil.copytree(ROOT / "examples", tmp_path / "examples")
     monkeypatch.chdir(tmp_path)
-    airplane = paper_scene().model_copy(update={"motion": Motion(poses=1)})  # is rendered once, not ninety times
+    airplane = paper_scene().model_copy(
+        update={"motion": Motion(poses=1)}
+    )  # is rendered once, not ninety times
     monkeypatch.setattr(simulated_world.renderer, "paper_scene", lambda: airplane)
 
     def call(words: list[str]) -> int:
@@ -147,7 +170,9 @@ def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[list[str]]
 
 
 @pytest.mark.slow
-def test_every_command_of_the_tutorial_does_its_work(tool: Tool, run: Callable[[list[str]], int]) -> None:
+def test_every_command_of_the_tutorial_does_its_work(
+    tool: Tool, run: Callable[[list[str]], int]
+) -> None:
     tutorial = tool("tutorial")
     commands = tutorial.commands_of(tutorial.PAGE.read_text(encoding="utf-8"))
     assert len(commands) >= 10
@@ -161,4 +186,6 @@ def test_every_command_block_is_followed_by_its_answer(tool: Tool) -> None:
     tutorial = tool("tutorial")
     text = tutorial.PAGE.read_text(encoding="utf-8")
     assert text.count("```sh\n") == len(tutorial.STEP.findall(text))
-    assert all(found["answer"].strip() for found in tutorial.STEP.finditer(text)), "run `python tools/docs/tutorial.py`"
+    assert all(found["answer"].strip() for found in tutorial.STEP.finditer(text)), (
+        "run `python tools/docs/tutorial.py`"
+    )

@@ -1,4 +1,6 @@
-"""Attacks, fuzz and soak of tools/robustness: they notice what they look for, and repeat their damage from a seed."""
+"""Attacks, fuzz and soak of tools/robustness: they notice what they look for, and repeat their
+damage from a seed.
+"""
 
 import os
 import struct
@@ -25,10 +27,14 @@ from nlos_cam.view.session_file import element, page_html
 Tool = Callable[[str], ModuleType]
 
 
-def test_starved_command_that_ends_badly_or_leaves_parts_is_noticed(tool: Tool, tmp_path: Path) -> None:
+def test_starved_command_that_ends_badly_or_leaves_parts_is_noticed(
+    tool: Tool, tmp_path: Path
+) -> None:
     def wrong(code: int = 1, said: str = "error: a.npz cannot be written: free some space") -> str:
         ended = subprocess.CompletedProcess([], code, "", said)
-        return tool("starve_commands").wrong_with(tool("trials").COMMANDS["render"], tmp_path, tmp_path, ended)
+        return tool("starve_commands").wrong_with(
+            tool("trials").COMMANDS["render"], tmp_path, tmp_path, ended
+        )
 
     assert wrong() == ""
     assert "Traceback" in wrong(1, "Traceback (most recent call last):\nMemoryError")
@@ -44,7 +50,8 @@ def test_starved_command_that_ends_badly_or_leaves_parts_is_noticed(tool: Tool, 
 
 def test_findings_of_two_groups_are_joined(tool: Tool) -> None:
     fuzz = tool("fuzz")
-    light, torch = fuzz.Findings(), fuzz.Findings()
+    light = fuzz.Findings()
+    torch = fuzz.Findings()
     light.add("a.bag", fuzz.Verdict("refused", "", 200, 0.1))
     torch.add("b.h5", fuzz.Verdict("crash", "", 300, 0.2))
     torch.bad.append({"input": "b.h5"})
@@ -54,7 +61,8 @@ def test_findings_of_two_groups_are_joined(tool: Tool) -> None:
 
 
 def test_trials_resume_and_a_failed_one_is_a_finding(tool: Tool, tmp_path: Path) -> None:
-    trials, drawn = tool("trials"), list[float]()
+    trials = tool("trials")
+    drawn = list[float]()
 
     def trial(random: Random) -> dict[str, str]:
         drawn.append(random.random())
@@ -70,7 +78,8 @@ def test_trials_resume_and_a_failed_one_is_a_finding(tool: Tool, tmp_path: Path)
 
 
 def test_session_that_does_not_play_is_noticed(tool: Tool) -> None:
-    trials, messages = tool("trials"), [pack({"kind": "bench"}), pack({"kind": "chunk"})]
+    trials = tool("trials")
+    messages = [pack({"kind": "bench"}), pack({"kind": "chunk"})]
     whole = page_html("session").encode() + b"".join(map(element, messages))
     assert (trials.check_session(whole), trials.check_session(whole[:-12])) == (2, 1)
     for bad in (b"", page_html("session").encode()):
@@ -81,7 +90,9 @@ def test_session_that_does_not_play_is_noticed(tool: Tool) -> None:
 
 
 def dataset(folder: Path, harm: str = "") -> Path:
-    """Store a dataset of three objects, one of whose arrays is harmed by a bit or, where it holds text, reversed."""
+    """Store a dataset of three objects, one of whose arrays is harmed by a bit or, where it holds
+    text, reversed.
+    """
     folder.mkdir()
     samples = samples_of(range(3))
     if harm == "category":
@@ -92,14 +103,17 @@ def dataset(folder: Path, harm: str = "") -> Path:
     return folder
 
 
-@pytest.mark.parametrize("harm", ["", "depth_m", "intensity", "image", "object_depth_m", "scene", "category"])
+@pytest.mark.parametrize(
+    "harm", ["", "depth_m", "intensity", "image", "object_depth_m", "scene", "category"]
+)
 def test_one_bit_in_a_dataset_makes_a_difference(tool: Tool, tmp_path: Path, harm: str) -> None:
     found = tool("trials").differing(dataset(tmp_path / "one"), dataset(tmp_path / "other", harm))
     assert found == ([harm] if harm else [])
 
 
 def test_finished_part_that_is_made_again_is_noticed(tool: Tool, tmp_path: Path) -> None:
-    trials, path = tool("trials"), dataset(tmp_path / "data") / "shard-000000000.h5"
+    trials = tool("trials")
+    path = dataset(tmp_path / "data") / "shard-000000000.h5"
     before = trials.finished_parts(trials.COMMANDS["dataset build"], tmp_path)
     assert list(before) == [path.name]
     os.utime(path, ns=(0, 0))
@@ -107,7 +121,9 @@ def test_finished_part_that_is_made_again_is_noticed(tool: Tool, tmp_path: Path)
     assert trials.finished_parts(trials.COMMANDS["export"], tmp_path) == {}
 
 
-def test_processes_of_a_killed_command_that_run_on_are_noticed(tool: Tool, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_processes_of_a_killed_command_that_run_on_are_noticed(
+    tool: Tool, monkeypatch: pytest.MonkeyPatch
+) -> None:
     kills = tool("kill_commands")
     monkeypatch.setattr(kills, "GRACE_S", 0.1)
     with subprocess.Popen(["/bin/sleep", "60"]) as process:
@@ -139,8 +155,12 @@ def test_judge_notices_each_kind_of_end(tool: Tool, kind: str, action: Callable[
 
 @pytest.mark.slow
 @pytest.mark.parametrize("suffix", [".bag", ".bin"])
-def test_mutation_is_the_same_for_the_same_seed(tool: Tool, noise_bags: dict[str, Path], suffix: str) -> None:
-    module, content, path = tool("mutations"), noise_bags["packed"].read_bytes(), Path("a").with_suffix(suffix)
+def test_mutation_is_the_same_for_the_same_seed(
+    tool: Tool, noise_bags: dict[str, Path], suffix: str
+) -> None:
+    module = tool("mutations")
+    content = noise_bags["packed"].read_bytes()
+    path = Path("a").with_suffix(suffix)
     taken = set[str]()
     for seed in range(20):
         ways, bad = module.mutate(path, content, np.random.default_rng(seed))
@@ -150,7 +170,8 @@ def test_mutation_is_the_same_for_the_same_seed(tool: Tool, noise_bags: dict[str
 
 
 def test_rows_of_a_growing_log_are_read_once_and_whole(tmp_path: Path) -> None:
-    path, rows = tmp_path / "frames.csv", list[dict[str, str]]()
+    path = tmp_path / "frames.csv"
+    rows = list[dict[str, str]]()
     frames = FrameLog(path)
     text = "frame,latency_ms,dropped\n" + "".join(f"{i},{10 + i},{i // 5}\n" for i in range(10))
     for end in (0, 5, 40, 41, 60, len(text) - 1, len(text)):

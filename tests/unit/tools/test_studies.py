@@ -1,4 +1,6 @@
-"""Studies, checks and the run on a GPU in the small: files are written, and figures are right where they are known."""
+"""Studies, checks and the run on a GPU in the small: files are written, and figures are right where
+they are known.
+"""
 
 import json
 from collections.abc import Callable
@@ -72,7 +74,8 @@ def test_interrupted_collection_resumes_with_the_same_records(harness: ModuleTyp
 
 
 def test_interval_of_a_share_narrows_with_its_count(harness: ModuleType) -> None:
-    few, many = harness.wilson(1, 10), harness.wilson(100, 1000)
+    few = harness.wilson(1, 10)
+    many = harness.wilson(100, 1000)
     assert few["low"] < few["share"] == many["share"] < few["high"]
     assert few["high"] - few["low"] > 3 * (many["high"] - many["low"])
 
@@ -80,7 +83,10 @@ def test_interval_of_a_share_narrows_with_its_count(harness: ModuleType) -> None
 @pytest.mark.slow
 def test_renderer_bench_agrees_with_the_cpu(run: Read, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(FileNotFoundError):  # it writes no file
-        run("renderer cuda --backend torch --accuracy draft --objects 1 --batch 1 --repeats 1", "cuda")
+        run(
+            "renderer cuda --backend torch --accuracy draft --objects 1 --batch 1 --repeats 1",
+            "cuda",
+        )
     assert json.loads(capsys.readouterr().out.splitlines()[-1])["difference_from_cpu"] < 1e-3
 
 
@@ -94,15 +100,24 @@ def weights(tmp_path: Path, monkeypatch: Patch) -> list[Path]:
 
 
 @pytest.mark.slow
-def test_limits_leave_out_the_latent_of_weights_without_one(tool: Tool, weights: list[Path]) -> None:
+def test_limits_leave_out_the_latent_of_weights_without_one(
+    tool: Tool, weights: list[Path]
+) -> None:
     some = seeded_objects(0, 1, object_box(RIG))
     rows = list(tool("weights").experiments(weights[1], some, some, frames=()))
-    assert [row.name for row in rows] == ["as evaluated", "no silhouette step", "noise off", "training's objects"]
+    assert [row.name for row in rows] == [
+        "as evaluated",
+        "no silhouette step",
+        "noise off",
+        "training's objects",
+    ]
     assert len(tool("weights").limits_table(rows).splitlines()) == 2 + len(rows)
 
 
 @pytest.mark.slow
-def test_rig_map_has_a_cell_for_every_place(tool: Tool, run: Read, weights: list[Path], monkeypatch: Patch) -> None:
+def test_rig_map_has_a_cell_for_every_place(
+    tool: Tool, run: Read, weights: list[Path], monkeypatch: Patch
+) -> None:
     module = tool("weights")
     record = SimpleNamespace(input="raw maps", rig_name=RIG.name, rig_checksum=RIG.checksum)
     network = type("Plate", (), {"record": record, "__call__": sheet_network})()
@@ -113,21 +128,31 @@ def test_rig_map_has_a_cell_for_every_place(tool: Tool, run: Read, weights: list
     monkeypatch.setattr(module, "ANGLES_DEG", (15.0, 45.0))
     monkeypatch.setattr(module, "BENCHES", [module.Place(aside_m=0.005, up_m=0.005)])
     table = run("weights rigs --weights", "rig_map", f"plate={weights[0]}")
-    assert [(cell["distance_m"], cell["yaw_deg"]) for cell in table["cells"]] == [(0.2, 15.0), (0.2, 45.0)]
+    assert [(cell["distance_m"], cell["yaw_deg"]) for cell in table["cells"]] == [
+        (0.2, 15.0),
+        (0.2, 45.0),
+    ]
     assert set(table["cells"][0]["weights"]["plate"]) >= set(TARGETS)
-    assert [set(one["weights"]) for one in table["benches"]] == [{"plate", "plate, record off", "plate, not aligned"}]
+    assert [set(one["weights"]) for one in table["benches"]] == [
+        {"plate", "plate, record off", "plate, not aligned"}
+    ]
 
 
 def test_transfer_curve_trains_on_nested_sets(tool: Tool, monkeypatch: Patch) -> None:
-    transfer, calls = tool("transfer"), list[list[str]]()
+    transfer = tool("transfer")
+    calls = list[list[str]]()
     sets = transfer.nested([Path(f"{k}.bag") for k in range(9)], (2, 5, 30))
     assert list(sets) == [2, 5, 9]
     assert set(sets[2]) < set(sets[5]) < set(sets[9])
-    monkeypatch.setattr(transfer, "nlos_cam", lambda arguments: calls.append(arguments) or len(calls) - 1)
+    monkeypatch.setattr(
+        transfer, "nlos_cam", lambda arguments: calls.append(arguments) or len(calls) - 1
+    )
     lesson = transfer.Lesson(Path("data"), Path("val"), 24, Path("run"))
     train = transfer.commanded("transfer", Path("r.toml"), "--weights", Path("w"))
     assert train(lesson) == Path("run")
-    assert " ".join(calls[0]).endswith("--dataset data --held-out val --objects 24 --out run --weights w")
+    assert " ".join(calls[0]).endswith(
+        "--dataset data --held-out val --objects 24 --out run --weights w"
+    )
     with pytest.raises(Exception, match=r"train transfer .* ended with 1"):
         train(lesson)
 
@@ -143,21 +168,28 @@ def test_transfer_figures_of_exact_images_are_perfect(tool: Tool) -> None:
 
 
 def test_doubt_study_is_right_for_laplace_errors(tool: Tool, harness: ModuleType) -> None:
-    doubt, generator = tool("doubt"), np.random.default_rng(0)
+    doubt = tool("doubt")
+    generator = np.random.default_rng(0)
     expected = generator.uniform(0.005, 0.05, 100_000)
     observed = np.abs(generator.laplace(0.0, expected))
-    rows, covered = doubt.reliability(expected, observed), doubt.coverage(expected, observed)
+    rows = doubt.reliability(expected, observed)
+    covered = doubt.coverage(expected, observed)
     assert all(row["observed_mm"] == pytest.approx(row["expected_mm"], rel=0.05) for row in rows)
     assert all(row["observed"] == pytest.approx(row["level"], abs=0.01) for row in covered)
     pipeline = doubt.Pipeline(RIG, sheet_network, FakeDoubter(error_v=0.2))
     answer = pipeline.answer(np.full((64, 80), 0.3, np.float32), np.ones((64, 80), np.float32))
     assert doubt.of_outliers([answer, answer], np.array([100, 0]))["cannot_be_seen"] == 1
-    parts = {"reliability": rows, "coverage": covered, "surface": [{"expected": 0.5, "observed": 0.6}]}
+    parts = {
+        "reliability": rows,
+        "coverage": covered,
+        "surface": [{"expected": 0.5, "observed": 0.6}],
+    }
     harness.save("reliability", doubt.draw({"test_objects": parts, "held_out_objects": parts}))
 
 
 def test_color_study_judges_weights_and_vae(tool: Tool, tmp_path: Path, monkeypatch: Patch) -> None:
-    color, things = tool("color"), 6
+    color = tool("color")
+    things = 6
     truth = np.zeros((things, 3, 64, 64), np.float32)
     truth[:, :, 20:40, 20:40] = 0.7
     maps = MapSet(np.ones((things, 64, 80)), np.ones((things, 3, 64, 80)), truth)
@@ -177,10 +209,16 @@ def test_color_study_judges_weights_and_vae(tool: Tool, tmp_path: Path, monkeypa
     figures = json.loads((tmp_path / "figures.json").read_text(encoding="utf-8"))
     assert figures["silhouette_iou"]["value"] == 1
     assert figures["baselines"]["vae_alone"]["silhouette_iou"]["value"] == 0
-    assert {path.name for path in tmp_path.iterdir()} == {"figures.json", "sheet.png", "sheet-vae.png"}
+    assert {path.name for path in tmp_path.iterdir()} == {
+        "figures.json",
+        "sheet.png",
+        "sheet-vae.png",
+    }
 
 
-def test_word_check_counts_patterns_with_their_lines(tool: Tool, tmp_path: Path, monkeypatch: Patch) -> None:
+def test_word_check_counts_patterns_with_their_lines(
+    tool: Tool, tmp_path: Path, monkeypatch: Patch
+) -> None:
     words = tool("words")
     monkeypatch.setattr(words, "ROOT", tmp_path)
     (tmp_path / "a.py").write_text('"""What is told\nmeanwhile."""\nMOST_X = 1\n', encoding="utf-8")
@@ -191,9 +229,14 @@ def test_word_check_counts_patterns_with_their_lines(tool: Tool, tmp_path: Path,
 
 
 @pytest.mark.slow
-def test_a_recording_is_of_its_object_on_the_bench_and_labelled(tool: Tool, tmp_path: Path, monkeypatch: Patch) -> None:
-    whole, rendered = load_scene(Path(__file__).parents[3] / "examples" / "bench.toml"), list[Any]()
-    small = whole.rig.intrinsics.model_copy(update=vars(whole.rig.pinhole.scaled(80, 64)))  # few pixels
+def test_a_recording_is_of_its_object_on_the_bench_and_labelled(
+    tool: Tool, tmp_path: Path, monkeypatch: Patch
+) -> None:
+    whole = load_scene(Path(__file__).parents[3] / "examples" / "bench.toml")
+    rendered = list[Any]()
+    small = whole.rig.intrinsics.model_copy(
+        update=vars(whole.rig.pinhole.scaled(80, 64))
+    )  # few pixels
     scene = whole.model_copy(update={"rig": whole.rig.model_copy(update={"intrinsics": small})})
 
     def render(scene: Any) -> Any:
@@ -216,12 +259,20 @@ def test_a_recording_is_of_its_object_on_the_bench_and_labelled(tool: Tool, tmp_
         np.testing.assert_array_equal(read.object_depth_m, np.stack([thing.depth_m] * 3))
 
 
-def test_every_command_is_started_and_compared_with_the_bare_interpreter_and_numpy(tool: Tool) -> None:
+def test_every_command_is_started_and_compared_with_the_bare_interpreter_and_numpy(
+    tool: Tool,
+) -> None:
     start = tool("start")
     names = [*start.programs()]
-    assert {"--version", "doctor", "live --help", "train --help", "train compressor --help"} <= {*names}
+    assert {"--version", "doctor", "live --help", "train --help", "train compressor --help"} <= {
+        *names
+    }
     assert names[:2] == [start.BARE, start.NUMPY]
-    times = {start.BARE: start.Times(0.02, 0.01), start.NUMPY: start.Times(0.1, 0.1), "live": start.Times(0.4, 0.3)}
+    times = {
+        start.BARE: start.Times(0.02, 0.01),
+        start.NUMPY: start.Times(0.1, 0.1),
+        "live": start.Times(0.4, 0.3),
+    }
     assert start.table(times).splitlines()[-1] == "| `live` | 0.40 | 0.30 | 20.0 | 4.0 |"
     assert start.timed(["-c", "print('x')"]).wall_s > 0
     with pytest.raises(RuntimeError, match="exit code 7"):
@@ -232,17 +283,30 @@ EPOCH = "epochs = 1\nbatch = 16\nlearning_rate = 1e-3\n"
 MAPS = "objects = 64\nheld_out = 20\n" + EPOCH
 DIRECT = "[direct]\nfeatures = 8\nwidth = 8\nblocks = 1\ntoken = 8\nmixers = 1\n"
 RECIPES = {
-    "small": 'task = "direct"\nschedule = "cosine"\nwarm_up_steps = 2\naverage = 0.9\n' + MAPS + DIRECT,
-    "encoder": 'task = "vae"\nstart = "decoder"\nschedule = "one-cycle"\nobjects = 16\nheld_out = 4\n' + EPOCH,
-    "compressor": 'task = "compressor"\nschedule = "one-cycle"\nimage_weight = 1.0\nwidth = 0.1\n' + MAPS,
+    "small": (
+        'task = "direct"\nschedule = "cosine"\nwarm_up_steps = 2\naverage = 0.9\n' + MAPS + DIRECT
+    ),
+    "encoder": (
+        'task = "vae"\nstart = "decoder"\nschedule = "one-cycle"\nobjects = 16\nheld_out = 4\n'
+        + EPOCH
+    ),
+    "compressor": (
+        'task = "compressor"\nschedule = "one-cycle"\nimage_weight = 1.0\nwidth = 0.1\n' + MAPS
+    ),
 }
 
 
-def test_parts_are_small_and_join_to_the_same_files(tool: Tool, tmp_path: Path, monkeypatch: Patch) -> None:
-    gpu, folder = tool("gpu_run"), tmp_path / "weights"
+def test_parts_are_small_and_join_to_the_same_files(
+    tool: Tool, tmp_path: Path, monkeypatch: Patch
+) -> None:
+    gpu = tool("gpu_run")
+    folder = tmp_path / "weights"
     monkeypatch.setattr(gpu, "PART_BYTES", 1000)
     folder.mkdir()
-    contents = {name: np.random.default_rng(k).bytes(1700) for k, name in enumerate(("a.safetensors", "b.json"))}
+    contents = {
+        name: np.random.default_rng(k).bytes(1700)
+        for k, name in enumerate(("a.safetensors", "b.json"))
+    }
     for name, content in contents.items():
         (folder / name).write_bytes(content)
     parts = gpu.write_parts(folder, list(contents), tmp_path / "direct.zip")
@@ -252,8 +316,12 @@ def test_parts_are_small_and_join_to_the_same_files(tool: Tool, tmp_path: Path, 
     assert {path.name: path.read_bytes() for path in (tmp_path / "joined").iterdir()} == contents
 
 
-def test_epochs_fit_the_time_by_the_fastest_epoch_and_go_into_the_recipe(tool: Tool, tmp_path: Path) -> None:
-    gpu, log, recipe = tool("gpu_run"), tmp_path / "log.csv", tmp_path / "a.toml"
+def test_epochs_fit_the_time_by_the_fastest_epoch_and_go_into_the_recipe(
+    tool: Tool, tmp_path: Path
+) -> None:
+    gpu = tool("gpu_run")
+    log = tmp_path / "log.csv"
+    recipe = tmp_path / "a.toml"
     log.write_text("epoch,loss,seconds\n0,1,30.0\n1,1,10.0\n", encoding="utf-8")
     assert gpu.epochs_within(100, log) == 9
     log.write_text("epoch,loss,seconds\n", encoding="utf-8")
@@ -272,8 +340,19 @@ def test_whole_run_in_the_small(tool: Tool, tmp_path: Path, monkeypatch: Patch) 
     monkeypatch.setattr(gpu, "TIMING_SHARE", 1.0)
     for name, text in RECIPES.items():
         (tmp_path / f"{name}.toml").write_text(text, encoding="utf-8")
-    recipes = [part for name in ("encoder", "compressor") for part in (f"--{name}", str(tmp_path / f"{name}.toml"))]
-    recipes += ["--recipe", str(tmp_path / "small.toml"), "--out", str(tmp_path / "out"), "--accelerator", "cpu"]
+    recipes = [
+        part
+        for name in ("encoder", "compressor")
+        for part in (f"--{name}", str(tmp_path / f"{name}.toml"))
+    ]
+    recipes += [
+        "--recipe",
+        str(tmp_path / "small.toml"),
+        "--out",
+        str(tmp_path / "out"),
+        "--accelerator",
+        "cpu",
+    ]
     small = "--held-out 20 --first-objects 100 --compressor-epochs 1 --minutes 20 --workers 1"
     gpu.train_and_judge(gpu.options().parse_args([*recipes, *small.split()]))
     facts = json.loads((tmp_path / "out" / "run.json").read_text(encoding="utf-8"))

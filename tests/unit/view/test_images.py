@@ -27,7 +27,9 @@ def flat(z_m: float) -> np.ndarray:
 
 
 def test_pictures_are_brighter_when_nearer_noisier_or_of_more_counts() -> None:
-    nearer = np.concatenate([images.hidden_rgb(flat(z_m), BOX)[:1, :1] for z_m in (np.nan, 0.4, 0.25, 0.13)], axis=1)
+    nearer = np.concatenate(
+        [images.hidden_rgb(flat(z_m), BOX)[:1, :1] for z_m in (np.nan, 0.4, 0.25, 0.13)], axis=1
+    )
     for rgb in (nearer, images.noise_rgb(np.array([[np.nan, 0.0, 1.0, 2.0]]), 2.0)):
         assert (np.diff(rgb[0].sum(axis=-1).astype(int)) > 0).all()
     grey = images.infrared_grey(np.arange(256, dtype=np.uint8)[None])[0].astype(int)
@@ -40,24 +42,32 @@ def test_depth_pictures_show_missing_depth_as_background() -> None:
     assert (images.lidar_rgb(NOTHING, 0.1, 1.0) == images.BACKGROUND_RGB).all()
     depth_m = flat(0.3)
     depth_m[5, 6] = np.nan
-    assert np.argwhere((images.lidar_rgb(depth_m, 0.1, 1.0) == images.BACKGROUND_RGB).all(axis=-1)).tolist() == [[5, 6]]
+    assert np.argwhere(
+        (images.lidar_rgb(depth_m, 0.1, 1.0) == images.BACKGROUND_RGB).all(axis=-1)
+    ).tolist() == [[5, 6]]
 
 
 def test_near_is_red_and_far_is_blue_and_a_difference_of_none_is_grey() -> None:
     near, far = images.lidar_rgb(np.array([[0.1, 1.0]], np.float32), 0.1, 1.0)[0]
     assert near[0] > near[2]
     assert far[2] > far[0]
-    near, same, far, nothing = images.difference_rgb(np.array([-0.01, 0.0, 0.01, np.nan]), 0.01).astype(int)
+    near, same, far, nothing = images.difference_rgb(
+        np.array([-0.01, 0.0, 0.01, np.nan]), 0.01
+    ).astype(int)
     assert near[0] > 2 * near[2]
     assert far[2] > 2 * far[0]
     assert np.ptp(same) < 30
     assert tuple(nothing) == images.BACKGROUND_RGB
-    redness = np.diff(images.difference_rgb(np.linspace(-1, 1, 21), 1.0)[:, [2, 0]].astype(int), axis=1)[:, 0]
+    redness = np.diff(
+        images.difference_rgb(np.linspace(-1, 1, 21), 1.0)[:, [2, 0]].astype(int), axis=1
+    )[:, 0]
     assert (np.diff(redness) < 0).all()
 
 
 def test_saturated_rgb_colors_saturated_pixels_only() -> None:
-    rgb = images.saturated_rgb(np.array([[0.0, 40.0, 255.0, np.nan]]), np.array([[0.0, 0.0, 0.01, 0.0]]))[0]
+    rgb = images.saturated_rgb(
+        np.array([[0.0, 40.0, 255.0, np.nan]]), np.array([[0.0, 0.0, 0.01, 0.0]])
+    )[0]
     assert tuple(rgb[2]) == images.SATURATED_RGB
     assert (np.ptp(rgb[[0, 1, 3]], axis=-1) == 0).all()
 
@@ -90,27 +100,39 @@ def test_spans_ignore_what_is_missing_or_has_not_changed() -> None:
 def test_uncertainty_rgb_is_brighter_the_larger_on_the_surface() -> None:
     depth_m = flat(0.2)
     depth_m[0] = np.nan
-    spread_m = np.linspace(0.0, 2 * images.MAX_UNCERTAINTY_M, 64, dtype=np.float32) * np.ones((64, 1), np.float32)
+    spread_m = np.linspace(0.0, 2 * images.MAX_UNCERTAINTY_M, 64, dtype=np.float32) * np.ones(
+        (64, 1), np.float32
+    )
     rgb = images.uncertainty_rgb(spread_m, depth_m)
     assert (rgb[0] == images.BACKGROUND_RGB).all()
     brightness = rgb[1].sum(axis=-1).astype(int)
     assert (np.diff(brightness) >= -3).all()
     assert brightness[0] > sum(images.BACKGROUND_RGB)
     assert (rgb[1, 40:] == rgb[1, 63]).all()
-    assert (images.uncertainty_rgb(NOTHING, depth_m) == images.uncertainty_rgb(flat(1.0), depth_m)).all()  # the largest
+    assert (
+        images.uncertainty_rgb(NOTHING, depth_m) == images.uncertainty_rgb(flat(1.0), depth_m)
+    ).all()  # the largest
 
 
 def test_pictures_clip_values_beyond_their_span() -> None:
-    np.testing.assert_array_equal(images.noise_rgb(flat(3.0), 2.0), images.noise_rgb(flat(2.0), 2.0))
-    np.testing.assert_array_equal(images.lidar_rgb(flat(9.0), 0.1, 1.0), images.lidar_rgb(flat(1.0), 0.1, 1.0))
-    np.testing.assert_array_equal(images.difference_rgb(flat(9.0), 0.01), images.difference_rgb(flat(0.01), 0.01))
+    np.testing.assert_array_equal(
+        images.noise_rgb(flat(3.0), 2.0), images.noise_rgb(flat(2.0), 2.0)
+    )
+    np.testing.assert_array_equal(
+        images.lidar_rgb(flat(9.0), 0.1, 1.0), images.lidar_rgb(flat(1.0), 0.1, 1.0)
+    )
+    np.testing.assert_array_equal(
+        images.difference_rgb(flat(9.0), 0.01), images.difference_rgb(flat(0.01), 0.01)
+    )
 
 
 def test_faded_keeps_brightness_and_loses_color() -> None:
     rgb = np.random.default_rng(0).integers(0, 256, (9, 9, 3)).astype(np.uint8)
     pale = images.faded(rgb).astype(float)
     np.testing.assert_allclose(pale.mean(axis=-1), rgb.mean(axis=-1), atol=1.0)
-    np.testing.assert_allclose(np.ptp(pale, axis=-1), images.FADED * np.ptp(rgb.astype(float), axis=-1), atol=1.5)
+    np.testing.assert_allclose(
+        np.ptp(pale, axis=-1), images.FADED * np.ptp(rgb.astype(float), axis=-1), atol=1.5
+    )
 
 
 def test_relief_rgb_is_lit_from_the_top_left() -> None:
@@ -130,7 +152,8 @@ def with_record(wall: MeasuredWall, **fields: Any) -> MeasuredWall:
 
 def test_wall_outline_is_closed_finite_and_on_the_wall() -> None:
     wall = exact_wall()
-    outline, extent = outline_m(wall), wall.record.rig.wall
+    outline = outline_m(wall)
+    extent = wall.record.rig.wall
     points_m = wall_points_m(wall.record, wall.reference)[..., :2].reshape(-1, 2)
     assert (points_m.min(axis=0) > outline.min(axis=0) - 0.01).all()
     assert (points_m.max(axis=0) < outline.max(axis=0) + 0.01).all()
@@ -138,18 +161,27 @@ def test_wall_outline_is_closed_finite_and_on_the_wall() -> None:
     assert (outline >= [extent.x_min_m - 1e-6, extent.y_min_m - 1e-6]).all()
     assert (outline <= [extent.x_max_m + 1e-6, extent.y_max_m + 1e-6]).all()
     pose = wall_from_plane(normal_from_angles(np.radians(75.0), 0.0), 0.2)
-    oblique = outline_m(with_record(wall, wall_from_lidar=pose.tolist(), yaw_deg=75.0, facing_deg=75.0))
+    oblique = outline_m(
+        with_record(wall, wall_from_lidar=pose.tolist(), yaw_deg=75.0, facing_deg=75.0)
+    )
     assert len(oblique) > 3
     assert np.isfinite(oblique).all()
     assert oblique[:, 0].max() == pytest.approx(extent.x_max_m, abs=0.5)
     far = extent.model_copy(update={"x_min_m": -1.0, "x_max_m": -0.9})
-    assert len(outline_m(with_record(wall, rig=wall.record.rig.model_copy(update={"wall": far})))) == 0
+    assert (
+        len(outline_m(with_record(wall, rig=wall.record.rig.model_copy(update={"wall": far})))) == 0
+    )
 
 
 def test_wall_pictures_need_a_reference_and_are_dark_without_returns() -> None:
     assert wall_pictures(exact_wall(reference=None)) == {}
-    pictures = wall_pictures(exact_wall(depth_m=UNSEEN, depth_std_m=UNSEEN, ir=UNSEEN, inliers=UNSEEN > 0))
-    assert all((pictures[name][1] == images.BACKGROUND_RGB).all() for name in ("wall_residual", "wall_noise"))
+    pictures = wall_pictures(
+        exact_wall(depth_m=UNSEEN, depth_std_m=UNSEEN, ir=UNSEEN, inliers=UNSEEN > 0)
+    )
+    assert all(
+        (pictures[name][1] == images.BACKGROUND_RGB).all()
+        for name in ("wall_residual", "wall_noise")
+    )
     titles = {name: title for name, (title, _) in wall_pictures(exact_wall()).items()}
     assert "±2 mm" in titles["wall_residual"]
     assert "0.5 mm" in titles["wall_noise"]
@@ -159,8 +191,16 @@ def test_saturated_pixel_survives_thinning() -> None:
     blank = np.full((480, 641), 0.3, np.float32)
     saturated = np.zeros_like(blank)
     saturated[301, 17] = 1.0
-    fields = {"depth_m": blank, "depth_std_m": blank, "ir": blank, "saturated": saturated, "inliers": blank > 0}
-    picture = wall_pictures(exact_wall(**fields, intrinsics=RIG.pinhole.scaled(641, 480)))["wall_saturated"][1]
+    fields = {
+        "depth_m": blank,
+        "depth_std_m": blank,
+        "ir": blank,
+        "saturated": saturated,
+        "inliers": blank > 0,
+    }
+    picture = wall_pictures(exact_wall(**fields, intrinsics=RIG.pinhole.scaled(641, 480)))[
+        "wall_saturated"
+    ][1]
     assert picture.shape == (240, 321, 3)
     assert np.argwhere((picture == images.SATURATED_RGB).all(axis=-1)).tolist() == [[150, 8]]
 
@@ -180,7 +220,8 @@ def test_film_holds_every_second_frame(tmp_path: Path, capfd: pytest.CaptureFixt
     with VideoFile(path, RIG) as film:
         for number in range(20):
             film.show(full_moment(number))
-    video, frames = cv2.VideoCapture(str(path)), list[np.ndarray]()
+    video = cv2.VideoCapture(str(path))
+    frames = list[np.ndarray]()
     assert video.get(cv2.CAP_PROP_FPS) == pytest.approx(layout.FRAMES_PER_S)
     while (got := video.read())[0]:
         frames.append(got[1][..., ::-1])
@@ -206,9 +247,15 @@ PANELS = {
     "banner": ((20, 20), (880, 96)),
     "reconstruction": (layout.LARGE_AT, (layout.LARGE, layout.LARGE)),
     "uncertainty": (layout.MIDDLE_AT, (layout.SMALL, layout.SMALL)),
-    "truth": ((layout.MIDDLE_AT[0], layout.MIDDLE_AT[1] + layout.LOWER), (layout.SMALL, layout.SMALL)),
+    "truth": (
+        (layout.MIDDLE_AT[0], layout.MIDDLE_AT[1] + layout.LOWER),
+        (layout.SMALL, layout.SMALL),
+    ),
     "depth": (layout.RIGHT_AT, (layout.LIDAR_WIDTH, layout.SMALL)),
-    "infrared": ((layout.RIGHT_AT[0], layout.RIGHT_AT[1] + layout.LOWER), (layout.LIDAR_WIDTH, layout.SMALL)),
+    "infrared": (
+        (layout.RIGHT_AT[0], layout.RIGHT_AT[1] + layout.LOWER),
+        (layout.LIDAR_WIDTH, layout.SMALL),
+    ),
     "footer": ((20, 690), (600, 25)),
 }
 
@@ -222,9 +269,12 @@ def changed(before: np.ndarray, after: np.ndarray) -> set[str]:
     return {name for name in PANELS if (panel(before, name) != panel(after, name)).any()}
 
 
-def test_still_shows_each_part_of_a_moment_in_its_panel_and_marks_a_doubted_reconstruction() -> None:
+def test_still_shows_each_part_of_a_moment_in_its_panel_and_marks_a_doubted_reconstruction() -> (
+    None
+):
     one = full_moment(0)
-    frame, still = one.frame, Still(RIG, one)
+    frame = one.frame
+    still = Still(RIG, one)
     before = still.rgb(one)
     assert before.shape == (layout.HEIGHT, layout.WIDTH, 3)
     for panels, others in (
@@ -233,15 +283,24 @@ def test_still_shows_each_part_of_a_moment_in_its_panel_and_marks_a_doubted_reco
         ({"depth"}, {"frame": replace(frame, depth_m=frame.depth_m * np.float32(0.5))}),
         ({"footer"}, {"latency_s": 0.5, "published_s": 0.5}),
         ({"uncertainty"}, {"reconstruction": replace(one.reconstruction, uncertainty_m=flat(0.0))}),
-        *(({"banner", "reconstruction"}, {"verdict": verdict}) for verdict in Verdict if verdict is not Verdict.SEEN),
+        *(
+            ({"banner", "reconstruction"}, {"verdict": verdict})
+            for verdict in Verdict
+            if verdict is not Verdict.SEEN
+        ),
     ):
         assert changed(before, still.rgb(replace(one, **others))) == panels
-    assert (panel(Still(RIG, moment(0)).rgb(moment(0, NOTHING)), "reconstruction") == images.BACKGROUND_RGB).all()
+    assert (
+        panel(Still(RIG, moment(0)).rgb(moment(0, NOTHING)), "reconstruction")
+        == images.BACKGROUND_RGB
+    ).all()
 
 
 def test_still_keeps_lidar_pictures_until_new_ones() -> None:
     still = Still(RIG, full_moment(0))
-    first, kept, new = (still.rgb(full_moment(number), with_lidar=number != 3) for number in (0, 3, 6))
+    first, kept, new = (
+        still.rgb(full_moment(number), with_lidar=number != 3) for number in (0, 3, 6)
+    )
     assert not {"depth", "infrared"} & changed(first, kept)
     assert "reconstruction" in changed(first, kept)
     assert "depth" in changed(kept, new)

@@ -10,7 +10,16 @@ import pytest
 from view_streams import ASSETS, EVERYWHERE, Streams, ask
 
 from nlos_cam.errors import NlosCamError
-from nlos_cam.view.server import LOOPBACK, Served, ViewServer, address_of, exposed, is_loopback, names_of, resolved
+from nlos_cam.view.server import (
+    LOOPBACK,
+    Served,
+    ViewServer,
+    address_of,
+    exposed,
+    is_loopback,
+    names_of,
+    resolved,
+)
 
 
 @pytest.fixture
@@ -41,13 +50,24 @@ def test_server_sends_whole_files_and_refuses_any_other_request(server: ViewServ
         with closing(ask(server.address, path, method="HEAD")) as answer:
             assert (answer.status, int(answer.headers["Content-Length"])) == (200, len(content))
             assert answer.read() == b""
-    assert status_of(server.address, "/../secret") == status_of(server.address, "/", method="POST") == 404
-    assert {status_of(server.address, "/", method=name) for name in ("PUT", "DELETE", "OPTIONS")} == {501}
+    assert (
+        status_of(server.address, "/../secret")
+        == status_of(server.address, "/", method="POST")
+        == 404
+    )
+    assert {
+        status_of(server.address, "/", method=name) for name in ("PUT", "DELETE", "OPTIONS")
+    } == {501}
 
 
-def test_server_closes_connections_beyond_its_limit(streams: Streams, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_server_closes_connections_beyond_its_limit(
+    streams: Streams, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr("nlos_cam.view.server.MAX_CONNECTIONS", 1)
-    with closing(ViewServer(Served(ASSETS, streams), 0)) as server, closing(ask(server.address, "/stream")) as first:
+    with (
+        closing(ViewServer(Served(ASSETS, streams), 0)) as server,
+        closing(ask(server.address, "/stream")) as first,
+    ):
         with pytest.raises((HTTPException, OSError)):
             ask(server.address, "/")
         assert first.read(2000) == b"x" * 2000
@@ -56,7 +76,9 @@ def test_server_closes_connections_beyond_its_limit(streams: Streams, monkeypatc
 
 def test_closing_server_cuts_browsers_that_do_not_read(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("nlos_cam.view.server.CLOSE_AFTER_S", 0.01)
-    server = ViewServer(Served(ASSETS, lambda send: [send(bytes(1 << 20)) for _ in range(1000)] and None), 0)
+    server = ViewServer(
+        Served(ASSETS, lambda send: [send(bytes(1 << 20)) for _ in range(1000)] and None), 0
+    )
     place = urlsplit(server.address)
     with socket.create_connection((place.hostname, place.port)) as silent, socket.socket() as deaf:
         deaf.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
@@ -67,7 +89,9 @@ def test_closing_server_cuts_browsers_that_do_not_read(monkeypatch: pytest.Monke
         assert silent.recv(1) == b""
 
 
-def test_server_replaces_a_busy_port_unless_it_is_exact(server: ViewServer, streams: Streams) -> None:
+def test_server_replaces_a_busy_port_unless_it_is_exact(
+    server: ViewServer, streams: Streams
+) -> None:
     busy = urlsplit(server.address).port or 0
     with pytest.raises(NlosCamError, match=rf"http://127.0.0.1:{busy}/ .* --view-port"):
         ViewServer(Served(ASSETS, streams), busy, exact=True)
@@ -128,7 +152,9 @@ def test_server_limits_streams_and_reuses_their_room(streams: Streams) -> None:
         answer.read()
         answer.close()
     streams.end.clear()
-    while status_of(server.address, "/stream") != 200:  # a stream's thread ends after the browser has seen its end
+    while (
+        status_of(server.address, "/stream") != 200
+    ):  # a stream's thread ends after the browser has seen its end
         pass
     streams.end.set()
     server.close()
@@ -159,11 +185,15 @@ def test_loopback_is_told_from_hosts_that_others_can_reach() -> None:
 CROSS_SITE = {"Sec_Fetch_Site": "cross-site", "Sec_Fetch_Mode": "cors"}
 
 
-@pytest.mark.parametrize("headers", [CROSS_SITE, {"Origin": "http://evil.example"}, {"Origin": "null"}])
+@pytest.mark.parametrize(
+    "headers", [CROSS_SITE, {"Origin": "http://evil.example"}, {"Origin": "null"}]
+)
 def test_server_refuses_pages_of_other_sites(server: ViewServer, headers: dict[str, str]) -> None:
     for path in ("/stream", "/file.wasm"):
         assert status_of(server.address, path, **headers) == 403
-    followed = status_of(server.address, "/", Sec_Fetch_Site="cross-site", Sec_Fetch_Mode="navigate")
+    followed = status_of(
+        server.address, "/", Sec_Fetch_Site="cross-site", Sec_Fetch_Mode="navigate"
+    )
     assert followed == 200, "a person may follow a link to the page"
 
 
@@ -197,7 +227,9 @@ def test_command_needs_the_token_and_answers_in_words(
         assert text in answer.read().decode()
 
 
-def test_slow_requests_end_and_never_lock_others_out(streams: Streams, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_slow_requests_end_and_never_lock_others_out(
+    streams: Streams, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr("nlos_cam.view.server.TIMEOUT_S", 0.5)
     monkeypatch.setattr("nlos_cam.view.server.MAX_CONNECTIONS", 4)
     with closing(ViewServer(Served(ASSETS, streams), 0)) as server:
@@ -207,7 +239,8 @@ def test_slow_requests_end_and_never_lock_others_out(streams: Streams, monkeypat
             with suppress(OSError):
                 connection.sendall(b"G")
         assert status_of(server.address, "/") == 200
-        while slow:  # each ends although it sends a byte now and then; the test's own limit ends a wait in vain
+        # each ends although it sends a byte now and then; the test's own limit ends a wait in vain
+        while slow:
             slow = [connection for connection in slow if drips(connection)]
 
 

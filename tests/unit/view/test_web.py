@@ -23,7 +23,15 @@ from nlos_cam.reconstruct.network import Doubt, Quality
 from nlos_cam.reconstruct.verdict import Verdict
 from nlos_cam.view import PlaybackViewer, RecordedView, WebViewer
 from nlos_cam.view.assessment import RGB, assess, expected_error_m, expected_overlap
-from nlos_cam.view.messages import ERROR_STEP_M, MomentPacker, bench_message, depth_bytes, pack, signed_bytes, unpack
+from nlos_cam.view.messages import (
+    ERROR_STEP_M,
+    MomentPacker,
+    bench_message,
+    depth_bytes,
+    pack,
+    signed_bytes,
+    unpack,
+)
 from nlos_cam.view.session_file import MAX_BYTES, SessionFile
 from nlos_cam.view.viewer import Viewers
 
@@ -67,7 +75,9 @@ def test_measured_bench_is_sent_again_and_leaving_ends_streams() -> None:
     assert list(received)[-1]["state"] == "ended"
 
 
-def test_nothing_is_packed_without_browser(viewer: WebViewer, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_nothing_is_packed_without_browser(
+    viewer: WebViewer, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(MomentPacker, "pack", lambda *_, **__: pytest.fail("packed"))
     for number in range(1000):
         viewer.show(moment(number))
@@ -75,7 +85,9 @@ def test_nothing_is_packed_without_browser(viewer: WebViewer, monkeypatch: pytes
 
 
 def test_slow_browser_skips_to_the_newest_moment() -> None:
-    asked, let, taken = Event(), Event(), list[bytes]()
+    asked = Event()
+    let = Event()
+    taken = list[bytes]()
 
     def slow_browser(content: bytes) -> None:
         if b"moment" in content:
@@ -90,20 +102,28 @@ def test_slow_browser_skips_to_the_newest_moment() -> None:
         assert asked.wait(60.0)
         for number in range(1, 500):
             viewer.show(moment(number))
-        assert any(each.get("frame") == 499 for each in frames(viewer)), "another browser is not kept waiting"
+        assert any(each.get("frame") == 499 for each in frames(viewer)), (
+            "another browser is not kept waiting"
+        )
         let.set()
     thread.join(60.0)
     assert sum(b"moment" in content for content in taken) < 10
 
 
 def test_page_controls_with_the_token_of_the_address() -> None:
-    controls = Mock(**{"status.return_value": {"state": "stalled", "camera": "sim"}, "run.return_value": "done"})
+    controls = Mock(
+        **{"status.return_value": {"state": "stalled", "camera": "sim"}, "run.return_value": "done"}
+    )
     with WebViewer(RIG, controls=controls) as viewer:
         address, _, token = (viewer.address or "").partition("#")
-        assert next(each for each in frames(viewer) if each["kind"] == "status")["state"] == "stalled"
+        assert (
+            next(each for each in frames(viewer) if each["kind"] == "status")["state"] == "stalled"
+        )
         for sent, status in ((token, 200), ("", 403)):
             body = '{"command": "average", "frames": 4}'
-            with closing(ask(address, "/command", method="POST", body=body, X_Token=sent)) as answer:
+            with closing(
+                ask(address, "/command", method="POST", body=body, X_Token=sent)
+            ) as answer:
                 assert answer.status == status
     assert controls.run.call_args_list == [call("average", {"frames": 4})]
 
@@ -132,9 +152,12 @@ def test_playback_keeps_every_moment_for_every_browser() -> None:
 
 
 @pytest.mark.parametrize(
-    ("content", "advice"), [(None, "cannot be read"), (b"something else", "--save-view"), (b"RRF2 old", "rerun")]
+    ("content", "advice"),
+    [(None, "cannot be read"), (b"something else", "--save-view"), (b"RRF2 old", "rerun")],
 )
-def test_recorded_view_refuses_other_files(tmp_path: Path, content: bytes | None, advice: str) -> None:
+def test_recorded_view_refuses_other_files(
+    tmp_path: Path, content: bytes | None, advice: str
+) -> None:
     if content is not None:
         (tmp_path / "other.rrd").write_bytes(content)
     with pytest.raises(RecordingError, match=rf"other\.rrd.*{advice}"):
@@ -177,7 +200,9 @@ def test_full_session_ends_before_the_run(tmp_path: Path, monkeypatch: pytest.Mo
     assert session.kept < 40 < MAX_BYTES
 
 
-def test_session_that_cannot_be_written_is_an_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_session_that_cannot_be_written_is_an_error(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     with pytest.raises(FileNotFoundError), SessionFile(tmp_path / "none" / "view.html", RIG):
         pytest.fail("it is an error at once")
     monkeypatch.setattr(base64, "b64encode", lambda _: 1 / 0)
@@ -186,7 +211,8 @@ def test_session_that_cannot_be_written_is_an_error(tmp_path: Path, monkeypatch:
 
 
 def test_viewers_all_see_every_moment_and_none_stays_open_if_one_cannot_begin() -> None:
-    some, shown = [MagicMock(address=address) for address in (None, "http://one", "http://two")], moment(7)
+    some = [MagicMock(address=address) for address in (None, "http://one", "http://two")]
+    shown = moment(7)
     with Viewers(some) as viewers:
         viewers.show(shown)
         assert viewers.address == "http://one"
@@ -202,9 +228,15 @@ def test_viewers_all_see_every_moment_and_none_stays_open_if_one_cannot_begin() 
 BOX = object_box(RIG)
 
 
-@given(st.dictionaries(st.text(max_size=5).filter(lambda name: name != "arrays"), st.integers()), st.integers(0, 9))
+@given(
+    st.dictionaries(st.text(max_size=5).filter(lambda name: name != "arrays"), st.integers()),
+    st.integers(0, 9),
+)
 def test_unpacked_message_is_the_packed_one(fields: dict[str, int], rows: int) -> None:
-    arrays = {"one": np.arange(rows * 3, dtype=np.uint8).reshape(rows, 3), "two": np.full((2, 2, 3), 7, np.uint8)}
+    arrays = {
+        "one": np.arange(rows * 3, dtype=np.uint8).reshape(rows, 3),
+        "two": np.full((2, 2, 3), 7, np.uint8),
+    }
     found, found_arrays = unpack(pack(fields, arrays))
     assert found == fields
     for name, array in arrays.items():
@@ -218,7 +250,14 @@ def test_bytes_keep_depth_to_a_step_and_differences_symmetric() -> None:
     step_m = (BOX.z_far_m - BOX.z_near_m) / 254
     found_m = BOX.z_near_m + (counts - 1.0) * step_m
     assert np.nanmax(np.abs(np.where(counts > 0, found_m, np.nan) - depth_m)) <= 0.51 * step_m
-    assert signed_bytes(np.array([-9.0, -1.0, 0.0, 1.0, 9.0, np.nan]), 1.0).tolist() == [1, 1, 128, 255, 255, 0]
+    assert signed_bytes(np.array([-9.0, -1.0, 0.0, 1.0, 9.0, np.nan]), 1.0).tolist() == [
+        1,
+        1,
+        128,
+        255,
+        255,
+        0,
+    ]
 
 
 def test_moment_message_holds_every_layer_and_lidar_pictures_if_requested() -> None:
@@ -228,7 +267,9 @@ def test_moment_message_holds_every_layer_and_lidar_pictures_if_requested() -> N
     assert arrays["lidar"].shape == (160, 214)
     assert fields["frame"] == 3
     assert fields["stages_ms"]["network"] > 0
-    np.testing.assert_allclose(arrays["error"] * ERROR_STEP_M, shown.reconstruction.uncertainty_m, atol=ERROR_STEP_M)
+    np.testing.assert_allclose(
+        arrays["error"] * ERROR_STEP_M, shown.reconstruction.uncertainty_m, atol=ERROR_STEP_M
+    )
     _, small = unpack(MomentPacker(RIG).pack(shown, with_lidar=False))
     assert {*arrays} - {*small} == {"lidar", "infrared", "change", "residual"}
 
@@ -240,7 +281,9 @@ def test_moment_without_surface_sends_uncertainty_in_valid_json() -> None:
     assert not arrays["depth"].any()
     assert arrays["error"].any()
     shown = moment(0, NOTHING)
-    dark = replace(shown, frame=replace(shown.frame, depth_m=np.full_like(shown.frame.depth_m, np.nan)))
+    dark = replace(
+        shown, frame=replace(shown.frame, depth_m=np.full_like(shown.frame.depth_m, np.nan))
+    )
     fields, arrays = unpack(MomentPacker(RIG).pack(dark))
     json.dumps(fields, allow_nan=False)
     assert not arrays["lidar"].any()
@@ -250,17 +293,23 @@ def test_moment_without_surface_sends_uncertainty_in_valid_json() -> None:
 def test_bench_message_names_every_part(measured: object) -> None:
     fields, arrays = unpack(bench_message(RIG, measured))  # type: ignore[arg-type]
     assert {"wall", "occluder", "lidar", "frustum", "light"} <= set(fields["parts"])
-    assert len(fields["parts"]["light"]) == 5, "three bounces between leaving and reaching the lidar"
+    assert len(fields["parts"]["light"]) == 5, (
+        "three bounces between leaving and reaching the lidar"
+    )
     assert fields["parts"]["lidar"] == pytest.approx([0.0, 0.0, 0.2])
     assert ("footprint" in fields["parts"]) == (measured is not None)
     assert {"map_depth", "map_error", "map_lidar"} <= set(arrays)
 
 
-def with_doubt(surface: np.ndarray, error_m: float = 0.017, quality: Quality | None = None) -> object:
+def with_doubt(
+    surface: np.ndarray, error_m: float = 0.017, quality: Quality | None = None
+) -> object:
     shown = full_moment(0)
     spread_m = np.full((64, 64), error_m, np.float32)
     doubt = Doubt(0.0, 0.0, spread_m, surface.astype(np.float32), quality)
-    return replace(shown, reconstruction=replace(shown.reconstruction, doubt=doubt, uncertainty_m=spread_m))
+    return replace(
+        shown, reconstruction=replace(shown.reconstruction, doubt=doubt, uncertainty_m=spread_m)
+    )
 
 
 def test_expected_overlap_is_exact_for_certain_pixels_and_needs_a_surface() -> None:
@@ -282,7 +331,9 @@ def test_detected_object_is_graded_by_the_models_numbers() -> None:
 
 @pytest.mark.parametrize("trusted", [True, False])
 @pytest.mark.parametrize("verdict", [Verdict.SEEN, Verdict.OUTSIDE])
-def test_only_a_trusted_quality_of_a_detected_object_is_green(trusted: bool, verdict: Verdict) -> None:
+def test_only_a_trusted_quality_of_a_detected_object_is_green(
+    trusted: bool, verdict: Verdict
+) -> None:
     predicted = Quality((0.58, 0.71, 0.82), 0.6, 0.017, trusted=trusted)
     shown = replace(with_doubt(np.ones((64, 64)), quality=predicted), verdict=verdict)  # type: ignore[type-var]
     told = assess(shown)  # type: ignore[arg-type]
@@ -292,7 +343,9 @@ def test_only_a_trusted_quality_of_a_detected_object_is_green(trusted: bool, ver
 
 
 @pytest.mark.parametrize("verdict", [*Verdict, None])
-def test_no_assessment_is_green_and_only_a_detected_shape_is_trusted(verdict: Verdict | None) -> None:
+def test_no_assessment_is_green_and_only_a_detected_shape_is_trusted(
+    verdict: Verdict | None,
+) -> None:
     told = assess(replace(full_moment(0), verdict=verdict))
     assert told.trusted == (verdict in {Verdict.SEEN, None})
     red, green, blue = told.rgb

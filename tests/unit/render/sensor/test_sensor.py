@@ -1,4 +1,6 @@
-"""Sensor on a rig: model, gain, dead pixels, bias and texture (formulas: tests/laws/test_sensor.py)."""
+"""Sensor on a rig: model, gain, dead pixels, bias and texture (formulas:
+tests/laws/test_sensor.py).
+"""
 
 import re
 from dataclasses import replace
@@ -15,15 +17,27 @@ from pydantic import ValidationError
 from nlos_cam.errors import SceneError
 from nlos_cam.frames import maps_from_frame
 from nlos_cam.objects.placement import object_depth
-from nlos_cam.render import STOPS, MultiBounce, Radiometry, Scene, Sensor, cast, render, sensor_effects
+from nlos_cam.render import (
+    STOPS,
+    MultiBounce,
+    Radiometry,
+    Scene,
+    Sensor,
+    cast,
+    render,
+    sensor_effects,
+)
 from nlos_cam.render.geometry import SPEED_OF_LIGHT_M_PER_S
 from nlos_cam.render.sensor.bias import DepthBias, ripples, smooth_patches, texture
 from nlos_cam.render.sensor.cells import QUANTILES, draw_deviates, normal_quantiles
 from nlos_cam.render.sensor.model import STEADY_CELSIUS, SensorModel, WarmUp
 from nlos_cam.render.sensor.sensor import cell_of_pixels
 
-RIG, BARE = load_rig("paper-rig"), load_rig("bare-wall")
-QUIET = SensorModel(range_noise_m=0, range_noise_per_m=0, read_noise_counts=0, shot_noise=0, dead_share=0)
+RIG = load_rig("paper-rig")
+BARE = load_rig("bare-wall")
+QUIET = SensorModel(
+    range_noise_m=0, range_noise_per_m=0, read_noise_counts=0, shot_noise=0, dead_share=0
+)
 DARK = np.zeros((64, 80), np.float32)
 NO_ECHO = MultiBounce(DARK, DARK, np.full_like(DARK, np.nan))
 
@@ -54,10 +68,13 @@ def test_gain_does_not_depend_on_the_occluder() -> None:
 
 def test_dead_pixels_stay_from_frame_to_frame() -> None:
     model = QUIET.model_copy(update={"dead_share": 0.05})
-    first, second = Sensor(BARE, model), Sensor(BARE, model)
+    first = Sensor(BARE, model)
+    second = Sensor(BARE, model)
     dead = first.expose(NO_ECHO, default_rng(0)).depth_z16 == 0
     for sensor, seed in ((first, 1), (second, 2)):
-        np.testing.assert_array_equal(sensor.expose(NO_ECHO, default_rng(seed)).depth_z16 == 0, dead)
+        np.testing.assert_array_equal(
+            sensor.expose(NO_ECHO, default_rng(seed)).depth_z16 == 0, dead
+        )
     whole = Sensor(BARE, QUIET).expose(NO_ECHO, default_rng(0))
     np.testing.assert_array_equal(first.expose(NO_ECHO, default_rng(0)).ir, whole.ir)
     alive = whole.depth_z16 > 0
@@ -66,7 +83,9 @@ def test_dead_pixels_stay_from_frame_to_frame() -> None:
 
 def test_sensor_with_a_short_gate_gives_black_images() -> None:
     device = BARE.device.model_copy(update={"gate_s": 0.1 / SPEED_OF_LIGHT_M_PER_S})
-    images = Sensor(BARE.model_copy(update={"device": device}), SensorModel()).expose(NO_ECHO, default_rng(0))
+    images = Sensor(BARE.model_copy(update={"device": device}), SensorModel()).expose(
+        NO_ECHO, default_rng(0)
+    )
     assert not images.depth_z16.any()
     assert not images.ir.any()
     assert not images.confidence.any()
@@ -74,13 +93,17 @@ def test_sensor_with_a_short_gate_gives_black_images() -> None:
 
 @pytest.mark.parametrize("k", [1, 2, 5])
 def test_cell_of_pixels_takes_the_beam_at_the_pixel_center(k: int) -> None:
-    rows, columns = 64 * k, 80 * k
+    rows = 64 * k
+    columns = 80 * k
     cell = cell_of_pixels((480, 640), (rows, columns)).reshape(480, 640)
     row, column = np.divmod(cell, columns)
-    centre_row, centre_column = (np.arange(480) + 0.5) / 480, (np.arange(640) + 0.5) / 640
+    centre_row = (np.arange(480) + 0.5) / 480
+    centre_column = (np.arange(640) + 0.5) / 640
     assert (np.abs(centre_row[:, None] - (row + 0.5) / rows) <= 0.5 / rows + 1e-12).all()
     assert (np.abs(centre_column - (column + 0.5) / columns) <= 0.5 / columns + 1e-12).all()
-    np.testing.assert_array_equal(cell_of_pixels((rows, columns), (rows, columns)), np.arange(rows * columns))
+    np.testing.assert_array_equal(
+        cell_of_pixels((rows, columns), (rows, columns)), np.arange(rows * columns)
+    )
 
 
 @pytest.mark.parametrize("shape", [(64, 81), (128, 80), (32, 40), (80, 64), (96, 120), (0, 0)])
@@ -97,7 +120,10 @@ def test_included_direct_return_does_not_compete_again() -> None:
     for echo in (NO_ECHO, faint):
         assert not sensor.expose(replace(echo, direct_included=True), default_rng(0)).ir.any()
     strong = replace(faint, peak=np.ones_like(DARK))
-    apart, mixed = (sensor.expose(replace(strong, direct_included=mixed), default_rng(0)) for mixed in (False, True))
+    apart, mixed = (
+        sensor.expose(replace(strong, direct_included=mixed), default_rng(0))
+        for mixed in (False, True)
+    )
     np.testing.assert_array_equal(apart.depth_z16, mixed.depth_z16)
     assert (mixed.confidence >= apart.confidence).all()
 
@@ -110,7 +136,9 @@ def test_included_direct_return_does_not_compete_again() -> None:
         ("warm_up", ({"from_celsius": 45, "to_celsius": 45, "time_constant_s": 600},)),
     ],
 )
-def test_sensor_model_refuses_values_out_of_range_by_field(field: str, values: tuple[object, ...]) -> None:
+def test_sensor_model_refuses_values_out_of_range_by_field(
+    field: str, values: tuple[object, ...]
+) -> None:
     for value in values:
         with pytest.raises(ValidationError, match=field):
             SensorModel.model_validate({field: value})
@@ -123,7 +151,9 @@ def test_celsius_at_approaches_the_end_of_the_warm_up(one_s: float, other_s: flo
     earlier, later = (model.celsius_at(seconds) for seconds in sorted((one_s, other_s)))
     assert 25 <= earlier <= later <= 45
     # the remaining difference shrinks to 1/e in each time constant
-    assert 45 - model.celsius_at(one_s + 600) == pytest.approx((45 - model.celsius_at(one_s)) / 2.718281828, abs=1e-6)
+    assert 45 - model.celsius_at(one_s + 600) == pytest.approx(
+        (45 - model.celsius_at(one_s)) / 2.718281828, abs=1e-6
+    )
 
 
 SHAPE = 120, 160
@@ -165,7 +195,9 @@ def test_patches_are_smooth_and_of_unit_spread() -> None:
 
 
 def test_patch_drift_grows_in_place_as_the_device_warms() -> None:
-    cold, half, warm = (_bias_m(celsius, patch_drift_m=0.001, warm_up=WARM_UP) for celsius in (25.0, 35.0, 45.0))
+    cold, half, warm = (
+        _bias_m(celsius, patch_drift_m=0.001, warm_up=WARM_UP) for celsius in (25.0, 35.0, 45.0)
+    )
     assert not cold.any()
     assert warm.std() == pytest.approx(0.001, rel=1e-4)
     assert warm.mean() == pytest.approx(0.0, abs=1e-7)  # a shift of the whole view is the drift
@@ -193,18 +225,24 @@ def test_texture_has_stains_and_grain_of_a_cell() -> None:
     pattern = np.log(texture(WALL, 0.2)).reshape(WALL)
     stains = cv2.GaussianBlur(pattern, (0, 0), 8)
     assert 0.3 < (stains.std() / pattern.std()) ** 2 < 0.7
-    grain, cell = pattern - stains, WALL[1] // 80
-    near, far = (np.corrcoef(grain[:, :-by].ravel(), grain[:, by:].ravel())[0, 1] for by in (1, 2 * cell))
+    grain = pattern - stains
+    cell = WALL[1] // 80
+    near, far = (
+        np.corrcoef(grain[:, :-by].ravel(), grain[:, by:].ravel())[0, 1] for by in (1, 2 * cell)
+    )
     assert near > 0.8  # no finer than a pixel
     assert abs(far) < 0.2
 
 
-BIASED, BRIGHT = {"dead_share": 0.1, "ripple_m": 0.003}, {"ambient_counts": 60.0, "bare_wall_counts": 200.0}
+BIASED = {"dead_share": 0.1, "ripple_m": 0.003}
+BRIGHT = {"ambient_counts": 60.0, "bare_wall_counts": 200.0}
 
 
 @pytest.mark.parametrize("change", [{}, BIASED, BRIGHT, {"wall_texture": 0.2}])
 @pytest.mark.parametrize("beams", [1, 2])
-def test_maps_without_noise_are_those_of_the_images_bit_for_bit(change: dict[str, float], beams: int) -> None:
+def test_maps_without_noise_are_those_of_the_images_bit_for_bit(
+    change: dict[str, float], beams: int
+) -> None:
     scene = Scene(RIG, object_depth(3, RIG.object_box)[1])
     multi = render(scene, replace(STOPS["draft"], beams_per_cell=beams)).multi
     sensor = Sensor(RIG, QUIET.model_copy(update=change))
@@ -217,11 +255,15 @@ def test_maps_without_noise_are_those_of_the_images_bit_for_bit(change: dict[str
 
 def test_maps_have_the_noise_of_the_images() -> None:
     echoes = render(Scene(RIG, object_depth(3, RIG.object_box)[1])).multi
-    sensor, frames = Sensor(RIG, SensorModel()), 40
+    sensor = Sensor(RIG, SensorModel())
+    frames = 40
     exposed = [sensor.expose(echoes, default_rng(k)).frame(RIG.pinhole) for k in range(frames)]
     drawn = [sensor.maps(echoes, default_rng(k)) for k in range(frames)]
     for name in ("depth_m", "intensity"):
-        one, other = (np.stack([getattr(m, name) for m in maps]) for maps in (drawn, map(maps_from_frame, exposed)))
+        one, other = (
+            np.stack([getattr(m, name) for m in maps])
+            for maps in (drawn, map(maps_from_frame, exposed))
+        )
         variance = (one.var(0) + other.var(0)) / 2
         noisy = np.isfinite(variance) & (variance > 1e-12)
         assert noisy.mean() > 0.5
@@ -232,9 +274,12 @@ def test_maps_have_the_noise_of_the_images() -> None:
             ratio = np.log(one.var(0) / other.var(0))[noisy]
         assert abs(np.median(ratio)) < 0.03
         # Two-sample Kolmogorov-Smirnov on the residuals of all cells together.
-        middle, spread = (one.mean(0) + other.mean(0)) / 2, np.sqrt(variance)
+        middle = (one.mean(0) + other.mean(0)) / 2
+        spread = np.sqrt(variance)
         with np.errstate(divide="ignore", invalid="ignore"):
-            residuals = [np.sort(((maps - middle) / spread)[:, noisy].ravel()) for maps in (one, other)]
+            residuals = [
+                np.sort(((maps - middle) / spread)[:, noisy].ravel()) for maps in (one, other)
+            ]
         every = np.concatenate(residuals)
         shares = [np.searchsorted(part, every, "right") / part.size for part in residuals]
         assert np.abs(shares[0] - shares[1]).max() < 1.95 * np.sqrt(2 / residuals[0].size)
