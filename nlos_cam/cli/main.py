@@ -155,7 +155,7 @@ def _share_options(app: typer.Typer, group: str = "") -> None:
 
 
 def main(arguments: list[str]) -> int:
-    """Run one command and return its exit code (see docs/reference.md: 0, 1, 2, 3, 4, 130)."""
+    """Run one command and return its exit code (see docs/files.md: 0, 1, 2, 3, 4, 130)."""
     as_json = "--json" in arguments
     command, arguments = _split(arguments)
     common.set_detail()

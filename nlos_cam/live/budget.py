@@ -38,7 +38,7 @@ ONNX_FLOAT32 = "ONNX Runtime float32"
 PERIOD_MS = 1000 / FRAMES_PER_S
 HANDOVER_MS = 2.4
 """From a frame's timestamp to its processing: 95th percentile of delivery and queue in
-docs/live.json.
+docs/figures/live.json.
 """
 BUSY_SHARE = 0.5
 """Share of each frame period for processing: the rest is for camera, view and other programs."""

@@ -1,5 +1,5 @@
 """Starting times of the command line, beside those of a bare interpreter and of NumPy: a table, and
-docs/start.json.
+docs/figures/start.json.
 
 `python tools/checks/start.py [--runs N] [--only WORD] [--out FILE]`. Each program runs N times; the
 runs of different programs alternate, so that a busy machine slows all alike, and medians are
@@ -164,7 +164,7 @@ def main() -> int:
         metavar="WORD",
         help="measure only the programs whose name has this word",
     )
-    parser.add_argument("--out", type=Path, default=DOCS / "start.json", metavar="FILE")
+    parser.add_argument("--out", type=Path, default=DOCS / "figures" / "start.json", metavar="FILE")
     asked = parser.parse_args()
     chosen = {
         name: run for name, run in programs().items() if name in {BARE, NUMPY} or asked.only in name

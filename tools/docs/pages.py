@@ -1,7 +1,7 @@
 """Generated parts of the docs: every command and option, our row of the comparison, and the
 gallery's tables.
 
-`python tools/docs/pages.py [commands] [comparison] [gallery] [--check]`: all without names;
+`python tools/docs/pages.py [reference] [comparison] [gallery] [--check]`: all without names;
 `--check` only compares. Run it after `nlos-cam evaluate`, `nlos-cam tradeoff reconstruct` and
 tools/studies/weights.py limits.
 """
@@ -10,6 +10,7 @@ import argparse
 import json
 import re
 import sys
+import tomllib
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, get_args, get_origin
@@ -21,11 +22,9 @@ from nlos_cam.cli.main import build_app
 from nlos_cam.evaluate import TARGETS, format_interval
 
 DOCS = Path(__file__).parents[2] / "docs"
-HEAD = """# Every command and option
-
-Written by `python tools/docs/pages.py commands` from the program itself, and compared with it by a test. Purpose of the
-commands, their `--json` answers, exit codes and files: [commands and files](reference.md).
-"""
+HEAD = Path(__file__).parent / "reference_head.md"
+ANSWERS = Path(__file__).parent / "answers.toml"
+"""Fields of each command's JSON object, by command."""
 EVERYWHERE = {
     "--json": "ends stdout with one JSON object",
     "--overwrite": "replaces the output, if it exists",
@@ -73,8 +72,8 @@ def option_row(parameter: Any) -> str:
     return f"| `{name}` | {kind_of(parameter)} | {default_of(parameter)} | {text} |"
 
 
-def section(name: str, command: Any) -> str:
-    """Return a command's purpose and options."""
+def section(name: str, command: Any, answer: str) -> str:
+    """Return a command's purpose, its answer and its options."""
     shared = [
         option for parameter in command.params for option in parameter.opts if option in EVERYWHERE
     ]
@@ -89,17 +88,20 @@ def section(name: str, command: Any) -> str:
         if shared
         else ""
     )
-    parts = f"## {name}", " ".join(command.help.split()), "\n".join(table), also
+    answers = f"Answers: {answer}."
+    parts = f"## {name}", " ".join(command.help.split()), answers, "\n".join(table), also
     return "\n\n".join(part for part in parts if part)
 
 
-def commands_page() -> str:
-    """Return docs/commands.md."""
+def reference_page() -> str:
+    """Return docs/reference.md."""
     app = typer.main.get_command(build_app())
-    return (
-        "\n\n".join([HEAD.rstrip(), *(section(name, command) for name, command in commands(app))])
-        + "\n"
-    )
+    answers = tomllib.loads(ANSWERS.read_text(encoding="utf-8"))
+    sections = [
+        section(name, command, answers[name.removeprefix("nlos-cam ")])
+        for name, command in commands(app)
+    ]
+    return "\n\n".join([HEAD.read_text(encoding="utf-8").rstrip(), *sections]) + "\n"
 
 
 def comparison_row(figures: Mapping[str, Any], cost: Mapping[str, Any]) -> str:
@@ -159,8 +161,8 @@ def filled(text: str, tables: Mapping[str, str]) -> str:
 
 
 def read(name: str) -> Any:
-    """Return the figures of a JSON in docs."""
-    return json.loads((DOCS / f"{name}.json").read_text(encoding="utf-8"))
+    """Return the figures of a JSON in docs/figures."""
+    return json.loads((DOCS / "figures" / f"{name}.json").read_text(encoding="utf-8"))
 
 
 def comparison_page() -> str:
@@ -176,7 +178,7 @@ def gallery_page() -> str:
 
 
 PAGES: dict[str, Callable[[], str]]
-PAGES = {"commands": commands_page, "comparison": comparison_page, "gallery": gallery_page}
+PAGES = {"reference": reference_page, "comparison": comparison_page, "gallery": gallery_page}
 
 
 def main() -> int:

@@ -1,4 +1,4 @@
-"""Damaged files of every format through everything that reads them: docs/fuzz.json.
+"""Damaged files of every format through everything that reads them: docs/figures/fuzz.json.
 
 `fuzz.py [--count N] [--minutes M] [--only NAME] [--first NUMBER] [--out FILE] [--keep FOLDER]
 [--files FOLDER]`. Each case runs in a process forked from one that has loaded the program, and has
@@ -298,7 +298,7 @@ def main() -> int:
     parser.add_argument("--minutes", type=float, default=1e6, help="limit of each group's time")
     parser.add_argument("--only", default="", help="only inputs with this in their name")
     parser.add_argument("--group", default="", help=f"only {' or '.join(GROUPS)}")
-    parser.add_argument("--out", type=Path, default=DOCS / "fuzz.json")
+    parser.add_argument("--out", type=Path, default=DOCS / "figures" / "fuzz.json")
     parser.add_argument("--keep", type=Path, default=Path(tempfile.gettempdir()))
     parser.add_argument(
         "--files", type=Path, help="folder of the whole files, kept for the next call"

@@ -323,7 +323,7 @@ def make_inputs(home: Path, group: str) -> dict[str, Input]:
             weights,
         )
     describe = partial(read_text, load=lambda path: command("info", path.parent))
-    place("figures.json", ROOT / "docs" / "figures.json", describe)
+    place("figures.json", ROOT / "docs" / "figures" / "figures.json", describe)
     return inputs
 
 

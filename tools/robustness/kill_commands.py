@@ -1,5 +1,5 @@
 """Commands killed at random moments, and pairs of them started at once on one output:
-docs/kill_commands.json.
+docs/figures/kill_commands.json.
 
 `kill_commands.py [--kills N] [--races N] [--seed S] [--only NAME] [--out FILE]`. After each kill
 the same command runs again: it has to end well and keep finished parts, nothing half-written may be

@@ -1,4 +1,4 @@
-"""Hours of `live` with a watcher that comes and goes: docs/soak.json and docs/images/soak.png.
+"""Hours of `live` with a watcher that comes and goes: docs/figures/soak.json and docs/images/soak.png.
 
 `soak.py [--minutes M] [--camera URI] [--watcher visits|stays|none] [--out FILE]`. Once a minute it
 notes memory, threads and descriptors of the process, and latency and drops of that minute's frames.
@@ -136,7 +136,7 @@ def main() -> int:
     parser.add_argument("--minutes", type=int, default=120)
     parser.add_argument("--camera", default="sim")
     parser.add_argument("--watcher", choices=WATCHERS, default="visits")
-    parser.add_argument("--out", type=Path, default=DOCS / "soak.json")
+    parser.add_argument("--out", type=Path, default=DOCS / "figures" / "soak.json")
     chosen = parser.parse_args()
     minutes = list[Minute]()
     visits = list[int]()

@@ -372,7 +372,7 @@ def options(about: str | None, file: str, **counts: int) -> argparse.ArgumentPar
         parser.add_argument(f"--{name}", type=int, default=count)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--only", default="", help="only commands with this in their name")
-    parser.add_argument("--out", type=Path, default=DOCS / file)
+    parser.add_argument("--out", type=Path, default=DOCS / "figures" / file)
     parser.add_argument(
         "--inputs", type=Path, help="folder of the commands' inputs, kept for the next call"
     )

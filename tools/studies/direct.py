@@ -1,7 +1,7 @@
 """Direct networks side by side, each trained for equal processor seconds:
-docs/direct_ablations.json and .md.
+docs/figures/direct_ablations.json and .md.
 
-And a learning curve over runs of one recipe with other budgets: docs/direct_curve.json,
+And a learning curve over runs of one recipe with other budgets: docs/figures/direct_curve.json,
 docs/images/direct_curve.png.
 
 `python tools/studies/direct.py --store DIR --dataset DIR --held-out DIR [--samples N]
@@ -218,7 +218,7 @@ def compare(chosen: Namespace, source: PackedMaps) -> None:
         "held_out": first_of(open_dataset(chosen.held_out).arrays(), base.held_out),
     }
     torch.set_num_threads(1)  # after rendering, whose threads set the number anew
-    path = chosen.out / "direct_ablations.json"
+    path = chosen.out / "figures" / "direct_ablations.json"
     rows = json.loads(path.read_text(encoding="utf-8")) if path.exists() else []
     jobs = [partial(judged, text, source, sets) for text in chosen.weights]
     jobs += [
@@ -251,9 +251,7 @@ def compare(chosen: Namespace, source: PackedMaps) -> None:
             for key, wanted in {"kinds": 0.85, "unseen": 0.72}.items()
         }
         facts = [{key: row[key] for key in ("name", "samples", "objects")} for row in curve]
-        (chosen.out / "direct_curve.json").write_text(
-            json.dumps({"runs": facts, **fits}, indent=2), encoding="utf-8"
-        )
+        harness.write("direct_curve", {"runs": facts, **fits}, chosen.out)
         (chosen.out / "images").mkdir(exist_ok=True)
         draw_curve(curve).savefig(chosen.out / "images" / "direct_curve.png", dpi=110)
         print(fits)

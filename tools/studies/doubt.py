@@ -1,4 +1,4 @@
-"""Calibration of the uncertainty network: docs/doubt.json and docs/images/reliability.png.
+"""Calibration of the uncertainty network: docs/figures/doubt.json and docs/images/reliability.png.
 
 Expected against observed error on the 54 test objects and on held-out ones; objects shown on empty
 benches; detection of outliers, of kinds in the training set and of others. `--weights DIR` names

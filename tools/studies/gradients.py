@@ -1,6 +1,6 @@
 """Gradients: their cost, how well a bench determines its object, and a pose fitted to echoes.
 
-python tools/studies/gradients.py [cost] [bound] [pose] [--trials 6]   docs/gradients.json and .png
+python tools/studies/gradients.py [cost] [bound] [pose] [--trials 6]   docs/figures/gradients.json and .png
 
 Each part that is named (default: all) replaces its own part of the JSON; the picture belongs to
 `bound`.
@@ -186,7 +186,7 @@ def main() -> None:
     parser.add_argument("parts", nargs="*", choices=[*PARTS, []], default=[])
     parser.add_argument("--trials", type=int, default=6)
     asked = parser.parse_args()
-    path = harness.DOCS / "gradients.json"
+    path = harness.DOCS / "figures" / "gradients.json"
     for name in asked.parts or PARTS:
         result = PARTS[name](asked)
         table: dict[str, Any] = (

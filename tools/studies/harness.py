@@ -108,8 +108,8 @@ def difference(figure: Mapping[str, float | None]) -> str:
 
 
 def write(name: str, facts: Any, folder: Path | None = None) -> None:
-    """Write docs/NAME.json, or the same in another folder."""
-    path = (folder or DOCS) / f"{name}.json"
+    """Write docs/figures/NAME.json, or the same in another folder."""
+    path = (folder or DOCS) / "figures" / f"{name}.json"
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(json.dumps(facts, indent=2) + "\n", encoding="utf-8")
 

@@ -2,9 +2,9 @@
 over recordings.
 
 python tools/studies/transfer.py record DIR [--scene examples/bench.toml] [--frames 8] python
-tools/studies/transfer.py figures DIR [--weights W]      docs/transfer.json python
+tools/studies/transfer.py figures DIR [--weights W]      docs/figures/transfer.json python
 tools/studies/transfer.py curve DIR RUNS --recipe direct-transfer [--weights W]
-docs/transfer_curve.json, .png
+docs/figures/transfer_curve.json, .png
 
 DIR holds the 54 test objects as labelled recordings of a simulated bench, for adaptation,
 validation and judging: of 8 frames of 640 x 480 they take 0.4 GB and two minutes, and a second call

@@ -49,7 +49,7 @@ def run(tool: Tool, harness: ModuleType, monkeypatch: Patch) -> Read:
     def call(line: str, result: str, *arguments: object) -> Any:
         monkeypatch.setattr("sys.argv", [*line.split(), *map(str, arguments)])
         tool(line.split(maxsplit=1)[0]).main()
-        return json.loads((harness.DOCS / f"{result}.json").read_text(encoding="utf-8"))
+        return json.loads((harness.DOCS / "figures" / f"{result}.json").read_text(encoding="utf-8"))
 
     return call
 
