@@ -1,4 +1,4 @@
-"""Every gate in one command: formatting, lint, types, import layers, docs, words (`make check`)."""
+"""Every gate in one command: formatting, lint, types, import layers, docs, words and density."""
 
 import subprocess
 import sys
@@ -13,6 +13,7 @@ GATES = (
     ("lint-imports",),
     ("python", "tools/docs/build_site.py", "--check"),
     ("python", "tools/checks/words.py"),
+    ("python", "tools/checks/density.py"),
 )
 
 
