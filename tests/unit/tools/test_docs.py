@@ -2,6 +2,7 @@
 commands run.
 """
 
+import re
 import runpy
 import shutil
 import sys
@@ -12,8 +13,8 @@ from types import ModuleType
 
 import numpy as np
 import pytest
-import typer
 
+import nlos_cam
 from nlos_cam.camera import simulated_world
 from nlos_cam.cli.main import main
 from nlos_cam.render.scene_file import Motion, paper_scene
@@ -178,3 +179,11 @@ def test_every_command_block_is_followed_by_its_answer(tool: Tool) -> None:
     assert all(found["answer"].strip() for found in tutorial.STEP.finditer(text)), (
         "run `python tools/docs/tutorial.py`"
     )
+
+
+def test_the_version_is_the_same_everywhere() -> None:
+    cited = re.search(r"^version: (\S+)$", (ROOT / "CITATION.cff").read_text("utf-8"), re.MULTILINE)
+
+    assert cited is not None
+    assert cited[1] == nlos_cam.__version__
+    assert f"## {nlos_cam.__version__}" in (ROOT / "CHANGELOG.md").read_text("utf-8")
