@@ -59,7 +59,7 @@ def truth_depth_m(recording: Path, label: str, rig: Rig, known: Mapping[str, Flo
     for name in dict.fromkeys((recording.stem, Path(label).name)):
         if (file := _truth_file(recording.parent, name)) is not None:
             return (
-                _depth_map(file)
+                _depth_map(file, shapes.object_box(rig))
                 if file.suffix == shapes.DEPTH_MAP_SUFFIX
                 else _placed(file, name, rig)
             )
@@ -97,8 +97,8 @@ def _meshes(folder: Path, name: str) -> list[Path]:
     return [path for end in shapes.MESH_SUFFIXES if (path := folder / f"{name}{end}").is_file()]
 
 
-def _depth_map(path: Path) -> Float32:
-    depth_m = shapes.read_depth_map(path)
+def _depth_map(path: Path, box: ObjectBox) -> Float32:
+    depth_m, _ = shapes.without_absent(shapes.read_depth_map(path), str(path), box)
     if depth_m.shape != (OBJECT_PIXELS, OBJECT_PIXELS):
         raise RecordingError(
             f"{path} has shape {depth_m.shape}: the depth map of a label needs {OBJECT_PIXELS} x"

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from nlos_cam import objects as shapes
 from nlos_cam.dataset.plan import DatasetPlan, Objects, scene_row
-from nlos_cam.errors import SceneError
+from nlos_cam.errors import SceneError, SceneFileError
 from nlos_cam.frames import LidarMaps
 from nlos_cam.render import Radiometry, Scene, Sensor, SensorModel, Surface, render
 
@@ -185,20 +185,36 @@ def hidden_object(objects: Objects, seed: int, box: ObjectBox) -> tuple[str, Flo
     return name, depth_m
 
 
+MAX_NAMED = 10
+"""Broken meshes that one error names."""
+
+
 def objects_from_folder(folder: Path, on_progress: OnProgress = ignore) -> Objects:
     """Read the meshes of a folder and its subfolders. Raises SceneError for none, or one that
     cannot be used.
     """
     paths = shapes.folder_objects(folder)
     meshes = list[tuple[str, str]]()
-    for path in paths:
+    problems = list[SceneError]()
+    for number, path in enumerate(paths, start=1):
         name = path.relative_to(folder).as_posix()
         try:
             name.encode()
         except UnicodeEncodeError as error:  # a shard stores names as UTF-8
             raise SceneError(f"the name of the mesh {name!a} is not UTF-8: rename it") from error
-        meshes.append((name, shapes.read_mesh(path).sha256))
-        on_progress(len(meshes), len(paths))
+        try:
+            meshes.append((name, shapes.read_mesh(path).sha256))
+        except SceneError as error:
+            problems.append(error)
+        on_progress(number, len(paths))
+    if len(problems) == 1:
+        raise problems[0]
+    if problems:
+        named = "; ".join(map(str, problems[:MAX_NAMED]))
+        more = f"; and {len(problems) - MAX_NAMED} more" if len(problems) > MAX_NAMED else ""
+        raise SceneFileError(
+            f"{len(problems)} of {len(paths)} meshes in {folder} cannot be used: {named}{more}"
+        )
     return Objects((), tuple(meshes), folder=folder.resolve())
 
 

@@ -38,6 +38,7 @@ __all__ = [
     "read_mesh",
     "turn_upright",
     "unseen_objects",
+    "without_absent",
 ]
 
 from .benchmark import OBJECTS_PER_CATEGORY, BenchmarkObject, benchmark_objects, unseen_objects
@@ -50,7 +51,7 @@ from .depth_map import (
 )
 from .generators import CATEGORIES, find_category
 from .generic import generic_depth
-from .loading import OBJECT_FILES, load_object, object_kind
+from .loading import OBJECT_FILES, load_object, object_kind, without_absent
 from .meshes import (
     DEPTH_MAP_SUFFIX,
     MESH_SUFFIXES,

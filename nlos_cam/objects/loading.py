@@ -8,7 +8,7 @@ from typing import Literal
 
 import numpy as np
 from nlos_calibration import ObjectBox
-from nlos_calibration.arrays import Float32
+from nlos_calibration.arrays import Float32, Float64
 
 from nlos_cam.errors import SceneError, UnknownNameError, did_you_mean
 from nlos_cam.objects.depth_map import orthographic_depth
@@ -85,9 +85,10 @@ def load_object(
             " pose"
         )
     if kind == "depth map":
-        depth_m = read_depth_map(Path(label))
-        empty = f"{label} is an empty object (all NaN): it hides nothing"
-        return LoadedObject(depth_m, (empty,) if np.isnan(depth_m).all() else ())
+        depth_m, notes = without_absent(read_depth_map(Path(label)), label, box)
+        if np.isnan(depth_m).all():
+            notes += (f"{label} is an empty object (all NaN or 0): it hides nothing",)
+        return LoadedObject(depth_m, notes)
     triangles = (
         category_triangles(label, seed)
         if kind == "category"
@@ -98,7 +99,7 @@ def load_object(
     if np.isnan(depth_m).all():
         raise invisible_object_error(label, box)
     fit = fit_in_box(triangles, pose, box)
-    warnings = list[str]()
+    warnings = _vanishing(label, triangles, depth_m)
     if fit.outside:
         warnings.append(
             f"{label}: {fit.outside:.0%} of its silhouette lies outside the object box and is"
@@ -110,3 +111,53 @@ def load_object(
             " object box"
         )
     return LoadedObject(depth_m, tuple(warnings))
+
+
+FEW_CELLS = 10
+FAR_FACES = 5.0
+"""Extents of the rest of a mesh from which on a face counts as far from it."""
+FEW_FACES = 0.05
+
+
+def without_absent(depth_m: Float32, label: str, box: ObjectBox) -> tuple[Float32, tuple[str, ...]]:
+    """Return a depth map with NaN where a depth of 0 stands for "no data", and what was changed.
+
+    Depth cameras write 0 there, and a depth of 0 is the relay wall itself. Raises SceneError for
+    other depths nearer than the box.
+    """
+    absent = depth_m == 0
+    found = np.where(absent, np.float32(np.nan), depth_m)
+    nearer = int((found < box.z_near_m).sum())
+    if nearer:
+        raise SceneError(
+            f"{label} has {nearer} of {depth_m.size} cells nearer than the object box"
+            f" ({box.z_near_m:g} m from the wall): depths are from the wall into the room, NaN or 0"
+            " for background"
+        )
+    if not absent.any():
+        return found, ()
+    return found, (f"{label}: {absent.sum()} cells with a depth of 0 are taken as background",)
+
+
+def _vanishing(label: str, triangles: Float64, depth_m: Float32) -> list[str]:
+    """Return warnings on an object of which next to nothing is left to see."""
+    warnings = list[str]()
+    covered = int(np.isfinite(depth_m).sum())
+    if covered < FEW_CELLS:
+        warnings.append(
+            f"{label} covers {covered} of {depth_m.size} cells of the object box: next to nothing"
+            " is hidden"
+        )
+    centers = triangles.mean(1)
+    middle = np.median(centers, axis=0)
+    distance = np.linalg.norm(centers - middle, axis=1)
+    extent = np.ptp(triangles.reshape(-1, 3), axis=0).max()
+    # The size of the bulk of the mesh: of all but the farthest faces.
+    bulk = 2 * np.quantile(distance, 1 - FEW_FACES, method="lower")
+    far = distance > FAR_FACES * max(bulk, 1e-12)
+    if far.any() and far.mean() < 0.5 and extent > FAR_FACES * bulk:
+        warnings.append(
+            f"{label}: {far.sum()} of its {len(far)} faces lie {distance[far].max():.3g} units away"
+            " from the others, and the size counts them: remove them"
+        )
+    return warnings

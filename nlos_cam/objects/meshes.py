@@ -27,6 +27,7 @@ from nlos_cam.errors import SceneError, SceneFileError
 from nlos_cam.frames import OBJECT_PIXELS
 from nlos_cam.objects.depth_map import orthographic_depth
 from nlos_cam.objects.placement import place, random_pose
+from nlos_cam.objects.polygons import cut_obj_polygons, ply_triangles
 
 if TYPE_CHECKING:
     import trimesh
@@ -36,6 +37,7 @@ _PLAIN = bytes(range(128)).replace(b"\t", b" ") + b"?" * 128
 _COMMENT = re.compile(rb"#[^\n]*")
 _RELATIVE = re.compile(rb" -(\d+)")
 _RELATIVE_FACE = re.compile(rb"^f [^\n]*-", re.MULTILINE)
+_DECIMAL_COMMA = re.compile(rb"^vn? [^\n]*\d,\d[^\n]*", re.MULTILINE)
 _VERTEX_0 = re.compile(rb"^f[^\n]* 0+(?!\d)", re.MULTILINE)
 
 
@@ -62,12 +64,27 @@ def plain(content: bytes, suffix: str) -> bytes:
 def _checked_binary(content: bytes, suffix: str) -> bytes:
     if suffix == ".obj":
         raise _MeshProblemError("it is not text")
-    faces = int.from_bytes(content[80:84], "little")
-    if suffix == ".stl" and len(content) != 84 + 50 * faces:
-        raise _MeshProblemError(
-            f"it has {len(content)} bytes, but its {faces} faces take {84 + 50 * faces}"
+    return _whole_stl(content) if suffix == ".stl" else content
+
+
+def _whole_stl(content: bytes) -> bytes:
+    """Return a binary .stl of the length that its count of faces asks for.
+
+    Some programs write a count of 0, or add bytes after the last face: both leave no doubt about
+    the faces. Raises ValueError for a file that is shorter than its faces.
+    """
+    counted = int.from_bytes(content[80:84], "little")
+    present = (len(content) - 84) // STL_FACE_BYTES
+    if counted == 0:
+        return (
+            content[:80] + present.to_bytes(4, "little") + content[84:][: STL_FACE_BYTES * present]
         )
-    return content
+    if present < counted:
+        needed = 84 + STL_FACE_BYTES * counted
+        raise _MeshProblemError(
+            f"it has {len(content)} bytes, but its {counted} faces take {needed}"
+        )
+    return content[: 84 + STL_FACE_BYTES * counted]
 
 
 def _plain_obj(text: bytes) -> bytes:
@@ -76,7 +93,10 @@ def _plain_obj(text: bytes) -> bytes:
         text = _with_absolute_indices(text)
     if _VERTEX_0.search(text):
         raise _MeshProblemError("a face names vertex 0, but vertices count from 1")
-    return text
+    if comma := _DECIMAL_COMMA.search(text):
+        shown = comma[0].decode().strip()
+        raise _MeshProblemError(f"it writes numbers with a comma ({shown!r}): use a point")
+    return cut_obj_polygons(text)
 
 
 def _with_absolute_indices(text: bytes) -> bytes:
@@ -110,6 +130,7 @@ parsed.
 MAX_COORDINATE = 1e30
 """Limit of a vertex's coordinates, in any unit: their squares stay finite."""
 _REDUCE = "reduce the mesh, or save it as binary"
+STL_FACE_BYTES = 50
 MIN_CELLS = 8
 MAX_CELLS = 256
 MAX_DEPTH_M = 10.0
@@ -144,8 +165,7 @@ def read_mesh(path: Path) -> MeshFile:
                 f"{path} has {size / 2**20:.0f} MiB, the limit is {MAX_BYTES >> 20} MiB: {_REDUCE}"
             )
         content = path.read_bytes()
-        parts = _parts(content, suffix)
-        triangles = np.concatenate([np.empty((0, 3, 3)), *(_triangles(part) for part in parts)])
+        triangles = _triangles_of(content, suffix)
     if problem := _problem(triangles):
         raise SceneFileError(f"{path} {problem}")
     return MeshFile(path, hashlib.sha256(content).hexdigest(), triangles)
@@ -234,6 +254,27 @@ def _parts(content: bytes, suffix: str) -> list[trimesh.Trimesh]:
         stream = BytesIO(plain(content, suffix))
         scene = trimesh.load_scene(stream, suffix[1:], process=False, fix_texture=False)
     return [part for part in scene.geometry.values() if isinstance(part, trimesh.Trimesh)]
+
+
+def _triangles_of(content: bytes, suffix: str) -> Float64:
+    """Return the triangles (n, 3, 3) of a file's content."""
+    if suffix == ".ply" and _has_strips(content):
+        return ply_triangles(content)
+    parts = _parts(content, suffix)
+    triangles = np.concatenate([np.empty((0, 3, 3)), *(_triangles(part) for part in parts)])
+    # More triangles than faces: the parser cut polygons as fans.
+    if suffix == ".ply" and len(triangles) > _ply_face_count(content):
+        return ply_triangles(content)
+    return triangles
+
+
+def _has_strips(content: bytes) -> bool:
+    return b"element tristrips" in content.partition(b"end_header")[0]
+
+
+def _ply_face_count(content: bytes) -> int:
+    found = re.search(rb"element face (\d+)", content.partition(b"end_header")[0])
+    return int(found[1]) if found else 0
 
 
 def _triangles(part: trimesh.Trimesh) -> Float64:
