@@ -12,9 +12,9 @@ from safetensors import SafetensorError
 from safetensors.torch import load, save
 from torch import nn
 
+from nlos_cam.files import TENSOR_LIMIT, describe, read_checked, write_checked
 from nlos_models.direct import DirectNetwork
 from nlos_models.errors import CheckpointError
-from nlos_models.files import TENSOR_LIMIT, describe, read_checked, write_checked
 from nlos_models.pipeline import RemappingNetwork, new_pipeline, new_vae
 from nlos_models.records import (
     DIRECT,

@@ -19,13 +19,13 @@ from numpy.typing import NDArray
 from onnx import TensorProto, helper, numpy_helper
 from torch import Tensor, nn
 
+from nlos_cam.files import write_checked
 from nlos_models import inference
 from nlos_models.arrays import Float32
 from nlos_models.checkpoint import load_network
 from nlos_models.direct import DirectNetwork
 from nlos_models.doubt_network import load_doubt
 from nlos_models.errors import CheckpointError, ModelError
-from nlos_models.files import write_checked
 from nlos_models.pipeline import RemappingNetwork
 from nlos_models.recipe import SIMULATION_ONLY
 from nlos_models.records import DOUBT, CheckpointRecord, checksum_of_watched, watched_files

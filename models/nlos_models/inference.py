@@ -10,10 +10,10 @@ from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 
+from nlos_cam.files import TENSOR_LIMIT, load_cached, read_checked
 from nlos_models import records
 from nlos_models.arrays import Float32
 from nlos_models.errors import CheckpointError, MissingExtraError, lacks_memory, require
-from nlos_models.files import TENSOR_LIMIT, load_cached, read_checked
 from nlos_models.quality import DOUBT_FILES, QualityModel, UncertaintyEstimate, load_quality_model
 from nlos_models.recipe import SIMULATION_ONLY
 

@@ -15,9 +15,9 @@ from typing import NamedTuple, Self
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
+from nlos_cam.files import TEXT_LIMIT, read_checked, write_checked
 from nlos_models.arrays import Float32, Mask
 from nlos_models.errors import CheckpointError, first_problem
-from nlos_models.files import TEXT_LIMIT, read_checked, write_checked
 from nlos_models.records import DOUBT, DOUBT_RECORD, checksum_of_watched
 
 QUALITY = "quality.json"

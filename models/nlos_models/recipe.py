@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any, Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
+from nlos_cam.files import read_toml
 from nlos_models.errors import RecipeError, UnknownRecipeError, first_problem
-from nlos_models.files import read_toml
 
 if TYPE_CHECKING:
     import torch

@@ -10,8 +10,8 @@ from typing import Self
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, ValidationInfo, field_validator
 
+from nlos_cam.files import TEXT_LIMIT, read_checked
 from nlos_models.errors import CheckpointError, first_problem
-from nlos_models.files import TEXT_LIMIT, read_checked
 from nlos_models.recipe import SIMULATION_ONLY, MapKind, Recipe
 
 RECORD = "checkpoint.json"

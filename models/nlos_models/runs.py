@@ -10,6 +10,7 @@ from pathlib import Path
 import torch
 from lightning_fabric import Fabric
 
+from nlos_cam.files import OutputExistsError, claim
 from nlos_models import checkpoint
 from nlos_models.arrays import Float16
 from nlos_models.data import MapSet, MapSource
@@ -17,9 +18,8 @@ from nlos_models.direct import DirectNetwork
 from nlos_models.direct_training import NormalSource, train_direct, transfer_direct
 from nlos_models.doubt_network import save_doubt
 from nlos_models.doubt_training import DoubtSet, calibrate, train_doubt
-from nlos_models.errors import OutputExistsError, TrainingError
+from nlos_models.errors import TrainingError
 from nlos_models.export import export_folder
-from nlos_models.files import claim
 from nlos_models.pipeline import RemappingNetwork, new_vae
 from nlos_models.recipe import SIMULATION_ONLY, Recipe
 from nlos_models.records import (

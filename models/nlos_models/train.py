@@ -25,9 +25,9 @@ import torch
 from lightning_fabric import Fabric
 from torch import Tensor, nn
 
+from nlos_cam.files import TENSOR_LIMIT, atomic_file, read_bounded
 from nlos_models.distributed import Loss, LossStep, open_fabric, precision_on, seed_of, share_of
 from nlos_models.errors import CheckpointError, ModelError, RecipeError, TrainingError
-from nlos_models.files import TENSOR_LIMIT, atomic_file, read_bounded
 from nlos_models.recipe import Recipe, has_ended, schedule_of
 
 LAST = "last.ckpt"

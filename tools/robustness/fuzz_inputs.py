@@ -20,7 +20,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import trimesh
 from nlos_calibration import load_rig, load_wall, reference
-from nlos_models import checksums_of, load_cached, load_recipe, load_record, shipped_folder
+from nlos_models import load_recipe, load_record, shipped_folder
 from noise_recordings import record
 from rosbags.rosbag1 import Reader
 
@@ -28,6 +28,7 @@ from nlos_cam.camera import open_camera, simulated_world
 from nlos_cam.cli.config import read_settings
 from nlos_cam.cli.main import main
 from nlos_cam.errors import NlosCamError
+from nlos_cam.files import checksums_of, load_cached
 from nlos_cam.objects import SurfaceMesh, read_depth_map, read_mesh
 from nlos_cam.recording import load_sidecar
 from nlos_cam.render import bare_wall_scene, load_scene

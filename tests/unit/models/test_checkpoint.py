@@ -9,7 +9,7 @@ from unittest.mock import Mock
 import numpy as np
 import pytest
 import torch
-from nlos_models import CHECKSUMS, SIMULATION_ONLY, checkpoint
+from nlos_models import SIMULATION_ONLY, checkpoint
 from nlos_models.compressor import Compressor
 from nlos_models.errors import CheckpointError
 from nlos_models.pipeline import RemappingNetwork, new_vae
@@ -17,6 +17,8 @@ from nlos_models.vae import Decoder, ResVae
 from safetensors.torch import load_file, save
 from small_run import small_recipe, state_of
 from torch import nn
+
+from nlos_cam.files import CHECKSUMS
 
 pytestmark = pytest.mark.usefixtures("narrow_networks", "one_thread")
 

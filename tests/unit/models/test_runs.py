@@ -11,14 +11,15 @@ from nlos_calibration.rig import load_rig
 from nlos_models import checkpoint, runs
 from nlos_models.checkpoint import CheckpointRecord, save_direct, save_pipeline, save_vae
 from nlos_models.direct import DirectNetwork
-from nlos_models.errors import OutputExistsError, TrainingError
-from nlos_models.files import CHECKSUMS
+from nlos_models.errors import TrainingError
 from nlos_models.pipeline import RemappingNetwork
 from nlos_models.recipe import Recipe
 from nlos_models.runs import compressor_start, record_run, transfer_start, vae_start
 from safetensors.torch import load_file, save_file
 from small_maps import SmallCompressor, SmallVae, use_small_networks
 from small_run import changed_tensors, small_recipe
+
+from nlos_cam.files import CHECKSUMS, OutputExistsError
 
 RIG = load_rig("paper-rig")
 NAMED = (RIG.name, RIG.checksum)
