@@ -11,9 +11,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from nlos_models.data import MapNoise
 from nlos_models.metrics import MIN_V
-from nlos_models.recipe import DirectSize
+from nlos_models.training.recipe import DirectSize
 
 ROWS = 64
 COLUMNS = 80
@@ -156,34 +155,6 @@ class CellNormal(nn.Module):
         middle = ordered.gather(1, ((number - 1) // 2).clamp(min=0))
         return torch.where(number > 0, middle, 0.0)[:, 0]
 
-    def vary(
-        self,
-        normal: Tensor,
-        noise: MapNoise | None,
-        log_reflectance: Tensor | None,
-        offset_m: Tensor | None,
-    ) -> Tensor:
-        """Return the maps (n, 2, 64, 80), normalised as `forward` does, as another bench or moment
-        would give them.
-
-        Noise is the sensor's, drawn for the intensity of expected maps; the logarithm of the wall's
-        reflectance (n, 64, 80) adds to that of the light, and a range offset (n,) to all depths.
-        """
-        depth = normal[:, :1]
-        light = normal[:, 1:]
-        returns = (normal != 0).any(dim=1, keepdim=True)
-        counts = torch.expm1(light * self.spread[1:] + self.median[1:])
-        if log_reflectance is not None:
-            counts = counts * log_reflectance.exp()[:, None]
-        if noise is not None:
-            counts = noise.add(counts)
-        if offset_m is not None:
-            depth = depth + offset_m[:, None, None, None] / self.spread[:1]
-        varied = torch.cat(
-            [depth, (torch.log1p(counts) - self.median[1:]) / self.spread[1:]], dim=1
-        )
-        return torch.where(returns, varied.clamp(-CLIP, CLIP), normal)
-
 
 def channels_of(*, color: bool) -> int:
     """Return the number of normalised channels: depth, and one intensity or three."""
@@ -310,29 +281,4 @@ def image_from_logits(logits: Tensor) -> Tensor:
     surface = share > cuts[overlap.argmax(1)][:, None, None]
     return torch.where(
         surface if values.dim() == 3 else surface[:, None], MIN_V + (1 - MIN_V) * values, 0.0
-    )
-
-
-def two_heads_error(logits: Tensor, truth: Tensor) -> Tensor:
-    """Return the loss of logits (n, 2, 64, 64) against images (n, 64, 64): cross-entropy, overlap
-    and depth.
-
-    Cross-entropy of the silhouette, plus 0.5 (1 - soft intersection over union), plus 2 times the
-    absolute error of v over the surface; each is a mean over pixels or objects. In color, (n, 4,
-    64, 64) against (n, 3, 64, 64), the error of v is the mean of three.
-    """
-    logits = logits.float()
-    truth = truth.float() if truth.dim() == 4 else truth.float()[:, None]
-    occupied = logits[:, 0]
-    values = logits[:, 1:]
-    surface = (truth > 0).any(1).float()
-    entropy = functional.binary_cross_entropy_with_logits(occupied, surface)
-    share = torch.sigmoid(occupied)
-    both = (share * surface).sum((1, 2))
-    one = (share + surface - share * surface).sum((1, 2))
-    off = (MIN_V + (1 - MIN_V) * torch.sigmoid(values) - truth).abs().mean(1) * surface
-    return (
-        entropy
-        + 0.5 * (1 - (both + 1) / (one + 1)).mean()
-        + 2 * off.sum() / surface.sum().clamp(min=1)
     )

@@ -3,10 +3,9 @@ and depth error.
 
 A small network in numpy on some fifty figures of the image, of the uncertainty network's answer
 and, where the reconstructing network has one, of its own probability of a surface, fitted to
-reconstructions of known objects by `train quality` (`doubt_training`).
+reconstructions of known objects by `train quality` (`uncertainty`).
 """
 
-import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,13 +14,13 @@ from typing import NamedTuple, Self
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from nlos_cam.files import TEXT_LIMIT, read_checked, write_checked
+from nlos_cam.files import TEXT_LIMIT, read_checked
 from nlos_models.arrays import Float32, Mask
 from nlos_models.errors import CheckpointError, first_problem
-from nlos_models.records import DOUBT, DOUBT_RECORD, checksum_of_watched
+from nlos_models.records import UNCERTAINTY, UNCERTAINTY_RECORD, checksum_of_watched
 
 QUALITY = "quality.json"
-DOUBT_FILES = f"{DOUBT}.safetensors", DOUBT_RECORD
+UNCERTAINTY_FILES = f"{UNCERTAINTY}.safetensors", UNCERTAINTY_RECORD
 GOOD_IOU = 0.75
 PRECISION = 0.9
 """A frame is trusted where its silhouette IoU is at least the first in at least the second of like
@@ -246,20 +245,6 @@ def _sigmoid(x: Float32) -> Float32:
     return (1 / (1 + np.exp(-x.clip(-30.0, 30.0)))).astype(np.float32)
 
 
-def quality_watches(folder: Path) -> str:
-    """Return the checksum of the uncertainty network in a folder, which a quality model is bound
-    to.
-    """
-    return checksum_of_watched(folder, DOUBT_FILES)
-
-
-def write_quality(folder: Path, record: QualityRecord) -> None:
-    """Write a quality model beside the weights that it watches, with its checksum. Raises OSError,
-    FileBusyError.
-    """
-    write_checked(folder, {QUALITY: (json.dumps(record.model_dump(mode="json")) + "\n").encode()})
-
-
 def load_quality_model(folder: Path) -> QualityModel | None:
     """Load the quality model beside a checkpoint's weights; None where there is none.
 
@@ -277,7 +262,7 @@ def load_quality_model(folder: Path) -> QualityModel | None:
         raise CheckpointError(f"{path} cannot be read ({error}): {advice}") from error
     if not _fits(record):
         raise CheckpointError(f"{path} has layers that do not fit each other: {advice}")
-    if record.watches != (found := quality_watches(folder)):
+    if record.watches != (found := checksum_of_watched(folder, UNCERTAINTY_FILES)):
         other = f"another uncertainty network ({record.watches}, not {found})"
         raise CheckpointError(f"{path} was fitted to {other}: {advice}")
     return QualityModel(record)

@@ -6,10 +6,9 @@ import os
 from contextlib import suppress
 from typing import Annotated, NamedTuple
 
-import nlos_models as models
 import typer
 from nlos_calibration.errors import CalibrationError
-from nlos_models.errors import ModelError
+from nlos_models.errors import ModelError, lacks_memory, missing_extra
 from typer.main import get_command
 
 from nlos_cam.cli import common
@@ -225,10 +224,10 @@ def _known_error(error: Exception, command: str) -> NlosCamError | ModelError | 
     """Return a lack of memory, a missing extra or an error about a file as one of our errors; None
     for others.
     """
-    if models.lacks_memory(error):  # also of a library while it is imported or works
+    if lacks_memory(error):  # also of a library while it is imported or works
         return NlosCamError("out of memory: close other programs, or raise the limit of this one")
     if isinstance(error, ModuleNotFoundError):
-        return models.missing_extra(error, f"nlos-cam {command}")
+        return missing_extra(error, f"nlos-cam {command}")
     if isinstance(error, OSError) and (error.errno in DISK_ERRORS or error.filename is not None):
         return _file_error(error)
     return None

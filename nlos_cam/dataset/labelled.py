@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from nlos_calibration import ObjectBox, Rig, first_problem, load_rig
 from nlos_calibration.arrays import Float32
-from nlos_models import MapSet
+from nlos_models.training import MapSet
 from pydantic import ValidationError
 
 from nlos_cam import objects as shapes

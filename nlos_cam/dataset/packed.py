@@ -15,7 +15,8 @@ from pathlib import Path
 import numpy as np
 import torch
 from nlos_calibration import Rig
-from nlos_models import CellNormal, MapNoise, MapSet, NormalBatch, channels_of, first_of
+from nlos_models import CellNormal, channels_of
+from nlos_models.training import MapNoise, MapSet, NormalBatch, first_of
 
 from nlos_cam.dataset.plan import DatasetPlan, RigSpread
 from nlos_cam.dataset.reader import MAP_CHANNELS, open_dataset

@@ -11,8 +11,9 @@ import pytest
 import torch
 from fake_farm import samples_of
 from nlos_calibration import load_rig
-from nlos_models import CellNormal, MapBatch
-from nlos_models.data import flip_some, subtract_bare_wall
+from nlos_models import CellNormal
+from nlos_models.training import MapBatch
+from nlos_models.training.data import flip_some, subtract_bare_wall
 from small_maps import SmallDataset, small_maps
 from small_run import small_recipe
 

@@ -5,8 +5,8 @@ import pytest
 import torch
 from nlos_models import metrics
 from nlos_models.arrays import Float32
-from nlos_models.recipe import ImageLoss
-from nlos_models.vae import image_error, kl_divergence, latent_error, variational_share
+from nlos_models.training.losses import image_error, kl_divergence, latent_error, variational_share
+from nlos_models.training.recipe import ImageLoss
 
 EMPTY = np.zeros((1, 64, 64), np.float32)
 

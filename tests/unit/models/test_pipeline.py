@@ -14,15 +14,6 @@ from nlos_models import (
     split_and_stack,
 )
 from nlos_models.compressor import Compressor, ResNet50
-from nlos_models.data import (
-    InMemory,
-    first_of,
-    flip_some,
-    image_batches,
-    map_batches,
-    shuffled,
-    subtract_bare_wall,
-)
 from nlos_models.pipeline import (
     KEPT_SHARE,
     WINDOW,
@@ -30,6 +21,15 @@ from nlos_models.pipeline import (
     new_pipeline,
     new_vae,
     stacked_channels,
+)
+from nlos_models.training.data import (
+    InMemory,
+    first_of,
+    flip_some,
+    image_batches,
+    map_batches,
+    shuffled,
+    subtract_bare_wall,
 )
 from small_maps import HARD_MAPS, hard_maps, small_maps
 from torch import Tensor

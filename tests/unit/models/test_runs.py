@@ -8,13 +8,14 @@ from pathlib import Path
 import pytest
 import torch
 from nlos_calibration.rig import load_rig
-from nlos_models import checkpoint, runs
-from nlos_models.checkpoint import CheckpointRecord, save_direct, save_pipeline, save_vae
+from nlos_models import CheckpointRecord, checkpoint
 from nlos_models.direct import DirectNetwork
 from nlos_models.errors import TrainingError
 from nlos_models.pipeline import RemappingNetwork
-from nlos_models.recipe import Recipe
-from nlos_models.runs import compressor_start, record_run, transfer_start, vae_start
+from nlos_models.training import runs
+from nlos_models.training.checkpoints import save_direct, save_pipeline, save_vae
+from nlos_models.training.recipe import Recipe
+from nlos_models.training.runs import compressor_start, record_run, transfer_start, vae_start
 from safetensors.torch import load_file, save_file
 from small_maps import SmallCompressor, SmallVae, use_small_networks
 from small_run import changed_tensors, small_recipe

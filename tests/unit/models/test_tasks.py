@@ -8,10 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from nlos_models import Recipe, Running, Scores, tasks, train
-from nlos_models.data import InMemory, map_batches
 from nlos_models.errors import TrainingError
 from nlos_models.pipeline import RemappingNetwork, channel_statistics, split_and_stack
+from nlos_models.training import Recipe, Running, Scores, tasks
+from nlos_models.training import loop as train
+from nlos_models.training.data import InMemory, map_batches
 from small_maps import SmallCompressor, SmallVae, small_images, small_maps, use_small_networks
 from small_run import Stopped, changed_tensors, log_rows, small_recipe, state_of, stop_halfway
 from torch import Tensor

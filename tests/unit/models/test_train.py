@@ -22,11 +22,11 @@ from unittest.mock import Mock
 import pytest
 import small_run
 import torch
-from nlos_models import recipe as schedule
-from nlos_models import train
-from nlos_models.direct_training import NormalBatch
-from nlos_models.distributed import launch, open_fabric, precision_on, seed_of, share_of
 from nlos_models.errors import CheckpointError, RecipeError, TrainingError
+from nlos_models.training import loop as train
+from nlos_models.training import schedule
+from nlos_models.training.direct import NormalBatch
+from nlos_models.training.distributed import launch, open_fabric, precision_on, seed_of, share_of
 from small_run import STEPS, SmallRun, Stopped, changed_tensors, small_recipe, state_of
 from torch import Tensor, nn
 from torch._inductor import config
@@ -65,7 +65,7 @@ def test_run_killed_at_random_moments_equals_uninterrupted(tmp_path: Path) -> No
     moments = random.Random(0).sample(range(2, clerk.seen // 2), 4)  # noqa: S311  each start resumes the last one
     context = multiprocessing.get_context("forkserver")
     context.set_forkserver_preload(
-        ["nlos_models.train", "pytest"]
+        ["nlos_models.training.loop", "pytest"]
     )  # each process begins with them imported
     ends: list[int | None] = []
     for moment in moments:

@@ -10,11 +10,12 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from nlos_models.data import STATISTICS_OBJECTS, MapBatch, MapNoise, MapSet, MapSource
-from nlos_models.direct import COLUMNS, ROWS, CellNormal, DirectNetwork, two_heads_error
-from nlos_models.recipe import Recipe
-from nlos_models.tasks import figures_of, in_two_phases, run
-from nlos_models.train import Running, Scores, fit
+from nlos_models.direct import CLIP, COLUMNS, ROWS, CellNormal, DirectNetwork
+from nlos_models.training.data import STATISTICS_OBJECTS, MapBatch, MapNoise, MapSet, MapSource
+from nlos_models.training.loop import Running, Scores, fit
+from nlos_models.training.losses import two_heads_error
+from nlos_models.training.recipe import DirectRecipe, TransferRecipe
+from nlos_models.training.tasks import figures_of, in_two_phases, run
 
 STAINS = 9, 11
 """Knots of a wall's stains along each axis of the maps."""
@@ -44,7 +45,7 @@ class NormalSource(Protocol):
 
 
 def train_direct(
-    recipe: Recipe,
+    recipe: DirectRecipe,
     source: NormalSource,
     held_out: MapSet,
     folder: Path,
@@ -71,6 +72,7 @@ def train_direct(
     logits = running.maybe_compile(network.logits)
 
     def loss(batch: NormalBatch, _: float) -> Tensor:
+        # Maps are rendered once, without noise; each step draws another, so that no noise is learnt.
         normal = _varied(recipe, network.normal, batch.normal.float(), source.noise)
         return two_heads_error(
             logits(normal + recipe.noise * torch.randn_like(normal)), batch.image
@@ -96,6 +98,8 @@ def blend(network: DirectNetwork, start: DirectNetwork, share: float) -> None:
     """Replace a network's parameters by means with another's, of which its own have a share; new
     layers stay.
     """
+    # Weights on both ends of a fine-tuning lie in one basin of the loss, so that their mean is good
+    # on the old maps and on the new ones.
     theirs = dict(start.named_parameters())
     with torch.no_grad():
         for name, own in network.named_parameters():
@@ -104,7 +108,7 @@ def blend(network: DirectNetwork, start: DirectNetwork, share: float) -> None:
 
 
 def transfer_direct(
-    recipe: Recipe,
+    recipe: TransferRecipe,
     network: DirectNetwork,
     maps: MapSource,
     held_out: MapSet,
@@ -133,7 +137,7 @@ def transfer_direct(
         )
 
     def fit_phase(
-        phase: Recipe, phase_folder: Path, running: Running, *, last_layers: bool
+        phase: TransferRecipe, phase_folder: Path, running: Running, *, last_layers: bool
     ) -> Scores:
         network.requires_grad_(not last_layers)
         for layer in network.last_layers:
@@ -153,7 +157,9 @@ def transfer_direct(
     return network.cpu().eval(), figures
 
 
-def _varied(recipe: Recipe, cells: CellNormal, normal: Tensor, noise: MapNoise | None) -> Tensor:
+def _varied(
+    recipe: DirectRecipe, cells: CellNormal, normal: Tensor, noise: MapNoise | None
+) -> Tensor:
     """Return normalised maps (n, 2, 64, 80) with noise, and on walls and with range offsets as the
     recipe has them.
     """
@@ -165,13 +171,46 @@ def _varied(recipe: Recipe, cells: CellNormal, normal: Tensor, noise: MapNoise |
         offset_m = recipe.range_offset_m * torch.randn(len(normal), device=normal.device)
     if noise is None and reflectance is None and offset_m is None:
         return normal
-    return cells.vary(normal, noise, reflectance, offset_m)
+    return vary(cells, normal, noise, reflectance, offset_m)
+
+
+def vary(
+    cells: CellNormal,
+    normal: Tensor,
+    noise: MapNoise | None,
+    log_reflectance: Tensor | None,
+    offset_m: Tensor | None,
+) -> Tensor:
+    """Return the maps (n, 2, 64, 80), normalised as `cells` does, as another bench or moment would
+    give them.
+
+    Noise is the sensor's, drawn for the intensity of expected maps; the logarithm of the wall's
+    reflectance (n, 64, 80) adds to that of the light, and a range offset (n,) to all depths.
+    """
+    depth = normal[:, :1]  # (n, 1, 64, 80)
+    light = normal[:, 1:]  # (n, 1 or 3, 64, 80)
+    returns = (normal != 0).any(dim=1, keepdim=True)
+
+    # Noise and reflectance act on counts, so that the normalisation (a logarithm) is undone.
+    median = cells.median[1:]
+    spread = cells.spread[1:]
+    counts = torch.expm1(light * spread + median)
+    if log_reflectance is not None:
+        counts = counts * log_reflectance.exp()[:, None]
+    if noise is not None:
+        counts = noise.add(counts)
+    if offset_m is not None:
+        depth = depth + offset_m[:, None, None, None] / cells.spread[:1]
+
+    varied = torch.cat([depth, (torch.log1p(counts) - median) / spread], dim=1)
+    return torch.where(returns, varied.clamp(-CLIP, CLIP), normal)
 
 
 def _stains(count: int, device: torch.device) -> Tensor:
     """Return patterns (count, 64, 80) of mean 0 and variance 1: half stains of some cells, half
     grain.
     """
+    # The sum of two independent patterns of variance 1 has variance 2.
     coarse = torch.randn(count, 1, *STAINS, device=device)
     stains = functional.interpolate(coarse, (ROWS, COLUMNS), mode="bilinear", align_corners=True)[
         :, 0

@@ -14,14 +14,6 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from nlos_models.arrays import Float16, Float32
-from nlos_models.data import (
-    STATISTICS_OBJECTS,
-    MapBatch,
-    MapSet,
-    MapSource,
-    as_images,
-    image_batches,
-)
 from nlos_models.errors import TrainingError
 from nlos_models.metrics import color_error, color_silhouette_iou, silhouette_iou
 from nlos_models.pipeline import (
@@ -31,16 +23,18 @@ from nlos_models.pipeline import (
     new_vae,
     split_and_stack,
 )
-from nlos_models.recipe import Recipe
-from nlos_models.train import Running, Scores, fit
-from nlos_models.vae import (
-    Encoder,
-    ResVae,
-    image_error,
-    kl_divergence,
-    latent_error,
-    variational_share,
+from nlos_models.training.data import (
+    STATISTICS_OBJECTS,
+    MapBatch,
+    MapSet,
+    MapSource,
+    as_images,
+    image_batches,
 )
+from nlos_models.training.loop import Running, Scores, fit
+from nlos_models.training.losses import image_error, kl_divergence, latent_error, variational_share
+from nlos_models.training.recipe import CompressorRecipe, MapRecipe, TransferRecipe, VaeRecipe
+from nlos_models.vae import Encoder, ResVae
 
 SCORING_BATCH = 100
 ALL_LAYERS = "all-layers"
@@ -73,17 +67,17 @@ class Remapping:
         self.pipeline.preprocess.learn(stacked, channels)
 
     def fit(
-        self, recipe: Recipe, frozen: Iterable[nn.Module], folder: Path, running: Running
+        self, recipe: MapRecipe, frozen: Iterable[nn.Module], folder: Path, running: Running
     ) -> Scores:
         """Train all of the pipeline except its frozen parts; a second call resumes.
 
         Frozen parts keep their weights and run in eval mode, so that their batch norms keep their
         statistics too.
         """
-        still = list(frozen)
+        frozen_parts = list(frozen)
         fabric = running.fabric_for(recipe)
         self.pipeline.requires_grad_(requires_grad=True)
-        for part in still:
+        for part in frozen_parts:
             part.requires_grad_(requires_grad=False)
         pipeline = in_channels_last(self.pipeline).to(fabric.device)
         targets = self._targets(recipe, fabric)
@@ -91,10 +85,15 @@ class Remapping:
         decode = running.maybe_compile(pipeline.decoder)
 
         def loss(batch: MapBatch, _: float) -> Tensor:
-            for part in still:
+            # `fit` has set the whole module to train. A frozen batch norm in that mode would go on
+            # adapting its statistics, and the decoder would no longer be the VAE's.
+            for part in frozen_parts:
                 part.eval()
-            latent = encode(batch.depth_m, batch.intensity)
+            latent = encode(batch.depth_m, batch.intensity)  # (b, 256)
             value = torch.zeros((), device=latent.device)
+
+            # The latent loss alone is SI 4's idea. It does not know which directions of the latent
+            # change the image, so that our recipes add the image behind the frozen decoder.
             if targets:
                 straight, mirrored = (pair[batch.row] for pair in targets)
                 target = torch.where(batch.mirrored[:, None, None], mirrored, straight)
@@ -117,7 +116,7 @@ class Remapping:
             running=running,
         )
 
-    def _targets(self, recipe: Recipe, fabric: Fabric) -> list[Tensor]:
+    def _targets(self, recipe: MapRecipe, fabric: Fabric) -> list[Tensor]:
         """Return the latents (n, 2, latent) of the images and of their mirror images; none without
         a latent loss.
         """
@@ -135,6 +134,8 @@ class Remapping:
             .requires_grad_(requires_grad=False)
             .eval()
         )
+        # Both orientations once, in place of an encoder's pass at every step; a mirrored object has
+        # its own latent, since the encoder is not symmetric.
         with fabric.autocast():
             return [
                 latents_of(encoder, images).float()
@@ -149,7 +150,7 @@ def in_channels_last(module: Module) -> Module:
     return module.to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue] (torch's stub omits it)
 
 
-def set_for_training(pipeline: RemappingNetwork, recipe: Recipe) -> None:
+def set_for_training(pipeline: RemappingNetwork, recipe: MapRecipe) -> None:
     """Give a loaded pipeline the recipe's dropout and noise, which checkpoints do not hold."""
     pipeline.preprocess.left_noise = recipe.left_noise
     for module in pipeline.compressor.modules():
@@ -207,7 +208,7 @@ def figures_of(image: Float32, truth: Float16 | Float32) -> Scores:
 
 
 def train_vae(
-    recipe: Recipe,
+    recipe: VaeRecipe,
     images: Float16,
     held_out: Float16,
     folder: Path,
@@ -223,16 +224,18 @@ def train_vae(
     running = running or Running()
     vae = in_channels_last(start or new_vae(color=recipe.colour))
     forward = running.maybe_compile(vae)
-    kept = recipe.start == "decoder"
-    vae.decoder.requires_grad_(not kept)
+    trains_decoder = recipe.start != "decoder"
+    vae.decoder.requires_grad_(trains_decoder)
 
     def loss(image: Tensor, done: float) -> Tensor:
-        vae.decoder.train(
-            not kept
-        )  # a decoder that is kept keeps the statistics of its batch norms too
+        # A decoder that stays keeps the statistics of its batch norms too.
+        vae.decoder.train(trains_decoder)
         if recipe.augmentation == "turns":
             image = turn_some(image, torch.randint(4, (len(image),), device=image.device))
         image = image.contiguous(memory_format=torch.channels_last)
+
+        # (b, 1, 64, 64) -> mean and log-variance (b, 256) -> one draw of the latent -> image: the
+        # evidence lower bound with one sample (Kingma and Welling 2013), its two terms weighted.
         share = variational_share(done, recipe.latent_warm_up)
         noise = share * torch.randn(len(image), vae.latent, device=image.device)
         decoded, mean, log_variance = forward(image, noise)
@@ -265,7 +268,7 @@ class Start:
 
 
 def train_compressor(
-    recipe: Recipe,
+    recipe: CompressorRecipe,
     start: Start,
     maps: MapSource,
     held_out: MapSet,
@@ -281,6 +284,7 @@ def train_compressor(
     torch.manual_seed(recipe.seed)
     pipeline = _starting_pipeline(recipe, start)
     remapping = Remapping(pipeline, start.vae.encoder if start.vae else None, maps, held_out)
+    # Two-step weights bring their statistics: other ones would shift every input of the compressor.
     if recipe.steps != "two-then-joint":
         remapping.learn_statistics()
     frozen = [pipeline.decoder] if recipe.steps == "two" else []
@@ -288,7 +292,7 @@ def train_compressor(
     return pipeline.cpu().eval(), figures
 
 
-def _starting_pipeline(recipe: Recipe, start: Start) -> RemappingNetwork:
+def _starting_pipeline(recipe: CompressorRecipe, start: Start) -> RemappingNetwork:
     if recipe.steps == "one":
         return new_pipeline(
             color=recipe.colour,
@@ -335,7 +339,7 @@ def rebuild(vae: ResVae, images: Float16 | Float32) -> Float32:
 
 
 def train_transfer(
-    recipe: Recipe,
+    recipe: TransferRecipe,
     pipeline: RemappingNetwork,
     encoder: Encoder | None,
     maps: MapSource,
@@ -357,7 +361,7 @@ def train_transfer(
         remapping.learn_statistics(CHANNELS[recipe.statistics])
 
     def fit_phase(
-        phase: Recipe, phase_folder: Path, running: Running, *, last_layers: bool
+        phase: TransferRecipe, phase_folder: Path, running: Running, *, last_layers: bool
     ) -> Scores:
         features = [pipeline.compressor.get_submodule("features")] if last_layers else []
         return remapping.fit(phase, [pipeline.decoder, *features], phase_folder, running)
@@ -370,16 +374,18 @@ class FitPhase(Protocol):
     """Training of one phase of a transfer: of all layers, or of the last ones alone."""
 
     def __call__(
-        self, phase: Recipe, phase_folder: Path, running: Running, *, last_layers: bool
+        self, phase: TransferRecipe, phase_folder: Path, running: Running, *, last_layers: bool
     ) -> Scores: ...
 
 
 def in_two_phases(
-    recipe: Recipe, samples: int, folder: Path, running: Running, fit_phase: FitPhase
+    recipe: TransferRecipe, samples: int, folder: Path, running: Running, fit_phase: FitPhase
 ) -> Scores:
     """Train all layers for `all_layers_epochs`, then the last ones (SI 4); return the last phase's
     figures.
     """
+    # A few epochs let all layers adapt to the bench's statistics. Then only the last ones go on:
+    # recordings are few, and would be learnt by heart by all layers.
     steps = samples // recipe.batch
     before = recipe.all_layers_epochs * steps
     total = before + recipe.epochs * steps

@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from torch.multiprocessing.spawn import ProcessExitedException, ProcessRaisedException
 
 from nlos_models.errors import RecipeError, TrainingError
-from nlos_models.recipe import Precision, Recipe
+from nlos_models.training.recipe import Precision, Recipe
 
 Accelerator = Literal["auto", "cpu", "cuda"]
 Loss = Callable[[Any, float], Tensor]
@@ -55,6 +55,7 @@ def open_fabric(recipe: Recipe, *, accelerator: Accelerator = "auto", devices: i
             f"{devices} GPU{'s' if devices > 1 else ''} requested, {gpus or 'none'} available"
         )
         raise TrainingError(f"{requested}: choose fewer --devices, or --accelerator cpu")
+    # Processes are spawned, not forked: CUDA and the threads of a BLAS do not survive a fork.
     strategy = "ddp_spawn" if devices > 1 else "auto"
     precision = precision_on(accelerator, recipe)
     return Fabric(accelerator=accelerator, devices=devices, strategy=strategy, precision=precision)
@@ -67,6 +68,8 @@ def precision_on(device: str, recipe: Recipe) -> Precision:
     Measured on two threads of an AMD EPYC without AVX-512: 25 samples per second in bfloat16, 235
     in float32.
     """
+    # bfloat16 has float32's range, so that losses need no scaling as in float16; its 8 bits are
+    # enough for products, while weights, sums and losses stay in float32.
     emulated = device == "cpu" and torch.backends.cpu.get_cpu_capability() in {"DEFAULT", "AVX2"}
     return "32-true" if emulated else recipe.precision
 

@@ -30,7 +30,7 @@ MAX_ERROR_V = 1.0
 """Range of an expected error."""
 
 
-class DoubtOutput(NamedTuple):
+class UncertaintyOutput(NamedTuple):
     """Raw outputs for training: logits, and the logarithm of a scale."""
 
     nothing: Tensor
@@ -62,7 +62,7 @@ class _Up(nn.Module):
         return self.join(torch.cat([wide, fine], 1))
 
 
-class DoubtNetwork(nn.Module):
+class UncertaintyNetwork(nn.Module):
     """Uncertainty network of maps (n, 64, 80) and images (n, 64, 64)."""
 
     bare_depth_m: Tensor
@@ -99,7 +99,7 @@ class DoubtNetwork(nn.Module):
         features += [torch.tanh(brighter / scale) for scale in INTENSITY_SCALES]
         return torch.stack([*features, invalid.to(depth_m.dtype)], 1)
 
-    def forward(self, depth_m: Tensor, intensity: Tensor, image: Tensor) -> DoubtOutput:
+    def forward(self, depth_m: Tensor, intensity: Tensor, image: Tensor) -> UncertaintyOutput:
         """Return the raw outputs for maps (n, 64, 80) with NaN for no return and images (n, 64, 64)
         in [0, 1].
         """
@@ -116,17 +116,17 @@ class DoubtNetwork(nn.Module):
         )
         pooled = [part for x in (from_maps, joint) for part in (x.mean((2, 3)), x.amax((2, 3)))]
         logits = self.frame(torch.cat(pooled, 1))
-        return DoubtOutput(logits[:, 0], logits[:, 1], pixels[:, 0] - 3.0, pixels[:, 1])
+        return UncertaintyOutput(logits[:, 0], logits[:, 1], pixels[:, 0] - 3.0, pixels[:, 1])
 
 
-class CalibratedDoubt(nn.Module):
+class CalibratedUncertainty(nn.Module):
     """Uncertainty network with its calibration: probabilities, and an expected error in v."""
 
     temperature: Tensor
     error_scale: Tensor
 
     def __init__(
-        self, network: DoubtNetwork, temperatures: tuple[float, float], error_scale: float
+        self, network: UncertaintyNetwork, temperatures: tuple[float, float], error_scale: float
     ) -> None:
         super().__init__()
         self.network = network
@@ -144,8 +144,8 @@ class CalibratedDoubt(nn.Module):
         return torch.sigmoid(nothing), torch.sigmoid(outside), error_v, torch.sigmoid(raw.surface)
 
 
-def save_doubt(
-    folder: Path, network: DoubtNetwork, record: records.DoubtRecord, watched: Path
+def save_uncertainty_network(
+    folder: Path, network: UncertaintyNetwork, record: records.UncertaintyRecord, watched: Path
 ) -> None:
     """Write an uncertainty network and its record into a folder, with a copy of the watched weights
     from elsewhere.
@@ -155,20 +155,22 @@ def save_doubt(
             f"{watched} changed during the training of its uncertainty network: train again"
         )
     text = json.dumps(record.model_dump(mode="json"), indent=2)
-    save_parts(folder, {records.DOUBT: network}, {records.DOUBT_RECORD: text})
+    save_parts(folder, {records.UNCERTAINTY: network}, {records.UNCERTAINTY_RECORD: text})
     if folder.resolve() != watched.resolve():
         for name in (*records.watched_files(watched), records.RECORD):
             shutil.copyfile(watched / name, folder / name)
 
 
-def load_doubt(folder: Path) -> tuple[CalibratedDoubt, records.DoubtRecord] | None:
+def load_uncertainty_network(
+    folder: Path,
+) -> tuple[CalibratedUncertainty, records.UncertaintyRecord] | None:
     """Return the calibrated uncertainty network beside a pipeline's weights in eval mode, or None
     where there is none.
 
     Raises CheckpointError where it cannot be read or watches other weights.
     """
-    if (record := records.load_doubt_record(folder)) is None:
+    if (record := records.load_uncertainty_record(folder)) is None:
         return None
-    network = DoubtNetwork()
-    load_part(folder / f"{records.DOUBT}.safetensors", network)
-    return CalibratedDoubt(network, record.temperatures, record.error_scale).eval(), record
+    network = UncertaintyNetwork()
+    load_part(folder / f"{records.UNCERTAINTY}.safetensors", network)
+    return CalibratedUncertainty(network, record.temperatures, record.error_scale).eval(), record

@@ -11,6 +11,7 @@ sums.
 import csv
 import hashlib
 import io
+import json
 import math
 import os
 import time
@@ -26,9 +27,17 @@ from lightning_fabric import Fabric
 from torch import Tensor, nn
 
 from nlos_cam.files import TENSOR_LIMIT, atomic_file, read_bounded
-from nlos_models.distributed import Loss, LossStep, open_fabric, precision_on, seed_of, share_of
 from nlos_models.errors import CheckpointError, ModelError, RecipeError, TrainingError
-from nlos_models.recipe import Recipe, has_ended, schedule_of
+from nlos_models.training.distributed import (
+    Loss,
+    LossStep,
+    open_fabric,
+    precision_on,
+    seed_of,
+    share_of,
+)
+from nlos_models.training.recipe import Recipe, recipe_of
+from nlos_models.training.schedule import has_ended, schedule_of
 
 LAST = "last.ckpt"
 PREVIOUS = "previous.ckpt"
@@ -279,6 +288,8 @@ def fit(
         while run.has_epochs_left:
             start_s = running.clock()
             module.train()
+            # The order of an epoch follows from its number, the noise of a step from the step's: no
+            # state of a generator is saved, and a resumed run repeats neither.
             order = torch.Generator().manual_seed(seed_of(recipe.seed, run.epoch))
             for batch in islice(batches(order), run.step, None):
                 torch.manual_seed(seed_of(recipe.seed, run.epoch, run.step, rank))
@@ -287,12 +298,15 @@ def fit(
                     value = run.forward(fabric.to_device(share_of(batch, rank, world)), share_done)
                     run.stepper.zero_grad(set_to_none=True)
                     fabric.backward(value)
+
+                # A batch with a few strange maps would move Adam's moments for hundreds of steps.
                 if recipe.gradient_limit:
                     fabric.clip_gradients(run.forward, run.stepper, max_norm=recipe.gradient_limit)
                 run.stepper.step()
                 if recipe.schedule != "plateau":
                     run.schedule.step()
                 run.take_average()
+
                 run.total += value.detach().float()
                 run.step += 1
                 if leads:
@@ -311,6 +325,7 @@ def fit(
             train_loss = _finite(
                 "loss", float(run.over_all(run.total / max(run.step, 1), "mean")), run.epoch
             )
+            # Scored with the averaged weights, which are the ones that are kept.
             module.eval()
             with run.averaged():
                 figures: Scores = fabric.broadcast(score() if leads else {})
@@ -365,6 +380,9 @@ class _Run:
                 "this processor emulates bfloat16: training in float32, which is several times"
                 " faster here"
             )
+
+        # Decay goes into the step, not into the gradient, where Adam would divide it by the
+        # gradient's own spread (Loshchilov and Hutter 2019).
         free = [p for p in module.parameters() if p.requires_grad]
         kind = torch.optim.AdamW if recipe.weight_decay else torch.optim.Adam
         self.optimizer = kind(
@@ -424,6 +442,9 @@ class _Run:
         """Move the average of the weights towards them; early on by more, so that it forgets the
         first ones.
         """
+        # The average of the last 1 / (1 - decay) steps has less of the noise of single batches, as
+        # if the rate had fallen already (Polyak and Juditsky 1992). Over the first steps it is near
+        # the plain mean, whose decay is t / (t + 1): the start would else weigh for a whole run.
         if self.average:
             decay = min(self.recipe.average, self.steps_done / (self.steps_done + 10))
             for average, own in zip(self.average, self._free, strict=True):
@@ -523,11 +544,10 @@ class _Run:
             ) from error
 
     def _restore(self, state: State) -> None:
-        if not self.recipe.trains_like(Recipe.model_validate_json(state["recipe"])):
+        if not self.recipe.trains_like(recipe_of(json.loads(state["recipe"]))):
             raise RecipeError(f"{self.folder} holds a run of another recipe: choose another --out")
-        if (
-            state.get("origin", self._running.origin) != self._running.origin
-        ):  # states of old runs have no origin
+        # States of old runs have no origin.
+        if state.get("origin", self._running.origin) != self._running.origin:
             raise RecipeError(
                 f"{self.folder} holds a run from other weights or objects: choose another --out"
             )
