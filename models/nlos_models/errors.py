@@ -2,10 +2,10 @@
 installation leaves out.
 
     ModelError (ValueError)               exit 1   root
-    ├── MissingExtraError (ImportError)   exit 1   'training needs torch: pip install "nlos-cam[train]"'
+    ├── MissingExtraError (ImportError)   exit 1   'training needs torch: pip install ...'
     ├── TrainingError                     exit 1   "the loss is nan in epoch 3: choose ..."
-    ├── CheckpointError                   exit 4   "decoder.safetensors cannot be read as weights: ..."
-    └── RecipeError                       exit 4   "recipe.toml: batch: must be greater than 1 (got 1)"
+    ├── CheckpointError                   exit 4   "decoder.safetensors cannot be read as ..."
+    └── RecipeError                       exit 4   "recipe.toml: batch: must be greater than 1 ..."
         └── UnknownRecipeError            exit 2   "no recipe 'vea'. Did you mean 'vae'?"
 
 Outputs that exist or are being written raise OutputExistsError and FileBusyError of `nlos_cam`.

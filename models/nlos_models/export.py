@@ -165,12 +165,14 @@ def write_onnx(
 def _as_onnx(
     network: nn.Module, inputs: Mapping[str, tuple[int, int]], outputs: list[str]
 ) -> onnx.ModelProto:
+    # The exporter reports its passes at the level of warnings.
     for noisy in ("onnxscript", "torch.onnx"):
         logging.getLogger(noisy).setLevel(logging.ERROR)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # the exporter warns about its own internals
         program = torch.onnx.export(
             network.eval(),
+            # Two samples: with one, the exporter takes the batch for a constant.
             tuple(torch.ones(2, *shape) for shape in inputs.values()),
             dynamo=True,
             input_names=list(inputs),
@@ -205,6 +207,8 @@ def _stored(path: Path, prefix: str) -> Iterator[tuple[str, _StoredTensor]]:
     """Yield the tensors of a safetensors file: the header's length (8 bytes), the header (JSON),
     then the tensors.
     """
+    # https://huggingface.co/docs/safetensors: offsets in the header count from the end of the
+    # header.
     content = path.read_bytes()
     start = 8 + int.from_bytes(content[:8], "little")
     for name, entry in json.loads(content[8:start]).items():
@@ -284,6 +288,7 @@ def _linked_transposed(
 
 
 def _external(name: str, tensor: _StoredTensor) -> TensorProto:
+    # ONNX external data: file, offset and length, so that the weights are stored once.
     external = TensorProto(name=name, data_type=TensorProto.FLOAT16, dims=tensor.values.shape)
     external.data_location = TensorProto.EXTERNAL
     for key, value in (
@@ -305,6 +310,7 @@ def _linked(
     batch norm after it. The same product is left to ONNX Runtime, which computes constants once,
     when it opens the graph.
     """
+    # Biases and norms are small, and stay in the graph.
     tensor = stored[name]
     half = f"{name}.half"
     if tensor.values.dtype != np.float16 or tensor.values.ndim == 1:
@@ -313,6 +319,8 @@ def _linked(
     plain = tensor.values.astype(np.float32)
     if np.array_equal(exported, plain):
         return [external], [helper.make_node("Cast", [half], [name], to=TensorProto.FLOAT)]
+    # In a Sequential the batch norm has the number after its convolution's. Its factor has to be
+    # computed as the exporter did, to the last bit, or the weight is not linked.
     module, _, index = name.removesuffix(".weight").rpartition(".")
     norm = f"{module}.{int(index) + 1}" if index.isdecimal() else ""
     if f"{norm}.running_var" not in stored:
@@ -334,6 +342,7 @@ def checksum_of(network: nn.Module) -> str:
     """Return a checksum of all that an exported network depends on: exporter, weights and this
     package's code.
     """
+    # Code as well as weights: a changed forward pass exports to another graph.
     digest = hashlib.sha256(f"{torch.__version__} {OPSET}".encode())
     for source in sorted(Path(__file__).parent.glob("*.py")):
         digest.update(source.read_bytes())

@@ -66,6 +66,8 @@ def ask(
     """Return a network's answer to maps (n, 64, 80), with the probability of a surface where its
     `answer` has one.
     """
+    # Any function of maps is a network, in tests and for a user's own; the second head is
+    # optional.
     if isinstance(network, _HasSurface):
         return network.answer(depth_m, intensity)
     return Answer(network(depth_m, intensity))
@@ -142,9 +144,10 @@ def open_session(model: Path | bytes, checksum: str = "") -> Any:
             f"ONNX Runtime cannot be loaded ({reason}): free memory or install it again"
         ) from error
     options = onnxruntime.SessionOptions()
-    # One thread: a frame's products are too small to be worth the hand-over between threads, and the
-    # other cores have the camera, the view and the check by physics.
+    # One thread: a frame's products are too small to be worth the hand-over between threads, and
+    # the other cores have the camera, the view and the check by physics.
     options.intra_op_num_threads = 1
+    # Errors are raised too; a log of a library on stderr would break the command's own output.
     options.log_severity_level = 4  # errors are raised too
     name = model if isinstance(model, Path) else "the cached network"
     try:
@@ -157,6 +160,8 @@ def open_session(model: Path | bytes, checksum: str = "") -> Any:
         if lacks_memory(error):
             raise MemoryError(str(error)) from error
         raise CheckpointError(f"{name} cannot be read as a network: export it again") from error
+    # A graph beside other tensors would answer, and wrongly: offsets of another file are still
+    # numbers.
     if checksum and session.get_modelmeta().custom_metadata_map.get(CHECKSUM) != checksum:
         raise CheckpointError(
             f"{name} was made from other weights than those beside it: export it again"
@@ -175,6 +180,7 @@ def load_reconstructor(folder: Path | None, cache: Path) -> Reconstructor:
     folder = records.weights_folder(folder)
     record = records.load_record(folder)
     refuse_color(record, folder)
+    # Without torch where it can be: importing it takes seconds. A GPU needs it.
     if _has_cuda():
         return require("nlos_models.export", "inference on a GPU").load_torch_reconstructor(folder)
     try:
@@ -216,8 +222,8 @@ def refuse_color(record: records.CheckpointRecord, folder: Path | None) -> None:
     """Raise CheckpointError for color weights: exports and runtimes are for depth."""
     if record.color:
         raise CheckpointError(
-            f"{folder} holds weights for full color ({records.SIMULATION_ONLY}): name weights for depth, or"
-            " evaluate these with tools/studies/color.py"
+            f"{folder} holds weights for full color ({records.SIMULATION_ONLY}): name weights for"
+            " depth, or evaluate these with tools/studies/color.py"
         )
 
 
@@ -234,6 +240,7 @@ def _has_cuda() -> bool:
     installed.
     """
     try:
+        # The driver's library, since asking torch would import it.
         ctypes.CDLL("nvcuda.dll" if sys.platform == "win32" else "libcuda.so.1")
     except OSError:
         return False

@@ -78,6 +78,8 @@ class CheckpointRecord(BaseModel):
         """
         last = dict[str, Recipe]()
         earlier = list[Recipe]()
+        # A new compressor is fitted to its VAE, so that an earlier transfer of another one is
+        # history; a new VAE replaces the VAE alone.
         for recipe in runs:
             replaced = ("compressor", "transfer") if recipe.task == "compressor" else (recipe.task,)
             earlier += [last.pop(task) for task in replaced if task in last]
@@ -191,6 +193,7 @@ def checksum_of_watched(folder: Path, names: Sequence[str] = ()) -> str:
     """Return a checksum, 12 hexadecimal digits, of files: by default `watched_files`. Raises
     CheckpointError.
     """
+    # The bytes of the files, not the tensors' values: a graph points into these bytes.
     digest = hashlib.sha256()
     for name in names or watched_files(folder):
         try:

@@ -1,4 +1,4 @@
-"""Uncertainty ("doubt") network: maps and the image reconstructed from them in, expected error and
+"""Uncertainty network: maps and the image reconstructed from them in, expected error and
 verdicts out.
 
 Our own, not the paper's; about 200,000 parameters. Its inputs are the maps' differences from the
@@ -72,6 +72,8 @@ class UncertaintyNetwork(nn.Module):
         super().__init__()
         self.register_buffer("bare_depth_m", torch.zeros(MAP_SHAPE))
         self.register_buffer("bare_intensity", torch.zeros(MAP_SHAPE))
+        # 64 x 80 -> 8 x 10 in three halvings; with a fourth block at that size, each feature sees
+        # 31 x 31 cells.
         self.maps = nn.Sequential(
             _down(5, 16), _down(16, 32), _down(32, 64), _down(64, 64, stride=1)
         )
@@ -85,6 +87,7 @@ class UncertaintyNetwork(nn.Module):
         """Set the bare wall to each cell's median over maps (n, 64, 80) of benches with nothing
         hidden.
         """
+        # The median: a cell with a few wrong returns has the right value, a mean has not.
         self.bare_depth_m.copy_(torch.nan_to_num(depth_m.nanmedian(0).values))
         self.bare_intensity.copy_(intensity.median(0).values)
 
@@ -92,6 +95,9 @@ class UncertaintyNetwork(nn.Module):
         """Return (n, 5, 64, 80): differences from the bare wall, each from -1 to 1, and 1 for cells
         without return.
         """
+        # Two scales of each difference, since tanh saturates: an object moves some cells by
+        # centimetres and counts by tens, while the question whether there is anything is one of
+        # millimetres. tanh bounds what a strange frame can do to the network.
         invalid = torch.isnan(depth_m)
         farther_m = torch.where(invalid, 0.0, depth_m - self.bare_depth_m)
         brighter = torch.where(invalid, 0.0, intensity - self.bare_intensity)
@@ -107,6 +113,8 @@ class UncertaintyNetwork(nn.Module):
         levels = [image[:, None]]
         for down in self.image:
             levels.append(down(levels[-1]))
+        # The maps say what is there, the image what was made of it: an error is a disagreement of
+        # both. They meet at 8 x 8, where each feature covers an object's part.
         joint = self.meet(
             torch.cat([functional.interpolate(from_maps, (8, 8), mode="bilinear"), levels[3]], 1)
         )
@@ -114,8 +122,12 @@ class UncertaintyNetwork(nn.Module):
         pixels = self.pixels(
             torch.cat([functional.interpolate(fine, scale_factor=2.0), levels[0]], 1)
         )
+        # Means for what is everywhere (empty benches, noise), largest values for what is in one
+        # place (a strange part).
         pooled = [part for x in (from_maps, joint) for part in (x.mean((2, 3)), x.amax((2, 3)))]
         logits = self.frame(torch.cat(pooled, 1))
+        # An untrained error starts at exp(-3) = 0.05 of the depth range, the size of real ones:
+        # from 1 the first steps would only lower it.
         return UncertaintyOutput(logits[:, 0], logits[:, 1], pixels[:, 0] - 3.0, pixels[:, 1])
 
 
@@ -140,6 +152,8 @@ class CalibratedUncertainty(nn.Module):
         raw = self.network(depth_m, intensity, image)
         nothing = raw.nothing / self.temperature[0]
         outside = raw.outside / self.temperature[1]
+        # Network and calibration are one module, so that the exported graph answers with
+        # probabilities.
         error_v = (self.error_scale * raw.log_error.exp()).clamp(MIN_ERROR_V, MAX_ERROR_V)
         return torch.sigmoid(nothing), torch.sigmoid(outside), error_v, torch.sigmoid(raw.surface)
 

@@ -43,6 +43,8 @@ class ResBlock(nn.Module):
         self, channels_in: int, within: int, channels_out: int, resample: nn.Module
     ) -> None:
         super().__init__()
+        # Table S1 names two convolutions of 3 x 3 and a shortcut with a convolution of its own,
+        # since the channels differ in every block.
         self.main = nn.Sequential(
             _conv(channels_in, within),
             nn.BatchNorm2d(within),
@@ -63,6 +65,8 @@ class Decoder(nn.Module):
 
     def __init__(self, channels: int = 1, latent: int = LATENT) -> None:
         super().__init__()
+        # 1 x 1 to 64 x 64 in six blocks, each of which doubles the image at its end: the latent
+        # is the image of one pixel that the first block reads.
         up = [
             ResBlock(*block, nn.Upsample(scale_factor=2, mode="nearest"))
             for block in _up_blocks(latent)
@@ -72,6 +76,7 @@ class Decoder(nn.Module):
 
     def forward(self, latent: Tensor) -> Tensor:
         """Map (n, latent) to (n, channels, 64, 64)."""
+        # (n, 256) -> (n, 256, 1, 1) -> (n, 16, 64, 64) -> (n, 1, 64, 64)
         return torch.sigmoid(self.output(self.blocks(latent[:, :, None, None])))
 
 
@@ -82,6 +87,8 @@ class Encoder(nn.Module):
         super().__init__()
         self.input = _conv(channels, UP_BLOCKS[-1][-1])
         down = [
+            # The same blocks backwards. Averaging, not the largest value: v is a depth, and the
+            # largest one of a region would favour near pixels.
             ResBlock(out, within, into, nn.AvgPool2d(2))
             for into, within, out in reversed(_up_blocks(latent))
         ]
@@ -92,6 +99,8 @@ class Encoder(nn.Module):
     def forward(self, image: Tensor) -> tuple[Tensor, Tensor]:
         """Map (n, channels, 64, 64) to two (n, latent)."""
         features = self.blocks(torch.relu(self.input(image)))
+        # The logarithm, since a variance must be positive, and within bounds, since its
+        # exponential enters the divergence and the weight of the latent's error.
         log_variance = self.log_variance(features).clamp(-LOG_VARIANCE_LIMIT, LOG_VARIANCE_LIMIT)
         return self.mean(features).flatten(1), log_variance.flatten(1)
 
@@ -109,5 +118,7 @@ class ResVae(nn.Module):
         """Map images (n, channels, 64, 64) and standard normal noise (n, latent) to image, mean and
         log-variance.
         """
+        # Reparametrisation: the noise comes from outside, so that the gradient passes to mean and
+        # variance through the draw (Kingma and Welling 2013, 2.4).
         mean, log_variance = self.encoder(image)
         return self.decoder(mean + noise * torch.exp(0.5 * log_variance)), mean, log_variance

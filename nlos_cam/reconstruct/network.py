@@ -69,6 +69,11 @@ class Reconstruction:
     """None without an uncertainty model."""
 
     @property
+    def doubt(self) -> Uncertainty | None:
+        """`uncertainty`, by its former name."""
+        return self.uncertainty
+
+    @property
     def has_surface(self) -> bool:
         """True if any pixel shows a surface."""
         return bool(np.isfinite(self.depth_m).any())

@@ -66,6 +66,8 @@ def save_pipeline(
 
     An encoder is saved with them, since its latents are the targets of further training.
     """
+    # The statistics of the preprocessing are weights like others: with another bench's, all maps
+    # are shifted.
     parts = {name: getattr(pipeline, name) for name in PIPELINE_PARTS}
     _save(folder, {**parts, "encoder": encoder} if encoder else parts, record)
 
@@ -76,6 +78,8 @@ def save_direct(folder: Path, network: DirectNetwork, record: CheckpointRecord) 
 
 
 def _save(folder: Path, parts: dict[str, nn.Module], record: CheckpointRecord) -> None:
+    # Readers of earlier versions refuse fields that they do not know, so that unset ones are not
+    # written.
     unset = {
         name for name in ("note", "direct_recipe") if not getattr(record, name)
     }  # older readers refuse these
@@ -95,6 +99,7 @@ def load_vae(folder: Path | None = None) -> tuple[ResVae, CheckpointRecord]:
             " make it again with `nlos-cam train vae --recipe vae-encoder --out DIR`, and give"
             " --vae DIR"
         )
+    # One file a network: the decoder of a pipeline is also that of its VAE.
     vae = new_vae(color=record.color)
     for name, module in (("encoder", vae.encoder), ("decoder", vae.decoder)):
         load_part(folder / f"{name}.safetensors", module)
@@ -135,6 +140,8 @@ def load_fitting(path: Path, module: nn.Module) -> LoadReport:
     fitting = [name for name in shared if tensors[name].shape == own[name].shape]
     if not fitting:
         raise CheckpointError(f"{path} holds no tensor that fits this network: name other weights")
+    # Not strict, on purpose, in this one place: the caller asked for a part (`--partial`), and
+    # the report says which tensors it got.
     module.load_state_dict({name: tensors[name] for name in fitting}, strict=False)
     missing = sorted(own.keys() - tensors.keys())
     left_over = sorted(tensors.keys() - own.keys())

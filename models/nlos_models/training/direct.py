@@ -58,10 +58,13 @@ def train_direct(
     change nothing at first. Returns the network in eval mode, with the recipe's blend of both, and
     its held-out figures.
     """
+    # Initial weights follow from the recipe's seed; `fit` seeds each step by itself.
     torch.manual_seed(recipe.seed)
     network = DirectNetwork(recipe.direct, recipe.dropout, color=recipe.colour)
     network.normal.load_state_dict(source.normal.state_dict())
     if start:
+        # Not strict: blocks and mixers that only this recipe has stay as they are initialised,
+        # that is, as identities.
         network.load_state_dict(start.state_dict(), strict=False)
     steps = recipe.objects // recipe.batch
 
@@ -69,10 +72,11 @@ def train_direct(
         return repeat(source, recipe.batch, steps, generator)
 
     running = running or Running()
+    # The normalisation is outside: it is exact in float32, and `source` has done it.
     logits = running.maybe_compile(network.logits)
 
     def loss(batch: NormalBatch, _: float) -> Tensor:
-        # Maps are rendered once, without noise; each step draws another, so that no noise is learnt.
+        # Maps are rendered once, without noise; each step draws its own, so that none is learnt.
         normal = _varied(recipe, network.normal, batch.normal.float(), source.noise)
         return two_heads_error(
             logits(normal + recipe.noise * torch.randn_like(normal)), batch.image
@@ -88,6 +92,7 @@ def train_direct(
         folder=folder,
         running=running,
     )
+    # After the last step, so that the run itself is the same at any blend.
     if start and recipe.blend < 1:
         blend(network, start, recipe.blend)
         figures = figures_of(run(network.eval(), held_out), held_out.image)
@@ -122,9 +127,12 @@ def transfer_direct(
     """
     torch.manual_seed(recipe.seed)
     for block in network.trunk:
+        # A checkpoint does not hold its dropout, which is a setting of the training.
         block.dropout.p = recipe.dropout  # type: ignore[union-attr]  (a Residual)
     if recipe.statistics != "kept":
         seen = maps.first(STATISTICS_OBJECTS)
+        # Depth is in metres on every bench, intensity in the counts of a device: the latter may
+        # be taken alone.
         channels = slice(1, None) if recipe.statistics == "own intensity" else slice(None)
         network.normal.shift(
             torch.from_numpy(seen.depth_m), torch.from_numpy(seen.intensity), channels
@@ -139,6 +147,8 @@ def transfer_direct(
     def fit_phase(
         phase: TransferRecipe, phase_folder: Path, running: Running, *, last_layers: bool
     ) -> Scores:
+        # The heads and the norm before them are 1 % of the weights: what few recordings can
+        # teach.
         network.requires_grad_(not last_layers)
         for layer in network.last_layers:
             layer.requires_grad_(requires_grad=True)
@@ -165,10 +175,12 @@ def _varied(
     """
     reflectance = offset_m = None
     if recipe.wall_texture:
+        # Every strength from none to the recipe's: a network must be right on a clean wall too.
         strength = recipe.wall_texture * torch.rand(len(normal), 1, 1, device=normal.device)
         reflectance = strength * _stains(len(normal), normal.device)
     if recipe.range_offset_m:
         offset_m = recipe.range_offset_m * torch.randn(len(normal), device=normal.device)
+    # Nothing to vary: the round trip through counts would only round.
     if noise is None and reflectance is None and offset_m is None:
         return normal
     return vary(cells, normal, noise, reflectance, offset_m)

@@ -42,6 +42,8 @@ def open_fabric(recipe: Recipe, *, accelerator: Accelerator = "auto", devices: i
     Raises TrainingError where there are fewer GPUs, RecipeError where the processes cannot share a
     batch evenly.
     """
+    # Shares of different size would weigh samples differently, since gradients are averaged over
+    # processes.
     if recipe.batch % devices:
         raise RecipeError(
             f"a batch of {recipe.batch} cannot be shared evenly by {devices} processes: change"
@@ -81,11 +83,13 @@ def launch(fabric: Fabric, work: Callable[..., Any], *arguments: Any) -> Any:
     are raised as they are; an interruption is passed on to all processes, waited for, and raised as
     KeyboardInterrupt.
     """
+    # No other process, no pickling: a debugger, and a test's closures, work.
     if fabric.world_size == 1:
         return work(fabric, *arguments)
     try:
         result = fabric.launch(partial(_return_errors, work=work, arguments=arguments))
     except (ProcessRaisedException, ProcessExitedException) as error:
+        # A process that a signal ended has no error of its own.
         last_line = str(error).strip().splitlines()[-1]
         raise TrainingError(
             f"a training process ended early ({last_line}): repeat the command to resume"
@@ -105,6 +109,8 @@ def _return_errors(fabric: Fabric, work: Callable[..., Any], arguments: tuple[An
     try:
         return work(fabric, *arguments)
     except (ValueError, OSError, KeyboardInterrupt) as error:
+        # Raised across processes, an error arrives as a traceback's text; as a value it keeps its
+        # class and message.
         if isinstance(error, KeyboardInterrupt) or hasattr(error, "exit_code"):
             return error
         raise
@@ -112,6 +118,7 @@ def _return_errors(fabric: Fabric, work: Callable[..., Any], arguments: tuple[An
 
 def _end_all() -> None:
     """Ask the processes to save and end, and wait for them."""
+    # SIGTERM first to all, then wait: each saves its state after the current step.
     children = multiprocessing.active_children()
     for child in children:
         child.terminate()
@@ -123,6 +130,8 @@ def seed_of(*parts: int) -> int:
     """Return a seed for a tuple of numbers; their count goes in too, since numpy ignores zeros at
     the end.
     """
+    # Sums of numbers would give epoch 1 step 2 and epoch 2 step 1 the same seed. The upper 63
+    # bits, since torch takes signed seeds.
     return int(
         np.random.SeedSequence([*parts, len(parts)]).generate_state(1, np.uint64)[0] >> np.uint64(1)
     )
@@ -136,5 +145,6 @@ def share_of(batch: Any, rank: int, world: int) -> Any:
         return batch
     if isinstance(batch, Tensor):
         return batch[rank::world]
+    # Named tuples stay what they are: the losses read their fields.
     parts = [share_of(part, rank, world) for part in batch]
     return type(batch)(*parts) if hasattr(batch, "_fields") else tuple(parts)

@@ -1,5 +1,5 @@
-"""Fit of the quality model that watches an uncertainty network's answers, judged on kinds of objects
-that were left out of the fit.
+"""Fit of the quality model that watches an uncertainty network's answers, judged on kinds of
+objects that were left out of the fit.
 """
 
 import json
@@ -70,8 +70,8 @@ def left_out_folds(kinds: Sequence[str]) -> list[tuple[Int64, Int64]]:
     """Return (rows to fit, rows to judge) for each group of kinds: the fit sees no family of the
     group.
     """
-    # A carved shape or a pair has a family in common with others: rows at random would test a fit on
-    # shapes that it has seen.
+    # A carved shape or a pair has a family in common with others: rows at random would test a fit
+    # on shapes that it has seen.
     of_row = [families(kind) for kind in kinds]
     every = sorted(set().union(*of_row))
     folds: list[tuple[Int64, Int64]] = []
@@ -87,6 +87,7 @@ def left_out_rows(count: int) -> list[tuple[Int64, Int64]]:
     """Return (rows to fit, rows to judge) for each of FOLDS groups of rows at random, the same for
     a count.
     """
+    # The same groups at every fit, so that figures differ by the data alone.
     group = np.random.default_rng(0).integers(0, FOLDS, count)
     return [(np.flatnonzero(group != fold), np.flatnonzero(group == fold)) for fold in range(FOLDS)]
 
@@ -95,6 +96,8 @@ def fit_quality(samples: QualitySet, watches: str) -> QualityRecord:
     """Fit a quality model; its threshold comes from objects, its figures from kinds, left out of
     further fits.
     """
+    # The threshold decides about frames of known and of unknown objects alike, so that it comes
+    # from objects left out; the figures that are printed are harder, of kinds left out.
     good = samples.iou >= GOOD_IOU
     count = len(samples.iou)
     above = trusted_above(
@@ -104,6 +107,7 @@ def fit_quality(samples: QualitySet, watches: str) -> QualityRecord:
     )
     outputs = _left_out(samples, left_out_folds(samples.kind.tolist()), watches)
     figures = judged_figures(QualityEstimate.of(outputs, above), samples)
+    # What is kept has seen all frames; the fits above only measure.
     whole = _fit(samples, np.arange(count), watches)
     return whole.model_copy(update={"trusted_above": above, "figures": figures})
 
@@ -118,6 +122,7 @@ def write_quality(folder: Path, record: QualityRecord) -> None:
 
 def _left_out(samples: QualitySet, folds: Sequence[tuple[Int64, Int64]], watches: str) -> Float32:
     """Return the outputs (n, OUTPUTS) of models that were fitted without the objects they judge."""
+    # NaN where no fold judges a row, so that a forgotten one cannot pass as an answer.
     outputs = np.full((len(samples.iou), OUTPUTS), np.nan, np.float32)
     for fitted, judged in folds:
         outputs[judged] = QualityModel(_fit(samples, fitted, watches)).outputs(
@@ -209,6 +214,7 @@ def trusted_above(good: Float32, is_good: Mask, generic: Mask) -> float | None:
 
     Judged by the lower 95 % limit over all frames, over generic shapes and over the 18 kinds.
     """
+    # From low to high: the first threshold that holds trusts most frames.
     for above in np.unique(good.round(3)):
         chosen = good >= above
         if chosen.sum() < MIN_TRUSTED:
@@ -241,6 +247,7 @@ def judged_figures(estimate: QualityEstimate, samples: QualitySet) -> dict[str, 
     }
     found = dict[str, float]()
     for name, share in shares.items():
+        # A correlation needs three frames.
         if share.sum() < 3:
             continue
         predicted_iou = estimate.iou[share]  # (n, 3)

@@ -76,6 +76,8 @@ class Recipe(BaseModel, frozen=True, extra="forbid"):
         """
         if not isinstance(facts, dict):
             return facts
+        # A field of another task at its default says nothing; at another value it is a mistake,
+        # and stays to be refused by `extra`.
         own = cls.model_fields
         return {
             name: value
@@ -103,6 +105,7 @@ class Recipe(BaseModel, frozen=True, extra="forbid"):
             raise RecipeError(f"--budget must be above 0 and at most 1, got {share:g}")
         if share == 1:
             return self
+        # Fewer epochs first: an epoch with fewer objects would be another data set.
         epochs = max(1, round(self.epochs * share))
         objects = max(self.batch, round(self.objects * min(1.0, self.epochs * share / epochs)))
         deviation = (

@@ -98,6 +98,7 @@ class TrainingRun(Generic[R]):
             fabric, tensorboard=self.tensorboard, compiled=self.compiled, origin=self.origin
         )
         with ExitStack() as held:
+            # One process writes; a second run in the same folder is refused while it lives.
             if fabric.is_global_zero:
                 self.out.mkdir(parents=True, exist_ok=True)
                 held.enter_context(claim(self.out, inside=True))
@@ -117,6 +118,7 @@ def record_run(
     Raises OutputExistsError where the run would write over a file, over a folder that it starts
     from, or over other weights.
     """
+    # Before an hour of training, not after it: the same checks as at the end.
     record = CheckpointRecord.of([*before, recipe], rig, maps_of(recipe))
     if out.exists() and not out.is_dir():
         raise OutputExistsError(
@@ -205,6 +207,7 @@ def run_transfer(
     """Fine-tune weights on recordings and save them; return their held-out figures before and
     after.
     """
+    # The same held-out maps before and after, so that their difference is the transfer's.
     before = figures_of(run(network.to(fabric.device).eval(), held_out), held_out.image)
     with training.watched(fabric, "transfer") as running:
         if isinstance(network, DirectNetwork):
@@ -239,6 +242,7 @@ def run_uncertainty(
         network, figures = train_uncertainty(
             training.recipe, samples, held_out, training.out, running
         )
+    # On held-out maps: a network is surer of those that it was trained on.
     fitted = calibrate(network, held_out)
     if fabric.is_global_zero:
         record = about.model_copy(update={**asdict(fitted), "figures": figures})
@@ -272,8 +276,10 @@ def vae_start(
     folder = weights_folder(weights, PAPER)
     if recipe.start == "decoder":
         torch.manual_seed(recipe.seed)
+        # Target latents from the encoder, decoder from the pipeline, which has trained on.
         vae = new_vae(color=recipe.colour)
         pipeline, record = load_pipeline(folder)
+        # A new encoder for a decoder that is given: the shipped weights come without theirs.
         vae.decoder = pipeline.decoder
     else:
         vae, record = checkpoints.load_vae(folder)
@@ -325,6 +331,7 @@ def direct_start(
     _check_same_color(recipe, folder)
     size = network.size
     wanted = recipe.direct
+    # Widths must agree, depths may grow: new blocks start as identities.
     grown = size.model_copy(update={"blocks": wanted.blocks, "mixers": wanted.mixers})
     if grown != wanted or wanted.blocks < size.blocks or wanted.mixers < size.mixers:
         raise TrainingError(

@@ -62,6 +62,7 @@ class Remapping:
 
     def learn_statistics(self, channels: slice = slice(None)) -> None:
         """Normalise some or all channels of the split maps by the source's mean and spread."""
+        # A sample of the maps: all of them may not fit into memory.
         maps = self.source.first(STATISTICS_OBJECTS)
         stacked = split_and_stack(torch.from_numpy(maps.depth_m), torch.from_numpy(maps.intensity))
         self.pipeline.preprocess.learn(stacked, channels)
@@ -75,6 +76,8 @@ class Remapping:
         statistics too.
         """
         frozen_parts = list(frozen)
+        # Everything trains except what is named: a resumed run, or a second phase, may have left
+        # other flags.
         fabric = running.fabric_for(recipe)
         self.pipeline.requires_grad_(requires_grad=True)
         for part in frozen_parts:
@@ -147,11 +150,14 @@ def in_channels_last(module: Module) -> Module:
     """Return the module with its convolutions' weights in the layout that CPUs and GPUs run
     fastest.
     """
-    return module.to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue] (torch's stub omits it)
+    # A convolution then reads all channels of a pixel from one place.
+    # torch's stub omits this argument.
+    return module.to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
 
 
 def set_for_training(pipeline: RemappingNetwork, recipe: MapRecipe) -> None:
     """Give a loaded pipeline the recipe's dropout and noise, which checkpoints do not hold."""
+    # Noise and dropout are settings of a training, not weights.
     pipeline.preprocess.left_noise = recipe.left_noise
     for module in pipeline.compressor.modules():
         if isinstance(module, nn.Dropout):
@@ -163,6 +169,7 @@ def run(pipeline: nn.Module, maps: MapSet) -> Float32:
     """Return the images (n, 64, 64), in color (n, 3, 64, 64), that a pipeline in eval mode
     reconstructs from maps.
     """
+    # Batches of 100: the activations of all held-out maps at once take gigabytes.
     device = next(pipeline.parameters()).device
     pairs = zip(parts_of(maps.depth_m), parts_of(maps.intensity), strict=True)
     parts = (pipeline(*(torch.from_numpy(part).to(device) for part in pair)) for pair in pairs)
@@ -192,12 +199,14 @@ def figures_of(image: Float32, truth: Float16 | Float32) -> Scores:
     ground truth.
     """
     truth = truth.astype(np.float32)
+    # Squared in any case, so that runs with different losses have one scale to be compared on.
     error = float(np.square(image - truth).sum(tuple(range(1, truth.ndim))).mean())
     if truth.ndim == 3:
         return {
             "held_out_loss": error,
             "held_out_iou": float(np.mean(silhouette_iou(image, truth))),
         }
+    # Objects without a shared pixel have no color error; if none has one, the worst.
     color = color_error(image, truth)
     shared = color[~np.isnan(color)]
     figures = {
@@ -220,6 +229,7 @@ def train_vae(
 
     A second call resumes. Returns the network in eval mode and its held-out figures.
     """
+    # Initial weights follow from the recipe's seed; `fit` seeds each step by itself.
     torch.manual_seed(recipe.seed)
     running = running or Running()
     vae = in_channels_last(start or new_vae(color=recipe.colour))
@@ -283,6 +293,8 @@ def train_compressor(
     """
     torch.manual_seed(recipe.seed)
     pipeline = _starting_pipeline(recipe, start)
+    # Two steps: the decoder is the VAE's and stays. One step, or jointly: it trains too, and the
+    # latent is no longer the VAE's.
     remapping = Remapping(pipeline, start.vae.encoder if start.vae else None, maps, held_out)
     # Two-step weights bring their statistics: other ones would shift every input of the compressor.
     if recipe.steps != "two-then-joint":
@@ -321,6 +333,7 @@ def turn_some(images: Tensor, quarters: Tensor) -> Tensor:
     """Rotate images (n, channels, 64, 64) by quarter turns (n,); with the mirror, these are SI 3's
     turns and flips.
     """
+    # All four turns of all images, then one of each: no loop over samples.
     turned = torch.stack([images.rot90(k, (-2, -1)) for k in range(4)])
     return turned[quarters, torch.arange(len(images), device=images.device)]
 
@@ -331,6 +344,7 @@ def rebuild(vae: ResVae, images: Float16 | Float32) -> Float32:
     silhouette cut.
     """
     device = next(vae.parameters()).device
+    # The mean, not a draw: the most likely image of a latent.
     means = (vae.encoder(as_images(part).to(device))[0] for part in parts_of(images))
     decoded = np.concatenate(
         [cut_silhouette(vae.decoder(mean)).float().cpu().numpy() for mean in means]
@@ -363,6 +377,7 @@ def train_transfer(
     def fit_phase(
         phase: TransferRecipe, phase_folder: Path, running: Running, *, last_layers: bool
     ) -> Scores:
+        # SI 4: the features, with their batch norms, are frozen in the second phase.
         features = [pipeline.compressor.get_submodule("features")] if last_layers else []
         return remapping.fit(phase, [pipeline.decoder, *features], phase_folder, running)
 

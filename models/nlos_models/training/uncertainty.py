@@ -79,6 +79,8 @@ def uncertainty_batches(
     """Yield one epoch, shuffled and mirrored at random."""
     for index in shuffled(len(samples), batch, generator):
         chosen = as_uncertainty_batch(samples.where(index.numpy()))
+        # Maps and both images are mirrored together; the verdicts are the same for a mirrored
+        # frame.
         flips = torch.rand(len(index), generator=generator) < 0.5
         yield UncertaintyBatch._make([*flip_some(list(chosen[:4]), flips), *chosen[4:]])
 
@@ -95,6 +97,7 @@ def uncertainty_loss(output: UncertaintyOutput, batch: UncertaintyBatch) -> Tens
     loss = cross_entropy(output.nothing, batch.nothing) + cross_entropy(
         output.outside, batch.outside
     )
+    # Three cross-entropies, each a proper score: least where its probability is the share.
     there = (batch.truth > 0).float()  # (b, 64, 64)
     loss = loss + cross_entropy(output.surface, there)
 
@@ -110,6 +113,7 @@ def uncertainty_loss(output: UncertaintyOutput, batch: UncertaintyBatch) -> Tens
 @torch.inference_mode()
 def predict(network: UncertaintyNetwork, samples: UncertaintySet) -> UncertaintyOutput:
     """Return the raw outputs of a network in eval mode for a whole set, on the CPU."""
+    # Raw outputs, since the calibration fits divisors of logits.
     parts = parts_of(np.arange(len(samples)))
     device = next(network.parameters()).device
     outputs = [
@@ -134,6 +138,7 @@ def train_uncertainty(
     running = running or Running()
     torch.manual_seed(recipe.seed)
     network = UncertaintyNetwork()
+    # The network sees differences from the bare wall, which it takes from the empty benches.
     bare = training.where(training.nothing)
     network.learn_bare(torch.from_numpy(bare.depth_m), torch.from_numpy(bare.intensity))
     network = in_channels_last(network)
@@ -188,6 +193,7 @@ def temperature(logits: Float64, truth: Mask) -> float:
     """Return the divisor of logits (n,) under which the truth (n,) is likeliest."""
     x = torch.from_numpy(logits)
     y = torch.from_numpy(truth.astype(np.float64))
+    # 65 candidates in place of an optimiser: one number, and no local minimum to be stuck in.
     losses = [float(functional.binary_cross_entropy_with_logits(x / t, y)) for t in TEMPERATURES]
     return float(TEMPERATURES[int(np.argmin(losses))])
 
@@ -196,6 +202,7 @@ def shared_errors(made: NDArray[np.floating], truth: NDArray[np.floating]) -> tu
     """Return the mask of pixels with surface in images (n, 64, 64) and truths, and the errors of v
     there (pixels,).
     """
+    # An error of depth is one of pixels that both call surface.
     shared = (made > 0) & (truth > 0)
     return shared, np.abs(made.astype(np.float64) - truth)[shared]
 

@@ -1,4 +1,4 @@
-"""Uncertainty ("doubt") network: features, training, calibration, predicted quality, and files
+"""Uncertainty network: features, training, calibration, predicted quality, and files
 beside the weights.
 """
 
