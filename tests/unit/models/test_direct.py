@@ -115,13 +115,16 @@ def _shaken() -> DirectNetwork:
     return network.eval()
 
 
-def test_answer_to_mirrored_maps_is_the_mirrored_answer_by_linear_layers_of_both_sides() -> None:
+def test_answer_to_mirrored_maps_is_the_mirrored_answer() -> None:
     network = _shaken()
     normal = torch.randn(3, 2, 64, 80)
     logits = network.logits(normal)
     torch.testing.assert_close(network.logits(normal.flip(-2)), logits.flip(-2), rtol=0, atol=1e-5)
     assert float(logits.detach().std()) > 0.1
     assert (logits - logits.flip(-2)).abs().max() > 0.1
+
+
+def test_mirror_linear_is_a_linear_layer_of_both_sides() -> None:
     layer = direct.MirrorLinear(5, 3)
     sides = torch.randn(4, 2, 5)
     own = (layer.even.weight + layer.odd.weight) / 2
@@ -146,7 +149,7 @@ def test_each_pixel_has_its_place(row: int, column: int) -> None:
     assert int(moved.sum()) == 64
 
 
-def test_cells_are_normalised_symmetrically_clipped_and_without_the_gain_of_a_frame() -> None:
+def test_cells_are_normalised_symmetrically_and_clipped() -> None:
     maps = small_maps(40, 0)
     normal = CellNormal()
     depth_m = torch.from_numpy(maps.depth_m.copy())
@@ -157,6 +160,9 @@ def test_cells_are_normalised_symmetrically_clipped_and_without_the_gain_of_a_fr
     assert (values[:, :, 3, 7] == 0).all()
     assert values.abs().max() <= direct.CLIP
     torch.testing.assert_close(normal(depth_m.flip(-2), intensity.flip(-2)), values.flip(-2))
+
+
+def test_gain_of_a_frame_is_taken_out() -> None:
     normal = CellNormal()
     generator = torch.Generator().manual_seed(0)
     depth_m = 0.3 + 0.01 * torch.randn(30, 64, 80, generator=generator)
@@ -241,13 +247,17 @@ def _train(
     return train_direct(_recipe(**changes), Source(), small_maps(4, 1), folder, running)
 
 
-def test_run_stopped_halfway_resumes_exactly_and_follows_its_recipe(tmp_path: Path) -> None:
+def test_run_stopped_halfway_resumes_exactly(tmp_path: Path) -> None:
     whole, figures = _train(tmp_path / "whole")
     with pytest.raises(KeyboardInterrupt):
         _train(tmp_path / "cut", Running(stop=iter([False] * 4 + [True]).__next__))
     resumed, again = _train(tmp_path / "cut")
     assert not changed_tensors(whole.state_dict(), resumed.state_dict())
     assert figures == again
+
+
+def test_run_follows_its_recipe(tmp_path: Path) -> None:
+    whole, _ = _train(tmp_path / "whole")
     for name, changes in (
         ("plain", {"average": 0.0}),
         ("varied", {"wall_texture": 0.05, "range_offset_m": 0.05}),
@@ -277,9 +287,7 @@ def test_training_goes_on_from_weights_that_grow(weights: Path, tmp_path: Path) 
     assert direct_start(_recipe(), None) == (None, [])
 
 
-def test_blend_is_the_mean_of_the_trained_weights_and_those_before(
-    weights: Path, tmp_path: Path
-) -> None:
+def test_blend_is_the_mean_of_trained_and_earlier_weights(weights: Path, tmp_path: Path) -> None:
     start, _ = direct_start(_recipe(start="weights"), weights)
     made = list[tuple[DirectNetwork, Scores]]()
     for share in (1.0, 0.25):
@@ -355,9 +363,7 @@ def test_start_refuses_weights_that_the_recipe_cannot_hold(
         direct_start(recipe, Path("paper"))
 
 
-def test_varied_maps_are_those_of_another_wall_with_stains_of_variance_1_and_of_another_range() -> (
-    None
-):
+def test_varied_maps_are_those_of_another_wall_and_range() -> None:
     """Stains and an offset on normalised maps are what they would be on the maps themselves."""
     maps = small_maps(40, 0)
     normal = CellNormal()
@@ -375,6 +381,9 @@ def test_varied_maps_are_those_of_another_wall_with_stains_of_variance_1_and_of_
     varied = vary(normal, normal(depth_m, intensity), None, reflectance, offset_m)
     assert float((measured - varied).abs().median()) < 0.02
     torch.testing.assert_close(vary(normal, varied, None, None, None), varied, atol=1e-4, rtol=0)
+
+
+def test_stains_have_mean_0_and_variance_1_and_half_are_grain() -> None:
     patterns = _stains(200, torch.device("cpu"))
     assert float(patterns.mean()) == pytest.approx(0, abs=0.03)
     assert float(patterns.var()) == pytest.approx(1, abs=0.05)

@@ -19,7 +19,7 @@ RECIPES = Path(__file__).parents[3] / "models" / "recipes"
 
 
 @pytest.mark.parametrize("path", sorted(RECIPES.glob("*.toml")), ids=lambda path: path.stem)
-def test_committed_recipes_load_by_path_or_name_and_state_deviations(path: Path) -> None:
+def test_committed_recipe_loads_by_path_or_name(path: Path) -> None:
     recipe = load_recipe(path)
     name = path.stem.removeprefix("paper-rig-")
     assert recipe.task in path.stem

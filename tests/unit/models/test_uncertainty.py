@@ -42,7 +42,7 @@ def network() -> UncertaintyNetwork:
     return UncertaintyNetwork().eval().requires_grad_(requires_grad=False)
 
 
-def test_features_are_zero_at_the_median_bare_wall_and_mark_a_cell_without_return(
+def test_features_are_zero_at_the_median_bare_wall(
     network: UncertaintyNetwork,
 ) -> None:
     generator = torch.Generator().manual_seed(0)
@@ -54,14 +54,13 @@ def test_features_are_zero_at_the_median_bare_wall_and_mark_a_cell_without_retur
     network.learn_bare(depth_m, counts.repeat(5, 1, 1))
     assert float(network.features(bare_m[None], counts[None]).abs().max()) == 0.0
     assert float(network.features(bare_m[None] + 0.05, counts[None] + 5)[:, :4].min()) > 0.4
-    bare_m[3, 4] = torch.nan
-    assert network.features(bare_m[None], counts[None] + 9)[0, :, 3, 4].tolist() == [
-        0.0,
-        0.0,
-        0.0,
-        0.0,
-        1.0,
-    ]
+
+
+def test_features_mark_a_cell_without_return(network: UncertaintyNetwork) -> None:
+    depth_m = torch.ones(1, 64, 80)
+    depth_m[0, 3, 4] = torch.nan
+    features = network.features(depth_m, torch.full((1, 64, 80), 9.0))
+    assert features[0, :, 3, 4].tolist() == [0, 0, 0, 0, 1]
 
 
 @pytest.mark.parametrize("name", HARD_MAPS)
@@ -109,18 +108,23 @@ def _train(folder: Path, steps: list[int], **running: Any) -> UncertaintyNetwork
 
 
 @pytest.mark.slow
-def test_doubt_run_resumes_exactly_and_learns_what_is_empty_unusual_or_uncertain(
+def test_uncertainty_run_resumes_exactly(
     tmp_path: Path,
 ) -> None:
     steps = list[int]()
     trained = _train(tmp_path / "whole", [])
-    fresh = small_uncertainty_set(64, 2)
     with pytest.raises(KeyboardInterrupt):
         _train(tmp_path / "stopped", steps, stop=lambda: len(steps) == 11)
     torch.testing.assert_close(
         _train(tmp_path / "stopped", steps).state_dict(), trained.state_dict()
     )
     assert steps == list(range(1, 65))
+
+
+@pytest.mark.slow
+def test_uncertainty_run_learns_what_is_empty_or_unusual(tmp_path: Path) -> None:
+    trained = _train(tmp_path, [])
+    fresh = small_uncertainty_set(64, 2)
     said = uncertainty.predict(trained, fresh)
     assert ((said.nothing.numpy() > 0) == fresh.nothing).mean() > 0.9
     there = ~fresh.nothing
@@ -129,6 +133,11 @@ def test_doubt_run_resumes_exactly_and_learns_what_is_empty_unusual_or_uncertain
         said.log_error.numpy()[fresh.truth == value].mean() for value in np.float16([DARK_V, 0.8])
     )
     assert dark > bright + 0.3
+
+
+@pytest.mark.slow
+def test_calibration_keeps_to_its_shares_of_false_alarms(tmp_path: Path) -> None:
+    trained = _train(tmp_path, [])
     some = small_uncertainty_set(200, 3)
     fitted = uncertainty.calibrate(trained, some)
     said = uncertainty.predict(trained, some)
@@ -145,7 +154,7 @@ def test_doubt_run_resumes_exactly_and_learns_what_is_empty_unusual_or_uncertain
     assert fitted.error_scale > 0
 
 
-def test_doubt_loss_is_least_at_mean_error_of_pixels_in_both_images() -> None:
+def test_loss_is_least_at_the_mean_error_of_shared_pixels() -> None:
     some = small_uncertainty_set(64, 0)
     there, empty = (
         uncertainty.as_uncertainty_batch(some.where(rows)) for rows in (~some.nothing, some.nothing)
@@ -317,9 +326,7 @@ def _short(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(quality_training, "FOLDS", 2)
 
 
-def test_figures_are_those_of_the_mirrored_frame_and_of_a_frame_alone_and_finite_without_a_surface() -> (
-    None
-):
+def test_figures_are_those_of_the_mirrored_frame() -> None:
     images, said = frames(4)
     turned = said._replace(error_v=said.error_v[:, ::-1], p_surface=said.p_surface[:, ::-1])
     figures = quality_features(images, said)
@@ -327,20 +334,34 @@ def test_figures_are_those_of_the_mirrored_frame_and_of_a_frame_alone_and_finite
     np.testing.assert_allclose(
         quality_features(images[:, ::-1], turned), figures, rtol=1e-4, atol=1e-4
     )
+
+
+def test_figures_of_a_frame_are_those_of_the_frame_alone() -> None:
+    images, said = frames(4)
+    figures = quality_features(images, said)
     alone = quality_features(images[1:2], UncertaintyEstimate(*(part[1:2] for part in said)))
     np.testing.assert_allclose(alone[0], figures[1], rtol=1e-4, atol=1e-5)
-    assert np.isfinite(quality_features(np.zeros_like(images), said)).all()
+
+
+def test_figures_with_the_network_s_own_surface_come_last() -> None:
+    images, said = frames(4)
+    turned = said._replace(error_v=said.error_v[:, ::-1], p_surface=said.p_surface[:, ::-1])
+    figures = quality_features(images, said)
     with_own = quality_features(images, said, said.p_surface)
     assert with_own.shape == (4, quality.WITH_SURFACE)
     np.testing.assert_array_equal(with_own[:, : quality.FEATURES], figures)
     own = quality_features(images[:, ::-1], turned, turned.p_surface)
     np.testing.assert_allclose(own, with_own, rtol=1e-4, atol=1e-4)
-    assert np.isfinite(quality_features(np.zeros_like(images), said, np.zeros_like(images))).all()
 
 
-def test_model_takes_a_network_s_own_probability_of_a_surface_where_it_was_fitted_with_one() -> (
-    None
-):
+def test_figures_are_finite_without_a_surface() -> None:
+    images, said = frames(4)
+    nothing = np.zeros_like(images)
+    assert np.isfinite(quality_features(nothing, said)).all()
+    assert np.isfinite(quality_features(nothing, said, nothing)).all()
+
+
+def test_model_takes_the_network_s_own_surface_if_fitted_with_one() -> None:
     """Without one it takes the uncertainty network's, and a model that was fitted without one
     leaves it out.
     """
@@ -361,7 +382,7 @@ def test_model_takes_a_network_s_own_probability_of_a_surface_where_it_was_fitte
     assert (wide(images, said, own).iou != wide(images, said).iou).any()
 
 
-def test_no_family_is_both_fitted_and_judged_and_every_row_is_judged_once() -> None:
+def test_left_out_families_are_judged_once_and_never_fitted() -> None:
     kinds = [*KINDS, "carved blobs", "cup"]
     judged = list[int]()
     for fitted, rows in left_out_folds(kinds):
@@ -371,9 +392,7 @@ def test_no_family_is_both_fitted_and_judged_and_every_row_is_judged_once() -> N
     assert sorted(judged) == list(range(len(kinds)))
 
 
-def test_fit_predicts_the_quality_of_kinds_that_it_never_saw_also_by_a_figure_that_never_differs() -> (
-    None
-):
+def test_fit_predicts_the_quality_of_kinds_that_it_never_saw() -> None:
     samples = known_objects(600)
     samples.figures[:, 5] = 1.0
     record = QualityRecord.model_validate_json(fit_quality(samples, "0" * 12).model_dump_json())
@@ -387,25 +406,31 @@ def test_fit_predicts_the_quality_of_kinds_that_it_never_saw_also_by_a_figure_th
     assert (samples.iou[found.trusted] >= quality.GOOD_IOU).mean() >= quality.PRECISION
 
 
-def test_trust_needs_good_outlines_enough_frames_and_precision_in_both_shares() -> None:
+def test_trust_needs_good_outlines_in_both_shares() -> None:
     good = np.linspace(0, 1, 1000).astype(np.float32)
     generic = np.arange(1000) % 2 == 0
     above = trusted_above(good, good >= 0.5, generic)
     assert 0.44 < above <= 0.5
     assert trusted_above(good[-10:], good[-10:] > 0, generic[-10:]) is None
     assert trusted_above(good, (good >= 0.5) & ~generic, generic) is None
+
+
+def test_model_of_poor_reconstructions_trusts_none() -> None:
     record = fit_quality(samples := known_objects(200, best=0.7), "0" * 12)
     assert record.trusted_above is None
     assert not QualityEstimate.of(QualityModel(record).outputs(samples.figures), None).trusted.any()
 
 
-def test_good_outline_of_a_kind_counts_where_the_kind_is_sure_and_older_records_know_no_kinds() -> (
-    None
-):
+def test_good_outline_of_a_kind_counts_where_the_kind_is_sure() -> None:
     outputs = np.zeros((3, quality.OUTPUTS), np.float32)
     outputs[:, 3:6] = [(-9, 9, known) for known in (12, 0, -9)]
     assert QualityEstimate.of(outputs, 0.9).trusted.tolist() == [True, False, False]
     assert QualityEstimate.of(outputs, None).good[1] == pytest.approx(quality.KINDS_ODDS, rel=0.05)
+
+
+def test_older_quality_records_know_no_kinds() -> None:
+    outputs = np.zeros((3, quality.OUTPUTS), np.float32)
+    outputs[:, 3:6] = [(-9, 9, known) for known in (12, 0, -9)]
     older = QualityEstimate.of(outputs[:, [0, 1, 2, 4, 6]], 0.9)
     assert older.trusted.all()
 
