@@ -1,36 +1,37 @@
-"""Tree of the errors that nlos-cam raises on purpose, with exit codes and an example message of
-each.
+"""Tree of the errors that nlos-cam raises on purpose, with exit codes and an example of each.
 
-    NlosCamError                     exit 1   root; one clear line: what was wrong, the value, what
-    to do ├── SceneError (ValueError)      exit 1   a scene, object or accuracy that cannot be
-    rendered │   ├── SceneFileError           exit 4   a scene, mesh or depth map that is missing or
-    unreadable │   └── UnknownNameError         exit 2   no object, scene or setting of that name
-    ├── BudgetError (ValueError)     exit 1   a latency budget that no setting meets on this machine
-    ├── OutputExistsError (FileExistsError)  exit 1   --out exists and --overwrite was not given ├──
-    DiskFullError (OSError)      exit 1   too little disk space for the output, or none left ├──
-    FolderBusyError (BlockingIOError)  exit 1   another process writes to the folder ├──
-    WorkersLostError (ChildProcessError)  exit 1   worker processes that cannot start, or that keep
-    dying ├── CameraError (OSError)        exit 3   a device that is missing or does not respond as
-    it should │   ├── CameraNotFoundError      exit 3   no such device │   │   └──
-    UnknownCameraError   exit 2   a mistyped name of a camera │   └── CameraLostError          exit
-    3   a device that vanished or went silent while in use └── RecordingError (OSError)     exit 4
-    a recording, dataset or record that cannot be read
-        └── StreamMissingError       exit 4   a readable recording without a stream that is needed
+    NlosCamError                     exit 1   root: what was wrong, the value, what to do
+    ├── SceneError (ValueError)      exit 1   a scene, object or accuracy that cannot be rendered
+    │   ├── SceneFileError           exit 4   a scene, mesh or depth map that cannot be read
+    │   └── UnknownNameError         exit 2   no object, scene or setting of that name
+    ├── BudgetError (ValueError)     exit 1   a latency budget that no setting meets
+    ├── OutputExistsError (FileExistsError)
+    │                                exit 1   --out exists and --overwrite was not given
+    ├── FileBusyError (BlockingIOError)
+    │                                exit 1   another process writes to the file
+    ├── DiskFullError (OSError)      exit 1   too little disk space for the output, or none left
+    ├── FolderBusyError (BlockingIOError)
+    │                                exit 1   another process writes to the folder
+    ├── WorkersLostError (ChildProcessError)
+    │                                exit 1   workers that cannot start, or that keep dying
+    ├── CameraError (OSError)        exit 3   a device that is missing or does not respond
+    │   ├── CameraNotFoundError      exit 3   no such device
+    │   │   └── UnknownCameraError   exit 2   a mistyped name of a camera
+    │   └── CameraLostError          exit 3   a device that vanished or went silent in use
+    └── RecordingError (OSError)     exit 4   a recording, dataset or record that cannot be read
+        └── StreamMissingError       exit 4   a recording without a stream that is needed
 
-OutputExistsError is also the one of `nlos_models`, which atomic writes raise: to catch both, name
-that one. `nlos_calibration.errors` and `nlos_models.errors` hold their packages' roots; the command
-line catches all three.
+All packages raise OutputExistsError and FileBusyError, which `nlos_cam.files` defines.
+`nlos_calibration.errors` and `nlos_models.errors` hold their packages' roots; the command line
+catches all three.
 """
 
 from collections.abc import Iterable
 
-from nlos_models import errors as models
-
-
-class NlosCamError(Exception):
-    """Root of nlos-cam's own errors: "sim cannot be recorded: give a live camera (l515, sim)"."""
-
-    exit_code = 1
+# Names of this module too: the base of the tree, which lies below the other two packages.
+from nlos_cam.files.errors import FileBusyError as FileBusyError  # noqa: PLC0414
+from nlos_cam.files.errors import NlosCamError as NlosCamError  # noqa: PLC0414
+from nlos_cam.files.errors import OutputExistsError as OutputExistsError  # noqa: PLC0414
 
 
 class SceneError(NlosCamError, ValueError):
@@ -56,12 +57,6 @@ class UnknownNameError(SceneError):
 class BudgetError(NlosCamError, ValueError):
     """Latency budget that no setting meets on this machine: "--budget-ms 5: the fastest setting
     takes 9.1 ms".
-    """
-
-
-class OutputExistsError(NlosCamError, models.OutputExistsError):
-    """Output path that exists: "run.bag exists: choose another name, or add --overwrite to replace
-    it".
     """
 
 

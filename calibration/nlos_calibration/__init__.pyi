@@ -67,7 +67,6 @@ __all__ = [
     "on_plane",
     "packaged_rigs",
     "points_m",
-    "read_toml",
     "record_kind",
     "rig_difference",
     "rig_named",
@@ -118,7 +117,6 @@ from .rig import (
     first_problem,
     load_rig,
     packaged_rigs,
-    read_toml,
     record_kind,
 )
 from .rig_check import (

@@ -10,7 +10,7 @@ from difflib import get_close_matches
 from importlib.resources.abc import Traversable
 from math import degrees, radians
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self, TypeVar
+from typing import Annotated, Literal, Self, TypeVar
 
 import numpy as np
 import tomli_w
@@ -24,15 +24,12 @@ from nlos_calibration.geometry import (
     normal_from_angles,
     wall_from_plane,
 )
+from nlos_cam.files import read_toml
 
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 R = TypeVar("R", bound=BaseModel)
-TOML_LIMIT = 1 << 20
-"""Bound on a file's bytes: a record has some kB."""
-DEEP_KEY = re.compile(r"(?<![^\s.=,#{}\[\]])(?:[^\s.=,#{}\[\]]++[ \t]*+\.[ \t]*+){100}")
-"""Key of a hundred parts: tomllib takes minutes for some thousands."""
 KINDS = {"schema_version": "wall record", "task": "training recipe", "lidar": "rig", "rig": "scene"}
 """Kind of a TOML file by a field of it, in this order: a wall record has a rig too."""
 WORDING = {
@@ -244,27 +241,13 @@ def load_rig(name_or_path: str | Path) -> Rig:
     return read_record(source, Rig, "rig", "give a packaged name (paper-rig) or a file")
 
 
-def read_toml(source: Traversable) -> dict[str, Any]:
-    """Return the content of a TOML file. Raises OSError, UnicodeDecodeError or TOMLDecodeError."""
-    with source.open("rb") as file:
-        content = file.read(TOML_LIMIT + 1)
-    if len(content) > TOML_LIMIT:
-        raise tomllib.TOMLDecodeError(f"it is longer than {TOML_LIMIT >> 20} MiB")
-    if DEEP_KEY.search(text := content.decode()):
-        raise tomllib.TOMLDecodeError("it is nested too deeply")
-    try:
-        return tomllib.loads(text)
-    except RecursionError as error:
-        raise tomllib.TOMLDecodeError("it is nested too deeply") from error
-
-
 def read_record(source: Traversable, model: type[R], kind: str, advice: str) -> R:
     """Read a validated record from a TOML file. Raises RecordFileError, with `advice` if there is
     no such file.
     """
     content: dict[str, object] = {}
     try:
-        content = read_toml(source)
+        content = read_toml(Path(str(source)))
         return model.model_validate(content)
     except FileNotFoundError as error:
         raise RecordFileError(f"no {kind} {source}: {advice}") from error

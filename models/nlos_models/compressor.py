@@ -33,6 +33,7 @@ class Filter(nn.Conv2d):
 
     def forward(self, input: Tensor) -> Tensor:  # noqa: A002  nn.Conv2d's name
         """Map (n, in, h, w) to (n, out, h', w')."""
+        # Only these are slow in bfloat16 on a CPU; all other layers are faster in it.
         if self.groups == 1 or self.stride[0] == 1 or input.device.type != "cpu":
             return super().forward(input)
         with torch.autocast("cpu", enabled=False):
@@ -43,6 +44,8 @@ def conv_norm(
     channels_in: int, channels_out: int, kernel: int, stride: int = 1, groups: int = 1
 ) -> list[nn.Module]:
     """Return a padded convolution and its batch norm; only the stride changes the image's size."""
+    # Half the kernel on each side, so that n becomes n / stride, also for a kernel of 1. No bias:
+    # the batch norm after it would subtract it.
     padding = kernel // 2
     conv = Filter(channels_in, channels_out, kernel, stride, padding, groups=groups, bias=False)
     return [conv, nn.BatchNorm2d(channels_out)]
@@ -56,6 +59,9 @@ class InvertedResidual(nn.Module):
     def __init__(self, channels_in: int, channels_out: int, stride: int, expansion: int) -> None:
         super().__init__()
         hidden = channels_in * expansion
+        # Sandler et al. 2018: nonlinear where there are many channels, linear where there are
+        # few; a ReLU on the narrow side would lose information, so that none follows the
+        # projection.
         layers = [*conv_norm(channels_in, hidden, 1), nn.ReLU6()] if expansion > 1 else []
         layers += [*conv_norm(hidden, hidden, 3, stride, groups=hidden), nn.ReLU6()]
         self.layers = nn.Sequential(*layers, *conv_norm(hidden, channels_out, 1))
@@ -70,6 +76,7 @@ def _scale_channels(channels: int, width: float) -> int:
     """Return the channels of a layer in a network of this width: a multiple of 8, by MobileNetV2's
     rule.
     """
+    # Multiples of 8 fill a CPU's vector registers.
     return max(8, int(channels * width + 4) // 8 * 8)
 
 
@@ -79,6 +86,7 @@ def _features(width: float) -> nn.Sequential:
     for expansion, full, repeats, stride in STAGES:
         out = _scale_channels(full, width)
         for repeat in range(repeats):
+            # Only the first block of a stage halves the image; the others are residual.
             layers.append(InvertedResidual(channels, out, stride if repeat == 0 else 1, expansion))
             channels = out
     return nn.Sequential(*layers, *conv_norm(channels, HEAD, 1), nn.ReLU6())
@@ -96,6 +104,8 @@ class Compressor(nn.Module):
 
     def forward(self, stacked: Tensor) -> Tensor:
         """Map (n, 4, 100, 100) to (n, 256)."""
+        # Features (n, 1280, 4, 4) are averaged over places: the paper's classifier has no places,
+        # and the latent must come from all of the map.
         return self.classifier(self.features(stacked).mean((2, 3)))
 
 
@@ -123,6 +133,8 @@ class Bottleneck(nn.Module):
             nn.ReLU(),
             *conv_norm(within, out, 1),
         )
+        # He et al. 2016: the input is added, so that a block starts as a small change and the
+        # gradient reaches the first layers; where shapes differ it is projected.
         same = stride == 1 and channels_in == out
         self.shortcut = (
             nn.Identity() if same else nn.Sequential(*conv_norm(channels_in, out, 1, stride))

@@ -11,9 +11,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from nlos_models.data import MapNoise
 from nlos_models.metrics import MIN_V
-from nlos_models.recipe import DirectSize
+from nlos_models.training.recipe import DirectSize
 
 ROWS = 64
 COLUMNS = 80
@@ -58,6 +57,10 @@ class MirrorLinear(nn.Module):
 
     def forward(self, sides: Tensor) -> Tensor:
         """Map both sides."""
+        # Swapping the sides leaves the sum and turns the sign of the difference. A layer that
+        # commutes with it maps sums to sums and differences to differences (Schur's lemma), and
+        # the odd part has no bias. 0.7, about 1 / sqrt(2), keeps the variance of sum and
+        # difference.
         top, bottom = sides.unbind(1)
         even = self.even(0.7 * (top + bottom))
         odd = self.odd(0.7 * (top - bottom))
@@ -82,10 +85,14 @@ class Residual(nn.Module):
         self.across = across
         self.first, self.second, self.dropout = *layers, nn.Dropout(dropout)
         for parameter in self.second.parameters():
+            # Each block starts as the identity, so that a deep trunk trains from the first step,
+            # and blocks added to trained weights change nothing at first (`train_direct`).
             nn.init.zeros_(parameter)
 
     def forward(self, x: Tensor) -> Tensor:
         """Map (b, 2, ..., n) to the same shape; `across` mixes over the axis before the last."""
+        # Norm before the layers, not after (Xiong et al. 2020): the residual path stays linear,
+        # and the rate needs little warm-up.
         y = self.norm(x)
         y = y.transpose(-1, -2) if self.across else y
         y = self.dropout(self.second(functional.gelu(self.first(y))))
@@ -112,11 +119,14 @@ class CellNormal(nn.Module):
     def learn(self, depth_m: Tensor, intensity: Tensor) -> None:
         """Set the statistics to those of maps (n, 64, 80), averaged with the mirrored ones."""
         for channel, values in enumerate(_channels(depth_m, intensity).unbind(1)):
+            # Medians, since the objects in a part of the maps must not move the center of a cell
+            # that sees bare wall in most of them.
             median = values.nanmedian(0).values.nan_to_num()
             spread = (values - median).square().nanmean(0).sqrt().nan_to_num()
             spread = spread.clamp(
                 min=max(SMALLEST_SHARE * float(spread.median()), MIN_LIGHT_SPREAD * bool(channel))
             )
+            # Mirrored maps need the same normalisation, or the network is no longer symmetric.
             self.median[channel] = (median + median.flip(0)) / 2
             self.spread[channel] = (spread + spread.flip(0)) / 2
 
@@ -127,6 +137,8 @@ class CellNormal(nn.Module):
         One number a channel, the median over the cells: a few objects do not tell each cell's own
         median.
         """
+        # Differences from the training rig's medians, and their median: an offset of the device
+        # or a gain of the bench is common to all cells, an object is not.
         medians = _channels(depth_m, intensity).nanmedian(0).values
         shifts = (medians - self.median).flatten(1).nanmedian(1).values.nan_to_num()
         self.median[channels] += shifts[channels, None, None]
@@ -135,6 +147,8 @@ class CellNormal(nn.Module):
         """Map maps (n, 64, 80) to (n, 2, 64, 80), in color (n, 4, 64, 80); a cell without a return
         is 0.
         """
+        # (n, 2, 64, 80), in color (n, 4, 64, 80); log(1 + counts), so that a gain is an offset
+        # and shot noise grows less with the light.
         off = _channels(depth_m, intensity) - self.median
         gain = self.log_gain(off[:, 1:].mean(1))[:, None, None, None]
         normal = torch.cat([off[:, :1], off[:, 1:] - gain], dim=1) / self.spread
@@ -147,42 +161,19 @@ class CellNormal(nn.Module):
         Medians are taken by sorting, which every runtime can do, with cells that do not count at
         the end.
         """
+        # A laser's power and a wall's reflectance scale all counts of a frame; without it taken
+        # out, the network would read brightness as distance.
         some = light[..., ::GAIN_COLUMNS]
         spread = self.spread[1:, :, ::GAIN_COLUMNS].mean(0)
+        # Cells whose light varies least over the training objects see the wall, not the object.
         quieter = spread <= spread.flatten().sort().values[(spread.numel() - 1) // 2]
+        # ONNX has no median of a varying number of values: sorted with infinity in place of those
+        # that do not count, the middle one is at (number - 1) // 2.
         counts = quieter & ~torch.isnan(some)
         ordered = torch.where(counts, some, torch.inf).flatten(1).sort(dim=1).values
         number = counts.flatten(1).sum(dim=1, keepdim=True)
         middle = ordered.gather(1, ((number - 1) // 2).clamp(min=0))
         return torch.where(number > 0, middle, 0.0)[:, 0]
-
-    def vary(
-        self,
-        normal: Tensor,
-        noise: MapNoise | None,
-        log_reflectance: Tensor | None,
-        offset_m: Tensor | None,
-    ) -> Tensor:
-        """Return the maps (n, 2, 64, 80), normalised as `forward` does, as another bench or moment
-        would give them.
-
-        Noise is the sensor's, drawn for the intensity of expected maps; the logarithm of the wall's
-        reflectance (n, 64, 80) adds to that of the light, and a range offset (n,) to all depths.
-        """
-        depth = normal[:, :1]
-        light = normal[:, 1:]
-        returns = (normal != 0).any(dim=1, keepdim=True)
-        counts = torch.expm1(light * self.spread[1:] + self.median[1:])
-        if log_reflectance is not None:
-            counts = counts * log_reflectance.exp()[:, None]
-        if noise is not None:
-            counts = noise.add(counts)
-        if offset_m is not None:
-            depth = depth + offset_m[:, None, None, None] / self.spread[:1]
-        varied = torch.cat(
-            [depth, (torch.log1p(counts) - self.median[1:]) / self.spread[1:]], dim=1
-        )
-        return torch.where(returns, varied.clamp(-CLIP, CLIP), normal)
 
 
 def channels_of(*, color: bool) -> int:
@@ -253,6 +244,7 @@ class DirectNetwork(nn.Module):
 
         In color four channels become four logits.
         """
+        # The bottom half upside down: row k of either side is as far from the plane of symmetry.
         sides = torch.stack(
             [normal[..., : ROWS // 2, :], normal[..., ROWS // 2 :, :].flip(-2)], dim=1
         )
@@ -265,6 +257,8 @@ class DirectNetwork(nn.Module):
         x = x.unflatten(-1, (channels, TOKEN, TOKEN)).unflatten(
             2, SIDE_TOKENS
         )  # (n, side, row, column, head, y, x)
+        # Tokens back to pixels: (n, side, head, row, y, column, x), then the bottom side turned
+        # up.
         x = x.permute(0, 1, 4, 2, 5, 3, 6).reshape(-1, 2, channels, PIXELS // 2, PIXELS)
         return torch.cat([x[:, 0], x[:, 1].flip(-2)], dim=-2)
 
@@ -299,6 +293,10 @@ def image_from_logits(logits: Tensor) -> Tensor:
     p of a surface, the expected intersection over union is about the sum of p inside over the sum
     of p everywhere and 1 - p inside.
     """
+    # A cut at 0.5 is best for single pixels, not for the overlap: a small object of probability
+    # 0.4 throughout would vanish. The expected overlap (sum of p inside) / (area + sum of p
+    # outside) is computed at six cuts, and the best taken; in the fraction, area + sum of all p -
+    # sum of p inside is that denominator.
     every = torch.sigmoid(logits.float())
     share = every[:, 0]
     values = every[:, 1:] if every.shape[1] > 2 else every[:, 1]
@@ -310,29 +308,4 @@ def image_from_logits(logits: Tensor) -> Tensor:
     surface = share > cuts[overlap.argmax(1)][:, None, None]
     return torch.where(
         surface if values.dim() == 3 else surface[:, None], MIN_V + (1 - MIN_V) * values, 0.0
-    )
-
-
-def two_heads_error(logits: Tensor, truth: Tensor) -> Tensor:
-    """Return the loss of logits (n, 2, 64, 64) against images (n, 64, 64): cross-entropy, overlap
-    and depth.
-
-    Cross-entropy of the silhouette, plus 0.5 (1 - soft intersection over union), plus 2 times the
-    absolute error of v over the surface; each is a mean over pixels or objects. In color, (n, 4,
-    64, 64) against (n, 3, 64, 64), the error of v is the mean of three.
-    """
-    logits = logits.float()
-    truth = truth.float() if truth.dim() == 4 else truth.float()[:, None]
-    occupied = logits[:, 0]
-    values = logits[:, 1:]
-    surface = (truth > 0).any(1).float()
-    entropy = functional.binary_cross_entropy_with_logits(occupied, surface)
-    share = torch.sigmoid(occupied)
-    both = (share * surface).sum((1, 2))
-    one = (share + surface - share * surface).sum((1, 2))
-    off = (MIN_V + (1 - MIN_V) * torch.sigmoid(values) - truth).abs().mean(1) * surface
-    return (
-        entropy
-        + 0.5 * (1 - (both + 1) / (one + 1)).mean()
-        + 2 * off.sum() / surface.sum().clamp(min=1)
     )

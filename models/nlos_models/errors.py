@@ -1,15 +1,14 @@
 """Errors of the models package, and of a missing extra "train", whose libraries the base
 installation leaves out.
 
-ModelError (ValueError)                  exit 1   root ├── MissingExtraError (ImportError)      exit
-1   'training needs torch: pip install "nlos-cam[train]"' ├── TrainingError
-exit 1   "the loss is nan in epoch 3: choose a smaller learning_rate" ├── OutputExistsError
-(FileExistsError)  exit 1   "runs/a holds weights from another run: choose another --out" ├──
-FileBusyError (BlockingIOError)      exit 1   "a.bag is being written by process 7 on lab: wait for
-it, ..." ├── CheckpointError                      exit 4   "decoder.safetensors cannot be read as
-weights: ..." └── RecipeError                          exit 4   "recipe.toml: batch: must be greater
-than 1 (got 1)"
-    └── UnknownRecipeError               exit 2   "no recipe 'vea'. Did you mean 'vae'?"
+    ModelError (ValueError)               exit 1   root
+    ├── MissingExtraError (ImportError)   exit 1   'training needs torch: pip install ...'
+    ├── TrainingError                     exit 1   "the loss is nan in epoch 3: choose ..."
+    ├── CheckpointError                   exit 4   "decoder.safetensors cannot be read as ..."
+    └── RecipeError                       exit 4   "recipe.toml: batch: must be greater than 1 ..."
+        └── UnknownRecipeError            exit 2   "no recipe 'vea'. Did you mean 'vae'?"
+
+Outputs that exist or are being written raise OutputExistsError and FileBusyError of `nlos_cam`.
 """
 
 import re
@@ -39,14 +38,6 @@ class ModelError(ValueError):
 
 class TrainingError(ModelError):
     """A training run that cannot continue; its saved state stays."""
-
-
-class OutputExistsError(ModelError, FileExistsError):
-    """An output folder with other contents, which training would overwrite."""
-
-
-class FileBusyError(ModelError, BlockingIOError):
-    """A file or folder that another process is writing."""
 
 
 class CheckpointError(ModelError):

@@ -1,15 +1,12 @@
-"""Export of networks to ONNX with torch: graphs that point into a checkpoint's tensors, and 8-bit
-networks.
-"""
+"""Export of networks to ONNX with torch: graphs that point into a checkpoint's tensors."""
 
 import hashlib
 import json
 import logging
 import warnings
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -19,16 +16,21 @@ from numpy.typing import NDArray
 from onnx import TensorProto, helper, numpy_helper
 from torch import Tensor, nn
 
+from nlos_cam.files import write_checked
 from nlos_models import inference
 from nlos_models.arrays import Float32
 from nlos_models.checkpoint import load_network
 from nlos_models.direct import DirectNetwork
-from nlos_models.doubt_network import load_doubt
 from nlos_models.errors import CheckpointError, ModelError
-from nlos_models.files import write_checked
 from nlos_models.pipeline import RemappingNetwork
-from nlos_models.recipe import SIMULATION_ONLY
-from nlos_models.records import DOUBT, CheckpointRecord, checksum_of_watched, watched_files
+from nlos_models.records import (
+    SIMULATION_ONLY,
+    UNCERTAINTY,
+    CheckpointRecord,
+    checksum_of_watched,
+    watched_files,
+)
+from nlos_models.uncertainty_network import load_uncertainty_network
 
 OPSET = 18
 IR_VERSION = 10
@@ -38,32 +40,27 @@ NORM_EPSILON = np.float32(1e-5)
 
 
 class TorchReconstructor:
-    """Pipeline in torch; in float32 it is the reference for the others."""
+    """Pipeline in torch, for a GPU, and the reference of the exported graphs."""
 
     def __init__(
-        self,
-        pipeline: RemappingNetwork | DirectNetwork,
-        record: CheckpointRecord,
-        device: str,
-        dtype: torch.dtype = torch.float32,
+        self, pipeline: RemappingNetwork | DirectNetwork, record: CheckpointRecord, device: str
     ) -> None:
         self.record = record
         self.runtime = f"torch on {device}"
         self._network = _Answering(pipeline.to(device).eval())
         self._device = device
-        self._dtype = dtype
 
     def __call__(self, depth_m: Float32, intensity: Float32) -> Float32:
         return self.answer(depth_m, intensity).image
 
     def answer(self, depth_m: Float32, intensity: Float32) -> inference.Answer:
-        mixed = torch.autocast(self._device, self._dtype, enabled=self._dtype != torch.float32)
-        with torch.inference_mode(), mixed:
-            maps = [
-                torch.from_numpy(np.ascontiguousarray(m)).to(self._device)
-                for m in (depth_m, intensity)
-            ]
-            return inference.Answer(*(each.float().cpu().numpy() for each in self._network(*maps)))
+        maps = [
+            torch.from_numpy(np.ascontiguousarray(each)).to(self._device)
+            for each in (depth_m, intensity)
+        ]
+        with torch.inference_mode():
+            answer = self._network(*maps)
+        return inference.Answer(*(each.float().cpu().numpy() for each in answer))
 
 
 class _Answering(nn.Module):
@@ -90,7 +87,7 @@ def load_torch_reconstructor(folder: Path) -> TorchReconstructor:
     return TorchReconstructor(*load_network(folder), "cuda")
 
 
-DOUBT_OUTPUTS = list(inference.UncertaintyEstimate._fields)
+UNCERTAINTY_OUTPUTS = list(inference.UncertaintyEstimate._fields)
 
 
 def export_folder(folder: Path) -> list[Path]:
@@ -103,21 +100,25 @@ def export_folder(folder: Path) -> list[Path]:
     inference.refuse_color(record, folder)
     files = watched_files(folder)
     answering = _Answering(network)
-    names = (
-        {"": files[0]}
-        if record.direct_recipe
-        else {f"{name.partition('.')[0]}.": name for name in files}
-    )
+    if record.direct_recipe:
+        names = {"": files[0]}
+    else:
+        names = {f"{name.partition('.')[0]}.": name for name in files}
     parts = {f"network.{prefix}": name for prefix, name in names.items()}
     graphs = {
         inference.NETWORK_ONNX: _linked_graph(
             answering, folder, inference.NETWORK_INPUTS, answering.outputs, parts, files
         )
     }
-    if loaded := load_doubt(folder):
-        parts = {"network.": inference.DOUBT_FILES[0]}
-        graphs[inference.DOUBT_ONNX] = _linked_graph(
-            loaded[0], folder, inference.DOUBT_INPUTS, DOUBT_OUTPUTS, parts, inference.DOUBT_FILES
+    if loaded := load_uncertainty_network(folder):
+        parts = {"network.": inference.UNCERTAINTY_FILES[0]}
+        graphs[inference.UNCERTAINTY_ONNX] = _linked_graph(
+            loaded[0],
+            folder,
+            inference.UNCERTAINTY_INPUTS,
+            UNCERTAINTY_OUTPUTS,
+            parts,
+            inference.UNCERTAINTY_FILES,
         )
     write_checked(folder, graphs)
     return [folder / name for name in graphs]
@@ -133,12 +134,12 @@ def network_export(folder: Path) -> Export:
     return f"{checksum_of(pipeline)}.onnx", partial(export_onnx, pipeline)
 
 
-def doubt_export(folder: Path) -> Export:
+def uncertainty_export(folder: Path) -> Export:
     """Return the export of a folder's uncertainty network. Raises CheckpointError."""
-    if not (loaded := load_doubt(folder)):
+    if not (loaded := load_uncertainty_network(folder)):
         raise CheckpointError(f"{folder} has no uncertainty network: train one with `train doubt`")
-    return f"{DOUBT}-{checksum_of(loaded[0])}.onnx", partial(
-        write_onnx, loaded[0], inference.DOUBT_INPUTS, DOUBT_OUTPUTS
+    return f"{UNCERTAINTY}-{checksum_of(loaded[0])}.onnx", partial(
+        write_onnx, loaded[0], inference.UNCERTAINTY_INPUTS, UNCERTAINTY_OUTPUTS
     )
 
 
@@ -164,12 +165,14 @@ def write_onnx(
 def _as_onnx(
     network: nn.Module, inputs: Mapping[str, tuple[int, int]], outputs: list[str]
 ) -> onnx.ModelProto:
+    # The exporter reports its passes at the level of warnings.
     for noisy in ("onnxscript", "torch.onnx"):
         logging.getLogger(noisy).setLevel(logging.ERROR)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # the exporter warns about its own internals
         program = torch.onnx.export(
             network.eval(),
+            # Two samples: with one, the exporter takes the batch for a constant.
             tuple(torch.ones(2, *shape) for shape in inputs.values()),
             dynamo=True,
             input_names=list(inputs),
@@ -204,6 +207,8 @@ def _stored(path: Path, prefix: str) -> Iterator[tuple[str, _StoredTensor]]:
     """Yield the tensors of a safetensors file: the header's length (8 bytes), the header (JSON),
     then the tensors.
     """
+    # https://huggingface.co/docs/safetensors: offsets in the header count from the end of the
+    # header.
     content = path.read_bytes()
     start = 8 + int.from_bytes(content[:8], "little")
     for name, entry in json.loads(content[8:start]).items():
@@ -234,24 +239,29 @@ def _linked_graph(
     stored = dict[str, _StoredTensor]()
     for prefix, name in parts.items():
         stored.update(_stored(folder / name, prefix))
-    initializers = {initializer.name: initializer for initializer in model.graph.initializer}
-    nodes = list[onnx.NodeProto]()
-    halves = {
-        name: tensor.values for name, tensor in stored.items() if tensor.values.dtype == np.float16
+
+    # The exporter names a weight as torch does, unless it has transposed it for a matrix product:
+    # such a one is found by its values.
+    transposed = {
+        _key(tensor.values.T): tensor
+        for tensor in stored.values()
+        if tensor.values.dtype == np.float16 and tensor.values.ndim == 2
     }
-    turned = {_key(values.T): name for name, values in halves.items() if values.ndim == 2}
+    nodes = list[onnx.NodeProto]()
+    initializers = {initializer.name: initializer for initializer in model.graph.initializer}
     for name, initializer in sorted(initializers.items()):
         values = numpy_helper.to_array(initializer)
+        linked = None
         if name in stored:
             linked = _linked(name, values, stored)
-        elif source := turned.get(_key(values)) if values.ndim == 2 else None:
-            linked = _linked_turned(name, stored[source])
-        else:
-            continue
+        elif values.ndim == 2 and (tensor := transposed.get(_key(values))):
+            linked = _linked_transposed(name, tensor)
         if linked:
             model.graph.initializer.remove(initializer)
             model.graph.initializer.extend(linked[0])
             nodes += linked[1]
+
+    # A graph's nodes are in the order of their use: those that make weights come first.
     rest = list(model.graph.node)
     del model.graph.node[:]
     for node in rest:
@@ -266,7 +276,7 @@ def _key(values: NDArray[Any]) -> tuple[tuple[int, ...], bytes]:
     return values.shape, np.ascontiguousarray(values, np.float32).tobytes()
 
 
-def _linked_turned(
+def _linked_transposed(
     name: str, tensor: _StoredTensor
 ) -> tuple[list[TensorProto], list[onnx.NodeProto]]:
     """Return the initializer and nodes of a weight that the exporter has transposed."""
@@ -278,6 +288,7 @@ def _linked_turned(
 
 
 def _external(name: str, tensor: _StoredTensor) -> TensorProto:
+    # ONNX external data: file, offset and length, so that the weights are stored once.
     external = TensorProto(name=name, data_type=TensorProto.FLOAT16, dims=tensor.values.shape)
     external.data_location = TensorProto.EXTERNAL
     for key, value in (
@@ -299,6 +310,7 @@ def _linked(
     batch norm after it. The same product is left to ONNX Runtime, which computes constants once,
     when it opens the graph.
     """
+    # Biases and norms are small, and stay in the graph.
     tensor = stored[name]
     half = f"{name}.half"
     if tensor.values.dtype != np.float16 or tensor.values.ndim == 1:
@@ -307,6 +319,8 @@ def _linked(
     plain = tensor.values.astype(np.float32)
     if np.array_equal(exported, plain):
         return [external], [helper.make_node("Cast", [half], [name], to=TensorProto.FLOAT)]
+    # In a Sequential the batch norm has the number after its convolution's. Its factor has to be
+    # computed as the exporter did, to the last bit, or the weight is not linked.
     module, _, index = name.removesuffix(".weight").rpartition(".")
     norm = f"{module}.{int(index) + 1}" if index.isdecimal() else ""
     if f"{norm}.running_var" not in stored:
@@ -328,75 +342,10 @@ def checksum_of(network: nn.Module) -> str:
     """Return a checksum of all that an exported network depends on: exporter, weights and this
     package's code.
     """
+    # Code as well as weights: a changed forward pass exports to another graph.
     digest = hashlib.sha256(f"{torch.__version__} {OPSET}".encode())
     for source in sorted(Path(__file__).parent.glob("*.py")):
         digest.update(source.read_bytes())
     for name, tensor in sorted(network.state_dict().items()):
         digest.update(name.encode() + tensor.contiguous().numpy().tobytes())
     return digest.hexdigest()[:16]
-
-
-Sample = tuple[Float32, Float32]
-"""Depth and intensity maps, each (n, 64, 80)."""
-QUANTIZED = ["Conv", "MatMul", "Gemm"]
-"""Operators with nearly all of the work; the rest is preprocessing, activations and the
-silhouette.
-"""
-
-
-def quantize(model: bytes, samples: Iterable[Sample] | None = None) -> bytes:
-    """Return an ONNX file with weights in 8 bits; given samples, also with activations in 8 bits of
-    their ranges.
-
-    The weights take 7 of the 8 bits: on a processor without VNNI instructions, ONNX Runtime adds
-    two products of 8 by 8 bits in 16 bits, which saturate (measured there: a mean error of 17 % of
-    the picture's spread in place of 3 %). Raises ModelError where ONNX Runtime fails.
-    """
-    from onnxruntime import quantization
-
-    plain = onnx.load_from_string(model)
-    del plain.graph.value_info[
-        :
-    ]  # shapes from the exporter; they are wrong after the quantizer transposes a Gemm
-    options: dict[str, Any] = {"op_types_to_quantize": QUANTIZED, "reduce_range": True}
-    logging.getLogger().addFilter(
-        _is_no_advice
-    )  # advice to preprocess the model, sent through the root logger
-    try:
-        with TemporaryDirectory() as folder:
-            part = Path(folder) / "quantized.onnx"
-            if samples is None:
-                quantization.quantize_dynamic(plain, part, **options)
-            else:
-                quantization.quantize_static(
-                    plain, part, _reader(samples), per_channel=True, **options
-                )
-            return part.read_bytes()
-    except (RuntimeError, ValueError, OSError) as error:
-        raise ModelError(
-            f"the network cannot be quantised to 8 bits ({error}): use it as it is"
-        ) from error
-    finally:
-        logging.getLogger().removeFilter(_is_no_advice)
-
-
-def _is_no_advice(record: logging.LogRecord) -> bool:
-    return "pre-processing before quantization" not in record.getMessage()
-
-
-def _reader(samples: Iterable[Sample]) -> Any:
-    from onnxruntime.quantization import CalibrationDataReader
-
-    class Reader(CalibrationDataReader):
-        """Reader of samples, one at a time; None at the end."""
-
-        def __init__(self) -> None:
-            self._rest: Iterator[Sample] = iter(samples)
-
-        def get_next(self) -> Any:
-            sample = next(self._rest, None)
-            return (
-                None if sample is None else dict(zip(("depth_m", "intensity"), sample, strict=True))
-            )
-
-    return Reader()

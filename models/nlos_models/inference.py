@@ -10,18 +10,22 @@ from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 
+from nlos_cam.files import TENSOR_LIMIT, load_cached, read_checked
 from nlos_models import records
 from nlos_models.arrays import Float32
 from nlos_models.errors import CheckpointError, MissingExtraError, lacks_memory, require
-from nlos_models.files import TENSOR_LIMIT, load_cached, read_checked
-from nlos_models.quality import DOUBT_FILES, QualityModel, UncertaintyEstimate, load_quality_model
-from nlos_models.recipe import SIMULATION_ONLY
+from nlos_models.quality import (
+    UNCERTAINTY_FILES,
+    QualityModel,
+    UncertaintyEstimate,
+    load_quality_model,
+)
 
 MAP_SHAPE = (64, 80)
 NETWORK_INPUTS = {"depth_m": MAP_SHAPE, "intensity": MAP_SHAPE}
-DOUBT_INPUTS = {**NETWORK_INPUTS, "image": (64, 64)}
+UNCERTAINTY_INPUTS = {**NETWORK_INPUTS, "image": (64, 64)}
 NETWORK_ONNX = "network.onnx"
-DOUBT_ONNX = "doubt.onnx"
+UNCERTAINTY_ONNX = "doubt.onnx"
 """Graphs beside a checkpoint's tensors, which they point into as ONNX external data: nothing is
 stored twice.
 """
@@ -62,6 +66,8 @@ def ask(
     """Return a network's answer to maps (n, 64, 80), with the probability of a surface where its
     `answer` has one.
     """
+    # Any function of maps is a network, in tests and for a user's own; the second head is
+    # optional.
     if isinstance(network, _HasSurface):
         return network.answer(depth_m, intensity)
     return Answer(network(depth_m, intensity))
@@ -76,12 +82,11 @@ class OnnxReconstructor:
         self,
         model: Path | bytes,
         record: records.CheckpointRecord,
-        threads: int = 1,
         checksum: str = "",
     ) -> None:
         self.record = record
         self.runtime = "ONNX Runtime on cpu"
-        self._session = open_session(model, threads, checksum)
+        self._session = open_session(model, checksum)
 
     def __call__(self, depth_m: Float32, intensity: Float32) -> Float32:
         return self.answer(depth_m, intensity).image
@@ -97,7 +102,7 @@ class OnnxReconstructor:
 class UncertaintyModel(Protocol):
     """Uncertainty network that is ready to run."""
 
-    record: records.DoubtRecord
+    record: records.UncertaintyRecord
     quality: QualityModel | None
     """None for weights without a quality model."""
 
@@ -109,23 +114,23 @@ class UncertaintyModel(Protocol):
 
 
 class OnnxUncertaintyModel:
-    """Uncertainty network in ONNX Runtime, on one thread of the CPU unless set otherwise."""
+    """Uncertainty network in ONNX Runtime on the CPU."""
 
     def __init__(
-        self, model: Path | bytes, record: records.DoubtRecord, threads: int = 1, checksum: str = ""
+        self, model: Path | bytes, record: records.UncertaintyRecord, checksum: str = ""
     ) -> None:
         self.record = record
-        self._session = open_session(model, threads, checksum)
+        self._session = open_session(model, checksum)
         self.quality: QualityModel | None = None
 
     def __call__(self, depth_m: Float32, intensity: Float32, image: Float32) -> UncertaintyEstimate:
         arrays = (np.ascontiguousarray(array, np.float32) for array in (depth_m, intensity, image))
         return UncertaintyEstimate(
-            *self._session.run(None, dict(zip(DOUBT_INPUTS, arrays, strict=True)))
+            *self._session.run(None, dict(zip(UNCERTAINTY_INPUTS, arrays, strict=True)))
         )
 
 
-def open_session(model: Path | bytes, threads: int = 1, checksum: str = "") -> Any:
+def open_session(model: Path | bytes, checksum: str = "") -> Any:
     """Open an ONNX file, or its content, in ONNX Runtime on the CPU.
 
     Raises CheckpointError where it cannot be read, or was made from other weights than those of
@@ -139,20 +144,24 @@ def open_session(model: Path | bytes, threads: int = 1, checksum: str = "") -> A
             f"ONNX Runtime cannot be loaded ({reason}): free memory or install it again"
         ) from error
     options = onnxruntime.SessionOptions()
-    options.intra_op_num_threads = threads
+    # One thread: a frame's products are too small to be worth the hand-over between threads, and
+    # the other cores have the camera, the view and the check by physics.
+    options.intra_op_num_threads = 1
+    # Errors are raised too; a log of a library on stderr would break the command's own output.
     options.log_severity_level = 4  # errors are raised too
     name = model if isinstance(model, Path) else "the cached network"
     try:
         if isinstance(model, Path):
             read_checked(model, TENSOR_LIMIT)
-        source = (
-            model if isinstance(model, bytes) else str(model)
-        )  # by its path: it points into the weights beside it
+        # A graph in a folder is opened by its path, since it points into the weights beside it.
+        source = model if isinstance(model, bytes) else str(model)
         session = onnxruntime.InferenceSession(source, options, providers=["CPUExecutionProvider"])
     except Exception as error:  # ONNX Runtime's errors share no class below Exception
         if lacks_memory(error):
             raise MemoryError(str(error)) from error
         raise CheckpointError(f"{name} cannot be read as a network: export it again") from error
+    # A graph beside other tensors would answer, and wrongly: offsets of another file are still
+    # numbers.
     if checksum and session.get_modelmeta().custom_metadata_map.get(CHECKSUM) != checksum:
         raise CheckpointError(
             f"{name} was made from other weights than those beside it: export it again"
@@ -160,28 +169,25 @@ def open_session(model: Path | bytes, threads: int = 1, checksum: str = "") -> A
     return session
 
 
-def load_reconstructor(folder: Path | None, cache: Path, threads: int = 1) -> Reconstructor:
+def load_reconstructor(folder: Path | None, cache: Path) -> Reconstructor:
     """Load a checkpoint folder's weights (None: the shipped ones) on a GPU if there is one, else in
     ONNX Runtime.
 
-    `threads` are ONNX Runtime's. Weights without a valid graph beside them are exported into the
+    Weights without a valid graph beside them are exported into the
     folder `cache`, which takes torch. Raises CheckpointError where they cannot be read or are for
     color, MissingExtraError without torch.
     """
     folder = records.weights_folder(folder)
     record = records.load_record(folder)
     refuse_color(record, folder)
+    # Without torch where it can be: importing it takes seconds. A GPU needs it.
     if _has_cuda():
         return require("nlos_models.export", "inference on a GPU").load_torch_reconstructor(folder)
     try:
-        return OnnxReconstructor(
-            folder / NETWORK_ONNX, record, threads, records.checksum_of_watched(folder)
-        )
+        return OnnxReconstructor(folder / NETWORK_ONNX, record, records.checksum_of_watched(folder))
     except CheckpointError as error:
         key, export = _exporter(error).network_export(folder)
-        return load_cached(
-            cache / key, lambda model: OnnxReconstructor(model, record, threads), export
-        )
+        return load_cached(cache / key, lambda model: OnnxReconstructor(model, record), export)
 
 
 def load_uncertainty_model(
@@ -197,14 +203,16 @@ def load_uncertainty_model(
     MissingExtraError.
     """
     folder = records.weights_folder(folder)
-    if (record := records.load_doubt_record(folder)) is None:
+    if (record := records.load_uncertainty_record(folder)) is None:
         return None
     try:
         loaded = OnnxUncertaintyModel(
-            folder / DOUBT_ONNX, record, checksum=records.checksum_of_watched(folder, DOUBT_FILES)
+            folder / UNCERTAINTY_ONNX,
+            record,
+            checksum=records.checksum_of_watched(folder, UNCERTAINTY_FILES),
         )
     except CheckpointError as error:
-        key, export = _exporter(error).doubt_export(folder)
+        key, export = _exporter(error).uncertainty_export(folder)
         loaded = load_cached(cache / key, lambda model: OnnxUncertaintyModel(model, record), export)
     loaded.quality = load_quality_model(folder) if quality else None
     return loaded
@@ -214,8 +222,8 @@ def refuse_color(record: records.CheckpointRecord, folder: Path | None) -> None:
     """Raise CheckpointError for color weights: exports and runtimes are for depth."""
     if record.color:
         raise CheckpointError(
-            f"{folder} holds weights for full color ({SIMULATION_ONLY}): name weights for depth, or"
-            " evaluate these with tools/studies/color.py"
+            f"{folder} holds weights for full color ({records.SIMULATION_ONLY}): name weights for"
+            " depth, or evaluate these with tools/studies/color.py"
         )
 
 
@@ -232,6 +240,7 @@ def _has_cuda() -> bool:
     installed.
     """
     try:
+        # The driver's library, since asking torch would import it.
         ctypes.CDLL("nvcuda.dll" if sys.platform == "win32" else "libcuda.so.1")
     except OSError:
         return False

@@ -32,6 +32,7 @@ def silhouette_iou(image: Float32, truth: Float32) -> Float64:
     """Return intersection over union of the surface masks, (n,); 1 where both are empty."""
     found = surface(image)
     true = surface(truth)
+    # Of two empty images the overlap is right, not undefined.
     union = (found | true).sum((-2, -1))
     return np.where(union > 0, (found & true).sum((-2, -1)) / np.maximum(union, 1), 1.0)
 
@@ -41,6 +42,7 @@ def foreground_rmse_mm(image: Float32, truth: Float32, mm_per_v: float) -> Float
 
     Depth as `live` shows it: v from 0.05 to MIN_V is at z_far.
     """
+    # Where one has no surface the error is the silhouette's, which the IoU counts.
     both = surface(image) & surface(truth)
     apart = np.maximum(image.astype(np.float64), MIN_V) - np.maximum(truth, MIN_V)
     squares = np.where(both, np.square(apart), 0.0).sum((-2, -1))
@@ -74,6 +76,8 @@ def root_mean_square_error(image: Float32, truth: Float32) -> Float64:
     """Return the RMS of v - v_true over all pixels and channels, (n,); the mean object is its best
     constant answer.
     """
+    # Squared, so that the mean image is the best constant answer and a baseline beats nothing for
+    # free.
     return np.sqrt(np.square(image.astype(np.float64) - truth).mean((-3, -2, -1)))
 
 

@@ -39,6 +39,8 @@ def split_and_stack(depth_m: Tensor, intensity: Tensor) -> Tensor:
     """
     depth = depth_m[:, None]
     each = intensity[:, None] if intensity.ndim == depth_m.ndim else intensity
+    # SI 4: the left and the right half of the wall have different distances to the object, and go
+    # in as channels of one place, so that one filter compares them.
     maps = torch.cat([depth, torch.where(torch.isnan(depth), depth, each)], dim=1)
     half = depth_m.shape[-1] // 2
     return torch.stack([maps[..., :half], maps[..., half:]], dim=2).flatten(1, 2)
@@ -48,6 +50,8 @@ def channel_statistics(stacked: Tensor) -> tuple[Tensor, Tensor]:
     """Return mean and standard deviation (channels,) of stacked maps (n, channels, 64, 40) over
     valid cells.
     """
+    # In double precision: sums over 10,000 maps of 2,560 cells lose digits in float32, and other
+    # batches would then give other statistics.
     values = stacked.transpose(0, 1).flatten(1).double()
     valid = ~torch.isnan(values)
     count = valid.sum(1).clamp(min=1)
@@ -83,10 +87,15 @@ class Preprocess(nn.Module):
         normalised).
         """
         stacked = split_and_stack(depth_m, intensity)
+        # Depth is in metres and intensity in counts: without a common scale, the larger one would
+        # drive the first layer's gradients.
         scale = self.spread.clamp(min=SMALLEST_SPREAD)
         normal = (stacked - self.mean[:, None, None]) / scale[:, None, None]
+        # A missing cell becomes the mean: the value that tells the network least.
         normal = torch.where(torch.isnan(normal), torch.zeros_like(normal), normal)
         if self.training:
+            # SI 4: noise of 0.2 spreads on the left half alone, drawn anew at each step, so that
+            # the compressor cannot learn single maps by heart.
             for channel in range(0, normal.shape[1], 2):
                 normal[:, channel] += self.left_noise * torch.randn_like(normal[:, channel])
         return functional.interpolate(
@@ -105,6 +114,8 @@ def cut_silhouette(image: Tensor) -> Tensor:
     """Set the background of decoded images (n, channels, h, w) to 0, judging each pixel by its
     brightest channel.
     """
+    # Relative to the surroundings, not absolute: a far surface is as dark as the blurred rim of a
+    # near one, so that no fixed threshold separates both from the background.
     bright = image.amax(1, keepdim=True)
     brightest = functional.max_pool2d(bright, WINDOW, stride=1, padding=WINDOW // 2)
     kept = (bright >= KEPT_SHARE * brightest) & (bright >= MIN_V)
@@ -115,6 +126,9 @@ def lift_edges(image: Tensor) -> Tensor:
     """Raise decoded images (n, 1, h, w) to the smoothed maximum around each pixel; no pixel gets
     darker.
     """
+    # A decoder trained with squared error answers p v at an uncertain outline
+    # (`losses.image_error`), which reads as a larger distance. The surface's own v is beside it;
+    # the mean of the largest values around keeps noise from being lifted too.
     pad = LIFT_WINDOW // 2
     brightest = functional.max_pool2d(image, LIFT_WINDOW, stride=1, padding=pad)
     return torch.maximum(
@@ -150,6 +164,7 @@ class RemappingNetwork(nn.Module):
         would mix.
         """
         image = self.decoder(self.latent(depth_m, intensity))
+        # First the silhouette, then its depth: lifted edges would otherwise widen the object.
         cut = cut_silhouette(image)
         if image.shape[1] > 1:
             return cut

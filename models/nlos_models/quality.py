@@ -3,10 +3,9 @@ and depth error.
 
 A small network in numpy on some fifty figures of the image, of the uncertainty network's answer
 and, where the reconstructing network has one, of its own probability of a surface, fitted to
-reconstructions of known objects by `train quality` (`doubt_training`).
+reconstructions of known objects by `train quality` (`uncertainty`).
 """
 
-import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,13 +14,13 @@ from typing import NamedTuple, Self
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
+from nlos_cam.files import TEXT_LIMIT, read_checked
 from nlos_models.arrays import Float32, Mask
 from nlos_models.errors import CheckpointError, first_problem
-from nlos_models.files import TEXT_LIMIT, read_checked, write_checked
-from nlos_models.records import DOUBT, DOUBT_RECORD, checksum_of_watched
+from nlos_models.records import UNCERTAINTY, UNCERTAINTY_RECORD, checksum_of_watched
 
 QUALITY = "quality.json"
-DOUBT_FILES = f"{DOUBT}.safetensors", DOUBT_RECORD
+UNCERTAINTY_FILES = f"{UNCERTAINTY}.safetensors", UNCERTAINTY_RECORD
 GOOD_IOU = 0.75
 PRECISION = 0.9
 """A frame is trusted where its silhouette IoU is at least the first in at least the second of like
@@ -96,9 +95,14 @@ class QualityEstimate:
         """Return the estimate of a model's outputs (n, OUTPUTS); without a threshold no frame is
         trusted.
         """
+        # Three quantiles fitted apart may cross; sorted they are at least as near (Chernozhukov
+        # et al. 2010).
         iou = np.sort(_sigmoid(outputs[:, : len(LEVELS)]), 1)
         good = _sigmoid(outputs[:, len(LEVELS)])
         if outputs.shape[1] == OUTPUTS:
+            # Law of total probability over "is one of the 18 kinds". The fit's set has many
+            # kinds, a user's bench few: prior odds times KINDS_ODDS is an addition to the logit
+            # (Saerens et al. 2002).
             of_kind = _sigmoid(outputs[:, -3])
             known = _sigmoid(outputs[:, -2] + np.float32(np.log(KINDS_ODDS)))
             good = (known * of_kind + (1 - known) * good).astype(np.float32)
@@ -138,6 +142,7 @@ class QualityModel:
         """Return the network's outputs (n, OUTPUTS) for figures of n frames."""
         x = normalised(figures, self._means, self._spreads)
         for number, layer in enumerate(self._layers):
+            # ReLU before each layer but the first; the last row of a layer is its bias.
             x = (np.maximum(x, 0.0) if number else x) @ layer[:-1] + layer[-1]
         return x
 
@@ -157,6 +162,8 @@ def quality_features(
     same for the mirrored image. All sums over pixels are divided by the area of the image's
     surface.
     """
+    # All sums are over pixels of (n, 4096), divided by the area of the image's surface, so that a
+    # figure does not depend on how large the object is; the area itself is a figure.
     mask = image > 0
     m, v, error = (_flat(np.asarray(each, np.float32)) for each in (mask, image, estimate.error_v))
     area = np.maximum(m.sum(1), 1.0)
@@ -164,11 +171,15 @@ def quality_features(
     def share(values: Float32) -> Float32:
         return values.sum(1) / area
 
+    # Overlap first: the image against the probability of a surface from another network is the
+    # best single figure.
     outline = _outline(m, p := _flat(estimate.p_surface), area)
     found = [*outline[:2], area / 4096, np.log(area), np.sqrt(area), *outline[2:]]
     mean = share(v)
     found += [share(error * m), np.sqrt(share(error * error * m)), mean]
     found += [np.sqrt(share((v - mean[:, None]) ** 2 * m))]
+    # Rim: number of changes between surface and background along both axes. Over the area's root
+    # it is a shape's roughness, over the area its thinness.
     edges = [np.diff(mask, axis=axis).reshape(len(mask), -1).sum(1) for axis in (1, 2)]
     rim = np.float32(edges[0] + edges[1])
     found += [rim / np.sqrt(area), rim / area, *_slopes(image, mask, area), *_place(mask, area)]
@@ -176,6 +187,8 @@ def quality_features(
     if surface is not None:
         own = _flat(surface)
         apart = np.abs(_flat(surface) - p)
+        # Sum p^2 / sum p is 1 for probabilities of 0 and 1, and p for a constant p: how decided
+        # the reconstructing network is.
         sharp = share(own**2) / np.maximum(share(own), 1e-4)
         found += [*_outline(m, own, area), share(apart), share(apart * m), sharp]
     return np.stack(found, 1).astype(np.float32)
@@ -185,6 +198,8 @@ def _outline(m: Float32, p: Float32, area: Float32) -> list[Float32]:
     """Return how an image's surface (n, 4096) fits probabilities of one: expected overlap, and
     outlines compared.
     """
+    # Intersection over union with p in place of the truth: (sum of p inside) / (area + sum of p
+    # outside), all over the area.
     inside = (p * m).sum(1) / area
     beside = (p * (1 - m)).sum(1) / area
     unsure = p * (1 - p)
@@ -221,6 +236,8 @@ def _place(mask: Mask, area: Float32) -> list[Float32]:
     spreads, fill.
     """
     pixels = np.arange(mask.shape[1], dtype=np.float32)
+    # Moments of the silhouette. The row's distance from the middle, not the row: the figures of a
+    # mirrored frame must be the same.
     rows, columns = (mask.sum(axis).astype(np.float32) for axis in (2, 1))
     row = (rows @ pixels) / area
     column = (columns @ pixels) / area
@@ -238,26 +255,13 @@ def _place(mask: Mask, area: Float32) -> list[Float32]:
 
 
 def _logit(p: Float32) -> Float32:
+    # A linear layer sees 0.99 and 0.9999 as the same; their logits differ.
     inner = p.clip(1e-4, 1 - 1e-4)
     return np.log(inner / (1 - inner)).astype(np.float32)
 
 
 def _sigmoid(x: Float32) -> Float32:
     return (1 / (1 + np.exp(-x.clip(-30.0, 30.0)))).astype(np.float32)
-
-
-def quality_watches(folder: Path) -> str:
-    """Return the checksum of the uncertainty network in a folder, which a quality model is bound
-    to.
-    """
-    return checksum_of_watched(folder, DOUBT_FILES)
-
-
-def write_quality(folder: Path, record: QualityRecord) -> None:
-    """Write a quality model beside the weights that it watches, with its checksum. Raises OSError,
-    FileBusyError.
-    """
-    write_checked(folder, {QUALITY: (json.dumps(record.model_dump(mode="json")) + "\n").encode()})
 
 
 def load_quality_model(folder: Path) -> QualityModel | None:
@@ -277,7 +281,7 @@ def load_quality_model(folder: Path) -> QualityModel | None:
         raise CheckpointError(f"{path} cannot be read ({error}): {advice}") from error
     if not _fits(record):
         raise CheckpointError(f"{path} has layers that do not fit each other: {advice}")
-    if record.watches != (found := quality_watches(folder)):
+    if record.watches != (found := checksum_of_watched(folder, UNCERTAINTY_FILES)):
         other = f"another uncertainty network ({record.watches}, not {found})"
         raise CheckpointError(f"{path} was fitted to {other}: {advice}")
     return QualityModel(record)

@@ -10,9 +10,21 @@ from typing import Self
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, ValidationInfo, field_validator
 
+from nlos_cam.files import TEXT_LIMIT, read_checked
 from nlos_models.errors import CheckpointError, first_problem
-from nlos_models.files import TEXT_LIMIT, read_checked
-from nlos_models.recipe import SIMULATION_ONLY, MapKind, Recipe
+from nlos_models.training.recipe import (
+    AnyRecipe,
+    CompressorRecipe,
+    DirectRecipe,
+    MapKind,
+    Recipe,
+    TransferRecipe,
+    UncertaintyRecipe,
+    VaeRecipe,
+)
+
+SIMULATION_ONLY = "simulation only: the L515's laser is infrared (860 nm)"
+"""Note on all data, weights and results in color."""
 
 RECORD = "checkpoint.json"
 DIRECT, PAPER = SHIPPED = "direct", "paper"
@@ -21,8 +33,8 @@ direct network.
 """
 ENCODER = "encoder.safetensors"
 """File that only training reads: the shipped weights come without it."""
-DOUBT = "doubt"
-DOUBT_RECORD = "doubt.json"
+UNCERTAINTY = "doubt"
+UNCERTAINTY_RECORD = "doubt.json"
 WATCHED = "compressor.safetensors", "preprocess.safetensors", "decoder.safetensors"
 
 
@@ -37,15 +49,15 @@ class CheckpointRecord(BaseModel):
     rig_checksum: str
     input: MapKind = "raw maps"
     """The compressor's input; difference maps are maps minus the bare wall's."""
-    vae_recipe: Recipe | None = None
+    vae_recipe: VaeRecipe | None = None
     """None for a compressor and decoder trained in one step."""
-    compressor_recipe: Recipe | None = None
+    compressor_recipe: CompressorRecipe | None = None
     """None for a VAE alone."""
-    transfer_recipe: Recipe | None = None
+    transfer_recipe: TransferRecipe | None = None
     """None for weights trained on synthetic maps alone."""
-    direct_recipe: Recipe | None = None
+    direct_recipe: DirectRecipe | None = None
     """None for anything but a direct network, which has no other networks beside it."""
-    earlier: list[Recipe] = []
+    earlier: list[AnyRecipe] = []
     """Recipes of the runs before those above, the oldest first."""
     figures: dict[str, float] = {}
     """Held-out figures at the end of training."""
@@ -66,6 +78,8 @@ class CheckpointRecord(BaseModel):
         """
         last = dict[str, Recipe]()
         earlier = list[Recipe]()
+        # A new compressor is fitted to its VAE, so that an earlier transfer of another one is
+        # history; a new VAE replaces the VAE alone.
         for recipe in runs:
             replaced = ("compressor", "transfer") if recipe.task == "compressor" else (recipe.task,)
             earlier += [last.pop(task) for task in replaced if task in last]
@@ -85,11 +99,7 @@ class CheckpointRecord(BaseModel):
     @property
     def vae_runs(self) -> list[Recipe]:
         """Recipes of the runs that trained the encoder or decoder."""
-        return [
-            recipe
-            for recipe in self.runs
-            if recipe.task == "vae" or recipe.steps == "two-then-joint"
-        ]
+        return [recipe for recipe in self.runs if _trains_decoder(recipe)]
 
     @property
     def width(self) -> float:
@@ -100,6 +110,11 @@ class CheckpointRecord(BaseModel):
     def color(self) -> bool:
         """True for weights of full color, which is simulation only."""
         return _any_in_color(self.vae_recipe, self.compressor_recipe, self.direct_recipe)
+
+
+def _trains_decoder(recipe: Recipe) -> bool:
+    joint = isinstance(recipe, CompressorRecipe) and recipe.steps == "two-then-joint"
+    return joint or isinstance(recipe, VaeRecipe)
 
 
 def _any_in_color(*recipes: Recipe | None) -> bool:
@@ -117,11 +132,9 @@ def weights_folder(weights: Path | None, default: str = DIRECT) -> Path:
     """
     if weights is None:
         return shipped_folder(default)
-    return (
-        shipped_folder(str(weights))
-        if str(weights) in SHIPPED and not weights.exists()
-        else weights
-    )
+    if str(weights) in SHIPPED and not weights.exists():
+        return shipped_folder(str(weights))
+    return weights
 
 
 def load_record(folder: Path) -> CheckpointRecord:
@@ -131,11 +144,6 @@ def load_record(folder: Path) -> CheckpointRecord:
     try:
         return CheckpointRecord.model_validate_json(read_checked(folder / RECORD, TEXT_LIMIT))
     except OSError as error:
-        if folder == shipped_folder(PAPER):
-            raise CheckpointError(
-                "the paper's weights (27 MB) are in the repository, not in the installed package:"
-                " install from a clone, or name a folder of weights"
-            ) from error
         raise CheckpointError(
             f"no checkpoint in {folder} ({RECORD} cannot be read): name a folder of weights"
         ) from error
@@ -149,14 +157,14 @@ def load_record(folder: Path) -> CheckpointRecord:
         ) from error
 
 
-class DoubtRecord(BaseModel):
+class UncertaintyRecord(BaseModel):
     """Watched weights, recipe, calibration and held-out figures of an uncertainty network."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     watches: str
     """`checksum_of_watched` of the weights whose images it judges."""
-    recipe: Recipe
+    recipe: UncertaintyRecipe
     learnt: list[str]
     """Kinds of outliers in its training set."""
     temperatures: tuple[float, float] = (1.0, 1.0)
@@ -185,6 +193,7 @@ def checksum_of_watched(folder: Path, names: Sequence[str] = ()) -> str:
     """Return a checksum, 12 hexadecimal digits, of files: by default `watched_files`. Raises
     CheckpointError.
     """
+    # The bytes of the files, not the tensors' values: a graph points into these bytes.
     digest = hashlib.sha256()
     for name in names or watched_files(folder):
         try:
@@ -196,17 +205,17 @@ def checksum_of_watched(folder: Path, names: Sequence[str] = ()) -> str:
     return digest.hexdigest()[:12]
 
 
-def load_doubt_record(folder: Path) -> DoubtRecord | None:
+def load_uncertainty_record(folder: Path) -> UncertaintyRecord | None:
     """Return the record of the uncertainty network beside a pipeline's weights, or None where there
     is none.
 
     Raises CheckpointError where it cannot be read or watches other weights.
     """
-    path = folder / DOUBT_RECORD
+    path = folder / UNCERTAINTY_RECORD
     if not path.exists():
         return None
     try:
-        record = DoubtRecord.model_validate_json(read_checked(path, TEXT_LIMIT))
+        record = UncertaintyRecord.model_validate_json(read_checked(path, TEXT_LIMIT))
     except OSError as error:
         raise CheckpointError(
             f"{path} cannot be read: train it again with `train doubt`"

@@ -1,17 +1,13 @@
-"""Res-VAE between images (n, channels, 64, 64) in [0, 1] and latents (SI 3, Table S1), and the
-losses of both.
+"""Res-VAE between images (n, channels, 64, 64) in [0, 1] and latents (SI 3, Table S1).
 
 Depth images have one channel and a latent of 256, color images three and 512; 512 channels then
 enter Table S1. Our choices where the paper is silent: ReLU between convolutions, a sigmoid at the
 output, and the encoder as the decoder's mirror (average pooling for upsampling, 1 x 1 convolutions
-for mean and log-variance). SI states no reduction of the losses: here pixels and latent entries are
-summed, samples averaged.
+for mean and log-variance).
 """
 
 import torch
 from torch import Tensor, nn
-
-from nlos_models.recipe import ImageLoss
 
 LATENT = 256
 UP_BLOCKS = (
@@ -47,6 +43,8 @@ class ResBlock(nn.Module):
         self, channels_in: int, within: int, channels_out: int, resample: nn.Module
     ) -> None:
         super().__init__()
+        # Table S1 names two convolutions of 3 x 3 and a shortcut with a convolution of its own,
+        # since the channels differ in every block.
         self.main = nn.Sequential(
             _conv(channels_in, within),
             nn.BatchNorm2d(within),
@@ -67,6 +65,8 @@ class Decoder(nn.Module):
 
     def __init__(self, channels: int = 1, latent: int = LATENT) -> None:
         super().__init__()
+        # 1 x 1 to 64 x 64 in six blocks, each of which doubles the image at its end: the latent
+        # is the image of one pixel that the first block reads.
         up = [
             ResBlock(*block, nn.Upsample(scale_factor=2, mode="nearest"))
             for block in _up_blocks(latent)
@@ -76,6 +76,7 @@ class Decoder(nn.Module):
 
     def forward(self, latent: Tensor) -> Tensor:
         """Map (n, latent) to (n, channels, 64, 64)."""
+        # (n, 256) -> (n, 256, 1, 1) -> (n, 16, 64, 64) -> (n, 1, 64, 64)
         return torch.sigmoid(self.output(self.blocks(latent[:, :, None, None])))
 
 
@@ -86,6 +87,8 @@ class Encoder(nn.Module):
         super().__init__()
         self.input = _conv(channels, UP_BLOCKS[-1][-1])
         down = [
+            # The same blocks backwards. Averaging, not the largest value: v is a depth, and the
+            # largest one of a region would favour near pixels.
             ResBlock(out, within, into, nn.AvgPool2d(2))
             for into, within, out in reversed(_up_blocks(latent))
         ]
@@ -96,6 +99,8 @@ class Encoder(nn.Module):
     def forward(self, image: Tensor) -> tuple[Tensor, Tensor]:
         """Map (n, channels, 64, 64) to two (n, latent)."""
         features = self.blocks(torch.relu(self.input(image)))
+        # The logarithm, since a variance must be positive, and within bounds, since its
+        # exponential enters the divergence and the weight of the latent's error.
         log_variance = self.log_variance(features).clamp(-LOG_VARIANCE_LIMIT, LOG_VARIANCE_LIMIT)
         return self.mean(features).flatten(1), log_variance.flatten(1)
 
@@ -113,54 +118,7 @@ class ResVae(nn.Module):
         """Map images (n, channels, 64, 64) and standard normal noise (n, latent) to image, mean and
         log-variance.
         """
+        # Reparametrisation: the noise comes from outside, so that the gradient passes to mean and
+        # variance through the draw (Kingma and Welling 2013, 2.4).
         mean, log_variance = self.encoder(image)
         return self.decoder(mean + noise * torch.exp(0.5 * log_variance)), mean, log_variance
-
-
-def image_error(
-    image: Tensor, truth: Tensor, surface_weight: float = 1.0, kind: ImageLoss = "squared"
-) -> Tensor:
-    """Return the error of images (n, channels, 64, 64), summed over pixels and channels, averaged
-    over the batch.
-
-    Suppose that a pixel is a surface at v with probability p, else background (0), and that w is
-    `surface_weight`. The expected squared error p w (x - v)^2 + (1 - p) x^2 is least at x = w p v /
-    (1 - p + w p): for w = 1 at p v, so that an uncertain outline looks like a larger distance, less
-    so for w > 1. The expected absolute error is least at x = v where w p > 1 - p and at x = 0
-    elsewhere: the outline stays sharp.
-    """
-    truth = truth.float()
-    off = image.float() - truth
-    error = off.square() if kind == "squared" else off.abs()
-    return torch.where(truth > 0, surface_weight * error, error).sum((1, 2, 3)).mean()
-
-
-def kl_divergence(mean: Tensor, log_variance: Tensor) -> Tensor:
-    """Return KL(q || N(0, 1)) of latents (n, latent), summed over entries, averaged over the batch.
-
-    For q = N(m, s^2) each entry has (m^2 + s^2 - 1 - log s^2) / 2 (Kingma and Welling, 2013,
-    appendix B).
-    """
-    mean = mean.float()
-    log_variance = log_variance.float()
-    return 0.5 * (mean.square() + log_variance.exp() - 1 - log_variance).sum(1).mean()
-
-
-def variational_share(done: float, warm_up: float) -> float:
-    """Return the weight of a VAE's noise and divergence after a share `done` of its run: 1 without
-    a warm-up.
-
-    With one, the VAE is a plain autoencoder for that share of the run; over an equal share the
-    weight then rises to 1.
-    """
-    return min(1.0, max(0.0, done / warm_up - 1)) if warm_up else 1.0
-
-
-def latent_error(latent: Tensor, mean: Tensor, log_variance: Tensor) -> Tensor:
-    """Return the squared error of latents (n, latent) in units of the encoder's variance, averaged
-    over the batch.
-
-    Entries that the encoder leaves close to its prior have a variance near 1 and weigh little.
-    """
-    weight = torch.exp(-log_variance.float()).clamp(max=100.0)
-    return (weight * (latent.float() - mean.float()).square()).sum(1).mean()

@@ -13,12 +13,12 @@ from functools import wraps
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
-import nlos_models as models
 import typer
 from rich.table import Table
 
 from nlos_cam.cli.common import Detail, Json, finish, say, say_interrupted, set_detail, show
 from nlos_cam.errors import RecordingError, did_you_mean
+from nlos_cam.files import read_toml
 
 FILE = "nlos-cam.toml"
 MAX_PORT = 65535
@@ -95,7 +95,7 @@ def _read_file(path: Path) -> dict[str, str | int]:
     except OSError:  # in a home folder that this user may not enter
         return {}
     try:
-        content = models.read_toml(path)
+        content = read_toml(path)
     except (OSError, ValueError) as error:
         reason = error.strerror if isinstance(error, OSError) else "it is no TOML text"
         raise RecordingError(f"{path} cannot be read ({reason}): correct or delete it") from error

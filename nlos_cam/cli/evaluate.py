@@ -60,12 +60,6 @@ def evaluate(
             "--no-nearest", help="Omit the nearest neighbour, which renders 2000 objects once."
         ),
     ] = False,
-    mirror: Annotated[
-        bool,
-        typer.Option(
-            "--mirror", help="Join the answer with the one to the mirrored maps; twice the time."
-        ),
-    ] = False,
     overwrite: Overwrite = False,
     json: Json = False,
 ) -> None:
@@ -87,7 +81,6 @@ def evaluate(
             wall=wall,
             training=training,
             nearest=not no_nearest,
-            mirror=mirror,
             tracked=tracked,
         )
     for note in evaluation.facts["notes"]:

@@ -6,10 +6,9 @@ import os
 from contextlib import suppress
 from typing import Annotated, NamedTuple
 
-import nlos_models as models
 import typer
 from nlos_calibration.errors import CalibrationError
-from nlos_models.errors import ModelError
+from nlos_models.errors import ModelError, lacks_memory, missing_extra
 from typer.main import get_command
 
 from nlos_cam.cli import common
@@ -18,6 +17,7 @@ from nlos_cam.cli.config import shared_options
 from nlos_cam.cli.plain_help import plain_help
 from nlos_cam.cli.usage import usage_lines, usage_reason
 from nlos_cam.errors import DiskFullError, NlosCamError, RecordingError
+from nlos_cam.files import DISK_ERRORS
 
 MIN_ADDRESS_BYTES = 1 << 30
 TORCH_ADDRESS_BYTES = 3 << 29
@@ -224,20 +224,18 @@ def _known_error(error: Exception, command: str) -> NlosCamError | ModelError | 
     """Return a lack of memory, a missing extra or an error about a file as one of our errors; None
     for others.
     """
-    if models.lacks_memory(error):  # also of a library while it is imported or works
+    if lacks_memory(error):  # also of a library while it is imported or works
         return NlosCamError("out of memory: close other programs, or raise the limit of this one")
     if isinstance(error, ModuleNotFoundError):
-        return models.missing_extra(error, f"nlos-cam {command}")
-    if isinstance(error, OSError) and (
-        error.errno in models.DISK_ERRORS or error.filename is not None
-    ):
+        return missing_extra(error, f"nlos-cam {command}")
+    if isinstance(error, OSError) and (error.errno in DISK_ERRORS or error.filename is not None):
         return _file_error(error)
     return None
 
 
 def _file_error(error: OSError) -> NlosCamError:
     """Return the system's error about a file as one of ours."""
-    if error.errno not in models.DISK_ERRORS:
+    if error.errno not in DISK_ERRORS:
         return RecordingError(
             f"{error.filename}: {error.strerror}: check that the file exists and that you have"
             " permission"

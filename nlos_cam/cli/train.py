@@ -10,11 +10,12 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from functools import wraps
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar, get_args
 
 import nlos_calibration as walls
 import nlos_models as models
 import typer
+from nlos_models import training
 
 from nlos_cam import dataset as data_sets
 from nlos_cam import objects as shapes
@@ -34,6 +35,7 @@ from nlos_cam.files import cache_folder
 if TYPE_CHECKING:
     from lightning_fabric import Fabric
 
+R = TypeVar("R", bound=training.Recipe)
 SAMPLES = "samples"
 """Folder of rendered samples in the output folder of `train doubt`."""
 
@@ -94,12 +96,13 @@ class RunOptions:
     ] = False
     json: Json = False
 
-    def recipe(self, task: str, budget: float = 1.0) -> models.Recipe:
+    def recipe(self, kind: type[R], budget: float = 1.0) -> R:
         """Return the recipe at a share of its budget. Raises SceneError where it is for another
         task.
         """
-        recipe = models.load_recipe(self.recipe_file)
-        if recipe.task != task:
+        recipe = training.load_recipe(self.recipe_file)
+        if not isinstance(recipe, kind):
+            (task,) = get_args(kind.model_fields["task"].annotation)
             raise SceneError(
                 f"{self.recipe_file} is a recipe for {recipe.task!r}, not {task!r}: choose another"
                 " --recipe"
@@ -108,22 +111,25 @@ class RunOptions:
             recipe = recipe.of_objects(self.objects)
         return recipe.scaled(budget)
 
-    def fabric(self, recipe: models.Recipe) -> Fabric:
+    def fabric(self, recipe: training.Recipe) -> Fabric:
         """Open the devices that the recipe is run on."""
-        return models.open_fabric(recipe, accelerator=self.accelerator, devices=self.devices)
+        return training.open_fabric(recipe, accelerator=self.accelerator, devices=self.devices)
 
     def training(
-        self, recipe: models.Recipe, record: models.CheckpointRecord, origin: str
-    ) -> models.TrainingRun:
+        self, recipe: R, record: models.CheckpointRecord, origin: str
+    ) -> training.TrainingRun[R]:
         """Return a run with progress and interruption; `record` is that of its weights, `origin` a
         `digest_of`.
         """
-        return models.TrainingRun(
+        return training.TrainingRun(
             recipe, self.out, record, origin, self.tensorboard, self.compiled, watched_run
         )
 
     def finish(
-        self, recipe: models.Recipe, figures: models.Scores, before: models.Scores | None = None
+        self,
+        recipe: training.Recipe,
+        figures: training.Scores,
+        before: training.Scores | None = None,
     ) -> None:
         """End a command with the figures of its weights, and of those that a transfer started
         from.
@@ -143,8 +149,8 @@ class RunOptions:
 
 @contextmanager
 def watched_run(
-    running: models.Running, recipe: models.Recipe, name: str
-) -> Generator[models.Running]:
+    running: training.Running, recipe: training.Recipe, name: str
+) -> Generator[training.Running]:
     """Show a run's progress, in the leading process; Ctrl-C or SIGTERM ends it after the current
     step, saved.
     """
@@ -159,7 +165,7 @@ def watched_run(
         def on_step(done: int, total: int) -> None:
             bar.update(task, completed=done, total=total)
 
-        def on_epoch(row: models.Scores) -> None:
+        def on_epoch(row: training.Scores) -> None:
             text = (
                 f"epoch {row['epoch'] + 1:.0f} done, loss {row['loss']:.4g}, held out"
                 f" {row['held_out_loss']:.4g}"
@@ -224,16 +230,16 @@ def vae(
     budget: Budget = 1.0,
 ) -> None:
     """Train a Res-VAE on procedural objects (SI 3)."""
-    recipe = run.recipe("vae", budget)
+    recipe = run.recipe(training.VaeRecipe, budget)
     rig = walls.rig_named(rig_name)
     refuse_ignored(
         'the recipe has start = "scratch"',
         {"--weights": bool(weights) and recipe.start == "scratch"},
     )
     fabric = run.fabric(recipe)
-    start, runs = models.vae_start(recipe, weights) if recipe.start != "scratch" else (None, [])
-    record = models.record_run(recipe, run.out, (rig.name, rig.checksum), runs, weights)
-    job = run.training(recipe, record, models.digest_of(start, rig.checksum))
+    start, runs = training.vae_start(recipe, weights) if recipe.start != "scratch" else (None, [])
+    record = training.record_run(recipe, run.out, (rig.name, rig.checksum), runs, weights)
+    job = run.training(recipe, record, training.digest_of(start, rig.checksum))
     say(f"generating {recipe.objects + recipe.held_out} objects")
     box = data_sets.DatasetPlan(rig, 0).box
     kinds = data_sets.Objects.without(recipe.left_out).categories
@@ -247,7 +253,7 @@ def vae(
             (data_sets.HELD_OUT_SEED, recipe.held_out),
         )
     )
-    run.finish(recipe, models.launch(fabric, models.run_vae, job, start, images, held_out))
+    run.finish(recipe, training.launch(fabric, training.run_vae, job, start, images, held_out))
 
 
 def compressor(
@@ -270,7 +276,7 @@ def compressor(
     """Train a compressor onto the latent of a trained VAE (SI 4), or as the recipe's `steps`
     say.
     """
-    recipe = run.recipe("compressor", budget)
+    recipe = run.recipe(training.CompressorRecipe, budget)
     scratch = recipe.start != "weights" and recipe.steps != "two-then-joint"
     refuse_ignored("the recipe starts from scratch", {"--weights": bool(weights) and scratch})
     refuse_ignored(
@@ -278,14 +284,14 @@ def compressor(
         {"--vae": bool(vae_folder) and recipe.steps != "two"},
     )
     fabric = run.fabric(recipe)
-    start, runs = models.compressor_start(recipe, vae_folder, weights)
+    start, runs = training.compressor_start(recipe, vae_folder, weights)
     maps = data_sets.read_maps(recipe, data, held_out_data, wall, stream=stream)
     recipe = maps.limit_recipe(recipe)
-    record = models.record_run(recipe, run.out, maps.rig, runs, weights, vae_folder)
-    job = run.training(recipe, record, models.digest_of(start.vae, start.pipeline, maps.digest))
+    record = training.record_run(recipe, run.out, maps.rig, runs, weights, vae_folder)
+    job = run.training(recipe, record, training.digest_of(start.vae, start.pipeline, maps.digest))
     run.finish(
         recipe,
-        models.launch(fabric, models.run_compressor, job, start, maps.training, maps.held_out),
+        training.launch(fabric, training.run_compressor, job, start, maps.training, maps.held_out),
     )
 
 
@@ -312,7 +318,7 @@ def direct(
     ] = None,
 ) -> None:
     """Train a direct network: maps to images by two heads, without a latent; the project's own."""
-    recipe = run.recipe("direct")
+    recipe = run.recipe(training.DirectRecipe)
     refuse_ignored(
         "the recipe starts from scratch", {"--weights": bool(weights) and recipe.start == "scratch"}
     )
@@ -321,7 +327,7 @@ def direct(
             f"a direct network trains in one process, got --devices {run.devices}: drop it"
         )
     fabric = run.fabric(recipe)
-    start, runs = models.direct_start(recipe, weights)
+    start, runs = training.direct_start(recipe, weights)
     with ExitStack() as held:
         with tracked("packing maps") as on_progress:
             normal = start.normal if start else None
@@ -332,11 +338,11 @@ def direct(
         held_out = source.held_out(held_out_data, recipe.held_out)
         recipe = recipe.model_copy(update={"held_out": len(held_out.image)})
         rig = source.plan.rig
-        record = models.record_run(recipe, run.out, (rig.name, rig.checksum), runs, weights)
+        record = training.record_run(recipe, run.out, (rig.name, rig.checksum), runs, weights)
         job = run.training(
-            recipe, record, models.digest_of(start, source.digest) if start else source.digest
+            recipe, record, training.digest_of(start, source.digest) if start else source.digest
         )
-        run.finish(recipe, models.run_direct(fabric, job, start, source, held_out))
+        run.finish(recipe, training.run_direct(fabric, job, start, source, held_out))
 
 
 def transfer(
@@ -367,16 +373,16 @@ def transfer(
     """Fine-tune synthetic weights on a bench's recordings (SI 4): all layers first, then the
     classifier alone.
     """
-    recipe = run.recipe("transfer")
+    recipe = run.recipe(training.TransferRecipe)
     fabric = run.fabric(recipe)
-    pipeline, start = models.transfer_start(recipe, weights, partial=partial, on_report=say)
-    encoder = models.load_encoder(vae_folder or weights)
+    pipeline, start = training.transfer_start(recipe, weights, partial=partial, on_report=say)
+    encoder = training.load_encoder(vae_folder or weights)
     maps = data_sets.read_maps(recipe, data, held_out_data, wall, start=start)
     recipe = maps.limit_recipe(recipe)
-    record = models.record_run(recipe, run.out, maps.rig, start.runs, weights)
-    job = run.training(recipe, record, models.digest_of(pipeline, encoder, maps.digest))
-    figures = models.launch(
-        fabric, models.run_transfer, job, pipeline, encoder, maps.training, maps.held_out
+    record = training.record_run(recipe, run.out, maps.rig, start.runs, weights)
+    job = run.training(recipe, record, training.digest_of(pipeline, encoder, maps.digest))
+    figures = training.launch(
+        fabric, training.run_transfer, job, pipeline, encoder, maps.training, maps.held_out
     )
     run.finish(recipe, figures["after"], figures["before"])
 
@@ -393,18 +399,20 @@ def doubt(
     """Train the uncertainty ("doubt") network of trained weights; --out then holds a copy of these
     weights too.
     """
-    recipe = run.recipe("doubt")
+    recipe = run.recipe(training.UncertaintyRecipe)
     watched = models.weights_folder(weights)
     fabric = run.fabric(recipe)
     pipeline = models.load_reconstructor(weights, cache_folder() / "onnx")
     datasets = data_sets.open_dataset(data), data_sets.open_dataset(held_out_data)
     data_sets.check_doubt_data(recipe, pipeline, *datasets)
     kinds = list(data_sets.outliers_beside(datasets[0].plan.objects.share_generic))
-    about = models.record_doubt_run(recipe, run.out, watched, kinds)
+    about = training.record_uncertainty_run(recipe, run.out, watched, kinds)
     with tracked("rendering empty benches and outliers") as on_progress:
         sets = data_sets.doubt_sets(recipe, pipeline, datasets, run.out / SAMPLES, on_progress)
     job = run.training(recipe, pipeline.record, about.watches)
-    run.finish(recipe, models.launch(fabric, models.run_doubt, job, about, watched, *sets))
+    run.finish(
+        recipe, training.launch(fabric, training.run_uncertainty, job, about, watched, *sets)
+    )
 
 
 def quality(
@@ -431,17 +439,19 @@ def quality(
             f"{weights} came with the program, and is not changed: give a copy of the folder"
         )
     pipeline = models.load_reconstructor(weights, graphs)
-    doubter = models.load_uncertainty_model(
-        weights, graphs, quality=False
-    )  # an old or damaged one is replaced
-    if doubter is None:
+    # An old or damaged quality model is replaced, so that it is not read.
+    uncertainty_model = models.load_uncertainty_model(weights, graphs, quality=False)
+    if uncertainty_model is None:
         raise SceneError(f"{weights} has no uncertainty network: train one with `train doubt`")
     with interrupted_by_signals(), tracked("reconstructing") as on_progress:
         samples = data_sets.quality_set(
-            pipeline, doubter, data_sets.open_dataset(data, expected=True), objects, on_progress
+            pipeline,
+            uncertainty_model,
+            data_sets.open_dataset(data, expected=True),
+            objects,
+            on_progress,
         )
-    record = models.fit_quality(samples, models.quality_watches(weights))
-    models.write_quality(weights, record)
+    record = training.run_quality(weights, samples)
     values = {name: value for name, value in record.figures.items() if name.startswith("all_")}
     text = f"quality model beside {weights}; on kinds left out: {_values(values)}"
     trusted = {"trusted_above": record.trusted_above}
@@ -452,5 +462,5 @@ def quality(
     )
 
 
-def _values(figures: models.Scores) -> str:
+def _values(figures: training.Scores) -> str:
     return ", ".join(f"{name} {value:.4g}" for name, value in figures.items())

@@ -11,6 +11,14 @@ import nlos_models as models
 import numpy as np
 from nlos_calibration import Rig
 from nlos_calibration.arrays import Float32
+from nlos_models.training import (
+    MapSet,
+    QualitySet,
+    UncertaintyRecipe,
+    UncertaintySet,
+    first_of,
+    parts_of,
+)
 from numpy.typing import NDArray
 
 from nlos_cam.dataset import outliers
@@ -19,7 +27,7 @@ from nlos_cam.dataset.packed import map_noise
 from nlos_cam.dataset.reader import Dataset
 from nlos_cam.dataset.samples import OnProgress, cached_sensor, ignore
 from nlos_cam.errors import SceneError
-from nlos_cam.files import atomic_file
+from nlos_cam.files import atomic_file, read_arrays
 from nlos_cam.frames import OBJECT_PIXELS, LidarMaps, maps_from_frame
 from nlos_cam.objects import CATEGORIES, image_from_depth
 from nlos_cam.render import Rendering, SensorModel, render
@@ -165,7 +173,7 @@ def samples_on_disk(
     for kind, seeds in _pieces(counts, first_seed):
         path = folder / f"{about}-{kind.replace(' ', '_')}-{seeds.start}-{len(seeds)}.npz"
         try:
-            part = DoubtSamples(**models.read_arrays(path))
+            part = DoubtSamples(**read_arrays(path))
         except (OSError, ValueError, TypeError):  # absent, or damaged: it is made again
             part = make_samples(kind, seeds, rig, sensor, accuracy)
             with atomic_file(path) as unfinished, unfinished.open("wb") as file:
@@ -183,7 +191,7 @@ def _pieces(counts: Mapping[str, int], first_seed: int) -> Iterator[tuple[str, r
             yield kind, range(start, min(start + PIECE, first_seed + count))
 
 
-def counts_of(recipe: models.Recipe, share_generic: float = 0.0) -> dict[str, int]:
+def counts_of(recipe: UncertaintyRecipe, share_generic: float = 0.0) -> dict[str, int]:
     """Return the number of samples to render of each kind, for training objects with a share of
     generic shapes.
 
@@ -196,16 +204,16 @@ def counts_of(recipe: models.Recipe, share_generic: float = 0.0) -> dict[str, in
     return {EMPTY: recipe.empties, ORDINARY: usual - sum(shapes.values()), **shapes, **per_kind}
 
 
-def _doubt_set(
-    pipeline: models.Reconstructor, ordinary_maps: models.MapSet, samples: DoubtSamples
-) -> models.DoubtSet:
+def _uncertainty_set(
+    pipeline: models.Reconstructor, ordinary_maps: MapSet, samples: DoubtSamples
+) -> UncertaintySet:
     """Return a dataset's maps of ordinary objects and the visible samples, with the pipeline's
     images of both.
     """
     nothing = samples.kind == EMPTY
     outside = ~nothing & ~np.isin(samples.kind, USUAL)
-    images = _images(pipeline, models.MapSet(samples.depth_m, samples.intensity, samples.image))
-    drawn = models.DoubtSet(
+    images = _images(pipeline, MapSet(samples.depth_m, samples.intensity, samples.image))
+    drawn = UncertaintySet(
         samples.depth_m, samples.intensity, images, samples.image, nothing, outside
     )
     drawn = drawn.where((samples.cells >= MIN_CELLS) | nothing)
@@ -213,8 +221,8 @@ def _doubt_set(
     intensity = ordinary_maps.intensity
     truth = ordinary_maps.image.astype(np.float16)
     no = np.zeros(len(truth), np.bool_)
-    usual = models.DoubtSet(depth_m, intensity, _images(pipeline, ordinary_maps), truth, no, no)
-    return models.DoubtSet(
+    usual = UncertaintySet(depth_m, intensity, _images(pipeline, ordinary_maps), truth, no, no)
+    return UncertaintySet(
         **{
             name: np.concatenate([values, vars(drawn)[name]])
             for name, values in vars(usual).items()
@@ -222,24 +230,24 @@ def _doubt_set(
     )
 
 
-def _images(pipeline: models.Reconstructor, maps: models.MapSet) -> NDArray[np.float16]:
-    pairs = zip(models.parts_of(maps.depth_m), models.parts_of(maps.intensity), strict=True)
+def _images(pipeline: models.Reconstructor, maps: MapSet) -> NDArray[np.float16]:
+    pairs = zip(parts_of(maps.depth_m), parts_of(maps.intensity), strict=True)
     return np.concatenate([pipeline(*pair) for pair in pairs]).astype(np.float16)
 
 
 def doubt_sets(
-    recipe: models.Recipe,
+    recipe: UncertaintyRecipe,
     pipeline: models.Reconstructor,
     datasets: tuple[Dataset, Dataset],
     folder: Path,
     on_progress: OnProgress = ignore,
-) -> list[models.DoubtSet]:
+) -> list[UncertaintySet]:
     """Return the training set and the held-out set of an uncertainty network; rendered samples are
     kept in `folder`.
     """
     counts = counts_of(recipe, datasets[0].plan.objects.share_generic)
     held_out_counts = {kind: round(HELD_OUT_SHARE * count) for kind, count in counts.items()}
-    sets: list[models.DoubtSet] = []
+    sets: list[UncertaintySet] = []
     for dataset, objects, kinds, seed in (
         (datasets[0], recipe.objects, counts, TRAINING_SEED),
         (datasets[1], recipe.held_out, held_out_counts, HELD_OUT_SEED),
@@ -254,7 +262,7 @@ def doubt_sets(
             accuracy=plan.accuracy,
             on_progress=on_progress,
         )
-        sets.append(_doubt_set(pipeline, models.first_of(dataset.arrays(), objects), samples))
+        sets.append(_uncertainty_set(pipeline, first_of(dataset.arrays(), objects), samples))
     return sets
 
 
@@ -264,7 +272,7 @@ def quality_set(
     dataset: Dataset,
     objects: int,
     on_progress: OnProgress,
-) -> models.QualitySet:
+) -> QualitySet:
     """Return figures and true quality of the reconstructions of a dataset's first objects; expected
     maps get noise.
 
@@ -288,7 +296,7 @@ def quality_set(
         if done == len(kinds):
             break
         maps = noise.expose(expected, done) if noise else expected
-        for part in models.parts_of(np.arange(min(len(maps.image), len(kinds) - done))):
+        for part in parts_of(np.arange(min(len(maps.image), len(kinds) - done))):
             depth_m = maps.depth_m[part]
             intensity = maps.intensity[part]
             truth = maps.image[part].astype(np.float32)
@@ -303,9 +311,7 @@ def quality_set(
             done += len(part)
             on_progress(done, len(kinds))
     found = np.concatenate(iou), np.concatenate(error_v)
-    return models.QualitySet(
-        np.concatenate(figures), *found, kinds, ~np.isin(kinds, tuple(CATEGORIES))
-    )
+    return QualitySet(np.concatenate(figures), *found, kinds, ~np.isin(kinds, tuple(CATEGORIES)))
 
 
 def shared_error_v(image: Float32, truth: Float32) -> Float32:
@@ -319,7 +325,7 @@ def shared_error_v(image: Float32, truth: Float32) -> Float32:
 
 
 def check_doubt_data(
-    recipe: models.Recipe, pipeline: models.Reconstructor, training: Dataset, held_out: Dataset
+    recipe: UncertaintyRecipe, pipeline: models.Reconstructor, training: Dataset, held_out: Dataset
 ) -> None:
     """Raise SceneError where datasets, weights and recipe do not fit together."""
     if pipeline.record.input != "raw maps":

@@ -10,9 +10,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from nlos_calibration import ObjectBox, Rig, first_problem, load_rig, read_toml
+from nlos_calibration import ObjectBox, Rig, first_problem, load_rig
 from nlos_calibration.arrays import Float32
-from nlos_models import MapSet
+from nlos_models.training import MapSet
 from pydantic import ValidationError
 
 from nlos_cam import objects as shapes
@@ -22,7 +22,7 @@ from nlos_cam.dataset.reader import MAP_CHANNELS
 from nlos_cam.dataset.samples import OnProgress, Samples, ignore
 from nlos_cam.dataset.shards import SHARD_PATTERN, shard_path, store
 from nlos_cam.errors import DiskFullError, RecordingError
-from nlos_cam.files import atomic_directory
+from nlos_cam.files import atomic_directory, read_toml
 from nlos_cam.frames import OBJECT_PIXELS, maps_from_frame
 from nlos_cam.reconstruct import CalibratedRig, open_bench
 from nlos_cam.recording import ReplayCamera, Sidecar, load_sidecar, open_lidar_bag, sidecar_path

@@ -15,23 +15,16 @@ from pathlib import Path
 import numpy as np
 import torch
 from nlos_calibration import Rig
-from nlos_models import (
-    CellNormal,
-    MapNoise,
-    MapSet,
-    NormalBatch,
-    channels_of,
-    first_of,
-    read_bounded,
-)
-from nlos_models import read_arrays as read_npz
+from nlos_models import CellNormal, channels_of
+from nlos_models.training import MapNoise, MapSet, NormalBatch, first_of
 
 from nlos_cam.dataset.plan import DatasetPlan, RigSpread
 from nlos_cam.dataset.reader import MAP_CHANNELS, open_dataset
 from nlos_cam.dataset.samples import OnProgress, ignore
 from nlos_cam.dataset.shards import SHARD_PATTERN, Shard, read_arrays, read_head
 from nlos_cam.errors import RecordingError, SceneError
-from nlos_cam.files import atomic_file, claim
+from nlos_cam.files import atomic_file, claim, read_bounded
+from nlos_cam.files import read_arrays as read_npz
 from nlos_cam.frames import MAP_COLUMNS, MAP_ROWS, OBJECT_PIXELS
 from nlos_cam.reconstruct import align_samples
 

@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 from nlos_calibration import Rig
 from nlos_calibration.arrays import Int64
-from nlos_models import SIMULATION_ONLY, MapBatch, MapSet, as_batch
+from nlos_models import SIMULATION_ONLY
+from nlos_models.training import MapBatch, MapSet, as_batch
 from numpy.typing import NDArray
 
 from nlos_cam.dataset.plan import DatasetPlan

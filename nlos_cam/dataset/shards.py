@@ -15,14 +15,13 @@ from typing import Any
 
 import h5py
 import numpy as np
-from nlos_models import FileBusyError, claim, describe
 from numpy.typing import NDArray
 
 from nlos_cam.dataset.hdf5 import read_array, read_text
 from nlos_cam.dataset.plan import SCENE_COLUMNS, DatasetPlan
 from nlos_cam.dataset.samples import Samples
 from nlos_cam.errors import DiskFullError, FolderBusyError, OutputExistsError, RecordingError
-from nlos_cam.files import atomic_file
+from nlos_cam.files import FileBusyError, atomic_file, claim, describe
 
 SHARD_PATTERN = "shard-*.h5"
 PART_PATTERN = "*shard-*.part"

@@ -12,13 +12,13 @@ import numpy as np
 import torch
 from nlos_calibration import Moments, load_measured
 from nlos_calibration.arrays import Float16, Float32
-from nlos_models import (
-    CheckpointRecord,
+from nlos_models import CheckpointRecord
+from nlos_models.training import (
     InMemory,
     MapBatch,
+    MapRecipe,
     MapSet,
     MapSource,
-    Recipe,
     WithNoise,
     first_of,
     subtract_bare_wall,
@@ -53,7 +53,7 @@ class MapSplit(NamedTuple):
         """SHA-256 of the rig and the training objects: a run with another one cannot be resumed."""
         return hashlib.sha256(self.rig[1].encode() + self.training.image.tobytes()).hexdigest()
 
-    def limit_recipe(self, recipe: Recipe) -> Recipe:
+    def limit_recipe(self, recipe: MapRecipe) -> MapRecipe:
         """Return the recipe with the number of held-out objects available, which may be lower than
         it requests.
         """
@@ -102,7 +102,7 @@ def _subtract(batch: MapBatch, bare: BareMaps) -> MapBatch:
 
 
 def read_maps(
-    recipe: Recipe,
+    recipe: MapRecipe,
     data: Path,
     held_out_data: Path,
     wall: Path | None,

@@ -7,7 +7,8 @@ from pathlib import Path
 import numpy as np
 import torch
 from nlos_calibration.arrays import Float16, Float32
-from nlos_models import SMALLEST_SPREAD, MapSet, channel_statistics, split_and_stack
+from nlos_models import SMALLEST_SPREAD, channel_statistics, split_and_stack
+from nlos_models.training import MapSet
 from torch import Tensor
 
 from nlos_cam import dataset as data

@@ -9,14 +9,8 @@ from typing import Any
 import numpy as np
 from nlos_calibration import Rig
 from nlos_calibration.arrays import Float16, Float32
-from nlos_models import (
-    SIMULATION_ONLY,
-    SMALLER_IS_BETTER,
-    MapSet,
-    brightness,
-    color_metrics,
-    surface,
-)
+from nlos_models import SIMULATION_ONLY, SMALLER_IS_BETTER, brightness, color_metrics, surface
+from nlos_models.training import MapSet
 
 from nlos_cam.dataset import sense_color
 from nlos_cam.evaluate.figures import ROWS

@@ -23,7 +23,6 @@ from nlos_cam.evaluate.figures import LABELS
 from nlos_cam.evaluate.recognition import PER_KIND, recognised
 from nlos_cam.files import atomic_directory, cache_folder
 from nlos_cam.objects import CATEGORIES
-from nlos_cam.reconstruct import Mirrored
 from nlos_cam.report import (
     Banner,
     Bullets,
@@ -127,7 +126,6 @@ def evaluate(
     wall: Path | None = None,
     training: Path | None = None,
     nearest: bool = True,
-    mirror: bool = False,
     tracked: subjects.Tracked = subjects.untracked,
 ) -> Evaluation:
     """Reconstruct held-out objects with weights (the shipped ones if None) and with the baselines.
@@ -135,13 +133,11 @@ def evaluate(
     The objects are those given, those of a dataset (a path), or rendered: the 54 test objects, or
     `count` random ones, on `rig` (the weights' own if None). `wall` is the bare wall of difference
     maps. `training` names the maps searched for the nearest neighbour, unless it is left out.
-    `mirror` joins the answers to mirrored maps. `tracked` opens progress bars. Raises SceneError,
+    `tracked` opens progress bars. Raises SceneError,
     RecordingError.
     """
     reconstructor = load_reconstructor(weights, cache_folder() / "onnx")
     record = reconstructor.record
-    if mirror:
-        reconstructor = Mirrored(reconstructor)
     second: subjects.HeldOutObjects | None = None
     if isinstance(objects, Path):
         objects = subjects.dataset_objects(objects)

@@ -12,9 +12,10 @@ from zipfile import BadZipFile, ZipFile
 
 import numpy as np
 from nlos_calibration import load_rig, load_wall
-from nlos_models import load_recipe, read_arrays, read_bounded, read_toml
+from nlos_models.training import load_recipe
 
 from nlos_cam.errors import NlosCamError, RecordingError
+from nlos_cam.files import read_arrays, read_bounded, read_toml
 
 MAX_TEXT_BYTES = 16 << 20
 SESSION_MARK = b"nlos-cam session"

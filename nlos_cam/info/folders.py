@@ -6,9 +6,10 @@ import shlex
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
-from nlos_models import CHECKSUMS, TEXT_LIMIT, checksums_of, load_record, read_bounded
+from nlos_models import load_record
 
 from nlos_cam.errors import RecordingError
+from nlos_cam.files import CHECKSUMS, TEXT_LIMIT, checksums_of, read_bounded
 from nlos_cam.info.files import Description, count, describe_npz, problem_of, read_json
 
 

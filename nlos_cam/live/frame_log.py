@@ -17,8 +17,8 @@ log = logging.getLogger(__name__)
 
 def log_line(moment: Moment) -> dict[str, Any]:
     """Return the fields of a moment's line; None for unknown values."""
-    doubt = moment.reconstruction.doubt
-    quality = doubt.quality if doubt else None
+    uncertainty = moment.reconstruction.uncertainty
+    quality = uncertainty.quality if uncertainty else None
     return {
         "frame_number": moment.frame.frame_number,
         "timestamp_s": round(moment.frame.timestamp_s, 6),

@@ -9,10 +9,9 @@ from typing import Any
 import numpy as np
 from nlos_calibration import ObjectBox
 from nlos_calibration.arrays import Float32
-from nlos_models import read_arrays
 
 from nlos_cam.errors import RecordingError
-from nlos_cam.files import atomic_directory
+from nlos_cam.files import atomic_directory, read_arrays
 from nlos_cam.live.frame_queue import ignore
 from nlos_cam.objects import mesh_from_depth
 

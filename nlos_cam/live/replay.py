@@ -114,7 +114,7 @@ class _Results:
         if reconstruction.has_surface and uncertainty_m is not None:
             self.uncertainty_mm.append(1e3 * float(np.median(uncertainty_m[np.isfinite(depth_m)])))
         self.quality.add(result)
-        quality = reconstruction.doubt.quality if reconstruction.doubt else None
+        quality = reconstruction.uncertainty.quality if reconstruction.uncertainty else None
         self.expected.append((quality.iou[1], quality.error_m) if quality else (np.nan, np.nan))
         if result.check:
             self.checks[result.check.frame_number] = result.check.score

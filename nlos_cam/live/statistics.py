@@ -245,8 +245,8 @@ class QualityLog:
         self._predicted = StageTimes()
 
     def add(self, result: FrameResult) -> None:
-        doubt = result.reconstruction.doubt
-        if result.verdict is Verdict.SEEN and doubt and (found := doubt.quality):
+        uncertainty = result.reconstruction.uncertainty
+        if result.verdict is Verdict.SEEN and uncertainty and (found := uncertainty.quality):
             error_mm = 1e3 * found.error_m
             trusted = float(found.trusted)
             self._predicted.add(

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 from nlos_calibration import ObjectBox
 from nlos_calibration.arrays import Float32, Float64, Int64
-from nlos_models import atomic_file
 
 from nlos_cam.errors import NlosCamError
+from nlos_cam.files import atomic_file
 from nlos_cam.objects.depth_map import cell_centers_m
 
 JUMP_M = 0.02

@@ -6,7 +6,6 @@ __all__ = [
     "FrameConditions",
     "FrameResult",
     "MapAlignment",
-    "Mirrored",
     "PeriodicPhysicsCheck",
     "PhysicsCheck",
     "PhysicsCheckResult",
@@ -24,7 +23,7 @@ __all__ = [
     "check_reconstruction",
     "compatibility_warnings",
     "describe_failure",
-    "estimate_doubt",
+    "estimate_uncertainty",
     "frame_issues",
     "load_networks",
     "load_uncertainty",
@@ -37,7 +36,7 @@ __all__ = [
 
 from .alignment import MapAlignment, align_all, align_samples, alignment, rig_to_align_with
 from .bench import CalibratedRig, check_intrinsics, open_bench
-from .network import Clock, Mirrored, Quality, Reconstruction, estimate_doubt, reconstruct
+from .network import Clock, Quality, Reconstruction, estimate_uncertainty, reconstruct
 from .physics_check import (
     UNEXPLAINED,
     PeriodicPhysicsCheck,

@@ -32,7 +32,7 @@ from nlos_cam.objects import object_box
 from nlos_cam.render import SensorModel, cast
 
 if TYPE_CHECKING:  # it imports torch, which `live` does without
-    from nlos_models import MapSet
+    from nlos_models.training import MapSet
 
 SHAPE = MAP_ROWS, MAP_COLUMNS
 THREE_BOUNCES_M = 0.02

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from nlos_calibration import ObjectBox, Rig
 from nlos_calibration.arrays import Float32
-from nlos_models import MIN_V, Answer, Reconstructor, UncertaintyModel, ask
+from nlos_models import MIN_V, Answer, UncertaintyModel, ask
 from numpy.typing import NDArray
 
 from nlos_cam.frames import OBJECT_PIXELS, LidarMaps
@@ -16,26 +16,6 @@ from nlos_cam.objects import depth_from_image, object_box
 Clock = Callable[[], float]
 Network = Callable[[Float32, Float32], Float32]
 """depth_m (n, 64, 80) with NaN and intensity (n, 64, 80) to images v (n, 64, 64) in [0, 1]."""
-
-
-class Mirrored:
-    """Reconstructor that joins its network's answer with the one to the mirrored maps, for twice
-    the time.
-
-    The paper's rig is symmetric about y = 0, the paper's networks are not. A pixel is surface if
-    either answer has one there; its v is the mean of those that have.
-    """
-
-    def __init__(self, network: Reconstructor) -> None:
-        self.record = network.record
-        self.runtime = f"{network.runtime}, with the mirrored maps"
-        self._network = network
-
-    def __call__(self, depth_m: Float32, intensity: Float32) -> Float32:
-        """Return the images (n, 64, 64) of maps (n, 64, 80)."""
-        turned = self._network(depth_m[:, ::-1], intensity[:, ::-1])[:, ::-1]
-        both = np.stack([self._network(depth_m, intensity), turned])
-        return (both.sum(0) / np.maximum((both > 0).sum(0), 1)).astype(np.float32)
 
 
 @dataclass(frozen=True)
@@ -53,8 +33,8 @@ class Quality:
 
 
 @dataclass(frozen=True)
-class Doubt:
-    """Uncertainty of a reconstruction, estimated by the uncertainty model ("doubt network")."""
+class Uncertainty:
+    """Uncertainty of a reconstruction, estimated by the uncertainty model."""
 
     nothing: float
     """Probability that nothing is hidden."""
@@ -85,8 +65,13 @@ class Reconstruction:
     without an uncertainty model."""
     timings_s: Mapping[str, float]
     """Seconds by stage."""
-    doubt: Doubt | None = None
+    uncertainty: Uncertainty | None = None
     """None without an uncertainty model."""
+
+    @property
+    def doubt(self) -> Uncertainty | None:
+        """`uncertainty`, by its former name."""
+        return self.uncertainty
 
     @property
     def has_surface(self) -> bool:
@@ -140,11 +125,16 @@ def reconstruct_all(
         result = Reconstruction(depth_from_image(image, box), box_pose(box), None, timings_s)
         if uncertainty_model is not None:
             start_s = clock()
-            doubt = estimate_doubt(
+            uncertainty = estimate_uncertainty(
                 uncertainty_model, maps, image, box, None if surfaces is None else surfaces[number]
             )
             timings = {**timings_s, "doubt": clock() - start_s}
-            result = replace(result, uncertainty_m=doubt.error_m, timings_s=timings, doubt=doubt)
+            result = replace(
+                result,
+                uncertainty_m=uncertainty.error_m,
+                timings_s=timings,
+                uncertainty=uncertainty,
+            )
         results.append(result)
     return results
 
@@ -169,13 +159,13 @@ def _run_network(batch: Sequence[LidarMaps], network: Network) -> Answer:
     return Answer(images, None if found is None else surfaces)
 
 
-def estimate_doubt(
+def estimate_uncertainty(
     uncertainty_model: UncertaintyModel,
     maps: LidarMaps,
     image: Float32,
     box: ObjectBox,
     surface: Float32 | None = None,
-) -> Doubt:
+) -> Uncertainty:
     """Return the uncertainty of an image (64, 64) in v that networks made from maps.
 
     `surface` (64, 64) is their own probability of a surface, if they have one.
@@ -193,7 +183,7 @@ def estimate_doubt(
         low, middle, high = found.iou[0].tolist()
         error = float(found.error_v[0]) * metres_per_v
         quality = Quality((low, middle, high), float(found.good[0]), error, bool(found.trusted[0]))
-    return Doubt(
+    return Uncertainty(
         float(said.p_empty[0]),
         float(said.p_out_of_distribution[0]),
         error_m,

@@ -223,7 +223,7 @@ def load_networks(weights: Path | None = None) -> Reconstructor:
 
 
 def load_uncertainty(weights: Path | None = None) -> UncertaintyModel | None:
-    """Load the uncertainty model ("doubt network") beside the shipped weights, or of a folder; None
+    """Load the uncertainty model beside the shipped weights, or of a folder; None
     without one.
     """
     return load_uncertainty_model(weights, cache_folder() / "onnx")

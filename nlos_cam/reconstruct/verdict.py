@@ -83,13 +83,13 @@ class VerdictFilter:
             if conditions.saturated
             else None
         )
-        if (limits := self._limits) is None or (doubt := reconstruction.doubt) is None:
+        if (limits := self._limits) is None or (uncertainty := reconstruction.uncertainty) is None:
             return reconstruction, of_lidar
-        if doubt.nothing >= limits.nothing:
+        if uncertainty.nothing >= limits.nothing:
             self._outside.clear()
             verdict = Verdict.OUTSIDE if conditions.invalid else Verdict.NOTHING
             return reconstruction.without_surface, of_lidar or verdict
-        self._outside.append(doubt.outside)
+        self._outside.append(uncertainty.outside)
         unlike = sum(self._outside) / len(self._outside) >= limits.outside
         unexplained = conditions.check is not None and conditions.check.score >= limits.unexplained
         outside = unlike or unexplained or conditions.invalid or not reconstruction.has_surface

@@ -20,12 +20,12 @@ import numpy as np
 from lz4.frame import LZ4FrameDecompressor
 from nlos_calibration import Intrinsics
 from nlos_calibration.arrays import Float64
-from nlos_models import describe
 from rosbags.rosbag1 import Reader
 from rosbags.rosbag1.reader import Header, RecordType, read_uint32
 
 from nlos_cam.camera import Sample, repair_command
 from nlos_cam.errors import RecordingError
+from nlos_cam.files import describe
 from nlos_cam.recording import bag_messages, rosbag
 
 DEVICE = "/device_0"

@@ -18,11 +18,10 @@ import cv2
 import numpy as np
 import trimesh
 from nlos_calibration.arrays import Float64
-from nlos_models import TEXT_LIMIT, read_bounded
 
 from nlos_cam.camera import FORMATS, FrameSet, FrameSynchronizer, Sample
 from nlos_cam.errors import NlosCamError, RecordingError
-from nlos_cam.files import atomic_directory
+from nlos_cam.files import TEXT_LIMIT, atomic_directory, read_bounded
 from nlos_cam.recording.bag_reader import BagReader
 
 POINTS = "points"

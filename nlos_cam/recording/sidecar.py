@@ -13,12 +13,11 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from nlos_calibration import Finite, PinholeRecord, Record, Rig, first_problem, load_wall
-from nlos_models import TEXT_LIMIT, describe, read_bounded
 from pydantic import AwareDatetime, Field, ValidationError
 
 from nlos_cam.camera import Camera
 from nlos_cam.errors import DiskFullError, RecordingError
-from nlos_cam.files import atomic_file
+from nlos_cam.files import TEXT_LIMIT, atomic_file, describe, read_bounded
 from nlos_cam.frames import Frame
 from nlos_cam.recording.bag_messages import finite
 from nlos_cam.recording.playback import VerifyResult

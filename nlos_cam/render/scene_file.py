@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
 import numpy as np
-from nlos_calibration import Record, Rig, first_problem, load_rig, read_toml, record_kind, rig_named
+from nlos_calibration import Record, Rig, first_problem, load_rig, record_kind, rig_named
 from nlos_calibration.arrays import Float64
 from nlos_calibration.errors import RecordFileError
 from pydantic import (
@@ -27,6 +27,7 @@ from pydantic_core import PydanticCustomError
 
 from nlos_cam import objects as shapes
 from nlos_cam.errors import SceneError, SceneFileError
+from nlos_cam.files import read_toml
 from nlos_cam.render.material import Material
 from nlos_cam.render.patches import JUMP_M
 from nlos_cam.render.scene import Radiometry, Scene

@@ -55,7 +55,7 @@ def assess(moment: Moment) -> Assessment:
     and the depth error.
 
     Both come from the quality model, with the interval that holds 80 % of like frames; it was
-    fitted to known objects, of which none of the shown kind may have been (docs/doubt.md). Without
+    fitted to known objects, of which none of the shown kind may have been (docs/uncertainty.md). Without
     one they are the uncertainty model's own.
     """
     verdict = moment.verdict
@@ -63,7 +63,7 @@ def assess(moment: Moment) -> Assessment:
     if verdict is not Verdict.SEEN:
         headline, detail, tone = WORDS[verdict]
         return Assessment(headline, detail, tone, trusted=verdict is None)
-    if found.doubt and (quality := found.doubt.quality):
+    if found.uncertainty and (quality := found.uncertainty.quality):
         low, typical, high = (f"{share:.0%}" for share in quality.iou)
         tone: Tone = "good" if quality.trusted else "estimate"
         detail = (
@@ -91,9 +91,9 @@ def expected_overlap(found: Reconstruction) -> float | None:
     With the reconstructed mask M: intersection = sum of p over M, union = |M| + sum of p outside M.
     """
     mask = np.isfinite(found.depth_m)
-    if found.doubt is None or not mask.any():
+    if found.uncertainty is None or not mask.any():
         return None
-    p = found.doubt.surface
+    p = found.uncertainty.surface
     return float(p[mask].sum() / (mask.sum() + p[~mask].sum()))
 
 

@@ -185,8 +185,10 @@ class MomentPacker:
             arrays["error"] = np.clip(np.rint(found.uncertainty_m / ERROR_STEP_M), 0, 255).astype(
                 np.uint8
             )
-        if found.doubt is not None:
-            arrays["surface"] = np.rint(255 * np.clip(found.doubt.surface, 0, 1)).astype(np.uint8)
+        if found.uncertainty is not None:
+            arrays["surface"] = np.rint(255 * np.clip(found.uncertainty.surface, 0, 1)).astype(
+                np.uint8
+            )
         return arrays
 
     def _fields(self, moment: Moment, start_s: float) -> dict[str, Any]:
@@ -222,7 +224,8 @@ class MomentPacker:
 
 
 def _quality(moment: Moment) -> dict[str, Any] | None:
-    if (doubt := moment.reconstruction.doubt) is None or (quality := doubt.quality) is None:
+    uncertainty = moment.reconstruction.uncertainty
+    if uncertainty is None or (quality := uncertainty.quality) is None:
         return None
     iou = [round(share, 3) for share in quality.iou]
     return {"iou": iou, "error_mm": round(1e3 * quality.error_m, 1), "trusted": quality.trusted}

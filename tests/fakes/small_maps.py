@@ -8,11 +8,13 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from nlos_models import Recipe, checkpoint
+from nlos_models import CheckpointRecord
 from nlos_models import pipeline as networks
 from nlos_models.arrays import Float16, Float32
-from nlos_models.data import MapBatch, MapSet, map_batches
 from nlos_models.pipeline import RemappingNetwork
+from nlos_models.training import checkpoints
+from nlos_models.training.data import MapBatch, MapSet, map_batches
+from nlos_models.training.recipe import recipe_of
 from torch import Tensor, nn
 from torch.nn import functional
 
@@ -180,11 +182,11 @@ def untrained_weights(folder: Path, *, rig: Any, seed: int = 0, **recipe: Any) -
         "image_weight": 1.0,
     }
     facts |= {"latent_weight": 0.0} if recipe.get("steps") == "one" else {}
-    made = Recipe.model_validate({"task": "compressor", **facts, **recipe})
-    record = checkpoint.CheckpointRecord(
+    made = recipe_of({"task": "compressor", **facts, **recipe})
+    record = CheckpointRecord(
         rig_name=rig.name, rig_checksum=rig.checksum, input=made.maps, compressor_recipe=made
     )
     torch.manual_seed(seed)
     pipeline = RemappingNetwork(SmallCompressor(), SmallDecoder())  # type: ignore[arg-type]
     encoder = None if made.steps == "one" else SmallEncoder()
-    checkpoint.save_pipeline(folder, pipeline, record, encoder)  # type: ignore[arg-type]
+    checkpoints.save_pipeline(folder, pipeline, record, encoder)  # type: ignore[arg-type]

@@ -3,6 +3,7 @@ processes.
 """
 
 import csv
+import json
 import os
 import signal
 from collections.abc import Iterator
@@ -11,8 +12,9 @@ from typing import Any
 
 import torch
 from lightning_fabric import Fabric
-from nlos_models import Recipe, train
-from nlos_models.train import Running, fit
+from nlos_models.training import Recipe, loop
+from nlos_models.training.loop import Running, fit
+from nlos_models.training.recipe import recipe_of
 from torch import Tensor, nn
 
 SAMPLES = 24
@@ -30,7 +32,7 @@ def small_recipe(**changes: object) -> Recipe:
         "batch": BATCH,
         "learning_rate": 1e-2,
     }
-    return Recipe.model_validate(facts | changes)
+    return recipe_of(facts | changes)
 
 
 def log_rows(folder: Path) -> list[dict[str, str]]:
@@ -157,12 +159,12 @@ def run_watched(recipe: Recipe, folder: Path, executioner: Executioner) -> Small
         executioner()
         return replace(path, target)
 
-    train.os.fsync = watched_fsync
+    loop.os.fsync = watched_fsync
     Path.replace = watched_replace  # type: ignore[method-assign]
     try:
         run.go(stop=lambda: bool(executioner()), checkpoint_s=0.0)
     finally:
-        train.os.fsync = fsync
+        loop.os.fsync = fsync
         Path.replace = replace  # type: ignore[method-assign]
     return run
 
@@ -170,7 +172,7 @@ def run_watched(recipe: Recipe, folder: Path, executioner: Executioner) -> Small
 def be_killed(recipe_json: str, folder: str, moment: int) -> None:
     """Run in a child process until it is killed at this moment."""
     torch.set_num_threads(1)
-    run_watched(Recipe.model_validate_json(recipe_json), Path(folder), Executioner(moment))
+    run_watched(recipe_of(json.loads(recipe_json)), Path(folder), Executioner(moment))
 
 
 def on_two(fabric: Fabric, folder: Path) -> dict[str, Any]:

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from fake_doubter import FakeDoubter
+from fake_uncertainty import FakeUncertainty
 from fake_wall import SERIAL, WallCamera, bare_wall, write_wall
 from nlos_calibration.errors import RecordFileError
 from nlos_models.errors import CheckpointError
@@ -48,7 +48,7 @@ class HalfSurface(SheetNetwork):
 def opened(monkeypatch: pytest.MonkeyPatch) -> Open:
     """Open the stream of a given camera with networks that take no time."""
     monkeypatch.setattr(api.reconstruct, "load_networks", lambda *_: HalfSurface())
-    monkeypatch.setattr(api.reconstruct, "load_uncertainty", lambda *_: FakeDoubter())
+    monkeypatch.setattr(api.reconstruct, "load_uncertainty", lambda *_: FakeUncertainty())
 
     def make(camera: Camera, uri: str = "bag:fake.bag", **options: Any) -> Stream:
         monkeypatch.setattr(api, "open_camera", lambda *_, **__: camera)

@@ -6,10 +6,9 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from nlos_models import FileBusyError
 
 from nlos_cam.errors import OutputExistsError
-from nlos_cam.files import atomic_directory, atomic_file, cache_folder
+from nlos_cam.files import FileBusyError, atomic_directory, atomic_file, cache_folder
 
 
 @pytest.mark.parametrize(
@@ -39,7 +38,7 @@ def test_atomic_file_appears_when_it_is_on_disk(
     out = tmp_path / "out.txt"
     synced = list[int]()
     out.write_text("old")
-    monkeypatch.setattr("nlos_models.files.os.fsync", synced.append)
+    monkeypatch.setattr("nlos_cam.files.atomic.os.fsync", synced.append)
     with atomic_file(out) as part:
         part.write_text("new")
         assert out.read_text() == "old"
@@ -104,9 +103,9 @@ def test_atomic_directory_replaces_entries_by_name(
         (out / folder / "old.txt").write_text("old")
     (out / "mine.txt").write_text("mine")
     if way == "no exchange":
-        monkeypatch.setattr("nlos_cam.files._exchange", lambda *_: False)
+        monkeypatch.setattr("nlos_cam.files.atomic._exchange", lambda *_: False)
     if way == "no links":
-        monkeypatch.setattr("nlos_cam.files._link_all", lambda *_: False)
+        monkeypatch.setattr("nlos_cam.files.atomic._link_all", lambda *_: False)
     if way == "current folder":
         monkeypatch.chdir(out)
     with atomic_directory(out) as part:

@@ -4,7 +4,7 @@ of the weights.
 
 from pathlib import Path
 
-from nlos_models import CHECKSUMS, write_checked
+from nlos_cam.files import CHECKSUMS, write_checked
 
 WEIGHTS = Path(__file__).parents[2] / "models" / "nlos_models" / "weights"
 PATTERNS = "*.safetensors", "*.onnx", "checkpoint.json", "doubt.json", "quality.json"

@@ -17,7 +17,7 @@ from tempfile import TemporaryDirectory
 from venv import EnvBuilder
 
 ROOT = Path(__file__).parents[2]
-MAX_WHEEL_MB = 30.0
+MAX_WHEEL_MB = 100.0  # of a file on the Python package index
 MAX_INSTALL_MB = 800.0
 COMMANDS: tuple[tuple[str, ...], ...] = (
     ("--version",),
@@ -25,6 +25,7 @@ COMMANDS: tuple[tuple[str, ...], ...] = (
     ("live", "sim", "--no-view", "--seconds", "2"),
     ("live", "sim", "--no-view", "--seconds", "2", "--log", "warm.csv"),
     ("replay", "sample", "--out", "replayed"),
+    ("replay", "sample", "--weights", "paper", "--out", "replayed-paper"),
     ("export", "sample", "--out", "exported"),
     ("recipes",),
     ("scenes",),

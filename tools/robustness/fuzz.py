@@ -34,13 +34,12 @@ import numpy as np
 from fuzz_inputs import DONE, Input, WrongResultError, link_or_copy, make_files, make_inputs
 from mutations import mutate
 from nlos_calibration.errors import CalibrationError
-from nlos_models import CHECKSUMS, checksums_of
-from nlos_models.errors import FileBusyError, ModelError
+from nlos_models.errors import ModelError
 
 from nlos_cam.cli.main import build_app
 from nlos_cam.errors import NlosCamError
 from nlos_cam.evaluate import machine
-from nlos_cam.files import atomic_file
+from nlos_cam.files import CHECKSUMS, FileBusyError, atomic_file, checksums_of
 
 DOCS = Path(__file__).parents[2] / "docs"
 GROUPS = "light", "torch"

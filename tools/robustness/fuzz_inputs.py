@@ -20,7 +20,8 @@ from typing import Any, NamedTuple
 import numpy as np
 import trimesh
 from nlos_calibration import load_rig, load_wall, reference
-from nlos_models import checksums_of, load_cached, load_recipe, load_record, shipped_folder
+from nlos_models import load_record, shipped_folder
+from nlos_models.training import load_recipe
 from noise_recordings import record
 from rosbags.rosbag1 import Reader
 
@@ -28,6 +29,7 @@ from nlos_cam.camera import open_camera, simulated_world
 from nlos_cam.cli.config import read_settings
 from nlos_cam.cli.main import main
 from nlos_cam.errors import NlosCamError
+from nlos_cam.files import checksums_of, load_cached
 from nlos_cam.objects import SurfaceMesh, read_depth_map, read_mesh
 from nlos_cam.recording import load_sidecar
 from nlos_cam.render import bare_wall_scene, load_scene
@@ -195,11 +197,11 @@ def is_listed(path: Path) -> bool:
 
 def read_weights(path: Path, _folder: Path, _random: np.random.Generator) -> None:
     """Load networks from a folder of weights, whose checksum may have been made right."""
-    from nlos_models import load_doubt, load_network
+    from nlos_models import load_network, load_uncertainty_network
 
     command("info", path.parent)
     network, _ = load_network(path.parent)
-    load_doubt(path.parent)
+    load_uncertainty_network(path.parent)
     if not is_listed(path):
         raise WrongResultError("changed weights were accepted")
     if not all(tensor.isfinite().all() for tensor in network.state_dict().values()):
@@ -208,7 +210,7 @@ def read_weights(path: Path, _folder: Path, _random: np.random.Generator) -> Non
 
 def read_state(path: Path, _folder: Path, _random: np.random.Generator) -> None:
     """Read the last state of a training run."""
-    from nlos_models import train
+    from nlos_models.training import loop as train
 
     train.read_last(path.parent, lambda _: None)
 
@@ -329,7 +331,7 @@ def make_inputs(home: Path, group: str) -> dict[str, Input]:
 
 def _place_torch(home: Path, weights: Path, place: Callable[..., None]) -> None:
     import torch
-    from nlos_models import train
+    from nlos_models.training import loop as train
 
     from nlos_cam.dataset import open_dataset
 

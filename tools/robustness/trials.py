@@ -252,7 +252,7 @@ def load_program() -> None:
         "pyrealsense2",
         "h5py",
         "matplotlib.figure",
-        "nlos_models.train",
+        "nlos_models.training.loop",
     ):
         import_module(name)
 

@@ -11,7 +11,8 @@ from pathlib import Path
 
 import numpy as np
 from nlos_calibration import load_rig
-from nlos_models import load_network, load_vae, rebuild, run
+from nlos_models import load_network
+from nlos_models.training import load_vae, rebuild, run
 
 from nlos_cam.cli.common import PAPER_RIG, tracked
 from nlos_cam.dataset import TEST_SEED, open_dataset

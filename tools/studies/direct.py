@@ -24,13 +24,12 @@ import numpy as np
 import torch
 from matplotlib.figure import Figure
 from nlos_calibration import rig_named
-from nlos_models import (
-    DirectNetwork,
+from nlos_models import DirectNetwork, load_network
+from nlos_models.training import (
+    DirectRecipe,
     MapSet,
-    Recipe,
     Running,
     first_of,
-    load_network,
     load_recipe,
     run,
     train_direct,
@@ -53,7 +52,7 @@ NOTES = """Means over objects and their bootstrap 95 % intervals; one run each, 
 object; positive is better. Each variant had the same processor seconds on one thread, and its own cosine schedule."""
 
 
-def variant(text: str, base: Recipe) -> tuple[str, Recipe]:
+def variant(text: str, base: DirectRecipe) -> tuple[str, DirectRecipe]:
     """Return name and recipe of "NAME:field=value,direct.field=value": values as JSON, or plain
     words.
     """
@@ -68,10 +67,10 @@ def variant(text: str, base: Recipe) -> tuple[str, Recipe]:
             parsed = value
         (size if key.startswith("direct.") else fields)[key.removeprefix("direct.")] = parsed
     fields["direct"] = base.direct.model_dump() | size
-    return name, Recipe.model_validate(base.model_dump() | fields)
+    return name, DirectRecipe.model_validate(base.model_dump() | fields)
 
 
-def pace(recipe: Recipe, source: PackedMaps, held_out: MapSet) -> float:
+def pace(recipe: DirectRecipe, source: PackedMaps, held_out: MapSet) -> float:
     """Return the samples per processor second of a few steps of training."""
     marks = list[float]()
     running = Running(on_step=lambda _done, _all: marks.append(time.process_time()))
@@ -82,7 +81,7 @@ def pace(recipe: Recipe, source: PackedMaps, held_out: MapSet) -> float:
 
 
 def measure(
-    name: str, recipe: Recipe, source: PackedMaps, sets: dict[str, MapSet], given: Namespace
+    name: str, recipe: DirectRecipe, source: PackedMaps, sets: dict[str, MapSet], given: Namespace
 ) -> dict[str, Any]:
     """Train a variant for some processor seconds, or samples; return its facts and metrics on each
     set, per object.

@@ -26,7 +26,8 @@ import numpy as np
 from matplotlib.figure import Figure
 from nlos_calibration import ObjectBox, load_rig
 from nlos_calibration.arrays import Float32
-from nlos_models import CheckpointRecord, MapSet, Reconstructor, load_reconstructor, surface
+from nlos_models import CheckpointRecord, Reconstructor, load_reconstructor, surface
+from nlos_models.training import MapSet
 from numpy.typing import NDArray
 
 from nlos_cam.camera import FRAMES_PER_S, Recording, SimulatedCamera, World

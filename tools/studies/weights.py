@@ -25,21 +25,18 @@ from matplotlib.patches import Rectangle
 from nlos_calibration import Rig, lidar_visible_share, load_rig
 from nlos_calibration.arrays import Float32
 from nlos_models import (
-    MapSet,
     Reconstructor,
     UncertaintyModel,
     cut_silhouette,
-    latent_error,
     lift_edges,
-    load_encoder,
     load_pipeline,
     load_reconstructor,
     load_record,
     load_uncertainty_model,
-    run,
     shipped_folder,
     weights_folder,
 )
+from nlos_models.training import MapSet, latent_error, load_encoder, run
 
 from nlos_cam.cli.common import tracked
 from nlos_cam.dataset import TEST_SEED, TRAINING_SEED, DatasetPlan
@@ -65,7 +62,7 @@ from nlos_cam.evaluate import (
 from nlos_cam.files import cache_folder
 from nlos_cam.frames import LidarMaps
 from nlos_cam.objects import benchmark_objects, object_box
-from nlos_cam.reconstruct import estimate_doubt
+from nlos_cam.reconstruct import estimate_uncertainty
 
 FRAMES = 10, 100
 DISTANCES_M = (0.15, 0.2, 0.25, 0.3)
@@ -292,7 +289,7 @@ def cell(
                 for pair in zip(taken.depth_m, taken.intensity, strict=True)
             )
             doubts = [
-                estimate_doubt(doubter, one, image, box)
+                estimate_uncertainty(doubter, one, image, box)
                 for one, image in zip(seen, images, strict=True)
             ]
             found["outside"] = float(

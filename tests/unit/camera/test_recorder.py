@@ -11,7 +11,6 @@ from typing import Any
 import pytest
 from fake_lidar import NapClock
 from nlos_calibration import Intrinsics
-from nlos_models import FileBusyError
 
 from nlos_cam.camera import (
     FORMATS,
@@ -32,6 +31,7 @@ from nlos_cam.camera.recorder import (
 )
 from nlos_cam.camera.session import CAPACITY
 from nlos_cam.errors import DiskFullError, OutputExistsError, RecordingError
+from nlos_cam.files import FileBusyError
 from nlos_cam.recording import ReplayCamera, verify
 from nlos_cam.recording.salvage import scan_bag
 

@@ -14,7 +14,8 @@ from typing import Any
 import numpy as np
 import pytest
 from nlos_calibration import load_rig
-from nlos_models import CheckpointRecord, MapSet, Recipe
+from nlos_models import CheckpointRecord
+from nlos_models.training import MapSet, VaeRecipe
 from small_frames import SheetNetwork, sheet_network
 from small_maps import SmallDataset
 
@@ -297,7 +298,7 @@ def test_tradeoff_keeps_rows_measured_before_signal(
 
 
 def test_tradeoff_refuses_color_weights_before_rendering(run: Run) -> None:
-    recipe = Recipe(
+    recipe = VaeRecipe(
         task="vae", colour=True, objects=2, held_out=1, epochs=1, batch=2, learning_rate=1e-3
     )
     record = CheckpointRecord.of([recipe], ("paper-rig", "0"))

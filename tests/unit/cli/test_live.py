@@ -15,7 +15,7 @@ from unittest.mock import Mock
 import numpy as np
 import pytest
 import typer
-from fake_doubter import FakeDoubter
+from fake_uncertainty import FakeUncertainty
 from fake_wall import WallCamera, bare_wall, wall_frame, write_wall
 from made_up_moments import RIG, Recorded, full_moment
 from small_frames import FrameCamera, SheetNetwork, small_frame
@@ -49,7 +49,7 @@ class Opened:
         self.count: int | None = 20
         self.camera: Recorded | WallCamera | None = None
         self.network = SheetNetwork()
-        self.doubter = FakeDoubter()
+        self.doubter = FakeUncertainty()
 
     def __call__(self, uri: str, **options: Any) -> FrameCamera | WallCamera:
         self.calls.append((uri, options))

@@ -12,11 +12,12 @@ import numpy as np
 import pytest
 import torch
 from nlos_calibration import load_rig
-from nlos_models import load_pipeline, load_record, runs
+from nlos_models import checkpoint, load_pipeline, load_record
 from nlos_models.quality import FEATURES
+from nlos_models.training import QualitySet, checkpoints, loop, runs, tasks
 from safetensors.torch import load_file, save_file
-from small_doubt import untrained_doubt, watched_weights
 from small_maps import SmallDataset, small_images, small_maps, untrained_weights, use_small_networks
+from small_uncertainty import untrained_uncertainty, watched_weights
 
 from nlos_cam.cli import train as command
 from nlos_cam.cli.main import main
@@ -80,7 +81,7 @@ def exported(tmp_path_factory: pytest.TempPathFactory) -> Iterator[list[Path]]:
     folders = list[Path]()
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(runs, "export_folder", folders.append)
-        use_small_networks(patch, models.tasks, models.checkpoint, runs)
+        use_small_networks(patch, tasks, checkpoint, checkpoints, runs)
         counts = {"data": 8, "held-out": 4}
         sets = {
             name: SmallDataset(small_maps(count, len(name)), PLAN) for name, count in counts.items()
@@ -131,7 +132,7 @@ def test_train_vae_answers_with_folder_and_figures(go: Run, out: Path) -> None:
 def test_train_follows_shared_options(go: Run, out: Path, monkeypatch: Patch) -> None:
     compiled: list[object] = []
     monkeypatch.setattr(
-        models.train, "compile_network", lambda network: compiled.append(network) or network
+        loop, "compile_network", lambda network: compiled.append(network) or network
     )
     go("vae", "--budget", "0.5", "--objects", "6", "--compile")
     assert len(compiled) == 1
@@ -279,7 +280,7 @@ def test_train_doubt_writes_weights_with_doubt_once(go: Run, folder: Path, out: 
     weights = folder / "two"
     answer = go("doubt", "--weights", weights)
     load_pipeline(out)
-    record = models.load_doubt(out)[1]
+    record = models.load_uncertainty_network(out)[1]
     assert record.learnt == list(TRAINING_OUTLIERS)
     assert record.figures == {"held_out_loss": answer["held_out_loss"]}
     for again in (out, weights):
@@ -316,7 +317,9 @@ def test_train_doubt_refuses_other_maps_or_rig(
 @pytest.mark.slow
 def test_train_doubt_ignores_invisible_outliers(go: Run, folder: Path, monkeypatch: Patch) -> None:
     sets = list[Any]()
-    monkeypatch.setattr("nlos_models.run_doubt", lambda *every: sets.extend(every[-2:]) or {})
+    monkeypatch.setattr(
+        "nlos_models.training.run_uncertainty", lambda *every: sets.extend(every[-2:]) or {}
+    )
     go("doubt", "--weights", folder / "two")
     training = sets[0]
     per_kind = dict.fromkeys(TRAINING_OUTLIERS, 7)
@@ -335,16 +338,16 @@ def test_train_doubt_ignores_invisible_outliers(go: Run, folder: Path, monkeypat
 def test_train_quality_replaces_a_damaged_model(
     tmp_path: Path, monkeypatch: Patch, run: Run, shown: Run
 ) -> None:
-    untrained_doubt(weights := tmp_path / "run", watched_weights(tmp_path / "watched"))
+    untrained_uncertainty(weights := tmp_path / "run", watched_weights(tmp_path / "watched"))
     (weights / "quality.json").write_text("{", encoding="utf-8")
     figures = np.random.default_rng(0).standard_normal((120, FEATURES)).astype(np.float32)
     iou = 1 / (1 + np.exp(-figures[:, 0]))
     kinds = np.array(["cup", "bowl", "rods", "blobs"] * 30)
-    known = models.QualitySet(figures, iou, 0.2 - 0.1 * iou, kinds, np.arange(120) % 4 > 1)
+    known = QualitySet(figures, iou, 0.2 - 0.1 * iou, kinds, np.arange(120) % 4 > 1)
     monkeypatch.setattr("nlos_models.load_reconstructor", lambda *_: None)
     monkeypatch.setattr("nlos_cam.dataset.open_dataset", lambda *_, **__: None)
     monkeypatch.setattr("nlos_cam.dataset.quality_set", lambda *_: known)
-    monkeypatch.setattr("nlos_models.doubt_training.MIN_STEPS", 20)
+    monkeypatch.setattr("nlos_models.training.quality.MIN_STEPS", 20)
     answer = run("train", "quality", "--weights", weights, "--dataset", tmp_path)
     assert (answer["weights"], answer["objects"]) == (str(weights), 120)
     assert models.load_uncertainty_model(weights, tmp_path).quality.record.objects == 120

@@ -9,16 +9,9 @@ from typing import Any
 import pytest
 import torch
 from nlos_calibration import load_rig
-from nlos_models import (
-    SIMULATION_ONLY,
-    load_encoder,
-    load_pipeline,
-    load_reconstructor,
-    load_record,
-    load_vae,
-    run,
-)
+from nlos_models import SIMULATION_ONLY, load_pipeline, load_reconstructor, load_record
 from nlos_models.errors import CheckpointError
+from nlos_models.training import load_encoder, load_vae, run
 from small_run import log_rows
 
 from nlos_cam.cli.main import main

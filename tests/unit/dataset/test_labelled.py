@@ -15,7 +15,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from nlos_calibration import Rig, dump_toml, load_rig
 from nlos_calibration.errors import CalibrationError
-from nlos_models import MapSet
+from nlos_models.training import MapSet
 
 from nlos_cam.camera import Recording, SimulatedCamera
 from nlos_cam.dataset import DatasetPlan, build_dataset, open_dataset, read_labelled, write_shards

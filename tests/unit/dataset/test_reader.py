@@ -12,7 +12,7 @@ import pytest
 import torch
 from fake_farm import samples_of
 from nlos_calibration import load_rig
-from nlos_models import MapBatch, MapSet
+from nlos_models.training import MapBatch, MapSet
 
 from nlos_cam.dataset import DatasetPlan, reader
 from nlos_cam.dataset.reader import MAP_CHANNELS, Dataset, _maps, _Window, open_dataset

@@ -13,7 +13,9 @@ import torch
 import trimesh
 from nlos_calibration import load_rig
 from nlos_calibration.arrays import Float32
-from nlos_models import CellNormal, InMemory, MapSet, WithNoise
+from nlos_models import CellNormal
+from nlos_models.training import InMemory, MapSet, WithNoise
+from nlos_models.training.direct import vary
 
 from nlos_cam.dataset import objects_from_folder, procedural_images
 from nlos_cam.dataset import samples as dataset_samples
@@ -116,7 +118,7 @@ def test_expected_maps_with_drawn_noise_have_the_law_of_exposures() -> None:
         *(torch.from_numpy(values[None]) for values in (expected.depth_m, expected.intensity))
     )
     torch.manual_seed(0)
-    drawn = normal.vary(maps.expand(60, -1, -1, -1), map_noise(PLAN), None, None)
+    drawn = vary(normal, maps.expand(60, -1, -1, -1), map_noise(PLAN), None, None)
     assert torch.equal(drawn[:, 0], maps[:, 0].expand(60, -1, -1))
     counts = torch.expm1(drawn[:, 1] + normal.median[1])
     ratio = intensity.std(0) / counts.std(0, correction=0).numpy()
@@ -148,11 +150,9 @@ def test_expected_samples_differ_from_exposures_by_noise_alone_and_cells_without
     assert not changed[:, noisy.depth_m[0].isnan()].any()
     reflectance = torch.ones(1, 64, 80)
     offset_m = torch.ones(1)
-    assert (
-        not CellNormal()
-        .vary(torch.zeros(1, 2, 64, 80), map_noise(PLAN), reflectance, offset_m)
-        .any()
-    )
+    assert not vary(
+        CellNormal(), torch.zeros(1, 2, 64, 80), map_noise(PLAN), reflectance, offset_m
+    ).any()
 
 
 def test_expected_maps_of_textured_walls_are_refused() -> None:

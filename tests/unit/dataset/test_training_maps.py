@@ -11,8 +11,9 @@ import pytest
 import torch
 from fake_farm import samples_of
 from nlos_calibration import load_rig
-from nlos_models import CellNormal, FileBusyError, MapBatch
-from nlos_models.data import flip_some, subtract_bare_wall
+from nlos_models import CellNormal
+from nlos_models.training import MapBatch
+from nlos_models.training.data import flip_some, subtract_bare_wall
 from small_maps import SmallDataset, small_maps
 from small_run import small_recipe
 
@@ -30,6 +31,7 @@ from nlos_cam.dataset.samples import Samples
 from nlos_cam.dataset.shards import shard_path, store
 from nlos_cam.dataset.training_maps import MapSplit, Streamed, read_maps, render_bare_wall
 from nlos_cam.errors import RecordingError, SceneError
+from nlos_cam.files import FileBusyError
 from nlos_cam.frames import LidarMaps, maps_from_frame
 from nlos_cam.reconstruct import MapAlignment
 from nlos_cam.reconstruct.alignment import can_align

@@ -10,7 +10,7 @@ import pytest
 from matplotlib import colormaps
 from matplotlib.image import imread
 from nlos_calibration.rig import load_rig
-from nlos_models.recipe import SIMULATION_ONLY
+from nlos_models import SIMULATION_ONLY
 
 from nlos_cam.dataset.plan import DatasetPlan
 from nlos_cam.dataset.samples import make_samples

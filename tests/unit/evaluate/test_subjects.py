@@ -10,7 +10,8 @@ from unittest.mock import Mock
 import numpy as np
 import pytest
 from nlos_calibration import LidarPose, load_rig
-from nlos_models import CheckpointRecord, MapSet, Recipe
+from nlos_models import CheckpointRecord
+from nlos_models.training import MapSet, VaeRecipe
 from small_maps import SmallDataset, small_maps
 
 from nlos_cam.camera.simulated_world import World
@@ -156,7 +157,7 @@ def test_rig_of_weights_is_asked_for_where_missing_and_notes_name_other_rigs_and
     assert rig_of(RECORD) == RIG
     with pytest.raises(SceneError, match=r"'my bench'.*--rig"):
         rig_of(RECORD.model_copy(update={"rig_name": "my bench"}))
-    recipe = Recipe(
+    recipe = VaeRecipe(
         task="vae",
         objects=4,
         held_out=2,

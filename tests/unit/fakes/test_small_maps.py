@@ -9,10 +9,11 @@ import pytest
 import small_maps as small
 import torch
 from nlos_calibration import load_rig
-from nlos_models import checkpoint, load_doubt
+from nlos_models import checkpoint, load_uncertainty_network
 from nlos_models.compressor import Compressor
+from nlos_models.training import checkpoints
 from nlos_models.vae import ResVae
-from small_doubt import small_doubt_set, untrained_doubt, watched_weights
+from small_uncertainty import small_uncertainty_set, untrained_uncertainty, watched_weights
 from torch import nn
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -55,7 +56,7 @@ def test_untrained_weights_load_and_differ_by_seed(
     rig = load_rig("paper-rig")
     watched = watched_weights(tmp_path / "watched")
     for seed in (0, 1):
-        untrained_doubt(tmp_path / f"doubt{seed}", watched, seed)
+        untrained_uncertainty(tmp_path / f"doubt{seed}", watched, seed)
         small.untrained_weights(
             tmp_path / str(seed), rig=rig, seed=seed, steps=steps, maps="difference maps"
         )
@@ -63,13 +64,13 @@ def test_untrained_weights_load_and_differ_by_seed(
     (one, record), (other, _) = (checkpoint.load_pipeline(tmp_path / name) for name in "01")
     assert (record.rig_checksum, record.input) == (rig.checksum, "difference maps")
     assert record.compressor_recipe.steps == steps
-    assert (checkpoint.load_encoder(tmp_path / "0") is None) == (steps == "one")
+    assert (checkpoints.load_encoder(tmp_path / "0") is None) == (steps == "one")
     maps = torch.rand(2, 64, 80), torch.rand(2, 64, 80)
     with torch.inference_mode():
         made = [pipeline.latent(*maps) for pipeline in (one, other)]
     assert made[0].shape == (2, 256)
     assert not torch.allclose(*made)
-    doubts = [load_doubt(tmp_path / f"doubt{seed}")[0] for seed in (0, 1)]
+    doubts = [load_uncertainty_network(tmp_path / f"doubt{seed}")[0] for seed in (0, 1)]
     assert not torch.equal(*(doubt.network.pixels.weight for doubt in doubts))
 
 
@@ -84,7 +85,7 @@ def test_hard_maps_have_the_named_extremes(channels: tuple[int, ...]) -> None:
 
 
 def test_small_doubt_set_has_all_kinds_and_varying_errors() -> None:
-    some = small_doubt_set(40, 0)
+    some = small_uncertainty_set(40, 0)
     assert (some.nothing.sum(), some.outside.sum()) == (20, 10)
     assert not (some.nothing & some.outside).any()
     assert not some.truth[some.nothing].any()

@@ -8,7 +8,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from fake_doubter import FakeDoubter
+from fake_uncertainty import FakeUncertainty
 from fake_wall import SMALL, WallCamera, measured_wall, wall_frame
 from made_up_moments import RIG, Recorded, full_moment
 from matplotlib.figure import Figure
@@ -90,7 +90,7 @@ def test_replay_writes_every_frame_with_number_time_and_place(tmp_path: Path) ->
 
 def test_replay_writes_uncertainty_and_verdict_of_each_frame(tmp_path: Path) -> None:
     says = iter([(0.0, 0.0), (0.9, 0.0), (0.0, 0.9)])
-    doubter = FakeDoubter(lambda *_: next(says), error_v=0.1)
+    doubter = FakeUncertainty(lambda *_: next(says), error_v=0.1)
     replayed_noise(
         tmp_path / "out", 3, pipeline=Pipeline(BENCH, left_half, uncertainty_model=doubter)
     )

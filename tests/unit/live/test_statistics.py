@@ -32,7 +32,7 @@ from nlos_cam.live.statistics import (
 )
 from nlos_cam.live.telemetry import Telemetry, telemetry_of
 from nlos_cam.reconstruct import FrameResult, Quality, Verdict
-from nlos_cam.reconstruct.network import Doubt
+from nlos_cam.reconstruct.network import Uncertainty
 from nlos_cam.recording.sidecar import Sidecar, Temperatures, sidecar_path
 from nlos_cam.view import Moment
 
@@ -176,8 +176,8 @@ def test_predicted_quality_is_summarised_over_detected_objects_alone() -> None:
         )
         plane = np.zeros((64, 64), np.float32)
         result = step_of(number, verdict=verdict)
-        doubt = Doubt(0.0, 0.0, plane, plane, quality)
-        log.add(replace(result, reconstruction=replace(result.reconstruction, doubt=doubt)))
+        doubt = Uncertainty(0.0, 0.0, plane, plane, quality)
+        log.add(replace(result, reconstruction=replace(result.reconstruction, uncertainty=doubt)))
     assert log.summary == pytest.approx(
         {"expected_iou": 0.7, "expected_error_mm": 7.0, "trusted": 0.5}
     )

@@ -9,14 +9,17 @@ from unittest.mock import Mock
 import numpy as np
 import pytest
 import torch
-from nlos_models import CHECKSUMS, SIMULATION_ONLY, checkpoint
+from nlos_models import SIMULATION_ONLY, CheckpointRecord, checkpoint
 from nlos_models.compressor import Compressor
 from nlos_models.errors import CheckpointError
 from nlos_models.pipeline import RemappingNetwork, new_vae
+from nlos_models.training import checkpoints
 from nlos_models.vae import Decoder, ResVae
 from safetensors.torch import load_file, save
 from small_run import small_recipe, state_of
 from torch import nn
+
+from nlos_cam.files import CHECKSUMS
 
 pytestmark = pytest.mark.usefixtures("narrow_networks", "one_thread")
 
@@ -25,7 +28,7 @@ RUNS = {f"v{seed}": small_recipe(seed=seed) for seed in range(3)}
 RUNS |= {f"c{seed}": small_recipe(task="compressor", seed=seed) for seed in range(2)}
 RUNS |= {f"t{seed}": small_recipe(task="transfer", seed=seed) for seed in range(2)}
 RUNS["j"] = small_recipe(task="compressor", seed=9, steps="two-then-joint", image_weight=1.0)
-RECORD = checkpoint.CheckpointRecord.of([RUNS["v0"]], RIG).model_copy(
+RECORD = CheckpointRecord.of([RUNS["v0"]], RIG).model_copy(
     update={"figures": {"held_out_iou": 0.5}}
 )
 PARTS = ("compressor", "preprocess", "decoder")
@@ -46,7 +49,7 @@ def saved(narrow_networks: None, tmp_path_factory: pytest.TempPathFactory) -> Pa
     del narrow_networks
     torch.manual_seed(0)
     folder = tmp_path_factory.mktemp("pipeline")
-    checkpoint.save_pipeline(folder, RemappingNetwork(_used(Compressor()), Decoder()), RECORD)
+    checkpoints.save_pipeline(folder, RemappingNetwork(_used(Compressor()), Decoder()), RECORD)
     return folder
 
 
@@ -68,10 +71,10 @@ def _replace(path: Path, content: bytes) -> None:
 def test_pipeline_round_trip_is_float16_with_exact_statistics(tmp_path: Path, width: float) -> None:
     torch.manual_seed(0)
     pipeline = RemappingNetwork(_used(Compressor(width=width)), _used(Decoder()))
-    saved = checkpoint.CheckpointRecord.of([small_recipe(task="compressor", width=width)], RIG)
+    saved = CheckpointRecord.of([small_recipe(task="compressor", width=width)], RIG)
     pipeline.preprocess.mean.copy_(torch.tensor([0.1, 1e-9, 20.0, 3.0]))
     pipeline.preprocess.spread.copy_(torch.tensor([1e-8, 0.2, 100_000.0, 3.0]))
-    checkpoint.save_pipeline(tmp_path, pipeline, saved)
+    checkpoints.save_pipeline(tmp_path, pipeline, saved)
     loaded, record = checkpoint.load_pipeline(tmp_path)
     assert record == saved
     assert not loaded.training
@@ -91,10 +94,10 @@ def test_pipeline_round_trip_is_float16_with_exact_statistics(tmp_path: Path, wi
 def test_vae_round_trip_keeps_weights_and_bytes(tmp_path: Path, color: bool) -> None:
     torch.manual_seed(0)
     vae = new_vae(color=color)
-    saved = checkpoint.CheckpointRecord.of([small_recipe(colour=color)], RIG)
-    checkpoint.save_vae(tmp_path / "one", vae, saved)
-    loaded, record = checkpoint.load_vae(tmp_path / "one")
-    checkpoint.save_vae(tmp_path / "two", loaded, record)
+    saved = CheckpointRecord.of([small_recipe(colour=color)], RIG)
+    checkpoints.save_vae(tmp_path / "one", vae, saved)
+    loaded, record = checkpoints.load_vae(tmp_path / "one")
+    checkpoints.save_vae(tmp_path / "two", loaded, record)
     assert record == saved
     assert not loaded.training
     torch.testing.assert_close(loaded.state_dict(), vae.state_dict(), rtol=1e-3, atol=1e-7)
@@ -103,9 +106,9 @@ def test_vae_round_trip_keeps_weights_and_bytes(tmp_path: Path, color: bool) -> 
             (tmp_path / n / f"{name}.safetensors").read_bytes() for n in ("one", "two")
         )
         assert first == second
-    checkpoint.save_vae(tmp_path / "two", new_vae(color=not color), saved)
+    checkpoints.save_vae(tmp_path / "two", new_vae(color=not color), saved)
     with pytest.raises(CheckpointError, match="encoder"):
-        checkpoint.load_vae(tmp_path / "two")
+        checkpoints.load_vae(tmp_path / "two")
 
 
 @pytest.mark.parametrize("part", PARTS)
@@ -183,7 +186,7 @@ def test_load_fitting_loads_matching_tensors_and_reports_rest(folder: Path) -> N
     )
     decoder = Decoder()
     own = state_of(decoder)
-    report = checkpoint.load_fitting(path, decoder)
+    report = checkpoints.load_fitting(path, decoder)
     assert report[1:] == (["output.bias"], ["output.more"], ["output.weight"])
     assert set(report.loaded) == own.keys() - {"output.bias", "output.weight"}
     assert all(
@@ -196,13 +199,13 @@ def test_load_fitting_loads_matching_tensors_and_reports_rest(folder: Path) -> N
 
 
 def test_load_pipeline_partly_is_strict_but_for_compressor(folder: Path) -> None:
-    _, record, report = checkpoint.load_pipeline_partly(folder)
+    _, record, report = checkpoints.load_pipeline_partly(folder)
     assert record == RECORD
     assert report[1:] == ([], [], [])
     for part in ("compressor", "decoder"):
         _replace(folder / f"{part}.safetensors", save({"nothing": torch.zeros(1)}))
         with pytest.raises(CheckpointError, match=rf"{part}\.safetensors"):
-            checkpoint.load_pipeline_partly(folder)
+            checkpoints.load_pipeline_partly(folder)
 
 
 def test_save_refuses_weights_beyond_float16_or_on_full_disk(
@@ -211,12 +214,12 @@ def test_save_refuses_weights_beyond_float16_or_on_full_disk(
     for value in (1e6, torch.nan, torch.inf):
         nn.init.constant_((decoder := Decoder()).output.weight, value)
         with pytest.raises(CheckpointError, match=r"output\.weight"):
-            checkpoint.save_pipeline(tmp_path, RemappingNetwork(Compressor(), decoder), RECORD)
+            checkpoints.save_pipeline(tmp_path, RemappingNetwork(Compressor(), decoder), RECORD)
     monkeypatch.setattr(
         checkpoint, "write_checked", Mock(side_effect=OSError(28, "No space left on device"))
     )
     with pytest.raises(CheckpointError, match="No space left"):
-        checkpoint.save_vae(tmp_path, ResVae(), RECORD)
+        checkpoints.save_vae(tmp_path, ResVae(), RECORD)
 
 
 @pytest.mark.parametrize(
@@ -236,35 +239,28 @@ def test_save_refuses_weights_beyond_float16_or_on_full_disk(
 def test_record_names_last_run_of_each_task_and_keeps_others(
     runs: str, named: list[str], earlier: str
 ) -> None:
-    record = checkpoint.CheckpointRecord.of(
-        [RUNS[name] for name in runs.split()], RIG, "difference maps"
-    )
+    record = CheckpointRecord.of([RUNS[name] for name in runs.split()], RIG, "difference maps")
     latest = [record.vae_recipe, record.compressor_recipe, record.transfer_recipe]
     assert latest == [RUNS.get(name) for name in named]
     assert record.earlier == [RUNS[name] for name in earlier.split()]
     assert sorted(name for name, run in RUNS.items() if run in record.runs) == sorted(runs.split())
     assert (record.rig_name, record.rig_checksum, record.input) == (*RIG, "difference maps")
-    assert checkpoint.CheckpointRecord.model_validate_json(record.model_dump_json()) == record
+    assert CheckpointRecord.model_validate_json(record.model_dump_json()) == record
 
 
 def test_record_vae_runs_include_runs_that_train_decoder() -> None:
-    record = checkpoint.CheckpointRecord.of(
-        [RUNS[name] for name in ("v0", "v1", "c0", "j", "t0")], RIG
-    )
+    record = CheckpointRecord.of([RUNS[name] for name in ("v0", "v1", "c0", "j", "t0")], RIG)
     assert record.vae_runs == [RUNS[name] for name in ("v0", "v1", "j")]
     written_before_earlier = RECORD.model_dump(mode="json", exclude={"earlier"})
-    assert checkpoint.CheckpointRecord.model_validate(written_before_earlier).runs == [RUNS["v0"]]
+    assert CheckpointRecord.model_validate(written_before_earlier).runs == [RUNS["v0"]]
 
 
 def test_record_in_color_notes_simulation_only() -> None:
     runs = [small_recipe(colour=True), small_recipe(task="compressor", colour=True)]
     for some in (runs[:1], runs[1:], runs):
-        record = checkpoint.CheckpointRecord.of(some, RIG)
+        record = CheckpointRecord.of(some, RIG)
         assert (record.color, record.note) == (True, SIMULATION_ONLY)
-        assert checkpoint.CheckpointRecord.model_validate_json(record.model_dump_json()) == record
-        assert (
-            checkpoint.CheckpointRecord.model_validate(record.model_dump(exclude={"note"}))
-            == record
-        )
-    depth = checkpoint.CheckpointRecord.of([RUNS["v0"], RUNS["c0"]], RIG)
+        assert CheckpointRecord.model_validate_json(record.model_dump_json()) == record
+        assert CheckpointRecord.model_validate(record.model_dump(exclude={"note"})) == record
+    depth = CheckpointRecord.of([RUNS["v0"], RUNS["c0"]], RIG)
     assert (depth.color, depth.note) == (False, "")

@@ -5,55 +5,70 @@ checkpoint.
 import io
 from collections.abc import Iterable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import onnx
 import pytest
 import torch
 from nlos_models import direct
-from nlos_models.checkpoint import load_network, load_pipeline, save_direct
-from nlos_models.data import InMemory, MapNoise, MapSet, as_images
-from nlos_models.direct import CellNormal, DirectNetwork, image_from_logits, two_heads_error
-from nlos_models.direct_training import NormalBatch, _stains, train_direct, transfer_direct
-from nlos_models.distributed import open_fabric
+from nlos_models.checkpoint import load_network, load_pipeline
+from nlos_models.direct import CellNormal, DirectNetwork, image_from_logits
 from nlos_models.errors import CheckpointError, TrainingError
 from nlos_models.export import TorchReconstructor, export_folder
 from nlos_models.inference import load_reconstructor
 from nlos_models.metrics import color_metrics
-from nlos_models.recipe import SIMULATION_ONLY, DirectSize, Recipe
-from nlos_models.records import CheckpointRecord, load_record
-from nlos_models.runs import TrainingRun, direct_start, record_run, run_transfer, transfer_start
-from nlos_models.tasks import figures_of
-from nlos_models.tasks import run as reconstruct
-from nlos_models.train import BEST, LAST, MINUTES, Running, Scores
+from nlos_models.records import SIMULATION_ONLY, CheckpointRecord, load_record
+from nlos_models.training.checkpoints import save_direct
+from nlos_models.training.data import InMemory, MapNoise, MapSet, as_images
+from nlos_models.training.direct import NormalBatch, _stains, train_direct, transfer_direct, vary
+from nlos_models.training.distributed import open_fabric
+from nlos_models.training.loop import BEST, LAST, MINUTES, Running, Scores
+from nlos_models.training.losses import two_heads_error
+from nlos_models.training.recipe import DirectSize, recipe_of
+from nlos_models.training.runs import (
+    TrainingRun,
+    direct_start,
+    record_run,
+    run_transfer,
+    transfer_start,
+)
+from nlos_models.training.tasks import figures_of
+from nlos_models.training.tasks import run as reconstruct
 from onnx import TensorProto
 from small_maps import small_maps
 from small_run import changed_tensors
 from torch import Tensor, nn
 
 pytestmark = pytest.mark.usefixtures("one_thread")
-TRANSFER: dict[str, object] = {"task": "transfer", "latent_weight": 0.0, "image_weight": 1.0}
+RUN = {
+    "objects": 16,
+    "held_out": 4,
+    "epochs": 2,
+    "batch": 4,
+    "learning_rate": 3e-3,
+    "schedule": "cosine",
+    "weight_decay": 0.05,
+    "average": 0.9,
+    "noise": 0.02,
+}
 SIZE = DirectSize(features=8, width=8, blocks=1, token=8, mixers=1)
 
 
-def _recipe(**changes: object) -> Recipe:
-    facts = {
+def _recipe(**changes: object) -> Any:
+    facts = RUN | {
         "task": "direct",
-        "objects": 16,
-        "held_out": 4,
-        "epochs": 2,
-        "batch": 4,
-        "learning_rate": 3e-3,
-        "schedule": "cosine",
         "warm_up_steps": 2,
-        "weight_decay": 0.05,
-        "average": 0.9,
         "gradient_limit": 1.0,
         "dropout": 0.1,
-        "noise": 0.02,
         "direct": SIZE,
     }
-    return Recipe.model_validate(facts | changes)
+    return recipe_of(facts | changes)
+
+
+def _transfer_recipe(**changes: object) -> Any:
+    facts = RUN | {"task": "transfer", "latent_weight": 0.0, "image_weight": 1.0, "dropout": 0.1}
+    return recipe_of(facts | {"warm_up_steps": 2, "gradient_limit": 1.0} | changes)
 
 
 def _painted(maps: MapSet) -> MapSet:
@@ -100,13 +115,16 @@ def _shaken() -> DirectNetwork:
     return network.eval()
 
 
-def test_answer_to_mirrored_maps_is_the_mirrored_answer_by_linear_layers_of_both_sides() -> None:
+def test_answer_to_mirrored_maps_is_the_mirrored_answer() -> None:
     network = _shaken()
     normal = torch.randn(3, 2, 64, 80)
     logits = network.logits(normal)
     torch.testing.assert_close(network.logits(normal.flip(-2)), logits.flip(-2), rtol=0, atol=1e-5)
     assert float(logits.detach().std()) > 0.1
     assert (logits - logits.flip(-2)).abs().max() > 0.1
+
+
+def test_mirror_linear_is_a_linear_layer_of_both_sides() -> None:
     layer = direct.MirrorLinear(5, 3)
     sides = torch.randn(4, 2, 5)
     own = (layer.even.weight + layer.odd.weight) / 2
@@ -131,7 +149,7 @@ def test_each_pixel_has_its_place(row: int, column: int) -> None:
     assert int(moved.sum()) == 64
 
 
-def test_cells_are_normalised_symmetrically_clipped_and_without_the_gain_of_a_frame() -> None:
+def test_cells_are_normalised_symmetrically_and_clipped() -> None:
     maps = small_maps(40, 0)
     normal = CellNormal()
     depth_m = torch.from_numpy(maps.depth_m.copy())
@@ -142,6 +160,9 @@ def test_cells_are_normalised_symmetrically_clipped_and_without_the_gain_of_a_fr
     assert (values[:, :, 3, 7] == 0).all()
     assert values.abs().max() <= direct.CLIP
     torch.testing.assert_close(normal(depth_m.flip(-2), intensity.flip(-2)), values.flip(-2))
+
+
+def test_gain_of_a_frame_is_taken_out() -> None:
     normal = CellNormal()
     generator = torch.Generator().manual_seed(0)
     depth_m = 0.3 + 0.01 * torch.randn(30, 64, 80, generator=generator)
@@ -201,7 +222,9 @@ def test_color_is_learnt_by_the_same_two_heads(tmp_path: Path) -> None:
     torch.testing.assert_close(
         network.logits(normal.flip(-2)), network.logits(normal).flip(-2), rtol=0, atol=1e-5
     )
-    varied = network.normal.vary(normal, None, torch.full((3, 64, 80), 0.3), torch.full((3,), 0.01))
+    varied = vary(
+        network.normal, normal, None, torch.full((3, 64, 80), 0.3), torch.full((3,), 0.01)
+    )
     moved = (varied - normal) * network.normal.spread
     returns = (normal != 0).any(1) & (varied.abs() < 5).all(1)
     torch.testing.assert_close(
@@ -224,13 +247,17 @@ def _train(
     return train_direct(_recipe(**changes), Source(), small_maps(4, 1), folder, running)
 
 
-def test_run_stopped_halfway_resumes_exactly_and_follows_its_recipe(tmp_path: Path) -> None:
+def test_run_stopped_halfway_resumes_exactly(tmp_path: Path) -> None:
     whole, figures = _train(tmp_path / "whole")
     with pytest.raises(KeyboardInterrupt):
         _train(tmp_path / "cut", Running(stop=iter([False] * 4 + [True]).__next__))
     resumed, again = _train(tmp_path / "cut")
     assert not changed_tensors(whole.state_dict(), resumed.state_dict())
     assert figures == again
+
+
+def test_run_follows_its_recipe(tmp_path: Path) -> None:
+    whole, _ = _train(tmp_path / "whole")
     for name, changes in (
         ("plain", {"average": 0.0}),
         ("varied", {"wall_texture": 0.05, "range_offset_m": 0.05}),
@@ -260,9 +287,7 @@ def test_training_goes_on_from_weights_that_grow(weights: Path, tmp_path: Path) 
     assert direct_start(_recipe(), None) == (None, [])
 
 
-def test_blend_is_the_mean_of_the_trained_weights_and_those_before(
-    weights: Path, tmp_path: Path
-) -> None:
+def test_blend_is_the_mean_of_trained_and_earlier_weights(weights: Path, tmp_path: Path) -> None:
     start, _ = direct_start(_recipe(start="weights"), weights)
     made = list[tuple[DirectNetwork, Scores]]()
     for share in (1.0, 0.25):
@@ -338,9 +363,7 @@ def test_start_refuses_weights_that_the_recipe_cannot_hold(
         direct_start(recipe, Path("paper"))
 
 
-def test_varied_maps_are_those_of_another_wall_with_stains_of_variance_1_and_of_another_range() -> (
-    None
-):
+def test_varied_maps_are_those_of_another_wall_and_range() -> None:
     """Stains and an offset on normalised maps are what they would be on the maps themselves."""
     maps = small_maps(40, 0)
     normal = CellNormal()
@@ -355,9 +378,12 @@ def test_varied_maps_are_those_of_another_wall_with_stains_of_variance_1_and_of_
     measured = normal(
         depth_m + offset_m[:, None, None], torch.expm1(torch.log1p(intensity)) * reflectance.exp()
     )
-    varied = normal.vary(normal(depth_m, intensity), None, reflectance, offset_m)
+    varied = vary(normal, normal(depth_m, intensity), None, reflectance, offset_m)
     assert float((measured - varied).abs().median()) < 0.02
-    torch.testing.assert_close(normal.vary(varied, None, None, None), varied, atol=1e-4, rtol=0)
+    torch.testing.assert_close(vary(normal, varied, None, None, None), varied, atol=1e-4, rtol=0)
+
+
+def test_stains_have_mean_0_and_variance_1_and_half_are_grain() -> None:
     patterns = _stains(200, torch.device("cpu"))
     assert float(patterns.mean()) == pytest.approx(0, abs=0.03)
     assert float(patterns.var()) == pytest.approx(1, abs=0.05)
@@ -386,7 +412,7 @@ def test_shift_follows_another_bench_and_nothing_else() -> None:
 
 def test_transfer_learns_the_bench_in_two_phases_and_resumes(tmp_path: Path) -> None:
     def go(folder: Path, running: Running | None = None) -> tuple[DirectNetwork, float]:
-        recipe = _recipe(**TRANSFER, all_layers_epochs=12, epochs=3, average=0.0)
+        recipe = _transfer_recipe(all_layers_epochs=12, epochs=3, average=0.0)
         after, figures = transfer_direct(
             recipe, _shaken(), InMemory(Source().maps), small_maps(4, 1), folder, running
         )
@@ -417,7 +443,7 @@ def test_transfer_learns_the_bench_in_two_phases_and_resumes(tmp_path: Path) -> 
 
 @pytest.mark.slow
 def test_transfer_of_direct_weights_is_saved_with_both_runs(weights: Path, tmp_path: Path) -> None:
-    recipe = _recipe(**TRANSFER, all_layers_epochs=1, epochs=1)
+    recipe = _transfer_recipe(all_layers_epochs=1, epochs=1)
     network, start = transfer_start(recipe, weights, partial=False, on_report=pytest.fail)
     record = record_run(recipe, tmp_path / "out", ("paper-rig", "0" * 64), start.runs, weights)
     job = TrainingRun(recipe, tmp_path / "out", record)

@@ -15,12 +15,14 @@ from zipfile import ZipFile
 
 import numpy as np
 import pytest
-from nlos_calibration import read_toml as read_record
-from nlos_models import files
-from nlos_models.errors import FileBusyError, OutputExistsError
-from nlos_models.files import (
+
+from nlos_cam import files
+from nlos_cam.files import (
+    FileBusyError,
+    OutputExistsError,
     atomic_file,
     claim,
+    claims,
     load_cached,
     read_arrays,
     read_bounded,
@@ -66,10 +68,10 @@ def test_reserved_path_is_written_by_its_process_alone(tmp_path: Path) -> None:
         process = FORK.Process(
             target=race, args=(tmp_path / "a", *(parts := (FORK.Barrier(1), FORK.SimpleQueue())), 1)
         )
-        files._reserved, held = set(), files._reserved
+        claims._reserved, held = set(), claims._reserved
         process.start()
         process.join()
-        files._reserved = held
+        claims._reserved = held
         assert parts[1].get() is None
         for content in ("one", "two"):
             with atomic_file(tmp_path / "a") as part:
@@ -99,7 +101,7 @@ def test_next_claim_removes_parts_of_the_killed_alone(
     assert (tmp_path / ".a.part" / "part").exists()
     with claim(tmp_path / "living") as folder:
         (folder / "part").write_bytes(b"1")
-        monkeypatch.setattr("nlos_models.files._swept", set())
+        monkeypatch.setattr("nlos_cam.files.claims._swept", set())
         with claim(tmp_path / "b"):
             assert not (tmp_path / ".a.part").exists()
             assert (folder / "part").exists()
@@ -269,7 +271,7 @@ def test_read_arrays_returns_what_was_saved_within_its_limit(tmp_path: Path) -> 
         read_arrays(path)
 
 
-@pytest.mark.parametrize("read", [files.read_toml, read_record])
+@pytest.mark.parametrize("read", [files.read_toml])
 @pytest.mark.parametrize("part", ["a.", "a . ", '{"a":', "{a = ", "[", "a ", '"a.'])
 def test_deep_toml_is_refused_without_much_work(
     tmp_path: Path, read: Callable[[Path], object], part: str

@@ -1,22 +1,21 @@
-"""Inference: ONNX Runtime held equal to torch, exports that are cached, and 8-bit networks."""
+"""Inference: ONNX Runtime held equal to torch, exports that are cached."""
 
 import shutil
 import sys
+import tomllib
 from collections.abc import Iterator
 from itertools import product
 from pathlib import Path
 from unittest.mock import Mock
 
 import numpy as np
-import onnx
 import pytest
 import torch
-from nlos_models import checkpoint, errors, export, inference, records
-from nlos_models.checkpoint import load_network, load_pipeline, save_pipeline
+from nlos_models import errors, export, inference
+from nlos_models.checkpoint import load_network, load_pipeline
 from nlos_models.compressor import Compressor
-from nlos_models.doubt_network import load_doubt
 from nlos_models.errors import CheckpointError, MissingExtraError, ModelError
-from nlos_models.export import TorchReconstructor, quantize
+from nlos_models.export import TorchReconstructor
 from nlos_models.inference import (
     OnnxReconstructor,
     Reconstructor,
@@ -32,8 +31,10 @@ from nlos_models.records import (
     shipped_folder,
     weights_folder,
 )
+from nlos_models.training import checkpoints
+from nlos_models.training.checkpoints import save_pipeline
+from nlos_models.uncertainty_network import load_uncertainty_network
 from nlos_models.vae import Decoder
-from onnx import TensorProto, numpy_helper
 from small_maps import HARD_MAPS, hard_maps, noise_maps
 from small_run import small_recipe
 
@@ -88,9 +89,7 @@ def pair(folders: tuple[Path, Path]) -> Pair:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("batch", [1, 5])
-def test_onnx_reconstruction_equals_torch_is_exported_once_and_of_hard_maps_a_possible_image(
-    folders: tuple[Path, Path], pair: Pair, monkeypatch: pytest.MonkeyPatch, batch: int
-) -> None:
+def test_onnx_reconstruction_equals_torch(pair: Pair, batch: int) -> None:
     assert isinstance(pair[0], OnnxReconstructor)
     assert pair[0].record == pair[1].record == RECORD
     assert pair[0].runtime != pair[1].runtime
@@ -105,75 +104,37 @@ def test_onnx_reconstruction_equals_torch_is_exported_once_and_of_hard_maps_a_po
     assert ((mine > 0) != (its > 0)).sum((1, 2)).max() <= HANDFUL
     assert 0 < both.mean() < 1
     np.testing.assert_allclose(mine[both], its[both], atol=1e-4)
+
+
+@pytest.mark.slow
+def test_network_is_exported_once(
+    folders: tuple[Path, Path], pair: Pair, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    maps = noise_maps(1)
     monkeypatch.setattr(export, "export_onnx", lambda _: pytest.fail("exported again"))
-    np.testing.assert_array_equal(load_reconstructor(*folders)(*maps), mine)
+    np.testing.assert_array_equal(load_reconstructor(*folders)(*maps), pair[0](*maps))
     assert [path.suffix for path in folders[1].iterdir()] == [".onnx"]
+
+
+@pytest.mark.slow
+def test_image_of_hard_maps_is_a_possible_one(pair: Pair) -> None:
     for name, reconstructor in product(HARD_MAPS, pair):
         image = reconstructor(*(part.numpy() for part in hard_maps(name)))
         assert ((image == 0) | ((image >= MIN_V) & (image <= 1))).all(), name
 
 
-def test_color_networks_are_not_exported_and_exports_are_named_by_weights(
+def test_color_networks_are_not_exported(
     pipeline: RemappingNetwork,
 ) -> None:
     color = RemappingNetwork(pipeline.compressor, Decoder(3, 512), intensities=3)
     with pytest.raises(ModelError, match="simulation only"):
         export.export_onnx(color)
+
+
+def test_exports_are_named_by_their_weights(pipeline: RemappingNetwork) -> None:
     before = export.checksum_of(pipeline)
     assert export.checksum_of(pipeline) == before
     assert export.checksum_of(RemappingNetwork(pipeline.compressor, Decoder())) != before
-
-
-GRAPH = """
-<ir_version: 9, opset_import: ["" : 18]>
-small (float[n, 64, 80] depth_m, float[n, 64, 80] intensity) => (float[n, 1, 64, 80] answer)
-<float[n, 3, 64, 80] wide>
-{
-    sum = Add(depth_m, intensity)
-    image = Unsqueeze(sum, axes)
-    wide = Conv<pads = [1, 1, 1, 1]>(image, kernel)
-    answer = Conv(wide, mix)
-}
-"""
-"""A network of two convolutions, with a stale shape of the kind that exporters leave."""
-
-
-def _samples(seed: int) -> list[tuple[np.ndarray, ...]]:
-    generator = np.random.default_rng(seed)
-    return [tuple(generator.random((1, 64, 80), np.float32) for _ in range(2)) for _ in range(4)]
-
-
-@pytest.mark.parametrize("static", [False, True])
-def test_quantized_network_is_nearly_exact_for_any_batch_or_one_of_our_errors(static: bool) -> None:
-    made = onnx.parser.parse_model(GRAPH)
-    generator = np.random.default_rng(0)
-    kernel, mix = (
-        generator.normal(size=size).astype(np.float32) for size in ((8, 1, 3, 3), (1, 8, 1, 1))
-    )
-    constants = {"kernel": kernel, "mix": mix, "axes": np.array([1])}
-    made.graph.initializer.extend(
-        numpy_helper.from_array(array, name) for name, array in constants.items()
-    )
-    model = made.SerializeToString()
-    small = quantize(model, _samples(0) if static else None)
-    weights = {
-        tensor.name: tensor.data_type for tensor in onnx.load_from_string(small).graph.initializer
-    }
-    assert {TensorProto.INT8, TensorProto.UINT8} & set(weights.values())
-    maps = dict(
-        zip(
-            ("depth_m", "intensity"),
-            map(np.concatenate, zip(*_samples(1), strict=True)),
-            strict=True,
-        )
-    )
-    exact, nearly = (
-        inference.open_session(network).run(None, maps)[0] for network in (model, small)
-    )
-    assert nearly.shape == exact.shape == (4, 1, 64, 80)
-    assert 0 < np.abs(nearly - exact).mean() < 0.05 * exact.std()
-    with pytest.raises(ModelError, match="8 bits"):
-        quantize(model, [])
 
 
 @pytest.mark.slow
@@ -217,7 +178,7 @@ def test_shipped_graphs_equal_shipped_checkpoint_in_torch(name: str) -> None:
     assert ((mine > 0) != (its > 0)).sum((1, 2)).max() <= HANDFUL
     assert both.mean() > 0
     np.testing.assert_allclose(mine[both], its[both], atol=1e-4)
-    reference = load_doubt(shipped)
+    reference = load_uncertainty_network(shipped)
     with torch.inference_mode():
         theirs = reference[0](*(torch.from_numpy(part) for part in (*maps, mine)))
     for said, wanted in zip(doubt(*maps, mine), theirs, strict=True):
@@ -243,20 +204,26 @@ def test_weights_without_graph_need_torch_in_one_line(
             load(tmp_path, tmp_path / "cache")
         assert "\n" not in str(found.value)
     with pytest.raises(MissingExtraError, match="training needs torch"):
-        errors.require("nlos_models.train", "training")
+        errors.require("nlos_models.training.loop", "training")
 
 
-def test_paper_weights_name_what_they_or_their_package_lack(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_paper_vae_names_the_command_that_makes_its_encoder() -> None:
     with pytest.raises(CheckpointError, match=r"encoder.*train vae --recipe vae-encoder"):
-        checkpoint.load_vae()
-    assert checkpoint.load_encoder() is None
-    monkeypatch.setattr(records, "shipped_folder", lambda name="direct": tmp_path / name)
-    with pytest.raises(CheckpointError, match="from a clone"):
-        load_reconstructor(Path("paper"), tmp_path)
+        checkpoints.load_vae()
+    assert checkpoints.load_encoder() is None
+
+
+def test_folder_without_a_record_is_no_checkpoint(tmp_path: Path) -> None:
     with pytest.raises(CheckpointError, match="no checkpoint in"):
         load_reconstructor(tmp_path / "other", tmp_path)
+
+
+def test_wheel_holds_all_shipped_weights() -> None:
+    project = tomllib.loads((Path(__file__).parents[3] / "pyproject.toml").read_text("utf-8"))
+    wheel = project["tool"]["hatch"]["build"]["targets"]["wheel"]
+    assert "models/nlos_models" in wheel["packages"]
+    assert "exclude" not in wheel
+    assert all((shipped_folder(name) / "network.onnx").exists() for name in SHIPPED)
 
 
 def test_weights_by_name_give_way_to_a_folder_of_that_name(

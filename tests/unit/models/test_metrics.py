@@ -5,8 +5,8 @@ import pytest
 import torch
 from nlos_models import metrics
 from nlos_models.arrays import Float32
-from nlos_models.recipe import ImageLoss
-from nlos_models.vae import image_error, kl_divergence, latent_error, variational_share
+from nlos_models.training.losses import image_error, kl_divergence, latent_error, variational_share
+from nlos_models.training.recipe import ImageLoss
 
 EMPTY = np.zeros((1, 64, 64), np.float32)
 
@@ -23,9 +23,7 @@ def _colored(color: tuple[float, float, float], rows: slice = slice(16, 48)) -> 
     return image
 
 
-def test_accuracies_count_every_pixel_iou_masks_above_5_percent_and_rmse_shared_pixels_up_to_the_farthest() -> (
-    None
-):
+def test_every_metric_of_an_equal_image_is_perfect() -> None:
     for score in (
         metrics.accuracy_mean_abs,
         metrics.accuracy_within_2_percent,
@@ -33,18 +31,25 @@ def test_accuracies_count_every_pixel_iou_masks_above_5_percent_and_rmse_shared_
     ):
         assert [score(image, image) for image in (EMPTY, _square(0.7))] == [1, 1]
     assert metrics.foreground_rmse_mm(_square(0.7), _square(0.7), 300.0) == 0
+
+
+def test_accuracies_count_every_pixel() -> None:
     assert metrics.accuracy_mean_abs(_square(0.5), EMPTY)[0] == pytest.approx(1 - 0.5 * 100 / 4096)
     assert metrics.accuracy_within_2_percent(_square(0.515), _square(0.5))[0] == 1
     assert metrics.accuracy_within_2_percent(_square(0.53), _square(0.5))[0] == pytest.approx(
         1 - 100 / 4096
     )
 
+
+def test_silhouette_iou_takes_surface_above_5_percent() -> None:
     shifted = _square(0.9, columns=slice(15, 25))
     assert metrics.silhouette_iou(_square(0.4), shifted)[0] == pytest.approx(50 / 150)
     assert metrics.silhouette_iou(_square(0.06), _square(1.0)) == 1
     assert metrics.silhouette_iou(_square(0.04), _square(1.0)) == 0
     assert metrics.silhouette_iou(EMPTY, _square(0.5)) == 0
 
+
+def test_foreground_rmse_is_over_shared_pixels() -> None:
     image = _square(0.6, columns=slice(10, 30))
     assert metrics.foreground_rmse_mm(image, _square(0.5), 300.0)[0] == pytest.approx(30, rel=1e-5)
     for image, truth in (
@@ -53,6 +58,9 @@ def test_accuracies_count_every_pixel_iou_masks_above_5_percent_and_rmse_shared_
         (_square(0.5, rows=slice(40, 50)), _square(0.5)),
     ):
         assert np.isnan(metrics.foreground_rmse_mm(image, truth, 300.0))
+
+
+def test_foreground_rmse_takes_faint_pixels_as_the_farthest_surface() -> None:
     assert metrics.foreground_rmse_mm(_square(0.06), _square(metrics.MIN_V), 300.0)[
         0
     ] == pytest.approx(0, abs=1e-6)
@@ -61,7 +69,7 @@ def test_accuracies_count_every_pixel_iou_masks_above_5_percent_and_rmse_shared_
     )
 
 
-def test_wrong_color_is_no_error_of_silhouette_nor_wrong_silhouette_of_color() -> None:
+def test_color_metrics_of_a_wrong_color() -> None:
     truth = _colored((0.9, 0.2, 0.1))
     image = _colored((0.9, 0.5, 0.1))
     assert [value.item() for value in metrics.color_metrics(truth, truth).values()] == [
@@ -78,11 +86,17 @@ def test_wrong_color_is_no_error_of_silhouette_nor_wrong_silhouette_of_color() -
     assert metrics.root_mean_square_error(image, truth) == pytest.approx(
         np.sqrt(0.25 / 3) * 0.9 * 0.3, rel=1e-5
     )
+
+
+def test_wrong_silhouette_is_no_error_of_color() -> None:
     truth = _colored((0.9, 0.2, 0.1))
     image = _colored((0.9, 0.2, 0.1), slice(16, 32))
     assert metrics.color_silhouette_iou(image, truth) == 0.5
     assert metrics.color_error(image, truth) == 0.0
     assert np.isnan(metrics.color_error(np.zeros_like(truth), truth)).all()
+
+
+def test_channel_below_black_is_black() -> None:
     black = _colored((0.9, 0.2, 0.0))
     below = _colored((0.9, 0.2, 0.0))
     below[:, 2, 16:48, 16:48] = 0.03  # below black is black
@@ -130,7 +144,7 @@ def test_absolute_error_is_least_at_weighted_median(
 
 
 @pytest.mark.parametrize("kind", ["squared", "absolute"])
-def test_image_error_sums_channels_and_pixels_and_averages_samples(kind: ImageLoss) -> None:
+def test_image_error_is_a_sum_over_pixels_and_a_mean_over_samples(kind: ImageLoss) -> None:
     generator = torch.Generator().manual_seed(0)
     image, truth = (torch.rand(2, 3, 64, 64, generator=generator) for _ in range(2))
     truth *= truth.amax(1, keepdim=True) > 0.5

@@ -37,7 +37,7 @@ def _channels(module: nn.Module) -> tuple[tuple[int, int], ...]:
 
 
 @pytest.mark.parametrize("width", [0.35, 0.5, 1.0, 1.4])
-def test_compressor_matches_table_s2_and_width_scales_channels_in_steps_of_eight(
+def test_compressor_has_table_s2_with_channels_scaled_by_width(
     width: float,
 ) -> None:
     compressor = Compressor(width=width).eval()

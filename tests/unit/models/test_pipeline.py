@@ -14,15 +14,6 @@ from nlos_models import (
     split_and_stack,
 )
 from nlos_models.compressor import Compressor, ResNet50
-from nlos_models.data import (
-    InMemory,
-    first_of,
-    flip_some,
-    image_batches,
-    map_batches,
-    shuffled,
-    subtract_bare_wall,
-)
 from nlos_models.pipeline import (
     KEPT_SHARE,
     WINDOW,
@@ -30,6 +21,15 @@ from nlos_models.pipeline import (
     new_pipeline,
     new_vae,
     stacked_channels,
+)
+from nlos_models.training.data import (
+    InMemory,
+    first_of,
+    flip_some,
+    image_batches,
+    map_batches,
+    shuffled,
+    subtract_bare_wall,
 )
 from small_maps import HARD_MAPS, hard_maps, small_maps
 from torch import Tensor
@@ -51,9 +51,7 @@ def _fitted(maps: tuple[Tensor, Tensor], intensities: int = 1) -> Preprocess:
     return preprocess
 
 
-def test_split_and_stack_puts_halves_missing_returns_and_each_color_in_documented_channels() -> (
-    None
-):
+def test_split_and_stack_puts_the_halves_in_channels_of_their_own() -> None:
     column = torch.arange(80.0).expand(1, 64, 80)
     left = column[0, :, :40]
     right = column[0, :, 40:]
@@ -61,12 +59,18 @@ def test_split_and_stack_puts_halves_missing_returns_and_each_color_in_documente
         split_and_stack(column, 100 + column)[0],
         torch.stack([left, right, 100 + left, 100 + right]),
     )
+
+
+def test_split_and_stack_marks_a_missing_return_in_all_its_channels() -> None:
     depth = torch.ones(1, 64, 80)
     intensity = torch.ones(1, 64, 80)
     depth[0, 5, 10] = torch.nan
     depth[0, 6, 70] = torch.nan
     missing = torch.isnan(split_and_stack(depth, intensity))[0].nonzero().tolist()
     assert missing == [[0, 5, 10], [1, 6, 30], [2, 5, 10], [3, 6, 30]]
+
+
+def test_split_and_stack_puts_each_color_behind_the_depth() -> None:
     depth, intensity = _maps(colors=3)
     stacked = split_and_stack(depth, intensity)
     assert stacked.shape == (3, stacked_channels(3), 64, 40)
@@ -184,9 +188,7 @@ def test_new_pipeline_is_of_depth_or_color(color: bool, channels: int, latent: i
     assert made.preprocess.left_noise == 0.1
 
 
-def test_cut_silhouette_clears_faint_skirt_beside_surface_of_any_color_and_all_of_a_faint_image() -> (
-    None
-):
+def test_cut_silhouette_clears_a_faint_skirt_beside_a_surface() -> None:
     image = torch.zeros(1, 1, 64, 64)
     faint = 0.9 * KEPT_SHARE * 0.9
     image[..., 10:30, 10:20] = 0.9
@@ -197,11 +199,17 @@ def test_cut_silhouette_clears_faint_skirt_beside_surface_of_any_color_and_all_o
     assert torch.equal(cut[..., 10:20], image[..., 10:20])
     assert (cut[..., 50:60, 50:60] == faint).all()
     assert WINDOW < 30
+
+
+def test_cut_silhouette_clears_all_of_a_faint_image() -> None:
     for value in (0.0, 0.05, MIN_V, 1.0):
         image = torch.full((1, 1, 64, 64), value)
         assert torch.equal(
             cut_silhouette(image), image if value >= MIN_V else torch.zeros_like(image)
         )
+
+
+def test_cut_silhouette_goes_by_the_brightest_color() -> None:
     image = torch.zeros(1, 3, 64, 64)
     image[0, :, 10:40, 10:40] = torch.tensor([0.9, 0.02, 0.5])[:, None, None]
     image[0, :, 10:40, 40:43] = torch.tensor([0.3, 0.35, 0.3])[:, None, None]
@@ -258,7 +266,7 @@ def test_image_batches_are_images_or_their_mirrors() -> None:
     assert sorted(found) == list(range(6))
 
 
-def test_map_batches_mirror_maps_with_their_images_and_first_maps_are_at_most_all() -> None:
+def test_map_batches_mirror_maps_with_their_images() -> None:
     maps = small_maps(8, 0)
     batches = list(map_batches(maps, 4, torch.Generator().manual_seed(0)))
     for batch in batches:
@@ -272,6 +280,10 @@ def test_map_batches_mirror_maps_with_their_images_and_first_maps_are_at_most_al
         torch.testing.assert_close(found, wanted, rtol=0, atol=0, equal_nan=True)
     assert sorted(torch.cat([batch.row for batch in batches]).tolist()) == list(range(8))
     assert 0 < torch.cat([batch.mirrored for batch in batches]).sum() < 8
+
+
+def test_first_maps_are_at_most_all() -> None:
+    maps = small_maps(8, 0)
     for few, every in zip(vars(first_of(maps, 2)).values(), vars(maps).values(), strict=True):
         np.testing.assert_array_equal(few, every[:2])
     assert len(InMemory(maps).first(9).image) == 8

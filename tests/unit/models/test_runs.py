@@ -8,17 +8,19 @@ from pathlib import Path
 import pytest
 import torch
 from nlos_calibration.rig import load_rig
-from nlos_models import checkpoint, runs
-from nlos_models.checkpoint import CheckpointRecord, save_direct, save_pipeline, save_vae
+from nlos_models import CheckpointRecord, checkpoint
 from nlos_models.direct import DirectNetwork
-from nlos_models.errors import OutputExistsError, TrainingError
-from nlos_models.files import CHECKSUMS
+from nlos_models.errors import TrainingError
 from nlos_models.pipeline import RemappingNetwork
-from nlos_models.recipe import Recipe
-from nlos_models.runs import compressor_start, record_run, transfer_start, vae_start
+from nlos_models.training import runs
+from nlos_models.training.checkpoints import save_direct, save_pipeline, save_vae
+from nlos_models.training.recipe import Recipe
+from nlos_models.training.runs import compressor_start, record_run, transfer_start, vae_start
 from safetensors.torch import load_file, save_file
 from small_maps import SmallCompressor, SmallVae, use_small_networks
 from small_run import changed_tensors, small_recipe
+
+from nlos_cam.files import CHECKSUMS, OutputExistsError
 
 RIG = load_rig("paper-rig")
 NAMED = (RIG.name, RIG.checksum)
@@ -48,7 +50,7 @@ def weights(tmp_path: Path) -> Path:
     return tmp_path / "two"
 
 
-def test_vae_start_lists_runs_of_vae_alone_and_leaves_an_encoder_that_is_missing_untrained(
+def test_vae_start_lists_runs_of_the_vae_alone(
     weights: Path,
 ) -> None:
     stored = load_file(weights / "decoder.safetensors")["output.weight"].float()
@@ -103,13 +105,16 @@ def test_start_refuses_weights_of_other_kind(
         _start(recipe.model_copy(update=changes), weights)
 
 
-def test_start_refuses_weights_without_encoder_for_latent_loss_and_color_weights_for_depth(
+def test_latent_loss_needs_weights_with_an_encoder(
     weights: Path,
 ) -> None:
     (weights / "encoder.safetensors").unlink()
     with pytest.raises(TrainingError, match="encoder"):
         _start(JOINT, weights)
     _start(JOINT.model_copy(update=IMAGES_ALONE), weights)
+
+
+def test_start_refuses_color_weights_for_depth(weights: Path) -> None:
     record = CheckpointRecord.of([small_recipe(colour=True)], NAMED).model_dump_json()
     (weights / "checkpoint.json").write_text(record, encoding="utf-8")
     (weights / CHECKSUMS).unlink()
@@ -170,7 +175,7 @@ def test_record_run_refuses_weights_of_another_run(
         _record(tmp_path, *recipes)
 
 
-def test_record_of_a_run_refuses_a_file_and_the_folder_that_it_starts_from(tmp_path: Path) -> None:
+def test_record_of_a_run_refuses_a_file_and_its_own_start(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     for name, starts in (("file", ()), ("run", (tmp_path / "x" / ".." / "run",))):
         with pytest.raises(OutputExistsError, match="--out"):

@@ -8,10 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from nlos_models import Recipe, Running, Scores, tasks, train
-from nlos_models.data import InMemory, map_batches
 from nlos_models.errors import TrainingError
 from nlos_models.pipeline import RemappingNetwork, channel_statistics, split_and_stack
+from nlos_models.training import Recipe, Running, Scores, tasks
+from nlos_models.training import loop as train
+from nlos_models.training.data import InMemory, map_batches
 from small_maps import SmallCompressor, SmallVae, small_images, small_maps, use_small_networks
 from small_run import Stopped, changed_tensors, log_rows, small_recipe, state_of, stop_halfway
 from torch import Tensor
@@ -78,15 +79,18 @@ def trained(tmp_path_factory: pytest.TempPathFactory) -> Trained:
     return *_vae(_recipe("vae"), folder), folder
 
 
-def test_vae_loss_falls_figures_are_of_last_epoch_and_resumed_run_equals_it(
-    trained: Trained, tmp_path: Path
-) -> None:
+def test_vae_run_returns_the_figures_of_its_last_epoch(trained: Trained) -> None:
     vae, figures, folder = trained
     log = log_rows(folder)
     assert float(log[-1]["loss"]) < float(log[0]["loss"])
     assert {key: float(log[-1][key]) for key in figures} == figures
     assert 0 <= figures["held_out_iou"] <= 1
     assert not vae.training
+
+
+def test_resumed_vae_run_equals_a_whole_one(trained: Trained, tmp_path: Path) -> None:
+    vae, figures, folder = trained
+    log = log_rows(folder)
     with pytest.raises(Stopped):
         _vae(_recipe("vae"), tmp_path, on_step=stop_halfway)
     torch.manual_seed(99)
@@ -104,9 +108,7 @@ def test_vae_warm_up_ignores_divergence(tmp_path: Path) -> None:
     assert [one == other for one, other in zip(*losses, strict=True)] == [True, True, False, False]
 
 
-def test_vae_continues_from_weights_or_trains_encoder_for_a_kept_decoder(
-    trained: Trained, tmp_path: Path
-) -> None:
+def test_vae_continues_from_weights(trained: Trained, tmp_path: Path) -> None:
     start = SmallVae()
     start.load_state_dict(before := state_of(trained[0]))
     vae, figures = _vae(
@@ -116,6 +118,9 @@ def test_vae_continues_from_weights_or_trains_encoder_for_a_kept_decoder(
         torch.testing.assert_close(tensor.data, before[name], rtol=0, atol=1e-5)
     assert changed_tensors(before, vae.state_dict())
     assert figures["held_out_loss"] == pytest.approx(trained[1]["held_out_loss"], rel=0.05)
+
+
+def test_vae_trains_an_encoder_for_a_given_decoder(trained: Trained, tmp_path: Path) -> None:
     start = SmallVae()
     start.decoder.load_state_dict(kept := state_of(trained[0].decoder))
     encoder = state_of(start.encoder)
@@ -330,7 +335,7 @@ class Bench:
         return state_of(self.pipeline)
 
 
-def test_transfer_changes_all_of_compressor_and_then_its_classifier_alone(
+def test_transfer_changes_all_layers_and_then_the_classifier(
     tmp_path: Path, monkeypatch: Patch
 ) -> None:
     bench = Bench(tmp_path / "second")
@@ -354,7 +359,7 @@ def test_transfer_changes_all_of_compressor_and_then_its_classifier_alone(
     assert changed_tensors(before, bench.state) == ours
 
 
-def test_transfer_phases_have_epochs_and_rates_of_recipe_and_resume_exactly(tmp_path: Path) -> None:
+def test_transfer_phases_have_epochs_and_rates_of_the_recipe(tmp_path: Path) -> None:
     bench = Bench(tmp_path / "whole")
     figures = bench.go()
     first, second = (log_rows(bench.folder / name) for name in (tasks.ALL_LAYERS, tasks.CLASSIFIER))
@@ -362,6 +367,11 @@ def test_transfer_phases_have_epochs_and_rates_of_recipe_and_resume_exactly(tmp_
     assert {float(row["rate"]) for row in first + second} == {1e-3}
     assert figures["held_out_loss"] == float(second[-1]["held_out_loss"])
     assert bench.steps == [(k + 1, 5 * STEPS) for k in range(5 * STEPS)]
+
+
+def test_transfer_resumes_exactly_in_either_phase(tmp_path: Path) -> None:
+    bench = Bench(tmp_path / "whole")
+    figures = bench.go()
     for fail_at in (STEPS + 1, 3 * STEPS + 1):
         with pytest.raises(Stopped):
             Bench(tmp_path / f"{fail_at}").go(fail_at)

@@ -22,11 +22,11 @@ from unittest.mock import Mock
 import pytest
 import small_run
 import torch
-from nlos_models import recipe as schedule
-from nlos_models import train
-from nlos_models.direct_training import NormalBatch
-from nlos_models.distributed import launch, open_fabric, precision_on, seed_of, share_of
 from nlos_models.errors import CheckpointError, RecipeError, TrainingError
+from nlos_models.training import loop as train
+from nlos_models.training import schedule
+from nlos_models.training.direct import NormalBatch
+from nlos_models.training.distributed import launch, open_fabric, precision_on, seed_of, share_of
 from small_run import STEPS, SmallRun, Stopped, changed_tensors, small_recipe, state_of
 from torch import Tensor, nn
 from torch._inductor import config
@@ -65,7 +65,7 @@ def test_run_killed_at_random_moments_equals_uninterrupted(tmp_path: Path) -> No
     moments = random.Random(0).sample(range(2, clerk.seen // 2), 4)  # noqa: S311  each start resumes the last one
     context = multiprocessing.get_context("forkserver")
     context.set_forkserver_preload(
-        ["nlos_models.train", "pytest"]
+        ["nlos_models.training.loop", "pytest"]
     )  # each process begins with them imported
     ends: list[int | None] = []
     for moment in moments:
@@ -79,7 +79,7 @@ def test_run_killed_at_random_moments_equals_uninterrupted(tmp_path: Path) -> No
     _assert_same(_trained(tmp_path / "killed", schedule="one-cycle", epochs=2), whole)
 
 
-def test_stopped_run_names_step_and_resumes_there_and_failed_run_from_its_last_checkpoint(
+def test_stopped_run_names_its_step_and_resumes_there(
     tmp_path: Path,
 ) -> None:
     whole = _trained(tmp_path / "whole")
@@ -92,12 +92,14 @@ def test_stopped_run_names_step_and_resumes_there_and_failed_run_from_its_last_c
     again = _trained(tmp_path / "stopped")
     assert again.steps[0] == (STEPS + 3, 4 * STEPS)
     _assert_same(again, whole)
+
+
+def test_failed_run_resumes_from_its_last_checkpoint(tmp_path: Path) -> None:
     run = SmallRun(small_recipe(epochs=1), tmp_path / "failed")
     seconds = count(0.0, 1.0)
     with pytest.raises(Stopped):
-        run.go(
-            fail_at=5, clock=lambda: next(seconds), checkpoint_s=2.5
-        )  # saved after steps 2 and 4
+        # Saved after steps 2 and 4.
+        run.go(fail_at=5, clock=lambda: next(seconds), checkpoint_s=2.5)
     assert _trained(tmp_path / "failed", epochs=1).steps[0][0] in {3, 4, 5}
 
 
@@ -125,9 +127,7 @@ def test_progress_counts_steps_and_finished_run_is_not_repeated(tmp_path: Path) 
     assert _trained(tmp_path / "other", seed=1).log != run.log
 
 
-def test_run_of_other_recipe_or_origin_or_of_few_objects_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(RecipeError, match="25"):
-        SmallRun(small_recipe(objects=25, batch=25), tmp_path).go()
+def test_run_of_other_recipe_or_origin_is_refused(tmp_path: Path) -> None:
     run = SmallRun(small_recipe(epochs=1), tmp_path)
     run.go(origin="these weights")
     reworded = SmallRun(small_recipe(epochs=1, deviations=["other words"]), tmp_path)
@@ -212,10 +212,23 @@ def test_read_last_returns_last_state_written(tmp_path: Path) -> None:
         train.read_last(tmp_path / "folder", print)
 
 
+def test_run_of_fewer_objects_than_a_batch_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(RecipeError, match="25"):
+        SmallRun(small_recipe(objects=25, batch=25), tmp_path).go()
+
+
 @pytest.mark.parametrize("how", ["cut", "flipped", "empty"])
-def test_read_last_falls_back_to_previous_state_and_read_best_refuses(
-    tmp_path: Path, how: str
-) -> None:
+def test_read_last_falls_back_to_the_previous_state(tmp_path: Path, how: str) -> None:
+    for step in (1, 2):
+        train.write_last(tmp_path, _state(step))
+    _damage(tmp_path / train.LAST, how)
+    messages: list[str] = []
+    assert train.read_last(tmp_path, messages.append)["step"] == 1
+    assert [str(tmp_path / train.LAST) in message for message in messages] == [True]
+
+
+@pytest.mark.parametrize("how", ["cut", "flipped", "empty"])
+def test_read_best_refuses_a_missing_or_damaged_state(tmp_path: Path, how: str) -> None:
     with pytest.raises(CheckpointError, match=train.BEST):
         train.read_best(tmp_path)
     train.write_best(tmp_path, _state(3))
@@ -223,12 +236,12 @@ def test_read_last_falls_back_to_previous_state_and_read_best_refuses(
     _damage(tmp_path / train.BEST, how)
     with pytest.raises(CheckpointError, match=train.BEST):
         train.read_best(tmp_path)
+
+
+def test_read_last_refuses_where_both_states_are_damaged(tmp_path: Path) -> None:
     for step in (1, 2):
         train.write_last(tmp_path, _state(step))
-    _damage(tmp_path / train.LAST, how)
-    messages: list[str] = []
-    assert train.read_last(tmp_path, messages.append)["step"] == 1
-    assert [str(tmp_path / train.LAST) in message for message in messages] == [True]
+    _damage(tmp_path / train.LAST, "flipped")
     _damage(tmp_path / train.PREVIOUS, "flipped")
     with pytest.raises(CheckpointError, match=train.LAST) as caught:
         train.read_last(tmp_path, pytest.fail)
@@ -328,7 +341,7 @@ NO_GRADIENTS = Mock(side_effect=InductorError(RuntimeError("No g++\nand more"), 
 @pytest.mark.parametrize(
     "network", [torch.compile(nn.Linear(3, 2), backend=_no_compiler), NO_GRADIENTS]
 )
-def test_failed_compilation_is_one_line_and_not_blamed_for_errors_of_the_network(
+def test_failed_compilation_is_reported_in_one_line(
     network: nn.Module,
 ) -> None:
     with (
@@ -337,6 +350,9 @@ def test_failed_compilation_is_one_line_and_not_blamed_for_errors_of_the_network
     ):
         network(torch.rand(1, 3))
     assert "\n" not in str(caught.value)
+
+
+def test_errors_of_the_network_are_not_blamed_on_the_compiler() -> None:
     with (
         pytest.raises(RuntimeError, match="shapes cannot be multiplied"),
         train.explain_compile_errors(),
@@ -371,7 +387,7 @@ def test_state_of_another_kind_is_refused(
     assert "unpickled" not in capsys.readouterr().out
 
 
-def test_processes_share_a_batch_without_repeating_samples_and_have_seeds_of_their_own() -> None:
+def test_processes_share_a_batch_without_repeating_samples() -> None:
     batch = NormalBatch(torch.arange(12).reshape(6, 2), torch.arange(6))
     shares = [share_of(batch, rank, 3) for rank in range(3)]
     assert all(
@@ -383,6 +399,9 @@ def test_processes_share_a_batch_without_repeating_samples_and_have_seeds_of_the
         assert torch.equal(share.normal, batch.normal[share.image])
     assert share_of(batch, 0, 1) is batch
     assert [part.tolist() for part in share_of((batch.image, batch.image), 1, 2)] == [[1, 3, 5]] * 2
+
+
+def test_seeds_differ_by_their_parts_and_count() -> None:
     parts = [(0,), (1,), (0, 1), (1, 0), (0, 0, 1), (0, 0, 2), (0, 1, 0)]
     assert len({seed_of(*part) for part in parts}) == len(parts)
     assert all(0 <= seed_of(*part) < 2**63 for part in parts)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from nlos_calibration import Rig, load_rig
 from nlos_calibration.arrays import Float32
-from nlos_models import MapSet
+from nlos_models.training import MapSet
 from small_frames import SheetNetwork
 
 from nlos_cam import reconstruct

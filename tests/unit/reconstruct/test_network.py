@@ -4,7 +4,7 @@ from unittest.mock import Mock
 
 import numpy as np
 import pytest
-from fake_doubter import FakeDoubter
+from fake_uncertainty import FakeUncertainty
 from nlos_calibration.rig import load_rig
 from nlos_models import Answer
 from nlos_models.quality import QualityEstimate
@@ -14,9 +14,8 @@ from nlos_cam.errors import SceneError
 from nlos_cam.frames import LidarMaps
 from nlos_cam.objects.depth_map import depth_from_image, image_from_depth, object_box
 from nlos_cam.reconstruct.network import (
-    Doubt,
-    Mirrored,
     Reconstruction,
+    Uncertainty,
     reconstruct,
     reconstruct_all,
 )
@@ -38,19 +37,6 @@ def some_maps() -> LidarMaps:
     depth_m = np.full((64, 80), 0.3, np.float32)
     depth_m[0, 0] = np.nan
     return LidarMaps(depth_m, np.full((64, 80), 40.0, np.float32), ~np.isnan(depth_m))
-
-
-def test_mirrored_answers_alike_to_mirrored_maps_and_takes_every_surface() -> None:
-    depth_m = np.full((1, 64, 80), np.nan, np.float32)
-    depth_m[0, 20, 30] = 0.4
-    depth_m[0, 22, 30] = 0.6
-    shifts_down = Mock(
-        side_effect=lambda depth_m, _: np.roll(np.nan_to_num(depth_m[:, :, 8:72]), 1, axis=1)
-    )
-    network = Mirrored(shifts_down)
-    image = network(depth_m, depth_m)
-    np.testing.assert_array_equal(network(depth_m[:, ::-1], depth_m[:, ::-1]), image[:, ::-1])
-    np.testing.assert_allclose(image[0, 18:25, 22], [0, 0.4, 0, 0.5, 0, 0.6, 0], atol=1e-6)
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -78,11 +64,11 @@ def test_reconstruct_all_shares_the_network_time() -> None:
 
 def test_reconstruct_with_doubt_adds_uncertainty_in_metres_and_a_stage() -> None:
     ticks = itertools.count()
-    doubter = FakeDoubter(lambda *_: (0.25, 0.5), error_v=0.1)
+    doubter = FakeUncertainty(lambda *_: (0.25, 0.5), error_v=0.1)
     found = reconstruct(some_maps(), RIG, sheet_network, lambda: float(next(ticks)), doubter)
     assert found.timings_s == {"network": 1.0, "doubt": 1.0}
-    assert (found.doubt.nothing, found.doubt.outside) == (0.25, 0.5)
-    assert found.uncertainty_m is found.doubt.error_m
+    assert (found.uncertainty.nothing, found.uncertainty.outside) == (0.25, 0.5)
+    assert found.uncertainty_m is found.uncertainty.error_m
     apart_m = depth_from_image(HALF[0], BOX) - depth_from_image(HALF[0] + np.float32(0.1), BOX)
     np.testing.assert_allclose(found.uncertainty_m, apart_m, rtol=1e-5)
     assert [part.shape for part in doubter.asked[0]] == [(1, 64, 80), (1, 64, 80), (1, 64, 64)]
@@ -92,15 +78,15 @@ def test_reconstruct_with_doubt_adds_uncertainty_in_metres_and_a_stage() -> None
         np.testing.assert_array_equal(asked[0], given)
     hidden = found.without_surface
     assert found.has_surface
-    assert (hidden.has_surface, hidden.uncertainty_m, hidden.doubt) == (
+    assert (hidden.has_surface, hidden.uncertainty_m, hidden.uncertainty) == (
         False,
         found.uncertainty_m,
-        found.doubt,
+        found.uncertainty,
     )
 
 
 def test_reconstruct_without_returns_still_asks_for_doubt() -> None:
-    doubter = FakeDoubter()
+    doubter = FakeUncertainty()
     blank = np.full((64, 80), np.nan, np.float32)
     maps = LidarMaps(blank, np.zeros((64, 80), np.float32), ~np.isnan(blank))
     found = reconstruct(
@@ -124,13 +110,13 @@ class TellingNetwork:
 
 def test_quality_is_predicted_from_each_frame_s_own_probability_of_a_surface() -> None:
     asked = Mock(return_value=QualityEstimate.of(np.zeros((1, 5), np.float32), None))
-    (doubter := FakeDoubter()).quality = asked
+    (doubter := FakeUncertainty()).quality = asked
     bright = some_maps()
     blank = np.full((64, 80), np.nan, np.float32)
     frames = [replace(bright, depth_m=blank, valid=np.zeros((64, 80), bool)), bright]
     nothing, found = reconstruct_all(frames, RIG, TellingNetwork(), uncertainty_model=doubter)
-    assert nothing.doubt.quality is None
-    assert found.doubt.quality.iou == (0.5, 0.5, 0.5)
+    assert nothing.uncertainty.quality is None
+    assert found.uncertainty.quality.iou == (0.5, 0.5, 0.5)
     np.testing.assert_array_equal(asked.call_args.args[2], sheet_network() * 40)
     reconstruct(bright, RIG, sheet_network, uncertainty_model=doubter)
     assert asked.call_args.args[2] is None
@@ -148,7 +134,7 @@ SURFACE_M = np.full((64, 64), 0.2, np.float32)
 def reconstruction(
     nothing: float = 0.0, outside: float = 0.0, depth_m: np.ndarray = SURFACE_M
 ) -> Reconstruction:
-    doubt = Doubt(
+    doubt = Uncertainty(
         nothing, outside, np.full((64, 64), 0.01, np.float32), np.ones((64, 64), np.float32)
     )
     return Reconstruction(depth_m, np.eye(4), doubt.error_m, {}, doubt)
@@ -205,7 +191,7 @@ def test_verdict_hides_the_surface_only_if_nothing_is_there(signs: FrameConditio
 
 @pytest.mark.parametrize("judge", [VerdictFilter(None), VerdictFilter(LIMITS)])
 def test_verdict_without_doubt_considers_the_lidar_only(judge: VerdictFilter) -> None:
-    plain = replace(reconstruction(), doubt=None, uncertainty_m=None)
+    plain = replace(reconstruction(), uncertainty=None, uncertainty_m=None)
     assert judge.decide(plain, FrameConditions()) == (plain, None)
     assert judge.decide(plain, FrameConditions(saturated=True))[1] == Verdict.SATURATED
     assert judge.decide(plain, FrameConditions(moved=True, saturated=True))[1] == Verdict.WALL_MOVED

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from fake_doubter import FakeDoubter
+from fake_uncertainty import FakeUncertainty
 from fake_wall import (
     RIG,
     SERIAL,
@@ -144,7 +144,7 @@ def test_batched_results_equal_results_in_turn(tmp_path: Path, count: int) -> No
         checks = PeriodicPhysicsCheck(RIG, every=5, accuracy="draft")
         bench = CalibratedRig(RIG, measured_wall(tmp_path))
         pipeline = Pipeline(
-            bench, looking, average=3, uncertainty_model=FakeDoubter(), checks=checks
+            bench, looking, average=3, uncertainty_model=FakeUncertainty(), checks=checks
         )
         done.append(all_steps(pipeline, WallCamera(count, moved=range(count // 2)), ahead=ahead))
     assert [step.frame.frame_number for step in done[1]] == list(range(count))
@@ -180,7 +180,7 @@ def test_result_shows_what_its_verdict_says(
     walled: CalibratedRig, nothing: float, verdict: Verdict
 ) -> None:
     noting = SheetNetwork()
-    doubter = FakeDoubter(lambda *_: (nothing, 0.0))
+    doubter = FakeUncertainty(lambda *_: (nothing, 0.0))
     pipeline = Pipeline(walled, noting, uses_difference=True, average=3, uncertainty_model=doubter)
     done = all_steps(pipeline, WallCamera(100, moved=range(50, 100)))
     for step, asked, given in zip(done[:50], doubter.asked, noting.given, strict=False):

@@ -138,7 +138,7 @@ def test_sidecar_stays_whole_on_a_full_disk(path: Path, monkeypatch: pytest.Monk
     def full(_: int) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("nlos_cam.files.os.fsync", full)
+    monkeypatch.setattr("nlos_cam.files.atomic.os.fsync", full)
     sidecar.on_frame(frame(0.0))  # goes on: the end of the recording raises
     with pytest.raises(DiskFullError, match=r"a\.json.*No space left on device"):
         sidecar.finish("complete", summary_of(READ, SEEN, {}))

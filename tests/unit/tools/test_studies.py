@@ -11,9 +11,10 @@ from typing import Any
 
 import numpy as np
 import pytest
-from fake_doubter import FakeDoubter
+from fake_uncertainty import FakeUncertainty
 from nlos_calibration import load_rig
-from nlos_models import MapSet, checkpoint
+from nlos_models import checkpoint
+from nlos_models.training import MapSet
 from small_frames import sheet_network
 from small_maps import untrained_weights, use_small_networks
 
@@ -167,24 +168,24 @@ def test_transfer_figures_of_exact_images_are_perfect(tool: Tool) -> None:
     assert near["foreground_too_far_mm"]["value"] == pytest.approx(-0.1 * 280 / 0.9, rel=1e-3)
 
 
-def test_doubt_study_is_right_for_laplace_errors(tool: Tool, harness: ModuleType) -> None:
-    doubt = tool("doubt")
+def test_uncertainty_study_is_right_for_laplace_errors(tool: Tool, harness: ModuleType) -> None:
+    study = tool("uncertainty")
     generator = np.random.default_rng(0)
     expected = generator.uniform(0.005, 0.05, 100_000)
     observed = np.abs(generator.laplace(0.0, expected))
-    rows = doubt.reliability(expected, observed)
-    covered = doubt.coverage(expected, observed)
+    rows = study.reliability(expected, observed)
+    covered = study.coverage(expected, observed)
     assert all(row["observed_mm"] == pytest.approx(row["expected_mm"], rel=0.05) for row in rows)
     assert all(row["observed"] == pytest.approx(row["level"], abs=0.01) for row in covered)
-    pipeline = doubt.Pipeline(RIG, sheet_network, FakeDoubter(error_v=0.2))
+    pipeline = study.Pipeline(RIG, sheet_network, FakeUncertainty(error_v=0.2))
     answer = pipeline.answer(np.full((64, 80), 0.3, np.float32), np.ones((64, 80), np.float32))
-    assert doubt.of_outliers([answer, answer], np.array([100, 0]))["cannot_be_seen"] == 1
+    assert study.of_outliers([answer, answer], np.array([100, 0]))["cannot_be_seen"] == 1
     parts = {
         "reliability": rows,
         "coverage": covered,
         "surface": [{"expected": 0.5, "observed": 0.6}],
     }
-    harness.save("reliability", doubt.draw({"test_objects": parts, "held_out_objects": parts}))
+    harness.save("reliability", study.draw({"test_objects": parts, "held_out_objects": parts}))
 
 
 def test_color_study_judges_weights_and_vae(tool: Tool, tmp_path: Path, monkeypatch: Patch) -> None:

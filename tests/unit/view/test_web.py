@@ -19,7 +19,7 @@ from view_streams import ask, messages, messages_of, saved_moments
 
 from nlos_cam.errors import RecordingError
 from nlos_cam.objects import object_box
-from nlos_cam.reconstruct.network import Doubt, Quality
+from nlos_cam.reconstruct.network import Quality, Uncertainty
 from nlos_cam.reconstruct.verdict import Verdict
 from nlos_cam.view import PlaybackViewer, RecordedView, WebViewer
 from nlos_cam.view.assessment import RGB, assess, expected_error_m, expected_overlap
@@ -301,14 +301,15 @@ def test_bench_message_names_every_part(measured: object) -> None:
     assert {"map_depth", "map_error", "map_lidar"} <= set(arrays)
 
 
-def with_doubt(
+def with_uncertainty(
     surface: np.ndarray, error_m: float = 0.017, quality: Quality | None = None
 ) -> object:
     shown = full_moment(0)
     spread_m = np.full((64, 64), error_m, np.float32)
-    doubt = Doubt(0.0, 0.0, spread_m, surface.astype(np.float32), quality)
+    doubt = Uncertainty(0.0, 0.0, spread_m, surface.astype(np.float32), quality)
     return replace(
-        shown, reconstruction=replace(shown.reconstruction, doubt=doubt, uncertainty_m=spread_m)
+        shown,
+        reconstruction=replace(shown.reconstruction, uncertainty=doubt, uncertainty_m=spread_m),
     )
 
 
@@ -316,14 +317,14 @@ def test_expected_overlap_is_exact_for_certain_pixels_and_needs_a_surface() -> N
     mask = np.isfinite(bump(0))
     half = mask & (np.arange(64) < np.argwhere(mask)[:, 1].mean())
     for surface, overlap in ((mask, 1.0), (half, half.sum() / mask.sum()), (~mask, 0.0)):
-        assert expected_overlap(with_doubt(surface).reconstruction) == pytest.approx(overlap)  # type: ignore[attr-defined]
+        assert expected_overlap(with_uncertainty(surface).reconstruction) == pytest.approx(overlap)  # type: ignore[attr-defined]
     assert expected_overlap(full_moment(0).reconstruction) is None
     assert expected_overlap(moment(0, NOTHING).reconstruction) is None
     assert expected_error_m(moment(0).reconstruction) is None
 
 
 def test_detected_object_is_graded_by_the_models_numbers() -> None:
-    told = assess(with_doubt(0.71 * np.isfinite(bump(0))))  # type: ignore[arg-type]
+    told = assess(with_uncertainty(0.71 * np.isfinite(bump(0))))  # type: ignore[arg-type]
     assert "71%" in told.detail
     assert "17 mm" in told.detail
     assert told.trusted
@@ -335,7 +336,7 @@ def test_only_a_trusted_quality_of_a_detected_object_is_green(
     trusted: bool, verdict: Verdict
 ) -> None:
     predicted = Quality((0.58, 0.71, 0.82), 0.6, 0.017, trusted=trusted)
-    shown = replace(with_doubt(np.ones((64, 64)), quality=predicted), verdict=verdict)  # type: ignore[type-var]
+    shown = replace(with_uncertainty(np.ones((64, 64)), quality=predicted), verdict=verdict)  # type: ignore[type-var]
     told = assess(shown)  # type: ignore[arg-type]
     assert (told.tone == "good") == (trusted and verdict is Verdict.SEEN)
     if verdict is Verdict.SEEN:

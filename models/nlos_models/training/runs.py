@@ -6,35 +6,56 @@ from collections.abc import Callable, Generator
 from contextlib import AbstractContextManager, ExitStack, contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any, Generic, TypeVar
 
 import torch
 from lightning_fabric import Fabric
 
-from nlos_models import checkpoint
+from nlos_cam.files import OutputExistsError, claim
 from nlos_models.arrays import Float16
-from nlos_models.data import MapSet, MapSource
+from nlos_models.checkpoint import load_network, load_pipeline
 from nlos_models.direct import DirectNetwork
-from nlos_models.direct_training import NormalSource, train_direct, transfer_direct
-from nlos_models.doubt_network import save_doubt
-from nlos_models.doubt_training import DoubtSet, calibrate, train_doubt
-from nlos_models.errors import OutputExistsError, TrainingError
+from nlos_models.errors import TrainingError
 from nlos_models.export import export_folder
-from nlos_models.files import claim
 from nlos_models.pipeline import RemappingNetwork, new_vae
-from nlos_models.recipe import SIMULATION_ONLY, Recipe
+from nlos_models.quality import UNCERTAINTY_FILES, QualityRecord
 from nlos_models.records import (
     DIRECT,
-    DOUBT_RECORD,
     PAPER,
     RECORD,
+    SIMULATION_ONLY,
+    UNCERTAINTY_RECORD,
     CheckpointRecord,
-    DoubtRecord,
+    UncertaintyRecord,
     checksum_of_watched,
     load_record,
     weights_folder,
 )
-from nlos_models.tasks import Start, figures_of, run, train_compressor, train_transfer, train_vae
-from nlos_models.train import Running, Scores
+from nlos_models.training import checkpoints
+from nlos_models.training.data import MapSet, MapSource
+from nlos_models.training.direct import NormalSource, train_direct, transfer_direct
+from nlos_models.training.loop import Running, Scores
+from nlos_models.training.quality import QualitySet, fit_quality, write_quality
+from nlos_models.training.recipe import (
+    CompressorRecipe,
+    DirectRecipe,
+    MapRecipe,
+    Recipe,
+    TransferRecipe,
+    UncertaintyRecipe,
+    VaeRecipe,
+    maps_of,
+)
+from nlos_models.training.tasks import (
+    Start,
+    figures_of,
+    run,
+    train_compressor,
+    train_transfer,
+    train_vae,
+)
+from nlos_models.training.uncertainty import UncertaintySet, calibrate, train_uncertainty
+from nlos_models.uncertainty_network import save_uncertainty_network
 from nlos_models.vae import Encoder, ResVae
 
 
@@ -51,11 +72,14 @@ picklable.
 """
 
 
+R = TypeVar("R", bound=Recipe)
+
+
 @dataclass(frozen=True)
-class TrainingRun:
+class TrainingRun(Generic[R]):
     """Parameters of a run besides its data and its starting weights."""
 
-    recipe: Recipe
+    recipe: R
     out: Path
     record: CheckpointRecord
     """Record of the weights that the run makes, without figures."""
@@ -74,6 +98,7 @@ class TrainingRun:
             fabric, tensorboard=self.tensorboard, compiled=self.compiled, origin=self.origin
         )
         with ExitStack() as held:
+            # One process writes; a second run in the same folder is refused while it lives.
             if fabric.is_global_zero:
                 self.out.mkdir(parents=True, exist_ok=True)
                 held.enter_context(claim(self.out, inside=True))
@@ -93,7 +118,8 @@ def record_run(
     Raises OutputExistsError where the run would write over a file, over a folder that it starts
     from, or over other weights.
     """
-    record = CheckpointRecord.of([*before, recipe], rig, recipe.maps)
+    # Before an hour of training, not after it: the same checks as at the end.
+    record = CheckpointRecord.of([*before, recipe], rig, maps_of(recipe))
     if out.exists() and not out.is_dir():
         raise OutputExistsError(
             f"{out} is a file, but --out must be a directory: choose another --out"
@@ -107,30 +133,40 @@ def record_run(
     return record
 
 
-def record_doubt_run(recipe: Recipe, out: Path, watched: Path, kinds: list[str]) -> DoubtRecord:
+def record_uncertainty_run(
+    recipe: UncertaintyRecipe, out: Path, watched: Path, kinds: list[str]
+) -> UncertaintyRecord:
     """Return the record of an uncertainty network that watches the weights in a folder and learns
     kinds of outliers.
 
     Raises OutputExistsError where `out` is that folder or holds an uncertainty network.
     """
-    if out.resolve() == watched.resolve() or (out / DOUBT_RECORD).exists():
+    if out.resolve() == watched.resolve() or (out / UNCERTAINTY_RECORD).exists():
         raise OutputExistsError(f"{out} holds weights already: choose another --out")
-    return DoubtRecord(watches=checksum_of_watched(watched), recipe=recipe, learnt=kinds)
+    return UncertaintyRecord(watches=checksum_of_watched(watched), recipe=recipe, learnt=kinds)
 
 
 def run_vae(
-    fabric: Fabric, training: TrainingRun, start: ResVae | None, images: Float16, held_out: Float16
+    fabric: Fabric,
+    training: TrainingRun[VaeRecipe],
+    start: ResVae | None,
+    images: Float16,
+    held_out: Float16,
 ) -> Scores:
     """Train a VAE and save it; return its held-out figures."""
     with training.watched(fabric, "VAE") as running:
         vae, figures = train_vae(training.recipe, images, held_out, training.out, running, start)
     if fabric.is_global_zero:
-        checkpoint.save_vae(training.out, vae, training.with_figures(figures))
+        checkpoints.save_vae(training.out, vae, training.with_figures(figures))
     return figures
 
 
 def run_compressor(
-    fabric: Fabric, training: TrainingRun, start: Start, maps: MapSource, held_out: MapSet
+    fabric: Fabric,
+    training: TrainingRun[CompressorRecipe],
+    start: Start,
+    maps: MapSource,
+    held_out: MapSet,
 ) -> Scores:
     """Train a compressor and save it with its decoder; return its held-out figures."""
     recipe = training.recipe
@@ -138,14 +174,14 @@ def run_compressor(
         pipeline, figures = train_compressor(recipe, start, maps, held_out, training.out, running)
     if fabric.is_global_zero:
         encoder = start.vae.encoder if start.vae and recipe.steps != "one" else None
-        checkpoint.save_pipeline(training.out, pipeline, training.with_figures(figures), encoder)
+        checkpoints.save_pipeline(training.out, pipeline, training.with_figures(figures), encoder)
         _export(training)
     return figures
 
 
 def run_direct(
     fabric: Fabric,
-    training: TrainingRun,
+    training: TrainingRun[DirectRecipe],
     start: DirectNetwork | None,
     source: NormalSource,
     held_out: MapSet,
@@ -155,14 +191,14 @@ def run_direct(
         network, figures = train_direct(
             training.recipe, source, held_out, training.out, running, start
         )
-    checkpoint.save_direct(training.out, network, training.with_figures(figures))
+    checkpoints.save_direct(training.out, network, training.with_figures(figures))
     _export(training)
     return figures
 
 
 def run_transfer(
     fabric: Fabric,
-    training: TrainingRun,
+    training: TrainingRun[TransferRecipe],
     network: RemappingNetwork | DirectNetwork,
     encoder: Encoder | None,
     maps: MapSource,
@@ -171,6 +207,7 @@ def run_transfer(
     """Fine-tune weights on recordings and save them; return their held-out figures before and
     after.
     """
+    # The same held-out maps before and after, so that their difference is the transfer's.
     before = figures_of(run(network.to(fabric.device).eval(), held_out), held_out.image)
     with training.watched(fabric, "transfer") as running:
         if isinstance(network, DirectNetwork):
@@ -183,35 +220,47 @@ def run_transfer(
             )
     if fabric.is_global_zero:
         if isinstance(network, DirectNetwork):
-            checkpoint.save_direct(training.out, network, training.with_figures(after))
+            checkpoints.save_direct(training.out, network, training.with_figures(after))
         else:
-            checkpoint.save_pipeline(training.out, network, training.with_figures(after), encoder)
+            checkpoints.save_pipeline(training.out, network, training.with_figures(after), encoder)
         _export(training)
     return {"before": before, "after": after}
 
 
-def run_doubt(
+def run_uncertainty(
     fabric: Fabric,
-    training: TrainingRun,
-    about: DoubtRecord,
+    training: TrainingRun[UncertaintyRecipe],
+    about: UncertaintyRecord,
     watched: Path,
-    samples: DoubtSet,
-    held_out: DoubtSet,
+    samples: UncertaintySet,
+    held_out: UncertaintySet,
 ) -> Scores:
     """Train, calibrate and save an uncertainty network beside the weights it watches; return its
     held-out figures.
     """
     with training.watched(fabric, "uncertainty network") as running:
-        network, figures = train_doubt(training.recipe, samples, held_out, training.out, running)
+        network, figures = train_uncertainty(
+            training.recipe, samples, held_out, training.out, running
+        )
+    # On held-out maps: a network is surer of those that it was trained on.
     fitted = calibrate(network, held_out)
     if fabric.is_global_zero:
         record = about.model_copy(update={**asdict(fitted), "figures": figures})
-        save_doubt(training.out, network, record, watched)
+        save_uncertainty_network(training.out, network, record, watched)
         _export(training)
     return {**figures, "error_scale": fitted.error_scale, "outside_above": fitted.outside_above}
 
 
-def _export(training: TrainingRun) -> None:
+def run_quality(weights: Path, samples: QualitySet) -> QualityRecord:
+    """Fit the quality model of the uncertainty network in a folder, and write it beside that
+    network.
+    """
+    record = fit_quality(samples, checksum_of_watched(weights, UNCERTAINTY_FILES))
+    write_quality(weights, record)
+    return record
+
+
+def _export(training: TrainingRun[Any]) -> None:
     """Write the graphs for inference without torch beside new weights; those of color stay in
     torch.
     """
@@ -219,22 +268,26 @@ def _export(training: TrainingRun) -> None:
         export_folder(training.out)
 
 
-def vae_start(recipe: Recipe, weights: Path | None) -> tuple[ResVae, list[Recipe]]:
+def vae_start(
+    recipe: VaeRecipe | CompressorRecipe, weights: Path | None
+) -> tuple[ResVae, list[Recipe]]:
     """Load the VAE that a recipe starts from (default: the paper's) and the runs that made it."""
     _check_same_color(recipe, weights)
     folder = weights_folder(weights, PAPER)
     if recipe.start == "decoder":
         torch.manual_seed(recipe.seed)
+        # Target latents from the encoder, decoder from the pipeline, which has trained on.
         vae = new_vae(color=recipe.colour)
-        pipeline, record = checkpoint.load_pipeline(folder)
+        pipeline, record = load_pipeline(folder)
+        # A new encoder for a decoder that is given: the shipped weights come without theirs.
         vae.decoder = pipeline.decoder
     else:
-        vae, record = checkpoint.load_vae(folder)
+        vae, record = checkpoints.load_vae(folder)
     return vae, record.vae_runs
 
 
 def compressor_start(
-    recipe: Recipe, vae_folder: Path | None, weights: Path | None
+    recipe: CompressorRecipe, vae_folder: Path | None, weights: Path | None
 ) -> tuple[Start, list[Recipe]]:
     """Load the networks that the recipe's steps start from and the runs that made them; none for
     steps = "one".
@@ -248,7 +301,7 @@ def compressor_start(
         pipeline, runs = _pipeline_start(recipe, weights)
         return Start(vae, pipeline), [*(run for run in runs if run not in vae_runs), *vae_runs]
     pipeline, runs = _pipeline_start(recipe, weights)
-    if not (encoder := checkpoint.load_encoder(weights)):
+    if not (encoder := checkpoints.load_encoder(weights)):
         if recipe.latent_weight:
             raise TrainingError(
                 f"{weights_folder(weights, PAPER)} has no encoder to aim at: set latent_weight = 0"
@@ -261,7 +314,9 @@ def compressor_start(
     return Start(vae, pipeline), runs
 
 
-def direct_start(recipe: Recipe, weights: Path | None) -> tuple[DirectNetwork | None, list[Recipe]]:
+def direct_start(
+    recipe: DirectRecipe, weights: Path | None
+) -> tuple[DirectNetwork | None, list[Recipe]]:
     """Load the direct network that a recipe goes on from (default: the shipped one) and the runs
     that made it.
 
@@ -270,12 +325,13 @@ def direct_start(recipe: Recipe, weights: Path | None) -> tuple[DirectNetwork | 
     if recipe.start == "scratch":
         return None, []
     folder = weights_folder(weights)
-    network, record = checkpoint.load_network(folder)
+    network, record = load_network(folder)
     if not isinstance(network, DirectNetwork):
         raise TrainingError(f"{folder} does not hold a direct network: choose other --weights")
     _check_same_color(recipe, folder)
     size = network.size
     wanted = recipe.direct
+    # Widths must agree, depths may grow: new blocks start as identities.
     grown = size.model_copy(update={"blocks": wanted.blocks, "mixers": wanted.mixers})
     if grown != wanted or wanted.blocks < size.blocks or wanted.mixers < size.mixers:
         raise TrainingError(
@@ -285,7 +341,7 @@ def direct_start(recipe: Recipe, weights: Path | None) -> tuple[DirectNetwork | 
 
 
 def transfer_start(
-    recipe: Recipe, weights: Path | None, *, partial: bool, on_report: Callable[[str], None]
+    recipe: TransferRecipe, weights: Path | None, *, partial: bool, on_report: Callable[[str], None]
 ) -> tuple[RemappingNetwork | DirectNetwork, CheckpointRecord]:
     """Load the networks that a transfer starts from and their record.
 
@@ -296,20 +352,22 @@ def transfer_start(
     folder = weights_folder(weights, PAPER if recipe.latent_weight else DIRECT)
     _check_fits(recipe, folder)
     if not partial:
-        return checkpoint.load_network(folder)
+        return load_network(folder)
     torch.manual_seed(recipe.seed)
-    pipeline, record, report = checkpoint.load_pipeline_partly(folder)
+    pipeline, record, report = checkpoints.load_pipeline_partly(folder)
     on_report(f"compressor: {report}")
     return pipeline, record
 
 
-def _pipeline_start(recipe: Recipe, weights: Path | None) -> tuple[RemappingNetwork, list[Recipe]]:
+def _pipeline_start(
+    recipe: CompressorRecipe, weights: Path | None
+) -> tuple[RemappingNetwork, list[Recipe]]:
     _check_fits(recipe, weights)
-    pipeline, record = checkpoint.load_pipeline(weights)
+    pipeline, record = load_pipeline(weights)
     return pipeline, record.runs
 
 
-def _check_fits(recipe: Recipe, folder: Path | None) -> None:
+def _check_fits(recipe: MapRecipe, folder: Path | None) -> None:
     """Raise TrainingError unless weights and recipe agree in color, maps, latent and the
     compressor's width.
     """
@@ -317,9 +375,9 @@ def _check_fits(recipe: Recipe, folder: Path | None) -> None:
     wrong = ""
     if record.input != recipe.maps:
         wrong = f"weights expect {record.input} but the recipe uses {recipe.maps}"
-    elif recipe.task == "transfer" and recipe.latent_weight and record.direct_recipe:
+    elif isinstance(recipe, TransferRecipe) and recipe.latent_weight and record.direct_recipe:
         wrong = "weights are a direct network, without the latent that the recipe aims at"
-    elif recipe.task == "compressor" and record.width != recipe.width:
+    elif isinstance(recipe, CompressorRecipe) and record.width != recipe.width:
         wrong = f"weights have width {record.width:g} but the recipe asks for {recipe.width:g}"
     if wrong:
         raise TrainingError(f"{wrong}: choose a matching pair of --weights and --recipe")

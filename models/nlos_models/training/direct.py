@@ -10,11 +10,12 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from nlos_models.data import STATISTICS_OBJECTS, MapBatch, MapNoise, MapSet, MapSource
-from nlos_models.direct import COLUMNS, ROWS, CellNormal, DirectNetwork, two_heads_error
-from nlos_models.recipe import Recipe
-from nlos_models.tasks import figures_of, in_two_phases, run
-from nlos_models.train import Running, Scores, fit
+from nlos_models.direct import CLIP, COLUMNS, ROWS, CellNormal, DirectNetwork
+from nlos_models.training.data import STATISTICS_OBJECTS, MapBatch, MapNoise, MapSet, MapSource
+from nlos_models.training.loop import Running, Scores, fit
+from nlos_models.training.losses import two_heads_error
+from nlos_models.training.recipe import DirectRecipe, TransferRecipe
+from nlos_models.training.tasks import figures_of, in_two_phases, run
 
 STAINS = 9, 11
 """Knots of a wall's stains along each axis of the maps."""
@@ -44,7 +45,7 @@ class NormalSource(Protocol):
 
 
 def train_direct(
-    recipe: Recipe,
+    recipe: DirectRecipe,
     source: NormalSource,
     held_out: MapSet,
     folder: Path,
@@ -57,10 +58,13 @@ def train_direct(
     change nothing at first. Returns the network in eval mode, with the recipe's blend of both, and
     its held-out figures.
     """
+    # Initial weights follow from the recipe's seed; `fit` seeds each step by itself.
     torch.manual_seed(recipe.seed)
     network = DirectNetwork(recipe.direct, recipe.dropout, color=recipe.colour)
     network.normal.load_state_dict(source.normal.state_dict())
     if start:
+        # Not strict: blocks and mixers that only this recipe has stay as they are initialised,
+        # that is, as identities.
         network.load_state_dict(start.state_dict(), strict=False)
     steps = recipe.objects // recipe.batch
 
@@ -68,9 +72,11 @@ def train_direct(
         return repeat(source, recipe.batch, steps, generator)
 
     running = running or Running()
+    # The normalisation is outside: it is exact in float32, and `source` has done it.
     logits = running.maybe_compile(network.logits)
 
     def loss(batch: NormalBatch, _: float) -> Tensor:
+        # Maps are rendered once, without noise; each step draws its own, so that none is learnt.
         normal = _varied(recipe, network.normal, batch.normal.float(), source.noise)
         return two_heads_error(
             logits(normal + recipe.noise * torch.randn_like(normal)), batch.image
@@ -86,6 +92,7 @@ def train_direct(
         folder=folder,
         running=running,
     )
+    # After the last step, so that the run itself is the same at any blend.
     if start and recipe.blend < 1:
         blend(network, start, recipe.blend)
         figures = figures_of(run(network.eval(), held_out), held_out.image)
@@ -96,6 +103,8 @@ def blend(network: DirectNetwork, start: DirectNetwork, share: float) -> None:
     """Replace a network's parameters by means with another's, of which its own have a share; new
     layers stay.
     """
+    # Weights on both ends of a fine-tuning lie in one basin of the loss, so that their mean is good
+    # on the old maps and on the new ones.
     theirs = dict(start.named_parameters())
     with torch.no_grad():
         for name, own in network.named_parameters():
@@ -104,7 +113,7 @@ def blend(network: DirectNetwork, start: DirectNetwork, share: float) -> None:
 
 
 def transfer_direct(
-    recipe: Recipe,
+    recipe: TransferRecipe,
     network: DirectNetwork,
     maps: MapSource,
     held_out: MapSet,
@@ -118,9 +127,12 @@ def transfer_direct(
     """
     torch.manual_seed(recipe.seed)
     for block in network.trunk:
+        # A checkpoint does not hold its dropout, which is a setting of the training.
         block.dropout.p = recipe.dropout  # type: ignore[union-attr]  (a Residual)
     if recipe.statistics != "kept":
         seen = maps.first(STATISTICS_OBJECTS)
+        # Depth is in metres on every bench, intensity in the counts of a device: the latter may
+        # be taken alone.
         channels = slice(1, None) if recipe.statistics == "own intensity" else slice(None)
         network.normal.shift(
             torch.from_numpy(seen.depth_m), torch.from_numpy(seen.intensity), channels
@@ -133,8 +145,10 @@ def transfer_direct(
         )
 
     def fit_phase(
-        phase: Recipe, phase_folder: Path, running: Running, *, last_layers: bool
+        phase: TransferRecipe, phase_folder: Path, running: Running, *, last_layers: bool
     ) -> Scores:
+        # The heads and the norm before them are 1 % of the weights: what few recordings can
+        # teach.
         network.requires_grad_(not last_layers)
         for layer in network.last_layers:
             layer.requires_grad_(requires_grad=True)
@@ -153,25 +167,62 @@ def transfer_direct(
     return network.cpu().eval(), figures
 
 
-def _varied(recipe: Recipe, cells: CellNormal, normal: Tensor, noise: MapNoise | None) -> Tensor:
+def _varied(
+    recipe: DirectRecipe, cells: CellNormal, normal: Tensor, noise: MapNoise | None
+) -> Tensor:
     """Return normalised maps (n, 2, 64, 80) with noise, and on walls and with range offsets as the
     recipe has them.
     """
     reflectance = offset_m = None
     if recipe.wall_texture:
+        # Every strength from none to the recipe's: a network must be right on a clean wall too.
         strength = recipe.wall_texture * torch.rand(len(normal), 1, 1, device=normal.device)
         reflectance = strength * _stains(len(normal), normal.device)
     if recipe.range_offset_m:
         offset_m = recipe.range_offset_m * torch.randn(len(normal), device=normal.device)
+    # Nothing to vary: the round trip through counts would only round.
     if noise is None and reflectance is None and offset_m is None:
         return normal
-    return cells.vary(normal, noise, reflectance, offset_m)
+    return vary(cells, normal, noise, reflectance, offset_m)
+
+
+def vary(
+    cells: CellNormal,
+    normal: Tensor,
+    noise: MapNoise | None,
+    log_reflectance: Tensor | None,
+    offset_m: Tensor | None,
+) -> Tensor:
+    """Return the maps (n, 2, 64, 80), normalised as `cells` does, as another bench or moment would
+    give them.
+
+    Noise is the sensor's, drawn for the intensity of expected maps; the logarithm of the wall's
+    reflectance (n, 64, 80) adds to that of the light, and a range offset (n,) to all depths.
+    """
+    depth = normal[:, :1]  # (n, 1, 64, 80)
+    light = normal[:, 1:]  # (n, 1 or 3, 64, 80)
+    returns = (normal != 0).any(dim=1, keepdim=True)
+
+    # Noise and reflectance act on counts, so that the normalisation (a logarithm) is undone.
+    median = cells.median[1:]
+    spread = cells.spread[1:]
+    counts = torch.expm1(light * spread + median)
+    if log_reflectance is not None:
+        counts = counts * log_reflectance.exp()[:, None]
+    if noise is not None:
+        counts = noise.add(counts)
+    if offset_m is not None:
+        depth = depth + offset_m[:, None, None, None] / cells.spread[:1]
+
+    varied = torch.cat([depth, (torch.log1p(counts) - median) / spread], dim=1)
+    return torch.where(returns, varied.clamp(-CLIP, CLIP), normal)
 
 
 def _stains(count: int, device: torch.device) -> Tensor:
     """Return patterns (count, 64, 80) of mean 0 and variance 1: half stains of some cells, half
     grain.
     """
+    # The sum of two independent patterns of variance 1 has variance 2.
     coarse = torch.randn(count, 1, *STAINS, device=device)
     stains = functional.interpolate(coarse, (ROWS, COLUMNS), mode="bilinear", align_corners=True)[
         :, 0

@@ -37,6 +37,8 @@ def shuffled(count: int, batch: int, generator: torch.Generator) -> Iterator[Ten
     """Yield the index batches of one epoch, without the last, smaller one: a batch norm needs
     several samples.
     """
+    # A new order each epoch, by the caller's generator, and without a remainder: of a batch of
+    # one, a batch norm has no variance.
     order = torch.randperm(count, generator=generator)
     for start in range(0, count - min(batch, count) + 1, batch):
         yield order[start : start + batch]
@@ -48,6 +50,8 @@ def flip_some(tensors: list[Tensor], flips: Tensor) -> list[Tensor]:
     The rig is symmetric about y = 0: the maps of a mirrored object are the object's maps, mirrored.
     So these are samples that could have been rendered.
     """
+    # Flags broadcast over (n, 1, 1, ...); both orientations are computed and one is taken, which
+    # is faster than indexing single samples.
     chosen = flips.bool()
     return [torch.where(chosen.view(-1, *[1] * (t.ndim - 1)), t.flip(-2), t) for t in tensors]
 
@@ -81,6 +85,9 @@ class MapNoise:
 
     def deviation(self, counts: Tensor) -> Tensor:
         """Return the standard deviation of intensities, in counts."""
+        # Read noise is the same at any light, shot noise (Poisson) grows with it; rounding to
+        # whole counts is uniform within a count, with variance 1 / 12. The mean over k pixels has
+        # 1 / k of their sum.
         light = self.shot_variance * (counts + self.ambient_counts)
         return ((self.read_variance + light + ROUNDING_VARIANCE) / self.pixels).sqrt()
 
@@ -89,6 +96,7 @@ class MapNoise:
         deviates = torch.randn(
             counts.shape, generator=generator, device=counts.device, dtype=counts.dtype
         )
+        # Normal, since a cell's mean over tens of pixels is nearly so; a count is not negative.
         return (counts + self.deviation(counts) * deviates).clamp(min=0)
 
     def draw(self, depth_m: Tensor, intensity: Tensor, generator: torch.Generator) -> Tensor:
@@ -96,6 +104,7 @@ class MapNoise:
         its own.
         """
         drawn = self.add(intensity, generator)
+        # In color three intensities share one depth: (n, 64, 80) against (n, 3, 64, 80).
         nowhere = depth_m.isnan()
         return torch.where(nowhere[:, None] if drawn.dim() == 4 else nowhere, intensity, drawn)
 
@@ -199,6 +208,8 @@ class WithNoise:
 
     def batches(self, batch: int, generator: torch.Generator) -> Iterator[MapBatch]:
         """Yield one epoch; a cell without a return keeps its intensity."""
+        # Expected maps are rendered once; another draw of the sensor's noise in every epoch costs
+        # nothing and cannot be learnt by heart.
         for plain in self.source.batches(batch, generator):
             yield plain._replace(
                 intensity=self.noise.draw(plain.depth_m, plain.intensity, generator)
@@ -219,6 +230,7 @@ def subtract_bare_wall(maps: MapSet, depth_m: Float32, intensity: Float32) -> Ma
     """Return difference maps: maps minus the bare wall's (64, 80); a cell has a return where both
     have one.
     """
+    # NaN in either is NaN in the difference: no return, no difference.
     difference_m = maps.depth_m - depth_m
     valid = ~np.isnan(difference_m)
     return replace(

@@ -11,6 +11,7 @@ sums.
 import csv
 import hashlib
 import io
+import json
 import math
 import os
 import time
@@ -25,10 +26,18 @@ import torch
 from lightning_fabric import Fabric
 from torch import Tensor, nn
 
-from nlos_models.distributed import Loss, LossStep, open_fabric, precision_on, seed_of, share_of
+from nlos_cam.files import TENSOR_LIMIT, atomic_file, read_bounded
 from nlos_models.errors import CheckpointError, ModelError, RecipeError, TrainingError
-from nlos_models.files import TENSOR_LIMIT, atomic_file, read_bounded
-from nlos_models.recipe import Recipe, has_ended, schedule_of
+from nlos_models.training.distributed import (
+    Loss,
+    LossStep,
+    open_fabric,
+    precision_on,
+    seed_of,
+    share_of,
+)
+from nlos_models.training.recipe import Recipe, recipe_of
+from nlos_models.training.schedule import has_ended, schedule_of
 
 LAST = "last.ckpt"
 PREVIOUS = "previous.ckpt"
@@ -82,6 +91,8 @@ def read_last(folder: Path, on_message: OnMessage) -> State | None:
 
     Raises CheckpointError where there are states and all of them are damaged.
     """
+    # The last state is replaced by a rename, and the one before it is kept: whatever a power cut
+    # leaves, one of both is whole.
     damaged: list[Path] = []
     for path in (folder / LAST, folder / PREVIOUS):
         if path.exists():
@@ -115,6 +126,7 @@ def digest_of(*parts: nn.Module | str | None) -> str:
     """
     digest = hashlib.sha256()
     for part in parts:
+        # A text is a name without values.
         tensors = part.state_dict() if isinstance(part, nn.Module) else {str(part): torch.zeros(0)}
         for name, tensor in tensors.items():
             digest.update(name.encode() + tensor.cpu().contiguous().numpy().tobytes())
@@ -122,6 +134,7 @@ def digest_of(*parts: nn.Module | str | None) -> str:
 
 
 def _pack(state: State) -> bytes:
+    # In memory first: the digest has to stand before the content.
     buffer = io.BytesIO()
     torch.save(state, buffer)
     content = buffer.getbuffer()
@@ -134,6 +147,7 @@ def _unpack(path: Path) -> State | None:
         raw = read_bounded(path, TENSOR_LIMIT)
         if len(raw) < DIGEST or hashlib.sha256(memoryview(raw)[DIGEST:]).digest() != raw[:DIGEST]:
             return None
+        # `weights_only`: a pickle from outside could run any program.
         state = torch.load(io.BytesIO(raw[DIGEST:]), map_location="cpu", weights_only=True)
     except Exception:  # noqa: BLE001  the unpickler raises almost anything for crafted bytes
         return None
@@ -193,6 +207,7 @@ def compile_network(network: Network) -> Network:
 
     Random numbers are drawn as without compilation, so that a run may be resumed either way.
     """
+    # Draws of dropout and noise come from torch's own generator either way.
     return cast("Network", torch.compile(network, options={"fallback_random": True}))
 
 
@@ -206,6 +221,7 @@ def explain_compile_errors() -> Generator[None]:
     except RuntimeError as error:
         if not type(error).__module__.startswith(COMPILERS):
             raise
+        # A missing compiler shows itself at the first step, inside the compiler's own errors.
         reason = str(getattr(error, "inner_exception", error)).strip().splitlines()[0]
         raise TrainingError(
             f"--compile does not work here ({reason}): install a C++ compiler (g++), or drop"
@@ -271,6 +287,8 @@ def fit(
     running = running or Running()
     run = _Run(module, recipe, steps_per_epoch, loss, folder, running)
     leads = run.leads
+    # A plain loop: what a step is can be read from top to bottom; `run` has the state of a
+    # checkpoint and what is done with it.
     rank = run.fabric.global_rank
     world = run.fabric.world_size
     fabric = run.fabric
@@ -279,6 +297,8 @@ def fit(
         while run.has_epochs_left:
             start_s = running.clock()
             module.train()
+            # The order of an epoch follows from its number, the noise of a step from the step's: no
+            # state of a generator is saved, and a resumed run repeats neither.
             order = torch.Generator().manual_seed(seed_of(recipe.seed, run.epoch))
             for batch in islice(batches(order), run.step, None):
                 torch.manual_seed(seed_of(recipe.seed, run.epoch, run.step, rank))
@@ -287,17 +307,23 @@ def fit(
                     value = run.forward(fabric.to_device(share_of(batch, rank, world)), share_done)
                     run.stepper.zero_grad(set_to_none=True)
                     fabric.backward(value)
+
+                # A batch with a few strange maps would move Adam's moments for hundreds of steps.
                 if recipe.gradient_limit:
                     fabric.clip_gradients(run.forward, run.stepper, max_norm=recipe.gradient_limit)
                 run.stepper.step()
+                # A plateau is judged on held-out losses, once an epoch.
                 if recipe.schedule != "plateau":
                     run.schedule.step()
                 run.take_average()
+
                 run.total += value.detach().float()
                 run.step += 1
                 if leads:
                     run.log_minute()
                     running.on_step(run.steps_done, run.steps_in_all)
+                # A process that stopped alone would leave the others waiting in the next sum of
+                # gradients.
                 stop = run.any_process_asks(stop=running.stop())
                 if leads and (stop or running.clock() - run.saved_s >= running.checkpoint_s):
                     run.save()
@@ -308,9 +334,11 @@ def fit(
                     )
                     raise KeyboardInterrupt
 
+            # Not a number in one process is not a number in the mean: all of them end.
             train_loss = _finite(
                 "loss", float(run.over_all(run.total / max(run.step, 1), "mean")), run.epoch
             )
+            # Scored with the averaged weights, which are the ones that are kept.
             module.eval()
             with run.averaged():
                 figures: Scores = fabric.broadcast(score() if leads else {})
@@ -365,6 +393,9 @@ class _Run:
                 "this processor emulates bfloat16: training in float32, which is several times"
                 " faster here"
             )
+
+        # Decay goes into the step, not into the gradient, where Adam would divide it by the
+        # gradient's own spread (Loshchilov and Hutter 2019).
         free = [p for p in module.parameters() if p.requires_grad]
         kind = torch.optim.AdamW if recipe.weight_decay else torch.optim.Adam
         self.optimizer = kind(
@@ -373,6 +404,8 @@ class _Run:
         self.average = [p.detach().clone() for p in free] if recipe.average else []
         """Moving average of the free parameters, in their order."""
         self._free = free
+        # The loss is inside of what is set up: with several processes, gradients are averaged
+        # behind a forward pass.
         self.forward, self.stepper = self.fabric.setup(LossStep(module, loss), self.optimizer)
         self._steps = steps
         self.steps_in_all = recipe.epochs * steps
@@ -414,6 +447,7 @@ class _Run:
         """Return the same answer in every process: true where one of them asks to stop at a step of
         agreement.
         """
+        # Agreeing costs a message between processes, so that it happens every tenth step.
         if self.fabric.world_size == 1:
             return stop
         if self.steps_done % STOP_CHECK_STEPS:
@@ -424,6 +458,9 @@ class _Run:
         """Move the average of the weights towards them; early on by more, so that it forgets the
         first ones.
         """
+        # The average of the last 1 / (1 - decay) steps has less of the noise of single batches, as
+        # if the rate had fallen already (Polyak and Juditsky 1992). Over the first steps it is near
+        # the plain mean, whose decay is t / (t + 1): the start would else weigh for a whole run.
         if self.average:
             decay = min(self.recipe.average, self.steps_done / (self.steps_done + 10))
             for average, own in zip(self.average, self._free, strict=True):
@@ -442,6 +479,7 @@ class _Run:
 
     def _swap(self) -> None:
         for own, average in zip(self._free, self.average, strict=True) if self.average else ():
+            # Pointers are exchanged, no memory is copied.
             own.data, average.data = average.data, own.data
 
     def log_minute(self) -> None:
@@ -451,6 +489,7 @@ class _Run:
         seconds = self._running.clock() - self._minute_s
         if seconds < MINUTE_S:
             return
+        # Since the last line, not since the start: a machine that slows down shows.
         pace = (self.steps_done - self._minute_steps) * self.recipe.batch / seconds
         line = (
             f"{time.strftime('%Y-%m-%dT%H:%M:%S')} epoch {self.epoch} step"
@@ -467,10 +506,12 @@ class _Run:
         if self.leads and all(
             figures["held_out_loss"] < earlier["held_out_loss"] for earlier in self.rows
         ):
+            # Of averaged weights, where there are any: `averaged` has put them into the module.
             write_best(self.folder, {"epoch": self.epoch, "module": self.module.state_dict()})
 
     def end_epoch(self, loss: float, figures: Scores, seconds: float) -> None:
         """Log the epoch, step a plateau's schedule, and save the state."""
+        # The rate that the epoch trained with, before the schedule lowers it.
         self.rows.append(
             {"epoch": self.epoch, "rate": self._rate, "loss": loss, **figures, "seconds": seconds}
         )
@@ -485,6 +526,8 @@ class _Run:
 
     def restore_best(self) -> Scores:
         """Load the epoch that the recipe keeps into the module, and return its figures."""
+        # Averaged weights are what is handed on; the run's own stay in the last state, for a
+        # resume.
         row = self.rows[-1]
         self._swap()
         if self.recipe.keep == "best":
@@ -523,11 +566,10 @@ class _Run:
             ) from error
 
     def _restore(self, state: State) -> None:
-        if not self.recipe.trains_like(Recipe.model_validate_json(state["recipe"])):
+        if not self.recipe.trains_like(recipe_of(json.loads(state["recipe"]))):
             raise RecipeError(f"{self.folder} holds a run of another recipe: choose another --out")
-        if (
-            state.get("origin", self._running.origin) != self._running.origin
-        ):  # states of old runs have no origin
+        # States of old runs have no origin.
+        if state.get("origin", self._running.origin) != self._running.origin:
             raise RecipeError(
                 f"{self.folder} holds a run from other weights or objects: choose another --out"
             )

@@ -3,10 +3,11 @@
 from collections.abc import Callable
 
 import numpy as np
-from nlos_models import DoubtRecord, Recipe
 from nlos_models.inference import UncertaintyEstimate
+from nlos_models.records import UncertaintyRecord
+from nlos_models.training import UncertaintyRecipe
 
-RECIPE = Recipe(
+RECIPE = UncertaintyRecipe(
     task="doubt",
     objects=8,
     outliers=4,
@@ -20,9 +21,9 @@ Says = Callable[[np.ndarray, np.ndarray, np.ndarray], tuple[float, float]]
 """Of maps and an image (n, ...): how probable nothing and outside are."""
 
 
-class FakeDoubter:
+class FakeUncertainty:
     def __init__(self, says: Says = lambda *_: (0.0, 0.0), error_v: float = 0.1) -> None:
-        self.record = DoubtRecord(watches="0123456789ab", recipe=RECIPE, learnt=[])
+        self.record = UncertaintyRecord(watches="0123456789ab", recipe=RECIPE, learnt=[])
         self.quality = None
         self.asked: list[tuple[np.ndarray, ...]] = []
         self._says = says

@@ -1,30 +1,54 @@
-"""Atomic writes of results (see also nlos_models.files), and the location of the cache
-directory.
-"""
+"""Atomic writes: readers see the old file or directory or the whole new one."""
 
 import ctypes
 import os
 import shutil
 from collections.abc import Generator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from nlos_models import FileBusyError, atomic_file, claim, load_cached, reservations, sync_folder
+from nlos_cam.files.claims import claim
+from nlos_cam.files.errors import OutputExistsError
 
-from nlos_cam.errors import OutputExistsError
-
-__all__ = [
-    "FileBusyError",
-    "atomic_directory",
-    "atomic_file",
-    "cache_folder",
-    "claim",
-    "load_cached",
-    "reservations",
-]
 AT_FDCWD = -100
 RENAME_EXCHANGE = 2
 """Of Linux' renameat2."""
+
+
+@contextmanager
+def atomic_file(path: Path, *, exclusive: bool = False) -> Generator[Path]:
+    """Yield a path to write to; on success flush that file to disk and rename it to `path`, else
+    delete it.
+
+    Readers see the old file or the whole new one, also after a power cut or a full disk. If
+    `exclusive`, raises OutputExistsError where `path` exists by then. Raises FileBusyError while
+    another process writes the same file.
+    """
+    with claim(path) as folder:
+        part = folder / path.name
+        yield part
+        _flush_file(part)
+        if exclusive:
+            _link_exclusively(part, path)
+        else:
+            part.replace(path)
+        _flush_entries(path.parent)
+
+
+def _link_exclusively(part: Path, path: Path) -> None:
+    """Give a file a second name. Raises OutputExistsError where that exists, also if it appeared
+    just now.
+    """
+    try:
+        try:
+            os.link(part, path)
+        except FileExistsError:
+            raise
+        except OSError:  # a file system without links
+            path.touch(exist_ok=False)
+            part.replace(path)
+    except FileExistsError as error:
+        raise OutputExistsError(f"{path} exists: choose another name") from error
 
 
 @contextmanager
@@ -39,25 +63,40 @@ def atomic_directory(out: Path) -> Generator[Path]:
         raise OutputExistsError(
             f"{out} is a file, but --out must be a directory: choose another name"
         )
-    out, existed = out.resolve(), out.exists()
+    out = out.resolve()
+    existed = out.exists()
     with claim(out) as folder:
         part = folder / out.name
         part.mkdir()
         yield part
-        _flush(part)
+        _flush_directory(part)
         if existed:
             _replace_directory(part, out, folder)
         else:
             _rename_new(part, out)
-        sync_folder(out.parent)
+        _flush_entries(out.parent)
 
 
-def _flush(folder: Path) -> None:
+def _flush_file(path: Path) -> None:
+    with path.open("r+b") as file:
+        os.fsync(file.fileno())
+
+
+def _flush_directory(folder: Path) -> None:
     for parent, _, names in os.walk(folder):
         for name in names:
-            with Path(parent, name).open("r+b") as file:
-                os.fsync(file.fileno())
-        sync_folder(Path(parent))
+            _flush_file(Path(parent, name))
+        _flush_entries(Path(parent))
+
+
+def _flush_entries(folder: Path) -> None:
+    """Flush a folder's list of entries to disk, where the system can."""
+    with suppress(OSError):  # Windows cannot open a folder
+        opened = os.open(folder, os.O_RDONLY)
+        try:
+            os.fsync(opened)
+        finally:
+            os.close(opened)
 
 
 def _rename_new(part: Path, out: Path) -> None:
@@ -74,12 +113,13 @@ def _rename_new(part: Path, out: Path) -> None:
 def _replace_directory(part: Path, out: Path, folder: Path) -> None:
     replaced = [entry.name for entry in part.iterdir()]
     others = [entry for entry in out.iterdir() if entry.name not in replaced]
+
     fixed = Path.cwd().is_relative_to(out) or any(entry.is_mount() for entry in (out, *others))
     if not fixed and _link_all(others, part) and _exchange(part, out):
         return
-    for name in (
-        replaced
-    ):  # entry by entry where the directory itself has to stay, or the system cannot exchange two
+
+    # Entry by entry where the directory itself has to stay, or the system cannot exchange two.
+    for name in replaced:
         if (out / name).is_dir():
             (out / name).rename(folder / f"old {name}")
         (part / name).replace(out / name)
@@ -107,10 +147,3 @@ def _exchange(one: Path, other: Path) -> bool:
     except (AttributeError, OSError, TypeError):
         return False
     return call(AT_FDCWD, os.fsencode(one), AT_FDCWD, os.fsencode(other), RENAME_EXCHANGE) == 0
-
-
-def cache_folder() -> Path:
-    """Return NLOS_CAM_CACHE, or "nlos-cam" in the user's cache directory."""
-    if chosen := os.environ.get("NLOS_CAM_CACHE"):
-        return Path(chosen)
-    return Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "nlos-cam"

@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from torch.multiprocessing.spawn import ProcessExitedException, ProcessRaisedException
 
 from nlos_models.errors import RecipeError, TrainingError
-from nlos_models.recipe import Precision, Recipe
+from nlos_models.training.recipe import Precision, Recipe
 
 Accelerator = Literal["auto", "cpu", "cuda"]
 Loss = Callable[[Any, float], Tensor]
@@ -42,6 +42,8 @@ def open_fabric(recipe: Recipe, *, accelerator: Accelerator = "auto", devices: i
     Raises TrainingError where there are fewer GPUs, RecipeError where the processes cannot share a
     batch evenly.
     """
+    # Shares of different size would weigh samples differently, since gradients are averaged over
+    # processes.
     if recipe.batch % devices:
         raise RecipeError(
             f"a batch of {recipe.batch} cannot be shared evenly by {devices} processes: change"
@@ -55,6 +57,7 @@ def open_fabric(recipe: Recipe, *, accelerator: Accelerator = "auto", devices: i
             f"{devices} GPU{'s' if devices > 1 else ''} requested, {gpus or 'none'} available"
         )
         raise TrainingError(f"{requested}: choose fewer --devices, or --accelerator cpu")
+    # Processes are spawned, not forked: CUDA and the threads of a BLAS do not survive a fork.
     strategy = "ddp_spawn" if devices > 1 else "auto"
     precision = precision_on(accelerator, recipe)
     return Fabric(accelerator=accelerator, devices=devices, strategy=strategy, precision=precision)
@@ -67,6 +70,8 @@ def precision_on(device: str, recipe: Recipe) -> Precision:
     Measured on two threads of an AMD EPYC without AVX-512: 25 samples per second in bfloat16, 235
     in float32.
     """
+    # bfloat16 has float32's range, so that losses need no scaling as in float16; its 8 bits are
+    # enough for products, while weights, sums and losses stay in float32.
     emulated = device == "cpu" and torch.backends.cpu.get_cpu_capability() in {"DEFAULT", "AVX2"}
     return "32-true" if emulated else recipe.precision
 
@@ -78,11 +83,13 @@ def launch(fabric: Fabric, work: Callable[..., Any], *arguments: Any) -> Any:
     are raised as they are; an interruption is passed on to all processes, waited for, and raised as
     KeyboardInterrupt.
     """
+    # No other process, no pickling: a debugger, and a test's closures, work.
     if fabric.world_size == 1:
         return work(fabric, *arguments)
     try:
         result = fabric.launch(partial(_return_errors, work=work, arguments=arguments))
     except (ProcessRaisedException, ProcessExitedException) as error:
+        # A process that a signal ended has no error of its own.
         last_line = str(error).strip().splitlines()[-1]
         raise TrainingError(
             f"a training process ended early ({last_line}): repeat the command to resume"
@@ -102,6 +109,8 @@ def _return_errors(fabric: Fabric, work: Callable[..., Any], arguments: tuple[An
     try:
         return work(fabric, *arguments)
     except (ValueError, OSError, KeyboardInterrupt) as error:
+        # Raised across processes, an error arrives as a traceback's text; as a value it keeps its
+        # class and message.
         if isinstance(error, KeyboardInterrupt) or hasattr(error, "exit_code"):
             return error
         raise
@@ -109,6 +118,7 @@ def _return_errors(fabric: Fabric, work: Callable[..., Any], arguments: tuple[An
 
 def _end_all() -> None:
     """Ask the processes to save and end, and wait for them."""
+    # SIGTERM first to all, then wait: each saves its state after the current step.
     children = multiprocessing.active_children()
     for child in children:
         child.terminate()
@@ -120,6 +130,8 @@ def seed_of(*parts: int) -> int:
     """Return a seed for a tuple of numbers; their count goes in too, since numpy ignores zeros at
     the end.
     """
+    # Sums of numbers would give epoch 1 step 2 and epoch 2 step 1 the same seed. The upper 63
+    # bits, since torch takes signed seeds.
     return int(
         np.random.SeedSequence([*parts, len(parts)]).generate_state(1, np.uint64)[0] >> np.uint64(1)
     )
@@ -133,5 +145,6 @@ def share_of(batch: Any, rank: int, world: int) -> Any:
         return batch
     if isinstance(batch, Tensor):
         return batch[rank::world]
+    # Named tuples stay what they are: the losses read their fields.
     parts = [share_of(part, rank, world) for part in batch]
     return type(batch)(*parts) if hasattr(batch, "_fields") else tuple(parts)

@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 import torch
-from fake_doubter import RECIPE
-from nlos_models.doubt_network import DoubtNetwork, save_doubt
-from nlos_models.doubt_training import DoubtSet
-from nlos_models.records import WATCHED, DoubtRecord, checksum_of_watched
+from fake_uncertainty import RECIPE
+from nlos_models.records import WATCHED, UncertaintyRecord, checksum_of_watched
+from nlos_models.training.uncertainty import UncertaintySet
+from nlos_models.uncertainty_network import UncertaintyNetwork, save_uncertainty_network
 
 DARK_V = 0.3
 
@@ -24,10 +24,10 @@ def watched_weights(folder: Path) -> Path:
     return folder
 
 
-def untrained_doubt(folder: Path, watched: Path, seed: int = 0) -> DoubtRecord:
+def untrained_uncertainty(folder: Path, watched: Path, seed: int = 0) -> UncertaintyRecord:
     """Write a doubt network of random weights whose batch norms hold statistics."""
     torch.manual_seed(seed)
-    network = DoubtNetwork()
+    network = UncertaintyNetwork()
     with torch.no_grad():
         for _ in range(3):
             network.train()(
@@ -44,12 +44,12 @@ def untrained_doubt(folder: Path, watched: Path, seed: int = 0) -> DoubtRecord:
         "nothing_above": 0.4,
         "outside_above": 0.3,
     }
-    record = DoubtRecord(**facts)
-    save_doubt(folder, network.eval(), record, watched)
+    record = UncertaintyRecord(**facts)
+    save_uncertainty_network(folder, network.eval(), record, watched)
     return record
 
 
-def small_doubt_set(count: int, seed: int) -> DoubtSet:
+def small_uncertainty_set(count: int, seed: int) -> UncertaintySet:
     """Return squares: half of the samples are empty, half of the others are outside the trained
     range and brighter.
 
@@ -66,6 +66,6 @@ def small_doubt_set(count: int, seed: int) -> DoubtSet:
         truth[k, row : row + 20, column : column + 20] = DARK_V if generator.random() < 0.5 else 0.8
         intensity[k, row : row + 20, column + 8 : column + 28] += 20.0 if outside[k] else 5.0
     made = np.where(truth > 0, truth + np.where(truth < 0.5, 0.1, 0.01), 0.0).astype(np.float16)
-    return DoubtSet(
+    return UncertaintySet(
         np.full((count, 64, 80), 0.3, np.float32), intensity, made, truth, nothing, outside
     )

@@ -1,4 +1,4 @@
-"""Uncertainty ("doubt") network: maps and the image reconstructed from them in, expected error and
+"""Uncertainty network: maps and the image reconstructed from them in, expected error and
 verdicts out.
 
 Our own, not the paper's; about 200,000 parameters. Its inputs are the maps' differences from the
@@ -30,7 +30,7 @@ MAX_ERROR_V = 1.0
 """Range of an expected error."""
 
 
-class DoubtOutput(NamedTuple):
+class UncertaintyOutput(NamedTuple):
     """Raw outputs for training: logits, and the logarithm of a scale."""
 
     nothing: Tensor
@@ -62,7 +62,7 @@ class _Up(nn.Module):
         return self.join(torch.cat([wide, fine], 1))
 
 
-class DoubtNetwork(nn.Module):
+class UncertaintyNetwork(nn.Module):
     """Uncertainty network of maps (n, 64, 80) and images (n, 64, 64)."""
 
     bare_depth_m: Tensor
@@ -72,6 +72,8 @@ class DoubtNetwork(nn.Module):
         super().__init__()
         self.register_buffer("bare_depth_m", torch.zeros(MAP_SHAPE))
         self.register_buffer("bare_intensity", torch.zeros(MAP_SHAPE))
+        # 64 x 80 -> 8 x 10 in three halvings; with a fourth block at that size, each feature sees
+        # 31 x 31 cells.
         self.maps = nn.Sequential(
             _down(5, 16), _down(16, 32), _down(32, 64), _down(64, 64, stride=1)
         )
@@ -85,6 +87,7 @@ class DoubtNetwork(nn.Module):
         """Set the bare wall to each cell's median over maps (n, 64, 80) of benches with nothing
         hidden.
         """
+        # The median: a cell with a few wrong returns has the right value, a mean has not.
         self.bare_depth_m.copy_(torch.nan_to_num(depth_m.nanmedian(0).values))
         self.bare_intensity.copy_(intensity.median(0).values)
 
@@ -92,6 +95,9 @@ class DoubtNetwork(nn.Module):
         """Return (n, 5, 64, 80): differences from the bare wall, each from -1 to 1, and 1 for cells
         without return.
         """
+        # Two scales of each difference, since tanh saturates: an object moves some cells by
+        # centimetres and counts by tens, while the question whether there is anything is one of
+        # millimetres. tanh bounds what a strange frame can do to the network.
         invalid = torch.isnan(depth_m)
         farther_m = torch.where(invalid, 0.0, depth_m - self.bare_depth_m)
         brighter = torch.where(invalid, 0.0, intensity - self.bare_intensity)
@@ -99,7 +105,7 @@ class DoubtNetwork(nn.Module):
         features += [torch.tanh(brighter / scale) for scale in INTENSITY_SCALES]
         return torch.stack([*features, invalid.to(depth_m.dtype)], 1)
 
-    def forward(self, depth_m: Tensor, intensity: Tensor, image: Tensor) -> DoubtOutput:
+    def forward(self, depth_m: Tensor, intensity: Tensor, image: Tensor) -> UncertaintyOutput:
         """Return the raw outputs for maps (n, 64, 80) with NaN for no return and images (n, 64, 64)
         in [0, 1].
         """
@@ -107,6 +113,8 @@ class DoubtNetwork(nn.Module):
         levels = [image[:, None]]
         for down in self.image:
             levels.append(down(levels[-1]))
+        # The maps say what is there, the image what was made of it: an error is a disagreement of
+        # both. They meet at 8 x 8, where each feature covers an object's part.
         joint = self.meet(
             torch.cat([functional.interpolate(from_maps, (8, 8), mode="bilinear"), levels[3]], 1)
         )
@@ -114,19 +122,23 @@ class DoubtNetwork(nn.Module):
         pixels = self.pixels(
             torch.cat([functional.interpolate(fine, scale_factor=2.0), levels[0]], 1)
         )
+        # Means for what is everywhere (empty benches, noise), largest values for what is in one
+        # place (a strange part).
         pooled = [part for x in (from_maps, joint) for part in (x.mean((2, 3)), x.amax((2, 3)))]
         logits = self.frame(torch.cat(pooled, 1))
-        return DoubtOutput(logits[:, 0], logits[:, 1], pixels[:, 0] - 3.0, pixels[:, 1])
+        # An untrained error starts at exp(-3) = 0.05 of the depth range, the size of real ones:
+        # from 1 the first steps would only lower it.
+        return UncertaintyOutput(logits[:, 0], logits[:, 1], pixels[:, 0] - 3.0, pixels[:, 1])
 
 
-class CalibratedDoubt(nn.Module):
+class CalibratedUncertainty(nn.Module):
     """Uncertainty network with its calibration: probabilities, and an expected error in v."""
 
     temperature: Tensor
     error_scale: Tensor
 
     def __init__(
-        self, network: DoubtNetwork, temperatures: tuple[float, float], error_scale: float
+        self, network: UncertaintyNetwork, temperatures: tuple[float, float], error_scale: float
     ) -> None:
         super().__init__()
         self.network = network
@@ -140,12 +152,14 @@ class CalibratedDoubt(nn.Module):
         raw = self.network(depth_m, intensity, image)
         nothing = raw.nothing / self.temperature[0]
         outside = raw.outside / self.temperature[1]
+        # Network and calibration are one module, so that the exported graph answers with
+        # probabilities.
         error_v = (self.error_scale * raw.log_error.exp()).clamp(MIN_ERROR_V, MAX_ERROR_V)
         return torch.sigmoid(nothing), torch.sigmoid(outside), error_v, torch.sigmoid(raw.surface)
 
 
-def save_doubt(
-    folder: Path, network: DoubtNetwork, record: records.DoubtRecord, watched: Path
+def save_uncertainty_network(
+    folder: Path, network: UncertaintyNetwork, record: records.UncertaintyRecord, watched: Path
 ) -> None:
     """Write an uncertainty network and its record into a folder, with a copy of the watched weights
     from elsewhere.
@@ -155,20 +169,22 @@ def save_doubt(
             f"{watched} changed during the training of its uncertainty network: train again"
         )
     text = json.dumps(record.model_dump(mode="json"), indent=2)
-    save_parts(folder, {records.DOUBT: network}, {records.DOUBT_RECORD: text})
+    save_parts(folder, {records.UNCERTAINTY: network}, {records.UNCERTAINTY_RECORD: text})
     if folder.resolve() != watched.resolve():
         for name in (*records.watched_files(watched), records.RECORD):
             shutil.copyfile(watched / name, folder / name)
 
 
-def load_doubt(folder: Path) -> tuple[CalibratedDoubt, records.DoubtRecord] | None:
+def load_uncertainty_network(
+    folder: Path,
+) -> tuple[CalibratedUncertainty, records.UncertaintyRecord] | None:
     """Return the calibrated uncertainty network beside a pipeline's weights in eval mode, or None
     where there is none.
 
     Raises CheckpointError where it cannot be read or watches other weights.
     """
-    if (record := records.load_doubt_record(folder)) is None:
+    if (record := records.load_uncertainty_record(folder)) is None:
         return None
-    network = DoubtNetwork()
-    load_part(folder / f"{records.DOUBT}.safetensors", network)
-    return CalibratedDoubt(network, record.temperatures, record.error_scale).eval(), record
+    network = UncertaintyNetwork()
+    load_part(folder / f"{records.UNCERTAINTY}.safetensors", network)
+    return CalibratedUncertainty(network, record.temperatures, record.error_scale).eval(), record

@@ -14,14 +14,6 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from nlos_models.arrays import Float16, Float32
-from nlos_models.data import (
-    STATISTICS_OBJECTS,
-    MapBatch,
-    MapSet,
-    MapSource,
-    as_images,
-    image_batches,
-)
 from nlos_models.errors import TrainingError
 from nlos_models.metrics import color_error, color_silhouette_iou, silhouette_iou
 from nlos_models.pipeline import (
@@ -31,16 +23,18 @@ from nlos_models.pipeline import (
     new_vae,
     split_and_stack,
 )
-from nlos_models.recipe import Recipe
-from nlos_models.train import Running, Scores, fit
-from nlos_models.vae import (
-    Encoder,
-    ResVae,
-    image_error,
-    kl_divergence,
-    latent_error,
-    variational_share,
+from nlos_models.training.data import (
+    STATISTICS_OBJECTS,
+    MapBatch,
+    MapSet,
+    MapSource,
+    as_images,
+    image_batches,
 )
+from nlos_models.training.loop import Running, Scores, fit
+from nlos_models.training.losses import image_error, kl_divergence, latent_error, variational_share
+from nlos_models.training.recipe import CompressorRecipe, MapRecipe, TransferRecipe, VaeRecipe
+from nlos_models.vae import Encoder, ResVae
 
 SCORING_BATCH = 100
 ALL_LAYERS = "all-layers"
@@ -68,22 +62,25 @@ class Remapping:
 
     def learn_statistics(self, channels: slice = slice(None)) -> None:
         """Normalise some or all channels of the split maps by the source's mean and spread."""
+        # A sample of the maps: all of them may not fit into memory.
         maps = self.source.first(STATISTICS_OBJECTS)
         stacked = split_and_stack(torch.from_numpy(maps.depth_m), torch.from_numpy(maps.intensity))
         self.pipeline.preprocess.learn(stacked, channels)
 
     def fit(
-        self, recipe: Recipe, frozen: Iterable[nn.Module], folder: Path, running: Running
+        self, recipe: MapRecipe, frozen: Iterable[nn.Module], folder: Path, running: Running
     ) -> Scores:
         """Train all of the pipeline except its frozen parts; a second call resumes.
 
         Frozen parts keep their weights and run in eval mode, so that their batch norms keep their
         statistics too.
         """
-        still = list(frozen)
+        frozen_parts = list(frozen)
+        # Everything trains except what is named: a resumed run, or a second phase, may have left
+        # other flags.
         fabric = running.fabric_for(recipe)
         self.pipeline.requires_grad_(requires_grad=True)
-        for part in still:
+        for part in frozen_parts:
             part.requires_grad_(requires_grad=False)
         pipeline = in_channels_last(self.pipeline).to(fabric.device)
         targets = self._targets(recipe, fabric)
@@ -91,10 +88,15 @@ class Remapping:
         decode = running.maybe_compile(pipeline.decoder)
 
         def loss(batch: MapBatch, _: float) -> Tensor:
-            for part in still:
+            # `fit` has set the whole module to train. A frozen batch norm in that mode would go on
+            # adapting its statistics, and the decoder would no longer be the VAE's.
+            for part in frozen_parts:
                 part.eval()
-            latent = encode(batch.depth_m, batch.intensity)
+            latent = encode(batch.depth_m, batch.intensity)  # (b, 256)
             value = torch.zeros((), device=latent.device)
+
+            # The latent loss alone is SI 4's idea. It does not know which directions of the latent
+            # change the image, so that our recipes add the image behind the frozen decoder.
             if targets:
                 straight, mirrored = (pair[batch.row] for pair in targets)
                 target = torch.where(batch.mirrored[:, None, None], mirrored, straight)
@@ -117,7 +119,7 @@ class Remapping:
             running=running,
         )
 
-    def _targets(self, recipe: Recipe, fabric: Fabric) -> list[Tensor]:
+    def _targets(self, recipe: MapRecipe, fabric: Fabric) -> list[Tensor]:
         """Return the latents (n, 2, latent) of the images and of their mirror images; none without
         a latent loss.
         """
@@ -135,6 +137,8 @@ class Remapping:
             .requires_grad_(requires_grad=False)
             .eval()
         )
+        # Both orientations once, in place of an encoder's pass at every step; a mirrored object has
+        # its own latent, since the encoder is not symmetric.
         with fabric.autocast():
             return [
                 latents_of(encoder, images).float()
@@ -146,11 +150,14 @@ def in_channels_last(module: Module) -> Module:
     """Return the module with its convolutions' weights in the layout that CPUs and GPUs run
     fastest.
     """
-    return module.to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue] (torch's stub omits it)
+    # A convolution then reads all channels of a pixel from one place.
+    # torch's stub omits this argument.
+    return module.to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
 
 
-def set_for_training(pipeline: RemappingNetwork, recipe: Recipe) -> None:
+def set_for_training(pipeline: RemappingNetwork, recipe: MapRecipe) -> None:
     """Give a loaded pipeline the recipe's dropout and noise, which checkpoints do not hold."""
+    # Noise and dropout are settings of a training, not weights.
     pipeline.preprocess.left_noise = recipe.left_noise
     for module in pipeline.compressor.modules():
         if isinstance(module, nn.Dropout):
@@ -162,6 +169,7 @@ def run(pipeline: nn.Module, maps: MapSet) -> Float32:
     """Return the images (n, 64, 64), in color (n, 3, 64, 64), that a pipeline in eval mode
     reconstructs from maps.
     """
+    # Batches of 100: the activations of all held-out maps at once take gigabytes.
     device = next(pipeline.parameters()).device
     pairs = zip(parts_of(maps.depth_m), parts_of(maps.intensity), strict=True)
     parts = (pipeline(*(torch.from_numpy(part).to(device) for part in pair)) for pair in pairs)
@@ -191,12 +199,14 @@ def figures_of(image: Float32, truth: Float16 | Float32) -> Scores:
     ground truth.
     """
     truth = truth.astype(np.float32)
+    # Squared in any case, so that runs with different losses have one scale to be compared on.
     error = float(np.square(image - truth).sum(tuple(range(1, truth.ndim))).mean())
     if truth.ndim == 3:
         return {
             "held_out_loss": error,
             "held_out_iou": float(np.mean(silhouette_iou(image, truth))),
         }
+    # Objects without a shared pixel have no color error; if none has one, the worst.
     color = color_error(image, truth)
     shared = color[~np.isnan(color)]
     figures = {
@@ -207,7 +217,7 @@ def figures_of(image: Float32, truth: Float16 | Float32) -> Scores:
 
 
 def train_vae(
-    recipe: Recipe,
+    recipe: VaeRecipe,
     images: Float16,
     held_out: Float16,
     folder: Path,
@@ -219,20 +229,23 @@ def train_vae(
 
     A second call resumes. Returns the network in eval mode and its held-out figures.
     """
+    # Initial weights follow from the recipe's seed; `fit` seeds each step by itself.
     torch.manual_seed(recipe.seed)
     running = running or Running()
     vae = in_channels_last(start or new_vae(color=recipe.colour))
     forward = running.maybe_compile(vae)
-    kept = recipe.start == "decoder"
-    vae.decoder.requires_grad_(not kept)
+    trains_decoder = recipe.start != "decoder"
+    vae.decoder.requires_grad_(trains_decoder)
 
     def loss(image: Tensor, done: float) -> Tensor:
-        vae.decoder.train(
-            not kept
-        )  # a decoder that is kept keeps the statistics of its batch norms too
+        # A decoder that stays keeps the statistics of its batch norms too.
+        vae.decoder.train(trains_decoder)
         if recipe.augmentation == "turns":
             image = turn_some(image, torch.randint(4, (len(image),), device=image.device))
         image = image.contiguous(memory_format=torch.channels_last)
+
+        # (b, 1, 64, 64) -> mean and log-variance (b, 256) -> one draw of the latent -> image: the
+        # evidence lower bound with one sample (Kingma and Welling 2013), its two terms weighted.
         share = variational_share(done, recipe.latent_warm_up)
         noise = share * torch.randn(len(image), vae.latent, device=image.device)
         decoded, mean, log_variance = forward(image, noise)
@@ -265,7 +278,7 @@ class Start:
 
 
 def train_compressor(
-    recipe: Recipe,
+    recipe: CompressorRecipe,
     start: Start,
     maps: MapSource,
     held_out: MapSet,
@@ -280,7 +293,10 @@ def train_compressor(
     """
     torch.manual_seed(recipe.seed)
     pipeline = _starting_pipeline(recipe, start)
+    # Two steps: the decoder is the VAE's and stays. One step, or jointly: it trains too, and the
+    # latent is no longer the VAE's.
     remapping = Remapping(pipeline, start.vae.encoder if start.vae else None, maps, held_out)
+    # Two-step weights bring their statistics: other ones would shift every input of the compressor.
     if recipe.steps != "two-then-joint":
         remapping.learn_statistics()
     frozen = [pipeline.decoder] if recipe.steps == "two" else []
@@ -288,7 +304,7 @@ def train_compressor(
     return pipeline.cpu().eval(), figures
 
 
-def _starting_pipeline(recipe: Recipe, start: Start) -> RemappingNetwork:
+def _starting_pipeline(recipe: CompressorRecipe, start: Start) -> RemappingNetwork:
     if recipe.steps == "one":
         return new_pipeline(
             color=recipe.colour,
@@ -317,6 +333,7 @@ def turn_some(images: Tensor, quarters: Tensor) -> Tensor:
     """Rotate images (n, channels, 64, 64) by quarter turns (n,); with the mirror, these are SI 3's
     turns and flips.
     """
+    # All four turns of all images, then one of each: no loop over samples.
     turned = torch.stack([images.rot90(k, (-2, -1)) for k in range(4)])
     return turned[quarters, torch.arange(len(images), device=images.device)]
 
@@ -327,6 +344,7 @@ def rebuild(vae: ResVae, images: Float16 | Float32) -> Float32:
     silhouette cut.
     """
     device = next(vae.parameters()).device
+    # The mean, not a draw: the most likely image of a latent.
     means = (vae.encoder(as_images(part).to(device))[0] for part in parts_of(images))
     decoded = np.concatenate(
         [cut_silhouette(vae.decoder(mean)).float().cpu().numpy() for mean in means]
@@ -335,7 +353,7 @@ def rebuild(vae: ResVae, images: Float16 | Float32) -> Float32:
 
 
 def train_transfer(
-    recipe: Recipe,
+    recipe: TransferRecipe,
     pipeline: RemappingNetwork,
     encoder: Encoder | None,
     maps: MapSource,
@@ -357,8 +375,9 @@ def train_transfer(
         remapping.learn_statistics(CHANNELS[recipe.statistics])
 
     def fit_phase(
-        phase: Recipe, phase_folder: Path, running: Running, *, last_layers: bool
+        phase: TransferRecipe, phase_folder: Path, running: Running, *, last_layers: bool
     ) -> Scores:
+        # SI 4: the features, with their batch norms, are frozen in the second phase.
         features = [pipeline.compressor.get_submodule("features")] if last_layers else []
         return remapping.fit(phase, [pipeline.decoder, *features], phase_folder, running)
 
@@ -370,16 +389,18 @@ class FitPhase(Protocol):
     """Training of one phase of a transfer: of all layers, or of the last ones alone."""
 
     def __call__(
-        self, phase: Recipe, phase_folder: Path, running: Running, *, last_layers: bool
+        self, phase: TransferRecipe, phase_folder: Path, running: Running, *, last_layers: bool
     ) -> Scores: ...
 
 
 def in_two_phases(
-    recipe: Recipe, samples: int, folder: Path, running: Running, fit_phase: FitPhase
+    recipe: TransferRecipe, samples: int, folder: Path, running: Running, fit_phase: FitPhase
 ) -> Scores:
     """Train all layers for `all_layers_epochs`, then the last ones (SI 4); return the last phase's
     figures.
     """
+    # A few epochs let all layers adapt to the bench's statistics. Then only the last ones go on:
+    # recordings are few, and would be learnt by heart by all layers.
     steps = samples // recipe.batch
     before = recipe.all_layers_epochs * steps
     total = before + recipe.epochs * steps

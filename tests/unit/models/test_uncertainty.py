@@ -1,4 +1,4 @@
-"""Uncertainty ("doubt") network: features, training, calibration, predicted quality, and files
+"""Uncertainty network: features, training, calibration, predicted quality, and files
 beside the weights.
 """
 
@@ -8,47 +8,42 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from fake_doubter import RECIPE
-from nlos_models import (
-    DoubtRecord,
-    Running,
-    doubt_network,
-    doubt_training,
-    load_uncertainty_model,
-    quality,
-    records,
-)
-from nlos_models.doubt_network import (
-    MAX_ERROR_V,
-    MIN_ERROR_V,
-    CalibratedDoubt,
-    DoubtNetwork,
-    DoubtOutput,
-)
-from nlos_models.doubt_training import (
+from fake_uncertainty import RECIPE
+from nlos_models import load_uncertainty_model, quality, records, uncertainty_network
+from nlos_models.errors import CheckpointError
+from nlos_models.inference import UncertaintyEstimate
+from nlos_models.quality import QualityEstimate, QualityModel, QualityRecord, quality_features
+from nlos_models.records import UncertaintyRecord
+from nlos_models.training import Running, uncertainty
+from nlos_models.training import quality as quality_training
+from nlos_models.training.quality import (
     QualitySet,
     families,
     fit_quality,
     left_out_folds,
     trusted_above,
 )
-from nlos_models.errors import CheckpointError
-from nlos_models.inference import UncertaintyEstimate
-from nlos_models.quality import QualityEstimate, QualityModel, QualityRecord, quality_features
-from small_doubt import DARK_V, small_doubt_set, untrained_doubt, watched_weights
+from nlos_models.uncertainty_network import (
+    MAX_ERROR_V,
+    MIN_ERROR_V,
+    CalibratedUncertainty,
+    UncertaintyNetwork,
+    UncertaintyOutput,
+)
 from small_maps import HARD_MAPS, hard_maps, noise_maps
+from small_uncertainty import DARK_V, small_uncertainty_set, untrained_uncertainty, watched_weights
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
 
 @pytest.fixture
-def network() -> DoubtNetwork:
+def network() -> UncertaintyNetwork:
     torch.manual_seed(0)
-    return DoubtNetwork().eval().requires_grad_(requires_grad=False)
+    return UncertaintyNetwork().eval().requires_grad_(requires_grad=False)
 
 
-def test_features_are_zero_at_the_median_bare_wall_and_mark_a_cell_without_return(
-    network: DoubtNetwork,
+def test_features_are_zero_at_the_median_bare_wall(
+    network: UncertaintyNetwork,
 ) -> None:
     generator = torch.Generator().manual_seed(0)
     bare_m = torch.rand(64, 80, generator=generator)
@@ -59,22 +54,21 @@ def test_features_are_zero_at_the_median_bare_wall_and_mark_a_cell_without_retur
     network.learn_bare(depth_m, counts.repeat(5, 1, 1))
     assert float(network.features(bare_m[None], counts[None]).abs().max()) == 0.0
     assert float(network.features(bare_m[None] + 0.05, counts[None] + 5)[:, :4].min()) > 0.4
-    bare_m[3, 4] = torch.nan
-    assert network.features(bare_m[None], counts[None] + 9)[0, :, 3, 4].tolist() == [
-        0.0,
-        0.0,
-        0.0,
-        0.0,
-        1.0,
-    ]
+
+
+def test_features_mark_a_cell_without_return(network: UncertaintyNetwork) -> None:
+    depth_m = torch.ones(1, 64, 80)
+    depth_m[0, 3, 4] = torch.nan
+    features = network.features(depth_m, torch.full((1, 64, 80), 9.0))
+    assert features[0, :, 3, 4].tolist() == [0, 0, 0, 0, 1]
 
 
 @pytest.mark.parametrize("name", HARD_MAPS)
 @pytest.mark.parametrize("v", [0.0, 1.0])
 def test_doubt_of_hard_maps_is_finite_and_in_range(
-    network: DoubtNetwork, name: str, v: float
+    network: UncertaintyNetwork, name: str, v: float
 ) -> None:
-    calibrated = CalibratedDoubt(network, (1.0, 2.0), 3.0).eval()
+    calibrated = CalibratedUncertainty(network, (1.0, 2.0), 3.0).eval()
     nothing, outside, error_v, surface = calibrated(*hard_maps(name), torch.full((1, 64, 64), v))
     for probability in (nothing, outside, surface):
         assert bool(((probability >= 0) & (probability <= 1)).all())
@@ -83,11 +77,12 @@ def test_doubt_of_hard_maps_is_finite_and_in_range(
     assert error_v.shape == surface.shape == (1, 64, 64)
 
 
-def test_calibration_scales_error_and_divides_logits(network: DoubtNetwork) -> None:
+def test_calibration_scales_error_and_divides_logits(network: UncertaintyNetwork) -> None:
     maps = hard_maps("saturated")
     image = torch.full((1, 64, 64), 0.5)
     plain, scaled = (
-        CalibratedDoubt(network, t, s).eval()(*maps, image) for t, s in (((1, 1), 1), ((2, 4), 1.5))
+        CalibratedUncertainty(network, t, s).eval()(*maps, image)
+        for t, s in (((1, 1), 1), ((2, 4), 1.5))
     )
     torch.testing.assert_close(scaled[2], 1.5 * plain[2])
     for one, other, divisor in zip(plain[:2], scaled[:2], (2.0, 4.0), strict=True):
@@ -105,27 +100,32 @@ QUICK = RECIPE.model_copy(
 )
 
 
-def _train(folder: Path, steps: list[int], **running: Any) -> DoubtNetwork:
+def _train(folder: Path, steps: list[int], **running: Any) -> UncertaintyNetwork:
     counted = Running(on_step=lambda done, _: steps.append(done), **running)
-    return doubt_training.train_doubt(
-        QUICK, small_doubt_set(128, 0), small_doubt_set(32, 1), folder, counted
+    return uncertainty.train_uncertainty(
+        QUICK, small_uncertainty_set(128, 0), small_uncertainty_set(32, 1), folder, counted
     )[0]
 
 
 @pytest.mark.slow
-def test_doubt_run_resumes_exactly_and_learns_what_is_empty_unusual_or_uncertain(
+def test_uncertainty_run_resumes_exactly(
     tmp_path: Path,
 ) -> None:
     steps = list[int]()
     trained = _train(tmp_path / "whole", [])
-    fresh = small_doubt_set(64, 2)
     with pytest.raises(KeyboardInterrupt):
         _train(tmp_path / "stopped", steps, stop=lambda: len(steps) == 11)
     torch.testing.assert_close(
         _train(tmp_path / "stopped", steps).state_dict(), trained.state_dict()
     )
     assert steps == list(range(1, 65))
-    said = doubt_training.predict(trained, fresh)
+
+
+@pytest.mark.slow
+def test_uncertainty_run_learns_what_is_empty_or_unusual(tmp_path: Path) -> None:
+    trained = _train(tmp_path, [])
+    fresh = small_uncertainty_set(64, 2)
+    said = uncertainty.predict(trained, fresh)
     assert ((said.nothing.numpy() > 0) == fresh.nothing).mean() > 0.9
     there = ~fresh.nothing
     assert np.corrcoef(said.outside.numpy()[there], fresh.outside[there])[0, 1] > 0.8
@@ -133,9 +133,14 @@ def test_doubt_run_resumes_exactly_and_learns_what_is_empty_unusual_or_uncertain
         said.log_error.numpy()[fresh.truth == value].mean() for value in np.float16([DARK_V, 0.8])
     )
     assert dark > bright + 0.3
-    some = small_doubt_set(200, 3)
-    fitted = doubt_training.calibrate(trained, some)
-    said = doubt_training.predict(trained, some)
+
+
+@pytest.mark.slow
+def test_calibration_keeps_to_its_shares_of_false_alarms(tmp_path: Path) -> None:
+    trained = _train(tmp_path, [])
+    some = small_uncertainty_set(200, 3)
+    fitted = uncertainty.calibrate(trained, some)
+    said = uncertainty.predict(trained, some)
     nothing, outside = (
         torch.sigmoid(part / t).numpy()
         for part, t in zip(said[:2], fitted.temperatures, strict=True)
@@ -143,23 +148,25 @@ def test_doubt_run_resumes_exactly_and_learns_what_is_empty_unusual_or_uncertain
     usual = ~some.nothing & ~some.outside
     assert (
         outside[usual] > fitted.outside_above + 1e-6
-    ).mean() <= doubt_training.MAX_FALSE_ALARMS + 1 / usual.sum()
+    ).mean() <= uncertainty.MAX_FALSE_ALARMS + 1 / usual.sum()
     assert (nothing[some.nothing] < fitted.nothing_above).mean() <= 1 / some.nothing.sum()
     assert fitted.nothing_above <= 0.5
     assert fitted.error_scale > 0
 
 
-def test_doubt_loss_is_least_at_mean_error_of_pixels_in_both_images() -> None:
-    some = small_doubt_set(64, 0)
+def test_loss_is_least_at_the_mean_error_of_shared_pixels() -> None:
+    some = small_uncertainty_set(64, 0)
     there, empty = (
-        doubt_training.as_doubt_batch(some.where(rows)) for rows in (~some.nothing, some.nothing)
+        uncertainty.as_uncertainty_batch(some.where(rows)) for rows in (~some.nothing, some.nothing)
     )
 
-    def loss(batch: doubt_training.DoubtBatch, log_error: float) -> float:
+    def loss(batch: uncertainty.UncertaintyBatch, log_error: float) -> float:
         flat = torch.zeros(len(batch.made))
         pixels = torch.zeros_like(batch.made)
         return float(
-            doubt_training.doubt_loss(DoubtOutput(flat, flat, pixels + log_error, pixels), batch)
+            uncertainty.uncertainty_loss(
+                UncertaintyOutput(flat, flat, pixels + log_error, pixels), batch
+            )
         )
 
     shared = (there.truth > 0) & (there.made > 0)
@@ -168,14 +175,14 @@ def test_doubt_loss_is_least_at_mean_error_of_pixels_in_both_images() -> None:
     assert loss(empty, -3.0) == loss(empty, 1.0)
     made = np.array([[[0.5, 0.5], [0.0, 0.0]]])
     truth = np.array([[[0.25, 0.0], [0.5, 0.0]]])
-    known, error = doubt_training.shared_errors(made, truth)
+    known, error = uncertainty.shared_errors(made, truth)
     assert known.tolist() == [[[True, False], [False, False]]]
     assert error.tolist() == [0.25]
 
 
 def test_doubt_batches_mirror_maps_with_their_images() -> None:
-    some = small_doubt_set(32, 0)
-    batch = next(iter(doubt_training.doubt_batches(some, 32, torch.Generator().manual_seed(0))))
+    some = small_uncertainty_set(32, 0)
+    batch = next(iter(uncertainty.uncertainty_batches(some, 32, torch.Generator().manual_seed(0))))
     assert sorted(batch.nothing.tolist()) == sorted(some.nothing.astype(float).tolist())
     bright = (batch.intensity[:, :, 8:72] > 12).float()
     torch.testing.assert_close(bright, (batch.truth > 0).float())
@@ -186,8 +193,8 @@ def test_doubt_batches_mirror_maps_with_their_images() -> None:
 def test_error_scale_undoes_factor_in_any_unit(factor: float, unit: float) -> None:
     expected = np.random.default_rng(1).uniform(0.01, 0.2, 20_000)
     error = np.abs(np.random.default_rng(0).laplace(0.0, expected))
-    scale = doubt_training.error_scale(expected, error)
-    assert factor * doubt_training.error_scale(
+    scale = uncertainty.error_scale(expected, error)
+    assert factor * uncertainty.error_scale(
         factor * unit * expected, unit * error
     ) == pytest.approx(scale)
     assert scale == pytest.approx(1.0, rel=0.03)
@@ -198,8 +205,8 @@ def test_temperature_finds_overconfidence(true: float) -> None:
     generator = np.random.default_rng(3)
     logits = generator.normal(0.0, 2.0, 50_000)
     truth = generator.random(50_000) < 1 / (1 + np.exp(-logits))
-    assert doubt_training.temperature(true * logits, truth) == pytest.approx(true, rel=0.1)
-    assert doubt_training.temperature(np.where(truth, 9.0, -9.0), truth) == 1.0  # separable
+    assert uncertainty.temperature(true * logits, truth) == pytest.approx(true, rel=0.1)
+    assert uncertainty.temperature(np.where(truth, 9.0, -9.0), truth) == 1.0  # separable
 
 
 @pytest.fixture
@@ -208,14 +215,14 @@ def watched(tmp_path: Path) -> Path:
 
 
 @pytest.fixture
-def record(tmp_path: Path, watched: Path) -> DoubtRecord:
-    return untrained_doubt(tmp_path / "run", watched)
+def record(tmp_path: Path, watched: Path) -> UncertaintyRecord:
+    return untrained_uncertainty(tmp_path / "run", watched)
 
 
 def test_doubt_is_restored_with_the_weights_that_it_watches(
-    tmp_path: Path, watched: Path, record: DoubtRecord
+    tmp_path: Path, watched: Path, record: UncertaintyRecord
 ) -> None:
-    network, found = doubt_network.load_doubt(tmp_path / "run")
+    network, found = uncertainty_network.load_uncertainty_network(tmp_path / "run")
     assert found == record
     assert not network.training
     assert network.temperature.tolist() == [0.5, 2.0]
@@ -223,7 +230,7 @@ def test_doubt_is_restored_with_the_weights_that_it_watches(
     assert (tmp_path / "run" / "doubt.safetensors").stat().st_size < 700_000
     for name in (*records.WATCHED, "checkpoint.json"):
         assert (tmp_path / "run" / name).read_bytes() == (watched / name).read_bytes()
-    assert doubt_network.load_doubt(watched) is None
+    assert uncertainty_network.load_uncertainty_network(watched) is None
     assert load_uncertainty_model(watched, tmp_path) is None
     with pytest.raises(CheckpointError, match="compressor"):
         records.checksum_of_watched(tmp_path)
@@ -234,34 +241,34 @@ def test_doubt_is_restored_with_the_weights_that_it_watches(
     ("name", "content"),
     [
         *((name, b"another") for name in records.WATCHED),
-        *((records.DOUBT_RECORD, text) for text in (b"{", b'{"watches": "x"}', b"\xff")),
+        *((records.UNCERTAINTY_RECORD, text) for text in (b"{", b'{"watches": "x"}', b"\xff")),
     ],
 )
 def test_load_doubt_refuses_other_weights_or_damaged_record(
     tmp_path: Path, name: str, content: bytes
 ) -> None:
     (tmp_path / "run" / name).write_bytes(content)
-    with pytest.raises(CheckpointError, match=records.DOUBT_RECORD):
-        doubt_network.load_doubt(tmp_path / "run")
+    with pytest.raises(CheckpointError, match=records.UNCERTAINTY_RECORD):
+        uncertainty_network.load_uncertainty_network(tmp_path / "run")
 
 
 def test_saved_bare_wall_is_exact_and_watched_weights_stay(
-    tmp_path: Path, watched: Path, record: DoubtRecord
+    tmp_path: Path, watched: Path, record: UncertaintyRecord
 ) -> None:
-    network = doubt_network.load_doubt(tmp_path / "run")[0].network
+    network = uncertainty_network.load_uncertainty_network(tmp_path / "run")[0].network
     wall_m = 0.3 + 1e-4 * torch.rand(5, 64, 80)
     network.learn_bare(wall_m, wall_m)
-    doubt_network.save_doubt(tmp_path / "second", network, record, watched)
-    again = doubt_network.load_doubt(tmp_path / "second")[0].network
+    uncertainty_network.save_uncertainty_network(tmp_path / "second", network, record, watched)
+    again = uncertainty_network.load_uncertainty_network(tmp_path / "second")[0].network
     torch.testing.assert_close(again.bare_depth_m, wall_m.median(0).values, rtol=0, atol=0)
     (watched / records.WATCHED[0]).write_bytes(b"another network")
     with pytest.raises(CheckpointError, match="watched"):
-        doubt_network.save_doubt(tmp_path / "other", network, record, watched)
+        uncertainty_network.save_uncertainty_network(tmp_path / "other", network, record, watched)
 
 
 @pytest.mark.slow
 def test_doubter_onnx_equals_torch_and_is_exported_once(
-    tmp_path: Path, record: DoubtRecord
+    tmp_path: Path, record: UncertaintyRecord
 ) -> None:
     folder = tmp_path / "run"
     cache = tmp_path / "cache"
@@ -274,7 +281,9 @@ def test_doubter_onnx_equals_torch_and_is_exported_once(
     for count in (1, 5):
         seen = *noise_maps(count), np.random.default_rng(count).random((count, 64, 64), np.float32)
         with torch.inference_mode():
-            theirs = doubt_network.load_doubt(folder)[0](*(torch.from_numpy(part) for part in seen))
+            theirs = uncertainty_network.load_uncertainty_network(folder)[0](
+                *(torch.from_numpy(part) for part in seen)
+            )
         for mine, its in zip(again(*seen), theirs, strict=True):
             assert mine.shape == tuple(its.shape)
             np.testing.assert_allclose(mine, its, rtol=1e-3, atol=1e-5)
@@ -313,13 +322,11 @@ def known_objects(count: int, best: float = 1.0) -> QualitySet:
 
 @pytest.fixture(autouse=True)
 def _short(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(doubt_training, "MIN_STEPS", 150)
-    monkeypatch.setattr(doubt_training, "FOLDS", 2)
+    monkeypatch.setattr(quality_training, "MIN_STEPS", 150)
+    monkeypatch.setattr(quality_training, "FOLDS", 2)
 
 
-def test_figures_are_those_of_the_mirrored_frame_and_of_a_frame_alone_and_finite_without_a_surface() -> (
-    None
-):
+def test_figures_are_those_of_the_mirrored_frame() -> None:
     images, said = frames(4)
     turned = said._replace(error_v=said.error_v[:, ::-1], p_surface=said.p_surface[:, ::-1])
     figures = quality_features(images, said)
@@ -327,20 +334,34 @@ def test_figures_are_those_of_the_mirrored_frame_and_of_a_frame_alone_and_finite
     np.testing.assert_allclose(
         quality_features(images[:, ::-1], turned), figures, rtol=1e-4, atol=1e-4
     )
+
+
+def test_figures_of_a_frame_are_those_of_the_frame_alone() -> None:
+    images, said = frames(4)
+    figures = quality_features(images, said)
     alone = quality_features(images[1:2], UncertaintyEstimate(*(part[1:2] for part in said)))
     np.testing.assert_allclose(alone[0], figures[1], rtol=1e-4, atol=1e-5)
-    assert np.isfinite(quality_features(np.zeros_like(images), said)).all()
+
+
+def test_figures_with_the_network_s_own_surface_come_last() -> None:
+    images, said = frames(4)
+    turned = said._replace(error_v=said.error_v[:, ::-1], p_surface=said.p_surface[:, ::-1])
+    figures = quality_features(images, said)
     with_own = quality_features(images, said, said.p_surface)
     assert with_own.shape == (4, quality.WITH_SURFACE)
     np.testing.assert_array_equal(with_own[:, : quality.FEATURES], figures)
     own = quality_features(images[:, ::-1], turned, turned.p_surface)
     np.testing.assert_allclose(own, with_own, rtol=1e-4, atol=1e-4)
-    assert np.isfinite(quality_features(np.zeros_like(images), said, np.zeros_like(images))).all()
 
 
-def test_model_takes_a_network_s_own_probability_of_a_surface_where_it_was_fitted_with_one() -> (
-    None
-):
+def test_figures_are_finite_without_a_surface() -> None:
+    images, said = frames(4)
+    nothing = np.zeros_like(images)
+    assert np.isfinite(quality_features(nothing, said)).all()
+    assert np.isfinite(quality_features(nothing, said, nothing)).all()
+
+
+def test_model_takes_the_network_s_own_surface_if_fitted_with_one() -> None:
     """Without one it takes the uncertainty network's, and a model that was fitted without one
     leaves it out.
     """
@@ -361,7 +382,7 @@ def test_model_takes_a_network_s_own_probability_of_a_surface_where_it_was_fitte
     assert (wide(images, said, own).iou != wide(images, said).iou).any()
 
 
-def test_no_family_is_both_fitted_and_judged_and_every_row_is_judged_once() -> None:
+def test_left_out_families_are_judged_once_and_never_fitted() -> None:
     kinds = [*KINDS, "carved blobs", "cup"]
     judged = list[int]()
     for fitted, rows in left_out_folds(kinds):
@@ -371,9 +392,7 @@ def test_no_family_is_both_fitted_and_judged_and_every_row_is_judged_once() -> N
     assert sorted(judged) == list(range(len(kinds)))
 
 
-def test_fit_predicts_the_quality_of_kinds_that_it_never_saw_also_by_a_figure_that_never_differs() -> (
-    None
-):
+def test_fit_predicts_the_quality_of_kinds_that_it_never_saw() -> None:
     samples = known_objects(600)
     samples.figures[:, 5] = 1.0
     record = QualityRecord.model_validate_json(fit_quality(samples, "0" * 12).model_dump_json())
@@ -387,25 +406,31 @@ def test_fit_predicts_the_quality_of_kinds_that_it_never_saw_also_by_a_figure_th
     assert (samples.iou[found.trusted] >= quality.GOOD_IOU).mean() >= quality.PRECISION
 
 
-def test_trust_needs_good_outlines_enough_frames_and_precision_in_both_shares() -> None:
+def test_trust_needs_good_outlines_in_both_shares() -> None:
     good = np.linspace(0, 1, 1000).astype(np.float32)
     generic = np.arange(1000) % 2 == 0
     above = trusted_above(good, good >= 0.5, generic)
     assert 0.44 < above <= 0.5
     assert trusted_above(good[-10:], good[-10:] > 0, generic[-10:]) is None
     assert trusted_above(good, (good >= 0.5) & ~generic, generic) is None
+
+
+def test_model_of_poor_reconstructions_trusts_none() -> None:
     record = fit_quality(samples := known_objects(200, best=0.7), "0" * 12)
     assert record.trusted_above is None
     assert not QualityEstimate.of(QualityModel(record).outputs(samples.figures), None).trusted.any()
 
 
-def test_good_outline_of_a_kind_counts_where_the_kind_is_sure_and_older_records_know_no_kinds() -> (
-    None
-):
+def test_good_outline_of_a_kind_counts_where_the_kind_is_sure() -> None:
     outputs = np.zeros((3, quality.OUTPUTS), np.float32)
     outputs[:, 3:6] = [(-9, 9, known) for known in (12, 0, -9)]
     assert QualityEstimate.of(outputs, 0.9).trusted.tolist() == [True, False, False]
     assert QualityEstimate.of(outputs, None).good[1] == pytest.approx(quality.KINDS_ODDS, rel=0.05)
+
+
+def test_older_quality_records_know_no_kinds() -> None:
+    outputs = np.zeros((3, quality.OUTPUTS), np.float32)
+    outputs[:, 3:6] = [(-9, 9, known) for known in (12, 0, -9)]
     older = QualityEstimate.of(outputs[:, [0, 1, 2, 4, 6]], 0.9)
     assert older.trusted.all()
 
@@ -432,10 +457,10 @@ def record_of(**values: object) -> QualityRecord:
 
 
 def test_model_is_bound_to_its_uncertainty_network(tmp_path: Path) -> None:
-    untrained_doubt(folder := tmp_path / "run", watched_weights(tmp_path / "watched"))
+    untrained_uncertainty(folder := tmp_path / "run", watched_weights(tmp_path / "watched"))
     assert quality.load_quality_model(folder) is None
-    record = record_of(watches=quality.quality_watches(folder))
-    quality.write_quality(folder, record)
+    record = record_of(watches=records.checksum_of_watched(folder, quality.UNCERTAINTY_FILES))
+    quality_training.write_quality(folder, record)
     loaded = load_uncertainty_model(folder, tmp_path)
     assert loaded.quality.record == record
     assert loaded.quality(*frames(2)).iou == pytest.approx(np.full((2, 3), 0.5))
@@ -465,9 +490,12 @@ def test_model_is_bound_to_its_uncertainty_network(tmp_path: Path) -> None:
 def test_file_that_does_not_fit_is_refused(
     tmp_path: Path, values: dict[str, object], reason: str
 ) -> None:
-    untrained_doubt(folder := tmp_path / "run", watched_weights(tmp_path / "watched"))
-    quality.write_quality(
-        folder, record_of(**{"watches": quality.quality_watches(folder), **values})
+    untrained_uncertainty(folder := tmp_path / "run", watched_weights(tmp_path / "watched"))
+    quality_training.write_quality(
+        folder,
+        record_of(
+            **{"watches": records.checksum_of_watched(folder, quality.UNCERTAINTY_FILES), **values}
+        ),
     )
     with pytest.raises(CheckpointError, match=reason):
         quality.load_quality_model(folder)

@@ -2,16 +2,16 @@
 
 import numpy as np
 import torch
-from fake_doubter import FakeDoubter
-from nlos_models.doubt_network import CalibratedDoubt, DoubtNetwork
+from fake_uncertainty import FakeUncertainty
+from nlos_models.uncertainty_network import CalibratedUncertainty, UncertaintyNetwork
 
 
 def test_fake_doubter_answers_in_the_shapes_of_a_real_network() -> None:
     maps = np.full((1, 64, 80), 0.3, np.float32)
     image = np.zeros((1, 64, 64), np.float32)
-    real = CalibratedDoubt(DoubtNetwork(), (1.0, 1.0), 1.0).eval()(
+    real = CalibratedUncertainty(UncertaintyNetwork(), (1.0, 1.0), 1.0).eval()(
         *(torch.from_numpy(a) for a in (maps, maps, image))
     )
-    said = FakeDoubter(lambda *_: (0.25, 0.75))(maps, maps, image)
+    said = FakeUncertainty(lambda *_: (0.25, 0.75))(maps, maps, image)
     assert [part.shape for part in said] == [tuple(part.shape) for part in real]
     assert (float(said.p_empty[0]), float(said.p_out_of_distribution[0])) == (0.25, 0.75)

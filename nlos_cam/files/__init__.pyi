@@ -1,0 +1,35 @@
+__all__ = [
+    "CHECKSUMS",
+    "DISK_ERRORS",
+    "TENSOR_LIMIT",
+    "TEXT_LIMIT",
+    "FileBusyError",
+    "OutputExistsError",
+    "atomic_directory",
+    "atomic_file",
+    "cache_folder",
+    "checksums_of",
+    "claim",
+    "describe",
+    "load_cached",
+    "read_arrays",
+    "read_bounded",
+    "read_checked",
+    "read_toml",
+    "reservations",
+    "write_checked",
+]
+
+from .atomic import atomic_directory, atomic_file
+from .cache import cache_folder, load_cached
+from .checksums import CHECKSUMS, checksums_of, read_checked, write_checked
+from .claims import DISK_ERRORS, claim, reservations
+from .errors import FileBusyError, OutputExistsError
+from .reading import (
+    TENSOR_LIMIT,
+    TEXT_LIMIT,
+    describe,
+    read_arrays,
+    read_bounded,
+    read_toml,
+)
