@@ -67,7 +67,7 @@ def reconstruct(
         list[Path] | None,
         typer.Option(
             "--weights",
-            help="Folder of weights, paper, or direct (the default); repeat to compare.",
+            help="Folder of weights, paper, or direct; repeat to compare (default: both).",
         ),
     ] = None,
     count: Annotated[
@@ -79,26 +79,20 @@ def reconstruct(
     overwrite: common.Overwrite = False,
     json: common.Json = False,
 ) -> None:
-    """Measure number formats, runtimes, threads and averaged frames on the test objects (1 to 2
-    minutes).
-    """
+    """Measure both networks, with 1 to 64 averaged frames, on the test objects (about a minute)."""
     folder = common.output_path(out, "tradeoff", "", overwrite=overwrite)
-    folders: dict[str, Path | None] = (
-        {str(path): path for path in weights} if weights else {"shipped": None}
-    )
-    rows: list[measure.RuntimeRow] = []
+    networks = {str(path): path for path in weights} if weights else measure.NETWORKS
+    rows: list[measure.ReconstructRow] = []
     with common.interrupted_by_signals():
-        common.say("Rendering test objects, exporting and quantising networks first")
-        bench = measure.open_runtime_bench(folders, count, common.tracked)
-        makes = {
-            name: measure.runtimes(path, bench.rig, bench.box, cache_folder() / "onnx")
-            for name, path in folders.items()
-        }
-    asked = measure.runtime_settings([*makes], [*next(iter(makes.values()))])
-    interrupted = _collect(measure.measure_runtimes(asked, makes, bench), rows, len(asked))
-    table = measure.runtime_facts(rows, len(asked), len(bench.truth), measure.machine())
+        common.say("Loading networks and rendering test objects first")
+        bench = measure.open_reconstruct_bench(
+            networks, cache_folder() / "onnx", count, common.tracked
+        )
+    asked = measure.reconstruct_settings(bench.networks)
+    interrupted = _collect(measure.measure_reconstructions(asked, bench), rows, len(asked))
+    table = measure.reconstruct_facts(rows, len(asked), len(bench.truth), measure.machine())
     if rows:
-        measure.write_runtimes(folder, table, rows)
+        measure.write_reconstructions(folder, table, rows)
     _finish(table, folder, len(rows), len(asked), as_json=json, interrupted=interrupted)
 
 

@@ -1,5 +1,6 @@
 __all__ = [
     "LABELS",
+    "NETWORKS",
     "QUIET",
     "REPORT",
     "SMALLER_IS_BETTER",
@@ -9,8 +10,8 @@ __all__ = [
     "Figures",
     "HeldOutObjects",
     "PerObject",
+    "ReconstructRow",
     "RenderRow",
-    "RuntimeRow",
     "SeededObject",
     "Subject",
     "advantage",
@@ -28,30 +29,29 @@ __all__ = [
     "format_interval",
     "judge",
     "machine",
+    "measure_reconstructions",
     "measure_renders",
-    "measure_runtimes",
     "mm_per_v",
     "network_input",
-    "open_runtime_bench",
+    "open_reconstruct_bench",
     "over_objects",
     "painted_maps",
     "per_object",
     "plain",
     "reconstruct_all",
+    "reconstruct_facts",
+    "reconstruct_settings",
     "render_document",
     "render_facts",
     "render_settings",
     "rendered_objects",
     "rig_of",
-    "runtime_facts",
-    "runtime_settings",
-    "runtimes",
     "seeded_objects",
     "sense",
     "truth_of",
+    "write_reconstructions",
     "write_renders",
     "write_report",
-    "write_runtimes",
 ]
 
 from .color import draw_color_sheet, figures_of_color, painted_maps
@@ -68,6 +68,15 @@ from .metrics import (
     per_object,
     plain,
 )
+from .reconstruct_tradeoff import (
+    NETWORKS,
+    ReconstructRow,
+    measure_reconstructions,
+    open_reconstruct_bench,
+    reconstruct_facts,
+    reconstruct_settings,
+    write_reconstructions,
+)
 from .render_tradeoff import (
     TRADEOFF_REPORT,
     RenderRow,
@@ -81,15 +90,6 @@ from .render_tradeoff import (
     write_renders,
 )
 from .report import REPORT, Evaluation, as_figures, evaluate, format_interval, write_report
-from .runtime_tradeoff import (
-    RuntimeRow,
-    measure_runtimes,
-    open_runtime_bench,
-    runtime_facts,
-    runtime_settings,
-    runtimes,
-    write_runtimes,
-)
 from .subjects import (
     QUIET,
     HeldOutObjects,

@@ -10,6 +10,7 @@ from itertools import islice
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -25,9 +26,9 @@ from nlos_cam.evaluate import (
     TARGETS,
     baselines,
     measure_renders,
+    reconstruct_tradeoff,
     render_settings,
     report,
-    runtime_tradeoff,
     subjects,
 )
 from nlos_cam.objects import benchmark_objects
@@ -211,12 +212,15 @@ def small(monkeypatch: Patch) -> list[Scene]:
 
 @pytest.fixture
 def plates(monkeypatch: Patch) -> None:
-    """Two runtimes that answer with a plate, for any weights."""
-    made = {
-        name: lambda _: sheet_network for name in ("torch float32, cpu", "ONNX Runtime float32")
-    }
-    monkeypatch.setattr("nlos_cam.evaluate.runtimes", lambda *_: made)
-    monkeypatch.setattr(runtime_tradeoff, "MIN_CALLS", 2)
+    """Networks that answer with a plate, for any weights."""
+    load = reconstruct_tradeoff.models.load_reconstructor
+
+    def loaded(folder: Path, cache: Path) -> Any:
+        record = load(folder, cache).record
+        return Mock(side_effect=sheet_network, record=record, runtime="plate")
+
+    monkeypatch.setattr(reconstruct_tradeoff.models, "load_reconstructor", loaded)
+    monkeypatch.setattr(reconstruct_tradeoff, "MIN_CALLS", 2)
 
 
 def _assert_written(result: dict[str, Any]) -> None:
@@ -247,7 +251,7 @@ def test_tradeoff_render_writes_table_and_plot_and_overwrites_when_asked(
 def test_tradeoff_reconstruct_writes_table_and_plot(run: Run) -> None:
     result = run(*RECONSTRUCT, "--count", "1")
     _assert_written(result)
-    assert (result["complete"], result["objects"], len(result["settings"])) == (True, 1, 6)
+    assert (result["complete"], result["objects"], len(result["settings"])) == (True, 1, 8)
     assert result["recommended"]["name"] in {row["name"] for row in result["settings"]}
 
 
@@ -273,7 +277,7 @@ def test_tradeoff_render_uses_object_that_render_renders(run: Run, small: list[S
 def test_tradeoff_keeps_rows_measured_before_signal(
     run: Run, monkeypatch: Patch, command: tuple[str, ...], number: signal.Signals, rows: int
 ) -> None:
-    measure = "measure_renders" if command is RENDER else "measure_runtimes"
+    measure = "measure_renders" if command is RENDER else "measure_reconstructions"
     whole = getattr(evaluate, measure)
 
     def cut_short(*arguments: Any) -> Iterator[Any]:

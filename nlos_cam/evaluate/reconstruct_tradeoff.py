@@ -1,0 +1,335 @@
+"""Trade-off of accuracy against time in reconstruction: both networks, and averaged frames.
+
+Number formats, runtimes and threads were measured too, and are not worth a choice: a decision
+record says what they gave. All settings here run as in `live`: ONNX Runtime, on one thread.
+"""
+
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import nlos_models as models
+import numpy as np
+from nlos_calibration import ObjectBox, Rig, rig_named
+from nlos_calibration.arrays import Float32
+
+from nlos_cam.camera import FRAMES_PER_S
+from nlos_cam.dataset import TEST_SEED
+from nlos_cam.errors import SceneError
+from nlos_cam.evaluate import subjects
+from nlos_cam.evaluate.figures import LABELS
+from nlos_cam.evaluate.metrics import SMALLER_IS_BETTER, TARGETS, Figures, judge, plain
+from nlos_cam.evaluate.render_tradeoff import INCOMPLETE, undominated, write_table
+from nlos_cam.files import atomic_directory
+from nlos_cam.frames import LidarMaps
+from nlos_cam.objects import benchmark_objects, object_box
+from nlos_cam.render import MultiBounce
+from nlos_cam.report import (
+    Banner,
+    Bullets,
+    Commands,
+    Document,
+    Picture,
+    Section,
+    Table,
+    figure_of,
+    saved_picture,
+)
+
+NETWORKS: Mapping[str, Path | None] = {"direct": Path("direct"), "paper": Path("paper")}
+"""Weights that are compared if none are named."""
+FRAMES = 1, 4, 16, 64
+MIN_CALLS = 50
+"""Minimum number of calls for a median; a small set of objects is repeated until then."""
+AS_GOOD = {
+    "silhouette_iou": 0.005,
+    "accuracy_mean_abs": 0.001,
+    "accuracy_within_2_percent": 0.005,
+    "foreground_rmse_mm": 0.5,
+}
+"""Losses against the most accurate setting up to which a setting is as good."""
+
+Clock = Callable[[], float]
+
+
+@dataclass(frozen=True)
+class ReconstructSetting:
+    """Weights and averaged frames of one measurement."""
+
+    name: str
+    weights: str
+    runtime: str
+    frames: int
+    """Frames averaged, as by `live --average`."""
+
+
+@dataclass(frozen=True)
+class ReconstructRow:
+    """Time and accuracy of one setting."""
+
+    setting: ReconstructSetting
+    milliseconds: float
+    """Median time of one call on one object's maps."""
+    milliseconds_p90: float
+    figures: Figures
+
+    @property
+    def wait_ms(self) -> float:
+        """Return the time in which the averaged frames arrive, at the camera's rate."""
+        return 1000 * self.setting.frames / FRAMES_PER_S
+
+
+@dataclass(frozen=True)
+class ReconstructBench:
+    """Networks, and objects with their echoes, on which every setting is measured."""
+
+    networks: Mapping[str, models.Reconstructor]
+    rig: Rig
+    box: ObjectBox
+    truth: Float32
+    """(n, 64, 64) in v."""
+    echoes: list[MultiBounce]
+
+
+def open_reconstruct_bench(
+    weights: Mapping[str, Path | None],
+    cache: Path,
+    count: int | None = None,
+    tracked: subjects.Tracked = subjects.untracked,
+) -> ReconstructBench:
+    """Load networks, and render the 54 test objects, or `count` random ones, on their rig.
+
+    Raises SceneError if the weights are for different rigs or expect difference maps,
+    CheckpointError for color.
+    """
+    networks = {name: models.load_reconstructor(folder, cache) for name, folder in weights.items()}
+    rigs = {network.record.rig_name for network in networks.values()}
+    if len(rigs) > 1:
+        raise SceneError(
+            f"the weights are for different rigs ({', '.join(sorted(rigs))}): compare weights of"
+            " one rig"
+        )
+    inputs = {network.record.input for network in networks.values()} - {"raw maps"}
+    if inputs:
+        raise SceneError(
+            f"the weights expect {inputs.pop()} but the test maps are raw: use weights for raw maps"
+        )
+
+    rig = rig_named(rigs.pop())
+    box = object_box(rig)
+    objects = subjects.seeded_objects(TEST_SEED, count, box) if count else benchmark_objects(box)
+    truth = subjects.truth_of(objects, box)
+    with tracked("rendering") as on_progress:
+        echoes = subjects.echoes_of(objects, rig, on_progress)
+    return ReconstructBench(networks, rig, box, truth, echoes)
+
+
+def reconstruct_settings(networks: Mapping[str, models.Reconstructor]) -> list[ReconstructSetting]:
+    """Return all settings to measure, the quickest to wait for first."""
+    return [
+        ReconstructSetting(
+            f"{name}, {frames} frame{'s' * (frames > 1)}", name, network.runtime, frames
+        )
+        for frames in FRAMES
+        for name, network in networks.items()
+    ]
+
+
+def measure_reconstructions(
+    asked: Sequence[ReconstructSetting],
+    bench: ReconstructBench,
+    clock: Clock = time.perf_counter,
+) -> Iterator[ReconstructRow]:
+    """Measure each setting and yield its row."""
+    maps: dict[int, list[LidarMaps]] = {}
+    for setting in asked:
+        frames = setting.frames
+        if frames not in maps:
+            maps = {frames: subjects.sense(bench.echoes, bench.rig, frames=frames)}
+        network = bench.networks[setting.weights]
+        image, seconds = _timed(network, maps[frames], bench.truth, clock)
+        middle, late = 1000 * np.quantile(seconds, [0.5, 0.9])
+        figures = judge(image, bench.truth, bench.box)
+        yield ReconstructRow(setting, float(middle), float(late), figures)
+
+
+def _timed(
+    network: models.Reconstructor, maps: Sequence[LidarMaps], truth: Float32, clock: Clock
+) -> tuple[Float32, list[float]]:
+    """Return images of all maps and the seconds of every call but the first, which allocates."""
+    both = subjects.as_map_set(maps, truth)
+    network(both.depth_m[:1], both.intensity[:1])
+    images: list[Float32] = []
+    seconds: list[float] = []
+    for _ in range(-(-MIN_CALLS // len(truth))):
+        images.clear()
+        for depth_m, intensity in zip(both.depth_m, both.intensity, strict=True):
+            start_s = clock()
+            images.append(network(depth_m[None], intensity[None]))
+            seconds.append(clock() - start_s)
+    return np.concatenate(images), seconds
+
+
+def losses(row: ReconstructRow, base: ReconstructRow) -> dict[str, float]:
+    """Return by how much a row is worse than the base, by metric; infinite without a value."""
+    worse: dict[str, float] = {}
+    for name in TARGETS:
+        own = row.figures[name].value
+        best = base.figures[name].value
+        sign = 1 if name in SMALLER_IS_BETTER else -1
+        worse[name] = float("inf") if own is None or best is None else sign * (own - best)
+    return worse
+
+
+def most_accurate(rows: Sequence[ReconstructRow]) -> ReconstructRow:
+    """Return the row of the largest silhouette IoU."""
+    return max(rows, key=_overlap)
+
+
+def loses_accuracy(row: ReconstructRow, base: ReconstructRow) -> bool:
+    """Return True if a row is worse than the base by more than AS_GOOD in any metric."""
+    return any(loss > AS_GOOD[name] for name, loss in losses(row, base).items())
+
+
+def recommended(rows: Sequence[ReconstructRow]) -> ReconstructRow | None:
+    """Return the first setting that is as good as the most accurate; None without rows."""
+    if not rows:
+        return None
+    base = most_accurate(rows)
+    as_good = [row for row in rows if not loses_accuracy(row, base)]
+    return min(as_good, key=_ready_ms)
+
+
+def pareto_front(rows: Sequence[ReconstructRow]) -> list[ReconstructRow]:
+    """Return the rows that no other beats in both time and silhouette IoU, from fast to slow."""
+    return undominated(rows, lambda row: (_ready_ms(row), -_overlap(row)))
+
+
+def _ready_ms(row: ReconstructRow) -> float:
+    """Return the time from the first of the frames to the picture."""
+    return row.wait_ms + row.milliseconds
+
+
+def _overlap(row: ReconstructRow) -> float:
+    return row.figures["silhouette_iou"].value or 0.0
+
+
+HEAD = (
+    "setting",
+    "time, ms: median",
+    "p90",
+    "wait for frames, ms",
+    *LABELS.values(),
+    "loses accuracy",
+)
+NOTES = (
+    "Times are of one call on one object's maps: medians over all objects, after a first call that"
+    " is not counted; they are from this machine and run. More frames cost no network time: their"
+    ' maps are averaged while the next arrive, and the picture is as old as the wait. "Loses'
+    ' accuracy": worse than the most accurate row by more than any of'
+    f" {', '.join(f'{least:g} of {LABELS[name]}' for name, least in AS_GOOD.items())}."
+)
+PLOT_CAPTION = "Upper left is better: a larger IoU, sooner. Lines: 95 % intervals over objects."
+
+
+def reconstruct_facts(
+    rows: Sequence[ReconstructRow], planned: int, objects: int, machine: str
+) -> dict[str, Any]:
+    """Return all rows, ready for JSON; `complete` is False after an interruption."""
+    pick = recommended(rows)
+    return {
+        "machine": machine,
+        "objects": objects,
+        "complete": len(rows) == planned,
+        "settings": [
+            {
+                **asdict(row.setting),
+                "milliseconds": row.milliseconds,
+                "milliseconds_p90": row.milliseconds_p90,
+                "wait_ms": row.wait_ms,
+                **plain(row.figures),
+                "loses_accuracy": loses_accuracy(row, most_accurate(rows)),
+            }
+            for row in rows
+        ],
+        "recommended": (
+            {"name": pick.setting.name, "weights": pick.setting.weights} if pick else None
+        ),
+        "pareto_front": [
+            {"name": row.setting.name, "weights": row.setting.weights} for row in pareto_front(rows)
+        ],
+    }
+
+
+def reconstruct_document(table: Mapping[str, Any], folder: Path | None = None) -> Document:
+    """Return the report on a table, with the plot in `folder`."""
+    pick = table["recommended"]
+    banner = Banner("doubtful", "Nothing was measured", "")
+    commands = ["nlos-cam evaluate"]
+    if pick:
+        row = next(row for row in table["settings"] if pick.items() <= row.items())
+        banner = Banner(
+            "good",
+            f"Recommended: {pick['name']}",
+            "The first setting that is as good as the most accurate one.",
+        )
+        commands.insert(
+            0, f"nlos-cam live sim --weights {row['weights']} --average {row['frames']}"
+        )
+    parts: list[Section | Picture] = [
+        Section("", [banner, Bullets("Note", [] if table["complete"] else [INCOMPLETE])]),
+        Section("Settings", [Table(HEAD, [_line(row) for row in table["settings"]]), NOTES]),
+        Section("Next commands", [Commands(commands)]),
+    ]
+    if folder:
+        picture = saved_picture("Accuracy against time", PLOT_CAPTION, folder / "tradeoff.png")
+        parts.insert(2, picture)
+    subtitle = f"{table['machine']}; {table['objects']} objects."
+    return Document("Reconstruction: accuracy against time", subtitle, parts)
+
+
+def _line(row: Mapping[str, Any]) -> tuple[str, ...]:
+    metrics = [_short(row[name]["value"]) for name in TARGETS]
+    times = f"{row['milliseconds']:.1f}", f"{row['milliseconds_p90']:.1f}", f"{row['wait_ms']:.0f}"
+    return row["name"], *times, *metrics, "yes" if row["loses_accuracy"] else "no"
+
+
+def _short(value: float | None) -> str:
+    if value is None:
+        return "none"
+    return f"{value:.3f}" if value < 1 else f"{value:.1f}"
+
+
+def write_reconstructions(
+    folder: Path, table: Mapping[str, Any], rows: Sequence[ReconstructRow]
+) -> None:
+    """Write the measured trade-off as JSON, report and plot."""
+    with atomic_directory(folder) as part:
+        draw_reconstructions(part / "tradeoff.png", rows)
+        write_table(part, table, reconstruct_document(table, part))
+
+
+def draw_reconstructions(path: Path, rows: Sequence[ReconstructRow]) -> None:
+    """Draw silhouette IoU against the time from the first frame to the picture."""
+    figure = figure_of(9, 5.5)
+    axis = figure.subplots()
+    for weights in dict.fromkeys(row.setting.weights for row in rows):
+        own = [row for row in rows if row.setting.weights == weights]
+        times_ms = [_ready_ms(row) for row in own]
+        (line,) = axis.plot(times_ms, [_overlap(row) for row in own], "o-", label=weights)
+        for time_ms, row in zip(times_ms, own, strict=True):
+            iou = row.figures["silhouette_iou"]
+            axis.plot([time_ms, time_ms], [iou.low, iou.high], color=line.get_color(), alpha=0.35)
+            words = f"{row.setting.frames} frame{'s' * (row.setting.frames > 1)}"
+            place = (time_ms, _overlap(row))
+            axis.annotate(words, place, (4, 4), textcoords="offset points", fontsize=8)
+    axis.set(
+        xscale="log",
+        xlabel="milliseconds from the first frame to the picture (log)",
+        ylabel="silhouette IoU, 95 % interval over objects",
+    )
+    axis.grid(alpha=0.3)
+    axis.legend()
+    figure.savefig(path, dpi=100)
