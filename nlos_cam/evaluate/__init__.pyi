@@ -21,11 +21,9 @@ __all__ = [
     "bare_wall_for",
     "baseline_answers",
     "dataset_objects",
-    "draw_color_sheet",
     "draw_renders",
     "echoes_of",
     "evaluate",
-    "figures_of_color",
     "format_interval",
     "judge",
     "machine",
@@ -35,7 +33,6 @@ __all__ = [
     "network_input",
     "open_reconstruct_bench",
     "over_objects",
-    "painted_maps",
     "per_object",
     "plain",
     "reconstruct_all",
@@ -54,7 +51,6 @@ __all__ = [
     "write_report",
 ]
 
-from .color import draw_color_sheet, figures_of_color, painted_maps
 from .figures import LABELS
 from .metrics import (
     SMALLER_IS_BETTER,

@@ -10,13 +10,13 @@ import json
 from pathlib import Path
 
 import numpy as np
+from color_figures import draw_color_sheet, figures_of_color, painted_maps
 from nlos_calibration import load_rig
 from nlos_models import load_network
 from nlos_models.training import load_vae, rebuild, run
 
 from nlos_cam.cli.common import PAPER_RIG, tracked
 from nlos_cam.dataset import TEST_SEED, open_dataset
-from nlos_cam.evaluate import draw_color_sheet, figures_of_color, painted_maps
 from nlos_cam.objects import OBJECTS_PER_CATEGORY, benchmark_objects, object_box
 
 
