@@ -404,11 +404,13 @@ def doubt(
     fabric = run.fabric(recipe)
     pipeline = models.load_reconstructor(weights, cache_folder() / "onnx")
     datasets = data_sets.open_dataset(data), data_sets.open_dataset(held_out_data)
-    data_sets.check_doubt_data(recipe, pipeline, *datasets)
+    data_sets.check_uncertainty_data(recipe, pipeline, *datasets)
     kinds = list(data_sets.outliers_beside(datasets[0].plan.objects.share_generic))
     about = training.record_uncertainty_run(recipe, run.out, watched, kinds)
     with tracked("rendering empty benches and outliers") as on_progress:
-        sets = data_sets.doubt_sets(recipe, pipeline, datasets, run.out / SAMPLES, on_progress)
+        sets = data_sets.uncertainty_sets(
+            recipe, pipeline, datasets, run.out / SAMPLES, on_progress
+        )
     job = run.training(recipe, pipeline.record, about.watches)
     run.finish(
         recipe, training.launch(fabric, training.run_uncertainty, job, about, watched, *sets)

@@ -23,8 +23,7 @@ __all__ = [
     "Stimulus",
     "build_dataset",
     "check_arrays",
-    "check_doubt_data",
-    "doubt_sets",
+    "check_uncertainty_data",
     "draw_outlier",
     "label_recordings",
     "list_recordings",
@@ -45,19 +44,11 @@ __all__ = [
     "sense_object",
     "shard_origin",
     "shards_of",
+    "uncertainty_sets",
     "write_shards",
 ]
 
 from .build import HELD_OUT_SEED, TEST_SEED, TRAINING_SEED, BuildReport, build_dataset
-from .doubt_samples import (
-    EMPTY,
-    GENERIC,
-    ORDINARY,
-    check_doubt_data,
-    doubt_sets,
-    quality_set,
-    samples_on_disk,
-)
 from .labelled import (
     FRAMES_PER_RECORDING,
     Labelled,
@@ -89,3 +80,12 @@ from .shards import (
     shards_of,
 )
 from .training_maps import BareMaps, measured_bare_wall, read_maps, render_bare_wall
+from .uncertainty_samples import (
+    EMPTY,
+    GENERIC,
+    ORDINARY,
+    check_uncertainty_data,
+    quality_set,
+    samples_on_disk,
+    uncertainty_sets,
+)

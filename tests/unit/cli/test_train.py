@@ -21,8 +21,8 @@ from small_uncertainty import untrained_uncertainty, watched_weights
 
 from nlos_cam.cli import train as command
 from nlos_cam.cli.main import main
-from nlos_cam.dataset import TRAINING_OUTLIERS, DatasetPlan, doubt_samples, training_maps
-from nlos_cam.dataset.doubt_samples import EMPTY, ORDINARY, DoubtSamples
+from nlos_cam.dataset import TRAINING_OUTLIERS, DatasetPlan, training_maps, uncertainty_samples
+from nlos_cam.dataset.uncertainty_samples import EMPTY, ORDINARY, UncertaintySamples
 from nlos_cam.files import claim
 from nlos_cam.objects import CATEGORIES
 
@@ -46,14 +46,14 @@ Patch = pytest.MonkeyPatch
 Run = Callable[..., Any]
 
 
-def _doubt_samples(
+def _uncertainty_samples(
     _: Path, counts: dict[str, int], seed: int, *__: object, **___: object
-) -> DoubtSamples:
+) -> UncertaintySamples:
     """Return samples of which every fourth cannot be seen."""
     kinds = [kind for kind, count in counts.items() for _ in range(count)]
     maps = small_maps(len(kinds), seed % 97)
     cells = np.where(np.arange(len(kinds)) % 4 == 0, 0, 100).astype(np.int32)
-    return DoubtSamples(
+    return UncertaintySamples(
         maps.depth_m, maps.intensity, maps.image.astype(np.float16), cells, np.array(kinds)
     )
 
@@ -92,7 +92,7 @@ def exported(tmp_path_factory: pytest.TempPathFactory) -> Iterator[list[Path]]:
             "nlos_cam.dataset.procedural_images",
             lambda seed, count, *_, **__: small_images(count, seed),
         )
-        patch.setattr(doubt_samples, "samples_on_disk", _doubt_samples)
+        patch.setattr(uncertainty_samples, "samples_on_disk", _uncertainty_samples)
         patch.setenv("NLOS_CAM_CACHE", str(tmp_path_factory.mktemp("cache")))
         yield folders
 
@@ -323,7 +323,7 @@ def test_train_doubt_ignores_invisible_outliers(go: Run, folder: Path, monkeypat
     go("doubt", "--weights", folder / "two")
     training = sets[0]
     per_kind = dict.fromkeys(TRAINING_OUTLIERS, 7)
-    every = _doubt_samples(
+    every = _uncertainty_samples(
         Path(), {EMPTY: 14, ORDINARY: 7 * len(TRAINING_OUTLIERS) // 2, **per_kind}, 0
     )
     outliers = ~np.isin(every.kind, [EMPTY, ORDINARY])

@@ -16,16 +16,8 @@ from nlos_cam.dataset import (
     SHAPE_OUTLIERS,
     TRAINING_OUTLIERS,
     Stimulus,
-    doubt_samples,
     outliers,
-)
-from nlos_cam.dataset.doubt_samples import (
-    EMPTY,
-    GENERIC,
-    ORDINARY,
-    SEEDS_PER_BENCH,
-    _stimulus,
-    make_samples,
+    uncertainty_samples,
 )
 from nlos_cam.dataset.outliers import (
     SLIGHT,
@@ -37,6 +29,14 @@ from nlos_cam.dataset.outliers import (
     vary_empty_bench,
 )
 from nlos_cam.dataset.plan import move_lidar
+from nlos_cam.dataset.uncertainty_samples import (
+    EMPTY,
+    GENERIC,
+    ORDINARY,
+    SEEDS_PER_BENCH,
+    _stimulus,
+    make_samples,
+)
 from nlos_cam.objects import object_box
 from nlos_cam.render import SensorModel
 
@@ -172,7 +172,9 @@ def test_ordinary_and_half_of_outlier_benches_lie_slightly_off_and_kinds_share_n
     assert ordinary[0] == ordinary[1] != ordinary[2]
     kinds = [EMPTY, ORDINARY, *TRAINING_OUTLIERS, *HELD_OUT_OUTLIERS]
     for of in range(3):
-        assert len({doubt_samples._generator(kind, 3, of).bytes(8) for kind in kinds}) == len(kinds)
+        assert len({uncertainty_samples._generator(kind, 3, of).bytes(8) for kind in kinds}) == len(
+            kinds
+        )
     slight = [
         _stimulus(kind, SEEDS_PER_BENCH, RIG, SENSOR) for kind in ("plates", "blobs", ORDINARY)
     ]
@@ -183,7 +185,7 @@ def test_ordinary_and_half_of_outlier_benches_lie_slightly_off_and_kinds_share_n
 def test_usual_objects_are_as_many_as_outliers_with_generic_shapes_by_their_share() -> None:
     recipe = small_recipe(task="doubt", outliers=20, empties=9)
     for share, kinds in ((0.0, 17), (0.25, 8)):
-        counts = doubt_samples.counts_of(recipe, share)
+        counts = uncertainty_samples.counts_of(recipe, share)
         assert counts[EMPTY] == 9
         assert sum(counts.values()) == 9 + kinds * 20 + kinds * 10
         assert counts.get(GENERIC, 0) == share * kinds * 10
@@ -197,16 +199,16 @@ def test_samples_on_disk_makes_only_missing_samples(
 ) -> None:
     made = list[tuple[str, int]]()
 
-    def quick(kind: str, seeds: range, *_: object) -> doubt_samples.DoubtSamples:
+    def quick(kind: str, seeds: range, *_: object) -> uncertainty_samples.UncertaintySamples:
         made.append((kind, seeds.start))
         maps = np.zeros((len(seeds), 2, 2), np.float32)
         kinds = np.array([kind] * len(seeds))
-        return doubt_samples.DoubtSamples(
+        return uncertainty_samples.UncertaintySamples(
             maps, maps, maps.astype(np.float16), np.array(seeds, np.int32), kinds
         )
 
-    monkeypatch.setattr(doubt_samples, "make_samples", quick)
-    samples_on_disk = doubt_samples.samples_on_disk
+    monkeypatch.setattr(uncertainty_samples, "make_samples", quick)
+    samples_on_disk = uncertainty_samples.samples_on_disk
     first = samples_on_disk(tmp_path, {EMPTY: 150}, 7, RIG, SENSOR)
     assert made == [(EMPTY, 7), (EMPTY, 107)]
     told = list[tuple[int, int]]()

@@ -63,7 +63,7 @@ HELD_OUT_SHARE = 0.15
 
 
 @dataclass(frozen=True)
-class DoubtSamples:
+class UncertaintySamples:
     """Maps of hidden objects, with the truth."""
 
     depth_m: Float32
@@ -82,14 +82,14 @@ class DoubtSamples:
     def __len__(self) -> int:
         return len(self.kind)
 
-    def where(self, chosen: NDArray[np.bool_]) -> "DoubtSamples":
+    def where(self, chosen: NDArray[np.bool_]) -> "UncertaintySamples":
         """Return the samples of a mask (n,)."""
-        return DoubtSamples(**{name: values[chosen] for name, values in vars(self).items()})
+        return UncertaintySamples(**{name: values[chosen] for name, values in vars(self).items()})
 
 
 def make_samples(
     kind: str, seeds: Sequence[int], rig: Rig, sensor: SensorModel, accuracy: str = "draft"
-) -> DoubtSamples:
+) -> UncertaintySamples:
     """Return samples of one kind, the same bits for the same seeds; SEEDS_PER_BENCH consecutive
     ones share a bench.
 
@@ -101,7 +101,7 @@ def make_samples(
     renderings = [render(stimulus.scene, accuracy) for stimulus in stimuli]
     noises = [_generator(kind, seed, 2) for seed in seeds]
     maps = [_sense(*each) for each in zip(stimuli, renderings, noises, strict=True)]
-    return DoubtSamples(
+    return UncertaintySamples(
         np.stack([one.depth_m for one in maps]),
         np.stack([one.intensity for one in maps]),
         np.stack([_truth(stimulus) for stimulus in stimuli]),
@@ -161,7 +161,7 @@ def samples_on_disk(
     *,
     accuracy: str = "draft",
     on_progress: OnProgress = ignore,
-) -> DoubtSamples:
+) -> UncertaintySamples:
     """Return `counts` samples of each kind; those missing in the folder are made and stored
     there.
     """
@@ -169,18 +169,18 @@ def samples_on_disk(
     about = f"v{VERSION}-{rig.checksum}-{accuracy}"
     done = 0
     total = sum(counts.values())
-    parts = list[DoubtSamples]()
+    parts = list[UncertaintySamples]()
     for kind, seeds in _pieces(counts, first_seed):
         path = folder / f"{about}-{kind.replace(' ', '_')}-{seeds.start}-{len(seeds)}.npz"
         try:
-            part = DoubtSamples(**read_arrays(path))
+            part = UncertaintySamples(**read_arrays(path))
         except (OSError, ValueError, TypeError):  # absent, or damaged: it is made again
             part = make_samples(kind, seeds, rig, sensor, accuracy)
             with atomic_file(path) as unfinished, unfinished.open("wb") as file:
                 np.savez(file, **vars(part))
         parts.append(part)
         on_progress(done := done + len(seeds), total)
-    return DoubtSamples(
+    return UncertaintySamples(
         **{name: np.concatenate([vars(part)[name] for part in parts]) for name in vars(parts[0])}
     )
 
@@ -205,7 +205,7 @@ def counts_of(recipe: UncertaintyRecipe, share_generic: float = 0.0) -> dict[str
 
 
 def _uncertainty_set(
-    pipeline: models.Reconstructor, ordinary_maps: MapSet, samples: DoubtSamples
+    pipeline: models.Reconstructor, ordinary_maps: MapSet, samples: UncertaintySamples
 ) -> UncertaintySet:
     """Return a dataset's maps of ordinary objects and the visible samples, with the pipeline's
     images of both.
@@ -235,7 +235,7 @@ def _images(pipeline: models.Reconstructor, maps: MapSet) -> NDArray[np.float16]
     return np.concatenate([pipeline(*pair) for pair in pairs]).astype(np.float16)
 
 
-def doubt_sets(
+def uncertainty_sets(
     recipe: UncertaintyRecipe,
     pipeline: models.Reconstructor,
     datasets: tuple[Dataset, Dataset],
@@ -324,7 +324,7 @@ def shared_error_v(image: Float32, truth: Float32) -> Float32:
     return np.where(count > 0, total / np.maximum(count, 1), np.nan).astype(np.float32)
 
 
-def check_doubt_data(
+def check_uncertainty_data(
     recipe: UncertaintyRecipe, pipeline: models.Reconstructor, training: Dataset, held_out: Dataset
 ) -> None:
     """Raise SceneError where datasets, weights and recipe do not fit together."""
