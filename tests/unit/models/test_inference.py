@@ -170,7 +170,7 @@ def test_shipped_graphs_equal_shipped_checkpoint_in_torch(name: str) -> None:
     )
     shipped = shipped_folder(name)
     network = load_reconstructor(shipped, Path("unused"))
-    doubt = load_uncertainty_model(shipped, Path("unused"))
+    uncertainty = load_uncertainty_model(shipped, Path("unused"))
     assert isinstance(network, OnnxReconstructor)
     mine = network(*maps)
     its = TorchReconstructor(*load_network(shipped), "cpu")(*maps)
@@ -181,7 +181,7 @@ def test_shipped_graphs_equal_shipped_checkpoint_in_torch(name: str) -> None:
     reference = load_uncertainty_network(shipped)
     with torch.inference_mode():
         theirs = reference[0](*(torch.from_numpy(part) for part in (*maps, mine)))
-    for said, wanted in zip(doubt(*maps, mine), theirs, strict=True):
+    for said, wanted in zip(uncertainty(*maps, mine), theirs, strict=True):
         np.testing.assert_allclose(said, wanted, rtol=1e-3, atol=1e-5)
 
 

@@ -60,7 +60,7 @@ def test_foreground_rmse_is_over_shared_pixels() -> None:
         assert np.isnan(metrics.foreground_rmse_mm(image, truth, 300.0))
 
 
-def test_foreground_rmse_takes_faint_pixels_as_the_farthest_surface() -> None:
+def test_foreground_rmse_takes_faint_pixels_as_the_farthest() -> None:
     assert metrics.foreground_rmse_mm(_square(0.06), _square(metrics.MIN_V), 300.0)[
         0
     ] == pytest.approx(0, abs=1e-6)
@@ -144,7 +144,7 @@ def test_absolute_error_is_least_at_weighted_median(
 
 
 @pytest.mark.parametrize("kind", ["squared", "absolute"])
-def test_image_error_is_a_sum_over_pixels_and_a_mean_over_samples(kind: ImageLoss) -> None:
+def test_image_error_sums_pixels_and_averages_samples(kind: ImageLoss) -> None:
     generator = torch.Generator().manual_seed(0)
     image, truth = (torch.rand(2, 3, 64, 64, generator=generator) for _ in range(2))
     truth *= truth.amax(1, keepdim=True) > 0.5

@@ -51,7 +51,7 @@ def _fitted(maps: tuple[Tensor, Tensor], intensities: int = 1) -> Preprocess:
     return preprocess
 
 
-def test_split_and_stack_puts_the_halves_in_channels_of_their_own() -> None:
+def test_split_and_stack_gives_halves_channels_of_their_own() -> None:
     column = torch.arange(80.0).expand(1, 64, 80)
     left = column[0, :, :40]
     right = column[0, :, 40:]
@@ -61,7 +61,7 @@ def test_split_and_stack_puts_the_halves_in_channels_of_their_own() -> None:
     )
 
 
-def test_split_and_stack_marks_a_missing_return_in_all_its_channels() -> None:
+def test_split_and_stack_marks_a_missing_return_everywhere() -> None:
     depth = torch.ones(1, 64, 80)
     intensity = torch.ones(1, 64, 80)
     depth[0, 5, 10] = torch.nan

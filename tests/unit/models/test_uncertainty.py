@@ -65,7 +65,7 @@ def test_features_mark_a_cell_without_return(network: UncertaintyNetwork) -> Non
 
 @pytest.mark.parametrize("name", HARD_MAPS)
 @pytest.mark.parametrize("v", [0.0, 1.0])
-def test_doubt_of_hard_maps_is_finite_and_in_range(
+def test_uncertainty_of_hard_maps_is_finite_and_in_range(
     network: UncertaintyNetwork, name: str, v: float
 ) -> None:
     calibrated = CalibratedUncertainty(network, (1.0, 2.0), 3.0).eval()
@@ -180,7 +180,7 @@ def test_loss_is_least_at_the_mean_error_of_shared_pixels() -> None:
     assert error.tolist() == [0.25]
 
 
-def test_doubt_batches_mirror_maps_with_their_images() -> None:
+def test_uncertainty_batches_mirror_maps_with_their_images() -> None:
     some = small_uncertainty_set(32, 0)
     batch = next(iter(uncertainty.uncertainty_batches(some, 32, torch.Generator().manual_seed(0))))
     assert sorted(batch.nothing.tolist()) == sorted(some.nothing.astype(float).tolist())
@@ -219,7 +219,7 @@ def record(tmp_path: Path, watched: Path) -> UncertaintyRecord:
     return untrained_uncertainty(tmp_path / "run", watched)
 
 
-def test_doubt_is_restored_with_the_weights_that_it_watches(
+def test_uncertainty_network_is_restored_with_the_weights_that_it_watches(
     tmp_path: Path, watched: Path, record: UncertaintyRecord
 ) -> None:
     network, found = uncertainty_network.load_uncertainty_network(tmp_path / "run")
@@ -244,7 +244,7 @@ def test_doubt_is_restored_with_the_weights_that_it_watches(
         *((records.UNCERTAINTY_RECORD, text) for text in (b"{", b'{"watches": "x"}', b"\xff")),
     ],
 )
-def test_load_doubt_refuses_other_weights_or_damaged_record(
+def test_uncertainty_network_refuses_other_weights_or_damaged_record(
     tmp_path: Path, name: str, content: bytes
 ) -> None:
     (tmp_path / "run" / name).write_bytes(content)
@@ -267,16 +267,16 @@ def test_saved_bare_wall_is_exact_and_watched_weights_stay(
 
 
 @pytest.mark.slow
-def test_doubter_onnx_equals_torch_and_is_exported_once(
+def test_uncertainty_onnx_equals_torch_and_is_exported_once(
     tmp_path: Path, record: UncertaintyRecord
 ) -> None:
     folder = tmp_path / "run"
     cache = tmp_path / "cache"
-    doubter = load_uncertainty_model(folder, cache)
+    uncertainty_model = load_uncertainty_model(folder, cache)
     (model,) = cache.glob("doubt-*.onnx")
     written_ns = model.stat().st_mtime_ns
     again = load_uncertainty_model(folder, cache)
-    assert again.record == doubter.record == record
+    assert again.record == uncertainty_model.record == record
     assert model.stat().st_mtime_ns == written_ns
     for count in (1, 5):
         seen = *noise_maps(count), np.random.default_rng(count).random((count, 64, 64), np.float32)
@@ -361,7 +361,7 @@ def test_figures_are_finite_without_a_surface() -> None:
     assert np.isfinite(quality_features(nothing, said, nothing)).all()
 
 
-def test_model_takes_the_network_s_own_surface_if_fitted_with_one() -> None:
+def test_model_fitted_with_the_networks_surface_takes_it() -> None:
     """Without one it takes the uncertainty network's, and a model that was fitted without one
     leaves it out.
     """
