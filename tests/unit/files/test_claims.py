@@ -39,6 +39,7 @@ def test_exclusive_write_refuses_a_file_that_appeared(
             part.write_text("second", encoding="utf-8")
         assert path.read_text(encoding="utf-8") == "first"
         path.unlink()
+
     assert not list(tmp_path.iterdir())
 
 
@@ -49,8 +50,10 @@ def test_claim_refuses_a_second_writer_and_names_the_first(tmp_path: Path) -> No
         claim(tmp_path / "a"),
     ):
         pytest.fail("two writers")
+
     with claim(tmp_path / "a") as folder:
         assert folder.is_dir()
+
     assert not list(tmp_path.iterdir())
 
 
@@ -60,7 +63,8 @@ def test_reserved_path_is_written_by_its_process_alone(tmp_path: Path) -> None:
         process = FORK.Process(
             target=race, args=(tmp_path / "a", *(parts := (FORK.Barrier(1), FORK.SimpleQueue())), 1)
         )
-        claims._reserved, held = set(), claims._reserved
+        held = claims._reserved
+        claims._reserved = set()  # as another process has it
         process.start()
         process.join()
         claims._reserved = held
@@ -70,6 +74,7 @@ def test_reserved_path_is_written_by_its_process_alone(tmp_path: Path) -> None:
                 with pytest.raises(FileBusyError), claim(tmp_path / "a"):
                     pytest.fail("two writers in one process")
                 part.write_text(content, encoding="utf-8")
+
     assert [path.name for path in tmp_path.iterdir()] == ["a"]
 
 
@@ -86,17 +91,22 @@ def test_next_claim_removes_parts_of_the_killed_alone(
     ready = FORK.Event()
     process = FORK.Process(target=hold, args=(tmp_path / "a", ready))
     process.start()
+
     assert ready.wait(20)
+
     os.kill(process.pid or 0, signal.SIGKILL)
     process.join()
     (tmp_path / ".mine.part").mkdir()  # somebody else's, without our lock
+
     assert (tmp_path / ".a.part" / "part").exists()
+
     with claim(tmp_path / "living") as folder:
         (folder / "part").write_bytes(b"1")
         monkeypatch.setattr("nlos_cam.files.claims._swept", set())
         with claim(tmp_path / "b"):
             assert not (tmp_path / ".a.part").exists()
             assert (folder / "part").exists()
+
     assert [path.name for path in tmp_path.iterdir()] == [".mine.part"]
 
 
@@ -127,6 +137,7 @@ def test_one_of_many_racing_writers_wins(tmp_path: Path) -> None:
             racer.join()
         winners = [number for number in (results.get() for _ in racers) if number is not None]
         assert winners == [int(path.read_text(encoding="utf-8"))]
+
     assert len(list(tmp_path.iterdir())) == 10
 
 
@@ -150,5 +161,6 @@ def test_claim_is_tried_again_where_its_folder_goes_meanwhile(
         with claim(tmp_path / "b") as other:
             assert other.is_dir()
     (tmp_path / ".c.part").write_bytes(b"")
+
     with pytest.raises(FileExistsError), claim(tmp_path / "c"):
         pass

@@ -16,12 +16,17 @@ from nlos_cam.files import read_arrays, read_bounded, read_checked
 def test_checked_files_are_refused_when_any_byte_differs(tmp_path: Path) -> None:
     files.write_checked(tmp_path, {"a.bin": b"one", "b.bin": b"two"})
     files.write_checked(tmp_path, {"b.bin": b"three"})
+
     assert [read_checked(tmp_path / name, 10) for name in ("a.bin", "b.bin")] == [b"one", b"three"]
     assert sorted(path.name for path in tmp_path.iterdir()) == [files.CHECKSUMS, "a.bin", "b.bin"]
+
     (tmp_path / "a.bin").write_bytes(b"onf")
+
     with pytest.raises(ValueError, match="checksum"):
         read_checked(tmp_path / "a.bin", 10)
+
     (tmp_path / files.CHECKSUMS).unlink()
+
     assert read_checked(tmp_path / "a.bin", 10) == b"onf"  # weights from before checksums
 
 
@@ -41,6 +46,7 @@ def test_describe_gives_one_line() -> None:
         ValueError("a\n b"),
         KeyError(),
     ]
+
     assert [files.describe(error) for error in errors] == [
         "it is nested too deeply",
         "it needs more memory than there is",
@@ -76,12 +82,15 @@ def test_read_arrays_refuses_a_header_that_lies(
 
 def test_read_arrays_returns_what_was_saved_within_its_limit(tmp_path: Path) -> None:
     path = _lying(tmp_path, bytes)
+
     assert read_arrays(path)["depth_m"].tolist() == np.ones((4, 4)).tolist()
     with pytest.raises(ValueError, match="more than 0 MiB"):
         read_arrays(path, limit=100)
     with pytest.raises(ValueError, match="other"):
         read_arrays(path, ["other"])
+
     path.write_bytes(b"no archive")
+
     with pytest.raises(ValueError, match="zip"):
         read_arrays(path)
 
