@@ -83,10 +83,13 @@ class Residual(nn.Module):
         super().__init__()
         self.norm = nn.LayerNorm(norm)
         self.across = across
-        self.first, self.second, self.dropout = *layers, nn.Dropout(dropout)
+        self.first = layers[0]
+        self.second = layers[1]
+        self.dropout = nn.Dropout(dropout)
+
+        # Each block starts as the identity, so that a deep trunk trains from the first step, and
+        # blocks added to trained weights change nothing at first (`train_direct`).
         for parameter in self.second.parameters():
-            # Each block starts as the identity, so that a deep trunk trains from the first step,
-            # and blocks added to trained weights change nothing at first (`train_direct`).
             nn.init.zeros_(parameter)
 
     def forward(self, x: Tensor) -> Tensor:
@@ -94,9 +97,12 @@ class Residual(nn.Module):
         # Norm before the layers, not after (Xiong et al. 2020): the residual path stays linear,
         # and the rate needs little warm-up.
         y = self.norm(x)
-        y = y.transpose(-1, -2) if self.across else y
+        if self.across:
+            y = y.transpose(-1, -2)
         y = self.dropout(self.second(functional.gelu(self.first(y))))
-        return x + (y.transpose(-1, -2) if self.across else y)
+        if self.across:
+            y = y.transpose(-1, -2)
+        return x + y
 
 
 class CellNormal(nn.Module):
@@ -123,9 +129,12 @@ class CellNormal(nn.Module):
             # that sees bare wall in most of them.
             median = values.nanmedian(0).values.nan_to_num()
             spread = (values - median).square().nanmean(0).sqrt().nan_to_num()
-            spread = spread.clamp(
-                min=max(SMALLEST_SHARE * float(spread.median()), MIN_LIGHT_SPREAD * bool(channel))
-            )
+
+            smallest = SMALLEST_SHARE * float(spread.median())
+            if channel > 0:  # of light
+                smallest = max(smallest, MIN_LIGHT_SPREAD)
+            spread = spread.clamp(min=smallest)
+
             # Mirrored maps need the same normalisation, or the network is no longer symmetric.
             self.median[channel] = (median + median.flip(0)) / 2
             self.spread[channel] = (spread + spread.flip(0)) / 2
@@ -207,19 +216,14 @@ class DirectNetwork(nn.Module):
         self.patch = nn.Linear(channels * PATCH**2, within)
         self.merge = nn.Linear(4 * within, size.features)
         self.into = MirrorLinear(SIDE_INPUTS * size.features, size.width)
-        self.trunk = nn.Sequential(
-            *(
-                Residual(
-                    size.width,
-                    (
-                        MirrorLinear(size.width, 2 * size.width),
-                        MirrorLinear(2 * size.width, size.width),
-                    ),
-                    dropout,
-                )
-                for _ in range(size.blocks)
+        blocks = list[nn.Module]()
+        for _ in range(size.blocks):
+            over_sides = (
+                MirrorLinear(size.width, 2 * size.width),
+                MirrorLinear(2 * size.width, size.width),
             )
-        )
+            blocks.append(Residual(size.width, over_sides, dropout))
+        self.trunk = nn.Sequential(*blocks)
         tokens = SIDE_TOKENS[0] * SIDE_TOKENS[1]
         self.out = MirrorLinear(size.width, tokens * size.token)
         self.place = nn.Parameter(0.02 * torch.randn(tokens, size.token))

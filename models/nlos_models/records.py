@@ -27,7 +27,9 @@ SIMULATION_ONLY = "simulation only: the L515's laser is infrared (860 nm)"
 """Note on all data, weights and results in color."""
 
 RECORD = "checkpoint.json"
-DIRECT, PAPER = SHIPPED = "direct", "paper"
+DIRECT = "direct"
+PAPER = "paper"
+SHIPPED = DIRECT, PAPER
 """Names of the weights that come with the package, the default ones first; DIRECT.safetensors is a
 direct network.
 """

@@ -1,4 +1,4 @@
-"""Untrained doubt network on disk beside random bytes as its pipeline's weights, and small training
+"""Untrained uncertainty network on disk beside random bytes as its pipeline's weights, and small training
 sets.
 """
 
@@ -25,7 +25,7 @@ def watched_weights(folder: Path) -> Path:
 
 
 def untrained_uncertainty(folder: Path, watched: Path, seed: int = 0) -> UncertaintyRecord:
-    """Write a doubt network of random weights whose batch norms hold statistics."""
+    """Write a uncertainty network of random weights whose batch norms hold statistics."""
     torch.manual_seed(seed)
     network = UncertaintyNetwork()
     with torch.no_grad():

@@ -29,9 +29,11 @@ RIG = load_rig("paper-rig")
 @pytest.fixture(scope="module")
 def processing() -> Pipeline:
     cache = cache_folder() / "onnx"
-    doubter = load_uncertainty_model(None, cache)
-    assert doubter is not None
-    return Pipeline(CalibratedRig(RIG), load_reconstructor(None, cache), uncertainty_model=doubter)
+    uncertainty_model = load_uncertainty_model(None, cache)
+    assert uncertainty_model is not None
+    return Pipeline(
+        CalibratedRig(RIG), load_reconstructor(None, cache), uncertainty_model=uncertainty_model
+    )
 
 
 def frames_of(stimulus: Stimulus, count: int, seed: int) -> list[Frame]:

@@ -75,17 +75,21 @@ class Answer:
 class Pipeline:
     """Pipeline of `live` for single frames, without a memory."""
 
-    def __init__(self, rig: Rig, network: Reconstructor, doubter: UncertaintyModel) -> None:
+    def __init__(
+        self, rig: Rig, network: Reconstructor, uncertainty_model: UncertaintyModel
+    ) -> None:
         self.rig = rig
-        self.limits = verdict_limits(doubter)
-        self.learnt = doubter.record.learnt
+        self.limits = verdict_limits(uncertainty_model)
+        self.learnt = uncertainty_model.record.learnt
         self._network = network
-        self._doubter = doubter
+        self._uncertainty_model = uncertainty_model
 
     def answer(self, depth_m: NDArray[np.float32], intensity: NDArray[np.float32]) -> Answer:
         """Return the answer to maps (64, 80)."""
         maps = LidarMaps(depth_m, intensity, ~np.isnan(depth_m))
-        found = reconstruct(maps, self.rig, self._network, uncertainty_model=self._doubter)
+        found = reconstruct(
+            maps, self.rig, self._network, uncertainty_model=self._uncertainty_model
+        )
         shown, verdict = VerdictFilter(self.limits).decide(found, FrameConditions())
         return Answer(found, verdict, shown.has_surface)
 
@@ -300,14 +304,14 @@ def main() -> None:
     asked = parser.parse_args()
     with harness.one_line_errors():
         network = load_reconstructor(asked.weights, cache_folder() / "onnx")
-        doubter = load_uncertainty_model(asked.weights, cache_folder() / "onnx")
-        if doubter is None:
+        uncertainty_model = load_uncertainty_model(asked.weights, cache_folder() / "onnx")
+        if uncertainty_model is None:
             raise SceneError(
-                f"{weights_folder(asked.weights)} has no doubt network: train one with `train"
+                f"{weights_folder(asked.weights)} has no uncertainty network: train one with `train"
                 " doubt`"
             )
-        pipeline = Pipeline(rig_of(network.record), network, doubter)
-        start = doubter.record.recipe.held_out
+        pipeline = Pipeline(rig_of(network.record), network, uncertainty_model)
+        start = uncertainty_model.record.recipe.held_out
         result = study(pipeline, asked.held_out, asked.samples, asked.count, asked.empty, start)
     result["limits"] = {"nothing": pipeline.limits.nothing, "outside": pipeline.limits.outside}
     harness.write("doubt", result, asked.out)

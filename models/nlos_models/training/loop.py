@@ -478,9 +478,13 @@ class _Run:
             self._swap()
 
     def _swap(self) -> None:
-        for own, average in zip(self._free, self.average, strict=True) if self.average else ():
+        if not self.average:
+            return
+        for own, average in zip(self._free, self.average, strict=True):
             # Pointers are exchanged, no memory is copied.
-            own.data, average.data = average.data, own.data
+            trained = own.data
+            own.data = average.data
+            average.data = trained
 
     def log_minute(self) -> None:
         """Append a line to MINUTES: steps done, rate, mean loss of the epoch so far, samples per

@@ -1,4 +1,4 @@
-"""The fake says what a doubt network says: the same names, shapes and kinds."""
+"""The fake says what a uncertainty network says: the same names, shapes and kinds."""
 
 import numpy as np
 import torch
@@ -6,7 +6,7 @@ from fake_uncertainty import FakeUncertainty
 from nlos_models.uncertainty_network import CalibratedUncertainty, UncertaintyNetwork
 
 
-def test_fake_doubter_answers_in_the_shapes_of_a_real_network() -> None:
+def test_fake_uncertainty_answers_in_the_shapes_of_a_real_network() -> None:
     maps = np.full((1, 64, 80), 0.3, np.float32)
     image = np.zeros((1, 64, 64), np.float32)
     real = CalibratedUncertainty(UncertaintyNetwork(), (1.0, 1.0), 1.0).eval()(

@@ -70,8 +70,8 @@ def test_untrained_weights_load_and_differ_by_seed(
         made = [pipeline.latent(*maps) for pipeline in (one, other)]
     assert made[0].shape == (2, 256)
     assert not torch.allclose(*made)
-    doubts = [load_uncertainty_network(tmp_path / f"doubt{seed}")[0] for seed in (0, 1)]
-    assert not torch.equal(*(doubt.network.pixels.weight for doubt in doubts))
+    networks = [load_uncertainty_network(tmp_path / f"doubt{seed}")[0] for seed in (0, 1)]
+    assert not torch.equal(*(each.network.pixels.weight for each in networks))
 
 
 @pytest.mark.parametrize("channels", [(), (3,)])
@@ -84,7 +84,7 @@ def test_hard_maps_have_the_named_extremes(channels: tuple[int, ...]) -> None:
     assert {i.shape for i in intensity} == {(1, *channels, 64, 80)}
 
 
-def test_small_doubt_set_has_all_kinds_and_varying_errors() -> None:
+def test_small_uncertainty_set_has_all_kinds_and_varying_errors() -> None:
     some = small_uncertainty_set(40, 0)
     assert (some.nothing.sum(), some.outside.sum()) == (20, 10)
     assert not (some.nothing & some.outside).any()

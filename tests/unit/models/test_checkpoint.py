@@ -76,8 +76,10 @@ def test_pipeline_round_trip_is_float16_with_exact_statistics(tmp_path: Path, wi
     pipeline.preprocess.spread.copy_(torch.tensor([1e-8, 0.2, 100_000.0, 3.0]))
     checkpoints.save_pipeline(tmp_path, pipeline, saved)
     loaded, record = checkpoint.load_pipeline(tmp_path)
+
     assert record == saved
     assert not loaded.training
+
     for name, tensor in pipeline.state_dict().items():
         back = loaded.state_dict()[name]
         exact = "running" in name or "preprocess" in name
@@ -86,6 +88,7 @@ def test_pipeline_round_trip_is_float16_with_exact_statistics(tmp_path: Path, wi
             back, tensor, rtol=0 if exact else 1e-3, atol=0 if exact else 1e-7
         )
     tensors = load_file(tmp_path / "decoder.safetensors")
+
     assert tensors["output.weight"].dtype == torch.float16
     assert all(t.dtype == torch.float32 for name, t in tensors.items() if "running" in name)
 
@@ -98,15 +101,18 @@ def test_vae_round_trip_keeps_weights_and_bytes(tmp_path: Path, color: bool) -> 
     checkpoints.save_vae(tmp_path / "one", vae, saved)
     loaded, record = checkpoints.load_vae(tmp_path / "one")
     checkpoints.save_vae(tmp_path / "two", loaded, record)
+
     assert record == saved
     assert not loaded.training
     torch.testing.assert_close(loaded.state_dict(), vae.state_dict(), rtol=1e-3, atol=1e-7)
+
     for name in ("encoder", "decoder"):
         first, second = (
             (tmp_path / n / f"{name}.safetensors").read_bytes() for n in ("one", "two")
         )
         assert first == second
     checkpoints.save_vae(tmp_path / "two", new_vae(color=not color), saved)
+
     with pytest.raises(CheckpointError, match="encoder"):
         checkpoints.load_vae(tmp_path / "two")
 
@@ -121,6 +127,7 @@ def test_load_pipeline_names_missing_or_corrupt_file(
     path.unlink()
     if content is not None:
         path.write_bytes(whole[:-100] if isinstance(content, str) else content)
+
     with pytest.raises(CheckpointError, match=rf"{part}\.safetensors"):
         checkpoint.load_pipeline(folder)
 
@@ -133,6 +140,7 @@ def test_load_pipeline_refuses_any_flipped_bit(folder: Path, saved: Path, seed: 
     content = bytearray(path.read_bytes())
     content[random.integers(len(content))] ^= 1 << random.integers(8)
     _replace(path, bytes(content))
+
     with pytest.raises(CheckpointError, match=rf"{path.stem}\.safetensors"):
         checkpoint.load_pipeline(folder)
 
@@ -187,12 +195,14 @@ def test_load_fitting_loads_matching_tensors_and_reports_rest(folder: Path) -> N
     decoder = Decoder()
     own = state_of(decoder)
     report = checkpoints.load_fitting(path, decoder)
+
     assert report[1:] == (["output.bias"], ["output.more"], ["output.weight"])
     assert set(report.loaded) == own.keys() - {"output.bias", "output.weight"}
     assert all(
         name in str(report)
         for name in (f"{len(report.loaded)}", "output.bias", "output.more", "output.weight")
     )
+
     for name, tensor in decoder.state_dict().items():
         wanted = tensors[name] if name in report.loaded else own[name]
         assert torch.equal(tensor.float(), wanted.float()), name
@@ -218,6 +228,7 @@ def test_save_refuses_weights_beyond_float16_or_on_full_disk(
     monkeypatch.setattr(
         checkpoint, "write_checked", Mock(side_effect=OSError(28, "No space left on device"))
     )
+
     with pytest.raises(CheckpointError, match="No space left"):
         checkpoints.save_vae(tmp_path, ResVae(), RECORD)
 
@@ -241,6 +252,7 @@ def test_record_names_last_run_of_each_task_and_keeps_others(
 ) -> None:
     record = CheckpointRecord.of([RUNS[name] for name in runs.split()], RIG, "difference maps")
     latest = [record.vae_recipe, record.compressor_recipe, record.transfer_recipe]
+
     assert latest == [RUNS.get(name) for name in named]
     assert record.earlier == [RUNS[name] for name in earlier.split()]
     assert sorted(name for name, run in RUNS.items() if run in record.runs) == sorted(runs.split())
@@ -263,4 +275,5 @@ def test_record_in_color_notes_simulation_only() -> None:
         assert CheckpointRecord.model_validate_json(record.model_dump_json()) == record
         assert CheckpointRecord.model_validate(record.model_dump(exclude={"note"})) == record
     depth = CheckpointRecord.of([RUNS["v0"], RUNS["c0"]], RIG)
+
     assert (depth.color, depth.note) == (False, "")

@@ -145,6 +145,7 @@ def test_each_pixel_has_its_place(row: int, column: int) -> None:
     with torch.no_grad():
         network.heads.bias[64 + 8 * within + column % 8] += 1  # the second head: depth
     moved = (network.logits(normal) - plain).abs() > 0.5
+
     assert moved[0, 1, row, column]
     assert int(moved.sum()) == 64
 
@@ -157,6 +158,7 @@ def test_cells_are_normalised_symmetrically_and_clipped() -> None:
     depth_m[:, 3, 7] = torch.nan
     normal.learn(depth_m, intensity)
     values = normal(depth_m, intensity)
+
     assert (values[:, :, 3, 7] == 0).all()
     assert values.abs().max() <= direct.CLIP
     torch.testing.assert_close(normal(depth_m.flip(-2), intensity.flip(-2)), values.flip(-2))
@@ -171,12 +173,15 @@ def test_gain_of_a_frame_is_taken_out() -> None:
     )  # columns differ more and more
     intensity = 20 * torch.exp(busy)
     normal.learn(depth_m, intensity)
+
     assert float(normal.spread[1].min()) == pytest.approx(direct.MIN_LIGHT_SPREAD)
+
     for gain in (-1.0, 0.05, 0.7):
         brighter = torch.expm1(torch.log1p(intensity) + gain)
         torch.testing.assert_close(
             normal(depth_m, brighter), normal(depth_m, intensity), atol=1e-3, rtol=0
         )
+
     assert not normal(torch.full_like(depth_m, torch.nan), intensity).any()
 
 
@@ -189,6 +194,7 @@ def test_loss_is_least_at_the_truth() -> None:
         return torch.stack([torch.where(surface, 12.0, -12.0), depth], dim=1)
 
     exact = logits(truth > 0)
+
     assert float(two_heads_error(exact, truth)) < 1e-3
     torch.testing.assert_close(direct.image_from_logits(exact), truth, rtol=0, atol=1e-3)
     assert two_heads_error(logits(truth.roll(1, -1) > 0), truth) > 0.1
@@ -205,6 +211,7 @@ def test_image_is_cut_where_the_expected_overlap_is_largest() -> None:
     share[1, :, 40:] = 0.28
     share[1, 20:40, 40:44] = 0.4
     images = image_from_logits(torch.stack([torch.logit(share), torch.zeros_like(share)], dim=1))
+
     assert [int((image > 0).sum()) for image in images] == [400, 480, 0]
 
 
@@ -213,26 +220,35 @@ def test_color_is_learnt_by_the_same_two_heads(tmp_path: Path) -> None:
     source = Source(_painted(small_maps(12, 0)))
     network, figures = train_direct(recipe, source, _painted(small_maps(4, 1)), tmp_path)
     made = reconstruct(network, source.maps)
+
     assert made.shape == source.maps.image.shape
+
     found = color_metrics(made, source.maps.image.astype(np.float32))
+
     assert "held_out_colour_error" in figures
     assert found["silhouette_iou"].mean() > 0.5
     assert found["colour_error"].mean() < 0.2
+
     normal = source.batch.normal[:3].float()
+
     torch.testing.assert_close(
         network.logits(normal.flip(-2)), network.logits(normal).flip(-2), rtol=0, atol=1e-5
     )
+
     varied = vary(
         network.normal, normal, None, torch.full((3, 64, 80), 0.3), torch.full((3,), 0.01)
     )
     moved = (varied - normal) * network.normal.spread
     returns = (normal != 0).any(1) & (varied.abs() < 5).all(1)
+
     torch.testing.assert_close(
         moved[:, 0][returns], torch.full_like(moved[:, 0][returns], 0.01), atol=1e-4, rtol=0
     )
     assert float(moved[:, 1:].median()) >= 0
+
     save_direct(tmp_path, network, CheckpointRecord.of([recipe], ("paper-rig", "0" * 64)))
     again, record = load_network(tmp_path)
+
     assert (record.note, record.color) == (SIMULATION_ONLY, True)
     assert (
         float((np.abs(reconstruct(again, source.maps) - made) < 0.02).mean()) > 0.999
@@ -279,8 +295,11 @@ def test_training_goes_on_from_weights_that_grow(weights: Path, tmp_path: Path) 
         direct=SIZE.model_copy(update={"mixers": 3}),
     )
     start, runs = direct_start(recipe, weights)
+
     assert runs == [_recipe()]
+
     grown, _ = train_direct(recipe, Source(), small_maps(4, 1), tmp_path, start=start)
+
     np.testing.assert_allclose(
         reconstruct(grown, Source().maps), reconstruct(start, Source().maps), atol=1e-3
     )
@@ -300,6 +319,7 @@ def test_blend_is_the_mean_of_trained_and_earlier_weights(weights: Path, tmp_pat
     after = trained.state_dict()
     for name, found in blended.state_dict().items():
         torch.testing.assert_close(found, 0.75 * before[name] + 0.25 * after[name])
+
     assert (
         figures
         == figures_of(reconstruct(blended, small_maps(4, 1)), small_maps(4, 1).image)
@@ -312,9 +332,12 @@ def test_average_is_scored_and_kept_and_minutes_are_logged(tmp_path: Path) -> No
     network, figures = _train(tmp_path, Running(clock=lambda: float(next(times))))
     truth = as_images(small_maps(4, 1).image)[:, 0].numpy()
     error = np.square(reconstruct(network, small_maps(4, 1)) - truth).sum((1, 2)).mean()
+
     assert figures["held_out_loss"] == pytest.approx(error, rel=1e-5)
     assert (tmp_path / BEST).exists()
+
     lines = (tmp_path / MINUTES).read_text(encoding="utf-8").splitlines()
+
     assert lines[0].split()[1:3] == ["epoch", "0"]
     assert "samples/s" in lines[-1]
 
@@ -330,23 +353,30 @@ def weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.mark.slow
 def test_weights_are_exported_and_kept_apart_from_a_pipeline(weights: Path, tmp_path: Path) -> None:
     network, record = load_network(weights)
+
     assert record.runs == [_recipe()]
+
     maps = Source().maps
     images = load_reconstructor(weights, tmp_path)(maps.depth_m, maps.intensity)
+
     np.testing.assert_allclose(images, reconstruct(network, maps), atol=1e-5)
+
     told = load_reconstructor(weights, tmp_path).answer(maps.depth_m, maps.intensity)
     in_torch = TorchReconstructor(network, record, "cpu").answer(maps.depth_m, maps.intensity)
     for one, other in zip(told, in_torch, strict=True):
         np.testing.assert_allclose(one, other, atol=1e-5)
+
     assert ((told.surface > direct.CUTS[-1]) <= (told.image > 0)).all()
     assert ((told.image > 0) <= (told.surface > direct.CUTS[0])).all()
     assert not [*tmp_path.iterdir()]
+
     stored = onnx.load(weights / "network.onnx", load_external_data=False).graph.initializer
     inline = [
         each.name
         for each in stored
         if len(each.dims) == 2 and each.data_location != TensorProto.EXTERNAL
     ]
+
     assert not inline  # no matrix is stored twice, the transposed ones included
     with pytest.raises(CheckpointError, match="direct network"):
         load_pipeline(weights)
@@ -379,6 +409,7 @@ def test_varied_maps_are_those_of_another_wall_and_range() -> None:
         depth_m + offset_m[:, None, None], torch.expm1(torch.log1p(intensity)) * reflectance.exp()
     )
     varied = vary(normal, normal(depth_m, intensity), None, reflectance, offset_m)
+
     assert float((measured - varied).abs().median()) < 0.02
     torch.testing.assert_close(vary(normal, varied, None, None, None), varied, atol=1e-4, rtol=0)
 
@@ -400,11 +431,14 @@ def test_shift_follows_another_bench_and_nothing_else() -> None:
     normal.learn(depth_m, intensity)
     shifted.load_state_dict(normal.state_dict())
     shifted.shift(depth_m, intensity)
+
     torch.testing.assert_close(shifted.median, normal.median, rtol=0, atol=0.1)
+
     shifted.load_state_dict(normal.state_dict())
     brighter = torch.expm1(torch.log1p(intensity) + 0.4)  # a gain
     shifted.shift(depth_m + 0.03, brighter, slice(1, None))
     change = shifted.median - normal.median
+
     assert (change[0] == 0).all()
     torch.testing.assert_close(change[1], torch.full_like(change[1], float(change[1, 0, 0])))
     assert float(change[1, 0, 0]) == pytest.approx(0.4, abs=0.1)
@@ -419,12 +453,14 @@ def test_transfer_learns_the_bench_in_two_phases_and_resumes(tmp_path: Path) -> 
         return after, figures["held_out_loss"]
 
     network, loss = go(tmp_path / "whole")
+
     assert (
         loss
         < figures_of(reconstruct(_shaken(), small_maps(4, 1)), small_maps(4, 1).image)[
             "held_out_loss"
         ]
     )
+
     first = torch.load(
         io.BytesIO((tmp_path / "whole" / "all-layers" / LAST).read_bytes()[32:]), weights_only=True
     )
@@ -433,10 +469,13 @@ def test_transfer_learns_the_bench_in_two_phases_and_resumes(tmp_path: Path) -> 
         for name, values in network.state_dict().items()
         if not torch.equal(values, first["module"][name])
     }
+
     assert {name.partition(".")[0] for name in last} <= {"norm", "heads"}
     with pytest.raises(KeyboardInterrupt):
         go(tmp_path / "cut", Running(stop=iter([False] * 20 + [True]).__next__))
+
     resumed, again = go(tmp_path / "cut")
+
     assert again == loss
     assert not changed_tensors(network.state_dict(), resumed.state_dict())
 
@@ -450,9 +489,12 @@ def test_transfer_of_direct_weights_is_saved_with_both_runs(weights: Path, tmp_p
     figures = run_transfer(
         open_fabric(recipe), job, network, None, InMemory(Source().maps), small_maps(4, 1)
     )
+
     assert set(figures) == {"before", "after"}
     assert load_record(tmp_path / "out").runs == [*start.runs, recipe]
+
     maps = Source().maps
     (loaded, _) = load_network(tmp_path / "out")
     images = load_reconstructor(tmp_path / "out", tmp_path)(maps.depth_m, maps.intensity)
+
     np.testing.assert_allclose(images, reconstruct(loaded, maps), atol=1e-5)

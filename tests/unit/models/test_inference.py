@@ -93,14 +93,18 @@ def test_onnx_reconstruction_equals_torch(pair: Pair, batch: int) -> None:
     assert isinstance(pair[0], OnnxReconstructor)
     assert pair[0].record == pair[1].record == RECORD
     assert pair[0].runtime != pair[1].runtime
+
     maps = noise_maps(batch)
     mine, its = (reconstructor(*maps) for reconstructor in pair)
     for image, reconstructor in zip((mine, its), pair, strict=True):
         strided = reconstructor(*(np.asfortranarray(part) for part in maps))
         np.testing.assert_allclose(strided, image, atol=1e-6)
+
     assert mine.shape == its.shape == (batch, 64, 64)
     assert mine.dtype == its.dtype == np.float32
+
     both = (mine > 0) & (its > 0)
+
     assert ((mine > 0) != (its > 0)).sum((1, 2)).max() <= HANDFUL
     assert 0 < both.mean() < 1
     np.testing.assert_allclose(mine[both], its[both], atol=1e-4)
@@ -144,13 +148,18 @@ def test_linked_graphs_equal_full_exports_bit_for_bit(
     weights = Path(shutil.copytree(folders[0], tmp_path / "weights"))
     maps = noise_maps(3)
     (graph,) = export.export_folder(weights)
+
     assert graph.stat().st_size < 400_000
+
     linked = load_reconstructor(weights, tmp_path / "unused")
+
     np.testing.assert_array_equal(linked(*maps), pair[0](*maps))
     assert not (tmp_path / "unused").exists()
+
     content = bytearray((weights / "compressor.safetensors").read_bytes())
     content[-1] ^= 1  # the graph still opens
     (weights / "compressor.safetensors").write_bytes(content)
+
     with pytest.raises(CheckpointError, match="other weights"):
         OnnxReconstructor(graph, RECORD, checksum=checksum_of_watched(weights))
 
@@ -170,18 +179,22 @@ def test_shipped_graphs_equal_shipped_checkpoint_in_torch(name: str) -> None:
     )
     shipped = shipped_folder(name)
     network = load_reconstructor(shipped, Path("unused"))
-    doubt = load_uncertainty_model(shipped, Path("unused"))
+    uncertainty = load_uncertainty_model(shipped, Path("unused"))
+
     assert isinstance(network, OnnxReconstructor)
+
     mine = network(*maps)
     its = TorchReconstructor(*load_network(shipped), "cpu")(*maps)
     both = (mine > 0) & (its > 0)
+
     assert ((mine > 0) != (its > 0)).sum((1, 2)).max() <= HANDFUL
     assert both.mean() > 0
     np.testing.assert_allclose(mine[both], its[both], atol=1e-4)
+
     reference = load_uncertainty_network(shipped)
     with torch.inference_mode():
         theirs = reference[0](*(torch.from_numpy(part) for part in (*maps, mine)))
-    for said, wanted in zip(doubt(*maps, mine), theirs, strict=True):
+    for said, wanted in zip(uncertainty(*maps, mine), theirs, strict=True):
         np.testing.assert_allclose(said, wanted, rtol=1e-3, atol=1e-5)
 
 
@@ -191,9 +204,11 @@ def test_weights_without_graph_need_torch_in_one_line(
     for path in shipped_folder().glob("*.*"):
         if path.suffix != ".onnx":
             (tmp_path / path.name).symlink_to(path)
+
     assert errors.require("json", "reading").__name__ == "json"
     with pytest.raises(ModuleNotFoundError, match="no_such_module"):
         errors.require("no_such_module", "reading")
+
     monkeypatch.setitem(sys.modules, "nlos_models.export", None)
     without_torch = Mock(side_effect=ModuleNotFoundError("No module named 'torch'", name="torch"))
     monkeypatch.setattr(errors, "import_module", without_torch)
@@ -203,6 +218,7 @@ def test_weights_without_graph_need_torch_in_one_line(
         ) as found:
             load(tmp_path, tmp_path / "cache")
         assert "\n" not in str(found.value)
+
     with pytest.raises(MissingExtraError, match="training needs torch"):
         errors.require("nlos_models.training.loop", "training")
 
@@ -230,8 +246,13 @@ def test_weights_by_name_give_way_to_a_folder_of_that_name(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
+
     assert weights_folder(None) == shipped_folder() == weights_folder(Path("direct"))
+
     name = Path("paper")
+
     assert weights_folder(name) == weights_folder(None, "paper") == shipped_folder("paper")
+
     name.mkdir()
+
     assert (weights_folder(name), weights_folder(tmp_path / "other")) == (name, tmp_path / "other")

@@ -51,7 +51,9 @@ def test_silhouette_iou_takes_surface_above_5_percent() -> None:
 
 def test_foreground_rmse_is_over_shared_pixels() -> None:
     image = _square(0.6, columns=slice(10, 30))
+
     assert metrics.foreground_rmse_mm(image, _square(0.5), 300.0)[0] == pytest.approx(30, rel=1e-5)
+
     for image, truth in (
         (EMPTY, EMPTY),
         (EMPTY, _square(0.5)),
@@ -60,7 +62,7 @@ def test_foreground_rmse_is_over_shared_pixels() -> None:
         assert np.isnan(metrics.foreground_rmse_mm(image, truth, 300.0))
 
 
-def test_foreground_rmse_takes_faint_pixels_as_the_farthest_surface() -> None:
+def test_foreground_rmse_takes_faint_pixels_as_the_farthest() -> None:
     assert metrics.foreground_rmse_mm(_square(0.06), _square(metrics.MIN_V), 300.0)[
         0
     ] == pytest.approx(0, abs=1e-6)
@@ -72,6 +74,7 @@ def test_foreground_rmse_takes_faint_pixels_as_the_farthest_surface() -> None:
 def test_color_metrics_of_a_wrong_color() -> None:
     truth = _colored((0.9, 0.2, 0.1))
     image = _colored((0.9, 0.5, 0.1))
+
     assert [value.item() for value in metrics.color_metrics(truth, truth).values()] == [
         1.0,
         1.0,
@@ -109,6 +112,7 @@ def test_color_metrics_do_not_depend_on_channel_order() -> None:
     turned = metrics.color_metrics(image[:, [2, 0, 1]], truth[:, [2, 0, 1]])
     for name, value in metrics.color_metrics(image, truth).items():
         np.testing.assert_allclose(value, turned[name], rtol=1e-12)
+
     np.testing.assert_array_equal(
         metrics.brightness(image), metrics.brightness(image[:, [2, 0, 1]])
     )
@@ -124,6 +128,7 @@ def test_squared_error_is_least_at_weighted_mean(share: float, weight: float) ->
         image_error(torch.full_like(truth, best + off), truth, weight).item()
         for off in (-0.01, 0.0, 0.01)
     ]
+
     assert min(losses) == losses[1]
     assert losses[0] == pytest.approx(losses[2], rel=1e-4)
 
@@ -140,20 +145,24 @@ def test_absolute_error_is_least_at_weighted_median(
         v: image_error(torch.full_like(truth, v), truth, weight, "absolute").item()
         for v in (0.0, 0.2, 0.4, 0.6)
     }
+
     assert min(losses, key=lambda v: losses[v]) == best
 
 
 @pytest.mark.parametrize("kind", ["squared", "absolute"])
-def test_image_error_is_a_sum_over_pixels_and_a_mean_over_samples(kind: ImageLoss) -> None:
+def test_image_error_sums_pixels_and_averages_samples(kind: ImageLoss) -> None:
     generator = torch.Generator().manual_seed(0)
     image, truth = (torch.rand(2, 3, 64, 64, generator=generator) for _ in range(2))
     truth *= truth.amax(1, keepdim=True) > 0.5
     channels = sum(image_error(image[:, [k]], truth[:, [k]], 2.0, kind) for k in range(3))
+
     torch.testing.assert_close(image_error(image, truth, 2.0, kind), channels)
+
     image = torch.zeros(2, 1, 64, 64)
     truth = torch.zeros(2, 1, 64, 64)
     image[0, 0, 3, 4] = 1.0
     image[0, 0, 5, 6] = 0.5
+
     assert image_error(image, truth).item() == pytest.approx((1 + 0.25) / 2)
     assert image_error(torch.ones(1, 1, 64, 64, dtype=torch.bfloat16), truth[:1]).item() == 4096
 
@@ -174,6 +183,7 @@ def test_kl_divergence_matches_closed_form(mean: float, spread: float) -> None:
         256 * torch.distributions.kl_divergence(normal(mean, spread), normal(0.0, 1.0)).item()
     )
     found = kl_divergence(mean * entries, (spread**2 * entries).log()).item()
+
     assert found == pytest.approx(expected, rel=1e-5)
     assert (found == 0) == (mean == 0)
 

@@ -50,7 +50,9 @@ def test_compressor_has_table_s2_with_channels_scaled_by_width(
         out = block[-1].out_channels
         assert max(c.stride[0] for c in block) == stride
         assert out == full if width == 1 else out % 8 == 0 and abs(out - width * full) <= 8
+
     assert (_parameters(compressor) == 2_552_096) == (width == 1)
+
     with torch.inference_mode():
         assert compressor(torch.randn(1, 4, 100, 100)).shape == (1, 256)
 
@@ -60,15 +62,20 @@ def test_blocks_pass_input_on_only_where_shapes_agree() -> None:
     residual = [
         InvertedResidual(16, out, stride, 6).residual for out, stride in ((16, 1), (24, 1), (16, 2))
     ]
+
     assert residual == [True, False, False]
+
     shortcuts = [
         Bottleneck(channels, 64, stride).shortcut
         for channels, stride in ((256, 1), (64, 1), (256, 2))
     ]
+
     assert [isinstance(shortcut, nn.Identity) for shortcut in shortcuts] == [True, False, False]
+
     block = Bottleneck(256, 64, 1).eval()
     nn.init.zeros_(block.main[-1].weight)
     x = torch.rand(2, 256, 5, 5)
+
     assert torch.equal(block(x), x)
 
 
@@ -79,6 +86,7 @@ def test_resnet_has_published_stages_and_one_dropout() -> None:
         assert _parameters(net) == 24_572_800  # 8 channels to a latent of 512
     blocks = [_convolutions(block.main) for block in net.features if type(block) is Bottleneck]
     stages = [*[(64, 256)] * 3, *[(128, 512)] * 4, *[(256, 1024)] * 6, *[(512, 2048)] * 3]
+
     assert [(c[0].out_channels, c[2].out_channels) for c in blocks] == stages
     assert [tuple(c.kernel_size[0] for c in each) for each in blocks] == [(1, 3, 1)] * 16
     assert [k for k, each in enumerate(blocks) if each[1].stride == (2, 2)] == [3, 7, 13]
@@ -109,8 +117,10 @@ def test_decoder_matches_table_s1_and_encoder_mirrors_it(vae: ResVae) -> None:
 
     down = list(vae.encoder.blocks)
     up = list(vae.decoder.blocks)[::-1]
+
     assert [ends(block) for block in down] == [ends(block)[::-1] for block in up]
     assert [_norms(block)[0] for block in down] == [_norms(block)[0] for block in up]
+
     for conv in (conv for block in (*down, *up) for conv in _convolutions(block)):
         assert (conv.kernel_size, conv.stride, conv.padding) == ((3, 3), (1, 1), (1, 1))
 
@@ -118,10 +128,15 @@ def test_decoder_matches_table_s1_and_encoder_mirrors_it(vae: ResVae) -> None:
 def test_color_vae_differs_in_outer_layers_alone() -> None:
     with torch.device("meta"):
         vae = new_vae(color=True)
+
     assert (vae.latent, CHANNELS, COLOR_OUTPUTS) == (512, 3, 512)
+
     counts = [sum(p.numel() for p in part.parameters()) for part in (vae.encoder, vae.decoder)]
+
     assert counts == [12_715_344, 12_188_083]
+
     blocks = tuple(_channels(block) for block in vae.decoder.blocks)
+
     assert blocks == (((512, 256), (256, 512), (512, 512)), *TABLE_S1[1:])
     assert _channels(vae.decoder.output) == ((32, 3),)
     assert _channels(vae.encoder.input) == ((3, 32),)
@@ -147,9 +162,12 @@ def test_log_variance_is_limited_to_finite_exponentials(
     nn.init.constant_(encoder.log_variance.weight, 0.0)
     nn.init.constant_(encoder.log_variance.bias, value)
     mean, log_variance = encoder(torch.rand(1, 1, 64, 64))
+
     assert (log_variance.abs() == LOG_VARIANCE_LIMIT).all()
+
     for sign in (1, -1):
         assert torch.isfinite(torch.exp(sign * log_variance.to(precision))).all()
+
     assert torch.isfinite(mean).all()
 
 
@@ -171,5 +189,6 @@ def test_shipped_weights_load_bit_for_bit_with_record() -> None:
         assert tensors.keys() == stored.keys()
         for name, tensor in stored.items():
             assert torch.equal(tensors[name], tensor.to(tensors[name].dtype)), name
+
     assert (record.vae_recipe.augmentation, record.vae_recipe.keep) == ("mirror", "last")
     assert record.transfer_recipe is None

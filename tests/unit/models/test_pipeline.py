@@ -51,7 +51,7 @@ def _fitted(maps: tuple[Tensor, Tensor], intensities: int = 1) -> Preprocess:
     return preprocess
 
 
-def test_split_and_stack_puts_the_halves_in_channels_of_their_own() -> None:
+def test_split_and_stack_gives_halves_channels_of_their_own() -> None:
     column = torch.arange(80.0).expand(1, 64, 80)
     left = column[0, :, :40]
     right = column[0, :, 40:]
@@ -61,7 +61,7 @@ def test_split_and_stack_puts_the_halves_in_channels_of_their_own() -> None:
     )
 
 
-def test_split_and_stack_marks_a_missing_return_in_all_its_channels() -> None:
+def test_split_and_stack_marks_a_missing_return_everywhere() -> None:
     depth = torch.ones(1, 64, 80)
     intensity = torch.ones(1, 64, 80)
     depth[0, 5, 10] = torch.nan
@@ -107,8 +107,11 @@ def test_preprocess_noise_falls_on_left_channels_in_training(colors: int) -> Non
     before = [part.clone() for part in maps]
     quiet = preprocess.eval()(*maps)
     noise = preprocess.train()(*maps) - quiet
+
     assert (noise[:, 1::2] == 0).all()
+
     left = noise[:, ::2].transpose(0, 1).flatten(1)
+
     # bilinear weights only average: the noise of 0.2 comes out smaller, never larger
     assert ((left.std(1) > 0.08) & (left.std(1) < 0.2)).all()
     assert (torch.corrcoef(left) - torch.eye(len(left))).abs().max() < 0.1
@@ -125,6 +128,7 @@ def test_preprocess_gives_missing_return_the_channel_mean() -> None:
         torch.cat([m.expand(40), n.expand(40)]) for m, n in (mean[:2], mean[2:])
     )
     filled = torch.where(hole, depth_mean, depth), torch.where(hole, intensity_mean, intensity)
+
     torch.testing.assert_close(preprocess(depth, intensity), preprocess(*filled), atol=1e-5, rtol=0)
     assert torch.equal(
         preprocess(depth, intensity), preprocess(depth, torch.where(hole, 1e6, intensity))
@@ -168,8 +172,11 @@ def test_pipeline_latent_depends_on_neither_batch_nor_layout(pipeline: Remapping
     alone = torch.cat(
         [pipeline.latent(d[None], i[None]) for d, i in zip(depth, intensity, strict=True)]
     )
+
     torch.testing.assert_close(latents, alone, atol=1e-4, rtol=1e-3)
+
     strided = (part.transpose(1, 2).contiguous().transpose(1, 2) for part in (depth, intensity))
+
     torch.testing.assert_close(pipeline.latent(*strided), latents, atol=1e-5, rtol=1e-4)
 
 
@@ -179,6 +186,7 @@ def test_new_pipeline_is_of_depth_or_color(color: bool, channels: int, latent: i
         vae = new_vae(color=color)
         made = new_pipeline(vae.decoder, color=color, dropout=0.3, left_noise=0.1)
         own = new_pipeline(color=color)
+
     assert made.decoder is vae.decoder
     assert own.decoder.state_dict().keys() == vae.decoder.state_dict().keys()
     assert vae.latent == latent
@@ -195,6 +203,7 @@ def test_cut_silhouette_clears_a_faint_skirt_beside_a_surface() -> None:
     image[..., 10:30, 20:23] = faint
     image[..., 50:60, 50:60] = faint
     cut = cut_silhouette(image)
+
     assert (cut[..., 20:23] == 0).all()
     assert torch.equal(cut[..., 10:20], image[..., 10:20])
     assert (cut[..., 50:60, 50:60] == faint).all()
@@ -222,12 +231,15 @@ def test_cut_silhouette_goes_by_the_brightest_color() -> None:
 def test_lift_edges_brightens_blurred_edge_of_plateau() -> None:
     noise = torch.rand(4, 1, 64, 64, generator=torch.Generator().manual_seed(0))
     blurred = torch.nn.functional.avg_pool2d(noise, 9, stride=1, padding=4) * 1.5
+
     assert (lift_edges(blurred) >= blurred).all()
     assert (lift_edges(blurred) <= blurred.amax((2, 3), keepdim=True) + 1e-6).all()
+
     image = torch.zeros(1, 1, 64, 64)
     image[..., 10:40, 20:50] = 0.8
     image[..., 10:40, 50:52] = 0.5
     lifted = lift_edges(image)
+
     torch.testing.assert_close(lifted[..., 10:40, 20:48], image[..., 10:40, 20:48])
     assert (lifted[..., 15:35, 50:52] > 0.7).all()
 
@@ -235,13 +247,18 @@ def test_lift_edges_brightens_blurred_edge_of_plateau() -> None:
 @pytest.mark.parametrize(("count", "batch"), [(10, 5), (11, 5), (14, 5), (5, 5), (3, 5), (2, 2)])
 def test_shuffled_batches_are_whole_and_repeat_no_sample(count: int, batch: int) -> None:
     batches = list(shuffled(count, batch, torch.Generator()))
+
     assert {len(b) for b in batches} == {min(batch, count)}
     assert len(batches) == max(count // batch, 1)
+
     drawn = torch.cat(batches).tolist()
+
     assert len(set(drawn)) == len(drawn)
     assert set(drawn) <= set(range(count))
+
     generators = (torch.Generator().manual_seed(seed) for seed in (1, 1, 2))
     first, again, other = (torch.cat(list(shuffled(50, 10, generator))) for generator in generators)
+
     assert torch.equal(first, again)
     assert not torch.equal(first, other)
 
@@ -251,6 +268,7 @@ def test_flip_some_mirrors_flagged_samples_and_undoes_itself() -> None:
     images = torch.rand(3, 1, 64, 64)
     flips = torch.tensor([True, False, True])
     mirrored_maps, mirrored_images = flip_some([maps, images], flips)
+
     assert torch.equal(mirrored_maps[1], maps[1])
     assert torch.equal(mirrored_maps[0], maps[0].flip(0))
     assert torch.equal(mirrored_images[2, 0], images[2, 0].flip(0))
@@ -278,6 +296,7 @@ def test_map_batches_mirror_maps_with_their_images() -> None:
         found = [batch.depth_m, batch.intensity, batch.image]
         wanted = [depth_m, intensity, image.float()]
         torch.testing.assert_close(found, wanted, rtol=0, atol=0, equal_nan=True)
+
     assert sorted(torch.cat([batch.row for batch in batches]).tolist()) == list(range(8))
     assert 0 < torch.cat([batch.mirrored for batch in batches]).sum() < 8
 
@@ -296,6 +315,7 @@ def test_difference_maps_subtract_bare_wall_where_both_return() -> None:
     depth[30] = np.nan
     difference = subtract_bare_wall(maps, depth, intensity)
     valid = ~np.isnan(maps.depth_m) & ~np.isnan(depth)
+
     assert 0 < valid.sum() < (~np.isnan(maps.depth_m)).sum()
     np.testing.assert_array_equal(~np.isnan(difference.depth_m), valid)
     np.testing.assert_allclose(difference.depth_m[valid], maps.depth_m[valid] - 0.125)

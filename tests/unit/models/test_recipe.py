@@ -22,6 +22,7 @@ RECIPES = Path(__file__).parents[3] / "models" / "recipes"
 def test_committed_recipe_loads_by_path_or_name(path: Path) -> None:
     recipe = load_recipe(path)
     name = path.stem.removeprefix("paper-rig-")
+
     assert recipe.task in path.stem
     assert recipe.deviations
     assert (
@@ -36,6 +37,7 @@ def test_si_recipes_have_the_values_of_the_paper() -> None:
     vae, compressor, transfer = (
         load_recipe(RECIPES / f"si-{task}.toml") for task in ("vae", "compressor", "transfer")
     )
+
     assert {recipe.schedule for recipe in (vae, compressor, transfer)} == {"plateau"}
     assert (vae.learning_rate, vae.betas, vae.kl_weight, vae.augmentation) == (
         1e-3,
@@ -51,6 +53,7 @@ def test_si_recipes_have_the_values_of_the_paper() -> None:
     )
     assert 3 <= transfer.all_layers_epochs <= 5
     assert (transfer.learning_rate, transfer.epochs, transfer.statistics) == (1e-3, 10, "kept")
+
     for task in ("vae", "compressor"):
         for scale, schedule in (("", "plateau"), ("-small", "one-cycle")):
             recipe = load_recipe(RECIPES / f"colour-{task}{scale}.toml")
@@ -97,10 +100,12 @@ def test_scaled_recipe_has_share_of_objects_times_epochs(
 
 def test_of_objects_limits_batch_and_refuses_bad_numbers() -> None:
     recipe = small_recipe(objects=100, batch=8)
+
     assert (recipe.of_objects(5).objects, recipe.of_objects(5).batch) == (5, 5)
     assert (recipe.of_objects(50).objects, recipe.of_objects(50).batch) == (50, 8)
     with pytest.raises(RecipeError, match="1"):
         recipe.of_objects(1)
+
     for share in (0.0, -1.0, 1.5, float("nan")):
         with pytest.raises(RecipeError, match=f"{share:g}"):
             recipe.scaled(share)
@@ -140,6 +145,7 @@ def test_wrong_recipe_is_refused_with_field(
         f"{name} = {json.dumps(value)}" for name, value in facts.items() if value is not None
     )
     (path := tmp_path / "recipe.toml").write_text(text, encoding="utf-8")
+
     with pytest.raises(RecipeError, match=words) as caught:
         load_recipe(path)
     assert "\n" not in str(caught.value)
@@ -153,6 +159,7 @@ def test_load_recipe_names_unreadable_file_or_similar_name(
     path = tmp_path / "recipe.toml"
     if content is not None:
         path.write_bytes(content)
+
     with pytest.raises(RecipeError, match=r"recipe\.toml") as caught:
         load_recipe(path)
     assert isinstance(caught.value, ModelError)
@@ -175,6 +182,7 @@ def test_plateau_schedule_ends_without_progress(rate: float) -> None:
         assert len(rates) < 100
         schedule.step(1.0)
         rates.append(optimizer.param_groups[0]["lr"])
+
     assert rates[-2] >= SMALLEST_RATE > rates[-1]
     assert rates[1 : PLATEAU_PATIENCE + 2] == [rate] * (PLATEAU_PATIENCE + 1)
     assert rates[PLATEAU_PATIENCE + 2 :][:1] in ([], [pytest.approx(0.3 * rate)])
@@ -190,6 +198,7 @@ def test_one_cycle_schedule_rises_to_rate_and_falls_to_end() -> None:
         optimizer.step()
         schedule.step()
     peak = rates.index(max(rates))
+
     assert max(rates) == pytest.approx(1e-3, rel=1e-2)
     assert rates == sorted(rates[: peak + 1]) + sorted(rates[peak + 1 :], reverse=True)
     assert optimizer.param_groups[0]["lr"] < SMALLEST_RATE

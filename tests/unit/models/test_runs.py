@@ -60,20 +60,26 @@ def test_vae_start_lists_runs_of_the_vae_alone(
     for trained, earlier in (whole, one):
         assert earlier == [VAE]
         assert torch.equal(trained.decoder.output.weight, stored)
+
     assert not changed_tensors(one[0].state_dict(), other[0].state_dict())
 
 
 def test_compressor_start_lists_runs_of_weights_and_vae(weights: Path, tmp_path: Path) -> None:
     start, runs = compressor_start(TWO, weights, None)
+
     assert (runs, start.pipeline) == ([VAE], None)
+
     save_vae(tmp_path / "other", SmallVae(), CheckpointRecord.of([OTHER_VAE], NAMED))
     start, runs = compressor_start(AGAIN, tmp_path / "other", weights)
+
     assert runs == [VAE, TWO, OTHER_VAE]
     assert not torch.equal(start.vae.decoder.output.weight, start.pipeline.decoder.output.weight)
     assert compressor_start(AGAIN, weights, weights)[1] == [TWO, VAE]
+
     start, runs = compressor_start(
         small_recipe(task="compressor", steps="one", **IMAGES_ALONE), None, None
     )
+
     assert (start.vae, start.pipeline, runs) == (None, None, [])
 
 
@@ -134,6 +140,7 @@ def test_transfer_default_weights_fit_its_loss(
     shipped = {"paper": weights, "direct": tmp_path / "direct"}
     monkeypatch.setattr(runs, "weights_folder", lambda given, default: given or shipped[default])
     start = partial(transfer_start, partial=False, on_report=pytest.fail)
+
     assert start(TRANSFER, None)[1].runs == [VAE, TWO]
     assert start(TRANSFER.model_copy(update=IMAGES_ALONE), None)[1].runs == [straight]
     with pytest.raises(TrainingError, match="latent"):
@@ -154,6 +161,7 @@ def test_partial_start_fills_missing_tensors_by_seed(weights: Path) -> None:
         rows.append(pipeline.compressor.get_parameter("classifier.1.weight").detach())
         assert record.runs == [VAE, TWO]
         assert all(word in messages[-1] for word in ("more", "classifier.1.weight"))
+
     assert torch.equal(rows[0], rows[1])
     assert not torch.equal(rows[0], rows[2])
 
@@ -171,6 +179,7 @@ def test_record_run_refuses_weights_of_another_run(
     )
     (tmp_path / "checkpoint.json").write_text(record.model_dump_json(), encoding="utf-8")
     _record(tmp_path, VAE, OTHER_VAE)  # the same run may be repeated
+
     with pytest.raises(OutputExistsError, match="--out"):
         _record(tmp_path, *recipes)
 

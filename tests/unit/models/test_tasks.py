@@ -91,10 +91,13 @@ def test_vae_run_returns_the_figures_of_its_last_epoch(trained: Trained) -> None
 def test_resumed_vae_run_equals_a_whole_one(trained: Trained, tmp_path: Path) -> None:
     vae, figures, folder = trained
     log = log_rows(folder)
+
     with pytest.raises(Stopped):
         _vae(_recipe("vae"), tmp_path, on_step=stop_halfway)
+
     torch.manual_seed(99)
     resumed, again = _vae(_recipe("vae"), tmp_path)
+
     assert not changed_tensors(vae.state_dict(), resumed.state_dict())
     assert (again, log_rows(tmp_path)) == (figures, log)
 
@@ -116,6 +119,7 @@ def test_vae_continues_from_weights(trained: Trained, tmp_path: Path) -> None:
     )
     for name, tensor in vae.named_parameters():  # at this rate they stay close
         torch.testing.assert_close(tensor.data, before[name], rtol=0, atol=1e-5)
+
     assert changed_tensors(before, vae.state_dict())
     assert figures["held_out_loss"] == pytest.approx(trained[1]["held_out_loss"], rel=0.05)
 
@@ -135,9 +139,12 @@ def test_compressor_keeps_vae_frozen_and_learns_statistics(
     before = state_of(trained[0])
     recipe = _recipe("compressor", epochs=1, image_weight=1.0, left_noise=0.1)
     pipeline, _ = _compressor(recipe, tasks.Start(trained[0]), tmp_path)
+
     assert not changed_tensors(before, trained[0].state_dict())
     assert not changed_tensors(pipeline.decoder.state_dict(), trained[0].decoder.state_dict())
+
     learnt = pipeline.preprocess.mean, pipeline.preprocess.spread
+
     assert all(map(torch.equal, learnt, _statistics(small_maps(COUNT, 0))))
     assert pipeline.preprocess.left_noise == 0.1
     assert not pipeline.training
@@ -177,6 +184,7 @@ def test_joint_training_moves_both_networks_but_not_encoder(
         torch.testing.assert_close(
             after[part], before[part], rtol=0, atol=1e-5
         )  # at this rate it stays close
+
     assert torch.equal(after["preprocess.mean"], before["preprocess.mean"])
     assert not changed_tensors(encoder, vae.encoder.state_dict())
     assert joint.compressor.classifier[0].p == 0.2
@@ -193,6 +201,7 @@ def test_compressor_continues_from_weights_with_decoder_of_vae(
     pipeline, _ = _compressor(recipe, tasks.Start(trained[0], earlier), tmp_path)
     for name, tensor in pipeline.compressor.named_parameters():
         torch.testing.assert_close(tensor.data, before[name], rtol=0, atol=1e-5)
+
     assert not changed_tensors(pipeline.decoder.state_dict(), trained[0].decoder.state_dict())
     assert pipeline.compressor.classifier[0].p == 0.2
 
@@ -207,10 +216,13 @@ def test_compiled_networks_are_the_trained_ones(
     plain, quick = (
         _vae(_recipe("vae", epochs=1), tmp_path / f"{on}", compiled=on)[0] for on in (False, True)
     )
+
     assert compiled == [quick]
     assert not changed_tensors(plain.state_dict(), quick.state_dict())
+
     recipe = _recipe("compressor", epochs=1, image_weight=1.0)
     made, _ = _compressor(recipe, tasks.Start(trained[0]), tmp_path / "c", compiled=True)
+
     assert compiled[1:] == [made.latent, made.decoder]
 
 
@@ -233,6 +245,7 @@ def test_vae_turns_images_by_recipe(
         tasks, "turn_some", lambda images, turns: quarters.extend(turns.tolist()) or images
     )
     _vae(_recipe("vae", epochs=1, augmentation=augmentation), tmp_path)
+
     assert sorted(set(quarters)) == turns
     assert len(quarters) == (COUNT if turns else 0)
 
@@ -243,9 +256,13 @@ def test_images_and_latents_in_parts_equal_those_at_once(monkeypatch: Patch) -> 
     maps = small_maps(8, 3)
     whole = tasks.run(pipeline, maps)
     encoder = SmallVae().eval().encoder
+
     assert whole.shape == (8, 64, 64)
+
     monkeypatch.setattr(tasks, "SCORING_BATCH", 3)
+
     np.testing.assert_allclose(tasks.run(pipeline, maps), whole, atol=1e-5)
+
     straight = tasks.latents_of(encoder, maps.image)
     mirrored = tasks.latents_of(encoder, maps.image[:, ::-1])
     for batch in map_batches(maps, 4, torch.Generator().manual_seed(0)):
@@ -260,18 +277,25 @@ def test_images_and_latents_in_parts_equal_those_at_once(monkeypatch: Patch) -> 
 def test_figures_are_mean_squared_error_sum_and_iou() -> None:
     truth = small_images(3, 0)
     off = truth.astype(np.float32)
+
     assert tasks.figures_of(off, truth) == {"held_out_loss": 0.0, "held_out_iou": 1.0}
+
     off[0, 0, 0] += 0.3
     figures = tasks.figures_of(off, truth)
+
     assert figures["held_out_loss"] == pytest.approx(0.09 / 3)
     assert figures["held_out_iou"] < 1
+
     color = np.stack([truth, 0.9 * truth, 0.5 * truth], axis=1)
+
     assert list(tasks.figures_of(color.astype(np.float32), color).values()) == [
         0.0,
         1.0,
         0.0,
     ]  # loss, IoU, color error
+
     nothing = tasks.figures_of(np.zeros_like(color, np.float32), color)
+
     assert (nothing["held_out_iou"], nothing["held_out_colour_error"]) == (0.0, 1.0)
 
 
@@ -295,6 +319,7 @@ def test_loss_weights_latent_image_and_surface(tmp_path: Path) -> None:
         _first_loss(tmp_path / f"{each}", **dict(zip(names, each, strict=True))) for each in weights
     ]
     latent, image, both, twice, thrice = losses
+
     assert both == pytest.approx(2 * latent + 3 * image, rel=1e-4)
     assert thrice - twice == pytest.approx(twice - image, rel=1e-4)
     assert twice > image
@@ -342,6 +367,7 @@ def test_transfer_changes_all_layers_and_then_the_classifier(
     before = bench.state
     fit = tasks.Remapping.fit
     bench.go(all_layers_epochs=0, epochs=1, dropout=0.25, left_noise=0.125)
+
     assert changed_tensors(before, bench.state) == CLASSIFIER_TENSORS
     assert bench.pipeline.compressor.classifier[0].p == 0.25
     assert bench.pipeline.preprocess.left_noise == 0.125
@@ -355,6 +381,7 @@ def test_transfer_changes_all_layers_and_then_the_classifier(
     bench = Bench(tmp_path / "first")
     bench.go()
     ours = {name for name in before if name.startswith("compressor")}
+
     assert any("running_mean" in name for name in ours)
     assert changed_tensors(before, bench.state) == ours
 
@@ -392,6 +419,7 @@ def test_transfer_second_phase_starts_from_best_epoch(tmp_path: Path, monkeypatc
     monkeypatch.setattr(tasks, "figures_of", figures)
     bench.go(all_layers_epochs=3, epochs=1, keep="best", dropout=0.0)
     after_best, last = (changed_tensors(found[k], bench.state) for k in (1, 2))
+
     assert after_best == CLASSIFIER_TENSORS
     assert last > after_best
 
@@ -407,6 +435,7 @@ def test_transfer_normalises_maps_by_recipe(
     for values, theirs in zip(wanted, _statistics(bench.maps), strict=True):
         values[own] = theirs[own]
     bench.go(statistics=statistics, all_layers_epochs=0, epochs=1)
+
     assert all(
         map(torch.equal, (bench.pipeline.preprocess.mean, bench.pipeline.preprocess.spread), wanted)
     )

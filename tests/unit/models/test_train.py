@@ -74,6 +74,7 @@ def test_run_killed_at_random_moments_equals_uninterrupted(tmp_path: Path) -> No
         child.start()
         child.join()
         ends.append(child.exitcode)
+
     assert ends[:3] == [-signal.SIGKILL] * 3
     assert (tmp_path / "killed" / train.LAST).exists()
     _assert_same(_trained(tmp_path / "killed", schedule="one-cycle", epochs=2), whole)
@@ -86,10 +87,13 @@ def test_stopped_run_names_its_step_and_resumes_there(
     calls = count(1)
     messages = list[str]()
     run = SmallRun(whole.recipe, tmp_path / "stopped")
+
     with pytest.raises(KeyboardInterrupt):
         run.go(stop=lambda: next(calls) == STEPS + 2, on_message=messages.append)
     assert [("epoch 1" in message, "step 2" in message) for message in messages] == [(True, True)]
+
     again = _trained(tmp_path / "stopped")
+
     assert again.steps[0] == (STEPS + 3, 4 * STEPS)
     _assert_same(again, whole)
 
@@ -117,6 +121,7 @@ def test_progress_counts_steps_and_finished_run_is_not_repeated(tmp_path: Path) 
     (run, again) = (SmallRun(small_recipe(), tmp_path) for _ in range(2))
     epochs = list[dict[str, float]]()
     figures = run.go(on_epoch=epochs.append)
+
     assert run.steps == [(k + 1, 4 * STEPS) for k in range(4 * STEPS)]
     assert run.done == [k / (4 * STEPS) for k in range(4 * STEPS)]
     assert [row["epoch"] for row in epochs] == [0, 1, 2, 3]
@@ -132,11 +137,13 @@ def test_run_of_other_recipe_or_origin_is_refused(tmp_path: Path) -> None:
     run.go(origin="these weights")
     reworded = SmallRun(small_recipe(epochs=1, deviations=["other words"]), tmp_path)
     reworded.go(origin="these weights")
+
     assert not reworded.steps
     with pytest.raises(RecipeError, match="recipe"):
         _trained(tmp_path, learning_rate=0.5)
     with pytest.raises(RecipeError, match="weights"):
         SmallRun(run.recipe, tmp_path).go(origin="those weights")
+
     state = train.read_last(tmp_path, pytest.fail)
     del state["origin"]  # a state that does not name its origin is accepted
     train.write_last(tmp_path, state)
@@ -154,8 +161,11 @@ def test_keep_best_restores_first_best_epoch(
 
     monkeypatch.setattr(SmallRun, "score", score)
     best, last = (SmallRun(small_recipe(keep=keep), tmp_path / keep) for keep in ("best", "last"))
+
     assert best.go() == {"held_out_loss": 1.0}
+
     last.go()
+
     assert not changed_tensors(judged[1], best.net.state_dict())
     assert not changed_tensors(judged[3], last.net.state_dict())
 
@@ -167,6 +177,7 @@ def test_plateau_run_ends_with_its_rate_and_stays_ended(
     monkeypatch.setattr(schedule, "SMALLEST_RATE", 2e-3)
     monkeypatch.setattr(SmallRun, "score", lambda _: {"held_out_loss": 1.0})
     done = _trained(tmp_path, epochs=20).steps
+
     assert 2 * STEPS <= len(done) <= 5 * STEPS  # the rate falls to 1e-2, 3e-3 and 9e-4
     assert _trained(tmp_path, epochs=20).steps == []
 
@@ -174,12 +185,16 @@ def test_plateau_run_ends_with_its_rate_and_stays_ended(
 def test_diverged_run_keeps_earlier_epochs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(Stopped):
         SmallRun(small_recipe(), tmp_path).go(fail_at=STEPS + 1)
+
     broken = SmallRun(small_recipe(), tmp_path)
     broken.y = broken.y * float("nan")
+
     with pytest.raises(TrainingError, match=r"nan .*epoch 1.*learning_rate"):
         broken.go()
     _assert_same(_trained(tmp_path), _trained(tmp_path / "whole"))
+
     monkeypatch.setattr(SmallRun, "score", lambda _: {"held_out_loss": float("nan")})
+
     with pytest.raises(TrainingError, match="epoch 0"):
         _trained(tmp_path / "nan")
     assert not (tmp_path / "nan" / train.BEST).exists()
@@ -201,13 +216,19 @@ def _damage(path: Path, how: str) -> None:
 
 def test_read_last_returns_last_state_written(tmp_path: Path) -> None:
     assert train.read_last(tmp_path, pytest.fail) is None
+
     for step in range(3):
         train.write_last(tmp_path, _state(step))
+
     torch.testing.assert_close(train.read_last(tmp_path, pytest.fail), _state(2), rtol=0, atol=0)
     assert {path.name for path in tmp_path.iterdir()} == {train.LAST, train.PREVIOUS}
+
     (tmp_path / train.LAST).unlink()  # as a kill between the two renames leaves it
+
     assert train.read_last(tmp_path, pytest.fail)["step"] == 1
+
     (tmp_path / "folder" / train.LAST).mkdir(parents=True)
+
     with pytest.raises(CheckpointError, match="damaged"):
         train.read_last(tmp_path / "folder", print)
 
@@ -243,6 +264,7 @@ def test_read_last_refuses_where_both_states_are_damaged(tmp_path: Path) -> None
         train.write_last(tmp_path, _state(step))
     _damage(tmp_path / train.LAST, "flipped")
     _damage(tmp_path / train.PREVIOUS, "flipped")
+
     with pytest.raises(CheckpointError, match=train.LAST) as caught:
         train.read_last(tmp_path, pytest.fail)
     assert caught.value.exit_code == 4
@@ -261,6 +283,7 @@ def test_full_disk_keeps_earlier_files(tmp_path: Path, monkeypatch: pytest.Monke
     ):
         with pytest.raises(TrainingError, match="No space left on device"):
             write()
+
     assert train.read_last(tmp_path, pytest.fail)["step"] == 1
     assert {path.name for path in tmp_path.iterdir()} == {train.LAST, train.LOG}
     assert "1.0" in (tmp_path / train.LOG).read_text(encoding="utf-8")
@@ -271,9 +294,12 @@ def test_digest_depends_on_every_bit_and_order() -> None:
     net = nn.Linear(3, 2)
     digest = train.digest_of
     digests = {digest(), digest("a"), digest("b"), digest(None), before := digest(net)}
+
     assert digest(copy.deepcopy(net)) == before
+
     net.bias.data[0] += 1e-3
     digests |= {digest(net), digest(net, "a"), digest("a", net), digest(nn.Linear(3, 2).half())}
+
     assert len(digests) == 9
 
 
@@ -283,8 +309,11 @@ def test_tensorboard_logs_figures_of_each_epoch(tmp_path: Path) -> None:
     run = SmallRun(small_recipe(), tmp_path)
     run.go(tensorboard=True)
     events = accumulators.EventAccumulator(str(tmp_path / "tensorboard")).Reload()
+
     assert set(events.Tags()["scalars"]) == {"rate", "loss", "held_out_loss", "seconds"}
+
     drawn = events.Scalars("held_out_loss")
+
     assert [event.step for event in drawn] == [0, 1, 2, 3]
     assert [event.value for event in drawn] == pytest.approx(
         [float(row["held_out_loss"]) for row in run.log]
@@ -327,6 +356,7 @@ def test_compiled_part_has_loss_and_gradients_of_plain_one() -> None:
         loss = part(x).square().sum()
         loss.backward()
         found.append((loss.detach(), linear.weight.grad.clone()))
+
     torch.testing.assert_close(*found)
 
 
@@ -381,6 +411,7 @@ def test_state_of_another_kind_is_refused(
         (tmp_path / name).write_bytes(
             hashlib.sha256(content.getvalue()).digest() + content.getvalue()
         )
+
     with pytest.raises(CheckpointError, match=str(tmp_path)) as caught:
         SmallRun(small_recipe(), tmp_path).go()
     assert "\n" not in str(caught.value)
@@ -390,13 +421,16 @@ def test_state_of_another_kind_is_refused(
 def test_processes_share_a_batch_without_repeating_samples() -> None:
     batch = NormalBatch(torch.arange(12).reshape(6, 2), torch.arange(6))
     shares = [share_of(batch, rank, 3) for rank in range(3)]
+
     assert all(
         type(share) is NormalBatch and len(share.normal) == len(share.image) == 2
         for share in shares
     )
     assert sorted(torch.cat([share.image for share in shares]).tolist()) == list(range(6))
+
     for share in shares:
         assert torch.equal(share.normal, batch.normal[share.image])
+
     assert share_of(batch, 0, 1) is batch
     assert [part.tolist() for part in share_of((batch.image, batch.image), 1, 2)] == [[1, 3, 5]] * 2
 
@@ -418,13 +452,18 @@ def test_two_processes_end_with_weights_of_one(tmp_path: Path) -> None:
     together = SmallRun(alone.recipe, tmp_path / "whole", plain=True)
     for name, tensor in alone.net.state_dict().items():
         torch.testing.assert_close(torch.tensor(made["net"][name]), tensor, rtol=1e-4, atol=1e-6)
+
     assert made["figures"] == pytest.approx(figures, rel=1e-4)
+
     for mine, its in zip(alone.log, together.log, strict=True):
         assert {k: float(v) for k, v in mine.items()} == pytest.approx(
             {k: float(v) for k, v in its.items()}, rel=1e-4
         )
+
     assert made["scored"] == 3  # only the leading process evaluates
+
     told, interrupted = made["messages"]
+
     assert ("step 4" in told, interrupted) == (True, "interrupted")
     assert made["again"] == made["net"]
 
@@ -444,6 +483,7 @@ def test_cpu_that_emulates_bfloat16_trains_in_float32(
     monkeypatch.setattr(torch.backends.cpu, "get_cpu_capability", lambda: vectors)
     halves = small_recipe(precision="bf16-mixed")
     singles = small_recipe()
+
     assert precision_on("cpu", halves) == made
     assert precision_on("cuda", halves) == "bf16-mixed"
     assert precision_on("cpu", singles) == "32-true"

@@ -52,6 +52,7 @@ def test_features_are_zero_at_the_median_bare_wall(
     depth_m[0] = bare_m + 0.3
     depth_m[1, 0, 0] = torch.nan
     network.learn_bare(depth_m, counts.repeat(5, 1, 1))
+
     assert float(network.features(bare_m[None], counts[None]).abs().max()) == 0.0
     assert float(network.features(bare_m[None] + 0.05, counts[None] + 5)[:, :4].min()) > 0.4
 
@@ -65,13 +66,14 @@ def test_features_mark_a_cell_without_return(network: UncertaintyNetwork) -> Non
 
 @pytest.mark.parametrize("name", HARD_MAPS)
 @pytest.mark.parametrize("v", [0.0, 1.0])
-def test_doubt_of_hard_maps_is_finite_and_in_range(
+def test_uncertainty_of_hard_maps_is_finite_and_in_range(
     network: UncertaintyNetwork, name: str, v: float
 ) -> None:
     calibrated = CalibratedUncertainty(network, (1.0, 2.0), 3.0).eval()
     nothing, outside, error_v, surface = calibrated(*hard_maps(name), torch.full((1, 64, 64), v))
     for probability in (nothing, outside, surface):
         assert bool(((probability >= 0) & (probability <= 1)).all())
+
     assert float(error_v.min()) >= MIN_ERROR_V
     assert float(error_v.max()) <= MAX_ERROR_V
     assert error_v.shape == surface.shape == (1, 64, 64)
@@ -84,7 +86,9 @@ def test_calibration_scales_error_and_divides_logits(network: UncertaintyNetwork
         CalibratedUncertainty(network, t, s).eval()(*maps, image)
         for t, s in (((1, 1), 1), ((2, 4), 1.5))
     )
+
     torch.testing.assert_close(scaled[2], 1.5 * plain[2])
+
     for one, other, divisor in zip(plain[:2], scaled[:2], (2.0, 4.0), strict=True):
         torch.testing.assert_close(torch.logit(other) * divisor, torch.logit(one))
 
@@ -113,6 +117,7 @@ def test_uncertainty_run_resumes_exactly(
 ) -> None:
     steps = list[int]()
     trained = _train(tmp_path / "whole", [])
+
     with pytest.raises(KeyboardInterrupt):
         _train(tmp_path / "stopped", steps, stop=lambda: len(steps) == 11)
     torch.testing.assert_close(
@@ -126,12 +131,17 @@ def test_uncertainty_run_learns_what_is_empty_or_unusual(tmp_path: Path) -> None
     trained = _train(tmp_path, [])
     fresh = small_uncertainty_set(64, 2)
     said = uncertainty.predict(trained, fresh)
+
     assert ((said.nothing.numpy() > 0) == fresh.nothing).mean() > 0.9
+
     there = ~fresh.nothing
+
     assert np.corrcoef(said.outside.numpy()[there], fresh.outside[there])[0, 1] > 0.8
+
     dark, bright = (
         said.log_error.numpy()[fresh.truth == value].mean() for value in np.float16([DARK_V, 0.8])
     )
+
     assert dark > bright + 0.3
 
 
@@ -146,6 +156,7 @@ def test_calibration_keeps_to_its_shares_of_false_alarms(tmp_path: Path) -> None
         for part, t in zip(said[:2], fitted.temperatures, strict=True)
     )
     usual = ~some.nothing & ~some.outside
+
     assert (
         outside[usual] > fitted.outside_above + 1e-6
     ).mean() <= uncertainty.MAX_FALSE_ALARMS + 1 / usual.sum()
@@ -171,16 +182,19 @@ def test_loss_is_least_at_the_mean_error_of_shared_pixels() -> None:
 
     shared = (there.truth > 0) & (there.made > 0)
     mean = float((there.made - there.truth).abs()[shared].mean().log())
+
     assert loss(there, mean) < min(loss(there, mean - 0.2), loss(there, mean + 0.2))
     assert loss(empty, -3.0) == loss(empty, 1.0)
+
     made = np.array([[[0.5, 0.5], [0.0, 0.0]]])
     truth = np.array([[[0.25, 0.0], [0.5, 0.0]]])
     known, error = uncertainty.shared_errors(made, truth)
+
     assert known.tolist() == [[[True, False], [False, False]]]
     assert error.tolist() == [0.25]
 
 
-def test_doubt_batches_mirror_maps_with_their_images() -> None:
+def test_uncertainty_batches_mirror_maps_with_their_images() -> None:
     some = small_uncertainty_set(32, 0)
     batch = next(iter(uncertainty.uncertainty_batches(some, 32, torch.Generator().manual_seed(0))))
     assert sorted(batch.nothing.tolist()) == sorted(some.nothing.astype(float).tolist())
@@ -219,17 +233,20 @@ def record(tmp_path: Path, watched: Path) -> UncertaintyRecord:
     return untrained_uncertainty(tmp_path / "run", watched)
 
 
-def test_doubt_is_restored_with_the_weights_that_it_watches(
+def test_uncertainty_network_is_restored_with_its_weights(
     tmp_path: Path, watched: Path, record: UncertaintyRecord
 ) -> None:
     network, found = uncertainty_network.load_uncertainty_network(tmp_path / "run")
+
     assert found == record
     assert not network.training
     assert network.temperature.tolist() == [0.5, 2.0]
     assert float(network.error_scale) == 1.5
     assert (tmp_path / "run" / "doubt.safetensors").stat().st_size < 700_000
+
     for name in (*records.WATCHED, "checkpoint.json"):
         assert (tmp_path / "run" / name).read_bytes() == (watched / name).read_bytes()
+
     assert uncertainty_network.load_uncertainty_network(watched) is None
     assert load_uncertainty_model(watched, tmp_path) is None
     with pytest.raises(CheckpointError, match="compressor"):
@@ -244,7 +261,7 @@ def test_doubt_is_restored_with_the_weights_that_it_watches(
         *((records.UNCERTAINTY_RECORD, text) for text in (b"{", b'{"watches": "x"}', b"\xff")),
     ],
 )
-def test_load_doubt_refuses_other_weights_or_damaged_record(
+def test_uncertainty_network_refuses_other_weights_or_record(
     tmp_path: Path, name: str, content: bytes
 ) -> None:
     (tmp_path / "run" / name).write_bytes(content)
@@ -260,24 +277,29 @@ def test_saved_bare_wall_is_exact_and_watched_weights_stay(
     network.learn_bare(wall_m, wall_m)
     uncertainty_network.save_uncertainty_network(tmp_path / "second", network, record, watched)
     again = uncertainty_network.load_uncertainty_network(tmp_path / "second")[0].network
+
     torch.testing.assert_close(again.bare_depth_m, wall_m.median(0).values, rtol=0, atol=0)
+
     (watched / records.WATCHED[0]).write_bytes(b"another network")
+
     with pytest.raises(CheckpointError, match="watched"):
         uncertainty_network.save_uncertainty_network(tmp_path / "other", network, record, watched)
 
 
 @pytest.mark.slow
-def test_doubter_onnx_equals_torch_and_is_exported_once(
+def test_uncertainty_onnx_equals_torch_and_is_exported_once(
     tmp_path: Path, record: UncertaintyRecord
 ) -> None:
     folder = tmp_path / "run"
     cache = tmp_path / "cache"
-    doubter = load_uncertainty_model(folder, cache)
+    uncertainty_model = load_uncertainty_model(folder, cache)
     (model,) = cache.glob("doubt-*.onnx")
     written_ns = model.stat().st_mtime_ns
     again = load_uncertainty_model(folder, cache)
-    assert again.record == doubter.record == record
+
+    assert again.record == uncertainty_model.record == record
     assert model.stat().st_mtime_ns == written_ns
+
     for count in (1, 5):
         seen = *noise_maps(count), np.random.default_rng(count).random((count, 64, 64), np.float32)
         with torch.inference_mode():
@@ -348,9 +370,12 @@ def test_figures_with_the_network_s_own_surface_come_last() -> None:
     turned = said._replace(error_v=said.error_v[:, ::-1], p_surface=said.p_surface[:, ::-1])
     figures = quality_features(images, said)
     with_own = quality_features(images, said, said.p_surface)
+
     assert with_own.shape == (4, quality.WITH_SURFACE)
     np.testing.assert_array_equal(with_own[:, : quality.FEATURES], figures)
+
     own = quality_features(images[:, ::-1], turned, turned.p_surface)
+
     np.testing.assert_allclose(own, with_own, rtol=1e-4, atol=1e-4)
 
 
@@ -361,7 +386,7 @@ def test_figures_are_finite_without_a_surface() -> None:
     assert np.isfinite(quality_features(nothing, said, nothing)).all()
 
 
-def test_model_takes_the_network_s_own_surface_if_fitted_with_one() -> None:
+def test_model_fitted_with_the_networks_surface_takes_it() -> None:
     """Without one it takes the uncertainty network's, and a model that was fitted without one
     leaves it out.
     """
@@ -377,6 +402,7 @@ def test_model_takes_the_network_s_own_surface_if_fitted_with_one() -> None:
             QualityModel(record_of(means=[0.0] * count, spreads=[10.0] * count, layers=layers))
         )
     plain, wide = models
+
     np.testing.assert_array_equal(plain(images, said, own).iou, plain(images, said).iou)
     np.testing.assert_array_equal(wide(images, said, said.p_surface).iou, wide(images, said).iou)
     assert (wide(images, said, own).iou != wide(images, said).iou).any()
@@ -396,9 +422,12 @@ def test_fit_predicts_the_quality_of_kinds_that_it_never_saw() -> None:
     samples = known_objects(600)
     samples.figures[:, 5] = 1.0
     record = QualityRecord.model_validate_json(fit_quality(samples, "0" * 12).model_dump_json())
+
     assert min(record.spreads) > 0
     assert record.figures["all_correlation"] > 0.8
+
     found = QualityEstimate.of(QualityModel(record).outputs(samples.figures), record.trusted_above)
+
     assert (np.diff(found.iou, axis=1) >= 0).all()
     assert np.corrcoef(found.error_v, samples.error_v)[0, 1] > 0.3
     assert record.figures["all_trusted_good"] >= quality.PRECISION
@@ -458,12 +487,16 @@ def record_of(**values: object) -> QualityRecord:
 
 def test_model_is_bound_to_its_uncertainty_network(tmp_path: Path) -> None:
     untrained_uncertainty(folder := tmp_path / "run", watched_weights(tmp_path / "watched"))
+
     assert quality.load_quality_model(folder) is None
+
     record = record_of(watches=records.checksum_of_watched(folder, quality.UNCERTAINTY_FILES))
     quality_training.write_quality(folder, record)
     loaded = load_uncertainty_model(folder, tmp_path)
+
     assert loaded.quality.record == record
     assert loaded.quality(*frames(2)).iou == pytest.approx(np.full((2, 3), 0.5))
+
     text = (folder / quality.QUALITY).read_text()
     for spoiled, reason in (
         (text[:-9], "damaged"),
@@ -497,5 +530,6 @@ def test_file_that_does_not_fit_is_refused(
             **{"watches": records.checksum_of_watched(folder, quality.UNCERTAINTY_FILES), **values}
         ),
     )
+
     with pytest.raises(CheckpointError, match=reason):
         quality.load_quality_model(folder)

@@ -28,6 +28,7 @@ def test_cache_folder_is_chosen_by_variables(
         monkeypatch.delenv(name, raising=False)
     for name, value in variables.items():
         monkeypatch.setenv(name, value and str(tmp_path / value))
+
     assert cache_folder() == tmp_path / expected
     assert not cache_folder().exists()
 
@@ -42,6 +43,7 @@ def test_atomic_file_appears_when_it_is_on_disk(
     with atomic_file(out) as part:
         part.write_text("new")
         assert out.read_text() == "old"
+
     assert out.read_text() == "new"
     assert len(synced) == 2, "the file, then its folder"
     assert list(tmp_path.iterdir()) == [out]
@@ -73,6 +75,7 @@ def test_atomic_directory_appears_when_it_is_whole(tmp_path: Path) -> None:
         assert not out.exists()
         with pytest.raises(FileBusyError), atomic_directory(out):
             pytest.fail("two writers")
+
     assert (out / "inner" / "a.txt").read_text() == "a"
     assert list(tmp_path.iterdir()) == [out]
 
@@ -87,7 +90,9 @@ def test_atomic_directory_refuses_one_that_appeared_and_a_file(tmp_path: Path) -
     with pytest.raises(OutputExistsError, match="appeared"):
         write()
     assert [path.name for path in (tmp_path / "out").iterdir()] == ["a.txt"]
+
     (file := tmp_path / "mine.txt").write_text("precious")
+
     with pytest.raises(OutputExistsError, match=r"mine\.txt"), atomic_directory(file):
         pass
     assert file.read_text() == "precious"
@@ -112,6 +117,7 @@ def test_atomic_directory_replaces_entries_by_name(
         (part / "inner").mkdir()
         (part / "inner" / "new.txt").write_text("new")
     files = sorted(str(path.relative_to(out)) for path in out.rglob("*.txt"))
+
     assert files == ["inner/new.txt", "kept/deep/old.txt", "mine.txt"]
     assert [path.name for path in tmp_path.iterdir()] == ["out"]
 
@@ -121,7 +127,9 @@ def overwrite_and_die(out: Path, calls: int) -> None:
     renames or links.
     """
     left = iter(range(calls))
-    (rename, link, replace) = (Path.rename, os.link, Path.replace)
+    rename = Path.rename
+    link = os.link
+    replace = Path.replace
 
     def dying(call: Callable[..., Any]) -> Callable[..., Any]:
         def act(*arguments: Any, **options: Any) -> Any:
@@ -160,4 +168,5 @@ def test_directory_is_old_or_new_whenever_its_writer_dies(tmp_path: Path) -> Non
             states.add(found)
     old = "a/old b/old mine1/old mine2/old"
     whole = "a/new b/new c/new"
+
     assert states == {old, f"{whole} mine1/old mine2/old", "", whole}
