@@ -5,7 +5,6 @@ each.
     to do ├── SceneError (ValueError)      exit 1   a scene, object or accuracy that cannot be
     rendered │   ├── SceneFileError           exit 4   a scene, mesh or depth map that is missing or
     unreadable │   └── UnknownNameError         exit 2   no object, scene or setting of that name
-    ├── BudgetError (ValueError)     exit 1   a latency budget that no setting meets on this machine
     ├── OutputExistsError (FileExistsError)  exit 1   --out exists and --overwrite was not given ├──
     DiskFullError (OSError)      exit 1   too little disk space for the output, or none left ├──
     FolderBusyError (BlockingIOError)  exit 1   another process writes to the folder ├──
@@ -51,12 +50,6 @@ class UnknownNameError(SceneError):
     """Name of nothing: "no object 'cupp'. Did you mean 'cup'?"."""
 
     exit_code = 2
-
-
-class BudgetError(NlosCamError, ValueError):
-    """Latency budget that no setting meets on this machine: "--budget-ms 5: the fastest setting
-    takes 9.1 ms".
-    """
 
 
 class OutputExistsError(NlosCamError, models.OutputExistsError):

@@ -6,16 +6,15 @@ from contextlib import nullcontext
 from dataclasses import asdict
 from functools import cache, partial
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
-import nlos_models as models
 import typer
 from rich.markup import escape
 
 from nlos_cam import camera as cameras
-from nlos_cam import evaluate as measure
 from nlos_cam import live as loop
 from nlos_cam import reconstruct
+from nlos_cam import replay as replays
 from nlos_cam import view as views
 from nlos_cam.cli import common
 from nlos_cam.cli import view as viewing
@@ -42,19 +41,6 @@ RecordTo = Annotated[
 ]
 Log = Annotated[
     Path | None, typer.Option("--log", help="Write one line per frame: F.csv, or F.jsonl.")
-]
-BudgetMs = Annotated[
-    float | None,
-    typer.Option(
-        "--budget-ms", min=0.1, help="Latency budget: use the most accurate setting that meets it."
-    ),
-]
-Tradeoff = Annotated[
-    Path | None,
-    typer.Option(
-        "--tradeoff",
-        help="Table of `tradeoff reconstruct` for --budget-ms (default: beside the weights).",
-    ),
 ]
 Wall = Annotated[
     Path | None, typer.Option("--wall", help="Wall record of `calibrate --wall` (wall.toml).")
@@ -110,19 +96,11 @@ def live(
     log: Log = None,
     weights: Weights = None,
     average: Average = 1,
-    budget_ms: BudgetMs = None,
-    tradeoff: Tradeoff = None,
     save_view: viewing.SaveView = None,
     overwrite: common.Overwrite = False,
     json: common.Json = False,
 ) -> None:
     """Show what is hidden around the corner, live, in a browser."""
-    if budget_ms is not None and average > 1:
-        raise typer.BadParameter(
-            "--budget-ms chooses the number of averaged frames: drop --average"
-        )
-    if tradeoff is not None and budget_ms is None:
-        raise typer.BadParameter("--tradeoff is the table for --budget-ms: give both")
     if no_view and open_view:
         raise typer.BadParameter("--open needs a view: drop --no-view")
     check_output = partial(_check_output, overwrite=overwrite)
@@ -153,13 +131,10 @@ def live(
             bench = reconstruct.open_bench(wall, opened)
             checks = loop.BackgroundPhysicsCheck(bench.rig, on_error=_warn_once)
             control.set_state("connecting", "loading the networks, first frame in a few seconds")
-            pipeline, choice = _choose_pipeline(
-                opened, bench, weights, average, budget_ms, tradeoff, checks
-            )
-            loop.warm_up(opened, pipeline)
+            pipeline = _load_pipeline(bench, weights, average, checks)
+            reconstruct.warm_up(opened, pipeline)
         viewer.begin(bench.rig, bench.measured)
-        control.on_bench = lambda bench: viewer.begin(bench.rig, bench.measured)
-        loop.offer_settings(control, opened, bench, tradeoff, weights)
+        control.bench.on_bench = lambda bench: viewer.begin(bench.rig, bench.measured)
         with (
             common.stop_on_signals() as stop,
             loop.realtime_priority(),
@@ -178,7 +153,7 @@ def live(
                 clock=cameras.WallClock().now,
                 on_error=lambda report: common.say(summary(report, verbose=common.Detail.verbose)),
                 on_warning=warn,
-                on_moment=frame_log.add if frame_log else loop.ignore,
+                on_moment=frame_log.add if frame_log else reconstruct.ignore,
                 control=control,
             )
     if log:
@@ -188,11 +163,7 @@ def live(
     if view_file:
         common.say(f"Saved the view: open {view_file} in a browser")
     text = summary(report, verbose=common.Detail.verbose)
-    budget = {}
-    if choice:
-        text = f"{text}\n{choice.describe_outcome(report)}"
-        budget = {"budget": choice.outcome(report)}
-    common.finish({**asdict(report), **budget}, as_json=json, text=text)
+    common.finish(asdict(report), as_json=json, text=text)
     if stop.is_set():
         common.exit_interrupted(f"{report.frames} frames were processed")
 
@@ -218,34 +189,22 @@ def replay(
     with common.interrupted_by_signals():
         opened = cameras.open_camera(f"bag:{bag}", reader=reader)
         bench = reconstruct.open_bench(wall, opened)
-        from nlos_cam.reconstruct import (
-            PeriodicPhysicsCheck,
-        )  # the renderer takes a second to import
-
-        checks = PeriodicPhysicsCheck(bench.rig, on_error=_warn_once)
-        pipeline = _build_pipeline(
-            bench,
-            reconstruct.load_networks(weights),
-            reconstruct.load_uncertainty(weights),
-            average,
-            checks,
-        )
+        checks = reconstruct.PeriodicPhysicsCheck(bench.rig, on_error=_warn_once)
+        pipeline = _load_pipeline(bench, weights, average, checks)
     with opened as source, common.stop_on_signals() as stop, common.progress() as bar:
         task = bar.add_task("reconstructing", total=None)
-        report = loop.replay_recording(
+        report = replays.replay_recording(
             source,
             pipeline,
             path,
             stop=stop,
             on_frame=lambda: bar.advance(task),
             on_warning=warn,
-            media=loop.ReplayMedia(
+            media=replays.ReplayMedia(
                 bench, view=save_view, stills=stills, video=video, objects=formats, every=every
             ),
         )
-    text = (
-        f"Reconstructed {report.frames} frames in {report.seconds:.1f} s: open {path / loop.REPORT}"
-    )
+    text = f"Reconstructed {report.frames} frames in {report.seconds:.1f} s: open {path / replays.REPORT}"
     common.finish(asdict(report), as_json=json, text=text)
     if stop.is_set():
         common.exit_interrupted(f"{path} holds the first {report.frames} frames")
@@ -260,54 +219,17 @@ def _check_output(path: Path, option: str, *suffixes: str, overwrite: bool) -> P
     return common.output_path(path, "live", path.suffix, overwrite=overwrite)
 
 
-def _runtimes(*which: Any) -> Any:
-    """Return `evaluate.runtimes`, which imports torch, once a setting needs it."""
-    return measure.runtimes(*which)
-
-
-def _choose_pipeline(
-    camera: cameras.Camera,
+def _load_pipeline(
     bench: reconstruct.CalibratedRig,
     weights: Path | None,
     average: int,
-    budget_ms: float | None,
-    tradeoff: Path | None,
-    checks: reconstruct.PhysicsCheck,
-) -> tuple[reconstruct.Pipeline, loop.BudgetChoice | None]:
-    """Return the usual pipeline, or that of a latency budget with its choice."""
-    if budget_ms is None:
-        return (
-            _build_pipeline(
-                bench,
-                reconstruct.load_networks(weights),
-                reconstruct.load_uncertainty(weights),
-                average,
-                checks,
-            ),
-            None,
-        )
-    settings = loop.available_settings(tradeoff, weights)
-    load = loop.setting_loader(weights, _runtimes)
-    uncertainty_model = reconstruct.load_uncertainty(weights)
-    # timed with the uncertainty model of `weights`: others take as long
-    build = partial(reconstruct.build_pipeline, bench, uncertainty_model=uncertainty_model)
-    network, choice = loop.choose_within_budget(
-        budget_ms, settings, build, load, loop.pipeline_timer(camera)
-    )
-    common.say(choice.describe())
-    if choice.setting.weights != loop.SHIPPED:
-        uncertainty_model = reconstruct.load_uncertainty(Path(choice.setting.weights))
-    return _build_pipeline(bench, network, uncertainty_model, choice.setting.frames, checks), choice
-
-
-def _build_pipeline(
-    bench: reconstruct.CalibratedRig,
-    network: models.Reconstructor,
-    uncertainty_model: models.UncertaintyModel | None,
-    average: int,
     checks: reconstruct.PhysicsCheck,
 ) -> reconstruct.Pipeline:
-    """Build the pipeline, and print the model's name and its mismatches with the bench."""
+    """Load the networks and build their pipeline, and print the model's name and its mismatches
+    with the bench.
+    """
+    network = reconstruct.load_networks(weights)
+    uncertainty_model = reconstruct.load_uncertainty(weights)
     common.say(f"Loaded model {network.record.rig_name} ({network.runtime})")
     for warning in reconstruct.compatibility_warnings(bench, network.record, uncertainty_model):
         common.say(f"note: {warning}")
@@ -357,7 +279,7 @@ def summary(report: loop.RunReport, *, verbose: bool = False) -> str:
     lost = report.dropped / max(report.frames + report.dropped, 1)
     if lost > SLOW_DROPPED_SHARE or latency["p50"] > SLOW_MS:
         slow = f"{lost:.0%} of the frames dropped, median latency {latency['p50']:.0f} ms"
-        lines.append(f"Warning: {slow}: close other programs, or give --budget-ms")
+        lines.append(f"Warning: {slow}: close other programs")
     if report.verdicts:
         phrases = {reconstruct.Verdict.SEEN.value: "object detected"}
         verdicts = [
@@ -367,7 +289,7 @@ def summary(report: loop.RunReport, *, verbose: bool = False) -> str:
         verdicts[0] = f"{verdicts[0]} of {report.frames} frames".capitalize()
         lines.append(", ".join(verdicts))
     if counts:
-        lines.append(f"Irregular: {loop.describe_counts(counts)}")
+        lines.append(f"Irregular: {reconstruct.describe_counts(counts)}")
     if report.stalled_s:
         lines.append(f"Stalled for {report.stalled_s:.1f} s without a frame")
     lines += [f"Warning in {frames} frames: {text}" for text, frames in report.warnings.items()]

@@ -37,7 +37,7 @@ from nlos_cam.reconstruct import (
     Verdict,
     VerdictFilter,
     align_all,
-    estimate_doubt,
+    estimate_uncertainty,
     rig_to_align_with,
     verdict_limits,
 )
@@ -165,14 +165,14 @@ def predict_quality(
         maps.depth_m, maps.intensity, answers.image, surfaces, strict=True
     ):
         frame = LidarMaps(depth_m, intensity, ~np.isnan(depth_m))
-        doubt = estimate_doubt(uncertainty_model, frame, image, box, surface)
+        uncertainty = estimate_uncertainty(uncertainty_model, frame, image, box, surface)
         found = Reconstruction(
-            shapes.depth_from_image(image, box), np.eye(4), doubt.error_m, {}, doubt
+            shapes.depth_from_image(image, box), box, uncertainty.error_m, {}, uncertainty
         )
         _, verdict = VerdictFilter(verdict_limits(uncertainty_model)).decide(
             found, FrameConditions()
         )
-        if quality := doubt.quality:
+        if quality := uncertainty.quality:
             trusted = quality.trusted and verdict is Verdict.SEEN
             rows.append((*quality.iou, 1e3 * quality.error_m, trusted))
         else:  # no surface: no overlap

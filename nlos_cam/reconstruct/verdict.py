@@ -76,27 +76,31 @@ class VerdictFilter:
         """Return the reconstruction to show, without surface if nothing is hidden, and the
         verdict.
         """
-        of_lidar = (
-            Verdict.WALL_MOVED
-            if conditions.moved
-            else Verdict.SATURATED
-            if conditions.saturated
-            else None
-        )
-        if (limits := self._limits) is None or (doubt := reconstruction.doubt) is None:
+        of_lidar = None
+        if conditions.saturated:
+            of_lidar = Verdict.SATURATED
+        if conditions.moved:
+            of_lidar = Verdict.WALL_MOVED
+
+        limits = self._limits
+        uncertainty = reconstruction.uncertainty
+        if limits is None or uncertainty is None:
             return reconstruction, of_lidar
-        if doubt.nothing >= limits.nothing:
+
+        if uncertainty.p_empty >= limits.nothing:
+            # A new object must not be averaged with the one that left.
             self._outside.clear()
             verdict = Verdict.OUTSIDE if conditions.invalid else Verdict.NOTHING
             return reconstruction.without_surface, of_lidar or verdict
-        self._outside.append(doubt.outside)
+
+        self._outside.append(uncertainty.p_out_of_distribution)
         unlike = sum(self._outside) / len(self._outside) >= limits.outside
         unexplained = conditions.check is not None and conditions.check.score >= limits.unexplained
         outside = unlike or unexplained or conditions.invalid or not reconstruction.has_surface
         return reconstruction, of_lidar or (Verdict.OUTSIDE if outside else Verdict.SEEN)
 
 
-def frame_issues(frame: Frame) -> list[str]:
+def frame_issues(frame: Frame) -> tuple[str, ...]:
     """Return the issues of a frame: blank (no depth at all) or half_invalid (none in half of the
     pixels); saturated.
     """
@@ -108,4 +112,4 @@ def frame_issues(frame: Frame) -> list[str]:
         issues.append("half_invalid")
     if saturated_share(frame.ir) > MAX_SATURATED:
         issues.append("saturated")
-    return issues
+    return tuple(issues)

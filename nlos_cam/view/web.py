@@ -116,7 +116,7 @@ class WebViewer(Website):
     def begin(self, rig: Rig, measured: MeasuredWall | None = None) -> None:
         """Show this bench from now on."""
         self._bench = (self._bench[0] + 1, bench_message(rig, measured))
-        self._packer = MomentPacker(rig)
+        self._packer = MomentPacker()
 
     def __enter__(self) -> Self:
         super().__enter__()
@@ -208,7 +208,7 @@ class PlaybackViewer(Website):
     ) -> None:
         super().__init__(host=host, port=port, controls=controls)
         self._bench = bench_message(rig, measured)
-        self._chunks = Chunks(MomentPacker(rig))
+        self._chunks = Chunks(MomentPacker())
         self._changed = Condition()
         self._closed = False
         self._ends = [0]

@@ -10,6 +10,7 @@ import numpy as np
 from nlos_calibration import Intrinsics, load_rig
 
 from nlos_cam.frames import Frame
+from nlos_cam.objects import object_box
 from nlos_cam.reconstruct.network import Reconstruction
 from nlos_cam.render import SensedImages
 from nlos_cam.view.viewer import Moment, NullViewer
@@ -17,7 +18,7 @@ from nlos_cam.view.viewer import Moment, NullViewer
 RIG = load_rig("paper-rig")
 SMALL = Intrinsics(80, 64, 57.0, 61.0, 39.5, 31.5)
 SERIAL = "f0246262"
-NOTHING = Reconstruction(np.full((64, 64), np.nan, np.float32), np.eye(4), None, {})
+NOTHING = Reconstruction(np.full((64, 64), np.nan, np.float32), object_box(RIG), None, {})
 
 
 def assert_exposed(frame: Frame, images: SensedImages) -> None:

@@ -65,7 +65,7 @@ from nlos_cam.evaluate import (
 from nlos_cam.files import cache_folder
 from nlos_cam.frames import LidarMaps
 from nlos_cam.objects import benchmark_objects, object_box
-from nlos_cam.reconstruct import estimate_doubt
+from nlos_cam.reconstruct import estimate_uncertainty
 
 FRAMES = 10, 100
 DISTANCES_M = (0.15, 0.2, 0.25, 0.3)
@@ -292,11 +292,13 @@ def cell(
                 for pair in zip(taken.depth_m, taken.intensity, strict=True)
             )
             doubts = [
-                estimate_doubt(doubter, one, image, box)
+                estimate_uncertainty(doubter, one, image, box)
                 for one, image in zip(seen, images, strict=True)
             ]
             found["outside"] = float(
-                np.mean([doubt.outside > doubter.record.outside_above for doubt in doubts])
+                np.mean(
+                    [doubt.p_out_of_distribution > doubter.record.outside_above for doubt in doubts]
+                )
             )
         return found
 

@@ -68,7 +68,7 @@ def opened(monkeypatch: pytest.MonkeyPatch) -> Iterator[Opened]:
     monkeypatch.setattr("nlos_cam.reconstruct.load_networks", lambda *_: opened.network)
     monkeypatch.setattr("nlos_cam.reconstruct.load_uncertainty", lambda *_: opened.doubter)
     monkeypatch.setattr(
-        "nlos_cam.live.replay.draw_contact_sheet", lambda path, *_: path.touch()
+        "nlos_cam.replay.replay.draw_contact_sheet", lambda path, *_: path.touch()
     )  # takes a second
     before = signal.getsignal(signal.SIGINT)
     yield opened
@@ -79,7 +79,7 @@ def opened(monkeypatch: pytest.MonkeyPatch) -> Iterator[Opened]:
 def walled(opened: Opened, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Opened:
     """Camera on a measured wall, wall.toml, that is moved for a while."""
     monkeypatch.setattr(
-        "nlos_cam.live.loop.os.cpu_count", lambda: 1
+        "nlos_cam.reconstruct.streaming.os.cpu_count", lambda: 1
     )  # the network is given maps in order
     write_wall(tmp_path / "wall.toml", bare_wall())
     opened.camera = WallCamera(100, moved=range(30, 60))
@@ -207,21 +207,12 @@ def test_interrupt_while_a_camera_opens_begins_no_run(
     assert run(*command, code=130) == {}
 
 
-def test_live_budget_reports_whether_it_was_kept(
-    opened: Opened, run: Run, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("nlos_cam.live.setting_loader", lambda *_: lambda _: opened.network)
-    report = run(*RECORDED, "--budget-ms", "100000")
-    assert report["budget"]["kept"]
-    assert "100000 ms" in report.err
-
-
 @pytest.mark.usefixtures("walled")
 @pytest.mark.parametrize("command", [SIMULATED, REPLAY])
 def test_begin_and_end_of_a_warning_print_once(
     run: Run, monkeypatch: pytest.MonkeyPatch, command: list[str]
 ) -> None:
-    monkeypatch.setattr("nlos_cam.live.frame_queue.QUEUE_FRAMES", 1000)
+    monkeypatch.setattr("nlos_cam.reconstruct.frame_reader.QUEUE_FRAMES", 1000)
     report = run(*command, "--wall", "wall.toml")
     [(warning, frames)] = report["warnings"].items()
     assert 0 < frames < 100
@@ -260,10 +251,7 @@ def test_summary_has_a_sentence_per_fact_and_stages_if_verbose() -> None:
     )
     assert summary(full).splitlines()[2:] == [
         "Dropped 5 frames: 2 at the camera, 3 because processing was too slow",
-        (
-            "Warning: 33% of the frames dropped, median latency 9 ms: close other programs, or give"
-            " --budget-ms"
-        ),
+        ("Warning: 33% of the frames dropped, median latency 9 ms: close other programs"),
         "Object detected in 7 of 10 frames, nothing there in 3",
         "Irregular: 1 blank",
         "Stalled for 1.2 s without a frame",

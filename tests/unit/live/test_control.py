@@ -67,7 +67,7 @@ def test_snapshot_writes_picture_arrays_and_mesh(control: RunControl, tmp_path: 
     told = control.run("snapshot", {})
     assert files(tmp_path) == [".npz", ".ply", ".png"]
     with np.load(next(tmp_path.glob("*.npz"))) as arrays:
-        np.testing.assert_array_equal(arrays["depth_m"], full_moment(29).reconstruction.depth_m)
+        np.testing.assert_array_equal(arrays["depth_m"], full_moment(29).result.depth_m)
         assert arrays["frame_number"] == 29
     assert ".npz" in told
     control.run("snapshot", {})
@@ -85,17 +85,10 @@ def test_session_is_saved_between_two_commands(control: RunControl, tmp_path: Pa
     assert set(shown) <= set(range(30, 60))
 
 
-def test_average_and_setting_change_the_pipeline(control: RunControl) -> None:
-    pipeline = control._pipeline
+def test_average_changes_the_pipeline(control: RunControl) -> None:
+    pipeline = control._run.pipeline
     control.run("average", {"frames": 4})
     assert pipeline.average == control.status()["control"]["average"] == 4
-    other: Any = object()
-    control.settings = [("fast", "fast: 3 ms, error 22 mm")]
-    control.load_setting = lambda _: (other, 1)
-    assert "22 mm" in control.run("setting", {"name": "fast"})
-    assert pipeline.network is other
-    assert pipeline.average == 1
-    assert control.status()["control"]["setting"] == "fast"
 
 
 @pytest.mark.parametrize(
@@ -105,7 +98,6 @@ def test_average_and_setting_change_the_pipeline(control: RunControl) -> None:
         ("average", {"frames": 0}, "1 to 1000"),
         ("average", {"frames": "x"}, "average"),
         ("average", {"of": 3}, "does not take"),
-        ("setting", {"name": "none"}, "no setting"),
         ("stop_recording", {}, "nothing is being recorded"),
         ("end_session", {}, "no session"),
         ("record", {"label": "cup"}, "live camera"),
@@ -137,7 +129,7 @@ def test_one_command_runs_at_a_time(control: RunControl) -> None:
         control.run("resume", {})
     leave.set()
     thread.join()
-    assert control.paused
+    assert control.pipeline.paused
 
 
 def run(camera: FrameCamera, control: RunControl) -> RunReport:
@@ -167,7 +159,7 @@ def test_reference_is_taken_from_the_passing_frames(tmp_path: Path) -> None:
     control = RunControl(folder=tmp_path)
     benches = list[CalibratedRig]()
     told = list[str]()
-    control.on_bench = benches.append
+    control.bench.on_bench = benches.append
     command = threading.Thread(
         target=lambda: told.append(control.run("take_reference", {"frames": 8}))
     )
@@ -196,7 +188,7 @@ def test_pace_watch_warns_once_and_says_what_to_do() -> None:
     for frames in range(0, 2 * SLOW_FRAMES, 10):
         watch.update(4 * SLOW_FRAMES + frames, frames // 2)
     assert [begins for _, begins in told] == [True]
-    assert "--budget-ms" in told[0][0]
+    assert "taskset" in told[0][0]
     assert watch.warnings
     for frames in range(0, 3 * SLOW_FRAMES, 10):
         watch.update(6 * SLOW_FRAMES + frames, SLOW_FRAMES)

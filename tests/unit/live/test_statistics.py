@@ -7,7 +7,7 @@ from dataclasses import replace
 from datetime import UTC, datetime
 from itertools import count as count_up
 from pathlib import Path
-from types import SimpleNamespace
+from types import MappingProxyType, SimpleNamespace
 from typing import Any
 from unittest.mock import Mock, call
 
@@ -26,14 +26,12 @@ from nlos_cam.live.statistics import (
     MAX_FAILED_IN_A_ROW,
     STALLED,
     STALLED_AFTER_S,
-    QualityLog,
     StallWatch,
-    WarningLog,
 )
-from nlos_cam.live.telemetry import Telemetry, telemetry_of
-from nlos_cam.reconstruct import FrameResult, Quality, Verdict
-from nlos_cam.reconstruct.network import Doubt
+from nlos_cam.reconstruct import FrameResult, Quality, QualityLog, RecentValues, Verdict, WarningLog
+from nlos_cam.reconstruct.network import Uncertainty
 from nlos_cam.recording.sidecar import Sidecar, Temperatures, sidecar_path
+from nlos_cam.recording.telemetry import Telemetry, telemetry_of
 from nlos_cam.view import Moment
 
 
@@ -44,12 +42,18 @@ def step_of(number: int, *warnings: str, **others: Any) -> FrameResult:
 
 
 def reported(
-    tally: RunStatistics, dropped_loop: int = 0, offset_s: float = 0.0, **camera: Any
+    tally: RunStatistics,
+    dropped_loop: int = 0,
+    issues: Mapping[str, int] = MappingProxyType({}),
+    offset_s: float = 0.0,
+    **camera: Any,
 ) -> RunReport:
     seen_through: Any = SimpleNamespace(
         **{"incomplete": 0, "dropped": 0, "counts": Counter[str](), **camera}
     )
-    reader: Any = SimpleNamespace(dropped=list(range(dropped_loop)), offset_s=offset_s)
+    reader: Any = SimpleNamespace(
+        dropped=list(range(dropped_loop)), offset_s=offset_s, issues=issues
+    )
     return tally.report(seen_through, reader)
 
 
@@ -71,9 +75,10 @@ def test_report_counts_verdicts_warnings_issues_and_lost_frames() -> None:
     passed = [Verdict.SEEN, None, Verdict.NOTHING, Verdict.SEEN, Verdict.WALL_MOVED]
     for number, verdict in enumerate(passed):
         tally.add(step_of(number, *["hot"] * (number > 2), verdict=verdict), view_s=0.0)
-    tally.issues.update(["blank", "blank"])
     tally.fail(small_frame(1), ZeroDivisionError("odd"), 1)
-    report = reported(tally, 4, incomplete=2, dropped=3, counts=Counter(duplicate=1, stalled=0))
+    report = reported(
+        tally, 4, {"blank": 2}, incomplete=2, dropped=3, counts=Counter(duplicate=1, stalled=0)
+    )
     lost = {"incomplete": 2, "dropped_camera": 3, "dropped_loop": 4, "failed": 1}
     assert (report.counts, report.dropped) == ({"duplicate": 1, **lost, "blank": 2}, 2 + 3 + 4 + 1)
     assert report.verdicts == {"object seen": 2, "nothing there": 1, "wall moved": 1}
@@ -116,7 +121,7 @@ def test_percentiles_rise_and_lie_among_the_times(seconds: list[float]) -> None:
 
 
 def test_stage_times_replace_the_oldest_in_constant_memory() -> None:
-    times = statistics.StageTimes(remembered=10)
+    times = RecentValues(remembered=10)
     for number in range(35):
         times.add({"maps": float(number)})
         assert times._columns["maps"].size == 10
@@ -176,8 +181,10 @@ def test_predicted_quality_is_summarised_over_detected_objects_alone() -> None:
         )
         plane = np.zeros((64, 64), np.float32)
         result = step_of(number, verdict=verdict)
-        doubt = Doubt(0.0, 0.0, plane, plane, quality)
-        log.add(replace(result, reconstruction=replace(result.reconstruction, doubt=doubt)))
+        uncertainty = Uncertainty(0.0, 0.0, plane, plane, quality)
+        log.add(
+            replace(result, reconstruction=replace(result.reconstruction, uncertainty=uncertainty))
+        )
     assert log.summary == pytest.approx(
         {"expected_iou": 0.7, "expected_error_mm": 7.0, "trusted": 0.5}
     )

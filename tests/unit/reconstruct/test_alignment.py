@@ -158,9 +158,8 @@ def test_what_cannot_be_aligned_is_left_alone() -> None:
 
 def arrival(rig: Rig) -> Arrival:
     echoes = render(Scene(rig, None), "draft").multi
-    return Arrival(
-        Sensor(rig, QUIET).expose(echoes, np.random.default_rng(0)).frame(rig.pinhole), 0.0
-    )
+    images = Sensor(rig, QUIET).expose(echoes, np.random.default_rng(0))
+    return Arrival(images.frame(rig.pinhole), 0.0, ())
 
 
 def test_occluder_that_was_not_measured_is_taken_to_stand_as_in_training() -> None:

@@ -14,9 +14,9 @@ from nlos_cam.errors import SceneError
 from nlos_cam.frames import LidarMaps
 from nlos_cam.objects.depth_map import depth_from_image, image_from_depth, object_box
 from nlos_cam.reconstruct.network import (
-    Doubt,
     Mirrored,
     Reconstruction,
+    Uncertainty,
     reconstruct,
     reconstruct_all,
 )
@@ -81,8 +81,8 @@ def test_reconstruct_with_doubt_adds_uncertainty_in_metres_and_a_stage() -> None
     doubter = FakeDoubter(lambda *_: (0.25, 0.5), error_v=0.1)
     found = reconstruct(some_maps(), RIG, sheet_network, lambda: float(next(ticks)), doubter)
     assert found.timings_s == {"network": 1.0, "doubt": 1.0}
-    assert (found.doubt.nothing, found.doubt.outside) == (0.25, 0.5)
-    assert found.uncertainty_m is found.doubt.error_m
+    assert (found.uncertainty.p_empty, found.uncertainty.p_out_of_distribution) == (0.25, 0.5)
+    assert found.uncertainty_m is found.uncertainty.error_m
     apart_m = depth_from_image(HALF[0], BOX) - depth_from_image(HALF[0] + np.float32(0.1), BOX)
     np.testing.assert_allclose(found.uncertainty_m, apart_m, rtol=1e-5)
     assert [part.shape for part in doubter.asked[0]] == [(1, 64, 80), (1, 64, 80), (1, 64, 64)]
@@ -92,10 +92,10 @@ def test_reconstruct_with_doubt_adds_uncertainty_in_metres_and_a_stage() -> None
         np.testing.assert_array_equal(asked[0], given)
     hidden = found.without_surface
     assert found.has_surface
-    assert (hidden.has_surface, hidden.uncertainty_m, hidden.doubt) == (
+    assert (hidden.has_surface, hidden.uncertainty_m, hidden.uncertainty) == (
         False,
         found.uncertainty_m,
-        found.doubt,
+        found.uncertainty,
     )
 
 
@@ -129,8 +129,8 @@ def test_quality_is_predicted_from_each_frame_s_own_probability_of_a_surface() -
     blank = np.full((64, 80), np.nan, np.float32)
     frames = [replace(bright, depth_m=blank, valid=np.zeros((64, 80), bool)), bright]
     nothing, found = reconstruct_all(frames, RIG, TellingNetwork(), uncertainty_model=doubter)
-    assert nothing.doubt.quality is None
-    assert found.doubt.quality.iou == (0.5, 0.5, 0.5)
+    assert nothing.uncertainty.quality is None
+    assert found.uncertainty.quality.iou == (0.5, 0.5, 0.5)
     np.testing.assert_array_equal(asked.call_args.args[2], sheet_network() * 40)
     reconstruct(bright, RIG, sheet_network, uncertainty_model=doubter)
     assert asked.call_args.args[2] is None
@@ -148,10 +148,10 @@ SURFACE_M = np.full((64, 64), 0.2, np.float32)
 def reconstruction(
     nothing: float = 0.0, outside: float = 0.0, depth_m: np.ndarray = SURFACE_M
 ) -> Reconstruction:
-    doubt = Doubt(
+    uncertainty = Uncertainty(
         nothing, outside, np.full((64, 64), 0.01, np.float32), np.ones((64, 64), np.float32)
     )
-    return Reconstruction(depth_m, np.eye(4), doubt.error_m, {}, doubt)
+    return Reconstruction(depth_m, object_box(RIG), uncertainty.error_m, {}, uncertainty)
 
 
 def checked(score: float) -> FrameConditions:
@@ -205,7 +205,7 @@ def test_verdict_hides_the_surface_only_if_nothing_is_there(signs: FrameConditio
 
 @pytest.mark.parametrize("judge", [VerdictFilter(None), VerdictFilter(LIMITS)])
 def test_verdict_without_doubt_considers_the_lidar_only(judge: VerdictFilter) -> None:
-    plain = replace(reconstruction(), doubt=None, uncertainty_m=None)
+    plain = replace(reconstruction(), uncertainty=None, uncertainty_m=None)
     assert judge.decide(plain, FrameConditions()) == (plain, None)
     assert judge.decide(plain, FrameConditions(saturated=True))[1] == Verdict.SATURATED
     assert judge.decide(plain, FrameConditions(moved=True, saturated=True))[1] == Verdict.WALL_MOVED

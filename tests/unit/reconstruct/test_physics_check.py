@@ -217,4 +217,4 @@ def test_live_loop_shows_the_newest_check_with_each_frame() -> None:
     checks = PeriodicPhysicsCheck(RIG, every=2, accuracy="draft")
     pipeline = Pipeline(CalibratedRig(RIG), sheet_network, checks=checks)
     run_live(WallCamera(5, period_s=0.0), pipeline, viewer, stop=Event(), recorded=True)
-    assert [moment.check.frame_number for moment in viewer.moments] == [0, 0, 2, 2, 4]
+    assert [moment.result.check.frame_number for moment in viewer.moments] == [0, 0, 2, 2, 4]

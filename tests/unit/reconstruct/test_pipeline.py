@@ -26,21 +26,17 @@ from nlos_calibration.rig import load_rig
 from small_frames import SheetNetwork, sheet_network
 
 from nlos_cam.frames import LidarMaps, maps_from_frame
-from nlos_cam.live import FrameReader
-from nlos_cam.live.loop import (
-    BATCH_FRAMES,
-    MAX_BATCHES_AHEAD,
-    iterate_batched,
-    iterate_results,
-    with_telemetry,
-)
 from nlos_cam.reconstruct import (
     Clock,
     FrameConditions,
+    FrameReader,
     FrameResult,
     Pipeline,
     Verdict,
     build_pipeline,
+    frame_issues,
+    iterate_batched,
+    iterate_results,
     load_networks,
 )
 from nlos_cam.reconstruct.bench import (
@@ -51,6 +47,8 @@ from nlos_cam.reconstruct.bench import (
 )
 from nlos_cam.reconstruct.physics_check import PeriodicPhysicsCheck, PhysicsCheckResult
 from nlos_cam.reconstruct.pipeline import compatibility_warnings, frame_conditions
+from nlos_cam.reconstruct.streaming import BATCH_FRAMES, MAX_BATCHES_AHEAD
+from nlos_cam.recording import with_telemetry
 
 
 def all_steps(
@@ -64,7 +62,7 @@ def all_steps(
     ):
         if ahead:
             return list(iterate_batched(reader, pipeline, clock, telemetry))
-        return list(iterate_results(reader, pipeline, clock, telemetry=telemetry))
+        return list(iterate_results(reader, pipeline, clock, temperatures=telemetry))
 
 
 @pytest.fixture
@@ -201,7 +199,8 @@ def test_frame_conditions_follow_frame_issues_and_bench(missing: int, saturated:
         wall_frame(0), depth_m=depth_m, ir=np.full((64, 80), 255 if saturated else 9, np.uint8)
     )
     check = PhysicsCheckResult(0, depth_m, depth_m, score=1.0, seconds=0.0)
-    conditions = frame_conditions(frame, BenchObservation(None, (), moved=saturated), check)
+    observation = BenchObservation(None, (), moved=saturated)
+    conditions = frame_conditions(frame_issues(frame), observation, check)
     assert conditions == FrameConditions(saturated, missing > 0, moved=saturated, check=check)
 
 

@@ -217,7 +217,7 @@ def test_calibration_facts_begin_with_the_verdict_and_note_a_missing_reference()
 
 def test_film_holds_every_second_frame(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     path = tmp_path / "film.webm"
-    with VideoFile(path, RIG) as film:
+    with VideoFile(path) as film:
         for number in range(20):
             film.show(full_moment(number))
     video = cv2.VideoCapture(str(path))
@@ -227,7 +227,7 @@ def test_film_holds_every_second_frame(tmp_path: Path, capfd: pytest.CaptureFixt
         frames.append(got[1][..., ::-1])
     assert len(frames) == film.filmed == 10
     assert {frame.shape for frame in frames} == {(layout.HEIGHT, layout.WIDTH, 3)}
-    expected = Still(RIG, full_moment(0)).rgb(full_moment(0)).astype(int)
+    expected = Still(full_moment(0)).rgb(full_moment(0)).astype(int)
     assert np.abs(frames[0] - expected).mean() < 6.0
     assert (np.abs(frames[0].astype(int) - frames[-1]).max(axis=-1) > 60).mean() > 0.005, "it moves"
     content = path.read_bytes()
@@ -239,7 +239,7 @@ def test_film_holds_every_second_frame(tmp_path: Path, capfd: pytest.CaptureFixt
 
 def test_film_refuses_a_missing_codec(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("nlos_cam.view.video.CODEC", "none")
-    with pytest.raises(NlosCamError, match="none codec"), VideoFile(tmp_path / "film.webm", RIG):
+    with pytest.raises(NlosCamError, match="none codec"), VideoFile(tmp_path / "film.webm"):
         pass
 
 
@@ -274,7 +274,7 @@ def test_still_shows_each_part_of_a_moment_in_its_panel_and_marks_a_doubted_reco
 ):
     one = full_moment(0)
     frame = one.frame
-    still = Still(RIG, one)
+    still = Still(one)
     before = still.rgb(one)
     assert before.shape == (layout.HEIGHT, layout.WIDTH, 3)
     for panels, others in (
@@ -291,13 +291,12 @@ def test_still_shows_each_part_of_a_moment_in_its_panel_and_marks_a_doubted_reco
     ):
         assert changed(before, still.rgb(replace(one, **others))) == panels
     assert (
-        panel(Still(RIG, moment(0)).rgb(moment(0, NOTHING)), "reconstruction")
-        == images.BACKGROUND_RGB
+        panel(Still(moment(0)).rgb(moment(0, NOTHING)), "reconstruction") == images.BACKGROUND_RGB
     ).all()
 
 
 def test_still_keeps_lidar_pictures_until_new_ones() -> None:
-    still = Still(RIG, full_moment(0))
+    still = Still(full_moment(0))
     first, kept, new = (
         still.rgb(full_moment(number), with_lidar=number != 3) for number in (0, 3, 6)
     )
@@ -308,7 +307,7 @@ def test_still_keeps_lidar_pictures_until_new_ones() -> None:
 
 def test_still_is_saved_as_png(tmp_path: Path) -> None:
     one = full_moment(0, size=(480, 640))
-    Still(RIG, one).save(tmp_path / "still.png", one)
+    Still(one).save(tmp_path / "still.png", one)
     with Image.open(tmp_path / "still.png") as image:
         assert (image.format, image.size) == ("PNG", (layout.WIDTH, layout.HEIGHT))
 

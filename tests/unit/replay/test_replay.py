@@ -18,19 +18,20 @@ from view_streams import saved_moments
 
 from nlos_cam.errors import OutputExistsError, RecordingError
 from nlos_cam.frames import Frame, LidarMaps, maps_from_frame
-from nlos_cam.live import OBJECT_FORMATS, VIDEO, ReplayMedia, export_objects
-from nlos_cam.live.loop import BATCH_FRAMES, MAX_BATCHES_AHEAD
-from nlos_cam.live.replay import DIFFERENCE, REPORT, RESULT, SHEET, ReplayReport, replay_recording
-from nlos_cam.live.replay_media import VIEW, FrameSampler, draw_contact_sheet, moment_of
 from nlos_cam.objects import mesh_from_depth, object_box
 from nlos_cam.reconstruct import CalibratedRig, FrameResult, PeriodicPhysicsCheck, Pipeline, Verdict
+from nlos_cam.reconstruct.streaming import BATCH_FRAMES, MAX_BATCHES_AHEAD
+from nlos_cam.replay import OBJECT_FORMATS, VIDEO, ReplayMedia, export_objects
+from nlos_cam.replay.media import VIEW, FrameSampler, draw_contact_sheet
+from nlos_cam.replay.replay import DIFFERENCE, REPORT, RESULT, SHEET, ReplayReport, replay_recording
+from nlos_cam.view import Moment
 
 TEXT = "report.md"
 NAMES = {REPORT, RESULT, SHEET, TEXT}
 BENCH = CalibratedRig(RIG)
 BOX = object_box(RIG)
 FULL = full_moment(0)
-STEP = FrameResult(FULL.frame, maps_from_frame(FULL.frame), FULL.reconstruction, 0.0, {})
+STEP = FULL.result
 
 
 def left_half(depth_m: np.ndarray, *_: np.ndarray) -> np.ndarray:
@@ -233,12 +234,12 @@ def test_media_of_a_failed_replay_have_no_stills(tmp_path: Path) -> None:
 
 
 def test_moment_of_step_is_complete_and_at_its_own_time() -> None:
-    known = {name: getattr(FULL, name) for name in ("difference", "verdict", "check")}
     stages_s = {"wait": 9.0, "maps": 0.001, "network": 0.01}
-    shown = moment_of(replace(STEP, published_s=77.0, stages_s=stages_s, **known), FULL.celsius)
-    assert shown.published_s == FULL.frame.timestamp_s
+    result = replace(STEP, published_s=77.0, stages_s=stages_s)
+    shown = Moment.recorded(result, FULL.celsius)
+    assert shown.result is result
+    assert shown.time_s == STEP.timestamp_s
     assert shown.latency_s == pytest.approx(0.011)
-    assert {name: getattr(shown, name) for name in known} == known
     assert shown.celsius == FULL.celsius
 
 
