@@ -14,7 +14,6 @@ from view_streams import saved_moments
 
 from nlos_cam.errors import NlosCamError
 from nlos_cam.live import RunControl, RunReport, run_live
-from nlos_cam.live.statistics import SLOW_FRAMES, PaceWatch
 from nlos_cam.reconstruct import CalibratedRig, Pipeline
 from nlos_cam.view import NullViewer
 
@@ -177,20 +176,3 @@ def test_reference_is_taken_from_the_passing_frames(tmp_path: Path) -> None:
     assert bench.rig is RIG
     measured = load_measured(next(tmp_path.glob("bench-*.toml")))
     np.testing.assert_array_equal(measured.reference.map_depth_m, bench.reference.map_depth_m)
-
-
-def test_pace_watch_warns_once_and_says_what_to_do() -> None:
-    told: list[tuple[str, bool]] = []
-    watch = PaceWatch(lambda text, begins: told.append((text, begins)))
-    for frames in range(0, 4 * SLOW_FRAMES, 10):
-        watch.update(frames, 0)
-    assert told == []
-    for frames in range(0, 2 * SLOW_FRAMES, 10):
-        watch.update(4 * SLOW_FRAMES + frames, frames // 2)
-    assert [begins for _, begins in told] == [True]
-    assert "taskset" in told[0][0]
-    assert watch.warnings
-    for frames in range(0, 3 * SLOW_FRAMES, 10):
-        watch.update(6 * SLOW_FRAMES + frames, SLOW_FRAMES)
-    assert [begins for _, begins in told] == [True, False]
-    assert watch.warnings == ()

@@ -17,8 +17,7 @@ from small_frames import FrameCamera, ListViewer, sheet_network, small_frame
 from nlos_cam.errors import CameraLostError
 from nlos_cam.live.loop import pace, run_live
 from nlos_cam.live.statistics import OUTSIDE_LATENCY, STALLED, RunReport
-from nlos_cam.reconstruct import CalibratedRig, FrameReader, Pipeline, Verdict, frame_issues
-from nlos_cam.reconstruct.frame_reader import QUEUE_FRAMES
+from nlos_cam.reconstruct import CalibratedRig, Pipeline, Verdict
 from nlos_cam.view import Moment, NullViewer
 
 RIG = load_rig("paper-rig")
@@ -258,60 +257,3 @@ def test_run_live_shows_a_stall_with_the_last_moment() -> None:
     assert (report.frames, report.counts, report.verdicts) == (10, {"stalls": 1}, {})
     assert report.stalled_s >= 1.0
     assert {moment.celsius["ldd_temperature"] for moment in viewer.moments} == {40.0}
-
-
-PIXELS = 80 * 64
-
-
-@pytest.mark.parametrize("depths", [0, PIXELS // 2, PIXELS // 2 + 1])
-@pytest.mark.parametrize("saturated", [PIXELS // 1000, PIXELS // 1000 + 1])
-def test_frame_issues_are_named(depths: int, saturated: int) -> None:
-    frame = small_frame(0)
-    frame.depth_m.ravel()[depths:] = np.nan
-    frame.ir[:] = 254
-    frame.ir.ravel()[:saturated] = 255
-    missing = {0: ("blank",), PIXELS // 2: ("half_invalid",)}.get(depths, ())
-    assert frame_issues(frame) == missing + ("saturated",) * (saturated > PIXELS // 1000)
-
-
-def wait_for_end(reader: FrameReader) -> None:
-    """Wait until the camera has ended: the consumer is as late as can be."""
-    reader._thread.join(60.0)
-    assert not reader._thread.is_alive()
-
-
-@pytest.mark.parametrize("lossless", [True, False])
-def test_reader_yields_every_frame_or_drops_the_oldest(lossless: bool) -> None:
-    with FrameReader(FrameCamera(200), lossless=lossless, stop=Event()) as reader:
-        if not lossless:
-            wait_for_end(reader)
-        numbers = [arrival.frame.frame_number for arrival in reader]
-    assert numbers == list(range(0 if lossless else 200 - QUEUE_FRAMES, 200))
-    assert reader.dropped == list(range(numbers[0]))
-
-
-def test_reader_ends_with_the_stop_event_or_when_left() -> None:
-    stop = Event()
-    with FrameReader(FrameCamera(None), lossless=True, stop=stop) as reader:
-        for arrival in reader:
-            if arrival.frame.frame_number == 5:
-                stop.set()
-    assert not reader._thread.is_alive()
-    with FrameReader(FrameCamera(None), lossless=True, stop=Event()) as reader:
-        next(iter(reader))
-    assert not reader._thread.is_alive()
-
-
-def test_reader_closes_or_reports_a_source_that_hangs(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("nlos_cam.reconstruct.frame_reader.ABANDON_AFTER_S", 0.01)
-    release = Event()
-    source = FrameCamera(None, lambda _: release.wait(60.0))
-    with FrameReader(source, lossless=True, stop=Event(), abandon_source=release.set) as reader:
-        pass
-    assert not reader._thread.is_alive()
-    monkeypatch.setattr("nlos_cam.reconstruct.frame_reader.JOIN_TIMEOUT_S", 0.05)
-    release.clear()
-    with pytest.raises(CameraLostError), FrameReader(source, lossless=True, stop=Event()) as reader:
-        pass
-    release.set()
-    wait_for_end(reader)

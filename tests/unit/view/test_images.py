@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from made_up_moments import NOTHING, RIG, full_moment, moment
+from made_up_moments import NOTHING, RIG, full_moment, moment, with_result
 from measured_walls import HEIGHT, WIDTH, exact_wall
 from nlos_calibration import MeasuredWall, normal_from_angles, wall_from_plane
 from PIL import Image
@@ -269,30 +269,39 @@ def changed(before: np.ndarray, after: np.ndarray) -> set[str]:
     return {name for name in PANELS if (panel(before, name) != panel(after, name)).any()}
 
 
-def test_still_shows_each_part_of_a_moment_in_its_panel_and_marks_a_doubted_reconstruction() -> (
-    None
-):
+def other_still(**fields: Any) -> set[str]:
+    """Return the panels that change with other fields of the result."""
     one = full_moment(0)
-    frame = one.frame
     still = Still(one)
-    before = still.rgb(one)
-    assert before.shape == (layout.HEIGHT, layout.WIDTH, 3)
-    for panels, others in (
-        ({"truth"}, {"frame": replace(frame, truth_depth_m=NOTHING)}),
-        ({"infrared"}, {"frame": replace(frame, ir=frame.ir + 90)}),
-        ({"depth"}, {"frame": replace(frame, depth_m=frame.depth_m * np.float32(0.5))}),
-        ({"footer"}, {"latency_s": 0.5, "published_s": 0.5}),
-        ({"uncertainty"}, {"reconstruction": replace(one.reconstruction, uncertainty_m=flat(0.0))}),
-        *(
-            ({"banner", "reconstruction"}, {"verdict": verdict})
-            for verdict in Verdict
-            if verdict is not Verdict.SEEN
-        ),
-    ):
-        assert changed(before, still.rgb(replace(one, **others))) == panels
-    assert (
-        panel(Still(moment(0)).rgb(moment(0, NOTHING)), "reconstruction") == images.BACKGROUND_RGB
-    ).all()
+    return changed(still.rgb(one), still.rgb(with_result(one, **fields)))
+
+
+def test_still_shows_each_part_of_a_frame_in_its_panel() -> None:
+    frame = full_moment(0).result.frame
+    halved_m = frame.depth_m * np.float32(0.5)
+    assert Still(full_moment(0)).rgb(full_moment(0)).shape == (layout.HEIGHT, layout.WIDTH, 3)
+    assert other_still(frame=replace(frame, truth_depth_m=NOTHING)) == {"truth"}
+    assert other_still(frame=replace(frame, ir=frame.ir + 90)) == {"infrared"}
+    assert other_still(frame=replace(frame, depth_m=halved_m)) == {"depth"}
+
+
+def test_still_shows_uncertainty_and_times_in_their_panels() -> None:
+    one = full_moment(0)
+    certain = replace(one.result.reconstruction, uncertainty_m=flat(0.0))
+    assert other_still(reconstruction=certain) == {"uncertainty"}
+    still = Still(one)
+    later = replace(one, latency_s=0.5, time_s=0.5)
+    assert changed(still.rgb(one), still.rgb(later)) == {"footer"}
+
+
+@pytest.mark.parametrize("verdict", [verdict for verdict in Verdict if verdict != Verdict.SEEN])
+def test_still_marks_an_uncertain_reconstruction(verdict: Verdict) -> None:
+    assert other_still(verdict=verdict) == {"banner", "reconstruction"}
+
+
+def test_still_of_nothing_shows_the_background() -> None:
+    rgb = Still(moment(0)).rgb(moment(0, NOTHING))
+    assert (panel(rgb, "reconstruction") == images.BACKGROUND_RGB).all()
 
 
 def test_still_keeps_lidar_pictures_until_new_ones() -> None:
