@@ -170,10 +170,8 @@ class Pipeline:
 
     @bench.setter
     def bench(self, bench: CalibratedRig) -> None:
-        self._bench = (
-            bench,
-            alignment(bench.rig, self._trained, bench.reference) if self._trained else None,
-        )
+        aligned = alignment(bench.rig, self._trained, bench.reference) if self._trained else None
+        self._bench = (bench, aligned)  # in one assignment: `prepare` must not see half of it
 
     @property
     def average(self) -> int:
@@ -197,16 +195,27 @@ class Pipeline:
         bench, aligned = self._bench  # another thread may replace it
         maps = maps_from_frame(arrival.frame)
         mapped_s = clock()
+
+        # Drift is watched in the frame, not in the mean, which would hide a move for its length.
         maps = self._mean.add(maps)
         observation = bench.observe(arrival.frame, maps)
         difference = observation.difference
         corrected = bench.correct_range(maps)
-        network_input = difference if self._uses_difference and difference else corrected
         if aligned:
+            # The difference has no drift in it, and neither has what it adds to the training wall.
             network_input = aligned.align(corrected, difference.depth_m if difference else None)
+        elif self._uses_difference and difference:
+            network_input = difference
+        else:
+            network_input = corrected
         observed_s = clock()
-        stages_s = {"wait": taken_s - start_s, "queue": taken_s - arrival.arrived_s}
-        stages_s |= {"maps": mapped_s - taken_s, "bench": observed_s - mapped_s}
+
+        stages_s = {
+            "wait": taken_s - start_s,
+            "queue": taken_s - arrival.arrived_s,
+            "maps": mapped_s - taken_s,
+            "bench": observed_s - mapped_s,
+        }
         return PreparedFrame(arrival, maps, observation, corrected, network_input, stages_s)
 
     def reconstruct(self, frames: Sequence[PreparedFrame], clock: Clock) -> list[Reconstruction]:
@@ -226,6 +235,7 @@ class Pipeline:
         observation = prepared.observation
         conditions = frame_conditions(issues, observation, self.checks.newest)
         shown, verdict = self._verdicts.decide(reconstruction, conditions)
+        # Raw maps are checked: they are what the renderer computes.
         self.checks.offer(frame.frame_number, prepared.corrected, shown.depth_m)
         return FrameResult(
             frame,
@@ -313,18 +323,16 @@ def compatibility_warnings(
 
 
 def _rig_warnings(rig: Rig, trained: CheckpointRecord) -> list[str]:
-    if (wanted := training_rig(trained)) is None:
+    wanted = training_rig(trained)
+    if wanted is None:
         if trained.rig_checksum == rig.checksum:
             return []
         return [f"the networks were trained for another rig than {rig.name}: expect larger errors"]
-    if difference := rig_difference(rig, wanted):
-        aligned = "are aligned with that rig's, expect larger errors"
-        outcome = (
-            aligned
-            if rig_to_align_with(rig, trained)
-            else "cannot be aligned with that rig's, expect wrong shapes"
-        )
-        return [
-            f"this rig differs from the training rig ({'; '.join(difference)}): its maps {outcome}"
-        ]
-    return []
+
+    difference = rig_difference(rig, wanted)
+    if not difference:
+        return []
+    outcome = "cannot be aligned with that rig's, expect wrong shapes"
+    if rig_to_align_with(rig, trained):
+        outcome = "are aligned with that rig's, expect larger errors"
+    return [f"this rig differs from the training rig ({'; '.join(difference)}): its maps {outcome}"]

@@ -37,14 +37,20 @@ class Verdict(StrEnum):
 
 @dataclass(frozen=True)
 class VerdictLimits:
-    """Smallest values at which a verdict is given; calibrated with the uncertainty model."""
+    """Smallest values at which a verdict is given.
+
+    The first two are quantiles over the uncertainty model's held-out samples, set when it was
+    trained (`nlos_models.doubt_training.calibrate`), the third over rendered objects.
+    """
 
     nothing: float
-    """Probability that nothing is hidden."""
+    """Probability that nothing is hidden: 999 of 1,000 empty benches reach it; at most 0.5."""
     outside: float
-    """Probability of an object out of distribution."""
+    """Probability of an object out of distribution: 15 % of ordinary objects reach it, the price
+    for nine in ten of those that are.
+    """
     unexplained: float = float("inf")
-    """Score of the physics check."""
+    """Score of the physics check; see UNEXPLAINED."""
 
 
 @dataclass(frozen=True)
@@ -76,6 +82,8 @@ class VerdictFilter:
         """Return the reconstruction to show, without surface if nothing is hidden, and the
         verdict.
         """
+        # Whatever was reconstructed from data that are not usable is not usable either: these two
+        # go before the verdict of the networks.
         of_lidar = None
         if conditions.saturated:
             of_lidar = Verdict.SATURATED
@@ -88,11 +96,12 @@ class VerdictFilter:
             return reconstruction, of_lidar
 
         if uncertainty.p_empty >= limits.nothing:
-            # A new object must not be averaged with the one that left.
+            # Decided on this frame alone; a new object must not be averaged with the one that left.
             self._outside.clear()
             verdict = Verdict.OUTSIDE if conditions.invalid else Verdict.NOTHING
             return reconstruction.without_surface, of_lidar or verdict
 
+        # "Outside" needs a mean over frames: noise moves the probability across the limit.
         self._outside.append(uncertainty.p_out_of_distribution)
         unlike = sum(self._outside) / len(self._outside) >= limits.outside
         unexplained = conditions.check is not None and conditions.check.score >= limits.unexplained
@@ -104,7 +113,7 @@ def frame_issues(frame: Frame) -> tuple[str, ...]:
     """Return the issues of a frame: blank (no depth at all) or half_invalid (none in half of the
     pixels); saturated.
     """
-    with_depth = np.count_nonzero(frame.depth_m > 0)  # NaN compares false
+    with_depth = np.count_nonzero(frame.depth_m > 0)  # NaN (no return) compares false
     issues: list[str] = []
     if with_depth == 0:
         issues.append("blank")
