@@ -77,20 +77,19 @@ def bench_message(rig: Rig, measured: MeasuredWall | None = None) -> bytes:
     """
     box = object_box(rig)
     relay = rig.relay
-    low = (relay.x_min_m - MARGIN_M, relay.y_min_m)
-    high = (relay.x_max_m + MARGIN_M, relay.y_max_m)
+    left_m = relay.x_min_m - MARGIN_M
+    right_m = relay.x_max_m + MARGIN_M
+    wall = _around(left_m, right_m, relay.y_min_m, relay.y_max_m)
     parts: dict[str, Any] = {
-        "wall": [[x_m, y_m, 0.0] for x_m, y_m in _around(low[0], high[0], low[1], high[1])]
-    }
-    if rig.occluder is not None:
-        gap_m = rig.occluder.z_min_m
-        sides = _around(low[1], high[1], gap_m, gap_m + OCCLUDER_HEIGHT_M)
-        parts["occluder"] = [[rig.occluder.x_m, y_m, z_m] for y_m, z_m in sides]
-    parts |= {
+        "wall": [[x_m, y_m, 0.0] for x_m, y_m in wall],
         "lidar": rig.wall_from_lidar[:3, 3].tolist(),
         "frustum": _frustum(rig),
         "light": _light_path(rig, box),
     }
+    if rig.occluder is not None:
+        gap_m = rig.occluder.z_min_m
+        sides = _around(relay.y_min_m, relay.y_max_m, gap_m, gap_m + OCCLUDER_HEIGHT_M)
+        parts["occluder"] = [[rig.occluder.x_m, y_m, z_m] for y_m, z_m in sides]
     fields: dict[str, Any] = {
         "kind": "bench",
         "rig": rig.name,
@@ -120,8 +119,9 @@ def color_maps() -> dict[str, UInt8]:
     return {f"map_{name}": np.ascontiguousarray(rgb, np.uint8) for name, rgb in colored.items()}
 
 
-def _around(a: float, b: float, c: float, d: float) -> list[tuple[float, float]]:
-    return [(a, c), (b, c), (b, d), (a, d)]
+def _around(left: float, right: float, low: float, high: float) -> list[tuple[float, float]]:
+    """Return the corners of a rectangle."""
+    return [(left, low), (right, low), (right, high), (left, high)]
 
 
 def _frustum(rig: Rig) -> Corners:
@@ -129,19 +129,19 @@ def _frustum(rig: Rig) -> Corners:
     pinhole = rig.pinhole
     pose = rig.wall_from_lidar
     pixels = np.array(_around(0.0, pinhole.width, 0.0, pinhole.height))
-    rays = np.column_stack(
-        [(pixels - [pinhole.ppx, pinhole.ppy]) / [pinhole.fx, pinhole.fy], np.ones(4)]
-    )
+    slopes = (pixels - [pinhole.ppx, pinhole.ppy]) / [pinhole.fx, pinhole.fy]
+    rays = np.column_stack([slopes, np.ones(4)])
     return (pose[:3, 3] + FRUSTUM_M * rays @ pose[:3, :3].T).tolist()
 
 
 def _light_path(rig: Rig, box: ObjectBox) -> Corners:
     """Return the path (5, 3) of one three-bounce echo: lidar, wall, hidden object, wall, lidar."""
     eye: Float64 = rig.wall_from_lidar[:3, 3]
-    middle = np.array(
-        [(box.x_min_m + box.x_max_m) / 2, (box.y_min_m + box.y_max_m) / 2, box.z_near_m]
-    )
-    there, back = (np.array([middle[0] * 0.6, y_m, 0.0]) for y_m in (-0.04, 0.04))
+    x_m = (box.x_min_m + box.x_max_m) / 2
+    y_m = (box.y_min_m + box.y_max_m) / 2
+    middle = np.array([x_m, y_m, box.z_near_m])
+    there = np.array([0.6 * x_m, -0.04, 0.0])
+    back = np.array([0.6 * x_m, 0.04, 0.0])
     return np.stack([eye, there, middle, back, eye]).tolist()
 
 

@@ -153,15 +153,15 @@ def test_playback_keeps_every_moment_for_every_browser() -> None:
 
 @pytest.mark.parametrize(
     ("content", "advice"),
-    [(None, "cannot be read"), (b"something else", "--save-view"), (b"RRF2 old", "rerun")],
+    [(None, "cannot be read"), (b"something else", "--save-view")],
 )
 def test_recorded_view_refuses_other_files(
     tmp_path: Path, content: bytes | None, advice: str
 ) -> None:
     if content is not None:
-        (tmp_path / "other.rrd").write_bytes(content)
-    with pytest.raises(RecordingError, match=rf"other\.rrd.*{advice}"):
-        RecordedView(tmp_path / "other.rrd")
+        (tmp_path / "other.html").write_bytes(content)
+    with pytest.raises(RecordingError, match=rf"other\.html.*{advice}"):
+        RecordedView(tmp_path / "other.html")
 
 
 @pytest.fixture
