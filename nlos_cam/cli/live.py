@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from contextlib import nullcontext
 from dataclasses import asdict
 from functools import cache, partial
@@ -104,29 +105,20 @@ def live(
     if no_view and open_view:
         raise typer.BadParameter("--open needs a view: drop --no-view")
     check_output = partial(_check_output, overwrite=overwrite)
-    recorded = check_output(record, "--record", ".bag") if record else None
-    recording = (
-        cameras.Recording(recorded, optional=True, overwrite=overwrite) if recorded else None
-    )
+    recording = None
+    if record:
+        path = check_output(record, "--record", ".bag")
+        recording = cameras.Recording(path, optional=True, overwrite=overwrite)
     frame_log = loop.FrameLog(check_output(log, "--log", *loop.LOG_SUFFIXES)) if log else None
     view_file = check_output(save_view, "--save-view", views.SESSION_SUFFIX) if save_view else None
     control = loop.RunControl(camera)
-    with viewing.viewer_of(
-        control, no_view=no_view, host=view_host, port=view_port
-    ) as viewer:  # serves before the camera runs
-        announce = cache(
-            partial(
-                viewing.announce_view, viewer, host=view_host, port=view_port, open_it=open_view
-            )
-        )
+    viewer = viewing.viewer_of(control, no_view=no_view, host=view_host, port=view_port)
+    announce = cache(
+        partial(viewing.announce_view, viewer, host=view_host, port=view_port, open_it=open_view)
+    )
+    with viewer:  # serves before the camera runs
         with common.interrupted_by_signals():
-            with common.tracked(
-                "Pre-rendering the simulated scene (first run only, about 90 s)", at_once=False
-            ) as on_progress:
-                on_rendering = viewing.each_of(
-                    lambda _, __: announce(), on_progress, control.show_progress
-                )
-                opened = cameras.open_camera(camera, on_progress=on_rendering, recording=recording)
+            opened = _open_camera(camera, recording, control, announce)
             announce()
             bench = reconstruct.open_bench(wall, opened)
             checks = loop.BackgroundPhysicsCheck(bench.rig, on_error=_warn_once)
@@ -156,6 +148,7 @@ def live(
                 on_moment=frame_log.add if frame_log else reconstruct.ignore,
                 control=control,
             )
+
     if log:
         common.say(f"Logged each frame to {log}")
     if recording:
@@ -166,6 +159,19 @@ def live(
     common.finish(asdict(report), as_json=json, text=text)
     if stop.is_set():
         common.exit_interrupted(f"{report.frames} frames were processed")
+
+
+def _open_camera(
+    camera: str,
+    recording: cameras.Recording | None,
+    control: loop.RunControl,
+    announce: Callable[[], None],
+) -> cameras.Camera:
+    """Open a camera; while a scene is pre-rendered, announce the view and show the progress."""
+    title = "Pre-rendering the simulated scene (first run only, about 90 s)"
+    with common.tracked(title, at_once=False) as on_progress:
+        on_rendering = viewing.each_of(lambda _, __: announce(), on_progress, control.show_progress)
+        return cameras.open_camera(camera, on_progress=on_rendering, recording=recording)
 
 
 def replay(
@@ -204,7 +210,8 @@ def replay(
                 bench, view=save_view, stills=stills, video=video, objects=formats, every=every
             ),
         )
-    text = f"Reconstructed {report.frames} frames in {report.seconds:.1f} s: open {path / replays.REPORT}"
+    took = f"Reconstructed {report.frames} frames in {report.seconds:.1f} s"
+    text = f"{took}: open {path / replays.REPORT}"
     common.finish(asdict(report), as_json=json, text=text)
     if stop.is_set():
         common.exit_interrupted(f"{path} holds the first {report.frames} frames")
@@ -253,8 +260,6 @@ def _warn_once(warning: str) -> None:
 def summary(report: loop.RunReport, *, verbose: bool = False) -> str:
     """Return the report as text, a sentence per line; `verbose` adds the time of each stage."""
     latency = report.latency_ms
-    counts = dict(report.counts)
-    losses = [f"{counts.pop(name)} {reason}" for name, reason in LOSSES.items() if name in counts]
     lines = [
         f"{report.frames} frames, {report.fps:.1f} per second",
         (
@@ -262,41 +267,59 @@ def summary(report: loop.RunReport, *, verbose: bool = False) -> str:
             f" {latency['p99']:.0f} ms p99"
         ),
     ]
-    if report.camera_ms:
-        middle = report.camera_ms["p50"]
-        high = report.camera_ms["p99"]
+    if camera_ms := report.camera_ms:
         lines.append(
-            f"Simulating the camera took {middle:.0f} ms a frame beside it, {high:.0f} ms p99"
+            f"Simulating the camera took {camera_ms['p50']:.0f} ms a frame beside it,"
+            f" {camera_ms['p99']:.0f} ms p99"
         )
-    if report.quality:
-        typical = report.quality["expected_iou"]
-        error_mm = report.quality["expected_error_mm"]
+    if quality := report.quality:
         lines.append(
-            f"Outline typically {typical:.0%} right, depth to {error_mm:.0f} mm (predicted)"
+            f"Outline typically {quality['expected_iou']:.0%} right, depth to"
+            f" {quality['expected_error_mm']:.0f} mm (predicted)"
         )
-    if report.dropped:
-        lines.append(f"Dropped {report.dropped} frames: {', '.join(losses)}")
-    lost = report.dropped / max(report.frames + report.dropped, 1)
-    if lost > SLOW_DROPPED_SHARE or latency["p50"] > SLOW_MS:
-        slow = f"{lost:.0%} of the frames dropped, median latency {latency['p50']:.0f} ms"
-        lines.append(f"Warning: {slow}: close other programs")
+    lines += _loss_lines(report)
     if report.verdicts:
-        phrases = {reconstruct.Verdict.SEEN.value: "object detected"}
-        verdicts = [
-            f"{phrases.get(verdict, verdict)} in {count}"
-            for verdict, count in report.verdicts.items()
-        ]
-        verdicts[0] = f"{verdicts[0]} of {report.frames} frames".capitalize()
-        lines.append(", ".join(verdicts))
-    if counts:
-        lines.append(f"Irregular: {reconstruct.describe_counts(counts)}")
+        lines.append(_verdict_line(report))
+    irregular = {name: count for name, count in report.counts.items() if name not in LOSSES}
+    if irregular:
+        lines.append(f"Irregular: {reconstruct.describe_counts(irregular)}")
     if report.stalled_s:
         lines.append(f"Stalled for {report.stalled_s:.1f} s without a frame")
     lines += [f"Warning in {frames} frames: {text}" for text, frames in report.warnings.items()]
     if verbose:
-        lines.append(f"{'Stage':10}{'median':>9}{'p99 (ms)':>11}")
-        stages = sorted(
-            report.stages_percentiles_ms.items(), key=lambda stage: stage[0] in loop.OUTSIDE_LATENCY
-        )
-        lines += [f"{name:10}{times['p50']:9.1f}{times['p99']:11.1f}" for name, times in stages]
+        lines += _stage_lines(report)
     return "\n".join(lines)
+
+
+def _loss_lines(report: loop.RunReport) -> list[str]:
+    """Return the lost frames by cause, and a warning if they or the latency are many."""
+    lines: list[str] = []
+    counts = report.counts
+    if report.dropped:
+        losses = [f"{counts[name]} {reason}" for name, reason in LOSSES.items() if name in counts]
+        lines.append(f"Dropped {report.dropped} frames: {', '.join(losses)}")
+    lost = report.dropped / max(report.frames + report.dropped, 1)
+    latency_ms = report.latency_ms["p50"]
+    if lost > SLOW_DROPPED_SHARE or latency_ms > SLOW_MS:
+        lines.append(
+            f"Warning: {lost:.0%} of the frames dropped, median latency {latency_ms:.0f} ms: close"
+            " other programs"
+        )
+    return lines
+
+
+def _verdict_line(report: loop.RunReport) -> str:
+    phrases = {reconstruct.Verdict.SEEN.value: "object detected"}
+    verdicts = [
+        f"{phrases.get(verdict, verdict)} in {count}" for verdict, count in report.verdicts.items()
+    ]
+    verdicts[0] = f"{verdicts[0]} of {report.frames} frames".capitalize()
+    return ", ".join(verdicts)
+
+
+def _stage_lines(report: loop.RunReport) -> list[str]:
+    """Return a table of the stages, those outside the latency last."""
+    stages = report.stages_percentiles_ms.items()
+    ordered = sorted(stages, key=lambda stage: stage[0] in loop.OUTSIDE_LATENCY)
+    head = f"{'Stage':10}{'median':>9}{'p99 (ms)':>11}"
+    return [head] + [f"{name:10}{ms['p50']:9.1f}{ms['p99']:11.1f}" for name, ms in ordered]
