@@ -96,7 +96,7 @@ def test_five_pages_and_one_that_never_reads_share_a_view(browser: Any) -> None:
             page.close()
 
 
-def test_refused_page_goes_on_by_itself_and_a_hidden_one_makes_room(browser: Any) -> None:
+def test_refused_page_retries_and_a_hidden_one_makes_room(browser: Any) -> None:
     with WebViewer(RIG) as viewer:
         viewer.show(full_moment(0))
         watchers = [ask(viewer.address or "", "/stream") for _ in range(MAX_STREAMS)]

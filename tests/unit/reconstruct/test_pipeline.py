@@ -213,7 +213,7 @@ def trained(
     return SimpleNamespace(rig_name=rig_name, rig_checksum=rig_checksum, input=eats)
 
 
-def test_warnings_name_what_differs_from_training_and_a_wall_without_reference(
+def test_warnings_name_mismatches_with_the_training(
     walled: CalibratedRig,
 ) -> None:
     farther = RIG.model_copy(update={"lidar": RIG.lidar.model_copy(update={"distance_m": 0.3})})
@@ -272,9 +272,7 @@ def observe(bench: CalibratedRig, number: int = 0, nearer_m: float = 0.0) -> Ben
     return bench.observe(frame, maps_from_frame(frame))
 
 
-def test_open_bench_takes_rig_and_reference_from_a_record_or_the_rig_of_the_camera(
-    wall: Path, tmp_path: Path
-) -> None:
+def test_open_bench_takes_a_record_or_the_cameras_rig(wall: Path, tmp_path: Path) -> None:
     own = RIG.model_copy(update={"name": "own"})
     assert open_bench(None, camera(rig=own)).rig is own
     assert open_bench(None, camera(rig=load_rig("bare-wall"))).rig == RIG
@@ -294,7 +292,7 @@ def test_open_bench_takes_rig_and_reference_from_a_record_or_the_rig_of_the_came
     assert observe(bare).difference is None
 
 
-def test_difference_of_the_bare_wall_is_noise_without_range_drift(walled: CalibratedRig) -> None:
+def test_difference_of_the_bare_wall_is_noise_less_drift(walled: CalibratedRig) -> None:
     levels_m = list[float]()
     for number in range(100, 160):
         difference = observe(walled, number, nearer_m=0.0006).difference

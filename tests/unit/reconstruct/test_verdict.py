@@ -105,7 +105,7 @@ def test_one_frame_out_of_distribution_is_smoothed() -> None:
     assert set(verdicts) == {Verdict.SEEN}
 
 
-def test_object_out_of_distribution_is_outside_within_a_fifth_second() -> None:
+def test_steady_outlier_is_outside_within_a_fifth_second() -> None:
     p_outside = [0.0] * 10 + [1.0] * STEADY_FRAMES
     verdicts = verdicts_of([reconstruction(outside=p) for p in p_outside])
     assert verdicts[-1] == Verdict.OUTSIDE

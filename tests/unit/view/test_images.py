@@ -26,7 +26,7 @@ def flat(z_m: float) -> np.ndarray:
     return np.full((64, 64), z_m, np.float32)
 
 
-def test_pictures_are_brighter_when_nearer_noisier_or_of_more_counts() -> None:
+def test_pictures_brighten_with_nearness_noise_and_counts() -> None:
     nearer = np.concatenate(
         [images.hidden_rgb(flat(z_m), BOX)[:1, :1] for z_m in (np.nan, 0.4, 0.25, 0.13)], axis=1
     )
@@ -47,7 +47,7 @@ def test_depth_pictures_show_missing_depth_as_background() -> None:
     ).tolist() == [[5, 6]]
 
 
-def test_near_is_red_and_far_is_blue_and_a_difference_of_none_is_grey() -> None:
+def test_near_is_red_far_is_blue_and_equal_is_grey() -> None:
     near, far = images.lidar_rgb(np.array([[0.1, 1.0]], np.float32), 0.1, 1.0)[0]
     assert near[0] > near[2]
     assert far[2] > far[0]
@@ -173,7 +173,7 @@ def test_wall_outline_is_closed_finite_and_on_the_wall() -> None:
     )
 
 
-def test_wall_pictures_need_a_reference_and_are_dark_without_returns() -> None:
+def test_wall_pictures_need_a_reference_and_returns() -> None:
     assert wall_pictures(exact_wall(reference=None)) == {}
     pictures = wall_pictures(
         exact_wall(depth_m=UNSEEN, depth_std_m=UNSEEN, ir=UNSEEN, inliers=UNSEEN > 0)
@@ -205,7 +205,7 @@ def test_saturated_pixel_survives_thinning() -> None:
     assert np.argwhere((picture == images.SATURATED_RGB).all(axis=-1)).tolist() == [[150, 8]]
 
 
-def test_calibration_facts_begin_with_the_verdict_and_note_a_missing_reference() -> None:
+def test_calibration_facts_have_verdict_and_missing_reference() -> None:
     record = exact_wall().record
     facts = calibration_facts(record)
     assert facts[0][:2] == ["verdict", record.verdict]

@@ -210,7 +210,7 @@ def test_session_that_cannot_be_written_is_an_error(
         session.show(moment(0))
 
 
-def test_viewers_all_see_every_moment_and_none_stays_open_if_one_cannot_begin() -> None:
+def test_viewers_show_every_moment_and_begin_all_or_none() -> None:
     some = [MagicMock(address=address) for address in (None, "http://one", "http://two")]
     shown = moment(7)
     with Viewers(some) as viewers:
@@ -260,7 +260,7 @@ def test_bytes_keep_depth_to_a_step_and_differences_symmetric() -> None:
     ]
 
 
-def test_moment_message_holds_every_layer_and_lidar_pictures_if_requested() -> None:
+def test_moment_message_holds_layers_and_requested_pictures() -> None:
     shown = full_moment(3, size=(480, 640))
     fields, arrays = unpack(MomentPacker().pack(shown))
     assert {"depth", "truth", "error", "lidar", "infrared", "change", "residual"} == set(arrays)
@@ -313,7 +313,7 @@ def with_uncertainty(
     return with_result(shown, reconstruction=reconstruction)
 
 
-def test_expected_overlap_is_exact_for_certain_pixels_and_needs_a_surface() -> None:
+def test_expected_overlap_is_exact_for_certain_pixels() -> None:
     mask = np.isfinite(bump(0))
     half = mask & (np.arange(64) < np.argwhere(mask)[:, 1].mean())
     for surface, overlap in ((mask, 1.0), (half, half.sum() / mask.sum()), (~mask, 0.0)):
@@ -346,7 +346,7 @@ def test_only_a_trusted_quality_of_a_detected_object_is_green(
 
 
 @pytest.mark.parametrize("verdict", [*Verdict, None])
-def test_no_assessment_is_green_and_only_a_detected_shape_is_trusted(
+def test_only_a_detected_shape_is_trusted_and_none_is_green(
     verdict: Verdict | None,
 ) -> None:
     told = assess(with_result(full_moment(0), verdict=verdict))
