@@ -33,7 +33,7 @@ from nlos_cam.render import SensorModel, cast
 if TYPE_CHECKING:  # MapSet imports torch, which `live` does without
     from nlos_models import MapSet
 
-    from nlos_cam.render.geometry import Beams
+    from nlos_cam.render import Beams
 
 SHAPE = MAP_ROWS, MAP_COLUMNS
 THREE_BOUNCES_M = 0.02
