@@ -4,8 +4,8 @@
 
     >>> import nlos_cam
     >>> with nlos_cam.open("bag:run.bag") as stream:
-    ...     for glimpse in stream:
-    ...         print(glimpse.frame_number, glimpse.depth_m.shape, glimpse.points_m.shape[1])
+    ...     for result in stream:
+    ...         print(result.frame_number, result.depth_m.shape, result.points_m.shape[1])
     0 (64, 64) 3
     1 (64, 64) 3
     2 (64, 64) 3
@@ -15,100 +15,18 @@ A live camera (`l515`, `sim`) runs until the loop is left.
 
 import time
 from contextlib import ExitStack
-from dataclasses import dataclass
 from pathlib import Path
 from threading import Event
 from types import TracebackType
 from typing import Self
 
-import numpy as np
-from nlos_calibration import ObjectBox, Rig
-from nlos_calibration.arrays import Float32
+from nlos_calibration import Rig
 
 from nlos_cam import reconstruct
 from nlos_cam.camera import Camera, OnProgress, open_camera
 from nlos_cam.errors import NlosCamError
-from nlos_cam.frames import LidarMaps
-from nlos_cam.live import FrameReader, RunStatistics, iterate_results, warm_up, with_telemetry
-from nlos_cam.objects import SurfaceMesh, cell_centers_m, mesh_from_depth, object_box
-
-
-@dataclass(frozen=True)
-class Glimpse:
-    """Result of one frame: the hidden surface with its uncertainty and verdict."""
-
-    step: reconstruct.FrameResult
-    """Everything else about the frame: the frame itself, the reconstruction's pose, timings, the
-    physics check.
-    """
-    box: ObjectBox
-    """Box in which objects are reconstructed, in the wall frame."""
-
-    @property
-    def depth_m(self) -> Float32:
-        """(64, 64) over the box: distance from the wall, NaN where there is no surface.
-
-        Column j grows with wall x (away from the lidar's foot), row i with wall -y (row 0 is the
-        top).
-        """
-        return self.step.reconstruction.depth_m
-
-    @property
-    def uncertainty_m(self) -> Float32 | None:
-        """(64, 64): expected absolute error of `depth_m`; None without an uncertainty model."""
-        return self.step.reconstruction.uncertainty_m
-
-    @property
-    def verdict(self) -> reconstruct.Verdict | None:
-        """Reliability of the reconstruction, such as "object seen"; None without an uncertainty
-        model.
-        """
-        return self.step.verdict
-
-    @property
-    def warnings(self) -> tuple[str, ...]:
-        """Warnings that hold now, such as that the lidar has moved."""
-        return self.step.warnings
-
-    @property
-    def points_m(self) -> Float32:
-        """(n, 3): points of the hidden surface in the wall frame, x along the wall, y up, z into
-        the room.
-        """
-        x_m, y_m = np.meshgrid(*cell_centers_m(self.box))
-        points_m = np.stack([x_m, y_m, self.depth_m], -1).astype(np.float32)
-        return points_m[np.isfinite(self.depth_m)]
-
-    def to_mesh(self) -> SurfaceMesh:
-        """Return the hidden surface as a mesh in the wall frame; its `save` writes .ply, .glb,
-        .obj, .csv or .npz.
-        """
-        return mesh_from_depth(self.depth_m, self.box, self.uncertainty_m)
-
-    @property
-    def maps(self) -> LidarMaps:
-        """Lidar maps of (64, 80) cells."""
-        return self.step.maps
-
-    @property
-    def difference(self) -> LidarMaps | None:
-        """Maps less those of the bare wall; None without a wall record that has a reference."""
-        return self.step.difference
-
-    @property
-    def timestamp_s(self) -> float:
-        """Time of the frame by the camera's clock."""
-        return self.step.frame.timestamp_s
-
-    @property
-    def frame_number(self) -> int:
-        """Number of the frame, counted by the camera."""
-        return self.step.frame.frame_number
-
-    @property
-    def truth_depth_m(self) -> Float32 | None:
-        """Ground truth of `depth_m` from a simulated camera; else None."""
-        return self.step.frame.truth_depth_m
+from nlos_cam.live import RunStatistics
+from nlos_cam.recording import with_telemetry
 
 
 class Stream:
@@ -135,10 +53,9 @@ class Stream:
         self._pipeline = pipeline
         self._lossless = lossless
         self._clock = clock
-        self._box = object_box(self.rig)
         self._statistics = RunStatistics()
         self._entered = ExitStack()
-        self._reader: FrameReader | None = None
+        self._reader: reconstruct.FrameReader | None = None
 
     @property
     def rig(self) -> Rig:
@@ -148,12 +65,14 @@ class Stream:
     @property
     def dropped(self) -> int:
         """Frames without a result up to now, for any reason."""
-        return sum(self._statistics.lost(self.camera, self._reader).values()) if self._reader else 0
+        if self._reader is None:
+            return 0
+        return sum(self._statistics.lost(self.camera, self._reader).values())
 
     def __enter__(self) -> Self:
         camera = self._entered.enter_context(self.camera)
         frames, telemetry = with_telemetry(camera)
-        reader = FrameReader(
+        reader = reconstruct.FrameReader(
             frames,
             lossless=self._lossless,
             stop=Event(),
@@ -161,7 +80,7 @@ class Stream:
             abandon_source=lambda: camera.__exit__(None, None, None),
         )
         self._reader = self._entered.enter_context(reader)
-        self._results = iterate_results(
+        self._results = reconstruct.iterate_results(
             reader, self._pipeline, self._clock, self._statistics.fail, telemetry
         )
         return self
@@ -177,12 +96,12 @@ class Stream:
     def __iter__(self) -> Self:
         return self
 
-    def __next__(self) -> Glimpse:
+    def __next__(self) -> reconstruct.FrameResult:
         if self._reader is None:
             raise NlosCamError(
                 "the camera has not been started: loop inside `with nlos_cam.open(...) as stream:`"
             )
-        return Glimpse(next(self._results), self._box)
+        return next(self._results)
 
 
 def open_stream(
@@ -212,6 +131,6 @@ def open_stream(
     pipeline = reconstruct.build_pipeline(
         bench, network, average, uncertainty_model=uncertainty_model
     )
-    warm_up(camera, pipeline)
+    reconstruct.warm_up(camera, pipeline)
     notes = tuple(reconstruct.compatibility_warnings(bench, network.record, uncertainty_model))
     return Stream(camera, pipeline, lossless=uri.startswith("bag:"), notes=notes, clock=clock)

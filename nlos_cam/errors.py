@@ -4,7 +4,6 @@
     ├── SceneError (ValueError)      exit 1   a scene, object or accuracy that cannot be rendered
     │   ├── SceneFileError           exit 4   a scene, mesh or depth map that cannot be read
     │   └── UnknownNameError         exit 2   no object, scene or setting of that name
-    ├── BudgetError (ValueError)     exit 1   a latency budget that no setting meets
     ├── OutputExistsError (FileExistsError)
     │                                exit 1   --out exists and --overwrite was not given
     ├── FileBusyError (BlockingIOError)
@@ -52,12 +51,6 @@ class UnknownNameError(SceneError):
     """Name of nothing: "no object 'cupp'. Did you mean 'cup'?"."""
 
     exit_code = 2
-
-
-class BudgetError(NlosCamError, ValueError):
-    """Latency budget that no setting meets on this machine: "--budget-ms 5: the fastest setting
-    takes 9.1 ms".
-    """
 
 
 class DiskFullError(NlosCamError, OSError):

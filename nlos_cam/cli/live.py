@@ -2,20 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from contextlib import nullcontext
 from dataclasses import asdict
 from functools import cache, partial
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
-import nlos_models as models
 import typer
 from rich.markup import escape
 
 from nlos_cam import camera as cameras
-from nlos_cam import evaluate as measure
 from nlos_cam import live as loop
 from nlos_cam import reconstruct
+from nlos_cam import replay as replays
 from nlos_cam import view as views
 from nlos_cam.cli import common
 from nlos_cam.cli import view as viewing
@@ -42,19 +42,6 @@ RecordTo = Annotated[
 ]
 Log = Annotated[
     Path | None, typer.Option("--log", help="Write one line per frame: F.csv, or F.jsonl.")
-]
-BudgetMs = Annotated[
-    float | None,
-    typer.Option(
-        "--budget-ms", min=0.1, help="Latency budget: use the most accurate setting that meets it."
-    ),
-]
-Tradeoff = Annotated[
-    Path | None,
-    typer.Option(
-        "--tradeoff",
-        help="Table of `tradeoff reconstruct` for --budget-ms (default: beside the weights).",
-    ),
 ]
 Wall = Annotated[
     Path | None, typer.Option("--wall", help="Wall record of `calibrate --wall` (wall.toml).")
@@ -110,56 +97,36 @@ def live(
     log: Log = None,
     weights: Weights = None,
     average: Average = 1,
-    budget_ms: BudgetMs = None,
-    tradeoff: Tradeoff = None,
     save_view: viewing.SaveView = None,
     overwrite: common.Overwrite = False,
     json: common.Json = False,
 ) -> None:
     """Show what is hidden around the corner, live, in a browser."""
-    if budget_ms is not None and average > 1:
-        raise typer.BadParameter(
-            "--budget-ms chooses the number of averaged frames: drop --average"
-        )
-    if tradeoff is not None and budget_ms is None:
-        raise typer.BadParameter("--tradeoff is the table for --budget-ms: give both")
     if no_view and open_view:
         raise typer.BadParameter("--open needs a view: drop --no-view")
     check_output = partial(_check_output, overwrite=overwrite)
-    recorded = check_output(record, "--record", ".bag") if record else None
-    recording = (
-        cameras.Recording(recorded, optional=True, overwrite=overwrite) if recorded else None
-    )
+    recording = None
+    if record:
+        path = check_output(record, "--record", ".bag")
+        recording = cameras.Recording(path, optional=True, overwrite=overwrite)
     frame_log = loop.FrameLog(check_output(log, "--log", *loop.LOG_SUFFIXES)) if log else None
     view_file = check_output(save_view, "--save-view", views.SESSION_SUFFIX) if save_view else None
     control = loop.RunControl(camera)
-    with viewing.viewer_of(
-        control, no_view=no_view, host=view_host, port=view_port
-    ) as viewer:  # serves before the camera runs
-        announce = cache(
-            partial(
-                viewing.announce_view, viewer, host=view_host, port=view_port, open_it=open_view
-            )
-        )
+    viewer = viewing.viewer_of(control, no_view=no_view, host=view_host, port=view_port)
+    announce = cache(
+        partial(viewing.announce_view, viewer, host=view_host, port=view_port, open_it=open_view)
+    )
+    with viewer:  # serves before the camera runs
         with common.interrupted_by_signals():
-            with common.tracked(
-                "Pre-rendering the simulated scene (first run only, about 90 s)", at_once=False
-            ) as on_progress:
-                on_rendering = viewing.each_of(
-                    lambda _, __: announce(), on_progress, control.show_progress
-                )
-                opened = cameras.open_camera(camera, on_progress=on_rendering, recording=recording)
+            opened = _open_camera(camera, recording, control, announce)
             announce()
             bench = reconstruct.open_bench(wall, opened)
             checks = loop.BackgroundPhysicsCheck(bench.rig, on_error=_warn_once)
             control.set_state("connecting", "loading the networks, first frame in a few seconds")
-            pipeline, choice = _choose_pipeline(
-                opened, bench, weights, average, budget_ms, tradeoff, checks
-            )
-            loop.warm_up(opened, pipeline)
+            pipeline = _load_pipeline(bench, weights, average, checks)
+            reconstruct.warm_up(opened, pipeline)
         viewer.begin(bench.rig, bench.measured)
-        control.on_bench = lambda bench: viewer.begin(bench.rig, bench.measured)
-        loop.offer_settings(control, opened, bench, tradeoff, weights)
+        control.bench.on_bench = lambda bench: viewer.begin(bench.rig, bench.measured)
         with (
             common.stop_on_signals() as stop,
             loop.realtime_priority(),
@@ -178,9 +145,10 @@ def live(
                 clock=cameras.WallClock().now,
                 on_error=lambda report: common.say(summary(report, verbose=common.Detail.verbose)),
                 on_warning=warn,
-                on_moment=frame_log.add if frame_log else loop.ignore,
+                on_moment=frame_log.add if frame_log else reconstruct.ignore,
                 control=control,
             )
+
     if log:
         common.say(f"Logged each frame to {log}")
     if recording:
@@ -188,13 +156,22 @@ def live(
     if view_file:
         common.say(f"Saved the view: open {view_file} in a browser")
     text = summary(report, verbose=common.Detail.verbose)
-    budget = {}
-    if choice:
-        text = f"{text}\n{choice.describe_outcome(report)}"
-        budget = {"budget": choice.outcome(report)}
-    common.finish({**asdict(report), **budget}, as_json=json, text=text)
+    common.finish(asdict(report), as_json=json, text=text)
     if stop.is_set():
         common.exit_interrupted(f"{report.frames} frames were processed")
+
+
+def _open_camera(
+    camera: str,
+    recording: cameras.Recording | None,
+    control: loop.RunControl,
+    announce: Callable[[], None],
+) -> cameras.Camera:
+    """Open a camera; while a scene is pre-rendered, announce the view and show the progress."""
+    title = "Pre-rendering the simulated scene (first run only, about 90 s)"
+    with common.tracked(title, at_once=False) as on_progress:
+        on_rendering = viewing.each_of(lambda _, __: announce(), on_progress, control.show_progress)
+        return cameras.open_camera(camera, on_progress=on_rendering, recording=recording)
 
 
 def replay(
@@ -218,34 +195,23 @@ def replay(
     with common.interrupted_by_signals():
         opened = cameras.open_camera(f"bag:{bag}", reader=reader)
         bench = reconstruct.open_bench(wall, opened)
-        from nlos_cam.reconstruct import (
-            PeriodicPhysicsCheck,
-        )  # the renderer takes a second to import
-
-        checks = PeriodicPhysicsCheck(bench.rig, on_error=_warn_once)
-        pipeline = _build_pipeline(
-            bench,
-            reconstruct.load_networks(weights),
-            reconstruct.load_uncertainty(weights),
-            average,
-            checks,
-        )
+        checks = reconstruct.PeriodicPhysicsCheck(bench.rig, on_error=_warn_once)
+        pipeline = _load_pipeline(bench, weights, average, checks)
     with opened as source, common.stop_on_signals() as stop, common.progress() as bar:
         task = bar.add_task("reconstructing", total=None)
-        report = loop.replay_recording(
+        report = replays.replay_recording(
             source,
             pipeline,
             path,
             stop=stop,
             on_frame=lambda: bar.advance(task),
             on_warning=warn,
-            media=loop.ReplayMedia(
+            media=replays.ReplayMedia(
                 bench, view=save_view, stills=stills, video=video, objects=formats, every=every
             ),
         )
-    text = (
-        f"Reconstructed {report.frames} frames in {report.seconds:.1f} s: open {path / loop.REPORT}"
-    )
+    took = f"Reconstructed {report.frames} frames in {report.seconds:.1f} s"
+    text = f"{took}: open {path / replays.REPORT}"
     common.finish(asdict(report), as_json=json, text=text)
     if stop.is_set():
         common.exit_interrupted(f"{path} holds the first {report.frames} frames")
@@ -260,54 +226,17 @@ def _check_output(path: Path, option: str, *suffixes: str, overwrite: bool) -> P
     return common.output_path(path, "live", path.suffix, overwrite=overwrite)
 
 
-def _runtimes(*which: Any) -> Any:
-    """Return `evaluate.runtimes`, which imports torch, once a setting needs it."""
-    return measure.runtimes(*which)
-
-
-def _choose_pipeline(
-    camera: cameras.Camera,
+def _load_pipeline(
     bench: reconstruct.CalibratedRig,
     weights: Path | None,
     average: int,
-    budget_ms: float | None,
-    tradeoff: Path | None,
-    checks: reconstruct.PhysicsCheck,
-) -> tuple[reconstruct.Pipeline, loop.BudgetChoice | None]:
-    """Return the usual pipeline, or that of a latency budget with its choice."""
-    if budget_ms is None:
-        return (
-            _build_pipeline(
-                bench,
-                reconstruct.load_networks(weights),
-                reconstruct.load_uncertainty(weights),
-                average,
-                checks,
-            ),
-            None,
-        )
-    settings = loop.available_settings(tradeoff, weights)
-    load = loop.setting_loader(weights, _runtimes)
-    uncertainty_model = reconstruct.load_uncertainty(weights)
-    # timed with the uncertainty model of `weights`: others take as long
-    build = partial(reconstruct.build_pipeline, bench, uncertainty_model=uncertainty_model)
-    network, choice = loop.choose_within_budget(
-        budget_ms, settings, build, load, loop.pipeline_timer(camera)
-    )
-    common.say(choice.describe())
-    if choice.setting.weights != loop.SHIPPED:
-        uncertainty_model = reconstruct.load_uncertainty(Path(choice.setting.weights))
-    return _build_pipeline(bench, network, uncertainty_model, choice.setting.frames, checks), choice
-
-
-def _build_pipeline(
-    bench: reconstruct.CalibratedRig,
-    network: models.Reconstructor,
-    uncertainty_model: models.UncertaintyModel | None,
-    average: int,
     checks: reconstruct.PhysicsCheck,
 ) -> reconstruct.Pipeline:
-    """Build the pipeline, and print the model's name and its mismatches with the bench."""
+    """Load the networks and build their pipeline, and print the model's name and its mismatches
+    with the bench.
+    """
+    network = reconstruct.load_networks(weights)
+    uncertainty_model = reconstruct.load_uncertainty(weights)
     common.say(f"Loaded model {network.record.rig_name} ({network.runtime})")
     for warning in reconstruct.compatibility_warnings(bench, network.record, uncertainty_model):
         common.say(f"note: {warning}")
@@ -331,8 +260,6 @@ def _warn_once(warning: str) -> None:
 def summary(report: loop.RunReport, *, verbose: bool = False) -> str:
     """Return the report as text, a sentence per line; `verbose` adds the time of each stage."""
     latency = report.latency_ms
-    counts = dict(report.counts)
-    losses = [f"{counts.pop(name)} {reason}" for name, reason in LOSSES.items() if name in counts]
     lines = [
         f"{report.frames} frames, {report.fps:.1f} per second",
         (
@@ -340,41 +267,59 @@ def summary(report: loop.RunReport, *, verbose: bool = False) -> str:
             f" {latency['p99']:.0f} ms p99"
         ),
     ]
-    if report.camera_ms:
-        middle = report.camera_ms["p50"]
-        high = report.camera_ms["p99"]
+    if camera_ms := report.camera_ms:
         lines.append(
-            f"Simulating the camera took {middle:.0f} ms a frame beside it, {high:.0f} ms p99"
+            f"Simulating the camera took {camera_ms['p50']:.0f} ms a frame beside it,"
+            f" {camera_ms['p99']:.0f} ms p99"
         )
-    if report.quality:
-        typical = report.quality["expected_iou"]
-        error_mm = report.quality["expected_error_mm"]
+    if quality := report.quality:
         lines.append(
-            f"Outline typically {typical:.0%} right, depth to {error_mm:.0f} mm (predicted)"
+            f"Outline typically {quality['expected_iou']:.0%} right, depth to"
+            f" {quality['expected_error_mm']:.0f} mm (predicted)"
         )
-    if report.dropped:
-        lines.append(f"Dropped {report.dropped} frames: {', '.join(losses)}")
-    lost = report.dropped / max(report.frames + report.dropped, 1)
-    if lost > SLOW_DROPPED_SHARE or latency["p50"] > SLOW_MS:
-        slow = f"{lost:.0%} of the frames dropped, median latency {latency['p50']:.0f} ms"
-        lines.append(f"Warning: {slow}: close other programs, or give --budget-ms")
+    lines += _loss_lines(report)
     if report.verdicts:
-        phrases = {reconstruct.Verdict.SEEN.value: "object detected"}
-        verdicts = [
-            f"{phrases.get(verdict, verdict)} in {count}"
-            for verdict, count in report.verdicts.items()
-        ]
-        verdicts[0] = f"{verdicts[0]} of {report.frames} frames".capitalize()
-        lines.append(", ".join(verdicts))
-    if counts:
-        lines.append(f"Irregular: {loop.describe_counts(counts)}")
+        lines.append(_verdict_line(report))
+    irregular = {name: count for name, count in report.counts.items() if name not in LOSSES}
+    if irregular:
+        lines.append(f"Irregular: {reconstruct.describe_counts(irregular)}")
     if report.stalled_s:
         lines.append(f"Stalled for {report.stalled_s:.1f} s without a frame")
     lines += [f"Warning in {frames} frames: {text}" for text, frames in report.warnings.items()]
     if verbose:
-        lines.append(f"{'Stage':10}{'median':>9}{'p99 (ms)':>11}")
-        stages = sorted(
-            report.stages_percentiles_ms.items(), key=lambda stage: stage[0] in loop.OUTSIDE_LATENCY
-        )
-        lines += [f"{name:10}{times['p50']:9.1f}{times['p99']:11.1f}" for name, times in stages]
+        lines += _stage_lines(report)
     return "\n".join(lines)
+
+
+def _loss_lines(report: loop.RunReport) -> list[str]:
+    """Return the lost frames by cause, and a warning if they or the latency are many."""
+    lines: list[str] = []
+    counts = report.counts
+    if report.dropped:
+        losses = [f"{counts[name]} {reason}" for name, reason in LOSSES.items() if name in counts]
+        lines.append(f"Dropped {report.dropped} frames: {', '.join(losses)}")
+    lost = report.dropped / max(report.frames + report.dropped, 1)
+    latency_ms = report.latency_ms["p50"]
+    if lost > SLOW_DROPPED_SHARE or latency_ms > SLOW_MS:
+        lines.append(
+            f"Warning: {lost:.0%} of the frames dropped, median latency {latency_ms:.0f} ms: close"
+            " other programs"
+        )
+    return lines
+
+
+def _verdict_line(report: loop.RunReport) -> str:
+    phrases = {reconstruct.Verdict.SEEN.value: "object detected"}
+    verdicts = [
+        f"{phrases.get(verdict, verdict)} in {count}" for verdict, count in report.verdicts.items()
+    ]
+    verdicts[0] = f"{verdicts[0]} of {report.frames} frames".capitalize()
+    return ", ".join(verdicts)
+
+
+def _stage_lines(report: loop.RunReport) -> list[str]:
+    """Return a table of the stages, those outside the latency last."""
+    stages = report.stages_percentiles_ms.items()
+    ordered = sorted(stages, key=lambda stage: stage[0] in loop.OUTSIDE_LATENCY)
+    head = f"{'Stage':10}{'median':>9}{'p99 (ms)':>11}"
+    return [head] + [f"{name:10}{ms['p50']:9.1f}{ms['p99']:11.1f}" for name, ms in ordered]

@@ -9,8 +9,8 @@ from typing import Annotated, Literal
 
 import typer
 
-from nlos_cam import live as loop
 from nlos_cam import recording as bags
+from nlos_cam import replay as replays
 from nlos_cam.cli import common
 from nlos_cam.errors import RecordingError
 
@@ -60,9 +60,9 @@ MAX_REPORTED = 5
 def object_formats(text: str) -> list[str]:
     """Return the formats of --object. Raises typer.BadParameter for an unknown one."""
     names = [name.strip() for name in text.split(",") if name.strip()]
-    if unknown := [name for name in names if name not in loop.OBJECT_FORMATS]:
+    if unknown := [name for name in names if name not in replays.OBJECT_FORMATS]:
         raise typer.BadParameter(
-            f"--object {','.join(unknown)}: choose from {', '.join(loop.OBJECT_FORMATS)}"
+            f"--object {','.join(unknown)}: choose from {', '.join(replays.OBJECT_FORMATS)}"
         )
     return names
 
@@ -156,7 +156,7 @@ def _export_objects(
             f"--object needs a replay's result: nlos-cam replay {result} --object ply,glb,csv"
         )
     with common.stop_on_signals() as stop, common.tracked("exporting") as on_frame:
-        count = loop.export_objects(result, folder, formats, every, stop=stop, on_frame=on_frame)
+        count = replays.export_objects(result, folder, formats, every, stop=stop, on_frame=on_frame)
     text = (
         f"Hidden surfaces of {count} frame{'' if count == 1 else 's'} as"
         f" {', '.join(formats)}\nWrote {folder}"

@@ -17,6 +17,7 @@ import typer
 from nlos_cam import camera as cameras
 from nlos_cam import live as loop
 from nlos_cam import reconstruct
+from nlos_cam import replay as replays
 from nlos_cam import view as views
 from nlos_cam.cli.common import (
     Json,
@@ -57,9 +58,8 @@ def viewer_of(
         if host is not None or port is not None:
             raise typer.BadParameter("--view-host and --view-port need a view: drop --no-view")
         return views.NullViewer()
-    control.thread_start = (
-        loop.yield_to_loop
-    )  # an ordinary thread could be stopped while it holds Python's lock
+    # An ordinary thread could be stopped while it holds Python's lock.
+    control.thread_start = loop.yield_to_loop
     return views.WebViewer(
         host=host or views.LOOPBACK, port=port, controls=control, on_thread=loop.yield_to_loop
     )
@@ -157,7 +157,7 @@ def view(
     if file.suffix == ".bag":
         with interrupted_by_signals():
             opened = cameras.open_camera(f"bag:{file}")
-            playback = loop.Playback(
+            playback = replays.Playback(
                 opened, reconstruct.open_bench(wall, opened), host=host, port=view_port
             )
         with stop_on_signals() as stop, playback:

@@ -149,19 +149,19 @@ def evaluate(
     guesses, searched = subjects.baseline_answers(
         objects, training, nearest=nearest, tracked=tracked
     )
-    doubter = (
+    uncertainty_model = (
         load_uncertainty_model(weights, cache_folder() / "onnx")
         if record.input == "raw maps"
         else None
     )
     maps = subjects.network_input(objects.maps, bare, objects.benches, record)
     answers = subjects.answer_all(reconstructor, maps)
-    predicted = subjects.predict_quality(answers, maps, doubter, objects.plan.rig)
+    predicted = subjects.predict_quality(answers, maps, uncertainty_model, objects.plan.rig)
     unseen = None
     if second:
         maps = subjects.network_input(second.maps, bare, second.benches, record)
         others = subjects.answer_all(reconstructor, maps)
-        sure = subjects.predict_quality(others, maps, doubter, second.plan.rig)
+        sure = subjects.predict_quality(others, maps, uncertainty_model, second.plan.rig)
         unseen = Unseen(second.names, second.maps.image.astype(np.float32), others.image, sure)
     facts = {
         "what": objects.description,

@@ -160,7 +160,7 @@ def predict_quality(
         frame = LidarMaps(depth_m, intensity, ~np.isnan(depth_m))
         uncertainty = estimate_uncertainty(uncertainty_model, frame, image, box, surface)
         found = Reconstruction(
-            shapes.depth_from_image(image, box), np.eye(4), uncertainty.error_m, {}, uncertainty
+            shapes.depth_from_image(image, box), box, uncertainty.error_m, {}, uncertainty
         )
         _, verdict = VerdictFilter(verdict_limits(uncertainty_model)).decide(
             found, FrameConditions()

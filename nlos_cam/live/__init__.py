@@ -1,4 +1,4 @@
-"""Streaming loop: threads, timing, statistics, and replay of recordings to files."""
+"""Live run: loop, timing, statistics, log, and the controls of the page."""
 
 import lazy_loader
 

@@ -17,19 +17,19 @@ log = logging.getLogger(__name__)
 
 def log_line(moment: Moment) -> dict[str, Any]:
     """Return the fields of a moment's line; None for unknown values."""
-    uncertainty = moment.reconstruction.uncertainty
-    quality = uncertainty.quality if uncertainty else None
+    result = moment.result
+    quality = result.reconstruction.quality
     return {
-        "frame_number": moment.frame.frame_number,
-        "timestamp_s": round(moment.frame.timestamp_s, 6),
-        "published_s": round(moment.published_s, 6),
+        "frame_number": result.frame_number,
+        "timestamp_s": round(result.timestamp_s, 6),
+        "published_s": round(moment.time_s, 6),
         "latency_ms": round(1e3 * moment.latency_s, 3),
-        **{f"{stage}_ms": round(1e3 * seconds, 3) for stage, seconds in moment.stages_s.items()},
+        **{f"{stage}_ms": round(1e3 * seconds, 3) for stage, seconds in result.stages_s.items()},
         "dropped": moment.dropped,
-        "verdict": moment.verdict.value if moment.verdict else None,
+        "verdict": result.verdict.value if result.verdict else None,
         "expected_iou": round(quality.iou[1], 4) if quality else None,
         "expected_error_mm": round(1e3 * quality.error_m, 2) if quality else None,
-        "check_score": round(moment.check.score, 4) if moment.check else None,
+        "check_score": round(result.check.score, 4) if result.check else None,
         "celsius": max(moment.celsius.values(), default=None),
     }
 
@@ -68,16 +68,12 @@ class FrameLog:
             return
         try:
             self._write(self._file, log_line(moment))
-            if moment.published_s - self._flushed_s >= FLUSH_INTERVAL_S:
+            if moment.time_s - self._flushed_s >= FLUSH_INTERVAL_S:
                 self._file.flush()
-                self._flushed_s = moment.published_s
+                self._flushed_s = moment.time_s
         except OSError as error:
-            log.warning(
-                "%s: the log ends at frame %d (%s)",
-                self._path,
-                moment.frame.frame_number,
-                error.strerror,
-            )
+            number = moment.result.frame_number
+            log.warning("%s: the log ends at frame %d (%s)", self._path, number, error.strerror)
             self.__exit__()
 
     def _write(self, file: IO[str], line: dict[str, Any]) -> None:

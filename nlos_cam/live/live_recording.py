@@ -2,12 +2,31 @@
 
 from collections import Counter
 from pathlib import Path
+from typing import Protocol, runtime_checkable
 
 from nlos_cam import recording as recordings
 from nlos_cam.camera import FRAMES_PER_S, Camera, Recording
 from nlos_cam.errors import NlosCamError
 from nlos_cam.frames import Frame
 from nlos_cam.reconstruct import Clock
+
+
+@runtime_checkable
+class RecordableCamera(Protocol):
+    """Camera whose streams can be recorded while it runs: a live one."""
+
+    @property
+    def recording(self) -> Recording | None:
+        """The recording that runs, if any."""
+        ...
+
+    def start_recording(self, recording: Recording) -> None:
+        """Record from the next set on."""
+        ...
+
+    def stop_recording(self) -> None:
+        """Close the recording, if any; frames go on."""
+        ...
 
 
 class LiveRecording:
@@ -18,19 +37,20 @@ class LiveRecording:
     """
 
     def __init__(self, camera: Camera, path: Path, label: str | None, clock: Clock) -> None:
-        self.path = path
-        self.start_s = clock()
-        self._camera = camera
-        self._target = recordings.CaptureTarget(path, label)
-        if not hasattr(camera, "start_recording"):
+        if not isinstance(camera, RecordableCamera):
             raise NlosCamError(
                 f"{camera.uri} cannot be recorded: only a live camera (l515, sim) can"
             )
+        self.path = path
+        self.start_s = clock()
+        self._recordable = camera
+        self._counts = camera.counts
+        self._target = recordings.CaptureTarget(path, label)
         self._sidecar = recordings.SidecarFile(recordings.sidecar_path(path), camera, label=label)
         self._meter = recordings.QualityMeter()
         self._recording = Recording(path, optional=True, last=False)
         try:
-            camera.start_recording(self._recording)  # type: ignore[attr-defined]  checked above
+            camera.start_recording(self._recording)
         except BaseException:
             self._sidecar.path.unlink(missing_ok=True)
             raise
@@ -47,7 +67,7 @@ class LiveRecording:
         Raises RecordingError for a damaged file, DiskFullError where there was no room.
         """
         sets = self._recording.sets
-        self._camera.stop_recording()  # type: ignore[attr-defined]  it started one
+        self._recordable.stop_recording()
         state: recordings.State = "disk full" if self._recording.disk_full else "complete"
         result = recordings.CaptureResult(
             self._target,
@@ -56,7 +76,7 @@ class LiveRecording:
             self._meter.quality(),
             self._sidecar,
             follows_another=True,
-            events=Counter(self._camera.counts),
+            events=Counter(self._counts),
         )
         final = recordings.finalize(result, recordings.verify)
         if final.error:

@@ -86,7 +86,8 @@ class BackgroundPhysicsCheck:
 
     def offer(self, frame_number: int, maps: LidarMaps, depth_m: Float32) -> None:
         """Have this frame checked if a check is due."""
-        if (now_s := self._clock()) < self._due_s:
+        now_s = self._clock()
+        if now_s < self._due_s:
             return
         self._due_s = now_s + self._period_s
         self.dropped += self._queue.put((frame_number, maps, depth_m)) is not None
@@ -173,7 +174,7 @@ def serve(from_parent: IO[bytes], to_parent: IO[bytes], leave: Callable[[], None
     rig, accuracy = messages.get()
     from nlos_cam.reconstruct import (
         check_reconstruction,
-    )  # takes a second, during which stdin is already watched
+    )  # takes a second: stdin is watched already
 
     while (message := messages.get()) is not None:
         frame_number, maps, depth_m = message

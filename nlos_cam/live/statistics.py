@@ -1,22 +1,29 @@
 """Statistics of a live run: rate, latency, time of each stage, verdicts, warnings, stalls."""
 
 import logging
-import re
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import Protocol, runtime_checkable
 
 import numpy as np
-from numpy.typing import NDArray
+from nlos_calibration.arrays import Float64
 
 from nlos_cam.camera import Camera
 from nlos_cam.errors import NlosCamError
 from nlos_cam.frames import Frame
-from nlos_cam.live.frame_queue import FrameReader, ignore
-from nlos_cam.reconstruct import FrameResult, Verdict
+from nlos_cam.reconstruct import (
+    FrameReader,
+    FrameResult,
+    OnWarning,
+    QualityLog,
+    RecentValues,
+    Verdict,
+    WarningLog,
+    frames_by_verdict,
+    ignore,
+)
 
-REMEMBERED = 100_000
-"""Frames: 55 minutes at 30 frames/s, and 0.8 MB for each stage, allocated with the first frame."""
 SHARES = 50, 95, 99
 STALLED_AFTER_S = 0.5
 """Fifteen frames: a healthy camera never pauses this long."""
@@ -27,47 +34,22 @@ OUTSIDE_LATENCY = "wait", "view"
 """Stages before a frame's arrival and after its result; the latency consists of the others."""
 LATENCY = "latency"
 DELIVERY = "delivery"
-NUMBERS = re.compile(r"\d+(\.\d+)?")
 
 Percentiles = dict[str, float]
 """p50, p95 and p99, rising."""
-OnWarning = Callable[[str, bool], None]
-"""Called with a warning, and whether it begins (or ends)."""
 
 log = logging.getLogger(__name__)
 
 
-class StageTimes:
-    """Seconds by stage of the last frames, in memory of a fixed size; a stage may be missing from
-    some frames.
-    """
+@runtime_checkable
+class ComputedCamera(Protocol):
+    """Camera whose images this machine computes: a simulated one."""
 
-    def __init__(self, remembered: int = REMEMBERED) -> None:
-        self._remembered = remembered
-        self._next = 0
-        self._columns: dict[str, NDArray[np.float64]] = {}
-
-    def add(self, seconds: Mapping[str, float]) -> None:
-        """Add one frame's times, in place of the oldest if the memory is full."""
-        for name in seconds:
-            if name not in self._columns:
-                self._columns[name] = np.full(self._remembered, np.nan)
-        for name, column in self._columns.items():
-            column[self._next] = seconds.get(name, np.nan)
-        self._next = (self._next + 1) % self._remembered
-
-    @property
-    def stages(self) -> list[str]:
-        """Names, in order of their first frame."""
-        return list(self._columns)
-
-    def of(self, stage: str) -> NDArray[np.float64]:
-        """Return the remembered seconds of a stage, in no order."""
-        column = self._columns.get(stage, np.empty(0))
-        return column[~np.isnan(column)]
+    exposures_s: Sequence[float]
+    """Seconds that the last images took to compute."""
 
 
-def percentiles_ms(seconds: NDArray[np.float64]) -> Percentiles:
+def percentiles_ms(seconds: Float64) -> Percentiles:
     """Return the percentiles of times in seconds, in milliseconds; 0 for no times."""
     values = np.percentile(seconds, SHARES) if seconds.size else np.zeros(len(SHARES))
     return {f"p{share}": 1e3 * float(value) for share, value in zip(SHARES, values, strict=True)}
@@ -102,8 +84,8 @@ class PaceWatch:
         slow = lost > MAX_SLOW_SHARE * (new + lost)
         text = (
             f"processing is too slow: {lost} of the last {new + lost} frames were dropped; stop"
-            " other programs (another live run on these processors?), choose --budget-ms 30, or"
-            " give each run processors of its own (taskset)"
+            " other programs (another live run on these processors?), or give each run processors"
+            " of its own (taskset)"
         )
         if slow != bool(self.warnings):
             self._on_warning(text if slow else self.warnings[0], slow)
@@ -131,13 +113,15 @@ class StallWatch:
         self.frame_arrived(newest_s)
         if now_s - newest_s < STALLED_AFTER_S:
             return False
-        if begins := self._since_s is None:
+        begins = self._since_s is None
+        if begins:
             self._since_s = newest_s
-            self.stalls = self.stalls + 1
+            self.stalls += 1
             self._on_stall(STALLED, True)
-        if due := begins or now_s - self._shown_s >= STALLED_AFTER_S:
+        is_due = begins or now_s - self._shown_s >= STALLED_AFTER_S
+        if is_due:
             self._shown_s = now_s
-        return due
+        return is_due
 
     def frame_arrived(self, newest_s: float) -> None:
         """End the stall if the frame arrived after it began."""
@@ -150,58 +134,6 @@ class StallWatch:
         if self._since_s is not None:
             self.stalled_s += now_s - self._since_s
             self._since_s = None
-
-
-@dataclass
-class WarningSpan:
-    """Frames during which a warning held."""
-
-    text: str
-    """Latest wording."""
-    frames: int
-    first: int
-    last: int
-    """Frame numbers; the warning may have ended and begun again between."""
-
-
-class WarningLog:
-    """Record of warnings by frame. Calls `on_warning` when one begins or ends, not when its numbers
-    change.
-    """
-
-    def __init__(self, on_warning: OnWarning = ignore) -> None:
-        self._spans: dict[str, WarningSpan] = {}
-        self._on_warning = on_warning
-        self._present = set[str]()
-
-    def add(self, result: FrameResult) -> None:
-        number = result.frame.frame_number
-        before = self._present
-        self._present = {self._count(warning, number) for warning in result.warnings}
-        for subject, span in self._spans.items():
-            if (begins := subject in self._present) != (subject in before):
-                self._on_warning(span.text, begins)
-
-    def _count(self, warning: str, number: int) -> str:
-        """Count a frame for a warning, and return the warning's subject: its text without
-        numbers.
-        """
-        subject = NUMBERS.sub("", warning)
-        span = self._spans.setdefault(subject, WarningSpan(warning, 0, number, number))
-        span.text = warning
-        span.frames = span.frames + 1
-        span.last = number
-        return subject
-
-    @property
-    def spans(self) -> list[WarningSpan]:
-        """One for each warning, in order of their first frame."""
-        return list(self._spans.values())
-
-    @property
-    def frames(self) -> dict[str, int]:
-        """Number of frames by warning."""
-        return {span.text: span.frames for span in self._spans.values()}
 
 
 @dataclass(frozen=True)
@@ -238,29 +170,6 @@ class RunReport:
     """
 
 
-class QualityLog:
-    """Predicted qualities of the last frames with a detected object."""
-
-    def __init__(self) -> None:
-        self._predicted = StageTimes()
-
-    def add(self, result: FrameResult) -> None:
-        uncertainty = result.reconstruction.uncertainty
-        if result.verdict is Verdict.SEEN and uncertainty and (found := uncertainty.quality):
-            error_mm = 1e3 * found.error_m
-            trusted = float(found.trusted)
-            self._predicted.add(
-                {"expected_iou": found.iou[1], "expected_error_mm": error_mm, "trusted": trusted}
-            )
-
-    @property
-    def summary(self) -> dict[str, float]:
-        """Medians of IoU and error, and share of trusted frames; empty without any frame."""
-        summaries = {"expected_iou": np.median, "expected_error_mm": np.median, "trusted": np.mean}
-        values = {name: self._predicted.of(name) for name in self._predicted.stages}
-        return {name: float(summaries[name](column)) for name, column in values.items()}
-
-
 class RunStatistics:
     """Collector of a RunReport's numbers, in memory that does not grow with the frames. Used by the
     loop's thread.
@@ -273,11 +182,9 @@ class RunStatistics:
         self.frames = 0
         self.failed = 0
         """Frames whose processing raised an error."""
-        self.issues: Counter[str] = Counter()
-        """Number of frames by issue."""
         self.quality = QualityLog()
         self.verdicts: Counter[Verdict] = Counter()
-        self._times = StageTimes()
+        self._times = RecentValues()
         """Latency and delivery as differences of two clocks, the loop's and the frames'."""
         self._first_s = self._last_s = 0.0
 
@@ -287,9 +194,9 @@ class RunStatistics:
             self._first_s = result.published_s
         self.frames += 1
         self._last_s = result.published_s
-        ages_s = {LATENCY: result.published_s - result.frame.timestamp_s}
+        ages_s = {LATENCY: result.published_s - result.timestamp_s}
         if result.arrived_s is not None:
-            ages_s[DELIVERY] = result.arrived_s - result.frame.timestamp_s
+            ages_s[DELIVERY] = result.arrived_s - result.timestamp_s
             self.stall.frame_arrived(result.arrived_s)
         self._times.add({**ages_s, **result.stages_s, "view": view_s})
         self.warnings.add(result)
@@ -330,7 +237,7 @@ class RunStatistics:
         latency_ms = stages.pop(LATENCY)
         duration_s = self.duration_s(self._last_s)
         lost = self.lost(camera, reader)
-        counts = {**camera.counts, **lost, **self.issues, "stalls": self.stall.stalls}
+        counts = {**camera.counts, **lost, **reader.issues, "stalls": self.stall.stalls}
         return RunReport(
             self.frames,
             fps=(self.frames - 1) / duration_s if duration_s > 0 else 0.0,
@@ -351,7 +258,7 @@ class RunStatistics:
         frames'.
         """
         offsets_s = {LATENCY: offset_s, DELIVERY: offset_s}
-        names = [LATENCY, *(name for name in self._times.stages if name != LATENCY)]
+        names = [LATENCY, *(name for name in self._times.names if name != LATENCY)]
         return {
             name: percentiles_ms(self._times.of(name) - offsets_s.get(name, 0.0)) for name in names
         }
@@ -361,10 +268,6 @@ def camera_ms(camera: Camera) -> Percentiles:
     """Return percentiles of the time in which a simulated camera computes an image; empty for other
     cameras.
     """
-    exposures_s = getattr(camera, "exposures_s", None)
-    return percentiles_ms(np.array(list(exposures_s))) if exposures_s else {}
-
-
-def frames_by_verdict(verdicts: Counter[Verdict]) -> dict[str, int]:
-    """Return the counts above 0, in the order of Verdict."""
-    return {verdict.value: verdicts[verdict] for verdict in Verdict if verdicts[verdict]}
+    if not isinstance(camera, ComputedCamera) or not camera.exposures_s:
+        return {}
+    return percentiles_ms(np.array(camera.exposures_s))

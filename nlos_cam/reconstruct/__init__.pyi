@@ -4,17 +4,23 @@ __all__ = [
     "CalibratedRig",
     "Clock",
     "FrameConditions",
+    "FrameReader",
     "FrameResult",
     "MapAlignment",
+    "OnWarning",
     "PeriodicPhysicsCheck",
     "PhysicsCheck",
     "PhysicsCheckResult",
     "Pipeline",
     "PreparedFrame",
     "Quality",
+    "QualityLog",
+    "RecentValues",
     "Reconstruction",
     "Verdict",
     "VerdictFilter",
+    "WarningLog",
+    "WarningSpan",
     "align_all",
     "align_samples",
     "alignment",
@@ -22,9 +28,14 @@ __all__ = [
     "check_intrinsics",
     "check_reconstruction",
     "compatibility_warnings",
+    "describe_counts",
     "describe_failure",
     "estimate_uncertainty",
     "frame_issues",
+    "frames_by_verdict",
+    "ignore",
+    "iterate_batched",
+    "iterate_results",
     "load_networks",
     "load_uncertainty",
     "log_warning",
@@ -32,10 +43,12 @@ __all__ = [
     "reconstruct",
     "rig_to_align_with",
     "verdict_limits",
+    "warm_up",
 ]
 
 from .alignment import MapAlignment, align_all, align_samples, alignment, rig_to_align_with
 from .bench import CalibratedRig, check_intrinsics, open_bench
+from .frame_reader import Arrival, FrameReader, ignore
 from .network import Clock, Quality, Reconstruction, estimate_uncertainty, reconstruct
 from .physics_check import (
     UNEXPLAINED,
@@ -47,7 +60,6 @@ from .physics_check import (
     log_warning,
 )
 from .pipeline import (
-    Arrival,
     FrameResult,
     Pipeline,
     PreparedFrame,
@@ -56,5 +68,15 @@ from .pipeline import (
     load_networks,
     load_uncertainty,
     verdict_limits,
+)
+from .streaming import iterate_batched, iterate_results, warm_up
+from .summaries import (
+    OnWarning,
+    QualityLog,
+    RecentValues,
+    WarningLog,
+    WarningSpan,
+    describe_counts,
+    frames_by_verdict,
 )
 from .verdict import FrameConditions, Verdict, VerdictFilter, frame_issues

@@ -10,8 +10,7 @@ what the bench measured at the cell's point of the wall:
 - an echo over three bounces, d1 + d2 + d3 + d4, changes by d1 to the point and by the mean change
   of d4;
 - intensities keep their ratio to the wall's own return, less the gain of the whole frame; over
-  three bounces they do
-  not fall with d1.
+  three bounces they do not fall with d1.
 
 Cells that the bench does not see past its occluder are extrapolated from their neighbors, a few
 cells far.
@@ -19,7 +18,7 @@ cells far.
 
 from collections.abc import Iterable
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from nlos_calibration import BareWall, ObjectBox, Occluder, Rig, load_rig
@@ -31,8 +30,10 @@ from nlos_cam.frames import MAP_COLUMNS, MAP_ROWS, LidarMaps
 from nlos_cam.objects import object_box
 from nlos_cam.render import SensorModel, cast
 
-if TYPE_CHECKING:  # it imports torch, which `live` does without
+if TYPE_CHECKING:  # MapSet imports torch, which `live` does without
     from nlos_models.training import MapSet
+
+    from nlos_cam.render import Beams
 
 SHAPE = MAP_ROWS, MAP_COLUMNS
 THREE_BOUNCES_M = 0.02
@@ -52,6 +53,21 @@ MIN_COUNTS = 0.5
 """Intensity that stands for less, whose logarithm tells nothing."""
 
 
+Cells = tuple[Int64, Int64]
+"""Rows and columns of cells."""
+
+
+class Neighbors(NamedTuple):
+    """Cells of a bench's maps from which n cells of the training rig take their values."""
+
+    around: Cells
+    """(4, n): the four cells around each point of the wall."""
+    shares: Float64
+    """(4, n): their bilinear shares, which extrapolate past the last cell that sees the wall."""
+    nearest: Cells
+    """(n,): the nearest cell that sees the wall."""
+
+
 class MapAlignment:
     """Alignment of the maps of one bench with the rig that networks were trained for; see the
     module.
@@ -64,18 +80,44 @@ class MapAlignment:
         bench, shift_m, spot_m = _spots_of(bench, trained)
         here = cast(bench, bench.pinhole.scaled(MAP_COLUMNS, MAP_ROWS), occluder=False)
         there = cast(trained, trained.pinhole.scaled(MAP_COLUMNS, MAP_ROWS))
-        # Of the training rig: the cells that see the wall, and what its cells see with nothing
-        # hidden.
-        self._cells = np.flatnonzero(there.on_wall)
-        counts = (
-            SensorModel().bare_wall_counts
-            / cast(trained, trained.pinhole, occluder=False).direct.max()
+        sees_wall = _cells_on_wall(bench)
+        self._neighbors = _neighbors_of(bench, spot_m, sees_wall)
+        self._keep_training_rig(trained, there)
+        self._keep_bare_wall(here, bare)
+
+        # An echo over three bounces ends at the lidar too, from wherever on the wall that the
+        # lidar sees: its last leg d4 differs between the rigs by the mean over those points.
+        seen = sees_wall.ravel()
+        last_m = here.length_m[seen]
+        away_m = here.laser_spot_m[seen] - shift_m - there.lidar_m
+        wanted_m = np.linalg.norm(away_m, axis=1)
+
+        # Its first leg d1 is known for each point: the distance from either lidar to it.
+        first_m = np.linalg.norm(spot_m - here.lidar_m, axis=1)
+        wanted_first_m = there.length_m[self._cells]
+        self._longer_m = first_m - wanted_first_m + (wanted_m - last_m).mean()
+
+        # A narrow beam puts the same light on the wall from any distance, so an echo's intensity
+        # does not fall with d1^2, but the wall's own return, to which it is related here, does.
+        # Of the last leg both rigs collect light in proportion to 1 / d4^2.
+        self._log_brighter = 2 * np.log(wanted_first_m / first_m) + np.log(
+            (wanted_m**-2).mean() / (last_m**-2).mean()
         )
+
+    def _keep_training_rig(self, trained: Rig, there: "Beams") -> None:
+        """Keep the cells of the training rig that see the wall, and its bare bench's maps."""
+        self._cells = np.flatnonzero(there.on_wall)
+        # The simulated sensor's gain fixes the counts of the brightest bare wall (SensorModel).
+        brightest = cast(trained, trained.pinhole, occluder=False).direct.max()
+        counts = SensorModel().bare_wall_counts / brightest
         self._depth_m = (there.length_m * there.cos_axis).astype(np.float32)
         self._light = np.nan_to_num(there.direct * counts).astype(np.float32)
+        # Maps hold depth along the optical axis: depth = path / 2 * cos.
         self._wall_path_m = 2 * there.length_m[self._cells]
         self._half_cos = there.cos_axis[self._cells] / 2
-        # Of the bench: the wall's own return, as measured or as the geometry has it.
+
+    def _keep_bare_wall(self, here: "Beams", bare: BareWall | None) -> None:
+        """Keep the bench's bare wall, as measured, or by its geometry where it was not."""
         wall_m = (here.length_m * here.cos_axis).reshape(SHAPE)
         light = here.direct.reshape(SHAPE)
         if bare:
@@ -86,21 +128,6 @@ class MapAlignment:
         self._path_per_depth = (2 / here.cos_axis).reshape(SHAPE)
         with np.errstate(divide="ignore"):
             self._log_light = np.log(light)
-        sees_wall = _cells_on_wall(bench)
-        self._neighbors, self._share, self._nearest = _taken_from(bench, spot_m, sees_wall)
-        # The last leg ends at the lidar too, from wherever on the wall that the lidar sees.
-        seen = sees_wall.ravel()
-        last_m = here.length_m[seen]
-        away_m = here.laser_spot_m[seen] - shift_m - there.lidar_m
-        wanted_m = np.linalg.norm(away_m, axis=1)
-        first_m = np.linalg.norm(spot_m - here.lidar_m, axis=1)
-        its_m = there.length_m[self._cells]
-        self._longer_m = first_m - its_m + (wanted_m - last_m).mean()
-        # Light on the wall does not fall with the distance that a narrow beam has come; the wall's
-        # own return does.
-        self._log_brighter = 2 * np.log(its_m / first_m) + np.log(
-            (wanted_m**-2).mean() / (last_m**-2).mean()
-        )
 
     def align(self, maps: LidarMaps, beyond_wall_m: Float32 | None = None) -> LidarMaps:
         """Return maps of the bench as those of the training rig.
@@ -108,19 +135,30 @@ class MapAlignment:
         `beyond_wall_m` (64, 80) are the depths less those of the bare wall, where they are known
         better than from `maps`: without drift.
         """
+        # Interpolate the path beyond the wall's own, and the logarithm of the light's ratio to the
+        # wall's: the wall's slope, reflectance and a constant range error are in neither.
         beyond_m = maps.depth_m - self._wall_m if beyond_wall_m is None else beyond_wall_m
-        path_m = beyond_m * self._path_per_depth
-        ratio = np.log(np.maximum(maps.intensity, MIN_COUNTS)) - self._log_light
-        rows, columns = self._neighbors
-        paths_m, row, column = path_m[rows, columns], *self._nearest
+        path_m = beyond_m * self._path_per_depth  # (64, 80)
+        ratio = np.log(np.maximum(maps.intensity, MIN_COUNTS)) - self._log_light  # (64, 80)
+
+        rows, columns = self._neighbors.around
+        shares = self._neighbors.shares
+        row, column = self._neighbors.nearest
+        paths_m = path_m[rows, columns]  # (4, n)
         with np.errstate(invalid="ignore"):
+            # Between cells of different echoes a mean would be an echo that nothing returned:
+            # there the nearest cell counts. NaN (no return) compares false and does the same.
             same = paths_m.max(0) - paths_m.min(0) < SAME_ECHO_M
-            path_m = np.where(same, (self._share * paths_m).sum(0), path_m[row, column])
-            ratio = np.where(same, (self._share * ratio[rows, columns]).sum(0), ratio[row, column])
+            path_m = np.where(same, (shares * paths_m).sum(0), path_m[row, column])
+            ratio = np.where(same, (shares * ratio[rows, columns]).sum(0), ratio[row, column])
             of_wall = np.abs(path_m) < THREE_BOUNCES_M
+
+        # The cells of the bare wall give the gain of the frame: their ratio should be 1.
         gain = np.median(ratio[of_wall]) if of_wall.any() else 0.0
         path_m = self._wall_path_m + np.where(of_wall, path_m, path_m + self._longer_m)
         ratio = np.where(of_wall, ratio, ratio + self._log_brighter)
+
+        # Cells that see no wall in training (but the occluder) keep the training rig's own value.
         depth_m = self._depth_m.copy()
         light = self._light.copy()
         depth_m[self._cells] = path_m * self._half_cos
@@ -161,12 +199,13 @@ def align_samples(maps: "MapSet", benches: Iterable[Rig], wanted: Rig) -> tuple[
     intensity = maps.intensity.copy()
     seen = np.ones(len(maps.image), bool)
     bench = wanted
-    aligned = None
+    aligned: MapAlignment | None = None
     possible = True
     for n, its_bench in zip(range(len(seen)), benches, strict=False):
-        if its_bench is not bench and its_bench != bench:  # samples of one bench follow each other
+        # An alignment casts rays through every cell; samples of one bench follow each other.
+        if its_bench is not bench and its_bench != bench:
             bench = its_bench
-            possible = its_bench == wanted or can_align(its_bench, wanted)
+            possible = bench == wanted or can_align(bench, wanted)
             aligned = MapAlignment(bench, wanted) if possible and bench != wanted else None
         seen[n] = possible
         if aligned:
@@ -194,6 +233,7 @@ def can_align(bench: Rig, trained: Rig) -> bool:
     """
     if not (bench.object_box and trained.object_box):
         return False
+    # The networks' image spans the box: in a box of another size every pixel would be elsewhere.
     apart_m = np.subtract(_size_m(bench.object_box), _size_m(trained.object_box))
     return bool(np.abs(apart_m).max() <= SAME_BOX_M and _is_in_view(bench, trained))
 
@@ -218,11 +258,22 @@ def _is_in_view(bench: Rig, trained: Rig) -> bool:
     if not sees_wall.any():
         return False
     row, column = _cells_at(bench, spot_m)
-    some = np.flatnonzero(sees_wall.any(1))
-    last = MAP_COLUMNS - 1 - sees_wall[:, ::-1].argmax(1)
-    return bool(
-        (column - last[np.clip(np.rint(row).astype(int), some[0], some[-1])]).max() <= HIDDEN_CELLS
-    )
+    top, bottom = _rows_on_wall(sees_wall)
+    _, last = _columns_on_wall(sees_wall)
+    nearest_row = np.clip(np.rint(row).astype(int), top, bottom)
+    hidden_cells = (column - last[nearest_row]).max()
+    return bool(hidden_cells <= HIDDEN_CELLS)
+
+
+def _rows_on_wall(sees_wall: Mask) -> tuple[int, int]:
+    """Return the first and last row with a cell that sees the wall."""
+    rows = np.flatnonzero(sees_wall.any(1))
+    return rows[0], rows[-1]
+
+
+def _columns_on_wall(sees_wall: Mask) -> tuple[Int64, Int64]:
+    """Return the first and last column (64,) that sees the wall in each row."""
+    return sees_wall.argmax(1), MAP_COLUMNS - 1 - sees_wall[:, ::-1].argmax(1)
 
 
 def _spots_of(bench: Rig, trained: Rig) -> tuple[Rig, Float64, Float64]:
@@ -260,6 +311,7 @@ def _size_m(box: ObjectBox) -> tuple[float, ...]:
 
 def _with_occluder(bench: Rig, usual: Occluder | None, along_m: float) -> Rig:
     """Return the bench, with the training rig's occluder where its own was not measured."""
+    # The occluder decides which cells see the hidden side: without one, all would count as seen.
     if bench.occluder or not usual:
         return bench
     return bench.model_copy(
@@ -269,39 +321,39 @@ def _with_occluder(bench: Rig, usual: Occluder | None, along_m: float) -> Rig:
 
 def _cells_on_wall(rig: Rig) -> Mask:
     """Return a mask (64, 80) of the cells that see the wall alone, past the occluder."""
+    # A cell is the mean over 8 x 8 beams: one at an edge mixes wall and occluder.
     on_wall = cast(rig, rig.pinhole.scaled(BEAMS * MAP_COLUMNS, BEAMS * MAP_ROWS)).on_wall
     return np.all(on_wall.reshape(MAP_ROWS, BEAMS, MAP_COLUMNS, BEAMS), axis=(1, 3))
 
 
-def _taken_from(
-    bench: Rig, spot_m: Float64, sees_wall: Mask
-) -> tuple[tuple[Int64, Int64], Float64, tuple[Int64, Int64]]:
-    """Return the cells (4, n) around points (n, 3) of the wall, in the bench's wall frame, their
-    shares (4, n), and the nearest cells (n,).
+def _neighbors_of(bench: Rig, spot_m: Float64, sees_wall: Mask) -> Neighbors:
+    """Return the bench's cells around points (n, 3) of the wall, in the bench's wall frame.
 
     Past the last cells that see the wall the shares extrapolate.
     """
     row, column = _cells_at(bench, spot_m)
-    some = np.flatnonzero(sees_wall.any(1))
-    row = np.clip(row, some[0], some[-1])
-    top = np.clip(np.floor(row).astype(int), some[0], max(some[-1] - 1, some[0]))
-    first = sees_wall.argmax(1)
-    last = MAP_COLUMNS - 1 - sees_wall[:, ::-1].argmax(1)
-    bottom = np.minimum(top + 1, some[-1])
+    first_row, last_row = _rows_on_wall(sees_wall)
+    first, last = _columns_on_wall(sees_wall)
+
+    # Rows outside the view repeat its first or last row, so their share is 0 or 1.
+    row = np.clip(row, first_row, last_row)
+    top = np.clip(np.floor(row).astype(int), first_row, max(last_row - 1, first_row))
+    bottom = np.minimum(top + 1, last_row)
+
+    # Columns must see the wall in both rows. Shares outside 0 to 1 extrapolate linearly, which
+    # follows the rise of intensity towards the occluder; far out they would only amplify noise.
     low = np.maximum(first[top], first[bottom])
     high = np.minimum(last[top], last[bottom])
     column = np.clip(column, low - BEYOND_CELLS, high + BEYOND_CELLS)
     left = np.clip(np.floor(column).astype(int), low, np.maximum(high - 1, low))
     right = np.minimum(left + 1, MAP_COLUMNS - 1)
+
     down = row - top
     across = column - left
-    share = np.stack(
+    shares = np.stack(
         [(1 - across) * (1 - down), across * (1 - down), (1 - across) * down, across * down]
     )
-    neighbors = np.stack([top, top, bottom, bottom]), np.stack([left, right, left, right])
-    nearest = np.clip(np.rint(row).astype(int), some[0], some[-1])
-    return (
-        neighbors,
-        share,
-        (nearest, np.clip(np.rint(column).astype(int), first[nearest], last[nearest])),
-    )
+    around = np.stack([top, top, bottom, bottom]), np.stack([left, right, left, right])
+    nearest_row = np.clip(np.rint(row).astype(int), first_row, last_row)
+    nearest_column = np.clip(np.rint(column).astype(int), first[nearest_row], last[nearest_row])
+    return Neighbors(around, shares, (nearest_row, nearest_column))

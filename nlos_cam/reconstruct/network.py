@@ -6,12 +6,17 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from nlos_calibration import ObjectBox, Rig
-from nlos_calibration.arrays import Float32
+from nlos_calibration.arrays import Float32, Float64
 from nlos_models import MIN_V, Answer, UncertaintyModel, ask
-from numpy.typing import NDArray
 
 from nlos_cam.frames import OBJECT_PIXELS, LidarMaps
-from nlos_cam.objects import depth_from_image, object_box
+from nlos_cam.objects import (
+    SurfaceMesh,
+    cell_centers_m,
+    depth_from_image,
+    mesh_from_depth,
+    object_box,
+)
 
 Clock = Callable[[], float]
 Network = Callable[[Float32, Float32], Float32]
@@ -34,17 +39,17 @@ class Quality:
 
 @dataclass(frozen=True)
 class Uncertainty:
-    """Uncertainty of a reconstruction, estimated by the uncertainty model."""
+    """Uncertainty of a reconstruction, estimated by the uncertainty model ("doubt network")."""
 
-    nothing: float
+    p_empty: float
     """Probability that nothing is hidden."""
-    outside: float
-    """Probability that the hidden object is out of distribution: unlike the training set."""
+    p_out_of_distribution: float
+    """Probability that the hidden object is unlike the training set."""
     error_m: Float32
     """(64, 64): expected absolute error of the hidden depth if there is a surface; finite
     everywhere.
     """
-    surface: Float32
+    p_surface: Float32
     """(64, 64): probability that there is a surface."""
     quality: Quality | None = None
     """None without a surface or a quality model."""
@@ -56,10 +61,8 @@ class Reconstruction:
 
     depth_m: Float32
     """(64, 64) over the object box: distance from the wall, NaN where there is no surface."""
-    wall_from_object: NDArray[np.float64]
-    """(4, 4); the object frame has the wall's axes and its origin on the wall, before the middle of
-    the box.
-    """
+    box: ObjectBox
+    """Box in which objects are reconstructed, in the wall frame."""
     uncertainty_m: Float32 | None
     """(64, 64), finite everywhere: expected absolute error of `depth_m` if there is a surface; None
     without an uncertainty model."""
@@ -69,9 +72,31 @@ class Reconstruction:
     """None without an uncertainty model."""
 
     @property
-    def doubt(self) -> Uncertainty | None:
-        """`uncertainty`, by its former name."""
-        return self.uncertainty
+    def wall_from_object(self) -> Float64:
+        """(4, 4); the object frame has the wall's axes and its origin on the wall, before the
+        middle of the box.
+        """
+        box = self.box
+        pose = np.eye(4)
+        pose[0, 3] = (box.x_min_m + box.x_max_m) / 2
+        pose[1, 3] = (box.y_min_m + box.y_max_m) / 2
+        return pose
+
+    @property
+    def points_m(self) -> Float32:
+        """(n, 3): points of the surface in the wall frame."""
+        x_m, y_m = np.meshgrid(*cell_centers_m(self.box))
+        points_m = np.stack([x_m, y_m, self.depth_m], -1).astype(np.float32)
+        return points_m[np.isfinite(self.depth_m)]
+
+    def to_mesh(self) -> SurfaceMesh:
+        """Return the surface as a mesh in the wall frame."""
+        return mesh_from_depth(self.depth_m, self.box, self.uncertainty_m)
+
+    @property
+    def quality(self) -> Quality | None:
+        """Predicted quality; None without a surface or a quality model."""
+        return self.uncertainty.quality if self.uncertainty else None
 
     @property
     def has_surface(self) -> bool:
@@ -82,13 +107,6 @@ class Reconstruction:
     def without_surface(self) -> "Reconstruction":
         """The same with NaN as depth everywhere."""
         return replace(self, depth_m=np.full_like(self.depth_m, np.nan))
-
-
-def box_pose(box: ObjectBox) -> NDArray[np.float64]:
-    """Return wall_from_object (4, 4) of a box."""
-    pose = np.eye(4)
-    pose[:2, 3] = (box.x_min_m + box.x_max_m) / 2, (box.y_min_m + box.y_max_m) / 2
-    return pose
 
 
 def reconstruct(
@@ -120,19 +138,18 @@ def reconstruct_all(
     start_s = clock()
     images, surfaces = _run_network(batch, network)
     timings_s = {"network": (clock() - start_s) / len(batch)}
+
     results: list[Reconstruction] = []
     for number, (maps, image) in enumerate(zip(batch, images, strict=True)):
-        result = Reconstruction(depth_from_image(image, box), box_pose(box), None, timings_s)
+        result = Reconstruction(depth_from_image(image, box), box, None, timings_s)
         if uncertainty_model is not None:
             start_s = clock()
-            uncertainty = estimate_uncertainty(
-                uncertainty_model, maps, image, box, None if surfaces is None else surfaces[number]
-            )
-            timings = {**timings_s, "doubt": clock() - start_s}
+            surface = None if surfaces is None else surfaces[number]
+            uncertainty = estimate_uncertainty(uncertainty_model, maps, image, box, surface)
             result = replace(
                 result,
                 uncertainty_m=uncertainty.error_m,
-                timings_s=timings,
+                timings_s={**timings_s, "doubt": clock() - start_s},
                 uncertainty=uncertainty,
             )
         results.append(result)
@@ -145,18 +162,25 @@ def _run_network(batch: Sequence[LidarMaps], network: Network) -> Answer:
     The networks take a cell without a return for an average one, and would show an average object
     for such maps.
     """
-    images, surfaces = (
-        np.zeros((len(batch), OBJECT_PIXELS, OBJECT_PIXELS), np.float32) for _ in range(2)
-    )
-    found = None
-    if valid := [index for index, maps in enumerate(batch) if maps.valid.any()]:
-        depth_m = np.stack([batch[index].depth_m for index in valid])
-        images[valid], found = ask(
-            network, depth_m, np.stack([batch[index].intensity for index in valid])
-        )
-        if found is not None:
-            surfaces[valid] = found
-    return Answer(images, None if found is None else surfaces)
+    shape = len(batch), OBJECT_PIXELS, OBJECT_PIXELS
+    images = np.zeros(shape, np.float32)
+    # v is 0 where there is no surface: a direct network's graph has cut each image, of six cuts of
+    # the probability p of a surface, at the one whose expected IoU is largest, sum of p inside over
+    # sum of p everywhere and of 1 - p inside.
+    valid = [index for index, maps in enumerate(batch) if maps.valid.any()]
+    if not valid:
+        return Answer(images, None)
+
+    depth_m = np.stack([batch[index].depth_m for index in valid])
+    intensity = np.stack([batch[index].intensity for index in valid])
+    answer = ask(network, depth_m, intensity)
+    images[valid] = answer.image
+    if answer.surface is None:
+        return Answer(images, None)
+
+    surfaces = np.zeros(shape, np.float32)
+    surfaces[valid] = answer.surface
+    return Answer(images, surfaces)
 
 
 def estimate_uncertainty(
@@ -170,23 +194,27 @@ def estimate_uncertainty(
 
     `surface` (64, 64) is their own probability of a surface, if they have one.
     """
-    said = uncertainty_model(*(array[None] for array in (maps.depth_m, maps.intensity, image)))
-    # v falls linearly from 1 at z_near to MIN_V at z_far, so an error of 1 in v is this many metres
-    # (depth_from_image)
+    prediction = uncertainty_model(maps.depth_m[None], maps.intensity[None], image[None])
+    # v falls linearly from 1 at z_near to MIN_V at z_far (depth_from_image), so an error of 1 in v
+    # is this many metres:
     metres_per_v = (box.z_far_m - box.z_near_m) / (1 - MIN_V)
-    error_m = said.error_v[0] * metres_per_v
+
     quality = None
+    # The quality model was fitted to images with a surface: an empty one has no outline to judge.
     if uncertainty_model.quality and image.any():
-        found = uncertainty_model.quality(
-            image[None], said, None if surface is None else surface[None]
+        surfaces = None if surface is None else surface[None]
+        predicted = uncertainty_model.quality(image[None], prediction, surfaces)
+        low, middle, high = predicted.iou[0].tolist()
+        quality = Quality(
+            iou=(low, middle, high),
+            good=float(predicted.good[0]),
+            error_m=float(predicted.error_v[0]) * metres_per_v,
+            trusted=bool(predicted.trusted[0]),
         )
-        low, middle, high = found.iou[0].tolist()
-        error = float(found.error_v[0]) * metres_per_v
-        quality = Quality((low, middle, high), float(found.good[0]), error, bool(found.trusted[0]))
     return Uncertainty(
-        float(said.p_empty[0]),
-        float(said.p_out_of_distribution[0]),
-        error_m,
-        said.p_surface[0],
-        quality,
+        p_empty=float(prediction.p_empty[0]),
+        p_out_of_distribution=float(prediction.p_out_of_distribution[0]),
+        error_m=prediction.error_v[0] * metres_per_v,
+        p_surface=prediction.p_surface[0],
+        quality=quality,
     )

@@ -5,11 +5,12 @@ bounces. If both are about as strong, a small error of the object swaps them and
 by decimetres. So the measurement is compared with both, and the one that explains it better counts.
 With r = measured less expected and s a tolerance that covers the noise:
 
-    h = (depth r / s)^2 + (log intensity r / s)^2 + (log of how much the other echo is stronger /
-    s)^2 cost = h / (1 + h)                          0 explained, 1 not at all; averaged over the
-    cells score = (cost - NOISE_COST) / (cost of the bare bench - NOISE_COST), the numerator at
-    least 0, the denominator at
-            least MIN_UNEXPLAINED
+    h     = (depth r / s)^2 + (log intensity r / s)^2
+            + (log of how much the other echo is stronger / s)^2
+    cost  = h / (1 + h)         0 explained, 1 not at all; averaged over the cells
+    score = (cost - NOISE_COST) / (cost of the bare bench - NOISE_COST)
+
+The numerator is at least 0, the denominator at least MIN_UNEXPLAINED.
 
 Two unknowns are fitted: the device's gain, from the cells that show the bare wall, and the object's
 albedo, to within a factor of MAX_ALBEDO, as the one of least cost. A wider range of albedos would
@@ -21,7 +22,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Protocol, Self
+from typing import NamedTuple, Protocol, Self
 
 import numpy as np
 from nlos_calibration import Rig
@@ -111,6 +112,7 @@ slope.
 """
 MAX_ALBEDO = 4 / 3
 ALBEDOS = 5
+"""Factors of the training set's albedo that are tried, from 1 / MAX_ALBEDO to MAX_ALBEDO."""
 NOISE_COST = 0.006
 """Cost of an explained bare bench: the sensor's noise, and cells of many pixels."""
 MIN_UNEXPLAINED = 0.02
@@ -146,12 +148,13 @@ class Expected:
         """Return depth (NaN where there is no return) and intensity in counts, as measured without
         noise.
         """
+        # The lidar reports the stronger of two echoes (S5).
         wins = albedo * self.echo > self.direct
         intensity = np.where(wins, albedo * self.echo, self.direct)
-        depth_m = np.where(intensity > 0, np.where(wins, self.echo_m, self.direct_m), np.nan)
-        return depth_m.astype(np.float32), np.minimum(gain * intensity, SATURATED).astype(
-            np.float32
-        )
+        depth_m = np.where(wins, self.echo_m, self.direct_m)
+        depth_m = np.where(intensity > 0, depth_m, np.nan)
+        counts = np.minimum(gain * intensity, SATURATED)
+        return depth_m.astype(np.float32), counts.astype(np.float32)
 
 
 @dataclass(frozen=True)
@@ -167,13 +170,13 @@ class Explanation:
 def explain(maps: LidarMaps, expected: Expected, bare: Expected) -> Explanation:
     """Return the best explanation of maps by an object, scored against that of the bare bench."""
     gain = fit_gain(maps, bare)
-    albedos = (
-        np.geomspace(1 / MAX_ALBEDO, MAX_ALBEDO, ALBEDOS)
-        if (expected.echo > 0).any()
-        else np.ones(1)
-    )
+    albedos = np.ones(1)
+    if (expected.echo > 0).any():
+        albedos = np.geomspace(1 / MAX_ALBEDO, MAX_ALBEDO, ALBEDOS)
     costs = [mean_cost(maps, expected, gain, albedo) for albedo in albedos]
     best = int(np.argmin(costs))
+    # Noise costs something on a perfect explanation too; an empty bench leaves nothing to explain,
+    # and its score would be a ratio of two noises.
     unexplained = max(mean_cost(maps, bare, gain, 1.0) - NOISE_COST, MIN_UNEXPLAINED)
     return Explanation(max(costs[best] - NOISE_COST, 0.0) / unexplained, float(albedos[best]), gain)
 
@@ -182,6 +185,7 @@ def fit_gain(maps: LidarMaps, bare: Expected) -> float:
     """Return the counts for an intensity of I0: the median of the cells that show the bare wall, of
     all if too few.
     """
+    # The median ignores the few cells in which an echo happens to lie at the wall's depth.
     lit = maps.valid & (maps.intensity > 0) & (bare.direct > 0)
     shows_wall = lit & (np.abs(maps.depth_m - bare.direct_m) < 3 * WALL_TOLERANCE_M)
     cells = shows_wall if shows_wall.sum() >= MIN_BARE_CELLS else lit
@@ -192,49 +196,60 @@ def mean_cost(maps: LidarMaps, expected: Expected, gain: float, albedo: float) -
     """Return the mean cost, 0 to 1, over the cells with a measured or expected return."""
     echo = albedo * expected.echo
     measured_m = np.where(maps.valid, maps.depth_m, np.nan).astype(np.float64)
-    light = _log(maps.intensity.astype(np.float64) / gain)  # in units of I0
-    counts_of_i0 = NOISE.bare_wall_counts / max(float(expected.direct.max()), 1e-12)
+    log_light = _log(maps.intensity.astype(np.float64) / gain)  # in units of I0
     lead = _log(echo) - _log(expected.direct)
-    full_scale = np.log(SATURATED / gain)
-    off_wall = measured_m - expected.direct_m
-    off_echo = measured_m - expected.echo_m
-    wall = _misfit(
-        off_wall / WALL_TOLERANCE_M, light, expected.direct, counts_of_i0, lead, full_scale
+    sensor = Exposure(
+        counts_of_i0=NOISE.bare_wall_counts / max(float(expected.direct.max()), 1e-12),
+        log_full_scale=np.log(SATURATED / gain),
     )
-    bounced = _misfit(off_echo / ECHO_TOLERANCE_M, light, echo, counts_of_i0, -lead, full_scale)
+
+    # The lidar reports one of two echoes: the one that explains the cell better is taken.
+    off_wall = (measured_m - expected.direct_m) / WALL_TOLERANCE_M
+    off_echo = (measured_m - expected.echo_m) / ECHO_TOLERANCE_M
+    wall = _misfit(off_wall, log_light, expected.direct, lead, sensor)
+    bounced = _misfit(off_echo, log_light, echo, -lead, sensor)
     h = np.minimum(wall, bounced)
-    # h / (1 + h) tends to 1 for h -> infinity, but inf / inf is NaN
+
+    # h / (1 + h) tends to 1 for h -> infinity, but inf / inf is NaN.
     cost = np.where(np.isfinite(h), h / (1 + np.where(np.isfinite(h), h, 0)), 1.0)
+    # A cell without a return, where none is expected either, tells nothing.
     counted = maps.valid | (expected.direct > 0) | (echo > 0)
     return float(cost[counted].mean()) if counted.any() else 0.0
 
 
+class Exposure(NamedTuple):
+    """Scale of a frame's intensities."""
+
+    counts_of_i0: float
+    """Counts of an intensity of I0 by the simulated sensor, whose noise is known in counts."""
+    log_full_scale: float
+    """Logarithm of the saturated intensity in units of I0."""
+
+
 def _misfit(
-    off: Float64,
-    light: Float64,
-    expected: Float64,
-    counts_of_i0: float,
-    lead: Float64,
-    full_scale: float,
+    off: Float64, log_light: Float64, expected: Float64, lead: Float64, sensor: Exposure
 ) -> Float64:
     """Return `h` of one of the two echoes; infinite where there is none, or nothing was measured.
 
-    `off` is the depth term's r / s, `light` the log of the measured intensity, `lead` the log of
-    how much the other echo is stronger.
+    `off` is the depth term's r / s, `log_light` the log of the measured intensity, `lead` the log
+    of how much the other echo is stronger.
     """
-    counts = counts_of_i0 * expected
+    counts = sensor.counts_of_i0 * expected
     with np.errstate(divide="ignore", invalid="ignore"):
-        # d(log n) = dn / n, so noise of variance read^2 + shot^2 n has variance (read^2 + shot^2 n)
-        # / n^2 in log n
+        # d(log n) = dn / n, so noise of variance read^2 + shot^2 n has variance
+        # (read^2 + shot^2 n) / n^2 in log n.
         variance = (
             LOG_TOLERANCE**2
             + (NOISE.read_noise_counts**2 + NOISE.shot_noise**2 * counts) / counts**2
         )
-        log_ratio = light - _log(expected)
-        # a saturated cell measures a lower limit of its light: only too little expected light is a
-        # misfit
-        log_ratio = np.where(light >= full_scale, np.maximum(log_ratio, 0), log_ratio)
-        h = off**2 + log_ratio**2 / variance + (np.maximum(lead, 0) / LOG_TOLERANCE) ** 2
+        # A saturated cell measures a lower limit of its light: only too little expected light is
+        # a misfit.
+        log_ratio = log_light - _log(expected)
+        is_saturated = log_light >= sensor.log_full_scale
+        log_ratio = np.where(is_saturated, np.maximum(log_ratio, 0), log_ratio)
+        # The weaker echo can be the reported one only by an error of the expected intensities.
+        weaker = np.maximum(lead, 0) / LOG_TOLERANCE
+        h = off**2 + log_ratio**2 / variance + weaker**2
     return np.where((expected > 0) & np.isfinite(h), h, np.inf)
 
 
@@ -263,15 +278,21 @@ def check_reconstruction(
     """
     start_s = clock()
     bare = _bare(rig)  # pyright: ignore[reportArgumentType]  frozen, so hashable
-    has_object = (
-        depth_m is not None and rig.object_box is not None and bool(np.isfinite(depth_m).any())
-    )
-    expected = _expected(render(Scene(rig, depth_m), accuracy), rig, bare) if has_object else bare
+    expected = bare
+    if depth_m is not None and rig.object_box is not None and np.isfinite(depth_m).any():
+        expected = _expected(render(Scene(rig, depth_m), accuracy), rig, bare)
+
     best = explain(maps, expected, bare)
     rendered_m, rendered = expected.noiseless_maps(best.albedo, best.gain)
     measured_m = np.where(maps.valid, maps.depth_m, np.float32(np.nan))
-    residuals = measured_m - rendered_m, maps.intensity - rendered
-    return PhysicsCheckResult(frame_number, *residuals, best.score, clock() - start_s, best.albedo)
+    return PhysicsCheckResult(
+        frame_number,
+        residual_depth_m=measured_m - rendered_m,
+        residual_intensity=maps.intensity - rendered,
+        score=best.score,
+        seconds=clock() - start_s,
+        albedo=best.albedo,
+    )
 
 
 @lru_cache(maxsize=4)
@@ -283,21 +304,23 @@ def _expected(rendering: Rendering, rig: Rig, bare: Expected | None) -> Expected
     """Return both echoes of each cell; where three bounces won, the direct echo is the bare
     bench's.
     """
-    cos_axis = cast(rig, rig.pinhole.scaled(MAP_COLUMNS, MAP_ROWS)).cos_axis.reshape(
-        MAP_ROWS, MAP_COLUMNS
-    )
+    shape = MAP_ROWS, MAP_COLUMNS
+    cos_axis = cast(rig, rig.pinhole.scaled(MAP_COLUMNS, MAP_ROWS)).cos_axis.reshape(shape)
     echo = rendering.multi.peak.astype(np.float64)
     echo_m = rendering.multi.path_m / 2 * cos_axis
     direct = rendering.intensity.astype(np.float64)
     direct_m = rendering.depth_m.astype(np.float64)
     if bare is None:
         return Expected(direct_m, direct, echo_m, echo)
+
+    # The rendering holds the stronger echo of each cell: where that has three bounces, the wall's
+    # own is taken from the bare bench, which the object does not change.
     bounced = (rendering.intensity <= rendering.multi.peak) & (echo > 0)
     return Expected(
-        np.where(bounced, bare.direct_m, direct_m),
-        np.where(bounced, bare.direct, direct),
-        echo_m,
-        echo,
+        direct_m=np.where(bounced, bare.direct_m, direct_m),
+        direct=np.where(bounced, bare.direct, direct),
+        echo_m=echo_m,
+        echo=echo,
     )
 
 
@@ -326,8 +349,9 @@ class PeriodicPhysicsCheck(NullPhysicsCheck):
 
     def offer(self, frame_number: int, maps: LidarMaps, depth_m: Float32) -> None:
         """Check this frame if it is the first of its group."""
+        is_due = self._offered % self._every == 0
         self._offered += 1
-        if (self._offered - 1) % self._every:
+        if not is_due:
             return
         try:
             self.newest = check_reconstruction(

@@ -3,11 +3,12 @@
 Built from a rig and networks, whose mismatches it lists.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from nlos_calibration import Rig, rig_difference
+from nlos_calibration.arrays import Float32
 from nlos_calibration.errors import CalibrationError
 from nlos_models import (
     CheckpointRecord,
@@ -19,8 +20,10 @@ from nlos_models import (
 
 from nlos_cam.files import cache_folder
 from nlos_cam.frames import Frame, LidarMaps, MapMean, maps_from_frame
+from nlos_cam.objects import SurfaceMesh
 from nlos_cam.reconstruct.alignment import alignment, rig_to_align_with, training_rig
 from nlos_cam.reconstruct.bench import BenchObservation, CalibratedRig
+from nlos_cam.reconstruct.frame_reader import Arrival
 from nlos_cam.reconstruct.network import Clock, Network, Reconstruction, reconstruct_all
 from nlos_cam.reconstruct.physics_check import (
     UNEXPLAINED,
@@ -33,37 +36,77 @@ from nlos_cam.reconstruct.verdict import (
     Verdict,
     VerdictFilter,
     VerdictLimits,
-    frame_issues,
 )
 
 
 @dataclass(frozen=True)
-class Arrival:
-    """Frame with the time at which the reader received it."""
-
-    frame: Frame
-    arrived_s: float
-
-
-@dataclass(frozen=True)
 class FrameResult:
-    """Frame with its maps, reconstruction, verdict and timings."""
+    """Result of one frame: the hidden surface with its uncertainty and verdict."""
 
     frame: Frame
+    """The frame itself, in SI units."""
     maps: LidarMaps
+    """Lidar maps of (64, 80) cells: of this frame, or the mean over several."""
     reconstruction: Reconstruction
+    """Hidden surface with its pose, its box and the networks' timings."""
     published_s: float
+    """Time at which the result was ready, by the loop's clock."""
     stages_s: Mapping[str, float]
     """Seconds by stage."""
     difference: LidarMaps | None = None
-    """Maps less those of the bare wall; None without a reference."""
+    """Maps less those of the bare wall; None without a wall record that has a reference."""
     warnings: tuple[str, ...] = ()
+    """Warnings that hold now, such as that the lidar has moved."""
     verdict: Verdict | None = None
-    """None without an uncertainty model, unless the lidar moved or is saturated."""
+    """Reliability of the reconstruction, such as "object seen"; None without an uncertainty model,
+    unless the lidar moved or is saturated.
+    """
     check: PhysicsCheckResult | None = None
-    """Newest physics check, of this frame or an earlier one."""
+    """Newest physics check, of this frame or an earlier one; None until there is one."""
     arrived_s: float | None = None
     """Time at which the reader received the frame."""
+
+    @property
+    def depth_m(self) -> Float32:
+        """(64, 64) over the box: distance from the wall, NaN where there is no surface.
+
+        Column j grows with wall x (away from the lidar's foot), row i with wall -y (row 0 is the
+        top).
+        """
+        return self.reconstruction.depth_m
+
+    @property
+    def uncertainty_m(self) -> Float32 | None:
+        """(64, 64): expected absolute error of `depth_m`; None without an uncertainty model."""
+        return self.reconstruction.uncertainty_m
+
+    @property
+    def points_m(self) -> Float32:
+        """(n, 3): points of the hidden surface in the wall frame, x along the wall, y up, z into
+        the room.
+        """
+        return self.reconstruction.points_m
+
+    def to_mesh(self) -> SurfaceMesh:
+        """Return the hidden surface as a mesh in the wall frame; its `save` writes .ply, .glb,
+        .obj, .csv or .npz.
+        """
+        return self.reconstruction.to_mesh()
+
+    @property
+    def timestamp_s(self) -> float:
+        """Time of the frame by the camera's clock."""
+        return self.frame.timestamp_s
+
+    @property
+    def frame_number(self) -> int:
+        """Number of the frame, counted by the camera."""
+        return self.frame.frame_number
+
+    @property
+    def truth_depth_m(self) -> Float32 | None:
+        """Ground truth of `depth_m` from a simulated camera; else None."""
+        return self.frame.truth_depth_m
 
 
 @dataclass(frozen=True)
@@ -127,10 +170,8 @@ class Pipeline:
 
     @bench.setter
     def bench(self, bench: CalibratedRig) -> None:
-        self._bench = (
-            bench,
-            alignment(bench.rig, self._trained, bench.reference) if self._trained else None,
-        )
+        aligned = alignment(bench.rig, self._trained, bench.reference) if self._trained else None
+        self._bench = (bench, aligned)  # in one assignment: `prepare` must not see half of it
 
     @property
     def average(self) -> int:
@@ -154,16 +195,27 @@ class Pipeline:
         bench, aligned = self._bench  # another thread may replace it
         maps = maps_from_frame(arrival.frame)
         mapped_s = clock()
+
+        # Drift is watched in the frame, not in the mean, which would hide a move for its length.
         maps = self._mean.add(maps)
         observation = bench.observe(arrival.frame, maps)
         difference = observation.difference
         corrected = bench.correct_range(maps)
-        network_input = difference if self._uses_difference and difference else corrected
         if aligned:
+            # The difference has no drift in it, and neither has what it adds to the training wall.
             network_input = aligned.align(corrected, difference.depth_m if difference else None)
+        elif self._uses_difference and difference:
+            network_input = difference
+        else:
+            network_input = corrected
         observed_s = clock()
-        stages_s = {"wait": taken_s - start_s, "queue": taken_s - arrival.arrived_s}
-        stages_s |= {"maps": mapped_s - taken_s, "bench": observed_s - mapped_s}
+
+        stages_s = {
+            "wait": taken_s - start_s,
+            "queue": taken_s - arrival.arrived_s,
+            "maps": mapped_s - taken_s,
+            "bench": observed_s - mapped_s,
+        }
         return PreparedFrame(arrival, maps, observation, corrected, network_input, stages_s)
 
     def reconstruct(self, frames: Sequence[PreparedFrame], clock: Clock) -> list[Reconstruction]:
@@ -179,10 +231,11 @@ class Pipeline:
         """Return the result of a frame with its verdict, and offer it to the physics check; call in
         frame order.
         """
-        frame = prepared.arrival.frame
+        frame, arrived_s, issues = prepared.arrival
         observation = prepared.observation
-        conditions = frame_conditions(frame, observation, self.checks.newest)
+        conditions = frame_conditions(issues, observation, self.checks.newest)
         shown, verdict = self._verdicts.decide(reconstruction, conditions)
+        # Raw maps are checked: they are what the renderer computes.
         self.checks.offer(frame.frame_number, prepared.corrected, shown.depth_m)
         return FrameResult(
             frame,
@@ -194,7 +247,7 @@ class Pipeline:
             warnings=observation.warnings,
             verdict=verdict,
             check=self.checks.newest,
-            arrived_s=prepared.arrival.arrived_s,
+            arrived_s=arrived_s,
         )
 
 
@@ -205,14 +258,17 @@ def verdict_limits(uncertainty_model: UncertaintyModel) -> VerdictLimits:
 
 
 def frame_conditions(
-    frame: Frame, observation: BenchObservation, check: PhysicsCheckResult | None
+    issues: Collection[str], observation: BenchObservation, check: PhysicsCheckResult | None
 ) -> FrameConditions:
-    """Return the conditions of a frame that affect its verdict; `check` is the newest physics
-    check.
+    """Return what affects a frame's verdict, from its issues (`frame_issues`), the bench, and the
+    newest physics check.
     """
-    issues = frame_issues(frame)
-    invalid = "blank" in issues or "half_invalid" in issues
-    return FrameConditions("saturated" in issues, invalid, observation.moved, check)
+    return FrameConditions(
+        saturated="saturated" in issues,
+        invalid="blank" in issues or "half_invalid" in issues,
+        moved=observation.moved,
+        check=check,
+    )
 
 
 def load_networks(weights: Path | None = None) -> Reconstructor:
@@ -267,18 +323,16 @@ def compatibility_warnings(
 
 
 def _rig_warnings(rig: Rig, trained: CheckpointRecord) -> list[str]:
-    if (wanted := training_rig(trained)) is None:
+    wanted = training_rig(trained)
+    if wanted is None:
         if trained.rig_checksum == rig.checksum:
             return []
         return [f"the networks were trained for another rig than {rig.name}: expect larger errors"]
-    if difference := rig_difference(rig, wanted):
-        aligned = "are aligned with that rig's, expect larger errors"
-        outcome = (
-            aligned
-            if rig_to_align_with(rig, trained)
-            else "cannot be aligned with that rig's, expect wrong shapes"
-        )
-        return [
-            f"this rig differs from the training rig ({'; '.join(difference)}): its maps {outcome}"
-        ]
-    return []
+
+    difference = rig_difference(rig, wanted)
+    if not difference:
+        return []
+    outcome = "cannot be aligned with that rig's, expect wrong shapes"
+    if rig_to_align_with(rig, trained):
+        outcome = "are aligned with that rig's, expect larger errors"
+    return [f"this rig differs from the training rig ({'; '.join(difference)}): its maps {outcome}"]

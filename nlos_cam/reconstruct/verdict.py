@@ -37,14 +37,20 @@ class Verdict(StrEnum):
 
 @dataclass(frozen=True)
 class VerdictLimits:
-    """Smallest values at which a verdict is given; calibrated with the uncertainty model."""
+    """Smallest values at which a verdict is given.
+
+    The first two are quantiles over the uncertainty model's held-out samples, set when it was
+    trained (`nlos_models.doubt_training.calibrate`), the third over rendered objects.
+    """
 
     nothing: float
-    """Probability that nothing is hidden."""
+    """Probability that nothing is hidden: 999 of 1,000 empty benches reach it; at most 0.5."""
     outside: float
-    """Probability of an object out of distribution."""
+    """Probability of an object out of distribution: 15 % of ordinary objects reach it, the price
+    for nine in ten of those that are.
+    """
     unexplained: float = float("inf")
-    """Score of the physics check."""
+    """Score of the physics check; see UNEXPLAINED."""
 
 
 @dataclass(frozen=True)
@@ -76,31 +82,38 @@ class VerdictFilter:
         """Return the reconstruction to show, without surface if nothing is hidden, and the
         verdict.
         """
-        of_lidar = (
-            Verdict.WALL_MOVED
-            if conditions.moved
-            else Verdict.SATURATED
-            if conditions.saturated
-            else None
-        )
-        if (limits := self._limits) is None or (uncertainty := reconstruction.uncertainty) is None:
+        # Whatever was reconstructed from data that are not usable is not usable either: these two
+        # go before the verdict of the networks.
+        of_lidar = None
+        if conditions.saturated:
+            of_lidar = Verdict.SATURATED
+        if conditions.moved:
+            of_lidar = Verdict.WALL_MOVED
+
+        limits = self._limits
+        uncertainty = reconstruction.uncertainty
+        if limits is None or uncertainty is None:
             return reconstruction, of_lidar
-        if uncertainty.nothing >= limits.nothing:
+
+        if uncertainty.p_empty >= limits.nothing:
+            # Decided on this frame alone; a new object must not be averaged with the one that left.
             self._outside.clear()
             verdict = Verdict.OUTSIDE if conditions.invalid else Verdict.NOTHING
             return reconstruction.without_surface, of_lidar or verdict
-        self._outside.append(uncertainty.outside)
+
+        # "Outside" needs a mean over frames: noise moves the probability across the limit.
+        self._outside.append(uncertainty.p_out_of_distribution)
         unlike = sum(self._outside) / len(self._outside) >= limits.outside
         unexplained = conditions.check is not None and conditions.check.score >= limits.unexplained
         outside = unlike or unexplained or conditions.invalid or not reconstruction.has_surface
         return reconstruction, of_lidar or (Verdict.OUTSIDE if outside else Verdict.SEEN)
 
 
-def frame_issues(frame: Frame) -> list[str]:
+def frame_issues(frame: Frame) -> tuple[str, ...]:
     """Return the issues of a frame: blank (no depth at all) or half_invalid (none in half of the
     pixels); saturated.
     """
-    with_depth = np.count_nonzero(frame.depth_m > 0)  # NaN compares false
+    with_depth = np.count_nonzero(frame.depth_m > 0)  # NaN (no return) compares false
     issues: list[str] = []
     if with_depth == 0:
         issues.append("blank")
@@ -108,4 +121,4 @@ def frame_issues(frame: Frame) -> list[str]:
         issues.append("half_invalid")
     if saturated_share(frame.ir) > MAX_SATURATED:
         issues.append("saturated")
-    return issues
+    return tuple(issues)

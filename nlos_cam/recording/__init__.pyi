@@ -1,6 +1,5 @@
 __all__ = [
     "SAMPLE",
-    "TEMPERATURE_INTERVAL_S",
     "BagReader",
     "CaptureResult",
     "CaptureSession",
@@ -16,6 +15,7 @@ __all__ = [
     "SidecarFile",
     "State",
     "Summary",
+    "Telemetry",
     "VerifyResult",
     "export_recording",
     "finalize",
@@ -25,6 +25,7 @@ __all__ = [
     "repair_recording",
     "sidecar_path",
     "verify",
+    "with_telemetry",
 ]
 
 from .bag_reader import SAMPLE, BagReader
@@ -35,7 +36,6 @@ from .quality import QualityMeter
 from .repair import RepairResult, repair_recording
 from .sdk_playback import SdkReplayCamera
 from .sidecar import (
-    TEMPERATURE_INTERVAL_S,
     Sidecar,
     SidecarFile,
     State,
@@ -44,3 +44,4 @@ from .sidecar import (
     load_sidecar,
     sidecar_path,
 )
+from .telemetry import Telemetry, with_telemetry

@@ -6,6 +6,7 @@ __all__ = [
     "STOPS",
     "Accuracy",
     "Agreement",
+    "Beams",
     "DepthBound",
     "EchoMaps",
     "Effects",
@@ -77,7 +78,7 @@ from .accuracy_search import (
 from .backend_torch import device_named, histograms_of_all
 from .echoes import MultiBounce
 from .effects import EFFECTS, Effects, included
-from .geometry import cast
+from .geometry import Beams, cast
 from .glossy import glossy_basis, histograms
 from .gradients import (
     DepthBound,

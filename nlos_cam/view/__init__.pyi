@@ -4,8 +4,6 @@ __all__ = [
     "PREFERRED_PORT",
     "SESSION_MARK",
     "SESSION_SUFFIX",
-    "Assessment",
-    "Controls",
     "Moment",
     "NullViewer",
     "PlaybackViewer",
@@ -16,17 +14,17 @@ __all__ = [
     "Viewer",
     "Viewers",
     "WebViewer",
-    "assess",
     "element",
     "exposed",
+    "save_moment",
     "unpack",
 ]
 
-from .assessment import Assessment, assess
+from .frame_files import save_moment
 from .images import MAX_UNCERTAINTY_M
 from .messages import unpack
 from .server import LOOPBACK, exposed
 from .session_file import SESSION_MARK, SESSION_SUFFIX, SessionFile, element
 from .video import Still, VideoFile
-from .viewer import Controls, Moment, NullViewer, Viewer, Viewers
+from .viewer import Moment, NullViewer, Viewer, Viewers
 from .web import PREFERRED_PORT, PlaybackViewer, RecordedView, WebViewer

@@ -16,8 +16,8 @@ RGB: dict[Tone, tuple[int, int, int]] = {
     "warning": (255, 180, 60),
     "alarm": (255, 110, 90),
 }
-"""Color by tone; only "good" is green, for frames of which at least 90 % have an outline that is 75
-% right.
+"""Color by tone. Only "good" is green: at least 90 % of such frames have an outline that is 75 %
+right.
 """
 
 
@@ -55,33 +55,33 @@ def assess(moment: Moment) -> Assessment:
     and the depth error.
 
     Both come from the quality model, with the interval that holds 80 % of like frames; it was
-    fitted to known objects, of which none of the shown kind may have been (docs/uncertainty.md). Without
+    fitted to known objects, of which none of the shown kind may have been (docs/doubt.md). Without
     one they are the uncertainty model's own.
     """
-    verdict = moment.verdict
-    found = moment.reconstruction
+    verdict = moment.result.verdict
+    found = moment.result.reconstruction
     if verdict is not Verdict.SEEN:
         headline, detail, tone = WORDS[verdict]
         return Assessment(headline, detail, tone, trusted=verdict is None)
-    if found.uncertainty and (quality := found.uncertainty.quality):
+
+    tone = "estimate"
+    overlap = expected_overlap(found)
+    error_m = expected_error_m(found)
+    if quality := found.quality:
         low, typical, high = (f"{share:.0%}" for share in quality.iou)
-        tone: Tone = "good" if quality.trusted else "estimate"
+        tone = "good" if quality.trusted else "estimate"
         detail = (
             f"outline typically {typical} right ({low} to {high}), depth to"
             f" {1e3 * quality.error_m:.0f} mm"
         )
-        return Assessment("Object detected", detail, tone, trusted=True)
-    overlap = expected_overlap(found)
-    error_m = expected_error_m(found)
-    if overlap is None or error_m is None:
-        return Assessment(
-            "Object detected", "no estimate of the shape's error", "estimate", trusted=True
+    elif overlap is None or error_m is None:
+        detail = "no estimate of the shape's error"
+    else:
+        detail = (
+            f"outline about {overlap:.0%} right, depth to about {1e3 * error_m:.0f} mm (the"
+            " model's own estimate)"
         )
-    detail = (
-        f"outline about {overlap:.0%} right, depth to about {1e3 * error_m:.0f} mm (the model's own"
-        " estimate)"
-    )
-    return Assessment("Object detected", detail, "estimate", trusted=True)
+    return Assessment("Object detected", detail, tone, trusted=True)
 
 
 def expected_overlap(found: Reconstruction) -> float | None:
@@ -93,7 +93,7 @@ def expected_overlap(found: Reconstruction) -> float | None:
     mask = np.isfinite(found.depth_m)
     if found.uncertainty is None or not mask.any():
         return None
-    p = found.uncertainty.surface
+    p = found.uncertainty.p_surface
     return float(p[mask].sum() / (mask.sum() + p[~mask].sum()))
 
 

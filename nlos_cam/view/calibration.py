@@ -70,14 +70,13 @@ def calibration_facts(record: WallRecord) -> list[list[str]]:
     """Return rows of quantity, value (± 95 %) and meaning, with the verdict first and warnings
     last.
     """
-    rows = [[name, value, meaning] for name, value, meaning in wall_facts(record)]
-    reference = (
-        []
-        if record.reference
-        else ["drift is not watched: no reference of the bare wall; calibrate the wall again"]
-    )
+    notes = list(record.warnings)
+    if not record.reference:
+        notes.append(
+            "drift is not watched: no reference of the bare wall; calibrate the wall again"
+        )
     return [
         ["verdict", record.verdict, record.advice],
-        *rows,
-        *(["note", text, ""] for text in [*record.warnings, *reference]),
+        *(list(fact) for fact in wall_facts(record)),
+        *(["note", text, ""] for text in notes),
     ]

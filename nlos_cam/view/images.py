@@ -17,11 +17,9 @@ BACKGROUND_RGB = (13, 16, 17)
 PICTURE_WIDTH = 320
 """Columns to which lidar pictures are thinned."""
 DARKEST = 60
-"""Where in the colour map the farthest surface starts, so that it stands out from the
-background.
-"""
+"""Count at which the farthest surface starts in a color map, to stand out from the background."""
 DIVERGING_RGB = (255, 150, 60), (70, 155, 130), (50, 160, 255)
-"""Colors of nearer, expected and farther depth."""
+"""Red, green and blue, each for nearer, expected and farther depth."""
 SATURATED_RGB = (255, 0, 200)
 ROUND_STEPS = 1.0, 2.0, 3.0, 5.0, 10.0
 CHANGED_M = 0.01
@@ -39,20 +37,19 @@ def hidden_rgb(depth_m: Float32, box: ObjectBox) -> UInt8:
     background.
     """
     v = image_from_depth(depth_m, box)
-    return _coloured(DARKEST + v * (255 - DARKEST), cv2.COLORMAP_INFERNO, np.isnan(depth_m))
+    return _in_color_map(_from_darkest(v), cv2.COLORMAP_INFERNO, np.isnan(depth_m))
 
 
 def lidar_rgb(depth_m: Float32, near_m: float, far_m: float) -> UInt8:
     """Return lidar depth (height, width) as a picture, red (near) to blue (far), dark without a
     return.
     """
-    share = (depth_m - near_m) / max(far_m - near_m, 1e-6)
-    return _coloured(
-        np.nan_to_num(1.0 - np.clip(share, 0.0, 1.0)) * 255, cv2.COLORMAP_TURBO, np.isnan(depth_m)
-    )
+    share = np.clip((depth_m - near_m) / max(far_m - near_m, 1e-6), 0.0, 1.0)
+    counts = np.nan_to_num(1.0 - share) * 255
+    return _in_color_map(counts, cv2.COLORMAP_TURBO, np.isnan(depth_m))
 
 
-def infrared_grey(ir: NDArray[np.uint8]) -> NDArray[np.uint8]:
+def infrared_grey(ir: UInt8) -> UInt8:
     """Return IR counts (height, width) as grey under a square root, so that weak returns are
     visible too.
     """
@@ -64,16 +61,16 @@ def uncertainty_rgb(uncertainty_m: Float32, depth_m: Float32) -> UInt8:
     without surface.
     """
     share = np.clip(np.nan_to_num(uncertainty_m, nan=np.inf) / MAX_UNCERTAINTY_M, 0.0, 1.0)
-    return _coloured(DARKEST + share * (255 - DARKEST), cv2.COLORMAP_VIRIDIS, np.isnan(depth_m))
+    return _in_color_map(_from_darkest(share), cv2.COLORMAP_VIRIDIS, np.isnan(depth_m))
 
 
 def relief_rgb(depth_m: Float32, box: ObjectBox) -> UInt8:
     """Return hidden depth (64, 64) as a relief lit from the top left."""
     pitch_m = (box.x_max_m - box.x_min_m) / depth_m.shape[1]
     down, right = np.gradient(np.nan_to_num(depth_m, nan=box.z_far_m), pitch_m)
-    facing = (1.0 - 0.7 * right - 0.7 * down) / np.sqrt(
-        (1.0 + right**2 + down**2) * (1.0 + 2 * 0.7**2)
-    )
+    # Cosine between the normal (-right, -down, 1) and the light's direction (0.7, 0.7, 1).
+    lengths = np.sqrt((1.0 + right**2 + down**2) * (1.0 + 2 * 0.7**2))
+    facing = (1.0 - 0.7 * right - 0.7 * down) / lengths
     shade = 0.25 + 0.75 * np.clip(facing, 0.0, 1.0)[..., np.newaxis]
     rgb = (hidden_rgb(depth_m, box) * shade).astype(np.uint8)
     rgb[np.isnan(depth_m)] = BACKGROUND_RGB
@@ -100,9 +97,8 @@ def difference_rgb(further: NDArray[np.floating], span: float) -> UInt8:
     NaN.
     """
     share = np.clip(np.nan_to_num(further) / span, -1.0, 1.0)
-    rgb = np.stack(
-        [np.interp(share, (-1.0, 0.0, 1.0), stops) for stops in DIVERGING_RGB], axis=-1
-    ).astype(np.uint8)
+    channels = [np.interp(share, (-1.0, 0.0, 1.0), stops) for stops in DIVERGING_RGB]
+    rgb = np.stack(channels, axis=-1).astype(np.uint8)
     rgb[np.isnan(further)] = BACKGROUND_RGB
     return rgb
 
@@ -110,7 +106,7 @@ def difference_rgb(further: NDArray[np.floating], span: float) -> UInt8:
 def noise_rgb(noise: NDArray[np.floating], span: float) -> UInt8:
     """Return a spread as a picture, bright where large, dark for NaN."""
     share = np.clip(np.nan_to_num(noise) / span, 0.0, 1.0)
-    return _coloured(DARKEST + share * (255 - DARKEST), cv2.COLORMAP_INFERNO, np.isnan(noise))
+    return _in_color_map(_from_darkest(share), cv2.COLORMAP_INFERNO, np.isnan(noise))
 
 
 def saturated_rgb(ir: NDArray[np.floating], saturated: NDArray[np.floating]) -> UInt8:
@@ -126,14 +122,13 @@ def round_span(
     """Return 1, 2, 3, 5 or 10 times a power of ten above most magnitudes; `otherwise` if all are
     zero or NaN.
     """
-    seen = np.abs(values[np.isfinite(values)])
-    most = float(np.percentile(seen, percent)) if seen.size else 0.0
+    known = np.abs(values[np.isfinite(values)])
+    most = float(np.percentile(known, percent)) if known.size else 0.0
     if most <= 0.0:
         return otherwise
     power = 10.0 ** floor(log10(most))
-    return float(
-        f"{next(step * power for step in ROUND_STEPS if most <= step * power * (1 + 1e-6)):g}"
-    )
+    above = [step * power for step in ROUND_STEPS if most <= step * power * (1 + 1e-6)]
+    return float(f"{above[0]:g}")
 
 
 def change_span_m(difference_m: Float32) -> float:
@@ -143,11 +138,14 @@ def change_span_m(difference_m: Float32) -> float:
     return QUIET_SPAN_M if few else round_span(changed_m, percent=75.0)
 
 
-def _coloured(values: NDArray[np.floating], colour_map: int, absent: Mask) -> UInt8:
+def _from_darkest(share: NDArray[np.floating]) -> NDArray[np.floating]:
+    return DARKEST + share * (255 - DARKEST)
+
+
+def _in_color_map(values: NDArray[np.floating], color_map: int, absent: Mask) -> UInt8:
     """Return values of 0 to 255 in a map's colors, and the background's where they are absent."""
-    rgb = np.ascontiguousarray(
-        cv2.applyColorMap(values.astype(np.uint8), colour_map)[..., ::-1], dtype=np.uint8
-    )
+    bgr = cv2.applyColorMap(values.astype(np.uint8), color_map)
+    rgb = np.ascontiguousarray(bgr[..., ::-1], dtype=np.uint8)
     rgb[absent] = BACKGROUND_RGB
     return rgb
 
@@ -178,16 +176,15 @@ def dim_untrusted(rgb: UInt8, note: str, note_rgb: tuple[int, int, int], *, hatc
     """Return an untrusted reconstruction (512, 512, 3) of (64, 64, 3): faded, framed and
     labelled.
     """
-    large = (
-        faded(rgb).repeat(NOTED_PIXELS // len(rgb), axis=0).repeat(NOTED_PIXELS // len(rgb), axis=1)
-    )
+    times = NOTED_PIXELS // len(rgb)
+    large = faded(rgb).repeat(times, axis=0).repeat(times, axis=1)
     over = note_rgba(note, note_rgb, hatched=hatched)
     alpha = over[..., 3:].astype(np.uint16)
     return ((over[..., :3] * alpha + large * (255 - alpha)) // 255).astype(np.uint8)
 
 
 @cache
-def note_rgba(note: str, rgb: tuple[int, int, int], *, hatched: bool) -> NDArray[np.uint8]:
+def note_rgba(note: str, rgb: tuple[int, int, int], *, hatched: bool) -> UInt8:
     """Return the overlay of an untrusted picture (512, 512, 4)."""
     image = Image.new("RGBA", (NOTED_PIXELS, NOTED_PIXELS), (0, 0, 0, 0))
     pen = ImageDraw.Draw(image)

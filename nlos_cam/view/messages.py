@@ -14,10 +14,11 @@ from typing import Any
 import cv2
 import numpy as np
 from nlos_calibration import MeasuredWall, ObjectBox, Rig
-from nlos_calibration.arrays import Float64
+from nlos_calibration.arrays import Float64, UInt8
 from numpy.typing import NDArray
 
 from nlos_cam.objects import object_box
+from nlos_cam.reconstruct import FrameResult, Quality
 from nlos_cam.view.assessment import assess
 from nlos_cam.view.calibration import calibration_facts, outline_m, wall_pictures
 from nlos_cam.view.images import BACKGROUND_RGB, change_span_m, depth_span_m
@@ -42,7 +43,7 @@ COLOR_MAPS = {
     "lidar": cv2.COLORMAP_TURBO,
 }
 
-Arrays = Mapping[str, NDArray[np.uint8]]
+Arrays = Mapping[str, UInt8]
 Corners = list[list[float]]
 
 
@@ -59,12 +60,12 @@ def pack(fields: Mapping[str, Any], arrays: Arrays | None = None) -> bytes:
     return b"".join([HEAD.pack(HEAD.size - 4 + len(text) + at, len(text)), text, *blobs])
 
 
-def unpack(message: bytes) -> tuple[dict[str, Any], dict[str, NDArray[np.uint8]]]:
+def unpack(message: bytes) -> tuple[dict[str, Any], dict[str, UInt8]]:
     """Return the fields and arrays of a message; the reverse of `pack`."""
     _, size = HEAD.unpack_from(message)
     fields = json.loads(message[HEAD.size : HEAD.size + size])
     body = memoryview(message)[HEAD.size + size :]
-    arrays = dict[str, NDArray[np.uint8]]()
+    arrays = dict[str, UInt8]()
     for name, (at, *shape) in fields.pop("arrays").items():
         arrays[name] = np.frombuffer(body, np.uint8, int(np.prod(shape)), at).reshape(shape)
     return fields, arrays
@@ -76,20 +77,19 @@ def bench_message(rig: Rig, measured: MeasuredWall | None = None) -> bytes:
     """
     box = object_box(rig)
     relay = rig.relay
-    low = (relay.x_min_m - MARGIN_M, relay.y_min_m)
-    high = (relay.x_max_m + MARGIN_M, relay.y_max_m)
+    left_m = relay.x_min_m - MARGIN_M
+    right_m = relay.x_max_m + MARGIN_M
+    wall = _around(left_m, right_m, relay.y_min_m, relay.y_max_m)
     parts: dict[str, Any] = {
-        "wall": [[x_m, y_m, 0.0] for x_m, y_m in _around(low[0], high[0], low[1], high[1])]
-    }
-    if rig.occluder is not None:
-        gap_m = rig.occluder.z_min_m
-        sides = _around(low[1], high[1], gap_m, gap_m + OCCLUDER_HEIGHT_M)
-        parts["occluder"] = [[rig.occluder.x_m, y_m, z_m] for y_m, z_m in sides]
-    parts |= {
+        "wall": [[x_m, y_m, 0.0] for x_m, y_m in wall],
         "lidar": rig.wall_from_lidar[:3, 3].tolist(),
         "frustum": _frustum(rig),
         "light": _light_path(rig, box),
     }
+    if rig.occluder is not None:
+        gap_m = rig.occluder.z_min_m
+        sides = _around(relay.y_min_m, relay.y_max_m, gap_m, gap_m + OCCLUDER_HEIGHT_M)
+        parts["occluder"] = [[rig.occluder.x_m, y_m, z_m] for y_m, z_m in sides]
     fields: dict[str, Any] = {
         "kind": "bench",
         "rig": rig.name,
@@ -110,7 +110,7 @@ def bench_message(rig: Rig, measured: MeasuredWall | None = None) -> bytes:
 
 
 @cache
-def color_maps() -> dict[str, NDArray[np.uint8]]:
+def color_maps() -> dict[str, UInt8]:
     """Return the color maps (256, 3), the same as in stills and videos."""
     ramp = np.arange(256, dtype=np.uint8)[:, np.newaxis]
     colored = {
@@ -119,8 +119,9 @@ def color_maps() -> dict[str, NDArray[np.uint8]]:
     return {f"map_{name}": np.ascontiguousarray(rgb, np.uint8) for name, rgb in colored.items()}
 
 
-def _around(a: float, b: float, c: float, d: float) -> list[tuple[float, float]]:
-    return [(a, c), (b, c), (b, d), (a, d)]
+def _around(left: float, right: float, low: float, high: float) -> list[tuple[float, float]]:
+    """Return the corners of a rectangle."""
+    return [(left, low), (right, low), (right, high), (left, high)]
 
 
 def _frustum(rig: Rig) -> Corners:
@@ -128,27 +129,26 @@ def _frustum(rig: Rig) -> Corners:
     pinhole = rig.pinhole
     pose = rig.wall_from_lidar
     pixels = np.array(_around(0.0, pinhole.width, 0.0, pinhole.height))
-    rays = np.column_stack(
-        [(pixels - [pinhole.ppx, pinhole.ppy]) / [pinhole.fx, pinhole.fy], np.ones(4)]
-    )
+    slopes = (pixels - [pinhole.ppx, pinhole.ppy]) / [pinhole.fx, pinhole.fy]
+    rays = np.column_stack([slopes, np.ones(4)])
     return (pose[:3, 3] + FRUSTUM_M * rays @ pose[:3, :3].T).tolist()
 
 
 def _light_path(rig: Rig, box: ObjectBox) -> Corners:
     """Return the path (5, 3) of one three-bounce echo: lidar, wall, hidden object, wall, lidar."""
     eye: Float64 = rig.wall_from_lidar[:3, 3]
-    middle = np.array(
-        [(box.x_min_m + box.x_max_m) / 2, (box.y_min_m + box.y_max_m) / 2, box.z_near_m]
-    )
-    there, back = (np.array([middle[0] * 0.6, y_m, 0.0]) for y_m in (-0.04, 0.04))
+    x_m = (box.x_min_m + box.x_max_m) / 2
+    y_m = (box.y_min_m + box.y_max_m) / 2
+    middle = np.array([x_m, y_m, box.z_near_m])
+    there = np.array([0.6 * x_m, -0.04, 0.0])
+    back = np.array([0.6 * x_m, 0.04, 0.0])
     return np.stack([eye, there, middle, back, eye]).tolist()
 
 
 class MomentPacker:
     """Packer of one run's moments; the first one's ranges of depth and change hold for all."""
 
-    def __init__(self, rig: Rig, *, picture_width: int = PICTURE_WIDTH) -> None:
-        self._box = object_box(rig)
+    def __init__(self, *, picture_width: int = PICTURE_WIDTH) -> None:
         self._width = picture_width
         self._start_s: float | None = None
         self._span_m = (0.0, 1.0)
@@ -158,87 +158,88 @@ class MomentPacker:
         """Return a moment's message; the pictures of the lidar's view, most of its bytes, only if
         requested.
         """
+        frame = moment.result.frame
         if self._start_s is None:
-            self._start_s = moment.published_s
-            self._span_m = depth_span_m(moment.frame.depth_m)
-        arrays = self._hidden(moment)
+            self._start_s = moment.time_s
+            self._span_m = depth_span_m(frame.depth_m)
+
+        arrays = _hidden_arrays(moment.result)
         if with_lidar:
-            if moment.difference is not None:
-                self._change_span_m = self._change_span_m or change_span_m(
-                    moment.difference.depth_m
-                )
-                arrays["change"] = signed_bytes(moment.difference.depth_m, self._change_span_m)
-            if moment.check:
-                arrays["residual"] = signed_bytes(moment.check.residual_depth_m, RESIDUAL_SPAN_M)
-            step = max(1, round(moment.frame.ir.shape[1] / self._width))
-            arrays["lidar"] = depth_bytes(moment.frame.depth_m[::step, ::step], *self._span_m)
-            arrays["infrared"] = moment.frame.ir[::step, ::step]
-        return pack(self._fields(moment, self._start_s), arrays)
+            difference = moment.result.difference
+            if difference is not None:
+                self._change_span_m = self._change_span_m or change_span_m(difference.depth_m)
+                arrays["change"] = signed_bytes(difference.depth_m, self._change_span_m)
+            check = moment.result.check
+            if check:
+                arrays["residual"] = signed_bytes(check.residual_depth_m, RESIDUAL_SPAN_M)
+            step = max(1, round(frame.ir.shape[1] / self._width))
+            arrays["lidar"] = depth_bytes(frame.depth_m[::step, ::step], *self._span_m)
+            arrays["infrared"] = frame.ir[::step, ::step]
+        return pack(self._fields(moment, moment.time_s - self._start_s), arrays)
 
-    def _hidden(self, moment: Moment) -> dict[str, NDArray[np.uint8]]:
-        span_m = (self._box.z_near_m, self._box.z_far_m)
-        found = moment.reconstruction
-        arrays = {"depth": depth_bytes(found.depth_m, *span_m)}
-        if moment.frame.truth_depth_m is not None:
-            arrays["truth"] = depth_bytes(moment.frame.truth_depth_m, *span_m)
-        if found.uncertainty_m is not None:
-            arrays["error"] = np.clip(np.rint(found.uncertainty_m / ERROR_STEP_M), 0, 255).astype(
-                np.uint8
-            )
-        if found.uncertainty is not None:
-            arrays["surface"] = np.rint(255 * np.clip(found.uncertainty.surface, 0, 1)).astype(
-                np.uint8
-            )
-        return arrays
-
-    def _fields(self, moment: Moment, start_s: float) -> dict[str, Any]:
+    def _fields(self, moment: Moment, time_s: float) -> dict[str, Any]:
+        result = moment.result
         assessment = assess(moment)
-        check = moment.check
+        score = result.check.score if result.check else np.nan
         return {
             "kind": "moment",
-            "frame": moment.frame.frame_number,
-            "time_s": round(moment.published_s - start_s, 4),
+            "frame": result.frame_number,
+            "time_s": round(time_s, 4),
             "latency_ms": round(1e3 * moment.latency_s, 2),
-            "stages_ms": {
-                name: round(1e3 * seconds, 2) for name, seconds in moment.stages_s.items()
-            },
+            "stages_ms": {name: round(1e3 * took_s, 2) for name, took_s in result.stages_s.items()},
             "dropped": moment.dropped,
             "celsius": {
                 name.removesuffix("_temperature"): round(value, 1)
                 for name, value in moment.celsius.items()
             },
-            "verdict": moment.verdict,
+            "verdict": result.verdict,
             "headline": assessment.headline,
             "detail": assessment.detail,
             "tone": assessment.tone,
             "trusted": assessment.trusted,
-            "quality": _quality(moment),
-            "warnings": moment.warnings,
+            "quality": _quality_fields(result.reconstruction.quality),
+            "warnings": result.warnings,
             "lidar_span_m": self._span_m,
             "change_span_m": self._change_span_m,
             "residual_span_m": RESIDUAL_SPAN_M,
-            "score": None
-            if check is None or not np.isfinite(check.score)
-            else round(check.score, 3),
+            "score": round(score, 3) if np.isfinite(score) else None,
         }
 
 
-def _quality(moment: Moment) -> dict[str, Any] | None:
-    uncertainty = moment.reconstruction.uncertainty
-    if uncertainty is None or (quality := uncertainty.quality) is None:
+def _hidden_arrays(result: FrameResult) -> dict[str, UInt8]:
+    box = result.reconstruction.box
+    span_m = (box.z_near_m, box.z_far_m)
+    arrays = {"depth": depth_bytes(result.depth_m, *span_m)}
+    if result.truth_depth_m is not None:
+        arrays["truth"] = depth_bytes(result.truth_depth_m, *span_m)
+    if result.uncertainty_m is not None:
+        steps = np.rint(result.uncertainty_m / ERROR_STEP_M)
+        arrays["error"] = np.clip(steps, 0, 255).astype(np.uint8)
+    uncertainty = result.reconstruction.uncertainty
+    if uncertainty is not None:
+        p_surface = np.clip(uncertainty.p_surface, 0, 1)
+        arrays["surface"] = np.rint(255 * p_surface).astype(np.uint8)
+    return arrays
+
+
+def _quality_fields(quality: Quality | None) -> dict[str, Any] | None:
+    if quality is None:
         return None
-    iou = [round(share, 3) for share in quality.iou]
-    return {"iou": iou, "error_mm": round(1e3 * quality.error_m, 1), "trusted": quality.trusted}
+    return {
+        "iou": [round(share, 3) for share in quality.iou],
+        "error_mm": round(1e3 * quality.error_m, 1),
+        "trusted": quality.trusted,
+    }
 
 
-def depth_bytes(depth_m: NDArray[np.floating], near_m: float, far_m: float) -> NDArray[np.uint8]:
+def depth_bytes(depth_m: NDArray[np.floating], near_m: float, far_m: float) -> UInt8:
     """Return depth as 1 (near) to 255 (far), clipped; 0 for NaN."""
     share = (depth_m - near_m) / max(far_m - near_m, 1e-6)
     counts = 1.5 + 254.0 * np.clip(share, 0.0, 1.0)
     return np.where(np.isnan(depth_m), 0.0, counts).astype(np.uint8)
 
 
-def signed_bytes(values: NDArray[np.floating], span: float) -> NDArray[np.uint8]:
+def signed_bytes(values: NDArray[np.floating], span: float) -> UInt8:
     """Return values from -span to span as 1 to 255, 128 for zero, clipped; 0 for NaN."""
     counts = 128.5 + 127.0 * np.clip(values / span, -1.0, 1.0)
     return np.where(np.isnan(values), 0.0, counts).astype(np.uint8)

@@ -271,7 +271,7 @@ async function command(name, values = {}) {
 const controls = {
   shape: "",
   update(given) {
-    const shape = JSON.stringify([given.commands, given.settings, given.options.map((each) => each.name)]);
+    const shape = JSON.stringify([given.commands, given.options.map((each) => each.name)]);
     if (shape !== this.shape) this.build(given, (this.shape = shape));
     const set = (id, value) => { const box = find(id); if (box && document.activeElement !== box) box.value = value; };
     const text = (id, value) => { const box = find(id); if (box) box.textContent = value; };
@@ -279,7 +279,6 @@ const controls = {
     text("#session", given.saving ? "End session" : "Save session");
     text("#pause", given.paused ? "Go on" : "Pause");
     set("#average", given.average);
-    set("#setting", given.setting);
     for (const option of given.options) set(`#option-${option.name}`, option.value);
   },
   build(given) {
@@ -287,7 +286,6 @@ const controls = {
     const rows = [];
     if (has("record")) rows.push(`<div class="row"><span>Record</span><input id="label" type="text" placeholder="label" maxlength="60" aria-label="label" />${button("record", "Record", "the camera's streams, as a .bag")}${button("session", "Save session", "this page with its pictures, as one .html file")}${button("snapshot", "Snapshot", "this frame as picture, arrays and mesh")}</div>`);
     if (has("pause")) rows.push(`<div class="row"><span>Run</span>${button("pause", "Pause", "stop reconstructing; the camera and a recording go on")}${button("reference", "Take empty bench as reference", "average 60 frames of the bench with nothing hidden")}<span class="quiet-text">average</span><input id="average" type="number" min="1" max="1000" aria-label="frames to average" title="the mean of this many frames; moving objects blur" /><span class="quiet-text">frames</span></div>`);
-    if (given.settings.length) rows.push(`<div class="row"><span>Precision</span><select id="setting" aria-label="precision"><option value="" disabled>as started</option>${given.settings.map(([name, text]) => `<option value="${escape(name)}">${escape(text)}</option>`).join("")}</select></div>`);
     for (const each of given.options) rows.push(`<div class="row"><span>${escape(each.name.replaceAll("_", " "))}</span><input id="option-${each.name}" data-option="${each.name}" type="number" min="${each.min}" max="${each.max}" step="${each.step}" /> <span class="quiet-text">${each.min} to ${each.max}</span></div>`);
     if (given.note) rows.push(`<div class="row quiet-text">${escape(given.note)}</div>`);
     find("#controls").innerHTML = `${rows.join("")}<div id="answer" class="quiet-text" role="status"></div>`;
@@ -298,7 +296,6 @@ const controls = {
     on("#pause", "click", () => command(find("#pause").textContent === "Pause" ? "pause" : "resume"));
     on("#reference", "click", () => command("take_reference"));
     on("#average", "change", (event) => command("average", { frames: Number(event.target.value) }));
-    on("#setting", "change", (event) => command("setting", { name: event.target.value }));
     for (const box of document.querySelectorAll("[data-option]"))
       box.addEventListener("change", () => command("option", { name: box.dataset.option, value: Number(box.value) }));
     if (!token) {

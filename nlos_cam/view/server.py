@@ -100,21 +100,12 @@ class Handler(BaseHTTPRequestHandler):
         """
         deadline_s = time.monotonic() + TIMEOUT_S
         content = b""
-        needed = 1
-        while len(content) < needed:
+        while len(content) < _request_bytes(content) <= MAX_REQUEST_BYTES:
             self.request.settimeout(max(deadline_s - time.monotonic(), 1e-3))
-            if not (more := self.request.recv(1 << 14)):
+            more = self.request.recv(1 << 14)
+            if not more:
                 break
             content += more
-            head, end, _ = content.partition(b"\r\n\r\n")
-            length = (
-                re.search(rb"\r\ncontent-length: *(\d{1,9})\r\n", head.lower() + b"\r\n")
-                if end
-                else None
-            )
-            needed = len(head) + 4 + int(length[1]) if length else len(content) + (not end)
-            if max(len(content), needed if end else 0) > MAX_REQUEST_BYTES:
-                break
         self.request.settimeout(TIMEOUT_S)
         return content
 
@@ -131,15 +122,9 @@ class Handler(BaseHTTPRequestHandler):
         path = self.path.partition("?")[0]
         try:
             if not self.served.known(self.headers.get("Host", "")):
-                self._say(
-                    HTTPStatus.FORBIDDEN,
-                    "this is not a name of the machine: open the address that it printed",
-                )
+                self._forbid("this is not a name of the machine: open the address that it printed")
             elif self._is_foreign(path):
-                self._say(
-                    HTTPStatus.FORBIDDEN,
-                    "a page of another site may not ask: open the address yourself",
-                )
+                self._forbid("a page of another site may not ask: open the address yourself")
             else:
                 answer(path)
         except OSError:
@@ -153,9 +138,8 @@ class Handler(BaseHTTPRequestHandler):
         if origin is not None and origin.partition("://")[2] != self.headers.get("Host", ""):
             return True
         visits = path == "/" and self.headers.get("Sec-Fetch-Mode", "navigate") == "navigate"
-        return (
-            self.headers.get("Sec-Fetch-Site", "none") not in {"none", "same-origin"} and not visits
-        )
+        is_ours = self.headers.get("Sec-Fetch-Site", "none") in {"none", "same-origin"}
+        return not (is_ours or visits)
 
     def _get(self, path: str) -> None:
         if path == STREAM_PATH:
@@ -184,35 +168,37 @@ class Handler(BaseHTTPRequestHandler):
 
     def _post(self, path: str) -> None:
         run = self.served.command
+        token = self.headers.get("X-Token", "")
         if path != COMMAND_PATH or run is None:
             self._say(HTTPStatus.NOT_FOUND, "this view has no controls")
-        elif not hmac.compare_digest(
-            self.headers.get("X-Token", "").encode(), self.served.token.encode()
-        ):
-            self._say(
-                HTTPStatus.FORBIDDEN,
-                "read-only: open the address that was printed, with its token, to control",
-            )
+        elif not hmac.compare_digest(token.encode(), self.served.token.encode()):
+            self._forbid("read-only: open the address that was printed, with its token, to control")
         else:
-            try:
-                request = json.loads(self.rfile.read())
-                name = str(request.pop("command"))
-                arguments = dict[str, Any](request)
-            except (ValueError, TypeError, KeyError, AttributeError, RecursionError):
-                self._say(
-                    HTTPStatus.BAD_REQUEST, 'not a command: send {"command": NAME, ...} as JSON'
-                )
-                return
-            try:
-                self._say(HTTPStatus.OK, run(name, arguments))
-            except NlosCamError as error:
-                self._say(HTTPStatus.CONFLICT, str(error))
-            except OSError:
-                raise
-            except Exception as error:  # noqa: BLE001  whatever it was, the page says it, and the run goes on
-                self._say(
-                    HTTPStatus.INTERNAL_SERVER_ERROR, f"unforeseen {type(error).__name__}: {error}"
-                )
+            self._run_command(run)
+
+    def _run_command(self, run: Command) -> None:
+        try:
+            request = json.loads(self.rfile.read())
+            name = str(request.pop("command"))
+            arguments = dict[str, Any](request)
+        except (ValueError, TypeError, KeyError, AttributeError, RecursionError):
+            self._say(HTTPStatus.BAD_REQUEST, 'not a command: send {"command": NAME, ...} as JSON')
+            return
+
+        try:
+            outcome = run(name, arguments)
+        except NlosCamError as error:
+            self._say(HTTPStatus.CONFLICT, str(error))
+        except OSError:
+            raise
+        except Exception as error:  # noqa: BLE001  whatever it was, the page says it, and the run goes on
+            reason = f"unforeseen {type(error).__name__}: {error}"
+            self._say(HTTPStatus.INTERNAL_SERVER_ERROR, reason)
+        else:
+            self._say(HTTPStatus.OK, outcome)
+
+    def _forbid(self, text: str) -> None:
+        self._say(HTTPStatus.FORBIDDEN, text)
 
     def _say(self, status: HTTPStatus, text: str) -> None:
         content = f"{text}\n".encode()
@@ -230,13 +216,23 @@ class Handler(BaseHTTPRequestHandler):
 
     def _send(self, content: bytes) -> None:
         if self.command != "HEAD":
+            # The timeout holds for a whole piece.
             for start in range(0, len(content), PIECE_BYTES):
-                self.wfile.write(
-                    content[start : start + PIECE_BYTES]
-                )  # the timeout holds for a whole piece
+                self.wfile.write(content[start : start + PIECE_BYTES])
 
     def log_message(self, format: str, *args: object) -> None:  # noqa: A002  the name http.server uses
         pass
+
+
+def _request_bytes(content: bytes) -> int:
+    """Return the bytes of a request of which `content` has come so far: at least one more until its
+    head is whole.
+    """
+    head, end, _ = content.partition(b"\r\n\r\n")
+    if not end:
+        return len(content) + 1
+    length = re.search(rb"\r\ncontent-length: *(\d{1,9})\r\n", head.lower() + b"\r\n")
+    return len(head) + len(end) + int(length[1]) if length else len(content)
 
 
 LOCAL_NAMES = {"localhost", "127.0.0.1", "::1"}

@@ -54,15 +54,16 @@ class Chunks:
         self._messages = list[bytes]()
         self._times_s: list[float] = []
         self._lidar_due_s = float("-inf")
-        self._start_s = None
+        self._start_s: float | None = None
 
     def add(self, moment: Moment) -> bytes | None:
         """Add a moment, and return the chunk before it if that is complete."""
-        now_s = moment.published_s
-        complete = (
-            self.rest() if self._times_s and now_s - self._times_s[0] >= CHUNK_S - SLACK_S else None
-        )
-        if with_lidar := now_s >= self._lidar_due_s or not self._messages:
+        now_s = moment.time_s
+        is_full = self._times_s and now_s - self._times_s[0] >= CHUNK_S - SLACK_S
+        complete = self.rest() if is_full else None
+
+        with_lidar = now_s >= self._lidar_due_s or not self._messages
+        if with_lidar:
             self._lidar_due_s = now_s + LIDAR_S - SLACK_S
         self._messages.append(self._packer.pack(moment, with_lidar=with_lidar))
         self._times_s.append(now_s)
@@ -72,8 +73,9 @@ class Chunks:
         """Return the last chunk, which may be shorter; None without moments."""
         if not self._messages:
             return None
-        start_s = self._start_s = self._times_s[0] if self._start_s is None else self._start_s
-        times_s = [round(each - start_s, 4) for each in self._times_s]
+        if self._start_s is None:
+            self._start_s = self._times_s[0]
+        times_s = [round(each - self._start_s, 4) for each in self._times_s]
         data = np.frombuffer(zlib.compress(b"".join(self._messages)), np.uint8)
         self._messages = []
         self._times_s = []
@@ -101,16 +103,15 @@ class SessionFile:
         """True if the file ended before the run."""
         self._bench = bench_message(rig, measured)
         self._keeps_all = keeps_all
-        self._chunks = Chunks(MomentPacker(rig, picture_width=PICTURE_WIDTH))
+        self._chunks = Chunks(MomentPacker(picture_width=PICTURE_WIDTH))
         self._queue = BoundedQueue[Moment](QUEUE_MOMENTS)
         self._due_s = float("-inf")
         self._error: Exception | None = None
         self._thread = Thread(target=self._write, name="saved session")
 
     def __enter__(self) -> Self:
-        self.path.open(
-            "wb"
-        ).close()  # a path that cannot be written to is an error now, not in the thread
+        # A path that cannot be written to is an error now, not in the thread.
+        self.path.open("wb").close()
         self._thread.start()
         return self
 
@@ -122,13 +123,12 @@ class SessionFile:
 
     def show(self, moment: Moment) -> None:
         """Queue a moment if one is due."""
-        if self.full or moment.published_s < self._due_s:
+        if self.full or moment.time_s < self._due_s:
             return
-        self._due_s = moment.published_s + PERIOD_S - SLACK_S
-        while (
-            self._keeps_all and self._thread.is_alive() and not self._queue.wait_for_room(CHUNK_S)
-        ):
-            pass
+        self._due_s = moment.time_s + PERIOD_S - SLACK_S
+        if self._keeps_all:
+            while self._thread.is_alive() and not self._queue.wait_for_room(CHUNK_S):
+                pass
         if self._queue.wait_for_room(0.0):
             self._queue.put(moment)
         else:

@@ -5,34 +5,30 @@ from contextlib import ExitStack
 from dataclasses import dataclass, field
 from typing import Any, Protocol, Self
 
-from nlos_cam.frames import Frame, LidarMaps
-from nlos_cam.reconstruct import PhysicsCheckResult, Reconstruction, Verdict
+from nlos_cam.reconstruct import FrameResult
 
 
 @dataclass(frozen=True)
 class Moment:
-    """One frame and its result."""
+    """Result of one frame at the time at which it is shown."""
 
-    frame: Frame
-    reconstruction: Reconstruction
-    published_s: float
-    """The loop's clock when the reconstruction was ready."""
+    result: FrameResult
+    time_s: float
+    """When the result was ready, by the loop's clock; of a recorded frame its timestamp."""
     latency_s: float
-    """From the frame's timestamp to `published_s`, on one clock."""
-    difference: LidarMaps | None = None
-    """Maps minus the bare wall's; None without a reference."""
-    warnings: tuple[str, ...] = ()
-    """Warnings about the bench, such as that the lidar has moved."""
-    verdict: Verdict | None = None
-    """None without an uncertainty network."""
-    check: PhysicsCheckResult | None = None
-    """The newest physics check, of this frame or an earlier one; None until there is one."""
-    stages_s: Mapping[str, float] = field(default_factory=dict[str, float])
-    """Seconds by stage."""
+    """From the frame's timestamp to `time_s`, on one clock; of a recorded frame the sum of its
+    stages.
+    """
     dropped: int = 0
     """Frames lost so far."""
     celsius: Mapping[str, float] = field(default_factory=dict[str, float])
     """The device's last temperatures, by name; empty where none were read."""
+
+    @classmethod
+    def recorded(cls, result: FrameResult, celsius: Mapping[str, float] | None = None) -> Self:
+        """Return the moment of a recorded frame."""
+        stages_s = {name: took_s for name, took_s in result.stages_s.items() if name != "wait"}
+        return cls(result, result.timestamp_s, sum(stages_s.values()), celsius=celsius or {})
 
 
 class Controls(Protocol):

@@ -116,7 +116,7 @@ class WebViewer(Website):
     def begin(self, rig: Rig, measured: MeasuredWall | None = None) -> None:
         """Show this bench from now on."""
         self._bench = (self._bench[0] + 1, bench_message(rig, measured))
-        self._packer = MomentPacker(rig)
+        self._packer = MomentPacker()
 
     def __enter__(self) -> Self:
         super().__enter__()
@@ -135,27 +135,27 @@ class WebViewer(Website):
         self._moments.put(moment)
 
     def _pack_all(self) -> None:
+        """Pack the newest moment and the status, PERIOD_S apart, while any browser watches."""
         seen = 0
-        statuses = 0
         status_s = float("-inf")
-        packed = status = (0, b"")
+        moment = status = (0, b"")
         while not self._closed.is_set():
             self._on_thread()
             start_s = self._clock()
             newest = self._moments.fresh(seen, PATIENCE_S, STATUS_S)
-            if newest is None and seen > packed[0]:
+            if newest is None and seen > moment[0]:
                 newest = self._moments.after(seen - 1, 0.0)  # the last one, when nobody watched
             if newest is not None:
                 seen = newest[0]
             if self._watching == 0:
                 continue
+
             if newest is not None and self._packer:
-                packed = seen, self._packer.pack(newest[1])
+                moment = seen, self._packer.pack(newest[1])
             if newest is None or start_s - status_s >= STATUS_S:
                 status_s = start_s
-                statuses = statuses + 1
-                status = statuses, self._status()
-            self._packets.put(Packet(self._bench, packed, status))
+                status = status[0] + 1, self._status()
+            self._packets.put(Packet(self._bench, moment, status))
             self._closed.wait(max(0.0, start_s + PERIOD_S - self._clock()))
 
     def _stream(self, send: Send) -> None:
@@ -171,16 +171,13 @@ class WebViewer(Website):
             count = 0
             while not self._closed.is_set():
                 self._on_thread()
-                if newest := self._packets.after(count, STATUS_S):
-                    count, packet = newest
-                    send(
-                        b"".join(
-                            new[1]
-                            for new, old in zip(packet, sent, strict=True)
-                            if new[0] != old[0]
-                        )
-                    )
-                    sent = packet
+                newest = self._packets.after(count, STATUS_S)
+                if newest is None:
+                    continue
+                count, packet = newest
+                pairs = zip(packet, sent, strict=True)
+                send(b"".join(new[1] for new, old in pairs if new[0] != old[0]))
+                sent = packet
             send(ENDED)
         finally:
             with self._lock:
@@ -208,7 +205,7 @@ class PlaybackViewer(Website):
     ) -> None:
         super().__init__(host=host, port=port, controls=controls)
         self._bench = bench_message(rig, measured)
-        self._chunks = Chunks(MomentPacker(rig))
+        self._chunks = Chunks(MomentPacker())
         self._changed = Condition()
         self._closed = False
         self._ends = [0]
@@ -278,11 +275,6 @@ class RecordedView(Website):
             raise RecordingError(
                 f"{path} cannot be read ({error.strerror}): name a saved session (.html)"
             ) from error
-        if self._content.startswith(b"RRF"):
-            raise RecordingError(
-                f"{path} was saved by an earlier version, for the Rerun viewer: open it with "
-                f"`pip install rerun-sdk==0.41.*` and `rerun {path}`"
-            )
         if SESSION_MARK not in self._content[:1000]:
             raise RecordingError(
                 f"{path} is no saved session: make one with `live --save-view` or `replay"

@@ -11,7 +11,7 @@ from urllib.parse import urlsplit
 
 import pytest
 from browser_page import DEADLINE_S, Page
-from made_up_moments import RIG, full_moment
+from made_up_moments import RIG, full_moment, with_result
 from measured_walls import exact_wall
 from view_streams import ask
 
@@ -96,7 +96,7 @@ def test_five_pages_and_one_that_never_reads_share_a_view(browser: Any) -> None:
             page.close()
 
 
-def test_refused_page_goes_on_by_itself_and_a_hidden_one_makes_room(browser: Any) -> None:
+def test_refused_page_retries_and_a_hidden_one_makes_room(browser: Any) -> None:
     with WebViewer(RIG) as viewer:
         viewer.show(full_moment(0))
         watchers = [ask(viewer.address or "", "/stream") for _ in range(MAX_STREAMS)]
@@ -129,7 +129,7 @@ def test_refused_page_goes_on_by_itself_and_a_hidden_one_makes_room(browser: Any
 def test_saved_session_plays_from_the_file_alone(browser: Any, tmp_path: Path) -> None:
     with SessionFile(tmp_path / "view.html", RIG, keeps_all=True) as session:
         for number in range(60):
-            session.show(replace(full_moment(number), published_s=0.5 * number))
+            session.show(replace(full_moment(number), time_s=0.5 * number))
     page = Page(browser, (tmp_path / "view.html").as_uri()).drawn()
     play_through(page)
     assert page.hosts <= {None, ""}
@@ -146,7 +146,7 @@ def test_saved_session_plays_from_the_file_alone(browser: Any, tmp_path: Path) -
 def test_playback_plays_scrubs_and_changes_speed(browser: Any) -> None:
     with PlaybackViewer(RIG) as viewer:
         for number in range(60):
-            viewer.show(replace(full_moment(number), published_s=0.5 * number))
+            viewer.show(replace(full_moment(number), time_s=0.5 * number))
         viewer.finish()
         page = Page(browser, viewer.address or "").drawn()
         page.wait_until(lambda: page.state()["end"] == pytest.approx(29.5), "the whole recording")
@@ -215,7 +215,8 @@ def settled() -> tuple[int, int, float]:
 def test_page_without_truth_shows_the_errors_in_its_place(browser: Any) -> None:
     with WebViewer(RIG) as viewer:
         real = full_moment(0)
-        viewer.show(replace(real, frame=replace(real.frame, truth_depth_m=None)))
+        frame = replace(real.result.frame, truth_depth_m=None)
+        viewer.show(with_result(real, frame=frame))
         page = Page(browser, viewer.address or "").drawn()
         assert page.page.inner_text("#truth figcaption").startswith("Error")
         assert not page.page.is_visible("#errors")

@@ -16,8 +16,8 @@ from small_frames import ListViewer, sheet_network
 from nlos_cam.camera import Recording, SimulatedCamera, session
 from nlos_cam.errors import CameraLostError
 from nlos_cam.frames import Frame
-from nlos_cam.live import RunReport, frame_queue, run_live
-from nlos_cam.reconstruct import CalibratedRig, Pipeline, Verdict
+from nlos_cam.live import RunReport, run_live
+from nlos_cam.reconstruct import CalibratedRig, Pipeline, Verdict, frame_reader
 from nlos_cam.recording import ReplayCamera, SdkReplayCamera
 from nlos_cam.render import Fault, SensedImages
 from nlos_cam.view import Moment
@@ -37,7 +37,7 @@ def camera(noise_world: Any, hurried_clock: Any, monkeypatch: pytest.MonkeyPatch
     slow.
     """
     monkeypatch.setattr(session, "CAPACITY", PLENTY)
-    monkeypatch.setattr(frame_queue, "QUEUE_FRAMES", PLENTY)
+    monkeypatch.setattr(frame_reader, "QUEUE_FRAMES", PLENTY)
 
     class QuietWorld(noise_world):
         def images(self, number: int) -> SensedImages:
@@ -86,7 +86,7 @@ def live(
         processing = Pipeline(CalibratedRig(RIG), sheet_network)
         report = run_live(Until(camera, last), processing, viewer, stop=Event(), **options)  # type: ignore[arg-type]
     moments = [
-        moment for moment in viewer.moments if moment.verdict != Verdict.STALLED
+        moment for moment in viewer.moments if moment.result.verdict != Verdict.STALLED
     ]  # the last one, shown again
     assert report.frames == len(moments)
     return moments, report
@@ -120,27 +120,27 @@ def test_passing_fault_is_survived_and_counted(
     camera: Make, befalls: Fault, missing: list[int], counts: dict[str, int]
 ) -> None:
     moments, report = live(camera(befalls))
-    assert [instant_of(moment.frame) for moment in moments] == [
+    assert [instant_of(moment.result.frame) for moment in moments] == [
         n for n in range(LAST + 1) if n not in missing
     ]
     assert report.counts == counts
     for one, next_one in pairwise(moments):
-        rise_s = next_one.frame.timestamp_s - one.frame.timestamp_s
+        rise_s = next_one.result.timestamp_s - one.result.timestamp_s
         assert rise_s * 30 == pytest.approx(
-            instant_of(next_one.frame) - instant_of(one.frame), abs=1e-3
+            instant_of(next_one.result.frame) - instant_of(one.result.frame), abs=1e-3
         )
 
 
 def test_frame_without_depth_shows_nothing(camera: Make) -> None:
     moments, _ = live(camera(fault("all_zero")))
     shown = [
-        instant_of(each.frame) for each in moments if np.isfinite(each.reconstruction.depth_m).any()
+        instant_of(each.result.frame) for each in moments if np.isfinite(each.result.depth_m).any()
     ]
     assert shown == [n for n in range(LAST + 1) if n not in {5, 6, 7}]
 
 
 def rises(moments: list[Moment]) -> None:
-    frames = [moment.frame for moment in moments]
+    frames = [moment.result.frame for moment in moments]
     for one, next_one in pairwise(frames):
         assert next_one.frame_number > one.frame_number
         assert next_one.timestamp_s > one.timestamp_s
@@ -152,12 +152,12 @@ def test_replugged_device_goes_on(camera: Make, own_clock: bool) -> None:
     wraps = [Fault(kind="clock_wrap", at_frame=20)] if own_clock else []
     moments, report = live(camera(fault("unplug", 30), *wraps), last=600)
     rises(moments)
-    seen = [instant_of(moment.frame) for moment in moments]
+    seen = [instant_of(moment.result.frame) for moment in moments]
     assert seen[:5] == [0, 1, 2, 3, 4]
     assert seen[5] >= 35
     assert seen == sorted(set(seen))
     assert report.counts["replugged"] == 1
-    assert report.dropped == moments[-1].frame.frame_number + 1 - report.frames
+    assert report.dropped == moments[-1].result.frame_number + 1 - report.frames
 
 
 @pytest.mark.slow

@@ -4,20 +4,21 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from threading import Event
 from types import SimpleNamespace
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
 from nlos_calibration import Intrinsics, load_rig
 
-from nlos_cam.frames import Frame
-from nlos_cam.reconstruct.network import Reconstruction
+from nlos_cam.frames import Frame, maps_from_frame
+from nlos_cam.objects import object_box
+from nlos_cam.reconstruct import FrameResult, Reconstruction
 from nlos_cam.render import SensedImages
 from nlos_cam.view.viewer import Moment, NullViewer
 
 RIG = load_rig("paper-rig")
 SMALL = Intrinsics(80, 64, 57.0, 61.0, 39.5, 31.5)
 SERIAL = "f0246262"
-NOTHING = Reconstruction(np.full((64, 64), np.nan, np.float32), np.eye(4), None, {})
+NOTHING = Reconstruction(np.full((64, 64), np.nan, np.float32), object_box(RIG), None, {})
 
 
 def assert_exposed(frame: Frame, images: SensedImages) -> None:
@@ -58,6 +59,20 @@ def small_frame(number: int, offset_s: float = 0.0) -> Frame:
     depth_m = np.full((64, 80), 0.3, np.float32)
     ir = np.full((64, 80), 9, np.uint8)
     return Frame(depth_m, ir, ir, offset_s + number / 30, number, SMALL)
+
+
+def result_of(frame: Frame, **fields: Any) -> FrameResult:
+    """Return a frame's result without a surface; `fields` replace its own."""
+    return FrameResult(
+        **{
+            "frame": frame,
+            "maps": maps_from_frame(frame),
+            "reconstruction": NOTHING,
+            "published_s": 0.0,
+            "stages_s": {},
+            **fields,
+        }
+    )
 
 
 class FrameCamera:

@@ -18,7 +18,14 @@ from nlos_cam.evaluate import echoes_of, sense
 from nlos_cam.files import cache_folder
 from nlos_cam.frames import Frame
 from nlos_cam.objects import benchmark_objects, object_box
-from nlos_cam.reconstruct import Arrival, CalibratedRig, FrameResult, Pipeline, Verdict
+from nlos_cam.reconstruct import (
+    Arrival,
+    CalibratedRig,
+    FrameResult,
+    Pipeline,
+    Verdict,
+    frame_issues,
+)
 from nlos_cam.render import Sensor, SensorModel, render
 
 pytestmark = pytest.mark.slow
@@ -45,7 +52,10 @@ def frames_of(stimulus: Stimulus, count: int, seed: int) -> list[Frame]:
 
 
 def steps_of(processing: Pipeline, frames: Sequence[Frame]) -> list[FrameResult]:
-    return [processing.process(Arrival(frame, 0.0), lambda: 0.0, 0.0) for frame in frames]
+    return [
+        processing.process(Arrival(frame, 0.0, frame_issues(frame)), lambda: 0.0, 0.0)
+        for frame in frames
+    ]
 
 
 @pytest.mark.parametrize("seed", range(10))

@@ -38,9 +38,9 @@ from nlos_cam.evaluate import (
 )
 from nlos_cam.files import atomic_file
 from nlos_cam.frames import OBJECT_PIXELS, Frame
-from nlos_cam.live import VIDEO, ReplayMedia, replay_recording
 from nlos_cam.reconstruct import CalibratedRig, build_pipeline, load_networks, load_uncertainty
 from nlos_cam.render import load_scene
+from nlos_cam.replay import VIDEO, ReplayMedia, replay_recording
 
 ROOT = Path(__file__).parents[2]
 WORST = 6

@@ -14,10 +14,11 @@ from nlos_models.training import MapSet
 
 from nlos_cam.dataset import sense_color
 from nlos_cam.evaluate import advantage, over_objects, plain
-from nlos_cam.evaluate.figures import ROWS
 from nlos_cam.objects import TEXTURES, image_from_albedo, paint
 from nlos_cam.render import Scene, Sensor, SensorModel, Surface
 from nlos_cam.report import figure_of
+
+ROWS = "truth", "reconstruction", "difference"
 
 
 def painted_maps(

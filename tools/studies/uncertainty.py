@@ -151,7 +151,7 @@ def of_objects(answers: Sequence[Answer], truth: NDArray[np.floating], rig: Rig)
     ]
     both = [(e.mean(), o.mean()) for e, o in per_object if e.size]
     surface = np.concatenate(
-        [one.found.uncertainty.surface.ravel() for one in answers if one.found.uncertainty]
+        [one.found.uncertainty.p_surface.ravel() for one in answers if one.found.uncertainty]
     ).astype(np.float64)
     there = (np.asarray(truth) > 0).ravel().astype(np.float64)
     return {

@@ -293,7 +293,9 @@ def cell(
                 for one, image in zip(seen, images, strict=True)
             ]
             found["outside"] = float(
-                np.mean([doubt.outside > doubter.record.outside_above for doubt in doubts])
+                np.mean(
+                    [doubt.p_out_of_distribution > doubter.record.outside_above for doubt in doubts]
+                )
             )
         return found
 

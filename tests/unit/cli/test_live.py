@@ -25,6 +25,7 @@ from nlos_cam.cli.live import summary
 from nlos_cam.cli.main import main
 from nlos_cam.cli.view import announce_view, opened_in_browser, viewer_of
 from nlos_cam.errors import NlosCamError
+from nlos_cam.frames import Frame
 from nlos_cam.live import RunControl
 from nlos_cam.live.statistics import RunReport
 from nlos_cam.reconstruct.verdict import Verdict
@@ -49,16 +50,16 @@ class Opened:
         self.count: int | None = 20
         self.camera: Recorded | WallCamera | None = None
         self.network = SheetNetwork()
-        self.doubter = FakeUncertainty()
+        self.uncertainty_model = FakeUncertainty()
 
     def __call__(self, uri: str, **options: Any) -> FrameCamera | WallCamera:
         self.calls.append((uri, options))
         self.on_open()
-        quick: Any = {
-            "uri": uri,
-            "make": lambda number: replace(small_frame(number), timestamp_s=number / 1000),
-        }
-        return self.camera or FrameCamera(self.count, self.on_frame, **quick)
+        return self.camera or FrameCamera(self.count, self.on_frame, make=quick_frame, uri=uri)
+
+
+def quick_frame(number: int) -> Frame:
+    return replace(small_frame(number), timestamp_s=number / 1000)
 
 
 @pytest.fixture
@@ -66,10 +67,11 @@ def opened(monkeypatch: pytest.MonkeyPatch) -> Iterator[Opened]:
     opened = Opened()
     monkeypatch.setattr("nlos_cam.camera.open_camera", opened)
     monkeypatch.setattr("nlos_cam.reconstruct.load_networks", lambda *_: opened.network)
-    monkeypatch.setattr("nlos_cam.reconstruct.load_uncertainty", lambda *_: opened.doubter)
     monkeypatch.setattr(
-        "nlos_cam.live.replay.draw_contact_sheet", lambda path, *_: path.touch()
-    )  # takes a second
+        "nlos_cam.reconstruct.load_uncertainty", lambda *_: opened.uncertainty_model
+    )
+    # Drawing takes a second.
+    monkeypatch.setattr("nlos_cam.replay.replay.draw_contact_sheet", lambda path, *_: path.touch())
     before = signal.getsignal(signal.SIGINT)
     yield opened
     assert signal.getsignal(signal.SIGINT) == before
@@ -78,59 +80,74 @@ def opened(monkeypatch: pytest.MonkeyPatch) -> Iterator[Opened]:
 @pytest.fixture
 def walled(opened: Opened, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Opened:
     """Camera on a measured wall, wall.toml, that is moved for a while."""
-    monkeypatch.setattr(
-        "nlos_cam.live.loop.os.cpu_count", lambda: 1
-    )  # the network is given maps in order
+    # One thread gives the network its maps in order.
+    monkeypatch.setattr("nlos_cam.reconstruct.streaming.os.cpu_count", lambda: 1)
     write_wall(tmp_path / "wall.toml", bare_wall())
     opened.camera = WallCamera(100, moved=range(30, 60))
-    opened.doubter = None
+    opened.uncertainty_model = None
     return opened
 
 
 Run = Callable[..., Any]
 
 
+REPORT_FIELDS = {
+    "frames",
+    "fps",
+    "dropped",
+    "latency_ms",
+    "stages_ms",
+    "counts",
+    "warnings",
+    "stages_percentiles_ms",
+    "verdicts",
+    "stalled_s",
+    "quality",
+    "camera_ms",
+}
+STAGES = {"delivery", "wait", "queue", "maps", "bench", "network", "doubt", "view"}
+COLUMNS = {"latency_ms", "delivery_ms", "queue_ms", "network_ms", "dropped", "verdict"}
+
+
 @pytest.mark.usefixtures("opened")
-def test_live_json_and_log_have_their_fields(run: Run) -> None:
-    arguments = [*RECORDED, "--log", "log.csv"]
-    report = run(*arguments)
-    fields = ("frames", "fps", "dropped", "latency_ms", "stages_ms", "counts", "warnings")
-    assert set(report) == {
-        *fields,
-        "stages_percentiles_ms",
-        "verdicts",
-        "stalled_s",
-        "quality",
-        "camera_ms",
-    }
+def test_live_json_has_its_fields(run: Run) -> None:
+    report = run(*RECORDED)
+    assert set(report) == REPORT_FIELDS
+    assert set(report["latency_ms"]) == {"p50", "p95", "p99"}
+    assert set(report["stages_ms"]) == STAGES
+
+
+@pytest.mark.usefixtures("opened")
+def test_live_on_a_recording_reports_every_frame(run: Run) -> None:
+    report = run(*RECORDED)
     assert (report["frames"], report["dropped"]) == (20, 0)
     assert report["verdicts"] == {Verdict.SEEN.value: 20}
-    assert set(report["latency_ms"]) == {"p50", "p95", "p99"}
-    assert set(report["stages_ms"]) == {
-        "delivery",
-        "wait",
-        "queue",
-        "maps",
-        "bench",
-        "network",
-        "doubt",
-        "view",
-    }
+
+
+@pytest.mark.usefixtures("opened")
+def test_live_log_has_a_line_per_frame_and_stays(run: Run) -> None:
+    arguments = [*RECORDED, "--log", "log.csv"]
+    run(*arguments)
     header, *lines = Path("log.csv").read_text(encoding="utf-8").splitlines()
     assert [int(line.split(",")[0]) for line in lines] == list(range(20))
-    assert {"latency_ms", "delivery_ms", "queue_ms", "network_ms", "dropped", "verdict"} <= set(
-        header.split(",")
-    )
+    assert set(header.split(",")) >= COLUMNS
     run(*arguments, code=1)
+
+
+@pytest.mark.usefixtures("opened")
+def test_live_prints_the_address_of_its_view(run: Run) -> None:
     assert "http://127.0.0.1:" in run("live", "--camera", "bag:fake").err
 
 
-def test_live_ends_with_a_live_camera_or_after_its_seconds(opened: Opened, run: Run) -> None:
+def test_live_ends_with_a_live_camera(opened: Opened, run: Run) -> None:
     report = run(*SIMULATED)
     assert report["frames"] + report["dropped"] == 20
+    assert [uri for uri, _ in opened.calls] == ["sim"]
+
+
+def test_live_ends_after_its_seconds(opened: Opened, run: Run) -> None:
     opened.on_frame = lambda number: threading.Event().wait(0.05 if number else 0.0)
     assert run(*SIMULATED, "--seconds", "0.2")["frames"] < 20
-    assert [uri for uri, _ in opened.calls] == ["sim", "sim"]
 
 
 def test_live_saves_its_view_and_overwrites_only_when_asked(opened: Opened, run: Run) -> None:
@@ -146,9 +163,8 @@ def test_live_saves_its_view_and_overwrites_only_when_asked(opened: Opened, run:
 def test_replay_saves_view_stills_and_video(opened: Opened, run: Run) -> None:
     opened.camera = Recorded(12)
     run(*REPLAY, "--save-view", "--stills", "2", "--video")
-    assert {"view.html", "replay.webm", "still-000000.png"} < {
-        file.name for file in Path("out").iterdir()
-    }
+    names = {file.name for file in Path("out").iterdir()}
+    assert {"view.html", "replay.webm", "still-000000.png"} < names
 
 
 def test_live_record_overwrites_only_when_asked(opened: Opened, run: Run) -> None:
@@ -207,21 +223,12 @@ def test_interrupt_while_a_camera_opens_begins_no_run(
     assert run(*command, code=130) == {}
 
 
-def test_live_budget_reports_whether_it_was_kept(
-    opened: Opened, run: Run, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("nlos_cam.live.setting_loader", lambda *_: lambda _: opened.network)
-    report = run(*RECORDED, "--budget-ms", "100000")
-    assert report["budget"]["kept"]
-    assert "100000 ms" in report.err
-
-
 @pytest.mark.usefixtures("walled")
 @pytest.mark.parametrize("command", [SIMULATED, REPLAY])
 def test_begin_and_end_of_a_warning_print_once(
     run: Run, monkeypatch: pytest.MonkeyPatch, command: list[str]
 ) -> None:
-    monkeypatch.setattr("nlos_cam.live.frame_queue.QUEUE_FRAMES", 1000)
+    monkeypatch.setattr("nlos_cam.reconstruct.frame_reader.QUEUE_FRAMES", 1000)
     report = run(*command, "--wall", "wall.toml")
     [(warning, frames)] = report["warnings"].items()
     assert 0 < frames < 100
@@ -245,47 +252,70 @@ def test_weights_of_difference_maps_need_a_wall(walled: Opened, run: Run) -> Non
     assert "--wall" in run(*SIMULATED, code=1)["error"]["message"]
 
 
-def test_summary_has_a_sentence_per_fact_and_stages_if_verbose() -> None:
-    latency_ms = {"p50": 9.0, "p95": 14.0, "p99": 21.0}
-    stages = {"wait": TIMES, "delivery": TIMES, "network": TIMES}
-    plain = RunReport(10, 29.97, 0, latency_ms, {}, {}, stages_percentiles_ms=stages)
-    assert len(summary(plain).splitlines()) == 2
-    full = replace(
-        plain,
+STAGE_TIMES = {"wait": TIMES, "delivery": TIMES, "network": TIMES}
+PLAIN = RunReport(
+    frames=10,
+    fps=29.97,
+    dropped=0,
+    latency_ms={"p50": 9.0, "p95": 14.0, "p99": 21.0},
+    stages_ms={},
+    counts={},
+    stages_percentiles_ms=STAGE_TIMES,
+)
+
+
+def test_summary_of_a_smooth_run_has_two_lines() -> None:
+    assert len(summary(PLAIN).splitlines()) == 2
+
+
+def test_summary_has_a_sentence_per_fact() -> None:
+    report = replace(
+        PLAIN,
         dropped=5,
         counts={"dropped_loop": 3, "dropped_camera": 2, "blank": 1},
         verdicts={"object seen": 7, "nothing there": 3},
         warnings={"the lidar has drifted": 4},
         stalled_s=1.25,
     )
-    assert summary(full).splitlines()[2:] == [
+    assert summary(report).splitlines()[2:] == [
         "Dropped 5 frames: 2 at the camera, 3 because processing was too slow",
-        (
-            "Warning: 33% of the frames dropped, median latency 9 ms: close other programs, or give"
-            " --budget-ms"
-        ),
+        "Warning: 33% of the frames dropped, median latency 9 ms: close other programs",
         "Object detected in 7 of 10 frames, nothing there in 3",
         "Irregular: 1 blank",
         "Stalled for 1.2 s without a frame",
         "Warning in 4 frames: the lidar has drifted",
     ]
-    stages_lines = [line.split() for line in summary(plain, verbose=True).splitlines()[3:]]
-    assert stages_lines == [[name, "1.0", "3.1"] for name in ("delivery", "network", "wait")]
 
 
-def test_view_serves_saved_view_until_interrupted_or_its_seconds(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+def test_verbose_summary_has_the_latencys_stages_first() -> None:
+    lines = summary(PLAIN, verbose=True).splitlines()[3:]
+    names = ("delivery", "network", "wait")
+    assert [line.split() for line in lines] == [[name, "1.0", "3.1"] for name in names]
+
+
+@pytest.fixture
+def saved(tmp_path: Path) -> Path:
+    path = tmp_path / "view.html"
+    with SessionFile(path, RIG) as view:
+        view.show(full_moment(0))
+    return path
+
+
+def test_view_of_a_saved_session_ends_after_its_seconds(saved: Path) -> None:
+    assert main(["view", str(saved), "--seconds", "0.1"]) == 0
+
+
+def test_view_serves_a_saved_session_until_interrupted(
+    saved: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     fetched: list[bytes] = []
 
     def fetch_and_interrupt(text: str) -> None:
-        with closing(ask(re.search(r"http://\S+", text)[0], "/")) as answer:  # type: ignore[index]
+        address = re.search(r"http://\S+", text)[0]  # type: ignore[index]
+        with closing(ask(address, "/")) as answer:
             fetched.append(answer.read())
         os.kill(os.getpid(), signal.SIGINT)
 
-    with SessionFile(saved := tmp_path / "view.html", RIG) as view:
-        view.show(full_moment(0))
-    assert main(["view", str(saved), "--seconds", "0.1"]) == 0
     monkeypatch.setattr("nlos_cam.cli.view.say", fetch_and_interrupt)
     assert main(["view", str(saved)]) == 130
     assert fetched == [saved.read_bytes()]
@@ -310,34 +340,46 @@ def serve(
         announce_view(viewer, host=host, port=port, open_it=open_it)
 
 
-def test_view_on_all_addresses_notes_who_can_see_it_and_no_view_serves_nothing(
-    printed: list[str],
-) -> None:
+def test_view_on_all_addresses_notes_who_can_see_it(printed: list[str]) -> None:
     serve(host=EVERYWHERE)
-    serve(no_view=True, open_it=True)
-    line, note, without = printed
+    line, note = printed
     assert "http://127.0.0.1:" in line
     assert "anyone" in note
-    assert "http" not in without
+
+
+def test_run_without_view_serves_nothing(printed: list[str]) -> None:
+    serve(no_view=True, open_it=True)
+    [line] = printed
+    assert "http" not in line
     assert isinstance(viewer_of(RunControl(), no_view=True), NullViewer)
-    for place in ({"host": "127.0.0.1"}, {"port": 9090}):
-        with pytest.raises(typer.BadParameter, match="--no-view"):
-            viewer_of(RunControl(), no_view=True, **place)
 
 
-def test_view_moves_from_a_taken_port_unless_asked_for(
-    printed: list[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+@pytest.mark.parametrize("place", [{"host": "127.0.0.1"}, {"port": 9090}])
+def test_place_of_a_view_contradicts_no_view(place: dict[str, Any]) -> None:
+    with pytest.raises(typer.BadParameter, match="--no-view"):
+        viewer_of(RunControl(), no_view=True, **place)
+
+
+@pytest.fixture
+def taken_port(monkeypatch: pytest.MonkeyPatch) -> Iterator[int]:
+    """Usual port of the view, where another program listens."""
     with socket.create_server(("127.0.0.1", 0)) as other:
         port = other.getsockname()[1]
         for module in ("nlos_cam.view", "nlos_cam.view.web"):
             monkeypatch.setattr(f"{module}.PREFERRED_PORT", port)
-        serve()
-        [line] = printed
-        assert f"{port} is taken" in line
-        assert f"127.0.0.1:{port}/" not in line
-        with pytest.raises(NlosCamError, match="--view-port"):
-            serve(port=port)
+        yield port
+
+
+def test_view_moves_from_a_taken_port(printed: list[str], taken_port: int) -> None:
+    serve()
+    [line] = printed
+    assert f"{taken_port} is taken" in line
+    assert f"127.0.0.1:{taken_port}/" not in line
+
+
+def test_view_at_a_given_port_that_is_taken_is_an_error(taken_port: int) -> None:
+    with pytest.raises(NlosCamError, match="--view-port"):
+        serve(port=taken_port)
 
 
 @pytest.mark.parametrize("opens", [True, False])
@@ -353,14 +395,19 @@ def test_view_opens_a_browser_or_notes_that_it_cannot(
     assert ["browser" in line for line in printed[1:]] == [True] * (not opens)
 
 
-def test_opened_in_browser_only_with_a_desktop(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("nlos_cam.cli.view.sys", SimpleNamespace(platform="linux"))
-    for desktop, answer, opened in (
+@pytest.mark.parametrize(
+    ("desktop", "answer", "opened"),
+    [
         ({}, {"return_value": True}, False),
         ({"DISPLAY": ":0"}, {"return_value": True}, True),
         ({"DISPLAY": ":0"}, {"return_value": False}, False),
         ({"BROWSER": "lynx"}, {"side_effect": webbrowser.Error("no runnable browser")}, False),
-    ):
-        monkeypatch.setattr("nlos_cam.cli.view.os.environ", desktop)
-        monkeypatch.setattr("nlos_cam.cli.view.webbrowser.open", Mock(**answer))
-        assert opened_in_browser("http://127.0.0.1:9090/") == opened
+    ],
+)
+def test_browser_opens_only_with_a_desktop(
+    monkeypatch: pytest.MonkeyPatch, desktop: dict[str, str], answer: dict[str, Any], opened: bool
+) -> None:
+    monkeypatch.setattr("nlos_cam.cli.view.sys", SimpleNamespace(platform="linux"))
+    monkeypatch.setattr("nlos_cam.cli.view.os.environ", desktop)
+    monkeypatch.setattr("nlos_cam.cli.view.webbrowser.open", Mock(**answer))
+    assert opened_in_browser("http://127.0.0.1:9090/") == opened

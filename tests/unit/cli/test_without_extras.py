@@ -29,7 +29,6 @@ too.
     ("line", "needs_it"),
     [
         ("live sim --no-view --seconds 1", False),
-        ("live sim --no-view --seconds 1 --budget-ms 500", False),
         ("demo --no-view --seconds 1", False),
         ("replay sample --out out", False),
         ("capture sim --frames 3 --out out.bag", False),

@@ -41,8 +41,6 @@ live --seconds 0 | 0.1
 live --seconds x | number
 live --view-port 0 | 65535
 live --average 1.5 | whole number
-live --average 2 --budget-ms 30 | --average
-live --tradeoff table.json | --budget-ms
 live --no-view --open | --no-view
 live --record run.mp4 | .bag
 live --log run.txt | .csv

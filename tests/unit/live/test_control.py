@@ -14,7 +14,6 @@ from view_streams import saved_moments
 
 from nlos_cam.errors import NlosCamError
 from nlos_cam.live import RunControl, RunReport, run_live
-from nlos_cam.live.statistics import SLOW_FRAMES, PaceWatch
 from nlos_cam.reconstruct import CalibratedRig, Pipeline
 from nlos_cam.view import NullViewer
 
@@ -42,36 +41,49 @@ def test_status_is_json_and_gives_pace_age_and_disk(control: RunControl) -> None
     assert status["disk_s"] > 0
 
 
-def test_status_says_honestly_what_the_run_waits_for(tmp_path: Path) -> None:
+@pytest.fixture
+def waiting(tmp_path: Path) -> RunControl:
+    """Controls of a run whose clock goes on by 10 s at each look, and whose camera opens."""
     now_s = iter(range(0, 1000, 10))
-    control = RunControl("sim", folder=tmp_path, clock=lambda: next(now_s))
-    assert control.status()["state"] == "connecting"
-    control.show_progress(1, 60)
-    control.show_progress(2, 60)
-    assert "first frame in about" in control.status()["message"]
-    control.attach(Recorded(0), Pipeline(CalibratedRig(RIG), sheet_network))  # type: ignore[arg-type]
-    assert "first frame" in control.status()["message"]
-    control.add(moment(0))
-    control.set_state("stalled", "no frame for 3 s")
-    assert (control.status()["state"], control.status()["message"]) == (
-        "stalled",
-        "no frame for 3 s",
-    )
-    control.add(moment(1))
-    assert control.status()["state"] == "running"
-    control.end()
-    assert control.status()["state"] == "ended"
+    return RunControl("sim", folder=tmp_path, clock=lambda: next(now_s))
+
+
+def state_of(control: RunControl) -> tuple[str, str]:
+    status = control.status()
+    return status["state"], status["message"]
+
+
+def test_status_tells_when_the_first_frame_is_expected(waiting: RunControl) -> None:
+    assert waiting.status()["state"] == "connecting"
+    waiting.show_progress(1, 60)
+    waiting.show_progress(2, 60)
+    assert "first frame in about" in waiting.status()["message"]
+
+
+def test_status_follows_the_run_from_its_camera_to_its_end(waiting: RunControl) -> None:
+    waiting.attach(Recorded(0), Pipeline(CalibratedRig(RIG), sheet_network))  # type: ignore[arg-type]
+    assert "first frame" in waiting.status()["message"]
+    waiting.add(moment(0))
+    waiting.set_state("stalled", "no frame for 3 s")
+    assert state_of(waiting) == ("stalled", "no frame for 3 s")
+    waiting.add(moment(1))
+    assert state_of(waiting) == ("running", "")
+    waiting.end()
+    assert state_of(waiting) == ("ended", "")
 
 
 def test_snapshot_writes_picture_arrays_and_mesh(control: RunControl, tmp_path: Path) -> None:
-    told = control.run("snapshot", {})
+    assert ".npz" in control.run("snapshot", {})
     assert files(tmp_path) == [".npz", ".ply", ".png"]
     with np.load(next(tmp_path.glob("*.npz"))) as arrays:
-        np.testing.assert_array_equal(arrays["depth_m"], full_moment(29).reconstruction.depth_m)
+        np.testing.assert_array_equal(arrays["depth_m"], full_moment(29).result.depth_m)
         assert arrays["frame_number"] == 29
-    assert ".npz" in told
-    control.run("snapshot", {})
-    assert len(files(tmp_path)) == 6, "the second one replaces nothing"
+
+
+def test_second_snapshot_replaces_nothing(control: RunControl, tmp_path: Path) -> None:
+    for _ in range(2):
+        control.run("snapshot", {})
+    assert len(files(tmp_path)) == 6
 
 
 def test_session_is_saved_between_two_commands(control: RunControl, tmp_path: Path) -> None:
@@ -85,17 +97,10 @@ def test_session_is_saved_between_two_commands(control: RunControl, tmp_path: Pa
     assert set(shown) <= set(range(30, 60))
 
 
-def test_average_and_setting_change_the_pipeline(control: RunControl) -> None:
-    pipeline = control._pipeline
+def test_average_changes_the_pipeline(control: RunControl) -> None:
+    pipeline = control._run.pipeline
     control.run("average", {"frames": 4})
     assert pipeline.average == control.status()["control"]["average"] == 4
-    other: Any = object()
-    control.settings = [("fast", "fast: 3 ms, error 22 mm")]
-    control.load_setting = lambda _: (other, 1)
-    assert "22 mm" in control.run("setting", {"name": "fast"})
-    assert pipeline.network is other
-    assert pipeline.average == 1
-    assert control.status()["control"]["setting"] == "fast"
 
 
 @pytest.mark.parametrize(
@@ -105,7 +110,6 @@ def test_average_and_setting_change_the_pipeline(control: RunControl) -> None:
         ("average", {"frames": 0}, "1 to 1000"),
         ("average", {"frames": "x"}, "average"),
         ("average", {"of": 3}, "does not take"),
-        ("setting", {"name": "none"}, "no setting"),
         ("stop_recording", {}, "nothing is being recorded"),
         ("end_session", {}, "no session"),
         ("record", {"label": "cup"}, "live camera"),
@@ -137,7 +141,7 @@ def test_one_command_runs_at_a_time(control: RunControl) -> None:
         control.run("resume", {})
     leave.set()
     thread.join()
-    assert control.paused
+    assert control.pipeline.paused
 
 
 def run(camera: FrameCamera, control: RunControl) -> RunReport:
@@ -156,7 +160,7 @@ def test_paused_run_reads_frames_and_reconstructs_none(tmp_path: Path) -> None:
     assert report.dropped == 0
 
 
-def test_run_ends_what_was_begun(tmp_path: Path) -> None:
+def test_run_ends_a_session_that_is_being_saved(tmp_path: Path) -> None:
     control = RunControl(folder=tmp_path)
     run(FrameCamera(30, lambda number: number == 5 and control.run("save_session", {})), control)
     assert control.status()["state"] == "ended"
@@ -166,10 +170,10 @@ def test_run_ends_what_was_begun(tmp_path: Path) -> None:
 def test_reference_is_taken_from_the_passing_frames(tmp_path: Path) -> None:
     control = RunControl(folder=tmp_path)
     benches = list[CalibratedRig]()
-    told = list[str]()
-    control.on_bench = benches.append
+    outcomes = list[str]()
+    control.bench.on_bench = benches.append
     command = threading.Thread(
-        target=lambda: told.append(control.run("take_reference", {"frames": 8}))
+        target=lambda: outcomes.append(control.run("take_reference", {"frames": 8}))
     )
 
     def act(number: int) -> None:
@@ -180,25 +184,8 @@ def test_reference_is_taken_from_the_passing_frames(tmp_path: Path) -> None:
 
     run(FrameCamera(200, act, make=wall_frame, uri="sim"), control)
     command.join()
-    assert "reference of 8 frames" in told[0]
+    assert "reference of 8 frames" in outcomes[0]
     (bench,) = benches
     assert bench.rig is RIG
     measured = load_measured(next(tmp_path.glob("bench-*.toml")))
     np.testing.assert_array_equal(measured.reference.map_depth_m, bench.reference.map_depth_m)
-
-
-def test_pace_watch_warns_once_and_says_what_to_do() -> None:
-    told: list[tuple[str, bool]] = []
-    watch = PaceWatch(lambda text, begins: told.append((text, begins)))
-    for frames in range(0, 4 * SLOW_FRAMES, 10):
-        watch.update(frames, 0)
-    assert told == []
-    for frames in range(0, 2 * SLOW_FRAMES, 10):
-        watch.update(4 * SLOW_FRAMES + frames, frames // 2)
-    assert [begins for _, begins in told] == [True]
-    assert "--budget-ms" in told[0][0]
-    assert watch.warnings
-    for frames in range(0, 3 * SLOW_FRAMES, 10):
-        watch.update(6 * SLOW_FRAMES + frames, SLOW_FRAMES)
-    assert [begins for _, begins in told] == [True, False]
-    assert watch.warnings == ()

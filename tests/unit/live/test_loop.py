@@ -15,10 +15,9 @@ from nlos_calibration import MeasuredWall, load_rig
 from small_frames import FrameCamera, ListViewer, sheet_network, small_frame
 
 from nlos_cam.errors import CameraLostError
-from nlos_cam.live.frame_queue import QUEUE_FRAMES, FrameReader
 from nlos_cam.live.loop import pace, run_live
 from nlos_cam.live.statistics import OUTSIDE_LATENCY, STALLED, RunReport
-from nlos_cam.reconstruct import CalibratedRig, Pipeline, Verdict, frame_issues
+from nlos_cam.reconstruct import CalibratedRig, Pipeline, Verdict
 from nlos_cam.view import Moment, NullViewer
 
 RIG = load_rig("paper-rig")
@@ -103,7 +102,9 @@ def test_run_live_reports_latency_on_any_clock(offset_s: float, delivery_ms: flo
     assert report.fps == pytest.approx(30.0, rel=0.04)
     for moment in lockstep.moments[-5:]:  # once the fastest delivery is known
         parts_s = sum(
-            seconds for stage, seconds in moment.stages_s.items() if stage not in OUTSIDE_LATENCY
+            seconds
+            for stage, seconds in moment.result.stages_s.items()
+            if stage not in OUTSIDE_LATENCY
         )
         assert 0.0 <= parts_s <= moment.latency_s + 1e-6
 
@@ -123,7 +124,9 @@ def test_run_live_warns_while_the_lidar_is_moved(tmp_path: Path) -> None:
     [(warning, frames)] = report.warnings.items()
     assert [each for _, each in begins] == [True, False]
     assert begins[1][0] == warning
-    warned = [moment.frame.frame_number for moment in viewer.moments if moment.warnings]
+    warned = [
+        moment.result.frame.frame_number for moment in viewer.moments if moment.result.warnings
+    ]
     assert len(warned) == frames
     assert warned[0] in range(30, 80)
     assert warned[-1] in range(79, 150)
@@ -145,7 +148,16 @@ def test_run_live_counts_and_survives_failed_frames(caplog: pytest.LogCaptureFix
         recorded=True,
         on_moment=logged.append,
     )
-    assert [moment.frame.frame_number for moment in viewer.moments] == [0, 1, 2, 5, 6, 7, 8, 9]
+    assert [moment.result.frame.frame_number for moment in viewer.moments] == [
+        0,
+        1,
+        2,
+        5,
+        6,
+        7,
+        8,
+        9,
+    ]
     assert [moment.dropped for moment in viewer.moments] == [0, 0, 0, 2, 2, 2, 2, 2]
     assert logged == viewer.moments
     assert (report.counts, report.dropped) == ({"failed": 2}, 2)
@@ -167,7 +179,7 @@ def test_run_live_reports_before_it_raises_the_cameras_error() -> None:
 
 
 def test_run_live_ends_in_time_without_further_frames(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("nlos_cam.live.frame_queue.ABANDON_AFTER_S", 0.01)
+    monkeypatch.setattr("nlos_cam.reconstruct.frame_reader.ABANDON_AFTER_S", 0.01)
     shown = Event()
     now_s = [0.0]
     viewer = ListViewer()
@@ -218,9 +230,9 @@ class Stalling(ListViewer):
 
     def show(self, moment: Moment) -> None:
         super().show(moment)
-        if moment.frame.frame_number == 4:
+        if moment.result.frame.frame_number == 4:
             self._shown.set()
-        if sum(moment.verdict is Verdict.STALLED for moment in self.moments) == 2:
+        if sum(moment.result.verdict is Verdict.STALLED for moment in self.moments) == 2:
             self._shown_twice.set()
 
 
@@ -232,73 +244,16 @@ def test_run_live_shows_a_stall_with_the_last_moment() -> None:
         viewer.camera, pipeline(), viewer, **run, on_warning=lambda *about: begins.append(about)
     )
     frames = [
-        moment.frame.frame_number
+        moment.result.frame.frame_number
         for moment in viewer.moments
-        if moment.verdict is not Verdict.STALLED
+        if moment.result.verdict is not Verdict.STALLED
     ]
     assert frames == list(range(10))
-    again = [moment for moment in viewer.moments if moment.verdict is Verdict.STALLED]
+    again = [moment for moment in viewer.moments if moment.result.verdict is Verdict.STALLED]
     assert len(again) >= 2
-    assert {moment.frame.frame_number for moment in again} == {4}
+    assert {moment.result.frame.frame_number for moment in again} == {4}
     assert all(later.latency_s > before.latency_s for before, later in pairwise(again))
     assert begins == [(STALLED, True), (STALLED, False)]
     assert (report.frames, report.counts, report.verdicts) == (10, {"stalls": 1}, {})
     assert report.stalled_s >= 1.0
     assert {moment.celsius["ldd_temperature"] for moment in viewer.moments} == {40.0}
-
-
-PIXELS = 80 * 64
-
-
-@pytest.mark.parametrize("depths", [0, PIXELS // 2, PIXELS // 2 + 1])
-@pytest.mark.parametrize("saturated", [PIXELS // 1000, PIXELS // 1000 + 1])
-def test_frame_issues_are_named(depths: int, saturated: int) -> None:
-    frame = small_frame(0)
-    frame.depth_m.ravel()[depths:] = np.nan
-    frame.ir[:] = 254
-    frame.ir.ravel()[:saturated] = 255
-    missing = {0: ["blank"], PIXELS // 2: ["half_invalid"]}.get(depths, [])
-    assert frame_issues(frame) == missing + ["saturated"] * (saturated > PIXELS // 1000)
-
-
-def wait_for_end(reader: FrameReader) -> None:
-    """Wait until the camera has ended: the consumer is as late as can be."""
-    reader._thread.join(60.0)
-    assert not reader._thread.is_alive()
-
-
-@pytest.mark.parametrize("lossless", [True, False])
-def test_reader_yields_every_frame_or_drops_the_oldest(lossless: bool) -> None:
-    with FrameReader(FrameCamera(200), lossless=lossless, stop=Event()) as reader:
-        if not lossless:
-            wait_for_end(reader)
-        numbers = [arrival.frame.frame_number for arrival in reader]
-    assert numbers == list(range(0 if lossless else 200 - QUEUE_FRAMES, 200))
-    assert reader.dropped == list(range(numbers[0]))
-
-
-def test_reader_ends_with_the_stop_event_or_when_left() -> None:
-    stop = Event()
-    with FrameReader(FrameCamera(None), lossless=True, stop=stop) as reader:
-        for arrival in reader:
-            if arrival.frame.frame_number == 5:
-                stop.set()
-    assert not reader._thread.is_alive()
-    with FrameReader(FrameCamera(None), lossless=True, stop=Event()) as reader:
-        next(iter(reader))
-    assert not reader._thread.is_alive()
-
-
-def test_reader_closes_or_reports_a_source_that_hangs(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("nlos_cam.live.frame_queue.ABANDON_AFTER_S", 0.01)
-    release = Event()
-    source = FrameCamera(None, lambda _: release.wait(60.0))
-    with FrameReader(source, lossless=True, stop=Event(), abandon_source=release.set) as reader:
-        pass
-    assert not reader._thread.is_alive()
-    monkeypatch.setattr("nlos_cam.live.frame_queue.JOIN_TIMEOUT_S", 0.05)
-    release.clear()
-    with pytest.raises(CameraLostError), FrameReader(source, lossless=True, stop=Event()) as reader:
-        pass
-    release.set()
-    wait_for_end(reader)

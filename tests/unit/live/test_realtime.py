@@ -47,7 +47,7 @@ def system(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> System:
     return system
 
 
-def test_realtime_priority_holds_for_all_threads_until_it_is_left(system: System) -> None:
+def test_realtime_priority_holds_for_all_threads_while_entered(system: System) -> None:
     with pytest.raises(ZeroDivisionError), realtime_priority() as allowed:  # noqa: PT012  an error leaves it too
         assert allowed
         assert set(system.schedules.values()) == {(ROUND_ROBIN, LOOP)}

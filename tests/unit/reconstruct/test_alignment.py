@@ -82,7 +82,7 @@ def test_bare_bench_looks_like_the_bare_training_rig(rig: Rig) -> None:
     assert np.quantile(np.abs(np.log(ratio)), 0.95) < 0.04
 
 
-def test_networks_keep_their_silhouettes_on_a_bench_built_with_a_ruler() -> None:
+def test_networks_keep_their_silhouettes_on_aligned_benches() -> None:
     truth = np.stack([image_from_depth(one.depth_m, object_box(RIG)) for one in THINGS])
     box = object_box(RIG)
     network = reconstruct.load_networks()
@@ -158,12 +158,11 @@ def test_what_cannot_be_aligned_is_left_alone() -> None:
 
 def arrival(rig: Rig) -> Arrival:
     echoes = render(Scene(rig, None), "draft").multi
-    return Arrival(
-        Sensor(rig, QUIET).expose(echoes, np.random.default_rng(0)).frame(rig.pinhole), 0.0
-    )
+    images = Sensor(rig, QUIET).expose(echoes, np.random.default_rng(0))
+    return Arrival(images.frame(rig.pinhole), 0.0, ())
 
 
-def test_occluder_that_was_not_measured_is_taken_to_stand_as_in_training() -> None:
+def test_unmeasured_occluder_stands_as_in_training() -> None:
     rig = BENCHES["lidar 5 mm aside and up"]
     seen = maps_of(rig, THINGS[0].depth_m)
     records = (rig, rig.model_copy(update={"occluder": None}))

@@ -1,3 +1,4 @@
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import cache
 from threading import Event
@@ -15,6 +16,7 @@ from nlos_cam.objects import object_box, object_depth
 from nlos_cam.reconstruct import CalibratedRig, PeriodicPhysicsCheck, Pipeline, check_reconstruction
 from nlos_cam.reconstruct.physics_check import (
     Expected,
+    PhysicsCheckResult,
     describe_failure,
     explain,
     fit_gain,
@@ -29,10 +31,12 @@ RIGHT = np.broadcast_to(np.arange(80) >= 40, SHAPE)
 WALL_M = np.broadcast_to(np.linspace(0.2, 0.6, 80), SHAPE)
 
 
+NO_ECHO = Expected(np.full(SHAPE, np.nan), np.zeros(SHAPE), np.full(SHAPE, np.nan), np.zeros(SHAPE))
+"""Neither wall nor object."""
+
+
 def expected_object(echo_m: float = 0.5, strength: float = 4.0) -> Expected:
-    """A wall; on the right half an object's echo, so many times as strong as the wall's own
-    return.
-    """
+    """Return a wall and, on the right half, an object's echo, `strength` times the wall's own."""
     direct = np.full(SHAPE, 3e-4)
     echo = np.where(RIGHT, strength * direct, 0.0)
     return Expected(WALL_M, direct, np.where(echo > 0, echo_m + np.zeros(SHAPE), np.nan), echo)
@@ -50,17 +54,26 @@ def score(seen: LidarMaps, expected: Expected) -> float:
     return explain(seen, expected, expected.bare).score
 
 
-def test_score_is_0_of_expected_maps_1_of_an_empty_bench_and_more_of_an_object_not_there() -> None:
+def test_score_of_expected_maps_is_0_but_for_noise() -> None:
     scene = expected_object()
-    nothing = Expected(np.full(SHAPE, np.nan), np.zeros(SHAPE), *[np.zeros(SHAPE)] * 2)
     assert score(maps_of(scene), scene) == pytest.approx(0.0, abs=1e-6)
     assert score(maps_of(scene, noise_m=1e-4), scene) < 0.1
+    assert score(maps_of(scene.bare, noise_m=1e-4), scene.bare) < 0.05
+
+
+def test_score_of_an_empty_bench_for_an_object_is_1() -> None:
+    scene = expected_object()
     assert score(maps_of(scene), scene.bare) == 1.0
-    assert score(maps_of(nothing), nothing) == 0.0
-    assert score(maps_of(nothing), scene) == pytest.approx(1.0)
-    seen = maps_of(expected_object().bare, noise_m=1e-4)
-    assert score(seen, expected_object().bare) < 0.05
-    assert score(seen, expected_object(strength=20.0)) > 1.0
+
+
+def test_score_of_maps_without_any_return() -> None:
+    assert score(maps_of(NO_ECHO), NO_ECHO) == 0.0
+    assert score(maps_of(NO_ECHO), expected_object()) == pytest.approx(1.0)
+
+
+def test_score_of_an_object_that_is_not_there_is_above_1() -> None:
+    bare = maps_of(expected_object().bare, noise_m=1e-4)
+    assert score(bare, expected_object(strength=20.0)) > 1.0
 
 
 def test_score_rises_with_the_distance_from_the_object() -> None:
@@ -71,15 +84,20 @@ def test_score_rises_with_the_distance_from_the_object() -> None:
 
 
 @pytest.mark.parametrize("albedo", [0.75, 1.0, (4 / 3) ** 0.5])
-def test_explain_fits_gain_and_albedo(albedo: float) -> None:
-    maps = maps_of(expected_object(), albedo=albedo)
+def test_explain_fits_the_albedo(albedo: float) -> None:
     scene = expected_object()
-    best = explain(maps, scene, scene.bare)
+    best = explain(maps_of(scene, albedo=albedo), scene, scene.bare)
     assert best.albedo == pytest.approx(albedo, rel=1e-6)
     assert best.score == pytest.approx(0.0, abs=1e-6)
-    dimmed = explain(replace(maps, intensity=maps.intensity * np.float32(0.25)), scene, scene.bare)
-    assert dimmed.score == pytest.approx(best.score, abs=1e-6)
-    assert dimmed.gain == pytest.approx(0.25 * GAIN, rel=1e-5)
+
+
+def test_explain_fits_the_gain() -> None:
+    scene = expected_object()
+    maps = maps_of(scene)
+    dimmed = replace(maps, intensity=maps.intensity * np.float32(0.25))
+    best = explain(dimmed, scene, scene.bare)
+    assert best.gain == pytest.approx(0.25 * GAIN, rel=1e-5)
+    assert best.score == pytest.approx(explain(maps, scene, scene.bare).score, abs=1e-6)
 
 
 def test_fitted_gain_uses_the_wall_where_it_is_visible() -> None:
@@ -90,30 +108,27 @@ def test_fitted_gain_uses_the_wall_where_it_is_visible() -> None:
     assert fit_gain(replace(seen, valid=np.zeros(SHAPE, np.bool_)), expected_object().bare) == 1.0
 
 
-def test_mean_cost_counts_cells_that_wrongly_return_and_lets_equal_echoes_swap_and_full_scale_hide_light() -> (
-    None
-):
+def test_mean_cost_lets_equally_strong_echoes_swap() -> None:
+    bare = maps_of(expected_object().bare)
+    assert mean_cost(bare, expected_object(strength=1.1), GAIN, 1.0) < 0.05
+    assert mean_cost(bare, expected_object(strength=10.0), GAIN, 1.0) > 0.4
+
+
+def test_mean_cost_counts_cells_that_wrongly_return_or_do_not() -> None:
     wall = expected_object().bare
-    close, clear = (
-        mean_cost(maps_of(wall), expected_object(strength=by), GAIN, 1.0) for by in (1.1, 10.0)
-    )
-    assert close < 0.05
-    assert clear > 0.4
-    half = replace(
-        wall,
-        direct=np.where(RIGHT, 0.0, wall.direct),
-        direct_m=np.where(RIGHT, np.nan, wall.direct_m),
-    )
+    direct = np.where(RIGHT, 0.0, wall.direct)
+    half = replace(wall, direct=direct, direct_m=np.where(RIGHT, np.nan, wall.direct_m))
     assert mean_cost(maps_of(wall), half, GAIN, 1.0) == pytest.approx(0.5, abs=1e-3)
     assert mean_cost(maps_of(half), wall, GAIN, 1.0) == pytest.approx(0.5, abs=1e-3)
     assert mean_cost(maps_of(half), half, GAIN, 1.0) == pytest.approx(0.0, abs=1e-6)
-    bright = maps_of(expected_object(strength=1000.0))
-    assert bright.intensity.max() == 255
-    assert mean_cost(bright, expected_object(strength=1000.0), GAIN, 1.0) == pytest.approx(
-        0.0, abs=1e-6
-    )
-    dim = mean_cost(bright, expected_object(strength=1.5), GAIN, 1.0)
-    assert dim > 0.1
+
+
+def test_saturated_cell_explains_any_more_light() -> None:
+    bright = expected_object(strength=1000.0)
+    maps = maps_of(bright)
+    assert maps.intensity.max() == 255
+    assert mean_cost(maps, bright, GAIN, 1.0) == pytest.approx(0.0, abs=1e-6)
+    assert mean_cost(maps, expected_object(strength=1.5), GAIN, 1.0) > 0.1
 
 
 RIG = load_rig("paper-rig")
@@ -142,37 +157,55 @@ def seen(seed: int | None, noise: int = 0) -> LidarMaps:
 def test_check_scores_the_true_object_best() -> None:
     for seed in SEEDS:
         scores = {
-            one: check_reconstruction(seen(seed), hidden(one), RIG, accuracy="draft").score
-            for one in SEEDS
+            other: check_reconstruction(seen(seed), hidden(other), RIG, accuracy="draft").score
+            for other in SEEDS
         }
-        assert min(scores, key=lambda other: scores[other]) == seed
-        assert scores[seed] < 0.5 * min(score for other, score in scores.items() if other != seed)
+        own = scores.pop(seed)
+        assert own < 0.5 * min(scores.values())
 
 
 def test_check_explains_the_true_object_to_within_noise() -> None:
-    found = check_reconstruction(
-        seen(SEEDS[0]), hidden(SEEDS[0]), RIG, clock=iter([5.0, 7.5]).__next__
-    )
+    found = check_reconstruction(seen(SEEDS[0]), hidden(SEEDS[0]), RIG)
     assert found.score < 0.05
     assert np.nanquantile(np.abs(found.residual_depth_m), 0.95) < 2e-3
     assert np.nanquantile(np.abs(found.residual_intensity), 0.95) < 3
     assert found.residual_depth_m.dtype == found.residual_intensity.dtype == np.float32
+
+
+def test_check_takes_its_time_from_the_clock() -> None:
+    ticks = iter([5.0, 7.5])
+    found = check_reconstruction(seen(None), EMPTY, RIG, clock=lambda: next(ticks))
     assert found.seconds == 2.5
 
 
-def test_check_renders_the_bare_bench_once(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_check_finds_an_object_where_none_is() -> None:
     assert check_reconstruction(seen(None), hidden(SEEDS[0]), RIG).score > 1.0
-    maps = seen(SEEDS[0])
-    nan_m = np.full((64, 80), np.nan, np.float32)
-    dark = np.zeros((64, 80), np.float32)
-    monkeypatch.setattr(
-        "nlos_cam.reconstruct.physics_check.render", lambda *_: pytest.fail("rendered again")
-    )
+
+
+@pytest.fixture
+def rendered_bench(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let nothing be rendered but the bare bench, which was."""
+    check_reconstruction(seen(None), EMPTY, RIG)
+    path = "nlos_cam.reconstruct.physics_check.render"
+    monkeypatch.setattr(path, lambda *_: pytest.fail("rendered again"))
+
+
+@pytest.mark.usefixtures("rendered_bench")
+def test_bare_bench_explains_itself_and_is_rendered_once() -> None:
     assert check_reconstruction(seen(None), EMPTY, RIG).score < 0.05
-    assert check_reconstruction(maps, EMPTY, RIG).score == 1.0
-    blank = check_reconstruction(LidarMaps(nan_m, dark, dark > 0), EMPTY, RIG)
-    assert blank.score == 1.0
-    assert np.isnan(blank.residual_depth_m).all()
+
+
+def test_bare_bench_does_not_explain_an_object() -> None:
+    assert check_reconstruction(seen(SEEDS[0]), EMPTY, RIG).score == 1.0
+
+
+@pytest.mark.usefixtures("rendered_bench")
+def test_maps_without_returns_have_no_residuals() -> None:
+    nan_m = np.full(SHAPE, np.nan, np.float32)
+    dark = np.zeros(SHAPE, np.float32)
+    found = check_reconstruction(LidarMaps(nan_m, dark, dark > 0), EMPTY, RIG)
+    assert found.score == 1.0
+    assert np.isnan(found.residual_depth_m).all()
 
 
 def test_check_works_on_a_rig_without_object_box() -> None:
@@ -185,19 +218,24 @@ def test_check_works_on_a_rig_without_object_box() -> None:
     assert check_reconstruction(maps, hidden(SEEDS[0]), bare).score < 1e-3
 
 
+def checks_of(seeds: Sequence[int]) -> dict[int, PhysicsCheckResult]:
+    """Return the checks of objects, in this order, against the first one's shape."""
+    checks = PeriodicPhysicsCheck(RIG, every=1, accuracy="draft")
+    found = {}
+    for seed in seeds:
+        checks.offer(seed, seen(seed), hidden(SEEDS[0]))
+        found[seed] = checks.newest
+    return found
+
+
 def test_periodic_check_is_independent_of_earlier_frames() -> None:
-    forwards = {}
-    backwards = {}
-    for found, order in ((forwards, SEEDS), (backwards, SEEDS[::-1])):
-        checks = PeriodicPhysicsCheck(RIG, every=1, accuracy="draft")
-        for seed in order:
-            checks.offer(seed, seen(seed), hidden(SEEDS[0]))
-            found[seed] = checks.newest
-    for seed in SEEDS:
-        assert (forwards[seed].frame_number, forwards[seed].score) == (seed, backwards[seed].score)
-        np.testing.assert_array_equal(
-            forwards[seed].residual_depth_m, backwards[seed].residual_depth_m
-        )
+    forwards = checks_of(SEEDS)
+    backwards = checks_of(SEEDS[::-1])
+    for seed, one in forwards.items():
+        other = backwards[seed]
+        assert one.frame_number == seed
+        assert one.score == other.score
+        np.testing.assert_array_equal(one.residual_depth_m, other.residual_depth_m)
 
 
 def test_periodic_check_reports_a_failure_once(caplog: pytest.LogCaptureFixture) -> None:
@@ -217,4 +255,4 @@ def test_live_loop_shows_the_newest_check_with_each_frame() -> None:
     checks = PeriodicPhysicsCheck(RIG, every=2, accuracy="draft")
     pipeline = Pipeline(CalibratedRig(RIG), sheet_network, checks=checks)
     run_live(WallCamera(5, period_s=0.0), pipeline, viewer, stop=Event(), recorded=True)
-    assert [moment.check.frame_number for moment in viewer.moments] == [0, 0, 2, 2, 4]
+    assert [moment.result.check.frame_number for moment in viewer.moments] == [0, 0, 2, 2, 4]

@@ -26,21 +26,17 @@ from nlos_calibration.rig import load_rig
 from small_frames import SheetNetwork, sheet_network
 
 from nlos_cam.frames import LidarMaps, maps_from_frame
-from nlos_cam.live import FrameReader
-from nlos_cam.live.loop import (
-    BATCH_FRAMES,
-    MAX_BATCHES_AHEAD,
-    iterate_batched,
-    iterate_results,
-    with_telemetry,
-)
 from nlos_cam.reconstruct import (
     Clock,
     FrameConditions,
+    FrameReader,
     FrameResult,
     Pipeline,
     Verdict,
     build_pipeline,
+    frame_issues,
+    iterate_batched,
+    iterate_results,
     load_networks,
 )
 from nlos_cam.reconstruct.bench import (
@@ -51,6 +47,8 @@ from nlos_cam.reconstruct.bench import (
 )
 from nlos_cam.reconstruct.physics_check import PeriodicPhysicsCheck, PhysicsCheckResult
 from nlos_cam.reconstruct.pipeline import compatibility_warnings, frame_conditions
+from nlos_cam.reconstruct.streaming import BATCH_FRAMES, MAX_BATCHES_AHEAD
+from nlos_cam.recording import with_telemetry
 
 
 def all_steps(
@@ -64,7 +62,7 @@ def all_steps(
     ):
         if ahead:
             return list(iterate_batched(reader, pipeline, clock, telemetry))
-        return list(iterate_results(reader, pipeline, clock, telemetry=telemetry))
+        return list(iterate_results(reader, pipeline, clock, temperatures=telemetry))
 
 
 @pytest.fixture
@@ -201,7 +199,8 @@ def test_frame_conditions_follow_frame_issues_and_bench(missing: int, saturated:
         wall_frame(0), depth_m=depth_m, ir=np.full((64, 80), 255 if saturated else 9, np.uint8)
     )
     check = PhysicsCheckResult(0, depth_m, depth_m, score=1.0, seconds=0.0)
-    conditions = frame_conditions(frame, BenchObservation(None, (), moved=saturated), check)
+    observation = BenchObservation(None, (), moved=saturated)
+    conditions = frame_conditions(frame_issues(frame), observation, check)
     assert conditions == FrameConditions(saturated, missing > 0, moved=saturated, check=check)
 
 
@@ -214,7 +213,7 @@ def trained(
     return SimpleNamespace(rig_name=rig_name, rig_checksum=rig_checksum, input=eats)
 
 
-def test_warnings_name_what_differs_from_training_and_a_wall_without_reference(
+def test_warnings_name_mismatches_with_the_training(
     walled: CalibratedRig,
 ) -> None:
     farther = RIG.model_copy(update={"lidar": RIG.lidar.model_copy(update={"distance_m": 0.3})})
@@ -273,9 +272,7 @@ def observe(bench: CalibratedRig, number: int = 0, nearer_m: float = 0.0) -> Ben
     return bench.observe(frame, maps_from_frame(frame))
 
 
-def test_open_bench_takes_rig_and_reference_from_a_record_or_the_rig_of_the_camera(
-    wall: Path, tmp_path: Path
-) -> None:
+def test_open_bench_takes_a_record_or_the_cameras_rig(wall: Path, tmp_path: Path) -> None:
     own = RIG.model_copy(update={"name": "own"})
     assert open_bench(None, camera(rig=own)).rig is own
     assert open_bench(None, camera(rig=load_rig("bare-wall"))).rig == RIG
@@ -295,7 +292,7 @@ def test_open_bench_takes_rig_and_reference_from_a_record_or_the_rig_of_the_came
     assert observe(bare).difference is None
 
 
-def test_difference_of_the_bare_wall_is_noise_without_range_drift(walled: CalibratedRig) -> None:
+def test_difference_of_the_bare_wall_is_noise_less_drift(walled: CalibratedRig) -> None:
     levels_m = list[float]()
     for number in range(100, 160):
         difference = observe(walled, number, nearer_m=0.0006).difference

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from made_up_moments import NOTHING, RIG, full_moment, moment
+from made_up_moments import NOTHING, RIG, full_moment, moment, with_result
 from measured_walls import HEIGHT, WIDTH, exact_wall
 from nlos_calibration import MeasuredWall, normal_from_angles, wall_from_plane
 from PIL import Image
@@ -26,7 +26,7 @@ def flat(z_m: float) -> np.ndarray:
     return np.full((64, 64), z_m, np.float32)
 
 
-def test_pictures_are_brighter_when_nearer_noisier_or_of_more_counts() -> None:
+def test_pictures_brighten_with_nearness_noise_and_counts() -> None:
     nearer = np.concatenate(
         [images.hidden_rgb(flat(z_m), BOX)[:1, :1] for z_m in (np.nan, 0.4, 0.25, 0.13)], axis=1
     )
@@ -47,7 +47,7 @@ def test_depth_pictures_show_missing_depth_as_background() -> None:
     ).tolist() == [[5, 6]]
 
 
-def test_near_is_red_and_far_is_blue_and_a_difference_of_none_is_grey() -> None:
+def test_near_is_red_far_is_blue_and_equal_is_grey() -> None:
     near, far = images.lidar_rgb(np.array([[0.1, 1.0]], np.float32), 0.1, 1.0)[0]
     assert near[0] > near[2]
     assert far[2] > far[0]
@@ -173,7 +173,7 @@ def test_wall_outline_is_closed_finite_and_on_the_wall() -> None:
     )
 
 
-def test_wall_pictures_need_a_reference_and_are_dark_without_returns() -> None:
+def test_wall_pictures_need_a_reference_and_returns() -> None:
     assert wall_pictures(exact_wall(reference=None)) == {}
     pictures = wall_pictures(
         exact_wall(depth_m=UNSEEN, depth_std_m=UNSEEN, ir=UNSEEN, inliers=UNSEEN > 0)
@@ -205,7 +205,7 @@ def test_saturated_pixel_survives_thinning() -> None:
     assert np.argwhere((picture == images.SATURATED_RGB).all(axis=-1)).tolist() == [[150, 8]]
 
 
-def test_calibration_facts_begin_with_the_verdict_and_note_a_missing_reference() -> None:
+def test_calibration_facts_have_verdict_and_missing_reference() -> None:
     record = exact_wall().record
     facts = calibration_facts(record)
     assert facts[0][:2] == ["verdict", record.verdict]
@@ -217,7 +217,7 @@ def test_calibration_facts_begin_with_the_verdict_and_note_a_missing_reference()
 
 def test_film_holds_every_second_frame(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     path = tmp_path / "film.webm"
-    with VideoFile(path, RIG) as film:
+    with VideoFile(path) as film:
         for number in range(20):
             film.show(full_moment(number))
     video = cv2.VideoCapture(str(path))
@@ -227,7 +227,7 @@ def test_film_holds_every_second_frame(tmp_path: Path, capfd: pytest.CaptureFixt
         frames.append(got[1][..., ::-1])
     assert len(frames) == film.filmed == 10
     assert {frame.shape for frame in frames} == {(layout.HEIGHT, layout.WIDTH, 3)}
-    expected = Still(RIG, full_moment(0)).rgb(full_moment(0)).astype(int)
+    expected = Still(full_moment(0)).rgb(full_moment(0)).astype(int)
     assert np.abs(frames[0] - expected).mean() < 6.0
     assert (np.abs(frames[0].astype(int) - frames[-1]).max(axis=-1) > 60).mean() > 0.005, "it moves"
     content = path.read_bytes()
@@ -239,7 +239,7 @@ def test_film_holds_every_second_frame(tmp_path: Path, capfd: pytest.CaptureFixt
 
 def test_film_refuses_a_missing_codec(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("nlos_cam.view.video.CODEC", "none")
-    with pytest.raises(NlosCamError, match="none codec"), VideoFile(tmp_path / "film.webm", RIG):
+    with pytest.raises(NlosCamError, match="none codec"), VideoFile(tmp_path / "film.webm"):
         pass
 
 
@@ -269,35 +269,43 @@ def changed(before: np.ndarray, after: np.ndarray) -> set[str]:
     return {name for name in PANELS if (panel(before, name) != panel(after, name)).any()}
 
 
-def test_still_shows_each_part_of_a_moment_in_its_panel_and_marks_a_doubted_reconstruction() -> (
-    None
-):
+def other_still(**fields: Any) -> set[str]:
+    """Return the panels that change with other fields of the result."""
     one = full_moment(0)
-    frame = one.frame
-    still = Still(RIG, one)
-    before = still.rgb(one)
-    assert before.shape == (layout.HEIGHT, layout.WIDTH, 3)
-    for panels, others in (
-        ({"truth"}, {"frame": replace(frame, truth_depth_m=NOTHING)}),
-        ({"infrared"}, {"frame": replace(frame, ir=frame.ir + 90)}),
-        ({"depth"}, {"frame": replace(frame, depth_m=frame.depth_m * np.float32(0.5))}),
-        ({"footer"}, {"latency_s": 0.5, "published_s": 0.5}),
-        ({"uncertainty"}, {"reconstruction": replace(one.reconstruction, uncertainty_m=flat(0.0))}),
-        *(
-            ({"banner", "reconstruction"}, {"verdict": verdict})
-            for verdict in Verdict
-            if verdict is not Verdict.SEEN
-        ),
-    ):
-        assert changed(before, still.rgb(replace(one, **others))) == panels
-    assert (
-        panel(Still(RIG, moment(0)).rgb(moment(0, NOTHING)), "reconstruction")
-        == images.BACKGROUND_RGB
-    ).all()
+    still = Still(one)
+    return changed(still.rgb(one), still.rgb(with_result(one, **fields)))
+
+
+def test_still_shows_each_part_of_a_frame_in_its_panel() -> None:
+    frame = full_moment(0).result.frame
+    halved_m = frame.depth_m * np.float32(0.5)
+    assert Still(full_moment(0)).rgb(full_moment(0)).shape == (layout.HEIGHT, layout.WIDTH, 3)
+    assert other_still(frame=replace(frame, truth_depth_m=NOTHING)) == {"truth"}
+    assert other_still(frame=replace(frame, ir=frame.ir + 90)) == {"infrared"}
+    assert other_still(frame=replace(frame, depth_m=halved_m)) == {"depth"}
+
+
+def test_still_shows_uncertainty_and_times_in_their_panels() -> None:
+    one = full_moment(0)
+    certain = replace(one.result.reconstruction, uncertainty_m=flat(0.0))
+    assert other_still(reconstruction=certain) == {"uncertainty"}
+    still = Still(one)
+    later = replace(one, latency_s=0.5, time_s=0.5)
+    assert changed(still.rgb(one), still.rgb(later)) == {"footer"}
+
+
+@pytest.mark.parametrize("verdict", [verdict for verdict in Verdict if verdict != Verdict.SEEN])
+def test_still_marks_an_uncertain_reconstruction(verdict: Verdict) -> None:
+    assert other_still(verdict=verdict) == {"banner", "reconstruction"}
+
+
+def test_still_of_nothing_shows_the_background() -> None:
+    rgb = Still(moment(0)).rgb(moment(0, NOTHING))
+    assert (panel(rgb, "reconstruction") == images.BACKGROUND_RGB).all()
 
 
 def test_still_keeps_lidar_pictures_until_new_ones() -> None:
-    still = Still(RIG, full_moment(0))
+    still = Still(full_moment(0))
     first, kept, new = (
         still.rgb(full_moment(number), with_lidar=number != 3) for number in (0, 3, 6)
     )
@@ -308,7 +316,7 @@ def test_still_keeps_lidar_pictures_until_new_ones() -> None:
 
 def test_still_is_saved_as_png(tmp_path: Path) -> None:
     one = full_moment(0, size=(480, 640))
-    Still(RIG, one).save(tmp_path / "still.png", one)
+    Still(one).save(tmp_path / "still.png", one)
     with Image.open(tmp_path / "still.png") as image:
         assert (image.format, image.size) == ("PNG", (layout.WIDTH, layout.HEIGHT))
 

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from made_up_moments import NOTHING, RIG, bump, full_moment, moment
+from made_up_moments import NOTHING, RIG, bump, full_moment, moment, with_result
 from measured_walls import exact_wall
 from view_streams import ask, messages, messages_of, saved_moments
 
@@ -21,7 +21,7 @@ from nlos_cam.errors import RecordingError
 from nlos_cam.objects import object_box
 from nlos_cam.reconstruct.network import Quality, Uncertainty
 from nlos_cam.reconstruct.verdict import Verdict
-from nlos_cam.view import PlaybackViewer, RecordedView, WebViewer
+from nlos_cam.view import Moment, PlaybackViewer, RecordedView, WebViewer
 from nlos_cam.view.assessment import RGB, assess, expected_error_m, expected_overlap
 from nlos_cam.view.messages import (
     ERROR_STEP_M,
@@ -153,15 +153,15 @@ def test_playback_keeps_every_moment_for_every_browser() -> None:
 
 @pytest.mark.parametrize(
     ("content", "advice"),
-    [(None, "cannot be read"), (b"something else", "--save-view"), (b"RRF2 old", "rerun")],
+    [(None, "cannot be read"), (b"something else", "--save-view")],
 )
 def test_recorded_view_refuses_other_files(
     tmp_path: Path, content: bytes | None, advice: str
 ) -> None:
     if content is not None:
-        (tmp_path / "other.rrd").write_bytes(content)
-    with pytest.raises(RecordingError, match=rf"other\.rrd.*{advice}"):
-        RecordedView(tmp_path / "other.rrd")
+        (tmp_path / "other.html").write_bytes(content)
+    with pytest.raises(RecordingError, match=rf"other\.html.*{advice}"):
+        RecordedView(tmp_path / "other.html")
 
 
 @pytest.fixture
@@ -210,7 +210,7 @@ def test_session_that_cannot_be_written_is_an_error(
         session.show(moment(0))
 
 
-def test_viewers_all_see_every_moment_and_none_stays_open_if_one_cannot_begin() -> None:
+def test_viewers_show_every_moment_and_begin_all_or_none() -> None:
     some = [MagicMock(address=address) for address in (None, "http://one", "http://two")]
     shown = moment(7)
     with Viewers(some) as viewers:
@@ -260,31 +260,31 @@ def test_bytes_keep_depth_to_a_step_and_differences_symmetric() -> None:
     ]
 
 
-def test_moment_message_holds_every_layer_and_lidar_pictures_if_requested() -> None:
+def test_moment_message_holds_layers_and_requested_pictures() -> None:
     shown = full_moment(3, size=(480, 640))
-    fields, arrays = unpack(MomentPacker(RIG).pack(shown))
+    fields, arrays = unpack(MomentPacker().pack(shown))
     assert {"depth", "truth", "error", "lidar", "infrared", "change", "residual"} == set(arrays)
     assert arrays["lidar"].shape == (160, 214)
     assert fields["frame"] == 3
     assert fields["stages_ms"]["network"] > 0
     np.testing.assert_allclose(
-        arrays["error"] * ERROR_STEP_M, shown.reconstruction.uncertainty_m, atol=ERROR_STEP_M
+        arrays["error"] * ERROR_STEP_M, shown.result.uncertainty_m, atol=ERROR_STEP_M
     )
-    _, small = unpack(MomentPacker(RIG).pack(shown, with_lidar=False))
+    _, small = unpack(MomentPacker().pack(shown, with_lidar=False))
     assert {*arrays} - {*small} == {"lidar", "infrared", "change", "residual"}
 
 
 def test_moment_without_surface_sends_uncertainty_in_valid_json() -> None:
     shown = full_moment(0)
-    empty = replace(shown, reconstruction=replace(shown.reconstruction, depth_m=NOTHING))
-    _, arrays = unpack(MomentPacker(RIG).pack(empty))
+    reconstruction = replace(shown.result.reconstruction, depth_m=NOTHING)
+    empty = with_result(shown, reconstruction=reconstruction)
+    _, arrays = unpack(MomentPacker().pack(empty))
     assert not arrays["depth"].any()
     assert arrays["error"].any()
     shown = moment(0, NOTHING)
-    dark = replace(
-        shown, frame=replace(shown.frame, depth_m=np.full_like(shown.frame.depth_m, np.nan))
-    )
-    fields, arrays = unpack(MomentPacker(RIG).pack(dark))
+    frame = shown.result.frame
+    dark = with_result(shown, frame=replace(frame, depth_m=np.full_like(frame.depth_m, np.nan)))
+    fields, arrays = unpack(MomentPacker().pack(dark))
     json.dumps(fields, allow_nan=False)
     assert not arrays["lidar"].any()
 
@@ -303,28 +303,30 @@ def test_bench_message_names_every_part(measured: object) -> None:
 
 def with_uncertainty(
     surface: np.ndarray, error_m: float = 0.017, quality: Quality | None = None
-) -> object:
+) -> Moment:
     shown = full_moment(0)
     spread_m = np.full((64, 64), error_m, np.float32)
-    doubt = Uncertainty(0.0, 0.0, spread_m, surface.astype(np.float32), quality)
-    return replace(
-        shown,
-        reconstruction=replace(shown.reconstruction, uncertainty=doubt, uncertainty_m=spread_m),
+    uncertainty = Uncertainty(0.0, 0.0, spread_m, surface.astype(np.float32), quality)
+    reconstruction = replace(
+        shown.result.reconstruction, uncertainty=uncertainty, uncertainty_m=spread_m
     )
+    return with_result(shown, reconstruction=reconstruction)
 
 
-def test_expected_overlap_is_exact_for_certain_pixels_and_needs_a_surface() -> None:
+def test_expected_overlap_is_exact_for_certain_pixels() -> None:
     mask = np.isfinite(bump(0))
     half = mask & (np.arange(64) < np.argwhere(mask)[:, 1].mean())
     for surface, overlap in ((mask, 1.0), (half, half.sum() / mask.sum()), (~mask, 0.0)):
-        assert expected_overlap(with_uncertainty(surface).reconstruction) == pytest.approx(overlap)  # type: ignore[attr-defined]
-    assert expected_overlap(full_moment(0).reconstruction) is None
-    assert expected_overlap(moment(0, NOTHING).reconstruction) is None
-    assert expected_error_m(moment(0).reconstruction) is None
+        assert expected_overlap(with_uncertainty(surface).result.reconstruction) == pytest.approx(
+            overlap
+        )
+    assert expected_overlap(full_moment(0).result.reconstruction) is None
+    assert expected_overlap(moment(0, NOTHING).result.reconstruction) is None
+    assert expected_error_m(moment(0).result.reconstruction) is None
 
 
 def test_detected_object_is_graded_by_the_models_numbers() -> None:
-    told = assess(with_uncertainty(0.71 * np.isfinite(bump(0))))  # type: ignore[arg-type]
+    told = assess(with_uncertainty(0.71 * np.isfinite(bump(0))))
     assert "71%" in told.detail
     assert "17 mm" in told.detail
     assert told.trusted
@@ -336,18 +338,18 @@ def test_only_a_trusted_quality_of_a_detected_object_is_green(
     trusted: bool, verdict: Verdict
 ) -> None:
     predicted = Quality((0.58, 0.71, 0.82), 0.6, 0.017, trusted=trusted)
-    shown = replace(with_uncertainty(np.ones((64, 64)), quality=predicted), verdict=verdict)  # type: ignore[type-var]
-    told = assess(shown)  # type: ignore[arg-type]
+    shown = with_result(with_uncertainty(np.ones((64, 64)), quality=predicted), verdict=verdict)
+    told = assess(shown)
     assert (told.tone == "good") == (trusted and verdict is Verdict.SEEN)
     if verdict is Verdict.SEEN:
         assert told.detail == "outline typically 71% right (58% to 82%), depth to 17 mm"
 
 
 @pytest.mark.parametrize("verdict", [*Verdict, None])
-def test_no_assessment_is_green_and_only_a_detected_shape_is_trusted(
+def test_only_a_detected_shape_is_trusted_and_none_is_green(
     verdict: Verdict | None,
 ) -> None:
-    told = assess(replace(full_moment(0), verdict=verdict))
+    told = assess(with_result(full_moment(0), verdict=verdict))
     assert told.trusted == (verdict in {Verdict.SEEN, None})
     red, green, blue = told.rgb
     assert green < max(red, blue)

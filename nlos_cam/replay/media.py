@@ -4,17 +4,16 @@ import shutil
 from collections.abc import Generator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from types import MappingProxyType
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
+from nlos_calibration.arrays import Float32
 
-from nlos_cam import view as view_package  # loads its heavy parts when they are used
-from nlos_cam.live.object_files import ObjectFiles
+from nlos_cam import view as views
 from nlos_cam.objects import object_box
 from nlos_cam.reconstruct import CalibratedRig, FrameResult
+from nlos_cam.replay.object_files import ObjectFiles
 from nlos_cam.report import figure_of
-from nlos_cam.view import MAX_UNCERTAINTY_M, Moment, Viewer
 
 VIEW = "view.html"
 VIDEO = "replay.webm"
@@ -23,7 +22,7 @@ STILLS = "still-*.png"
 OBJECT = "object"
 """Folder of the hidden objects' files."""
 USUAL_PERCENT = 95
-Images = list[NDArray[np.float32]]
+Images = list[Float32]
 
 
 class FrameSampler:
@@ -43,15 +42,13 @@ class FrameSampler:
         self._count += 1
         if len(self._results) > 2 * self._size:
             self._results = self._results[::2]
-            self._stride = self._stride * 2
+            self._stride *= 2
 
     def results(self) -> list[FrameResult]:
         """Return at most `size` results in order, the first one included."""
         count = min(self._size, len(self._results))
-        return [
-            self._results[i]
-            for i in np.linspace(0, len(self._results) - 1, count).round().astype(int)
-        ]
+        spread = np.linspace(0, len(self._results) - 1, count).round().astype(int)
+        return [self._results[index] for index in spread]
 
 
 class ReplayMedia:
@@ -78,7 +75,7 @@ class ReplayMedia:
         self._formats = objects
         self._every = every
         self._objects: ObjectFiles | None = None
-        self._viewers: list[Viewer] = []
+        self._viewers: list[views.Viewer] = []
         self._stills = FrameSampler(stills) if stills else None
         self._names: set[str] = set()
 
@@ -88,34 +85,32 @@ class ReplayMedia:
         rig = self._bench.rig
         if self._view:
             self._viewers.append(
-                view_package.SessionFile(folder / VIEW, rig, self._bench.measured, keeps_all=True)
+                views.SessionFile(folder / VIEW, rig, self._bench.measured, keeps_all=True)
             )
         if self.video:
-            self._viewers.append(view_package.VideoFile(folder / VIDEO, rig))
+            self._viewers.append(views.VideoFile(folder / VIDEO))
         if self._formats:
             self._objects = ObjectFiles(
                 folder / OBJECT, object_box(rig), self._formats, self._every
             )
-        with view_package.Viewers(self._viewers):
+        with views.Viewers(self._viewers):
             yield
         if self._stills:
-            moments = [moment_of(result) for result in self._stills.results()]
+            moments = [views.Moment.recorded(result) for result in self._stills.results()]
             for moment in moments:
-                view_package.Still(rig, moments[0]).save(
-                    folder / STILL.format(moment.frame.frame_number), moment
-                )
+                path = folder / STILL.format(moment.result.frame_number)
+                views.Still(moments[0]).save(path, moment)
         self._names = {path.name for path in _media_in(folder)}
 
     def add(self, result: FrameResult, celsius: Mapping[str, float]) -> None:
         if self._viewers:
-            moment = moment_of(result, celsius)
+            moment = views.Moment.recorded(result, celsius)
             for viewer in self._viewers:
                 viewer.show(moment)
         if self._stills:
             self._stills.add(result)
         if self._objects:
-            made = result.reconstruction
-            self._objects.add(result.frame.frame_number, made.depth_m, made.uncertainty_m)
+            self._objects.add(result.frame_number, result.depth_m, result.uncertainty_m)
 
     def remove_stale(self, out: Path) -> None:
         """Remove the media of an earlier replay from a folder."""
@@ -130,22 +125,13 @@ def _media_in(folder: Path) -> list[Path]:
     )
 
 
-def moment_of(result: FrameResult, celsius: Mapping[str, float] = MappingProxyType({})) -> Moment:
-    """Return the moment of a recorded frame, at its timestamp; the latency is the sum of its
-    stages.
-    """
-    return Moment(
-        result.frame,
-        result.reconstruction,
-        published_s=result.frame.timestamp_s,
-        latency_s=sum(seconds for name, seconds in result.stages_s.items() if name != "wait"),
-        difference=result.difference,
-        warnings=result.warnings,
-        verdict=result.verdict,
-        check=result.check,
-        stages_s=result.stages_s,
-        celsius=celsius,
-    )
+class Row(NamedTuple):
+    """Images of one kind, an image per frame, drawn at one scale."""
+
+    title: str
+    color_map: str
+    limits: tuple[float, float]
+    images: Images
 
 
 def draw_contact_sheet(path: Path, results: list[FrameResult]) -> None:
@@ -154,43 +140,42 @@ def draw_contact_sheet(path: Path, results: list[FrameResult]) -> None:
 
     The title of a column is its verdict; rows without any image are left out.
     """
-    rows = _rows(results)
+    rows = [row for row in _rows(results) if row.images]
     figure = figure_of(2.2 * len(results) + 1, 6.5 * len(rows) / 3)
     grid = figure.subplots(len(rows), len(results), squeeze=False)
-    for axes, (title, (colormap, (low, high), images)) in zip(grid, rows.items(), strict=True):
+    for axes, row in zip(grid, rows, strict=True):
+        low, high = row.limits
         drawn = [
-            axis.imshow(image, colormap, vmin=low, vmax=high)
-            for axis, image in zip(axes, images, strict=True)
+            axis.imshow(image, row.color_map, vmin=low, vmax=high)
+            for axis, image in zip(axes, row.images, strict=True)
         ]
-        figure.colorbar(drawn[0], ax=list(axes), label=title)
+        figure.colorbar(drawn[0], ax=list(axes), label=row.title)
         for axis in axes:
             axis.set_axis_off()
+
     for axis, result in zip(grid[0], results, strict=True):
-        verdict = [result.verdict] if result.verdict else []
-        axis.set_title("\n".join([f"frame {result.frame.frame_number}", *verdict]))
+        title = f"frame {result.frame_number}"
+        axis.set_title(f"{title}\n{result.verdict}" if result.verdict else title)
     figure.savefig(path, dpi=80)
 
 
-def _rows(results: list[FrameResult]) -> dict[str, tuple[str, tuple[float, float], Images]]:
-    """Return color map, limits and images of each row of the sheet, by title."""
-    depths_m = [each.maps.depth_m for each in results]
-    intensities = [each.maps.intensity for each in results]
+def _rows(results: list[FrameResult]) -> list[Row]:
+    lidar_m = [each.maps.depth_m for each in results]
+    counts = [each.maps.intensity for each in results]
     differences_mm = [1e3 * each.difference.depth_m for each in results if each.difference]
-    reconstructions = [each.reconstruction for each in results]
-    hidden_m = [each.depth_m for each in reconstructions]
+    hidden_m = [each.depth_m for each in results]
     uncertainties_mm = [
         np.where(np.isnan(each.depth_m), np.float32(np.nan), 1e3 * each.uncertainty_m)
-        for each in reconstructions
+        for each in results
         if each.uncertainty_m is not None
     ]
-    rows = {
-        "lidar depth (m)": ("turbo_r", _limits(depths_m), depths_m),
-        "infrared (counts)": ("gray", _limits(intensities), intensities),
-        "difference (mm)": ("coolwarm", _symmetric_limits(differences_mm), differences_mm),
-        "hidden depth (m)": ("inferno_r", _limits(hidden_m), hidden_m),
-        "uncertainty (mm)": ("viridis", (0.0, 1e3 * MAX_UNCERTAINTY_M), uncertainties_mm),
-    }
-    return {title: row for title, row in rows.items() if row[2]}
+    return [
+        Row("lidar depth (m)", "turbo_r", _limits(lidar_m), lidar_m),
+        Row("infrared (counts)", "gray", _limits(counts), counts),
+        Row("difference (mm)", "coolwarm", _symmetric_limits(differences_mm), differences_mm),
+        Row("hidden depth (m)", "inferno_r", _limits(hidden_m), hidden_m),
+        Row("uncertainty (mm)", "viridis", (0.0, 1e3 * views.MAX_UNCERTAINTY_M), uncertainties_mm),
+    ]
 
 
 def _limits(images: Images) -> tuple[float, float]:
@@ -207,7 +192,7 @@ def _symmetric_limits(images: Images) -> tuple[float, float]:
     return -limit, limit
 
 
-def _finite(images: Images) -> NDArray[np.float32]:
+def _finite(images: Images) -> Float32:
     return np.concatenate(
         [np.empty(0, np.float32), *(image[np.isfinite(image)] for image in images)]
     )

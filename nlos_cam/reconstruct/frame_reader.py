@@ -1,13 +1,15 @@
-"""Reader thread between a camera and the loop, so that a slow loop never blocks the camera."""
+"""Reader thread between a camera and a loop, so that a slow loop never blocks the camera."""
 
 import time
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
 from threading import Event, Thread
-from typing import Self
+from typing import NamedTuple, Self
 
 from nlos_cam.errors import CameraLostError
 from nlos_cam.frames import Frame
-from nlos_cam.reconstruct import Arrival, Clock
+from nlos_cam.reconstruct.network import Clock
+from nlos_cam.reconstruct.verdict import frame_issues
 from nlos_cam.threads import BoundedQueue
 
 QUEUE_FRAMES = 3
@@ -20,6 +22,16 @@ SAME_CLOCK_S = 10.0
 """Timestamps this close to the host's time of day are host time; others have a zero of their
 own.
 """
+
+
+class Arrival(NamedTuple):
+    """Frame as the reader received it."""
+
+    frame: Frame
+    arrived_s: float
+    """Time at which the reader received the frame."""
+    issues: tuple[str, ...]
+    """See `frame_issues`."""
 
 
 def ignore(*_: object) -> None:
@@ -49,6 +61,8 @@ class FrameReader:
     ) -> None:
         self.dropped: list[int] = []
         """Frame numbers."""
+        self.issues = Counter[str]()
+        """Number of frames by issue, dropped ones included."""
         self.newest_s: float | None = None
         """Arrival of the newest frame; None before the first."""
         self._shortest_delay_s = float("inf")
@@ -82,6 +96,7 @@ class FrameReader:
             has_item = self._queue.wait_for_item(POLL_S)
             if self._is_done:
                 return
+
             if not has_item:
                 self._on_idle()
             elif (arrival := self._queue.take()) is not None:
@@ -92,24 +107,25 @@ class FrameReader:
     def _read(self) -> None:
         try:
             for frame in self._frames:
-                if not self._put(Arrival(frame, self._clock())):
+                issues = frame_issues(frame)
+                self.issues.update(issues)
+                self._put(Arrival(frame, self._clock(), issues))
+                if self._queue.finished or self._stop.is_set():
                     return
         except BaseException as error:  # noqa: BLE001  whatever it was, the consumer raises it
             self._queue.finish(error)
         finally:
             self._queue.finish()
 
-    def _put(self, arrival: Arrival) -> bool:
-        """Queue a frame; return False once no more are wanted."""
+    def _put(self, arrival: Arrival) -> None:
         while self._lossless and not self._queue.wait_for_room(POLL_S) and not self._stop.is_set():
             pass
         self.newest_s = arrival.arrived_s
-        self._shortest_delay_s = min(
-            self._shortest_delay_s, arrival.arrived_s - arrival.frame.timestamp_s
-        )
-        if (dropped := self._queue.put(arrival)) is not None:
+        delay_s = arrival.arrived_s - arrival.frame.timestamp_s
+        self._shortest_delay_s = min(self._shortest_delay_s, delay_s)
+        dropped = self._queue.put(arrival)
+        if dropped is not None:
             self.dropped.append(dropped.frame.frame_number)
-        return not (self._queue.finished or self._stop.is_set())
 
     @property
     def offset_s(self) -> float:

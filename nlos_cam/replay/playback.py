@@ -2,8 +2,6 @@
 exported.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from datetime import datetime
 from functools import cached_property
@@ -13,15 +11,21 @@ from typing import Any
 
 from nlos_models import Reconstructor, UncertaintyModel
 
-from nlos_cam import reconstruct as pipelines
-from nlos_cam.camera import Camera
+from nlos_cam.camera import Camera, open_camera
 from nlos_cam.errors import NlosCamError, RecordingError
-from nlos_cam.live.control import save_moment
-from nlos_cam.live.frame_queue import FrameReader
-from nlos_cam.live.loop import iterate_batched
-from nlos_cam.live.replay_media import moment_of
-from nlos_cam.live.telemetry import with_telemetry
-from nlos_cam.view import PlaybackViewer
+from nlos_cam.reconstruct import (
+    CalibratedRig,
+    FrameReader,
+    PeriodicPhysicsCheck,
+    PhysicsCheck,
+    Pipeline,
+    build_pipeline,
+    iterate_batched,
+    load_networks,
+    load_uncertainty,
+)
+from nlos_cam.recording import with_telemetry
+from nlos_cam.view import Moment, PlaybackViewer, save_moment
 
 
 class Playback(PlaybackViewer):
@@ -33,19 +37,19 @@ class Playback(PlaybackViewer):
     def __init__(
         self,
         camera: Camera,
-        bench: pipelines.CalibratedRig,
+        bench: CalibratedRig,
         *,
         folder: Path = Path(),
         host: str,
         port: int | None = None,
     ) -> None:
         super().__init__(bench.rig, bench.measured, host=host, port=port, controls=self)
-        self._camera = camera
-        self._measured_bench = bench
-        self._folder = folder
-        self._exporting = Lock()
         self.frames = 0
         """Frames reconstructed so far."""
+        self._camera = camera
+        self._calibrated = bench
+        self._folder = folder
+        self._exporting = Lock()
         self._state = "loading the networks"
 
     def reconstruct(self, stop: Event) -> None:
@@ -54,12 +58,13 @@ class Playback(PlaybackViewer):
         """
         with self._camera as camera:
             frames, telemetry = with_telemetry(camera)
-            pipeline = self._pipeline(checks=True)
+            pipeline = self._pipeline(PeriodicPhysicsCheck(self._calibrated.rig))
             self._state = "reconstructing"
             with FrameReader(frames, lossless=True, stop=stop) as reader, pipeline.checks:
-                for result in iterate_batched(reader, pipeline, telemetry=telemetry):
-                    self.show(moment_of(result, telemetry.celsius))
+                for result in iterate_batched(reader, pipeline, temperatures=telemetry):
+                    self.show(Moment.recorded(result, telemetry.celsius))
                     self.frames += 1
+
         if not self.frames and not stop.is_set():
             raise RecordingError(
                 f"{camera.uri} has no frame with depth, infrared and confidence: record it again"
@@ -69,31 +74,30 @@ class Playback(PlaybackViewer):
 
     @cached_property
     def _networks(self) -> tuple[Reconstructor, UncertaintyModel | None]:
-        return pipelines.load_networks(), pipelines.load_uncertainty()
+        return load_networks(), load_uncertainty()
 
-    def _pipeline(self, *, checks: bool) -> pipelines.Pipeline:
+    def _pipeline(self, checks: PhysicsCheck | None = None) -> Pipeline:
         network, uncertainty_model = self._networks
-        check = pipelines.PeriodicPhysicsCheck(self._measured_bench.rig) if checks else None
-        return pipelines.build_pipeline(
-            self._measured_bench, network, uncertainty_model=uncertainty_model, checks=check
+        return build_pipeline(
+            self._calibrated, network, uncertainty_model=uncertainty_model, checks=checks
         )
 
     def status(self) -> dict[str, Any]:
         """Return the state for the page."""
         message = "" if self._state == "whole" else f"{self._state}, {self.frames} frames so far"
-        control = {"commands": ["export"], "settings": [], "options": [], "note": ""}
         return {
             "state": "recording",
             "message": message,
             "camera": self._camera.uri,
-            "control": control,
+            "control": {"commands": ["export"], "options": [], "note": ""},
         }
 
     def run(self, command: str, arguments: Mapping[str, Any]) -> str:
         """Export a frame by its number. Raises NlosCamError for another command, number, or while
         exporting.
         """
-        if command != "export" or not isinstance(number := arguments.get("frame"), int):
+        number = arguments.get("frame")
+        if command != "export" or not isinstance(number, int):
             raise NlosCamError(
                 f"no command {command!r} with {dict(arguments)!r}: this view exports a frame by"
                 " number"
@@ -104,11 +108,12 @@ class Playback(PlaybackViewer):
     def _export(self, number: int) -> str:
         """Reconstruct one frame again, since the page's copy is rounded, and write its files."""
         bag = Path(self._camera.uri.removeprefix("bag:"))
-        with type(self._camera)(bag) as camera:  # type: ignore[call-arg]  a recording opens by its path
+        with open_camera(self._camera.uri) as camera:
             frame = next((each for each in camera if each.frame_number == number), None)
         if frame is None:
             raise NlosCamError(f"{bag} has no frame {number}")
+
         with FrameReader([frame], lossless=True, stop=Event()) as reader:
-            (result,) = iterate_batched(reader, pipeline := self._pipeline(checks=False))
+            (result,) = iterate_batched(reader, self._pipeline())
         path = self._folder / f"{bag.stem}-{number:06d}-{datetime.now().astimezone():%H%M%S}.npz"
-        return save_moment(path, moment_of(result), pipeline)
+        return save_moment(path, Moment.recorded(result))

@@ -8,7 +8,7 @@ from pathlib import Path
 from nlos_cam.camera import Camera
 from nlos_cam.errors import RecordingError
 from nlos_cam.frames import Frame
-from nlos_cam.recording import TEMPERATURE_INTERVAL_S, load_sidecar, sidecar_path
+from nlos_cam.recording.sidecar import TEMPERATURE_INTERVAL_S, load_sidecar, sidecar_path
 
 RECORDED = "bag:"
 Celsius = Mapping[str, float]

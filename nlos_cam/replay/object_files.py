@@ -12,8 +12,8 @@ from nlos_calibration.arrays import Float32
 
 from nlos_cam.errors import RecordingError
 from nlos_cam.files import atomic_directory, read_arrays
-from nlos_cam.live.frame_queue import ignore
 from nlos_cam.objects import mesh_from_depth
+from nlos_cam.reconstruct import ignore
 
 OBJECT_FORMATS = ("ply", "glb", "obj", "csv", "npz", "points")
 """Suffixes of `SurfaceMesh.save`, and "points" for a .ply without faces."""
@@ -41,11 +41,12 @@ class ObjectFiles:
         mesh = mesh_from_depth(depth_m, self.box, uncertainty_m)
         self.folder.mkdir(exist_ok=True)
         for name in self.formats:
-            points = name == "points"
-            content = mesh.points_only.as_bytes(".ply") if points else mesh.as_bytes(f".{name}")
-            (self.folder / f"{number:06d}{'-points.ply' if points else f'.{name}'}").write_bytes(
-                content
-            )
+            if name == "points":
+                path = self.folder / f"{number:06d}-points.ply"
+                path.write_bytes(mesh.points_only.as_bytes(".ply"))
+            else:
+                path = self.folder / f"{number:06d}.{name}"
+                path.write_bytes(mesh.as_bytes(f".{name}"))
         self.written += 1
 
 
@@ -65,16 +66,15 @@ def export_objects(
     file.
     """
     arrays, box = _read(result)
-    depth_m, uncertainty_m, numbers = (
-        arrays[name] for name in ("depth_m", "uncertainty_m", "frame_number")
-    )
+    numbers = arrays["frame_number"]
     with atomic_directory(out) as part:
         files = ObjectFiles(part, box, formats, every)
         for k, number in enumerate(numbers):
             if stop.is_set():
                 break
-            known = np.isfinite(uncertainty_m[k]).any()
-            files.add(int(number), depth_m[k], uncertainty_m[k] if known else None)
+            uncertainty_m = arrays["uncertainty_m"][k]
+            is_known = np.isfinite(uncertainty_m).any()
+            files.add(int(number), arrays["depth_m"][k], uncertainty_m if is_known else None)
             on_frame(k + 1, len(numbers))
     return files.written
 

@@ -1,0 +1,290 @@
+"""Commands of a live run, by group: pipeline, saved views, recording, camera and bench."""
+
+import re
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from dataclasses import dataclass, field
+from datetime import datetime
+from pathlib import Path
+from queue import Empty, Queue
+from typing import Any, Protocol, runtime_checkable
+
+from nlos_calibration import MeasuredWall, WallRecord
+from nlos_calibration.arrays import Mask
+from nlos_calibration.errors import OccluderRefusedError
+
+from nlos_cam import calibrate
+from nlos_cam import view as views  # both load their heavy parts when they are used
+from nlos_cam.camera import FRAMES_PER_S, Camera
+from nlos_cam.errors import NlosCamError
+from nlos_cam.frames import Frame
+from nlos_cam.live.live_recording import LiveRecording
+from nlos_cam.reconstruct import CalibratedRig, Clock, Pipeline, ignore
+from nlos_cam.view import Moment
+
+REFERENCE_FRAMES = 60
+REFERENCE_TIMEOUT_S = 10.0
+MAX_AVERAGE = 1000
+
+OnFrame = Callable[[Frame], None]
+Commands = dict[str, Callable[..., str]]
+"""By name; each returns its outcome in words, and raises NlosCamError with the reason if it fails.
+"""
+
+
+@runtime_checkable
+class AdjustableCamera(Protocol):
+    """Camera whose laser and near-wall options can be set while it runs: an L515."""
+
+    def adjustable(self) -> list[dict[str, Any]]:
+        """Return name, value and range of each option."""
+        ...
+
+    def set_option(self, name: str, value: float) -> str:
+        """Set an option to the nearest allowed value; return the outcome in words."""
+        ...
+
+
+@dataclass
+class RunContext:
+    """State of a live run that its commands share."""
+
+    uri: str
+    folder: Path
+    """Files get dated names here, and replace nothing."""
+    clock: Clock
+    camera: Camera | None = None
+    """None until the camera runs."""
+    pipeline: Pipeline | None = None
+    newest: Moment | None = None
+    on_frame: list[OnFrame] = field(default_factory=list[OnFrame])
+    """Called with each frame of the camera, in the reader's thread."""
+
+    def attached(self) -> tuple[Camera, Pipeline]:
+        """Return camera and pipeline. Raises NlosCamError before they run."""
+        if self.camera is None or self.pipeline is None:
+            raise NlosCamError("the camera is not running yet: wait for the first frame")
+        return self.camera, self.pipeline
+
+    def new_file(self, stem: str, suffix: str) -> Path:
+        """Return a path with the present date, to a millisecond."""
+        date = f"{datetime.now().astimezone():%Y%m%d-%H%M%S-%f}"[:-3]
+        return self.folder / f"{stem}-{date}{suffix}"
+
+
+class PipelineCommands:
+    """Commands that change how frames are reconstructed."""
+
+    def __init__(self, run: RunContext) -> None:
+        self.paused = False
+        self._run = run
+
+    @property
+    def commands(self) -> Commands:
+        return {"pause": self.pause, "resume": self.resume, "average": self.average}
+
+    def pause(self) -> str:
+        """Stop reconstructing; frames still arrive, and a recording goes on."""
+        self.paused = True
+        return "paused: frames are read and not reconstructed"
+
+    def resume(self) -> str:
+        self.paused = False
+        return "reconstructing again"
+
+    def average(self, frames: int) -> str:
+        """Average the maps of the last `frames` frames (1 to 1000) from now on."""
+        _, pipeline = self._run.attached()
+        count = int(frames)
+        if not 1 <= count <= MAX_AVERAGE or count != frames:
+            raise NlosCamError(f"average {frames}: give a whole number from 1 to {MAX_AVERAGE}")
+        pipeline.average = count
+        older_s = (count - 1) / 2 / FRAMES_PER_S
+        return f"the mean of {count} frame{'s' if count > 1 else ''}, {older_s:.2f} s older"
+
+
+class SavingCommands:
+    """Commands that save what the page shows: one frame, or a session."""
+
+    def __init__(self, run: RunContext) -> None:
+        self._run = run
+        self._session: tuple[views.SessionFile, ExitStack] | None = None
+
+    @property
+    def commands(self) -> Commands:
+        return {
+            "snapshot": self.snapshot,
+            "save_session": self.save_session,
+            "end_session": self.end_session,
+        }
+
+    @property
+    def is_saving(self) -> bool:
+        """True while a session is being saved."""
+        return self._session is not None
+
+    def show(self, moment: Moment) -> None:
+        """Add a moment to the session that is being saved, if any."""
+        if session := self._session:
+            session[0].show(moment)
+
+    def snapshot(self) -> str:
+        """Write the newest frame: picture (.png), arrays (.npz) and, if there is a surface, its
+        mesh (.ply).
+        """
+        self._run.attached()
+        moment = self._run.newest
+        if moment is None:
+            raise NlosCamError("there is no frame yet: wait for the first one")
+        return views.save_moment(self._run.new_file("snapshot", ".npz"), moment)
+
+    def save_session(self) -> str:
+        """Save what the page shows from now on as one HTML file."""
+        _, pipeline = self._run.attached()
+        if self._session:
+            raise NlosCamError(f"{self._session[0].path} is being saved: end it first")
+        bench = pipeline.bench
+        path = self._run.new_file("session", ".html")
+        entered = ExitStack()
+        file = entered.enter_context(views.SessionFile(path, bench.rig, bench.measured))
+        self._session = file, entered
+        return f"saving the session to {path}"
+
+    def end_session(self) -> str:
+        """Close the session's file."""
+        if not self._session:
+            raise NlosCamError("no session is being saved")
+        file, entered = self._session
+        self._session = None
+        entered.close()
+        return f"saved {file.kept} moments to {file.path}: any browser plays it"
+
+
+class RecordingCommands:
+    """Commands that record the camera's streams."""
+
+    def __init__(self, run: RunContext) -> None:
+        self.recording: LiveRecording | None = None
+        """The recording that runs, if a command began it."""
+        self._run = run
+
+    @property
+    def commands(self) -> Commands:
+        return {"record": self.record, "stop_recording": self.stop_recording}
+
+    def record(self, label: str = "") -> str:
+        """Record the camera's streams from now on, with a sidecar that holds the label."""
+        camera, _ = self._run.attached()
+        if self.recording:
+            raise NlosCamError(f"{self.recording.path} is being recorded: stop it first")
+        label = str(label)
+        name = re.sub(r"[^\w.-]+", "-", label).strip("-.")[:60]
+        path = self._run.new_file(name or "live", ".bag")
+        self.recording = LiveRecording(camera, path, label or None, self._run.clock)
+        self._run.on_frame.append(self.recording.add)
+        return f"recording {path}"
+
+    def stop_recording(self) -> str:
+        """Close the recording, and read it back to verify it."""
+        recording = self.recording
+        if not recording:
+            raise NlosCamError("nothing is being recorded")
+        self.recording = None
+        self._run.on_frame.remove(recording.add)
+        return recording.stop()
+
+
+class BenchCommands:
+    """Commands that set the camera's options, or measure the empty bench."""
+
+    def __init__(self, run: RunContext) -> None:
+        self.options: list[dict[str, Any]] = []
+        """Name, value and range of the options that the camera lets one change."""
+        self.on_bench: Callable[[CalibratedRig], None] = ignore
+        """Called with the bench once it has another reference."""
+        self._run = run
+
+    @property
+    def commands(self) -> Commands:
+        return {"option": self.set_option, "take_reference": self.take_reference}
+
+    def read_options(self) -> None:
+        """Read the camera's options."""
+        camera = self._run.camera
+        self.options = camera.adjustable() if isinstance(camera, AdjustableCamera) else []
+
+    def set_option(self, name: str, value: float) -> str:
+        """Set an option of the device, such as laser_power, to the nearest allowed value."""
+        camera, _ = self._run.attached()
+        if not isinstance(camera, AdjustableCamera):
+            raise NlosCamError(
+                f"{camera.uri} has no option {name}: laser and near-wall settings are an L515's"
+            )
+        outcome = camera.set_option(str(name), float(value))
+        self.read_options()
+        return outcome
+
+    def take_reference(self, frames: int = REFERENCE_FRAMES) -> str:
+        """Measure the empty bench (nothing hidden) and use it as the reference of difference maps
+        and drift.
+
+        With a wall record the occluder is found again; without one the wall is measured as it is
+        now. The record is written beside the other files, for --wall.
+        """
+        camera, pipeline = self._run.attached()
+        passing: Any = _PassingFrames(camera)  # all that measuring needs of a camera
+        self._run.on_frame.append(passing.frames.put)
+        try:
+            capture = calibrate.collect_statistics(passing, int(frames))
+        finally:
+            self._run.on_frame.remove(passing.frames.put)
+
+        bench = pipeline.bench
+        record, inliers = measure_bench(capture, bench.measured)
+        path = self._run.new_file("bench", ".toml")
+        reference = capture.reference(inliers)
+        files = calibrate.WallFiles.beside(path, overwrite=False)
+        record = calibrate.write_record(files, record, reference)
+        pipeline.bench = CalibratedRig(bench.rig, MeasuredWall(record, reference), bench.notes)
+        self.on_bench(pipeline.bench)
+        return (
+            f"reference of {capture.statistics.depth.frames} frames ({record.verdict}:"
+            f" {record.advice}); wrote {path}"
+        )
+
+
+def measure_bench(
+    capture: calibrate.CaptureStatistics, measured: MeasuredWall | None
+) -> tuple[WallRecord, Mask]:
+    """Return the record of an empty bench and the wall's pixels; the occluder is found if the wall
+    was measured.
+
+    Raises CalibrationError where the depth is not that of a wall.
+    """
+    if measured:
+        try:
+            return calibrate.measure_occluder(capture, measured)
+        except OccluderRefusedError:  # a bare wall, without one
+            pass
+    fit, facts = calibrate.measure_by_depth(capture)
+    return capture.record(fit, facts), fit.inliers
+
+
+class _PassingFrames:
+    """Camera-like source of the frames that pass through the run."""
+
+    def __init__(self, camera: Camera) -> None:
+        self.uri = camera.uri
+        self.intrinsics = camera.intrinsics
+        self.identity = camera.identity
+        self.telemetry = camera.telemetry
+        self.frames: Queue[Frame] = Queue()
+
+    def __iter__(self) -> Iterator[Frame]:
+        while True:
+            try:
+                yield self.frames.get(timeout=REFERENCE_TIMEOUT_S)
+            except Empty:
+                raise NlosCamError(
+                    f"no frame for {REFERENCE_TIMEOUT_S:.0f} s: the camera has stalled"
+                ) from None

@@ -1,0 +1,36 @@
+"""One frame's result as files: arrays, picture and mesh."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from nlos_cam.files import atomic_file
+from nlos_cam.view.video import Still
+from nlos_cam.view.viewer import Moment
+
+
+def save_moment(path: Path, moment: Moment) -> str:
+    """Write a moment's arrays to `path` (.npz), its picture and mesh beside it; return what was
+    written.
+    """
+    result = moment.result
+    arrays: dict[str, Any] = {
+        "depth_m": result.depth_m,
+        "lidar_depth_m": result.frame.depth_m,
+        "infrared": result.frame.ir,
+        "uncertainty_m": result.uncertainty_m,
+        "truth_depth_m": result.truth_depth_m,
+        "frame_number": result.frame_number,
+        "timestamp_s": result.timestamp_s,
+        "verdict": result.verdict or "",
+    }
+    known = {name: array for name, array in arrays.items() if array is not None}
+    with atomic_file(path) as part, part.open("wb") as file:
+        np.savez_compressed(file, **known)
+    Still(moment).save(path.with_suffix(".png"), moment)
+
+    if not result.reconstruction.has_surface:
+        return f"wrote {path}, .png; no surface, so no .ply"
+    result.to_mesh().save(path.with_suffix(".ply"))
+    return f"wrote {path}, .png and .ply"

@@ -1,0 +1,97 @@
+from pathlib import Path
+from threading import Event
+
+import numpy as np
+import pytest
+from made_up_moments import RIG
+from replays import replay_moments
+
+from nlos_cam.errors import RecordingError
+from nlos_cam.objects import mesh_from_depth, object_box
+from nlos_cam.replay import OBJECT_FORMATS, export_objects
+from nlos_cam.replay.replay import RESULT
+
+
+@pytest.fixture(scope="module")
+def replay(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Folder of a replay of seven frames, with every third object in all formats."""
+    out = tmp_path_factory.mktemp("replay")
+    replay_moments(out, 7, objects=OBJECT_FORMATS, every=3)
+    return out
+
+
+def names_in(folder: Path) -> list[str]:
+    return sorted(file.name for file in folder.iterdir())
+
+
+def vertices_m(folder: Path) -> np.ndarray:
+    with np.load(folder / "000003.npz") as mesh:
+        return mesh["vertices_m"]
+
+
+def test_replay_writes_the_surface_of_every_third_frame(replay: Path) -> None:
+    assert len(names_in(replay / "object")) == 3 * len(OBJECT_FORMATS)
+    with np.load(replay / RESULT) as result:
+        mesh = mesh_from_depth(result["depth_m"][3], object_box(RIG))
+    np.testing.assert_array_equal(vertices_m(replay / "object"), mesh.vertices_m)
+
+
+def test_export_of_a_result_equals_the_files_of_its_replay(replay: Path, tmp_path: Path) -> None:
+    out = tmp_path / "exported"
+    assert export_objects(replay / RESULT, out, OBJECT_FORMATS, 3, stop=Event()) == 3
+    assert names_in(out) == names_in(replay / "object")
+    np.testing.assert_allclose(vertices_m(out), vertices_m(replay / "object"), atol=1e-9)
+
+
+def test_export_stops_when_asked(replay: Path, tmp_path: Path) -> None:
+    stop = Event()
+    stop.set()
+    assert export_objects(replay / RESULT, tmp_path / "a", ["ply"], stop=stop) == 0
+
+
+def changed(replay: Path, path: Path, **arrays: object) -> Path:
+    """Write a replay's result with other arrays."""
+    with np.load(replay / RESULT) as file:
+        np.savez(path, **{**file, **arrays})
+    return path
+
+
+def test_export_skips_frames_without_surface(replay: Path, tmp_path: Path) -> None:
+    nothing_m = np.full((7, 64, 64), np.nan, np.float32)
+    path = changed(replay, tmp_path / "empty.npz", depth_m=nothing_m)
+    assert export_objects(path, tmp_path / "out", ["ply"], stop=Event()) == 0
+
+
+@pytest.mark.parametrize("content", [b"", b"PK\x03\x04 cut", b"text"])
+def test_export_refuses_other_files(tmp_path: Path, content: bytes) -> None:
+    path = tmp_path / "reconstruction.npz"
+    path.write_bytes(content)
+    with pytest.raises(RecordingError, match="replay"):
+        export_objects(path, tmp_path / "out", ["ply"], stop=Event())
+    assert names_in(tmp_path) == ["reconstruction.npz"]
+
+
+def test_export_refuses_other_arrays(tmp_path: Path) -> None:
+    path = tmp_path / "reconstruction.npz"
+    np.savez(path, depth_m=np.zeros(3))
+    with pytest.raises(RecordingError, match="replay"):
+        export_objects(path, tmp_path / "out", ["ply"], stop=Event())
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("depth_m", "text"),
+        ("depth_m", 1.0),
+        ("pitch_m", [0.1]),
+        ("z_far_m", 0.0),
+        ("frame_number", [1, 2]),
+        ("z_near_m", [[]]),
+    ],
+)
+def test_export_refuses_arrays_that_contradict(
+    replay: Path, tmp_path: Path, name: str, value: object
+) -> None:
+    path = changed(replay, tmp_path / "bad.npz", **{name: np.array(value)})
+    with pytest.raises(RecordingError, match="not the reconstruction"):
+        export_objects(path, tmp_path / "out", ["ply"], stop=Event())
