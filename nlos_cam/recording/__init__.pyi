@@ -11,7 +11,6 @@ __all__ = [
     "QualityMeter",
     "RepairResult",
     "ReplayCamera",
-    "SdkReplayCamera",
     "Sidecar",
     "SidecarFile",
     "State",
@@ -33,7 +32,6 @@ from .export import ExportOptions, ExportResult, Format, export_recording
 from .playback import ReplayCamera, VerifyResult, open_lidar_bag, verify
 from .quality import QualityMeter
 from .repair import RepairResult, repair_recording
-from .sdk_playback import SdkReplayCamera
 from .sidecar import (
     TEMPERATURE_INTERVAL_S,
     Sidecar,
