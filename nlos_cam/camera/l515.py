@@ -8,7 +8,7 @@ from typing import Any
 
 from nlos_cam.camera.laser_power import PowerLimits, turn_down
 from nlos_cam.camera.live_camera import LiveCamera
-from nlos_cam.camera.protocol import Clock
+from nlos_cam.camera.protocol import WaitingClock
 from nlos_cam.camera.recorder import Recording
 from nlos_cam.camera.sdk import load_sdk
 from nlos_cam.camera.session import FrameSize
@@ -173,7 +173,7 @@ class L515Camera(LiveCamera):
         *,
         recording: Recording | None = None,
         sdk: Any = None,
-        clock: Clock | None = None,
+        clock: WaitingClock | None = None,
     ) -> None:
         sdk = sdk or load_sdk()
         self._context = shared_context(sdk)

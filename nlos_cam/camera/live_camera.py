@@ -10,7 +10,7 @@ from typing import Any, Self
 from nlos_calibration import Intrinsics, Rig
 from nlos_calibration.arrays import Float32
 
-from nlos_cam.camera.protocol import Clock, WallClock
+from nlos_cam.camera.protocol import WaitingClock, WallClock
 from nlos_cam.camera.recorder import Recording
 from nlos_cam.camera.recovery import NO_INTRINSICS, Hooks, Recovery
 from nlos_cam.camera.session import FrameSize, SampleQueue, Session, find_streams
@@ -42,7 +42,7 @@ class LiveCamera:
         size: FrameSize,
         sdk: Any,
         recording: Recording | None,
-        clock: Clock | None = None,
+        clock: WaitingClock | None = None,
     ) -> None:
         self.uri = uri
         self.rig: Rig | None = None
@@ -55,7 +55,7 @@ class LiveCamera:
         self._size = size
         self._sdk = sdk
         self._recording = recording
-        self._clock: Clock = clock or WallClock()
+        self._clock: WaitingClock = clock or WallClock()
         self._session: Session | None = None
         self._changing = RLock()
         """Held while streams start or stop: one thread iterates, another may leave."""

@@ -33,7 +33,8 @@ def open_camera(
     Raises CameraNotFoundError, RecordingError, SceneError; NlosCamError for a recording of a
     recording; UnknownCameraError for a mistyped name.
     """
-    scheme, colon, rest = (uri := full_uri(uri)).partition(":")
+    uri = full_uri(uri)
+    scheme, colon, rest = uri.partition(":")
     if colon and not rest:
         raise UnknownCameraError(f"no camera {uri!r}: leave out the colon, or use {NAMES}")
     if scheme == "bag" and rest:

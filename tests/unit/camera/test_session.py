@@ -88,13 +88,15 @@ def test_set_from_before_the_settings_is_not_delivered(clock_stands: bool) -> No
     """A clock that stands still holds no more than one set back."""
     lidar = FakeLidar(usb="2.1")
     session = session_of(lidar)
-    begun = ("depth",)
+    early_streams = ("depth",)
     if clock_stands:
         lidar.period_ms = 0.0
         session.start(lambda _: None, lambda: None)
         lidar.deliver(range(5, 6))
     else:
-        session.start(lambda _: None, ready=lambda: lidar.deliver(range(5, 6), streams=begun))
+        session.start(
+            lambda _: None, ready=lambda: lidar.deliver(range(5, 6), streams=early_streams)
+        )
         lidar.deliver(range(5, 6), streams=("infrared", "confidence"))
     lidar.deliver(range(6, 8))
     assert take_all(session.inbox) == [6, 7]
