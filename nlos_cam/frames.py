@@ -180,8 +180,8 @@ def reduce_cell(
     as depths.
     """
     # The median, and not the mean: at an edge or near a multipath return the samples of a cell are
-    # of two echoes, and their mean is a depth at which nothing stands. The intensity is averaged over
-    # the samples of the median's echo only, so that it belongs to the same surface.
+    # of two echoes, and their mean is a depth at which nothing stands. The intensity is averaged
+    # over the samples of the median's echo only, so that it belongs to the same surface.
     middle[0], middle[1] = _two_from(bits, np.int32((valid - np.int32(1)) >> 1))
     depth = middle_m[0] if valid % 2 else (middle_m[0] + middle_m[1]) / np.float32(2.0)
     mean = _mean_near(bits, samples_m, counts, depth, np.float32(WINNER_SPREAD_M))

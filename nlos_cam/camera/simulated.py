@@ -137,8 +137,8 @@ JOIN_TIMEOUT_S = 5.0
 RESET_INSTANTS = FRAMES_PER_S
 """Instants for which a device that is reset is disconnected."""
 # A real camera exposes a frame without this machine's processor; a simulated one computes it here,
-# beside the reconstruction of the frame before. So each image is computed as late as it can be: half
-# a period before it is due, or twice the time that the last image took, whichever is earlier.
+# beside the reconstruction of the frame before. So each image is computed as late as it can be:
+# half a period before it is due, or twice the time that the last image took, whichever is earlier.
 MIN_LEAD_S = 0.5 / FRAMES_PER_S
 """Shortest time between the start of an image's computation and its delivery."""
 MAX_EXPOSURES = 3000

@@ -39,12 +39,12 @@ class Quality:
     """
 
 
-# Temporal noise. Depth of a pixel at frame t is z + e_t with independent e_t of variance s^2, so the
-# difference of two frames has variance Var(e_t - e_{t-1}) = 2 s^2, and
+# Temporal noise. Depth of a pixel at frame t is z + e_t with independent e_t of variance s^2, so
+# the difference of two frames has variance Var(e_t - e_{t-1}) = 2 s^2, and
 #     s = sqrt(mean((z_t - z_{t-1})^2) / 2).
-# Differences of consecutive frames, not deviations from a mean: slow drift hardly adds to them. A push
-# of the camera shifts all pixels at once; the median difference over the image is that shift, and is
-# subtracted from each pair first.
+# Differences of consecutive frames, not deviations from a mean: slow drift hardly adds to them. A
+# push of the camera shifts all pixels at once; the median difference over the image is that shift,
+# and is subtracted from each pair first.
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _add_squares(
     depth_m: Float32, before_m: Float32, shift_m: float, squares: Float32, pairs: Float32

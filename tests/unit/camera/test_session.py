@@ -41,7 +41,7 @@ def test_finish_of_a_live_device_counts_no_half_set() -> None:
     assert inbox.incomplete == 0
 
 
-def test_read_settings_omits_what_cannot_be_read_or_was_not_measured_yet() -> None:
+def test_read_settings_omits_unreadable_and_unmeasured_options() -> None:
     sensor = FakeSensor(FakeLidar(apd_temperature=-9999.0, ldd_temperature=40.0), 0)
     listed = [
         SimpleNamespace(name=name)
@@ -64,7 +64,7 @@ def session_of(lidar: FakeLidar) -> Session:
     return Session(*find_streams(FakeDevice(lidar, 0)), SampleQueue())
 
 
-def test_look_returns_the_next_set_while_preparing_or_none_by_timeout_or_end() -> None:
+def test_look_returns_the_next_set_while_preparing_or_none() -> None:
     lidar = FakeLidar(usb="2.1")
     found = list[Any]()
     session = session_of(lidar)

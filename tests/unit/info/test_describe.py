@@ -195,7 +195,7 @@ def test_damaged_file_has_one_line_that_says_so(
         assert str(place) in found.problem or source.name in found.problem
 
 
-def test_weights_unlike_checksums_and_lone_wall_records_are_damaged(
+def test_changed_weights_and_lone_wall_records_are_damaged(
     files: dict[str, Path], tmp_path: Path
 ) -> None:
     (tmp_path / "wall.toml").write_bytes(files["wall record"].read_bytes())

@@ -204,7 +204,7 @@ def test_lenses_and_poses_agree_with_librealsense(
             np.testing.assert_allclose(pose[:3, 3], extrinsics.translation, atol=1e-7)
 
 
-def test_built_in_reader_yields_what_librealsense_yields_before_damage(damaged: Path) -> None:
+def test_readers_agree_on_the_frames_before_damage(damaged: Path) -> None:
     ours: list[int] = []
     with ReplayCamera(damaged) as camera, pytest.raises(RecordingError, match="nlos-cam repair"):
         ours.extend(frame.frame_number for frame in camera)
