@@ -179,11 +179,14 @@ def reduce_cell(
     `samples_m` and `middle_m` show the bits of `bits` and `middle` (2,), which is scratch memory,
     as depths.
     """
+    # The median, and not the mean: at an edge or near a multipath return the samples of a cell are
+    # of two echoes, and their mean is a depth at which nothing stands. The intensity is averaged
+    # over the samples of the median's echo only, so that it belongs to the same surface.
     middle[0], middle[1] = _two_from(bits, np.int32((valid - np.int32(1)) >> 1))
     depth = middle_m[0] if valid % 2 else (middle_m[0] + middle_m[1]) / np.float32(2.0)
     mean = _mean_near(bits, samples_m, counts, depth, np.float32(WINNER_SPREAD_M))
-    # the two middle samples may be of two echoes, with no sample near their mean: take all valid
-    # ones then
+    # With an even count the two middle samples may be of two echoes, and no sample near their mean:
+    # then average over all valid ones.
     if np.isnan(mean):
         mean = _mean_near(bits, samples_m, counts, np.float32(0), np.float32(np.inf))
     return depth, mean
@@ -204,9 +207,8 @@ def scratch_memory(samples: int) -> Scratch:
     return bits, bits.view(np.float32), middle, middle.view(np.float32), np.empty(samples, np.uint8)
 
 
-@numba.njit(
-    cache=True, error_model="numpy", nogil=True
-)  # so that another thread can read the next frame
+# Without the interpreter's lock, so that another thread can read the next frame.
+@numba.njit(cache=True, error_model="numpy", nogil=True)
 def _reduce_cells(
     depth_bits: Int32,
     ir: NDArray[np.uint8],

@@ -13,11 +13,8 @@ __all__ = [
     "FrameSet",
     "FrameSynchronizer",
     "OnProgress",
-    "Reader",
     "Recording",
     "Sample",
-    "SampleQueue",
-    "Session",
     "SimulatedCamera",
     "SoftwareLidar",
     "WallClock",
@@ -46,9 +43,9 @@ __all__ = [
 from .l515 import DeviceInfo, connected, find_l515, shared_context
 from .protocol import Camera, OnProgress, WallClock
 from .recorder import RESERVE_BYTES, Recording, check_room, free_bytes, recording_s, repair_command
-from .registry import NAMES, SIMULATED, Reader, full_uri, open_camera
+from .registry import NAMES, SIMULATED, full_uri, open_camera
 from .sdk import MAC_WHEEL, WHEEL, load_sdk
-from .session import SampleQueue, Session, find_streams
+from .session import find_streams
 from .simulated import SimulatedCamera, SoftwareLidar
 from .simulated_world import WORLDS, World, open_world, pack_loop, read_packaged, render_loop
 from .streams import (

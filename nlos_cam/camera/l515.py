@@ -8,10 +8,10 @@ from typing import Any
 
 from nlos_cam.camera.laser_power import PowerLimits, turn_down
 from nlos_cam.camera.live_camera import LiveCamera
-from nlos_cam.camera.protocol import Clock
+from nlos_cam.camera.protocol import WaitingClock
 from nlos_cam.camera.recorder import Recording
 from nlos_cam.camera.sdk import load_sdk
-from nlos_cam.camera.session import Size
+from nlos_cam.camera.session import FrameSize
 from nlos_cam.errors import CameraError, CameraNotFoundError
 from nlos_cam.frames import MAX_SATURATED, saturated_share
 
@@ -79,8 +79,8 @@ class Options:
         return getattr(self._sdk.option, name)
 
 
-USB3_SIZE: Size = (640, 480)
-USB2_SIZE: Size = (320, 240)
+USB3_SIZE: FrameSize = (640, 480)
+USB2_SIZE: FrameSize = (320, 240)
 PRESET = {"global_time_enabled": 1.0, "visual_preset": 5.0}
 """Timestamps on the host's clock, and short range, whose lower gain does not saturate near a
 wall.
@@ -136,7 +136,8 @@ def connected(sdk: Any, context: Any) -> list[tuple[Any, DeviceInfo]]:
         listed = context.query_devices()
         for index in range(len(listed)):
             try:
-                found.append(((device := listed[index]), _info(device, sdk)))
+                device = listed[index]
+                found.append((device, _info(device, sdk)))
             except RuntimeError as error:
                 failure = error
     except RuntimeError as error:
@@ -172,7 +173,7 @@ class L515Camera(LiveCamera):
         *,
         recording: Recording | None = None,
         sdk: Any = None,
-        clock: Clock | None = None,
+        clock: WaitingClock | None = None,
     ) -> None:
         sdk = sdk or load_sdk()
         self._context = shared_context(sdk)

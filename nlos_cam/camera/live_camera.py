@@ -10,10 +10,10 @@ from typing import Any, Self
 from nlos_calibration import Intrinsics, Rig
 from nlos_calibration.arrays import Float32
 
-from nlos_cam.camera.protocol import Clock, WallClock
+from nlos_cam.camera.protocol import WaitingClock, WallClock
 from nlos_cam.camera.recorder import Recording
 from nlos_cam.camera.recovery import NO_INTRINSICS, Hooks, Recovery
-from nlos_cam.camera.session import SampleQueue, Session, Size, find_streams
+from nlos_cam.camera.session import FrameSize, SampleQueue, Session, find_streams
 from nlos_cam.camera.streams import FORMATS, FrameSet
 from nlos_cam.camera.timestamps import Continuity
 from nlos_cam.errors import CameraError, CameraLostError
@@ -39,10 +39,10 @@ class LiveCamera:
         self,
         uri: str,
         device: Any,
-        size: Size,
+        size: FrameSize,
         sdk: Any,
         recording: Recording | None,
-        clock: Clock | None = None,
+        clock: WaitingClock | None = None,
     ) -> None:
         self.uri = uri
         self.rig: Rig | None = None
@@ -55,7 +55,7 @@ class LiveCamera:
         self._size = size
         self._sdk = sdk
         self._recording = recording
-        self._clock: Clock = clock or WallClock()
+        self._clock: WaitingClock = clock or WallClock()
         self._session: Session | None = None
         self._changing = RLock()
         """Held while streams start or stop: one thread iterates, another may leave."""
@@ -104,8 +104,9 @@ class LiveCamera:
     def _new_session(self) -> Session:
         try:
             sensor, profiles = find_streams(self._device, self._size)
-            if not (missing := [stream for stream in FORMATS if stream not in profiles]):
-                return Session(sensor, profiles, SampleQueue(lossless=False, on_set=self._on_set))
+            missing = [stream for stream in FORMATS if stream not in profiles]
+            if not missing:
+                return Session(sensor, profiles, SampleQueue(self._on_set))
         except RuntimeError as error:
             raise CameraError(
                 f"{self.uri} cannot be read ({error}): unplug it, wait 10 s, plug it in again"
@@ -140,9 +141,8 @@ class LiveCamera:
         except BaseException:
             self._abandon()
             raise
-        atexit.register(
-            self._leave
-        )  # the SDK's threads would crash a program that ends without leaving
+        # The SDK's threads would crash a program that ends without leaving.
+        atexit.register(self._leave)
         return self
 
     def _start(self, device: Any | None = None) -> None:
@@ -166,7 +166,7 @@ class LiveCamera:
     def _record(self) -> None:
         """Start recording, once the settings hold: the SDK's recorder can join a running sensor."""
         if self._recording:
-            # not paused before: the SDK then stamps frames out of order when it resumes
+            # Not paused before: the SDK then stamps frames out of order when it resumes.
             self._recording.begin(self._device, self._sdk)
 
     def __exit__(self, *_: object) -> None:
@@ -176,7 +176,8 @@ class LiveCamera:
         """Stop, and end an iteration in another thread; without effect if repeated."""
         atexit.unregister(self._leave)
         self._left.set()
-        if session := self._session:
+        session = self._session
+        if session:
             session.end_wait()
         with self._changing:
             if self._recording and self._session:
@@ -213,12 +214,8 @@ class LiveCamera:
     def _count(self, inbox: SampleQueue) -> None:
         self.incomplete = self._past_incomplete + inbox.incomplete
         self.dropped = self._past_dropped + inbox.dropped + self._continuity.missed
-        self.counts.update(
-            {
-                name: self._past_counts[name] + n - self.counts[name]
-                for name, n in inbox.counts.items()
-            }
-        )
+        for name, count in inbox.counts.items():
+            self.counts[name] = self._past_counts[name] + count
 
     def __iter__(self) -> Iterator[Frame]:
         if not self._entered:
@@ -277,9 +274,8 @@ class LiveCamera:
                 raise CameraError(
                     f"{self.recording.path} is being recorded (--record) until the run ends"
                 )
-            self._recording = (
-                recording  # before it begins: the SDK's thread must pass it a set, as a boundary
-            )
+            # Before it begins: the SDK's thread must pass it a set, as a boundary.
+            self._recording = recording
             try:
                 recording.join(self._device, self._sdk)
             except BaseException:
@@ -291,13 +287,15 @@ class LiveCamera:
         is optional.
         """
         with self._changing:
-            if recording := self._recording:
+            recording = self._recording
+            if recording:
                 recording.stop()
                 self._recording = None
                 recording.close()
 
     def telemetry(self, ending: str = "") -> Mapping[str, float]:
-        return session.telemetry(ending) if (session := self._session) else {}
+        session = self._session
+        return session.telemetry(ending) if session else {}
 
     def _on_set(self, found: FrameSet) -> None:
         recording = self._recording

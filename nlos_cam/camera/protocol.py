@@ -53,7 +53,7 @@ class Camera(Protocol):
         ...
 
 
-class Clock(Protocol):
+class WaitingClock(Protocol):
     """Time source that can also wait."""
 
     def now(self) -> float:

@@ -114,8 +114,10 @@ class SdkRecorder:
 
     def watch(self) -> None:
         """Check that the file grows; call about once a second while frames come."""
-        if (size := self.path.stat().st_size) != self._bytes:
-            self._bytes, self._grew_s = size, self._now()
+        size = self.path.stat().st_size
+        if size != self._bytes:
+            self._bytes = size
+            self._grew_s = self._now()
         elif self._now() - self._grew_s > STILL_S:
             self.failure = f"nothing written for {STILL_S:.0f} s"
 
@@ -147,9 +149,8 @@ class SdkRecorder:
 
     def _abandon(self) -> None:
         """Raise DiskFullError, and leave the file as it is."""
-        ctypes.pythonapi.Py_IncRef(
-            ctypes.py_object(self._recorder)
-        )  # never deleted, not even at exit
+        # One reference too many: never deleted, not even at exit.
+        ctypes.pythonapi.Py_IncRef(ctypes.py_object(self._recorder))
         self._recorder = None
         raise DiskFullError(
             f"{self.path} could not be completed ({self.failure}): free some space, and recover its"
@@ -255,9 +256,8 @@ class Recording:
         self._at_boundary.clear()
         self._changed.clear()
         self._changing.set()
-        self._at_boundary.wait(
-            BOUNDARY_WAIT_S
-        )  # `add` holds the SDK's thread there: no set is cut in two
+        # `add` holds the SDK's thread there: no set is cut in two.
+        self._at_boundary.wait(BOUNDARY_WAIT_S)
         self.path = path
         self.sets = 0
         self.started = False
@@ -281,19 +281,17 @@ class Recording:
             return False
         if self._recorder and not self._paused.is_set():
             self._count(found, self._recorder)
-        return (
-            self._paused.is_set()
-            and (self._last or self.disk_full)
-            and not (self.disk_full and self.optional)
-        )
+        if self.disk_full:
+            return self._paused.is_set() and not self.optional
+        return self._paused.is_set() and self._last
 
     def _count(self, found: FrameSet, recorder: SdkRecorder) -> None:
-        self._first_s = found.timestamp_s if self.sets == 0 else self._first_s
+        if self.sets == 0:
+            self._first_s = found.timestamp_s
         self._last_s = found.timestamp_s
         self.sets += 1
-        self.disk_full = self.sets % FRAMES_PER_S == 1 and self._is_disk_full(
-            recorder
-        )  # checked once a second
+        is_due = self.sets % FRAMES_PER_S == 1  # once a second
+        self.disk_full = is_due and self._is_disk_full(recorder)
         if self.disk_full or self._is_full(found.timestamp_s) or self._stopping.is_set():
             recorder.pause()  # queued behind the frames so far: none of them is lost
             self._paused.set()
@@ -307,11 +305,11 @@ class Recording:
     def _is_full(self, timestamp_s: float) -> bool:
         if self._frames is not None and self.sets >= self._frames:
             return True
-        period_s = 2 * SAME_INSTANT_S
-        return (
-            self._seconds is not None
-            and timestamp_s - self._first_s + period_s > self._seconds - SAME_INSTANT_S
-        )
+        if self._seconds is None:
+            return False
+        # A set lasts a period, and timestamps jitter by less than half of one.
+        end_s = timestamp_s - self._first_s + 2 * SAME_INSTANT_S
+        return end_s > self._seconds - SAME_INSTANT_S
 
     @property
     def done(self) -> bool:

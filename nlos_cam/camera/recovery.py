@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from threading import Event
 from typing import Any
 
-from nlos_cam.camera.protocol import Clock
+from nlos_cam.camera.protocol import WaitingClock
 from nlos_cam.errors import CameraError, CameraLostError
 
 BACK_OFF_S = (0.5, 1.0, 2.0)
@@ -45,7 +45,7 @@ class Recovery:
     """
 
     def __init__(
-        self, uri: str, hooks: Hooks, clock: Clock, left: Event, counts: Counter[str]
+        self, uri: str, hooks: Hooks, clock: WaitingClock, left: Event, counts: Counter[str]
     ) -> None:
         self._uri = uri
         self._hooks = hooks
@@ -143,7 +143,8 @@ class Recovery:
 
     def _starts_if_there(self) -> bool:
         try:
-            if (device := self._hooks.reconnect()) is None:
+            device = self._hooks.reconnect()
+            if device is None:
                 return False
             self._hooks.start(device)
         except (RuntimeError, CameraError) as error:

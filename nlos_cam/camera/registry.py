@@ -4,7 +4,7 @@ fallback.
 
 from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING
 
 from nlos_cam.camera.protocol import Camera, OnProgress
 from nlos_cam.errors import NlosCamError, UnknownCameraError, did_you_mean
@@ -12,18 +12,13 @@ from nlos_cam.errors import NlosCamError, UnknownCameraError, did_you_mean
 if TYPE_CHECKING:
     from nlos_cam.camera.recorder import Recording
 
-Reader = Literal["plain", "sdk"]
-
 SIMULATED = {
     "sim": "simulated: the paper's rig with a moving hidden object",
     "sim:bare-wall": "simulated: the same wall with nothing hidden",
 }
 """Packaged simulated worlds and their descriptions."""
-REPLAY_BACKENDS = {
-    "plain": ("nlos_cam.recording.playback", "ReplayCamera"),
-    "sdk": ("nlos_cam.recording.sdk_playback", "SdkReplayCamera"),
-}
-"""Module and class of each reader of recordings, by name: they stand in a layer above this one."""
+PLAYBACK = "nlos_cam.recording.playback"
+"""Module of `ReplayCamera`, by name: it stands in a layer above this one."""
 NAMES = "l515, l515:SERIAL, sim, sim:bare-wall, sim:SCENE.toml or FILE.bag"
 
 
@@ -32,15 +27,14 @@ def open_camera(
     *,
     on_progress: OnProgress | None = None,
     recording: "Recording | None" = None,
-    reader: Reader = "plain",
 ) -> Camera:
     """Find and check the camera of that name without starting it; a live one can be recorded.
 
-    `reader` chooses the reader of recordings: "plain" (built in) or "sdk" (librealsense). Raises
-    CameraNotFoundError, RecordingError, SceneError; NlosCamError for a recording of a recording;
-    UnknownCameraError for a mistyped name.
+    Raises CameraNotFoundError, RecordingError, SceneError; NlosCamError for a recording of a
+    recording; UnknownCameraError for a mistyped name.
     """
-    scheme, colon, rest = (uri := full_uri(uri)).partition(":")
+    uri = full_uri(uri)
+    scheme, colon, rest = uri.partition(":")
     if colon and not rest:
         raise UnknownCameraError(f"no camera {uri!r}: leave out the colon, or use {NAMES}")
     if scheme == "bag" and rest:
@@ -48,8 +42,7 @@ def open_camera(
             raise NlosCamError(
                 f"{uri} is already a recording: copy the file, or give a live camera (l515, sim)"
             )
-        module, name = REPLAY_BACKENDS[reader]
-        return getattr(import_module(module), name)(Path(rest))
+        return import_module(PLAYBACK).ReplayCamera(Path(rest))
     if scheme == "sim":
         from nlos_cam.camera.simulated import SimulatedCamera
         from nlos_cam.camera.simulated_world import open_world

@@ -25,17 +25,13 @@ class SampleQueue:
     """Queue of paired samples between the SDK's threads, which `put`, and the thread that iterates
     over a camera.
 
-    When full it drops and counts the oldest set, so that a live device never waits; a `lossless`
-    one makes the SDK wait, which pauses the playback of a recording. `on_set` is called on an SDK
-    thread with every set.
+    When full it drops and counts the oldest set, so that the device never waits. `on_set` is called
+    on an SDK thread with every set.
     """
 
-    def __init__(
-        self, *, lossless: bool, on_set: Callable[[streams.FrameSet], None] | None = None
-    ) -> None:
+    def __init__(self, on_set: Callable[[streams.FrameSet], None] | None = None) -> None:
         self.arrived: Counter[str] = Counter()
         """Samples so far, by stream."""
-        self._lossless = lossless
         self._on_set = on_set
         self._pairing = streams.FrameSynchronizer()
         self._evicted = 0
@@ -58,11 +54,6 @@ class SampleQueue:
             return Counter(self._pairing.counts)
 
     @property
-    def closed(self) -> bool:
-        """True once the consumer has left."""
-        return self._sets.closed
-
-    @property
     def ended(self) -> bool:
         """True once no set is left and none will come."""
         return self._sets.ended
@@ -74,8 +65,6 @@ class SampleQueue:
     def put(self, sample: streams.Sample) -> None:
         """Pair a sample, on an SDK thread."""
         with self._sets.changed:
-            if self._lossless:
-                self._sets.wait_for_room()
             if self._sets.closed or self._sets.finished:
                 return
             self.arrived[sample.stream] += 1
@@ -96,26 +85,21 @@ class SampleQueue:
         """Accept no more samples, optionally because of an error; sets that wait can still be
         taken.
         """
-        with self._sets.changed:
-            self._sets.finish(error)
-            if (
-                self._lossless
-            ):  # half a set is a loss at a recording's end, but normal when a live device is left
-                self._pairing.finish()
+        self._sets.finish(error)
 
     def close(self) -> None:
         """Discard all sets and wake every thread that waits."""
         self._sets.close()
 
 
-Size = tuple[int, int]
+FrameSize = tuple[int, int]
 """Width and height in pixels."""
 NOT_YET = -9999.0
 """Reading of a temperature not measured yet: the photodiode's, until 5 s after the start."""
 BOUNDARY_WAIT_S = 0.2
 
 
-def find_streams(device: Any, size: Size | None = None) -> tuple[Any, dict[str, Any]]:
+def find_streams(device: Any, size: FrameSize | None = None) -> tuple[Any, dict[str, Any]]:
     """Return the sensor with most of the needed streams, and their profiles; at `size` and 30
     frames/s, if given.
     """
@@ -133,7 +117,7 @@ def find_streams(device: Any, size: Size | None = None) -> tuple[Any, dict[str, 
     return best
 
 
-def _has(profile: Any, size: Size) -> bool:
+def _has(profile: Any, size: FrameSize) -> bool:
     video = profile.as_video_stream_profile()
     return (video.width(), video.height()) == size and profile.fps() == streams.FRAMES_PER_S
 
@@ -146,10 +130,8 @@ def read_settings(sensor: Any, ending: str = "") -> dict[str, float]:
     for option in sensor.get_supported_options():
         if not option.name.endswith(ending):
             continue
-        try:
+        with suppress(RuntimeError):  # listed, but not readable in this state
             settings[option.name] = float(sensor.get_option(option))
-        except RuntimeError:  # listed, but not readable in this state
-            continue
     return {name: value for name, value in settings.items() if value != NOT_YET}
 
 
@@ -171,37 +153,30 @@ class Session:
             raise RuntimeError("it does not report its depth unit")
         self._unit_m = unit_m
         self._clocks = {stream: ClockUnwrap() for stream in profiles}
-        self._preview = SampleQueue(lossless=False)
+        self._preview = SampleQueue()
         """Frames from before the settings hold."""
         self._listening = False
         self._previewed_s = -inf
         """Timestamp of the newest sample from before the settings held."""
         self._held_back = 0
 
-    def start(
-        self, prepare: Callable[[Any], None] | None = None, ready: Callable[[], None] | None = None
-    ) -> None:
+    def start(self, prepare: Callable[[Any], None], ready: Callable[[], None]) -> None:
         """Start the sensor, set it up with `prepare`, call `ready`, and deliver every frame from
         then on.
 
         Raises RuntimeError when the device vanishes during this.
         """
         self._sensor.open(self._profiles)
-        self._listening = (
-            prepare is None
-        )  # a recording's first frame comes while `start` still runs
+        self._listening = False
         self._sensor.start(self._on_frame)
-        if prepare:
-            prepare(self._sensor)
+        prepare(self._sensor)
         self.settings = read_settings(self._sensor)
         if not self.settings:
             raise RuntimeError("it vanished while it was set up")
         if self._preview.arrived:
-            self.look(
-                BOUNDARY_WAIT_S
-            )  # else the first set of a recording would miss streams that came before
-        if ready:
-            ready()
+            # Else the first set of a recording would miss the streams that came before.
+            self.look(BOUNDARY_WAIT_S)
+        ready()
         self._listening = True
         self._preview.close()
 
@@ -219,12 +194,10 @@ class Session:
 
     def _on_frame(self, frame: Any) -> None:
         sample = streams.sample_from_sdk(frame)
-        if (
-            frame.get_frame_timestamp_domain().name == "hardware_clock"
-        ):  # it wraps, for each stream by itself
-            sample = replace(
-                sample, timestamp_s=self._clocks[sample.stream].add(sample.timestamp_s)
-            )
+        if frame.get_frame_timestamp_domain().name == "hardware_clock":
+            # It wraps, for each stream by itself.
+            unwrapped_s = self._clocks[sample.stream].add(sample.timestamp_s)
+            sample = replace(sample, timestamp_s=unwrapped_s)
         inbox = self.inbox if self._is_heard(sample) else self._preview
         inbox.put(sample)
 
@@ -259,12 +232,10 @@ class Session:
     def stop(self) -> None:
         """Stop, close and release the sensor."""
         self.end_wait()
-        # first: the SDK waits for its callbacks, and a callback may wait for room
         self.inbox.close()
         for end in (self._sensor.stop, self._sensor.close):
-            with suppress(
-                RuntimeError
-            ):  # a device that vanished or never started is already stopped
+            # A device that vanished or never started is already stopped.
+            with suppress(RuntimeError):
                 end()
         self._sensor = None
         self._profiles.clear()

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from nlos_cam.camera.fault_injection import Delivery, FaultyDevice
 from nlos_cam.camera.live_camera import LiveCamera
-from nlos_cam.camera.protocol import Clock, WallClock
+from nlos_cam.camera.protocol import WaitingClock, WallClock
 from nlos_cam.camera.recorder import Recording
 from nlos_cam.camera.sdk import load_sdk
 from nlos_cam.camera.session import SampleQueue
@@ -120,7 +120,7 @@ class SoftwareLidar:
     def _push(
         self, profile: Any, stream: str, number: int, timestamp_s: float, pixels: NDArray[Any]
     ) -> None:
-        frame = self._sdk.software_video_frame()  # a new one each time: the SDK owns a pushed frame
+        frame = self._sdk.software_video_frame()  # new each time: the SDK owns a pushed one
         frame.pixels = np.ascontiguousarray(pixels)
         frame.bpp = BYTES_PER_PIXEL[stream]
         frame.stride = pixels.shape[1] * BYTES_PER_PIXEL[stream]
@@ -136,14 +136,15 @@ MAX_LATE_FRAMES = FRAMES_PER_S
 JOIN_TIMEOUT_S = 5.0
 RESET_INSTANTS = FRAMES_PER_S
 """Instants for which a device that is reset is disconnected."""
-EXPOSED_AHEAD_S = 0.5 / FRAMES_PER_S
-"""Least time before a frame is due at which its exposure is computed: late, since a real device
-needs no processor for it and the last frame is still being reconstructed, and twice the time of the
-last exposure if that is longer."""
-REMEMBERED_EXPOSURES = 3000
-"""Frames (100 s) whose computing time is remembered."""
+# A real camera exposes a frame without this machine's processor; a simulated one computes it here,
+# beside the reconstruction of the frame before. So each image is computed as late as it can be:
+# half a period before it is due, or twice the time that the last image took, whichever is earlier.
+MIN_LEAD_S = 0.5 / FRAMES_PER_S
+"""Shortest time between the start of an image's computation and its delivery."""
+MAX_EXPOSURES = 3000
+"""Frames (100 s) whose computing time is stored."""
 MAX_TRUTHS = 1000
-"""Frames whose instant is remembered for their ground truth; no reader is that late."""
+"""Frames whose instant is stored for their ground truth; no reader is that late."""
 
 
 class SimulatedCamera(LiveCamera):
@@ -162,15 +163,15 @@ class SimulatedCamera(LiveCamera):
         uri: str,
         world: World,
         *,
-        clock: Clock | None = None,
+        clock: WaitingClock | None = None,
         recording: Recording | None = None,
         faults: Sequence[Fault] = (),
     ) -> None:
         self._world = world
         self._clock = clock or WallClock()
         self._faults = tuple(faults)
-        world.images(0)  # compile now: it would delay the first frames
-        self.exposures_s = deque[float](maxlen=REMEMBERED_EXPOSURES)
+        world.images(0)  # compiles, which would delay the first frames
+        self.exposures_s = deque[float](maxlen=MAX_EXPOSURES)
         """Seconds that the last frames' images took to compute: a real camera takes none of this
         machine's.
         """
@@ -197,19 +198,23 @@ class SimulatedCamera(LiveCamera):
         return super().__enter__()
 
     def _plug_in(self, instant: int) -> None:
-        self._model = model = FaultyDevice(self._faults, instant)
+        self._model = FaultyDevice(self._faults, instant)
         self._instants: dict[int, int] = {}
-        pinhole = self._world.rig.pinhole
-        celsius = self._world.celsius(instant)
-        other_size = model.has_other_size
-        own_clock = model.has_own_clock
+        """Instant of each frame, by the device's own number."""
         self._lidar = SoftwareLidar(
-            pinhole, load_sdk(), celsius=celsius, has_other_size=other_size, has_own_clock=own_clock
+            self._world.rig.pinhole,
+            load_sdk(),
+            celsius=self._world.celsius(instant),
+            has_other_size=self._model.has_other_size,
+            has_own_clock=self._model.has_own_clock,
         )
 
     def _begin(self, inbox: SampleQueue) -> None:
-        first = self._instant() + 1 if self._start_s is not None else 0
-        self._start_s = self._clock.now() if self._start_s is None else self._start_s
+        if self._start_s is None:
+            first = 0
+            self._start_s = self._clock.now()
+        else:  # the world went on while the device was away
+            first = self._instant() + 1
         self._stopping.clear()
         self._thread = Thread(
             target=self._run, args=(inbox, first), name=f"world of {self.uri}", daemon=True
@@ -226,11 +231,9 @@ class SimulatedCamera(LiveCamera):
         self._thread = None
 
     def _instant(self) -> int:
-        return (
-            int((self._clock.now() - self._start_s) * FRAMES_PER_S)
-            if self._start_s is not None
-            else 0
-        )
+        if self._start_s is None:
+            return 0
+        return int((self._clock.now() - self._start_s) * FRAMES_PER_S)
 
     def _is_connected(self) -> bool:
         return self._model.is_connected(self._instant())
@@ -267,19 +270,23 @@ class SimulatedCamera(LiveCamera):
     def _deliver(self, instant: int) -> None:
         """Expose each instant ahead of time, and deliver the device's frames when it is due."""
         start_s = self._start_s or 0.0
-        ahead_s = EXPOSED_AHEAD_S
+        lead_s = MIN_LEAD_S
         while True:
             due_s = start_s + instant / FRAMES_PER_S
-            if self._clock.wait(self._stopping, due_s - ahead_s - self._clock.now()):
+            if self._clock.wait(self._stopping, due_s - lead_s - self._clock.now()):
                 return
-            exposure_s = self._clock.now()
+            computed_from_s = self._clock.now()
             images = self._world.images(instant)
-            self.exposures_s.append(self._clock.now() - exposure_s)
-            ahead_s = max(EXPOSED_AHEAD_S, 2 * self.exposures_s[-1])
+            computing_s = self._clock.now() - computed_from_s
+            self.exposures_s.append(computing_s)
+            lead_s = max(MIN_LEAD_S, 2 * computing_s)
+
             if self._clock.wait(self._stopping, due_s - self._clock.now()):
                 return
             for delivery in self._model.deliver(instant, due_s, images):
                 self._push(delivery)
+
+            # On a machine too busy to keep up, skip instants rather than fall behind without end.
             late = int((self._clock.now() - start_s) * FRAMES_PER_S) - instant
             instant += max(1, late - MAX_LATE_FRAMES)
 

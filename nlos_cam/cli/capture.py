@@ -20,7 +20,7 @@ from nlos_cam.cli import common
 from nlos_cam.errors import NlosCamError
 
 FIGURES = ("saturated_share", "invalid_share", "temporal_noise_mm")
-ENDINGS: dict[recordings.State, str] = {
+ENDINGS: dict[recordings.TakeState, str] = {
     "interrupted": "Interrupted. ",
     "lost": "Camera lost. ",
     "disk full": "Disk full. ",
@@ -58,7 +58,7 @@ def _with_totals(each: list[dict[str, Any]]) -> dict[str, Any]:
 
 def _take_fields(
     target: recordings.CaptureTarget,
-    state: recordings.State,
+    state: recordings.TakeState,
     summary: recordings.Summary,
     sidecar: Path,
 ) -> dict[str, Any]:
@@ -100,15 +100,16 @@ def format_take(take: recordings.CaptureResult) -> str:
         return f"{ending}Recorded {take.sets} frames; not verified\nWrote {take.target.path}"
     size_mb = take.target.path.stat().st_size / 1e6
     summary = take.summary
-    noise = (
-        "unknown" if summary.temporal_noise_mm is None else f"{summary.temporal_noise_mm:.2f} mm"
-    )
+    noise_mm = summary.temporal_noise_mm
+    noise = "unknown" if noise_mm is None else f"{noise_mm:.2f} mm"
+    verified = "" if take.state == "damaged" else "; verified"
+    saturated = f"{100 * (summary.saturated_share or 0.0):.2f} % saturated"
+    missing = f"{100 * (summary.invalid_share or 0.0):.1f} % missing depth"
+    seconds = f"{take.verified.seconds:.1f} s"
     return (
-        f"{ending}Recorded {take.verified.frames} frames ({take.verified.seconds:.1f} s,"
-        f" {size_mb:.0f}"
-        f" MB){'' if take.state == 'damaged' else '; verified'}\n{100 * (summary.saturated_share or 0.0):.2f}"
-        f" % saturated, {100 * (summary.invalid_share or 0.0):.1f} % missing depth, temporal noise"
-        f" {noise}\nWrote {take.target.path}"
+        f"{ending}Recorded {take.verified.frames} frames ({seconds}, {size_mb:.0f} MB){verified}\n"
+        f"{saturated}, {missing}, temporal noise {noise}\n"
+        f"Wrote {take.target.path}"
     )
 
 
@@ -228,13 +229,8 @@ def _targets(
     digits = max(2, len(str(takes)))
     numbered = [base.with_stem(f"{base.stem}-{number:0{digits}}") for number in range(1, takes + 1)]
     paths = numbered if takes > 1 else [base]
-    targets = list(
-        map(
-            recordings.CaptureTarget,
-            paths,
-            labels * takes if len(labels) == 1 else labels or [None] * takes,
-        )
-    )
+    each = labels * takes if len(labels) == 1 else labels or [None] * takes
+    targets = [recordings.CaptureTarget(*pair) for pair in zip(paths, each, strict=True)]
     for target in targets:
         for path in (target.path, recordings.sidecar_path(target.path)):
             common.output_path(path, "", path.suffix, overwrite=overwrite)
@@ -247,7 +243,8 @@ def _check_disk(
     """Raise DiskFullError where the takes may not fit; without a limit of frames, print how long
     the disk lasts.
     """
-    path, free = targets[0].path, cameras.free_bytes(targets[0].path)
+    path = targets[0].path
+    free = cameras.free_bytes(path)
     cameras.check_room(path, camera.intrinsics, (limit or 0) * len(targets), free)
     if limit is None:
         lasts_s = cameras.recording_s(camera.intrinsics, free)

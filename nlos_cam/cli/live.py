@@ -7,7 +7,7 @@ from contextlib import nullcontext
 from dataclasses import asdict
 from functools import cache, partial
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated
 
 import typer
 from rich.markup import escape
@@ -55,10 +55,6 @@ Average = Annotated[
     typer.Option(
         "--average", min=1, max=1000, help="Number of frames to average; moving objects blur."
     ),
-]
-ReadBy = Annotated[
-    Literal["plain", "sdk"],
-    typer.Option("--reader", help='Bag reader: built-in ("plain"), or librealsense ("sdk").'),
 ]
 BagFile = Annotated[
     Path, typer.Argument(metavar="F.BAG", help="Recording with depth, infrared and confidence.")
@@ -180,7 +176,6 @@ def replay(
     out: Out = None,
     weights: Weights = None,
     average: Average = 1,
-    reader: ReadBy = "plain",
     save_view: viewing.SaveReplayView = False,
     stills: viewing.Stills = 0,
     video: viewing.Video = False,
@@ -193,7 +188,7 @@ def replay(
     formats = object_formats(as_object)
     path = common.output_path(out, "replay", "", overwrite=overwrite)
     with common.interrupted_by_signals():
-        opened = cameras.open_camera(f"bag:{bag}", reader=reader)
+        opened = cameras.open_camera(f"bag:{bag}")
         bench = reconstruct.open_bench(wall, opened)
         checks = reconstruct.PeriodicPhysicsCheck(bench.rig, on_error=_warn_once)
         pipeline = _load_pipeline(bench, weights, average, checks)

@@ -20,7 +20,6 @@ FILES: dict[str, tuple[str, Describe]] = {
     ".toml": ("record", files.describe_toml),
     ".json": ("record", files.describe_json),
     ".html": ("page", files.describe_page),
-    ".rrd": ("saved view", files.describe_rrd),
     ".h5": ("dataset shard", files.describe_shard),
 }
 """Word for a damaged file, and reader, by suffix."""

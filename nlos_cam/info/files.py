@@ -387,15 +387,6 @@ def describe_page(path: Path, _verify: bool) -> Description | None:
     return Description("report", {"title": title}, problem=problem, checked="head and end")
 
 
-def describe_rrd(path: Path, _verify: bool) -> Description | None:
-    """Describe a saved view of an earlier version, which Rerun opens."""
-    with path.open("rb") as file:
-        if file.read(3) != b"RRF":
-            return None
-    following = ["pip install 'rerun-sdk==0.41.*'", f"rerun {shlex.quote(str(path))}"]
-    return Description("saved view of an earlier version", checked="first bytes", next=following)
-
-
 def describe_shard(path: Path, verify: bool) -> Description:
     """Describe a shard of a dataset; its heads have checksums."""
     from nlos_cam.dataset import check_arrays, read_head, shard_origin

@@ -10,11 +10,10 @@ __all__ = [
     "QualityMeter",
     "RepairResult",
     "ReplayCamera",
-    "SdkReplayCamera",
     "Sidecar",
     "SidecarFile",
-    "State",
     "Summary",
+    "TakeState",
     "Telemetry",
     "VerifyResult",
     "export_recording",
@@ -34,12 +33,11 @@ from .export import ExportOptions, ExportResult, Format, export_recording
 from .playback import ReplayCamera, VerifyResult, open_lidar_bag, verify
 from .quality import QualityMeter
 from .repair import RepairResult, repair_recording
-from .sdk_playback import SdkReplayCamera
 from .sidecar import (
     Sidecar,
     SidecarFile,
-    State,
     Summary,
+    TakeState,
     load_measured_wall,
     load_sidecar,
     sidecar_path,

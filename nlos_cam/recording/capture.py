@@ -16,8 +16,8 @@ from nlos_cam.recording.playback import VerifyResult
 from nlos_cam.recording.quality import Quality, QualityMeter
 from nlos_cam.recording.sidecar import (
     SidecarFile,
-    State,
     Summary,
+    TakeState,
     WallFile,
     sidecar_path,
     summary_of,
@@ -37,7 +37,7 @@ class CaptureResult:
     """Outcome of a take."""
 
     target: CaptureTarget
-    state: State
+    state: TakeState
     sets: int
     """Complete sets of the three streams that came while it recorded."""
     quality: Quality
@@ -129,7 +129,7 @@ class CaptureSession:
             sidecar_path(target.path), self._camera, label=target.label, wall=self._wall
         )
         meter = QualityMeter()
-        state: State = "complete"
+        state: TakeState = "complete"
         error: NlosCamError | None = None
         try:
             for frame in self._recorded(frames):

@@ -68,14 +68,13 @@ class ReplayCamera:
             raise
 
     def _frames(self, pairing: FrameSynchronizer, iteration: int) -> Iterator[Frame]:
-        wraps = (
-            self._bag.metadata("depth", 0).domain == "hardware_clock"
-        )  # the counter of a device's own clock
-        clock = ClockUnwrap().add if wraps else float
+        # A device's own clock is a counter that wraps.
+        is_counter = self._bag.metadata("depth", 0).domain == "hardware_clock"
+        unwrap = ClockUnwrap().add if is_counter else float
         for place in self._bag.order(FORMATS):
             sample = self._bag.sample(place.stream, place.index)
             self.arrived[sample.stream] += 1
-            found = pairing.add(replace(sample, timestamp_s=clock(sample.timestamp_s)))
+            found = pairing.add(replace(sample, timestamp_s=unwrap(sample.timestamp_s)))
             if found:
                 self._count(pairing)
                 self._settings = self._bag.settings(place.time_ns)
@@ -105,13 +104,15 @@ def open_lidar_bag(path: Path) -> BagReader:
     if not bag.streams:
         raise RecordingError(f"{path} holds no frames: record it again")
     present = {name: info.format for name, info in bag.streams.items()}
-    if missing := [stream for stream, wanted in FORMATS.items() if present.get(stream) != wanted]:
+    missing = [stream for stream, wanted in FORMATS.items() if present.get(stream) != wanted]
+    if missing:
         raise StreamMissingError(
             f"{path} has no {' and no '.join(missing)} stream (it has"
             f" {', '.join(sorted(present))}): record depth, infrared and confidence with an L515,"
             " e.g. `nlos-cam capture --camera l515`"
         )
-    if min((pinhole := bag.streams["depth"].intrinsics).fx, pinhole.fy) <= 0:
+    pinhole = bag.streams["depth"].intrinsics
+    if min(pinhole.fx, pinhole.fy) <= 0:
         raise RecordingError(
             f"{path} is damaged (a focal length of {pinhole.fx:g} x {pinhole.fy:g}): record it"
             " again"
@@ -145,7 +146,8 @@ def verify(path: Path, on_frame: Callable[[], None] = lambda: None) -> VerifyRes
     last_s = 0.0
     with ReplayCamera(path) as camera:
         for frame in camera:
-            first_s = first_s if frames else frame.timestamp_s
+            if frames == 0:
+                first_s = frame.timestamp_s
             last_s = frame.timestamp_s
             frames += 1
             on_frame()

@@ -30,13 +30,8 @@ class Quality:
     confidence_mean: float | None = None
     """Over all pixels; 0 to 15."""
     temporal_noise_mm: float | None = None
-    """Median over pixels of the standard deviation of depth in time.
-
-    For independent noise of standard deviation s, the difference of two frames has variance 2 s^2,
-    so s is the root mean square of a pixel's differences between consecutive frames over the root
-    of 2. The median difference of each pair of frames over the image is subtracted first, so that a
-    push of the camera does not count as noise; slow drift adds little. Pixels with 8 valid pairs or
-    more.
+    """Median over pixels of the standard deviation of depth in time, without movement of the whole
+    camera.
     """
     jitter_ms: float | None = None
     """Standard deviation of the intervals between frames, relative to those of their numbers at 30
@@ -44,6 +39,12 @@ class Quality:
     """
 
 
+# Temporal noise. Depth of a pixel at frame t is z + e_t with independent e_t of variance s^2, so
+# the difference of two frames has variance Var(e_t - e_{t-1}) = 2 s^2, and
+#     s = sqrt(mean((z_t - z_{t-1})^2) / 2).
+# Differences of consecutive frames, not deviations from a mean: slow drift hardly adds to them. A
+# push of the camera shifts all pixels at once; the median difference over the image is that shift,
+# and is subtracted from each pair first.
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _add_squares(
     depth_m: Float32, before_m: Float32, shift_m: float, squares: Float32, pairs: Float32
@@ -63,7 +64,8 @@ class QualityMeter:
         self._frames = self._pixels = 0
         self._saturated = self._invalid = self._confidence = 0
         self._before: Frame | None = None
-        self._squares = self._pairs = np.zeros(0, np.float32)
+        self._squares = np.zeros(0, np.float32)
+        self._pairs = np.zeros(0, np.float32)
         self._lateness = _Spread()
 
     def add(self, frame: Frame) -> None:
@@ -76,9 +78,8 @@ class QualityMeter:
         if self._before:
             self._add_pair(self._before, frame)
         else:
-            self._squares, self._pairs = (
-                np.zeros(frame.depth_m.size, np.float32) for _ in range(2)
-            )
+            self._squares = np.zeros(frame.depth_m.size, np.float32)
+            self._pairs = np.zeros(frame.depth_m.size, np.float32)
         self._before = frame
 
     def _add_pair(self, before: Frame, frame: Frame) -> None:
@@ -133,4 +134,7 @@ def _shift_m(depth_m: Float32, before_m: Float32) -> float:
 
 def _noise_mm(squares: Float32, pairs: Float32) -> float | None:
     valid = pairs >= MIN_PAIRS
-    return 1e3 * sqrt(float(np.median(squares[valid] / pairs[valid])) / 2) if valid.any() else None
+    if not valid.any():
+        return None
+    mean_square_m2 = float(np.median(squares[valid] / pairs[valid]))
+    return 1e3 * sqrt(mean_square_m2 / 2)

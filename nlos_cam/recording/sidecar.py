@@ -23,7 +23,7 @@ from nlos_cam.recording.bag_messages import finite
 from nlos_cam.recording.playback import VerifyResult
 from nlos_cam.recording.quality import Quality
 
-State = Literal["recording", "complete", "interrupted", "lost", "disk full", "damaged"]
+TakeState = Literal["recording", "complete", "interrupted", "lost", "disk full", "damaged"]
 """recording: in progress, or killed. interrupted: by Ctrl-C. lost: the camera vanished. damaged:
 the file holds fewer frames than came.
 """
@@ -82,7 +82,7 @@ class Sidecar(Record):
     label: str | None
     camera: str
     """The camera's URI."""
-    state: State
+    state: TakeState
     started: AwareDatetime
     """UTC."""
     device: dict[str, str]
@@ -210,7 +210,7 @@ class SidecarFile:
             self._every_s = 2 * self._every_s
         self._sidecar = self._sidecar.model_copy(update={"temperatures": series})
 
-    def finish(self, state: State, summary: Summary) -> None:
+    def finish(self, state: TakeState, summary: Summary) -> None:
         """Write the final state and summary."""
         self._sidecar = self._sidecar.model_copy(update={"state": state, "summary": summary})
         self._write()

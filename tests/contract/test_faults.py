@@ -3,6 +3,7 @@ and counts.
 """
 
 from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, nullcontext
 from itertools import pairwise
 from pathlib import Path
 from threading import Event
@@ -11,6 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 from nlos_calibration import load_rig
+from sdk_playback import SdkReplay
 from small_frames import ListViewer, sheet_network
 
 from nlos_cam.camera import Recording, SimulatedCamera, session
@@ -18,7 +20,7 @@ from nlos_cam.errors import CameraLostError
 from nlos_cam.frames import Frame
 from nlos_cam.live import RunReport, run_live
 from nlos_cam.reconstruct import CalibratedRig, Pipeline, Verdict, frame_reader
-from nlos_cam.recording import ReplayCamera, SdkReplayCamera
+from nlos_cam.recording import ReplayCamera
 from nlos_cam.render import Fault, SensedImages
 from nlos_cam.view import Moment
 
@@ -213,8 +215,12 @@ RECORDED = [
 ]
 
 
+def sdk_replay(path: Path) -> AbstractContextManager[SdkReplay]:
+    return nullcontext(SdkReplay(path))
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize("reader", [ReplayCamera, SdkReplayCamera])
+@pytest.mark.parametrize("reader", [ReplayCamera, sdk_replay])
 def test_recording_of_faults_replays_as_it_was_captured(
     camera: Make, tmp_path: Path, reader: Any
 ) -> None:

@@ -76,7 +76,7 @@ def test_settings_that_do_not_take_are_logged_once(
         assert word in record.message
 
 
-def test_device_that_cannot_be_asked_is_reported_but_hides_no_other() -> None:
+def test_unreadable_device_is_reported_and_hides_no_other() -> None:
     def fail(_: str) -> bool:
         raise RuntimeError("no such luck")
 
@@ -168,7 +168,7 @@ def test_two_cameras_share_a_context_and_keep_their_devices() -> None:
     assert sdk.contexts == 1
 
 
-def test_identity_and_telemetry_omit_what_is_not_reported_or_measured_yet(
+def test_identity_and_telemetry_omit_unreported_values(
     fake_camera: Make,
 ) -> None:
     lidar = FakeLidar(apd_temperature=-9999.0, ldd_temperature=41.5)

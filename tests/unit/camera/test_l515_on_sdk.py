@@ -72,7 +72,7 @@ class Delivering(L515Camera):
             self.thread.join(5.0)
 
 
-def test_settings_take_on_librealsense_before_its_recording_which_is_whole(tmp_path: Path) -> None:
+def test_settings_hold_before_a_recording_by_librealsense(tmp_path: Path) -> None:
     recording = Recording(tmp_path / "wall.bag", frames=20)
     with Delivering(Desk(), recording) as camera:
         settings = list(camera)[-1].settings

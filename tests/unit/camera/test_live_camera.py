@@ -54,7 +54,7 @@ def test_frames_are_in_metres_and_levels_and_none_is_early(fake_camera: Make) ->
     assert frames[0].truth_depth_m is None
 
 
-def test_device_without_a_stream_or_unit_or_that_fails_at_the_start_is_an_error(
+def test_device_without_stream_unit_or_start_is_an_error(
     fake_camera: Make,
 ) -> None:
     with pytest.raises(CameraError, match=r"confidence.*640 x 480"):
@@ -290,9 +290,7 @@ def test_recovery_restarts_with_back_off_then_resets_then_ends() -> None:
     assert device.counts == {"restarted": 3, "reset": 1}
 
 
-def test_failed_restart_is_followed_by_the_next_at_once_and_by_a_reset_if_intrinsics_are_lost() -> (
-    None
-):
+def test_lost_intrinsics_lead_to_a_reset_at_once() -> None:
     device = Device(failing=("busy", "busy"))
     device.recover()
     assert device.counts == {"restarted": 3}

@@ -218,9 +218,7 @@ def test_recorder_pauses_again_while_a_disk_is_behind(
     assert fake.pauses == pauses
 
 
-def test_recorder_without_a_folder_or_whose_file_grows_no_more_fails(
-    made: SdkRecorder, tmp_path: Path
-) -> None:
+def test_recorder_fails_without_folder_or_growing_file(made: SdkRecorder, tmp_path: Path) -> None:
     with pytest.raises(RecordingError, match="no folder"):
         SdkRecorder(tmp_path / "no folder" / "a.bag", "device", SDK)
     for _ in range(10):  # now and then

@@ -2,7 +2,6 @@ import subprocess
 import sys
 import tomllib
 from pathlib import Path
-from typing import Any
 
 import pytest
 from packaging.requirements import Requirement
@@ -10,6 +9,7 @@ from packaging.requirements import Requirement
 from nlos_cam.camera import SIMULATED, open_camera
 from nlos_cam.camera.sdk import MAC_WHEEL, WHEEL, load_sdk, wheel_for
 from nlos_cam.errors import CameraError, CameraNotFoundError
+from nlos_cam.recording import ReplayCamera
 
 LATE = """
 import sys
@@ -27,16 +27,12 @@ def test_unknown_camera_is_an_error_with_the_known_ones(uri: str) -> None:
     assert repr(uri) in str(raised.value)
 
 
-@pytest.mark.parametrize(
-    ("reader", "kind"), [("plain", "ReplayCamera"), ("sdk", "SdkReplayCamera")]
-)
-def test_reader_and_path_choose_the_playback(
-    noise_bag: Path, tmp_path: Path, reader: Any, kind: str
-) -> None:
+def test_path_of_a_recording_chooses_the_playback(noise_bag: Path, tmp_path: Path) -> None:
     path = tmp_path / "a:b.bag"
     path.write_bytes(noise_bag.read_bytes())
-    camera = open_camera(f"bag:{path}", reader=reader)
-    assert (type(camera).__name__, camera.uri) == (kind, f"bag:{path}")
+    camera = open_camera(f"bag:{path}")
+    assert isinstance(camera, ReplayCamera)
+    assert camera.uri == f"bag:{path}"
 
 
 def test_worlds_can_be_opened_and_report_progress(
@@ -63,7 +59,7 @@ def test_backends_are_imported_late() -> None:
     [("x86_64", f"pip install {WHEEL}"), ("aarch64", r"linux aarch64.*Python 3\.11")],
 )
 def test_missing_wheel_has_advice(
-    noise_bag: Path, monkeypatch: pytest.MonkeyPatch, machine: str, words: str
+    monkeypatch: pytest.MonkeyPatch, machine: str, words: str
 ) -> None:
     assert load_sdk() is load_sdk()
     monkeypatch.setitem(sys.modules, "pyrealsense2", None)
@@ -73,9 +69,8 @@ def test_missing_wheel_has_advice(
     monkeypatch.setattr("sys.version_info", (3, 11, 7, "final", 0))
     load_sdk.cache_clear()
     try:
-        for ask in (load_sdk, lambda: open_camera(f"bag:{noise_bag}", reader="sdk")):
-            with pytest.raises(CameraError, match=words):
-                ask()
+        with pytest.raises(CameraError, match=words):
+            load_sdk()
     finally:
         load_sdk.cache_clear()
 

@@ -1,5 +1,4 @@
-import time
-from threading import Thread, Timer
+from threading import Timer
 from types import SimpleNamespace
 from typing import Any
 
@@ -27,7 +26,7 @@ def take_all(inbox: SampleQueue) -> list[int]:
 
 def test_live_queue_drops_its_oldest_when_full() -> None:
     numbers: list[int] = []
-    inbox = SampleQueue(lossless=False, on_set=lambda found: numbers.append(found.number))
+    inbox = SampleQueue(on_set=lambda found: numbers.append(found.number))
     put(inbox, range(CAPACITY + 3))
     assert take_all(inbox) == list(range(3, CAPACITY + 3))
     assert inbox.dropped == 3
@@ -35,32 +34,14 @@ def test_live_queue_drops_its_oldest_when_full() -> None:
     assert inbox.take(0.001) is None
 
 
-def test_full_lossless_queue_makes_the_sender_wait() -> None:
-    inbox = SampleQueue(lossless=True)
-    sender = Thread(target=put, args=(inbox, range(5 * CAPACITY)))
-    sender.start()
-    while inbox.arrived.total() < 3 * CAPACITY:
-        time.sleep(0.001)
-    sender.join(0.05)
-    assert inbox.arrived.total() == 3 * CAPACITY
-    taken = [found.number for _ in range(3 * CAPACITY) if (found := inbox.take(30.0))]
-    assert taken == list(range(3 * CAPACITY))
-    assert inbox.dropped == 0
-    inbox.close()  # releases the sender
-    sender.join(30.0)
-    assert not sender.is_alive()
-    assert inbox.ended
-
-
-@pytest.mark.parametrize("lossless", [False, True])
-def test_finish_counts_half_a_set_of_a_recording(lossless: bool) -> None:
-    inbox = SampleQueue(lossless=lossless)
+def test_finish_of_a_live_device_counts_no_half_set() -> None:
+    inbox = SampleQueue()
     inbox.put(Sample("depth", 0, 0.0, np.zeros((1, 1))))
     inbox.finish()
-    assert inbox.incomplete == int(lossless)
+    assert inbox.incomplete == 0
 
 
-def test_read_settings_omits_what_cannot_be_read_or_was_not_measured_yet() -> None:
+def test_read_settings_omits_unreadable_and_unmeasured_options() -> None:
     sensor = FakeSensor(FakeLidar(apd_temperature=-9999.0, ldd_temperature=40.0), 0)
     listed = [
         SimpleNamespace(name=name)
@@ -80,10 +61,10 @@ def test_find_streams_takes_the_sensor_with_most_streams() -> None:
 
 
 def session_of(lidar: FakeLidar) -> Session:
-    return Session(*find_streams(FakeDevice(lidar, 0)), SampleQueue(lossless=False))
+    return Session(*find_streams(FakeDevice(lidar, 0)), SampleQueue())
 
 
-def test_look_returns_the_next_set_while_preparing_or_none_by_timeout_or_end() -> None:
+def test_look_returns_the_next_set_while_preparing_or_none() -> None:
     lidar = FakeLidar(usb="2.1")
     found = list[Any]()
     session = session_of(lidar)
@@ -96,7 +77,7 @@ def test_look_returns_the_next_set_while_preparing_or_none_by_timeout_or_end() -
         Timer(0.1, session.end_wait).start()
         found.append(session.look(10_000.0))
 
-    session.start(prepare)
+    session.start(prepare, lambda: None)
     session.stop()
     assert found == [4, None, None]
     assert session.inbox.arrived.total() == 0  # none of these is delivered
@@ -107,13 +88,15 @@ def test_set_from_before_the_settings_is_not_delivered(clock_stands: bool) -> No
     """A clock that stands still holds no more than one set back."""
     lidar = FakeLidar(usb="2.1")
     session = session_of(lidar)
-    begun = ("depth",)
+    early_streams = ("depth",)
     if clock_stands:
         lidar.period_ms = 0.0
-        session.start(lambda _: None)
+        session.start(lambda _: None, lambda: None)
         lidar.deliver(range(5, 6))
     else:
-        session.start(lambda _: None, ready=lambda: lidar.deliver(range(5, 6), streams=begun))
+        session.start(
+            lambda _: None, ready=lambda: lidar.deliver(range(5, 6), streams=early_streams)
+        )
         lidar.deliver(range(5, 6), streams=("infrared", "confidence"))
     lidar.deliver(range(6, 8))
     assert take_all(session.inbox) == [6, 7]

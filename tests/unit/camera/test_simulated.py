@@ -17,8 +17,8 @@ from nlos_cam.camera.fault_injection import Delivery, FaultyDevice
 from nlos_cam.camera.protocol import WallClock
 from nlos_cam.camera.session import read_settings
 from nlos_cam.camera.simulated import (
-    EXPOSED_AHEAD_S,
     MAX_LATE_FRAMES,
+    MIN_LEAD_S,
     SimulatedCamera,
     SoftwareLidar,
 )
@@ -52,14 +52,14 @@ def timed(noise_world: Any, hurried_clock: Any) -> Timed:
     return make
 
 
-@pytest.mark.parametrize(("takes_s", "ahead_s"), [(0.001, EXPOSED_AHEAD_S), (0.012, 0.024)])
-def test_frames_are_exposed_late_but_in_time(timed: Timed, takes_s: float, ahead_s: float) -> None:
+@pytest.mark.parametrize(("takes_s", "lead_s"), [(0.001, MIN_LEAD_S), (0.012, 0.024)])
+def test_frames_are_exposed_late_but_in_time(timed: Timed, takes_s: float, lead_s: float) -> None:
     camera, start_s = timed(lambda _: takes_s)
     with camera:
         assert len(list(islice(camera, 6))) == 6
     for number in range(2, 6):
         assert takes_s + number / 30 - start_s[number] == pytest.approx(
-            ahead_s, abs=1e-6
+            lead_s, abs=1e-6
         )  # compiling took once more
 
 

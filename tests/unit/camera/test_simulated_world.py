@@ -42,7 +42,7 @@ def world(scene: Path) -> World:
     return open_world(str(scene))
 
 
-def test_world_frame_is_bit_identical_by_number_and_repeats_the_loop_with_other_noise(
+def test_world_frame_is_a_function_of_its_number(
     world: World,
 ) -> None:
     first, second, again, later = (world.images(number) for number in (0, 1, 2, 7))
@@ -87,7 +87,7 @@ def test_world_from_the_cache_equals_the_rendered_one(
     assert (harmed.depth_z16 > 0).sum() < 0.7 * (world.images(0).depth_z16 > 0).sum()
 
 
-def test_world_warms_and_drifts_by_the_frame_number_beyond_the_loop(tmp_path: Path) -> None:
+def test_world_warms_and_drifts_beyond_the_loop(tmp_path: Path) -> None:
     (tmp_path / "warming.toml").write_text(WARMING, encoding="utf-8")
     warming = open_world(str(tmp_path / "warming.toml"))
     numbers = (0, 18_000, 180_000)

@@ -203,7 +203,7 @@ def of_another_shape(number: int, *streams: str) -> list[Sample]:
         ),
     ],
 )
-def test_pairing_counts_late_odd_missing_renumbered_stray_paused_and_repeated_sets(
+def test_pairing_counts_every_kind_of_irregular_set(
     samples: list[Sample], numbers: list[int], counts: dict[str, int], incomplete: int, dropped: int
 ) -> None:
     pairing = FrameSynchronizer(SHAPE)

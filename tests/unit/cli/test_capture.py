@@ -194,7 +194,7 @@ def take(**changes: Any) -> CaptureResult:
     return CaptureResult(**values | {"sidecar": SimpleNamespace(path=Path("a.json"))} | changes)
 
 
-def test_result_holds_the_fields_of_one_take_and_totals_of_several() -> None:
+def test_result_holds_fields_of_one_take_totals_of_several() -> None:
     found = result_of([take(target=CaptureTarget(OUT, "a cup"))], several=False)
     shares = {"saturated_share": 0.001, "invalid_share": 0.25, "temporal_noise_mm": 1.234}
     named = {

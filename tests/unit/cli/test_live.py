@@ -191,11 +191,8 @@ def test_replay_writes_its_folder_and_one_json_object(opened: Opened, run: Run) 
     assert (report["frames"], report["out"]) == (20, "out")
     assert "training rig" not in report.err
     run(*REPLAY, code=1)
-    run(*REPLAY, "--overwrite", "--reader", "sdk")
-    assert opened.calls == [
-        ("bag:run.bag", {"reader": "plain"}),
-        ("bag:run.bag", {"reader": "sdk"}),
-    ]
+    run(*REPLAY, "--overwrite")
+    assert opened.calls == [("bag:run.bag", {})] * 2
 
 
 @pytest.mark.parametrize("command", [RECORDED, REPLAY])

@@ -65,7 +65,7 @@ def test_repair_interrupted_is_exit_code_130_without_output(
     assert list(tmp_path.iterdir()) == []
 
 
-def test_export_reports_what_was_written_and_overwrites_when_asked(
+def test_export_reports_its_files_and_overwrites_if_asked(
     noise_bag: Path, tmp_path: Path, run: Run
 ) -> None:
     (tmp_path / "depth.csv").write_text("precious")

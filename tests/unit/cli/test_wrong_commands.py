@@ -57,7 +57,6 @@ capture --takes 2 | --takes
 capture --takes 3 --frames 1 --label a --label b | --label
 capture --out run.mp4 | .bag
 replay | missing
-replay run.bag --reader fast | plain or sdk
 replay random.bag --object fbx | fbx
 repair run.bag --out run.txt | .bag
 calibrate | --wall
@@ -120,7 +119,7 @@ live sim:faults.toml | faults.0.kind
 live sim:wall.toml | wall record
 live sim:folder.toml | folder.toml
 capture --wall binary.toml | binary
-replay zero.bag --reader plain | zero.bag
+replay zero.bag | zero.bag
 export zero.bag | zero.bag
 repair none.bag | none.bag
 repair random.bag | random.bag

@@ -107,7 +107,7 @@ def test_sidecar_thins_a_long_series_evenly(path: Path, monkeypatch: pytest.Monk
     assert len(set(np.diff(times).tolist())) == 1
 
 
-def test_sidecar_ends_with_the_first_frames_settings_a_state_and_a_summary(path: Path) -> None:
+def test_sidecar_ends_with_settings_state_and_summary(path: Path) -> None:
     sidecar = SidecarFile(path, Warm())
     sidecar.on_frame(frame(5.0, laser_power=31.0))
     sidecar.on_frame(frame(5.1, laser_power=99.0))

@@ -5,40 +5,31 @@ import time
 from collections import defaultdict
 from collections.abc import Callable, Iterable
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
+from sdk_playback import SdkReplay
 
 from nlos_cam.camera import intrinsics_of, load_sdk, sample_from_sdk
-from nlos_cam.camera.session import SampleQueue, read_settings
+from nlos_cam.camera.session import read_settings
 from nlos_cam.camera.timestamps import WRAP_PERIOD_S
 from nlos_cam.errors import RecordingError
-from nlos_cam.recording import BagReader, ReplayCamera, SdkReplayCamera
+from nlos_cam.frames import Frame
+from nlos_cam.recording import BagReader, ReplayCamera
 
 IMAGE = "/image/data"
 Messages = Iterable[tuple[int, bytes]]
 
 
-def frames_of(camera: Any, pause_s: float = 0.0) -> tuple[list[Any], dict[str, Any]]:
-    frames: list[Any] = []
-    with camera:
-        for frame in camera:
-            time.sleep(pause_s)
-            images = frame.depth_m.tobytes(), frame.ir.tobytes(), frame.confidence.tobytes()
-            frames.append(
-                (
-                    frame.frame_number,
-                    frame.timestamp_s,
-                    frame.intrinsics,
-                    dict(frame.settings),
-                    images,
-                )
-            )
-        return frames, {
-            name: getattr(camera, name) for name in ("incomplete", "dropped", "arrived", "identity")
-        }
+def values_of(recorded: Iterable[Frame]) -> list[Any]:
+    """Return number, time, intrinsics, settings and the bits of each frame's images."""
+    values: list[Any] = []
+    for frame in recorded:
+        images = [image.tobytes() for image in (frame.depth_m, frame.ir, frame.confidence)]
+        settings = dict(frame.settings)
+        values.append((frame.frame_number, frame.timestamp_s, frame.intrinsics, settings, images))
+    return values
 
 
 def as_recorded(topic: str, time_ns: int, raw: bytes) -> Messages:
@@ -78,16 +69,25 @@ def test_both_readers_give_the_same_frames(
     rewritten: Any, edit: Callable[[str, int, bytes], Messages]
 ) -> None:
     path = rewritten(edit)
-    ours = frames_of(ReplayCamera(path))
-    missing = {3, 4, 8, 12, 19} if edit is with_gaps else set()
-    assert [frame[0] for frame in ours[0]] == [
-        number for number in range(20) if number not in missing
-    ]
-    assert (ours[1]["dropped"], ours[1]["incomplete"]) == ((2, 3) if missing else (0, 0))
-    assert ours == frames_of(SdkReplayCamera(path), pause_s=0.01 if edit is as_recorded else 0.0)
-    if edit is around_a_wrap:
-        expected_s = WRAP_PERIOD_S + 0.033333 * np.arange(-10, 10)
-        assert [frame[1] for frame in ours[0]] == pytest.approx(expected_s)
+    theirs = SdkReplay(path)
+    with ReplayCamera(path) as ours:
+        assert values_of(ours) == values_of(theirs)
+    assert ours.arrived == theirs.arrived
+    assert (ours.dropped, ours.incomplete) == (theirs.dropped, theirs.incomplete)
+
+
+def test_replay_counts_gaps_and_sets_without_all_streams(rewritten: Any) -> None:
+    with ReplayCamera(rewritten(with_gaps)) as camera:
+        numbers = [frame.frame_number for frame in camera]
+    assert numbers == sorted(set(range(20)) - {3, 4, 8, 12, 19})
+    assert camera.dropped == 2
+    assert camera.incomplete == 3
+
+
+def test_replay_unwraps_the_device_clock(rewritten: Any) -> None:
+    with ReplayCamera(rewritten(around_a_wrap)) as camera:
+        times_s = [frame.timestamp_s for frame in camera]
+    assert times_s == pytest.approx(WRAP_PERIOD_S + 0.033333 * np.arange(-10, 10))
 
 
 class SdkPlayback:
@@ -204,72 +204,24 @@ def test_lenses_and_poses_agree_with_librealsense(
             np.testing.assert_allclose(pose[:3, 3], extrinsics.translation, atol=1e-7)
 
 
-MESSAGE = r"nlos-cam repair"
-LOAD = "nlos_cam.recording.sdk_playback.load_sdk"
-
-
-def test_sdk_is_never_given_a_damaged_or_cut_file(
-    damaged: Path, noise_bag_uncompressed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(
-        LOAD, lambda: SimpleNamespace(context=lambda: pytest.fail("the SDK was given the file"))
-    )
-    with pytest.raises(RecordingError, match=rf"\d+\.\d s .*{MESSAGE}"):
-        SdkReplayCamera(damaged)
-    content = bytearray(noise_bag_uncompressed.read_bytes())
-    path = tmp_path / "damaged.bag"
-    headers = list(
-        re.finditer(rb"(?s)\x2f\0\0\0.\0\0\0(?:op|ver|conn|count)=", content)
-    )  # of indexes
-    content[headers[-1].start() + 3] = 0xFF
-    path.write_bytes(content)
-    assert len(frames_of(ReplayCamera(path))[0]) == 20  # our reader does not need that index
-    with pytest.raises(RecordingError, match=rf"byte \d+.*{MESSAGE}"):
-        SdkReplayCamera(path)
-    for share in (0.0, 0.1, 0.5, 0.99):
-        path.write_bytes(content[: int(share * len(content))])
-        with pytest.raises(RecordingError):
-            SdkReplayCamera(path)
-
-
-def test_playback_that_ends_too_early_is_an_error(
-    damaged: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(SdkReplayCamera, "_check_all", lambda _: None)
-    found: dict[type, list[int]] = {}
-    for camera in (ReplayCamera(damaged), SdkReplayCamera(damaged)):
-        frames = found[type(camera)] = []
-        with camera, pytest.raises(RecordingError, match=MESSAGE):
-            frames.extend(frame.frame_number for frame in camera)
-        assert camera.dropped == 0
-    ours = found[ReplayCamera]
-    theirs = found[SdkReplayCamera]
+def test_readers_agree_on_the_frames_before_damage(damaged: Path) -> None:
+    ours: list[int] = []
+    with ReplayCamera(damaged) as camera, pytest.raises(RecordingError, match="nlos-cam repair"):
+        ours.extend(frame.frame_number for frame in camera)
+    assert camera.dropped == 0
+    assert 0 < len(ours) < 150
+    theirs = [frame.frame_number for frame in SdkReplay(damaged)]
     assert theirs == ours[: len(theirs)]  # it loses the frames that it holds at the damage
     assert 0 <= len(ours) - len(theirs) <= 2
-    assert 0 < len(ours) < 150
 
 
-def test_sdk_playback_reports_what_the_sdk_refuses(
-    noise_bag: Path, monkeypatch: pytest.MonkeyPatch
+def test_built_in_reader_needs_no_index_of_a_chunk(
+    noise_bag_uncompressed: Path, tmp_path: Path
 ) -> None:
-    def refuse(_: str) -> None:
-        raise RuntimeError("no such stream")
-
-    with monkeypatch.context() as patch:
-        patch.setattr("nlos_cam.recording.sdk_playback.find_streams", lambda _: (None, {}))
-        with pytest.raises(RecordingError, match=rf"'depth'.*{MESSAGE}"):
-            SdkReplayCamera(noise_bag)
-    monkeypatch.setattr(
-        LOAD, lambda: SimpleNamespace(context=lambda: SimpleNamespace(load_device=refuse))
-    )
-    with pytest.raises(RecordingError, match=rf"no such stream.*{MESSAGE}"):
-        SdkReplayCamera(noise_bag)
-
-
-def test_playback_that_never_starts_is_an_error(
-    noise_bag: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("nlos_cam.recording.sdk_playback.START_TIMEOUT_S", 0.0)
-    stopped = SimpleNamespace(current_status=lambda: load_sdk().playback_status.stopped)
-    with SdkReplayCamera(noise_bag) as camera, pytest.raises(RecordingError, match=r"noise\.bag"):
-        camera._next(SampleQueue(lossless=True), stopped)
+    content = bytearray(noise_bag_uncompressed.read_bytes())
+    headers = list(re.finditer(rb"(?s)\x2f\0\0\0.\0\0\0(?:op|ver|conn|count)=", content))
+    content[headers[-1].start() + 3] = 0xFF
+    path = tmp_path / "damaged.bag"
+    path.write_bytes(content)
+    with ReplayCamera(path) as camera:
+        assert len(list(camera)) == 20
