@@ -15,8 +15,6 @@ __all__ = [
     "BareWallStatistics",
     "Board",
     "BoardRecord",
-    "BoardView",
-    "CameraErrors",
     "Corners",
     "DepthMean",
     "DeviceConstants",
@@ -26,7 +24,6 @@ __all__ = [
     "Finite",
     "Intrinsics",
     "LidarPose",
-    "Light",
     "MeanNoise",
     "MeasuredWall",
     "Moments",
@@ -85,9 +82,9 @@ __all__ = [
     "with_occluder",
 ]
 
-from .board import BOARDS, PAPER_MM, Board, Corners, Light, Paper, find_corners
+from .board import BOARDS, PAPER_MM, Board, Corners, Paper, find_corners
 from .board_pose import PrintErrors, fit_board
-from .board_wall import BoardRecord, BoardView, CameraErrors, WallByBoard, wall_with_board
+from .board_wall import BoardRecord, WallByBoard, wall_with_board
 from .drift import WINDOW_FRAMES, Drift, DriftCheck, settings_changed
 from .geometry import Intrinsics, facing_angle_rad, normal_from_angles, wall_from_plane
 from .noise import (

@@ -105,23 +105,15 @@ smaller ones.
 """
 
 
-Light = Literal["infrared", "colour"]
-
 MIN_CORNERS = 8
 """With fewer corners, the residuals hardly test the pose."""
 BRIGHTEST_QUANTILE = 0.9995
 CONTRAST_LIMIT = 4.0
 CONTRAST_TILES = (8, 8)
-REMEDIES: dict[Light, str] = {
-    "infrared": (
-        "place it where the view is bright, print it with toner (dye ink is white in infrared), and"
-        " lower the laser power if it is washed out"
-    ),
-    "colour": (
-        "place it in the view of the colour camera too, and light the room evenly, without gloss on"
-        " the paper"
-    ),
-}
+REMEDY = (
+    "place it where the view is bright, print it with toner (dye ink is white in infrared), and"
+    " lower the laser power if it is washed out"
+)
 """Advice where no marker is read."""
 
 
@@ -135,11 +127,8 @@ class Corners:
     """(n, 2); x, y in pixel centres."""
 
 
-def find_corners(
-    image: NDArray[np.floating] | UInt8, board: Board, light: Light = "infrared"
-) -> Corners:
-    """Detect the corners of `board` in an image (height, width) of any gain; `light` selects the
-    advice in an error.
+def find_corners(image: NDArray[np.floating] | UInt8, board: Board) -> Corners:
+    """Detect the corners of `board` in an infrared image (height, width) of any gain.
 
     Raises BoardRefusedError where fewer than MIN_CORNERS are found, or where the image is mirrored.
     """
@@ -151,7 +140,7 @@ def find_corners(
         raise BoardRefusedError(
             "the board is mirrored: flip the image, or print the board without mirroring"
         )
-    raise BoardRefusedError(_too_few(len(corners.ids), markers, board, light))
+    raise BoardRefusedError(_too_few(len(corners.ids), markers, board))
 
 
 def even_contrast(image: NDArray[np.floating] | UInt8) -> UInt8:
@@ -177,10 +166,10 @@ def _detect(image: UInt8, board: Board) -> tuple[Corners, int]:
     )
 
 
-def _too_few(corners: int, markers: int, board: Board, light: Light) -> str:
+def _too_few(corners: int, markers: int, board: Board) -> str:
     size = f"{board.squares_x} x {board.squares_y} squares of {board.square_mm:g} mm"
     if markers == 0:
-        return f"no board of {size} is visible in {light}: {REMEDIES[light]}"
+        return f"no board of {size} is visible in infrared: {REMEDY}"
     return (
         f"{corners} corners of a board of {size} are visible ({markers} markers), {MIN_CORNERS}"
         " needed: move more of it to the near, bright side of the view, or average more frames"

@@ -217,10 +217,10 @@ class PrintErrors:
 
 @dataclass(frozen=True)
 class BoardFit:
-    """Plane of a board in the frame of the camera that saw it, until it is moved to the lidar's."""
+    """Plane of a board in the lidar frame."""
 
     slopes: Float64
-    """(3,); -normal / distance_m, the normal towards the camera."""
+    """(3,); -normal / distance_m, the normal towards the lidar."""
     covariance: Float64
     """(3, 3) of the slopes."""
     corners: int
@@ -238,14 +238,11 @@ def fit_board(
     board: Board,
     intrinsics: Intrinsics,
     printed: PrintErrors | None = None,
-    focal_std: float = 0.0,
 ) -> BoardFit:
-    """Fit the plane of `board` to its corners in the image of a pinhole, in the frame of that
-    camera.
+    """Fit the plane of `board` to its corners in the lidar's infrared image.
 
-    `focal_std` is the relative uncertainty of its focal length. Raises BoardRefusedError where the
-    corners are not those of a flat print of the right proportions, and where they do not determine
-    the plane.
+    Raises BoardRefusedError where the corners are not those of a flat print of the right
+    proportions, and where they do not determine the plane.
     """
     printed = printed or PrintErrors()
     observed = _observations(corners, board, intrinsics, printed)
@@ -255,15 +252,12 @@ def fit_board(
     pose = refine_pose(observed, pose.parameters)
     _check_print(pose)
     slopes, covariance = pose.slopes()
-    by_focal = _by_focal(observed, pose, focal_std)
     _check_certain(slopes, covariance)
     return BoardFit(
         slopes=slopes,
-        # a print larger by a share moves the plane away by that share: the slopes change along
-        # themselves
-        covariance=covariance
-        + printed.scale_std**2 * np.outer(slopes, slopes)
-        + np.outer(by_focal, by_focal),
+        # A print larger by a share moves the plane away by that share: the slopes change along
+        # themselves. No image shows the scale, so its variance is added, not fitted.
+        covariance=covariance + printed.scale_std**2 * np.outer(slopes, slopes),
         corners=len(observed.pixels),
         residual_px=float(np.sqrt(np.mean(pose.errors_px**2))),
         stretch=float(np.expm1(pose.parameters[6])),
@@ -334,18 +328,6 @@ def _variance_px2(errors_px: Float64, spent: int) -> float:
     # squares by k - 2 instead of k makes normal intervals as wide as they must be where few corners
     # estimate the noise
     return max(float((errors_px**2).sum()) / (errors_px.size - spent - 2), SIGMA_FLOOR_PX**2)
-
-
-def _by_focal(corners: CornerObservations, pose: BoardPose, focal_std: float) -> Float64:
-    """Return the change of the slopes (3,) for a focal length longer by its uncertainty."""
-    if focal_std == 0.0:
-        return np.zeros(3)
-    longer = corners.camera + np.diag(np.diag(corners.camera)) * focal_std * np.array(
-        [1.0, 1.0, 0.0]
-    )
-    return (
-        refine_pose(replace(corners, camera=longer), pose.parameters).slopes()[0] - pose.slopes()[0]
-    )
 
 
 def _check_fit(pose: BoardPose) -> None:

@@ -35,18 +35,17 @@ from nlos_calibration.wall import Verdict, WallFit, range_verdict
 Row = tuple[Finite, Finite, Finite, Finite]
 POSE_TOLERANCE = 1e-6
 VERSION = 3
-"""Version 2 added uncertainties, flatness, device, board, reference and offset; version 3
-temperatures, footprint and occluder. All have defaults."""
+"""The one version of the format that is read and written."""
 
 
-def _upgraded(version: Any) -> Any:
-    """Return the current version for an older one; raise ValueError for a newer one."""
-    if isinstance(version, int) and version > VERSION:
+def _known_version(version: Any) -> Any:
+    """Return the version. Raises ValueError for any other than VERSION."""
+    if isinstance(version, int) and version != VERSION:
         raise ValueError(
-            f"written by a newer nlos-cam, this one reads up to {VERSION}: update it, or measure"
-            " again"
+            f"this nlos-cam reads version {VERSION} only: measure the wall again, or use the"
+            " nlos-cam that wrote it"
         )
-    return VERSION if version in (1, 2) else version
+    return version
 
 
 class WallRecord(Record):
@@ -54,7 +53,7 @@ class WallRecord(Record):
     the measurement.
     """
 
-    schema_version: Annotated[Literal[3], BeforeValidator(_upgraded)] = VERSION
+    schema_version: Annotated[Literal[3], BeforeValidator(_known_version)] = VERSION
     created: date
     camera: str
     """URI of the camera or recording."""
@@ -68,14 +67,14 @@ class WallRecord(Record):
     frames: Annotated[int, Field(gt=0)]
     """Number of frames averaged."""
     distance_m: Positive
-    distance_std_m: NotNegative | None = None
-    """Standard uncertainty, like all *_std; None in records of version 1."""
+    distance_std_m: NotNegative
+    """Standard uncertainty, like all *_std."""
     facing_deg: Annotated[float, Field(ge=0, lt=90)]
-    facing_std_deg: NotNegative | None = None
+    facing_std_deg: NotNegative
     yaw_deg: Finite
-    yaw_std_deg: NotNegative | None = None
+    yaw_std_deg: NotNegative
     pitch_deg: Finite
-    pitch_std_deg: NotNegative | None = None
+    pitch_std_deg: NotNegative
     wall_from_lidar: tuple[Row, Row, Row, Row]
     range_offset_m: Finite = 0.0
     """Length to add to the lidar's depth; the pose includes it (`range_offset`)."""
@@ -94,7 +93,7 @@ class WallRecord(Record):
     bend_deg: NotNegative | None = None
     board: BoardRecord | None = None
     """Measurement by a printed board; None without one."""
-    footprint_share: Annotated[float, Field(ge=0, le=1)] | None = None
+    footprint_share: Annotated[float, Field(ge=0, le=1)]
     """Share of the map's 64 x 80 cells that meet the wall."""
     occluder: OccluderRecord | None = None
     """None where it was neither detected nor entered: then `rig` has the paper's."""
@@ -198,9 +197,7 @@ def with_occluder(record: WallRecord, fit: OccluderFit) -> WallRecord:
 
 
 def load_wall(path: Path) -> WallRecord:
-    """Read a `wall.toml` of this version or an older one. Raises RecordFileError with the first
-    problem.
-    """
+    """Read a `wall.toml`. Raises RecordFileError with the first problem."""
     return read_record(
         path, WallRecord, "wall record", "write one with `nlos-cam calibrate --wall`"
     )

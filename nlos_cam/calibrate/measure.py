@@ -128,13 +128,11 @@ def measure_by_board(
     capture: CaptureStatistics,
     printed: walls.Board,
     square_mm: float | None,
-    color: walls.BoardView | None = None,
 ) -> tuple[walls.WallFit | walls.WallByBoard, dict[str, object]]:
     """Fit the wall to its depth, unless that is refused, and to a printed board; return the fit and
     the board's record.
 
-    The board is searched in the mean infrared, unless there is a `color` view of it. Raises
-    BoardRefusedError.
+    The board is searched in the mean infrared. Raises BoardRefusedError.
     """
     try:
         depth = measure_by_depth(capture)[0]
@@ -142,8 +140,9 @@ def measure_by_board(
         depth = error
     measured = square_mm is not None
     board = printed.measured(square_mm) if measured else printed
-    view = color or walls.BoardView(capture.statistics.ir_mean(), capture.intrinsics)
-    fit, record = walls.wall_with_board(depth, view, board, measured=measured)
+    fit, record = walls.wall_with_board(
+        depth, capture.statistics.ir_mean(), capture.intrinsics, board, measured=measured
+    )
     return fit, {"board": record}
 
 
@@ -169,8 +168,8 @@ def measure_occluder(
     noise = statistics.noise()
     pose = walls.wall_from_zero(record)
     stds = {
-        "distance_std_m": record.distance_std_m or 0.0,
-        "yaw_std_deg": record.yaw_std_deg or 0.0,
+        "distance_std_m": record.distance_std_m,
+        "yaw_std_deg": record.yaw_std_deg,
     }
     found = walls.find_occluder(
         depth_m, noise, capture.intrinsics, pose, np.random.default_rng(0), **stds

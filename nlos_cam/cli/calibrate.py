@@ -35,7 +35,6 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 Paper = Literal["a4", "a3", "letter"]
-Light = Literal["infrared", "colour"]
 EVERY = 3
 """Frames between two updates of the display, of 30 a second."""
 GAUGE_WIDTH = 31
@@ -164,12 +163,6 @@ Tape = Annotated[
 ByBoard = Annotated[
     bool, typer.Option("--board", help="Also find a printed board (`nlos-cam board`).")
 ]
-BoardIn = Annotated[
-    Light,
-    typer.Option(
-        "--board-in", help="Image to find the board in; colour needs an L515, or a recording of it."
-    ),
-]
 OnPaper = Annotated[
     Paper | None, typer.Option("--paper", help="Paper of the printed board (default: a4).")
 ]
@@ -231,7 +224,6 @@ def calibrate(
     watch: Watch = False,
     tape_m: Tape = None,
     board: ByBoard = False,
-    board_in: BoardIn = "infrared",
     paper: OnPaper = None,
     square_mm: SquareMm = None,
     occluder_x_m: OccluderX = None,
@@ -248,8 +240,8 @@ def calibrate(
     new reference, with no object hidden.
     """
     uri = _source(camera, bag, wall=wall, occluder=occluder)
-    if not board and (paper or square_mm or board_in == "colour"):
-        raise typer.BadParameter("--paper, --square-mm and --board-in need --board")
+    if not board and (paper or square_mm):
+        raise typer.BadParameter("--paper and --square-mm need --board")
     if board and tape_m is not None:
         raise typer.BadParameter(
             "give one of --tape-m and --board: each measures the lidar's range offset"
@@ -278,17 +270,13 @@ def calibrate(
             last = watch_wall(source, until_enter())
         if last is not None:
             stderr.print(panel(last))
-    # the color camera first: it runs alone, then the lidar has the link to itself
-    color = _capture_color(uri, frames) if board_in == "colour" else None
     capture = _capture(uri, frames)
     inliers: NDArray[np.bool_] | None
     if bare:
         record, inliers = bench.measure_occluder(capture, bare)
     else:
         if board:
-            fit, facts = bench.measure_by_board(
-                capture, walls.BOARDS[paper or "a4"], square_mm, color
-            )
+            fit, facts = bench.measure_by_board(capture, walls.BOARDS[paper or "a4"], square_mm)
         else:
             fit, facts = bench.measure_by_depth(capture, tape_m)
         record = capture.record(fit, facts, by_hand)
@@ -336,12 +324,6 @@ def _capture(uri: str, frames: int) -> bench.CaptureStatistics:
     with _opened(uri) as source, progress() as bar:
         task = bar.add_task("Measuring the wall", total=frames)
         return bench.collect_statistics(source, frames, lambda: bar.advance(task))
-
-
-def _capture_color(uri: str, frames: int) -> walls.BoardView:
-    with progress() as bar:
-        task = bar.add_task("Averaging colour frames", total=frames)
-        return bench.capture_color_view(uri, frames, on_frame=lambda: bar.advance(task))
 
 
 SheetOut = Annotated[Path | None, typer.Option("--out", help="PDF to write.")]

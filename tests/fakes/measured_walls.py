@@ -58,6 +58,7 @@ def exact_wall(**fields: Any) -> MeasuredWall:
     }
     found |= {
         "wall_from_lidar": rig.wall_from_lidar.tolist(),
+        "footprint_share": 1.0,
         "temperatures_c": {"ldd_temperature": 41.7},
     }
     record = WallRecord(created=date(2026, 11, 22), camera="made-up", frames=30, **found)

@@ -15,8 +15,8 @@ from nlos_calibration import (
 from nlos_calibration.errors import OccluderRefusedError
 from nlos_calibration.occluder import MIN_COLUMNS, find_occluder
 from synthetic_scenes import Sheet, bench_depth
+from synthetic_walls import View, depth_statistics, view, with_outliers
 
-from nlos_cam.calibrate import View, depth_statistics, view, with_outliers
 from nlos_cam.render import MultiBounce, Sensor, SensorModel
 
 Generator = np.random.Generator

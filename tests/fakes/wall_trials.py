@@ -8,8 +8,7 @@ import numpy as np
 from nlos_calibration import INTERVAL_STDS, fit_wall, load_rig
 from nlos_calibration.arrays import Float64
 from nlos_calibration.errors import WallRefusedError
-
-from nlos_cam.calibrate import View, depth_statistics, patchy, rippled, view, with_outliers
+from synthetic_walls import View, depth_statistics, patchy, rippled, view, with_outliers
 
 Generator = np.random.Generator
 

@@ -16,8 +16,7 @@ from synthetic_scenes import (
     noisy_depth,
     occluding_sheet,
 )
-
-from nlos_cam.calibrate import view
+from synthetic_walls import view
 
 POSES = [
     (0.2, 45.0, 0.0),

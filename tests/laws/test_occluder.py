@@ -7,8 +7,7 @@ import pytest
 from nlos_calibration.rig import load_rig
 from occluder_trials import BARELY, IN_VIEW, Setting, draw, find_occluder, simulated_trial, trial
 from synthetic_scenes import bench_depth
-
-from nlos_cam.calibrate.synthetic import depth_statistics
+from synthetic_walls import depth_statistics
 
 SENSOR = load_rig("paper-rig").pinhole.scaled(160, 120)
 LOOKS = {

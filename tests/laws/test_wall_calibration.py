@@ -10,8 +10,7 @@ from nlos_calibration.errors import WallRefusedError
 from nlos_calibration.geometry import angles_from_normal, wall_from_plane
 from nlos_calibration.plane import fit_depth
 from numpy.typing import NDArray
-
-from nlos_cam.calibrate import View, depth_statistics, view
+from synthetic_walls import View, depth_statistics, view
 
 PINHOLE = load_rig("bare-wall").pinhole.scaled(160, 120)
 LONGEST_DEPTH_M = 4.0

@@ -10,8 +10,8 @@ import pytest
 from nlos_calibration import WallFit, fit_wall, load_rig
 from nlos_calibration.arrays import Float64
 from nlos_calibration.errors import WallRefusedError
-
-from nlos_cam.calibrate import (
+from synthetic_walls import (
+    View,
     bent,
     curved,
     depth_statistics,
@@ -22,7 +22,6 @@ from nlos_cam.calibrate import (
     window,
     with_outliers,
 )
-from nlos_cam.calibrate.synthetic import View
 
 PINHOLE = load_rig("bare-wall").pinhole.scaled(160, 120)
 VIEWS = [(0.2, 20.0, 5.0), (0.2, 45.0, 0.0), (0.25, -60.0, 8.0)]

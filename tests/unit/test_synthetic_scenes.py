@@ -5,9 +5,9 @@ parameters.
 import numpy as np
 import pytest
 import synthetic_scenes as scenes
+import synthetic_walls
 from nlos_calibration import BOARDS, BareWallStatistics, LidarPose, Occluder, load_rig, wall_depth
 
-from nlos_cam.calibrate import synthetic
 from nlos_cam.render import cast
 
 RIG = load_rig("bare-wall")
@@ -25,9 +25,9 @@ POSE: scenes.WallPose = (0.2, 30.0, 0.0)
 def test_bent_wall_is_one_plane_on_either_side_of_a_fold(
     bend_deg: float, direction_rad: float
 ) -> None:
-    seen = synthetic.view(0.2, 20.0, 5.0, SMALL_BARE)
-    depth_m, main = synthetic.bent(seen, bend_deg, 0.4, direction_rad)
-    _, other = synthetic.bent(seen, bend_deg, 0.6, direction_rad)
+    seen = synthetic_walls.view(0.2, 20.0, 5.0, SMALL_BARE)
+    depth_m, main = synthetic_walls.bent(seen, bend_deg, 0.4, direction_rad)
+    _, other = synthetic_walls.bent(seen, bend_deg, 0.6, direction_rad)
     assert main is seen
     assert np.degrees(np.arccos(other.pose[2, :3] @ seen.pose[2, :3])) == pytest.approx(
         abs(bend_deg)
@@ -40,20 +40,24 @@ def test_bent_wall_is_one_plane_on_either_side_of_a_fold(
 
 
 def test_scenes_are_off_the_wall_by_their_parameters() -> None:
-    seen = synthetic.view(0.2, 30.0, 0.0, SMALL_BARE)
+    seen = synthetic_walls.view(0.2, 30.0, 0.0, SMALL_BARE)
     away = -(SMALL_BARE.rays() @ seen.pose[2, :3])
 
     def height_m(depth_m: np.ndarray) -> np.ndarray:
         return 0.2 - depth_m * away
 
     assert np.allclose(
-        np.unique(height_m(synthetic.stepped(seen, 0.004, 0.3)).round(9)), [0.0, 0.004]
+        np.unique(height_m(synthetic_walls.stepped(seen, 0.004, 0.3)).round(9)), [0.0, 0.004]
     )
-    assert np.allclose(np.unique(height_m(synthetic.window(seen, 0.01)).round(9)), [-0.01, 0.0])
-    assert (height_m(synthetic.window(seen, 0.01)) < -0.005).mean() == pytest.approx(0.5, abs=0.1)
-    assert np.abs(height_m(synthetic.curved(seen, 1.0))).max() > 0.002
-    assert synthetic.patch(seen, 0.25).mean() == pytest.approx(0.25, abs=0.03)
-    ripples_m = synthetic.rippled(seen, 0.001, 4.0, np.random.default_rng(0)) - seen.depth_m
+    assert np.allclose(
+        np.unique(height_m(synthetic_walls.window(seen, 0.01)).round(9)), [-0.01, 0.0]
+    )
+    assert (height_m(synthetic_walls.window(seen, 0.01)) < -0.005).mean() == pytest.approx(
+        0.5, abs=0.1
+    )
+    assert np.abs(height_m(synthetic_walls.curved(seen, 1.0))).max() > 0.002
+    assert synthetic_walls.patch(seen, 0.25).mean() == pytest.approx(0.25, abs=0.03)
+    ripples_m = synthetic_walls.rippled(seen, 0.001, 4.0, np.random.default_rng(0)) - seen.depth_m
     assert np.abs(ripples_m).max() == pytest.approx(0.001, rel=0.01)
 
 
@@ -66,7 +70,7 @@ def test_scene_rays_are_the_renderers(
     lidar = LidarPose(distance_m=0.2, yaw_deg=yaw_deg, pitch_deg=pitch_deg)
     rig = PAPER.model_copy(update={"lidar": lidar, "occluder": Occluder(x_m=x_m, z_min_m=gap_m)})
     beams = cast(rig, SMALL_PAPER)
-    seen = synthetic.View(rig.wall_from_lidar, SMALL_PAPER)
+    seen = synthetic_walls.View(rig.wall_from_lidar, SMALL_PAPER)
     depth_m = scenes.bench_depth(seen, scenes.Sheet(x_m, gap_m)).ravel()
     met = (
         np.isfinite(beams.length_m)
@@ -78,7 +82,7 @@ def test_scene_rays_are_the_renderers(
 
 
 def test_tilted_sheet_is_at_its_parameters() -> None:
-    seen = synthetic.view(0.2, 45.0, 0.0, SMALL_PAPER)
+    seen = synthetic_walls.view(0.2, 45.0, 0.0, SMALL_PAPER)
     occluding_sheet = scenes.Sheet(
         lean_deg=10.0, twist_deg=-5.0, edge_deg=4.0, height_m=0.05, bottom_m=-0.03, top_m=0.04
     )
@@ -98,7 +102,7 @@ def test_tilted_sheet_is_at_its_parameters() -> None:
 
 
 def test_sheet_mixes_only_pixels_on_its_edge() -> None:
-    seen = synthetic.view(0.2, 45.0, 0.0, SMALL_PAPER)
+    seen = synthetic_walls.view(0.2, 45.0, 0.0, SMALL_PAPER)
     occluding_sheet = scenes.Sheet(gap_m=0.103)
     sharp = scenes.bench_depth(seen, occluding_sheet)
     mixed = scenes.bench_depth(seen, occluding_sheet, beams=9)
@@ -108,7 +112,7 @@ def test_sheet_mixes_only_pixels_on_its_edge() -> None:
 
 
 def test_ball_is_round() -> None:
-    seen = synthetic.view(0.2, 45.0, 0.0, SMALL_PAPER)
+    seen = synthetic_walls.view(0.2, 45.0, 0.0, SMALL_PAPER)
     depth_m = scenes.ball(seen, (0.15, 0.01, 0.12), 0.04)
     hit = np.isfinite(depth_m)
     points = (
@@ -123,7 +127,7 @@ def test_paper_and_toner_have_their_counts() -> None:
     """Without a spot: the falloff of a bare wall, its brightest pixel at the gain, toner at its
     albedo.
     """
-    seen = synthetic.View(RIG.wall_from_lidar, PINHOLE)
+    seen = synthetic_walls.View(RIG.wall_from_lidar, PINHOLE)
     light = scenes.Illumination(spot_mm=0.0)
     away = scenes.Placement(50.0)
     placed = scenes.at_near_edge(A4, seen)

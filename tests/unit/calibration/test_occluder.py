@@ -7,8 +7,7 @@ from nlos_calibration.errors import OccluderRefusedError
 from nlos_calibration.occluder import MAX_BEHIND, OccluderFit, SheetFit, find_edge, find_occluder
 from numpy.typing import NDArray
 from synthetic_scenes import Sheet, ball, bench_depth
-
-from nlos_cam.calibrate import View, view
+from synthetic_walls import View, view
 
 PAPER = load_rig("paper-rig")
 PINHOLE = PAPER.pinhole.scaled(160, 120)

@@ -48,8 +48,7 @@ def test_facts_hold_quantities_with_intervals() -> None:
     assert facts["temperature"] == "41.7 °C"
     assert facts["depth"] == "refused"
     assert values(residual_m=0.0001)["residual"] == "0.10 mm RMS"
-    assert values(facing_std_deg=None)["facing angle"] == "45.00°"
-    for name in ("range offset", "printed board", "view on the wall", "occluder's tilt"):
+    for name in ("range offset", "printed board", "occluder's tilt"):
         assert name not in facts
     assert "temperature" not in values(temperatures_c={})
 

@@ -19,8 +19,7 @@ from nlos_calibration.wall import (
     measures_of,
     warnings,
 )
-
-from nlos_cam.calibrate import view
+from synthetic_walls import view
 
 PINHOLE = load_rig("bare-wall").pinhole.scaled(160, 120)
 RAYS = PINHOLE.rays()

@@ -23,8 +23,9 @@ from nlos_calibration import (
 from rich.console import Console
 from small_frames import FrameCamera
 from synthetic_scenes import at_near_edge, clean_infrared, infrared_frames
+from synthetic_walls import View
 
-from nlos_cam.calibrate import FrameFit, View, fit_frame
+from nlos_cam.calibrate import FrameFit, fit_frame
 from nlos_cam.cli.calibrate import EVERY, gauge, panel, until_enter, watch_wall
 from nlos_cam.frames import Frame
 from nlos_cam.render.sensor.sensor import DEPTH_UNIT_M, SensedImages
