@@ -33,6 +33,7 @@ PAPER_MM: dict[Paper, tuple[float, float]] = {
 class Board(Record):
     """A printed ChArUco board. Measured are the chessboard corners between its markers."""
 
+    # Only corners between four squares are measured: three squares a side leave four of them.
     squares_x: Annotated[int, Field(ge=3, le=40)]
     squares_y: Annotated[int, Field(ge=3, le=40)]
     square_mm: Positive
@@ -44,6 +45,7 @@ class Board(Record):
     def _printable(self) -> Self:
         if self.marker_mm >= self.square_mm:
             raise ValueError("a board needs marker_mm < square_mm: markers stand in white squares")
+        # Markers fill the white squares, every other one.
         markers = self.squares_x * self.squares_y // 2
         known = len(self.opencv_dictionary.bytesList)
         if markers > known:
@@ -132,6 +134,8 @@ def find_corners(image: NDArray[np.floating] | UInt8, board: Board) -> Corners:
 
     Raises BoardRefusedError where fewer than MIN_CORNERS are found, or where the image is mirrored.
     """
+    # OpenCV's own corners: refining them in a rectified image made single corners better by a
+    # quarter and the plane no better.
     even = even_contrast(image)
     corners, markers = _detect(even, board)
     if len(corners.ids) >= MIN_CORNERS:
@@ -147,6 +151,9 @@ def even_contrast(image: NDArray[np.floating] | UInt8) -> UInt8:
     """Return the image (height, width) in 8 bits with its local contrast equalised (CLAHE): dim
     parts become clear.
     """
+    # The laser's light falls off with distance and angle, so that the far side of an oblique board
+    # is dim; contrast is equalised in tiles, in 16 bits, before it is cut to 8. A quantile sets the
+    # scale, not the maximum, which may be a glint.
     brightest = float(np.quantile(image, BRIGHTEST_QUANTILE))
     fine = np.clip(image / max(brightest, 1e-9) * 65535.0, 0.0, 65535.0).astype(np.uint16)
     even = np.asarray(cv2.createCLAHE(CONTRAST_LIMIT, CONTRAST_TILES).apply(fine), np.uint16)

@@ -91,6 +91,7 @@ def combine(depth: UncertainPlane, board: UncertainPlane, *, measured: bool) -> 
         slopes = depth.slopes + gain @ (board.slopes - depth.slopes)
         average = UncertainPlane(slopes, depth.covariance - gain @ depth.covariance)
         return Combined(average, "both", apart, ())
+    # Which of two is wrong only a ruler tells: a measured print is trusted, a drawing is not.
     used: Used = "board" if measured else "depth"
     return Combined(
         board if measured else depth, used, apart, _causes(depth, board, apart, measured=measured)
@@ -131,12 +132,10 @@ def _causes(
     amount.
     """
     causes: list[str] = []
-    scale = (
-        depth.distance_m / board.distance_m
-    )  # a board's distance is proportional to the assumed size of its squares
-    offset_m = apart.distance_m / max(
-        -float(depth.normal[2]), 1e-3
-    )  # along the axis, longer than along the normal
+    # A board's distance is proportional to the assumed size of its squares. An offset acts along
+    # the optical axis, where the same change is longer than along the normal, by 1 / cos(facing).
+    scale = depth.distance_m / board.distance_m
+    offset_m = apart.distance_m / max(-float(depth.normal[2]), 1e-3)
     if apart.distance_sigmas > AGREE_SIGMAS:
         if abs(scale - 1.0) <= MAX_SCALE and not measured:
             causes.append(
@@ -228,6 +227,7 @@ def wall_with_board(
     )
     if isinstance(depth, WallRefusedError):
         return _by_board(plane, depth), record.model_copy(update={"depth_refused": str(depth)})
+    # In slopes both are linear, and their covariances add; distance and angles would not be.
     by_depth = UncertainPlane(-depth.wall_from_lidar[2, :3] / depth.distance_m, depth.covariance)
     both = combine(by_depth, plane, measured=measured)
     apart = both.disagreement
@@ -243,6 +243,7 @@ def wall_with_board(
 
 def _by_board(plane: UncertainPlane, refusal: WallRefusedError) -> WallByBoard:
     """Return the board's wall, doubtful for want of a depth to compare it with."""
+    # No board shows whether the rest of the wall is bare and flat.
     measures = measures_of(plane.slopes, plane.covariance)
     doubt = f"the plane is the board's alone, since the depth was refused: {refusal}"
     problems = out_of_range(measures.distance_m, measures.facing_deg)

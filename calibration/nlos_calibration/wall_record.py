@@ -108,6 +108,8 @@ class WallRecord(Record):
     @model_validator(mode="after")
     def _one_pose(self) -> Self:
         """Check that the pose, which is stored in three forms, is the same in all."""
+        # The three numbers define the matrix (`geometry`); it is stored for readers without this
+        # package. The rig may be edited by hand, but not away from the measurement.
         lidar = LidarPose(
             distance_m=self.distance_m, yaw_deg=self.yaw_deg, pitch_deg=self.pitch_deg
         )
@@ -140,6 +142,8 @@ def new_wall_record(
     Without `occluder` the paper's is assumed. `others` are further fields: of the device, the
     board, the reference and the range offset.
     """
+    # What a bench shares with the paper's (wall, relay, object box, device) stays the paper's until
+    # it is edited by hand; pose and intrinsics are measured.
     lidar = LidarPose(distance_m=fit.distance_m, yaw_deg=fit.yaw_deg, pitch_deg=fit.pitch_deg)
     pinhole = PinholeRecord.model_validate(vars(intrinsics))
     rig = load_rig("paper-rig").model_copy(
@@ -175,19 +179,18 @@ def with_occluder(record: WallRecord, fit: OccluderFit) -> WallRecord:
     occluder = OccluderRecord(source="detected", **measured)
     rig = rig_with_occluder(record.rig, occluder.x_m, occluder.gap_m)
     pose = np.array(record.wall_from_lidar)
+    # The verdict joins the wall's doubts with the rig's problems in one sentence. Those of the
+    # previous occluder are taken out of it again; a wall without doubts is judged anew by its
+    # range.
     if record.verdict == "doubtful" and not record.advice.startswith(UNUSABLE):
-        assumed = judge_rig(
-            record.rig, footprint(pose, record.rig.pinhole, record.rig.wall), record.occluder
-        )
-        wall = (
-            record.verdict,
-            record.advice.removesuffix("".join(f"; {problem}" for problem in assumed)),
-        )
+        view = footprint(pose, record.rig.pinhole, record.rig.wall)
+        earlier = "".join(f"; {one}" for one in judge_rig(record.rig, view, record.occluder))
+        verdict = record.verdict
+        advice = record.advice.removesuffix(earlier)
     else:
-        wall = range_verdict(record.distance_m, record.facing_deg)
-    verdict, advice = combined(
-        *wall, judge_rig(rig, footprint(pose, rig.pinhole, rig.wall), occluder)
-    )
+        verdict, advice = range_verdict(record.distance_m, record.facing_deg)
+    problems = judge_rig(rig, footprint(pose, rig.pinhole, rig.wall), occluder)
+    verdict, advice = combined(verdict, advice, problems)
     if fit.doubt:
         verdict = "doubtful"
         advice = f"{UNUSABLE}: {fit.doubt}; remove the object and measure again"
@@ -207,6 +210,7 @@ def rig_named(name: str) -> Rig:
     """Return a packaged rig by name, or the rig of a file: a rig.toml, or the wall.toml that
     `calibrate` writes.
     """
+    # Only a wall record has a schema version; a rig's own file has none.
     path = Path(name)
     if path.is_file() and "schema_version" in path.read_text(encoding="utf-8", errors="replace"):
         return load_wall(path).rig
@@ -227,10 +231,10 @@ def load_measured(path: Path) -> MeasuredWall:
     do not match.
     """
     record = load_wall(path)
-    named = record.reference
-    return MeasuredWall(
-        record, load_reference(path.parent / named, record.reference_sha256) if named else None
-    )
+    if not record.reference:
+        return MeasuredWall(record, None)
+    reference = load_reference(path.parent / record.reference, record.reference_sha256)
+    return MeasuredWall(record, reference)
 
 
 def wall_points_m(record: WallRecord, reference: BareWall) -> Float64:
@@ -244,12 +248,11 @@ def points_m(record: WallRecord, depth_m: Float64, intrinsics: Intrinsics) -> Fl
     """Return depths (height, width) as points (height, width, 3) in the wall frame, range offset
     included.
     """
-    pose = wall_from_zero(record)
     # p = R (depth x ray) + t, with the offset added to the depth or, through the pose, to the
     # origin
-    return ((depth_m[..., np.newaxis] + depth_offset_m(record)) * intrinsics.rays()) @ pose[
-        :3, :3
-    ].T + pose[:3, 3]
+    pose = wall_from_zero(record)
+    true_m = depth_m[..., np.newaxis] + depth_offset_m(record)
+    return (true_m * intrinsics.rays()) @ pose[:3, :3].T + pose[:3, 3]
 
 
 def depth_offset_m(record: WallRecord) -> float:
@@ -263,6 +266,8 @@ def wall_from_zero(record: WallRecord) -> Float64:
     """Return the pose (4, 4) of the point where the beams meet, which an offset of the origin puts
     before the glass.
     """
+    # The record's pose is that of the glass. An offset of the origin puts the zero of depth that
+    # far along the optical axis, the third column; an offset of the depth leaves it in the glass.
     pose = np.array(record.wall_from_lidar)
     pose[:3, 3] += (record.range_offset_m - depth_offset_m(record)) * pose[:3, 2]
     return pose
