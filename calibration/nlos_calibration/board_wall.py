@@ -245,14 +245,14 @@ def _by_board(plane: UncertainPlane, refusal: WallRefusedError) -> WallByBoard:
     """Return the board's wall, doubtful for want of a depth to compare it with."""
     # No board shows whether the rest of the wall is bare and flat.
     measures = measures_of(plane.slopes, plane.covariance)
-    doubt = f"the plane is the board's alone, since the depth was refused: {refusal}"
+    reason = f"the plane is the board's alone, since the depth was refused: {refusal}"
     problems = out_of_range(measures.distance_m, measures.facing_deg)
     pose = wall_from_plane(plane.normal, plane.distance_m)
     return WallByBoard(
         **vars(measures),
         wall_from_lidar=pose,
         verdict="doubtful",
-        advice="; ".join([doubt, *problems]),
+        advice="; ".join([reason, *problems]),
     )
 
 

@@ -274,7 +274,7 @@ class OccluderFit:
     pixels: Mask = field(repr=False)
     """(height, width); inliers of the sheet's plane."""
     warnings: tuple[str, ...]
-    doubt: str = ""
+    why_unusable: str = ""
     """Reason not to use the reference that was taken along: an object seems to be hidden."""
 
 
@@ -323,7 +323,7 @@ def find_occluder(
         residual_m=sheet.plane.residual_m,
         pixels=pixels,
         warnings=_warnings(sheet),
-        doubt=_doubt(view),
+        why_unusable=_sign_of_object(view),
     )
     _check_edge(fit)
     return fit
@@ -444,7 +444,7 @@ def _check_edge(fit: OccluderFit) -> None:
         )
 
 
-def _doubt(view: ClassifiedView) -> str:
+def _sign_of_object(view: ClassifiedView) -> str:
     """Return the sign of a hidden object in the view, whose echoes the reference then holds too;
     else empty.
     """

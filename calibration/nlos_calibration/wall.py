@@ -33,13 +33,13 @@ TOLERANCE_DEG = 0.2
 """Tolerated error: a wall on the edge of a range is inside, a smaller shift by a bend is
 ignored.
 """
-DOUBTED_TOLERANCES = 0.7
+DOUBTFUL_TOLERANCES = 0.7
 REFUSED_TOLERANCES = 5.0
 """Difference between half of the view and the whole, in tolerances. From the second on (5 mm or 1
 degree, a bend of 2 degrees) the wall is refused; less could also be ripples of the lidar, 1 or 2 mm
 high and half a view wide, which are only reported. Doubt begins below one tolerance, since a half
 that bends itself shows too little."""
-DOUBTED_RIPPLE_M = 0.0009
+DOUBTFUL_RIPPLE_M = 0.0009
 MAX_RIPPLE_M = 0.002
 """RMS normal to the wall. The L515's ripples are a millimetre or two high; two panes 2 mm apart are
 1 mm off a plane between them."""
@@ -72,10 +72,10 @@ def judge(
     distance_m: float, facing_deg: float, flat: Flatness, ripple_m: float
 ) -> tuple[Verdict, str]:
     """Return the verdict, and one sentence with its reason or the remedy."""
-    doubts = _doubts(flat, ripple_m)
-    if not doubts:
+    reasons = _reasons_to_doubt(flat, ripple_m)
+    if not reasons:
         return range_verdict(distance_m, facing_deg)
-    return "doubtful", "; ".join(doubts + out_of_range(distance_m, facing_deg))
+    return "doubtful", "; ".join(reasons + out_of_range(distance_m, facing_deg))
 
 
 def range_verdict(distance_m: float, facing_deg: float) -> tuple[Verdict, str]:
@@ -112,9 +112,9 @@ def _amounts(flat: Flatness) -> str:
     return f"{flat.bend_m * 1e3:.1f} mm and {flat.bend_deg:.2f} degrees"
 
 
-def _doubts(flat: Flatness, ripple_m: float) -> list[str]:
+def _reasons_to_doubt(flat: Flatness, ripple_m: float) -> list[str]:
     """Return the reason why the fitted plane may not be the wall's; empty if there is none."""
-    bent = _tolerances(flat.bend_m, flat.bend_deg) > DOUBTED_TOLERANCES
+    bent = _tolerances(flat.bend_m, flat.bend_deg) > DOUBTFUL_TOLERANCES
     if bent and _explained_by_offset(flat):
         return [
             (
@@ -122,7 +122,7 @@ def _doubts(flat: Flatness, ripple_m: float) -> list[str]:
                 " is curved): measure the distance with a tape and give it with --tape-m"
             )
         ]
-    if ripple_m > DOUBTED_RIPPLE_M:
+    if ripple_m > DOUBTFUL_RIPPLE_M:
         return [
             (
                 f"parts of the wall are {ripple_m * 1e3:.1f} mm RMS off the plane: ripples of the lidar,"

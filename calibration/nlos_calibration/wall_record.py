@@ -191,9 +191,9 @@ def with_occluder(record: WallRecord, fit: OccluderFit) -> WallRecord:
         verdict, advice = range_verdict(record.distance_m, record.facing_deg)
     problems = judge_rig(rig, footprint(pose, rig.pinhole, rig.wall), occluder)
     verdict, advice = combined(verdict, advice, problems)
-    if fit.doubt:
+    if fit.why_unusable:
         verdict = "doubtful"
-        advice = f"{UNUSABLE}: {fit.doubt}; remove the object and measure again"
+        advice = f"{UNUSABLE}: {fit.why_unusable}; remove the object and measure again"
     changed = {"occluder": occluder, "rig": rig, "verdict": verdict, "advice": advice}
     changed |= {"warnings": tuple(dict.fromkeys((*record.warnings, *fit.warnings)))}
     return WallRecord.model_validate(record.model_dump() | changed)

@@ -115,14 +115,14 @@ def wall_pixels(seen: View) -> NDArray[np.intp]:
     return np.flatnonzero(bench_depth(seen, Sheet()) == bench_depth(seen, None))
 
 
-def test_find_occluder_doubts_a_view_with_an_object_in_some_beams(seen: View) -> None:
+def test_find_occluder_suspects_an_object_in_some_beams(seen: View) -> None:
     depth_m = bench_depth(seen, Sheet())
     generator = np.random.default_rng(0)
     some = generator.choice(wall_pixels(seen), depth_m.size // 5, replace=False)
     depth_m.flat[some] += 0.15
     fit = fitted(seen, noisy(depth_m))
     assert abs(fit.gap_m - 0.1) < 2 * PIXEL_M
-    assert "20%" in fit.doubt
+    assert "20%" in fit.why_unusable
 
 
 def test_find_occluder_refuses_an_object_in_all_beams(seen: View) -> None:

@@ -344,9 +344,7 @@ def test_gauge_points_to_where_a_value_lies() -> None:
     assert len({len(gauge(value, 0.15, 0.3)) for value in (0.0, 0.2, 1.0)}) == 1
 
 
-def test_board_json_is_the_board_that_was_printed_with_a_note_how_to_print(
-    run: Run, shown: Run
-) -> None:
+def test_board_json_is_the_board_that_was_printed(run: Run, shown: Run) -> None:
     command = "board", "--out", "board.pdf", "--overwrite"
     for paper, board in BOARDS.items():
         result = run(*command, "--paper", paper)
