@@ -37,7 +37,6 @@ __all__ = [
     "PrintErrors",
     "Record",
     "Rig",
-    "Verdict",
     "WallByBoard",
     "WallFit",
     "WallRecord",
@@ -76,7 +75,6 @@ __all__ = [
     "wall_from_zero",
     "wall_points_m",
     "wall_with_board",
-    "watched_pixels",
     "with_degrees",
     "with_mm",
     "with_occluder",
@@ -133,7 +131,6 @@ from .wall import (
     FACING_RANGE_DEG,
     TOLERANCE_DEG,
     TOLERANCE_M,
-    Verdict,
     WallFit,
     fit_wall,
     measures_of,
@@ -152,4 +149,3 @@ from .wall_record import (
     wall_points_m,
     with_occluder,
 )
-from .wall_tracker import watched_pixels

@@ -45,25 +45,21 @@ def format_result(record: walls.WallRecord, files: bench.WallFiles) -> str:
     Rich's markup.
     """
     rows = walls.wall_facts(record)
-    wide, wider = (max(len(row[column]) for row in rows) for column in (0, 1))
+    name_width = max(len(name) for name, _, _ in rows)
+    value_width = max(len(value) for _, value, _ in rows)
     lines = [
-        f"{name:{wide}}  {value:{wider}}  [dim]{escape(meaning)}[/]"
+        f"{name:{name_width}}  {value:{value_width}}  [dim]{escape(meaning)}[/]"
         for name, value, meaning in rows
     ]
     advice = record.advice[:1].upper() + record.advice[1:]
     lines.append(f"[bold {_color(record.verdict)}]Verdict: {record.verdict}.[/] {escape(advice)}.")
     lines += [f"Note: {escape(warning)}" for warning in record.warnings]
-    written = [
-        str(files.record),
-        *([files.reference.name] if record.reference else []),
-        files.report.name,
-    ]
-    return "\n".join(
-        [
-            *lines,
-            f"Wrote {escape(', '.join(written))}: open {escape(files.report.name)} for the report",
-        ]
-    )
+    written = [str(files.record), files.report.name]
+    if record.reference:
+        written.insert(1, files.reference.name)
+    report = escape(files.report.name)
+    lines.append(f"Wrote {escape(', '.join(written))}: open {report} for the report")
+    return "\n".join(lines)
 
 
 def _color(verdict: str) -> str:
@@ -108,14 +104,10 @@ def panel(found: bench.FrameFit) -> Table:
         table.add_row("wall", f"[yellow]not measured:[/] {escape(found.refusal)}")
     else:
         fit = found.fit
-        table.add_row(
-            "distance",
-            f"{1e3 * fit.distance_m:.1f} mm",
-            gauge(fit.distance_m, *walls.DISTANCE_RANGE_M),
-        )
-        table.add_row(
-            "facing", f"{fit.facing_deg:.2f}°", gauge(fit.facing_deg, *walls.FACING_RANGE_DEG)
-        )
+        distance = gauge(fit.distance_m, *walls.DISTANCE_RANGE_M)
+        facing = gauge(fit.facing_deg, *walls.FACING_RANGE_DEG)
+        table.add_row("distance", f"{1e3 * fit.distance_m:.1f} mm", distance)
+        table.add_row("facing", f"{fit.facing_deg:.2f}°", facing)
         table.add_row("yaw, pitch", f"{fit.yaw_deg:+z.2f}°, {fit.pitch_deg:+z.2f}°")
         table.add_row("verdict", f"[{_color(fit.verdict)}]{fit.verdict}[/]", fit.advice)
     if found.saturated > MAX_SATURATED:
@@ -131,7 +123,11 @@ def gauge(value: float, low: float, high: float) -> str:
     """
     share = (value - low) / (high - low)
     place = round(min(max(share, 0.0), 1.0) * (GAUGE_WIDTH - 1))
-    mark = "◀" if share < 0 else "▶" if share > 1 else "●"
+    mark = "●"
+    if share < 0:
+        mark = "◀"
+    elif share > 1:
+        mark = "▶"
     return f"{low:g} {'─' * place}{mark}{'─' * (GAUGE_WIDTH - 1 - place)} {high:g}"
 
 
