@@ -259,8 +259,8 @@ def _shade(axis: "Axes", stray: NDArray[np.bool_], absent: NDArray[np.bool_]) ->
     axis.imshow(paint, extent=(-0.5, width - 0.5, height - 0.5, -0.5), interpolation="nearest")
     entries: list[Patch] = []
     if stray.any():
-        striped = {"edgecolor": STRIPE, "hatch": "///", "label": "left out of the plane"}
-        entries.append(Patch(facecolor=STRAY, **striped))
+        label = "left out of the plane"
+        entries.append(Patch(facecolor=STRAY, edgecolor=STRIPE, hatch="///", label=label))
     if absent.any():
         entries.append(Patch(facecolor=NO_RETURN, edgecolor="0.6", label="no return"))
     if entries:
