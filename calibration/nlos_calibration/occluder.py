@@ -458,9 +458,5 @@ def _warnings(sheet: SheetFit) -> tuple[str, ...]:
     if sheet.plane.inlier_fraction >= WARN_ON_SHEET_SHARE:
         return ()
     off = 1.0 - sheet.plane.inlier_fraction
-    return (
-        (
-            f"{off:.0%} of the pixels in front of the wall are not on the occluder: remove everything"
-            " else"
-        ),
-    )
+    remark = f"{off:.0%} of the pixels in front of the wall are not on the occluder"
+    return (f"{remark}: remove everything else",)

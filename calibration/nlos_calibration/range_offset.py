@@ -7,8 +7,9 @@ disagree about the sign: so it is measured.
 
 Two causes look alike where the wall is faced squarely; on an oblique wall the flatter one is right:
 
-- origin: the beams meet in the zero of depth, which lies offset_m before the glass. The measured wall
-  is flat; the pose's origin moves along the optical axis, and the distance by offset_m x cos(facing).
+- origin: the beams meet in the zero of depth, which lies offset_m before the glass. The measured
+  wall is flat; the pose's origin moves along the optical axis, and the distance by offset_m x
+  cos(facing).
 - depth: the beams meet in the glass, and every depth is too short by offset_m. That bends and turns
   an oblique wall (by 0.2 degrees at 45 degrees and 4.5 mm); the corrected depths are fitted again.
 """

@@ -72,10 +72,10 @@ def judge(
     distance_m: float, facing_deg: float, flat: Flatness, ripple_m: float
 ) -> tuple[Verdict, str]:
     """Return the verdict, and one sentence with its reason or the remedy."""
-    reasons = _reasons_to_doubt(flat, ripple_m)
-    if not reasons:
+    reason = _reason_to_doubt(flat, ripple_m)
+    if not reason:
         return range_verdict(distance_m, facing_deg)
-    return "doubtful", "; ".join(reasons + out_of_range(distance_m, facing_deg))
+    return "doubtful", "; ".join([reason, *out_of_range(distance_m, facing_deg)])
 
 
 def range_verdict(distance_m: float, facing_deg: float) -> tuple[Verdict, str]:
@@ -112,43 +112,35 @@ def _amounts(flat: Flatness) -> str:
     return f"{flat.bend_m * 1e3:.1f} mm and {flat.bend_deg:.2f} degrees"
 
 
-def _reasons_to_doubt(flat: Flatness, ripple_m: float) -> list[str]:
+def _reason_to_doubt(flat: Flatness, ripple_m: float) -> str:
     """Return the reason why the fitted plane may not be the wall's; empty if there is none."""
     bent = _tolerances(flat.bend_m, flat.bend_deg) > DOUBTFUL_TOLERANCES
     if bent and _explained_by_offset(flat):
-        return [
-            (
-                f"a range offset of {flat.offset_m * 1e3:+.1f} mm would make the wall flat (or the wall"
-                " is curved): measure the distance with a tape and give it with --tape-m"
-            )
-        ]
+        return (
+            f"a range offset of {1e3 * flat.offset_m:+.1f} mm would make the wall flat (or the"
+            " wall is curved): measure the distance with a tape and give it with --tape-m"
+        )
     if ripple_m > DOUBTFUL_RIPPLE_M:
-        return [
-            (
-                f"parts of the wall are {ripple_m * 1e3:.1f} mm RMS off the plane: ripples of the lidar,"
-                " or a wall that is not flat; use a flat, matt wall and let the lidar warm up"
-            )
-        ]
+        return (
+            f"parts of the wall are {1e3 * ripple_m:.1f} mm RMS off the plane: ripples of the"
+            " lidar, or a wall that is not flat; use a flat, matt wall and let the lidar warm up"
+        )
     if not bent:
-        return []
+        return ""
 
     by_noise = (
         flat.bend_m <= SURE_SIGMAS * flat.bend_std_m
         and flat.bend_deg <= SURE_SIGMAS * flat.bend_std_deg
     )
     if by_noise:
-        return [
-            (
-                f"noise leaves {_amounts(flat)} between half of the view and the whole:"
-                " average more frames"
-            )
-        ]
-    return [
-        (
-            f"half of the view differs from the whole by {_amounts(flat)}: a bent wall, or ripples of"
-            " the lidar; use a flat wall and let the lidar warm up"
+        return (
+            f"noise leaves {_amounts(flat)} between half of the view and the whole: average more"
+            " frames"
         )
-    ]
+    return (
+        f"half of the view differs from the whole by {_amounts(flat)}: a bent wall, or ripples"
+        " of the lidar; use a flat wall and let the lidar warm up"
+    )
 
 
 def out_of_range(distance_m: float, facing_deg: float) -> list[str]:
@@ -162,7 +154,8 @@ def out_of_range(distance_m: float, facing_deg: float) -> list[str]:
         way = "back" if distance_m < low else "closer"
         by_cm = at_least(100.0 * max(low - distance_m, distance_m - high))
         problems.append(
-            f"{distance_m:.3f} m is outside {low:.2f} to {high:.2f} m: move the lidar {by_cm} cm {way}"
+            f"{distance_m:.3f} m is outside {low:.2f} to {high:.2f} m: move the lidar {by_cm} cm"
+            f" {way}"
         )
 
     low, high = FACING_RANGE_DEG
