@@ -77,9 +77,10 @@ class Picture:
     @property
     def is_wide(self) -> bool:
         """True if a narrow screen should scroll the picture instead of shrinking it."""
-        return (
-            self.png is not None and int.from_bytes(self.png[16:20], "big") > WIDE_PIXELS
-        )  # its header's width
+        if self.png is None:
+            return False
+        width = int.from_bytes(self.png[16:20], "big")  # from the PNG's header
+        return width > WIDE_PIXELS
 
 
 def saved_picture(title: str, caption: str, path: Path) -> Picture:
@@ -141,11 +142,9 @@ def _row(cells: tuple[str, ...]) -> str:
 def bullets(name: str, items: Iterable[str], css_class: str = "") -> str:
     """Return a list of sentences under a heading; empty where there are none."""
     entries = "".join(f"<li>{escape(item)}</li>" for item in items)
-    return (
-        f"<section class='{css_class}'><h3>{escape(name)}</h3><ul>{entries}</ul></section>"
-        if entries
-        else ""
-    )
+    if not entries:
+        return ""
+    return f"<section class='{css_class}'><h3>{escape(name)}</h3><ul>{entries}</ul></section>"
 
 
 def commands(lines: Iterable[str]) -> str:

@@ -95,10 +95,8 @@ def random_bench(generator: Generator, printed: PrintErrors) -> BoardBench:
         generator.uniform(0.15, 0.30), generator.uniform(15, 75), generator.uniform(-10, 10), LIDAR
     )
     near = at_near_edge(A4, seen)
-    x_m, y_m, turn_rad = (
-        near.x_m + generator.uniform(0.0, 0.03),
-        *generator.uniform((-0.02, -0.1), (0.02, 0.1)),
-    )
+    x_m = near.x_m + generator.uniform(0.0, 0.03)
+    y_m, turn_rad = generator.uniform((-0.02, -0.1), (0.02, 0.1))
     scale, stretch = (
         float(np.exp(std * generator.standard_normal()))
         for std in (printed.scale_std, printed.stretch_std)

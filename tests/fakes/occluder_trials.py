@@ -94,12 +94,11 @@ def simulated_trial(
     """Find an upright occluder in frames of the renderer's beams and the simulated camera's
     sensor.
     """
-    sheet = Sheet((drawn := draw(conditions, generator))[1].x_m, drawn[1].gap_m)
+    seen, leaning = draw(conditions, generator)
+    sheet = Sheet(leaning.x_m, leaning.gap_m)
     rig = PAPER.model_copy(
         update={
-            "lidar": LidarPose(
-                distance_m=float(drawn[0].pose[2, 3]), yaw_deg=conditions.facing_deg
-            ),
+            "lidar": LidarPose(distance_m=float(seen.pose[2, 3]), yaw_deg=conditions.facing_deg),
             "intrinsics": PinholeRecord.model_validate(vars(pinhole)),
             "occluder": Occluder(x_m=sheet.x_m, z_min_m=sheet.gap_m),
         }
@@ -115,8 +114,11 @@ def outcome(seen: View, sheet: Sheet, mean: DepthMean, generator: Generator) -> 
     """Find the occluder and compare it with the truth."""
     on_sheet = bench_depth(seen, sheet) < bench_depth(seen, None)
     columns = np.median(on_sheet.sum(axis=1))
-    shown = IN_VIEW if columns >= 2 * MIN_COLUMNS else BARELY if on_sheet.any() else NOT_IN_VIEW
-    shown = EDGE_HIDDEN if on_sheet[:, 0].mean() > 0.5 else shown
+    shown = BARELY if on_sheet.any() else NOT_IN_VIEW
+    if columns >= 2 * MIN_COLUMNS:
+        shown = IN_VIEW
+    if on_sheet[:, 0].mean() > 0.5:
+        shown = EDGE_HIDDEN
     try:
         fit = find_occluder(mean.mean_m(), mean.noise(), seen.pinhole, seen.pose, generator)
     except OccluderRefusedError as error:
