@@ -140,7 +140,7 @@ def test_sheet_too_near_is_added_to_the_walls_advice(doubtful: WallRecord) -> No
     assert "0.030 m" in near.advice
 
 
-def test_occluder_measured_again_replaces_the_advice_on_the_first(doubtful: WallRecord) -> None:
+def test_occluder_measured_again_replaces_the_first_advice(doubtful: WallRecord) -> None:
     again = with_occluder(with_occluder(doubtful, NEAR), GOOD)
     assert again.advice == "average more frames"
     assert again.warnings == ("a stray",)
