@@ -15,8 +15,6 @@ __all__ = [
     "BareWallStatistics",
     "Board",
     "BoardRecord",
-    "BoardView",
-    "CameraErrors",
     "Corners",
     "DepthMean",
     "DeviceConstants",
@@ -26,7 +24,6 @@ __all__ = [
     "Finite",
     "Intrinsics",
     "LidarPose",
-    "Light",
     "MeanNoise",
     "MeasuredWall",
     "Moments",
@@ -40,7 +37,6 @@ __all__ = [
     "PrintErrors",
     "Record",
     "Rig",
-    "Verdict",
     "WallByBoard",
     "WallFit",
     "WallRecord",
@@ -78,15 +74,14 @@ __all__ = [
     "wall_from_zero",
     "wall_points_m",
     "wall_with_board",
-    "watched_pixels",
     "with_degrees",
     "with_mm",
     "with_occluder",
 ]
 
-from .board import BOARDS, PAPER_MM, Board, Corners, Light, Paper, find_corners
+from .board import BOARDS, PAPER_MM, Board, Corners, Paper, find_corners
 from .board_pose import PrintErrors, fit_board
-from .board_wall import BoardRecord, BoardView, CameraErrors, WallByBoard, wall_with_board
+from .board_wall import BoardRecord, WallByBoard, wall_with_board
 from .drift import WINDOW_FRAMES, Drift, DriftCheck, settings_changed
 from .geometry import Intrinsics, facing_angle_rad, normal_from_angles, wall_from_plane
 from .noise import (
@@ -134,7 +129,6 @@ from .wall import (
     FACING_RANGE_DEG,
     TOLERANCE_DEG,
     TOLERANCE_M,
-    Verdict,
     WallFit,
     fit_wall,
     measures_of,
@@ -153,4 +147,3 @@ from .wall_record import (
     wall_points_m,
     with_occluder,
 )
-from .wall_tracker import watched_pixels

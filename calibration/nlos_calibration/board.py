@@ -33,6 +33,7 @@ PAPER_MM: dict[Paper, tuple[float, float]] = {
 class Board(Record):
     """A printed ChArUco board. Measured are the chessboard corners between its markers."""
 
+    # Only corners between four squares are measured: three squares a side leave four of them.
     squares_x: Annotated[int, Field(ge=3, le=40)]
     squares_y: Annotated[int, Field(ge=3, le=40)]
     square_mm: Positive
@@ -44,6 +45,7 @@ class Board(Record):
     def _printable(self) -> Self:
         if self.marker_mm >= self.square_mm:
             raise ValueError("a board needs marker_mm < square_mm: markers stand in white squares")
+        # Markers fill the white squares, every other one.
         markers = self.squares_x * self.squares_y // 2
         known = len(self.opencv_dictionary.bytesList)
         if markers > known:
@@ -105,23 +107,15 @@ smaller ones.
 """
 
 
-Light = Literal["infrared", "colour"]
-
 MIN_CORNERS = 8
 """With fewer corners, the residuals hardly test the pose."""
 BRIGHTEST_QUANTILE = 0.9995
 CONTRAST_LIMIT = 4.0
 CONTRAST_TILES = (8, 8)
-REMEDIES: dict[Light, str] = {
-    "infrared": (
-        "place it where the view is bright, print it with toner (dye ink is white in infrared), and"
-        " lower the laser power if it is washed out"
-    ),
-    "colour": (
-        "place it in the view of the colour camera too, and light the room evenly, without gloss on"
-        " the paper"
-    ),
-}
+REMEDY = (
+    "place it where the view is bright, print it with toner (dye ink is white in infrared), and"
+    " lower the laser power if it is washed out"
+)
 """Advice where no marker is read."""
 
 
@@ -135,14 +129,13 @@ class Corners:
     """(n, 2); x, y in pixel centres."""
 
 
-def find_corners(
-    image: NDArray[np.floating] | UInt8, board: Board, light: Light = "infrared"
-) -> Corners:
-    """Detect the corners of `board` in an image (height, width) of any gain; `light` selects the
-    advice in an error.
+def find_corners(image: NDArray[np.floating] | UInt8, board: Board) -> Corners:
+    """Detect the corners of `board` in an infrared image (height, width) of any gain.
 
     Raises BoardRefusedError where fewer than MIN_CORNERS are found, or where the image is mirrored.
     """
+    # OpenCV's own corners: refining them in a rectified image made single corners better by a
+    # quarter and the plane no better.
     even = even_contrast(image)
     corners, markers = _detect(even, board)
     if len(corners.ids) >= MIN_CORNERS:
@@ -151,13 +144,16 @@ def find_corners(
         raise BoardRefusedError(
             "the board is mirrored: flip the image, or print the board without mirroring"
         )
-    raise BoardRefusedError(_too_few(len(corners.ids), markers, board, light))
+    raise BoardRefusedError(_too_few(len(corners.ids), markers, board))
 
 
 def even_contrast(image: NDArray[np.floating] | UInt8) -> UInt8:
     """Return the image (height, width) in 8 bits with its local contrast equalised (CLAHE): dim
     parts become clear.
     """
+    # The laser's light falls off with distance and angle, so that the far side of an oblique board
+    # is dim; contrast is equalised in tiles, in 16 bits, before it is cut to 8. A quantile sets the
+    # scale, not the maximum, which may be a glint.
     brightest = float(np.quantile(image, BRIGHTEST_QUANTILE))
     fine = np.clip(image / max(brightest, 1e-9) * 65535.0, 0.0, 65535.0).astype(np.uint16)
     even = np.asarray(cv2.createCLAHE(CONTRAST_LIMIT, CONTRAST_TILES).apply(fine), np.uint16)
@@ -177,10 +173,10 @@ def _detect(image: UInt8, board: Board) -> tuple[Corners, int]:
     )
 
 
-def _too_few(corners: int, markers: int, board: Board, light: Light) -> str:
+def _too_few(corners: int, markers: int, board: Board) -> str:
     size = f"{board.squares_x} x {board.squares_y} squares of {board.square_mm:g} mm"
     if markers == 0:
-        return f"no board of {size} is visible in {light}: {REMEDIES[light]}"
+        return f"no board of {size} is visible in infrared: {REMEDY}"
     return (
         f"{corners} corners of a board of {size} are visible ({markers} markers), {MIN_CORNERS}"
         " needed: move more of it to the near, bright side of the view, or average more frames"

@@ -75,9 +75,8 @@ class BoardPose:
         by_turn = cv2.Rodrigues(self.parameters[:3])[1]
         normal = self.normal
         shift = self.parameters[3:6]
-        normal_by_turn = by_turn.reshape(3, 3, 3)[
-            :, :, 2
-        ].T  # OpenCV: d matrix[i, j] / d turn[k] at [k, 3 i + j]
+        # OpenCV has d matrix[i, j] / d turn[k] at [k, 3 i + j]; the normal is column j = 2
+        normal_by_turn = by_turn.reshape(3, 3, 3)[:, :, 2].T
         height = float(normal @ shift)
         by_normal = (np.eye(3) - np.outer(normal, shift) / height) / height
         by_pose = np.hstack([by_normal @ normal_by_turn, -np.outer(normal, normal) / height**2])
@@ -101,6 +100,7 @@ def solve_pose(corners: CornerObservations) -> BoardPose:
     best, *others = sorted(
         (refine_pose(corners, one.astype(np.float64)) for one in starts), key=lambda pose: pose.chi2
     )
+    # chi^2 differs by the square of a number of standard deviations: 25 is five of them.
     for other in others:
         apart_deg = degrees(np.arccos(np.clip(float(best.normal @ other.normal), -1.0, 1.0)))
         if apart_deg > SAME_NORMAL_DEG and other.chi2 - best.chi2 < AMBIGUOUS_CHI2:
@@ -132,12 +132,9 @@ def refine_pose(corners: CornerObservations, parameters: Float64) -> BoardPose:
         if gain <= SETTLED * float(errors @ errors):
             break
     errors_px = errors[:-3].reshape(-1, 2) * sqrt(corners.variance_px2)
-    return BoardPose(
-        parameters,
-        errors_px,
-        float(errors @ errors),
-        np.linalg.inv(rows.T @ rows).astype(np.float64),
-    )
+    # Residuals and priors are in standard deviations, so that (J' J)^-1 is the covariance itself.
+    covariance = np.linalg.inv(rows.T @ rows).astype(np.float64)
+    return BoardPose(parameters, errors_px, float(errors @ errors), covariance)
 
 
 def _linear(corners: CornerObservations, parameters: Float64) -> tuple[Float64, Float64]:
@@ -217,10 +214,10 @@ class PrintErrors:
 
 @dataclass(frozen=True)
 class BoardFit:
-    """Plane of a board in the frame of the camera that saw it, until it is moved to the lidar's."""
+    """Plane of a board in the lidar frame."""
 
     slopes: Float64
-    """(3,); -normal / distance_m, the normal towards the camera."""
+    """(3,); -normal / distance_m, the normal towards the lidar."""
     covariance: Float64
     """(3, 3) of the slopes."""
     corners: int
@@ -238,16 +235,15 @@ def fit_board(
     board: Board,
     intrinsics: Intrinsics,
     printed: PrintErrors | None = None,
-    focal_std: float = 0.0,
 ) -> BoardFit:
-    """Fit the plane of `board` to its corners in the image of a pinhole, in the frame of that
-    camera.
+    """Fit the plane of `board` to its corners in the lidar's infrared image.
 
-    `focal_std` is the relative uncertainty of its focal length. Raises BoardRefusedError where the
-    corners are not those of a flat print of the right proportions, and where they do not determine
-    the plane.
+    Raises BoardRefusedError where the corners are not those of a flat print of the right
+    proportions, and where they do not determine the plane.
     """
     printed = printed or PrintErrors()
+    # First with the noise that a free homography leaves, which no wrong assumption about print or
+    # lens inflates, so that a misfit shows; then with the residuals' own, for the covariance.
     observed = _observations(corners, board, intrinsics, printed)
     pose = solve_pose(observed)
     _check_fit(pose)
@@ -255,15 +251,12 @@ def fit_board(
     pose = refine_pose(observed, pose.parameters)
     _check_print(pose)
     slopes, covariance = pose.slopes()
-    by_focal = _by_focal(observed, pose, focal_std)
     _check_certain(slopes, covariance)
     return BoardFit(
         slopes=slopes,
-        # a print larger by a share moves the plane away by that share: the slopes change along
-        # themselves
-        covariance=covariance
-        + printed.scale_std**2 * np.outer(slopes, slopes)
-        + np.outer(by_focal, by_focal),
+        # A print larger by a share moves the plane away by that share: the slopes change along
+        # themselves. No image shows the scale, so its variance is added, not fitted.
+        covariance=covariance + printed.scale_std**2 * np.outer(slopes, slopes),
         corners=len(observed.pixels),
         residual_px=float(np.sqrt(np.mean(pose.errors_px**2))),
         stretch=float(np.expm1(pose.parameters[6])),
@@ -293,6 +286,8 @@ def _inliers(points_m: Float64, pixels: Float64) -> Mask:
     """Return the corners on one plane with most others: the detector now and then takes an edge for
     a corner.
     """
+    # The length of a two-dimensional error has a median of 1.18 sigma (Rayleigh); dividing by
+    # sqrt(2) x 0.674 = 0.95 takes it a quarter too large, on the wide side.
     errors_px = np.linalg.norm(_homography_errors_px(points_m, pixels, cv2.USAC_MAGSAC), axis=1)
     sigma_px = max(float(np.median(errors_px)) / sqrt(2.0) / MEDIAN_PER_SIGMA, SIGMA_FLOOR_PX)
     good = errors_px < OUTLIER_SIGMAS * sigma_px
@@ -336,20 +331,10 @@ def _variance_px2(errors_px: Float64, spent: int) -> float:
     return max(float((errors_px**2).sum()) / (errors_px.size - spent - 2), SIGMA_FLOOR_PX**2)
 
 
-def _by_focal(corners: CornerObservations, pose: BoardPose, focal_std: float) -> Float64:
-    """Return the change of the slopes (3,) for a focal length longer by its uncertainty."""
-    if focal_std == 0.0:
-        return np.zeros(3)
-    longer = corners.camera + np.diag(np.diag(corners.camera)) * focal_std * np.array(
-        [1.0, 1.0, 0.0]
-    )
-    return (
-        refine_pose(replace(corners, camera=longer), pose.parameters).slopes()[0] - pose.slopes()[0]
-    )
-
-
 def _check_fit(pose: BoardPose) -> None:
     """Raise BoardRefusedError if a homography explains the corners much better than any pose."""
+    # A homography has 8 free parameters, a pose 6 and three that priors hold: what it explains
+    # beyond them is intrinsics or squares that are not those assumed.
     free = pose.errors_px.size - 8
     if pose.chi2 > free + MISFIT_CHI2:
         raise BoardRefusedError(

@@ -1,133 +1,27 @@
 """Wall from depth and a printed board together: one pose, one verdict, and the board's part of the
 record.
 
-Infrared shares the lidar's pinhole. Another camera has a distorting lens and a pose of its own: its
-plane is fitted in its own frame, and moved to the lidar's together with its covariance.
-
-Depth and board each give slopes = -normal / distance_m (3,) with a covariance. Where they agree,
-they are averaged by weight. Where they do not, an average would be neither: one is used, and the
-likely causes are listed with amounts.
+The board is seen in infrared, through the lidar's own pinhole. Depth and board each give slopes =
+-normal / distance_m (3,) with a covariance. Where they agree, they are averaged by weight. Where
+they do not, an average would be neither: one is used, and the likely causes are listed with
+amounts.
 """
 
-from dataclasses import dataclass, field, replace
-from math import degrees, radians, sqrt
+from dataclasses import dataclass, replace
+from math import degrees, sqrt
 from typing import Annotated, Literal
 
-import cv2
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import Field
 
-from nlos_calibration.arrays import Float64
-from nlos_calibration.board import Board, Corners, Light, find_corners
-from nlos_calibration.board_pose import BoardFit, PrintErrors, fit_board
-from nlos_calibration.errors import BoardRefusedError, WallRefusedError
+from nlos_calibration.arrays import Float64, UInt8
+from nlos_calibration.board import Board, find_corners
+from nlos_calibration.board_pose import fit_board
+from nlos_calibration.errors import WallRefusedError
 from nlos_calibration.geometry import Intrinsics, plane_from_slopes, wall_from_plane
 from nlos_calibration.rig import Finite, NotNegative, Positive, Record
 from nlos_calibration.wall import Verdict, WallFit, WallMeasures, measures_of, out_of_range
-
-UNDISTORTED = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-9)
-
-
-@dataclass(frozen=True)
-class CameraErrors:
-    """Standard uncertainties of a color camera's calibration: assumed, since its maker publishes
-    none.
-
-    Owners of the L515 saw color and depth 4 to 5 pixels apart at 4 m, which is a turn of 0.3
-    degrees.
-    """
-
-    turn_std_deg: float = 0.2
-    """Rotation against the lidar about each axis, errors of the principal point included."""
-    shift_std_m: float = 0.0005
-    """Position along each axis."""
-    focal_std: float = 0.001
-    """Relative; librealsense itself corrects it for the camera's temperature."""
-
-
-EXACT = CameraErrors(0.0, 0.0, 0.0)
-"""Errors of the lidar's infrared: it shares the pinhole with the depth, so that both have the same
-errors.
-"""
-
-
-@dataclass(frozen=True)
-class BoardView:
-    """Image of a board and the camera that took it, by default the lidar in infrared."""
-
-    image: Float64
-    """(height, width), the mean over frames; of any gain."""
-    intrinsics: Intrinsics
-    distortion: Float64 = field(default_factory=lambda: np.zeros(5))
-    """(5,): k1, k2, p1, p2, k3 of Brown and Conrady, in the order of OpenCV and librealsense."""
-    lidar_from_camera: Float64 = field(default_factory=lambda: np.eye(4))
-    """(4, 4)."""
-    light: Light = "infrared"
-    errors: CameraErrors = EXACT
-
-
-def fit_in_lidar(
-    corners: Corners, board: Board, view: BoardView, printed: PrintErrors | None = None
-) -> BoardFit:
-    """Fit the plane of `board` in the lidar frame to corners detected in the image of a view.
-
-    Raises BoardRefusedError as `fit_board` does, and where the lidar would be behind the plane.
-    """
-    fit = fit_board(
-        undistorted(corners, view), board, view.intrinsics, printed, focal_std=view.errors.focal_std
-    )
-    slopes, covariance = plane_in_lidar(
-        fit.slopes, fit.covariance, view.lidar_from_camera, view.errors
-    )
-    return replace(fit, slopes=slopes, covariance=covariance)
-
-
-def undistorted(corners: Corners, view: BoardView) -> Corners:
-    """Return the corners as a pinhole of the same intrinsics would see them."""
-    if not view.distortion.any():
-        return corners
-    points = corners.pixels.reshape(-1, 1, 2)
-    straight = cv2.undistortImagePoints(
-        points, view.intrinsics.matrix, view.distortion, None, UNDISTORTED
-    )
-    return replace(corners, pixels=np.asarray(straight, np.float64).reshape(-1, 2))
-
-
-def plane_in_lidar(
-    slopes: Float64, covariance: Float64, lidar_from_camera: Float64, errors: CameraErrors
-) -> tuple[Float64, Float64]:
-    """Move a plane slopes . p = 1 from the camera's to the lidar's frame: slopes (3,) and
-    covariance (3, 3).
-
-    Raises BoardRefusedError where the plane runs between camera and lidar.
-    """
-    # With u = R slopes and t the camera's position, p_camera = R' (p - t) gives u . (p - t) = 1, so
-    # the lidar's slopes are v = u / h with h = 1 + u . t. Derivatives: dv/du = (I - v t') / h,
-    # dv/dt = -u u' / h^2 = -v v', and a small turn w changes u by w x u. Errors of turn and
-    # position have equal, independent axes.
-    turn = lidar_from_camera[:3, :3]
-    place_m = lidar_from_camera[:3, 3]
-    turned = turn @ slopes
-    height = 1.0 + float(turned @ place_m)
-    if height <= 0.0:
-        raise BoardRefusedError(
-            "the board's wall runs between color camera and lidar: check the pose of one to the"
-            " other"
-        )
-    moved = turned / height
-    by_turned = (np.eye(3) - np.outer(moved, place_m)) / height
-    x, y, z = turned
-    cross = np.array([[0.0, z, -y], [-z, 0.0, x], [y, -x, 0.0]])  # d (w x u) / d w
-    by_slopes = by_turned @ turn
-    by_angle = by_turned @ cross
-    by_place = -np.outer(moved, moved)
-    angle_std = radians(errors.turn_std_deg)
-    return moved, (
-        by_slopes @ covariance @ by_slopes.T
-        + angle_std**2 * by_angle @ by_angle.T
-        + errors.shift_std_m**2 * by_place @ by_place.T
-    )
-
 
 Used = Literal["both", "depth", "board"]
 
@@ -197,6 +91,7 @@ def combine(depth: UncertainPlane, board: UncertainPlane, *, measured: bool) -> 
         slopes = depth.slopes + gain @ (board.slopes - depth.slopes)
         average = UncertainPlane(slopes, depth.covariance - gain @ depth.covariance)
         return Combined(average, "both", apart, ())
+    # Which of two is wrong only a ruler tells: a measured print is trusted, a drawing is not.
     used: Used = "board" if measured else "depth"
     return Combined(
         board if measured else depth, used, apart, _causes(depth, board, apart, measured=measured)
@@ -237,12 +132,10 @@ def _causes(
     amount.
     """
     causes: list[str] = []
-    scale = (
-        depth.distance_m / board.distance_m
-    )  # a board's distance is proportional to the assumed size of its squares
-    offset_m = apart.distance_m / max(
-        -float(depth.normal[2]), 1e-3
-    )  # along the axis, longer than along the normal
+    # A board's distance is proportional to the assumed size of its squares. An offset acts along
+    # the optical axis, where the same change is longer than along the normal, by 1 / cos(facing).
+    scale = depth.distance_m / board.distance_m
+    offset_m = apart.distance_m / max(-float(depth.normal[2]), 1e-3)
     if apart.distance_sigmas > AGREE_SIGMAS:
         if abs(scale - 1.0) <= MAX_SCALE and not measured:
             causes.append(
@@ -264,13 +157,6 @@ def _causes(
     )
 
 
-COLOR_POSE_CAUSE = (
-    "the color camera's factory pose against the lidar, which may have shifted: measure in infrared"
-    " to compare"
-)
-"""A further cause of a disagreement, where the board was seen in color."""
-
-
 @dataclass(frozen=True)
 class WallByBoard(WallMeasures):
     """Wall measured by a board alone, since its depth was refused."""
@@ -288,7 +174,8 @@ class BoardRecord(Record):
     printed: Board
     measured: bool
     """True if the squares' size was measured on the print; else it is that of the drawing."""
-    seen_in: Light = "infrared"
+    seen_in: Literal["infrared"] = "infrared"
+    """Light of the image; stated in the file, where other lights may follow."""
     corners: Annotated[int, Field(gt=0)]
     residual_px: NotNegative
     stretch: Finite
@@ -317,29 +204,32 @@ class BoardRecord(Record):
 
 
 def wall_with_board(
-    depth: WallFit | WallRefusedError, view: BoardView, board: Board, *, measured: bool
+    depth: WallFit | WallRefusedError,
+    image: NDArray[np.floating] | UInt8,
+    intrinsics: Intrinsics,
+    board: Board,
+    *,
+    measured: bool,
 ) -> tuple[WallFit | WallByBoard, BoardRecord]:
-    """Measure the wall from its depth (or the reason why that was refused) and a view of a board.
+    """Measure the wall from its depth (or the reason why that was refused) and a board.
 
-    `measured` states that the board's squares were measured by hand. Raises BoardRefusedError for
-    an unusable view.
+    `image` (height, width) is the mean infrared; `measured` states that the board's squares were
+    measured by hand. Raises BoardRefusedError for an unusable image.
     """
-    fit = fit_in_lidar(find_corners(view.image, board, view.light), board, view)
+    fit = fit_board(find_corners(image, board), board, intrinsics)
     plane = UncertainPlane(fit.slopes, fit.covariance)
     record = BoardRecord(
         **vars(measures_of(fit.slopes, fit.covariance)),
         **{name: getattr(fit, name) for name in ("corners", "residual_px", "stretch", "bow_m")},
         printed=board,
         measured=measured,
-        seen_in=view.light,
         used="board",
     )
     if isinstance(depth, WallRefusedError):
         return _by_board(plane, depth), record.model_copy(update={"depth_refused": str(depth)})
+    # In slopes both are linear, and their covariances add; distance and angles would not be.
     by_depth = UncertainPlane(-depth.wall_from_lidar[2, :3] / depth.distance_m, depth.covariance)
     both = combine(by_depth, plane, measured=measured)
-    if both.causes and view.light == "colour":
-        both = replace(both, causes=(*both.causes, COLOR_POSE_CAUSE))
     apart = both.disagreement
     comparison = {
         "used": both.used,
@@ -353,15 +243,16 @@ def wall_with_board(
 
 def _by_board(plane: UncertainPlane, refusal: WallRefusedError) -> WallByBoard:
     """Return the board's wall, doubtful for want of a depth to compare it with."""
+    # No board shows whether the rest of the wall is bare and flat.
     measures = measures_of(plane.slopes, plane.covariance)
-    doubt = f"the plane is the board's alone, since the depth was refused: {refusal}"
+    reason = f"the plane is the board's alone, since the depth was refused: {refusal}"
     problems = out_of_range(measures.distance_m, measures.facing_deg)
     pose = wall_from_plane(plane.normal, plane.distance_m)
     return WallByBoard(
         **vars(measures),
         wall_from_lidar=pose,
         verdict="doubtful",
-        advice="; ".join([doubt, *problems]),
+        advice="; ".join([reason, *problems]),
     )
 
 

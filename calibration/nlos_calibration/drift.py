@@ -116,6 +116,7 @@ class DriftWindow:
 
     def add(self, observation: WallObservation | None, share: float) -> None:
         """Add a frame's observation, and the share of the watched pixels that showed the wall."""
+        # A frame without a pose takes its place too: medians are over a second, not over 30 poses.
         place = self._frames % WINDOW_FRAMES
         self._observations[place] = np.nan if observation is None else observation
         self._shares[place] = share
@@ -140,9 +141,8 @@ class DriftWindow:
         median = np.sort(valid, axis=0)[middle]
         off = np.abs(valid - median)
         spread = SCATTER_PER_MEDIAN * np.sort(off, axis=0)[middle]
-        agreeing = np.maximum(
-            (off <= 3.0 * spread).sum(axis=0), 1
-        )  # just after a knock, half of them
+        # Just after a knock half of the frames agree with the median, and only these count.
+        agreeing = np.maximum((off <= 3.0 * spread).sum(axis=0), 1)
         share = np.pi / 2 / agreeing + 1 / max(self._reference_frames, 1)
         *stds, _ = (CARRIED_OVER * spread * np.sqrt(share)).tolist()
         *changes, misfit = median.tolist()
@@ -239,6 +239,8 @@ class DriftCheck:
 
         Raises CalibrationError for a frame of another size.
         """
+        # The watched pixels are places in the image: they mean the same parts of the wall only at
+        # the reference's size.
         then = self._reference.intrinsics
         height, width = depth_m.shape
         if (height, width) != (then.height, then.width):
@@ -269,13 +271,11 @@ class DriftCheck:
         well.
         """
         lines = [str(self._reported) if self._reported else "", self._blindness]
-        if off := [
-            line for line in self._about_celsius.values() if line
-        ]:  # one device: the first stands for all
-            lines.append(
-                off[0]
-                + (f" ({len(off) - 1} more of its temperatures are off)" if len(off) > 1 else "")
-            )
+        # It is one device: the first of its temperatures stands for all.
+        off = [line for line in self._about_celsius.values() if line]
+        lines += off[:1]
+        if len(off) > 1:
+            lines[-1] += f" ({len(off) - 1} more of its temperatures are off)"
         if self._about_settings:
             changes = ", ".join(self._about_settings)
             lines.append(
@@ -305,10 +305,13 @@ class DriftCheck:
 
     def _update_blindness(self) -> None:
         """Begin or end the warning that too little of the wall is in view."""
+        # A counter that rises by one and falls by ten: objects may hide the wall for ten seconds,
+        # and one second in which the pose is well known takes all of that back.
         sharp = self.drift is not None and self.drift.sharp
-        self._blind = (
-            max(self._blind - BLIND_ENDS, 0) if sharp else min(self._blind + 1, BLIND_FRAMES)
-        )
+        if sharp:
+            self._blind = max(self._blind - BLIND_ENDS, 0)
+        else:
+            self._blind = min(self._blind + 1, BLIND_FRAMES)
         if self._blind == 0:
             self._blindness = ""
         elif self._blind == BLIND_FRAMES and not self._blindness:
@@ -322,6 +325,7 @@ class DriftCheck:
         """Return a warning for a temperature beyond the tolerance; empty within it."""
         then_c = self._reference.celsius[name]
         span_c = self._reference.celsius_span.get(name, 0.0)
+        # A lidar that warmed up during the calibration itself is compared with that range.
         limit_c = max(TOLERANCE_C, span_c) * (ENDS_AT if self._about_celsius.get(name) else 1.0)
         if abs(now_c - then_c) <= limit_c:
             return ""

@@ -1,11 +1,11 @@
-"""Errors of the calibration package.
+"""Errors of the calibration package, with their exit codes and an example of each message.
 
-CalibrationError (ValueError)    exit 1   root ├── WallRefusedError             exit 1   "only 31.0%
-of the depth lies on one plane (50% needed), ..." ├── BoardRefusedError            exit 1   "4
-corners of a board of 6 x 9 squares of 30 mm are seen, 8 needed: ..." ├── OccluderRefusedError
-exit 1   "the occluder touches the wall (gap 1.2 mm, known to 2.0 mm): ..." └── RecordFileError
-exit 4   "wall.toml is not a wall record: frames: must be greater than 0 (got 0)"
-    └── UnknownRigError          exit 2   "no rig 'paper-rgi'. Did you mean 'paper-rig'?"
+CalibrationError (ValueError)  1  root
+├── WallRefusedError           1  "only 31.0% of the depth lies on one plane (50% needed), ..."
+├── BoardRefusedError          1  "4 corners of a board of 6 x 9 squares of 30 mm are visible, ..."
+├── OccluderRefusedError       1  "the occluder touches the wall (gap 1.2 ± 2.0 mm): ..."
+└── RecordFileError            4  "wall.toml is not a wall record: frames: must be greater than 0"
+    └── UnknownRigError        2  "no rig 'paper-rgi'. Did you mean 'paper-rig'?"
 """
 
 

@@ -105,6 +105,7 @@ def _bend(plane: PlaneFit, steps: list[Float64], whole: Float64) -> tuple[float,
     """Return the largest change of distance (m) and normal (degrees) by any of the steps (3,),
     beyond the whole's.
     """
+    # The angle is that of a tangent: arccos of a product near 1 loses half of the digits.
     normal, distance_m = plane_from_slopes(plane.slopes + whole)
     parts = [plane_from_slopes(plane.slopes + step) for step in steps]
     turns = [
@@ -126,9 +127,10 @@ def _offset_m(matrix: Float64, right: Float64, chi2: float) -> float:
     """Return the constant to add to every depth for the smallest residuals of a plane; 0 where none
     is plausible.
     """
-    offset_m = -float(
-        np.linalg.lstsq(matrix, right)[0][3]
-    )  # the fourth unknown is the error, the offset removes it
+    # The fourth unknown is the constant error of every depth; the offset removes it. On a wall
+    # faced squarely it is nearly a change of distance: then its uncertainty exceeds it, and 0 is
+    # returned.
+    offset_m = -float(np.linalg.lstsq(matrix, right)[0][3])
     std_m = float(np.sqrt(chi2 * np.linalg.pinv(matrix)[3, 3]))
     return offset_m if SURE_SIGMAS * std_m < abs(offset_m) <= MAX_OFFSET_M else 0.0
 
@@ -159,6 +161,7 @@ def ripples(plane: PlaneFit, rays: Float64) -> Ripples:
     """Measure the correlation of the residuals of `plane`, fitted to depth along `rays` (height,
     width, 3).
     """
+    # Normal to the wall a depth residual is shorter by distance / p_z = distance (ray . slopes).
     shape = rays.shape[:2]
     size = max(2, shape[1] // BLOCKS_ACROSS)
     across = np.where(plane.inliers, plane.distance_m * (rays.reshape(-1, 3) @ plane.slopes), 0.0)
@@ -216,6 +219,8 @@ def _correlation(count: Float64, total: Float64, chi2: float) -> tuple[float, in
 
 def _pulls(plane: PlaneFit, rays: Float64, weighted: Float64, size: int) -> Float64:
     """Return each block's sum (n, 3) of the least-squares gradient with respect to the slopes."""
+    # The gradient of a pixel's half square is J e / sigma^2 with J = -p_z^2 r. At the minimum it
+    # sums to zero over the view, but not over a block: that is the block's pull.
     slopewise = rays.reshape(-1, 3) @ plane.slopes
     predicted_m = np.divide(1.0, slopewise, out=np.zeros_like(slopewise), where=plane.inliers)
     strength = -(predicted_m**2 * weighted).reshape(rays.shape[:2])

@@ -15,6 +15,8 @@ from nlos_calibration.arrays import Float64, Int64, Mask
 
 Depth = TypeVar("Depth", float, Float64)
 
+# No data sheet gives the L515's noise below 0.25 m: these are nominal values, those of the
+# simulated sensor, and every fit scales them by the spread or the residuals that it finds.
 NOISE_FLOOR_M = 0.0005
 NOISE_PER_METRE = 0.002
 """Standard deviation of one depth sample: constant part, and increase per metre of depth."""
@@ -135,6 +137,7 @@ class DepthMean:
         """Return the mean depth (height, width); NaN where fewer than half of the frames had a
         return.
         """
+        # A pixel seen in fewer than half of the frames shows now the wall and now something else.
         mean_m = self._settle_median_m() + self._sum_m / np.maximum(self._count, 1)
         return np.where(2 * self._count >= max(self.frames, 1), mean_m, np.nan)
 
@@ -143,6 +146,8 @@ class DepthMean:
         two.
         """
         self._settle_median_m()
+        # sum (x - mean)^2 = sum off^2 - (sum off)^2 / n holds for deviations from any constant.
+        # From the median they are as small as the noise, so that the difference loses few digits.
         freedom = np.where(self._count > 1, self._count - 1.0, np.nan)
         squares_m2 = self._squares_m2 - self._sum_m**2 / np.maximum(self._count, 1)
         return np.sqrt(np.maximum(squares_m2, 0.0) / freedom)
@@ -160,15 +165,15 @@ class DepthMean:
         """Return the median of the first frames, and fix it once these are complete or a result is
         asked for.
         """
-        if self._median_m is None:
-            self._median_m = (
-                _median(np.stack(self._first))
-                if self._first
-                else np.full(self._count.shape, np.nan)
-            )
-            for depth_m in self._first:
-                self._accumulate(depth_m, self._median_m)
-            self._first.clear()
+        if self._median_m is not None:
+            return self._median_m
+
+        self._median_m = np.full(self._count.shape, np.nan)
+        if self._first:
+            self._median_m = _median(np.stack(self._first))
+        for depth_m in self._first:
+            self._accumulate(depth_m, self._median_m)
+        self._first.clear()
         return self._median_m
 
     def _accumulate(self, depth_m: Float64, median_m: Float64) -> None:
@@ -184,6 +189,8 @@ def _median(frames_m: Float64) -> Float64:
     """Return each pixel's median over frames (n, height, width), ignoring NaN; the upper one of an
     even number.
     """
+    # The upper of two middle samples rather than their mean: of an echo that flickers between two
+    # surfaces the mean would be on neither.
     ordered = np.sort(frames_m, axis=0)  # NaN last
     middle = np.isfinite(frames_m).sum(axis=0) // 2
     return np.take_along_axis(ordered, middle[np.newaxis], axis=0)[0]
@@ -191,7 +198,8 @@ def _median(frames_m: Float64) -> Float64:
 
 def with_mm(value_m: float, std_m: float | None, sign: str = "") -> str:
     """Return a length in metres as millimetres with its 95 % interval: "200.00 ± 0.01 mm"."""
-    return f"{_with_interval(1e3 * value_m, None if std_m is None else 1e3 * std_m, MAX_DECIMALS_MM, sign)} mm"
+    std_mm = None if std_m is None else 1e3 * std_m
+    return f"{_with_interval(1e3 * value_m, std_mm, MAX_DECIMALS_MM, sign)} mm"
 
 
 def with_degrees(value_deg: float, std_deg: float | None, sign: str = "") -> str:

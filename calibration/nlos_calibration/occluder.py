@@ -59,9 +59,10 @@ class ClassifiedView:
 class SheetFit:
     """Plane of a sheet in the wall frame, read as x = x_m + lean z + twist y."""
 
-    # The lidar's plane is slopes . q = 1. With q = R' (p - t) it is n . p = 1 + n . t in the wall frame, where n =
-    # R slopes and t = `lidar_m`. Solved for x: (1 + n . t - n_y y - n_z z) / n_x, so lean = -n_z / n_x and twist =
-    # -n_y / n_x. The gradients below are the derivatives of these by n.
+    # The lidar's plane is slopes . q = 1. With q = R' (p - t) it is n . p = 1 + n . t in the wall
+    # frame, where n = R slopes and t = `lidar_m`. Solved for x: (1 + n . t - n_y y - n_z z) / n_x,
+    # so lean = -n_z / n_x and twist = -n_y / n_x. The gradients below are the derivatives of these
+    # by n.
 
     plane: PlaneFit
     normal: Float64
@@ -94,6 +95,7 @@ class SheetFit:
     @property
     def tilt_std_deg(self) -> float:
         """Upper limit of the standard uncertainty of `tilt_deg`."""
+        # tilt^2 = lean^2 + twist^2 for small angles, so its uncertainty is at most that of both.
         twist_std = propagated_std(
             np.array([-self.twist, -1.0, 0.0]) / self.normal[0], self.covariance
         )
@@ -272,7 +274,7 @@ class OccluderFit:
     pixels: Mask = field(repr=False)
     """(height, width); inliers of the sheet's plane."""
     warnings: tuple[str, ...]
-    doubt: str = ""
+    why_unusable: str = ""
     """Reason not to use the reference that was taken along: an object seems to be hidden."""
 
 
@@ -321,7 +323,7 @@ def find_occluder(
         residual_m=sheet.plane.residual_m,
         pixels=pixels,
         warnings=_warnings(sheet),
-        doubt=_doubt(view),
+        why_unusable=_sign_of_object(view),
     )
     _check_edge(fit)
     return fit
@@ -343,11 +345,11 @@ def _check_in_view(view: ClassifiedView) -> None:
             f" lidar towards the occluder, or {BY_HAND}"
         )
     # x at which the farthest beam of the middle row is as near to the wall as an edge might be
-    x, z = (view.direction[len(view.direction) // 2, :, axis] for axis in (0, 2))
-    reach_m = (
-        np.inf if (z >= 0.0).any() else (x / -z).max() * max(view.pose[2, 3] - REACH_HEIGHT_M, 0.0)
-    )
-    reach = f"reach to x = {reach_m:.2f} m" if np.isfinite(reach_m) else "reach without end"
+    x, _, z = view.direction[len(view.direction) // 2].T
+    reach = "reach without end"
+    if (z < 0.0).all():
+        reach_m = (x / -z).max() * max(view.pose[2, 3] - REACH_HEIGHT_M, 0.0)
+        reach = f"reach to x = {reach_m:.2f} m"
     raise OccluderRefusedError(
         f"no occluder is in view: {REACH_HEIGHT_M:.2f} m off the wall the beams of this pose"
         f" {reach} and meet nothing in front of the wall: move it into their way, or {BY_HAND}"
@@ -356,6 +358,8 @@ def _check_in_view(view: ClassifiedView) -> None:
 
 def _sheet(view: ClassifiedView, noise: MeanNoise, generator: np.random.Generator) -> SheetFit:
     """Fit the plane of most pixels in front of the wall, and refuse anything that is not flat."""
+    # No least width is asked of its inliers (min_extent 0): a sheet may show as a narrow strip,
+    # whose tilt is then uncertain and says so in the covariance.
     near_m = np.where(view.near, view.depth_m, np.nan)
     try:
         plane = fit_depth(
@@ -403,6 +407,7 @@ def _edge(hits_m: Float64, pixels: Mask, passed: Mask) -> Edge:
     """Find the sheet's edge; refuse one that is out of view, touches the wall, or ends in the
     middle of the view.
     """
+    # Rows whose beams rise to the sheet's middle must show it: a real sheet has no end in y.
     lowest_m, middle_m = np.percentile(hits_m[pixels][:, 2], (5.0, 50.0))
     expected = hits_m[..., 2].max(axis=1) > middle_m
     rows = pixels.sum(axis=1) >= MIN_ROW_PIXELS
@@ -420,6 +425,7 @@ def _edge(hits_m: Float64, pixels: Mask, passed: Mask) -> Edge:
 
 def _check_edge(fit: OccluderFit) -> None:
     """Refuse a gap that is too small or too uncertain, and a tilted edge."""
+    # A gap is one only if it exceeds its own uncertainty and what the wall's error can feign.
     if fit.gap_m < max(MIN_GAP_M, SURE_SIGMAS * fit.gap_std_m):
         gap = with_mm(fit.gap_m, fit.gap_std_m)
         raise OccluderRefusedError(
@@ -438,7 +444,7 @@ def _check_edge(fit: OccluderFit) -> None:
         )
 
 
-def _doubt(view: ClassifiedView) -> str:
+def _sign_of_object(view: ClassifiedView) -> str:
     """Return the sign of a hidden object in the view, whose echoes the reference then holds too;
     else empty.
     """
@@ -449,11 +455,8 @@ def _doubt(view: ClassifiedView) -> str:
 
 def _warnings(sheet: SheetFit) -> tuple[str, ...]:
     """Return remarks on an occluder that was found nevertheless."""
-    lines: list[str] = []
-    if sheet.plane.inlier_fraction < WARN_ON_SHEET_SHARE:
-        off = 1.0 - sheet.plane.inlier_fraction
-        lines.append(
-            f"{off:.0%} of the pixels in front of the wall are not on the occluder: remove"
-            " everything else"
-        )
-    return tuple(lines)
+    if sheet.plane.inlier_fraction >= WARN_ON_SHEET_SHARE:
+        return ()
+    off = 1.0 - sheet.plane.inlier_fraction
+    remark = f"{off:.0%} of the pixels in front of the wall are not on the occluder"
+    return (f"{remark}: remove everything else",)

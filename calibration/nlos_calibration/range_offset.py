@@ -6,12 +6,12 @@ wall's normal. The data sheet puts 4.5 mm between the glass and the zero of dept
 disagree about the sign: so it is measured.
 
 Two causes look alike where the wall is faced squarely; on an oblique wall the flatter one is right:
-origin: the beams meet in the zero of depth, which lies offset_m before the glass. The measured wall
-is flat; the pose's
-    origin moves along the optical axis, and the distance by offset_m x cos(facing).
-depth: the beams meet in the glass, and every depth is too short by offset_m. That bends and turns
-an oblique wall
-    (by 0.2 degrees at 45 degrees and 4.5 mm); the corrected depths are fitted again.
+
+- origin: the beams meet in the zero of depth, which lies offset_m before the glass. The measured
+  wall is flat; the pose's origin moves along the optical axis, and the distance by offset_m x
+  cos(facing).
+- depth: the beams meet in the glass, and every depth is too short by offset_m. That bends and turns
+  an oblique wall (by 0.2 degrees at 45 degrees and 4.5 mm); the corrected depths are fitted again.
 """
 
 from collections.abc import Callable
@@ -22,6 +22,7 @@ from typing import Literal
 from nlos_calibration.errors import CalibrationError, WallRefusedError
 from nlos_calibration.wall import WallFit
 
+# A ruled millimetre is read to half of it.
 TAPE_STD_M = 0.0005
 """Standard uncertainty of a tape read by eye."""
 MAX_OFFSET_M = 0.03
@@ -67,7 +68,9 @@ def fit_with_tape_distance(fit_with: FitWith, tape_m: float) -> TapedWall:
         )
     moved = _taped(fit_with(0.0, origin_m), origin_m, axis_share, "origin")
     corrected = _corrected(fit_with, plain, origin_m, tape_m)
-    return corrected if corrected is not None and corrected.fit.bend_deg < plain.bend_deg else moved
+    if corrected is not None and corrected.fit.bend_deg < plain.bend_deg:
+        return corrected
+    return moved
 
 
 def _corrected(
@@ -83,6 +86,8 @@ def _corrected(
             fit = fit_with(offset_m, 0.0)
         except WallRefusedError:
             return None
+        # The secant's slope: by how much the wall moves per offset, the turn that it causes
+        # included. A wall that comes nearer as its depths grow cannot be corrected so.
         effect = (fit.distance_m - before.distance_m) / step_m if step_m else 1.0
         if effect <= 0.0:
             return None

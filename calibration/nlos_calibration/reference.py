@@ -89,6 +89,7 @@ class BareWall:
     """Maximum less minimum of each temperature during the measurement."""
 
 
+# The arrays come first among the fields and are stored as such; the rest is one JSON text.
 ARRAYS = [known.name for known in fields(BareWall)][:10]
 FACTS = [known.name for known in fields(BareWall)][10:]
 
@@ -115,6 +116,8 @@ class BareWallStatistics:
         self._ir.add(ir)
         self._saturated += ir == FULL_SCALE
         self._map_depth.add(map_depth_m)
+        # Without a return a cell's intensity is that of background light: leave it out like the
+        # depth.
         self._map_intensity.add(np.where(np.isfinite(map_depth_m), map_intensity, np.nan))
 
     def add_temperatures(self, celsius: Mapping[str, float]) -> None:
@@ -173,6 +176,7 @@ def load_reference(path: Path, sha256: str) -> BareWall:
     another record's.
     """
     advice = "calibrate the wall again"
+    # A file that is too long is not read; its digest is then that of no bytes, which matches none.
     try:
         content = path.read_bytes() if path.stat().st_size <= MAX_BYTES else b""
         digest = hashlib.sha256(content).hexdigest()
@@ -187,6 +191,7 @@ def load_reference(path: Path, sha256: str) -> BareWall:
             f" not {sha256[:12]}): restore the original file, or {advice}"
         )
     try:
+        # Before numpy allocates: a crafted archive of a few kB may claim gigabytes.
         _check_unpacked_size(content)
         with np.load(BytesIO(content)) as file:
             facts = json.loads(str(file["facts"]))

@@ -47,6 +47,7 @@ WORDING = {
 class Record(BaseModel):
     """Frozen record that rejects unknown fields."""
 
+    # A mistyped key would otherwise leave its field at the default without a word.
     model_config = ConfigDict(frozen=True, extra="forbid")
 
 
@@ -120,6 +121,8 @@ class LidarPose(Record):
     free.
     """
 
+    # A pose has six. The frame's origin is the foot of the lidar's perpendicular, which fixes two
+    # of the position, and its x axis is the lidar's, which fixes the roll (`geometry`).
     distance_m: Positive
     yaw_deg: Annotated[float, Field(gt=-90, lt=90)]
     """Positive turns the axis towards wall +x."""
@@ -132,6 +135,8 @@ class PinholeRecord(Record):
     480.
     """
 
+    # fx = (640 / 2) / tan(70 deg / 2) and fy = (480 / 2) / tan(55 deg / 2), the L515's field of
+    # view; the centre of an even number of pixels lies between two of them.
     width: Annotated[int, Field(gt=0)] = 640
     height: Annotated[int, Field(gt=0)] = 480
     fx: Positive = 457.0073622
@@ -143,6 +148,7 @@ class PinholeRecord(Record):
 class DeviceConstants(Record):
     """Constants of the device beside its geometry."""
 
+    # A bin of 10 mm of path is 33 ps of flight; 100 ns of gate are 30 m of path.
     receiver_cell_m2: Positive = 1e-4
     """S_unit_wall of S1, a constant of the device, independent of any grid."""
     bin_m: Positive = 0.01
@@ -157,6 +163,8 @@ class Rig(Record):
     name: str
     lidar: LidarPose
     intrinsics: PinholeRecord = PinholeRecord()
+    # Two extents, since the wall is metres wide, while S2's sum needs a fine grid over the part
+    # that light comes back from.
     wall: Extent
     """The physical wall: beams that miss it give no return."""
     relay: Extent
@@ -184,6 +192,8 @@ class Rig(Record):
     @property
     def checksum(self) -> str:
         """Twelve hexadecimal digits that change with any field; datasets and weights store them."""
+        # Pydantic writes fields in the order of their declaration, and floats in their shortest
+        # exact form: equal rigs give equal bytes on every machine.
         return hashlib.sha256(self.model_dump_json().encode()).hexdigest()[:12]
 
 
@@ -195,18 +205,19 @@ def first_problem(error: ValidationError) -> str:
     value = problem["input"]
     for library, plain in WORDING.items():
         text = re.sub(library, plain, text)
-    if isinstance(value, dict):  # a rule among fields: the values of those that its message names
-        given = {
-            name: got
-            for name, got in value.items()
-            if re.search(rf"\b{re.escape(str(name))}\b", text)
-        }
+    if isinstance(value, dict):
+        # A rule among several fields: show the values of those that its message names.
         got = ", ".join(
-            f"{name} = {got!r:.40}" for name, got in given.items() if str(got) not in text
+            f"{name} = {given!r:.40}"
+            for name, given in value.items()
+            if re.search(rf"\b{re.escape(str(name))}\b", text) and str(given) not in text
         )
+    elif isinstance(value, list):
+        got = ""
     else:
-        got = "" if isinstance(value, list) else f"{value!r:.80}"
-    return f"{field or 'record'}: {text}{f' (got {got})' if got else ''}"
+        got = f"{value!r:.80}"
+    ending = f" (got {got})" if got else ""
+    return f"{field or 'record'}: {text}{ending}"
 
 
 def record_kind(content: Mapping[str, object]) -> str:
@@ -231,12 +242,10 @@ def load_rig(name_or_path: str | Path) -> Rig:
     if str(name_or_path) in packaged:
         source = packaged[str(name_or_path)]
     elif not source.exists() and str(name_or_path) == source.stem:
-        names = [*packaged]
-        near = "".join(
-            f" Did you mean {name!r}?" for name in get_close_matches(source.stem, names, 1)
-        )
+        near = get_close_matches(source.stem, packaged, 1)
+        hint = f" Did you mean {near[0]!r}?" if near else ""
         raise UnknownRigError(
-            f"no rig {source.stem!r}.{near} Give {' or '.join(names)}, or a rig's TOML file"
+            f"no rig {source.stem!r}.{hint} Give {' or '.join(packaged)}, or a rig's TOML file"
         )
     return read_record(source, Rig, "rig", "give a packaged name (paper-rig) or a file")
 
@@ -252,6 +261,7 @@ def read_record(source: Traversable, model: type[R], kind: str, advice: str) -> 
     except FileNotFoundError as error:
         raise RecordFileError(f"no {kind} {source}: {advice}") from error
     except ValidationError as error:
+        # A scene given for a wall lacks a dozen fields: its kind says more than the first of them.
         if (other := record_kind(content)) not in {"", kind}:
             raise RecordFileError(f"{source} is a {other}, not a {kind}: {advice}") from error
         raise RecordFileError(f"{source} is not a {kind}: {first_problem(error)}") from error

@@ -41,11 +41,9 @@ def rig_difference(rig: Rig, other: Rig) -> tuple[str, ...]:
 
 
 def _moved(part: str, by_m: float, more: str, less: str) -> str:
-    return (
-        f"{part} {abs(by_m) * 1e3:.0f} mm {more if by_m > 0 else less}"
-        if abs(by_m) > TOLERANCE_M
-        else ""
-    )
+    if abs(by_m) <= TOLERANCE_M:
+        return ""
+    return f"{part} {abs(by_m) * 1e3:.0f} mm {more if by_m > 0 else less}"
 
 
 def _turned(angle: str, by_deg: float) -> str:
@@ -55,8 +53,10 @@ def _turned(angle: str, by_deg: float) -> str:
 def _occluder(rig: Rig, other: Rig) -> tuple[str, ...]:
     here = rig.occluder
     there = other.occluder
-    if here is None or there is None:
-        return () if here is there else ("no occluder" if here is None else "an occluder",)
+    if here is None:
+        return () if there is None else ("no occluder",)
+    if there is None:
+        return ("an occluder",)
     place = _moved(
         "the occluder", here.x_m - there.x_m, "farther along the wall", "nearer along the wall"
     )
@@ -64,16 +64,21 @@ def _occluder(rig: Rig, other: Rig) -> tuple[str, ...]:
 
 
 def _field(here: Intrinsics, there: Intrinsics) -> str:
-    (across, down), (across_there, down_there) = (
-        [degrees(atan(far) - atan(near)) for near, far in _view_edges(pinhole)]
-        for pinhole in (here, there)
-    )
+    # Angles, not focal lengths: the same view at another resolution is no difference.
+    across, down = _view_angles_deg(here)
+    across_there, down_there = _view_angles_deg(there)
     if max(abs(across - across_there), abs(down - down_there)) <= TOLERANCE_DEG:
         return ""
     return (
         f"a field of view of {across:.1f} x {down:.1f} degrees, not {across_there:.1f} x"
         f" {down_there:.1f}"
     )
+
+
+def _view_angles_deg(pinhole: Intrinsics) -> tuple[float, float]:
+    """Return the width and height of the field of view in degrees."""
+    (left, right), (top, bottom) = _view_edges(pinhole)
+    return degrees(atan(right) - atan(left)), degrees(atan(bottom) - atan(top))
 
 
 MAP_SHAPE = 64, 80
@@ -133,6 +138,7 @@ def on_plane(wall_from_lidar: Float64, rays: Float64) -> Float64:
     """Return wall x and y (..., 2) where rays (..., 3) in the lidar frame meet the wall plane; NaN
     without hit.
     """
+    # A ray p = t + s d meets z = 0 at s = t_z / -d_z, and never if d_z >= 0: it leads away.
     directions = rays @ wall_from_lidar[:3, :3].T
     origin = wall_from_lidar[:3, 3]
     towards = np.where(directions[..., 2] < 0.0, -directions[..., 2], np.nan)
@@ -153,9 +159,8 @@ def lidar_visible_share(rig: Rig, box: ObjectBox) -> float:
     middles = (np.arange(SLICES) + 0.5) / SLICES
     slices_m = box.y_min_m + middles * (box.y_max_m - box.y_min_m)
     past = [_past_edge(rig.occluder, (0.0, rig.lidar.distance_m))] if rig.occluder else []
-    return float(
-        np.mean([_visible_share(box, [*past, *_field_half_planes(rig, y_m)]) for y_m in slices_m])
-    )
+    shares = [_visible_share(box, [*past, *_field_half_planes(rig, y_m)]) for y_m in slices_m]
+    return float(np.mean(shares))
 
 
 def wall_visible_share(rig: Rig, box: ObjectBox, view: Footprint) -> float:
@@ -204,13 +209,19 @@ def _field_half_planes(rig: Rig, y_m: float) -> list[Float64]:
     # a side n . q >= 0 of the lidar frame is (R n) . (p - t) >= 0 in the wall frame, a line in x
     # and z at fixed y
     sides = inward @ pose[:3, :3].T
-    return [np.array([x, z, y * y_m - side @ pose[:3, 3]]) for side in sides for x, y, z in [side]]
+    half_planes: list[Float64] = []
+    for side in sides:
+        x, y, z = side
+        half_planes.append(np.array([x, z, y * y_m - side @ pose[:3, 3]]))
+    return half_planes
 
 
 def _visible_share(box: ObjectBox, half_planes: list[Float64]) -> float:
     """Return the share of the box's cross-section in x and z that is inside all half planes."""
     x = (box.x_min_m, box.x_max_m)
     z = (box.z_near_m, box.z_far_m)
+    # Cutting a convex polygon by a half plane leaves a convex polygon, so the cuts may follow each
+    # other in any order.
     corners = np.array([[x[0], z[0]], [x[1], z[0]], [x[1], z[1]], [x[0], z[1]]])
     left = corners
     for half_plane in half_planes:
@@ -222,6 +233,8 @@ def _cut(corners: Float64, half_plane: Float64) -> Float64:
     """Cut a convex polygon (n, 2) by a half plane (Sutherland and Hodgman, 1974); (0, 2) where
     nothing is left.
     """
+    # Walk around the polygon: keep each corner that is inside, and add the point of each edge that
+    # crosses the line, where the linear function `inside` is 0.
     inside = corners @ half_plane[:2] + half_plane[2]
     points: list[Float64] = []
     for here, there, at, to in zip(
@@ -265,11 +278,9 @@ def judge_rig(rig: Rig, view: Footprint, occluder: OccluderRecord | None) -> tup
     `occluder` is the source of the rig's; None where the paper's is assumed. Distance and angle are
     not repeated here: see `out_of_range`.
     """
-    name = (
-        "the occluder"
-        if occluder or not rig.occluder
-        else "the occluder (not measured, the paper's is assumed)"
-    )
+    name = "the occluder"
+    if rig.occluder and not occluder:
+        name += " (not measured, the paper's is assumed)"
     problems = _too_little_wall(rig, view)
     if rig.occluder is not None:
         tilt_deg = occluder.tilt_deg if occluder else None
@@ -345,6 +356,7 @@ def _leak(rig: Rig, box: ObjectBox, name: str) -> list[str]:
     if rig.occluder is None:
         return [f"{problem}: put an occluder at x = {PAPER_X_M:.2f} m before it"]
 
+    # Lowering the edge is tried first: it keeps the occluder's place between lidar and object.
     def hidden(x_cm: int, z_cm: int) -> bool:
         moved = _with_occluder_moved(rig, x_cm, z_cm)
         return moved is not None and lidar_visible_share(moved, box) <= MAX_LEAK
@@ -366,6 +378,8 @@ def _aperture(rig: Rig, box: ObjectBox, view: Footprint, name: str) -> list[str]
         f"the lit wall sees {share:.1%} of the object's box past {name}, {MIN_SEEN:.0%} needed"
     )
 
+    # Turning the lidar lights more of the wall next to the occluder; a wider gap shows more of the
+    # box.
     def turned(degrees: int) -> bool:
         if (yaw_deg := rig.lidar.yaw_deg + degrees) > FACING_RANGE_DEG[1]:
             return False
@@ -378,11 +392,9 @@ def _aperture(rig: Rig, box: ObjectBox, view: Footprint, name: str) -> list[str]
 
     if by_deg := _first(FARTHEST_DEG, turned):
         return [f"{problem}: turn the lidar {_degrees(by_deg)} towards the occluder"]
-    by_cm = _first(FARTHEST_CM, opened)
-    return [
-        f"{problem}: "
-        + (f"move the occluder {by_cm} cm away from the wall" if by_cm else "use a larger wall")
-    ]
+    if by_cm := _first(FARTHEST_CM, opened):
+        return [f"{problem}: move the occluder {by_cm} cm away from the wall"]
+    return [f"{problem}: use a larger wall"]
 
 
 def rig_with_occluder(rig: Rig, x_m: float, gap_m: float) -> Rig:
@@ -407,6 +419,8 @@ def _turned_to_wall(rig: Rig, degrees: int) -> Rig:
     """Return the rig with its lidar turned by `degrees` towards the wall's normal, at most onto
     it.
     """
+    # Yaw and pitch shrink in proportion, so that the axis keeps its direction while the angle
+    # falls.
     left = max(1.0 - degrees / max(rig.facing_deg, 1e-9), 0.0)
     return _posed(rig, left * rig.lidar.yaw_deg, left * rig.lidar.pitch_deg)
 

@@ -57,14 +57,8 @@ def wall_facts(record: WallRecord) -> list[Row]:
         meaning = f"{board.corners} corners; used: {board.used}. {board_agreement(board)}"
         rows.append(("printed board", ", ".join(plane), meaning))
     rows += _depth_rows(record)
-    if record.footprint_share is not None:
-        rows.append(
-            (
-                "view on the wall",
-                f"{100.0 * record.footprint_share:.1f} %",
-                "of the map's 64 x 80 cells",
-            )
-        )
+    view = f"{100.0 * record.footprint_share:.1f} %"
+    rows.append(("view on the wall", view, "of the map's 64 x 80 cells"))
     rows.append(("measured on", f"{record.created}", f"{record.frames} frames averaged"))
     if celsius := record.temperatures_c.values():
         span = dict.fromkeys(f"{value:.1f}" for value in (min(celsius), max(celsius)))

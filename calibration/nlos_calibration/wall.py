@@ -33,13 +33,13 @@ TOLERANCE_DEG = 0.2
 """Tolerated error: a wall on the edge of a range is inside, a smaller shift by a bend is
 ignored.
 """
-DOUBTED_TOLERANCES = 0.7
+DOUBTFUL_TOLERANCES = 0.7
 REFUSED_TOLERANCES = 5.0
 """Difference between half of the view and the whole, in tolerances. From the second on (5 mm or 1
 degree, a bend of 2 degrees) the wall is refused; less could also be ripples of the lidar, 1 or 2 mm
 high and half a view wide, which are only reported. Doubt begins below one tolerance, since a half
 that bends itself shows too little."""
-DOUBTED_RIPPLE_M = 0.0009
+DOUBTFUL_RIPPLE_M = 0.0009
 MAX_RIPPLE_M = 0.002
 """RMS normal to the wall. The L515's ripples are a millimetre or two high; two panes 2 mm apart are
 1 mm off a plane between them."""
@@ -51,6 +51,8 @@ def check_flat(flat: Flatness, ripple_m: float) -> None:
     """Refuse a wall that surely bends, curves or steps, unless a range offset of the lidar explains
     it.
     """
+    # A refusal must not be noise's: only what exceeds three standard uncertainties counts. A range
+    # offset bends an oblique wall in the same way, and is no fault of the wall.
     sure_m = flat.bend_m - SURE_SIGMAS * flat.bend_std_m
     sure_deg = flat.bend_deg - SURE_SIGMAS * flat.bend_std_deg
     if _tolerances(sure_m, sure_deg) > REFUSED_TOLERANCES and not _explained_by_offset(flat):
@@ -70,10 +72,10 @@ def judge(
     distance_m: float, facing_deg: float, flat: Flatness, ripple_m: float
 ) -> tuple[Verdict, str]:
     """Return the verdict, and one sentence with its reason or the remedy."""
-    doubts = _doubts(flat, ripple_m)
-    if not doubts:
+    reason = _reason_to_doubt(flat, ripple_m)
+    if not reason:
         return range_verdict(distance_m, facing_deg)
-    return "doubtful", "; ".join(doubts + out_of_range(distance_m, facing_deg))
+    return "doubtful", "; ".join([reason, *out_of_range(distance_m, facing_deg)])
 
 
 def range_verdict(distance_m: float, facing_deg: float) -> tuple[Verdict, str]:
@@ -110,38 +112,35 @@ def _amounts(flat: Flatness) -> str:
     return f"{flat.bend_m * 1e3:.1f} mm and {flat.bend_deg:.2f} degrees"
 
 
-def _doubts(flat: Flatness, ripple_m: float) -> list[str]:
+def _reason_to_doubt(flat: Flatness, ripple_m: float) -> str:
     """Return the reason why the fitted plane may not be the wall's; empty if there is none."""
-    bent = _tolerances(flat.bend_m, flat.bend_deg) > DOUBTED_TOLERANCES
+    bent = _tolerances(flat.bend_m, flat.bend_deg) > DOUBTFUL_TOLERANCES
     if bent and _explained_by_offset(flat):
-        why = (
-            f"a range offset of {flat.offset_m * 1e3:+.1f} mm would make the wall flat (or the wall"
-            " is curved): "
+        return (
+            f"a range offset of {1e3 * flat.offset_m:+.1f} mm would make the wall flat (or the"
+            " wall is curved): measure the distance with a tape and give it with --tape-m"
         )
-        return [why + "measure the distance with a tape and give it with --tape-m"]
-    if ripple_m > DOUBTED_RIPPLE_M:
-        why = (
-            f"parts of the wall are {ripple_m * 1e3:.1f} mm RMS off the plane: ripples of the"
-            " lidar, or a wall "
+    if ripple_m > DOUBTFUL_RIPPLE_M:
+        return (
+            f"parts of the wall are {1e3 * ripple_m:.1f} mm RMS off the plane: ripples of the"
+            " lidar, or a wall that is not flat; use a flat, matt wall and let the lidar warm up"
         )
-        return [why + "that is not flat; use a flat, matt wall and let the lidar warm up"]
     if not bent:
-        return []
-    if (
+        return ""
+
+    by_noise = (
         flat.bend_m <= SURE_SIGMAS * flat.bend_std_m
         and flat.bend_deg <= SURE_SIGMAS * flat.bend_std_deg
-    ):
-        return [
-            (
-                f"noise leaves {_amounts(flat)} between half of the view and the whole: average more"
-                " frames"
-            )
-        ]
-    why = (
-        f"half of the view differs from the whole by {_amounts(flat)}: a bent wall, or ripples of"
-        " the lidar; "
     )
-    return [why + "use a flat wall and let the lidar warm up"]
+    if by_noise:
+        return (
+            f"noise leaves {_amounts(flat)} between half of the view and the whole: average more"
+            " frames"
+        )
+    return (
+        f"half of the view differs from the whole by {_amounts(flat)}: a bent wall, or ripples"
+        " of the lidar; use a flat wall and let the lidar warm up"
+    )
 
 
 def out_of_range(distance_m: float, facing_deg: float) -> list[str]:
@@ -149,23 +148,20 @@ def out_of_range(distance_m: float, facing_deg: float) -> list[str]:
     move that cures it.
     """
     problems: list[str] = []
+    # Centimetres and degrees are rounded up, so that following the advice once is enough.
     low, high = DISTANCE_RANGE_M
     if not low - TOLERANCE_M <= distance_m <= high + TOLERANCE_M:
-        excess_m, way = (
-            (low - distance_m, "back") if distance_m < low else (distance_m - high, "closer")
-        )
+        way = "back" if distance_m < low else "closer"
+        by_cm = at_least(100.0 * max(low - distance_m, distance_m - high))
         problems.append(
-            f"{distance_m:.3f} m is outside {low:.2f} to {high:.2f} m: move the lidar"
-            f" {at_least(100.0 * excess_m)} cm {way}"
+            f"{distance_m:.3f} m is outside {low:.2f} to {high:.2f} m: move the lidar {by_cm} cm"
+            f" {way}"
         )
+
     low, high = FACING_RANGE_DEG
     if not low - TOLERANCE_DEG <= facing_deg <= high + TOLERANCE_DEG:
-        excess, way = (
-            (low - facing_deg, "aside")
-            if facing_deg < low
-            else (facing_deg - high, "towards the wall")
-        )
-        turn = at_least(excess)
+        way = "aside" if facing_deg < low else "towards the wall"
+        turn = at_least(max(low - facing_deg, facing_deg - high))
         problems.append(
             f"{facing_deg:.1f} degrees is outside {low:.0f} to {high:.0f}: turn the lidar {turn} "
             f"degree{'s' * (turn != 1)} {way}"
@@ -199,8 +195,8 @@ def measures_of(slopes: Float64, covariance: Float64) -> WallMeasures:
     normal, distance_m = geometry.plane_from_slopes(slopes)
     along, across = geometry.plane_gradients(normal, distance_m)
     turn = across @ covariance @ across.T
-    # yaw = atan2(x, -z) has the gradient (-z, 0, x) / (x^2 + z^2) over the normal, pitch = asin(-y) that of
-    # -y / sqrt(1 - y^2) = -y / sqrt(x^2 + z^2)
+    # yaw = atan2(x, -z) has the gradient (-z, 0, x) / (x^2 + z^2) over the normal, and pitch =
+    # asin(-y) the gradient -1 / sqrt(1 - y^2) = -1 / sqrt(x^2 + z^2) along y.
     x = normal[0]
     z = normal[2]
     level = x**2 + z**2
@@ -314,6 +310,8 @@ def fit_wall(
     that of a point `origin_m` behind the zero of depth on the optical axis (`range_offset`). Raises
     WallRefusedError where the depth is not that of one bare, flat wall.
     """
+    # In order: refuse an empty or constant map, fit, refuse a second surface, then a wall that is
+    # not flat; what is left is measured, and ripples widen its covariance.
     depth_m = np.where(np.isfinite(depth_m) & (depth_m > 0.0), depth_m, np.nan).astype(np.float64)
     _check_depth(depth_m)
     rays = intrinsics.rays()
@@ -322,6 +320,7 @@ def fit_wall(
         raise WallRefusedError(
             "the optical axis never meets the wall's plane: turn the lidar towards the wall"
         )
+    # The spread over frames is noise alone; the residuals of one frame hold ripples as well.
     scale = noise.scale if noise is not None and noise.measured else plane.noise_scale
     _check_one_surface(depth_m, plane_depth_m(rays, plane.slopes))
     flat = flatness(plane, rays)
@@ -357,6 +356,8 @@ def _check_depth(depth_m: Float64) -> None:
             f"{share:.1%} of the pixels have depth, {MIN_VALID_SHARE:.0%} needed: is the lens free"
             " and the wall near?"
         )
+    # Depth comes in steps of 0.25 mm and noise spreads it over several, so that half of a live view
+    # never reads one and the same value.
     some_m = valid_m[:: max(len(valid_m) // STATISTICS_POINTS, 1)]
     values_m, times = np.unique(some_m, return_counts=True)
     if times.max() >= STUCK_SHARE * len(some_m):
@@ -370,6 +371,7 @@ def _check_one_surface(depth_m: Float64, expected_m: Float64) -> None:
     """Raise WallRefusedError for a map in which blocks of pixels stray from the wall together; NaN
     is ignored.
     """
+    # The noise of single samples, whatever the number of frames: ripples do not fall with it.
     gate_m = GATE_SIGMAS * depth_noise_m(depth_m)
     valid = np.isfinite(depth_m)
     behind = valid & (depth_m - expected_m > gate_m)

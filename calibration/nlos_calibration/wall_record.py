@@ -35,18 +35,17 @@ from nlos_calibration.wall import Verdict, WallFit, range_verdict
 Row = tuple[Finite, Finite, Finite, Finite]
 POSE_TOLERANCE = 1e-6
 VERSION = 3
-"""Version 2 added uncertainties, flatness, device, board, reference and offset; version 3
-temperatures, footprint and occluder. All have defaults."""
+"""The one version of the format that is read and written."""
 
 
-def _upgraded(version: Any) -> Any:
-    """Return the current version for an older one; raise ValueError for a newer one."""
-    if isinstance(version, int) and version > VERSION:
+def _known_version(version: Any) -> Any:
+    """Return the version. Raises ValueError for any other than VERSION."""
+    if isinstance(version, int) and version != VERSION:
         raise ValueError(
-            f"written by a newer nlos-cam, this one reads up to {VERSION}: update it, or measure"
-            " again"
+            f"this nlos-cam reads version {VERSION} only: measure the wall again, or use the"
+            " nlos-cam that wrote it"
         )
-    return VERSION if version in (1, 2) else version
+    return version
 
 
 class WallRecord(Record):
@@ -54,7 +53,7 @@ class WallRecord(Record):
     the measurement.
     """
 
-    schema_version: Annotated[Literal[3], BeforeValidator(_upgraded)] = VERSION
+    schema_version: Annotated[Literal[3], BeforeValidator(_known_version)] = VERSION
     created: date
     camera: str
     """URI of the camera or recording."""
@@ -68,14 +67,14 @@ class WallRecord(Record):
     frames: Annotated[int, Field(gt=0)]
     """Number of frames averaged."""
     distance_m: Positive
-    distance_std_m: NotNegative | None = None
-    """Standard uncertainty, like all *_std; None in records of version 1."""
+    distance_std_m: NotNegative
+    """Standard uncertainty, like all *_std."""
     facing_deg: Annotated[float, Field(ge=0, lt=90)]
-    facing_std_deg: NotNegative | None = None
+    facing_std_deg: NotNegative
     yaw_deg: Finite
-    yaw_std_deg: NotNegative | None = None
+    yaw_std_deg: NotNegative
     pitch_deg: Finite
-    pitch_std_deg: NotNegative | None = None
+    pitch_std_deg: NotNegative
     wall_from_lidar: tuple[Row, Row, Row, Row]
     range_offset_m: Finite = 0.0
     """Length to add to the lidar's depth; the pose includes it (`range_offset`)."""
@@ -94,7 +93,7 @@ class WallRecord(Record):
     bend_deg: NotNegative | None = None
     board: BoardRecord | None = None
     """Measurement by a printed board; None without one."""
-    footprint_share: Annotated[float, Field(ge=0, le=1)] | None = None
+    footprint_share: Annotated[float, Field(ge=0, le=1)]
     """Share of the map's 64 x 80 cells that meet the wall."""
     occluder: OccluderRecord | None = None
     """None where it was neither detected nor entered: then `rig` has the paper's."""
@@ -109,6 +108,8 @@ class WallRecord(Record):
     @model_validator(mode="after")
     def _one_pose(self) -> Self:
         """Check that the pose, which is stored in three forms, is the same in all."""
+        # The three numbers define the matrix (`geometry`); it is stored for readers without this
+        # package. The rig may be edited by hand, but not away from the measurement.
         lidar = LidarPose(
             distance_m=self.distance_m, yaw_deg=self.yaw_deg, pitch_deg=self.pitch_deg
         )
@@ -141,6 +142,8 @@ def new_wall_record(
     Without `occluder` the paper's is assumed. `others` are further fields: of the device, the
     board, the reference and the range offset.
     """
+    # What a bench shares with the paper's (wall, relay, object box, device) stays the paper's until
+    # it is edited by hand; pose and intrinsics are measured.
     lidar = LidarPose(distance_m=fit.distance_m, yaw_deg=fit.yaw_deg, pitch_deg=fit.pitch_deg)
     pinhole = PinholeRecord.model_validate(vars(intrinsics))
     rig = load_rig("paper-rig").model_copy(
@@ -176,31 +179,28 @@ def with_occluder(record: WallRecord, fit: OccluderFit) -> WallRecord:
     occluder = OccluderRecord(source="detected", **measured)
     rig = rig_with_occluder(record.rig, occluder.x_m, occluder.gap_m)
     pose = np.array(record.wall_from_lidar)
+    # The verdict joins the wall's doubts with the rig's problems in one sentence. Those of the
+    # previous occluder are taken out of it again; a wall without doubts is judged anew by its
+    # range.
     if record.verdict == "doubtful" and not record.advice.startswith(UNUSABLE):
-        assumed = judge_rig(
-            record.rig, footprint(pose, record.rig.pinhole, record.rig.wall), record.occluder
-        )
-        wall = (
-            record.verdict,
-            record.advice.removesuffix("".join(f"; {problem}" for problem in assumed)),
-        )
+        view = footprint(pose, record.rig.pinhole, record.rig.wall)
+        earlier = "".join(f"; {one}" for one in judge_rig(record.rig, view, record.occluder))
+        verdict = record.verdict
+        advice = record.advice.removesuffix(earlier)
     else:
-        wall = range_verdict(record.distance_m, record.facing_deg)
-    verdict, advice = combined(
-        *wall, judge_rig(rig, footprint(pose, rig.pinhole, rig.wall), occluder)
-    )
-    if fit.doubt:
+        verdict, advice = range_verdict(record.distance_m, record.facing_deg)
+    problems = judge_rig(rig, footprint(pose, rig.pinhole, rig.wall), occluder)
+    verdict, advice = combined(verdict, advice, problems)
+    if fit.why_unusable:
         verdict = "doubtful"
-        advice = f"{UNUSABLE}: {fit.doubt}; remove the object and measure again"
+        advice = f"{UNUSABLE}: {fit.why_unusable}; remove the object and measure again"
     changed = {"occluder": occluder, "rig": rig, "verdict": verdict, "advice": advice}
     changed |= {"warnings": tuple(dict.fromkeys((*record.warnings, *fit.warnings)))}
     return WallRecord.model_validate(record.model_dump() | changed)
 
 
 def load_wall(path: Path) -> WallRecord:
-    """Read a `wall.toml` of this version or an older one. Raises RecordFileError with the first
-    problem.
-    """
+    """Read a `wall.toml`. Raises RecordFileError with the first problem."""
     return read_record(
         path, WallRecord, "wall record", "write one with `nlos-cam calibrate --wall`"
     )
@@ -210,6 +210,7 @@ def rig_named(name: str) -> Rig:
     """Return a packaged rig by name, or the rig of a file: a rig.toml, or the wall.toml that
     `calibrate` writes.
     """
+    # Only a wall record has a schema version; a rig's own file has none.
     path = Path(name)
     if path.is_file() and "schema_version" in path.read_text(encoding="utf-8", errors="replace"):
         return load_wall(path).rig
@@ -230,10 +231,10 @@ def load_measured(path: Path) -> MeasuredWall:
     do not match.
     """
     record = load_wall(path)
-    named = record.reference
-    return MeasuredWall(
-        record, load_reference(path.parent / named, record.reference_sha256) if named else None
-    )
+    if not record.reference:
+        return MeasuredWall(record, None)
+    reference = load_reference(path.parent / record.reference, record.reference_sha256)
+    return MeasuredWall(record, reference)
 
 
 def wall_points_m(record: WallRecord, reference: BareWall) -> Float64:
@@ -247,12 +248,11 @@ def points_m(record: WallRecord, depth_m: Float64, intrinsics: Intrinsics) -> Fl
     """Return depths (height, width) as points (height, width, 3) in the wall frame, range offset
     included.
     """
-    pose = wall_from_zero(record)
     # p = R (depth x ray) + t, with the offset added to the depth or, through the pose, to the
     # origin
-    return ((depth_m[..., np.newaxis] + depth_offset_m(record)) * intrinsics.rays()) @ pose[
-        :3, :3
-    ].T + pose[:3, 3]
+    pose = wall_from_zero(record)
+    true_m = depth_m[..., np.newaxis] + depth_offset_m(record)
+    return (true_m * intrinsics.rays()) @ pose[:3, :3].T + pose[:3, 3]
 
 
 def depth_offset_m(record: WallRecord) -> float:
@@ -266,6 +266,8 @@ def wall_from_zero(record: WallRecord) -> Float64:
     """Return the pose (4, 4) of the point where the beams meet, which an offset of the origin puts
     before the glass.
     """
+    # The record's pose is that of the glass. An offset of the origin puts the zero of depth that
+    # far along the optical axis, the third column; an offset of the depth leaves it in the glass.
     pose = np.array(record.wall_from_lidar)
     pose[:3, 3] += (record.range_offset_m - depth_offset_m(record)) * pose[:3, 2]
     return pose

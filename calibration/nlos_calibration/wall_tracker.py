@@ -67,6 +67,8 @@ def watched_pixels(reference: BareWall) -> NDArray[np.intp]:
     """Return flat indices of good pixels of the bare wall, in each cell of GRID the one nearest to
     its centre.
     """
+    # One pixel a cell spreads a few hundred over the view: as many as a pose needs, at 0.06 ms a
+    # frame.
     height, width = reference.depth_m.shape
     usual_m = noise_scale(reference) * depth_noise_m(reference.depth_m.astype(np.float64))
     steady = ~(reference.depth_std_m > NOISY * usual_m)  # NaN, the spread of a single frame, passes
@@ -135,6 +137,7 @@ class WallTrack:
             return None
         now_m = depth_m.take(self.pixels).astype(np.float64)
         returned = (now_m > 0.0) & (now_m < inf)
+        # A pixel without a return is put so far off that no gate holds it.
         off = np.divide(1.0, now_m, out=np.full(len(now_m), NOWHERE), where=returned)
         off = (off - self._inverse) * self._per_inverse_m
         errors, near = self._begin(off)
@@ -157,6 +160,9 @@ class WallTrack:
         """Return errors from the plane to start at (previous, reference or search) and which pixels
         count (1: all).
         """
+        # Three starts: the previous plane as a rule; the reference, where more of it is visible
+        # than of the previous plane; a search from the reference with a wide gate, after frames
+        # without a wall.
         if self._lost == PATIENCE:
             self._widened = WIDENED
             self._change = np.zeros(3)
@@ -201,6 +207,7 @@ class WallTrack:
         gain = weight * self._per_m
         longer = (now_m - self._depth_m) * self._per_m
         range_m = float(gain @ longer) / float(gain @ self._per_m)
+        # Both hypotheses are compared by the depths they leave unexplained, weighted alike.
         plane_m = 1.0 / (self._inverse + self._rows @ self._change / self._per_inverse_m)
         misfit = float(
             weight

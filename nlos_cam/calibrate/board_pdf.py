@@ -85,24 +85,19 @@ def black_cells(board: Board, left_mm: float, top_mm: float) -> Iterator[Rectang
     for row in range(board.squares_y):
         for column in range(row % 2, board.squares_x, 2):
             yield left_mm + column * side_mm, top_mm + row * side_mm, side_mm, side_mm
-    size = (
-        board.opencv_dictionary.markerSize + 2
-    )  # with the marker's black border; one pixel for each cell
-    for marker, corners_m in zip(
-        board.opencv_board.getIds(), board.opencv_board.getObjPoints(), strict=True
-    ):
-        cells = np.asarray(
-            cv2.aruco.generateImageMarker(board.opencv_dictionary, int(marker), size)
-        )
-        cell_mm = board.marker_mm / len(cells)
+
+    dictionary = board.opencv_dictionary
+    drawn = board.opencv_board
+    # one pixel for each cell, and one more on either side for the marker's black border
+    size = dictionary.markerSize + 2
+    cell_mm = board.marker_mm / size
+    for marker, corners_m in zip(drawn.getIds(), drawn.getObjPoints(), strict=True):
+        cells = np.asarray(cv2.aruco.generateImageMarker(dictionary, int(marker), size))
         x_mm, y_mm = np.asarray(corners_m)[0, :2] * 1e3
         for row, column in np.argwhere(cells == 0):
-            yield (
-                left_mm + float(x_mm) + column * cell_mm,
-                top_mm + float(y_mm) + row * cell_mm,
-                cell_mm,
-                cell_mm,
-            )
+            left = left_mm + float(x_mm) + column * cell_mm
+            top = top_mm + float(y_mm) + row * cell_mm
+            yield left, top, cell_mm, cell_mm
 
 
 def _patch(rectangles: list[Rectangle]) -> "PathPatch":

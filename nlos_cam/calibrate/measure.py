@@ -42,9 +42,9 @@ class CaptureStatistics:
 
     def facts(self) -> dict[str, object]:
         """Return the record's fields about the device."""
-        device = {"serial": self.serial, "firmware": self.firmware}
         return {
-            **device,
+            "serial": self.serial,
+            "firmware": self.firmware,
             "settings": dict(self.settings),
             "temperatures_c": self.statistics.celsius(),
         }
@@ -88,7 +88,8 @@ def collect_statistics(
         raise WallRefusedError(
             f"{camera.uri} gave no frames: record the wall again, or use a live camera"
         )
-    serial, firmware = (camera.identity.get(name, "") for name in ("serial", "firmware"))
+    serial = camera.identity.get("serial", "")
+    firmware = camera.identity.get("firmware", "")
     return CaptureStatistics(camera.uri, statistics, camera.intrinsics, serial, firmware, settings)
 
 
@@ -128,13 +129,11 @@ def measure_by_board(
     capture: CaptureStatistics,
     printed: walls.Board,
     square_mm: float | None,
-    color: walls.BoardView | None = None,
 ) -> tuple[walls.WallFit | walls.WallByBoard, dict[str, object]]:
     """Fit the wall to its depth, unless that is refused, and to a printed board; return the fit and
     the board's record.
 
-    The board is searched in the mean infrared, unless there is a `color` view of it. Raises
-    BoardRefusedError.
+    The board is searched in the mean infrared. Raises BoardRefusedError.
     """
     try:
         depth = measure_by_depth(capture)[0]
@@ -142,8 +141,9 @@ def measure_by_board(
         depth = error
     measured = square_mm is not None
     board = printed.measured(square_mm) if measured else printed
-    view = color or walls.BoardView(capture.statistics.ir_mean(), capture.intrinsics)
-    fit, record = walls.wall_with_board(depth, view, board, measured=measured)
+    fit, record = walls.wall_with_board(
+        depth, capture.statistics.ir_mean(), capture.intrinsics, board, measured=measured
+    )
     return fit, {"board": record}
 
 
@@ -168,12 +168,14 @@ def measure_occluder(
     depth_m = statistics.mean_m() + offset_m
     noise = statistics.noise()
     pose = walls.wall_from_zero(record)
-    stds = {
-        "distance_std_m": record.distance_std_m or 0.0,
-        "yaw_std_deg": record.yaw_std_deg or 0.0,
-    }
     found = walls.find_occluder(
-        depth_m, noise, capture.intrinsics, pose, np.random.default_rng(0), **stds
+        depth_m,
+        noise,
+        capture.intrinsics,
+        pose,
+        np.random.default_rng(0),
+        distance_std_m=record.distance_std_m,
+        yaw_std_deg=record.yaw_std_deg,
     )
     # the wall is fitted again beside the occluder: if the lidar moved, the occluder's place would
     # be wrong as well
@@ -184,15 +186,10 @@ def measure_occluder(
     _raise_if_moved(record, wall)
     found = replace(found, x_std_m=hypot(found.x_std_m, _edge_std_from_offset_m(record, found)))
     changes = walls.settings_changed(bare.reference, capture.settings) if bare.reference else ()
-    notes = (
-        [f"settings have changed since the bare wall was measured: {', '.join(changes)}"]
-        if changes
-        else []
-    )
-    return (
-        walls.with_occluder(record, replace(found, warnings=(*found.warnings, *notes))),
-        wall.inliers,
-    )
+    if changes:
+        note = f"settings have changed since the bare wall was measured: {', '.join(changes)}"
+        found = replace(found, warnings=(*found.warnings, note))
+    return walls.with_occluder(record, found), wall.inliers
 
 
 def _edge_std_from_offset_m(record: walls.WallRecord, found: walls.OccluderFit) -> float:
@@ -219,20 +216,15 @@ def _raise_if_moved(record: walls.WallRecord, wall: walls.WallFit) -> None:
     apart_m = wall.distance_m - record.distance_m
     yaw_deg = wall.yaw_deg - record.yaw_deg
     pitch_deg = wall.pitch_deg - record.pitch_deg
-    if (
-        max(
-            abs(apart_m) / walls.TOLERANCE_M,
-            abs(yaw_deg) / walls.TOLERANCE_DEG,
-            abs(pitch_deg) / walls.TOLERANCE_DEG,
-        )
-        > 1.0
-    ):
-        raise WallRefusedError(
-            "the lidar has moved since the bare wall was measured: the wall is"
-            f" {1e3 * abs(apart_m):.1f} mm {'farther' if apart_m > 0 else 'nearer'}, the lidar"
-            f" turned by {yaw_deg:+z.2f} degrees in yaw and {pitch_deg:+z.2f} in pitch: calibrate"
-            " the bare wall again, then put the occluder back"
-        )
+    turn_deg = max(abs(yaw_deg), abs(pitch_deg))
+    if abs(apart_m) <= walls.TOLERANCE_M and turn_deg <= walls.TOLERANCE_DEG:
+        return
+    raise WallRefusedError(
+        "the lidar has moved since the bare wall was measured: the wall is"
+        f" {1e3 * abs(apart_m):.1f} mm {'farther' if apart_m > 0 else 'nearer'}, the lidar turned"
+        f" by {yaw_deg:+z.2f} degrees in yaw and {pitch_deg:+z.2f} in pitch: calibrate the bare"
+        " wall again, then put the occluder back"
+    )
 
 
 MAX_FIT_COLUMNS = 160

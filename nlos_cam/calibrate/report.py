@@ -54,12 +54,12 @@ def range_bar(
     """
     low, high = allowed
     inside = low - tolerance <= value <= high + tolerance
-    left, right, at = (
-        BAR_MARGIN + BAR_WIDTH * each / end for each in (low, high, min(max(value, 0.0), end))
-    )
-    marker, state = (
-        ("inside", "inside") if inside else ("outside", "too small" if value < low else "too large")
-    )
+    shown = min(max(value, 0.0), end)
+    left, right, at = (BAR_MARGIN + BAR_WIDTH * each / end for each in (low, high, shown))
+    marker = "inside" if inside else "outside"
+    state = marker
+    if not inside:
+        state = "too small" if value < low else "too large"
     label = escape(f"{name}: {value:.1f} {unit}, {state} ({low:.0f} to {high:.0f} {unit})")
     ends = "".join(
         f"<text x='{x:.0f}' y='46' text-anchor='middle'>{each:.0f} {unit}</text>"
@@ -111,11 +111,9 @@ def _bar_in_cm(name: str, value_m: float, allowed_m: tuple[float, float], end_cm
 
 def measures(record: walls.WallRecord) -> str:
     """Return the measured quantities with the half width of each 95 % interval."""
-    hint = (
-        ""
-        if record.range_offset_std_m is not None
-        else "<p>Range offset not measured: give --tape-m.</p>"
-    )
+    hint = ""
+    if record.range_offset_std_m is None:
+        hint = "<p>Range offset not measured: give --tape-m.</p>"
     rows = table(walls.wall_facts(record), ("", "measured (± 95 %)", "meaning"))
     return f"<section><h2>What was measured</h2>{rows}{hint}</section>"
 
@@ -125,42 +123,39 @@ def board(record: walls.WallRecord) -> str:
     found = record.board
     if found is None:
         return ""
-    rows = [
-        (
-            "distance",
-            walls.with_mm(found.distance_m, found.distance_std_m),
-            walls.with_mm(record.distance_m, record.distance_std_m),
-        ),
-        *(
-            (
-                name,
-                *(
-                    walls.with_degrees(getattr(by, f"{key}_deg"), getattr(by, f"{key}_std_deg"))
-                    for by in (found, record)
-                ),
-            )
-            for name, key in (("facing angle", "facing"), ("yaw", "yaw"), ("pitch", "pitch"))
-        ),
-    ]
+    rows = list(zip(QUANTITIES, _quantities(found), _quantities(record), strict=True))
     used = {
         "both": "depth and board together",
         "depth": "the depth alone",
         "board": "the board alone",
     }[found.used]
+    size = "measured on the print" if found.measured else "as drawn, not measured on the print"
     printed = (
         f"{found.printed.squares_x} x {found.printed.squares_y} squares of"
         f" {found.printed.square_mm:.2f} mm"
     )
     facts = (
         f"{walls.board_agreement(found)} The record's plane is of {used}. {found.corners} corners"
-        f" of {printed}"
-        f" ({'measured on the print' if found.measured else 'as drawn, not measured on the print'}),"
+        f" of {printed} ({size}),"
         f" {found.residual_px:.2f} pixels RMS off; stretched by {100.0 * found.stretch:+z.2f} %,"
         f" bowed by {1e3 * found.bow_m:+z.2f} mm."
     )
     compared = table(rows, ("", "by the board (± 95 %)", "in the record"))
     causes = bullets("Possible causes", found.causes)
     return f"<section><h2>By a printed board</h2>{compared}<p>{escape(facts)}</p>{causes}</section>"
+
+
+QUANTITIES = ("distance", "facing angle", "yaw", "pitch")
+
+
+def _quantities(by: walls.BoardRecord | walls.WallRecord) -> tuple[str, ...]:
+    """Return QUANTITIES with their intervals."""
+    return (
+        walls.with_mm(by.distance_m, by.distance_std_m),
+        walls.with_degrees(by.facing_deg, by.facing_std_deg),
+        walls.with_degrees(by.yaw_deg, by.yaw_std_deg),
+        walls.with_degrees(by.pitch_deg, by.pitch_std_deg),
+    )
 
 
 def device(wall: walls.MeasuredWall) -> str:
@@ -175,10 +170,9 @@ def device(wall: walls.MeasuredWall) -> str:
         "firmware": record.firmware or "not known",
         "depth image": f"{pinhole.width} x {pinhole.height} pixels",
     }
-    celsius = {
-        name: f"{value:.1f} °C" + (f", changed by {span[name]:.1f}" if name in span else "")
-        for name, value in record.temperatures_c.items()
-    }
+    celsius = {name: f"{value:.1f} °C" for name, value in record.temperatures_c.items()}
+    for name in celsius.keys() & span.keys():
+        celsius[name] += f", changed by {span[name]:.1f}"
     settings = {name: f"{value:g}" for name, value in record.settings.items()}
     parts = [("Device", facts), ("Temperatures", celsius), ("Settings", settings)]
     tables = "".join(

@@ -12,6 +12,7 @@ from nlos_calibration import (
     MAP_SHAPE,
     Extent,
     ObjectBox,
+    Occluder,
     Rig,
     WallRecord,
     corner_rays,
@@ -64,9 +65,9 @@ def bench_picture(record: WallRecord) -> Picture:
     """Return the bench from above and from the side, both to one scale."""
     limits = drawn_limits(record.rig)
     wide, tall, deep = (high - low for low, high in limits)
-    figure = figure_of(
-        BENCH_WIDTH_IN, 0.86 * BENCH_WIDTH_IN * max(tall, deep) / (wide + deep) + 0.9
-    )
+    # both drawings side by side at one scale, with 14 % of the width and 0.9 inches for labels
+    height_in = 0.86 * BENCH_WIDTH_IN * max(tall, deep) / (wide + deep) + 0.9
+    figure = figure_of(BENCH_WIDTH_IN, height_in)
     above, beside = figure.subplots(1, 2, width_ratios=(wide, deep))
     for axis, side in ((above, ABOVE), (beside, BESIDE)):
         _draw(axis, side, record, limits)
@@ -131,16 +132,15 @@ def _draw(
     axis: "Axes", side: _Side, record: WallRecord, limits: tuple[Limits, Limits, Limits]
 ) -> None:
     rig = record.rig
-    axis.set(
-        xlim=limits[side.across], ylim=limits[side.up][:: -1 if side.turned else 1], aspect="equal"
-    )
-    axis.set(xlabel=NAMES[side.across], ylabel=NAMES[side.up])
+    low, high = limits[side.up]
+    axis.set(xlim=limits[side.across], ylim=(high, low) if side.turned else (low, high))
+    axis.set(xlabel=NAMES[side.across], ylabel=NAMES[side.up], aspect="equal")
     _view(axis, side, rig)
     _wall(axis, side)
     if rig.occluder is not None and side is ABOVE:
-        _occluder_from_above(axis, record, limits[Z][1])
+        _occluder_from_above(axis, record, rig.occluder, high)
     elif rig.occluder is not None:
-        _occluder_from_the_side(axis, record, limits[Y][1])
+        _occluder_from_the_side(axis, record, rig.occluder, high)
     if rig.object_box is not None:
         _object(axis, side, rig.object_box)
     place = rig.wall_from_lidar[:3, 3][[side.across, side.up]]
@@ -153,24 +153,25 @@ def _wall(axis: "Axes", side: _Side) -> None:
     from matplotlib.patches import Rectangle
 
     style: Style = {"facecolor": "0.85", "edgecolor": WALL, "hatch": "///", "linewidth": 1.5}
-    across = Rectangle((-FAR_M, -1.0), 2.0 * FAR_M, 1.0, **style)
-    axis.add_patch(
-        across if side is ABOVE else Rectangle((-1.0, -FAR_M), 1.0, 2.0 * FAR_M, **style)
-    )
+    if side is ABOVE:
+        axis.add_patch(Rectangle((-FAR_M, -1.0), 2.0 * FAR_M, 1.0, **style))
+    else:
+        axis.add_patch(Rectangle((-1.0, -FAR_M), 1.0, 2.0 * FAR_M, **style))
 
 
 def _view(axis: "Axes", side: _Side, rig: Rig) -> None:
     """Draw the field of view: corner rays, the area between them, the optical axis."""
     pose = rig.wall_from_lidar
     drawn = [side.across, side.up]
-    start, corners = pose[:3, 3], [start := pose[:3, 3]]
+    start = pose[:3, 3]
+    corners = [start]
     for edge in corner_rays(rig.pinhole) @ pose[:3, :3].T:
-        end = start + edge * min(start[Z] / -edge[Z] if edge[Z] < 0.0 else FAR_M, FAR_M)
-        corners += [
-            end,
-            end * np.array([1.0, 1.0, 0.0]),
-        ]  # and its foot on the wall, which rays over the wall cover
-        line = "-" if edge[Z] < 0.0 else "--"
+        meets_wall = edge[Z] < 0.0
+        length = min(start[Z] / -edge[Z], FAR_M) if meets_wall else FAR_M
+        end = start + edge * length
+        # with its foot on the wall: rays that end over the wall cover what is below them
+        corners += [end, end * np.array([1.0, 1.0, 0.0])]
+        line = "-" if meets_wall else "--"
         axis.plot(*np.stack([start, end])[:, drawn].T, color=EDGE, linewidth=1.0, linestyle=line)
     outline = cv2.convexHull(np.array(corners, np.float32)[:, drawn])[:, 0]
     axis.fill(*outline.T, color=VIEW, alpha=0.3, linewidth=0.0, zorder=0)
@@ -183,39 +184,27 @@ def _occluder_style(record: WallRecord) -> tuple[str, str]:
     return ("-", "occluder") if record.occluder is not None else ("--", "occluder (paper's)")
 
 
-def _occluder_from_above(axis: "Axes", record: WallRecord, low_m: float) -> None:
-    occluder = record.rig.occluder
+def _occluder_from_above(
+    axis: "Axes", record: WallRecord, occluder: Occluder, low_m: float
+) -> None:
     line, label = _occluder_style(record)
-    if occluder is None:
-        return
     lean = radians((record.occluder.tilt_deg if record.occluder else None) or 0.0)
     top = np.array([occluder.x_m, occluder.z_min_m])
     end = top + FAR_M * np.array([sin(lean), cos(lean)])
-    axis.plot(
-        *np.stack([top, end]).T,
-        color=OCCLUDER,
-        linewidth=4.0 if record.occluder else 2.0,
-        linestyle=line,
-    )
+    width = 4.0 if record.occluder else 2.0
+    axis.plot(*np.stack([top, end]).T, color=OCCLUDER, linewidth=width, linestyle=line)
     arrow: Style = {"arrowstyle": "<->", "color": OCCLUDER, "shrinkA": 0, "shrinkB": 0}
     axis.annotate("", (occluder.x_m, 0.0), xytext=tuple(top), arrowprops=arrow)
-    axis.text(
-        occluder.x_m + 0.01,
-        0.5 * occluder.z_min_m,
-        f"gap {occluder.z_min_m:.3f} m",
-        fontsize=9,
-        va="center",
-    )
-    axis.text(
-        occluder.x_m + 0.02, low_m - 0.01, label, fontsize=9, rotation=90, ha="left", va="bottom"
-    )
+    gap = f"gap {occluder.z_min_m:.3f} m"
+    axis.text(occluder.x_m + 0.01, 0.5 * occluder.z_min_m, gap, fontsize=9, va="center")
+    style: Style = {"fontsize": 9, "rotation": 90, "ha": "left", "va": "bottom"}
+    axis.text(occluder.x_m + 0.02, low_m - 0.01, label, **style)
 
 
-def _occluder_from_the_side(axis: "Axes", record: WallRecord, high_m: float) -> None:
-    occluder = record.rig.occluder
+def _occluder_from_the_side(
+    axis: "Axes", record: WallRecord, occluder: Occluder, high_m: float
+) -> None:
     line, label = _occluder_style(record)
-    if occluder is None:
-        return
     if record.occluder is not None:
         axis.axvspan(occluder.z_min_m, FAR_M, color=OCCLUDER, alpha=0.12, linewidth=0.0)
     axis.axvline(occluder.z_min_m, color=OCCLUDER, linewidth=1.5, linestyle=line)
@@ -233,29 +222,20 @@ def _object(axis: "Axes", side: _Side, box: ObjectBox) -> None:
     }
     left, right = spans[side.across]
     low, high = spans[side.up]
-    # from the side the box lies behind the lidar and the occluder: dashed, with its distance from
-    # the lidar's plane
-    behind = side is BESIDE
-    style: Style = {
-        "facecolor": to_rgba(OBJECT, 0.07 if behind else 0.2),
-        "edgecolor": OBJECT,
-        "linewidth": 1.5,
-    }
-    axis.add_patch(
-        Rectangle((left, low), right - left, high - low, linestyle="--" if behind else "-", **style)
-    )
-    style: Style = {
-        "ha": "right",
-        "va": "bottom" if side.turned else "top",
-        "color": "#8c3b00",
-        "fontsize": 9,
-    }
-    words = (
-        f"hidden object,\n{box.x_min_m:.2f} m to the\nside of the lidar"
-        if behind
-        else "hidden object"
-    )
-    axis.text(right - 0.008, high - 0.008, words, **style)
+    size = right - left, high - low
+    words = "hidden object"
+    line = "-"
+    opacity = 0.2
+    if side is BESIDE:
+        # the box lies behind the lidar and the occluder, at some distance from the lidar's plane
+        words += f",\n{box.x_min_m:.2f} m to the\nside of the lidar"
+        line = "--"
+        opacity = 0.07
+    fill = to_rgba(OBJECT, opacity)
+    outline: Style = {"facecolor": fill, "edgecolor": OBJECT, "linewidth": 1.5, "linestyle": line}
+    axis.add_patch(Rectangle((left, low), *size, **outline))
+    text: Style = {"ha": "right", "va": "bottom" if side.turned else "top", "fontsize": 9}
+    axis.text(right - 0.008, high - 0.008, words, color="#8c3b00", **text)
 
 
 def _dimension(axis: "Axes", record: WallRecord) -> None:
@@ -266,13 +246,14 @@ def _dimension(axis: "Axes", record: WallRecord) -> None:
 
     distance_m = record.rig.lidar.distance_m
     along = record.rig.wall_from_lidar[:3, 2]
+    to_right = along[X] >= 0.0
     arrow: Style = {"arrowstyle": "<->", "color": LIDAR, "shrinkA": 0, "shrinkB": 5}
     axis.annotate("", (0.0, 0.0), xytext=(0.0, distance_m), arrowprops=arrow)
     axis.plot(0.0, 0.0, marker="o", markersize=5, color=LIDAR)
-    inner, outer = ("left", "right") if along[X] >= 0.0 else ("right", "left")
+    inner, outer = ("left", "right") if to_right else ("right", "left")
     box = {"facecolor": "white", "alpha": 0.8, "pad": 1.0}
     style: Style = {"fontsize": 10, "color": LIDAR, "va": "center", "bbox": box}
-    aside_m = -0.012 if along[X] >= 0.0 else 0.012
+    aside_m = -0.012 if to_right else 0.012
     axis.text(aside_m, 0.4 * distance_m, f"{distance_m:.3f} m", ha=outer, **style)
     drawn_deg = degrees(atan2(along[X], -along[Z]))
     radius_m = 0.45 * distance_m
@@ -286,8 +267,10 @@ def _dimension(axis: "Axes", record: WallRecord) -> None:
 
 def _facing(record: WallRecord) -> str:
     """Return the facing angle, and the yaw, which the view from above shows, if it differs."""
-    same = abs(record.facing_deg - abs(record.yaw_deg)) <= 0.3
-    return f"{record.facing_deg:.1f}°" + ("" if same else f"\n(yaw {record.yaw_deg:+z.1f}°)")
+    facing = f"{record.facing_deg:.1f}°"
+    if abs(record.facing_deg - abs(record.yaw_deg)) <= 0.3:
+        return facing
+    return f"{facing}\n(yaw {record.yaw_deg:+z.1f}°)"
 
 
 RELAY = "#1b9e77"
@@ -304,45 +287,26 @@ def footprint_picture(record: WallRecord) -> Picture:
     """
     rig = record.rig
     x, y, _ = drawn_limits(rig)
-    figure = figure_of(
-        FOOTPRINT_WIDTH_IN, min(FOOTPRINT_WIDTH_IN * (y[1] - y[0]) / (x[1] - x[0]) + 1.0, 9.0)
-    )
+    height_in = FOOTPRINT_WIDTH_IN * (y[1] - y[0]) / (x[1] - x[0]) + 1.0
+    figure = figure_of(FOOTPRINT_WIDTH_IN, min(height_in, 9.0))
     axis = figure.add_subplot()
     axis.set(xlim=x, ylim=y, aspect="equal", xlabel=NAMES[X], ylabel=NAMES[Y], facecolor="0.93")
     _cells(axis, rig)
     if not rig.wall.contains(np.column_stack([x, y])).all():
         _rectangle(axis, rig.wall, WALL, "-", "edge of the wall")
-    _rectangle(
-        axis,
-        rig.relay,
-        RELAY,
-        "-",
-        "relay: the part of the wall that reflects light to and from the object",
-    )
+    relay = "relay: the part of the wall that reflects light to and from the object"
+    _rectangle(axis, rig.relay, RELAY, "-", relay)
     if rig.object_box is not None:
         _rectangle(axis, rig.object_box, OBJECT, "--", "hidden object's box, behind the occluder")
     if rig.occluder is not None:
-        style = "-" if record.occluder is not None else "--"
-        axis.axvline(
-            rig.occluder.x_m,
-            color=OCCLUDER,
-            linewidth=1.5,
-            linestyle=style,
-            label="occluder's edge",
-        )
+        edge: Style = {"color": OCCLUDER, "linewidth": 1.5, "label": "occluder's edge"}
+        axis.axvline(rig.occluder.x_m, linestyle=_occluder_style(record)[0], **edge)
     marked: Style = {"color": LIDAR, "linestyle": "none"}
-    axis.plot(
-        0.0,
-        0.0,
-        marker="+",
-        markersize=14,
-        label="foot of the perpendicular from the lidar",
-        **marked,
-    )
+    foot = "foot of the perpendicular from the lidar"
+    axis.plot(0.0, 0.0, marker="+", markersize=14, label=foot, **marked)
     meets = on_plane(rig.wall_from_lidar, np.array([0.0, 0.0, 1.0]))
-    axis.plot(
-        *meets, marker="x", markersize=10, label="where the optical axis meets the wall", **marked
-    )
+    spot = "where the optical axis meets the wall"
+    axis.plot(*meets, marker="x", markersize=10, label=spot, **marked)
     figure.legend(loc="outside lower center", ncols=2, fontsize=9, frameon=False)
     share = footprint(rig.wall_from_lidar, rig.pinhole, rig.wall).share
     caption = (
@@ -363,15 +327,11 @@ def _cells(axis: "Axes", rig: Rig) -> None:
     y = (np.arange(0, rows + 1, CELLS_PER_LINE) - 0.5 - cells.ppy) / cells.fy
     rays = np.stack([*np.meshgrid(x, y), np.ones((len(y), len(x)))], axis=-1, dtype=np.float64)
     at_m = on_plane(rig.wall_from_lidar, rays)
-    quads = np.stack([at_m[:-1, :-1], at_m[:-1, 1:], at_m[1:, 1:], at_m[1:, :-1]], axis=2).reshape(
-        -1, 4, 2
-    )
+    quads = np.stack([at_m[:-1, :-1], at_m[:-1, 1:], at_m[1:, 1:], at_m[1:, :-1]], axis=2)
+    quads = quads.reshape(-1, 4, 2)
     visible = quads[np.abs(quads).max(axis=(1, 2)) < MAX_CELL_M]  # False for NaN
-    axis.add_collection(
-        PolyCollection(
-            list(visible), facecolor=VISIBLE, edgecolor=VISIBLE_EDGE, linewidth=0.6, alpha=0.8
-        )
-    )
+    style: Style = {"facecolor": VISIBLE, "edgecolor": VISIBLE_EDGE, "linewidth": 0.6}
+    axis.add_collection(PolyCollection(list(visible), alpha=0.8, **style))
 
 
 def _rectangle(axis: "Axes", extent: Extent, color: str, line: str, label: str) -> None:
@@ -380,11 +340,5 @@ def _rectangle(axis: "Axes", extent: Extent, color: str, line: str, label: str) 
 
     size = extent.x_max_m - extent.x_min_m, extent.y_max_m - extent.y_min_m
     fill = to_rgba(color, 0.15 if line == "--" else 0.0)
-    style: Style = {
-        "edgecolor": color,
-        "facecolor": fill,
-        "linestyle": line,
-        "linewidth": 1.8,
-        "label": label,
-    }
-    axis.add_patch(Rectangle((extent.x_min_m, extent.y_min_m), *size, **style))
+    style: Style = {"edgecolor": color, "facecolor": fill, "linestyle": line, "linewidth": 1.8}
+    axis.add_patch(Rectangle((extent.x_min_m, extent.y_min_m), *size, label=label, **style))

@@ -47,9 +47,8 @@ def expected_std_m(record: WallRecord, reference: BareWall) -> Float64:
     """
     scale = 1.0 if record.noise_scale is None else record.noise_scale
     noise = MeanNoise(np.array([float(reference.frames)]), scale)
-    return noise.of(reference.depth_m.astype(np.float64)) * np.abs(
-        reference.intrinsics.rays() @ np.array(record.wall_from_lidar)[2, :3]
-    )
+    along = reference.intrinsics.rays() @ np.array(record.wall_from_lidar)[2, :3]
+    return noise.of(reference.depth_m.astype(np.float64)) * np.abs(along)
 
 
 def block_side(columns: int) -> int:
@@ -61,12 +60,9 @@ def in_blocks(values: NDArray[np.floating], side: int) -> Float64:
     """Return means over blocks of side x side pixels without NaN; NaN for a block of NaN only."""
     known = np.isfinite(values)
     count = _sums(known.astype(np.float64), side)
-    return np.divide(
-        _sums(np.where(known, values, 0.0), side),
-        count,
-        out=np.full(count.shape, np.nan),
-        where=count > 0.0,
-    )
+    total = _sums(np.where(known, values, 0.0), side)
+    nothing = np.full(count.shape, np.nan)
+    return np.divide(total, count, out=nothing, where=count > 0.0)
 
 
 def block_majority(mask: NDArray[np.bool_], side: int) -> NDArray[np.bool_]:
@@ -120,13 +116,8 @@ def _residuals(record: WallRecord, reference: BareWall) -> Picture:
     limit_mm = max(_limit(np.abs(in_blocks(drawn, side))), MIN_RESIDUAL_MM)
     figure = figure_of(8.6, 5.4)
     axis = figure.add_subplot()
-    scale: dict[str, Any] = {
-        "extend": "both",
-        "cmap": "RdBu_r",
-        "vmin": -limit_mm,
-        "vmax": limit_mm,
-    }
-    _map(axis, drawn, "mm behind the plane (negative: in front)", **scale)
+    label = "mm behind the plane (negative: in front)"
+    _map(axis, drawn, label, extend="both", cmap="RdBu_r", vmin=-limit_mm, vmax=limit_mm)
     _shade(axis, stray, ~known)
     axis.set_title("distance of the mean depth from the plane, normal to the wall", fontsize=10)
     shares = (
@@ -161,19 +152,11 @@ def _spread(record: WallRecord, reference: BareWall) -> Picture:
     normal = np.exp(-0.5 * (at_mm / some_mm) ** 2) / (np.sqrt(2.0 * np.pi) * some_mm)
     figure = figure_of(8.6, 3.4)
     axis = figure.add_subplot()
-    axis.hist(
-        off_mm,
-        bins=80,
-        range=(-reach_mm, reach_mm),
-        density=True,
-        color="#9ecae1",
-        label="measured",
-    )
+    ends_mm = -reach_mm, reach_mm
+    axis.hist(off_mm, bins=80, range=ends_mm, density=True, color="#9ecae1", label="measured")
     axis.plot(at_mm, normal.mean(axis=0), color="#b2182b", label="expected from the lidar's noise")
     axis.axvline(0.0, color="0.4", linewidth=0.8)
-    axis.set(
-        xlabel="mm behind the plane", ylabel="share of pixels per mm", xlim=(-reach_mm, reach_mm)
-    )
+    axis.set(xlabel="mm behind the plane", ylabel="share of pixels per mm", xlim=ends_mm)
     axis.legend(frameon=False)
     caption = (
         f"The pixels that the plane rests on are {rms_mm:.3f} mm RMS off it; noise, averaged over"
@@ -196,22 +179,18 @@ def _noise(reference: BareWall) -> Picture:
     _shade(left, np.zeros_like(reference.inliers), ~np.isfinite(std_m))
     left.set_title("noise of one depth sample (standard deviation)", fontsize=10)
     times = np.log2(np.maximum(ratio, 2.0**-9))
-    bar = _map(
-        right, times, "times the nominal noise", extend="both", cmap="PuOr_r", vmin=-2.0, vmax=2.0
-    )
+    label = "times the nominal noise"
+    bar = _map(right, times, label, extend="both", cmap="PuOr_r", vmin=-2.0, vmax=2.0)
     bar.set_ticks([-2.0, -1.0, 0.0, 1.0, 2.0], labels=["¼", "½", "1", "2", "4"])
     _shade(right, np.zeros_like(reference.inliers), ~np.isfinite(ratio))
     right.set_title("against 0.5 mm + 2 mm per metre, the nominal", fontsize=10)
-    typical = (
-        ""
-        if not np.isfinite(ratio).any()
-        else f" Typical here: {np.nanmedian(ratio):.2f} times the nominal."
-    )
     caption = (
         "Left: standard deviation of one pixel's depth from frame to frame. Right: white is as"
         " expected, orange is noisier (weak returns, a cold lidar, light from elsewhere)."
     )
-    return Picture(title, caption + typical, png(figure))
+    if np.isfinite(ratio).any():
+        caption += f" Typical here: {np.nanmedian(ratio):.2f} times the nominal."
+    return Picture(title, caption, png(figure))
 
 
 def _infrared(reference: BareWall) -> Picture:
@@ -221,16 +200,18 @@ def _infrared(reference: BareWall) -> Picture:
     if not np.isfinite(ir).any():
         return Picture(title, "There is no infrared image.")
     saturated = share > 0.0
+    high = min(_limit(ir), float(FULL_SCALE))
+    gray: dict[str, Any] = {"levels": 3 * LEVELS, "cmap": "gray", "vmin": 0.0, "vmax": high}
     figure = figure_of(11.0, 3.9) if saturated.any() else figure_of(6.2, 4.0)
     axes = figure.subplots(1, 2 if saturated.any() else 1, squeeze=False)[0]
-    high = min(_limit(ir), float(FULL_SCALE))
-    _map(axes[0], ir, "IR counts of 255", levels=3 * LEVELS, cmap="gray", vmin=0.0, vmax=high)
+    _map(axes[0], ir, "IR counts of 255", **gray)
     axes[0].set_title("mean infrared image", fontsize=10)
     if not saturated.any():
         caption = (
             f"No pixel is saturated: the brightest is {np.nanmax(ir):.0f} of 255 counts on average."
         )
         return Picture(title, caption, png(figure))
+
     _map(axes[1], share, "% of the frames", cmap="magma", vmin=0.0, vmax=100.0)
     axes[1].set_title("saturated: at full scale", fontsize=10)
     caption = (
@@ -276,10 +257,12 @@ def _shade(axis: "Axes", stray: NDArray[np.bool_], absent: NDArray[np.bool_]) ->
     paint[stray_blocks & ((rows + columns) // STRIPE_BLOCKS % 2 == 0)] = STRIPE
     paint[absent_blocks] = NO_RETURN
     axis.imshow(paint, extent=(-0.5, width - 0.5, height - 0.5, -0.5), interpolation="nearest")
-    entries = [
-        Patch(facecolor=STRAY, edgecolor=STRIPE, hatch="///", label="left out of the plane")
-    ] * bool(stray.any())
-    entries += [Patch(facecolor=NO_RETURN, edgecolor="0.6", label="no return")] * bool(absent.any())
+    entries: list[Patch] = []
+    if stray.any():
+        label = "left out of the plane"
+        entries.append(Patch(facecolor=STRAY, edgecolor=STRIPE, hatch="///", label=label))
+    if absent.any():
+        entries.append(Patch(facecolor=NO_RETURN, edgecolor="0.6", label="no return"))
     if entries:
         axis.legend(handles=entries, loc="lower right", fontsize=8, framealpha=0.95)
 
@@ -287,7 +270,9 @@ def _shade(axis: "Axes", stray: NDArray[np.bool_], absent: NDArray[np.bool_]) ->
 def _percent(mask: NDArray[np.bool_]) -> str:
     """Return a share as text; a few pixels are not rounded to none."""
     share = 100.0 * float(mask.mean())
-    return "none" if share == 0.0 else "less than 0.1 %" if share < 0.1 else f"{share:.1f} %"
+    if share == 0.0:
+        return "none"
+    return "less than 0.1 %" if share < 0.1 else f"{share:.1f} %"
 
 
 def _limit(values: Float64) -> float:

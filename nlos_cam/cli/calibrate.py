@@ -35,7 +35,6 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 Paper = Literal["a4", "a3", "letter"]
-Light = Literal["infrared", "colour"]
 EVERY = 3
 """Frames between two updates of the display, of 30 a second."""
 GAUGE_WIDTH = 31
@@ -46,25 +45,21 @@ def format_result(record: walls.WallRecord, files: bench.WallFiles) -> str:
     Rich's markup.
     """
     rows = walls.wall_facts(record)
-    wide, wider = (max(len(row[column]) for row in rows) for column in (0, 1))
+    name_width = max(len(name) for name, _, _ in rows)
+    value_width = max(len(value) for _, value, _ in rows)
     lines = [
-        f"{name:{wide}}  {value:{wider}}  [dim]{escape(meaning)}[/]"
+        f"{name:{name_width}}  {value:{value_width}}  [dim]{escape(meaning)}[/]"
         for name, value, meaning in rows
     ]
     advice = record.advice[:1].upper() + record.advice[1:]
     lines.append(f"[bold {_color(record.verdict)}]Verdict: {record.verdict}.[/] {escape(advice)}.")
     lines += [f"Note: {escape(warning)}" for warning in record.warnings]
-    written = [
-        str(files.record),
-        *([files.reference.name] if record.reference else []),
-        files.report.name,
-    ]
-    return "\n".join(
-        [
-            *lines,
-            f"Wrote {escape(', '.join(written))}: open {escape(files.report.name)} for the report",
-        ]
-    )
+    written = [str(files.record), files.report.name]
+    if record.reference:
+        written.insert(1, files.reference.name)
+    report = escape(files.report.name)
+    lines.append(f"Wrote {escape(', '.join(written))}: open {report} for the report")
+    return "\n".join(lines)
 
 
 def _color(verdict: str) -> str:
@@ -109,14 +104,10 @@ def panel(found: bench.FrameFit) -> Table:
         table.add_row("wall", f"[yellow]not measured:[/] {escape(found.refusal)}")
     else:
         fit = found.fit
-        table.add_row(
-            "distance",
-            f"{1e3 * fit.distance_m:.1f} mm",
-            gauge(fit.distance_m, *walls.DISTANCE_RANGE_M),
-        )
-        table.add_row(
-            "facing", f"{fit.facing_deg:.2f}°", gauge(fit.facing_deg, *walls.FACING_RANGE_DEG)
-        )
+        distance = gauge(fit.distance_m, *walls.DISTANCE_RANGE_M)
+        facing = gauge(fit.facing_deg, *walls.FACING_RANGE_DEG)
+        table.add_row("distance", f"{1e3 * fit.distance_m:.1f} mm", distance)
+        table.add_row("facing", f"{fit.facing_deg:.2f}°", facing)
         table.add_row("yaw, pitch", f"{fit.yaw_deg:+z.2f}°, {fit.pitch_deg:+z.2f}°")
         table.add_row("verdict", f"[{_color(fit.verdict)}]{fit.verdict}[/]", fit.advice)
     if found.saturated > MAX_SATURATED:
@@ -132,7 +123,11 @@ def gauge(value: float, low: float, high: float) -> str:
     """
     share = (value - low) / (high - low)
     place = round(min(max(share, 0.0), 1.0) * (GAUGE_WIDTH - 1))
-    mark = "◀" if share < 0 else "▶" if share > 1 else "●"
+    mark = "●"
+    if share < 0:
+        mark = "◀"
+    elif share > 1:
+        mark = "▶"
     return f"{low:g} {'─' * place}{mark}{'─' * (GAUGE_WIDTH - 1 - place)} {high:g}"
 
 
@@ -163,12 +158,6 @@ Tape = Annotated[
 ]
 ByBoard = Annotated[
     bool, typer.Option("--board", help="Also find a printed board (`nlos-cam board`).")
-]
-BoardIn = Annotated[
-    Light,
-    typer.Option(
-        "--board-in", help="Image to find the board in; colour needs an L515, or a recording of it."
-    ),
 ]
 OnPaper = Annotated[
     Paper | None, typer.Option("--paper", help="Paper of the printed board (default: a4).")
@@ -231,7 +220,6 @@ def calibrate(
     watch: Watch = False,
     tape_m: Tape = None,
     board: ByBoard = False,
-    board_in: BoardIn = "infrared",
     paper: OnPaper = None,
     square_mm: SquareMm = None,
     occluder_x_m: OccluderX = None,
@@ -248,8 +236,8 @@ def calibrate(
     new reference, with no object hidden.
     """
     uri = _source(camera, bag, wall=wall, occluder=occluder)
-    if not board and (paper or square_mm or board_in == "colour"):
-        raise typer.BadParameter("--paper, --square-mm and --board-in need --board")
+    if not board and (paper or square_mm):
+        raise typer.BadParameter("--paper and --square-mm need --board")
     if board and tape_m is not None:
         raise typer.BadParameter(
             "give one of --tape-m and --board: each measures the lidar's range offset"
@@ -278,17 +266,13 @@ def calibrate(
             last = watch_wall(source, until_enter())
         if last is not None:
             stderr.print(panel(last))
-    # the color camera first: it runs alone, then the lidar has the link to itself
-    color = _capture_color(uri, frames) if board_in == "colour" else None
     capture = _capture(uri, frames)
     inliers: NDArray[np.bool_] | None
     if bare:
         record, inliers = bench.measure_occluder(capture, bare)
     else:
         if board:
-            fit, facts = bench.measure_by_board(
-                capture, walls.BOARDS[paper or "a4"], square_mm, color
-            )
+            fit, facts = bench.measure_by_board(capture, walls.BOARDS[paper or "a4"], square_mm)
         else:
             fit, facts = bench.measure_by_depth(capture, tape_m)
         record = capture.record(fit, facts, by_hand)
@@ -336,12 +320,6 @@ def _capture(uri: str, frames: int) -> bench.CaptureStatistics:
     with _opened(uri) as source, progress() as bar:
         task = bar.add_task("Measuring the wall", total=frames)
         return bench.collect_statistics(source, frames, lambda: bar.advance(task))
-
-
-def _capture_color(uri: str, frames: int) -> walls.BoardView:
-    with progress() as bar:
-        task = bar.add_task("Averaging colour frames", total=frames)
-        return bench.capture_color_view(uri, frames, on_frame=lambda: bar.advance(task))
 
 
 SheetOut = Annotated[Path | None, typer.Option("--out", help="PDF to write.")]

@@ -103,16 +103,12 @@ def video_driver(facts: Facts) -> Finding:
     cameras = [camera for camera in facts.host.cameras if LIDARS[camera.product_id][0] == "camera"]
     if bare := [camera.port for camera in cameras if not camera.video_nodes]:
         state = facts.host.modules.get("uvcvideo", "unknown")
-        fix = (
-            "install a kernel with CONFIG_USB_VIDEO_CLASS"
-            if state == "missing"
-            else "sudo modprobe uvcvideo"
-        )
+        fix = "sudo modprobe uvcvideo"
+        if state == "missing":
+            fix = "install a kernel with CONFIG_USB_VIDEO_CLASS"
         return failed(f"the L515 at {', '.join(bare)} has no /dev/video* (uvcvideo: {state})", fix)
-    return ok(
-        ", ".join(node for camera in cameras for node in camera.video_nodes)
-        or "none is needed in recovery mode"
-    )
+    nodes = [node for camera in cameras for node in camera.video_nodes]
+    return ok(", ".join(nodes) or "none is needed in recovery mode")
 
 
 def hid_sensors(facts: Facts) -> Finding:
@@ -297,9 +293,8 @@ def _load_fix(error: str, on: str) -> str:
         )
     for library, package in SYSTEM_LIBRARIES.items():
         if library in error:
-            return f"sudo apt install {package}" + (
-                ", or `pip install libusb-package`" if "usb" in library else ""
-            )
+            fix = f"sudo apt install {package}"
+            return f"{fix}, or `pip install libusb-package`" if "usb" in library else fix
     return f"pip install {_wheel(on)} libusb-package"
 
 
@@ -341,23 +336,18 @@ def sdk_alone(facts: Facts) -> Finding:
             f"{packages} are installed into one folder, and overwrite each other",
             f"pip uninstall -y {names} && pip install {_wheel(facts.host.platform.system)}",
         )
-    return (
-        ok(f"only {packages}") if packages else skipped("no package of librealsense is installed")
-    )
+    if not packages:
+        return skipped("no package of librealsense is installed")
+    return ok(f"only {packages}")
 
 
 def libusb(facts: Facts) -> Finding:
     """Check that USB devices can be listed without librealsense."""
     if facts.usb.error:
-        return failed(
-            f"cannot list USB devices: {facts.usb.error}",
-            "pip install pyusb libusb-package"
-            + (
-                ", or `sudo apt install libusb-1.0-0`"
-                if facts.host.platform.system == "linux"
-                else ""
-            ),
-        )
+        fix = "pip install pyusb libusb-package"
+        if facts.host.platform.system == "linux":
+            fix += ", or `sudo apt install libusb-1.0-0`"
+        return failed(f"cannot list USB devices: {facts.usb.error}", fix)
     return ok(f"{facts.usb.total} USB devices are listed")
 
 
@@ -379,13 +369,10 @@ def usb_camera(facts: Facts) -> Finding:
         return ok(", ".join(f"{device.label} ({device.id}, {device.link})" for device in here))
     if kernel := facts.host.cameras:
         ports = ", ".join(camera.port for camera in kernel)
-        fix = (
-            CONTAINER_FIX
-            if facts.host.container
-            else "unplug the camera and plug it in again: udev then makes its node"
-        )
+        fix = "unplug the camera and plug it in again: udev then makes its node"
         return failed(
-            f"the kernel sees an L515 at {ports}, but /dev/bus/usb does not show it here", fix
+            f"the kernel sees an L515 at {ports}, but /dev/bus/usb does not show it here",
+            CONTAINER_FIX if facts.host.container else fix,
         )
     if facts.sdk.lidars:
         return warning(

@@ -17,8 +17,15 @@ REPLUG_WINDOWS = (
     " of a vendor"
 )
 CAUSES = (
-    *("sdk-version", "sdk-alone", "system", "container", "permissions"),
-    *("video-driver", "hid-sensors", "in-use", "firmware"),
+    "sdk-version",
+    "sdk-alone",
+    "system",
+    "container",
+    "permissions",
+    "video-driver",
+    "hid-sensors",
+    "in-use",
+    "firmware",
 )
 """Checks whose failure can hide a camera from librealsense that USB shows, the likeliest cause
 first.
@@ -54,30 +61,24 @@ def _hidden(facts: Facts, cameras: str) -> Finding:
 
 
 IN_ORDER: tuple[Callable[[Facts], Finding], ...] = (
-    *(
-        checks.python,
-        checks.system,
-        checks.sdk,
-        checks.sdk_version,
-        checks.sdk_alone,
-        checks.libusb,
-    ),
-    *(
-        checks.usb_camera,
-        checks.recovery,
-        checks.link,
-        checks.container,
-        checks.udev_rules,
-        checks.permissions,
-    ),
-    *(
-        checks.video_driver,
-        checks.hid_sensors,
-        checks.in_use,
-        sdk_camera,
-        checks.firmware,
-        checks.metadata,
-    ),
+    checks.python,
+    checks.system,
+    checks.sdk,
+    checks.sdk_version,
+    checks.sdk_alone,
+    checks.libusb,
+    checks.usb_camera,
+    checks.recovery,
+    checks.link,
+    checks.container,
+    checks.udev_rules,
+    checks.permissions,
+    checks.video_driver,
+    checks.hid_sensors,
+    checks.in_use,
+    sdk_camera,
+    checks.firmware,
+    checks.metadata,
 )
 CHECKS = {check.__name__.replace("_", "-"): check for check in IN_ORDER}
 """Every check by its name, in the order of the output."""

@@ -62,29 +62,37 @@ class Pair:
     @property
     def name(self) -> str:
         """Product name by the SDK, or else by its USB id."""
-        return self.sdk.name if self.sdk else self.usb.meaning if self.usb else ""
+        if self.sdk:
+            return self.sdk.name
+        return self.usb.meaning if self.usb else ""
 
     @property
     def serial(self) -> str:
         """Serial number as the SDK writes it; empty if unknown."""
-        return self.sdk.serial if self.sdk else self.usb.serial if self.usb else ""
+        if self.sdk:
+            return self.sdk.serial
+        return self.usb.serial if self.usb else ""
 
     @property
     def firmware(self) -> str:
         """Firmware: four numbers from the SDK, or three of them from USB."""
-        return (self.sdk and self.sdk.firmware) or (self.usb.firmware if self.usb else "")
+        if self.sdk and self.sdk.firmware:
+            return self.sdk.firmware
+        return self.usb.firmware if self.usb else ""
 
     @property
     def link(self) -> str:
         """Speed of the link, or version of USB."""
-        return self.usb.link if self.usb else f"USB {self.sdk.usb_type}" if self.sdk else ""
+        if self.usb:
+            return self.usb.link
+        return f"USB {self.sdk.usb_type}" if self.sdk else ""
 
     @property
     def is_slow(self) -> bool:
         """True for a link of USB 2 or less."""
-        return (
-            self.usb.is_slow if self.usb else bool(self.sdk and self.sdk.usb_type.startswith("2"))
-        )
+        if self.usb:
+            return self.usb.is_slow
+        return self.sdk is not None and self.sdk.usb_type.startswith("2")
 
 
 @dataclass(frozen=True)
@@ -103,7 +111,10 @@ class Facts:
 
 def gather_facts() -> Facts:
     """Return the facts of this machine; never raises."""
-    return Facts(read_host(), scan_usb(), query_sdk())  # the SDK last: it opens nodes of its own
+    host = read_host()
+    usb = scan_usb()
+    # The SDK last: it opens device nodes of its own, which the host's check would find held.
+    return Facts(host, usb, query_sdk())
 
 
 def query_sdk(
@@ -116,17 +127,14 @@ def query_sdk(
     try:
         sdk = load()
     except CameraError as error:
-        return Sdk(
-            packages, load_error=str(error.__cause__ or error)
-        )  # the cause alone: the check adds the fix
+        # The cause alone: the check adds the fix.
+        return Sdk(packages, load_error=str(error.__cause__ or error))
     try:
-        return Sdk(packages, devices=tuple(info for _, info in connected(sdk, shared_context(sdk))))
-    except (
-        CameraError,
-        RuntimeError,
-        AttributeError,
-    ) as error:  # AttributeError: a folder shadows the wheel
+        found = connected(sdk, shared_context(sdk))
+    except (CameraError, RuntimeError, AttributeError) as error:
+        # AttributeError: a folder called pyrealsense2 shadows the wheel.
         return Sdk(packages, query_error=str(error))
+    return Sdk(packages, devices=tuple(info for _, info in found))
 
 
 def match_devices(usb: Sequence[UsbDevice], sdk: Sequence[DeviceInfo]) -> list[Pair]:
@@ -139,14 +147,10 @@ def match_devices(usb: Sequence[UsbDevice], sdk: Sequence[DeviceInfo]) -> list[P
     nameless = [device for device in usb if not device.serial]
     unmatched = [info for serial, info in listed.items() if serial not in known]
     if len(nameless) == len(unmatched):
-        return matched + [
-            Pair(device, info) for device, info in zip(nameless, unmatched, strict=True)
-        ]
-    return (
-        matched
-        + [Pair(device, None) for device in nameless]
-        + [Pair(None, info) for info in unmatched]
-    )
+        return matched + list(map(Pair, nameless, unmatched))
+    usb_only = [Pair(device, None) for device in nameless]
+    sdk_only = [Pair(None, info) for info in unmatched]
+    return matched + usb_only + sdk_only
 
 
 Status = Literal["ok", "warning", "failed", "skipped"]

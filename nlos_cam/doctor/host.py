@@ -291,18 +291,14 @@ def _container(root: Path) -> str:
         return "docker"
     if path_exists(root / "run/.containerenv"):
         return "podman"
-    environment = read_text(root / "proc/1/environ").split("\0")
-    named = [
-        value
-        for name, _, value in (entry.partition("=") for entry in environment)
-        if name == "container"
-    ]
+    for entry in read_text(root / "proc/1/environ").split("\0"):
+        name, _, value = entry.partition("=")
+        if name == "container" and value:
+            return value
+    if named := read_text(root / "run/systemd/container"):
+        return named
     groups = read_text(root / "proc/1/cgroup")
-    named += [
-        read_text(root / "run/systemd/container"),
-        *(name for word, name in CONTAINERS.items() if word in groups),
-    ]
-    return next((name for name in named if name), "")
+    return next((name for word, name in CONTAINERS.items() if word in groups), "")
 
 
 def _modules(root: Path) -> dict[str, str]:
@@ -322,10 +318,10 @@ def _state(name: str, loaded: set[str], lists: Mapping[str, str], shown: Path) -
     if name in loaded or path_exists(shown):
         return "loaded"
     files = (f"/{name}.ko", f"/{name.replace('_', '-')}.ko")
-    found = next(
-        (state for state, listed in lists.items() if any(file in listed for file in files)), ""
-    )
-    return found or ("missing" if any(lists.values()) else "unknown")
+    for state, listed in lists.items():
+        if any(file in listed for file in files):
+            return state
+    return "missing" if any(lists.values()) else "unknown"
 
 
 def _rules(root: Path) -> tuple[str, ...]:

@@ -93,16 +93,11 @@ def scan_usb(backend: Any = None, root: Path = Path("/")) -> UsbScan:
         import libusb_package
         import usb.core
 
-        devices: Any = usb.core.find(
-            find_all=True, backend=backend or libusb_package.get_libusb1_backend()
-        )
+        backend = backend or libusb_package.get_libusb1_backend()
+        devices: Any = usb.core.find(find_all=True, backend=backend)
         found = list(devices)
-    except (
-        ImportError,
-        OSError,
-        ValueError,
-        NotImplementedError,
-    ) as error:  # no pyusb, no libusb, no USB
+    except (ImportError, OSError, ValueError, NotImplementedError) as error:
+        # no pyusb, no libusb, or no USB
         return UsbScan(error=str(error) or type(error).__name__)
     known = [
         device
@@ -113,15 +108,16 @@ def scan_usb(backend: Any = None, root: Path = Path("/")) -> UsbScan:
 
 
 def _describe(device: Any, root: Path) -> UsbDevice:
-    kind, meaning = LIDARS.get(device.idProduct) or (
-        "other",
-        f"RealSense {OTHERS[device.idProduct]}",
-    )
-    port = (
-        f"{device.bus}-{'.'.join(map(str, device.port_numbers))}" if device.port_numbers else ""
-    )  # as 2-1.4
+    other: tuple[Kind, str] = ("other", f"RealSense {OTHERS.get(device.idProduct)}")
+    kind, meaning = LIDARS.get(device.idProduct, other)
     serial, product, error = _strings(device)
-    kernel = root / "sys/bus/usb/devices" / port
+    port = ""
+    if device.port_numbers:
+        port = f"{device.bus}-{'.'.join(map(str, device.port_numbers))}"  # as 2-1.4
+        # The kernel has read the strings when the camera was plugged in, whatever this user may.
+        kernel = root / "sys/bus/usb/devices" / port
+        serial = serial or read_text(kernel / "serial")
+        product = product or read_text(kernel / "product")
     return UsbDevice(
         product_id=device.idProduct,
         kind=kind,
@@ -132,8 +128,8 @@ def _describe(device: Any, root: Path) -> UsbDevice:
         bcd_usb=device.bcdUSB,
         speed=device.speed,
         firmware=firmware_of(device.bcdDevice) if device.idProduct in LIDARS else "",
-        serial=sdk_serial(serial or read_text(kernel / "serial")) if port else sdk_serial(serial),
-        product=product or (read_text(kernel / "product") if port else ""),
+        serial=sdk_serial(serial),
+        product=product,
         interfaces=_interfaces(device),
         error=str(error) if error else "",
         denied=isinstance(error, OSError) and error.errno in {errno.EACCES, errno.EPERM},
@@ -147,9 +143,8 @@ def _strings(device: Any) -> tuple[str, str, Exception | None]:
     import usb.util
 
     try:
-        languages = usb.util.get_langids(
-            device
-        )  # not device.langids, which hides a missing permission
+        # not device.langids, which hides a missing permission
+        languages = usb.util.get_langids(device)
         if not languages:
             return "", "", None
         indices = (device.iSerialNumber, device.iProduct)
@@ -184,9 +179,9 @@ def firmware_of(bcd_device: int) -> str:
     version is not encoded.
     """
     major, second, minor, patch = (bcd_device >> shift & 0xF for shift in (12, 8, 4, 0))
-    return (
-        "" if second or major == 0 or max(major, minor, patch) > 9 else f"{major}.{minor}.{patch}"
-    )
+    if second or major == 0 or max(major, minor, patch) > 9:
+        return ""
+    return f"{major}.{minor}.{patch}"
 
 
 def sdk_serial(serial: str) -> str:

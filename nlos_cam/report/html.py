@@ -15,35 +15,42 @@ if TYPE_CHECKING:
 DPI = 100
 WIDE_PIXELS = 900
 STYLE = """
-:root { color-scheme: light dark; --ink: #1c1c1c; --paper: #fff; --faint: #d8d8d8; --good: #1a7f5a; --bad: #b3360b;
+:root { color-scheme: light dark; --ink: #1c1c1c; --paper: #fff; --faint: #d8d8d8;
+  --good: #1a7f5a; --bad: #b3360b;
   --doubt: #8a6100; --allowed: #7fc8a9; --link: #08519c; }
 @media (prefers-color-scheme: dark) { :root { --ink: #e8e8e8; --paper: #16181b; --faint: #3a3f45;
   --allowed: #2d7a5c; --link: #9ecae1; } }
 * { box-sizing: border-box; print-color-adjust: exact; -webkit-print-color-adjust: exact; }
-body { font: 16px/1.5 system-ui, sans-serif; max-width: 980px; margin: 0 auto; padding: 1.5rem 1rem 4rem;
+body { font: 16px/1.5 system-ui, sans-serif; max-width: 980px; margin: 0 auto;
+  padding: 1.5rem 1rem 4rem;
   color: var(--ink); background: var(--paper); }
-h1 { font-size: 1.6rem; margin: 0; overflow-wrap: anywhere; } h2 { font-size: 1.2rem; margin: 2rem 0 .5rem; }
+h1 { font-size: 1.6rem; margin: 0; overflow-wrap: anywhere; } h2 { font-size: 1.2rem;
+  margin: 2rem 0 .5rem; }
 h3 { font-size: 1rem; margin: .5rem 0; }
 .under { margin: 0 0 1rem; opacity: .8; }
 .verdict { color: #fff; border-radius: .6rem; padding: .8rem 1.2rem; font-size: 1.15rem; }
 .verdict p { margin: 0; overflow-wrap: anywhere; }
 .verdict .word { font-size: 1.9rem; font-weight: 700; line-height: 1.2; }
-.good { background: var(--good); } .out-of-range { background: var(--bad); } .doubtful { background: var(--doubt); }
+.good { background: var(--good); } .out-of-range { background: var(--bad); }
+  .doubtful { background: var(--doubt); }
 .warnings { border-left: .4rem solid var(--doubt); padding: .1rem 1rem; margin: 1rem 0; }
 .bar { margin: .6rem 0 0; } svg { width: 100%; max-width: 680px; display: block; font-size: 14px; }
 svg text { fill: var(--ink); } .rail { fill: var(--faint); } .allowed { fill: var(--allowed); }
 .inside { fill: var(--ink); } .outside { fill: #e0480f; stroke: var(--ink); }
 table { border-collapse: collapse; margin: .5rem 0; }
 th, td { text-align: left; vertical-align: top; padding: .15rem 1rem .15rem 0;
-  border-bottom: 1px solid var(--faint); overflow-wrap: anywhere; } tbody th { font-weight: 600; min-width: 8rem; }
-.numbers td:nth-child(2) { white-space: nowrap; } .wide { overflow-x: auto; } .wide img { min-width: 40rem; }
+  border-bottom: 1px solid var(--faint); overflow-wrap: anywhere; } tbody th { font-weight: 600;
+  min-width: 8rem; }
+.numbers td:nth-child(2) { white-space: nowrap; } .wide { overflow-x: auto; }
+  .wide img { min-width: 40rem; }
 .figures td { white-space: nowrap; font-variant-numeric: tabular-nums; }
 .figures th { overflow-wrap: normal; } .figures tbody th { min-width: 11rem; }
 .columns { display: flex; flex-wrap: wrap; gap: 0 2.5rem; }
 figure { margin: 1.5rem 0; break-inside: avoid; } figcaption { margin-top: .4rem; }
 img { max-width: 100%; height: auto; background: #fff; border-radius: .4rem; display: block; }
 pre { border: 1px solid var(--faint); border-radius: .4rem; padding: .6rem 1rem; overflow-x: auto; }
-section, tr { break-inside: avoid; } @media print { body { max-width: none; font-size: 11pt; padding: 0; } }
+section, tr { break-inside: avoid; } @media print { body { max-width: none; font-size: 11pt;
+  padding: 0; } }
 """
 PAGE = Template("""<!DOCTYPE html>
 <html lang="en">
@@ -70,9 +77,10 @@ class Picture:
     @property
     def is_wide(self) -> bool:
         """True if a narrow screen should scroll the picture instead of shrinking it."""
-        return (
-            self.png is not None and int.from_bytes(self.png[16:20], "big") > WIDE_PIXELS
-        )  # its header's width
+        if self.png is None:
+            return False
+        width = int.from_bytes(self.png[16:20], "big")  # from the PNG's header
+        return width > WIDE_PIXELS
 
 
 def saved_picture(title: str, caption: str, path: Path) -> Picture:
@@ -134,11 +142,9 @@ def _row(cells: tuple[str, ...]) -> str:
 def bullets(name: str, items: Iterable[str], css_class: str = "") -> str:
     """Return a list of sentences under a heading; empty where there are none."""
     entries = "".join(f"<li>{escape(item)}</li>" for item in items)
-    return (
-        f"<section class='{css_class}'><h3>{escape(name)}</h3><ul>{entries}</ul></section>"
-        if entries
-        else ""
-    )
+    if not entries:
+        return ""
+    return f"<section class='{css_class}'><h3>{escape(name)}</h3><ul>{entries}</ul></section>"
 
 
 def commands(lines: Iterable[str]) -> str:

@@ -123,39 +123,34 @@ def fake_device(
     """Make an L515 with firmware 1.5.8 on USB 3, except for the changes; `shut` is raised on
     opening.
     """
+    strings = ("Intel(R) RealSense(TM) Camera", "Intel(R) RealSense(TM) 515", serial)
     values: dict[str, Any] = {
+        # the descriptor, by its names in the USB standard
         "bLength": 18,
         "bDescriptorType": 1,
         "bMaxPacketSize0": 9,
         "bNumConfigurations": 1,
-    }
-    values |= {
         "bDeviceClass": 0xEF,
         "bDeviceSubClass": 2,
         "bDeviceProtocol": 1,
-        "classes": L515_CLASSES,
-    }
-    values |= {
         "idVendor": 0x8086,
         "idProduct": product,
         "bcdUSB": 0x0320,
         "bcdDevice": 0x1058,
+        "iManufacturer": 1,
+        "iProduct": 2,
+        "iSerialNumber": 3,
+        # its place and link, as pyusb adds them
         "speed": 4,
-    }
-    values |= {
         "bus": 2,
         "address": 3,
         "port_number": 1,
         "port_numbers": (1,),
+        # this fake's own
+        "classes": L515_CLASSES,
+        "strings": dict(enumerate(strings, start=1)),
         "shut": None,
         "hides": None,
-    }
-    strings = "Intel(R) RealSense(TM) Camera", "Intel(R) RealSense(TM) 515", serial
-    values |= {
-        "iManufacturer": 1,
-        "iProduct": 2,
-        "iSerialNumber": 3,
-        "strings": dict(enumerate(strings, start=1)),
     }
     return SimpleNamespace(**values | changes)
 

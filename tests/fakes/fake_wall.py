@@ -23,16 +23,26 @@ WALL_M = wall_depth(RIG.wall_from_lidar, SMALL)
 WALL_M[~(WALL_M < 0.6)] = np.nan
 """(64, 80); as the paper's lidar sees a bare wall, as far as 0.6 m."""
 FIT = WallFit(
-    *(0.2, 45.0, 0.0, RIG.facing_deg),
-    *(0.0,) * 4,
-    RIG.wall_from_lidar,
-    np.zeros((3, 3)),
-    *(1e-4, 1.0, 0.99),
-    np.isfinite(WALL_M),
-    *(0.0, 0.0, 0.0),
-    "good",
-    "fine",
-    (),
+    distance_m=0.2,
+    yaw_deg=45.0,
+    pitch_deg=0.0,
+    facing_deg=RIG.facing_deg,
+    distance_std_m=0.0,
+    yaw_std_deg=0.0,
+    pitch_std_deg=0.0,
+    facing_std_deg=0.0,
+    wall_from_lidar=RIG.wall_from_lidar,
+    covariance=np.zeros((3, 3)),
+    residual_m=1e-4,
+    noise_scale=1.0,
+    inlier_fraction=0.99,
+    inliers=np.isfinite(WALL_M),
+    ripple_m=0.0,
+    bend_m=0.0,
+    bend_deg=0.0,
+    verdict="good",
+    advice="fine",
+    warnings=(),
 )
 
 

@@ -16,22 +16,28 @@ from nlos_calibration.wall_record import MeasuredWall, WallRecord
 
 WIDTH = 96
 HEIGHT = 72
-ANGLES = "yaw", "pitch", "facing"
-SEEN = {
-    "corners": 24,
-    "residual_px": 0.07,
-    "stretch": 0.001,
-    "bow_m": 0.0002,
-    "causes": ("printed at 97 %",),
-}
-APART = {"disagreement_m": 0.0034, "disagreement_deg": 0.117, "disagreement_sigmas": 6.5}
-PLACE = {
-    "distance_m": 0.2034,
-    "distance_std_m": 0.0005,
-    **{f"{angle}_deg": 40.1 for angle in ANGLES},
-}
-PLACE |= {f"{angle}_std_deg": 0.02 for angle in ANGLES}
-BOARD = BoardRecord(printed=BOARDS["a4"], measured=True, used="depth", **SEEN, **APART, **PLACE)  # type: ignore[arg-type]
+BOARD = BoardRecord(
+    printed=BOARDS["a4"],
+    measured=True,
+    corners=24,
+    residual_px=0.07,
+    stretch=0.001,
+    bow_m=0.0002,
+    distance_m=0.2034,
+    distance_std_m=0.0005,
+    yaw_deg=40.1,
+    yaw_std_deg=0.02,
+    pitch_deg=40.1,
+    pitch_std_deg=0.02,
+    facing_deg=40.1,
+    facing_std_deg=0.02,
+    used="depth",
+    disagreement_m=0.0034,
+    disagreement_deg=0.117,
+    disagreement_sigmas=6.5,
+    causes=("printed at 97 %",),
+)
+"""A board that disagrees with the depth."""
 
 
 def exact_wall(**fields: Any) -> MeasuredWall:
@@ -41,24 +47,19 @@ def exact_wall(**fields: Any) -> MeasuredWall:
     rig = rig.model_copy(update={"intrinsics": PinholeRecord.model_validate(vars(small))})
     found: dict[str, Any] = {
         "distance_m": 0.2,
-        "facing_deg": 45.0,
-        "yaw_deg": 45.0,
-        "pitch_deg": 0.0,
-    }
-    found |= {
         "distance_std_m": 0.0001,
+        "facing_deg": 45.0,
         "facing_std_deg": 0.01,
+        "yaw_deg": 45.0,
         "yaw_std_deg": 0.01,
+        "pitch_deg": 0.0,
         "pitch_std_deg": 0.02,
-    }
-    found |= {
+        "wall_from_lidar": rig.wall_from_lidar.tolist(),
+        "temperatures_c": {"ldd_temperature": 41.7},
+        "footprint_share": 1.0,
         "verdict": "good",
         "advice": "distance and angle are inside the paper's ranges",
         "rig": rig,
-    }
-    found |= {
-        "wall_from_lidar": rig.wall_from_lidar.tolist(),
-        "temperatures_c": {"ldd_temperature": 41.7},
     }
     record = WallRecord(created=date(2026, 11, 22), camera="made-up", frames=30, **found)
     if "reference" in fields:

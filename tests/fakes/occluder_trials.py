@@ -15,8 +15,8 @@ from nlos_calibration import (
 from nlos_calibration.errors import OccluderRefusedError
 from nlos_calibration.occluder import MIN_COLUMNS, find_occluder
 from synthetic_scenes import Sheet, bench_depth
+from synthetic_walls import View, depth_statistics, view, with_outliers
 
-from nlos_cam.calibrate import View, depth_statistics, view, with_outliers
 from nlos_cam.render import MultiBounce, Sensor, SensorModel
 
 Generator = np.random.Generator
@@ -33,7 +33,7 @@ EDGE_HIDDEN = "edge out of view"
 
 
 @dataclass(frozen=True)
-class Setting:
+class OccluderConditions:
     """Approximate pose of lidar and sheet, and conditions of the depth."""
 
     distance_m: float = 0.2
@@ -65,44 +65,47 @@ class Outcome:
     """True for x, gap and tilt with the truth inside their 95 % interval."""
 
 
-def draw(setting: Setting, generator: Generator) -> tuple[View, Sheet]:
-    """Return a bench near the setting, at random against the pixels' grid."""
-    yaw_deg = setting.facing_deg + generator.uniform(-1.0, 1.0)
+def draw(conditions: OccluderConditions, generator: Generator) -> tuple[View, Sheet]:
+    """Return a bench near the conditions, at random against the pixels' grid."""
+    yaw_deg = conditions.facing_deg + generator.uniform(-1.0, 1.0)
     distance_m = generator.uniform(-0.005, 0.005)
-    lean_deg, twist_deg, edge_deg = generator.uniform(-setting.lean_deg, setting.lean_deg, 3)
-    x_m = setting.x_m + generator.uniform(-0.01, 0.01)
-    gap_m = setting.gap_m + generator.uniform(-0.005, 0.005)
+    lean_deg, twist_deg, edge_deg = generator.uniform(-conditions.lean_deg, conditions.lean_deg, 3)
+    x_m = conditions.x_m + generator.uniform(-0.01, 0.01)
+    gap_m = conditions.gap_m + generator.uniform(-0.005, 0.005)
     seen = view(
-        setting.distance_m + distance_m, yaw_deg, float(generator.choice(PITCHES_DEG)), PINHOLE
+        conditions.distance_m + distance_m, yaw_deg, float(generator.choice(PITCHES_DEG)), PINHOLE
     )
     return seen, Sheet(x_m, gap_m, lean_deg, twist_deg, edge_deg)
 
 
-def trial(setting: Setting, generator: Generator) -> Outcome:
-    """Draw a bench near the setting and find its occluder."""
-    seen, sheet = draw(setting, generator)
+def trial(conditions: OccluderConditions, generator: Generator) -> Outcome:
+    """Draw a bench near the conditions and find its occluder."""
+    seen, sheet = draw(conditions, generator)
     depth_m = with_outliers(
-        bench_depth(seen, sheet, beams=setting.beams), setting.outliers, generator
+        bench_depth(seen, sheet, beams=conditions.beams), conditions.outliers, generator
     )
-    mean = depth_statistics(depth_m, generator, frames=setting.frames, noise=setting.noise)
+    mean = depth_statistics(depth_m, generator, frames=conditions.frames, noise=conditions.noise)
     return outcome(seen, sheet, mean, generator)
 
 
-def simulated_trial(setting: Setting, generator: Generator, pinhole: Intrinsics) -> Outcome:
+def simulated_trial(
+    conditions: OccluderConditions, generator: Generator, pinhole: Intrinsics
+) -> Outcome:
     """Find an upright occluder in frames of the renderer's beams and the simulated camera's
     sensor.
     """
-    sheet = Sheet((drawn := draw(setting, generator))[1].x_m, drawn[1].gap_m)
+    seen, leaning = draw(conditions, generator)
+    sheet = Sheet(leaning.x_m, leaning.gap_m)
     rig = PAPER.model_copy(
         update={
-            "lidar": LidarPose(distance_m=float(drawn[0].pose[2, 3]), yaw_deg=setting.facing_deg),
+            "lidar": LidarPose(distance_m=float(seen.pose[2, 3]), yaw_deg=conditions.facing_deg),
             "intrinsics": PinholeRecord.model_validate(vars(pinhole)),
             "occluder": Occluder(x_m=sheet.x_m, z_min_m=sheet.gap_m),
         }
     )
     sensor = Sensor(rig, SensorModel())
     mean = DepthMean(pinhole.height, pinhole.width)
-    for _ in range(setting.frames):
+    for _ in range(conditions.frames):
         mean.add(sensor.expose(NO_ECHO, generator).frame(pinhole).depth_m)
     return outcome(View(rig.wall_from_lidar, pinhole), sheet, mean, generator)
 
@@ -111,8 +114,11 @@ def outcome(seen: View, sheet: Sheet, mean: DepthMean, generator: Generator) -> 
     """Find the occluder and compare it with the truth."""
     on_sheet = bench_depth(seen, sheet) < bench_depth(seen, None)
     columns = np.median(on_sheet.sum(axis=1))
-    shown = IN_VIEW if columns >= 2 * MIN_COLUMNS else BARELY if on_sheet.any() else NOT_IN_VIEW
-    shown = EDGE_HIDDEN if on_sheet[:, 0].mean() > 0.5 else shown
+    shown = BARELY if on_sheet.any() else NOT_IN_VIEW
+    if columns >= 2 * MIN_COLUMNS:
+        shown = IN_VIEW
+    if on_sheet[:, 0].mean() > 0.5:
+        shown = EDGE_HIDDEN
     try:
         fit = find_occluder(mean.mean_m(), mean.noise(), seen.pinhole, seen.pose, generator)
     except OccluderRefusedError as error:

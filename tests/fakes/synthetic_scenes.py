@@ -1,5 +1,5 @@
 """Synthetic benches with an occluder, printed boards and drifting streams, beside the walls of
-`calibrate.synthetic`.
+`synthetic_walls`.
 
 The image of a board has perspective, pixel area, the laser's spot, falloff with distance and
 incidence, toner that reflects, a print that is scaled and stretched, gain, saturation, shot and
@@ -26,8 +26,7 @@ from nlos_calibration import (
 from nlos_calibration.arrays import Float64
 from nlos_calibration.wall_tracker import watched_pixels
 from numpy.typing import NDArray
-
-from nlos_cam.calibrate import View, view
+from synthetic_walls import View, view
 
 WALL_EXTENT_M = 2.0
 

@@ -8,8 +8,7 @@ import numpy as np
 from nlos_calibration import INTERVAL_STDS, fit_wall, load_rig
 from nlos_calibration.arrays import Float64
 from nlos_calibration.errors import WallRefusedError
-
-from nlos_cam.calibrate import View, depth_statistics, patchy, rippled, view, with_outliers
+from synthetic_walls import View, depth_statistics, patchy, rippled, view, with_outliers
 
 Generator = np.random.Generator
 
@@ -39,7 +38,7 @@ SCENES: dict[str, Callable[[View, Generator], Float64]] = {
 
 
 @dataclass(frozen=True)
-class Setting:
+class WallConditions:
     """Scene (a key of SCENES), noise over the nominal, shares of outliers and flicker, and
     frames.
     """
@@ -62,14 +61,20 @@ def random_view(generator: Generator) -> View:
     return view(float(distance_m), float(yaw_deg), float(pitch_deg), PINHOLE)
 
 
-def trial(setting: Setting, generator: Generator) -> dict[str, Any] | None:
+def trial(conditions: WallConditions, generator: Generator) -> dict[str, Any] | None:
     """Draw a wall and measure it; return errors and what lies inside its 95 % interval, None where
     it is refused.
     """
     seen = random_view(generator)
-    depth_m = with_outliers(SCENES[setting.scene](seen, generator), setting.outliers, generator)
+    depth_m = with_outliers(
+        SCENES[conditions.scene](seen, generator), conditions.outliers, generator
+    )
     mean = depth_statistics(
-        depth_m, generator, frames=setting.frames, noise=setting.noise, flicker=setting.flicker
+        depth_m,
+        generator,
+        frames=conditions.frames,
+        noise=conditions.noise,
+        flicker=conditions.flicker,
     )
     try:
         fit = fit_wall(mean.mean_m(), seen.pinhole, generator, mean.noise())

@@ -15,7 +15,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from nlos_cam.calibrate.color_view import capture_color_view
 from nlos_cam.camera import Camera, Recording, connected, load_sdk, open_camera, shared_context
 from nlos_cam.camera.l515 import NEAR_WALL, L515Camera
 from nlos_cam.recording.playback import ReplayCamera, verify
@@ -74,16 +73,6 @@ def test_wall_is_near_and_unsaturated(camera: Camera) -> None:
     assert np.count_nonzero(~np.isnan(frame.depth_m)) > 0.5 * frame.depth_m.size
     assert np.count_nonzero(frame.ir == 255) < 0.001 * frame.ir.size
     assert frame.settings["laser_power"] > 0
-
-
-def test_color_is_captured_before_depth_and_leaves_it_alone(camera: Camera) -> None:
-    view = capture_color_view(camera.uri, 10)
-    assert view.image.shape == (view.intrinsics.height, view.intrinsics.width)
-    assert 5.0 < view.image.mean() < 250.0
-    assert view.distortion.any()
-    assert 0.005 < np.linalg.norm(view.lidar_from_camera[:3, 3]) < 0.03
-    with camera:
-        assert next(iter(camera)).depth_m.shape == (480, 640)
 
 
 def test_temperatures_are_reported_after_five_seconds(camera: Camera) -> None:

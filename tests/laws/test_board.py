@@ -27,7 +27,7 @@ TILTED = [(0.25, 40.0, 12.0), (0.25, 40.0, -12.0), (0.25, 0.0, 20.0), (0.25, 0.0
 
 
 @pytest.mark.parametrize("wall", [*RANGES, *TILTED])
-def test_board_measures_every_wall_of_the_papers_ranges_and_a_tilted_one(
+def test_board_measures_walls_of_the_papers_ranges_and_tilted(
     wall: tuple[float, ...],
 ) -> None:
     assert_measured(bench_at(*wall))

@@ -16,8 +16,7 @@ from synthetic_scenes import (
     noisy_depth,
     occluding_sheet,
 )
-
-from nlos_cam.calibrate import view
+from synthetic_walls import view
 
 POSES = [
     (0.2, 45.0, 0.0),
@@ -28,7 +27,7 @@ POSES = [
     (0.2, 0.0, 0.0),
 ]
 SHIFTS = [(0.002, 0.0, 0.0), (-0.002, 0.0, 0.0), (0.0, 0.5, 0.0), (0.0, -0.5, 0.0), (0.0, 0.0, 0.5)]
-TOLD_FRAMES = 60
+REPORTED_FRAMES = 60
 SIGMAS = 4.5
 poses = pytest.mark.parametrize("pose", POSES)
 
@@ -94,8 +93,8 @@ def test_drift_check_measures_a_knock_beside_an_object(
     stream = WallStream(pose, seed=3)
     hide = [multipath(stream.places, share, 5)] if share else []
     assert stream.show(pose, 40, *hide) is None
-    told = stream.show(stream.moved(*shift), TOLD_FRAMES, *hide)
-    assert told > 3 or share  # a frame or two are no news
+    reported = stream.show(stream.moved(*shift), REPORTED_FRAMES, *hide)
+    assert reported > 3 or share  # a frame or two are no news
     assert_right(stream, shift)
 
 
@@ -107,14 +106,14 @@ def test_drift_check_measures_a_large_move_beside_both(pose: WallPose, shift: Wa
     stream = WallStream(pose, seed=4)
     hide = chained(multipath(stream.places, 0.3, 6), occluding_sheet(stream.places, 0.8))
     assert stream.show(pose, 40, hide) is None
-    assert stream.show(stream.moved(*shift), 3 * TOLD_FRAMES, hide) is not None
+    assert stream.show(stream.moved(*shift), 3 * REPORTED_FRAMES, hide) is not None
     assert_right(stream, shift)
 
 
 @poses
 def test_drift_check_warning_ends_when_the_lidar_is_back(pose: WallPose) -> None:
     stream = WallStream(pose, seed=5)
-    assert stream.show(stream.moved(0.002, 0.5, -0.5), TOLD_FRAMES) is not None
+    assert stream.show(stream.moved(0.002, 0.5, -0.5), REPORTED_FRAMES) is not None
     stream.show(pose, WINDOW_FRAMES)
     assert stream.check.warnings == ()
 
@@ -134,7 +133,7 @@ def test_drift_check_names_a_range_that_drifts(pose: WallPose) -> None:
 def test_drift_check_separates_a_move_from_a_range_drift(pose: WallPose) -> None:
     """Not where the wall is faced squarely: both are the same there."""
     stream = WallStream(pose, seed=7)
-    stream.show(stream.moved(0.002), TOLD_FRAMES)
+    stream.show(stream.moved(0.002), REPORTED_FRAMES)
     (line,) = stream.check.warnings
     assert "moved" in line
 
@@ -173,9 +172,9 @@ def test_drift_check_warns_of_a_wall_out_of_view_until_back() -> None:
 
 def test_drift_check_keeps_its_warning_while_the_wall_is_hidden() -> None:
     stream = WallStream(POSES[0], seed=10)
-    stream.show(stream.moved(0.003), TOLD_FRAMES)
+    stream.show(stream.moved(0.003), REPORTED_FRAMES)
     before = stream.check.warnings
-    stream.show(stream.pose, TOLD_FRAMES, lambda depth_m, _: np.full_like(depth_m, np.nan))
+    stream.show(stream.pose, REPORTED_FRAMES, lambda depth_m, _: np.full_like(depth_m, np.nan))
     assert stream.check.warnings == before != ()
 
 

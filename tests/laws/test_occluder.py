@@ -5,10 +5,17 @@ found.
 import numpy as np
 import pytest
 from nlos_calibration.rig import load_rig
-from occluder_trials import BARELY, IN_VIEW, Setting, draw, find_occluder, simulated_trial, trial
+from occluder_trials import (
+    BARELY,
+    IN_VIEW,
+    OccluderConditions,
+    draw,
+    find_occluder,
+    simulated_trial,
+    trial,
+)
 from synthetic_scenes import bench_depth
-
-from nlos_cam.calibrate.synthetic import depth_statistics
+from synthetic_walls import depth_statistics
 
 SENSOR = load_rig("paper-rig").pinhole.scaled(160, 120)
 LOOKS = {
@@ -30,8 +37,10 @@ def test_occluder_interval_holds_the_truth_as_often_as_stated(look: str) -> None
         uniform(low, high, 80)
         for low, high in ((0.15, 0.3), (35.0, 70.0), (0.12, 0.22), (0.05, 0.12))
     ]
-    settings = [Setting(*values, **LOOKS[look]) for values in zip(*drawn_of, strict=True)]
-    outcomes = [trial(setting, np.random.default_rng([3, n])) for n, setting in enumerate(settings)]
+    benches = [OccluderConditions(*values, **LOOKS[look]) for values in zip(*drawn_of, strict=True)]
+    outcomes = [
+        trial(conditions, np.random.default_rng([3, n])) for n, conditions in enumerate(benches)
+    ]
     found = [one for one in outcomes if not one.refused]
     inside = np.array([one.inside for one in found]).mean(axis=0)
     assert len(found) > 70
@@ -43,7 +52,9 @@ def test_occluder_interval_holds_the_truth_as_often_as_stated(look: str) -> None
 def test_occluder_is_found_only_where_one_is_in_view(facing_deg: float) -> None:
     shown = set()
     for n, (x_m, gap_m) in enumerate([(0.12, 0.05), (0.2, 0.1), (0.3, 0.15), (0.3, 0.05)]):
-        one = trial(Setting(0.2, facing_deg, x_m, gap_m, frames=4), np.random.default_rng(n))
+        one = trial(
+            OccluderConditions(0.2, facing_deg, x_m, gap_m, frames=4), np.random.default_rng(n)
+        )
         shown.add(one.shown)
         if one.shown == IN_VIEW:
             assert not one.refused
@@ -56,7 +67,7 @@ def test_occluder_is_found_only_where_one_is_in_view(facing_deg: float) -> None:
 def test_occluder_of_more_frames_has_a_surer_sheet_but_same_edge() -> None:
     def stds(frames: int) -> tuple[float, float]:
         generator = np.random.default_rng(4)
-        seen, sheet = draw(Setting(lean_deg=0.0), generator)
+        seen, sheet = draw(OccluderConditions(lean_deg=0.0), generator)
         mean = depth_statistics(bench_depth(seen, sheet), generator, frames=frames, noise=1.0)
         fit = find_occluder(mean.mean_m(), mean.noise(), seen.pinhole, seen.pose, generator)
         return fit.x_std_m, fit.gap_std_m
@@ -74,7 +85,7 @@ def test_occluder_of_the_simulated_camera_is_found(
     facing_deg: float, x_m: float, gap_m: float
 ) -> None:
     one = simulated_trial(
-        Setting(0.2, facing_deg, x_m, gap_m, frames=4), np.random.default_rng(2), SENSOR
+        OccluderConditions(0.2, facing_deg, x_m, gap_m, frames=4), np.random.default_rng(2), SENSOR
     )
     assert not one.refused
     assert abs(one.x_error_m) < 1e-3

@@ -6,18 +6,20 @@ from typing import Any
 
 import numpy as np
 import pytest
-from wall_trials import Setting, trial
+from wall_trials import WallConditions, trial
 
 pytestmark = pytest.mark.slow
 
 
-def outcomes(count: int, **setting: Any) -> list[dict[str, Any]]:
-    tried = [trial(Setting(**setting), np.random.default_rng([7, n])) for n in range(count)]
+def outcomes(count: int, **conditions: Any) -> list[dict[str, Any]]:
+    tried = [
+        trial(WallConditions(**conditions), np.random.default_rng([7, n])) for n in range(count)
+    ]
     return [one for one in tried if one]
 
 
-def inside(count: int, at_least: int, **setting: Any) -> Any:
-    found = outcomes(count, **setting)
+def inside(count: int, at_least: int, **conditions: Any) -> Any:
+    found = outcomes(count, **conditions)
     assert len(found) > at_least
     return np.array([one["inside"] for one in found])
 
@@ -34,7 +36,7 @@ def test_wall_interval_holds_the_truth_as_often_as_stated(noise: float, frames: 
 
 
 @pytest.mark.parametrize(
-    ("count", "at_least", "share", "setting"),
+    ("count", "at_least", "share", "conditions"),
     [
         *(
             (120, 80, 0.87, {"scene": s, "outliers": o, "frames": 6})
@@ -52,14 +54,16 @@ def test_wall_interval_holds_the_truth_as_often_as_stated(noise: float, frames: 
     ],
 )
 def test_interval_allows_outliers_ripples_and_flicker(
-    count: int, at_least: int, share: float, setting: dict
+    count: int, at_least: int, share: float, conditions: dict
 ) -> None:
-    assert (inside(count, at_least, **setting).mean(axis=0) >= share).all()
+    assert (inside(count, at_least, **conditions).mean(axis=0) >= share).all()
 
 
 def test_wall_error_falls_with_more_frames_and_less_noise() -> None:
-    def facing_error_deg(**setting: float) -> float:
-        return float(np.median([abs(one["facing_error_deg"]) for one in outcomes(40, **setting)]))
+    def facing_error_deg(**conditions: float) -> float:
+        return float(
+            np.median([abs(one["facing_error_deg"]) for one in outcomes(40, **conditions)])
+        )
 
     assert facing_error_deg(frames=30) < 0.4 * facing_error_deg(frames=1)
     assert facing_error_deg(noise=1.0) < 0.5 * facing_error_deg(noise=4.0)

@@ -5,9 +5,18 @@ parameters.
 import numpy as np
 import pytest
 import synthetic_scenes as scenes
-from nlos_calibration import BOARDS, BareWallStatistics, LidarPose, Occluder, load_rig, wall_depth
+import synthetic_walls as walls
+from nlos_calibration import (
+    BOARDS,
+    BareWall,
+    BareWallStatistics,
+    LidarPose,
+    Occluder,
+    load_rig,
+    wall_depth,
+)
+from synthetic_walls import View, view
 
-from nlos_cam.calibrate import synthetic
 from nlos_cam.render import cast
 
 RIG = load_rig("bare-wall")
@@ -25,13 +34,12 @@ POSE: scenes.WallPose = (0.2, 30.0, 0.0)
 def test_bent_wall_is_one_plane_on_either_side_of_a_fold(
     bend_deg: float, direction_rad: float
 ) -> None:
-    seen = synthetic.view(0.2, 20.0, 5.0, SMALL_BARE)
-    depth_m, main = synthetic.bent(seen, bend_deg, 0.4, direction_rad)
-    _, other = synthetic.bent(seen, bend_deg, 0.6, direction_rad)
+    seen = view(0.2, 20.0, 5.0, SMALL_BARE)
+    depth_m, main = walls.bent(seen, bend_deg, 0.4, direction_rad)
+    _, other = walls.bent(seen, bend_deg, 0.6, direction_rad)
     assert main is seen
-    assert np.degrees(np.arccos(other.pose[2, :3] @ seen.pose[2, :3])) == pytest.approx(
-        abs(bend_deg)
-    )
+    turn_deg = np.degrees(np.arccos(other.pose[2, :3] @ seen.pose[2, :3]))
+    assert turn_deg == pytest.approx(abs(bend_deg))
     first = depth_m == seen.depth_m
     assert first.mean() == pytest.approx(0.6, abs=0.03)
     fold = first[:, 1:] != first[:, :-1]
@@ -39,21 +47,36 @@ def test_bent_wall_is_one_plane_on_either_side_of_a_fold(
     assert np.abs(np.diff(depth_m, axis=1))[fold].max() < 0.01
 
 
-def test_scenes_are_off_the_wall_by_their_parameters() -> None:
-    seen = synthetic.view(0.2, 30.0, 0.0, SMALL_BARE)
-    away = -(SMALL_BARE.rays() @ seen.pose[2, :3])
+OBLIQUE = view(0.2, 30.0, 0.0, SMALL_BARE)
 
-    def height_m(depth_m: np.ndarray) -> np.ndarray:
-        return 0.2 - depth_m * away
 
-    assert np.allclose(
-        np.unique(height_m(synthetic.stepped(seen, 0.004, 0.3)).round(9)), [0.0, 0.004]
-    )
-    assert np.allclose(np.unique(height_m(synthetic.window(seen, 0.01)).round(9)), [-0.01, 0.0])
-    assert (height_m(synthetic.window(seen, 0.01)) < -0.005).mean() == pytest.approx(0.5, abs=0.1)
-    assert np.abs(height_m(synthetic.curved(seen, 1.0))).max() > 0.002
-    assert synthetic.patch(seen, 0.25).mean() == pytest.approx(0.25, abs=0.03)
-    ripples_m = synthetic.rippled(seen, 0.001, 4.0, np.random.default_rng(0)) - seen.depth_m
+def heights_m(depth_m: np.ndarray) -> np.ndarray:
+    """Return the heights of depths over the oblique wall."""
+    return 0.2 + depth_m * (SMALL_BARE.rays() @ OBLIQUE.pose[2, :3])
+
+
+def test_step_is_as_high_as_it_says() -> None:
+    found_m = heights_m(walls.stepped(OBLIQUE, 0.004, 0.3))
+    assert np.allclose(np.unique(found_m.round(9)), [0.0, 0.004])
+
+
+def test_half_of_a_window_is_behind_its_frame() -> None:
+    found_m = heights_m(walls.window(OBLIQUE, 0.01))
+    assert np.allclose(np.unique(found_m.round(9)), [-0.01, 0.0])
+    assert (found_m < -0.005).mean() == pytest.approx(0.5, abs=0.1)
+
+
+def test_curved_wall_is_off_the_plane() -> None:
+    assert np.abs(heights_m(walls.curved(OBLIQUE, 1.0))).max() > 0.002
+
+
+def test_patch_has_its_share_of_the_view() -> None:
+    assert walls.patch(OBLIQUE, 0.25).mean() == pytest.approx(0.25, abs=0.03)
+
+
+def test_ripples_have_their_amplitude() -> None:
+    rippled_m = walls.rippled(OBLIQUE, 0.001, 4.0, np.random.default_rng(0))
+    ripples_m = rippled_m - OBLIQUE.depth_m
     assert np.abs(ripples_m).max() == pytest.approx(0.001, rel=0.01)
 
 
@@ -66,7 +89,7 @@ def test_scene_rays_are_the_renderers(
     lidar = LidarPose(distance_m=0.2, yaw_deg=yaw_deg, pitch_deg=pitch_deg)
     rig = PAPER.model_copy(update={"lidar": lidar, "occluder": Occluder(x_m=x_m, z_min_m=gap_m)})
     beams = cast(rig, SMALL_PAPER)
-    seen = synthetic.View(rig.wall_from_lidar, SMALL_PAPER)
+    seen = View(rig.wall_from_lidar, SMALL_PAPER)
     depth_m = scenes.bench_depth(seen, scenes.Sheet(x_m, gap_m)).ravel()
     met = (
         np.isfinite(beams.length_m)
@@ -78,16 +101,15 @@ def test_scene_rays_are_the_renderers(
 
 
 def test_tilted_sheet_is_at_its_parameters() -> None:
-    seen = synthetic.view(0.2, 45.0, 0.0, SMALL_PAPER)
+    seen = view(0.2, 45.0, 0.0, SMALL_PAPER)
     occluding_sheet = scenes.Sheet(
         lean_deg=10.0, twist_deg=-5.0, edge_deg=4.0, height_m=0.05, bottom_m=-0.03, top_m=0.04
     )
     depth_m = scenes.bench_depth(seen, occluding_sheet)
     bare_m = scenes.bench_depth(seen, None)
     on = depth_m < bare_m
-    x, y, z = (
-        seen.pose[:3, 3] + (SMALL_PAPER.rays() * depth_m[..., np.newaxis])[on] @ seen.pose[:3, :3].T
-    ).T
+    points = (SMALL_PAPER.rays() * depth_m[..., np.newaxis])[on]
+    x, y, z = (seen.pose[:3, 3] + points @ seen.pose[:3, :3].T).T
     lean, twist, edge = np.tan(np.radians([10.0, -5.0, 4.0]))
     assert np.allclose(x, 0.2 + lean * (z - 0.1) + twist * y)
     above_m = z - 0.1 - edge * y
@@ -98,7 +120,7 @@ def test_tilted_sheet_is_at_its_parameters() -> None:
 
 
 def test_sheet_mixes_only_pixels_on_its_edge() -> None:
-    seen = synthetic.view(0.2, 45.0, 0.0, SMALL_PAPER)
+    seen = view(0.2, 45.0, 0.0, SMALL_PAPER)
     occluding_sheet = scenes.Sheet(gap_m=0.103)
     sharp = scenes.bench_depth(seen, occluding_sheet)
     mixed = scenes.bench_depth(seen, occluding_sheet, beams=9)
@@ -108,22 +130,21 @@ def test_sheet_mixes_only_pixels_on_its_edge() -> None:
 
 
 def test_ball_is_round() -> None:
-    seen = synthetic.view(0.2, 45.0, 0.0, SMALL_PAPER)
+    seen = view(0.2, 45.0, 0.0, SMALL_PAPER)
     depth_m = scenes.ball(seen, (0.15, 0.01, 0.12), 0.04)
     hit = np.isfinite(depth_m)
-    points = (
-        seen.pose[:3, 3]
-        + (SMALL_PAPER.rays()[hit] * depth_m[hit][:, np.newaxis]) @ seen.pose[:3, :3].T
-    )
+    seen_m = SMALL_PAPER.rays()[hit] * depth_m[hit][:, np.newaxis]
+    points_m = seen.pose[:3, 3] + seen_m @ seen.pose[:3, :3].T
+    radius_m = np.linalg.norm(points_m - [0.15, 0.01, 0.12], axis=1)
     assert hit.sum() > 100
-    assert np.allclose(np.linalg.norm(points - [0.15, 0.01, 0.12], axis=1), 0.04)
+    assert np.allclose(radius_m, 0.04)
 
 
 def test_paper_and_toner_have_their_counts() -> None:
     """Without a spot: the falloff of a bare wall, its brightest pixel at the gain, toner at its
     albedo.
     """
-    seen = synthetic.View(RIG.wall_from_lidar, PINHOLE)
+    seen = View(RIG.wall_from_lidar, PINHOLE)
     light = scenes.Illumination(spot_mm=0.0)
     away = scenes.Placement(50.0)
     placed = scenes.at_near_edge(A4, seen)
@@ -160,32 +181,52 @@ def test_frames_have_the_lidars_noise_and_saturate() -> None:
     assert scenes.infrared_frames(np.full((2, 2), 400.0), np.random.default_rng(0), 1).max() == 255
 
 
-def test_reference_matches_one_collected_from_frames() -> None:
-    generator = np.random.default_rng(0)
-    drawn = scenes.reference_of_wall(POSE, TINY, generator)
-    collected = BareWallStatistics(TINY)
-    truth_m = wall_depth(scenes.wall_from_lidar(POSE), TINY)
+@pytest.fixture
+def truth_m() -> np.ndarray:
+    return wall_depth(scenes.wall_from_lidar(POSE), TINY)
+
+
+@pytest.fixture
+def drawn() -> BareWall:
+    return scenes.reference_of_wall(POSE, TINY, np.random.default_rng(0))
+
+
+@pytest.fixture
+def collected(drawn: BareWall, truth_m: np.ndarray) -> BareWall:
+    """Reference collected from as many frames as the drawn one stands for."""
+    generator = np.random.default_rng(1)
+    statistics = BareWallStatistics(TINY)
+    ir = np.full((60, 80), 40, np.uint8)
     cells = np.zeros((64, 80), np.float32)
     for _ in range(scenes.REFERENCE_FRAMES):
-        collected.add(
-            scenes.noisy_depth(truth_m, generator).astype(np.float32),
-            np.full((60, 80), 40, np.uint8),
-            cells,
-            cells,
-        )
-    wall = collected.reference(drawn.inliers, serial="", settings={})
-    for reference in (drawn, wall):
-        pulls = (
-            (reference.depth_m - truth_m)
-            / (0.0005 + 0.002 * truth_m)
-            * np.sqrt(scenes.REFERENCE_FRAMES)
-        )
-        assert np.nanstd(pulls) == pytest.approx(1.0, abs=0.05)
-    assert np.nanmean(drawn.depth_std_m / wall.depth_std_m) == pytest.approx(1.0, abs=0.03)
-    assert set(vars(drawn)) == set(vars(wall))
+        depth_m = scenes.noisy_depth(truth_m, generator).astype(np.float32)
+        statistics.add(depth_m, ir, cells, cells)
+    return statistics.reference(drawn.inliers, serial="", settings={})
+
+
+@pytest.mark.parametrize("name", ["drawn", "collected"])
+def test_reference_is_as_noisy_as_a_mean_of_its_frames(
+    request: pytest.FixtureRequest, truth_m: np.ndarray, name: str
+) -> None:
+    reference = request.getfixturevalue(name)
+    std_m = (0.0005 + 0.002 * truth_m) / np.sqrt(scenes.REFERENCE_FRAMES)
+    assert np.nanstd((reference.depth_m - truth_m) / std_m) == pytest.approx(1.0, abs=0.05)
+
+
+def test_drawn_reference_has_the_spread_of_a_collected_one(
+    drawn: BareWall, collected: BareWall
+) -> None:
+    ratio = np.nanmean(drawn.depth_std_m / collected.depth_std_m)
+    assert ratio == pytest.approx(1.0, abs=0.03)
+
+
+def test_drawn_reference_has_the_arrays_of_a_collected_one(
+    drawn: BareWall, collected: BareWall
+) -> None:
+    assert set(vars(drawn)) == set(vars(collected))
     for name in ("depth_m", "ir", "saturated", "map_depth_m"):
-        assert getattr(drawn, name).dtype == getattr(wall, name).dtype
-        assert getattr(drawn, name).shape == getattr(wall, name).shape
+        assert getattr(drawn, name).dtype == getattr(collected, name).dtype
+        assert getattr(drawn, name).shape == getattr(collected, name).shape
 
 
 def test_multipath_is_longer_and_moves_and_a_sheet_is_nearer() -> None:

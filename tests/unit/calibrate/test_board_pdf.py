@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from nlos_calibration.board import BOARDS, PAPER_MM, Board, Paper
+from numpy.typing import NDArray
 
 from nlos_cam.calibrate.board_pdf import (
     BAR_MM,
@@ -20,31 +21,48 @@ DPI = 254
 PIXELS_PER_MM = DPI / 25.4
 
 
-@pytest.mark.parametrize("paper", BOARDS)
-def test_board_sheet_is_drawn_to_scale_with_a_bar_and_clear_margins(paper: Paper) -> None:
+@pytest.fixture(params=list(BOARDS))
+def paper(request: pytest.FixtureRequest) -> Paper:
+    return request.param
+
+
+@pytest.fixture
+def dots(paper: Paper) -> NDArray[np.uint8]:
+    """The sheet as printed, at ten dots per millimetre; 0 is black."""
     figure = board_figure(paper)
     figure.set_dpi(DPI)
     canvas = FigureCanvasAgg(figure)
     canvas.draw()
-    dots = np.asarray(canvas.buffer_rgba())[
-        ..., 0
-    ].copy()  # a sheet as printed, at ten dots per millimetre
+    return np.asarray(canvas.buffer_rgba())[..., 0].copy()
+
+
+def test_sheet_shows_the_board_to_scale(paper: Paper, dots: NDArray[np.uint8]) -> None:
     board = BOARDS[paper]
-    (left_mm, top_mm) = pattern_origin_mm(paper)
     pixels, ids, _, markers = cv2.aruco.CharucoDetector(board.opencv_board).detectBoard(dots)
     assert len(markers) == board.squares_x * board.squares_y // 2
     assert len(ids) == len(board.corners_m)
-    expected = (board.corners_m[ids.ravel(), :2] * 1e3 + [left_mm, top_mm]) * PIXELS_PER_MM - 0.5
+    corners_mm = board.corners_m[ids.ravel(), :2] * 1e3 + pattern_origin_mm(paper)
+    expected = corners_mm * PIXELS_PER_MM - 0.5
     np.testing.assert_allclose(pixels, expected, atol=0.6)  # 0.06 mm
+
+
+def test_bar_on_the_sheet_is_100_mm_long(paper: Paper, dots: NDArray[np.uint8]) -> None:
     (_, top_mm, _, height_mm), *_ = bar_mm(paper)
-    black = np.flatnonzero(dots[int((top_mm + height_mm / 2.0) * PIXELS_PER_MM)] < 128)
+    row = dots[int((top_mm + height_mm / 2.0) * PIXELS_PER_MM)]
+    black = np.flatnonzero(row < 128)
     assert len(black) == black[-1] - black[0] + 1
     assert len(black) / PIXELS_PER_MM == pytest.approx(BAR_MM, abs=0.15)
+
+
+def test_sheet_has_a_white_margin(dots: NDArray[np.uint8]) -> None:
     edge = int(5.0 * PIXELS_PER_MM)
-    frame = dots.copy()
-    frame[edge:-edge, edge:-edge] = 255
-    assert (frame == 255).all()
-    bottom = int((pattern_origin_mm(paper)[1] + BOARDS[paper].size_mm[1]) * PIXELS_PER_MM) + 1
+    dots[edge:-edge, edge:-edge] = 255
+    assert (dots == 255).all()
+
+
+def test_sheet_is_white_below_the_pattern(paper: Paper, dots: NDArray[np.uint8]) -> None:
+    bottom_mm = pattern_origin_mm(paper)[1] + BOARDS[paper].size_mm[1]
+    bottom = int(bottom_mm * PIXELS_PER_MM) + 1
     assert (dots[bottom : bottom + int(2.0 * PIXELS_PER_MM)] == 255).all()
 
 
@@ -53,12 +71,12 @@ def test_black_cells_are_those_that_opencv_draws() -> None:
     k = 48
     drawn = np.full((5 * k, 4 * k), 255, np.uint8)
     for left, top, width, height in black_cells(board, 0.0, 0.0):
-        rows, columns = ((start, start + size) for start, size in ((top, height), (left, width)))
-        drawn[slice(*(round(2 * at) for at in rows)), slice(*(round(2 * at) for at in columns))] = 0
+        rows = slice(round(2 * top), round(2 * (top + height)))
+        columns = slice(round(2 * left), round(2 * (left + width)))
+        drawn[rows, columns] = 0
     np.testing.assert_array_equal(drawn, board.pattern(k))
 
 
-@pytest.mark.parametrize("paper", list(BOARDS))
 def test_write_sheet_makes_a_vector_page_of_the_paper(tmp_path: Path, paper: Paper) -> None:
     write_board_pdf(tmp_path / "board.pdf", paper)
     content = (tmp_path / "board.pdf").read_bytes()

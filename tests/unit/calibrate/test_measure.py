@@ -8,7 +8,7 @@ import pytest
 from fake_wall import SERIAL, WallCamera
 from nlos_calibration.errors import CalibrationError, OccluderRefusedError, WallRefusedError
 from nlos_calibration.geometry import Intrinsics
-from nlos_calibration.reference import BareWallStatistics
+from nlos_calibration.reference import BareWall, BareWallStatistics
 from nlos_calibration.rig import LidarPose, Occluder, Rig, load_rig
 from nlos_calibration.wall import wall_depth
 from nlos_calibration.wall_record import MeasuredWall, new_wall_record
@@ -37,27 +37,43 @@ class Warming(WallCamera):
         return super().telemetry(ending)
 
 
-def test_collect_statistics_averages_all_frames() -> None:
-    wall = collect_statistics(Warming(20), 1000).reference(ALL)
-    frames = list(Warming(20))
-    maps = [maps_from_frame(frame) for frame in frames]
-    depths_m = [frame.depth_m.astype(np.float64) for frame in frames]
+@pytest.fixture(scope="module")
+def twenty() -> BareWall:
+    return collect_statistics(Warming(20), 1000).reference(ALL)
+
+
+def test_reference_is_the_mean_of_all_frames(twenty: BareWall) -> None:
+    depths_m = [frame.depth_m.astype(np.float64) for frame in Warming(20)]
+    np.testing.assert_allclose(twenty.depth_m, np.mean(depths_m, axis=0), rtol=1e-6)
+
+
+def test_reference_maps_are_the_means_of_the_frames_maps(twenty: BareWall) -> None:
+    maps = [maps_from_frame(frame) for frame in Warming(20)]
+    depth_m = np.mean([each.depth_m for each in maps], axis=0)
     counts = [np.where(each.valid, each.intensity, np.nan) for each in maps]
-    np.testing.assert_allclose(wall.depth_m, np.mean(depths_m, axis=0), rtol=1e-6)
-    np.testing.assert_allclose(
-        wall.map_depth_m, np.mean([each.depth_m for each in maps], axis=0), rtol=1e-6
-    )
-    np.testing.assert_allclose(wall.map_intensity, np.mean(counts, axis=0), rtol=1e-6)
-    assert (wall.frames, wall.serial, wall.settings) == (20, SERIAL, {"laser_power": 40.0})
+    np.testing.assert_allclose(twenty.map_depth_m, depth_m, rtol=1e-6)
+    np.testing.assert_allclose(twenty.map_intensity, np.mean(counts, axis=0), rtol=1e-6)
+
+
+def test_reference_names_the_device(twenty: BareWall) -> None:
+    assert twenty.frames == 20
+    assert twenty.serial == SERIAL
+    assert twenty.settings == {"laser_power": 40.0}
+
+
+def test_collect_statistics_stops_at_the_number_of_frames() -> None:
     assert collect_statistics(Warming(10), 4).statistics.depth.frames == 4
+
+
+def test_collect_statistics_refuses_a_camera_without_frames() -> None:
+    with pytest.raises(WallRefusedError, match="fake"):
+        collect_statistics(Warming(0), 1000)
 
 
 def test_statistics_read_temperatures_now_and_then() -> None:
     capture = collect_statistics(Warming(2 * measure.CELSIUS_EVERY + 1, celsius=30.0), 1000)
     assert capture.facts()["temperatures_c"] == {"ldd_temperature": 32.0}
     assert capture.reference(ALL).celsius_span == {"ldd_temperature": 2.0}
-    with pytest.raises(WallRefusedError, match="fake"):
-        collect_statistics(Warming(0), 1000)
 
 
 def seen_of(
@@ -78,12 +94,9 @@ def bench_seen(intrinsics: Intrinsics = INTRINSICS, **changes: object) -> Captur
     beams.
     """
     beams = cast(BENCH.model_copy(update=changes), intrinsics)
-    return seen_of(
-        (beams.length_m * beams.cos_axis).reshape(intrinsics.height, intrinsics.width),
-        20,
-        intrinsics,
-        1,
-    )
+    depth_m = beams.length_m * beams.cos_axis
+    shape = intrinsics.height, intrinsics.width
+    return seen_of(depth_m.reshape(shape), 20, intrinsics, 1)
 
 
 @pytest.fixture(scope="module")
@@ -106,15 +119,21 @@ def bare(seen: CaptureStatistics) -> MeasuredWall:
 def test_measure_occluder_finds_it_beside_the_known_wall(
     bare: MeasuredWall, x_m: float, gap_m: float
 ) -> None:
-    seen = bench_seen(occluder=Occluder(x_m=x_m, z_min_m=gap_m))
-    record, inliers = measure_occluder(seen, bare)
-    assert (record.occluder.source, record.verdict) == ("detected", "good")
-    assert (record.occluder.x_m, record.occluder.gap_m) == pytest.approx((x_m, gap_m), abs=0.002)
-    assert record.rig.occluder == Occluder(x_m=record.occluder.x_m, z_min_m=record.occluder.gap_m)
+    record, _ = measure_occluder(bench_seen(occluder=Occluder(x_m=x_m, z_min_m=gap_m)), bare)
+    found = record.occluder
+    assert found.source == "detected"
+    assert found.x_m == pytest.approx(x_m, abs=0.002)
+    assert found.gap_m == pytest.approx(gap_m, abs=0.002)
+    assert record.verdict == "good"
+    assert record.rig.occluder == Occluder(x_m=found.x_m, z_min_m=found.gap_m)
     assert record.rig.lidar == bare.record.rig.lidar
-    far = (
-        np.abs(wall_depth(RIG.wall_from_lidar, INTRINSICS) - seen.statistics.depth.mean_m()) > 0.02
-    )
+
+
+def test_walls_pixels_are_those_beside_the_occluder(bare: MeasuredWall) -> None:
+    seen = bench_seen()
+    _, inliers = measure_occluder(seen, bare)
+    wall_m = wall_depth(RIG.wall_from_lidar, INTRINSICS)
+    far = np.abs(wall_m - seen.statistics.depth.mean_m()) > 0.02
     assert 0.1 < far.mean() < 0.5
     assert not (inliers & far).any()
     assert inliers[~far].mean() > 0.95
@@ -149,17 +168,29 @@ def test_measure_occluder_is_not_moved_by_an_origin_offset(seen: CaptureStatisti
     assert record.occluder.x_std_m == pytest.approx(0.0005, rel=0.02)  # the tape's
 
 
-def test_measure_occluder_notices_another_camera_and_settings(
-    bare: MeasuredWall, seen: CaptureStatistics
-) -> None:
+def test_measure_occluder_refuses_another_image_size(bare: MeasuredWall) -> None:
     with pytest.raises(CalibrationError, match=r"160x120.*80x60"):
         measure_occluder(bench_seen(RIG.pinhole.scaled(80, 60)), bare)
-    now = replace(bench_seen(), serial="f2", settings={"laser_power": 40.0})
+
+
+def test_measure_occluder_refuses_another_camera(bare: MeasuredWall) -> None:
+    first = replace(bare, record=bare.record.model_copy(update={"serial": "f1"}))
     with pytest.raises(CalibrationError, match=r"f1.*f2"):
-        measure_occluder(now, replace(bare, record=bare.record.model_copy(update={"serial": "f1"})))
+        measure_occluder(replace(bench_seen(), serial="f2"), first)
+
+
+def test_measure_occluder_warns_of_changed_settings(
+    bare: MeasuredWall, seen: CaptureStatistics
+) -> None:
     then = replace(seen, settings={"laser_power": 80.0}).reference(np.ones((120, 160), np.bool_))
+    now = replace(bench_seen(), settings={"laser_power": 40.0})
     record, _ = measure_occluder(now, replace(bare, reference=then))
     assert re.search("laser_power.*80.*40", record.warnings[-1])
+
+
+def test_measure_occluder_refuses_a_bench_without_one(
+    bare: MeasuredWall, seen: CaptureStatistics
+) -> None:
     with pytest.raises(OccluderRefusedError, match="--occluder-x-m"):
         measure_occluder(seen, bare)
 
@@ -180,17 +211,17 @@ def test_fit_frame_measures_wall_in_a_thinned_frame(
 ) -> None:
     pose = LidarPose(distance_m=distance_m, yaw_deg=yaw_deg)
     seen = fit_frame(frame_of(RIG.model_copy(update={"lidar": pose}), width, height))
-    assert seen.fit.distance_m == pytest.approx(
-        distance_m, abs=max(0.0005, 4 * seen.fit.distance_std_m)
-    )
-    assert seen.fit.yaw_deg == pytest.approx(yaw_deg, abs=max(0.1, 4 * seen.fit.yaw_std_deg))
+    within_m = max(0.0005, 4 * seen.fit.distance_std_m)
+    within_deg = max(0.1, 4 * seen.fit.yaw_std_deg)
+    assert seen.fit.distance_m == pytest.approx(distance_m, abs=within_m)
+    assert seen.fit.yaw_deg == pytest.approx(yaw_deg, abs=within_deg)
 
 
 def test_fit_frame_reports_refusal_and_saturation() -> None:
     frame = frame_of(RIG, 640, 480)
-    seen = fit_frame(
-        replace(frame, depth_m=np.full_like(frame.depth_m, np.nan), ir=np.full_like(frame.ir, 255))
-    )
+    nothing = np.full_like(frame.depth_m, np.nan)
+    blinded = np.full_like(frame.ir, 255)
+    seen = fit_frame(replace(frame, depth_m=nothing, ir=blinded))
     assert seen.fit is None
     assert "0.0%" in seen.refusal
     assert seen.saturated == 1.0

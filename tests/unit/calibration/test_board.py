@@ -7,6 +7,7 @@ import pytest
 from nlos_calibration.arrays import Float64
 from nlos_calibration.board import BOARDS, MIN_CORNERS, Board, Corners, find_corners
 from nlos_calibration.board_pose import (
+    BoardPose,
     CornerObservations,
     PrintErrors,
     _linear,
@@ -20,8 +21,7 @@ from nlos_calibration.rig import load_rig
 from nlos_calibration.wall import WallMeasures, measures_of
 from pydantic import ValidationError
 from synthetic_scenes import Illumination, at_near_edge, clean_infrared, corners_px, infrared_frames
-
-from nlos_cam.calibrate import View
+from synthetic_walls import View
 
 PRINT_STD = np.array([0.0035, 0.0003, 0.0003])
 TRUE = np.array([0.1, 0.7, 0.05, -0.11, -0.13, 0.30, 0.004, 0.0005, -0.0003])
@@ -34,6 +34,7 @@ RIG = load_rig("bare-wall")
 
 
 def of_bench(**light: float) -> tuple[Float64, Float64]:
+    """Return the clean infrared of a board on the wall of the rig, and its corners in pixels."""
     seen = View(RIG.wall_from_lidar, RIG.pinhole)
     placed = at_near_edge(A4, seen)
     return clean_infrared(A4, seen, placed, Illumination(**light)), corners_px(A4, seen, placed)
@@ -64,19 +65,22 @@ def test_board_that_cannot_exist_is_refused(changed: dict[str, object], problem:
         Board.model_validate(small | changed)
 
 
-@pytest.mark.parametrize(
-    ("counts", "least", "error_px"), [(None, 25, 0.15), (6.0, 20, 0.3), (600.0, 20, 0.3)]
-)
-def test_find_corners_locates_them_at_any_brightness(
-    counts: float | None, least: int, error_px: float
-) -> None:
-    clean, true_px = of_bench() if counts is None else of_bench(brightest_counts=counts)
+def test_corners_of_a_well_lit_board_are_found_without_bias() -> None:
+    clean, true_px = of_bench()
     found = find_corners(mean_of(clean), A4)
-    assert len(found.ids) >= least
     errors_px = found.pixels - true_px[found.ids]
-    assert np.median(np.linalg.norm(errors_px, axis=1)) < error_px
-    assert counts or np.sqrt(np.mean(errors_px**2)) < error_px
-    assert counts or np.abs(np.median(errors_px, axis=0)).max() < 0.1
+    assert len(found.ids) >= 25
+    assert np.sqrt(np.mean(errors_px**2)) < 0.15
+    assert np.abs(np.median(errors_px, axis=0)).max() < 0.1
+
+
+@pytest.mark.parametrize("counts", [6.0, 600.0])
+def test_corners_are_found_at_any_brightness(counts: float) -> None:
+    clean, true_px = of_bench(brightest_counts=counts)
+    found = find_corners(mean_of(clean), A4)
+    errors_px = found.pixels - true_px[found.ids]
+    assert len(found.ids) >= 20
+    assert np.median(np.linalg.norm(errors_px, axis=1)) < 0.3
 
 
 @pytest.mark.slow
@@ -92,33 +96,43 @@ def test_find_corners_without_a_board_advises_on_the_light(value: int) -> None:
     blank = np.full((480, 640), value, np.uint8)
     with pytest.raises(BoardRefusedError, match="toner"):
         find_corners(blank, A4)
-    with pytest.raises(BoardRefusedError, match="in colour"):
-        find_corners(blank, A4, "colour")
 
 
-def test_find_corners_refuses_mirrored_hidden_and_other_boards() -> None:
+def test_mirrored_board_is_refused() -> None:
     clean, _ = of_bench()
     mirrored = clean[:, ::-1] + np.random.default_rng(0).normal(0.0, 0.1, clean.shape)
     with pytest.raises(BoardRefusedError, match="mirrored"):
         find_corners(mirrored, A4)
-    hidden = mean_of(clean)
+
+
+def test_board_mostly_out_of_view_is_refused_with_its_corners() -> None:
+    hidden = mean_of(of_bench()[0])
     hidden[:, 150:] = 0.0
     with pytest.raises(BoardRefusedError, match=rf"^\d corners .*{MIN_CORNERS} "):
         find_corners(hidden, A4)
+
+
+def test_board_of_another_dictionary_is_refused() -> None:
+    clean, _ = of_bench()
+    other = BOARDS["a3"].model_copy(update={"dictionary": "DICT_4X4_250", "squares_x": 5})
     with pytest.raises(BoardRefusedError):
-        find_corners(
-            clean, BOARDS["a3"].model_copy(update={"dictionary": "DICT_4X4_250", "squares_x": 5})
-        )
+        find_corners(clean, other)
 
 
 def seen_of(
     parameters: Float64, sigma_px: float, generator: np.random.Generator
 ) -> CornerObservations:
+    """Return the corners of a print with these nine parameters, with noise."""
     drawn = CornerObservations(
-        *(A4.corners_m, np.zeros((40, 2)), PINHOLE.matrix),
-        *(np.array(A4.size_mm) * 1e-3, PRINT_STD, max(sigma_px, 1e-3) ** 2),
+        points_m=A4.corners_m,
+        pixels=np.zeros((40, 2)),
+        camera=PINHOLE.matrix,
+        size_m=np.array(A4.size_mm) * 1e-3,
+        print_std=PRINT_STD,
+        variance_px2=max(sigma_px, 1e-3) ** 2,
     )
-    pixels = -_linear(drawn, parameters)[1][:-3].reshape(-1, 2) * np.sqrt(drawn.variance_px2)
+    _, errors = _linear(drawn, parameters)
+    pixels = -errors[:-3].reshape(-1, 2) * np.sqrt(drawn.variance_px2)
     return replace(drawn, pixels=pixels + sigma_px * generator.standard_normal(pixels.shape))
 
 
@@ -153,28 +167,38 @@ def measures(found: Corners, board: Board = A4, **fit: Any) -> WallMeasures:
     return measures_of(plane.slopes, plane.covariance)
 
 
-def test_solve_pose_finds_stretch_and_bow_or_refuses_ambiguity() -> None:
+def test_solve_pose_finds_stretch_and_bows() -> None:
     pose = solve_pose(seen_of(TRUE, 0.02, np.random.default_rng(0)))
     assert (np.abs(pose.parameters[6:] - TRUE[6:]) < [5e-4, 1e-4, 1e-4]).all()
+
+
+def test_solve_pose_refuses_two_poses_that_fit_equally_well() -> None:
     far = np.array([0.0, 0.35, 0.0, -0.09, -0.135, 4.0, 0.0, 0.0, 0.0])
     with pytest.raises(BoardRefusedError, match=r"\d+ degrees"):
         solve_pose(seen_of(far, 0.5, np.random.default_rng(0)))
 
 
-def test_board_pose_slopes_and_covariance_are_those_of_its_plane() -> None:
-    pose = refine_pose(seen_of(TRUE, 0.1, np.random.default_rng(0)), TRUE)
-    slopes, covariance = pose.slopes()
-    corner_m = cv2.Rodrigues(pose.parameters[:3])[0] @ [0.1, 0.2, 0.0] + pose.parameters[3:6]
-    assert slopes @ corner_m == pytest.approx(1.0)  # points p of the plane have slopes . p = 1
+@pytest.fixture(scope="module")
+def refined() -> BoardPose:
+    return refine_pose(seen_of(TRUE, 0.1, np.random.default_rng(0)), TRUE)
+
+
+def test_slopes_are_those_of_the_boards_plane(refined: BoardPose) -> None:
+    rotation = cv2.Rodrigues(refined.parameters[:3])[0]
+    point_m = rotation @ [0.1, 0.2, 0.0] + refined.parameters[3:6]
+    slopes, _ = refined.slopes()
+    assert slopes @ point_m == pytest.approx(1.0)
+
+
+def test_slopes_have_the_poses_covariance_by_their_derivatives(refined: BoardPose) -> None:
+    slopes, covariance = refined.slopes()
     step = 1e-7
     by_pose = np.zeros((3, 6))
     for k in range(6):
-        by_pose[:, k] = (
-            replace(pose, parameters=pose.parameters + step * np.eye(9)[k]).slopes()[0] - slopes
-        ) / step
-    np.testing.assert_allclose(
-        covariance, by_pose @ pose.covariance[:6, :6] @ by_pose.T, rtol=1e-4, atol=1e-8
-    )
+        moved = replace(refined, parameters=refined.parameters + step * np.eye(9)[k])
+        by_pose[:, k] = (moved.slopes()[0] - slopes) / step
+    expected = by_pose @ refined.covariance[:6, :6] @ by_pose.T
+    np.testing.assert_allclose(covariance, expected, rtol=1e-4, atol=1e-8)
 
 
 def test_fit_board_of_exact_corners_is_exact() -> None:
@@ -187,7 +211,8 @@ def test_fit_board_of_exact_corners_is_exact() -> None:
 
 def test_fit_board_covariance_grows_with_the_residuals() -> None:
     flat = PrintErrors(1e-9, 1e-9, 1e-9)
-    quiet, loud = (fit_board(corners(sigma_px=sigma), A4, PINHOLE, flat) for sigma in (0.05, 0.2))
+    quiet = fit_board(corners(sigma_px=0.05), A4, PINHOLE, flat)
+    loud = fit_board(corners(sigma_px=0.2), A4, PINHOLE, flat)
     assert loud.residual_px == pytest.approx(0.2, rel=0.3)
     np.testing.assert_allclose(loud.covariance, 16.0 * quiet.covariance, rtol=0.3, atol=1e-7)
 
@@ -207,29 +232,16 @@ def test_fit_board_of_a_scaled_print_shifts_only_the_distance(scale: float) -> N
     wall = measures(found)
     assert wall.distance_m == pytest.approx(DISTANCE_M / scale, rel=0.01)
     assert wall.yaw_deg == pytest.approx(45.0, abs=0.2)
-    assert measures(found, A4.measured(30.0 * scale)).distance_m == pytest.approx(
-        DISTANCE_M, rel=0.003
-    )
+    measured = measures(found, A4.measured(30.0 * scale))
+    assert measured.distance_m == pytest.approx(DISTANCE_M, rel=0.003)
 
 
 def test_fit_board_scale_uncertainty_is_one_of_the_distance() -> None:
-    exact, ruled = (measures(corners(), printed=PrintErrors(scale_std=std)) for std in (0.0, 0.01))
-    assert ruled.distance_std_m == pytest.approx(
-        np.hypot(exact.distance_std_m, 0.01 * exact.distance_m)
-    )
+    exact = measures(corners(), printed=PrintErrors(scale_std=0.0))
+    ruled = measures(corners(), printed=PrintErrors(scale_std=0.01))
+    expected_m = np.hypot(exact.distance_std_m, 0.01 * exact.distance_m)
+    assert ruled.distance_std_m == pytest.approx(expected_m)
     assert ruled.yaw_std_deg == pytest.approx(exact.yaw_std_deg)
-
-
-def test_fit_board_covariance_holds_the_focal_length_error() -> None:
-    exact, unsure = (
-        fit_board(corners(sigma_px=0.0), A4, PINHOLE, focal_std=std) for std in (0.0, 1e-4)
-    )
-    longer = replace(PINHOLE, fx=PINHOLE.fx * 1.0001, fy=PINHOLE.fy * 1.0001)
-    change = fit_board(corners(sigma_px=0.0), A4, longer).slopes - exact.slopes
-    np.testing.assert_allclose(
-        unsure.covariance - exact.covariance, np.outer(change, change), rtol=0.02, atol=1e-11
-    )
-    assert np.linalg.norm(change) > 1e-5
 
 
 @pytest.mark.parametrize(
@@ -248,24 +260,34 @@ def test_fit_board_refuses_a_print_out_of_shape(points_m: Float64) -> None:
         fit_board(corners(points_m, sigma_px=0.03), A4, PINHOLE)
 
 
-def test_fit_board_refuses_wrong_intrinsics_and_weak_views() -> None:
-    found = corners()
+def test_fit_board_refuses_wrong_intrinsics() -> None:
     with pytest.raises(BoardRefusedError):
-        fit_board(found, A4, Intrinsics(640, 480, 457.0, 520.0, 300.0, 200.0))
+        fit_board(corners(), A4, Intrinsics(640, 480, 457.0, 520.0, 300.0, 200.0))
+
+
+def test_fit_board_refuses_corners_in_one_column() -> None:
+    found = corners()
     column = found.ids % 5 == 2
+    with pytest.raises(BoardRefusedError):
+        fit_board(Corners(found.ids[column], found.pixels[column]), A4, PINHOLE)
+
+
+def noise_px() -> Float64:
+    return np.random.default_rng(0).standard_normal((40, 2))
+
+
+def test_fit_board_refuses_a_board_edge_on() -> None:
+    pixels = projected(A4.corners_m, 0.02, normal_from_angles(np.radians(89.0), 0.0))
+    with pytest.raises(BoardRefusedError):
+        fit_board(Corners(np.arange(40), pixels + 0.2 * noise_px()), A4, PINHOLE)
+
+
+def test_fit_board_refuses_a_tiny_board_far_away() -> None:
     tiny = A4.measured(1.0)
-    far = projected(
-        tiny.corners_m + np.array([0.0875, 0.131, 0.0]), 0.4, normal_from_angles(0.5, 0.0)
-    )
-    edge_on = projected(A4.corners_m, 0.02, normal_from_angles(np.radians(89.0), 0.0))
-    noise = np.random.default_rng(0).standard_normal(edge_on.shape)
-    for board, weak in (
-        (A4, Corners(found.ids[column], found.pixels[column])),
-        (A4, Corners(found.ids, edge_on + 0.2 * noise)),
-        (tiny, Corners(found.ids, far + 0.05 * noise)),
-    ):
-        with pytest.raises(BoardRefusedError):
-            fit_board(weak, board, PINHOLE)
+    middle_m = np.array([0.0875, 0.131, 0.0])
+    pixels = projected(tiny.corners_m + middle_m, 0.4, normal_from_angles(0.5, 0.0))
+    with pytest.raises(BoardRefusedError):
+        fit_board(Corners(np.arange(40), pixels + 0.05 * noise_px()), tiny, PINHOLE)
 
 
 @pytest.mark.parametrize("kind", ["scattered", "in a line", "mirrored", "in a heap"])

@@ -1,194 +1,160 @@
 from dataclasses import replace
 from functools import cache
-from typing import Any
 
-import cv2
 import numpy as np
 import pytest
-from board_trials import CALIBRATION, ColorCamera, bench_at, through_lens
-from nlos_calibration import (
-    BOARDS,
-    Corners,
-    Light,
-    PrintErrors,
-    board_wall,
-    load_rig,
-    normal_from_angles,
-)
+from nlos_calibration import BOARDS, BoardRecord, board_wall, load_rig, normal_from_angles
 from nlos_calibration.arrays import Float64
-from nlos_calibration.board_wall import (
-    EXACT,
-    BoardView,
-    UncertainPlane,
-    combine,
-    plane_in_lidar,
-    wall_with_board,
-)
+from nlos_calibration.board_wall import Combined, UncertainPlane, combine, wall_with_board
 from nlos_calibration.errors import BoardRefusedError, WallRefusedError
-from nlos_calibration.wall import WallFit, WallMeasures, fit_wall, measures_of
-from synthetic_scenes import at_near_edge, clean_infrared, corners_px, infrared_frames
-
-from nlos_cam.calibrate import View, depth_statistics
+from nlos_calibration.wall import WallFit, fit_wall
+from synthetic_scenes import at_near_edge, clean_infrared, infrared_frames
+from synthetic_walls import View, depth_statistics
 
 RIG = load_rig("bare-wall")
 PINHOLE = RIG.pinhole
 A4 = BOARDS["a4"]
-SLOPES = np.array([1.2, -0.4, 3.5])
-POSE = np.eye(4)
-POSE[:3, :3] = cv2.Rodrigues(np.array([0.1, -0.3, 0.05]))[0]
-POSE[:3, 3] = [0.02, -0.014, 0.007]
-NO_PRINT = PrintErrors(0.0, 1e-9, 1e-9)
-
-
-def moved(slopes: Float64) -> Float64:
-    return plane_in_lidar(slopes, np.zeros((3, 3)), POSE, EXACT)[0]
-
-
-def test_plane_in_lidar_moves_plane_and_covariance_or_is_refused_between_camera_and_lidar() -> None:
-    rays = np.column_stack([np.random.default_rng(0).uniform(-0.5, 0.5, (20, 2)), np.ones(20)])
-    points = rays / (rays @ SLOPES)[:, np.newaxis]
-    there = points @ POSE[:3, :3].T + POSE[:3, 3]
-    np.testing.assert_allclose(there @ moved(SLOPES), 1.0, rtol=1e-12)
-    steps = 1e-6 * np.eye(3)
-    by_slopes = np.stack(
-        [(moved(SLOPES + step) - moved(SLOPES - step)) / 2e-6 for step in steps], axis=1
-    )
-    root = np.random.default_rng(1).standard_normal((3, 3)) * 1e-3
-    covariance = plane_in_lidar(SLOPES, root @ root.T, POSE, EXACT)[1]
-    np.testing.assert_allclose(
-        covariance, by_slopes @ root @ root.T @ by_slopes.T, rtol=1e-5, atol=1e-12
-    )
-    behind = POSE.copy()
-    behind[:3, 3] = POSE[:3, :3] @ (-2.0 * SLOPES / (SLOPES @ SLOPES))
-    with pytest.raises(BoardRefusedError, match="between"):
-        plane_in_lidar(SLOPES, np.zeros((3, 3)), behind, EXACT)
-
-
-def test_fit_in_lidar_of_exact_corners_needs_lens_and_pose() -> None:
-    bench = bench_at(0.25, 40.0, 5.0)
-    straight = corners_px(A4, ColorCamera().view(bench.seen), bench.placed)
-    inside = np.flatnonzero(((straight > 0.0) & (straight < [1280.0, 720.0])).all(axis=1))
-    corners = Corners(inside, through_lens(straight[inside]))
-
-    def found(**change: Any) -> WallMeasures:
-        fit = board_wall.fit_in_lidar(corners, A4, replace(CALIBRATION, **change), NO_PRINT)
-        return measures_of(fit.slopes, fit.covariance)
-
-    exact = found(errors=EXACT)
-    assert (exact.distance_m, exact.yaw_deg, exact.pitch_deg) == pytest.approx(
-        (0.25, 40.0, 5.0), abs=1e-4
-    )
-    for wrong in (found(distortion=np.zeros(5)), found(lidar_from_camera=np.eye(4))):
-        assert abs(wrong.distance_m - 0.25) > 3.0 * wrong.distance_std_m
+TRUE_M = 0.2
+PRINTED_AT_97_PERCENT_M = TRUE_M / 0.97
+"""Distance that squares taken for 30 mm give if they are 29.1 mm."""
+CHI2_95_OF_3 = 7.815
+"""95 % of a chi-square of three degrees of freedom lie below."""
+REFUSAL = WallRefusedError("the wall is not flat: take another")
 
 
 @cache
-def infrared(scale: float = 1.0) -> BoardView:
-    """The mean of 20 frames of a board of that scale on the wall of the rig."""
+def infrared(scale: float = 1.0) -> Float64:
+    """Mean of 20 frames of a board, printed at that scale, on the wall of the rig."""
     seen = View(RIG.wall_from_lidar, PINHOLE)
     placed = replace(at_near_edge(A4, seen), scale=scale)
-    frames = infrared_frames(clean_infrared(A4, seen, placed), np.random.default_rng(0), 20)
-    return BoardView(frames.mean(axis=0), PINHOLE)
+    clean = clean_infrared(A4, seen, placed)
+    return infrared_frames(clean, np.random.default_rng(0), 20).mean(axis=0)
 
 
 @pytest.fixture(scope="module")
 def depth() -> WallFit:
     depth_m = View(RIG.wall_from_lidar, PINHOLE).depth_m
-    mean = depth_statistics(depth_m, np.random.default_rng(0), frames=20, noise=1.0)
+    mean = depth_statistics(depth_m, np.random.default_rng(0), frames=20)
     return fit_wall(mean.mean_m(), PINHOLE, np.random.default_rng(0), mean.noise())
 
 
-def test_wall_with_board_combines_planes_that_agree_and_keeps_a_doubt_of_the_depth(
-    depth: WallFit,
-) -> None:
-    fit, record = wall_with_board(depth, infrared(), A4, measured=False)
+@pytest.fixture(scope="module")
+def agreed(depth: WallFit) -> tuple[WallFit, BoardRecord]:
+    """Wall of depth and a board printed to scale."""
+    fit, record = wall_with_board(depth, infrared(), PINHOLE, A4, measured=False)
     assert isinstance(fit, WallFit)
-    assert (fit.verdict, record.used, record.causes, record.depth_refused) == (
-        "good",
-        "both",
-        (),
-        "",
-    )
-    assert (fit.distance_m, fit.facing_deg) == pytest.approx((0.2, 45.0), abs=0.02)
-    assert fit.distance_std_m <= depth.distance_std_m
-    assert record.disagreement_m == pytest.approx(record.distance_m - depth.distance_m)
-    assert record.disagreement_sigmas < 4.0
-    np.testing.assert_allclose(fit.wall_from_lidar[2, 3], fit.distance_m)
-    doubted = replace(depth, verdict="doubtful", advice="half of the view differs")
-    fit, _ = wall_with_board(doubted, infrared(), A4, measured=False)
-    assert (fit.verdict, fit.advice) == ("doubtful", "half of the view differs")
+    return fit, record
 
 
-@pytest.mark.parametrize(("measured", "used"), [(False, "depth"), (True, "board")])
-def test_wall_with_board_doubts_a_print_at_97_percent(
-    depth: WallFit, measured: bool, used: str
+def test_depth_and_board_that_agree_are_combined(agreed: tuple[WallFit, BoardRecord]) -> None:
+    fit, record = agreed
+    assert fit.verdict == "good"
+    assert record.used == "both"
+    assert record.causes == ()
+    assert record.depth_refused == ""
+
+
+def test_combined_wall_is_true_and_at_least_as_certain(
+    agreed: tuple[WallFit, BoardRecord], depth: WallFit
 ) -> None:
-    fit, record = wall_with_board(depth, infrared(0.97), A4, measured=measured)
-    assert (fit.verdict, record.used) == ("doubtful", used)
-    assert record.disagreement_m == pytest.approx(0.2 / 0.97 - 0.2, abs=5e-4)
+    fit, _ = agreed
+    assert fit.distance_m == pytest.approx(TRUE_M, abs=0.02)
+    assert fit.facing_deg == pytest.approx(45.0, abs=0.02)
+    assert fit.distance_std_m <= depth.distance_std_m
+    assert fit.wall_from_lidar[2, 3] == pytest.approx(fit.distance_m)
+
+
+def test_record_holds_the_boards_distance_less_the_depths(
+    agreed: tuple[WallFit, BoardRecord], depth: WallFit
+) -> None:
+    _, record = agreed
+    assert record.disagreement_m == pytest.approx(record.distance_m - depth.distance_m)
+    assert record.disagreement_sigmas < board_wall.AGREE_SIGMAS
+
+
+def test_agreeing_board_keeps_a_doubtful_verdict_of_the_depth(depth: WallFit) -> None:
+    doubtful = replace(depth, verdict="doubtful", advice="half of the view differs")
+    fit, _ = wall_with_board(doubtful, infrared(), PINHOLE, A4, measured=False)
+    assert fit.verdict == "doubtful"
+    assert fit.advice == "half of the view differs"
+
+
+@pytest.mark.parametrize(
+    ("measured", "used", "distance_m"),
+    [(False, "depth", TRUE_M), (True, "board", PRINTED_AT_97_PERCENT_M)],
+)
+def test_board_printed_at_97_percent_makes_the_wall_doubtful(
+    depth: WallFit, measured: bool, used: str, distance_m: float
+) -> None:
+    fit, record = wall_with_board(depth, infrared(0.97), PINHOLE, A4, measured=measured)
+    assert fit.verdict == "doubtful"
+    assert fit.distance_m == pytest.approx(distance_m, abs=5e-4)
+    assert record.used == used
+    assert record.disagreement_m == pytest.approx(PRINTED_AT_97_PERCENT_M - TRUE_M, abs=5e-4)
     assert used in fit.advice
     assert ("scale" in fit.advice) is not measured
-    assert fit.distance_m == pytest.approx(0.2 / 0.97 if measured else 0.2, abs=5e-4)
 
 
-@pytest.mark.parametrize("light", ["infrared", "colour"])
-def test_wall_with_board_in_colour_may_blame_the_colour_camera(
-    depth: WallFit, light: Light
-) -> None:
-    fit, record = wall_with_board(depth, replace(infrared(0.97), light=light), A4, measured=False)
-    assert record.seen_in == light
-    for text in (fit.advice, record.causes[-1]):
-        assert ("color camera" in text) is (light == "colour")
-    _, agreed = wall_with_board(depth, replace(infrared(), light=light), A4, measured=False)
-    assert (agreed.seen_in, agreed.causes) == (light, ())
-
-
-def test_wall_with_board_doubts_board_alone_and_gives_advice() -> None:
-    refusal = WallRefusedError("the wall is not flat: take another")
-    fit, record = wall_with_board(refusal, infrared(), A4, measured=False)
+def test_board_alone_gives_a_doubtful_wall_near_the_truth() -> None:
+    fit, record = wall_with_board(REFUSAL, infrared(), PINHOLE, A4, measured=False)
     assert isinstance(fit, board_wall.WallByBoard)
-    assert (fit.verdict, record.used, record.depth_refused) == ("doubtful", "board", str(refusal))
-    assert str(refusal) in fit.advice
-    assert record.disagreement_m is record.disagreement_deg is record.disagreement_sigmas is None
-    assert fit.distance_m == pytest.approx(0.2, abs=3.0 * fit.distance_std_m)
+    assert fit.verdict == "doubtful"
+    assert fit.distance_m == pytest.approx(TRUE_M, abs=3.0 * fit.distance_std_m)
     assert fit.distance_m == record.distance_m
     np.testing.assert_allclose(fit.wall_from_lidar, RIG.wall_from_lidar, atol=3e-3)
-    far, _ = wall_with_board(refusal, infrared(), A4.measured(60.0), measured=True)
-    assert far.distance_m == pytest.approx(0.4, abs=0.005)
-    assert "10 cm" in far.advice
 
 
-def test_wall_with_board_refusal_names_the_light(depth: WallFit) -> None:
-    for view, light in (
-        (BoardView(np.full((480, 640), 40.0), PINHOLE), "infrared"),
-        (CALIBRATION, "colour"),
-    ):
-        with pytest.raises(BoardRefusedError, match=light):
-            wall_with_board(depth, view, A4, measured=False)
+def test_board_alone_names_why_the_depth_was_refused() -> None:
+    fit, record = wall_with_board(REFUSAL, infrared(), PINHOLE, A4, measured=False)
+    assert str(REFUSAL) in fit.advice
+    assert record.used == "board"
+    assert record.depth_refused == str(REFUSAL)
+    assert record.disagreement_m is None
+    assert record.disagreement_deg is None
+    assert record.disagreement_sigmas is None
+
+
+def test_board_alone_advises_to_move_a_lidar_too_far_away() -> None:
+    twice = A4.measured(2.0 * A4.square_mm)
+    fit, _ = wall_with_board(REFUSAL, infrared(), PINHOLE, twice, measured=True)
+    assert fit.distance_m == pytest.approx(2.0 * TRUE_M, abs=0.005)
+    assert "10 cm" in fit.advice
+
+
+def test_image_without_a_board_is_refused(depth: WallFit) -> None:
+    blank = np.full((480, 640), 40.0)
+    with pytest.raises(BoardRefusedError, match="infrared"):
+        wall_with_board(depth, blank, PINHOLE, A4, measured=False)
 
 
 def plane(
     distance_m: float, yaw_deg: float = 45.0, *, std_m: float = 1e-4, std_deg: float = 0.02
 ) -> UncertainPlane:
+    """Return a plane whose distance and angles are known independently."""
     normal = normal_from_angles(np.radians(yaw_deg), 0.1)
     along = np.outer(normal, normal)
-    covariance = (std_m / distance_m**2) ** 2 * along
-    return UncertainPlane(
-        -normal / distance_m,
-        covariance + (np.radians(std_deg) / distance_m) ** 2 * (np.eye(3) - along),
-    )
+    across = np.eye(3) - along
+    by_distance = (std_m / distance_m**2) ** 2 * along
+    by_angle = (np.radians(std_deg) / distance_m) ** 2 * across
+    return UncertainPlane(-normal / distance_m, by_distance + by_angle)
 
 
-def shaken(of: UncertainPlane, generator: np.random.Generator) -> UncertainPlane:
-    return UncertainPlane(generator.multivariate_normal(of.slopes, of.covariance), of.covariance)
+def drawn(true: UncertainPlane, generator: np.random.Generator) -> UncertainPlane:
+    """Return a measurement of the plane with its errors."""
+    slopes = generator.multivariate_normal(true.slopes, true.covariance)
+    return UncertainPlane(slopes, true.covariance)
 
 
-def test_combine_of_equal_planes_halves_the_covariance_and_keeps_an_exact_plane() -> None:
+def test_combine_of_equal_planes_halves_the_covariance() -> None:
     both = combine(plane(0.2), plane(0.2), measured=False)
-    assert (both.used, both.causes) == ("both", ())
+    assert both.used == "both"
+    assert both.causes == ()
     np.testing.assert_allclose(both.plane.slopes, plane(0.2).slopes)
     np.testing.assert_allclose(both.plane.covariance, 0.5 * plane(0.2).covariance)
     assert both.disagreement.sigmas == pytest.approx(0.0, abs=1e-9)
+
+
+def test_combine_keeps_an_exact_plane() -> None:
     exact = UncertainPlane(plane(0.2).slopes, np.zeros((3, 3)))
     both = combine(exact, plane(0.2001), measured=False)
     np.testing.assert_allclose(both.plane.slopes, exact.slopes)
@@ -202,53 +168,80 @@ def test_combine_takes_each_quantity_from_the_better_plane() -> None:
     assert both.plane.distance_m == pytest.approx(0.2, abs=2e-5)
     assert both.plane.normal @ board.normal == pytest.approx(1.0, abs=1e-7)
     for one in (depth, board):
-        assert (np.linalg.eigvalsh(one.covariance - both.plane.covariance) > -1e-9).all()
+        gain = one.covariance - both.plane.covariance
+        assert (np.linalg.eigvalsh(gain) > -1e-9).all()
 
 
-def test_disagreement_has_distance_angle_and_sigmas() -> None:
-    apart = board_wall.disagreement(plane(0.2, 45.0), plane(0.2003, 45.0))
+def test_disagreement_in_distance_is_in_joint_uncertainties() -> None:
+    apart = board_wall.disagreement(plane(0.2), plane(0.2003))
     assert apart.distance_m == pytest.approx(0.0003)
     assert apart.angle_deg == pytest.approx(0.0, abs=1e-6)
     assert apart.distance_sigmas == pytest.approx(0.3 / np.hypot(0.1, 0.1), rel=0.01)
     assert apart.angle_sigmas < 1e-6
+
+
+def test_disagreement_in_angle_is_in_joint_uncertainties() -> None:
     turned = board_wall.disagreement(plane(0.2, 45.0), plane(0.2, 45.1))
+    # on a wall pitched by 0.1, a turn in yaw moves the normal by its cosine
     expected_deg = 0.1 * np.cos(0.1)
     assert turned.angle_deg == pytest.approx(expected_deg, rel=1e-3)
     assert turned.angle_sigmas == pytest.approx(expected_deg / np.hypot(0.02, 0.02), rel=0.01)
     assert turned.distance_sigmas < 0.1
 
 
-def test_combine_rarely_disagrees_by_chance_and_holds_the_truth_as_often_as_stated() -> None:
+@pytest.fixture(scope="module")
+def drawings() -> list[Combined]:
+    """Combinations of a thousand measurements of one wall by depth and board."""
     generator = np.random.default_rng(0)
     depth = plane(0.2)
     board = plane(0.2, std_m=5e-4, std_deg=0.05)
-    sigmas = list[float]()
-    inside = list[bool]()
-    for _ in range(1000):
-        both = combine(shaken(depth, generator), shaken(board, generator), measured=False)
-        sigmas.append(both.disagreement.sigmas)
-        off = both.plane.slopes - depth.slopes
-        inside.append(
-            off @ np.linalg.solve(both.plane.covariance, off) < 7.815
-        )  # 95 % of a chi-square of three
-    assert np.mean(np.square(sigmas)) == pytest.approx(3.0, rel=0.1)
-    assert np.mean(np.array(sigmas) > board_wall.AGREE_SIGMAS) < 0.004
+    return [
+        combine(drawn(depth, generator), drawn(board, generator), measured=False)
+        for _ in range(1000)
+    ]
+
+
+def test_planes_disagree_by_chance_as_rarely_as_stated(drawings: list[Combined]) -> None:
+    sigmas = np.array([both.disagreement.sigmas for both in drawings])
+    assert np.mean(sigmas**2) == pytest.approx(3.0, rel=0.1)
+    assert np.mean(sigmas > board_wall.AGREE_SIGMAS) < 0.004
+
+
+def test_combined_plane_holds_the_truth_as_often_as_stated(drawings: list[Combined]) -> None:
+    inside: list[bool] = []
+    for both in drawings:
+        off = both.plane.slopes - plane(0.2).slopes
+        chi2 = off @ np.linalg.solve(both.plane.covariance, off)
+        inside.append(chi2 < CHI2_95_OF_3)
     assert np.mean(inside) == pytest.approx(0.95, abs=0.02)
 
 
-def test_combine_names_causes_that_explain_it_and_no_others() -> None:
-    """Squares taken for 30 mm that are 29.1 mm put the wall 3 % too far away."""
-    causes = combine(plane(0.2), plane(0.2 / 0.97, std_m=5e-4), measured=False).causes
-    assert any("97.0 %" in cause for cause in causes)
+def causes_of(board: UncertainPlane, *, measured: bool = False) -> str:
+    return "\n".join(combine(plane(0.2), board, measured=measured).causes)
+
+
+def test_cause_of_a_distance_is_scale_or_offset_with_amounts() -> None:
+    causes = causes_of(plane(PRINTED_AT_97_PERCENT_M, std_m=5e-4))
     # along the axis the same wall is farther than along its normal
-    offset_mm = 1e3 * 0.2 * (1 / 0.97 - 1) / (np.cos(np.radians(45.0)) * np.cos(0.1))
-    assert any(f"{offset_mm:+.1f} mm" in cause for cause in causes)
-    assert not any("angle" in cause for cause in causes)
+    offset_m = (PRINTED_AT_97_PERCENT_M - TRUE_M) / (np.cos(np.radians(45.0)) * np.cos(0.1))
+    assert "97.0 %" in causes
+    assert f"{1e3 * offset_m:+.1f} mm" in causes
+    assert "angle" not in causes
+
+
+def test_cause_of_a_turn_is_the_angle_alone() -> None:
     (cause,) = combine(plane(0.2, 45.0), plane(0.2, 46.005), measured=False).causes
     assert "1.00 degrees" in cause
-    causes = combine(plane(0.2), plane(0.204), measured=True).causes
-    assert [cause for cause in causes if "offset" in cause]
-    assert not [cause for cause in causes if "scale" in cause]
-    causes = combine(plane(0.2), plane(0.4), measured=False).causes
+
+
+def test_measured_board_has_no_scale_error_among_the_causes() -> None:
+    causes = causes_of(plane(0.204), measured=True)
+    assert "offset" in causes
+    assert "scale" not in causes
+
+
+def test_implausible_amounts_are_no_causes() -> None:
+    causes = causes_of(plane(0.4))
     assert causes
-    assert not [cause for cause in causes if "scale" in cause or "offset" in cause]
+    assert "scale" not in causes
+    assert "offset" not in causes

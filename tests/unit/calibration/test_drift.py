@@ -74,23 +74,35 @@ def test_drift_check_warns_of_a_changed_setting(wall: BareWall, check: DriftChec
     assert check.warnings == ()
 
 
-def test_drift_check_warns_of_a_known_temperature_beyond_tolerance(check: DriftCheck) -> None:
-    unknown = {
-        "apd_temperature": -9999.0,
-        "another_temperature": 99.0,
-        "ldd_temperature": float("nan"),
-    }
-    for celsius in (unknown, {"ldd_temperature": 40.0, "apd_temperature": 37.0}):  # within its span
-        check.update_temperatures(celsius)
-        assert check.warnings == ()
-    check.update_temperatures({"ldd_temperature": 40.0 + TOLERANCE_C, "apd_temperature": 30.0})
+@pytest.mark.parametrize(
+    "celsius",
+    [
+        {"apd_temperature": -9999.0},
+        {"another_temperature": 99.0},
+        {"ldd_temperature": float("nan")},
+        {"ldd_temperature": 40.0, "apd_temperature": 37.0},
+        {"ldd_temperature": 40.0 + TOLERANCE_C, "apd_temperature": 30.0},
+    ],
+    ids=["invalid", "unknown", "nan", "within its span", "within the tolerance"],
+)
+def test_temperature_within_its_limits_raises_no_warning(
+    check: DriftCheck, celsius: dict[str, float]
+) -> None:
+    check.update_temperatures(celsius)
     assert check.warnings == ()
+
+
+def test_temperature_beyond_the_tolerance_is_named(check: DriftCheck) -> None:
     check.update_temperatures({"ldd_temperature": 41.0 + TOLERANCE_C})
     (line,) = check.warnings
     assert re.search("ldd_temperature.*46.*40", line)
+
+
+def test_one_warning_stands_for_several_temperatures(check: DriftCheck) -> None:
     check.update_temperatures({"ldd_temperature": 30.0, "apd_temperature": 39.0})
-    assert "warm" in check.warnings[0]
-    assert "1 more" in check.warnings[0]
+    (line,) = check.warnings
+    assert "warm" in line
+    assert "1 more" in line
 
 
 def test_drift_check_temperature_warning_does_not_flicker(check: DriftCheck) -> None:
@@ -118,14 +130,14 @@ def test_drift_check_warns_of_too_few_good_pixels(wall: BareWall, left: int) -> 
     assert (check.drift, check.wall_share) == (None, 0.0)
 
 
-def filled(sights: np.ndarray, reference_frames: int = MANY) -> DriftWindow:
+def filled(observations: np.ndarray, reference_frames: int = MANY) -> DriftWindow:
     window = DriftWindow(reference_frames)
-    for sight in sights:
-        window.add(WallObservation(*sight.tolist()), 0.5)
+    for observation in observations:
+        window.add(WallObservation(*observation.tolist()), 0.5)
     return window
 
 
-def sights(count: int, seed: int = 0) -> np.ndarray:
+def observations(count: int, seed: int = 0) -> np.ndarray:
     """Return measurements of a wall 2 mm farther, each uncertain by 0.1 mm and 0.05 degrees."""
     middle = np.array([0.002, 0.0, 0.0, 0.0027, 50.0])
     spread = np.array([1e-4, 0.05, 0.05, 1e-4, 5.0])
@@ -133,8 +145,8 @@ def sights(count: int, seed: int = 0) -> np.ndarray:
 
 
 def test_drift_window_needs_enough_frames() -> None:
-    assert filled(sights(MIN_FRAMES - 1)).drift() is None
-    window = filled(sights(MIN_FRAMES))
+    assert filled(observations(MIN_FRAMES - 1)).drift() is None
+    window = filled(observations(MIN_FRAMES))
     assert window.drift() is not None
     for _ in range(WINDOW_FRAMES - MIN_FRAMES + 1):
         window.add(None, 0.0)
@@ -142,7 +154,7 @@ def test_drift_window_needs_enough_frames() -> None:
 
 
 def test_drift_window_of_a_short_reference_is_less_certain() -> None:
-    few, many = (filled(sights(WINDOW_FRAMES), frames).drift() for frames in (1, MANY))
+    few, many = (filled(observations(WINDOW_FRAMES), frames).drift() for frames in (1, MANY))
     assert few.distance_std_m > 3.0 * many.distance_std_m
 
 
@@ -216,13 +228,13 @@ def test_wall_track_finds_an_exact_pose_exactly(tilted: BareWall, shift: WallPos
     pose = wall_from_lidar((TILTED[0] + shift[0], TILTED[1] + shift[1], TILTED[2] + shift[2]))
     track = WallTrack(exact, wall_from_lidar(TILTED))
     frame = wall_depth(pose, SMALL).astype(np.float32)
-    sight = None
+    observation = None
     for _ in range(60):
-        sight = track.follow(frame)
+        observation = track.follow(frame)
     now = measures_of(-pose[2, :3] / pose[2, 3], np.zeros((3, 3)))
-    assert sight.distance_m == pytest.approx(now.distance_m - TILTED[0], abs=2e-6)
-    assert sight.yaw_deg == pytest.approx(now.yaw_deg - TILTED[1], abs=1e-3)
-    assert sight.pitch_deg == pytest.approx(now.pitch_deg - TILTED[2], abs=1e-3)
+    assert observation.distance_m == pytest.approx(now.distance_m - TILTED[0], abs=2e-6)
+    assert observation.yaw_deg == pytest.approx(now.yaw_deg - TILTED[1], abs=1e-3)
+    assert observation.pitch_deg == pytest.approx(now.pitch_deg - TILTED[2], abs=1e-3)
     assert track.share == pytest.approx(1.0, abs=0.05)
 
 

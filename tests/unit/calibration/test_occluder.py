@@ -1,14 +1,15 @@
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 import pytest
 from nlos_calibration import MeanNoise, depth_noise_m, load_rig
+from nlos_calibration.arrays import Float64, Mask
 from nlos_calibration.errors import OccluderRefusedError
 from nlos_calibration.occluder import MAX_BEHIND, OccluderFit, SheetFit, find_edge, find_occluder
 from numpy.typing import NDArray
 from synthetic_scenes import Sheet, ball, bench_depth
-
-from nlos_cam.calibrate import View, view
+from synthetic_walls import View, view
 
 PAPER = load_rig("paper-rig")
 PINHOLE = PAPER.pinhole.scaled(160, 120)
@@ -21,6 +22,7 @@ ROWS = 40
 COLUMNS = 100
 PITCH_M = 0.002
 Y_M = np.linspace(-0.1, 0.1, ROWS)
+EDGE_M = 0.0601
 
 
 @pytest.fixture(scope="module")
@@ -28,14 +30,14 @@ def seen() -> View:
     return view(0.2, 45.0, 0.0, PINHOLE)
 
 
-def noisy(depth_m: NDArray[np.float64], seed: int = 0) -> NDArray[np.float64]:
+def noisy(depth_m: Float64, seed: int = 0) -> Float64:
+    """Return a mean of 30 frames of a depth map."""
     seen_m = np.where(depth_m < 9.0, depth_m, np.nan)
-    return seen_m + np.random.default_rng(seed).normal(
-        0.0, 30**-0.5, depth_m.shape
-    ) * depth_noise_m(seen_m)
+    errors = np.random.default_rng(seed).normal(0.0, 30**-0.5, depth_m.shape)
+    return seen_m + errors * depth_noise_m(seen_m)
 
 
-def fitted(seen: View, depth_m: NDArray[np.float64], **stds: float) -> OccluderFit:
+def fitted(seen: View, depth_m: Float64, **stds: float) -> OccluderFit:
     return find_occluder(depth_m, NOISE, PINHOLE, seen.pose, np.random.default_rng(1), **stds)
 
 
@@ -44,20 +46,28 @@ def found(sheet: Sheet | None, yaw_deg: float = 45.0, **stds: float) -> Occluder
     return fitted(seen, noisy(bench_depth(seen, sheet)), **stds)
 
 
-def test_sheet_propagates_uncertainty_by_its_derivatives() -> None:
+def sheet_with(normal: Float64) -> SheetFit:
+    plane: Any = None
+    return SheetFit(plane, normal, np.eye(3), np.array([0.1, 0.2, 0.9]))
+
+
+@pytest.mark.parametrize(
+    ("quantity", "std"),
+    [
+        (lambda sheet: sheet.x_m(0.3), lambda sheet: sheet.x_std_m(0.3)),
+        (lambda sheet: sheet.lean, lambda sheet: sheet.lean_std),
+    ],
+    ids=["place", "lean"],
+)
+def test_sheet_propagates_uncertainty_by_its_derivatives(
+    quantity: Callable[[SheetFit], float], std: Callable[[SheetFit], float]
+) -> None:
     normal = np.array([2.0, 0.3, -0.4])
+    sheet = sheet_with(normal)
     step = 1e-6
-    none: Any = None
-    sheets = [
-        SheetFit(none, normal + shift, np.eye(3), np.array([0.1, 0.2, 0.9]))
-        for shift in step * np.eye(4, 3, -1)
-    ]
-    for std, values in (
-        (sheets[0].x_std_m(0.3), [sheet.x_m(0.3) for sheet in sheets]),
-        (sheets[0].lean_std, [sheet.lean for sheet in sheets]),
-    ):
-        gradient = (np.array(values[1:]) - values[0]) / step
-        assert std == pytest.approx(np.linalg.norm(gradient), rel=1e-4)
+    moved = [quantity(sheet_with(normal + shift)) for shift in step * np.eye(3)]
+    gradient = (np.array(moved) - quantity(sheet)) / step
+    assert std(sheet) == pytest.approx(np.linalg.norm(gradient), rel=1e-4)
 
 
 def test_find_occluder_finds_the_papers_to_half_a_pixel() -> None:
@@ -73,7 +83,8 @@ def test_find_occluder_finds_the_papers_to_half_a_pixel() -> None:
 
 def test_find_occluder_measures_lean_twist_and_edge() -> None:
     fit = found(Sheet(lean_deg=3.0, twist_deg=-2.0, edge_deg=2.0))
-    assert (fit.tilt_deg, fit.twist_deg) == pytest.approx((3.0, -2.0), abs=0.1)
+    assert fit.tilt_deg == pytest.approx(3.0, abs=0.1)
+    assert fit.twist_deg == pytest.approx(-2.0, abs=0.1)
     assert fit.edge_deg == pytest.approx(2.0, abs=0.3)
     assert abs(fit.x_m - 0.2) < 1e-3
 
@@ -82,30 +93,41 @@ def test_find_occluder_uncertainty_holds_that_of_the_wall() -> None:
     plain = found(Sheet())
     less_sure = found(Sheet(), distance_std_m=0.003, yaw_std_deg=0.5)
     turn = np.radians(0.5)
-    assert less_sure.x_std_m == pytest.approx(np.hypot(plain.x_std_m, 0.1 * turn), rel=0.02)
-    expected = np.sqrt(plain.gap_std_m**2 + 0.003**2 + (0.2 * turn) ** 2)
-    assert less_sure.gap_std_m == pytest.approx(expected, rel=0.02)
+    x_std_m = np.hypot(plain.x_std_m, 0.1 * turn)
+    gap_std_m = np.sqrt(plain.gap_std_m**2 + 0.003**2 + (0.2 * turn) ** 2)
+    assert less_sure.x_std_m == pytest.approx(x_std_m, rel=0.02)
+    assert less_sure.gap_std_m == pytest.approx(gap_std_m, rel=0.02)
 
 
 def test_find_occluder_gap_is_not_biased_by_flying_pixels(seen: View) -> None:
-    errors_m = []
+    errors_m: list[float] = []
     for step in np.linspace(0.0, 2.0, 9):
         gap_m = 0.1 + step * PIXEL_M
-        fit = fitted(seen, noisy(bench_depth(seen, Sheet(gap_m=gap_m), beams=5)))
+        mixed = bench_depth(seen, Sheet(gap_m=gap_m), beams=5)
+        fit = fitted(seen, noisy(mixed))
         errors_m.append(fit.gap_m - gap_m)
         assert abs(errors_m[-1]) <= 1.96 * fit.gap_std_m
     assert abs(np.mean(errors_m)) < 0.35 * PIXEL_M
 
 
-def test_find_occluder_tolerates_an_object_in_some_beams_only(seen: View) -> None:
+def wall_pixels(seen: View) -> NDArray[np.intp]:
+    """Return flat indices of the pixels that see the wall beside the paper's sheet."""
+    return np.flatnonzero(bench_depth(seen, Sheet()) == bench_depth(seen, None))
+
+
+def test_find_occluder_suspects_an_object_in_some_beams(seen: View) -> None:
     depth_m = bench_depth(seen, Sheet())
-    on_wall = np.flatnonzero(depth_m == bench_depth(seen, None))
-    some = depth_m.copy()
-    some.flat[np.random.default_rng(0).choice(on_wall, depth_m.size // 5, replace=False)] += 0.15
-    fit = fitted(seen, noisy(some))
+    generator = np.random.default_rng(0)
+    some = generator.choice(wall_pixels(seen), depth_m.size // 5, replace=False)
+    depth_m.flat[some] += 0.15
+    fit = fitted(seen, noisy(depth_m))
     assert abs(fit.gap_m - 0.1) < 2 * PIXEL_M
-    assert "20%" in fit.doubt
-    depth_m.flat[on_wall] += 0.15
+    assert "20%" in fit.why_unusable
+
+
+def test_find_occluder_refuses_an_object_in_all_beams(seen: View) -> None:
+    depth_m = bench_depth(seen, Sheet())
+    depth_m.flat[wall_pixels(seen)] += 0.15
     with pytest.raises(OccluderRefusedError, match=f"{MAX_BEHIND:.0%}"):
         fitted(seen, noisy(depth_m))
 
@@ -142,39 +164,67 @@ def test_find_occluder_refuses_a_sheet_it_cannot_trust(
         found(sheet, yaw_deg)
 
 
-def test_find_occluder_refuses_a_fist_or_a_box_beside_the_sheet(seen: View) -> None:
+def test_find_occluder_refuses_a_box_beside_the_sheet(seen: View) -> None:
     box = bench_depth(seen, Sheet(0.08, 0.05, height_m=0.06))
     with pytest.raises(OccluderRefusedError, match=r"\d+%"):
         fitted(seen, noisy(np.minimum(bench_depth(seen, Sheet()), box)))
-    for centre_m in ((0.2, 0.02, 0.13), (0.1, 0.0, 0.1)):
-        with pytest.raises(OccluderRefusedError):
-            fitted(seen, noisy(np.minimum(bench_depth(seen, None), ball(seen, centre_m, 0.045))))
 
 
-def met() -> NDArray[np.float64]:
-    """Return the points of a sheet on which each pixel lies 2 mm higher than the one before."""
+@pytest.mark.parametrize("centre_m", [(0.2, 0.02, 0.13), (0.1, 0.0, 0.1)])
+def test_find_occluder_refuses_a_fist(seen: View, centre_m: tuple[float, float, float]) -> None:
+    fist = ball(seen, centre_m, 0.045)
+    with pytest.raises(OccluderRefusedError):
+        fitted(seen, noisy(np.minimum(bench_depth(seen, None), fist)))
+
+
+def points_on_sheet() -> Float64:
+    """Return points (rows, columns, 3) of a sheet, each 2 mm higher than the one before."""
     height_m, y_m = np.meshgrid(PITCH_M * np.arange(COLUMNS), Y_M)
     return np.stack([np.full_like(y_m, 0.2), y_m, height_m], axis=-1)
 
 
-def labels(edge_m: NDArray[np.float64] | float) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-    """Return which pixels see the sheet and which see past it, by an edge for each row."""
-    sheet = met()[..., 2] >= np.broadcast_to(edge_m, ROWS)[:, np.newaxis]
-    return sheet, ~sheet
+POINTS_M = points_on_sheet()
 
 
-def test_find_edge_allows_for_raggedness_strays_and_upper_end() -> None:
-    sheet, passed = labels(0.0601)
-    over = met()[..., 2] > 0.1
-    assert abs(find_edge(met(), sheet & ~over, passed | over).gap_m - 0.0601) <= PITCH_M / 2
+def on_sheet(edge_m: Float64 | float = EDGE_M) -> Mask:
+    """Return the pixels above the edge, which may have a height for each row."""
+    return POINTS_M[..., 2] >= np.broadcast_to(edge_m, ROWS)[:, np.newaxis]
+
+
+def test_find_edge_ignores_beams_over_the_sheets_upper_end() -> None:
+    sheet = on_sheet()
+    over = POINTS_M[..., 2] > 0.1
+    edge = find_edge(POINTS_M, sheet & ~over, ~sheet | over)
+    assert edge
+    assert abs(edge.gap_m - EDGE_M) <= PITCH_M / 2
+
+
+def test_find_edge_allows_for_stray_pixels() -> None:
+    sheet = on_sheet()
     stray = np.random.default_rng(3).random(sheet.shape) < 0.1
-    strewn = find_edge(met(), sheet ^ stray, passed ^ stray)
-    assert abs(strewn.gap_m - 0.0601) < PITCH_M
-    assert strewn.gap_std_m < 2 * PITCH_M
-    ragged = find_edge(met(), *labels(0.06 + np.random.default_rng(0).normal(0.0, 0.004, ROWS)))
-    assert ragged.gap_std_m == pytest.approx(0.004, rel=0.3)
-    mixed = find_edge(
-        met(), np.roll(sheet, 1, axis=1) & sheet, np.roll(passed, -1, axis=1) & passed
-    )
-    assert mixed.gap_std_m == pytest.approx(3 * PITCH_M / np.sqrt(12))
-    assert find_edge(met(), sheet, np.zeros_like(passed)) is None
+    edge = find_edge(POINTS_M, sheet ^ stray, ~sheet ^ stray)
+    assert edge
+    assert abs(edge.gap_m - EDGE_M) < PITCH_M
+    assert edge.gap_std_m < 2 * PITCH_M
+
+
+def test_find_edge_of_a_ragged_sheet_is_as_uncertain_as_its_rows() -> None:
+    sheet = on_sheet(0.06 + np.random.default_rng(0).normal(0.0, 0.004, ROWS))
+    edge = find_edge(POINTS_M, sheet, ~sheet)
+    assert edge
+    assert edge.gap_std_m == pytest.approx(0.004, rel=0.3)
+
+
+def test_find_edge_is_uniform_over_pixels_that_mix() -> None:
+    """One pixel on either side of the edge is undecided, so that it lies between three."""
+    sheet = on_sheet()
+    surely_sheet = np.roll(sheet, 1, axis=1) & sheet
+    surely_passed = np.roll(~sheet, -1, axis=1) & ~sheet
+    edge = find_edge(POINTS_M, surely_sheet, surely_passed)
+    assert edge
+    assert edge.gap_std_m == pytest.approx(3 * PITCH_M / np.sqrt(12))
+
+
+def test_find_edge_needs_beams_that_passed() -> None:
+    sheet = on_sheet()
+    assert find_edge(POINTS_M, sheet, np.zeros_like(sheet)) is None

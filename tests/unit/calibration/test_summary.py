@@ -38,20 +38,31 @@ def test_interval_is_printed_within_a_tenth_of_a_digit(std_deg: float, value_deg
     assert len(value.partition(".")[2]) == len(half.partition(".")[2])
 
 
-def test_facts_hold_quantities_with_intervals() -> None:
-    facts = values()
-    assert facts["distance"] == "200.00 ± 0.20 mm"
-    assert facts["facing angle"] == "45.000 ± 0.020°"
-    assert facts["yaw"] == "+45.000 ± 0.020°"
-    assert facts["pitch"] == "+0.00 ± 0.04°"
-    assert facts["measured on"] == "2026-11-22"
-    assert facts["temperature"] == "41.7 °C"
-    assert facts["depth"] == "refused"
+@pytest.mark.parametrize(
+    ("name", "text"),
+    [
+        ("distance", "200.00 ± 0.20 mm"),
+        ("facing angle", "45.000 ± 0.020°"),
+        ("yaw", "+45.000 ± 0.020°"),
+        ("pitch", "+0.00 ± 0.04°"),
+        ("measured on", "2026-11-22"),
+        ("temperature", "41.7 °C"),
+        ("depth", "refused"),
+        ("view on the wall", "100.0 %"),
+    ],
+)
+def test_fact_has_its_interval_or_unit(name: str, text: str) -> None:
+    assert values()[name] == text
+
+
+def test_facts_of_the_depth_are_those_measured() -> None:
     assert values(residual_m=0.0001)["residual"] == "0.10 mm RMS"
-    assert values(facing_std_deg=None)["facing angle"] == "45.00°"
-    for name in ("range offset", "printed board", "view on the wall", "occluder's tilt"):
+
+
+def test_facts_leave_out_what_was_not_measured() -> None:
+    facts = values(temperatures_c={})
+    for name in ("range offset", "printed board", "occluder's tilt", "temperature"):
         assert name not in facts
-    assert "temperature" not in values(temperatures_c={})
 
 
 def test_facts_hold_offset_board_occluder_and_footprint() -> None:

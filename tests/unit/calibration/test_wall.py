@@ -19,8 +19,7 @@ from nlos_calibration.wall import (
     measures_of,
     warnings,
 )
-
-from nlos_cam.calibrate import view
+from synthetic_walls import view
 
 PINHOLE = load_rig("bare-wall").pinhole.scaled(160, 120)
 RAYS = PINHOLE.rays()
@@ -48,32 +47,39 @@ def test_wall_depth_lies_on_the_wall_or_is_infinite() -> None:
     depth_m = bare(0.23, 30.0, 10.0)
     wall_from_lidar = view(0.23, 30.0, 10.0, PINHOLE).pose
     points = PINHOLE.rays() * depth_m[..., np.newaxis]
-    np.testing.assert_allclose(
-        points @ wall_from_lidar[2, :3] + wall_from_lidar[2, 3], 0.0, atol=1e-12
-    )
+    height_m = points @ wall_from_lidar[2, :3] + wall_from_lidar[2, 3]
+    np.testing.assert_allclose(height_m, 0.0, atol=1e-12)
     assert np.isinf(view(0.2, 75.0, 0.0, PINHOLE).depth_m[:, -1]).all()
 
 
 def test_fit_wall_of_exact_depth_is_exact() -> None:
     fit = fit_wall(bare(0.23, 30.0, -10.0), PINHOLE, np.random.default_rng(0))
-    np.testing.assert_allclose(
-        fit.wall_from_lidar, view(0.23, 30.0, -10.0, PINHOLE).pose, atol=1e-9
-    )
-    assert (fit.yaw_deg, fit.pitch_deg) == pytest.approx((30.0, -10.0))
-    assert fit.facing_deg == pytest.approx(
-        np.degrees(np.arccos(np.cos(np.radians(30)) * np.cos(np.radians(10))))
-    )
-    assert (fit.verdict, fit.inlier_fraction) == ("good", 1.0)
+    pose = view(0.23, 30.0, -10.0, PINHOLE).pose
+    np.testing.assert_allclose(fit.wall_from_lidar, pose, atol=1e-9)
+    assert fit.verdict == "good"
+    assert fit.inlier_fraction == 1.0
     assert fit.residual_m < 1e-9
 
 
-def test_fit_wall_refuses_what_is_not_a_wall_in_view() -> None:
-    before = bare(yaw_deg=75.0)
-    before[:, -30:] = 0.5
-    wavy = bare(0.3, 15.0) + 0.0035 * np.sign(np.sin(np.arange(160) / 2.0))
-    for depth_m, word in ((before, "in front"), (wavy, "flat")):
-        with pytest.raises(WallRefusedError, match=word):
-            fit_wall(depth_m, PINHOLE, np.random.default_rng(0))
+def test_fit_wall_has_the_angles_of_its_pose() -> None:
+    fit = fit_wall(bare(0.23, 30.0, -10.0), PINHOLE, np.random.default_rng(0))
+    facing_rad = np.arccos(np.cos(np.radians(30.0)) * np.cos(np.radians(10.0)))
+    assert fit.yaw_deg == pytest.approx(30.0)
+    assert fit.pitch_deg == pytest.approx(-10.0)
+    assert fit.facing_deg == pytest.approx(np.degrees(facing_rad))
+
+
+def test_fit_wall_refuses_an_object_before_the_wall() -> None:
+    depth_m = bare(yaw_deg=75.0)
+    depth_m[:, -30:] = 0.5
+    with pytest.raises(WallRefusedError, match="in front"):
+        fit_wall(depth_m, PINHOLE, np.random.default_rng(0))
+
+
+def test_fit_wall_refuses_a_corrugated_wall() -> None:
+    depth_m = bare(0.3, 15.0) + 0.0035 * np.sign(np.sin(np.arange(160) / 2.0))
+    with pytest.raises(WallRefusedError, match="flat"):
+        fit_wall(depth_m, PINHOLE, np.random.default_rng(0))
 
 
 @pytest.mark.parametrize(
@@ -131,21 +137,25 @@ def test_judge_doubts_what_may_be_another_plane(
         assert amount in advice
 
 
-def test_check_flat_refuses_what_surely_is_not_one_plane() -> None:
-    refused = [
-        replace(FLAT, bend_deg=1.2),
-        replace(FLAT, bend_m=0.006),
-        replace(OFFSET, offset_bend_deg=0.4),
-    ]
-    for flat, ripple_m, amount in [
-        *((flat, 0.0, "mm") for flat in refused),
+@pytest.mark.parametrize(
+    ("flat", "ripple_m", "amount"),
+    [
+        (replace(FLAT, bend_deg=1.2), 0.0, "mm"),
+        (replace(FLAT, bend_m=0.006), 0.0, "mm"),
+        (replace(OFFSET, offset_bend_deg=0.4), 0.0, "mm"),
         (FLAT, 0.0025, r"2\.5 mm"),
-    ]:
-        with pytest.raises(WallRefusedError, match=amount):
-            check_flat(flat, ripple_m)
-    check_flat(
-        replace(FLAT, bend_m=0.006, bend_deg=1.2, bend_std_m=0.002, bend_std_deg=0.5), 0.0
-    )  # noise alone
+    ],
+)
+def test_check_flat_refuses_what_surely_is_not_one_plane(
+    flat: Flatness, ripple_m: float, amount: str
+) -> None:
+    with pytest.raises(WallRefusedError, match=amount):
+        check_flat(flat, ripple_m)
+
+
+def test_check_flat_accepts_a_bend_within_noise() -> None:
+    uncertain = replace(FLAT, bend_m=0.006, bend_deg=1.2, bend_std_m=0.002, bend_std_deg=0.5)
+    check_flat(uncertain, 0.0)
 
 
 def test_warnings_of_ripples_and_noise_keep_the_verdict() -> None:
@@ -171,12 +181,12 @@ def drawn(slopes: Float64, covariance: Float64, count: int = 4000) -> list[WallM
 def test_measures_of_uncertainties_are_the_spread(yaw_deg: float, pitch_deg: float) -> None:
     slopes = slopes_of(yaw_deg, pitch_deg)
     covariance = 1e-6 * SPREAD
-    told = measures_of(slopes, covariance)
+    stated = measures_of(slopes, covariance)
     others = drawn(slopes, covariance)
     for name in ("distance_m", "yaw_deg", "pitch_deg", "facing_deg"):
         stem, unit = name.rsplit("_", 1)
         spread = float(np.std([getattr(other, name) for other in others]))
-        assert getattr(told, f"{stem}_std_{unit}") == pytest.approx(spread, rel=0.06), name
+        assert getattr(stated, f"{stem}_std_{unit}") == pytest.approx(spread, rel=0.06), name
 
 
 @pytest.mark.parametrize("facing_deg", [0.0, 0.3, 5.0])
@@ -200,13 +210,8 @@ WALL_M = view(0.2, 20.0, 6.0, PINHOLE).depth_m
 
 
 def plane_of(depth_m: Float64, *, noise: float = 1.0, seed: int = 0) -> PlaneFit:
-    noisy_m = (
-        depth_m
-        + noise
-        * depth_noise_m(WALL_M)
-        * np.random.default_rng(seed).standard_normal(depth_m.shape)
-        / 5
-    )
+    errors = np.random.default_rng(seed).standard_normal(depth_m.shape)
+    noisy_m = depth_m + noise * depth_noise_m(WALL_M) * errors / 5
     samples = MeanNoise(np.full(depth_m.size, 25.0))
     return fit_depth(RAYS.reshape(-1, 3), noisy_m.ravel(), np.random.default_rng(0), samples)
 
@@ -263,13 +268,11 @@ def test_ripples_are_rarely_found_in_independent_noise() -> None:
 def test_ripples_have_their_size_and_widen_the_covariance(amplitude_m: float) -> None:
     wave_m = amplitude_m * np.sin(2.0 * np.pi * COLUMN / 27.0)
     found = rippled(wave_m)
-    assert found.rms_m == pytest.approx(
-        amplitude_m / np.sqrt(2.0), rel=0.15
-    )  # the wall is nearly faced squarely
+    # the wall is nearly faced squarely, so that depth and distance are alike
+    assert found.rms_m == pytest.approx(amplitude_m / np.sqrt(2.0), rel=0.15)
     assert found.correlation > 10.0
-    grown = np.linalg.eigvalsh(
-        found.covariance - found.correlation * plane_of(WALL_M + wave_m).covariance
-    )
+    scaled = found.correlation * plane_of(WALL_M + wave_m).covariance
+    grown = np.linalg.eigvalsh(found.covariance - scaled)
     assert grown.min() > -1e-9 * np.abs(found.covariance).max()
 
 
@@ -277,6 +280,9 @@ def test_ripples_need_neighbours_that_agree() -> None:
     found = rippled(0.0006 * (-1.0) ** (COLUMN + ROW))
     assert found.correlation == 1.0
     assert found.rms_m < 1e-4
+
+
+def test_ripples_of_exact_depth_are_none() -> None:
     exact = ripples(fit_depth(RAYS.reshape(-1, 3), WALL_M.ravel(), np.random.default_rng(0)), RAYS)
     assert exact.rms_m < 1e-9
     assert np.isfinite(exact.covariance).all()
@@ -289,9 +295,8 @@ def read_as(depth_m: Float64) -> FitWith:
     """Return the wall fit, by offset, of a lidar that reads `depth_m` with a fifth of one sample's
     noise.
     """
-    noisy_m = depth_m + 0.2 * depth_noise_m(depth_m) * np.random.default_rng(0).standard_normal(
-        depth_m.shape
-    )
+    errors = np.random.default_rng(0).standard_normal(depth_m.shape)
+    noisy_m = depth_m + 0.2 * depth_noise_m(depth_m) * errors
 
     def fit_with(offset_m: float, origin_m: float) -> WallFit:
         return fit_wall(noisy_m + offset_m, PINHOLE, np.random.default_rng(0), origin_m=origin_m)
@@ -340,10 +345,8 @@ def test_tape_that_agrees_changes_only_the_uncertainty() -> None:
 
 
 def test_tape_offset_is_less_certain_on_an_oblique_wall() -> None:
-    squarely, obliquely = (
-        fit_with_tape_distance(read_as(bare(0.2, yaw_deg, PITCH_DEG)), 0.201)
-        for yaw_deg in (20.0, 65.0)
-    )
+    squarely = fit_with_tape_distance(read_as(bare(0.2, 20.0, PITCH_DEG)), 0.201)
+    obliquely = fit_with_tape_distance(read_as(bare(0.2, 65.0, PITCH_DEG)), 0.201)
     assert squarely.offset_std_m == pytest.approx(TAPE_STD_M / np.cos(np.radians(20.0)), rel=0.02)
     assert obliquely.offset_std_m > 1.5 * squarely.offset_std_m
 

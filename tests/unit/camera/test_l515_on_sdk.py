@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 from fake_lidar import NapClock
 from nlos_calibration.rig import load_rig
-from software_colour import SoftwareSdk
+from software_sdk import SoftwareSdk
 
 from nlos_cam.camera.l515 import NEAR_WALL, PRESET, L515Camera
 from nlos_cam.camera.recorder import Recording

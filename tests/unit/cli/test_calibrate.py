@@ -23,8 +23,9 @@ from nlos_calibration import (
 from rich.console import Console
 from small_frames import FrameCamera
 from synthetic_scenes import at_near_edge, clean_infrared, infrared_frames
+from synthetic_walls import View
 
-from nlos_cam.calibrate import FrameFit, View, fit_frame
+from nlos_cam.calibrate import FrameFit, fit_frame
 from nlos_cam.cli.calibrate import EVERY, gauge, panel, until_enter, watch_wall
 from nlos_cam.frames import Frame
 from nlos_cam.render.sensor.sensor import DEPTH_UNIT_M, SensedImages
@@ -61,17 +62,10 @@ class FakeCamera(FrameCamera):
         return {"ldd_temperature": 40.0} if "ldd_temperature".endswith(ending) else {}
 
     def _frame(self, number: int) -> Frame:
-        self.taken = self.taken + 1
+        self.taken += 1
         counts = np.zeros((120, 160), np.uint8)
-        return Frame(
-            self.depth_m,
-            counts,
-            counts,
-            number / 30.0,
-            number,
-            self.intrinsics,
-            {"laser_power": 80.0},
-        )
+        settings = {"laser_power": 80.0}
+        return Frame(self.depth_m, counts, counts, number / 30.0, number, self.intrinsics, settings)
 
 
 @pytest.fixture
@@ -85,9 +79,8 @@ def camera(monkeypatch: pytest.MonkeyPatch) -> FakeCamera:
         return camera
 
     monkeypatch.setattr("nlos_cam.camera.open_camera", open_fake)
-    monkeypatch.setattr(
-        "nlos_cam.calibrate.files.report_html", lambda *_: ""
-    )  # it takes a second to draw
+    # the report takes a second to draw
+    monkeypatch.setattr("nlos_cam.calibrate.files.report_html", lambda *_: "")
     return camera
 
 
@@ -95,53 +88,69 @@ def assert_has(text: str, *parts: str) -> None:
     assert not [part for part in parts if part not in text]
 
 
+JSON_FIELDS = {
+    *("distance_m", "facing_deg", "residual_m", "inlier_fraction", "verdict", "advice", "frames"),
+    *("distance_std_m", "facing_std_deg", "yaw_std_deg", "pitch_std_deg", "range_offset_m"),
+}
+
+
 @pytest.mark.usefixtures("camera")
 def test_calibrate_json_is_what_the_record_holds(run: Run) -> None:
     result = run(*WALL)
+    assert result.pop("out") == "wall.toml"
+    assert result.pop("report") == "wall.html"
+    assert result == load_wall(OUT).model_dump(mode="json", include=set(result))
+    assert set(result) >= JSON_FIELDS
+
+
+@pytest.mark.usefixtures("camera")
+def test_calibrate_writes_the_measured_wall(run: Run) -> None:
+    run(*WALL)
     record = load_wall(OUT)
-    assert (result.pop("out"), result.pop("report")) == ("wall.toml", "wall.html")
-    assert result == record.model_dump(mode="json", include=set(result))
-    assert set(result) >= {
-        "distance_m",
-        "facing_deg",
-        "residual_m",
-        "inlier_fraction",
-        "verdict",
-        "advice",
-        "frames",
-    }
-    assert set(result) >= {
-        "distance_std_m",
-        "facing_std_deg",
-        "yaw_std_deg",
-        "pitch_std_deg",
-        "range_offset_m",
-    }
-    assert (result["distance_m"], result["facing_deg"]) == pytest.approx((0.2, 45.0), abs=1e-6)
-    assert (record.camera, record.frames, record.verdict) == ("sim:bare-wall", 10, "good")
+    assert record.distance_m == pytest.approx(0.2, abs=1e-6)
+    assert record.facing_deg == pytest.approx(45.0, abs=1e-6)
+    assert record.camera == "sim:bare-wall"
+    assert record.frames == 10
+    assert record.verdict == "good"
     assert abs((record.created - datetime.now().astimezone().date()).days) <= 1
+
+
+@pytest.mark.usefixtures("camera")
+def test_calibrate_without_out_names_the_record_itself(run: Run) -> None:
     run(*BARE)
     (path,) = Path().glob("wall-*.toml")
     assert load_wall(path).verdict == "good"
 
 
-def test_calibrate_writes_device_and_reference(camera: FakeCamera, shown: Run) -> None:
-    printed = shown("calibrate", "--wall", "--camera", "l515", "--out", OUT).out
+L515 = "calibrate", "--wall", "--camera", "l515", "--out", OUT
+
+
+@pytest.mark.usefixtures("camera")
+def test_calibrate_records_the_device(run: Run) -> None:
+    run(*L515)
     record = load_wall(OUT)
-    reference = load_measured(OUT).reference
-    assert (record.serial, record.firmware, record.settings) == (
-        "f0246262",
-        "1.5.8.1",
-        {"laser_power": 80.0},
-    )
-    assert (record.temperatures_c, record.footprint_share) == ({"ldd_temperature": 40.0}, 1.0)
+    assert record.serial == "f0246262"
+    assert record.firmware == "1.5.8.1"
+    assert record.settings == {"laser_power": 80.0}
+    assert record.temperatures_c == {"ldd_temperature": 40.0}
+    assert record.footprint_share == 1.0
+
+
+def test_calibrate_writes_the_reference(camera: FakeCamera, run: Run) -> None:
+    run(*L515)
+    record, reference = vars(load_measured(OUT)).values()
     assert record.reference == "wall.npz"
-    assert (reference.frames, reference.settings) == (10, {"laser_power": 80.0})
+    assert reference.frames == 10
+    assert reference.settings == {"laser_power": 80.0}
     np.testing.assert_allclose(reference.depth_m, camera.depth_m, rtol=1e-6)
     assert reference.inliers.mean() == pytest.approx(record.inlier_fraction)
-    assert_has(
-        printed, "200.00 ± 0.0", "45.00", " mm RMS", "Verdict: good", "wall.npz", "open wall.html"
-    )
+
+
+@pytest.mark.usefixtures("camera")
+def test_calibrate_prints_result_verdict_and_files(shown: Run) -> None:
+    printed = shown(*L515).out
+    assert_has(printed, "200.00 ± 0.0", "45.00", " mm RMS")
+    assert_has(printed, "Verdict: good", "wall.npz", "open wall.html")
 
 
 @pytest.mark.slow
@@ -343,9 +352,7 @@ def test_gauge_points_to_where_a_value_lies() -> None:
     assert len({len(gauge(value, 0.15, 0.3)) for value in (0.0, 0.2, 1.0)}) == 1
 
 
-def test_board_json_is_the_board_that_was_printed_with_a_note_how_to_print(
-    run: Run, shown: Run
-) -> None:
+def test_board_json_is_the_board_that_was_printed(run: Run, shown: Run) -> None:
     command = "board", "--out", "board.pdf", "--overwrite"
     for paper, board in BOARDS.items():
         result = run(*command, "--paper", paper)

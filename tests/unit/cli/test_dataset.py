@@ -14,7 +14,7 @@ import h5py
 import numpy as np
 import pytest
 import trimesh
-from fake_farm import FakeFarm
+from fake_workers import FakeWorkers
 from nlos_calibration import load_rig
 from nlos_models import SIMULATION_ONLY
 from rich.progress import Progress
@@ -29,9 +29,9 @@ Run = Callable[..., Any]
 
 @pytest.fixture(autouse=True)
 def _no_processes(monkeypatch: pytest.MonkeyPatch) -> None:
-    def processes(workers: int) -> FakeFarm:
+    def processes(workers: int) -> FakeWorkers:
         assert workers > 0
-        return FakeFarm()
+        return FakeWorkers()
 
     monkeypatch.setattr(build, "processes", processes)
 

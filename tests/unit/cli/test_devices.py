@@ -21,31 +21,45 @@ def on_bench(monkeypatch: pytest.MonkeyPatch, bench: Bench) -> None:
     monkeypatch.setenv("COLUMNS", "160")
 
 
-def test_devices_lists_usb_and_sdk(run: Run, shown: Run, bench: Bench) -> None:
+USB_FIELDS = [
+    *("id", "kind", "meaning", "serial", "product", "firmware", "usb_type", "link"),
+    *("port", "bus", "address", "interfaces", "error", "sdk_seen"),
+]
+
+
+@pytest.fixture
+def three_cameras(bench: Bench) -> Bench:
+    """The bench's L515, a D435 that only the SDK lists, and an L515 in recovery mode on USB."""
     bench.sdk_devices.append(FakeLidar("123", name="Intel RealSense D435"))
     bench.usb.devices.append(fake_device(0x0B55, serial="", port_numbers=(2,)))
-    made = run("devices")
-    assert list(made) == ["devices", "usb", "sdk_error", "usb_error"]
-    found = made["devices"]
+    return bench
+
+
+@pytest.mark.usefixtures("three_cameras")
+def test_devices_json_lists_cameras_by_their_uri(run: Run) -> None:
+    result = run("devices")
+    found = result["devices"]
+    assert list(result) == ["devices", "usb", "sdk_error", "usb_error"]
     assert [one["uri"] for one in found] == ["l515:f0246262", "", "sim", "sim:bare-wall"]
     assert [one["simulated"] for one in found] == [False, False, True, True]
     assert [one["usb_seen"] for one in found] == [True, None, None, None]
     assert {"name", "serial", "firmware", "usb_type"} < set(found[0])
-    one, other = made["usb"]
-    names = (
-        "id kind meaning serial product firmware usb_type link port bus address interfaces error"
-        " sdk_seen"
-    )
-    assert list(one) == names.split()
-    assert (one["id"], one["serial"], one["firmware"], one["sdk_seen"]) == (
-        "8086:0b64",
-        "f0246262",
-        "1.5.8",
-        True,
-    )
+
+
+@pytest.mark.usefixtures("three_cameras")
+def test_devices_json_lists_cameras_on_usb(run: Run) -> None:
+    one, other = run("devices")["usb"]
+    assert list(one) == USB_FIELDS
+    assert one["id"] == "8086:0b64"
+    assert one["serial"] == "f0246262"
+    assert one["firmware"] == "1.5.8"
+    assert one["sdk_seen"] is True
     assert one["interfaces"] == ["hid", "video", "vendor"]
     assert (other["id"], other["kind"], other["sdk_seen"]) == ("8086:0b55", "recovery", None)
-    bench.usb.devices[1] = fake_device(0x0AD3, serial="77", port_numbers=(2,))
+
+
+def test_devices_table_lists_cameras_of_both_sides(shown: Run, three_cameras: Bench) -> None:
+    three_cameras.usb.devices[1] = fake_device(0x0AD3, serial="77", port_numbers=(2,))
     table = shown("devices").out
     for word in (
         "l515:f0246262",

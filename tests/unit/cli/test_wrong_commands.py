@@ -64,7 +64,6 @@ calibrate --wall --occluder wall.toml | --wall
 calibrate --wall sim --bag run.bag | --bag
 calibrate --wall --occluder-x-m 0.2 | together
 calibrate --wall --board --tape-m 0.2 | --tape-m
-calibrate --wall --board-in colour | --board
 calibrate --wall --square-mm 30 | --board
 calibrate --wall --paper a4 | --board
 calibrate --occluder wall.toml --board | --board

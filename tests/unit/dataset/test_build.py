@@ -19,7 +19,7 @@ from unittest.mock import Mock
 import numba
 import numpy as np
 import pytest
-from fake_farm import FakeFarm, samples_of
+from fake_workers import FakeWorkers, samples_of
 from nlos_calibration import load_rig
 
 import nlos_cam
@@ -72,7 +72,12 @@ def _small_shards() -> Iterator[None]:
 
 
 def _build(folder: Path, farm: Any = None, count: int = COUNT, **others: Any) -> BuildReport:
-    options = {"workers": 1, "on_progress": lambda *_: None, "farm": farm or FakeFarm(), **others}
+    options = {
+        "workers": 1,
+        "on_progress": lambda *_: None,
+        "farm": farm or FakeWorkers(),
+        **others,
+    }
     return build_dataset(options.pop("plan", PLAN), count, folder, **options)
 
 
@@ -117,8 +122,8 @@ def test_interrupted_build_resumes(
     tmp_path: Path, whole: Shards, after: int, order: int | None
 ) -> None:
     """Every finished shard is kept, and no sample is made twice."""
-    farm = FakeFarm(order, fails_after=after)
-    rest = FakeFarm()
+    farm = FakeWorkers(order, fails_after=after)
+    rest = FakeWorkers()
     with pytest.raises(KeyboardInterrupt):
         _build(tmp_path, farm)
     assert farm.closed
@@ -162,7 +167,7 @@ def test_build_grows_dataset_to_count_and_leaves_finished_one_alone(
     assert len(open_dataset(tmp_path)) == first
     assert _build(tmp_path).made == COUNT - first // 5 * 5
     assert _bytes(tmp_path) == whole
-    farm = FakeFarm()
+    farm = FakeWorkers()
     checked = list[tuple[int, int]]()
     built = _build(tmp_path, farm, on_check=lambda *at: checked.append(at))
     assert (farm.made, built.made) == ([], 0)
@@ -202,12 +207,12 @@ def test_build_locks_its_folder_and_refuses_a_file(tmp_path: Path) -> None:
 def test_build_keeps_shards_if_object_fails_or_disk_is_full(
     tmp_path: Path, whole: Shards, monkeypatch: Patch
 ) -> None:
-    farm = FakeFarm(fails_after=4, error=errors.SceneError("cup.stl shows nothing"))
+    farm = FakeWorkers(fails_after=4, error=errors.SceneError("cup.stl shows nothing"))
     with pytest.raises(errors.SceneError, match=r"cup\.stl"):
         _build(tmp_path, farm)
     assert farm.closed
     assert len(_bytes(tmp_path)) == 1
-    farm = FakeFarm()
+    farm = FakeWorkers()
     stores = iter([store, store, Mock(side_effect=errors.DiskFullError("full")), *[store] * 9])
     monkeypatch.setattr(dataset, "store", lambda *given: next(stores)(*given))  # noqa: PLW0108  another each time
     with pytest.raises(errors.DiskFullError):

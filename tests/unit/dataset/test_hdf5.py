@@ -17,7 +17,7 @@ from unittest.mock import Mock
 import h5py
 import numpy as np
 import pytest
-from fake_farm import samples_of
+from fake_workers import samples_of
 from nlos_calibration import load_rig
 
 import nlos_cam

@@ -10,7 +10,7 @@ from unittest.mock import Mock
 import numpy as np
 import pytest
 import torch
-from fake_farm import samples_of
+from fake_workers import samples_of
 from nlos_calibration import load_rig
 from nlos_models.training import MapBatch, MapSet
 

@@ -9,7 +9,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
-from fake_farm import samples_of
+from fake_workers import samples_of
 from nlos_calibration import load_rig
 from nlos_models import CellNormal
 from nlos_models.training import MapBatch

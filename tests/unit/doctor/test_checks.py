@@ -1,248 +1,438 @@
-"""Each check on a bench with one fault: the checks that fail, and the detail and fix of one of
-them.
+"""Each check on a bench with one fault: the checks that fail, and the detail and fix of one."""
 
-A case: steps that cause the fault, names of the checks that fail, checks with their status
-("failed" if none is given), and words of the detail and fix of the first of them.
-"""
-
+from collections.abc import Callable
 from functools import partial
 from operator import attrgetter
-from operator import methodcaller as do
-from typing import Any
+from typing import Any, NamedTuple
 from unittest.mock import Mock
 
 import pytest
 import usb.core
-from fake_bench import fake_device
+from fake_bench import Bench, fake_device
 from fake_lidar import FakeLidar
 
 from nlos_cam.camera.sdk import WHEEL
 from nlos_cam.doctor.diagnosis import REPLUG
 
-DENIED = usb.core.USBError("Access denied (insufficient permissions)", -3, 13)
-LINUX_ONLY = ("container", "udev-rules", "permissions", "video-driver", "hid-sensors", "in-use")
-CAMERA_ONLY = (
-    "recovery",
-    "link",
-    "permissions",
-    "video-driver",
-    "hid-sensors",
-    "in-use",
-    "sdk-camera",
-    "firmware",
-)
+Fault = Callable[[Any], object]
+"""Change of a healthy bench."""
 
 
-def linux(name: str, *arguments: Any) -> Any:
-    """Call a method of the fake Linux."""
-    return lambda bench: do(name, *arguments)(bench.linux)
+class Case(NamedTuple):
+    """Faults of a bench, and the finding of one check that they lead to."""
+
+    faults: list[Fault]
+    check: str
+    status: str = "failed"
+    words: str = ""
+    """Parts of the detail or fix, separated by |."""
+    also_failed: str = ""
+    """Names of the other checks that fail."""
 
 
-write, runs, load = (partial(linux, name) for name in ("write", "process", "load"))
+def of_bench(method: str, *arguments: Any, **options: Any) -> Fault:
+    """Call a method of the bench."""
+    return lambda bench: getattr(bench, method)(*arguments, **options)
 
 
-def remove(path: str) -> Any:
-    return lambda bench: (bench.linux.root / path).unlink()
+def of_linux(method: str, *arguments: Any) -> Fault:
+    """Call a method of the bench's Linux."""
+    return lambda bench: getattr(bench.linux, method)(*arguments)
 
 
-def put(name: str, value: Any) -> Any:
+def put(name: str, value: Any) -> Fault:
     """Set an attribute of the bench, or of a part of it."""
     part, _, last = name.rpartition(".")
     return lambda bench: setattr(attrgetter(part)(bench) if part else bench, last, value)
 
 
-def all_of(status: str, *names: str) -> str:
-    return ", ".join(f"{name} {status}" for name in names)
+def remove(path: str) -> Fault:
+    return lambda bench: (bench.linux.root / path).unlink()
 
 
-UNPLUG = do("unplug")
-HIDE = do("hide")
-NO_RULES = do("remove_rules")
-REFUSE = do("refuse")
+run_on = partial(of_bench, "run_on")
+put_on_usb = partial(of_bench, "put_on_usb")
+plug_second = partial(of_bench, "plug_second")
+write = partial(of_linux, "write")
+runs = partial(of_linux, "process")
+load_modules = partial(of_linux, "load")
+sdk_fails = partial(put, "sdk_error")
+
+UNPLUG = of_bench("unplug")
+SHOW_TO_SDK = of_bench("show")
+HIDE_FROM_SDK = of_bench("hide")
+NO_RULES = of_bench("remove_rules")
+REFUSE = of_bench("refuse")
 DOCKER = write(".dockerenv", "")
 NO_USB = put("usb.devices", [])
-SECOND = do("plug_second", hid=0)
-NO_SDK = put("sdk_error", ImportError("No module named 'pyrealsense2'"))
+SECOND_WITHOUT_SENSORS = plug_second(hid=0)
+NO_SDK = sdk_fails(ImportError("No module named 'pyrealsense2'"))
 WSL = write("proc/version", "Linux version 6.6.87-microsoft-standard-WSL2")
+NO_VIDEO_CLASS = write("lib/modules/6.8.0/modules.dep", "kernel/fs/ext4/ext4.ko:")
+NOT_LISTED = write("proc/43/fd", "stands for a folder that may not be listed")
+DENIED = usb.core.USBError("Access denied (insufficient permissions)", -3, 13)
+NO_LIBUSB = put("usb.fails", usb.core.NoBackendError("No backend available"))
+NO_POWER = Mock(context=Mock(side_effect=RuntimeError("no power")))
+TWO_PACKAGES = dict.fromkeys(("pyrealsense2", "pyrealsense2-beta"), "2.54.2.5684")
+HID_DEVICE = "sys/bus/hid/devices/0003:8086:0B64.5"
+
+CAMERA_ON_USB = [
+    Case([UNPLUG], "usb-camera", words="no device at all|--camera sim"),
+    Case([UNPLUG, put_on_usb(idVendor=0x046D)], "usb-camera", words="1 devices"),
+    Case([UNPLUG, put_on_usb(0x0B07, serial="123")], "usb-camera", words="D435 123|8086:0b07"),
+    Case([NO_USB, HIDE_FROM_SDK], "usb-camera", words="udev"),
+    Case(
+        [NO_USB, HIDE_FROM_SDK, DOCKER],
+        "usb-camera",
+        words="-v /dev:/dev",
+        also_failed="container",
+    ),
+    Case([UNPLUG, SHOW_TO_SDK], "usb-camera", "warning", "as a user"),
+    Case([UNPLUG, SHOW_TO_SDK], "sdk-camera", "warning"),
+    Case([UNPLUG, SHOW_TO_SDK], "link", "ok"),
+    Case([UNPLUG, SHOW_TO_SDK, DOCKER], "usb-camera", "warning", "-v /dev:/dev"),
+    Case([UNPLUG, put_on_usb(0x0B55, serial="")], "recovery", words="8086:0b55|rs-fw-update -r"),
+    Case([UNPLUG, put_on_usb(0x0ADC, serial="")], "recovery", words="8086:0adc|rs-fw-update -r"),
+    Case([put_on_usb(bcdUSB=0x0210, speed=3)], "link", "warning", "320 x 240|USB-C"),
+    Case(
+        [of_bench("show", usb_type_descriptor="2.1"), put("usb.fails", OSError("none"))],
+        "link",
+        "warning",
+        also_failed="libusb",
+    ),
+]
+
+RULES_AND_PERMISSIONS = [
+    Case(
+        [UNPLUG, NO_RULES],
+        "udev-rules",
+        words="nlos-cam doctor --write-udev|--reload-rules",
+        also_failed="usb-camera",
+    ),
+    Case([NO_RULES], "udev-rules", "warning", "--write-udev"),
+    Case([NO_RULES, REFUSE], "permissions", words="--write-udev", also_failed="udev-rules"),
+    Case(
+        [NO_RULES, UNPLUG, run_on("linux", is_root=True)],
+        "udev-rules",
+        "warning",
+        also_failed="usb-camera",
+    ),
+    Case([REFUSE], "permissions", words="/dev/video30 (Permission denied)|udevadm trigger"),
+    Case([REFUSE, run_on("linux", in_plugdev=False)], "permissions", words="usermod -aG plugdev"),
+    Case(
+        [remove("sys/bus/usb/devices/2-1"), put_on_usb(shut=DENIED)],
+        "permissions",
+        words="Access denied",
+    ),
+]
+
+KERNEL_DRIVERS = [
+    Case(
+        [SECOND_WITHOUT_SENSORS],
+        "hid-sensors",
+        words="2-2|(none; 0003:8086:0B64.5 (hid-generic))|modprobe",
+    ),
+    Case(
+        [plug_second(hid=1)],
+        "hid-sensors",
+        words="(accel_3d; |sudo modprobe -a hid_sensor_hub",
+    ),
+    Case(
+        [SECOND_WITHOUT_SENSORS, load_modules("uvcvideo")],
+        "hid-sensors",
+        words="hid_sensor_gyro_3d|CONFIG_HID_SENSOR_HUB",
+    ),
+    Case([SECOND_WITHOUT_SENSORS, DOCKER], "hid-sensors", words="modprobe"),
+    Case(
+        [SECOND_WITHOUT_SENSORS, remove(HID_DEVICE)],
+        "hid-sensors",
+        words="(none; no HID device)",
+    ),
+    Case(
+        [SECOND_WITHOUT_SENSORS, put_on_usb(port_numbers=(2,), classes=(0x0E, 0xFF))],
+        "hid-sensors",
+        words="no HID interface",
+    ),
+    Case([plug_second(video=0)], "video-driver", words="2-2|sudo modprobe uvcvideo"),
+    Case(
+        [plug_second(product="0b3d", hid=0, video=0)],
+        "hid-sensors",
+        "ok",
+        also_failed="video-driver",
+    ),
+    Case(
+        [plug_second(video=0), load_modules(), NO_VIDEO_CLASS],
+        "video-driver",
+        words="CONFIG_USB_VIDEO_CLASS",
+    ),
+    Case(
+        [UNPLUG, plug_second(product="0b55", hid=0, video=0), put_on_usb(0x0B55)],
+        "recovery",
+    ),
+]
+
+OTHER_PROGRAMS = [
+    Case([runs(41, "cheese", "/dev/video30")], "in-use", words="cheese (pid 41)|kill 41`"),
+    Case(
+        [runs(42, "wireplumber", "/dev/video30"), runs(43, "pipewire", "/dev/video30")],
+        "in-use",
+        "warning",
+    ),
+    Case([runs(42, "pipewire", "/dev/video30"), runs(41, "cheese", "/dev/video30")], "in-use"),
+    Case([NOT_LISTED], "in-use", "ok", "1 processes"),
+]
+
+CONTAINERS = [
+    Case(
+        [DOCKER, NO_USB, HIDE_FROM_SDK],
+        "container",
+        words='-v /dev:/dev|-v /sys:/sys|"c 81:* rmw"|"c 189:* rmw"',
+        also_failed="usb-camera",
+    ),
+    Case(
+        [write("run/.containerenv", ""), UNPLUG],
+        "container",
+        "warning",
+        "podman",
+        also_failed="usb-camera",
+    ),
+    Case([DOCKER, NO_RULES], "container", "ok"),
+    Case([DOCKER, NO_RULES], "udev-rules", "skipped"),
+    Case([DOCKER, REFUSE], "permissions", words="--device-cgroup-rule"),
+    Case([DOCKER, REFUSE], "container", "warning", also_failed="permissions"),
+]
+
+SYSTEMS = [
+    Case([run_on("windows"), HIDE_FROM_SDK], "sdk-camera", words="Device Manager"),
+    Case(
+        [run_on("darwin", "arm64"), HIDE_FROM_SDK],
+        "system",
+        words="pyrealsense2-macosx==2.54.2|sudo",
+        also_failed="sdk-camera",
+    ),
+    Case([run_on("darwin", "arm64")], "system", "warning"),
+    Case(
+        [run_on("darwin", "arm64"), NO_SDK],
+        "sdk",
+        words="pip install pyrealsense2-macosx==2.54.2",
+        also_failed="system",
+    ),
+    Case(
+        [WSL, UNPLUG],
+        "system",
+        words="usbipd attach --wsl --busid",
+        also_failed="usb-camera",
+    ),
+    Case([WSL], "system", "warning"),
+]
+
+TIMES_OF_FRAMES = [
+    Case([], "metadata", "ok", "host's clock"),
+    Case([write("sys/module/uvcvideo/version", "1.1.1")], "metadata", "ok", "host's clock"),
+    Case(
+        [write("sys/module/uvcvideo/version", "1.1.1.realsense-6.1")],
+        "metadata",
+        "ok",
+        "camera's clock",
+    ),
+    Case([run_on("darwin", "arm64")], "metadata", "skipped", "Linux and Windows"),
+    Case([run_on("windows")], "metadata", "ok", "realsense_metadata_win10.ps1"),
+    Case([run_on("windows")], "sdk-camera", "ok"),
+    Case([load_modules()], "metadata", "skipped", "uvcvideo"),
+]
+
+PYTHON = [
+    Case([NO_SDK], "python", "ok", also_failed="sdk"),
+    Case([run_on("linux", "x86_64", 12)], "python", "ok"),
+    *(
+        Case([run_on(*platform), NO_SDK], "python", words=words, also_failed=also)
+        for platform, words, also in (
+            (("linux", "x86_64", 12), "x86_64|python3.11 -m venv", "sdk"),
+            (("windows", "amd64", 13), "amd64|python3.11 -m venv", "sdk"),
+            (("linux", "aarch64"), "aarch64|BUILD_PYTHON_BINDINGS", "sdk"),
+            (("linux", "riscv64"), "riscv64|BUILD_PYTHON_BINDINGS", "sdk"),
+            (("darwin", "arm64", 13), "arm64|python3.12 -m venv", "system sdk"),
+        )
+    ),
+    Case(
+        [run_on("linux", "x86_64", is_musl=True), NO_SDK],
+        "python",
+        words="glibc",
+        also_failed="sdk",
+    ),
+]
+
+LOADING_ERRORS = {
+    "No module named 'pyrealsense2'": f"pip install {WHEEL}",
+    "No module named 'libusb_package'": "libusb-package",
+    "libusb-1.0.so.0: cannot open": "apt install libusb-1.0-0, or `pip install libusb-package`",
+    "libudev.so.1: cannot open": "sudo apt install libudev1",
+    "libstdc++.so.6: cannot open": "sudo apt install libstdc++6",
+    "/lib/libc.so.6: version `GLIBC_2.17' not found": "newer release",
+    "DLL load failed while importing pyrealsense2": "vc_redist",
+}
+
+LIBREALSENSE = [
+    Case([NO_SDK], "sdk-camera", "skipped", also_failed="sdk"),
+    *(
+        Case([sdk_fails(ImportError(error))], "sdk", words=f"{error}|{fix}")
+        for error, fix in LOADING_ERRORS.items()
+    ),
+    Case([put("load_sdk", object)], "sdk", words="attribute|--force-reinstall"),
+    Case([put("load_sdk", lambda: NO_POWER)], "sdk", words="no power|unplug"),
+    Case([put("installed", {"pyrealsense2": "2.53.1.4623"})], "sdk-version", "warning"),
+    Case([put("installed", {})], "sdk", "ok", "unknown version"),
+    Case([put("installed", {})], "sdk-version", "skipped"),
+    Case([put("installed", {})], "sdk-alone", "skipped"),
+    Case(
+        [put("installed", TWO_PACKAGES)],
+        "sdk-alone",
+        words=f"pip uninstall -y pyrealsense2 pyrealsense2-beta && pip install {WHEEL}",
+    ),
+    Case(
+        [NO_LIBUSB],
+        "libusb",
+        words="No backend available|pip install pyusb libusb-package|sudo apt",
+    ),
+    Case([NO_LIBUSB], "usb-camera", "skipped", also_failed="libusb"),
+    Case([NO_LIBUSB], "sdk-camera", "ok", also_failed="libusb"),
+    Case([HIDE_FROM_SDK], "sdk-camera", words=f"L515 f0246262 at 2-1|{REPLUG}"),
+    Case(
+        [HIDE_FROM_SDK, of_bench("refuse", "/dev/bus/usb/002/003")],
+        "sdk-camera",
+        words="udevadm trigger",
+        also_failed="permissions",
+    ),
+    Case(
+        [HIDE_FROM_SDK, SECOND_WITHOUT_SENSORS],
+        "sdk-camera",
+        words="hid-sensors|sudo modprobe -a hid_sensor_hub",
+        also_failed="hid-sensors",
+    ),
+]
 
 
 @pytest.mark.parametrize(
-    ("steps", "failures", "check", "words"),
+    "case",
     [
-        # the camera on USB
-        ([UNPLUG], "usb-camera", "usb-camera", "no device at all|--camera sim"),
-        ([UNPLUG], "usb-camera", all_of("skipped", *CAMERA_ONLY), ""),
-        ([UNPLUG, do("put_on_usb", idVendor=0x046D)], "usb-camera", "usb-camera", "1 devices"),
-        ([UNPLUG, do("put_on_usb", 0x0B07, serial="123")], "usb-camera", "usb-camera", "D435 123|8086:0b07"),
-        ([NO_USB, HIDE], "usb-camera", "usb-camera", "udev"),
-        ([NO_USB, HIDE, DOCKER], "usb-camera container", "usb-camera", "-v /dev:/dev"),
-        ([UNPLUG, do("show")], "", "usb-camera warning, sdk-camera warning, link ok", "as a user"),
-        ([UNPLUG, do("show"), DOCKER], "", "usb-camera warning", "-v /dev:/dev"),
-        ([UNPLUG, do("put_on_usb", 0x0B55, serial="")], "recovery", "recovery", "8086:0b55|rs-fw-update -r"),
-        ([UNPLUG, do("put_on_usb", 0x0ADC, serial="")], "recovery", "recovery", "8086:0adc|rs-fw-update -r"),
-        ([do("put_on_usb", bcdUSB=0x0210, speed=3)], "", "link warning", "320 x 240|USB-C"),
-        ([do("show", usb_type_descriptor="2.1"), put("usb.fails", OSError("none"))], "libusb", "link warning", ""),
-        # udev rules and permissions
-        ([UNPLUG, NO_RULES], "usb-camera udev-rules", "udev-rules", "nlos-cam doctor --write-udev|--reload-rules"),
-        ([NO_RULES], "", "udev-rules warning", "--write-udev"),
-        ([NO_RULES, REFUSE], "udev-rules permissions", "permissions", "--write-udev"),
-        ([NO_RULES, UNPLUG, do("run_on", "linux", is_root=True)], "usb-camera", "udev-rules warning", ""),
-        ([REFUSE], "permissions", "permissions", "/dev/video30 (Permission denied)|udevadm trigger"),
-        ([REFUSE, do("run_on", "linux", in_plugdev=False)], "permissions", "permissions", "usermod -aG plugdev"),
-        ([remove("sys/bus/usb/devices/2-1"), do("put_on_usb", shut=DENIED)], "permissions", "permissions",
-         "Access denied"),
-        # kernel drivers
-        ([SECOND], "hid-sensors", "hid-sensors", "2-2|(none; 0003:8086:0B64.5 (hid-generic))|modprobe"),
-        ([do("plug_second", hid=1)], "hid-sensors", "hid-sensors", "(accel_3d; |sudo modprobe -a hid_sensor_hub"),
-        ([SECOND, load("uvcvideo")], "hid-sensors", "hid-sensors", "hid_sensor_gyro_3d|CONFIG_HID_SENSOR_HUB"),
-        ([SECOND, DOCKER], "hid-sensors", "hid-sensors", "modprobe"),
-        ([SECOND, remove("sys/bus/hid/devices/0003:8086:0B64.5")], "hid-sensors", "hid-sensors",
-         "(none; no HID device)"),
-        ([SECOND, do("put_on_usb", port_numbers=(2,), classes=(0x0E, 0xFF))], "hid-sensors", "hid-sensors",
-         "no HID interface"),
-        ([do("plug_second", video=0)], "video-driver", "video-driver", "2-2|sudo modprobe uvcvideo"),
-        ([do("plug_second", product="0b3d", hid=0, video=0)], "video-driver", "hid-sensors ok", ""),
-        ([do("plug_second", video=0), load(), write("lib/modules/6.8.0/modules.dep", "kernel/fs/ext4/ext4.ko:")],
-         "video-driver", "video-driver", "CONFIG_USB_VIDEO_CLASS"),
-        ([UNPLUG, do("plug_second", product="0b55", hid=0, video=0), do("put_on_usb", 0x0B55)], "recovery",
-         "recovery", ""),
-        # other programs
-        ([runs(41, "cheese", "/dev/video30")], "in-use", "in-use", "cheese (pid 41)|kill 41`"),
-        ([runs(42, "wireplumber", "/dev/video30"), runs(43, "pipewire", "/dev/video30")], "", "in-use warning", ""),
-        ([runs(42, "pipewire", "/dev/video30"), runs(41, "cheese", "/dev/video30")], "in-use", "in-use", ""),
-        ([write("proc/43/fd", "stands for a folder that may not be listed")], "", "in-use ok", "1 processes"),
-        # containers
-        ([DOCKER, NO_USB, HIDE], "container usb-camera",
-         "container", '-v /dev:/dev|-v /sys:/sys|"c 81:* rmw"|"c 189:* rmw"'),
-        ([write("run/.containerenv", ""), UNPLUG], "usb-camera", "container warning", "podman"),
-        ([DOCKER, NO_RULES], "", "container ok, udev-rules skipped", ""),
-        ([DOCKER, REFUSE], "permissions", "permissions, container warning", "--device-cgroup-rule"),
-        # systems
-        *(([do("run_on", system)], "", all_of("skipped", *LINUX_ONLY), "") for system in ("windows", "darwin")),
-        ([do("run_on", "windows"), HIDE], "sdk-camera", "sdk-camera", "Device Manager"),
-        ([do("run_on", "darwin", "arm64"), HIDE], "system sdk-camera", "system", "pyrealsense2-macosx==2.54.2|sudo"),
-        ([do("run_on", "darwin", "arm64"), NO_SDK], "system sdk", "sdk", "pip install pyrealsense2-macosx==2.54.2"),
-        ([WSL, UNPLUG], "system usb-camera", "system", "usbipd attach --wsl --busid"),
-        ([WSL], "", "system warning", ""),
-        # times of frames
-        ([], "", "metadata ok", "host's clock"),
-        ([write("sys/module/uvcvideo/version", "1.1.1")], "", "metadata ok", "host's clock"),
-        ([write("sys/module/uvcvideo/version", "1.1.1.realsense-6.1")], "", "metadata ok", "camera's clock"),
-        ([do("run_on", "darwin", "arm64")], "", "metadata skipped, system warning", "Linux and Windows"),
-        ([do("run_on", "windows")], "", "metadata ok, sdk-camera ok", "realsense_metadata_win10.ps1"),
-        ([load()], "", "metadata skipped", "uvcvideo"),
-        # Python and the SDK
-        ([NO_SDK], "sdk", "python ok, sdk-camera skipped", ""),
-        ([do("run_on", "linux", "x86_64", 12)], "", "python ok", ""),
-        ([do("run_on", "linux", "x86_64", 12), NO_SDK], "python sdk", "python", "x86_64|python3.11 -m venv"),
-        ([do("run_on", "windows", "amd64", 13), NO_SDK], "python sdk", "python", "amd64|python3.11 -m venv"),
-        ([do("run_on", "linux", "aarch64"), NO_SDK], "python sdk", "python", "aarch64|BUILD_PYTHON_BINDINGS"),
-        ([do("run_on", "linux", "riscv64"), NO_SDK], "python sdk", "python", "riscv64|BUILD_PYTHON_BINDINGS"),
-        ([do("run_on", "darwin", "arm64", 13), NO_SDK], "python system sdk", "python", "arm64|python3.12 -m venv"),
-        ([do("run_on", "linux", "x86_64", is_musl=True), NO_SDK], "python sdk", "python", "glibc"),
-        *(([put("sdk_error", ImportError(error))], "sdk", "sdk", f"{error}|{fix}") for error, fix in (
-            ("No module named 'pyrealsense2'", f"pip install {WHEEL}"),
-            ("No module named 'libusb_package'", "libusb-package"),
-            ("libusb-1.0.so.0: cannot open", "apt install libusb-1.0-0, or `pip install libusb-package`"),
-            ("libudev.so.1: cannot open", "sudo apt install libudev1"),
-            ("libstdc++.so.6: cannot open", "sudo apt install libstdc++6"),
-            ("/lib/libc.so.6: version `GLIBC_2.17' not found", "newer release"),
-            ("DLL load failed while importing pyrealsense2", "vc_redist"))),
-        ([put("load_sdk", object)], "sdk", "sdk", "attribute|--force-reinstall"),
-        ([put("load_sdk", lambda: Mock(context=Mock(side_effect=RuntimeError("no power"))))], "sdk", "sdk",
-         "no power|unplug"),
-        ([put("installed", {"pyrealsense2": "2.53.1.4623"})], "", "sdk-version warning", ""),
-        ([put("installed", {})], "", "sdk ok, sdk-version skipped, sdk-alone skipped", "unknown version"),
-        ([put("installed", dict.fromkeys(("pyrealsense2", "pyrealsense2-beta"), "2.54.2.5684"))], "sdk-alone",
-         "sdk-alone", f"pip uninstall -y pyrealsense2 pyrealsense2-beta && pip install {WHEEL}"),
-        ([put("usb.fails", usb.core.NoBackendError("No backend available"))], "libusb",
-         "libusb, usb-camera skipped, sdk-camera ok", "No backend available|pip install pyusb libusb-package|sudo apt"),
-        # the camera in the SDK
-        ([HIDE], "sdk-camera", "sdk-camera", f"L515 f0246262 at 2-1|{REPLUG}"),
-        ([HIDE, do("refuse", "/dev/bus/usb/002/003")], "permissions sdk-camera", "sdk-camera", "udevadm trigger"),
-        ([HIDE, SECOND], "hid-sensors sdk-camera", "sdk-camera", "hid-sensors|sudo modprobe -a hid_sensor_hub"),
+        *CAMERA_ON_USB,
+        *RULES_AND_PERMISSIONS,
+        *KERNEL_DRIVERS,
+        *OTHER_PROGRAMS,
+        *CONTAINERS,
+        *SYSTEMS,
+        *TIMES_OF_FRAMES,
+        *PYTHON,
+        *LIBREALSENSE,
     ],
-)  # fmt: skip
-def test_check_reports_fault_with_its_fix(
-    bench: Any, steps: list[Any], failures: str, check: str, words: str
-) -> None:
-    for step in steps:
-        step(bench)
+    ids=lambda case: f"{case.check}-{case.status}",
+)
+def test_check_reports_fault_with_its_fix(bench: Bench, case: Case) -> None:
+    for fault in case.faults:
+        fault(bench)
     checks = bench.checks()
-    wanted = [(*each.split(), "failed")[:2] for each in check.split(", ")]
-    assert {each.name for each in checks.values() if each.status == "failed"} == set(
-        failures.split()
-    )
-    assert [(name, checks[name].status) for name, _ in wanted] == wanted
-    first = checks[wanted[0][0]]
-    for word in words.split("|"):
-        assert word in f"{first.detail}\n{first.fix}"
+
+    finding = checks[case.check]
+    assert finding.status == case.status
+    for word in case.words.split("|"):
+        assert word in f"{finding.detail}\n{finding.fix}"
+
+    failed = {name for name, check in checks.items() if check.status == "failed"}
+    expected = {case.check} if case.status == "failed" else set[str]()
+    assert failed == expected | set(case.also_failed.split())
 
 
-def test_fixes_fit_the_platform_and_the_user(bench: Any) -> None:
+def statuses(bench: Bench, names: str) -> set[str]:
+    checks = bench.checks()
+    return {checks[name].status for name in names.split()}
+
+
+def test_checks_of_a_camera_are_skipped_without_one(bench: Bench) -> None:
+    bench.unplug()
+    names = "recovery link permissions video-driver hid-sensors in-use sdk-camera firmware"
+    assert statuses(bench, names) == {"skipped"}
+
+
+@pytest.mark.parametrize("system", ["windows", "darwin"])
+def test_checks_of_linux_are_skipped_elsewhere(bench: Bench, system: str) -> None:
+    bench.run_on(system)
+    assert not bench.failed()
+    names = "container udev-rules permissions video-driver hid-sensors in-use"
+    assert statuses(bench, names) == {"skipped"}
+
+
+def test_fix_does_not_add_a_user_to_a_group_that_has_him(bench: Bench) -> None:
     bench.refuse()
-    assert "usermod" not in bench.failed()["permissions"].fix  # in the group already
+    assert "usermod" not in bench.failed()["permissions"].fix
+
+
+def test_fix_on_windows_names_no_package_of_linux(bench: Bench) -> None:
     bench.run_on("windows")
-    bench.usb.fails = usb.core.NoBackendError("No backend available")
+    NO_LIBUSB(bench)
     assert "apt" not in bench.checks()["libusb"].fix
 
 
-def test_container_that_hides_sensors_is_named_as_the_cause(bench: Any) -> None:
+def test_container_that_hides_sensors_is_named_as_the_cause(bench: Bench) -> None:
     DOCKER(bench)
-    SECOND(bench)
-    for sensor in (bench.linux.root / "sys/bus/iio/devices").iterdir():
+    SECOND_WITHOUT_SENSORS(bench)
+    sensors = bench.linux.root / "sys/bus/iio/devices"
+    for sensor in sensors.iterdir():
         sensor.unlink()
-    (bench.linux.root / "sys/bus/iio/devices").rmdir()
-    (bench.linux.root / "sys/bus/iio").rmdir()
+    sensors.rmdir()
+    sensors.parent.rmdir()
     assert "-v /sys:/sys" in bench.failed()["hid-sensors"].fix
 
 
 @pytest.mark.parametrize("version", ["2.55.1.6486", "2.59.1.11053", "3.0"])
-def test_sdk_without_the_l515_is_why_it_is_not_seen(bench: Any, version: str) -> None:
+def test_sdk_without_the_l515_is_why_it_is_not_seen(bench: Bench, version: str) -> None:
     bench.installed["pyrealsense2"] = version
     bench.hide()
     failed = bench.failed()
     assert set(failed) == {"sdk-version", "sdk-camera"}
-    assert failed["sdk-version"].fix == failed["sdk-camera"].fix == f"pip install {WHEEL}"
+    assert failed["sdk-version"].fix == f"pip install {WHEEL}"
+    assert failed["sdk-camera"].fix == f"pip install {WHEEL}"
     assert version in failed["sdk-camera"].detail
 
 
 @pytest.mark.parametrize(
     ("firmware", "status"),
     [
-        *(
-            ("01.05.08.01", "ok"),
-            ("01.05.10.00", "ok"),
-            ("01.05.08.00", "warning"),
-            ("01.05.01.03", "warning"),
-        ),
-        *(("01.05.01.02", "failed"), ("01.04.01.02", "failed")),
-        *(
-            (0x1058, "ok"),
-            (0x1052, "warning"),
-            (0x1041, "failed"),
-            (0x2F00, "skipped"),
-            (0, "skipped"),
-        ),
+        ("01.05.08.01", "ok"),
+        ("01.05.10.00", "ok"),
+        ("01.05.08.00", "warning"),
+        ("01.05.01.03", "warning"),
+        ("01.05.01.02", "failed"),
+        ("01.04.01.02", "failed"),
     ],
 )
-def test_firmware_is_judged_by_sdk_or_usb(bench: Any, firmware: str | int, status: str) -> None:
-    """USB has three of its four version_numbers, and not of every firmware."""
-    if isinstance(firmware, str):
-        bench.show(firmware_version=firmware)
-    else:
-        bench.put_on_usb(bcdDevice=firmware)
-        bench.hide()
+def test_firmware_of_the_sdk_has_four_numbers(bench: Bench, firmware: str, status: str) -> None:
+    bench.show(firmware_version=firmware)
     check = bench.checks()["firmware"]
     assert check.status == status
-    if isinstance(firmware, str):
-        assert firmware in check.detail
-        assert ("1.5.8.1" in check.fix) == (status != "ok")
+    assert firmware in check.detail
+    assert ("1.5.8.1" in check.fix) == (status != "ok")
 
 
-def test_older_of_two_firmwares_counts(bench: Any) -> None:
+@pytest.mark.parametrize(
+    ("release", "status"),
+    [
+        (0x1058, "ok"),
+        (0x1052, "warning"),
+        (0x1041, "failed"),
+        (0x2F00, "skipped"),
+        (0, "skipped"),
+    ],
+)
+def test_firmware_of_usb_has_three_numbers_or_none(bench: Bench, release: int, status: str) -> None:
+    bench.put_on_usb(bcdDevice=release)
+    bench.hide()
+    assert bench.checks()["firmware"].status == status
+
+
+def test_older_of_two_firmwares_counts(bench: Bench) -> None:
     bench.usb.devices.append(fake_device(serial="F1", port_numbers=(2,), address=4))
     bench.sdk_devices.append(FakeLidar("f1"))
     bench.sdk_devices[1].info["firmware_version"] = "01.04.01.02"
-    assert "f0246262" in (detail := bench.failed()["firmware"].detail)
+    detail = bench.failed()["firmware"].detail
+    assert "f0246262" in detail
     assert "01.04.01.02" in detail

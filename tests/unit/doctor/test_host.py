@@ -178,9 +178,7 @@ def test_odd_files_are_empty_and_odd_folders_hold_nothing(tmp_path: Path) -> Non
     assert not host.path_exists(tmp_path / "loop")
 
 
-def test_process_that_holds_a_node_is_named_where_there_is_a_camera(
-    bench: Any, tmp_path: Path
-) -> None:
+def test_process_that_holds_a_cameras_node_is_named(bench: Any, tmp_path: Path) -> None:
     bench.linux.process(41, "realsense-viewer", "/dev/null", "/dev/video30", "/dev/video31")
     bench.linux.process(42, "bash", "/dev/tty")
     bench.linux.write("proc/43/fd", "stands for a folder that may not be listed")
@@ -210,28 +208,42 @@ def test_real_process_that_has_a_file_open_is_found(tmp_path: Path) -> None:
 CLAUSE = re.compile(r'[A-Z]+(\{\w+\})?(==|:=|\+=)"[^"]*"')
 
 
-def test_rules_open_each_lidar_and_its_sensors_and_are_installed() -> None:
-    lines = [line for line in rules_text().splitlines() if line and not line.startswith("#")]
-    for product_id in LIDARS:
-        [rule] = [
-            line
-            for line in lines
-            if f'"{product_id:04x}"' in line and line.startswith('SUBSYSTEMS=="usb"')
-        ]
-        assert 'ATTRS{idVendor}=="8086"' in rule
-        assert 'MODE:="0666"' in rule
-    sensors = [line for line in lines if not line.startswith("SUBSYSTEMS")]
+@pytest.fixture(scope="module")
+def rules() -> list[str]:
+    return [line for line in rules_text().splitlines() if line and not line.startswith("#")]
+
+
+@pytest.mark.parametrize("product_id", LIDARS)
+def test_rules_open_each_lidar(rules: list[str], product_id: int) -> None:
+    usb_rules = [line for line in rules if line.startswith('SUBSYSTEMS=="usb"')]
+    [rule] = [line for line in usb_rules if f'"{product_id:04x}"' in line]
+    assert 'ATTRS{idVendor}=="8086"' in rule
+    assert 'MODE:="0666"' in rule
+
+
+def test_rules_open_the_motion_sensors_of_the_l515(rules: list[str]) -> None:
+    sensors = [line for line in rules if not line.startswith("SUBSYSTEMS")]
     assert [line.split(",")[0] for line in sensors] == ['KERNEL=="iio*"', 'DRIVER=="hid_sensor*"']
-    assert all(
-        'ATTRS{idProduct}=="0b64"' in line and "chmod -R 0777 /sys/%p" in line for line in sensors
-    )
-    for line in lines:
+    for line in sensors:
+        assert 'ATTRS{idProduct}=="0b64"' in line
+        assert "chmod -R 0777 /sys/%p" in line
+
+
+def test_rules_have_the_syntax_of_udev(rules: list[str]) -> None:
+    for line in rules:
         assert all(CLAUSE.fullmatch(clause) for clause in line.split(", ")), line
-    assert not LIDARS.keys() & OTHERS.keys()
+
+
+def test_rules_are_written_installed_and_reloaded_in_order() -> None:
     assert f"--write-udev {FILE_NAME}" in WRITE_AND_INSTALL
     assert WRITE_AND_INSTALL.endswith(RELOAD)
-    assert "'my rules'" in install_command("my rules")
-    assert install_command("a").index("install") < install_command("a").index("udevadm")
+    command = install_command("my rules")
+    assert "'my rules'" in command
+    assert command.index("install") < command.index("udevadm")
+
+
+def test_product_ids_are_of_one_family_only() -> None:
+    assert not LIDARS.keys() & OTHERS.keys()
 
 
 Scan = Callable[..., list[UsbDevice]]
@@ -340,7 +352,7 @@ def test_scan_closes_every_device_and_claims_none(bench: Any, seen: Scan, tmp_pa
     assert "Input/Output Error" in scan_usb(bench.usb, tmp_path).error
 
 
-def test_scan_of_the_real_bus_reports_a_missing_libusb_or_package(
+def test_scan_of_the_real_bus_reports_what_is_missing(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     found = scan_usb()

@@ -13,7 +13,7 @@ from threading import Event
 
 import numpy as np
 import pytest
-from fake_farm import samples_of
+from fake_workers import samples_of
 from nlos_calibration.rig import load_rig
 from nlos_models import shipped_folder
 

@@ -14,7 +14,7 @@ from unittest.mock import Mock
 
 import numpy as np
 import pytest
-from fake_farm import samples_of
+from fake_workers import samples_of
 from nlos_calibration.rig import load_rig
 from soak import FrameLog, summarize
 

@@ -1,5 +1,4 @@
-"""Synthetic walls, flat and not, and their noisy depth, for studies and tests of the wall fit
-without a camera.
+"""Synthetic walls, flat and not, and their noisy depth, for tests of the wall fit without a camera.
 
 A scene is a depth map (height, width) with the pose of the wall that fills most of the view. Walls
 that are not flat are given by their height above that plane, or by a second plane.

@@ -1,7 +1,7 @@
-"""The farm that renders nothing keeps the promises of a real farm."""
+"""The worker pool that renders nothing keeps the promises of a real one."""
 
 import numpy as np
-from fake_farm import FakeFarm, samples_of
+from fake_workers import FakeWorkers, samples_of
 from nlos_calibration.rig import load_rig
 
 from nlos_cam.dataset import DatasetPlan
@@ -20,8 +20,8 @@ def test_fake_samples_have_names_and_types_of_real_ones() -> None:
     }
 
 
-def test_fake_farm_makes_every_piece_once_in_its_order() -> None:
-    assert [piece for piece, _ in FakeFarm()(PLAN, PIECES)] == PIECES
-    shuffled = [piece for piece, _ in FakeFarm(order=2)(PLAN, PIECES)]
+def test_fake_workers_deliver_every_piece_once_in_their_order() -> None:
+    assert [piece for piece, _ in FakeWorkers()(PLAN, PIECES)] == PIECES
+    shuffled = [piece for piece, _ in FakeWorkers(order=2)(PLAN, PIECES)]
     assert shuffled != PIECES
     assert sorted(shuffled, key=lambda piece: piece.start) == PIECES
