@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 import nlos_calibration as walls
-import nlos_models as models
+from nlos_models import training
 
 from nlos_cam import camera as cameras
 from nlos_cam import objects as shapes
@@ -34,7 +34,7 @@ def rigs(json: Json = False) -> None:
 
 def recipes(json: Json = False) -> None:
     """List the packaged training recipes, for --recipe."""
-    titles = {name: _title(path) for name, path in models.packaged_recipes().items()}
+    titles = {name: _title(path) for name, path in training.packaged_recipes().items()}
     _print("recipes", titles, as_json=json)
 
 
