@@ -65,19 +65,17 @@ def read_settings(
     """Return every setting. Raises RecordingError for a file that cannot be used, BadParameter for
     a variable.
     """
-    files = [(folder or Path()) / FILE, (user_folder or Path(typer.get_app_dir("nlos-cam"))) / FILE]
-    read = [(path, _read_file(path)) for path in files]
-    values: dict[str, Value] = {}
-    for name, setting in SETTINGS.items():
-        found = next(((content[name], path) for path, content in read if name in content), None)
-        if text := environment.get(variable(name)):
-            values[name] = Value(
-                _port_in(variable(name), text) if name == "view_port" else text, variable(name)
-            )
-        else:
-            values[name] = (
-                Value(found[0], str(found[1])) if found else Value(setting.default, "default")
-            )
+    values = {name: Value(setting.default, "default") for name, setting in SETTINGS.items()}
+
+    # from the weakest source to the strongest
+    for place in (user_folder or Path(typer.get_app_dir("nlos-cam")), folder or Path()):
+        path = place / FILE
+        for name, value in _read_file(path).items():
+            values[name] = Value(value, str(path))
+    for name in SETTINGS:
+        source = variable(name)
+        if text := environment.get(source):
+            values[name] = Value(_port_in(source, text) if name == "view_port" else text, source)
     return values
 
 
@@ -189,8 +187,7 @@ def _cache_at(setting: Value) -> Generator[None]:
 
 
 def _optional(annotation: Any) -> Any:
-    kind, *rest = annotation.__origin__, *annotation.__metadata__
-    return Annotated[kind | None, *rest]
+    return Annotated[annotation.__origin__ | None, *annotation.__metadata__]
 
 
 def _choose_camera(values: dict[str, Any], used: dict[str, Value]) -> None:

@@ -42,9 +42,9 @@ def _format(path: Path, found: inspect.Description) -> str:
     width = max(map(len, facts))
     lines = [f"{path}: {found.kind}, {_format_size(found.bytes)}"]
     lines += [f"  {name:{width}}  {value}" for name, value in facts.items() if value]
-    return "\n".join(
-        [*lines, *(["Next:"] if found.next else []), *(f"  {line}" for line in found.next)]
-    )
+    if found.next:
+        lines += ["Next:", *(f"  {line}" for line in found.next)]
+    return "\n".join(lines)
 
 
 def _format_size(size: int) -> str:

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 import nlos_calibration as walls
-import nlos_models as models
+from nlos_models import training
 
 from nlos_cam import camera as cameras
 from nlos_cam import objects as shapes
@@ -22,10 +22,9 @@ def scenes(json: Json = False) -> None:
 
 def objects(json: Json = False) -> None:
     """List the kinds of hidden objects, for `render` and scene files."""
-    kinds = {
-        name: f"varies in {', '.join(kind.settings)}" for name, kind in shapes.CATEGORIES.items()
-    }
-    _print("objects", kinds, as_json=json)
+    kinds = shapes.CATEGORIES.items()
+    varies = {name: f"varies in {', '.join(kind.settings)}" for name, kind in kinds}
+    _print("objects", varies, as_json=json)
 
 
 def rigs(json: Json = False) -> None:
@@ -35,11 +34,8 @@ def rigs(json: Json = False) -> None:
 
 def recipes(json: Json = False) -> None:
     """List the packaged training recipes, for --recipe."""
-    _print(
-        "recipes",
-        {name: _title(path) for name, path in models.packaged_recipes().items()},
-        as_json=json,
-    )
+    titles = {name: _title(path) for name, path in training.packaged_recipes().items()}
+    _print("recipes", titles, as_json=json)
 
 
 def _title(path: Path) -> str:
@@ -51,8 +47,5 @@ def _title(path: Path) -> str:
 def _print(kind: str, found: Mapping[str, str], *, as_json: bool) -> None:
     width = max(map(len, found))
     text = "\n".join(f"{name:{width}}  {description}" for name, description in found.items())
-    finish(
-        {kind: [{"name": name, "description": what} for name, what in found.items()]},
-        as_json=as_json,
-        text=text,
-    )
+    rows = [{"name": name, "description": description} for name, description in found.items()]
+    finish({kind: rows}, as_json=as_json, text=text)

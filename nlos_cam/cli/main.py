@@ -4,6 +4,7 @@ import importlib
 import json
 import os
 from contextlib import suppress
+from itertools import dropwhile
 from typing import Annotated, NamedTuple
 
 import typer
@@ -180,9 +181,8 @@ def _run(command: str, arguments: list[str]) -> int:
     with common.interrupted_by_signals():
         if command in COMMANDS:
             _check_address_space(TORCH_ADDRESS_BYTES if command == "train" else MIN_ADDRESS_BYTES)
-        with (
-            common.stop_on_signals() as stop
-        ):  # an interrupted import can end in any error of any library
+        # an interrupted import can end in any error of any library
+        with common.stop_on_signals() as stop:
             app = build_app(None if COMPLETION in os.environ else command)
             tree = get_command(app)
             plain_help(tree)
@@ -196,15 +196,16 @@ def _run(command: str, arguments: list[str]) -> int:
 
 def _split(arguments: list[str]) -> tuple[str, list[str]]:
     """Return the command, and the arguments with the options for all commands moved behind it."""
-    place = next(
-        (i for i, argument in enumerate(arguments) if not argument.startswith("-")), len(arguments)
-    )
-    early = [argument for argument in arguments[:place] if argument in EVERYWHERE]
-    before = [argument for argument in arguments[:place] if argument not in EVERYWHERE]
-    command = "".join(arguments[place : place + 1])
-    rest = arguments[place:]
+    rest = list(dropwhile(lambda argument: argument.startswith("-"), arguments))
+    before = arguments[: len(arguments) - len(rest)]
+    own = [argument for argument in before if argument not in EVERYWHERE]
+    early = [argument for argument in before if argument in EVERYWHERE]
+
+    command = rest[0] if rest else ""
     words = 2 if command in GROUPS else 1
-    return command, [*before, *rest[:words], *(early if len(rest) >= words else []), *rest[words:]]
+    if len(rest) < words:  # no command: the options for all commands have no place
+        return command, own + rest
+    return command, own + rest[:words] + early + rest[words:]
 
 
 def _check_address_space(needed: int) -> None:

@@ -46,7 +46,8 @@ def _describe(parameter: Any) -> None:
     high = getattr(parameter, "max", None)
     if text := range_text(low, high):
         parameter.help = f"{(parameter.help or '').removesuffix('.')} ({text})."
-    parameter._get_number_range_help_str = lambda: None  # noqa: SLF001  typer has no public way to leave "[x>=0.1]" out
+    # typer has no public way to leave "[x>=0.1]" out
+    parameter._get_number_range_help_str = lambda: None  # noqa: SLF001
     if parameter.param_type_name == "option" and parameter.metavar is None:
         parameter.metavar = "" if getattr(parameter, "is_flag", False) else placeholder(parameter)
 
@@ -56,15 +57,14 @@ def placeholder(parameter: Any) -> str | None:
     if parameter.type_descriptor.is_choice:
         return None
     name = str(parameter.name)
-    suffix = next((unit for end, unit in SUFFIXES.items() if name.endswith(end)), None)
-    kind = (
-        parameter.type_descriptor.path_type
-        if parameter.type_descriptor.is_path
-        else parameter.bare_type()
-    )
-    return (
-        PLACEHOLDERS.get(name) or suffix or TYPES.get(str(kind).split(" ")[-1], str(kind).upper())
-    )
+    if name in PLACEHOLDERS:
+        return PLACEHOLDERS[name]
+    for end, unit in SUFFIXES.items():
+        if name.endswith(end):
+            return unit
+    descriptor = parameter.type_descriptor
+    kind = str(descriptor.path_type if descriptor.is_path else parameter.bare_type())
+    return TYPES.get(kind.rsplit(" ", maxsplit=1)[-1], kind.upper())
 
 
 def range_text(low: float | None, high: float | None) -> str:

@@ -1,6 +1,4 @@
-"""Wording of usage errors: the reason in our own words, and the help page to try; typer's speak of
-its internals.
-"""
+"""Wording of usage errors: the reason in one line, and the help page to try."""
 
 from typing import Any
 
@@ -15,28 +13,12 @@ def usage_reason(error: typer.TyperException) -> str:
     """Return the reason of a usage error in one line: the option, the value and the remedy."""
     parameter: Any = getattr(error, "param", None)
     if option := getattr(error, "option_name", None):
-        possible = getattr(error, "possibilities", ())
-        near = f". Did you mean {' or '.join(possible)}?" if possible else ""
-        return f"{option} needs a value" if possible == () else f"no option {option}{near}"
+        return _option_reason(option, getattr(error, "possibilities", ()))
     if parameter and hasattr(error, "param_type"):
         return f"{_name(parameter)} is missing: {_lower(parameter.help or 'give it')}".rstrip(".")
-    if parameter and (cause := getattr(error.__cause__, "errors", None)):
-        return _value_reason(parameter, cause()[0]["input"])
+    if parameter and (invalid := getattr(error.__cause__, "errors", None)):
+        return _value_reason(parameter, invalid()[0]["input"])
     return _message_reason(error)
-
-
-def _message_reason(error: typer.TyperException) -> str:
-    context: Any = getattr(error, "ctx", None)
-    message = str(getattr(error, "message", "") or error.format_message())
-    if extra := message.partition("unexpected extra argument")[2].rpartition("(")[2]:
-        return f"unexpected argument {extra.rstrip(').')!r}"
-    names = list(getattr(getattr(context, "command", None), "commands", {}))
-    if message.startswith(("No such command", "Missing command")) and context and context.parent:
-        return (
-            f"{message if message.endswith('?') else message.rstrip('.') + '.'} Choose from"
-            f" {', '.join(names)}"
-        )
-    return message
 
 
 def usage_lines(error: typer.TyperException) -> tuple[str, str]:
@@ -49,8 +31,44 @@ def usage_lines(error: typer.TyperException) -> tuple[str, str]:
     return " ".join(context.get_usage().split()), f"Try `{context.command_path} --help`"
 
 
-def _listed(names: list[str]) -> str:
-    return " or ".join([", ".join(names[:-1]), *names[-1:]] if names[1:] else names)
+def _option_reason(option: str, possible: Any) -> str:
+    if possible == ():  # the error of an option without its value has no such field
+        return f"{option} needs a value"
+    near = f". Did you mean {' or '.join(possible)}?" if possible else ""
+    return f"no option {option}{near}"
+
+
+def _message_reason(error: typer.TyperException) -> str:
+    context: Any = getattr(error, "ctx", None)
+    message = str(getattr(error, "message", "") or error.format_message())
+    if "unexpected extra argument" in message:
+        extra = message.rpartition("(")[2].rstrip(").")
+        return f"unexpected argument {extra!r}"
+    if message.startswith(("No such command", "Missing command")) and context and context.parent:
+        ended = message if message.endswith("?") else message.rstrip(".") + "."
+        return f"{ended} Choose from {', '.join(context.command.commands)}"
+    return message
+
+
+def _value_reason(parameter: Any, value: Any) -> str:
+    """Return the values that a parameter takes, and the one that it got instead."""
+    name = _name(parameter)
+    kind = parameter.type_descriptor
+    if kind.choices is None:
+        wanted = NUMBERS.get(kind.annotation, "a valid value")
+        return f"{name} must be {wanted}{_bounds(parameter)} (got {value!r})"
+    names = [str(choice) for choice in kind.choices]
+    near = did_you_mean(str(value), names)
+    reason = f"{name} must be {_listed(names)} (got {value!r})"
+    return f"{reason}.{near}" if near else reason
+
+
+def _bounds(parameter: Any) -> str:
+    low = getattr(parameter, "min", None)
+    high = getattr(parameter, "max", None)
+    if high is None:
+        return "" if low is None else f" of at least {low:g}"
+    return f" to {high:g}" if low is None else f" from {low:g} to {high:g}"
 
 
 def _name(parameter: Any) -> str:
@@ -59,31 +77,9 @@ def _name(parameter: Any) -> str:
     return max(parameter.opts, key=len)
 
 
-def _value_reason(parameter: Any, value: Any) -> str:
-    """Return what a parameter takes, and the value that it got instead."""
-    kind = parameter.type_descriptor
-    name = _name(parameter)
-    if kind.choices is not None:
-        names = [str(choice) for choice in kind.choices]
-        return f"{name} must be {_listed(names)} (got {value!r}).{did_you_mean(str(value), names)}".rstrip(
-            "."
-        )
-    low = getattr(parameter, "min", None)
-    high = getattr(parameter, "max", None)
-    bounds = [
-        f"{word} {bound:g}" for word, bound in (("from", low), ("to", high)) if bound is not None
-    ]
-    if high is None and low is not None:
-        bounds = [f"of at least {low:g}"]
-    return " ".join(
-        [
-            name,
-            "must be",
-            NUMBERS.get(kind.annotation, "a valid value"),
-            *bounds,
-            f"(got {value!r})",
-        ]
-    )
+def _listed(names: list[str]) -> str:
+    *others, last = names
+    return f"{', '.join(others)} or {last}" if others else last
 
 
 def _lower(text: str) -> str:

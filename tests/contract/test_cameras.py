@@ -28,6 +28,7 @@ from nlos_cam.frames import Frame
 FAKE_L515 = "l515:fake"
 RECORDED = 12
 SEEN = 5
+READERS = {"bag": "plain", "bag-sdk": "sdk"}
 ENDS_CLEANLY = """
 import json
 import sys
@@ -52,6 +53,7 @@ def bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
         "sim",
         "sim:bare-wall",
         "bag",
+        "bag-sdk",
         FAKE_L515,
         pytest.param("l515", marks=pytest.mark.hardware),
     ]
@@ -64,8 +66,8 @@ def opens(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> di
     found = connected(load_sdk(), shared_context(load_sdk())) if request.param == "l515" else []
     if request.param == "l515" and not any("L515" in info.name for _, info in found):
         pytest.skip("no L515 is connected")
-    if request.param == "bag":
-        return {"uri": f"bag:{request.getfixturevalue('bag')}"}
+    if request.param in READERS:
+        return {"uri": f"bag:{request.getfixturevalue('bag')}", "reader": READERS[request.param]}
     return {"uri": request.param}
 
 
@@ -79,7 +81,7 @@ def look(camera: Camera) -> list[Frame]:
         return list(islice(camera, SEEN))
 
 
-def test_frames_fulfil_the_protocol(camera: Camera) -> None:
+def test_frames_have_the_shapes_and_types_of_the_protocol(camera: Camera) -> None:
     shape = camera.intrinsics.height, camera.intrinsics.width
     for frame in look(camera):
         assert frame.depth_m.shape == frame.ir.shape == frame.confidence.shape == shape
@@ -88,6 +90,10 @@ def test_frames_fulfil_the_protocol(camera: Camera) -> None:
             np.uint8,
             np.uint8,
         )
+
+
+def test_frames_have_the_units_and_settings_of_the_protocol(camera: Camera) -> None:
+    for frame in look(camera):
         assert frame.intrinsics == camera.intrinsics
         seen = frame.depth_m[~np.isnan(frame.depth_m)]
         assert seen.size > 0.5 * frame.depth_m.size
@@ -97,12 +103,16 @@ def test_frames_fulfil_the_protocol(camera: Camera) -> None:
         assert frame.settings["depth_units"] == pytest.approx(0.00025)
 
 
-def test_numbers_and_timestamps_rise_together(camera: Camera) -> None:
+def test_frame_numbers_and_timestamps_rise_together(camera: Camera) -> None:
     frames = look(camera)
     for one, next_one in pairwise(frames):
         assert next_one.frame_number > one.frame_number
         frames_later = (next_one.timestamp_s - one.timestamp_s) * 30
         assert frames_later == pytest.approx(next_one.frame_number - one.frame_number, abs=0.5)
+
+
+def test_gaps_in_frame_numbers_are_counted_as_dropped(camera: Camera) -> None:
+    frames = look(camera)
     assert camera.incomplete == 0
     assert camera.dropped >= frames[-1].frame_number - frames[0].frame_number + 1 - len(frames)
 
@@ -137,9 +147,12 @@ def test_camera_can_be_entered_again_after_an_error_too(camera: Camera) -> None:
     assert len(look(camera)) == len(look(camera)) == SEEN
 
 
-def test_frames_come_only_between_entering_and_leaving(camera: Camera) -> None:
+def test_iterating_before_entering_is_an_error(camera: Camera) -> None:
     with pytest.raises(CameraError, match=camera.uri):
         next(iter(camera))
+
+
+def test_leaving_a_camera_ends_its_frames(camera: Camera) -> None:
     with camera:
         frames = iter(camera)
         next(frames)
@@ -159,6 +172,7 @@ def test_process_that_used_a_camera_ends_cleanly(opens: dict[str, Any]) -> None:
     assert (ended.returncode, ended.stdout, ended.stderr) == (0, "3\n", "")
 
 
-def test_recording_cannot_be_recorded(bag: Path, tmp_path: Path) -> None:
+@pytest.mark.parametrize("reader", READERS.values())
+def test_recording_cannot_be_recorded(bag: Path, tmp_path: Path, reader: Any) -> None:
     with pytest.raises(NlosCamError, match=bag.name):
-        open_camera(f"bag:{bag}", recording=Recording(tmp_path / "copy.bag"))
+        open_camera(f"bag:{bag}", recording=Recording(tmp_path / "copy.bag"), reader=reader)

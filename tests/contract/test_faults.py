@@ -86,7 +86,8 @@ def live(
     viewer = ListViewer()
     with camera:
         processing = Pipeline(CalibratedRig(RIG), sheet_network)
-        report = run_live(Until(camera, last), processing, viewer, stop=Event(), **options)  # type: ignore[arg-type]
+        source: Any = Until(camera, last)
+        report = run_live(source, processing, viewer, stop=Event(), **options)
     moments = [
         moment for moment in viewer.moments if moment.result.verdict != Verdict.STALLED
     ]  # the last one, shown again

@@ -39,7 +39,9 @@ ssize_t write(int fd, const void *data, size_t count) {
     static ssize_t (*next)(int, const void *, size_t);
     static int writes;
     if (!next) next = dlsym(RTLD_NEXT, "write");
-    const char *folder = getenv("SHIM_FOLDER"), *fail = getenv("SHIM_FAIL_AT"), *cut = getenv("SHIM_SHORT");
+    const char *folder = getenv("SHIM_FOLDER");
+    const char *fail = getenv("SHIM_FAIL_AT");
+    const char *cut = getenv("SHIM_SHORT");
     if (folder && is_regular(fd, folder)) {
         if (fail && ++writes >= atoi(fail)) { errno = EIO; return -1; }
         if (cut && count > 1000) count = count / 2;

@@ -125,7 +125,7 @@ def problems() -> Iterator[str]:
         if packed > MAX_PACKED:
             yield f"{name}: {packed:.1f} packed assignments in 1,000 lines, at most {MAX_PACKED:g}"
         if wide > MAX_WIDE:
-            yield f"{name}: {wide:.0f} lines in 1,000 beyond {MAX_COLUMNS} columns, at most {MAX_WIDE:g}"
+            yield f"{name}: {wide:.0f} wide lines in 1,000, at most {MAX_WIDE:g}"
         if found.tokens_a_line > MAX_TOKENS_A_LINE[name]:
             limit = MAX_TOKENS_A_LINE[name]
             yield f"{name}: {found.tokens_a_line:.2f} tokens a line, at most {limit:g}"

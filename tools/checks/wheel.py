@@ -39,8 +39,9 @@ SIZES = """
 import importlib.metadata, json, pathlib
 total = {}
 for found in importlib.metadata.distributions():
-    files = [path for path in map(found.locate_file, found.files or []) if pathlib.Path(path).is_file()]
-    total[found.metadata["Name"]] = sum(pathlib.Path(path).stat().st_size for path in files) / 1e6
+    paths = [pathlib.Path(found.locate_file(file)) for file in found.files or []]
+    size = sum(path.stat().st_size for path in paths if path.is_file())
+    total[found.metadata["Name"]] = size / 1e6
 print(json.dumps(total))
 """
 Times = dict[str, float]

@@ -62,10 +62,8 @@ def matches(pattern: str, texts: list[Text]) -> Iterator[str]:
     for file, first, text in texts:
         for found in re.finditer(pattern, text, re.IGNORECASE):
             line = first + text.count("\n", 0, found.start())
-            yield (
-                f"{file}:{line}:"
-                f" {' '.join(text[max(found.start() - 30, 0) : found.end() + 30].split())}"
-            )
+            around = text[max(found.start() - 30, 0) : found.end() + 30]
+            yield f"{file}:{line}: {' '.join(around.split())}"
 
 
 def findings(
@@ -87,12 +85,13 @@ def findings(
 
 def pages() -> list[Text]:
     """Return the Markdown pages without their code."""
-    paths = [path for pattern in PAGES for path in sorted(ROOT.glob(pattern))]
-    blank = {
-        path: FENCE.sub(lambda m: "\n" * m[0].count("\n"), path.read_text(encoding="utf-8"))
-        for path in paths
-    }
-    return [(str(path.relative_to(ROOT)), 1, text) for path, text in blank.items()]
+    texts = list[Text]()
+    for pattern in PAGES:
+        for path in sorted(ROOT.glob(pattern)):
+            # lines of code become empty ones, so that line numbers stay
+            prose = FENCE.sub(lambda code: "\n" * code[0].count("\n"), path.read_text("utf-8"))
+            texts.append((str(path.relative_to(ROOT)), 1, prose))
+    return texts
 
 
 def main() -> int:
@@ -112,6 +111,7 @@ def main() -> int:
         name: findings(*scan(ROOT / folder), docstrings=True) for name, folder in PACKAGES.items()
     }
     every["docs"] = findings(pages(), [], docstrings=False)
+
     failed = False
     for name, found in every.items():
         print(f"{name:17}" + "  ".join(f"{key} {rate:.1f}" for key, (rate, _) in found.items()))

@@ -219,7 +219,8 @@ def read_label(path: Path, _folder: Path, _random: np.random.Generator) -> None:
     """Return the depth map of the hidden object that a file beside a recording describes."""
     from nlos_cam.dataset import labelled
 
-    labelled._placed(path, "short", load_rig("paper-rig"))  # noqa: SLF001  what `dataset label` reads, without its rest
+    # the part of `dataset label` that reads the file
+    labelled._placed(path, "short", load_rig("paper-rig"))  # noqa: SLF001
 
 
 def make_files(home: Path) -> None:

@@ -232,10 +232,9 @@ def change_topic(bag: Bag, random: Random) -> None:
     other = pick(random, list(bag.topics))
     topic, kind = bag.topics[one]
     if random.random() < 0.4:
-        bag.topics[one], bag.topics[other] = (
-            (bag.topics[other][0], kind),
-            (topic, bag.topics[other][1]),
-        )
+        other_topic, other_kind = bag.topics[other]
+        bag.topics[one] = other_topic, kind
+        bag.topics[other] = topic, other_kind
     elif random.random() < 0.6:
         bag.topics[one] = topic.replace("sensor_0", f"sensor_{pick(random, SENSORS)}"), kind
     else:

@@ -1,4 +1,4 @@
-"""Hours of `live` with a watcher that comes and goes: docs/figures/soak.json and docs/images/soak.png.
+"""Hours of `live` with a watcher that comes and goes: `soak.json` and `soak.png` of the docs.
 
 `soak.py [--minutes M] [--camera URI] [--watcher visits|stays|none] [--out FILE]`. Once a minute it
 notes memory, threads and descriptors of the process, and latency and drops of that minute's frames.

@@ -1,4 +1,4 @@
-"""Commands on a disk that fills up, in little memory, and without /dev/shm: docs/figures/starved.json.
+"""Commands on a full disk, in little memory, without /dev/shm: docs/figures/starved.json.
 
 `starve_commands.py [--count N] [--seed S] [--only NAME] [--out FILE]`, as root on Linux. Each
 command runs N times on a tmpfs of a random size up to a little more than its output needs, N times

@@ -48,8 +48,11 @@ from nlos_cam.evaluate import (
 
 RECIPE = harness.ROOT / "models" / "recipes" / "paper-rig-direct.toml"
 PACE_STEPS = 8
-NOTES = """Means over objects and their bootstrap 95 % intervals; one run each, seed 0. Differences are taken object by
-object; positive is better. Each variant had the same processor seconds on one thread, and its own cosine schedule."""
+NOTES = (
+    "Means over objects and their bootstrap 95 % intervals; one run each, seed 0. Differences are"
+    " taken object by\nobject; positive is better. Each variant had the same processor seconds on one"
+    " thread, and its own cosine schedule."
+)
 
 
 def variant(text: str, base: DirectRecipe) -> tuple[str, DirectRecipe]:

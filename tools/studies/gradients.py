@@ -1,6 +1,7 @@
 """Gradients: their cost, how well a bench determines its object, and a pose fitted to echoes.
 
-python tools/studies/gradients.py [cost] [bound] [pose] [--trials 6]   docs/figures/gradients.json and .png
+    python tools/studies/gradients.py [cost] [bound] [pose] [--trials 6]
+        docs/figures/gradients.json, docs/images/gradients.png
 
 Each part that is named (default: all) replaces its own part of the JSON; the picture belongs to
 `bound`.

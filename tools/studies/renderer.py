@@ -1,11 +1,18 @@
 """Renderer: accuracy against time, glossy objects, random scenes against the reference, and the
 pace on a GPU.
 
-python tools/studies/renderer.py tradeoff     docs/figures/renderer.json, docs/images/tradeoff.png, table of
-docs/accuracy.md python tools/studies/renderer.py glossy       docs/figures/glossy.json: rank against error,
-time over a Lambertian object's python tools/studies/renderer.py soak [--scenes 1000000]
-docs/figures/renderer_soak.json: random scenes against the reference python tools/studies/renderer.py cuda
-[--backend torch] [--objects 64] [--batch 1 4 16 64]: one line of JSON
+    python tools/studies/renderer.py tradeoff
+        accuracy against time: docs/figures/renderer.json, docs/images/tradeoff.png and the table
+        of docs/accuracy.md
+
+    python tools/studies/renderer.py glossy
+        rank against error, time over a Lambertian object's: docs/figures/glossy.json
+
+    python tools/studies/renderer.py soak [--scenes 1000000]
+        random scenes against the reference: docs/figures/renderer_soak.json
+
+    python tools/studies/renderer.py cuda [--backend torch] [--objects 64] [--batch 1 4 16 64]
+        one line of JSON
 """
 
 import argparse

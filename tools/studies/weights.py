@@ -1,8 +1,10 @@
 """Weights: the limits of their figures, and their range of rigs.
 
-python tools/studies/weights.py limits [--weights DIR] [--frames 10 100]   docs/figures/limits.json python
-tools/studies/weights.py rigs [--weights [NAME=]DIR ...]            docs/figures/rig_map.json and
-images/rig_map.png
+    python tools/studies/weights.py limits [--weights DIR] [--frames 10 100]
+        docs/figures/limits.json
+
+    python tools/studies/weights.py rigs [--weights [NAME=]DIR ...]
+        docs/figures/rig_map.json and docs/images/rig_map.png
 
 `limits` evaluates with one thing removed or added at a time. `rigs` moves the lidar over the
 distances and angles of SI 1 and by what a bench built with a ruler is off, while occluder and

@@ -264,7 +264,8 @@ def test_command_table_names_the_right_module(command: str) -> None:
 def test_option_help_has_placeholders_and_ranges_in_words(shown: Run) -> None:
     tree = get_command(build_app("capture"))
     plain_help(tree)
-    options = {parameter.name: parameter for parameter in tree.commands["capture"].params}  # type: ignore[attr-defined]
+    parameters = tree.commands["capture"].params  # type: ignore[attr-defined]
+    options = {parameter.name: parameter for parameter in parameters}
     assert (options["seconds"].metavar, options["takes"].metavar, options["overwrite"].metavar) == (
         "SECONDS",
         "N",
@@ -314,7 +315,8 @@ HEAVY = {"torch", "numba", "cv2", "onnxruntime", "rerun", "matplotlib", "h5py", 
 def test_help_groups_commands_and_imports_nothing_heavy() -> None:
     """The page of the groups, which needs no command's module, and the page of every command."""
     tree = get_command(build_app())
-    groups = {name: [*getattr(each, "commands", {})] for name, each in tree.commands.items()}  # type: ignore[attr-defined]
+    commands = tree.commands  # type: ignore[attr-defined]
+    groups = {name: [*getattr(each, "commands", {})] for name, each in commands.items()}
     lines = [
         [name, *below]
         for name, parts in groups.items()

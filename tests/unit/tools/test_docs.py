@@ -38,7 +38,8 @@ PAGES = {
     "docs/figures.json": "{}",
     "docs/left.md": "# Left\n",
     "docs/decisions/2026-01-01-one.md": "# One\n",
-    "README.md": "# Top\n\n[docs](docs/other.md#a-part) [here](#top) ![x](docs/figures.json) <https://example.org/a>\n",
+    "README.md": "# Top\n\n[docs](docs/other.md#a-part) [here](#top) ![x](docs/figures.json)"
+    " <https://example.org/a>\n",
 }
 
 

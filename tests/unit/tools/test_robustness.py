@@ -27,25 +27,43 @@ from nlos_cam.view.session_file import element, page_html
 Tool = Callable[[str], ModuleType]
 
 
-def test_starved_command_that_ends_badly_or_leaves_parts_is_noticed(
-    tool: Tool, tmp_path: Path
-) -> None:
-    def wrong(code: int = 1, said: str = "error: a.npz cannot be written: free some space") -> str:
-        ended = subprocess.CompletedProcess([], code, "", said)
-        return tool("starve_commands").wrong_with(
-            tool("trials").COMMANDS["render"], tmp_path, tmp_path, ended
-        )
+NO_SPACE = "error: a.npz cannot be written: free some space"
 
-    assert wrong() == ""
-    assert "Traceback" in wrong(1, "Traceback (most recent call last):\nMemoryError")
-    assert "4 lines" in wrong(1, "one\ntwo\nthree\nfour")
-    assert "-11" in wrong(-11, "")
-    assert "a.npz is not whole" in wrong(0, "")
+
+def starved(tool: Tool, folder: Path, code: int = 1, message: str = NO_SPACE) -> str:
+    """Return the fault that is found in a starved `render` that ended so."""
+    ended = subprocess.CompletedProcess([], code, "", message)
+    render = tool("trials").COMMANDS["render"]
+    return tool("starve_commands").wrong_with(render, folder, folder, ended)
+
+
+def test_starved_command_may_end_with_one_line(tool: Tool, tmp_path: Path) -> None:
+    assert starved(tool, tmp_path) == ""
+
+
+@pytest.mark.parametrize(
+    ("code", "message", "fault"),
+    [
+        (1, "Traceback (most recent call last):\nMemoryError", "Traceback"),
+        (1, "one\ntwo\nthree\nfour", "4 lines"),
+        (-11, "", "-11"),
+        (0, "", "a.npz is not whole"),
+    ],
+)
+def test_starved_command_that_ends_badly_is_noticed(
+    tool: Tool, tmp_path: Path, code: int, message: str, fault: str
+) -> None:
+    assert fault in starved(tool, tmp_path, code, message)
+
+
+def test_part_left_by_a_starved_command_is_noticed(tool: Tool, tmp_path: Path) -> None:
     (tmp_path / ".a.npz.part").mkdir()
-    assert ".a.npz.part" in wrong()
-    (tmp_path / ".a.npz.part").rmdir()
+    assert ".a.npz.part" in starved(tool, tmp_path)
+
+
+def test_broken_output_of_a_starved_command_is_noticed(tool: Tool, tmp_path: Path) -> None:
     (tmp_path / "a.npz").touch()
-    assert "not whole" in wrong()
+    assert "not whole" in starved(tool, tmp_path)
 
 
 def test_findings_of_two_groups_are_joined(tool: Tool) -> None:
