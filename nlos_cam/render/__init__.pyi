@@ -38,7 +38,6 @@ __all__ = [
     "depth_bound",
     "device_named",
     "fit_pose",
-    "glossy_basis",
     "histograms",
     "histograms_of_all",
     "included",
@@ -78,7 +77,7 @@ from .backend_torch import device_named, histograms_of_all
 from .echoes import MultiBounce
 from .effects import EFFECTS, Effects, included
 from .geometry import cast
-from .glossy import glossy_basis, histograms
+from .backend_cpu import histograms
 from .gradients import (
     DepthBound,
     Gradients,
