@@ -54,7 +54,6 @@ __all__ = [
     "render_scan",
     "retroreflective",
     "ripples",
-    "sample_beams",
     "sensor_effects",
     "smooth_patches",
     "three_bounce",
@@ -62,22 +61,14 @@ __all__ = [
 ]
 
 from .accuracy import STOPS, Accuracy, Stop, accuracy_named
-from .accuracy_search import (
-    Agreement,
-    EchoMaps,
-    Stopwatch,
-    Work,
-    agreement,
-    choose,
-    costs,
-    least_seconds,
-    sample_beams,
-)
+from .accuracy_table import choose
+from .agreement import Agreement, EchoMaps, agreement
+from .backend_cpu import histograms
 from .backend_torch import device_named, histograms_of_all
+from .costs import Stopwatch, Work, costs, least_seconds
 from .echoes import MultiBounce
 from .effects import EFFECTS, Effects, included
 from .geometry import cast
-from .backend_cpu import histograms
 from .gradients import (
     DepthBound,
     Gradients,

@@ -6,9 +6,6 @@ adds the table, shifted by d1 + d2 to the nearest sub-bin: n s + s q terms in pl
 sums of sub-bins to bins are made in advance for each shift within a bin, so that a beam adds one
 row of a table per patch (`beam_sums`). Neither rounding is biased: a path lies anywhere within its
 sub-bin, and rounding to the nearest shift puts a bin's edge in the middle of a sub-bin.
-
-numba's cache depends on this file alone: after a change of a kernel that is imported here, delete
-__pycache__.
 """
 
 from functools import lru_cache
@@ -193,7 +190,6 @@ class NumbaJob:
 
     def __init__(self, job: TransportJob, *, tiled: bool = True) -> None:
         patches = job.patches
-        relay = job.relay
         self.job = job
         accuracy = job.accuracy
         self._tiled = tiled
@@ -207,8 +203,7 @@ class NumbaJob:
         )
         sites = patches.row, patches.column, low, high, walk, highest, shaded
         self.surface = NumbaSurface(*geometry, _single(job.strength), *sites)
-        columns = relay.x_m, relay.y_m, relay.length_m, job.relay_weight
-        self.relay = _points(columns, job.soft_wall_m2, RELAY_TILE, tiled=tiled)
+        self.relay = self.relay_in(RELAY_TILE)
         edge_x, edge_z = job.edge_m
         edge = np.float32(edge_x), np.float32(edge_z), np.float32(job.near_m**2)
         sectors = accuracy.sectors if job.field.shades else 0
@@ -217,6 +212,12 @@ class NumbaJob:
         )
         self.groups, self.centers = groups_of(self.surface, patches.diagonal_m)
         self.first, self.width = table_bins(job)
+
+    def relay_in(self, tile: int) -> NumbaPoints:
+        """Return the relay cells in tiles of some size."""
+        relay = self.job.relay
+        columns = relay.x_m, relay.y_m, relay.length_m, self.job.relay_weight
+        return _points(columns, self.job.soft_wall_m2, tile, tiled=self._tiled)
 
     @property
     def sites(self) -> tuple[NumbaSurface, NumbaGroups, NumbaSurface, NumbaOptics, HeightField]:
@@ -236,8 +237,7 @@ class NumbaJob:
         )
 
     def tables(self, *, second_only: bool = False) -> NumbaTables:
-        """Return the patches' tables; `second_only` leaves the light out that met the object once.
-        """
+        """Return the patches' tables; `second_only` leaves the light out that met the object once."""
         per_bin = self.job.accuracy.sub_bins
         sites = self.surface, self.relay, *self.sites[3:]
         fine = sub_bins(*sites, self.first, per_bin, self.width)

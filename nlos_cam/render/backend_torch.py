@@ -18,10 +18,10 @@ from torch import Tensor
 from torch.nn.functional import avg_pool1d, embedding_bag, pad
 
 from nlos_cam.errors import SceneError
+from nlos_cam.render import backend_cpu
 from nlos_cam.render.backend_numba import horizons, table_bins
 from nlos_cam.render.interreflection import add_interreflection
 from nlos_cam.render.job import TransportJob
-from nlos_cam.render.material import Brdf
 from nlos_cam.render.visibility import FACES, bias_m
 
 
@@ -396,9 +396,7 @@ class _Batch:
             fine = torch.as_tensor(more, device=self.device)
         return first, tables(fine, self.per_bin)
 
-    def _counts(
-        self, surface: TorchSurface, sites: TorchSites | None
-    ) -> tuple[Tensor, Tensor]:
+    def _counts(self, surface: TorchSurface, sites: TorchSites | None) -> tuple[Tensor, Tensor]:
         """Return the first bin (n, 1) of some patches, and B over d3 + d4 in sub-bins from there
         on.
         """

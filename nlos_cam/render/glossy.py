@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 
 import numba
 import numpy as np
-from nlos_calibration.arrays import Float32, Float64, Int32, Int64, Mask
+from nlos_calibration.arrays import Float32, Float64, Int32, Int64
 
 from nlos_cam.frames import inner
 from nlos_cam.render.backend_numba import NumbaJob, returns
@@ -33,7 +33,7 @@ from nlos_cam.render.legs import (
     judge,
     scratch,
 )
-from nlos_cam.render.material import Brdf
+from nlos_cam.render.material import Brdf, phong
 from nlos_cam.render.visibility import HeightField
 
 LANES = 8
@@ -42,14 +42,20 @@ CHUNK = 16
 """Relay cells that are left out together where they lie beyond a lobe."""
 NEIGHBORS = 16
 """Nodes of one interpolation, 4 x 4."""
-INTERPOLATION = 0.043
+INTERPOLATION = 0.05
 """Error of the interpolation (relative L1 of the lobe) where nodes lie one standard deviation of
 the lobe apart.
+"""
+LOWERED = 11 / 720
+"""Mean of (t + 1) t (t - 1) (t - 2) / 4! for t from 0 to 1: cubic interpolation through nodes h
+apart lies that times h^4 and the fourth derivative below a function, on average.
 """
 MAX_STEP = 0.25
 """Largest step of a lattice, so that two nodes beyond the horizon (at sqrt 2) still lie before the
 map's own edge (at 2).
 """
+LEAST_RAISED = np.float32(1e-4)
+"""Smaller factors are left out."""
 CUT_SHARE = 1 / 30
 """Share of the accuracy's error that may be lost by cutting the lobe off."""
 TABLE_BYTES = 1 << 20
@@ -71,6 +77,8 @@ class Lobe(NamedTuple):
     """Smallest cosine to the lobe's axis that counts."""
     step: np.float32
     """Step of the lattice, in the plane of `_on_plane`."""
+    raised: np.float32
+    """LOWERED times the fourth power of the step in standard deviations of the lobe."""
 
 
 class Cells(NamedTuple):
@@ -111,6 +119,7 @@ def lobe_of(brdf: Brdf, error: float) -> Lobe:
         brdf.mirrored,
         np.float32(cut),
         np.float32(step),
+        np.float32(LOWERED * (step / deviation) ** 4),
     )
 
 
@@ -133,8 +142,10 @@ def _on_plane(
 @numba.njit(cache=True, error_model="numpy", inline="always")
 def _axis(
     i: int, j: int, s: int, surface: NumbaSurface, lobe: Lobe
-) -> tuple[np.float32, np.float32, np.float32]:
-    """Return the unit vector of the lobe of light that arrives from a node of the lattice."""
+) -> tuple[np.float32, np.float32, np.float32, np.float32]:
+    """Return the unit vector of the lobe of light that arrives from a node of the lattice, and the
+    factor `raised` there.
+    """
     x = np.float32(i) * lobe.step
     y = np.float32(j) * lobe.step
     squared = x * x + y * y
@@ -145,13 +156,16 @@ def _axis(
     x *= scale
     y *= scale
     z = squared * half - one
+    # A step is longer by 1 / cos(theta / 2) along the radius and shorter by as much across it.
+    stretch = max(scale, half) ** 4
+    raised = lobe.raised * (stretch + one / stretch) * half
     if lobe.mirrored:
         nx = surface.normal_x[s]
         ny = surface.normal_y[s]
         nz = surface.normal_z[s]
         twice = np.float32(2) * (x * nx + y * ny + z * nz)
-        return twice * nx - x, twice * ny - y, twice * nz - z
-    return x, y, z
+        return twice * nx - x, twice * ny - y, twice * nz - z, raised
+    return x, y, z, raised
 
 
 @numba.njit(cache=True, error_model="numpy", inline="always")
@@ -167,25 +181,29 @@ def _weights(at: np.float32, weight: Float32) -> None:
 
 
 @inner(error_model="numpy", fastmath=FAST)
+def _multiply_roots(values: Float32, base: Float32, fraction: int) -> None:
+    """Multiply by the base to a power in 1 / 256: a square root for each binary digit."""
+    root = base.copy()
+    digit = 128
+    while fraction:
+        for i in range(len(values)):
+            root[i] = np.sqrt(root[i])
+        if fraction & digit:
+            for i in range(len(values)):
+                values[i] *= root[i]
+            fraction -= digit
+        digit >>= 1
+
+
+@inner(error_model="numpy", fastmath=FAST)
 def _power(values: Float32, lobe: Lobe, square: Float32) -> None:
     """Raise cosines to the lobe's exponent, in place, and set those below its cut to 0."""
     # By repeated squaring: whole vectors of products, where a logarithm would be a call for each.
     for i in range(len(values)):
         square[i] = values[i] if values[i] >= lobe.cut else np.float32(0)
         values[i] = np.float32(1) if values[i] >= lobe.cut else np.float32(0)
-    root = lobe.fraction
-    if root:
-        # x^(1/2) x^(1/4) ...: the binary digits of the fraction.
-        part = square.copy()
-        digit = 128
-        while root:
-            for i in range(len(values)):
-                part[i] = np.sqrt(part[i])
-            if root & digit:
-                for i in range(len(values)):
-                    values[i] *= part[i]
-                root -= digit
-            digit >>= 1
+    if lobe.fraction:
+        _multiply_roots(values, square, lobe.fraction)
     left = lobe.whole
     while left:
         if left & 1:
@@ -228,9 +246,7 @@ def _cells(
                 dx = relay.x_m[begin + i] - surface.x_m[s]
                 dy = relay.y_m[begin + i] - surface.y_m[s]
                 z = surface.z_m[s]
-                inverse = np.float32(1) / np.sqrt(
-                    max(dx * dx + dy * dy + z * z, np.float32(1e-20))
-                )
+                inverse = np.float32(1) / np.sqrt(max(dx * dx + dy * dy + z * z, np.float32(1e-20)))
                 cells.x[found] = dx * inverse
                 cells.y[found] = dy * inverse
                 cells.z[found] = -z * inverse
@@ -239,7 +255,11 @@ def _cells(
                 found += 1
     whole = (found + CHUNK - 1) // CHUNK * CHUNK
     return Cells(
-        cells.x[:whole], cells.y[:whole], cells.z[:whole], cells.weight[:whole], cells.sub_bin[:whole]
+        cells.x[:whole],
+        cells.y[:whole],
+        cells.z[:whole],
+        cells.weight[:whole],
+        cells.sub_bin[:whole],
     )
 
 
@@ -271,6 +291,26 @@ def _chunks(cells: Cells) -> Chunks:
 
 
 @inner(error_model="numpy", fastmath=FAST)
+def _fill_raised(cosines: Float32, factors: Float32, lobe: Lobe, raised: Float32) -> None:
+    """Fill in the factors by which a lobe's values are raised at some cosines to its axes."""
+    raised[:] = 1
+    if lobe.raised < LEAST_RAISED:
+        return
+    one = np.float32(1)
+    six = np.float32(6)
+    three_quarters = np.float32(0.75)
+    twice = np.float32(2 * lobe.whole)
+    # With R = n theta^2 = 2 n (1 - cos theta) the lobe is nearly exp(-R / 2), and the sum of its
+    # fourth derivatives along both axes is (6 - 6 R + 3/4 R^2) f, averaged over the turn of the
+    # axes, in units of its standard deviation.
+    for i in range(CHUNK):
+        for lane in range(LANES):
+            r = twice * (one - cosines[i * LANES + lane])
+            terms = six - six * r + three_quarters * r * r
+            raised[i * LANES + lane] += factors[lane] * terms
+
+
+@inner(error_model="numpy", fastmath=FAST)
 def _count(
     axes: Float32,
     lobe: Lobe,
@@ -282,10 +322,11 @@ def _count(
 ) -> tuple[int, int]:
     """Count the light of the cells in sub-bins (n, LANES), weighted by the lobes about some axes.
 
-    Return the first sub-bin with light, and the one after the last. `axes` is (3, LANES).
+    Return the first sub-bin with light, and the one after the last. `axes` is (4, LANES): unit vectors, and the factor `raised`.
     """
     first = len(counted)
     last = 0
+    raised = np.empty(CHUNK * LANES, np.float32)
     for k in range(len(chunks.x)):
         # |u . v - u . m| <= |v - m| for unit vectors u.
         near = np.float32(-2)
@@ -304,7 +345,10 @@ def _count(
             z = cells.z[k * CHUNK + i]
             for lane in range(LANES):
                 values[i * LANES + lane] = axes[0, lane] * x + axes[1, lane] * y + axes[2, lane] * z
+        _fill_raised(values, axes[3], lobe, raised)
         _power(values, lobe, square)
+        for i in range(CHUNK * LANES):
+            values[i] *= raised[i]
         for i in range(CHUNK):
             at = cells.sub_bin[k * CHUNK + i]
             weight = cells.weight[k * CHUNK + i]
@@ -336,48 +380,73 @@ def _as_rows(
     rest[:] = 0
     if first >= last:
         return
-    # float64, so that the difference of large sums keeps the small bins.
-    total[first] = 0
-    for k in range(first, last):
-        for lane in range(LANES):
-            total[k + 1, lane] = total[k, lane] + counted[k, lane]
-            counted[k, lane] = 0
     begin = first // per_bin
     end = min((last + per_bin - 1) // per_bin + 1, bins)
-    for i in range(begin, end):
+    low = max(begin - 1, 0) * per_bin
+    high = end * per_bin
+    for lane in range(LANES):
+        # float64, so that the difference of large sums keeps the small bins.
+        running = 0.0
+        for k in range(low, high):
+            total[lane, k] = running
+            running += counted[k, lane]
+            counted[k, lane] = 0
+        total[lane, high] = running
+    for lane in range(LANES):
         for shift in range(per_bin):
-            low = min(max(i * per_bin - shift, first), last)
-            high = min(max((i + 1) * per_bin - shift, first), last)
-            for lane in range(LANES):
-                value = np.float32(total[high, lane] - total[low, lane])
+            before = total[lane, max(begin * per_bin - shift, low)]
+            for i in range(begin, end):
+                after = total[lane, (i + 1) * per_bin - shift]
+                value = np.float32(after - before)
+                before = after
                 rest[lane, i] = max(rest[lane, i], value)
                 if i < width:
                     rows[lane, shift, WINDOW + i] = value
-    for lane in range(LANES):
         for i in range(end - 1, -1, -1):
             rest[lane, i] = max(rest[lane, i], rest[lane, i + 1])
 
 
-@inner(error_model="numpy")
-def _needed(
-    s: int, surface: NumbaSurface, feet: NumbaPoints, lobe: Lobe, corner: Int32
-) -> Mask:
-    """Return which nodes (columns, rows) of a patch's lattice some beam interpolates between."""
-    columns = corner[2]
-    rows = corner[3]
-    needed = np.zeros((columns, rows), np.bool_)
-    some = np.zeros((columns, rows), np.bool_)
-    z = surface.z_m[s]
-    for i in range(len(feet.x_m)):
-        x, y = _on_plane(
-            feet.x_m[i] - surface.x_m[s], feet.y_m[i] - surface.y_m[s], z, lobe.step
-        )
-        some[int(np.floor(x)) - corner[0], int(np.floor(y)) - corner[1]] = True
-    for i in range(1, columns - 2):
-        for j in range(1, rows - 2):
-            if some[i, j]:
-                needed[i - 1 : i + 3, j - 1 : j + 3] = True
-    return needed
+class Lattices(NamedTuple):
+    """Nodes of each patch (n) between which some beam interpolates."""
+
+    corner: Int32
+    """(n, 4); first column and row, and the numbers of columns and rows."""
+    place: Int32
+    """(n, nodes); place of each node among those needed, column by column, or -1."""
+    count: Int32
+    """(n,); nodes needed."""
+
+
+@numba.njit(cache=True, parallel=True, error_model="numpy")
+def _places(surface: NumbaSurface, feet: NumbaPoints, lobe: Lobe, corners: Int32) -> Lattices:
+    """Return the lattices with those corners."""
+    patches = len(corners)
+    most = (corners[:, 2] * corners[:, 3]).max()
+    place = np.full((patches, most), np.int32(-1))
+    count = np.zeros(patches, np.int32)
+    for s in numba.prange(patches):
+        columns = corners[s, 2]
+        rows = corners[s, 3]
+        some = np.zeros((columns, rows), np.bool_)
+        for i in range(len(feet.x_m)):
+            x, y = _on_plane(
+                feet.x_m[i] - surface.x_m[s],
+                feet.y_m[i] - surface.y_m[s],
+                surface.z_m[s],
+                lobe.step,
+            )
+            some[int(np.floor(x)) - corners[s, 0], int(np.floor(y)) - corners[s, 1]] = True
+        needed = np.zeros((columns, rows), np.bool_)
+        for i in range(1, columns - 2):
+            for j in range(1, rows - 2):
+                if some[i, j]:
+                    needed[i - 1 : i + 3, j - 1 : j + 3] = True
+        for i in range(columns):
+            for j in range(rows):
+                if needed[i, j]:
+                    place[s, i * rows + j] = count[s]
+                    count[s] += 1
+    return Lattices(corners, place, count)
 
 
 @numba.njit(cache=True, parallel=True, error_model="numpy")
@@ -414,9 +483,8 @@ def _patch_rows(
     relay: NumbaPoints,
     optics: NumbaOptics,
     field: HeightField,
-    feet: NumbaPoints,
     lobe: Lobe,
-    corner: Int32,
+    lattices: Lattices,
     table: NumbaTables,
     rows: Float32,
     rest: Float32,
@@ -426,8 +494,8 @@ def _patch_rows(
     sub_bins = table.width * per_bin
     start = np.float32(table.first[s] * per_bin)
     cells = _cells(s, surface, relay, optics, field, start, sub_bins)
-    counted = np.zeros((sub_bins + 1, LANES), np.float32)
-    total = np.empty((sub_bins + 2, LANES))
+    counted = np.zeros((sub_bins, LANES), np.float32)
+    total = np.empty((LANES, sub_bins + 1))
     # The first LANES places belong to the diffuse part, in the first of them.
     first = sub_bins
     last = 0
@@ -440,38 +508,37 @@ def _patch_rows(
     _as_rows(counted, total, first, last, per_bin, rows[:LANES], rest[:LANES])
     if lobe.gain == 0:
         return
-    needed = _needed(s, surface, feet, lobe, corner)
     chunks = _chunks(cells)
-    axes = np.zeros((3, LANES), np.float32)
+    axes = np.zeros((4, LANES), np.float32)
     values = np.empty(CHUNK * LANES, np.float32)
     square = np.empty(CHUNK * LANES, np.float32)
-    lanes = _padded(corner[3])
-    for i in range(corner[2]):
-        for j in range(0, lanes, LANES):
-            if not needed[i, j : j + LANES].any():
-                continue
-            for lane in range(LANES):
-                x, y, z = _axis(corner[0] + i, corner[1] + j + lane, s, surface, lobe)
-                axes[0, lane] = x
-                axes[1, lane] = y
-                axes[2, lane] = z
-            first, last = _count(axes, lobe, cells, chunks, counted, values, square)
-            place = LANES + i * lanes + j
-            _as_rows(
-                counted,
-                total,
-                first,
-                last,
-                per_bin,
-                rows[place : place + LANES],
-                rest[place : place + LANES],
-            )
-
-
-@numba.njit(cache=True, inline="always")
-def _padded(count: int) -> int:
-    """Return a number of rows of a lattice in whole vectors."""
-    return (count + LANES - 1) // LANES * LANES
+    corner = lattices.corner[s]
+    node = 0
+    for k in range(corner[2] * corner[3]):
+        if lattices.place[s, k] < 0:
+            continue
+        x, y, z, raised = _axis(
+            corner[0] + k // corner[3], corner[1] + k % corner[3], s, surface, lobe
+        )
+        lane = node % LANES
+        axes[0, lane] = x
+        axes[1, lane] = y
+        axes[2, lane] = z
+        axes[3, lane] = raised
+        node += 1
+        if node % LANES and node < lattices.count[s]:
+            continue
+        first, last = _count(axes, lobe, cells, chunks, counted, values, square)
+        begin = (node + LANES - 1) // LANES * LANES
+        _as_rows(
+            counted,
+            total,
+            first,
+            last,
+            per_bin,
+            rows[begin : begin + LANES],
+            rest[begin : begin + LANES],
+        )
 
 
 @numba.njit(cache=True, parallel=True)
@@ -481,9 +548,8 @@ def _rows(
     relay: NumbaPoints,
     optics: NumbaOptics,
     field: HeightField,
-    feet: NumbaPoints,
     lobe: Lobe,
-    corners: Int32,
+    lattices: Lattices,
     table: NumbaTables,
     rows: Float32,
     rest: Float32,
@@ -497,9 +563,8 @@ def _rows(
             relay,
             optics,
             field,
-            feet,
             lobe,
-            corners[s],
+            lattices,
             table,
             rows[j],
             rest[j],
@@ -541,7 +606,7 @@ def _add_tile(
     optics: NumbaOptics,
     field: HeightField,
     lobe: Lobe,
-    corners: Int32,
+    lattices: Lattices,
     table: NumbaTables,
     begin: Float32,
     rows: Float32,
@@ -571,7 +636,8 @@ def _add_tile(
         if verdicts[j, 0] == DARK:
             continue
         fill(legs, s, surface, feet, start, size, verdicts[j, 0], optics, field, False)
-        lanes = _padded(corners[s, 3])
+        corner = lattices.corner[s]
+        place_of = lattices.place[s]
         for i in range(size):
             if legs.weight[i] == 0:
                 continue
@@ -596,11 +662,11 @@ def _add_tile(
                 row = int(np.floor(y))
                 _weights(x - np.float32(column), along_x)
                 _weights(y - np.float32(row), along_y)
-                node = LANES + (column - 1 - corners[s, 0]) * lanes + row - 1 - corners[s, 1]
+                node = (column - 1 - corner[0]) * corner[3] + row - 1 - corner[1]
                 for a in range(4):
                     for b in range(4):
                         k = 1 + 4 * a + b
-                        place = node + a * lanes + b
+                        place = LANES + place_of[node + a * corner[3] + b]
                         weight[k] = light * lobe.gain * along_x[a] * along_y[b]
                         base[k] = (j * places + place) * per_bin * span + shift
                         later += abs(weight[k]) * rest[j, place, beyond]
@@ -621,7 +687,7 @@ def _add(
     optics: NumbaOptics,
     field: HeightField,
     lobe: Lobe,
-    corners: Int32,
+    lattices: Lattices,
     table: NumbaTables,
     begin: Float32,
     rows: Float32,
@@ -642,7 +708,7 @@ def _add(
             optics,
             field,
             lobe,
-            corners,
+            lattices,
             table,
             begin,
             rows,
@@ -660,6 +726,7 @@ def _sums(
     """
     surface, groups, centers, optics, field = numba_job.sites
     per_bin = numba_job.job.accuracy.sub_bins
+    relay = numba_job.relay_in(CHUNK)
     nothing = np.empty(0, np.float32)
     table = NumbaTables(numba_job.first, nothing, nothing[None], per_bin, numba_job.width)
     begin, bins = _begins(feet, groups, centers, optics, table)
@@ -667,8 +734,9 @@ def _sums(
     # window can meet.
     windows = 1 if first_only else -(-bins // WINDOW)
     span = WINDOW + min(WINDOW + 8, table.width) if first_only else WINDOW + table.width
-    corners = _corners(surface, feet, lobe)
-    nodes = LANES + int((corners[:, 2] * _padded(corners[:, 3])).max(initial=0))
+    lattices = _places(surface, feet, lobe, _corners(surface, feet, lobe))
+    # The first vector is the diffuse part's, and the last may not be full.
+    nodes = 2 * LANES + int(lattices.count.max()) // LANES * LANES
     sums = np.zeros((len(begin), windows * WINDOW), np.float32)
     bound = np.zeros(len(begin), np.float32)
     patches = len(surface.x_m)
@@ -682,9 +750,9 @@ def _sums(
     for patch in range(0, patches, block):
         rows = whole[: patches - patch]
         some = rest[: patches - patch]
-        where = surface, numba_job.relay, optics, field, feet, lobe, corners, table
+        where = surface, relay, optics, field, lobe, lattices, table
         _rows(patch, *where, rows, some)
-        places = feet, surface, optics, field, lobe, corners, table
+        places = feet, surface, optics, field, lobe, lattices, table
         _add(patch, *places, begin, rows, some, sums, bound)
     # Interpolation may fall below 0 by its error where there is no light.
     begin = begin[feet.place]
@@ -707,8 +775,8 @@ def _histograms(numba_job: NumbaJob, lobe: Lobe, which: Any = slice(None)) -> Fl
 
 
 def _lobe(job: TransportJob) -> Lobe:
-    assert job.brdf is not None
-    return lobe_of(job.brdf, job.accuracy.scatter_error)
+    """Return the lobe of a job, without gain for a Lambertian surface."""
+    return lobe_of(job.brdf or phong(1.0, 0.0, 1.0), job.accuracy.scatter_error)
 
 
 def histograms(job: TransportJob) -> Float32:
