@@ -413,7 +413,7 @@ class Lattices(NamedTuple):
     """(n, 4); first column and row, and the numbers of columns and rows."""
     place: Int32
     """(n, nodes); place of each node among those needed, column by column, or -1."""
-    count: Int32
+    needed: Int32
     """(n,); nodes needed."""
 
 
@@ -526,7 +526,7 @@ def _patch_rows(
         axes[2, lane] = z
         axes[3, lane] = raised
         node += 1
-        if node % LANES and node < lattices.count[s]:
+        if node % LANES and node < lattices.needed[s]:
             continue
         first, last = _count(axes, lobe, cells, chunks, counted, values, square)
         begin = (node + LANES - 1) // LANES * LANES
@@ -736,7 +736,7 @@ def _sums(
     span = WINDOW + min(WINDOW + 8, table.width) if first_only else WINDOW + table.width
     lattices = _places(surface, feet, lobe, _corners(surface, feet, lobe))
     # The first vector is the diffuse part's, and the last may not be full.
-    nodes = 2 * LANES + int(lattices.count.max()) // LANES * LANES
+    nodes = 2 * LANES + int(lattices.needed.max()) // LANES * LANES
     sums = np.zeros((len(begin), windows * WINDOW), np.float32)
     bound = np.zeros(len(begin), np.float32)
     patches = len(surface.x_m)
