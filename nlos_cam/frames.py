@@ -13,6 +13,10 @@ from nlos_calibration import Intrinsics
 from nlos_calibration.arrays import Float32, Int32
 from numpy.typing import NDArray
 
+from nlos_cam import kernel_cache
+
+kernel_cache.install()  # before the first kernel: every module with kernels imports this one
+
 MAP_ROWS = 64
 MAP_COLUMNS = 80
 OBJECT_PIXELS = 64

@@ -128,9 +128,6 @@ def accuracy_of(
     max_error: float | None,
     max_seconds: float | None,
     beams_per_cell: int | None,
-    scene: renderer.Scene,
-    effects: renderer.Effects,
-    backend: str,
 ) -> renderer.Accuracy:
     """Return the setting of a stop, or the one that keeps a bound. Raises typer.BadParameter for
     both.
@@ -145,8 +142,9 @@ def accuracy_of(
             "--max-error and --max-seconds choose the accuracy: drop --accuracy and"
             " --beams-per-cell"
         )
-    say("Measuring every accuracy on this scene first (up to a minute)")
-    return renderer.choose(scene, max_error, max_seconds, effects, backend).accuracy
+    chosen = renderer.choose(max_error, max_seconds)
+    say(f"Accuracy: {chosen}")
+    return renderer.accuracy_named(chosen.stop)
 
 
 def _option(field: str, text: str) -> Any:
@@ -279,7 +277,7 @@ def render(
     wanted: renderer.Effects = (
         "auto" if effects == "auto" else [name for name in effects.split(",") if name]
     )
-    setting = accuracy_of(accuracy, max_error, max_seconds, beams_per_cell, target, wanted, backend)
+    setting = accuracy_of(accuracy, max_error, max_seconds, beams_per_cell)
     start_s = time.perf_counter()
     rendering = renderer.render(target, setting, wanted, backend)
     seconds = time.perf_counter() - start_s

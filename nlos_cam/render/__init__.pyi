@@ -39,7 +39,6 @@ __all__ = [
     "depth_bound",
     "device_named",
     "fit_pose",
-    "glossy_basis",
     "histograms",
     "histograms_of_all",
     "included",
@@ -56,7 +55,6 @@ __all__ = [
     "render_scan",
     "retroreflective",
     "ripples",
-    "sample_beams",
     "sensor_effects",
     "smooth_patches",
     "three_bounce",
@@ -64,22 +62,14 @@ __all__ = [
 ]
 
 from .accuracy import STOPS, Accuracy, Stop, accuracy_named
-from .accuracy_search import (
-    Agreement,
-    EchoMaps,
-    Stopwatch,
-    Work,
-    agreement,
-    choose,
-    costs,
-    least_seconds,
-    sample_beams,
-)
+from .accuracy_table import choose
+from .agreement import Agreement, EchoMaps, agreement
+from .backend_cpu import histograms
 from .backend_torch import device_named, histograms_of_all
+from .costs import Stopwatch, Work, costs, least_seconds
 from .echoes import MultiBounce
 from .effects import EFFECTS, Effects, included
 from .geometry import Beams, cast
-from .glossy import glossy_basis, histograms
 from .gradients import (
     DepthBound,
     Gradients,

@@ -31,9 +31,7 @@ class Accuracy:
     beams_per_cell: int = 1
     """Beams along each axis of a map cell."""
     scatter_error: float = 5e-3
-    """Error (relative L1) of a BRDF's tables, which have as many nodes of incoming light as it
-    takes.
-    """
+    """Error (relative L1) of a BRDF's values, for which its lattice has as many nodes as it takes."""
     tolerance: float = 1e-3
     """Largest change (relative L1 of the transient) by all effects that a plan leaves out
     together.

@@ -6,9 +6,6 @@ adds the table, shifted by d1 + d2 to the nearest sub-bin: n s + s q terms in pl
 sums of sub-bins to bins are made in advance for each shift within a bin, so that a beam adds one
 row of a table per patch (`beam_sums`). Neither rounding is biased: a path lies anywhere within its
 sub-bin, and rounding to the nearest shift puts a bin's edge in the middle of a sub-bin.
-
-numba's cache depends on this file alone: after a change of a kernel that is imported here, delete
-__pycache__.
 """
 
 from functools import lru_cache
@@ -84,7 +81,6 @@ def _count(
     relay: NumbaPoints,
     optics: NumbaOptics,
     field: HeightField,
-    factor: Float32,
     start: np.float32,
     histogram: Float32,
 ) -> None:
@@ -95,9 +91,6 @@ def _count(
     verdicts = judge(s, s + 1, surface, relay.bounds_m, optics, field)[0]
     for tile in range(len(verdicts)):
         count = returns(verdicts[tile], legs, s, tile * relay.tile, surface, relay, optics, field)
-        if len(factor):
-            for i in range(count):
-                legs.weight[i] *= factor[s, tile * relay.tile + i]
         for i in range(count):
             legs.sector[i] = np.int32(legs.length_m[i] - start)
         for i in range(count):
@@ -112,15 +105,12 @@ def sub_bins(
     relay: NumbaPoints,
     optics: NumbaOptics,
     field: HeightField,
-    factor: Float32,
     first: Int32,
     per_bin: int,
     width: int,
 ) -> Float32:
     """Return histograms (n, width * per_bin) of B over d3 + d4 in sub-bins, each from a bin (n,)
     on.
-
-    A BRDF's `factor` (n, m) is in the order of the tiles, or empty.
     """
     histogram = np.zeros((len(first), width * per_bin), np.float32)
     for s in numba.prange(len(first)):
@@ -130,7 +120,6 @@ def sub_bins(
             relay,
             optics,
             field,
-            factor,
             np.float32(first[s] * per_bin),
             histogram[s],
         )
@@ -170,7 +159,7 @@ def histograms(job: TransportJob) -> Float32:
     The result does not depend on the number of threads: one thread sums each histogram, patches in
     order.
     """
-    return NumbaJob(job).histograms(np.empty((0, 0), np.float32), np.ones(len(job.laser_spot_m)))
+    return NumbaJob(job).histograms()
 
 
 def echoes(job: TransportJob) -> MultiBounce:
@@ -182,7 +171,7 @@ def echoes(job: TransportJob) -> MultiBounce:
     """
     numba_job = NumbaJob(job)
     every = numba_job.feet(np.ones(len(job.laser_spot_m)))
-    table = numba_job.tables(np.empty((0, 0), np.float32))
+    table = numba_job.tables()
     winner, peak, second, sure = strongest_in_window(every, *numba_job.sites, table, job.bins)
     path = np.where(peak > 0, (winner + 0.5) * job.bin_m, np.nan).astype(np.float32)
     found = MultiBounce(peak, second, path)
@@ -201,7 +190,6 @@ class NumbaJob:
 
     def __init__(self, job: TransportJob, *, tiled: bool = True) -> None:
         patches = job.patches
-        relay = job.relay
         self.job = job
         accuracy = job.accuracy
         self._tiled = tiled
@@ -215,8 +203,7 @@ class NumbaJob:
         )
         sites = patches.row, patches.column, low, high, walk, highest, shaded
         self.surface = NumbaSurface(*geometry, _single(job.strength), *sites)
-        columns = relay.x_m, relay.y_m, relay.length_m, job.relay_weight
-        self.relay = _points(columns, job.soft_wall_m2, RELAY_TILE, tiled=tiled)
+        self.relay = self.relay_in(RELAY_TILE)
         edge_x, edge_z = job.edge_m
         edge = np.float32(edge_x), np.float32(edge_z), np.float32(job.near_m**2)
         sectors = accuracy.sectors if job.field.shades else 0
@@ -225,6 +212,12 @@ class NumbaJob:
         )
         self.groups, self.centers = groups_of(self.surface, patches.diagonal_m)
         self.first, self.width = table_bins(job)
+
+    def relay_in(self, tile: int) -> NumbaPoints:
+        """Return the relay cells in tiles of some size."""
+        relay = self.job.relay
+        columns = relay.x_m, relay.y_m, relay.length_m, self.job.relay_weight
+        return _points(columns, self.job.soft_wall_m2, tile, tiled=self._tiled)
 
     @property
     def sites(self) -> tuple[NumbaSurface, NumbaGroups, NumbaSurface, NumbaOptics, HeightField]:
@@ -243,33 +236,30 @@ class NumbaJob:
             tiled=self._tiled,
         )
 
-    def tables(self, factor: Float32) -> NumbaTables:
-        """Return the patches' tables, with a BRDF's factor (n, m) or an empty one."""
+    def tables(self, *, second_only: bool = False) -> NumbaTables:
+        """Return the patches' tables; `second_only` leaves the light out that met the object once."""
         per_bin = self.job.accuracy.sub_bins
-        job = self.job
-        if factor.size:
-            factor = factor[:, np.argsort(self.relay.place)]
-        fine = sub_bins(
-            self.surface, self.relay, *self.sites[3:], factor, self.first, per_bin, self.width
-        )
-        return tables(
-            self.first,
-            add_interreflection(job, self.first, fine) if job.more_bounces else fine,
-            per_bin,
-        )
+        sites = self.surface, self.relay, *self.sites[3:]
+        fine = sub_bins(*sites, self.first, per_bin, self.width)
+        found = fine
+        if self.job.more_bounces:
+            found = add_interreflection(self.job, self.first, fine)
+        if second_only:
+            found[:, : fine.shape[1]] -= fine
+        return tables(self.first, found, per_bin)
 
-    def histograms(self, factor: Float32, share: Float64) -> Float32:
-        """Return histograms (n, bins) of the beams, each with a weight (n,)."""
-        bins = self.job.bins
-        feet = self.feet(share)
-        found = shift_and_add(
-            np.arange(len(feet.bounds_m)), feet, *self.sites, self.tables(factor), bins
-        )[feet.place]
-        if len(found) == len(share):
-            return found
-        histogram = np.zeros((len(share), bins), np.float32)
-        histogram[share > 0] = found
-        return histogram
+    def histograms(self) -> Float32:
+        """Return histograms (n, bins) of the beams."""
+        return self._summed(self.tables())
+
+    def second_bounces(self) -> Float32:
+        """Return histograms (n, bins) of light that met the object twice."""
+        return self._summed(self.tables(second_only=True))
+
+    def _summed(self, table: NumbaTables) -> Float32:
+        feet = self.feet(np.ones(len(self.job.laser_spot_m)))
+        tiles = np.arange(len(feet.bounds_m))
+        return shift_and_add(tiles, feet, *self.sites, table, self.job.bins)[feet.place]
 
 
 def _single(column: Float64) -> Float32:

@@ -12,10 +12,10 @@ import numpy as np
 from nlos_calibration.arrays import Float64, Mask
 
 from nlos_cam.errors import SceneError
-from nlos_cam.render.brdf_table import scattering
 from nlos_cam.render.geometry import softened_leg
 from nlos_cam.render.interreflection import object_factors, wall_cells, wall_factors
 from nlos_cam.render.job import PatchArrays, TransportJob
+from nlos_cam.render.material import Brdf
 from nlos_cam.render.visibility import HeightField, occluded, visible
 
 MAX_PATHS = 3e10
@@ -172,6 +172,31 @@ def _returned(
 
 
 @numba.njit(cache=True, parallel=True)
+def scattering(
+    brdf: Brdf, gain: float, spot: Float64, patches: PatchArrays, x: Float64, y: Float64
+) -> Float64:
+    """Return the BRDF (n, m) on the ways from one laser spot over patches to points of the wall."""
+    table = np.empty((len(patches.row), len(x)))
+    for s in numba.prange(len(patches.row)):
+        point = patches.point_m[s]
+        normal = patches.normal[s]
+        to_spot = spot - point
+        # Lengths are limited above 0 for objects that touch the wall.
+        to_spot = to_spot / max(np.sqrt((to_spot**2).sum()), 1e-12)
+        cos_in = max((to_spot * normal).sum(), 0.0)
+        for q in range(len(x)):
+            dx = x[q] - point[0]
+            dy = y[q] - point[1]
+            d3 = max(np.sqrt(dx**2 + dy**2 + point[2] ** 2), 1e-12)
+            cos_out = max((normal[0] * dx + normal[1] * dy - normal[2] * point[2]) / d3, 0.0)
+            axis = (to_spot[0] * dx + to_spot[1] * dy - to_spot[2] * point[2]) / d3
+            if brdf.mirrored:
+                axis = 2 * cos_in * cos_out - axis
+            table[s, q] = brdf.diffuse + gain * max(axis, 0.0) ** brdf.exponent
+    return table
+
+
+@numba.njit(cache=True, parallel=True)
 def _paths(
     spots: Spots,
     patches: PatchArrays,
@@ -249,9 +274,8 @@ def _three_bounces(job: TransportJob, cells: Cells) -> Float64:
         factor = np.empty((0, 0))
         if job.brdf is not None:
             spot = job.laser_spot_m[which.start]
-            factor = scattering(job.brdf)(
-                spot, patches.point_m, patches.normal, cells.x_m, cells.y_m
-            )
+            gain = job.brdf.gain
+            factor = scattering(job.brdf, gain, spot, patches, cells.x_m, cells.y_m)
         settings = job.near_m, job.lambertian, job.bin_m, job.bins
         histogram[which] = _paths(_spots(job, which), patches, cells, factor, *settings)
     return histogram

@@ -18,11 +18,10 @@ from torch import Tensor
 from torch.nn.functional import avg_pool1d, embedding_bag, pad
 
 from nlos_cam.errors import SceneError
+from nlos_cam.render import backend_cpu
 from nlos_cam.render.backend_numba import horizons, table_bins
-from nlos_cam.render.brdf_table import nodes
 from nlos_cam.render.interreflection import add_interreflection
 from nlos_cam.render.job import TransportJob
-from nlos_cam.render.material import Brdf
 from nlos_cam.render.visibility import FACES, bias_m
 
 
@@ -275,32 +274,6 @@ def _cut(surface: TorchSurface, wall: TorchPoints, edge_m: tuple[float, float]) 
     return (edge_x - wall.x_m) * d.sign() >= begins
 
 
-def scattered(
-    brdf: Brdf, laser_spot_m: Float64, surface: TorchSurface, wall: TorchPoints
-) -> Tensor:
-    """Return the factor (n, m) of a BRDF on the ways from one laser spot (3,) over patches to
-    points of the wall.
-    """
-    x, y, z = (
-        float(place) - column for place, column in zip(laser_spot_m, surface[:3], strict=True)
-    )
-    d2 = (x * x + y * y + z * z).sqrt().clamp(min=1e-12)
-    x = x / d2
-    y = y / d2
-    z = z / d2
-    dx = wall.x_m - surface.x_m
-    dy = wall.y_m - surface.y_m
-    dz = -surface.z_m
-    d3 = (dx * dx + dy * dy + dz * dz).sqrt().clamp(min=1e-12)
-    cos_in = surface.normal_x * x + surface.normal_y * y + surface.normal_z * z
-    cos_out = (surface.normal_x * dx + surface.normal_y * dy + surface.normal_z * dz) / d3
-    cos_between = (x * dx + y * dy + z * dz) / d3
-    # Legs to the dark side have weight 0 already. Lengths are limited above 0 for objects that
-    # touch the wall.
-    value = brdf(cos_in.clamp(min=0), cos_out.clamp(min=0), cos_between)
-    return torch.as_tensor(value, dtype=torch.float32, device=d3.device).expand(d3.shape)
-
-
 CPU_CHUNK = 1 << 18
 """Elements of a tensor that fit in a CPU's cache."""
 CUDA_CHUNK = 1 << 27
@@ -341,9 +314,14 @@ def histograms_of_all(jobs: Sequence[TransportJob], device: torch.device) -> lis
     together.
     """
     alike: dict[object, list[int]] = {}
-    for index, job in enumerate(jobs):
-        alike.setdefault(_shared(job) or index, []).append(index)
     found: dict[int, Float32] = {}
+    for index, job in enumerate(jobs):
+        if job.brdf is None:
+            alike.setdefault(_shared(job) or index, []).append(index)
+        else:
+            # Lobes differ from beam to beam: the CPU's lattices take less time than one table for
+            # each of many spots did on a GPU.
+            found[index] = backend_cpu.histograms(job)
     for which in alike.values():
         batch = _Batch([jobs[index] for index in which], device)
         found.update(zip(which, batch.histograms(), strict=True))
@@ -354,7 +332,7 @@ def _shared(job: TransportJob) -> tuple[object, ...] | None:
     """Return a key of all that jobs of one batch have in common; None for a job that is computed
     alone.
     """
-    if job.brdf is not None or job.more_bounces:
+    if job.more_bounces:
         return None
     relay = job.relay
     field = job.field
@@ -399,27 +377,8 @@ class _Batch:
 
     def histograms(self) -> list[Float32]:
         """Return the histograms (n, bins) of each job."""
-        job = self.job
-        if job.brdf is None:
-            found = self._sums(*self._tables(None), self._feet(np.ones(len(job.laser_spot_m))))
-            return [histogram.cpu().numpy() for histogram in found]
-        total = torch.zeros((len(job.laser_spot_m), job.bins), device=self.device)
-        for foot, share in nodes(job, job.brdf):
-            lit = torch.as_tensor(np.flatnonzero(share), device=self.device)
-            total[lit] += self._sums(*self._tables(foot), self._feet(share))[0]
-        return [total.cpu().numpy()]
-
-    def _feet(self, share: Float64) -> TorchPoints:
-        job = self.job
-        lit = np.flatnonzero(share)
-        weight = job.beam_weight[lit] * share[lit]
-        return TorchPoints.of(
-            job.laser_spot_m[lit, 0],
-            job.laser_spot_m[lit, 1],
-            job.length_m[lit],
-            weight,
-            device=self.device,
-        )
+        found = self._sums(*self._tables())
+        return [histogram.cpu().numpy() for histogram in found]
 
     def _parts(self, points: int) -> Iterator[tuple[TorchSurface, TorchSites | None]]:
         """Yield the patches in parts whose legs to a number of points fit in a chunk."""
@@ -428,35 +387,33 @@ class _Batch:
             ends = start, start + count
             yield self.surface.part(*ends), self.sites.part(*ends) if self.sites else None
 
-    def _tables(self, foot: Float64 | None) -> tuple[Tensor, Tensor]:
-        """Return first bins (n, 1) and tables (n, per_bin, width), for light from one spot or, for
-        None, from any.
-        """
-        counts = [self._counts(*part, foot) for part in self._parts(len(self.relay.x_m))]
+    def _tables(self) -> tuple[Tensor, Tensor]:
+        """Return first bins (n, 1) and tables (n, per_bin, width)."""
+        counts = [self._counts(*part) for part in self._parts(len(self.relay.x_m))]
         first, fine = (torch.cat(parts) for parts in zip(*counts, strict=True))
         if self.job.more_bounces:
             more = add_interreflection(self.job, first[:, 0].cpu().numpy(), fine.cpu().numpy())
             fine = torch.as_tensor(more, device=self.device)
         return first, tables(fine, self.per_bin)
 
-    def _counts(
-        self, surface: TorchSurface, sites: TorchSites | None, foot: Float64 | None
-    ) -> tuple[Tensor, Tensor]:
+    def _counts(self, surface: TorchSurface, sites: TorchSites | None) -> tuple[Tensor, Tensor]:
         """Return the first bin (n, 1) of some patches, and B over d3 + d4 in sub-bins from there
         on.
         """
         # B(s, q) over d3 + d4, counted from the patch's own first bin.
         weight, length = legs(surface, sites, self.relay, self.optics, outgoing=True)
-        if foot is not None and self.job.brdf is not None:
-            weight *= scattered(self.job.brdf, foot, surface, self.relay)
         at = (length + self.relay.length_m) * self.per_m
         first = at.amin(1, keepdim=True).int() // self.per_bin
         return first, counted((at - first * self.per_bin).long(), weight, self.width * self.per_bin)
 
-    def _sums(self, first: Tensor, table: Tensor, feet: TorchPoints) -> list[Tensor]:
+    def _sums(self, first: Tensor, table: Tensor) -> list[Tensor]:
         """Return histograms (n, bins) of each job: the sum of its patches' tables, times A, shifted
         by d1 + d2.
         """
+        one = self.job
+        spots = one.laser_spot_m
+        columns = spots[:, 0], spots[:, 1], one.length_m, one.beam_weight
+        feet = TorchPoints.of(*columns, device=self.device)
         found = [torch.zeros((len(feet.x_m), job.bins), device=self.device) for job in self.jobs]
         sizes = [len(job.patches.beta) for job in self.jobs]
         count = max(self.chunk // len(first), 1)

@@ -6,9 +6,6 @@ neighboring patches differ in path by nearly the same length and in weight by ne
 So the tile joins their tables first, and each beam adds one row for all of them. Patches are joined
 only where that moves no path by more than JOIN_SUB_BINS sub-bins, and half of one for rounding. The
 more sub-bins an accuracy has, the fewer patches are joined.
-
-numba's cache depends on this file alone: after a change of a kernel that is imported here, delete
-__pycache__.
 """
 
 from typing import NamedTuple

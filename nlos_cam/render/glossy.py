@@ -1,27 +1,23 @@
-"""Glossy surfaces on the CPU: a BRDF as a sum of products, each of a function of one leg and the
-same of the other.
+"""Glossy surfaces on the CPU: the lobe of a BRDF on a lattice of directions for each patch.
 
-An isotropic, reciprocal BRDF is a symmetric function of two directions, so it has eigenfunctions on
-the hemisphere about the normal: f(in, out) = sum_r l_r e_r(in) e_r(out), with e_r = g_r(x) cos(m
-phi) or g_r(x) sin(m phi) and x = sqrt(1 - cosine). S2 then factorizes again, once for each r: a
-patch has a table of B e_r for every r, and a beam adds them all with the weights l_r e_r. Many
-directions never occur, so the functions are mixed anew to be the eigenfunctions for the directions
-of sample paths, which takes half as many for the same error. They are looked up on a grid.
-Reciprocity is exact, whatever the number of terms and the grid.
+A BRDF couples both legs at a patch, so S2 no longer factorizes there. Its diffuse part still does.
+The lobe, gain (u . v)^n, is a smooth function of the direction u of the light that arrives: a
+patch has one table of returns for each node of a lattice of directions, weighted by the lobe about
+that node, and a beam adds the tables of the 4 x 4 nodes around its own direction with the weights
+of cubic interpolation. A narrower lobe needs more nodes, in proportion to n, and each meets fewer
+cells of the wall, in proportion to 1 / n: the tables cost nearly the same for any exponent.
 """
 
-from functools import lru_cache
-from typing import Any, NamedTuple, Self
+from math import sqrt
+from typing import Any, NamedTuple
 
 import numba
 import numpy as np
-from nlos_calibration.arrays import Float32, Float64, Int64
-from numpy.typing import NDArray
+from nlos_calibration.arrays import Float32, Float64, Int32, Int64
 
-from nlos_cam.render import backend_numba
+from nlos_cam.frames import inner
 from nlos_cam.render.backend_numba import NumbaJob, returns
 from nlos_cam.render.beam_sums import ROUNDED, NumbaGroups, NumbaTables, ends
-from nlos_cam.render.brdf_table import nodes, scattered, scattering
 from nlos_cam.render.echoes import MultiBounce, strongest
 from nlos_cam.render.job import TransportJob
 from nlos_cam.render.legs import (
@@ -37,404 +33,512 @@ from nlos_cam.render.legs import (
     judge,
     scratch,
 )
-from nlos_cam.render.material import Brdf
+from nlos_cam.render.material import Brdf, phong
 from nlos_cam.render.visibility import HeightField
 
-STAGES = (48, 128), (48, 2048), (96, 2048), (192, 2048)
-"""Gauss points of x, and functions at most, in the order in which they are tried."""
-STEPS = 512
-"""Steps of x in the table of the functions."""
-GRID_BYTES = 1 << 28
-"""Limit of the memory for a grid of directions."""
-SIDES = 32, 48, 64, 96, 128, 192, 256, 384
-"""Points along a side of the grid of directions, in the order in which they are tried."""
-PROBES = 2048
-"""Sample paths on which the error is measured."""
-PATHS = 32
-PATHS_AT_MOST = 1 << 14
-"""Other sample paths for each function, for whose directions they are mixed: with fewer a lobe is
-learnt by heart.
+LANES = 8
+"""Nodes whose tables are counted together: one vector of float32."""
+CHUNK = 16
+"""Relay cells that are left out together where they lie beyond a lobe."""
+NEIGHBORS = 16
+"""Nodes of one interpolation, 4 x 4."""
+INTERPOLATION = 0.05
+"""Error of the interpolation (relative L1 of the lobe) where nodes lie one standard deviation of
+the lobe apart.
 """
+LOWERED = 11 / 720
+"""Mean of (t + 1) t (t - 1) (t - 2) / 4! for t from 0 to 1: cubic interpolation through nodes h
+apart lies that times h^4 and the fourth derivative below a function, on average.
+"""
+MAX_STEP = 0.25
+"""Largest step of a lattice, so that two nodes beyond the horizon (at sqrt 2) still lie before the
+map's own edge (at 2).
+"""
+LEAST_RAISED = np.float32(1e-4)
+"""Smaller factors are left out."""
+CUT_SHARE = 1 / 30
+"""Share of the accuracy's error that may be lost by cutting the lobe off."""
 TABLE_BYTES = 1 << 20
 """Memory for the tables of the patches whose rows are added together: the second cache."""
 
 
-class Eigenfunctions(NamedTuple):
-    """Functions of one direction (R) about the normal, of an eigenfunction with m > 0 two."""
+class Lobe(NamedTuple):
+    """Lobe of a BRDF for compiled loops, with the lattice on which it is interpolated."""
 
-    value: Float64
-    """(STEPS + 2, R); sqrt |l| g(x), the last row a copy for the upper end."""
-    harmonic: NDArray[np.int64]
-    """(R,); 2 m for cos(m phi), 2 m + 1 for sin(m phi)."""
-    sign: Float64
-    """(R,); of l."""
-
-    def first(self, count: int) -> Self:
-        """Return the largest functions alone."""
-        return self._replace(
-            value=self.value[:, :count], harmonic=self.harmonic[:count], sign=self.sign[:count]
-        )
-
-
-class Basis(NamedTuple):
-    """Functions of one direction (R) on a grid of the disc of x (cos phi, sin phi), from -1 to
-    1.
-    """
-
-    value: Float32
-    """(side, side, R)."""
-    sign: Float32
-    """(R,)."""
+    diffuse: np.float32
+    gain: np.float32
+    whole: int
+    """Whole part of the exponent."""
+    fraction: int
+    """Rest of the exponent, in 1 / 256."""
+    mirrored: bool
+    """True for a lobe about the mirror direction, False for one about the incoming light."""
+    cut: np.float32
+    """Smallest cosine to the lobe's axis that counts."""
+    step: np.float32
+    """Step of the lattice, in the plane of `_on_plane`."""
+    raised: np.float32
+    """LOWERED times the fourth power of the step in standard deviations of the lobe."""
 
 
-@lru_cache(maxsize=8)
-def eigenfunctions(brdf: Brdf, points: int) -> Eigenfunctions:
-    """Return the functions of a BRDF, the largest |l| first, from a grid of `points` x and twice as
-    many angles.
-    """
-    node, weight = np.polynomial.legendre.leggauss(points)
-    x = (node + 1) / 2
-    turn = np.arange(points + 1) * np.pi / points
-    cosine = 1 - x**2
-    sine = np.sqrt(1 - cosine**2)
-    across = sine[:, None, None] * sine[None, :, None]
-    along = cosine[:, None, None] * cosine[None, :, None]
-    f = brdf(
-        cosine[:, None, None], cosine[None, :, None], along + across * np.cos(turn)
-    ) + np.zeros_like(across * turn)
-    # Fourier series in the angle between the azimuths, even: f = sum_m f_m(x, x') cos(m turn).
-    series = np.fft.rfft(np.concatenate([f, f[..., -2:0:-1]], -1)).real / points
-    series[..., 0] /= 2
-    orders = np.flatnonzero(np.abs(series[..., :points]).max((0, 1)) > 1e-7 * np.abs(f).max())
-    # The solid angle of a ring is 2 pi sin dtheta = 4 pi x dx: its root on both sides keeps the
-    # matrix symmetric.
-    root = np.sqrt(weight * x)
-    strength, vector = np.linalg.eigh(
-        np.moveaxis(series[..., orders], -1, 0) * root * root[:, None]
+class Cells(NamedTuple):
+    """Relay cells to which a patch sends light, in whole chunks; the rest of the last is dark."""
+
+    x: Float32
+    """(n,); unit vectors from the patch."""
+    y: Float32
+    z: Float32
+    weight: Float32
+    sub_bin: Int32
+
+
+class Chunks(NamedTuple):
+    """Chunks (k) of cells: every unit vector lies within `reach` of the mean."""
+
+    x: Float32
+    y: Float32
+    z: Float32
+    reach: Float32
+
+
+def lobe_of(brdf: Brdf, error: float) -> Lobe:
+    """Return the lobe of a BRDF for an error (relative L1) of the whole BRDF's values."""
+    deviation = 1 / sqrt(brdf.exponent)
+    # Cubic interpolation errs by the fourth power of the step. The error may be larger where the
+    # lobe is but a part of the light.
+    share = max(brdf.specular / max(brdf.diffuse + brdf.specular, 1e-9), 1e-9)
+    step = min(deviation * (error / share / INTERPOLATION) ** 0.25, MAX_STEP)
+    # The integral of cos^n beyond the angle where it is e is about e of the whole.
+    cut = (error * CUT_SHARE) ** (1 / brdf.exponent)
+    units = round(brdf.exponent * 256)
+    return Lobe(
+        np.float32(brdf.diffuse),
+        np.float32(brdf.gain),
+        units // 256,
+        units % 256,
+        brdf.mirrored,
+        np.float32(cut),
+        np.float32(step),
+        np.float32(LOWERED * (step / deviation) ** 4),
     )
-    which, k = np.nonzero(np.abs(strength) > 1e-7 * np.abs(strength).max())
-    order = np.argsort(-np.abs(strength[which, k]), kind="stable")
-    which = which[order]
-    k = k[order]
-    # From the Gauss points to an even grid by the polynomial through them, which Gauss quadrature
-    # gives in Legendre's.
-    degree = np.arange(points)
-    of_node, of_step = (
-        np.polynomial.legendre.legvander(at, points - 1)
-        for at in (node, np.linspace(-1, 1, STEPS + 1))
-    )
-    shape = (
-        of_step
-        @ ((of_node * weight[:, None]).T * (degree[:, None] + 0.5))
-        @ (vector[which, :, k] / root).T
-    )
-    shape *= np.sqrt(np.abs(strength[which, k]))
-    twice = np.repeat(np.arange(len(k)), np.where(orders[which] > 0, 2, 1))
-    second = np.concatenate([[False], twice[1:] == twice[:-1]])
-    value = np.concatenate([shape, shape[-1:]])[:, twice]
-    return Eigenfunctions(
-        value, 2 * orders[which][twice] + second, np.sign(strength[which, k])[twice]
-    )
-
-
-def glossy_basis(job: TransportJob, brdf: Brdf) -> Basis | None:
-    """Return the functions that keep a BRDF within the accuracy's error on sample paths; None if
-    none do.
-    """
-    spot, point, normal, cell = _sample_paths(job, PROBES, seed=0)
-    exact = scattered(brdf, spot, point, normal, cell)
-    probes = [_on_disc(end - point, normal) for end in (spot, cell)]
-    limit = job.accuracy.scatter_error * exact.sum()
-    for points, most in STAGES:
-        every = eigenfunctions(brdf, points).first(most)
-        one, other = (_at(every, end) for end in probes)
-        if (rank := _rank(one * other * every.sign, exact, limit / 2)) <= len(every.sign):
-            mix, sign = _restricted(job, every.first(rank))
-            one, other = (end[:, :rank] @ mix for end in (one, other))
-            fewer = min(_rank(one * other * sign, exact, 0.8 * limit), len(sign))
-            return _on_grid(every.first(rank), mix[:, :fewer], sign[:fewer], probes, exact, limit)
-    return None
-
-
-def _sample_paths(
-    job: TransportJob, count: int, seed: int
-) -> tuple[Float64, Float64, Float64, Float64]:
-    """Return spots, patches' points and normals, and relay cells (n, 3) of sample paths that may
-    carry light.
-    """
-    generator = np.random.default_rng(seed)
-    patches = job.patches
-    relay = job.relay
-    s = generator.integers(len(patches.beta), size=count)
-    q = generator.integers(len(relay.x_m), size=count)
-    spot = job.map_spots_m[generator.integers(len(job.map_spots_m), size=count)]
-    cell = np.stack([relay.x_m[q], relay.y_m[q], np.zeros(count)], 1)
-    point = patches.point_m[s]
-    normal = patches.normal[s]
-    # Legs to the dark side of a patch carry no light.
-    lit = np.flatnonzero(
-        np.all([((end - point) * normal).sum(1) > 0 for end in (spot, cell)], axis=0)
-    )
-    return spot[lit], point[lit], normal[lit], cell[lit]
-
-
-def _rank(terms: Float64, exact: Float64, limit: float) -> int:
-    """Return how many terms (n, R) of a series are enough for a sum of errors; more than R if all
-    are not.
-    """
-    enough = np.abs(np.cumsum(terms, 1) - exact[:, None]).sum(0) <= limit
-    return (
-        1 + int(np.flatnonzero(~enough).max(initial=-1)) + 1
-    )  # errors need not fall with every term
-
-
-def _restricted(job: TransportJob, functions: Eigenfunctions) -> tuple[Float64, Float64]:
-    """Return the mix (R, R) of functions that has the fewest terms for the directions of a job, and
-    their signs.
-
-    These are the eigenfunctions of the same BRDF where a direction counts as often as it occurs: an
-    object that sees the wall under half of all directions needs half of the functions.
-    """
-    rank = len(functions.sign)
-    spot, point, normal, cell = _sample_paths(job, min(PATHS * rank, PATHS_AT_MOST), seed=1)
-    products = np.zeros((rank, rank))
-    for begin in range(0, len(point), PROBES):
-        some = slice(begin, begin + PROBES)
-        for end in (spot, cell):
-            value = _at(functions, _on_disc(end[some] - point[some], normal[some]))
-            products += value.T @ value
-    spread, axes = np.linalg.eigh(products)
-    root = axes * np.sqrt(np.maximum(spread, 0))
-    strength, vector = np.linalg.eigh((root.T * functions.sign) @ root)
-    some = np.abs(strength) > 1e-9 * np.abs(strength).max()
-    order = np.flatnonzero(some)[np.argsort(-np.abs(strength[some]), kind="stable")]
-    mix = (functions.sign[:, None] * root) @ vector[:, order] / np.sqrt(np.abs(strength[order]))
-    # Their last digits may differ between calls (test_repeatable saw it): rounded, a scene keeps
-    # its functions.
-    return mix.astype(np.float32).astype(np.float64), np.sign(strength[order])
-
-
-def _on_grid(
-    functions: Eigenfunctions,
-    mix: Float64,
-    sign: Float64,
-    ends: list[Float64],
-    exact: Float64,
-    limit: float,
-) -> Basis | None:
-    """Return mixed functions on the coarsest grid that keeps the sum of errors of paths; None if
-    none does.
-    """
-    for side in SIDES:
-        if 4 * side**2 * len(sign) > GRID_BYTES:
-            break
-        axis = np.linspace(-1, 1, side)
-        lines = (np.stack([np.full(side, x), axis], -1) for x in axis)
-        value = np.stack([(_at(functions, line) @ mix).astype(np.float32) for line in lines])
-        # Between points that are a step h apart, straight lines lie h^2 / 12 f'' above a function,
-        # on average.
-        bent = [
-            np.diff(value, 2, axis, value.take([0], axis), value.take([-1], axis))
-            for axis in (0, 1)
-        ]
-        basis = Basis(
-            (value - (bent[0] + bent[1]) / 12).astype(np.float32), sign.astype(np.float32)
-        )
-        one, other = (_looked_up(basis, end) for end in ends)
-        if np.abs((one * other * sign).sum(1) - exact).sum() <= limit:
-            return basis
-    return None
-
-
-def _on_disc(to_wall: Float64, normal: Float64) -> Float64:
-    """Return directions (n, 3) from patches with normals (n, 3) as x (cos phi, sin phi) (n, 2)."""
-    disc = np.empty((len(normal), 2), np.float32)
-    _fill_discs(to_wall.astype(np.float32), normal.astype(np.float32), disc)
-    return disc.astype(np.float64)
-
-
-@numba.njit(cache=True)
-def _fill_discs(to_wall: Float32, normal: Float32, disc: Float32) -> None:
-    for i in range(len(normal)):
-        disc[i] = _disc(
-            to_wall[i, 0], to_wall[i, 1], to_wall[i, 2], normal[i, 0], normal[i, 1], normal[i, 2]
-        )
-
-
-def _at(functions: Eigenfunctions, disc: Float64) -> Float64:
-    """Return the functions' values (n, R) at points (n, 2) of the disc, or beyond its edge at the
-    edge.
-    """
-    at = np.minimum(np.hypot(*disc.T), 1) * STEPS
-    step = at.astype(np.int64)
-    turn = np.arctan2(disc[:, 1], disc[:, 0])
-    low = functions.value[step]
-    high = functions.value[step + 1]
-    angle = turn[:, None] * np.arange(functions.harmonic.max() // 2 + 1)
-    around = np.stack([np.cos(angle), np.sin(angle)], -1).reshape(len(disc), -1)
-    return (low + (at - step)[:, None] * (high - low)) * around[:, functions.harmonic]
 
 
 @numba.njit(cache=True, error_model="numpy", inline="always")
-def _disc(
-    dx: np.float32, dy: np.float32, dz: np.float32, nx: np.float32, ny: np.float32, nz: np.float32
+def _on_plane(
+    dx: np.float32, dy: np.float32, z: np.float32, step: np.float32
 ) -> tuple[np.float32, np.float32]:
-    """Return the direction (dx, dy, dz) from a patch with that normal (nz <= 0) as x (cos phi, sin
-    phi).
+    """Return where the direction from a patch at height z to a point of the wall lies, in steps.
+
+    The map is Lambert's equal-area one about the wall's normal: its radius is 2 sin(theta / 2), so
+    a lobe covers about the same area wherever it points.
     """
     one = np.float32(1)
-    tiny = np.float32(1e-20)
-    inverse = one / np.sqrt(max(dx * dx + dy * dy + dz * dz, tiny))
-    cosine = max((dx * nx + dy * ny + dz * nz) * inverse, np.float32(0))
-    # Tangents of the frame that the smallest rotation turns from the wall's: continuous for every
-    # normal with nz < 1.
-    share = (dx * nx + dy * ny) / (one - nz)
-    scale = inverse / np.sqrt(one + cosine)  # sine^2 = (1 - cosine) (1 + cosine) = x^2 (1 + cosine)
-    return (dx + nx * dz - nx * share) * scale, (dy + ny * dz - ny * share) * scale
+    inverse = one / np.sqrt(max(dx * dx + dy * dy + z * z, np.float32(1e-20)))
+    # sin(theta) / (2 sin(theta / 2)) = cos(theta / 2) = sqrt((1 + cos theta) / 2)
+    scale = inverse * np.sqrt(np.float32(2) / (one + z * inverse)) / step
+    return dx * scale, dy * scale
 
 
-@numba.njit(cache=True, error_model="numpy", fastmath=FAST, inline="always")
-def _values(
-    functions: Basis, x: np.float32, y: np.float32, light: np.float32, out: Float32
-) -> np.float32:
-    """Fill in the functions' values at a point of the disc, times light; return the sum of their
-    squares.
+@numba.njit(cache=True, error_model="numpy", inline="always")
+def _axis(
+    i: int, j: int, s: int, surface: NumbaSurface, lobe: Lobe
+) -> tuple[np.float32, np.float32, np.float32, np.float32]:
+    """Return the unit vector of the lobe of light that arrives from a node of the lattice, and the
+    factor `raised` there.
     """
-    last = len(functions.value) - 2
-    rank = len(out)
+    x = np.float32(i) * lobe.step
+    y = np.float32(j) * lobe.step
+    squared = x * x + y * y
+    one = np.float32(1)
     half = np.float32(0.5)
+    # The inverse of `_on_plane`: cos theta = 1 - r^2 / 2, and sin theta / r = sqrt(1 - r^2 / 4).
+    scale = np.sqrt(max(one - squared * half * half, np.float32(0)))
+    x *= scale
+    y *= scale
+    z = squared * half - one
+    # A step is longer by 1 / cos(theta / 2) along the radius and shorter by as much across it.
+    stretch = max(scale, half) ** 4
+    raised = lobe.raised * (stretch + one / stretch) * half
+    if lobe.mirrored:
+        nx = surface.normal_x[s]
+        ny = surface.normal_y[s]
+        nz = surface.normal_z[s]
+        twice = np.float32(2) * (x * nx + y * ny + z * nz)
+        return twice * nx - x, twice * ny - y, twice * nz - z, raised
+    return x, y, z, raised
+
+
+@numba.njit(cache=True, error_model="numpy", inline="always")
+def _weights(at: np.float32, weight: Float32) -> None:
+    """Fill in Lagrange's weights (4,) of the nodes -1, 0, 1, 2 for a place from 0 to 1."""
     one = np.float32(1)
-    squares = np.float32(0)
-    at_x = (x * half + half) * np.float32(last + 1)
-    at_y = (y * half + half) * np.float32(last + 1)
-    i = min(max(int(at_x), 0), last)
-    j = min(max(int(at_y), 0), last)
-    x = min(max(at_x - np.float32(i), np.float32(0)), one)
-    y = min(max(at_y - np.float32(j), np.float32(0)), one)
-    near = (one - x) * light
-    far = x * light
-    near_low = near * (one - y)
-    near_high = near * y
-    far_low = far * (one - y)
-    far_high = far * y
-    one_row = functions.value[i]
-    next_row = functions.value[i + 1]
-    a = one_row[j]
-    b = one_row[j + 1]
-    c = next_row[j]
-    d = next_row[j + 1]
-    for r in range(rank):
-        value = near_low * a[r] + near_high * b[r] + far_low * c[r] + far_high * d[r]
-        out[r] = value
-        squares += value * value
-    return squares
+    two = np.float32(2)
+    six = np.float32(6)
+    weight[0] = -at * (at - one) * (at - two) / six
+    weight[1] = (at + one) * (at - one) * (at - two) / two
+    weight[2] = -(at + one) * at * (at - two) / two
+    weight[3] = (at + one) * at * (at - one) / six
 
 
-@numba.njit(cache=True)
-def _fill(functions: Basis, disc: Float32, out: Float32) -> None:
-    for i in range(len(out)):
-        _values(functions, disc[i, 0], disc[i, 1], np.float32(1), out[i])
+@inner(error_model="numpy", fastmath=FAST)
+def _multiply_roots(values: Float32, base: Float32, fraction: int) -> None:
+    """Multiply by the base to a power in 1 / 256: a square root for each binary digit."""
+    root = base.copy()
+    digit = 128
+    while fraction:
+        for i in range(len(values)):
+            root[i] = np.sqrt(root[i])
+        if fraction & digit:
+            for i in range(len(values)):
+                values[i] *= root[i]
+            fraction -= digit
+        digit >>= 1
 
 
-def _looked_up(functions: Basis, disc: Float64) -> Float64:
-    """Return the values (n, R) at points (n, 2) of the disc, as the sums take them."""
-    out = np.zeros((len(disc), len(functions.sign)), np.float32)
-    _fill(functions, disc.astype(np.float32), out)
-    return out.astype(np.float64)
+@inner(error_model="numpy", fastmath=FAST)
+def _power(values: Float32, lobe: Lobe, square: Float32) -> None:
+    """Raise cosines to the lobe's exponent, in place, and set those below its cut to 0."""
+    # By repeated squaring: whole vectors of products, where a logarithm would be a call for each.
+    for i in range(len(values)):
+        square[i] = values[i] if values[i] >= lobe.cut else np.float32(0)
+        values[i] = np.float32(1) if values[i] >= lobe.cut else np.float32(0)
+    if lobe.fraction:
+        _multiply_roots(values, square, lobe.fraction)
+    left = lobe.whole
+    while left:
+        if left & 1:
+            for i in range(len(values)):
+                values[i] *= square[i]
+        left >>= 1
+        if left:
+            for i in range(len(values)):
+                square[i] *= square[i]
 
 
-@numba.njit(cache=True, error_model="numpy")
-def _discs(
+@inner(error_model="numpy")
+def _cells(
     s: int,
     surface: NumbaSurface,
-    points: NumbaPoints,
-    start: int,
-    count: int,
-    disc_x: Float32,
-    disc_y: Float32,
+    relay: NumbaPoints,
+    optics: NumbaOptics,
+    field: HeightField,
+    start: np.float32,
+    sub_bins: int,
+) -> Cells:
+    """Return the relay cells to which a patch sends light, with sub-bins from `start` on."""
+    room = len(relay.x_m) + CHUNK
+    cells = Cells(
+        np.zeros(room, np.float32),
+        np.zeros(room, np.float32),
+        np.zeros(room, np.float32),
+        np.zeros(room, np.float32),
+        np.zeros(room, np.int32),
+    )
+    legs = scratch(relay.tile)
+    verdicts = judge(s, s + 1, surface, relay.bounds_m, optics, field)[0]
+    found = 0
+    for tile in range(len(verdicts)):
+        begin = tile * relay.tile
+        count = returns(verdicts[tile], legs, s, begin, surface, relay, optics, field)
+        for i in range(count):
+            at = int(legs.length_m[i] - start)
+            if legs.weight[i] > 0 and at < sub_bins:
+                dx = relay.x_m[begin + i] - surface.x_m[s]
+                dy = relay.y_m[begin + i] - surface.y_m[s]
+                z = surface.z_m[s]
+                inverse = np.float32(1) / np.sqrt(max(dx * dx + dy * dy + z * z, np.float32(1e-20)))
+                cells.x[found] = dx * inverse
+                cells.y[found] = dy * inverse
+                cells.z[found] = -z * inverse
+                cells.weight[found] = legs.weight[i]
+                cells.sub_bin[found] = at
+                found += 1
+    whole = (found + CHUNK - 1) // CHUNK * CHUNK
+    return Cells(
+        cells.x[:whole],
+        cells.y[:whole],
+        cells.z[:whole],
+        cells.weight[:whole],
+        cells.sub_bin[:whole],
+    )
+
+
+@inner(error_model="numpy")
+def _chunks(cells: Cells) -> Chunks:
+    """Return the mean unit vector of each chunk of cells, and how far from it any of them lies."""
+    count = len(cells.x) // CHUNK
+    chunks = Chunks(
+        np.empty(count, np.float32),
+        np.empty(count, np.float32),
+        np.empty(count, np.float32),
+        np.empty(count, np.float32),
+    )
+    for k in range(count):
+        some = slice(k * CHUNK, (k + 1) * CHUNK)
+        x = cells.x[some].sum() / np.float32(CHUNK)
+        y = cells.y[some].sum() / np.float32(CHUNK)
+        z = cells.z[some].sum() / np.float32(CHUNK)
+        farthest = np.float32(0)
+        for i in range(k * CHUNK, (k + 1) * CHUNK):
+            if cells.weight[i] > 0:
+                off = (cells.x[i] - x) ** 2 + (cells.y[i] - y) ** 2 + (cells.z[i] - z) ** 2
+                farthest = max(farthest, np.float32(off))
+        chunks.x[k] = x
+        chunks.y[k] = y
+        chunks.z[k] = z
+        chunks.reach[k] = np.sqrt(farthest) + np.float32(1e-5)
+    return chunks
+
+
+@inner(error_model="numpy", fastmath=FAST)
+def _fill_raised(cosines: Float32, factors: Float32, lobe: Lobe, raised: Float32) -> None:
+    """Fill in the factors by which a lobe's values are raised at some cosines to its axes."""
+    raised[:] = 1
+    if lobe.raised < LEAST_RAISED:
+        return
+    one = np.float32(1)
+    six = np.float32(6)
+    three_quarters = np.float32(0.75)
+    twice = np.float32(2 * lobe.whole)
+    # With R = n theta^2 = 2 n (1 - cos theta) the lobe is nearly exp(-R / 2), and the sum of its
+    # fourth derivatives along both axes is (6 - 6 R + 3/4 R^2) f, averaged over the turn of the
+    # axes, in units of its standard deviation.
+    for i in range(CHUNK):
+        for lane in range(LANES):
+            r = twice * (one - cosines[i * LANES + lane])
+            terms = six - six * r + three_quarters * r * r
+            raised[i * LANES + lane] += factors[lane] * terms
+
+
+@inner(error_model="numpy", fastmath=FAST)
+def _count(
+    axes: Float32,
+    lobe: Lobe,
+    cells: Cells,
+    chunks: Chunks,
+    counted: Float32,
+    values: Float32,
+    square: Float32,
+) -> tuple[int, int]:
+    """Count the light of the cells in sub-bins (n, LANES), weighted by the lobes about some axes.
+
+    Return the first sub-bin with light, and the one after the last. `axes` is (4, LANES): unit vectors, and the factor `raised`.
+    """
+    first = len(counted)
+    last = 0
+    raised = np.empty(CHUNK * LANES, np.float32)
+    for k in range(len(chunks.x)):
+        # |u . v - u . m| <= |v - m| for unit vectors u.
+        near = np.float32(-2)
+        for lane in range(LANES):
+            near = max(
+                near,
+                axes[0, lane] * chunks.x[k]
+                + axes[1, lane] * chunks.y[k]
+                + axes[2, lane] * chunks.z[k],
+            )
+        if near + chunks.reach[k] < lobe.cut:
+            continue
+        for i in range(CHUNK):
+            x = cells.x[k * CHUNK + i]
+            y = cells.y[k * CHUNK + i]
+            z = cells.z[k * CHUNK + i]
+            for lane in range(LANES):
+                values[i * LANES + lane] = axes[0, lane] * x + axes[1, lane] * y + axes[2, lane] * z
+        _fill_raised(values, axes[3], lobe, raised)
+        _power(values, lobe, square)
+        for i in range(CHUNK * LANES):
+            values[i] *= raised[i]
+        for i in range(CHUNK):
+            at = cells.sub_bin[k * CHUNK + i]
+            weight = cells.weight[k * CHUNK + i]
+            if weight > 0:
+                first = min(first, at)
+                last = max(last, at + 1)
+                for lane in range(LANES):
+                    counted[at, lane] += weight * values[i * LANES + lane]
+    return first, last
+
+
+@inner(error_model="numpy", fastmath=FAST)
+def _as_rows(
+    counted: Float32,
+    total: Float64,
+    first: int,
+    last: int,
+    per_bin: int,
+    rows: Float32,
+    rest: Float32,
 ) -> None:
-    """Fill in where the legs from a patch to points of the wall meet its disc, vector by vector.
+    """Fill in rows (LANES, per_bin, WINDOW + width) and bounds (LANES, bins + 1) from sub-bins.
 
-    Without leave to contract products and sums, so that a leg's last bit does not depend on its
-    place in the vectors.
+    Clears the sub-bins. `rest` is the largest bin of any shift from a bin on.
     """
-    x = surface.x_m[s]
-    y = surface.y_m[s]
-    z = surface.z_m[s]
-    nx = surface.normal_x[s]
-    ny = surface.normal_y[s]
-    nz = surface.normal_z[s]
-    at_x = points.x_m[start : start + count]
-    at_y = points.y_m[start : start + count]
-    for i in range(count):
-        disc_x[i], disc_y[i] = _disc(at_x[i] - x, at_y[i] - y, -z, nx, ny, nz)
-
-
-@numba.njit(cache=True, error_model="numpy", fastmath=FAST)
-def _as_rows(counted: Float32, sign: Float32, rows: Float32, rest: Float32) -> None:
-    """Fill in rows, and norms from a bin on, from light in sub-bins (bins * per_bin, R), times each
-    function.
-    """
-    per_bin = rows.shape[0]
-    rank = rows.shape[1]
+    bins = rest.shape[1] - 1
     width = rows.shape[2] - WINDOW
-    bins = len(rest) - 1
-    total = np.zeros(
-        (len(counted) + 1, rank)
-    )  # float64, so that the difference of large sums keeps the small bins
-    for k in range(len(counted)):
-        for r in range(rank):
-            total[k + 1, r] = total[k, r] + counted[k, r]
-    for shift in range(per_bin):
-        for i in range(bins):
-            until = total[(i + 1) * per_bin - shift]
-            begin = total[max(i * per_bin - shift, 0)]
-            squares = 0.0
-            for r in range(rank):
-                squares += (until[r] - begin[r]) ** 2
-            rest[i] = max(rest[i], np.float32(np.sqrt(squares)))
-            if i < width:
-                for r in range(rank):
-                    rows[shift, r, WINDOW + i] = np.float32(until[r] - begin[r]) * sign[r]
-    for i in range(bins - 1, -1, -1):
-        rest[i] = max(rest[i], rest[i + 1])
+    rows[:] = 0
+    rest[:] = 0
+    if first >= last:
+        return
+    begin = first // per_bin
+    end = min((last + per_bin - 1) // per_bin + 1, bins)
+    low = max(begin - 1, 0) * per_bin
+    high = end * per_bin
+    for lane in range(LANES):
+        # float64, so that the difference of large sums keeps the small bins.
+        running = 0.0
+        for k in range(low, high):
+            total[lane, k] = running
+            running += counted[k, lane]
+            counted[k, lane] = 0
+        total[lane, high] = running
+    for lane in range(LANES):
+        for shift in range(per_bin):
+            before = total[lane, max(begin * per_bin - shift, low)]
+            for i in range(begin, end):
+                after = total[lane, (i + 1) * per_bin - shift]
+                value = np.float32(after - before)
+                before = after
+                rest[lane, i] = max(rest[lane, i], value)
+                if i < width:
+                    rows[lane, shift, WINDOW + i] = value
+        for i in range(end - 1, -1, -1):
+            rest[lane, i] = max(rest[lane, i], rest[lane, i + 1])
 
 
-@numba.njit(cache=True, error_model="numpy", fastmath=FAST)
+class Lattices(NamedTuple):
+    """Nodes of each patch (n) between which some beam interpolates."""
+
+    corner: Int32
+    """(n, 4); first column and row, and the numbers of columns and rows."""
+    place: Int32
+    """(n, nodes); place of each node among those needed, column by column, or -1."""
+    needed: Int32
+    """(n,); nodes needed."""
+
+
+@numba.njit(cache=True, parallel=True, error_model="numpy")
+def _places(surface: NumbaSurface, feet: NumbaPoints, lobe: Lobe, corners: Int32) -> Lattices:
+    """Return the lattices with those corners."""
+    patches = len(corners)
+    most = (corners[:, 2] * corners[:, 3]).max()
+    place = np.full((patches, most), np.int32(-1))
+    count = np.zeros(patches, np.int32)
+    for s in numba.prange(patches):
+        columns = corners[s, 2]
+        rows = corners[s, 3]
+        some = np.zeros((columns, rows), np.bool_)
+        for i in range(len(feet.x_m)):
+            x, y = _on_plane(
+                feet.x_m[i] - surface.x_m[s],
+                feet.y_m[i] - surface.y_m[s],
+                surface.z_m[s],
+                lobe.step,
+            )
+            some[int(np.floor(x)) - corners[s, 0], int(np.floor(y)) - corners[s, 1]] = True
+        needed = np.zeros((columns, rows), np.bool_)
+        for i in range(1, columns - 2):
+            for j in range(1, rows - 2):
+                if some[i, j]:
+                    needed[i - 1 : i + 3, j - 1 : j + 3] = True
+        for i in range(columns):
+            for j in range(rows):
+                if needed[i, j]:
+                    place[s, i * rows + j] = count[s]
+                    count[s] += 1
+    return Lattices(corners, place, count)
+
+
+@numba.njit(cache=True, parallel=True, error_model="numpy")
+def _corners(surface: NumbaSurface, feet: NumbaPoints, lobe: Lobe) -> Int32:
+    """Return the first column and row of each patch's lattice and their numbers (n, 4)."""
+    corners = np.zeros((len(surface.x_m), 4), np.int32)
+    for s in numba.prange(len(surface.x_m)):
+        low_x = np.float32(np.inf)
+        low_y = np.float32(np.inf)
+        high_x = np.float32(-np.inf)
+        high_y = np.float32(-np.inf)
+        for i in range(len(feet.x_m)):
+            x, y = _on_plane(
+                feet.x_m[i] - surface.x_m[s],
+                feet.y_m[i] - surface.y_m[s],
+                surface.z_m[s],
+                lobe.step,
+            )
+            low_x = min(low_x, x)
+            low_y = min(low_y, y)
+            high_x = max(high_x, x)
+            high_y = max(high_y, y)
+        corners[s, 0] = int(np.floor(low_x)) - 1
+        corners[s, 1] = int(np.floor(low_y)) - 1
+        corners[s, 2] = int(np.floor(high_x)) + 3 - corners[s, 0]
+        corners[s, 3] = int(np.floor(high_y)) + 3 - corners[s, 1]
+    return corners
+
+
+@inner(error_model="numpy", fastmath=FAST)
 def _patch_rows(
     s: int,
     surface: NumbaSurface,
     relay: NumbaPoints,
     optics: NumbaOptics,
     field: HeightField,
-    functions: Basis,
-    start: np.float32,
-    per_bin: int,
+    lobe: Lobe,
+    lattices: Lattices,
+    table: NumbaTables,
     rows: Float32,
     rest: Float32,
 ) -> None:
-    """Fill in the tables (per_bin, R, WINDOW + width) of one patch, from the sub-bin `start` on.
-
-    `rest` (bins + 1) is the largest norm over all functions, of any shift, from a bin on.
-    """
-    bins = len(rest) - 1
-    legs = scratch(relay.tile)
-    counted = np.zeros((bins * per_bin, rows.shape[1]), np.float32)
-    value = np.empty(rows.shape[1], np.float32)
-    verdicts = judge(s, s + 1, surface, relay.bounds_m, optics, field)[0]
-    disc_x = np.empty(relay.tile, np.float32)
-    disc_y = np.empty(relay.tile, np.float32)
-    for tile in range(len(verdicts)):
-        count = returns(verdicts[tile], legs, s, tile * relay.tile, surface, relay, optics, field)
-        _discs(s, surface, relay, tile * relay.tile, count, disc_x, disc_y)
-        for i in range(count):
-            at = int(legs.length_m[i] - start)
-            if legs.weight[i] > 0 and at < bins * per_bin:
-                _values(functions, disc_x[i], disc_y[i], legs.weight[i], value)
-                line = counted[at]
-                for r in range(len(value)):
-                    line[r] += value[r]
-    _as_rows(counted, functions.sign, rows, rest)
+    """Fill in the rows (nodes, per_bin, WINDOW + width) of one patch: diffuse first, then nodes."""
+    per_bin = table.per_bin
+    sub_bins = table.width * per_bin
+    start = np.float32(table.first[s] * per_bin)
+    cells = _cells(s, surface, relay, optics, field, start, sub_bins)
+    counted = np.zeros((sub_bins, LANES), np.float32)
+    total = np.empty((LANES, sub_bins + 1))
+    # The first LANES places belong to the diffuse part, in the first of them.
+    first = sub_bins
+    last = 0
+    for i in range(len(cells.x)):
+        if cells.weight[i] > 0:
+            at = cells.sub_bin[i]
+            counted[at, 0] += cells.weight[i]
+            first = min(first, at)
+            last = max(last, at + 1)
+    _as_rows(counted, total, first, last, per_bin, rows[:LANES], rest[:LANES])
+    if lobe.gain == 0:
+        return
+    chunks = _chunks(cells)
+    axes = np.zeros((4, LANES), np.float32)
+    values = np.empty(CHUNK * LANES, np.float32)
+    square = np.empty(CHUNK * LANES, np.float32)
+    corner = lattices.corner[s]
+    node = 0
+    for k in range(corner[2] * corner[3]):
+        if lattices.place[s, k] < 0:
+            continue
+        x, y, z, raised = _axis(
+            corner[0] + k // corner[3], corner[1] + k % corner[3], s, surface, lobe
+        )
+        lane = node % LANES
+        axes[0, lane] = x
+        axes[1, lane] = y
+        axes[2, lane] = z
+        axes[3, lane] = raised
+        node += 1
+        if node % LANES and node < lattices.needed[s]:
+            continue
+        first, last = _count(axes, lobe, cells, chunks, counted, values, square)
+        begin = (node + LANES - 1) // LANES * LANES
+        _as_rows(
+            counted,
+            total,
+            first,
+            last,
+            per_bin,
+            rows[begin : begin + LANES],
+            rest[begin : begin + LANES],
+        )
 
 
 @numba.njit(cache=True, parallel=True)
@@ -444,21 +548,26 @@ def _rows(
     relay: NumbaPoints,
     optics: NumbaOptics,
     field: HeightField,
-    functions: Basis,
+    lobe: Lobe,
+    lattices: Lattices,
     table: NumbaTables,
     rows: Float32,
+    rest: Float32,
 ) -> None:
-    """Fill in the tables (patches, per_bin, R, WINDOW + width) of some patches: B times each
-    function, as sums to bins.
-
-    Light beyond the width is in `table.rest` alone.
-    """
+    """Fill in the rows of some patches, and bounds on their bins."""
     for j in numba.prange(len(rows)):
         s = begin + j
-        per_bin = table.per_bin
-        start = np.float32(table.first[s] * per_bin)
         _patch_rows(
-            s, surface, relay, optics, field, functions, start, per_bin, rows[j], table.rest[s]
+            s,
+            surface,
+            relay,
+            optics,
+            field,
+            lobe,
+            lattices,
+            table,
+            rows[j],
+            rest[j],
         )
 
 
@@ -487,7 +596,7 @@ def _begins(
     return begin, bins.max()
 
 
-@numba.njit(cache=True, error_model="numpy", fastmath=FAST)
+@inner(error_model="numpy", fastmath=FAST)
 def _add_tile(
     start: int,
     size: int,
@@ -496,73 +605,78 @@ def _add_tile(
     surface: NumbaSurface,
     optics: NumbaOptics,
     field: HeightField,
-    functions: Basis,
+    lobe: Lobe,
+    lattices: Lattices,
     table: NumbaTables,
     begin: Float32,
     rows: Float32,
+    rest: Float32,
     sums: Float32,
     bound: Float32,
 ) -> None:
-    """Add the tables of the patches from one on to the windows of some beams, and to their
-    bounds.
-    """
+    """Add the tables of some patches to the windows of a tile's beams, and to their bounds."""
     bins = sums.shape[1]
     per_bin = table.per_bin
-    rank = rows.shape[2]
+    places = rows.shape[1]
     span = rows.shape[3]
+    width = span - WINDOW
     flat = rows.ravel()
     every = sums.ravel()
-    width = span - WINDOW
+    count = NEIGHBORS + 1 if lobe.gain > 0 else 1
     tile = feet.bounds_m[start // BEAM_TILE : start // BEAM_TILE + 1]
     verdicts = judge(patch, patch + len(rows), surface, tile, optics, field)
     legs = scratch(size)
-    at = np.empty(size, np.int32)
-    shift = np.empty(size, np.int32)
-    disc_x = np.empty(size, np.float32)
-    disc_y = np.empty(size, np.float32)
-    weight = np.empty(rank, np.float32)
-    offset = np.empty(rank, np.int32)
-    base = np.arange(rank) * span
+    base = np.zeros(NEIGHBORS + 1, np.int64)
+    offset = np.empty(NEIGHBORS + 1, np.int32)
+    weight = np.empty(NEIGHBORS + 1, np.float32)
+    along_x = np.empty(4, np.float32)
+    along_y = np.empty(4, np.float32)
     for j in range(len(rows)):
         s = patch + j
         if verdicts[j, 0] == DARK:
             continue
         fill(legs, s, surface, feet, start, size, verdicts[j, 0], optics, field, False)
-        _discs(s, surface, feet, start, size, disc_x, disc_y)
+        corner = lattices.corner[s]
+        place_of = lattices.place[s]
         for i in range(size):
-            at[i] = np.int32(
+            if legs.weight[i] == 0:
+                continue
+            at = np.int32(
                 (legs.length_m[i] + feet.length_m[start + i]) * optics.inverse_bin + np.float32(0.5)
             )
-            shift[i] = at[i] % np.int32(per_bin)
-        # Beams of one shift go together: their rows stay in the first cache.
-        for now in range(per_bin):
-            origin = (j * per_bin + now) * rank * span + WINDOW
-            for i in range(size):
-                if shift[i] != now or legs.weight[i] == 0:
-                    continue
-                ahead = int(begin[start + i]) - at[i] // per_bin - table.first[s]
-                light = legs.weight[i]
-                squares = _values(
-                    functions, disc_x[i], disc_y[i], light * surface.strength[s], weight
+            ahead = int(begin[start + i]) - at // per_bin - table.first[s]
+            beyond = min(max(ahead + bins, 0), table.width)
+            shift = (at % per_bin) * span + WINDOW
+            light = legs.weight[i] * surface.strength[s]
+            weight[0] = light * lobe.diffuse
+            base[0] = j * places * per_bin * span + shift
+            later = weight[0] * rest[j, 0, beyond]
+            if lobe.gain > 0:
+                x, y = _on_plane(
+                    feet.x_m[start + i] - surface.x_m[s],
+                    feet.y_m[start + i] - surface.y_m[s],
+                    surface.z_m[s],
+                    lobe.step,
                 )
-                # A sum of products is at most the product of both norms (Cauchy and Schwarz).
-                bound[start + i] += (
-                    np.sqrt(squares) * table.rest[s, min(max(ahead + bins, 0), table.width)]
-                )
-                for window in range(0, bins, WINDOW):
-                    if -WINDOW < ahead + window < width:
-                        offset[:] = origin + ahead + window
-                        add_rows(
-                            every,
-                            (start + i) * bins + window,
-                            flat,
-                            base,
-                            offset,
-                            weight,
-                            0,
-                            1,
-                            rank,
-                        )
+                column = int(np.floor(x))
+                row = int(np.floor(y))
+                _weights(x - np.float32(column), along_x)
+                _weights(y - np.float32(row), along_y)
+                node = (column - 1 - corner[0]) * corner[3] + row - 1 - corner[1]
+                for a in range(4):
+                    for b in range(4):
+                        k = 1 + 4 * a + b
+                        place = LANES + place_of[node + a * corner[3] + b]
+                        weight[k] = light * lobe.gain * along_x[a] * along_y[b]
+                        base[k] = (j * places + place) * per_bin * span + shift
+                        later += abs(weight[k]) * rest[j, place, beyond]
+            bound[start + i] += later
+            for window in range(0, bins, WINDOW):
+                if -WINDOW < ahead + window < width:
+                    offset[:] = ahead + window
+                    add_rows(
+                        every, (start + i) * bins + window, flat, base, offset, weight, 0, 1, count
+                    )
 
 
 @numba.njit(cache=True, parallel=True)
@@ -572,80 +686,87 @@ def _add(
     surface: NumbaSurface,
     optics: NumbaOptics,
     field: HeightField,
-    functions: Basis,
+    lobe: Lobe,
+    lattices: Lattices,
     table: NumbaTables,
     begin: Float32,
     rows: Float32,
+    rest: Float32,
     sums: Float32,
     bound: Float32,
 ) -> None:
-    """Add the tables of the patches from one on to the beams' windows, and to each beam's bound on
-    all later bins.
-    """
+    """Add the tables of some patches to all beams' windows, and to a bound on each's later bins."""
     beams = len(feet.x_m)
     for tile in numba.prange((beams + BEAM_TILE - 1) // BEAM_TILE):
         start = tile * BEAM_TILE
-        size = min(BEAM_TILE, beams - start)
         _add_tile(
             start,
-            size,
+            min(BEAM_TILE, beams - start),
             patch,
             feet,
             surface,
             optics,
             field,
-            functions,
+            lobe,
+            lattices,
             table,
             begin,
             rows,
+            rest,
             sums,
             bound,
         )
 
 
 def _sums(
-    numba_job: NumbaJob, feet: NumbaPoints, functions: Basis, *, first_only: bool
+    numba_job: NumbaJob, feet: NumbaPoints, lobe: Lobe, *, first_only: bool
 ) -> tuple[Int64, Float32, Float32]:
     """Return the bin (n,) at which each beam's window begins, its sums (n, bins), and a bound (n,)
     on later bins.
     """
     surface, groups, centers, optics, field = numba_job.sites
-    rest = np.zeros((len(surface.x_m), numba_job.width + 1), np.float32)
     per_bin = numba_job.job.accuracy.sub_bins
-    table = NumbaTables(numba_job.first, np.empty(0, np.float32), rest, per_bin, numba_job.width)
+    relay = numba_job.relay_in(CHUNK)
+    nothing = np.empty(0, np.float32)
+    table = NumbaTables(numba_job.first, nothing, nothing[None], per_bin, numba_job.width)
     begin, bins = _begins(feet, groups, centers, optics, table)
     # No path of a patch begins before the window, so that its first bins hold all that the first
     # window can meet.
     windows = 1 if first_only else -(-bins // WINDOW)
-    span = WINDOW + (WINDOW + 8 if first_only else table.width)
-    rank = len(functions.sign)
+    span = WINDOW + min(WINDOW + 8, table.width) if first_only else WINDOW + table.width
+    lattices = _places(surface, feet, lobe, _corners(surface, feet, lobe))
+    # The first vector is the diffuse part's, and the last may not be full.
+    nodes = 2 * LANES + int(lattices.needed.max()) // LANES * LANES
     sums = np.zeros((len(begin), windows * WINDOW), np.float32)
     bound = np.zeros(len(begin), np.float32)
     patches = len(surface.x_m)
-    threads = numba.get_num_threads()
-    block = max(TABLE_BYTES // (4 * table.per_bin * rank * span), threads)
+    block = max(TABLE_BYTES // (4 * per_bin * nodes * span), numba.get_num_threads())
+    block = min(block, patches)
+    # A row is read up to a window beyond its end: into the next one's zeros, or those after the
+    # last.
+    flat = np.zeros(block * nodes * per_bin * span + WINDOW, np.float32)
+    whole = flat[:-WINDOW].reshape(block, nodes, per_bin, span)
+    rest = np.zeros((block, nodes, table.width + 1), np.float32)
     for patch in range(0, patches, block):
-        # A row is read up to a window beyond its end: into the next one's zeros, or those after the
-        # last.
-        flat = np.zeros(
-            min(block, patches - patch) * table.per_bin * rank * span + WINDOW, np.float32
-        )
-        rows = flat[:-WINDOW].reshape(-1, table.per_bin, rank, span)
-        _rows(patch, surface, numba_job.relay, optics, field, functions, table, rows)
-        _add(patch, feet, surface, optics, field, functions, table, begin, rows, sums, bound)
-    # A truncated series may fall below 0 by its error where there is no light.
+        rows = whole[: patches - patch]
+        some = rest[: patches - patch]
+        where = surface, relay, optics, field, lobe, lattices, table
+        _rows(patch, *where, rows, some)
+        places = feet, surface, optics, field, lobe, lattices, table
+        _add(patch, *places, begin, rows, some, sums, bound)
+    # Interpolation may fall below 0 by its error where there is no light.
     begin = begin[feet.place]
     sums = sums[feet.place]
     bound = bound[feet.place]
     return begin.astype(np.int64), np.maximum(sums, 0), bound
 
 
-def _histograms(numba_job: NumbaJob, functions: Basis, which: Any = slice(None)) -> Float32:
+def _histograms(numba_job: NumbaJob, lobe: Lobe, which: Any = slice(None)) -> Float32:
     """Return histograms (n, bins) of I_multi over path length, for some of the job's beams."""
     job = numba_job.job
     share = np.zeros(len(job.laser_spot_m))
     share[which] = 1
-    begin, sums, _ = _sums(numba_job, numba_job.feet(share), functions, first_only=False)
+    begin, sums, _ = _sums(numba_job, numba_job.feet(share), lobe, first_only=False)
     found = np.zeros((len(begin), job.bins), np.float32)
     at = begin[:, None] + np.arange(sums.shape[1])
     beam, k = np.nonzero((at >= 0) & (at < job.bins))
@@ -653,53 +774,40 @@ def _histograms(numba_job: NumbaJob, functions: Basis, which: Any = slice(None))
     return found
 
 
-def _echoes(numba_job: NumbaJob, functions: Basis) -> MultiBounce:
-    """Return the strongest bins (n,) of the job's beams: those of `_histograms`, bit for bit, for
-    less work.
-    """
-    job = numba_job.job
-    begin, sums, bound = _sums(
-        numba_job, numba_job.feet(np.ones(len(job.laser_spot_m))), functions, first_only=True
-    )
-    at = begin[:, None] + np.arange(WINDOW)
-    found = strongest(np.where((at >= 0) & (at < job.bins), sums, 0), job.bin_m)
-    found.path_m[:] = ((found.path_m / job.bin_m - 0.5).round() + begin + 0.5) * job.bin_m
-    if (unsure := np.flatnonzero(bound * ROUNDED > found.runner_up)).size:
-        rest = strongest(_histograms(numba_job, functions, unsure), job.bin_m)
-        found.peak[unsure] = rest.peak
-        found.runner_up[unsure] = rest.runner_up
-        found.path_m[unsure] = rest.path_m
-    return found
+def _lobe(job: TransportJob) -> Lobe:
+    """Return the lobe of a job, without gain for a Lambertian surface."""
+    return lobe_of(job.brdf or phong(1.0, 0.0, 1.0), job.accuracy.scatter_error)
 
 
 def histograms(job: TransportJob) -> Float32:
-    """Return histograms (n, bins) of I_multi over path length, for the beams of a job with any BRDF
-    or none.
-
-    A BRDF without few eigenfunctions has a table for each of some directions of incoming light
-    instead.
+    """Return histograms (n, bins) of I_multi over path length, for the beams of a job with a
+    BRDF.
     """
-    if job.brdf is None:
-        return backend_numba.histograms(job)
     numba_job = NumbaJob(job)
-    if not job.more_bounces and (functions := glossy_basis(job, job.brdf)) is not None:
-        return _histograms(numba_job, functions)
-    total = np.zeros((len(job.laser_spot_m), job.bins), np.float32)
-    for foot, share in nodes(job, job.brdf):
-        factor = scattering(job.brdf)(
-            foot, job.patches.point_m, job.patches.normal, job.relay.x_m, job.relay.y_m
-        )
-        total += numba_job.histograms(factor.astype(np.float32), share)
-    return total
+    found = _histograms(numba_job, _lobe(job))
+    if job.more_bounces:
+        # Light that met the object twice is taken as diffuse, as in the reference.
+        found += numba_job.second_bounces()
+    return found
 
 
 def echoes(job: TransportJob) -> MultiBounce:
     """Return the strongest bins (n,) of the job's beams: those of `histograms`, bit for bit, from a
     part of its work.
-
-    A BRDF without few eigenfunctions needs whole histograms.
     """
-    if job.brdf is None:
-        return backend_numba.echoes(job)
-    functions = None if job.more_bounces else glossy_basis(job, job.brdf)
-    return _echoes(NumbaJob(job), functions) if functions else strongest(histograms(job), job.bin_m)
+    if job.more_bounces:
+        return strongest(histograms(job), job.bin_m)
+    numba_job = NumbaJob(job)
+    lobe = _lobe(job)
+    every = numba_job.feet(np.ones(len(job.laser_spot_m)))
+    begin, sums, bound = _sums(numba_job, every, lobe, first_only=True)
+    at = begin[:, None] + np.arange(WINDOW)
+    found = strongest(np.where((at >= 0) & (at < job.bins), sums, 0), job.bin_m)
+    found.path_m[:] = ((found.path_m / job.bin_m - 0.5).round() + begin + 0.5) * job.bin_m
+    unsure = np.flatnonzero(bound * ROUNDED > found.runner_up)
+    if unsure.size:
+        rest = strongest(_histograms(numba_job, lobe, unsure), job.bin_m)
+        found.peak[unsure] = rest.peak
+        found.runner_up[unsure] = rest.runner_up
+        found.path_m[unsure] = rest.path_m
+    return found

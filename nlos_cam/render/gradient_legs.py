@@ -6,9 +6,6 @@ winner's bin k and t = d1 + d2 in bins, with F_s the running sum of the returned
 d3 + d4. One pass over the patches, each with its table in the first cache, gives the derivative
 with respect to every leg. To have a smooth F_s, each relay cell spreads its light over the path
 lengths that its own size covers; the renderer counts it at its middle.
-
-numba's cache depends on this file alone: after a change of a kernel that is imported here, delete
-__pycache__.
 """
 
 from dataclasses import dataclass

@@ -21,7 +21,7 @@ from nlos_calibration.arrays import Float32, Float64, Mask
 
 from nlos_cam.errors import SceneError
 from nlos_cam.frames import SATURATED
-from nlos_cam.render import backend_reference, glossy
+from nlos_cam.render import backend_cpu, backend_reference
 from nlos_cam.render.accuracy import STOPS, Accuracy, accuracy_named
 from nlos_cam.render.backend_numba import NumbaJob
 from nlos_cam.render.echoes import MultiBounce, compete, no_echoes, strongest
@@ -408,7 +408,7 @@ class Gradients:
 def _echoes(job: TransportJob) -> MultiBounce:
     if job.accuracy.sub_bins == 0:
         return strongest(backend_reference.histograms(job), job.bin_m)
-    return glossy.echoes(job)
+    return backend_cpu.echoes(job)
 
 
 def _wall_as_lidar(lidar_m: Float64) -> Float64:

@@ -1,14 +1,11 @@
 """Material of a hidden surface: albedo and BRDF.
 
 A BRDF is given relative to a perfectly diffuse surface (pi f_r in the rendering equation), as a
-function of three cosines: incoming to normal, outgoing to normal, incoming to outgoing. Every
-isotropic BRDF can be written so. With arithmetic alone, the same function runs compiled on scalars,
-on arrays and on tensors.
+function of three cosines: incoming to normal, outgoing to normal, incoming to outgoing.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from nlos_calibration import Record
@@ -18,34 +15,41 @@ from pydantic_core import PydanticCustomError
 
 from nlos_cam.errors import SceneError
 
-Brdf = Callable[[Any, Any, Any], Any]
-"""(cos_in, cos_out, cos_between) -> value; 1 is a white Lambertian surface."""
+
+class Brdf(NamedTuple):
+    """Diffuse part and one lobe, relative to a white Lambertian surface."""
+
+    diffuse: float
+    specular: float
+    """Share of the light in the lobe."""
+    exponent: float
+    mirrored: bool
+    """True for a lobe about the mirror direction, False for one about the incoming light."""
+
+    @property
+    def gain(self) -> float:
+        """Value of the lobe along its axis."""
+        # Modified Phong (Lafortune and Willems 1994): (n + 2) / (2 pi) cos^n integrates to at most
+        # 1 with the cosine, and pi times it is relative to a diffuse surface.
+        return self.specular * (self.exponent + 2) / 2
+
+    def __call__(self, cos_in: Any, cos_out: Any, cos_between: Any) -> Any:
+        """Return the value for three cosines: incoming and outgoing to normal, and in between."""
+        axis = 2 * cos_in * cos_out - cos_between if self.mirrored else cos_between
+        # (x + |x|) / 2 is max(x, 0) on scalars and arrays alike.
+        return self.diffuse + self.gain * ((axis + abs(axis)) / 2) ** self.exponent
 
 
 def phong(diffuse: float, specular: float, exponent: float) -> Brdf:
     """Return a lobe about the mirror direction, normalized: diffuse + specular <= 1 never gains
     energy.
     """
-    # Modified Phong (Lafortune and Willems 1994): (n + 2) / (2 pi) cos^n integrates to at most 1
-    # with the cosine, and pi times it is relative to a diffuse surface. (x + |x|) / 2 is max(x, 0)
-    # on scalars, arrays and tensors alike.
-    gain = specular * (exponent + 2) / 2
-
-    def brdf(cos_in: Any, cos_out: Any, cos_between: Any) -> Any:
-        mirror = 2 * cos_in * cos_out - cos_between
-        return diffuse + gain * ((mirror + abs(mirror)) / 2) ** exponent
-
-    return brdf
+    return Brdf(diffuse, specular, exponent, mirrored=True)
 
 
 def retroreflective(diffuse: float, specular: float, exponent: float) -> Brdf:
     """Return a lobe about the direction of the incoming light, normalized as in `phong`."""
-    gain = specular * (exponent + 2) / 2
-
-    def brdf(_cos_in: Any, _cos_out: Any, cos_between: Any) -> Any:
-        return diffuse + gain * ((cos_between + abs(cos_between)) / 2) ** exponent
-
-    return brdf
+    return Brdf(diffuse, specular, exponent, mirrored=False)
 
 
 class Material(Record):

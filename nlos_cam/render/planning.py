@@ -114,7 +114,7 @@ def _brdf(facts: SceneFacts) -> Finding:
     # Without the effect the mean m of both ends replaces the BRDF: |f - m| / f is largest at f =
     # low.
     bound = min((high - low) / (2 * low), 1.0) if low > 0 else float(high > 0)
-    cost = "needs tables for every direction of incoming light, some dozens of times the cost"
+    cost = "needs tables for a lattice of directions, 20 times the cost and more"
     return "brdf", bound, f"the BRDF ranges from {low:.3g} to {high:.3g}: {cost}"
 
 

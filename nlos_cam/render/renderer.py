@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from nlos_cam.errors import SceneError
 from nlos_cam.frames import MAP_COLUMNS, MAP_ROWS, WINNER_SPREAD_M
-from nlos_cam.render import backend_reference, glossy
+from nlos_cam.render import backend_cpu, backend_reference
 from nlos_cam.render.accuracy import Accuracy, accuracy_named
 from nlos_cam.render.echoes import (
     MultiBounce,
@@ -173,7 +173,7 @@ def transport(job: TransportJob | None, backend: str) -> Histograms | None:
     if job.accuracy.sub_bins == 0:
         return backend_reference.histograms(job)
     if backend == "cpu":
-        return glossy.histograms(job)
+        return backend_cpu.histograms(job)
     from nlos_cam.render import backend_torch  # torch takes a second to import
 
     return backend_torch.histograms(job, backend_torch.device_named(backend))
@@ -187,7 +187,7 @@ def _echoes(problem: RenderProblem, backend: str) -> MultiBounce:
     # A pulse mixes neighbouring bins, so that the strongest bin before it may not be the strongest
     # after it: only a waveform without one may be summed in part.
     if backend == "cpu" and job and job.accuracy.sub_bins and not problem.includes("pulse"):
-        return glossy.echoes(job).spread_over(problem.beams.on_wall)
+        return backend_cpu.echoes(job).spread_over(problem.beams.on_wall)
     return _strongest(problem, transport(job, backend))
 
 

@@ -133,7 +133,7 @@ def test_phong_without_its_lobe_is_lambertian(implementation: Any) -> None:
 
 
 @pytest.mark.slow
-def test_brdf_tables_agree_with_brute_force() -> None:
+def test_brdf_agrees_with_brute_force() -> None:
     depth = np.random.default_rng(0).uniform(0.2, 0.3, (6, 6)).astype(np.float32)
     scene = Scene(RIG, depth, Surface(1.0, phong(0.4, 0.6, 10)))
     effects = ["three-bounce", "occluder", "tilt", "brdf"]

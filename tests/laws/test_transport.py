@@ -109,9 +109,14 @@ def test_transport_is_reciprocal(implementation: Any, brdf: Any) -> None:
     sent = implementation.histograms(there)[0] / there.relay_weight[0]
     returned = implementation.histograms(back)[0] / back.relay_weight[0]
     assert sent.any()
-    np.testing.assert_allclose(returned.sum(), sent.sum(), rtol=1e-5)
+    # The CPU interpolates a lobe over the incoming direction alone.
+    error = 1e-5 if brdf is None else COARSE.scatter_error
+    np.testing.assert_allclose(returned.sum(), sent.sum(), rtol=error)
     moved = np.abs(np.cumsum(returned) - np.cumsum(sent)).sum() / sent.sum()
-    assert moved < 0.1  # bins: a fast renderer may round a path across an edge
+    # In bins: a fast renderer may round a path across an edge, and the light of a lobe may err by
+    # its share in every bin.
+    spread = 0 if brdf is None else np.ptp(np.flatnonzero(sent))
+    assert moved < 0.1 + error * spread
 
 
 def test_echoes_lie_between_shortest_and_longest_path(implementation: Any) -> None:

@@ -25,12 +25,10 @@ from nlos_cam.render import (
     transient,
 )
 from nlos_cam.render.backend_numba import echoes, histograms
-from nlos_cam.render.brdf_table import MAX_NODES, node_count, nodes, scattered, scattering
 from nlos_cam.render.echoes import MultiBounce, compete, no_echoes, strongest
 from nlos_cam.render.effects import Effect
 from nlos_cam.render.geometry import Beams
 from nlos_cam.render.job import TransportJob
-from nlos_cam.render.material import Brdf
 from nlos_cam.render.renderer import render_scan, scan_effect, slices
 from nlos_cam.render.scene import Radiometry
 
@@ -197,41 +195,6 @@ def job() -> TransportJob:
     return prepare(
         Scene(load_rig("paper-rig"), depth, Surface(1.0, BRDF), jump_m=0.5), COARSE, "auto"
     ).job
-
-
-@pytest.mark.slow
-def test_scattering_compiled_and_plain_agree_leg_by_leg(job: TransportJob) -> None:
-    patches = job.patches
-    relay = job.relay
-    foot = job.laser_spot_m[1000]
-    table = scattering(BRDF)(foot, patches.point_m, patches.normal, relay.x_m, relay.y_m)
-    out = np.stack([relay.x_m, relay.y_m, np.zeros_like(relay.x_m)], 1)
-    for s in range(len(patches.beta)):
-        same = (
-            np.broadcast_to(column, out.shape)
-            for column in (foot, patches.point_m[s], patches.normal[s])
-        )
-        np.testing.assert_allclose(table[s], scattered(BRDF, *same, out), rtol=1e-9)
-    assert table.min() >= 0.4
-    assert table.max() > 0.5
-
-
-def test_nodes_interpolate_every_beam_exactly_whichever_are_rendered(job: TransportJob) -> None:
-    feet, share = map(np.stack, zip(*nodes(job, BRDF), strict=True))
-    np.testing.assert_allclose(share.sum(0), 1)
-    np.testing.assert_allclose(share.T @ feet, job.laser_spot_m, atol=1e-9)
-    whole = {tuple(foot): each[[5, 900]] for foot, each in zip(feet, share, strict=True)}
-    for foot, each in nodes(job.select(np.array([5, 900])), BRDF):
-        np.testing.assert_array_equal(whole[tuple(foot)], each)
-
-
-def test_node_count_grows_as_the_error_shrinks(job: TransportJob) -> None:
-    def count(error: float, brdf: Brdf = BRDF) -> int:
-        return node_count(replace(job, accuracy=replace(COARSE, scatter_error=error)), brdf)
-
-    assert count(0.5) == 4
-    assert 4 < count(5e-3) <= count(1e-4) <= MAX_NODES
-    assert count(1e-4, phong(0.5, 0.0, 10)) == 4
 
 
 @pytest.mark.parametrize("radiometry", ["paper", "lambertian"])

@@ -1,0 +1,108 @@
+"""Folder of numba's compiled kernels, named by a checksum of every file that holds kernels.
+
+numba notices a change of a kernel's own file alone: after a change of a kernel that it calls, old
+machine code would stay in use. Here the folder's name depends on all of them.
+"""
+
+import hashlib
+import os
+import shutil
+from functools import cache
+from pathlib import Path
+from typing import Any, Self
+
+from numba.core import caching
+
+PACKAGE = Path(__file__).parent
+MARK = b"cache=True"
+"""Text of the files with kernels that numba keeps."""
+FOLDERS = ".", "objects", "recording", "render", "render/sensor"
+"""Folders of the package with such files: to read them all takes less than 5 ms."""
+PREFIX = "kernels-"
+
+
+@cache
+def checksum(package: Path = PACKAGE) -> str:
+    """Return the SHA-256 of the files with kernels in a package's folder."""
+    found = hashlib.sha256()
+    files = [path for name in FOLDERS for path in sorted((package / name).glob("*.py"))]
+    for path in files:
+        text = path.read_bytes()
+        if MARK in text:
+            found.update(f"{path.relative_to(package)} {len(text)}\n".encode())
+            found.update(text)
+    return found.hexdigest()
+
+
+@cache
+def folder() -> Path | None:
+    """Return the folder beside the package's files, or in the user's cache if they are read-only.
+
+    Folders of other checksums in the same place are removed. None if neither can be written.
+    """
+    user = os.environ.get("NLOS_CAM_CACHE")
+    base = Path(user) if user else _user_cache() / "nlos-cam"
+    # Several installations may share the user's cache: each has a place of its own.
+    place = hashlib.sha256(str(PACKAGE).encode()).hexdigest()[:16]
+    for parent in (PACKAGE / "__pycache__", base / "numba" / place):
+        path = parent / f"{PREFIX}{checksum()[:16]}"
+        if path.is_dir() and os.access(path, os.W_OK):
+            return path
+        try:
+            path.mkdir(parents=True, exist_ok=True)
+        except OSError:
+            continue
+        for other in parent.glob(f"{PREFIX}*"):
+            if other != path:
+                shutil.rmtree(other, ignore_errors=True)
+        return path
+    return None
+
+
+def _user_cache() -> Path:
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+
+
+BaseLocator: Any = getattr(caching, "_CacheLocator")  # noqa: B009, numba has no public one
+
+
+class KernelCacheLocator(BaseLocator):
+    """Place of one kernel of this package in `folder`, for numba."""
+
+    def __init__(self, function: Any, path: Path) -> None:
+        self._line: int = function.__code__.co_firstlineno
+        self._path = path
+
+    def get_cache_path(self) -> str:
+        """Return the folder of the kernel's module."""
+        root = folder()
+        module = self._path.relative_to(PACKAGE).with_suffix("")
+        return str((root or PACKAGE / "__pycache__") / "-".join(module.parts))
+
+    def get_source_stamp(self) -> str:
+        """Return what the compiled code depends on."""
+        return checksum()
+
+    def get_disambiguator(self) -> str:
+        """Return what tells functions of one name in a module apart."""
+        return str(self._line)
+
+    @classmethod
+    def from_function(cls, py_func: Any, py_file: str) -> Self | None:
+        """Return the place of a kernel; None leaves functions of other packages to numba."""
+        path = Path(py_file)
+        if not path.is_relative_to(PACKAGE) or os.environ.get("NUMBA_CACHE_DIR"):
+            return None
+        place = cls(py_func, path)
+        try:
+            place.ensure_cache_path()
+        except OSError:
+            return None
+        return place
+
+
+def install() -> None:
+    """Let numba keep this package's kernels here. A user's NUMBA_CACHE_DIR has precedence."""
+    locators: list[Any] = getattr(caching.CacheImpl, "_locator_classes")  # noqa: B009, numba has no public list
+    if KernelCacheLocator not in locators:
+        locators.insert(0, KernelCacheLocator)

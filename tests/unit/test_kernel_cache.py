@@ -1,0 +1,98 @@
+"""Numba's cache follows every file with kernels."""
+
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from nlos_cam import kernel_cache
+
+CALLED = """
+from numba import njit
+
+@njit(cache=True)
+def called(x):
+    return x + {number}
+"""
+CALLER = """
+from numba import njit
+from nlos_cam import kernel_cache
+kernel_cache.install()
+from nlos_cam.called import called
+
+@njit(cache=True)
+def caller(x):
+    return called(x)
+
+print(caller(1))
+"""
+
+
+@pytest.fixture
+def package(tmp_path: Path) -> Path:
+    """Package with one kernel that calls another, in two files."""
+    package = tmp_path / "nlos_cam"
+    package.mkdir()
+    (package / "__init__.py").touch()
+    shutil.copy(kernel_cache.__file__, package)
+    (package / "called.py").write_text(CALLED.format(number=1))
+    (package / "caller.py").write_text(CALLER)
+    return package
+
+
+def run(package: Path, **environment: str) -> str:
+    """Return what the calling kernel prints in a process of its own."""
+    known = {key: value for key, value in os.environ.items() if key != "NUMBA_CACHE_DIR"}
+    done = subprocess.run(
+        [sys.executable, "-m", "nlos_cam.caller"],
+        env={**known, "PYTHONPATH": str(package.parent), **environment},
+        cwd=package.parent,
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    return done.stdout.strip()
+
+
+@pytest.mark.slow
+def test_changed_kernel_changes_its_callers(package: Path) -> None:
+    assert run(package) == "2"
+    (package / "called.py").write_text(CALLED.format(number=5))
+    assert run(package) == "6"
+
+
+@pytest.mark.slow
+def test_old_folders_are_removed(package: Path) -> None:
+    run(package)
+    before = list((package / "__pycache__").glob("kernels-*"))
+    (package / "called.py").write_text(CALLED.format(number=5))
+    run(package)
+    after = list((package / "__pycache__").glob("kernels-*"))
+    assert len(before) == len(after) == 1
+    assert before != after
+
+
+@pytest.mark.slow
+def test_read_only_package_is_cached_in_the_users_folder(package: Path, tmp_path: Path) -> None:
+    (package / "__pycache__").write_text("a file, so that no folder can be made here")
+    cache = tmp_path / "cache"
+    assert run(package, NLOS_CAM_CACHE=str(cache)) == "2"
+    assert list(cache.rglob("*.nbi"))
+
+
+def test_checksum_covers_every_file_with_kernels(tmp_path: Path) -> None:
+    (tmp_path / "plain.py").write_text("x = 1")
+    without = kernel_cache.checksum(tmp_path)
+    (tmp_path / "kernels.py").write_text(CALLED)
+    kernel_cache.checksum.cache_clear()
+    assert kernel_cache.checksum(tmp_path) != without
+
+
+def test_every_file_with_kernels_lies_in_the_folders() -> None:
+    package = kernel_cache.PACKAGE
+    marked = {path for path in package.rglob("*.py") if kernel_cache.MARK in path.read_bytes()}
+    found = {path for name in kernel_cache.FOLDERS for path in (package / name).glob("*.py")}
+    assert marked <= found
