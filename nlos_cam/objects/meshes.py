@@ -145,7 +145,12 @@ def read_mesh(path: Path) -> MeshFile:
             )
         content = path.read_bytes()
         parts = _parts(content, suffix)
-        triangles = np.concatenate([np.empty((0, 3, 3)), *(_triangles(part) for part in parts)])
+        triangles = np.concatenate(
+            [
+                np.empty((0, 3, 3)),
+                *(_triangles(part) for part in parts),
+            ]
+        )
     if problem := _problem(triangles):
         raise SceneFileError(f"{path} {problem}")
     return MeshFile(path, hashlib.sha256(content).hexdigest(), triangles)
@@ -255,7 +260,10 @@ def _problem(triangles: Float64) -> str:
             " again"
         )
     extent = np.ptp(triangles.reshape(-1, 3), axis=0).max()
-    normals = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
+    normals = np.cross(
+        triangles[:, 1] - triangles[:, 0],
+        triangles[:, 2] - triangles[:, 0],
+    )
     if not np.abs(normals).max() > 1e-12 * extent**2:
         return "has no face with an area: it is a point or a line; export a surface or a solid"
     return ""

@@ -334,7 +334,7 @@ def _near_enough(
     # the segment between them. Over the wall, grad l is the leg's unit vector u. Moving the patch
     # by r turns u by at most r / d, so
     #     |grad (l_a - l_b)| = |u_a - u_b| <= r / d.
-    # A weight falls with l^-k (S2: k = 3 with the leg's own length in the cosine, 4 if Lambertian),
+    # A weight falls with l^-k (S2: k = 3, as the cosine has l once; 4 if Lambertian),
     # so grad log w = -k u / l. The map from p to u / l is an inversion, which scales by 1 / l^2:
     #     |grad log (w_a / w_b)| <= 4 r / d^2.
     # Both differences are 0 at the tile's middle after joining, and grow over at most half its
