@@ -235,9 +235,5 @@ def _grid_surface(points: NDArray[np.float64]) -> Float64:
     b = points[1:, :-1]
     c = points[1:, 1:]
     d = points[:-1, 1:]
-    return np.concatenate(
-        [
-            np.stack([a, b, c], axis=2),
-            np.stack([a, c, d], axis=2),
-        ]
-    ).reshape(-1, 3, 3)
+    halves = [np.stack(corners, axis=2) for corners in ([a, b, c], [a, c, d])]
+    return np.concatenate(halves).reshape(-1, 3, 3)

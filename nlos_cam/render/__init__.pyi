@@ -6,7 +6,6 @@ __all__ = [
     "STOPS",
     "Accuracy",
     "Agreement",
-    "DepthBound",
     "EchoMaps",
     "Effects",
     "Fault",
@@ -15,7 +14,6 @@ __all__ = [
     "HiddenObject",
     "Material",
     "MultiBounce",
-    "PoseFit",
     "Radiometry",
     "Rendering",
     "Scene",
@@ -55,7 +53,6 @@ __all__ = [
     "render_scan",
     "retroreflective",
     "ripples",
-    "sample_beams",
     "sensor_effects",
     "smooth_patches",
     "three_bounce",
@@ -72,7 +69,6 @@ from .accuracy_search import (
     choose,
     costs,
     least_seconds,
-    sample_beams,
 )
 from .backend_torch import device_named, histograms_of_all
 from .echoes import MultiBounce
@@ -80,9 +76,7 @@ from .effects import EFFECTS, Effects, included
 from .geometry import cast
 from .glossy import glossy_basis, histograms
 from .gradients import (
-    DepthBound,
     Gradients,
-    PoseFit,
     SceneVector,
     depth_bound,
     fit_pose,

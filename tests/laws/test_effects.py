@@ -123,10 +123,9 @@ def _left_out(scene: Scene, accuracy: Accuracy = COARSE) -> set[str]:
 @pytest.mark.parametrize("name", EFFECTS)
 def test_effect_called_for_changes_more_than_the_tolerance(implementation: Any, name: str) -> None:
     scene = CALLED_FOR[name]
+    # Path by path it is for a few patches only.
     if name == "inter-reflection" and implementation.name == "reference":
-        scene = replace(
-            scene, object_depth_m=_bowl()[3:6, 3:6]
-        )  # path by path it is for a few patches only
+        scene = replace(scene, object_depth_m=_bowl()[3:6, 3:6])
     accuracy = (
         replace(COARSE, relay_columns=3, relay_rows=3) if name == "inter-reflection" else COARSE
     )
@@ -151,9 +150,8 @@ def test_effect_not_called_for_changes_less_than_the_tolerance(
     assert name in left_out
     chosen = set(EFFECTS) - left_out
     forced = _with(implementation, scene, chosen | {name})
-    lit = bool(
-        chosen & {"direct", "three-bounce"}
-    )  # without either there is no light, and a rendering is refused
+    # Without either there is no light, and a rendering is refused.
+    lit = bool(chosen & {"direct", "three-bounce"})
     whole = _with(implementation, scene, chosen) if lit else np.zeros_like(forced)
     assert _change(forced, whole) <= COARSE.tolerance
 

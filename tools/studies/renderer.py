@@ -262,9 +262,8 @@ def soak_faults(seed: int) -> list[str]:
     shaken has it too.
     """
     generator = np.random.default_rng([seed, 20])
-    grid = ((8, 6), (24, 20))[
-        int(generator.random() < 0.2)
-    ]  # the finer one has more than one tile of relay cells
+    # The finer one has more than one tile of relay cells.
+    grid = ((8, 6), (24, 20))[int(generator.random() < 0.2)]
     accuracy = renderer.Accuracy(
         "soak",
         *grid,

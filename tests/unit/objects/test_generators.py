@@ -521,6 +521,5 @@ def test_prism_has_the_volume_of_its_frustum(taper: float) -> None:
         0,
     )
     area_z = 0.5 * np.abs(np.cross(b - a, c - a)[:, 2])
-    assert area_z.sum() == pytest.approx(
-        2 + 2 * taper**2 + 2 * (1 - taper**2)
-    )  # base, front, and sides seen along z
+    # Base, front, and sides seen along z.
+    assert area_z.sum() == pytest.approx(2 + 2 * taper**2 + 2 * (1 - taper**2))

@@ -116,9 +116,8 @@ def test_strongest_finds_the_two_highest_bins(histogram: np.ndarray) -> None:
     ordered = np.sort(histogram, axis=1)
     np.testing.assert_array_equal(found.peak, ordered[:, -1])
     np.testing.assert_array_equal(found.runner_up, ordered[:, -2])
-    expected = np.where(
-        found.peak > 0, (histogram.argmax(1) + 0.5) * BIN_M, np.nan
-    )  # the first of equals
+    # The first of equals.
+    expected = np.where(found.peak > 0, (histogram.argmax(1) + 0.5) * BIN_M, np.nan)
     np.testing.assert_allclose(found.path_m, expected, rtol=1e-6)
 
 
@@ -342,9 +341,8 @@ def test_joined_patches_move_light_by_less_than_a_bin(
     ).job
     joined = histograms(job).astype(np.float64)
     groups_of = beam_sums.groups_of
-    monkeypatch.setattr(
-        backend_numba, "groups_of", lambda surface, _: groups_of(surface, -1.0)
-    )  # each patch alone
+    # Each patch alone.
+    monkeypatch.setattr(backend_numba, "groups_of", lambda surface, _: groups_of(surface, -1.0))
     alone = histograms(job).astype(np.float64)
     below = [np.cumsum(each, axis=1) for each in (joined, alone)]
     weight = float((1 + beam_sums.JOIN_COSINE) * beam_sums.JOIN_WEIGHT) / job.accuracy.sub_bins

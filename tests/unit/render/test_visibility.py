@@ -228,43 +228,33 @@ def _hit(
     return float(found[0][0]) / length, float(found[1][0]), int(found[2][0]), int(found[3][0])
 
 
-def test_first_hits_meet_a_column_by_its_front_or_side() -> None:
-    depth = np.full((4, 4), np.nan)
-    depth[1, 2] = 0.5  # x in 0.5 to 0.75, y in 0.5 to 0.75
-    assert _hit(
-        depth,
-        [0.6, 0.6, 0.0],
-        [0.6, 0.6, 1.0],
-    ) == pytest.approx((0.5, 1.0, 1, 2))
-    assert _hit(
-        depth,
-        [0.0, 0.6, 0.8],
-        [1.0, 0.6, 0.8],
-    ) == pytest.approx((0.5, 1.0, 1, 2))
-    assert (
-        _hit(
-            depth,
-            [0.0, 0.6, 0.3],
-            [1.0, 0.6, 0.3],
-        )[0]
-        == np.inf
-    )  # between the object and the wall
-    assert (
-        _hit(
-            depth,
-            [0.0, 0.2, 0.8],
-            [1.0, 0.2, 0.8],
-        )[0]
-        == np.inf
-    )  # past it
-    assert (
-        _hit(
-            depth,
-            [0.0, 0.6, 0.8],
-            [0.4, 0.6, 0.8],
-        )[0]
-        == np.inf
-    )  # not so far
+COLUMN = np.full((4, 4), np.nan)
+COLUMN[1, 2] = 0.5  # x in 0.5 to 0.75, y in 0.5 to 0.75
+
+
+@pytest.mark.parametrize(
+    ("start", "end"),
+    [
+        ([0.6, 0.6, 0.0], [0.6, 0.6, 1.0]),
+        ([0.0, 0.6, 0.8], [1.0, 0.6, 0.8]),
+    ],
+    ids=["front", "side"],
+)
+def test_first_hits_meet_a_column(start: list[float], end: list[float]) -> None:
+    assert _hit(COLUMN, start, end) == pytest.approx((0.5, 1.0, 1, 2))
+
+
+@pytest.mark.parametrize(
+    ("start", "end"),
+    [
+        ([0.0, 0.6, 0.3], [1.0, 0.6, 0.3]),
+        ([0.0, 0.2, 0.8], [1.0, 0.2, 0.8]),
+        ([0.0, 0.6, 0.8], [0.4, 0.6, 0.8]),
+    ],
+    ids=["between object and wall", "past it", "not so far"],
+)
+def test_first_hits_miss_a_column(start: list[float], end: list[float]) -> None:
+    assert _hit(COLUMN, start, end)[0] == np.inf
 
 
 def test_sight_is_empty_in_the_paper_rig_and_refused_inside() -> None:
@@ -339,9 +329,8 @@ def test_form_factor_of_two_squares_follows_s2(lambertian: bool) -> None:
 
 
 def test_patch_to_patch_is_reciprocal_and_loses_energy(job: TransportJob) -> None:
-    table = interreflection.patch_to_patch(
-        job.patch_arrays, job.field, 1e-9, True
-    )  # beyond near contact
+    # Beyond near contact.
+    table = interreflection.patch_to_patch(job.patch_arrays, job.field, 1e-9, True)
     assert (table > 0).any()
     assert not np.diag(table).any()
     given = table / job.strength

@@ -196,9 +196,8 @@ def test_ir_changes_by_at_most_the_bound(
 
 def test_ir_bound_is_near_the_worst_case(monkeypatch: pytest.MonkeyPatch) -> None:
     noisy = QUIET.model_copy(update={"read_noise_counts": 2.0})
-    change, bound = _ir_change(
-        noisy, "read noise", 30.0, monkeypatch
-    )  # the same at 1 count, were it not cut at 0
+    # The same at 1 count, were it not cut at 0.
+    change, bound = _ir_change(noisy, "read noise", 30.0, monkeypatch)
     assert bound / 2 < change <= bound
     rough = QUIET.model_copy(update={"wall_texture": 0.2})
     change, bound = _ir_change(rough, "wall texture", 100.0, monkeypatch)
@@ -234,7 +233,6 @@ def test_bias_moves_depth_by_half_to_all_its_bound(
         without = _turned(model, name, 30.0, monkeypatch, celsius)
         return float(np.abs(seen.depth_z16.astype(float) - without.depth_z16).mean() * DEPTH_UNIT_M)
 
-    assert (
-        change_m(celsius) <= bound + DEPTH_UNIT_M / 20
-    )  # rounding to units adds to a mean of moduli
+    # Rounding to units adds to a mean of moduli.
+    assert change_m(celsius) <= bound + DEPTH_UNIT_M / 20
     assert change_m(WORST_AT.get(name, 45.0)) > bound / 2
