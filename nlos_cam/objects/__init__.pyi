@@ -3,7 +3,6 @@ __all__ = [
     "DEPTH_MAP_SUFFIX",
     "MESH_SUFFIXES",
     "OBJECTS_PER_CATEGORY",
-    "OBJECT_FILES",
     "TEXTURES",
     "BenchmarkObject",
     "Coat",
@@ -51,7 +50,7 @@ from .depth_map import (
 )
 from .generators import CATEGORIES, find_category
 from .generic import generic_depth
-from .loading import OBJECT_FILES, load_object, object_kind, without_absent
+from .loading import load_object, object_kind, without_absent
 from .meshes import (
     DEPTH_MAP_SUFFIX,
     MESH_SUFFIXES,

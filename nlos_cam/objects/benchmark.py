@@ -53,7 +53,17 @@ def unseen_objects(box: ObjectBox) -> list[BenchmarkObject]:
     every run.
     """
     rows = ((name, make, k) for name, make in KINDS.items() for k in range(OBJECTS_PER_CATEGORY))
-    return [_placed(name, k, {}, make(k), row, box) for row, (name, make, k) in enumerate(rows)]
+    return [
+        _placed(
+            name,
+            k,
+            {},
+            make(k),
+            row,
+            box,
+        )
+        for row, (name, make, k) in enumerate(rows)
+    ]
 
 
 def _object(name: str, k: int, box: ObjectBox) -> BenchmarkObject:

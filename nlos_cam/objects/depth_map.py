@@ -31,11 +31,16 @@ def image_from_depth(depth_m: NDArray[np.floating], box: ObjectBox) -> Float32:
     (near the wall).
     """
     v = MIN_V + (1 - MIN_V) * (box.z_far_m - depth_m) / (box.z_far_m - box.z_near_m)
-    return np.where(np.isnan(depth_m), 0.0, np.clip(v, MIN_V, 1.0)).astype(np.float32)
+    return np.where(
+        np.isnan(depth_m),
+        0.0,
+        np.clip(v, MIN_V, 1.0),
+    ).astype(np.float32)
 
 
 def depth_from_image(v: NDArray[np.floating], box: ObjectBox) -> Float32:
     """Return the depth in metres of an image v (..., 64, 64): NaN where v < 0.05."""
+    # v falls linearly from 1 at z_near to MIN_V at z_far, so the share of the depth is the inverse.
     share = np.clip((v - MIN_V) / (1 - MIN_V), 0.0, 1.0)
     depth_m = box.z_far_m - share * (box.z_far_m - box.z_near_m)
     return np.where(v < BACKGROUND_BELOW_V, np.nan, depth_m).astype(np.float32)
@@ -79,16 +84,32 @@ def _fill(
         area = (bx - ax) * (cy - ay) - (cx - ax) * (by - ay)
         if abs(area) < 1e-14:  # edge on: its projection has no area
             continue
-        j0 = max(int(np.ceil((min(ax, bx, cx) - x_m[0]) / pitch_x)), 0)
-        j1 = min(int(np.floor((max(ax, bx, cx) - x_m[0]) / pitch_x)), x_m.size - 1)
-        i0 = max(int(np.ceil((y_m[0] - max(ay, by, cy)) / pitch_y)), 0)
-        i1 = min(int(np.floor((y_m[0] - min(ay, by, cy)) / pitch_y)), y_m.size - 1)
+        j0 = max(
+            int(np.ceil((min(ax, bx, cx) - x_m[0]) / pitch_x)),
+            0,
+        )
+        j1 = min(
+            int(np.floor((max(ax, bx, cx) - x_m[0]) / pitch_x)),
+            x_m.size - 1,
+        )
+        i0 = max(
+            int(np.ceil((y_m[0] - max(ay, by, cy)) / pitch_y)),
+            0,
+        )
+        i1 = min(
+            int(np.floor((y_m[0] - min(ay, by, cy)) / pitch_y)),
+            y_m.size - 1,
+        )
+        # The depth buffer keeps the surface nearest the wall: the smallest z of all triangles.
         for i in range(i0, i1 + 1):
             for j in range(j0, j1 + 1):
                 u = ((bx - x_m[j]) * (cy - y_m[i]) - (cx - x_m[j]) * (by - y_m[i])) / area
                 v = ((cx - x_m[j]) * (ay - y_m[i]) - (ax - x_m[j]) * (cy - y_m[i])) / area
                 if u >= -EDGE and v >= -EDGE and u + v <= 1 + EDGE:
-                    depth[i, j] = min(depth[i, j], u * az + v * bz + (1 - u - v) * cz)
+                    depth[i, j] = min(
+                        depth[i, j],
+                        u * az + v * bz + (1 - u - v) * cz,
+                    )
     return depth
 
 
@@ -112,8 +133,17 @@ def share_outside(triangles_m: NDArray[np.float64], box: ObjectBox) -> float:
     points = triangles_m.reshape(-1, 3)
     (x0, y0, _) = points.min(0)
     (x1, y1, _) = points.max(0)
-    if min(x0 - box.x_min_m, box.x_max_m - x1, y0 - box.y_min_m, box.y_max_m - y1) >= -EDGE:
+    if (
+        min(
+            x0 - box.x_min_m,
+            box.x_max_m - x1,
+            y0 - box.y_min_m,
+            box.y_max_m - y1,
+        )
+        >= -EDGE
+    ):
         return 0.0
+    # The silhouette is counted on its own extent: what lies outside the box has no cell in it.
     around = box.model_copy(update={"x_min_m": x0, "x_max_m": x1, "y_min_m": y0, "y_max_m": y1})
     x_m, y_m = cell_centers_m(around, FINE_PIXELS)
     beside_x = (x_m < box.x_min_m) | (x_m > box.x_max_m)

@@ -48,16 +48,26 @@ class Setting:
         if self.held_out is None:
             return [(self.low, self.high)]
         gap_low, gap_high = self.held_out
-        pieces = (self.low, min(self.high, gap_low)), (max(self.low, gap_high), self.high)
+        pieces = (
+            (self.low, min(self.high, gap_low)),
+            (
+                max(self.low, gap_high),
+                self.high,
+            ),
+        )
         return [(low, high) for low, high in pieces if low < high]
 
     def draw(self, unit: float) -> float:
         """Return the value at `unit` in [0, 1] of the training intervals, joined end to end."""
+        # Uniform over the intervals joined end to end: past the first, the value skips the gap.
         pieces = self.training_intervals
         value = pieces[0][0] + sum(high - low for low, high in pieces) * unit
         if len(pieces) == 1 or value <= pieces[0][1]:
             return value
-        return max(pieces[1][0], value + (pieces[1][0] - pieces[0][1]))
+        return max(
+            pieces[1][0],
+            value + (pieces[1][0] - pieces[0][1]),
+        )
 
     def draw_held_out(self, unit: float) -> float:
         """Return the value at `unit` in ]0, 1[ of the held-out interval, or of the whole range if
@@ -84,7 +94,12 @@ class Category:
     def draw(self, units: Iterable[float]) -> dict[str, float]:
         """Return training settings from numbers in [0, 1], one for each."""
         return {
-            name: s.draw(unit) for (name, s), unit in zip(self.settings.items(), units, strict=True)
+            name: s.draw(unit)
+            for (name, s), unit in zip(
+                self.settings.items(),
+                units,
+                strict=True,
+            )
         }
 
     def draw_held_out(self, units: Iterable[float]) -> dict[str, float]:
@@ -122,9 +137,23 @@ def computer(width: float, height: float, neck: float, reach: float, tip: float)
     screen = joined(
         frame(width, height, 0.07, 0.18), at(box(width - 0.1, height - 0.1, 0.04), z=0.06)
     )
-    stand = joined(at(box(0.16, neck, 0.08), y=foot + neck / 2), at(box(0.4, 0.04, 0.26), y=foot))
-    keys = [at(box(width * 0.74, 0.06, 0.05), y=0.03, z=z) for z in (-0.09, 0.0, 0.09)]
-    keyboard = turned(joined(box(width * 0.8, 0.05, 0.3), *keys), (1, 0, 0), -15)
+    stand = joined(
+        at(box(0.16, neck, 0.08), y=foot + neck / 2),
+        at(box(0.4, 0.04, 0.26), y=foot),
+    )
+    keys = [
+        at(
+            box(width * 0.74, 0.06, 0.05),
+            y=0.03,
+            z=z,
+        )
+        for z in (-0.09, 0.0, 0.09)
+    ]
+    keyboard = turned(
+        joined(box(width * 0.8, 0.05, 0.3), *keys),
+        (1, 0, 0),
+        -15,
+    )
     return tipped(joined(screen, stand, at(keyboard, y=foot + 0.02, z=-reach)), tip)
 
 
@@ -141,15 +170,29 @@ def cupboard(width: float, depth: float, shelves: float, ajar: float, tip: float
     """
     leaf = width / 2 - 0.02
     rows = int(shelves)
-    case = joined(frame(width, 0.9, 0.05, depth), at(box(width, 0.9, 0.03), z=depth / 2))
+    case = joined(
+        frame(width, 0.9, 0.05, depth),
+        at(box(width, 0.9, 0.03), z=depth / 2),
+    )
     boards = [
-        at(box(width - 0.04, 0.04, depth * 0.85), y=0.9 * (k / rows - 0.5), z=0.03)
+        at(
+            box(width - 0.04, 0.04, depth * 0.85),
+            y=0.9 * (k / rows - 0.5),
+            z=0.03,
+        )
         for k in range(1, rows)
     ]
     middle = box(0.04, 0.9, depth)
-    door = joined(at(box(leaf, 0.88, 0.04), leaf / 2), at(knob(0.035, 0.05), leaf * 0.85, z=-0.05))
+    door = joined(
+        at(box(leaf, 0.88, 0.04), leaf / 2),
+        at(knob(0.035, 0.05), leaf * 0.85, z=-0.05),
+    )
     shut = at(door * (-1, 1, 1), width / 2, z=-depth / 2 - 0.02)
-    wide = at(turned(door, (0, 1, 0), ajar), -width / 2, z=-depth / 2 - 0.02)
+    wide = at(
+        turned(door, (0, 1, 0), ajar),
+        -width / 2,
+        z=-depth / 2 - 0.02,
+    )
     cornice = at(box(width + 0.08, 0.06, depth + 0.06), y=0.47)
     legs = _at_corners(box(0.08, 0.1, 0.08), width / 2 - 0.05, -0.5, depth / 3)
     return tipped(joined(case, *boards, middle, shut, wide, cornice, *legs), tip)
@@ -168,9 +211,18 @@ def oven(width: float, depth: float, window: float, knobs: float, tip: float) ->
     """
     front = -depth / 2
     count = int(knobs)
-    door = at(frame(width, 0.6, (0.6 - window) / 2, 0.14), y=-0.2, z=front + 0.07)
+    door = at(
+        frame(width, 0.6, (0.6 - window) / 2, 0.14),
+        y=-0.2,
+        z=front + 0.07,
+    )
     body = joined(
-        at(box(width, 0.6, depth - 0.14), y=-0.2, z=0.07), at(box(width, 0.26, depth), y=0.23)
+        at(
+            box(width, 0.6, depth - 0.14),
+            y=-0.2,
+            z=0.07,
+        ),
+        at(box(width, 0.26, depth), y=0.23),
     )
     dials = [
         at(disc(0.05, 0.1), width * ((k + 0.5) / count - 0.5), 0.23, front - 0.05)
@@ -193,14 +245,26 @@ def soundbox(width: float, depth: float, woofer: float, tweeter: float) -> Float
     low = _speaker(width, 0.6, woofer * width)
     high = _speaker(width, 0.4, tweeter * width)
     fronts = joined(at(low, y=-0.2), at(high, y=0.3))
-    return joined(at(fronts, z=-depth / 2), at(box(width, 1.0, depth - 0.28), z=0.14))
+    return joined(
+        at(fronts, z=-depth / 2),
+        at(box(width, 1.0, depth - 0.28), z=0.14),
+    )
 
 
 def _speaker(width: float, height: float, radius: float) -> Float64:
     """Return a front plate at z = 0, facing the wall, with a sunk cone, its rim and its cap."""
-    cone = turned(lathe([(radius, 0.0), (radius * 0.4, -0.25), (0, -0.25)]), (1, 0, 0), -90)
+    cone = turned(
+        lathe([(radius, 0.0), (radius * 0.4, -0.25), (0, -0.25)]),
+        (1, 0, 0),
+        -90,
+    )
     cap = at(knob(radius * 0.4, 0.1), z=0.25)
-    return joined(at(pierced(width, height, radius, 0.28), z=0.14), ring(radius, 0.03), cone, cap)
+    return joined(
+        at(pierced(width, height, radius, 0.28), z=0.14),
+        ring(radius, 0.03),
+        cone,
+        cap,
+    )
 
 
 @category(
@@ -212,7 +276,12 @@ def _speaker(width: float, height: float, radius: float) -> Float64:
 )
 def table(width: float, depth: float, leg: float, height: float, tip: float) -> Float64:
     """Build a table seen a little from above: top and four legs."""
-    legs = _at_corners(box(leg, height, leg), (width - leg) / 2, -height / 2, (depth - leg) / 2)
+    legs = _at_corners(
+        box(leg, height, leg),
+        (width - leg) / 2,
+        -height / 2,
+        (depth - leg) / 2,
+    )
     return tipped(joined(box(width, 0.09, depth), *legs), tip)
 
 
@@ -232,7 +301,11 @@ def birdhouse(width: float, height: float, depth: float, gable: float, hole: flo
     face = at(pierced(width, height, hole, sunk), 0, -0.1, front + sunk / 2)
     rim = at(ring(hole + 0.02, 0.03), 0, -0.1, front)
     roof = slab(
-        [(-0.62 * width - 0.06, eaves), (0.62 * width + 0.06, eaves), (0, eaves + gable)],
+        [
+            (-0.62 * width - 0.06, eaves),
+            (0.62 * width + 0.06, eaves),
+            (0, eaves + gable),
+        ],
         depth + 0.14,
     )
     perch = at(box(0.06, 0.06, 0.24), 0, -0.16 - hole, front - 0.1)
@@ -249,11 +322,23 @@ def tower(radius: float, flare: float, turn: float) -> Float64:
     head = radius * flare
     merlon = 0.45 * head
     shaft = lathe(
-        [(0, 0.35), (head, 0.35), (head, 0.22), (radius, 0.14), (radius * 1.1, -0.5), (0, -0.5)]
+        [
+            (0, 0.35),
+            (head, 0.35),
+            (head, 0.22),
+            (radius, 0.14),
+            (radius * 1.1, -0.5),
+            (0, -0.5),
+        ]
     )
     around = np.linspace(0, 2 * np.pi, 6, endpoint=False) + turn
     crown = [
-        at(box(merlon, 0.15, merlon), 0.85 * head * np.cos(a), 0.42, 0.85 * head * np.sin(a))
+        at(
+            box(merlon, 0.15, merlon),
+            0.85 * head * np.cos(a),
+            0.42,
+            0.85 * head * np.sin(a),
+        )
         for a in around
     ]
     return joined(shaft, *crown)
@@ -272,22 +357,50 @@ def baskets(bottom: float, height: float, handle: float, ribs: float, tip: float
     top = 0.44
     low = -height
     weave = [
-        (bottom + (top - bottom) * k / rows + (0.035 if k % 2 else 0.0), low + height * k / rows)
+        (
+            bottom + (top - bottom) * k / rows + (0.035 if k % 2 else 0.0),
+            low + height * k / rows,
+        )
         for k in range(rows + 1)
     ]
     hollow = [(top - 0.06, 0.0), (bottom - 0.06, low * 0.8), (0, low * 0.8)]
-    shell = lathe([(0, low), *weave, (top + 0.035, -0.02), (top + 0.035, 0.03), *hollow])
+    shell = lathe(
+        [
+            (0, low),
+            *weave,
+            (top + 0.035, -0.02),
+            (top + 0.035, 0.03),
+            *hollow,
+        ]
+    )
     return tipped(joined(shell, arch(top - 0.02, 0.04) * (1, handle, 1.4)), tip)
 
 
 @category(
-    rim=Setting(0.4, 0.52, held_out=(0.44, 0.475)), waist=Setting(0.2, 0.28, held_out=(0.23, 0.255))
+    rim=Setting(
+        0.4,
+        0.52,
+        held_out=(0.44, 0.475),
+    ),
+    waist=Setting(0.2, 0.28, held_out=(0.23, 0.255)),
 )
 def bell(rim: float, waist: float) -> Float64:
     """Build a bell with a flared rim, a crown and a clapper."""
     crown = [(0, 0.34), (waist * 0.7, 0.32), (waist, 0.2)]
-    shell = lathe([*crown, (waist * 1.1, -0.1), (rim * 0.8, -0.28), (rim, -0.4), (0, -0.4)])
-    return joined(shell, at(ring(0.1, 0.045), 0, 0.42), at(knob(0.09, 0.09), 0, -0.44))
+    shell = lathe(
+        [
+            *crown,
+            (waist * 1.1, -0.1),
+            (rim * 0.8, -0.28),
+            (rim, -0.4),
+            (0, -0.4),
+        ]
+    )
+    return joined(
+        shell,
+        at(ring(0.1, 0.045), 0, 0.42),
+        at(knob(0.09, 0.09), 0, -0.44),
+    )
 
 
 @category(
@@ -299,7 +412,12 @@ def bowl(depth: float, foot: float, tip: float) -> Float64:
     """Build a bowl tipped towards the wall, so that its hollow shows above its side and foot."""
     base = [(0, -depth - 0.06), (foot, -depth - 0.06), (foot, -depth)]
     outer = [*base, (0.38, -depth * 0.5), (0.47, -depth * 0.15), (0.5, 0)]
-    inner = [(0.44, 0), (0.33, -depth * 0.5), (0.14, -depth * 0.85), (0, -depth * 0.85)]
+    inner = [
+        (0.44, 0),
+        (0.33, -depth * 0.5),
+        (0.14, -depth * 0.85),
+        (0, -depth * 0.85),
+    ]
     return tipped(lathe(outer + inner), tip)
 
 
@@ -318,7 +436,13 @@ def cup(radius: float, taper: float, height: float, handle: float, tip: float) -
         (radius, height / 2),
         (radius - 0.06, height / 2),
     ]
-    body = lathe([*wall, (radius * taper - 0.06, 0.08 - height / 2), (0, 0.08 - height / 2)])
+    body = lathe(
+        [
+            *wall,
+            (radius * taper - 0.06, 0.08 - height / 2),
+            (0, 0.08 - height / 2),
+        ]
+    )
     return tipped(joined(body, at(ring(height * handle, 0.055), radius * 0.95)), tip)
 
 
@@ -336,7 +460,19 @@ def hat(crown: float, height: float, tip: float) -> Float64:
         (crown, height * 0.85),
     ]
     band = [(crown * 1.06, 0.2), (crown * 1.2, 0.2), (crown * 1.24, 0.06)]
-    return tipped(lathe([*top, *band, (0.42, 0.02), (0.5, 0.05), (0.5, 0.0), (0, -0.04)]), tip)
+    return tipped(
+        lathe(
+            [
+                *top,
+                *band,
+                (0.42, 0.02),
+                (0.5, 0.05),
+                (0.5, 0.0),
+                (0, -0.04),
+            ]
+        ),
+        tip,
+    )
 
 
 @category(
@@ -347,9 +483,27 @@ def hat(crown: float, height: float, tip: float) -> Float64:
 )
 def lamp(top: float, bottom: float, shade: float, foot: float) -> Float64:
     """Build a table lamp: foot, stem, shade."""
-    hood = lathe([(0, 0.5), (top, 0.5), (bottom, 0.5 - shade), (0, 0.5 - shade)])
+    hood = lathe(
+        [
+            (0, 0.5),
+            (top, 0.5),
+            (bottom, 0.5 - shade),
+            (0, 0.5 - shade),
+        ]
+    )
     stem = at(box(0.08, 0.6, 0.08), 0, -0.15)
-    return joined(hood, stem, lathe([(0, -0.4), (foot, -0.42), (0.3, -0.5), (0, -0.5)]))
+    return joined(
+        hood,
+        stem,
+        lathe(
+            [
+                (0, -0.4),
+                (foot, -0.42),
+                (0.3, -0.5),
+                (0, -0.5),
+            ]
+        ),
+    )
 
 
 @category(
@@ -364,12 +518,27 @@ def airplane(body: float, span: float, chord: float, sweep: float, tail: float) 
     fuselage = ellipsoid(body, 0.5, body)
     wings = [
         slab(
-            [(0, 0.1), (0, 0.1 - chord), (s * span, -0.05 - sweep), (s * span, 0.05 - sweep)], 0.05
+            [
+                (0, 0.1),
+                (0, 0.1 - chord),
+                (s * span, -0.05 - sweep),
+                (s * span, 0.05 - sweep),
+            ],
+            0.05,
         )
         for s in SIDES
     ]
     tails = [
-        slab([(0, -0.34), (0, -0.48), (s * tail, -0.5), (s * tail, -0.42)], 0.05) for s in SIDES
+        slab(
+            [
+                (0, -0.34),
+                (0, -0.48),
+                (s * tail, -0.5),
+                (s * tail, -0.42),
+            ],
+            0.05,
+        )
+        for s in SIDES
     ]
     fin = at(box(0.05, 0.14, 0.18), 0, -0.42, -0.1)
     return joined(fuselage, *wings, *tails, fin)
@@ -383,10 +552,23 @@ def airplane(body: float, span: float, chord: float, sweep: float, tail: float) 
 )
 def boat(beam: float, sail: float, lead: float, lag: float) -> Float64:
     """Build a boat from the side: hull, mast and two triangular sails."""
-    hull = slab([(-0.48, -0.2), (0.5, -0.2), (0.3, -0.45), (-0.32, -0.45)], 2 * beam)
+    hull = slab(
+        [
+            (-0.48, -0.2),
+            (0.5, -0.2),
+            (0.3, -0.45),
+            (-0.32, -0.45),
+        ],
+        2 * beam,
+    )
     mast = at(box(0.06, sail + 0.1, 0.06), 0, sail / 2 - 0.22)
     jib = slab([(0.0, sail - 0.2), (0.0, -0.12), (lead, -0.12)], 0.06)
-    return joined(hull, mast, jib, slab([(0.0, sail - 0.25), (0.0, -0.12), (-lag, -0.12)], 0.06))
+    return joined(
+        hull,
+        mast,
+        jib,
+        slab([(0.0, sail - 0.25), (0.0, -0.12), (-lag, -0.12)], 0.06),
+    )
 
 
 @category(
@@ -401,15 +583,36 @@ def car(
     height: float, wheel: float, width: float, front: float, back: float, cabin: float
 ) -> Float64:
     """Build a car from the side: body, cabin with recessed windows, two wheels."""
-    body = slab([(-0.5, -0.08), (-0.5, 0.04), (0.44, 0.04), (0.5, -0.02), (0.5, -0.08)], 2 * width)
+    body = slab(
+        [
+            (-0.5, -0.08),
+            (-0.5, 0.04),
+            (0.44, 0.04),
+            (0.5, -0.02),
+            (0.5, -0.08),
+        ],
+        2 * width,
+    )
     sill = at(box(1.0, height - 0.06, 2 * width), 0, -0.08 - (height - 0.06) / 2)
     top = 0.04 + cabin
     lean = 0.12
     glass = slab(
-        [(-back, 0.04), (front, 0.04), (front - lean, top), (lean / 2 - back, top)], 1.2 * width
+        [
+            (-back, 0.04),
+            (front, 0.04),
+            (front - lean, top),
+            (lean / 2 - back, top),
+        ],
+        1.2 * width,
     )
     roof = bar(
-        (lean / 2 - back - 0.01, top - 0.02), (front - lean + 0.01, top - 0.02), 0.05, 1.8 * width
+        (
+            lean / 2 - back - 0.01,
+            top - 0.02,
+        ),
+        (front - lean + 0.01, top - 0.02),
+        0.05,
+        1.8 * width,
     )
     middle = (front - back) / 2
     pillars = [
@@ -421,8 +624,24 @@ def car(
         )
     ]
     bottom = -0.02 - height
-    wheels = [at(disc(wheel, 0.12), x, bottom, -width - 0.02) for x in (-0.29, 0.29)]
-    hubs = [at(disc(wheel * 0.45, 0.06), x, bottom, -width - 0.09) for x in (-0.29, 0.29)]
+    wheels = [
+        at(
+            disc(wheel, 0.12),
+            x,
+            bottom,
+            -width - 0.02,
+        )
+        for x in (-0.29, 0.29)
+    ]
+    hubs = [
+        at(
+            disc(wheel * 0.45, 0.06),
+            x,
+            bottom,
+            -width - 0.09,
+        )
+        for x in (-0.29, 0.29)
+    ]
     return joined(body, sill, glass, roof, *pillars, *wheels, *hubs)
 
 
@@ -442,20 +661,61 @@ def motorcycle(
     """
     axle = -0.22
     head = base - rake
-    wheels = [at(joined(ring(wheel, tyre), disc(0.05, 0.14)), s * base, axle) for s in SIDES]
-    guards = [at(arch(wheel + 0.05, 0.03, 150), s * base, axle) * (1, 1, 2) for s in SIDES]
-    fork = [at(bar((base, axle), (head, 0.16), 0.05, 0.05), z=z) for z in (-0.09, 0.09)]
+    wheels = [
+        at(
+            joined(ring(wheel, tyre), disc(0.05, 0.14)),
+            s * base,
+            axle,
+        )
+        for s in SIDES
+    ]
+    guards = [
+        at(
+            arch(wheel + 0.05, 0.03, 150),
+            s * base,
+            axle,
+        )
+        * (1, 1, 2)
+        for s in SIDES
+    ]
+    fork = [
+        at(
+            bar((base, axle), (head, 0.16), 0.05, 0.05),
+            z=z,
+        )
+        for z in (-0.09, 0.09)
+    ]
     handle = at(
-        joined(box(0.05, 0.05, 2 * bars), bar((0, 0), (-0.12, 0.04), 0.04, 0.3)), head, 0.18
+        joined(
+            box(0.05, 0.05, 2 * bars),
+            bar((0, 0), (-0.12, 0.04), 0.04, 0.3),
+        ),
+        head,
+        0.18,
     )
     lamp = at(knob(0.06, 0.08), head + 0.06, 0.1)
     frame = [
         bar((-base, axle), (0.02, -0.16), 0.05, 0.16),
         bar((-0.1, -0.2), (head, 0.08), 0.06, 0.08),
     ]
-    engine = joined(at(box(0.22, 0.17, 0.2), -0.01, -0.17), at(disc(0.07, 0.3), 0.0, -0.17))
-    seat = slab([(-0.4, 0.08), (-0.36, 0.0), (0.0, -0.02), (0.0, 0.05), (-0.24, 0.05)], 0.2)
-    exhaust = at(bar((0.02, -0.25), (-base - 0.14, -0.2), 0.055, 0.06), z=-0.14)
+    engine = joined(
+        at(box(0.22, 0.17, 0.2), -0.01, -0.17),
+        at(disc(0.07, 0.3), 0.0, -0.17),
+    )
+    seat = slab(
+        [
+            (-0.4, 0.08),
+            (-0.36, 0.0),
+            (0.0, -0.02),
+            (0.0, 0.05),
+            (-0.24, 0.05),
+        ],
+        0.2,
+    )
+    exhaust = at(
+        bar((0.02, -0.25), (-base - 0.14, -0.2), 0.055, 0.06),
+        z=-0.14,
+    )
     body = at(ellipsoid(tank, 0.085, 0.12), 0.04, 0.06)
     return joined(*wheels, *guards, *fork, handle, lamp, *frame, engine, seat, exhaust, body)
 
@@ -468,7 +728,14 @@ def motorcycle(
 def rocket(radius: float, nose: float, fin: float) -> Float64:
     """Build a rocket: nose cone, body with a porthole, fins."""
     tip = [(0, 0.5), (radius * 0.6, 0.5 - nose * 0.5), (radius, 0.5 - nose)]
-    body = lathe([*tip, (radius, -0.4), (radius * 0.6, -0.5), (0, -0.5)])
+    body = lathe(
+        [
+            *tip,
+            (radius, -0.4),
+            (radius * 0.6, -0.5),
+            (0, -0.5),
+        ]
+    )
     root = radius * 0.8
     fins = [
         slab(

@@ -48,6 +48,7 @@ def _solid(generator: Generator) -> Float64:
     """Return a box, an ellipsoid, a frustum (from cylinder to cone) or a torus in any
     orientation.
     """
+    # Four kinds of faces: flat, round, conical, and with a hole.
     a, b, c = generator.uniform(0.12, 0.5, 3).tolist()
     kind = int(generator.integers(4))
     if kind == 0:
@@ -55,7 +56,14 @@ def _solid(generator: Generator) -> Float64:
     elif kind == 1:
         solid = ellipsoid(a, b, c)
     elif kind == 2:
-        solid = lathe([(0, -b), (a, -b), (a * generator.random(), b), (0, b)])
+        solid = lathe(
+            [
+                (0, -b),
+                (a, -b),
+                (a * generator.random(), b),
+                (0, b),
+            ]
+        )
     else:
         solid = ring(a, a * generator.uniform(0.2, 0.5))
     return solid @ _turn(generator).T
@@ -64,16 +72,32 @@ def _solid(generator: Generator) -> Float64:
 def solids(generator: Generator) -> Float64:
     """Build a union of one to four overlapping solids."""
     count = int(generator.integers(1, 5))
-    return joined(*(at(_solid(generator), *generator.uniform(-0.4, 0.4, 3)) for _ in range(count)))
+    return joined(
+        *(
+            at(
+                _solid(generator),
+                *generator.uniform(-0.4, 0.4, 3),
+            )
+            for _ in range(count)
+        )
+    )
 
 
 def _outline(generator: Generator) -> Float64:
     """Return a star-shaped polygon (n, 2) about the origin: with straight edges, or smooth."""
     if generator.random() < 0.5:
-        angle = np.sort(generator.uniform(0, 2 * np.pi, int(generator.integers(4, 13))))
+        angle = np.sort(
+            generator.uniform(
+                0,
+                2 * np.pi,
+                int(generator.integers(4, 13)),
+            )
+        )
         radius = generator.uniform(0.15, 0.5, angle.size)
     else:
         angle = np.linspace(0, 2 * np.pi, 48, endpoint=False)
+        # A Fourier series whose amplitudes fall with 1 / order is smooth; its exponential is
+        # positive.
         order = np.arange(1, 7)[:, None]
         waves = (
             generator.standard_normal((6, 1))
@@ -104,7 +128,12 @@ def strokes(generator: Generator) -> Float64:
         path = [point]
         for _ in range(int(generator.integers(2, 9))):
             heading += generator.choice([bend, generator.normal(0, 1.2)])
-            step = generator.uniform(0.12, 0.5) * np.array([np.cos(heading), np.sin(heading)])
+            step = generator.uniform(0.12, 0.5) * np.array(
+                [
+                    np.cos(heading),
+                    np.sin(heading),
+                ]
+            )
             path.append(np.clip(path[-1] + step, -0.7, 0.7) + 1e-6 * step)
         points = [(float(x), float(y)) for x, y in path]
         parts += [bar(a, b, width, thickness) for a, b in pairwise(points)]
@@ -116,13 +145,23 @@ def profiles(generator: Generator) -> Float64:
     """Build a surface of revolution in any orientation, solid or hollow, often standing or
     tipped.
     """
+    # Points from bottom to top; the profile closes on the axis, or along an inner side.
     count = int(generator.integers(3, 9))
     height = np.sort(generator.uniform(-0.5, 0.5, count))
     radius = generator.uniform(0.1, 0.5, count)
     if generator.random() < 0.5:
         radius = np.convolve(np.pad(radius, 1, mode="edge"), [0.25, 0.5, 0.25], "valid")
-    outer = [(0.0, float(height[0])), *zip(radius.tolist(), height.tolist(), strict=True)]
-    inner = [(max(r - 0.06, 0.02), max(h, height[0] + 0.06)) for r, h in outer[:0:-1]]
+    outer = [
+        (0.0, float(height[0])),
+        *zip(radius.tolist(), height.tolist(), strict=True),
+    ]
+    inner = [
+        (
+            max(r - 0.06, 0.02),
+            max(h, height[0] + 0.06),
+        )
+        for r, h in outer[:0:-1]
+    ]
     closed = (
         [*inner, (0.0, height[0] + 0.06)]
         if generator.random() < 0.5
@@ -138,13 +177,20 @@ def _tip(generator: Generator) -> Float64:
     angle = np.radians(generator.uniform(-50, 50))
     cos = np.cos(angle)
     sin = np.sin(angle)
-    return np.array([[1, 0, 0], [0, cos, -sin], [0, sin, cos]])
+    return np.array(
+        [
+            [1, 0, 0],
+            [0, cos, -sin],
+            [0, sin, cos],
+        ]
+    )
 
 
 def blobs(generator: Generator) -> Float64:
     """Build a smooth closed surface: a sphere whose radius follows random waves."""
     sphere = ellipsoid(0.5, 0.5, 0.5)
     waves = generator.normal(0, generator.uniform(2, 9), (6, 3))
+    # Plane waves of random direction and length over the sphere, in the logarithm of the radius.
     grows = np.sin(sphere @ waves.T + generator.uniform(0, 2 * np.pi, 6)) @ generator.uniform(
         0.05, 0.35, 6
     )
@@ -169,7 +215,10 @@ def plates(generator: Generator) -> Float64:
         axis = np.array([*generator.standard_normal(2), 0.0])
         lean = np.asarray(rotation_matrix(generator.uniform(0, 1.05), axis))[:3, :3]
         parts.append(
-            at(kinds[int(generator.integers(3))] @ lean.T, *generator.uniform(-0.4, 0.4, 3))
+            at(
+                kinds[int(generator.integers(3))] @ lean.T,
+                *generator.uniform(-0.4, 0.4, 3),
+            )
         )
     return joined(*parts)
 
@@ -209,6 +258,7 @@ def generic_depth(seed: int, box: ObjectBox) -> tuple[str, Float32]:
     """Return one generic shape, by the seed alone: its family and its depth map (64, 64) in metres,
     NaN background.
     """
+    # The 1 keeps these streams apart from those of `object_depth`.
     generator = np.random.default_rng([seed, OBJECT_PIXELS, 1])
     while True:
         names = generator.choice(list(FAMILIES), 2)
@@ -251,6 +301,8 @@ def _carve(generator: Generator, triangles: Float64, box: ObjectBox) -> Float32:
     """Return the depth map of a placed body less up to three solids: where one covers the front,
     its back shows.
     """
+    # Per cell the body is an interval of depth. A cutter that covers its front leaves the part
+    # behind the cutter, or nothing.
     front_m, back_m = _interval(triangles, box)
     points = triangles.reshape(-1, 3)
     size_m = np.ptp(triangles.reshape(-1, 3)[:, :2], axis=0).max()
@@ -261,7 +313,11 @@ def _carve(generator: Generator, triangles: Float64, box: ObjectBox) -> Float32:
         )
         from_m, to_m = _interval(cutter, box)
         cut = (from_m <= front_m) & (front_m < to_m)  # false where either is NaN
-        front_m = np.where(cut, np.where(to_m < back_m, to_m, np.nan), front_m).astype(np.float32)
+        front_m = np.where(
+            cut,
+            np.where(to_m < back_m, to_m, np.nan),
+            front_m,
+        ).astype(np.float32)
     return front_m
 
 

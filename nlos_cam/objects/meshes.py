@@ -113,10 +113,9 @@ def _with_absolute_indices(text: bytes) -> bytes:
     return b"\n".join(lines)
 
 
+# Before the first vertex: 0, which is refused.
 def _absolute_index(vertices: int, relative: re.Match[bytes]) -> bytes:
-    return b" %d" % max(
-        vertices + 1 - int(relative[1]), 0
-    )  # before the first vertex: 0, which is refused
+    return b" %d" % max(vertices + 1 - int(relative[1]), 0)
 
 
 MESH_SUFFIXES = (".obj", ".stl", ".ply")
@@ -186,10 +185,9 @@ def read_depth_map(path: Path) -> Float32:
 
     Raises SceneFileError where the file holds anything else.
     """
+    # No pickles; a huge shape in the header costs nothing.
     with _readable(path, "depth map", "save one with numpy.save(file, depth_m)"):
-        stored = np.lib.format.open_memmap(
-            path, mode="r"
-        )  # no pickles; a huge shape in the header costs nothing
+        stored = np.lib.format.open_memmap(path, mode="r")
     if stored.dtype.kind not in "fiu":
         raise SceneFileError(
             f"{path} holds {stored.dtype} values: a depth map holds real numbers, in metres"
@@ -223,9 +221,8 @@ def _readable(path: Path, kind: str, advice: str) -> Generator[None]:
             f"{path} cannot be read as a {kind}: {error.strerror or error}"
         ) from error
     except Exception as error:
-        problem = (
-            f" ({error})" if isinstance(error, _MeshProblemError) else ""
-        )  # a parser's own words would not help
+        # A parser's own words would not help.
+        problem = f" ({error})" if isinstance(error, _MeshProblemError) else ""
         raise SceneFileError(f"{path} is damaged or not a {kind}{problem}: {advice}") from error
 
 
@@ -296,7 +293,10 @@ def _problem(triangles: Float64) -> str:
             " again"
         )
     extent = np.ptp(triangles.reshape(-1, 3), axis=0).max()
-    normals = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
+    normals = np.cross(
+        triangles[:, 1] - triangles[:, 0],
+        triangles[:, 2] - triangles[:, 0],
+    )
     if not np.abs(normals).max() > 1e-12 * extent**2:
         return "has no face with an area: it is a point or a line; export a surface or a solid"
     return ""

@@ -52,6 +52,7 @@ def post(depth_m: Float32, generator: np.random.Generator) -> Float32:
     """Return a flat post (rows, columns) from the object's underside to the bottom of the box, NaN
     elsewhere.
     """
+    # Below a column's lowest surface: no surface in it from the bottom up to there.
     surface = ~np.isnan(depth_m)
     columns = np.flatnonzero(surface.any(axis=0))
     width = max(2, round(generator.uniform(0.1, 0.35) * len(columns)))
@@ -65,6 +66,7 @@ def panel(depth_m: Float32, box: ObjectBox, generator: np.random.Generator) -> F
     """Return a panel (rows, columns) behind the object, parallel to the wall, over 60 to 100 % of
     the box's sides.
     """
+    # Behind the whole object, so that the panel never hides a part of it.
     z_m = generator.uniform(np.nanmax(depth_m), box.z_far_m)
     rows, columns = (
         np.abs((np.arange(cells) + 0.5) / cells - 0.5) <= generator.uniform(0.6, 1.0) / 2
@@ -77,9 +79,8 @@ def add_background(depth_m: Float32, box: ObjectBox, generator: np.random.Genera
     """Return an object's depth map (rows, columns) with a random post or panel where it has no
     surface.
     """
-    behind = (
-        post(depth_m, generator) if generator.random() < 0.5 else panel(depth_m, box, generator)
-    )
+    stands = generator.random() < 0.5
+    behind = post(depth_m, generator) if stands else panel(depth_m, box, generator)
     return np.where(np.isnan(depth_m), behind, depth_m)
 
 
@@ -106,7 +107,11 @@ def place(triangles: Float64, pose: Pose, box: ObjectBox) -> Float64:
     where front_m lies behind the box.
     """
     points = _turn_and_scale(triangles, pose)
-    points[:, 2] *= min(1.0, _room_m(pose, box) / max(np.ptp(points[:, 2]), 1e-9))
+    # Flattened along z only: what the wall sees of the outline stays.
+    points[:, 2] *= min(
+        1.0,
+        _room_m(pose, box) / max(np.ptp(points[:, 2]), 1e-9),
+    )
     middle_x = (box.x_min_m + box.x_max_m) / 2
     middle_y = (box.y_min_m + box.y_max_m) / 2
     points += (
@@ -130,9 +135,11 @@ def _turn_and_scale(triangles: Float64, pose: Pose) -> Float64:
     """Return the corners (3 n, 3), turned and scaled about their middle."""
     from trimesh.transformations import euler_matrix
 
+    # x, then y, then z about fixed axes: the matrix is Rz Ry Rx.
     turn = euler_matrix(pose.tilt_x_rad, pose.tilt_y_rad, pose.turn_z_rad)[:3, :3]
     points = triangles.reshape(-1, 3) @ turn.T
     points = points - (points.min(0) + points.max(0)) / 2
+    # Depth does not count: size is what the wall sees.
     points *= pose.size_m / np.ptp(points[:, :2], axis=0).max()
     return points
 
@@ -157,6 +164,7 @@ def pose_from_units(units: Sequence[float], box: ObjectBox) -> Pose:
     size, tilt_x, tilt_y, turn_z, right, up, front = units
     width_m = box_width_m(box)
     size_m = width_m * (0.55 + 0.35 * size)
+    # Offsets within half of what the object leaves free: it stays inside the box.
     spare_m = (width_m - size_m) / 2
     return Pose(
         tilt_x_rad=radians(30 * tilt_x - 15),
@@ -196,10 +204,11 @@ def object_depth(
     ]
     if not names:
         raise SceneError(f"no object category is left: choose from {', '.join(CATEGORIES)}")
+    # The order of draws is part of the data sets: category, shape, pose, and background last.
     generator = np.random.default_rng([seed, OBJECT_PIXELS])
     category = str(generator.choice(names))
     triangles = category_triangles(category, int(generator.integers(2**31)))
     depth_m = orthographic_depth(place(triangles, random_pose(generator, box), box), box)
-    return category, (
-        add_background(depth_m, box, generator) if generator.random() < backgrounds else depth_m
-    )
+    if generator.random() < backgrounds:
+        depth_m = add_background(depth_m, box, generator)
+    return category, depth_m

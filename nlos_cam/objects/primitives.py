@@ -62,6 +62,7 @@ def knob(radius: float, reach: float) -> Float64:
 
 def lathe(profile: Sequence[Point]) -> Float64:
     """Return the solid that a profile of (radius, height) sweeps about the y axis."""
+    # The last section is the first again: the grid closes on itself.
     angle = np.linspace(0, 2 * np.pi, SECTIONS + 1)[:, None]
     radius, height = np.asarray(profile, float).T
     return _grid_surface(
@@ -74,7 +75,18 @@ def lathe(profile: Sequence[Point]) -> Float64:
 def disc(radius: float, thickness: float) -> Float64:
     """Return a disc centred on the origin that faces the wall."""
     half = thickness / 2
-    return turned(lathe([(0, -half), (radius, -half), (radius, half), (0, half)]), (1, 0, 0), -90)
+    return turned(
+        lathe(
+            [
+                (0, -half),
+                (radius, -half),
+                (radius, half),
+                (0, half),
+            ]
+        ),
+        (1, 0, 0),
+        -90,
+    )
 
 
 def ring(radius: float, tube: float) -> Float64:
@@ -84,6 +96,7 @@ def ring(radius: float, tube: float) -> Float64:
 
 def arch(radius: float, tube: float, angle_deg: float = 180.0) -> Float64:
     """Return part of a torus in the x-y plane, from the +x axis on, counter-clockwise with y up."""
+    # Torus: a circle of radius `tube` at the distance `radius` from the axis z.
     along = np.linspace(0, np.radians(angle_deg), SECTIONS + 1)[:, None]
     around = np.linspace(0, 2 * np.pi, 13)
     distance = radius + tube * np.cos(around)
@@ -93,6 +106,7 @@ def arch(radius: float, tube: float, angle_deg: float = 180.0) -> Float64:
 
 def slab(corners: Sequence[Point], thickness: float) -> Float64:
     """Return a convex polygon of (x, y) corners with a thickness along z."""
+    # Front and back are fans of triangles from corner 0, the sides two triangles an edge.
     outline: NDArray[np.float64] = np.asarray(corners, float)
     n = len(outline)
     front = np.column_stack([outline, np.full(n, -thickness / 2)])
@@ -109,26 +123,51 @@ def prism(outline: NDArray[np.float64], thickness: float, taper: float = 1.0) ->
     """Return a star-shaped polygon (n, 2) about the origin with a thickness along z; its front is
     `taper` as wide.
     """
+    # Star-shaped: each edge forms a triangle with the middle that lies inside.
     a = outline
     b = np.roll(outline, -1, axis=0)
     middle = np.zeros_like(a)
     half = thickness / 2
     near = [
-        np.pad(taper * points, ((0, 0), (0, 1)), constant_values=-half) for points in (a, b, middle)
+        np.pad(
+            taper * points,
+            ((0, 0), (0, 1)),
+            constant_values=-half,
+        )
+        for points in (a, b, middle)
     ]
-    far = [np.pad(points, ((0, 0), (0, 1)), constant_values=half) for points in (a, b, middle)]
-    sides = [[near[0], near[1], far[1]], [near[0], far[1], far[0]]]
+    far = [
+        np.pad(
+            points,
+            ((0, 0), (0, 1)),
+            constant_values=half,
+        )
+        for points in (a, b, middle)
+    ]
+    sides = [
+        [near[0], near[1], far[1]],
+        [near[0], far[1], far[0]],
+    ]
     return np.concatenate([np.stack(corners, axis=1) for corners in (near, far, *sides)])
 
 
 def bar(start: Point, end: Point, width: float, thickness: float) -> Float64:
     """Return a straight bar in the x-y plane from one point to another."""
-    (x0, y0) = start
-    (x1, y1) = end
+    # (u, v) is the normal of the bar with half its width as length.
+    x0, y0 = start
+    x1, y1 = end
     share = width / 2 / np.hypot(x1 - x0, y1 - y0)
     u = (y0 - y1) * share
     v = (x1 - x0) * share
-    return slab([(x0 - u, y0 - v), (x0 + u, y0 + v), (x1 + u, y1 + v), (x1 - u, y1 - v)], thickness)
+    return slab(
+        [
+            (x0 - u, y0 - v),
+            (x0 + u, y0 + v),
+            (x1 + u, y1 + v),
+            (x1 - u, y1 - v),
+        ],
+        thickness,
+    )
 
 
 def pierced(width: float, height: float, hole: float, thickness: float) -> Float64:
@@ -143,7 +182,13 @@ def pierced(width: float, height: float, hole: float, thickness: float) -> Float
     corners = np.array([[x, y] for x in (-1, 1) for y in (-1, 1)]) * (width / 2, height / 2)
     for corner in corners:  # snap the nearest ray to the corner, which would otherwise be cut off
         edge[np.linalg.norm(edge - corner, axis=1).argmin()] = corner
-    loops = [(hole * circle, -1), (edge, -1), (edge, 1), (hole * circle, 1), (hole * circle, -1)]
+    loops = [
+        (hole * circle, -1),
+        (edge, -1),
+        (edge, 1),
+        (hole * circle, 1),
+        (hole * circle, -1),
+    ]
     rings = [
         np.column_stack([loop, np.full(len(loop), side * thickness / 2)]) for loop, side in loops
     ]
@@ -154,11 +199,17 @@ def frame(width: float, height: float, border: float, thickness: float) -> Float
     """Return a rectangular frame centred on the origin that faces the wall; its border lies
     inside.
     """
+    # Rails over the whole width, posts over the whole height: they overlap in the corners.
     rail = box(width, border, thickness)
     post = box(border, height, thickness)
     up = (height - border) / 2
     aside = (width - border) / 2
-    return joined(at(rail, y=up), at(rail, y=-up), at(post, aside), at(post, -aside))
+    return joined(
+        at(rail, y=up),
+        at(rail, y=-up),
+        at(post, aside),
+        at(post, -aside),
+    )
 
 
 @cache
@@ -179,10 +230,10 @@ def _grid_surface(points: NDArray[np.float64]) -> Float64:
     """Return the surface through a grid of points (rows, columns, 3): two triangles per grid
     cell.
     """
+    # Corners of each cell in turn a, b, c, d; its diagonal is a c.
     a = points[:-1, :-1]
     b = points[1:, :-1]
     c = points[1:, 1:]
     d = points[:-1, 1:]
-    return np.concatenate([np.stack([a, b, c], axis=2), np.stack([a, c, d], axis=2)]).reshape(
-        -1, 3, 3
-    )
+    halves = [np.stack(corners, axis=2) for corners in ([a, b, c], [a, c, d])]
+    return np.concatenate(halves).reshape(-1, 3, 3)

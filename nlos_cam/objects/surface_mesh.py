@@ -81,23 +81,36 @@ def mesh_from_depth(
     cells' centres, is the depth map.
     """
     x_m, y_m = cell_centers_m(box, len(depth_m))
-    points_m = np.stack([*np.meshgrid(x_m, y_m), depth_m], axis=-1, dtype=np.float64).reshape(-1, 3)
+    points_m = np.stack(
+        [*np.meshgrid(x_m, y_m), depth_m],
+        axis=-1,
+        dtype=np.float64,
+    ).reshape(-1, 3)
     faces = _faces(depth_m, jump_m)
+    # Vertices: first the cells that triangles use, then four for each cell that none uses.
     alone = np.setdiff1d(np.flatnonzero(np.isfinite(depth_m)), faces)
     used = np.unique(faces)
     half_x_m = 0.5 * (x_m[1] - x_m[0])
     half_y_m = 0.5 * (y_m[0] - y_m[1])
-    corners_m = np.array(
-        [[-half_x_m, half_y_m, 0], [half_x_m, half_y_m, 0], [-half_x_m, -half_y_m, 0]]
-    )
-    corners_m = np.vstack([corners_m, [half_x_m, -half_y_m, 0]])
-    squares = (
-        len(used) + 4 * np.arange(len(alone))[:, None, None] + np.array([[0, 1, 2], [1, 3, 2]])
-    )
+    # Corners of a lone cell's square, row by row, and its two triangles.
+    corners_m = np.array([[-1, 1, 0], [1, 1, 0], [-1, -1, 0], [1, -1, 0]])
+    corners_m = corners_m * (half_x_m, half_y_m, 0.0)
+    first = len(used) + 4 * np.arange(len(alone))
+    squares = first[:, None, None] + np.array([[0, 1, 2], [1, 3, 2]])
     cells = np.concatenate([used, np.repeat(alone, 4)])
     return SurfaceMesh(
-        np.concatenate([points_m[used], (points_m[alone, None] + corners_m).reshape(-1, 3)]),
-        np.concatenate([np.searchsorted(used, faces), squares.reshape(-1, 3)]).astype(np.int64),
+        np.concatenate(
+            [
+                points_m[used],
+                (points_m[alone, None] + corners_m).reshape(-1, 3),
+            ]
+        ),
+        np.concatenate(
+            [
+                np.searchsorted(used, faces),
+                squares.reshape(-1, 3),
+            ]
+        ).astype(np.int64),
         None if uncertainty_m is None else uncertainty_m.reshape(-1)[cells].astype(np.float32),
     )
 
@@ -110,14 +123,24 @@ def _faces(depth_m: Float32, jump_m: float) -> Int64:
     z_m = depth_m.reshape(-1)
     a, b, c, d = (
         part.reshape(-1)
-        for part in (index[:-1, :-1], index[:-1, 1:], index[1:, :-1], index[1:, 1:])
+        for part in (
+            index[:-1, :-1],
+            index[:-1, 1:],
+            index[1:, :-1],
+            index[1:, 1:],
+        )
     )
     # Of four neighbours (a b / c d) the diagonal with the smaller step of depth is an edge. One
     # through a background cell counts as an infinite step, so that the triangle of the other three
     # cells remains.
     down, up = (
-        np.nan_to_num(np.abs(z_m[one] - z_m[other]), nan=np.inf) for one, other in ((a, d), (b, c))
+        np.nan_to_num(
+            np.abs(z_m[one] - z_m[other]),
+            nan=np.inf,
+        )
+        for one, other in ((a, d), (b, c))
     )
+    # All clockwise seen from the room, so that the lit side faces the wall.
     first = np.where(down < up, [a, b, d], [a, b, c])
     second = np.where(down < up, [a, d, c], [b, d, c])
     faces = np.concatenate([first.T, second.T])
@@ -148,11 +171,18 @@ def _colors(mesh: SurfaceMesh) -> Any:
         return np.full((len(mesh.vertices_m), 4), NEUTRAL, np.uint8)
     import cv2
 
+    # An unknown error is drawn like a large one.
     share = np.clip(np.nan_to_num(mesh.uncertainty_m, nan=np.inf) / MAX_UNCERTAINTY_M, 0.0, 1.0)
-    bgr = cv2.applyColorMap(np.rint(255 * share).astype(np.uint8)[:, None], cv2.COLORMAP_VIRIDIS)[
-        :, 0
-    ]
-    return np.column_stack([bgr[:, ::-1], np.full(len(bgr), 255, np.uint8)])
+    bgr = cv2.applyColorMap(
+        np.rint(255 * share).astype(np.uint8)[:, None],
+        cv2.COLORMAP_VIRIDIS,
+    )[:, 0]
+    return np.column_stack(
+        [
+            bgr[:, ::-1],
+            np.full(len(bgr), 255, np.uint8),
+        ]
+    )
 
 
 def _as_double_sided(tree: dict[str, Any]) -> None:

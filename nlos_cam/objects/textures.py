@@ -57,7 +57,10 @@ def _colors(generator: Generator, count: int) -> Float64:
 
 def _grid(n: int) -> tuple[Float64, Float64]:
     """Return x (right) and y (up) of the cells of an image, from -1 to 1."""
-    x, y = np.meshgrid(np.linspace(-1, 1, n), np.linspace(1, -1, n))
+    x, y = np.meshgrid(
+        np.linspace(-1, 1, n),
+        np.linspace(1, -1, n),
+    )
     return x, y
 
 
@@ -73,7 +76,10 @@ def _patches(generator: Generator, depth_m: Float32) -> Float64:
     count = int(generator.integers(2, 5))
     (x, y) = _grid(len(depth_m))
     points = generator.uniform(-0.7, 0.7, (count, 2))
-    nearest = np.argmin([(x - a) ** 2 + (y - b) ** 2 for a, b in points], axis=0)
+    nearest = np.argmin(
+        [(x - a) ** 2 + (y - b) ** 2 for a, b in points],
+        axis=0,
+    )
     return _colors(generator, count)[nearest]
 
 

@@ -7,7 +7,6 @@ __all__ = [
     "Accuracy",
     "Agreement",
     "Beams",
-    "DepthBound",
     "EchoMaps",
     "Effects",
     "Fault",
@@ -16,7 +15,6 @@ __all__ = [
     "HiddenObject",
     "Material",
     "MultiBounce",
-    "PoseFit",
     "Radiometry",
     "Rendering",
     "Scene",
@@ -71,9 +69,7 @@ from .echoes import MultiBounce
 from .effects import EFFECTS, Effects, included
 from .geometry import Beams, cast
 from .gradients import (
-    DepthBound,
     Gradients,
-    PoseFit,
     SceneVector,
     depth_bound,
     fit_pose,

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from nlos_cam.frames import inner, int64
 from nlos_cam.render.beam_sums import (
-    NumbaGroups,
+    NumbaScene,
     NumbaTables,
     groups_of,
     shift_and_add,
@@ -85,7 +85,8 @@ def _count(
     histogram: Float32,
 ) -> None:
     """Count B over d3 + d4 of one patch in sub-bins, from the sub-bin `start` on."""
-    # Neighboring cells often share a sub-bin, and each sum there would wait for the one before.
+    # Neighboring cells often share a sub-bin, and each sum there would wait for the one before: so
+    # neighbors count in histograms of their own.
     lanes = np.zeros((COUNTERS, len(histogram)), np.float32)
     legs = scratch(relay.tile)
     verdicts = judge(s, s + 1, surface, relay.bounds_m, optics, field)[0]
@@ -134,6 +135,7 @@ def tables(first: Int32, histogram: Float32, per_bin: int) -> NumbaTables:
     rows = np.zeros((patches * per_bin + 1, WINDOW + width), np.float32)
     rest = np.zeros((patches, width + 1), np.float32)
     for s in numba.prange(patches):
+        # Running sums: below[k] is the light before sub-bin k.
         below = np.zeros(width * per_bin + 1)
         for k in range(width * per_bin):
             below[k + 1] = below[k] + histogram[s, k]
@@ -147,6 +149,7 @@ def tables(first: Int32, histogram: Float32, per_bin: int) -> NumbaTables:
                 )
                 rows[s * per_bin + shift, WINDOW + i] = value
                 rest[s, i] = max(rest[s, i], value)
+        # The largest value from a bin on is the larger of its own and of those after it.
         for i in range(width - 1, -1, -1):
             rest[s, i] = max(rest[s, i], rest[s, i + 1])
     return NumbaTables(first, rows.ravel(), rest, per_bin, width)
@@ -175,7 +178,10 @@ def echoes(job: TransportJob) -> MultiBounce:
     winner, peak, second, sure = strongest_in_window(every, *numba_job.sites, table, job.bins)
     path = np.where(peak > 0, (winner + 0.5) * job.bin_m, np.nan).astype(np.float32)
     found = MultiBounce(peak, second, path)
-    if (unsure := np.flatnonzero(~sure)).size:
+
+    unsure = np.flatnonzero(~sure)
+    if unsure.size:
+        # By whole tiles, as `histograms` sums them: the same joins, and so the same bits.
         tiles, which = np.unique(every.place[unsure] // BEAM_TILE, return_inverse=True)
         whole = shift_and_add(tiles.astype(np.int64), every, *numba_job.sites, table, job.bins)
         rest = strongest(whole[which * BEAM_TILE + every.place[unsure] % BEAM_TILE], job.bin_m)
@@ -194,6 +200,8 @@ class NumbaJob:
         accuracy = job.accuracy
         self._tiled = tiled
         geometry = *_columns(patches.point_m), *_columns(patches.normal), _single(job.soft_patch_m2)
+        # A patch is shaded if it lies below its highest horizon on some leg: z < u h (see
+        # `visibility`) for the longest u and the largest h.
         low, high, walk = horizons(job)
         highest = high.max(1, initial=0)
         shaded = (
@@ -220,9 +228,9 @@ class NumbaJob:
         return _points(columns, self.job.soft_wall_m2, tile, tiled=self._tiled)
 
     @property
-    def sites(self) -> tuple[NumbaSurface, NumbaGroups, NumbaSurface, NumbaOptics, HeightField]:
-        """Arguments of the kernels that do not depend on beams and tables."""
-        return self.surface, self.groups, self.centers, self.optics, self.job.field
+    def sites(self) -> NumbaScene:
+        """Everything that the kernels need beside beams and tables."""
+        return NumbaScene(self.surface, self.groups, self.centers, self.optics, self.job.field)
 
     def feet(self, share: Float64) -> NumbaPoints:
         """Return the beams with a weight (n,) above 0."""
@@ -286,6 +294,7 @@ def _tiles(x: bytes, y: bytes, size: int, *, tiled: bool) -> tuple[Int32, Int32,
     Points are sorted along x, cut into strips, and sorted along y in each: whole tiles that are
     nearly square.
     """
+    # Small tiles have tight bounds: more of them are wholly free, or join more patches.
     at_x = np.frombuffer(x, np.float32)
     at_y = np.frombuffer(y, np.float32)
     count = len(at_x)
@@ -328,6 +337,7 @@ def reach_cells(job: TransportJob) -> Float64:
     """Return the longest leg (n,) from each patch along an axis to a beam's spot or a relay cell,
     in cells.
     """
+    # The far end of a leg along an axis is at one of both extremes of all spots and cells.
     point = job.patches.point_m
     field = job.field
     relay = job.relay
@@ -347,6 +357,7 @@ def table_bins(job: TransportJob) -> tuple[Int32, int]:
     and never shorter than the straight line to the mirror image of the lidar behind the wall
     (Heron).
     """
+    # S4: a path's bin counts d1 + d2 + d3 + d4; the table of a patch has the last two legs.
     x, y, z = job.patches.point_m.T
     relay = job.relay
     lidar = job.lidar_m

@@ -120,6 +120,7 @@ def legs(
     """Return V (n, m) of the legs between patches and points of the wall: lit side, occluder, the
     object itself.
     """
+    # V of S2 is 0 or 1, and the same in both directions: one table serves spots and relay cells.
     table = np.zeros((len(patches.row), len(x)), np.bool_)
     for s in numba.prange(len(patches.row)):
         point = patches.point_m[s]
@@ -141,6 +142,7 @@ def _incident(
     """Return the factors of S2 on the leg from a laser spot to a patch: the light that the patch
     gives on.
     """
+    # S2: strength cos t2 / d2^2, with d2^2 limited at contact.
     to_spot = spot - patches.point_m[s]
     d2 = np.sqrt((to_spot**2).sum())
     cos_2 = (patches.normal[s] * to_spot).sum() / d2

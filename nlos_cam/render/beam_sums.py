@@ -81,6 +81,43 @@ class NumbaGroups(NamedTuple):
     """(k,); distance from the mean to the farthest member."""
 
 
+class NumbaScene(NamedTuple):
+    """Everything on the way of light that depends on neither beams nor tables."""
+
+    surface: NumbaSurface
+    groups: NumbaGroups
+    centers: NumbaSurface
+    """The groups' means, as if each were one patch."""
+    optics: NumbaOptics
+    field: HeightField
+
+
+class Windows(NamedTuple):
+    """Windows of bins that a tile's beams (count) sum."""
+
+    start: int
+    """Place of the first beam."""
+    length_m: Float32
+    """(count,); d1."""
+    begin: Int32
+    """(count,); first bin of each window."""
+    sums: Float32
+    """(count, whole WINDOWs)."""
+    bound: Float32
+    """(count,); upper bound on any bin beyond the window."""
+
+
+class RowSource(NamedTuple):
+    """Rows of one patch or joined group in a flat table."""
+
+    per_bin: int
+    stride: int
+    """Numbers from one row to the next."""
+    first: int
+    """Bin at which the rows start."""
+    strength: np.float32
+
+
 class Block(NamedTuple):
     """Legs of up to PATCH_BLOCK patches or groups to a tile's beams, whose rows are not added
     yet.
@@ -135,6 +172,7 @@ def ends(
     far = np.zeros(count, np.float32)
     at_x = feet.x_m[start : start + count]
     at_y = feet.y_m[start : start + count]
+    # A group at a time with all beams side by side: the inner loop is made of vectors.
     for g in range(len(groups.reach_m)):
         x = centers.x_m[g]
         y = centers.y_m[g]
@@ -142,10 +180,10 @@ def ends(
         first = table.first[groups.member[groups.begin[g]]]
         last = int64(0)
         for j in range(groups.begin[g], groups.begin[g + 1]):
-            first, last = (
-                min(first, table.first[groups.member[j]]),
-                max(last, table.first[groups.member[j]]),
-            )
+            first = min(first, table.first[groups.member[j]])
+            last = max(last, table.first[groups.member[j]])
+
+        # Triangle inequality: a member's d2 differs from its mean's by at most the group's reach.
         reach = groups.reach_m[g] * optics.inverse_bin
         soonest = np.float32(first * table.per_bin) - reach
         latest = np.float32(last * table.per_bin) + reach
@@ -155,15 +193,15 @@ def ends(
             length = np.sqrt(dx * dx + dy * dy + z * z) * optics.inverse_bin
             near[i] = min(near[i], length + soonest)
             far[i] = max(far[i], length + latest)
+
     spread = 0
     whole = np.float32(1 / table.per_bin)
     for i in range(count):
         spread = max(spread, int((far[i] - near[i]) * whole))
         # A beam's first path is d1 + min (d2 + d3 + d4) over the patches; one bin less covers
         # rounding.
-        near[i] = np.floor(
-            (near[i] + feet.length_m[start + i] * optics.inverse_bin) * whole
-        ) - np.float32(1)
+        before = (near[i] + feet.length_m[start + i] * optics.inverse_bin) * whole
+        near[i] = np.floor(before) - np.float32(1)
     return near, spread + table.width + 4
 
 
@@ -179,44 +217,51 @@ def _bits(number: int) -> int:
 @numba.njit(cache=True, error_model="numpy", fastmath=FAST, inline="always")
 def _place(
     legs: NumbaLegs,
-    start: int,
-    feet: NumbaPoints,
-    optics: NumbaOptics,
-    begin: Int32,
-    per_bin: int,
-    stride: int,
-    strength: np.float32,
-    first: int,
+    windows: Windows,
+    inverse_bin: np.float32,
+    source: RowSource,
     used: int,
     block: Block,
 ) -> tuple[np.float32, int]:
     """Fill in each leg's weight, row of a table, and bin of the row at which the beam's window
     begins.
 
-    Return the sum of the weights, and the smallest of those bins. Numbers are 32 bits wide, so that
-    the loop is made of vectors: numba's own integers are wider, and floats have no smallest one
-    without order.
+    Return the sum of the weights, and the smallest of those bins.
     """
+    # Numbers are 32 bits wide, so that the loop is made of vectors: numba's own integers are wider,
+    # and floats have no smallest one without order.
     total = np.float32(0)
     least = np.int32(1 << 30)
-    count = len(begin)
+    count = len(windows.begin)
+    begin = windows.begin
+    length_m = windows.length_m
     weight = block.weights[used * count : (used + 1) * count]
     row = block.row[used]
     ahead = block.ahead[used]
-    length_m = feet.length_m[start : start + count]
-    starts = np.int32(first)
-    bits = _bits(per_bin)
-    mask = np.int32(per_bin - 1)
-    long = np.int32(stride)
+    starts = np.int32(source.first)
+    bits = _bits(source.per_bin)
+    mask = np.int32(source.per_bin - 1)
+    long = np.int32(source.stride)
     for i in range(count):
-        shift = np.int32((legs.length_m[i] + length_m[i]) * optics.inverse_bin + np.float32(0.5))
-        weight[i] = legs.weight[i] * strength
+        # d1 + d2 to the nearest sub-bin: its whole bins move the window along the row, the sub-bins
+        # that are left choose among the rows.
+        shift = np.int32((legs.length_m[i] + length_m[i]) * inverse_bin + np.float32(0.5))
+        weight[i] = legs.weight[i] * source.strength
         row[i] = np.int32((shift & mask) * long)
         at = np.int32(begin[i] - np.int32(shift >> bits) - starts)
         ahead[i] = at
         total += weight[i]
         least = min(least, at)
     return total, int64(least)
+
+
+@numba.njit(cache=True, error_model="numpy", fastmath=FAST, inline="always")
+def _raise_bound(windows: Windows, used: int, block: Block, largest: np.float32) -> None:
+    """Add to each beam's bound the most that a placed table, of values up to `largest`, can add."""
+    count = len(windows.begin)
+    weight = block.weights[used * count : (used + 1) * count]
+    for i in range(count):
+        windows.bound[i] += weight[i] * largest
 
 
 @numba.njit(cache=True, error_model="numpy", fastmath=FAST, inline="always")
@@ -229,11 +274,14 @@ def _add_block(used: int, rows: Float32, row_bins: int, block: Block, sums: Floa
     width = np.int32(row_bins)
     every = sums.ravel()
     offset = block.offsets.reshape(PATCH_BLOCK, count)
+    # Windows outside, beams inside: all offsets of a window are computed as vectors, then each
+    # beam's window stays in registers while the rows of the block are added to it.
     for window in range(0, bins, WINDOW):
         ahead_of = np.int32(window)
         before = np.int32(-WINDOW)
         for j in range(used):
             for i in range(count):
+                # Before and beyond a row lie WINDOW zeros: clamped, a window adds nothing there.
                 at = min(max(np.int32(block.ahead[j, i] + ahead_of), before), width)
                 offset[j, i] = np.int32(block.row[j, i] + at)
         for i in range(count):
@@ -276,12 +324,18 @@ def _near_enough(
     optics: NumbaOptics,
     limit: np.float32,
 ) -> bool:
-    """Return whether joining a group moves no path of a tile (4,) by more than JOIN_SUB_BINS.
-
-    The gradient, over the wall, of the difference of two patches' paths is at most their distance
-    over that to the wall's point, and the relative one of their weights apart from the cosine at
-    most four times that over the latter.
+    """Return whether joining a group moves no path of a tile (4,) by more than JOIN_SUB_BINS, and
+    no weight, apart from the patch's cosine, by more than `limit` of it.
     """
+    # Patches a and b, r apart, have legs l_a and l_b to a point of the wall that is at least d from
+    # the segment between them. Over the wall, grad l is the leg's unit vector u. Moving the patch
+    # by r turns u by at most r / d, so
+    #     |grad (l_a - l_b)| = |u_a - u_b| <= r / d.
+    # A weight falls with l^-k (S2: k = 3, as the cosine has l once; 4 if Lambertian),
+    # so grad log w = -k u / l. The map from p to u / l is an inversion, which scales by 1 / l^2:
+    #     |grad log (w_a / w_b)| <= 4 r / d^2.
+    # Both differences are 0 at the tile's middle after joining, and grow over at most half its
+    # diagonal. Near contact, where weights follow another law, nothing is joined.
     half_x = (bounds_m[1] - bounds_m[0]) / 2
     half_y = (bounds_m[3] - bounds_m[2]) / 2
     nothing = np.float32(0)
@@ -290,7 +344,7 @@ def _near_enough(
     z = centers.z_m[g]
     reach = groups.reach_m[g]
     nearest = np.sqrt(out_x * out_x + out_y * out_y + z * z) - reach
-    # moved_m = half the tile's diagonal times reach / nearest
+    # Half the diagonal times r; over d it is the most that a path moves, in meters.
     moving_m2 = np.sqrt(half_x * half_x + half_y * half_y) * reach
     return (
         nearest > nothing
@@ -308,6 +362,8 @@ def _first(g: int, groups: NumbaGroups, joins: Joins, table: NumbaTables) -> tup
     first = int64(1 << 40)
     last = int64(0)
     bits = _bits(table.per_bin)
+    # A member's rows start later by its path's shift, which a row's own shift within a bin may
+    # carry into the next bin.
     for j in range(groups.begin[g], groups.begin[g + 1]):
         if joins.ratio[j] > 0:
             own = table.first[groups.member[j]]
@@ -316,19 +372,29 @@ def _first(g: int, groups: NumbaGroups, joins: Joins, table: NumbaTables) -> tup
     return first, last
 
 
+@numba.njit(cache=True, inline="always")
+def _joinable(g: int, verdicts: NDArray[np.int8], groups: NumbaGroups) -> bool:
+    """Return whether a group has two free members or more, and none that may be blocked."""
+    free = 0
+    mixed = 0
+    for j in range(groups.begin[g], groups.begin[g + 1]):
+        verdict = verdicts[groups.member[j]]
+        free += int(verdict == FREE)
+        mixed += int((verdict != FREE) & (verdict != DARK))
+    return mixed == 0 and free >= 2
+
+
 @inner(error_model="numpy", fastmath=FAST)
 def _joins(
-    verdicts: NDArray[np.int8],
-    bounds_m: Float32,
-    surface: NumbaSurface,
-    groups: NumbaGroups,
-    centers: NumbaSurface,
-    optics: NumbaOptics,
-    table: NumbaTables,
+    verdicts: NDArray[np.int8], bounds_m: Float32, scene: NumbaScene, table: NumbaTables
 ) -> Joins:
     """Return which groups a tile (4,) of beams joins: those whose free members it cannot tell
     apart.
     """
+    surface = scene.surface
+    groups = scene.groups
+    centers = scene.centers
+    optics = scene.optics
     count = len(groups.reach_m)
     joins = Joins(
         np.zeros(count, np.bool_),
@@ -341,13 +407,9 @@ def _joins(
     nothing = np.float32(0)
     half = np.float32(0.5)
     for g in range(count):
-        free = 0
-        mixed = 0
-        for j in range(groups.begin[g], groups.begin[g + 1]):
-            verdict = verdicts[groups.member[j]]
-            free += int(verdict == FREE)
-            mixed += int((verdict != FREE) & (verdict != DARK))
-        if mixed or free < 2 or not _near_enough(g, bounds_m, groups, centers, optics, limit):
+        if not _joinable(g, verdicts, groups) or not _near_enough(
+            g, bounds_m, groups, centers, optics, limit
+        ):
             continue
         length, facing, weight = _leg(g, centers, x, y, optics)
         alike = facing > 0
@@ -356,8 +418,11 @@ def _joins(
             if verdicts[s] == DARK:
                 continue
             own_length, own_facing, own_weight = _leg(s, surface, x, y, optics)
-            # Facing is linear over the tile, and the quotient of two is largest and smallest at
-            # corners.
+            # The cosine's part f = n . (q - p) is affine in the wall's point q. Where f_g > 0, the
+            # points with f_s / f_g <= c fill a half plane, so the quotient is largest and smallest
+            # at corners c of the tile. Against the middle m it may change by
+            #     |f_s(c) f_g(m) / (f_g(c) f_s(m)) - 1| <= JOIN_COSINE limit,
+            # which is tested without the division.
             for corner in range(4):
                 to_x = bounds_m[corner & 1]
                 to_y = bounds_m[2 + (corner >> 1)]
@@ -389,6 +454,8 @@ def _build(
     """Fill in the joined rows of some groups, where windows of `bins` bins from `ahead` (k, count)
     on meet them.
     """
+    # Row r of the group is sum_j ratio_j T_j(r + shift_j), each T_j at its member's own first bin.
+    # Only the part of it that some beam's window meets is summed, one window at a time.
     stride = WINDOW + table.width
     wide = table.width + MARGIN
     bits = _bits(table.per_bin)
@@ -428,49 +495,52 @@ def _build(
                 )
 
 
+@numba.njit(cache=True, error_model="numpy", fastmath=FAST, inline="always")
+def _largest_joined(
+    g: int, groups: NumbaGroups, joins: Joins, table: NumbaTables, first: int, beyond: int
+) -> np.float32:
+    """Return a bound on a group's joined rows, which start at bin `first`, from their bin `beyond`
+    on.
+    """
+    # |sum_j ratio_j T_j(k)| <= sum_j ratio_j max T_j, as no table has a value below 0.
+    largest = np.float32(0)
+    bits = _bits(table.per_bin)
+    for j in range(groups.begin[g], groups.begin[g + 1]):
+        s = groups.member[j]
+        off = table.first[s] + ((joins.shift[j] + table.per_bin - 1) >> bits) - first
+        largest += joins.ratio[j] * table.rest[s, min(max(beyond - off, 0), table.width)]
+    return largest
+
+
 @inner(error_model="numpy", fastmath=FAST)
 def _add_joined(
-    start: int,
-    feet: NumbaPoints,
-    groups: NumbaGroups,
-    centers: NumbaSurface,
-    joins: Joins,
-    optics: NumbaOptics,
-    table: NumbaTables,
-    begin: Int32,
-    sums: Float32,
-    bound: Float32,
+    windows: Windows, feet: NumbaPoints, scene: NumbaScene, joins: Joins, table: NumbaTables
 ) -> None:
     """Add the joined groups to the windows of a tile's beams, and to the bound on every bin
     beyond.
     """
-    count, bins, per_bin, bits = len(begin), sums.shape[1], table.per_bin, _bits(table.per_bin)
+    groups = scene.groups
+    centers = scene.centers
+    optics = scene.optics
+    sums = windows.sums
+    count = len(windows.begin)
+    bins = sums.shape[1]
+    wide = table.width + MARGIN
+    size = table.per_bin * (WINDOW + wide)
     legs = scratch(count)
     block = _block(count)
-    used = 0
-    wide = table.width + MARGIN
-    size = per_bin * (WINDOW + wide)
     rows = np.zeros(PATCH_BLOCK * size + 2 * WINDOW, np.float32)
     group = np.empty(PATCH_BLOCK, np.int64)
+    used = 0
     for g in range(len(joins.joined)):
         if joins.joined[g]:
             first = _first(g, groups, joins, table)[0]
-            geometry(legs, g, centers, feet, start, count, optics, False)
-            one = np.float32(1)
-            stride = WINDOW + wide
-            _, least = _place(
-                legs, start, feet, optics, begin, per_bin, stride, one, first, used, block
-            )
-            largest = np.float32(0)
-            for j in range(groups.begin[g], groups.begin[g + 1]):
-                s = groups.member[j]
-                off = table.first[s] + ((joins.shift[j] + per_bin - 1) >> bits) - first
-                largest += (
-                    joins.ratio[j] * table.rest[s, min(max(least + bins - off, 0), table.width)]
-                )
-            weight = block.weights[used * count : (used + 1) * count]
-            for i in range(count):
-                bound[i] += weight[i] * largest
+            geometry(legs, g, centers, feet, windows.start, count, optics, False)
+            # The members' strengths are in the joined rows.
+            source = RowSource(table.per_bin, WINDOW + wide, first, np.float32(1))
+            _, least = _place(legs, windows, optics.inverse_bin, source, used, block)
+            largest = _largest_joined(g, groups, joins, table, first, least + bins)
+            _raise_bound(windows, used, block, largest)
             block.base[used] = used * size + WINDOW
             group[used] = g
             used += 1
@@ -482,58 +552,45 @@ def _add_joined(
 
 @inner(error_model="numpy", fastmath=FAST)
 def _add_single(
-    start: int,
+    windows: Windows,
     feet: NumbaPoints,
-    surface: NumbaSurface,
+    scene: NumbaScene,
     verdicts: NDArray[np.int8],
-    groups: NumbaGroups,
     joins: Joins,
-    optics: NumbaOptics,
-    field: HeightField,
     table: NumbaTables,
-    begin: Int32,
-    sums: Float32,
-    bound: Float32,
 ) -> None:
     """Add the patches that are not joined to the windows of a tile's beams, and to the bound on
     every bin beyond.
     """
-    count = len(begin)
+    surface = scene.surface
+    groups = scene.groups
+    optics = scene.optics
+    field = scene.field
+    sums = windows.sums
+    start = windows.start
+    count = len(windows.begin)
     bins = sums.shape[1]
     stride = WINDOW + table.width
     legs = scratch(count)
     block = _block(count)
     used = 0
     for g in range(len(joins.joined)):
-        for j in range(
-            groups.begin[g], groups.begin[g + 1] if not joins.joined[g] else groups.begin[g]
-        ):
+        if joins.joined[g]:
+            continue
+        for j in range(groups.begin[g], groups.begin[g + 1]):
             s = int64(groups.member[j])
             if verdicts[s] == DARK:
                 continue
             fill(legs, s, surface, feet, start, count, int64(verdicts[s]), optics, field, False)
-            strength = np.float32(surface.strength[s])
             first = int64(table.first[s])
-            total, least = _place(
-                legs,
-                start,
-                feet,
-                optics,
-                begin,
-                table.per_bin,
-                stride,
-                strength,
-                first,
-                used,
-                block,
-            )
+            source = RowSource(table.per_bin, stride, first, np.float32(surface.strength[s]))
+            total, least = _place(legs, windows, optics.inverse_bin, source, used, block)
             if total > 0:
-                # h(k) = sum_s A(p, s) T_s(k - at_s): beyond the window T_s is at most its largest
-                # value from there.
-                largest = table.rest[s, min(max(least + bins, 0), table.width)]
-                weight = block.weights[used * count : (used + 1) * count]
-                for i in range(count):
-                    bound[i] += weight[i] * largest
+                # S2 factorized: h(k) = sum_s A(p, s) T_s(k - at_s). Beyond the window T_s is at
+                # most its largest value from there on.
+                beyond = min(max(least + bins, 0), table.width)
+                largest = np.float32(table.rest[s, beyond])
+                _raise_bound(windows, used, block, largest)
                 block.base[used] = s * table.per_bin * stride + WINDOW
                 used += 1
                 if used == PATCH_BLOCK:
@@ -544,36 +601,28 @@ def _add_single(
 
 @inner()
 def _sum_tile(
-    start: int,
-    feet: NumbaPoints,
-    surface: NumbaSurface,
-    groups: NumbaGroups,
-    centers: NumbaSurface,
-    optics: NumbaOptics,
-    field: HeightField,
-    table: NumbaTables,
-    most: int,
-) -> tuple[Int32, Float32, Float32]:
-    """Return the first bin (count,) of a tile's beams, their sums from there on over `most` bins or
-    all, and a bound.
-
-    The bound (count,) is on every bin beyond the sums.
-    """
+    start: int, feet: NumbaPoints, scene: NumbaScene, table: NumbaTables, most: int
+) -> Windows:
+    """Return the windows of a tile's beams, over `most` bins or all, with every patch added."""
+    surface = scene.surface
+    optics = scene.optics
     count = min(BEAM_TILE, len(feet.x_m) - start)
-    near, span = ends(start, count, feet, groups, centers, optics, table)
-    begin = near.astype(np.int32)
-    sums = np.zeros((count, (min(span, most) + WINDOW - 1) // WINDOW * WINDOW), np.float32)
-    bound = np.zeros(count, np.float32)
-    tile = feet.bounds_m[start // BEAM_TILE : start // BEAM_TILE + 1]
-    verdicts = judge(int64(0), len(table.first), surface, tile, optics, field)[:, 0]
-    joins = _joins(verdicts, tile[0], surface, groups, centers, optics, table)
-    # Legs of some patches first, then the rows of each beam: rows and windows stay in the first
-    # cache
-    _add_joined(start, feet, groups, centers, joins, optics, table, begin, sums, bound)
-    _add_single(
-        start, feet, surface, verdicts, groups, joins, optics, field, table, begin, sums, bound
+    near, span = ends(start, count, feet, scene.groups, scene.centers, optics, table)
+    windows = Windows(
+        start,
+        feet.length_m[start : start + count],
+        near.astype(np.int32),
+        np.zeros((count, (min(span, most) + WINDOW - 1) // WINDOW * WINDOW), np.float32),
+        np.zeros(count, np.float32),
     )
-    return begin, sums, bound
+    tile = feet.bounds_m[start // BEAM_TILE : start // BEAM_TILE + 1]
+    verdicts = judge(int64(0), len(table.first), surface, tile, optics, scene.field)[:, 0]
+    joins = _joins(verdicts, tile[0], scene, table)
+    # Legs of some patches first, then the rows of each beam: rows and windows stay in the first
+    # cache.
+    _add_joined(windows, feet, scene, joins, table)
+    _add_single(windows, feet, scene, verdicts, joins, table)
+    return windows
 
 
 @numba.njit(cache=True, parallel=True)
@@ -594,14 +643,14 @@ def shift_and_add(
     tiles, so that their bits do not depend on which are asked for.
     """
     histogram = np.zeros((len(tiles) * BEAM_TILE, bins), np.float32)
+    # The scene comes in parts, as numba's parallel loops take no nested tuples.
     for k in numba.prange(len(tiles)):
-        begin, sums, _ = _sum_tile(
-            tiles[k] * BEAM_TILE, feet, surface, groups, centers, optics, field, table, bins
-        )
-        for i in range(len(begin)):
-            first = int(begin[i])
-            for j in range(max(-first, 0), min(sums.shape[1], bins - first)):
-                histogram[k * BEAM_TILE + i, first + j] = sums[i, j]
+        scene = NumbaScene(surface, groups, centers, optics, field)
+        windows = _sum_tile(int64(tiles[k] * BEAM_TILE), feet, scene, table, bins)
+        for i in range(len(windows.begin)):
+            first = int(windows.begin[i])
+            for j in range(max(-first, 0), min(windows.sums.shape[1], bins - first)):
+                histogram[k * BEAM_TILE + i, first + j] = windows.sums[i, j]
     return histogram
 
 
@@ -629,16 +678,17 @@ def strongest_in_window(
     sure = np.zeros(beams, np.bool_)
     for tile in numba.prange((beams + BEAM_TILE - 1) // BEAM_TILE):
         start = tile * BEAM_TILE
-        begin, sums, bound = _sum_tile(
-            start, feet, surface, groups, centers, optics, field, table, int64(WINDOW)
-        )
-        for i in range(len(begin)):
-            first = int(begin[i])
-            best = strongest_between(sums[i], max(-first, 0), min(WINDOW, bins - first))
+        scene = NumbaScene(surface, groups, centers, optics, field)
+        windows = _sum_tile(start, feet, scene, table, int64(WINDOW))
+        for i in range(len(windows.begin)):
+            first = int(windows.begin[i])
+            best = strongest_between(windows.sums[i], max(-first, 0), min(WINDOW, bins - first))
             winner[start + i] = best[0] + first
             peak[start + i] = best[1]
             second[start + i] = best[2]
-            sure[start + i] = bound[i] * ROUNDED <= best[2]
+            # A bin beyond the window is at most the bound, so it is neither of the two if the bound
+            # does not exceed the second, by more than float32 rounds.
+            sure[start + i] = windows.bound[i] * ROUNDED <= best[2]
     return winner[feet.place], peak[feet.place], second[feet.place], sure[feet.place]
 
 
@@ -648,20 +698,24 @@ def groups_of(surface: NumbaSurface, diagonal_m: float) -> tuple[NumbaGroups, Nu
     A group with a member farther from the mean than the diagonal of a cell, as across an edge, is
     broken up.
     """
-    which = np.unique((surface.row // 2) * (1 << 20) + surface.column // 2, return_inverse=True)[1]
+    which = _numbered((surface.row // 2) * (1 << 20) + surface.column // 2)
     count, means, reach_m = _means(surface, which)
-    if (far := reach_m[which] > diagonal_m).any():
-        which = np.unique(
-            np.where(far, len(which) + np.arange(len(which)), which), return_inverse=True
-        )[1]
+    far = reach_m[which] > diagonal_m
+    if far.any():
+        which = _numbered(np.where(far, len(which) + np.arange(len(which)), which))
         count, means, reach_m = _means(surface, which)
+
     begin = np.concatenate([[0], np.cumsum(count)]).astype(np.int32)
-    groups = NumbaGroups(
-        np.argsort(which, kind="stable").astype(np.int32), begin, reach_m * ROUNDED
-    )
+    member = np.argsort(which, kind="stable").astype(np.int32)
     # The kernels ask for a mean's place, normal and near contact alone.
-    rest = {name: column[:0] for name, column in zip(surface._fields[7:], surface[7:], strict=True)}
-    return groups, surface._replace(**rest, **dict(zip(surface._fields, means, strict=False)))
+    columns = {name: column[:0] for name, column in surface._asdict().items()}
+    columns.update(zip(surface._fields, means, strict=False))
+    return NumbaGroups(member, begin, reach_m * ROUNDED), surface._replace(**columns)
+
+
+def _numbered(label: NDArray[np.int64]) -> NDArray[np.intp]:
+    """Return labels (n,) as numbers from 0 on."""
+    return np.unique(label, return_inverse=True)[1]
 
 
 def _means(
@@ -670,7 +724,7 @@ def _means(
     """Return size and mean columns of the groups in which patches (n,) are, and the distance to the
     farthest member.
     """
-    columns = surface[:7]
+    columns = surface[:7]  # up to soft_m2
     count = np.bincount(which)
     means = [(np.bincount(which, column) / count).astype(np.float32) for column in columns]
     squared = [

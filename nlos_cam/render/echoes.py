@@ -59,6 +59,7 @@ def strongest_between(
     """Return index and value of the strongest bin from `start` to before `end`, and the value of
     the second.
     """
+    # One pass with strict comparisons: a tie stays with the shorter path, and dark bins never win.
     best = np.float32(0)
     second = np.float32(0)
     at = 0
@@ -97,6 +98,7 @@ def compete(beams: Beams, multi: MultiBounce) -> tuple[Float32, Float32, Float32
     """Return depth, intensity and margin (rows, columns) of the strongest echoes (S5); ties go to
     the direct return.
     """
+    # S5: direct return and strongest three-bounce bin compete; the larger one is the echo.
     direct = beams.direct.astype(np.float32).reshape(beams.shape)
     peak = multi.peak
     if multi.direct_included:
@@ -146,7 +148,9 @@ def with_pulse(histogram: Float32, pulse_ns: float, bin_m: float) -> Float32:
     # Convolution theorem; zero padding by the kernel's length keeps the end from wrapping to the
     # start.
     spectrum = np.fft.rfft(histogram.astype(np.float64), size, axis=1) * np.fft.rfft(kernel, size)
-    wide = np.fft.irfft(spectrum, size, axis=1)[:, half:]  # what would come before time 0 is cut
+    # What would come before time 0 is cut.
+    wide = np.fft.irfft(spectrum, size, axis=1)[:, half:]
+    # Rounding of the transform leaves tiny values below 0 where there is no light.
     return np.maximum(wide, 0).astype(np.float32)
 
 
@@ -159,6 +163,8 @@ def _pulse(pulse_ns: float, bin_m: float) -> Float64:
     """Return the pulse over the bins around its middle, normalized to 1: differences of the normal
     distribution.
     """
+    # Four sigmas hold all but 6e-5 of the light. Each bin gets the integral of the Gaussian over
+    # it, so that pulses far narrower than a bin lose nothing.
     sigma = pulse_bins(pulse_ns, bin_m)
     half = int(np.ceil(4 * sigma)) + 1
     edges = np.arange(-half, half + 2) - 0.5

@@ -124,6 +124,7 @@ class Beams:
         """Laser spots (k, 3) and d1 (k,) of the lit beams at the ends of each row and column of the
         image.
         """
+        # Beams that miss the wall count as beyond both ends, so that they are never an extreme.
         number = np.arange(len(self.on_wall)).reshape(self.shape)
         lit = self.on_wall.reshape(self.shape)
         ends = [np.where(lit, number, empty) for empty in (len(self.on_wall), -1)]
@@ -153,7 +154,8 @@ def cast(
 
     Cached per rig; the arrays are read-only.
     """
-    return _cast(rig, intrinsics, lambertian, occluder)  # pyright: ignore[reportArgumentType]  frozen, so hashable
+    # The records are frozen, so they can be hashed.
+    return _cast(rig, intrinsics, lambertian, occluder)  # pyright: ignore[reportArgumentType]
 
 
 @lru_cache(maxsize=16)
@@ -214,6 +216,7 @@ def _occluder_length(rig: Rig, lidar: Float64, direction: Float64) -> Float64:
     """Return the distance along each beam to the occluder's half plane; inf for beams that miss
     it.
     """
+    # A ray along the half plane divides by 0: inf or NaN, neither of which compares as a hit.
     if rig.occluder is None:
         return np.full(len(direction), np.inf)
     # The half plane is x = x_m: lidar_x + t direction_x = x_m, and it stops the beam if it is high
@@ -260,6 +263,7 @@ def occluder_edge(rig: Rig) -> tuple[float, float]:
 
 def relay_cells(rig: Rig, lidar_m: Float64, columns: int, rows: int) -> Relay:
     """Return the relay wall as columns x rows cells, as if nothing stood in front of it."""
+    # S2 integrates over the relay wall: cells of equal area, each at its center.
     extent = rig.relay
     pitch_x = (extent.x_max_m - extent.x_min_m) / columns
     pitch_y = (extent.y_max_m - extent.y_min_m) / rows

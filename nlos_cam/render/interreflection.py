@@ -84,6 +84,7 @@ def patch_to_patch(
     patches: PatchArrays, field: HeightField, near_m: float, lambertian: bool
 ) -> Float64:
     """Return form factors (n, n) from patch to patch, 0 if the object stands between."""
+    # Both directions apart: F(a, b) has the area of b, so F(a, b) != F(b, a).
     n = len(patches.row)
     table = np.zeros((n, n))
     for a in numba.prange(n):
@@ -107,6 +108,7 @@ def patch_to_wall(
     """Return form factors (n, m) from patches to cells (m, 3) of the wall, and from the cells to
     the patches.
     """
+    # The wall has no horizon of its own: V is that of the leg from the patch, the same both ways.
     there = np.zeros((len(patches.row), len(cells)))
     back = np.zeros((len(patches.row), len(cells)))
     up = np.array([0.0, 0.0, 1.0])
@@ -135,6 +137,7 @@ def patch_to_wall(
 @inner()
 def _add(target: Float32, at: int, weight: float, source: Float32) -> None:
     """Add a histogram to another from bin `at` on, scaled."""
+    # A detour only delays, so no light is lost before the first bin; past the last one it is cut.
     start = max(at, 0)
     scale = np.float32(weight)
     for k in range(min(len(source), len(target) - start)):
@@ -173,6 +176,7 @@ def _carry(factor: Float64, steps: Int64, histogram: Float32, width: int) -> Flo
     """Return histograms (n, width): the sum of others (m, k), shifted by steps (n, m) and scaled by
     factors (n, m).
     """
+    # One thread sums one histogram in a fixed order: the bits do not depend on the threads.
     out = np.zeros((len(factor), width), np.float32)
     for a in numba.prange(len(factor)):
         for b in range(factor.shape[1]):

@@ -96,6 +96,8 @@ class TransportJob:
     @cached_property
     def beam_weight(self) -> Float64:
         """(n,); factors of S2 that depend on the beam alone."""
+        # A beam's power lands on its spot whatever the angle: the cosine t1 is a factor of S2
+        # alone.
         return (
             np.ones_like(self.cos_incidence) if self.lambertian else self.cos_incidence
         ) / self.solid_angle
@@ -121,12 +123,14 @@ class TransportJob:
     @property
     def patch_arrays(self) -> PatchArrays:
         """Patches as columns for compiled loops."""
+        # Flat columns: numba indexes them without an object in between.
         p = self.patches
         return PatchArrays(p.point_m, p.normal, self.strength, self.soft_patch_m2, p.row, p.column)
 
 
 def count_near_legs(job: TransportJob) -> int:
     """Return the number of legs between patches and wall that are shorter than near contact."""
+    # A patch deeper than near contact has no such leg, so only the others are searched.
     reach = job.near_m**2
     count = 0
     for point in job.patches.point_m[job.patches.point_m[:, 2] < job.near_m]:

@@ -23,7 +23,7 @@ from numba.core import cgutils, types
 from numba.extending import intrinsic
 from numpy.typing import NDArray
 
-from nlos_cam.frames import inner, int64
+from nlos_cam.frames import inner
 from nlos_cam.render.visibility import HeightField, blocked
 
 FAST = {"contract", "reassoc", "nsz", "arcp"}
@@ -108,8 +108,8 @@ class NumbaLegs(NamedTuple):
     length_m: Float32
     sector: Int32
     major: Float32
-    todo: Int32
-    """Legs to look at again."""
+    low: Int32
+    """Legs that run below their horizon's upper bound: the lower bound or a walk decides them."""
 
 
 @numba.njit(cache=True, error_model="numpy", fastmath=FAST, inline="always")
@@ -142,6 +142,8 @@ def geometry(
     at_x = points.x_m[start:end]
     at_y = points.y_m[start:end]
     light = points.weight[start:end]
+    # S2 for one leg of length d: cosine / d^2, as facing = d cos at the patch and z = d cos at the
+    # wall. No branch, so that legs are computed side by side; a leg behind the patch gets weight 0.
     for i in range(count):
         dx = at_x[i] - x
         dy = at_y[i] - y
@@ -167,7 +169,8 @@ def past_edge(
     """
     first = (x - edge_x) * (bounds_m[0] - edge_x) < 0
     last = (x - edge_x) * (bounds_m[1] - edge_x) < 0
-    # Between both ends the height at which a leg crosses the edge's plane is monotone.
+    # A leg to the wall's x crosses the plane x = edge at height z (1 - (edge - x_s) / (x - x_s)).
+    # That is monotone in x, so over the tile it lies between its values at both ends.
     to_edge = edge_x - x
     one = np.float32(1)
     low = z * (one - to_edge / (bounds_m[0] - x))
@@ -178,60 +181,43 @@ def past_edge(
 
 
 @numba.njit(cache=True, error_model="numpy", fastmath=FAST, inline="always")
-def cut(
-    legs: NumbaLegs,
-    s: int,
-    surface: NumbaSurface,
-    points: NumbaPoints,
-    start: int,
-    begin: int,
-    count: int,
-    optics: NumbaOptics,
-) -> None:
-    """Set the weight of legs that the occluder's edge cuts to 0; leg i goes to point start + i."""
-    x = surface.x_m[s]
-    z = surface.z_m[s]
+def cut(legs: NumbaLegs, x: np.float32, z: np.float32, at_x: Float32, optics: NumbaOptics) -> None:
+    """Set the weight of legs from a patch to points (count,) that the occluder's edge cuts to 0."""
     edge_x = optics.edge_x_m
     edge_z = optics.edge_z_m
     to_edge = edge_x - x
     one = np.float32(1)
-    at_x = points.x_m[start + begin : start + begin + count]
-    weights = legs.weight[begin : begin + count]
-    for i in range(count):
+    weights = legs.weight[: len(at_x)]
+    for i in range(len(at_x)):
         # The leg runs from the patch at height z to the wall at 0. It crosses the edge's plane at
         # the share to_edge / dx, at height z (1 - to_edge / dx), if patch and point lie on both
         # sides of it.
         beyond = to_edge * (edge_x - at_x[i]) < 0
-        weights[i] = (
-            np.float32(0)
-            if beyond & (z * (one - to_edge / (at_x[i] - x)) >= edge_z)
-            else weights[i]
-        )
+        blocked = beyond & (z * (one - to_edge / (at_x[i] - x)) >= edge_z)
+        weights[i] = np.float32(0) if blocked else weights[i]
 
 
 @numba.njit(cache=True, error_model="numpy", fastmath=FAST, inline="always")
 def past_object(
     s: int,
     surface: NumbaSurface,
-    left: np.float32,
-    right: np.float32,
-    below: np.float32,
-    above: np.float32,
+    ends_m: tuple[np.float32, np.float32, np.float32, np.float32],
     pitches: tuple[np.float32, np.float32],
     sectors: int,
 ) -> int:
     """Return FREE, MIXED or DARK for the legs from patch s to a tile, whose ends are given from the
     patch on.
 
-    What holds at the tile's corners holds inside. `pitches` are the inverse ones of the depth map's
-    cells.
+    What holds at the tile's corners holds inside. `ends_m` are left, right, lower and upper end;
+    `pitches` are the inverse ones of the depth map's cells.
     """
+    left, right, below, above = ends_m
     z = surface.z_m[s]
     nx = surface.normal_x[s]
     ny = surface.normal_y[s]
     nothing = np.float32(0)
     one = np.float32(1)
-    # Facing is linear over the tile.
+    # Facing is linear over the tile, so it is largest at a corner.
     if max(nx * left, nx * right) + max(ny * below, ny * above) - surface.normal_z[s] * z < -BACK_M:
         return DARK
     if sectors == 0 or not surface.shaded[s]:
@@ -244,6 +230,7 @@ def past_object(
     near_v = max(v_low, -v_high, nothing)
     far_u = max(-u_low, u_high)
     far_v = max(-v_low, v_high)
+    # A leg over u cells along its major axis is free if z >= u h (see `visibility`).
     if z >= max(far_u, far_v) * surface.highest[s] * (one + SLACK):
         return FREE
     along_columns = near_u > far_v
@@ -260,6 +247,7 @@ def past_object(
     face += 0 if (u_high if along_columns else v_high) > 0 else 1
     first = face * sectors + max(int(np.floor((least + one) * half)) - 1, 0)
     last = face * sectors + min(int(np.floor((most + one) * half)) + 1, sectors - 1)
+    # Every leg to the tile has its horizon within the bounds of these sectors.
     highest = nothing
     lowest = np.float32(np.inf)
     for sector in range(first, last + 1):
@@ -280,6 +268,7 @@ def judge(
     field: HeightField,
 ) -> NDArray[np.int8]:
     """Return verdicts (end - begin, tiles) on the legs from some patches to tiles (tiles, 4)."""
+    # One verdict spares the test of each leg in the tile; most tiles are wholly free or dark.
     verdicts = np.empty((end - begin, len(bounds_m)), np.int8)
     pitches = np.float32(1 / field.pitch_x_m), np.float32(1 / field.pitch_y_m)
     for s in range(begin, end):
@@ -288,16 +277,8 @@ def judge(
         for tile in range(len(bounds_m)):
             bounds = bounds_m[tile]
             by_edge = past_edge(x, surface.z_m[s], bounds, optics.edge_x_m, optics.edge_z_m)
-            by_object = past_object(
-                s,
-                surface,
-                bounds[0] - x,
-                bounds[1] - x,
-                bounds[2] - y,
-                bounds[3] - y,
-                pitches,
-                optics.sectors,
-            )
+            ends_m = bounds[0] - x, bounds[1] - x, bounds[2] - y, bounds[3] - y
+            by_object = past_object(s, surface, ends_m, pitches, optics.sectors)
             dark = DARK in (by_edge, by_object)
             verdicts[s - begin, tile] = DARK if dark else by_edge + by_object
     return verdicts
@@ -327,7 +308,10 @@ def fill(
     """Fill in the legs from patch s to the points of a tile of that verdict, from `start` on."""
     geometry(legs, s, surface, points, start, count, optics, outgoing)
     if verdict != FREE:
-        block(verdict, legs, s, surface, points, start, int64(0), count, optics, field)
+        end = start + count
+        block(
+            verdict, legs, s, surface, points.x_m[start:end], points.y_m[start:end], optics, field
+        )
 
 
 @inner(error_model="numpy", fastmath=FAST)
@@ -347,11 +331,20 @@ def fill_all(
     verdicts = judge(s, s + 1, surface, points.bounds_m, optics, field)[0]
     for tile in range(len(verdicts)):
         begin = tile * points.tile
-        count = min(points.tile, len(points.x_m) - tile * points.tile)
+        end = min(begin + points.tile, len(points.x_m))
         if verdicts[tile] == DARK:
-            legs.weight[begin : begin + count] = 0
+            legs.weight[begin:end] = 0
         elif verdicts[tile] != FREE:
-            block(verdicts[tile], legs, s, surface, points, int64(0), begin, count, optics, field)
+            own = NumbaLegs(
+                legs.weight[begin:end],
+                legs.length_m[begin:end],
+                legs.sector[begin:end],
+                legs.major[begin:end],
+                legs.low[begin : end + 1],
+            )
+            at_x = points.x_m[begin:end]
+            at_y = points.y_m[begin:end]
+            block(verdicts[tile], own, s, surface, at_x, at_y, optics, field)
 
 
 @numba.njit(cache=True, error_model="numpy", fastmath=FAST, inline="always")
@@ -360,20 +353,16 @@ def block(
     legs: NumbaLegs,
     s: int,
     surface: NumbaSurface,
-    points: NumbaPoints,
-    start: int,
-    begin: int,
-    count: int,
+    at_x: Float32,
+    at_y: Float32,
     optics: NumbaOptics,
     field: HeightField,
 ) -> None:
-    """Set the weight of blocked legs to 0, for some legs from `begin` on; leg i goes to point start
-    + i.
-    """
+    """Set the weight of blocked legs from patch s to points (count,) to 0."""
     if verdict >= CUT:
-        cut(legs, s, surface, points, start, begin, count, optics)
+        cut(legs, surface.x_m[s], surface.z_m[s], at_x, optics)
     if verdict != CUT:
-        shade(legs, s, surface, points, start, begin, count, optics, field)
+        shade(legs, s, surface, at_x, at_y, optics, field)
 
 
 @numba.njit(cache=True, error_model="numpy", fastmath=FAST, inline="always")
@@ -381,16 +370,13 @@ def shade(
     legs: NumbaLegs,
     s: int,
     surface: NumbaSurface,
-    points: NumbaPoints,
-    start: int,
-    begin: int,
-    count: int,
+    at_x: Float32,
+    at_y: Float32,
     optics: NumbaOptics,
     field: HeightField,
 ) -> None:
-    """Set the weight of blocked legs to 0, for some legs from `begin` on; leg i goes to point start
-    + i.
-    """
+    """Set the weight of legs from patch s to points (count,) that the object blocks to 0."""
+    count = len(at_x)
     x = surface.x_m[s]
     y = surface.y_m[s]
     z = surface.z_m[s]
@@ -400,15 +386,13 @@ def shade(
     one = np.float32(1)
     two = np.float32(2)
     inverse_x = np.float32(1 / field.pitch_x_m)
-    inverse_y = np.float32(-1 / field.pitch_y_m)
+    inverse_y = np.float32(-1 / field.pitch_y_m)  # rows run along -y
     half = np.float32(optics.sectors / 2)
     last = np.float32(optics.sectors - 1)
     faces = np.float32(optics.sectors)
-    at_x = points.x_m[start + begin : start + begin + count]
-    at_y = points.y_m[start + begin : start + begin + count]
-    majors = legs.major[begin : begin + count]
-    sectors = legs.sector[begin : begin + count]
-    weights = legs.weight[begin : begin + count]
+    majors = legs.major[:count]
+    sectors = legs.sector[:count]
+    weights = legs.weight[:count]
     for i in range(count):
         # Sector of the horizon tables: the face by the major axis and its sign, then the tilt -1 to
         # 1 in equal parts.
@@ -423,13 +407,15 @@ def shade(
         sectors[i] = np.int32(face * faces + np.floor(inside))
     # Free above the upper bound of the horizon, blocked below the lower one; in between the leg is
     # walked. The legs that are not free are listed without a branch, which would be mispredicted.
-    listed = 0
+    below = 0
     for i in range(count):
-        legs.todo[listed] = i
-        listed += int((z < majors[i] * high[np.uint32(sectors[i])]) & (weights[i] != 0))
-    for i in legs.todo[:listed]:
+        legs.low[below] = i
+        below += int((z < majors[i] * high[np.uint32(sectors[i])]) & (weights[i] != 0))
+
+    for i in legs.low[:below]:
         sector = sectors[i]
         if z >= majors[i] * low[sector]:
+            # In float64, as the reference walks it: the bounds only choose which legs are walked.
             u = (at_x[i] - surface.x_m[s]) / field.pitch_x_m
             v = (surface.y_m[s] - at_y[i]) / field.pitch_y_m
             steps = surface.walk[s, sector]
@@ -440,12 +426,14 @@ def shade(
 
 @numba.njit(cache=True, inline="always")
 def scratch(count: int) -> NumbaLegs:
+    """Return empty legs to `count` points."""
     weight = np.empty(count, np.float32)
     length_m = np.empty(count, np.float32)
+    sector = np.empty(count, np.int32)
     major = np.empty(count, np.float32)
-    return NumbaLegs(
-        weight, length_m, np.empty(count, np.int32), major, np.empty(count + 1, np.int32)
-    )
+    # One more: a leg is listed before it is known to be low, and the next one takes its place.
+    low = np.empty(count + 1, np.int32)
+    return NumbaLegs(weight, length_m, sector, major, low)
 
 
 WINDOW = 32
@@ -485,6 +473,8 @@ def _add_rows(
             for kind, arg in zip(signature.args, args, strict=True)
         ]
         target, place, rows, starts, offsets, weights, begin, stride, number = arrays
+        # The compiler's own multiply-add: one instruction where the processor has it, two
+        # operations elsewhere.
         vector = ir.VectorType(ir.FloatType(), VECTOR)
         name = f"llvm.fmuladd.v{VECTOR}f32"
         multiply_add = cgutils.get_or_insert_function(
@@ -510,6 +500,7 @@ def _add_rows(
                 rows, [builder.add(builder.load(builder.gep(starts, [loop.index])), offset_j)]
             )
             # Rows are aligned to a number, not to a vector: any shift in bins must be possible.
+            # The weight goes into every lane of a vector.
             lone = builder.insert_element(
                 undefined, builder.load(builder.gep(weights, [j])), ir.IntType(32)(0)
             )

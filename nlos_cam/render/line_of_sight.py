@@ -149,9 +149,8 @@ def direct_visibility(
     to_cells = np.stack([relay.x_m, relay.y_m, np.zeros_like(relay.x_m)], 1) - beams.lidar_m
     directions = np.concatenate([beams.direction, to_cells / relay.length_m[:, None]])
     lengths = np.concatenate([np.nan_to_num(beams.length_m, nan=np.inf), relay.length_m])
-    level = np.zeros(
-        (2, *depth_m.shape)
-    )  # slopes change a hit's cosine alone, and most scenes have no hit
+    # Slopes change a hit's cosine alone, and most scenes have no hit: they are computed after one.
+    level = np.zeros((2, *depth_m.shape))
     hit = np.isfinite(first_hits(field, level, beams.lidar_m, directions, lengths)[0])
     count = len(beams.length_m)
     if not hit.any():

@@ -61,16 +61,16 @@ def slope_along(depth: Float64, axis: int, pitch_m: float, jump_m: float = JUMP_
     """Return the forward difference along an axis; backward at an edge or a jump; 0 without
     neighbors.
     """
+    # Forward as S3 takes it; a difference over a jump would tilt both patches towards a curtain
+    # that is not there.
     step = np.diff(depth, axis=axis)
     slope = np.zeros_like(depth)
-    near = np.abs(step) <= jump_m  # not of NaN
-    before, after = (
-        np.moveaxis(slope, axis, 0)[part] for part in (slice(None, -1), slice(1, None))
-    )  # views
     step = np.moveaxis(step, axis, 0)
-    near = np.moveaxis(near, axis, 0)
-    after[near] = step[near]
-    before[near] = step[near]
+    near = np.abs(step) <= jump_m  # not of NaN
+    along = np.moveaxis(slope, axis, 0)  # a view
+    # First each cell takes the step behind it, then the step ahead where there is one.
+    along[1:][near] = step[near]
+    along[:-1][near] = step[near]
     return slope / pitch_m
 
 
@@ -82,9 +82,8 @@ def make_patches(
     """
     x_m, y_m = cell_centers_m(box, len(depth))
     pitch_x, pitch_y = cell_pitch_m(box, depth.shape)
-    row, column = (
-        np.ascontiguousarray(index) for index in np.nonzero(~np.isnan(depth))
-    )  # as those of `clustered`
+    # Contiguous, as those of `clustered`: kernels are compiled for one layout.
+    row, column = (np.ascontiguousarray(index) for index in np.nonzero(~np.isnan(depth)))
     slope_x = slope_along(depth, 1, pitch_x, jump_m)[row, column]
     slope_y = -slope_along(depth, 0, pitch_y, jump_m)[row, column]  # rows run along -y
     # The surface z(x, y) has tangents (1, 0, zx) and (0, 1, zy). Their cross product (-zx, -zy, 1)
@@ -118,8 +117,10 @@ def clustered(patches: Patches, stride: int, size: int) -> Patches:
             [np.bincount(which, column, len(blocks)).astype(np.float64) for column in columns.T], -1
         )
 
+    # S2 is linear in albedo * true area * normal: their sum lights the wall as the cells do.
     area = summed((patches.albedo * patches.beta)[:, None] * patches.normal)
     albedo = summed(patches.albedo[:, None])[:, 0] / stride**2
+    # beta is what is left of the sum's length beside albedo and projected area.
     length = np.linalg.norm(area, axis=-1)
     beta = np.divide(length / stride**2, albedo, out=np.ones_like(albedo), where=albedo > 0)
     level = np.array([0.0, 0.0, -1.0])

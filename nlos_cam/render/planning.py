@@ -36,11 +36,7 @@ Finding = tuple[str, float, str]
 
 def plan(facts: SceneFacts, effects: Effects = "auto") -> Plan:
     """Return the verdicts on all effects, in the order in which light meets them."""
-    findings = [
-        verdict(facts)
-        for verdict in (_direct, _three_bounce, _line_of_sight, _occluder, _self_occlusion)
-    ]
-    findings += [verdict(facts) for verdict in (_tilt, _brdf, _color, _interreflection, _pulse)]
+    findings = [finding(facts) for finding in FINDINGS]
     return decide(findings, facts.accuracy.tolerance, effects)
 
 
@@ -159,6 +155,18 @@ def _pulse(facts: SceneFacts) -> Finding:
     )
 
 
+FINDINGS = (
+    _direct,
+    _three_bounce,
+    _line_of_sight,
+    _occluder,
+    _self_occlusion,
+    _tilt,
+    _brdf,
+    _color,
+    _interreflection,
+    _pulse,
+)
 MAX_BYTES = 4 << 30
 """Largest histograms, in bytes, that are tried at all."""
 
@@ -189,6 +197,7 @@ class RenderProblem:
         scene = facts.scene
         per_cell = facts.accuracy.beams_per_cell
         with_occluder = included(verdicts, "occluder")
+        # What is left out is left out everywhere: beams, relay cells and legs see the same edge.
         edge_m = occluder_edge(scene.rig) if with_occluder else NO_OCCLUDER
         beams = facts.beams(occluder=with_occluder)
         hidden = facts.relay.behind(edge_m, beams.lidar_m)
@@ -240,6 +249,7 @@ def _job(
     Bins and BRDF nodes come from the beams of the whole map, so that they do not depend on the
     rows.
     """
+    # Rows of the image are runs of the flattened beams.
     ends = (row * beams.shape[1] for row in rows)
     wanted = np.zeros_like(beams.on_wall)
     wanted[slice(*ends)] = True
@@ -273,15 +283,13 @@ def _job(
 
 def _patches(facts: SceneFacts, verdicts: Plan, channel: int | None) -> Patches | None:
     """Return the patches with tilt and BRDF as the plan includes them."""
-    patches = (
-        facts.patches if channel is None or facts.patches is None else facts.patches_of(channel)
-    )
-    if patches is not None and not included(verdicts, "tilt"):
+    patches = facts.patches
+    if patches is not None and channel is not None:
+        patches = facts.patches_of(channel)
+    if patches is None:
+        return None
+    if not included(verdicts, "tilt"):
         patches = patches.level()
-    if (
-        patches is not None
-        and facts.scene.surface.brdf is not None
-        and not included(verdicts, "brdf")
-    ):
+    if facts.scene.surface.brdf is not None and not included(verdicts, "brdf"):
         patches = replace(patches, albedo=patches.albedo * np.mean(facts.brdf_range))
     return patches

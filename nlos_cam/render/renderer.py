@@ -234,9 +234,9 @@ def _strongest(problem: RenderProblem, histograms: Histograms | None) -> MultiBo
     if problem.includes("pulse"):
         whole = _waveforms(problem, _spread_over(lit, histograms))
         return replace(strongest(whole, bin_m), direct_included=True)
-    return (
-        no_echoes(len(lit)) if histograms is None else strongest(histograms, bin_m).spread_over(lit)
-    )
+    if histograms is None:
+        return no_echoes(len(lit))
+    return strongest(histograms, bin_m).spread_over(lit)
 
 
 def _waveforms(problem: RenderProblem, histograms: Histograms) -> Float32:
@@ -384,6 +384,7 @@ def _change(first: Scene, last: Scene) -> float:
     """Return the relative L1 between the transients of two instants, on some beams at draft."""
     count = first.cell_intrinsics.width * first.cell_intrinsics.height
     chosen = np.arange(count)[:: count // PROBES]
+    # Few beams at the coarsest accuracy: a bound on motion is wanted, not its picture.
     one, other = (three_bounce(scene, "draft", chosen=chosen) for scene in (first, last))
     # L1 over all bins, relative to the light: an echo that leaves one bin for the next counts as
     # lost and as new.

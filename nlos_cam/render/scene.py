@@ -84,6 +84,7 @@ class Scene:
         """
         if self.object_depth_m is None or np.isnan(self.object_depth_m).all():
             return None
+        # Light is linear in albedo, so the mean of the channels renders their mean.
         every = self.surface.over(self.object_depth_m.shape)
         albedo = every.mean(-1) if channel is None else every[..., channel]
         return make_patches(self.object_depth_m.astype(np.float64), self.box, albedo, self.jump_m)
@@ -99,6 +100,7 @@ def _check_depth(depth: Float32) -> None:
         raise SceneError(
             f"object depth has type {depth.dtype}: use floating point, with NaN for background"
         )
+    # The wall is z = 0: what lies behind it no light reaches.
     surface = depth[~np.isnan(depth)]
     if surface.size and not (np.isfinite(surface).all() and surface.min() >= 0):
         where = "behind the wall" if surface.min() < 0 else "not finite"

@@ -74,6 +74,7 @@ class SceneFacts:
             return 1
         finer = len(depth) // accuracy.finest_cells if accuracy.finest_cells else 1
         strides = accuracy.object_stride * max(finer, 1), accuracy.object_stride, 1
+        # The first that divides the map: blocks must not reach beyond its edge. 1 always does.
         return next(stride for stride in strides if len(depth) % stride == 0)
 
     @cached_property
@@ -82,11 +83,8 @@ class SceneFacts:
         depth = self.scene.object_depth_m
         if depth is None:
             return np.empty((0, 0))
-        return (
-            coarser(depth.astype(np.float64), self.stride)
-            if self.stride > 1
-            else depth.astype(np.float64)
-        )
+        fine = depth.astype(np.float64)
+        return coarser(fine, self.stride) if self.stride > 1 else fine
 
     @cached_property
     def patches(self) -> Patches | None:
@@ -95,6 +93,7 @@ class SceneFacts:
         """
         if np.isnan(self.depth_m).all() or not self.beams().on_wall.any():
             return None
+        # The shortest path of three bounces goes twice between wall and object: at least 2 z.
         if 2 * np.nanmin(self.depth_m) >= SPEED_OF_LIGHT_M_PER_S * self.rig.device.gate_s:
             return None
         return self.patches_of(None)
@@ -132,6 +131,7 @@ class SceneFacts:
     @cached_property
     def light(self) -> EnergySurvey | None:
         """Coarse survey of the light over each patch."""
+        # The survey samples a coarse grid: a lobe can be brighter between its points by high / low.
         low, high = self.brdf_range
         return None if self._whole_job is None else survey(self._whole_job, high / max(low, 1e-9))
 
@@ -144,7 +144,8 @@ class SceneFacts:
     @cached_property
     def line_of_sight(self) -> DirectVisibility | None:
         """Beams and relay cells that the object blocks from the lidar; None if it blocks none."""
-        if np.isnan(self.depth_m).all():  # also for an empty map
+        # An empty map has no surface: all() of nothing is True.
+        if np.isnan(self.depth_m).all():
             return None
         return direct_visibility(
             self.beams(), self.relay, self.field, self.depth_m, self.scene.jump_m
@@ -168,7 +169,7 @@ class SceneFacts:
         """Return the transport of all beams that light the wall over the patches to the relay
         cells.
         """
-        (spots, length, cosine) = beams.lit
+        spots, length, cosine = beams.lit
         device = self.rig.device
         wall = self.rig.wall
         return TransportJob(
@@ -216,7 +217,7 @@ def bins_of(beams: Beams, patches: Patches, relay: Relay, device: DeviceConstant
             back, [np.sqrt((a - corner_x) ** 2 + (b - corner_y) ** 2 + z[1] ** 2) for a, b in ends]
         )
     back += [np.linalg.norm(np.subtract((*end, 0.0), beams.lidar_m)) for end in ends]
-    longest_bin = int(
-        (there + back.max()) / device.bin_m
-    )  # of a path on a bin's edge, the bin beyond it
-    return min(longest_bin + 2, gate_bins(device))  # one to spare: the fast renderers round lengths
+    # A path on a bin's edge lies in the bin beyond it; one more, as the fast backends round
+    # lengths.
+    longest_bin = int((there + back.max()) / device.bin_m)
+    return min(longest_bin + 2, gate_bins(device))

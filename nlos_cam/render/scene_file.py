@@ -189,6 +189,7 @@ class Fault(Record):
     @property
     def until_frame(self) -> int:
         """First frame after the fault."""
+        # A late frame takes the place of its successor, so each one lasts for two.
         return self.at_frame + self.frames * (2 if self.kind == "out_of_order" else 1)
 
     def befalls(self, frame: int) -> bool:
@@ -236,6 +237,8 @@ class SceneFile(Record):
     @property
     def checksum(self) -> str:
         """Twelve hexadecimal digits that change with anything that changes a rendering."""
+        # A mesh counts by its content, and the sensor only by its pulse, which the renderer
+        # applies.
         mesh = self.hidden.file if self.hidden else None
         seen = {"name": True, "sensor": True, "faults": True, "hidden": {"file"}}
         facts = self.model_dump_json(exclude=seen), mesh and mesh.sha256, self.sensor.pulse_ns
@@ -276,6 +279,8 @@ class SceneFile(Record):
 
     def pose_at(self, rest: HiddenObject, number: float) -> shapes.Pose:
         """Return the pose, at an instant of the loop, of an object whose pose at rest is `rest`."""
+        # Whole numbers of oscillations per loop: the last pose leads into the first. Twice the
+        # frequency in y makes the path an eight; the approach begins at its far end.
         turn = 2 * pi * number / self.poses
         motion = self.motion
         return shapes.Pose(
@@ -308,6 +313,7 @@ def bare_wall_scene() -> SceneFile:
 
 def packaged_scenes() -> dict[str, Path]:
     """Return the example scenes that come with the package (in a clone: examples) by name."""
+    # A wheel holds the scenes beside this module; a clone has them in examples.
     here = Path(__file__).parent
     folder = next(
         (folder for folder in (here / "scenes", here.parents[1] / "examples") if folder.is_dir()),
@@ -323,6 +329,7 @@ def load_scene(path: Path) -> SceneFile:
     Raises SceneFileError with the first problem, SceneError for an object that cannot be seen.
     """
     content: dict[str, Any] = {}
+    # A bare name that is no file here is one of the packaged scenes.
     if str(path) == path.stem and not path.exists():
         path = packaged_scenes().get(path.stem, path)
     try:

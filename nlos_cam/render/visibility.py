@@ -117,6 +117,7 @@ def _between(field: HeightField, along: int, across: float, along_columns: bool)
     """
     low = int(np.floor(across))
     share = across - low
+    # Depth is linear between two centers; an interpolation with background has no depth at all.
     near = _depth(field, along, low, along_columns)
     far = _depth(field, along, low + 1, along_columns)
     if np.isnan(near) or np.isnan(far):
@@ -157,14 +158,15 @@ def blocked(
     step = 1 if major > 0 else -1
     limit = depth_m / abs(major)
     bias = bias_m(field)
+    # h = max_k (z - z' - bias) / k against z / u: the leg is blocked as soon as one term is larger.
     for k in range(first, min(_steps(field, start, major > 0, along_columns), last) + 1):
         # The highest surface there is cannot reach the leg any more, nor can any farther away: 1 /
         # k only falls.
         if (depth_m - field.nearest_m - bias) / k <= limit:
             return False
-        if (
-            depth_m - _between(field, start + k * step, across + k * tilt, along_columns) - bias
-        ) / k > limit:
+        depth = _between(field, start + k * step, across + k * tilt, along_columns)
+        # Background is NaN, which compares false.
+        if (depth_m - depth - bias) / k > limit:
             return True
     return False
 
@@ -204,6 +206,7 @@ def segment_blocked(
     major, minor = (across, down) if along_columns else (down, across)
     count = abs(major)
     bias = bias_m(field)
+    # Both ends are cells of the surface itself, so only the cells between them count.
     for k in range(1, count):
         depth = _between(
             field, start + k * major // count, start_across + k * minor / count, along_columns
@@ -298,13 +301,13 @@ def _line(
             across = k * (2.0 * sector / sectors - 1.0)
             offset = int(np.floor(across))
             if sector == 0:
-                last[:] = (
-                    np.inf
-                )  # before the first sector: what it adds is true of the first one too
+                # Before the first sector: what its edge adds is true of the first one too.
+                last[:] = np.inf
             for cell in range(before + 1, offset if sector else before):
                 for c in range(count):
                     depth = row[margin + cell + c]
-                    last[0, c], last[1, c] = min(last[0, c], depth), max(last[1, c], depth)
+                    last[0, c] = min(last[0, c], depth)
+                    last[1, c] = max(last[1, c], depth)
             over = sector > 0 and offset > before
             share = np.float32(across - offset)
             _meet(
@@ -363,6 +366,7 @@ def horizon_table(
     cells, patch = _side_by_side(field, rows, columns, margin)
     # Depths are float32 here: bounds give way by more than their rounding.
     slack_m = np.float32(1e-6 * depth_m.max())
+    # A line of cells is one task: its patches share every row of neighbors that a step leads to.
     for line in numba.prange(2 * size):
         axis = line // size
         start = line % size

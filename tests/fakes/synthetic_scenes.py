@@ -50,7 +50,12 @@ class Sheet:
     """Range of y."""
 
 
-def bench_depth(seen: View, occluding_sheet: Sheet | None, *, beams: int = 1) -> Float64:
+def bench_depth(
+    seen: View,
+    occluding_sheet: Sheet | None,
+    *,
+    beams: int = 1,
+) -> Float64:
     """Return the depth (height, width) of wall and sheet, inf where a ray meets neither.
 
     A pixel reads the mean of its `beams`, so on the edge it lies between sheet and wall (a flying
@@ -60,21 +65,36 @@ def bench_depth(seen: View, occluding_sheet: Sheet | None, *, beams: int = 1) ->
     rays = pinhole.rays() @ seen.pose[:3, :3].T
     lidar = seen.pose[:3, 3]
     with np.errstate(divide="ignore", invalid="ignore"):
-        wall_m = np.where(rays[..., 2] < 0.0, -lidar[2] / rays[..., 2], np.inf)
+        wall_m = np.where(
+            rays[..., 2] < 0.0,
+            -lidar[2] / rays[..., 2],
+            np.inf,
+        )
         wall_m[wall_m * rays[..., 0] > WALL_EXTENT_M] = np.inf
         depth_m = (
             wall_m
             if occluding_sheet is None
             else np.minimum(wall_m, _sheet_depth(occluding_sheet, lidar, rays))
         )
-    return depth_m.reshape(pinhole.height, seen.pinhole.width, beams).mean(axis=-1)
+    return depth_m.reshape(
+        pinhole.height,
+        seen.pinhole.width,
+        beams,
+    ).mean(axis=-1)
 
 
 def _sheet_depth(occluding_sheet: Sheet, lidar: Float64, rays: Float64) -> Float64:
     """Return the depth along each ray to the sheet: t with normal . (lidar + t ray - edge) = 0; inf
     without a hit.
     """
-    lean, twist = np.tan(np.radians([occluding_sheet.lean_deg, occluding_sheet.twist_deg]))
+    lean, twist = np.tan(
+        np.radians(
+            [
+                occluding_sheet.lean_deg,
+                occluding_sheet.twist_deg,
+            ]
+        )
+    )
     normal = np.array([1.0, -twist, -lean])
     edge = np.array([occluding_sheet.x_m, 0.0, occluding_sheet.gap_m])
     depth_m = (normal @ (edge - lidar)) / (rays @ normal)
@@ -89,7 +109,11 @@ def _sheet_depth(occluding_sheet: Sheet, lidar: Float64, rays: Float64) -> Float
     return np.where((depth_m > 0.0) & on, depth_m, np.inf)
 
 
-def ball(seen: View, centre_m: tuple[float, float, float], radius_m: float) -> Float64:
+def ball(
+    seen: View,
+    centre_m: tuple[float, float, float],
+    radius_m: float,
+) -> Float64:
     """Return the depth (height, width) of a ball in the wall frame, inf beside it."""
     rays = seen.pinhole.rays() @ seen.pose[:3, :3].T
     towards = np.asarray(centre_m) - seen.pose[:3, 3]
@@ -150,7 +174,12 @@ class Placement:
         )
         origin_m = np.array([self.x_m, self.y_m]) - turn @ board.size_mm * 0.5e-3
         return np.array(
-            [[*turn[0], origin_m[0]], [*turn[1], origin_m[1]], [0.0, 0.0, 0.0], [0.0, 0.0, 1.0]]
+            [
+                [*turn[0], origin_m[0]],
+                [*turn[1], origin_m[1]],
+                [0.0, 0.0, 0.0],
+                [0.0, 0.0, 1.0],
+            ]
         )
 
 
@@ -158,7 +187,13 @@ def at_near_edge(board: Board, seen: View) -> Placement:
     """Return an upright board at the edge of the lidar's view, on the side where the wall is
     near.
     """
-    ray = np.array([(EDGE_PX - seen.pinhole.ppx) / seen.pinhole.fx, 0.0, 1.0])
+    ray = np.array(
+        [
+            (EDGE_PX - seen.pinhole.ppx) / seen.pinhole.fx,
+            0.0,
+            1.0,
+        ]
+    )
     direction = seen.pose[:3, :3] @ ray
     edge_m = float(-direction[0] / direction[2] * seen.pose[2, 3])
     return Placement(edge_m + board.size_mm[0] * 0.5e-3)
@@ -172,12 +207,22 @@ def corners_px(
     `bow_m` is the height of the sheet's middle above the wall, for a bow along its x and its y
     axis.
     """
-    flat = np.column_stack([board.corners_m[:, :2], np.ones(len(board.corners_m))])
+    flat = np.column_stack(
+        [
+            board.corners_m[:, :2],
+            np.ones(len(board.corners_m)),
+        ]
+    )
     wall_m = placed.wall_from_board(board) @ flat.T
     wall_m[2] = (1.0 - (2e3 * flat[:, :2] / board.size_mm - 1.0) ** 2) @ bow_m
     x_m, y_m, z_m, _ = np.linalg.inv(seen.pose) @ wall_m
     lidar = seen.pinhole
-    return np.column_stack([lidar.fx * x_m / z_m + lidar.ppx, lidar.fy * y_m / z_m + lidar.ppy])
+    return np.column_stack(
+        [
+            lidar.fx * x_m / z_m + lidar.ppx,
+            lidar.fy * y_m / z_m + lidar.ppy,
+        ]
+    )
 
 
 def clean_infrared(
@@ -198,9 +243,12 @@ def clean_infrared(
         return counts
     # 2.355 = 2 sqrt(2 ln 2): full width at half maximum over sigma
     sigma_px = light.spot_mm * 1e-3 / 2.355 / float(np.quantile(length_m, 0.25)) * seen.pinhole.fx
-    return cv2.GaussianBlur(counts, (0, 0), sigma_px, borderType=cv2.BORDER_REPLICATE).astype(
-        np.float64
-    )
+    return cv2.GaussianBlur(
+        counts,
+        (0, 0),
+        sigma_px,
+        borderType=cv2.BORDER_REPLICATE,
+    ).astype(np.float64)
 
 
 def infrared_frames(
@@ -210,16 +258,22 @@ def infrared_frames(
     light = light or Illumination()
     noise = generator.standard_normal((count, *clean.shape), np.float32)
     spread = np.sqrt(light.read_noise_counts**2 + light.shot_noise**2 * clean).astype(np.float32)
-    return np.clip(np.rint(clean.astype(np.float32) + noise * spread), 0, 255).astype(np.uint8)
+    return np.clip(
+        np.rint(clean.astype(np.float32) + noise * spread),
+        0,
+        255,
+    ).astype(np.uint8)
 
 
 @lru_cache(maxsize=8)
 def _texture(board: Board) -> NDArray[np.float32]:
     """Return the pattern's albedo with a margin of one square of paper."""
     pattern = board.pattern(TEXTURE_PER_SQUARE).astype(np.float32) / 255.0
-    return np.pad(TONER + (1.0 - TONER) * pattern, TEXTURE_PER_SQUARE, constant_values=1.0).astype(
-        np.float32
-    )
+    return np.pad(
+        TONER + (1.0 - TONER) * pattern,
+        TEXTURE_PER_SQUARE,
+        constant_values=1.0,
+    ).astype(np.float32)
 
 
 def _albedo(board: Board, seen: View, placed: Placement) -> Float64:
@@ -230,12 +284,21 @@ def _albedo(board: Board, seen: View, placed: Placement) -> Float64:
     texel_m = board.square_mm * 1e-3 / TEXTURE_PER_SQUARE
     first_m = (0.5 - TEXTURE_PER_SQUARE) * texel_m
     board_from_texture = np.array(
-        [[texel_m, 0.0, first_m], [0.0, texel_m, first_m], [0.0, 0.0, 1.0]]
+        [
+            [texel_m, 0.0, first_m],
+            [0.0, texel_m, first_m],
+            [0.0, 0.0, 1.0],
+        ]
     )
     lidar_from_board = (np.linalg.inv(seen.pose) @ placed.wall_from_board(board))[:3]
     warp = fine.matrix @ lidar_from_board @ board_from_texture
     texture = _texture(board)
-    sharp = cv2.warpPerspective(texture, warp, (fine.width, fine.height), borderValue=1.0)
+    sharp = cv2.warpPerspective(
+        texture,
+        warp,
+        (fine.width, fine.height),
+        borderValue=1.0,
+    )
     shape = seen.pinhole.width, seen.pinhole.height
     return cv2.resize(sharp, shape, interpolation=cv2.INTER_AREA).astype(np.float64)
 
@@ -299,7 +362,12 @@ class WallStream:
     Only watched pixels have depth, to be fast.
     """
 
-    def __init__(self, pose: WallPose, intrinsics: Intrinsics = SMALL, seed: int = 0) -> None:
+    def __init__(
+        self,
+        pose: WallPose,
+        intrinsics: Intrinsics = SMALL,
+        seed: int = 0,
+    ) -> None:
         self.pose = pose
         self.intrinsics = intrinsics
         self.frames = 0
@@ -308,9 +376,16 @@ class WallStream:
         self.check = DriftCheck(self.reference, wall_from_lidar(pose))
         self.pixels = watched_pixels(self.reference)
         rows, columns = np.divmod(self.pixels, intrinsics.width)
-        self.places = np.stack([columns / intrinsics.width, rows / intrinsics.height], axis=1)
+        self.places = np.stack(
+            [columns / intrinsics.width, rows / intrinsics.height],
+            axis=1,
+        )
         """Places (N, 2) of the watched pixels in the view, 0 to 1."""
-        self._frame = np.full((intrinsics.height, intrinsics.width), np.nan, np.float32)
+        self._frame = np.full(
+            (intrinsics.height, intrinsics.width),
+            np.nan,
+            np.float32,
+        )
 
     def moved(
         self, distance_m: float = 0.0, yaw_deg: float = 0.0, pitch_deg: float = 0.0
@@ -345,7 +420,13 @@ class WallStream:
         self.frames += 1
 
 
-def multipath(places: Float64, share: float, seed: int, *, beyond: bool = False) -> DepthChange:
+def multipath(
+    places: Float64,
+    share: float,
+    seed: int,
+    *,
+    beyond: bool = False,
+) -> DepthChange:
     """Return multipath by a moving object: a share of the pixels reads 3 to 40 cm too far,
     smoothly.
 
@@ -379,7 +460,11 @@ def occluding_sheet(places: Float64, nearest: float) -> DepthChange:
     """
 
     def hide(depth_m: Float64, _: int) -> Float64:
-        into = np.clip((places[:, 0] - nearest) / (1.0 - nearest), 0.0, 1.0)
+        into = np.clip(
+            (places[:, 0] - nearest) / (1.0 - nearest),
+            0.0,
+            1.0,
+        )
         shorter = np.maximum(depth_m - 0.05 - 0.45 * into, 0.5 * depth_m)
         return np.where(places[:, 0] >= nearest, shorter, depth_m)
 

@@ -37,26 +37,51 @@ def _hill(cells: int) -> np.ndarray:
 
 def _blurred(histogram: np.ndarray) -> np.ndarray:
     bins = 400
-    padded = np.pad(histogram, [(0, 0), (0, bins - histogram.shape[1])])
+    padded = np.pad(
+        histogram,
+        [(0, 0), (0, bins - histogram.shape[1])],
+    )
     return padded.reshape(len(padded), -1, BLUR).sum(-1, dtype=np.float64)
 
 
 def _found(depth: np.ndarray, accuracy: Accuracy) -> np.ndarray:
-    return _blurred(three_bounce(Scene(RIG, depth, jump_m=0.5), accuracy, chosen=SOME))
+    return _blurred(
+        three_bounce(
+            Scene(RIG, depth, jump_m=0.5),
+            accuracy,
+            chosen=SOME,
+        )
+    )
 
 
 def _relay(cells: int) -> np.ndarray:
-    return _found(_hill(32), replace(STOPS["standard"], relay_columns=cells, relay_rows=cells))
+    return _found(
+        _hill(32),
+        replace(STOPS["standard"], relay_columns=cells, relay_rows=cells),
+    )
 
 
 def _object(cells: int) -> np.ndarray:
-    return _found(_hill(cells), replace(STOPS["standard"], relay_columns=40, relay_rows=32))
+    return _found(
+        _hill(cells),
+        replace(STOPS["standard"], relay_columns=40, relay_rows=32),
+    )
 
 
 def _beams(per_cell: int) -> np.ndarray:
     coarse = Accuracy("coarse", relay_columns=10, relay_rows=10, beams_per_cell=per_cell)
-    found = transient(Scene(RIG, _hill(8)), coarse, effects=["three-bounce", "occluder", "tilt"])
-    mean = found.reshape(64, per_cell, 80, per_cell, -1).mean((1, 3))
+    found = transient(
+        Scene(RIG, _hill(8)),
+        coarse,
+        effects=["three-bounce", "occluder", "tilt"],
+    )
+    mean = found.reshape(
+        64,
+        per_cell,
+        80,
+        per_cell,
+        -1,
+    ).mean((1, 3))
     return _blurred(mean.reshape(5120, -1))
 
 
@@ -78,7 +103,12 @@ def test_finer_depth_maps_keep_the_size_of_patches_and_the_error() -> None:
 
 
 @pytest.mark.parametrize(
-    ("grid", "sizes"), [(_relay, (10, 20, 40, 80)), (_object, (8, 16, 32, 64)), (_beams, (1, 2, 4))]
+    ("grid", "sizes"),
+    [
+        (_relay, (10, 20, 40, 80)),
+        (_object, (8, 16, 32, 64)),
+        (_beams, (1, 2, 4)),
+    ],
 )
 def test_refining_a_grid_changes_less_each_time(grid: Any, sizes: tuple[int, ...]) -> None:
     found = [grid(size) for size in sizes]
@@ -96,7 +126,14 @@ def test_refining_sub_bins_converges_to_brute_force() -> None:
     exact = three_bounce(scene, replace(base, sub_bins=0), chosen=SOME)
     errors = [
         float(
-            np.abs(three_bounce(scene, replace(base, sub_bins=n), chosen=SOME) - exact).sum()
+            np.abs(
+                three_bounce(
+                    scene,
+                    replace(base, sub_bins=n),
+                    chosen=SOME,
+                )
+                - exact
+            ).sum()
             / exact.sum()
         )
         for n in (1, 4, 16, 64)
@@ -108,7 +145,12 @@ def test_share_of_winning_echoes_does_not_drift_with_the_grid() -> None:
     shares: list[float] = []
     for cells in (20, 40, 80, 160):
         rendering = render(
-            Scene(RIG, _hill(32)), replace(STOPS["draft"], relay_columns=cells, relay_rows=cells)
+            Scene(RIG, _hill(32)),
+            replace(
+                STOPS["draft"],
+                relay_columns=cells,
+                relay_rows=cells,
+            ),
         )
         direct = render(Scene(RIG)).intensity
         shares.append(float((rendering.intensity > direct).mean()))
@@ -132,7 +174,11 @@ def case(request: pytest.FixtureRequest) -> Case:
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("stop", "median", "p99"), [("standard", 3e-3, 1e-2), ("fine", 1e-3, 1e-3)]
+    ("stop", "median", "p99"),
+    [
+        ("standard", 3e-3, 1e-2),
+        ("fine", 1e-3, 1e-3),
+    ],
 )
 def test_stop_keeps_its_promised_error(case: Case, stop: str, median: float, p99: float) -> None:
     """Relative error of the peak and its offset in bins, beam by beam."""
@@ -152,7 +198,13 @@ def test_finer_stop_is_nearer_to_brute_force(case: Case) -> None:
     for stop in ("draft", "standard", "fine"):
         fast = three_bounce(scene, stop, chosen=chosen)
         bins = max(fast.shape[1], slow.shape[1])
-        fast, exact = (np.pad(part, [(0, 0), (0, bins - part.shape[1])]) for part in (fast, slow))
+        fast, exact = (
+            np.pad(
+                part,
+                [(0, 0), (0, bins - part.shape[1])],
+            )
+            for part in (fast, slow)
+        )
         errors.append(float(np.abs(fast - exact).sum() / exact.sum()))
     assert errors == sorted(errors, reverse=True)
     assert errors[1] < 1e-2
@@ -162,12 +214,21 @@ def test_finer_stop_is_nearer_to_brute_force(case: Case) -> None:
 def test_float32_light_is_within_1e_5_of_float64(case: Case) -> None:
     scene, chosen, slow = case
     fast = three_bounce(scene, replace(STOPS["fine"], tolerance=0.0), chosen=chosen)
-    np.testing.assert_allclose(fast.sum(1, dtype=np.float64), slow.sum(1), rtol=1e-5)
+    np.testing.assert_allclose(
+        fast.sum(1, dtype=np.float64),
+        slow.sum(1),
+        rtol=1e-5,
+    )
 
 
 def test_sectors_do_not_change_a_bit_of_the_result(case: Case) -> None:
     scene, chosen, _ = case
     few, many = (
-        three_bounce(scene, replace(STOPS["draft"], sectors=n), chosen=chosen) for n in (1, 16)
+        three_bounce(
+            scene,
+            replace(STOPS["draft"], sectors=n),
+            chosen=chosen,
+        )
+        for n in (1, 16)
     )
     np.testing.assert_array_equal(few, many)

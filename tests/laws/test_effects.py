@@ -33,7 +33,14 @@ GREY = np.array([0.5, 0.5, 0.5])
 
 
 def _plate(slope: float = 0.0, z_m: float = 0.25) -> np.ndarray:
-    return depth_map(8, np.nan, (np.s_[2:6, 1:6], z_m + slope * 0.25 / 8 * np.arange(5)))
+    return depth_map(
+        8,
+        np.nan,
+        (
+            np.s_[2:6, 1:6],
+            z_m + slope * 0.25 / 8 * np.arange(5),
+        ),
+    )
 
 
 def _bowl() -> np.ndarray:
@@ -46,7 +53,10 @@ CALLED_FOR = {
     "three-bounce": Scene(RIG, _plate()),
     "line-of-sight": Scene(OPEN, depth_map(8, 0.06)),
     "occluder": Scene(RIG, _plate()),
-    "self-occlusion": Scene(RIG, depth_map(8, 0.35, (np.s_[:, 2:4], 0.14))),
+    "self-occlusion": Scene(
+        RIG,
+        depth_map(8, 0.35, (np.s_[:, 2:4], 0.14)),
+    ),
     "tilt": Scene(RIG, _plate(0.5)),
     "brdf": Scene(RIG, _plate(), Surface(1.0, SHINY)),
     "colour": Scene(RIG, _plate(), Surface(COLOURED)),
@@ -63,7 +73,13 @@ NOT_CALLED_FOR = {
     "brdf": Scene(RIG, _plate(), Surface(1.0, NEARLY_DULL)),
     "colour": Scene(RIG, _plate(), Surface(GREY)),
     "inter-reflection": Scene(
-        RIG, depth_map(64, np.nan, ((30, 30), 0.39)), radiometry="lambertian"
+        RIG,
+        depth_map(
+            64,
+            np.nan,
+            ((30, 30), 0.39),
+        ),
+        radiometry="lambertian",
     ),
     "pulse": Scene(RIG, _plate(), pulse_ns=1e-5),
 }
@@ -82,7 +98,16 @@ def _change(other: np.ndarray, whole: np.ndarray) -> float:
     """Relative L1 of other to whole, where there is any light."""
     bins = max(other.shape[2], whole.shape[2])
     other, whole = (
-        np.pad(part, [(0, 0), (0, 0), (0, bins - part.shape[2]), (0, 0)]) for part in (other, whole)
+        np.pad(
+            part,
+            [
+                (0, 0),
+                (0, 0),
+                (0, bins - part.shape[2]),
+                (0, 0),
+            ],
+        )
+        for part in (other, whole)
     )
     other, whole = np.broadcast_arrays(other, whole)
     light = float(whole.sum(dtype=np.float64))
@@ -98,10 +123,9 @@ def _left_out(scene: Scene, accuracy: Accuracy = COARSE) -> set[str]:
 @pytest.mark.parametrize("name", EFFECTS)
 def test_effect_called_for_changes_more_than_the_tolerance(implementation: Any, name: str) -> None:
     scene = CALLED_FOR[name]
+    # Path by path it is for a few patches only.
     if name == "inter-reflection" and implementation.name == "reference":
-        scene = replace(
-            scene, object_depth_m=_bowl()[3:6, 3:6]
-        )  # path by path it is for a few patches only
+        scene = replace(scene, object_depth_m=_bowl()[3:6, 3:6])
     accuracy = (
         replace(COARSE, relay_columns=3, relay_rows=3) if name == "inter-reflection" else COARSE
     )
@@ -109,7 +133,11 @@ def test_effect_called_for_changes_more_than_the_tolerance(implementation: Any, 
     assert name in chosen
     whole = _with(implementation, scene, chosen, accuracy)
     assert (
-        _change(_with(implementation, scene, chosen - {name}, accuracy), whole) > COARSE.tolerance
+        _change(
+            _with(implementation, scene, chosen - {name}, accuracy),
+            whole,
+        )
+        > COARSE.tolerance
     )
 
 
@@ -122,14 +150,19 @@ def test_effect_not_called_for_changes_less_than_the_tolerance(
     assert name in left_out
     chosen = set(EFFECTS) - left_out
     forced = _with(implementation, scene, chosen | {name})
-    lit = bool(
-        chosen & {"direct", "three-bounce"}
-    )  # without either there is no light, and a rendering is refused
+    # Without either there is no light, and a rendering is refused.
+    lit = bool(chosen & {"direct", "three-bounce"})
     whole = _with(implementation, scene, chosen) if lit else np.zeros_like(forced)
     assert _change(forced, whole) <= COARSE.tolerance
 
 
-def _random(cells: int, base_m: float, rough_m: float, share: float, seed: int) -> np.ndarray:
+def _random(
+    cells: int,
+    base_m: float,
+    rough_m: float,
+    share: float,
+    seed: int,
+) -> np.ndarray:
     generator = np.random.default_rng(seed)
     depth = (base_m + rough_m * generator.random((cells, cells))).astype(np.float32)
     depth[generator.random((cells, cells)) < share] = np.nan
@@ -149,7 +182,12 @@ scenes = st.builds(
     rig=st.sampled_from([RIG, OPEN, BEHIND]),
     object_depth_m=depths,
     surface=st.sampled_from(
-        [Surface(), Surface(0.5), Surface(COLOURED), Surface(np.array([1, 0.99, 1]))]
+        [
+            Surface(),
+            Surface(0.5),
+            Surface(COLOURED),
+            Surface(np.array([1, 0.99, 1])),
+        ]
     ),
     radiometry=st.sampled_from(["paper", "lambertian"]),
     jump_m=st.sampled_from([0.02, 0.5]),
@@ -173,7 +211,15 @@ BOUNDED = tuple(name for name in EFFECTS if name not in {"direct", "three-bounce
 
 @settings(max_examples=12, deadline=None, derandomize=True)
 @given(
-    scene=scenes, name=st.sampled_from(BOUNDED), cells=st.sampled_from([(8, 6), (3, 11), (1, 1)])
+    scene=scenes,
+    name=st.sampled_from(BOUNDED),
+    cells=st.sampled_from(
+        [
+            (8, 6),
+            (3, 11),
+            (1, 1),
+        ]
+    ),
 )
 def test_bound_is_never_below_the_change_without_the_effect(
     scene: Scene, name: str, cells: tuple[int, int]
@@ -190,11 +236,19 @@ def test_bound_is_never_below_the_change_without_the_effect(
 
 
 def test_bound_of_a_brdf_counts_its_replacement() -> None:
-    scene = Scene(RIG, _plate(), Surface(1.0, phong(0.8, 0.2, 1)))
+    scene = Scene(
+        RIG,
+        _plate(),
+        Surface(1.0, phong(0.8, 0.2, 1)),
+    )
     verdicts = plan(SceneFacts(scene, COARSE))
     assert included(verdicts, "brdf")
     bound = next(effect.bound for effect in verdicts if effect.name == "brdf")
     whole, without = (
-        transient(scene, COARSE, names) for names in (set(EFFECTS), set(EFFECTS) - {"brdf"})
+        transient(scene, COARSE, names)
+        for names in (
+            set(EFFECTS),
+            set(EFFECTS) - {"brdf"},
+        )
     )
     assert _change(without[..., None], whole[..., None]) <= bound

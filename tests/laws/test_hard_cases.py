@@ -24,15 +24,34 @@ MAX_EFFECTS = sorted(set(EFFECTS) - {"inter-reflection", "pulse"})
 CLIFF = depth_map(8, 0.38, (np.s_[:, :4], 0.13))
 ONE_PIXEL = depth_map(8, np.nan, ((3, 5), 0.2))
 OBJECTS = {
-    **{f"touching from {z_m} m": depth_map(8, z_m) for z_m in (0.0, 1e-30, 1e-9, 1e-4, 0.01)},
-    "half touching": np.linspace(0, 0.2, 64, dtype=np.float32).reshape(8, 8),
+    **{
+        f"touching from {z_m} m": depth_map(8, z_m)
+        for z_m in (
+            0.0,
+            1e-30,
+            1e-9,
+            1e-4,
+            0.01,
+        )
+    },
+    "half touching": np.linspace(
+        0,
+        0.2,
+        64,
+        dtype=np.float32,
+    ).reshape(8, 8),
     "one pixel": ONE_PIXEL,
     "one cell is the whole grid": depth_map(1, 0.2),
     "empty": depth_map(8),
     "spike": depth_map(8, 0.38, ((4, 4), 1e-3)),
     "cliff": CLIFF,
     "full": depth_map(8, 0.25),
-    "tiny and huge": np.geomspace(1e-38, 1e3, 64, dtype=np.float32).reshape(8, 8),
+    "tiny and huge": np.geomspace(
+        1e-38,
+        1e3,
+        64,
+        dtype=np.float32,
+    ).reshape(8, 8),
 }
 
 
@@ -78,7 +97,10 @@ def test_beam_along_the_wall_has_no_return(implementation: Any) -> None:
     """
     pinhole = OPEN.pinhole.scaled(80, 64)
     angle = np.degrees(np.arctan((79 - pinhole.ppx) / pinhole.fx))
-    rendering = implementation.render(Scene(_lidar(0.2, 90 - angle, OPEN), ONE_PIXEL), accuracy=FEW)
+    rendering = implementation.render(
+        Scene(_lidar(0.2, 90 - angle, OPEN), ONE_PIXEL),
+        accuracy=FEW,
+    )
     _check(rendering)
     assert np.isnan(rendering.depth_m[:, 79]).all()
 
@@ -86,7 +108,10 @@ def test_beam_along_the_wall_has_no_return(implementation: Any) -> None:
 @pytest.mark.parametrize("gate_m", [1e-9, 0.1, 0.9, 1.2034])
 def test_gate_ends_the_histogram(implementation: Any, gate_m: float) -> None:
     device = RIG.device.model_copy(update={"gate_s": gate_m / SPEED_OF_LIGHT_M_PER_S})
-    scene = Scene(RIG.model_copy(update={"device": device}), depth_map(8, 0.2))
+    scene = Scene(
+        RIG.model_copy(update={"device": device}),
+        depth_map(8, 0.2),
+    )
     rendering = implementation.render(scene, accuracy=FEW)
     whole = implementation.transient(scene, accuracy=FEW)
     _check(rendering)
@@ -107,7 +132,13 @@ def test_path_on_the_edge_of_a_bin_is_kept(implementation: Any) -> None:
     depth = depth_map(8, np.nan, ((3, 3), 0.25))
     one = replace(FEW, relay_columns=1, relay_rows=1)
     job = prepare(Scene(OPEN, depth), one, ["three-bounce"]).job
-    cell = np.array([job.relay.x_m[0], job.relay.y_m[0], 0])
+    cell = np.array(
+        [
+            job.relay.x_m[0],
+            job.relay.y_m[0],
+            0,
+        ]
+    )
     point = job.patches.point_m[0]
     path = (
         job.length_m
@@ -128,22 +159,51 @@ def test_histogram_holds_a_ratio_of_a_million_to_one(implementation: Any) -> Non
     """A patch with an albedo of 1e-6 stays as bright as alone beside a white one."""
     alone = depth_map(8, np.nan, ((6, 6), 0.4))
     albedo = np.full((8, 8), 1e-6)
-    depth = depth_map(8, np.nan, ((6, 6), 0.4), ((1, 1), 0.14))
+    depth = depth_map(
+        8,
+        np.nan,
+        ((6, 6), 0.4),
+        ((1, 1), 0.14),
+    )
     albedo[1, 1] = 1.0
     effects = ["three-bounce", "occluder"]
     some = np.arange(5120)[::61]
-    both = implementation.three_bounce(Scene(RIG, depth, Surface(albedo)), some, effects, FEW)
-    dim = implementation.three_bounce(Scene(RIG, alone, Surface(albedo)), some, effects, FEW)
+    both = implementation.three_bounce(
+        Scene(RIG, depth, Surface(albedo)),
+        some,
+        effects,
+        FEW,
+    )
+    dim = implementation.three_bounce(
+        Scene(RIG, alone, Surface(albedo)),
+        some,
+        effects,
+        FEW,
+    )
     only = implementation.three_bounce(
-        Scene(RIG, depth, Surface(np.where(albedo < 1, 0, 1.0))), some, effects, FEW
+        Scene(
+            RIG,
+            depth,
+            Surface(np.where(albedo < 1, 0, 1.0)),
+        ),
+        some,
+        effects,
+        FEW,
     )
     own = (dim > 0) & (only[:, : dim.shape[1]] == 0)
     assert own.sum() > 100
     assert both.max() > 1e6 * both[:, : dim.shape[1]][own].max()
-    np.testing.assert_allclose(both[:, : dim.shape[1]][own], dim[own], rtol=1e-4)
+    np.testing.assert_allclose(
+        both[:, : dim.shape[1]][own],
+        dim[own],
+        rtol=1e-4,
+    )
 
 
-@pytest.mark.parametrize("dtype", [np.float16, np.float32, np.float64, ">f4", np.longdouble])
+@pytest.mark.parametrize(
+    "dtype",
+    [np.float16, np.float32, np.float64, ">f4", np.longdouble],
+)
 @pytest.mark.parametrize("layout", ["C", "F", "strided", "read-only"])
 def test_dtype_and_layout_do_not_change_the_result(
     implementation: Any, dtype: Any, layout: str
@@ -151,16 +211,32 @@ def test_dtype_and_layout_do_not_change_the_result(
     plain = CLIFF.astype(np.float16)
     depth = plain.astype(dtype, order="F" if layout == "F" else "C")
     if layout == "strided":
-        depth = np.repeat(np.repeat(depth, 2, 0), 3, 1)[::2, ::3]
+        depth = np.repeat(
+            np.repeat(depth, 2, 0),
+            3,
+            1,
+        )[::2, ::3]
     depth.flags.writeable = layout != "read-only"
     expected = implementation.three_bounce(
-        Scene(RIG, plain.astype(np.float32)), np.arange(5120)[::401], accuracy=FEW
+        Scene(
+            RIG,
+            plain.astype(np.float32),
+        ),
+        np.arange(5120)[::401],
+        accuracy=FEW,
     )
-    found = implementation.three_bounce(Scene(RIG, depth), np.arange(5120)[::401], accuracy=FEW)
+    found = implementation.three_bounce(
+        Scene(RIG, depth),
+        np.arange(5120)[::401],
+        accuracy=FEW,
+    )
     np.testing.assert_array_equal(found, expected)
 
 
-@pytest.mark.parametrize("bad", [np.inf, -np.inf, -0.1, -1e-6, -1e-9])
+@pytest.mark.parametrize(
+    "bad",
+    [np.inf, -np.inf, -0.1, -1e-6, -1e-9],
+)
 def test_scene_refuses_depths_that_cannot_be(bad: float) -> None:
     with pytest.raises(SceneError, match="depth"):
         Scene(RIG, depth_map(8, 0.2, ((3, 3), bad)))
@@ -169,7 +245,13 @@ def test_scene_refuses_depths_that_cannot_be(bad: float) -> None:
 values = st.one_of(
     st.just(np.nan), st.floats(0, 0.5, width=32), st.sampled_from([0.0, 1e-38, 1e-9, 5.0])
 )
-grids = st.integers(1, 6).flatmap(lambda n: st.lists(values, min_size=n * n, max_size=n * n))
+grids = st.integers(1, 6).flatmap(
+    lambda n: st.lists(
+        values,
+        min_size=n * n,
+        max_size=n * n,
+    )
+)
 
 
 @settings(max_examples=15, deadline=None, derandomize=True)
@@ -177,7 +259,14 @@ grids = st.integers(1, 6).flatmap(lambda n: st.lists(values, min_size=n * n, max
     cells=grids,
     albedo=st.sampled_from([0.0, 1e-6, 1.0]),
     radiometry=st.sampled_from(["paper", "lambertian"]),
-    rig=st.sampled_from([RIG, OPEN, _lidar(0.15, 15.0), _lidar(0.15, 75.0, OPEN)]),
+    rig=st.sampled_from(
+        [
+            RIG,
+            OPEN,
+            _lidar(0.15, 15.0),
+            _lidar(0.15, 75.0, OPEN),
+        ]
+    ),
     jump_m=st.sampled_from([0.0, 0.02, 10.0]),
 )
 def test_any_depths_give_bounded_maps(

@@ -40,11 +40,22 @@ def _object(seed: int = 5, size: int = 32) -> np.ndarray:
 
 
 def _plane(size: int = 22) -> np.ndarray:
-    return depth_map(32, np.nan, (np.s_[4 : 4 + size, 4 : 4 + size], 0.2 + 0.004 * np.arange(size)))
+    return depth_map(
+        32,
+        np.nan,
+        (
+            np.s_[4 : 4 + size, 4 : 4 + size],
+            0.2 + 0.004 * np.arange(size),
+        ),
+    )
 
 
 COLUMN_X_M = float(cell_centers_m(object_box(RIG), 32)[0][9])
-NEAR = depth_map(32, np.nan, (np.s_[10:20, 10:20], 0.004))
+NEAR = depth_map(
+    32,
+    np.nan,
+    (np.s_[10:20, 10:20], 0.004),
+)
 PIXEL = depth_map(32, np.nan, ((15, 15), 0.3))
 SCENES = {
     "object": Scene(RIG, _object()),
@@ -56,17 +67,42 @@ SCENES = {
         RIG.model_copy(update={"occluder": Occluder(x_m=0.43, z_min_m=0.1)}), _plane()
     ),
     "occluder on a column": Scene(
-        RIG.model_copy(update={"occluder": Occluder(x_m=COLUMN_X_M, z_min_m=0.1)}), _plane()
+        RIG.model_copy(
+            update={
+                "occluder": Occluder(
+                    x_m=COLUMN_X_M,
+                    z_min_m=0.1,
+                )
+            }
+        ),
+        _plane(),
     ),
     "near contact": Scene(RIG, NEAR),
     "near contact, lambertian": Scene(RIG, NEAR, radiometry="lambertian"),
-    "coloured": Scene(RIG, _object(), Surface(np.array([0.9, 0.5, 0.1]))),
+    "coloured": Scene(
+        RIG,
+        _object(),
+        Surface(np.array([0.9, 0.5, 0.1])),
+    ),
     "one pixel": Scene(RIG, PIXEL),
-    "full grid": Scene(RIG, depth_map(32, 0.38, (np.s_[:, 12:14], 0.15))),
-    "phong": Scene(RIG, _plane(8), Material(kind="phong", exponent=3).surface),
+    "full grid": Scene(
+        RIG,
+        depth_map(32, 0.38, (np.s_[:, 12:14], 0.15)),
+    ),
+    "phong": Scene(
+        RIG,
+        _plane(8),
+        Material(kind="phong", exponent=3).surface,
+    ),
     "retroreflective": Scene(RIG, PIXEL, Material(kind="retroreflective").surface),
     "inter-reflection": Scene(
-        RIG, depth_map(4, 0.15, (np.s_[1:3, 1:3], 0.32)), radiometry="lambertian"
+        RIG,
+        depth_map(
+            4,
+            0.15,
+            (np.s_[1:3, 1:3], 0.32),
+        ),
+        radiometry="lambertian",
     ),
 }
 MANY_PATCHES = 2e-3
@@ -95,7 +131,10 @@ def _histograms(kind: str, backend: str) -> np.ndarray:
 _kept = cache(_histograms)
 
 
-@pytest.mark.parametrize("backend", ["cpu", "torch", pytest.param("cuda", marks=NO_GPU)])
+@pytest.mark.parametrize(
+    "backend",
+    ["cpu", "torch", pytest.param("cuda", marks=NO_GPU)],
+)
 @pytest.mark.parametrize("kind", SCENES)
 def test_backend_agrees_with_the_reference(kind: str, backend: str) -> None:
     found = _kept(kind, backend)
@@ -110,7 +149,10 @@ def test_backend_agrees_with_the_reference(kind: str, backend: str) -> None:
     )
 
 
-@pytest.mark.parametrize("backend", ["torch", pytest.param("cuda", marks=NO_GPU)])
+@pytest.mark.parametrize(
+    "backend",
+    ["torch", pytest.param("cuda", marks=NO_GPU)],
+)
 @pytest.mark.parametrize("kind", SCENES)
 def test_torch_and_numba_differ_by_rounding(kind: str, backend: str) -> None:
     found = _kept(kind, backend)
@@ -120,15 +162,25 @@ def test_torch_and_numba_differ_by_rounding(kind: str, backend: str) -> None:
     assert np.abs(found - other).sum() < limit * other.sum()
 
 
-@pytest.mark.parametrize("backend", ["torch", pytest.param("cuda", marks=NO_GPU)])
+@pytest.mark.parametrize(
+    "backend",
+    ["torch", pytest.param("cuda", marks=NO_GPU)],
+)
 def test_torch_is_repeatable(backend: str) -> None:
     assert np.array_equal(_histograms("object", backend), _kept("object", backend))
 
 
-@pytest.mark.parametrize("backend", ["cpu", "torch", pytest.param("cuda", marks=NO_GPU)])
+@pytest.mark.parametrize(
+    "backend",
+    ["cpu", "torch", pytest.param("cuda", marks=NO_GPU)],
+)
 def test_batch_renders_each_scene_as_alone(backend: str) -> None:
     """To the last bit on the CPU, also of a batch of one."""
-    coloured = Scene(RIG, PIXEL, Surface(np.array([0.9, 0.5, 0.1])))
+    coloured = Scene(
+        RIG,
+        PIXEL,
+        Surface(np.array([0.9, 0.5, 0.1])),
+    )
     open_rig = SCENES["no occluder"].rig
     lambertian = Scene(RIG, _object(size=16), radiometry="lambertian")
     scenes = [
@@ -139,7 +191,11 @@ def test_batch_renders_each_scene_as_alone(backend: str) -> None:
         SCENES["one pixel"],
     ]
     for batch in ([*scenes, lambertian], scenes[:1]):
-        for scene, rendering in zip(batch, render_all(batch, SMALL, backend=backend), strict=True):
+        for scene, rendering in zip(
+            batch,
+            render_all(batch, SMALL, backend=backend),
+            strict=True,
+        ):
             alone = render(scene, SMALL, backend=backend)
             for one, same in (
                 (rendering.multi.peak, alone.multi.peak),

@@ -20,7 +20,14 @@ from nlos_cam.objects.meshes import read_mesh, turn_upright
 from nlos_cam.objects.placement import Pose, category_triangles, object_depth, place
 
 BOX: ObjectBox = load_rig("paper-rig").object_box
-POSE = Pose(tilt_x_rad=0.2, tilt_y_rad=-0.3, turn_z_rad=0.4, size_m=0.19, x_m=0.01, y_m=-0.02)
+POSE = Pose(
+    tilt_x_rad=0.2,
+    tilt_y_rad=-0.3,
+    turn_z_rad=0.4,
+    size_m=0.19,
+    x_m=0.01,
+    y_m=-0.02,
+)
 EXPORTS: dict[str, Callable[[trimesh.Trimesh], bytes]] = {
     "text.obj": lambda mesh: mesh.export(file_type="obj", digits=12).encode(),
     "binary.stl": lambda mesh: mesh.export(file_type="stl"),
@@ -47,10 +54,20 @@ def _assert_same(depth: np.ndarray, other: np.ndarray) -> None:
     """The same but for rounding: it may decide a few cells that an edge runs through, and no
     others.
     """
-    differs = ~np.isclose(depth, other, rtol=0, atol=SINGLE_M, equal_nan=True)
+    differs = ~np.isclose(
+        depth,
+        other,
+        rtol=0,
+        atol=SINGLE_M,
+        equal_nan=True,
+    )
     assert differs.sum() <= 3
     assert np.isfinite(depth).sum() > 100
-    padded = np.pad(np.nan_to_num(depth, nan=1.0), 1, mode="edge")
+    padded = np.pad(
+        np.nan_to_num(depth, nan=1.0),
+        1,
+        mode="edge",
+    )
     around = np.lib.stride_tricks.sliding_window_view(padded, (3, 3))
     assert (np.ptp(around, axis=(2, 3))[differs] > 0.001).all()
 
@@ -94,15 +111,24 @@ def test_quarter_turn_about_z_turns_the_depth_map(category: str) -> None:
 
 
 @settings(max_examples=25, deadline=None)
-@given(st.integers(0, 2**31), st.sampled_from(sorted(CATEGORIES)))
+@given(
+    st.integers(0, 2**31),
+    st.sampled_from(sorted(CATEGORIES)),
+)
 def test_winding_order_and_repetition_of_faces_do_not_matter(seed: int, category: str) -> None:
     generator = np.random.default_rng(seed)
     triangles = category_triangles(category, 4)
-    corners = generator.permuted(np.tile(np.arange(3), (len(triangles), 1)), axis=1)
+    corners = generator.permuted(
+        np.tile(np.arange(3), (len(triangles), 1)),
+        axis=1,
+    )
     shuffled = np.take_along_axis(triangles, corners[..., None], axis=1)[
         generator.permutation(len(triangles))
     ]
-    _assert_same(_depth(np.concatenate([shuffled, shuffled[:50]])), _depth(triangles))
+    _assert_same(
+        _depth(np.concatenate([shuffled, shuffled[:50]])),
+        _depth(triangles),
+    )
 
 
 def test_mesh_with_z_up_equals_the_same_with_y_up(tmp_path: Path) -> None:
@@ -123,7 +149,20 @@ def _plates(depth_m: np.ndarray) -> Triangles:
     half_x = (x[1] - x[0]) / 2
     half_y = (y[0] - y[1]) / 2
     row, column = np.nonzero(~np.isnan(depth_m))
-    signs = np.array([[(-1, -1), (1, -1), (1, 1)], [(-1, -1), (1, 1), (-1, 1)]])
+    signs = np.array(
+        [
+            [
+                (-1, -1),
+                (1, -1),
+                (1, 1),
+            ],
+            [
+                (-1, -1),
+                (1, 1),
+                (-1, 1),
+            ],
+        ]
+    )
     corners = np.empty((len(row), 2, 3, 3))
     corners[..., 0] = x[column][:, None, None] + signs[..., 0] * half_x
     corners[..., 1] = y[row][:, None, None] + signs[..., 1] * half_y
@@ -141,9 +180,13 @@ def _sheet(depth_m: np.ndarray) -> Triangles:
     b = point[:-1, 1:]
     c = point[1:, 1:]
     d = point[1:, :-1]
-    both = np.stack([np.stack([a, b, c], axis=2), np.stack([a, c, d], axis=2)], axis=2).reshape(
-        -1, 3, 3
-    )
+    both = np.stack(
+        [
+            np.stack([a, b, c], axis=2),
+            np.stack([a, c, d], axis=2),
+        ],
+        axis=2,
+    ).reshape(-1, 3, 3)
     return both[~np.isnan(both).any(axis=(1, 2))]
 
 
@@ -155,13 +198,22 @@ def test_plates_of_a_depth_map_rasterize_back_to_it(
 ) -> None:
     """Within single precision, cell by cell: no map is too ragged."""
     generator = np.random.default_rng(pixels)
-    depth = generator.uniform(BOX.z_near_m, BOX.z_far_m, (pixels, pixels)).astype(np.float32)
+    depth = generator.uniform(
+        BOX.z_near_m,
+        BOX.z_far_m,
+        (pixels, pixels),
+    ).astype(np.float32)
     depth[generator.uniform(size=depth.shape) < 0.5] = np.nan
     triangles = _plates(depth)
     if name:
         (tmp_path / name).write_bytes(EXPORTS[name](_mesh(triangles)))
         triangles = read_mesh(tmp_path / name).triangles
-    np.testing.assert_allclose(orthographic_depth(triangles, BOX, pixels), depth, rtol=0, atol=1e-7)
+    np.testing.assert_allclose(
+        orthographic_depth(triangles, BOX, pixels),
+        depth,
+        rtol=0,
+        atol=1e-7,
+    )
 
 
 def test_sheet_through_a_depth_map_rasterizes_back_to_it() -> None:
@@ -170,7 +222,12 @@ def test_sheet_through_a_depth_map_rasterizes_back_to_it() -> None:
         depth = object_depth(seed, BOX)[1]
         sheet = orthographic_depth(_sheet(depth), BOX)
         drawn = ~np.isnan(sheet)
-        np.testing.assert_allclose(sheet[drawn], depth[drawn], rtol=0, atol=1e-7)
+        np.testing.assert_allclose(
+            sheet[drawn],
+            depth[drawn],
+            rtol=0,
+            atol=1e-7,
+        )
         lost = ~drawn & ~np.isnan(depth)
         assert lost.sum() < 0.1 * drawn.sum()
 
@@ -178,6 +235,13 @@ def test_sheet_through_a_depth_map_rasterizes_back_to_it() -> None:
 def test_placing_a_placed_mesh_moves_nothing() -> None:
     placed = place(category_triangles("hat", 2), POSE, BOX)
     again = place(
-        placed, Pose(size_m=POSE.size_m, x_m=POSE.x_m, y_m=POSE.y_m, front_m=POSE.front_m), BOX
+        placed,
+        Pose(
+            size_m=POSE.size_m,
+            x_m=POSE.x_m,
+            y_m=POSE.y_m,
+            front_m=POSE.front_m,
+        ),
+        BOX,
     )
     np.testing.assert_allclose(again, placed, atol=1e-12)

@@ -23,13 +23,24 @@ RIG = load_rig("paper-rig")
 
 @pytest.fixture(scope="module")
 def objects() -> list[np.ndarray]:
-    return [object_depth(seed, RIG.object_box)[1] for seed in (3, 20_000_001, 20_000_009)]
+    return [
+        object_depth(seed, RIG.object_box)[1]
+        for seed in (
+            3,
+            20_000_001,
+            20_000_009,
+        )
+    ]
 
 
 def test_depth_maps_of_direct_returns_do_not_show_the_object(objects: list[np.ndarray]) -> None:
     empty = render(Scene(RIG), "draft").depth_m
     for depth in objects:
-        alone = render(Scene(RIG, depth), "draft", effects=["direct", "occluder", "line-of-sight"])
+        alone = render(
+            Scene(RIG, depth),
+            "draft",
+            effects=["direct", "occluder", "line-of-sight"],
+        )
         np.testing.assert_array_equal(alone.depth_m, empty)
 
 
@@ -56,7 +67,13 @@ def test_receiver_cell_scales_only_the_direct_return() -> None:
         update={"device": RIG.device.model_copy(update={"receiver_cell_m2": 2e-4})}
     )
     depth = np.full((8, 8), 0.25, np.float32)
-    one, other = (three_bounce(Scene(rig, depth), "draft") for rig in (RIG, wide))
+    one, other = (
+        three_bounce(
+            Scene(rig, depth),
+            "draft",
+        )
+        for rig in (RIG, wide)
+    )
     np.testing.assert_array_equal(one, other)
     direct, wider = (transient(Scene(rig), "draft").sum() for rig in (RIG, wide))
     assert wider == pytest.approx(2 * direct, rel=1e-5)
@@ -74,7 +91,17 @@ def _given_back(brdf: Brdf, cos_in: float) -> float:
         (np.arange(2000) + 0.5) / 2000, np.linspace(0, np.pi, 2001)[1:] - np.pi / 4000
     )
     across = np.sqrt((1 - cos_in**2) * (1 - cos_out**2)) * np.cos(turn)
-    return float(2 * (brdf(cos_in, cos_out, cos_in * cos_out + across) * cos_out).mean())
+    return float(
+        2
+        * (
+            brdf(
+                cos_in,
+                cos_out,
+                cos_in * cos_out + across,
+            )
+            * cos_out
+        ).mean()
+    )
 
 
 @pytest.mark.slow
@@ -89,7 +116,10 @@ def test_brdf_returns_no_more_light_than_came(kind: Any, exponent: float, cos_in
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("exponent", [1, 20, 500])
 def test_brdf_along_the_normal_returns_all_light(kind: Any, exponent: float) -> None:
-    assert _given_back(kind(0.5, 0.5, exponent), 1.0) == pytest.approx(1, abs=2e-3)
+    assert _given_back(
+        kind(0.5, 0.5, exponent),
+        1.0,
+    ) == pytest.approx(1, abs=2e-3)
 
 
 cosines = st.floats(0.01, 1.0)
@@ -97,13 +127,21 @@ cosines = st.floats(0.01, 1.0)
 
 @pytest.mark.parametrize("kind", KINDS)
 @settings(deadline=None, derandomize=True)
-@given(cos_in=cosines, cos_out=cosines, turn=st.floats(0, np.pi))
+@given(
+    cos_in=cosines,
+    cos_out=cosines,
+    turn=st.floats(0, np.pi),
+)
 def test_brdf_is_reciprocal_and_never_negative(
     kind: Any, cos_in: float, cos_out: float, turn: float
 ) -> None:
     between = cos_in * cos_out + np.sqrt((1 - cos_in**2) * (1 - cos_out**2)) * np.cos(turn)
     brdf = kind(0.3, 0.7, 20)
-    assert brdf(cos_in, cos_out, between) == pytest.approx(brdf(cos_out, cos_in, between))
+    assert brdf(
+        cos_in,
+        cos_out,
+        between,
+    ) == pytest.approx(brdf(cos_out, cos_in, between))
     assert brdf(cos_in, cos_out, between) >= 0.3
 
 
@@ -126,10 +164,21 @@ def test_phong_without_its_lobe_is_lambertian(implementation: Any) -> None:
     depth = np.random.default_rng(0).uniform(0.2, 0.3, (6, 6)).astype(np.float32)
     effects = ["three-bounce", "occluder", "tilt", "brdf"]
     dull = implementation.three_bounce(
-        Scene(RIG, depth, Surface(1.0, phong(0.6, 0.0, 20))), SOME, effects
+        Scene(
+            RIG,
+            depth,
+            Surface(1.0, phong(0.6, 0.0, 20)),
+        ),
+        SOME,
+        effects,
     )
     plain = implementation.three_bounce(Scene(RIG, depth, Surface(0.6)), SOME, effects)
-    np.testing.assert_allclose(dull, plain, rtol=1e-4, atol=1e-6 * plain.max())
+    np.testing.assert_allclose(
+        dull,
+        plain,
+        rtol=1e-4,
+        atol=1e-6 * plain.max(),
+    )
 
 
 @pytest.mark.slow
@@ -138,9 +187,20 @@ def test_brdf_agrees_with_brute_force() -> None:
     scene = Scene(RIG, depth, Surface(1.0, phong(0.4, 0.6, 10)))
     effects = ["three-bounce", "occluder", "tilt", "brdf"]
     found, exact = (
-        three_bounce(scene, each, effects, chosen=SOME).sum(1) for each in (COARSE, BRUTE_FORCE)
+        three_bounce(
+            scene,
+            each,
+            effects,
+            chosen=SOME,
+        ).sum(1)
+        for each in (COARSE, BRUTE_FORCE)
     )
-    dull = three_bounce(scene, BRUTE_FORCE, effects[:-1], chosen=SOME).sum(1)
+    dull = three_bounce(
+        scene,
+        BRUTE_FORCE,
+        effects[:-1],
+        chosen=SOME,
+    ).sum(1)
     assert np.abs(found - exact).sum() < 1e-2 * exact.sum()
     assert np.abs(exact - dull).sum() > 0.05 * dull.sum()
 
@@ -180,7 +240,17 @@ def test_softening_fades_out_at_the_near_distance() -> None:
 
 def test_far_object_has_no_near_legs() -> None:
     assert (
-        render(Scene(RIG, depth_map(64, np.nan, (np.s_[20:40, 20:40], 0.3))), "draft").near_legs
+        render(
+            Scene(
+                RIG,
+                depth_map(
+                    64,
+                    np.nan,
+                    (np.s_[20:40, 20:40], 0.3),
+                ),
+            ),
+            "draft",
+        ).near_legs
         == 0
     )
 
@@ -207,8 +277,18 @@ def test_pulse_keeps_energy_and_lowers_the_peak(implementation: Any) -> None:
     thin = implementation.transient(Scene(RIG, DEPTH)).astype(np.float64)
     peak = thin.max()
     for pulse_ns in WIDTHS_NS[1:4]:
-        wide = implementation.transient(Scene(RIG, DEPTH, pulse_ns=pulse_ns)).astype(np.float64)
-        np.testing.assert_allclose(wide.sum(-1), thin.sum(-1), rtol=1e-5)
+        wide = implementation.transient(
+            Scene(
+                RIG,
+                DEPTH,
+                pulse_ns=pulse_ns,
+            )
+        ).astype(np.float64)
+        np.testing.assert_allclose(
+            wide.sum(-1),
+            thin.sum(-1),
+            rtol=1e-5,
+        )
         assert wide.max() < peak
         peak = wide.max()
 
@@ -232,7 +312,10 @@ def test_pulse_spreads_an_echo_into_a_gaussian(pulse_ns: float) -> None:
     assert wide.sum() == pytest.approx(2)
     assert (wide * at).sum() == pytest.approx(0, abs=1e-3)
     if sigma > 1:  # plus the variance of a bin
-        assert (wide * at**2).sum() / 2 == pytest.approx(sigma**2 + 1 / 12, rel=1e-2)
+        assert (wide * at**2).sum() / 2 == pytest.approx(
+            sigma**2 + 1 / 12,
+            rel=1e-2,
+        )
     assert wide.argmax() == 200
     assert len(wide) > 400 + 3 * sigma  # room for the tail
     assert pulse_ns < 1 or (wide >= wide.max() / 2).sum() * BIN_M == pytest.approx(
@@ -245,5 +328,9 @@ def test_wide_pulse_mixes_direct_return_and_echoes(implementation: Any) -> None:
     rendering = implementation.render(Scene(RIG, DEPTH, pulse_ns=1.0))
     assert rendering.multi.direct_included
     seen = np.isfinite(rendering.multi.path_m)
-    np.testing.assert_allclose(rendering.multi.path_m[seen] / BIN_M % 1, 0.5, atol=1e-3)
+    np.testing.assert_allclose(
+        rendering.multi.path_m[seen] / BIN_M % 1,
+        0.5,
+        atol=1e-3,
+    )
     np.testing.assert_array_equal(rendering.intensity, rendering.multi.peak)

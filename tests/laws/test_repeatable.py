@@ -22,7 +22,11 @@ DEPTH = np.random.default_rng(0).uniform(0.13, 0.35, (8, 8)).astype(np.float32)
 SCENES = {
     "plain": Scene(RIG, DEPTH),
     "lambertian": Scene(RIG, DEPTH, radiometry="lambertian", jump_m=0.5),
-    "shiny": Scene(RIG, DEPTH[:3, :3], Surface(1.0, phong(0.4, 0.6, 10))),
+    "shiny": Scene(
+        RIG,
+        DEPTH[:3, :3],
+        Surface(1.0, phong(0.4, 0.6, 10)),
+    ),
     "bouncing": Scene(RIG, DEPTH[:3, :3], radiometry="lambertian"),
 }
 EVERY = np.arange(5120)
@@ -55,7 +59,11 @@ def whole(implementation: Any) -> dict[str, np.ndarray]:
 
 
 @settings(max_examples=10, deadline=None, derandomize=True)
-@given(name=st.sampled_from(sorted(SCENES)), start=st.integers(0, 5000), step=st.integers(1, 900))
+@given(
+    name=st.sampled_from(sorted(SCENES)),
+    start=st.integers(0, 5000),
+    step=st.integers(1, 900),
+)
 def test_beams_do_not_depend_on_other_beams(
     implementation: Any, whole: Any, name: str, start: int, step: int
 ) -> None:
@@ -76,7 +84,11 @@ ROUGHLY = replace(FEW, scatter_error=0.5, beams_per_cell=2)
 
 @pytest.mark.parametrize(
     ("name", "accuracy", "rows"),
-    [("plain", COARSE, (17, 40)), ("lambertian", COARSE, (17, 40)), ("shiny", ROUGHLY, (30, 33))],
+    [
+        ("plain", COARSE, (17, 40)),
+        ("lambertian", COARSE, (17, 40)),
+        ("shiny", ROUGHLY, (30, 33)),
+    ],
 )
 def test_rows_alone_equal_rows_of_the_whole(
     name: str, accuracy: Accuracy, rows: tuple[int, int]
@@ -84,7 +96,10 @@ def test_rows_alone_equal_rows_of_the_whole(
     every = render(SCENES[name], accuracy)
     part = render(SCENES[name], accuracy, rows=rows)
     for image in ("intensity", "depth_m", "margin"):
-        np.testing.assert_array_equal(getattr(part, image), getattr(every, image)[slice(*rows)])
+        np.testing.assert_array_equal(
+            getattr(part, image),
+            getattr(every, image)[slice(*rows)],
+        )
 
 
 @pytest.mark.usefixtures("one_thread")

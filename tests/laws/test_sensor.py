@@ -26,7 +26,13 @@ QUIET = SensorModel(
     range_noise_m=0, range_noise_per_m=0, read_noise_counts=0, shot_noise=0, dead_share=0
 )
 RICH = SensorModel(ambient_counts=40, read_noise_counts=1.5, dead_share=0)
-BIAS: dict[str, object] = {"warm_up": WarmUp(from_celsius=25, to_celsius=45, time_constant_s=600)}
+BIAS: dict[str, object] = {
+    "warm_up": WarmUp(
+        from_celsius=25,
+        to_celsius=45,
+        time_constant_s=600,
+    )
+}
 BIAS |= {
     "range_offset_m": 0.0045,
     "ripple_m": 0.002,
@@ -50,11 +56,22 @@ BARE = _at_map_size(load_rig("bare-wall"))
 BRIGHTEST = float(cast(BARE, BARE.pinhole).direct.max())
 
 
-def _echo(counts: np.ndarray | float, path_m: np.ndarray | float = 1.0) -> MultiBounce:
+def _echo(
+    counts: np.ndarray | float,
+    path_m: np.ndarray | float = 1.0,
+) -> MultiBounce:
     """Echoes of these counts without a direct return."""
-    peak = np.broadcast_to(np.asarray(counts) * BRIGHTEST / 48, (64, 80)).astype(np.float32)
+    peak = np.broadcast_to(
+        np.asarray(counts) * BRIGHTEST / 48,
+        (64, 80),
+    ).astype(np.float32)
     path = np.broadcast_to(path_m, (64, 80)).astype(np.float32)
-    return MultiBounce(peak, np.zeros((64, 80), np.float32), path, direct_included=True)
+    return MultiBounce(
+        peak,
+        np.zeros((64, 80), np.float32),
+        path,
+        direct_included=True,
+    )
 
 
 def _frames(model: SensorModel, echo: MultiBounce) -> list[SensedImages]:
@@ -97,12 +114,21 @@ def _bias_m(model: SensorModel) -> np.ndarray:
 )
 def test_sensor_equals_plain_float64_array_steps(rendering: Rendering, model: SensorModel) -> None:
     """The same chain written as plain array steps, in float64."""
-    fast = Sensor(RIG, model).expose(rendering.multi, default_rng(3), celsius=CELSIUS)
+    fast = Sensor(RIG, model).expose(
+        rendering.multi,
+        default_rng(3),
+        celsius=CELSIUS,
+    )
     multi = rendering.multi
     beams = cast(RIG, RIG.pinhole)
     generator = default_rng(3)
     peak, runner_up, path = (
-        each.ravel().astype(float) for each in (multi.peak, multi.runner_up, multi.path_m)
+        each.ravel().astype(float)
+        for each in (
+            multi.peak,
+            multi.runner_up,
+            multi.path_m,
+        )
     )
     one, other = (
         generator.standard_normal(peak.size, np.float32) if model != QUIET else 0 for _ in range(2)
@@ -117,19 +143,36 @@ def test_sensor_equals_plain_float64_array_steps(rendering: Rendering, model: Se
     )
     read = model.read_noise_counts**2
     shot = model.shot_noise**2
-    alone, noise = (np.sqrt(read + shot * (counts + light)) for light in (0, model.ambient_counts))
+    alone, noise = (
+        np.sqrt(read + shot * (counts + light))
+        for light in (
+            0,
+            model.ambient_counts,
+        )
+    )
     seen = np.minimum(counts + model.ambient_counts + one * noise, SATURATED) - model.ambient_counts
     certain = counts * (alone / noise if model.ambient_counts else 1)
     confidence = (
         15 * (1 - np.exp(-certain / 6)) * (1 - 0.5 * second / np.maximum(intensity, 1e-30)) + 0.5
     )
-    depth = np.where(peak > beams.direct, path / 2, beams.length_m) * beams.cos_axis
+    depth = (
+        np.where(
+            peak > beams.direct,
+            path / 2,
+            beams.length_m,
+        )
+        * beams.cos_axis
+    )
     depth += _bias_m(model)
     depth += other * (model.range_noise_m + model.range_noise_per_m * depth)
     dead = default_rng(0).random(peak.size) < model.dead_share
     kept = (intensity > 0) & (confidence >= 1) & ~dead
     z16 = np.where(kept, np.nan_to_num(depth) / DEPTH_UNIT_M + 0.5, 0)
-    ir = np.where(intensity > 0, np.clip(seen + 0.5, 0, SATURATED), 0)
+    ir = np.where(
+        intensity > 0,
+        np.clip(seen + 0.5, 0, SATURATED),
+        0,
+    )
     pairs = (
         (fast.depth_z16, z16),
         (fast.ir, ir),
@@ -157,17 +200,22 @@ def test_bias_is_the_same_for_near_and_far_returns(path_m: float) -> None:
 
 @pytest.mark.parametrize("counts", [15.0, 60.3, 120.0])
 @pytest.mark.parametrize("ambient", [0.0, 40.0, 90.0])
-def test_mean_is_free_of_noise_and_variance_read_plus_shot_plus_ambient_noise(
-    counts: float, ambient: float
-) -> None:
-    frames = _frames(RICH.model_copy(update={"ambient_counts": ambient}), echo := _echo(counts))
+def test_variance_is_that_of_read_shot_and_ambient_noise(counts: float, ambient: float) -> None:
+    frames = _frames(
+        RICH.model_copy(update={"ambient_counts": ambient}),
+        echo := _echo(counts),
+    )
     variance = 1.5**2 + 0.3**2 * (counts + ambient) + 1 / 12  # the last: rounding to whole counts
     assert np.var([f.ir for f in frames]) == pytest.approx(variance, rel=0.01)
     assert np.mean([f.ir for f in frames]) == pytest.approx(counts, abs=0.03)
     truth = Sensor(BARE, QUIET).expose(echo, default_rng(0)).depth_z16.astype(float)
-    assert (np.mean([f.depth_z16 for f in frames], axis=0) - truth).mean() == pytest.approx(
-        0, abs=0.1
-    )
+    assert (
+        np.mean(
+            [f.depth_z16 for f in frames],
+            axis=0,
+        )
+        - truth
+    ).mean() == pytest.approx(0, abs=0.1)
 
 
 def test_noise_is_white_and_independent_of_range_noise() -> None:
@@ -176,22 +224,61 @@ def test_noise_is_white_and_independent_of_range_noise() -> None:
     frames = _frames(RICH, echo)
     ir = np.array([f.ir - 60.0 for f in frames])
     depth = np.array([(f.depth_z16 - truth) / truth for f in frames])
-    neighbours = (ir[:, :, 1:], ir[:, :, :-1]), (ir[:, 1:], ir[:, :-1])
-    for one, other in (*neighbours, (ir[1:], ir[:-1]), (ir, depth), (depth[1:], depth[:-1])):
-        assert abs(np.corrcoef(one.ravel(), other.ravel())[0, 1]) < 0.01
+    neighbours = (
+        (
+            ir[:, :, 1:],
+            ir[:, :, :-1],
+        ),
+        (ir[:, 1:], ir[:, :-1]),
+    )
+    for one, other in (
+        *neighbours,
+        (ir[1:], ir[:-1]),
+        (ir, depth),
+        (depth[1:], depth[:-1]),
+    ):
+        assert (
+            abs(
+                np.corrcoef(
+                    one.ravel(),
+                    other.ravel(),
+                )[0, 1]
+            )
+            < 0.01
+        )
 
 
 @pytest.mark.parametrize("ambient", [0.0, 40.0, 254.0])
 def test_ir_rises_with_intensity_and_saturates(ambient: float) -> None:
     counts = np.geomspace(1e-3, 1e3, 5120).reshape(64, 80)
     model = QUIET.model_copy(update={"ambient_counts": ambient})
-    ir = Sensor(BARE, model).expose(_echo(counts), default_rng(0)).ir.astype(float)
+    ir = (
+        Sensor(BARE, model)
+        .expose(
+            _echo(counts),
+            default_rng(0),
+        )
+        .ir.astype(float)
+    )
     assert (np.diff(ir.ravel()) >= 0).all()
     assert ir.max() == SATURATED - ambient
-    assert np.abs(ir - np.minimum(counts, SATURATED - ambient)).max() <= 0.5 + 1e-3
+    assert (
+        np.abs(
+            ir
+            - np.minimum(
+                counts,
+                SATURATED - ambient,
+            )
+        ).max()
+        <= 0.5 + 1e-3
+    )
 
 
-@pytest.mark.parametrize("model", [SensorModel(), QUIET], ids=["default", "quiet"])
+@pytest.mark.parametrize(
+    "model",
+    [SensorModel(), QUIET],
+    ids=["default", "quiet"],
+)
 def test_confidence_never_rises_with_ambient_light(
     rendering: Rendering, model: SensorModel
 ) -> None:
@@ -216,7 +303,23 @@ def test_more_ambient_light_leaves_fewer_depths() -> None:
     assert depths[0] > depths[1] > depths[2] > 0
 
 
-ODD = np.array([0, -0.0, -1, 1e-38, 1e-6, 1e-3, 1, 1e6, 1e38, np.nan, np.inf, -np.inf], np.float32)
+ODD = np.array(
+    [
+        0,
+        -0.0,
+        -1,
+        1e-38,
+        1e-6,
+        1e-3,
+        1,
+        1e6,
+        1e38,
+        np.nan,
+        np.inf,
+        -np.inf,
+    ],
+    np.float32,
+)
 
 
 @settings(max_examples=60, deadline=None)
@@ -242,12 +345,21 @@ def test_any_input_gives_a_possible_image(seed: int, included: bool, model: Sens
     generator = default_rng(seed)
     spread = (10 ** generator.uniform(-9, 3, 5120)).astype(np.float32)
     peak, runner_up, path = (
-        np.where(generator.random(5120) < 0.5, spread, generator.choice(ODD, 5120)).reshape(64, 80)
+        np.where(
+            generator.random(5120) < 0.5,
+            spread,
+            generator.choice(ODD, 5120),
+        ).reshape(64, 80)
         for _ in range(3)
     )
     multi = MultiBounce(peak, runner_up, path, direct_included=included)
     one, same = (
-        Sensor(RIG, model).expose(multi, default_rng(seed), celsius=CELSIUS) for _ in range(2)
+        Sensor(RIG, model).expose(
+            multi,
+            default_rng(seed),
+            celsius=CELSIUS,
+        )
+        for _ in range(2)
     )
     for name in ("depth_z16", "ir", "confidence"):
         np.testing.assert_array_equal(getattr(one, name), getattr(same, name))

@@ -137,9 +137,11 @@ def random_scene(generator: np.random.Generator) -> renderer.Scene:
     wave = 0.25 + 0.1 * np.sin(generator.uniform(0, 9) * x + 4) * np.cos(
         generator.uniform(0, 9) * y
     )
-    depth = (generator.uniform(0.05, 0.5, (size, size)), wave, wave + 0.1 * x)[
-        generator.integers(3)
-    ]
+    depth = (
+        generator.uniform(0.05, 0.5, (size, size)),
+        wave,
+        wave + 0.1 * x,
+    )[generator.integers(3)]
     depth = np.where(
         generator.random((size, size)) < generator.choice([0, 0.05]),
         generator.choice([0, 1e-4, 3]),
@@ -172,7 +174,10 @@ def light_bounds(job: renderer.TransportJob, seen: renderer.TransportJob) -> Any
     exact = replace(
         seen, accuracy=renderer.STOPS["reference"], bin_m=job.bin_m / fine, bins=job.bins * fine
     )
-    below = np.pad(np.cumsum(renderer.backend_reference.histograms(exact), 1), [(0, 0), (1, 0)])
+    below = np.pad(
+        np.cumsum(renderer.backend_reference.histograms(exact), 1),
+        [(0, 0), (1, 0)],
+    )
     at = np.arange(job.bins) * fine
     moved = 3 * fine // sub_bins + 1
     joined = float((1 + beam_sums.JOIN_COSINE) * beam_sums.JOIN_WEIGHT) / max(sub_bins, 4)
@@ -183,14 +188,37 @@ def light_bounds(job: renderer.TransportJob, seen: renderer.TransportJob) -> Any
     def light(start: Any, end: Any) -> Any:
         return (
             below[:, np.clip(end, 0, below.shape[1] - 1)]
-            - below[:, np.clip(start, 0, below.shape[1] - 1)]
+            - below[
+                :,
+                np.clip(
+                    start,
+                    0,
+                    below.shape[1] - 1,
+                ),
+            ]
         )
 
-    least = np.maximum(light(starts + 2 * moved, ends - 2 * moved), 0) * (1 - joined) - edge
-    return np.stack([least, light(starts, ends) * (1 + joined) + edge])
+    least = (
+        np.maximum(
+            light(starts + 2 * moved, ends - 2 * moved),
+            0,
+        )
+        * (1 - joined)
+        - edge
+    )
+    return np.stack(
+        [
+            least,
+            light(starts, ends) * (1 + joined) + edge,
+        ]
+    )
 
 
-def faults_within(least: Any, most: Any, job: renderer.TransportJob) -> list[str]:
+def faults_within(
+    least: Any,
+    most: Any,
+    job: renderer.TransportJob,
+) -> list[str]:
     """Return what is wrong with a job's histograms and echoes. A winner must be the strongest for
     some such light.
     """
@@ -217,17 +245,24 @@ def soak_faults(seed: int) -> list[str]:
     shaken has it too.
     """
     generator = np.random.default_rng([seed, 20])
-    grid = ((8, 6), (24, 20))[
-        int(generator.random() < 0.2)
-    ]  # the finer one has more than one tile of relay cells
-    accuracy = renderer.Accuracy("soak", *grid, sub_bins=int(generator.choice([1, 4, 8, 64])))
+    # The finer one has more than one tile of relay cells.
+    grid = ((8, 6), (24, 20))[int(generator.random() < 0.2)]
+    accuracy = renderer.Accuracy(
+        "soak",
+        *grid,
+        sub_bins=int(generator.choice([1, 4, 8, 64])),
+    )
     facts = scene_facts.SceneFacts(random_scene(generator), accuracy)
     if (job := planning.RenderProblem.of(facts, SOAK_PLAN).job) is None:
         return []
     beams = generator.integers(len(job.length_m), size=12)
     if generator.random() < 0.5:  # neighbors, whose tile may see all of a patch or nothing
         beams = np.argsort(
-            np.linalg.norm(job.laser_spot_m - job.laser_spot_m[beams[0]], axis=1), kind="stable"
+            np.linalg.norm(
+                job.laser_spot_m - job.laser_spot_m[beams[0]],
+                axis=1,
+            ),
+            kind="stable",
         )[:12]
     job = job.select(beams)
     least, most = light_bounds(job, job)
@@ -257,7 +292,10 @@ def soak(options: argparse.Namespace) -> None:
         else {"scenes": 0, "faults": {}}
     )
     while done["scenes"] < options.scenes:
-        for seed in range(done["scenes"], min(done["scenes"] + 500, options.scenes)):
+        for seed in range(
+            done["scenes"],
+            min(done["scenes"] + 500, options.scenes),
+        ):
             for fault in soak_faults(seed):
                 done["faults"].setdefault(fault, []).append(seed)
             done["scenes"] = seed + 1
@@ -267,7 +305,10 @@ def soak(options: argparse.Namespace) -> None:
     harness.write("renderer_soak", {"machine": evaluate.machine(), **done})
 
 
-def jobs_of(scenes: Sequence[renderer.Scene], accuracy: str) -> list[renderer.TransportJob]:
+def jobs_of(
+    scenes: Sequence[renderer.Scene],
+    accuracy: str,
+) -> list[renderer.TransportJob]:
     """Plan scenes for the GPU."""
     return [
         job
@@ -278,7 +319,16 @@ def jobs_of(scenes: Sequence[renderer.Scene], accuracy: str) -> list[renderer.Tr
 
 def deviation(jobs: Sequence[renderer.TransportJob], device: torch.device) -> float:
     """Return the relative L1 deviation of some histograms from the numba renderer's."""
-    some = [job.select(np.arange(0, len(job.laser_spot_m), 50)) for job in jobs]
+    some = [
+        job.select(
+            np.arange(
+                0,
+                len(job.laser_spot_m),
+                50,
+            )
+        )
+        for job in jobs
+    ]
     pairs = zip(
         renderer.histograms_of_all(some, device), map(renderer.histograms, some), strict=True
     )
@@ -305,7 +355,14 @@ def bench_cuda(options: argparse.Namespace) -> None:
     }
     planning_s = shortest_s(lambda: jobs_of(scenes, options.accuracy), 1) / len(scenes)
     whole_s = shortest_s(
-        lambda: list(renderer.render_all(scenes, options.accuracy, backend=options.backend)), 1
+        lambda: list(
+            renderer.render_all(
+                scenes,
+                options.accuracy,
+                backend=options.backend,
+            )
+        ),
+        1,
     )
     result = {
         "device": torch.cuda.get_device_name() if device.type == "cuda" else "cpu",
@@ -334,7 +391,12 @@ def main() -> None:
     gpu.add_argument("--backend", choices=["torch", "cuda"], default="cuda")
     gpu.add_argument("--accuracy", default="standard")
     gpu.add_argument("--objects", type=int, default=64)
-    gpu.add_argument("--batch", type=int, nargs="+", default=[1, 4, 16, 64])
+    gpu.add_argument(
+        "--batch",
+        type=int,
+        nargs="+",
+        default=[1, 4, 16, 64],
+    )
     gpu.add_argument("--repeats", type=int, default=3)
     asked = parser.parse_args()
     asked.run(asked)

@@ -38,6 +38,7 @@ def ripples(shape: tuple[int, int], waves: float, generator: np.random.Generator
     """Return a wave (height, width) of amplitude 1 in a random direction, `waves` of it across the
     width.
     """
+    # A plane wave sin(k . x + phase) with |k| = 2 pi waves per width.
     rows, columns = np.indices(shape) / shape[1]
     way, phase = generator.uniform(0.0, 2.0 * np.pi, 2)
     return np.sin(2.0 * np.pi * waves * (columns * np.cos(way) + rows * np.sin(way)) + phase)
@@ -49,6 +50,8 @@ def smooth_patches(
     """Return a smooth pattern (height, width) of standard deviation 1, with about `across` patches
     across the width.
     """
+    # White noise on a coarse grid, interpolated by cubics: smooth over about one step of the grid.
+    # One step more on each side keeps the interpolation inside.
     height, width = shape
     coarse = generator.standard_normal((across * height // width + 3, across + 3)).astype(
         np.float32
@@ -77,6 +80,7 @@ class DepthBias:
             wave = ripples(shape, WAVES, np.random.default_rng(RIPPLES_SEED))
             self._fixed_m = (ripple_m * wave - offset_m).astype(np.float32).ravel()
         if patch_m:
+            # Mean 0 over the view: patches add no common offset.
             pattern = smooth_patches(shape, np.random.default_rng(PATCHES_SEED))
             self._patches_m = (patch_m * (pattern - pattern.mean())).astype(np.float32).ravel()
 
@@ -84,6 +88,7 @@ class DepthBias:
         """Return the bias (n,) of each pixel's depth, at a temperature or in the warm device; empty
         for no bias.
         """
+        # fixed + warmth * patches + drift * (T - T_warm), each only if the verdicts include it.
         celsius = self._warm_celsius if celsius is None else celsius
         bias_m = self._fixed_m
         if self._patches_m.size:
@@ -94,6 +99,7 @@ class DepthBias:
 
     def _warmth(self, celsius: float) -> float:
         """Return 0 at the start of the warm-up, 1 at its end."""
+        # Linear in the temperature, as expansion is.
         warm = self._warm_up
         return (
             (celsius - warm.from_celsius) / (warm.to_celsius - warm.from_celsius) if warm else 1.0
@@ -119,5 +125,6 @@ def texture(shape: tuple[int, int], strength: float) -> Float32:
         return EVEN
     generator = np.random.default_rng(TEXTURE_SEED)
     pattern = smooth_patches(shape, generator, STAINS) + smooth_patches(shape, generator, GRAINS)
+    # A log-normal factor is positive at any strength; divided by its mean it adds no light.
     factor = np.exp(strength * (pattern - pattern.mean()) / pattern.std())
     return (factor / factor.mean()).astype(np.float32).ravel()

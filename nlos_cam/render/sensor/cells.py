@@ -37,6 +37,7 @@ def normal_quantiles() -> Float32:
     """Return the middles of QUANTILES equally likely parts of the normal distribution, scaled to
     variance 1.
     """
+    # Middles of equally likely parts lose the tails' variance: it is scaled back to 1.
     lower = np.array([NormalDist().inv_cdf((k + 0.5) / QUANTILES) for k in range(QUANTILES // 2)])
     every = np.concatenate([lower, -lower[::-1]])
     return (every / every.std()).astype(np.float32)
@@ -49,6 +50,8 @@ def draw_deviates(
     """Fill in two normal deviates for each of some pixels, numbers first to first + count of the
     seed's stream.
     """
+    # Counter-based: pixel i has the same deviates whichever pixels are drawn, on any thread. The
+    # two halves of one word choose both of them.
     for i in range(count):
         word = seed + np.uint64(first + i) * GOLDEN
         word = (word ^ (word >> np.uint64(30))) * FIRST
@@ -63,6 +66,8 @@ def spread_deviates(count: int, quantiles: Float32, light: Float32, ranges: Floa
     """Fill in two normal deviates for each of some pixels: evenly spread over the distribution, in
     two orders.
     """
+    # The first deviate by equal steps, the second by steps of the golden ratio (Kronecker
+    # sequence): spread evenly each by itself and together.
     for i in range(count):
         light[i] = quantiles[np.int64((i + 0.5) / count * QUANTILES)]
         ranges[i] = quantiles[np.int64((i + 0.5) * GOLDEN_SHARE % 1.0 * QUANTILES)]
@@ -87,11 +92,13 @@ class PixelOrder(NamedTuple):
     @classmethod
     def of(cls, cell: Int32, echo: Int32) -> "PixelOrder":
         """Return the order of pixels (p,) with their map cells and the cells of their echoes."""
+        # Sorted by map cell, then by echo: cells and runs are slices.
         pixel = np.lexsort((echo, cell))
         cells = cell[pixel]
         echoes = echo[pixel]
         begins = np.flatnonzero(np.diff(cells, prepend=-1) | np.diff(echoes, prepend=-1))
         numbers = np.arange(cell.max() + 2)
+        # A run ends where the next one begins, the last at the end of all pixels.
         run_start = np.append(begins, pixel.size)
         first_run = np.searchsorted(cells[begins], numbers)
         return cls(
@@ -133,6 +140,7 @@ def expose_cells(
     samples_m = bits.view(np.float32)
     middle_m = middle.view(np.float32)
     spread = 0  # pixels over which the deviates are spread already
+    # Cell by cell: a cell's pixels are reduced while they are in the first cache.
     for k in range(cells):
         pixels = order.start[k + 1] - order.start[k]
         start = order.start[k]
@@ -150,6 +158,7 @@ def expose_cells(
             echo = echoes.peak[c], echoes.runner_up[c], echoes.surety[c], echoes.path_m[c]
             _light(begin, optics, echo, light[some], noisy[0], chain, counts[some])
             _range(begin, optics, echo, ranges[some], noisy[1], bias_m, chain, samples_m[some])
+        # Positive floats order like their bits, so the median is found on integers.
         valid = np.int32(0)
         for i in range(pixels):
             is_return = bits[i] > 0
@@ -180,6 +189,7 @@ def _light(
     """Fill in the counts of some pixels that see one echo: the light of `sensor.expose`, without
     branches.
     """
+    # Every choice is a select, not a branch: pixels are computed side by side.
     peak = echo[0]
     direct = optics.direct[start : start + counts.size]
     for k in range(counts.size):
@@ -205,6 +215,7 @@ def _range(
     """Fill in the depth of some pixels that see one echo, 0 for none: the range of `sensor.expose`,
     likewise.
     """
+    # Loads come before the selects, so that none depends on a choice.
     biased = bias_m.size > 0
     dying = optics.dead.size > 0
     end = start + depth_m.size

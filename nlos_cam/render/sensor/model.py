@@ -86,6 +86,7 @@ class SensorModel(Record):
 
     def celsius_at(self, seconds: float) -> float:
         """Return the device's temperature a number of seconds after its start."""
+        # Newton's law of cooling: the difference from the end decays with the time constant.
         if (warm := self.warm_up) is None:
             return STEADY_CELSIUS
         return warm.to_celsius - (warm.to_celsius - warm.from_celsius) * exp(

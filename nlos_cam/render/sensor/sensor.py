@@ -96,6 +96,7 @@ def compete(
     """Return intensity, surety and length of the stronger of direct return and cell's echo (S5),
     and the second.
     """
+    # The device halves every path, also one of three bounces (S5); a tie goes to the direct return.
     own = optics.direct[pixel]
     peak = echoes.peak[cell]
     runner_up = echoes.runner_up[cell]
@@ -109,6 +110,8 @@ def noise_counts(light_counts: float, chain: Chain) -> float:
     """Return the standard deviation of shot and read noise for an amount of light, ambient light
     included.
     """
+    # Shot noise is Poisson: its variance grows with the light. Independent of read noise, so that
+    # variances add.
     return np.sqrt(chain.read_variance + chain.shot_variance * light_counts)
 
 
@@ -117,12 +120,14 @@ def saturate(light_counts: float, chain: Chain) -> float:
     """Return the light cut at full scale together with the ambient light, of which the mean is then
     subtracted.
     """
+    # The converter saturates on echo and ambient light together, before the mean is subtracted.
     return min(light_counts, SATURATED) - chain.ambient_counts
 
 
 @inner()
 def quantise(value: float, most: int) -> int:
     """Return the nearest whole number from 0 to `most`; 0 for NaN."""
+    # NaN compares false, so it becomes 0 like everything else that is not above 0.
     return int(np.floor(min(value, most) + 0.5)) if value > 0 else 0
 
 
@@ -131,10 +136,13 @@ def sure(counts: float, chain: Chain) -> float:
     """Return from 0 to 1 how far a signal stands above the noise, dimmed by the noise that ambient
     light adds.
     """
+    # Confidence follows the signal over its noise: ambient light scales it by the ratio of the
+    # noise without it to that with it.
     if chain.ambient_counts > 0:
         noise = noise_counts(counts + chain.ambient_counts, chain)
         if noise > 0:
             counts *= noise_counts(counts, chain) / noise
+    # Saturating, as confidence has a largest value: SURE_COUNTS is its scale.
     return 1 - np.exp(-counts / SURE_COUNTS)
 
 
@@ -167,6 +175,8 @@ def expose(
     """Fill in depth, IR and confidence (n,) of n pixels, each with its map cell; empty deviates are
     no noise.
     """
+    # The stages in the order of the chain. Images start black, so that a pixel without an echo is
+    # left out.
     for i in range(z16.size):
         intensity, surety, length_m, second = compete(optics, i, echoes, cell[i])
         if intensity <= 0:
@@ -175,20 +185,22 @@ def expose(
         if optics.texture.size:
             counts *= optics.texture[i]
             surety = sure(counts, chain)
+        # One deviate carries shot and read noise: a sum of independent normal deviates is normal.
         light = counts + chain.ambient_counts
         if light_deviates.size:
             light += light_deviates[i] * noise_counts(light, chain)
         ir[i] = quantise(saturate(light, chain), SATURATED)
-        # half of the signal's own surety is the winner's lead
-        confidence[i] = int(
-            MAX_CONFIDENCE * (surety * (0.5 + 0.5 * (1 - second / intensity))) + 0.5
-        )
+        # Half of the signal's own surety is the winner's lead over the second echo.
+        lead = 1 - second / intensity
+        confidence[i] = int(MAX_CONFIDENCE * (surety * (0.5 + 0.5 * lead)) + 0.5)
         if confidence[i] == 0 or (optics.dead.size and optics.dead[i]):
             continue
+        # S5: depth is the range along the beam, projected on the optical axis.
         depth_m = length_m * optics.cos_axis[i]
         if bias_m.size:
             depth_m += bias_m[i]
         if range_deviates.size:
+            # The data sheet gives a standard deviation that grows with distance: an affine law.
             depth_m += range_deviates[i] * (chain.range_noise_m + chain.range_noise_per_m * depth_m)
         z16[i] = quantise(depth_m / DEPTH_UNIT_M, FARTHEST)
 
@@ -229,6 +241,7 @@ class Sensor:
 
     def __init__(self, rig: Rig, model: SensorModel, radiometry: Radiometry = "paper") -> None:
         self.rig = rig
+        # Everything here depends on rig and model alone: frames differ in echoes and noise.
         verdicts = sensor_effects(model)
         lambertian = radiometry == "lambertian"
         self._chain = _chain(rig, model, verdicts, lambertian=lambertian)
@@ -283,6 +296,8 @@ class Sensor:
                     " noise"
                 )
             return maps_from_frame(self.expose(multi, generator).frame(self.rig.pinhole))
+        # Cell by cell in memory: each cell's pixels are drawn and reduced while they are in the
+        # cache.
         order, optics = self._in_order(multi.peak.shape)
         optics = (
             optics._replace(direct=np.zeros_like(optics.direct))
@@ -332,11 +347,11 @@ def _chain(
     def called_for(name: str, value: float) -> float:
         return value if included(verdicts, name) else 0.0
 
+    # The bare wall fixes the gain: an occluder nearer to the lidar would change it.
     bare = rig.model_copy(update={"occluder": None})
     brightest = float(cast(bare, bare.pinhole, lambertian=lambertian).direct.max())
-    brightest *= peak_share(
-        model.pulse_ns, rig.device.bin_m
-    )  # the waveform's peak, as a renderer with a pulse has it
+    # With a pulse the renderer's echo is the waveform's peak, which holds a share of the light.
+    brightest *= peak_share(model.pulse_ns, rig.device.bin_m)
     return Chain(
         gain=model.bare_wall_counts / brightest if brightest > 0 else 0.0,
         ambient_counts=called_for("ambient light", model.ambient_counts),
@@ -351,6 +366,7 @@ def _optics(beams: Beams, chain: Chain, dead_share: float, reflectance: Float32)
     direct = beams.direct.astype(np.float32)
     surety = signal_surety(direct, chain)
     length_m = beams.length_m.astype(np.float32)
+    # A seed of its own: the same pixels are dead in every frame and every run.
     dead = np.random.default_rng(0).random(direct.size if dead_share else 0) < dead_share
     return PixelOptics(
         direct, surety, length_m, beams.cos_axis.astype(np.float32), dead, reflectance
@@ -359,6 +375,7 @@ def _optics(beams: Beams, chain: Chain, dead_share: float, reflectance: Float32)
 
 def _echoes(multi: MultiBounce, chain: Chain) -> CellEchoes:
     """Return the echoes flattened, without intensities that are not finite."""
+    # An echo that is not finite is none; a runner-up never exceeds its peak.
     peak, runner_up = (
         np.where((map_ > 0) & (map_ < np.inf), map_, np.float32(0)).ravel()
         for map_ in (multi.peak, multi.runner_up)
@@ -379,6 +396,7 @@ def cell_of_pixels(image: tuple[int, int], maps: tuple[int, int]) -> NDArray[np.
         raise SceneError(
             f"echo maps have shape {maps}: it must be (64 k, 80 k) for k x k beams in each map cell"
         )
+    # The cell that holds a pixel's center; images need not be whole multiples of the maps.
     row = (np.arange(height) + 0.5) * rows // height
     column = (np.arange(width) + 0.5) * columns // width
     return (row[:, None] * columns + column).astype(np.int32).ravel()

@@ -42,7 +42,15 @@ EXPORTS = {
     "text.ply": export_ply(SOLID, "ascii"),
 }
 VERTICES = b"v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\n"
-SQUARE = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], float)
+SQUARE = np.array(
+    [
+        [0, 0, 0],
+        [1, 0, 0],
+        [1, 1, 0],
+        [0, 1, 0],
+    ],
+    float,
+)
 PLY = (
     b"ply\nformat ascii 1.0\ncomment TextureFile none.png\nelement vertex 4\n"
     b"property float x\nproperty float y\nproperty float z\nproperty float s\nproperty float t\n"
@@ -70,7 +78,11 @@ def _write(folder: Path, name: str, content: bytes) -> Path:
     return path
 
 
-def _assert_refused(path: Path, word: str, read: Callable[[Path], object] = read_mesh) -> None:
+def _assert_refused(
+    path: Path,
+    word: str,
+    read: Callable[[Path], object] = read_mesh,
+) -> None:
     """The error is one line that begins with the path and holds the word."""
     with pytest.raises(SceneError) as caught:
         read(path)
@@ -94,7 +106,16 @@ def test_read_mesh_gives_the_same_triangles_for_every_format(
 
 def test_read_mesh_needs_no_optional_package(tmp_path: Path) -> None:
     """Reads materials, textures, edges and non-ASCII names without any optional package."""
-    names = [str(_write(tmp_path, name, content)) for name, content in EXPORTS.items()]
+    names = [
+        str(
+            _write(
+                tmp_path,
+                name,
+                content,
+            )
+        )
+        for name, content in EXPORTS.items()
+    ]
     faces = (
         b"mtllib none.mtl\nusemtl fa\xe7ade\nvt 0 0\nvn 0 0 1\nf 1/1/1 2/1/1 3/1/1\nf 1//1 3//1"
         b" 4//1\n"
@@ -105,11 +126,17 @@ def test_read_mesh_needs_no_optional_package(tmp_path: Path) -> None:
     ]
     command = [sys.executable, "-c", WITHOUT_EXTRAS, *names]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
-    assert (done.stdout.split(), done.stderr) == ([str(len(SOLID.faces))] * 5 + ["2", "2"], "")
+    assert (done.stdout.split(), done.stderr) == (
+        [str(len(SOLID.faces))] * 5 + ["2", "2"],
+        "",
+    )
 
 
-@pytest.mark.parametrize(("warning", "is_damage"), [(UNREADABLE, True), ("old fashioned", False)])
-def test_read_mesh_silences_the_parser_and_refuses_unreadable_numbers(
+@pytest.mark.parametrize(
+    ("warning", "is_damage"),
+    [(UNREADABLE, True), ("old fashioned", False)],
+)
+def test_read_mesh_is_silent_and_refuses_unreadable_numbers(
     tmp_path: Path,
     caplog: pytest.LogCaptureFixture,
     monkeypatch: pytest.MonkeyPatch,
@@ -129,7 +156,13 @@ def test_read_mesh_silences_the_parser_and_refuses_unreadable_numbers(
     if is_damage:
         _assert_refused(_write(tmp_path, "thing.stl", EXPORTS["text.stl"]), "")
     else:
-        assert len(_read(tmp_path, "thing.stl", EXPORTS["text.stl"]).triangles) == len(SOLID.faces)
+        assert len(
+            _read(
+                tmp_path,
+                "thing.stl",
+                EXPORTS["text.stl"],
+            ).triangles
+        ) == len(SOLID.faces)
     assert not caplog.records
     assert logging.getLogger("trimesh").level == before
 
@@ -138,7 +171,14 @@ def test_read_mesh_silences_the_parser_and_refuses_unreadable_numbers(
     ("faces", "corners"),
     [
         (b"f 1 2 3 4\n", [[0, 1, 2], [0, 2, 3]]),
-        (b"f 1 2 3\nf 1 2 3 4\n", [[0, 1, 2], [0, 1, 2], [0, 2, 3]]),
+        (
+            b"f 1 2 3\nf 1 2 3 4\n",
+            [
+                [0, 1, 2],
+                [0, 1, 2],
+                [0, 2, 3],
+            ],
+        ),
         (b"f -4 -3 -2\n", [[0, 1, 2]]),
         (b"o a\nf 1 2 3\no b\nusemtl c\nf 1 3 4\n", [[0, 1, 2], [0, 2, 3]]),
         (b"v nan inf 1e300\nf 1 2 3\n", [[0, 1, 2]]),  # a vertex of no face
@@ -149,18 +189,31 @@ def test_read_mesh_joins_faces_of_every_kind(
 ) -> None:
     triangles = {
         t.tobytes()
-        for t in np.sort(_read(tmp_path, "thing.obj", VERTICES + faces).triangles, axis=1)
+        for t in np.sort(
+            _read(tmp_path, "thing.obj", VERTICES + faces).triangles,
+            axis=1,
+        )
     }
-    assert triangles == {t.tobytes() for t in np.sort(SQUARE[np.array(corners)], axis=1)}
+    assert triangles == {
+        t.tobytes()
+        for t in np.sort(
+            SQUARE[np.array(corners)],
+            axis=1,
+        )
+    }
 
 
 def test_read_mesh_joins_parts_and_equals_by_path_and_content(tmp_path: Path) -> None:
     other = b"v 5 0 0\nv 6 0 0\nv 6 1 0\nf -3 -2 -1\n"
     mesh = _read(tmp_path, "thing.obj", VERTICES + b"f -4 -3 -2\n" + other)
     assert sorted(mesh.triangles[..., 0].max(1)) == [1, 6]
-    assert len(_read(tmp_path, "two.stl", EXPORTS["text.stl"] * 2).triangles) == 2 * len(
-        SOLID.faces
-    )
+    assert len(
+        _read(
+            tmp_path,
+            "two.stl",
+            EXPORTS["text.stl"] * 2,
+        ).triangles
+    ) == 2 * len(SOLID.faces)
     mesh = _read(tmp_path, "thing.stl", EXPORTS["binary.stl"])
     assert _read(tmp_path, "thing.stl", EXPORTS["binary.stl"]) == mesh
     assert _read(tmp_path, "other.stl", EXPORTS["binary.stl"]).sha256 == mesh.sha256
@@ -175,7 +228,11 @@ def test_read_mesh_joins_parts_and_equals_by_path_and_content(tmp_path: Path) ->
         ("short.stl", EXPORTS["text.stl"][:900], "faces"),
         *[
             (name, content, "faces")
-            for name, content in (("a.obj", VERTICES), ("a.obj", b""), ("a.stl", b""))
+            for name, content in (
+                ("a.obj", VERTICES),
+                ("a.obj", b""),
+                ("a.stl", b""),
+            )
         ],
         ("none.stl", bytes(84), "faces"),
         ("empty.ply", b"", ".ply"),
@@ -189,7 +246,14 @@ def test_read_mesh_joins_parts_and_equals_by_path_and_content(tmp_path: Path) ->
             ("face.obj", VERTICES + b"f " + face, "")
             for face in (b"1 2 9", b"1 2 -5", b"1/1 0/2 3/3", b"1 00 2")
         ],
-        *[("face.ply", PLY.replace(b"3 0 2 3", face), "") for face in (b"3 0 2 4", b"3 0 2 -1")],
+        *[
+            (
+                "face.ply",
+                PLY.replace(b"3 0 2 3", face),
+                "",
+            )
+            for face in (b"3 0 2 4", b"3 0 2 -1")
+        ],
         *[
             ("far.obj", VERTICES + b"v " + x + b" 0 0\nf 1 2 5\n", "NaN")
             for x in (b"nan", b"1e200")
@@ -216,7 +280,11 @@ def test_reader_names_a_missing_file_and_a_folder(tmp_path: Path, name: str) -> 
 
 
 @pytest.mark.parametrize(
-    ("limit", "value", "word"), [("MAX_FACES", 89, "89"), ("MAX_BYTES", 99, "MiB")]
+    ("limit", "value", "word"),
+    [
+        ("MAX_FACES", 89, "89"),
+        ("MAX_BYTES", 99, "MiB"),
+    ],
 )
 def test_read_mesh_refuses_too_large_files(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, limit: str, value: int, word: str
@@ -271,7 +339,20 @@ def test_plain_renames_ply_edges_and_keeps_binary_bodies() -> None:
 
 
 @pytest.mark.parametrize(
-    "dtype", ["f2", "f4", "f8", "g", ">f4", "i1", "u1", "i2", ">i4", "i8", "u8"]
+    "dtype",
+    [
+        "f2",
+        "f4",
+        "f8",
+        "g",
+        ">f4",
+        "i1",
+        "u1",
+        "i2",
+        ">i4",
+        "i8",
+        "u8",
+    ],
 )
 @pytest.mark.parametrize("size", [8, 64, 256])
 def test_read_depth_map_takes_every_real_type_and_size(
@@ -282,14 +363,21 @@ def test_read_depth_map_takes_every_real_type_and_size(
     )
     if dtype == "f2":
         depth[:] = np.nan  # an empty object
-    np.save(tmp_path / "map.npy", depth.astype(dtype, order="F" if dtype == "f8" else "C"))
+    np.save(
+        tmp_path / "map.npy",
+        depth.astype(dtype, order="F" if dtype == "f8" else "C"),
+    )
     read = read_depth_map(tmp_path / "map.npy")
     np.testing.assert_array_equal(read, depth)
     assert (read.dtype, type(read)) == (np.float32, np.ndarray)
     assert read.flags.c_contiguous or dtype == "f8"
 
 
-def _map(value: complex, shape: tuple[int, ...] = (16, 16), dtype: str = "f8") -> np.ndarray:
+def _map(
+    value: complex,
+    shape: tuple[int, ...] = (16, 16),
+    dtype: str = "f8",
+) -> np.ndarray:
     depth = np.full(shape, 0.3, dtype)
     depth.reshape(-1)[:1] = value
     return depth
@@ -303,14 +391,27 @@ def _map(value: complex, shape: tuple[int, ...] = (16, 16), dtype: str = "f8") -
         (_map(300, dtype="u2"), "300 m"),
         (_map(np.inf), "inf m"),
         (_map(-np.inf, dtype="f2"), "-inf m"),
-        *[(_map(0.3, s), str(s)) for s in ((16,), (16, 16, 1), (16, 17), (7, 7), (257, 257), ())],
+        *[
+            (_map(0.3, s), str(s))
+            for s in (
+                (16,),
+                (16, 16, 1),
+                (16, 17),
+                (7, 7),
+                (257, 257),
+                (),
+            )
+        ],
         (_map(0.3, (0, 0)), ""),
         (_map(0.3, dtype="c8"), "complex64"),
         (_map(True, dtype="?"), "bool"),
         (np.full((16, 16), "a"), "U1"),
         (np.full((16, 16), None), ""),
         (np.zeros((16, 16), "M8[s]"), "datetime"),
-        (np.zeros((16, 16), [("depth_m", "f4")]), "depth_m"),
+        (
+            np.zeros((16, 16), [("depth_m", "f4")]),
+            "depth_m",
+        ),
     ],
 )
 def test_read_depth_map_refuses_other_arrays(tmp_path: Path, depth: np.ndarray, word: str) -> None:
@@ -342,7 +443,7 @@ def _save(path: Path, mesh: trimesh.Trimesh = TORUS) -> Path:
     return path
 
 
-def test_folder_objects_finds_meshes_in_a_fixed_order_and_refuses_missing_empty_and_file_paths(
+def test_folder_objects_sorts_meshes_and_refuses_other_paths(
     tmp_path: Path,
 ) -> None:
     tmp_path /= ".cache"  # a hidden folder named on purpose is searched
@@ -361,10 +462,21 @@ def test_folder_objects_finds_meshes_in_a_fixed_order_and_refuses_missing_empty_
             folder_objects(path)
 
 
-def test_mesh_depth_is_one_mesh_at_one_pose_per_seed_and_reads_no_other(tmp_path: Path) -> None:
-    meshes = [_save(tmp_path / "a.stl"), _save(tmp_path / "b.ply", trimesh.creation.box((3, 2, 1)))]
+def test_mesh_depth_reads_one_mesh_at_one_pose_per_seed(tmp_path: Path) -> None:
+    meshes = [
+        _save(tmp_path / "a.stl"),
+        _save(tmp_path / "b.ply", trimesh.creation.box((3, 2, 1))),
+    ]
     read = Mock(wraps=read_mesh)
-    made = [mesh_depth(seed, meshes, BOX, read=read) for seed in range(12)]
+    made = [
+        mesh_depth(
+            seed,
+            meshes,
+            BOX,
+            read=read,
+        )
+        for seed in range(12)
+    ]
     assert [path for path, _ in made] == [call.args[0] for call in read.call_args_list]
     assert {path for path, _ in made} == set(meshes)
     assert len({depth.tobytes() for _, depth in made}) == 12
@@ -383,7 +495,15 @@ def test_mesh_depth_names_a_broken_or_invisible_mesh(tmp_path: Path) -> None:
     (tmp_path / "broken.ply").write_bytes(b"ply\nnothing")
     with pytest.raises(SceneError, match=r"broken\.ply"):
         mesh_depth(0, folder_objects(tmp_path), BOX, read=read_mesh)
-    needle = trimesh.Trimesh([[0, 0, 0], [0, 1, 0], [1e-5, 0.5, 0]], [[0, 1, 2]], process=False)
+    needle = trimesh.Trimesh(
+        [
+            [0, 0, 0],
+            [0, 1, 0],
+            [1e-5, 0.5, 0],
+        ],
+        [[0, 1, 2]],
+        process=False,
+    )
     with pytest.raises(SceneError, match=r"needle\.ply"):
         mesh_depth(0, [_save(tmp_path / "needle.ply", needle)], BOX, read=read_mesh)
 
@@ -392,12 +512,35 @@ def test_mesh_depth_draws_another_pose_for_an_edge_on_sheet(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     along_the_sight = Pose()
-    others = (random_pose(np.random.default_rng(seed), BOX) for seed in range(POSES))
+    others = (
+        random_pose(
+            np.random.default_rng(seed),
+            BOX,
+        )
+        for seed in range(POSES)
+    )
     monkeypatch.setattr(files, "random_pose", drawn := Mock(side_effect=[along_the_sight, *others]))
     lying = np.array(
-        [[[0, 0, 0], [1, 0, 0], [0, 0, 1]], [[1, 0, 0], [1, 0, 1], [0, 0, 1]]], np.float64
+        [
+            [
+                [0, 0, 0],
+                [1, 0, 0],
+                [0, 0, 1],
+            ],
+            [
+                [1, 0, 0],
+                [1, 0, 1],
+                [0, 0, 1],
+            ],
+        ],
+        np.float64,
     )
-    _, depth_m = mesh_depth(3, ["sheet"], BOX, read=lambda name: MeshFile(Path(name), "", lying))
+    _, depth_m = mesh_depth(
+        3,
+        ["sheet"],
+        BOX,
+        read=lambda name: MeshFile(Path(name), "", lying),
+    )
     assert 1 < drawn.call_count <= POSES
     assert np.isfinite(depth_m).any()
 
@@ -408,7 +551,11 @@ POSE = Pose(size_m=0.15, tilt_y_rad=0.3)
 def test_load_object_places_a_category_and_a_mesh_alike(tmp_path: Path) -> None:
     triangles = category_triangles("cup", 4)
     corners = triangles.reshape(-1, 3)
-    mesh = trimesh.Trimesh(corners, np.arange(len(corners)).reshape(-1, 3), process=False)
+    mesh = trimesh.Trimesh(
+        corners,
+        np.arange(len(corners)).reshape(-1, 3),
+        process=False,
+    )
     mesh.export(tmp_path / "cup.stl")
     expected = orthographic_depth(place(triangles, POSE, BOX), BOX)
     loaded = load_object("cup", BOX, POSE, seed=4)
@@ -420,7 +567,12 @@ def test_load_object_places_a_category_and_a_mesh_alike(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "hint"), [("cupp", "Did you mean 'cup'?"), ("teapot", "tower"), ("cup.glb", ".stl")]
+    ("name", "hint"),
+    [
+        ("cupp", "Did you mean 'cup'?"),
+        ("teapot", "tower"),
+        ("cup.glb", ".stl"),
+    ],
 )
 def test_load_object_suggests_the_nearest_category(name: str, hint: str) -> None:
     with pytest.raises(SceneError) as caught:
@@ -432,7 +584,12 @@ def test_load_object_suggests_the_nearest_category(name: str, hint: str) -> None
 
 
 @pytest.mark.parametrize(
-    ("name", "arguments"), [("cup", {"up": "z"}), ("a.stl", {"seed": 1}), ("a.npy", {"pose": POSE})]
+    ("name", "arguments"),
+    [
+        ("cup", {"up": "z"}),
+        ("a.stl", {"seed": 1}),
+        ("a.npy", {"pose": POSE}),
+    ],
 )
 def test_load_object_refuses_arguments_that_do_not_apply(
     name: str, arguments: dict[str, object]
@@ -453,9 +610,19 @@ SMALL_BOX = ObjectBox(
 )
 NAN = np.float32(np.nan)
 DEPTHS = arrays(
-    np.float32, (8, 8), elements=st.one_of(st.just(NAN), st.floats(0.125, 0.25, width=32))
+    np.float32,
+    (8, 8),
+    elements=st.one_of(
+        st.just(NAN),
+        st.floats(0.125, 0.25, width=32),
+    ),
 )
-ERROR_M = np.linspace(0.001, 0.05, 64, dtype=np.float32).reshape(8, 8)
+ERROR_M = np.linspace(
+    0.001,
+    0.05,
+    64,
+    dtype=np.float32,
+).reshape(8, 8)
 
 
 def slope() -> np.ndarray:
@@ -482,15 +649,33 @@ def test_mesh_sampled_at_cell_centers_is_the_depth_map(depth_m: np.ndarray, jump
     mesh = mesh_from_depth(depth_m, SMALL_BOX, ERROR_M, jump_m)
     np.testing.assert_allclose(sampled(mesh), depth_m, atol=1e-6)
     corners_m = mesh.vertices_m[mesh.faces]
-    assert not len(corners_m) or np.ptp(corners_m[..., 2], axis=1).max() <= jump_m + 1e-7
-    normal = np.cross(corners_m[:, 1] - corners_m[:, 0], corners_m[:, 2] - corners_m[:, 0])
+    assert (
+        not len(corners_m)
+        or np.ptp(
+            corners_m[..., 2],
+            axis=1,
+        ).max()
+        <= jump_m + 1e-7
+    )
+    normal = np.cross(
+        corners_m[:, 1] - corners_m[:, 0],
+        corners_m[:, 2] - corners_m[:, 0],
+    )
     assert (normal[:, 2] < 0).all(), "the lit side faces the wall"
 
 
 def test_vertices_lie_at_cell_centers_with_their_uncertainty() -> None:
     x_m, y_m = cell_centers_m(SMALL_BOX, 8)
-    mesh = mesh_from_depth(np.full((8, 8), 0.2, np.float32), SMALL_BOX, ERROR_M)
-    np.testing.assert_allclose(mesh.vertices_m[9], [x_m[1], y_m[1], 0.2], atol=1e-8)
+    mesh = mesh_from_depth(
+        np.full((8, 8), 0.2, np.float32),
+        SMALL_BOX,
+        ERROR_M,
+    )
+    np.testing.assert_allclose(
+        mesh.vertices_m[9],
+        [x_m[1], y_m[1], 0.2],
+        atol=1e-8,
+    )
     np.testing.assert_array_equal(mesh.uncertainty_m, ERROR_M.ravel())
 
 
@@ -499,7 +684,10 @@ def test_opencv_reads_the_saved_mesh(tmp_path: Path, suffix: str) -> None:
     mesh = mesh_from_depth(slope(), SMALL_BOX, ERROR_M)
     mesh.save(tmp_path / f"mesh{suffix}")
     vertices_m, faces, *_ = cv2.loadMesh(str(tmp_path / f"mesh{suffix}"))
-    read = SurfaceMesh(np.float64(vertices_m[0]), np.array(faces, np.int64).reshape(-1, 3))
+    read = SurfaceMesh(
+        np.float64(vertices_m[0]),
+        np.array(faces, np.int64).reshape(-1, 3),
+    )
     np.testing.assert_allclose(read.vertices_m, mesh.vertices_m, atol=1e-6)
     np.testing.assert_array_equal(read.faces, mesh.faces)
     assert [path.name for path in tmp_path.iterdir()] == [f"mesh{suffix}"]
@@ -508,7 +696,10 @@ def test_opencv_reads_the_saved_mesh(tmp_path: Path, suffix: str) -> None:
 def test_glb_holds_the_mesh_and_its_uncertainty(tmp_path: Path) -> None:
     mesh = mesh_from_depth(slope(), SMALL_BOX, ERROR_M)
     mesh.save(tmp_path / "mesh.glb")
-    (read,) = trimesh.load_scene(tmp_path / "mesh.glb", process=False).geometry.values()
+    (read,) = trimesh.load_scene(
+        tmp_path / "mesh.glb",
+        process=False,
+    ).geometry.values()
     np.testing.assert_allclose(read.vertices, mesh.vertices_m, atol=1e-6)
     np.testing.assert_array_equal(read.faces, mesh.faces)
     np.testing.assert_array_equal(
@@ -535,11 +726,18 @@ def test_points_are_saved_without_faces(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "depth_m", "word"), [("a.fbx", 0.2, ".glb"), ("a.ply", NAN, "no surface")]
+    ("name", "depth_m", "word"),
+    [
+        ("a.fbx", 0.2, ".glb"),
+        ("a.ply", NAN, "no surface"),
+    ],
 )
 def test_mesh_that_cannot_be_saved_is_refused(
     tmp_path: Path, name: str, depth_m: float, word: str
 ) -> None:
     with pytest.raises(NlosCamError, match=word):
-        mesh_from_depth(np.full((8, 8), depth_m, np.float32), SMALL_BOX).save(tmp_path / name)
+        mesh_from_depth(
+            np.full((8, 8), depth_m, np.float32),
+            SMALL_BOX,
+        ).save(tmp_path / name)
     assert not any(tmp_path.iterdir())

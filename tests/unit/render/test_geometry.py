@@ -34,26 +34,43 @@ def test_beams_land_on_the_wall_along_the_rays_of_their_pixels(
 ) -> None:
     rig = _lidar(yaw_deg=yaw_deg, pitch_deg=pitch_deg)
     beams = cast(rig, _cells(rig))
-    np.testing.assert_allclose(beams.laser_spot_m[beams.on_wall, 2], 0, atol=1e-12)
+    np.testing.assert_allclose(
+        beams.laser_spot_m[beams.on_wall, 2],
+        0,
+        atol=1e-12,
+    )
     pose = rig.wall_from_lidar
     back = (beams.laser_spot_m[beams.on_wall] - pose[:3, 3]) @ pose[:3, :3]
     rays = _cells(rig).rays().reshape(-1, 3)[beams.on_wall]
     np.testing.assert_allclose(back / back[:, 2:], rays, atol=1e-9)
-    np.testing.assert_allclose(np.linalg.norm(back, axis=1), beams.length_m[beams.on_wall])
+    np.testing.assert_allclose(
+        np.linalg.norm(back, axis=1),
+        beams.length_m[beams.on_wall],
+    )
     np.testing.assert_allclose(
         back[:, 2] / np.linalg.norm(back, axis=1), beams.cos_axis[beams.on_wall]
     )
 
 
 def test_direct_return_scales_with_distance_and_receiver_cell() -> None:
-    near, far = (cast(_lidar(distance_m=d), _cells(BARE)) for d in (0.15, 0.3))
+    near, far = (
+        cast(
+            _lidar(distance_m=d),
+            _cells(BARE),
+        )
+        for d in (0.15, 0.3)
+    )
     both = near.on_wall & far.on_wall
     np.testing.assert_allclose(far.length_m[both], 2 * near.length_m[both])
     np.testing.assert_allclose(far.direct[both], near.direct[both] / 4)
     device = BARE.device.model_copy(update={"receiver_cell_m2": 3e-4})
     beams = cast(BARE, _cells(BARE))
     np.testing.assert_allclose(
-        cast(BARE.model_copy(update={"device": device}), _cells(BARE)).direct, 3 * beams.direct
+        cast(
+            BARE.model_copy(update={"device": device}),
+            _cells(BARE),
+        ).direct,
+        3 * beams.direct,
     )
     fine = cast(BARE, BARE.pinhole.scaled(243, 195))
     coarse = cast(BARE, BARE.pinhole.scaled(81, 65))
@@ -64,7 +81,14 @@ def test_direct_return_scales_with_distance_and_receiver_cell() -> None:
 
 def test_beams_end_at_the_wall_edge_and_at_the_occluder() -> None:
     small = BARE.model_copy(
-        update={"wall": Extent(x_min_m=0, x_max_m=0.3, y_min_m=-0.1, y_max_m=0.1)}
+        update={
+            "wall": Extent(
+                x_min_m=0,
+                x_max_m=0.3,
+                y_min_m=-0.1,
+                y_max_m=0.1,
+            )
+        }
     )
     beams = cast(small, _cells(small))
     feet = beams.laser_spot_m[beams.on_wall]
@@ -79,7 +103,10 @@ def test_beams_end_at_the_wall_edge_and_at_the_occluder() -> None:
     reached = beams.on_wall
     np.testing.assert_allclose(beams.length_m[reached], free.length_m[reached])
     degrees = np.degrees(
-        np.arctan2(beams.laser_spot_m[stopped, 0], 0.2 - beams.laser_spot_m[stopped, 2])
+        np.arctan2(
+            beams.laser_spot_m[stopped, 0],
+            0.2 - beams.laser_spot_m[stopped, 2],
+        )
     )
     assert degrees.min() > 63
 
@@ -100,13 +127,22 @@ def test_beams_met_takes_the_place_of_the_wall() -> None:
         BARE, np.array([7]), np.array([0.1]), np.array([0.5]), np.array([0.25]), 2 * np.pi
     )
     assert not met.on_wall[7]
-    np.testing.assert_allclose(met.laser_spot_m[7], beams.lidar_m + 0.1 * beams.direction[7])
-    assert met.direct[7] == pytest.approx(0.25 * 0.5 * 1e-4 / (2 * np.pi * 0.01), rel=0.02)
+    np.testing.assert_allclose(
+        met.laser_spot_m[7],
+        beams.lidar_m + 0.1 * beams.direction[7],
+    )
+    assert met.direct[7] == pytest.approx(
+        0.25 * 0.5 * 1e-4 / (2 * np.pi * 0.01),
+        rel=0.02,
+    )
     others = np.arange(5120) != 7
     np.testing.assert_array_equal(met.direct[others], beams.direct[others])
 
 
-@pytest.mark.parametrize(("gate_m", "bins"), [(0.999, 100), (1.001, 101), (1e-6, 1)])
+@pytest.mark.parametrize(
+    ("gate_m", "bins"),
+    [(0.999, 100), (1.001, 101), (1e-6, 1)],
+)
 def test_gate_bins_begin_inside_the_gate(gate_m: float, bins: int) -> None:
     device = BARE.device.model_copy(update={"gate_s": gate_m / SPEED_OF_LIGHT_M_PER_S})
     assert gate_bins(device) == bins
@@ -122,7 +158,15 @@ def test_cast_is_cached_and_read_only() -> None:
 LIDAR_M = np.array([0.0, 0.0, 0.2])
 
 
-@pytest.mark.parametrize(("columns", "rows"), [(80, 64), (40, 32), (1, 1), (7, 3)])
+@pytest.mark.parametrize(
+    ("columns", "rows"),
+    [
+        (80, 64),
+        (40, 32),
+        (1, 1),
+        (7, 3),
+    ],
+)
 def test_relay_cells_cover_the_wall_exactly(columns: int, rows: int) -> None:
     relay, wall = relay_cells(BARE, LIDAR_M, columns, rows), BARE.relay
     assert len(relay.x_m) == len(relay.y_m) == len(relay.length_m) == columns * rows
@@ -130,7 +174,18 @@ def test_relay_cells_cover_the_wall_exactly(columns: int, rows: int) -> None:
     assert relay.cell_m2 * columns * rows == pytest.approx(area)
     assert relay.x_m.mean() == pytest.approx((wall.x_min_m + wall.x_max_m) / 2)
     assert relay.y_m.mean() == pytest.approx((wall.y_min_m + wall.y_max_m) / 2)
-    assert len(set(zip(relay.x_m, relay.y_m, strict=True))) == columns * rows
+    assert (
+        len(
+            set(
+                zip(
+                    relay.x_m,
+                    relay.y_m,
+                    strict=True,
+                )
+            )
+        )
+        == columns * rows
+    )
     assert relay.diagonal_m**2 >= 2 * relay.cell_m2 - 1e-15
 
 
@@ -148,4 +203,7 @@ def test_relay_cells_and_points_behind_the_edge_are_hidden() -> None:
     assert relay.behind((0.2, 1e-6), LIDAR_M).sum() == (relay.x_m > 0.2).sum()
     x = np.array([0.4, 0.4, 0.1, 0.0])
     z = np.array([0.3, -0.1, 0.3, 0.3])
-    np.testing.assert_array_equal(behind((0.2, 0.1), x, z, LIDAR_M), [True, False, False, False])
+    np.testing.assert_array_equal(
+        behind((0.2, 0.1), x, z, LIDAR_M),
+        [True, False, False, False],
+    )

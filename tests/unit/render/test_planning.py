@@ -35,7 +35,14 @@ def _called_for(scene: Scene, stop: str = "standard") -> set[str]:
 
 
 def _plate(slope: float = 0.0) -> np.ndarray:
-    return depth_map(16, np.nan, (np.s_[4:12, 2:14], 0.25 + slope * 0.25 / 16 * np.arange(12)))
+    return depth_map(
+        16,
+        np.nan,
+        (
+            np.s_[4:12, 2:14],
+            0.25 + slope * 0.25 / 16 * np.arange(12),
+        ),
+    )
 
 
 @pytest.mark.parametrize(
@@ -69,40 +76,57 @@ def test_plan_calls_for_a_small_tilt_on_a_shiny_surface() -> None:
 
 COARSE = Accuracy("coarse", relay_columns=8, relay_rows=6)
 DEPTH = (0.25 + 0.01 * np.arange(8) * np.ones((8, 1))).astype(np.float32)
-SCENE = Scene(RIG, DEPTH, Surface(np.array([0.9, 0.6, 0.3]), phong(0.5, 0.5, 3)))
+SCENE = Scene(
+    RIG,
+    DEPTH,
+    Surface(
+        np.array([0.9, 0.6, 0.3]),
+        phong(0.5, 0.5, 3),
+    ),
+)
 
 
 def _without(*names: str) -> RenderProblem:
     return prepare(SCENE, COARSE, set(EFFECTS) - set(names))
 
 
-def test_problem_holds_every_effect_and_drops_those_left_out() -> None:
+def test_problem_holds_every_effect() -> None:
     problem = _without()
-    whole = problem.job
+    job = problem.job
     assert len(problem.color_jobs) == 3
-    assert whole.more_bounces
-    assert whole.field.shades
-    assert whole.brdf is SCENE.surface.brdf
-    assert whole.patches.beta.max() > 1
-    assert whole.edge_m == (0.2, 0.1)
-    assert whole.relay.x_m.max() < 0.4
+    assert job.more_bounces
+    assert job.field.shades
+    assert job.brdf is SCENE.surface.brdf
+    assert job.patches.beta.max() > 1
+    assert job.edge_m == (0.2, 0.1)
+    assert job.relay.x_m.max() < 0.4
+
+
+def test_problem_drops_effects_left_out() -> None:
     assert not _without("direct").beams.direct.any()
     assert _without("three-bounce").job is None
     assert not _without("colour").color_jobs
     assert _without("tilt").job.patches.beta.max() == 1
     assert not _without("self-occlusion").job.field.shades
-    open_job, short, dull = (
-        _without(name).job for name in ("occluder", "inter-reflection", "brdf")
-    )
-    assert open_job.edge_m == NO_OCCLUDER
-    assert len(open_job.relay.x_m) == 48
-    assert len(open_job.laser_spot_m) > len(whole.laser_spot_m)
-    assert not short.more_bounces
-    assert short.bins < whole.bins
-    assert dull.brdf is None
-    assert dull.patches.albedo.mean() == pytest.approx(
-        0.6 * (0.5 + 0.5 + 0.5 * 2.5) / 2
-    )  # the middle of its range
+
+
+def test_problem_without_occluder_opens_wall_and_relay() -> None:
+    job = _without("occluder").job
+    assert job.edge_m == NO_OCCLUDER
+    assert len(job.relay.x_m) == 48
+    assert len(job.laser_spot_m) > len(_without().job.laser_spot_m)
+
+
+def test_problem_without_interreflection_is_shorter() -> None:
+    job = _without("inter-reflection").job
+    assert not job.more_bounces
+    assert job.bins < _without().job.bins
+
+
+def test_problem_without_brdf_takes_the_middle_of_its_range() -> None:
+    job = _without("brdf").job
+    assert job.brdf is None
+    assert job.patches.albedo.mean() == pytest.approx(0.6 * (0.5 + 0.5 + 0.5 * 2.5) / 2)
 
 
 def test_prepare_refuses_histograms_that_do_not_fit() -> None:
@@ -117,7 +141,10 @@ def test_job_weights_are_the_factors_of_s2(radiometry: Radiometry) -> None:
     job = prepare(Scene(RIG, DEPTH, Surface(0.5), radiometry), COARSE).job
     relay = job.relay
     solid = np.pi if radiometry == "lambertian" else 2 * np.pi
-    np.testing.assert_allclose(job.strength, 0.5 * job.patches.beta * job.patches.cell_m2)
+    np.testing.assert_allclose(
+        job.strength,
+        0.5 * job.patches.beta * job.patches.cell_m2,
+    )
     far = relay.length_m > job.near_m
     expected = relay.cell_m2 / (solid**2 * relay.length_m**2)
     if radiometry == "lambertian":
@@ -129,7 +156,11 @@ def test_job_weights_are_the_factors_of_s2(radiometry: Radiometry) -> None:
     assert (job.relay_weight <= expected * (1 + 1e-12)).all()
 
 
-bounds = st.lists(st.floats(0, 1), min_size=len(EFFECTS), max_size=len(EFFECTS))
+bounds = st.lists(
+    st.floats(0, 1),
+    min_size=len(EFFECTS),
+    max_size=len(EFFECTS),
+)
 
 
 def _findings(values: list[float]) -> list[tuple[str, float, str]]:
@@ -151,7 +182,10 @@ def test_decide_leaves_out_bounds_up_to_the_tolerance(
     assert max(out, default=0) <= min(kept, default=1)
 
 
-@pytest.mark.parametrize("asked", [["tilt", "direct"], ("direct", "tilt"), {"tilt", "direct"}])
+@pytest.mark.parametrize(
+    "asked",
+    [["tilt", "direct"], ("direct", "tilt"), {"tilt", "direct"}],
+)
 def test_decide_includes_exactly_the_named_effects(asked: Collection[str]) -> None:
     plan = decide(_findings([0.5] * len(EFFECTS)), 0.0, asked)
     assert {effect.name for effect in plan if effect.included} == {"direct", "tilt"}
@@ -162,7 +196,13 @@ def test_decide_includes_exactly_the_named_effects(asked: Collection[str]) -> No
 
 def test_decide_takes_names_and_leaves_out_zero_bounds() -> None:
     assert {
-        e.name for e in decide(_findings([1.0] * len(EFFECTS)), 0.0, "direct") if e.included
+        e.name
+        for e in decide(
+            _findings([1.0] * len(EFFECTS)),
+            0.0,
+            "direct",
+        )
+        if e.included
     } == {"direct"}
     with pytest.raises(SceneError, match="no light arrives"):
         decide(_findings([1.0] * len(EFFECTS)), 0.0, [])
@@ -218,7 +258,14 @@ def test_survey_share_is_cautious_and_at_most_1() -> None:
 @pytest.mark.parametrize("z_m", [0.0, 1e-9])
 def test_survey_bounds_the_energy_of_a_patch_on_the_wall(z_m: float) -> None:
     """A patch on the wall must not outweigh all others, whose bounds would then be too small."""
-    light = SceneFacts(Scene(RIG, depth_map(8, 0.2, ((3, 3), z_m)), jump_m=0.5), COARSE).light
+    light = SceneFacts(
+        Scene(
+            RIG,
+            depth_map(8, 0.2, ((3, 3), z_m)),
+            jump_m=0.5,
+        ),
+        COARSE,
+    ).light
     assert np.isfinite(light.energy).all()
     assert light.energy.max() < 1e3 * np.median(light.energy)
 
@@ -227,7 +274,13 @@ LEVEL = np.full((8, 8), 0.25, np.float32)
 
 
 @pytest.mark.parametrize(
-    ("cells", "stride", "blocks"), [(8, 2, 4), (8, 1, 8), (7, 2, 7), (8, 4, 2)]
+    ("cells", "stride", "blocks"),
+    [
+        (8, 2, 4),
+        (8, 1, 8),
+        (7, 2, 7),
+        (8, 4, 2),
+    ],
 )
 def test_facts_take_blocks_where_the_stride_divides_the_grid(
     cells: int, stride: int, blocks: int
@@ -248,6 +301,10 @@ def test_facts_have_no_patches_of_empty_boxes_or_beyond_the_gate() -> None:
         assert facts.interreflection == 0
     device = RIG.device.model_copy(update={"gate_s": 0.4999 / SPEED_OF_LIGHT_M_PER_S})
     assert (
-        SceneFacts(Scene(RIG.model_copy(update={"device": device}), LEVEL), COARSE).patches is None
+        SceneFacts(
+            Scene(RIG.model_copy(update={"device": device}), LEVEL),
+            COARSE,
+        ).patches
+        is None
     )
     assert SceneFacts(Scene(RIG, LEVEL), COARSE).patches is not None

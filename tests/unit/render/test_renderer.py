@@ -45,7 +45,10 @@ def test_rendering_has_maps_of_cells_and_echoes_of_beams() -> None:
             assert image.dtype == np.float32
         assert rendering.multi.peak.shape == (64 * beams, 80 * beams)
         assert rendering.color is None
-        assert transient(Scene(RIG, DEPTH), replace(COARSE, beams_per_cell=beams)).shape[:2] == (
+        assert transient(
+            Scene(RIG, DEPTH),
+            replace(COARSE, beams_per_cell=beams),
+        ).shape[:2] == (
             64 * beams,
             80 * beams,
         )
@@ -72,39 +75,74 @@ def test_color_is_the_winning_echo_in_each_channel() -> None:
         atol=1e-30,
     )
     np.testing.assert_allclose(
-        rendering.color[~wins], np.repeat(rendering.intensity[~wins, None], 3, 1), rtol=1e-6
+        rendering.color[~wins],
+        np.repeat(
+            rendering.intensity[~wins, None],
+            3,
+            1,
+        ),
+        rtol=1e-6,
     )
 
 
 BIN_M = 0.01
 
 
-def _multi(peak: list[float], runner_up: list[float], path_m: float = 2.0) -> MultiBounce:
+def _multi(
+    peak: list[float],
+    runner_up: list[float],
+    path_m: float = 2.0,
+) -> MultiBounce:
     paths = np.full(len(peak), path_m, np.float32)
-    return MultiBounce(np.array(peak, np.float32), np.array(runner_up, np.float32), paths).reshape(
-        (1, len(peak))
-    )
+    return MultiBounce(
+        np.array(peak, np.float32),
+        np.array(runner_up, np.float32),
+        paths,
+    ).reshape((1, len(peak)))
 
 
 @settings(deadline=None, derandomize=True)
-@given(arrays(np.float32, (5, 9), elements=st.sampled_from([0.0, 1e-6, 0.25, 0.5, 1.0])))
+@given(
+    arrays(
+        np.float32,
+        (5, 9),
+        elements=st.sampled_from([0.0, 1e-6, 0.25, 0.5, 1.0]),
+    )
+)
 def test_strongest_finds_the_two_highest_bins(histogram: np.ndarray) -> None:
     found = strongest(histogram, BIN_M)
     ordered = np.sort(histogram, axis=1)
     np.testing.assert_array_equal(found.peak, ordered[:, -1])
     np.testing.assert_array_equal(found.runner_up, ordered[:, -2])
-    expected = np.where(
-        found.peak > 0, (histogram.argmax(1) + 0.5) * BIN_M, np.nan
-    )  # the first of equals
+    # The first of equals.
+    expected = np.where(found.peak > 0, (histogram.argmax(1) + 0.5) * BIN_M, np.nan)
     np.testing.assert_allclose(found.path_m, expected, rtol=1e-6)
 
 
 @pytest.mark.parametrize(
     ("direct", "multi", "depth_m", "intensity", "margin"),
     [
-        ([0.4, 0.1], _multi([0.2, 0.2], [0.1, 0.15]), [0.25, 0.5], [0.4, 0.2], [0.5, 0.25]),
-        ([0.25], _multi([0.25], [0.0]), [0.25], [0.25], [0.0]),  # a tie goes to the direct return
-        ([0.0, 0.1], no_echoes(2).reshape((1, 2)), [np.nan, 0.25], [0.0, 0.1], [0.0, 1.0]),
+        (
+            [0.4, 0.1],
+            _multi([0.2, 0.2], [0.1, 0.15]),
+            [0.25, 0.5],
+            [0.4, 0.2],
+            [0.5, 0.25],
+        ),
+        (
+            [0.25],
+            _multi([0.25], [0.0]),
+            [0.25],
+            [0.25],
+            [0.0],
+        ),  # a tie goes to the direct return
+        (
+            [0.0, 0.1],
+            no_echoes(2).reshape((1, 2)),
+            [np.nan, 0.25],
+            [0.0, 0.1],
+            [0.0, 1.0],
+        ),
         (
             [0.4],
             replace(_multi([0.2], [0.05]), direct_included=True),
@@ -128,13 +166,24 @@ def test_compete_takes_the_stronger_return(
     beams = Beams(
         (1, n), foot, foot, half, half, half, np.ones(n, np.bool_), np.array(direct), np.zeros(3)
     )
-    for found, expected in zip(compete(beams, multi), (depth_m, intensity, margin), strict=True):
+    for found, expected in zip(
+        compete(beams, multi),
+        (depth_m, intensity, margin),
+        strict=True,
+    ):
         np.testing.assert_allclose(found[0], expected, rtol=1e-6)
 
 
 def _plate(share: float) -> Scene:
     """A plate that comes 4 cm nearer to the wall during a scan."""
-    return Scene(RIG, depth_map(16, np.nan, (np.s_[4:12, 4:12], 0.3 - 0.04 * share)))
+    return Scene(
+        RIG,
+        depth_map(
+            16,
+            np.nan,
+            (np.s_[4:12, 4:12], 0.3 - 0.04 * share),
+        ),
+    )
 
 
 def _still(_share: float) -> Scene:
@@ -175,14 +224,24 @@ def test_scan_slice_is_the_rendering_of_its_instant() -> None:
     assert scan.depth_m.shape == (64, 80)
 
 
-@pytest.mark.parametrize(("bound", "count"), [(0.01, 2), (0.1, 5), (1.0, 50)])
+@pytest.mark.parametrize(
+    ("bound", "count"),
+    [(0.01, 2), (0.1, 5), (1.0, 50)],
+)
 def test_slices_grow_with_the_motion(bound: float, count: int) -> None:
     assert (
-        slices(Effect("scan-time", included=True, reason="", bound=bound), STOPS["standard"])
+        slices(
+            Effect("scan-time", included=True, reason="", bound=bound),
+            STOPS["standard"],
+        )
         == count
     )
     assert (
-        slices(Effect("scan-time", included=False, reason="", bound=bound), STOPS["standard"]) == 1
+        slices(
+            Effect("scan-time", included=False, reason="", bound=bound),
+            STOPS["standard"],
+        )
+        == 1
     )
 
 
@@ -193,40 +252,67 @@ BRDF = phong(0.4, 0.6, 10)
 def job() -> TransportJob:
     depth = np.random.default_rng(0).uniform(0.1, 0.3, (4, 4)).astype(np.float32)
     return prepare(
-        Scene(load_rig("paper-rig"), depth, Surface(1.0, BRDF), jump_m=0.5), COARSE, "auto"
+        Scene(
+            load_rig("paper-rig"),
+            depth,
+            Surface(1.0, BRDF),
+            jump_m=0.5,
+        ),
+        COARSE,
+        "auto",
     ).job
 
 
 @pytest.mark.parametrize("radiometry", ["paper", "lambertian"])
 @pytest.mark.parametrize("stop", ["draft", "standard"])
-def test_joined_patches_move_light_by_less_than_a_bin_and_hardly_change_it(
+def test_joined_patches_move_light_by_less_than_a_bin(
     stop: str, radiometry: Radiometry, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     job = prepare(
-        Scene(RIG, object_depth(4, object_box(RIG))[1], radiometry=radiometry), STOPS[stop]
+        Scene(
+            RIG,
+            object_depth(4, object_box(RIG))[1],
+            radiometry=radiometry,
+        ),
+        STOPS[stop],
     ).job
     joined = histograms(job).astype(np.float64)
     groups_of = beam_sums.groups_of
-    monkeypatch.setattr(
-        backend_numba, "groups_of", lambda surface, _: groups_of(surface, -1.0)
-    )  # each patch alone
+    # Each patch alone.
+    monkeypatch.setattr(backend_numba, "groups_of", lambda surface, _: groups_of(surface, -1.0))
     alone = histograms(job).astype(np.float64)
     below = [np.cumsum(each, axis=1) for each in (joined, alone)]
     weight = float((1 + beam_sums.JOIN_COSINE) * beam_sums.JOIN_WEIGHT) / job.accuracy.sub_bins
     assert (below[0][:, 1:] >= below[1][:, :-1] * (1 - weight)).all()
     assert (below[0][:, :-1] <= below[1][:, 1:] * (1 + weight) + 1e-6 * below[1][:, -1:]).all()
-    np.testing.assert_allclose(below[0][:, -1], below[1][:, -1], rtol=0.05 * weight)
-    np.testing.assert_allclose(joined.max(1), alone.max(1), rtol=0.3 * weight)
+    np.testing.assert_allclose(
+        below[0][:, -1],
+        below[1][:, -1],
+        rtol=0.05 * weight,
+    )
+    np.testing.assert_allclose(
+        joined.max(1),
+        alone.max(1),
+        rtol=0.3 * weight,
+    )
     assert np.abs(joined - alone).max() > 1e-4 * alone.max()
 
 
-@pytest.mark.parametrize("bound", [beam_sums.ROUNDED, np.float32(np.inf)])
+@pytest.mark.parametrize(
+    "bound",
+    [beam_sums.ROUNDED, np.float32(np.inf)],
+)
 @pytest.mark.parametrize("radiometry", ["paper", "lambertian"])
-def test_echoes_are_the_strongest_bins_of_the_histograms_bit_for_bit(
+def test_echoes_are_the_histograms_strongest_bins_bit_for_bit(
     bound: np.float32, radiometry: Radiometry, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     job = prepare(
-        Scene(RIG, object_depth(4, object_box(RIG))[1], radiometry=radiometry), STOPS["draft"]
+        Scene(
+            RIG,
+            object_depth(4, object_box(RIG))[1],
+            radiometry=radiometry,
+        ),
+        STOPS["draft"],
     ).job
     job = job.select(np.arange(0, len(job.laser_spot_m), 7))
     # With bounds of infinity no window decides, and every beam sums all of its bins.

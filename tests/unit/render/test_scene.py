@@ -25,7 +25,13 @@ def _depth(z_m: float = 0.25, cells: int = 8) -> np.ndarray:
     [
         *[
             ({"object_depth_m": np.full(shape, 0.3, np.float32)}, "256")
-            for shape in ((7, 8), (8,), (1, 8, 8), (0, 0), (FINEST_GRID + 1, FINEST_GRID + 1))
+            for shape in (
+                (7, 8),
+                (8,),
+                (1, 8, 8),
+                (0, 0),
+                (FINEST_GRID + 1, FINEST_GRID + 1),
+            )
         ],
         *[
             ({"object_depth_m": np.ones((8, 8), kind)}, kind)
@@ -37,7 +43,13 @@ def _depth(z_m: float = 0.25, cells: int = 8) -> np.ndarray:
             for value in (-1e-9, np.inf, np.nan)
         ],
         ({"radiometry": "gothic"}, "gothic"),
-        ({"object_depth_m": _depth(), "surface": Surface(np.ones((5, 5)))}, "5"),
+        (
+            {
+                "object_depth_m": _depth(),
+                "surface": Surface(np.ones((5, 5))),
+            },
+            "5",
+        ),
         ({"object_depth_m": _depth(), "rig": load_rig("bare-wall")}, "object_box"),
     ],
 )
@@ -50,7 +62,10 @@ def test_scene_has_patches_where_an_object_is() -> None:
     for empty in (
         Scene(RIG),
         Scene(load_rig("bare-wall")),
-        Scene(RIG, np.full((8, 8), np.nan, np.float32)),
+        Scene(
+            RIG,
+            np.full((8, 8), np.nan, np.float32),
+        ),
     ):
         assert empty.patches is None
     touching = Scene(RIG, _depth(0.0)).patches
@@ -75,17 +90,33 @@ def test_surface_refuses_albedos_out_of_range_or_shape(albedo: float | np.ndarra
         Surface(albedo)
 
 
-@pytest.mark.parametrize(("shape", "channels"), [((), 1), ((3,), 3), ((5, 5), 1), ((5, 5, 3), 3)])
+@pytest.mark.parametrize(
+    ("shape", "channels"),
+    [
+        ((), 1),
+        ((3,), 3),
+        ((5, 5), 1),
+        ((5, 5, 3), 3),
+    ],
+)
 def test_surface_spreads_its_albedo_over_every_cell(shape: tuple[int, ...], channels: int) -> None:
     surface = Surface(np.full(shape, 0.5))
     assert surface.colored == (channels == 3)
-    np.testing.assert_array_equal(surface.over((5, 5)), np.full((5, 5, channels), 0.5))
+    np.testing.assert_array_equal(
+        surface.over((5, 5)),
+        np.full((5, 5, channels), 0.5),
+    )
 
 
 def test_material_makes_the_brdf_of_its_kind() -> None:
     assert Material().surface.brdf is None
     for kind, make in (("phong", phong), ("retroreflective", retroreflective)):
-        material = Material(kind=kind, specular=0.3, exponent=7, albedo=(0.1, 0.2, 0.3))
+        material = Material(
+            kind=kind,
+            specular=0.3,
+            exponent=7,
+            albedo=(0.1, 0.2, 0.3),
+        )
         assert material.surface.colored
         assert material.brdf(0.6, 0.7, 0.8) == pytest.approx(make(0.7, 0.3, 7)(0.6, 0.7, 0.8))
 
@@ -114,14 +145,28 @@ def _patches(depth: np.ndarray, albedo: float = 1.0) -> Patches:
 def test_patches_lie_at_the_centers_of_surface_cells() -> None:
     patches = _patches(_patches_depth())
     assert len(patches.beta) == 20 * 30
-    np.testing.assert_allclose(patches.point_m[:, 0], BOX.x_min_m + (patches.column + 0.5) * PITCH)
-    np.testing.assert_allclose(patches.point_m[:, 1], BOX.y_max_m - (patches.row + 0.5) * PITCH)
+    np.testing.assert_allclose(
+        patches.point_m[:, 0],
+        BOX.x_min_m + (patches.column + 0.5) * PITCH,
+    )
+    np.testing.assert_allclose(
+        patches.point_m[:, 1],
+        BOX.y_max_m - (patches.row + 0.5) * PITCH,
+    )
     np.testing.assert_allclose(patches.point_m[:, 2], 0.25)
     assert patches.cell_m2 == pytest.approx(PITCH**2)
     assert patches.diagonal_m == pytest.approx(PITCH * np.sqrt(2))
 
 
-@pytest.mark.parametrize(("slope_x", "slope_y"), [(0.0, 0.0), (0.7, 0.0), (0.0, -0.4), (0.3, 0.5)])
+@pytest.mark.parametrize(
+    ("slope_x", "slope_y"),
+    [
+        (0.0, 0.0),
+        (0.7, 0.0),
+        (0.0, -0.4),
+        (0.3, 0.5),
+    ],
+)
 def test_patches_of_a_plane_have_its_normal_and_area(slope_x: float, slope_y: float) -> None:
     rows, columns = np.mgrid[0:64, 0:64]
     patches = _patches(_patches_depth(0.2) + slope_x * PITCH * columns - slope_y * PITCH * rows)
@@ -129,16 +174,27 @@ def test_patches_of_a_plane_have_its_normal_and_area(slope_x: float, slope_y: fl
     np.testing.assert_allclose(patches.beta, beta)
     np.testing.assert_allclose(patches.area_m2, beta * PITCH**2)
     np.testing.assert_allclose(
-        patches.slope, np.broadcast_to([slope_x, slope_y], patches.slope.shape), atol=1e-9
+        patches.slope,
+        np.broadcast_to(
+            [slope_x, slope_y],
+            patches.slope.shape,
+        ),
+        atol=1e-9,
     )
-    expected = np.broadcast_to(np.array([slope_x, slope_y, -1]) / beta, patches.normal.shape)
+    expected = np.broadcast_to(
+        np.array([slope_x, slope_y, -1]) / beta,
+        patches.normal.shape,
+    )
     np.testing.assert_allclose(patches.normal, expected, atol=1e-9)
     level = patches.level()
     assert (level.beta == 1).all()
     assert (level.normal == [0, 0, -1]).all()
 
 
-@pytest.mark.parametrize(("step_m", "joined"), [(0.9 * JUMP_M, True), (1.1 * JUMP_M, False)])
+@pytest.mark.parametrize(
+    ("step_m", "joined"),
+    [(0.9 * JUMP_M, True), (1.1 * JUMP_M, False)],
+)
 def test_patches_join_steps_up_to_the_jump(step_m: float, joined: bool) -> None:
     depth = _patches_depth()
     depth[:, 35:] += step_m
@@ -155,8 +211,14 @@ def test_clustered_keeps_area_albedo_and_tilt(stride: int) -> None:
     for part in (patches, blocks):
         assert (part.beta > 0).all()
     given = [(p.albedo * p.area_m2)[:, None] * p.normal for p in (patches, blocks)]
-    np.testing.assert_allclose(given[1].sum(0), given[0].sum(0))
-    np.testing.assert_allclose(np.linalg.norm(blocks.normal, axis=1), 1)
+    np.testing.assert_allclose(
+        given[1].sum(0),
+        given[0].sum(0),
+    )
+    np.testing.assert_allclose(
+        np.linalg.norm(blocks.normal, axis=1),
+        1,
+    )
     assert blocks.cell_m2 == pytest.approx(stride**2 * patches.cell_m2)
     np.testing.assert_allclose(
         blocks.point_m[:, 2], coarser(depth, stride)[blocks.row, blocks.column]
@@ -172,4 +234,7 @@ def test_coarser_map_is_the_mean_of_the_surface() -> None:
     depth[0, 0] = 1.0
     depth[0, 1] = 2.0
     depth[3, 3] = 5.0
-    np.testing.assert_array_equal(coarser(depth, 2), [[1.5, np.nan], [np.nan, 5.0]])
+    np.testing.assert_array_equal(
+        coarser(depth, 2),
+        [[1.5, np.nan], [np.nan, 5.0]],
+    )

@@ -48,8 +48,20 @@ def _ridge(front_m: float = 0.15) -> np.ndarray:
     return depth
 
 
-def _seen(field: HeightField, column: int, x: float, y: float, row: int = ROW) -> bool:
-    point = np.array([X_M[column], Y_M[row], field.depth_m[row, column]])
+def _seen(
+    field: HeightField,
+    column: int,
+    x: float,
+    y: float,
+    row: int = ROW,
+) -> bool:
+    point = np.array(
+        [
+            X_M[column],
+            Y_M[row],
+            field.depth_m[row, column],
+        ]
+    )
     return visible(field, row, column, point, x, y)
 
 
@@ -61,23 +73,50 @@ def test_ridge_shades_up_to_the_line_over_its_top() -> None:
     reach = (X_M[40] - X_M[10]) * 0.35 / (0.35 - 0.15 - 0.25 * field.pitch_x_m)
     assert _seen(field, 10, X_M[10] + 0.999 * reach, Y_M[ROW])
     assert not _seen(field, 10, X_M[10] + 1.001 * reach, Y_M[ROW])
-    assert _seen(_field(_ridge(), shades=False), 10, X_M[10] + 1.001 * reach, Y_M[ROW])
-    for x, y in ((X_M[10] - 2, Y_M[ROW]), (X_M[10], Y_M[ROW] + 2), (X_M[10], Y_M[ROW])):
+    assert _seen(
+        _field(_ridge(), shades=False),
+        10,
+        X_M[10] + 1.001 * reach,
+        Y_M[ROW],
+    )
+    for x, y in (
+        (X_M[10] - 2, Y_M[ROW]),
+        (X_M[10], Y_M[ROW] + 2),
+        (X_M[10], Y_M[ROW]),
+    ):
         assert _seen(field, 10, x, y)  # other directions
     for angle in np.linspace(0, 2 * np.pi, 33):  # from the ridge itself
-        assert _seen(field, 40, X_M[40] + 3 * np.cos(angle), Y_M[ROW] + 3 * np.sin(angle))
+        assert _seen(
+            field,
+            40,
+            X_M[40] + 3 * np.cos(angle),
+            Y_M[ROW] + 3 * np.sin(angle),
+        )
 
 
 @pytest.mark.parametrize("slope", [0.0, 1.0, -1.0])
 def test_plane_does_not_shade_its_lit_side(slope: float) -> None:
     columns, rows = np.meshgrid(X_M - X_M[32], Y_M - Y_M[32])
     field = _field(0.4 + slope * (columns + 0.5 * rows))
-    for row, column in [(0, 0), (32, 32), (63, 10)]:
+    for row, column in [
+        (0, 0),
+        (32, 32),
+        (63, 10),
+    ]:
         for angle in np.linspace(0, 2 * np.pi, 33):
             dx = np.cos(angle)
             dy = np.sin(angle)
             lit = slope * (dx + 0.5 * dy) * 10 + field.depth_m[row, column] > 0
-            assert _seen(field, column, X_M[column] + 10 * dx, Y_M[row] + 10 * dy, row) or not lit
+            assert (
+                _seen(
+                    field,
+                    column,
+                    X_M[column] + 10 * dx,
+                    Y_M[row] + 10 * dy,
+                    row,
+                )
+                or not lit
+            )
 
 
 def test_background_neither_shades_nor_ends_the_walk() -> None:
@@ -95,7 +134,11 @@ def test_segment_is_blocked_by_what_stands_between() -> None:
     assert not between(field, ROW, 10, 0.35, ROW, 30, 0.35)
     assert not between(field, ROW, 10, 0.35, 10, 10, 0.35)
     assert not between(field, ROW, 10, 0.35, ROW, 40, 0.15)
-    for one, other in ((10, 60), (60, 10), (10, 39)):
+    for one, other in (
+        (10, 60),
+        (60, 10),
+        (10, 39),
+    ):
         assert between(field, ROW, one, 0.35, 40, other, 0.35) == between(
             field, 40, other, 0.35, ROW, one, 0.35
         )
@@ -109,7 +152,14 @@ def test_horizon_table_bounds_the_walk_on_every_leg(seed: int, sectors: int) -> 
     rows = rows[::40]
     columns = columns[::40]
     z = field.depth_m[rows, columns]
-    low, high, walk = horizon_table(field, rows, columns, z, np.full(len(rows), 400.0), sectors)
+    low, high, walk = horizon_table(
+        field,
+        rows,
+        columns,
+        z,
+        np.full(len(rows), 400.0),
+        sectors,
+    )
     assert low.shape == high.shape == (len(rows), FACES * sectors)
     generator = np.random.default_rng(seed)
     sure = 0
@@ -119,7 +169,10 @@ def test_horizon_table_bounds_the_walk_on_every_leg(seed: int, sectors: int) -> 
             along = abs(u) >= abs(v)
             major, minor = (u, v) if along else (v, u)
             face = (0 if along else 2) + (0 if major >= 0 else 1)
-            k = face * sectors + min(int((minor / abs(major) + 1) * sectors / 2), sectors - 1)
+            k = face * sectors + min(
+                int((minor / abs(major) + 1) * sectors / 2),
+                sectors - 1,
+            )
             shaded = blocked(field, row, columns[s], z[s], u, v)
             if z[s] >= abs(major) * high[s, k]:
                 assert not shaded
@@ -129,14 +182,33 @@ def test_horizon_table_bounds_the_walk_on_every_leg(seed: int, sectors: int) -> 
                 sure += 1
             else:
                 first, last = walk[s, k].tolist()
-                assert blocked(field, row, columns[s], z[s], u, v, first, last) == shaded
+                assert (
+                    blocked(
+                        field,
+                        row,
+                        columns[s],
+                        z[s],
+                        u,
+                        v,
+                        first,
+                        last,
+                    )
+                    == shaded
+                )
                 walked += 1
     assert sure > 0 < walked
 
 
 OPEN = load_rig("bare-wall").model_copy(update={"object_box": RIG.object_box})
 COARSE = Accuracy("coarse", relay_columns=8, relay_rows=6)
-UNIT_BOX = ObjectBox(x_min_m=0, x_max_m=1, y_min_m=0, y_max_m=1, z_near_m=0.1, z_far_m=1)
+UNIT_BOX = ObjectBox(
+    x_min_m=0,
+    x_max_m=1,
+    y_min_m=0,
+    y_max_m=1,
+    z_near_m=0.1,
+    z_far_m=1,
+)
 
 
 def _hit(
@@ -146,30 +218,62 @@ def _hit(
     field = height_field(depth, UNIT_BOX, shades=True)
     length = float(np.linalg.norm(ray))
     slope = np.zeros((2, *depth.shape))
-    found = first_hits(field, slope, np.array(start), ray[None] / length, np.array([length]))
+    found = first_hits(
+        field,
+        slope,
+        np.array(start),
+        ray[None] / length,
+        np.array([length]),
+    )
     return float(found[0][0]) / length, float(found[1][0]), int(found[2][0]), int(found[3][0])
 
 
-def test_first_hits_meet_a_column_by_its_front_or_side() -> None:
-    depth = np.full((4, 4), np.nan)
-    depth[1, 2] = 0.5  # x in 0.5 to 0.75, y in 0.5 to 0.75
-    assert _hit(depth, [0.6, 0.6, 0.0], [0.6, 0.6, 1.0]) == pytest.approx((0.5, 1.0, 1, 2))
-    assert _hit(depth, [0.0, 0.6, 0.8], [1.0, 0.6, 0.8]) == pytest.approx((0.5, 1.0, 1, 2))
-    assert (
-        _hit(depth, [0.0, 0.6, 0.3], [1.0, 0.6, 0.3])[0] == np.inf
-    )  # between the object and the wall
-    assert _hit(depth, [0.0, 0.2, 0.8], [1.0, 0.2, 0.8])[0] == np.inf  # past it
-    assert _hit(depth, [0.0, 0.6, 0.8], [0.4, 0.6, 0.8])[0] == np.inf  # not so far
+COLUMN = np.full((4, 4), np.nan)
+COLUMN[1, 2] = 0.5  # x in 0.5 to 0.75, y in 0.5 to 0.75
+
+
+@pytest.mark.parametrize(
+    ("start", "end"),
+    [
+        ([0.6, 0.6, 0.0], [0.6, 0.6, 1.0]),
+        ([0.0, 0.6, 0.8], [1.0, 0.6, 0.8]),
+    ],
+    ids=["front", "side"],
+)
+def test_first_hits_meet_a_column(start: list[float], end: list[float]) -> None:
+    assert _hit(COLUMN, start, end) == pytest.approx((0.5, 1.0, 1, 2))
+
+
+@pytest.mark.parametrize(
+    ("start", "end"),
+    [
+        ([0.0, 0.6, 0.3], [1.0, 0.6, 0.3]),
+        ([0.0, 0.2, 0.8], [1.0, 0.2, 0.8]),
+        ([0.0, 0.6, 0.8], [0.4, 0.6, 0.8]),
+    ],
+    ids=["between object and wall", "past it", "not so far"],
+)
+def test_first_hits_miss_a_column(start: list[float], end: list[float]) -> None:
+    assert _hit(COLUMN, start, end)[0] == np.inf
 
 
 def test_sight_is_empty_in_the_paper_rig_and_refused_inside() -> None:
-    assert SceneFacts(Scene(RIG, np.full((8, 8), 0.12, np.float32)), COARSE).line_of_sight is None
+    assert (
+        SceneFacts(
+            Scene(RIG, np.full((8, 8), 0.12, np.float32)),
+            COARSE,
+        ).line_of_sight
+        is None
+    )
     box = ObjectBox(
         x_min_m=-0.1, x_max_m=0.1, y_min_m=-0.1, y_max_m=0.1, z_near_m=0.05, z_far_m=0.4
     )
     around = OPEN.model_copy(update={"object_box": box})
     with pytest.raises(SceneError, match=r"0\.2 m"):
-        _ = SceneFacts(Scene(around, np.full((8, 8), 0.1, np.float32)), COARSE).line_of_sight
+        _ = SceneFacts(
+            Scene(around, np.full((8, 8), 0.1, np.float32)),
+            COARSE,
+        ).line_of_sight
 
 
 def test_sight_stops_beams_and_hides_relay_cells() -> None:
@@ -188,7 +292,11 @@ def test_sight_stops_beams_and_hides_relay_cells() -> None:
     np.testing.assert_allclose(ready.beams.length_m[sight.beam], sight.length_m)
     assert not ready.beams.on_wall[sight.beam].any()
     assert len(ready.job.relay.x_m) == (~sight.hidden).sum()
-    white = prepare(Scene(OPEN, depth), COARSE, "auto").beams.direct[sight.beam]
+    white = prepare(
+        Scene(OPEN, depth),
+        COARSE,
+        "auto",
+    ).beams.direct[sight.beam]
     np.testing.assert_allclose(ready.beams.direct[sight.beam], 0.5 * white)
 
 
@@ -213,14 +321,16 @@ def test_form_factor_of_two_squares_follows_s2(lambertian: bool) -> None:
     found = interreflection.form_factor(a, UP, b, DOWN, 1e-4, 1.0, 0.1, lambertian)
     expected = 1e-4 * 0.8 / 0.25 / ((np.pi / 0.8) if lambertian else 2 * np.pi)
     assert found == pytest.approx(expected)
-    for back in ((a, DOWN, b, DOWN), (a, UP, b, UP)):
+    for back in (
+        (a, DOWN, b, DOWN),
+        (a, UP, b, UP),
+    ):
         assert interreflection.form_factor(*back, 1e-4, 1.0, 0.1, lambertian) == 0
 
 
 def test_patch_to_patch_is_reciprocal_and_loses_energy(job: TransportJob) -> None:
-    table = interreflection.patch_to_patch(
-        job.patch_arrays, job.field, 1e-9, True
-    )  # beyond near contact
+    # Beyond near contact.
+    table = interreflection.patch_to_patch(job.patch_arrays, job.field, 1e-9, True)
     assert (table > 0).any()
     assert not np.diag(table).any()
     given = table / job.strength
@@ -241,11 +351,23 @@ def test_wall_factors_sum_to_at_most_1(job: TransportJob) -> None:
 
 
 def test_brute_force_refuses_too_many_interreflections() -> None:
-    scene = Scene(RIG, np.full((32, 32), 0.2, np.float32), radiometry="lambertian")
+    scene = Scene(
+        RIG,
+        np.full((32, 32), 0.2, np.float32),
+        radiometry="lambertian",
+    )
     effects = ["three-bounce", "occluder", "tilt", "self-occlusion", "inter-reflection"]
     with pytest.raises(SceneError, match="inter-reflection"):
         three_bounce(
-            scene, Accuracy("own", 3, 3, sub_bins=0), effects=effects, chosen=np.arange(5120)[::151]
+            scene,
+            Accuracy(
+                "own",
+                3,
+                3,
+                sub_bins=0,
+            ),
+            effects=effects,
+            chosen=np.arange(5120)[::151],
         )
 
 
@@ -255,7 +377,10 @@ def _verdicts(surface: NumbaSurface, bounds_m: Any, optics: NumbaOptics, field: 
 
 
 @pytest.mark.parametrize("surface", ["wave", "rough", "object"])
-@pytest.mark.parametrize("edge", [None, Occluder(x_m=0.43, z_min_m=0.1)])
+@pytest.mark.parametrize(
+    "edge",
+    [None, Occluder(x_m=0.43, z_min_m=0.1)],
+)
 def test_verdict_on_a_tile_holds_for_each_leg(surface: str, edge: Occluder | None) -> None:
     """No leg to a free tile is blocked, and no leg to a dark one carries light; either verdict is
     common.
@@ -269,24 +394,48 @@ def test_verdict_on_a_tile_holds_for_each_leg(surface: str, edge: Occluder | Non
     }[surface]
     rig = RIG.model_copy(update={"occluder": edge})
     effects = "direct", "three-bounce", "line-of-sight", "occluder", "self-occlusion", "tilt"
-    job = prepare(Scene(rig, depth.astype(np.float32)), Accuracy("some", 40, 32), effects).job
+    job = prepare(
+        Scene(rig, depth.astype(np.float32)),
+        Accuracy("some", 40, 32),
+        effects,
+    ).job
     assert job is not None
     single = NumbaJob(job)
     where = job.patches
-    for points in (single.relay, single.feet(np.ones(len(job.laser_spot_m)))):
+    for points in (
+        single.relay,
+        single.feet(np.ones(len(job.laser_spot_m))),
+    ):
         verdicts = _verdicts(single.surface, points.bounds_m, *single.sites[3:])
         each = points.tile
         for s in range(0, len(where.row), 41):
             point = where.point_m[s]
             normal = where.normal[s]
-            place = np.repeat(np.arange(len(points.bounds_m)), each)[: len(points.x_m)]
+            place = np.repeat(
+                np.arange(len(points.bounds_m)),
+                each,
+            )[: len(points.x_m)]
             for tile in np.flatnonzero((verdicts[s] == FREE) | (verdicts[s] == DARK)):
-                for px, py in np.stack([points.x_m, points.y_m], 1)[place == tile][::7].astype(
-                    float
-                ):
+                for px, py in np.stack(
+                    [points.x_m, points.y_m],
+                    1,
+                )[place == tile][::7].astype(float):
                     facing = normal @ (np.array([px, py, 0.0]) - point)
-                    seen = visible(job.field, where.row[s], where.column[s], point, px, py)
-                    passes = seen and not occluded(point[0], point[2], px, 0.0, *job.edge_m)
+                    seen = visible(
+                        job.field,
+                        where.row[s],
+                        where.column[s],
+                        point,
+                        px,
+                        py,
+                    )
+                    passes = seen and not occluded(
+                        point[0],
+                        point[2],
+                        px,
+                        0.0,
+                        *job.edge_m,
+                    )
                     if (
                         facing > 1e-5
                     ):  # legs to the back of a patch carry no light in a free tile either

@@ -66,11 +66,20 @@ RICH = BIASED.model_copy(update={"ambient_counts": 60.0, "dead_share": 0.05, "wa
 def _flat(counts: float) -> MultiBounce:
     gain = Sensor(BARE, QUIET)._chain.gain
     peak = np.full((64, 80), counts / gain, np.float32)
-    return MultiBounce(peak, np.zeros_like(peak), np.ones_like(peak), direct_included=True)
+    return MultiBounce(
+        peak,
+        np.zeros_like(peak),
+        np.ones_like(peak),
+        direct_included=True,
+    )
 
 
 def _seen(model: SensorModel, counts: float, celsius: float | None = None) -> SensedImages:
-    return Sensor(BARE, model).expose(_flat(counts), np.random.default_rng(4), celsius=celsius)
+    return Sensor(BARE, model).expose(
+        _flat(counts),
+        np.random.default_rng(4),
+        celsius=celsius,
+    )
 
 
 def _turned(
@@ -82,7 +91,13 @@ def _turned(
 ) -> SensedImages:
     """The images with one stage switched the other way."""
     turned = tuple(
-        replace(e, included=not e.included) if e.name == name else e for e in sensor_effects(model)
+        replace(
+            e,
+            included=not e.included,
+        )
+        if e.name == name
+        else e
+        for e in sensor_effects(model)
     )
     with monkeypatch.context() as patch:
         patch.setattr("nlos_cam.render.sensor.sensor.sensor_effects", lambda _: turned)
@@ -110,7 +125,11 @@ def test_stage_is_included_exactly_when_the_model_has_it(name: str) -> None:
     assert next(e.bound for e in rich if e.name == name) == 0
 
 
-@pytest.mark.parametrize("model", [SensorModel(), QUIET, RICH], ids=["default", "quiet", "rich"])
+@pytest.mark.parametrize(
+    "model",
+    [SensorModel(), QUIET, RICH],
+    ids=["default", "quiet", "rich"],
+)
 def test_stages_have_their_order_and_reasons(model: SensorModel) -> None:
     verdicts = sensor_effects(model)
     assert tuple(effect.name for effect in verdicts) == CHAIN
@@ -125,17 +144,29 @@ def test_stage_changes_the_images_only_if_the_model_has_it(
 ) -> None:
     model = QUIET.model_copy(update=HAS[name])
     celsius = WORST_AT.get(name)
-    assert not _same(_seen(model, 30.0, celsius), _turned(model, name, 30.0, monkeypatch, celsius))
+    assert not _same(
+        _seen(model, 30.0, celsius),
+        _turned(model, name, 30.0, monkeypatch, celsius),
+    )
     assert _same(_seen(QUIET, 30.0), _turned(QUIET, name, 30.0, monkeypatch))
 
 
 @pytest.mark.parametrize(
     ("name", "deviates"),
-    [("shot noise", 1), ("read noise", 1), ("range noise", 1), ("dead pixels", 0), ("none", 0)],
+    [
+        ("shot noise", 1),
+        ("read noise", 1),
+        ("range noise", 1),
+        ("dead pixels", 0),
+        ("none", 0),
+    ],
 )
 def test_noise_left_out_is_not_drawn(name: str, deviates: int) -> None:
     drawn, counted = map(np.random.default_rng, (7, 7))
-    Sensor(BARE, QUIET.model_copy(update=HAS.get(name, {}))).expose(_flat(30.0), drawn)
+    Sensor(
+        BARE,
+        QUIET.model_copy(update=HAS.get(name, {})),
+    ).expose(_flat(30.0), drawn)
     counted.standard_normal((deviates, WIDTH * HEIGHT), np.float32)
     assert drawn.bit_generator.state == counted.bit_generator.state
 
@@ -152,7 +183,10 @@ def _ir_change(
 
 
 @pytest.mark.parametrize("name", ["wall texture", "ambient light", "shot noise", "read noise"])
-@pytest.mark.parametrize("counts", [1.0, 5.0, 30.0, 120.0, 195.0, 250.0])
+@pytest.mark.parametrize(
+    "counts",
+    [1.0, 5.0, 30.0, 120.0, 195.0, 250.0],
+)
 def test_ir_changes_by_at_most_the_bound(
     name: str, counts: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -162,9 +196,8 @@ def test_ir_changes_by_at_most_the_bound(
 
 def test_ir_bound_is_near_the_worst_case(monkeypatch: pytest.MonkeyPatch) -> None:
     noisy = QUIET.model_copy(update={"read_noise_counts": 2.0})
-    change, bound = _ir_change(
-        noisy, "read noise", 30.0, monkeypatch
-    )  # the same at 1 count, were it not cut at 0
+    # The same at 1 count, were it not cut at 0.
+    change, bound = _ir_change(noisy, "read noise", 30.0, monkeypatch)
     assert bound / 2 < change <= bound
     rough = QUIET.model_copy(update={"wall_texture": 0.2})
     change, bound = _ir_change(rough, "wall texture", 100.0, monkeypatch)
@@ -200,7 +233,6 @@ def test_bias_moves_depth_by_half_to_all_its_bound(
         without = _turned(model, name, 30.0, monkeypatch, celsius)
         return float(np.abs(seen.depth_z16.astype(float) - without.depth_z16).mean() * DEPTH_UNIT_M)
 
-    assert (
-        change_m(celsius) <= bound + DEPTH_UNIT_M / 20
-    )  # rounding to units adds to a mean of moduli
+    # Rounding to units adds to a mean of moduli.
+    assert change_m(celsius) <= bound + DEPTH_UNIT_M / 20
     assert change_m(WORST_AT.get(name, 45.0)) > bound / 2

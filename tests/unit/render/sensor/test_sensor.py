@@ -46,7 +46,15 @@ NO_ECHO = MultiBounce(DARK, DARK, np.full_like(DARK, np.nan))
 def test_gain_puts_the_brightest_return_at_its_counts(counts: float) -> None:
     model = QUIET.model_copy(update={"bare_wall_counts": counts})
     for rig in (RIG, BARE):
-        assert Sensor(rig, model).expose(NO_ECHO, default_rng(0)).ir.max() == counts
+        assert (
+            Sensor(rig, model)
+            .expose(
+                NO_ECHO,
+                default_rng(0),
+            )
+            .ir.max()
+            == counts
+        )
 
 
 @pytest.mark.parametrize("radiometry", ["paper", "lambertian"])
@@ -54,13 +62,22 @@ def test_gain_puts_the_brightest_return_at_its_counts(counts: float) -> None:
 def test_gain_holds_for_any_pulse_and_radiometry(radiometry: Radiometry, pulse_ns: float) -> None:
     scene = Scene(BARE, None, radiometry=radiometry, pulse_ns=pulse_ns)
     model = QUIET.model_copy(update={"pulse_ns": pulse_ns})
-    images = Sensor(BARE, model, radiometry).expose(render(scene, "draft").multi, default_rng(0))
+    images = Sensor(BARE, model, radiometry).expose(
+        render(scene, "draft").multi,
+        default_rng(0),
+    )
     assert images.ir.max() == pytest.approx(48, abs=2)
 
 
 def test_gain_does_not_depend_on_the_occluder() -> None:
     near = RIG.model_copy(update={"occluder": Occluder(x_m=0.1, z_min_m=0.05)})
-    images, free = (Sensor(rig, QUIET).expose(NO_ECHO, default_rng(0)) for rig in (near, BARE))
+    images, free = (
+        Sensor(rig, QUIET).expose(
+            NO_ECHO,
+            default_rng(0),
+        )
+        for rig in (near, BARE)
+    )
     on_wall = cast(near, near.pinhole).on_wall.reshape(images.ir.shape)
     assert 0 < on_wall.sum() < on_wall.size
     np.testing.assert_array_equal(images.ir[on_wall], free.ir[on_wall])
@@ -76,16 +93,20 @@ def test_dead_pixels_stay_from_frame_to_frame() -> None:
             sensor.expose(NO_ECHO, default_rng(seed)).depth_z16 == 0, dead
         )
     whole = Sensor(BARE, QUIET).expose(NO_ECHO, default_rng(0))
-    np.testing.assert_array_equal(first.expose(NO_ECHO, default_rng(0)).ir, whole.ir)
+    np.testing.assert_array_equal(
+        first.expose(NO_ECHO, default_rng(0)).ir,
+        whole.ir,
+    )
     alive = whole.depth_z16 > 0
     assert (dead & alive).sum() / alive.sum() == pytest.approx(0.05, abs=0.003)
 
 
 def test_sensor_with_a_short_gate_gives_black_images() -> None:
     device = BARE.device.model_copy(update={"gate_s": 0.1 / SPEED_OF_LIGHT_M_PER_S})
-    images = Sensor(BARE.model_copy(update={"device": device}), SensorModel()).expose(
-        NO_ECHO, default_rng(0)
-    )
+    images = Sensor(
+        BARE.model_copy(update={"device": device}),
+        SensorModel(),
+    ).expose(NO_ECHO, default_rng(0))
     assert not images.depth_z16.any()
     assert not images.ir.any()
     assert not images.confidence.any()
@@ -95,30 +116,57 @@ def test_sensor_with_a_short_gate_gives_black_images() -> None:
 def test_cell_of_pixels_takes_the_beam_at_the_pixel_center(k: int) -> None:
     rows = 64 * k
     columns = 80 * k
-    cell = cell_of_pixels((480, 640), (rows, columns)).reshape(480, 640)
+    cell = cell_of_pixels(
+        (480, 640),
+        (rows, columns),
+    ).reshape(480, 640)
     row, column = np.divmod(cell, columns)
     centre_row = (np.arange(480) + 0.5) / 480
     centre_column = (np.arange(640) + 0.5) / 640
     assert (np.abs(centre_row[:, None] - (row + 0.5) / rows) <= 0.5 / rows + 1e-12).all()
     assert (np.abs(centre_column - (column + 0.5) / columns) <= 0.5 / columns + 1e-12).all()
     np.testing.assert_array_equal(
-        cell_of_pixels((rows, columns), (rows, columns)), np.arange(rows * columns)
+        cell_of_pixels(
+            (rows, columns),
+            (rows, columns),
+        ),
+        np.arange(rows * columns),
     )
 
 
-@pytest.mark.parametrize("shape", [(64, 81), (128, 80), (32, 40), (80, 64), (96, 120), (0, 0)])
+@pytest.mark.parametrize(
+    "shape",
+    [
+        (64, 81),
+        (128, 80),
+        (32, 40),
+        (80, 64),
+        (96, 120),
+        (0, 0),
+    ],
+)
 def test_sensor_refuses_maps_of_another_shape(shape: tuple[int, int]) -> None:
     empty = np.zeros(shape, np.float32)
     with pytest.raises(SceneError, match=re.escape(str(shape))):
-        Sensor(BARE, QUIET).expose(MultiBounce(empty, empty, empty), default_rng(0))
+        Sensor(BARE, QUIET).expose(
+            MultiBounce(empty, empty, empty),
+            default_rng(0),
+        )
 
 
 def test_included_direct_return_does_not_compete_again() -> None:
     sensor = Sensor(BARE, QUIET)
-    faint = replace(NO_ECHO, peak=np.full_like(DARK, 1e-9), path_m=np.ones_like(DARK))
+    faint = replace(
+        NO_ECHO,
+        peak=np.full_like(DARK, 1e-9),
+        path_m=np.ones_like(DARK),
+    )
     assert sensor.expose(faint, default_rng(0)).ir.max() == 48
     for echo in (NO_ECHO, faint):
-        assert not sensor.expose(replace(echo, direct_included=True), default_rng(0)).ir.any()
+        assert not sensor.expose(
+            replace(echo, direct_included=True),
+            default_rng(0),
+        ).ir.any()
     strong = replace(faint, peak=np.ones_like(DARK))
     apart, mixed = (
         sensor.expose(replace(strong, direct_included=mixed), default_rng(0))
@@ -165,10 +213,15 @@ def _bias_m(celsius: float | None, **fields: float | WarmUp) -> np.ndarray:
     return DepthBias(SHAPE, model, sensor_effects(model)).at_m(celsius)
 
 
-def test_bias_is_empty_by_default_and_drifts_from_the_warm_device() -> None:
+def test_bias_is_empty_by_default_and_drifts_when_not_warm() -> None:
     for celsius in (None, 0.0, 100.0):
         assert _bias_m(celsius).size == _bias_m(celsius, warm_up=WARM_UP).size == 0
-    for celsius, shift_m in ((45.0, 0.0), (None, 0.0), (35.0, -0.002), (25.0, -0.004)):
+    for celsius, shift_m in (
+        (45.0, 0.0),
+        (None, 0.0),
+        (35.0, -0.002),
+        (25.0, -0.004),
+    ):
         drift_m = _bias_m(celsius, drift_m_per_celsius=0.0002, warm_up=WARM_UP)
         np.testing.assert_allclose(drift_m, shift_m, rtol=1e-6)
 
@@ -178,8 +231,14 @@ def test_ripples_are_a_wave_with_five_periods_of_any_direction() -> None:
     assert np.abs(wave_m).max() == pytest.approx(0.002, rel=0.01)
     assert abs(wave_m.mean()) < 0.1 * 0.002
     power = np.abs(np.fft.rfft2(wave_m)) ** 2
-    rows, columns = np.divmod(int(power.argmax()), power.shape[1])
-    periods = np.hypot(min(rows, SHAPE[0] - rows) * SHAPE[1] / SHAPE[0], columns)
+    rows, columns = np.divmod(
+        int(power.argmax()),
+        power.shape[1],
+    )
+    periods = np.hypot(
+        min(rows, SHAPE[0] - rows) * SHAPE[1] / SHAPE[0],
+        columns,
+    )
     assert periods == pytest.approx(5.0, abs=1.0)
     waves = [ripples(SHAPE, 4.0, default_rng(seed)) for seed in range(8)]
     alike = np.corrcoef([wave.ravel() for wave in waves]) - np.eye(8)
@@ -190,7 +249,14 @@ def test_patches_are_smooth_and_of_unit_spread() -> None:
     pattern = smooth_patches(SHAPE, default_rng(0))
     assert pattern.std() == pytest.approx(1.0)
     assert np.abs(np.diff(pattern)).max() < 0.5
-    few, many = (smooth_patches(SHAPE, default_rng(0), across) for across in (4, 24))
+    few, many = (
+        smooth_patches(
+            SHAPE,
+            default_rng(0),
+            across,
+        )
+        for across in (4, 24)
+    )
     assert np.diff(few).std() < np.diff(many).std() / 2
 
 
@@ -217,7 +283,11 @@ def test_texture_has_mean_1_and_its_strength_as_log_spread(strength: float) -> N
     assert np.log(factor).std() == pytest.approx(strength, rel=1e-4)
     np.testing.assert_array_equal(texture(WALL, strength), factor)
     half = np.log(texture(WALL, strength / 2))
-    np.testing.assert_allclose(2 * np.ptp(half), np.ptp(np.log(factor)), rtol=1e-4)
+    np.testing.assert_allclose(
+        2 * np.ptp(half),
+        np.ptp(np.log(factor)),
+        rtol=1e-4,
+    )
     assert texture(WALL, 0.0).size == 0
 
 
@@ -228,7 +298,11 @@ def test_texture_has_stains_and_grain_of_a_cell() -> None:
     grain = pattern - stains
     cell = WALL[1] // 80
     near, far = (
-        np.corrcoef(grain[:, :-by].ravel(), grain[:, by:].ravel())[0, 1] for by in (1, 2 * cell)
+        np.corrcoef(
+            grain[:, :-by].ravel(),
+            grain[:, by:].ravel(),
+        )[0, 1]
+        for by in (1, 2 * cell)
     )
     assert near > 0.8  # no finer than a pixel
     assert abs(far) < 0.2
@@ -238,7 +312,10 @@ BIASED = {"dead_share": 0.1, "ripple_m": 0.003}
 BRIGHT = {"ambient_counts": 60.0, "bare_wall_counts": 200.0}
 
 
-@pytest.mark.parametrize("change", [{}, BIASED, BRIGHT, {"wall_texture": 0.2}])
+@pytest.mark.parametrize(
+    "change",
+    [{}, BIASED, BRIGHT, {"wall_texture": 0.2}],
+)
 @pytest.mark.parametrize("beams", [1, 2])
 def test_maps_without_noise_are_those_of_the_images_bit_for_bit(
     change: dict[str, float], beams: int
@@ -254,7 +331,12 @@ def test_maps_without_noise_are_those_of_the_images_bit_for_bit(
 
 
 def test_maps_have_the_noise_of_the_images() -> None:
-    echoes = render(Scene(RIG, object_depth(3, RIG.object_box)[1])).multi
+    echoes = render(
+        Scene(
+            RIG,
+            object_depth(3, RIG.object_box)[1],
+        )
+    ).multi
     sensor = Sensor(RIG, SensorModel())
     frames = 40
     exposed = [sensor.expose(echoes, default_rng(k)).frame(RIG.pinhole) for k in range(frames)]
