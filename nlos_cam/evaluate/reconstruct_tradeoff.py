@@ -321,7 +321,9 @@ def draw_reconstructions(path: Path, rows: Sequence[ReconstructRow]) -> None:
         (line,) = axis.plot(times_ms, [_overlap(row) for row in own], "o-", label=weights)
         for time_ms, row in zip(times_ms, own, strict=True):
             iou = row.figures["silhouette_iou"]
-            axis.plot([time_ms, time_ms], [iou.low, iou.high], color=line.get_color(), alpha=0.35)
+            low = iou.low or 0.0
+            high = iou.high or 0.0
+            axis.plot([time_ms, time_ms], [low, high], color=line.get_color(), alpha=0.35)
             words = f"{row.setting.frames} frame{'s' * (row.setting.frames > 1)}"
             place = (time_ms, _overlap(row))
             axis.annotate(words, place, (4, 4), textcoords="offset points", fontsize=8)

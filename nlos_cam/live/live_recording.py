@@ -68,7 +68,7 @@ class LiveRecording:
         """
         sets = self._recording.sets
         self._recordable.stop_recording()
-        state: recordings.State = "disk full" if self._recording.disk_full else "complete"
+        state: recordings.TakeState = "disk full" if self._recording.disk_full else "complete"
         result = recordings.CaptureResult(
             self._target,
             state,

@@ -1,6 +1,6 @@
 """Measured error and time of each stop, from which a bound on either chooses one.
 
-Written from `python tools/studies/renderer.py tradeoff` (docs/renderer.json): the default scene, an
+Written from `python tools/studies/renderer.py tradeoff` (docs/figures/renderer.json): the default scene, an
 airplane of 702 patches, on 2 cores of an AMD EPYC. Another scene or machine has other figures; the
 order of the stops stays.
 """
