@@ -137,13 +137,15 @@ def test_transport_is_reciprocal(implementation: Any, brdf: Any) -> None:
     sent = implementation.histograms(there)[0] / there.relay_weight[0]
     returned = implementation.histograms(back)[0] / back.relay_weight[0]
     assert sent.any()
-    # The CPU interpolates a lobe over the incoming direction alone.
-    error = 1e-5 if brdf is None else COARSE.scatter_error
+    # The CPU interpolates a lobe over the incoming direction alone: its error is bounded by the
+    # accuracy's. The reference interpolates nothing.
+    interpolated = brdf is not None and implementation.name == "cpu"
+    error = COARSE.scatter_error if interpolated else 1e-5
     np.testing.assert_allclose(returned.sum(), sent.sum(), rtol=error)
     moved = np.abs(np.cumsum(returned) - np.cumsum(sent)).sum() / sent.sum()
     # In bins: a fast renderer may round a path across an edge, and the light of a lobe may err by
     # its share in every bin.
-    spread = 0 if brdf is None else np.ptp(np.flatnonzero(sent))
+    spread = np.ptp(np.flatnonzero(sent)) if interpolated else 0
     assert moved < 0.1 + error * spread
 
 
