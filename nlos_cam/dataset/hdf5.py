@@ -1,11 +1,12 @@
 """Bounded reading of HDF5: every size that a file declares is compared with the bytes it holds,
 before memory is taken.
 
-HDF5 itself takes memory for each declared chunk, also for those that are not stored. Its own reading
-of a chunk has no bound either (measured with HDF5 2.0): one that unpacks to 256 MiB takes 256 MiB,
-whatever the array declares; one with more bytes than declared is cut silently; and one with fewer is
-read beyond its end, so that other memory of the process appears in the array. Therefore chunks are
-taken packed, and unpacked here with zlib's limit on the length: the only step that is not h5py's.
+HDF5 itself takes memory for each declared chunk, also for those that are not stored. Its own
+reading of a chunk has no bound either (measured with HDF5 2.0): one that unpacks to 256 MiB takes
+256 MiB, whatever the array declares; one with more bytes than declared is cut silently; and one
+with fewer is read beyond its end, so that other memory of the process appears in the array.
+Therefore chunks are taken packed, and unpacked here with zlib's limit on the length: the only step
+that is not h5py's.
 """
 
 import zlib
