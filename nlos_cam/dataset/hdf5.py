@@ -1,9 +1,12 @@
 """Bounded reading of HDF5: every size that a file declares is compared with the bytes it holds,
 before memory is taken.
 
-HDF5 itself takes memory for each declared chunk, also for those that are not stored, and unpacks a
-chunk to whatever length its bytes give. The door for arrays therefore reads the packed chunks and
-unpacks them here.
+HDF5 itself takes memory for each declared chunk, also for those that are not stored. Its own
+reading of a chunk has no bound either (measured with HDF5 2.0): one that unpacks to 256 MiB takes
+256 MiB, whatever the array declares; one with more bytes than declared is cut silently; and one
+with fewer is read beyond its end, so that other memory of the process appears in the array.
+Therefore chunks are taken packed, and unpacked here with zlib's limit on the length: the only step
+that is not h5py's.
 """
 
 import zlib
@@ -86,43 +89,60 @@ def _unpacked(
     """Return an array whose chunks are packed by gzip or not at all; each of them has to be in the
     file.
     """
-    shape = stored.shape
-    dtype = stored.dtype
-    chunk_bytes = prod(chunk_shape) * dtype.itemsize
-    count = prod(ceil(size / chunk) for size, chunk in zip(shape, chunk_shape, strict=True))
-    declared = f"{name} declares {stored.nbytes} bytes, in {count} chunks of {chunk_bytes}"
-    if max(stored.nbytes, count * chunk_bytes) > min(MAX_ARRAY_BYTES, MAX_RATIO * file_bytes):
-        raise ValueError(declared)
-    if chunk_bytes > MAX_CHUNK_BYTES or count > min(MAX_CHUNKS, file_bytes // ENTRY_BYTES):
-        raise ValueError(declared)
-    storage = stored.id.get_create_plist()
-    filters = [storage.get_filter(k)[0] for k in range(storage.get_nfilters())]
-    if filters not in ([], [GZIP]):
-        raise ValueError(f"{name} is packed in another way than by gzip")
-    chunks = _chunks(stored, count)
-    packed_bytes = sum(chunk.size for chunk in chunks)
-    if (
-        len(chunks) != count
-        or packed_bytes > file_bytes
-        or count * chunk_bytes > MAX_RATIO * packed_bytes
-    ):
-        raise ValueError(f"{declared}, and holds {len(chunks)} of {packed_bytes} bytes")
-    values = np.empty(shape, dtype)
+    chunk_bytes = prod(chunk_shape) * stored.dtype.itemsize
+    chunks = _checked_chunks(stored, name, chunk_shape, file_bytes)
+    values = np.empty(stored.shape, stored.dtype)
     for chunk in chunks:
-        mask, packed = stored.id.read_direct_chunk(chunk.chunk_offset)
-        if filters and not mask & 1:
-            packed = zlib.decompressobj().decompress(packed, chunk_bytes + 1)
-        if len(packed) != chunk_bytes:
+        content = _chunk_content(stored, chunk, chunk_bytes)
+        if len(content) != chunk_bytes:
             raise ValueError(f"a chunk of {name} does not unpack to its {chunk_bytes} bytes")
         place = tuple(
             slice(start, start + size)
             for start, size in zip(chunk.chunk_offset, chunk_shape, strict=True)
         )
         target = values[place]
-        target[...] = np.frombuffer(packed, dtype).reshape(chunk_shape)[
-            tuple(map(slice, target.shape))
-        ]
+        # The last chunk of an axis is stored whole, also where it reaches beyond the array.
+        inside = tuple(map(slice, target.shape))
+        target[...] = np.frombuffer(content, stored.dtype).reshape(chunk_shape)[inside]
     return values
+
+
+def _checked_chunks(
+    stored: h5py.Dataset, name: str, chunk_shape: tuple[int, ...], file_bytes: int
+) -> list[Any]:
+    """Return address and size of all chunks. Raises ValueError where they declare too much, or are
+    not in the file.
+    """
+    chunk_bytes = prod(chunk_shape) * stored.dtype.itemsize
+    count = prod(ceil(size / chunk) for size, chunk in zip(stored.shape, chunk_shape, strict=True))
+    declared = f"{name} declares {stored.nbytes} bytes, in {count} chunks of {chunk_bytes}"
+    if max(stored.nbytes, count * chunk_bytes) > min(MAX_ARRAY_BYTES, MAX_RATIO * file_bytes):
+        raise ValueError(declared)
+    if chunk_bytes > MAX_CHUNK_BYTES or count > min(MAX_CHUNKS, file_bytes // ENTRY_BYTES):
+        raise ValueError(declared)
+    if _filters(stored) not in ([], [GZIP]):
+        raise ValueError(f"{name} is packed in another way than by gzip")
+
+    chunks = _chunks(stored, count)
+    packed_bytes = sum(chunk.size for chunk in chunks)
+    is_whole = len(chunks) == count and packed_bytes <= file_bytes
+    if not is_whole or count * chunk_bytes > MAX_RATIO * packed_bytes:
+        raise ValueError(f"{declared}, and holds {len(chunks)} of {packed_bytes} bytes")
+    return chunks
+
+
+def _filters(stored: h5py.Dataset) -> list[int]:
+    storage = stored.id.get_create_plist()
+    return [storage.get_filter(k)[0] for k in range(storage.get_nfilters())]
+
+
+def _chunk_content(stored: h5py.Dataset, chunk: Any, chunk_bytes: int) -> bytes:
+    """Return the content of a chunk, at most one byte more than it should have."""
+    mask, packed = stored.id.read_direct_chunk(chunk.chunk_offset)
+    # A bit of the mask is set where the writer left the filter out for this chunk.
+    if not _filters(stored) or mask & 1:
+        return packed
+    return zlib.decompressobj().decompress(packed, chunk_bytes + 1)
 
 
 def _chunks(stored: h5py.Dataset, count: int) -> list[Any]:

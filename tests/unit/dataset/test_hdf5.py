@@ -73,6 +73,15 @@ def _bomb(file: h5py.File) -> None:
     image.id.write_direct_chunk((0,), zlib.compress(bytes(1 << 28)))
 
 
+def _short_chunk(file: h5py.File, mask: int) -> None:
+    """Give a chunk of 4 KiB 64 bytes, packed or (by its mask) plain."""
+    image = _replace(
+        file, "image", shape=(1 << 10,), dtype="f4", chunks=(1 << 10,), compression="gzip"
+    )
+    content = bytes(64)
+    image.id.write_direct_chunk((0,), content if mask else zlib.compress(content), mask)
+
+
 def _one_text_in_all_rows(file: h5py.File) -> None:
     texts = ["x" * TEXT_BYTES, *"y" * (ROWS - 1)]
     rows = _replace(file, "category", data=texts, dtype=h5py.string_dtype()).id
@@ -151,6 +160,8 @@ HARMS = {
     "other compression": _declare(data=np.zeros(1 << 24, "i1"), compression="lzf"),
     "texts in chunks": _declare(shape=(3,), dtype="S1000", chunks=(1,)),
     "bomb": _bomb,
+    "short packed chunk": partial(_short_chunk, mask=0),
+    "short plain chunk": partial(_short_chunk, mask=1),
     "one text in all rows": _one_text_in_all_rows,
     "references": _declare(shape=(3,), dtype=h5py.ref_dtype),
     **{harm: partial(_crafted, harm=harm) for harm in (*CRAFTED, "virtual")},
