@@ -64,8 +64,8 @@ from .accuracy_table import choose
 from .agreement import Agreement, EchoMaps, agreement
 from .backend_cpu import histograms
 from .backend_torch import device_named, histograms_of_all
-from .costs import Stopwatch, Work, costs, least_seconds
 from .echoes import MultiBounce
+from .effect_costs import Stopwatch, Work, costs, least_seconds
 from .effects import EFFECTS, Effects, included
 from .geometry import Beams, cast
 from .gradients import (
