@@ -81,8 +81,14 @@ class CalibratedRig:
         """Return the maps with the measured range offset of the lidar (`range_offset`) added, if
         there is one.
         """
-        offset_m = self.measured.record.range_offset_m if self.measured else 0.0
-        return replace(maps, depth_m=maps.depth_m + np.float32(offset_m)) if offset_m else maps
+        if not self.range_offset_m:
+            return maps
+        return replace(maps, depth_m=maps.depth_m + np.float32(self.range_offset_m))
+
+    @property
+    def range_offset_m(self) -> float:
+        """Range offset of the lidar as it was measured; 0 if it was not."""
+        return self.measured.record.range_offset_m if self.measured else 0.0
 
 
 def subtract_reference(maps: LidarMaps, reference: walls.BareWall) -> LidarMaps:

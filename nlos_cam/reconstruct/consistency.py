@@ -1,0 +1,300 @@
+"""Consistency of a frame's two maps: with each other, and with the bare bench, cell by cell.
+
+A network answers whatever it is given, and a physics check that renders its answer again cannot
+tell a wrong answer from maps that no object can cause. This check needs no answer. Each cell
+returns the stronger of two echoes (S5): that of the bare wall, or that of three bounces. So,
+whatever is hidden:
+
+1. a three-bounce path is longer than the direct one, so no cell measures less than the wall;
+2. a cell that measures the wall's depth returns the wall's light;
+3. a cell that measures more returns at least the wall's light, or its echo would not have won; and
+   since the echo's lead grows from zero at the region's outline, it returns more inside;
+4. the scene is one exposure, so light does not jump from one row to the next along the whole row;
+5. the wall's light falls off as from the lidar's place: seen from elsewhere it is tilted.
+
+And a frame is worth what its cells are worth: `information` says how often a cell tells anything
+about objects in the box, so that missing cells count by what is lost with them.
+"""
+
+from dataclasses import dataclass
+from enum import StrEnum
+from functools import lru_cache
+
+import numpy as np
+from nlos_calibration import BareWall, Rig
+from nlos_calibration.arrays import Float64, Mask
+
+from nlos_cam.frames import MAP_COLUMNS, MAP_ROWS, SATURATED, LidarMaps
+from nlos_cam.objects import object_box, object_depth
+from nlos_cam.reconstruct.bench import CalibratedRig
+from nlos_cam.render import Scene, cast, render
+
+OFF_WALL_M = 0.009
+"""Depth beyond the wall's from which on a cell shows an echo: three times the error of a bench's
+record, and far below the shortest detour over an object in a box (0.1 m).
+"""
+LOST_SHARE = 0.03
+"""Share of the information from which on a frame is no longer judged by its networks. With a tenth
+of the rows missing a share of 0.09 is lost, and the silhouette IoU falls from 0.64 to 0.42.
+"""
+SAME_WALL_M = 0.03
+"""Largest difference of measured and calibrated depth at which a cell's reference is of the wall: it
+was measured without the occluder, or with another one."""
+MOVED_M = 0.005
+"""Median depth of the wall's cells off their record: beyond the error of a record and the drift of a
+range over an hour's warming."""
+NEARER_CELLS = 4
+NEARER_M = 0.006
+"""Twice the error of a bench's record."""
+UNLIKE_WALL_CELLS = 4
+UNLIKE_WALL = 0.2
+"""Logarithm of light over the wall's, in a cell of the wall's depth. Without texture, cells differ
+by 0.01."""
+TOO_DARK_CELLS = 4
+TOO_DARK = -0.15
+"""The same in a cell that shows an echo."""
+BRIGHT_INSIDE_CELLS = 8
+BRIGHT_INSIDE = 0.06
+"""The same well inside a region of the wall's depth."""
+DARK_INSIDE_CELLS = 30
+DARK_INSIDE = 0.05
+"""Light that a cell well inside a region of echoes exceeds: 97 % of unharmed frames have at most 17
+cells that do not."""
+MIN_ECHO_OVERLAP = 0.8
+"""Overlap of the cells that are deeper than the wall with those that are brighter: 0.86 and more
+in 95 % of unharmed frames."""
+MIN_ECHO_CELLS = 100
+BRIGHTER = 0.1
+SEAM = 0.06
+"""Mean jump of the light between two rows, in units of the largest that counts: 0.028 at most in
+unharmed frames, 0.12 at least where rows below are of another object."""
+SEAM_LIMIT = 0.3
+TILT = 0.06
+"""Change of the wall's light over the height of the view, as a logarithm: three rows of shift cause
+0.09, one row 0.03."""
+TEXTURE_SPREADS = 5.0
+"""Spreads of the wall's own light that a limit is raised to, for walls that are not uniform."""
+MIN_WALL_CELLS = 100
+INFORMATION_OBJECTS = 16
+INFORMATION_SEED = 910_000
+
+
+class MapProblem(StrEnum):
+    """Reason why a frame's maps cannot be those of any hidden object on this bench."""
+
+    LOST = "cells that tell about the hidden object have no depth"
+    OFF_RECORD = "the wall is not where it was calibrated"
+    UNLIKE = "infrared and depth do not belong together"
+    TORN = "the frame joins two exposures"
+    TILTED = "the wall's light falls off as from another place"
+
+
+@dataclass(frozen=True)
+class MapFindings:
+    """Findings of one frame's maps."""
+
+    missing_share: float
+    """Share of the cells that see the wall and have no depth."""
+    lost_share: float
+    """The same, each cell by the information it carries."""
+    problems: tuple[MapProblem, ...] = ()
+
+    @property
+    def kept_share(self) -> float:
+        """Factor from 0 to 1 on a predicted quality: it falls with every missing cell."""
+        return (1 - self.missing_share) * (1 - self.lost_share)
+
+
+COMPLETE = MapFindings(0.0, 0.0)
+
+
+class MapConsistency:
+    """Check of maps against the bare wall of a bench, as it was measured, else as rendered.
+
+    The measured light holds the wall's texture and the room's light, the rendered one does not.
+    Cells that see the occluder, or its edge, take no part: its depth and its light are not known.
+    A rig without an object box weighs all cells alike.
+    """
+
+    def __init__(self, bench: CalibratedRig) -> None:
+        rig = bench.rig
+        self._information = information(rig)  # pyright: ignore[reportArgumentType]  frozen, hashable
+        self._depth_m, self._light = _bare_wall(rig)  # pyright: ignore[reportArgumentType]
+        if bench.reference is not None:
+            self._take_measured(bench.reference, bench.range_offset_m)
+
+    def _take_measured(self, reference: BareWall, offset_m: float) -> None:
+        """Replace depth and light of the cells where the reference saw the wall of the rig."""
+        measured_m = reference.map_depth_m.astype(np.float64) + offset_m
+        same = np.abs(measured_m - self._depth_m) < SAME_WALL_M  # NaN compares false
+        same &= reference.map_intensity > 0
+        if same.sum() < MIN_WALL_CELLS:
+            return
+
+        # in the rendering's units, so that cells without a measurement still fit
+        units = float(np.median(self._light[same] / reference.map_intensity[same]))
+        self._depth_m = np.where(same, measured_m, self._depth_m)
+        self._light = np.where(same, units * reference.map_intensity, self._light)
+
+    def examine(self, maps: LidarMaps) -> MapFindings:
+        """Return the findings of maps (64, 80) with the range offset corrected."""
+        sees_wall = self._light > 0
+        absent = sees_wall & ~maps.valid
+        missing_share = float(absent.sum() / max(sees_wall.sum(), 1))
+        lost_share = float(self._information[absent].sum())
+
+        problems: list[MapProblem] = []
+        if lost_share >= LOST_SHARE:
+            problems.append(MapProblem.LOST)
+        both = sees_wall & maps.valid
+        if both.sum() >= MIN_WALL_CELLS:
+            problems += self._contradictions(maps, both)
+        return MapFindings(missing_share, lost_share, tuple(problems))
+
+    def _contradictions(self, maps: LidarMaps, both: Mask) -> list[MapProblem]:
+        """Return what is wrong in the cells that have a depth and see the wall."""
+        beyond_m = np.where(both, maps.depth_m - self._depth_m, 0.0)
+        at_wall = both & (np.abs(beyond_m) < OFF_WALL_M)
+        echo = both & (beyond_m >= OFF_WALL_M)
+        nearer = (beyond_m < -NEARER_M).sum() > NEARER_CELLS
+        if at_wall.sum() < MIN_WALL_CELLS:
+            return [MapProblem.OFF_RECORD] if nearer else []
+
+        light = self._log_light(maps, both, at_wall)
+        spread = _spread(light[at_wall])
+        unsaturated = maps.intensity < SATURATED
+        problems: list[MapProblem] = []
+        if nearer or abs(np.median(beyond_m[at_wall])) > MOVED_M:
+            problems.append(MapProblem.OFF_RECORD)
+        if _unlike(light, spread, at_wall, echo, unsaturated):
+            problems.append(MapProblem.UNLIKE)
+        if _largest_seam(light, both) > max(SEAM, TEXTURE_SPREADS * spread / SEAM_LIMIT / 2):
+            problems.append(MapProblem.TORN)
+        if abs(_tilt(light, at_wall)) > max(TILT, spread):
+            problems.append(MapProblem.TILTED)
+        return problems
+
+    def _log_light(self, maps: LidarMaps, both: Mask, at_wall: Mask) -> Float64:
+        """Return the logarithm of each cell's light over the bare wall's, 0 where it has no depth.
+
+        The device's gain and the room's light are fitted to the cells that show the wall, twice:
+        the second time without those that the first fit explains least.
+        """
+        counts = maps.intensity.astype(np.float64)
+        used = at_wall & (counts > 0)
+        light = np.zeros(counts.shape)
+        for _ in range(2):
+            expected = _fitted(self._light, counts, used)
+            # one count is added to both, so that dark cells, known to a count, differ by less
+            light = np.log((counts + 1) / (np.maximum(expected, 0) + 1))
+            used &= np.abs(light) < max(3 * _spread(light[used]), BRIGHTER)
+        return np.where(both, light, 0.0)
+
+
+def _fitted(light: Float64, counts: Float64, used: Mask) -> Float64:
+    """Return gain * light + room (64, 80) by least squares over some of the cells.
+
+    The room's light is at least 0: a negative one would let any fall-off pass.
+    """
+    if used.sum() < 2:
+        return light
+    design = np.stack([light[used], np.ones(used.sum())], 1)
+    (gain, room), *_ = np.linalg.lstsq(design, counts[used], rcond=None)
+    if room < 0 or gain <= 0:
+        room = 0.0
+        gain = float(np.median(counts[used] / light[used]))
+    return gain * light + room
+
+
+def _spread(values: Float64) -> float:
+    """Return the standard deviation, by the median of the absolute deviations; 0 for none."""
+    if not values.size:
+        return 0.0
+    return 1.4826 * float(np.median(np.abs(values - np.median(values))))
+
+
+def _unlike(light: Float64, spread: float, at_wall: Mask, echo: Mask, unsaturated: Mask) -> bool:
+    """Return True if light and depth name different echoes as the stronger one (2 and 3)."""
+    texture = TEXTURE_SPREADS * spread
+    if (at_wall & (np.abs(light) > max(UNLIKE_WALL, texture))).sum() >= UNLIKE_WALL_CELLS:
+        return True
+    if (echo & (light < min(TOO_DARK, -texture))).sum() >= TOO_DARK_CELLS:
+        return True
+    if (_inner(at_wall) & (light > max(BRIGHT_INSIDE, texture))).sum() > BRIGHT_INSIDE_CELLS:
+        return True
+    # on a textured wall some of the cells inside are darker by chance: the limit falls with it
+    dark = light < min(DARK_INSIDE, DARK_INSIDE + 2 * BRIGHT_INSIDE / TEXTURE_SPREADS - 2 * spread)
+    if (_inner(echo) & unsaturated & dark).sum() > DARK_INSIDE_CELLS:
+        return True
+
+    brighter = (at_wall | echo) & unsaturated & (light > max(BRIGHTER, texture))
+    deeper = echo & unsaturated
+    both = (brighter & deeper).sum()
+    either = (brighter | deeper).sum()
+    overlap_floor = MIN_ECHO_OVERLAP - max(texture - BRIGHTER, 0.0)
+    return bool(echo.sum() >= MIN_ECHO_CELLS and both < overlap_floor * either)
+
+
+def _inner(region: Mask) -> Mask:
+    """Return the cells of a region (64, 80) whose four neighbors belong to it too."""
+    inner = region.copy()
+    inner[1:] &= region[:-1]
+    inner[:-1] &= region[1:]
+    inner[:, 1:] &= region[:, :-1]
+    inner[:, :-1] &= region[:, 1:]
+    return inner
+
+
+def _largest_seam(light: Float64, both: Mask) -> float:
+    """Return the largest mean jump between two rows, beyond that of the rows around, 0 to 1.
+
+    |l[r+1] - l[r]| less half the jumps above and below: a smooth field, however steep, gives about
+    zero; an edge of an object's echo crosses rows at a few columns only, a seam at all of them.
+    """
+    columns = both.any(0)
+    if not columns.any():
+        return 0.0
+    limited = np.clip(light[:, columns], -1.0, 3.0)
+    jumps = np.abs(np.diff(limited, axis=0))  # (63, columns)
+    jumps[~(both[1:, columns] & both[:-1, columns])] = 0.0
+    excess = jumps[1:-1] - 0.5 * (jumps[:-2] + jumps[2:])
+    return float(np.clip(excess, -SEAM_LIMIT, SEAM_LIMIT).mean(1).max()) / SEAM_LIMIT
+
+
+def _tilt(light: Float64, at_wall: Mask) -> float:
+    """Return the slope of the wall's light over the height of the view, by least squares."""
+    row, column = np.nonzero(at_wall)
+    design = np.stack([np.ones(len(row)), row / MAP_ROWS - 0.5, column / MAP_COLUMNS - 0.5], 1)
+    solved, *_ = np.linalg.lstsq(design, np.clip(light[at_wall], -0.5, 0.5), rcond=None)
+    return float(solved[1])
+
+
+@lru_cache(maxsize=4)
+def _bare_wall(rig: Rig) -> tuple[Float64, Float64]:
+    """Return depth along the optical axis in metres and light (64, 80) of the cells that see the
+    wall alone; NaN and 0 elsewhere.
+    """
+    bare = render(Scene(rig))
+    on_wall = cast(rig, rig.pinhole.scaled(MAP_COLUMNS, MAP_ROWS)).on_wall
+    sees_wall = _inner(on_wall.reshape(MAP_ROWS, MAP_COLUMNS)) & (bare.intensity > 0)
+    return np.where(sees_wall, bare.depth_m, np.nan), np.where(sees_wall, bare.intensity, 0.0)
+
+
+@lru_cache(maxsize=4)
+def information(rig: Rig) -> Float64:
+    """Return the share (64, 80) of what a frame tells about objects that each cell carries.
+
+    A cell tells something about an object if the object's echo wins there (S5): its path is then
+    measured, and that it won. Counted over random objects in the rig's box; the sum is 1.
+    """
+    cells = np.zeros((MAP_ROWS, MAP_COLUMNS))
+    if rig.object_box is not None:
+        box = object_box(rig)
+        for seed in range(INFORMATION_SEED, INFORMATION_SEED + INFORMATION_OBJECTS):
+            _, depth_m = object_depth(seed, box)
+            rendering = render(Scene(rig, depth_m), "draft")
+            echo = rendering.multi.peak
+            cells += (echo > 0) & (rendering.intensity <= echo)
+    if not cells.any():
+        cells += 1
+    return cells / max(cells.sum(), 1.0)
