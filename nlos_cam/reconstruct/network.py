@@ -36,6 +36,19 @@ class Quality:
     trusted: bool
     """At least 90 % of like frames have an IoU of at least 0.75."""
 
+    def of_incomplete_maps(self, kept_share: float, *, trusted: bool) -> "Quality":
+        """Return the quality for maps of which a share is kept: it never rises as data vanish.
+
+        The model was fitted to complete maps, and reads a smaller image as a better one.
+        """
+        low, middle, high = (kept_share * iou for iou in self.iou)
+        return replace(
+            self,
+            iou=(low, middle, high),
+            good=kept_share * self.good,
+            trusted=self.trusted and trusted,
+        )
+
 
 @dataclass(frozen=True)
 class Uncertainty:
@@ -92,6 +105,12 @@ class Reconstruction:
     def to_mesh(self) -> SurfaceMesh:
         """Return the surface as a mesh in the wall frame."""
         return mesh_from_depth(self.depth_m, self.box, self.uncertainty_m)
+
+    def with_quality(self, quality: Quality) -> "Reconstruction":
+        """Return the same with another predicted quality; unchanged without an uncertainty."""
+        if self.uncertainty is None:
+            return self
+        return replace(self, uncertainty=replace(self.uncertainty, quality=quality))
 
     @property
     def quality(self) -> Quality | None:

@@ -32,6 +32,10 @@ from nlos_cam.frames import MAP_COLUMNS, MAP_ROWS, SATURATED, LidarMaps
 from nlos_cam.reconstruct.network import Clock
 from nlos_cam.render import Rendering, Scene, SensorModel, Stop, cast, render
 
+UNEXPLAINED_EMPTY = 0.5
+"""Score from which on the empty bench does not explain the maps. Empty benches score 0.00, and any
+object that is missed about 1.
+"""
 UNEXPLAINED = 0.84
 """Score from which on the reconstruction does not explain the maps: 1 % of the 300 new objects that
 it was chosen on reach it (docs/physics-check.md)."""
@@ -68,6 +72,8 @@ class PhysicsCheckResult:
     """Duration of the check."""
     albedo: float = 1.0
     """Albedo of the object that explains the maps best, relative to the training set's."""
+    has_surface: bool = True
+    """False if the empty bench was compared, because no surface was shown."""
 
 
 class PhysicsCheck(Protocol):
@@ -279,7 +285,9 @@ def check_reconstruction(
     start_s = clock()
     bare = _bare(rig)  # pyright: ignore[reportArgumentType]  frozen, so hashable
     expected = bare
-    if depth_m is not None and rig.object_box is not None and np.isfinite(depth_m).any():
+    shows_surface = depth_m is not None and bool(np.isfinite(depth_m).any())
+    has_surface = shows_surface and rig.object_box is not None
+    if has_surface:
         expected = _expected(render(Scene(rig, depth_m), accuracy), rig, bare)
 
     best = explain(maps, expected, bare)
@@ -292,6 +300,7 @@ def check_reconstruction(
         score=best.score,
         seconds=clock() - start_s,
         albedo=best.albedo,
+        has_surface=has_surface,
     )
 
 

@@ -3,9 +3,10 @@
 Built from a rig and networks, whose mismatches it lists.
 """
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 from nlos_calibration import Rig, rig_difference
 from nlos_calibration.arrays import Float32
@@ -21,22 +22,32 @@ from nlos_models import (
 from nlos_cam.files import cache_folder
 from nlos_cam.frames import Frame, LidarMaps, MapMean, maps_from_frame
 from nlos_cam.objects import SurfaceMesh
-from nlos_cam.reconstruct.alignment import alignment, rig_to_align_with, training_rig
+from nlos_cam.reconstruct.alignment import MapAlignment, alignment, rig_to_align_with, training_rig
 from nlos_cam.reconstruct.bench import BenchObservation, CalibratedRig
+from nlos_cam.reconstruct.consistency import MapConsistency, MapFindings
 from nlos_cam.reconstruct.frame_reader import Arrival
 from nlos_cam.reconstruct.network import Clock, Network, Reconstruction, reconstruct_all
 from nlos_cam.reconstruct.physics_check import (
     UNEXPLAINED,
+    UNEXPLAINED_EMPTY,
     NullPhysicsCheck,
     PhysicsCheck,
     PhysicsCheckResult,
 )
 from nlos_cam.reconstruct.verdict import (
     FrameConditions,
+    FrozenFrames,
     Verdict,
     VerdictFilter,
     VerdictLimits,
 )
+
+CHECK_HOLDS_FRAMES = 150
+"""Frames (5 s) for which a physics check counts: it runs once a second, longer on a busy machine."""
+TRUSTED_MISSING = 0.02
+"""Share of cells without a depth from which on no frame is trusted: what the quality model was
+fitted to had none."""
+FROZEN = "the camera repeats the same frame: unplug it and plug it in again"
 
 
 @dataclass(frozen=True)
@@ -109,6 +120,14 @@ class FrameResult:
         return self.frame.truth_depth_m
 
 
+class PreparedBench(NamedTuple):
+    """Bench with what is computed from it once."""
+
+    bench: CalibratedRig
+    aligned: MapAlignment | None
+    consistency: MapConsistency
+
+
 @dataclass(frozen=True)
 class PreparedFrame:
     """Frame with the maps that go into the networks."""
@@ -119,6 +138,8 @@ class PreparedFrame:
     corrected: LidarMaps
     """Raw maps with the measured range offset of the lidar added."""
     network_input: LidarMaps
+    findings: MapFindings
+    frozen: bool
     stages_s: Mapping[str, float]
 
 
@@ -157,6 +178,7 @@ class Pipeline:
         self._verdicts = VerdictFilter(
             verdict_limits(uncertainty_model) if uncertainty_model else None
         )
+        self._frozen = FrozenFrames()
         self._uses_difference = uses_difference
         self.average = average
         self.bench = bench
@@ -166,12 +188,13 @@ class Pipeline:
         """Bench of the frames; setting it aligns their maps with the training rig again. Any thread
         may set it.
         """
-        return self._bench[0]
+        return self._bench.bench
 
     @bench.setter
     def bench(self, bench: CalibratedRig) -> None:
         aligned = alignment(bench.rig, self._trained, bench.reference) if self._trained else None
-        self._bench = (bench, aligned)  # in one assignment: `prepare` must not see half of it
+        # in one assignment: `prepare` must not see half of it
+        self._bench = PreparedBench(bench, aligned, MapConsistency(bench))
 
     @property
     def average(self) -> int:
@@ -192,7 +215,7 @@ class Pipeline:
     def prepare(self, arrival: Arrival, clock: Clock, start_s: float) -> PreparedFrame:
         """Return the maps of a frame as the networks need them; call in frame order."""
         taken_s = clock()
-        bench, aligned = self._bench  # another thread may replace it
+        bench, aligned, consistency = self._bench  # another thread may replace it
         maps = maps_from_frame(arrival.frame)
         mapped_s = clock()
 
@@ -208,6 +231,8 @@ class Pipeline:
             network_input = difference
         else:
             network_input = corrected
+        findings = consistency.examine(corrected)
+        frozen = self._frozen.add(arrival.frame)
         observed_s = clock()
 
         stages_s = {
@@ -216,7 +241,9 @@ class Pipeline:
             "maps": mapped_s - taken_s,
             "bench": observed_s - mapped_s,
         }
-        return PreparedFrame(arrival, maps, observation, corrected, network_input, stages_s)
+        return PreparedFrame(
+            arrival, maps, observation, corrected, network_input, findings, frozen, stages_s
+        )
 
     def reconstruct(self, frames: Sequence[PreparedFrame], clock: Clock) -> list[Reconstruction]:
         """Return the reconstruction of each frame; reads and changes no state, so any thread may
@@ -231,10 +258,11 @@ class Pipeline:
         """Return the result of a frame with its verdict, and offer it to the physics check; call in
         frame order.
         """
-        frame, arrived_s, issues = prepared.arrival
+        frame, arrived_s, _ = prepared.arrival
         observation = prepared.observation
-        conditions = frame_conditions(issues, observation, self.checks.newest)
-        shown, verdict = self._verdicts.decide(reconstruction, conditions)
+        conditions = frame_conditions(prepared, self.checks.newest)
+        judged = with_quality_of_maps(reconstruction, conditions)
+        shown, verdict = self._verdicts.decide(judged, conditions)
         # Raw maps are checked: they are what the renderer computes.
         self.checks.offer(frame.frame_number, prepared.corrected, shown.depth_m)
         return FrameResult(
@@ -244,7 +272,7 @@ class Pipeline:
             published_s=clock(),
             stages_s={**prepared.stages_s, **reconstruction.timings_s},
             difference=observation.difference,
-            warnings=observation.warnings,
+            warnings=observation.warnings + problems_of(conditions),
             verdict=verdict,
             check=self.checks.newest,
             arrived_s=arrived_s,
@@ -254,21 +282,43 @@ class Pipeline:
 def verdict_limits(uncertainty_model: UncertaintyModel) -> VerdictLimits:
     """Return the probabilities and the physics-check score above which verdicts change."""
     record = uncertainty_model.record
-    return VerdictLimits(record.nothing_above, record.outside_above, UNEXPLAINED)
+    return VerdictLimits(record.nothing_above, record.outside_above, UNEXPLAINED, UNEXPLAINED_EMPTY)
 
 
-def frame_conditions(
-    issues: Collection[str], observation: BenchObservation, check: PhysicsCheckResult | None
-) -> FrameConditions:
-    """Return what affects a frame's verdict, from its issues (`frame_issues`), the bench, and the
-    newest physics check.
+def frame_conditions(prepared: PreparedFrame, newest: PhysicsCheckResult | None) -> FrameConditions:
+    """Return what affects a frame's verdict, from its issues (`frame_issues`), its maps, the bench,
+    and the newest physics check, if that is recent.
     """
+    frame, _, issues = prepared.arrival
+    recent = newest is not None and frame.frame_number - newest.frame_number <= CHECK_HOLDS_FRAMES
     return FrameConditions(
         saturated="saturated" in issues,
         invalid="blank" in issues or "half_invalid" in issues,
-        moved=observation.moved,
-        check=check,
+        moved=prepared.observation.moved,
+        frozen=prepared.frozen,
+        findings=prepared.findings,
+        check=newest if recent else None,
     )
+
+
+def with_quality_of_maps(
+    reconstruction: Reconstruction, conditions: FrameConditions
+) -> Reconstruction:
+    """Return a reconstruction whose predicted quality knows what its maps lack."""
+    findings = conditions.findings
+    quality = reconstruction.quality
+    if quality is None or (findings.missing_share == 0 and not conditions.contradicted):
+        return reconstruction
+    trusted = not conditions.contradicted and findings.missing_share < TRUSTED_MISSING
+    return reconstruction.with_quality(
+        quality.of_incomplete_maps(findings.kept_share, trusted=trusted)
+    )
+
+
+def problems_of(conditions: FrameConditions) -> tuple[str, ...]:
+    """Return what is wrong with a frame's maps, for the user."""
+    problems = tuple(str(problem) for problem in conditions.findings.problems)
+    return (*problems, FROZEN) if conditions.frozen else problems
 
 
 def load_networks(weights: Path | None = None) -> Reconstructor:

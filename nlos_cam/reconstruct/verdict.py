@@ -5,11 +5,15 @@ from dataclasses import dataclass
 from enum import StrEnum
 
 import numpy as np
+from numpy.typing import NDArray
 
 from nlos_cam.frames import MAX_SATURATED, Frame, saturated_share
+from nlos_cam.reconstruct.consistency import COMPLETE, MapFindings
 from nlos_cam.reconstruct.network import Reconstruction
 from nlos_cam.reconstruct.physics_check import PhysicsCheckResult
 
+FROZEN_AFTER = 4
+"""Repeats of a frame after which a camera counts as frozen: a seventh of a second."""
 STEADY_FRAMES = 5
 """Frames (0.17 s) over which the out-of-distribution probability is averaged, so that the verdict
 does not flicker.
@@ -21,10 +25,11 @@ class Verdict(StrEnum):
     order is given.
 
     SEEN: there is an object like those of the training set. NOTHING: the bench is empty; no surface
-    is shown. OUTSIDE: the shape is shown but not reliable, because it is out of distribution (OOD),
-    or the physics check does not explain the maps by it, or there is no surface, or half of the
+    is shown. OUTSIDE: what is shown, also if it is nothing, is not reliable, because it is out of
+    distribution (OOD), or the physics check does not explain the maps by it, or the maps cannot be
+    those of any object on this bench (`MapConsistency`), or there is no surface, or half of the
     frame has no depth. SATURATED, WALL_MOVED: the lidar's data are not usable, whatever was
-    reconstructed. STALLED: no newer frame has come.
+    reconstructed. STALLED: no newer frame has come, or the same one again and again.
     """
 
     SEEN = "object seen"
@@ -51,6 +56,8 @@ class VerdictLimits:
     """
     unexplained: float = float("inf")
     """Score of the physics check; see UNEXPLAINED."""
+    unexplained_empty: float = float("inf")
+    """The same where no surface is shown; see UNEXPLAINED_EMPTY."""
 
 
 @dataclass(frozen=True)
@@ -61,7 +68,49 @@ class FrameConditions:
     invalid: bool = False
     """At least half of the pixels have no depth."""
     moved: bool = False
+    frozen: bool = False
+    """The camera repeats one frame."""
+    findings: MapFindings = COMPLETE
     check: PhysicsCheckResult | None = None
+    """A recent one; None where the newest is old."""
+
+    @property
+    def contradicted(self) -> bool:
+        """True if the maps alone forbid any good word, whatever the networks say."""
+        return self.invalid or bool(self.findings.problems)
+
+
+class FrozenFrames:
+    """Watch for a camera that repeats a frame. Stateful: give it the frames in order.
+
+    The noise of a lidar differs from frame to frame, so that two equal ones are already a fault. A
+    few are waited for, and frames without noise, of a simulation, say nothing.
+    """
+
+    def __init__(self) -> None:
+        self._last: Frame | None = None
+        self._repeats = 0
+
+    def add(self, frame: Frame) -> bool:
+        """Return True if this frame and those before it are the same."""
+        last = self._last
+        self._last = frame
+        same = (
+            last is not None
+            and np.array_equal(last.ir, frame.ir)
+            and np.array_equal(last.depth_m, frame.depth_m, equal_nan=True)
+        )
+        self._repeats = self._repeats + 1 if same else 0
+        return self._repeats >= FROZEN_AFTER and is_noisy(frame.ir)
+
+
+def is_noisy(ir: NDArray[np.uint8]) -> bool:
+    """Return True for an infrared image whose neighboring pixels differ by noise: by the second
+    difference along a row, which a smooth image does not have.
+    """
+    row = ir.astype(np.int16)
+    bent = np.abs(row[:, :-2] - 2 * row[:, 1:-1] + row[:, 2:])
+    return bool(np.median(bent) >= 1)
 
 
 class VerdictFilter:
@@ -89,6 +138,8 @@ class VerdictFilter:
             of_lidar = Verdict.SATURATED
         if conditions.moved:
             of_lidar = Verdict.WALL_MOVED
+        if conditions.frozen:
+            of_lidar = Verdict.STALLED
 
         limits = self._limits
         uncertainty = reconstruction.uncertainty
@@ -98,15 +149,25 @@ class VerdictFilter:
         if uncertainty.p_empty >= limits.nothing:
             # Decided on this frame alone; a new object must not be averaged with the one that left.
             self._outside.clear()
-            verdict = Verdict.OUTSIDE if conditions.invalid else Verdict.NOTHING
+            unlike_empty = self._is_unexplained(conditions, limits.unexplained_empty, shown=False)
+            wrong = conditions.contradicted or unlike_empty
+            verdict = Verdict.OUTSIDE if wrong else Verdict.NOTHING
             return reconstruction.without_surface, of_lidar or verdict
 
         # "Outside" needs a mean over frames: noise moves the probability across the limit.
         self._outside.append(uncertainty.p_out_of_distribution)
         unlike = sum(self._outside) / len(self._outside) >= limits.outside
-        unexplained = conditions.check is not None and conditions.check.score >= limits.unexplained
-        outside = unlike or unexplained or conditions.invalid or not reconstruction.has_surface
-        return reconstruction, of_lidar or (Verdict.OUTSIDE if outside else Verdict.SEEN)
+        unexplained = self._is_unexplained(conditions, limits.unexplained, shown=True)
+        wrong = conditions.contradicted or unlike or unexplained or not reconstruction.has_surface
+        return reconstruction, of_lidar or (Verdict.OUTSIDE if wrong else Verdict.SEEN)
+
+    @staticmethod
+    def _is_unexplained(conditions: FrameConditions, limit: float, *, shown: bool) -> bool:
+        """Return True if the check of a like picture, of a surface or of none, did not explain the
+        maps.
+        """
+        check = conditions.check
+        return check is not None and check.has_surface == shown and check.score >= limit
 
 
 def frame_issues(frame: Frame) -> tuple[str, ...]:

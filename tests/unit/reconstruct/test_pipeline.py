@@ -200,8 +200,18 @@ def test_frame_conditions_follow_frame_issues_and_bench(missing: int, saturated:
     )
     check = PhysicsCheckResult(0, depth_m, depth_m, score=1.0, seconds=0.0)
     observation = BenchObservation(None, (), moved=saturated)
-    conditions = frame_conditions(frame_issues(frame), observation, check)
-    assert conditions == FrameConditions(saturated, missing > 0, moved=saturated, check=check)
+    prepared = SimpleNamespace(
+        arrival=Arrival(frame, 0.0, frame_issues(frame)),
+        observation=observation,
+        frozen=saturated,
+        findings=COMPLETE,
+    )
+
+    conditions = frame_conditions(prepared, check)  # type: ignore[arg-type]
+
+    assert conditions == FrameConditions(
+        saturated, missing > 0, moved=saturated, frozen=saturated, check=check
+    )
 
 
 DOUBTER: Any = object()
