@@ -272,7 +272,7 @@ class Pipeline:
             published_s=clock(),
             stages_s={**prepared.stages_s, **reconstruction.timings_s},
             difference=observation.difference,
-            warnings=observation.warnings + problems_of(conditions),
+            warnings=observation.warnings + (problems_of(conditions) if shown.uncertainty else ()),
             verdict=verdict,
             check=self.checks.newest,
             arrived_s=arrived_s,

@@ -27,6 +27,7 @@ from small_frames import SheetNetwork, sheet_network
 
 from nlos_cam.frames import LidarMaps, maps_from_frame
 from nlos_cam.reconstruct import (
+    Arrival,
     Clock,
     FrameConditions,
     FrameReader,
@@ -45,6 +46,7 @@ from nlos_cam.reconstruct.bench import (
     open_bench,
     subtract_reference,
 )
+from nlos_cam.reconstruct.consistency import COMPLETE
 from nlos_cam.reconstruct.physics_check import PeriodicPhysicsCheck, PhysicsCheckResult
 from nlos_cam.reconstruct.pipeline import compatibility_warnings, frame_conditions
 from nlos_cam.reconstruct.streaming import BATCH_FRAMES, MAX_BATCHES_AHEAD
