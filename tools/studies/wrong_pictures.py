@@ -38,8 +38,8 @@ from nlos_cam.reconstruct import (
 )
 from nlos_cam.render import MultiBounce, SceneFile, SensorModel
 
-FRAMES = 3
-"""Frames of each scene: the first is checked by physics, the last is judged with that."""
+FRAMES = 2
+"""Frames of each scene: the first is checked by physics, the second is judged with that."""
 FROZEN_FRAMES = 7
 """The same of a frozen camera, which is recognised by its repeats."""
 SHAPES = "left", "right", "top", "bottom", "disc", "scattered"
@@ -229,7 +229,7 @@ def measure(group: str, subjects: Sequence[Subject], rig: Rig) -> list[Outcome]:
                     frames = [change(a, b) for a, b in zip(own, others, strict=True)]
                 if harm.startswith("frozen"):
                     frames = frames[:1] * FROZEN_FRAMES
-                checks = PeriodicPhysicsCheck(rig, every=1)
+                checks = PeriodicPhysicsCheck(rig, every=FROZEN_FRAMES + 1)
                 pipeline = build_pipeline(
                     bench, network, uncertainty_model=uncertainty_model, checks=checks
                 )
