@@ -29,6 +29,13 @@ from nlos_cam.files import read_toml
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
+# Bounds that no bench reaches: numbers beyond them are typing errors or damage, and would overflow
+# in products of lengths far from the place that names the field.
+Coordinate = Annotated[float, Field(ge=-100, le=100)]
+Length = Annotated[float, Field(ge=1e-4, le=100)]
+FocalLength = Annotated[float, Field(ge=1, le=1e6)]
+PixelPlace = Annotated[float, Field(ge=-1e5, le=1e5)]
+Pixels = Annotated[int, Field(gt=0, le=16384)]
 R = TypeVar("R", bound=BaseModel)
 KINDS = {"schema_version": "wall record", "task": "training recipe", "lidar": "rig", "rig": "scene"}
 """Kind of a TOML file by a field of it, in this order: a wall record has a rig too."""
@@ -54,10 +61,10 @@ class Record(BaseModel):
 class Extent(Record):
     """A rectangle on the wall, in the wall frame."""
 
-    x_min_m: Finite
-    x_max_m: Finite
-    y_min_m: Finite
-    y_max_m: Finite
+    x_min_m: Coordinate
+    x_max_m: Coordinate
+    y_min_m: Coordinate
+    y_max_m: Coordinate
 
     @model_validator(mode="after")
     def _ordered(self) -> Self:
@@ -82,8 +89,8 @@ class ObjectBox(Extent):
     (far).
     """
 
-    z_near_m: Positive
-    z_far_m: Positive
+    z_near_m: Length
+    z_far_m: Length
 
     @model_validator(mode="after")
     def _deep(self) -> Self:
@@ -95,17 +102,17 @@ class ObjectBox(Extent):
 class Occluder(Record):
     """Half plane x = x_m, z >= z_min_m, endless in y, that hides the object from the lidar."""
 
-    x_m: Finite
-    z_min_m: Positive
+    x_m: Coordinate
+    z_min_m: Length
 
 
 class OccluderRecord(Record):
     """The occluder as detected or as entered by hand; `rig.occluder` is its half plane."""
 
     source: Literal["detected", "entered"]
-    x_m: Finite
+    x_m: Coordinate
     """Wall x of the edge."""
-    gap_m: Positive
+    gap_m: Length
     """Distance from the edge to the wall: the aperture."""
     x_std_m: NotNegative | None = None
     """None, like gap_std_m and tilt_deg, if entered by hand."""
@@ -123,7 +130,7 @@ class LidarPose(Record):
 
     # A pose has six. The frame's origin is the foot of the lidar's perpendicular, which fixes two
     # of the position, and its x axis is the lidar's, which fixes the roll (`geometry`).
-    distance_m: Positive
+    distance_m: Length
     yaw_deg: Annotated[float, Field(gt=-90, lt=90)]
     """Positive turns the axis towards wall +x."""
     pitch_deg: Annotated[float, Field(gt=-90, lt=90)] = 0.0
@@ -137,23 +144,23 @@ class PinholeRecord(Record):
 
     # fx = (640 / 2) / tan(70 deg / 2) and fy = (480 / 2) / tan(55 deg / 2), the L515's field of
     # view; the centre of an even number of pixels lies between two of them.
-    width: Annotated[int, Field(gt=0)] = 640
-    height: Annotated[int, Field(gt=0)] = 480
-    fx: Positive = 457.0073622
-    fy: Positive = 461.0357105
-    ppx: Finite = 319.5
-    ppy: Finite = 239.5
+    width: Pixels = 640
+    height: Pixels = 480
+    fx: FocalLength = 457.0073622
+    fy: FocalLength = 461.0357105
+    ppx: PixelPlace = 319.5
+    ppy: PixelPlace = 239.5
 
 
 class DeviceConstants(Record):
     """Constants of the device beside its geometry."""
 
     # A bin of 10 mm of path is 33 ps of flight; 100 ns of gate are 30 m of path.
-    receiver_cell_m2: Positive = 1e-4
+    receiver_cell_m2: Annotated[float, Field(ge=1e-12, le=1)] = 1e-4
     """S_unit_wall of S1, a constant of the device, independent of any grid."""
-    bin_m: Positive = 0.01
+    bin_m: Annotated[float, Field(ge=1e-5, le=10)] = 0.01
     """Width of a path-length bin (S4)."""
-    gate_s: Positive = 100e-9
+    gate_s: Annotated[float, Field(ge=1e-12, le=1e-3)] = 100e-9
     """Latest echo that is received (S5)."""
 
 

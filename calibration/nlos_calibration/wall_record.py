@@ -76,7 +76,7 @@ class WallRecord(Record):
     pitch_deg: Finite
     pitch_std_deg: NotNegative
     wall_from_lidar: tuple[Row, Row, Row, Row]
-    range_offset_m: Finite = 0.0
+    range_offset_m: Annotated[float, Field(ge=-1, le=1)] = 0.0
     """Length to add to the lidar's depth; the pose includes it (`range_offset`)."""
     range_offset_std_m: NotNegative | None = None
     """None where the offset was not measured."""

@@ -158,6 +158,13 @@ def _quantities(by: walls.BoardRecord | walls.WallRecord) -> tuple[str, ...]:
     )
 
 
+UPRIGHT = (
+    "Not measured: which way is up. A bench is symmetric about the lidar's height, so a camera that"
+    " hangs upside down shows the mirror image, with every check content. Look at the picture: the"
+    " top of the view is the top of the room."
+)
+
+
 def device(wall: walls.MeasuredWall) -> str:
     """Return the camera, its settings and temperatures."""
     record = wall.record
@@ -179,7 +186,8 @@ def device(wall: walls.MeasuredWall) -> str:
         f"<div><h3>{name}</h3>{pairs(values)}</div>" for name, values in parts if values
     )
     return (
-        f"<section><h2>What it was measured with</h2><div class='columns'>{tables}</div></section>"
+        "<section><h2>What it was measured with</h2>"
+        f"<div class='columns'>{tables}</div><p>{UPRIGHT}</p></section>"
     )
 
 

@@ -360,6 +360,8 @@ def compatibility_warnings(
 ) -> list[str]:
     """Return the mismatches between networks and bench, one sentence each; empty if all fits."""
     warnings = _rig_warnings(bench.rig, trained)
+    if bench.measured and bench.measured.record.verdict == "doubtful":
+        warnings.append(f"the wall's record calls itself doubtful: {bench.measured.record.advice}")
     if bench.measured and not bench.reference:
         warnings.append(
             "this wall record has no reference: no difference maps, and a moved lidar goes"

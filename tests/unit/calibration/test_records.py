@@ -2,6 +2,7 @@ import hashlib
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -17,7 +18,7 @@ from nlos_calibration.reference import (
     load_reference,
     save_reference,
 )
-from nlos_calibration.rig import ObjectBox, Occluder, dump_toml, load_rig
+from nlos_calibration.rig import ObjectBox, Occluder, Rig, dump_toml, load_rig
 from nlos_calibration.wall_record import (
     VERSION,
     MeasuredWall,
@@ -26,6 +27,7 @@ from nlos_calibration.wall_record import (
     load_wall,
     with_occluder,
 )
+from pydantic import ValidationError
 
 EXAMPLE = Path(__file__).parents[3] / "calibration/records/wall.toml"
 SMALL = Intrinsics(16, 12, 11.4, 11.5, 7.5, 5.5)
@@ -335,3 +337,22 @@ def test_reference_of_another_kind_is_refused(tmp_path: Path) -> None:
     np.savez(path, depth_m=np.zeros(3))
     with pytest.raises(RecordFileError, match=r"wall\.npz"):
         load_reference(path, hashlib.sha256(path.read_bytes()).hexdigest())
+
+
+@pytest.mark.parametrize(
+    ("changed", "field"),
+    [
+        ({"object_box": {"x_max_m": 1e308}}, "x_max_m"),
+        ({"device": {"bin_m": 1e-300}}, "bin_m"),
+        ({"lidar": {"distance_m": 1e-9}}, "distance_m"),
+        ({"intrinsics": {"fx": 1e300}}, "fx"),
+        ({"wall": {"x_min_m": -1e6}}, "x_min_m"),
+    ],
+)
+def test_absurd_numbers_of_a_rig_are_refused(changed: dict[str, Any], field: str) -> None:
+    rig = load_rig("paper-rig").model_dump()
+    for part, values in changed.items():
+        rig[part] |= values
+
+    with pytest.raises(ValidationError, match=field):
+        Rig.model_validate(rig)

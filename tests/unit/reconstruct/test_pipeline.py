@@ -383,3 +383,13 @@ def test_open_bench_refuses_unreadable_records(tmp_path: Path, wall: Path) -> No
     wall.with_suffix(".npz").unlink()
     with pytest.raises(RecordFileError, match=r"wall\.npz"):
         open_bench(wall, camera())
+
+
+def test_record_that_calls_itself_doubtful_is_named(walled: CalibratedRig) -> None:
+    changes = {"verdict": "doubtful", "advice": "measure again"}
+    record = walled.measured.record.model_copy(update=changes)
+    bench = CalibratedRig(RIG, replace(walled.measured, record=record))
+
+    notes = compatibility_warnings(bench, trained(), DOUBTER)
+
+    assert any("doubtful: measure again" in note for note in notes)
