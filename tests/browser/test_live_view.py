@@ -86,21 +86,8 @@ def test_controls_of_a_live_run_do_what_they_say(
     for part in ("sim", "frames/s", "latency", "newest frame", "dropped", "°C", "disk for"):
         assert part in page.state()["statusText"]
 
-    page.page.fill("#label", "cup")
-    assert "recording" in page.click("#record")
-    page.wait_until(lambda: "REC" in page.state()["statusText"], "the recording's time")
-    page.wait_until(lambda: page.page.inner_text("#record") == "Stop recording", "the button")
-    page.page.wait_for_timeout(1500)
-    assert "verified" in page.click("#record")
-    bag = only(tmp_path, "cup-*.bag")
-    assert verify(bag).frames > 10
-    assert load_sidecar(sidecar_path(bag)).label == "cup"
-
-    assert "wrote" in page.click("#snapshot")
-    with np.load(only(tmp_path, "snapshot-*.npz")) as arrays:
-        assert arrays["depth_m"].shape == (64, 64)
-    assert only(tmp_path, "snapshot-*.png").stat().st_size > 10_000
-
+    record_cup(page, tmp_path)
+    save_snapshot(page, tmp_path)
     change_run(page)
     save_session(page, browser, tmp_path)
     assert "bare wall" in page.click("#reference"), (
@@ -114,6 +101,28 @@ def test_controls_of_a_live_run_do_what_they_say(
     parts = urlsplit(program.address)
     with pytest.raises(ConnectionRefusedError):
         socket.create_connection((parts.hostname, parts.port), timeout=60.0)
+
+
+def record_cup(page: Page, folder: Path) -> None:
+    """Record with a label, and find the recording verified."""
+    page.page.fill("#label", "cup")
+    assert "recording" in page.click("#record")
+    page.wait_until(lambda: "REC" in page.state()["statusText"], "the recording's time")
+    page.wait_until(lambda: page.page.inner_text("#record") == "Stop recording", "the button")
+    page.page.wait_for_timeout(1500)
+    assert "verified" in page.click("#record")
+
+    bag = only(folder, "cup-*.bag")
+    assert verify(bag).frames > 10
+    assert load_sidecar(sidecar_path(bag)).label == "cup"
+
+
+def save_snapshot(page: Page, folder: Path) -> None:
+    """Save what is shown, as arrays and as a picture."""
+    assert "wrote" in page.click("#snapshot")
+    with np.load(only(folder, "snapshot-*.npz")) as arrays:
+        assert arrays["depth_m"].shape == (64, 64)
+    assert only(folder, "snapshot-*.png").stat().st_size > 10_000
 
 
 def change_run(page: Page) -> None:
