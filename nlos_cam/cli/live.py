@@ -56,6 +56,13 @@ Average = Annotated[
         "--average", min=1, max=1000, help="Number of frames to average; moving objects blur."
     ),
 ]
+PriorityOption = Annotated[
+    loop.Priority,
+    typer.Option(
+        "--priority",
+        help="Real-time priority where the system allows it (auto), or never; --verbose says which.",
+    ),
+]
 BagFile = Annotated[
     Path, typer.Argument(metavar="F.BAG", help="Recording with depth, infrared and confidence.")
 ]
@@ -94,6 +101,7 @@ def live(
     weights: Weights = None,
     average: Average = 1,
     save_view: viewing.SaveView = None,
+    priority: PriorityOption = "auto",
     overwrite: common.Overwrite = False,
     json: common.Json = False,
 ) -> None:
@@ -125,7 +133,7 @@ def live(
         control.bench.on_bench = lambda bench: viewer.begin(bench.rig, bench.measured)
         with (
             common.stop_on_signals() as stop,
-            loop.realtime_priority(),
+            loop.RealtimePriority(priority, control.strain_of(stop)),
             viewing.saving(viewer, bench, view_file) as viewers,
             frame_log or nullcontext(),
             loop.low_latency_interpreter(),

@@ -30,6 +30,11 @@ from nlos_cam.view import Moment
 
 RECENT_FRAMES = 300
 """Frames (10 s) over which the status gives rate and latency."""
+STRAIN_FRAMES = 60
+MAX_DROPS = 3
+"""Of so many frames (2 s), the number of dropped ones above which the run is too slow."""
+COMMAND_WAIT_S = 0.5
+"""Time after which a command without an answer waits: most take milliseconds."""
 CONTROL_ERRORS = NlosCamError, CalibrationError, OSError
 
 log = logging.getLogger(__name__)
@@ -57,6 +62,12 @@ class RunControl:
         groups = self.recording, self.saving, self.pipeline, self.bench
         self._commands = {name: call for group in groups for name, call in group.commands.items()}
         self._command_lock = threading.Lock()
+        self._command_start_s: float | None = None
+        """Monotonic time at which the command that runs began."""
+        self._drops: deque[int] = deque(maxlen=STRAIN_FRAMES)
+        """Number of frames that processing dropped so far, after each of the last results."""
+        self._too_slow = False
+        """True for good once too many were dropped."""
         self._state = "connecting"
         self._message = ""
         self._rendering_start_s: float | None = None
@@ -110,6 +121,12 @@ class RunControl:
         self._recent.append((moment.time_s, moment.latency_s))
         self.saving.show(moment)
 
+    def note_drops(self, count: int) -> None:
+        """Take the number of frames that processing was too slow for so far, after each result."""
+        self._drops.append(count)
+        if count - self._drops[0] > MAX_DROPS:
+            self._too_slow = True
+
     def end(self) -> None:
         """End recording and session while the camera still runs; errors are logged, since the run
         ends anyway.
@@ -126,6 +143,21 @@ class RunControl:
                 log.warning("%s", error)
         self.set_state("ended")
 
+    def strain_of(self, stop: threading.Event) -> Callable[[], str]:
+        """Return a function, for any thread, that returns the reason why the run should leave more
+        processor time to others; empty if there is none.
+        """
+
+        def strain() -> str:
+            if stop.is_set():
+                return "the run ends"
+            start_s = self._command_start_s
+            if start_s is not None and time.monotonic() - start_s > COMMAND_WAIT_S:
+                return "a command waits"
+            return "frames are dropped" if self._too_slow else ""
+
+        return strain
+
     # ---- the page's side
 
     def run(self, command: str, arguments: Mapping[str, Any]) -> str:
@@ -135,6 +167,7 @@ class RunControl:
         if not self._command_lock.acquire(blocking=False):
             raise NlosCamError("another command is running: wait for its answer")
         try:
+            self._command_start_s = time.monotonic()
             self.thread_start()
             return self._commands[command](**arguments)
         except NlosCamError:
@@ -146,6 +179,7 @@ class RunControl:
         except ValueError as error:
             raise NlosCamError(f"{command}: {error}") from error
         finally:
+            self._command_start_s = None
             self._command_lock.release()
 
     def status(self) -> dict[str, Any]:

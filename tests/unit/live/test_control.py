@@ -189,3 +189,30 @@ def test_reference_is_taken_from_the_passing_frames(tmp_path: Path) -> None:
     assert bench.rig is RIG
     measured = load_measured(next(tmp_path.glob("bench-*.toml")))
     np.testing.assert_array_equal(measured.reference.map_depth_m, bench.reference.map_depth_m)
+
+
+def test_run_is_under_strain_while_a_command_waits(
+    control: RunControl, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("nlos_cam.live.control.COMMAND_WAIT_S", -1.0)
+    strain = control.strain_of(Event())
+    found = list[str]()
+    control.thread_start = lambda: found.append(strain())
+    control.run("pause", {})
+    assert found == ["a command waits"]
+    assert not strain()
+
+
+def test_run_is_under_strain_once_it_drops_frames(control: RunControl) -> None:
+    strain = control.strain_of(Event())
+    for count in (0, 1, 3):
+        control.note_drops(count)
+        assert not strain()
+    control.note_drops(4)
+    assert strain() == "frames are dropped"
+
+
+def test_run_is_under_strain_when_it_is_to_stop(control: RunControl) -> None:
+    stop = Event()
+    stop.set()
+    assert control.strain_of(stop)() == "the run ends"
