@@ -265,7 +265,7 @@ class Recording:
             raise RecordingError(
                 f"{self.path} cannot be written ({error.strerror}): choose another --out"
             ) from error
-        if not self._overwrite and not self.started and self.path.exists():
+        if not self._overwrite and not self.started and os.path.lexists(self.path):
             self._claim.close()
             raise OutputExistsError(
                 f"{self.path} exists by now: choose another --out, or add --overwrite"

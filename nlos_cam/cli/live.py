@@ -129,6 +129,8 @@ def live(
             control.set_state("connecting", "loading the networks, first frame in a few seconds")
             pipeline = _load_pipeline(bench, weights, average, checks)
             reconstruct.warm_up(opened, pipeline)
+            if not no_view:
+                views.prepare_saving()
         viewer.begin(bench.rig, bench.measured)
         control.bench.on_bench = lambda bench: viewer.begin(bench.rig, bench.measured)
         with (

@@ -3,7 +3,9 @@
 import importlib
 import json
 import os
+import sys
 from contextlib import suppress
+from io import TextIOWrapper
 from typing import Annotated, NamedTuple
 
 import typer
@@ -157,6 +159,7 @@ def _share_options(app: typer.Typer, group: str = "") -> None:
 def main(arguments: list[str]) -> int:
     """Run one command and return its exit code (see docs/files.md: 0, 1, 2, 3, 4, 130)."""
     as_json = "--json" in arguments
+    _escape_foreign_characters()
     command, arguments = _split(arguments)
     common.set_detail()
     try:
@@ -174,6 +177,13 @@ def main(arguments: list[str]) -> int:
         return _report(known, as_json=as_json)
     finally:
         common.release_outputs()
+
+
+def _escape_foreign_characters() -> None:
+    """Print characters that the locale lacks as escapes, and not as an error of the encoding."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")
 
 
 def _run(command: str, arguments: list[str]) -> int:

@@ -7,6 +7,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -35,6 +36,9 @@ MAX_DROPS = 3
 """Of so many frames (2 s), the number of dropped ones above which the run is too slow."""
 COMMAND_WAIT_S = 0.5
 """Time after which a command without an answer waits: most take milliseconds."""
+MAX_NUMBER = 1e9
+MAX_TEXT = 200
+"""Bounds of every argument of a command, far above what any takes."""
 CONTROL_ERRORS = NlosCamError, CalibrationError, OSError
 
 log = logging.getLogger(__name__)
@@ -141,6 +145,7 @@ class RunControl:
                 stop()
             except CONTROL_ERRORS as error:
                 log.warning("%s", error)
+        self._run.ended = True
         self.set_state("ended")
 
     def strain_of(self, stop: threading.Event) -> Callable[[], str]:
@@ -164,6 +169,7 @@ class RunControl:
         """Run a command by name. Raises NlosCamError, also for arguments that it does not take."""
         if command not in self._commands:
             raise NlosCamError(f"no command {command!r}: choose from {', '.join(self._commands)}")
+        _check_arguments(command, arguments)
         if not self._command_lock.acquire(blocking=False):
             raise NlosCamError("another command is running: wait for its answer")
         try:
@@ -172,11 +178,17 @@ class RunControl:
             return self._commands[command](**arguments)
         except NlosCamError:
             raise
-        except CONTROL_ERRORS as error:
+        except CalibrationError as error:
             raise NlosCamError(str(error)) from error
+        except OSError as error:
+            place = error.filename or self._run.folder.name or "the folder of the run"
+            raise NlosCamError(
+                f"{command}: {place} cannot be written ({error.strerror or error}): check that its"
+                " folder is still there and has room"
+            ) from error
         except TypeError as error:
             raise NlosCamError(f"{command} does not take {dict(arguments)!r}") from error
-        except ValueError as error:
+        except (ValueError, ArithmeticError) as error:
             raise NlosCamError(f"{command}: {error}") from error
         finally:
             self._command_start_s = None
@@ -197,8 +209,9 @@ class RunControl:
         if camera:
             if simulated_ms := camera_ms(camera):
                 status["camera_ms"] = round(simulated_ms["p50"], 2)
-            free = free_bytes(self._run.folder / "any.bag")
-            status["disk_s"] = round(recording_s(camera.intrinsics, free))
+            with suppress(OSError):  # the folder may have gone away
+                free = free_bytes(self._run.folder / "any.bag")
+                status["disk_s"] = round(recording_s(camera.intrinsics, free))
         if recording := self._recording_status(now_s):
             status["recording"] = recording
         status["control"] = self._control_status()
@@ -257,3 +270,22 @@ class RunControl:
         """
         scheme, colon, rest = self._run.uri.partition(":")
         return f"{scheme}{colon}{Path(rest).name}"
+
+
+def _check_arguments(command: str, arguments: Mapping[str, Any]) -> None:
+    """Raise NlosCamError for a value that no command takes: a list, a number without bounds, a text
+    that is too long or cannot be written.
+    """
+    for name, value in arguments.items():
+        if isinstance(value, str):
+            if len(value) > MAX_TEXT or not value.isprintable():
+                raise NlosCamError(
+                    f"{command}: {name} {value[:MAX_TEXT]!a} is no text of at most {MAX_TEXT}"
+                    " printable characters: give another"
+                )
+        elif isinstance(value, bool) or not isinstance(value, int | float):
+            raise NlosCamError(f"{command}: {name} is neither a number nor a text: give one")
+        elif not abs(value) <= MAX_NUMBER:  # NaN too
+            raise NlosCamError(
+                f"{command}: {name} is out of range: give a number up to {MAX_NUMBER:g}"
+            )

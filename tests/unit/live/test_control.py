@@ -216,3 +216,56 @@ def test_run_is_under_strain_when_it_is_to_stop(control: RunControl) -> None:
     stop = Event()
     stop.set()
     assert control.strain_of(stop)() == "the run ends"
+
+
+@pytest.mark.parametrize(
+    ("command", "arguments"),
+    [
+        ("average", {"frames": float("inf")}),
+        ("average", {"frames": float("nan")}),
+        ("average", {"frames": 10**400}),
+        ("average", {"frames": 1.5}),
+        ("average", {"frames": "three"}),
+        ("average", {"frames": None}),
+        ("average", {"frames": [1]}),
+        ("average", {"frames": True}),
+        ("take_reference", {"frames": 10**9}),
+        ("take_reference", {"frames": -1}),
+        ("take_reference", {"frames": 2.5}),
+        ("record", {"label": "\ud800"}),
+        ("record", {"label": "\x1b[2J"}),
+        ("record", {"label": "x" * 1000}),
+        ("record", {"\udcff": 1}),
+        ("option", {"name": "\udcff", "value": 1}),
+        ("option", {"name": "laser_power", "value": 1e308}),
+        ("\ud800", {}),
+    ],
+)
+def test_command_beyond_its_range_has_one_clear_answer(
+    control: RunControl, command: str, arguments: dict[str, Any]
+) -> None:
+    with pytest.raises(NlosCamError) as caught:
+        control.run(command, arguments)
+    answer = str(caught.value)
+    assert answer.isprintable()
+    assert "unforeseen" not in answer
+    assert len(answer) < 400
+
+
+@pytest.mark.parametrize("command", ["snapshot", "save_session", "record"])
+def test_command_says_that_its_folder_went_away(
+    control: RunControl, command: str, tmp_path: Path
+) -> None:
+    tmp_path.rmdir()
+    with pytest.raises(NlosCamError, match=r"folder|cannot be (written|recorded)"):
+        control.run(command, {})
+    assert control.status()["state"] == "running"
+
+
+def test_reference_ends_with_the_run(
+    control: RunControl, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("nlos_cam.live.run_commands.POLL_S", 0.001)
+    control.end()
+    with pytest.raises(NlosCamError, match="ended"):
+        control.run("take_reference", {"frames": 5})
