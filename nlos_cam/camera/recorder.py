@@ -136,6 +136,12 @@ class SdkRecorder:
         self._grew_s = now()
         self._bytes = 0
         try:
+            str(path).encode()
+        except UnicodeEncodeError as error:  # librealsense takes no other names
+            raise RecordingError(
+                f"{path} cannot be written (its name is not UTF-8): choose another --out"
+            ) from error
+        try:
             path.unlink(missing_ok=True)
             self._recorder: Any = _within_deadline(lambda: sdk.recorder(str(path), device))
         except (RuntimeError, OSError) as error:

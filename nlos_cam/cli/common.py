@@ -2,6 +2,7 @@
 signals.
 """
 
+import errno
 import json as json_module
 import os
 import re
@@ -279,7 +280,9 @@ def _unraisable_hook(hook: Callable[[Any], None]) -> Generator[None]:
 @contextmanager
 def _on_signals(act: Callable[[], None]) -> Generator[None]:
     def on_signal(number: int, frame: FrameType | None) -> None:
-        del number, frame
+        del frame
+        if number not in (signal.SIGINT, signal.SIGTERM):
+            _leave_closed_terminal()
         act()
 
     numbers = [signal.SIGINT, signal.SIGTERM]
@@ -292,6 +295,19 @@ def _on_signals(act: Callable[[], None]) -> Generator[None]:
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
+
+
+def _leave_closed_terminal() -> None:
+    """Discard further output to a terminal that was closed: each write would fail."""
+    import termios  # where there is SIGHUP
+
+    for stream in (1, 2):
+        try:
+            termios.tcgetattr(stream)
+        except termios.error as error:
+            if error.args[0] == errno.EIO:
+                with open(os.devnull, "wb") as nowhere:  # noqa: PTH123  os.devnull is no path of ours
+                    os.dup2(nowhere.fileno(), stream)
 
 
 def output_path(out: Path | None, stem: str, suffix: str, *, overwrite: bool) -> Path:

@@ -3,6 +3,7 @@
 import importlib
 import json
 import os
+import re
 import sys
 from contextlib import suppress
 from io import TextIOWrapper
@@ -238,6 +239,8 @@ def _known_error(error: Exception, command: str) -> NlosCamError | ModelError | 
         return NlosCamError("out of memory: close other programs, or raise the limit of this one")
     if isinstance(error, ModuleNotFoundError):
         return missing_extra(error, f"nlos-cam {command}")
+    if isinstance(error, UnicodeEncodeError) and re.search("[\udc80-\udcff]", error.object):
+        return NlosCamError(f"a name is not UTF-8 ({error.object!a:.200}): rename the file")
     if isinstance(error, OSError) and (error.errno in DISK_ERRORS or error.filename is not None):
         return _file_error(error)
     return None

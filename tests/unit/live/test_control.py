@@ -262,9 +262,7 @@ def test_command_says_that_its_folder_went_away(
     assert control.status()["state"] == "running"
 
 
-def test_reference_ends_with_the_run(
-    control: RunControl, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_reference_ends_with_the_run(control: RunControl, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("nlos_cam.live.run_commands.POLL_S", 0.001)
     control.end()
     with pytest.raises(NlosCamError, match="ended"):
