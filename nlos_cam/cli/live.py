@@ -115,7 +115,8 @@ def live(
         recording = cameras.Recording(path, optional=True, overwrite=overwrite)
     frame_log = loop.FrameLog(check_output(log, "--log", *loop.LOG_SUFFIXES)) if log else None
     view_file = check_output(save_view, "--save-view", views.SESSION_SUFFIX) if save_view else None
-    control = loop.RunControl(camera)
+    clock = cameras.WallClock().now  # the system's may jump
+    control = loop.RunControl(camera, clock=clock)
     viewer = viewing.viewer_of(control, no_view=no_view, host=view_host, port=view_port)
     announce = cache(
         partial(viewing.announce_view, viewer, host=view_host, port=view_port, open_it=open_view)
@@ -148,7 +149,7 @@ def live(
                 stop=stop,
                 seconds=seconds,
                 recorded=camera.startswith("bag:"),
-                clock=cameras.WallClock().now,
+                clock=clock,
                 on_error=lambda report: common.say(summary(report, verbose=common.Detail.verbose)),
                 on_warning=warn,
                 on_moment=frame_log.add if frame_log else reconstruct.ignore,

@@ -14,9 +14,10 @@ import logging
 import os
 import sys
 from collections.abc import Callable, Generator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from threading import Event, Thread
+from threading import enumerate as enumerate_threads
 from typing import Literal, Self
 
 LOOP = 2
@@ -27,6 +28,9 @@ none).
 """
 TASKS = Path("/proc/self/task")
 MIN_PROCESSORS = 2
+GIVE_WAY = 5
+"""`nice` of the run's threads on one processor. The kernel's weight of 5 is a third of that of 0:
+the three busy threads of a run (camera, loop, network) together get as much as another program."""
 POLL_S = 0.1
 Priority = Literal["auto", "never"]
 SWITCH_S = 0.001
@@ -40,8 +44,8 @@ class RealtimePriority:
     """Real-time priority of all threads of this process, and of those that they start, while
     entered.
 
-    It is not taken with `wanted` "never", on one processor, or without permission. `strain` is
-    polled: the priority is given up while it returns a reason. Each change is logged.
+    It is not taken with `wanted` "never", on one processor, or without permission. On one processor
+    the threads are scheduled after other programs instead (see GIVE_WAY). `strain` is polled: the priority is given up while it returns a reason. Each change is logged.
     """
 
     def __init__(
@@ -63,6 +67,8 @@ class RealtimePriority:
             refusal = "the system does not allow it"
         if refusal:
             log.info("ordinary priority: %s", refusal)
+            if self._wanted == "auto" and processors() < MIN_PROCESSORS:
+                _give_way()
             return self
         self.held = True
         log.info("real-time priority %d", LOOP)
@@ -97,6 +103,21 @@ class RealtimePriority:
             elif not self.held and _all_threads(LOOP):
                 self.held = True
                 log.info("real-time priority %d again", LOOP)
+
+
+def _give_way() -> None:
+    """Schedule all threads but the view's after ordinary programs, until this process ends."""
+    if not hasattr(os, "setpriority") or not TASKS.is_dir():
+        return
+    views = {thread.native_id for thread in enumerate_threads() if thread.name.startswith("view")}
+    for task in TASKS.iterdir():
+        number = int(task.name)
+        if number in views:
+            continue
+        with suppress(OSError):  # the thread has ended since
+            os.setpriority(
+                os.PRIO_PROCESS, number, max(GIVE_WAY, os.getpriority(os.PRIO_PROCESS, number))
+            )
 
 
 def processors() -> int:

@@ -6,12 +6,14 @@ import weakref
 from collections.abc import Callable
 from pathlib import Path
 from threading import Event, Thread
+from types import SimpleNamespace
 
 import pytest
 
 from nlos_cam.live import RealtimePriority, low_latency_interpreter, yield_to_loop
 from nlos_cam.live.realtime import (
     DRAWING,
+    GIVE_WAY,
     LOOP,
     ORDINARY,
     SWITCH_S,
@@ -89,10 +91,26 @@ def test_realtime_priority_is_not_taken_on_one_processor(
 ) -> None:
     caplog.set_level("INFO")
     monkeypatch.setattr("nlos_cam.live.realtime.processors", lambda: 1)
+    monkeypatch.setattr("nlos_cam.live.realtime._give_way", lambda: None)
     with RealtimePriority() as priority:
         assert not priority.held
     assert set(system.schedules.values()) == {(OTHER, ORDINARY)}
     assert "one processor" in caplog.text
+
+
+def test_run_gives_way_on_one_processor_but_not_its_view(
+    system: System, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    nice: dict[int, int] = {0: 0, 7: 0, 8: 10}
+    monkeypatch.setattr("nlos_cam.live.realtime.processors", lambda: 1)
+    monkeypatch.setattr(os, "getpriority", lambda _, task: nice[task])
+    monkeypatch.setattr(os, "setpriority", lambda _, task, value: nice.update({task: value}))
+    view = SimpleNamespace(native_id=7, name="view server")
+    monkeypatch.setattr("nlos_cam.live.realtime.enumerate_threads", lambda: [view])
+    with RealtimePriority("never"):
+        assert nice[0] == 0
+    with RealtimePriority():
+        assert nice == {0: GIVE_WAY, 7: 0, 8: 10}
 
 
 def test_realtime_priority_never_is_not_taken(system: System) -> None:
