@@ -45,7 +45,8 @@ class RealtimePriority:
     entered.
 
     It is not taken with `wanted` "never", on one processor, or without permission. On one processor
-    the threads are scheduled after other programs instead (see GIVE_WAY). `strain` is polled: the priority is given up while it returns a reason. Each change is logged.
+    the threads are scheduled after other programs instead (see GIVE_WAY). `strain` is polled: the
+    priority is given up while it returns a reason. Each change is logged.
     """
 
     def __init__(

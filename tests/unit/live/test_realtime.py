@@ -98,9 +98,8 @@ def test_realtime_priority_is_not_taken_on_one_processor(
     assert "one processor" in caplog.text
 
 
-def test_run_gives_way_on_one_processor_but_not_its_view(
-    system: System, monkeypatch: pytest.MonkeyPatch
-) -> None:
+@pytest.mark.usefixtures("system")
+def test_run_gives_way_on_one_processor_but_not_its_view(monkeypatch: pytest.MonkeyPatch) -> None:
     nice: dict[int, int] = {0: 0, 7: 0, 8: 10}
     monkeypatch.setattr("nlos_cam.live.realtime.processors", lambda: 1)
     monkeypatch.setattr(os, "getpriority", lambda _, task: nice[task])
