@@ -154,7 +154,7 @@ class RunControl:
         """
 
         def strain() -> str:
-            if stop.is_set():
+            if stop.is_set() or self._run.ended:
                 return "the run ends"
             start_s = self._command_start_s
             if start_s is not None and time.monotonic() - start_s > COMMAND_WAIT_S:

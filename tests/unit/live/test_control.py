@@ -216,6 +216,8 @@ def test_run_is_under_strain_when_it_is_to_stop(control: RunControl) -> None:
     stop = Event()
     stop.set()
     assert control.strain_of(stop)() == "the run ends"
+    control.end()
+    assert control.strain_of(Event())() == "the run ends"
 
 
 @pytest.mark.parametrize(
