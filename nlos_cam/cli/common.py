@@ -306,7 +306,7 @@ def _leave_closed_terminal() -> None:
             termios.tcgetattr(stream)
         except termios.error as error:
             if error.args[0] == errno.EIO:
-                with open(os.devnull, "wb") as nowhere:  # noqa: PTH123  os.devnull is no path of ours
+                with Path(os.devnull).open("wb") as nowhere:
                     os.dup2(nowhere.fileno(), stream)
 
 
