@@ -41,6 +41,7 @@ BENCHES = ("--rig-spread-mm", "10", "--rig-spread-deg", "5", "--objects-per-rig"
 """Half of the direct network's objects are on measured benches, and aligned with the one rig."""
 PROGRAM = (
     sys.executable,
+    "-P",
     "-c",
     "import sys; from nlos_cam.cli import run; sys.argv[0] = 'nlos-cam'; run()",
 )

@@ -1,5 +1,6 @@
 """Files that `calibrate` writes: the record, the bare wall's reference and the report."""
 
+import os
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
@@ -30,7 +31,7 @@ class WallFiles:
                 f"{record} would be overwritten by the reference or the report: name it wall.toml"
             )
         for path in (files.reference, files.report):
-            if path.is_dir() or (path.exists() and not overwrite):
+            if path.is_dir() or (os.path.lexists(path) and not overwrite):
                 raise OutputExistsError(
                     f"{path} exists: choose another name, or add --overwrite to replace it"
                 )

@@ -3,6 +3,7 @@ disk is full.
 """
 
 import ctypes
+import faulthandler
 import gc
 import logging
 import os
@@ -12,7 +13,7 @@ from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
 from shlex import quote
-from threading import Event
+from threading import Event, Thread
 from typing import Any
 
 from nlos_calibration import Intrinsics
@@ -20,6 +21,7 @@ from nlos_calibration import Intrinsics
 from nlos_cam.camera.streams import BYTES_PER_PIXEL, FRAMES_PER_S, SAME_INSTANT_S, FrameSet
 from nlos_cam.errors import DiskFullError, OutputExistsError, RecordingError
 from nlos_cam.files import FileBusyError, claim
+from nlos_cam.threads import BoundedQueue
 
 RESERVE_BYTES = 200_000_000
 """Disk space that a recording leaves free: five seconds of 640 x 480, and its index."""
@@ -87,6 +89,35 @@ MAX_FLUSHES = 30
 """Pauses, of 10 s each, until the disk counts as unable to write."""
 
 
+START_WITHIN_S = 10.0
+"""Time for the SDK to begin a recording; it usually takes milliseconds."""
+END_AFTER_S = 30.0
+"""Time after which this process ends, if the SDK holds Python's lock during such a start: nothing
+else can end it then, not even SIGTERM."""
+
+
+def _within_deadline(start: Callable[[], Any]) -> Any:
+    """Return what `start` returns. Raises TimeoutError if that takes longer, and its errors."""
+    outcome = BoundedQueue[tuple[Any]](1)
+
+    def run() -> None:
+        try:
+            outcome.put((start(),))
+        except Exception as error:  # noqa: BLE001  whatever it was, the caller raises it
+            outcome.finish(error)
+
+    faulthandler.dump_traceback_later(END_AFTER_S, exit=True, file=2)
+    try:
+        Thread(target=run, name="recorder start", daemon=True).start()
+        started = outcome.take(START_WITHIN_S)
+    finally:
+        faulthandler.cancel_dump_traceback_later()
+    if started is None:
+        outcome.close()
+        raise TimeoutError(f"it did not begin within {START_WITHIN_S:g} s")
+    return started[0]
+
+
 class SdkRecorder:
     """librealsense's recorder of one device to one .bag, from construction to `close`.
 
@@ -105,8 +136,14 @@ class SdkRecorder:
         self._grew_s = now()
         self._bytes = 0
         try:
+            str(path).encode()
+        except UnicodeEncodeError as error:  # librealsense takes no other names
+            raise RecordingError(
+                f"{path} cannot be written (its name is not UTF-8): choose another --out"
+            ) from error
+        try:
             path.unlink(missing_ok=True)
-            self._recorder: Any = sdk.recorder(str(path), device)
+            self._recorder: Any = _within_deadline(lambda: sdk.recorder(str(path), device))
         except (RuntimeError, OSError) as error:
             raise RecordingError(
                 f"{path} cannot be written ({error}): choose another --out"
@@ -234,7 +271,7 @@ class Recording:
             raise RecordingError(
                 f"{self.path} cannot be written ({error.strerror}): choose another --out"
             ) from error
-        if not self._overwrite and not self.started and self.path.exists():
+        if not self._overwrite and not self.started and os.path.lexists(self.path):
             self._claim.close()
             raise OutputExistsError(
                 f"{self.path} exists by now: choose another --out, or add --overwrite"

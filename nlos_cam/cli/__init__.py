@@ -15,6 +15,7 @@ def run() -> None:
     Python is ending anyway.
     """
     signal(SIGINT, _leave)
+    sys.path[:] = [entry for entry in sys.path if entry]  # '' is the current folder
     from nlos_cam.cli.main import main
 
     code = main(sys.argv[1:])

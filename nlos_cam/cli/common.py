@@ -2,8 +2,10 @@
 signals.
 """
 
+import errno
 import json as json_module
 import os
+import re
 import signal
 import sys
 from collections.abc import Callable, Generator
@@ -27,6 +29,7 @@ from rich.progress import (
     TimeRemainingColumn,
 )
 from rich.table import Table
+from rich.text import Text
 
 from nlos_cam.errors import OutputExistsError
 
@@ -46,12 +49,31 @@ Overwrite = Annotated[bool, typer.Option("--overwrite", help="Overwrite the outp
 
 PAPER_RIG = "paper-rig"
 INTERRUPTED = 130
-"""Exit code after Ctrl-C or SIGTERM."""
+"""Exit code after Ctrl-C, SIGTERM or SIGHUP."""
 LINE_PERIOD_S = 10.0
 """Seconds between two lines of progress where stderr is no terminal."""
 NARROW_COLUMNS = 60
 
-stderr = Console(stderr=True, highlight=False, emoji=False)
+CONTROL_CHARACTER = re.compile(
+    "[\x00-\x08\x0b-\x1f\x7f-\x9f\u200e\u200f\u202a-\u202e\u2066-\u2069\ud800-\udfff]"
+)
+"""Characters of names that a terminal would obey (control, direction of writing), and bytes that
+are no UTF-8; tabs and line ends are text."""
+
+
+def printable(text: str) -> str:
+    """Return a text with its control characters as Python's escapes."""
+    return CONTROL_CHARACTER.sub(lambda found: ascii(found[0])[1:-1], text)
+
+
+class PlainConsole(Console):
+    """Console that obeys no control characters in the texts it prints."""
+
+    def render_str(self, text: str, **options: Any) -> Text:
+        return super().render_str(printable(text), **options)
+
+
+stderr = PlainConsole(stderr=True, highlight=False, emoji=False)
 _outputs = ExitStack()
 _reserved: list[Path] = []
 """Reserved output paths of the command that runs, and their reservations."""
@@ -86,7 +108,7 @@ def say_error(text: str) -> None:
     try:
         stderr.print(f"[bold red]error:[/] {escape(line)}", soft_wrap=True)
     except (MemoryError, ImportError):  # too little memory is left for rich
-        os.write(2, f"error: {line}\n".encode())
+        os.write(2, f"error: {printable(line)}\n".encode())
 
 
 def say_interrupted(kept: str = "nothing was written") -> None:
@@ -122,14 +144,14 @@ def finish(
     if as_json:
         print(json_module.dumps(result), flush=True)  # noqa: T201  stdout is the machine's
     else:
-        Console(highlight=False).print(text, soft_wrap=True, markup=marked)
+        PlainConsole(highlight=False).print(text, soft_wrap=True, markup=marked)
 
 
 def show(table: Table) -> None:
     """Print a table to stdout without its empty columns; on a narrow terminal, each row as a block
     of lines.
     """
-    console = Console(highlight=False)
+    console = PlainConsole(highlight=False)
     table.columns = [column for column in table.columns if any(column.cells)]
     if console.width >= NARROW_COLUMNS:
         console.print(table)
@@ -195,8 +217,8 @@ def tracked(description: str, *, at_once: bool = True) -> Generator[Callable[[in
 
 @contextmanager
 def stop_on_signals(note: str = "") -> Generator[Event]:
-    """Yield an event that Ctrl-C or SIGTERM sets within the block, so that the loop ends and
-    results are printed.
+    """Yield an event that Ctrl-C, SIGTERM or SIGHUP sets within the block, so that the loop
+    ends and results are printed.
 
     The first signal prints `note`, for loops whose end takes long.
     """
@@ -214,8 +236,8 @@ def stop_on_signals(note: str = "") -> Generator[Event]:
 
 @contextmanager
 def interrupted_by_signals(kept: str = "nothing was written") -> Generator[None]:
-    """Raise KeyboardInterrupt in the block on Ctrl-C or SIGTERM, also where a shell had them
-    ignored.
+    """Raise KeyboardInterrupt in the block on Ctrl-C, SIGTERM or SIGHUP; the first two also
+    where a shell had them ignored.
 
     It is raised at the end of the block too: a library may have swallowed it or turned it into
     another error. `kept` completes the line "interrupted: ...", which the command line prints.
@@ -258,17 +280,34 @@ def _unraisable_hook(hook: Callable[[Any], None]) -> Generator[None]:
 @contextmanager
 def _on_signals(act: Callable[[], None]) -> Generator[None]:
     def on_signal(number: int, frame: FrameType | None) -> None:
-        del number, frame
+        del frame
+        if number not in (signal.SIGINT, signal.SIGTERM):
+            _leave_closed_terminal()
         act()
 
-    before = {
-        number: signal.signal(number, on_signal) for number in (signal.SIGINT, signal.SIGTERM)
-    }
+    numbers = [signal.SIGINT, signal.SIGTERM]
+    # A terminal that is closed sends SIGHUP, unless the command was started with nohup.
+    if hasattr(signal, "SIGHUP") and signal.getsignal(signal.SIGHUP) != signal.SIG_IGN:
+        numbers.append(signal.SIGHUP)
+    before = {number: signal.signal(number, on_signal) for number in numbers}
     try:
         yield
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
+
+
+def _leave_closed_terminal() -> None:
+    """Discard further output to a terminal that was closed: each write would fail."""
+    import termios  # where there is SIGHUP
+
+    for stream in (1, 2):
+        try:
+            termios.tcgetattr(stream)
+        except termios.error as error:
+            if error.args[0] == errno.EIO:
+                with Path(os.devnull).open("wb") as nowhere:
+                    os.dup2(nowhere.fileno(), stream)
 
 
 def output_path(out: Path | None, stem: str, suffix: str, *, overwrite: bool) -> Path:
@@ -282,7 +321,7 @@ def output_path(out: Path | None, stem: str, suffix: str, *, overwrite: bool) ->
     path = out or Path(f"{stem}-{datetime.now().astimezone():%Y%m%d-%H%M%S}{suffix}")
     if suffix and path.is_dir():
         raise OutputExistsError(f"{path} is a folder: name a {suffix} file in it")
-    if not suffix and path.exists() and not path.is_dir():
+    if not suffix and os.path.lexists(path) and not path.is_dir():
         raise OutputExistsError(
             f"{path} is a file, but --out must be a folder: choose another name"
         )
@@ -302,7 +341,8 @@ def output_path(out: Path | None, stem: str, suffix: str, *, overwrite: bool) ->
 
 
 def _refuse_existing(path: Path, *, overwrite: bool) -> None:
-    if path.exists() and not overwrite and not (path.is_dir() and not any(path.iterdir())):
+    # A link that leads nowhere is something too.
+    if os.path.lexists(path) and not overwrite and not (path.is_dir() and not any(path.iterdir())):
         raise OutputExistsError(
             f"{path} exists: choose another name, or add --overwrite to replace it"
         )

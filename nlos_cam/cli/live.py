@@ -56,6 +56,13 @@ Average = Annotated[
         "--average", min=1, max=1000, help="Number of frames to average; moving objects blur."
     ),
 ]
+PriorityOption = Annotated[
+    loop.Priority,
+    typer.Option(
+        "--priority",
+        help="Real-time priority where the system allows it (auto), or never; --verbose says which.",
+    ),
+]
 BagFile = Annotated[
     Path, typer.Argument(metavar="F.BAG", help="Recording with depth, infrared and confidence.")
 ]
@@ -94,6 +101,7 @@ def live(
     weights: Weights = None,
     average: Average = 1,
     save_view: viewing.SaveView = None,
+    priority: PriorityOption = "auto",
     overwrite: common.Overwrite = False,
     json: common.Json = False,
 ) -> None:
@@ -107,7 +115,8 @@ def live(
         recording = cameras.Recording(path, optional=True, overwrite=overwrite)
     frame_log = loop.FrameLog(check_output(log, "--log", *loop.LOG_SUFFIXES)) if log else None
     view_file = check_output(save_view, "--save-view", views.SESSION_SUFFIX) if save_view else None
-    control = loop.RunControl(camera)
+    clock = cameras.WallClock().now  # the system's may jump
+    control = loop.RunControl(camera, clock=clock)
     viewer = viewing.viewer_of(control, no_view=no_view, host=view_host, port=view_port)
     announce = cache(
         partial(viewing.announce_view, viewer, host=view_host, port=view_port, open_it=open_view)
@@ -121,11 +130,13 @@ def live(
             control.set_state("connecting", "loading the networks, first frame in a few seconds")
             pipeline = _load_pipeline(bench, weights, average, checks)
             reconstruct.warm_up(opened, pipeline)
+            if not no_view:
+                views.prepare_saving()
         viewer.begin(bench.rig, bench.measured)
         control.bench.on_bench = lambda bench: viewer.begin(bench.rig, bench.measured)
         with (
             common.stop_on_signals() as stop,
-            loop.realtime_priority(),
+            loop.RealtimePriority(priority, control.strain_of(stop)),
             viewing.saving(viewer, bench, view_file) as viewers,
             frame_log or nullcontext(),
             loop.low_latency_interpreter(),
@@ -138,7 +149,7 @@ def live(
                 stop=stop,
                 seconds=seconds,
                 recorded=camera.startswith("bag:"),
-                clock=cameras.WallClock().now,
+                clock=clock,
                 on_error=lambda report: common.say(summary(report, verbose=common.Detail.verbose)),
                 on_warning=warn,
                 on_moment=frame_log.add if frame_log else reconstruct.ignore,

@@ -3,7 +3,10 @@
 import importlib
 import json
 import os
+import re
+import sys
 from contextlib import suppress
+from io import TextIOWrapper
 from itertools import dropwhile
 from typing import Annotated, NamedTuple
 
@@ -158,6 +161,7 @@ def _share_options(app: typer.Typer, group: str = "") -> None:
 def main(arguments: list[str]) -> int:
     """Run one command and return its exit code (see docs/files.md: 0, 1, 2, 3, 4, 130)."""
     as_json = "--json" in arguments
+    _escape_foreign_characters()
     command, arguments = _split(arguments)
     common.set_detail()
     try:
@@ -175,6 +179,13 @@ def main(arguments: list[str]) -> int:
         return _report(known, as_json=as_json)
     finally:
         common.release_outputs()
+
+
+def _escape_foreign_characters() -> None:
+    """Print characters that the locale lacks as escapes, and not as an error of the encoding."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")
 
 
 def _run(command: str, arguments: list[str]) -> int:
@@ -229,6 +240,8 @@ def _known_error(error: Exception, command: str) -> NlosCamError | ModelError | 
         return NlosCamError("out of memory: close other programs, or raise the limit of this one")
     if isinstance(error, ModuleNotFoundError):
         return missing_extra(error, f"nlos-cam {command}")
+    if isinstance(error, UnicodeEncodeError) and re.search("[\udc80-\udcff]", error.object):
+        return NlosCamError(f"a name is not UTF-8 ({error.object!a:.200}): rename the file")
     if isinstance(error, OSError) and (error.errno in DISK_ERRORS or error.filename is not None):
         return _file_error(error)
     return None

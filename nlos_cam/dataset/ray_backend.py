@@ -5,6 +5,7 @@ writes the shards.
 """
 
 from collections.abc import Generator, Sequence
+from contextlib import chdir
 from importlib.metadata import version
 from itertools import islice
 from typing import Any
@@ -13,6 +14,7 @@ from nlos_cam.dataset.plan import DatasetPlan
 from nlos_cam.dataset.samples import Samples, make_samples
 from nlos_cam.dataset.worker import use_one_thread
 from nlos_cam.errors import NlosCamError, SceneError, WorkersLostError
+from nlos_cam.processes import package_folder, safe_children
 
 MAX_RETRIES = 5
 """Deaths of its worker that a piece survives."""
@@ -63,7 +65,9 @@ class RayFarm:
 
     def _connect(self) -> None:
         try:
-            self._ray.init(address=self._address, log_to_driver=False, configure_logging=False)
+            # Ray gives its workers the current folder to import from.
+            with safe_children(), chdir(package_folder()):
+                self._ray.init(address=self._address, log_to_driver=False, configure_logging=False)
         except (ConnectionError, ValueError, RuntimeError, OSError) as error:
             raise WorkersLostError(
                 f"no Ray cluster at {self._address!r} ({' '.join(str(error).split()):.120}): start"

@@ -17,6 +17,7 @@ from traceback import format_exc
 from typing import TYPE_CHECKING
 
 from nlos_cam.errors import WorkersLostError
+from nlos_cam.processes import safe_children
 
 if TYPE_CHECKING:
     from nlos_cam.dataset.plan import DatasetPlan
@@ -42,7 +43,8 @@ class Worker:
         self.asked = deque[range]()
         self._process = CONTEXT.Process(target=make_pieces, args=(other,), daemon=True)
         try:
-            self._process.start()
+            with safe_children():
+                self._process.start()
         except OSError as error:
             raise WorkersLostError(
                 f"no worker can be started ({error.strerror}): free memory or processes, or lower"

@@ -59,7 +59,7 @@ def atomic_directory(out: Path) -> Generator[Path]:
     Entries of `out` with other names stay. Raises OutputExistsError where `out` is a file, or
     appeared meanwhile, and FileBusyError while another process writes it.
     """
-    if out.exists() and not out.is_dir():
+    if os.path.lexists(out) and not out.is_dir():
         raise OutputExistsError(
             f"{out} is a file, but --out must be a directory: choose another name"
         )

@@ -7,6 +7,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -30,6 +31,14 @@ from nlos_cam.view import Moment
 
 RECENT_FRAMES = 300
 """Frames (10 s) over which the status gives rate and latency."""
+STRAIN_FRAMES = 60
+MAX_DROPS = 3
+"""Of so many frames (2 s), the number of dropped ones above which the run is too slow."""
+COMMAND_WAIT_S = 0.5
+"""Time after which a command without an answer waits: most take milliseconds."""
+MAX_NUMBER = 1e9
+MAX_TEXT = 200
+"""Bounds of every argument of a command, far above what any takes."""
 CONTROL_ERRORS = NlosCamError, CalibrationError, OSError
 
 log = logging.getLogger(__name__)
@@ -57,6 +66,12 @@ class RunControl:
         groups = self.recording, self.saving, self.pipeline, self.bench
         self._commands = {name: call for group in groups for name, call in group.commands.items()}
         self._command_lock = threading.Lock()
+        self._command_start_s: float | None = None
+        """Monotonic time at which the command that runs began."""
+        self._drops: deque[int] = deque(maxlen=STRAIN_FRAMES)
+        """Number of frames that processing dropped so far, after each of the last results."""
+        self._too_slow = False
+        """True for good once too many were dropped."""
         self._state = "connecting"
         self._message = ""
         self._rendering_start_s: float | None = None
@@ -110,6 +125,12 @@ class RunControl:
         self._recent.append((moment.time_s, moment.latency_s))
         self.saving.show(moment)
 
+    def note_drops(self, count: int) -> None:
+        """Take the number of frames that processing was too slow for so far, after each result."""
+        self._drops.append(count)
+        if count - self._drops[0] > MAX_DROPS:
+            self._too_slow = True
+
     def end(self) -> None:
         """End recording and session while the camera still runs; errors are logged, since the run
         ends anyway.
@@ -124,7 +145,23 @@ class RunControl:
                 stop()
             except CONTROL_ERRORS as error:
                 log.warning("%s", error)
+        self._run.ended = True
         self.set_state("ended")
+
+    def strain_of(self, stop: threading.Event) -> Callable[[], str]:
+        """Return a function, for any thread, that returns the reason why the run should leave more
+        processor time to others; empty if there is none.
+        """
+
+        def strain() -> str:
+            if stop.is_set() or self._run.ended:
+                return "the run ends"
+            start_s = self._command_start_s
+            if start_s is not None and time.monotonic() - start_s > COMMAND_WAIT_S:
+                return "a command waits"
+            return "frames are dropped" if self._too_slow else ""
+
+        return strain
 
     # ---- the page's side
 
@@ -132,20 +169,29 @@ class RunControl:
         """Run a command by name. Raises NlosCamError, also for arguments that it does not take."""
         if command not in self._commands:
             raise NlosCamError(f"no command {command!r}: choose from {', '.join(self._commands)}")
+        _check_arguments(command, arguments)
         if not self._command_lock.acquire(blocking=False):
             raise NlosCamError("another command is running: wait for its answer")
         try:
+            self._command_start_s = time.monotonic()
             self.thread_start()
             return self._commands[command](**arguments)
         except NlosCamError:
             raise
-        except CONTROL_ERRORS as error:
+        except CalibrationError as error:
             raise NlosCamError(str(error)) from error
+        except OSError as error:
+            place = error.filename or self._run.folder.name or "the folder of the run"
+            raise NlosCamError(
+                f"{command}: {place} cannot be written ({error.strerror or error}): check that its"
+                " folder is still there and has room"
+            ) from error
         except TypeError as error:
             raise NlosCamError(f"{command} does not take {dict(arguments)!r}") from error
-        except ValueError as error:
+        except (ValueError, ArithmeticError) as error:
             raise NlosCamError(f"{command}: {error}") from error
         finally:
+            self._command_start_s = None
             self._command_lock.release()
 
     def status(self) -> dict[str, Any]:
@@ -163,8 +209,9 @@ class RunControl:
         if camera:
             if simulated_ms := camera_ms(camera):
                 status["camera_ms"] = round(simulated_ms["p50"], 2)
-            free = free_bytes(self._run.folder / "any.bag")
-            status["disk_s"] = round(recording_s(camera.intrinsics, free))
+            with suppress(OSError):  # the folder may have gone away
+                free = free_bytes(self._run.folder / "any.bag")
+                status["disk_s"] = round(recording_s(camera.intrinsics, free))
         if recording := self._recording_status(now_s):
             status["recording"] = recording
         status["control"] = self._control_status()
@@ -223,3 +270,22 @@ class RunControl:
         """
         scheme, colon, rest = self._run.uri.partition(":")
         return f"{scheme}{colon}{Path(rest).name}"
+
+
+def _check_arguments(command: str, arguments: Mapping[str, Any]) -> None:
+    """Raise NlosCamError for a value that no command takes: a list, a number without bounds, a text
+    that is too long or cannot be written.
+    """
+    for name, value in arguments.items():
+        if isinstance(value, str):
+            if len(value) > MAX_TEXT or not value.isprintable():
+                raise NlosCamError(
+                    f"{command}: {name} {value[:MAX_TEXT]!a} is no text of at most {MAX_TEXT}"
+                    " printable characters: give another"
+                )
+        elif isinstance(value, bool) or not isinstance(value, int | float):
+            raise NlosCamError(f"{command}: {name} is neither a number nor a text: give one")
+        elif not abs(value) <= MAX_NUMBER:  # NaN too
+            raise NlosCamError(
+                f"{command}: {name} is out of range: give a number up to {MAX_NUMBER:g}"
+            )

@@ -151,6 +151,7 @@ def run_live(
                 statistics.pace.update(statistics.frames, len(reader.dropped))
                 control.warnings = statistics.pace.warnings
                 control.add(moment)
+                control.note_drops(len(reader.dropped))
                 on_moment(moment)
     except Exception:
         on_error(report())

@@ -22,12 +22,13 @@ from nlos_calibration.arrays import Float32
 
 from nlos_cam.frames import LidarMaps
 from nlos_cam.live.realtime import drop_realtime_priority
+from nlos_cam.processes import PYTHON, child_environment
 from nlos_cam.reconstruct import Clock, PhysicsCheckResult, describe_failure, log_warning
 from nlos_cam.render import Stop
 from nlos_cam.threads import BoundedQueue
 
 PERIOD_S = 1.0
-WORKER = sys.executable, "-m", "nlos_cam.live.physics_check_process"
+WORKER = *PYTHON, "-m", "nlos_cam.live.physics_check_process"
 END_WITHIN_S = 2.0
 """A process that has not ended by then is killed."""
 LOWEST_PRIORITY = 19
@@ -139,13 +140,12 @@ def _start(command: Sequence[str]) -> subprocess.Popen[bytes]:
     does not reach.
     """
     one_thread = {f"{name}_NUM_THREADS": "1" for name in ("NUMBA", "OMP", "OPENBLAS", "MKL")}
-    path = os.pathsep.join(entry for entry in sys.path if entry)
     group = 0
     flags = 0
     if sys.platform == "win32":
         group = None
         flags = subprocess.CREATE_NEW_PROCESS_GROUP | subprocess.BELOW_NORMAL_PRIORITY_CLASS
-    env = {**os.environ, **one_thread, "PYTHONPATH": path}
+    env = child_environment(**one_thread)
     pipe = subprocess.PIPE
     return subprocess.Popen(
         [*command], stdin=pipe, stdout=pipe, env=env, process_group=group, creationflags=flags

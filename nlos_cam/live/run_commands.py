@@ -1,6 +1,7 @@
 """Commands of a live run, by group: pipeline, saved views, recording, camera and bench."""
 
 import re
+import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass, field
@@ -23,7 +24,11 @@ from nlos_cam.reconstruct import CalibratedRig, Clock, Pipeline, ignore
 from nlos_cam.view import Moment
 
 REFERENCE_FRAMES = 60
+MAX_REFERENCE_FRAMES = 1800
+"""A minute."""
 REFERENCE_TIMEOUT_S = 10.0
+POLL_S = 0.2
+"""Interval at which a wait for a frame looks whether the run has ended."""
 MAX_AVERAGE = 1000
 
 OnFrame = Callable[[Frame], None]
@@ -57,6 +62,8 @@ class RunContext:
     """None until the camera runs."""
     pipeline: Pipeline | None = None
     newest: Moment | None = None
+    ended: bool = False
+    """True once no more frames come."""
     on_frame: list[OnFrame] = field(default_factory=list[OnFrame])
     """Called with each frame of the camera, in the reader's thread."""
 
@@ -232,10 +239,15 @@ class BenchCommands:
         now. The record is written beside the other files, for --wall.
         """
         camera, pipeline = self._run.attached()
-        passing: Any = _PassingFrames(camera)  # all that measuring needs of a camera
+        count = int(frames)
+        if not 1 <= count <= MAX_REFERENCE_FRAMES or count != frames:
+            raise NlosCamError(
+                f"take_reference {frames}: give a whole number from 1 to {MAX_REFERENCE_FRAMES}"
+            )
+        passing: Any = _PassingFrames(self._run, camera)  # all that measuring needs of a camera
         self._run.on_frame.append(passing.frames.put)
         try:
-            capture = calibrate.collect_statistics(passing, int(frames))
+            capture = calibrate.collect_statistics(passing, count)
         finally:
             self._run.on_frame.remove(passing.frames.put)
 
@@ -273,7 +285,8 @@ def measure_bench(
 class _PassingFrames:
     """Camera-like source of the frames that pass through the run."""
 
-    def __init__(self, camera: Camera) -> None:
+    def __init__(self, run: RunContext, camera: Camera) -> None:
+        self._run = run
         self.uri = camera.uri
         self.intrinsics = camera.intrinsics
         self.identity = camera.identity
@@ -281,10 +294,16 @@ class _PassingFrames:
         self.frames: Queue[Frame] = Queue()
 
     def __iter__(self) -> Iterator[Frame]:
+        newest_s = time.monotonic()
         while True:
             try:
-                yield self.frames.get(timeout=REFERENCE_TIMEOUT_S)
+                yield self.frames.get(timeout=min(POLL_S, REFERENCE_TIMEOUT_S))
             except Empty:
-                raise NlosCamError(
-                    f"no frame for {REFERENCE_TIMEOUT_S:.0f} s: the camera has stalled"
-                ) from None
+                if self._run.ended:
+                    raise NlosCamError("the run has ended: start it again to measure") from None
+                if time.monotonic() - newest_s >= REFERENCE_TIMEOUT_S:
+                    raise NlosCamError(
+                        f"no frame for {REFERENCE_TIMEOUT_S:.0f} s: the camera has stalled"
+                    ) from None
+            else:
+                newest_s = time.monotonic()

@@ -86,8 +86,10 @@ class Document:
 
 def write_document(document: Document, page: Path) -> None:
     """Write the page, and beside it a .md file of its text."""
-    page.write_text(document.as_html(), encoding="utf-8")
-    page.with_suffix(".md").write_text(document.as_markdown(), encoding="utf-8")
+    # A recording's name may hold bytes that are no UTF-8.
+    texts = {".html": document.as_html(), ".md": document.as_markdown()}
+    for suffix, text in texts.items():
+        page.with_suffix(suffix).write_bytes(text.encode(errors="backslashreplace"))
 
 
 def _part_html(part: Section | Picture) -> str:

@@ -16,11 +16,12 @@ __all__ = [
     "WebViewer",
     "element",
     "exposed",
+    "prepare_saving",
     "save_moment",
     "unpack",
 ]
 
-from .frame_files import save_moment
+from .frame_files import prepare_saving, save_moment
 from .images import MAX_UNCERTAINTY_M
 from .messages import unpack
 from .server import LOOPBACK, exposed

@@ -1,5 +1,6 @@
 """One frame's result as files: arrays, picture and mesh."""
 
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -8,6 +9,12 @@ import numpy as np
 from nlos_cam.files import atomic_file
 from nlos_cam.view.video import Still
 from nlos_cam.view.viewer import Moment
+
+
+def prepare_saving() -> None:
+    """Import what `save_moment` needs, which takes seconds beside a run on one processor."""
+    for module in ("PIL.PngImagePlugin", "nlos_cam.objects.surface_mesh", "trimesh"):
+        import_module(module)
 
 
 def save_moment(path: Path, moment: Moment) -> str:

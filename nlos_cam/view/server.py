@@ -201,7 +201,7 @@ class Handler(BaseHTTPRequestHandler):
         self._say(HTTPStatus.FORBIDDEN, text)
 
     def _say(self, status: HTTPStatus, text: str) -> None:
-        content = f"{text}\n".encode()
+        content = f"{text}\n".encode(errors="backslashreplace")
         self._begin(status, "text/plain; charset=utf-8", len(content))
         self._send(content)
 

@@ -102,7 +102,7 @@ def timed(words: list[str], until: Await = ended, *, cold: bool = False) -> Time
         pipe = subprocess.PIPE
         before_s = children_s()
         start_s = time.perf_counter()
-        command = [sys.executable, *words]
+        command = [sys.executable, "-P", *words]
         with subprocess.Popen(
             command, cwd=folder, env={**os.environ, **caches}, stdout=pipe, stderr=pipe
         ) as process:

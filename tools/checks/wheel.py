@@ -53,7 +53,7 @@ INSTALLER = {"pip", "setuptools"}
 def build(out: Path) -> Path:
     """Build sdist and wheel into a folder; return the wheel."""
     subprocess.run(
-        [sys.executable, "-m", "build", "--outdir", out, ROOT],
+        [sys.executable, "-P", "-m", "build", "--outdir", out, ROOT],
         check=True,
         stdout=subprocess.DEVNULL,
     )

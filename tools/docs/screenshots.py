@@ -37,7 +37,7 @@ FLAGS = [
     *("--disable-background-networking", "--disable-component-update"),
 ]
 IMAGES = Path("docs/images")
-PROGRAM = [sys.executable, "-c", "from nlos_cam.cli import run; run()"]
+PROGRAM = [sys.executable, "-P", "-c", "from nlos_cam.cli import run; run()"]
 TIMEOUT_S = 180.0
 CUP = 'rig = "paper-rig"\n[object]\ncategory = "cup"\n'
 ASIDE = f"{CUP}size_m = 0.06\nx_m = 0.08\n"

@@ -49,7 +49,7 @@ def as_program(words: list[str]) -> list[str]:
     """Return the words that start a command with this Python."""
     if words[0] == "python":
         return [sys.executable, *words[1:]]
-    return [sys.executable, "-c", "from nlos_cam.cli import run; run()", *words[1:]]
+    return [sys.executable, "-P", "-c", "from nlos_cam.cli import run; run()", *words[1:]]
 
 
 def run_in(folder: Path) -> Runner:

@@ -40,6 +40,7 @@ from nlos_cam.cli.main import build_app
 from nlos_cam.errors import NlosCamError
 from nlos_cam.evaluate import machine
 from nlos_cam.files import CHECKSUMS, FileBusyError, atomic_file, checksums_of
+from nlos_cam.processes import safe_children
 
 DOCS = Path(__file__).parents[2] / "docs"
 GROUPS = "light", "torch"
@@ -315,8 +316,9 @@ def main() -> int:
         ]
         for steps in (made, groups):
             processes = [spawn.Process(target=step) for step in steps]
-            for process in processes:
-                process.start()
+            with safe_children():
+                for process in processes:
+                    process.start()
             for process in processes:
                 process.join()
             if any(process.exitcode for process in processes):

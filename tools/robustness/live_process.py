@@ -24,7 +24,7 @@ class LiveProcess:
     """
 
     def __init__(self, arguments: Sequence[str]) -> None:
-        command = [sys.executable, "-c", PROGRAM, "live", *arguments]
+        command = [sys.executable, "-P", "-c", PROGRAM, "live", *arguments]
         pipe = subprocess.PIPE
         self.process = subprocess.Popen(
             command, stdout=pipe, stderr=pipe, text=True, start_new_session=True

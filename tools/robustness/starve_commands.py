@@ -28,7 +28,7 @@ MAX_SHARE = 1.2
 AS_MIB = 300, 4000
 PAIRS = {"cache", "port"}
 """Commands for races alone."""
-PROGRAM = [sys.executable, "-c", "from nlos_cam.cli import run; run()"]
+PROGRAM = [sys.executable, "-P", "-c", "from nlos_cam.cli import run; run()"]
 NO_SHM = [
     "unshare",
     "--mount",

@@ -13,6 +13,7 @@ from lightning_fabric import Fabric
 from torch import Tensor, nn
 from torch.multiprocessing.spawn import ProcessExitedException, ProcessRaisedException
 
+from nlos_cam.processes import safe_children
 from nlos_models.errors import RecipeError, TrainingError
 from nlos_models.training.recipe import Precision, Recipe
 
@@ -87,7 +88,8 @@ def launch(fabric: Fabric, work: Callable[..., Any], *arguments: Any) -> Any:
     if fabric.world_size == 1:
         return work(fabric, *arguments)
     try:
-        result = fabric.launch(partial(_return_errors, work=work, arguments=arguments))
+        with safe_children():
+            result = fabric.launch(partial(_return_errors, work=work, arguments=arguments))
     except (ProcessRaisedException, ProcessExitedException) as error:
         # A process that a signal ended has no error of its own.
         last_line = str(error).strip().splitlines()[-1]

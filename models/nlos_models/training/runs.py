@@ -2,6 +2,7 @@
 and saves.
 """
 
+import os
 from collections.abc import Callable, Generator
 from contextlib import AbstractContextManager, ExitStack, contextmanager
 from dataclasses import asdict, dataclass
@@ -120,7 +121,7 @@ def record_run(
     """
     # Before an hour of training, not after it: the same checks as at the end.
     record = CheckpointRecord.of([*before, recipe], rig, maps_of(recipe))
-    if out.exists() and not out.is_dir():
+    if os.path.lexists(out) and not out.is_dir():
         raise OutputExistsError(
             f"{out} is a file, but --out must be a directory: choose another --out"
         )

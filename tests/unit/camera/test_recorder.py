@@ -1,6 +1,7 @@
 import os
 import subprocess
 import sys
+import time
 from collections.abc import Callable
 from itertools import islice
 from pathlib import Path
@@ -310,3 +311,35 @@ def test_can_grow_finds_a_limit_and_changes_nothing(tmp_path: Path) -> None:
     )
     assert ended.stdout == "True False\n"
     assert path.read_bytes() == b"precious"
+
+
+def test_recorder_whose_start_hangs_fails_within_its_deadline(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    answered = Event()
+    hanging = SimpleNamespace(recorder=lambda *_: answered.wait(60.0))
+    monkeypatch.setattr("nlos_cam.camera.recorder.START_WITHIN_S", 0.01)
+    with pytest.raises(RecordingError, match="did not begin"):
+        SdkRecorder(tmp_path / "a.bag", "device", hanging)
+    answered.set()
+
+
+LOCKED = """
+import ctypes, sys, types
+from pathlib import Path
+from nlos_cam.camera import recorder
+recorder.END_AFTER_S = 0.5
+sleep = ctypes.PyDLL(None).sleep  # does not release Python's lock
+recorder.SdkRecorder(Path("a.bag"), None, types.SimpleNamespace(recorder=lambda *_: sleep(60)))
+"""
+
+
+@pytest.mark.slow
+def test_recorder_whose_start_locks_python_ends_the_process(tmp_path: Path) -> None:
+    start_s = time.monotonic()
+    ended = subprocess.run(
+        [sys.executable, "-P", "-c", LOCKED], cwd=tmp_path, capture_output=True, check=False
+    )
+    assert ended.returncode == 1
+    assert b"Timeout" in ended.stderr
+    assert time.monotonic() - start_s < 30.0

@@ -189,3 +189,83 @@ def test_reference_is_taken_from_the_passing_frames(tmp_path: Path) -> None:
     assert bench.rig is RIG
     measured = load_measured(next(tmp_path.glob("bench-*.toml")))
     np.testing.assert_array_equal(measured.reference.map_depth_m, bench.reference.map_depth_m)
+
+
+def test_run_is_under_strain_while_a_command_waits(
+    control: RunControl, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("nlos_cam.live.control.COMMAND_WAIT_S", -1.0)
+    strain = control.strain_of(Event())
+    found = list[str]()
+    control.thread_start = lambda: found.append(strain())
+    control.run("pause", {})
+    assert found == ["a command waits"]
+    assert not strain()
+
+
+def test_run_is_under_strain_once_it_drops_frames(control: RunControl) -> None:
+    strain = control.strain_of(Event())
+    for count in (0, 1, 3):
+        control.note_drops(count)
+        assert not strain()
+    control.note_drops(4)
+    assert strain() == "frames are dropped"
+
+
+def test_run_is_under_strain_when_it_is_to_stop(control: RunControl) -> None:
+    stop = Event()
+    stop.set()
+    assert control.strain_of(stop)() == "the run ends"
+    control.end()
+    assert control.strain_of(Event())() == "the run ends"
+
+
+@pytest.mark.parametrize(
+    ("command", "arguments"),
+    [
+        ("average", {"frames": float("inf")}),
+        ("average", {"frames": float("nan")}),
+        ("average", {"frames": 10**400}),
+        ("average", {"frames": 1.5}),
+        ("average", {"frames": "three"}),
+        ("average", {"frames": None}),
+        ("average", {"frames": [1]}),
+        ("average", {"frames": True}),
+        ("take_reference", {"frames": 10**9}),
+        ("take_reference", {"frames": -1}),
+        ("take_reference", {"frames": 2.5}),
+        ("record", {"label": "\ud800"}),
+        ("record", {"label": "\x1b[2J"}),
+        ("record", {"label": "x" * 1000}),
+        ("record", {"\udcff": 1}),
+        ("option", {"name": "\udcff", "value": 1}),
+        ("option", {"name": "laser_power", "value": 1e308}),
+        ("\ud800", {}),
+    ],
+)
+def test_command_beyond_its_range_has_one_clear_answer(
+    control: RunControl, command: str, arguments: dict[str, Any]
+) -> None:
+    with pytest.raises(NlosCamError) as caught:
+        control.run(command, arguments)
+    answer = str(caught.value)
+    assert answer.isprintable()
+    assert "unforeseen" not in answer
+    assert len(answer) < 400
+
+
+@pytest.mark.parametrize("command", ["snapshot", "save_session", "record"])
+def test_command_says_that_its_folder_went_away(
+    control: RunControl, command: str, tmp_path: Path
+) -> None:
+    tmp_path.rmdir()
+    with pytest.raises(NlosCamError, match=r"folder|cannot be (written|recorded)"):
+        control.run(command, {})
+    assert control.status()["state"] == "running"
+
+
+def test_reference_ends_with_the_run(control: RunControl, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("nlos_cam.live.run_commands.POLL_S", 0.001)
+    control.end()
+    with pytest.raises(NlosCamError, match="ended"):
+        control.run("take_reference", {"frames": 5})

@@ -1,14 +1,26 @@
 import gc
 import os
 import sys
+import time
 import weakref
+from collections.abc import Callable
 from pathlib import Path
 from threading import Event, Thread
+from types import SimpleNamespace
 
 import pytest
 
-from nlos_cam.live import low_latency_interpreter, realtime_priority, yield_to_loop
-from nlos_cam.live.realtime import DRAWING, LOOP, ORDINARY, SWITCH_S, TASKS, drop_realtime_priority
+from nlos_cam.live import RealtimePriority, low_latency_interpreter, yield_to_loop
+from nlos_cam.live.realtime import (
+    DRAWING,
+    GIVE_WAY,
+    LOOP,
+    ORDINARY,
+    SWITCH_S,
+    TASKS,
+    drop_realtime_priority,
+    processors,
+)
 
 OTHER = 0
 ROUND_ROBIN = 2
@@ -40,6 +52,7 @@ class System:
 def system(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> System:
     system = System(tmp_path / "task", "0", "7", "8")
     monkeypatch.setattr("nlos_cam.live.realtime.TASKS", system.tasks)
+    monkeypatch.setattr("nlos_cam.live.realtime.processors", lambda: 2)
     for name, value in (("SCHED_RR", ROUND_ROBIN), ("SCHED_OTHER", OTHER), ("sched_param", int)):
         monkeypatch.setattr(os, name, value, raising=False)
     for name in ("sched_setscheduler", "sched_getscheduler"):
@@ -48,8 +61,8 @@ def system(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> System:
 
 
 def test_realtime_priority_holds_for_all_threads_while_entered(system: System) -> None:
-    with pytest.raises(ZeroDivisionError), realtime_priority() as allowed:  # noqa: PT012  an error leaves it too
-        assert allowed
+    with pytest.raises(ZeroDivisionError), RealtimePriority() as priority:  # noqa: PT012  an error leaves it too
+        assert priority.held
         assert set(system.schedules.values()) == {(ROUND_ROBIN, LOOP)}
         raise ZeroDivisionError
     assert set(system.schedules.values()) == {(OTHER, ORDINARY)}
@@ -59,24 +72,81 @@ def test_realtime_priority_changes_nothing_where_not_possible(
     system: System, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     system.missing = "7"
-    with realtime_priority() as allowed:
-        assert allowed
+    with RealtimePriority() as priority:
+        assert priority.held
         assert system.schedules["8"] == (ROUND_ROBIN, LOOP), "a thread that ended is passed over"
     system.may = False
-    with realtime_priority() as allowed:
-        assert not allowed
+    with RealtimePriority() as priority:
+        assert not priority.held
     monkeypatch.setattr("nlos_cam.live.realtime.TASKS", system.tasks / "none")
-    with realtime_priority() as allowed:
-        assert not allowed
+    with RealtimePriority() as priority:
+        assert not priority.held
     yield_to_loop()
     drop_realtime_priority()
     assert set(system.schedules.values()) == {(OTHER, ORDINARY)}
 
 
+def test_realtime_priority_is_not_taken_on_one_processor(
+    system: System, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level("INFO")
+    monkeypatch.setattr("nlos_cam.live.realtime.processors", lambda: 1)
+    monkeypatch.setattr("nlos_cam.live.realtime._give_way", lambda: None)
+    with RealtimePriority() as priority:
+        assert not priority.held
+    assert set(system.schedules.values()) == {(OTHER, ORDINARY)}
+    assert "one processor" in caplog.text
+
+
+@pytest.mark.usefixtures("system")
+def test_run_gives_way_on_one_processor_but_not_its_view(monkeypatch: pytest.MonkeyPatch) -> None:
+    nice: dict[int, int] = {0: 0, 7: 0, 8: 10}
+    monkeypatch.setattr("nlos_cam.live.realtime.processors", lambda: 1)
+    monkeypatch.setattr(os, "getpriority", lambda _, task: nice[task])
+    monkeypatch.setattr(os, "setpriority", lambda _, task, value: nice.update({task: value}))
+    view = SimpleNamespace(native_id=7, name="view server")
+    monkeypatch.setattr("nlos_cam.live.realtime.enumerate_threads", lambda: [view])
+    with RealtimePriority("never"):
+        assert nice[0] == 0
+    with RealtimePriority():
+        assert nice == {0: GIVE_WAY, 7: 0, 8: 10}
+
+
+def test_realtime_priority_never_is_not_taken(system: System) -> None:
+    with RealtimePriority("never") as priority:
+        assert not priority.held
+        assert set(system.schedules.values()) == {(OTHER, ORDINARY)}
+
+
+def wait_until(happened: Callable[[], bool]) -> None:
+    """Poll; the test's own time limit ends a wait in vain."""
+    while not happened():
+        time.sleep(0.002)
+
+
+def test_realtime_priority_is_given_up_while_there_is_a_reason(
+    system: System, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level("INFO")
+    reason = ""
+    with RealtimePriority(strain=lambda: reason, poll_s=0.001) as priority:
+        reason = "a command waits"
+        wait_until(lambda: not priority.held)
+        assert set(system.schedules.values()) == {(OTHER, ORDINARY)}
+        reason = ""
+        wait_until(lambda: priority.held)
+        assert set(system.schedules.values()) == {(ROUND_ROBIN, LOOP)}
+    assert caplog.text.count("a command waits") == 1
+
+
+def test_processors_are_those_that_this_process_may_use() -> None:
+    assert 1 <= processors() <= (os.cpu_count() or 1)
+
+
 def test_drawing_goes_after_the_loop_and_before_the_rest(system: System) -> None:
     yield_to_loop()
     assert system.schedules["0"] == (OTHER, ORDINARY)
-    with realtime_priority():
+    with RealtimePriority():
         yield_to_loop()
         assert system.schedules["0"] == (ROUND_ROBIN, DRAWING)
         drop_realtime_priority()
@@ -95,7 +165,7 @@ def test_realtime_priority_restores_the_threads_of_this_process() -> None:
         found.append(os.sched_getscheduler(0))
 
     before = os.sched_getscheduler(0)
-    with realtime_priority():
+    with RealtimePriority():
         worker = Thread(target=work)
         worker.start()
         assert began.wait(60.0)
