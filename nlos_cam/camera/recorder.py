@@ -346,6 +346,9 @@ class Recording:
             self._claim.close()
 
 
-def repair_command(path: Path) -> str:
-    """Return the command that repairs a recording into the current folder."""
-    return f"nlos-cam repair {quote(str(path))} --out {quote(f'{path.stem}-repaired.bag')}"
+def repair_command(path: Path, take_from: str = "") -> str:
+    """Return the command that repairs a recording into the current folder, with descriptions from
+    another file if given.
+    """
+    source = f" --from {quote(take_from)}" if take_from else ""
+    return f"nlos-cam repair {quote(str(path))}{source} --out {quote(f'{path.stem}-repaired.bag')}"

@@ -1,5 +1,6 @@
 """Playback of a recording as a camera, without librealsense; and verification of recordings."""
 
+import logging
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
@@ -8,10 +9,12 @@ from typing import Self
 
 from nlos_calibration import Intrinsics, Rig
 
-from nlos_cam.camera import FORMATS, ClockUnwrap, FrameSynchronizer, frame_in_si
+from nlos_cam.camera import FORMATS, OPTIONAL, ClockUnwrap, FrameSynchronizer, frame_in_si
 from nlos_cam.errors import CameraError, RecordingError, StreamMissingError
 from nlos_cam.frames import Frame
-from nlos_cam.recording.bag_reader import BagReader
+from nlos_cam.recording.bag_reader import BagReader, no_frames
+
+log = logging.getLogger(__name__)
 
 IDENTITY = {
     "name": "name",
@@ -28,13 +31,15 @@ class ReplayCamera:
 
     No thread and no open file, so leaving the context only ends iterations. A frame's settings are
     those in force when it was recorded. Raises RecordingError for a file that cannot be read, or at
-    the damage; StreamMissingError without depth, infrared or confidence.
+    the damage; StreamMissingError without depth or infrared. Confidence may be missing: its levels
+    are 0 then.
     """
 
     def __init__(self, path: Path) -> None:
         self.uri = f"bag:{path}"
         self.rig: Rig | None = None
         self._bag = open_lidar_bag(path)
+        self._streams = streams_of(self._bag)
         self._unit_m = self._bag.depth_unit_m()
         self.identity: Mapping[str, str] = identity_of(self._bag)
         self.intrinsics: Intrinsics = self._bag.streams["depth"].intrinsics
@@ -60,7 +65,8 @@ class ReplayCamera:
             raise CameraError(f"{self.uri} is not started: iterate inside `with`")
         self._iterations += 1
         self.arrived = Counter()
-        pairing = FrameSynchronizer((self.intrinsics.height, self.intrinsics.width))
+        shape = self.intrinsics.height, self.intrinsics.width
+        pairing = FrameSynchronizer(shape, self._streams)
         try:
             yield from self._frames(pairing, self._iterations)
         except RecordingError:
@@ -71,7 +77,7 @@ class ReplayCamera:
         # A device's own clock is a counter that wraps.
         is_counter = self._bag.metadata("depth", 0).domain == "hardware_clock"
         unwrap = ClockUnwrap().add if is_counter else float
-        for place in self._bag.order(FORMATS):
+        for place in self._bag.order(self._streams):
             sample = self._bag.sample(place.stream, place.index)
             self.arrived[sample.stream] += 1
             found = pairing.add(replace(sample, timestamp_s=unwrap(sample.timestamp_s)))
@@ -97,18 +103,21 @@ class ReplayCamera:
 
 
 def open_lidar_bag(path: Path) -> BagReader:
-    """Open a recording of an L515. Raises StreamMissingError without one of its three streams,
-    RecordingError.
+    """Open a recording of an L515. Raises StreamMissingError without depth or infrared,
+    RecordingError. Logs a warning for one without confidence.
     """
     bag = BagReader(path)
     if not bag.streams:
-        raise RecordingError(f"{path} holds no frames: record it again")
+        raise RecordingError(no_frames(bag))
     present = {name: info.format for name, info in bag.streams.items()}
     missing = [stream for stream, wanted in FORMATS.items() if present.get(stream) != wanted]
-    if missing:
+    if set(missing) <= OPTIONAL:
+        for stream in missing:
+            log.warning("%s has no %s stream: no result depends on it", path, stream)
+    else:
         raise StreamMissingError(
             f"{path} has no {' and no '.join(missing)} stream (it has"
-            f" {', '.join(sorted(present))}): record depth, infrared and confidence with an L515,"
+            f" {', '.join(sorted(present))}): record depth and infrared with an L515,"
             " e.g. `nlos-cam capture --camera l515`"
         )
     pinhole = bag.streams["depth"].intrinsics
@@ -118,6 +127,15 @@ def open_lidar_bag(path: Path) -> BagReader:
             " again"
         )
     return bag
+
+
+def streams_of(bag: BagReader) -> list[str]:
+    """Return the lidar's streams that a recording has, in the lidar's formats."""
+    return [
+        stream
+        for stream, wanted in FORMATS.items()
+        if stream in bag.streams and bag.streams[stream].format == wanted
+    ]
 
 
 def identity_of(bag: BagReader) -> dict[str, str]:
@@ -152,5 +170,8 @@ def verify(path: Path, on_frame: Callable[[], None] = lambda: None) -> VerifyRes
             frames += 1
             on_frame()
         return VerifyResult(
-            frames, camera.dropped + camera.incomplete, last_s - first_s, dict(camera.arrived)
+            frames,
+            camera.dropped + camera.incomplete,
+            max(last_s - first_s, 0.0),
+            dict(camera.arrived),
         )

@@ -15,14 +15,18 @@ from nlos_calibration.errors import RecordFileError
 from nlos_cam.errors import DiskFullError, RecordingError
 from nlos_cam.frames import Frame
 from nlos_cam.recording import (
-    TEMPERATURE_INTERVAL_S,
     SidecarFile,
     VerifyResult,
     load_sidecar,
     sidecar_path,
 )
 from nlos_cam.recording.quality import MIN_PAIRS, Quality, QualityMeter
-from nlos_cam.recording.sidecar import load_measured_wall, summary_of, versions
+from nlos_cam.recording.sidecar import (
+    TEMPERATURE_INTERVAL_S,
+    load_measured_wall,
+    summary_of,
+    versions,
+)
 
 PINHOLE = Intrinsics(64, 48, 46.0, 46.0, 32.0, 24.0)
 DARK = np.zeros((48, 64), np.uint8)
