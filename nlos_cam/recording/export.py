@@ -60,15 +60,18 @@ class PngSink:
         path = self._folder / f"{sample.number:06d}{suffix}.png"
         try:
             done, png = cv2.imencode(".png", self._for_opencv(sample.pixels))
-        except cv2.error:  # such as an odd width of pixels that share their color
-            done = False
+        except cv2.error as error:  # such as an odd width of pixels that share their color
+            raise self._not_a_png(sample) from error
         if not done:
-            raise NlosCamError(
-                f"{sample.stream} ({self._encoding}) cannot be written as PNG: use --format npz"
-            )
+            raise self._not_a_png(sample)
         path.write_bytes(png.tobytes())
         self._rows.writerow(
             [f"{self._folder.name}/{path.name}", sample.number, f"{sample.timestamp_s:.6f}"]
+        )
+
+    def _not_a_png(self, sample: Sample) -> NlosCamError:
+        return NlosCamError(
+            f"{sample.stream} ({self._encoding}) cannot be written as PNG: use --format npz"
         )
 
     def _for_opencv(self, pixels: NDArray[Any]) -> NDArray[Any]:

@@ -4,7 +4,7 @@ from bisect import bisect_left
 from collections.abc import Callable, Sequence
 from itertools import pairwise
 from statistics import median
-from typing import Protocol
+from typing import Protocol, TypeVar
 
 NEAR_SHARE = 0.3
 FAR_SHARE = 1.7
@@ -28,12 +28,13 @@ class Recorded(Protocol):
     def offset(self) -> int: ...
 
 
+Message = TypeVar("Message", bound=Recorded)
 Stamp = tuple[int, float]
 """Number of a frame, and its time in s on the device's clock."""
 
 
 def corrected_times_ns(
-    entries: Sequence[Recorded], stamp_of: Callable[[Recorded], Stamp]
+    entries: Sequence[Message], stamp_of: Callable[[Message], Stamp]
 ) -> list[int]:
     """Return the recorder's times of frames given in order of them, with those replaced whose frame
     belongs elsewhere by its number and its stamp.
