@@ -82,6 +82,14 @@ def repair_recording(
     return RepairResult(_count_frames(chunks, scan.connections), len(chunks), damages, out)
 
 
+def recoverable_frames(path: Path) -> dict[str, int]:
+    """Return the frames of each stream that a repair of a recording recovers. Raises OSError where
+    it cannot be read.
+    """
+    scan = scan_bag(path)
+    return _count_frames(_readable(scan)[0], scan.connections)
+
+
 def _readable(scan: Scan) -> tuple[list[Chunk], list[Damage]]:
     """Return the chunks, with each described message and each frame once in their indexes, and all
     damage.

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from noise_bags import make_all
 from rosbags.rosbag1 import Reader, Writer
 
 from nlos_cam.cli.main import main
@@ -73,3 +74,9 @@ def remake(tmp_path: Path) -> Remake:
 def noise(recorded: Callable[..., Path], tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Record forty small frames."""
     return recorded(tmp_path_factory.mktemp("noise") / "noise.bag", frames=40)
+
+
+@pytest.fixture(scope="session")
+def noise_bags(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """Record forty frames, closed and as a kill leaves them."""
+    return make_all(tmp_path_factory.mktemp("killed"))
