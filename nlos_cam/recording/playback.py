@@ -9,10 +9,11 @@ from typing import Self
 
 from nlos_calibration import Intrinsics, Rig
 
-from nlos_cam.camera import FORMATS, OPTIONAL, ClockUnwrap, FrameSynchronizer, frame_in_si
+from nlos_cam.camera import FORMATS, OPTIONAL, ClockUnwrap, FrameSynchronizer, Sample, frame_in_si
 from nlos_cam.errors import CameraError, RecordingError, StreamMissingError
 from nlos_cam.frames import Frame
 from nlos_cam.recording.bag_reader import BagReader, no_frames
+from nlos_cam.recording.renumbering import renumbered
 
 log = logging.getLogger(__name__)
 
@@ -74,20 +75,27 @@ class ReplayCamera:
             raise
 
     def _frames(self, pairing: FrameSynchronizer, iteration: int) -> Iterator[Frame]:
+        for time_ns, sample in renumbered(self._samples(), self._streams):
+            self.arrived[sample.stream] += 1
+            found = pairing.add(sample)
+            if found:
+                self._count(pairing)
+                self._settings = self._bag.settings(time_ns)
+                yield frame_in_si(found, self._unit_m, self.intrinsics, self._settings)
+            if iteration != self._iterations:  # the context was left, or another iteration started
+                return
+        self._end(pairing)
+
+    def _samples(self) -> Iterator[tuple[int, Sample]]:
+        """Yield the recorder's time in ns of each sample, and the sample on a clock that does not
+        wrap.
+        """
         # A device's own clock is a counter that wraps.
         is_counter = self._bag.metadata("depth", 0).domain == "hardware_clock"
         unwrap = ClockUnwrap().add if is_counter else float
         for place in self._bag.order(self._streams):
             sample = self._bag.sample(place.stream, place.index)
-            self.arrived[sample.stream] += 1
-            found = pairing.add(replace(sample, timestamp_s=unwrap(sample.timestamp_s)))
-            if found:
-                self._count(pairing)
-                self._settings = self._bag.settings(place.time_ns)
-                yield frame_in_si(found, self._unit_m, self.intrinsics, self._settings)
-            if iteration != self._iterations:  # the context was left, or another iteration started
-                return
-        self._end(pairing)
+            yield place.time_ns, replace(sample, timestamp_s=unwrap(sample.timestamp_s))
 
     def _end(self, pairing: FrameSynchronizer) -> None:
         pairing.finish()

@@ -27,7 +27,9 @@ def number_of(raw: bytes) -> int:
 
 def depth_of(path: Path) -> list[tuple[int, bytes]]:
     with ReplayCamera(path) as camera:
-        return [(frame.frame_number, frame.depth_m.tobytes()) for frame in camera]
+        return [
+            (frame.frame_number, frame.depth_m.tobytes() + frame.ir.tobytes()) for frame in camera
+        ]
 
 
 def as_decoded_and_encoded(topic: str, time_ns: int, raw: bytes) -> Messages:
@@ -199,3 +201,39 @@ def test_bags_of_ros_2_are_named(run: Run, name: str) -> None:
         Path(name).write_bytes(b"\x89MCAP0\r\n" + bytes(100))
     assert "ROS 2" in run("info", name, code=4)["problem"]
     assert "ROS 2" in run("export", name, "--out", "out", code=4).err
+
+
+def counted_apart(stream: str, at: int, jump: int) -> Callable[[str, int, bytes], Messages]:
+    """Return an edit after which one stream's numbers differ from the others' from a frame on."""
+
+    def edit(topic: str, time_ns: int, raw: bytes) -> Messages:
+        if topic.endswith(FRAMES_END) and stream in topic and number_of(raw) >= at:
+            raw = (number_of(raw) + jump).to_bytes(4, "little") + raw[4:]
+        yield time_ns, raw
+
+    return edit
+
+
+@pytest.mark.parametrize("stream", ["Depth", "Infrared", "Confidence"])
+@pytest.mark.parametrize(("at", "jump"), [(0, 3), (0, 500), (20, 1), (20, -1), (20, 2), (36, 1)])
+def test_streams_counted_apart_lose_no_frame(
+    remake: Remake, noise: Path, stream: str, at: int, jump: int
+) -> None:
+    found = depth_of(remake(counted_apart(stream, at, jump), source=noise))
+    assert [depth for _, depth in found] == [depth for _, depth in depth_of(noise)]
+
+
+@pytest.mark.parametrize("stream", ["Depth", "Infrared", "Confidence"])
+def test_lost_frame_of_a_stream_counted_apart_loses_one(
+    remake: Remake, noise: Path, stream: str
+) -> None:
+    def edit(topic: str, time_ns: int, raw: bytes) -> Messages:
+        number = number_of(raw)
+        if not (topic.endswith(FRAMES_END) and stream in topic and number >= 20):
+            yield time_ns, raw
+        elif number > 20:
+            yield time_ns, (number - 1).to_bytes(4, "little") + raw[4:]
+
+    expected = [depth for number, depth in depth_of(noise) if number != 20]
+    found = depth_of(remake(edit, source=noise))
+    assert [depth for _, depth in found] == expected
