@@ -102,3 +102,17 @@ def test_export_holds_distortion_and_pose(run: Run) -> None:
         assert stream["distortion"] == {"model": model, "coefficients": coefficients.tolist()}
         assert stream["pose"]["in_frame_of"] == "depth"
         np.testing.assert_array_equal(stream["pose"]["matrix"], bag.pose("depth", name))
+
+
+def test_surfaces_are_counted_not_their_numbers(run: Run) -> None:
+    depth_m = np.full((6, 64, 64), np.nan, np.float32)
+    depth_m[:, 20:30, 20:30] = 0.2
+    box = {"origin_m": [0.1, 0.1], "pitch_m": [0.002, -0.002], "z_near_m": 0.15, "z_far_m": 0.3}
+    numbers = 2 * np.arange(6) + 1
+    np.savez("r.npz", depth_m=depth_m, uncertainty_m=depth_m, frame_number=numbers, **box)
+    run("export", "r.npz", "--object", "csv", "--every", 2, "--out", "out")
+    assert sorted(path.name for path in Path("out").iterdir()) == [
+        "000001.csv",
+        "000005.csv",
+        "000009.csv",
+    ]
