@@ -77,8 +77,7 @@ def describe_bag(path: Path, verify: bool) -> Description:
     if longest := max(
         bag.streams.values(), key=lambda info: info.frames if info.format else 0, default=None
     ):
-        ends_s = [bag.sample(longest.name, k).timestamp_s for k in (0, longest.frames - 1)]
-        facts["duration"] = f"{max(ends_s[1] - ends_s[0], 0.0):.1f} s"
+        facts["duration"] = f"{bag.duration_s(longest.name):.1f} s"
     for name, info in bag.streams.items():
         size = f"{info.intrinsics.width} x {info.intrinsics.height}"
         form = info.format or f"{info.encoding} (not readable)"

@@ -27,7 +27,7 @@ from nlos_cam.camera import Sample, repair_command
 from nlos_cam.errors import RecordingError
 from nlos_cam.files import describe, is_claimed
 from nlos_cam.recording import bag_messages, rosbag
-from nlos_cam.recording.frame_order import corrected_times_ns
+from nlos_cam.recording.frame_order import AGREED_S, corrected_times_ns
 
 DEVICE = "/device_0"
 STREAM = re.compile(DEVICE + r"/sensor_([0-9]{1,3})/([A-Za-z_]{1,40})_([0-9]{1,3})(?=/image/data$)")
@@ -39,6 +39,8 @@ BYTES_PER_READ = 100
 T = TypeVar("T")
 COMPRESSED_IMAGE = "sensor_msgs/msg/CompressedImage"
 MAX_NAMED = 4
+ENDS = 4
+"""Frames at each end among which one has a stamp that agrees with the next."""
 STATIC_NS = 1
 """The time that librealsense gives to values in force when the recording began."""
 SAMPLE = Path(__file__).parent / "sample.bag"
@@ -291,6 +293,36 @@ class BagReader:
         """Return a frame's number, and its time in s on the device's clock."""
         with self._locate(entry):
             return bag_messages.stamp(self.raw(entry))
+
+    def duration_s(self, stream: str) -> float:
+        """Return the time from the first frame of a stream to its last.
+
+        It is that of the device's clock, between the outermost stamps that agree with those beside
+        them; of the recorder's where none do, or the device's clock started again.
+        """
+        frames = self._frames(stream)
+        times_ns = self._times_ns[stream]
+        recorded_s = (times_ns[-1] - times_ns[0]) / 1e9
+        first = self._first_agreed_s(list(zip(frames[:ENDS], times_ns[:ENDS], strict=True)))
+        last = self._first_agreed_s(
+            list(zip(frames[: -ENDS - 1 : -1], times_ns[: -ENDS - 1 : -1], strict=True))
+        )
+        if first is None or last is None or last < first:
+            return max(recorded_s, 0.0)
+        return last - first
+
+    def _first_agreed_s(self, frames: list[tuple[Entry, int]]) -> float | None:
+        """Return the first stamp, in s, that is as far from the next as the recorder says; of a
+        lone frame its own.
+        """
+        stamps_s = [self._stamp(entry)[1] for entry, _ in frames]
+        if len(stamps_s) == 1:
+            return stamps_s[0]
+        for k, (one_s, next_s) in enumerate(pairwise(stamps_s)):
+            recorded_s = (frames[k + 1][1] - frames[k][1]) / 1e9
+            if abs(next_s - one_s - recorded_s) < AGREED_S:
+                return one_s
+        return None
 
     def samples(self, streams: Iterable[str]) -> Iterator[Sample]:
         """Yield all frames of these streams, in the order of recording."""

@@ -2,6 +2,7 @@
 
 import csv
 import json
+import struct
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
@@ -91,6 +92,19 @@ def test_yuv_becomes_8_bit_color(encoding: str) -> None:
     image = cv2.imread("color/000000.png", cv2.IMREAD_UNCHANGED)
     assert (image.shape, image.dtype) == ((360, 640, 3), np.uint8)
     np.testing.assert_allclose(image[..., ::-1], np.broadcast_to(rgb, image.shape), atol=2)
+
+
+def test_recorded_yuyv_is_exported_as_color(remake: Remake, run: Run, noise: Path) -> None:
+    def as_yuyv(topic: str, time_ns: int, raw: bytes) -> Messages:
+        if "Infrared" in topic:  # two bytes a pixel: half as wide
+            raw = raw.replace(b"8UC1", b"YUYV", 1)
+            raw = raw.replace(struct.pack("<II", 48, 64), struct.pack("<II", 48, 32), 1)
+        yield time_ns, raw
+
+    path = remake(as_yuyv, source=noise)
+    run("export", path, "--streams", "infrared", "--out", "out")
+    image = cv2.imread("out/infrared/000000.png", cv2.IMREAD_UNCHANGED)
+    assert (image.shape, image.dtype) == ((48, 32, 3), np.uint8)
 
 
 def test_export_holds_distortion_and_pose(run: Run) -> None:

@@ -154,6 +154,19 @@ def test_frame_with_a_wrong_stamp_moves_nothing(remake: Remake, noise: Path) -> 
     assert numbers == list(range(40))
 
 
+@pytest.mark.parametrize("number", [0, 39])
+@pytest.mark.parametrize("seconds", [7, 3_000_000_000])
+def test_duration_passes_over_a_wrong_stamp(
+    remake: Remake, run: Run, noise: Path, number: int, seconds: int
+) -> None:
+    def edit(topic: str, time_ns: int, raw: bytes) -> Messages:
+        if topic.endswith(FRAMES_END) and number_of(raw) == number:
+            raw = raw[:4] + struct.pack("<I", seconds) + raw[8:]
+        yield time_ns, raw
+
+    assert run("info", remake(edit, source=noise))["facts"]["duration"] == "1.3 s"
+
+
 def descriptions_only(topic: str, time_ns: int, raw: bytes) -> Messages:
     if not topic.endswith(FRAMES_END):
         yield time_ns, raw
