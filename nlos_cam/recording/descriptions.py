@@ -34,7 +34,9 @@ def with_descriptions(part: Scan, path: Path, first: Path) -> Scan:
         if FRAMES not in topic and topic not in _set_up_topics(part)
     }
     _check_streams(part, path, first, {topic for topic, entries in described.items() if entries})
-    theirs = {connection.topic: connection for connection in scan_bag(first).connections.values()}
+    theirs = {
+        connection.topic: connection for connection in scan_bag(bag.path).connections.values()
+    }
     connections = {**part.connections}
     numbers = {connection.topic: number for number, connection in connections.items()}
     content = bytearray()
