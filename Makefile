@@ -16,11 +16,11 @@ live: .venv/.live
 
 # The quick tests, in two processes: to be run before every commit.
 test: .venv/.test
-	$(BIN)/python -m pytest -n 2 --dist loadfile -m 'not bench and not slow' tests/laws tests/unit tests/contract tests/hardware
+	$(BIN)/python -m pytest -n 2 --dist loadfile -m 'not bench and not slow' tests/laws tests/unit tests/contract tests/field tests/hardware
 
 # All tests: the quick ones first, then the slow ones, and alone those that draw in a browser.
 test-all: test
-	$(BIN)/python -m pytest -n 2 --dist loadfile -m 'slow and not bench' tests/laws tests/unit tests/contract
+	$(BIN)/python -m pytest -n 2 --dist loadfile -m 'slow and not bench' tests/laws tests/unit tests/contract tests/field
 	$(BIN)/python -m pytest tests/browser
 
 # Lay out the code as `make check` asks, and mend what the linter can mend.

@@ -27,6 +27,10 @@ TAPE_STD_M = 0.0005
 """Standard uncertainty of a tape read by eye."""
 MAX_OFFSET_M = 0.03
 """A larger offset is a misreading."""
+SEARCHED_M = 0.15
+"""Larger offsets are not looked for where the depth as read is no wall."""
+SEARCH_STEP_M = 0.01
+"""An offset known to this leaves a wall that is not refused."""
 AGREED_M = 1e-6
 MAX_STEPS = 8
 
@@ -35,6 +39,8 @@ FitWith = Callable[[float, float], WallFit]
 """Fit of the wall with (offset_m added to each depth, the pose's origin origin_m behind the zero of
 depth).
 """
+FitAlongRays = Callable[[float], WallFit]
+"""Fit of the wall with this length in m added along each ray."""
 
 
 @dataclass(frozen=True)
@@ -49,15 +55,28 @@ class TapedWall:
     cause: Cause
 
 
-def fit_with_tape_distance(fit_with: FitWith, tape_m: float) -> TapedWall:
+def fit_with_tape_distance(
+    fit_with: FitWith, tape_m: float, fit_along_rays: FitAlongRays | None = None
+) -> TapedWall:
     """Find the offset that puts the wall at `tape_m`, with the cause that makes the wall flatter.
 
-    Raises CalibrationError where tape and lidar cannot both be right.
+    Raises CalibrationError where tape and lidar cannot both be right, and names the offset where
+    the depth is that of a bare wall but for it; WallRefusedError where it is of no bare wall.
     """
     # an origin that moves back along the optical axis moves away from the wall by cos(facing) of
     # that: exact. A depth offset also bends an oblique wall, so its effect on the distance is found
     # numerically.
-    plain = fit_with(0.0, 0.0)
+    try:
+        plain = fit_with(0.0, 0.0)
+    except WallRefusedError:
+        # A large offset bends an oblique wall so far that it looks like clutter.
+        found = _searched(lambda offset_m: fit_with(offset_m, 0.0), tape_m)
+        if found and abs(found.offset_m) <= MAX_OFFSET_M:
+            return found
+        along = None if found or not fit_along_rays else _searched(fit_along_rays, tape_m)
+        if not (found or along):
+            raise
+        raise _named(found, along, tape_m) from None
     axis_share = cos(radians(plain.facing_deg))
     origin_m = (tape_m - plain.distance_m) / axis_share
     if abs(origin_m) > MAX_OFFSET_M:
@@ -71,6 +90,45 @@ def fit_with_tape_distance(fit_with: FitWith, tape_m: float) -> TapedWall:
     if corrected is not None and corrected.fit.bend_deg < plain.bend_deg:
         return corrected
     return moved
+
+
+def _searched(fit_with: Callable[[float], WallFit], tape_m: float) -> TapedWall | None:
+    """Return the smallest offset that makes the depth a bare wall at `tape_m`; None without any.
+
+    One number has to do both, so clutter or a bent wall does not pass.
+    """
+    steps = int(SEARCHED_M / SEARCH_STEP_M + 0.5)
+    for step in sorted(range(-steps, steps + 1), key=abs):
+        offset_m = step * SEARCH_STEP_M
+        try:
+            start = fit_with(offset_m)
+        except WallRefusedError:
+            continue
+        missing_m = tape_m - start.distance_m
+        if abs(missing_m) > SEARCH_STEP_M:
+            continue
+        found = _corrected(
+            lambda added_m, _origin_m, at_m=offset_m: fit_with(at_m + added_m),
+            start,
+            missing_m,
+            tape_m,
+        )
+        if found:
+            return replace(found, offset_m=offset_m + found.offset_m)
+    return None
+
+
+def _named(found: TapedWall | None, along: TapedWall | None, tape_m: float) -> CalibrationError:
+    """Return the error that names an offset too large, or along the rays, to be corrected."""
+    offset_m = found.offset_m if found else along.offset_m if along else 0.0
+    kind = "depths" if found else "ranges along the rays"
+    return CalibrationError(
+        f"the lidar's {kind} are {abs(offset_m) * 1e3:.0f} mm too"
+        f" {'short' if offset_m > 0 else 'long'}: corrected by that they are a bare wall at the"
+        f" tape's {tape_m * 1e3:.0f} mm, and nothing needs to be removed. An offset of depth of up"
+        f" to {MAX_OFFSET_M * 1e3:.0f} mm can be corrected: check the tape, let the lidar warm up,"
+        " or move it farther from the wall"
+    )
 
 
 def _corrected(

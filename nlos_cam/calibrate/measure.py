@@ -117,7 +117,15 @@ def measure_by_depth(
 
     if tape_m is None:
         return fit_with(0.0, 0.0), {}
-    taped = walls.fit_with_tape_distance(fit_with, tape_m)
+
+    def fit_along_rays(offset_m: float) -> walls.WallFit:
+        # depth = range * cos(angle to the axis), and a ray of unit depth has the length 1 / cos
+        length = np.linalg.norm(capture.intrinsics.rays(), axis=-1)
+        return walls.fit_wall(
+            depth_m + offset_m / length, capture.intrinsics, np.random.default_rng(0), noise
+        )
+
+    taped = walls.fit_with_tape_distance(fit_with, tape_m, fit_along_rays)
     return taped.fit, {
         "range_offset_m": taped.offset_m,
         "range_offset_std_m": taped.offset_std_m,

@@ -3,7 +3,9 @@ __all__ = [
     "FRAMES_PER_S",
     "MAC_WHEEL",
     "NAMES",
+    "OPTIONAL",
     "RESERVE_BYTES",
+    "SAME_INSTANT_S",
     "SIMULATED",
     "WHEEL",
     "WORLDS",
@@ -51,6 +53,8 @@ from .simulated_world import WORLDS, World, open_world, pack_loop, read_packaged
 from .streams import (
     FORMATS,
     FRAMES_PER_S,
+    OPTIONAL,
+    SAME_INSTANT_S,
     FrameSet,
     FrameSynchronizer,
     Sample,

@@ -11,6 +11,7 @@ import shutil
 import time
 from collections.abc import Callable
 from contextlib import ExitStack
+from math import inf
 from pathlib import Path
 from shlex import quote
 from threading import Event, Thread
@@ -81,6 +82,18 @@ def can_grow(path: Path, by_bytes: int) -> bool:
         os.truncate(path, length)
 
 
+def size_limit() -> float:
+    """Return the system's limit on the size in bytes of a file of this process, as `ulimit -f`
+    sets it; infinity without one.
+    """
+    try:
+        import resource
+    except ImportError:  # Windows has no such limits
+        return inf
+    limit = resource.getrlimit(resource.RLIMIT_FSIZE)[0]
+    return inf if limit == resource.RLIM_INFINITY else limit
+
+
 STILL_S = 5.0
 """Time without growth, while frames come, after which the SDK has failed to write."""
 FLUSH_S = 9.0
@@ -132,6 +145,9 @@ class SdkRecorder:
         self.path = path
         self.failure: str | None = None
         """Reason of a failed write."""
+        self.at_size_limit = False
+        """True if that is the limit on a file's size, and not the disk."""
+        self._size_limit = size_limit()
         self._now = now
         self._grew_s = now()
         self._bytes = 0
@@ -152,11 +168,25 @@ class SdkRecorder:
     def watch(self) -> None:
         """Check that the file grows; call about once a second while frames come."""
         size = self.path.stat().st_size
-        if size != self._bytes:
+        if size >= self._size_limit:
+            self._fail("")
+        elif size != self._bytes:
             self._bytes = size
             self._grew_s = self._now()
         elif self._now() - self._grew_s > STILL_S:
-            self.failure = f"nothing written for {STILL_S:.0f} s"
+            self._fail(f"nothing written for {STILL_S:.0f} s")
+
+    def _fail(self, reason: str) -> None:
+        """Note a failed write, and the reason for it where that is not the limit on a file's
+        size.
+        """
+        margin_bytes = CHUNK_BYTES + int(self.path.stat().st_size * INDEX_SHARE)
+        self.at_size_limit = self.path.stat().st_size + margin_bytes > self._size_limit
+        self.failure = (
+            f"it reached the limit on a file's size, {self._size_limit / 1e6:.3g} MB"
+            if self.at_size_limit
+            else reason
+        )
 
     def pause(self) -> None:
         """Stop recording. Frames so far are written before this returns, if the disk has room."""
@@ -170,7 +200,7 @@ class SdkRecorder:
         self._flush()
         closing_bytes = CHUNK_BYTES + int(self.path.stat().st_size * INDEX_SHARE)
         if self.failure is None and not can_grow(self.path, closing_bytes):
-            self.failure = "no room for its index"
+            self._fail("no room for its index")
         if self.failure:
             self._abandon()
         self._recorder = None
@@ -182,15 +212,16 @@ class SdkRecorder:
             self.pause()
             if self.failure or self._now() - start_s < FLUSH_S:
                 return
-        self.failure = "the disk no longer accepts data"
+        self._fail("the disk no longer accepts data")
 
     def _abandon(self) -> None:
         """Raise DiskFullError, and leave the file as it is."""
         # One reference too many: never deleted, not even at exit.
         ctypes.pythonapi.Py_IncRef(ctypes.py_object(self._recorder))
         self._recorder = None
+        remedy = "raise the limit (ulimit -f)" if self.at_size_limit else "free some space"
         raise DiskFullError(
-            f"{self.path} could not be completed ({self.failure}): free some space, and recover its"
+            f"{self.path} could not be completed ({self.failure}): {remedy}, and recover its"
             f" frames with `{repair_command(self.path)}`"
         )
 
@@ -230,7 +261,11 @@ class Recording:
         self.started = False
         """True once the file is this take's, and no longer the one it replaces."""
         self.disk_full = False
-        """True if it stopped for want of disk space."""
+        """True if it stopped for want of disk space, or at the limit on a file's size."""
+        self.at_size_limit = False
+        """True if it was that limit."""
+        self.error: DiskFullError | None = None
+        """Reason for which this take's file has no index."""
         self._frames = frames
         self._seconds = seconds
         self._last = last
@@ -258,6 +293,7 @@ class Recording:
         self._source = device, sdk
         self._own()
         self._recorder = SdkRecorder(self.path, device, sdk)
+        self.error = None
         self.started = True
 
     def _own(self) -> None:
@@ -333,7 +369,8 @@ class Recording:
             recorder.pause()  # queued behind the frames so far: none of them is lost
             self._paused.set()
         if self.disk_full and self.optional:
-            log.warning("%s: disk full, the recording ends after %d frames", self.path, self.sets)
+            reason = "limit on a file's size" if recorder.at_size_limit else "disk full"
+            log.warning("%s: %s, the recording ends", self.path, reason)
 
     def _is_disk_full(self, recorder: SdkRecorder) -> bool:
         recorder.watch()
@@ -376,13 +413,18 @@ class Recording:
             if recorder:
                 recorder.close()
         except DiskFullError as error:
+            self.error = error
             if not self.optional:
                 raise
             log.warning("%s", error)
         finally:
+            self.at_size_limit = recorder.at_size_limit if recorder else self.at_size_limit
             self._claim.close()
 
 
-def repair_command(path: Path) -> str:
-    """Return the command that repairs a recording into the current folder."""
-    return f"nlos-cam repair {quote(str(path))} --out {quote(f'{path.stem}-repaired.bag')}"
+def repair_command(path: Path, take_from: str = "") -> str:
+    """Return the command that repairs a recording into the current folder, with descriptions from
+    another file if given.
+    """
+    source = f" --from {quote(take_from)}" if take_from else ""
+    return f"nlos-cam repair {quote(str(path))}{source} --out {quote(f'{path.stem}-repaired.bag')}"

@@ -3,7 +3,7 @@ units.
 """
 
 from collections import Counter, deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, replace
 from math import isfinite
 from typing import Any
@@ -16,7 +16,9 @@ from numpy.typing import NDArray
 from nlos_cam.frames import Frame
 
 FORMATS = {"depth": "z16", "infrared": "y8", "confidence": "raw8"}
-"""Streams that are needed, by the SDK's names, and the pixel format of each."""
+"""Streams that a lidar delivers, by the SDK's names, and the pixel format of each."""
+OPTIONAL = frozenset({"confidence"})
+"""Streams that no result is computed from: a recording may lack them."""
 BYTES_PER_PIXEL = {"depth": 2, "infrared": 1, "confidence": 1}
 FRAMES_PER_S = 30
 SAME_INSTANT_S = 0.5 / FRAMES_PER_S
@@ -149,7 +151,8 @@ class Occurrences:
 class FrameSynchronizer:
     """Pairing of samples with one number and instant into sets, each once and in order.
 
-    Stateful, with bounded memory whatever comes; one thread at a time. Every number is decided
+    A set has a sample of each of the `streams`, which include depth and infrared; without
+    confidence its levels are 0. Stateful, with bounded memory whatever comes; one thread at a time. Every number is decided
     once, in rising order, as a set, incomplete or dropped. Samples must have `shape` (rows,
     columns), if given.
     """
@@ -160,8 +163,11 @@ class FrameSynchronizer:
     # before, n - b - 1 = incomplete + dropped. A number that waits for WAITING_SETS others has lost
     # a stream, and is decided without a set.
 
-    def __init__(self, shape: tuple[int, int] | None = None) -> None:
+    def __init__(
+        self, shape: tuple[int, int] | None = None, streams: Collection[str] = tuple(FORMATS)
+    ) -> None:
         self.shape = shape
+        self._streams = frozenset(streams)
         self.incomplete = 0
         """Numbers with samples, but not of all streams, of one instant and of the shape."""
         self.dropped = 0
@@ -204,7 +210,7 @@ class FrameSynchronizer:
             self._occurrences.note("duplicate", sample)
         else:
             samples[sample.stream] = sample
-        if len(samples) == len(FORMATS):
+        if len(samples) == len(self._streams):
             return self._complete(number)
         if len(self._waiting) > WAITING_SETS:
             self._give_up(next(iter(self._waiting)))
@@ -223,10 +229,17 @@ class FrameSynchronizer:
         if max(times_s.values()) - min(times_s.values()) > SAME_INSTANT_S:
             self.incomplete += 1
             return None
-        depth, ir, confidence = (samples[stream] for stream in FORMATS)
+        depth = samples["depth"]
+        confidence = (
+            samples["confidence"].pixels
+            if "confidence" in samples
+            else np.zeros(depth.pixels.shape, np.uint8)
+        )
         self._sets.append(number)
         self._note_stall(number, depth.timestamp_s)
-        return FrameSet(number, depth.timestamp_s, depth.pixels, ir.pixels, confidence.pixels)
+        return FrameSet(
+            number, depth.timestamp_s, depth.pixels, samples["infrared"].pixels, confidence
+        )
 
     def _decide(self, number: int) -> None:
         """Decide every number before this one."""

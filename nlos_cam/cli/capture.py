@@ -24,6 +24,7 @@ ENDINGS: dict[recordings.TakeState, str] = {
     "interrupted": "Interrupted. ",
     "lost": "Camera lost. ",
     "disk full": "Disk full. ",
+    "size limit": "Limit on a file's size reached. ",
     "damaged": "File damaged. ",
 }
 NOTHING = "nothing was recorded"
@@ -81,6 +82,9 @@ def final_error(take: recordings.CaptureResult) -> NlosCamError | None:
     """
     if take.error is None:
         return None
+    if take.recoverable is not None:
+        count = f"{take.summary.frames} of the {take.sets} frames that came are in it"
+        return type(take.error)(f"{take.error}; {count}")
     if take.sets and not take.verified:
         return take.error
     saved = (
@@ -96,6 +100,9 @@ def format_take(take: recordings.CaptureResult) -> str:
     ending = ENDINGS.get(take.state, "")
     if take.sets == 0:
         return f"{ending.rstrip('. ')} before the first frame; {NOTHING}"
+    if take.recoverable is not None:
+        frames = f"{take.summary.frames} of {take.sets} frames"
+        return f"{ending}Recorded {frames}; the file has no index\nWrote {take.target.path}"
     if take.verified is None:
         return f"{ending}Recorded {take.sets} frames; not verified\nWrote {take.target.path}"
     size_mb = take.target.path.stat().st_size / 1e6

@@ -18,6 +18,14 @@ DamagedBag = Annotated[
     Path, typer.Argument(metavar="F.BAG", help="Recording that was killed, cut short or damaged.")
 ]
 NewBag = Annotated[Path | None, typer.Option("--out", help="Recording to write (.bag).")]
+FirstPart = Annotated[
+    Path | None,
+    typer.Option(
+        "--from",
+        metavar="FIRST.BAG",
+        help="Take the descriptions of the streams from this first part of a split recording.",
+    ),
+]
 AnyBag = Annotated[
     Path,
     typer.Argument(
@@ -41,7 +49,7 @@ Streams = Annotated[
     str, typer.Option("--streams", help="Only these streams, separated by commas (default: all).")
 ]
 Every = Annotated[
-    int, typer.Option("--every", min=1, help="Only every Nth frame, by its number (default: 1).")
+    int, typer.Option("--every", min=1, help="Only every Nth frame, counted (default: 1).")
 ]
 AsObject = Annotated[
     str,
@@ -70,6 +78,7 @@ def object_formats(text: str) -> list[str]:
 def repair(
     bag: DamagedBag,
     out: NewBag = None,
+    take_from: FirstPart = None,
     overwrite: common.Overwrite = False,
     json: common.Json = False,
 ) -> None:
@@ -80,7 +89,7 @@ def repair(
         raise typer.BadParameter(f"--out {out}: the name of a recording must end in .bag")
     path = common.output_path(out, "repaired", ".bag", overwrite=overwrite)
     with common.interrupted_by_signals(), common.tracked("repairing") as report:
-        repaired = bags.repair_recording(bag, path, report)
+        repaired = bags.repair_recording(bag, path, report, take_from=take_from)
     result = {
         "recovered_frames": repaired.recovered_frames,
         "chunks": repaired.chunks,

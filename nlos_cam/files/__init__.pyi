@@ -11,6 +11,7 @@ __all__ = [
     "checksums_of",
     "claim",
     "describe",
+    "is_claimed",
     "load_cached",
     "read_arrays",
     "read_bounded",
@@ -23,7 +24,7 @@ __all__ = [
 from .atomic import atomic_directory, atomic_file
 from .cache import cache_folder, load_cached
 from .checksums import CHECKSUMS, checksums_of, read_checked, write_checked
-from .claims import DISK_ERRORS, claim, reservations
+from .claims import DISK_ERRORS, claim, is_claimed, reservations
 from .errors import FileBusyError, OutputExistsError
 from .reading import (
     TENSOR_LIMIT,

@@ -68,9 +68,7 @@ def _new_claim(path: Path, folder: Path) -> Generator[None]:
     try:
         _empty(folder)
         with suppress(OSError):  # a full disk is reported when a part is written
-            (folder / HOLDER).write_text(
-                f"process {os.getpid()} on {platform.node()}", encoding="utf-8"
-            )
+            (folder / HOLDER).write_text(_this_process(), encoding="utf-8")
         yield
     finally:
         shutil.rmtree(folder, ignore_errors=True)
@@ -94,6 +92,23 @@ def _lock_new_folder(path: Path, folder: Path) -> FileLock:
     raise FileBusyError(
         f"{path} is being written by {_holder(folder)}: wait for it, or choose another name"
     )
+
+
+def is_claimed(path: Path) -> bool:
+    """Return whether another process writes `path`, as far as its claim says."""
+    place = _resolve(path)
+    folder = place.with_name(CLAIM.format(place.name))
+    if not (folder / LOCK).is_file() or _holder(folder) == _this_process():
+        return False
+    lock = FileLock(folder / LOCK)
+    try:
+        lock.acquire(timeout=0)
+    except Timeout:
+        return True
+    except OSError:  # its holder ended just now, or another user's folder
+        return False
+    lock.release()
+    return False
 
 
 @contextmanager
@@ -132,6 +147,10 @@ def _acquire(folder: Path) -> FileLock | None:
     # nobody else can open.
     lock.release()
     return None
+
+
+def _this_process() -> str:
+    return f"process {os.getpid()} on {platform.node()}"
 
 
 def _holder(folder: Path) -> str:

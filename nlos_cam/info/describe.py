@@ -16,6 +16,8 @@ from nlos_cam.recording import SAMPLE
 Describe = Callable[[Path, bool], files.Description | None]
 FILES: dict[str, tuple[str, Describe]] = {
     ".bag": ("recording", files.describe_bag),
+    ".db3": ("recording", files.describe_bag),
+    ".mcap": ("recording", files.describe_bag),
     ".npz": ("arrays", files.describe_npz),
     ".toml": ("record", files.describe_toml),
     ".json": ("record", files.describe_json),

@@ -66,8 +66,8 @@ def problem_of(check: Callable[[], object]) -> str:
 
 def describe_bag(path: Path, verify: bool) -> Description:
     """Describe a recording from its index, or with `verify` from every message."""
-    from nlos_cam.camera import FORMATS
-    from nlos_cam.recording import BagReader, load_sidecar, sidecar_path
+    from nlos_cam.camera import FORMATS, OPTIONAL
+    from nlos_cam.recording import BagReader, load_sidecar, no_frames, sidecar_path
 
     bag = BagReader(path)
     facts = {
@@ -77,8 +77,7 @@ def describe_bag(path: Path, verify: bool) -> Description:
     if longest := max(
         bag.streams.values(), key=lambda info: info.frames if info.format else 0, default=None
     ):
-        ends_s = [bag.sample(longest.name, k).timestamp_s for k in (0, longest.frames - 1)]
-        facts["duration"] = f"{max(ends_s[1] - ends_s[0], 0.0):.1f} s"
+        facts["duration"] = f"{bag.duration_s(longest.name):.1f} s"
     for name, info in bag.streams.items():
         size = f"{info.intrinsics.width} x {info.intrinsics.height}"
         form = info.format or f"{info.encoding} (not readable)"
@@ -99,12 +98,15 @@ def describe_bag(path: Path, verify: bool) -> Description:
         except (RecordingError, KeyError) as error:
             facts["sidecar"] = f"not readable: {error}"
     problem = problem_of(bag.check) if verify else ""
+    if not bag.streams:
+        problem = no_frames(bag)
     quoted = shlex.quote(str(path))
     is_lidar = all(
         stream in bag.streams and bag.streams[stream].format == form
         for stream, form in FORMATS.items()
+        if stream not in OPTIONAL
     )
-    following = [f"nlos-cam export {quoted}"]
+    following = [] if not bag.streams else [f"nlos-cam export {quoted}"]
     if is_lidar and not problem:
         following = [f"nlos-cam replay {quoted} --out replayed", *following]
     return Description(

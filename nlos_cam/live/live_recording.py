@@ -68,13 +68,18 @@ class LiveRecording:
         """
         sets = self._recording.sets
         self._recordable.stop_recording()
-        state: recordings.TakeState = "disk full" if self._recording.disk_full else "complete"
+        error = self._recording.error
+        state: recordings.TakeState = "complete"
+        if self._recording.disk_full or error:
+            state = "size limit" if self._recording.at_size_limit else "disk full"
         result = recordings.CaptureResult(
             self._target,
             state,
             self._recording.sets or sets,
             self._meter.quality(),
             self._sidecar,
+            error=error,
+            closed=error is None,
             follows_another=True,
             events=Counter(self._counts),
         )

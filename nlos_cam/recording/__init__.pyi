@@ -20,6 +20,7 @@ __all__ = [
     "finalize",
     "load_measured_wall",
     "load_sidecar",
+    "no_frames",
     "open_lidar_bag",
     "repair_recording",
     "sidecar_path",
@@ -27,7 +28,7 @@ __all__ = [
     "with_telemetry",
 ]
 
-from .bag_reader import SAMPLE, BagReader
+from .bag_reader import SAMPLE, BagReader, no_frames
 from .capture import CaptureResult, CaptureSession, CaptureTarget, finalize
 from .export import ExportOptions, ExportResult, Format, export_recording
 from .playback import ReplayCamera, VerifyResult, open_lidar_bag, verify

@@ -1,5 +1,6 @@
 """Messages that librealsense writes into a .bag, as values: images, intrinsics, poses, metadata."""
 
+import struct
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
@@ -51,12 +52,10 @@ MAX_TEXT = 200
 """Bounds on an image, four times the largest of a RealSense camera, and on the characters of a
 value.
 """
-TAIL_MARK = b"\x01\x00\x00\x001"
-"""The frame_id of an image with its depth unit after it, against its definition; since librealsense
-2.49.
-"""
 TAIL_BYTES = 4
-FRAME_ID_AT = 12
+"""Depth unit that librealsense since 2.49 writes after an image, against the definition."""
+TEXT_AT = 12
+"""Offset of an image's first text: behind number, seconds and nanoseconds."""
 UNIT_TOLERANCE = 1e-3
 
 
@@ -87,7 +86,20 @@ def parse(raw: memoryview, message_type: str, expected: str = "") -> Any:
 
 
 def _has_tail(raw: memoryview) -> bool:
-    return bytes(raw[FRAME_ID_AT : FRAME_ID_AT + len(TAIL_MARK)]) == TAIL_MARK
+    """Return whether an image is longer than its definition, by the lengths in it.
+
+    Its frame_id marks such images too, but other tools copy the mark and not the tail.
+    """
+    # frame_id, height and width, encoding, is_bigendian, step, data: each text and the data behind
+    # their length.
+    at = _after_text(raw, TEXT_AT)
+    at = _after_text(raw, at + 8)
+    at = _after_text(raw, at + 5)
+    return at + TAIL_BYTES == len(raw)
+
+
+def _after_text(raw: memoryview, at: int) -> int:
+    return at + 4 + int.from_bytes(raw[at : at + 4], "little")
 
 
 def depth_unit_m(raw: memoryview) -> float | None:
@@ -104,6 +116,12 @@ def timestamp_s(image: Any) -> float:
     """Return a frame's time on the device's clock, with librealsense's rounding."""
     stamp = image.header.stamp
     return (stamp.sec + 1e-9 * stamp.nanosec) * 1e3 / 1e3
+
+
+def stamp(raw: memoryview) -> tuple[int, float]:
+    """Return an image's number, and its time in s on the device's clock, from its first bytes."""
+    number, seconds, nanoseconds = struct.unpack_from("<III", raw)
+    return number, seconds + 1e-9 * nanoseconds
 
 
 def pixels(image: Any, encoding: str, intrinsics: Intrinsics) -> NDArray[Any]:

@@ -25,8 +25,9 @@ from rosbags.rosbag1.reader import Header, RecordType, read_uint32
 
 from nlos_cam.camera import Sample, repair_command
 from nlos_cam.errors import RecordingError
-from nlos_cam.files import describe
+from nlos_cam.files import describe, is_claimed
 from nlos_cam.recording import bag_messages, rosbag
+from nlos_cam.recording.frame_order import AGREED_S, corrected_times_ns
 
 DEVICE = "/device_0"
 STREAM = re.compile(DEVICE + r"/sensor_([0-9]{1,3})/([A-Za-z_]{1,40})_([0-9]{1,3})(?=/image/data$)")
@@ -36,12 +37,23 @@ MIN_READS = 2_000_000
 BYTES_PER_READ = 100
 """Bound on the reads of an index, two for each entry, so that it cannot fill the memory."""
 T = TypeVar("T")
+COMPRESSED_IMAGE = "sensor_msgs/msg/CompressedImage"
+MAX_NAMED = 4
+ENDS = 4
+"""Frames at each end among which one has a stamp that agrees with the next."""
 STATIC_NS = 1
 """The time that librealsense gives to values in force when the recording began."""
 SAMPLE = Path(__file__).parent / "sample.bag"
 """Recording that comes with the package: eight frames of the simulated airplane; the name "sample"
 stands for it.
 """
+ROS2_MARKS = {b"SQLite format": "a ROS 2 bag (.db3)", b"\x89MCAP0\r\n": "a ROS 2 bag (.mcap)"}
+"""First bytes of other recordings."""
+ROS2_ADVICE = (
+    "librealsense 2.58 and ROS 2 record to: record to a .bag (ROS 1), with `nlos-cam capture` or an"
+    " earlier librealsense"
+)
+BEING_RECORDED = "{} is being recorded: it can be read once that has ended"
 DECOMPRESSORS = {"lz4": LZ4FrameDecompressor, "bz2": BZ2Decompressor}
 
 
@@ -114,6 +126,9 @@ class BagReader:
         self._chunk_pos = -1
         self._chunk = b""
         self._options: dict[int, _SensorOptions] = {}
+        self._ordered: dict[str, list[Entry]] = {}
+        self._times_ns: dict[str, list[int]] = {}
+        """Of each frame in that order, on the recorder's clock."""
         _check_start(path)
         with raise_as_recording_error(path, "is cut short or damaged"):
             self._read_index()
@@ -179,7 +194,9 @@ class BagReader:
         if entries := self.entries.get(topic):
             return self.read(topic, entries[0], kind, convert)
         raise RecordingError(
-            f"{self.path} is damaged (it has no {topic}): {repair_advice(self.path)}"
+            f"{self.path} has no {topic}, which describes a stream: where a recording is split, the"
+            " descriptions are in its first part; take them from there with"
+            f" `{repair_command(self.path, take_from='FIRST.bag')}`"
         )
 
     def _all(self, topic: str) -> list[Any]:
@@ -255,11 +272,57 @@ class BagReader:
 
     def order(self, streams: Iterable[str]) -> Iterator[Place]:
         """Yield the places of all frames of these streams, in the order of recording."""
-        each = [zip(self._frames(stream), repeat(stream), count()) for stream in streams]
-        return (Place(stream, index, entry.time_ns) for entry, stream, index in merge(*each))
+        each = [
+            zip(self._times_ns[stream], frames, repeat(stream), count())
+            for stream in streams
+            if (frames := self._frames(stream))
+        ]
+        return (Place(stream, index, time_ns) for time_ns, _, stream, index in merge(*each))
 
     def _frames(self, stream: str) -> list[Entry]:
-        return self.entries[f"{self.streams[stream].topic}/image/data"]
+        """Return the frames of a stream in their order, which is found once."""
+        if stream not in self._ordered:
+            entries = self.entries[f"{self.streams[stream].topic}/image/data"]
+            times_ns = corrected_times_ns(entries, self._stamp)
+            pairs = sorted(zip(times_ns, entries, strict=True))
+            self._ordered[stream] = [entry for _, entry in pairs]
+            self._times_ns[stream] = [time_ns for time_ns, _ in pairs]
+        return self._ordered[stream]
+
+    def _stamp(self, entry: Entry) -> tuple[int, float]:
+        """Return a frame's number, and its time in s on the device's clock."""
+        with self._locate(entry):
+            return bag_messages.stamp(self.raw(entry))
+
+    def duration_s(self, stream: str) -> float:
+        """Return the time from the first frame of a stream to its last.
+
+        It is that of the device's clock, between the outermost stamps that agree with those beside
+        them; of the recorder's where none do, or the device's clock started again.
+        """
+        frames = self._frames(stream)
+        times_ns = self._times_ns[stream]
+        recorded_s = (times_ns[-1] - times_ns[0]) / 1e9
+        first = self._first_agreed_s(list(zip(frames[:ENDS], times_ns[:ENDS], strict=True)))
+        last = self._first_agreed_s(
+            list(zip(frames[: -ENDS - 1 : -1], times_ns[: -ENDS - 1 : -1], strict=True))
+        )
+        if first is None or last is None or last < first:
+            return max(recorded_s, 0.0)
+        return last - first
+
+    def _first_agreed_s(self, frames: list[tuple[Entry, int]]) -> float | None:
+        """Return the first stamp, in s, that is as far from the next as the recorder says; of a
+        lone frame its own.
+        """
+        stamps_s = [self._stamp(entry)[1] for entry, _ in frames]
+        if len(stamps_s) == 1:
+            return stamps_s[0]
+        for k, (one_s, next_s) in enumerate(pairwise(stamps_s)):
+            recorded_s = (frames[k + 1][1] - frames[k][1]) / 1e9
+            if abs(next_s - one_s - recorded_s) < AGREED_S:
+                return one_s
+        return None
 
     def samples(self, streams: Iterable[str]) -> Iterator[Sample]:
         """Yield all frames of these streams, in the order of recording."""
@@ -351,7 +414,10 @@ class BagReader:
         entry = self._frames("depth")[0]
         with self._locate(entry):
             after_image = bag_messages.depth_unit_m(self.raw(entry))
-        unit_m = self.settings().get("depth_units", after_image)
+        # Tools that count from another zero move the options in force at the start with the frames.
+        start_ns = max(STATIC_NS, entry.time_ns)
+        settings = self.settings() or self.settings(start_ns)
+        unit_m = settings.get("depth_units", after_image)
         if unit_m is None or not 0 < unit_m < inf:
             raise RecordingError(
                 f"{self.path}: {info.topic} has no valid depth unit ({unit_m}): record it again"
@@ -446,6 +512,26 @@ def _unpack(packed: bytes, compression: str, size: int) -> bytes:
     return content
 
 
+def no_frames(bag: BagReader) -> str:
+    """Return an error for a recording without streams, with the topics of images that it has
+    instead.
+    """
+    images = [
+        f"{topic} ({len(entries)} images)"
+        for topic, entries in bag.entries.items()
+        if entries
+        and bag.types[topic] in {bag_messages.IMAGE, COMPRESSED_IMAGE}
+        and not topic.startswith(DEVICE)
+    ]
+    if not images:
+        return f"{bag.path} holds no frames: record it again"
+    named = ", ".join(images[:MAX_NAMED]) + (" and others" if len(images) > MAX_NAMED else "")
+    return (
+        f"{bag.path} is a bag of a ROS driver, not of librealsense's recorder: it has {named}."
+        f" Record with `nlos-cam capture` or the SDK's viewer, whose topics begin with {DEVICE}"
+    )
+
+
 def _check_topics(path: Path) -> None:
     """Raise OverflowError for a file header with absurdly many topics; rosbags reports a damaged
     one.
@@ -474,7 +560,11 @@ def _check_start(path: Path) -> None:
     with raise_as_recording_error(path, "cannot be read"), path.open("rb") as file:
         start = file.read(len(rosbag.MAGIC))
     if not start:
-        raise RecordingError(f"{path} is empty: record it again")
+        raise RecordingError(
+            BEING_RECORDED.format(path) if is_claimed(path) else f"{path} is empty: record it again"
+        )
+    if kind := next((kind for mark, kind in ROS2_MARKS.items() if start.startswith(mark)), ""):
+        raise RecordingError(f"{path} is {kind}, which {ROS2_ADVICE}")
     if start != rosbag.MAGIC:
         raise RecordingError(
             f"{path} is not a .bag recording (it starts with {start!r}): give one made by `capture`"
@@ -494,6 +584,8 @@ def raise_as_recording_error(path: Path, problem: str) -> Generator[None]:
         detail = describe(error)
         if isinstance(error, OSError) and error.strerror:
             raise RecordingError(f"{path} cannot be read: {detail}") from error
+        if is_claimed(path):
+            raise RecordingError(BEING_RECORDED.format(path)) from error
         if "not indexed" in detail:
             problem = "was never closed"
             detail = "the capture was killed, so it has no index"

@@ -1,7 +1,7 @@
 """Takes of one running camera, each recorded with its sidecar and then verified."""
 
 from collections import Counter
-from collections.abc import Callable, Generator, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -14,6 +14,7 @@ from nlos_cam.errors import CameraError, DiskFullError, NlosCamError, RecordingE
 from nlos_cam.frames import Frame
 from nlos_cam.recording.playback import VerifyResult
 from nlos_cam.recording.quality import Quality, QualityMeter
+from nlos_cam.recording.repair import recoverable_frames
 from nlos_cam.recording.sidecar import (
     SidecarFile,
     Summary,
@@ -53,10 +54,16 @@ class CaptureResult:
     """Contents of the file, once verified."""
     closed: bool = True
     """Whether the file has its index, without which it cannot be read."""
+    recoverable: Mapping[str, int] | None = None
+    """Frames of each stream in a file without an index."""
 
     @property
     def summary(self) -> Summary:
-        return summary_of(self.verified, self.quality, self.events)
+        summary = summary_of(self.verified, self.quality, self.events)
+        if self.recoverable is None:
+            return summary
+        frames = min(self.recoverable.values(), default=0)
+        return summary.model_copy(update={"frames": frames, "streams": dict(self.recoverable)})
 
 
 class CaptureSession:
@@ -104,7 +111,8 @@ class CaptureSession:
         except DiskFullError as error:
             if take is None:
                 raise
-            take = replace(take, state="disk full", error=error, closed=False)
+            state = "size limit" if self._recording.at_size_limit else "disk full"
+            take = replace(take, state=state, error=error, closed=False)
         if take:
             yield replace(
                 take, sets=self._recording.sets
@@ -174,12 +182,20 @@ def finalize(
         for path in (take.target.path, take.sidecar.path):
             path.unlink(missing_ok=True)
         return take
-    final = _verify(take, read_back) if take.closed else take
+    final = _verify(take, read_back) if take.closed else _count(take)
     try:
         final.sidecar.finish(final.state, final.summary)
     except DiskFullError as error:
         return replace(final, error=final.error or error)
     return final
+
+
+def _count(take: CaptureResult) -> CaptureResult:
+    """Count the frames in a file that was not closed: not all that came were written."""
+    try:
+        return replace(take, recoverable=recoverable_frames(take.target.path))
+    except OSError:
+        return take
 
 
 def _verify(take: CaptureResult, read_back: Callable[[Path], VerifyResult | None]) -> CaptureResult:

@@ -4,7 +4,7 @@ point clouds.
 
 import csv
 import json
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Callable, Collection
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass
@@ -18,15 +18,25 @@ import cv2
 import numpy as np
 import trimesh
 from nlos_calibration.arrays import Float64
+from numpy.typing import NDArray
 
-from nlos_cam.camera import FORMATS, FrameSet, FrameSynchronizer, Sample
+from nlos_cam.camera import FORMATS, OPTIONAL, SAME_INSTANT_S, FrameSynchronizer, Sample
 from nlos_cam.errors import NlosCamError, RecordingError
 from nlos_cam.files import TEXT_LIMIT, atomic_directory, read_bounded
-from nlos_cam.recording.bag_reader import BagReader
+from nlos_cam.recording.bag_reader import BagReader, no_frames
 
 POINTS = "points"
-TO_BGR = {"rgb8": cv2.COLOR_RGB2BGR, "rgba8": cv2.COLOR_RGBA2BGRA}
+RECENT_INSTANTS = 30
+"""Instants that a stream may lag behind another."""
+TO_BGR = {
+    "rgb8": cv2.COLOR_RGB2BGR,
+    "rgba8": cv2.COLOR_RGBA2BGRA,
+    "yuyv": cv2.COLOR_YUV2BGR_YUYV,
+    "uyvy": cv2.COLOR_YUV2BGR_UYVY,
+}
 """Conversions to OpenCV's order of channels for PNG; a .npz keeps every stream's own."""
+INTERLEAVED = {"yuyv", "uyvy"}
+"""Formats of two bytes a pixel, of which the second belongs to two pixels."""
 
 
 class PngSink:
@@ -48,17 +58,28 @@ class PngSink:
         self._repeats[sample.number] += 1
         suffix = f"-{self._repeats[sample.number]}" if self._repeats[sample.number] > 1 else ""
         path = self._folder / f"{sample.number:06d}{suffix}.png"
-        code = TO_BGR.get(self._encoding)
-        pixels = sample.pixels if code is None else cv2.cvtColor(sample.pixels, code)
-        done, png = cv2.imencode(".png", pixels)
+        try:
+            done, png = cv2.imencode(".png", self._for_opencv(sample.pixels))
+        except cv2.error as error:  # such as an odd width of pixels that share their color
+            raise self._not_a_png(sample) from error
         if not done:
-            raise NlosCamError(
-                f"{sample.stream} ({self._encoding}) cannot be written as PNG: use --format npz"
-            )
+            raise self._not_a_png(sample)
         path.write_bytes(png.tobytes())
         self._rows.writerow(
             [f"{self._folder.name}/{path.name}", sample.number, f"{sample.timestamp_s:.6f}"]
         )
+
+    def _not_a_png(self, sample: Sample) -> NlosCamError:
+        return NlosCamError(
+            f"{sample.stream} ({self._encoding}) cannot be written as PNG: use --format npz"
+        )
+
+    def _for_opencv(self, pixels: NDArray[Any]) -> NDArray[Any]:
+        """Return pixels with the channels in OpenCV's order, and YUV ones as 8-bit color."""
+        if self._encoding in INTERLEAVED:
+            pixels = pixels.view(np.uint8).reshape(*pixels.shape, 2)
+        code = TO_BGR.get(self._encoding)
+        return pixels if code is None else cv2.cvtColor(pixels, code)
 
     def close(self) -> None:
         self._table.close()
@@ -113,34 +134,55 @@ class NpzSink:
 
 
 class PointSink:
-    """Writer of one binary PLY per complete set of streams, at most `limit`, gray by infrared.
+    """Writer of one binary PLY per depth frame, at most `limit`.
 
-    Points in metres in the lidar frame: x right, y down, z forward.
+    With infrared among the `streams`, one per complete set of them, gray by infrared. Points in
+    metres in the lidar frame: x right, y down, z forward.
     """
 
     def __init__(
-        self, folder: Path, rays: Float64, unit_m: float, limit: int | None = None
+        self,
+        folder: Path,
+        rays: Float64,
+        unit_m: float,
+        streams: Collection[str],
+        limit: int | None = None,
     ) -> None:
         self._folder = folder / POINTS
         self._rays = rays
         self._unit_m = unit_m
         self._limit = limit
         self._folder.mkdir()
-        self._pairing = FrameSynchronizer((rays.shape[0], rays.shape[1]))
+        self.streams = streams
+        self._pairing = FrameSynchronizer((rays.shape[0], rays.shape[1]), streams)
+        self._repeats: Counter[int] = Counter()
         self.written = 0
 
     def add(self, sample: Sample) -> None:
-        if self.written == self._limit or sample.stream not in FORMATS:
+        """Take a frame. Raises RecordingError for depth of another size than its camera's."""
+        if self.written == self._limit or sample.stream not in self.streams:
             return
-        if found := self._pairing.add(sample):
-            self._write(found)
+        if "infrared" not in self.streams:
+            if sample.pixels.shape != self._rays.shape[:2]:
+                raise RecordingError(
+                    f"frame {sample.number} of depth has shape {sample.pixels.shape}, its camera"
+                    f" {self._rays.shape[:2]}: no point cloud can be made of it"
+                )
+            self._write(sample.number, sample.pixels)
+        elif found := self._pairing.add(sample):
+            self._write(found.number, found.depth_z16, found.ir)
 
-    def _write(self, found: FrameSet) -> None:
-        valid = found.depth_z16 > 0
-        points_m = self._rays[valid] * (found.depth_z16[valid] * self._unit_m)[:, np.newaxis]
-        gray = np.repeat(found.ir[valid][:, np.newaxis], 3, axis=1)
+    def _write(
+        self, number: int, depth_z16: NDArray[np.uint16], ir: NDArray[np.uint8] | None = None
+    ) -> None:
+        valid = depth_z16 > 0
+        points_m = self._rays[valid] * (depth_z16[valid] * self._unit_m)[:, np.newaxis]
+        gray = None if ir is None else np.repeat(ir[valid][:, np.newaxis], 3, axis=1)
         cloud: Any = trimesh.PointCloud(points_m, colors=gray)
-        (self._folder / f"{found.number:06d}.ply").write_bytes(cloud.export(file_type="ply"))
+        self._repeats[number] += 1
+        suffix = f"-{self._repeats[number]}" if self._repeats[number] > 1 else ""
+        path = self._folder / f"{number:06d}{suffix}.ply"
+        path.write_bytes(cloud.export(file_type="ply"))
         self.written += 1
 
     def close(self) -> None:
@@ -168,13 +210,11 @@ class ExportOptions:
 
     format: Format = "png"
     points: bool = False
-    """A point cloud for each complete set; otherwise one for the first, when all streams are
-    exported.
-    """
+    """A point cloud for each frame; otherwise one for the first, when all streams are exported."""
     streams: Collection[str] = ()
     """By name; empty for all."""
     every: int = 1
-    """Only frames whose number is divisible by this."""
+    """Only the first frame of each so many, counted, whatever their numbers."""
 
 
 def export_recording(
@@ -188,7 +228,8 @@ def export_recording(
     """Write the selected frames of a recording into the directory `out`.
 
     Setting `stop` ends it early and keeps the frames so far, and so does damage within the
-    recording. Raises RecordingError for streams that the recording does not have.
+    recording. Raises RecordingError for streams that the recording does not have, and where there
+    is no frame to write.
     """
     streams = _streams(bag, options)
     written: Counter[str] = Counter(dict.fromkeys(streams, 0))
@@ -201,11 +242,12 @@ def export_recording(
             for sink in [*sinks.values(), *([points] if points else [])]:
                 closing.callback(sink.close)
             try:
-                for sample in bag.samples({*sinks, *(FORMATS if points else ())}):
+                instants = _Instants()
+                for sample in bag.samples({*sinks, *(points.streams if points else ())}):
                     if stop.is_set():
                         break
                     on_frame()
-                    if sample.number % options.every:
+                    if instants.count(sample) % options.every:
                         continue
                     if sample.stream in sinks:
                         sinks[sample.stream].add(sample)
@@ -214,23 +256,62 @@ def export_recording(
                         points.add(sample)
             except RecordingError as error:
                 damage = str(error)
+        if not written.total() and not stop.is_set():
+            raise RecordingError(
+                f"{bag.path} has no frame to write"
+                + (f" ({damage})" if damage else f": it has {', '.join(streams)}")
+            )
     if points:
         written[POINTS] = points.written
     return ExportResult(dict(written), str(out), damage)
+
+
+class _Instants:
+    """Count of the instants at which frames were taken.
+
+    The lidar's streams share their instants; any other stream counts its own frames. Frame numbers
+    are not looked at: cameras skip some, and count streams apart.
+    """
+
+    def __init__(self) -> None:
+        self._others: Counter[str] = Counter()
+        self._begun = 0
+        self._recent: deque[tuple[int, float, set[str]]] = deque(maxlen=RECENT_INSTANTS)
+        """Number and time in s of the last instants, and the streams that have their frame."""
+
+    def count(self, sample: Sample) -> int:
+        """Return the number of the sample's instant, from 0; feed samples in order."""
+        if sample.stream not in FORMATS:
+            self._others[sample.stream] += 1
+            return self._others[sample.stream] - 1
+        for number, time_s, streams in self._recent:
+            apart_s = abs(time_s - sample.timestamp_s)
+            if sample.stream not in streams and apart_s <= SAME_INSTANT_S:
+                streams.add(sample.stream)
+                return number
+        self._recent.append((self._begun, sample.timestamp_s, {sample.stream}))
+        self._begun += 1
+        return self._begun - 1
 
 
 def _streams(bag: BagReader, options: ExportOptions) -> list[str]:
     """Return the streams to write. Raises RecordingError for one that the recording does not
     have.
     """
+    if not bag.streams:
+        raise RecordingError(no_frames(bag))
     present = [name for name, info in bag.streams.items() if info.format]
+    if not present:
+        encodings = ", ".join(f"{name} {info.encoding}" for name, info in bag.streams.items())
+        raise RecordingError(f"{bag.path} has no stream that can be read: it has {encodings}")
     if missing := sorted(set(options.streams) - set(present)):
         raise RecordingError(
             f"{bag.path} has no {' and no '.join(missing)} stream: it has {', '.join(present)}"
         )
-    if options.points and (missing := [stream for stream in FORMATS if stream not in present]):
+    if options.points and not _has(bag, "depth"):
         raise RecordingError(
-            f"{bag.path} has no {' and no '.join(missing)} stream: point clouds need all three"
+            f"{bag.path} has no depth stream, which point clouds are made of: it has"
+            f" {', '.join(present)}"
         )
     return [name for name in present if not options.streams or name in options.streams]
 
@@ -245,11 +326,20 @@ def _sink(bag: BagReader, stream: str, folder: Path, form: Format) -> PngSink | 
 
 
 def _points(bag: BagReader, options: ExportOptions, folder: Path) -> PointSink | None:
-    has_sets = all(stream in bag.streams and bag.streams[stream].format for stream in FORMATS)
+    has_sets = all(_has(bag, stream) for stream in FORMATS if stream not in OPTIONAL)
     if not options.points and (options.streams or not has_sets):
         return None
     limit = None if options.points else 1
-    return PointSink(folder, bag.streams["depth"].intrinsics.rays(), bag.depth_unit_m(), limit)
+    pinhole = bag.streams["depth"].intrinsics
+    # The lidar's infrared has depth's pixels; another camera's need not.
+    has_gray = has_sets and bag.streams["infrared"].intrinsics == pinhole
+    streams = [name for name in FORMATS if _has(bag, name)] if has_gray else ["depth"]
+    return PointSink(folder, pinhole.rays(), bag.depth_unit_m(), streams, limit)
+
+
+def _has(bag: BagReader, stream: str) -> bool:
+    """Return whether a recording has one of the lidar's streams, in the lidar's format."""
+    return stream in bag.streams and bag.streams[stream].format == FORMATS[stream]
 
 
 def _info(bag: BagReader, options: ExportOptions) -> dict[str, Any]:
@@ -262,6 +352,8 @@ def _info(bag: BagReader, options: ExportOptions) -> dict[str, Any]:
             "frames_per_s": info.frames_per_s,
             "frames_in_recording": info.frames,
             "intrinsics": asdict(info.intrinsics),
+            "distortion": _distortion(bag, name),
+            "pose": _pose(bag, name),
             "settings": dict(bag.settings(bag.end_ns, name)),
         }
         for name, info in bag.streams.items()
@@ -275,6 +367,30 @@ def _info(bag: BagReader, options: ExportOptions) -> dict[str, Any]:
         "streams": streams,
         "capture": _read_json(bag.path.with_suffix(".json")),
     }
+
+
+def _distortion(bag: BagReader, stream: str) -> dict[str, Any]:
+    """Return the distortion model of a stream, by the SDK's name, and its coefficients."""
+    model, coefficients = bag.lens(stream)
+    return {"model": model, "coefficients": [_or_none(value) for value in coefficients.tolist()]}
+
+
+def _pose(bag: BagReader, stream: str) -> dict[str, Any] | None:
+    """Return reference_from_stream (4, 4), by rows in metres, and the reference stream.
+
+    That is depth, or the first stream where there is no depth; None where the recording has no
+    extrinsics between the two.
+    """
+    reference = "depth" if "depth" in bag.streams else next(iter(bag.streams))
+    try:
+        pose = bag.pose(reference, stream)
+    except RecordingError:
+        return None
+    return {"in_frame_of": reference, "matrix": pose.tolist()}
+
+
+def _or_none(value: float) -> float | None:
+    return value if isfinite(value) else None
 
 
 def _read_json(path: Path) -> Any:

@@ -1,5 +1,6 @@
 """Playback of a recording as a camera, without librealsense; and verification of recordings."""
 
+import logging
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
@@ -8,10 +9,13 @@ from typing import Self
 
 from nlos_calibration import Intrinsics, Rig
 
-from nlos_cam.camera import FORMATS, ClockUnwrap, FrameSynchronizer, frame_in_si
+from nlos_cam.camera import FORMATS, OPTIONAL, ClockUnwrap, FrameSynchronizer, Sample, frame_in_si
 from nlos_cam.errors import CameraError, RecordingError, StreamMissingError
 from nlos_cam.frames import Frame
-from nlos_cam.recording.bag_reader import BagReader
+from nlos_cam.recording.bag_reader import BagReader, no_frames
+from nlos_cam.recording.renumbering import renumbered
+
+log = logging.getLogger(__name__)
 
 IDENTITY = {
     "name": "name",
@@ -28,13 +32,15 @@ class ReplayCamera:
 
     No thread and no open file, so leaving the context only ends iterations. A frame's settings are
     those in force when it was recorded. Raises RecordingError for a file that cannot be read, or at
-    the damage; StreamMissingError without depth, infrared or confidence.
+    the damage; StreamMissingError without depth or infrared. Confidence may be missing: its levels
+    are 0 then.
     """
 
     def __init__(self, path: Path) -> None:
         self.uri = f"bag:{path}"
         self.rig: Rig | None = None
         self._bag = open_lidar_bag(path)
+        self._streams = streams_of(self._bag)
         self._unit_m = self._bag.depth_unit_m()
         self.identity: Mapping[str, str] = identity_of(self._bag)
         self.intrinsics: Intrinsics = self._bag.streams["depth"].intrinsics
@@ -60,7 +66,8 @@ class ReplayCamera:
             raise CameraError(f"{self.uri} is not started: iterate inside `with`")
         self._iterations += 1
         self.arrived = Counter()
-        pairing = FrameSynchronizer((self.intrinsics.height, self.intrinsics.width))
+        shape = self.intrinsics.height, self.intrinsics.width
+        pairing = FrameSynchronizer(shape, self._streams)
         try:
             yield from self._frames(pairing, self._iterations)
         except RecordingError:
@@ -68,20 +75,27 @@ class ReplayCamera:
             raise
 
     def _frames(self, pairing: FrameSynchronizer, iteration: int) -> Iterator[Frame]:
-        # A device's own clock is a counter that wraps.
-        is_counter = self._bag.metadata("depth", 0).domain == "hardware_clock"
-        unwrap = ClockUnwrap().add if is_counter else float
-        for place in self._bag.order(FORMATS):
-            sample = self._bag.sample(place.stream, place.index)
+        for time_ns, sample in renumbered(self._samples(), self._streams):
             self.arrived[sample.stream] += 1
-            found = pairing.add(replace(sample, timestamp_s=unwrap(sample.timestamp_s)))
+            found = pairing.add(sample)
             if found:
                 self._count(pairing)
-                self._settings = self._bag.settings(place.time_ns)
+                self._settings = self._bag.settings(time_ns)
                 yield frame_in_si(found, self._unit_m, self.intrinsics, self._settings)
             if iteration != self._iterations:  # the context was left, or another iteration started
                 return
         self._end(pairing)
+
+    def _samples(self) -> Iterator[tuple[int, Sample]]:
+        """Yield the recorder's time in ns of each sample, and the sample on a clock that does not
+        wrap.
+        """
+        # A device's own clock is a counter that wraps.
+        is_counter = self._bag.metadata("depth", 0).domain == "hardware_clock"
+        unwrap = ClockUnwrap().add if is_counter else float
+        for place in self._bag.order(self._streams):
+            sample = self._bag.sample(place.stream, place.index)
+            yield place.time_ns, replace(sample, timestamp_s=unwrap(sample.timestamp_s))
 
     def _end(self, pairing: FrameSynchronizer) -> None:
         pairing.finish()
@@ -97,18 +111,21 @@ class ReplayCamera:
 
 
 def open_lidar_bag(path: Path) -> BagReader:
-    """Open a recording of an L515. Raises StreamMissingError without one of its three streams,
-    RecordingError.
+    """Open a recording of an L515. Raises StreamMissingError without depth or infrared,
+    RecordingError. Logs a warning for one without confidence.
     """
     bag = BagReader(path)
     if not bag.streams:
-        raise RecordingError(f"{path} holds no frames: record it again")
+        raise RecordingError(no_frames(bag))
     present = {name: info.format for name, info in bag.streams.items()}
     missing = [stream for stream, wanted in FORMATS.items() if present.get(stream) != wanted]
-    if missing:
+    if set(missing) <= OPTIONAL:
+        for stream in missing:
+            log.warning("%s has no %s stream: no result depends on it", path, stream)
+    else:
         raise StreamMissingError(
             f"{path} has no {' and no '.join(missing)} stream (it has"
-            f" {', '.join(sorted(present))}): record depth, infrared and confidence with an L515,"
+            f" {', '.join(sorted(present))}): record depth and infrared with an L515,"
             " e.g. `nlos-cam capture --camera l515`"
         )
     pinhole = bag.streams["depth"].intrinsics
@@ -118,6 +135,15 @@ def open_lidar_bag(path: Path) -> BagReader:
             " again"
         )
     return bag
+
+
+def streams_of(bag: BagReader) -> list[str]:
+    """Return the lidar's streams that a recording has, in the lidar's formats."""
+    return [
+        stream
+        for stream, wanted in FORMATS.items()
+        if stream in bag.streams and bag.streams[stream].format == wanted
+    ]
 
 
 def identity_of(bag: BagReader) -> dict[str, str]:
@@ -152,5 +178,8 @@ def verify(path: Path, on_frame: Callable[[], None] = lambda: None) -> VerifyRes
             frames += 1
             on_frame()
         return VerifyResult(
-            frames, camera.dropped + camera.incomplete, last_s - first_s, dict(camera.arrived)
+            frames,
+            camera.dropped + camera.incomplete,
+            max(last_s - first_s, 0.0),
+            dict(camera.arrived),
         )

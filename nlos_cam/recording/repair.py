@@ -14,11 +14,16 @@ from nlos_cam.camera import FORMATS, OnProgress
 from nlos_cam.errors import NlosCamError, OutputExistsError, RecordingError
 from nlos_cam.files import atomic_file
 from nlos_cam.recording import rosbag
+from nlos_cam.recording.descriptions import with_descriptions
 from nlos_cam.recording.salvage import Chunk, Damage, Scan, scan_bag
 
 FRAMES_TOPIC = re.compile(r"/([A-Za-z]+)_\d+/image/data$")
 VERSION_TOPIC = "/file_version"
 """First message of the device's description; librealsense plays no file without it."""
+MISSING = (
+    "stream descriptions missing, without which librealsense plays nothing: take them from the"
+    " recording's first part with --from"
+)
 RECORD_BYTES = 128
 """Bound on an index or chunk record without its data."""
 
@@ -36,10 +41,17 @@ class RepairResult:
 
 
 def repair_recording(
-    path: Path, out: Path, report: OnProgress = lambda _done, _total: None
+    path: Path,
+    out: Path,
+    report: OnProgress = lambda _done, _total: None,
+    *,
+    take_from: Path | None = None,
 ) -> RepairResult:
     """Write the undamaged part of the recording `path` to `out`, replacing it atomically; `path` is
     only read.
+
+    The descriptions of its streams come from `take_from`, if given: the first part of a recording
+    that was split.
 
     Raises RecordingError where nothing can be recovered, OutputExistsError if both are the same
     file, NlosCamError where `out` cannot be written.
@@ -49,7 +61,9 @@ def repair_recording(
     ):  # opening a pipe would wait for a writer
         raise RecordingError(f"{path} is not a file: give the path of a .bag recording")
     try:
-        same = out.exists() and out.samefile(path)
+        same = out.exists() and any(
+            out.samefile(source) for source in (path, take_from) if source and source.exists()
+        )
         scan = None if same else scan_bag(path, lambda done, total: report(done, 2 * total))
     except OSError as error:
         raise RecordingError(
@@ -59,11 +73,21 @@ def repair_recording(
         raise OutputExistsError(
             f"{out} is the recording itself, which is never changed: choose another --out"
         )
+    if take_from:
+        scan = with_descriptions(scan, path, take_from)
     chunks, damages = _readable(scan)
     if not any(_holds_frames(chunk) for chunk in chunks):
         raise RecordingError(f"{path} has nothing to recover: {_why_nothing(scan)}")
     _write(path, out, replace(scan, chunks=chunks), report)
     return RepairResult(_count_frames(chunks, scan.connections), len(chunks), damages, out)
+
+
+def recoverable_frames(path: Path) -> dict[str, int]:
+    """Return the frames of each stream that a repair of a recording recovers. Raises OSError where
+    it cannot be read.
+    """
+    scan = scan_bag(path)
+    return _count_frames(_readable(scan)[0], scan.connections)
 
 
 def _readable(scan: Scan) -> tuple[list[Chunk], list[Damage]]:
@@ -76,7 +100,7 @@ def _readable(scan: Scan) -> tuple[list[Chunk], list[Damage]]:
     if VERSION_TOPIC not in {
         scan.connections[number].topic.lower() for chunk in chunks for number in chunk.index
     }:
-        damages.append(Damage(0, 0, "stream descriptions missing: librealsense cannot play this"))
+        damages.append(Damage(0, 0, MISSING))
     return chunks, sorted(damages, key=lambda damage: damage.position)
 
 

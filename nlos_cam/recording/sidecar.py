@@ -23,9 +23,11 @@ from nlos_cam.recording.bag_messages import finite
 from nlos_cam.recording.playback import VerifyResult
 from nlos_cam.recording.quality import Quality
 
-TakeState = Literal["recording", "complete", "interrupted", "lost", "disk full", "damaged"]
-"""recording: in progress, or killed. interrupted: by Ctrl-C. lost: the camera vanished. damaged:
-the file holds fewer frames than came.
+TakeState = Literal[
+    "recording", "complete", "interrupted", "lost", "disk full", "size limit", "damaged"
+]
+"""recording: in progress, or killed. interrupted: by Ctrl-C. lost: the camera vanished. size limit:
+the file reached the system's limit on its size. damaged: it holds fewer frames than came.
 """
 Share = Annotated[float, Field(ge=0, le=1)]
 Count = Annotated[int, Field(ge=0)]
@@ -58,7 +60,9 @@ class Summary(Record):
     """Verified contents of the file, and quality of the frames."""
 
     frames: Count | None = None
-    """Complete sets in the file; None where not verified."""
+    """Complete sets in the file; of one without an index, the frames that a repair recovers. None
+    where not verified.
+    """
     dropped: Count | None = None
     seconds: Finite | None = None
     frames_per_s: Finite | None = None

@@ -30,13 +30,17 @@ class ObjectFiles:
     formats: Sequence[str]
     """Some of OBJECT_FORMATS."""
     every: int = 1
-    """Only frames whose number is divisible by this."""
+    """Only the first of each so many frames, counted."""
     written: int = 0
     """Frames with a surface so far."""
+    came: int = 0
+    """Frames so far."""
 
     def add(self, number: int, depth_m: Float32, uncertainty_m: Float32 | None) -> None:
         """Write a frame's depth map (64, 64), if it is due and has a surface."""
-        if number % self.every or not np.isfinite(depth_m).any():
+        is_due = self.came % self.every == 0
+        self.came += 1
+        if not is_due or not np.isfinite(depth_m).any():
             return
         mesh = mesh_from_depth(depth_m, self.box, uncertainty_m)
         self.folder.mkdir(exist_ok=True)
@@ -63,7 +67,7 @@ def export_objects(
     their number.
 
     Setting `stop` ends it early and keeps the files so far. Raises RecordingError for any other
-    file.
+    file, and where no frame has a surface.
     """
     arrays, box = _read(result)
     numbers = arrays["frame_number"]
@@ -76,7 +80,17 @@ def export_objects(
             is_known = np.isfinite(uncertainty_m).any()
             files.add(int(number), arrays["depth_m"][k], uncertainty_m if is_known else None)
             on_frame(k + 1, len(numbers))
+        if not files.written and not stop.is_set():
+            raise RecordingError(
+                f"{result} has no hidden surface in {_frames(len(numbers), every)}: nothing was"
+                " written"
+            )
     return files.written
+
+
+def _frames(count: int, every: int) -> str:
+    frames = f"its {count} frame{'' if count == 1 else 's'}"
+    return frames if every == 1 else f"every {every}th of {frames}"
 
 
 DIMENSIONS = {

@@ -52,7 +52,7 @@ def test_repair_prints_what_was_recovered_and_lost(
 def test_repair_interrupted_is_exit_code_130_without_output(
     run: Run, noise_bags: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def interrupted(path: Path, out: Path, report: Callable[[int, int], None]) -> Any:
+    def interrupted(path: Path, out: Path, report: Callable[[int, int], None], **_: Any) -> Any:
         def once_half_way(done: int, total: int) -> None:
             report(done, total)
             if done > 0.7 * total:

@@ -183,7 +183,7 @@ def test_take_whose_file_cannot_be_closed_is_not_read_back(
     )
     assert "nlos-cam repair" in str(take.error)
     summary = load_sidecar(take.sidecar.path).summary
-    assert summary.frames is None
+    assert summary.frames == min(summary.streams.values())
     assert summary.frames_seen in range(
         1, 5
     )  # a slow machine may notice the full disk before the last frame

@@ -56,10 +56,12 @@ def changed(replay: Path, path: Path, **arrays: object) -> Path:
     return path
 
 
-def test_export_skips_frames_without_surface(replay: Path, tmp_path: Path) -> None:
+def test_export_refuses_a_replay_without_surface(replay: Path, tmp_path: Path) -> None:
     nothing_m = np.full((7, 64, 64), np.nan, np.float32)
     path = changed(replay, tmp_path / "empty.npz", depth_m=nothing_m)
-    assert export_objects(path, tmp_path / "out", ["ply"], stop=Event()) == 0
+    with pytest.raises(RecordingError, match="no hidden surface"):
+        export_objects(path, tmp_path / "out", ["ply"], stop=Event())
+    assert not (tmp_path / "out").exists()
 
 
 @pytest.mark.parametrize("content", [b"", b"PK\x03\x04 cut", b"text"])

@@ -1,0 +1,132 @@
+"""Someone takes a recording's frames to another program."""
+
+import csv
+import json
+import struct
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+import trimesh
+
+from nlos_cam.camera import Sample
+from nlos_cam.recording import SAMPLE, BagReader
+from nlos_cam.recording.export import PngSink
+
+Run = Callable[..., Any]
+Remake = Callable[..., Path]
+Messages = Iterable[tuple[int, bytes]]
+FRAMES_END = "/image/data"
+
+
+def number_of(raw: bytes) -> int:
+    return int.from_bytes(raw[:4], "little")
+
+
+def odd_frames(topic: str, time_ns: int, raw: bytes) -> Messages:
+    if not topic.endswith(FRAMES_END) or number_of(raw) % 2:
+        yield time_ns, raw
+
+
+def depth_alone(topic: str, time_ns: int, raw: bytes) -> Messages:
+    if "Confidence" not in topic and "Infrared" not in topic:
+        yield time_ns, raw
+
+
+def numbers(stream: str) -> list[int]:
+    with Path("out", f"{stream}.csv").open(encoding="utf-8") as file:
+        return [int(row["frame_number"]) for row in csv.DictReader(file)]
+
+
+def test_export_counts_frames_not_their_numbers(remake: Remake, run: Run, noise: Path) -> None:
+    run("export", remake(odd_frames, source=noise), "--every", 2, "--out", "out")
+    assert numbers("depth") == list(range(1, 40, 4))
+    assert numbers("infrared") == numbers("depth")
+    assert numbers("confidence") == numbers("depth")
+
+
+def test_export_chooses_whole_sets_beside_gaps(remake: Remake, run: Run, noise: Path) -> None:
+    def with_gap(topic: str, time_ns: int, raw: bytes) -> Messages:
+        if not ("Infrared" in topic and topic.endswith(FRAMES_END) and number_of(raw) == 3):
+            yield time_ns, raw
+
+    run("export", remake(with_gap, source=noise), "--every", 2, "--out", "out")
+    assert numbers("infrared") == numbers("depth") == list(range(0, 40, 2))
+
+
+def test_cloud_needs_depth_alone(remake: Remake, run: Run) -> None:
+    run("export", SAMPLE, "--ply", "--out", "whole")
+    found = run("export", remake(depth_alone), "--ply", "--out", "out")["frames"]
+    assert found == {"depth": 8, "points": 8}
+    clouds = [
+        np.asarray(trimesh.load(next(Path(folder, "points").iterdir())).vertices)
+        for folder in ("whole", "out")
+    ]
+    np.testing.assert_array_equal(*clouds)
+
+
+def test_cloud_without_depth_is_refused(remake: Remake, run: Run) -> None:
+    def without_depth(topic: str, time_ns: int, raw: bytes) -> Messages:
+        if "Depth" not in topic:
+            yield time_ns, raw
+
+    path = remake(without_depth)
+    assert "no depth" in run("export", path, "--ply", "--out", "out", code=4).err
+    assert not Path("out").exists()
+
+
+@pytest.mark.parametrize("encoding", ["yuyv", "uyvy"])
+def test_yuv_becomes_8_bit_color(encoding: str) -> None:
+    # Y = 120, Cb = 90 and Cr = 180 in the range of video, by ITU-R BT.601: 1.164 (Y - 16) is 121.
+    rgb = [121 + 1.596 * 52, 121 - 0.391 * -38 - 0.813 * 52, 121 + 2.018 * -38]
+    luma = np.full((360, 640), 120, np.uint8)
+    chroma = np.where(np.arange(640) % 2, 180, 90) + 0 * luma
+    pair = (luma, chroma) if encoding == "yuyv" else (chroma, luma)
+    pixels = np.stack(pair, -1).astype(np.uint8).view("<u2")[..., 0]
+    sink = PngSink(Path(), "color", encoding)
+    sink.add(Sample("color", 0, 0.0, pixels))
+    sink.close()
+    image = cv2.imread("color/000000.png", cv2.IMREAD_UNCHANGED)
+    assert (image.shape, image.dtype) == ((360, 640, 3), np.uint8)
+    np.testing.assert_allclose(image[..., ::-1], np.broadcast_to(rgb, image.shape), atol=2)
+
+
+def test_recorded_yuyv_is_exported_as_color(remake: Remake, run: Run, noise: Path) -> None:
+    def as_yuyv(topic: str, time_ns: int, raw: bytes) -> Messages:
+        if "Infrared" in topic:  # two bytes a pixel: half as wide
+            raw = raw.replace(b"8UC1", b"YUYV", 1)
+            raw = raw.replace(struct.pack("<II", 48, 64), struct.pack("<II", 48, 32), 1)
+        yield time_ns, raw
+
+    path = remake(as_yuyv, source=noise)
+    run("export", path, "--streams", "infrared", "--out", "out")
+    image = cv2.imread("out/infrared/000000.png", cv2.IMREAD_UNCHANGED)
+    assert (image.shape, image.dtype) == ((48, 32, 3), np.uint8)
+
+
+def test_export_holds_distortion_and_pose(run: Run) -> None:
+    run("export", SAMPLE, "--out", "out")
+    streams = json.loads(Path("out/export.json").read_text())["streams"]
+    bag = BagReader(SAMPLE)
+    for name, stream in streams.items():
+        model, coefficients = bag.lens(name)
+        assert stream["distortion"] == {"model": model, "coefficients": coefficients.tolist()}
+        assert stream["pose"]["in_frame_of"] == "depth"
+        np.testing.assert_array_equal(stream["pose"]["matrix"], bag.pose("depth", name))
+
+
+def test_surfaces_are_counted_not_their_numbers(run: Run) -> None:
+    depth_m = np.full((6, 64, 64), np.nan, np.float32)
+    depth_m[:, 20:30, 20:30] = 0.2
+    box = {"origin_m": [0.1, 0.1], "pitch_m": [0.002, -0.002], "z_near_m": 0.15, "z_far_m": 0.3}
+    numbers = 2 * np.arange(6) + 1
+    np.savez("r.npz", depth_m=depth_m, uncertainty_m=depth_m, frame_number=numbers, **box)
+    run("export", "r.npz", "--object", "csv", "--every", 2, "--out", "out")
+    assert sorted(path.name for path in Path("out").iterdir()) == [
+        "000001.csv",
+        "000005.csv",
+        "000009.csv",
+    ]
