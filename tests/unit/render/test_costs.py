@@ -1,5 +1,6 @@
 """Seconds that each effect of a rendering costs."""
 
+import sys
 from unittest.mock import Mock
 
 import numpy as np
@@ -27,7 +28,7 @@ def test_costs_are_the_seconds_that_each_effect_adds(monkeypatch: pytest.MonkeyP
     def priced(_scene: Scene, _accuracy: str, effects: list[str], _backend: str) -> None:
         now[0] += sum(PRICES[name] for name in effects)
 
-    monkeypatch.setattr("nlos_cam.render.costs.render", priced)
+    monkeypatch.setattr(sys.modules[costs.__module__], "render", priced)
     found = costs(scene, "standard", plan, clock=lambda: now[0])
     expected = [PRICES[effect.name] if effect.included else 0.0 for effect in plan]
     assert list(found) == [effect.name for effect in plan]
