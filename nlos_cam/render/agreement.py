@@ -35,6 +35,7 @@ class EchoMaps:
     @classmethod
     def of_cells(cls, rendering: Rendering, scene: Scene) -> Self:
         """Return the maps (64, 80), for renderings with different numbers of beams per cell."""
+        # The reported depth is along the camera's axis; the path is there and back along the beam.
         depth = rendering.depth_m.ravel()
         cos_axis = cast(scene.rig, scene.cell_intrinsics).cos_axis
         return cls(rendering.intensity.ravel(), 2 * depth / cos_axis, depth)
@@ -64,6 +65,7 @@ def relative_error(found: Floating, truth: Floating) -> Floating:
     """Return |found - truth| / truth (n,); where the truth is 0, 0 if nothing was found and else
     1.
     """
+    # Light where there should be none is wrong by all of it, whatever its amount.
     off = np.abs(found - truth)
     return np.divide(off, truth, out=(off > 0).astype(off.dtype), where=truth > 0)
 
@@ -72,9 +74,8 @@ def agreement(found: EchoMaps, truth: EchoMaps, bin_m: float) -> Agreement:
     """Return the agreement of echoes (at least one) with the true ones."""
     error = relative_error(found.intensity, truth.intensity)
     bins = np.abs(found.path_m - truth.path_m) / bin_m
-    bins[np.isnan(found.path_m) & np.isnan(truth.path_m)] = (
-        0  # NaN of one alone is in no bin of the other
-    )
+    # Nothing in both agrees. NaN of one alone stays NaN, which is within no number of bins.
+    bins[np.isnan(found.path_m) & np.isnan(truth.path_m)] = 0
     depth = 1000 * np.abs(found.depth_m - truth.depth_m)
     depth = depth[~np.isnan(depth)]
     return Agreement(

@@ -22,6 +22,43 @@ MAX_PATHS = 3e10
 """Some minutes of computing."""
 
 
+class PathRules(NamedTuple):
+    """Constants of every path."""
+
+    near_m: float
+    lambertian: bool
+    bin_m: float
+    bins: int
+
+
+class Ends(NamedTuple):
+    """Both ends of the paths that meet the object twice."""
+
+    incident: Float64
+    """(beams, patches); light that the first patch gives on."""
+    there_m: Float64
+    """(beams, patches); d1 + d2."""
+    returned: Float64
+    """(patches, cells); share that reaches the lidar from the second patch over a relay cell."""
+    back_m: Float64
+    """(patches, cells); d3 + d4."""
+
+
+class Detours(NamedTuple):
+    """Ways between two patches, directly or over the wall."""
+
+    point_m: Float64
+    """(patches, 3)."""
+    factor: Float64
+    """(patches, patches); form factors from patch to patch."""
+    there: Float64
+    """(patches, wall cells); form factors to the wall."""
+    back: Float64
+    """(patches, wall cells); form factors from the wall."""
+    to_wall_m: Float64
+    """(patches, wall cells)."""
+
+
 def more_paths(job: TransportJob, incident: Float64, returned: Float64) -> Float64:
     """Return histograms (n, bins) of the paths that meet the object twice.
 
@@ -29,6 +66,7 @@ def more_paths(job: TransportJob, incident: Float64, returned: Float64) -> Float
     m) the share of it that reaches the lidar over each relay cell. Raises SceneError for more than
     MAX_PATHS.
     """
+    # Two ends that are known, joined by a form factor: one term of the Neumann series more.
     point = job.patches.point_m
     cells = wall_cells(job)
     count = incident.size * returned.size * len(cells)
@@ -43,26 +81,18 @@ def more_paths(job: TransportJob, incident: Float64, returned: Float64) -> Float
     d2 = np.linalg.norm(job.laser_spot_m[:, None] - point, axis=-1) + job.length_m[:, None]
     d3 = np.linalg.norm(point[:, None] - relay, axis=-1) + job.relay.length_m
     to_wall = np.linalg.norm(point[:, None] - cells, axis=-1)
-    factors = object_factors(job)
-    return _sum(
-        incident, d2, returned, d3, factors, point, there, back, to_wall, job.bin_m, job.bins
-    )
+    detours = Detours(point, object_factors(job), there, back, to_wall)
+    return _sum(Ends(incident, d2, returned, d3), detours, _rules(job))
 
 
 @numba.njit(cache=True, parallel=True)
-def _sum(
-    incident: Float64,
-    d2: Float64,
-    returned: Float64,
-    d3: Float64,
-    factors: Float64,
-    points: Float64,
-    there: Float64,
-    back: Float64,
-    to_wall: Float64,
-    bin_m: float,
-    bins: int,
-) -> Float64:
+def _sum(paths: Ends, detours: Detours, rules: PathRules) -> Float64:
+    """Return histograms (n, bins) of all paths spot -> a -> b -> relay cell, and over the wall."""
+    incident = paths.incident
+    returned = paths.returned
+    points = detours.point_m
+    to_wall = detours.to_wall_m
+    bins = rules.bins
     histogram = np.zeros((len(incident), bins))
     for p in numba.prange(len(incident)):
         for a in range(len(points)):
@@ -71,19 +101,19 @@ def _sum(
             for b in range(len(points)):
                 away = np.sqrt(((points[a] - points[b]) ** 2).sum())
                 for q in range(returned.shape[1]):
-                    ends = d2[p, a] + d3[b, q]
+                    ends = paths.there_m[p, a] + paths.back_m[b, q]
                     light = incident[p, a] * returned[b, q]
                     if light == 0:
                         continue
-                    k = int(np.floor((ends + away) / bin_m))
+                    k = int(np.floor((ends + away) / rules.bin_m))
                     if k < bins:
                         # Spot -> a -> b -> relay cell, and below spot -> a -> wall -> b -> relay
                         # cell.
-                        histogram[p, k] += light * factors[a, b]
-                    for w in range(there.shape[1]):
-                        k = int(np.floor((ends + to_wall[a, w] + to_wall[b, w]) / bin_m))
+                        histogram[p, k] += light * detours.factor[a, b]
+                    for w in range(to_wall.shape[1]):
+                        k = int(np.floor((ends + to_wall[a, w] + to_wall[b, w]) / rules.bin_m))
                         if k < bins:
-                            histogram[p, k] += light * there[a, w] * back[b, w]
+                            histogram[p, k] += light * detours.there[a, w] * detours.back[b, w]
     return histogram
 
 
@@ -136,9 +166,7 @@ def legs(
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _incident(
-    spot: Float64, patches: PatchArrays, s: int, near_m: float, lambertian: bool
-) -> float:
+def _incident(spot: Float64, patches: PatchArrays, s: int, rules: PathRules) -> float:
     """Return the factors of S2 on the leg from a laser spot to a patch: the light that the patch
     gives on.
     """
@@ -146,14 +174,14 @@ def _incident(
     to_spot = spot - patches.point_m[s]
     d2 = np.sqrt((to_spot**2).sum())
     cos_2 = (patches.normal[s] * to_spot).sum() / d2
-    incident = patches.strength[s] * cos_2 / softened_leg(d2**2, patches.soft_m2[s], near_m)
+    incident = patches.strength[s] * cos_2 / softened_leg(d2**2, patches.soft_m2[s], rules.near_m)
     # The rendering equation has the cosine at which the light leaves the wall too: z / d2.
-    return incident * patches.point_m[s, 2] / d2 if lambertian else incident
+    return incident * patches.point_m[s, 2] / d2 if rules.lambertian else incident
 
 
 @numba.njit(cache=True, error_model="numpy")
 def _returned(
-    patches: PatchArrays, s: int, cells: Cells, q: int, near_m: float, lambertian: bool
+    patches: PatchArrays, s: int, cells: Cells, q: int, rules: PathRules
 ) -> tuple[float, float]:
     """Return the factors of S2 on the leg from a patch over a relay cell to the lidar, and d3."""
     # Number by number: numba counts references to each array that is unpacked, ten times a path's
@@ -167,10 +195,12 @@ def _returned(
     dx = cells.x_m[q] - px
     dy = cells.y_m[q] - py
     facing = nx * dx + ny * dy - nz * z
+    # S2: cos t3 / d3^2 with the wall's cosine z / d3, and d3^2 limited at contact. The rendering
+    # equation has the patch's cosine too.
     squared = dx**2 + dy**2 + z**2
     d3 = np.sqrt(squared)
-    returned = cells.weight[q] * (z / d3) / softened_leg(squared, cells.soft_m2, near_m)  # cos t3
-    return (returned * facing / d3 if lambertian else returned), d3
+    returned = cells.weight[q] * (z / d3) / softened_leg(squared, cells.soft_m2, rules.near_m)
+    return (returned * facing / d3 if rules.lambertian else returned), d3
 
 
 @numba.njit(cache=True, parallel=True)
@@ -191,6 +221,8 @@ def scattering(
             dy = y[q] - point[1]
             d3 = max(np.sqrt(dx**2 + dy**2 + point[2] ** 2), 1e-12)
             cos_out = max((normal[0] * dx + normal[1] * dy - normal[2] * point[2]) / d3, 0.0)
+            # The lobe is about the incoming direction itself (retroreflective), or about its mirror
+            # image r = 2 (n . u) n - u: r . v = 2 cos_in cos_out - u . v.
             axis = (to_spot[0] * dx + to_spot[1] * dy - to_spot[2] * point[2]) / d3
             if brdf.mirrored:
                 axis = 2 * cos_in * cos_out - axis
@@ -204,38 +236,35 @@ def _paths(
     patches: PatchArrays,
     cells: Cells,
     factor: Float64,
-    near_m: float,
-    lambertian: bool,
-    bin_m: float,
-    bins: int,
+    rules: PathRules,
 ) -> Float64:
     """Return histograms (n, bins): for each path p, s, q its weight (S2) in the bin of its length
-    (S4).
+    (S4). `factor` (patches, cells) is the BRDF, empty for a Lambertian surface.
     """
-    histogram = np.zeros((len(spots.point_m), bins))
+    histogram = np.zeros((len(spots.point_m), rules.bins))
     for p in numba.prange(len(spots.point_m)):
         for s in range(len(patches.row)):
             if not spots.lit[s, p]:
                 continue
             # A(p, s) B(s, q) is S2 in two factors; here no sum uses that they separate.
-            a = spots.weight[p] * _incident(spots.point_m[p], patches, s, near_m, lambertian)
+            a = spots.weight[p] * _incident(spots.point_m[p], patches, s, rules)
             d2 = np.sqrt(((spots.point_m[p] - patches.point_m[s]) ** 2).sum())
             for q in range(len(cells.x_m)):
                 if not cells.visible[s, q]:
                     continue
-                b, d3 = _returned(patches, s, cells, q, near_m, lambertian)
+                b, d3 = _returned(patches, s, cells, q, rules)
                 if factor.size:
                     b *= factor[s, q]
                 # S4: the bin is the floor of the whole path over the bin's width.
-                k = int(np.floor((spots.length_m[p] + d2 + d3 + cells.length_m[q]) / bin_m))
-                if k < bins:
+                k = int(np.floor((spots.length_m[p] + d2 + d3 + cells.length_m[q]) / rules.bin_m))
+                if k < rules.bins:
                     histogram[p, k] += a * b
     return histogram
 
 
 @numba.njit(cache=True)
 def _ends(
-    spots: Spots, patches: PatchArrays, cells: Cells, near_m: float, lambertian: bool
+    spots: Spots, patches: PatchArrays, cells: Cells, rules: PathRules
 ) -> tuple[Float64, Float64]:
     """Return both ends of every path: incident (beams, patches) and returned (patches, cells)."""
     incident = np.zeros((len(spots.point_m), len(patches.row)))
@@ -243,12 +272,11 @@ def _ends(
     for s in range(len(patches.row)):
         for p in range(len(spots.point_m)):
             if spots.lit[s, p]:
-                incident[p, s] = spots.weight[p] * _incident(
-                    spots.point_m[p], patches, s, near_m, lambertian
-                )
+                light = _incident(spots.point_m[p], patches, s, rules)
+                incident[p, s] = spots.weight[p] * light
         for q in range(len(cells.x_m)):
             if cells.visible[s, q]:
-                returned[s, q], _ = _returned(patches, s, cells, q, near_m, lambertian)
+                returned[s, q], _ = _returned(patches, s, cells, q, rules)
     return incident, returned
 
 
@@ -257,7 +285,7 @@ def histograms(job: TransportJob) -> Float64:
     cells = _cells(job)
     more: Float64 | float = 0.0
     if job.more_bounces:  # first: it refuses jobs that would take too long
-        ends = _ends(_spots(job, slice(None)), job.patch_arrays, cells, job.near_m, job.lambertian)
+        ends = _ends(_spots(job, slice(None)), job.patch_arrays, cells, _rules(job))
         more = more_paths(job, *ends)
     return _three_bounces(job, cells) + more
 
@@ -278,9 +306,13 @@ def _three_bounces(job: TransportJob, cells: Cells) -> Float64:
             spot = job.laser_spot_m[which.start]
             gain = job.brdf.gain
             factor = scattering(job.brdf, gain, spot, patches, cells.x_m, cells.y_m)
-        settings = job.near_m, job.lambertian, job.bin_m, job.bins
-        histogram[which] = _paths(_spots(job, which), patches, cells, factor, *settings)
+        spots = _spots(job, which)
+        histogram[which] = _paths(spots, patches, cells, factor, _rules(job))
     return histogram
+
+
+def _rules(job: TransportJob) -> PathRules:
+    return PathRules(job.near_m, job.lambertian, job.bin_m, job.bins)
 
 
 def _spots(job: TransportJob, which: slice) -> Spots:

@@ -8,7 +8,7 @@ of the bounds of `visibility` and its exact walk, for many legs at a time.
 """
 
 from collections.abc import Iterator, Sequence
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 import torch
@@ -57,10 +57,6 @@ class TorchSites(NamedTuple):
     """(n, FACES); row of the fields in which the patch stands."""
     across: Tensor
     """(n, FACES); position of the patch across the walk."""
-
-    def part(self, start: int, end: int) -> "TorchSites":
-        """Return the patches [start, end)."""
-        return TorchSites(*(column[start:end] for column in self))
 
 
 def lay_out(jobs: Sequence[TransportJob], device: torch.device) -> tuple[TorchFields, TorchSites]:
@@ -114,8 +110,12 @@ def shade(
     far = torch.maximum(u.abs(), v.abs())
     tilt = torch.where(along_columns, v, u).div_(far.clamp(min=1e-20))
     sector = _sector(tilt, along_columns, torch.where(along_columns, u, v) < 0, fields.sectors)
+    # Along a leg the height falls in proportion to the distance, z / far a cell: blocked below the
+    # horizon's lower bound of its sector, free above the upper one, and walked in between.
     meets = (sites.depth_m < sites.high.gather(1, sector).mul_(far)) & (weight != 0)
-    for some in meets.flatten().nonzero()[:, 0].split(max(chunk // max(fields.steps, 1), 1)):
+    # A walk has `steps` numbers for each leg, so that fewer legs go together.
+    together = max(chunk // max(fields.steps, 1), 1)
+    for some in meets.flatten().nonzero()[:, 0].split(together):
         which = some // weight.shape[1]
         legs = which, sector.flatten()[some], tilt.flatten()[some], far.flatten()[some]
         hidden = sites.depth_m[which, 0] < sites.low[legs[:2]] * legs[3]
@@ -126,9 +126,9 @@ def shade(
 
 def _sector(tilt: Tensor, along_columns: Tensor, backward: Tensor, sectors: int) -> Tensor:
     """Return the index of the sector, of FACES * sectors, that holds each direction."""
-    inside = torch.add(sectors / 2, tilt, alpha=sectors / 2).clamp_(
-        max=sectors - 1
-    )  # floored when made whole
+    # Sectors divide a face's tilts from -1 to 1 evenly; the sum is floored when it is made whole.
+    # The faces stand in the order of `lay_out`: along columns, back, along rows, back.
+    inside = torch.add(sectors / 2, tilt, alpha=sectors / 2).clamp_(max=sectors - 1)
     return (
         inside + torch.where(along_columns, 0.0, 2.0 * sectors) + backward * float(sectors)
     ).long()
@@ -155,6 +155,7 @@ def blocked(
     near = fields.depth_m[row + cell.clamp(0, fields.across - 1)]
     beyond = fields.depth_m[row + (cell + 1).clamp(0, fields.across - 1)]
     between = near + share * (beyond - near)
+    # Beside background (NaN) the nearer of the two cells counts.
     between = torch.where(between.isnan(), torch.where(share < 0.5, near, beyond), between)
     depth = sites.depth_m[which]
     # (z - z' - bias) / k > z / far, multiplied by k. NaN compares false.
@@ -176,17 +177,12 @@ class TorchSurface(NamedTuple):
     @classmethod
     def of(cls, jobs: Sequence[TransportJob], device: torch.device) -> "TorchSurface":
         """Return the patches of all jobs, one after another."""
-        columns = [
-            np.column_stack([j.patches.point_m, j.patches.normal, j.soft_patch_m2, j.strength]).T[
-                ..., None
-            ]
+        rows = [
+            np.column_stack([j.patches.point_m, j.patches.normal, j.soft_patch_m2, j.strength])
             for j in jobs
         ]
-        return cls(*torch.as_tensor(np.concatenate(columns, 1).astype(np.float32), device=device))
-
-    def part(self, start: int, end: int) -> "TorchSurface":
-        """Return the patches [start, end)."""
-        return TorchSurface(*(column[start:end] for column in self))
+        columns = np.concatenate(rows).T[..., None].astype(np.float32)  # (8, n, 1)
+        return cls(*torch.as_tensor(columns, device=device))
 
 
 class TorchPoints(NamedTuple):
@@ -202,9 +198,13 @@ class TorchPoints(NamedTuple):
         """Return the columns as float32 on a device."""
         return cls(*torch.as_tensor(np.stack(columns).astype(np.float32), device=device))
 
-    def part(self, start: int, end: int) -> "TorchPoints":
-        """Return the points [start, end)."""
-        return TorchPoints(*(column[start:end] for column in self))
+
+Columns = TypeVar("Columns", TorchSites, TorchSurface, TorchPoints)
+
+
+def part(columns: Columns, start: int, end: int) -> Columns:
+    """Return the rows [start, end) of columns of patches or points."""
+    return type(columns)(*(column[start:end] for column in columns))
 
 
 class TorchOptics(NamedTuple):
@@ -243,13 +243,18 @@ def legs(
     # temporary tensors.
     squared = torch.addcmul(z * z, dx, dx).addcmul_(dy, dy)
     length = squared.sqrt()
-    facing = torch.addcmul(-surface.normal_z * z, surface.normal_x, dx).addcmul_(
-        surface.normal_y, dy
-    )
+    facing = torch.addcmul(-surface.normal_z * z, surface.normal_x, dx)
+    facing.addcmul_(surface.normal_y, dy)
     passes = facing > 0
     if np.isfinite(optics.edge_m[0]):
         passes &= ~_cut(surface, wall, optics.edge_m)
-    cosine = z * facing / length if optics.lambertian else z if outgoing else facing
+
+    # S2 has one cosine over d^2: the weight is (cosine d) / (d^2 d), with d^2 limited at contact as
+    # in `geometry.softened`.
+    if optics.lambertian:
+        cosine = z * facing / length
+    else:
+        cosine = z if outgoing else facing
     if optics.near:
         soft = optics.soft_wall_m2 if outgoing else surface.soft_m2
         squared += soft * (1 - squared / optics.near_m2).clamp_(min=0).square_()
@@ -315,6 +320,7 @@ def histograms_of_all(jobs: Sequence[TransportJob], device: torch.device) -> lis
     """
     alike: dict[object, list[int]] = {}
     found: dict[int, Float32] = {}
+    # A key that no job shares, its own index, keeps it apart.
     for index, job in enumerate(jobs):
         if job.brdf is None:
             alike.setdefault(_shared(job) or index, []).append(index)
@@ -334,13 +340,12 @@ def _shared(job: TransportJob) -> tuple[object, ...] | None:
     """
     if job.more_bounces:
         return None
+    # One relay and one set of beams for all, one kind of leg, and grids of one shape (`lay_out`).
     relay = job.relay
     field = job.field
     feet = job.laser_spot_m, job.length_m, job.beam_weight
-    columns = [
-        column.tobytes()
-        for column in (*feet, relay.x_m, relay.y_m, relay.length_m, job.relay_weight)
-    ]
+    cells = relay.x_m, relay.y_m, relay.length_m, job.relay_weight
+    columns = [column.tobytes() for column in (*feet, *cells)]
     numbers = job.edge_m, job.near_m, job.soft_wall_m2, job.lambertian, job.bin_m, job.accuracy
     return *columns, *numbers, field.depth_m.shape, field.pitch_x_m, field.pitch_y_m
 
@@ -349,13 +354,15 @@ class _Batch:
     """Jobs that differ in the object alone, on a device."""
 
     def __init__(self, jobs: Sequence[TransportJob], device: torch.device) -> None:
-        job = self.job = jobs[0]
+        self.job = jobs[0]
         self.jobs = jobs
         self.device = device
         self.chunk = chunk_for(device)
-        fields, self.sites = (
-            lay_out(jobs, device) if any(j.field.shades for j in jobs) else (None, None)
-        )
+        job = self.job
+        fields = None
+        self.sites = None
+        if any(one.field.shades for one in jobs):
+            fields, self.sites = lay_out(jobs, device)
         self.surface = TorchSurface.of(jobs, device)
         relay = job.relay
         self.relay = TorchPoints.of(
@@ -371,6 +378,7 @@ class _Batch:
             fields,
             self.chunk,
         )
+        # The widest table of the batch serves all: a window is as wide for each.
         self.per_bin = job.accuracy.sub_bins
         self.width = max(table_bins(one)[1] for one in jobs)
         self.per_m = self.per_bin / job.bin_m
@@ -384,8 +392,9 @@ class _Batch:
         """Yield the patches in parts whose legs to a number of points fit in a chunk."""
         count = max(self.chunk // points, 1)
         for start in range(0, len(self.surface.x_m), count):
-            ends = start, start + count
-            yield self.surface.part(*ends), self.sites.part(*ends) if self.sites else None
+            end = start + count
+            sites = part(self.sites, start, end) if self.sites else None
+            yield part(self.surface, start, end), sites
 
     def _tables(self) -> tuple[Tensor, Tensor]:
         """Return first bins (n, 1) and tables (n, per_bin, width)."""
@@ -418,7 +427,7 @@ class _Batch:
         sizes = [len(job.patches.beta) for job in self.jobs]
         count = max(self.chunk // len(first), 1)
         for start in range(0, len(feet.x_m), count):
-            some = feet.part(start, start + count)
+            some = part(feet, start, start + count)
             # A(p, s) over d1 + d2: the shift in whole bins and the row of the table, as in
             # `backend_numba`.
             weight, length = legs(self.surface, self.sites, some, self.optics, outgoing=False)
@@ -429,6 +438,7 @@ class _Batch:
                 sub_bin // self.per_bin + first,
                 weight * self.surface.strength,
             )
+            # Legs of all patches at once; a beam sums the patches of one object at a time.
             by_job = zip(*(column.split(sizes) for column in columns), strict=True)
             for histogram, (rows, shift, at, a) in zip(found, by_job, strict=True):
                 histogram[start : start + count] = shifted_sum(
@@ -444,6 +454,7 @@ def counted(at: Tensor, weight: Tensor, size: int) -> Tensor:
     """
     # Integer addition is associative and float addition is not: atomic adds of integers give the
     # same bits every time.
+    # A step is 2^-44 of the row's largest weight: far below the last bit of its float32.
     step = weight.amax(1, keepdim=True).double().clamp_(min=1e-300) / WHOLE_STEPS
     total = torch.zeros((len(at), size), dtype=torch.int64, device=at.device)
     return (total.scatter_add_(1, at, (weight / step).long()) * step).float()
@@ -477,10 +488,10 @@ def shifted_sum(table: Tensor, shift: Tensor, at: Tensor, weight: Tensor, bins: 
     found = window_sums(
         windows, (row + (shift * span - late)).T.contiguous(), weight.T.contiguous()
     )
+    # Bins beyond the histogram land in a margin that is cut off.
     placed = torch.zeros((len(found), bins + span), device=at.device)
-    placed.scatter_(
-        1, earliest.clamp(max=bins)[:, None].long() + torch.arange(span, device=at.device), found
-    )
+    into = earliest.clamp(max=bins)[:, None].long() + torch.arange(span, device=at.device)
+    placed.scatter_(1, into, found)
     return placed[:, :bins]
 
 
@@ -493,6 +504,7 @@ def window_sums(windows: Tensor, start: Tensor, weight: Tensor) -> Tensor:
     """
     if windows.is_cuda:
         return embedding_bag(start, windows, per_sample_weights=weight, mode="sum")
+    # A batched product of (1, n) by (n, span) for a few beams whose copied windows fit the memory.
     few = max(16 * CPU_CHUNK // max(start.shape[1] * windows.shape[1], 1), 1)
     parts = zip(start.split(few), weight.split(few), strict=True)
     return torch.cat([torch.bmm(some[:, None], windows[where])[:, 0] for where, some in parts])

@@ -39,12 +39,15 @@ def costs(
     """
     names = [effect.name for effect in plan if effect.included]
 
+    # An effect's own cost is what a rendering saves without it. Effects share work, so the costs do
+    # not add up to the whole; noise may make one negative.
     def least(effects: list[str]) -> float:
         return least_seconds(lambda: render(scene, accuracy, effects, backend), REPEATS, clock)
 
     least(names)  # compiles
     whole = least(names)
-    added = {
-        name: max(whole - least([other for other in names if other != name]), 0.0) for name in names
-    }
-    return {effect.name: added.get(effect.name, 0.0) for effect in plan}
+
+    def added(name: str) -> float:
+        return max(whole - least([other for other in names if other != name]), 0.0)
+
+    return {effect.name: added(effect.name) if effect.included else 0.0 for effect in plan}

@@ -3,7 +3,7 @@ follows.
 """
 
 from collections.abc import Collection
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Literal
 
 from nlos_cam.errors import SceneError, UnknownNameError, did_you_mean
@@ -70,6 +70,7 @@ def decide(
 
 
 def _asked(findings: Collection[tuple[str, float, str]], effects: Collection[str]) -> Plan:
+    """Return the plan with exactly some effects, each with its bound all the same."""
     names = {effects} if isinstance(effects, str) else set(effects)
     if unknown := names - set(EFFECTS):
         near = did_you_mean(min(unknown), EFFECTS)
@@ -81,8 +82,8 @@ def _asked(findings: Collection[tuple[str, float, str]], effects: Collection[str
             f"effects {', '.join(sorted(names)) or 'none'}: no light arrives: add direct or"
             " three-bounce"
         )
-    verdicts = (Effect(name, name in names, reason, bound) for name, bound, reason in findings)
-    return tuple(
-        replace(e, reason=f"{'requested' if e.included else 'left out on request'}; {e.reason}")
-        for e in verdicts
-    )
+    verdicts: list[Effect] = []
+    for name, bound, reason in findings:
+        why = "requested" if name in names else "left out on request"
+        verdicts.append(Effect(name, name in names, f"{why}; {reason}", bound))
+    return tuple(verdicts)

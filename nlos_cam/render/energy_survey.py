@@ -7,6 +7,7 @@ whole.
 """
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numba
 import numpy as np
@@ -23,6 +24,28 @@ SAMPLE_BEAMS = 160
 SAMPLE_CELLS = 96
 CAUTION = 1.5
 """Factor on every surveyed change before it is used as a bound."""
+
+
+class SurveyPatches(NamedTuple):
+    """Patches (n) as the compiled sum takes them."""
+
+    point_m: Float64
+    """(n, 3)."""
+    normal: Float64
+    """(n, 3)."""
+    beta: Float64
+    soft_m2: Float64
+    """Near-contact term of the leg's receiver."""
+
+
+class SurveyPoints(NamedTuple):
+    """Points (m) of the wall: laser spots or relay cells."""
+
+    x_m: Float64
+    y_m: Float64
+    weight: Float64
+    hidden: NDArray[np.bool_]
+    """True where the occluder cuts the leg to the lidar."""
 
 
 @dataclass(frozen=True)
@@ -51,6 +74,7 @@ class EnergySurvey:
         """Return a bound on the relative change of the whole, at most 1, for a change of each
         patch's energy (n,).
         """
+        # A BRDF may give the changed patches up to `uneven` times the others' light.
         whole = float(self.energy.sum())
         part = CAUTION * self.uneven * float(change.sum())
         return min(part / whole, 1.0) if whole > 0 else float(part > 0)
@@ -78,33 +102,30 @@ def survey(job: TransportJob, uneven: float) -> EnergySurvey:
 
     `uneven` is the largest ratio of light between two patches that a BRDF may cause.
     """
-    patches = job.patches
     relay = job.relay
     lit = slice(None, None, max(len(job.laser_spot_m) // SAMPLE_BEAMS, 1))
     some = slice(None, None, max(len(relay.x_m) // SAMPLE_CELLS, 1))
-    shape = (patches.point_m, patches.normal, patches.beta)
-    start = job.beam_weight[lit]
-    feet = job.laser_spot_m[lit, 0], job.laser_spot_m[lit, 1], start, np.zeros(len(start), np.bool_)
-    cells = (
+    weight = job.beam_weight[lit]
+    # Every leg from a spot's beam to the lidar is free: the beam would not light the wall else.
+    feet = _contiguous(
+        job.laser_spot_m[lit, 0], job.laser_spot_m[lit, 1], weight, np.zeros(len(weight), np.bool_)
+    )
+    cells = _contiguous(
         relay.x_m[some],
         relay.y_m[some],
         job.relay_weight[some],
         relay.behind(job.edge_m, job.lidar_m)[some],
     )
+
+    # The near-contact term belongs to the leg's receiver: the patch, then the relay cell.
+    patches = job.patches
+    lit_patches = SurveyPatches(patches.point_m, patches.normal, patches.beta, job.soft_patch_m2)
     soft_wall = np.full_like(patches.beta, job.soft_wall_m2)
-    incident = _sums(
-        *shape,
-        *_contiguous(*feet),
-        job.soft_patch_m2,
-        job.near_m,
-        *job.edge_m,
-        job.lambertian,
-        False,
-    )
-    returned = _sums(
-        *shape, *_contiguous(*cells), soft_wall, job.near_m, *job.edge_m, job.lambertian, True
-    )
-    scale = job.strength / len(start)
+    edge = job.near_m, *job.edge_m, job.lambertian
+    incident = _sums(lit_patches, feet, *edge, False)
+    returned = _sums(lit_patches._replace(soft_m2=soft_wall), cells, *edge, True)
+    # Sums over samples: their scale cancels in every share.
+    scale = job.strength / len(weight)
     return EnergySurvey(
         incident[0] * scale,
         returned[0],
@@ -116,11 +137,9 @@ def survey(job: TransportJob, uneven: float) -> EnergySurvey:
     )
 
 
-def _contiguous(
-    x: Float64, y: Float64, weight: Float64, hidden: NDArray[np.bool_]
-) -> tuple[Float64, Float64, Float64, NDArray[np.bool_]]:
+def _contiguous(x: Float64, y: Float64, weight: Float64, hidden: NDArray[np.bool_]) -> SurveyPoints:
     """Return points of the wall in one layout, so that `_sums` is compiled once."""
-    return (
+    return SurveyPoints(
         np.ascontiguousarray(x),
         np.ascontiguousarray(y),
         np.ascontiguousarray(weight),
@@ -130,14 +149,8 @@ def _contiguous(
 
 @numba.njit(cache=True, parallel=True, error_model="numpy", fastmath={"contract", "reassoc", "nsz"})
 def _sums(
-    points: Float64,
-    normals: Float64,
-    beta: Float64,
-    x: Float64,
-    y: Float64,
-    weight: Float64,
-    hidden: NDArray[np.bool_],
-    soft: Float64,
+    patches: SurveyPatches,
+    wall: SurveyPoints,
     near_m: float,
     edge_x: float,
     edge_z: float,
@@ -147,16 +160,20 @@ def _sums(
     """Return sums (3, n) over points of the wall: light, its change by tilt, and light that the
     occluder cuts off.
     """
+    points = patches.point_m
+    normals = patches.normal
+    x = wall.x_m
+    y = wall.y_m
     sums = np.zeros((3, len(points)))
     for s in numba.prange(len(points)):
         point_x = points[s, 0]
         point_y = points[s, 1]
         z = points[s, 2]
-        area = beta[s]
+        area = patches.beta[s]
         normal_x = normals[s, 0]
         normal_y = normals[s, 1]
         behind = normals[s, 2] * z
-        softest = soft[s]
+        soft = patches.soft_m2[s]
         seen = 0.0
         changed = 0.0
         cut = 0.0
@@ -171,19 +188,22 @@ def _sums(
             # Incident light goes with the patch's cosine and area; returned light goes with it in
             # Lambertian radiometry, and in the paper's only with the side that is lit. A level
             # patch has cos = z / d and area / beta.
-            bent = (tilted if lambertian else (1.0 if tilted > 0 else 0.0)) if outgoing else tilted
-            level = (
-                (at_wall if lambertian else (1.0 if at_wall > 0 else 0.0))
-                if outgoing
-                else at_wall / area
-            )
+            bent = tilted
+            level = at_wall
+            if not outgoing:
+                level = at_wall / area
+            elif not lambertian:
+                bent = 1.0 if tilted > 0 else 0.0
+                level = 1.0 if at_wall > 0 else 0.0
+            # The wall's own cosine: of received light always, of emitted light in Lambertian
+            # radiometry.
             slant = at_wall if outgoing or lambertian else 1.0
-            light = weight[w] * slant / softened_leg(squared, softest, near_m)
+            light = wall.weight[w] * slant / softened_leg(squared, soft, near_m)
             # As in `visibility.occluded`, without its branch: the loop is made of vectors.
             crosses = (to_edge * (edge_x - x[w]) < 0) & (
                 z - to_edge / (dx if dx != 0 else 1.0) * z >= edge_z
             )
-            open_share = 0.0 if hidden[w] | crosses else 1.0
+            open_share = 0.0 if wall.hidden[w] | crosses else 1.0
             seen += open_share * light * bent
             changed += open_share * light * abs(bent - level)
             cut += (1.0 - open_share) * light * bent
@@ -203,9 +223,11 @@ def occluder_meets(
         return False
     if relay.behind(edge_m, beams.lidar_m).any():
         return True
+
     feet = beams.laser_spot_m[beams.on_wall, 0]
     x = patches.point_m[:, 0]
     z = patches.point_m[:, 2]
+    # The occluder is the half plane x = edge_x, z >= edge_z, parallel to y: heights alone decide.
     # Wall points range from `least` to `most`, interreflection around the object included. The leg
     # to the farthest of them is the highest where it crosses the edge: z (edge - end) / (x - end)
     # by similar triangles.

@@ -54,7 +54,7 @@ MAX_STEP = 0.25
 """Largest step of a lattice, so that two nodes beyond the horizon (at sqrt 2) still lie before the
 map's own edge (at 2).
 """
-LEAST_RAISED = np.float32(1e-4)
+SMALLEST_RAISED = np.float32(1e-4)
 """Smaller factors are left out."""
 CUT_SHARE = 1 / 30
 """Share of the accuracy's error that may be lost by cutting the lobe off."""
@@ -103,12 +103,14 @@ class Chunks(NamedTuple):
 
 def lobe_of(brdf: Brdf, error: float) -> Lobe:
     """Return the lobe of a BRDF for an error (relative L1) of the whole BRDF's values."""
+    # cos^n theta = exp(n log cos theta) is nearly exp(-n theta^2 / 2).
     deviation = 1 / sqrt(brdf.exponent)
     # Cubic interpolation errs by the fourth power of the step. The error may be larger where the
     # lobe is but a part of the light.
     share = max(brdf.specular / max(brdf.diffuse + brdf.specular, 1e-9), 1e-9)
     step = min(deviation * (error / share / INTERPOLATION) ** 0.25, MAX_STEP)
-    # The integral of cos^n beyond the angle where it is e is about e of the whole.
+    # The integral of cos^n beyond the angle where it is e is about e of the whole: with c = cos,
+    # the integral of c^n dc from 0 to e^(1 / n) is e^(1 + 1 / n) / (n + 1).
     cut = (error * CUT_SHARE) ** (1 / brdf.exponent)
     units = round(brdf.exponent * 256)
     return Lobe(
@@ -171,6 +173,7 @@ def _axis(
 @numba.njit(cache=True, error_model="numpy", inline="always")
 def _weights(at: np.float32, weight: Float32) -> None:
     """Fill in Lagrange's weights (4,) of the nodes -1, 0, 1, 2 for a place from 0 to 1."""
+    # Of node k: the product over the other nodes j of (at - j) / (k - j).
     one = np.float32(1)
     two = np.float32(2)
     six = np.float32(6)
@@ -199,6 +202,7 @@ def _multiply_roots(values: Float32, base: Float32, fraction: int) -> None:
 def _power(values: Float32, lobe: Lobe, square: Float32) -> None:
     """Raise cosines to the lobe's exponent, in place, and set those below its cut to 0."""
     # By repeated squaring: whole vectors of products, where a logarithm would be a call for each.
+    # Cosines below the cut, negative ones among them, are 0 to any power: no root of them either.
     for i in range(len(values)):
         square[i] = values[i] if values[i] >= lobe.cut else np.float32(0)
         values[i] = np.float32(1) if values[i] >= lobe.cut else np.float32(0)
@@ -226,6 +230,8 @@ def _cells(
     sub_bins: int,
 ) -> Cells:
     """Return the relay cells to which a patch sends light, with sub-bins from `start` on."""
+    # Dark cells are dropped and the others packed, so that every node of the lattice goes over
+    # whole vectors of light alone. The last chunk is filled up with weight 0.
     room = len(relay.x_m) + CHUNK
     cells = Cells(
         np.zeros(room, np.float32),
@@ -266,6 +272,7 @@ def _cells(
 @inner(error_model="numpy")
 def _chunks(cells: Cells) -> Chunks:
     """Return the mean unit vector of each chunk of cells, and how far from it any of them lies."""
+    # Cells of a chunk are near one another on the wall: their directions lie close together.
     count = len(cells.x) // CHUNK
     chunks = Chunks(
         np.empty(count, np.float32),
@@ -286,6 +293,7 @@ def _chunks(cells: Cells) -> Chunks:
         chunks.x[k] = x
         chunks.y[k] = y
         chunks.z[k] = z
+        # With room for the rounding of float32, so that a bound by it is never too low.
         chunks.reach[k] = np.sqrt(farthest) + np.float32(1e-5)
     return chunks
 
@@ -294,12 +302,14 @@ def _chunks(cells: Cells) -> Chunks:
 def _fill_raised(cosines: Float32, factors: Float32, lobe: Lobe, raised: Float32) -> None:
     """Fill in the factors by which a lobe's values are raised at some cosines to its axes."""
     raised[:] = 1
-    if lobe.raised < LEAST_RAISED:
+    if lobe.raised < SMALLEST_RAISED:
         return
     one = np.float32(1)
     six = np.float32(6)
     three_quarters = np.float32(0.75)
     twice = np.float32(2 * lobe.whole)
+    # Interpolation is too low by LOWERED h^4 times the fourth derivative, so the nodes are raised
+    # by as much: what is added is interpolated along with them.
     # With R = n theta^2 = 2 n (1 - cos theta) the lobe is nearly exp(-R / 2), and the sum of its
     # fourth derivatives along both axes is (6 - 6 R + 3/4 R^2) f, averaged over the turn of the
     # axes, in units of its standard deviation.
@@ -322,13 +332,15 @@ def _count(
 ) -> tuple[int, int]:
     """Count the light of the cells in sub-bins (n, LANES), weighted by the lobes about some axes.
 
-    Return the first sub-bin with light, and the one after the last. `axes` is (4, LANES): unit vectors, and the factor `raised`.
+    Return the first sub-bin with light, and the one after the last. `axes` is (4, LANES): unit
+    vectors, and the factor `raised`.
     """
     first = len(counted)
     last = 0
     raised = np.empty(CHUNK * LANES, np.float32)
     for k in range(len(chunks.x)):
-        # |u . v - u . m| <= |v - m| for unit vectors u.
+        # |u . v - u . m| <= |v - m| <= reach for unit vectors u: if the nearest axis is farther
+        # from the mean m, no cosine of the chunk reaches the cut.
         near = np.float32(-2)
         for lane in range(LANES):
             near = max(
@@ -380,6 +392,7 @@ def _as_rows(
     rest[:] = 0
     if first >= last:
         return
+    # A shift takes sub-bins up to per_bin - 1 earlier: light of bin `last` may fall one bin later.
     begin = first // per_bin
     end = min((last + per_bin - 1) // per_bin + 1, bins)
     low = max(begin - 1, 0) * per_bin
@@ -392,6 +405,7 @@ def _as_rows(
             running += counted[k, lane]
             counted[k, lane] = 0
         total[lane, high] = running
+    # Bin i at a shift is the sum over the sub-bins [i per_bin - shift, (i + 1) per_bin - shift).
     for lane in range(LANES):
         for shift in range(per_bin):
             before = total[lane, max(begin * per_bin - shift, low)]
@@ -402,6 +416,7 @@ def _as_rows(
                 rest[lane, i] = max(rest[lane, i], value)
                 if i < width:
                     rows[lane, shift, WINDOW + i] = value
+        # From the last bin backwards: the largest of this bin and all later ones.
         for i in range(end - 1, -1, -1):
             rest[lane, i] = max(rest[lane, i], rest[lane, i + 1])
 
@@ -436,6 +451,7 @@ def _places(surface: NumbaSurface, feet: NumbaPoints, lobe: Lobe, corners: Int32
                 lobe.step,
             )
             some[int(np.floor(x)) - corners[s, 0], int(np.floor(y)) - corners[s, 1]] = True
+        # Cubic interpolation takes the nodes -1 to 2 around each cell with a beam.
         needed = np.zeros((columns, rows), np.bool_)
         for i in range(1, columns - 2):
             for j in range(1, rows - 2):
@@ -469,6 +485,7 @@ def _corners(surface: NumbaSurface, feet: NumbaPoints, lobe: Lobe) -> Int32:
             low_y = min(low_y, y)
             high_x = max(high_x, x)
             high_y = max(high_y, y)
+        # One node before the first cell with a beam, and two after the corner of the last.
         corners[s, 0] = int(np.floor(low_x)) - 1
         corners[s, 1] = int(np.floor(low_y)) - 1
         corners[s, 2] = int(np.floor(high_x)) + 3 - corners[s, 0]
@@ -508,6 +525,12 @@ def _patch_rows(
     _as_rows(counted, total, first, last, per_bin, rows[:LANES], rest[:LANES])
     if lobe.gain == 0:
         return
+
+    # Then the needed nodes, LANES at a time; the last vector may not be full, and its spare lanes
+    # keep the axes of earlier nodes, which no beam reads.
+
+    # Then the needed nodes, LANES at a time; the last vector may not be full, and its spare lanes
+    # keep the axes of earlier nodes: no beam reads their rows.
     chunks = _chunks(cells)
     axes = np.zeros((4, LANES), np.float32)
     values = np.empty(CHUNK * LANES, np.float32)
@@ -641,12 +664,15 @@ def _add_tile(
         for i in range(size):
             if legs.weight[i] == 0:
                 continue
+            # d1 + d2 in sub-bins, rounded: whole bins move the window, the rest picks the shift.
             at = np.int32(
                 (legs.length_m[i] + feet.length_m[start + i]) * optics.inverse_bin + np.float32(0.5)
             )
             ahead = int(begin[start + i]) - at // per_bin - table.first[s]
             beyond = min(max(ahead + bins, 0), table.width)
             shift = (at % per_bin) * span + WINDOW
+
+            # First the diffuse part, which goes with A(p, s) of S2 alone.
             light = legs.weight[i] * surface.strength[s]
             weight[0] = light * lobe.diffuse
             base[0] = j * places * per_bin * span + shift
@@ -658,6 +684,8 @@ def _add_tile(
                     surface.z_m[s],
                     lobe.step,
                 )
+                # Then the 4 x 4 nodes around the light's direction; weights may be negative, so the
+                # bound takes their size.
                 column = int(np.floor(x))
                 row = int(np.floor(y))
                 _weights(x - np.float32(column), along_x)
@@ -671,6 +699,9 @@ def _add_tile(
                         base[k] = (j * places + place) * per_bin * span + shift
                         later += abs(weight[k]) * rest[j, place, beyond]
             bound[start + i] += later
+
+            # Rows begin with WINDOW zeros and end before others: a window that overlaps a row's
+            # bins reads zeros where it reaches beyond.
             for window in range(0, bins, WINDOW):
                 if -WINDOW < ahead + window < width:
                     offset[:] = ahead + window
@@ -697,6 +728,7 @@ def _add(
 ) -> None:
     """Add the tables of some patches to all beams' windows, and to a bound on each's later bins."""
     beams = len(feet.x_m)
+    # One thread adds all patches to its beams in their order: no sum depends on the threads.
     for tile in numba.prange((beams + BEAM_TILE - 1) // BEAM_TILE):
         start = tile * BEAM_TILE
         _add_tile(
@@ -730,6 +762,7 @@ def _sums(
     nothing = np.empty(0, np.float32)
     table = NumbaTables(numba_job.first, nothing, nothing[None], per_bin, numba_job.width)
     begin, bins = _begins(feet, groups, centers, optics, table)
+
     # No path of a patch begins before the window, so that its first bins hold all that the first
     # window can meet.
     windows = 1 if first_only else -(-bins // WINDOW)
@@ -799,6 +832,8 @@ def echoes(job: TransportJob) -> MultiBounce:
         return strongest(histograms(job), job.bin_m)
     numba_job = NumbaJob(job)
     lobe = _lobe(job)
+    # First the window that nearly always holds the strongest two. A later bin can win only where
+    # the bound on it, with room for rounding, exceeds the runner-up: those beams get all bins.
     every = numba_job.feet(np.ones(len(job.laser_spot_m)))
     begin, sums, bound = _sums(numba_job, every, lobe, first_only=True)
     at = begin[:, None] + np.arange(WINDOW)

@@ -70,6 +70,17 @@ class PointChange(NamedTuple):
     """Of the logarithm of the weight."""
 
 
+class GradientScene(NamedTuple):
+    """Everything on the way of the winners' light."""
+
+    feet: NumbaPoints
+    surface: NumbaSurface
+    relay: NumbaPoints
+    optics: NumbaOptics
+    field: HeightField
+    winners: Winners
+
+
 class _Table(NamedTuple):
     """Sub-bins (high excluded) that each relay cell's light covers, from `begin` on."""
 
@@ -100,12 +111,14 @@ def _spread(
     last = np.float32(0)
     scale = winners.pitch_m * inverse_bin
     for q in range(cells):
-        # The gradient of d3 + d4 over the wall, times the cell's side: a box with the variance of
-        # the cell's lengths.
+        # The gradient of d3 + d4 over the wall is the sum of the unit vectors to the cell, cut to
+        # the wall's plane. Lengths over a square cell of side w have the variance |gradient|^2 w^2
+        # / 12, whatever its direction; a box as wide as |gradient| w has the same.
         to_patch = one / legs.length_m[q]
         to_lidar = one / relay.length_m[q]
         gx = (relay.x_m[q] - x) * to_patch + (relay.x_m[q] - winners.lidar_x_m) * to_lidar
         gy = (relay.y_m[q] - y) * to_patch + (relay.y_m[q] - winners.lidar_y_m) * to_lidar
+        # At least one sub-bin: where both legs are shortest the gradient is 0.
         width = max(np.sqrt(gx * gx + gy * gy) * scale, one)
         at = (legs.length_m[q] + relay.length_m[q]) * inverse_bin
         start = np.floor(at - half * width + half)
@@ -114,6 +127,8 @@ def _spread(
         high[q] = np.int32(end)
         first = min(first, start)
         last = max(last, end)
+    # Empty sub-bins on both sides: `_edges` clamps to the outermost, where the running sum is 0 or
+    # the whole and its rate 0. A bin that no light reaches then has no derivative.
     begin = int(first) - 2
     for q in range(cells):
         low[q] -= begin
@@ -129,6 +144,7 @@ def _sums(table: _Table, values: Float32) -> tuple[Float32, Float32]:
     density = np.zeros(table.size, np.float32)
     total = np.zeros(table.size, np.float32)
     rate = np.zeros(table.size, np.float32)
+    # Each box is a step up and a step down: its cost does not depend on its width.
     for q in range(len(values)):
         each = values[q] / np.float32(table.high[q] - table.low[q])
         density[table.low[q]] += each
@@ -136,6 +152,8 @@ def _sums(table: _Table, values: Float32) -> tuple[Float32, Float32]:
     level = 0.0
     running = 0.0
     before = 0.0
+    # The running sum F is linear within a sub-bin and bends at its edges: its rate at an edge is
+    # the mean of the densities on both sides. float64, so that small steps are not lost.
     for i in range(table.size):
         level += density[i]
         total[i] = running
@@ -161,6 +179,10 @@ def _means(
     rate = np.zeros(size + 1)
     level = 0.0
     other = 0.0
+    # F at edge e sums the sub-bins below e, so sub-bin i counts in all edges above i. A beam reads
+    # F(high) - F(low), which cancel over all edges: the sum over those above i is minus that up to
+    # i. `edges` has its signs turned, + at low and - at high. The rate at edge e is half of
+    # sub-bin e - 1 and half of e.
     for i in range(size):
         level += edges[i]
         other += edge_rates[i]
@@ -169,6 +191,7 @@ def _means(
         rate[i + 1] = rate[i] + other + 0.5 * inverse_bin * (edges[i] + following)
     values = np.empty(len(table.low), np.float32)
     rates = np.empty(len(table.low), np.float32)
+    # A second running sum makes the mean over any box a difference of two entries.
     for q in range(len(values)):
         start = table.low[q]
         end = table.high[q]
@@ -190,6 +213,8 @@ def _edges(
     low = np.empty(len(legs.length_m), np.int32)
     high = np.empty(len(legs.length_m), np.int32)
     for p in range(len(low)):
+        # d1 + d2 + d3 + d4 in [edge, edge + per_bin) sub-bins, with d1 + d2 rounded to a whole
+        # sub-bin as in `beam_sums`.
         at = np.floor(
             winners.edge[p] - (feet.length_m[p] + legs.length_m[p]) * inverse_bin + half
         ) - np.float32(table.begin)
@@ -205,8 +230,14 @@ def _fall(squared: np.float32, soft: np.float32, optics: NumbaOptics) -> np.floa
     """
     one = np.float32(1)
     two = np.float32(2)
+    # The weight is [cosines' ends] d^-k / g, with g = d^2 + soft ramp^2 (S2, limited at contact)
+    # and ramp = 1 - d^2 / near^2. So -2 d log / d(d^2) = k / d^2 + 2 g' / g, and
+    # g' = 1 - 2 soft ramp / near^2. Each of k cosines divides by d once.
+    # The weight is [cosines' ends] d^-k / g, with g = d^2 + soft ramp^2 (S2, limited at contact)
+    # and ramp = 1 - d^2 / near^2. So -2 d log / d(d^2) = k / d^2 + 2 g' / g, and
+    # g' = 1 - 2 soft ramp / near^2.
     ramp = max(one - squared / optics.near_m2, np.float32(0))
-    lengths = two if optics.lambertian else one  # cosines divide by d once or twice
+    lengths = two if optics.lambertian else one
     return lengths / squared + two * (one - two * soft * ramp / optics.near_m2) / (
         squared + soft * ramp * ramp
     )
@@ -237,6 +268,8 @@ def _pull_legs(
     ny = surface.normal_y[s]
     nz = surface.normal_z[s]
     soft = points.soft_m2 if outgoing else surface.soft_m2[s]
+    # S2 has the patch's cosine on the leg from the spot alone, and the wall's on that to the relay
+    # cell; the rendering equation has both on both.
     faces = optics.lambertian or not outgoing
     nothing = np.float32(0)
     total = nothing
@@ -253,7 +286,9 @@ def _pull_legs(
         dy = points.y_m[i] - y
         squared = dx * dx + dy * dy + z * z
         across = nx * dx + ny * dy - nz * z
+        # A leg behind the patch has no weight, and must not divide by its cosine.
         front = light[i] / across if faces and across > nothing else nothing
+        # d length / d patch = -v / length, in the same direction as the weight's fall.
         pulled = light[i] * _fall(squared, soft, optics) - longer[i] / np.sqrt(squared)
         total += light[i]
         facing += front
@@ -266,6 +301,7 @@ def _pull_legs(
         points_out[1, i] += ny * front - pulled * dy
         points_out[2, i] += longer[i]
         points_out[3, i] += light[i]
+    # v_z = -z for every leg, so that the z components come out of the sums.
     height = total / z if outgoing or optics.lambertian else nothing
     patch[0] += away_x - nx * facing
     patch[1] += away_y - ny * facing
@@ -299,10 +335,13 @@ def _push_legs(
     px, py, pz = change.point[s]
     tx, ty, tz = change.normal[s]
     soft = points.soft_m2 if outgoing else surface.soft_m2[s]
+    # As in `_pull_legs`: v = point - patch changes by (vx, vy, -pz), as the wall's points stay in
+    # its plane.
     faces = optics.lambertian or not outgoing
     nothing = np.float32(0)
     height = pz / z if outgoing or optics.lambertian else nothing
     for i in range(len(light)):
+        # v = point - patch changes by (vx, vy, -pz): the wall's points stay in its plane.
         dx = points.x_m[i] - x
         dy = points.y_m[i] - y
         vx = moved.x[i] - px
@@ -310,6 +349,7 @@ def _push_legs(
         squared = dx * dx + dy * dy + z * z
         across = nx * dx + ny * dy - nz * z
         along = dx * vx + dy * vy + z * pz
+        # (n . v)' by the product rule, the normal's own turn included.
         turned = nx * vx + ny * vy - nz * pz + tx * dx + ty * dy - tz * z
         front = turned / across if faces and across > nothing else nothing
         light[i] = front - _fall(squared, soft, optics) * along + height + moved.light[i]
@@ -351,6 +391,9 @@ def _pull_patch(
     table = _spread(s, back, surface, relay, optics.inverse_bin, winners)
     total, rate = _sums(table, back.weight)
     low, high = _edges(there, feet, table, winners, optics.inverse_bin)
+
+    # First the beams' side: h = a [F(high) - F(low)] by a, by the edges, and by F (left at the
+    # edges for the cells' side).
     edges = np.zeros(table.size, np.float32)
     edge_rates = np.zeros(table.size, np.float32)
     strength = surface.strength[s]
@@ -361,13 +404,18 @@ def _pull_patch(
         b = there.weight[p] * strength * path[p]
         patch[6] += a * inside
         a *= strength
+        # A longer d1 + d2 adds to every path in the bin (b), and moves the bin's edges towards
+        # shorter d3 + d4 (a): the light that crosses them is the difference of F's rates.
         shorter[p] = b * inside - a * (rate[high[p]] - rate[low[p]]) * optics.inverse_bin
         edges[low[p]] += a
         edges[high[p]] -= a
         edge_rates[low[p]] += b
         edge_rates[high[p]] -= b
+        # The derivative by the logarithm of a weight is the weight's own share of the light.
         there.weight[p] = a * inside
     _pull_legs(s, surface, feet, optics, False, there.weight, shorter, patch, beams)
+
+    # Then the cells' side: what all beams left at the edges, averaged over each cell's sub-bins.
     values, rates = _means(table, edges, edge_rates, optics.inverse_bin)
     for q in range(len(values)):
         values[q] *= back.weight[q]
@@ -434,6 +482,8 @@ def _push_patch(
     there = _legs(s, feet, False, surface, optics, field)
     table = _spread(s, back, surface, relay, optics.inverse_bin, winners)
     total, rate = _sums(table, back.weight)
+
+    # F' has two parts: cells get brighter, and their light moves along F by the cells' d3 + d4.
     brighter = np.empty_like(back.weight)
     longer = np.empty_like(back.weight)
     _push_legs(s, surface, relay, optics, True, change, cells, brighter, longer)
@@ -442,6 +492,7 @@ def _push_patch(
         longer[q] *= back.weight[q]
     total_light, _ = _sums(table, brighter)
     total_path, rate_path = _sums(table, longer)
+
     brighter = np.empty_like(there.weight)
     longer = np.empty_like(there.weight)
     _push_legs(s, surface, feet, optics, False, change, spots, brighter, longer)
@@ -453,6 +504,8 @@ def _push_patch(
         i = low[p]
         j = high[p]
         inside = total[j] - total[i]
+        # Light leaves the bin as paths grow, at the rate of F at its far edge, and enters at the
+        # near one.
         crossing = longer[p] * (rate[j] - rate[i]) + rate_path[j] - rate_path[i]
         light[p] += a * (
             brighter[p] * inside + total_light[j] - total_light[i] - crossing * optics.inverse_bin
@@ -533,15 +586,18 @@ class BeamRates:
         turn = np.eye(6)[:, None, 3:]
         length = np.where(lit, beams.length_m, 0.0)[:, None]
         rate = np.cross(turn, beams.direction[None])
-        # The wall is z = 0: lidar_z + length direction_z = 0 stays true.
+        # The wall is z = 0: lidar_z + length direction_z = 0 stays true, so that
+        # shift_z + length' direction_z + length rate_z = 0.
         longer = (
             -(shift[..., 2:] + length * rate[..., 2:])
             / np.where(lit, beams.direction[:, 2], -1.0)[:, None]
         )
         spot = (shift + longer * beams.direction + length * rate)[..., :2]
         longer = longer[..., 0] * lit
+        # cos t1 = -direction_z.
         cosine = -rate[..., 2] * lit
-        # I_direct falls with softened(d1^2), as in `geometry.returned`.
+        # I_direct goes with cos t1 / softened(d1^2) (S1), as in `geometry.returned`: its logarithm
+        # changes by cos' / cos - 2 d1 d1' softened' / softened.
         cell_m2 = rig.device.receiver_cell_m2
         squared = beams.length_m[chosen] ** 2
         soft = cell_m2 / solid_angle(lambertian=problem.scene.radiometry == "lambertian")
@@ -578,8 +634,11 @@ class Tilts:
         """Return the slopes of a job's patches, none if the plan left the tilt out."""
         patches = job.patches
         depth = job.field.depth_m
+        # Numbers of the patches in the image, -1 for background, with a margin all around.
         number = np.full(np.add(depth.shape, 2), -1)
-        row, column, own = patches.row + 1, patches.column + 1, np.arange(len(patches.row))
+        row = patches.row + 1
+        column = patches.column + 1
+        own = np.arange(len(patches.row))
         number[row, column] = own
         z = patches.point_m[:, 2]
         pairs: list[tuple[Int64, Int64]] = []
@@ -589,6 +648,7 @@ class Tilts:
             forward, backward = (
                 number[row + sign * abs(down), column + sign * right] for sign in (1, -1)
             )
+            # Neighbors across a jump are separate surfaces, and a plan without tilt joins none.
             usable = [tilted & (n >= 0) & (np.abs(z[n] - z) <= jump_m) for n in (forward, backward)]
             after = np.where(usable[0], forward, own)
             before = np.where(usable[0], own, np.where(usable[1], backward, own))
@@ -598,24 +658,31 @@ class Tilts:
 
     def slopes(self, depth: Float64) -> Float64:
         """Return the rates (n, 2) of the slopes along x and y for rates (n,) of the depths."""
-        parts = zip(self.pairs, self.pitch_m, strict=True)
-        return np.stack([(depth[more] - depth[less]) / pitch for (more, less), pitch in parts], -1)
+        along = [
+            (depth[more] - depth[less]) / pitch
+            for (more, less), pitch in zip(self.pairs, self.pitch_m, strict=True)
+        ]
+        return np.stack(along, -1)
 
     def turned(self, slopes: Float64) -> tuple[Float64, Float64]:
         """Return the rates of normal (n, 3) and strength (n,) for rates of the slopes (n, 2)."""
-        # beta normal = (slope_x, slope_y, -1), so that beta' = normal . slopes'.
-        rate = np.pad(slopes, ((0, 0), (0, 1)))
+        # beta normal = (slope_x, slope_y, -1) (S3). Its length is beta, so that beta' = normal .
+        # slopes'; the rest of the change, across the normal, turns it: normal' = (slopes' - normal
+        # beta') / beta. The strength is albedo times area, which grows with beta.
+        rate = np.pad(slopes, ((0, 0), (0, 1)))  # (n, 3)
         steeper = (self.normal * rate).sum(-1)
-        return (rate - self.normal * steeper[:, None]) / self.beta[
-            :, None
-        ], self.strength * steeper / self.beta
+        turned = (rate - self.normal * steeper[:, None]) / self.beta[:, None]
+        return turned, self.strength * steeper / self.beta
 
     def transposed(self, normal: Float64, strength: Float64) -> Float64:
         """Return the derivative (n,) with respect to the depths, from that with respect to normals
         and strengths.
         """
+        # The transpose of `turned`: (I - n n^T) / beta is symmetric, and the strength's row is
+        # strength n^T / beta.
         along = (self.normal * normal).sum(-1) - self.strength * strength
         slopes = ((normal - self.normal * along[:, None]) / self.beta[:, None])[:, :2]
+        # The transpose of `slopes`: a cell gets from every pair that it is part of.
         depth = np.zeros(len(self.beta))
         for axis, (more, less) in enumerate(self.pairs):
             rate = slopes[:, axis] / self.pitch_m[axis]

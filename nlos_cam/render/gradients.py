@@ -29,6 +29,7 @@ from nlos_cam.render.effects import Effects
 from nlos_cam.render.geometry import cast, softened
 from nlos_cam.render.gradient_legs import (
     BeamRates,
+    GradientScene,
     PatchChange,
     PointChange,
     Tilts,
@@ -38,12 +39,10 @@ from nlos_cam.render.gradient_legs import (
     softened_slope,
 )
 from nlos_cam.render.job import TransportJob
-from nlos_cam.render.legs import NumbaOptics, NumbaPoints, NumbaSurface
 from nlos_cam.render.planning import RenderProblem, prepare
 from nlos_cam.render.scene import Scene
 from nlos_cam.render.scene_facts import bins_of
 from nlos_cam.render.sensor.model import SensorModel
-from nlos_cam.render.visibility import HeightField
 
 Parameters = Literal["depth", "albedo", "lidar", "wall"]
 COVERED = {"direct", "three-bounce", "occluder", "self-occlusion", "tilt", "colour"}
@@ -96,52 +95,64 @@ def moved(
     """
     shift, turn = _motion(lidar)
     back, turned = _motion(wall)
+    # The wall's frame moves with the wall, so that a point x of the room has the coordinates
+    # turned^T (x - back) afterwards.
     pose = problem.scene.rig.wall_from_lidar.copy()
-    pose[:3, :3], pose[:3, 3] = (
-        turned.T @ turn @ pose[:3, :3],
-        turned.T @ (pose[:3, 3] + shift - back),
-    )
+    pose[:3, :3] = turned.T @ turn @ pose[:3, :3]
+    pose[:3, 3] = turned.T @ (pose[:3, 3] + shift - back)
     rig = MovedRig(**problem.scene.rig.model_dump(exclude={"pose"}), pose=tuple(pose.ravel()))
-    lambertian = problem.scene.radiometry == "lambertian"
-    job = problem.job
-    intrinsics = replace(problem.scene, rig=rig).intrinsics(problem.accuracy.beams_per_cell)
+    scene = replace(problem.scene, rig=rig)
+
+    intrinsics = scene.intrinsics(problem.accuracy.beams_per_cell)
+    lambertian = scene.radiometry == "lambertian"
     beams = cast(rig, intrinsics, lambertian=lambertian, occluder=problem.includes("occluder"))
-    beams = beams if problem.includes("direct") else beams.without_direct()
-    if job is not None:
-        patches = job.patches
-        lit = beams.on_wall
-        patches = replace(
-            patches, point_m=(patches.point_m - back) @ turned, normal=patches.normal @ turned
-        )
-        length = np.sqrt(
-            (job.relay.x_m - pose[0, 3]) ** 2 + (job.relay.y_m - pose[1, 3]) ** 2 + pose[2, 3] ** 2
-        )
-        relay = replace(job.relay, length_m=length, cos_lidar=pose[2, 3] / length)
-        columns = beams.laser_spot_m[lit], beams.length_m[lit], beams.cos_incidence[lit]
-        names = "laser_spot_m", "length_m", "cos_incidence"
-        job = replace(
-            job,
-            patches=patches,
-            relay=relay,
-            lidar_m=beams.lidar_m,
-            map_spots_m=columns[0],
-            bins=bins_of(beams, patches, relay, rig.device),
-            **dict(zip(names, columns, strict=True)),
-        )
-    return replace(problem, scene=replace(problem.scene, rig=rig), beams=beams, job=job)
+    if not problem.includes("direct"):
+        beams = beams.without_direct()
+    job = problem.job
+    if job is None:
+        return replace(problem, scene=scene, beams=beams)
+
+    # Rows x^T turned are (turned^T x)^T.
+    patches = replace(
+        job.patches,
+        point_m=(job.patches.point_m - back) @ turned,
+        normal=job.patches.normal @ turned,
+    )
+    x, y, z = pose[:3, 3]
+    # d4 of S4 and the cosine at which the relay's light leaves the wall; cells stay on the wall.
+    length = np.sqrt((job.relay.x_m - x) ** 2 + (job.relay.y_m - y) ** 2 + z**2)
+    relay = replace(job.relay, length_m=length, cos_lidar=z / length)
+    lit = beams.on_wall
+    spots = beams.laser_spot_m[lit]
+    job = replace(
+        job,
+        patches=patches,
+        relay=relay,
+        lidar_m=beams.lidar_m,
+        map_spots_m=spots,
+        laser_spot_m=spots,
+        length_m=beams.length_m[lit],
+        cos_incidence=beams.cos_incidence[lit],
+        bins=bins_of(beams, patches, relay, rig.device),
+    )
+    return replace(problem, scene=scene, beams=beams, job=job)
 
 
 def _motion(vector: Float64 | None) -> tuple[Float64, Float64]:
     """Return shift (3,) and rotation (3, 3) of a motion (6,) by Rodrigues' formula."""
-    shift, turn = (np.zeros(3), np.zeros(3)) if vector is None else (vector[:3], vector[3:])
+    if vector is None:
+        return np.zeros(3), np.eye(3)
+    turn = vector[3:]
     angle = float(np.linalg.norm(turn))
     cross = np.cross(np.eye(3), turn)  # rows e_i x turn: the matrix of turn x
-    return (
-        shift,
+    # I + sin a / a K + (1 - cos a) / a^2 K^2, with 1 - cos a = 2 sin^2(a / 2). numpy's sinc is
+    # sin(pi x) / (pi x), which is 1 at 0: no division by a.
+    rotation = (
         np.eye(3)
         + np.sinc(angle / np.pi) * cross
-        + 0.5 * np.sinc(angle / 2 / np.pi) ** 2 * cross @ cross,
+        + 0.5 * np.sinc(angle / 2 / np.pi) ** 2 * cross @ cross
     )
+    return vector[:3], rotation
 
 
 class Gradients:
@@ -170,16 +181,17 @@ class Gradients:
             )
         job = problem.job
         depth_m = problem.scene.object_depth_m
+        # Joined cells have no depth of their own to differentiate by.
         if job is not None and depth_m is not None and len(job.field.depth_m) < len(depth_m):
             raise SceneError(
                 f"no gradients at accuracy {problem.accuracy.name!r}, which joins cells: choose"
                 " fine"
             )
-        echoes = (
-            no_echoes(len(beams.on_wall))
-            if job is None
-            else _echoes(job).spread_over(beams.on_wall)
-        ).reshape(beams.shape)
+        if job is None:
+            echoes = no_echoes(len(beams.on_wall))
+        else:
+            echoes = _echoes(job).spread_over(beams.on_wall)
+        echoes = echoes.reshape(beams.shape)
         depth, self.intensity, self.margin = compete(beams, echoes)
         self.depth_m: Float32 = depth
         """(rows, columns); as the lidar reports it."""
@@ -187,9 +199,8 @@ class Gradients:
             echoes.peak > beams.direct.reshape(beams.shape)
         )
         """(rows, columns); beams that a three-bounce echo wins."""
-        self.direct: Mask = (beams.on_wall & (beams.direct > 0)).reshape(
-            beams.shape
-        ) & ~self.three_bounce
+        returning = beams.on_wall & (beams.direct > 0)
+        self.direct: Mask = returning.reshape(beams.shape) & ~self.three_bounce
         """(rows, columns); beams that the wall's direct return wins. The others have no
         derivatives: 0 throughout.
         """
@@ -202,12 +213,12 @@ class Gradients:
 
         About the cost of two renders, whatever the number of parameters.
         """
-        dark = np.zeros(self.intensity.shape)
         job = self._maybe_job
-        problem = self.problem
-        light, path = (
-            dark if map_ is None else np.asarray(map_, np.float64) for map_ in (intensity, path_m)
-        )
+        shape = self.intensity.shape
+        light = np.zeros(shape) if intensity is None else np.asarray(intensity, np.float64)
+        path = np.zeros(shape) if path_m is None else np.asarray(path_m, np.float64)
+
+        # A direct winner's path is 2 d1: the way there and back.
         lidar = np.zeros(6)
         if self.direct.any():
             rates = self._lidar_rates
@@ -215,24 +226,33 @@ class Gradients:
                 rates.direct * light[self.direct]
                 + 2 * rates.length[:, self.direct.ravel()] * path[self.direct]
             ).sum(1)
-        to_lidar = _wall_as_lidar(problem.beams.lidar_m)
+        to_lidar = _wall_as_lidar(self.problem.beams.lidar_m)
         if job is None:
             return SceneVector(
                 np.zeros((0, 0)), np.zeros((0, 0)), np.zeros((0, 3)), lidar, to_lidar.T @ lidar
             )
-        weights = light[self.three_bounce], path[self.three_bounce] / self._peak
+
+        # The mean path is the light-weighted sum over the bin's light; that light's own change is
+        # left out, as the mean rate of the lengths is meant (see the module).
         by_patch, beams, cells = pull(
-            *self._legs, self._winners, *(w.astype(np.float32) for w in weights)
+            *self._scene,
+            light[self.three_bounce].astype(np.float32),
+            (path[self.three_bounce] / self._peak).astype(np.float32),
         )
         beams = beams.sum(0, np.float64)
         cells = cells.sum(0, np.float64)
         point = by_patch[:, :3]
         normal = by_patch[:, 3:6]
         strength = by_patch[:, 6]
+
+        # Chain rule from the legs' ends (m motions, c quantities, n points) to the lidar, and from
+        # patches to the wall: they move against it, a turn by the cross product with their arms.
         spots, relay = self._lidar_points
         lidar += np.einsum("mcn,cn->m", spots, beams) + np.einsum("mcn,cn->m", relay, cells)
         turned = np.cross(job.patches.point_m, point) + np.cross(job.patches.normal, normal)
         wall = to_lidar.T @ lidar - np.concatenate([point.sum(0), turned.sum(0)])
+
+        # A cell's depth moves its own patch along z, and tilts it and its neighbors.
         depth = point[:, 2] + self._tilts.transposed(normal, strength)
         albedo = strength * job.patches.area_m2
         return SceneVector(self.image(depth), self.image(albedo), point, lidar, wall)
@@ -258,11 +278,10 @@ class Gradients:
                 PointChange(*np.einsum("m,mcn->cn", lidar, rate).astype(np.float32))
                 for rate in self._lidar_points
             )
-            found = push(
-                *self._legs, self._winners, self._patch_change(change, wall), spots, relay, False
-            )
-            light[self.three_bounce], sums = (rows.sum(0, np.float64) for rows in found)
-            path[self.three_bounce] = sums / self._peak
+            patches = self._patch_change(change, wall)
+            brighter, longer = push(*self._scene, patches, spots, relay, False)
+            light[self.three_bounce] = brighter.sum(0, np.float64)
+            path[self.three_bounce] = longer.sum(0, np.float64) / self._peak
         return light, path
 
     def jacobian(self, parameters: Parameters) -> tuple[Float32, Float32]:
@@ -272,6 +291,7 @@ class Gradients:
         k beams of `three_bounce` and the n cells with a surface, in the order of the image.
         """
         if parameters in {"lidar", "wall"}:
+            # Column by column: J e_i for the six unit motions.
             found = [self.push(SceneVector(**{parameters: unit})) for unit in np.eye(6)]
             light, path = (
                 np.stack([map_.ravel() for map_ in maps], -1) for maps in zip(*found, strict=True)
@@ -285,13 +305,14 @@ class Gradients:
         tilts = self._tilts
         still = np.zeros(len(self._tilts.beta))
         up = np.tile([0.0, 0.0, 1.0], (len(still), 1))
+        # One pass for the depth alone; one for the slope along each axis by its two neighbors: a
+        # patch's slope is linear in the two depths of its pair, one with plus and one with minus.
         light, path = self._each(up, 0 * up, still)
         for axis, (more, less) in enumerate(tilts.pairs):
             steeper = np.zeros((len(still), 2))
             steeper[:, axis] = 1 / tilts.pitch_m[axis]
-            for total, part in zip(
-                (light, path), self._each(0 * up, *tilts.turned(steeper)), strict=True
-            ):
+            by_slope = self._each(0 * up, *tilts.turned(steeper))
+            for total, part in zip((light, path), by_slope, strict=True):
                 np.add.at(total.T, more, part.T)
                 np.subtract.at(total.T, less, part.T)
         return light, path
@@ -304,7 +325,7 @@ class Gradients:
         spots, relay = (
             PointChange(*np.zeros(rate.shape[1:], np.float32)) for rate in self._lidar_points
         )
-        light, path = push(*self._legs, self._winners, change, spots, relay, True)
+        light, path = push(*self._scene, change, spots, relay, True)
         return light.T, path.T / self._peak[:, None]
 
     def _patch_change(self, change: SceneVector, wall: Float64) -> PatchChange:
@@ -317,6 +338,7 @@ class Gradients:
         if change.point_m is not None:
             point = point + change.point_m
         if change.depth_m is not None:
+            # The tilt's part: depths change slopes, and slopes the normal and the true area (S3).
             rate = np.asarray(change.depth_m, np.float64)[where]
             point[:, 2] += rate
             turned, stronger = self._tilts.turned(self._tilts.slopes(rate))
@@ -351,19 +373,19 @@ class Gradients:
         return job.select((np.cumsum(self.problem.beams.on_wall) - 1)[self.three_bounce.ravel()])
 
     @cached_property
-    def _legs(self) -> tuple[NumbaPoints, NumbaSurface, NumbaPoints, NumbaOptics, HeightField]:
-        """Arguments of the kernels: beams, patches, relay cells, optics, depth map."""
-        single = NumbaJob(self.echo_job, tiled=False)
-        surface, _, _, optics, field = single.sites
-        return single.feet(np.ones(len(self._peak))), surface, single.relay, optics, field
-
-    @cached_property
-    def _winners(self) -> Winners:
+    def _scene(self) -> GradientScene:
+        """Arguments of the kernels."""
         job = self.echo_job
-        per_bin = self.echo_job.accuracy.sub_bins
+        single = NumbaJob(job, tiled=False)
+        per_bin = job.accuracy.sub_bins
+        # The reported path is the center of bin k: (k + 1/2) bin_m.
         edge = (np.round(self._path / job.bin_m - 0.5) * per_bin).astype(np.float32)
         pitch = np.float32(job.relay.diagonal_m / np.sqrt(2))
-        return Winners(edge, per_bin, np.float32(job.lidar_m[0]), np.float32(job.lidar_m[1]), pitch)
+        lidar_x, lidar_y = job.lidar_m[:2].astype(np.float32)
+        winners = Winners(edge, per_bin, lidar_x, lidar_y, pitch)
+        feet = single.feet(np.ones(len(self._peak)))
+        surface, _, _, optics, field = single.sites
+        return GradientScene(feet, surface, single.relay, optics, field, winners)
 
     @cached_property
     def _tilts(self) -> Tilts:
@@ -383,18 +405,20 @@ class Gradients:
         job = self.echo_job
         wins = self.three_bounce.ravel()
         rates = self._lidar_rates
+        # A spot's weight goes with cos t1 in S2. In the rendering equation the laser's whole power
+        # lands on the spot at any angle.
         cosine = rates.cosine[:, wins] / job.cos_incidence
-        spots = np.stack(
-            [
-                *rates.spot[:, wins].transpose(2, 0, 1),
-                rates.length[:, wins],
-                0 * cosine if job.lambertian else cosine,
-            ],
-            1,
-        )
+        if job.lambertian:
+            cosine = 0 * cosine
+        x, y = rates.spot[:, wins].transpose(2, 0, 1)
+        spots = np.stack([x, y, rates.length[:, wins], cosine], 1)
+
+        # Relay cells stay where they are; the lidar's shift changes d4, its turn nothing. The
+        # weight goes with 1 / softened(d4^2), and in the rendering equation with the cosine
+        # lidar_z / d4.
         squared = job.relay.length_m**2
         relay = job.relay
-        away = job.lidar_m - np.stack([relay.x_m, relay.y_m, 0 * relay.x_m], -1)
+        away = job.lidar_m - np.stack([relay.x_m, relay.y_m, 0 * relay.x_m], -1)  # (m, 3)
         length = np.concatenate([away.T / relay.length_m, np.zeros((3, len(squared)))])
         light = -2 * relay.length_m * softened_slope(squared, job.soft_wall_m2, job.near_m) * length
         light /= softened(squared, job.soft_wall_m2, job.near_m)
@@ -415,7 +439,8 @@ def _wall_as_lidar(lidar_m: Float64) -> Float64:
     """Return the matrix (6, 6) from a motion of the wall to the lidar's motion in the wall's
     frame.
     """
-    # A point x of the room has coordinates x - shift - turn x x after the wall has moved.
+    # A point x of the room has coordinates x - shift - turn x x after the wall has moved, to first
+    # order: the lidar seems to shift by -shift - turn x lidar and to turn by -turn.
     matrix = -np.eye(6)
     matrix[:3, 3:] = np.cross(np.eye(3), lidar_m)
     return matrix
@@ -434,6 +459,8 @@ def intensity_noise(gradients: Gradients, model: SensorModel, frames: int = 1) -
         bare, scene.intrinsics(), lambertian=scene.radiometry == "lambertian"
     ).direct.max()
     gain = model.bare_wall_counts / brightest
+    # Variances of read noise, of photons (in proportion to the counts), and of rounding to whole
+    # counts (1 / 12) add; the mean over a cell's pixels and frames divides them.
     counts = gain * gradients.intensity.astype(np.float64) + model.ambient_counts
     variance = model.read_noise_counts**2 + model.shot_noise**2 * counts + 1 / 12
     pixels = scene.rig.pinhole.width * scene.rig.pinhole.height / np.prod(shape)
@@ -478,22 +505,28 @@ def depth_bound(
     wins = gradients.three_bounce
     rates, _ = gradients.jacobian("depth")
     sure = (gradients.margin[wins] >= min_margin) & np.isfinite(noise[wins])
-    group = np.unique(
-        job.patches.row // block * 1000 + job.patches.column // block, return_inverse=True
-    )[1]
+    # Blocks get numbers without gaps; a depth map has at most 256 columns.
+    block_of = job.patches.row // block * 1000 + job.patches.column // block
+    group = np.unique(block_of, return_inverse=True)[1]
+
+    # Fisher information of independent normal errors: sum over beams of J^T J / noise^2. The rate
+    # of a block is the sum of its cells'.
     scaled = np.zeros((int(sure.sum()), group.max() + 1))
     np.add.at(scaled.T, group, (rates[sure] / noise[wins][sure, None]).T)
     information = scaled.T @ scaled
     values = np.maximum(np.linalg.eigvalsh(information)[::-1], 1e-30)
+    # Cramer-Rao: no unbiased estimate has a covariance below the inverse. Others held, it is the
+    # inverse of the diagonal; with all unknown, the diagonal of the inverse.
     covariance = np.linalg.inv(information + np.eye(len(information)) / prior_m**2)
-    alone, bound = (np.full(job.field.depth_m.shape, np.nan) for _ in range(2))
-    alone[job.patches.row, job.patches.column] = (
-        1 / np.sqrt(np.maximum(np.diag(information), 1e-30))
-    )[group]
-    bound[job.patches.row, job.patches.column] = np.sqrt(np.diag(covariance))[group]
-    return DepthBound(
-        alone, bound, 1 / np.sqrt(values), float(np.sum(values / (values + prior_m**-2)))
-    )
+    deviations = 1 / np.sqrt(np.maximum(np.diag(information), 1e-30)), np.sqrt(np.diag(covariance))
+    maps: list[Float64] = []
+    for deviation in deviations:
+        image = np.full(job.field.depth_m.shape, np.nan)
+        image[job.patches.row, job.patches.column] = deviation[group]
+        maps.append(image)
+    alone, bound = maps
+    determined = float(np.sum(values / (values + prior_m**-2)))
+    return DepthBound(alone, bound, 1 / np.sqrt(values), determined)
 
 
 @dataclass(frozen=True)
@@ -560,16 +593,19 @@ def fit_pose(
     normal = np.diag(precision)
     while iterations < steps:
         iterations += 1
+        # Gauss and Newton's step with Cauchy's weight for each residual, (J^T W J + P) step =
+        # J^T W r - P motion: the prior P pulls back to the first pose.
         rest, deviation, used = residual(now)
         weight = 1 / (1 + (rest / OUTLIER) ** 2)
         rates = now.jacobian(body)[0][used.ravel()].astype(np.float64) / deviation[:, None]
         normal = rates.T @ (weight[:, None] * rates) + np.diag(precision)
         downhill = rates.T @ (weight * rest) - precision * motion
         before = cost
+        # Marquardt's damping shortens and turns the step towards the steepest descent, in each
+        # parameter's own scale.
         for _ in range(MAX_DAMPINGS):
-            step = np.linalg.solve(normal + damping * np.diag(np.diag(normal)), downhill).astype(
-                np.float64
-            )
+            damped = normal + damping * np.diag(np.diag(normal))
+            step = np.linalg.solve(damped, downhill).astype(np.float64)
             following = Gradients(moved(now.problem, **{body: step}))
             if (found := loss(following, motion + step)) < cost:
                 now = following
@@ -580,6 +616,5 @@ def fit_pose(
             damping *= 5
         if before - cost < 1e-4 * before:
             break
-    return PoseFit(
-        motion, np.sqrt(np.diag(np.linalg.inv(normal))), (first, cost), iterations, now.problem
-    )
+    deviation = np.sqrt(np.diag(np.linalg.inv(normal)))
+    return PoseFit(motion, deviation, (first, cost), iterations, now.problem)

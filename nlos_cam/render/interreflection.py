@@ -7,6 +7,8 @@ by the detour's length and weaker by the form factor F(a, b). One detour is the 
 Neumann series of the rendering equation (Kajiya 1986).
 """
 
+from typing import NamedTuple
+
 import numba
 import numpy as np
 from nlos_calibration.arrays import Float32, Float64, Int64
@@ -25,6 +27,27 @@ AROUND_M = 0.4
 """Margin of that wall around the object: beyond, less than a hundredth of a patch's light
 arrives.
 """
+
+
+class WallCells(NamedTuple):
+    """Cells (m) of the wall that the light may go over."""
+
+    point_m: Float64
+    """(m, 3)."""
+    cell_m2: float
+    soft_m2: float
+    """Near-contact term of a cell as the receiver."""
+    edge_x_m: float
+    edge_z_m: float
+
+
+class SubBins(NamedTuple):
+    """Sub-bins of the patches' histograms."""
+
+    per_m: float
+    start: Int64
+    """(n,); sub-bin with which each patch's histogram begins."""
+    width: int
 
 
 @numba.njit(cache=True)
@@ -46,6 +69,7 @@ def form_factor(
     cos_in = -(normal_b * leg).sum()
     if cos_out <= 0 or cos_in <= 0:
         return 0.0
+
     # Receiving area x cosine / (solid angle x d^2), with the strength as albedo x area; the
     # sender's cosine is part of the rendering equation only. near_m limits 1 / d^2 at contact as in
     # S2.
@@ -95,19 +119,14 @@ def patch_to_patch(
 
 @numba.njit(cache=True, parallel=True)
 def patch_to_wall(
-    patches: PatchArrays,
-    cells: Float64,
-    cell_m2: float,
-    soft_wall: float,
-    edge_x: float,
-    edge_z: float,
-    field: HeightField,
-    near_m: float,
-    lambertian: bool,
+    patches: PatchArrays, wall: WallCells, field: HeightField, near_m: float, lambertian: bool
 ) -> tuple[Float64, Float64]:
-    """Return form factors (n, m) from patches to cells (m, 3) of the wall, and from the cells to
-    the patches.
+    """Return form factors (n, m) from patches to cells of the wall, and from the cells to the
+    patches.
     """
+    cells = wall.point_m
+    edge_x = wall.edge_x_m
+    edge_z = wall.edge_z_m
     # The wall has no horizon of its own: V is that of the leg from the patch, the same both ways.
     there = np.zeros((len(patches.row), len(cells)))
     back = np.zeros((len(patches.row), len(cells)))
@@ -119,12 +138,13 @@ def patch_to_wall(
             x = cells[w, 0]
             y = cells[w, 1]
             factor = form_factor(
-                point, normal, cells[w], up, cell_m2, soft_wall, near_m, lambertian
+                point, normal, cells[w], up, wall.cell_m2, wall.soft_m2, near_m, lambertian
             )
             if factor == 0 or occluded(point[0], point[2], x, 0.0, edge_x, edge_z):
                 continue
             if not visible(field, patches.row[s], patches.column[s], point, x, y):
                 continue
+            # Both ways differ in the receiver alone: its area, its cosine and its near contact.
             there[s, w] = factor
             strength = patches.strength[s]
             soft = patches.soft_m2[s]
@@ -150,16 +170,15 @@ def _over_the_object(
     field: HeightField,
     near_m: float,
     lambertian: bool,
-    per_m: float,
-    start: Int64,
+    sub_bins: SubBins,
     histogram: Float32,
-    width: int,
 ) -> Float32:
     """Return histograms (n, width): for each patch those of every other, later by its distance and
     scaled by F.
     """
     points = patches.point_m
-    out = np.zeros((len(patches.row), width), np.float32)
+    start = sub_bins.start
+    out = np.zeros((len(patches.row), sub_bins.width), np.float32)
     for a in numba.prange(len(points)):
         for b in range(len(points)):
             # Neumann series, one term: L(a) = E(a) + sum_b F(a, b) L(b), with L(b) on the right cut
@@ -167,7 +186,8 @@ def _over_the_object(
             factor = _between_patches(a, b, patches, field, near_m, lambertian)
             if factor > 0:
                 away = np.sqrt(((points[b] - points[a]) ** 2).sum())
-                _add(out[a], int(np.rint(away * per_m)) + start[b] - start[a], factor, histogram[b])
+                later = int(np.rint(away * sub_bins.per_m)) + start[b] - start[a]
+                _add(out[a], later, factor, histogram[b])
     return out
 
 
@@ -198,16 +218,18 @@ def add_interreflection(job: TransportJob, first: NDArray[np.int32], histogram: 
     cells = wall_cells(job)
     away = np.sqrt(sum((point[:, None, axis] - cells[None, :, axis]) ** 2 for axis in range(3)))
     there, back = wall_factors(job, cells)
+    # No detour is longer than twice the longest leg to the wall plus the object's diagonal.
     longest_m = 2 * away.max() + float(np.linalg.norm(np.ptp(point, axis=0)))
     width = histogram.shape[1] + per_bin * (int(longest_m / job.bin_m) + 2)
     steps = np.rint(away * per_m).astype(np.int64)
+
     # Over the wall in two passes, n m each instead of n^2 m: first every wall cell collects the
     # histograms of the patches that it lights, then every patch collects those of the cells. All
     # are aligned to the earliest start in between. Patch b's sub-bins count from start[b], the
     # wall's from the earliest start: b's come later by the difference.
     on_wall = _carry(back.T.copy(), steps.T + start - start.min(), histogram, width)
     by_wall = _carry(there, steps + (start.min() - start)[:, None], on_wall, width)
-    over_object = _over_the_object(*_object(job), per_m, start, histogram, width)
+    over_object = _over_the_object(*_object(job), SubBins(per_m, start, width), histogram)
     return np.pad(histogram, [(0, 0), (0, width - histogram.shape[1])]) + by_wall + over_object
 
 
@@ -227,12 +249,13 @@ def wall_factors(
     (m, 3), and back.
     """
     cell_m2 = wall_cell_m2(job)
-    wall = cells, cell_m2, contact_m2(cell_m2, job.solid_angle), *job.edge_m
-    return patch_to_wall(patches or job.patch_arrays, *wall, job.field, job.near_m, job.lambertian)
+    wall = WallCells(cells, cell_m2, contact_m2(cell_m2, job.solid_angle), *job.edge_m)
+    return patch_to_wall(patches or job.patch_arrays, wall, job.field, job.near_m, job.lambertian)
 
 
 def _wall_extent(job: TransportJob) -> Float64:
     """Return the corners (2, 2), low and high x and y, of the wall for interreflection."""
+    # As far as the wall reaches, and no farther than AROUND_M from the object.
     wall = np.array(job.wall_m)
     low = job.patches.point_m[:, :2].min(0) - AROUND_M
     high = job.patches.point_m[:, :2].max(0) + AROUND_M
@@ -268,6 +291,7 @@ def interreflection_share(job: TransportJob, incident: Float64, returned: Float6
     returned = returned[::step]
     over_object = patch_to_patch(patches, job.field, job.near_m, job.lambertian) @ returned
     there, back = wall_factors(job, wall_cells(job), patches)
+    # Over the wall the energy goes by two matrices, n m each, as in `add_interreflection`.
     by_wall = there @ (back.T @ returned)
     whole = float((incident * returned).sum())
     return float((incident * (over_object + by_wall)).sum()) / whole if whole > 0 else 0.0

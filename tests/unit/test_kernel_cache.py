@@ -1,6 +1,7 @@
 """Numba's cache follows every file with kernels."""
 
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -21,7 +22,7 @@ CALLER = """
 from numba import njit
 from nlos_cam import kernel_cache
 kernel_cache.install()
-from nlos_cam.called import called
+from nlos_cam.render.called import called
 
 @njit(cache=True)
 def caller(x):
@@ -35,10 +36,10 @@ print(caller(1))
 def package(tmp_path: Path) -> Path:
     """Package with one kernel that calls another, in two files."""
     package = tmp_path / "nlos_cam"
-    package.mkdir()
+    (package / "render").mkdir(parents=True)
     (package / "__init__.py").touch()
     shutil.copy(kernel_cache.__file__, package)
-    (package / "called.py").write_text(CALLED.format(number=1))
+    (package / "render" / "called.py").write_text(CALLED.format(number=1))
     (package / "caller.py").write_text(CALLER)
     return package
 
@@ -60,7 +61,7 @@ def run(package: Path, **environment: str) -> str:
 @pytest.mark.slow
 def test_changed_kernel_changes_its_callers(package: Path) -> None:
     assert run(package) == "2"
-    (package / "called.py").write_text(CALLED.format(number=5))
+    (package / "render" / "called.py").write_text(CALLED.format(number=5))
     assert run(package) == "6"
 
 
@@ -68,7 +69,7 @@ def test_changed_kernel_changes_its_callers(package: Path) -> None:
 def test_old_folders_are_removed(package: Path) -> None:
     run(package)
     before = list((package / "__pycache__").glob("kernels-*"))
-    (package / "called.py").write_text(CALLED.format(number=5))
+    (package / "render" / "called.py").write_text(CALLED.format(number=5))
     run(package)
     after = list((package / "__pycache__").glob("kernels-*"))
     assert len(before) == len(after) == 1
@@ -83,16 +84,19 @@ def test_read_only_package_is_cached_in_the_users_folder(package: Path, tmp_path
     assert list(cache.rglob("*.nbi"))
 
 
-def test_checksum_covers_every_file_with_kernels(tmp_path: Path) -> None:
-    (tmp_path / "plain.py").write_text("x = 1")
-    without = kernel_cache.checksum(tmp_path)
-    (tmp_path / "kernels.py").write_text(CALLED)
+def test_checksum_follows_a_constant_in_a_file_without_kernels(tmp_path: Path) -> None:
+    (tmp_path / "render").mkdir()
+    (tmp_path / "render" / "constants.py").write_text("X = 1")
+    before = kernel_cache.checksum(tmp_path)
+    (tmp_path / "render" / "constants.py").write_text("X = 2")
     kernel_cache.checksum.cache_clear()
-    assert kernel_cache.checksum(tmp_path) != without
+    assert kernel_cache.checksum(tmp_path) != before
 
 
-def test_every_file_with_kernels_lies_in_the_folders() -> None:
+def test_every_file_with_kernels_is_among_the_sources() -> None:
     package = kernel_cache.PACKAGE
-    marked = {path for path in package.rglob("*.py") if kernel_cache.MARK in path.read_bytes()}
-    found = {path for name in kernel_cache.FOLDERS for path in (package / name).glob("*.py")}
-    assert marked <= found
+    compiled = re.compile(rb"cache=True|\binner\(")
+    kernels = {path for path in package.rglob("*.py") if compiled.search(path.read_bytes())}
+    found = {path for pattern in kernel_cache.SOURCES for path in package.glob(pattern)}
+    assert kernels
+    assert kernels <= found

@@ -145,7 +145,7 @@ def problems() -> Iterator[str]:
 
 
 def main() -> int:
-    """Print the figures and what is out of bounds, and exit with 1 for that."""
+    """Print the figures and those out of bounds, and exit with 1 for any."""
     for name, folders in {"product": PRODUCT, "tests": ("tests",), "tools": ("tools",)}.items():
         found = density(*folders)
         print(

@@ -13,7 +13,7 @@ from nlos_calibration.rig import load_rig
 from nlos_cam.errors import SceneError
 from nlos_cam.objects import object_box, object_depth
 from nlos_cam.render import Accuracy, Scene, TransportJob, backend_torch, phong, prepare, render
-from nlos_cam.render.backend_torch import lay_out, shade
+from nlos_cam.render.backend_torch import lay_out, part, shade
 from nlos_cam.render.geometry import NO_OCCLUDER
 from nlos_cam.render.visibility import visible
 
@@ -136,7 +136,7 @@ def _shaded(
     point = torch.as_tensor(job.patches.point_m).float()
     foot = torch.as_tensor(job.laser_spot_m).float()
     dx, dy = (foot[:, axis] - point[:, axis, None] for axis in (0, 1))
-    shade(weight, dx, dy, sites.part(first, first + count), fields, chunk)
+    shade(weight, dx, dy, part(sites, first, first + count), fields, chunk)
     return weight.numpy() > 0
 
 
