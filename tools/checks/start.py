@@ -117,7 +117,7 @@ def timed(words: list[str], until: Await = ended, *, cold: bool = False) -> Time
 
 
 def programs() -> dict[str, Callable[[], Times]]:
-    """Return what is measured, by name."""
+    """Return the measurements, by name."""
     tree = get_command(build_app()).commands  # type: ignore[attr-defined]
     parts = {
         name: [[], *([part] for part in getattr(tree[name], "commands", ()))] for name in COMMANDS

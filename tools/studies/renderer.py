@@ -219,7 +219,7 @@ def faults_within(
     most: Any,
     job: renderer.TransportJob,
 ) -> list[str]:
-    """Return what is wrong with a job's histograms and echoes. A winner must be the strongest for
+    """Return the faults of a job's histograms and echoes. A winner must be the strongest for
     some such light.
     """
     found = renderer.histograms(job).astype(np.float64)
@@ -241,7 +241,7 @@ def faults_within(
 
 
 def soak_faults(seed: int) -> list[str]:
-    """Return what is wrong with a random scene; `ROUNDED` where the reference of the scene barely
+    """Return the faults of a random scene; `ROUNDED` where the reference of the scene barely
     shaken has it too.
     """
     generator = np.random.default_rng([seed, 20])

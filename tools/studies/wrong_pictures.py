@@ -1,4 +1,4 @@
-"""Wrong pictures with a good word: 108 objects, 41 ways to harm a frame, and what is said of each.
+"""Wrong pictures with a good word: 108 objects, 41 ways to harm a frame, and the verdict on each.
 
     python tools/studies/wrong_pictures.py [--objects N]     docs/figures/wrong_pictures.json
 
