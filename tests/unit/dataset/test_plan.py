@@ -97,7 +97,7 @@ def older_facts() -> dict[str, Any]:
     return facts
 
 
-def test_older_plan_has_defaults_and_objects_of_the_first_version(
+def test_older_plan_has_defaults_and_objects_of_first_version(
     older_facts: dict[str, Any],
 ) -> None:
     older = DatasetPlan.from_provenance(json.dumps(older_facts))
