@@ -111,7 +111,7 @@ def test_same_generator_draws_the_same_noise(stream: bool) -> None:
 
 
 @streamed_or_not
-def test_noise_is_of_the_intensity_alone_and_of_its_stated_deviation(stream: bool) -> None:
+def test_noise_has_its_stated_deviation_in_intensity_alone(stream: bool) -> None:
     noisy = _first_batch("expected", 1, stream=stream)
     plain = _first_batch("expecte*", 1, stream=stream)
     bright = plain.intensity > 10  # no noise is cut off at 0
