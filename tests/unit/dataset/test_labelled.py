@@ -245,7 +245,7 @@ def test_truth_is_the_depth_map_of_the_label(tmp_path: Path) -> None:
     np.testing.assert_array_equal(_truth(tmp_path, "cup-1"), of_label)
 
 
-def test_depth_map_of_the_recording_goes_before_that_of_the_label(tmp_path: Path) -> None:
+def test_depth_map_of_the_recording_goes_before_the_labels(tmp_path: Path) -> None:
     of_recording = np.full((64, 64), 0.25, np.float32)
     of_label = np.full((64, 64), 0.3, np.float32)
     np.save(tmp_path / "F.npy", of_recording)
