@@ -66,22 +66,33 @@ def saved_state(take: CaptureResult) -> str:
     return load_sidecar(take.sidecar.path).state
 
 
-def test_take_holds_what_came_and_its_sidecar_agrees(run: Run, noise_world: Any) -> None:
+def test_take_holds_what_came(run: Run) -> None:
     (take,) = run(frames=5)
+
     assert (take.state, take.sets, take.error) == ("complete", 5, None)
     assert take.verified == verify(take.target.path)
+
+
+def test_sidecar_agrees_with_its_take(run: Run) -> None:
+    (take,) = run(frames=5)
+
     found = load_sidecar(sidecar_path(take.target.path))
     assert (found.state, found.label, found.camera) == ("complete", "object 0", "sim")
     assert found.summary == take.summary
     assert (found.summary.frames, found.summary.streams["infrared"]) == (5, 5)
     assert found.rig
-    assert take.quality.frames_seen == 5
+
+
+def test_quality_of_a_take_is_that_of_its_frames(run: Run, noise_world: Any) -> None:
     images = [noise_world().images(number) for number in range(5)]
-    assert take.quality.saturated_share == sum((image.ir == 255).mean() for image in images) / 5
-    assert take.quality.invalid_share == sum((image.depth_z16 == 0).mean() for image in images) / 5
-    assert take.quality.confidence_mean == pytest.approx(
-        sum(image.confidence.mean() for image in images) / 5
-    )
+    confidence = sum(image.confidence.mean() for image in images) / 5
+
+    quality = run(frames=5)[0].quality
+
+    assert quality.frames_seen == 5
+    assert quality.saturated_share == sum((image.ir == 255).mean() for image in images) / 5
+    assert quality.invalid_share == sum((image.depth_z16 == 0).mean() for image in images) / 5
+    assert quality.confidence_mean == pytest.approx(confidence)
 
 
 @pytest.mark.slow

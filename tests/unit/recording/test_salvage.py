@@ -167,30 +167,47 @@ def count(scan: Scan) -> int:
     return sum(len(entries) for index in indexes(scan) for entries in index.values()) // 12
 
 
-def test_scan_of_a_whole_bag_finds_every_chunk_and_index(bag: Path, scanned: Scanned) -> None:
-    content = bag.read_bytes()
+def test_scan_reports_progress(bag: Path) -> None:
     progress = list[tuple[int, int]]()
+    size = len(bag.read_bytes())
+
     scan = scan_bag(bag, lambda done, total: progress.append((done, total)))
+
     assert progress == sorted(progress)
-    assert progress[-1] == (scan.bytes, scan.bytes) == (len(content), len(content))
+    assert progress[-1] == (scan.bytes, scan.bytes) == (size, size)
+
+
+def test_scan_of_a_whole_bag_finds_every_chunk_and_connection(bag: Path) -> None:
+    streams = ("Depth", "Infrared", "Confidence")
+
+    scan = scan_bag(bag)
+
+    topics = {connection.topic for connection in scan.connections.values()}
     assert not scan.damages
-    places = chunk_places(content)
-    assert [chunk.at for chunk in scan.chunks] == [at for at, _ in places]
+    assert [chunk.at for chunk in scan.chunks] == [at for at, _ in chunk_places(bag.read_bytes())]
     assert len(scan.chunks) > 3
-    assert {connection.topic for connection in scan.connections.values()} >= {
-        f"/device_0/sensor_0/{stream}_0/image/data"
-        for stream in ("Depth", "Infrared", "Confidence")
-    }
-    for (_, end), chunk in zip(places, scan.chunks, strict=True):
-        written = b"".join(
-            rosbag.pack_index(number, entries) for number, entries in chunk.index.items()
-        )
-        assert content[end:].startswith(written)
-    short = scanned(content[: places[-1][1]])
+    assert topics >= {f"/device_0/sensor_0/{stream}_0/image/data" for stream in streams}
+
+
+def test_scan_of_a_whole_bag_finds_every_index(bag: Path) -> None:
+    content = bag.read_bytes()
+
+    for (_, end), chunk in zip(chunk_places(content), scan_bag(bag).chunks, strict=True):
+        parts = (rosbag.pack_index(number, entries) for number, entries in chunk.index.items())
+        assert content[end:].startswith(b"".join(parts))
+
+
+def test_scan_needs_no_index_of_the_last_chunk(bag: Path, scanned: Scanned) -> None:
+    content = bag.read_bytes()
+    scan = scan_bag(bag)
+
+    short = scanned(content[: chunk_places(content)[-1][1]])
+
     assert (short.chunks, short.connections, short.damages) == (scan.chunks, scan.connections, [])
-    assert [damage.bytes > 0 for damage in scanned(content[:-1]).damages] == [
-        True
-    ]  # the index is cut
+
+
+def test_scan_names_a_cut_index_as_damage(bag: Path, scanned: Scanned) -> None:
+    assert [damage.bytes > 0 for damage in scanned(bag.read_bytes()[:-1]).damages] == [True]
 
 
 def test_scan_loses_only_the_damaged_chunk(noise_bags: dict[str, Path], scanned: Scanned) -> None:
