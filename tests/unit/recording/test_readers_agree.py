@@ -4,8 +4,9 @@ import struct
 import time
 from collections import defaultdict
 from collections.abc import Callable, Iterable
+from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
@@ -143,41 +144,68 @@ class SdkPlayback:
         self.samples[sample.stream].append(sample)
 
 
-@pytest.mark.parametrize("kind", ["noise_bag", "noise_bag_uncompressed", "real_bag"])
-def test_bag_file_agrees_with_librealsense(kind: str, request: pytest.FixtureRequest) -> None:
-    bag = BagReader(request.getfixturevalue(kind))
-    played = SdkPlayback(bag.path)
+class Both(NamedTuple):
+    """A file read by both readers."""
+
+    bag: BagReader
+    played: SdkPlayback
+
+
+@pytest.fixture(scope="module")
+def played() -> Callable[[Path], SdkPlayback]:
+    """Play a file, once for all tests."""
+    return cache(SdkPlayback)
+
+
+@pytest.fixture(params=["noise_bag", "noise_bag_uncompressed", "real_bag"])
+def both(request: pytest.FixtureRequest, played: Callable[[Path], SdkPlayback]) -> Both:
+    path = request.getfixturevalue(request.param)
+    return Both(BagReader(path), played(path))
+
+
+def test_streams_agree_with_librealsense(both: Both) -> None:
+    bag, played = both
+
     assert set(bag.streams) == set(played.samples)
     for stream, info in bag.streams.items():
         assert (info.format, info.frames_per_s, info.intrinsics) == played.profiles[stream]
         assert info.frames == len(played.samples[stream])
-        for ours, sample in zip(bag.samples([stream]), played.samples[stream], strict=True):
-            assert (ours.stream, ours.number, ours.timestamp_s) == (
-                sample.stream,
-                sample.number,
-                sample.timestamp_s,
-            )
-            np.testing.assert_array_equal(ours.pixels, sample.pixels, strict=True)
-        for index, (domain, values) in enumerate(played.metadata[stream]):
-            found = bag.metadata(stream, index)
-            assert found.domain == domain
+
+
+def test_samples_agree_with_librealsense(both: Both) -> None:
+    for stream, samples in both.played.samples.items():
+        for ours, theirs in zip(both.bag.samples([stream]), samples, strict=True):
+            assert (ours.stream, ours.number) == (theirs.stream, theirs.number)
+            assert ours.timestamp_s == theirs.timestamp_s
+            np.testing.assert_array_equal(ours.pixels, theirs.pixels, strict=True)
+
+
+def test_metadata_agrees_with_librealsense(both: Both) -> None:
+    # The SDK makes up numbers for frames without recorded metadata.
+    recorded = "D435" in both.bag.device["name"]
+
+    for stream, frames in both.played.metadata.items():
+        for index, (domain, values) in enumerate(frames):
+            found = both.bag.metadata(stream, index)
             common = found.values.keys() & values.keys()
-            assert {name: found.values[name] for name in common} == {
-                name: values[name] for name in common
-            }
-            if (
-                "D435" in bag.device["name"]
-            ):  # the SDK makes up numbers for frames without recorded metadata
+            assert found.domain == domain
+            assert all(found.values[name] == values[name] for name in common)
+            if recorded:
                 assert common == values.keys()
                 assert len(common) > 10
-        assert (
-            bag.settings(stream=stream)
-            == bag.settings(bag.end_ns, stream)
-            == played.settings[stream]
-        )
+
+
+def test_settings_agree_with_librealsense(both: Both) -> None:
+    bag, played = both
+
+    for stream, settings in played.settings.items():
+        assert bag.settings(stream=stream) == bag.settings(bag.end_ns, stream) == settings
     assert bag.depth_unit_m() == played.settings["depth"]["depth_units"]
-    assert bag.device.items() <= played.device.items()
-    assert bag.device["name"]
+
+
+def test_device_agrees_with_librealsense(both: Both) -> None:
+    assert both.bag.device.items() <= both.played.device.items()
+    assert both.bag.device["name"]
 
 
 @pytest.mark.parametrize("kind", ["noise_bag", "real_bag"])
