@@ -270,7 +270,7 @@ def test_build_keeps_shards_if_disk_is_full(
 ) -> None:
     farm = FakeWorkers()
     stores = iter([*[store] * 3, Mock(side_effect=errors.DiskFullError("full")), *[store] * 9])
-    monkeypatch.setattr(dataset, "store", lambda *given: next(stores)(*given))  # noqa: PLW0108  another each time
+    monkeypatch.setattr(dataset, "store", lambda *given: next(stores)(*given))  # noqa: PLW0108
 
     with pytest.raises(errors.DiskFullError):
         _build(tmp_path, farm)

@@ -393,7 +393,7 @@ def test_labelled_shards_survive_full_disk(tmp_path: Path, monkeypatch: pytest.M
     write_shards(_samples(SHARD + 7), out)
     before = {path.name: path.read_bytes() for path in out.iterdir()}
     stores = iter([store, Mock(side_effect=DiskFullError("full"))])
-    monkeypatch.setattr(labelled_shards, "store", lambda *given: next(stores)(*given))  # noqa: PLW0108  another each time
+    monkeypatch.setattr(labelled_shards, "store", lambda *given: next(stores)(*given))  # noqa: PLW0108
 
     with pytest.raises(DiskFullError, match=str(out)):
         write_shards(_samples(SHARD + 9), out)

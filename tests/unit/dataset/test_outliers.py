@@ -1,5 +1,5 @@
-"""Outliers lie outside training's range, varied rigs within theirs; uncertainty samples are cached and
-follow their seeds.
+"""Outliers lie outside training's range, varied rigs within theirs; uncertainty samples are
+cached and follow their seeds.
 """
 
 from collections.abc import Callable
