@@ -148,7 +148,8 @@ def _sense(
     seed: int,
 ) -> LidarMaps:
     scene = Scene(rig, depth_m, plan.material.surface, plan.radiometry, plan.jump_m, model.pulse_ns)
-    sensor = cached_sensor(rig, model, plan.radiometry)  # pyright: ignore[reportArgumentType]  frozen, so hashable
+    # The records are frozen, so hashable, which pyright does not see.
+    sensor = cached_sensor(rig, model, plan.radiometry)  # pyright: ignore[reportArgumentType]
     if coat is None:
         return sense_object(scene, sensor, seed, plan.accuracy, expected=plan.expected)
     painted = replace(scene, surface=Surface(coat.albedo, plan.material.brdf))

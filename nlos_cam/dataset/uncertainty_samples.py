@@ -135,7 +135,8 @@ def _stimulus(kind: str, seed: int, rig: Rig, sensor: SensorModel) -> outliers.S
 def _sense(
     stimulus: outliers.Stimulus, rendering: Rendering, noise: np.random.Generator
 ) -> LidarMaps:
-    sensor = cached_sensor(stimulus.rig, stimulus.sensor)  # pyright: ignore[reportArgumentType]  frozen, so hashable
+    # The records are frozen, so hashable, which pyright does not see.
+    sensor = cached_sensor(stimulus.rig, stimulus.sensor)  # pyright: ignore[reportArgumentType]
     images = sensor.expose(rendering.multi, noise)
     return maps_from_frame(images.frame(stimulus.rig.pinhole))
 

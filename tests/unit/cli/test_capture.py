@@ -62,9 +62,7 @@ def test_capture_json_reports_the_file(run: Run) -> None:
 
 
 @pytest.mark.slow
-def test_capture_numbers_and_labels_takes_and_pauses_between_them(
-    run: Run, monkeypatch: Patch
-) -> None:
+def test_capture_numbers_and_labels_takes_and_pauses_between(run: Run, monkeypatch: Patch) -> None:
     paused: list[float | None] = []
     monkeypatch.setattr(
         capture, "_pause", lambda _bar, _stop, pause_s, _text: paused.append(pause_s)

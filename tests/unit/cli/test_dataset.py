@@ -97,17 +97,22 @@ def test_build_in_color_is_noted_as_simulation_only(tmp_path: Path, built: Run) 
     assert "textures" in built(tmp_path, code=4)["error"]["message"]
 
 
-def test_build_takes_rig_and_sensor_of_scene_and_hides_meshes_of_folder(
-    tmp_path: Path, built: Run
-) -> None:
+def test_build_takes_rig_and_sensor_of_scene(tmp_path: Path, built: Run) -> None:
     scene = tmp_path / "scene.toml"
-    scene.write_text(
-        'name = "s"\nrig = "paper-rig"\n[sensor]\nambient_counts = 20.0\n', encoding="utf-8"
-    )
+    text = 'name = "s"\nrig = "paper-rig"\n[sensor]\nambient_counts = 20.0\n'
+    scene.write_text(text, encoding="utf-8")
+
+    built(tmp_path / "d", "--scene", scene)
+
+    assert open_dataset(tmp_path / "d").plan.sensor.ambient_counts == 20
+
+
+def test_build_hides_meshes_of_folder(tmp_path: Path, built: Run) -> None:
     trimesh.creation.box((1, 1, 1)).export(tmp_path / "cube.stl")
-    built(tmp_path / "d", "--scene", scene, "--objects", tmp_path)
+
+    built(tmp_path / "d", "--objects", tmp_path)
+
     plan = open_dataset(tmp_path / "d").plan
-    assert plan.sensor.ambient_counts == 20
     assert [name for name, _ in plan.objects.meshes] == ["cube.stl"]
 
 

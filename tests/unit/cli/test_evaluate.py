@@ -108,21 +108,32 @@ def unwritten(monkeypatch: Patch) -> None:
     monkeypatch.setattr("nlos_cam.evaluate.write_report", lambda *_: None)
 
 
-def test_evaluate_writes_figures_of_dataset_beside_baselines(run: Run, monkeypatch: Patch) -> None:
+@pytest.mark.usefixtures("unwritten")
+def test_evaluate_prints_figures_of_dataset(run: Run) -> None:
     result = run(*JUDGE, *STORED)
-    out = Path("figures")
+
     assert {*TARGETS, "baselines", "per_category", "objects", "seconds", "out"} < set(result)
     assert (result["objects"], result["training_objects"]) == (3, 3)
-    assert set(result["baselines"]) == {"all_background", "mean_object", "nearest_neighbour"}
-    assert (
-        result["baselines"]["nearest_neighbour"]["silhouette_iou"]["value"] == 1
-    )  # it is the set itself
     assert set(result["per_category"]) == {"cup", "hat"}
     assert set(result["shown_and_left_out"]) == {"shown", "left out"}
     assert ["cup" in note for note in result["notes"]] == [True]
-    assert json.loads((out / "figures.json").read_text("utf-8")) == {
-        k: v for k, v in result.items() if k != "out"
-    }
+
+
+@pytest.mark.usefixtures("unwritten")
+def test_evaluate_compares_with_baselines(run: Run) -> None:
+    baseline = run(*JUDGE, *STORED)["baselines"]
+
+    assert set(baseline) == {"all_background", "mean_object", "nearest_neighbour"}
+    assert baseline["nearest_neighbour"]["silhouette_iou"]["value"] == 1  # it is the set itself
+
+
+def test_evaluate_writes_its_figures_once(run: Run, monkeypatch: Patch) -> None:
+    out = Path("figures")
+
+    result = run(*JUDGE, *STORED)
+
+    del result["out"]
+    assert json.loads((out / "figures.json").read_text("utf-8")) == result
     assert "\nhat 1," in (out / "objects.csv").read_text("utf-8")
     assert run(*JUDGE, *STORED, code=1)["error"]["type"] == "OutputExistsError"
     monkeypatch.setattr("nlos_cam.evaluate.write_report", lambda *_: None)
@@ -231,20 +242,28 @@ def _assert_written(result: dict[str, Any]) -> None:
     }
 
 
-def test_tradeoff_render_writes_table_and_plot_and_overwrites_when_asked(
-    run: Run, small: list[Scene]
-) -> None:
+@pytest.mark.usefixtures("small")
+def test_tradeoff_render_overwrites_when_asked(run: Run) -> None:
     OUT.mkdir()
-    (precious := OUT / "tradeoff.md").write_text("precious")
+    precious = OUT / "tradeoff.md"
+    precious.write_text("precious")
+
     assert run(*RENDER, code=1)["error"]["type"] == "OutputExistsError"
     assert precious.read_text() == "precious"
-    result = run(*RENDER, "--overwrite")
+    _assert_written(run(*RENDER, "--overwrite"))
     assert precious.read_text() != "precious"
+
+
+def test_tradeoff_render_writes_table_and_plot(run: Run, small: list[Scene]) -> None:
+    depth_m = paper_scene().scene_at(0).object_depth_m
+
+    result = run(*RENDER)
+
     _assert_written(result)
     assert result["complete"]
     assert {stop["name"] for stop in result["stops"]} == set(STOPS)
-    assert result["patches"] == np.isfinite(paper_scene().scene_at(0).object_depth_m).sum()
-    np.testing.assert_array_equal(small[0].object_depth_m, paper_scene().scene_at(0).object_depth_m)
+    assert result["patches"] == np.isfinite(depth_m).sum()
+    np.testing.assert_array_equal(small[0].object_depth_m, depth_m)
 
 
 @pytest.mark.usefixtures("plates")

@@ -51,22 +51,36 @@ def rendered(run: Run) -> Run:
     return call
 
 
-def test_render_writes_maps_picture_and_effects(
-    rendered: Run, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    monkeypatch.undo()  # the picture is drawn
-    result, file = rendered("cup", "--out", out := tmp_path / "cup.npz", "--explain")
+def test_render_writes_maps(rendered: Run, tmp_path: Path) -> None:
+    out = tmp_path / "cup.npz"
+
+    result, file = rendered("cup", "--out", out)
+
     assert (result["accuracy"], result["out"]) == ("draft", str(out))
     assert result["seconds"] > 0
-    assert [effect["name"] for effect in result["effects"]] == NAMES
-    assert all(
-        set(e) == {"name", "included", "reason", "bound", "seconds"} for e in result["effects"]
-    )
-    assert "self-occlusion" in result.err
-    assert out.with_suffix(".png").read_bytes().startswith(b"\x89PNG")
     assert file["depth_m"].shape == file["intensity"].shape == file["margin"].shape == (64, 80)
     assert file["object_depth_m"].shape == (64, 64)
     assert (str(file["rig_name"]), str(file["rig_checksum"])) == (RIG.name, RIG.checksum)
+
+
+def test_render_writes_picture(
+    rendered: Run, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.undo()  # the picture is drawn
+
+    rendered("cup", "--out", tmp_path / "cup.npz")
+
+    assert (tmp_path / "cup.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_render_explains_its_effects(rendered: Run) -> None:
+    keys = {"name", "included", "reason", "bound", "seconds"}
+
+    result, _ = rendered("cup", "--explain")
+
+    assert [effect["name"] for effect in result["effects"]] == NAMES
+    assert all(set(effect) == keys for effect in result["effects"])
+    assert "self-occlusion" in result.err
 
 
 def test_render_of_a_depth_map_equals_the_library(rendered: Run) -> None:

@@ -104,123 +104,184 @@ def finished(tmp_path: Path, whole: Shards) -> Path:
 
 
 def test_build_stores_samples_in_seed_order(tmp_path: Path) -> None:
-    seen: list[tuple[int, int]] = []
-    built = _build(tmp_path, on_progress=lambda *at: seen.append(at))
+    built = _build(tmp_path)
+
     found = open_dataset(tmp_path)
     assert (built.objects, built.made, built.damaged) == (COUNT, COUNT, ())
     assert (len(found), found.plan) == (COUNT, PLAN)
     for name, values in samples_of(range(40, 40 + COUNT)).items():
         np.testing.assert_array_equal(found.column(name), values)
-    assert seen == [
-        (done, COUNT) for done in (0, 2, 4, 5, 7, 9, 10, 12, 14, 15, 17, 19, 20, 22, 23)
-    ]
+
+
+def test_build_reports_progress(tmp_path: Path) -> None:
+    progress: list[tuple[int, int]] = []
+
+    _build(tmp_path, on_progress=lambda *at: progress.append(at))
+
+    done = (0, 2, 4, 5, 7, 9, 10, 12, 14, 15, 17, 19, 20, 22, 23)
+    assert progress == [(count, COUNT) for count in done]
 
 
 @pytest.mark.parametrize("after", [0, 1, 2, 3, 7, 11, 13])
 @pytest.mark.parametrize("order", [None, 3])
-def test_interrupted_build_resumes(
+def test_interrupted_build_resumes_without_making_a_sample_twice(
     tmp_path: Path, whole: Shards, after: int, order: int | None
 ) -> None:
-    """Every finished shard is kept, and no sample is made twice."""
     farm = FakeWorkers(order, fails_after=after)
     rest = FakeWorkers()
     with pytest.raises(KeyboardInterrupt):
         _build(tmp_path, farm)
-    assert farm.closed
     kept = _bytes(tmp_path)
+    assert farm.closed
     assert kept.items() <= whole.items()
-    if order is None:
-        assert len(kept) == after // 3  # a shard is made in three pieces
+
     built = _build(tmp_path, rest)
-    assert _bytes(tmp_path) == whole
+
     again = [seed for piece in rest.made for seed in piece]
-    assert (
-        len(again)
-        == len(set(again))
-        == built.made
-        == COUNT - sum(3 if name == LAST else 5 for name in kept)
-    )
+    lacking = COUNT - sum(3 if name == LAST else 5 for name in kept)
+    assert _bytes(tmp_path) == whole
+    assert len(again) == len(set(again)) == built.made == lacking
 
 
-@pytest.mark.parametrize(
-    ("name", "keep", "count", "made"),
-    [*(("shard-000000045.h5", share, COUNT, 5) for share in (0.0, 0.3, 0.99)), (LAST, 0.0, 10, 0)],
-)
-def test_build_replaces_only_damaged_shards_it_needs(
-    finished: Path, whole: Shards, name: str, keep: float, count: int, made: int
-) -> None:
-    told = list[str]()
-    path = finished / name
-    path.write_bytes(whole[name][: int(keep * len(whole[name]))])
-    built = _build(finished, count=count, on_warning=told.append)
-    assert [str(path) in line for line in told] == [True]
-    assert (built.made, built.damaged) == (made, (path,) if made else ())
-    assert (_bytes(finished) == whole) == bool(made)
+@pytest.mark.parametrize("after", [0, 1, 2, 3, 7, 11, 13])
+def test_interrupted_build_keeps_every_finished_shard(tmp_path: Path, after: int) -> None:
+    with pytest.raises(KeyboardInterrupt):
+        _build(tmp_path, FakeWorkers(fails_after=after))
+
+    assert len(_bytes(tmp_path)) == after // 3  # a shard is made in three pieces
+
+
+def _cut(path: Path, keep: float) -> None:
+    content = path.read_bytes()
+    path.write_bytes(content[: int(keep * len(content))])
+
+
+@pytest.mark.parametrize("keep", [0.0, 0.3, 0.99])
+def test_build_replaces_damaged_shard(finished: Path, whole: Shards, keep: float) -> None:
+    warnings = list[str]()
+    path = finished / "shard-000000045.h5"
+    _cut(path, keep)
+
+    built = _build(finished, on_warning=warnings.append)
+
+    assert [str(path) in line for line in warnings] == [True]
+    assert (built.made, built.damaged) == (5, (path,))
+    assert _bytes(finished) == whole
+
+
+def test_build_leaves_damaged_shard_that_it_does_not_need(finished: Path, whole: Shards) -> None:
+    warnings = list[str]()
+    path = finished / LAST
+    _cut(path, 0.0)
+
+    built = _build(finished, count=10, on_warning=warnings.append)
+
+    assert [str(path) in line for line in warnings] == [True]
+    assert (built.made, built.damaged) == (0, ())
+    assert _bytes(finished) != whole
 
 
 @pytest.mark.parametrize("first", [1, 5, 7, 22])
-def test_build_grows_dataset_to_count_and_leaves_finished_one_alone(
-    tmp_path: Path, whole: Shards, first: int
-) -> None:
+def test_build_grows_dataset_to_count(tmp_path: Path, whole: Shards, first: int) -> None:
     """7 objects leave a shard half full, which a larger count must fill."""
     _build(tmp_path, count=first)
     assert len(open_dataset(tmp_path)) == first
-    assert _build(tmp_path).made == COUNT - first // 5 * 5
+
+    grown = _build(tmp_path)
+
+    assert grown.made == COUNT - first // 5 * 5
     assert _bytes(tmp_path) == whole
+
+
+def test_build_checks_finished_dataset_and_leaves_it_alone(finished: Path, whole: Shards) -> None:
     farm = FakeWorkers()
     checked = list[tuple[int, int]]()
-    built = _build(tmp_path, farm, on_check=lambda *at: checked.append(at))
+
+    built = _build(finished, farm, on_check=lambda *at: checked.append(at))
+
     assert (farm.made, built.made) == ([], 0)
     assert checked == [(k, 5) for k in range(1, 6)]
-    assert _bytes(tmp_path) == whole
+    assert _bytes(finished) == whole
 
 
-def test_build_refuses_another_plan_shard_size_or_program(
+def test_build_refuses_another_plan(finished: Path, whole: Shards) -> None:
+    rig = PLAN.rig.model_copy(update={"name": "other"})
+
+    with pytest.raises(errors.RecordingError, match=r"rig.*accuracy"):
+        _build(finished, plan=replace(PLAN, accuracy="fine", rig=rig))
+
+    assert _bytes(finished) == whole
+
+
+def test_build_refuses_another_shard_size(
     finished: Path, whole: Shards, monkeypatch: Patch
 ) -> None:
-    other = replace(PLAN, accuracy="fine", rig=PLAN.rig.model_copy(update={"name": "other"}))
-    with pytest.raises(errors.RecordingError, match=r"rig.*accuracy"):
-        _build(finished, plan=other)
-    with monkeypatch.context() as patch:
-        patch.setattr(dataset, "SHARD", 4)
-        with pytest.raises(errors.RecordingError, match=r"shard-000000040\.h5"):
-            _build(finished)
+    monkeypatch.setattr(dataset, "SHARD", 4)
+
+    with pytest.raises(errors.RecordingError, match=r"shard-000000040\.h5"):
+        _build(finished)
+
     assert _bytes(finished) == whole
+
+
+def test_build_refuses_dataset_of_a_newer_program(finished: Path) -> None:
     newer = PLAN.provenance.replace('{"rig"', '{"lens": 1, "rig"', 1)
     store(finished / "shard-000000040.h5", samples_of(range(40, 45)), newer, "")
     before = _bytes(finished)
+
     with pytest.raises(errors.RecordingError, match="lens"):
         _build(finished)
+
     assert _bytes(finished) == before
 
 
-def test_build_locks_its_folder_and_refuses_a_file(tmp_path: Path) -> None:
+def test_build_locks_its_folder(tmp_path: Path) -> None:
     with only_builder(tmp_path), pytest.raises(errors.FolderBusyError, match=str(os.getpid())):
         _build(tmp_path)
+
+
+def test_build_leaves_shards_alone_in_its_folder(tmp_path: Path) -> None:
     _build(tmp_path)
+
     assert {path.suffix for path in tmp_path.iterdir()} == {".h5"}
+
+
+def test_build_refuses_a_file_as_its_folder(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("here")
+
     with pytest.raises(errors.OutputExistsError, match="--out"):
         _build(tmp_path / "file")
 
 
-def test_build_keeps_shards_if_object_fails_or_disk_is_full(
-    tmp_path: Path, whole: Shards, monkeypatch: Patch
-) -> None:
+def test_build_keeps_shards_if_object_fails(tmp_path: Path, whole: Shards) -> None:
     farm = FakeWorkers(fails_after=4, error=errors.SceneError("cup.stl shows nothing"))
+
     with pytest.raises(errors.SceneError, match=r"cup\.stl"):
         _build(tmp_path, farm)
+
     assert farm.closed
     assert len(_bytes(tmp_path)) == 1
+    _build(tmp_path)
+    assert _bytes(tmp_path) == whole
+
+
+def test_build_keeps_shards_if_disk_is_full(
+    tmp_path: Path, whole: Shards, monkeypatch: Patch
+) -> None:
     farm = FakeWorkers()
-    stores = iter([store, store, Mock(side_effect=errors.DiskFullError("full")), *[store] * 9])
-    monkeypatch.setattr(dataset, "store", lambda *given: next(stores)(*given))  # noqa: PLW0108  another each time
+    stores = iter([*[store] * 3, Mock(side_effect=errors.DiskFullError("full")), *[store] * 9])
+    monkeypatch.setattr(dataset, "store", lambda *given: next(stores)(*given))  # noqa: PLW0108
+
     with pytest.raises(errors.DiskFullError):
         _build(tmp_path, farm)
+
     assert farm.closed
     assert len(list(tmp_path.glob(SHARD_PATTERN))) == 3
     _build(tmp_path)
     assert _bytes(tmp_path) == whole
+
+
+MAKER = "nlos_cam.dataset.samples.make_samples"
 
 
 def _dying(counter: Path, dies_at: Sequence[int]) -> Callable[[object, range], Samples]:
@@ -245,37 +306,69 @@ def _forked(monkeypatch: Patch) -> None:
 
 
 @pytest.mark.usefixtures("_forked")
-@pytest.mark.parametrize(
-    ("workers", "least"), [(1, 2), (2, 0)]
-)  # two may leave gaps in every shard
-def test_processes_replace_killed_workers_or_give_up(
+# Two workers may leave gaps in every shard.
+@pytest.mark.parametrize(("workers", "least"), [(1, 2), (2, 0)])
+def test_processes_give_up_where_workers_die_again_and_again(
     tmp_path: Path, whole: Shards, monkeypatch: Patch, workers: int, least: int
 ) -> None:
-    maker = "nlos_cam.dataset.samples.make_samples"
-    monkeypatch.setattr(maker, _dying(tmp_path / "calls", range(7, 100)))
+    out = tmp_path / "out"
+    monkeypatch.setattr(MAKER, _dying(tmp_path / "calls", range(7, 100)))
+
     with pytest.raises(errors.WorkersLostError, match=r"code -9\).*--workers"):
-        _build(tmp_path / "out", processes(workers))
-    assert _bytes(tmp_path / "out").items() <= whole.items()
-    assert least <= len(_bytes(tmp_path / "out")) <= 2
-    monkeypatch.setattr(maker, _dying(tmp_path / "later", [2, 6]))
+        _build(out, processes(workers))
+
+    assert _bytes(out).items() <= whole.items()
+    assert least <= len(_bytes(out)) <= 2
+    assert not active_children()
+
+
+@pytest.mark.usefixtures("_forked")
+@pytest.mark.parametrize("workers", [1, 2])
+def test_processes_replace_killed_workers(
+    tmp_path: Path, whole: Shards, monkeypatch: Patch, workers: int
+) -> None:
+    monkeypatch.setattr(MAKER, _dying(tmp_path / "calls", [2, 6]))
+
     _build(tmp_path / "out", processes(workers))
+
     assert _bytes(tmp_path / "out") == whole
     assert not active_children()
 
 
 @pytest.mark.usefixtures("_forked")
-def test_processes_raise_what_a_worker_raised_and_say_where_none_can_start(
-    tmp_path: Path, monkeypatch: Patch
+def test_build_resumes_after_processes_gave_up(
+    tmp_path: Path, whole: Shards, monkeypatch: Patch
 ) -> None:
-    maker = "nlos_cam.dataset.samples.make_samples"
-    monkeypatch.setattr(maker, Mock(side_effect=SceneError("no such object")))
+    out = tmp_path / "out"
+    monkeypatch.setattr(MAKER, _dying(tmp_path / "calls", range(7, 100)))
+    with pytest.raises(errors.WorkersLostError):
+        _build(out, processes(2))
+    monkeypatch.setattr(MAKER, _dying(tmp_path / "later", [2, 6]))
+
+    _build(out, processes(2))
+
+    assert _bytes(out) == whole
+
+
+@pytest.mark.usefixtures("_forked")
+def test_processes_raise_what_a_worker_raised(tmp_path: Path, monkeypatch: Patch) -> None:
+    monkeypatch.setattr(MAKER, Mock(side_effect=SceneError("no such object")))
+
     with pytest.raises(SceneError, match="no such object") as raised:
         _build(tmp_path / "out", processes(2))
+
     assert "make_samples" in raised.value.__notes__[0]  # where in the worker
+    assert not active_children()
+
+
+@pytest.mark.usefixtures("_forked")
+def test_processes_say_where_none_can_start(tmp_path: Path, monkeypatch: Patch) -> None:
     refusal = Mock(side_effect=OSError(errno.EAGAIN, "Resource temporarily unavailable"))
     monkeypatch.setattr(worker.CONTEXT.Process, "start", refusal)
+
     with pytest.raises(errors.WorkersLostError, match="Resource temporarily unavailable"):
         _build(tmp_path / "out", processes(2))
+
     assert not active_children()
 
 
@@ -284,33 +377,40 @@ def test_closing_ends_workers_while_they_send(monkeypatch: Patch) -> None:
     def large(_: object, piece: range) -> Samples:
         return {"depth_m": np.zeros((len(piece), 1_000_000))}  # more than a pipe holds
 
-    monkeypatch.setattr("nlos_cam.dataset.samples.make_samples", large)
-    made = processes(2)(PLAN, [range(k, k + 2) for k in range(0, 40, 2)])
+    monkeypatch.setattr(MAKER, large)
+    made = processes(2)(PLAN, PIECES)
     next(made)
+
     made.close()
+
     assert not active_children()
 
 
 @pytest.mark.slow
 def test_processes_make_the_samples_of_one_process(tmp_path: Path) -> None:
     build_dataset(PLAN, 4, tmp_path, workers=2, on_progress=lambda *_: None)
+
+    found = open_dataset(tmp_path)
     for name, values in make_samples(PLAN, range(40, 44)).items():
-        np.testing.assert_array_equal(open_dataset(tmp_path).column(name), values)
+        np.testing.assert_array_equal(found.column(name), values)
     assert not active_children()
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
 def test_worker_ends_with_killed_parent() -> None:
-    with subprocess.Popen(
-        [sys.executable, "-c", PARENT], stdout=subprocess.PIPE, text=True
-    ) as parent:
+    command = [sys.executable, "-c", PARENT]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as parent:
         assert parent.stdout.readline().strip().isdigit()
+
         parent.send_signal(signal.SIGKILL)
         parent.wait()
+
         assert parent.stdout.read() == ""  # end of file: the worker held this pipe open, and ended
 
 
-def test_worker_has_one_thread_and_ignores_interrupts(monkeypatch: Patch) -> None:
+@pytest.fixture
+def _begun(monkeypatch: Patch) -> Iterator[None]:
+    """As in a worker that has begun; put back afterwards."""
     monkeypatch.setattr(worker, "parent_process", lambda: None)
     for name in BLAS:
         monkeypatch.setenv(name, "2")
@@ -318,26 +418,34 @@ def test_worker_has_one_thread_and_ignores_interrupts(monkeypatch: Patch) -> Non
     handler = signal.getsignal(signal.SIGINT)
     try:
         worker.begin_worker()
-        assert numba.get_num_threads() == 1
-        assert {os.environ[name] for name in BLAS} == {"1"}
-        assert signal.getsignal(signal.SIGINT) is signal.SIG_IGN
+        yield
     finally:
         numba.set_num_threads(threads)
         signal.signal(signal.SIGINT, handler)
 
 
+@pytest.mark.usefixtures("_begun")
+def test_worker_has_one_thread() -> None:
+    assert numba.get_num_threads() == 1
+    assert {os.environ[name] for name in BLAS} == {"1"}
+
+
+@pytest.mark.usefixtures("_begun")
+def test_worker_ignores_interrupts() -> None:
+    assert signal.getsignal(signal.SIGINT) is signal.SIG_IGN
+
+
 @pytest.mark.parametrize(
     ("modules", "without"),
     [
-        (
-            "nlos_cam.cli.main, nlos_cam.dataset.worker",
-            "numpy",
-        ),  # BLAS counts processors at import: after begin_worker
+        # BLAS counts processors when numpy is imported: after begin_worker.
+        ("nlos_cam.cli.main, nlos_cam.dataset.worker", "numpy"),
         pytest.param("nlos_cam.dataset.samples", "torch", marks=pytest.mark.slow),
     ],
 )
 def test_module_does_not_import(modules: str, without: str) -> None:
     program = f"import sys, {modules}; raise SystemExit({without!r} in sys.modules)"
+
     assert subprocess.run([sys.executable, "-c", program], check=False).returncode == 0
 
 
@@ -400,35 +508,69 @@ def _nothing_rendered(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(ray_backend, "use_one_thread", lambda: None)
 
 
-def test_ray_farm_makes_every_piece_once_and_leaves_cluster() -> None:
-    ray = FakeRay()
-    made = dict(RayFarm(ray, "auto")(PLAN, PIECES))
+def test_ray_farm_makes_every_piece_once() -> None:
+    made = dict(RayFarm(FakeRay(), "auto")(PLAN, PIECES))
+
     assert sorted(made, key=lambda piece: piece.start) == PIECES
     for piece, samples in made.items():
         np.testing.assert_array_equal(samples["depth_m"], samples_of(piece)["depth_m"])
+
+
+def test_ray_farm_keeps_few_pieces_waiting_and_leaves_cluster() -> None:
+    ray = FakeRay()
+
+    list(RayFarm(ray, "auto")(PLAN, PIECES))
+
     assert ray.most_waiting == 2 * PIECES_PER_CPU
     assert not ray.running
+
+
+def test_closed_ray_farm_leaves_cluster() -> None:
+    ray = FakeRay()
     making = RayFarm(ray, "auto")(PLAN, PIECES)
     next(making)
     assert ray.running
+
     making.close()
+
     assert not ray.running
 
 
-def test_ray_farm_raises_error_of_missing_cluster_and_of_failed_lost_or_other_worker() -> None:
-    assert list(RayFarm(FakeRay(), "nowhere")(PLAN, [])) == []  # nothing to make needs no cluster
+def test_ray_farm_with_nothing_to_make_needs_no_cluster() -> None:
+    assert list(RayFarm(FakeRay(), "nowhere")(PLAN, [])) == []
+
+
+def test_ray_farm_names_missing_cluster() -> None:
     with pytest.raises(WorkersLostError, match="nowhere") as caught:
         list(RayFarm(FakeRay(), "nowhere")(PLAN, PIECES))
+
     assert "\n" not in str(caught.value)
+
+
+def test_ray_farm_raises_error_of_failed_worker() -> None:
     failed = RayError("a long traceback")
     failed.cause = SceneError("cup.stl is empty")
+
     with pytest.raises(SceneError, match=r"^cup\.stl is empty$"):
         list(RayFarm(FakeRay(failed), "auto")(PLAN, PIECES))
+
+
+def test_ray_farm_raises_error_of_lost_worker_and_leaves_cluster() -> None:
     ray = FakeRay(RayError("the worker\ndied"))
+
     with pytest.raises(WorkersLostError, match="the worker died"):
         list(RayFarm(ray, "auto")(PLAN, PIECES))
+
     assert not ray.running
-    assert make_piece(PLAN, range(1), nlos_cam.__version__).keys() == samples_of(range(1)).keys()
+
+
+def test_ray_worker_of_the_same_version_makes_samples() -> None:
+    made = make_piece(PLAN, range(1), nlos_cam.__version__)
+
+    assert made.keys() == samples_of(range(1)).keys()
+
+
+def test_ray_worker_of_another_version_is_refused() -> None:
     with pytest.raises(SceneError, match=rf"{nlos_cam.__version__}.*9\.9"):
         make_piece(PLAN, range(1), "9.9")
 

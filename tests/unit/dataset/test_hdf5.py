@@ -12,7 +12,7 @@ from concurrent.futures import ProcessPoolExecutor
 from functools import partial
 from pathlib import Path
 from typing import Any
-from unittest.mock import Mock
+from unittest.mock import Mock, patch
 
 import h5py
 import numpy as np
@@ -65,21 +65,20 @@ def _declare(**options: Any) -> Callable[[h5py.File], object]:
     return lambda file: _replace(file, "image", **options)
 
 
+def _one_chunk(file: h5py.File, content: bytes, mask: int = 0) -> None:
+    """Give a chunk of 4 KiB these bytes, packed or (by its mask) plain."""
+    shape = (1 << 10,)
+    image = _replace(file, "image", shape=shape, dtype="f4", chunks=shape, compression="gzip")
+    image.id.write_direct_chunk((0,), content if mask else zlib.compress(content), mask)
+
+
 def _bomb(file: h5py.File) -> None:
     """Give a chunk of 4 KiB bytes that unpack to 256 MiB."""
-    image = _replace(
-        file, "image", shape=(1 << 10,), dtype="f4", chunks=(1 << 10,), compression="gzip"
-    )
-    image.id.write_direct_chunk((0,), zlib.compress(bytes(1 << 28)))
+    _one_chunk(file, bytes(1 << 28))
 
 
 def _short_chunk(file: h5py.File, mask: int) -> None:
-    """Give a chunk of 4 KiB 64 bytes, packed or (by its mask) plain."""
-    image = _replace(
-        file, "image", shape=(1 << 10,), dtype="f4", chunks=(1 << 10,), compression="gzip"
-    )
-    content = bytes(64)
-    image.id.write_direct_chunk((0,), content if mask else zlib.compress(content), mask)
+    _one_chunk(file, bytes(64), mask)
 
 
 def _one_text_in_all_rows(file: h5py.File) -> None:
@@ -133,10 +132,10 @@ def _without_seeds(file: h5py.File, other: str) -> None:
     del file["seed"]
     if other == "group":
         file.create_group("seed")
+    elif other == "type":
+        file["seed"] = np.dtype(int)
     else:
-        file["seed"] = (
-            np.dtype(int) if other == "type" else np.array(["a", "b"], h5py.string_dtype())
-        )
+        file["seed"] = np.array(["a", "b"], h5py.string_dtype())
 
 
 CRAFTED = (
@@ -192,6 +191,7 @@ def _refuse(path: Path) -> int:
 def test_crafted_shard_is_refused_within_little_memory(shard: Path, harm: str) -> None:
     with h5py.File(shard, "a") as file:
         HARMS[harm](file)
+
     assert shard.stat().st_size < 600_000
     assert _in_child(_refuse, shard) < MAX_GROWTH_MIB
 
@@ -205,24 +205,39 @@ def test_read_array_returns_what_was_stored(
     values = np.random.default_rng(1).integers(0, 100, shape).astype(kind)
     with h5py.File(tmp_path / "a.h5", "w") as file:
         file.create_dataset("a", data=values, **storage)
-        file["texts"] = ["", "ä", "b\nc"]
+
     with h5py.File(tmp_path / "a.h5") as file:
         found = read_array(file, "a")
-        assert (found.dtype, found.shape) == (values.dtype, values.shape)
-        np.testing.assert_array_equal(found, values)
-        assert read_array(file, "texts").tolist() == ["", "ä", "b\nc"]
+
+    assert (found.dtype, found.shape) == (values.dtype, values.shape)
+    np.testing.assert_array_equal(found, values)
 
 
-def test_lack_of_memory_or_permission_does_not_count_as_damage(
+def test_read_array_returns_texts(tmp_path: Path) -> None:
+    texts = ["", "ä", "b\nc"]
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file["texts"] = texts
+
+    with h5py.File(tmp_path / "a.h5") as file:
+        assert read_array(file, "texts").tolist() == texts
+
+
+def test_lack_of_memory_does_not_count_as_damage(
     shard: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(np, "empty", Mock(side_effect=MemoryError))
+
     with pytest.raises(MemoryError):
         read_head(shard)
-    monkeypatch.setattr(
-        Path, "mkdir", Mock(side_effect=PermissionError(13, "Permission denied", str(shard)))
-    )
-    with pytest.raises(OutputExistsError, match=str(shard.parent)), only_builder(shard.parent):
+
+
+def test_lack_of_permission_names_the_folder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    refusal = PermissionError(13, "Permission denied", str(tmp_path))
+    monkeypatch.setattr(Path, "mkdir", Mock(side_effect=refusal))
+
+    with pytest.raises(OutputExistsError, match=str(tmp_path)), only_builder(tmp_path):
         pass
 
 
@@ -235,49 +250,60 @@ def _assert_as_stored(path: Path) -> None:
         np.testing.assert_array_equal(found, values)
 
 
-def test_shard_is_read_as_stored_and_describes_itself(tmp_path: Path) -> None:
-    _assert_as_stored(path := _stored(tmp_path))
-    check_arrays(read_head(path))
-    assert [path.name for path in tmp_path.iterdir()] == ["shard-000000040.h5"]
-    with h5py.File(path) as file:
+def test_shard_is_read_as_stored(shard: Path) -> None:
+    _assert_as_stored(shard)
+    check_arrays(read_head(shard))
+
+
+def test_shard_is_named_by_its_first_seed(shard: Path) -> None:
+    assert [path.name for path in shard.parent.iterdir()] == ["shard-000000040.h5"]
+
+
+def test_shard_describes_itself(shard: Path) -> None:
+    with h5py.File(shard) as file:
         facts = dict(file.attrs)
+
     assert (facts["first_seed"], facts["last_seed"]) == (40, 42)
-    assert (facts["package_version"], facts["command"]) == (
-        nlos_cam.__version__,
-        "nlos-cam dataset build",
-    )
+    assert facts["package_version"] == nlos_cam.__version__
+    assert facts["command"] == "nlos-cam dataset build"
     assert PLAN.rig.checksum in facts["plan"]
 
 
-def test_shard_with_flipped_bit_is_damaged_or_unchanged(tmp_path: Path) -> None:
+def test_shard_with_flipped_bit_is_damaged_or_unchanged(shard: Path) -> None:
     """A flip in padding or in a time stamp changes nothing that is read; any other flip is an
     error.
     """
-    path = _stored(tmp_path)
-    whole = path.read_bytes()
+    whole = shard.read_bytes()
     refusals = list[str]()
+
     for place in np.random.default_rng(0).integers(0, len(whole), 100):
         harmed = bytearray(whole)
         harmed[place] ^= 1 << int(place) % 8
-        path.write_bytes(harmed)
+        shard.write_bytes(harmed)
         try:
-            check_arrays(read_head(path))
+            check_arrays(read_head(shard))
         except RecordingError as error:
             refusals.append(str(error))
         else:
-            _assert_as_stored(path)
+            _assert_as_stored(shard)
+
     assert len(refusals) > 15
-    assert all(refusal.startswith(f"{path} is damaged") for refusal in refusals)
+    assert all(refusal.startswith(f"{shard} is damaged") for refusal in refusals)
 
 
-def test_shards_of_refuses_overlapping_and_renamed_shards(tmp_path: Path) -> None:
-    _stored(tmp_path)
-    other = _stored(tmp_path, range(42, 44))
+def test_shards_of_refuses_overlapping_shards(shard: Path) -> None:
+    _stored(shard.parent, range(42, 44))
+
     with pytest.raises(RecordingError, match=r"shard-000000042\.h5.*shard-000000040\.h5"):
-        shards_of(tmp_path)
-    other.rename(shard_path(tmp_path, 50))
+        shards_of(shard.parent)
+
+
+def test_shards_of_refuses_renamed_shard(shard: Path) -> None:
+    other = _stored(shard.parent, range(43, 45))
+    other.rename(shard_path(shard.parent, 50))
+
     with pytest.raises(RecordingError, match=r"shard-000000050\.h5"):
-        shards_of(tmp_path)
+        shards_of(shard.parent)
 
 
 def _fill_disk(folder: Path) -> None:
@@ -287,14 +313,22 @@ def _fill_disk(folder: Path) -> None:
         _stored(folder)
 
 
-def test_full_disk_and_ctrl_c_keep_the_earlier_shard_alone(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+def _interrupt(folder: Path) -> None:
+    """Store where Ctrl+C comes before the file is safe."""
+    with (
+        patch.object(os, "fsync", side_effect=KeyboardInterrupt),
+        pytest.raises(KeyboardInterrupt),
+    ):
+        _stored(folder)
+
+
+@pytest.mark.parametrize("fail", [partial(_in_child, _fill_disk), _interrupt])
+def test_failed_store_keeps_the_earlier_shard_alone(
+    shard: Path, fail: Callable[[Path], None]
 ) -> None:
-    path = _stored(tmp_path)
-    before = path.read_bytes()
-    _in_child(_fill_disk, tmp_path)
-    monkeypatch.setattr(os, "fsync", Mock(side_effect=KeyboardInterrupt))
-    with pytest.raises(KeyboardInterrupt):
-        _stored(tmp_path)
-    assert path.read_bytes() == before
-    assert list(tmp_path.iterdir()) == [path]
+    before = shard.read_bytes()
+
+    fail(shard.parent)
+
+    assert shard.read_bytes() == before
+    assert list(shard.parent.iterdir()) == [shard]

@@ -63,68 +63,120 @@ def labelled(noise_bag: Path, tmp_path: Path) -> Label:
     return make
 
 
-def test_read_labelled_pairs_frames_with_truth_of_their_label(
-    labelled: Label, noise_world: Any
-) -> None:
-    progress = list[tuple[int, int]]()
+@pytest.fixture
+def paths(labelled: Label) -> list[Path]:
+    """Two recordings, one of each known object."""
+    return [labelled("a"), labelled("b", "half")]
+
+
+def test_read_labelled_takes_maps_of_frames(paths: list[Path], noise_world: Any) -> None:
     world = noise_world()
-    paths = [labelled("a"), labelled("b", "half")]
-    found = read_labelled(paths, known=known, frames=4, on_progress=lambda *at: progress.append(at))
-    frames = [
-        maps_from_frame(world.images(number).frame(world.rig.pinhole)) for number in (2, 7, 12, 17)
-    ]
+
+    found = read_labelled(paths, known=known, frames=4)
+
+    images = [world.images(number) for number in (2, 7, 12, 17)]
+    frames = [maps_from_frame(one.frame(world.rig.pinhole)) for one in images]
     np.testing.assert_array_equal(found.maps.depth_m[:4], [maps.depth_m for maps in frames])
     np.testing.assert_array_equal(found.maps.intensity[:4], [maps.intensity for maps in frames])
+    assert found.rig == RIG
+
+
+def test_read_labelled_pairs_frames_with_truth_of_their_label(paths: list[Path]) -> None:
+    found = read_labelled(paths, known=known, frames=4)
+
     assert found.label == ("slope",) * 4 + ("half",) * 4
     assert found.recording == ("a.bag",) * 4 + ("b.bag",) * 4
-    assert found.rig == RIG
     for k, label in enumerate(found.label):
+        image = image_from_depth(KNOWN[label], BOX).astype(np.float16)
         np.testing.assert_array_equal(found.object_depth_m[k], KNOWN[label])
-        np.testing.assert_array_equal(
-            found.maps.image[k], image_from_depth(KNOWN[label], BOX).astype(np.float16)
-        )
+        np.testing.assert_array_equal(found.maps.image[k], image)
+
+
+def test_read_labelled_reports_progress(paths: list[Path]) -> None:
+    progress = list[tuple[int, int]]()
+
+    read_labelled(paths, known=known, frames=4, on_progress=lambda *at: progress.append(at))
+
     assert progress == [(1, 2), (2, 2)]
 
 
 @given(st.integers(0, 1000), st.integers(1, 100))
+def test_spread_chooses_different_frames_of_the_recording(count: int, wanted: int) -> None:
+    chosen = spread(count, wanted)
+
+    assert len(set(chosen)) == len(chosen) == min(count, wanted)
+    assert set(chosen) <= set(range(count))
+
+
+@given(st.integers(1, 1000), st.integers(1, 100))
 def test_spread_chooses_frames_evenly(count: int, wanted: int) -> None:
     chosen = sorted(spread(count, wanted))
-    assert len(chosen) == min(count, wanted)
-    assert set(chosen) <= set(range(count))
-    gaps = np.diff([-chosen[0] - 1, *chosen, 2 * count - chosen[-1]]) if chosen else np.zeros(1)
-    assert np.ptp(gaps) <= 2  # mirrored at both ends: neither end is left out
+
+    # Mirrored at both ends: neither end is left out.
+    gaps = np.diff([-chosen[0] - 1, *chosen, 2 * count - chosen[-1]])
+    assert np.ptp(gaps) <= 2
+
+
+@pytest.fixture
+def corrected(labelled: Label) -> Path:
+    """A recording whose sidecar names a wall record."""
+    return labelled("a", wall=(RIG, WallFile(path="there/wall.toml", sha256="")))
+
+
+@pytest.fixture
+def wall(measured: Callable[..., Any], tmp_path: Path) -> Callable[..., Path]:
+    """A wall record with these fields."""
+
+    def write(**fields: Any) -> Path:
+        path = tmp_path / "wall.toml"
+        path.write_text(dump_toml(measured(**fields).record), encoding="utf-8")
+        return path
+
+    return write
+
+
+def test_read_labelled_asks_for_the_wall_record_of_the_sidecar(corrected: Path) -> None:
+    with pytest.raises(RecordingError, match=r"there/wall\.toml"):
+        read_labelled([corrected], known=known)
 
 
 def test_read_labelled_corrects_by_wall_record(
-    labelled: Label, measured: Callable[..., Any], tmp_path: Path
+    labelled: Label, corrected: Path, wall: Callable[..., Path]
 ) -> None:
-    def wall(**fields: Any) -> Path:
-        (path := tmp_path / "wall.toml").write_text(
-            dump_toml(measured(**fields).record), encoding="utf-8"
-        )
-        return path
-
-    path = labelled("a", wall=(RIG, WallFile(path="there/wall.toml", sha256="")))
-    with pytest.raises(RecordingError, match=r"there/wall\.toml"):
-        read_labelled([path], known=known)
     plain = read_labelled([labelled("b")], known=known, frames=2)
-    corrected = read_labelled([path], known=known, wall=wall(range_offset_m=0.004), frames=2)
-    assert corrected.rig.name == "measured"
-    np.testing.assert_allclose(corrected.maps.depth_m, plain.maps.depth_m + 0.004, atol=1e-6)
-    np.testing.assert_array_equal(corrected.maps.intensity, plain.maps.intensity)
+
+    found = read_labelled([corrected], known=known, wall=wall(range_offset_m=0.004), frames=2)
+
+    assert found.rig.name == "measured"
+    np.testing.assert_allclose(found.maps.depth_m, plain.maps.depth_m + 0.004, atol=1e-6)
+    np.testing.assert_array_equal(found.maps.intensity, plain.maps.intensity)
+
+
+def test_read_labelled_refuses_wall_record_of_another_size(
+    corrected: Path, wall: Callable[..., Path]
+) -> None:
     with pytest.raises(CalibrationError, match=r"80x60.*64x48"):
-        read_labelled([path], known=known, wall=wall(width=80))
+        read_labelled([corrected], known=known, wall=wall(width=80))
 
 
-def test_read_labelled_uses_the_one_rig_of_the_sidecars(labelled: Label) -> None:
-    own = RIG.model_copy(update={"name": "own"})
-    bare = load_rig("bare-wall")
-    for rig, used in ((own, own), (bare, RIG)):
-        path = _sidecar(labelled("a"), rig, label="slope")
-        assert read_labelled([path], known=known, frames=1).rig == used
-    other = _sidecar(labelled("b"), own, label="slope")
+OWN = RIG.model_copy(update={"name": "own"})
+
+
+@pytest.mark.parametrize(("rig", "used"), [(OWN, OWN), (load_rig("bare-wall"), RIG)])
+def test_read_labelled_uses_the_rig_of_the_sidecar(labelled: Label, rig: Rig, used: Rig) -> None:
+    path = _sidecar(labelled("a"), rig, label="slope")
+
+    assert read_labelled([path], known=known, frames=1).rig == used
+
+
+def test_read_labelled_refuses_sidecars_of_two_rigs(labelled: Label) -> None:
+    paths = [
+        _sidecar(labelled("a"), load_rig("bare-wall"), label="slope"),
+        _sidecar(labelled("b"), OWN, label="slope"),
+    ]
+
     with pytest.raises(RecordingError, match=r"a\.bag.*b\.bag"):
-        read_labelled([path, other], known=known)
+        read_labelled(paths, known=known)
 
 
 @pytest.mark.parametrize(("label", "word"), [(None, "--label"), ("", "--label"), ("mug", "mug")])
@@ -132,34 +184,50 @@ def test_read_labelled_refuses_missing_or_unknown_label(
     labelled: Label, label: str | None, word: str
 ) -> None:
     path = labelled("a", label)
+
     with pytest.raises(RecordingError, match=rf"a\.bag.*{word}"):
         read_labelled([path], known=known)
+
+
+def test_read_labelled_refuses_recording_without_sidecar(labelled: Label) -> None:
+    path = labelled("a")
     sidecar_path(path).unlink()
+
     with pytest.raises(RecordingError, match="a"):
         read_labelled([path], known=known)
 
 
-@pytest.mark.parametrize("dark_from", [2, 0])
-def test_dark_frames_are_skipped(
-    noise_world: Any, hurried_clock: Any, tmp_path: Path, dark_from: int
-) -> None:
-    class Dark(noise_world):
-        def images(self, number: int) -> Any:
-            seen = super().images(number)
-            seen.depth_z16[:] = 0 if number >= dark_from else seen.depth_z16
-            return seen
+@pytest.fixture
+def dark(noise_world: Any, hurried_clock: Any, tmp_path: Path) -> Callable[[int], Path]:
+    """A recording of four frames that are dark from some frame on."""
 
-    path = tmp_path / "dark.bag"
-    with SimulatedCamera(
-        "sim:dark", Dark(), clock=hurried_clock(), recording=Recording(path, frames=4)
-    ) as camera:
-        assert len(list(camera)) >= 1
-    _sidecar(path, label="slope")
-    if dark_from:
-        assert len(read_labelled([path], known=known).label) == dark_from
-    else:
-        with pytest.raises(RecordingError, match=r"dark\.bag"):
-            read_labelled([path], known=known)
+    def record(dark_from: int) -> Path:
+        class Dark(noise_world):
+            def images(self, number: int) -> Any:
+                seen = super().images(number)
+                seen.depth_z16[:] = 0 if number >= dark_from else seen.depth_z16
+                return seen
+
+        path = tmp_path / "dark.bag"
+        recording = Recording(path, frames=4)
+        with SimulatedCamera(
+            "sim:dark", Dark(), clock=hurried_clock(), recording=recording
+        ) as camera:
+            assert len(list(camera)) >= 1
+        return _sidecar(path, label="slope")
+
+    return record
+
+
+def test_dark_frames_are_skipped(dark: Callable[[int], Path]) -> None:
+    assert len(read_labelled([dark(2)], known=known).label) == 2
+
+
+def test_recording_of_dark_frames_alone_is_refused(dark: Callable[[int], Path]) -> None:
+    path = dark(0)
+
+    with pytest.raises(RecordingError, match=r"dark\.bag"):
+        read_labelled([path], known=known)
 
 
 def _truth(folder: Path, label: str = "mug", name: str = "F") -> np.ndarray:
@@ -170,35 +238,56 @@ def _write_truth(folder: Path, text: str) -> None:
     (folder / "mug.truth.toml").write_text(text, encoding="utf-8")
 
 
-def test_truth_is_depth_map_of_recording_then_of_label_then_its_test_object(tmp_path: Path) -> None:
-    np.save(
-        tmp_path / "cup-1.npy",
-        of_label := np.where(np.eye(64) > 0, np.float32(0.3), np.float32(np.nan)),
-    )
+def test_truth_is_the_depth_map_of_the_label(tmp_path: Path) -> None:
+    of_label = np.where(np.eye(64) > 0, np.float32(0.3), np.float32(np.nan))
+    np.save(tmp_path / "cup-1.npy", of_label)
+
     np.testing.assert_array_equal(_truth(tmp_path, "cup-1"), of_label)
-    np.save(tmp_path / "F.npy", of_recording := np.full((64, 64), 0.25, np.float32))
+
+
+def test_depth_map_of_the_recording_goes_before_the_labels(tmp_path: Path) -> None:
+    of_recording = np.full((64, 64), 0.25, np.float32)
+    of_label = np.full((64, 64), 0.3, np.float32)
+    np.save(tmp_path / "F.npy", of_recording)
+    np.save(tmp_path / "cup-1.npy", of_label)
+
     np.testing.assert_array_equal(_truth(tmp_path, "cup-1"), of_recording)
     np.testing.assert_array_equal(_truth(tmp_path, "cup-1", name="G"), of_label)
+
+
+def test_truth_without_files_is_the_test_object_of_the_label() -> None:
     assert _truth(Path("nowhere"), "cup-1") is CUP
-    objects = benchmark_depths(BOX)
-    assert list(objects) == [thing.name for thing in fixed_set(BOX)]
-    np.testing.assert_array_equal(
-        objects["cup-2"], next(o.depth_m for o in fixed_set(BOX) if o.name == "cup-2")
-    )
 
 
-@pytest.mark.parametrize("named", [True, False])
-def test_truth_of_mesh_stands_at_its_pose(tmp_path: Path, named: bool) -> None:
-    BALL.export(tmp_path / ("print.stl" if named else "mug.stl"))
-    file = 'file = "print.stl"\n' if named else ""
-    _write_truth(tmp_path, f"{file}size_m = 0.1\nx_m = 0.05\ny_m = -0.03\nfront_m = 0.06\n")
+def test_benchmark_depths_are_those_of_the_test_objects() -> None:
+    things = fixed_set(BOX)
+    cup = next(thing for thing in things if thing.name == "cup-2")
+
+    depths_m = benchmark_depths(BOX)
+
+    assert list(depths_m) == [thing.name for thing in things]
+    np.testing.assert_array_equal(depths_m["cup-2"], cup.depth_m)
+
+
+@pytest.mark.parametrize(("mesh", "named"), [("print.stl", 'file = "print.stl"'), ("mug.stl", "")])
+def test_truth_of_mesh_stands_at_its_pose(tmp_path: Path, mesh: str, named: str) -> None:
+    BALL.export(tmp_path / mesh)
+    _write_truth(tmp_path, f"{named}\nsize_m = 0.1\nx_m = 0.05\ny_m = -0.03\nfront_m = 0.06\n")
+
     depth_m = _truth(tmp_path)
-    (x_m, y_m) = cell_centers_m(BOX)
+
+    x_m, y_m = cell_centers_m(BOX)
     rows, columns = np.nonzero(~np.isnan(depth_m))
     assert x_m[columns].mean() == pytest.approx(0.45 + 0.05, abs=0.002)
     assert y_m[rows].mean() == pytest.approx(-0.03, abs=0.002)
     assert np.ptp(x_m[columns]) == pytest.approx(0.1, abs=0.01)
     assert np.nanmin(depth_m) == pytest.approx(BOX.z_near_m + 0.06, abs=0.001)
+
+
+def test_truth_file_gives_a_category(tmp_path: Path) -> None:
+    _write_truth(tmp_path, 'category = "cup"\nseed = 3\nsize_m = 0.15\n')
+
+    assert np.isfinite(_truth(tmp_path)).any()
 
 
 @pytest.mark.parametrize(
@@ -216,30 +305,44 @@ def test_truth_of_mesh_stands_at_its_pose(tmp_path: Path, named: bool) -> None:
 def test_truth_file_names_its_problem(
     tmp_path: Path, text: str, kind: type[NlosCamError], word: str
 ) -> None:
-    _write_truth(tmp_path, 'category = "cup"\nseed = 3\nsize_m = 0.15\n')
-    assert np.isfinite(_truth(tmp_path)).any()
     _write_truth(tmp_path, text)
+
     with pytest.raises(kind, match=word):
         _truth(tmp_path)
 
 
-def test_truth_is_refused_where_files_are_missing_doubled_elsewhere_or_of_another_size(
-    tmp_path: Path,
-) -> None:
+def test_missing_truth_names_the_files_it_could_have(tmp_path: Path) -> None:
     with pytest.raises(RecordingError, match=r"mug\.truth\.toml.*mug\.npy"):
         _truth(tmp_path)
-    (tmp_path / "a").mkdir()
-    BALL.export(tmp_path / "a" / "mug.stl")
+
+
+def test_mesh_without_truth_file_is_refused(tmp_path: Path) -> None:
+    BALL.export(tmp_path / "mug.stl")
+
     with pytest.raises(RecordingError, match=r"mug\.stl.*mug\.truth\.toml"):
-        _truth(tmp_path / "a")
+        _truth(tmp_path)
+
+
+def test_truth_of_another_size_is_refused(tmp_path: Path) -> None:
     np.save(tmp_path / "mug.npy", np.full((32, 32), 0.2, np.float32))
+
     with pytest.raises(RecordingError, match=r"32, 32"):
         _truth(tmp_path)
+
+
+@pytest.mark.parametrize("label", ["../mug", "a/mug"])
+def test_label_that_leads_elsewhere_is_refused(tmp_path: Path, label: str) -> None:
+    (tmp_path / "a").mkdir()
     np.save(tmp_path / "mug.npy", CUP)
-    for label in ("../mug", "a/mug"):
-        with pytest.raises(RecordingError, match=label):
-            _truth(tmp_path / "a", label)
+
+    with pytest.raises(RecordingError, match=label):
+        _truth(tmp_path / "a", label)
+
+
+def test_two_truths_of_one_label_are_refused(tmp_path: Path) -> None:
+    np.save(tmp_path / "mug.npy", CUP)
     _write_truth(tmp_path, 'category = "cup"\n')
+
     with pytest.raises(RecordingError, match="mug"):
         _truth(tmp_path)
 
@@ -249,37 +352,51 @@ def _samples(count: int) -> Labelled:
     depth_m, intensity = generator.random((2, count, 64, 80), np.float32)
     depth_m[:, 0, 0] = np.nan
     truth_m = generator.uniform(0.12, 0.4, (count, 64, 64)).astype(np.float32)
+    maps = MapSet(depth_m, intensity, truth_m.astype(np.float16))
     names = tuple(f"cup-{k}" for k in range(count))
-    return Labelled(
-        MapSet(depth_m, intensity, truth_m.astype(np.float16)), truth_m, names, names, RIG
-    )
+    return Labelled(maps, truth_m, names, names, RIG)
 
 
 @pytest.mark.parametrize("count", [3, SHARD + 7])
-def test_labelled_shards_are_read_as_written_and_not_extended(tmp_path: Path, count: int) -> None:
-    write_shards(
-        _samples(SHARD + 5), tmp_path
-    )  # a larger dataset, which the next replaces as a whole
-    write_shards(samples := _samples(count), tmp_path)
-    maps = (data := open_dataset(tmp_path)).arrays()
-    plan = data.plan
+def test_labelled_shards_are_read_as_written(tmp_path: Path, count: int) -> None:
+    """A larger dataset before them is replaced as a whole."""
+    samples = _samples(count)
+    write_shards(_samples(SHARD + 5), tmp_path)
+
+    write_shards(samples, tmp_path)
+
+    data = open_dataset(tmp_path)
+    maps = data.arrays()
     for name in ("depth_m", "intensity", "image"):
         np.testing.assert_array_equal(getattr(maps, name), getattr(samples.maps, name))
     assert tuple(data.column("category")) == samples.label
     np.testing.assert_array_equal(data.column("object_depth_m"), samples.object_depth_m)
-    assert np.isnan(data.column("scene")).any(axis=0).sum() == 1  # the gain is not known
-    assert (plan.rig, plan.accuracy) == (RIG, RECORDED)
+
+
+def test_labelled_shards_name_their_rig_but_not_its_gain(tmp_path: Path) -> None:
+    write_shards(_samples(3), tmp_path)
+
+    data = open_dataset(tmp_path)
+    assert (data.plan.rig, data.plan.accuracy) == (RIG, RECORDED)
+    assert np.isnan(data.column("scene")).any(axis=0).sum() == 1
+
+
+def test_labelled_shards_are_not_extended(tmp_path: Path) -> None:
+    write_shards(_samples(3), tmp_path)
+
     with pytest.raises(RecordingError, match="--out"):
         build_dataset(DatasetPlan(RIG, 0), 4, tmp_path, workers=1, on_progress=lambda *_: None)
 
 
 def test_labelled_shards_survive_full_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     out = tmp_path / "data"
-    stores = iter([store, Mock(side_effect=DiskFullError("full"))])
     write_shards(_samples(SHARD + 7), out)
     before = {path.name: path.read_bytes() for path in out.iterdir()}
-    monkeypatch.setattr(labelled_shards, "store", lambda *given: next(stores)(*given))  # noqa: PLW0108  another each time
+    stores = iter([store, Mock(side_effect=DiskFullError("full"))])
+    monkeypatch.setattr(labelled_shards, "store", lambda *given: next(stores)(*given))  # noqa: PLW0108
+
     with pytest.raises(DiskFullError, match=str(out)):
         write_shards(_samples(SHARD + 9), out)
+
     assert {path.name: path.read_bytes() for path in out.iterdir()} == before
     assert list(tmp_path.iterdir()) == [out]

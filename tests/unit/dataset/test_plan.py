@@ -47,32 +47,69 @@ CHANGES: dict[str, Any] = {
 
 
 @pytest.mark.parametrize("name", CHANGES)
-def test_plan_survives_json_and_names_the_field_that_differs(name: str) -> None:
+def test_plan_survives_json(name: str) -> None:
     other = replace(PLAN, **{name: CHANGES[name]})
+
     assert DatasetPlan.from_provenance(other.provenance) == other
-    assert other.differences(PLAN) == [name.replace("_", " ")]
-    assert PLAN.differences(replace(PLAN)) == []
     assert "somewhere" not in other.provenance  # the folder of meshes differs between machines
 
 
-def test_plan_writes_later_fields_only_where_used_and_of_older_version_has_defaults() -> None:
+@pytest.mark.parametrize("name", CHANGES)
+def test_plan_names_the_field_that_differs(name: str) -> None:
+    other = replace(PLAN, **{name: CHANGES[name]})
+
+    assert other.differences(PLAN) == [name.replace("_", " ")]
+
+
+def test_equal_plans_have_no_differences() -> None:
+    assert PLAN.differences(replace(PLAN)) == []
+
+
+def test_plan_writes_later_fields_only_where_used() -> None:
     """Checksums of older plans stay."""
-    mixed = replace(PLAN, objects=Objects(share_generic=0.5))
     facts = json.loads(PLAN.provenance)
-    assert json.loads(replace(PLAN, textures=tuple(TEXTURES)).provenance)["note"] == SIMULATION_ONLY
-    assert json.loads(mixed.provenance)["objects"]["share_generic"] == 0.5
-    assert DatasetPlan.from_provenance(mixed.provenance) == mixed
+
     assert not {"textures", "note", "expected", "objects_per_rig"} & facts.keys()
     assert "share_generic" not in facts["objects"]
+
+
+def test_textured_plan_carries_a_note() -> None:
+    facts = json.loads(replace(PLAN, textures=tuple(TEXTURES)).provenance)
+
+    assert facts["note"] == SIMULATION_ONLY
+
+
+def test_plan_writes_share_of_generic_shapes() -> None:
+    mixed = replace(PLAN, objects=Objects(share_generic=0.5))
+
+    assert json.loads(mixed.provenance)["objects"]["share_generic"] == 0.5
+    assert DatasetPlan.from_provenance(mixed.provenance) == mixed
+
+
+@pytest.fixture
+def older_facts() -> dict[str, Any]:
+    """Facts of a plan that the first version wrote."""
+    facts = json.loads(PLAN.provenance)
     for name in ("objects", "spread", "radiometry", "jump_m", "material"):
         del facts[name]
     for name in ("ripple_m", "warm_up", "range_offset_m"):
         del facts["sensor"][name]
-    older = DatasetPlan.from_provenance(json.dumps(facts))
+    return facts
+
+
+def test_older_plan_has_defaults_and_objects_of_first_version(
+    older_facts: dict[str, Any],
+) -> None:
+    older = DatasetPlan.from_provenance(json.dumps(older_facts))
+
     assert PLAN.differences(older) == ["objects"]  # the generators of the first version were others
     assert (older.objects.categories, older.objects.version) == (FIRST_OBJECTS["categories"], 1)
-    facts["objects"] = {"categories": list(CATEGORIES)}
-    assert DatasetPlan.from_provenance(json.dumps(facts)) == PLAN
+
+
+def test_older_plan_that_names_categories_has_defaults(older_facts: dict[str, Any]) -> None:
+    older_facts["objects"] = {"categories": list(CATEGORIES)}
+
+    assert DatasetPlan.from_provenance(json.dumps(older_facts)) == PLAN
 
 
 @pytest.mark.parametrize(
@@ -91,8 +128,14 @@ def test_plan_refuses_other_json_and_newer_plans(text: str, word: str) -> None:
 
 def test_objects_without_leaves_categories_out() -> None:
     assert set(CATEGORIES) - set(Objects.without(["hat", "boat"]).categories) == {"hat", "boat"}
+
+
+def test_objects_without_refuses_unknown_category() -> None:
     with pytest.raises(SceneError, match="hut"):
         Objects.without(["hut"])
+
+
+def test_objects_without_refuses_to_leave_none() -> None:
     with pytest.raises(SceneError):
         Objects.without(list(CATEGORIES))
 
@@ -106,29 +149,54 @@ def test_plan_of_scene_takes_all_but_the_object() -> None:
         "sensor": {"pulse_ns": 1.0},
     }
     scene = SceneFile.model_validate({"name": "s", "object": hidden, **facts})
+
     plan = DatasetPlan.of_scene(scene, 3, accuracy="draft")
+
     assert (plan.rig, plan.first_seed, plan.accuracy) == (scene.rig, 3, "draft")
     assert (plan.sensor, plan.radiometry, plan.jump_m) == (scene.sensor, "lambertian", 0.03)
     assert (plan.material, plan.objects) == (Material(kind="phong"), Objects())
 
 
-def test_spread_draws_rigs_by_seed_uniformly_within_bounds_and_none_keeps_the_rig() -> None:
-    drawn = np.array([scene_row(*SPREAD.draw(RIG, SENSOR, seed)) for seed in range(300)])
+@pytest.fixture(scope="module")
+def drawn() -> np.ndarray:
+    """Rows of facts of 300 rigs."""
+    return np.array([scene_row(*SPREAD.draw(RIG, SENSOR, seed)) for seed in range(300)])
+
+
+def test_scene_row_has_its_columns(drawn: np.ndarray) -> None:
+    assert drawn.shape[1] == len(SCENE_COLUMNS)
+
+
+def test_spread_draws_rigs_uniformly_within_bounds(drawn: np.ndarray) -> None:
     half = np.array([0.02, 5, 5, 0.02, 0.02, 0.3 * SENSOR.bare_wall_counts])
     share = (drawn - np.array(scene_row(RIG, SENSOR))) / half
-    assert drawn.shape[1] == len(SCENE_COLUMNS)
+
     assert np.abs(share).max() <= 1 + 1e-9
     assert share.min(0).max() < -0.95
     assert share.max(0).min() > 0.95
     assert np.abs(np.corrcoef(share.T) - np.eye(6)).max() < 0.25
+
+
+def test_spread_draws_rigs_by_seed() -> None:
     assert SPREAD.draw(RIG, SENSOR, 5) == SPREAD.draw(RIG, SENSOR, 5)
     assert SPREAD.draw(RIG, SENSOR, 5) != SPREAD.draw(RIG, SENSOR, 6)
+
+
+def test_no_spread_keeps_the_rig() -> None:
     assert RigSpread().draw(RIG, SENSOR, 5) == (RIG, SENSOR)
+
+
+def test_objects_share_a_rig_in_groups() -> None:
     shared = replace(PLAN, spread=SPREAD, objects_per_rig=5)
-    assert [shared.bench_of(seed) for seed in range(4, 7)] == [
-        SPREAD.draw(RIG, SENSOR, draw) for draw in (0, 1, 1)
-    ]
+
+    benches = [shared.bench_of(seed) for seed in range(4, 7)]
+
+    assert benches == [SPREAD.draw(RIG, SENSOR, draw) for draw in (0, 1, 1)]
+
+
+def test_rig_without_occluder_is_drawn_without_one() -> None:
     rig, sensor = SPREAD.draw(RIG.model_copy(update={"occluder": None}), SENSOR, 1)
+
     assert rig.occluder is None
     assert np.isnan(scene_row(rig, sensor)).tolist() == [False, False, False, True, True, False]
 
@@ -151,8 +219,15 @@ NEAR = RIG.model_copy(update={"occluder": RIG.occluder.model_copy(update={"x_m":
     ],
 )
 def test_plan_check_refuses_impossible_plans(changes: dict[str, Any], words: str) -> None:
-    replace(PLAN, textures=changes.get("textures", ())).check()
     with pytest.raises(SceneError, match=words):
         replace(PLAN, **changes).check()
+
+
+@pytest.mark.parametrize("textures", [(), tuple(TEXTURES)])
+def test_plan_check_accepts_possible_plans(textures: tuple[str, ...]) -> None:
+    replace(PLAN, textures=textures).check()
+
+
+def test_spread_refuses_negative_lengths() -> None:
     with pytest.raises(ValidationError, match="place_m"):
         RigSpread(place_m=-1)

@@ -49,6 +49,10 @@ def _rows(
     return [found.row.tolist() for found in data.batches(seed, epoch, batch, **others)]
 
 
+def _every_row(data: Dataset, batch: int = 1) -> list[int]:
+    return [row for some in _rows(data, batch=batch) for row in some]
+
+
 def _assert_as_stored(found: MapBatch) -> None:
     samples = samples_of([40 + row for row in found.row.tolist()])
     for k, mirrored in enumerate(found.mirrored.tolist()):
@@ -60,67 +64,89 @@ def _assert_as_stored(found: MapBatch) -> None:
         )
 
 
-def test_dataset_is_read_as_stored(data: Dataset) -> None:
-    maps = data.arrays()
-    plan = data.plan
-    assert (len(data), plan) == (COUNT, PLAN)
-    for name in MAP_CHANNELS:
-        np.testing.assert_array_equal(getattr(maps, name), samples_of(range(40, 40 + COUNT))[name])
-        parts = [getattr(part, name) for part in data.chunks()]
-        np.testing.assert_array_equal(np.concatenate(parts), getattr(maps, name))
+def test_dataset_has_its_samples_and_plan(data: Dataset) -> None:
+    assert (len(data), data.plan) == (COUNT, PLAN)
+
+
+@pytest.mark.parametrize("name", MAP_CHANNELS)
+def test_dataset_is_read_as_stored(data: Dataset, name: str) -> None:
+    stored = samples_of(range(40, 40 + COUNT))[name]
+    parts = [getattr(part, name) for part in data.chunks()]
+
+    np.testing.assert_array_equal(getattr(data.arrays(), name), stored)
+    np.testing.assert_array_equal(np.concatenate(parts), stored)
 
 
 @pytest.mark.parametrize("batch", [1, 4, 7, 43, 100])
 def test_epoch_holds_samples_once_without_last_partial_batch(data: Dataset, batch: int) -> None:
     size = min(batch, COUNT)
-    rows = _rows(data, batch=batch)
-    assert {len(some) for some in rows} == {size}
-    every = [row for some in rows for row in some]
+
+    every = _every_row(data, batch)
+
+    assert {len(some) for some in _rows(data, batch=batch)} == {size}
     assert len(every) == len(set(every)) == COUNT // size * size
     assert set(every) <= set(range(COUNT))
 
 
-def test_batches_are_samples_mirrored_at_random_as_seed_and_epoch_determine(data: Dataset) -> None:
+def test_batches_are_samples_mirrored_at_random(data: Dataset) -> None:
     batches = list(data.batches(1, 2, 4))
+
     for found in batches:
         assert found.depth_m.dtype == found.image.dtype == torch.float32
         _assert_as_stored(found)
     assert 0.2 < torch.cat([found.mirrored for found in batches]).float().mean() < 0.8
+
+
+def test_batches_repeat_by_seed_and_epoch(data: Dataset) -> None:
     for one, again in zip(data.batches(3, 1, 4), data.batches(3, 1, 4), strict=True):
         for here, there in zip(one, again, strict=True):
             torch.testing.assert_close(here, there, rtol=0, atol=0, equal_nan=True)
-    assert _rows(data, 3, 1) != _rows(data, 3, 2)
-    assert _rows(data, 3, 1) != _rows(data, 4, 1)
+
+
+@pytest.mark.parametrize(("seed", "epoch"), [(3, 2), (4, 1)])
+def test_batches_of_another_seed_or_epoch_differ(data: Dataset, seed: int, epoch: int) -> None:
+    assert _rows(data, 3, 1) != _rows(data, seed, epoch)
 
 
 @pytest.mark.parametrize("world", [2, 3])
 def test_processes_share_the_batches_of_one_process(data: Dataset, world: int) -> None:
     alone = list(data.batches(0, 0, 6))
-    shares = [list(data.batches(0, 0, 6, rank=rank, world=world)) for rank in range(world)]
-    for number, whole in enumerate(alone):
-        for rank in range(world):
-            share = shares[rank][number]
+
+    for rank in range(world):
+        shares = list(data.batches(0, 0, 6, rank=rank, world=world))
+        for share, whole in zip(shares, alone, strict=True):
             assert share.row.tolist() == whole.row.tolist()[rank::world]
             assert share.mirrored.tolist() == whole.mirrored.tolist()[rank::world]
             _assert_as_stored(share)
-    for rank, count in ((0, 4), (2, 2), (-1, 2)):
-        with pytest.raises(SceneError, match="6"):
-            next(data.batches(0, 0, 6, rank=rank, world=count))
 
 
-def test_samples_are_shuffled_and_read_once_into_two_buffers(
-    data: Dataset, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    shards = np.array([row for some in _rows(data, batch=1) for row in some]) // SHARD
+@pytest.mark.parametrize(("rank", "world"), [(0, 4), (2, 2), (-1, 2)])
+def test_impossible_share_of_a_batch_is_refused(data: Dataset, rank: int, world: int) -> None:
+    with pytest.raises(SceneError, match="6"):
+        next(data.batches(0, 0, 6, rank=rank, world=world))
+
+
+def test_samples_of_three_shards_are_shuffled_together(data: Dataset) -> None:
+    shards = np.array(_every_row(data)) // SHARD
     blocks = [set(shards[k : k + 15].tolist()) for k in range(0, 30, 15)]
-    assert any(
-        len(block) == 3 for block in blocks
-    )  # three shards of five samples, shuffled together
+    runs = np.split(shards, np.flatnonzero(np.diff(shards)) + 1)
+
+    assert any(len(block) == 3 for block in blocks)
     assert shards.tolist() != sorted(shards.tolist())
-    assert (
-        len({len(list(run)) for run in np.split(shards, np.flatnonzero(np.diff(shards)) + 1)}) > 1
-    )
+    assert len({len(run) for run in runs}) > 1
+
+
+def test_shards_are_read_once(data: Dataset, monkeypatch: pytest.MonkeyPatch) -> None:
     read = Mock(wraps=_maps)
+    monkeypatch.setattr(reader, "_maps", read)
+
+    assert len(_every_row(data)) == COUNT
+
+    paths = {call.args[0].path for call in read.call_args_list}
+    assert read.call_count == len(paths) == len(data.shards)
+
+
+def test_two_buffers_of_shards_are_held(data: Dataset, monkeypatch: pytest.MonkeyPatch) -> None:
     held = list[int]()
     original_take = _Window.take
 
@@ -129,40 +155,50 @@ def test_samples_are_shuffled_and_read_once_into_two_buffers(
         held.append(len(window._held))
         return found
 
-    monkeypatch.setattr(reader, "_maps", read)
     monkeypatch.setattr(_Window, "take", take)
-    assert len(_rows(data, batch=1)) == COUNT == len(held)
+
+    assert len(_every_row(data)) == COUNT == len(held)
     assert max(held) <= 2 * reader.BUFFER
-    assert (
-        read.call_count
-        == len({call.args[0].path for call in read.call_args_list})
-        == len(data.shards)
-    )
 
 
-@pytest.mark.parametrize("way", ["arrays", "batches", "chunks"])
-def test_reader_names_damaged_shard(folder: Path, tmp_path: Path, way: str) -> None:
+@pytest.mark.parametrize(
+    ("way", "options"), [("arrays", ()), ("batches", (0, 0, 4)), ("chunks", ())]
+)
+def test_reader_names_damaged_shard(
+    folder: Path, tmp_path: Path, way: str, options: tuple[int, ...]
+) -> None:
     shutil.copytree(folder, tmp_path, dirs_exist_ok=True)
     victim = tmp_path / "shard-000000050.h5"
     content = bytearray(victim.read_bytes())
-    content[len(content) // 3 : len(content) // 2] = bytes(len(content) // 2 - len(content) // 3)
+    start = len(content) // 3
+    stop = len(content) // 2
+    content[start:stop] = bytes(stop - start)
     victim.write_bytes(content)
+
     with pytest.raises(RecordingError, match=r"shard-000000050\.h5") as caught:
-        list(getattr(open_dataset(tmp_path), way)(*((0, 0, 4) if way == "batches" else ())))
+        list(getattr(open_dataset(tmp_path), way)(*options))
+
     assert "\n" not in str(caught.value)
 
 
-def test_reader_refuses_no_dataset_shards_of_two_and_unasked_expected_maps(
-    tmp_path: Path, folder: Path
-) -> None:
+def test_reader_refuses_folder_without_dataset(tmp_path: Path) -> None:
     with pytest.raises(RecordingError, match="nlos-cam dataset build"):
         open_dataset(tmp_path)
-    store(shard_path(tmp_path, 40), samples_of([40]), replace(PLAN, expected=True).provenance, "")
+
+
+def test_reader_opens_expected_maps_where_asked_alone(tmp_path: Path) -> None:
+    expected = replace(PLAN, expected=True)
+    store(shard_path(tmp_path, 40), samples_of([40]), expected.provenance, "")
+
     with pytest.raises(RecordingError, match="without --expected-maps"):
         open_dataset(tmp_path)
     assert open_dataset(tmp_path, expected=True).plan.expected
+
+
+def test_reader_refuses_shards_of_two_datasets(tmp_path: Path, folder: Path) -> None:
     shutil.copytree(folder, tmp_path, dirs_exist_ok=True)
     other = DatasetPlan(PLAN.rig, 40, accuracy="fine")
     store(shard_path(tmp_path, 90), samples_of(range(90, 92)), other.provenance, "")
+
     with pytest.raises(RecordingError, match=r"shard-000000090\.h5"):
         open_dataset(tmp_path)

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 from fake_workers import samples_of
-from nlos_calibration import load_rig
+from nlos_calibration import Rig, load_rig
 from nlos_models import CellNormal
 from nlos_models.training import MapBatch
 from nlos_models.training.data import flip_some, subtract_bare_wall
@@ -66,42 +66,63 @@ def _read(
     )
 
 
-def test_read_maps_takes_first_objects_of_recipe_and_a_digest_of_objects_and_rig() -> None:
+def test_read_maps_takes_first_objects_of_recipe() -> None:
     maps = _read()
+
     np.testing.assert_array_equal(maps.training.image, small_maps(6, 4).image[:4])
     np.testing.assert_array_equal(maps.held_out.image, small_maps(6, 5).image[:2])
     assert maps.limit_recipe(RECIPE) == RECIPE
-    assert _read(held_out=400).limit_recipe(RECIPE).held_out == 6  # all that there are
+
+
+def test_read_maps_limits_recipe_to_what_there_is() -> None:
+    assert _read(held_out=400).limit_recipe(RECIPE).held_out == 6
+
+
+def test_digest_of_read_maps_is_of_objects_and_rig() -> None:
     pairs = (("data", "other"), ("also", "other"), ("others", "other"), ("rig1", "rig2"))
+
     digests = [_read(*pair).digest for pair in pairs]
+
     assert digests[0] == digests[1]
     assert len(set(digests)) == 3
 
 
-@pytest.mark.parametrize("stream", [False, True])
+def _first_batch(data: str, seed: int, *, stream: bool) -> MapBatch:
+    maps = _read(data, stream=stream, objects=6).training
+    return next(iter(maps.batches(6, torch.Generator().manual_seed(seed))))
+
+
+streamed_or_not = pytest.mark.parametrize("stream", [False, True])
+
+
+@streamed_or_not
 def test_expected_maps_get_noise_anew_in_each_epoch(stream: bool) -> None:
-    """Of its stated deviation, in the intensity alone; the same generator draws the same again."""
+    one = _first_batch("expected", 1, stream=stream)
+    other = _first_batch("expected", 2, stream=stream)
 
-    def first(data: str, seed: int) -> MapBatch:
-        batches = _read(data, stream=stream, objects=6).training.batches(
-            6, torch.Generator().manual_seed(seed)
-        )
-        return next(iter(batches))
+    assert not torch.equal(one.intensity, other.intensity)
 
-    one = first("expected", 1)
-    other = first("expected", 2)
-    same = first("expected", 1)
-    plain = first("expecte*", 1)
+
+@streamed_or_not
+def test_same_generator_draws_the_same_noise(stream: bool) -> None:
+    one, same = (_first_batch("expected", 1, stream=stream) for _ in range(2))
+
     assert all(torch.equal(mine, its) for mine, its in zip(one[1:], same[1:], strict=True))
-    assert torch.equal(one.row, plain.row)
-    torch.testing.assert_close(one.depth_m, plain.depth_m, equal_nan=True, rtol=0, atol=0)
+
+
+@streamed_or_not
+def test_noise_has_its_stated_deviation_in_intensity_alone(stream: bool) -> None:
+    noisy = _first_batch("expected", 1, stream=stream)
+    plain = _first_batch("expecte*", 1, stream=stream)
     bright = plain.intensity > 10  # no noise is cut off at 0
-    off = (one.intensity - plain.intensity)[bright] / map_noise(PLAN).deviation(
-        plain.intensity[bright]
-    )
+    deviation = map_noise(PLAN).deviation(plain.intensity[bright])
+
+    off = (noisy.intensity - plain.intensity)[bright] / deviation
+
+    assert torch.equal(noisy.row, plain.row)
+    torch.testing.assert_close(noisy.depth_m, plain.depth_m, equal_nan=True, rtol=0, atol=0)
     assert abs(float(off.mean())) < 0.05
     assert 0.95 < float(off.std()) < 1.05
-    assert not torch.equal(one.intensity, other.intensity)
 
 
 @pytest.mark.parametrize(
@@ -120,62 +141,105 @@ def test_read_maps_refuses_what_does_not_fit(
         _read("data", held_out, wall, stream=stream)
 
 
-def test_rendered_bare_wall_cancels_a_frame_of_bare_wall_of_the_one_rig() -> None:
+def test_rendered_bare_wall_cancels_a_frame_of_bare_wall() -> None:
     depth_m, intensity = render_bare_wall(PLAN, frames=8)
-    images = Sensor(PLAN.rig, PLAN.sensor).expose(
-        render(Scene(PLAN.rig)).multi, np.random.default_rng(99)
-    )
+    sensor = Sensor(PLAN.rig, PLAN.sensor)
+    images = sensor.expose(render(Scene(PLAN.rig)).multi, np.random.default_rng(99))
     maps = maps_from_frame(images.frame(PLAN.rig.pinhole))
     valid = maps.valid & ~np.isnan(depth_m)
+
     assert valid.mean() > 0.5
     assert abs(np.median((maps.depth_m - depth_m)[valid])) < 1e-3
     assert abs(np.median((maps.intensity - intensity)[valid])) < 0.05 * np.median(intensity[valid])
     assert np.median(depth_m[valid]) > 0.1
+
+
+def test_bare_wall_of_many_rigs_is_refused() -> None:
     with pytest.raises(SceneError, match="--wall"):
         render_bare_wall(replace(PLAN, spread=RigSpread(place_m=0.01)))
 
 
-@pytest.mark.parametrize("wall", [None, WALL])
-def test_difference_maps_subtract_rendered_or_measured_wall(
-    monkeypatch: pytest.MonkeyPatch, wall: Path | None
-) -> None:
+@pytest.fixture
+def measured(monkeypatch: pytest.MonkeyPatch) -> SimpleNamespace:
+    """A measured wall; the rendered one has half its depth and intensity."""
     flat = np.zeros((64, 80), np.float32)
-    measured = SimpleNamespace(
-        reference=SimpleNamespace(map_depth_m=flat + 0.5, map_intensity=flat + 2)
-    )
+    reference = SimpleNamespace(map_depth_m=flat + 0.5, map_intensity=flat + 2)
+    wall = SimpleNamespace(reference=reference)
     monkeypatch.setattr(training_maps, "render_bare_wall", lambda _: (flat + 0.25, flat + 1))
-    monkeypatch.setattr(training_maps, "load_measured", lambda _: measured)
+    monkeypatch.setattr(training_maps, "load_measured", lambda _: wall)
+    return wall
+
+
+@pytest.mark.usefixtures("measured")
+@pytest.mark.parametrize(("wall", "depth_m", "intensity"), [(None, 0.25, 1.0), (WALL, 0.5, 2.0)])
+def test_difference_maps_subtract_rendered_or_measured_wall(
+    wall: Path | None, depth_m: float, intensity: float
+) -> None:
     made = _read(wall=wall, maps="difference maps")
-    for maps, raw in (
-        (made.training.first(4), small_maps(6, 4)),
-        (made.held_out, small_maps(6, 5)),
-    ):
-        difference = raw.intensity[: len(maps.image)] - maps.intensity
-        np.testing.assert_allclose(difference[~np.isnan(maps.depth_m)], 2.0 if wall else 1.0)
-        nearer_m = (raw.depth_m[: len(maps.image)] - maps.depth_m)[~np.isnan(maps.depth_m)]
-        np.testing.assert_allclose(nearer_m, 0.5 if wall else 0.25, rtol=1e-5)
+
+    pairs = ((made.training.first(4), small_maps(6, 4)), (made.held_out, small_maps(6, 5)))
+    for maps, raw in pairs:
+        count = len(maps.image)
+        seen = ~np.isnan(maps.depth_m)
+        darker = (raw.intensity[:count] - maps.intensity)[seen]
+        nearer_m = (raw.depth_m[:count] - maps.depth_m)[seen]
+        np.testing.assert_allclose(darker, intensity)
+        np.testing.assert_allclose(nearer_m, depth_m, rtol=1e-5)
+
+
+def test_measured_wall_without_reference_is_refused(measured: SimpleNamespace) -> None:
     measured.reference = None
+
     with pytest.raises(SceneError, match=r"wall\.toml"):
         _read(wall=WALL, maps="difference maps")
 
 
-def test_streamed_maps_equal_maps_in_memory() -> None:
-    maps = small_maps(8, 0)
+@pytest.fixture
+def bare() -> tuple[np.ndarray, ...]:
+    """Depth and intensity of a bare wall."""
     generator = np.random.default_rng(0)
-    bare = tuple(generator.random((64, 80), np.float32) for _ in range(2))
-    stream = Streamed(SmallDataset(maps, PLAN), maps.image, bare)
-    whole = subtract_bare_wall(maps, *bare)
-    batches, again = (list(stream.batches(4, torch.Generator().manual_seed(3))) for _ in "ab")
-    for batch, same in zip(batches, again, strict=True):
-        wanted = [torch.from_numpy(part)[batch.row] for part in (whole.depth_m, whole.intensity)]
+    return tuple(generator.random((64, 80), np.float32) for _ in range(2))
+
+
+@pytest.fixture
+def stream(bare: tuple[np.ndarray, ...]) -> Streamed:
+    """Eight small maps as streamed."""
+    maps = small_maps(8, 0)
+    return Streamed(SmallDataset(maps, PLAN), maps.image, bare)
+
+
+def _streamed_epoch(stream: Streamed) -> list[MapBatch]:
+    return list(stream.batches(4, torch.Generator().manual_seed(3)))
+
+
+def test_streamed_maps_equal_maps_in_memory(stream: Streamed, bare: tuple[np.ndarray, ...]) -> None:
+    whole = subtract_bare_wall(small_maps(8, 0), *bare)
+
+    for batch in _streamed_epoch(stream):
+        parts = [torch.from_numpy(part)[batch.row] for part in (whole.depth_m, whole.intensity)]
+        wanted = flip_some(parts, batch.mirrored)
         found = [batch.depth_m, batch.intensity]
-        wanted = flip_some(wanted, batch.mirrored)
         torch.testing.assert_close(found, wanted, rtol=0, atol=0, equal_nan=True)
+    np.testing.assert_array_equal(stream.first(6).depth_m, whole.depth_m[:6])
+
+
+def test_streamed_epoch_repeats_by_its_generator(stream: Streamed) -> None:
+    for batch, same in zip(_streamed_epoch(stream), _streamed_epoch(stream), strict=True):
         assert torch.equal(batch.row, same.row)
         assert torch.equal(batch.mirrored, same.mirrored)
-    assert sorted(torch.cat([batch.row for batch in batches]).tolist()) == list(range(8))
-    np.testing.assert_array_equal(stream.first(6).depth_m, whole.depth_m[:6])
+
+
+def test_streamed_epoch_holds_every_map_once(stream: Streamed) -> None:
+    rows = torch.cat([batch.row for batch in _streamed_epoch(stream)])
+
+    assert sorted(rows.tolist()) == list(range(8))
+
+
+def test_first_streamed_maps_are_at_most_all(stream: Streamed) -> None:
     assert len(stream.first(99).image) == 8
+
+
+def test_read_maps_streams_training_maps() -> None:
     assert isinstance(_read(stream=True, objects=6).training, Streamed)
 
 
@@ -206,134 +270,230 @@ def _epoch(packed: PackedMaps, seed: int, batch: int = 2) -> tuple[np.ndarray, n
     return tuple(np.concatenate([part[k].numpy() for part in parts]) for k in (0, 1))
 
 
-def test_packed_maps_are_the_datasets_normalised(tmp_path: Path) -> None:
-    folders = [_add(tmp_path / "a", 0), _add(tmp_path / "b", 20)]
-    with open_packed_maps(folders, tmp_path / "store") as packed:
+def _normalised(packed: PackedMaps, depth_m: np.ndarray, intensity: np.ndarray) -> np.ndarray:
+    return packed.normal(torch.from_numpy(depth_m), torch.from_numpy(intensity)).half().numpy()
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """A dataset of one shard."""
+    return _add(tmp_path / "a", 0)
+
+
+@pytest.fixture
+def store_folder(tmp_path: Path) -> Path:
+    """Where packed maps are kept."""
+    return tmp_path / "store"
+
+
+def test_packed_maps_are_the_datasets_normalised(
+    folder: Path, tmp_path: Path, store_folder: Path
+) -> None:
+    folders = [folder, _add(tmp_path / "b", 20)]
+    wanted = dict[bytes, np.ndarray]()
+
+    with open_packed_maps(folders, store_folder) as packed:
         assert len(packed) == 2 * SHARD
-        wanted = dict[bytes, np.ndarray]()
         for first in (0, 20):
             samples = _samples(first)
-            normal = packed.normal(
-                *(torch.from_numpy(samples[name]) for name in ("depth_m", "intensity"))
-            )
-            normal = normal.half().numpy()
-            wanted |= {
-                image.tobytes(): one for image, one in zip(samples["image"], normal, strict=True)
-            }
+            normal = _normalised(packed, samples["depth_m"], samples["intensity"])
+            keys = (image.tobytes() for image in samples["image"])
+            wanted.update(zip(keys, normal, strict=True))
         maps, images = _epoch(packed, 1)
+
     assert len({image.tobytes() for image in images}) == 2 * SHARD
     for image, one in zip(images, maps, strict=True):
         np.testing.assert_array_equal(one, wanted[image.tobytes()])
 
 
-def test_maps_of_many_rigs_are_packed_as_the_one_rig_sees_them_and_others_left_out(
-    tmp_path: Path,
+VARIED = replace(PLAN, spread=RigSpread(angle_deg=40))
+
+
+@pytest.fixture
+def benches() -> list[Rig]:
+    """The rigs of the varied dataset."""
+    return [VARIED.bench_of(seed)[0] for seed in range(SHARD)]
+
+
+@pytest.fixture
+def seen(benches: list[Rig]) -> list[bool]:
+    """Whether the one rig can see a rig's maps: some can, some not."""
+    found = [can_align(bench, PLAN.rig) for bench in benches]
+    assert 0 < sum(found) < SHARD
+    return found
+
+
+def test_maps_that_the_one_rig_cannot_see_are_left_out(
+    tmp_path: Path, store_folder: Path, seen: list[bool]
 ) -> None:
-    varied = replace(PLAN, spread=RigSpread(angle_deg=40))
-    benches = [varied.bench_of(seed)[0] for seed in range(SHARD)]
-    seen = [can_align(bench, PLAN.rig) for bench in benches]
-    assert 0 < sum(seen) < SHARD
-    folder = _add(tmp_path / "a", 0, varied)
-    samples = _samples(0)
-    with open_packed_maps([folder], tmp_path / "store") as packed:
+    varied = _add(tmp_path / "varied", 0, VARIED)
+
+    with open_packed_maps([varied], store_folder) as packed:
         assert len(packed) == sum(seen)
+        assert len(packed.held_out(varied, SHARD - 1).image) == sum(seen[:-1])
+
+
+def test_maps_of_many_rigs_are_packed_as_the_one_rig_sees_them(
+    tmp_path: Path, store_folder: Path, benches: list[Rig], seen: list[bool]
+) -> None:
+    varied = _add(tmp_path / "varied", 0, VARIED)
+    samples = _samples(0)
+
+    with open_packed_maps([varied], store_folder) as packed:
         maps, images = _epoch(packed, 1, 1)
-        held_out = packed.held_out(folder, SHARD - 1)
-    assert len(held_out.image) == sum(seen[:-1])
+
     for row in np.flatnonzero(seen):
-        one = LidarMaps(
-            samples["depth_m"][row], samples["intensity"][row], np.isfinite(samples["depth_m"][row])
-        )
+        depth_m = samples["depth_m"][row]
+        one = LidarMaps(depth_m, samples["intensity"][row], np.isfinite(depth_m))
         aligned = MapAlignment(benches[row], PLAN.rig).align(one)
-        wanted = packed.normal(
-            *(torch.from_numpy(part[None]) for part in (aligned.depth_m, aligned.intensity))
-        )
         found = maps[(images == samples["image"][row]).all((1, 2))]
-        np.testing.assert_array_equal(found, wanted.half().numpy())
+        wanted = _normalised(packed, aligned.depth_m[None], aligned.intensity[None])
+        np.testing.assert_array_equal(found, wanted)
 
 
-def test_maps_in_color_are_packed_with_three_intensities_of_one_rig(tmp_path: Path) -> None:
-    plan = replace(PLAN, textures=("plain",))
+COLOR = replace(PLAN, textures=("plain",))
+
+
+def _add_in_color(folder: Path, plan: DatasetPlan) -> Path:
     samples = _samples(0)
     painted = {name: np.stack([samples[name]] * 3, 1) for name in ("intensity", "image")}
-    store_shard = {**samples, **painted, "texture": np.array(["plain"] * SHARD, object)}
-    for name, made in (("one", plan), ("many", replace(plan, spread=RigSpread(angle_deg=1)))):
-        (tmp_path / name).mkdir()
-        store(shard_path(tmp_path / name, 0), store_shard, made.provenance, "")
-    with open_packed_maps([tmp_path / "one"], tmp_path / "store", color=True) as packed:
+    texture = np.array(["plain"] * SHARD, object)
+    folder.mkdir()
+    shard = {**samples, **painted, "texture": texture}
+    store(shard_path(folder, 0), shard, plan.provenance, "")
+    return folder
+
+
+def test_maps_in_color_are_packed_with_three_intensities(
+    tmp_path: Path, store_folder: Path
+) -> None:
+    one = _add_in_color(tmp_path / "one", COLOR)
+
+    with open_packed_maps([one], store_folder, color=True) as packed:
         maps, images = _epoch(packed, 1)
-        assert packed.held_out(tmp_path / "one", 2).intensity.shape == (2, 3, 64, 80)
+        held_out = packed.held_out(one, 2)
+
+    assert held_out.intensity.shape == (2, 3, 64, 80)
     assert (maps.shape[1:], images.shape[1:]) == ((4, 64, 80), (3, 64, 64))
+
+
+def test_maps_in_color_of_many_rigs_are_refused(tmp_path: Path, store_folder: Path) -> None:
+    many = _add_in_color(tmp_path / "many", replace(COLOR, spread=RigSpread(angle_deg=1)))
+
     with pytest.raises(SceneError, match="without a spread"):
-        open_packed_maps([tmp_path / "many"], tmp_path / "other", color=True).__enter__()
+        open_packed_maps([many], store_folder, color=True).__enter__()
 
 
-def test_new_shards_enter_new_epochs_and_an_epoch_can_be_seen_again(tmp_path: Path) -> None:
-    folder = _add(tmp_path / "a", 0)
-    with open_packed_maps([folder], tmp_path / "store") as packed:
+def test_new_shards_enter_new_epochs(folder: Path, store_folder: Path) -> None:
+    with open_packed_maps([folder], store_folder) as packed:
+        _epoch(packed, 1)
+        _add(folder, 5)
+
+        assert len(_epoch(packed, 2)[0]) == 10
+
+
+def test_reopened_store_shows_an_epoch_again(folder: Path, store_folder: Path) -> None:
+    with open_packed_maps([folder], store_folder) as packed:
         first = _epoch(packed, 1)
         _add(folder, 5)
-        assert len(_epoch(packed, 2)[0]) == 10
-    with (tmp_path / "store" / MAPS).open("ab") as file:
+        _epoch(packed, 2)
+    with (store_folder / MAPS).open("ab") as file:
         file.write(b"left by an interruption")
-    with open_packed_maps([folder], tmp_path / "store") as again:
+
+    with open_packed_maps([folder], store_folder) as again:
         assert (len(again), again.digest) == (10, packed.digest)
         for one, other in zip(_epoch(again, 1), first, strict=True):
             np.testing.assert_array_equal(one, other)
         assert len(_epoch(again, 3)[0]) == 10
 
 
-def test_store_keeps_the_normalisation_of_given_weights(tmp_path: Path) -> None:
-    folder = _add(tmp_path / "a", 0)
-    store_folder = tmp_path / "store"
-    given = CellNormal()
-    given.median += 0.5
-    with open_packed_maps([folder], store_folder, normal=given) as packed:
-        assert torch.equal(packed.normal.median, given.median)
+@pytest.fixture
+def given(folder: Path, store_folder: Path) -> CellNormal:
+    """A normalisation with which a store was made."""
+    normal = CellNormal()
+    normal.median += 0.5
+    with open_packed_maps([folder], store_folder, normal=normal) as packed:
+        assert torch.equal(packed.normal.median, normal.median)
+    return normal
+
+
+def test_store_keeps_the_normalisation_of_given_weights(
+    folder: Path, store_folder: Path, given: CellNormal
+) -> None:
     with open_packed_maps([folder], store_folder) as packed:
         assert torch.equal(packed.normal.median, given.median)
-    with (
-        pytest.raises(SceneError, match="name another --store"),
-        open_packed_maps([folder], store_folder, normal=CellNormal()),
-    ):
-        pass
 
 
-def test_open_packed_maps_refuses_a_store_in_use(tmp_path: Path) -> None:
-    folder = _add(tmp_path / "a", 0)
-    store_folder = tmp_path / "store"
+@pytest.mark.usefixtures("given")
+def test_store_of_another_normalisation_is_refused(folder: Path, store_folder: Path) -> None:
+    with pytest.raises(SceneError, match="name another --store"):
+        open_packed_maps([folder], store_folder, normal=CellNormal()).__enter__()
+
+
+def test_open_packed_maps_refuses_a_store_in_use(folder: Path, store_folder: Path) -> None:
     with (
         open_packed_maps([folder], store_folder),
         pytest.raises(FileBusyError, match="store is being written"),
     ):
         open_packed_maps([folder], store_folder).__enter__()
+
+
+def test_store_is_free_again_after_an_error(folder: Path, store_folder: Path) -> None:
     with pytest.raises(ZeroDivisionError), open_packed_maps([folder], store_folder):
         raise ZeroDivisionError
-    with open_packed_maps([folder], store_folder) as packed:  # free again after an error
+
+    with open_packed_maps([folder], store_folder) as packed:
         assert len(packed) == SHARD
 
 
 @pytest.mark.parametrize("name", [CELLS, INDEX, MAPS, IMAGES])
-def test_damaged_store_is_refused(tmp_path: Path, name: str) -> None:
-    folder = _add(tmp_path / "a", 0)
-    with open_packed_maps([folder], tmp_path / "store"):
-        file = tmp_path / "store" / name
+def test_damaged_store_is_refused(folder: Path, store_folder: Path, name: str) -> None:
+    with open_packed_maps([folder], store_folder):
+        file = store_folder / name
     file.write_bytes(file.read_bytes()[: file.stat().st_size // 2])
+
     with pytest.raises(RecordingError, match=f"{name} is damaged"):
-        open_packed_maps([folder], tmp_path / "store").__enter__()
+        open_packed_maps([folder], store_folder).__enter__()
 
 
-def test_expected_maps_have_noise_to_draw_and_mixed_datasets_or_too_few_objects_are_refused(
-    tmp_path: Path,
+@pytest.fixture
+def expected(tmp_path: Path) -> Path:
+    """A dataset of expected maps."""
+    return _add(tmp_path / "b", 20, replace(PLAN, expected=True))
+
+
+def test_exposed_maps_have_no_noise_to_draw(folder: Path, store_folder: Path) -> None:
+    with open_packed_maps([folder], store_folder) as packed:
+        assert packed.noise is None
+
+
+def test_expected_maps_have_noise_to_draw(expected: Path, store_folder: Path) -> None:
+    with open_packed_maps([expected], store_folder) as packed:
+        assert packed.noise == map_noise(PLAN)
+
+
+@pytest.mark.parametrize("kind", ["folder", "expected"])
+def test_fewer_objects_than_a_batch_are_refused(
+    request: pytest.FixtureRequest, store_folder: Path, kind: str
 ) -> None:
-    plain = _add(tmp_path / "a", 0)
-    expected = _add(tmp_path / "b", 20, replace(PLAN, expected=True))
-    for folder, wanted in ((plain, None), (expected, map_noise(PLAN))):
-        with open_packed_maps([folder], tmp_path / f"store of {folder.name}") as packed:
-            assert packed.noise == wanted
-            with pytest.raises(RecordingError, match="fewer than a batch of 64"):
-                next(packed.batches(64, torch.Generator()))
+    with (
+        open_packed_maps([request.getfixturevalue(kind)], store_folder) as packed,
+        pytest.raises(RecordingError, match="fewer than a batch of 64"),
+    ):
+        next(packed.batches(64, torch.Generator()))
+
+
+def test_exposed_and_expected_maps_together_are_refused(
+    folder: Path, expected: Path, store_folder: Path
+) -> None:
+    with pytest.raises(SceneError, match="give one kind"):
+        open_packed_maps([folder, expected], store_folder).__enter__()
+
+
+def test_datasets_of_different_rigs_are_refused(
+    folder: Path, tmp_path: Path, store_folder: Path
+) -> None:
     other_rig = _add(tmp_path / "c", 0, OTHER)
-    for other, word in ((expected, "give one kind"), (other_rig, "different rigs")):
-        with pytest.raises(SceneError, match=word):
-            open_packed_maps([plain, other], tmp_path / "store").__enter__()
+
+    with pytest.raises(SceneError, match="different rigs"):
+        open_packed_maps([folder, other_rig], store_folder).__enter__()

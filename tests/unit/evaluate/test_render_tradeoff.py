@@ -3,6 +3,7 @@
 import json
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -52,138 +53,183 @@ def _of(rows: list[RenderRow], part: Part) -> list[RenderRow]:
     return [row for row in rows if row.part == part]
 
 
-def test_measure_runs_every_setting_once_and_brute_force_first(
-    rows: list[RenderRow], repeats: list[int]
-) -> None:
+def test_measure_runs_every_setting_once(rows: list[RenderRow]) -> None:
     planned = render_settings(_scene(), SMALL)
-    assert [(row.name, row.part) for row in rows] == [
-        (setting.name, setting.part) for setting in planned
-    ]
+
+    assert [(row.name, row.part) for row in rows] == [(one.name, one.part) for one in planned]
     assert len({row.name for row in rows}) == len(rows)
+
+
+def test_measure_runs_brute_force_first(rows: list[RenderRow]) -> None:
+    reference = rows[0]
+
     assert [row.name for row in _of(rows, "stop")] == ["reference", "draft", "standard", "fine"]
-    assert (rows[0].speedup, rows[0].errors.intensity_error_max, rows[0].errors.bin_exact) == (
-        1,
-        0,
-        1,
-    )
+    assert (reference.speedup, reference.errors.intensity_error_max) == (1, 0)
+    assert reference.errors.bin_exact == 1
+
+
+def test_measure_takes_times_and_speedups(rows: list[RenderRow]) -> None:
     assert [row.seconds for row in rows] == list(range(1, len(rows) + 1))
     assert all(row.speedup == rows[0].seconds / row.seconds for row in rows)
+
+
+def test_measure_repeats_all_but_brute_force(rows: list[RenderRow], repeats: list[int]) -> None:
     assert repeats == [1, *[REPEATS] * (len(rows) - 1)]
 
 
 def test_settings_change_one_field_of_the_standard_stop() -> None:
-    standard = SMALL["standard"]
+    standard = vars(SMALL["standard"])
+    allowed = {"relay grid": {"relay_columns", "relay_rows"}, "effect left out": set[str]()}
+
     for setting in render_settings(_scene(), SMALL):
-        changed = {
-            name
-            for name in vars(standard)
-            if getattr(setting.accuracy, name) != getattr(standard, name)
-        }
-        allowed = {"relay grid": {"relay_columns", "relay_rows"}, "effect left out": set[str]()}
+        changed = {name for name in standard if getattr(setting.accuracy, name) != standard[name]}
         assert setting.part == "stop" or changed <= allowed.get(setting.part, {setting.part})
         assert (setting.effects == "auto") == (setting.part != "effect left out")
-    names = [s.name for s in render_settings(_scene()) if s.part == "relay grid"]
-    assert names == [
-        f"relay grid {grid}" for grid in ("20 x 16", "40 x 32", "80 x 64", "160 x 128")
-    ]
 
 
-def test_error_grows_without_an_effect_of_the_scene_and_shrinks_with_sub_bins_and_beams(
-    rows: list[RenderRow],
-) -> None:
+def test_settings_have_relay_grids_from_coarse_to_fine() -> None:
+    names = [one.name for one in render_settings(_scene()) if one.part == "relay grid"]
+
+    grids = ("20 x 16", "40 x 32", "80 x 64", "160 x 128")
+    assert names == [f"relay grid {grid}" for grid in grids]
+
+
+def _errors(rows: list[RenderRow], name: str) -> Agreement:
+    return next(row for row in rows if row.name == name).errors
+
+
+def test_effects_of_the_scene_are_left_out_in_turn(rows: list[RenderRow]) -> None:
     names = {row.name.removeprefix("without ") for row in _of(rows, "effect left out")}
+
     assert {"direct", "three-bounce", "occluder", "tilt"} <= names
     assert "colour" not in names
-    without = next(row for row in rows if row.name == "without tilt")
-    kept = next(row for row in rows if row.name == "standard")
-    assert without.errors.intensity_error_median > 2 * kept.errors.intensity_error_median
-    nothing = next(row for row in rows if row.name == "without three-bounce")
-    assert nothing.errors.intensity_error_median == 1
-    assert nothing.errors.bin_within_1 == 0
+
+
+def test_error_grows_without_tilt(rows: list[RenderRow]) -> None:
+    without = _errors(rows, "without tilt").intensity_error_median
+
+    assert without > 2 * _errors(rows, "standard").intensity_error_median
+
+
+def test_error_is_whole_without_three_bounces(rows: list[RenderRow]) -> None:
+    nothing = _errors(rows, "without three-bounce")
+
+    assert nothing.intensity_error_median == 1
+    assert nothing.bin_within_1 == 0
+
+
+def test_error_shrinks_with_sub_bins(rows: list[RenderRow]) -> None:
     errors = [row.errors.intensity_error_median for row in _of(rows, "sub_bins")]
+
     assert errors[0] > errors[3] > errors[-1]
     assert errors[-1] < 0.1 * errors[0]
-    one, two = _of(rows, "beams_per_cell")
-    assert one.errors.intensity_error_median > two.errors.intensity_error_median > 0
-    assert one.errors.intensity_error_p99 > two.errors.intensity_error_p99
 
 
-def test_facts_count_patches_and_beams_and_refuse_an_empty_scene() -> None:
+def test_error_shrinks_with_beams(rows: list[RenderRow]) -> None:
+    one, two = (row.errors for row in _of(rows, "beams_per_cell"))
+
+    assert one.intensity_error_median > two.intensity_error_median > 0
+    assert one.intensity_error_p99 > two.intensity_error_p99
+
+
+def test_facts_count_patches_and_beams() -> None:
     size = render_facts(_scene(), SMALL)
+
     assert size.patches == 32
     assert 3000 < size.beams_on_wall < 5120
-    for depth in (None, np.full((16, 16), np.nan, np.float32)):
-        with pytest.raises(SceneError, match="hidden"):
-            render_facts(Scene(RIG, depth), SMALL)
+
+
+@pytest.mark.parametrize("depth_m", [None, np.full((16, 16), np.nan, np.float32)])
+def test_facts_of_an_empty_scene_are_refused(depth_m: np.ndarray | None) -> None:
+    with pytest.raises(SceneError, match="hidden"):
+        render_facts(Scene(RIG, depth_m), SMALL)
+
+
+def _row(name: str, part: Part, seconds: float, *errors: float) -> RenderRow:
+    return RenderRow(name, part, seconds, 20.0 / seconds, Agreement(*errors))
 
 
 ROWS = [
-    RenderRow("reference", "stop", 20.0, 1.0, Agreement(0, 0, 0, 1, 1, 0, 0)),
-    RenderRow("draft", "stop", 0.005, 4000.0, Agreement(0.005, 0.03, 0.05, 0.8, 0.99, 0, 1.4)),
-    RenderRow(
-        "sub_bins 2", "sub_bins", 0.01, 2000.0, Agreement(0.001, 0.005, 0.007, 0.9, 1, 0, 0.4)
-    ),
-    RenderRow(
-        "sub_bins 1", "sub_bins", 0.01, 2000.0, Agreement(0.001, 0.006, 0.007, 0.9, 1, 0, 0.4)
-    ),
-    RenderRow(
-        "object_stride 1",
-        "object_stride",
-        0.02,
-        1000.0,
-        Agreement(0.001, 0.04, 0.05, 0.9, 1, 0, 0.4),
-    ),
-    RenderRow(
-        "beams_per_cell 2", "beams_per_cell", 0.001, 20000.0, Agreement(0, 0.001, 0.002, 1, 1, 0, 0)
-    ),
-    RenderRow(
-        "without tilt", "effect left out", 0.001, 20000.0, Agreement(0.2, 0.3, 0.4, 0.1, 0.7, 0, 11)
-    ),
+    _row("reference", "stop", 20.0, 0, 0, 0, 1, 1, 0, 0),
+    _row("draft", "stop", 0.005, 0.005, 0.03, 0.05, 0.8, 0.99, 0, 1.4),
+    _row("sub_bins 2", "sub_bins", 0.01, 0.001, 0.005, 0.007, 0.9, 1, 0, 0.4),
+    _row("sub_bins 1", "sub_bins", 0.01, 0.001, 0.006, 0.007, 0.9, 1, 0, 0.4),
+    _row("object_stride 1", "object_stride", 0.02, 0.001, 0.04, 0.05, 0.9, 1, 0, 0.4),
+    _row("beams_per_cell 2", "beams_per_cell", 0.001, 0, 0.001, 0.002, 1, 1, 0, 0),
+    _row("without tilt", "effect left out", 0.001, 0.2, 0.3, 0.4, 0.1, 0.7, 0, 11),
 ]
 FACTS = RenderFacts(patches=702, beams_on_wall=3776)
 
 
-def test_table_is_json_with_fixed_keys() -> None:
-    table = json.loads(json.dumps(as_table(FACTS, ROWS, len(ROWS)), allow_nan=False))
-    assert [stop["name"] for stop in table["stops"]] == ["reference", "draft"]
+@pytest.fixture
+def table() -> dict[str, Any]:
+    """The table of all rows, as scripts read it."""
+    return json.loads(json.dumps(as_table(FACTS, ROWS, len(ROWS)), allow_nan=False))
+
+
+def test_table_is_json_with_fixed_keys(table: dict[str, Any]) -> None:
     keys = (
         "name seconds speedup intensity_error_median intensity_error_p99 bin_exact bin_within_1"
         " depth_error_mm"
     )
+
     assert all(set(stop) >= {*keys.split()} for stop in table["stops"])
-    assert [(row["name"], row["part"]) for row in table["ingredients"]] == [
-        (row.name, row.part) for row in ROWS[2:]
-    ]
-    assert (table["patches"], table["beams_on_wall"], table["reference_seconds"]) == (
-        702,
-        3776,
-        20.0,
-    )
+    assert (table["patches"], table["beams_on_wall"]) == (702, 3776)
+    assert table["reference_seconds"] == 20.0
     assert table["complete"]
-    assert table["pareto_front"] == [
-        "draft",
-        "sub_bins 2",
-        "reference",
-    ]  # undominated, of brute force's truth
+
+
+def test_table_separates_stops_from_ingredients(table: dict[str, Any]) -> None:
+    ingredients = [(row["name"], row["part"]) for row in table["ingredients"]]
+
+    assert [stop["name"] for stop in table["stops"]] == ["reference", "draft"]
+    assert ingredients == [(row.name, row.part) for row in ROWS[2:]]
+
+
+def test_pareto_front_is_undominated_and_of_brute_forces_truth(table: dict[str, Any]) -> None:
+    assert table["pareto_front"] == ["draft", "sub_bins 2", "reference"]
+
+
+DRAFT_LINE = "| draft | 5.0 | 4000 | 0.5 | 3 | 5 | 80.00 | 99.00 | 0.00 | 1.40 |"
 
 
 @pytest.mark.parametrize("measured", [0, 1, 3, len(ROWS)])
-def test_table_markdown_and_plot_hold_what_was_measured(tmp_path: Path, measured: int) -> None:
-    rows = ROWS[:measured]
-    table = as_table(FACTS, rows, len(ROWS))
-    assert (table["complete"], bool(table["pareto_front"])) == (rows == ROWS, bool(rows))
+def test_table_holds_what_was_measured(measured: int) -> None:
+    table = as_table(FACTS, ROWS[:measured], len(ROWS))
+
+    assert table["complete"] == (measured == len(ROWS))
+    assert bool(table["pareto_front"]) == (measured > 0)
     assert len(table["stops"]) + len(table["ingredients"]) == measured
-    if rows:
-        text = render_document(table, "cup").as_markdown()
-        assert (text == render_document({**table, "complete": True}, "cup").as_markdown()) == (
-            rows == ROWS
-        )
-        assert all(f"| {row.name} |" in text for row in rows)
-        assert len({line.count("|") for line in text.splitlines() if line.startswith("|")}) == 1
-        assert (
-            measured < 2
-            or "| draft | 5.0 | 4000 | 0.5 | 3 | 5 | 80.00 | 99.00 | 0.00 | 1.40 |" in text
-        )
-        draw_renders(tmp_path / "plot.png", rows, "a title")
-        assert (tmp_path / "plot.png").read_bytes().startswith(b"\x89PNG")
+
+
+@pytest.mark.parametrize("measured", [1, 3, len(ROWS)])
+def test_document_holds_what_was_measured(measured: int) -> None:
+    rows = ROWS[:measured]
+
+    text = render_document(as_table(FACTS, rows, len(ROWS)), "cup").as_markdown()
+
+    widths = {line.count("|") for line in text.splitlines() if line.startswith("|")}
+    assert all(f"| {row.name} |" in text for row in rows)
+    assert len(widths) == 1
+    assert (DRAFT_LINE in text) == (measured > 1)
+
+
+@pytest.mark.parametrize("measured", [1, 3, len(ROWS)])
+def test_document_says_whether_it_is_complete(measured: int) -> None:
+    table = as_table(FACTS, ROWS[:measured], len(ROWS))
+    complete = render_document({**table, "complete": True}, "cup").as_markdown()
+
+    text = render_document(table, "cup").as_markdown()
+
+    assert (text == complete) == (measured == len(ROWS))
+
+
+@pytest.mark.parametrize("measured", [1, 3, len(ROWS)])
+def test_plot_is_drawn_of_what_was_measured(tmp_path: Path, measured: int) -> None:
+    draw_renders(tmp_path / "plot.png", ROWS[:measured], "a title")
+
+    assert (tmp_path / "plot.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_machine_has_a_name() -> None:
     assert machine()

@@ -90,61 +90,99 @@ def _rows(folder: Path) -> list[dict[str, str]]:
 
 def test_figures_have_names_that_scripts_depend_on() -> None:
     figures = _usual()
+
     assert {*TARGETS, "baselines", "per_category", "objects", "bars", *FACTS} < set(figures)
     assert set(figures["per_category"]) == {"kind 0", "kind 1", "kind 2"}
     for table in (figures, *figures["baselines"].values(), *figures["per_category"].values()):
         assert all(set(table[name]) == {"value", "low", "high"} for name in TARGETS)
+
+
+def test_figures_count_objects_and_compare_with_baselines() -> None:
+    figures = _usual()
+
     assert figures["objects"] == 7
     assert figures["baselines"]["all_background"]["foreground_rmse_mm"]["value"] is None
     assert figures["advantage_over_nearest_neighbour"]["silhouette_iou"]["value"] > 0
-    assert sum(
-        zone["share_of_error"] for zone in figures["where_the_error_is"].values()
-    ) == pytest.approx(1)
 
 
-@pytest.mark.usefixtures("undrawn")
-def test_predicted_quality_is_reported_by_set_and_share_with_a_picture(tmp_path: Path) -> None:
+def test_figures_share_the_error_between_zones() -> None:
+    zones = _usual()["where_the_error_is"].values()
+
+    assert sum(zone["share_of_error"] for zone in zones) == pytest.approx(1)
+
+
+@pytest.mark.parametrize("name", ["quality", "shown_and_left_out", "unseen", "recognised"])
+def test_figures_of_what_was_not_measured_are_none(name: str) -> None:
+    assert _usual()[name] is None
+
+
+@pytest.fixture
+def with_quality() -> Evaluation:
+    """An evaluation with predicted quality, of a cup, generic shapes and kinds never seen."""
     made = _judgement()
     iou = made.ours["silhouette_iou"]
     predicted = Predictions(iou - 0.1, iou, iou + 0.1, iou, iou > np.median(iou))
     unseen = Unseen(made.names, made.truth, made.image, predicted)
-    mixed = replace(
-        made, categories=["cup", *made.categories[1:]], predicted=predicted, unseen=unseen
-    )
-    figures = _figures(mixed)
-    assert set(figures["quality"]) == {
-        "objects",
-        "the 18 kinds",
-        "generic shapes",
-        "kinds never seen",
-    }
-    assert figures["quality"]["objects"]["correlation"] == pytest.approx(1)
-    write_report(tmp_path / "out", mixed, figures)
-    text = (tmp_path / "out" / "report.md").read_text(encoding="utf-8")
+    categories = ["cup", *made.categories[1:]]
+    return replace(made, categories=categories, predicted=predicted, unseen=unseen)
+
+
+def _written(folder: Path, evaluation: Evaluation) -> str:
+    """Write a report into the folder; return its text."""
+    write_report(folder, evaluation, _figures(evaluation))
+    return (folder / "report.md").read_text(encoding="utf-8")
+
+
+def test_predicted_quality_has_figures_by_set(with_quality: Evaluation) -> None:
+    quality = _figures(with_quality)["quality"]
+
+    assert set(quality) == {"objects", "the 18 kinds", "generic shapes", "kinds never seen"}
+    assert quality["objects"]["correlation"] == pytest.approx(1)
+
+
+@pytest.mark.usefixtures("undrawn")
+def test_predicted_quality_is_reported_by_share_with_a_picture(
+    tmp_path: Path, with_quality: Evaluation
+) -> None:
+    text = _written(tmp_path / "out", with_quality)
+
     assert "(quality.png)" in text
     assert "shown in green" in text
-    assert _usual()["quality"] is None
 
 
-def test_report_contains_metrics_pictures_notes_and_the_bars_that_are_met(drawn: Path) -> None:
+def test_report_has_its_pictures(drawn: Path) -> None:
     made = document(_usual(), drawn)
-    page = read_page(made.as_html())
     text = made.as_markdown()
-    assert len(page.pictures) == 4
+
+    assert len(read_page(made.as_html()).pictures) == 4
     assert all(f"({name})" in text for name in PICTURES)
-    for words in (
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
         *LABELS.values(),
         "0 of 4 targets met",
         "nearest neighbour",
         "99",
         "they are few",
         "nlos-cam live",
-    ):
-        assert words in page.text
-        assert words in text
+    ],
+)
+def test_report_contains_metrics_and_notes(drawn: Path, words: str) -> None:
+    made = document(_usual(), drawn)
+
+    assert words in read_page(made.as_html()).text
+    assert words in made.as_markdown()
+
+
+def test_report_without_baselines_names_none(drawn: Path) -> None:
     assert "nearest" not in document(_usual(guesses=False), drawn).as_markdown()
-    perfect = replace(_judgement(), image=_judgement().truth)
-    figures = _figures(perfect)
+
+
+def test_report_of_perfect_images_meets_every_target(drawn: Path) -> None:
+    figures = _figures(replace(_judgement(), image=_judgement().truth))
+
     assert all(bar["met"] for bar in figures["bars"].values())
     assert "4 of 4 targets met" in document(figures, drawn).as_markdown()
 
@@ -164,32 +202,45 @@ def test_folder_is_complete_for_any_number_of_objects(tmp_path: Path, count: int
 
 def test_figures_separate_categories_left_out_of_training(drawn: Path) -> None:
     whole = _judgement()
-    assert _usual()["shown_and_left_out"] is None
     blind = np.array([kind == "kind 1" for kind in whole.categories])[:, None, None]
-    guessed = _figures(
-        replace(whole, image=np.where(blind, 0, whole.image), left_out=["kind 1", "kind 9"])
-    )
+    image = np.where(blind, 0, whole.image)
+
+    guessed = _figures(replace(whole, image=image, left_out=["kind 1", "kind 9"]))
+
     by = guessed["shown_and_left_out"]
     assert by["left out"]["silhouette_iou"]["value"] == 0
     assert by["shown"]["silhouette_iou"]["value"] > guessed["silhouette_iou"]["value"] > 0
     assert "left out" in document(guessed, drawn).as_markdown()
 
 
-@pytest.mark.usefixtures("undrawn")
-def test_second_set_and_recognition_have_their_figures(tmp_path: Path) -> None:
+@pytest.fixture
+def with_second_set() -> Evaluation:
+    """An evaluation of objects of known kinds, and of two of kinds never seen."""
     whole = _judgement(3)
-    assert _usual()["unseen"] is _usual()["recognised"] is None
-    kinds = replace(whole, categories=[object_depth(seed, BOX)[0] for seed in range(3)])
-    both = replace(
-        kinds, unseen=Unseen(["a", "b"], whole.truth[:2], np.zeros_like(whole.truth[:2]))
-    )
-    figures = _figures(both)
-    assert figures["unseen"]["silhouette_iou"]["value"] == 0
-    assert figures["unseen"]["objects"] == 2
-    assert figures["recognised"]["truth"]["value"] == 1
-    write_report(tmp_path / "out", both, figures)
+    kinds = [object_depth(seed, BOX)[0] for seed in range(3)]
+    truth = whole.truth[:2]
+    unseen = Unseen(["a", "b"], truth, np.zeros_like(truth))
+    return replace(whole, categories=kinds, unseen=unseen)
+
+
+def test_second_set_has_its_figures(with_second_set: Evaluation) -> None:
+    unseen = _figures(with_second_set)["unseen"]
+
+    assert unseen["silhouette_iou"]["value"] == 0
+    assert unseen["objects"] == 2
+
+
+def test_recognition_has_its_figures(with_second_set: Evaluation) -> None:
+    assert _figures(with_second_set)["recognised"]["truth"]["value"] == 1
+
+
+@pytest.mark.usefixtures("undrawn")
+def test_second_set_and_recognition_are_reported(
+    tmp_path: Path, with_second_set: Evaluation
+) -> None:
+    text = _written(tmp_path / "out", with_second_set)
+
     assert {path.name for path in (tmp_path / "out").iterdir()} == {*FILES, "sheet-unseen.png"}
-    text = (tmp_path / "out" / "report.md").read_text(encoding="utf-8")
     assert "2 objects of kinds that training never sees" in text
     assert "recognised as their kind" in text
 
@@ -198,11 +249,14 @@ def test_second_set_and_recognition_have_their_figures(tmp_path: Path) -> None:
 def test_interrupted_write_leaves_earlier_folder(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    (out := tmp_path / "out").mkdir()
+    out = tmp_path / "out"
+    out.mkdir()
     (out / "report.md").write_text("earlier")
     monkeypatch.setattr(report.pictures, "draw_gallery", Mock(side_effect=KeyboardInterrupt))
+
     with pytest.raises(KeyboardInterrupt):
         write_report(out, _judgement(3), {})
+
     assert {path.name: path.read_text() for path in out.iterdir()} == {"report.md": "earlier"}
     assert [path.name for path in tmp_path.iterdir()] == ["out"]
 
@@ -210,7 +264,10 @@ def test_interrupted_write_leaves_earlier_folder(
 def test_object_without_value_has_an_empty_field(tmp_path: Path) -> None:
     whole = _judgement(2, guesses=False)
     blank = replace(whole, image=0 * whole.truth)
-    write_report(tmp_path / "out", blank, figures := _figures(blank))
+    figures = _figures(blank)
+
+    write_report(tmp_path / "out", blank, figures)
+
     assert {row["foreground_rmse_mm"] for row in _rows(tmp_path / "out")} == {""}
     assert format_interval(figures["foreground_rmse_mm"]) == "none"
 

@@ -67,113 +67,172 @@ JUDGED = HeldOutObjects(
 
 @pytest.fixture(scope="module")
 def echoes() -> list[MultiBounce]:
-    seen: list[tuple[int, int]] = []
-    made = echoes_of(seeded_objects(TEST_SEED, 2, BOX), RIG, lambda *at: seen.append(at))
-    assert seen == [(1, 2), (2, 2)]
-    return made
+    return echoes_of(seeded_objects(TEST_SEED, 2, BOX), RIG, lambda *_: None)
 
 
-def test_seeded_objects_are_those_of_their_seeds_and_second_set_is_of_other_kinds_in_the_same_poses() -> (
-    None
-):
+def test_echoes_report_progress() -> None:
+    progress: list[tuple[int, int]] = []
+
+    echoes_of(seeded_objects(TEST_SEED, 2, BOX), RIG, lambda *at: progress.append(at))
+
+    assert progress == [(1, 2), (2, 2)]
+
+
+@pytest.mark.parametrize("k", range(2))
+def test_seeded_objects_are_those_of_their_seeds(k: int) -> None:
     seeded = seeded_objects(TEST_SEED, 2, BOX)
-    for k, subject in enumerate(seeded):
-        category, depth_m = object_depth(TEST_SEED + k, BOX)
-        assert subject.category == category
-        assert category in subject.name
-        np.testing.assert_array_equal(subject.depth_m, depth_m)
-        np.testing.assert_array_equal(truth_of(seeded, BOX)[k], image_from_depth(depth_m, BOX))
+    category, depth_m = object_depth(TEST_SEED + k, BOX)
+
+    assert seeded[k].category == category
+    assert category in seeded[k].name
+    np.testing.assert_array_equal(seeded[k].depth_m, depth_m)
+    np.testing.assert_array_equal(truth_of(seeded, BOX)[k], image_from_depth(depth_m, BOX))
+
+
+def test_rendered_objects_are_seeded_objects() -> None:
+    truth = truth_of(seeded_objects(TEST_SEED, 1, BOX), BOX)
+
     judged = module.rendered_objects(RIG, 1)
-    np.testing.assert_array_equal(judged.maps.image, truth_of(seeded[:1], BOX))
+
+    np.testing.assert_array_equal(judged.maps.image, truth)
     assert judged.maps.depth_m.shape == (1, 64, 80)
     assert (len(judged.names), judged.plan) == (1, PLAN)
-    kinds = benchmark_objects(BOX)
+
+
+def test_second_set_is_of_other_kinds_in_the_same_poses() -> None:
     unseen = unseen_objects(BOX)
-    assert [one.pose for one in unseen] == [one.pose for one in kinds]
     names = {one.category for one in unseen}
+
+    assert [one.pose for one in unseen] == [one.pose for one in benchmark_objects(BOX)]
     assert (len(unseen), len(names), names & CATEGORIES.keys()) == (54, 18, set())
-    assert min(int(np.isfinite(one.depth_m).sum()) for one in unseen) > 150
 
 
-def test_each_object_of_a_dataset_of_many_rigs_is_aligned_from_its_own(tmp_path: Path) -> None:
-    plan = DatasetPlan(
-        RIG, 0, accuracy="draft", spread=RigSpread(place_m=0.005, angle_deg=2), objects_per_rig=2
-    )
-    samples = make_samples(plan, range(3))
-    store(shard_path(tmp_path, 0), samples, plan.provenance, "")
-    found = module.dataset_objects(tmp_path)
-    assert found.benches == [plan.bench_of(seed)[0] for seed in range(3)]
-    assert found.benches[0] == found.benches[1] != found.benches[2]
-    aligned = module.network_input(found.maps, None, found.benches, RECORD)
-    for n, bench in enumerate(found.benches):
-        seen = LidarMaps(
-            samples["depth_m"][n], samples["intensity"][n], np.isfinite(samples["depth_m"][n])
-        )
-        wanted = MapAlignment(bench, RIG).align(seen)
-        np.testing.assert_array_equal(aligned.depth_m[n], wanted.depth_m)
-        np.testing.assert_array_equal(aligned.intensity[n], wanted.intensity)
-    (note,) = notes_about(RECORD, found, None)
+def test_objects_of_the_second_set_can_be_seen() -> None:
+    assert min(int(np.isfinite(one.depth_m).sum()) for one in unseen_objects(BOX)) > 150
+
+
+MANY_RIGS = DatasetPlan(
+    RIG, 0, accuracy="draft", spread=RigSpread(place_m=0.005, angle_deg=2), objects_per_rig=2
+)
+
+
+@pytest.fixture(scope="module")
+def of_many_rigs(tmp_path_factory: pytest.TempPathFactory) -> HeldOutObjects:
+    """Three objects of a dataset of many rigs."""
+    folder = tmp_path_factory.mktemp("rigs")
+    samples = make_samples(MANY_RIGS, range(3))
+    store(shard_path(folder, 0), samples, MANY_RIGS.provenance, "")
+    return module.dataset_objects(folder)
+
+
+def test_objects_of_a_dataset_have_the_rigs_of_its_plan(of_many_rigs: HeldOutObjects) -> None:
+    first, same, other = of_many_rigs.benches
+
+    assert of_many_rigs.benches == [MANY_RIGS.bench_of(seed)[0] for seed in range(3)]
+    assert first == same != other
+
+
+@pytest.mark.parametrize("n", range(3))
+def test_each_object_of_many_rigs_is_aligned_from_its_own(
+    of_many_rigs: HeldOutObjects, n: int
+) -> None:
+    sample = make_samples(MANY_RIGS, [n])
+    depth_m = sample["depth_m"][0]
+    seen = LidarMaps(depth_m, sample["intensity"][0], np.isfinite(depth_m))
+    wanted = MapAlignment(of_many_rigs.benches[n], RIG).align(seen)
+
+    aligned = module.network_input(of_many_rigs.maps, None, of_many_rigs.benches, RECORD)
+
+    np.testing.assert_array_equal(aligned.depth_m[n], wanted.depth_m)
+    np.testing.assert_array_equal(aligned.intensity[n], wanted.intensity)
+
+
+def test_note_says_that_objects_have_rigs_of_their_own(of_many_rigs: HeldOutObjects) -> None:
+    (note,) = notes_about(RECORD, of_many_rigs, None)
+
     assert "a rig of its own" in note
 
 
-def test_sense_repeats_matches_simulated_camera_and_averages_noise_down_with_frames(
-    echoes: list[MultiBounce],
-) -> None:
-    first = sense(echoes, RIG)
-    second = sense(echoes, RIG)
+def test_sense_repeats(echoes: list[MultiBounce]) -> None:
+    for first, second in zip(sense(echoes, RIG), sense(echoes, RIG), strict=True):
+        np.testing.assert_array_equal(first.depth_m, second.depth_m)
+
+
+def test_sense_matches_simulated_camera(echoes: list[MultiBounce]) -> None:
     world = World(SceneFile(name="any", rig=RIG), echoes, [None, None])
-    for k in range(2):
-        np.testing.assert_array_equal(first[k].depth_m, second[k].depth_m)
+
+    for k, sensed in enumerate(sense(echoes, RIG)):
         frame = maps_from_frame(world.images(k).frame(RIG.pinhole))
-        np.testing.assert_array_equal(first[k].intensity, frame.intensity)
+        np.testing.assert_array_equal(sensed.intensity, frame.intensity)
+
+
+def test_frames_without_noise_are_alike(echoes: list[MultiBounce]) -> None:
     quiet, mean = (sense(echoes[:1], RIG, QUIET, frames=frames)[0] for frames in (1, 3))
-    np.testing.assert_allclose(
-        quiet.depth_m, mean.depth_m, atol=1e-6
-    )  # every frame without noise is alike
+
+    np.testing.assert_allclose(quiet.depth_m, mean.depth_m, atol=1e-6)
     np.testing.assert_allclose(quiet.intensity, mean.intensity, rtol=1e-6)
+
+
+def test_frames_average_noise_down(echoes: list[MultiBounce]) -> None:
+    quiet = sense(echoes[:1], RIG, QUIET, frames=1)[0].intensity
     noisy = (sense(echoes[:1], RIG, frames=frames)[0].intensity for frames in (1, 4))
-    one, four = (
-        float(np.abs(some - quiet.intensity)[quiet.intensity > 5].mean()) for some in noisy
-    )
+
+    one, four = (float(np.abs(some - quiet)[quiet > 5].mean()) for some in noisy)
+
     assert 0 < four < 0.75 * one
 
 
 def test_reconstruct_all_takes_one_object_at_a_time(echoes: list[MultiBounce]) -> None:
+    def middle(depth_m: np.ndarray, _: object = None) -> np.ndarray:
+        return np.nan_to_num(depth_m[:, :, 8:72])
+
     maps = as_map_set(sense(echoes, RIG), np.zeros((2, 64, 64), np.float32))
-    network = Mock(
-        spec=reconstruct_all, side_effect=lambda depth_m, _: np.nan_to_num(depth_m[:, :, 8:72])
-    )
-    np.testing.assert_array_equal(
-        reconstruct_all(network, maps), np.nan_to_num(maps.depth_m[:, :, 8:72])
-    )
-    assert [part.shape for call in network.call_args_list for part in call.args] == [
-        (1, 64, 80)
-    ] * 4
+    network = Mock(spec=reconstruct_all, side_effect=middle)
+
+    found = reconstruct_all(network, maps)
+
+    shapes = [part.shape for call in network.call_args_list for part in call.args]
+    np.testing.assert_array_equal(found, middle(maps.depth_m))
+    assert shapes == [(1, 64, 80)] * 4
 
 
-def test_rig_of_weights_is_asked_for_where_missing_and_notes_name_other_rigs_and_categories_left_out() -> (
-    None
-):
+def test_rig_of_weights_is_known() -> None:
     assert rig_of(RECORD) == RIG
+
+
+def test_unknown_rig_of_weights_is_asked_for() -> None:
     with pytest.raises(SceneError, match=r"'my bench'.*--rig"):
         rig_of(RECORD.model_copy(update={"rig_name": "my bench"}))
-    recipe = VaeRecipe(
-        task="vae",
-        objects=4,
-        held_out=2,
-        epochs=1,
-        batch=2,
-        learning_rate=1e-3,
-        left_out=["hat", "car"],
-    )
+
+
+def test_notes_are_none_where_rigs_are_the_same() -> None:
+    assert notes_about(RECORD, JUDGED, SmallDataset(JUDGED.maps, PLAN)) == []
+
+
+@pytest.fixture
+def elsewhere() -> SmallDataset:
+    """Training maps of another rig."""
     training = SmallDataset(JUDGED.maps, ELSEWHERE)
     training.folder = Path("train")
-    assert notes_about(RECORD, JUDGED, SmallDataset(JUDGED.maps, PLAN)) == []
+    return training
+
+
+def test_notes_name_other_rig_and_categories_left_out(elsewhere: SmallDataset) -> None:
+    facts = {"objects": 4, "held_out": 2, "epochs": 1, "batch": 2, "learning_rate": 1e-3}
+    recipe = VaeRecipe(task="vae", left_out=["hat", "car"], **facts)
     record = RECORD.model_copy(update={"vae_recipe": recipe})
-    other_rig, left_out = notes_about(record, replace(JUDGED, plan=ELSEWHERE), training)
-    assert ("paper-rig" in other_rig, "hat" in left_out, "car" in left_out) == (True, True, False)
-    (other_training,) = notes_about(RECORD, JUDGED, training)
-    assert "train" in other_training
+
+    other_rig, left_out = notes_about(record, replace(JUDGED, plan=ELSEWHERE), elsewhere)
+
+    assert "paper-rig" in other_rig
+    assert "hat" in left_out
+    assert "car" not in left_out
+
+
+def test_note_names_training_maps_of_another_rig(elsewhere: SmallDataset) -> None:
+    (note,) = notes_about(RECORD, JUDGED, elsewhere)
+
+    assert "train" in note
 
 
 @pytest.fixture(scope="module")
@@ -212,20 +271,36 @@ def _guesses(
     return answers_with_nearest(sought, Chunked(maps=training, size=size), **options)  # type: ignore[arg-type]
 
 
-def test_baselines_answer_every_object(images: np.ndarray, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_baselines_without_training_maps_are_two(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(baselines, "NEIGHBOURS", 3)
-    without_nearest, among = baseline_answers(JUDGED, None, nearest=False)
-    assert (set(without_nearest), among) == ({"all_background", "mean_object"}, None)
     trained = procedural_images(TRAINING_SEED, 3, BOX).astype(np.float32)
-    np.testing.assert_allclose(without_nearest["mean_object"][1], trained.mean(0), atol=1e-3)
+
+    answers, among = baseline_answers(JUDGED, None, nearest=False)
+
+    assert (set(answers), among) == ({"all_background", "mean_object"}, None)
+    np.testing.assert_allclose(answers["mean_object"][1], trained.mean(0), atol=1e-3)
+
+
+def test_mean_image_is_the_mean(images: np.ndarray) -> None:
     mean = mean_image(images.astype(np.float16))
+
     np.testing.assert_allclose(mean, images.mean(0), atol=1e-3)
-    alone = trivial_answers(5, mean)
+
+
+@pytest.mark.parametrize("nearest", [False, True])
+def test_baselines_answer_every_object(images: np.ndarray, nearest: bool) -> None:
+    alone = trivial_answers(5, mean_image(images.astype(np.float16)))
     guesses = _guesses(_maps(images[:5], seed=1), _maps(images))
+
     assert set(alone) == {"all_background", "mean_object"}
     assert set(guesses) == {*alone, "nearest_neighbour"}
-    for guess in (*alone.values(), *guesses.values()):
+    for guess in (guesses if nearest else alone).values():
         assert (guess.shape, guess.dtype) == ((5, 64, 64), np.float32)
+
+
+def test_baselines_are_empty_and_mean_images(images: np.ndarray) -> None:
+    guesses = _guesses(_maps(images[:5], seed=1), _maps(images))
+
     assert not guesses["all_background"].any()
     np.testing.assert_allclose(guesses["mean_object"][3], images.mean(0), atol=1e-3)
 
@@ -233,11 +308,13 @@ def test_baselines_answer_every_object(images: np.ndarray, monkeypatch: pytest.M
 @pytest.mark.parametrize("size", [1, 5, 12])
 def test_nearest_neighbour_is_found_in_any_chunk(images: np.ndarray, size: int) -> None:
     order = np.array([7, 2, 11, 0])
-    told = list[tuple[int, int]]()
+    progress = list[tuple[int, int]]()
     sought = _maps(images[order], seed=1)
-    guesses = _guesses(sought, _maps(images), size, on_progress=lambda *at: told.append(at))
+
+    guesses = _guesses(sought, _maps(images), size, on_progress=lambda *at: progress.append(at))
+
     np.testing.assert_array_equal(guesses["nearest_neighbour"], images[order])
-    assert (len(told), told[-1]) == (-(-12 // size), (12, 12))
+    assert (len(progress), progress[-1]) == (-(-12 // size), (12, 12))
 
 
 @pytest.mark.parametrize("scale", [1e-6, 0.0])
@@ -245,34 +322,65 @@ def test_nearest_neighbour_weighs_channels_by_their_spread(
     images: np.ndarray, scale: float
 ) -> None:
     """A channel that never varies counts for nothing."""
-    faint = [
-        replace(maps, intensity=scale * maps.intensity)
-        for maps in (_maps(images[:4], seed=1), _maps(images))
-    ]
+    both = (_maps(images[:4], seed=1), _maps(images))
+    faint = [replace(maps, intensity=scale * maps.intensity) for maps in both]
+
     np.testing.assert_array_equal(_guesses(*faint)["nearest_neighbour"], images[:4])
 
 
-def test_training_maps_are_cached_by_what_determines_them(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    built: list[tuple[DatasetPlan, int, Path]] = []
-    shapes = {"images": np.zeros((2, 64, 64), np.float16)}
-    monkeypatch.setattr(baselines.data, "build_dataset", lambda *args, **_: built.append(args))
-    monkeypatch.setattr(baselines.data, "open_dataset", lambda folder: folder)
-    monkeypatch.setattr(baselines.data, "procedural_images", lambda *_: shapes["images"])
-    monkeypatch.setattr(baselines, "NEIGHBOURS", 7)
-    plan = DatasetPlan(RIG, TEST_SEED, objects=Objects(("cup",)))
-    elsewhere = RIG.model_copy(update={"lidar": LidarPose(distance_m=0.3, yaw_deg=45)})
-    for one in (plan, plan, replace(plan, rig=elsewhere), replace(plan, first_seed=5)):
-        training_maps(one, tmp_path, 1, lambda *_: None)
-    shapes["images"] = shapes["images"] + np.float16(0.5)
-    training_maps(plan, tmp_path, 1, lambda *_: None)
-    first, again, moved, other_seed, other_shapes = (folder for _, _, folder in built)
-    assert first == again == other_seed
-    assert len({first, moved, other_shapes}) == 3
-    assert first.parent.parent == tmp_path
-    assert built[0][1] == 7
-    assert (built[0][0].first_seed, built[0][0].objects) == (TRAINING_SEED, Objects())
-    assert {object_depth(seed, BOX)[0] for seed in range(baselines.FINGERPRINT_OBJECTS)} == set(
-        CATEGORIES
-    )
+class Builds:
+    """Builds of training maps that make nothing."""
+
+    def __init__(self, folder: Path, patch: pytest.MonkeyPatch) -> None:
+        self.folder = folder
+        self.images = np.zeros((2, 64, 64), np.float16)
+        """Images of the training objects."""
+        self.asked: list[tuple[DatasetPlan, int, Path]] = []
+        """Plan, count and folder of each build."""
+        patch.setattr(baselines.data, "build_dataset", lambda *args, **_: self.asked.append(args))
+        patch.setattr(baselines.data, "open_dataset", lambda folder: folder)
+        patch.setattr(baselines.data, "procedural_images", lambda *_: self.images)
+        patch.setattr(baselines, "NEIGHBOURS", 7)
+
+    def folder_of(self, plan: DatasetPlan) -> Path:
+        training_maps(plan, self.folder, 1, lambda *_: None)
+        return self.asked[-1][2]
+
+
+@pytest.fixture
+def builds(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Builds:
+    return Builds(tmp_path, monkeypatch)
+
+
+CUPS = DatasetPlan(RIG, TEST_SEED, objects=Objects(("cup",)))
+
+
+def test_training_maps_are_cached_by_rig_and_shapes(builds: Builds) -> None:
+    lidar = LidarPose(distance_m=0.3, yaw_deg=45)
+    moved = replace(CUPS, rig=RIG.model_copy(update={"lidar": lidar}))
+    folders = {builds.folder_of(CUPS), builds.folder_of(moved)}
+    builds.images = builds.images + np.float16(0.5)
+
+    folders.add(builds.folder_of(CUPS))
+
+    assert len(folders) == 3
+    assert {folder.parent.parent for folder in folders} == {builds.folder}
+
+
+@pytest.mark.parametrize("plan", [CUPS, replace(CUPS, first_seed=5)])
+def test_training_maps_of_the_same_rig_are_found_again(builds: Builds, plan: DatasetPlan) -> None:
+    assert builds.folder_of(CUPS) == builds.folder_of(plan)
+
+
+def test_training_maps_are_of_training_objects(builds: Builds) -> None:
+    builds.folder_of(CUPS)
+
+    plan, count, _ = builds.asked[0]
+    assert count == 7
+    assert (plan.first_seed, plan.objects) == (TRAINING_SEED, Objects())
+
+
+def test_fingerprint_covers_every_category() -> None:
+    seeds = range(baselines.FINGERPRINT_OBJECTS)
+
+    assert {object_depth(seed, BOX)[0] for seed in seeds} == set(CATEGORIES)

@@ -144,7 +144,7 @@ e9436516 1007c23a d80bea10 f102da95 de848140 c5348870
 """SHA-256 of each category's mesh for seed 0, vertices rounded to 9 decimals."""
 
 
-def test_categories_and_their_seeds_make_the_same_objects_as_ever() -> None:
+def test_categories_and_seeds_make_the_same_objects_as_ever() -> None:
     """Datasets name their objects by seeds: a changed shape, or another order, would make others of
     them.
     """

@@ -100,7 +100,7 @@ def test_depth_derivatives_are_the_differences_of_the_reference(radiometry: Any)
 
 
 @pytest.mark.slow
-def test_derivative_over_a_path_is_the_difference_across_bin_edges() -> None:
+def test_derivative_over_a_path_is_the_difference_across_bins() -> None:
     # Light crosses the edges of 5 cm bins while the plate recedes by 4 cm: the mean derivative is
     # the difference. The strongest bin changes on the way, and its intensity is continuous there.
     scene = bent_plate(0.05, cells=12)
