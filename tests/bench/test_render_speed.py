@@ -14,4 +14,5 @@ def test_render_at_an_accuracy(benchmark: BenchmarkFixture, stop: str) -> None:
     scene = paper_scene().scene_at(0)
     render(scene, stop)  # compiles
     rendering = benchmark(render, scene, stop)
+
     assert rendering.accuracy.name == stop

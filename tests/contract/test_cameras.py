@@ -111,6 +111,7 @@ def test_frame_numbers_and_timestamps_rise_together(camera: Camera) -> None:
 
 def test_gaps_in_frame_numbers_are_counted_as_dropped(camera: Camera) -> None:
     frames = look(camera)
+
     assert camera.incomplete == 0
     assert camera.dropped >= frames[-1].frame_number - frames[0].frame_number + 1 - len(frames)
 
@@ -167,7 +168,10 @@ def test_process_that_used_a_camera_ends_cleanly(opens: dict[str, Any]) -> None:
         text=True,
         timeout=120,
     )
-    assert (ended.returncode, ended.stdout, ended.stderr) == (0, "3\n", "")
+
+    assert ended.returncode == 0
+    assert ended.stdout == "3\n"
+    assert ended.stderr == ""
 
 
 def test_recording_cannot_be_recorded(bag: Path, tmp_path: Path) -> None:

@@ -153,6 +153,7 @@ def test_camera_goes_on_after_a_fault_of_its_streams(
     device = type("Device", (Tampered,), {"streams": streams, "tamper": staticmethod(WAYS[way])})
     monkeypatch.setattr(simulated, "SoftwareLidar", device)
     frames = outcome(camera)
+
     assert len(frames) == WANTED
     assert not isinstance(frames, str), frames
 
@@ -185,4 +186,5 @@ def test_camera_goes_on_with_a_mad_thermometer(
 ) -> None:
     make = camera()
     monkeypatch.setattr(type(make._world), "celsius", lambda *_: {"ldd_temperature": value})
+
     assert len(outcome(lambda: make)) == WANTED

@@ -123,10 +123,12 @@ def test_passing_fault_is_survived_and_counted(
     camera: Make, befalls: Fault, missing: list[int], counts: dict[str, int]
 ) -> None:
     moments, report = live(camera(befalls))
+
     assert [instant_of(moment.result.frame) for moment in moments] == [
         n for n in range(LAST + 1) if n not in missing
     ]
     assert report.counts == counts
+
     for one, next_one in pairwise(moments):
         rise_s = next_one.result.timestamp_s - one.result.timestamp_s
         assert rise_s * 30 == pytest.approx(
@@ -139,6 +141,7 @@ def test_frame_without_depth_shows_nothing(camera: Make) -> None:
     shown = [
         instant_of(each.result.frame) for each in moments if np.isfinite(each.result.depth_m).any()
     ]
+
     assert shown == [n for n in range(LAST + 1) if n not in {5, 6, 7}]
 
 
@@ -156,6 +159,7 @@ def test_replugged_device_goes_on(camera: Make, own_clock: bool) -> None:
     moments, report = live(camera(fault("unplug", 30), *wraps), last=600)
     rises(moments)
     seen = [instant_of(moment.result.frame) for moment in moments]
+
     assert seen[:5] == [0, 1, 2, 3, 4]
     assert seen[5] >= 35
     assert seen == sorted(set(seen))
@@ -172,6 +176,7 @@ def test_long_stall_restarts_the_streams(camera: Make, hurried_clock: Any) -> No
     stalled = camera(fault("stall", 150), clock=Strolling())  # 0.75 s, or more on a busy machine
     moments, report = live(stalled, last=300)
     rises(moments)
+
     assert report.counts["restarted"] >= 1
     assert "replugged" not in report.counts
 
@@ -190,6 +195,7 @@ def test_device_that_stays_away_ends_the_run_with_its_counts(
             camera(fault(kind, FOREVER), Fault(kind="duplicate", at_frame=2)),
             on_error=until_then.append,
         )
+
     assert "\n" not in str(error.value)
     assert until_then[0].frames == 5
     assert until_then[0].counts.pop("stalls") >= 1  # type: ignore[attr-defined]
@@ -230,12 +236,15 @@ def test_recording_of_faults_replays_as_it_was_captured(
         seen = list(recorded)
     with reader(recording.path) as replayed:
         again = list(replayed)
+
     assert [frame.frame_number for frame in again] == [frame.frame_number for frame in seen]
     np.testing.assert_allclose(
         [f.timestamp_s for f in again], [f.timestamp_s for f in seen], atol=1e-6
     )
+
     for one, other in zip(seen, again, strict=True):
         np.testing.assert_array_equal(one.depth_m, other.depth_m)
+
     assert (
         replayed.counts
         == recorded.counts

@@ -48,6 +48,7 @@ def run(folder: Path, faults: list[dict[str, Any]], *options: str) -> int:
 @pytest.mark.usefixtures("impatient")
 def test_live_goes_on_and_counts_faults(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert run(tmp_path, PASSING, "--seconds", "4", "--json") == 0
+
     report = json.loads(capsys.readouterr().out.splitlines()[-1])
     seen = {
         "duplicate",
@@ -58,6 +59,7 @@ def test_live_goes_on_and_counts_faults(tmp_path: Path, capsys: pytest.CaptureFi
         "dropped_camera",
         "stalls",
     }
+
     assert seen <= set(report["counts"])
     assert report["stalled_s"] >= 0.9
     assert report["counts"]["replugged"] == 1
@@ -70,11 +72,15 @@ def test_live_ends_with_counts_when_the_device_stays_away(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert run(tmp_path, LASTING, "--json") == 3
+
     captured = capsys.readouterr()
     error = json.loads(captured.out)["error"]
+
     assert error["type"] == "CameraLostError"
     assert "2 s" in error["message"]
+
     lines = captured.err.splitlines()
     [seen] = [place for place, line in enumerate(lines) if "1 duplicate" in line]
     [failed] = [place for place, line in enumerate(lines) if line.startswith("error:")]
+
     assert seen < failed == len(lines) - 1

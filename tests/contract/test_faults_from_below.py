@@ -106,15 +106,18 @@ def test_full_disk_is_one_line_and_leaves_nothing(
     if code == 0:
         assert all(path.stat().st_size <= limit_bytes for path in out.rglob("*") if path.is_file())
         return
+
     assert code == 1, said
     assert len(said.strip().splitlines()) <= 2
     assert str(out) in said
     assert "a file cannot" not in said
+
     left = [
         path
         for path in out.iterdir()
         if path.suffix != ".npz" or not np.load(path)["depth_m"].any()
     ]
+
     assert left == [], "the maps may be there, whole, without their picture"
 
 
@@ -133,6 +136,7 @@ def test_folder_that_cannot_be_written_is_one_line(
     noise_bag: Path, tmp_path: Path, command: str
 ) -> None:
     code, said = ending(command.replace("{out}", "/proc"), noise_bag, tmp_path)
+
     assert code in {1, 4}
     assert "/proc" in said
     assert len(said.strip().splitlines()) == 1
@@ -161,6 +165,7 @@ def test_disk_error_is_one_line_and_leaves_nothing(
         "SHIM_FAIL_AT": str(write),
     }
     code, said = ending(REPAIR, noise_bag, out, **variables)
+
     assert code == 1, said
     assert "Input/output error" in said
     assert str(out) in said
@@ -176,5 +181,6 @@ def test_short_writes_and_clock_jumps_change_nothing(
 ) -> None:
     out = tmp_path / "out"
     code, said = ending(REPAIR, noise_bag, out, LD_PRELOAD=shim, SHIM_FOLDER=str(out), **variables)
+
     assert code == 0, said
     assert verify(out / "repaired.bag").frames == verify(noise_bag).frames

@@ -97,7 +97,9 @@ def test_interrupted_live_leaves_no_process_or_partial_file(
         assert not run.left()
         assert run.process.returncode == (0 if is_watched else INTERRUPTED)
         stdout = run.stdout
+
     assert not [path for path in tmp_path.rglob("*") if ".part" in path.name]
+
     if log.exists():  # the run had begun
         assert_log_is_whole(log)
         assert {"frames", "error"} & json.loads(stdout.splitlines()[-1]).keys()

@@ -78,9 +78,12 @@ def digest_of(recorded: Iterable[Frame]) -> tuple[int, str]:
 def test_long_capture_holds_every_frame_and_counts_gaps(long: Long) -> None:
     """On a machine too busy to expose the world in time there are gaps, which are counted."""
     report = long[0]
+
     assert report["state"] == "complete"
     assert set(report["streams"].values()) == {report["frames"]}
+
     numbers = report["frames"] + report["dropped"]
+
     assert numbers >= FRAMES
     assert report["seconds"] == pytest.approx((numbers - 1) / 30, abs=0.01)
 
@@ -90,8 +93,11 @@ def test_long_capture_holds_every_frame_and_counts_gaps(long: Long) -> None:
 )
 def test_long_capture_keeps_memory_flat(long: Long) -> None:
     memory_mib = long[1]
+
     assert len(memory_mib) > SECONDS / 2
+
     warm = memory_mib[round(WARM_UP * len(memory_mib)) :]
+
     assert max(warm) - warm[0] < MAX_GROWTH_MIB
 
 
@@ -99,5 +105,6 @@ def test_long_capture_reads_alike_with_both_readers(long: Long) -> None:
     report, _, path = long
     with ReplayCamera(path) as camera:
         ours = digest_of(camera)
+
     assert ours == digest_of(SdkReplay(path))
     assert ours[0] == report["frames"]

@@ -57,9 +57,12 @@ def test_second_replay_into_a_folder_names_the_first(tmp_path: Path) -> None:
     both = [begin(tmp_path, "replay", "a.bag", "--out", "out") for _ in range(2)]
     errors = {process.communicate(timeout=WITHIN_S)[1]: process for process in both}
     codes = sorted(process.returncode for process in both)
+
     assert codes == [0, 1]
+
     refusal = next(error for error, process in errors.items() if process.returncode)
     winner = next(process for process in both if not process.returncode)
+
     assert f"process {winner.pid}" in refusal or "exists" in refusal
     assert (tmp_path / "out" / "report.html").is_file()
     assert not list(tmp_path.glob(".*.part"))
@@ -75,12 +78,14 @@ def test_dataset_outlives_a_killed_worker(tmp_path: Path) -> None:
     time.sleep(1.0)
     os.kill(max(workers), signal.SIGKILL)
     _, err = building.communicate(timeout=WITHIN_S)
+
     assert building.returncode == 0, err
     assert len(open_dataset(tmp_path / "data").column("seed")) == 120
 
 
 def test_live_run_goes_on_while_the_time_of_day_jumps(tmp_path: Path) -> None:
     report = last_line(begin(tmp_path, *LIVE, program=JUMPING))
+
     assert report["stalled_s"] == 0.0
     assert report["frames"] > 30
     assert report["latency_ms"]["p99"] < 2000.0

@@ -68,6 +68,7 @@ def test_closed_terminal_leaves_a_whole_recording(
     process = started(IN_TERMINAL, terminal)
     os.close(terminal)
     os.close(window)  # the system sends SIGHUP
+
     assert process.wait(60.0) == INTERRUPTED
     assert min(info.frames for info in BagReader(tmp_path / "a.bag").streams.values()) > 0
 
@@ -78,4 +79,5 @@ def test_run_under_nohup_outlives_its_terminal(started: Callable[[str, int], Pro
     with pytest.raises(subprocess.TimeoutExpired):
         process.wait(1.0)
     process.terminate()
+
     assert process.wait(60.0) == INTERRUPTED

@@ -35,6 +35,7 @@ def measured(depth_m: np.ndarray) -> Any:
 @pytest.mark.parametrize("short_m", [-0.03, -0.02, 0.02])
 def test_offset_of_depth_is_fitted_with_the_tape(short_m: float) -> None:
     fit, facts = measured(bare_wall_m() - short_m)
+
     assert facts["range_offset_m"] == pytest.approx(short_m, abs=1e-3)
     assert fit.distance_m == pytest.approx(TAPE_M, abs=1e-6)
     assert fit.facing_deg == pytest.approx(45.0, abs=0.2)
@@ -46,6 +47,7 @@ def test_large_offset_is_named(short_m: float, kind: str) -> None:
     share = 1.0 if kind == "depths" else 1.0 / RAY_LENGTH
     with pytest.raises(CalibrationError, match=f"{kind} are {abs(short_m) * 1e3:.0f} mm") as raised:
         measured(bare_wall_m() - short_m * share)
+
     assert "remove everything" not in str(raised.value)
 
 

@@ -38,6 +38,7 @@ def limited(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.mark.slow
 def test_limit_on_file_size_is_named(limited: Path) -> None:
     answer = json.loads((limited / "answer.json").read_text())
+
     assert "limit on a file's size" in answer["error"]["message"]
     assert "free some space" not in answer["error"]["message"]
     assert answer["state"] == "size limit"
@@ -47,6 +48,7 @@ def test_limit_on_file_size_is_named(limited: Path) -> None:
 def test_capture_counts_frames_in_the_file(limited: Path) -> None:
     answer = json.loads((limited / "answer.json").read_text())
     repaired = repair_recording(limited / "a.bag", limited / "repaired.bag")
+
     assert answer["frames"] == min(repaired.recovered_frames.values()) < 20
     assert answer["streams"] == repaired.recovered_frames
 
@@ -55,6 +57,7 @@ def test_capture_counts_frames_in_the_file(limited: Path) -> None:
 def test_sidecar_tells_what_the_file_holds(limited: Path) -> None:
     answer = json.loads((limited / "answer.json").read_text())
     sidecar = load_sidecar(limited / "a.json")
+
     assert sidecar.state == "size limit"
     assert sidecar.summary.frames == answer["frames"]
 
@@ -78,6 +81,7 @@ def test_info_says_that_a_file_is_being_recorded(run: Run, noise_bags: dict[str,
         during = run("info", "a.bag", code=4)["problem"]
         holder.stdin.close()
     after = run("info", "a.bag", code=4)["problem"]
+
     assert "is being recorded" in during
     assert "killed" in after
     assert "being recorded" not in after

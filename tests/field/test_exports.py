@@ -43,6 +43,7 @@ def numbers(stream: str) -> list[int]:
 
 def test_export_counts_frames_not_their_numbers(remake: Remake, run: Run, noise: Path) -> None:
     run("export", remake(odd_frames, source=noise), "--every", 2, "--out", "out")
+
     assert numbers("depth") == list(range(1, 40, 4))
     assert numbers("infrared") == numbers("depth")
     assert numbers("confidence") == numbers("depth")
@@ -54,17 +55,21 @@ def test_export_chooses_whole_sets_beside_gaps(remake: Remake, run: Run, noise: 
             yield time_ns, raw
 
     run("export", remake(with_gap, source=noise), "--every", 2, "--out", "out")
+
     assert numbers("infrared") == numbers("depth") == list(range(0, 40, 2))
 
 
 def test_cloud_needs_depth_alone(remake: Remake, run: Run) -> None:
     run("export", SAMPLE, "--ply", "--out", "whole")
     found = run("export", remake(depth_alone), "--ply", "--out", "out")["frames"]
+
     assert found == {"depth": 8, "points": 8}
+
     clouds = [
         np.asarray(trimesh.load(next(Path(folder, "points").iterdir())).vertices)
         for folder in ("whole", "out")
     ]
+
     np.testing.assert_array_equal(*clouds)
 
 
@@ -74,6 +79,7 @@ def test_cloud_without_depth_is_refused(remake: Remake, run: Run) -> None:
             yield time_ns, raw
 
     path = remake(without_depth)
+
     assert "no depth" in run("export", path, "--ply", "--out", "out", code=4).err
     assert not Path("out").exists()
 
@@ -90,7 +96,9 @@ def test_yuv_becomes_8_bit_color(encoding: str) -> None:
     sink.add(Sample("color", 0, 0.0, pixels))
     sink.close()
     image = cv2.imread("color/000000.png", cv2.IMREAD_UNCHANGED)
-    assert (image.shape, image.dtype) == ((360, 640, 3), np.uint8)
+
+    assert image.shape == (360, 640, 3)
+    assert image.dtype == np.uint8
     np.testing.assert_allclose(image[..., ::-1], np.broadcast_to(rgb, image.shape), atol=2)
 
 
@@ -104,7 +112,9 @@ def test_recorded_yuyv_is_exported_as_color(remake: Remake, run: Run, noise: Pat
     path = remake(as_yuyv, source=noise)
     run("export", path, "--streams", "infrared", "--out", "out")
     image = cv2.imread("out/infrared/000000.png", cv2.IMREAD_UNCHANGED)
-    assert (image.shape, image.dtype) == ((48, 32, 3), np.uint8)
+
+    assert image.shape == (48, 32, 3)
+    assert image.dtype == np.uint8
 
 
 def test_export_holds_distortion_and_pose(run: Run) -> None:
@@ -125,6 +135,7 @@ def test_surfaces_are_counted_not_their_numbers(run: Run) -> None:
     numbers = 2 * np.arange(6) + 1
     np.savez("r.npz", depth_m=depth_m, uncertainty_m=depth_m, frame_number=numbers, **box)
     run("export", "r.npz", "--object", "csv", "--every", 2, "--out", "out")
+
     assert sorted(path.name for path in Path("out").iterdir()) == [
         "000001.csv",
         "000005.csv",

@@ -72,6 +72,7 @@ def test_polygon_covers_its_own_area(
     columns = covered.any(0).sum()
 
     share_of_square = area(corners) / np.prod(np.ptp(corners, axis=0))
+
     assert covered.sum() / (rows * columns) == pytest.approx(share_of_square, abs=0.04)
 
 

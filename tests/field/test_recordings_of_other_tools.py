@@ -93,6 +93,7 @@ def test_replay_gives_the_same_results_without_confidence(remake: Remake, run: R
 
 def test_second_part_is_not_called_damaged(remake: Remake, run: Run) -> None:
     answer = run("replay", remake(second_part), "--out", "r", code=4)
+
     assert "damaged" not in answer.err
     assert "first part" in answer.err
     assert "--from" in answer.err
@@ -102,6 +103,7 @@ def test_repair_takes_descriptions_from_the_first_part(remake: Remake, run: Run)
     part = remake(second_part)
     run("repair", part, "--from", SAMPLE, "--out", "joined.bag")
     found = depth_of(Path("joined.bag"))
+
     assert 0 < len(found) < len(depth_of(SAMPLE))
     assert found == depth_of(SAMPLE)[-len(found) :]
 
@@ -110,6 +112,7 @@ def test_librealsense_plays_a_part_with_descriptions(remake: Remake) -> None:
     repair_recording(remake(second_part), Path("joined.bag"), take_from=SAMPLE)
     with ReplayCamera(Path("joined.bag")) as camera:
         ours = [frame.frame_number for frame in camera]
+
     assert [frame.frame_number for frame in SdkReplay(Path("joined.bag"))] == ours
 
 
@@ -125,6 +128,7 @@ def test_repair_refuses_the_first_part_of_another(remake: Remake, run: Run, nois
 
     first = remake(renamed, source=noise, name="first.bag")
     answer = run("repair", remake(second_part), "--from", first, "--out", "j.bag", code=4)
+
     assert "first.bag" in answer.err
     assert not Path("j.bag").exists()
 
@@ -134,6 +138,7 @@ def test_frame_with_a_wrong_recorder_time_stays(
     remake: Remake, noise: Path, number: int, at_ns: int
 ) -> None:
     path = remake(frame_recorded_at(number, at_ns), source=noise)
+
     assert depth_of(path) == depth_of(noise)
     assert verify(path).seconds == verify(noise).seconds
 
@@ -151,6 +156,7 @@ def test_frame_with_a_wrong_stamp_moves_nothing(remake: Remake, noise: Path) -> 
         yield time_ns, raw
 
     numbers = [number for number, _ in depth_of(remake(late, source=noise))]
+
     assert numbers == list(range(40))
 
 
@@ -192,6 +198,7 @@ def of_ros_driver(path: Path) -> Path:
 def test_bag_of_a_ros_driver_is_named(run: Run, command: str) -> None:
     path = of_ros_driver(Path("driver.bag"))
     answer = run(command, path, *([] if command == "info" else ["--out", "out"]), code=4)
+
     assert "/camera/depth/image_rect_raw (24 images)" in str(answer) + answer.err
     assert not Path("out").exists()
 
@@ -200,6 +207,7 @@ def test_bag_of_a_ros_driver_is_named(run: Run, command: str) -> None:
 def test_descriptions_alone_are_no_recording(remake: Remake, run: Run, command: str) -> None:
     path = remake(descriptions_only)
     answer = run(command, path, *([] if command == "info" else ["--out", "out"]), code=4)
+
     assert "holds no frames" in str(answer) + answer.err
     assert not Path("out").exists()
 
@@ -212,6 +220,7 @@ def test_bags_of_ros_2_are_named(run: Run, name: str) -> None:
         file.close()
     else:
         Path(name).write_bytes(b"\x89MCAP0\r\n" + bytes(100))
+
     assert "ROS 2" in run("info", name, code=4)["problem"]
     assert "ROS 2" in run("export", name, "--out", "out", code=4).err
 
@@ -249,4 +258,5 @@ def test_lost_frame_of_a_stream_counted_apart_loses_one(
 
     expected = [depth for number, depth in depth_of(noise) if number != 20]
     found = depth_of(remake(edit, source=noise))
+
     assert [depth for _, depth in found] == expected

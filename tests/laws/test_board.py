@@ -54,6 +54,7 @@ def test_board_interval_holds_the_truth_as_often_as_stated() -> None:
     found = coverage(
         120, lambda: random_bench(generator, FLAT), lambda bench: bench.fit_image(4, generator)
     )
+
     assert found.refused <= 2
     assert 0.91 < found.inside.mean() < 0.99
 
@@ -68,6 +69,7 @@ def test_board_interval_allows_for_bow_and_stretch(sigma_px: float) -> None:
         lambda: random_bench(generator, printed),
         lambda bench: bench.fit_corners(sigma_px, generator, printed),
     )
+
     assert found.refused <= 4
     assert ((found.inside > 0.91) & (found.inside < 0.985)).all()
 

@@ -91,13 +91,16 @@ def test_finer_depth_maps_keep_the_size_of_patches_and_the_error() -> None:
     standard = replace(STOPS["standard"], relay_columns=40, relay_rows=32)
     joined = prepare(scene, standard).job
     apart = prepare(scene, replace(standard, finest_cells=0)).job
+
     assert joined is not None
     assert apart is not None
     assert len(apart.patches.beta) == 192**2
     assert len(joined.patches.beta) == 96**2
+
     some = np.arange(0, len(apart.length_m), 40)
     strongest, exact = (histograms(job.select(some)).max(1) for job in (joined, apart))
     off = np.abs(strongest[exact > 0] / exact[exact > 0] - 1)
+
     assert np.median(off) < 0.003
     assert np.percentile(off, 99) < 0.01
 
@@ -115,6 +118,7 @@ def test_refining_a_grid_changes_less_each_time(grid: Any, sizes: tuple[int, ...
     steps = [
         float(np.abs(finer - coarser).sum() / finer.sum()) for coarser, finer in pairwise(found)
     ]
+
     assert all(later < earlier for earlier, later in pairwise(steps)), steps
     assert 0 < steps[-1] < 0.5 * steps[0]
     assert steps[-1] < 0.05
@@ -138,6 +142,7 @@ def test_refining_sub_bins_converges_to_brute_force() -> None:
         )
         for n in (1, 4, 16, 64)
     ]
+
     assert all(later < 0.7 * earlier for earlier, later in pairwise(errors)), errors
 
 
@@ -154,6 +159,7 @@ def test_share_of_winning_echoes_does_not_drift_with_the_grid() -> None:
         )
         direct = render(Scene(RIG)).intensity
         shares.append(float((rendering.intensity > direct).mean()))
+
     assert 0.1 < shares[-1] < 0.95
     assert np.ptp(shares[1:]) < 0.03
 
@@ -186,6 +192,7 @@ def test_stop_keeps_its_promised_error(case: Case, stop: str, median: float, p99
     fast = three_bounce(scene, stop, chosen=chosen)
     error = np.abs(fast.max(1) - slow.max(1)) / slow.max(1)
     off = np.abs(fast.argmax(1) - slow.argmax(1))
+
     assert np.median(error) < median
     assert np.quantile(error, 0.99) < p99
     assert (off <= 1).mean() >= 0.995
@@ -206,6 +213,7 @@ def test_finer_stop_is_nearer_to_brute_force(case: Case) -> None:
             for part in (fast, slow)
         )
         errors.append(float(np.abs(fast - exact).sum() / exact.sum()))
+
     assert errors == sorted(errors, reverse=True)
     assert errors[1] < 1e-2
     assert errors[2] < 2e-3
@@ -214,6 +222,7 @@ def test_finer_stop_is_nearer_to_brute_force(case: Case) -> None:
 def test_float32_light_is_within_1e_5_of_float64(case: Case) -> None:
     scene, chosen, slow = case
     fast = three_bounce(scene, replace(STOPS["fine"], tolerance=0.0), chosen=chosen)
+
     np.testing.assert_allclose(
         fast.sum(1, dtype=np.float64),
         slow.sum(1),
@@ -231,4 +240,5 @@ def test_sectors_do_not_change_a_bit_of_the_result(case: Case) -> None:
         )
         for n in (1, 16)
     )
+
     np.testing.assert_array_equal(few, many)

@@ -44,6 +44,7 @@ def assert_right(stream: WallStream, shift: WallPose) -> None:
 @pytest.mark.parametrize("intrinsics", [SMALL, PINHOLE], ids=["320", "640"])
 def test_drift_check_is_silent_at_noise_alone(pose: WallPose, intrinsics: Intrinsics) -> None:
     stream = WallStream(pose, intrinsics)
+
     assert stream.show(pose, 500) is None
     assert_right(stream, (0.0, 0.0, 0.0))
     assert stream.check.wall_share > 0.95
@@ -55,7 +56,9 @@ def test_drift_check_is_silent_at_objects_and_occluders(pose: WallPose, share: f
     stream = WallStream(pose, seed=1)
     for seed in range(3):
         assert stream.show(pose, 100, multipath(stream.places, share, seed)) is None
+
     assert stream.check.wall_share == pytest.approx(1.0 - share, abs=0.05)
+
     for hide in (
         occluding_sheet(stream.places, 0.4),
         chained(multipath(stream.places, 0.5, 4), occluding_sheet(stream.places, 0.7)),
@@ -68,6 +71,7 @@ def test_drift_check_is_silent_at_objects_and_occluders(pose: WallPose, share: f
 def test_drift_check_is_silent_at_detours_beyond_the_wall(pose: WallPose, seed: int) -> None:
     """At a grazing angle a detour of centimetres looks like a wall turned by a degree."""
     stream = WallStream(pose, seed=seed)
+
     assert stream.show(pose, 200, multipath(stream.places, 0.9, seed, beyond=True)) is None
     assert stream.check.wall_share == pytest.approx(0.1, abs=0.05)
 
@@ -81,6 +85,7 @@ def test_drift_check_is_silent_at_detours_across_the_wall(pose: WallPose, seed: 
         occluding_sheet(stream.places, 0.3),
         multipath(stream.places, 0.8, seed, beyond=seed % 2 == 0),
     )
+
     assert stream.show(pose, 200, hide) is None
 
 
@@ -92,8 +97,11 @@ def test_drift_check_measures_a_knock_beside_an_object(
 ) -> None:
     stream = WallStream(pose, seed=3)
     hide = [multipath(stream.places, share, 5)] if share else []
+
     assert stream.show(pose, 40, *hide) is None
+
     reported = stream.show(stream.moved(*shift), REPORTED_FRAMES, *hide)
+
     assert reported > 3 or share  # a frame or two are no news
     assert_right(stream, shift)
 
@@ -105,6 +113,7 @@ def test_drift_check_measures_a_knock_beside_an_object(
 def test_drift_check_measures_a_large_move_beside_both(pose: WallPose, shift: WallPose) -> None:
     stream = WallStream(pose, seed=4)
     hide = chained(multipath(stream.places, 0.3, 6), occluding_sheet(stream.places, 0.8))
+
     assert stream.show(pose, 40, hide) is None
     assert stream.show(stream.moved(*shift), 3 * REPORTED_FRAMES, hide) is not None
     assert_right(stream, shift)
@@ -113,19 +122,27 @@ def test_drift_check_measures_a_large_move_beside_both(pose: WallPose, shift: Wa
 @poses
 def test_drift_check_warning_ends_when_the_lidar_is_back(pose: WallPose) -> None:
     stream = WallStream(pose, seed=5)
+
     assert stream.show(stream.moved(0.002, 0.5, -0.5), REPORTED_FRAMES) is not None
+
     stream.show(pose, WINDOW_FRAMES)
+
     assert stream.check.warnings == ()
 
 
 @poses
 def test_drift_check_names_a_range_that_drifts(pose: WallPose) -> None:
     stream = WallStream(pose, seed=6)
+
     assert stream.show(pose, 60, lambda depth_m, _: depth_m + 0.7 * TOLERANCE_M) is None
+
     stream.show(pose, 60, lambda depth_m, _: depth_m + 1.5 * TOLERANCE_M)
     (line,) = stream.check.warnings
+
     assert "range" in line
+
     drift = stream.check.drift
+
     assert abs(drift.range_m - 1.5 * TOLERANCE_M) < SIGMAS * drift.range_std_m < 0.2 * TOLERANCE_M
 
 
@@ -135,6 +152,7 @@ def test_drift_check_separates_a_move_from_a_range_drift(pose: WallPose) -> None
     stream = WallStream(pose, seed=7)
     stream.show(stream.moved(0.002), REPORTED_FRAMES)
     (line,) = stream.check.warnings
+
     assert "moved" in line
 
 
@@ -151,12 +169,14 @@ def test_drift_check_warnings_do_not_flicker(offset_m: float) -> None:
         )
         if seen[-1] != stream.check.warnings:
             seen.append(stream.check.warnings)
+
     assert len(seen) <= 2
 
 
 def test_drift_check_warns_of_a_wall_out_of_view_until_back() -> None:
     stream = WallStream(POSES[0], seed=9)
     stream.show(stream.pose, 40)
+
     assert (
         stream.show(stream.pose, BLIND_FRAMES - 1, lambda depth_m, _: np.full_like(depth_m, np.nan))
         is None
@@ -164,9 +184,13 @@ def test_drift_check_warns_of_a_wall_out_of_view_until_back() -> None:
     assert stream.check.drift is None
     assert stream.check.wall_share == 0.0
     assert stream.show(stream.pose, 60, multipath(stream.places, 0.97, 1)) is not None
+
     (line,) = stream.check.warnings
+
     assert "%" in line
+
     stream.show(stream.pose, 2 * WINDOW_FRAMES)
+
     assert stream.check.warnings == ()
 
 
@@ -175,6 +199,7 @@ def test_drift_check_keeps_its_warning_while_the_wall_is_hidden() -> None:
     stream.show(stream.moved(0.003), REPORTED_FRAMES)
     before = stream.check.warnings
     stream.show(stream.pose, REPORTED_FRAMES, lambda depth_m, _: np.full_like(depth_m, np.nan))
+
     assert stream.check.warnings == before != ()
 
 
@@ -188,6 +213,9 @@ def test_drift_check_measures_whole_frames_with_holes() -> None:
         frame = noisy_depth(depth_m, generator) if number % 4 else np.full_like(depth_m, np.nan)
         stream.check.observe(frame.astype(np.float32), {})
     drift = stream.check.drift
+
     assert abs(drift.distance_m - 0.002) < SIGMAS * drift.distance_std_m < TOLERANCE_M
+
     (line,) = stream.check.warnings
+
     assert "moved" in line

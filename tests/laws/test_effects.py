@@ -130,8 +130,11 @@ def test_effect_called_for_changes_more_than_the_tolerance(implementation: Any, 
         replace(COARSE, relay_columns=3, relay_rows=3) if name == "inter-reflection" else COARSE
     )
     chosen = set(EFFECTS) - _left_out(scene, accuracy)
+
     assert name in chosen
+
     whole = _with(implementation, scene, chosen, accuracy)
+
     assert (
         _change(
             _with(implementation, scene, chosen - {name}, accuracy),
@@ -147,12 +150,15 @@ def test_effect_not_called_for_changes_less_than_the_tolerance(
 ) -> None:
     scene = NOT_CALLED_FOR[name]
     left_out = _left_out(scene)
+
     assert name in left_out
+
     chosen = set(EFFECTS) - left_out
     forced = _with(implementation, scene, chosen | {name})
     # Without either there is no light, and a rendering is refused.
     lit = bool(chosen & {"direct", "three-bounce"})
     whole = _with(implementation, scene, chosen) if lit else np.zeros_like(forced)
+
     assert _change(forced, whole) <= COARSE.tolerance
 
 
@@ -199,6 +205,7 @@ scenes = st.builds(
 @given(scene=scenes, stop=st.sampled_from(sorted(STOPS)))
 def test_plan_leaves_out_bounds_within_the_tolerance(scene: Scene, stop: str) -> None:
     verdicts = plan(SceneFacts(scene, STOPS[stop]))
+
     assert tuple(effect.name for effect in verdicts) == EFFECTS
     assert sum(effect.bound for effect in verdicts if not effect.included) <= STOPS[stop].tolerance
     assert all(0 <= effect.bound <= 1 and effect.reason for effect in verdicts)
@@ -242,7 +249,9 @@ def test_bound_of_a_brdf_counts_its_replacement() -> None:
         Surface(1.0, phong(0.8, 0.2, 1)),
     )
     verdicts = plan(SceneFacts(scene, COARSE))
+
     assert included(verdicts, "brdf")
+
     bound = next(effect.bound for effect in verdicts if effect.name == "brdf")
     whole, without = (
         transient(scene, COARSE, names)
@@ -251,4 +260,5 @@ def test_bound_of_a_brdf_counts_its_replacement() -> None:
             set(EFFECTS) - {"brdf"},
         )
     )
+
     assert _change(without[..., None], whole[..., None]) <= bound

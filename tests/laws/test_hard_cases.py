@@ -88,6 +88,7 @@ def test_grazing_lidars_give_bounded_maps(
         )
         _check(rendering)
     lost = np.isnan(rendering.depth_m)
+
     assert lost.any() or abs(yaw_deg) < 60
 
 
@@ -102,6 +103,7 @@ def test_beam_along_the_wall_has_no_return(implementation: Any) -> None:
         accuracy=FEW,
     )
     _check(rendering)
+
     assert np.isnan(rendering.depth_m[:, 79]).all()
 
 
@@ -118,8 +120,11 @@ def test_gate_ends_the_histogram(implementation: Any, gate_m: float) -> None:
     if gate_m < 0.2:
         assert not whole.any()
         assert np.isnan(rendering.depth_m).all()
+
     assert whole.shape[2] * RIG.device.bin_m < gate_m + 2 * RIG.device.bin_m
+
     heard = np.isfinite(rendering.multi.path_m)
+
     assert (rendering.multi.path_m[heard] < gate_m + RIG.device.bin_m).all()
     # transient and render keep the same last bin
     np.testing.assert_allclose(
@@ -191,6 +196,7 @@ def test_histogram_holds_a_ratio_of_a_million_to_one(implementation: Any) -> Non
         FEW,
     )
     own = (dim > 0) & (only[:, : dim.shape[1]] == 0)
+
     assert own.sum() > 100
     assert both.max() > 1e6 * both[:, : dim.shape[1]][own].max()
     np.testing.assert_allclose(
@@ -230,6 +236,7 @@ def test_dtype_and_layout_do_not_change_the_result(
         np.arange(5120)[::401],
         accuracy=FEW,
     )
+
     np.testing.assert_array_equal(found, expected)
 
 

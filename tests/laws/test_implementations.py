@@ -139,6 +139,7 @@ _kept = cache(_histograms)
 def test_backend_agrees_with_the_reference(kind: str, backend: str) -> None:
     found = _kept(kind, backend)
     slow = _kept(kind, "reference")
+
     assert slow.sum() > 0
     assert (
         np.abs(found - slow).sum()
@@ -159,6 +160,7 @@ def test_torch_and_numba_differ_by_rounding(kind: str, backend: str) -> None:
     other = _kept(kind, "cpu")
     # A BRDF is left to numba by torch.
     limit = ROUNDING
+
     assert np.abs(found - other).sum() < limit * other.sum()
 
 

@@ -85,6 +85,7 @@ def test_mesh_written_and_read_back_keeps_its_depth_map(tmp_path: Path, category
 def test_unit_of_a_file_does_not_matter(tmp_path: Path, name: str, unit: float) -> None:
     triangles = category_triangles("cup", 1)
     (tmp_path / name).write_bytes(EXPORTS[name](_mesh(triangles * unit)))
+
     _assert_same(_depth(read_mesh(tmp_path / name).triangles), _depth(triangles))
 
 
@@ -106,6 +107,7 @@ def test_quarter_turn_about_z_turns_the_depth_map(category: str) -> None:
     quarter = triangles @ rotation_matrix(np.pi / 2, (0, 0, 1))[:3, :3].T
     still = Pose(size_m=0.2)
     turned = Pose(size_m=0.2, turn_z_rad=np.pi / 2)
+
     _assert_same(_depth(triangles, turned), np.rot90(_depth(triangles, still)))
     _assert_same(_depth(quarter, still), np.rot90(_depth(triangles, still)))
 
@@ -125,6 +127,7 @@ def test_winding_order_and_repetition_of_faces_do_not_matter(seed: int, category
     shuffled = np.take_along_axis(triangles, corners[..., None], axis=1)[
         generator.permutation(len(triangles))
     ]
+
     _assert_same(
         _depth(np.concatenate([shuffled, shuffled[:50]])),
         _depth(triangles),
@@ -136,6 +139,7 @@ def test_mesh_with_z_up_equals_the_same_with_y_up(tmp_path: Path) -> None:
     z_up = triangles @ rotation_matrix(np.pi / 2, (1, 0, 0))[:3, :3].T
     (tmp_path / "thing.stl").write_bytes(EXPORTS["binary.stl"](_mesh(z_up)))
     read = read_mesh(tmp_path / "thing.stl").triangles
+
     _assert_same(_depth(turn_upright(read, "z")), _depth(triangles))
     assert not np.allclose(
         _depth(turn_upright(read, "y")), _depth(triangles), atol=1e-3, equal_nan=True
@@ -208,6 +212,7 @@ def test_plates_of_a_depth_map_rasterize_back_to_it(
     if name:
         (tmp_path / name).write_bytes(EXPORTS[name](_mesh(triangles)))
         triangles = read_mesh(tmp_path / name).triangles
+
     np.testing.assert_allclose(
         orthographic_depth(triangles, BOX, pixels),
         depth,
@@ -244,4 +249,5 @@ def test_placing_a_placed_mesh_moves_nothing() -> None:
         ),
         BOX,
     )
+
     np.testing.assert_allclose(again, placed, atol=1e-12)

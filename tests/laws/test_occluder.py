@@ -43,6 +43,7 @@ def test_occluder_interval_holds_the_truth_as_often_as_stated(look: str) -> None
     ]
     found = [one for one in outcomes if not one.refused]
     inside = np.array([one.inside for one in found]).mean(axis=0)
+
     assert len(found) > 70
     assert (inside >= 0.86).all()
     assert inside[1] >= 0.97
@@ -61,6 +62,7 @@ def test_occluder_is_found_only_where_one_is_in_view(facing_deg: float) -> None:
             assert abs(one.x_error_m) < 1e-3
         elif one.shown != BARELY:
             assert one.refused
+
     assert shown - {BARELY}
 
 
@@ -74,6 +76,7 @@ def test_occluder_of_more_frames_has_a_surer_sheet_but_same_edge() -> None:
 
     (x_few, gap_few) = stds(4)
     (x_many, gap_many) = stds(64)
+
     assert x_many < 0.5 * x_few
     assert gap_many == pytest.approx(gap_few, rel=0.2)
 
@@ -87,6 +90,7 @@ def test_occluder_of_the_simulated_camera_is_found(
     one = simulated_trial(
         OccluderConditions(0.2, facing_deg, x_m, gap_m, frames=4), np.random.default_rng(2), SENSOR
     )
+
     assert not one.refused
     assert abs(one.x_error_m) < 1e-3
     assert abs(one.gap_error_m) < 2e-3

@@ -74,8 +74,11 @@ def test_receiver_cell_scales_only_the_direct_return() -> None:
         )
         for rig in (RIG, wide)
     )
+
     np.testing.assert_array_equal(one, other)
+
     direct, wider = (transient(Scene(rig), "draft").sum() for rig in (RIG, wide))
+
     assert wider == pytest.approx(2 * direct, rel=1e-5)
 
 
@@ -137,6 +140,7 @@ def test_brdf_is_reciprocal_and_never_negative(
 ) -> None:
     between = cos_in * cos_out + np.sqrt((1 - cos_in**2) * (1 - cos_out**2)) * np.cos(turn)
     brdf = kind(0.3, 0.7, 20)
+
     assert brdf(
         cos_in,
         cos_out,
@@ -173,6 +177,7 @@ def test_phong_without_its_lobe_is_lambertian(implementation: Any) -> None:
         effects,
     )
     plain = implementation.three_bounce(Scene(RIG, depth, Surface(0.6)), SOME, effects)
+
     np.testing.assert_allclose(
         dull,
         plain,
@@ -201,6 +206,7 @@ def test_brdf_agrees_with_brute_force() -> None:
         effects[:-1],
         chosen=SOME,
     ).sum(1)
+
     assert np.abs(found - exact).sum() < 1e-2 * exact.sum()
     assert np.abs(exact - dull).sum() > 0.05 * dull.sum()
 
@@ -227,12 +233,14 @@ def test_plane_takes_no_more_than_was_sent(
     cosine = height / np.sqrt(squared)
     near = NEAR_DIAGONALS * np.hypot(1, longer)
     soft = softened(squared, contact_m2(longer, solid_angle), near)
+
     assert (longer * cosine * (cosine if lambertian else 1) / (solid_angle * soft)).sum() <= 1
 
 
 def test_softening_fades_out_at_the_near_distance() -> None:
     squared = np.linspace(0, 4, 400) ** 2
     soft = softened(squared, 0.3, 2.0)
+
     assert soft[0] == pytest.approx(0.3)
     assert (np.diff(soft) > -1e-3).all()
     np.testing.assert_array_equal(soft[squared >= 4], squared[squared >= 4])
@@ -299,6 +307,7 @@ def test_pulse_of_zero_width_changes_nothing(implementation: Any) -> None:
     with_it, without = (
         implementation.transient(scene, names) for names in ([*effects, "pulse"], effects)
     )
+
     np.testing.assert_array_equal(with_it, without)
 
 
@@ -309,13 +318,16 @@ def test_pulse_spreads_an_echo_into_a_gaussian(pulse_ns: float) -> None:
     wide = with_pulse(one, pulse_ns, BIN_M)[0].astype(np.float64)
     at = np.arange(len(wide)) - 200
     sigma = pulse_bins(pulse_ns, BIN_M)
+
     assert wide.sum() == pytest.approx(2)
     assert (wide * at).sum() == pytest.approx(0, abs=1e-3)
+
     if sigma > 1:  # plus the variance of a bin
         assert (wide * at**2).sum() / 2 == pytest.approx(
             sigma**2 + 1 / 12,
             rel=1e-2,
         )
+
     assert wide.argmax() == 200
     assert len(wide) > 400 + 3 * sigma  # room for the tail
     assert pulse_ns < 1 or (wide >= wide.max() / 2).sum() * BIN_M == pytest.approx(
@@ -326,8 +338,11 @@ def test_pulse_spreads_an_echo_into_a_gaussian(pulse_ns: float) -> None:
 def test_wide_pulse_mixes_direct_return_and_echoes(implementation: Any) -> None:
     """The highest bin of the waveform holds both."""
     rendering = implementation.render(Scene(RIG, DEPTH, pulse_ns=1.0))
+
     assert rendering.multi.direct_included
+
     seen = np.isfinite(rendering.multi.path_m)
+
     np.testing.assert_allclose(
         rendering.multi.path_m[seen] / BIN_M % 1,
         0.5,

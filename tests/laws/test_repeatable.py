@@ -46,6 +46,7 @@ def test_result_repeats_again_and_on_one_thread(implementation: Any, name: str) 
         np.testing.assert_array_equal(
             implementation.three_bounce(SCENES[name], DISTANT, _effects(name), FEW), first
         )
+
     assert first.any()
 
 
@@ -76,6 +77,7 @@ def test_beams_do_not_depend_on_other_beams(
         some = DISTANT[places]
         expected = known[places]
     found = implementation.three_bounce(SCENES[name], some, _effects(name), FEW)
+
     np.testing.assert_array_equal(found, expected)
 
 
@@ -108,5 +110,6 @@ def test_whole_object_repeats_at_a_named_stop() -> None:
     first = render(Scene(RIG, depth), STOPS["draft"])
     numba.set_num_threads(numba.config.NUMBA_NUM_THREADS)
     again = render(Scene(RIG, depth), STOPS["draft"])
+
     np.testing.assert_array_equal(first.intensity, again.intensity)
     np.testing.assert_array_equal(first.multi.runner_up, again.multi.runner_up)

@@ -89,11 +89,16 @@ def rendering() -> Rendering:
 def test_quiet_sensor_reports_the_rendering_within_rounding(rendering: Rendering) -> None:
     images = Sensor(RIG, QUIET).expose(rendering.multi, default_rng(0))
     returned = images.depth_z16 > 0
+
     assert returned.mean() > 0.5
     assert not (returned & np.isnan(rendering.depth_m)).any()
+
     error = images.depth_z16[returned] * DEPTH_UNIT_M - rendering.depth_m[returned]
+
     assert np.abs(error).max() <= DEPTH_UNIT_M / 2 + 1e-6
+
     counts = np.minimum(48 / BRIGHTEST * rendering.intensity, SATURATED)
+
     assert np.abs(images.ir - counts).max() <= 0.5 + 1e-3
 
 
@@ -194,6 +199,7 @@ def test_bias_is_the_same_for_near_and_far_returns(path_m: float) -> None:
         - free.expose(echo, default_rng(2)).depth_z16
         for sensor in [Sensor(BARE, plain)] * 2
     ]
+
     np.testing.assert_array_equal(*apart)
     assert np.abs(apart[0].ravel() * DEPTH_UNIT_M - _bias_m(plain)).max() <= DEPTH_UNIT_M + 1e-6
 
@@ -206,9 +212,12 @@ def test_variance_is_that_of_read_shot_and_ambient_noise(counts: float, ambient:
         echo := _echo(counts),
     )
     variance = 1.5**2 + 0.3**2 * (counts + ambient) + 1 / 12  # the last: rounding to whole counts
+
     assert np.var([f.ir for f in frames]) == pytest.approx(variance, rel=0.01)
     assert np.mean([f.ir for f in frames]) == pytest.approx(counts, abs=0.03)
+
     truth = Sensor(BARE, QUIET).expose(echo, default_rng(0)).depth_z16.astype(float)
+
     assert (
         np.mean(
             [f.depth_z16 for f in frames],
@@ -260,6 +269,7 @@ def test_ir_rises_with_intensity_and_saturates(ambient: float) -> None:
         )
         .ir.astype(float)
     )
+
     assert (np.diff(ir.ravel()) >= 0).all()
     assert ir.max() == SATURATED - ambient
     assert (
@@ -300,6 +310,7 @@ def test_more_ambient_light_leaves_fewer_depths() -> None:
     depths = [
         (Sensor(BARE, model).expose(faint, default_rng(0)).depth_z16 > 0).sum() for model in models
     ]
+
     assert depths[0] > depths[1] > depths[2] > 0
 
 
@@ -363,11 +374,14 @@ def test_any_input_gives_a_possible_image(seed: int, included: bool, model: Sens
     )
     for name in ("depth_z16", "ir", "confidence"):
         np.testing.assert_array_equal(getattr(one, name), getattr(same, name))
+
     assert one.confidence.max() <= MAX_CONFIDENCE
     assert not one.depth_z16[one.confidence == 0].any()
+
     if included:
         assert not one.depth_z16[np.isnan(path)].any()
         nothing = ~((peak > 0) & (peak < np.inf))
         assert not one.ir[nothing].any()
         assert not one.confidence[nothing].any()
+
     assert not np.isinf(one.frame(RIG.pinhole).depth_m).any()

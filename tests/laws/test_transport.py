@@ -82,6 +82,7 @@ def test_relay_receives_less_light_than_left_the_spot(
         implementation,
         job.select(np.arange(len(job.laser_spot_m))[::37]),
     )
+
     assert arrived.max() <= 1
     assert arrived.min() >= 0
     assert arrived.max() > 0
@@ -125,7 +126,9 @@ def test_transport_is_reciprocal(implementation: Any, brdf: Any) -> None:
         jump_m=0.5,
     )
     job = _job(scene, replace(COARSE, relay_columns=40, relay_rows=40))
+
     assert job.near_m < 0.25  # near contact depends on the direction
+
     job = replace(
         job,
         relay=job.relay.select(np.arange(len(job.relay.x_m)) == 905),
@@ -136,16 +139,20 @@ def test_transport_is_reciprocal(implementation: Any, brdf: Any) -> None:
     back = replace(back, map_spots_m=back.laser_spot_m)
     sent = implementation.histograms(there)[0] / there.relay_weight[0]
     returned = implementation.histograms(back)[0] / back.relay_weight[0]
+
     assert sent.any()
     # The CPU interpolates a lobe over the incoming direction alone: its error is bounded by the
     # accuracy's. The reference interpolates nothing.
     interpolated = brdf is not None and implementation.name == "cpu"
     error = COARSE.scatter_error if interpolated else 1e-5
+
     np.testing.assert_allclose(returned.sum(), sent.sum(), rtol=error)
+
     moved = np.abs(np.cumsum(returned) - np.cumsum(sent)).sum() / sent.sum()
     # In bins: a fast renderer may round a path across an edge, and the light of a lobe may err by
     # its share in every bin.
     spread = np.ptp(np.flatnonzero(sent)) if interpolated else 0
+
     assert moved < 0.1 + error * spread
 
 
@@ -175,6 +182,7 @@ def test_echoes_lie_between_shortest_and_longest_path(implementation: Any) -> No
     bins = np.arange(histogram.shape[1])
     early = (bins + 1) * BIN_M < shortest[:, None] - 0.1 * BIN_M
     late = bins * BIN_M > longest[:, None] + 0.1 * BIN_M
+
     assert (early | late).any()
     assert not histogram[early | late].any()
     assert histogram.any()
@@ -207,17 +215,22 @@ def test_single_path_has_its_bin_and_the_weight_of_s2(implementation: Any) -> No
     d3 = np.linalg.norm(cell - point)
     path = (job.length_m + d2 + d3 + relay.length_m[0]) / BIN_M
     histogram = implementation.histograms(job)
+
     assert ((histogram > 0).sum(1) == 1).all()
+
     clear = np.abs(path - np.rint(path)) > 0.02
+
     assert clear.any()
     np.testing.assert_array_equal(
         histogram.argmax(1)[clear],
         np.floor(path[clear]),
     )
+
     cos_2 = 0.3 / d2
     cos_3 = 0.3 / d3
     expected = job.cos_incidence * cos_2 * cos_3 * relay.cell_m2 * job.patches.cell_m2
     expected /= (2 * np.pi) ** 3 * d2**2 * d3**2 * relay.length_m[0] ** 2  # S2
+
     assert min(d2.min(), d3, relay.length_m[0]) > job.near_m
     np.testing.assert_allclose(histogram.sum(1), expected, rtol=1e-5)
 
@@ -238,11 +251,13 @@ def test_mirrored_object_gives_mirrored_maps(implementation: Any) -> None:
             depth[::-1].copy(),
         )
     )
+
     np.testing.assert_allclose(
         one.multi.peak[::-1],
         other.multi.peak,
         rtol=3e-2,
     )
+
     whole = implementation.three_bounce(Scene(RIG, depth)).sum(1).reshape(64, 80)
     turned = (
         implementation.three_bounce(
@@ -254,6 +269,7 @@ def test_mirrored_object_gives_mirrored_maps(implementation: Any) -> None:
         .sum(1)
         .reshape(64, 80)
     )
+
     np.testing.assert_allclose(whole[::-1], turned, rtol=1e-4)
 
 
@@ -264,6 +280,7 @@ def test_three_bounce_scales_with_the_albedo(implementation: Any, albedo: float)
         Scene(RIG, _rough(3), Surface(albedo)),
         SOME,
     )
+
     np.testing.assert_allclose(grey, albedo * white, rtol=1e-5, atol=1e-30)
 
 
@@ -285,6 +302,7 @@ def test_albedo_of_each_cell_weighs_that_cell(implementation: Any) -> None:
     )
     cut = implementation.three_bounce(Scene(RIG, left), SOME, without)
     bins = min(painted.shape[1], cut.shape[1])
+
     np.testing.assert_allclose(
         painted[:, :bins],
         cut[:, :bins],
@@ -308,6 +326,7 @@ def test_parts_that_do_not_shade_each_other_add_up(implementation: Any) -> None:
     ):
         found = implementation.three_bounce(Scene(RIG, part), SOME)[:, : whole.shape[1]]
         parts[:, : found.shape[1]] += found
+
     np.testing.assert_allclose(
         whole,
         parts,
@@ -328,6 +347,7 @@ def test_front_part_shades_the_part_behind_it(implementation: Any) -> None:
         )
     ]
     *apart, together = (implementation.three_bounce(scene, SOME).sum() for scene in scenes)
+
     assert together < 0.98 * sum(apart)
 
 
@@ -342,12 +362,15 @@ def test_transient_is_three_bounces_plus_the_direct_return(
     rest = whole.copy()
     rest[:, : three.shape[1]] -= three.astype(np.float32)
     direct = prepare(scene, COARSE, ALL_BUT_MORE).beams.direct
+
     np.testing.assert_allclose(
         rest.sum(1),
         direct,
         rtol=1e-5,
         atol=1e-6 * whole.max(),
     )
+
     rendering = implementation.render(scene, NO_WIDTH)
     stronger = np.maximum(three.max(1), direct).astype(np.float32)
+
     np.testing.assert_allclose(rendering.intensity.ravel(), stronger, rtol=1e-6)

@@ -88,6 +88,7 @@ def test_known_objects_are_seen_with_honest_expected_errors(processing: Pipeline
         expected.append(float(uncertainty_m[there].mean()))
         observed.append(float(np.abs(off_m[there]).mean()))
     ranks = [np.argsort(np.argsort(values)) for values in (expected, observed)]
+
     assert np.corrcoef(*ranks)[0, 1] > 0.2
     assert np.mean(expected) == pytest.approx(np.mean(observed), rel=0.4)
     assert Verdict.NOTHING not in verdicts
@@ -102,6 +103,7 @@ def test_plain_outliers_are_reported_as_unusual(processing: Pipeline, name: str)
             TRAINING_OUTLIERS[name], np.random.default_rng([seed, 78]), Stimulus(RIG, SensorModel())
         )
         verdicts.append(steps_of(processing, frames_of(shown, 5, seed))[-1].verdict)
+
     assert verdicts.count(Verdict.OUTSIDE) + verdicts.count(Verdict.SATURATED) >= 6
 
 
@@ -113,4 +115,5 @@ def test_object_shows_in_its_first_frame_and_not_after(processing: Pipeline) -> 
         step.reconstruction.has_surface
         for step in steps_of(processing, [*without, *with_it, *without])
     ]
+
     assert shown == [False, True, False]

@@ -43,6 +43,7 @@ def test_wall_fit_measures_every_wall_of_the_papers_ranges(
     wall = view(distance_m, yaw_deg, pitch_deg, PINHOLE)
     fit = measured(wall.depth_m)
     again = measured(wall.depth_m)
+
     assert_close(fit, wall)
     assert fit.verdict == "good"
     np.testing.assert_array_equal(again.wall_from_lidar, fit.wall_from_lidar)
@@ -55,6 +56,7 @@ def test_wall_fit_needs_one_frame_even_with_dead_pixels(
 ) -> None:
     wall = view(distance_m, yaw_deg, pitch_deg, PINHOLE)
     alive = np.random.default_rng(seed).random(wall.depth_m.shape) >= dead
+
     assert_close(measured(np.where(alive, wall.depth_m, np.nan), seed, frames=1), wall)
 
 
@@ -67,6 +69,7 @@ def test_wall_fit_allows_outliers(
     generator = np.random.default_rng(seed)
     stray = generator.random(wall.depth_m.shape) < share  # also where no wall is met
     anything_m = generator.uniform(0.05, 2.0, wall.depth_m.shape)
+
     assert_close(measured(np.where(stray, anything_m, wall.depth_m), seed), wall)
 
 
@@ -89,6 +92,7 @@ def test_fit_moves_with_its_points(
     points = points @ turn.T + shift
     fit = fit_depth(points / points[:, 2:], points[:, 2], np.random.default_rng(0))
     normal = turn @ wall.pose[2, :3]
+
     np.testing.assert_allclose(fit.normal, normal, atol=1e-6)
     assert fit.distance_m == pytest.approx(0.2 - normal @ shift, abs=1e-6)
 

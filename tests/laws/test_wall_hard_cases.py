@@ -119,6 +119,7 @@ def test_wall_of_constant_depth_is_refused_as_a_stuck_lidar(value_m: float) -> N
 @pytest.mark.parametrize("frames", [1, 60])
 def test_wall_faced_squarely_is_measured(frames: int) -> None:
     fit = measured(view(0.2, 0.0, 0.0, PINHOLE).depth_m, frames=frames)
+
     assert fit.distance_m == pytest.approx(0.2, abs=1e-4)
     assert fit.facing_deg <= 3.0 * fit.facing_std_deg
 
@@ -135,6 +136,7 @@ def test_two_walls_in_a_corner_are_refused_or_doubted(
     fit = measured_unless_refused(
         bent(view(0.2, 20.0, 5.0, PINHOLE), bend_deg, share, direction_rad)[0]
     )
+
     assert fit is None or (abs(bend_deg) < 8.0 and fit.verdict == "doubtful")
 
 
@@ -143,6 +145,7 @@ def test_two_walls_in_a_corner_are_refused_or_doubted(
 def test_wall_with_a_slight_bend_is_not_averaged(seen: View, bend_deg: float, share: float) -> None:
     depth_m, main = bent(seen, bend_deg, share)
     fit = measured_unless_refused(depth_m)
+
     assert fit is None or fit.verdict == "doubtful" or is_right(fit, main.pose)
 
 
@@ -173,6 +176,7 @@ def test_wall_with_slight_saturation_is_doubted_or_right(
 ) -> None:
     fit = measured_unless_refused(hidden(seen, share, short_m=short_m))
     distance_m = pytest.approx(seen.pose[2, 3], abs=0.001)
+
     assert fit is None or fit.verdict == "doubtful" or fit.distance_m == distance_m
 
 
@@ -182,6 +186,7 @@ def test_wall_with_ripples_of_the_lidar_is_measured(
     seen: View, amplitude_m: float, waves: float
 ) -> None:
     fit = measured(rippled(seen, amplitude_m, waves, np.random.default_rng(1)))
+
     assert is_right(fit, seen.pose)
     assert fit.verdict == "good" or amplitude_m > 0.001
     assert amplitude_m < 0.001 or any("ripples" in warning for warning in fit.warnings)

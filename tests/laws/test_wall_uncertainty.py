@@ -31,6 +31,7 @@ def test_wall_interval_holds_the_truth_as_often_as_stated(noise: float, frames: 
     thousand.
     """
     found = inside(120, 110, noise=noise, frames=frames)
+
     assert (found.mean(axis=0) >= 0.88).all()
     assert found.mean() <= 0.985
 

@@ -65,6 +65,7 @@ def test_doctest_of_api_runs_on_recording(
     recorded(tmp_path / "run.bag", 3)
     monkeypatch.chdir(tmp_path)
     result = doctest.testmod(api)
+
     assert result.attempted > 0
     assert result.failed == 0
 
@@ -74,6 +75,7 @@ def test_import_is_cheap_and_recording_needs_no_sdk(noise_bag: Path) -> None:
     run = [sys.executable, "-c", LATE, str(noise_bag)]
     ended = subprocess.run(run, capture_output=True, text=True, timeout=250, check=True)
     before, frames = json.loads(ended.stdout)
+
     assert not {"numpy", "torch", "cv2", "nlos_cam.api"} & set(before)
     assert frames == 20
 
@@ -86,18 +88,24 @@ def test_stream_of_recording_resumes_after_a_break(opened: Open) -> None:
             if one.frame_number == 4:
                 break
         seen += list(stream)
+
     assert [one.frame_number for one in seen] == list(range(9))
     assert [one.timestamp_s for one in seen] == [number / 30 for number in range(9)]
-    assert (stream.dropped, stream.notes) == (0, ())
+    assert stream.dropped == 0
+    assert stream.notes == ()
 
 
 def test_points_are_surface_in_wall_frame(opened: Open) -> None:
     with opened(WallCamera(1)) as stream:
         seen = next(stream)
     box = stream.rig.object_box
-    assert (seen.points_m.shape, seen.points_m.dtype) == ((64 * 32, 3), np.float32)
+
+    assert seen.points_m.shape == (64 * 32, 3)
+    assert seen.points_m.dtype == np.float32
+
     middle_x_m = (box.x_min_m + box.x_max_m) / 2
     pitch_y_m = (box.y_max_m - box.y_min_m) / 64
+
     assert seen.points_m[:, 0].min() > box.x_min_m
     assert seen.points_m[:, 0].max() < middle_x_m
     np.testing.assert_allclose(
@@ -128,6 +136,7 @@ def test_stream_stops_camera_after_error_and_needs_a_start(opened: Open) -> None
         next(stream)
     with pytest.raises(ZeroDivisionError), stream:
         next(stream).frame_number // 0
+
     assert camera.closed.is_set()
 
 
@@ -136,6 +145,7 @@ def test_stream_of_live_camera_drops_and_counts_old_frames(opened: Open) -> None
     with opened(camera, "sim") as stream:
         assert camera.given.wait(30.0)
         taken = [seen.frame_number for seen in stream]
+
     assert taken == [17, 18, 19]
     assert stream.dropped == 17
 
@@ -143,14 +153,19 @@ def test_stream_of_live_camera_drops_and_counts_old_frames(opened: Open) -> None
 def test_stream_applies_wall_and_average(opened: Open, tmp_path: Path) -> None:
     wall = write_wall(tmp_path / "wall.toml", bare_wall())
     camera = WallCamera(80, moved=range(40, 80))
+
     assert camera.identity["serial"] == SERIAL
+
     with opened(camera, wall=str(wall), average=4) as stream:
         seen = list(stream)
+
     assert stream.rig.name == "measured"
     assert [bool(seen[number].warnings) for number in (20, -1)] == [False, True]
+
     single, mean = (
         np.nanstd(one.difference.depth_m) for one in (seen[0], seen[30]) if one.difference
     )
+
     assert mean < 0.75 * single
 
 

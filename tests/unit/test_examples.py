@@ -58,9 +58,13 @@ def recording(folder: Path, recorded: Callable[..., Path]) -> Record:
 def test_live_depth_and_point_cloud_find_the_cup(run: Run, recording: Record, folder: Path) -> None:
     bag = recording("still.toml", 3)
     box = RIG.object_box
+
     assert box is not None
+
     lines = run("live_depth", f"bag:{bag}").splitlines()
+
     assert len(lines) == 3
+
     for line in lines:
         _, x_m, y_m, z_m = (float(figure) for figure in re.findall(r"-?[\d.]+", line))
         assert box.x_min_m < x_m < box.x_max_m
@@ -68,10 +72,13 @@ def test_live_depth_and_point_cloud_find_the_cup(run: Run, recording: Record, fo
         assert box.z_near_m < z_m < box.z_far_m
     told = run("point_cloud", str(bag), "cup.ply")
     points = trimesh.load(folder / "cup.ply").vertices
+
     assert told == f"cup.ply: {len(points)} points of 3 frames\n"
     assert points[:, 2].min() >= box.z_near_m - 1e-6
+
     triangles = int(re.findall(r"(\d+) triangles", run("hidden_mesh", str(bag), "cup.glb"))[0])
     (mesh,) = trimesh.load_scene(folder / "cup.glb").geometry.values()
+
     assert len(mesh.faces) == triangles > 100
 
 
@@ -80,6 +87,7 @@ def test_hide_and_seek_overlaps_more_than_chance(run: Run) -> None:
     overlap, off_mm = (
         int(figure) for figure in re.findall(r"(\d+)(?:%| mm)", run("hide_and_seek", "cup", "4"))
     )
+
     assert overlap > 40
     assert off_mm < 60
 
@@ -89,7 +97,9 @@ def test_calibrate_bag_writes_readable_record(run: Run, recording: Record, folde
     assert run("calibrate_bag", str(recording("bare-wall", 6))).startswith(
         "200.0 mm to the wall, 45.00 degrees: good"
     )
+
     measured = load_measured(folder / "wall.toml")
+
     assert measured.record.frames == 6
     assert measured.reference is not None
 
@@ -115,6 +125,7 @@ def test_own_training_reduces_the_loss(run: Run, folder: Path) -> None:
         plan, 24, folder / "data", workers=1, on_progress=lambda *_: None, farm=in_this_process
     )
     losses = [float(line.split()[-1]) for line in run("own_training", "data", "3").splitlines()]
+
     assert len(losses) == 3
     assert losses[-1] < losses[0]
 

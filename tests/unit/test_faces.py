@@ -61,6 +61,7 @@ def modules() -> Iterator[tuple[Path, str]]:
 @pytest.mark.parametrize("face", FACES)
 def test_face_loads_every_name(face: str) -> None:
     package = importlib.import_module(face)
+
     assert package.__doc__
     assert package.__all__
     assert all(hasattr(package, name) for name in package.__all__)
@@ -95,4 +96,5 @@ def test_importing_faces_imports_nothing_heavy() -> None:
     found = subprocess.run(
         [sys.executable, "-c", program], capture_output=True, text=True, check=True
     ).stdout
+
     assert found.strip() == ""

@@ -38,9 +38,14 @@ def _maps(depth_m: np.ndarray, ir: np.ndarray | int = 10) -> LidarMaps:
 )
 def test_edges_give_pixels_to_cells_that_hold_their_centres(pixels: int, cells: int) -> None:
     edges = _edges(pixels, cells)
-    assert (edges[0], edges[-1], len(edges)) == (0, pixels, cells + 1)
+
+    assert edges[0] == 0
+    assert edges[-1] == pixels
+    assert len(edges) == cells + 1
     assert (np.diff(edges) >= 0).all()
+
     found = np.searchsorted(edges, np.arange(pixels), side="right") - 1
+
     assert found.tolist() == [int((k + 0.5) * cells / pixels) for k in range(pixels)]
 
 
@@ -62,6 +67,7 @@ def test_median_equals_numpys_for_every_count_and_tie(seed: int, valid: int, val
         if valid
         else np.nan
     )
+
     np.testing.assert_allclose(maps.depth_m.ravel(), expected, rtol=1e-6)
 
 
@@ -75,6 +81,7 @@ def test_intensity_is_the_mean_over_samples_near_the_median() -> None:
     depth[1, 7] = 0.511
     ir[1, 7] = 240
     maps = _maps(depth, ir)
+
     assert maps.depth_m[0, 0] == np.float32(0.5)
     assert maps.intensity[0, 0] == pytest.approx((38 * 20 + 60) / 39)
     assert maps.intensity[0, 1] == 20
@@ -86,6 +93,7 @@ def test_two_balanced_winners_give_an_intensity() -> None:
     depth[:, ::2] = 0.8
     ir[:, ::2] = 30
     maps = _maps(depth, ir)
+
     assert maps.valid.all()
     assert ((maps.depth_m >= np.float32(0.4)) & (maps.depth_m <= np.float32(0.8))).all()
     assert ((maps.intensity >= 10) & (maps.intensity <= 30)).all()
@@ -99,6 +107,7 @@ def test_invalid_depth_does_not_count_in_a_cell(nothing: float) -> None:
     ir[::2] = 255
     depth[:15, :8] = nothing  # two whole cells
     maps = _maps(depth, ir)
+
     assert maps.depth_m.shape == maps.intensity.shape == maps.valid.shape == (MAP_ROWS, MAP_COLUMNS)
     assert maps.depth_m.dtype == maps.intensity.dtype == np.float32
     np.testing.assert_array_equal(np.argwhere(~maps.valid), [[0, 0], [1, 0]])
@@ -116,11 +125,14 @@ def test_maps_stay_within_the_range_of_the_frame(
     depth[generator.random(size) < share] = np.nan
     ir = generator.integers(0, 256, size, np.uint8)
     maps = _maps(depth, ir)
+
     np.testing.assert_array_equal(maps.valid, ~np.isnan(maps.depth_m))
     assert (maps.intensity[~maps.valid] == 0).all()
+
     if maps.valid.any():
         assert np.nanmin(depth) <= np.nanmin(maps.depth_m)
         assert np.nanmax(maps.depth_m) <= np.nanmax(depth)
+
     assert maps.intensity.max() <= 255
 
 
@@ -128,6 +140,7 @@ def test_maps_stay_within_the_range_of_the_frame(
 def test_simulated_sensor_spreads_cells_as_maps_gather_them(size: tuple[int, int]) -> None:
     cell = cell_of_pixels(size, (MAP_ROWS, MAP_COLUMNS)).reshape(size)
     maps = _maps(cell + 1)
+
     np.testing.assert_array_equal(maps.depth_m.ravel(), np.arange(MAP_ROWS * MAP_COLUMNS) + 1)
 
 
@@ -180,6 +193,7 @@ def test_map_mean_accumulates_no_error() -> None:
     given = [noise(number) for number in range(50)]
     for turn in range(4000):
         found = mean.add(given[turn % 50])
+
     assert_equal(found, mean_of([given[turn % 50] for turn in range(3993, 4000)]))
 
 
@@ -191,6 +205,7 @@ def test_map_mean_neither_changes_nor_keeps_its_input() -> None:
     kept = first.depth_m.copy()
     maps.depth_m[:] = 9.0
     mean.add(noise(4))
+
     np.testing.assert_array_equal(first.depth_m, kept)
     assert_equal(mean.add(noise(5)), mean_of([noise(4), noise(5)]))
     np.testing.assert_array_equal(kept, again.depth_m)

@@ -61,7 +61,9 @@ def run(package: Path, **environment: str) -> str:
 @pytest.mark.slow
 def test_changed_kernel_changes_its_callers(package: Path) -> None:
     assert run(package) == "2"
+
     (package / "render" / "called.py").write_text(CALLED.format(number=5))
+
     assert run(package) == "6"
 
 
@@ -72,6 +74,7 @@ def test_old_folders_are_removed(package: Path) -> None:
     (package / "render" / "called.py").write_text(CALLED.format(number=5))
     run(package)
     after = list((package / "__pycache__").glob("kernels-*"))
+
     assert len(before) == len(after) == 1
     assert before != after
 
@@ -80,6 +83,7 @@ def test_old_folders_are_removed(package: Path) -> None:
 def test_read_only_package_is_cached_in_the_users_folder(package: Path, tmp_path: Path) -> None:
     (package / "__pycache__").write_text("a file, so that no folder can be made here")
     cache = tmp_path / "cache"
+
     assert run(package, NLOS_CAM_CACHE=str(cache)) == "2"
     assert list(cache.rglob("*.nbi"))
 
@@ -90,6 +94,7 @@ def test_checksum_follows_a_constant_in_a_file_without_kernels(tmp_path: Path) -
     before = kernel_cache.checksum(tmp_path)
     (tmp_path / "render" / "constants.py").write_text("X = 2")
     kernel_cache.checksum.cache_clear()
+
     assert kernel_cache.checksum(tmp_path) != before
 
 
@@ -98,5 +103,6 @@ def test_every_file_with_kernels_is_among_the_sources() -> None:
     compiled = re.compile(rb"cache=True|\binner\(")
     kernels = {path for path in package.rglob("*.py") if compiled.search(path.read_bytes())}
     found = {path for pattern in kernel_cache.SOURCES for path in package.glob(pattern)}
+
     assert kernels
     assert kernels <= found

@@ -116,6 +116,7 @@ def run_in(poisoned: Path, program: str, *arguments: str) -> subprocess.Complete
 )
 def test_child_runs_nothing_of_the_current_folder(program: str, poisoned: Path) -> None:
     ended = run_in(poisoned, program)
+
     assert ended.returncode == 0, ended.stderr
     assert not (poisoned / MARKER).exists()
 
@@ -134,6 +135,7 @@ def test_command_runs_nothing_of_the_current_folder(
     arguments: tuple[str, ...], poisoned: Path
 ) -> None:
     ended = run_in(poisoned, ENTRY, *arguments)
+
     assert ended.returncode == 0, ended.stderr
     assert not (poisoned / MARKER).exists()
 
@@ -145,6 +147,7 @@ def test_child_of_a_child_finds_the_package(poisoned: Path) -> None:
         env=child_environment(),
         check=False,
     )
+
     assert ended.returncode == 0
     assert not (poisoned / MARKER).exists()
 
@@ -161,5 +164,6 @@ def test_safe_children_leave_this_process_as_it_was(monkeypatch: pytest.MonkeyPa
         assert "" not in sys.path
         assert os.environ[SAFE_PATH] == "1"
         raise ZeroDivisionError
+
     assert sys.path[0] == ""
     assert SAFE_PATH not in os.environ

@@ -39,10 +39,13 @@ def dots(paper: Paper) -> NDArray[np.uint8]:
 def test_sheet_shows_the_board_to_scale(paper: Paper, dots: NDArray[np.uint8]) -> None:
     board = BOARDS[paper]
     pixels, ids, _, markers = cv2.aruco.CharucoDetector(board.opencv_board).detectBoard(dots)
+
     assert len(markers) == board.squares_x * board.squares_y // 2
     assert len(ids) == len(board.corners_m)
+
     corners_mm = board.corners_m[ids.ravel(), :2] * 1e3 + pattern_origin_mm(paper)
     expected = corners_mm * PIXELS_PER_MM - 0.5
+
     np.testing.assert_allclose(pixels, expected, atol=0.6)  # 0.06 mm
 
 
@@ -50,6 +53,7 @@ def test_bar_on_the_sheet_is_100_mm_long(paper: Paper, dots: NDArray[np.uint8]) 
     (_, top_mm, _, height_mm), *_ = bar_mm(paper)
     row = dots[int((top_mm + height_mm / 2.0) * PIXELS_PER_MM)]
     black = np.flatnonzero(row < 128)
+
     assert len(black) == black[-1] - black[0] + 1
     assert len(black) / PIXELS_PER_MM == pytest.approx(BAR_MM, abs=0.15)
 
@@ -57,12 +61,14 @@ def test_bar_on_the_sheet_is_100_mm_long(paper: Paper, dots: NDArray[np.uint8]) 
 def test_sheet_has_a_white_margin(dots: NDArray[np.uint8]) -> None:
     edge = int(5.0 * PIXELS_PER_MM)
     dots[edge:-edge, edge:-edge] = 255
+
     assert (dots == 255).all()
 
 
 def test_sheet_is_white_below_the_pattern(paper: Paper, dots: NDArray[np.uint8]) -> None:
     bottom_mm = pattern_origin_mm(paper)[1] + BOARDS[paper].size_mm[1]
     bottom = int(bottom_mm * PIXELS_PER_MM) + 1
+
     assert (dots[bottom : bottom + int(2.0 * PIXELS_PER_MM)] == 255).all()
 
 
@@ -74,14 +80,18 @@ def test_black_cells_are_those_that_opencv_draws() -> None:
         rows = slice(round(2 * top), round(2 * (top + height)))
         columns = slice(round(2 * left), round(2 * (left + width)))
         drawn[rows, columns] = 0
+
     np.testing.assert_array_equal(drawn, board.pattern(k))
 
 
 def test_write_sheet_makes_a_vector_page_of_the_paper(tmp_path: Path, paper: Paper) -> None:
     write_board_pdf(tmp_path / "board.pdf", paper)
     content = (tmp_path / "board.pdf").read_bytes()
+
     assert content.startswith(b"%PDF-")
+
     (box,) = re.findall(rb"/MediaBox \[([^\]]*)\]", content)
     points = [0.0, 0.0, *(72.0 * mm / 25.4 for mm in PAPER_MM[paper])]
+
     assert [float(number) for number in box.split()] == pytest.approx(points, abs=0.01)
     assert b"/Subtype /Image" not in content

@@ -51,6 +51,7 @@ def test_reference_maps_are_the_means_of_the_frames_maps(twenty: BareWall) -> No
     maps = [maps_from_frame(frame) for frame in Warming(20)]
     depth_m = np.mean([each.depth_m for each in maps], axis=0)
     counts = [np.where(each.valid, each.intensity, np.nan) for each in maps]
+
     np.testing.assert_allclose(twenty.map_depth_m, depth_m, rtol=1e-6)
     np.testing.assert_allclose(twenty.map_intensity, np.mean(counts, axis=0), rtol=1e-6)
 
@@ -72,6 +73,7 @@ def test_collect_statistics_refuses_a_camera_without_frames() -> None:
 
 def test_statistics_read_temperatures_now_and_then() -> None:
     capture = collect_statistics(Warming(2 * measure.CELSIUS_EVERY + 1, celsius=30.0), 1000)
+
     assert capture.facts()["temperatures_c"] == {"ldd_temperature": 32.0}
     assert capture.reference(ALL).celsius_span == {"ldd_temperature": 2.0}
 
@@ -121,6 +123,7 @@ def test_measure_occluder_finds_it_beside_the_known_wall(
 ) -> None:
     record, _ = measure_occluder(bench_seen(occluder=Occluder(x_m=x_m, z_min_m=gap_m)), bare)
     found = record.occluder
+
     assert found.source == "detected"
     assert found.x_m == pytest.approx(x_m, abs=0.002)
     assert found.gap_m == pytest.approx(gap_m, abs=0.002)
@@ -134,6 +137,7 @@ def test_walls_pixels_are_those_beside_the_occluder(bare: MeasuredWall) -> None:
     _, inliers = measure_occluder(seen, bare)
     wall_m = wall_depth(RIG.wall_from_lidar, INTRINSICS)
     far = np.abs(wall_m - seen.statistics.depth.mean_m()) > 0.02
+
     assert 0.1 < far.mean() < 0.5
     assert not (inliers & far).any()
     assert inliers[~far].mean() > 0.95
@@ -161,8 +165,11 @@ def test_measure_occluder_is_not_moved_by_an_origin_offset(seen: CaptureStatisti
     mm from theirs.
     """
     wall = measured(seen, 0.204)
+
     assert wall.record.range_offset_cause == "origin"
+
     record, _ = measure_occluder(bench_seen(), wall)
+
     assert record.occluder.x_m == pytest.approx(0.204, abs=2e-4)
     assert record.occluder.gap_m == pytest.approx(0.1, abs=0.002)
     assert record.occluder.x_std_m == pytest.approx(0.0005, rel=0.02)  # the tape's
@@ -185,6 +192,7 @@ def test_measure_occluder_warns_of_changed_settings(
     then = replace(seen, settings={"laser_power": 80.0}).reference(np.ones((120, 160), np.bool_))
     now = replace(bench_seen(), settings={"laser_power": 40.0})
     record, _ = measure_occluder(now, replace(bare, reference=then))
+
     assert re.search("laser_power.*80.*40", record.warnings[-1])
 
 
@@ -213,6 +221,7 @@ def test_fit_frame_measures_wall_in_a_thinned_frame(
     seen = fit_frame(frame_of(RIG.model_copy(update={"lidar": pose}), width, height))
     within_m = max(0.0005, 4 * seen.fit.distance_std_m)
     within_deg = max(0.1, 4 * seen.fit.yaw_std_deg)
+
     assert seen.fit.distance_m == pytest.approx(distance_m, abs=within_m)
     assert seen.fit.yaw_deg == pytest.approx(yaw_deg, abs=within_deg)
 
@@ -222,6 +231,7 @@ def test_fit_frame_reports_refusal_and_saturation() -> None:
     nothing = np.full_like(frame.depth_m, np.nan)
     blinded = np.full_like(frame.ir, 255)
     seen = fit_frame(replace(frame, depth_m=nothing, ir=blinded))
+
     assert seen.fit is None
     assert "0.0%" in seen.refusal
     assert seen.saturated == 1.0

@@ -29,7 +29,9 @@ def recorded(measured: Measured, **fields: object) -> WallRecord:
 
 def test_report_is_self_contained(measured: Measured) -> None:
     found = read(measured(warnings=("ripples of 0.5 mm RMS", "noise > 2 & rising")))
+
     assert len(found.pictures) == 6
+
     for words in (
         "Good",
         "2026-01-31",
@@ -48,12 +50,15 @@ def test_report_escapes_hostile_names(measured: Measured) -> None:
         update={"camera": hostile, "advice": hostile, "warnings": (hostile,)}
     )
     found = read(MeasuredWall(changed, wall.reference), f"{hostile}.toml")
+
     assert found.text.count(hostile) >= 8
 
 
 def test_report_shows_maps_only_of_a_reference_with_depth(measured: Measured) -> None:
     wall = measured()
+
     assert len(read(MeasuredWall(wall.record, None)).pictures) == 2
+
     nothing = np.full_like(wall.reference.depth_m, np.nan)
     depth_less = replace(
         wall.reference, depth_m=nothing, depth_std_m=nothing, inliers=nothing > 0.0
@@ -61,6 +66,7 @@ def test_report_shows_maps_only_of_a_reference_with_depth(measured: Measured) ->
     gone = dict.fromkeys(
         ("residual_m", "noise_scale", "inlier_fraction", "ripple_m", "bend_m", "bend_deg")
     )
+
     assert len(read(MeasuredWall(wall.record.model_copy(update=gone), depth_less)).pictures) == 3
 
 
@@ -76,6 +82,7 @@ def test_report_of_noise_stays_small(measured: Measured) -> None:
         ir=noise.uniform(0.0, 255.0, shape).astype(np.float32),
         saturated=noise.uniform(0.0, 1.0, shape).astype(np.float32),
     )
+
     assert len(report.report_html(MeasuredWall(wall.record, loud), "wall.toml")) < 1_500_000
 
 
@@ -98,6 +105,7 @@ def test_range_bar_marker_is_where_the_value_is() -> None:
         places = marker_and_range(value)
         assert places[0] == pytest.approx(places[ends], abs=0.2)
     at, low, high = marker_and_range(22.5)
+
     assert at == pytest.approx((low + high) / 2.0, abs=0.2)
     assert marker_and_range(60.0)[0] == marker_and_range(45.0)[0] < 680.0
     assert marker_and_range(-5.0)[0] == marker_and_range(0.0)[0] > 0.0
@@ -109,6 +117,7 @@ def test_range_bar_marker_is_where_the_value_is() -> None:
 )
 def test_range_bar_shows_whether_the_value_is_inside(value: float, drawn: str) -> None:
     html = report.range_bar("distance", value, (15.0, 30.0), 0.1, "cm", 45.0)
+
     assert f"{value:.1f} cm" in html
     assert f"class='{drawn}'" in html
 
@@ -121,7 +130,9 @@ def test_report_banner_holds_verdict_advice_and_warnings(measured: Measured, ver
         "warnings": ("ripples & noise", "cold"),
     }
     banner = report.banner(recorded(measured, **fields))
+
     assert f"class='verdict {verdict.replace(' ', '-')}'" in banner
+
     for sentence in (verdict, "move <4 cm> back", "ripples & noise", "cold"):
         assert sentence in unescape(banner).lower()
 
@@ -129,10 +140,13 @@ def test_report_banner_holds_verdict_advice_and_warnings(measured: Measured, ver
 def test_report_bars_are_of_measured_quantities(measured: Measured) -> None:
     record = measured(0.35, 80.0, 0.0).record
     bars = report.ranges(record)
+
     assert "35.0 cm" in bars
     assert "80.0 degrees" in bars
     assert "gap" not in bars
+
     wide = OccluderRecord(source="entered", x_m=0.2, gap_m=0.25)
+
     assert "25.0 cm" in report.ranges(record.model_copy(update={"occluder": wide}))
 
 
@@ -141,6 +155,7 @@ def test_report_measures_are_the_summarys_rows(measured: Measured) -> None:
     html = unescape(report.measures(record))
     for cell in (cell for row in wall_facts(record) for cell in row):
         assert cell in html
+
     assert "--tape-m" in html
     assert "--tape-m" not in report.measures(
         record.model_copy(update={"range_offset_std_m": 0.001})
@@ -149,6 +164,7 @@ def test_report_measures_are_the_summarys_rows(measured: Measured) -> None:
 
 def test_report_compares_the_board_with_the_record(measured: Measured) -> None:
     assert not report.board(measured().record)
+
     html = unescape(report.board(recorded(measured, board=BOARD)))
     for words in (
         "203.4 ± 1.0 mm",
@@ -161,6 +177,7 @@ def test_report_compares_the_board_with_the_record(measured: Measured) -> None:
     ):
         assert words in html
     alone = {"used": "board", "disagreement_m": None, "depth_refused": "a <mirror>"}
+
     assert "a <mirror>" in unescape(
         report.board(recorded(measured, board=BOARD.model_copy(update=alone)))
     )
@@ -174,6 +191,7 @@ def test_report_device_has_temperatures_and_settings(measured: Measured) -> None
     )
     for words in ("f0246262", "1.5.8.1", "laser_power", "80", "41.3 °C", "1.5", "64 x 48"):
         assert words in html
+
     assert "°C" not in report.device(MeasuredWall(measured().record, None))
 
 
@@ -192,6 +210,7 @@ def test_report_commands_can_be_pasted(
         update={"camera": camera}
     )
     html = unescape(report.usage(record, record_file))
+
     assert f"nlos-cam {live}\n" in html
     assert all(
         words in html for words in ("render cup --rig", "wall.npz", "ab" * 32, record.rig.checksum)
@@ -210,10 +229,13 @@ def test_wall_files_belong_together(
     wall = bare_wall()
     record = write_record(files, measured().record, wall)
     loaded = load_measured(files.record)
+
     assert loaded.record == record
     np.testing.assert_array_equal(loaded.reference.depth_m, wall.depth_m)
     assert files.report.read_text(encoding="utf-8") == report.report_html(loaded, "wall.toml")
+
     before = {path.name: path.read_bytes() for path in files.record.parent.iterdir()}
+
     assert set(before) == {"wall.toml", "wall.npz", "wall.html"}
 
     def interrupted(*_: object) -> None:
@@ -222,6 +244,7 @@ def test_wall_files_belong_together(
     monkeypatch.setattr("nlos_cam.calibrate.files.report_html", interrupted)
     with pytest.raises(KeyboardInterrupt):
         write_record(files, record, replace(wall, depth_m=wall.depth_m + np.float32(0.1)))
+
     assert {path.name: path.read_bytes() for path in files.record.parent.iterdir()} == before
 
 

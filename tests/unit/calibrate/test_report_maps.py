@@ -46,6 +46,7 @@ def red_and_blue(picture: Picture) -> tuple[float, float]:
 
 def test_maps_of_an_exact_plane_are_pale(wall: MeasuredWall) -> None:
     residual, spread, noise, _ = maps(wall)
+
     assert red_and_blue(residual) == (0.0, 0.0)
     assert not re.search("%|board", residual.caption)
     assert "0.000 mm" in spread.caption
@@ -72,6 +73,7 @@ def test_residual_map_is_red_behind_the_plane_else_blue(wall: MeasuredWall, bump
     depth_m = wall.reference.depth_m.copy()
     depth_m[:, 16:32] += bump_m
     drawn, other = red_and_blue(maps(wall, depth_m=depth_m)[0])[:: 1 if bump_m > 0.0 else -1]
+
     assert 0.1 < drawn < 0.3
     assert other == 0.0
 
@@ -84,6 +86,7 @@ def test_residual_map_stripes_what_was_left_out(wall: MeasuredWall) -> None:
     inliers[:, 16:32] = False
     depth_m[:12] = np.nan
     residual = maps(wall, depth_m=depth_m, inliers=inliers)[0]
+
     assert red_and_blue(residual) == (0.0, 0.0)
     assert "18.8 %" in residual.caption
     assert "25.0 %" in residual.caption
@@ -92,6 +95,7 @@ def test_residual_map_stripes_what_was_left_out(wall: MeasuredWall) -> None:
 @pytest.mark.slow
 def test_residual_map_without_a_plane_is_striped_all_over(wall: MeasuredWall) -> None:
     residual, spread, *_ = maps(wall, inliers=np.zeros_like(wall.reference.inliers))
+
     assert residual.png is not None
     assert "100.0 %" in residual.caption
     assert spread.png is None
@@ -101,6 +105,7 @@ def test_residual_map_without_a_plane_is_striped_all_over(wall: MeasuredWall) ->
 def test_spread_map_separates_ripples_from_noise(wall: MeasuredWall) -> None:
     rippled_m = wall.reference.depth_m + 0.002 * np.sin(np.arange(64) / 4.0)
     spread = maps(wall, depth_m=rippled_m)[1]
+
     assert 0.8 < float(spread.caption.split(" mm RMS")[0].rsplit(" ", 1)[1]) < 1.45
     assert "60 frames" in spread.caption
 
@@ -114,6 +119,7 @@ def test_wall_maps_without_data_have_no_picture(wall: MeasuredWall) -> None:
         ir=nothing,
         inliers=np.zeros(nothing.shape, bool),
     )
+
     assert [picture.png for picture in shown] == [None] * 4
     assert all(picture.caption.endswith(".") for picture in shown)
 
@@ -121,6 +127,7 @@ def test_wall_maps_without_data_have_no_picture(wall: MeasuredWall) -> None:
 def test_noise_map_needs_two_samples_of_a_pixel(wall: MeasuredWall) -> None:
     nothing = np.full_like(wall.reference.depth_m, np.nan)
     residual, _, noise, _ = maps(wall, depth_std_m=nothing)
+
     assert residual.png is not None
     assert noise.png is None
 
@@ -132,6 +139,7 @@ def test_infrared_map_draws_saturation_if_any(wall: MeasuredWall) -> None:
     share[:, :16] = 0.1
     share[:, :8] = 0.9
     blinded = maps(wall, saturated=share)[3]
+
     assert "48 of 255" in bare.caption
     assert "25.0 %" in blinded.caption
     assert "12.5 %" in blinded.caption
@@ -142,6 +150,7 @@ def test_infrared_map_draws_saturation_if_any(wall: MeasuredWall) -> None:
 def test_infrared_map_does_not_round_one_pixel_to_none(wall: MeasuredWall) -> None:
     share = np.zeros_like(wall.reference.saturated)
     share[5, 5] = 1.0
+
     assert "0.1 %" in maps(wall, saturated=share)[3].caption
 
 
@@ -184,6 +193,7 @@ def test_residual_allows_for_the_range_offset(
         depth_m = wall_depth(meeting, reference.intrinsics)
     offset = {"range_offset_m": offset_m, "range_offset_cause": cause}
     near = reference.depth_m < 2.0
+
     assert np.abs(seen(wall, depth_m, **offset)[near]).max() < FLOAT32_M
     assert np.abs(seen(wall, depth_m)[near]).max() > 0.003
 
@@ -194,14 +204,18 @@ def test_residual_of_noise_has_the_expected_spread(measured: Callable[..., Measu
     noise_m = depth_noise_m(depth_m) / np.sqrt(wall.reference.frames)
     off_m = seen(wall, depth_m + noise_m * np.random.default_rng(0).standard_normal(depth_m.shape))
     sigmas = off_m / expected_std_m(wall.record, wall.reference)
+
     assert sigmas.std() == pytest.approx(1.0, abs=0.02)
     assert [sigmas[:, :40].std(), sigmas[:, -40:].std()] == pytest.approx([1.0, 1.0], abs=0.04)
 
 
 def test_blocks_are_means_of_known_pixels_and_majorities() -> None:
     values = np.array([[1.0, 3.0, np.nan], [np.nan, 5.0, np.nan], [7.0, 9.0, 11.0]])
+
     np.testing.assert_allclose(in_blocks(values, 2), [[3.0, np.nan], [8.0, 11.0]])
     np.testing.assert_array_equal(in_blocks(values, 1), values)
     assert [block_side(columns) for columns in (16, 320, 321, 640, 1024)] == [1, 1, 2, 2, 4]
+
     mask = np.array([[True, True, False, True], [False, False, False, False]])
+
     assert block_majority(mask, 2).tolist() == [[True, False]]

@@ -46,6 +46,7 @@ def mean_of(clean: Float64, frames: int = 30) -> Float64:
 
 def test_measured_board_is_the_same_board_scaled() -> None:
     board = A4.measured(29.1)
+
     np.testing.assert_allclose(board.corners_m, 0.97 * A4.corners_m, atol=1e-8)
     assert board.marker_mm / board.square_mm == pytest.approx(0.75)
     np.testing.assert_array_equal(board.pattern(32), A4.pattern(32))
@@ -69,6 +70,7 @@ def test_corners_of_a_well_lit_board_are_found_without_bias() -> None:
     clean, true_px = of_bench()
     found = find_corners(mean_of(clean), A4)
     errors_px = found.pixels - true_px[found.ids]
+
     assert len(found.ids) >= 25
     assert np.sqrt(np.mean(errors_px**2)) < 0.15
     assert np.abs(np.median(errors_px, axis=0)).max() < 0.1
@@ -79,6 +81,7 @@ def test_corners_are_found_at_any_brightness(counts: float) -> None:
     clean, true_px = of_bench(brightest_counts=counts)
     found = find_corners(mean_of(clean), A4)
     errors_px = found.pixels - true_px[found.ids]
+
     assert len(found.ids) >= 20
     assert np.median(np.linalg.norm(errors_px, axis=1)) < 0.3
 
@@ -88,6 +91,7 @@ def test_find_corners_needs_the_mean_of_dim_frames() -> None:
     frames = infrared_frames(of_bench(brightest_counts=3.0)[0], np.random.default_rng(1), 60)
     with pytest.raises(BoardRefusedError):
         find_corners(frames[0], A4)
+
     assert len(find_corners(frames.mean(axis=0), A4).ids) >= 16
 
 
@@ -187,6 +191,7 @@ def test_slopes_are_those_of_the_boards_plane(refined: BoardPose) -> None:
     rotation = cv2.Rodrigues(refined.parameters[:3])[0]
     point_m = rotation @ [0.1, 0.2, 0.0] + refined.parameters[3:6]
     slopes, _ = refined.slopes()
+
     assert slopes @ point_m == pytest.approx(1.0)
 
 
@@ -198,11 +203,13 @@ def test_slopes_have_the_poses_covariance_by_their_derivatives(refined: BoardPos
         moved = replace(refined, parameters=refined.parameters + step * np.eye(9)[k])
         by_pose[:, k] = (moved.slopes()[0] - slopes) / step
     expected = by_pose @ refined.covariance[:6, :6] @ by_pose.T
+
     np.testing.assert_allclose(covariance, expected, rtol=1e-4, atol=1e-8)
 
 
 def test_fit_board_of_exact_corners_is_exact() -> None:
     fit = fit_board(corners(sigma_px=0.0), A4, PINHOLE)
+
     np.testing.assert_allclose(fit.slopes, -NORMAL / DISTANCE_M, rtol=1e-6)
     assert fit.corners == 40
     assert fit.residual_px < 1e-6
@@ -213,6 +220,7 @@ def test_fit_board_covariance_grows_with_the_residuals() -> None:
     flat = PrintErrors(1e-9, 1e-9, 1e-9)
     quiet = fit_board(corners(sigma_px=0.05), A4, PINHOLE, flat)
     loud = fit_board(corners(sigma_px=0.2), A4, PINHOLE, flat)
+
     assert loud.residual_px == pytest.approx(0.2, rel=0.3)
     np.testing.assert_allclose(loud.covariance, 16.0 * quiet.covariance, rtol=0.3, atol=1e-7)
 
@@ -220,8 +228,11 @@ def test_fit_board_covariance_grows_with_the_residuals() -> None:
 def test_fit_board_leaves_out_corners_far_off() -> None:
     found = corners()
     found.pixels[[3, 17, 30]] += [[4.0, 1.0], [-2.0, 2.0], [20.0, -30.0]]
+
     assert fit_board(found, A4, PINHOLE).corners == 37
+
     wall = measures(found)
+
     assert wall.distance_m == pytest.approx(DISTANCE_M, abs=4 * wall.distance_std_m)
     assert wall.yaw_deg == pytest.approx(45.0, abs=4 * wall.yaw_std_deg)
 
@@ -230,9 +241,12 @@ def test_fit_board_leaves_out_corners_far_off() -> None:
 def test_fit_board_of_a_scaled_print_shifts_only_the_distance(scale: float) -> None:
     found = corners(scale * A4.corners_m)
     wall = measures(found)
+
     assert wall.distance_m == pytest.approx(DISTANCE_M / scale, rel=0.01)
     assert wall.yaw_deg == pytest.approx(45.0, abs=0.2)
+
     measured = measures(found, A4.measured(30.0 * scale))
+
     assert measured.distance_m == pytest.approx(DISTANCE_M, rel=0.003)
 
 
@@ -240,6 +254,7 @@ def test_fit_board_scale_uncertainty_is_one_of_the_distance() -> None:
     exact = measures(corners(), printed=PrintErrors(scale_std=0.0))
     ruled = measures(corners(), printed=PrintErrors(scale_std=0.01))
     expected_m = np.hypot(exact.distance_std_m, 0.01 * exact.distance_m)
+
     assert ruled.distance_std_m == pytest.approx(expected_m)
     assert ruled.yaw_std_deg == pytest.approx(exact.yaw_std_deg)
 

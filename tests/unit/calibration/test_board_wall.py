@@ -48,6 +48,7 @@ def agreed(depth: WallFit) -> tuple[WallFit, BoardRecord]:
 
 def test_depth_and_board_that_agree_are_combined(agreed: tuple[WallFit, BoardRecord]) -> None:
     fit, record = agreed
+
     assert fit.verdict == "good"
     assert record.used == "both"
     assert record.causes == ()
@@ -58,6 +59,7 @@ def test_combined_wall_is_true_and_at_least_as_certain(
     agreed: tuple[WallFit, BoardRecord], depth: WallFit
 ) -> None:
     fit, _ = agreed
+
     assert fit.distance_m == pytest.approx(TRUE_M, abs=0.02)
     assert fit.facing_deg == pytest.approx(45.0, abs=0.02)
     assert fit.distance_std_m <= depth.distance_std_m
@@ -68,6 +70,7 @@ def test_record_holds_the_boards_distance_less_the_depths(
     agreed: tuple[WallFit, BoardRecord], depth: WallFit
 ) -> None:
     _, record = agreed
+
     assert record.disagreement_m == pytest.approx(record.distance_m - depth.distance_m)
     assert record.disagreement_sigmas < board_wall.AGREE_SIGMAS
 
@@ -75,6 +78,7 @@ def test_record_holds_the_boards_distance_less_the_depths(
 def test_agreeing_board_keeps_a_doubtful_verdict_of_the_depth(depth: WallFit) -> None:
     doubtful = replace(depth, verdict="doubtful", advice="half of the view differs")
     fit, _ = wall_with_board(doubtful, infrared(), PINHOLE, A4, measured=False)
+
     assert fit.verdict == "doubtful"
     assert fit.advice == "half of the view differs"
 
@@ -87,6 +91,7 @@ def test_board_printed_at_97_percent_makes_the_wall_doubtful(
     depth: WallFit, measured: bool, used: str, distance_m: float
 ) -> None:
     fit, record = wall_with_board(depth, infrared(0.97), PINHOLE, A4, measured=measured)
+
     assert fit.verdict == "doubtful"
     assert fit.distance_m == pytest.approx(distance_m, abs=5e-4)
     assert record.used == used
@@ -97,6 +102,7 @@ def test_board_printed_at_97_percent_makes_the_wall_doubtful(
 
 def test_board_alone_gives_a_doubtful_wall_near_the_truth() -> None:
     fit, record = wall_with_board(REFUSAL, infrared(), PINHOLE, A4, measured=False)
+
     assert isinstance(fit, board_wall.WallByBoard)
     assert fit.verdict == "doubtful"
     assert fit.distance_m == pytest.approx(TRUE_M, abs=3.0 * fit.distance_std_m)
@@ -106,6 +112,7 @@ def test_board_alone_gives_a_doubtful_wall_near_the_truth() -> None:
 
 def test_board_alone_names_why_the_depth_was_refused() -> None:
     fit, record = wall_with_board(REFUSAL, infrared(), PINHOLE, A4, measured=False)
+
     assert str(REFUSAL) in fit.advice
     assert record.used == "board"
     assert record.depth_refused == str(REFUSAL)
@@ -117,6 +124,7 @@ def test_board_alone_names_why_the_depth_was_refused() -> None:
 def test_board_alone_advises_to_move_a_lidar_too_far_away() -> None:
     twice = A4.measured(2.0 * A4.square_mm)
     fit, _ = wall_with_board(REFUSAL, infrared(), PINHOLE, twice, measured=True)
+
     assert fit.distance_m == pytest.approx(2.0 * TRUE_M, abs=0.005)
     assert "10 cm" in fit.advice
 
@@ -147,6 +155,7 @@ def drawn(true: UncertainPlane, generator: np.random.Generator) -> UncertainPlan
 
 def test_combine_of_equal_planes_halves_the_covariance() -> None:
     both = combine(plane(0.2), plane(0.2), measured=False)
+
     assert both.used == "both"
     assert both.causes == ()
     np.testing.assert_allclose(both.plane.slopes, plane(0.2).slopes)
@@ -157,6 +166,7 @@ def test_combine_of_equal_planes_halves_the_covariance() -> None:
 def test_combine_keeps_an_exact_plane() -> None:
     exact = UncertainPlane(plane(0.2).slopes, np.zeros((3, 3)))
     both = combine(exact, plane(0.2001), measured=False)
+
     np.testing.assert_allclose(both.plane.slopes, exact.slopes)
     np.testing.assert_allclose(both.plane.covariance, 0.0, atol=1e-15)
 
@@ -165,8 +175,10 @@ def test_combine_takes_each_quantity_from_the_better_plane() -> None:
     depth = plane(0.2, 45.0, std_m=1e-5, std_deg=1.0)
     board = plane(0.2005, 45.5, std_m=1e-3, std_deg=0.01)
     both = combine(depth, board, measured=False)
+
     assert both.plane.distance_m == pytest.approx(0.2, abs=2e-5)
     assert both.plane.normal @ board.normal == pytest.approx(1.0, abs=1e-7)
+
     for one in (depth, board):
         gain = one.covariance - both.plane.covariance
         assert (np.linalg.eigvalsh(gain) > -1e-9).all()
@@ -174,6 +186,7 @@ def test_combine_takes_each_quantity_from_the_better_plane() -> None:
 
 def test_disagreement_in_distance_is_in_joint_uncertainties() -> None:
     apart = board_wall.disagreement(plane(0.2), plane(0.2003))
+
     assert apart.distance_m == pytest.approx(0.0003)
     assert apart.angle_deg == pytest.approx(0.0, abs=1e-6)
     assert apart.distance_sigmas == pytest.approx(0.3 / np.hypot(0.1, 0.1), rel=0.01)
@@ -184,6 +197,7 @@ def test_disagreement_in_angle_is_in_joint_uncertainties() -> None:
     turned = board_wall.disagreement(plane(0.2, 45.0), plane(0.2, 45.1))
     # on a wall pitched by 0.1, a turn in yaw moves the normal by its cosine
     expected_deg = 0.1 * np.cos(0.1)
+
     assert turned.angle_deg == pytest.approx(expected_deg, rel=1e-3)
     assert turned.angle_sigmas == pytest.approx(expected_deg / np.hypot(0.02, 0.02), rel=0.01)
     assert turned.distance_sigmas < 0.1
@@ -203,6 +217,7 @@ def drawings() -> list[Combined]:
 
 def test_planes_disagree_by_chance_as_rarely_as_stated(drawings: list[Combined]) -> None:
     sigmas = np.array([both.disagreement.sigmas for both in drawings])
+
     assert np.mean(sigmas**2) == pytest.approx(3.0, rel=0.1)
     assert np.mean(sigmas > board_wall.AGREE_SIGMAS) < 0.004
 
@@ -213,6 +228,7 @@ def test_combined_plane_holds_the_truth_as_often_as_stated(drawings: list[Combin
         off = both.plane.slopes - plane(0.2).slopes
         chi2 = off @ np.linalg.solve(both.plane.covariance, off)
         inside.append(chi2 < CHI2_95_OF_3)
+
     assert np.mean(inside) == pytest.approx(0.95, abs=0.02)
 
 
@@ -224,6 +240,7 @@ def test_cause_of_a_distance_is_scale_or_offset_with_amounts() -> None:
     causes = causes_of(plane(PRINTED_AT_97_PERCENT_M, std_m=5e-4))
     # along the axis the same wall is farther than along its normal
     offset_m = (PRINTED_AT_97_PERCENT_M - TRUE_M) / (np.cos(np.radians(45.0)) * np.cos(0.1))
+
     assert "97.0 %" in causes
     assert f"{1e3 * offset_m:+.1f} mm" in causes
     assert "angle" not in causes
@@ -236,12 +253,14 @@ def test_cause_of_a_turn_is_the_angle_alone() -> None:
 
 def test_measured_board_has_no_scale_error_among_the_causes() -> None:
     causes = causes_of(plane(0.204), measured=True)
+
     assert "offset" in causes
     assert "scale" not in causes
 
 
 def test_implausible_amounts_are_no_causes() -> None:
     causes = causes_of(plane(0.4))
+
     assert causes
     assert "scale" not in causes
     assert "offset" not in causes

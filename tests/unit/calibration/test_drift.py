@@ -65,12 +65,17 @@ def test_settings_changed_names_settings_only(
 def test_drift_check_warns_of_a_changed_setting(wall: BareWall, check: DriftCheck) -> None:
     settings = dict(SETTINGS)
     check.observe(wall.depth_m, settings)
+
     assert check.warnings == ()
+
     settings["laser_power"] = 40.0  # in place
     check.observe(wall.depth_m, settings)
     (line,) = check.warnings
+
     assert re.search("laser_power.*60.*40", line)
+
     check.observe(wall.depth_m, SETTINGS)
+
     assert check.warnings == ()
 
 
@@ -95,12 +100,14 @@ def test_temperature_within_its_limits_raises_no_warning(
 def test_temperature_beyond_the_tolerance_is_named(check: DriftCheck) -> None:
     check.update_temperatures({"ldd_temperature": 41.0 + TOLERANCE_C})
     (line,) = check.warnings
+
     assert re.search("ldd_temperature.*46.*40", line)
 
 
 def test_one_warning_stands_for_several_temperatures(check: DriftCheck) -> None:
     check.update_temperatures({"ldd_temperature": 30.0, "apd_temperature": 39.0})
     (line,) = check.warnings
+
     assert "warm" in line
     assert "1 more" in line
 
@@ -110,6 +117,7 @@ def test_drift_check_temperature_warning_does_not_flicker(check: DriftCheck) -> 
         check.update_temperatures({"ldd_temperature": 40.0 + TOLERANCE_C + over_c})
         assert len(check.warnings) == 1
     check.update_temperatures({"ldd_temperature": 40.0})
+
     assert check.warnings == ()
 
 
@@ -126,6 +134,7 @@ def test_drift_check_warns_of_too_few_good_pixels(wall: BareWall, left: int) -> 
     for _ in range(40):
         check.observe(wall.depth_m, {})
     (line,) = check.warnings
+
     assert str(MIN_PIXELS) in line
     assert (check.drift, check.wall_share) == (None, 0.0)
 
@@ -146,10 +155,14 @@ def observations(count: int, seed: int = 0) -> np.ndarray:
 
 def test_drift_window_needs_enough_frames() -> None:
     assert filled(observations(MIN_FRAMES - 1)).drift() is None
+
     window = filled(observations(MIN_FRAMES))
+
     assert window.drift() is not None
+
     for _ in range(WINDOW_FRAMES - MIN_FRAMES + 1):
         window.add(None, 0.0)
+
     assert window.drift() is None
 
 
@@ -176,6 +189,7 @@ def test_drift_text_holds_amounts_and_uncertainties() -> None:
     moved = str(
         replace(STILL, distance_m=0.0018, distance_std_m=0.0002, yaw_deg=-0.3, pitch_deg=0.4)
     )
+
     assert "1.8 ± 0.4 mm" in moved
     assert "0.500 ± 0.020°" in moved
     assert "1.30 ± 0.02 mm" in str(replace(STILL, range_m=-0.0013, uniform=True))
@@ -197,7 +211,9 @@ def cells(pixels: np.ndarray) -> np.ndarray:
 def test_watched_pixels_are_a_good_one_of_each_cell(tilted: BareWall) -> None:
     before = watched_pixels(tilted)
     worse = replace(tilted)
+
     np.testing.assert_array_equal(cells(before), np.unique(cells(np.flatnonzero(tilted.inliers))))
+
     for number, (field, value) in enumerate(
         {"depth_m": np.nan, "depth_std_m": 0.01, "saturated": 0.1, "inliers": False}.items()
     ):
@@ -205,6 +221,7 @@ def test_watched_pixels_are_a_good_one_of_each_cell(tilted: BareWall) -> None:
         array.flat[before[number::4]] = value
         worse = replace(worse, **{field: array})
     after = watched_pixels(worse)
+
     assert not set(before) & set(after)
     np.testing.assert_array_equal(cells(before), cells(after))
 
@@ -213,7 +230,9 @@ def test_noise_scale_is_that_of_the_reference(tilted: BareWall) -> None:
     assert noise_scale(replace(tilted, depth_std_m=2.0 * tilted.depth_std_m)) == pytest.approx(
         2.0, rel=0.05
     )
+
     single = replace(tilted, depth_std_m=np.full_like(tilted.depth_std_m, np.nan), frames=1)
+
     np.testing.assert_array_equal(watched_pixels(single), watched_pixels(tilted))
     assert noise_scale(single) == 1.0
 
@@ -232,6 +251,7 @@ def test_wall_track_finds_an_exact_pose_exactly(tilted: BareWall, shift: WallPos
     for _ in range(60):
         observation = track.follow(frame)
     now = measures_of(-pose[2, :3] / pose[2, 3], np.zeros((3, 3)))
+
     assert observation.distance_m == pytest.approx(now.distance_m - TILTED[0], abs=2e-6)
     assert observation.yaw_deg == pytest.approx(now.yaw_deg - TILTED[1], abs=1e-3)
     assert observation.pitch_deg == pytest.approx(now.pitch_deg - TILTED[2], abs=1e-3)

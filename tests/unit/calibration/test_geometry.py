@@ -21,12 +21,14 @@ def pose(angles_rad: tuple[float, float]) -> Float64:
 
 def test_normal_is_of_unit_length_and_keeps_its_angles(angles_rad: tuple[float, float]) -> None:
     normal = normal_from_angles(*angles_rad)
+
     assert np.linalg.norm(normal) == pytest.approx(1.0)
     assert angles_from_normal(normal) == pytest.approx(angles_rad)
 
 
 def test_wall_pose_is_a_rotation(pose: Float64) -> None:
     rotation = pose[:3, :3]
+
     np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-12)
     assert np.linalg.det(rotation) == pytest.approx(1.0)
 
@@ -38,6 +40,7 @@ def test_wall_pose_puts_the_lidar_above_the_origin(pose: Float64) -> None:
 
 def test_wall_x_is_the_lidars_x_axis_projected(pose: Float64) -> None:
     along_x, along_y, _ = pose[:3, 0]
+
     assert along_x > 0.0
     assert along_y == pytest.approx(0.0, abs=1e-12)
 
@@ -71,6 +74,7 @@ def test_rays_lead_back_to_their_pixels() -> None:
     rays = PINHOLE.rays()
     columns = rays[..., 0] * PINHOLE.fx + PINHOLE.ppx
     rows = rays[..., 1] * PINHOLE.fy + PINHOLE.ppy
+
     np.testing.assert_allclose(columns, np.tile(np.arange(640), (480, 1)), atol=1e-9)
     np.testing.assert_allclose(rows[:, 0], np.arange(480), atol=1e-9)
     assert (rays[..., 2] == 1.0).all()
@@ -81,6 +85,7 @@ def test_matrix_projects_points_on_a_ray_to_its_pixel() -> None:
     points = 0.7 * PINHOLE.rays()[rows, columns].reshape(-1, 3)
     seen = points @ PINHOLE.matrix.T
     pixels = np.column_stack([columns.ravel(), rows.ravel()])
+
     np.testing.assert_allclose(seen[:, :2] / seen[:, 2:], pixels, atol=1e-9)
 
 
@@ -94,5 +99,6 @@ def edges(pinhole: Intrinsics) -> list[float]:
 @pytest.mark.parametrize("size", [(80, 64), (1024, 768), (640, 480)])
 def test_scaled_intrinsics_keep_the_edges_of_the_field(size: tuple[int, int]) -> None:
     scaled = PINHOLE.scaled(*size)
+
     assert edges(scaled) == pytest.approx(edges(PINHOLE))
     assert scaled.scaled(640, 480).ppx == pytest.approx(PINHOLE.ppx)

@@ -20,6 +20,7 @@ def test_mean_noise_falls_with_the_root_of_the_samples() -> None:
     depth_m = np.array([0.2, 1.0])
     one = MeanNoise().of(depth_m)
     many = MeanNoise(np.array([25.0, 100.0])).of(depth_m)
+
     np.testing.assert_allclose(one / many, [5.0, 10.0])
 
 
@@ -38,6 +39,7 @@ def test_mean_noise_of_rounded_samples_matches_their_spread(scale: float) -> Non
         # each sample's own rounding is noise too, which the scale here leaves out
         rounding = QUANTUM_M / np.sqrt(12) / NOISE_FLOOR_M
         expected_m *= np.hypot(scale, rounding) / scale
+
     assert spread_m == pytest.approx(expected_m, rel=0.25)
 
 
@@ -51,12 +53,14 @@ def test_noise_scale_is_found_from_few_samples_and_flicker(samples: int, scale: 
     flickering = slice(2000)
     spread_m[flickering] = 0.3
     noise = measured_noise(depth_m, spread_m, np.full(20_000, samples))
+
     assert noise.measured
     assert noise.scale == pytest.approx(scale, rel=0.07)
 
 
 def test_noise_of_too_few_samples_is_nominal() -> None:
     noise = measured_noise(np.full(9, 0.2), np.full(9, 0.1), np.full(9, 3))
+
     assert noise.scale == 1.0
     assert not noise.measured
     np.testing.assert_array_equal(noise.samples, 3.0)
@@ -65,6 +69,7 @@ def test_noise_of_too_few_samples_is_nominal() -> None:
 def test_noise_without_a_sample_is_finite() -> None:
     nothing = np.full(9, np.nan)
     noise = measured_noise(nothing, nothing, np.zeros(9, np.int64))
+
     assert np.isfinite(noise.of(np.ones(9))).all()
 
 
@@ -79,6 +84,7 @@ def test_depth_mean_counts_only_returns() -> None:
     first = [[1.0, np.nan, np.inf, 0.0]]
     second = [[1.002, 2.0, np.inf, -1.0]]
     mean = mean_of(np.array([first, second], np.float32))
+
     np.testing.assert_allclose(mean.mean_m(), [[1.001, 2.0, np.nan, np.nan]], rtol=1e-6)
     np.testing.assert_array_equal(mean.count(), [[2, 1, 0, 0]])
     assert mean.frames == 2
@@ -87,6 +93,7 @@ def test_depth_mean_counts_only_returns() -> None:
 @pytest.mark.parametrize("frames", [[0.2, np.nan, np.nan], []])
 def test_depth_mean_needs_returns_in_half_of_the_frames(frames: list[float]) -> None:
     mean = mean_of(np.array(frames).reshape(-1, 1, 1))
+
     assert np.isnan(mean.mean_m()).all()
     assert not mean.noise().measured
 
@@ -98,6 +105,7 @@ def test_depth_mean_is_that_of_the_frames_also_if_read_between(count: int) -> No
     for frame in frames:
         mean.add(frame)
         mean.mean_m()
+
     np.testing.assert_allclose(mean.mean_m(), frames.mean(axis=0), rtol=1e-12)
 
 
@@ -105,6 +113,7 @@ def test_depth_mean_is_that_of_the_frames_also_if_read_between(count: int) -> No
 def test_depth_spread_is_that_of_the_frames(count: int) -> None:
     frames = np.random.default_rng(0).normal(0.2, 0.0009, (count, 3, 4))
     spread_m = mean_of(frames).spread_m()
+
     np.testing.assert_allclose(spread_m, frames.std(axis=0, ddof=1), rtol=1e-9)
 
 
@@ -119,6 +128,7 @@ def test_depth_mean_leaves_out_flicker() -> None:
     flickering = mean_of(np.where(stray, 1.0, frames))
     # where most of the first frames strayed, their median does
     settled = np.abs(flickering.mean_m() - steady_m) < 0.0005
+
     assert settled.mean() > 0.98
     assert flickering.count()[settled].mean() == pytest.approx(54.0, abs=0.5)
 
@@ -127,6 +137,7 @@ def test_depth_mean_measures_the_noise_by_the_spread() -> None:
     depth_m = np.broadcast_to(np.linspace(0.15, 2.0, 100), (30, 40, 100))
     errors = np.random.default_rng(0).standard_normal(depth_m.shape)
     noise = mean_of(depth_m + 1.7 * depth_noise_m(depth_m) * errors).noise()
+
     assert noise.measured
     assert noise.scale == pytest.approx(1.7, rel=0.02)
     np.testing.assert_array_equal(noise.samples, 30.0)

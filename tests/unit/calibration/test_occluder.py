@@ -67,11 +67,13 @@ def test_sheet_propagates_uncertainty_by_its_derivatives(
     step = 1e-6
     moved = [quantity(sheet_with(normal + shift)) for shift in step * np.eye(3)]
     gradient = (np.array(moved) - quantity(sheet)) / step
+
     assert std(sheet) == pytest.approx(np.linalg.norm(gradient), rel=1e-4)
 
 
 def test_find_occluder_finds_the_papers_to_half_a_pixel() -> None:
     fit = found(Sheet())
+
     assert abs(fit.x_m - 0.2) < 1e-4
     assert abs(fit.gap_m - 0.1) <= 0.6 * PIXEL_M
     assert abs(fit.tilt_deg) < 0.1
@@ -83,6 +85,7 @@ def test_find_occluder_finds_the_papers_to_half_a_pixel() -> None:
 
 def test_find_occluder_measures_lean_twist_and_edge() -> None:
     fit = found(Sheet(lean_deg=3.0, twist_deg=-2.0, edge_deg=2.0))
+
     assert fit.tilt_deg == pytest.approx(3.0, abs=0.1)
     assert fit.twist_deg == pytest.approx(-2.0, abs=0.1)
     assert fit.edge_deg == pytest.approx(2.0, abs=0.3)
@@ -95,6 +98,7 @@ def test_find_occluder_uncertainty_holds_that_of_the_wall() -> None:
     turn = np.radians(0.5)
     x_std_m = np.hypot(plain.x_std_m, 0.1 * turn)
     gap_std_m = np.sqrt(plain.gap_std_m**2 + 0.003**2 + (0.2 * turn) ** 2)
+
     assert less_sure.x_std_m == pytest.approx(x_std_m, rel=0.02)
     assert less_sure.gap_std_m == pytest.approx(gap_std_m, rel=0.02)
 
@@ -107,6 +111,7 @@ def test_find_occluder_gap_is_not_biased_by_flying_pixels(seen: View) -> None:
         fit = fitted(seen, noisy(mixed))
         errors_m.append(fit.gap_m - gap_m)
         assert abs(errors_m[-1]) <= 1.96 * fit.gap_std_m
+
     assert abs(np.mean(errors_m)) < 0.35 * PIXEL_M
 
 
@@ -121,6 +126,7 @@ def test_find_occluder_suspects_an_object_in_some_beams(seen: View) -> None:
     some = generator.choice(wall_pixels(seen), depth_m.size // 5, replace=False)
     depth_m.flat[some] += 0.15
     fit = fitted(seen, noisy(depth_m))
+
     assert abs(fit.gap_m - 0.1) < 2 * PIXEL_M
     assert "20%" in fit.why_unusable
 
@@ -135,6 +141,7 @@ def test_find_occluder_refuses_an_object_in_all_beams(seen: View) -> None:
 def test_find_occluder_warns_of_a_finger_beside_the_sheet(seen: View) -> None:
     finger = ball(seen, (0.12, 0.02, 0.06), 0.015)
     fit = fitted(seen, noisy(np.minimum(bench_depth(seen, Sheet()), finger)))
+
     assert abs(fit.x_m - 0.2) < 1e-3
     assert len(fit.warnings) == 1
 
@@ -195,6 +202,7 @@ def test_find_edge_ignores_beams_over_the_sheets_upper_end() -> None:
     sheet = on_sheet()
     over = POINTS_M[..., 2] > 0.1
     edge = find_edge(POINTS_M, sheet & ~over, ~sheet | over)
+
     assert edge
     assert abs(edge.gap_m - EDGE_M) <= PITCH_M / 2
 
@@ -203,6 +211,7 @@ def test_find_edge_allows_for_stray_pixels() -> None:
     sheet = on_sheet()
     stray = np.random.default_rng(3).random(sheet.shape) < 0.1
     edge = find_edge(POINTS_M, sheet ^ stray, ~sheet ^ stray)
+
     assert edge
     assert abs(edge.gap_m - EDGE_M) < PITCH_M
     assert edge.gap_std_m < 2 * PITCH_M
@@ -211,6 +220,7 @@ def test_find_edge_allows_for_stray_pixels() -> None:
 def test_find_edge_of_a_ragged_sheet_is_as_uncertain_as_its_rows() -> None:
     sheet = on_sheet(0.06 + np.random.default_rng(0).normal(0.0, 0.004, ROWS))
     edge = find_edge(POINTS_M, sheet, ~sheet)
+
     assert edge
     assert edge.gap_std_m == pytest.approx(0.004, rel=0.3)
 
@@ -221,6 +231,7 @@ def test_find_edge_is_uniform_over_pixels_that_mix() -> None:
     surely_sheet = np.roll(sheet, 1, axis=1) & sheet
     surely_passed = np.roll(~sheet, -1, axis=1) & ~sheet
     edge = find_edge(POINTS_M, surely_sheet, surely_passed)
+
     assert edge
     assert edge.gap_std_m == pytest.approx(3 * PITCH_M / np.sqrt(12))
 

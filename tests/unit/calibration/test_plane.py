@@ -43,6 +43,7 @@ def test_residual_is_the_rms_distance_of_inliers(generator: Generator) -> None:
     points[::10] += [0.0, 0.0, 0.1]
     fit = fit_plane(points, generator)
     off_m = points[fit.inliers] @ fit.normal + fit.distance_m
+
     assert fit.residual_m == pytest.approx(np.sqrt(np.mean(off_m**2)))
 
 
@@ -50,6 +51,7 @@ def test_points_off_the_plane_are_no_inliers(generator: Generator) -> None:
     points = wall_points(generator)
     points[::10] += [0.0, 0.0, 0.1]
     fit = fit_plane(points, generator)
+
     assert not fit.inliers[::10].any()
     assert fit.inlier_fraction == pytest.approx(fit.inliers.mean())
 
@@ -58,6 +60,7 @@ def test_noise_scale_is_that_of_the_residuals(generator: Generator) -> None:
     """The points are as noisy as single samples, and given as means of four."""
     points = wall_points(generator, 1000)
     fit = fit_plane(points, generator, np.full(1000, 4.0))
+
     assert fit.noise_scale == pytest.approx(2.0, rel=0.1)
 
 
@@ -66,6 +69,7 @@ def test_points_of_more_samples_weigh_more(generator: Generator) -> None:
     alike = fit_plane(points, generator, np.full(1000, 4.0))
     right = np.where(points[:, 0] > 0.0, 400.0, 4.0)
     weighted = fit_plane(points, generator, right)
+
     assert not np.allclose(weighted.slopes, alike.slopes, rtol=1e-6)
 
 
@@ -76,6 +80,7 @@ def test_gate_follows_the_noise_of_the_mean(generator: Generator) -> None:
     length_m = np.linalg.norm(points[away], axis=1)[:, np.newaxis]
     points[away] *= 1.0 + 0.003 / length_m
     fit = fit_plane(points, generator, np.full(4000, 100.0))
+
     assert fit.inlier_fraction == pytest.approx(0.9, abs=0.03)
     assert fit.distance_m == pytest.approx(DISTANCE_M, abs=2e-5)
     assert angle_deg(fit.normal, NORMAL) < 0.02
@@ -136,4 +141,5 @@ def test_narrow_strip_is_accepted_only_if_allowed(generator: Generator) -> None:
     with pytest.raises(WallRefusedError, match="line"):
         fit_depth(rays, depth_m, generator)
     fit = fit_depth(rays, depth_m, generator, min_extent=0.02)
+
     assert angle_deg(fit.normal, NORMAL) < 1e-3

@@ -49,6 +49,7 @@ def written(folder: Path, record: WallRecord) -> Path:
 
 def test_paper_rig_is_that_of_the_paper() -> None:
     rig = load_rig("paper-rig")
+
     assert rig.wall_from_lidar[2, 3] == 0.2
     assert rig.facing_deg == pytest.approx(45.0)
     assert rig.occluder == Occluder(x_m=0.2, z_min_m=0.1)
@@ -58,15 +59,19 @@ def test_paper_rig_has_the_field_of_view_of_an_l515() -> None:
     one_pixel = load_rig("paper-rig").pinhole.scaled(1, 1)
     width_deg = 2 * np.degrees(np.arctan(0.5 / one_pixel.fx))
     height_deg = 2 * np.degrees(np.arctan(0.5 / one_pixel.fy))
+
     assert width_deg == pytest.approx(70.0, abs=1e-3)
     assert height_deg == pytest.approx(55.0, abs=1e-3)
 
 
 def test_bare_wall_is_the_papers_without_its_bench() -> None:
     bare = load_rig("bare-wall")
+
     assert bare.occluder is None
     assert bare.object_box is None
+
     pose = load_rig("paper-rig").wall_from_lidar
+
     np.testing.assert_array_equal(bare.wall_from_lidar, pose)
 
 
@@ -75,7 +80,9 @@ def test_rig_and_its_checksum_survive_a_file(tmp_path: Path, name: str) -> None:
     rig = load_rig(name)
     (tmp_path / "rig.toml").write_text(dump_toml(rig), encoding="utf-8")
     again = load_rig(tmp_path / "rig.toml")
-    assert (again, again.checksum) == (rig, rig.checksum)
+
+    assert again == rig
+    assert again.checksum == rig.checksum
 
 
 DEVICE = {
@@ -101,15 +108,20 @@ def test_wall_record_with_an_edited_rig_survives_a_file(tmp_path: Path, record: 
     box = ObjectBox(x_min_m=0.3, x_max_m=0.5, y_min_m=-0.1, y_max_m=0.1, z_near_m=0.15, z_far_m=0.3)
     bench = {"occluder": Occluder(x_m=0.25, z_min_m=0.08), "object_box": box}
     edited = record.model_copy(update={"rig": record.rig.model_copy(update=bench)})
+
     assert load_wall(written(tmp_path, edited)) == edited
 
 
 def test_wall_record_rig_is_the_papers_as_measured(record: WallRecord) -> None:
     paper = load_rig("paper-rig")
+
     assert record.rig.pinhole == paper.pinhole.scaled(64, 48)
     np.testing.assert_allclose(record.rig.wall_from_lidar, record.wall_from_lidar, atol=1e-9)
-    assert (record.rig.occluder, record.rig.object_box) == (paper.occluder, paper.object_box)
+    assert record.rig.occluder == paper.occluder
+    assert record.rig.object_box == paper.object_box
+
     moved = paper.model_copy(update={"lidar": paper.lidar.model_copy(update={"distance_m": 0.201})})
+
     assert len({record.rig.checksum, paper.checksum, moved.checksum}) == 3
 
 
@@ -137,6 +149,7 @@ def doubtful(record: WallRecord) -> WallRecord:
 
 def test_sheet_too_near_is_added_to_the_walls_advice(doubtful: WallRecord) -> None:
     near = with_occluder(doubtful, NEAR)
+
     assert near.verdict == "doubtful"
     assert near.advice.startswith("average more frames; ")
     assert "0.030 m" in near.advice
@@ -144,6 +157,7 @@ def test_sheet_too_near_is_added_to_the_walls_advice(doubtful: WallRecord) -> No
 
 def test_occluder_measured_again_replaces_the_first_advice(doubtful: WallRecord) -> None:
     again = with_occluder(with_occluder(doubtful, NEAR), GOOD)
+
     assert again.advice == "average more frames"
     assert again.warnings == ("a stray",)
 
@@ -151,6 +165,7 @@ def test_occluder_measured_again_replaces_the_first_advice(doubtful: WallRecord)
 def test_sign_of_an_object_makes_the_record_unusable(record: WallRecord) -> None:
     hidden = replace(GOOD, why_unusable="an object seems to be hidden")
     unusable = with_occluder(record, hidden)
+
     assert unusable.verdict == "doubtful"
     assert "do not use" in unusable.advice
 
@@ -169,6 +184,7 @@ def test_wall_record_of_another_version_is_refused_in_one_line(
     path.write_text(text.replace(f"schema_version = {VERSION}", f"schema_version = {version}"))
     with pytest.raises(RecordFileError, match=f"version {VERSION} only.*got {version}") as caught:
         load_wall(path)
+
     assert "\n" not in str(caught.value)
 
 
@@ -215,10 +231,13 @@ def test_file_error_names_field_and_value_in_one_line(
 ) -> None:
     text = dump_toml(record if load is load_wall else load_rig("paper-rig"))
     path = tmp_path / "file.toml"
+
     assert old in text
+
     path.write_text(text.replace(old, new, 1), encoding="utf-8")
     with pytest.raises(RecordFileError, match=problem) as caught:
         load(path)
+
     assert "\n" not in str(caught.value)
     assert caught.value.exit_code == 4
 
@@ -241,6 +260,7 @@ def test_file_of_another_kind_or_none_is_refused(tmp_path: Path, content: bytes)
 
 def test_load_wall_reads_the_worked_example() -> None:
     example = load_wall(EXAMPLE)
+
     assert example.verdict == "good"
     assert example.distance_m == pytest.approx(0.2, abs=1e-3)
     assert example.facing_deg == pytest.approx(45.0, abs=0.2)
@@ -270,6 +290,7 @@ def test_moments_are_those_of_all_samples_together(offset: float, scale: float, 
     moments = Moments((3, 2))
     for values in samples:
         moments.add(values)
+
     np.testing.assert_allclose(moments.mean(), samples.mean(axis=0), rtol=1e-9)
     np.testing.assert_allclose(moments.spread(), samples.std(axis=0, ddof=1), rtol=1e-6)
 
@@ -278,6 +299,7 @@ def test_moments_leave_out_nan() -> None:
     moments = Moments((1, 2))
     for values in ([1.0, np.nan], [3.0, np.nan], [np.nan, 5.0]):
         moments.add(np.array([values]))
+
     np.testing.assert_array_equal(moments.mean(), [[2.0, 5.0]])
     np.testing.assert_array_equal(moments.spread(), [[np.sqrt(2.0), np.nan]])
 
@@ -287,7 +309,9 @@ def test_reference_holds_means_and_saturation(wall: BareWall) -> None:
     assert wall.saturated[0, 0] == 1.0
     assert wall.saturated.sum() == 1.0
     assert np.isnan(wall.depth_m[0, 1])
+
     tolerance_m = 3 * 0.001 / np.sqrt(FRAMES * wall.depth_m.size)
+
     assert np.nanmean(wall.depth_m) == pytest.approx(0.2, abs=tolerance_m)
 
 

@@ -72,6 +72,7 @@ def amount(problem: str, unit: str) -> int:
 @pytest.mark.parametrize("yaw_deg", [15.0, 30.0, 45.0, 60.0, 75.0])
 def test_papers_poses_have_no_problems(distance_m: float, yaw_deg: float) -> None:
     bench = rig(distance_m=distance_m, yaw_deg=yaw_deg)
+
     assert problems(bench) == ()
     assert problems(bench, measured=False) == ()
 
@@ -116,6 +117,7 @@ def test_judge_rig_advises_on_a_misplaced_sheet(
     x_m: float, tilt_deg: float | None, fault: str, move: str
 ) -> None:
     (problem,) = problems(rig(x_m), tilt_deg=tilt_deg)
+
     assert fault in problem
     assert move in problem
 
@@ -130,7 +132,9 @@ def test_slight_tilt_is_no_problem(tilt_deg: float) -> None:
 )
 def test_judge_rig_advises_the_least_move_that_hides(bench: Rig) -> None:
     (problem,) = problems(bench)
+
     assert re.search(r"\d+\.\d%", problem)
+
     by_m = amount(problem, "cm") / 100
 
     def leak(closer_m: float) -> float:
@@ -149,12 +153,14 @@ def with_low_box(bench: Rig, x_min_m: float) -> Rig:
 def test_judge_rig_moves_the_sheet_if_no_gap_hides_the_object() -> None:
     bench = rig(0.32, 0.06, distance_m=0.3, yaw_deg=50.0)
     (problem,) = problems(with_low_box(bench, 0.33))
+
     assert "cm towards the lidar" in problem
 
 
 def test_judge_rig_moves_the_object_if_no_sheet_hides_it() -> None:
     bench = rig(0.05, 0.055, distance_m=0.05, yaw_deg=70.0)
     (problem,) = problems(with_low_box(bench, 0.1))
+
     assert "move the object" in problem
 
 
@@ -177,6 +183,7 @@ def test_judge_rig_advises_the_least_turn_to_the_occluder() -> None:
 def test_judge_rig_widens_an_aperture_that_no_turn_opens() -> None:
     narrow = -1.0, 0.15, -1.5, 1.5
     (problem,) = problems(on_wall(rig(0.3, 0.05, yaw_deg=15.0), *narrow))
+
     assert (
         problems(on_wall(rig(0.3, 0.05 + amount(problem, "cm") / 100, yaw_deg=15.0), *narrow)) == ()
     )
@@ -185,9 +192,12 @@ def test_judge_rig_widens_an_aperture_that_no_turn_opens() -> None:
 def test_judge_rig_advises_the_least_turn_onto_the_wall() -> None:
     wall = -0.1, 0.25, -0.2, 0.2
     problem = problems(on_wall(rig(yaw_deg=60.0), *wall))[0]
+
     assert f"{rig_check.MIN_SHARE:.0%}" in problem
+
     yaw_deg = 60.0 - amount(problem, "degrees")
     shares = [seen_by(on_wall(rig(yaw_deg=each), *wall)).share for each in (yaw_deg, yaw_deg + 1.0)]
+
     assert shares[0] >= rig_check.MIN_SHARE > shares[1]
 
 
@@ -241,6 +251,7 @@ def test_lidar_sees_the_share_of_sampled_points(bench: Rig) -> None:
     row = row + pinhole.ppy
     inside = (seen[:, 2] > 0) & (column > -0.5) & (column < 639.5) & (row > -0.5) & (row < 479.5)
     share = (inside & passes(bench, pose[:3, 3], points_m)).mean()
+
     assert lidar_visible_share(bench, BOX) == pytest.approx(share, abs=0.008)
 
 
@@ -261,6 +272,7 @@ def test_wall_sees_as_much_as_its_best_lit_cell(bench: Rig) -> None:
     best = max(
         (passes(bench, foot, points_m) | (foot[0] >= bench.occluder.x_m)).mean() for foot in lit
     )
+
     assert wall_visible_share(bench, BOX, seen) == pytest.approx(best, abs=0.03)
 
 
@@ -278,14 +290,17 @@ def test_footprint_is_the_field_of_view_along_the_beams() -> None:
     wide = 0.2 * np.tan(np.radians(35.0))
     tall = 0.2 * np.tan(np.radians(27.5))
     expected = [[-wide, tall], [wide, tall], [wide, -tall], [-wide, -tall]]
+
     np.testing.assert_allclose(seen.corners_m, expected, atol=1e-6)
     assert seen.cells_m.shape == (64, 80, 2)
     assert seen.share == 1.0
+
     bench = on_wall(rig(yaw_deg=40.0, pitch_deg=10.0), *WALL)
     world = np.concatenate(
         [seen_by(bench).cells_m, np.zeros((64, 80, 1)), np.ones((64, 80, 1))], axis=-1
     )
     lidar = (world @ np.linalg.inv(bench.wall_from_lidar).T)[..., :3]
+
     np.testing.assert_allclose(
         lidar / lidar[..., 2:], bench.pinhole.scaled(80, 64).rays(), atol=1e-9
     )
@@ -294,11 +309,14 @@ def test_footprint_is_the_field_of_view_along_the_beams() -> None:
 def test_footprint_of_beams_that_miss_the_wall_is_nan() -> None:
     seen = seen_by(on_wall(rig(yaw_deg=75.0), *WALL))
     away = np.isnan(seen.cells_m).any(axis=-1)
+
     assert away.any()
     assert not seen.on_wall[away].any()
     assert np.isnan(seen.corners_m[1]).all()
     assert np.isfinite(seen.corners_m[0]).all()
+
     upwards = np.array([0.0, 0.0, 1.0])
+
     assert np.isnan(rig_check.on_plane(wall_from_plane(upwards, 0.2), upwards[np.newaxis])).all()
 
 
@@ -331,5 +349,6 @@ SMALL_BOX = ObjectBox(
 )
 def test_rig_difference_names_field_and_amount(field: str, value: object, amounts: str) -> None:
     (problem,) = rig_difference(changed(**{field: value}), PAPER)
+
     assert amounts in problem
     assert rig_difference(PAPER, changed(occluder=None)) == ("an occluder",)

@@ -48,6 +48,7 @@ def test_wall_depth_lies_on_the_wall_or_is_infinite() -> None:
     wall_from_lidar = view(0.23, 30.0, 10.0, PINHOLE).pose
     points = PINHOLE.rays() * depth_m[..., np.newaxis]
     height_m = points @ wall_from_lidar[2, :3] + wall_from_lidar[2, 3]
+
     np.testing.assert_allclose(height_m, 0.0, atol=1e-12)
     assert np.isinf(view(0.2, 75.0, 0.0, PINHOLE).depth_m[:, -1]).all()
 
@@ -55,6 +56,7 @@ def test_wall_depth_lies_on_the_wall_or_is_infinite() -> None:
 def test_fit_wall_of_exact_depth_is_exact() -> None:
     fit = fit_wall(bare(0.23, 30.0, -10.0), PINHOLE, np.random.default_rng(0))
     pose = view(0.23, 30.0, -10.0, PINHOLE).pose
+
     np.testing.assert_allclose(fit.wall_from_lidar, pose, atol=1e-9)
     assert fit.verdict == "good"
     assert fit.inlier_fraction == 1.0
@@ -64,6 +66,7 @@ def test_fit_wall_of_exact_depth_is_exact() -> None:
 def test_fit_wall_has_the_angles_of_its_pose() -> None:
     fit = fit_wall(bare(0.23, 30.0, -10.0), PINHOLE, np.random.default_rng(0))
     facing_rad = np.arccos(np.cos(np.radians(30.0)) * np.cos(np.radians(10.0)))
+
     assert fit.yaw_deg == pytest.approx(30.0)
     assert fit.pitch_deg == pytest.approx(-10.0)
     assert fit.facing_deg == pytest.approx(np.degrees(facing_rad))
@@ -95,6 +98,7 @@ def test_judge_out_of_range_advises_a_distance(
     distance_m: float, facing_deg: float, amounts: str, way: str
 ) -> None:
     verdict, advice = judge(distance_m, facing_deg, FLAT, 0.0)
+
     assert verdict == "out of range"
     assert re.search(f"{amounts}.*{way}", advice)
 
@@ -107,6 +111,7 @@ def test_judge_advice_when_followed_leads_into_range(distance_m: float, facing_d
     by_deg = int(re.findall(r" (\d+) degree", advice)[-1])
     moved_m = distance_m + (1 if distance_m < 0.15 else -1) * int(by_cm) / 100.0
     turned_deg = facing_deg + (1 if facing_deg < 15.0 else -1) * by_deg
+
     assert judge(moved_m, turned_deg, FLAT, 0.0)[0] == "good"
 
 
@@ -132,7 +137,9 @@ def test_judge_doubts_what_may_be_another_plane(
 ) -> None:
     check_flat(flat, ripple_m)
     verdict, advice = judge(0.11, 45.0, flat, ripple_m)
+
     assert verdict == "doubtful"
+
     for amount in (*amounts, "4 cm"):
         assert amount in advice
 
@@ -160,7 +167,9 @@ def test_check_flat_accepts_a_bend_within_noise() -> None:
 
 def test_warnings_of_ripples_and_noise_keep_the_verdict() -> None:
     assert judge(0.2, 45.0, FLAT, 0.0006)[0] == "good"
+
     ripples, noise = warnings(0.0006, 3.2)
+
     assert "0.6 mm" in ripples
     assert "3.2" in noise
     assert warnings(0.0, 1.0) == ()
@@ -203,6 +212,7 @@ def test_measures_of_a_wall_faced_squarely_reach_back_to_zero(
         abs(one.facing_deg - facing_deg) <= 1.96 * one.facing_std_deg
         for one in drawn(slopes, covariance)
     ]
+
     assert 0.93 <= np.mean(inside) <= 0.99
 
 
@@ -228,6 +238,7 @@ def rippled(extra_m: Float64 | float, **how: Any) -> Ripples:
 @pytest.mark.parametrize("yaw_deg", [20.0, 45.0])
 def test_flatness_of_noise_has_no_bend(yaw_deg: float, noise: float) -> None:
     flat = judged(view(0.2, yaw_deg, 6.0, PINHOLE).depth_m, noise=noise)
+
     assert flat.bend_m < 5.0 * flat.bend_std_m
     assert flat.bend_deg < 5.0 * flat.bend_std_deg < 0.4
 
@@ -238,6 +249,7 @@ def test_flatness_bend_is_the_angle_that_each_side_turns() -> None:
     """
     slope = np.tan(np.radians(2.0)) * (np.maximum(COLUMN - 80, 0) / PINHOLE.fx) * 0.2
     flat = judged(WALL_M + slope)
+
     assert flat.bend_deg == pytest.approx(1.0, abs=0.35)
     assert flat.bend_deg > 10.0 * flat.bend_std_deg
 
@@ -246,6 +258,7 @@ def test_flatness_bend_is_the_angle_that_each_side_turns() -> None:
 def test_flatness_finds_a_range_offset_on_an_oblique_wall(offset_m: float) -> None:
     oblique_m = view(0.2, 50.0, 6.0, PINHOLE).depth_m
     flat = judged(oblique_m - offset_m)
+
     assert flat.offset_m == pytest.approx(offset_m, rel=0.1)
     assert abs(judged(oblique_m).offset_m) < 1e-4
     assert flat.bend_deg > 3.0 * flat.offset_bend_deg
@@ -254,6 +267,7 @@ def test_flatness_finds_a_range_offset_on_an_oblique_wall(offset_m: float) -> No
 @pytest.mark.parametrize("noise", [0.5, 1.0, 4.0])
 def test_ripples_of_noise_are_none(noise: float) -> None:
     found = rippled(0.0, noise=noise)
+
     assert found.rms_m < 5e-5 * noise
     assert found.correlation == 1.0
     np.testing.assert_array_equal(found.covariance, plane_of(WALL_M, noise=noise).covariance)
@@ -271,19 +285,23 @@ def test_ripples_have_their_size_and_widen_the_covariance(amplitude_m: float) ->
     # the wall is nearly faced squarely, so that depth and distance are alike
     assert found.rms_m == pytest.approx(amplitude_m / np.sqrt(2.0), rel=0.15)
     assert found.correlation > 10.0
+
     scaled = found.correlation * plane_of(WALL_M + wave_m).covariance
     grown = np.linalg.eigvalsh(found.covariance - scaled)
+
     assert grown.min() > -1e-9 * np.abs(found.covariance).max()
 
 
 def test_ripples_need_neighbours_that_agree() -> None:
     found = rippled(0.0006 * (-1.0) ** (COLUMN + ROW))
+
     assert found.correlation == 1.0
     assert found.rms_m < 1e-4
 
 
 def test_ripples_of_exact_depth_are_none() -> None:
     exact = ripples(fit_depth(RAYS.reshape(-1, 3), WALL_M.ravel(), np.random.default_rng(0)), RAYS)
+
     assert exact.rms_m < 1e-9
     assert np.isfinite(exact.covariance).all()
 
@@ -311,6 +329,7 @@ def test_tape_offset_is_added_to_depth_that_is_too_short(yaw_deg: float, offset_
     true one.
     """
     taped = fit_with_tape_distance(read_as(bare(0.2, yaw_deg, PITCH_DEG) - offset_m), 0.2)
+
     assert taped.cause == "depth"
     assert taped.offset_m == pytest.approx(offset_m, abs=3e-5)
     np.testing.assert_allclose(
@@ -328,6 +347,7 @@ def test_tape_offset_of_the_origin_moves_the_pose_along_the_axis(
     true = view(0.2, yaw_deg, PITCH_DEG, PINHOLE).pose
     cosine = -true[2, 2]
     taped = fit_with_tape_distance(read_as(bare(0.2, yaw_deg, PITCH_DEG)), 0.2 + offset_m * cosine)
+
     assert taped.cause == "origin"
     assert taped.offset_m == pytest.approx(offset_m, abs=3e-5)
     assert taped.fit.distance_m == pytest.approx(0.2 + offset_m * cosine, abs=1e-9)
@@ -339,6 +359,7 @@ def test_tape_that_agrees_changes_only_the_uncertainty() -> None:
     fit_with = read_as(bare(0.2, 45.0, PITCH_DEG))
     plain = fit_with(0.0, 0.0)
     taped = fit_with_tape_distance(fit_with, plain.distance_m)
+
     assert taped.offset_m == 0.0
     np.testing.assert_array_equal(taped.fit.wall_from_lidar, plain.wall_from_lidar)
     assert taped.fit.distance_std_m == TAPE_STD_M
@@ -347,6 +368,7 @@ def test_tape_that_agrees_changes_only_the_uncertainty() -> None:
 def test_tape_offset_is_less_certain_on_an_oblique_wall() -> None:
     squarely = fit_with_tape_distance(read_as(bare(0.2, 20.0, PITCH_DEG)), 0.201)
     obliquely = fit_with_tape_distance(read_as(bare(0.2, 65.0, PITCH_DEG)), 0.201)
+
     assert squarely.offset_std_m == pytest.approx(TAPE_STD_M / np.cos(np.radians(20.0)), rel=0.02)
     assert obliquely.offset_std_m > 1.5 * squarely.offset_std_m
 

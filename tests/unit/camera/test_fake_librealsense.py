@@ -33,6 +33,7 @@ def test_every_name_that_a_camera_uses_is_one_of_the_sdk() -> None:
     real = load_sdk()
     with L515Camera("l515", "", sdk=sdk, clock=NapClock()) as camera:
         next(iter(camera))
+
     assert {"laser_power", "visual_preset", "min_distance"} <= sdk.option.asked
     assert all(hasattr(real.option, name) for name in sdk.option.asked)
     assert all(hasattr(real.camera_info, name) for name in sdk.camera_info.asked)
@@ -53,6 +54,7 @@ def test_options_of_fake_and_sdk_look_and_fail_alike(noise_world: Any) -> None:
             with pytest.raises(RuntimeError):
                 ask(sdk.option.laser_power)
     limits = fake.get_option_range(FakeSdk().option.depth_units)
+
     assert vars(limits).keys() <= set(dir(sensor.get_option_range(load_sdk().option.depth_units)))
 
 
@@ -63,30 +65,42 @@ def test_handle_fails_once_its_lidar_was_unplugged() -> None:
     [sensor] = device.query_sensors()
     sensor.set_option(option.laser_power, 12.0)
     lidar.unplug()
+
     assert lidar.options["laser_power"] == 93.0
+
     lidar.plug_in()
     calls = (lambda: sensor.get_option(option.depth_units), lambda: sensor.open([]))
     for call in (*calls, device.query_sensors, device.hardware_reset):
         with pytest.raises(RuntimeError):
             call()
     [sensor] = FakeContext([lidar]).query_devices()[0].query_sensors()
+
     assert sensor.get_option(option.depth_units) > 0
 
 
 def test_color_camera_is_described_as_the_sdk_does() -> None:
     sdk = load_sdk()
     lidar = FakeLidar(runs=(3,))
+
     assert len(FakeDevice(lidar, 0).query_sensors()) == 1
+
     lidar.colour = lambda number: 50 * number
     depth, color = FakeDevice(lidar, 0).query_sensors()
     profile = color.get_stream_profiles()[1]
+
     assert hasattr(sdk.stream, profile.stream_type().name)
     assert hasattr(sdk.format, profile.format().name)
+
     made = profile.get_intrinsics()
+
     assert vars(made).keys() <= set(dir(sdk.intrinsics()))
     assert made.model.name in sdk.distortion.__members__
+
     extrinsics = profile.get_extrinsics_to(depth.get_stream_profiles()[0])
+
     assert vars(extrinsics).keys() <= set(dir(sdk.extrinsics()))
+
     turn = np.reshape(extrinsics.rotation, (3, 3)).T
+
     np.testing.assert_allclose(turn @ turn.T, np.eye(3), atol=1e-12)
     assert np.linalg.det(turn) == pytest.approx(1.0)

@@ -44,6 +44,7 @@ def test_usb_link_decides_the_resolution(
         assert [(profile.stream, profile.size) for profile in device.opened] == [
             (one, size) for one in FORMATS
         ]
+
     assert ("USB 2.1" in caplog.text) == (usb == "2.1")
     assert usb == "2.1" or not caplog.records  # settings that take are not logged
 
@@ -84,7 +85,9 @@ def test_unreadable_device_is_reported_and_hides_no_other() -> None:
     broken, other = sdk.context().query_devices()
     broken.supports = fail
     [(_, info)] = connected(sdk, SimpleNamespace(query_devices=lambda: [broken, other]))
+
     assert info.serial == "f2"
+
     with pytest.raises(CameraError, match="no such luck"):
         connected(sdk, SimpleNamespace(query_devices=lambda: [broken]))
 
@@ -95,8 +98,10 @@ def test_setting_that_takes_late_is_set_once_more(fake_camera: Make) -> None:
     lidar.stubborn = {"min_distance"}
     with fake_camera(lidar, clock=clock) as camera:
         assert camera.differences == {}
+
     assert clock.naps == [0.5, 0.5]
-    assert (lidar.did.count("min_distance"), lidar.did.count("noise_filtering")) == (2, 1)
+    assert lidar.did.count("min_distance") == 2
+    assert lidar.did.count("noise_filtering") == 1
 
 
 @pytest.mark.parametrize(
@@ -111,6 +116,7 @@ def test_setting_that_the_start_resets_is_set_again(
         lidar, clock=NapClock(lambda naps: lidar.options.update(reset if naps == nap else {}))
     ) as camera:
         assert camera.differences == {}
+
     assert lidar.options[name] == wanted
 
 
@@ -132,11 +138,14 @@ def test_laser_is_turned_down_until_little_saturates(
     lidar.saturated_share = lambda power: 0.02 if power > threshold else 0.0005
     with fake_camera(lidar) as camera:
         frame = next(iter(camera))
+
     assert frame.settings["laser_power"] == found
+
     if found > 1.0:
         assert (
             np.count_nonzero(frame.ir == 255) <= 0.001 * frame.ir.size
         )  # none from before it was found
+
     assert (
         ("laser power 1:" in caplog.text) == ("2.0 %" in caplog.text) == (found == 1.0)
     )  # with advice
@@ -153,6 +162,7 @@ def test_laser_power_is_kept_when_a_device_comes_back(fake_camera: Make) -> None
         while not camera.counts["replugged"]:
             found = next(frames)
         assert found.settings["laser_power"] == 53.0
+
     assert lidar.did[lidar.did.index("unplugged") :].count("laser_power") == 1
 
 
@@ -165,6 +175,7 @@ def test_two_cameras_share_a_context_and_keep_their_devices() -> None:
         for camera, serial in ((first, "f1"), (second, "f2")):
             assert camera.identity["serial"] == serial
             assert len(list(islice(camera, 5))) == 5
+
     assert sdk.contexts == 1
 
 
@@ -175,8 +186,10 @@ def test_identity_and_telemetry_omit_unreported_values(
     del lidar.info["usb_type_descriptor"]
     camera = fake_camera(lidar)
     named = {"name": "Intel RealSense L515", "serial": "f0246262", "firmware": "01.05.08.01"}
+
     assert camera.identity == named
     assert camera.telemetry() == {}
+
     with camera:
         assert camera.telemetry()["ldd_temperature"] == 41.5
         assert "apd_temperature" not in camera.telemetry()
@@ -185,6 +198,7 @@ def test_identity_and_telemetry_omit_unreported_values(
         assert set(camera.telemetry("_temperature")) == {"ldd_temperature", "apd_temperature"}
         lidar.unplug()
         assert camera.telemetry() == {}
+
     assert camera.telemetry() == {}
 
 
@@ -197,6 +211,7 @@ def test_option_is_set_to_the_nearest_value_in_range(wanted: float, value: float
     options = Options(FakeSensor(lidar, 0), FakeSdk())
     lidar.ranges["min_distance"] = (190.0, 6000.0, 10.0)
     difference = options.put("min_distance", wanted)
+
     assert bool(difference) == (wanted != value)
     assert not difference or (f"{wanted:g}" in difference and f"{value:g}" in difference)
     assert lidar.options["min_distance"] == options.get("min_distance") == value
@@ -206,7 +221,9 @@ def test_options_are_changed_while_the_camera_runs(fake_camera: Make) -> None:
     lidar = FakeLidar(laser_power=40.0)
     lidar.ranges["laser_power"] = (0.0, 100.0, 1.0)
     camera = fake_camera(lidar)
+
     assert camera.adjustable() == []
+
     with pytest.raises(CameraError, match="not running"):
         camera.set_option("laser_power", 20.0)
     with camera:
@@ -241,6 +258,7 @@ def test_turn_down_falls_above_darkness_as_far_as_needed(
         lambda: 0.5 if tried[-1] > threshold else 0.0,
         lambda power: not tried.append(power),
     )
+
     assert settled.power == tried[-1]
     assert len(tried) <= STRIDES + 2
     assert all(lower < higher for higher, lower in pairwise(tried))
@@ -259,4 +277,7 @@ def test_turn_down_ends_at_good_or_no_image_or_a_stuck_power(
 ) -> None:
     put: list[float] = []
     settled = turn_down(93, PowerLimits(0, 100, 1), lambda: share, put.append)
-    assert (settled.power, settled.saturated, put) == (93, share, tried)
+
+    assert settled.power == 93
+    assert settled.saturated == share
+    assert put == tried

@@ -76,15 +76,22 @@ def test_settings_hold_before_a_recording_by_librealsense(tmp_path: Path) -> Non
     recording = Recording(tmp_path / "wall.bag", frames=20)
     with Delivering(Desk(), recording) as camera:
         settings = list(camera)[-1].settings
+
     assert set(camera.differences) == {"global_time_enabled"}
+
     wanted = NEAR_WALL | {"visual_preset": PRESET["visual_preset"], "laser_power": 60.0}
+
     assert {name: settings[name] for name in wanted} == wanted
+
     found = verify(recording.path)
+
     assert found.frames >= recording.sets == 20
     assert found.dropped == 0
     assert found.streams == dict.fromkeys(("depth", "infrared", "confidence"), found.frames)
+
     with ReplayCamera(recording.path) as replayed:
         frames = list(replayed)
+
     assert {name: frames[0].settings[name] for name in RANGES} == {
         name: settings[name] for name in RANGES
     }

@@ -64,12 +64,11 @@ def test_recording_ends_at_frames_or_seconds(
         for _ in source:
             pass
     found = verify(path)
-    assert (found.frames, found.dropped, recording.sets, set(found.streams.values())) == (
-        frames,
-        0,
-        frames,
-        {frames},
-    )
+
+    assert found.frames == frames
+    assert found.dropped == 0
+    assert recording.sets == frames
+    assert set(found.streams.values()) == {frames}
 
 
 def test_slow_reader_costs_the_recording_nothing(camera: Make, tmp_path: Path) -> None:
@@ -78,6 +77,7 @@ def test_slow_reader_costs_the_recording_nothing(camera: Make, tmp_path: Path) -
         while recording.sets < 60:
             source._thread.join(0.01)
         count = len(list(source))
+
     assert count < 60
     assert source.dropped == 60 - count
     assert verify(recording.path).frames == 60
@@ -108,6 +108,7 @@ def test_takes_follow_each_other_on_a_running_camera(
             numbers += recorded
             found = verify(path)
             assert (found.frames, found.dropped, set(found.streams.values())) == (6, 0, {6})
+
     assert numbers == sorted(set(numbers))
 
 
@@ -122,12 +123,15 @@ def test_recordings_of_one_path_refuse_each_other(camera: Make, tmp_path: Path) 
         ):
             pytest.fail("two recordings of one file")
         assert path.read_bytes() == before
+
     assert verify(path).frames == 3
+
     with (
         pytest.raises(OutputExistsError, match="exists"),
         camera(Recording(path, frames=1, overwrite=False)),
     ):
         pytest.fail("a recording was replaced")
+
     assert verify(path).frames == 3
     assert [entry.name for entry in tmp_path.iterdir()] == ["a.bag"]
 
@@ -140,6 +144,7 @@ def test_only_the_last_take_ends_the_iteration(camera: Make, tmp_path: Path) -> 
         recording.close()
         recording.next_take(tmp_path / "b.bag", last=True)
         assert len(list(source)) <= CAPACITY + 1 + 3
+
     assert recording.sets == 3
 
 
@@ -155,6 +160,7 @@ def test_next_take_starts_though_no_frame_comes(
         recording.next_take(tmp_path / "b.bag", last=True)
         assert recording.started
         assert not recording.done
+
     assert (tmp_path / "b.bag").exists()
 
 
@@ -172,8 +178,11 @@ def test_camera_goes_on_without_an_optional_recording(
     recording = Recording(tmp_path / "a.bag", optional=True, free=lambda _: left)
     with camera(recording) as source:
         assert len(list(islice(source, 40))) == 40
+
     assert recording.sets == 1 or ending == "no index"
+
     (warning,) = [record.getMessage() for record in caplog.records]
+
     assert "a.bag" in warning
 
 
@@ -216,6 +225,7 @@ def test_recorder_pauses_again_while_a_disk_is_behind(
     else:
         made.close()
         assert made._recorder is None
+
     assert fake.pauses == pauses
 
 
@@ -229,13 +239,16 @@ def test_recorder_fails_without_folder_or_growing_file(made: SdkRecorder, tmp_pa
         with made.path.open("ab") as file:
             file.write(b"more")
     made.watch()
+
     assert made.failure is None
+
     CLOCK.wait(Event(), STILL_S + 1)
     made.watch()
     with pytest.raises(
         DiskFullError, match=r"nlos-cam repair .*a\.bag --out .*a-repaired\.bag"
     ) as raised:
         made.close()
+
     assert "\n" not in str(raised.value)
 
 
@@ -252,7 +265,9 @@ def test_librealsense_at_a_file_size_limit_keeps_whole_chunks(tmp_path: Path, li
         str(limit),
     ]
     ended = subprocess.run(run, capture_output=True, text=True, timeout=120)  # noqa: PLW1510  the code is what is tested
-    assert (ended.returncode, ended.stderr) == (0, "")
+
+    assert ended.returncode == 0
+    assert ended.stderr == ""
     assert ended.stdout.count("\n") == 1
     assert f"nlos-cam repair {path} --out" in ended.stdout
     assert path.stat().st_size <= limit
@@ -271,12 +286,15 @@ def test_bytes_per_frame_bounds_a_recording(
     images = noise_world().images(0)
     frames = 200
     streams = images.depth_z16, images.ir, images.confidence
+
     assert len(streams) == len(FORMATS)
     assert bytes_per_frame(SMALL) == sum(pixels.nbytes for pixels in streams)
+
     size = recorded(tmp_path / "noise.bag", frames).stat().st_size
     overhead = (
         3 * 600 * frames
     )  # metadata and index of a stream's frame, which count where frames are this small
+
     assert 0.5 * frames * bytes_per_frame(SMALL) < size < frames * bytes_per_frame(SMALL) + overhead
 
 
@@ -285,11 +303,15 @@ def test_check_room_needs_frames_and_a_reserve(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, seconds: int
 ) -> None:
     monkeypatch.chdir(tmp_path)
+
     assert free_bytes(tmp_path / "none.bag") > 0 < free_bytes(Path("none.bag"))
+
     path = tmp_path / "a.bag"
     free = RESERVE_BYTES + 30 * seconds * bytes_per_frame(VGA)
+
     assert recording_s(VGA, free) == seconds
     assert recording_s(VGA, 0) == 0
+
     check_room(path, VGA, 30 * seconds, free)
     with pytest.raises(DiskFullError, match=rf"a\.bag.*{30 * seconds or ''}"):
         check_room(path, VGA, 30 * seconds, free - 1)
@@ -298,8 +320,10 @@ def test_check_room_needs_frames_and_a_reserve(
 def test_can_grow_finds_a_limit_and_changes_nothing(tmp_path: Path) -> None:
     path = tmp_path / "a.bag"
     path.write_bytes(b"precious")
+
     assert can_grow(path, 1_000_000)
     assert path.read_bytes() == b"precious"
+
     pytest.importorskip("resource")
     program = (
         "import pathlib, resource, sys\nfrom nlos_cam.camera.recorder import can_grow\n"
@@ -309,6 +333,7 @@ def test_can_grow_finds_a_limit_and_changes_nothing(tmp_path: Path) -> None:
     ended = subprocess.run(
         [sys.executable, "-c", program, path], capture_output=True, text=True, check=True
     )
+
     assert ended.stdout == "True False\n"
     assert path.read_bytes() == b"precious"
 
@@ -340,6 +365,7 @@ def test_recorder_whose_start_locks_python_ends_the_process(tmp_path: Path) -> N
     ended = subprocess.run(
         [sys.executable, "-P", "-c", LOCKED], cwd=tmp_path, capture_output=True, check=False
     )
+
     assert ended.returncode == 1
     assert b"Timeout" in ended.stderr
     assert time.monotonic() - start_s < 30.0

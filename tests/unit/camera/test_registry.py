@@ -31,6 +31,7 @@ def test_path_of_a_recording_chooses_the_playback(noise_bag: Path, tmp_path: Pat
     path = tmp_path / "a:b.bag"
     path.write_bytes(noise_bag.read_bytes())
     camera = open_camera(f"bag:{path}")
+
     assert isinstance(camera, ReplayCamera)
     assert camera.uri == f"bag:{path}"
 
@@ -44,6 +45,7 @@ def test_worlds_can_be_opened_and_report_progress(
     monkeypatch.setattr("nlos_cam.camera.simulated_world.WORLDS", tmp_path)
     progress: list[tuple[int, int]] = []
     open_camera("sim:bare-wall", on_progress=lambda done, total: progress.append((done, total)))
+
     assert progress == [(1, 1)]
 
 
@@ -62,6 +64,7 @@ def test_missing_wheel_has_advice(
     monkeypatch: pytest.MonkeyPatch, machine: str, words: str
 ) -> None:
     assert load_sdk() is load_sdk()
+
     monkeypatch.setitem(sys.modules, "pyrealsense2", None)
     monkeypatch.setattr("nlos_cam.camera.sdk._preload_libusb", lambda: None)
     monkeypatch.setattr("platform.machine", lambda: machine)
@@ -89,5 +92,6 @@ def test_wheel_is_the_one_that_the_package_requires(system: str, machine: str, m
         if found.name.startswith("pyrealsense2") and found.marker and found.marker.evaluate(there)
     ]
     wheel = wheel_for((3, minor), system, machine)
+
     assert asked == ([wheel] if wheel else [])
     assert wheel in {WHEEL, MAC_WHEEL, None}

@@ -28,6 +28,7 @@ def test_live_queue_drops_its_oldest_when_full() -> None:
     numbers: list[int] = []
     inbox = SampleQueue(on_set=lambda found: numbers.append(found.number))
     put(inbox, range(CAPACITY + 3))
+
     assert take_all(inbox) == list(range(3, CAPACITY + 3))
     assert inbox.dropped == 3
     assert numbers == list(range(CAPACITY + 3))
@@ -38,6 +39,7 @@ def test_finish_of_a_live_device_counts_no_half_set() -> None:
     inbox = SampleQueue()
     inbox.put(Sample("depth", 0, 0.0, np.zeros((1, 1))))
     inbox.finish()
+
     assert inbox.incomplete == 0
 
 
@@ -48,6 +50,7 @@ def test_read_settings_omits_unreadable_and_unmeasured_options() -> None:
         for name in ("not_while_idle", "apd_temperature", "ldd_temperature")
     ]
     sensor.get_supported_options = lambda: listed
+
     assert read_settings(sensor) == {"ldd_temperature": 40.0}
 
 
@@ -55,6 +58,7 @@ def test_find_streams_takes_the_sensor_with_most_streams() -> None:
     partial = FakeSensor(FakeLidar(streams=("infrared",)), 0)
     whole = FakeSensor(FakeLidar(), 0)
     sensor, profiles = find_streams(SimpleNamespace(query_sensors=lambda: [partial, whole]))
+
     assert sensor is whole
     assert set(profiles) == set(FORMATS)
     assert find_streams(SimpleNamespace(query_sensors=list)) == (None, {})
@@ -79,6 +83,7 @@ def test_look_returns_the_next_set_while_preparing_or_none() -> None:
 
     session.start(prepare, lambda: None)
     session.stop()
+
     assert found == [4, None, None]
     assert session.inbox.arrived.total() == 0  # none of these is delivered
 
@@ -99,6 +104,8 @@ def test_set_from_before_the_settings_is_not_delivered(clock_stands: bool) -> No
         )
         lidar.deliver(range(5, 6), streams=("infrared", "confidence"))
     lidar.deliver(range(6, 8))
+
     assert take_all(session.inbox) == [6, 7]
     assert clock_stands or session.inbox.incomplete == session.inbox.dropped == 0
+
     session.stop()

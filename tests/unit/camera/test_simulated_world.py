@@ -46,13 +46,16 @@ def test_world_frame_is_a_function_of_its_number(
     world: World,
 ) -> None:
     first, second, again, later = (world.images(number) for number in (0, 1, 2, 7))
+
     assert _equal(world.images(7), later)
     assert not _equal(first, second)
     assert world.celsius(0) == world.celsius(1_000_000)
     assert not _equal(first, again)
     np.testing.assert_array_equal(first.confidence, again.confidence)
+
     both = (first.depth_z16 > 0) & (again.depth_z16 > 0)
     difference = first.depth_z16[both].astype(int) - again.depth_z16[both].astype(int)
+
     assert np.abs(difference).max() * 0.00025 < 0.05
     assert not np.array_equal(second.confidence, first.confidence)
 
@@ -70,20 +73,27 @@ def test_world_from_the_cache_equals_the_rendered_one(
     seen: list[tuple[int, int]] = []
     monkeypatch.setenv("NLOS_CAM_CACHE", str(tmp_path))
     fresh = open_world(str(scene), lambda done, total: seen.append((done, total)))
+
     assert seen == [(1, 2), (2, 2)]
+
     monkeypatch.setattr("nlos_cam.render.render_scan", lambda *_: pytest.fail("rendered again"))
     cached = open_world(str(scene), lambda done, total: seen.append((done, total)))
+
     assert len(seen) == 2
+
     for number in (0, 1, 5):
         assert _equal(cached.images(number), fresh.images(number))
         assert _equal(world.images(number), fresh.images(number))
     (entry,) = (tmp_path / "worlds").iterdir()
+
     assert entry.name.startswith(fresh.scene.checksum)
+
     other = tmp_path / "scene.toml"
     other.write_text(
         scene.read_text(encoding="utf-8") + "sensor = { dead_share = 0.5 }\n", encoding="utf-8"
     )
     harmed = open_world(str(other)).images(0)  # another sensor, the same rendering
+
     assert (harmed.depth_z16 > 0).sum() < 0.7 * (world.images(0).depth_z16 > 0).sum()
 
 
@@ -91,10 +101,14 @@ def test_world_warms_and_drifts_beyond_the_loop(tmp_path: Path) -> None:
     (tmp_path / "warming.toml").write_text(WARMING, encoding="utf-8")
     warming = open_world(str(tmp_path / "warming.toml"))
     numbers = (0, 18_000, 180_000)
+
     assert warming.scene.poses == 1
+
     after = [warming.celsius(number) for number in numbers]
     ldd = [celsius["ldd_temperature"] for celsius in after]
+
     assert ldd == pytest.approx([25.0, 45 - 20 / np.e, 45.0], abs=0.01)
+
     for celsius in after:
         assert set(celsius) == {
             f"{part}_temperature" for part in ("ldd", "mc", "ma", "apd", "humidity")
@@ -104,6 +118,7 @@ def test_world_warms_and_drifts_beyond_the_loop(tmp_path: Path) -> None:
         )
     frames = [warming.images(number).frame(warming.rig.pinhole) for number in numbers]
     means_m = np.array([np.nanmean(frame.depth_m) for frame in frames])
+
     np.testing.assert_allclose(means_m - means_m[2], 0.0005 * (np.array(ldd) - 45), atol=2e-5)
     assert _equal(warming.images(18_000), warming.images(18_000))
 
@@ -113,6 +128,7 @@ def test_world_with_a_wide_pulse_survives_the_cache(world: World, tmp_path: Path
     wide.write_text(SCENE + "sensor = { pulse_ns = 1.0 }\n", encoding="utf-8")
     rendered = open_world(str(wide))
     cached = open_world(str(wide))
+
     assert _equal(rendered.images(0), cached.images(0))
     assert not np.array_equal(rendered.images(0).ir, world.images(0).ir)
 
@@ -124,10 +140,13 @@ def test_world_with_a_wide_pulse_survives_the_cache(world: World, tmp_path: Path
 )
 def test_packaged_loop_equals_the_renderers(shipped: SceneFile) -> None:
     packaged = read_packaged(shipped)
+
     assert [len(part) for part in packaged] == [shipped.poses, shipped.poses]
+
     number = shipped.poses // 2
     (rendered,), (truth_m,) = render_loop(shipped, poses=[number])
     echoes = packaged[0][number]
+
     np.testing.assert_array_equal(packaged[1][number], truth_m)
     np.testing.assert_allclose(
         echoes.peak, rendered.peak, rtol=1e-4
@@ -145,6 +164,7 @@ def test_packaged_scenes_open_without_rendering_or_cache(
     monkeypatch.setattr("nlos_cam.render.render_scan", lambda *_: pytest.fail("rendered"))
     for name in ("", "bare-wall"):
         assert open_world(name).images(0).depth_z16.any()
+
     assert not list(tmp_path.iterdir())
 
 
@@ -152,7 +172,9 @@ def test_damaged_packaged_loop_counts_as_absent(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     monkeypatch.setattr("nlos_cam.camera.simulated_world.WORLDS", tmp_path)
+
     assert read_packaged(paper_scene()) is None
+
     for content in (b"", b"damaged"):
         (tmp_path / f"{paper_scene().checksum}.npz").write_bytes(content)
         assert read_packaged(paper_scene()) is None

@@ -51,13 +51,16 @@ def test_pairing_completes_or_counts_every_number(came: list[set[str]], order: l
     ]
     found = paired(pairing, samples)
     pairing.finish()
+
     assert numbers_of(found) == [number for number, streams in enumerate(came) if len(streams) == 3]
     assert pairing.incomplete == sum(0 < len(streams) < 3 for streams in came)
+
     if found:
         came_until = max(number for number, streams in enumerate(came) if streams)
         assert pairing.dropped == sum(
             len(streams) == 0 for streams in came[found[0].number : came_until]
         )
+
     assert not pairing.counts
 
 
@@ -89,22 +92,29 @@ def test_pairing_gives_each_set_once_and_counts_the_rest(samples: list[Sample]) 
         if came is in_time.get(one.number) and set(came) == set(STREAMS):
             sets.append(one.number)
     pairing = FrameSynchronizer()
+
     assert numbers_of(paired(pairing, samples)) == sets == sorted(set(sets))
+
     pairing.finish()
     first = sets[0] if sets else min(in_time, default=0)
     expected = range(first, max(in_time, default=-1) + 1)
+
     assert pairing.incomplete == len(in_time.keys() - set(sets))
     assert len(sets) + pairing.incomplete + pairing.dropped == len(expected) + sum(
         number < first for number in in_time
     )
+
     again = [Counter(came) - Counter(STREAMS) for came in in_time.values()]
     again += [Counter(came) for number, came in late.items() if number in sets]
     passed_over = [Counter(came) for number, came in late.items() if number not in sets]
+
     assert pairing.counts["out_of_order"] == sum(max(streams.values()) for streams in passed_over)
+
     if not late:
         assert pairing.counts["duplicate"] == sum(
             max(streams.values(), default=0) for streams in again
         )
+
     assert (pairing.counts["duplicate"] > 0) == any(again)
 
 
@@ -117,8 +127,11 @@ def test_pairing_does_not_depend_on_which_stream_is_ahead(data: st.DataObject) -
         stream = data.draw(st.sampled_from([stream for stream in STREAMS if waiting[stream]]))
         samples.append(sample(stream, waiting[stream].pop(0)))
     pairing = FrameSynchronizer()
+
     assert numbers_of(paired(pairing, samples)) == list(range(12))
-    assert (pairing.incomplete, pairing.dropped, pairing.counts) == (0, 0, Counter())
+    assert pairing.incomplete == 0
+    assert pairing.dropped == 0
+    assert pairing.counts == Counter()
 
 
 def test_pairing_puts_each_stream_in_its_place_once_in_time() -> None:
@@ -126,9 +139,14 @@ def test_pairing_puts_each_stream_in_its_place_once_in_time() -> None:
         Sample(stream, 7, 0.0, np.full((1, 1), place)) for place, stream in enumerate(STREAMS)
     ]
     [found] = paired(FrameSynchronizer(), reversed(samples))
-    assert (found.depth_z16[0, 0], found.ir[0, 0], found.confidence_raw8[0, 0]) == (0, 1, 2)
+
+    assert found.depth_z16[0, 0] == 0
+    assert found.ir[0, 0] == 1
+    assert found.confidence_raw8[0, 0] == 2
+
     pairing = FrameSynchronizer()
     torn = [sample("depth", 1), sample("infrared", 1), sample("confidence", 1, late_s=0.02)]
+
     assert paired(pairing, torn) == []  # one number, two instants
     assert pairing.incomplete == 1
     assert len(paired(pairing, whole(2, late_s=0.01))) == 1
@@ -148,6 +166,7 @@ def test_pairing_bounds_memory_and_delivers_despite_wild_numbers(
         )
         assert len(pairing._waiting) <= WAITING_SETS
         assert len(pairing._occurrences._streams) <= WAITING_SETS
+
     assert set(numbers_of(found)) >= set(range(1000, 1100))
 
 
@@ -207,9 +226,14 @@ def test_pairing_counts_every_kind_of_irregular_set(
     samples: list[Sample], numbers: list[int], counts: dict[str, int], incomplete: int, dropped: int
 ) -> None:
     pairing = FrameSynchronizer(SHAPE)
+
     assert numbers_of(paired(pairing, samples)) == numbers
+
     pairing.finish()
-    assert (pairing.counts, pairing.incomplete, pairing.dropped) == (counts, incomplete, dropped)
+
+    assert pairing.counts == counts
+    assert pairing.incomplete == incomplete
+    assert pairing.dropped == dropped
 
 
 def counted_apart(instants: range, lost: dict[str, int]) -> Iterator[Sample]:
@@ -236,12 +260,15 @@ def test_pairing_realigns_a_stream_that_lost_a_frame(stream: str, instant: int) 
         for sample in counted_apart(range(60), {stream: instant})
         if (one := pairing.add(sample))
     ]
+
     assert len(found) == 60 - 1 - CONSISTENT_SETS
     assert pairing.incomplete == 60 - len(found)
     assert pairing.counts == {}
+
     numbers, times_s = (
         np.array([getattr(one, name) for one in found]) for name in ("number", "timestamp_s")
     )
+
     np.testing.assert_allclose(
         times_s - times_s[-1], (numbers - numbers[-1]) / FRAMES_PER_S, atol=1e-9
     )
@@ -255,12 +282,16 @@ def test_frame_in_si_has_metres_levels_and_nan() -> None:
     pinhole = Intrinsics(3, 1, 1.0, 1.0, 1.0, 0.5)
     settings = {"laser_power": 93.0}
     frame = frame_in_si(FrameSet(9, 1.5, depth, ir, raw), 0.00025, pinhole, settings, truth_m)
+
     np.testing.assert_allclose(frame.depth_m, [[np.nan, 1.0, 16.38375]], rtol=1e-6)
     assert frame.depth_m.dtype == np.float32
     np.testing.assert_array_equal(frame.confidence, [[0, 7, 15]])
     assert frame.ir is ir
-    assert (frame.frame_number, frame.timestamp_s, frame.intrinsics) == (9, 1.5, pinhole)
-    assert (frame.settings, frame.truth_depth_m) == (settings, truth_m)
+    assert frame.frame_number == 9
+    assert frame.timestamp_s == 1.5
+    assert frame.intrinsics == pinhole
+    assert frame.settings == settings
+    assert frame.truth_depth_m == truth_m
 
 
 STEP_BACK_S = STEP_BACK * WRAP_PERIOD_S
@@ -283,6 +314,7 @@ def test_unwrap_gives_the_times_of_a_clock_without_wraps(
         true_s.append(max(max(true_s) + gap_s, first_s))
     found_s = unwrapped([each_s % WRAP_PERIOD_S for each_s in true_s])
     offset_s = first_s - first_s % WRAP_PERIOD_S
+
     assert all(
         abs(found - true + offset_s) < 1e-6 for found, true in zip(found_s, true_s, strict=True)
     )
@@ -328,15 +360,20 @@ def passed_on(
 
 def test_continuity_keeps_first_run_and_counts_missed_once() -> None:
     given = frame(7, 1.5)
+
     assert Continuity().add(given, arrived_s=99.0) is given
+
     continuity = Continuity()
     continuity.restart(counted=0)  # after a run without frames
+
     assert continuity.add(frame(4, 2.0), arrived_s=0.0).frame_number == 4
+
     continuity = Continuity()
     passed_on(continuity, range(1), zero_s=0.0, arrived_s=0.0)
     continuity.restart(counted=20)
     continuity.restart(counted=5)
     passed_on(continuity, range(1), zero_s=1.0, arrived_s=1.0)
+
     assert continuity.missed == 29 - 25
 
 
@@ -353,6 +390,7 @@ def test_numbers_and_seconds_rise_together_over_an_outage(zero_s: float) -> None
         later = next_one.frame_number - one.frame_number
         assert later > 0
         assert (next_one.timestamp_s - one.timestamp_s) * 30 == pytest.approx(later, abs=0.01)
+
     assert after[0].timestamp_s - before[0].timestamp_s == pytest.approx(9.0)
     assert continuity.missed == after[0].frame_number - before[-1].frame_number - 1 == 240
 
@@ -369,4 +407,6 @@ def test_continuity_splices_the_next_run(
     passed_on(continuity, range(5), zero_s=10.0, arrived_s=0.0)
     continuity.restart(counted=0)
     found = continuity.add(frame(0, device_s), arrived_s)
-    assert (found.frame_number, found.timestamp_s) == (number, pytest.approx(timestamp_s))
+
+    assert found.frame_number == number
+    assert found.timestamp_s == pytest.approx(timestamp_s)

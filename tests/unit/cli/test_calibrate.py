@@ -97,6 +97,7 @@ JSON_FIELDS = {
 @pytest.mark.usefixtures("camera")
 def test_calibrate_json_is_what_the_record_holds(run: Run) -> None:
     result = run(*WALL)
+
     assert result.pop("out") == "wall.toml"
     assert result.pop("report") == "wall.html"
     assert result == load_wall(OUT).model_dump(mode="json", include=set(result))
@@ -107,6 +108,7 @@ def test_calibrate_json_is_what_the_record_holds(run: Run) -> None:
 def test_calibrate_writes_the_measured_wall(run: Run) -> None:
     run(*WALL)
     record = load_wall(OUT)
+
     assert record.distance_m == pytest.approx(0.2, abs=1e-6)
     assert record.facing_deg == pytest.approx(45.0, abs=1e-6)
     assert record.camera == "sim:bare-wall"
@@ -119,6 +121,7 @@ def test_calibrate_writes_the_measured_wall(run: Run) -> None:
 def test_calibrate_without_out_names_the_record_itself(run: Run) -> None:
     run(*BARE)
     (path,) = Path().glob("wall-*.toml")
+
     assert load_wall(path).verdict == "good"
 
 
@@ -129,6 +132,7 @@ L515 = "calibrate", "--wall", "--camera", "l515", "--out", OUT
 def test_calibrate_records_the_device(run: Run) -> None:
     run(*L515)
     record = load_wall(OUT)
+
     assert record.serial == "f0246262"
     assert record.firmware == "1.5.8.1"
     assert record.settings == {"laser_power": 80.0}
@@ -139,6 +143,7 @@ def test_calibrate_records_the_device(run: Run) -> None:
 def test_calibrate_writes_the_reference(camera: FakeCamera, run: Run) -> None:
     run(*L515)
     record, reference = vars(load_measured(OUT)).values()
+
     assert record.reference == "wall.npz"
     assert reference.frames == 10
     assert reference.settings == {"laser_power": 80.0}
@@ -149,6 +154,7 @@ def test_calibrate_writes_the_reference(camera: FakeCamera, run: Run) -> None:
 @pytest.mark.usefixtures("camera")
 def test_calibrate_prints_result_verdict_and_files(shown: Run) -> None:
     printed = shown(*L515).out
+
     assert_has(printed, "200.00 ± 0.0", "45.00", " mm RMS")
     assert_has(printed, "Verdict: good", "wall.npz", "open wall.html")
 
@@ -169,14 +175,19 @@ def test_calibrate_finds_the_occluder_on_a_simulated_bench(run: Run) -> None:
         "bench.toml",
     )
     result = run(*bench)
+
     assert result["occluder"]["source"] == "detected"
     assert (result["occluder"]["x_m"], result["occluder"]["gap_m"]) == pytest.approx(
         (0.2, 0.1), abs=0.001
     )
+
     before = load_measured(OUT)
     after = load_measured(Path("bench.toml"))
-    assert (after.record.distance_m, result["reference"]) == (before.record.distance_m, "bench.npz")
+
+    assert after.record.distance_m == before.record.distance_m
+    assert result["reference"] == "bench.npz"
     assert after.reference.inliers.mean() < 0.8
+
     run(*bench, code=1)
     run(*bench, "--overwrite")
 
@@ -187,6 +198,7 @@ def test_calibrate_takes_frames_and_the_entered_occluder(camera: FakeCamera, sho
         "calibrate", "--wall", "--bag", "run.bag", "--frames", "3", *entered, "--out", OUT
     ).out
     record = load_wall(OUT)
+
     assert camera.uri == "bag:run.bag"
     assert camera.taken == record.frames == 3
     assert record.rig.occluder == Occluder(x_m=0.25, z_min_m=0.08)
@@ -197,17 +209,23 @@ def test_calibrate_takes_frames_and_the_entered_occluder(camera: FakeCamera, sho
 @pytest.mark.usefixtures("camera")
 def test_calibrate_measures_after_watching(shown: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("sys.stdin", StringIO("\n"))
+
     assert "200.0 mm" in shown(*WALL, "--watch").err
     assert load_wall(OUT).frames == 10
 
 
 def test_calibrate_moves_by_tape_and_reports_out_of_range(camera: FakeCamera, shown: Run) -> None:
     assert "+4.2 ± 1.4 mm" in shown(*WALL, "--tape-m", "0.203").out
+
     record = load_wall(OUT)
+
     assert record.distance_m == record.rig.lidar.distance_m == pytest.approx(0.203, abs=2e-6)
     assert record.range_offset_m == pytest.approx(0.003 * np.sqrt(2.0), abs=1e-5)
-    assert (record.range_offset_cause, record.verdict) == ("origin", "good")
+    assert record.range_offset_cause == "origin"
+    assert record.verdict == "good"
+
     camera.scale = 2.0
+
     assert "10 cm" in shown(*WALL, "--overwrite").out
     assert load_wall(OUT).verdict == "out of range"
 
@@ -231,6 +249,7 @@ def test_calibrate_that_is_refused_writes_nothing(
 ) -> None:
     vars(camera).update(changed)
     refused = run(*WALL, *options, code=1)["error"]
+
     assert refused["type"] == error
     assert re.search(value, refused["message"])
     assert not list(Path().iterdir())
@@ -241,10 +260,13 @@ def test_calibrate_that_is_refused_writes_nothing(
 def test_calibrate_keeps_existing_files_unless_asked(run: Run, name: str) -> None:
     (mine := Path(name)).write_text("mine", encoding="utf-8")
     refused = run(*WALL, code=1)["error"]
+
     assert (refused["type"], name in refused["message"]) == ("OutputExistsError", True)
     assert mine.read_text(encoding="utf-8") == "mine"
     assert list(Path().iterdir()) == [mine]
+
     run(*WALL, "--overwrite")
+
     assert load_wall(OUT).verdict == "good"
 
 
@@ -280,8 +302,11 @@ def test_calibrate_board_uses_depth_and_board(record: Run, run: Run, shown: Run)
     arguments = "calibrate", "--wall", "--board", "--bag", record(), "--out", OUT
     result = run(*arguments)
     board = result["board"]
+
     assert board == load_wall(OUT).model_dump(mode="json")["board"]
-    assert (result["verdict"], board["used"], board["causes"]) == ("good", "both", [])
+    assert result["verdict"] == "good"
+    assert board["used"] == "both"
+    assert board["causes"] == []
     assert (result["distance_m"], result["facing_deg"]) == pytest.approx((0.2, 45.0), abs=0.01)
     assert board["corners"] >= 20
     assert board["distance_m"] == pytest.approx(0.2, abs=3 * board["distance_std_m"])
@@ -299,6 +324,7 @@ def test_calibrate_board_replaces_depth_that_is_refused(record: Run, run: Run) -
     arguments = "calibrate", "--wall", "--bag", record(step_m=0.05), "--out", OUT
     run(*arguments, code=1)
     result = run(*arguments, "--board", "--square-mm", "30")
+
     assert (result["verdict"], result["board"]["used"], result["board"]["measured"]) == (
         "doubtful",
         "board",
@@ -313,6 +339,7 @@ def test_calibrate_board_replaces_depth_that_is_refused(record: Run, run: Run) -
 def test_calibrate_board_refuses_a_recording_without_one(noise_bag: Path, run: Run) -> None:
     arguments = "calibrate", "--wall", "--board", "--paper", "a3", "--bag", noise_bag, "--out", OUT
     error = run(*arguments, code=1)["error"]
+
     assert (error["type"], "9 x 13" in error["message"]) == ("BoardRefusedError", True)
     assert not OUT.exists()
 
@@ -320,14 +347,18 @@ def test_calibrate_board_refuses_a_recording_without_one(noise_bag: Path, run: R
 def test_watch_panel_shows_fit_or_refusal() -> None:
     console = Console(file=(text := StringIO()), width=140)
     console.print(panel(fit_frame(next(iter(FakeCamera())))))
+
     assert_has(text.getvalue(), "200.0 mm", "45.00°", "good", "●")
+
     console.print(panel(FrameFit(None, "the wall [so to say] is not flat", 0.25)))
+
     assert_has(text.getvalue(), "the wall [so to say] is not", "25.0%")
 
 
 def test_watch_ends_with_the_camera_or_on_request() -> None:
     stops = iter([False] * (2 * EVERY - 1) + [True])
     last = watch_wall(FakeCamera(frames=100), lambda: next(stops))  # type: ignore[arg-type]
+
     assert last.fit is not None
     assert not list(stops)
     assert watch_wall(FakeCamera(frames=0), lambda: False) is None  # type: ignore[arg-type]
@@ -346,6 +377,7 @@ def test_until_enter_ends_on_enter_or_end_of_input(
 
 def test_gauge_points_to_where_a_value_lies() -> None:
     places = [gauge(value, 0.15, 0.3).index("●") for value in (0.15, 0.2, 0.25, 0.3)]
+
     assert places == sorted(places)
     assert "◀" in gauge(0.1, 0.15, 0.3)
     assert "▶" in gauge(0.31, 0.15, 0.3)
@@ -363,4 +395,5 @@ def test_board_json_is_the_board_that_was_printed(run: Run, shown: Run) -> None:
             2,
         )
         assert Board.model_validate(result) == board
+
     assert_has(shown(*command).out, "6 x 9", "30 mm", "a4", "100 %", "board.pdf")

@@ -45,16 +45,17 @@ def lines(monkeypatch: Patch) -> list[str]:
 
 def test_capture_json_reports_the_file(run: Run) -> None:
     found = run(*CAPTURE, "--frames", "9", "--label", "a cup")
-    assert (found["frames"], found["dropped"], found["seconds"], found["out"]) == (
-        9,
-        0,
-        0.267,
-        "a.bag",
-    )
+
+    assert found["frames"] == 9
+    assert found["dropped"] == 0
+    assert found["seconds"] == 0.267
+    assert found["out"] == "a.bag"
     assert (found["state"], found["sidecar"]) == ("complete", "a.json")
     assert verify(OUT).streams == found["streams"] == {"depth": 9, "infrared": 9, "confidence": 9}
     assert found["label"] == load_sidecar(Path("a.json")).label == "a cup"
+
     by_time = run("capture", "--seconds", "1")
+
     assert (by_time["frames"], Path(by_time["out"]).exists()) == (
         30,
         True,
@@ -69,12 +70,17 @@ def test_capture_numbers_and_labels_takes_and_pauses_between(run: Run, monkeypat
     )
     labels = "--label", "a cup", "--label", "a ball", "--label", "a box"
     found = run(*CAPTURE, "--takes", "3", "--frames", "4", "--pause-s", "7", *labels)
-    assert (found["frames"], found["dropped"], paused) == (12, 0, [7.0, 7.0])
+
+    assert found["frames"] == 12
+    assert found["dropped"] == 0
+    assert paused == [7.0, 7.0]
+
     for number, (take, label) in enumerate(zip(found["takes"], labels[1::2], strict=True), start=1):
         path = Path(f"a-0{number}.bag")
         assert (take["out"], take["label"], take["frames"]) == (str(path), label, 4)
         assert (verify(path).frames, load_sidecar(path.with_suffix(".json")).label) == (4, label)
     found = run("capture", "--takes", "2", "--frames", "2", "--label", "cup", "--out", "b.bag")
+
     assert [take["label"] for take in found["takes"]] == ["cup", "cup"]
 
 
@@ -91,6 +97,7 @@ def test_terminal_is_asked_before_each_take(
         capture.sys, "stdin", SimpleNamespace(isatty=lambda: True, readline=readline)
     )
     found = run(*CAPTURE, "--takes", "2", "--frames", "2", code=code)
+
     assert [take["state"] for take in found["takes"]] == ["complete"] * takes
 
 
@@ -98,6 +105,7 @@ def test_terminal_is_asked_before_each_take(
 def test_capture_overwrites_only_with_the_option(run: Run, name: str, takes: int) -> None:
     (precious := Path(name)).write_text("precious")
     command = *CAPTURE, "--frames", "2", *(["--takes", "3"] if takes > 1 else [])
+
     assert run(*command, code=1)["error"]["type"] == "OutputExistsError"
     assert list(Path().iterdir()) == [precious]
     assert precious.read_text() == "precious"
@@ -108,6 +116,7 @@ def test_capture_overwrites_only_with_the_option(run: Run, name: str, takes: int
 def test_capture_checks_disk_space_before_writing(run: Run, monkeypatch: Patch) -> None:
     monkeypatch.setattr("nlos_cam.camera.free_bytes", lambda _: 210_000_000)
     error = run(*CAPTURE, "--takes", "2", "--frames", "500", code=1)["error"]
+
     assert error["type"] == "DiskFullError"
     assert re.search("1000 .*64 x 48", error["message"])
     assert list(Path().iterdir()) == []
@@ -126,16 +135,21 @@ def test_capture_without_a_limit_reports_remaining_time(
         "nlos_cam.recording.CaptureSession.record", lambda *_: (one for one in [ended])
     )
     run(*CAPTURE, code=130)
+
     assert "at least 90 s" in lines[0]
 
 
 def test_capture_reports_damage_and_gaps(run: Run, monkeypatch: Patch, lines: list[str]) -> None:
     monkeypatch.setattr("nlos_cam.recording.verify", lambda *_, **__: VerifyResult(3, 0, 0.1, {}))
     found = run(*CAPTURE, "--frames", "5", code=4)
-    assert (found["state"], found["error"]["type"]) == ("damaged", "RecordingError")
+
+    assert found["state"] == "damaged"
+    assert found["error"]["type"] == "RecordingError"
     assert "3 of the 5" in lines[-1]
+
     lines.clear()
     monkeypatch.setattr("nlos_cam.recording.verify", lambda *_, **__: VerifyResult(5, 2, 0.1, {}))
+
     assert run(*CAPTURE, "--frames", "5", "--overwrite")["dropped"] == 2
     assert "2 frames" in lines[0]
 
@@ -146,6 +160,7 @@ def test_capture_interrupted_while_reading_back_loses_nothing(run: Run, monkeypa
 
     monkeypatch.setattr("nlos_cam.recording.verify", interrupted)
     found = run(*CAPTURE, "--frames", "5", code=130)
+
     assert (found["state"], found["frames"]) == ("interrupted", None)
     assert verify(OUT).frames == 5
 
@@ -166,16 +181,20 @@ def test_capture_ended_by_a_signal_loses_no_data(asked: signal.Signals) -> None:
         finally:
             process.kill()
     beside = load_sidecar(Path("a.json"))
-    assert (beside.camera, beside.settings["depth_units"]) == (
-        "sim:bare-wall",
-        pytest.approx(0.00025),
-    )
+
+    assert beside.camera == "sim:bare-wall"
+    assert beside.settings["depth_units"] == pytest.approx(0.00025)
+
     if asked == signal.SIGKILL:  # what is on the disk can be repaired
         assert (process.returncode, beside.state, stdout) == (-9, "recording", "")
         return
-    assert (process.returncode, beside.state) == (130, "interrupted")
+
+    assert process.returncode == 130
+    assert beside.state == "interrupted"
+
     found = verify(OUT)
     report = json.loads(stdout)
+
     assert found.frames == report["frames"] > 0
     assert set(found.streams.values()) == {found.frames}
 
@@ -202,10 +221,15 @@ def test_result_holds_fields_of_one_take_totals_of_several() -> None:
         "sidecar": "a.json",
         "label": "a cup",
     }
+
     assert found == {"frames": 30, "dropped": 1, "seconds": 1.0, **shares, **named}
+
     found = result_of([take(), take()], several=True)
+
     assert [one["frames"] for one in found["takes"]] == [30, 30]
-    assert (found["frames"], found["dropped"], found["seconds"]) == (60, 2, 2.0)
+    assert found["frames"] == 60
+    assert found["dropped"] == 2
+    assert found["seconds"] == 2.0
     assert not {"error", "label"} & found["takes"][0].keys()
     assert result_of([take(verified=None)], several=True)["frames"] == 0
     assert result_of([take(verified=None)], several=False)["seconds"] is None
@@ -214,13 +238,17 @@ def test_result_holds_fields_of_one_take_totals_of_several() -> None:
 def test_error_of_a_take_says_what_is_saved() -> None:
     lost = take(state="lost", error=LOST)
     error = result_of([lost], several=False)["error"]
-    assert (error["type"], error["message"]) == ("CameraLostError", str(final_error(lost)))
+
+    assert error["type"] == "CameraLostError"
+    assert error["message"] == str(final_error(lost))
     assert isinstance(final_error(lost), CameraLostError)
     assert all(
         word in error["message"] for word in ("l515 vanished: replug it", "30 frames", "a.bag")
     )
     assert "frames" not in str(final_error(take(state="lost", sets=0, verified=None, error=LOST)))
+
     full = take(state="disk full", verified=None, closed=False, error=DiskFullError("repair it"))
+
     assert str(final_error(full)) == "repair it"
     assert final_error(take(state="interrupted")) is None
 
@@ -229,12 +257,15 @@ def test_lines_at_the_terminal_hold_the_figures() -> None:
     text = format_take(take())
     for word in ("30 frames", "1.0 s", "3 MB", "verified", "0.10 %", "25.0 %", "1.23 mm", "a.bag"):
         assert word in text
+
     assert "unknown" in format_take(take(quality=Quality(1, 0.0, 0.0)))
     assert "verified" not in format_take(take(state="damaged"))
+
     for changes in ({}, {"verified": None}):
         assert format_take(take(state="interrupted", **changes)).startswith(
             "Interrupted. Recorded 30 frames"
         )
+
     assert format_take(take(state="lost", sets=0, verified=None)).startswith("Camera lost before")
 
 
@@ -246,7 +277,12 @@ def test_capture_interrupted_before_start_has_the_same_fields(
         "nlos_cam.camera.open_camera", lambda *_, **__: signal.raise_signal(signal.SIGINT)
     )
     found = run(*CAPTURE, *several, code=130)
+
     assert list(Path().iterdir()) == []
     assert set(found) == set(result_of([take()], several=bool(several)))
+
     one = found["takes"][0] if several else found
-    assert (one["frames"], one["state"], found["frames"]) == (0, "interrupted", 0)
+
+    assert one["frames"] == 0
+    assert one["state"] == "interrupted"
+    assert found["frames"] == 0

@@ -65,6 +65,7 @@ def test_precedence_is_option_environment_folder_user_default(
     monkeypatch.setenv("NLOS_CAM_CAMERA", "sim")
     main(["live"])
     main(["live", "run.bag", "--view-port", "9500"])
+
     assert live == [
         {"camera": "sim", "wall": None, "view_port": None},
         {"camera": "l515", "wall": None, "view_port": 9100},
@@ -85,6 +86,7 @@ def test_camera_is_an_argument_and_an_option(live: list[dict[str, Any]], words: 
 def test_paths_of_the_users_file_are_relative_to_it(folders: tuple[Path, Path]) -> None:
     (folders[1] / FILE).write_text(LIVE, encoding="utf-8")
     settings = read_settings({})
+
     assert settings["wall"].value == str(folders[1] / "bench.toml")
     assert settings["camera"].value == f"sim:{folders[1] / 'scene.toml'}"
 
@@ -100,6 +102,7 @@ def test_wrong_file_is_refused_with_its_name(
     (folders[0] / FILE).write_text(text, encoding="utf-8")
     with pytest.raises(RecordingError, match=word) as caught:
         read_settings({})
+
     assert FILE in str(caught.value)
 
 
@@ -114,6 +117,7 @@ def test_config_shows_values_and_sources(
     (folders[0] / FILE).write_text(LIVE + 'cache = "c"', encoding="utf-8")
     monkeypatch.setenv("NLOS_CAM_WEIGHTS", "mine")
     settings = run("config")["settings"]
+
     assert settings["cache"] == {"value": "c", "source": FILE}
     assert settings["weights"] == {"value": "mine", "source": "NLOS_CAM_WEIGHTS"}
     assert settings["camera"]["source"] == FILE
@@ -123,5 +127,6 @@ def test_verbose_prints_settings_in_use(
     folders: tuple[Path, Path], live: list[dict[str, Any]], shown: Run
 ) -> None:
     (folders[0] / FILE).write_text(LIVE, encoding="utf-8")
+
     assert f"wall = bench.toml (from {FILE})" in shown("-v", "live").err
     assert len(live) == 1

@@ -57,7 +57,9 @@ def _command(folder: Path) -> str:
 def test_build_reports_and_resumes(tmp_path: Path, built: Run) -> None:
     assert built(tmp_path) == {"objects": 4, "made": 4, "damaged": [], "out": str(tmp_path)}
     assert built(tmp_path, "--count", "6")["made"] == 6  # a shard that was not full is made again
+
     result = built(tmp_path, "--count", "6")
+
     assert (result["made"], result["objects_per_s"]) == (0, None)
     assert open_dataset(tmp_path).plan == DatasetPlan(load_rig("paper-rig"), 0)
 
@@ -76,6 +78,7 @@ def test_build_options_set_plan_and_are_stored_as_command(tmp_path: Path, built:
     ]
     built(folder := tmp_path / "a b", *spread, *others, "--expected-maps", "--workers", "1")
     plan = open_dataset(folder, expected=True).plan
+
     assert plan.spread == RigSpread(place_m=0.01, angle_deg=3, gain_share=0.2)
     assert set(CATEGORIES) - set(plan.objects.categories) == {"hat", "boat"}
     assert (plan.objects.backgrounds, plan.accuracy, plan.first_seed, plan.expected) == (
@@ -113,6 +116,7 @@ def test_build_hides_meshes_of_folder(tmp_path: Path, built: Run) -> None:
     built(tmp_path / "d", "--objects", tmp_path)
 
     plan = open_dataset(tmp_path / "d").plan
+
     assert [name for name, _ in plan.objects.meshes] == ["cube.stl"]
 
 
@@ -120,6 +124,7 @@ def test_build_reports_damaged_shard(tmp_path: Path, built: Run, shown: Run) -> 
     built(tmp_path)
     (shard := tmp_path / "shard-000000000.h5").write_bytes(b"")
     printed = shown("dataset", "build", "--out", tmp_path, "--count", "4", "--json")
+
     assert shard.name in printed.err
     assert json.loads(printed.out)["damaged"] == [str(shard)]
     assert len(read_head(shard).seeds) == 4
@@ -136,9 +141,12 @@ def test_rate_is_objects_per_second_once_known() -> None:
     clock = iter(range(100))
     bar = Progress(get_time=lambda: float(next(clock)))
     task = bar.add_task("x", total=100)
+
     assert Rate().render(bar.tasks[0]).plain == ""
+
     for done in (1, 2, 3):
         bar.update(task, completed=done)
+
     assert Rate().render(bar.tasks[0]).plain.endswith("/s")
 
 
@@ -164,9 +172,13 @@ def test_label_makes_dataset_of_single_frames(label: Run, tmp_path: Path) -> Non
     result = label("--frames", "3")
     maps = (data := open_dataset(out := tmp_path / "my data")).arrays()
     plan = data.plan
+
     assert len(maps.image) == result["samples"] == 6
-    assert (result["recordings"], result["labels"], result["out"]) == (2, ["jug", "mug"], str(out))
-    assert (result["rig_name"], result["rig_checksum"]) == (plan.rig.name, plan.rig.checksum)
+    assert result["recordings"] == 2
+    assert result["labels"] == ["jug", "mug"]
+    assert result["out"] == str(out)
+    assert result["rig_name"] == plan.rig.name
+    assert result["rig_checksum"] == plan.rig.checksum
     assert [len(np.unique(image)) for image in maps.image] == [1] * 6
     assert maps.image[0, 0, 0] > maps.image[5, 0, 0]
 
@@ -176,14 +188,19 @@ def test_label_replaces_dataset_only_with_overwrite(
 ) -> None:
     out = tmp_path / "my data"
     label("--frames", "2")
+
     assert label("--frames", "1", code=1)["error"]["type"] == "OutputExistsError"
     assert len(open_dataset(out).arrays().image) == 4
+
     label("--frames", "1", "--overwrite")
+
     assert len(open_dataset(out).arrays().image) == 2
     assert (
         _command(out) == f"nlos-cam dataset label {recordings} --out '{out}' --frames 1 --overwrite"
     )
+
     (recordings / "b.npy").unlink()
     error = label("--overwrite", code=4)["error"]
+
     assert (error["type"], "'jug'" in error["message"]) == ("RecordingError", True)
     assert len(open_dataset(out).arrays().image) == 2

@@ -113,7 +113,8 @@ def test_evaluate_prints_figures_of_dataset(run: Run) -> None:
     result = run(*JUDGE, *STORED)
 
     assert {*TARGETS, "baselines", "per_category", "objects", "seconds", "out"} < set(result)
-    assert (result["objects"], result["training_objects"]) == (3, 3)
+    assert result["objects"] == 3
+    assert result["training_objects"] == 3
     assert set(result["per_category"]) == {"cup", "hat"}
     assert set(result["shown_and_left_out"]) == {"shown", "left out"}
     assert ["cup" in note for note in result["notes"]] == [True]
@@ -133,9 +134,11 @@ def test_evaluate_writes_its_figures_once(run: Run, monkeypatch: Patch) -> None:
     result = run(*JUDGE, *STORED)
 
     del result["out"]
+
     assert json.loads((out / "figures.json").read_text("utf-8")) == result
     assert "\nhat 1," in (out / "objects.csv").read_text("utf-8")
     assert run(*JUDGE, *STORED, code=1)["error"]["type"] == "OutputExistsError"
+
     monkeypatch.setattr("nlos_cam.evaluate.write_report", lambda *_: None)
     run(*JUDGE, *STORED, "--overwrite")
 
@@ -148,7 +151,10 @@ def test_evaluate_uses_test_set_without_dataset(
         subjects.shapes, "benchmark_objects", lambda box: benchmark_objects(box)[:2]
     )
     result = run(*JUDGE)
-    assert (result["objects"], result["rig"], guessing[0].rig) == (2, RIG.name, RIG)
+
+    assert result["objects"] == 2
+    assert result["rig"] == RIG.name
+    assert guessing[0].rig == RIG
     assert list(result["per_category"]) == [benchmark_objects(DatasetPlan(RIG, 0).box)[0].category]
     assert "nearest_neighbour" in result["baselines"]
 
@@ -156,7 +162,9 @@ def test_evaluate_uses_test_set_without_dataset(
 @pytest.mark.usefixtures("unwritten")
 def test_evaluate_count_uses_seeded_objects(run: Run, guessing: list[DatasetPlan]) -> None:
     result = run(*JUDGE, "--count", "1", "--no-nearest")
-    assert (result["objects"], set(result["baselines"])) == (1, {"all_background", "mean_object"})
+
+    assert result["objects"] == 1
+    assert set(result["baselines"]) == {"all_background", "mean_object"}
     assert result["advantage_over_nearest_neighbour"] is None
     assert not guessing
 
@@ -184,6 +192,7 @@ def test_evaluate_subtracts_bare_wall_for_the_weights_alone(
     )
     result = run(*JUDGE, *STORED, *options)
     raw = _maps(DatasetPlan(RIG, HELD_OUT_SEED), 3)
+
     np.testing.assert_allclose(np.stack(network.given), raw.depth_m - wall_m, atol=1e-6)
     assert result["input"] == maps
     assert result["baselines"]["nearest_neighbour"]["silhouette_iou"]["value"] == 1
@@ -269,6 +278,7 @@ def test_tradeoff_render_writes_table_and_plot(run: Run, small: list[Scene]) -> 
 @pytest.mark.usefixtures("plates")
 def test_tradeoff_reconstruct_writes_table_and_plot(run: Run) -> None:
     result = run(*RECONSTRUCT, "--count", "1")
+
     _assert_written(result)
     assert (result["complete"], result["objects"], len(result["settings"])) == (True, 1, 8)
     assert result["recommended"]["name"] in {row["name"] for row in result["settings"]}
@@ -308,7 +318,9 @@ def test_tradeoff_keeps_rows_measured_before_signal(
     monkeypatch.setattr(f"nlos_cam.evaluate.{measure}", cut_short)
     before = signal.getsignal(number)
     result = run(*command, code=130)
+
     assert signal.getsignal(number) == before
+
     if rows:
         _assert_written(result)
         assert (result["complete"], len(result.get("stops", result.get("settings")))) == (
@@ -327,5 +339,6 @@ def test_tradeoff_refuses_color_weights_before_rendering(run: Run) -> None:
     record = CheckpointRecord.of([recipe], ("paper-rig", "0"))
     (weights := Path("color")).mkdir()
     (weights / "checkpoint.json").write_text(record.model_dump_json(), encoding="utf-8")
+
     assert str(weights) in run(*RECONSTRUCT, "--weights", weights, code=4)["error"]["message"]
     assert not OUT.exists()

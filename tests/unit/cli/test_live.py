@@ -115,6 +115,7 @@ COLUMNS = {"latency_ms", "delivery_ms", "queue_ms", "network_ms", "dropped", "ve
 @pytest.mark.usefixtures("opened")
 def test_live_json_has_its_fields(run: Run) -> None:
     report = run(*RECORDED)
+
     assert set(report) == REPORT_FIELDS
     assert set(report["latency_ms"]) == {"p50", "p95", "p99"}
     assert set(report["stages_ms"]) == STAGES
@@ -123,7 +124,9 @@ def test_live_json_has_its_fields(run: Run) -> None:
 @pytest.mark.usefixtures("opened")
 def test_live_on_a_recording_reports_every_frame(run: Run) -> None:
     report = run(*RECORDED)
-    assert (report["frames"], report["dropped"]) == (20, 0)
+
+    assert report["frames"] == 20
+    assert report["dropped"] == 0
     assert report["verdicts"] == {Verdict.SEEN.value: 20}
 
 
@@ -132,8 +135,10 @@ def test_live_log_has_a_line_per_frame_and_stays(run: Run) -> None:
     arguments = [*RECORDED, "--log", "log.csv"]
     run(*arguments)
     header, *lines = Path("log.csv").read_text(encoding="utf-8").splitlines()
+
     assert [int(line.split(",")[0]) for line in lines] == list(range(20))
     assert set(header.split(",")) >= COLUMNS
+
     run(*arguments, code=1)
 
 
@@ -144,6 +149,7 @@ def test_live_prints_the_address_of_its_view(run: Run) -> None:
 
 def test_live_ends_with_a_live_camera(opened: Opened, run: Run) -> None:
     report = run(*SIMULATED)
+
     assert report["frames"] + report["dropped"] == 20
     assert [uri for uri, _ in opened.calls] == ["sim"]
 
@@ -156,8 +162,10 @@ def test_live_ends_after_its_seconds(opened: Opened, run: Run) -> None:
 def test_live_saves_its_view_and_overwrites_only_when_asked(opened: Opened, run: Run) -> None:
     opened.camera = Recorded(12)
     arguments = [*RECORDED, "--save-view", "view.html"]
+
     assert "open view.html" in run(*arguments).err
     assert Path("view.html").stat().st_size > 10_000
+
     run(*arguments, code=1)
     run(*arguments, "--overwrite")
 
@@ -167,34 +175,46 @@ def test_replay_saves_view_stills_and_video(opened: Opened, run: Run) -> None:
     opened.camera = Recorded(12)
     run(*REPLAY, "--save-view", "--stills", "2", "--video")
     names = {file.name for file in Path("out").iterdir()}
+
     assert {"view.html", "replay.webm", "still-000000.png"} < names
 
 
 def test_live_record_overwrites_only_when_asked(opened: Opened, run: Run) -> None:
     arguments = [*SIMULATED, "--record", "run.bag"]
     run(*arguments)
+
     assert opened.calls[-1][1]["recording"].path == Path("run.bag")
+
     Path("run.bag").write_text("mine")
+
     assert run(*arguments, code=1)["error"]["type"] == "OutputExistsError"
+
     run(*arguments, "--overwrite")
 
 
 @pytest.mark.usefixtures("opened")
 def test_replay_on_a_wall_notes_that_the_rig_differs(run: Run) -> None:
     write_wall(Path("wall.toml"))
+
     assert "training rig" in run(*WALLED, "wall.toml").err
+
     with np.load("out/reconstruction.npz") as file:
         assert str(file["rig_name"]) == "measured"
+
     assert run(*WALLED, "none.toml", code=4)["error"]["type"] == "RecordFileError"
 
 
 def test_replay_writes_its_folder_and_one_json_object(opened: Opened, run: Run) -> None:
     report = run(*REPLAY)
+
     assert set(report) == {"frames", "seconds", "out", "warnings", "verdicts", "quality"}
-    assert (report["frames"], report["out"]) == (20, "out")
+    assert report["frames"] == 20
+    assert report["out"] == "out"
     assert "training rig" not in report.err
+
     run(*REPLAY, code=1)
     run(*REPLAY, "--overwrite")
+
     assert opened.calls == [("bag:run.bag", {})] * 2
 
 
@@ -208,6 +228,7 @@ def test_interrupted_command_keeps_its_results(
     if command is REPLAY:
         with np.load("out/reconstruction.npz") as file:
             assert len(file["depth_m"]) == report["frames"]
+
     assert report["frames"] >= 1
 
 
@@ -220,6 +241,7 @@ def test_interrupt_while_a_camera_opens_begins_no_run(
             signal.raise_signal(signal.SIGINT)
 
     opened.on_open = swallow
+
     assert run(*command, code=130) == {}
 
 
@@ -231,6 +253,7 @@ def test_begin_and_end_of_a_warning_print_once(
     monkeypatch.setattr("nlos_cam.reconstruct.frame_reader.QUEUE_FRAMES", 1000)
     report = run(*command, "--wall", "wall.toml")
     [(warning, frames)] = report["warnings"].items()
+
     assert 0 < frames < 100
     assert report.err.count("drifted") == 2
     assert report.err.count(warning) >= 1
@@ -239,8 +262,11 @@ def test_begin_and_end_of_a_warning_print_once(
 def test_average_is_over_as_many_frames_as_asked(walled: Opened) -> None:
     walled.camera = WallCamera(26)
     walled.network.record.rig_checksum = "of a rig that is not here"  # maps are left as they are
+
     assert main([*WALLED, "wall.toml", "--average", "20"]) == 0
+
     mean_m = np.mean([wall_frame(number).depth_m for number in range(6, 26)], axis=0)
+
     np.testing.assert_allclose(walled.network.given[25], mean_m, atol=1e-6)  # NaN where NaN
 
 
@@ -248,6 +274,7 @@ def test_weights_of_difference_maps_need_a_wall(walled: Opened, run: Run) -> Non
     walled.camera = WallCamera(21)
     walled.network.record.input = "difference maps"
     run(*WALLED, "wall.toml")
+
     assert abs(np.nanmean(walled.network.given[20])) < 1e-3
     assert "--wall" in run(*SIMULATED, code=1)["error"]["message"]
 
@@ -290,6 +317,7 @@ def test_summary_has_a_sentence_per_fact() -> None:
 def test_verbose_summary_has_the_latencys_stages_first() -> None:
     lines = summary(PLAIN, verbose=True).splitlines()[3:]
     names = ("delivery", "network", "wait")
+
     assert [line.split() for line in lines] == [[name, "1.0", "3.1"] for name in names]
 
 
@@ -317,6 +345,7 @@ def test_view_serves_a_saved_session_until_interrupted(
         os.kill(os.getpid(), signal.SIGINT)
 
     monkeypatch.setattr("nlos_cam.cli.view.say", fetch_and_interrupt)
+
     assert main(["view", str(saved)]) == 130
     assert fetched == [saved.read_bytes()]
 
@@ -343,6 +372,7 @@ def serve(
 def test_view_on_all_addresses_notes_who_can_see_it(printed: list[str]) -> None:
     serve(host=EVERYWHERE)
     line, note = printed
+
     assert "http://127.0.0.1:" in line
     assert "anyone" in note
 
@@ -350,6 +380,7 @@ def test_view_on_all_addresses_notes_who_can_see_it(printed: list[str]) -> None:
 def test_run_without_view_serves_nothing(printed: list[str]) -> None:
     serve(no_view=True, open_it=True)
     [line] = printed
+
     assert "http" not in line
     assert isinstance(viewer_of(RunControl(), no_view=True), NullViewer)
 
@@ -373,6 +404,7 @@ def taken_port(monkeypatch: pytest.MonkeyPatch) -> Iterator[int]:
 def test_view_moves_from_a_taken_port(printed: list[str], taken_port: int) -> None:
     serve()
     [line] = printed
+
     assert f"{taken_port} is taken" in line
     assert f"127.0.0.1:{taken_port}/" not in line
 
@@ -391,6 +423,7 @@ def test_view_opens_a_browser_or_notes_that_it_cannot(
         "nlos_cam.cli.view.opened_in_browser", lambda address: asked.append(address) or opens
     )
     serve(open_it=True)
+
     assert asked[0].startswith("http://127.0.0.1:")
     assert ["browser" in line for line in printed[1:]] == [True] * (not opens)
 
@@ -410,4 +443,5 @@ def test_browser_opens_only_with_a_desktop(
     monkeypatch.setattr("nlos_cam.cli.view.sys", SimpleNamespace(platform="linux"))
     monkeypatch.setattr("nlos_cam.cli.view.os.environ", desktop)
     monkeypatch.setattr("nlos_cam.cli.view.webbrowser.open", Mock(**answer))
+
     assert opened_in_browser("http://127.0.0.1:9090/") == opened

@@ -88,8 +88,11 @@ def does(monkeypatch: Patch) -> Does:
 
 def test_command_prints_its_sentence_or_one_json_object(does: Does, shown: Run, run: Run) -> None:
     does(lambda: None)
+
     assert shown("act").out == "1 done\n"
+
     does(lambda: sys.stdout.write("a line of the command's own\n"))
+
     assert run("act", "--count", "3") == {"count": 3}
 
 
@@ -100,6 +103,7 @@ def test_foreseen_error_has_code_and_line(
     does: Does, shown: Run, run: Run, kind: type[Exception], code: int
 ) -> None:
     does(kind(message := "a depth of [3] m\nin [red]"))
+
     assert shown("act", code=code) == ("", "error: a depth of [3] m in [red]\n")
     assert run("act", code=code) == {"error": {"type": kind.__name__, "message": message}}
 
@@ -115,6 +119,7 @@ FILE = (errno.EACCES, errno.ENOENT, errno.EISDIR)
 def test_system_error_names_file_and_reason(does: Does, run: Run, code: int, kind: str) -> None:
     does(OSError(code, os.strerror(code), "out/F.npz"))
     error = run("act", code=1 if code in DISK else 4)["error"]
+
     assert error["type"] == kind
     assert "out/F.npz" in error["message"]
     assert os.strerror(code) in error["message"]
@@ -160,16 +165,22 @@ def test_progress_prints_lines_where_stderr_is_no_terminal(capsys: Capsys) -> No
         bar.update(bar.add_task("rendering", total=4), completed=3)
         while "rendering" not in (shown := capsys.readouterr().err):
             time.sleep(0.001)
+
     assert set(shown.splitlines()) == {"rendering: 3/4, 0 s"}
+
     with common.progress() as bar:
         bar.add_task("short")
+
     assert capsys.readouterr().err == ""
 
 
 def test_quiet_prints_results_and_errors_only(does: Does, shown: Run) -> None:
     does(lambda: say("a note"))
+
     assert shown("-q", "act") == ("1 done\n", "")
+
     does(errors.SceneError("no light"))
+
     assert shown("act", "--quiet", code=1) == ("", "error: no light\n")
 
 
@@ -188,6 +199,7 @@ def test_ctrl_c_while_loading_exits_with_130(monkeypatch: Patch) -> None:
         return build_app("devices")
 
     monkeypatch.setattr(module, "build_app", interrupted)
+
     assert main(["live"]) == 130
 
 
@@ -195,6 +207,7 @@ def test_ctrl_c_while_loading_exits_with_130(monkeypatch: Patch) -> None:
 def test_wrong_usage_exits_with_2(does: Does, shown: Run, arguments: str) -> None:
     does(lambda: None)
     out, err = shown(*arguments.split(), code=2)
+
     assert (out, bool(err)) == ("", True)
 
 
@@ -207,6 +220,7 @@ def test_console_script_exits_with_the_code(does: Does, monkeypatch: Patch, caps
             run_script()
     finally:
         signal.signal(signal.SIGINT, before)
+
     assert caught.value.code == 3
     assert "no device" in capsys.readouterr().err
 
@@ -227,7 +241,9 @@ def test_interruption_while_python_imports_is_one_line(module_name: str) -> None
     )
     line = [sys.executable, "-c", program, "scenes"]
     ended = subprocess.run(line, check=False, capture_output=True, text=True, timeout=120)
-    assert (ended.returncode, ended.stdout) == (130, "")
+
+    assert ended.returncode == 130
+    assert ended.stdout == ""
     assert len(ended.stderr.splitlines()) == 1
     assert ended.stderr.startswith("interrupted")
 
@@ -246,17 +262,23 @@ def leaves(app: typer.Typer, path: str = "") -> list[tuple[str, object]]:
 def test_help_names_every_command_with_json_and_version(shown: Run) -> None:
     page = shown("--help").out
     named = "devices doctor capture calibrate live replay render dataset train evaluate tradeoff"
+
     assert not [name for name in {*named.split(), *COMMANDS} if name not in page]
+
     commands = leaves(build_app())
+
     assert len(commands) >= 10
+
     for name, callback in commands:
         assert "json" in getattr(callback, "__annotations__", {}), name
+
     assert shown("--version").out == shown("-V").out == f"nlos-cam {version('nlos-cam')}\n"
 
 
 @pytest.mark.parametrize("command", COMMANDS)
 def test_command_table_names_the_right_module(command: str) -> None:
     names = {name for name, _ in leaves(build_app(command))}
+
     assert any(name.split()[0] == command for name in names)
     assert names <= {name for name, _ in leaves(build_app())}
 
@@ -266,22 +288,25 @@ def test_option_help_has_placeholders_and_ranges_in_words(shown: Run) -> None:
     plain_help(tree)
     parameters = tree.commands["capture"].params  # type: ignore[attr-defined]
     options = {parameter.name: parameter for parameter in parameters}
-    assert (options["seconds"].metavar, options["takes"].metavar, options["overwrite"].metavar) == (
-        "SECONDS",
-        "N",
-        "",
-    )
+
+    assert options["seconds"].metavar == "SECONDS"
+    assert options["takes"].metavar == "N"
+    assert options["overwrite"].metavar == ""
     assert options["takes"].help.endswith("(1 to 9999).")
     assert not {"<bool>", "<=", ">="} & {*shown("capture", "--help").out.replace("[", " ").split()}
+
     texts = {(1, 65535): "1 to 65535", (0.1, None): "at least 0.1", (None, 5): "at most 5"}
     texts |= dict.fromkeys([(1 / 30, 1e9), (0, None)], "")  # bounds against nonsense are left out
+
     assert {bounds: range_text(*bounds) for bounds in texts} == texts
 
 
 def test_output_path_refuses_read_only_folder(tmp_path: Path, monkeypatch: Patch) -> None:
     """The system's answer is replaced, since the tests may run as a user who may write anywhere."""
     out = tmp_path / "wall.toml"
+
     assert common.output_path(out, "wall", ".toml", overwrite=False) == out
+
     monkeypatch.setattr(os, "access", lambda path, mode: not (path == tmp_path and mode == os.W_OK))
     with pytest.raises(errors.OutputExistsError, match=r"wall\.toml"):
         common.output_path(out, "wall", ".toml", overwrite=True)
@@ -292,9 +317,12 @@ def test_table_on_a_narrow_terminal_is_blocks_of_lines(monkeypatch: Patch, capsy
     table.add_row("sim", "", "simulated: the paper's rig")
     monkeypatch.setenv("COLUMNS", "30")
     common.show(table)
+
     assert capsys.readouterr().out == "camera: sim\nname: simulated: the paper's rig\n\n"
+
     monkeypatch.setenv("COLUMNS", "80")
     common.show(table)
+
     assert "serial" not in capsys.readouterr().out
 
 
@@ -303,6 +331,7 @@ def test_printed_text_is_literal_unless_marked(capsys: Capsys) -> None:
     finish({}, as_json=False, text="[bold]good[/]", marked=True)
     say("kept in [red]")
     say_error("a:smile:b")
+
     assert capsys.readouterr() == (
         "wrote runs/[bold]x\ngood\n",
         "kept in [red]\nerror: a:smile:b\n",
@@ -322,7 +351,9 @@ def test_help_groups_commands_and_imports_nothing_heavy() -> None:
         for name, parts in groups.items()
         for below in [[]] + [[part] for part in parts]
     ]
+
     assert len(lines) > len(COMMANDS)
+
     program = (
         "import sys; from nlos_cam.cli.main import main; "
         "print([main(line) for line in ([], ['-h'], ['--help'])], *sys.modules); "
@@ -332,10 +363,13 @@ def test_help_groups_commands_and_imports_nothing_heavy() -> None:
         [sys.executable, "-c", program], capture_output=True, text=True, check=True, timeout=120
     )
     pages, separator, rest = ended.stdout.partition("[0, 0, 0] ")
+
     assert separator
     assert all(pages.count(row.group) >= 3 for row in COMMANDS.values())
+
     first = rest.partition("\n")[0]
     last = rest.rstrip().rpartition("\n")[2]
+
     assert not {f"nlos_cam.cli.{name}" for name in ("capture", "live", "train")} & {*first.split()}
     assert last.count("0, ") + 1 == len(lines)
     assert not HEAVY & {*first.split(), *last.split()}
@@ -369,6 +403,7 @@ def test_interruption_that_python_ignores_is_raised_again() -> None:
     hook = sys.unraisablehook
     with pytest.raises(KeyboardInterrupt, match="kept"):
         lose_a_signal()
+
     assert sys.unraisablehook is hook
 
 
@@ -379,7 +414,9 @@ def test_little_address_space_is_one_line_at_once(
     monkeypatch: Patch, shown: Run, command: str, needed: int
 ) -> None:
     monkeypatch.setattr(resource, "getrlimit", lambda _: (needed - 1, needed))
+
     assert f"is {(needed >> 20) - 1} MiB" in shown(command, "--help", code=1).err
+
     monkeypatch.setattr(resource, "getrlimit", lambda _: (needed, needed))
     shown(command, "--help")
 
@@ -390,6 +427,7 @@ def test_error_is_printed_without_rich_where_memory_is_short(
 ) -> None:
     monkeypatch.setattr(common.stderr, "print", Mock(side_effect=error))
     say_error("out of\nmemory")
+
     assert capfd.readouterr().err == "error: out of memory\n"
 
 
@@ -406,6 +444,7 @@ def test_lack_of_memory_is_one_line(monkeypatch: Patch, shown: Run, error: Excep
         raise error from (MemoryError() if str(error) == "of one" else None)
 
     monkeypatch.setattr("nlos_cam.cli.main.build_app", lack)
+
     assert shown("rigs", code=1).err.startswith("error: out of memory: close")
 
 

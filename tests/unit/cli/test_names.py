@@ -33,6 +33,7 @@ def nowhere(tmp_path: Path) -> Path:
 
 def test_error_shows_control_characters_as_escapes(shown: Run) -> None:
     error = shown("info", f"{OBEYED}.bag", code=4).err
+
     assert r"a\x1b[2J\x07\u202eb.bag" in error
     assert "\x1b" not in error
 
@@ -52,6 +53,7 @@ def test_foreign_name_works_in_a_plain_locale(tmp_path: Path) -> None:
         capture_output=True,
         check=False,
     )
+
     assert ended.returncode == 0, ended.stderr
     assert ended.stdout.startswith(b"\\udcff.bag: recording")
 

@@ -24,11 +24,16 @@ def test_repair_reports_new_file_and_overwrites_if_asked(
     (out := tmp_path / "good.bag").write_bytes(b"mine")
     command = "repair", noise_bags["packed-unindexed"], "--out", out
     error = run(*command, code=1)["error"]
-    assert (error["type"], out.read_bytes()) == ("OutputExistsError", b"mine")
+
+    assert error["type"] == "OutputExistsError"
+    assert out.read_bytes() == b"mine"
+
     found = run(*command, "--overwrite")
+
     assert set(found) == {"recovered_frames", "chunks", "damaged", "out"}
     assert found["recovered_frames"] == verify(out).streams
-    assert (found["damaged"], found["out"]) == (1, str(out))
+    assert found["damaged"] == 1
+    assert found["out"] == str(out)
     assert found["chunks"] > 2
 
 
@@ -36,16 +41,21 @@ def test_repair_prints_what_was_recovered_and_lost(
     shown: Run, noise_bags: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     printed = shown("repair", noise_bags["packed"], "--out", tmp_path / "a.bag").out
+
     assert all(word in printed for word in ("40 depth", "40 infrared", "40 confidence", " 0 bytes"))
+
     content = bytearray(noise_bags["packed"].read_bytes())
     for at in range(1_000_000, len(content), 500_000):
         content[at] ^= 1
     (tmp_path / "bad.bag").write_bytes(content)
     repair = "repair", tmp_path / "bad.bag", "--overwrite", "--out", tmp_path / "b.bag"
     printed = shown(*repair).out
+
     assert " 0 bytes" not in printed
     assert str(tmp_path / "b.bag") in printed
+
     monkeypatch.setattr(recordings, "MAX_REPORTED", 1)  # much damage in few lines
+
     assert 1 < len(shown(*repair).out.splitlines()) < len(printed.splitlines())
 
 
@@ -62,6 +72,7 @@ def test_repair_interrupted_is_exit_code_130_without_output(
 
     monkeypatch.setattr("nlos_cam.recording.repair_recording", interrupted)
     run("repair", noise_bags["plain"], "--out", tmp_path / "a.bag", code=130)
+
     assert list(tmp_path.iterdir()) == []
 
 
@@ -71,8 +82,11 @@ def test_export_reports_its_files_and_overwrites_if_asked(
     (tmp_path / "depth.csv").write_text("precious")
     command = "export", noise_bag, "--out", tmp_path, "--ply", "--every", "10"
     run(*command, code=1)
+
     assert (tmp_path / "depth.csv").read_text() == "precious"
+
     found = run(*command, "--overwrite")
+
     assert (tmp_path / "depth.csv").read_text() != "precious"
     assert found == {
         "frames": {"depth": 2, "infrared": 2, "confidence": 2, "points": 2},
@@ -85,12 +99,15 @@ def test_export_of_wrong_streams_or_damage_is_exit_code_4(
     noise_bag: Path, tmp_path: Path, shown: Run
 ) -> None:
     out = "--out", tmp_path / "out"
+
     assert "color" in shown("export", noise_bag, "--streams", "color", *out, code=4).err
     assert list(tmp_path.iterdir()) == []
+
     content = bytearray(noise_bag.read_bytes())
     middle = len(content) // 3
     content[middle : middle + 200] = bytes(200)
     (tmp_path / "damaged.bag").write_bytes(content)
+
     assert "nlos-cam repair" in shown("export", tmp_path / "damaged.bag", *out, code=4).err
 
 
@@ -101,11 +118,13 @@ def test_export_writes_hidden_surfaces_of_a_replay(tmp_path: Path, run: Run) -> 
     result = tmp_path / "reconstruction.npz"
     np.savez(result, depth_m=depth_m, uncertainty_m=depth_m, frame_number=[5, 6], **box)  # pyright: ignore[reportArgumentType]
     export = "export", result, "--out", tmp_path / "out", "--object"
+
     assert run(*export, "glb,points")["frames"] == {"objects": 1}
     assert {file.name for file in (tmp_path / "out").iterdir()} == {
         "000005.glb",
         "000005-points.ply",
     }
+
     for formats, word in (("", "--object ply"), ("ply,fbx", "fbx")):
         assert word in run(*export, formats, "--overwrite", code=2).err
 
@@ -120,6 +139,7 @@ def test_info_prints_facts_and_next_commands(noise_bag: Path, shown: Run) -> Non
     ):
         assert words in printed
     texts = {0: "0 bytes", 999: "999 bytes", 1_780_000: "1.78 MB", 48 * 10**9: "48 GB"}
+
     assert {size: _format_size(size) for size in texts} == texts
 
 
@@ -128,8 +148,10 @@ def test_info_of_damaged_or_unknown_file_is_exit_code_4(
 ) -> None:
     (cut := tmp_path / "cut.bag").write_bytes(noise_bag.read_bytes()[:9_000])
     found = run("info", cut, code=4)
+
     assert not found["whole"]
     assert "nlos-cam repair" in found["problem"]
+
     (tmp_path / "notes.txt").write_text("")
     for name in ("notes.txt", "nothing.bag"):
         out, err = shown("info", tmp_path / name, code=4)

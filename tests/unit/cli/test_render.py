@@ -56,11 +56,13 @@ def test_render_writes_maps(rendered: Run, tmp_path: Path) -> None:
 
     result, file = rendered("cup", "--out", out)
 
-    assert (result["accuracy"], result["out"]) == ("draft", str(out))
+    assert result["accuracy"] == "draft"
+    assert result["out"] == str(out)
     assert result["seconds"] > 0
     assert file["depth_m"].shape == file["intensity"].shape == file["margin"].shape == (64, 80)
     assert file["object_depth_m"].shape == (64, 64)
-    assert (str(file["rig_name"]), str(file["rig_checksum"])) == (RIG.name, RIG.checksum)
+    assert str(file["rig_name"]) == RIG.name
+    assert str(file["rig_checksum"]) == RIG.checksum
 
 
 def test_render_writes_picture(
@@ -88,6 +90,7 @@ def test_render_of_a_depth_map_equals_the_library(rendered: Run) -> None:
     np.save("thing.npy", depth_m)
     _, file = rendered("thing.npy")
     expected = render(Scene(RIG, depth_m), "draft")
+
     np.testing.assert_array_equal(file["depth_m"], expected.depth_m)
     np.testing.assert_array_equal(file["intensity"], expected.intensity)
     np.testing.assert_array_equal(file["object_depth_m"], depth_m)
@@ -102,6 +105,7 @@ def test_render_places_its_object_as_a_scene_file_does(mesh: str, rendered: Run,
     options = [
         text for field, value in fields.items() for text in (f"--{field.replace('_', '-')}", value)
     ]
+
     np.testing.assert_array_equal(
         rendered(name, *options)[1]["object_depth_m"], _of_scene(**{kind: name, **fields})
     )
@@ -110,8 +114,11 @@ def test_render_places_its_object_as_a_scene_file_does(mesh: str, rendered: Run,
 def test_render_takes_the_rig_of_a_scene_and_reports_its_file(rendered: Run) -> None:
     lent = SceneFile(name="a scene", rig=RIG.model_copy(update={"name": "lent"}))
     Path("scene.toml").write_text(dump_toml(lent), encoding="utf-8")
+
     assert str(rendered("hat", "--scene", "scene.toml")[1]["rig_name"]) == "lent"
+
     result, _ = rendered("cup", "--out", "other")
+
     assert Path(result["out"]).is_file()
 
 
@@ -130,13 +137,17 @@ def _included(result: dict[str, Any]) -> set[str]:
 @pytest.mark.slow
 def test_render_takes_a_material_and_an_albedo(plate: str, rendered: Run) -> None:
     result, _ = rendered(plate, "--material", "phong", "--specular", "0.3", "--exponent", "4")
+
     assert "brdf" in _included(result)
+
     (_, black), (_, white) = (rendered(plate, "--albedo", albedo) for albedo in "01")
+
     assert (white["intensity"] > black["intensity"]).any()
 
 
 def test_render_with_three_albedos_gives_color(plate: str, rendered: Run) -> None:
     result, file = rendered(plate, "--albedo", "0.9,0.5,0.1")
+
     assert "colour" in _included(result)
     assert file["colour"].shape == (64, 80, 3)
     assert (file["colour"][..., 0] >= file["colour"][..., 2]).all()
@@ -145,15 +156,22 @@ def test_render_with_three_albedos_gives_color(plate: str, rendered: Run) -> Non
 
 def test_render_takes_effects_radiometry_pulse_and_beams(plate: str, rendered: Run) -> None:
     only, _ = rendered(plate, "--effects", "three-bounce")
+
     assert _included(only) & {"direct", "occluder", "three-bounce"} == {"three-bounce"}
+
     plain, sharp = rendered(plate)
     _, lambertian = rendered(plate, "--radiometry", "lambertian")
-    assert (str(sharp["radiometry"]), str(lambertian["radiometry"])) == ("paper", "lambertian")
+
+    assert str(sharp["radiometry"]) == "paper"
+    assert str(lambertian["radiometry"]) == "lambertian"
     assert (
         lambertian["intensity"].max() > 1.5 * sharp["intensity"].max()
     )  # 1/pi in place of 1/(2 pi)
+
     wide, blurred = rendered(plate, "--pulse-ns", "1")
+
     assert "pulse" in _included(wide) - _included(plain)
+
     for _, other in ((wide, blurred), rendered(plate, "--beams-per-cell", "2")):
         assert not np.array_equal(sharp["intensity"], other["intensity"])
 
@@ -183,11 +201,16 @@ def _of_scene(rig: Rig = RIG, **fields: Any) -> np.ndarray:
 def test_hidden_depth_takes_a_depth_map_as_it_is(capsys: pytest.CaptureFixture[str]) -> None:
     depth = _of_scene(category="hat")
     np.save("hat.NPY.npy", depth)
+
     np.testing.assert_array_equal(hidden_depth("hat.NPY.npy", RIG, {"size_m": None}), depth)
     assert capsys.readouterr().err == ""
+
     np.save("none [b].npy", np.full((64, 64), np.nan))
+
     assert np.isnan(hidden_depth("none [b].npy", RIG, {})).all()
+
     warning = capsys.readouterr().err
+
     assert ("none [b].npy" in warning, warning.count("\n")) == (True, 1)
 
 
@@ -198,6 +221,7 @@ def test_hidden_depth_warns_of_object_cut_or_flattened_by_box(
     half = hidden_depth(plate, RIG, {"size_m": 0.2, "x_m": 0.125})  # the box ends in its middle
     flat = hidden_depth(mesh, RIG, {"tilt_y_deg": 90, "front_m": 0.2})
     of_half, of_flat = capsys.readouterr().err.splitlines()
+
     assert f"{plate}: 50%" in of_half
     assert np.isfinite(half[:, -1]).any()
     assert np.isnan(half[:, 0]).all()

@@ -123,9 +123,12 @@ def _same(one: Path, other: Path, *parts: str) -> list[bool]:
 def test_train_vae_answers_with_folder_and_figures(go: Run, out: Path) -> None:
     answer = go("vae")
     record = load_record(out)
-    assert (set(answer), answer["out"]) == ({"out", *FIGURES}, str(out))
+
+    assert set(answer) == {"out", *FIGURES}
+    assert answer["out"] == str(out)
     assert record.figures == {name: answer[name] for name in FIGURES}
-    assert (record.rig_name, record.rig_checksum) == (RIG.name, RIG.checksum)
+    assert record.rig_name == RIG.name
+    assert record.rig_checksum == RIG.checksum
     assert len((out / "log.csv").read_text(encoding="utf-8").splitlines()) == 3
 
 
@@ -135,9 +138,13 @@ def test_train_follows_shared_options(go: Run, out: Path, monkeypatch: Patch) ->
         loop, "compile_network", lambda network: compiled.append(network) or network
     )
     go("vae", "--budget", "0.5", "--objects", "6", "--compile")
+
     assert len(compiled) == 1
+
     recipe = load_record(out).vae_recipe
-    assert (recipe.epochs, recipe.objects) == (1, 6)
+
+    assert recipe.epochs == 1
+    assert recipe.objects == 6
     assert "0.5" in recipe.deviations[-1]
 
 
@@ -163,6 +170,7 @@ def test_train_vae_leaves_out_categories_of_recipe(
         RECIPES["vae"] + 'left_out = ["car", "boat"]\nbackgrounds = 0.25\n'
     )
     go("vae", "--recipe", folder / "left-out.toml")
+
     assert shown == [{*CATEGORIES, "0.25"} - {"car", "boat"}] * 2
 
 
@@ -176,9 +184,12 @@ def test_interrupted_train_exits_130_and_resumes_exactly(
         patch.setattr(command, "stop_on_signals", lambda _: nullcontext(stop))
         patch.setattr(command, "say", messages.append)
         go("vae", code=130)
+
     assert "step 1" in messages[-1]
     assert not (out / "decoder.safetensors").exists()
+
     go("vae")
+
     assert _same(out, folder / "vae", "encoder", "decoder") == [True, True]
 
 
@@ -187,18 +198,21 @@ def test_train_compressor_uses_shipped_vae_and_streams(
 ) -> None:
     monkeypatch.setattr(runs, "weights_folder", lambda *_: folder / "vae")
     go("two")
+
     assert exported[-1] == out
     assert _same(out, folder / "two", "compressor") == [True]
+
     record = load_record(out)
+
     assert [run.task for run in record.runs] == ["vae", "compressor"]
-    assert (record.rig_name, record.rig_checksum, record.input) == (
-        "bench",
-        PLAN.rig.checksum,
-        "raw maps",
-    )
+    assert record.rig_name == "bench"
+    assert record.rig_checksum == PLAN.rig.checksum
+    assert record.input == "raw maps"
     assert _same(out, folder / "vae", "encoder", "decoder") == [True, True]
+
     shutil.rmtree(out)
     go("two", "--stream")
+
     assert _same(out, folder / "two", "preprocess") == [True]
 
 
@@ -208,11 +222,15 @@ def test_joint_keeps_encoder_and_one_step_has_none(
 ) -> None:
     monkeypatch.setattr(runs, "export_folder", models.export_folder)
     go("joint", "--weights", folder / "two")
+
     assert (out / "network.onnx").is_file()
     assert _same(out, folder / "two", "decoder", "encoder") == [False, True]
+
     go("one", "--out", one := out.with_name("one"))
+
     assert load_record(one).vae_recipe is None
     assert not (one / "encoder.safetensors").exists()
+
     load_pipeline(one)
 
 
@@ -223,10 +241,13 @@ def test_train_on_difference_maps_records_input(
     flat = np.zeros((64, 80), np.float32)
     monkeypatch.setattr(training_maps, "render_bare_wall", lambda _: (flat, flat + 3))
     go("difference", "--vae", folder / "vae")
+
     assert load_record(out).input == "difference maps"
+
     raw, difference = (
         load_file(where / "preprocess.safetensors") for where in (folder / "two", out)
     )
+
     torch.testing.assert_close(
         raw["mean"] - difference["mean"], torch.tensor([0.0, 0.0, 3.0, 3.0]), atol=1e-4, rtol=0
     )
@@ -244,9 +265,12 @@ def test_train_transfer_reports_both_figures_and_keeps_decoder(
     (other / "SHA256SUMS").unlink()
     go("transfer", "--weights", other, code=4)
     answer = go("transfer", "--weights", other, "--partial")
+
     assert set(answer) == {"out", *FIGURES, "before"}
     assert answer["before"]["held_out_loss"] != answer["held_out_loss"]
+
     record = load_record(out)
+
     assert record.runs == [*load_record(folder / "two").runs, record.transfer_recipe]
     assert _same(out, folder / "two", "decoder", "encoder") == [True, True]
     assert (out / "all-layers" / "log.csv").exists()
@@ -271,6 +295,7 @@ def test_train_refuses_options_that_do_not_fit(
 ) -> None:
     monkeypatch.setattr(torch.cuda, "device_count", lambda: 0)
     monkeypatch.chdir(folder)
+
     assert words in go(*arguments.split(), code=code)["error"]["message"]
     assert not out.exists()
 
@@ -281,8 +306,10 @@ def test_train_doubt_writes_weights_with_doubt_once(go: Run, folder: Path, out: 
     answer = go("doubt", "--weights", weights)
     load_pipeline(out)
     record = models.load_uncertainty_network(out)[1]
+
     assert record.learnt == list(TRAINING_OUTLIERS)
     assert record.figures == {"held_out_loss": answer["held_out_loss"]}
+
     for again in (out, weights):
         assert (
             "--out" in go("doubt", "--weights", weights, "--out", again, code=1)["error"]["message"]
@@ -309,6 +336,7 @@ def test_train_doubt_refuses_other_maps_or_rig(
     untrained_weights(
         others := tmp_path / "others", rig=PLAN.rig.model_copy(update={"wall": wall}), maps=maps
     )
+
     assert (
         word in go("doubt", "--weights", others, "--objects", objects, code=1)["error"]["message"]
     )
@@ -328,6 +356,7 @@ def test_train_doubt_ignores_invisible_outliers(go: Run, folder: Path, monkeypat
     )
     outliers = ~np.isin(every.kind, [EMPTY, ORDINARY])
     visible = every.cells > 0
+
     assert training.nothing.sum() == 14
     assert (~training.nothing & ~training.outside).sum() == 8 + (
         (every.kind == ORDINARY) & visible
@@ -349,7 +378,9 @@ def test_train_quality_replaces_a_damaged_model(
     monkeypatch.setattr("nlos_cam.dataset.quality_set", lambda *_: known)
     monkeypatch.setattr("nlos_models.training.quality.MIN_STEPS", 20)
     answer = run("train", "quality", "--weights", weights, "--dataset", tmp_path)
-    assert (answer["weights"], answer["objects"]) == (str(weights), 120)
+
+    assert answer["weights"] == str(weights)
+    assert answer["objects"] == 120
     assert models.load_uncertainty_model(weights, tmp_path).quality.record.objects == 120
     assert (
         "came with"

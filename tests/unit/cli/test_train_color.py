@@ -93,6 +93,7 @@ def test_color_training_is_noted_as_simulation_only(trained: Trained, out: Path)
 
     assert trained.answer["note"] == SIMULATION_ONLY
     assert (record.color, record.note) == (True, SIMULATION_ONLY)
+
     with pytest.raises(CheckpointError, match="simulation only"):
         load_reconstructor(out, out.with_name("onnx"))
 
@@ -148,6 +149,7 @@ def test_training_of_depth_refuses_weights_of_color(go: Run, first: Path) -> Non
     refused = go("transfer-of-depth", data="depth", weights=first.name, code=1)
 
     message = refused["error"]["message"]
+
     assert str(first) in message
     assert "simulation only" in message
 
@@ -168,5 +170,6 @@ def test_train_refuses_mixture_of_depth_and_color(
 ) -> None:
     with pytest.raises(RecordingError, match="simulation only"):
         open_dataset(folder / "data")
+
     assert word in go(recipe, **options, code=code)["error"]["message"]
     assert not out.exists()

@@ -45,7 +45,9 @@ def test_command_runs_without_the_extra_or_names_it_in_one_line(
 ) -> None:
     command = [sys.executable, "-c", PROGRAM, *line.split()]
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
+
     assert done.returncode == needs_it, done.stderr
+
     if needs_it:
         (error,) = [line for line in done.stderr.splitlines() if "error:" in line]
         assert 'pip install "nlos-cam[train]"' in error
@@ -65,6 +67,7 @@ def test_list_has_a_name_and_a_line_for_each(
     kind: str, name: str, shown: Callable[..., Any]
 ) -> None:
     rows = [line.split(maxsplit=1) for line in shown(kind).out.splitlines() if line]
+
     assert name in {row[0] for row in rows}
     assert all(len(row) == 2 for row in rows)
     assert shown(kind, "--json").out.count('"description"') == len(rows)

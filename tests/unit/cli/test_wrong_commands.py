@@ -211,9 +211,12 @@ def test_wrong_command_has_its_exit_code_and_one_line(
     monkeypatch.chdir(folder)
     monkeypatch.setenv("XDG_CONFIG_HOME", str(folder))
     before = _listing(folder)
+
     assert main(["--json", *shlex.split(line)]) == code
+
     shown = capsys.readouterr()
     errors = [text for text in shown.err.splitlines() if text.startswith("error: ")]
+
     assert len(errors) == 1
     assert word in errors[0]
     assert not [phrase for phrase in INTERNALS if phrase in shown.err]

@@ -107,8 +107,13 @@ def test_build_stores_samples_in_seed_order(tmp_path: Path) -> None:
     built = _build(tmp_path)
 
     found = open_dataset(tmp_path)
-    assert (built.objects, built.made, built.damaged) == (COUNT, COUNT, ())
-    assert (len(found), found.plan) == (COUNT, PLAN)
+
+    assert built.objects == COUNT
+    assert built.made == COUNT
+    assert built.damaged == ()
+    assert len(found) == COUNT
+    assert found.plan == PLAN
+
     for name, values in samples_of(range(40, 40 + COUNT)).items():
         np.testing.assert_array_equal(found.column(name), values)
 
@@ -119,6 +124,7 @@ def test_build_reports_progress(tmp_path: Path) -> None:
     _build(tmp_path, on_progress=lambda *at: progress.append(at))
 
     done = (0, 2, 4, 5, 7, 9, 10, 12, 14, 15, 17, 19, 20, 22, 23)
+
     assert progress == [(count, COUNT) for count in done]
 
 
@@ -132,6 +138,7 @@ def test_interrupted_build_resumes_without_making_a_sample_twice(
     with pytest.raises(KeyboardInterrupt):
         _build(tmp_path, farm)
     kept = _bytes(tmp_path)
+
     assert farm.closed
     assert kept.items() <= whole.items()
 
@@ -139,6 +146,7 @@ def test_interrupted_build_resumes_without_making_a_sample_twice(
 
     again = [seed for piece in rest.made for seed in piece]
     lacking = COUNT - sum(3 if name == LAST else 5 for name in kept)
+
     assert _bytes(tmp_path) == whole
     assert len(again) == len(set(again)) == built.made == lacking
 
@@ -165,7 +173,8 @@ def test_build_replaces_damaged_shard(finished: Path, whole: Shards, keep: float
     built = _build(finished, on_warning=warnings.append)
 
     assert [str(path) in line for line in warnings] == [True]
-    assert (built.made, built.damaged) == (5, (path,))
+    assert built.made == 5
+    assert built.damaged == (path,)
     assert _bytes(finished) == whole
 
 
@@ -177,7 +186,8 @@ def test_build_leaves_damaged_shard_that_it_does_not_need(finished: Path, whole:
     built = _build(finished, count=10, on_warning=warnings.append)
 
     assert [str(path) in line for line in warnings] == [True]
-    assert (built.made, built.damaged) == (0, ())
+    assert built.made == 0
+    assert built.damaged == ()
     assert _bytes(finished) != whole
 
 
@@ -185,6 +195,7 @@ def test_build_leaves_damaged_shard_that_it_does_not_need(finished: Path, whole:
 def test_build_grows_dataset_to_count(tmp_path: Path, whole: Shards, first: int) -> None:
     """7 objects leave a shard half full, which a larger count must fill."""
     _build(tmp_path, count=first)
+
     assert len(open_dataset(tmp_path)) == first
 
     grown = _build(tmp_path)
@@ -199,7 +210,8 @@ def test_build_checks_finished_dataset_and_leaves_it_alone(finished: Path, whole
 
     built = _build(finished, farm, on_check=lambda *at: checked.append(at))
 
-    assert (farm.made, built.made) == ([], 0)
+    assert farm.made == []
+    assert built.made == 0
     assert checked == [(k, 5) for k in range(1, 6)]
     assert _bytes(finished) == whole
 
@@ -261,7 +273,9 @@ def test_build_keeps_shards_if_object_fails(tmp_path: Path, whole: Shards) -> No
 
     assert farm.closed
     assert len(_bytes(tmp_path)) == 1
+
     _build(tmp_path)
+
     assert _bytes(tmp_path) == whole
 
 
@@ -277,7 +291,9 @@ def test_build_keeps_shards_if_disk_is_full(
 
     assert farm.closed
     assert len(list(tmp_path.glob(SHARD_PATTERN))) == 3
+
     _build(tmp_path)
+
     assert _bytes(tmp_path) == whole
 
 
@@ -393,6 +409,7 @@ def test_processes_make_the_samples_of_one_process(tmp_path: Path) -> None:
     found = open_dataset(tmp_path)
     for name, values in make_samples(PLAN, range(40, 44)).items():
         np.testing.assert_array_equal(found.column(name), values)
+
     assert not active_children()
 
 
@@ -512,6 +529,7 @@ def test_ray_farm_makes_every_piece_once() -> None:
     made = dict(RayFarm(FakeRay(), "auto")(PLAN, PIECES))
 
     assert sorted(made, key=lambda piece: piece.start) == PIECES
+
     for piece, samples in made.items():
         np.testing.assert_array_equal(samples["depth_m"], samples_of(piece)["depth_m"])
 
@@ -529,6 +547,7 @@ def test_closed_ray_farm_leaves_cluster() -> None:
     ray = FakeRay()
     making = RayFarm(ray, "auto")(PLAN, PIECES)
     next(making)
+
     assert ray.running
 
     making.close()
@@ -582,4 +601,5 @@ def test_local_cluster_makes_equal_samples() -> None:
     done = subprocess.run(
         [sys.executable, "-c", LOCAL], capture_output=True, text=True, check=False, timeout=280
     )
+
     assert done.returncode == 0, done.stdout + done.stderr

@@ -209,7 +209,8 @@ def test_read_array_returns_what_was_stored(
     with h5py.File(tmp_path / "a.h5") as file:
         found = read_array(file, "a")
 
-    assert (found.dtype, found.shape) == (values.dtype, values.shape)
+    assert found.dtype == values.dtype
+    assert found.shape == values.shape
     np.testing.assert_array_equal(found, values)
 
 
@@ -263,7 +264,8 @@ def test_shard_describes_itself(shard: Path) -> None:
     with h5py.File(shard) as file:
         facts = dict(file.attrs)
 
-    assert (facts["first_seed"], facts["last_seed"]) == (40, 42)
+    assert facts["first_seed"] == 40
+    assert facts["last_seed"] == 42
     assert facts["package_version"] == nlos_cam.__version__
     assert facts["command"] == "nlos-cam dataset build"
     assert PLAN.rig.checksum in facts["plan"]

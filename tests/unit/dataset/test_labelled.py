@@ -76,6 +76,7 @@ def test_read_labelled_takes_maps_of_frames(paths: list[Path], noise_world: Any)
 
     images = [world.images(number) for number in (2, 7, 12, 17)]
     frames = [maps_from_frame(one.frame(world.rig.pinhole)) for one in images]
+
     np.testing.assert_array_equal(found.maps.depth_m[:4], [maps.depth_m for maps in frames])
     np.testing.assert_array_equal(found.maps.intensity[:4], [maps.intensity for maps in frames])
     assert found.rig == RIG
@@ -86,6 +87,7 @@ def test_read_labelled_pairs_frames_with_truth_of_their_label(paths: list[Path])
 
     assert found.label == ("slope",) * 4 + ("half",) * 4
     assert found.recording == ("a.bag",) * 4 + ("b.bag",) * 4
+
     for k, label in enumerate(found.label):
         image = image_from_depth(KNOWN[label], BOX).astype(np.float16)
         np.testing.assert_array_equal(found.object_depth_m[k], KNOWN[label])
@@ -114,6 +116,7 @@ def test_spread_chooses_frames_evenly(count: int, wanted: int) -> None:
 
     # Mirrored at both ends: neither end is left out.
     gaps = np.diff([-chosen[0] - 1, *chosen, 2 * count - chosen[-1]])
+
     assert np.ptp(gaps) <= 2
 
 
@@ -278,6 +281,7 @@ def test_truth_of_mesh_stands_at_its_pose(tmp_path: Path, mesh: str, named: str)
 
     x_m, y_m = cell_centers_m(BOX)
     rows, columns = np.nonzero(~np.isnan(depth_m))
+
     assert x_m[columns].mean() == pytest.approx(0.45 + 0.05, abs=0.002)
     assert y_m[rows].mean() == pytest.approx(-0.03, abs=0.002)
     assert np.ptp(x_m[columns]) == pytest.approx(0.1, abs=0.01)
@@ -369,6 +373,7 @@ def test_labelled_shards_are_read_as_written(tmp_path: Path, count: int) -> None
     maps = data.arrays()
     for name in ("depth_m", "intensity", "image"):
         np.testing.assert_array_equal(getattr(maps, name), getattr(samples.maps, name))
+
     assert tuple(data.column("category")) == samples.label
     np.testing.assert_array_equal(data.column("object_depth_m"), samples.object_depth_m)
 
@@ -377,7 +382,9 @@ def test_labelled_shards_name_their_rig_but_not_its_gain(tmp_path: Path) -> None
     write_shards(_samples(3), tmp_path)
 
     data = open_dataset(tmp_path)
-    assert (data.plan.rig, data.plan.accuracy) == (RIG, RECORDED)
+
+    assert data.plan.rig == RIG
+    assert data.plan.accuracy == RECORDED
     assert np.isnan(data.column("scene")).any(axis=0).sum() == 1
 
 

@@ -293,9 +293,11 @@ def test_samples_on_disk_makes_only_missing_samples(
     tmp_path: Path, pieces_made: list[tuple[str, int]]
 ) -> None:
     first = _on_disk(tmp_path, EMPTIES)
+
     assert pieces_made == [(EMPTY, 7), (EMPTY, 107)]
 
     both = _on_disk(tmp_path, WITH_FAR)
+
     assert pieces_made[2:] == [("far", 7)]
     np.testing.assert_array_equal(both.cells[:150], first.cells)
 

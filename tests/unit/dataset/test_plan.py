@@ -103,7 +103,8 @@ def test_older_plan_has_defaults_and_objects_of_first_version(
     older = DatasetPlan.from_provenance(json.dumps(older_facts))
 
     assert PLAN.differences(older) == ["objects"]  # the generators of the first version were others
-    assert (older.objects.categories, older.objects.version) == (FIRST_OBJECTS["categories"], 1)
+    assert older.objects.categories == FIRST_OBJECTS["categories"]
+    assert older.objects.version == 1
 
 
 def test_older_plan_that_names_categories_has_defaults(older_facts: dict[str, Any]) -> None:
@@ -152,9 +153,14 @@ def test_plan_of_scene_takes_all_but_the_object() -> None:
 
     plan = DatasetPlan.of_scene(scene, 3, accuracy="draft")
 
-    assert (plan.rig, plan.first_seed, plan.accuracy) == (scene.rig, 3, "draft")
-    assert (plan.sensor, plan.radiometry, plan.jump_m) == (scene.sensor, "lambertian", 0.03)
-    assert (plan.material, plan.objects) == (Material(kind="phong"), Objects())
+    assert plan.rig == scene.rig
+    assert plan.first_seed == 3
+    assert plan.accuracy == "draft"
+    assert plan.sensor == scene.sensor
+    assert plan.radiometry == "lambertian"
+    assert plan.jump_m == 0.03
+    assert plan.material == Material(kind="phong")
+    assert plan.objects == Objects()
 
 
 @pytest.fixture(scope="module")

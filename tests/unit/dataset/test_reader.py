@@ -65,7 +65,8 @@ def _assert_as_stored(found: MapBatch) -> None:
 
 
 def test_dataset_has_its_samples_and_plan(data: Dataset) -> None:
-    assert (len(data), data.plan) == (COUNT, PLAN)
+    assert len(data) == COUNT
+    assert data.plan == PLAN
 
 
 @pytest.mark.parametrize("name", MAP_CHANNELS)
@@ -94,6 +95,7 @@ def test_batches_are_samples_mirrored_at_random(data: Dataset) -> None:
     for found in batches:
         assert found.depth_m.dtype == found.image.dtype == torch.float32
         _assert_as_stored(found)
+
     assert 0.2 < torch.cat([found.mirrored for found in batches]).float().mean() < 0.8
 
 
@@ -143,6 +145,7 @@ def test_shards_are_read_once(data: Dataset, monkeypatch: pytest.MonkeyPatch) ->
     assert len(_every_row(data)) == COUNT
 
     paths = {call.args[0].path for call in read.call_args_list}
+
     assert read.call_count == len(paths) == len(data.shards)
 
 
@@ -192,6 +195,7 @@ def test_reader_opens_expected_maps_where_asked_alone(tmp_path: Path) -> None:
 
     with pytest.raises(RecordingError, match="without --expected-maps"):
         open_dataset(tmp_path)
+
     assert open_dataset(tmp_path, expected=True).plan.expected
 
 

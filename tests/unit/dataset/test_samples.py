@@ -99,6 +99,7 @@ def test_samples_are_equal_in_any_pieces(three: Samples) -> None:
     pieces = join_samples([make_samples(PLAN, [0]), make_samples(PLAN, [1, 2])])
 
     assert pieces.keys() == three.keys()
+
     for name, values in pieces.items():
         assert values.dtype == three[name].dtype
         np.testing.assert_array_equal(values, three[name])
@@ -119,7 +120,9 @@ def test_samples_are_rendered_with_pulse_and_radiometry_of_plan(
 
     make_samples(replace(PLAN, sensor=sensor, radiometry="lambertian", jump_m=0.5), [0])
 
-    assert (seen[0].pulse_ns, seen[0].radiometry, seen[0].jump_m) == (1.0, "lambertian", 0.5)
+    assert seen[0].pulse_ns == 1.0
+    assert seen[0].radiometry == "lambertian"
+    assert seen[0].jump_m == 0.5
 
 
 class Exposed(NamedTuple):
@@ -160,6 +163,7 @@ def test_noise_drawn_in_training_deviates_as_exposures(exposed: Exposed) -> None
 
     counts = torch.expm1(drawn[:, 1] + normal.median[1])
     ratio = exposed.intensity.std(0) / counts.std(0, correction=0).numpy()
+
     assert torch.equal(drawn[:, 0], maps[:, 0].expand(60, -1, -1))
     assert 0.97 < np.nanmedian(ratio) < 1.03
 
@@ -174,6 +178,7 @@ def test_noise_of_a_map_set_deviates_as_exposures(exposed: Exposed) -> None:
 
     spread = np.stack(drawn).std(0)
     ratio = exposed.intensity.std(0)[~empty] / spread[~empty]
+
     assert 0.97 < np.median(ratio) < 1.03
     np.testing.assert_array_equal(spread[empty], 0)
 
@@ -197,6 +202,7 @@ def test_noise_of_expected_maps_varies_cells_with_a_return_alone() -> None:
         plain = plain.flip(-2)
     changed = (noisy.intensity != plain)[0]
     empty = noisy.depth_m[0].isnan()
+
     assert changed[:, ~empty].any(1).all()
     assert not changed[:, empty].any()
 
@@ -278,7 +284,9 @@ def test_meshes_of_a_folder_are_hidden_by_seed(meshes: Path) -> None:
     found = _drawn(objects, 12)
 
     assert {name for name, _ in found} == {"cube.stl", "sub/ball.ply"}
+
     again = hidden_object(objects_from_folder(meshes), 3, BOX)
+
     np.testing.assert_array_equal(again[1], found[3][1])
     assert make_samples(replace(PLAN, objects=objects), [0])["category"][0] == found[0][0]
 
@@ -286,9 +294,11 @@ def test_meshes_of_a_folder_are_hidden_by_seed(meshes: Path) -> None:
 def test_meshes_are_identified_by_content_not_by_folder(meshes: Path) -> None:
     before = objects_from_folder(meshes)
     moved = meshes.rename(meshes.with_name("moved"))
+
     assert objects_from_folder(moved) == before
 
     trimesh.creation.box((1, 2, 1)).export(moved / "cube.stl")
+
     assert objects_from_folder(moved) != before
 
 
@@ -345,6 +355,7 @@ def test_mirrored_object_gives_mirrored_maps(painted: LidarMaps) -> None:
 
     valid = ~np.isnan(painted.depth_m) & ~np.isnan(mirrored.depth_m[::-1])
     apart = np.abs(mirrored.intensity[:, ::-1] - painted.intensity)[:, valid]
+
     assert (apart <= 1.0).mean() > 0.99  # rounding decides some ties between echoes
 
 
@@ -355,6 +366,7 @@ def test_grey_object_is_sensed_as_in_one_color() -> None:
     alone = sense_object(GREY_SCENE, QUIET, 0, "draft")
 
     np.testing.assert_array_equal(maps.depth_m, alone.depth_m)
+
     for intensity in maps.intensity:
         np.testing.assert_array_equal(intensity, alone.intensity)
 
@@ -443,6 +455,7 @@ def test_samples_on_drawn_rig_are_sensed_on_it(
 
     np.testing.assert_array_equal(in_color["scene"][0], scene_row(rig, model))
     assert in_color["intensity"].shape == (1, 3, 64, 80)
+
     for samples, maps in ((in_color, sensed), (unpainted, alone)):
         np.testing.assert_array_equal(samples["depth_m"][0], maps.depth_m)
         np.testing.assert_array_equal(samples["intensity"][0], maps.intensity)

@@ -220,6 +220,7 @@ def test_streamed_maps_equal_maps_in_memory(stream: Streamed, bare: tuple[np.nda
         wanted = flip_some(parts, batch.mirrored)
         found = [batch.depth_m, batch.intensity]
         torch.testing.assert_close(found, wanted, rtol=0, atol=0, equal_nan=True)
+
     np.testing.assert_array_equal(stream.first(6).depth_m, whole.depth_m[:6])
 
 
@@ -302,6 +303,7 @@ def test_packed_maps_are_the_datasets_normalised(
         maps, images = _epoch(packed, 1)
 
     assert len({image.tobytes() for image in images}) == 2 * SHARD
+
     for image, one in zip(images, maps, strict=True):
         np.testing.assert_array_equal(one, wanted[image.tobytes()])
 
@@ -374,7 +376,8 @@ def test_maps_in_color_are_packed_with_three_intensities(
         held_out = packed.held_out(one, 2)
 
     assert held_out.intensity.shape == (2, 3, 64, 80)
-    assert (maps.shape[1:], images.shape[1:]) == ((4, 64, 80), (3, 64, 64))
+    assert maps.shape[1:] == (4, 64, 80)
+    assert images.shape[1:] == (3, 64, 64)
 
 
 def test_maps_in_color_of_many_rigs_are_refused(tmp_path: Path, store_folder: Path) -> None:

@@ -333,12 +333,15 @@ def test_check_reports_fault_with_its_fix(bench: Bench, case: Case) -> None:
     checks = bench.checks()
 
     finding = checks[case.check]
+
     assert finding.status == case.status
+
     for word in case.words.split("|"):
         assert word in f"{finding.detail}\n{finding.fix}"
 
     failed = {name for name, check in checks.items() if check.status == "failed"}
     expected = {case.check} if case.status == "failed" else set[str]()
+
     assert failed == expected | set(case.also_failed.split())
 
 
@@ -350,14 +353,18 @@ def statuses(bench: Bench, names: str) -> set[str]:
 def test_checks_of_a_camera_are_skipped_without_one(bench: Bench) -> None:
     bench.unplug()
     names = "recovery link permissions video-driver hid-sensors in-use sdk-camera firmware"
+
     assert statuses(bench, names) == {"skipped"}
 
 
 @pytest.mark.parametrize("system", ["windows", "darwin"])
 def test_checks_of_linux_are_skipped_elsewhere(bench: Bench, system: str) -> None:
     bench.run_on(system)
+
     assert not bench.failed()
+
     names = "container udev-rules permissions video-driver hid-sensors in-use"
+
     assert statuses(bench, names) == {"skipped"}
 
 
@@ -369,6 +376,7 @@ def test_fix_does_not_add_a_user_to_a_group_that_has_him(bench: Bench) -> None:
 def test_fix_on_windows_names_no_package_of_linux(bench: Bench) -> None:
     bench.run_on("windows")
     NO_LIBUSB(bench)
+
     assert "apt" not in bench.checks()["libusb"].fix
 
 
@@ -380,6 +388,7 @@ def test_container_that_hides_sensors_is_named_as_the_cause(bench: Bench) -> Non
         sensor.unlink()
     sensors.rmdir()
     sensors.parent.rmdir()
+
     assert "-v /sys:/sys" in bench.failed()["hid-sensors"].fix
 
 
@@ -388,6 +397,7 @@ def test_sdk_without_the_l515_is_why_it_is_not_seen(bench: Bench, version: str) 
     bench.installed["pyrealsense2"] = version
     bench.hide()
     failed = bench.failed()
+
     assert set(failed) == {"sdk-version", "sdk-camera"}
     assert failed["sdk-version"].fix == f"pip install {WHEEL}"
     assert failed["sdk-camera"].fix == f"pip install {WHEEL}"
@@ -408,6 +418,7 @@ def test_sdk_without_the_l515_is_why_it_is_not_seen(bench: Bench, version: str) 
 def test_firmware_of_the_sdk_has_four_numbers(bench: Bench, firmware: str, status: str) -> None:
     bench.show(firmware_version=firmware)
     check = bench.checks()["firmware"]
+
     assert check.status == status
     assert firmware in check.detail
     assert ("1.5.8.1" in check.fix) == (status != "ok")
@@ -426,6 +437,7 @@ def test_firmware_of_the_sdk_has_four_numbers(bench: Bench, firmware: str, statu
 def test_firmware_of_usb_has_three_numbers_or_none(bench: Bench, release: int, status: str) -> None:
     bench.put_on_usb(bcdDevice=release)
     bench.hide()
+
     assert bench.checks()["firmware"].status == status
 
 
@@ -434,5 +446,6 @@ def test_older_of_two_firmwares_counts(bench: Bench) -> None:
     bench.sdk_devices.append(FakeLidar("f1"))
     bench.sdk_devices[1].info["firmware_version"] = "01.04.01.02"
     detail = bench.failed()["firmware"].detail
+
     assert "f0246262" in detail
     assert "01.04.01.02" in detail

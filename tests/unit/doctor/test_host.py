@@ -53,12 +53,17 @@ def look(root: Path) -> host.Host:
 
 def test_this_host_and_platform_can_be_read(tmp_path: Path) -> None:
     found = host.this_platform()
+
     assert found.python == sys.version_info[:2]
-    assert (found.system, found.machine) == (platform.system().lower(), platform.machine().lower())
-    assert (found.is_root, found.is_musl) == (os.geteuid() == 0, platform.libc_ver()[0] == "")
+    assert found.system == platform.system().lower()
+    assert found.machine == platform.machine().lower()
+    assert found.is_root == os.geteuid() == 0
+    assert found.is_musl == platform.libc_ver()[0] == ""
     assert set(host.read_host().modules) == set(host.MODULES)
+
     (tmp_path / ".dockerenv").touch()
     mac = host.Platform("darwin", "arm64", (3, 11))
+
     assert host.read_host(tmp_path, mac) == host.Host(mac)  # only Linux is searched
 
 
@@ -87,9 +92,12 @@ def test_module_is_loaded_built_in_available_or_missing(bench: Any, tmp_path: Pa
     bench.linux.write(
         "lib/modules/6.8.0/modules.dep", "kernel/drivers/iio/hid-sensor-accel-3d.ko.xz: a.ko\n"
     )
+
     assert list(look(tmp_path).modules.values()) == ["loaded", "built in", "available", "missing"]
+
     bench.linux.load()
     bench.linux.write("sys/module/hid_sensor_hub/uevent", "")
+
     assert look(tmp_path).modules["hid_sensor_hub"] == "loaded"
     assert set(look(tmp_path / "none").modules.values()) == {"unknown"}
 
@@ -99,11 +107,14 @@ def test_rules_are_found_in_every_folder_of_udev(bench: Any, tmp_path: Path, fol
     bench.remove_rules()
     bench.linux.write("etc/udev/rules.d/10-other.rules", 'ATTRS{idProduct}=="0b07"')
     bench.linux.write("etc/udev/rules.d/readme.txt", "0b64")
+
     assert look(tmp_path).rules == ()
+
     bench.linux.rules(f"{folder}/udev/rules.d/60-cameras.rules")
     if folder == "usr/lib":
         bench.linux.link("lib/udev", tmp_path / "usr/lib/udev")  # the same file once more
     found = "lib" if folder == "usr/lib" else folder
+
     assert look(tmp_path).rules == (f"/{found}/udev/rules.d/60-cameras.rules",)
 
 
@@ -111,6 +122,7 @@ def test_every_node_is_opened_and_refusals_are_kept(bench: Any) -> None:
     bench.refuse()
     bench.refused["/dev/video31"] = FileNotFoundError(errno.ENOENT, "No such file")
     nodes = {node.path: node.error for node in bench.facts().host.nodes}
+
     assert list(nodes.items()) == [
         ("/dev/bus/usb/002/003", ""),
         ("/dev/video30", "Permission denied"),
@@ -122,7 +134,9 @@ def test_open_node_opens_and_closes_the_file(tmp_path: Path) -> None:
     (tmp_path / "node").touch()
     before = set(Path("/proc/self/fd").iterdir())
     host.open_node(str(tmp_path / "node"))
+
     assert set(Path("/proc/self/fd").iterdir()) == before
+
     with pytest.raises(IsADirectoryError):
         host.open_node(str(tmp_path))
     with pytest.raises(FileNotFoundError):
@@ -142,22 +156,27 @@ def test_read_host_accepts_any_files(
             continue
         (root / path).parent.mkdir(parents=True, exist_ok=True)
         (root / path).mkdir() if content is None else (root / path).write_bytes(content)
+
     assert look(root).platform == LINUX
 
 
 def test_kernel_cameras_hold_what_hangs_on_each_port(bench: Any, tmp_path: Path) -> None:
     assert bench.linux.root == tmp_path
+
     bench.linux.plug("2-2", product="0b07", address=5)  # no L515
     bench.linux.write("sys/bus/usb/devices/2-3/idVendor", "not a number")
     [found] = host.kernel_cameras(tmp_path)
+
     assert (found.port, found.product_id, found.serial) == ("2-1", 0x0B64, "00000000F0246262")
     assert found.nodes == ("/dev/bus/usb/002/003", "/dev/video30", "/dev/video31")
     assert found.hid_sensors == ("accel_3d", "gyro_3d")
     assert found.hid_devices == ("0003:8086:0B64.3 (hid-sensor-hub)",)
+
     bench.linux.plug(
         "2-1.4", address=7, hid=0, video=1
     )  # behind a hub whose name begins like the other's
     one, other = host.kernel_cameras(tmp_path)
+
     assert (one.port, len(one.hid_sensors), len(one.video_nodes)) == ("2-1", 2, 2)
     assert (other.port, other.hid_sensors, other.video_nodes) == ("2-1.4", (), ("/dev/video70",))
 
@@ -165,7 +184,9 @@ def test_kernel_cameras_hold_what_hangs_on_each_port(bench: Any, tmp_path: Path)
 def test_odd_files_are_empty_and_odd_folders_hold_nothing(tmp_path: Path) -> None:
     assert host.kernel_cameras(tmp_path) == ()
     assert host.find_holders(["/dev/video0"], tmp_path) == ([], 0)
+
     (tmp_path / "binary").write_bytes(b"\xff\xfe 1 ")
+
     assert host.read_text(tmp_path / "binary").endswith("1")
     assert (
         host.read_text(tmp_path)
@@ -174,7 +195,9 @@ def test_odd_files_are_empty_and_odd_folders_hold_nothing(tmp_path: Path) -> Non
         == ""
     )
     assert host.list_folder(tmp_path / "binary") == host.list_folder(tmp_path / "absent") == []
+
     (tmp_path / "loop").symlink_to(tmp_path / "loop")
+
     assert not host.path_exists(tmp_path / "loop")
 
 
@@ -183,9 +206,13 @@ def test_process_that_holds_a_cameras_node_is_named(bench: Any, tmp_path: Path) 
     bench.linux.process(42, "bash", "/dev/tty")
     bench.linux.write("proc/43/fd", "stands for a folder that may not be listed")
     found, closed = host.find_holders(["/dev/video30", "/dev/bus/usb/002/003"], tmp_path)
-    assert (found, closed) == ([host.Holder(41, "realsense-viewer", "/dev/video30")], 1)
+
+    assert found == [host.Holder(41, "realsense-viewer", "/dev/video30")]
+    assert closed == 1
     assert look(tmp_path).closed_processes == 1
+
     bench.unplug()
+
     assert look(tmp_path).closed_processes == 0
 
 
@@ -200,6 +227,7 @@ def test_real_process_that_has_a_file_open_is_found(tmp_path: Path) -> None:
         with held.open():  # ours is left out
             found, _ = host.find_holders([str(held)])
         other.communicate(b"")
+
     assert [(one.pid, one.node) for one in found] == [(other.pid, str(held))]
     assert found[0].name.startswith("python")
     assert host.find_holders([str(held)])[0] == []
@@ -217,13 +245,16 @@ def rules() -> list[str]:
 def test_rules_open_each_lidar(rules: list[str], product_id: int) -> None:
     usb_rules = [line for line in rules if line.startswith('SUBSYSTEMS=="usb"')]
     [rule] = [line for line in usb_rules if f'"{product_id:04x}"' in line]
+
     assert 'ATTRS{idVendor}=="8086"' in rule
     assert 'MODE:="0666"' in rule
 
 
 def test_rules_open_the_motion_sensors_of_the_l515(rules: list[str]) -> None:
     sensors = [line for line in rules if not line.startswith("SUBSYSTEMS")]
+
     assert [line.split(",")[0] for line in sensors] == ['KERNEL=="iio*"', 'DRIVER=="hid_sensor*"']
+
     for line in sensors:
         assert 'ATTRS{idProduct}=="0b64"' in line
         assert "chmod -R 0777 /sys/%p" in line
@@ -237,7 +268,9 @@ def test_rules_have_the_syntax_of_udev(rules: list[str]) -> None:
 def test_rules_are_written_installed_and_reloaded_in_order() -> None:
     assert f"--write-udev {FILE_NAME}" in WRITE_AND_INSTALL
     assert WRITE_AND_INSTALL.endswith(RELOAD)
+
     command = install_command("my rules")
+
     assert "'my rules'" in command
     assert command.index("install") < command.index("udevadm")
 
@@ -264,6 +297,7 @@ def seen(bench: Any, tmp_path: Path) -> Scan:
 
 def test_l515_has_every_field_that_usb_knows(seen: Scan) -> None:
     [found, nowhere] = seen(fake_device(), fake_device(serial="", port_numbers=None))
+
     assert (found.id, found.kind, found.meaning) == ("8086:0b64", "camera", "L515")
     assert (found.bus, found.address, found.port) == (2, 3, "2-1")
     assert (found.usb_type, found.link, found.is_slow) == (
@@ -278,7 +312,8 @@ def test_l515_has_every_field_that_usb_knows(seen: Scan) -> None:
     )
     assert found.interfaces == ("hid", "video", "vendor")
     assert (found.error, found.denied) == ("", False)
-    assert (found.label, nowhere.label) == ("L515 f0246262 at 2-1", "L515")
+    assert found.label == "L515 f0246262 at 2-1"
+    assert nowhere.label == "L515"
 
 
 def test_realsense_products_are_known(seen: Scan) -> None:
@@ -303,6 +338,7 @@ def test_realsense_products_are_known(seen: Scan) -> None:
 def test_link_is_slow_by_speed_or_else_by_version(seen: Scan) -> None:
     assert SPEEDS[usb.util.SPEED_HIGH] == "480 Mbit/s (USB 2)"
     assert SPEEDS[usb.util.SPEED_SUPER] == "5 Gbit/s (USB 3)"
+
     fast = (0x0320, 4), (0x0320, 5), (0x0320, 0), (0x0300, None)
     slow = (0x0210, 3), (0x0210, 0), (0x0210, None)
     for bcd_usb, speed in fast + slow:
@@ -313,7 +349,9 @@ def test_link_is_slow_by_speed_or_else_by_version(seen: Scan) -> None:
 def test_firmware_and_serial_are_read_as_the_sdk_writes_them() -> None:
     known = {0x1058: "1.5.8", 0x1052: "1.5.2", 0x1041: "1.4.1", 0x1099: "1.9.9"}
     expected = known | dict.fromkeys((0x1158, 0x0058, 0x105A), "")
+
     assert {number: firmware_of(number) for number in expected} == expected
+
     for serial, written in {
         "00000000F0246262": "f0246262",
         "00000000f0140727": "f0140727",
@@ -324,8 +362,11 @@ def test_firmware_and_serial_are_read_as_the_sdk_writes_them() -> None:
 
 def test_serial_comes_from_the_kernel_without_permission(seen: Scan) -> None:
     [found] = seen(fake_device(shut=usb.core.USBError("Access denied", -3, errno.EACCES)))
+
     assert (found.denied, "Access denied" in found.error) == (True, True)
-    assert (found.serial, found.product, found.firmware) == ("f0246262", "RealSense", "1.5.8")
+    assert found.serial == "f0246262"
+    assert found.product == "RealSense"
+    assert found.firmware == "1.5.8"
     assert "hid" in found.interfaces
 
 
@@ -335,20 +376,27 @@ def test_serial_comes_from_the_kernel_without_permission(seen: Scan) -> None:
 def test_other_refusals_are_no_lack_of_permission(seen: Scan, refusal: Exception) -> None:
     """As by a driver of Windows, or of a device that left."""
     [found] = seen(fake_device(shut=refusal, hides=refusal, port_numbers=None))
+
     assert (found.error, found.denied) == (str(refusal), False)
-    assert (found.serial, found.interfaces, found.port) == ("", (), "")
+    assert found.serial == ""
+    assert found.interfaces == ()
+    assert found.port == ""
 
 
 def test_broken_string_is_an_error_of_the_device(seen: Scan) -> None:
     strings = {1: "", 2: "", 3: SimpleNamespace(encode=lambda _: b"\x00\xd8")}  # half a surrogate
     [found] = seen(fake_device(strings=strings, port_numbers=()))
+
     assert "surrogate" in found.error or "decode" in found.error
 
 
 def test_scan_closes_every_device_and_claims_none(bench: Any, seen: Scan, tmp_path: Path) -> None:
     assert len(seen(fake_device(), fake_device(0x0B07, address=4))) == 2
-    assert (bench.usb.open_handles, bench.usb.meddled) == (0, [])
+    assert bench.usb.open_handles == 0
+    assert bench.usb.meddled == []
+
     bench.usb.fails = usb.core.USBError("Input/Output Error", -1, 5)
+
     assert "Input/Output Error" in scan_usb(bench.usb, tmp_path).error
 
 
@@ -356,8 +404,10 @@ def test_scan_of_the_real_bus_reports_what_is_missing(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     found = scan_usb()
+
     assert found.error == ""
     assert len(found.devices) <= found.total
+
     for package in ("usb.core", "libusb_package"):
         with monkeypatch.context() as patch:
             patch.setitem(sys.modules, package, None)
@@ -365,12 +415,15 @@ def test_scan_of_the_real_bus_reports_what_is_missing(
     monkeypatch.setattr("libusb_package.get_libusb1_backend", lambda: None)
     for name in ("libusb1", "libusb0", "openusb"):
         monkeypatch.setattr(f"usb.backend.{name}.get_backend", lambda: None)
+
     assert scan_usb().error == "No backend available"
 
 
 def test_fake_bus_has_the_methods_of_the_real_one(bench: Any) -> None:
     faked = [name for name in vars(type(bench.usb)) if not name.startswith("_")]
+
     assert len(faked) == 10
+
     for name in faked:
         real = list(inspect.signature(getattr(_LibUSB, name)).parameters)
         assert list(inspect.signature(getattr(type(bench.usb), name)).parameters) == real

@@ -47,6 +47,7 @@ def images() -> np.ndarray:
 
 def test_judge_scores_perfect_image_without_uncertainty(images: np.ndarray) -> None:
     figures = judge(images, images, BOX)
+
     assert {name: figure.value for name, figure in figures.items()} == PERFECT
     assert all(figure.low == figure.value == figure.high for figure in figures.values())
     assert all(bar["met"] for bar in metrics.targets_met(figures).values())
@@ -62,6 +63,7 @@ def test_foreground_rmse_is_that_of_the_depth_live_shows(images: np.ndarray, see
     found_mm = per_object(guess, images, BOX)["foreground_rmse_mm"]
 
     expected_mm = np.sqrt(np.nanmean(np.square(apart_mm), axis=(1, 2)))
+
     np.testing.assert_allclose(found_mm, expected_mm, rtol=1e-4)
 
 
@@ -111,7 +113,9 @@ def test_categories_average_to_the_whole(images: np.ndarray) -> None:
     by = metrics.per_category(values, categories)
 
     whole = over_objects(values)
+
     assert list(by) == list(counts)
+
     for name in TARGETS:
         total = sum(count * by[category][name].value for category, count in counts.items())
         assert total / len(images) == pytest.approx(whole[name].value)

@@ -91,9 +91,11 @@ def test_losses_are_positive_where_a_row_is_worse() -> None:
 
 def test_front_is_undominated_in_time_to_the_picture_and_iou() -> None:
     names = [row.setting.name for row in pareto_front(ROWS)]
+
     assert names == ["quicker", "quick", "exact", "many"]
 
     names = [row.setting.name for row in pareto_front([*ROWS, row_of("best", 1, 0.95)])]
+
     assert names == ["best"]
 
 
@@ -103,6 +105,7 @@ def test_settings_are_every_network_with_every_number_of_frames() -> None:
     asked = reconstruct_settings(networks)  # type: ignore[arg-type]
 
     assert len({one.name for one in asked}) == len(asked)
+
     for weights in networks:
         assert [one.frames for one in asked if one.weights == weights] == [1, 4, 16, 64]
 
@@ -139,11 +142,17 @@ def test_table_shows_the_measured_rows(measured: int) -> None:
     table = facts_of(ROWS[:measured], len(ROWS))
 
     assert table["complete"] == (measured == len(ROWS))
+
     names = [row["name"] for row in table["settings"]]
+
     assert names == [row.setting.name for row in ROWS[:measured]]
+
     lost = [row["loses_accuracy"] for row in table["settings"]]
+
     assert lost == [False, False, True, False][:measured]
+
     page = read_page(reconstruct_document(table).as_html())
+
     assert all(name in page.text for name in names)
 
 

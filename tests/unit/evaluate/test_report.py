@@ -93,6 +93,7 @@ def test_figures_have_names_that_scripts_depend_on() -> None:
 
     assert {*TARGETS, "baselines", "per_category", "objects", "bars", *FACTS} < set(figures)
     assert set(figures["per_category"]) == {"kind 0", "kind 1", "kind 2"}
+
     for table in (figures, *figures["baselines"].values(), *figures["per_category"].values()):
         assert all(set(table[name]) == {"value", "low", "high"} for name in TARGETS)
 
@@ -193,10 +194,13 @@ def test_folder_is_complete_for_any_number_of_objects(tmp_path: Path, count: int
     out = tmp_path / "out"
     figures = _figures(judgement)
     write_report(out, judgement, figures)
+
     assert {path.name for path in out.iterdir()} == FILES
     assert json.loads((out / "figures.json").read_text(encoding="utf-8")) == figures
     assert [row["name"] for row in _rows(out)] == judgement.names
+
     mean = np.mean([float(row["silhouette_iou"]) for row in _rows(out)])
+
     assert mean == pytest.approx(figures["silhouette_iou"]["value"], rel=1e-4)
 
 
@@ -208,6 +212,7 @@ def test_figures_separate_categories_left_out_of_training(drawn: Path) -> None:
     guessed = _figures(replace(whole, image=image, left_out=["kind 1", "kind 9"]))
 
     by = guessed["shown_and_left_out"]
+
     assert by["left out"]["silhouette_iou"]["value"] == 0
     assert by["shown"]["silhouette_iou"]["value"] > guessed["silhouette_iou"]["value"] > 0
     assert "left out" in document(guessed, drawn).as_markdown()

@@ -96,7 +96,8 @@ def test_rendered_objects_are_seeded_objects() -> None:
 
     np.testing.assert_array_equal(judged.maps.image, truth)
     assert judged.maps.depth_m.shape == (1, 64, 80)
-    assert (len(judged.names), judged.plan) == (1, PLAN)
+    assert len(judged.names) == 1
+    assert judged.plan == PLAN
 
 
 def test_second_set_is_of_other_kinds_in_the_same_poses() -> None:
@@ -104,7 +105,9 @@ def test_second_set_is_of_other_kinds_in_the_same_poses() -> None:
     names = {one.category for one in unseen}
 
     assert [one.pose for one in unseen] == [one.pose for one in benchmark_objects(BOX)]
-    assert (len(unseen), len(names), names & CATEGORIES.keys()) == (54, 18, set())
+    assert len(unseen) == 54
+    assert len(names) == 18
+    assert names & CATEGORIES.keys() == set()
 
 
 def test_objects_of_the_second_set_can_be_seen() -> None:
@@ -192,6 +195,7 @@ def test_reconstruct_all_takes_one_object_at_a_time(echoes: list[MultiBounce]) -
     found = reconstruct_all(network, maps)
 
     shapes = [part.shape for call in network.call_args_list for part in call.args]
+
     np.testing.assert_array_equal(found, middle(maps.depth_m))
     assert shapes == [(1, 64, 80)] * 4
 
@@ -294,6 +298,7 @@ def test_baselines_answer_every_object(images: np.ndarray, nearest: bool) -> Non
 
     assert set(alone) == {"all_background", "mean_object"}
     assert set(guesses) == {*alone, "nearest_neighbour"}
+
     for guess in (guesses if nearest else alone).values():
         assert (guess.shape, guess.dtype) == ((5, 64, 64), np.float32)
 
@@ -314,7 +319,8 @@ def test_nearest_neighbour_is_found_in_any_chunk(images: np.ndarray, size: int) 
     guesses = _guesses(sought, _maps(images), size, on_progress=lambda *at: progress.append(at))
 
     np.testing.assert_array_equal(guesses["nearest_neighbour"], images[order])
-    assert (len(progress), progress[-1]) == (-(-12 // size), (12, 12))
+    assert len(progress) == -(-12 // size)
+    assert progress[-1] == (12, 12)
 
 
 @pytest.mark.parametrize("scale", [1e-6, 0.0])
@@ -376,8 +382,10 @@ def test_training_maps_are_of_training_objects(builds: Builds) -> None:
     builds.folder_of(CUPS)
 
     plan, count, _ = builds.asked[0]
+
     assert count == 7
-    assert (plan.first_seed, plan.objects) == (TRAINING_SEED, Objects())
+    assert plan.first_seed == TRAINING_SEED
+    assert plan.objects == Objects()
 
 
 def test_fingerprint_covers_every_category() -> None:

@@ -15,6 +15,7 @@ def test_fake_samples_have_names_and_types_of_real_ones() -> None:
     real = make_samples(PLAN, range(1))
     fake = samples_of(range(1))
     types = {name: values.dtype for name, values in fake.items()}
+
     assert {name: values.dtype for name, values in real.items()} == types | {
         "scene": np.dtype(np.float64)
     }
@@ -22,6 +23,8 @@ def test_fake_samples_have_names_and_types_of_real_ones() -> None:
 
 def test_fake_workers_deliver_every_piece_once_in_their_order() -> None:
     assert [piece for piece, _ in FakeWorkers()(PLAN, PIECES)] == PIECES
+
     shuffled = [piece for piece, _ in FakeWorkers(order=2)(PLAN, PIECES)]
+
     assert shuffled != PIECES
     assert sorted(shuffled, key=lambda piece: piece.start) == PIECES

@@ -30,6 +30,7 @@ def _shapes(vae: nn.Module, compressor: nn.Module) -> list[torch.Size]:
 @torch.no_grad()
 def test_small_networks_have_shapes_and_parts_of_real_ones() -> None:
     assert _shapes(small.SmallVae(), small.SmallCompressor()) == _shapes(ResVae(), Compressor())
+
     for compressor in (small.SmallCompressor(0.25, 0.5), Compressor(0.25, 0.5)):
         dropout, linear = compressor.classifier
         assert isinstance(compressor.features, nn.Module)
@@ -44,6 +45,7 @@ def test_small_networks_have_shapes_and_parts_of_real_ones() -> None:
 @pytest.mark.parametrize("seed", [0, 1])
 def test_small_maps_show_their_images_and_nothing_else(seed: int) -> None:
     maps = small.small_maps(3, seed)
+
     np.testing.assert_array_equal(maps.image, small.small_images(3, seed))
     np.testing.assert_array_equal(~np.isnan(maps.depth_m[:, :, 8:-8]), maps.image > 0)
     assert not maps.intensity[np.isnan(maps.depth_m)].any()
@@ -62,15 +64,21 @@ def test_untrained_weights_load_and_differ_by_seed(
         )
     small.use_small_networks(monkeypatch, checkpoint)
     (one, record), (other, _) = (checkpoint.load_pipeline(tmp_path / name) for name in "01")
-    assert (record.rig_checksum, record.input) == (rig.checksum, "difference maps")
+
+    assert record.rig_checksum == rig.checksum
+    assert record.input == "difference maps"
     assert record.compressor_recipe.steps == steps
     assert (checkpoints.load_encoder(tmp_path / "0") is None) == (steps == "one")
+
     maps = torch.rand(2, 64, 80), torch.rand(2, 64, 80)
     with torch.inference_mode():
         made = [pipeline.latent(*maps) for pipeline in (one, other)]
+
     assert made[0].shape == (2, 256)
     assert not torch.allclose(*made)
+
     networks = [load_uncertainty_network(tmp_path / f"doubt{seed}")[0] for seed in (0, 1)]
+
     assert not torch.equal(*(each.network.pixels.weight for each in networks))
 
 
@@ -79,6 +87,7 @@ def test_hard_maps_have_the_named_extremes(channels: tuple[int, ...]) -> None:
     depth, intensity = zip(
         *(small.hard_maps(name, channels) for name in small.HARD_MAPS), strict=True
     )
+
     assert [float(d.isnan().float().mean()) for d in depth] == [0, 0, 0, 0.5, 1]
     assert [float(i.max()) for i in intensity] == [10, 0, 255, 10, 10]
     assert {i.shape for i in intensity} == {(1, *channels, 64, 80)}
@@ -86,10 +95,14 @@ def test_hard_maps_have_the_named_extremes(channels: tuple[int, ...]) -> None:
 
 def test_small_uncertainty_set_has_all_kinds_and_varying_errors() -> None:
     some = small_uncertainty_set(40, 0)
-    assert (some.nothing.sum(), some.outside.sum()) == (20, 10)
+
+    assert some.nothing.sum() == 20
+    assert some.outside.sum() == 10
     assert not (some.nothing & some.outside).any()
     assert not some.truth[some.nothing].any()
+
     off = np.abs(some.made.astype(float) - some.truth)
     dark = off[(some.truth > 0) & (some.truth.astype(float) < 0.5)]
     bright = off[some.truth.astype(float) > 0.5]
+
     assert dark.min() > 5 * bright.max() > 0

@@ -64,6 +64,7 @@ def test_atomic_writes_leave_nothing_after_an_error(
 
     with pytest.raises(error):
         write()
+
     assert list(tmp_path.iterdir()) == []
 
 
@@ -89,12 +90,14 @@ def test_atomic_directory_refuses_one_that_appeared_and_a_file(tmp_path: Path) -
 
     with pytest.raises(OutputExistsError, match="appeared"):
         write()
+
     assert [path.name for path in (tmp_path / "out").iterdir()] == ["a.txt"]
 
     (file := tmp_path / "mine.txt").write_text("precious")
 
     with pytest.raises(OutputExistsError, match=r"mine\.txt"), atomic_directory(file):
         pass
+
     assert file.read_text() == "precious"
 
 

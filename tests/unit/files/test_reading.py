@@ -84,6 +84,7 @@ def test_read_arrays_returns_what_was_saved_within_its_limit(tmp_path: Path) -> 
     path = _lying(tmp_path, bytes)
 
     assert read_arrays(path)["depth_m"].tolist() == np.ones((4, 4)).tolist()
+
     with pytest.raises(ValueError, match="more than 0 MiB"):
         read_arrays(path, limit=100)
     with pytest.raises(ValueError, match="other"):

@@ -119,13 +119,16 @@ KINDS = [
 @pytest.mark.parametrize("kind", KINDS)
 def test_every_kind_is_known_and_whole(files: dict[str, Path], kind: str, verify: bool) -> None:
     found = describe(files[kind], verify=verify)
-    assert (found.kind, found.problem) == (kind, "")
+
+    assert found.kind == kind
+    assert found.problem == ""
     assert found.created
     assert all(line.split(" ")[0] in {"nlos-cam", "open"} for line in found.next)
 
 
 def test_recording_has_its_frames_and_duration(files: dict[str, Path]) -> None:
     facts = describe(files["recording of a lidar"]).facts
+
     assert facts["depth"].startswith("20 frames, 30 per second")
     assert facts["duration"] == "0.6 s"
 
@@ -141,6 +144,7 @@ def test_dataset_has_its_objects_and_its_command(files: dict[str, Path]) -> None
 
 def test_replay_has_its_frames_and_verdicts(files: dict[str, Path]) -> None:
     replay = describe(files["result of a replay"]).facts
+
     assert replay["frames"] == "2, numbers 3 to 4"
     assert replay["verdicts"] == "none 1, object seen 1"
 
@@ -159,6 +163,7 @@ def test_pipes_and_arrays_that_would_fill_memory_are_refused(
     np.savez_compressed(
         tmp_path / "bomb.npz", vertices_m=np.zeros((1000, 3)), faces=np.zeros((1, 3))
     )
+
     assert "bomb.npz holds more" in describe(tmp_path / "bomb.npz").problem
 
 
@@ -189,8 +194,10 @@ def test_damaged_file_has_one_line_that_says_so(
         found = describe(place, verify=True)
     except RecordingError as error:
         found = Description("none", problem=str(error))
+
     assert "\n" not in found.problem
     assert "Traceback" not in found.problem
+
     if damage in {"cut", "noise"} and kind not in {"training run", "scene of the simulated camera"}:
         assert str(place) in found.problem or source.name in found.problem
 
@@ -199,14 +206,21 @@ def test_changed_weights_and_lone_wall_records_are_damaged(
     files: dict[str, Path], tmp_path: Path
 ) -> None:
     (tmp_path / "wall.toml").write_bytes(files["wall record"].read_bytes())
+
     assert "wall.npz is missing" in describe(tmp_path / "wall.toml").problem
+
     (tmp_path / "checkpoint.json").write_bytes((shipped_folder() / "checkpoint.json").read_bytes())
     (tmp_path / "a.safetensors").write_bytes(b"a")
     (tmp_path / "SHA256SUMS").write_text(f"{hashlib.sha256(b'a').hexdigest()}  a.safetensors\n")
+
     assert describe(tmp_path).problem == ""
+
     (tmp_path / "a.safetensors").write_bytes(b"b")
+
     assert "a.safetensors is damaged" in describe(tmp_path).problem
+
     (tmp_path / "a.safetensors").unlink()
+
     assert "a.safetensors is missing" in describe(tmp_path).problem
 
 
@@ -224,7 +238,9 @@ def test_unknown_file_names_the_known_kinds(tmp_path: Path, name: str) -> None:
 
 def test_recording_of_another_camera_is_described(real_bag: Path) -> None:
     found = describe(real_bag, verify=True)
-    assert (found.kind, found.problem) == ("recording of a RealSense camera", "")
+
+    assert found.kind == "recording of a RealSense camera"
+    assert found.problem == ""
     assert "D435" in found.facts["device"]
     assert found.facts["depth"].endswith("640 x 480, z16")
 
@@ -238,7 +254,10 @@ def test_command_prints_json_without_importing_torch(files: dict[str, Path]) -> 
     answer, ended = subprocess.run(
         run, capture_output=True, text=True, check=True
     ).stdout.splitlines()
+
     assert ended == "0"
+
     found = json.loads(answer)
     size = files["recording of a lidar"].stat().st_size
+
     assert (found["kind"], found["whole"], found["bytes"]) == ("recording of a lidar", True, size)

@@ -34,6 +34,7 @@ def files(folder: Path) -> list[str]:
 
 def test_status_is_json_and_gives_pace_age_and_disk(control: RunControl) -> None:
     status = json.loads(json.dumps(control.status(), allow_nan=False))
+
     assert status["state"] == "running"
     assert status["fps"] == pytest.approx(30.0)
     assert status["p50_ms"] == status["p99_ms"] == pytest.approx(20.0)
@@ -55,26 +56,36 @@ def state_of(control: RunControl) -> tuple[str, str]:
 
 def test_status_tells_when_the_first_frame_is_expected(waiting: RunControl) -> None:
     assert waiting.status()["state"] == "connecting"
+
     waiting.show_progress(1, 60)
     waiting.show_progress(2, 60)
+
     assert "first frame in about" in waiting.status()["message"]
 
 
 def test_status_follows_the_run_from_its_camera_to_its_end(waiting: RunControl) -> None:
     waiting.attach(Recorded(0), Pipeline(CalibratedRig(RIG), sheet_network))  # type: ignore[arg-type]
+
     assert "first frame" in waiting.status()["message"]
+
     waiting.add(moment(0))
     waiting.set_state("stalled", "no frame for 3 s")
+
     assert state_of(waiting) == ("stalled", "no frame for 3 s")
+
     waiting.add(moment(1))
+
     assert state_of(waiting) == ("running", "")
+
     waiting.end()
+
     assert state_of(waiting) == ("ended", "")
 
 
 def test_snapshot_writes_picture_arrays_and_mesh(control: RunControl, tmp_path: Path) -> None:
     assert ".npz" in control.run("snapshot", {})
     assert files(tmp_path) == [".npz", ".ply", ".png"]
+
     with np.load(next(tmp_path.glob("*.npz"))) as arrays:
         np.testing.assert_array_equal(arrays["depth_m"], full_moment(29).result.depth_m)
         assert arrays["frame_number"] == 29
@@ -88,11 +99,14 @@ def test_second_snapshot_replaces_nothing(control: RunControl, tmp_path: Path) -
 
 def test_session_is_saved_between_two_commands(control: RunControl, tmp_path: Path) -> None:
     control.run("save_session", {})
+
     assert control.status()["control"]["saving"]
+
     for number in range(30, 60):
         control.add(full_moment(number))
     control.run("end_session", {})
     shown = [each["frame"] for each in saved_moments(next(tmp_path.glob("session-*.html")))]
+
     assert shown[0] == 30
     assert set(shown) <= set(range(30, 60))
 
@@ -100,6 +114,7 @@ def test_session_is_saved_between_two_commands(control: RunControl, tmp_path: Pa
 def test_average_changes_the_pipeline(control: RunControl) -> None:
     pipeline = control._run.pipeline
     control.run("average", {"frames": 4})
+
     assert pipeline.average == control.status()["control"]["average"] == 4
 
 
@@ -136,11 +151,14 @@ def test_one_command_runs_at_a_time(control: RunControl) -> None:
     control.thread_start = lambda: entered.set() or leave.wait(60.0)
     thread = threading.Thread(target=control.run, args=("pause", {}))
     thread.start()
+
     assert entered.wait(60.0)
+
     with pytest.raises(NlosCamError, match="another command"):
         control.run("resume", {})
     leave.set()
     thread.join()
+
     assert control.pipeline.paused
 
 
@@ -156,6 +174,7 @@ def test_paused_run_reads_frames_and_reconstructs_none(tmp_path: Path) -> None:
         FrameCamera(30, lambda number: number in commands and control.run(commands[number], {})),
         control,
     )
+
     assert 14 <= report.frames <= 26
     assert report.dropped == 0
 
@@ -163,6 +182,7 @@ def test_paused_run_reads_frames_and_reconstructs_none(tmp_path: Path) -> None:
 def test_run_ends_a_session_that_is_being_saved(tmp_path: Path) -> None:
     control = RunControl(folder=tmp_path)
     run(FrameCamera(30, lambda number: number == 5 and control.run("save_session", {})), control)
+
     assert control.status()["state"] == "ended"
     assert saved_moments(next(tmp_path.glob("session-*.html")))
 
@@ -184,10 +204,15 @@ def test_reference_is_taken_from_the_passing_frames(tmp_path: Path) -> None:
 
     run(FrameCamera(200, act, make=wall_frame, uri="sim"), control)
     command.join()
+
     assert "reference of 8 frames" in outcomes[0]
+
     (bench,) = benches
+
     assert bench.rig is RIG
+
     measured = load_measured(next(tmp_path.glob("bench-*.toml")))
+
     np.testing.assert_array_equal(measured.reference.map_depth_m, bench.reference.map_depth_m)
 
 
@@ -199,6 +224,7 @@ def test_run_is_under_strain_while_a_command_waits(
     found = list[str]()
     control.thread_start = lambda: found.append(strain())
     control.run("pause", {})
+
     assert found == ["a command waits"]
     assert not strain()
 
@@ -209,14 +235,18 @@ def test_run_is_under_strain_once_it_drops_frames(control: RunControl) -> None:
         control.note_drops(count)
         assert not strain()
     control.note_drops(4)
+
     assert strain() == "frames are dropped"
 
 
 def test_run_is_under_strain_when_it_is_to_stop(control: RunControl) -> None:
     stop = Event()
     stop.set()
+
     assert control.strain_of(stop)() == "the run ends"
+
     control.end()
+
     assert control.strain_of(Event())() == "the run ends"
 
 
@@ -249,6 +279,7 @@ def test_command_beyond_its_range_has_one_clear_answer(
     with pytest.raises(NlosCamError) as caught:
         control.run(command, arguments)
     answer = str(caught.value)
+
     assert answer.isprintable()
     assert "unforeseen" not in answer
     assert len(answer) < 400
@@ -261,6 +292,7 @@ def test_command_says_that_its_folder_went_away(
     tmp_path.rmdir()
     with pytest.raises(NlosCamError, match=r"folder|cannot be (written|recorded)"):
         control.run(command, {})
+
     assert control.status()["state"] == "running"
 
 

@@ -34,6 +34,7 @@ def test_log_has_a_line_for_each_frame_in_order(tmp_path: Path, suffix: str) -> 
         for number in range(100):
             log.add(moment(number))
         assert len(path.read_text(encoding="utf-8").splitlines()) >= 31, "flushed during the run"
+
     assert [int(line["frame_number"]) for line in lines_of(path)] == list(range(100))
 
 
@@ -44,7 +45,9 @@ def test_log_line_holds_times_verdict_and_warmest_reading(tmp_path: Path, suffix
         log.add(moment(0, verdict=Verdict.SEEN))
         log.add(moment(1))
     line, other = lines_of(path)
-    assert (float(line["latency_ms"]), float(line["network_ms"])) == (10.0, 4.2)
+
+    assert float(line["latency_ms"]) == 10.0
+    assert float(line["network_ms"]) == 4.2
     assert float(line["celsius"]) == 41.5
     assert line["verdict"] == "object seen"
     assert other["verdict"] in {None, ""}
@@ -56,7 +59,9 @@ def test_log_keeps_its_columns_when_a_stage_comes_later(tmp_path: Path) -> None:
         log.add(moment(0))
         log.add(moment(1, stages_s={"doubt": 1.0, "network": 0.005}))
     first, second = lines_of(path)
-    assert (first["network_ms"], second["network_ms"]) == ("4.2", "5.0")
+
+    assert first["network_ms"] == "4.2"
+    assert second["network_ms"] == "5.0"
     assert second["queue_ms"] == ""
 
 
@@ -70,4 +75,5 @@ def test_log_ends_on_a_full_disk_without_ending_the_run(
         for number in range(5):
             log.add(moment(number))
         real.close()
+
     assert sum("frame 0 (No space left on device)" in line for line in caplog.messages) == 1

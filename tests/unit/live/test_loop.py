@@ -45,9 +45,12 @@ def test_pace_yields_frames_at_their_timestamps() -> None:
     for each in pace(map(small_frame, (0, 1, 4, 2)), stop, lambda: now_s[0]):
         given.append(each.frame_number)
         now_s[0] += 0.01
+
     assert given == [0, 1, 4, 2]
     assert waits_s == pytest.approx([0.0, PERIOD_S - 0.01, 3 * PERIOD_S - 0.01, 0.0])
+
     stop.set()
+
     assert list(pace([small_frame(0)], stop, lambda: 0.0)) == []
 
 
@@ -97,7 +100,9 @@ def test_run_live_reports_every_stage_of_every_frame() -> None:
         "network",
         "view",
     }
+
     medians_ms = {name: times["p50"] for name, times in report.stages_percentiles_ms.items()}
+
     assert medians_ms == report.stages_ms
 
 
@@ -115,6 +120,7 @@ def test_run_live_reports_latency_on_any_clock(offset_s: float, delivery_ms: flo
     assert report.stages_ms["delivery"] == pytest.approx(delivery_ms, abs=1.0)
     assert report.latency_ms["p50"] == pytest.approx(delivery_ms, abs=1.0)
     assert report.fps == pytest.approx(30.0, rel=0.04)
+
     for moment in lockstep.moments[-5:]:  # once the fastest delivery is known
         parts_s = sum(
             seconds
@@ -137,11 +143,14 @@ def test_run_live_warns_while_the_lidar_is_moved(tmp_path: Path) -> None:
     }  # the recording is never ahead of it
     report = run_live(camera, method, viewer, **run, on_warning=lambda *about: begins.append(about))
     [(warning, frames)] = report.warnings.items()
+
     assert [each for _, each in begins] == [True, False]
     assert begins[1][0] == warning
+
     warned = [
         moment.result.frame.frame_number for moment in viewer.moments if moment.result.warnings
     ]
+
     assert len(warned) == frames
     assert warned[0] in range(30, 80)
     assert warned[-1] in range(79, 150)
@@ -163,6 +172,7 @@ def test_run_live_counts_and_survives_failed_frames(caplog: pytest.LogCaptureFix
         recorded=True,
         on_moment=logged.append,
     )
+
     assert [moment.result.frame.frame_number for moment in viewer.moments] == [
         0,
         1,
@@ -175,7 +185,8 @@ def test_run_live_counts_and_survives_failed_frames(caplog: pytest.LogCaptureFix
     ]
     assert [moment.dropped for moment in viewer.moments] == [0, 0, 0, 2, 2, 2, 2, 2]
     assert logged == viewer.moments
-    assert (report.counts, report.dropped) == ({"failed": 2}, 2)
+    assert report.counts == {"failed": 2}
+    assert report.dropped == 2
     assert all(moment.latency_s >= 0.0 for moment in viewer.moments)
     assert "frame 3 " in caplog.text
     assert "ZeroDivisionError: an odd frame" in caplog.text
@@ -190,7 +201,9 @@ def test_run_live_reports_before_it_raises_the_cameras_error() -> None:
             camera, pipeline(), NullViewer(), stop=Event(), recorded=True, on_error=reports.append
         )
     [report] = reports
-    assert (report.frames, report.counts) == (2, {"restarted": 3})
+
+    assert report.frames == 2
+    assert report.counts == {"restarted": 3}
 
 
 def test_run_live_ends_in_time_without_further_frames(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -210,6 +223,7 @@ def test_run_live_ends_in_time_without_further_frames(monkeypatch: pytest.Monkey
     report = run_live(
         camera, pipeline(), viewer, stop=Event(), seconds=500.0, clock=lambda: now_s[-1]
     )
+
     assert camera.closed.is_set()
     assert report.frames <= 5
 
@@ -263,8 +277,11 @@ def test_run_live_shows_a_stall_with_the_last_moment() -> None:
         for moment in viewer.moments
         if moment.result.verdict is not Verdict.STALLED
     ]
+
     assert frames == list(range(10))
+
     again = [moment for moment in viewer.moments if moment.result.verdict is Verdict.STALLED]
+
     assert len(again) >= 2
     assert {moment.result.frame.frame_number for moment in again} == {4}
     assert all(later.latency_s > before.latency_s for before, later in pairwise(again))

@@ -66,6 +66,7 @@ def test_background_check_equals_a_check_in_this_process() -> None:
         wait_until(lambda: checks.newest is not None or bool(errors))
         if hasattr(os, "getpriority"):
             assert os.getpriority(os.PRIO_PROCESS, checks.process.pid) == 19
+
     assert not errors
     assert checks.newest.frame_number == 5
     assert checks.newest.score == check_reconstruction(DARK, NOTHING, RIG, accuracy="draft").score
@@ -109,6 +110,7 @@ def test_background_checks_never_wait_for_their_process() -> None:
             assert os.getpgid(checks.process.pid) != os.getpgrp(), (
                 "Ctrl-C at the terminal reaches it"
             )
+
     assert checks.process.returncode is not None
     assert not errors, "its end by us is no error"
 
@@ -120,6 +122,7 @@ def test_background_checks_kill_a_process_that_will_not_end(
     with BackgroundPhysicsCheck(RIG, command=python(DEAF)) as checks:
         checks.offer(0, DARK, NOTHING)
         wait_until(lambda: checks.ended)  # what it printed is no answer
+
     assert checks.process.returncode == (1 if sys.platform == "win32" else -9)
 
 
@@ -132,6 +135,7 @@ def test_background_checks_report_a_failure_once_and_go_on() -> None:
         wait_until(lambda: bool(errors))
         assert not checks.ended
     (error,) = errors
+
     assert "frame 0" in error
     assert "(no)" in error
 
@@ -144,6 +148,7 @@ def test_background_checks_report_a_missing_process_once(command: tuple[str, ...
         wait_until(lambda: checks.ended)
         checks.offer(1, DARK, NOTHING)
         assert not checks.waits
+
     assert (len(errors), checks.newest) == (1, None)
 
 
@@ -157,6 +162,7 @@ def test_background_process_ends_with_a_killed_parent() -> None:
         check=False,
         env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)},
     )
+
     assert done.returncode == -9
     assert int(done.stdout) > 0
 
@@ -176,7 +182,9 @@ def answers(*frames: object, end: bytes = b"") -> list[Any]:
 
 def test_worker_answers_each_frame_in_order_or_names_its_error() -> None:
     found, error, later = answers((4, DARK, NOTHING), (1, "no maps", NOTHING), (9, DARK, NOTHING))
-    assert (found.frame_number, later.frame_number) == (4, 9)
+
+    assert found.frame_number == 4
+    assert later.frame_number == 9
     assert found.score == check_reconstruction(DARK, NOTHING, RIG, accuracy="draft").score
     assert error.startswith("AttributeError: ")
 
@@ -199,4 +207,6 @@ def test_worker_is_nice_and_keeps_prints_out_of_its_answers(
         lambda asked, told, leave: served.append((asked, told, sys.stdout.buffer, callable(leave))),
     )
     main()
-    assert (niced, served) == ([19], [("stdin", "stdout", "stderr", True)])
+
+    assert niced == [19]
+    assert served == [("stdin", "stdout", "stderr", True)]

@@ -83,6 +83,7 @@ def test_realtime_priority_changes_nothing_where_not_possible(
         assert not priority.held
     yield_to_loop()
     drop_realtime_priority()
+
     assert set(system.schedules.values()) == {(OTHER, ORDINARY)}
 
 
@@ -94,6 +95,7 @@ def test_realtime_priority_is_not_taken_on_one_processor(
     monkeypatch.setattr("nlos_cam.live.realtime._give_way", lambda: None)
     with RealtimePriority() as priority:
         assert not priority.held
+
     assert set(system.schedules.values()) == {(OTHER, ORDINARY)}
     assert "one processor" in caplog.text
 
@@ -136,6 +138,7 @@ def test_realtime_priority_is_given_up_while_there_is_a_reason(
         reason = ""
         wait_until(lambda: priority.held)
         assert set(system.schedules.values()) == {(ROUND_ROBIN, LOOP)}
+
     assert caplog.text.count("a command waits") == 1
 
 
@@ -145,7 +148,9 @@ def test_processors_are_those_that_this_process_may_use() -> None:
 
 def test_drawing_goes_after_the_loop_and_before_the_rest(system: System) -> None:
     yield_to_loop()
+
     assert system.schedules["0"] == (OTHER, ORDINARY)
+
     with RealtimePriority():
         yield_to_loop()
         assert system.schedules["0"] == (ROUND_ROBIN, DRAWING)
@@ -171,6 +176,7 @@ def test_realtime_priority_restores_the_threads_of_this_process() -> None:
         assert began.wait(60.0)
     ended.set()
     worker.join(60.0)
+
     assert [os.sched_getscheduler(0), *found] == [before] * 2
 
 
@@ -194,5 +200,6 @@ def test_interpreter_collects_once_and_shortens_turns_until_left() -> None:
         assert later() is None
         assert gc.get_freeze_count() == known
         raise ZeroDivisionError
+
     assert sys.getswitchinterval() == before_s
     assert gc.get_freeze_count() < known

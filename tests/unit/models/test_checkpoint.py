@@ -161,6 +161,7 @@ def test_load_pipeline_refuses_unusable_tensors(
     _replace(path, save({name: tensor for name, tensor in tensors.items() if tensor is not None}))
     with pytest.raises(CheckpointError, match=word) as caught:
         checkpoint.load_pipeline(folder)
+
     assert "\n" not in str(caught.value)
 
 
@@ -210,8 +211,10 @@ def test_load_fitting_loads_matching_tensors_and_reports_rest(folder: Path) -> N
 
 def test_load_pipeline_partly_is_strict_but_for_compressor(folder: Path) -> None:
     _, record, report = checkpoints.load_pipeline_partly(folder)
+
     assert record == RECORD
     assert report[1:] == ([], [], [])
+
     for part in ("compressor", "decoder"):
         _replace(folder / f"{part}.safetensors", save({"nothing": torch.zeros(1)}))
         with pytest.raises(CheckpointError, match=rf"{part}\.safetensors"):
@@ -262,8 +265,11 @@ def test_record_names_last_run_of_each_task_and_keeps_others(
 
 def test_record_vae_runs_include_runs_that_train_decoder() -> None:
     record = CheckpointRecord.of([RUNS[name] for name in ("v0", "v1", "c0", "j", "t0")], RIG)
+
     assert record.vae_runs == [RUNS[name] for name in ("v0", "v1", "j")]
+
     written_before_earlier = RECORD.model_dump(mode="json", exclude={"earlier"})
+
     assert CheckpointRecord.model_validate(written_before_earlier).runs == [RUNS["v0"]]
 
 

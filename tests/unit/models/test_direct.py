@@ -119,6 +119,7 @@ def test_answer_to_mirrored_maps_is_the_mirrored_answer() -> None:
     network = _shaken()
     normal = torch.randn(3, 2, 64, 80)
     logits = network.logits(normal)
+
     torch.testing.assert_close(network.logits(normal.flip(-2)), logits.flip(-2), rtol=0, atol=1e-5)
     assert float(logits.detach().std()) > 0.1
     assert (logits - logits.flip(-2)).abs().max() > 0.1
@@ -130,6 +131,7 @@ def test_mirror_linear_is_a_linear_layer_of_both_sides() -> None:
     own = (layer.even.weight + layer.odd.weight) / 2
     other = (layer.even.weight - layer.odd.weight) / 2
     top = 0.98 * (sides[:, 0] @ own.T + sides[:, 1] @ other.T) + 0.7 * layer.even.bias
+
     torch.testing.assert_close(layer(sides)[:, 0], top)
 
 
@@ -253,6 +255,7 @@ def test_color_is_learnt_by_the_same_two_heads(tmp_path: Path) -> None:
     assert (
         float((np.abs(reconstruct(again, source.maps) - made) < 0.02).mean()) > 0.999
     )  # float16 moves an edge
+
     with pytest.raises(TrainingError, match="simulation only"):
         direct_start(_recipe(start="weights"), tmp_path)
 
@@ -268,6 +271,7 @@ def test_run_stopped_halfway_resumes_exactly(tmp_path: Path) -> None:
     with pytest.raises(KeyboardInterrupt):
         _train(tmp_path / "cut", Running(stop=iter([False] * 4 + [True]).__next__))
     resumed, again = _train(tmp_path / "cut")
+
     assert not changed_tensors(whole.state_dict(), resumed.state_dict())
     assert figures == again
 
@@ -378,6 +382,7 @@ def test_weights_are_exported_and_kept_apart_from_a_pipeline(weights: Path, tmp_
     ]
 
     assert not inline  # no matrix is stored twice, the transposed ones included
+
     with pytest.raises(CheckpointError, match="direct network"):
         load_pipeline(weights)
 
@@ -416,9 +421,12 @@ def test_varied_maps_are_those_of_another_wall_and_range() -> None:
 
 def test_stains_have_mean_0_and_variance_1_and_half_are_grain() -> None:
     patterns = _stains(200, torch.device("cpu"))
+
     assert float(patterns.mean()) == pytest.approx(0, abs=0.03)
     assert float(patterns.var()) == pytest.approx(1, abs=0.05)
+
     neighbours = (patterns[..., 1:] * patterns[..., :-1]).mean()
+
     assert 0.4 < float(neighbours) < 0.6  # half stains, half grain
 
 
@@ -471,6 +479,7 @@ def test_transfer_learns_the_bench_in_two_phases_and_resumes(tmp_path: Path) -> 
     }
 
     assert {name.partition(".")[0] for name in last} <= {"norm", "heads"}
+
     with pytest.raises(KeyboardInterrupt):
         go(tmp_path / "cut", Running(stop=iter([False] * 20 + [True]).__next__))
 

@@ -43,6 +43,7 @@ def test_accuracies_count_every_pixel() -> None:
 
 def test_silhouette_iou_takes_surface_above_5_percent() -> None:
     shifted = _square(0.9, columns=slice(15, 25))
+
     assert metrics.silhouette_iou(_square(0.4), shifted)[0] == pytest.approx(50 / 150)
     assert metrics.silhouette_iou(_square(0.06), _square(1.0)) == 1
     assert metrics.silhouette_iou(_square(0.04), _square(1.0)) == 0
@@ -94,6 +95,7 @@ def test_color_metrics_of_a_wrong_color() -> None:
 def test_wrong_silhouette_is_no_error_of_color() -> None:
     truth = _colored((0.9, 0.2, 0.1))
     image = _colored((0.9, 0.2, 0.1), slice(16, 32))
+
     assert metrics.color_silhouette_iou(image, truth) == 0.5
     assert metrics.color_error(image, truth) == 0.0
     assert np.isnan(metrics.color_error(np.zeros_like(truth), truth)).all()
@@ -103,6 +105,7 @@ def test_channel_below_black_is_black() -> None:
     black = _colored((0.9, 0.2, 0.0))
     below = _colored((0.9, 0.2, 0.0))
     below[:, 2, 16:48, 16:48] = 0.03  # below black is black
+
     assert metrics.color_error(below, black) == 0.0
 
 
@@ -193,6 +196,7 @@ def test_latent_error_is_weighted_by_encoder_variance() -> None:
     mean = torch.zeros(1, 2)
     sure = torch.full((1, 2), 0.25).log()
     unsure = torch.full((1, 2), 4.0).log()
+
     assert latent_error(latent, mean, sure).item() == pytest.approx(2 / 0.25)
     assert latent_error(latent, mean, unsure).item() == pytest.approx(2 / 4)
     assert latent_error(mean, mean, sure).item() == 0

@@ -129,7 +129,9 @@ def test_color_vae_differs_in_outer_layers_alone() -> None:
     with torch.device("meta"):
         vae = new_vae(color=True)
 
-    assert (vae.latent, CHANNELS, COLOR_OUTPUTS) == (512, 3, 512)
+    assert vae.latent == 512
+    assert CHANNELS == 3
+    assert COLOR_OUTPUTS == 512
 
     counts = [sum(p.numel() for p in part.parameters()) for part in (vae.encoder, vae.decoder)]
 
@@ -146,9 +148,12 @@ def test_color_vae_differs_in_outer_layers_alone() -> None:
 @torch.inference_mode()
 def test_decoder_is_in_range_and_independent_of_batch(vae: ResVae) -> None:
     far = vae.decoder(torch.tensor([[0.0], [1e4], [-1e4]]).expand(3, LATENT))
+
     assert ((far >= 0) & (far <= 1)).all()
+
     latent = torch.randn(3, LATENT)
     alone = torch.cat([vae.decoder(row[None]) for row in latent])
+
     torch.testing.assert_close(vae.decoder(latent), alone, atol=1e-5, rtol=1e-4)
 
 
@@ -178,6 +183,7 @@ def test_vae_trains_in_bfloat16() -> None:
         image, mean, log_variance = vae(torch.rand(2, 1, 64, 64), torch.randn(2, LATENT))
         loss = image.float().sum() + mean.float().sum() + log_variance.float().sum()
     loss.backward()
+
     assert all(p.grad is not None and torch.isfinite(p.grad).all() for p in vae.parameters())
 
 
@@ -190,5 +196,6 @@ def test_shipped_weights_load_bit_for_bit_with_record() -> None:
         for name, tensor in stored.items():
             assert torch.equal(tensors[name], tensor.to(tensors[name].dtype)), name
 
-    assert (record.vae_recipe.augmentation, record.vae_recipe.keep) == ("mirror", "last")
+    assert record.vae_recipe.augmentation == "mirror"
+    assert record.vae_recipe.keep == "last"
     assert record.transfer_recipe is None

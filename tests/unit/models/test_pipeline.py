@@ -55,6 +55,7 @@ def test_split_and_stack_gives_halves_channels_of_their_own() -> None:
     column = torch.arange(80.0).expand(1, 64, 80)
     left = column[0, :, :40]
     right = column[0, :, 40:]
+
     assert torch.equal(
         split_and_stack(column, 100 + column)[0],
         torch.stack([left, right, 100 + left, 100 + right]),
@@ -67,13 +68,16 @@ def test_split_and_stack_marks_a_missing_return_everywhere() -> None:
     depth[0, 5, 10] = torch.nan
     depth[0, 6, 70] = torch.nan
     missing = torch.isnan(split_and_stack(depth, intensity))[0].nonzero().tolist()
+
     assert missing == [[0, 5, 10], [1, 6, 30], [2, 5, 10], [3, 6, 30]]
 
 
 def test_split_and_stack_puts_each_color_behind_the_depth() -> None:
     depth, intensity = _maps(colors=3)
     stacked = split_and_stack(depth, intensity)
+
     assert stacked.shape == (3, stacked_channels(3), 64, 40)
+
     for color in range(3):
         chosen = stacked[:, [0, 1, 2 + 2 * color, 3 + 2 * color]]
         of_one = split_and_stack(depth, intensity[:, color])
@@ -86,6 +90,7 @@ def test_split_and_stack_commutes_with_mirroring(colors: int) -> None:
     flips = torch.tensor([True, False, True])
     before = split_and_stack(*flip_some(list(maps), flips))
     (after,) = flip_some([split_and_stack(*maps)], flips)
+
     torch.testing.assert_close(before, after, rtol=0, atol=0, equal_nan=True)
 
 
@@ -93,8 +98,10 @@ def test_channel_statistics_ignore_missing_returns() -> None:
     stacked = split_and_stack(*_maps())
     mean, spread = channel_statistics(stacked)
     values = stacked.double().numpy()
+
     np.testing.assert_allclose(mean, np.nanmean(values, (0, 2, 3)), rtol=1e-6)
     np.testing.assert_allclose(spread, np.nanstd(values, (0, 2, 3)), rtol=1e-6)
+
     for statistic in channel_statistics(torch.full((2, 4, 64, 40), torch.nan)):
         assert torch.equal(statistic, torch.zeros(4))
 
@@ -160,6 +167,7 @@ def test_pipeline_makes_possible_image_of_hard_maps(
 ) -> None:
     with torch.autocast("cpu", torch.bfloat16, enabled=bfloat16):
         image = pipeline(*hard_maps(name))
+
     assert image.shape == (1, 64, 64)
     assert ((image == 0) | ((image >= MIN_V) & (image <= 1))).all()
 
@@ -223,6 +231,7 @@ def test_cut_silhouette_goes_by_the_brightest_color() -> None:
     image[0, :, 10:40, 10:40] = torch.tensor([0.9, 0.02, 0.5])[:, None, None]
     image[0, :, 10:40, 40:43] = torch.tensor([0.3, 0.35, 0.3])[:, None, None]
     cut = cut_silhouette(image)
+
     assert torch.equal(cut[..., 10:40, 10:40], image[..., 10:40, 10:40])
     assert (cut[..., 40:43] == 0).all()
     assert torch.equal(cut_silhouette(image[:, [1, 2, 0]]), cut[:, [1, 2, 0]])
@@ -279,8 +288,11 @@ def test_image_batches_are_images_or_their_mirrors() -> None:
     images = np.random.default_rng(0).random((6, 64, 64)).astype(np.float16)
     known = {view.tobytes(): k for k, image in enumerate(images) for view in (image, image[::-1])}
     batches = list(image_batches(images, 3, torch.Generator()))
+
     assert all(b.shape == (3, 1, 64, 64) and b.dtype == torch.float32 for b in batches)
+
     found = [known[image[0].numpy().astype(np.float16).tobytes()] for b in batches for image in b]
+
     assert sorted(found) == list(range(6))
 
 
@@ -305,6 +317,7 @@ def test_first_maps_are_at_most_all() -> None:
     maps = small_maps(8, 0)
     for few, every in zip(vars(first_of(maps, 2)).values(), vars(maps).values(), strict=True):
         np.testing.assert_array_equal(few, every[:2])
+
     assert len(InMemory(maps).first(9).image) == 8
 
 

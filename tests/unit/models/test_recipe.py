@@ -92,7 +92,9 @@ def test_scaled_recipe_has_share_of_objects_times_epochs(
     share: float, epochs: int, objects: int
 ) -> None:
     scaled = small_recipe(objects=6000, epochs=34, batch=64, deviations=["a"]).scaled(share)
-    assert (scaled.epochs, scaled.objects) == (epochs, objects)
+
+    assert scaled.epochs == epochs
+    assert scaled.objects == objects
     assert scaled.deviations[0] == "a"
     assert (len(scaled.deviations) == 1) == (share == 1)
     assert recipe_of(json.loads(scaled.model_dump_json())) == scaled
@@ -101,8 +103,11 @@ def test_scaled_recipe_has_share_of_objects_times_epochs(
 def test_of_objects_limits_batch_and_refuses_bad_numbers() -> None:
     recipe = small_recipe(objects=100, batch=8)
 
-    assert (recipe.of_objects(5).objects, recipe.of_objects(5).batch) == (5, 5)
-    assert (recipe.of_objects(50).objects, recipe.of_objects(50).batch) == (50, 8)
+    assert recipe.of_objects(5).objects == 5
+    assert recipe.of_objects(5).batch == 5
+    assert recipe.of_objects(50).objects == 50
+    assert recipe.of_objects(50).batch == 8
+
     with pytest.raises(RecipeError, match="1"):
         recipe.of_objects(1)
 
@@ -148,6 +153,7 @@ def test_wrong_recipe_is_refused_with_field(
 
     with pytest.raises(RecipeError, match=words) as caught:
         load_recipe(path)
+
     assert "\n" not in str(caught.value)
     assert "{" not in str(caught.value)
 
@@ -162,8 +168,10 @@ def test_load_recipe_names_unreadable_file_or_similar_name(
 
     with pytest.raises(RecipeError, match=r"recipe\.toml") as caught:
         load_recipe(path)
+
     assert isinstance(caught.value, ModelError)
     assert caught.value.exit_code == 4
+
     with pytest.raises(RecipeError, match="Did you mean 'transfer'"):
         load_recipe(Path("transfre"))
 

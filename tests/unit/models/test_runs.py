@@ -143,6 +143,7 @@ def test_transfer_default_weights_fit_its_loss(
 
     assert start(TRANSFER, None)[1].runs == [VAE, TWO]
     assert start(TRANSFER.model_copy(update=IMAGES_ALONE), None)[1].runs == [straight]
+
     with pytest.raises(TrainingError, match="latent"):
         start(TRANSFER, shipped["direct"])
 

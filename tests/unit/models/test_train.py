@@ -54,6 +54,7 @@ def test_resumed_run_equals_uninterrupted(tmp_path: Path, schedule: str, fail_at
     with pytest.raises(Stopped):
         SmallRun(whole.recipe, tmp_path / "failed").go(fail_at)
     torch.manual_seed(99)
+
     _assert_same(_trained(tmp_path / "failed", schedule=schedule), whole)
 
 
@@ -90,6 +91,7 @@ def test_stopped_run_names_its_step_and_resumes_there(
 
     with pytest.raises(KeyboardInterrupt):
         run.go(stop=lambda: next(calls) == STEPS + 2, on_message=messages.append)
+
     assert [("epoch 1" in message, "step 2" in message) for message in messages] == [(True, True)]
 
     again = _trained(tmp_path / "stopped")
@@ -104,6 +106,7 @@ def test_failed_run_resumes_from_its_last_checkpoint(tmp_path: Path) -> None:
     with pytest.raises(Stopped):
         # Saved after steps 2 and 4.
         run.go(fail_at=5, clock=lambda: next(seconds), checkpoint_s=2.5)
+
     assert _trained(tmp_path / "failed", epochs=1).steps[0][0] in {3, 4, 5}
 
 
@@ -113,6 +116,7 @@ def test_held_out_loss_falls(
 ) -> None:
     monkeypatch.setattr(torch.backends.cpu, "get_cpu_capability", lambda: "AVX512")
     log = _trained(tmp_path, epochs=10, precision=precision).log
+
     assert [int(row["epoch"]) for row in log] == list(range(10))
     assert float(log[-1]["held_out_loss"]) < 0.5 * float(log[0]["held_out_loss"])
 
@@ -139,6 +143,7 @@ def test_run_of_other_recipe_or_origin_is_refused(tmp_path: Path) -> None:
     reworded.go(origin="these weights")
 
     assert not reworded.steps
+
     with pytest.raises(RecipeError, match="recipe"):
         _trained(tmp_path, learning_rate=0.5)
     with pytest.raises(RecipeError, match="weights"):
@@ -191,12 +196,14 @@ def test_diverged_run_keeps_earlier_epochs(tmp_path: Path, monkeypatch: pytest.M
 
     with pytest.raises(TrainingError, match=r"nan .*epoch 1.*learning_rate"):
         broken.go()
+
     _assert_same(_trained(tmp_path), _trained(tmp_path / "whole"))
 
     monkeypatch.setattr(SmallRun, "score", lambda _: {"held_out_loss": float("nan")})
 
     with pytest.raises(TrainingError, match="epoch 0"):
         _trained(tmp_path / "nan")
+
     assert not (tmp_path / "nan" / train.BEST).exists()
 
 
@@ -244,6 +251,7 @@ def test_read_last_falls_back_to_the_previous_state(tmp_path: Path, how: str) ->
         train.write_last(tmp_path, _state(step))
     _damage(tmp_path / train.LAST, how)
     messages: list[str] = []
+
     assert train.read_last(tmp_path, messages.append)["step"] == 1
     assert [str(tmp_path / train.LAST) in message for message in messages] == [True]
 
@@ -253,7 +261,9 @@ def test_read_best_refuses_a_missing_or_damaged_state(tmp_path: Path, how: str) 
     with pytest.raises(CheckpointError, match=train.BEST):
         train.read_best(tmp_path)
     train.write_best(tmp_path, _state(3))
+
     assert train.read_best(tmp_path)["step"] == 3
+
     _damage(tmp_path / train.BEST, how)
     with pytest.raises(CheckpointError, match=train.BEST):
         train.read_best(tmp_path)
@@ -267,6 +277,7 @@ def test_read_last_refuses_where_both_states_are_damaged(tmp_path: Path) -> None
 
     with pytest.raises(CheckpointError, match=train.LAST) as caught:
         train.read_last(tmp_path, pytest.fail)
+
     assert caught.value.exit_code == 4
     assert "\n" not in str(caught.value)
 
@@ -414,6 +425,7 @@ def test_state_of_another_kind_is_refused(
 
     with pytest.raises(CheckpointError, match=str(tmp_path)) as caught:
         SmallRun(small_recipe(), tmp_path).go()
+
     assert "\n" not in str(caught.value)
     assert "unpickled" not in capsys.readouterr().out
 
@@ -437,6 +449,7 @@ def test_processes_share_a_batch_without_repeating_samples() -> None:
 
 def test_seeds_differ_by_their_parts_and_count() -> None:
     parts = [(0,), (1,), (0, 1), (1, 0), (0, 0, 1), (0, 0, 2), (0, 1, 0)]
+
     assert len({seed_of(*part) for part in parts}) == len(parts)
     assert all(0 <= seed_of(*part) < 2**63 for part in parts)
     assert seed_of(3, 4) == seed_of(3, 4)
@@ -508,4 +521,5 @@ def test_launch_raises_error_of_process(error: BaseException, raised: type[BaseE
     with pytest.raises(raised, match="SIGKILL" if error is KILLED else None):
         launch(SimpleNamespace(world_size=2, launch=start), fail)
     alone = SimpleNamespace(world_size=1, launch=pytest.fail)
+
     assert launch(alone, lambda its, a, b: (its is alone, a + b), 2, 3) == (True, 5)

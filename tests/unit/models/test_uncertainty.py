@@ -61,6 +61,7 @@ def test_features_mark_a_cell_without_return(network: UncertaintyNetwork) -> Non
     depth_m = torch.ones(1, 64, 80)
     depth_m[0, 3, 4] = torch.nan
     features = network.features(depth_m, torch.full((1, 64, 80), 9.0))
+
     assert features[0, :, 3, 4].tolist() == [0, 0, 0, 0, 1]
 
 
@@ -120,6 +121,7 @@ def test_uncertainty_run_resumes_exactly(
 
     with pytest.raises(KeyboardInterrupt):
         _train(tmp_path / "stopped", steps, stop=lambda: len(steps) == 11)
+
     torch.testing.assert_close(
         _train(tmp_path / "stopped", steps).state_dict(), trained.state_dict()
     )
@@ -197,8 +199,11 @@ def test_loss_is_least_at_the_mean_error_of_shared_pixels() -> None:
 def test_uncertainty_batches_mirror_maps_with_their_images() -> None:
     some = small_uncertainty_set(32, 0)
     batch = next(iter(uncertainty.uncertainty_batches(some, 32, torch.Generator().manual_seed(0))))
+
     assert sorted(batch.nothing.tolist()) == sorted(some.nothing.astype(float).tolist())
+
     bright = (batch.intensity[:, :, 8:72] > 12).float()
+
     torch.testing.assert_close(bright, (batch.truth > 0).float())
     torch.testing.assert_close((batch.made > 0).float(), bright)
 
@@ -208,6 +213,7 @@ def test_error_scale_undoes_factor_in_any_unit(factor: float, unit: float) -> No
     expected = np.random.default_rng(1).uniform(0.01, 0.2, 20_000)
     error = np.abs(np.random.default_rng(0).laplace(0.0, expected))
     scale = uncertainty.error_scale(expected, error)
+
     assert factor * uncertainty.error_scale(
         factor * unit * expected, unit * error
     ) == pytest.approx(scale)
@@ -219,6 +225,7 @@ def test_temperature_finds_overconfidence(true: float) -> None:
     generator = np.random.default_rng(3)
     logits = generator.normal(0.0, 2.0, 50_000)
     truth = generator.random(50_000) < 1 / (1 + np.exp(-logits))
+
     assert uncertainty.temperature(true * logits, truth) == pytest.approx(true, rel=0.1)
     assert uncertainty.temperature(np.where(truth, 9.0, -9.0), truth) == 1.0  # separable
 
@@ -249,6 +256,7 @@ def test_uncertainty_network_is_restored_with_its_weights(
 
     assert uncertainty_network.load_uncertainty_network(watched) is None
     assert load_uncertainty_model(watched, tmp_path) is None
+
     with pytest.raises(CheckpointError, match="compressor"):
         records.checksum_of_watched(tmp_path)
 
@@ -352,6 +360,7 @@ def test_figures_are_those_of_the_mirrored_frame() -> None:
     images, said = frames(4)
     turned = said._replace(error_v=said.error_v[:, ::-1], p_surface=said.p_surface[:, ::-1])
     figures = quality_features(images, said)
+
     assert figures.shape == (4, quality.FEATURES)
     np.testing.assert_allclose(
         quality_features(images[:, ::-1], turned), figures, rtol=1e-4, atol=1e-4
@@ -362,6 +371,7 @@ def test_figures_of_a_frame_are_those_of_the_frame_alone() -> None:
     images, said = frames(4)
     figures = quality_features(images, said)
     alone = quality_features(images[1:2], UncertaintyEstimate(*(part[1:2] for part in said)))
+
     np.testing.assert_allclose(alone[0], figures[1], rtol=1e-4, atol=1e-5)
 
 
@@ -382,6 +392,7 @@ def test_figures_with_the_network_s_own_surface_come_last() -> None:
 def test_figures_are_finite_without_a_surface() -> None:
     images, said = frames(4)
     nothing = np.zeros_like(images)
+
     assert np.isfinite(quality_features(nothing, said)).all()
     assert np.isfinite(quality_features(nothing, said, nothing)).all()
 
@@ -415,6 +426,7 @@ def test_left_out_families_are_judged_once_and_never_fitted() -> None:
         judged += rows.tolist()
         seen = set[str]().union(*(families(kinds[row]) for row in fitted))
         assert not any(min(families(kinds[row])) in seen for row in rows)
+
     assert sorted(judged) == list(range(len(kinds)))
 
 
@@ -439,6 +451,7 @@ def test_trust_needs_good_outlines_in_both_shares() -> None:
     good = np.linspace(0, 1, 1000).astype(np.float32)
     generic = np.arange(1000) % 2 == 0
     above = trusted_above(good, good >= 0.5, generic)
+
     assert 0.44 < above <= 0.5
     assert trusted_above(good[-10:], good[-10:] > 0, generic[-10:]) is None
     assert trusted_above(good, (good >= 0.5) & ~generic, generic) is None
@@ -446,6 +459,7 @@ def test_trust_needs_good_outlines_in_both_shares() -> None:
 
 def test_model_of_poor_reconstructions_trusts_none() -> None:
     record = fit_quality(samples := known_objects(200, best=0.7), "0" * 12)
+
     assert record.trusted_above is None
     assert not QualityEstimate.of(QualityModel(record).outputs(samples.figures), None).trusted.any()
 
@@ -453,6 +467,7 @@ def test_model_of_poor_reconstructions_trusts_none() -> None:
 def test_good_outline_of_a_kind_counts_where_the_kind_is_sure() -> None:
     outputs = np.zeros((3, quality.OUTPUTS), np.float32)
     outputs[:, 3:6] = [(-9, 9, known) for known in (12, 0, -9)]
+
     assert QualityEstimate.of(outputs, 0.9).trusted.tolist() == [True, False, False]
     assert QualityEstimate.of(outputs, None).good[1] == pytest.approx(quality.KINDS_ODDS, rel=0.05)
 
@@ -461,6 +476,7 @@ def test_older_quality_records_know_no_kinds() -> None:
     outputs = np.zeros((3, quality.OUTPUTS), np.float32)
     outputs[:, 3:6] = [(-9, 9, known) for known in (12, 0, -9)]
     older = QualityEstimate.of(outputs[:, [0, 1, 2, 4, 6]], 0.9)
+
     assert older.trusted.all()
 
 
@@ -470,6 +486,7 @@ def test_shape_that_looks_like_a_kind_is_not_trusted() -> None:
     samples.figures[:, 1] = np.where(samples.generic, -1, 1) + 0.3 * samples.figures[:, 1]
     record = fit_quality(samples, "0" * 12)
     found = QualityEstimate.of(QualityModel(record).outputs(samples.figures), record.trusted_above)
+
     assert found.trusted[~samples.generic].sum() > 100
     assert not found.trusted[samples.generic].any()
 

@@ -85,6 +85,7 @@ def test_triangles_sharing_an_edge_leave_no_hole(corner: float) -> None:
         ]
         for a, b in pairwise(ring)
     ]
+
     assert np.isfinite(
         orthographic_depth(
             np.array(fan, float),
@@ -98,14 +99,19 @@ def test_sphere_and_box_show_their_near_side_in_their_cells() -> None:
     centre = (0.3, 0.05, 0.4)
     depth = orthographic_depth(_triangles(trimesh.creation.icosphere(5, radius), centre), BOX)
     from_axis = np.hypot(X - centre[0], Y - centre[1])
+
     assert np.isnan(depth[from_axis > radius]).all()
+
     inside = from_axis < 0.95 * radius
+
     np.testing.assert_allclose(
         depth[inside], centre[2] - np.sqrt(radius**2 - from_axis[inside] ** 2), atol=1e-3
     )
+
     solid = trimesh.creation.box(extents=(0.2, 0.1, 0.08))
     depth = orthographic_depth(_triangles(solid, (0.32, 0.1, 0.3)), BOX)
     inside = (np.abs(X - 0.32) < 0.1) & (np.abs(Y - 0.1) < 0.05)
+
     np.testing.assert_allclose(depth[inside], 0.26, rtol=1e-6)
     assert np.isnan(depth[~inside]).all()
 
@@ -148,6 +154,7 @@ def test_share_outside_is_the_part_of_a_plate_beyond_the_box(
 ) -> None:
     plate = trimesh.creation.box(extents=(0.1, 0.1, 0.01))
     x, y = (s * (0.32 - 0.05 + 0.1 * share) for s in side)
+
     assert share_outside(
         _triangles(plate, (0.32 + x, y, 0.3)),
         BOX,
@@ -158,10 +165,12 @@ def test_share_outside_counts_the_silhouette_once_and_no_edges() -> None:
     inside = _quad((0.3, 0.3, 0.3, 0.3), 0.1, 0.2)
     outside = _quad((0.3, 0.3, 0.3, 0.3), 0.65, 0.75)
     layers = [outside + np.array((0, 0, 0.1 * k)) for k in range(4)]
+
     assert share_outside(
         np.concatenate([inside, *layers]),
         BOX,
     ) == pytest.approx(0.5)
+
     edge_on = (3.0, -1, 0.2), (3.0, 1, 0.2), (3.0, 0, 0.5)
     sliver = (3.0, -1, 0.2), (3.5, 0.37, 0.2), (3.5, 0.37 + 1e-9, 0.5)
     speck = (4.0, 1, 0.2), (4.0 - 1e-6, 1, 0.2), (4, 1 - 1e-6, 0.2)
@@ -175,6 +184,7 @@ def test_share_outside_counts_the_silhouette_once_and_no_edges() -> None:
         ),
     )
     thin = [edge_on], [sliver, speck], [exact]
+
     assert [
         share_outside(
             np.array(triangles),
@@ -201,6 +211,7 @@ def test_image_maps_near_to_1_far_to_a_tenth_and_background_to_0() -> None:
             np.inf,
         ]
     )
+
     np.testing.assert_allclose(
         image_from_depth(depth, PAPER),
         [
@@ -214,7 +225,9 @@ def test_image_maps_near_to_1_far_to_a_tenth_and_background_to_0() -> None:
         ],
         rtol=1e-6,
     )
+
     depth = depth_from_image(np.array([0.0, 0.049, 0.051, 0.1]), PAPER)
+
     assert np.isnan(depth).tolist() == [True, True, False, False]
     np.testing.assert_allclose(depth[2:], PAPER.z_far_m, rtol=1e-6)
 
@@ -235,6 +248,7 @@ def test_depth_survives_the_image_and_back(near: float, deep: float, seed: int) 
     ).astype(np.float32)
     depth[generator.random(depth.shape) < 0.5] = np.nan
     back = depth_from_image(image_from_depth(depth, box), box)
+
     np.testing.assert_allclose(back, depth, atol=1e-6 * (1 + deep))
 
 
@@ -246,10 +260,13 @@ def test_image_survives_the_depth_map_and_back_in_float16() -> None:
         dtype=np.float32,
     ).reshape(64, 64)
     image[:10] = 0
+
     np.testing.assert_allclose(
         image_from_depth(depth_from_image(image, PAPER), PAPER), image, atol=1e-6
     )
+
     half = image.astype(np.float16)
+
     np.testing.assert_allclose(
         image_from_depth(depth_from_image(half, PAPER), PAPER), half, atol=2e-3
     )
@@ -258,6 +275,7 @@ def test_image_survives_the_depth_map_and_back_in_float16() -> None:
 def test_cell_centers_grow_with_wall_x_and_against_wall_y() -> None:
     x_m, y_m = cell_centers_m(PAPER)
     pitch = (PAPER.x_max_m - PAPER.x_min_m) / 64
+
     np.testing.assert_allclose(np.diff(x_m), pitch)
     np.testing.assert_allclose(np.diff(y_m), -pitch)
     np.testing.assert_allclose(
@@ -288,6 +306,7 @@ def test_painted_depends_on_the_seed_and_draws_every_texture() -> None:
         )
         for seed in (5, 5, 6)
     )
+
     np.testing.assert_array_equal(one.albedo, again.albedo)
     assert one.texture == again.texture
     assert not np.array_equal(one.albedo, other.albedo)
@@ -328,16 +347,21 @@ def test_textures_have_the_colors_of_their_names() -> None:
         )
         for name, albedo in made.items()
     }
+
     assert colours["plain"] == 1
     assert colours["stripes"] == colours["layers"] == 2
     assert 2 <= colours["patches"] <= 4
     assert colours["gradient"] > 100
+
     near = made["layers"][np.nanmin(THING) == THING]
+
     assert (near == near[0]).all()
+
     albedo = TEXTURES["layers"](
         np.random.default_rng(0),
         np.full((64, 64), np.nan, np.float32),
     )
+
     assert np.isfinite(albedo).all()
 
 
@@ -345,11 +369,14 @@ def test_image_is_the_albedo_on_the_surface_and_0_beside_it() -> None:
     albedo = paint(2, THING, [*TEXTURES]).albedo
     image = image_from_albedo(albedo, THING)
     hidden = np.isnan(THING)
+
     assert image.shape == (3, 64, 64)
+
     black = image_from_albedo(
         np.zeros((64, 64, 3)),
         np.full((64, 64), 0.2),
     )
+
     np.testing.assert_allclose(black, BLACK_V, atol=1e-6)  # no background
     assert (image[:, hidden] == 0).all()
     np.testing.assert_allclose(

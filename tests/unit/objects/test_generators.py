@@ -52,6 +52,7 @@ def test_cupboard_shows_its_shelves_beside_the_open_door(shelves: int) -> None:
     )
     columns = np.flatnonzero(np.isfinite(depth).sum(axis=0) > 40)
     inside = depth[:, columns[0] + (columns[-1] - columns[0]) // 3]
+
     assert _runs(inside > np.nanmin(depth[:, columns[-6]]) + 0.03) == shelves
 
 
@@ -59,9 +60,12 @@ def test_cupboard_shows_its_shelves_beside_the_open_door(shelves: int) -> None:
 def test_oven_has_its_knobs_in_a_row_and_a_recessed_window(knobs: int) -> None:
     depth = straight_view(CATEGORIES["oven"], knobs=float(knobs), tip=18.0)
     found = [_runs(row < np.nanmedian(row) - 0.01) for row in depth if np.isfinite(row).sum() > 20]
+
     assert knobs in found
+
     rows, columns = (np.flatnonzero(np.isfinite(depth).any(axis=axis)) for axis in (1, 0))
     window = depth[rows[len(rows) * 3 // 4]]
+
     assert window[32] > window[columns[4]] + 0.015
 
 
@@ -78,6 +82,7 @@ def test_symmetric_kind_is_the_same_on_both_sides(kind: str) -> None:
 def test_hollow_is_deeper_than_its_rim(kind: str) -> None:
     column = straight_view(CATEGORIES[kind])[:, 32]
     column = column[np.isfinite(column)]
+
     assert column.max() - column.min() > 0.05
     assert np.abs(np.diff(column)).max() > 0.02
 
@@ -87,11 +92,13 @@ def test_category_makes_an_object_per_seed_that_fits_its_box(
     category: str,
 ) -> None:
     meshes = {seed: category_triangles(category, seed) for seed in SEEDS}
+
     np.testing.assert_array_equal(
         category_triangles(category, SEEDS[-1]),
         meshes[SEEDS[-1]],
     )
     assert len({mesh.tobytes() for mesh in meshes.values()}) == len(SEEDS)
+
     for seed, mesh in meshes.items():
         assert (
             0.5
@@ -148,7 +155,9 @@ def test_categories_and_seeds_make_the_same_objects_as_ever() -> None:
     """Datasets name their objects by seeds: a changed shape, or another order, would make others of
     them.
     """
+
     assert list(CATEGORIES) == [kind.name for kind in CATEGORIES.values()] == NAMES.split()
+
     meshes = [
         np.round(
             category_triangles(name, 0),
@@ -158,10 +167,13 @@ def test_categories_and_seeds_make_the_same_objects_as_ever() -> None:
         for name in CATEGORIES
     ]
     found = [hashlib.sha256(mesh.tobytes()).hexdigest()[:8] for mesh in meshes]
+
     assert dict(zip(CATEGORIES, found, strict=True)) == dict(
         zip(CATEGORIES, DIGESTS.split(), strict=True)
     )
+
     hidden = np.round(paper_scene().hidden.triangles, 9)
+
     assert hashlib.sha256(hidden.tobytes()).hexdigest()[:16] == "1ab023dab17e054a", (
         "the README's airplane"
     )
@@ -206,7 +218,9 @@ def _settings(draw: st.DrawFn) -> Setting:
 @given(_settings(), UNIT)
 def test_setting_never_draws_held_out_values(setting: Setting, unit: float) -> None:
     value = setting.draw(unit)
+
     assert any(low - 1e-12 <= value <= high + 1e-12 for low, high in setting.training_intervals)
+
     if (
         setting.held_out
         and setting.low < setting.held_out[0]
@@ -226,8 +240,10 @@ def test_category_setting_steps_over_its_held_out_interval(name: str) -> None:
     drawn = [setting.draw(unit) for unit in np.linspace(0, 1, 501)]
     below = [k for k, value in enumerate(drawn) if value <= low]
     above = [k for k, value in enumerate(drawn) if value >= high]
+
     assert drawn == sorted(drawn)
     assert below + above == list(range(501))
+
     if below and above:  # bisect to the very numbers where it steps over what is held out
         under = below[-1] / 500
         over = above[0] / 500
@@ -240,10 +256,13 @@ def test_category_setting_steps_over_its_held_out_interval(name: str) -> None:
 @given(_settings())
 def test_setting_draws_grow_evenly_from_end_to_end(setting: Setting) -> None:
     lows, highs = zip(*setting.training_intervals, strict=True)
+
     assert setting.draw(0) == pytest.approx(min(lows), abs=1e-9)
     assert setting.draw(1) == pytest.approx(max(highs), abs=1e-9)
+
     total = sum(high - low for low, high in setting.training_intervals)
     steps = np.diff([setting.draw(u) for u in np.linspace(0, 1, 20)])
+
     assert (steps >= -1e-12).all()
     assert np.sort(steps)[:-1] == pytest.approx(total / 19, abs=1e-9), (
         "all but the step over the gap"
@@ -258,13 +277,16 @@ def test_setting_draws_grow_evenly_from_end_to_end(setting: Setting) -> None:
 def test_setting_without_a_gap_draws_what_numpy_draws(ends: tuple[float, float], seed: int) -> None:
     low, high = sorted(ends)
     drawn = Setting(low, high).draw(np.random.default_rng(seed).random())
+
     assert drawn == np.random.default_rng(seed).uniform(low, high)
 
 
 @pytest.mark.parametrize("kind", CATEGORIES.values(), ids=CATEGORIES)
 def test_category_holds_out_enough_and_trains_on_most(kind: Category) -> None:
     held = {name: s for name, s in kind.settings.items() if s.held_out}
+
     assert len(held) >= 2
+
     for setting in held.values():
         low, high = setting.held_out or (0, 0)
         trained = sum(b - a for a, b in setting.training_intervals)
@@ -283,6 +305,7 @@ def test_category_decorator_keeps_name_and_setting_order() -> None:
     assert crate.draw([0.5, 1.0]) == {"width": 1.5, "height": 5}
     assert crate.draw_held_out([0.5, 0.5]) == {"width": 1.5, "height": 3.75}
     assert np.ptp(crate.make(**crate.draw([0.5, 1.0]))[..., 1]) == 5
+
     with pytest.raises(ValueError, match="shorter"):
         crate.draw([0.5])
 
@@ -299,8 +322,11 @@ def test_generic_shapes_follow_the_seed_and_the_families_shares() -> None:
         assert surface.size >= MIN_PIXELS, name
         assert surface.min() >= BOX.z_near_m - 1e-6, name
         assert surface.max() <= BOX.z_far_m + 1e-6, name
+
     assert len({depth_m.tobytes() for _, depth_m in shapes}) == len(shapes)
+
     names = [name for name, _ in shapes]
+
     assert {name for name in names if " " not in name} == FAMILIES.keys()
     assert 0.1 < np.mean([name.startswith("carved") for name in names]) < 0.3
     assert 0.06 < np.mean([" and " in name for name in names]) < 0.2
@@ -384,27 +410,33 @@ def test_lathe_turns_about_y_and_frame_is_open() -> None:
         .reshape(-1, 3)
         .T
     )
-    assert (y.min(), y.max()) == (
-        pytest.approx(-0.2),
-        pytest.approx(0.5),
-    )
+
+    assert y.min() == pytest.approx(-0.2)
+    assert y.max() == pytest.approx(0.5)
+
     radius = np.hypot(x, z)
+
     assert radius[np.isclose(y, -0.2)].max() == pytest.approx(0.3)
     assert radius[np.isclose(y, 0.5)].max() == pytest.approx(0.1)
+
     x, y, _ = solids.frame(0.6, 0.4, 0.1, 0.2).reshape(-1, 3).T
+
     assert ((np.abs(x) > 0.2 - 1e-9) | (np.abs(y) > 0.1 - 1e-9)).all()
 
 
 @pytest.mark.parametrize("angle", [90.0, 180.0, 270.0])
 def test_arch_is_part_of_a_ring_from_the_x_axis_on(angle: float) -> None:
     part = solids.arch(0.4, 0.05, angle)
+
     assert _area(part) == pytest.approx(
         _area(solids.ring(0.4, 0.05)) * angle / 360,
         rel=0.01,
     )
     assert part[..., 0].max() == pytest.approx(0.45)
     assert solids.arch(0.4, 0.05, 180)[..., 1].min() == pytest.approx(0, abs=1e-9)
+
     x, y, z = part.reshape(-1, 3).T
+
     np.testing.assert_allclose(
         np.hypot(np.hypot(x, y) - 0.4, z),
         0.05,
@@ -460,6 +492,7 @@ def test_solid_is_closed(solid: Float64) -> None:
         axis=1,
     )
     _, times = np.unique(edges, axis=0, return_counts=True)
+
     assert len(corners) > 4
     assert (times == 2).all()
 

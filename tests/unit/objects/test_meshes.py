@@ -126,10 +126,9 @@ def test_read_mesh_needs_no_optional_package(tmp_path: Path) -> None:
     ]
     command = [sys.executable, "-c", WITHOUT_EXTRAS, *names]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
-    assert (done.stdout.split(), done.stderr) == (
-        [str(len(SOLID.faces))] * 5 + ["2", "2"],
-        "",
-    )
+
+    assert done.stdout.split() == [str(len(SOLID.faces))] * 5 + ["2", "2"]
+    assert done.stderr == ""
 
 
 @pytest.mark.parametrize(
@@ -163,6 +162,7 @@ def test_read_mesh_is_silent_and_refuses_unreadable_numbers(
                 EXPORTS["text.stl"],
             ).triangles
         ) == len(SOLID.faces)
+
     assert not caplog.records
     assert logging.getLogger("trimesh").level == before
 
@@ -206,6 +206,7 @@ def test_read_mesh_joins_faces_of_every_kind(
 def test_read_mesh_joins_parts_and_equals_by_path_and_content(tmp_path: Path) -> None:
     other = b"v 5 0 0\nv 6 0 0\nv 6 1 0\nf -3 -2 -1\n"
     mesh = _read(tmp_path, "thing.obj", VERTICES + b"f -4 -3 -2\n" + other)
+
     assert sorted(mesh.triangles[..., 0].max(1)) == [1, 6]
     assert len(
         _read(
@@ -214,7 +215,9 @@ def test_read_mesh_joins_parts_and_equals_by_path_and_content(tmp_path: Path) ->
             EXPORTS["text.stl"] * 2,
         ).triangles
     ) == 2 * len(SOLID.faces)
+
     mesh = _read(tmp_path, "thing.stl", EXPORTS["binary.stl"])
+
     assert _read(tmp_path, "thing.stl", EXPORTS["binary.stl"]) == mesh
     assert _read(tmp_path, "other.stl", EXPORTS["binary.stl"]).sha256 == mesh.sha256
     assert _read(tmp_path, "thing.stl", EXPORTS["text.stl"]) != mesh
@@ -274,8 +277,11 @@ def test_read_mesh_refuses_damaged_files(
 @pytest.mark.parametrize("name", ["none.obj", "none.stl", "none.ply", "none.npy"])
 def test_reader_names_a_missing_file_and_a_folder(tmp_path: Path, name: str) -> None:
     read = read_depth_map if name.endswith("npy") else read_mesh
+
     _assert_refused(tmp_path / name, "No such file", read)
+
     (tmp_path / name).mkdir()
+
     _assert_refused(tmp_path / name, "directory", read)
 
 
@@ -330,11 +336,14 @@ def test_plain_makes_odd_obj_text_usual(odd: bytes, usual: bytes) -> None:
 
 def test_plain_renames_ply_edges_and_keeps_binary_bodies() -> None:
     body = b"\n\0element edge 7"
+
     assert (
         plain(b"ply\nelement edge 2\nend_header" + body, ".ply")
         == b"ply\nelement wire 2\nend_header" + body
     )
+
     stl = bytes(80) + (1).to_bytes(4, "little") + b"\t#\xe7\r\n" * 10
+
     assert plain(stl, ".stl") == stl
 
 
@@ -368,8 +377,10 @@ def test_read_depth_map_takes_every_real_type_and_size(
         depth.astype(dtype, order="F" if dtype == "f8" else "C"),
     )
     read = read_depth_map(tmp_path / "map.npy")
+
     np.testing.assert_array_equal(read, depth)
-    assert (read.dtype, type(read)) == (np.float32, np.ndarray)
+    assert read.dtype == np.float32
+    assert type(read) is np.ndarray
     assert read.flags.c_contiguous or dtype == "f8"
 
 
@@ -423,13 +434,16 @@ def test_read_depth_map_refuses_damaged_files_and_archives(tmp_path: Path) -> No
     np.save(path := tmp_path / "map.npy", _map(0.3))
     content = path.read_bytes()
     claims_too_much = content.replace(b"(16, 16), }            ", b"(1600000, 1600000), }  ")
+
     assert claims_too_much != content
+
     for damaged in (
         claims_too_much,
         *(content[:cut] + junk for cut in (0, 5, 60, 128, 400) for junk in (b"", b"hello")),
     ):
         _assert_refused(_write(tmp_path, "map.npy", damaged), "", read_depth_map)
     np.savez(tmp_path / "maps.npz", depth_m=_map(0.3))
+
     _assert_refused(tmp_path / "maps.npz", "", read_depth_map)
 
 
@@ -455,7 +469,9 @@ def test_folder_objects_sorts_meshes_and_refuses_other_paths(
         (tmp_path / other).write_bytes(b"no mesh")
     (tmp_path / "folder.obj").mkdir()
     found = [path.relative_to(tmp_path).as_posix() for path in folder_objects(tmp_path)]
+
     assert found == ["a/deep/er/y.ply", "a/z.STL", "b.obj", "c/x.stl"]
+
     (tmp_path / "empty" / "sub").mkdir(parents=True)
     for path in (tmp_path / "gone", _save(tmp_path / "a.stl"), tmp_path / "empty"):
         with pytest.raises(SceneError, match=str(path)):
@@ -477,9 +493,11 @@ def test_mesh_depth_reads_one_mesh_at_one_pose_per_seed(tmp_path: Path) -> None:
         )
         for seed in range(12)
     ]
+
     assert [path for path, _ in made] == [call.args[0] for call in read.call_args_list]
     assert {path for path, _ in made} == set(meshes)
     assert len({depth.tobytes() for _, depth in made}) == 12
+
     for seed, (path, depth) in enumerate(made):
         again = mesh_depth(seed, meshes, BOX, read=read_mesh)
         assert again[0] == path
@@ -541,6 +559,7 @@ def test_mesh_depth_draws_another_pose_for_an_edge_on_sheet(
         BOX,
         read=lambda name: MeshFile(Path(name), "", lying),
     )
+
     assert 1 < drawn.call_count <= POSES
     assert np.isfinite(depth_m).any()
 
@@ -559,6 +578,7 @@ def test_load_object_places_a_category_and_a_mesh_alike(tmp_path: Path) -> None:
     mesh.export(tmp_path / "cup.stl")
     expected = orthographic_depth(place(triangles, POSE, BOX), BOX)
     loaded = load_object("cup", BOX, POSE, seed=4)
+
     np.testing.assert_array_equal(loaded.depth_m, expected)
     assert loaded.warnings == ()
     np.testing.assert_allclose(
@@ -577,8 +597,10 @@ def test_load_object_places_a_category_and_a_mesh_alike(tmp_path: Path) -> None:
 def test_load_object_suggests_the_nearest_category(name: str, hint: str) -> None:
     with pytest.raises(SceneError) as caught:
         load_object(name, BOX)
+
     assert name in str(caught.value)
     assert hint in str(caught.value)
+
     with pytest.raises(SceneError, match="Did you mean 'airplane'"):
         find_category("aeroplane")
 
@@ -647,8 +669,11 @@ def sampled(mesh: SurfaceMesh) -> np.ndarray:
 @given(depth_m=DEPTHS, jump_m=st.sampled_from([0.0, JUMP_M, 1.0]))
 def test_mesh_sampled_at_cell_centers_is_the_depth_map(depth_m: np.ndarray, jump_m: float) -> None:
     mesh = mesh_from_depth(depth_m, SMALL_BOX, ERROR_M, jump_m)
+
     np.testing.assert_allclose(sampled(mesh), depth_m, atol=1e-6)
+
     corners_m = mesh.vertices_m[mesh.faces]
+
     assert (
         not len(corners_m)
         or np.ptp(
@@ -657,10 +682,12 @@ def test_mesh_sampled_at_cell_centers_is_the_depth_map(depth_m: np.ndarray, jump
         ).max()
         <= jump_m + 1e-7
     )
+
     normal = np.cross(
         corners_m[:, 1] - corners_m[:, 0],
         corners_m[:, 2] - corners_m[:, 0],
     )
+
     assert (normal[:, 2] < 0).all(), "the lit side faces the wall"
 
 
@@ -671,6 +698,7 @@ def test_vertices_lie_at_cell_centers_with_their_uncertainty() -> None:
         SMALL_BOX,
         ERROR_M,
     )
+
     np.testing.assert_allclose(
         mesh.vertices_m[9],
         [x_m[1], y_m[1], 0.2],
@@ -688,6 +716,7 @@ def test_opencv_reads_the_saved_mesh(tmp_path: Path, suffix: str) -> None:
         np.float64(vertices_m[0]),
         np.array(faces, np.int64).reshape(-1, 3),
     )
+
     np.testing.assert_allclose(read.vertices_m, mesh.vertices_m, atol=1e-6)
     np.testing.assert_array_equal(read.faces, mesh.faces)
     assert [path.name for path in tmp_path.iterdir()] == [f"mesh{suffix}"]
@@ -700,6 +729,7 @@ def test_glb_holds_the_mesh_and_its_uncertainty(tmp_path: Path) -> None:
         tmp_path / "mesh.glb",
         process=False,
     ).geometry.values()
+
     np.testing.assert_allclose(read.vertices, mesh.vertices_m, atol=1e-6)
     np.testing.assert_array_equal(read.faces, mesh.faces)
     np.testing.assert_array_equal(
@@ -712,13 +742,17 @@ def test_points_are_saved_without_faces(tmp_path: Path) -> None:
     mesh = mesh_from_depth(slope(), SMALL_BOX)
     mesh.points_only.save(tmp_path / "points.ply")
     read, *_ = cv2.loadPointCloud(str(tmp_path / "points.ply"))
+
     np.testing.assert_allclose(read[:, 0], mesh.vertices_m, atol=1e-6)
+
     mesh.save(str(tmp_path / "points.csv"))
     rows = [*csv.DictReader((tmp_path / "points.csv").read_text(encoding="utf-8").splitlines())]
+
     np.testing.assert_allclose(
         [float(row["z_m"]) for row in rows], mesh.vertices_m[:, 2], atol=1e-5
     )
     assert {row["uncertainty_m"] for row in rows} == {""}
+
     mesh_from_depth(slope(), SMALL_BOX, ERROR_M).save(tmp_path / "mesh.npz")
     with np.load(tmp_path / "mesh.npz") as arrays_read:
         np.testing.assert_array_equal(arrays_read["vertices_m"], mesh.vertices_m)

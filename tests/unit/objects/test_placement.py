@@ -36,14 +36,18 @@ def test_place_gives_size_offset_and_a_front_within_the_box() -> None:
             front_m=0.04,
         )
     )
+
     assert np.ptp(points[:, :2], axis=0).max() == pytest.approx(0.15)
+
     middle = (points.min(0) + points.max(0)) / 2
+
     np.testing.assert_allclose(
         middle[:2],
         [0.45 + 0.02, -0.03],
         atol=1e-12,
     )
     assert points[:, 2].min() == pytest.approx(BOX.z_near_m + 0.04)
+
     for front_m in (0.3, 1.0):
         with pytest.raises(SceneError, match="front_m"):
             place(CUP, Pose(front_m=front_m), BOX)
@@ -52,15 +56,20 @@ def test_place_gives_size_offset_and_a_front_within_the_box() -> None:
 def test_deep_mesh_is_flattened_and_fit_reports_it() -> None:
     inside = fit_in_box(CUP, Pose(size_m=0.2), BOX)
     beside = fit_in_box(CUP, Pose(size_m=0.2, x_m=0.25), BOX)
+
     assert inside.outside == 0
     assert beside.outside == 1
     assert inside.depth_m == pytest.approx(np.ptp(_points(Pose(size_m=0.2))[:, 2]))
     assert inside.room_m == pytest.approx(BOX.z_far_m - BOX.z_near_m - Pose().front_m)
+
     shallow = BOX.model_copy(update={"z_far_m": BOX.z_near_m + 0.06})
     flattened = fit_in_box(CUP, Pose(size_m=0.2), shallow)
+
     assert flattened.depth_m == inside.depth_m > flattened.room_m == pytest.approx(0.03)
+
     deep = _points(Pose())
     flat = _points(Pose(), shallow)
+
     assert flat[:, 2].max() == pytest.approx(shallow.z_far_m)
     np.testing.assert_allclose(flat[:, :2], deep[:, :2])
 
@@ -88,6 +97,7 @@ def test_object_depth_draws_known_categories_only() -> None:
         for seed in range(12)
     } == {"cup", "hat"}
     assert {object_depth(seed, BOX)[0] for seed in range(250)} == set(CATEGORIES)
+
     for categories, word in (
         ((), "category"),
         (("cup", "teapot"), "teapot"),
@@ -111,7 +121,9 @@ def test_backgrounds_come_at_their_share_behind_the_same_objects() -> None:
             strict=True,
         )
     ]
+
     assert 4 <= sum(has) <= 20
+
     for thing, with_some, with_each, seed_has in zip(
         alone,
         some,
@@ -127,18 +139,16 @@ def test_backgrounds_come_at_their_share_behind_the_same_objects() -> None:
 def test_random_pose_spans_the_training_range_in_the_box() -> None:
     least = pose_from_units([0.0] * POSE_UNITS, BOX)
     most = pose_from_units([1.0] * POSE_UNITS, BOX)
-    assert (least.size_m, most.size_m) == (
-        pytest.approx(0.55 * 0.25),
-        pytest.approx(0.9 * 0.25),
-    )
-    assert (least.turn_z_rad, most.turn_z_rad) == (
-        pytest.approx(-np.radians(35)),
-        pytest.approx(np.radians(35)),
-    )
+
+    assert least.size_m == pytest.approx(0.55 * 0.25)
+    assert most.size_m == pytest.approx(0.9 * 0.25)
+    assert least.turn_z_rad == pytest.approx(-np.radians(35))
+    assert most.turn_z_rad == pytest.approx(np.radians(35))
     assert (least.front_m, most.front_m) == (
         0,
         pytest.approx(0.35 * 0.28),
     )
+
     for pose in (least, most):
         assert abs(pose.x_m) + pose.size_m / 2 == pytest.approx(0.125)
         assert abs(pose.y_m) + pose.size_m / 2 == pytest.approx(0.125)
@@ -155,8 +165,11 @@ def test_background_leaves_the_object_and_stays_in_the_box(seed: int) -> None:
     thing = OBJECTS[seed]
     depth = add_background(thing, BOX, np.random.default_rng(seed))
     surface = ~np.isnan(thing)
+
     np.testing.assert_array_equal(depth[surface], thing[surface])
+
     added = depth[~surface & ~np.isnan(depth)]
+
     assert added.size
     assert (added >= np.nanmin(thing) - 1e-6).all()
     assert (added <= BOX.z_far_m + 1e-6).all()
@@ -174,6 +187,7 @@ def test_background_is_a_post_or_a_panel() -> None:
         ).mean()
         for seed in range(20)
     ]
+
     assert min(shares) < np.isfinite(OBJECTS[0]).mean() + 0.1
     assert max(shares) > 0.4
 
@@ -188,6 +202,7 @@ def test_post_is_level_from_the_underside_to_the_bottom(thing: Float32) -> None:
             np.flatnonzero(below[:, column]),
             np.arange(lowest + 1, 64),
         )
+
     assert (
         np.ptp(
             post(
@@ -207,6 +222,7 @@ def test_panel_is_a_rectangle_behind_the_object(thing: Float32) -> None:
     there = ~np.isnan(board)
     rows = there.any(axis=1)
     columns = there.any(axis=0)
+
     np.testing.assert_array_equal(there, rows[:, None] & columns)
     assert 36 <= rows.sum() <= 64
     assert 36 <= columns.sum() <= 64
@@ -219,14 +235,18 @@ BENCHMARK = benchmark_objects(BOX)
 
 def test_benchmark_has_three_named_objects_per_category() -> None:
     assert len(BENCHMARK) == len({thing.name for thing in BENCHMARK}) == 54
+
     numbered = [(thing.category, thing.number) for thing in BENCHMARK]
+
     assert numbered == [(c, k) for c in CATEGORIES for k in (1, 2, 3)]
     assert BENCHMARK[0].name == "airplane-1"
 
 
 def test_benchmark_is_the_same_each_time() -> None:
     again = benchmark_objects(BOX)
+
     assert again == BENCHMARK
+
     for thing, same in zip(BENCHMARK, again, strict=True):
         assert thing.depth_m.tobytes() == same.depth_m.tobytes()
         assert thing.triangles.tobytes() == same.triangles.tobytes()
@@ -244,7 +264,9 @@ def test_benchmark_object_shows_in_the_box(thing: BenchmarkObject) -> None:
 def test_benchmark_object_takes_held_out_settings(thing: BenchmarkObject) -> None:
     """No seed reaches these intervals (test_generators.py)."""
     kind = CATEGORIES[thing.category]
+
     assert list(thing.settings) == list(kind.settings)
+
     for name, setting in kind.settings.items():
         if setting.held_out:
             assert setting.held_out[0] < thing.settings[name] < setting.held_out[1]
@@ -276,7 +298,9 @@ def test_benchmark_poses_cover_the_training_range_evenly() -> None:
             ("turn_z", 35),
         )
     }
+
     assert set(spans) == set(Pose.__dataclass_fields__)
+
     for name, (low, high) in spans.items():
         spare = [
             (0.25 - thing.pose.size_m) / 2 if name in {"x_m", "y_m"} else 1 for thing in BENCHMARK
@@ -301,4 +325,5 @@ def test_benchmark_poses_cover_the_training_range_evenly() -> None:
             for k, thing in enumerate(BENCHMARK)
         ]
     )
+
     assert np.abs(np.corrcoef(table.T) - np.eye(8)).max() < 0.25

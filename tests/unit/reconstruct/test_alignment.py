@@ -74,10 +74,12 @@ def test_bare_bench_looks_like_the_bare_training_rig(rig: Rig) -> None:
     aligned = MapAlignment(rig, RIG)
     found = aligned.align(maps_of(rig, None))
     wanted = maps_of(RIG, None)
+
     np.testing.assert_array_equal(found.valid, wanted.valid)
     # Cells are compared but for the column at the occluder's edge, which sees both it and the wall.
     off_m = np.abs(found.depth_m - wanted.depth_m)
     ratio = found.intensity / wanted.intensity
+
     assert np.quantile(off_m, 0.98) < 1e-3
     assert np.quantile(np.abs(np.log(ratio)), 0.95) < 0.04
 
@@ -115,27 +117,36 @@ def test_bare_wall_takes_reflectance_gain_and_offset_out(gain: float, offset_m: 
     reference: Any = SimpleNamespace(map_depth_m=empty.depth_m, map_intensity=empty.intensity)
     aligned = alignment(rig, trained(), reference)
     plain = alignment(rig, trained())
+
     assert aligned
     assert plain
+
     seen = maps_of(rig, depth_m, painted)
     seen = replace(seen, intensity=gain * seen.intensity)
     wanted = plain.align(maps_of(rig, depth_m))
     of_wall = np.abs(wanted.depth_m - maps_of(RIG, None).depth_m) < 1e-3
     found = aligned.align(seen)
+
     assert np.quantile(np.abs(found.depth_m - wanted.depth_m)[of_wall], 0.98) < 1e-3
     assert np.quantile(np.abs(np.log(found.intensity / wanted.intensity))[of_wall], 0.98) < 0.04
+
     known = aligned.align(replace(seen, depth_m=seen.depth_m + 0.5), seen.depth_m - empty.depth_m)
+
     np.testing.assert_array_equal(known.depth_m, found.depth_m)
 
 
 def test_what_cannot_be_aligned_is_left_alone() -> None:
     rig = BENCHES["all of it"]
     box = RIG.object_box
+
     assert box
+
     larger = rig.model_copy(
         update={"object_box": box.model_copy(update={"z_far_m": box.z_far_m + 0.05})}
     )
+
     assert reconstruct.rig_to_align_with(rig, trained()) == RIG
+
     for other, record in (
         (RIG, trained()),
         (larger, trained()),
@@ -153,6 +164,7 @@ def test_what_cannot_be_aligned_is_left_alone() -> None:
     dark = LidarMaps(
         np.full_like(maps.depth_m, np.nan), np.zeros_like(maps.intensity), np.zeros_like(maps.valid)
     )
+
     assert not MapAlignment(rig, RIG).align(dark).valid[:, :50].any()
 
 
@@ -167,6 +179,7 @@ def test_unmeasured_occluder_stands_as_in_training() -> None:
     seen = maps_of(rig, THINGS[0].depth_m)
     records = (rig, rig.model_copy(update={"occluder": None}))
     found, wanted = (alignment(one, trained()).align(seen) for one in records)  # type: ignore[union-attr]
+
     np.testing.assert_allclose(found.depth_m, wanted.depth_m)
     np.testing.assert_allclose(found.intensity, wanted.intensity)
 

@@ -84,6 +84,7 @@ def test_each_kind_of_wrong_maps_is_named(name: str) -> None:
     found = [CHECK.examine(change(maps, MAPS[k - 1])) for k, maps in enumerate(MAPS)]
 
     named = sum(problem in each.problems for each in found)
+
     assert named >= len(MAPS) - 1
 
 

@@ -18,15 +18,18 @@ PIXELS = 80 * 64
 def test_frame_without_half_of_its_depth_has_an_issue(depths: int, issues: tuple[str]) -> None:
     frame = small_frame(0)
     frame.depth_m.ravel()[depths:] = np.nan
+
     assert frame_issues(frame) == issues
 
 
 @pytest.mark.parametrize(("saturated", "issues"), [(5, ()), (6, ("saturated",))])
 def test_more_than_a_thousandth_saturated_is_an_issue(saturated: int, issues: tuple[str]) -> None:
     assert PIXELS // 1000 == 5
+
     frame = small_frame(0)
     frame.ir[:] = 254
     frame.ir.ravel()[:saturated] = 255
+
     assert frame_issues(frame) == issues
 
 
@@ -39,6 +42,7 @@ def wait_for_end(reader: FrameReader) -> None:
 def test_lossless_reader_yields_every_frame() -> None:
     with FrameReader(FrameCamera(200), lossless=True, stop=Event()) as reader:
         numbers = [arrival.frame.frame_number for arrival in reader]
+
     assert numbers == list(range(200))
     assert reader.dropped == []
 
@@ -47,6 +51,7 @@ def test_full_reader_drops_the_oldest_frames() -> None:
     with FrameReader(FrameCamera(200), lossless=False, stop=Event()) as reader:
         wait_for_end(reader)
         numbers = [arrival.frame.frame_number for arrival in reader]
+
     assert numbers == list(range(200 - QUEUE_FRAMES, 200))
     assert reader.dropped == list(range(200 - QUEUE_FRAMES))
 
@@ -56,6 +61,7 @@ def test_reader_counts_issues_and_gives_each_frame_its_own() -> None:
     camera._make = lambda number: small_frame(number) if number % 3 else blank_frame(number)
     with FrameReader(camera, lossless=True, stop=Event()) as reader:
         issues = [arrival.issues for arrival in reader]
+
     assert issues == [() if number % 3 else ("blank",) for number in range(30)]
     assert reader.issues == {"blank": 10}
 
@@ -72,6 +78,7 @@ def test_reader_ends_with_the_stop_event() -> None:
         for arrival in reader:
             if arrival.frame.frame_number == 5:
                 stop.set()
+
     assert not reader._thread.is_alive()
 
 
@@ -87,6 +94,7 @@ def test_reader_closes_a_source_that_hangs(monkeypatch: pytest.MonkeyPatch) -> N
     source = FrameCamera(None, lambda _: release.wait(60.0))
     with FrameReader(source, lossless=True, stop=Event(), abandon_source=release.set) as reader:
         pass
+
     assert not reader._thread.is_alive()
 
 

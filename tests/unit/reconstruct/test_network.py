@@ -33,11 +33,13 @@ def test_reconstruct_inverts_the_image_of_a_depth_map(seed: int) -> None:
     truth_m = generator.uniform(BOX.z_near_m, BOX.z_far_m, (64, 64)).astype(np.float32)
     truth_m[generator.random((64, 64)) < 0.5] = np.nan
     found = reconstruct(some_maps(), RIG, lambda *_: image_from_depth(truth_m, BOX)[None])
+
     np.testing.assert_allclose(found.depth_m, truth_m, atol=1e-6)  # NaN where NaN
 
 
 def test_reconstruction_stands_on_the_wall_before_the_box() -> None:
     found = reconstruct(some_maps(), RIG, sheet_network)
+
     np.testing.assert_allclose(found.wall_from_object @ [0, 0, 0, 1], [0.45, 0.0, 0.0, 1.0])
     np.testing.assert_array_equal(found.wall_from_object[:3, :3], np.eye(3))
 
@@ -46,6 +48,7 @@ def test_reconstruct_all_shares_the_network_time() -> None:
     ticks = itertools.count()
     images = np.repeat(HALF, 4, 0)
     found = reconstruct_all([some_maps()] * 4, RIG, lambda *_: images, lambda: float(next(ticks)))
+
     assert [each.timings_s for each in found] == [{"network": 0.25}] * 4
     assert [each.uncertainty_m for each in found] == [None] * 4
 
@@ -72,6 +75,7 @@ def test_uncertainty_model_adds_probabilities_and_a_stage(uncertain: Reconstruct
 
 def test_uncertainty_is_an_error_in_metres(uncertain: Reconstruction) -> None:
     apart_m = depth_from_image(HALF[0], BOX) - depth_from_image(HALF[0] + np.float32(0.1), BOX)
+
     np.testing.assert_allclose(uncertain.uncertainty_m, apart_m, rtol=1e-5)
     assert uncertain.uncertainty_m is uncertain.uncertainty.error_m
 
@@ -79,6 +83,7 @@ def test_uncertainty_is_an_error_in_metres(uncertain: Reconstruction) -> None:
 @pytest.mark.usefixtures("uncertain")
 def test_uncertainty_model_gets_maps_and_image(uncertainty_model: FakeUncertainty) -> None:
     depth_m, intensity, image = uncertainty_model.asked[0]
+
     np.testing.assert_array_equal(depth_m, some_maps().depth_m[None])
     np.testing.assert_array_equal(intensity, some_maps().intensity[None])
     np.testing.assert_array_equal(image, HALF)
@@ -86,6 +91,7 @@ def test_uncertainty_model_gets_maps_and_image(uncertainty_model: FakeUncertaint
 
 def test_hidden_surface_keeps_its_uncertainty(uncertain: Reconstruction) -> None:
     hidden = uncertain.without_surface
+
     assert uncertain.has_surface
     assert not hidden.has_surface
     assert hidden.uncertainty_m is uncertain.uncertainty_m
@@ -98,6 +104,7 @@ def test_maps_without_returns_have_uncertainty_and_no_surface(
     maps = LidarMaps(BLANK_M, np.zeros((64, 80), np.float32), ~np.isnan(BLANK_M))
     full = np.ones((1, 64, 64), np.float32)
     found = reconstruct(maps, RIG, lambda *_: full, uncertainty_model=uncertainty_model)
+
     assert not found.has_surface
     assert found.uncertainty_m is not None
     assert not uncertainty_model.asked[0][2].any()
@@ -129,6 +136,7 @@ def test_quality_is_predicted_from_each_frames_own_surface(
     nothing, found = reconstruct_all(
         [blank, bright], RIG, SurfaceNetwork(), uncertainty_model=uncertainty_model
     )
+
     assert nothing.quality is None
     assert found.quality.iou == (0.5, 0.5, 0.5)
     np.testing.assert_array_equal(quality_model.call_args.args[2], sheet_network() * 40)

@@ -56,6 +56,7 @@ def score(seen: LidarMaps, expected: Expected) -> float:
 
 def test_score_of_expected_maps_is_0_but_for_noise() -> None:
     scene = expected_object()
+
     assert score(maps_of(scene), scene) == pytest.approx(0.0, abs=1e-6)
     assert score(maps_of(scene, noise_m=1e-4), scene) < 0.1
     assert score(maps_of(scene.bare, noise_m=1e-4), scene.bare) < 0.05
@@ -79,6 +80,7 @@ def test_score_of_an_object_that_is_not_there_is_above_1() -> None:
 def test_score_rises_with_the_distance_from_the_object() -> None:
     maps = maps_of(expected_object(0.5))
     scores = [score(maps, expected_object(0.5 + off_m)) for off_m in (0.0, 0.005, 0.01, 0.03, 0.1)]
+
     assert scores[0] <= scores[1] < scores[2] < scores[3] < scores[4]
     assert scores[-1] > 0.9
 
@@ -87,6 +89,7 @@ def test_score_rises_with_the_distance_from_the_object() -> None:
 def test_explain_fits_the_albedo(albedo: float) -> None:
     scene = expected_object()
     best = explain(maps_of(scene, albedo=albedo), scene, scene.bare)
+
     assert best.albedo == pytest.approx(albedo, rel=1e-6)
     assert best.score == pytest.approx(0.0, abs=1e-6)
 
@@ -96,20 +99,25 @@ def test_explain_fits_the_gain() -> None:
     maps = maps_of(scene)
     dimmed = replace(maps, intensity=maps.intensity * np.float32(0.25))
     best = explain(dimmed, scene, scene.bare)
+
     assert best.gain == pytest.approx(0.25 * GAIN, rel=1e-5)
     assert best.score == pytest.approx(explain(maps, scene, scene.bare).score, abs=1e-6)
 
 
 def test_fitted_gain_uses_the_wall_where_it_is_visible() -> None:
     seen = maps_of(expected_object(strength=40.0), gain=1e4)
+
     assert fit_gain(seen, expected_object().bare) == pytest.approx(1e4, rel=1e-5)
+
     far = replace(seen, depth_m=seen.depth_m + np.float32(0.2))
+
     assert fit_gain(far, expected_object().bare) > 1e4
     assert fit_gain(replace(seen, valid=np.zeros(SHAPE, np.bool_)), expected_object().bare) == 1.0
 
 
 def test_mean_cost_lets_equally_strong_echoes_swap() -> None:
     bare = maps_of(expected_object().bare)
+
     assert mean_cost(bare, expected_object(strength=1.1), GAIN, 1.0) < 0.05
     assert mean_cost(bare, expected_object(strength=10.0), GAIN, 1.0) > 0.4
 
@@ -118,6 +126,7 @@ def test_mean_cost_counts_cells_that_wrongly_return_or_do_not() -> None:
     wall = expected_object().bare
     direct = np.where(RIGHT, 0.0, wall.direct)
     half = replace(wall, direct=direct, direct_m=np.where(RIGHT, np.nan, wall.direct_m))
+
     assert mean_cost(maps_of(wall), half, GAIN, 1.0) == pytest.approx(0.5, abs=1e-3)
     assert mean_cost(maps_of(half), wall, GAIN, 1.0) == pytest.approx(0.5, abs=1e-3)
     assert mean_cost(maps_of(half), half, GAIN, 1.0) == pytest.approx(0.0, abs=1e-6)
@@ -126,6 +135,7 @@ def test_mean_cost_counts_cells_that_wrongly_return_or_do_not() -> None:
 def test_saturated_cell_explains_any_more_light() -> None:
     bright = expected_object(strength=1000.0)
     maps = maps_of(bright)
+
     assert maps.intensity.max() == 255
     assert mean_cost(maps, bright, GAIN, 1.0) == pytest.approx(0.0, abs=1e-6)
     assert mean_cost(maps, expected_object(strength=1.5), GAIN, 1.0) > 0.1
@@ -166,6 +176,7 @@ def test_check_scores_the_true_object_best() -> None:
 
 def test_check_explains_the_true_object_to_within_noise() -> None:
     found = check_reconstruction(seen(SEEDS[0]), hidden(SEEDS[0]), RIG)
+
     assert found.score < 0.05
     assert np.nanquantile(np.abs(found.residual_depth_m), 0.95) < 2e-3
     assert np.nanquantile(np.abs(found.residual_intensity), 0.95) < 3
@@ -175,6 +186,7 @@ def test_check_explains_the_true_object_to_within_noise() -> None:
 def test_check_takes_its_time_from_the_clock() -> None:
     ticks = iter([5.0, 7.5])
     found = check_reconstruction(seen(None), EMPTY, RIG, clock=lambda: next(ticks))
+
     assert found.seconds == 2.5
 
 
@@ -204,6 +216,7 @@ def test_maps_without_returns_have_no_residuals() -> None:
     nan_m = np.full(SHAPE, np.nan, np.float32)
     dark = np.zeros(SHAPE, np.float32)
     found = check_reconstruction(LidarMaps(nan_m, dark, dark > 0), EMPTY, RIG)
+
     assert found.score == 1.0
     assert np.isnan(found.residual_depth_m).all()
 
@@ -214,6 +227,7 @@ def test_check_works_on_a_rig_without_object_box() -> None:
     maps = LidarMaps(
         rendering.depth_m, rendering.intensity * np.float32(1e5), np.isfinite(rendering.depth_m)
     )
+
     assert check_reconstruction(maps, None, bare).score < 1e-3
     assert check_reconstruction(maps, hidden(SEEDS[0]), bare).score < 1e-3
 
@@ -244,9 +258,12 @@ def test_periodic_check_reports_a_failure_once(caplog: pytest.LogCaptureFixture)
     for number, depth_m in enumerate([behind_the_wall, behind_the_wall, EMPTY]):
         checks.offer(number, seen(None), depth_m)
     (message,) = caplog.messages
+
     assert "frame 0" in message
     assert checks.newest.frame_number == 2
+
     log_warning(describe_failure(7, "SceneError: 100 % wrong"))
+
     assert "SceneError: 100 % wrong" in caplog.messages[1]
 
 
@@ -255,4 +272,5 @@ def test_live_loop_shows_the_newest_check_with_each_frame() -> None:
     checks = PeriodicPhysicsCheck(RIG, every=2, accuracy="draft")
     pipeline = Pipeline(CalibratedRig(RIG), sheet_network, checks=checks)
     run_live(WallCamera(5, period_s=0.0), pipeline, viewer, stop=Event(), recorded=True)
+
     assert [moment.result.check.frame_number for moment in viewer.moments] == [0, 0, 2, 2, 4]

@@ -77,7 +77,9 @@ def test_steps_time_every_stage_with_the_given_clock() -> None:
     done = all_steps(
         Pipeline(CalibratedRig(RIG), sheet_network), WallCamera(3), lambda: float(next(ticks))
     )
+
     assert [step.frame.frame_number for step in done] == [0, 1, 2]
+
     for step in done:
         stages_s = dict(step.stages_s)
         assert stages_s.pop("queue") > (step.arrived_s or 0.0) == 0.0
@@ -91,10 +93,12 @@ def test_pipeline_feeds_the_mean_of_raw_or_difference_maps(walled: CalibratedRig
             Pipeline(walled, noting, uses_difference=uses_difference, average=4), WallCamera(6)
         )
     mean_m = np.mean([wall_frame(number).depth_m for number in range(2, 6)], axis=0)
+
     np.testing.assert_allclose(noting.given[5], mean_m, atol=1e-6)
     np.testing.assert_allclose(noting.given[11], mean_m - walled.reference.map_depth_m, atol=1e-6)
     assert done[5].frame.frame_number == 5
     np.testing.assert_array_equal(done[5].difference.depth_m, noting.given[11])
+
     with pytest.raises(CalibrationError, match="--wall"):
         Pipeline(CalibratedRig(RIG), sheet_network, uses_difference=True)
 
@@ -107,6 +111,7 @@ def test_pipeline_adds_the_measured_offset_to_raw_maps(
     record = walled.measured.record.model_copy(update={"range_offset_m": offset_m})
     bench = CalibratedRig(RIG, replace(walled.measured, record=record))
     (step,) = all_steps(Pipeline(bench, noting), WallCamera(1))
+
     np.testing.assert_array_equal(noting.given[0], step.maps.depth_m + np.float32(offset_m))
 
 
@@ -114,6 +119,7 @@ def test_pipeline_watches_drift_in_the_frame_not_the_mean(walled: CalibratedRig)
     done = all_steps(
         Pipeline(walled, sheet_network, average=1000), WallCamera(100, moved=range(50, 100))
     )
+
     assert not any(step.warnings for step in done[:50])
     assert done[-1].warnings
 
@@ -147,7 +153,9 @@ def test_batched_results_equal_results_in_turn(tmp_path: Path, count: int) -> No
             bench, looking, average=3, uncertainty_model=FakeUncertainty(), checks=checks
         )
         done.append(all_steps(pipeline, WallCamera(count, moved=range(count // 2)), ahead=ahead))
+
     assert [step.frame.frame_number for step in done[1]] == list(range(count))
+
     for one, other in zip(*done, strict=True):
         assert (one.verdict, one.warnings, one.arrived_s) == (
             other.verdict,
@@ -188,6 +196,7 @@ def test_result_shows_what_its_verdict_says(
         assert step.reconstruction.has_surface == (verdict is Verdict.SEEN)
         assert step.reconstruction.uncertainty_m is not None
         np.testing.assert_array_equal(asked[0][0], given)
+
     assert done[-1].verdict == Verdict.WALL_MOVED
 
 
@@ -229,14 +238,22 @@ def test_warnings_name_mismatches_with_the_training(
     walled: CalibratedRig,
 ) -> None:
     farther = RIG.model_copy(update={"lidar": RIG.lidar.model_copy(update={"distance_m": 0.3})})
+
     assert compatibility_warnings(CalibratedRig(RIG), trained(), DOUBTER) == []
+
     (note,) = compatibility_warnings(CalibratedRig(farther), trained(), DOUBTER)
+
     assert "100 mm" in note
+
     (note,) = compatibility_warnings(CalibratedRig(RIG), trained(), None)
+
     assert "uncertainty" in note
+
     bare = CalibratedRig(RIG, replace(walled.measured, reference=None))
     found, more = (compatibility_warnings(each, trained(), DOUBTER) for each in (walled, bare))
+
     assert ["reference" in note for note in set(more) - set(found)] == [True]
+
     for checksum, notes in ((RIG.checksum, 0), ("0" * 12, 1)):  # a rig of another name
         unnamed = trained("a rig of somebody else's", checksum)
         assert len(compatibility_warnings(CalibratedRig(RIG), unnamed, DOUBTER)) == notes
@@ -250,8 +267,11 @@ def test_build_pipeline_feeds_the_networks_their_kind_of_maps(
     network.record = trained(eats=eats)
     pipeline: Any = build_pipeline(walled, network, average=7)
     done = all_steps(pipeline, WallCamera(1))
+
     assert pipeline.network is network
+
     fed = {"raw maps": done[0].maps, "difference maps": done[0].difference}[eats]
+
     np.testing.assert_array_equal(network.given[0], fed.depth_m)
     assert len(pipeline._mean._last) == 7
 
@@ -264,6 +284,7 @@ def test_load_networks_exports_into_the_cache(
     monkeypatch.setattr(
         "nlos_cam.reconstruct.pipeline.load_reconstructor", lambda *given: asked.append(given) or np
     )
+
     assert load_networks(Path("mine")) is np
     assert asked == [(Path("mine"), tmp_path / "onnx")]
 
@@ -286,20 +307,27 @@ def observe(bench: CalibratedRig, number: int = 0, nearer_m: float = 0.0) -> Ben
 
 def test_open_bench_takes_a_record_or_the_cameras_rig(wall: Path, tmp_path: Path) -> None:
     own = RIG.model_copy(update={"name": "own"})
+
     assert open_bench(None, camera(rig=own)).rig is own
     assert open_bench(None, camera(rig=load_rig("bare-wall"))).rig == RIG
+
     bench = open_bench(None, camera(Intrinsics(320, 240, 1.0, 1.0, 0.0, 0.0)))
     bench.update_temperatures({"ldd_temperature": 90.0})
     look = observe(bench)
+
     assert bench.rig == RIG
     assert (look.difference, look.warnings, bench.reference) == (None, (), None)
+
     bench = open_bench(wall, camera())
+
     assert (bench.rig.name, bench.reference.frames, bench.measured.record.serial) == (
         "measured",
         20,
         SERIAL,
     )
+
     bare = open_bench(write_wall(tmp_path / "bare.toml"), camera())
+
     assert bare.rig.name == "measured"
     assert observe(bare).difference is None
 
@@ -312,6 +340,7 @@ def test_difference_of_the_bare_wall_is_noise_less_drift(walled: CalibratedRig) 
         levels_m.append(float(off_m.mean()))
         assert off_m.std() == pytest.approx(5e-4, rel=0.1)
         assert abs(difference.intensity[difference.valid].mean()) < 0.5
+
     assert levels_m[0] == pytest.approx(-0.0006, abs=1e-4)
     assert np.mean(levels_m[-20:]) == pytest.approx(0.0, abs=1e-4)
 
@@ -323,6 +352,7 @@ def test_difference_is_valid_where_maps_and_reference_are() -> None:
     depth_m[:, 3] = np.nan
     maps = LidarMaps(depth_m, reference.map_intensity + added, ~np.isnan(depth_m))
     found = subtract_reference(maps, reference)
+
     np.testing.assert_array_equal(found.valid, maps.valid & np.isfinite(reference.map_depth_m))
     assert not found.valid[:, 3].any()
     assert not found.valid.all(axis=0)[79]  # the wall as far as 0.6 m is all that the reference has
@@ -348,6 +378,7 @@ def test_bench_warns_of_drift_heat_and_of_a_moved_lidar(
 ) -> None:
     walled.update_temperatures({"ldd_temperature": celsius})
     looks = [observe(walled, number + 500, nearer_m) for number in range(frames)]
+
     assert not looks[0].moved
     assert looks[-1].moved == moved
     assert bool(looks[-1].warnings) == (nearer_m != 0 or celsius > 70.0)
@@ -373,6 +404,7 @@ def test_open_bench_warns_of_another_camera(wall: Path, serial: str, warned: boo
     warnings = observe(
         open_bench(wall, camera(identity={"serial": serial} if serial else {}))
     ).warnings
+
     assert len(warnings) == warned
     assert all(SERIAL in warning and serial in warning for warning in warnings)
 

@@ -20,6 +20,7 @@ def test_warning_log_ignores_numbers_in_a_warning() -> None:
     log.add(warned(2, "48 degrees"))
     log.add(warned(3, "48 degrees", "48 mm"))
     log.add(warned(4))
+
     assert on_warning.call_args_list == [
         call("46.5 degrees", True),
         call("48 mm", True),
@@ -34,6 +35,7 @@ def test_recent_values_replace_the_oldest_in_constant_memory() -> None:
     for number in range(35):
         times.add({"maps": float(number)})
         assert times._columns["maps"].size == 10
+
     assert sorted(times.of("maps")) == [float(number) for number in range(25, 35)]
 
 
@@ -49,9 +51,12 @@ def predicted(iou: float, verdict: Verdict, *, trusted: bool) -> FrameResult:
 
 def test_quality_is_summarized_over_detected_objects_alone() -> None:
     log = QualityLog()
+
     assert log.summary == {}
+
     log.add(predicted(0.6, Verdict.SEEN, trusted=False))
     log.add(predicted(0.8, Verdict.SEEN, trusted=True))
     log.add(predicted(0.1, Verdict.OUTSIDE, trusted=False))
     expected = {"expected_iou": 0.7, "expected_error_mm": 7.0, "trusted": 0.5}
+
     assert log.summary == pytest.approx(expected)

@@ -67,6 +67,7 @@ def test_verdict_is_the_last_that_holds(
 @pytest.mark.parametrize("conditions", [USUAL, ALL])
 def test_surface_is_hidden_if_nothing_is_there(conditions: FrameConditions) -> None:
     shown, _ = VerdictFilter(LIMITS).decide(reconstruction(nothing=0.9), conditions)
+
     assert np.isnan(shown.depth_m).all()
     assert np.isfinite(shown.uncertainty_m).all()
 
@@ -102,12 +103,14 @@ def verdicts_of(frames: list[Reconstruction]) -> list[Verdict | None]:
 def test_one_frame_out_of_distribution_is_smoothed() -> None:
     p_outside = [0.0] * 10 + [1.0] + [0.0] * 10
     verdicts = verdicts_of([reconstruction(outside=p) for p in p_outside])
+
     assert set(verdicts) == {Verdict.SEEN}
 
 
 def test_steady_outlier_is_outside_within_a_fifth_second() -> None:
     p_outside = [0.0] * 10 + [1.0] * STEADY_FRAMES
     verdicts = verdicts_of([reconstruction(outside=p) for p in p_outside])
+
     assert verdicts[-1] == Verdict.OUTSIDE
     assert STEADY_FRAMES / 30 < 0.2
 
@@ -116,4 +119,5 @@ def test_empty_frame_is_not_smoothed_and_forgets_the_object() -> None:
     frames = [reconstruction(outside=1.0)] * STEADY_FRAMES
     frames += [reconstruction(nothing=0.9), reconstruction()]
     verdicts = verdicts_of(frames)
+
     assert verdicts[-3:] == [Verdict.OUTSIDE, Verdict.NOTHING, Verdict.SEEN]

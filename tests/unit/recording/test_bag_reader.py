@@ -52,6 +52,7 @@ def test_reader_reads_the_messages_that_rosbags_reads(bag: BagReader) -> None:
     with Reader(bag.path) as reader:
         for connection, time_ns, raw in reader.messages():
             expected.setdefault(connection.topic, []).append((time_ns, bytes(raw)))
+
     assert contents(bag) == expected
     assert bag.end_ns == max(messages[-1][0] for messages in expected.values())
 
@@ -80,6 +81,7 @@ def test_damage_is_reported_with_its_place_and_the_repair(noise_bag: Path, tmp_p
     position = BagReader(noise_bag).entries["/file_version"][0].chunk_pos
     with pytest.raises(RecordingError, match=rf"0\.0 s .* byte {position}") as raised:
         BagReader(path)
+
     assert f"`nlos-cam repair {path} --out damaged-repaired.bag`" in str(raised.value)
 
 
@@ -114,12 +116,16 @@ def test_reader_keeps_no_file_open_and_reports_its_loss(noise_bag: Path, tmp_pat
 def test_frames_come_in_recorded_order_and_by_index(bag: BagReader) -> None:
     bag.check()
     places = list(bag.order(bag.streams))
+
     assert all(one.time_ns <= other.time_ns for one, other in pairwise(places))
+
     for stream, info in bag.streams.items():
         assert [place.index for place in places if place.stream == stream] == list(
             range(info.frames)
         )
+
     assert places[-1].time_ns <= bag.end_ns
+
     for place, sample in reversed(list(zip(places, bag.samples(bag.streams), strict=True))):
         again = bag.sample(place.stream, place.index)
         assert (again.stream, again.number, again.timestamp_s) == (
@@ -133,7 +139,9 @@ def test_frames_come_in_recorded_order_and_by_index(bag: BagReader) -> None:
 def test_sample_owns_its_pixels_and_ends_at_the_last(noise_bag: Path) -> None:
     bag = BagReader(noise_bag)
     bag.sample("depth", 0).pixels[:] = 0
+
     assert bag.sample("depth", 0).pixels.any()
+
     with pytest.raises(IndexError):
         bag.sample("depth", 20)
 
@@ -184,8 +192,10 @@ def test_bag_without_intrinsics_is_an_error(rewritten: Any) -> None:
 
 def test_unknown_encoding_is_an_error_when_read(rewritten: Any) -> None:
     bag = BagReader(rewritten(lambda _, time_ns, raw: [(time_ns, raw.replace(b"8UC1", b"Y10B"))]))
+
     assert not bag.streams["infrared"].format
     assert bag.sample("depth", 0).number == 0
+
     with pytest.raises(RecordingError, match="Y10B"):
         bag.sample("infrared", 0)
 
@@ -197,6 +207,7 @@ def test_streams_of_one_kind_differ_by_their_index(
     bag = BagReader(
         changed(noise_bag_uncompressed, path, lambda old: old.replace(b"Infrared_0", b"Infrared_2"))
     )
+
     assert set(bag.streams) == {"depth", "infrared_2", "confidence"}
     assert bag.sample("infrared_2", 19).number == 19
 
@@ -254,8 +265,11 @@ def test_settings_at_a_time_are_those_last_set(rewritten: Any) -> None:
         assert bag.settings(time_ns)["depth_units"] == pytest.approx(0.00025)
     for time_ns in (10**12, 1, 25_000_000, 15_000_000, 35_000_000, 0):  # in any order
         assert bag.settings(time_ns) == BagReader(path).settings(time_ns)
+
     assert bag.settings(0) == {}
+
     before = bag.settings(11_000_000)
+
     assert bag.settings(12_000_000) is before
     assert bag.settings(21_000_000) is not before
     assert before["frames_queue_size"] == 3.0
@@ -292,6 +306,7 @@ def test_reader_of_a_damaged_bag_raises_one_line(
         read_all(path)
     except RecordingError as error:
         message = str(error)
+
     assert message.startswith(str(path))
     assert "\n" not in message
 
@@ -348,19 +363,23 @@ def test_pixels_refuses_an_image_that_contradicts_itself(changed: dict[str, obje
 def test_pixels_skips_padding_of_rows() -> None:
     image = parsed_image(bytes(range(10)))
     image.step = 5
+
     np.testing.assert_array_equal(pixels(image, "mono8", PINHOLE), [[0, 1, 2], [5, 6, 7]])
 
 
 @pytest.mark.parametrize("encoding", ENCODINGS)
 def test_encodings_are_formats_of_the_sdk(encoding: str) -> None:
     found = ENCODINGS[encoding]
+
     assert found.sdk_format in load_sdk().format.__members__
+
     bytes_per_pixel = found.channels * np.dtype(found.dtype).itemsize
     values = np.arange(6 * bytes_per_pixel, dtype=np.uint8)
     image = SimpleNamespace(
         encoding=encoding, width=3, height=2, step=3 * bytes_per_pixel, data=values
     )
     result = pixels(image, encoding, PINHOLE)
+
     assert result.shape == ((2, 3) if found.channels == 1 else (2, 3, found.channels))
     assert result.tobytes() == values.tobytes()
 
@@ -380,15 +399,17 @@ def test_sdk_name_gives_names_of_the_sdk() -> None:
 def test_metadata_and_lens_are_parsed() -> None:
     pairs = {"system_time": "15.25", "timestamp_domain": "System Time", "Frame Counter": "169"}
     found = metadata([SimpleNamespace(key=key, value=value) for key, value in pairs.items()])
-    assert (found.domain, found.values) == (
-        "system_time",
-        {"system_time": 15.25, "frame_counter": 169.0},
-    )
+
+    assert found.domain == "system_time"
+    assert found.values == {"system_time": 15.25, "frame_counter": 169.0}
     assert not metadata([]).domain
+
     model, coefficients = lens_of(
         SimpleNamespace(distortion_model="Brown Conrady", D=[0.1, 0.2, 0.3, 0.4, 0.5])
     )
-    assert (model, list(coefficients)) == ("brown_conrady", [0.1, 0.2, 0.3, 0.4, 0.5])
+
+    assert model == "brown_conrady"
+    assert list(coefficients) == [0.1, 0.2, 0.3, 0.4, 0.5]
 
 
 SHIFT_M = 0.1, 0.2, -0.3

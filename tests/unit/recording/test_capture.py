@@ -77,9 +77,12 @@ def test_sidecar_agrees_with_its_take(run: Run) -> None:
     (take,) = run(frames=5)
     found = load_sidecar(sidecar_path(take.target.path))
 
-    assert (found.state, found.label, found.camera) == ("complete", "object 0", "sim")
+    assert found.state == "complete"
+    assert found.label == "object 0"
+    assert found.camera == "sim"
     assert found.summary == take.summary
-    assert (found.summary.frames, found.summary.streams["infrared"]) == (5, 5)
+    assert found.summary.frames == 5
+    assert found.summary.streams["infrared"] == 5
     assert found.rig
 
 
@@ -104,7 +107,9 @@ def test_takes_have_own_files_and_follow_each_other(run: Run, tmp_path: Path) ->
         return verify(path)
 
     takes = run(count=3, frames=6, read_back=read_back)
+
     assert there == [["0.bag"], ["0.bag", "1.bag"], ["0.bag", "1.bag", "2.bag"]]
+
     for take in takes:
         assert (take.state, take.verified.streams) == ("complete", dict.fromkeys(FORMATS, 6))
         assert take.quality.frames_seen <= 6
@@ -130,6 +135,7 @@ def test_take_that_ends_early_is_whole_and_the_last(
 ) -> None:
     world.fails_at = vanishes_at
     (take,) = run(count=3, frames=500, **limits)
+
     assert take.state == saved_state(take) == state
     assert take.verified.frames == take.sets
     assert take.sets in sets
@@ -147,10 +153,13 @@ def test_take_without_a_frame_or_a_start_leaves_no_file(
     camera._prepare = fail
     with pytest.raises(CameraLostError, match="does not start"):
         list(takes.record(Event(), print))
+
     assert list(tmp_path.iterdir()) == []
+
     takes, _ = session()
     world.fails_at = 0
     (take,) = [finalize(take, verify) for take in takes.record(Event(), print)]
+
     assert (take.state, take.sets, take.verified) == ("lost", 0, None)
     assert list(tmp_path.iterdir()) == []
 
@@ -165,6 +174,7 @@ def test_sidecar_that_cannot_be_written_hides_no_other_error(
     monkeypatch.setattr("nlos_cam.recording.sidecar.SidecarFile.finish", full)
     monkeypatch.setattr("nlos_cam.camera.recorder.can_grow", lambda *_: indexed)
     (take,) = run(frames=4)
+
     assert (take.verified is not None) == indexed
     assert ("0.json" if indexed else "nlos-cam repair") in str(take.error)
 
@@ -175,6 +185,7 @@ def test_take_whose_file_cannot_be_closed_is_not_read_back(
 ) -> None:
     monkeypatch.setattr("nlos_cam.camera.recorder.can_grow", lambda *_: False)
     (take,) = run(count=count, frames=4, read_back=lambda _: pytest.fail("it has no index"))
+
     assert (take.state, saved_state(take), take.closed, take.verified) == (
         "disk full",
         "disk full",
@@ -182,7 +193,9 @@ def test_take_whose_file_cannot_be_closed_is_not_read_back(
         None,
     )
     assert "nlos-cam repair" in str(take.error)
+
     summary = load_sidecar(take.sidecar.path).summary
+
     assert summary.frames == min(summary.streams.values())
     assert summary.frames_seen in range(
         1, 5
@@ -194,14 +207,19 @@ def test_take_whose_reading_back_fails_is_damaged(run: Run) -> None:
         raise RecordingError(f"{path} is cut short")
 
     (take,) = run(frames=5, read_back=read_back)
-    assert (take.state, str(take.error)) == ("damaged", f"{take.target.path} is cut short")
+
+    assert take.state == "damaged"
+    assert str(take.error) == f"{take.target.path} is cut short"
 
 
 @pytest.mark.slow
 def test_take_with_missing_frames_in_its_file_is_damaged(run: Run) -> None:
     (take,) = run(frames=5, read_back=lambda _: VerifyResult(3, 0, 0.1, {}))
-    assert (take.state, saved_state(take)) == ("damaged", "damaged")
+
+    assert take.state == "damaged"
+    assert saved_state(take) == "damaged"
     assert "3 of the 5" in str(take.error)
+
     whole, short = ({"depth": 5, "infrared": 5, "confidence": count} for count in (5, 4))
     for streams, state in (
         (whole, "complete"),
@@ -212,6 +230,7 @@ def test_take_with_missing_frames_in_its_file_is_damaged(run: Run) -> None:
         )
         assert take.state == state
     takes = run(count=2, frames=5, read_back=lambda _: VerifyResult(4, 0, 0.1, {}))
+
     assert [take.state for take in takes] == [
         "damaged",
         "complete",
@@ -222,8 +241,11 @@ def test_closing_between_takes_stops_the_camera(session: Any, tmp_path: Path) ->
     recorder, camera = session(2, frames=3)
     takes = recorder.record(Event(), print)
     next(takes)
+
     assert camera._thread
+
     takes.close()
+
     assert camera._thread is None
     assert verify(tmp_path / "0.bag").frames == 3
     assert not (tmp_path / "1.bag").exists()

@@ -174,6 +174,7 @@ def test_export_holds_no_number_that_json_lacks(crafted: Callable[[Change], Path
     use(path)
     text = (path.parent / "export" / "export.json").read_text(encoding="utf-8")
     facts = json.loads(text, parse_constant=pytest.fail)
+
     assert facts["capture"]["settings"] == {"a": None, "b": None, "c": 1.5}
     assert "frames_queue_size" not in facts["streams"]["depth"]["settings"]
 
@@ -186,6 +187,7 @@ def test_export_ignores_a_sidecar_that_is_none(
     path.with_suffix(".json").write_text(text, encoding="utf-8")
     use(path)
     facts = json.loads((path.parent / "export" / "export.json").read_text(encoding="utf-8"))
+
     assert facts["capture"] is None
 
 
@@ -194,6 +196,7 @@ def test_texts_of_a_device_are_printable_and_bounded(crafted: Callable[[Change],
     pair = b"\4\0\0\0Name" + struct.pack("<I", len(text)) + text
     path = crafted(lambda bag: with_data(bag, "/device_0/info", lambda _: pair))
     (value,) = BagReader(path).device.values()
+
     assert value.isprintable()
     assert len(value) <= 200
 
@@ -225,8 +228,11 @@ def test_repair_of_a_bomb_is_bounded_in_work_and_memory(tmp_path: Path, kind: st
     path = tmp_path / "bomb.bag"
     path.write_bytes(bomb(kind))
     before_s, before_kib = (resource.getrusage(resource.RUSAGE_SELF)[k] for k in (0, 2))
+
     assert "\n" not in line_of(lambda: repair_recording(path, tmp_path / "out.bag"))
+
     after_s, after_kib = (resource.getrusage(resource.RUSAGE_SELF)[k] for k in (0, 2))
+
     assert after_kib - before_kib < 1 << 20
     assert after_s - before_s < 60
 
@@ -237,11 +243,14 @@ def test_consistent_mutation_ends_in_frames_or_a_line(
 ) -> None:
     path = tmp_path / "mutated.bag"
     ways, content = mutate_bag(noise_bags["packed"].read_bytes(), np.random.default_rng(seed))
+
     assert (ways, content) == mutate_bag(
         noise_bags["packed"].read_bytes(), np.random.default_rng(seed)
     )
     assert set(ways.split("+")) <= {way.__name__ for way in BAG_WAYS}
+
     path.write_bytes(content)
+
     assert "\n" not in line_of(lambda: use(path))
     assert "\n" not in line_of(lambda: repair_recording(path, path.with_name("repaired.bag")))
 
@@ -249,4 +258,5 @@ def test_consistent_mutation_ends_in_frames_or_a_line(
 def test_messages_keep_their_fields() -> None:
     message = Message(3, (1, 2), b"x")
     bag = Bag({3: ("/a", "std_msgs/String")}, [message])
+
     assert read_bag(write_bag(bag, np.random.default_rng(1), packed=True)) == bag

@@ -31,14 +31,16 @@ def rows(out: Path, stream: str) -> list[dict[str, str]]:
 
 def test_export_writes_every_bit_into_png(noise_bag: Path, tmp_path: Path) -> None:
     made = exported(noise_bag, tmp_path / "out")
+
     assert made.frames == dict.fromkeys(FORMATS, FRAMES) | {"points": 1}
+
     info = json.loads((tmp_path / "out" / INFO).read_text())
-    assert (info["device"]["name"], info["depth_unit_m"]) == (
-        "Simulated L515",
-        pytest.approx(0.00025),
-    )
+
+    assert info["device"]["name"] == "Simulated L515"
+    assert info["depth_unit_m"] == pytest.approx(0.00025)
     assert (set(info["streams"]), info["capture"]) == (set(FORMATS), None)
     assert info["streams"]["depth"]["intrinsics"]["height"] == 48
+
     for stream in FORMATS:
         for row, sample in zip(
             rows(tmp_path / "out", stream), samples(noise_bag, stream), strict=True
@@ -64,6 +66,7 @@ def test_export_writes_every_bit_into_npz(noise_bag: Path, tmp_path: Path) -> No
             )
             assert (found["width"], found["fx"]) == (64, pytest.approx(45.7, abs=0.1))
             assert ("depth_unit_m" in found) == (stream == "depth")
+
     assert sorted(path.suffix for path in (tmp_path / "out").iterdir()) == [
         "",
         ".json",
@@ -75,17 +78,20 @@ def test_export_writes_every_bit_into_npz(noise_bag: Path, tmp_path: Path) -> No
 
 def test_export_points_are_depth_along_the_rays(noise_bag: Path, tmp_path: Path) -> None:
     assert exported(noise_bag, tmp_path / "out", points=True).frames["points"] == FRAMES
+
     with open_camera(f"bag:{noise_bag}") as camera:
         frame = next(iter(camera))
     seen = ~np.isnan(frame.depth_m)
     cloud = trimesh.load(tmp_path / "out" / "points" / "000000.ply")
     expected_m = frame.intrinsics.rays()[seen] * frame.depth_m[seen][:, np.newaxis]
+
     np.testing.assert_allclose(cloud.vertices, expected_m, rtol=1e-5, atol=1e-6)
     np.testing.assert_array_equal(cloud.colors[:, 0], frame.ir[seen])
 
 
 def test_export_writes_only_chosen_streams_and_frames(noise_bag: Path, tmp_path: Path) -> None:
     made = exported(noise_bag, tmp_path / "out", streams=["infrared"], every=6)
+
     assert made.frames == {"infrared": 4}
     assert not (tmp_path / "out" / "points").exists()
     assert not (tmp_path / "out" / "depth").exists()
@@ -113,13 +119,16 @@ def test_export_that_is_stopped_keeps_written_frames(noise_bag: Path, tmp_path: 
         stop=stop,
         on_frame=after_six,
     )
+
     assert made.frames == {"depth": 2, "infrared": 2, "confidence": 2, "points": 1}
+
     with np.load(tmp_path / "out" / "depth.npz") as found:
         assert found["pixels"].shape == (2, 48, 64)
 
 
 def test_export_keeps_the_frames_before_damage(damaged: Path, tmp_path: Path) -> None:
     made = exported(damaged, tmp_path / "out")
+
     assert "damaged.bag" in made.damage
     assert 0 < made.frames["depth"] < 150
     assert len(rows(tmp_path / "out", "depth")) == made.frames["depth"]
@@ -127,11 +136,18 @@ def test_export_keeps_the_frames_before_damage(damaged: Path, tmp_path: Path) ->
 
 def test_export_of_another_camera_writes_its_streams(real_bag: Path, tmp_path: Path) -> None:
     made = exported(real_bag, tmp_path / "out")
+
     assert made.frames == {"depth": 2, "color": 1}
+
     depth = cv2.imread(
         str(tmp_path / "out" / rows(tmp_path / "out", "depth")[0]["file"]), cv2.IMREAD_UNCHANGED
     )
     colour = cv2.imread(str(tmp_path / "out" / rows(tmp_path / "out", "color")[0]["file"]))
-    assert (depth.dtype, depth.shape, colour.shape) == (np.uint16, (480, 640), (480, 640, 3))
+
+    assert depth.dtype == np.uint16
+    assert depth.shape == (480, 640)
+    assert colour.shape == (480, 640, 3)
+
     rgb = samples(real_bag, "color")[0].pixels
+
     np.testing.assert_array_equal(colour[..., ::-1], rgb)

@@ -25,11 +25,10 @@ def test_replay_returns_every_recorded_bit(noise_bag: Path, noise_world: Any) ->
             assert threading.active_count() == threads
             assert_exposed(frame, world.images(count))
     found = verify(noise_bag)
-    assert (found.frames, found.dropped, found.seconds) == (
-        count + 1,
-        0,
-        pytest.approx(19 / 30, abs=1e-3),
-    )
+
+    assert found.frames == count + 1
+    assert found.dropped == 0
+    assert found.seconds == pytest.approx(19 / 30, abs=1e-3)
     assert found.streams == {"depth": 20, "infrared": 20, "confidence": 20}
     assert camera.identity == {"name": "Simulated L515", "serial": "simulated"}
 
@@ -60,8 +59,11 @@ def test_replay_refuses_broken_file_with_repair(
     path.write_bytes(content)
     with pytest.raises(RecordingError, match=str(path)) as raised:
         ReplayCamera(path)
+
     assert "\n" not in str(raised.value)
+
     advice = r"nlos-cam repair '.*/my run\.bag' --out 'my run-repaired\.bag'"
+
     assert bool(re.search(advice, str(raised.value))) == content.startswith(b"#ROSBAG")
     assert ("nlos-cam repair" in str(raised.value)) == content.startswith(b"#ROSBAG")
 
@@ -88,10 +90,12 @@ def test_replay_gives_the_frames_before_damage(damaged: Path) -> None:
         pytest.raises(RecordingError, match=r"\d+\.\d s") as raised,
     ):
         frames.extend(frame.frame_number for frame in camera)
+
     assert f"`nlos-cam repair {damaged} --out damaged-repaired.bag`" in str(raised.value)
     assert frames == list(range(len(frames)))
     assert max(camera.arrived.values()) - len(frames) == camera.incomplete <= 1
     assert 0 < len(frames) < 150
+
     with pytest.raises(RecordingError, match=r"damaged\.bag"):
         verify(damaged)
 

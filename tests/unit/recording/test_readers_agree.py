@@ -72,13 +72,16 @@ def test_both_readers_give_the_same_frames(
     theirs = SdkReplay(path)
     with ReplayCamera(path) as ours:
         assert values_of(ours) == values_of(theirs)
+
     assert ours.arrived == theirs.arrived
-    assert (ours.dropped, ours.incomplete) == (theirs.dropped, theirs.incomplete)
+    assert ours.dropped == theirs.dropped
+    assert ours.incomplete == theirs.incomplete
 
 
 def test_replay_counts_gaps_and_sets_without_all_streams(rewritten: Any) -> None:
     with ReplayCamera(rewritten(with_gaps)) as camera:
         numbers = [frame.frame_number for frame in camera]
+
     assert numbers == sorted(set(range(20)) - {3, 4, 8, 12, 19})
     assert camera.dropped == 2
     assert camera.incomplete == 3
@@ -164,6 +167,7 @@ def test_streams_agree_with_librealsense(both: tuple[BagReader, SdkPlayback]) ->
     bag, played = both
 
     assert set(bag.streams) == set(played.samples)
+
     for stream, info in bag.streams.items():
         assert (info.format, info.frames_per_s, info.intrinsics) == played.profiles[stream]
         assert info.frames == len(played.samples[stream])
@@ -205,6 +209,7 @@ def test_settings_and_device_agree_with_librealsense(
     for stream in bag.streams:
         assert bag.settings(stream=stream) == played.settings[stream]
         assert bag.settings(bag.end_ns, stream) == played.settings[stream]
+
     assert bag.depth_unit_m() == played.settings["depth"]["depth_units"]
     assert bag.device.items() <= played.device.items()
     assert bag.device["name"]
@@ -238,9 +243,12 @@ def test_readers_agree_on_the_frames_before_damage(damaged: Path) -> None:
     ours: list[int] = []
     with ReplayCamera(damaged) as camera, pytest.raises(RecordingError, match="nlos-cam repair"):
         ours.extend(frame.frame_number for frame in camera)
+
     assert camera.dropped == 0
     assert 0 < len(ours) < 150
+
     theirs = [frame.frame_number for frame in SdkReplay(damaged)]
+
     assert theirs == ours[: len(theirs)]  # it loses the frames that it holds at the damage
     assert 0 <= len(ours) - len(theirs) <= 2
 

@@ -81,10 +81,15 @@ def test_examine_ignores_a_wrong_length_in_the_header(
     compression: str, length: int, size: int
 ) -> None:
     found, file = examined(DATA[compression] + AFTER, compression, size, length)
-    assert (found.ending, found.end) == (Ending.WHOLE, len(file) - len(AFTER))
+
+    assert found.ending == Ending.WHOLE
+    assert found.end == len(file) - len(AFTER)
     assert found.why
-    assert (found.chunk.size, found.chunk.data_bytes) == (len(CONTENT), len(DATA[compression]))
+    assert found.chunk.size == len(CONTENT)
+    assert found.chunk.data_bytes == len(DATA[compression])
+
     entries = list(struct.iter_unpack("<III", found.chunk.index[0]))
+
     assert [entry[:2] for entry in entries] == [SET_UP_S, (1, 1), (1, 2), (1, 3)]
 
 
@@ -115,11 +120,16 @@ def test_examine_keeps_whole_messages_of_a_cut_chunk(compression: str) -> None:
 
 def test_unpack_refuses_a_bomb(monkeypatch: pytest.MonkeyPatch) -> None:
     bomb = packed(bytes(300 << 20))
+
     assert len(bomb) < 2 << 20
+
     content, read_bytes, ending, why = unpack(reader(bomb), 0, len(bomb), 1 << 16)
+
     assert (content, ending, "64 MiB" in why) == (b"", Ending.BROKEN, True)
     assert read_bytes < len(bomb) / 3
+
     monkeypatch.setattr("nlos_cam.recording.salvage.CHUNK_LIMIT", len(CONTENT) - 1)
+
     assert examined(DATA["lz4"])[0].chunk is None
     assert examined(CONTENT, "none")[0].ending == Ending.BROKEN
 
@@ -127,9 +137,11 @@ def test_unpack_refuses_a_bomb(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_find_chunk_refuses_other_records_and_compressions() -> None:
     assert find_chunk(reader(CONNECTION + CONNECTION), 0) is None
     assert find_chunk(reader(AFTER), 0) is None
+
     with pytest.raises(BagFormatError):
         find_chunk(reader(b"no record at all"), 0)
     found, _ = examined(CONTENT, "zstd")
+
     assert (found.chunk, found.ending, "zstd" in found.why) == (None, Ending.BROKEN, True)
     assert examine(reader(b""), 0, rosbag.BagRecord(Op.CHUNK, {}, 0, 0), 0).chunk is None
 
@@ -180,14 +192,18 @@ def test_scan_reports_its_progress(bag: Path) -> None:
 def test_scan_of_a_whole_bag_finds_every_chunk_and_index(bag: Path) -> None:
     content = bag.read_bytes()
     scan = scan_bag(bag)
+
     assert not scan.damages
+
     places = chunk_places(content)
+
     assert [chunk.at for chunk in scan.chunks] == [at for at, _ in places]
     assert len(scan.chunks) > 3
     assert {connection.topic for connection in scan.connections.values()} >= {
         f"/device_0/sensor_0/{stream}_0/image/data"
         for stream in ("Depth", "Infrared", "Confidence")
     }
+
     for (_, end), chunk in zip(places, scan.chunks, strict=True):
         written = b"".join(
             rosbag.pack_index(number, entries) for number, entries in chunk.index.items()
@@ -202,7 +218,9 @@ def test_scan_needs_no_index_at_the_end(bag: Path, scanned: Scanned) -> None:
 
     short = scanned(content[:end_of_chunks])
 
-    assert (short.chunks, short.connections, short.damages) == (scan.chunks, scan.connections, [])
+    assert short.chunks == scan.chunks
+    assert short.connections == scan.connections
+    assert short.damages == []
 
 
 def test_scan_names_a_cut_index(bag: Path, scanned: Scanned) -> None:
@@ -233,12 +251,15 @@ def test_scan_loses_little_of_a_plain_chunk_and_takes_no_foreign(
     at, end = chunk_places(whole)[1]
     middle = whole.index(MESSAGE, (at + end) // 2)
     scan = scanned(whole[:middle] + bytes(8) + whole[middle + 8 :])
+
     assert 1 <= count(expected) - count(scan) <= 2
     assert len(scan.damages) == 1
+
     at, end = chunk_places(whole)[0]
     scan = scanned(
         whole[:end] + whole[at:end].replace(b"topic=/device_0", b"topic=/device_1") + whole[end:]
     )
+
     assert indexes(scan) == indexes(expected)
     assert ["topics" in damage.why for damage in scan.damages] == [True]
 
@@ -249,12 +270,17 @@ def test_scan_bridges_lost_headers_ranges_and_repeats(bag: Path, scanned: Scanne
     places = chunk_places(whole)
     at = places[2][0]
     scan = scanned(whole[:at] + bytes(40) + whole[at + 40 :])
+
     assert indexes(scan) == expected
     assert [damage.position for damage in scan.damages] == [at]
+
     scan = scanned(whole[: places[1][0] + 500_000] + whole[places[2][0] + 500_000 :])
+
     assert indexes(scan)[0] == expected[0]
     assert indexes(scan)[-len(expected) + 3 :] == expected[3:]
+
     scan = scanned(whole[: places[2][0]] + whole[places[1][0] :])
+
     assert indexes(scan) == expected
     assert ["twice" in damage.why for damage in scan.damages] == [True]
 
@@ -264,12 +290,15 @@ def test_scan_finds_connections_without_the_first_chunk(
 ) -> None:
     whole = noise_bags["packed"].read_bytes()
     expected = scan_bag(noise_bags["packed"]).connections
+
     assert (
         scanned(whole[:FIRST_CHUNK_AT] + whole[chunk_places(whole)[1][0] :]).connections == expected
     )
+
     content = bytearray(noise_bags["packed-unindexed"].read_bytes())
     content[400_000] ^= 1  # within the first chunk, and no copy at the end of the file
     scan = scanned(bytes(content))
+
     assert scan.connections == expected
     assert len(scan.damages) > 0
     assert scan.chunks[0].content is not None
@@ -303,7 +332,9 @@ def test_read_record_returns_what_was_packed(
 ) -> None:
     content = before + pack_record({**fields, "op": bytes([op])}, data)
     record = read_record(reader(content), len(before))
-    assert (record.op, dict(record.fields)) == (op, {**fields, "op": bytes([op])})
+
+    assert record.op == op
+    assert dict(record.fields) == {**fields, "op": bytes([op])}
     assert content[record.data_at : record.end] == data
     assert record.end == len(content)
 
@@ -327,6 +358,7 @@ def test_read_connection_keeps_or_refuses_a_changed_byte(at: int, value: int) ->
         found = read_connection(*read_of(bytes(content)))
     except BagFormatError:
         return
+
     assert found.record == bytes(content)
 
 
@@ -346,6 +378,7 @@ def test_read_record_does_not_read_an_absurd_header() -> None:
 
     with pytest.raises(BagFormatError, match="65537"):
         read_record(read, 0)
+
     assert max(asked) == 4
 
 
@@ -408,7 +441,10 @@ NO_TIME, NO_CONNECTION = (
 )
 def test_read_content_keeps_messages_before_damage(content: bytes, ending: Ending) -> None:
     found = rosbag.read_content(reader(content), 0, rosbag.CHUNK_LIMIT, rosbag.CHUNK_LIMIT)
-    assert (found.ending, found.bytes, len(found.index[0])) == (ending, len(ONE), 12)
+
+    assert found.ending == ending
+    assert found.bytes == len(ONE)
+    assert len(found.index[0]) == 12
 
 
 def test_set_up_records_finds_connections_and_first_messages() -> None:
@@ -418,10 +454,12 @@ def test_set_up_records_finds_connections_and_first_messages() -> None:
         first + message((0, 1), conn=1) + message((0, 2), conn=1) + second + message((0, 1), conn=2)
     )
     found = list(rosbag.set_up_records(reader(content + b"damage")))
+
     assert [record.op for _, record in found] == [
         Op.CONNECTION,
         Op.MESSAGE,
         Op.CONNECTION,
         Op.MESSAGE,
     ]
-    assert (found[0][0], found[-1][1].end) == (0, len(content))
+    assert found[0][0] == 0
+    assert found[-1][1].end == len(content)

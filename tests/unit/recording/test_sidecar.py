@@ -71,6 +71,7 @@ def test_sidecar_exists_from_the_start_of_a_recording(path: Path) -> None:
     SidecarFile(path, Warm(), label="a cup", started=WHEN)
     found = load_sidecar(path)
     fields = json.loads(path.read_text())
+
     assert (found.label, found.camera, found.state, found.summary) == (
         "a cup",
         "l515",
@@ -78,8 +79,12 @@ def test_sidecar_exists_from_the_start_of_a_recording(path: Path) -> None:
         None,
     )
     assert found.device == {"name": "L515", "serial": "f0246262"}
-    assert (found.started, found.intrinsics.fx, found.settings["laser_power"]) == (WHEN, 46.0, 40.0)
-    assert (fields["label"], fields["camera"], fields["started"][-1]) == ("a cup", "l515", "Z")
+    assert found.started == WHEN
+    assert found.intrinsics.fx == 46.0
+    assert found.settings["laser_power"] == 40.0
+    assert fields["label"] == "a cup"
+    assert fields["camera"] == "l515"
+    assert fields["started"][-1] == "Z"
 
 
 def test_sidecar_samples_temperatures_over_device_time(path: Path) -> None:
@@ -87,15 +92,20 @@ def test_sidecar_samples_temperatures_over_device_time(path: Path) -> None:
     for number in range(900):
         sidecar.on_frame(frame(1e9 + number / 30))
     series = load_sidecar(path).temperatures
+
     assert [look.time_s for look in series] == pytest.approx(
         [0.0, TEMPERATURE_INTERVAL_S, 2 * TEMPERATURE_INTERVAL_S], abs=0.05
     )
+
     celsius = [look.celsius["ldd_temperature"] for look in series]
+
     assert celsius == sorted(celsius)
     assert set(series[0].celsius) == {"ldd_temperature"}
+
     camera = Warm()
     camera.telemetry = lambda ending="": {} if ending else {"laser_power": 40.0}
     SidecarFile(path, camera).on_frame(frame(0.0))
+
     assert load_sidecar(path).temperatures == []
 
 
@@ -105,6 +115,7 @@ def test_sidecar_thins_a_long_series_evenly(path: Path, monkeypatch: pytest.Monk
     for number in range(100):
         sidecar.on_frame(frame(number * TEMPERATURE_INTERVAL_S))
     times = [look.time_s for look in load_sidecar(path).temperatures]
+
     assert 5 <= len(times) <= 10
     assert times[0] == 0.0
     assert times[-1] >= 900.0
@@ -117,8 +128,13 @@ def test_sidecar_ends_with_settings_state_and_summary(path: Path) -> None:
     sidecar.on_frame(frame(5.1, laser_power=99.0))
     sidecar.finish("lost", expected := summary_of(READ, SEEN, {"restarted": 1}))
     found = load_sidecar(path)
-    assert (found.state, found.summary, found.settings) == ("lost", expected, {"laser_power": 31.0})
-    assert (expected.frames, expected.dropped, expected.frames_per_s) == (9, 2, 16.0)
+
+    assert found.state == "lost"
+    assert found.summary == expected
+    assert found.settings == {"laser_power": 31.0}
+    assert expected.frames == 9
+    assert expected.dropped == 2
+    assert expected.frames_per_s == 16.0
     assert (expected.saturated_share, expected.temporal_noise_mm, expected.events) == (
         0.25,
         1.5,
@@ -128,8 +144,11 @@ def test_sidecar_ends_with_settings_state_and_summary(path: Path) -> None:
 
 def test_summary_writes_unknown_values_as_null(path: Path) -> None:
     SidecarFile(path, Warm()).finish("disk full", expected := summary_of(None, Quality(), {}))
+
     assert "NaN" not in path.read_text()
+
     summary = json.loads(path.read_text())["summary"]
+
     assert summary["frames"] is summary["temporal_noise_mm"] is summary["saturated_share"] is None
     assert load_sidecar(path).summary == expected
     assert summary_of(VerifyResult(1, 0, 0.0, {"depth": 1}), Quality(), {}).frames_per_s is None
@@ -146,6 +165,7 @@ def test_sidecar_stays_whole_on_a_full_disk(path: Path, monkeypatch: pytest.Monk
     sidecar.on_frame(frame(0.0))  # goes on: the end of the recording raises
     with pytest.raises(DiskFullError, match=r"a\.json.*No space left on device"):
         sidecar.finish("complete", summary_of(READ, SEEN, {}))
+
     assert [entry.name for entry in path.parent.iterdir()] == ["a.json"]
     assert path.read_bytes() == before
 
@@ -158,18 +178,23 @@ def test_sidecar_prefers_the_rig_of_a_measured_wall(
     wall_toml = tmp_path / "wall.toml"
     wall_toml.write_text(dump_toml(record))
     SidecarFile(path, Warm(rig=bench))
+
     assert load_sidecar(path).rig == bench
+
     rig, wall = load_measured_wall(wall_toml)
     SidecarFile(path, Warm(rig=bench), wall=(rig, wall))
     found = load_sidecar(path)
+
     assert found.rig == rig == record.rig != bench
     assert found.wall.sha256 == hashlib.sha256(wall_toml.read_bytes()).hexdigest()
+
     with pytest.raises(RecordFileError):
         load_measured_wall(tmp_path / "none.toml")
 
 
 def test_versions_name_the_program_and_no_machine() -> None:
     found = versions()
+
     assert set(found) <= {"nlos-cam", "pyrealsense2", "python", "platform"}
     assert found["platform"].count(" ") == 1
 
@@ -190,12 +215,14 @@ def test_load_sidecar_names_the_wrong_field_in_one_line(
     path.write_text(json.dumps({name: value for name, value in fields.items() if value is not ...}))
     with pytest.raises(RecordingError, match=rf"a\.json .*{key}") as raised:
         load_sidecar(path)
+
     assert "\n" not in str(raised.value)
 
 
 @pytest.mark.parametrize("content", [b"", b"{", b"\xff\xfe", b"[]", None])
 def test_load_sidecar_refuses_other_files_in_one_line(path: Path, content: bytes | None) -> None:
     assert sidecar_path(path.with_suffix(".bag")) == path
+
     if content is not None:
         path.write_bytes(content)
     for other in (path, path.parent):
@@ -249,6 +276,7 @@ def test_noise_ignores_a_push_a_drift_moving_and_invalid_parts(
             frame.depth_m[:10] = frame.depth_m[10 + number % 2] = (
                 np.nan
             )  # never valid; never twice in a row
+
     assert quality_of(frames).temporal_noise_mm == pytest.approx(
         quality_of(noisy()).temporal_noise_mm, rel=tolerance
     )
@@ -260,22 +288,30 @@ def test_noise_is_none_where_too_little_is_valid(spoil: str) -> None:
     for frame in frames:
         if spoil == "all invalid" or (spoil == "nothing twice" and frame.frame_number % 2):
             frame.depth_m[:] = np.nan
+
     assert quality_of(frames).temporal_noise_mm is None
 
 
 def test_jitter_is_the_spread_of_intervals() -> None:
     on_time = [frame for frame in noisy() if frame.frame_number % 7]  # some are missing
+
     assert quality_of(on_time).jitter_ms == pytest.approx(0.0, abs=1e-3)
+
     late = [
         replace(frame, timestamp_s=frame.timestamp_s + 0.002 * (frame.frame_number % 2))
         for frame in noisy()
     ]
+
     assert quality_of(late).jitter_ms == pytest.approx(2.0, rel=0.01)
 
 
 def test_quality_of_no_frame_and_of_one_has_no_spread() -> None:
     assert astuple(quality_of([])) == (0, None, None, None, None, None)
+
     found = quality_of(noisy(count=1))
-    assert (found.frames_seen, found.saturated_share, found.invalid_share) == (1, 0.0, 0.0)
+
+    assert found.frames_seen == 1
+    assert found.saturated_share == 0.0
+    assert found.invalid_share == 0.0
     assert found.temporal_noise_mm is None
     assert found.jitter_ms is None

@@ -36,6 +36,7 @@ def readings(telemetry: Telemetry, frames: list[Frame]) -> list[Mapping[str, flo
 
 def test_each_reading_is_given_once() -> None:
     given = readings(Telemetry(warming(), every_s=1.0), FRAMES)
+
     assert [bool(celsius) for celsius in given] == [number % 3 == 0 for number in range(10)]
     assert given[3] == {"ldd_temperature": 42.0}
 
@@ -43,6 +44,7 @@ def test_each_reading_is_given_once() -> None:
 def test_telemetry_is_read_periodically_by_the_frames_clock() -> None:
     read = warming()
     telemetry = Telemetry(read, every_s=1.0)
+
     assert list(telemetry.watch(FRAMES)) == FRAMES
     assert [call.args[0] for call in read.call_args_list] == pytest.approx([0.0, 1.0, 2.0, 3.0])
 
@@ -50,6 +52,7 @@ def test_telemetry_is_read_periodically_by_the_frames_clock() -> None:
 def test_readings_of_dropped_frames_are_superseded() -> None:
     telemetry = Telemetry(warming(), every_s=1.0)
     list(telemetry.watch(FRAMES))
+
     assert telemetry.at(FRAMES[2]) == {"ldd_temperature": 41.0}
     assert telemetry.at(FRAMES[2]) is None
     assert telemetry.at(FRAMES[9]) == {"ldd_temperature": 44.0}
@@ -90,11 +93,13 @@ def test_telemetry_of_a_recording_reads_its_sidecar(bag: Path) -> None:
     telemetry = telemetry_of(camera(f"bag:{bag}", ldd_temperature=99.0))
     frames = [wall_frame(300 * k) for k in range(5)]  # 10 s apart
     given = [celsius and celsius["ldd_temperature"] for celsius in readings(telemetry, frames)]
+
     assert given == [40.0, 41.0, 42.0, 43.0, 43.0]
 
 
 def test_broken_sidecar_is_a_warning(bag: Path, caplog: pytest.LogCaptureFixture) -> None:
     sidecar_path(bag).write_text("{")
     telemetry = telemetry_of(camera(f"bag:{bag}", ldd_temperature=39.0))
+
     assert readings(telemetry, FRAMES[:2]) == [None, None]
     assert "wall.json" in caplog.text

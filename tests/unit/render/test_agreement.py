@@ -24,7 +24,9 @@ def truth() -> EchoMaps:
 
 def test_echoes_agree_with_themselves(truth: EchoMaps) -> None:
     same = agreement(truth, truth, BIN_M)
-    assert (same.bin_exact, same.bin_within_1) == (1.0, 1.0)
+
+    assert same.bin_exact == 1.0
+    assert same.bin_within_1 == 1.0
     assert max(same.intensity_error_max, same.depth_error_mm, same.depth_error_mean_mm) == 0
 
 
@@ -36,6 +38,7 @@ def test_depth_without_common_entries_has_no_error(truth: EchoMaps) -> None:
 def test_intensity_errors_are_relative(truth: EchoMaps) -> None:
     off = np.linspace(0, 0.1, COUNT)
     found = agreement(replace(truth, intensity=truth.intensity * (1 + off)), truth, BIN_M)
+
     assert found.intensity_error_median == pytest.approx(np.median(off))
     assert found.intensity_error_p99 == pytest.approx(np.quantile(off, 0.99))
     assert found.intensity_error_max == pytest.approx(0.1)
@@ -47,6 +50,7 @@ def test_moved_echoes_count_by_bins(truth: EchoMaps) -> None:
     step[20:50] = -BIN_M
     moved = replace(truth, path_m=truth.path_m + step, depth_m=truth.depth_m + step)
     found = agreement(moved, truth, BIN_M)
+
     np.testing.assert_allclose((found.bin_exact, found.bin_within_1), (0.5, 0.8))
     np.testing.assert_allclose(found.depth_error_mean_mm, 0.2 * 20 + 0.3 * 10)
 
@@ -55,6 +59,7 @@ def test_echo_lost_by_one_side_is_in_another_bin(truth: EchoMaps) -> None:
     lost = truth.path_m.copy()
     lost[:10] = np.nan
     one_side = replace(truth, path_m=lost)
+
     assert agreement(one_side, truth, BIN_M).bin_within_1 == pytest.approx(0.9)
     assert agreement(one_side, one_side, BIN_M).bin_exact == 1
 
@@ -71,5 +76,6 @@ def test_echoes_of_cells_are_those_of_beams_that_win() -> None:
     cells = EchoMaps.of_cells(rendering, scene)
     beams = EchoMaps.of_beams(rendering)
     wins = cells.intensity == beams.intensity
+
     assert wins.sum() > 500
     np.testing.assert_allclose(cells.path_m[wins], beams.path_m[wins], rtol=1e-5)

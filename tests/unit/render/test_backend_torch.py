@@ -39,6 +39,7 @@ def test_counted_is_exact_in_any_order() -> None:
     exact = torch.zeros(5, 7, dtype=torch.float64).scatter_add_(1, at, weight.double())
     found = backend_torch.counted(at, weight, 7)
     turned = torch.randperm(900, generator=generator)
+
     torch.testing.assert_close(found, exact.float(), rtol=1e-6, atol=0)
     assert torch.equal(backend_torch.counted(at[:, turned], weight[:, turned], 7), found)
     assert not backend_torch.counted(
@@ -50,6 +51,7 @@ def test_histograms_do_not_depend_on_the_chunk_size(monkeypatch: pytest.MonkeyPa
     job = _job(_scene())
     whole = backend_torch.histograms(job, CPU)
     monkeypatch.setattr(backend_torch, "CPU_CHUNK", 500)
+
     np.testing.assert_allclose(
         backend_torch.histograms(job, CPU), whole, rtol=1e-5, atol=1e-6 * whole.max()
     )
@@ -73,6 +75,7 @@ def test_histograms_of_all_keep_the_order_of_jobs() -> None:
         Scene(bare, _scene(6).object_depth_m),
     ]
     jobs = [_job(scene) for scene in scenes]
+
     assert [job.field.shades for job in jobs] == [True, False, False, True]
     _assert_as_alone(jobs)
     assert backend_torch.histograms_of_all([], CPU) == []
@@ -93,7 +96,9 @@ def test_jobs_that_differ_in_more_than_the_object_stay_apart(field: str, value: 
 @pytest.mark.parametrize("change", [{"brdf": phong(0.5, 0.5, 3.0)}, {"more_bounces": True}])
 def test_jobs_with_brdf_or_interreflection_stay_apart(change: dict[str, Any]) -> None:
     jobs = [replace(_job(_scene(size), 10), **change) for size in (4, 3)]
+
     _assert_as_alone(jobs)
+
     for job in jobs:
         plain = backend_torch.histograms(replace(job, brdf=None, more_bounces=False), CPU)
         assert not np.allclose(backend_torch.histograms(job, CPU), plain, rtol=1e-3)
@@ -115,6 +120,7 @@ def test_render_refuses_cuda_without_a_device(monkeypatch: pytest.MonkeyPatch) -
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     with pytest.raises(SceneError, match="CUDA") as raised:
         render(_scene(), SMALL, backend="cuda")
+
     assert "\n" not in str(raised.value)
 
 

@@ -14,6 +14,7 @@ PRICES = {"direct": 0.5, "three-bounce": 8.0, "self-occlusion": 4.0, "tilt": 1.0
 
 def test_least_seconds_repeats_the_work() -> None:
     work = Mock()
+
     assert least_seconds(work, 3) >= 0
     assert work.call_count == 3
 
@@ -30,6 +31,7 @@ def test_costs_are_the_seconds_that_each_effect_adds(monkeypatch: pytest.MonkeyP
     monkeypatch.setattr("nlos_cam.render.effect_costs.render", priced)
     found = costs(scene, "standard", plan, clock=lambda: now[0])
     expected = [PRICES[effect.name] if effect.included else 0.0 for effect in plan]
+
     assert list(found) == [effect.name for effect in plan]
     assert list(found.values()) == pytest.approx(expected)
     assert sum(effect.included for effect in plan) >= 4

@@ -34,14 +34,17 @@ def test_beams_land_on_the_wall_along_the_rays_of_their_pixels(
 ) -> None:
     rig = _lidar(yaw_deg=yaw_deg, pitch_deg=pitch_deg)
     beams = cast(rig, _cells(rig))
+
     np.testing.assert_allclose(
         beams.laser_spot_m[beams.on_wall, 2],
         0,
         atol=1e-12,
     )
+
     pose = rig.wall_from_lidar
     back = (beams.laser_spot_m[beams.on_wall] - pose[:3, 3]) @ pose[:3, :3]
     rays = _cells(rig).rays().reshape(-1, 3)[beams.on_wall]
+
     np.testing.assert_allclose(back / back[:, 2:], rays, atol=1e-9)
     np.testing.assert_allclose(
         np.linalg.norm(back, axis=1),
@@ -61,10 +64,13 @@ def test_direct_return_scales_with_distance_and_receiver_cell() -> None:
         for d in (0.15, 0.3)
     )
     both = near.on_wall & far.on_wall
+
     np.testing.assert_allclose(far.length_m[both], 2 * near.length_m[both])
     np.testing.assert_allclose(far.direct[both], near.direct[both] / 4)
+
     device = BARE.device.model_copy(update={"receiver_cell_m2": 3e-4})
     beams = cast(BARE, _cells(BARE))
+
     np.testing.assert_allclose(
         cast(
             BARE.model_copy(update={"device": device}),
@@ -72,8 +78,10 @@ def test_direct_return_scales_with_distance_and_receiver_cell() -> None:
         ).direct,
         3 * beams.direct,
     )
+
     fine = cast(BARE, BARE.pinhole.scaled(243, 195))
     coarse = cast(BARE, BARE.pinhole.scaled(81, 65))
+
     np.testing.assert_allclose(
         fine.direct.reshape(195, 243)[1::3, 1::3].ravel(), coarse.direct, rtol=1e-9
     )
@@ -92,22 +100,29 @@ def test_beams_end_at_the_wall_edge_and_at_the_occluder() -> None:
     )
     beams = cast(small, _cells(small))
     feet = beams.laser_spot_m[beams.on_wall]
+
     assert (np.abs(feet - (0.15, 0, 0)) <= (0.15, 0.1, 1e-9)).all()
     assert np.isnan(beams.length_m[~beams.on_wall]).all()
+
     beams = cast(PAPER, _cells(PAPER))
     free = cast(BARE, _cells(BARE))
     stopped = np.isfinite(beams.length_m) & ~beams.on_wall
+
     assert stopped.any()
     np.testing.assert_allclose(beams.laser_spot_m[stopped, 0], 0.2)
     assert (beams.laser_spot_m[stopped, 2] >= 0.1).all()
+
     reached = beams.on_wall
+
     np.testing.assert_allclose(beams.length_m[reached], free.length_m[reached])
+
     degrees = np.degrees(
         np.arctan2(
             beams.laser_spot_m[stopped, 0],
             0.2 - beams.laser_spot_m[stopped, 2],
         )
     )
+
     assert degrees.min() > 63
 
 
@@ -116,6 +131,7 @@ def test_direct_return_after_the_gate_is_not_received() -> None:
     device = BARE.device.model_copy(update={"gate_s": gate_m / SPEED_OF_LIGHT_M_PER_S})
     beams = cast(BARE.model_copy(update={"device": device}), _cells(BARE))
     late = 2 * beams.length_m >= gate_m
+
     assert 0 < late.sum() < late.size
     assert (beams.direct[late] == 0).all()
     assert (beams.direct[~late] > 0).all()
@@ -126,6 +142,7 @@ def test_beams_met_takes_the_place_of_the_wall() -> None:
     met = beams.with_hits(
         BARE, np.array([7]), np.array([0.1]), np.array([0.5]), np.array([0.25]), 2 * np.pi
     )
+
     assert not met.on_wall[7]
     np.testing.assert_allclose(
         met.laser_spot_m[7],
@@ -135,7 +152,9 @@ def test_beams_met_takes_the_place_of_the_wall() -> None:
         0.25 * 0.5 * 1e-4 / (2 * np.pi * 0.01),
         rel=0.02,
     )
+
     others = np.arange(5120) != 7
+
     np.testing.assert_array_equal(met.direct[others], beams.direct[others])
 
 
@@ -150,7 +169,9 @@ def test_gate_bins_begin_inside_the_gate(gate_m: float, bins: int) -> None:
 
 def test_cast_is_cached_and_read_only() -> None:
     beams = cast(PAPER, _cells(PAPER))
+
     assert cast(PAPER, _cells(PAPER)) is beams
+
     with pytest.raises(ValueError, match="read-only"):
         beams.direct[0] = 1
 
@@ -169,8 +190,11 @@ LIDAR_M = np.array([0.0, 0.0, 0.2])
 )
 def test_relay_cells_cover_the_wall_exactly(columns: int, rows: int) -> None:
     relay, wall = relay_cells(BARE, LIDAR_M, columns, rows), BARE.relay
+
     assert len(relay.x_m) == len(relay.y_m) == len(relay.length_m) == columns * rows
+
     area = (wall.x_max_m - wall.x_min_m) * (wall.y_max_m - wall.y_min_m)
+
     assert relay.cell_m2 * columns * rows == pytest.approx(area)
     assert relay.x_m.mean() == pytest.approx((wall.x_min_m + wall.x_max_m) / 2)
     assert relay.y_m.mean() == pytest.approx((wall.y_min_m + wall.y_max_m) / 2)
@@ -192,17 +216,25 @@ def test_relay_cells_cover_the_wall_exactly(columns: int, rows: int) -> None:
 def test_relay_cells_and_points_behind_the_edge_are_hidden() -> None:
     """From (0, 0.2) over the edge at (0.2, 0.1) the line of sight meets the wall at x = 0.4."""
     relay = relay_cells(PAPER, LIDAR_M, 80, 64)
+
     assert occluder_edge(PAPER) == (0.2, 0.1)
+
     hidden = relay.behind(occluder_edge(PAPER), LIDAR_M)
+
     np.testing.assert_array_equal(hidden, relay.x_m > 0.4)
+
     kept = relay.select(~hidden)
+
     assert len(kept.x_m) == len(kept.y_m) == len(kept.cos_lidar) == 64 * 64
-    assert (kept.cell_m2, kept.diagonal_m) == (relay.cell_m2, relay.diagonal_m)
+    assert kept.cell_m2 == relay.cell_m2
+    assert kept.diagonal_m == relay.diagonal_m
     assert occluder_edge(BARE) == NO_OCCLUDER
     assert not relay.behind(NO_OCCLUDER, LIDAR_M).any()
     assert relay.behind((0.2, 1e-6), LIDAR_M).sum() == (relay.x_m > 0.2).sum()
+
     x = np.array([0.4, 0.4, 0.1, 0.0])
     z = np.array([0.3, -0.1, 0.3, 0.3])
+
     np.testing.assert_array_equal(
         behind((0.2, 0.1), x, z, LIDAR_M),
         [True, False, False, False],

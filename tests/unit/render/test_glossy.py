@@ -45,6 +45,7 @@ def test_light_of_a_lobe_agrees_with_the_reference(
     job = job_of(kind(0.3, 0.7, exponent), replace(COARSE, scatter_error=error))
     found = glossy.histograms(job).sum(1)
     exact = backend_reference.histograms(job).sum(1)
+
     assert np.abs(found - exact).sum() < error * exact.sum()
 
 
@@ -53,6 +54,7 @@ def test_lobe_without_diffuse_part_agrees_with_the_reference() -> None:
     job = job_of(retroreflective(0.0, 1.0, 50))
     found = glossy.histograms(job).sum(1)
     exact = backend_reference.histograms(job).sum(1)
+
     assert np.abs(found - exact).sum() < COARSE.scatter_error * exact.sum()
 
 
@@ -92,6 +94,7 @@ def test_echoes_are_strongest_bins_bit_for_bit(
 def test_beams_do_not_depend_on_the_others() -> None:
     job = job_of(retroreflective(0.2, 0.8, 40), every=9)
     some = np.arange(0, len(job.length_m), 7)
+
     np.testing.assert_array_equal(glossy.histograms(job)[some], glossy.histograms(job.select(some)))
 
 

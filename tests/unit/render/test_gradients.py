@@ -75,6 +75,7 @@ def test_pose_derivatives_are_the_differences_of_the_reference(radiometry: str, 
         for sign in (1, -1)
     )
     light, _ = found.push(SceneVector(**{body: change}))
+
     np.testing.assert_allclose(light.ravel()[beams], (ahead - behind) / 2e-4, rtol=2e-5)
 
 
@@ -94,6 +95,7 @@ def test_depth_derivatives_are_the_differences_of_the_reference(radiometry: Any)
     )
     light, _ = found.push(SceneVector(depth_m=change))
     difference = (ahead - behind) / 2e-5
+
     np.testing.assert_allclose(
         light.ravel()[beams], difference, atol=1e-4 * np.abs(difference).max()
     )
@@ -116,6 +118,7 @@ def test_derivative_over_a_path_is_the_difference_across_bins() -> None:
     ends = [reference(problem, beams).max(1) for problem in (problems[0], problems[-1])]
     difference = ends[1] - ends[0]
     error = np.trapezoid(rates, steps, axis=0) - difference
+
     assert np.linalg.norm(error) < 0.06 * np.linalg.norm(
         difference
     )  # relay cells that cross an edge one by one
@@ -126,6 +129,7 @@ def test_albedo_times_its_derivative_is_the_intensity() -> None:
     found = Gradients(paper_scene().scene_at(0))
     sum_of_beams = found.pull(found.three_bounce.astype(np.float64))
     share = sum_of_beams.albedo * found.image(found.echo_job.patches.albedo)
+
     assert share.sum() == pytest.approx(found.intensity[found.three_bounce].sum(), rel=1e-3)
     assert (share >= 0).all()
 
@@ -145,6 +149,7 @@ def test_pull_is_the_transpose_of_push(bin_m: float) -> None:
     backward = sum(
         float((getattr(pulled, name) * getattr(change, name)).sum()) for name in vars(change)
     )
+
     assert backward == pytest.approx(forward, rel=1e-4)
 
 
@@ -166,6 +171,7 @@ def test_path_of_a_receding_lidar_grows_by_both_legs() -> None:
     found = Gradients(replace(bent_plate(0.01), object_depth_m=None))
     _, path = found.push(SceneVector(lidar=np.array([0, 0, 1.0, 0, 0, 0])))
     cosine = found.problem.beams.cos_incidence.reshape(path.shape)
+
     np.testing.assert_allclose(path[found.direct], 2 / cosine[found.direct])
 
 
@@ -182,6 +188,7 @@ def test_path_of_three_bounces_follows_their_lengths() -> None:
         (point - end) / np.linalg.norm(point - end, axis=-1, keepdims=True)
         for end in (job.laser_spot_m, cell)
     ]
+
     np.testing.assert_allclose(
         path[found.three_bounce], (units[0] + units[1]) @ change, rtol=1e-4, atol=1e-5
     )
@@ -192,6 +199,7 @@ def test_bound_falls_with_frames_and_is_below_the_prior() -> None:
     noise = [intensity_noise(found, SensorModel(), frames) for frames in (1, 100)]
     few, many = (depth_bound(found, each, prior_m=0.05) for each in noise)
     surface = ~np.isnan(few.bound_m)
+
     assert (few.bound_m[surface] <= 0.05 + 1e-9).all()
     assert (many.bound_m[surface] <= few.bound_m[surface] + 1e-9).all()
     np.testing.assert_allclose(many.alone_m[surface], few.alone_m[surface] / 10, rtol=1e-6)
@@ -205,12 +213,15 @@ def test_fit_finds_the_pose_of_a_displaced_lidar() -> None:
     measured = Gradients(moved(problem, lidar=truth))
     noise = intensity_noise(measured, SensorModel(), 100)
     fit = fit_pose(problem, measured.intensity.astype(np.float64), noise, model_error=0.001)
+
     assert np.linalg.norm(fit.motion - truth) < 0.2 * np.linalg.norm(truth)
+
     used = measured.three_bounce & np.isfinite(noise)
     before, after = (
         np.square((measured.intensity - Gradients(at).intensity)[used] / noise[used]).mean()
         for at in (problem, fit.problem)
     )
+
     assert after < 0.01 * before
     assert fit.cost[1] < fit.cost[0]
 
@@ -224,7 +235,9 @@ def test_gradients_refuse_uncovered_effects_and_joined_cells() -> None:
 
 def test_scene_without_echoes_has_no_object_gradients() -> None:
     found = Gradients(replace(bent_plate(0.01), object_depth_m=None))
+
     assert not found.three_bounce.any()
     assert found.jacobian("depth")[0].shape == (0, 0)
+
     with pytest.raises(SceneError, match="no beam"):
         _ = found.echo_job

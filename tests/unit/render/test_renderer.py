@@ -58,6 +58,7 @@ def test_cell_takes_the_median_depth_of_its_beams() -> None:
     rendering = render(Scene(RIG), replace(COARSE, beams_per_cell=2))
     every = render(Scene(RIG), COARSE)
     both = np.isfinite(rendering.depth_m) & np.isfinite(every.depth_m)
+
     assert both.mean() > 0.5
     assert np.median(np.abs(rendering.depth_m - every.depth_m)[both]) < 1e-3
 
@@ -66,6 +67,7 @@ def test_color_is_the_winning_echo_in_each_channel() -> None:
     albedo = np.array([1.0, 0.5, 0.0])
     rendering = render(Scene(RIG, DEPTH, Surface(albedo)), COARSE)
     wins = rendering.multi.peak == rendering.intensity
+
     assert wins.any()
     assert not wins.all()
     np.testing.assert_allclose(
@@ -112,10 +114,12 @@ def _multi(
 def test_strongest_finds_the_two_highest_bins(histogram: np.ndarray) -> None:
     found = strongest(histogram, BIN_M)
     ordered = np.sort(histogram, axis=1)
+
     np.testing.assert_array_equal(found.peak, ordered[:, -1])
     np.testing.assert_array_equal(found.runner_up, ordered[:, -2])
     # The first of equals.
     expected = np.where(found.peak > 0, (histogram.argmax(1) + 0.5) * BIN_M, np.nan)
+
     np.testing.assert_allclose(found.path_m, expected, rtol=1e-6)
 
 
@@ -193,10 +197,14 @@ def _still(_share: float) -> Scene:
 def test_scan_of_a_still_scene_is_one_rendering() -> None:
     assert not scan_effect(_still).included
     assert scan_effect(_still).bound == 0
+
     bare = Scene(load_rig("bare-wall"))
+
     assert not scan_effect(lambda _share: bare).included
+
     scan = render_scan(_still)
     instant = render(_still(0.0))
+
     np.testing.assert_array_equal(scan.depth_m, instant.depth_m)
     np.testing.assert_array_equal(scan.multi.peak, instant.multi.peak)
     assert scan.plan[-1].name == "scan-time"
@@ -204,12 +212,17 @@ def test_scan_of_a_still_scene_is_one_rendering() -> None:
 
 def test_scan_effect_is_called_for_by_motion_above_the_tolerance() -> None:
     verdict = scan_effect(_plate)
+
     assert verdict.included
+
     scan = render_scan(_plate).multi.peak
     instant = render(_plate(0.0)).multi.peak
     change = np.abs(scan - instant).sum() / scan.sum()
+
     assert STOPS["standard"].tolerance < change <= verdict.bound
+
     hardly = scan_effect(lambda share: _plate(share * 1e-4), "draft")
+
     assert 0 < hardly.bound < STOPS["draft"].tolerance
     assert not hardly.included
 
@@ -220,6 +233,7 @@ def test_scan_slice_is_the_rendering_of_its_instant() -> None:
     count = slices(scan_effect(_plate), STOPS["standard"])
     rows = np.array_split(np.arange(64), count)[0]
     instant = render(_plate(float(rows.mean() + 0.5) / 64))
+
     np.testing.assert_array_equal(scan.depth_m[rows], instant.depth_m[rows])
     assert scan.depth_m.shape == (64, 80)
 
@@ -283,6 +297,7 @@ def test_joined_patches_move_light_by_less_than_a_bin(
     alone = histograms(job).astype(np.float64)
     below = [np.cumsum(each, axis=1) for each in (joined, alone)]
     weight = float((1 + beam_sums.JOIN_COSINE) * beam_sums.JOIN_WEIGHT) / job.accuracy.sub_bins
+
     assert (below[0][:, 1:] >= below[1][:, :-1] * (1 - weight)).all()
     assert (below[0][:, :-1] <= below[1][:, 1:] * (1 + weight) + 1e-6 * below[1][:, -1:]).all()
     np.testing.assert_allclose(

@@ -69,6 +69,7 @@ def test_scene_has_patches_where_an_object_is() -> None:
     ):
         assert empty.patches is None
     touching = Scene(RIG, _depth(0.0)).patches
+
     assert len(touching.beta) == 12
 
 
@@ -101,6 +102,7 @@ def test_surface_refuses_albedos_out_of_range_or_shape(albedo: float | np.ndarra
 )
 def test_surface_spreads_its_albedo_over_every_cell(shape: tuple[int, ...], channels: int) -> None:
     surface = Surface(np.full(shape, 0.5))
+
     assert surface.colored == (channels == 3)
     np.testing.assert_array_equal(
         surface.over((5, 5)),
@@ -144,6 +146,7 @@ def _patches(depth: np.ndarray, albedo: float = 1.0) -> Patches:
 
 def test_patches_lie_at_the_centers_of_surface_cells() -> None:
     patches = _patches(_patches_depth())
+
     assert len(patches.beta) == 20 * 30
     np.testing.assert_allclose(
         patches.point_m[:, 0],
@@ -171,6 +174,7 @@ def test_patches_of_a_plane_have_its_normal_and_area(slope_x: float, slope_y: fl
     rows, columns = np.mgrid[0:64, 0:64]
     patches = _patches(_patches_depth(0.2) + slope_x * PITCH * columns - slope_y * PITCH * rows)
     beta = np.sqrt(1 + slope_x**2 + slope_y**2)
+
     np.testing.assert_allclose(patches.beta, beta)
     np.testing.assert_allclose(patches.area_m2, beta * PITCH**2)
     np.testing.assert_allclose(
@@ -181,12 +185,16 @@ def test_patches_of_a_plane_have_its_normal_and_area(slope_x: float, slope_y: fl
         ),
         atol=1e-9,
     )
+
     expected = np.broadcast_to(
         np.array([slope_x, slope_y, -1]) / beta,
         patches.normal.shape,
     )
+
     np.testing.assert_allclose(patches.normal, expected, atol=1e-9)
+
     level = patches.level()
+
     assert (level.beta == 1).all()
     assert (level.normal == [0, 0, -1]).all()
 
@@ -198,6 +206,7 @@ def test_patches_of_a_plane_have_its_normal_and_area(slope_x: float, slope_y: fl
 def test_patches_join_steps_up_to_the_jump(step_m: float, joined: bool) -> None:
     depth = _patches_depth()
     depth[:, 35:] += step_m
+
     assert (_patches(depth).beta.max() > 2) == joined
 
 
@@ -211,6 +220,7 @@ def test_clustered_keeps_area_albedo_and_tilt(stride: int) -> None:
     for part in (patches, blocks):
         assert (part.beta > 0).all()
     given = [(p.albedo * p.area_m2)[:, None] * p.normal for p in (patches, blocks)]
+
     np.testing.assert_allclose(
         given[1].sum(0),
         given[0].sum(0),
@@ -223,7 +233,9 @@ def test_clustered_keeps_area_albedo_and_tilt(stride: int) -> None:
     np.testing.assert_allclose(
         blocks.point_m[:, 2], coarser(depth, stride)[blocks.row, blocks.column]
     )
+
     black = clustered(_patches(_patches_depth(), 0.0), 2, 32)
+
     assert (black.albedo == 0).all()
     assert np.isfinite(black.normal).all()
     assert np.isfinite(black.beta).all()
@@ -234,6 +246,7 @@ def test_coarser_map_is_the_mean_of_the_surface() -> None:
     depth[0, 0] = 1.0
     depth[0, 1] = 2.0
     depth[3, 3] = 5.0
+
     np.testing.assert_array_equal(
         coarser(depth, 2),
         [[1.5, np.nan], [np.nan, 5.0]],

@@ -71,6 +71,7 @@ def test_ridge_shades_up_to_the_line_over_its_top() -> None:
     """
     field = _field(_ridge())
     reach = (X_M[40] - X_M[10]) * 0.35 / (0.35 - 0.15 - 0.25 * field.pitch_x_m)
+
     assert _seen(field, 10, X_M[10] + 0.999 * reach, Y_M[ROW])
     assert not _seen(field, 10, X_M[10] + 1.001 * reach, Y_M[ROW])
     assert _seen(
@@ -79,6 +80,7 @@ def test_ridge_shades_up_to_the_line_over_its_top() -> None:
         X_M[10] + 1.001 * reach,
         Y_M[ROW],
     )
+
     for x, y in (
         (X_M[10] - 2, Y_M[ROW]),
         (X_M[10], Y_M[ROW] + 2),
@@ -123,17 +125,22 @@ def test_background_neither_shades_nor_ends_the_walk() -> None:
     depth = _ridge()
     far = X_M[10] + 3
     depth[:, 11:40] = np.nan
+
     assert not _seen(_field(depth), 10, far, Y_M[ROW])
+
     depth[:, 40] = np.nan
+
     assert _seen(_field(depth), 10, far, Y_M[ROW])
 
 
 def test_segment_is_blocked_by_what_stands_between() -> None:
     field = _field(_ridge())
+
     assert between(field, ROW, 10, 0.35, ROW, 60, 0.35)
     assert not between(field, ROW, 10, 0.35, ROW, 30, 0.35)
     assert not between(field, ROW, 10, 0.35, 10, 10, 0.35)
     assert not between(field, ROW, 10, 0.35, ROW, 40, 0.15)
+
     for one, other in (
         (10, 60),
         (60, 10),
@@ -160,7 +167,9 @@ def test_horizon_table_bounds_the_walk_on_every_leg(seed: int, sectors: int) -> 
         np.full(len(rows), 400.0),
         sectors,
     )
+
     assert low.shape == high.shape == (len(rows), FACES * sectors)
+
     generator = np.random.default_rng(seed)
     sure = 0
     walked = 0
@@ -196,6 +205,7 @@ def test_horizon_table_bounds_the_walk_on_every_leg(seed: int, sectors: int) -> 
                     == shaded
                 )
                 walked += 1
+
     assert sure > 0 < walked
 
 
@@ -265,6 +275,7 @@ def test_sight_is_empty_in_the_paper_rig_and_refused_inside() -> None:
         ).line_of_sight
         is None
     )
+
     box = ObjectBox(
         x_min_m=-0.1, x_max_m=0.1, y_min_m=-0.1, y_max_m=0.1, z_near_m=0.05, z_far_m=0.4
     )
@@ -281,22 +292,31 @@ def test_sight_stops_beams_and_hides_relay_cells() -> None:
     stage = SceneFacts(Scene(OPEN, depth, Surface(0.5)), COARSE)
     sight = stage.line_of_sight
     beams = stage.beams()
+
     assert sight.beam.size
     assert sight.hidden.any()
+
     free = np.nan_to_num(beams.length_m[sight.beam], nan=np.inf)
+
     assert (sight.length_m < free).all()
+
     point = beams.lidar_m + sight.length_m[:, None] * beams.direction[sight.beam]
+
     assert (point[:, 2] >= 0.06 - 1e-9).all()
     assert (stage.relay.x_m[sight.hidden] > 0.3).all()
+
     ready = prepare(stage.scene, COARSE, "auto")
+
     np.testing.assert_allclose(ready.beams.length_m[sight.beam], sight.length_m)
     assert not ready.beams.on_wall[sight.beam].any()
     assert len(ready.job.relay.x_m) == (~sight.hidden).sum()
+
     white = prepare(
         Scene(OPEN, depth),
         COARSE,
         "auto",
     ).beams.direct[sight.beam]
+
     np.testing.assert_allclose(ready.beams.direct[sight.beam], 0.5 * white)
 
 
@@ -320,7 +340,9 @@ def test_form_factor_of_two_squares_follows_s2(lambertian: bool) -> None:
     b = np.array([0.3, 0.0, 0.4])
     found = interreflection.form_factor(a, UP, b, DOWN, 1e-4, 1.0, 0.1, lambertian)
     expected = 1e-4 * 0.8 / 0.25 / ((np.pi / 0.8) if lambertian else 2 * np.pi)
+
     assert found == pytest.approx(expected)
+
     for back in (
         (a, DOWN, b, DOWN),
         (a, UP, b, UP),
@@ -331,21 +353,31 @@ def test_form_factor_of_two_squares_follows_s2(lambertian: bool) -> None:
 def test_patch_to_patch_is_reciprocal_and_loses_energy(job: TransportJob) -> None:
     # Beyond near contact.
     table = interreflection.patch_to_patch(job.patch_arrays, job.field, 1e-9, True)
+
     assert (table > 0).any()
     assert not np.diag(table).any()
+
     given = table / job.strength
+
     np.testing.assert_allclose(given, given.T, atol=1e-9 * given.max())
+
     near = interreflection.patch_to_patch(job.patch_arrays, job.field, job.near_m, True)
+
     assert near.sum(1).max() <= 1
 
 
 def test_wall_factors_sum_to_at_most_1(job: TransportJob) -> None:
     cells = interreflection.wall_cells(job)
     side = interreflection.WALL_CELLS
+
     assert len(cells) == side**2
+
     extent = np.ptp(cells[:, :2], axis=0) * side / (side - 1)
+
     assert interreflection.wall_cell_m2(job) * len(cells) == pytest.approx(extent.prod())
+
     there, back = interreflection.wall_factors(job, cells)
+
     assert 0.5 < there.sum(1).max() <= 1
     assert back.sum(0).max() <= 1
 
@@ -399,7 +431,9 @@ def test_verdict_on_a_tile_holds_for_each_leg(surface: str, edge: Occluder | Non
         Accuracy("some", 40, 32),
         effects,
     ).job
+
     assert job is not None
+
     single = NumbaJob(job)
     where = job.patches
     for points in (

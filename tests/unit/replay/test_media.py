@@ -36,6 +36,7 @@ def media(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_stills_are_spread_over_the_replay(media: Path) -> None:
     numbers = sorted(int(path.stem.removeprefix("still-")) for path in media.glob("still-*.png"))
+
     assert len(numbers) == 3
     assert numbers[0] == 0
     assert numbers[-1] >= 20
@@ -46,6 +47,7 @@ def test_video_has_every_second_frame(media: Path) -> None:
     frames = 0
     while video.read()[0]:
         frames += 1
+
     assert frames == 15
     assert VIDEO in (media / REPORT).read_text(encoding="utf-8")
 
@@ -63,8 +65,11 @@ def test_media_change_no_result(media: Path, tmp_path: Path) -> None:
 def test_replay_removes_media_of_an_earlier_one(tmp_path: Path) -> None:
     out = tmp_path / "out"
     replay_moments(out, 12, view=True, stills=4, objects=["csv"])
+
     assert (out / "object" / "000003.csv").is_file()
+
     (out / "mine.png").write_text("keep me")
+
     assert replay_moments(out, 3, stills=1) == NAMES | {"mine.png", "still-000000.png"}
 
 
@@ -72,6 +77,7 @@ def test_media_of_a_failed_replay_have_no_stills(tmp_path: Path) -> None:
     media = ReplayMedia(BENCH, view=True, stills=2)
     with pytest.raises(ZeroDivisionError), media.into(tmp_path):
         media.add(FULL.result, 1 / 0)  # type: ignore[arg-type]
+
     assert {file.name for file in tmp_path.iterdir()} == {VIEW}
 
 
@@ -79,6 +85,7 @@ def test_recorded_moment_is_at_its_own_time() -> None:
     stages_s = {"wait": 9.0, "maps": 0.001, "network": 0.01}
     result = replace(FULL.result, published_s=77.0, stages_s=stages_s)
     shown = Moment.recorded(result, FULL.celsius)
+
     assert shown.result is result
     assert shown.time_s == result.timestamp_s
     assert shown.latency_s == pytest.approx(0.011)
@@ -91,6 +98,7 @@ def test_samples_are_few_ordered_and_spread(count: int) -> None:
     for number in range(count):
         samples.add(number)  # type: ignore[arg-type]
     chosen: list[Any] = samples.results()
+
     assert len(chosen) == min(count, 6)
     assert chosen == sorted(set(chosen))
     assert chosen[0] == 0
@@ -117,12 +125,14 @@ def titles(figure: Figure) -> list[str]:
 def test_sheet_has_a_row_per_map_and_a_column_per_frame(figures: list[Any]) -> None:
     draw_contact_sheet(Path("sheet.png"), [wall_result(3), wall_result(9)])
     rows = ["lidar depth (m)", "infrared (counts)", "hidden depth (m)"]
+
     assert titles(figures[0]) == ["frame 3", "frame 9", *rows]
 
 
 def test_sheet_shows_differences_from_the_bare_wall(figures: list[Any]) -> None:
     results = [wall_result(number, maps_from_frame(wall_frame(number))) for number in (3, 9)]
     draw_contact_sheet(Path("sheet.png"), results)
+
     assert titles(figures[0])[4] == "difference (mm)"
 
 
@@ -130,5 +140,6 @@ def test_sheet_shows_verdict_and_uncertainty(figures: list[Any]) -> None:
     uncertain = replace(NOTHING, uncertainty_m=np.full((64, 64), 0.01, np.float32))
     result = replace(wall_result(3), verdict=Verdict.OUTSIDE, reconstruction=uncertain)
     draw_contact_sheet(Path("sheet.png"), [result])
+
     assert titles(figures[0])[0] == "frame 3\noutside the trained range"
     assert titles(figures[0])[-1] == "uncertainty (mm)"

@@ -31,13 +31,16 @@ def vertices_m(folder: Path) -> np.ndarray:
 
 def test_replay_writes_the_surface_of_every_third_frame(replay: Path) -> None:
     assert len(names_in(replay / "object")) == 3 * len(OBJECT_FORMATS)
+
     with np.load(replay / RESULT) as result:
         mesh = mesh_from_depth(result["depth_m"][3], object_box(RIG))
+
     np.testing.assert_array_equal(vertices_m(replay / "object"), mesh.vertices_m)
 
 
 def test_export_of_a_result_equals_the_files_of_its_replay(replay: Path, tmp_path: Path) -> None:
     out = tmp_path / "exported"
+
     assert export_objects(replay / RESULT, out, OBJECT_FORMATS, 3, stop=Event()) == 3
     assert names_in(out) == names_in(replay / "object")
     np.testing.assert_allclose(vertices_m(out), vertices_m(replay / "object"), atol=1e-9)
@@ -46,6 +49,7 @@ def test_export_of_a_result_equals_the_files_of_its_replay(replay: Path, tmp_pat
 def test_export_stops_when_asked(replay: Path, tmp_path: Path) -> None:
     stop = Event()
     stop.set()
+
     assert export_objects(replay / RESULT, tmp_path / "a", ["ply"], stop=stop) == 0
 
 
@@ -61,6 +65,7 @@ def test_export_refuses_a_replay_without_surface(replay: Path, tmp_path: Path) -
     path = changed(replay, tmp_path / "empty.npz", depth_m=nothing_m)
     with pytest.raises(RecordingError, match="no hidden surface"):
         export_objects(path, tmp_path / "out", ["ply"], stop=Event())
+
     assert not (tmp_path / "out").exists()
 
 
@@ -70,6 +75,7 @@ def test_export_refuses_other_files(tmp_path: Path, content: bytes) -> None:
     path.write_bytes(content)
     with pytest.raises(RecordingError, match="replay"):
         export_objects(path, tmp_path / "out", ["ply"], stop=Event())
+
     assert names_in(tmp_path) == ["reconstruction.npz"]
 
 

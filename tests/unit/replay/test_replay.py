@@ -31,7 +31,9 @@ def test_replay_reports_frames_folder_and_progress(tmp_path: Path) -> None:
     progress = []
     out = tmp_path / "out"
     report = replay_noise(out, 12, on_frame=lambda: progress.append(1))
-    assert (report.frames, report.out) == (12, str(out))
+
+    assert report.frames == 12
+    assert report.out == str(out)
     assert len(progress) == 12
     assert list(tmp_path.iterdir()) == [out]
 
@@ -104,6 +106,7 @@ def test_replay_is_reproducible_to_the_bit(checked: tuple[Path, Path]) -> None:
     for file in (RESULT, SHEET):
         assert (one / file).read_bytes() == (other / file).read_bytes()
     page = (one / REPORT).read_text(encoding="utf-8")
+
     assert page.replace(str(one), str(other)) == (other / REPORT).read_text(encoding="utf-8")
 
 
@@ -121,9 +124,12 @@ def test_interrupted_replay_keeps_its_results(tmp_path: Path) -> None:
     done = count_up(1)
     out = tmp_path / "out"
     report = replay_noise(out, 1000, stop=stop, on_frame=lambda: next(done) == 7 and stop.set())
+
     assert report.frames == BATCH_FRAMES * (MAX_BATCHES_AHEAD + 2)
+
     with np.load(out / RESULT) as result:
         assert result["frame_number"].tolist() == list(range(100, 100 + report.frames))
+
     assert "Interrupted" in text_of(out)
 
 
@@ -137,6 +143,7 @@ def test_replay_replaces_its_own_files_and_keeps_others(tmp_path: Path) -> None:
     (tmp_path / "mine.txt").write_text("keep me")
     (tmp_path / TEXT).write_text("old")
     replay_noise(tmp_path)
+
     assert (tmp_path / "mine.txt").read_text() == "keep me"
     assert "Replay" in text_of(tmp_path)
 
@@ -146,6 +153,7 @@ def test_replay_into_a_file_is_refused(tmp_path: Path) -> None:
     path.write_text("keep me")
     with pytest.raises(OutputExistsError, match=r"mine\.txt"):
         replay_noise(path)
+
     assert path.read_text() == "keep me"
 
 
@@ -179,6 +187,7 @@ def test_difference_maps_name_frames_rig_and_reference(tmp_path: Path) -> None:
         np.testing.assert_allclose(file["timestamp_s"], np.arange(9) / 30)
         assert str(file["reference_sha256"]) == record.reference_sha256
         assert (str(file["rig_name"]), str(file["rig_checksum"])) == (RIG.name, RIG.checksum)
+
     assert DIFFERENCE in text_of(out)
     assert "20 frames" in text_of(out)
 
@@ -186,6 +195,7 @@ def test_difference_maps_name_frames_rig_and_reference(tmp_path: Path) -> None:
 def test_replay_without_a_wall_removes_earlier_difference_maps(tmp_path: Path) -> None:
     out = replay_wall(tmp_path, WallCamera(2))
     replay_recording(WallCamera(2), Pipeline(BENCH, left_half), out, stop=Event())
+
     assert not (out / DIFFERENCE).exists()
     assert "difference maps" not in text_of(out)
 
@@ -197,9 +207,11 @@ def test_replay_reports_warnings_with_their_frames(tmp_path: Path) -> None:
         camera = WallCamera(100, moved=range(30, 60), celsius=80.0)
         out = replay_wall(tmp_path, camera, name)
         texts.append(text_of(out).replace(f"/{name}/", "/"))
+
     assert texts[0] == texts[1]
 
     lines = [line for line in texts[0].splitlines() if "warning" in line]
     warnings = [tuple(map(int, re.findall(r"\d+", line)[:3])) for line in lines]
+
     assert (100, 0, 99) in warnings
     assert any(first in range(30, 60) for _, first, _ in warnings)

@@ -42,6 +42,7 @@ def test_page_and_markdown_hold_the_same_words(tmp_path: Path) -> None:
     write_document(document("salt"), tmp_path / "report.html")
     page = read_page((tmp_path / "report.html").read_text(encoding="utf-8"))
     text = (tmp_path / "report.md").read_text(encoding="utf-8")
+
     assert (
         page.text.count("salt") - text.count("salt") == 1
     )  # the page's title, too, is the document's
@@ -57,5 +58,6 @@ def test_names_with_markup_stay_text() -> None:
 
 def test_bullets_without_items_are_left_out() -> None:
     empty = Document("a", "b", [Section("", [Bullets("notes", [])])])
+
     assert "notes" not in empty.as_html()
     assert empty.as_markdown() == "# a\n\nb\n"

@@ -29,6 +29,7 @@ def test_truth_scores_one_without_error_of_color() -> None:
     found = figures_of_color(TRUTH, TRUTH, {}, TRUTH)
 
     exact = {"value": 1.0, "low": 1.0, "high": 1.0}
+
     assert found["silhouette_iou"] == exact
     assert found["accuracy_mean_abs"] == exact
     assert found["colour_error"] == {"value": 0.0, "low": 0.0, "high": 0.0}
@@ -67,7 +68,9 @@ def test_baselines_are_nothing_the_mean_and_the_mean_color() -> None:
 
     assert not guesses["all_background"].any()
     np.testing.assert_allclose(guesses["mean_object"][1], TRUTH.mean(0))
+
     expected = (TRUTH > 0) * np.array([0.55, 0.55, 0.1])[:, None, None]
+
     np.testing.assert_allclose(guesses["mean_colour"], expected, rtol=1e-6)
 
 
@@ -91,6 +94,7 @@ def test_color_sheet_shows_truth_reconstruction_and_difference(tmp_path: Path) -
     pixels = imread(tmp_path / "sheet.png")[..., :3].reshape(-1, 3)
     colors = (1.0, 0.1, 0.1), (0.1, 1.0, 0.1), (0.9, 0.9, 0.0)
     red, green, yellow = ((np.abs(pixels - color) < 0.05).all(1).sum() for color in colors)
+
     assert red > 100  # once as truth, once as reconstruction
     assert abs(int(red) - int(green)) < 0.05 * red
     assert yellow > 100  # their difference, twice

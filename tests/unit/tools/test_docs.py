@@ -62,8 +62,11 @@ def test_whole_docs_have_no_problem_and_every_page_a_place(
     tool: Tool, written: Callable[..., Path]
 ) -> None:
     root = written()
+
     assert tool("build_site").problems(root / "site", root) == []
+
     start = (root / "site" / "index.html").read_text(encoding="utf-8")
+
     assert 'href="left.html"' in start
     assert 'href="decisions/2026-01-01-one.html"' in start
 
@@ -116,13 +119,16 @@ def test_stale_page_fails_the_check_until_written(
     for arguments, code in ((["--check"], 1), ([], 0), (["--check"], 0)):
         monkeypatch.setattr("sys.argv", ["pages.py", "reference", *arguments])
         assert tool("pages").main() == code
+
     assert "out of date" in capsys.readouterr().out
 
 
 def test_things_unlike_training_lie_in_the_box_and_are_drawn(tool: Tool, tmp_path: Path) -> None:
     gallery = tool("pictures")
     *things, nothing = gallery.unlike_training()
+
     assert np.isnan(nothing.depth_m).all()
+
     for thing in things:
         assert thing.depth_m.shape == (64, 64)
         assert 0.12 <= np.nanmin(thing.depth_m) <= np.nanmax(thing.depth_m) <= 0.4
@@ -131,6 +137,7 @@ def test_things_unlike_training_lie_in_the_box_and_are_drawn(tool: Tool, tmp_pat
         tmp_path / "a.png",
         [("a row", [things[-1], nothing], image, truth, np.array([1.0, np.nan]))],
     )
+
     assert (tmp_path / "a.png").stat().st_size > 1000
 
 
@@ -166,16 +173,20 @@ def test_every_command_of_the_tutorial_does_its_work(
 ) -> None:
     tutorial = tool("tutorial")
     commands = tutorial.commands_of(tutorial.PAGE.read_text(encoding="utf-8"))
+
     assert len(commands) >= 10
+
     for words in commands:
         assert run(words) == 0, " ".join(words)
     made = [word for words in commands for before, word in pairwise(words) if before == "--out"]
+
     assert [name for name in made if not Path(name).exists()] == []
 
 
 def test_every_command_block_is_followed_by_its_answer(tool: Tool) -> None:
     tutorial = tool("tutorial")
     text = tutorial.PAGE.read_text(encoding="utf-8")
+
     assert text.count("```sh\n") == len(tutorial.STEP.findall(text))
     assert all(found["answer"].strip() for found in tutorial.STEP.finditer(text)), (
         "run `python tools/docs/tutorial.py`"

@@ -74,8 +74,11 @@ def test_findings_of_two_groups_are_joined(tool: Tool) -> None:
     torch.add("b.h5", fuzz.Verdict("crash", "", 300, 0.2))
     torch.bad.append({"input": "b.h5"})
     facts = light.replaced(torch, ["b.h5"]).facts()
-    assert (facts["cases"], facts["verdicts"]) == (2, {"refused": 1, "crash": 1})
-    assert (facts["most_mib"], facts["bad"]) == ({"a.bag": 200, "b.h5": 300}, [{"input": "b.h5"}])
+
+    assert facts["cases"] == 2
+    assert facts["verdicts"] == {"refused": 1, "crash": 1}
+    assert facts["most_mib"] == {"a.bag": 200, "b.h5": 300}
+    assert facts["bad"] == [{"input": "b.h5"}]
 
 
 def test_trials_resume_and_a_failed_one_is_a_finding(tool: Tool, tmp_path: Path) -> None:
@@ -91,6 +94,7 @@ def test_trials_resume_and_a_failed_one_is_a_finding(tool: Tool, tmp_path: Path)
     trials.Results(tmp_path / "a.json", 0).repeat("render", "kills", 2, trial)
     results = trials.Results(tmp_path / "a.json", 0)
     results.repeat("render", "kills", 4, trial)
+
     assert len(set(drawn)) == len(results.facts["render"]["kills"]) == 4
     assert [row["wrong"] for row in results.findings] == ["TimeoutError('it never ends')"]
 
@@ -99,7 +103,10 @@ def test_session_that_does_not_play_is_noticed(tool: Tool) -> None:
     trials = tool("trials")
     messages = [pack({"kind": "bench"}), pack({"kind": "chunk"})]
     whole = page_html("session").encode() + b"".join(map(element, messages))
-    assert (trials.check_session(whole), trials.check_session(whole[:-12])) == (2, 1)
+
+    assert trials.check_session(whole) == 2
+    assert trials.check_session(whole[:-12]) == 1
+
     for bad in (b"", page_html("session").encode()):
         with pytest.raises(ValueError, match="no saved session"):
             trials.check_session(bad)
@@ -133,8 +140,11 @@ def test_finished_part_that_is_made_again_is_noticed(tool: Tool, tmp_path: Path)
     trials = tool("trials")
     path = dataset(tmp_path / "data") / "shard-000000000.h5"
     before = trials.finished_parts(trials.COMMANDS["dataset build"], tmp_path)
+
     assert list(before) == [path.name]
+
     os.utime(path, ns=(0, 0))
+
     assert trials.finished_parts(trials.COMMANDS["dataset build"], tmp_path) != before
     assert trials.finished_parts(trials.COMMANDS["export"], tmp_path) == {}
 
@@ -148,6 +158,7 @@ def test_processes_of_a_killed_command_that_run_on_are_noticed(
         assert "1 of its processes" in kills.survivors([process.pid])
         process.kill()
         process.wait()
+
     assert not kills.survivors([process.pid])
 
 
@@ -167,6 +178,7 @@ def test_processes_of_a_killed_command_that_run_on_are_noticed(
 )
 def test_judge_notices_each_kind_of_end(tool: Tool, kind: str, action: Callable[[], None]) -> None:
     verdict = tool("fuzz").judge(action, timeout_s=3.0)
+
     assert verdict.kind == kind
     assert verdict.details or kind == "done"
 
@@ -184,6 +196,7 @@ def test_mutation_is_the_same_for_the_same_seed(
         ways, bad = module.mutate(path, content, np.random.default_rng(seed))
         assert (ways, bad) == module.mutate(path, content, np.random.default_rng(seed))
         taken |= set(ways.split("+"))
+
     assert len(taken) > 4
 
 
@@ -195,7 +208,12 @@ def test_rows_of_a_growing_log_are_read_once_and_whole(tmp_path: Path) -> None:
     for end in (0, 5, 40, 41, 60, len(text) - 1, len(text)):
         path.write_text(text[:end], encoding="utf-8")
         rows += frames.rows()
+
     assert [row["frame"] for row in rows] == [str(i) for i in range(10)]
     assert frames.rows() == []
+
     minute = summarize(3, (500.0, 13, 15), rows, watchers=2)
-    assert (minute.frames, minute.latency_p50_ms, minute.dropped) == (10, 14.5, 1.0)
+
+    assert minute.frames == 10
+    assert minute.latency_p50_ms == 14.5
+    assert minute.dropped == 1.0

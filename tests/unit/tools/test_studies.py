@@ -68,6 +68,7 @@ def test_interrupted_collection_resumes_with_the_same_records(harness: ModuleTyp
     with pytest.raises(KeyboardInterrupt):
         harness.collect("sizes", grid, measure, 2)
     resumed = harness.collect("sizes", grid, measure, 2)
+
     assert measured == [1, 1, 2, 2, 2]
     assert [(one["size"], one["seed"]) for one in resumed] == [(1, 0), (1, 1), (2, 0), (2, 1)]
     assert harness.collect("sizes", grid[:1], measure, 2) == resumed[:2]
@@ -77,6 +78,7 @@ def test_interrupted_collection_resumes_with_the_same_records(harness: ModuleTyp
 def test_interval_of_a_share_narrows_with_its_count(harness: ModuleType) -> None:
     few = harness.wilson(1, 10)
     many = harness.wilson(100, 1000)
+
     assert few["low"] < few["share"] == many["share"] < few["high"]
     assert few["high"] - few["low"] > 3 * (many["high"] - many["low"])
 
@@ -106,6 +108,7 @@ def test_limits_leave_out_the_latent_of_weights_without_one(
 ) -> None:
     some = seeded_objects(0, 1, object_box(RIG))
     rows = list(tool("weights").experiments(weights[1], some, some, frames=()))
+
     assert [row.name for row in rows] == [
         "as evaluated",
         "no silhouette step",
@@ -129,6 +132,7 @@ def test_rig_map_has_a_cell_for_every_place(
     monkeypatch.setattr(module, "ANGLES_DEG", (15.0, 45.0))
     monkeypatch.setattr(module, "BENCHES", [module.Place(aside_m=0.005, up_m=0.005)])
     table = run("weights rigs --weights", "rig_map", f"plate={weights[0]}")
+
     assert [(cell["distance_m"], cell["yaw_deg"]) for cell in table["cells"]] == [
         (0.2, 15.0),
         (0.2, 45.0),
@@ -143,17 +147,21 @@ def test_transfer_curve_trains_on_nested_sets(tool: Tool, monkeypatch: Patch) ->
     transfer = tool("transfer")
     calls = list[list[str]]()
     sets = transfer.nested([Path(f"{k}.bag") for k in range(9)], (2, 5, 30))
+
     assert list(sets) == [2, 5, 9]
     assert set(sets[2]) < set(sets[5]) < set(sets[9])
+
     monkeypatch.setattr(
         transfer, "nlos_cam", lambda arguments: calls.append(arguments) or len(calls) - 1
     )
     lesson = transfer.Lesson(Path("data"), Path("val"), 24, Path("run"))
     train = transfer.commanded("transfer", Path("r.toml"), "--weights", Path("w"))
+
     assert train(lesson) == Path("run")
     assert " ".join(calls[0]).endswith(
         "--dataset data --held-out val --objects 24 --out run --weights w"
     )
+
     with pytest.raises(Exception, match=r"train transfer .* ended with 1"):
         train(lesson)
 
@@ -164,7 +172,9 @@ def test_transfer_figures_of_exact_images_are_perfect(tool: Tool) -> None:
     box = tool("transfer").paper_box()
     exact = tool("transfer").judge(lambda *_: image, maps, box)
     near = tool("transfer").judge(lambda *_: image + np.float32(0.1) * (image > 0), maps, box)
-    assert (exact["silhouette_iou"]["value"], exact["foreground_rmse_mm"]["value"]) == (1, 0)
+
+    assert exact["silhouette_iou"]["value"] == 1
+    assert exact["foreground_rmse_mm"]["value"] == 0
     assert near["foreground_too_far_mm"]["value"] == pytest.approx(-0.1 * 280 / 0.9, rel=1e-3)
 
 
@@ -175,11 +185,15 @@ def test_uncertainty_study_is_right_for_laplace_errors(tool: Tool, harness: Modu
     observed = np.abs(generator.laplace(0.0, expected))
     rows = study.reliability(expected, observed)
     covered = study.coverage(expected, observed)
+
     assert all(row["observed_mm"] == pytest.approx(row["expected_mm"], rel=0.05) for row in rows)
     assert all(row["observed"] == pytest.approx(row["level"], abs=0.01) for row in covered)
+
     pipeline = study.Pipeline(RIG, sheet_network, FakeUncertainty(error_v=0.2))
     answer = pipeline.answer(np.full((64, 80), 0.3, np.float32), np.ones((64, 80), np.float32))
+
     assert study.of_outliers([answer, answer], np.array([100, 0]))["cannot_be_seen"] == 1
+
     parts = {
         "reliability": rows,
         "coverage": covered,
@@ -208,6 +222,7 @@ def test_color_study_judges_weights_and_vae(tool: Tool, tmp_path: Path, monkeypa
     monkeypatch.setattr("sys.argv", ["color", *given])
     color.main()
     figures = json.loads((tmp_path / "figures.json").read_text(encoding="utf-8"))
+
     assert figures["silhouette_iou"]["value"] == 1
     assert figures["baselines"]["vae_alone"]["silhouette_iou"]["value"] == 0
     assert {path.name for path in tmp_path.iterdir()} == {
@@ -225,6 +240,7 @@ def test_word_check_counts_patterns_with_their_lines(
     (tmp_path / "a.py").write_text('"""What is told\nmeanwhile."""\nMOST_X = 1\n', encoding="utf-8")
     found = words.findings(*words.scan(tmp_path), docstrings=True)
     counts = {key: len(lines) for key, (_, lines) in found.items()}
+
     assert counts == {"begin": 1, "what": 1, "tell": 1, "so": 0, "rare": 1, "names": 1}
     assert found["rare"][1][0].startswith("a.py:2:")
 
@@ -250,7 +266,9 @@ def test_a_recording_is_of_its_object_on_the_bench_and_labelled(
     monkeypatch.setattr(tool("transfer"), "render", render)
     things = benchmark_objects(object_box(RIG))
     paths = list(tool("transfer").record_all(scene, things[:2], tmp_path, 3, lambda *_: None))
+
     assert [path.name for path in paths] == ["airplane-1.bag", "airplane-2.bag"]
+
     for path, thing, shown in zip(paths, things, rendered, strict=False):
         sidecar = load_sidecar(path.with_suffix(".json"))
         assert (sidecar.label, sidecar.state, sidecar.rig) == (thing.name, "complete", scene.rig)
@@ -263,8 +281,11 @@ def test_a_recording_is_of_its_object_on_the_bench_and_labelled(
 def test_every_command_is_started_after_the_bare_interpreter(tool: Tool) -> None:
     start = tool("start")
     names = list(start.programs())
+
     assert names[:2] == [start.BARE, start.NUMPY]
+
     commands = {"--version", "doctor", "live --help", "train --help", "train compressor --help"}
+
     assert commands <= set(names)
 
 
@@ -275,12 +296,15 @@ def test_starts_are_compared_with_the_bare_interpreter(tool: Tool) -> None:
         start.NUMPY: start.Times(0.1, 0.1),
         "live": start.Times(0.4, 0.3),
     }
+
     assert start.table(times).splitlines()[-1] == "| `live` | 0.40 | 0.30 | 20.0 | 4.0 |"
 
 
 def test_timed_program_must_end_well(tool: Tool) -> None:
     start = tool("start")
+
     assert start.timed(["-c", "print('x')"]).wall_s > 0
+
     with pytest.raises(RuntimeError, match="exit code 7"):
         start.timed(["-c", "raise SystemExit(7)"])
 
@@ -316,9 +340,12 @@ def test_parts_are_small_and_join_to_the_same_files(
     for name, content in contents.items():
         (folder / name).write_bytes(content)
     parts = gpu.write_parts(folder, list(contents), tmp_path / "direct.zip")
+
     assert len(parts) == 4
     assert max(part.stat().st_size for part in parts) <= 1000
+
     gpu.join_parts(parts[0], tmp_path / "joined")
+
     assert {path.name: path.read_bytes() for path in (tmp_path / "joined").iterdir()} == contents
 
 
@@ -326,7 +353,9 @@ def test_epochs_fit_the_time_by_the_fastest_epoch(tool: Tool, tmp_path: Path) ->
     gpu = tool("gpu_run")
     log = tmp_path / "log.csv"
     log.write_text("epoch,loss,seconds\n0,1,30.0\n1,1,10.0\n", encoding="utf-8")
+
     assert gpu.epochs_within(100, log) == 9
+
     log.write_text("epoch,loss,seconds\n", encoding="utf-8")
     with pytest.raises(SystemExit, match="more --minutes"):
         gpu.epochs_within(100, log)
@@ -337,6 +366,7 @@ def test_epochs_go_into_the_recipe(tool: Tool, tmp_path: Path) -> None:
     recipe = tmp_path / "a.toml"
     recipe.write_text("objects = 5\nepochs = 3\n", encoding="utf-8")
     made = gpu.recipe_with(recipe, tmp_path / "b.toml", epochs=70)
+
     assert made.read_text(encoding="utf-8") == "objects = 5\nepochs = 70\n"
 
 
@@ -364,7 +394,9 @@ def test_whole_run_in_the_small(tool: Tool, tmp_path: Path, monkeypatch: Patch) 
     small = "--held-out 20 --first-objects 100 --compressor-epochs 1 --minutes 20 --workers 1"
     gpu.train_and_judge(gpu.options().parse_args([*recipes, *small.split()]))
     facts = json.loads((tmp_path / "out" / "run.json").read_text(encoding="utf-8"))
+
     assert facts["objects"] >= 100
+
     for name in ("direct", "compressor"):
         assert 0 <= facts[name]["unseen"]["silhouette_iou"]["value"] <= 1
         assert facts[f"{name}_parts"][0] == f"{name}.00"

@@ -42,6 +42,7 @@ def status_of(address: str, path: str, **options: Any) -> int:
 
 def test_server_sends_whole_files_and_refuses_any_other_request(server: ViewServer) -> None:
     assert urlsplit(server.address).hostname == server._server.server_address[0] == LOOPBACK
+
     for path, (kind, content) in ASSETS.items():
         with closing(ask(server.address, path + "?renderer=webgl")) as answer:
             assert (answer.status, answer.headers["Content-Type"]) == (200, kind)
@@ -50,6 +51,7 @@ def test_server_sends_whole_files_and_refuses_any_other_request(server: ViewServ
         with closing(ask(server.address, path, method="HEAD")) as answer:
             assert (answer.status, int(answer.headers["Content-Length"])) == (200, len(content))
             assert answer.read() == b""
+
     assert (
         status_of(server.address, "/../secret")
         == status_of(server.address, "/", method="POST")
@@ -126,6 +128,7 @@ def test_stream_lasts_until_it_is_ended(server: ViewServer, streams: Streams) ->
 def test_stream_ends_when_its_browser_leaves(server: ViewServer, streams: Streams) -> None:
     with closing(ask(server.address, "/stream")) as answer:
         answer.read(10)
+
     assert streams.ended.wait(60.0)
     assert isinstance(streams.error, OSError)
 
@@ -146,7 +149,9 @@ def test_server_limits_streams_and_reuses_their_room(streams: Streams) -> None:
     with closing(ask(server.address, "/stream")) as refused:
         assert refused.status == 503
         assert b"2 browsers" in refused.read()
+
     assert status_of(server.address, "/") == 200
+
     streams.end.set()
     for answer in watching:
         answer.read()
@@ -164,6 +169,7 @@ def test_names_of_a_host_are_this_machines() -> None:
     is_known = names_of("bench.lan", "192.0.2.7")
     known = ("BENCH.lan:9090", "192.0.2.7:9090", "[fe80::1]:1", "localhost", socket.gethostname())
     unknown = ("evil.example", "bench.lan.evil.example", "")
+
     assert [is_known(name) for name in (*known, *unknown)] == [True] * 5 + [False] * 3
     assert not names_of("127.0.0.1", "127.0.0.1")(socket.gethostname() + ".evil.example")
 
@@ -176,8 +182,11 @@ def test_loopback_is_told_from_hosts_that_others_can_reach() -> None:
         assert ("9090" in exposed(host, 9090)) == bool(exposed(host, 9090)) == (not loopback)
     for host in ("127.0.0.1", EVERYWHERE):
         assert address_of(host, 7) == "http://127.0.0.1:7/"
+
     assert address_of("::", 7) == address_of("::1", 7) == "http://[::1]:7/"
+
     note = exposed("192.0.2.7", 8000)
+
     assert all(text in note for text in ("192.0.2.7", "8000", "password"))
     assert "\n" not in note
 
@@ -194,6 +203,7 @@ def test_server_refuses_pages_of_other_sites(server: ViewServer, headers: dict[s
     followed = status_of(
         server.address, "/", Sec_Fetch_Site="cross-site", Sec_Fetch_Mode="navigate"
     )
+
     assert followed == 200, "a person may follow a link to the page"
 
 

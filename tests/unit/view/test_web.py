@@ -81,6 +81,7 @@ def test_nothing_is_packed_without_browser(
     monkeypatch.setattr(MomentPacker, "pack", lambda *_, **__: pytest.fail("packed"))
     for number in range(1000):
         viewer.show(moment(number))
+
     assert threading.active_count() <= 4
 
 
@@ -107,6 +108,7 @@ def test_slow_browser_skips_to_the_newest_moment() -> None:
         )
         let.set()
     thread.join(60.0)
+
     assert sum(b"moment" in content for content in taken) < 10
 
 
@@ -125,12 +127,14 @@ def test_page_controls_with_the_token_of_the_address() -> None:
                 ask(address, "/command", method="POST", body=body, X_Token=sent)
             ) as answer:
                 assert answer.status == status
+
     assert controls.run.call_args_list == [call("average", {"frames": 4})]
 
 
 def test_page_is_whole_and_names_no_other_address(viewer: WebViewer) -> None:
     with closing(ask(viewer.address or "", "/")) as answer:
         page = answer.read().decode()
+
     assert "class Bench" in page
     assert "class Pictures" in page
     assert "src=" not in page
@@ -175,10 +179,14 @@ def saved(tmp_path: Path) -> Path:
 
 def test_session_keeps_ten_moments_a_second_in_one_page(saved: Path) -> None:
     assert [each["frame"] for each in saved_moments(saved)] == list(range(0, 90, 3))
+
     page = saved.read_text()
+
     assert 'data-mode="session"' in page
     assert "src=" not in page
+
     kinds = [unpack(message)[0]["kind"] for message in messages_of(page.encode())]
+
     assert kinds == ["bench", "chunk", "chunk", "chunk"]
 
 
@@ -187,6 +195,7 @@ def test_cut_session_lacks_only_its_end(saved: Path, tmp_path: Path, share: floa
     content = saved.read_bytes()
     (tmp_path / "cut.html").write_bytes(content[: int(share * len(content))])
     frames = [each["frame"] for each in saved_moments(tmp_path / "cut.html")]
+
     assert frames == list(range(0, 90, 3))[: len(frames)]
     assert len(frames) % 10 == 0
 
@@ -196,6 +205,7 @@ def test_full_session_ends_before_the_run(tmp_path: Path, monkeypatch: pytest.Mo
     with SessionFile(tmp_path / "view.html", RIG, keeps_all=True) as session:
         for number in range(0, 300, 3):
             session.show(moment(number))
+
     assert session.full
     assert session.kept < 40 < MAX_BYTES
 
@@ -222,6 +232,7 @@ def test_viewers_show_every_moment_and_begin_all_or_none() -> None:
     some[2].__enter__.side_effect = OSError("no room")
     with pytest.raises(OSError, match="no room"), Viewers(some[1:]):
         pass
+
     assert [name for name, *_ in some[1].mock_calls[3:]] == ["__enter__", "__exit__"]
 
 
@@ -238,7 +249,9 @@ def test_unpacked_message_is_the_packed_one(fields: dict[str, int], rows: int) -
         "two": np.full((2, 2, 3), 7, np.uint8),
     }
     found, found_arrays = unpack(pack(fields, arrays))
+
     assert found == fields
+
     for name, array in arrays.items():
         np.testing.assert_array_equal(found_arrays[name], array)
 
@@ -246,9 +259,12 @@ def test_unpacked_message_is_the_packed_one(fields: dict[str, int], rows: int) -
 def test_bytes_keep_depth_to_a_step_and_differences_symmetric() -> None:
     depth_m = bump(0)
     counts = depth_bytes(depth_m, BOX.z_near_m, BOX.z_far_m)
+
     assert ((counts == 0) == np.isnan(depth_m)).all()
+
     step_m = (BOX.z_far_m - BOX.z_near_m) / 254
     found_m = BOX.z_near_m + (counts - 1.0) * step_m
+
     assert np.nanmax(np.abs(np.where(counts > 0, found_m, np.nan) - depth_m)) <= 0.51 * step_m
     assert signed_bytes(np.array([-9.0, -1.0, 0.0, 1.0, 9.0, np.nan]), 1.0).tolist() == [
         1,
@@ -263,6 +279,7 @@ def test_bytes_keep_depth_to_a_step_and_differences_symmetric() -> None:
 def test_moment_message_holds_layers_and_requested_pictures() -> None:
     shown = full_moment(3, size=(480, 640))
     fields, arrays = unpack(MomentPacker().pack(shown))
+
     assert {"depth", "truth", "error", "lidar", "infrared", "change", "residual"} == set(arrays)
     assert arrays["lidar"].shape == (160, 214)
     assert fields["frame"] == 3
@@ -270,7 +287,9 @@ def test_moment_message_holds_layers_and_requested_pictures() -> None:
     np.testing.assert_allclose(
         arrays["error"] * ERROR_STEP_M, shown.result.uncertainty_m, atol=ERROR_STEP_M
     )
+
     _, small = unpack(MomentPacker().pack(shown, with_lidar=False))
+
     assert {*arrays} - {*small} == {"lidar", "infrared", "change", "residual"}
 
 
@@ -279,19 +298,23 @@ def test_moment_without_surface_sends_uncertainty_in_valid_json() -> None:
     reconstruction = replace(shown.result.reconstruction, depth_m=NOTHING)
     empty = with_result(shown, reconstruction=reconstruction)
     _, arrays = unpack(MomentPacker().pack(empty))
+
     assert not arrays["depth"].any()
     assert arrays["error"].any()
+
     shown = moment(0, NOTHING)
     frame = shown.result.frame
     dark = with_result(shown, frame=replace(frame, depth_m=np.full_like(frame.depth_m, np.nan)))
     fields, arrays = unpack(MomentPacker().pack(dark))
     json.dumps(fields, allow_nan=False)
+
     assert not arrays["lidar"].any()
 
 
 @pytest.mark.parametrize("measured", [None, exact_wall()])
 def test_bench_message_names_every_part(measured: object) -> None:
     fields, arrays = unpack(bench_message(RIG, measured))  # type: ignore[arg-type]
+
     assert {"wall", "occluder", "lidar", "frustum", "light"} <= set(fields["parts"])
     assert len(fields["parts"]["light"]) == 5, (
         "three bounces between leaving and reaching the lidar"
@@ -320,6 +343,7 @@ def test_expected_overlap_is_exact_for_certain_pixels() -> None:
         assert expected_overlap(with_uncertainty(surface).result.reconstruction) == pytest.approx(
             overlap
         )
+
     assert expected_overlap(full_moment(0).result.reconstruction) is None
     assert expected_overlap(moment(0, NOTHING).result.reconstruction) is None
     assert expected_error_m(moment(0).result.reconstruction) is None
@@ -327,6 +351,7 @@ def test_expected_overlap_is_exact_for_certain_pixels() -> None:
 
 def test_detected_object_is_graded_by_the_models_numbers() -> None:
     told = assess(with_uncertainty(0.71 * np.isfinite(bump(0))))
+
     assert "71%" in told.detail
     assert "17 mm" in told.detail
     assert told.trusted
@@ -340,7 +365,9 @@ def test_only_a_trusted_quality_of_a_detected_object_is_green(
     predicted = Quality((0.58, 0.71, 0.82), 0.6, 0.017, trusted=trusted)
     shown = with_result(with_uncertainty(np.ones((64, 64)), quality=predicted), verdict=verdict)
     told = assess(shown)
+
     assert (told.tone == "good") == (trusted and verdict is Verdict.SEEN)
+
     if verdict is Verdict.SEEN:
         assert told.detail == "outline typically 71% right (58% to 82%), depth to 17 mm"
 
@@ -350,8 +377,11 @@ def test_only_a_detected_shape_is_trusted_and_none_is_green(
     verdict: Verdict | None,
 ) -> None:
     told = assess(with_result(full_moment(0), verdict=verdict))
+
     assert told.trusted == (verdict in {Verdict.SEEN, None})
+
     red, green, blue = told.rgb
+
     assert green < max(red, blue)
     assert told.headline
     assert set(RGB.values()) >= {told.rgb}

@@ -115,12 +115,15 @@ def _same(one: SensedImages, other: SensedImages) -> bool:
 def test_stage_is_included_exactly_when_the_model_has_it(name: str) -> None:
     bare = sensor_effects(QUIET.model_copy(update=HAS[name]))
     rich = sensor_effects(RICH.model_copy(update=LACKS[name]))
+
     assert included(bare, name)
+
     if name == "range noise":
         assert included(sensor_effects(QUIET.model_copy(update={"range_noise_per_m": 0.001})), name)
     if name == "drift":  # at a steady temperature there is none
         steady = sensor_effects(QUIET.model_copy(update={"drift_m_per_celsius": 0.001}))
         assert [(e.included, e.bound) for e in steady if e.name == name] == [(False, 0.0)]
+
     assert {e.name for e in rich if not e.included} == {name}
     assert next(e.bound for e in rich if e.name == name) == 0
 
@@ -132,9 +135,12 @@ def test_stage_is_included_exactly_when_the_model_has_it(name: str) -> None:
 )
 def test_stages_have_their_order_and_reasons(model: SensorModel) -> None:
     verdicts = sensor_effects(model)
+
     assert tuple(effect.name for effect in verdicts) == CHAIN
+
     for effect in verdicts:
         assert effect.included == (effect.bound > 0)
+
     assert {e.name for e in verdicts if e.included} >= FORMAT
 
 
@@ -144,6 +150,7 @@ def test_stage_changes_the_images_only_if_the_model_has_it(
 ) -> None:
     model = QUIET.model_copy(update=HAS[name])
     celsius = WORST_AT.get(name)
+
     assert not _same(
         _seen(model, 30.0, celsius),
         _turned(model, name, 30.0, monkeypatch, celsius),
@@ -168,6 +175,7 @@ def test_noise_left_out_is_not_drawn(name: str, deviates: int) -> None:
         QUIET.model_copy(update=HAS.get(name, {})),
     ).expose(_flat(30.0), drawn)
     counted.standard_normal((deviates, WIDTH * HEIGHT), np.float32)
+
     assert drawn.bit_generator.state == counted.bit_generator.state
 
 
@@ -198,12 +206,17 @@ def test_ir_bound_is_near_the_worst_case(monkeypatch: pytest.MonkeyPatch) -> Non
     noisy = QUIET.model_copy(update={"read_noise_counts": 2.0})
     # The same at 1 count, were it not cut at 0.
     change, bound = _ir_change(noisy, "read noise", 30.0, monkeypatch)
+
     assert bound / 2 < change <= bound
+
     rough = QUIET.model_copy(update={"wall_texture": 0.2})
     change, bound = _ir_change(rough, "wall texture", 100.0, monkeypatch)
+
     assert 100 * bound / 2 < change <= 100 * bound
+
     lit = QUIET.model_copy(update={"ambient_counts": 60.0})
     change, bound = _ir_change(lit, "ambient light", 300.0, monkeypatch)
+
     assert change == pytest.approx(255 * bound)
 
 
@@ -211,8 +224,11 @@ def test_depth_changes_by_at_most_the_bounds(monkeypatch: pytest.MonkeyPatch) ->
     bounds = {e.name: e.bound for e in sensor_effects(RICH)}
     seen = _seen(RICH, 30.0).depth_z16.astype(float)
     still = _turned(RICH, "range noise", 30.0, monkeypatch).depth_z16.astype(float)
+
     assert 0 < np.abs(seen - still).mean() * DEPTH_UNIT_M <= bounds["range noise"]
+
     whole = _turned(RICH, "dead pixels", 30.0, monkeypatch).depth_z16.astype(float)
+
     assert np.abs(seen - whole).sum() / whole.sum() == pytest.approx(
         bounds["dead pixels"], rel=0.05
     )

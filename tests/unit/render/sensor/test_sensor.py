@@ -66,6 +66,7 @@ def test_gain_holds_for_any_pulse_and_radiometry(radiometry: Radiometry, pulse_n
         render(scene, "draft").multi,
         default_rng(0),
     )
+
     assert images.ir.max() == pytest.approx(48, abs=2)
 
 
@@ -79,6 +80,7 @@ def test_gain_does_not_depend_on_the_occluder() -> None:
         for rig in (near, BARE)
     )
     on_wall = cast(near, near.pinhole).on_wall.reshape(images.ir.shape)
+
     assert 0 < on_wall.sum() < on_wall.size
     np.testing.assert_array_equal(images.ir[on_wall], free.ir[on_wall])
 
@@ -93,11 +95,14 @@ def test_dead_pixels_stay_from_frame_to_frame() -> None:
             sensor.expose(NO_ECHO, default_rng(seed)).depth_z16 == 0, dead
         )
     whole = Sensor(BARE, QUIET).expose(NO_ECHO, default_rng(0))
+
     np.testing.assert_array_equal(
         first.expose(NO_ECHO, default_rng(0)).ir,
         whole.ir,
     )
+
     alive = whole.depth_z16 > 0
+
     assert (dead & alive).sum() / alive.sum() == pytest.approx(0.05, abs=0.003)
 
 
@@ -107,6 +112,7 @@ def test_sensor_with_a_short_gate_gives_black_images() -> None:
         BARE.model_copy(update={"device": device}),
         SensorModel(),
     ).expose(NO_ECHO, default_rng(0))
+
     assert not images.depth_z16.any()
     assert not images.ir.any()
     assert not images.confidence.any()
@@ -123,6 +129,7 @@ def test_cell_of_pixels_takes_the_beam_at_the_pixel_center(k: int) -> None:
     row, column = np.divmod(cell, columns)
     centre_row = (np.arange(480) + 0.5) / 480
     centre_column = (np.arange(640) + 0.5) / 640
+
     assert (np.abs(centre_row[:, None] - (row + 0.5) / rows) <= 0.5 / rows + 1e-12).all()
     assert (np.abs(centre_column - (column + 0.5) / columns) <= 0.5 / columns + 1e-12).all()
     np.testing.assert_array_equal(
@@ -161,7 +168,9 @@ def test_included_direct_return_does_not_compete_again() -> None:
         peak=np.full_like(DARK, 1e-9),
         path_m=np.ones_like(DARK),
     )
+
     assert sensor.expose(faint, default_rng(0)).ir.max() == 48
+
     for echo in (NO_ECHO, faint):
         assert not sensor.expose(
             replace(echo, direct_included=True),
@@ -172,6 +181,7 @@ def test_included_direct_return_does_not_compete_again() -> None:
         sensor.expose(replace(strong, direct_included=mixed), default_rng(0))
         for mixed in (False, True)
     )
+
     np.testing.assert_array_equal(apart.depth_z16, mixed.depth_z16)
     assert (mixed.confidence >= apart.confidence).all()
 
@@ -195,8 +205,11 @@ def test_sensor_model_refuses_values_out_of_range_by_field(
 @given(st.floats(0, 1e5), st.floats(0, 1e5))
 def test_celsius_at_approaches_the_end_of_the_warm_up(one_s: float, other_s: float) -> None:
     model = SensorModel(warm_up=WarmUp(from_celsius=25, to_celsius=45, time_constant_s=600))
+
     assert SensorModel().celsius_at(one_s) == STEADY_CELSIUS
+
     earlier, later = (model.celsius_at(seconds) for seconds in sorted((one_s, other_s)))
+
     assert 25 <= earlier <= later <= 45
     # the remaining difference shrinks to 1/e in each time constant
     assert 45 - model.celsius_at(one_s + 600) == pytest.approx(
@@ -228,8 +241,10 @@ def test_bias_is_empty_by_default_and_drifts_when_not_warm() -> None:
 
 def test_ripples_are_a_wave_with_five_periods_of_any_direction() -> None:
     wave_m = _bias_m(None, ripple_m=0.002).reshape(SHAPE)
+
     assert np.abs(wave_m).max() == pytest.approx(0.002, rel=0.01)
     assert abs(wave_m.mean()) < 0.1 * 0.002
+
     power = np.abs(np.fft.rfft2(wave_m)) ** 2
     rows, columns = np.divmod(
         int(power.argmax()),
@@ -239,16 +254,21 @@ def test_ripples_are_a_wave_with_five_periods_of_any_direction() -> None:
         min(rows, SHAPE[0] - rows) * SHAPE[1] / SHAPE[0],
         columns,
     )
+
     assert periods == pytest.approx(5.0, abs=1.0)
+
     waves = [ripples(SHAPE, 4.0, default_rng(seed)) for seed in range(8)]
     alike = np.corrcoef([wave.ravel() for wave in waves]) - np.eye(8)
+
     assert np.abs(alike).max() < 0.9
 
 
 def test_patches_are_smooth_and_of_unit_spread() -> None:
     pattern = smooth_patches(SHAPE, default_rng(0))
+
     assert pattern.std() == pytest.approx(1.0)
     assert np.abs(np.diff(pattern)).max() < 0.5
+
     few, many = (
         smooth_patches(
             SHAPE,
@@ -257,6 +277,7 @@ def test_patches_are_smooth_and_of_unit_spread() -> None:
         )
         for across in (4, 24)
     )
+
     assert np.diff(few).std() < np.diff(many).std() / 2
 
 
@@ -264,6 +285,7 @@ def test_patch_drift_grows_in_place_as_the_device_warms() -> None:
     cold, half, warm = (
         _bias_m(celsius, patch_drift_m=0.001, warm_up=WARM_UP) for celsius in (25.0, 35.0, 45.0)
     )
+
     assert not cold.any()
     assert warm.std() == pytest.approx(0.001, rel=1e-4)
     assert warm.mean() == pytest.approx(0.0, abs=1e-7)  # a shift of the whole view is the drift
@@ -277,12 +299,15 @@ WALL = 240, 320
 @pytest.mark.parametrize("strength", [0.01, 0.2, 1.0])
 def test_texture_has_mean_1_and_its_strength_as_log_spread(strength: float) -> None:
     factor = texture(WALL, strength)
+
     assert factor.shape == (WALL[0] * WALL[1],)
     assert factor.min() > 0
     assert factor.mean() == pytest.approx(1, rel=1e-5)
     assert np.log(factor).std() == pytest.approx(strength, rel=1e-4)
     np.testing.assert_array_equal(texture(WALL, strength), factor)
+
     half = np.log(texture(WALL, strength / 2))
+
     np.testing.assert_allclose(
         2 * np.ptp(half),
         np.ptp(np.log(factor)),
@@ -294,7 +319,9 @@ def test_texture_has_mean_1_and_its_strength_as_log_spread(strength: float) -> N
 def test_texture_has_stains_and_grain_of_a_cell() -> None:
     pattern = np.log(texture(WALL, 0.2)).reshape(WALL)
     stains = cv2.GaussianBlur(pattern, (0, 0), 8)
+
     assert 0.3 < (stains.std() / pattern.std()) ** 2 < 0.7
+
     grain = pattern - stains
     cell = WALL[1] // 80
     near, far = (
@@ -304,6 +331,7 @@ def test_texture_has_stains_and_grain_of_a_cell() -> None:
         )[0, 1]
         for by in (1, 2 * cell)
     )
+
     assert near > 0.8  # no finer than a pixel
     assert abs(far) < 0.2
 
@@ -369,15 +397,20 @@ def test_maps_have_the_noise_of_the_images() -> None:
 
 def test_deviates_are_normal_and_follow_the_seed() -> None:
     quantiles = normal_quantiles()
+
     assert quantiles.size == QUANTILES
     assert quantiles.astype(float).std() == pytest.approx(1, abs=1e-6)
+
     light, ranges, again = np.empty((3, 200_000), np.float32)
     draw_deviates(np.uint64(7), 0, light.size, quantiles, light, ranges)
     draw_deviates(np.uint64(7), 0, light.size, quantiles, again, ranges)
+
     np.testing.assert_array_equal(light, again)
+
     for values in (light, ranges):
         assert abs(values.mean()) < 0.01
         assert values.var() == pytest.approx(1, abs=0.015)
         assert abs((values[1:] * values[:-1]).mean()) < 0.01
         assert (np.abs(values) > 3).mean() == pytest.approx(0.0027, abs=5e-4)
+
     assert abs((light * ranges).mean()) < 0.01
