@@ -281,8 +281,8 @@ def test_film_is_a_webm_that_browsers_play(tmp_path: Path) -> None:
     assert b"V_VP8" in content
 
 
-@pytest.mark.usefixtures("film")
-def test_film_keeps_the_codec_quiet(capfd: pytest.CaptureFixture[str]) -> None:
+def test_film_keeps_the_codec_quiet(capfd: pytest.CaptureFixture[str], film: VideoFile) -> None:
+    assert film.filmed
     assert capfd.readouterr().err == "", "the codec writes to the terminal"
 
 
