@@ -32,7 +32,7 @@ NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 # Bounds that no bench reaches: numbers beyond them are typing errors or damage, and would overflow
 # in products of lengths far from the place that names the field.
 Coordinate = Annotated[float, Field(ge=-100, le=100)]
-Length = Annotated[float, Field(ge=1e-4, le=100)]
+Length = Annotated[float, Field(ge=1e-9, le=100)]
 FocalLength = Annotated[float, Field(ge=1, le=1e6)]
 PixelPlace = Annotated[float, Field(ge=-1e5, le=1e5)]
 Pixels = Annotated[int, Field(gt=0, le=16384)]

@@ -368,7 +368,7 @@ def test_reference_of_another_kind_is_refused(tmp_path: Path) -> None:
     [
         ({"object_box": {"x_max_m": 1e308}}, "x_max_m"),
         ({"device": {"bin_m": 1e-300}}, "bin_m"),
-        ({"lidar": {"distance_m": 1e-9}}, "distance_m"),
+        ({"lidar": {"distance_m": 1e-300}}, "distance_m"),
         ({"intrinsics": {"fx": 1e300}}, "fx"),
         ({"wall": {"x_min_m": -1e6}}, "x_min_m"),
     ],

@@ -291,7 +291,7 @@ def test_frame_in_si_has_metres_levels_and_nan() -> None:
     assert frame.timestamp_s == 1.5
     assert frame.intrinsics == pinhole
     assert frame.settings == settings
-    assert frame.truth_depth_m == truth_m
+    assert frame.truth_depth_m is truth_m
 
 
 STEP_BACK_S = STEP_BACK * WRAP_PERIOD_S

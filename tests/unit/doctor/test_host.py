@@ -57,8 +57,8 @@ def test_this_host_and_platform_can_be_read(tmp_path: Path) -> None:
     assert found.python == sys.version_info[:2]
     assert found.system == platform.system().lower()
     assert found.machine == platform.machine().lower()
-    assert found.is_root == os.geteuid() == 0
-    assert found.is_musl == platform.libc_ver()[0] == ""
+    assert found.is_root == (os.geteuid() == 0)
+    assert found.is_musl == (platform.libc_ver()[0] == "")
     assert set(host.read_host().modules) == set(host.MODULES)
 
     (tmp_path / ".dockerenv").touch()

@@ -52,7 +52,8 @@ def test_repair_copies_a_whole_bag(
     )
     old = {"depth": 2, "infrared": 0, "confidence": 0, "color": 1}
 
-    assert found.recovered_frames == ALL if name in noise_bags else old
+    expected = ALL if name in noise_bags else old
+    assert found.recovered_frames == expected
     assert found.damages == []
     assert (tmp_path / "good.bag").read_bytes() == path.read_bytes() == content
     assert path.stat().st_mtime_ns == before.st_mtime_ns
