@@ -40,12 +40,12 @@ of the rows missing a share of 0.09 is lost, and the silhouette IoU falls from 0
 SAME_WALL_M = 0.03
 """Largest difference of measured and calibrated depth at which a cell's reference is of the wall: it
 was measured without the occluder, or with another one."""
-MOVED_M = 0.005
+MOVED_M = 0.006
 """Median depth of the wall's cells off their record: beyond the error of a record and the drift of a
 range over an hour's warming."""
 NEARER_CELLS = 4
-NEARER_M = 0.006
-"""Twice the error of a bench's record."""
+NEARER_M = 0.01
+"""What half a degree of an unnoticed turn moves the farthest cells by."""
 UNLIKE_WALL_CELLS = 4
 UNLIKE_WALL = 0.2
 """Logarithm of light over the wall's, in a cell of the wall's depth. Without texture, cells differ

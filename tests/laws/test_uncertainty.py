@@ -78,7 +78,8 @@ def test_known_objects_are_seen_with_honest_expected_errors(processing: Pipeline
         frame = Frame(
             maps.depth_m, ir, ir, 0.0, 0, RIG.pinhole.scaled(80, 64)
         )  # of one pixel per cell
-        step = steps_of(processing, [frame] * 5)[-1]
+        # A fifth repeat of the same noise would be a frozen camera's.
+        step = steps_of(processing, [frame] * 4)[-1]
         verdicts.append(step.verdict)
         uncertainty_m = step.reconstruction.uncertainty_m
         off_m = step.reconstruction.depth_m - subject.depth_m
