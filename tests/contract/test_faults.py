@@ -3,7 +3,6 @@ and counts.
 """
 
 from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, nullcontext
 from itertools import pairwise
 from pathlib import Path
 from threading import Event
@@ -15,7 +14,7 @@ from nlos_calibration import load_rig
 from sdk_playback import SdkReplay
 from small_frames import ListViewer, sheet_network
 
-from nlos_cam.camera import Recording, SimulatedCamera, session
+from nlos_cam.camera import Camera, Recording, SimulatedCamera, session
 from nlos_cam.errors import CameraLostError
 from nlos_cam.frames import Frame
 from nlos_cam.live import RunReport, run_live
@@ -222,34 +221,50 @@ RECORDED = [
 ]
 
 
-def sdk_replay(path: Path) -> AbstractContextManager[SdkReplay]:
-    return nullcontext(SdkReplay(path))
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("reader", [ReplayCamera, sdk_replay])
-def test_recording_of_faults_replays_as_it_was_captured(
-    camera: Make, tmp_path: Path, reader: Any
-) -> None:
+@pytest.fixture
+def captured(camera: Make, tmp_path: Path) -> tuple[Path, Camera, list[Frame]]:
+    """A recording of many faults, the camera that made it, and the frames that it delivered."""
     recording = Recording(tmp_path / "faulty.bag", frames=40)
     with camera(*RECORDED, recording=recording) as recorded:
         seen = list(recorded)
-    with reader(recording.path) as replayed:
-        again = list(replayed)
+    return recording.path, recorded, seen
 
-    assert [frame.frame_number for frame in again] == [frame.frame_number for frame in seen]
-    np.testing.assert_allclose(
-        [f.timestamp_s for f in again], [f.timestamp_s for f in seen], atol=1e-6
-    )
 
+def assert_same_frames(again: list[Frame], seen: list[Frame]) -> None:
+    numbers = [frame.frame_number for frame in seen]
+    times_s = [frame.timestamp_s for frame in seen]
+
+    assert [frame.frame_number for frame in again] == numbers
+    np.testing.assert_allclose([frame.timestamp_s for frame in again], times_s, atol=1e-6)
     for one, other in zip(seen, again, strict=True):
         np.testing.assert_array_equal(one.depth_m, other.depth_m)
 
-    assert (
-        replayed.counts
-        == recorded.counts
-        == {"duplicate": 1, "out_of_order": 1, "wrong_size": 1, "stalled": 1}
-    )
-    assert (
-        (replayed.incomplete, replayed.dropped) == (recorded.incomplete, recorded.dropped) == (2, 3)
-    )
+
+@pytest.mark.slow
+def test_librealsense_replays_faults_as_they_were_captured(
+    captured: tuple[Path, Camera, list[Frame]],
+) -> None:
+    path, recorded, seen = captured
+    replayed = SdkReplay(path)
+    again = list(replayed)
+
+    assert_same_frames(again, seen)
+    expected = {"duplicate": 1, "out_of_order": 1, "wrong_size": 1, "stalled": 1}
+    assert replayed.counts == recorded.counts == expected
+    assert (replayed.incomplete, replayed.dropped) == (recorded.incomplete, recorded.dropped)
+    assert (replayed.incomplete, replayed.dropped) == (2, 3)
+
+
+@pytest.mark.slow
+def test_replay_of_faults_puts_a_late_frame_in_its_place(
+    captured: tuple[Path, Camera, list[Frame]],
+) -> None:
+    path, _, seen = captured
+    with ReplayCamera(path) as replayed:
+        again = list(replayed)
+    (late,) = [frame for frame in again if frame.frame_number == 9]
+
+    assert [frame.frame_number for frame in again[5:8]] == [8, 9, 10]
+    assert_same_frames([frame for frame in again if frame is not late], seen)
+    assert replayed.counts == {"duplicate": 1, "wrong_size": 1, "stalled": 1}
+    assert (replayed.incomplete, replayed.dropped) == (2, 2)
