@@ -45,7 +45,7 @@ class VerdictLimits:
     """Smallest values at which a verdict is given.
 
     The first two are quantiles over the uncertainty model's held-out samples, set when it was
-    trained (`nlos_models.doubt_training.calibrate`), the third over rendered objects.
+    trained (`nlos_models.training.uncertainty.calibrate`), the third over rendered objects.
     """
 
     nothing: float
