@@ -28,9 +28,10 @@ none).
 """
 TASKS = Path("/proc/self/task")
 MIN_PROCESSORS = 2
-GIVE_WAY = 5
-"""`nice` of the run's threads on one processor. The kernel's weight of 5 is a third of that of 0:
-the three busy threads of a run (camera, loop, network) together get as much as another program."""
+GIVE_WAY = 8
+"""`nice` of the run's threads on one processor. The kernel gives 8 a sixth of the weight of 0: the
+three busy threads of a run (camera, loop, network) together get half as much as another program,
+which leaves room for the page's threads, whose priority is an ordinary one."""
 POLL_S = 0.1
 Priority = Literal["auto", "never"]
 SWITCH_S = 0.001

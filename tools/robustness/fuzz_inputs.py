@@ -330,7 +330,7 @@ def make_inputs(home: Path, group: str) -> dict[str, Input]:
     return inputs
 
 
-def _place_torch(home: Path, weights: Path, place: Callable[..., None]) -> None:
+def _place_torch(home: Path, direct: Path, place: Callable[..., None]) -> None:
     import torch
     from nlos_models.training import loop as train
 
@@ -340,7 +340,13 @@ def _place_torch(home: Path, weights: Path, place: Callable[..., None]) -> None:
     whole = {name: found.column(name) for name in DATASET_ARRAYS}
     shard = next((home / "data").glob("*.h5"))
     place("shard.h5", shard, partial(read_shard, whole=whole), home / "data")
-    for name in ("preprocess.safetensors", "doubt.safetensors", "compressor.safetensors"):
+    paper = shipped_folder("paper")
+    for weights, name in (
+        (direct, "direct.safetensors"),
+        (direct, "doubt.safetensors"),
+        (paper, "preprocess.safetensors"),
+        (paper, "compressor.safetensors"),
+    ):
         place(name, weights / name, read_weights, weights)
     state = {"recipe": "{}", "module": {"x": torch.zeros(3)}, "epoch": 1, "rows": [{"loss": 1.0}]}
     torch.save(state, content := io.BytesIO())
