@@ -54,6 +54,7 @@ COMMANDS = {
     "calibrate": Command(
         "calibrate", BENCH, "Measure a bare wall, a printed board or the occluder."
     ),
+    "adapt": Command("adapt", BENCH, "Make weights for one bench, from its calibration."),
     "board": Command("calibrate", BENCH, "Write the calibration board as a PDF to print."),
     "capture": Command(
         "capture", RECORDINGS, "Record a camera to a .bag file and check the recording."

@@ -8,7 +8,7 @@ number of objects of every epoch, so that an interrupted run sees the same batch
 import hashlib
 import json
 import operator
-from collections.abc import Generator, Iterable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -34,6 +34,8 @@ IMAGES = "images.f16"
 CELLS = "cells.npz"
 INDEX_LIMIT = 1 << 26
 """Bytes of the index: some hundred thousand shards."""
+Growth = Callable[[int], int]
+"""Returns the number of shards that an epoch sees, once they are there."""
 STATISTICS_SHARDS = 40
 """Shards of each dataset that the cells' statistics are taken from: 4,000 objects."""
 
@@ -78,10 +80,14 @@ class PackedMaps:
         normal: CellNormal | None = None,
         *,
         color: bool = False,
+        growth: Growth | None = None,
+        align: bool = True,
     ) -> None:
         """Open or make the store: use `open_packed_maps`, which holds its claim meanwhile.
 
-        Maps are normalised as `normal` does, by default by their own statistics. Raises
+        Maps are normalised as `normal` does, by default by their own statistics. `growth` decides
+        how many objects an epoch sees (default: all that are there). Without `align` a spread of
+        rigs stays in the maps, as a deviation that is not known. Raises
         RecordingError for no dataset, SceneError for datasets of two rigs or a store that is
         normalised otherwise.
         """
@@ -102,6 +108,8 @@ class PackedMaps:
         """To be drawn at each step of training."""
         self._datasets = list(datasets)
         self._store = store
+        self._growth = growth
+        self._align = align
         self.normal = CellNormal(color=color)
         if color and self.plan.spread != RigSpread():
             raise SceneError(
@@ -147,7 +155,8 @@ class PackedMaps:
             raise SceneError(
                 f"{store} holds maps that are normalised for other weights: name another --store"
             )
-        self.refresh(on_progress)
+        if growth is None:
+            self.refresh(on_progress)
 
     def __len__(self) -> int:
         return sum(self._index["shards"].values())
@@ -159,11 +168,13 @@ class PackedMaps:
             self.plan.rig.checksum.encode() + (self._store / CELLS).read_bytes()
         ).hexdigest()
 
-    def refresh(self, on_progress: OnProgress = ignore) -> None:
-        """Add the shards that appeared in the datasets since the last time."""
+    def refresh(self, on_progress: OnProgress = ignore, shards: int | None = None) -> None:
+        """Add the shards that appeared in the datasets since the last time, of the first `shards`
+        where that is given.
+        """
         known = self._index["shards"]
         paths = [path for folder in self._datasets for path in sorted(folder.glob(SHARD_PATTERN))]
-        new = [path for path in paths if str(path.resolve()) not in known]
+        new = [path for path in paths[:shards] if str(path.resolve()) not in known]
         for name, shape in self._rows.items():
             path = self._store / name
             size = 2 * len(self) * int(np.prod(shape))
@@ -194,8 +205,11 @@ class PackedMaps:
             part.write_text(json.dumps(self._index), encoding="utf-8")
 
     def _read(self, shard: Shard) -> MapSet:
+        maps = MapSet(*read_arrays(shard, MAP_CHANNELS))
+        if not self._align:
+            return maps
         rigs = (shard.plan.bench_of(seed)[0] for seed in shard.seeds)
-        return _aligned(MapSet(*read_arrays(shard, MAP_CHANNELS)), rigs, self.plan.rig)
+        return _aligned(maps, rigs, self.plan.rig)
 
     def held_out(self, folder: Path, count: int) -> MapSet:
         """Return up to `count` samples of another dataset as the store has its own: as the plan's
@@ -213,7 +227,7 @@ class PackedMaps:
         key = str(generator.initial_seed())
         epochs = self._index["epochs"]
         if key not in epochs:
-            self.refresh()
+            self.refresh(shards=self._growth(len(epochs)) if self._growth else None)
             epochs[key] = len(self)
             self._write_index()
         count = int(epochs[key])
@@ -245,6 +259,8 @@ def open_packed_maps(
     normal: CellNormal | None = None,
     *,
     color: bool = False,
+    growth: Growth | None = None,
+    align: bool = True,
 ) -> Generator[PackedMaps]:
     """Open or make a store, and hold the right to write it until the end of the block.
 
@@ -252,4 +268,6 @@ def open_packed_maps(
     """
     store.mkdir(parents=True, exist_ok=True)
     with claim(store, inside=True):
-        yield PackedMaps(datasets, store, on_progress, normal, color=color)
+        yield PackedMaps(
+            datasets, store, on_progress, normal, color=color, growth=growth, align=align
+        )

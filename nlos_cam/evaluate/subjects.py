@@ -203,17 +203,22 @@ def rig_of(record: CheckpointRecord) -> Rig:
 
 
 def rendered_objects(
-    rig: Rig, count: int | None = None, tracked: Tracked = untracked, *, test: TestSet = "kinds"
+    rig: Rig,
+    count: int | None = None,
+    tracked: Tracked = untracked,
+    *,
+    test: TestSet = "kinds",
+    sensor: SensorModel | None = None,
 ) -> HeldOutObjects:
-    """Render the 54 test objects of a set, or `count` random ones, with the simulated camera's
-    noise on a rig.
+    """Render the 54 test objects of a set, or `count` random ones, with a sensor's noise (the
+    simulated camera's by default) on a rig.
     """
-    plan = data.DatasetPlan(rig, data.TEST_SEED)
+    plan = data.DatasetPlan(rig, data.TEST_SEED, sensor or SensorModel())
     fixed = shapes.benchmark_objects if test == "kinds" else shapes.unseen_objects
     subjects = seeded_objects(plan.first_seed, count, plan.box) if count else fixed(plan.box)
     with tracked("rendering test objects") as on_progress:
         echoes = echoes_of(subjects, rig, on_progress)
-    maps = as_map_set(sense(echoes, rig), truth_of(subjects, plan.box))
+    maps = as_map_set(sense(echoes, rig, sensor), truth_of(subjects, plan.box))
     kind = "random objects" if count else TEST_SETS[test]
     description = f"{len(subjects)} held-out {kind}, with the sensor's noise"
     names = [one.name for one in subjects]

@@ -30,8 +30,8 @@ TASKS = Path("/proc/self/task")
 MIN_PROCESSORS = 2
 GIVE_WAY = 8
 """`nice` of the run's threads on one processor. The kernel gives 8 a sixth of the weight of 0: the
-three busy threads of a run (camera, loop, network) together get half as much as another program,
-which leaves room for the page's threads, whose priority is an ordinary one."""
+four busy threads of a run (camera, loop, network, drawing) together get two thirds as much as
+another program, which leaves room for the threads that answer the page."""
 POLL_S = 0.1
 Priority = Literal["auto", "never"]
 SWITCH_S = 0.001
@@ -108,13 +108,16 @@ class RealtimePriority:
 
 
 def _give_way() -> None:
-    """Schedule all threads but the view's after ordinary programs, until this process ends."""
+    """Schedule all threads but those that answer the page's commands after ordinary programs, until
+    this process ends.
+    """
     if not hasattr(os, "setpriority") or not TASKS.is_dir():
         return
-    views = {thread.native_id for thread in enumerate_threads() if thread.name.startswith("view")}
+    # the threads that answer inherit the priority of the server's
+    servers = {thread.native_id for thread in enumerate_threads() if thread.name == "view server"}
     for task in TASKS.iterdir():
         number = int(task.name)
-        if number in views:
+        if number in servers:
             continue
         with suppress(OSError):  # the thread has ended since
             os.setpriority(

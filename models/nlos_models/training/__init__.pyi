@@ -18,6 +18,7 @@ __all__ = [
     "UncertaintyRecipe",
     "UncertaintySet",
     "VaeRecipe",
+    "Watch",
     "WithNoise",
     "as_batch",
     "compressor_start",
@@ -45,6 +46,7 @@ __all__ = [
     "subtract_bare_wall",
     "train_direct",
     "transfer_start",
+    "unwatched",
     "vae_start",
 ]
 
@@ -78,6 +80,7 @@ from .recipe import (
 )
 from .runs import (
     TrainingRun,
+    Watch,
     compressor_start,
     direct_start,
     record_run,
@@ -89,6 +92,7 @@ from .runs import (
     run_uncertainty,
     run_vae,
     transfer_start,
+    unwatched,
     vae_start,
 )
 from .tasks import parts_of, rebuild, run

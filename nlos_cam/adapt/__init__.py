@@ -1,0 +1,5 @@
+"""Weights for one bench: objects rendered for exactly its rig, trained on from the start weights."""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -1,0 +1,201 @@
+"""Plan of an adaptation: how many objects and steps fit into the minutes, on this machine.
+
+The pace of rendering and training is measured once and kept in the plan with everything else that
+decides the weights. So an adaptation that was killed goes on to the same weights, also if the
+machine is slower then.
+"""
+
+import json
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+from nlos_calibration import MeasuredWall, Record
+from nlos_models.training import DirectRecipe, UncertaintyRecipe
+from pydantic import Field, ValidationError
+
+from nlos_cam.dataset import RigSpread
+from nlos_cam.errors import RecordingError
+from nlos_cam.files import TEXT_LIMIT, atomic_file, read_bounded
+from nlos_cam.render import SensorModel
+
+PLAN = "plan.json"
+BATCH = 256
+NETWORK_SHARE = 0.7
+"""Share of the minutes for the network itself; uncertainty, quality and figures get the rest."""
+SHARD = 100
+FIRST_OBJECTS = 1000
+"""Objects that are there before training begins."""
+RENDERED_AFTER = 0.8
+"""Share of the epochs after which all objects are there: the last ones are seen as well."""
+STEPS_PER_EPOCH = 40
+MIN_EPOCHS = 4
+MAX_EPOCHS = 60
+WHOLE_MINUTES = 100.0
+"""Minutes from which on uncertainty and quality get the samples of the shipped weights' recipe."""
+MIN_SHARE = 0.04
+CERTAIN_TIMES = 2.0
+"""Standard uncertainties that a bench may be off its record by: 95 % of benches are within."""
+LEAST_SPREAD = RigSpread(place_m=0.0005, angle_deg=0.1, gain_share=0.05)
+"""A fit's own uncertainty leaves out what it has no model of: a bent wall, a bench that settles.
+One column of cells at the occluder's edge flips between wall and occluder at 0.2 mm."""
+Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+Count = Annotated[int, Field(gt=0, le=10**9)]
+
+
+class Pace(Record):
+    """Speed of a machine."""
+
+    objects_per_s: Positive
+    samples_per_s: Positive
+
+
+class Stage(Record):
+    """Training run of a plan: it starts where the stage before it ended, the first one from the
+    start weights.
+    """
+
+    minutes: Positive
+    """Of this stage alone."""
+    objects: Annotated[int, Field(ge=SHARD)]
+    """Objects that are rendered by its end, those of earlier stages included."""
+    epochs: Count
+    steps: Count
+    """Of an epoch."""
+
+    def recipe(self) -> DirectRecipe:
+        """Return the recipe: the one that trains the shipped weights on, at a length of this
+        stage.
+        """
+        return DirectRecipe(
+            task="direct",
+            start="weights",
+            objects=self.steps * BATCH,
+            held_out=400,
+            epochs=self.epochs,
+            batch=BATCH,
+            learning_rate=1e-3,
+            betas=(0.9, 0.98),
+            schedule="cosine",
+            warm_up_steps=min(100, self.epochs * self.steps // 5),
+            weight_decay=0.05,
+            # the average forgets the start within a tenth of the run
+            average=min(0.998, max(0.0, 1 - 10 / (self.epochs * self.steps))),
+            keep="best",
+            gradient_limit=1.0,
+            noise=0.02,
+            wall_texture=0.05,
+            range_offset_m=0.002,
+            precision="bf16-mixed",
+            deviations=["not the paper's network: two heads, no latent (docs/direct.md)"],
+        )
+
+    def objects_at(self, epoch: int, before: int) -> int:
+        """Return how many objects an epoch trains on; `before` are there from earlier stages.
+
+        Whole shards, the same at every run: rendering goes on meanwhile, and training waits for
+        it where it must.
+        """
+        first = max(before, min(FIRST_OBJECTS, self.objects))
+        share = min(1.0, epoch / max(RENDERED_AFTER * (self.epochs - 1), 1))
+        return SHARD * ((first + round(share * (self.objects - first))) // SHARD)
+
+
+class Plan(Record):
+    """Everything that decides the weights of an adaptation."""
+
+    rig_checksum: str
+    start_checksum: str
+    """Of the weights that the first stage starts from."""
+    spread: RigSpread
+    sensor: SensorModel
+    seed: Annotated[int, Field(ge=0)]
+    pace: Pace
+    stages: tuple[Stage, ...] = ()
+
+    @property
+    def minutes(self) -> float:
+        """Minutes of all stages."""
+        return sum(stage.minutes for stage in self.stages)
+
+    def objects_before(self, stage: int) -> int:
+        """Return the number of objects that earlier stages have rendered."""
+        return self.stages[stage - 1].objects if stage else 0
+
+    def extended(self, minutes: float) -> "Plan":
+        """Return the plan with a stage for what `minutes` are more than its own; itself where they
+        are not.
+        """
+        further = minutes - self.minutes
+        if further <= 0:
+            return self
+        seconds = 60 * further * NETWORK_SHARE
+        before = self.objects_before(len(self.stages))
+        rendered = SHARD * round(self.pace.objects_per_s * seconds * RENDERED_AFTER / SHARD)
+        steps = max(round(self.pace.samples_per_s * seconds / BATCH), 2 * MIN_EPOCHS)
+        epochs = min(max(steps // STEPS_PER_EPOCH, MIN_EPOCHS), MAX_EPOCHS)
+        stage = Stage(
+            minutes=further,
+            objects=before + max(rendered, FIRST_OBJECTS),
+            epochs=epochs,
+            steps=steps // epochs,
+        )
+        return self.model_copy(update={"stages": (*self.stages, stage)})
+
+    def uncertainty_recipe(self, whole: UncertaintyRecipe) -> UncertaintyRecipe:
+        """Return the recipe of the uncertainty network, with a share of the samples of `whole` that
+        goes with the minutes.
+        """
+        share = min(max(self.minutes / WHOLE_MINUTES, MIN_SHARE), 1.0)
+        counts = {
+            name: max(round(share * getattr(whole, name)), 20)
+            for name in ("outliers", "empties", "objects")
+        }
+        counts["objects"] = max(counts["objects"], 2 * whole.batch)
+        held_out = min(whole.held_out, 400)
+        return whole.model_copy(update={**counts, "held_out": held_out})
+
+    def save(self, folder: Path) -> None:
+        """Write the plan into a folder."""
+        with atomic_file(folder / PLAN) as part:
+            part.write_text(self.model_dump_json(indent=1) + "\n", encoding="utf-8")
+
+
+def load_plan(folder: Path) -> Plan | None:
+    """Return the plan in a folder; None where there is none. Raises RecordingError for a damaged
+    one.
+    """
+    path = folder / PLAN
+    if not path.exists():
+        return None
+    try:
+        return Plan.model_validate(json.loads(read_bounded(path, TEXT_LIMIT)))
+    except (OSError, ValueError, ValidationError, RecursionError) as error:
+        raise RecordingError(
+            f"{path} is damaged: delete {folder} to adapt from the beginning"
+        ) from error
+
+
+def calibration_spread(measured: MeasuredWall | None) -> RigSpread:
+    """Return how far a bench may be off its record: CERTAIN_TIMES the standard uncertainties of its
+    calibration, and at least LEAST_SPREAD.
+    """
+    if measured is None:
+        return LEAST_SPREAD
+    record = measured.record
+    place_m = [record.distance_std_m, record.range_offset_std_m or 0.0]
+    angle_deg = [record.yaw_std_deg, record.pitch_std_deg]
+    return RigSpread(
+        place_m=max(LEAST_SPREAD.place_m, CERTAIN_TIMES * max(place_m)),
+        angle_deg=max(LEAST_SPREAD.angle_deg, CERTAIN_TIMES * max(angle_deg)),
+        gain_share=LEAST_SPREAD.gain_share,
+    )
+
+
+def bench_sensor(measured: MeasuredWall | None) -> SensorModel:
+    """Return the sensor of a bench: the simulated one, at the gain that its reference shows."""
+    if measured is None or measured.reference is None:
+        return SensorModel()
+    # the brightest cell of a wall without noise; a percentile, since single cells glitter
+    counts = float(np.nanpercentile(measured.reference.map_intensity, 99.5))
+    return SensorModel(bare_wall_counts=max(counts, 1.0))

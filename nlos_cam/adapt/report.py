@@ -1,0 +1,174 @@
+"""Report of an adaptation: figures before and after, learning curve, contact sheet, what more
+minutes would bring.
+"""
+
+import csv
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from nlos_cam.adapt.plan import Plan, Stage
+from nlos_cam.evaluate import LABELS, TARGETS, format_interval
+from nlos_cam.report import (
+    Banner,
+    Commands,
+    Document,
+    Facts,
+    Picture,
+    Section,
+    Table,
+    figure_of,
+    png,
+    saved_picture,
+    write_document,
+)
+
+PAGE = "adapt.html"
+LATE_SHARE = 0.5
+"""The gain of further work is read off the second half of a run."""
+
+
+@dataclass(frozen=True)
+class Curve:
+    """Held-out silhouette IoU of one stage."""
+
+    samples: Sequence[int]
+    """Trained on, earlier stages included, at the end of each epoch."""
+    iou: Sequence[float]
+
+
+def read_curves(plan: Plan, logs: Sequence[Path]) -> list[Curve]:
+    """Return the learning curve of each stage from its log."""
+    curves: list[Curve] = []
+    before = 0
+    for stage, path in zip(plan.stages, logs, strict=True):
+        with path.open(encoding="utf-8", newline="") as file:
+            rows = list(csv.DictReader(file))
+        samples = stage.steps * _batch(stage)
+        curves.append(
+            Curve(
+                [before + samples * (k + 1) for k in range(len(rows))],
+                [float(row["silhouette_iou"]) for row in rows],
+            )
+        )
+        before += samples * len(rows)
+    return curves
+
+
+def _batch(stage: Stage) -> int:
+    return stage.recipe().batch
+
+
+def gain_by_doubling(curves: Sequence[Curve]) -> float | None:
+    """Return by how much the held-out IoU rises if the samples are doubled; None from too few
+    points.
+
+    Between stages it is what a stage brought; within one, the slope against the logarithm of the
+    samples, which also holds what the falling rate brings: an upper bound.
+    """
+    ends = [(curve.samples[-1], curve.iou[-1]) for curve in curves if curve.samples]
+    if len(ends) > 1:
+        (fewer, worse), (more, better) = list(pairwise(ends))[-1]
+        return (better - worse) / np.log2(more / fewer)
+    if not ends or len(curves[0].iou) < 4:
+        return None
+    late = int(LATE_SHARE * len(curves[0].iou))
+    slope, _ = np.polyfit(np.log2(curves[0].samples[late:]), curves[0].iou[late:], 1)
+    return float(slope)
+
+
+def outlook(plan: Plan, curves: Sequence[Curve]) -> str:
+    """Return in words what more minutes would bring."""
+    gain = gain_by_doubling(curves)
+    if gain is None:
+        return "Too few epochs to say what more minutes would bring."
+    minutes = f"{2 * plan.minutes:.0f} minutes in all"
+    if gain < 0.005:
+        return f"More minutes bring little: {gain:+.3f} of IoU at {minutes}, by the last epochs."
+    return f"{minutes} would bring about {gain:+.3f} of IoU, by the last epochs."
+
+
+def draw_curves(curves: Sequence[Curve]) -> bytes:
+    """Draw the learning curves as a PNG."""
+    figure = figure_of(6.0, 3.0)
+    axis = figure.subplots()
+    for number, curve in enumerate(curves):
+        axis.plot(curve.samples, curve.iou, marker=".", label=f"stage {number + 1}")
+    axis.set(xlabel="samples trained on", ylabel="held-out silhouette IoU")
+    axis.grid(alpha=0.3)
+    if len(curves) > 1:
+        axis.legend()
+    return png(figure)
+
+
+def write_page(
+    folder: Path,
+    plan: Plan,
+    figures: tuple[Mapping[str, Any], Mapping[str, Any]],
+    curves: Sequence[Curve],
+    sheet: Path,
+) -> Path:
+    """Write the report of an adaptation; `figures` are those before and after it.
+
+    Returns the path of the page.
+    """
+    before, after = figures
+    rows = [
+        (LABELS[metric], format_interval(before[metric]), format_interval(after[metric]))
+        for metric in TARGETS
+    ]
+    better = after["silhouette_iou"]["value"] > before["silhouette_iou"]["value"]
+    headline = (
+        f"Silhouette IoU {before['silhouette_iou']['value']:.3f} ->"
+        f" {after['silhouette_iou']['value']:.3f}"
+    )
+    spread = plan.spread
+    facts = {
+        "objects rendered for this bench": f"{plan.stages[-1].objects}",
+        "samples trained on": f"{curves[-1].samples[-1]}",
+        "minutes, as planned": f"{plan.minutes:.0f}",
+        "this machine": (
+            f"{plan.pace.objects_per_s:.0f} objects and {plan.pace.samples_per_s:.0f} samples a"
+            " second"
+        ),
+        "bench may be off its record by": (
+            f"{1e3 * spread.place_m:.1f} mm, {spread.angle_deg:.2f} degrees,"
+            f" {spread.gain_share:.0%} of the gain"
+        ),
+    }
+    document = Document(
+        "Weights for this bench",
+        "54 test objects, rendered on this bench with the sensor's noise. Simulated light.",
+        [
+            Section(
+                "", [Banner("good" if better else "doubtful", headline, outlook(plan, curves))]
+            ),
+            Section(
+                "Before and after",
+                [
+                    Table(
+                        (
+                            "metric (95 % interval over objects)",
+                            "start weights, aligned",
+                            "adapted",
+                        ),
+                        rows,
+                    ),
+                    Facts(facts),
+                ],
+            ),
+            Picture(
+                "Learning curve",
+                "On 400 objects that no training saw.",
+                draw_curves(curves),
+            ),
+            saved_picture("Truth, reconstruction and difference", "The 54 test objects.", sheet),
+            Section("Next commands", [Commands(["nlos-cam live --bench BENCH"])]),
+        ],
+    )
+    write_document(document, folder / PAGE)
+    return folder / PAGE

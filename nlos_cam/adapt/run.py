@@ -1,0 +1,471 @@
+"""Adaptation of the networks to one bench, from its rig to weights with their own verdicts.
+
+The folder of an adaptation holds its plan, the objects, and a folder for each stage. Every step
+leaves its result there and is not done again, so that a killed adaptation goes on where it was.
+"""
+
+import json
+import os
+import shutil
+import time
+from collections.abc import Callable, Generator
+from contextlib import AbstractContextManager, closing, contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from threading import Event, Thread
+from typing import Any, Literal
+
+import nlos_models as models
+import torch
+from nlos_calibration import Rig
+from nlos_models import training
+
+from nlos_cam import dataset as data
+from nlos_cam import evaluate as measure
+from nlos_cam.adapt.plan import (
+    BATCH,
+    FIRST_OBJECTS,
+    SHARD,
+    Pace,
+    Plan,
+    Stage,
+    load_plan,
+)
+from nlos_cam.adapt.report import read_curves, write_page
+from nlos_cam.errors import OutputExistsError, SceneError
+from nlos_cam.files import atomic_directory, atomic_file, cache_folder, checksums_of, claim
+from nlos_cam.render import SensorModel
+
+OBJECTS = "objects"
+HELD_OUT = "held-out"
+JUDGED = "judged"
+QUALITY = "quality"
+NETWORK = "network"
+WEIGHTS = "weights"
+PACKED = "packed"
+BEFORE = "before.json"
+AFTER = "after.json"
+REPORT = "report"
+HELD_OUT_OBJECTS = 400
+QUALITY_SEED = 40_000_000
+JUDGED_SEED = 30_000_000
+QUALITY_OBJECTS = 600, 6000
+"""Objects that the quality model is fitted to, at least and at most."""
+QUALITY_PER_MINUTE = 60
+SHARE_GENERIC = 0.5
+OBJECTS_PER_RIG = 25
+"""Objects that share a draw of the bench's uncertainty, whose tables are then made once."""
+POLL_S = 0.2
+PACE_OBJECTS = 200
+PACE_STEPS = 6
+RECIPE = "doubt"
+
+Farm = Any
+Tracked = Callable[[str], AbstractContextManager[Callable[[int, int], None]]]
+
+
+@dataclass(frozen=True)
+class Adaptation:
+    """What is adapted, and by whom."""
+
+    rig: Rig
+    spread: data.RigSpread
+    """How far the bench may be off its rig."""
+    folder: Path
+    start: Path | None = None
+    """Start weights; None for the shipped ones."""
+    sensor: SensorModel = field(default_factory=SensorModel)
+    seed: int = 0
+    workers: int = field(default_factory=lambda: max((os.cpu_count() or 2) - 1, 1))
+    farm: Farm | None = None
+    """Cluster that renders in place of `workers` processes here."""
+    accelerator: Literal["auto", "cpu", "cuda"] = "auto"
+
+
+@dataclass(frozen=True)
+class AdaptResult:
+    """Weights of a bench, with their figures."""
+
+    weights: Path
+    minutes: float
+    objects: int
+    before: dict[str, Any]
+    """Figures of the start weights, aligned, on the 54 test objects on this bench."""
+    after: dict[str, Any]
+    page: Path
+    """Report."""
+    was_there: bool
+    """True where the adaptation of so many minutes was finished before."""
+
+
+@contextmanager
+def _untracked(_: str) -> Generator[Callable[[int, int], None]]:
+    yield lambda _done, _total: None
+
+
+def adapt(
+    job: Adaptation,
+    minutes: float,
+    *,
+    tracked: Tracked = _untracked,
+    watch: training.Watch | None = None,
+    on_message: Callable[[str], None] = print,
+) -> AdaptResult:
+    """Bring the weights of a bench to `minutes` of work in all, and return them with their figures.
+
+    A call for more minutes goes on from the weights of the earlier ones. Raises FileBusyError where
+    another adaptation works in the folder, SceneError where the folder is another bench's,
+    KeyboardInterrupt where it was stopped: the same call goes on.
+    """
+    job.folder.mkdir(parents=True, exist_ok=True)
+    with claim(job.folder, inside=True):
+        plan = _plan_for(job, minutes, tracked)
+        weights = job.folder / _stage_name(len(plan.stages) - 1) / WEIGHTS
+        was_there = (weights.parent / AFTER).exists()
+        before = _figures(job, job.start, job.folder / BEFORE, tracked)
+        for number, stage in enumerate(plan.stages):
+            on_message(
+                f"stage {number + 1} of {len(plan.stages)}: {stage.objects} objects,"
+                f" {stage.epochs * stage.steps * BATCH} samples"
+            )
+            _run_stage(job, plan, number, tracked, watch)
+        after = _figures(job, weights, weights.parent / AFTER, tracked)
+        page = _draw_report(job, plan, (before, after), tracked)
+        objects = plan.stages[-1].objects
+        return AdaptResult(weights, plan.minutes, objects, before, after, page, was_there)
+
+
+def _stage_name(number: int) -> str:
+    return f"stage-{number + 1}"
+
+
+def _plan_for(job: Adaptation, minutes: float, tracked: Tracked) -> Plan:
+    """Return the folder's plan, extended to `minutes`, or a new one after a measurement of the
+    machine.
+    """
+    start = models.weights_folder(job.start)
+    plan = load_plan(job.folder)
+    if plan is None:
+        with tracked("measuring the pace of this machine") as on_progress:
+            pace = _measure_pace(job, on_progress)
+        checksum = json.dumps(checksums_of(start), sort_keys=True)
+        plan = Plan(
+            rig_checksum=job.rig.checksum,
+            start_checksum=training.digest_of(checksum),
+            spread=job.spread,
+            sensor=job.sensor,
+            seed=job.seed,
+            pace=pace,
+        )
+    if plan.rig_checksum != job.rig.checksum:
+        raise SceneError(
+            f"{job.folder} is an adaptation to another rig: the bench was calibrated again since;"
+            " delete or rename that folder"
+        )
+    plan = plan.extended(minutes)
+    plan.save(job.folder)
+    return plan
+
+
+def _data_plan(job: Adaptation, first_seed: int, *, expected: bool) -> data.DatasetPlan:
+    """Return the plan of objects on the bench as it may be; held-out ones are on the rig itself."""
+    return data.DatasetPlan(
+        job.rig,
+        first_seed,
+        job.sensor,
+        accuracy="draft",
+        objects=data.Objects(share_generic=SHARE_GENERIC),
+        spread=job.spread if expected else data.RigSpread(),
+        expected=expected,
+        objects_per_rig=OBJECTS_PER_RIG if expected else 1,
+    )
+
+
+def _measure_pace(job: Adaptation, on_progress: Callable[[int, int], None]) -> Pace:
+    """Measure rendering on the first objects, which are kept, and training on maps of noise."""
+    total = PACE_OBJECTS + PACE_STEPS
+    plan = _data_plan(job, job.seed, expected=True)
+    folder = job.folder / OBJECTS
+
+    # the first objects compile kernels and start the workers
+    data.build_dataset(
+        plan, SHARD, folder, workers=1, on_progress=lambda _done, _total: None, farm=job.farm
+    )
+    report = data.build_dataset(
+        plan,
+        SHARD + PACE_OBJECTS,
+        folder,
+        workers=job.workers,
+        on_progress=lambda done, _: on_progress(done - SHARD, total),
+        farm=job.farm,
+    )
+    objects_per_s = report.objects_per_s or 1.0
+
+    network, _ = models.load_network(models.weights_folder(job.start))
+    if not isinstance(network, models.DirectNetwork):
+        raise SceneError("the start weights are no direct network: choose others with --weights")
+    device = training.open_fabric(_probe_recipe(), accelerator=job.accelerator).device
+    network = network.to(device).train()
+    optimizer = torch.optim.AdamW(network.parameters(), 1e-12)
+    normal = torch.randn(BATCH, 2, 64, 80, device=device)
+    start_s = 0.0
+    for step in range(PACE_STEPS):
+        if step == 1:  # the first one allocates
+            start_s = time.perf_counter()
+        with torch.autocast(device.type, torch.bfloat16, enabled=device.type != "cpu"):
+            loss = sum(part.float().square().mean() for part in _parts(network.logits(normal)))
+        optimizer.zero_grad(set_to_none=True)
+        loss.backward()  # type: ignore[union-attr]  a sum of at least one tensor
+        optimizer.step()
+        on_progress(PACE_OBJECTS + step + 1, total)
+    seconds = time.perf_counter() - start_s
+    return Pace(objects_per_s=objects_per_s, samples_per_s=(PACE_STEPS - 1) * BATCH / seconds)
+
+
+def _parts(outputs: Any) -> tuple[torch.Tensor, ...]:
+    return outputs if isinstance(outputs, tuple) else (outputs,)
+
+
+def _probe_recipe() -> training.DirectRecipe:
+    return Stage(minutes=1.0, objects=FIRST_OBJECTS, epochs=1, steps=10).recipe()
+
+
+def _run_stage(
+    job: Adaptation, plan: Plan, number: int, tracked: Tracked, watch: training.Watch | None
+) -> None:
+    """Train a stage's network, its uncertainty network and its quality model, each unless it is
+    there.
+    """
+    folder = job.folder / _stage_name(number)
+    before = job.folder / _stage_name(number - 1) / NETWORK if number else job.start
+    weights = folder / WEIGHTS
+    if not (folder / NETWORK / "SHA256SUMS").exists():
+        _train_network(job, plan, number, before, tracked, watch)
+    is_last = number == len(plan.stages) - 1
+    if not is_last or (weights / "quality.json").exists():
+        return
+    _train_uncertainty(job, plan, folder, tracked, watch)
+
+
+class _Rendering:
+    """Rendering of a stage's objects in a thread, while the network trains on those that are there.
+
+    Leaving it ends the rendering: finished shards are kept.
+    """
+
+    def __init__(self, job: Adaptation, count: int) -> None:
+        self._job = job
+        self._count = count
+        self._stop = Event()
+        self._error: BaseException | None = None
+        self._thread = Thread(target=self._render, name="rendering")
+        self._thread.start()
+
+    def _render(self) -> None:
+        def on_progress(_done: int, _total: int) -> None:
+            if self._stop.is_set():
+                raise KeyboardInterrupt
+
+        try:
+            data.build_dataset(
+                _data_plan(self._job, self._job.seed, expected=True),
+                self._count,
+                self._job.folder / OBJECTS,
+                workers=self._job.workers,
+                on_progress=on_progress,
+                farm=self._job.farm,
+            )
+        except BaseException as error:  # noqa: BLE001  raised again where the objects are waited for
+            self._error = error
+
+    def wait_for(self, objects: int, stop: Callable[[], bool] = lambda: False) -> None:
+        """Wait until the first `objects` are on disk. Raises what ended the rendering before."""
+        folder = self._job.folder / OBJECTS
+        seeds = range(self._job.seed, self._job.seed + objects, SHARD)
+        missing = [folder / f"shard-{seed:09d}.h5" for seed in seeds]
+        while missing := [path for path in missing if not path.exists()]:
+            if stop():
+                raise KeyboardInterrupt
+            if not self._thread.is_alive():
+                raise self._error or SceneError(f"{missing[0]} was not rendered: try again")
+            time.sleep(POLL_S)
+
+    def close(self) -> None:
+        """End the rendering."""
+        self._stop.set()
+        self._thread.join()
+
+
+class _Watched:
+    """Watch of a run whose wish to stop is also heard between its steps, while it waits."""
+
+    def __init__(self, watch: training.Watch) -> None:
+        self._watch = watch
+        self.stop: Callable[[], bool] = lambda: False
+
+    @contextmanager
+    def __call__(
+        self, running: training.Running, recipe: training.Recipe, name: str
+    ) -> Generator[training.Running]:
+        with self._watch(running, recipe, name) as watched:
+            self.stop = watched.stop
+            yield watched
+
+
+def _train_network(
+    job: Adaptation,
+    plan: Plan,
+    number: int,
+    before: Path | None,
+    tracked: Tracked,
+    watch: training.Watch | None,
+) -> None:
+    """Train on from the weights `before`, on objects that are rendered meanwhile."""
+    stage = plan.stages[number]
+    recipe = stage.recipe()
+    out = job.folder / _stage_name(number) / NETWORK
+    start, runs = training.direct_start(recipe, before)
+    if start is None:
+        raise SceneError("the start weights are no direct network: choose others")
+    held_out = _noisy_set(job, HELD_OUT, data.HELD_OUT_SEED, HELD_OUT_OBJECTS, tracked)
+    there = plan.objects_before(number)
+    watched = _Watched(watch or training.unwatched)
+
+    with closing(_Rendering(job, stage.objects)) as rendering:
+
+        def shards_of(epoch: int) -> int:
+            objects = stage.objects_at(epoch, there)
+            rendering.wait_for(objects, watched.stop)
+            return objects // SHARD
+
+        with tracked("rendering the first objects"):
+            rendering.wait_for(stage.objects_at(0, there))
+        store = data.open_packed_maps(
+            [job.folder / OBJECTS],
+            out.parent / PACKED,
+            normal=start.normal,
+            growth=shards_of,
+            align=False,
+        )
+        with store as source:
+            record = training.record_run(
+                recipe, out, (job.rig.name, job.rig.checksum), runs, before
+            )
+            fabric = training.open_fabric(recipe, accelerator=job.accelerator)
+            origin = training.digest_of(start, source.digest)
+            run = training.TrainingRun(recipe, out, record, origin, watch=watched)
+            maps = source.held_out(held_out, HELD_OUT_OBJECTS)
+            training.run_direct(fabric, run, start, source, maps)
+    shutil.rmtree(out.parent / PACKED, ignore_errors=True)  # made again from the objects if needed
+
+
+def _noisy_set(job: Adaptation, name: str, first_seed: int, count: int, tracked: Tracked) -> Path:
+    """Return a folder of `count` objects on the rig itself, with the sensor's noise."""
+    folder = job.folder / name
+    with tracked(f"rendering {count} objects ({name})") as on_progress:
+        data.build_dataset(
+            _data_plan(job, first_seed, expected=False),
+            count,
+            folder,
+            workers=job.workers + 1,
+            on_progress=on_progress,
+            farm=job.farm,
+        )
+    return folder
+
+
+def _train_uncertainty(
+    job: Adaptation, plan: Plan, folder: Path, tracked: Tracked, watch: training.Watch | None
+) -> None:
+    """Train the uncertainty network of a stage's network, and fit its quality model."""
+    watched = folder / NETWORK
+    weights = folder / WEIGHTS
+    recipe = plan.uncertainty_recipe(_uncertainty_recipe())
+    graphs = cache_folder() / "onnx"
+    if not (weights / "doubt.json").exists():
+        judged = _noisy_set(job, JUDGED, JUDGED_SEED, recipe.objects, tracked)
+        held_out = job.folder / HELD_OUT
+        pipeline = models.load_reconstructor(watched, graphs)
+        sets = data.open_dataset(judged), data.open_dataset(held_out)
+        data.check_uncertainty_data(recipe, pipeline, *sets)
+        about = training.record_uncertainty_run(
+            recipe, weights, watched, list(data.outliers_beside(SHARE_GENERIC))
+        )
+        with tracked("rendering empty benches and outliers") as on_progress:
+            samples = data.uncertainty_sets(
+                recipe, pipeline, sets, job.folder / "outliers", on_progress
+            )
+        fabric = training.open_fabric(recipe, accelerator=job.accelerator)
+        run = training.TrainingRun(
+            recipe,
+            weights,
+            pipeline.record,
+            about.watches,
+            watch=watch or training.unwatched,
+        )
+        training.run_uncertainty(fabric, run, about, watched, *samples)
+
+    at_least, at_most = QUALITY_OBJECTS
+    objects = min(max(round(QUALITY_PER_MINUTE * plan.minutes), at_least), at_most)
+    scored = _noisy_set(job, QUALITY, QUALITY_SEED, objects, tracked)
+    pipeline = models.load_reconstructor(weights, graphs)
+    judge = models.load_uncertainty_model(weights, graphs, quality=False)
+    if judge is None:
+        raise SceneError(f"{weights} has no uncertainty network: delete {folder}, and try again")
+    with tracked("fitting the quality model") as on_progress:
+        found = data.quality_set(pipeline, judge, data.open_dataset(scored), objects, on_progress)
+    training.run_quality(weights, found)
+
+
+def _uncertainty_recipe() -> training.UncertaintyRecipe:
+    recipe = training.load_recipe(training.packaged_recipes()[RECIPE])
+    if not isinstance(recipe, training.UncertaintyRecipe):
+        raise SceneError(f"{RECIPE} is no recipe of an uncertainty network")
+    return recipe
+
+
+def _figures(job: Adaptation, weights: Path | None, path: Path, tracked: Tracked) -> dict[str, Any]:
+    """Return the figures of weights on the 54 test objects on the bench; measured once."""
+    if path.exists():
+        return json.loads(path.read_text(encoding="utf-8"))
+    evaluation = _evaluated(job, weights, tracked)
+    figures = measure.as_figures(evaluation)
+    with atomic_file(path) as part:
+        part.write_text(json.dumps(figures, indent=1) + "\n", encoding="utf-8")
+    return figures
+
+
+def _evaluated(job: Adaptation, weights: Path | None, tracked: Tracked) -> measure.Evaluation:
+    objects = measure.rendered_objects(job.rig, tracked=tracked, sensor=job.sensor)
+    return measure.evaluate(weights, objects, nearest=False, tracked=tracked)
+
+
+def _draw_report(
+    job: Adaptation,
+    plan: Plan,
+    figures: tuple[dict[str, Any], dict[str, Any]],
+    tracked: Tracked,
+) -> Path:
+    """Write the report of the last stage, and return its page; with the weights' own report beside
+    it.
+    """
+    folders = [job.folder / _stage_name(number) for number in range(len(plan.stages))]
+    weights = folders[-1] / WEIGHTS
+    details = folders[-1] / REPORT
+    if not details.exists():
+        evaluation = _evaluated(job, weights, tracked)
+        measure.write_report(details, evaluation, figures[1])
+    curves = read_curves(plan, [folder / NETWORK / "log.csv" for folder in folders])
+    return write_page(job.folder, plan, figures, curves, details / "sheet.png")
+
+
+def install(weights: Path, target: Path) -> None:
+    """Copy an adaptation's weights to where the bench keeps its own, in one step.
+
+    Raises OutputExistsError where `target` is a file.
+    """
+    if target.exists() and not target.is_dir():
+        raise OutputExistsError(f"{target} is a file, but weights are a folder: move it away")
+    with atomic_directory(target) as part:
+        for name in (*checksums_of(weights), "SHA256SUMS"):
+            shutil.copy2(weights / name, part / name)

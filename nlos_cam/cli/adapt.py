@@ -1,0 +1,131 @@
+"""The command `adapt`: from a calibrated bench to weights of its own."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import nlos_calibration as walls
+import typer
+
+from nlos_cam import adapt as adaptation
+from nlos_cam import evaluate as measure
+from nlos_cam.cli import common
+from nlos_cam.cli.train import watched_run
+from nlos_cam.errors import OutputExistsError
+
+WALL = "wall.toml"
+WORK = "adapt"
+WEIGHTS = "weights"
+
+
+def adapt(
+    bench: Annotated[
+        str,
+        typer.Argument(
+            metavar="BENCH", help="Bench folder, wall record, rig file or name of a packaged rig."
+        ),
+    ],
+    minutes: Annotated[
+        float,
+        typer.Option(
+            "--minutes", min=1, max=6000, help="Minutes of work in all; more go on from fewer."
+        ),
+    ] = 10.0,
+    out: Annotated[
+        Path | None,
+        typer.Option("--out", help="Folder of the work and the weights (default: in the bench)."),
+    ] = None,
+    weights: Annotated[
+        Path | None,
+        typer.Option("--weights", help="Start weights (default: the shipped direct ones)."),
+    ] = None,
+    ray: Annotated[
+        str | None,
+        typer.Option("--ray", help="Ray cluster that renders: auto, HOST:PORT, local."),
+    ] = None,
+    workers: Annotated[
+        int | None,
+        typer.Option(
+            "--workers", min=1, help="Processes that render (default: all cores but one)."
+        ),
+    ] = None,
+    accelerator: Annotated[
+        Literal["auto", "cpu", "cuda"],
+        typer.Option("--accelerator", help="Device of the training; auto: a GPU if there is one."),
+    ] = "auto",
+    overwrite: common.Overwrite = False,
+    json: common.Json = False,
+) -> None:
+    """Make weights for one bench: render objects for exactly its rig, and train on meanwhile.
+
+    Killed at any moment, the same command goes on. More --minutes go on from what is there.
+    """
+    rig, measured = _rig_of(bench)
+    home = out or (Path(bench) if Path(bench).is_dir() else Path(f"adapted-{rig.name}"))
+    target = home / WEIGHTS
+    work = home / WORK
+    if not overwrite:
+        _refuse_others(target, work)
+    optional: dict[str, Any] = {}
+    if workers:
+        optional["workers"] = workers
+    if ray:
+        from nlos_cam.dataset import ray_farm
+
+        optional["farm"] = ray_farm(ray)
+    job = adaptation.Adaptation(
+        rig,
+        adaptation.calibration_spread(measured),
+        work,
+        weights,
+        adaptation.bench_sensor(measured),
+        accelerator=accelerator,
+        **optional,
+    )
+    try:
+        result = adaptation.adapt(
+            job, minutes, tracked=common.tracked, watch=watched_run, on_message=common.say
+        )
+    except KeyboardInterrupt:
+        common.exit_interrupted(f"what was made is kept in {work}; give the same command to go on")
+    adaptation.install(result.weights, target)
+
+    iou = "silhouette_iou"
+    before, after = (measure.format_interval(each[iou]) for each in (result.before, result.after))
+    state = "was finished before" if result.was_there else "done"
+    text = (
+        f"{state}: silhouette IoU {before} -> {after} on this bench; weights in {target}, report"
+        f" {result.page}"
+    )
+    facts = {
+        "out": str(target),
+        "report": str(result.page),
+        "minutes": result.minutes,
+        "objects": result.objects,
+        "before": result.before,
+        "after": result.after,
+    }
+    common.finish(facts, as_json=json, text=text)
+
+
+def _rig_of(bench: str) -> tuple[walls.Rig, walls.MeasuredWall | None]:
+    """Return a bench's rig and, where it was measured, its wall."""
+    path = Path(bench) / WALL if Path(bench).is_dir() else Path(bench)
+    is_record = path.is_file() and "schema_version" in path.read_text("utf-8", errors="replace")
+    if path.name == WALL or is_record:
+        measured = walls.load_measured(path)
+        return measured.record.rig, measured
+    return walls.rig_named(bench), None
+
+
+def _refuse_others(target: Path, work: Path) -> None:
+    """Raise OutputExistsError where the bench has weights that no adaptation in `work` made."""
+    sums = target / "SHA256SUMS"
+    if not target.exists():
+        return
+    ours = [path.read_bytes() for path in work.glob(f"stage-*/{WEIGHTS}/SHA256SUMS")]
+    if not sums.exists() or sums.read_bytes() not in ours:
+        raise OutputExistsError(
+            f"{target} holds weights that were not made here: move them, or give --overwrite"
+        )

@@ -1,0 +1,96 @@
+"""Adaptation to a bench, stopped and resumed."""
+
+from collections.abc import Callable, Generator
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from nlos_calibration import Rig, load_rig
+from nlos_models import training
+
+from nlos_cam.adapt import Adaptation, Plan, Stage, adapt, calibration_spread
+from nlos_cam.adapt.plan import Pace
+from nlos_cam.errors import SceneError
+from nlos_cam.files import FileBusyError, claim
+from nlos_cam.render import SensorModel
+
+AFTER_THE_NETWORK = "judged"
+
+
+@contextmanager
+def until_judged(description: str) -> Generator[Callable[[int, int], None]]:
+    """Stop the adaptation when its network is trained: the rest has tests of its own."""
+    if AFTER_THE_NETWORK in description:
+        raise KeyboardInterrupt
+    yield lambda _done, _total: None
+
+
+def stopping_after(steps: int) -> training.Watch:
+    """Return a watch that stops a run after some of its steps."""
+
+    @contextmanager
+    def watch(
+        running: training.Running, _recipe: training.Recipe, _name: str
+    ) -> Generator[training.Running]:
+        asked: list[None] = []
+
+        def stop() -> bool:
+            asked.append(None)
+            return len(asked) >= steps
+
+        yield replace(running, stop=stop)
+
+    return watch
+
+
+def job_in(folder: Path, rig: Rig) -> Adaptation:
+    """Return a job whose plan, of a few steps, is there already."""
+    spread = calibration_spread(None)
+    folder.mkdir()
+    stage = Stage(minutes=1.0, objects=300, epochs=2, steps=3)
+    Plan(
+        rig_checksum=rig.checksum,
+        start_checksum="0",
+        spread=spread,
+        sensor=SensorModel(),
+        seed=0,
+        pace=Pace(objects_per_s=1.0, samples_per_s=1.0),
+        stages=(stage,),
+    ).save(folder)
+    return Adaptation(rig, spread, folder, workers=1)
+
+
+@pytest.mark.slow
+def test_a_stopped_adaptation_goes_on_to_the_same_weights(tmp_path: Path) -> None:
+    rig = load_rig("paper-rig")
+    network = Path("stage-1", "network", "direct.safetensors")
+    whole = job_in(tmp_path / "whole", rig)
+    broken = job_in(tmp_path / "broken", rig)
+
+    with pytest.raises(KeyboardInterrupt):
+        adapt(whole, 1.0, tracked=until_judged)
+    for steps in (2, 3):
+        with pytest.raises(KeyboardInterrupt):
+            adapt(broken, 1.0, watch=stopping_after(steps))
+    with pytest.raises(KeyboardInterrupt):
+        adapt(broken, 1.0, tracked=until_judged)
+
+    assert (broken.folder / network).read_bytes() == (whole.folder / network).read_bytes()
+
+
+def test_two_adaptations_in_one_folder_are_one_too_many(tmp_path: Path) -> None:
+    job = job_in(tmp_path / "work", load_rig("paper-rig"))
+
+    with claim(job.folder, inside=True), pytest.raises(FileBusyError):
+        adapt(job, 1.0)
+
+
+def test_a_bench_that_was_calibrated_again_is_refused(tmp_path: Path) -> None:
+    rig = load_rig("paper-rig")
+    job = job_in(tmp_path / "work", rig)
+    lidar = rig.lidar.model_copy(update={"distance_m": rig.lidar.distance_m + 0.01})
+    moved = rig.model_copy(update={"lidar": lidar})
+
+    with pytest.raises(SceneError, match="calibrated again"):
+        adapt(replace(job, rig=moved), 1.0)

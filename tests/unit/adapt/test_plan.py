@@ -1,0 +1,86 @@
+"""Plan of an adaptation: what fits into the minutes."""
+
+from pathlib import Path
+
+import pytest
+from nlos_calibration import load_rig
+
+from nlos_cam.adapt import Plan, Stage, calibration_spread
+from nlos_cam.adapt.plan import PLAN, SHARD, Pace, load_plan
+from nlos_cam.errors import RecordingError
+from nlos_cam.render import SensorModel
+
+
+def plan_at(objects_per_s: float = 50.0, samples_per_s: float = 400.0) -> Plan:
+    return Plan(
+        rig_checksum=load_rig("paper-rig").checksum,
+        start_checksum="0",
+        spread=calibration_spread(None),
+        sensor=SensorModel(),
+        seed=0,
+        pace=Pace(objects_per_s=objects_per_s, samples_per_s=samples_per_s),
+    )
+
+
+def samples(plan: Plan) -> int:
+    return sum(stage.epochs * stage.recipe().objects for stage in plan.stages)
+
+
+@pytest.mark.parametrize("minutes", [1.0, 10.0, 60.0])
+def test_training_takes_at_most_its_share_of_the_minutes(minutes: float) -> None:
+    plan = plan_at().extended(minutes)
+
+    assert samples(plan) / plan.pace.samples_per_s <= 60 * minutes
+
+
+def test_a_second_stage_has_the_minutes_that_are_more() -> None:
+    plan = plan_at().extended(10.0).extended(30.0)
+
+    assert [stage.minutes for stage in plan.stages] == [10.0, 20.0]
+    assert plan.stages[1].objects > plan.stages[0].objects
+
+
+def test_fewer_minutes_than_were_spent_change_nothing() -> None:
+    plan = plan_at().extended(30.0)
+
+    assert plan.extended(10.0) == plan
+
+
+def test_epochs_see_whole_shards_that_only_become_more() -> None:
+    stage = plan_at().extended(20.0).stages[0]
+
+    seen = [stage.objects_at(epoch, 0) for epoch in range(stage.epochs)]
+
+    assert seen == sorted(seen)
+    assert seen[-1] == stage.objects
+    assert all(objects % SHARD == 0 for objects in seen)
+
+
+def test_a_later_stage_begins_with_all_objects_that_are_there() -> None:
+    plan = plan_at().extended(10.0).extended(30.0)
+
+    assert plan.stages[1].objects_at(0, plan.objects_before(1)) == plan.stages[0].objects
+
+
+def test_a_plan_is_read_back_as_it_was_saved(tmp_path: Path) -> None:
+    plan = plan_at().extended(10.0)
+
+    plan.save(tmp_path)
+
+    assert load_plan(tmp_path) == plan
+
+
+@pytest.mark.parametrize("text", ["", "{", "[1]", '{"seed": 1e400}', '{"rig_checksum": 3}'])
+def test_a_damaged_plan_is_said_in_one_line(tmp_path: Path, text: str) -> None:
+    (tmp_path / PLAN).write_text(text)
+
+    with pytest.raises(RecordingError, match="damaged") as caught:
+        load_plan(tmp_path)
+
+    assert "\n" not in str(caught.value)
+
+
+def test_a_stage_of_any_length_has_a_recipe_that_averages() -> None:
+    recipe = Stage(minutes=1.0, objects=SHARD, epochs=1, steps=3).recipe()
+
+    assert 0 <= recipe.average < 1
