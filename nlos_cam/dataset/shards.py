@@ -96,7 +96,9 @@ def shard_origin(path: Path) -> tuple[str, str]:
     not say.
     """
     with open_shard(path) as file:
-        return read_hdf5_text(file, "package_version", "unknown"), read_hdf5_text(file, "command", "unknown")
+        return read_hdf5_text(file, "package_version", "unknown"), read_hdf5_text(
+            file, "command", "unknown"
+        )
 
 
 def read_arrays(head: Shard, names: Sequence[str]) -> list[NDArray[Any]]:

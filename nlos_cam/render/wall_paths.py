@@ -137,7 +137,9 @@ class WallPaths:
     @cached_property
     def _lengths_m(self) -> tuple[Float64, Float64]:
         """d2 (laser points, patches) and d3 (cells, patches)."""
-        job = _some(self.job)
+        if (job := self.job) is None:
+            none = np.zeros((0, 0))
+            return none, none
         relay = np.stack([job.relay.x_m, job.relay.y_m, np.zeros_like(job.relay.x_m)], 1)
         point = job.patches.point_m
         return (
@@ -214,16 +216,20 @@ class WallPaths:
         for start in range(0, len(pairs), BLOCK):
             block = np.ascontiguousarray(pairs[start : start + BLOCK])
             sums[start : start + BLOCK] = _pair_sums(
-                block, arms, directions, normal, brdf, brdf.gain, glossy, self.job.bin_m, first, count
+                block,
+                arms,
+                directions,
+                normal,
+                brdf,
+                brdf.gain,
+                glossy,
+                self.job.bin_m,
+                first,
+                count,
             )
             if on_progress:
                 on_progress(min(start + BLOCK, len(pairs)), len(pairs))
         return sums
-
-
-def _some(job: TransportJob | None) -> TransportJob:
-    assert job is not None
-    return job
 
 
 def _relay(cells: WallGrid, lidar_m: Float64) -> Relay:

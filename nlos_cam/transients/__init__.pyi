@@ -1,6 +1,7 @@
 __all__ = [
     "CAPTURES",
     "Capture",
+    "CaptureKind",
     "Layout",
     "Noise",
     "Transient",
@@ -16,6 +17,6 @@ __all__ = [
 
 from .back_projection import Volume, back_projection, peak_m
 from .picture import transient_document, transient_figure
-from .rendered import CAPTURES, Capture, Noise, render_transient
+from .rendered import CAPTURES, Capture, CaptureKind, Noise, render_transient
 from .tal_file import load_transient, save_transient
 from .transient import Layout, Transient

@@ -59,7 +59,11 @@ class Volume:
         z = float(points[:, 2].mean())
         return cls(
             (float(low[0]), float(low[1]), z + 0.02 * deep),
-            (max(float(high[0]), float(low[0]) + 1e-3), max(float(high[1]), float(low[1]) + 1e-3), z + deep),
+            (
+                max(float(high[0]), float(low[0]) + 1e-3),
+                max(float(high[1]), float(low[1]) + 1e-3),
+                z + deep,
+            ),
             (side, side, side),
         )
 

@@ -32,7 +32,11 @@ def transient_figure(transient: Transient, title: str = "") -> "Figure":
     if shown.size:
         window = tuple(transient.start_m + transient.bin_m * (shown[[0, -1]] + [0, 1]))
     slice_axis.imshow(
-        image, aspect="auto", cmap="magma", origin="lower", extent=(-0.5, image.shape[1] - 0.5, *ends)
+        image,
+        aspect="auto",
+        cmap="magma",
+        origin="lower",
+        extent=(-0.5, image.shape[1] - 0.5, *ends),
     )
     slice_axis.set(title="slice", xlabel=label, ylabel="path length (m)", ylim=window)
     path_m = transient.start_m + transient.bin_m * (np.arange(transient.bins) + 0.5)

@@ -19,7 +19,7 @@ CAPTURES: tuple[CaptureKind, ...] = get_args(CaptureKind)
 DEFAULT_CELLS = {"lidar": 32, "confocal": 32, "single": 32, "exhaustive": 8}
 MAX_BYTES = 1 << 30
 """Largest histograms, as readers of this package take them."""
-MAX_POINTS = 256
+MAX_POINTS = 128
 """Cells along a side of the wall grid."""
 SPARE_BINS = 2
 OnProgress = Callable[[int, int], None]
@@ -116,16 +116,19 @@ def render_transient(
     grid = WallGrid(capture.wall or scene.rig.relay, side, side)
     laser_m = _laser_points(capture, grid)
     is_lidar = capture.kind == "lidar"
-    cells = WallGrid(scene.rig.relay, setting.relay_columns, setting.relay_rows) if is_lidar else grid
+    rows = grid.size**2 if capture.kind == "exhaustive" else grid.size
+    _check_size(rows, capture.bins or 1, side)
+    cells = (
+        WallGrid(scene.rig.relay, setting.relay_columns, setting.relay_rows) if is_lidar else grid
+    )
     bin_m = capture.bin_m or scene.rig.device.bin_m
     paths = WallPaths.of(scene, laser_m.reshape(-1, 3), cells, bin_m, setting)
     first = floor(capture.start_m / bin_m + 1e-9)
     _, longest_m = paths.range_m(first_and_last=capture.first_and_last)
     tail = _pulse_tail(scene.pulse_ns, bin_m)
     count = capture.bins or max(ceil(longest_m / bin_m) + tail + SPARE_BINS - first, 1)
-    pairs = _pairs(capture.kind, len(laser_m.reshape(-1, 3)), grid.size)
-    rows = len(pairs) if pairs is not None else grid.size
     _check_size(rows, count, side)
+    pairs = _pairs(capture.kind, laser_m.size // 3, grid.size)
 
     # Light outside the window reaches into it by the pulse's tail.
     margin = min(tail, first)
@@ -165,7 +168,9 @@ def _pairs(kind: CaptureKind, lasers: int, detectors: int) -> Int64 | None:
 
 def _pulse_tail(pulse_ns: float, bin_m: float) -> int:
     """Return the bins by which the pulse reaches beyond an echo."""
-    return (with_pulse(np.zeros((1, 1), np.float32), pulse_ns, bin_m).shape[1] - 1) if pulse_ns else 0
+    return (
+        (with_pulse(np.zeros((1, 1), np.float32), pulse_ns, bin_m).shape[1] - 1) if pulse_ns else 0
+    )
 
 
 def _check_size(rows: int, bins: int, side: int) -> None:

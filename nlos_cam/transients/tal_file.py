@@ -83,8 +83,6 @@ def load_transient(path: Path) -> Transient:
         raise RecordingError(f"{path} is not a file: check the name")
     try:
         with h5py.File(path) as file:
-            if missing := sorted(NAMES - set(file)):
-                raise ValueError(f"it has no {', '.join(missing)}")
             return _checked(_read(file))
     except MemoryError:
         raise
@@ -96,6 +94,8 @@ def load_transient(path: Path) -> Transient:
 
 
 def _read(file: h5py.File) -> Transient:
+    if missing := sorted(NAMES - set(file)):
+        raise ValueError(f"it has no {', '.join(missing)}")
     code = int(_number(file, "H_format"))
     if code not in set(Layout):
         known = ", ".join(f"{one.value} ({one.name})" for one in Layout)
@@ -121,9 +121,17 @@ def _read(file: h5py.File) -> Transient:
 
 
 def _is_given(file: h5py.File, name: str) -> bool:
-    """Return False for a field that is missing, or empty as tal writes None."""
-    stored = file[name] if isinstance(file.get(name, getlink=True), h5py.HardLink) else None
-    return stored is not None and not (isinstance(stored, h5py.Dataset) and stored.shape is None)
+    """Return False for a field that is missing, or empty as tal writes None.
+
+    Raises ValueError for one that lies elsewhere.
+    """
+    link = file.get(name, getlink=True)
+    if link is None:
+        return False
+    stored = file[name] if isinstance(link, h5py.HardLink) else None
+    if not isinstance(stored, h5py.Dataset):
+        raise ValueError(f"{name} is not an array of this file")
+    return stored.shape is not None
 
 
 def _number(file: h5py.File, name: str) -> float:
@@ -143,7 +151,7 @@ def _points(file: h5py.File, name: str) -> Float64:
     if values.dtype.kind not in "fiu" or values.ndim not in {1, 2, 3} or values.shape[-1:] != (3,):
         raise ValueError(f"{name} is not an array of points (n, 3) or (x, y, 3)")
     points = values.astype(np.float64)
-    if not np.isfinite(points).all() or np.abs(points).max(initial=0) > 1e6:  # noqa: PLR2004
+    if not np.isfinite(points).all() or np.abs(points).max(initial=0) > 1e6:
         raise ValueError(f"{name} holds points that are not finite, or beyond 1000 km")
     return points
 
@@ -186,7 +194,9 @@ def _checked(transient: Transient) -> Transient:
     if "L" not in "".join(axes) and not transient.paired and lasers != 1:
         raise ValueError(f"{lasers} laser points belong to no axis of H")
     if transient.first_and_last and (transient.laser_m is None or transient.detector_m is None):
-        raise ValueError("its times include the legs from laser and detector, whose places it lacks")
+        raise ValueError(
+            "its times include the legs from laser and detector, whose places it lacks"
+        )
     for name, place in (("laser_xyz", transient.laser_m), ("sensor_xyz", transient.detector_m)):
         if place is not None and place.shape != (3,):
             raise ValueError(f"{name} has shape {place.shape}, not (3,)")
