@@ -77,7 +77,7 @@ class WallGrid:
         x_m = self.extent.x_min_m + (np.arange(self.columns) + 0.5) * width
         y_m = self.extent.y_min_m + (np.arange(self.rows) + 0.5) * height
         x, y = np.meshgrid(x_m, y_m, indexing="ij")
-        return np.stack([x, y, np.zeros_like(x)], -1)
+        return np.stack([x, y, np.zeros_like(x)], -1).astype(np.float64)
 
     @property
     def size(self) -> int:

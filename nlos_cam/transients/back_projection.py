@@ -3,7 +3,7 @@ et al. 2012), without filters or weights.
 """
 
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numba
 import numpy as np
@@ -72,7 +72,7 @@ def _written(
     transient: Transient,
 ) -> tuple[tuple[float, float, float], tuple[float, float, float]] | None:
     """Return the corners of the volume in a description by nlos-cam; None without one."""
-    facts = transient.facts().get("volume")
+    facts: Any = transient.facts().get("volume")
     try:
         center = np.array(facts["center"], np.float64).reshape(3)
         half = np.array(facts["size"], np.float64).reshape(3) / 2

@@ -128,10 +128,9 @@ def _is_given(file: h5py.File, name: str) -> bool:
     link = file.get(name, getlink=True)
     if link is None:
         return False
-    stored = file[name] if isinstance(link, h5py.HardLink) else None
-    if not isinstance(stored, h5py.Dataset):
-        raise ValueError(f"{name} is not an array of this file")
-    return stored.shape is not None
+    if isinstance(link, h5py.HardLink) and isinstance(stored := file[name], h5py.Dataset):
+        return stored.shape is not None
+    raise ValueError(f"{name} is not an array of this file")
 
 
 def _number(file: h5py.File, name: str) -> float:
