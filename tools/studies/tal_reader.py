@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import tal
 
-SIDE = 32
+SIDE = 24
 
 
 def read(path: str) -> dict[str, Any]:

@@ -1,10 +1,11 @@
 """Transients: y-tal's own loader and back-projection of all four captures of three objects, and the
 time to render one beside mitransient.
 
-    python tools/studies/transients.py --tal-python VENV/bin/python
+    python tools/studies/transients.py [tal] [mitransient] --tal-python VENV/bin/python
         docs/figures/transients.json, docs/images/transients.png
 
-The Python named has y-tal and mitransient (`pip install y-tal mitransient`); they need numpy below
+Each part that is named (default: all) replaces its own part of the JSON; the picture belongs to
+`tal`. The Python named has y-tal and mitransient (`pip install y-tal mitransient`); they need numpy below
 2, so usually a virtual environment of their own.
 """
 
@@ -32,8 +33,9 @@ OBJECTS = "cup", "airplane", "table"
 RIG = rig_named("paper-rig")
 BOX = object_box(RIG)
 TOOLS = Path(__file__).parent
-SAMPLES = [256, 1024, 4096]
+SAMPLES = [64, 256, 1024]
 COLORS = 32
+PARTS = ["tal", "mitransient"]
 
 
 def run(python: str, program: str, *arguments: str) -> Any:
@@ -52,26 +54,32 @@ def off_the_object_m(depth_m: Float32, point_m: list[float]) -> float:
     return float(np.linalg.norm(points - np.array(point_m), axis=1).min())
 
 
+def rendered(name: str, depth_m: Float32, folder: Path) -> dict[str, float]:
+    """Write the four captures of an object; return the seconds to render each."""
+    scene = renderer.Scene(RIG, depth_m)
+    seconds: dict[str, float] = {}
+    for kind in CAPTURES:
+        render_transient(scene, Capture(kind))  # compiles
+        start = time.perf_counter()
+        found = render_transient(scene, Capture(kind))
+        seconds[kind] = time.perf_counter() - start
+        save_transient(folder / f"{name}-{kind}.hdf5", found)
+    return seconds
+
+
 def captures(python: str, folder: Path) -> tuple[dict[str, Any], Figure]:
     """Return seconds and tal's peaks for each object and capture, and the pictures."""
     figure = Figure(figsize=(7.2, 8.0), layout="constrained")
     axes = figure.subplots(len(OBJECTS), 1 + len(CAPTURES))
     rows: dict[str, Any] = {}
     extent = BOX.x_min_m, BOX.x_max_m, BOX.y_min_m, BOX.y_max_m
+    depths = {name: load_object(name, BOX).depth_m for name in OBJECTS}
+    seconds = {name: rendered(name, depth_m, folder) for name, depth_m in depths.items()}
+    answers = run(python, "tal_reader.py", *map(str, sorted(folder.glob("*.hdf5"))))
     for line, name in zip(axes, OBJECTS, strict=True):
-        depth_m = load_object(name, BOX).depth_m
-        scene = renderer.Scene(RIG, depth_m)
+        depth_m = depths[name]
         line[0].imshow(depth_m, cmap="viridis_r", extent=extent)
         line[0].set_title(name, fontsize=8)
-        seconds: dict[str, float] = {}
-        for kind in CAPTURES:
-            render_transient(scene, Capture(kind))  # compiles
-            start = time.perf_counter()
-            found = render_transient(scene, Capture(kind))
-            seconds[kind] = time.perf_counter() - start
-            save_transient(folder / f"{name}-{kind}.hdf5", found)
-        files = [str(folder / f"{name}-{kind}.hdf5") for kind in CAPTURES]
-        answers = run(python, "tal_reader.py", *files)
         rows[name] = {}
         for axis, kind in zip(line[1:], CAPTURES, strict=True):
             answer = answers[f"{name}-{kind}.hdf5"]
@@ -80,7 +88,7 @@ def captures(python: str, folder: Path) -> tuple[dict[str, Any], Figure]:
             axis.plot(*answer["peak_m"][:2], "+", color="cyan")
             axis.set_title(kind, fontsize=8)
             rows[name][kind] = {
-                "render_s": seconds[kind],
+                "render_s": seconds[name][kind],
                 "shape": answer["shape"],
                 "peak_m": answer["peak_m"],
                 "peak_off_the_object_m": off_the_object_m(depth_m, answer["peak_m"]),
@@ -183,18 +191,24 @@ def save(figure: Figure) -> None:
 
 
 def main() -> None:
-    """Run both parts, and write figures and picture."""
+    """Run the parts that are named, and write their figures and the picture."""
     parser = harness.options(__doc__)
+    parser.add_argument("parts", nargs="*", choices=PARTS, default=PARTS)
     parser.add_argument("--tal-python", required=True, help="a Python with y-tal and mitransient")
-    python = parser.parse_args().tal_python
-    with TemporaryDirectory() as folder:
-        rows, figure = captures(python, Path(folder))
-        beside = beside_mitransient(python, Path(folder))
-    save(figure)
-    load = os.getloadavg()[0]
-    facts = {"machine": machine(), "load_average_1_min": load, "objects": rows, "beside": beside}
-    harness.write("transients", facts)
-    print(json.dumps(facts, indent=1))
+    options = parser.parse_args()
+    path = harness.DOCS / "figures/transients.json"
+    facts = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
+    for part in options.parts:
+        with TemporaryDirectory() as folder:
+            if part == "tal":
+                found, figure = captures(options.tal_python, Path(folder))
+                save(figure)
+            else:
+                found = beside_mitransient(options.tal_python, Path(folder))
+        load = os.getloadavg()[0]
+        facts[part] = {"machine": machine(), "load_average_1_min": load, **found}
+        harness.write("transients", facts)
+        print(json.dumps(facts[part], indent=1))
 
 
 if __name__ == "__main__":
