@@ -126,6 +126,13 @@ RayAddress = Annotated[
         "--ray", help="Ray cluster to use instead: auto, HOST:PORT, ray://HOST:PORT, local."
     ),
 ]
+Transients = Annotated[
+    bool,
+    typer.Option(
+        "--transient",
+        help="Write each object's transient too, in tal's HDF5: OUT/transients/SEED.hdf5.",
+    ),
+]
 Recordings = Annotated[
     Path, typer.Argument(metavar="DIR", help="Folder of recordings with labels.")
 ]
@@ -166,6 +173,7 @@ def build(
     expected_maps: Expected = False,
     workers: Workers = os.cpu_count() or 1,
     ray: RayAddress = None,
+    transient: Transients = False,
     json: common.Json = False,
 ) -> None:
     """Render random objects into HDF5 shards; give the same command again to resume after an
@@ -213,6 +221,9 @@ def build(
             common.exit_interrupted(
                 f"finished shards are kept in {out}; give the same command to resume"
             )
+    if transient:
+        with common.tracked("rendering transients") as on_progress:
+            data.build_transients(plan, count, out, on_progress)
     rate = report.objects_per_s
     facts = {
         "objects": report.objects,

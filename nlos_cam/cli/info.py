@@ -11,7 +11,7 @@ from typing import Annotated
 import typer
 
 from nlos_cam import info as inspect
-from nlos_cam.cli.common import Json, finish, interrupted_by_signals
+from nlos_cam.cli.common import Json, Overwrite, finish, interrupted_by_signals, output_path
 from nlos_cam.errors import RecordingError
 
 UNITS = (1e9, "GB"), (1e6, "MB"), (1e3, "kB")
@@ -24,11 +24,25 @@ def info(
     verify: Annotated[
         bool, typer.Option("--verify", help="Read all of it, not its index or heads alone.")
     ] = False,
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            "--out",
+            help="Of a transient (.hdf5): write a slice and its back-projection, .html or .png.",
+        ),
+    ] = None,
+    overwrite: Overwrite = False,
     json: Json = False,
 ) -> None:
     """Describe a file or folder: kind, origin, content, whether it is whole, next commands."""
+    if out is not None and out.suffix not in {".html", ".png"}:
+        raise typer.BadParameter(f"--out {out}: choose a name that ends in .html or .png")
     with interrupted_by_signals():
         found = inspect.describe(path, verify=verify)
+        if out is not None and not found.problem:
+            inspect.write_picture(
+                path, found, output_path(out, "", out.suffix, overwrite=overwrite)
+            )
     result = {"path": str(path), "whole": not found.problem, **asdict(found)}
     finish(result, as_json=json, text=_format(path, found))
     if found.problem:

@@ -13,6 +13,7 @@ from rich.table import Table
 
 from nlos_cam import objects
 from nlos_cam import render as renderer
+from nlos_cam.cli import transients as transient_options
 from nlos_cam.cli.common import Json, Overwrite, finish, output_path, say, stderr
 
 if TYPE_CHECKING:
@@ -257,6 +258,18 @@ def render(
     explain: Annotated[
         bool, typer.Option("--explain", help="Print the included effects, with reasons and costs.")
     ] = False,
+    transient: transient_options.TransientFile = None,
+    capture: transient_options.CaptureName = "lidar",
+    wall_cells: transient_options.WallCells = None,
+    wall_extent: transient_options.WallExtent = None,
+    laser: transient_options.LaserPoint = None,
+    bin_mm: transient_options.BinMm = None,
+    start_m: transient_options.StartM = 0.0,
+    bins: transient_options.Bins = None,
+    wall_to_wall: transient_options.WallToWall = False,
+    photons: transient_options.Photons = None,
+    background: transient_options.Background = 0.0,
+    noise_seed: transient_options.NoiseSeed = 0,
     overwrite: Overwrite = False,
     json: Json = False,
 ) -> None:
@@ -265,7 +278,14 @@ def render(
         raise typer.BadParameter(
             f"--out {out}: choose a name that ends in .npz; the picture has the same name in .png"
         )
-    path = output_path(out and out.with_suffix(".npz"), "render", ".npz", overwrite=overwrite)
+    if transient is not None:
+        if out is not None or explain or effects != "auto":
+            raise typer.BadParameter(
+                "--transient writes no maps and takes all effects: drop --out, --explain, --effects"
+            )
+        path = transient_options.transient_path(transient, overwrite=overwrite)
+    else:
+        path = output_path(out and out.with_suffix(".npz"), "render", ".npz", overwrite=overwrite)
     file = renderer.load_scene(scene) if scene else None
     bare = file.bare if file else renderer.Scene(walls.rig_named(rig))
     surface = {"kind": material, "specular": specular, "exponent": exponent, "albedo": albedo}
@@ -278,6 +298,22 @@ def render(
         "auto" if effects == "auto" else [name for name in effects.split(",") if name]
     )
     setting = accuracy_of(accuracy, max_error, max_seconds, beams_per_cell)
+    if transient is not None:
+        wanted_capture = transient_options.capture_of(
+            capture,
+            wall_cells,
+            wall_extent,
+            laser,
+            bin_mm,
+            start_m,
+            bins,
+            wall_to_wall=wall_to_wall,
+            noise=(photons, background, noise_seed),
+        )
+        transient_options.write_transient(
+            path, target, wanted_capture, setting, backend, as_json=json
+        )
+        return
     start_s = time.perf_counter()
     rendering = renderer.render(target, setting, wanted, backend)
     seconds = time.perf_counter() - start_s

@@ -22,6 +22,7 @@ __all__ = [
     "RigSpread",
     "Stimulus",
     "build_dataset",
+    "build_transients",
     "check_arrays",
     "check_uncertainty_data",
     "draw_outlier",
@@ -80,6 +81,7 @@ from .shards import (
     shards_of,
 )
 from .training_maps import BareMaps, measured_bare_wall, read_maps, render_bare_wall
+from .transients import build_transients
 from .uncertainty_samples import (
     EMPTY,
     GENERIC,

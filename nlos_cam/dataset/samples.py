@@ -139,6 +139,11 @@ def _image(depth_m: Float32, box: ObjectBox, coat: shapes.Coat | None) -> Float3
     )
 
 
+def scene_of(plan: DatasetPlan, depth_m: Float32, rig: Rig, model: SensorModel) -> Scene:
+    """Return the scene of one object, unpainted, on its rig."""
+    return Scene(rig, depth_m, plan.material.surface, plan.radiometry, plan.jump_m, model.pulse_ns)
+
+
 def _sense(
     plan: DatasetPlan,
     depth_m: Float32,
@@ -147,7 +152,7 @@ def _sense(
     model: SensorModel,
     seed: int,
 ) -> LidarMaps:
-    scene = Scene(rig, depth_m, plan.material.surface, plan.radiometry, plan.jump_m, model.pulse_ns)
+    scene = scene_of(plan, depth_m, rig, model)
     # The records are frozen, so hashable, which pyright does not see.
     sensor = cached_sensor(rig, model, plan.radiometry)  # pyright: ignore[reportArgumentType]
     if coat is None:

@@ -17,11 +17,17 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from nlos_cam.dataset.hdf5 import read_array, read_text
 from nlos_cam.dataset.plan import SCENE_COLUMNS, DatasetPlan
 from nlos_cam.dataset.samples import Samples
 from nlos_cam.errors import DiskFullError, FolderBusyError, OutputExistsError, RecordingError
-from nlos_cam.files import FileBusyError, atomic_file, claim, describe
+from nlos_cam.files import (
+    FileBusyError,
+    atomic_file,
+    claim,
+    describe,
+    read_hdf5,
+    read_hdf5_text,
+)
 
 SHARD_PATTERN = "shard-*.h5"
 PART_PATTERN = "*shard-*.part"
@@ -75,9 +81,9 @@ def shards_of(folder: Path) -> list[Shard]:
 def read_head(path: Path) -> Shard:
     """Return the head of a shard. Raises RecordingError where it cannot be read."""
     with open_shard(path) as file:
-        plan = read_text(file, "plan")
+        plan = read_hdf5_text(file, "plan")
         seeds = _checked(path, "seed", file)
-        if read_text(file, "plan_sha256", "") != _digest(plan.encode()):
+        if read_hdf5_text(file, "plan_sha256", "") != _digest(plan.encode()):
             raise _damaged(path, "the checksum of its plan is missing or differs")
         consecutive = seeds.ndim == 1 and len(seeds) and (np.diff(seeds) == 1).all()
         if not consecutive or shard_path(path.parent, seeds[0]) != path:
@@ -90,7 +96,9 @@ def shard_origin(path: Path) -> tuple[str, str]:
     not say.
     """
     with open_shard(path) as file:
-        return read_text(file, "package_version", "unknown"), read_text(file, "command", "unknown")
+        return read_hdf5_text(file, "package_version", "unknown"), read_hdf5_text(
+            file, "command", "unknown"
+        )
 
 
 def read_arrays(head: Shard, names: Sequence[str]) -> list[NDArray[Any]]:
@@ -180,10 +188,10 @@ def open_shard(path: Path) -> Generator[h5py.File]:
 def _checked(path: Path, name: str, file: h5py.File) -> NDArray[Any]:
     """Return an array of a shard whose checksum, size and storage have been verified."""
     try:
-        values = read_array(file, name)
+        values = read_hdf5(file, name)
     except ValueError as error:
         raise _damaged(path, describe(error)) from error
-    if read_text(file[name], "sha256", "") != content_checksum(values):
+    if read_hdf5_text(file[name], "sha256", "") != content_checksum(values):
         raise _damaged(path, f"the checksum of {name} is missing or differs")
     return values
 

@@ -16,6 +16,8 @@ __all__ = [
     "read_arrays",
     "read_bounded",
     "read_checked",
+    "read_hdf5",
+    "read_hdf5_text",
     "read_toml",
     "reservations",
     "write_checked",
@@ -26,6 +28,7 @@ from .cache import cache_folder, load_cached
 from .checksums import CHECKSUMS, checksums_of, read_checked, write_checked
 from .claims import DISK_ERRORS, claim, is_claimed, reservations
 from .errors import FileBusyError, OutputExistsError
+from .hdf5 import read_hdf5, read_hdf5_text
 from .reading import (
     TENSOR_LIMIT,
     TEXT_LIMIT,

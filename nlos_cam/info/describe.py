@@ -9,7 +9,7 @@ from nlos_calibration.errors import CalibrationError
 from nlos_models.errors import ModelError
 
 from nlos_cam.errors import NlosCamError, RecordingError
-from nlos_cam.info import files
+from nlos_cam.info import files, transients
 from nlos_cam.info.folders import FOLDERS
 from nlos_cam.recording import SAMPLE
 
@@ -22,12 +22,13 @@ FILES: dict[str, tuple[str, Describe]] = {
     ".toml": ("record", files.describe_toml),
     ".json": ("record", files.describe_json),
     ".html": ("page", files.describe_page),
-    ".h5": ("dataset shard", files.describe_shard),
+    ".h5": ("dataset shard", transients.describe_hdf5),
+    ".hdf5": ("transient", transients.describe_transient),
 }
 """Word for a damaged file, and reader, by suffix."""
 KINDS = (
     "recordings (.bag) and their sidecars (.json), .npz files, saved views and reports (.html),"
-    " wall, scene, rig and recipe files (.toml), dataset shards (.h5), and the folders of datasets,"
+    " wall, scene, rig and recipe files (.toml), dataset shards (.h5), transients (.hdf5), and the folders of datasets,"
     " training runs, weights, replays, exports, evaluations and trade-offs"
 )
 

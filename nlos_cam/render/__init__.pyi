@@ -27,6 +27,8 @@ __all__ = [
     "Stopwatch",
     "Surface",
     "TransportJob",
+    "WallGrid",
+    "WallPaths",
     "Work",
     "accuracy_named",
     "agreement",
@@ -57,6 +59,7 @@ __all__ = [
     "smooth_patches",
     "three_bounce",
     "transient",
+    "with_pulse",
 ]
 
 from .accuracy import STOPS, Accuracy, Stop, accuracy_named
@@ -64,7 +67,7 @@ from .accuracy_table import choose
 from .agreement import Agreement, EchoMaps, agreement
 from .backend_cpu import histograms
 from .backend_torch import device_named, histograms_of_all
-from .echoes import MultiBounce
+from .echoes import MultiBounce, with_pulse
 from .effect_costs import Stopwatch, Work, costs, least_seconds
 from .effects import EFFECTS, Effects, included
 from .geometry import Beams, cast
@@ -97,3 +100,4 @@ from .sensor.bias import ripples, smooth_patches
 from .sensor.effects import sensor_effects
 from .sensor.model import DEPTH_UNIT_M, SensorModel
 from .sensor.sensor import SensedImages, Sensor
+from .wall_paths import WallGrid, WallPaths

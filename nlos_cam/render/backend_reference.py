@@ -290,6 +290,13 @@ def histograms(job: TransportJob) -> Float64:
     return _three_bounces(job, cells) + more
 
 
+def path_ends(job: TransportJob) -> tuple[Float64, Float64]:
+    """Return both ends of every path of a Lambertian surface: the light (beams, patches) that each
+    patch gives on, and the share (patches, relay cells) of it that reaches the lidar.
+    """
+    return _ends(_spots(job, slice(None)), job.patch_arrays, _cells(job), _rules(job))
+
+
 def _three_bounces(job: TransportJob, cells: Cells) -> Float64:
     """Return the three-bounce histograms in groups of beams so that Ctrl-C works; single beams with
     a BRDF.

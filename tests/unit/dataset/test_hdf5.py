@@ -21,7 +21,6 @@ from fake_workers import samples_of
 from nlos_calibration import load_rig
 
 import nlos_cam
-from nlos_cam.dataset.hdf5 import read_array
 from nlos_cam.dataset.plan import DatasetPlan
 from nlos_cam.dataset.shards import (
     check_arrays,
@@ -33,6 +32,7 @@ from nlos_cam.dataset.shards import (
     store,
 )
 from nlos_cam.errors import DiskFullError, OutputExistsError, RecordingError
+from nlos_cam.files import read_hdf5
 
 SEEDS = range(40, 43)
 PLAN = DatasetPlan(load_rig("paper-rig"), SEEDS.start)
@@ -207,7 +207,7 @@ def test_read_array_returns_what_was_stored(
         file.create_dataset("a", data=values, **storage)
 
     with h5py.File(tmp_path / "a.h5") as file:
-        found = read_array(file, "a")
+        found = read_hdf5(file, "a")
 
     assert found.dtype == values.dtype
     assert found.shape == values.shape
@@ -220,7 +220,7 @@ def test_read_array_returns_texts(tmp_path: Path) -> None:
         file["texts"] = texts
 
     with h5py.File(tmp_path / "a.h5") as file:
-        assert read_array(file, "texts").tolist() == texts
+        assert read_hdf5(file, "texts").tolist() == texts
 
 
 def test_lack_of_memory_does_not_count_as_damage(

@@ -32,8 +32,8 @@ file's index.
 """
 
 
-def read_array(file: h5py.File, name: str) -> NDArray[Any]:
-    """Return an array of numbers or texts that lies in the file itself.
+def read_hdf5(file: h5py.File, name: str) -> NDArray[Any]:
+    """Return an array of numbers, truth values or texts that lies in the file itself.
 
     Raises ValueError where it is none, or declares more than the file holds; h5py raises many kinds
     for damage.
@@ -43,7 +43,7 @@ def read_array(file: h5py.File, name: str) -> NDArray[Any]:
         raise ValueError(f"{name} is not an array of this file")
     file_bytes = Path(file.filename).stat().st_size
     is_text = h5py.check_string_dtype(stored.dtype)
-    if not is_text and stored.dtype.kind not in "fiu":
+    if not is_text and stored.dtype.kind not in "fiub":
         raise ValueError(f"{name} does not hold numbers")
     if is_text and stored.chunks:
         raise ValueError(f"{name} holds texts in chunks")
@@ -54,7 +54,7 @@ def read_array(file: h5py.File, name: str) -> NDArray[Any]:
     return _texts(stored, name, file_bytes) if is_text else np.asarray(stored[()])
 
 
-def read_text(holder: h5py.HLObject, name: str, default: str | None = None) -> str:
+def read_hdf5_text(holder: h5py.HLObject, name: str, default: str | None = None) -> str:
     """Return a single text among an object's attributes, or the default where there is none of the
     name.
 
