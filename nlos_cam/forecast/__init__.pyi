@@ -1,21 +1,26 @@
 __all__ = [
+    "CAVEATS",
     "FRAMES",
+    "HEAD",
     "Change",
     "Conditions",
     "Expectation",
     "Forecast",
     "Prior",
     "Shape",
+    "change_words",
     "changes",
     "fit_prior",
     "forecast",
     "network_iou",
     "shipped_prior",
+    "table_of",
+    "words_of",
     "write_report",
 ]
 
-from .changes import Change, changes
+from .advice import Change, changes
 from .curve import network_iou
-from .forecast import FRAMES, Conditions, Expectation, Forecast, forecast
+from .expectation import FRAMES, Conditions, Expectation, Forecast, forecast
 from .prior import Prior, Shape, fit_prior, shipped_prior
-from .report import write_report
+from .report import CAVEATS, HEAD, change_words, table_of, words_of, write_report

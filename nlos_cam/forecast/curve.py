@@ -8,6 +8,9 @@ NETWORK = (0.39, 0.79)
 NETWORK_GUESS = NETWORK[0]
 
 
+SCATTER_IOU = 0.05
+
+
 def network_iou(linear_iou: float) -> float:
     """Return the silhouette IoU to expect of a network trained for the rig."""
     slope = (NETWORK[1] - NETWORK[0]) / (LINEAR[1] - LINEAR[0])
