@@ -92,6 +92,7 @@ def predict(
     lines += [f"Written: {path}"] if path else []
     if not json:
         show(_table(found))
+        lines.insert(0, forecast.COLUMNS)
     finish(facts, as_json=json, text="\n".join(lines))
 
 
@@ -104,7 +105,8 @@ def rig_of(name: str) -> Rig:
 
 
 def _table(found: forecast.Forecast) -> Table:
-    table = Table(*forecast.HEAD)
-    for row in forecast.table_of(found).rows:
+    content = forecast.table_of(found)
+    table = Table(*content.head)
+    for row in content.rows:
         table.add_row(*row)
     return table

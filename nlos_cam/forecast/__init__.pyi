@@ -1,7 +1,7 @@
 __all__ = [
     "CAVEATS",
+    "COLUMNS",
     "FRAMES",
-    "HEAD",
     "Change",
     "Conditions",
     "Expectation",
@@ -23,4 +23,4 @@ from .advice import Change, changes
 from .curve import network_iou
 from .expectation import FRAMES, Conditions, Expectation, Forecast, forecast
 from .prior import Prior, Shape, fit_prior, shipped_prior
-from .report import CAVEATS, HEAD, change_words, table_of, words_of, write_report
+from .report import CAVEATS, COLUMNS, change_words, table_of, words_of, write_report

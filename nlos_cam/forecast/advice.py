@@ -19,6 +19,7 @@ from nlos_cam.forecast.linear import Echoes, echoes_of
 from nlos_cam.objects import object_box
 from nlos_cam.render import SensorModel
 
+OBJECTS = 4
 NEARER_M = 0.03
 TURN_DEG = 10.0
 GAP_M = 0.03
@@ -48,7 +49,7 @@ def changes(
     """
     box = object_box(rig)
     span_m = box.z_far_m - box.z_near_m
-    shapes = typical_shapes(rig, quick=True)
+    shapes = typical_shapes(rig, quick=True)[:OBJECTS]
     sensor = SensorModel()
     now = [echoes_of(rig, shape, sensor)["matt"] for shape in shapes]
 

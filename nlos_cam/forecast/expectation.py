@@ -5,9 +5,10 @@ determine.
 import io
 import json
 from collections.abc import Iterable, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from functools import cache
-from typing import Any, Self
+from itertools import product
+from typing import Any, Self, get_args
 
 import numpy as np
 from nlos_calibration import Rig, lidar_visible_share
@@ -23,7 +24,7 @@ from nlos_cam.forecast.linear import (
     echoes_of,
     posterior,
 )
-from nlos_cam.forecast.prior import FILE, Shape, shipped_prior
+from nlos_cam.forecast.prior import Shape, shipped_prior
 from nlos_cam.objects import benchmark_objects, object_box
 from nlos_cam.render import Radiometry, SensorModel
 
@@ -36,6 +37,7 @@ STRIDE = {False: 5, True: 11}
 MATERIAL_OBJECTS = 3
 """Objects whose materials are compared, each with its matt self."""
 SEED = 0
+MATERIAL_NAMES: tuple[MaterialName, ...] = get_args(MaterialName)
 
 
 @dataclass(frozen=True)
@@ -203,13 +205,13 @@ def shipped_basis() -> Basis:
 def _forecast(rig: Rig, sensor: SensorModel, shapes: Sequence[Shape], *, quick: bool) -> Forecast:
     box = object_box(rig)
     span_m = box.z_far_m - box.z_near_m
-    materials: tuple[MaterialName, ...] = ("matt", "glossy", "retroreflective")
     few = 0 if quick else MATERIAL_OBJECTS
     echoes = [
-        echoes_of(rig, shape, sensor, "paper", materials if i < few else ("matt",))
+        echoes_of(rig, shape, sensor, "paper", MATERIAL_NAMES if i < few else ("matt",))
         for i, shape in enumerate(shapes)
     ]
-    guesses = posteriors(shapes, [Echoes.none()] * len(shapes), 1)
+    nothing = [Echoes.none()] * len(shapes)
+    guess = expectation(Conditions(), posteriors(shapes, nothing, 1), nothing, span_m)
     rows: list[Expectation] = []
     outline_std: dict[int, Float64] = {}
     depth_std_m: dict[int, Float64] = {}
@@ -221,8 +223,7 @@ def _forecast(rig: Rig, sensor: SensorModel, shapes: Sequence[Shape], *, quick: 
         outline_std[frames] = np.mean([one.outline_std for one in found], 0)
         depth_std_m[frames] = span_m * np.mean([one.depth_std for one in found], 0)
     if not quick:
-        rows += _by_material(rig, sensor, shapes[:few], echoes[:few], rows)
-    guess = expectation(Conditions(), guesses, [Echoes.none()] * len(shapes), span_m)
+        rows += _by_material(rig, sensor, shapes[:few], echoes[:few], rows, guess)
     return Forecast(
         rig.name,
         rig.checksum,
@@ -242,6 +243,7 @@ def _by_material(
     shapes: Sequence[Shape],
     echoes: Sequence[dict[MaterialName, Echoes]],
     matt: Sequence[Expectation],
+    guess: Expectation,
 ) -> list[Expectation]:
     """Return the expectations of all other materials and radiometries.
 
@@ -250,46 +252,28 @@ def _by_material(
     """
     box = object_box(rig)
     span_m = box.z_far_m - box.z_near_m
-    names: tuple[MaterialName, ...] = ("matt", "glossy", "retroreflective")
-    in_room = [echoes_of(rig, shape, sensor, "lambertian", names) for shape in shapes]
+    in_room = [echoes_of(rig, shape, sensor, "lambertian", MATERIAL_NAMES) for shape in shapes]
     rows: list[Expectation] = []
-    for base in matt:
-        frames = base.conditions.frames
-        own = [found["matt"] for found in echoes]
-        reference = expectation(Conditions(frames), posteriors(shapes, own, frames), own, span_m)
-        by_radiometry: tuple[tuple[Radiometry, Sequence[dict[MaterialName, Echoes]]], ...] = (
-            ("paper", echoes),
-            ("lambertian", in_room),
-        )
-        for radiometry, found in by_radiometry:
-            for name in names:
-                if radiometry == "paper" and name == "matt":
-                    continue
-                now = [one[name] for one in found]
-                conditions = Conditions(frames, name, radiometry)
-                row = expectation(conditions, posteriors(shapes, now, frames), now, span_m)
-                earlier = [r for r in rows if _same_light(r.conditions, conditions)]
-                row = _shifted(row, reference, base)
-                rows.append(at_least(row, earlier[-1]) if earlier else row)
+    for light, name in product(get_args(Radiometry), MATERIAL_NAMES):
+        if (light, name) == ("paper", "matt"):
+            continue
+        now = [one[name] for one in (echoes if light == "paper" else in_room)]
+        for i, base in enumerate(matt):
+            frames = base.conditions.frames
+            conditions = Conditions(frames, name, light)
+            if not any(one.light.size for one in now):
+                rows.append(replace(guess, conditions=conditions))
+                continue
+            own = [one["matt"] for one in echoes]
+            reference = expectation(base.conditions, posteriors(shapes, own, frames), own, span_m)
+            row = expectation(conditions, posteriors(shapes, now, frames), now, span_m)
+            shift = base.linear_iou - reference.linear_iou
+            row = replace(row, linear_iou=float(np.clip(row.linear_iou + shift, 0, 1)))
+            rows.append(at_least(row, rows[-1]) if i else row)
     return rows
 
 
-def _same_light(one: Conditions, other: Conditions) -> bool:
-    return (one.material, one.radiometry) == (other.material, other.radiometry)
-
-
-def _shifted(row: Expectation, reference: Expectation, base: Expectation) -> Expectation:
-    """Return a row of few objects less the bias of these few."""
-    values = vars(row).copy()
-    values["linear_iou"] = float(
-        np.clip(row.linear_iou + base.linear_iou - reference.linear_iou, 0, 1)
-    )
-    return Expectation(**values)
-
-
-def posteriors(
-    shapes: Sequence[Shape], echoes: Sequence[Echoes], frames: int
-) -> list[Posterior]:
+def posteriors(shapes: Sequence[Shape], echoes: Sequence[Echoes], frames: int) -> list[Posterior]:
     """Return the posterior of each shape, from the shipped prior."""
     basis = shipped_basis()
     return [
@@ -324,10 +308,11 @@ def at_least(row: Expectation, fewer: Expectation) -> Expectation:
     Who has more frames can always use fewer; only the few noise draws behind a figure could say
     otherwise.
     """
-    values = vars(row).copy()
-    values["linear_iou"] = max(row.linear_iou, fewer.linear_iou)
-    values["depth_rmse_m"] = min(row.depth_rmse_m, fewer.depth_rmse_m)
-    return Expectation(**values)
+    return replace(
+        row,
+        linear_iou=max(row.linear_iou, fewer.linear_iou),
+        depth_rmse_m=min(row.depth_rmse_m, fewer.depth_rmse_m),
+    )
 
 
 def _mean(values: Iterable[float]) -> float:

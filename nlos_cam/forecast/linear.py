@@ -17,7 +17,6 @@ import numpy as np
 from nlos_calibration import Rig
 from nlos_calibration.arrays import Float32, Float64, Mask
 
-from nlos_cam.errors import SceneError
 from nlos_cam.forecast.prior import DEPTH_RADIUS, GRID, OUTLINE_RADIUS, Prior, Shape, modes
 from nlos_cam.objects import object_box
 from nlos_cam.render import (
@@ -124,7 +123,7 @@ def echoes_of(
     wins = {name: every.three_bounce & (own > direct) for name, own in light.items()}
     if not any(mask.any() for mask in wins.values()):
         return found
-    chosen = _chosen(every, np.any(list(wins.values()), axis=0))
+    chosen = every.select(np.any(list(wins.values()), axis=0))
     span_m = box.z_far_m - box.z_near_m
     by_outline = chosen.jacobian("albedo")[0]
     by_depth, path_by_depth = (part * np.float32(span_m) for part in chosen.jacobian("depth"))
@@ -159,16 +158,6 @@ def _light(every: Gradients, scene: Scene, shape: Shape, material: Material) -> 
     alone = replace(scene, object_depth_m=depth_m.astype(np.float32), surface=material.surface)
     rendered = render(alone, ACCURACY, (*EFFECTS, "brdf"))
     return rendered.intensity.astype(np.float64)
-
-
-def _chosen(every: Gradients, wanted: Mask) -> Gradients:
-    """Return the gradients of some of the beams that three bounces win."""
-    few = copy(every)
-    few.three_bounce = every.three_bounce & wanted
-    kept = wanted[every.three_bounce]
-    few._peak = every._peak[kept]
-    few._path = every._path[kept]
-    return few
 
 
 @dataclass(frozen=True)

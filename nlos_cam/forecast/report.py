@@ -11,24 +11,24 @@ from nlos_cam.report import Bullets, Document, Picture, Section, Table, figure_o
 
 USEFUL_GAIN = 0.1
 """IoU above a guess from which on a bench shows shapes."""
-HEAD = (
-    "conditions",
-    "IoU, network",
-    "IoU, linear",
-    "numbers of the outline",
-    "of the depth",
-    "depth error, mm",
-    "cells",
-    "signal to noise",
-)
 CAVEATS = (
     "Networks gain less from averaged frames than the linear estimate does: on the home rig nothing.",
-    "The linear estimate holds the winner of each cell and the edges of shadows; it knows the true"
-    " shape that it is linear about. Its depth error is a lower bound: networks err three to five"
-    " times as much.",
+    (
+        "The linear estimate holds the winner of each cell and the edges of shadows; it knows the true"
+        " shape that it is linear about. Its depth error is a lower bound: networks err three to five"
+        " times as much."
+    ),
     "The paper's radiometry is brighter than any measured third bounce; the Lambertian one dimmer.",
 )
 """Where a forecast misleads."""
+
+
+COLUMNS = (
+    "IoU: of the silhouette, to expect of a network trained for the rig. For one frame: numbers of"
+    " the outline and of the depth that the maps determine, depth error of the linear estimate,"
+    " cells won by the object."
+)
+"""Meaning of the columns of the table."""
 
 
 def words_of(found: Forecast, subject: str = "") -> list[str]:
@@ -43,11 +43,15 @@ def words_of(found: Forecast, subject: str = "") -> list[str]:
     verdict = "shows shapes" if gain >= USEFUL_GAIN else "hardly shows more than a guess"
     whose = f"of {subject}" if subject else "of a typical matt object"
     lines = [
-        f"This bench {verdict}: expected silhouette IoU {found.expected_iou:.2f} "
-        f"(± {SCATTER_IOU:.2f}) for a network trained for it.",
-        f"One frame {whose} determines {best.outline_numbers:.0f} numbers of the outline and"
-        f" {best.depth_numbers:.0f} of the depth, in {best.cells:.0f} of 5120 cells;"
-        f" signal to noise {best.signal_to_noise:.0f}.",
+        (
+            f"This bench {verdict}: expected silhouette IoU {found.expected_iou:.2f} "
+            f"(± {SCATTER_IOU:.2f}) for a network trained for it."
+        ),
+        (
+            f"One frame {whose} determines {best.outline_numbers:.0f} numbers of the outline and"
+            f" {best.depth_numbers:.0f} of the depth, in {best.cells:.0f} of 5120 cells;"
+            f" signal to noise {best.signal_to_noise:.0f}."
+        ),
         f"The echoes stand {_margin(best)} the wall's own return.",
     ]
     if found.visible_share > 0:
@@ -64,23 +68,34 @@ def _margin(row: Expectation) -> str:
 
 
 def table_of(found: Forecast) -> Table:
-    """Return all conditions as rows."""
-    return Table(HEAD, [_row(row) for row in found.expectations])
-
-
-def _row(row: Expectation) -> tuple[str, ...]:
-    conditions = row.conditions
-    frames = f"{conditions.frames} frame{'s' if conditions.frames > 1 else ''}"
-    return (
-        f"{conditions.material}, {conditions.radiometry}, {frames}",
-        f"{row.network_iou:.2f}",
-        f"{row.linear_iou:.2f}",
-        f"{row.outline_numbers:.0f}",
-        f"{row.depth_numbers:.0f}",
-        f"{1e3 * row.depth_rmse_m:.1f}",
-        f"{row.cells:.0f}",
-        f"{row.signal_to_noise:.0f}",
+    """Return a row for each material and radiometry, by frames averaged."""
+    frames = sorted({row.conditions.frames for row in found.expectations})
+    head = (
+        "object",
+        *(f"IoU, {n} frame{'s' if n > 1 else ''}" for n in frames),
+        "outline",
+        "depth",
+        "error, mm",
+        "cells",
     )
+    kinds = dict.fromkeys(
+        (row.conditions.material, row.conditions.radiometry) for row in found.expectations
+    )
+    rows: list[tuple[str, ...]] = []
+    for material, radiometry in kinds:
+        own = [found.at(n, material, radiometry) for n in frames]
+        once = own[0]
+        rows.append(
+            (
+                f"{material}, {radiometry}",
+                *(f"{row.network_iou:.2f}" for row in own),
+                f"{once.outline_numbers:.0f}",
+                f"{once.depth_numbers:.0f}",
+                f"{1e3 * once.depth_rmse_m:.1f}",
+                f"{once.cells:.0f}",
+            )
+        )
+    return Table(head, rows)
 
 
 def change_words(found: Sequence[Change], count: int = 2) -> list[str]:
@@ -93,8 +108,9 @@ def change_words(found: Sequence[Change], count: int = 2) -> list[str]:
     seconds = [change for change in found if change.as_second_gain_iou is not None]
     if seconds:
         best = max(seconds, key=lambda change: change.as_second_gain_iou or 0.0)
-        lines.append(f"As a second place beside this one: {best.words}:"
-                     f" IoU {best.as_second_gain_iou:+.2f}")
+        lines.append(
+            f"As a second place beside this one: {best.words}: IoU {best.as_second_gain_iou:+.2f}"
+        )
     return lines
 
 
@@ -134,7 +150,7 @@ def write_report(
             parts.append(Section("What to change", [Bullets("", change_words(advice))]))
         parts += [
             Picture("Uncertainty over the object box", "Black is determined.", image),
-            Section("By frames, material and radiometry", [table_of(found)]),
+            Section("By frames, material and radiometry", [table_of(found), COLUMNS]),
             Section("Where this misleads", list(CAVEATS)),
         ]
         title = f"Forecast of {found.rig}"
