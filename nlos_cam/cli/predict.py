@@ -48,7 +48,7 @@ def predict(
         Path | None, typer.Option("--out", help="Page (.html) or picture (.png) with the maps.")
     ] = None,
     quick: Annotated[
-        bool, typer.Option("--quick", help="Fewer objects, matt ones, and no advice: seconds.")
+        bool, typer.Option("--quick", help="Matt objects, 1 and 100 frames, no advice: a few seconds.")
     ] = False,
     size_m: Annotated[
         float | None, typer.Option("--size-m", help="Size of OBJECT in meters.")

@@ -49,7 +49,7 @@ def changes(
     """
     box = object_box(rig)
     span_m = box.z_far_m - box.z_near_m
-    shapes = typical_shapes(rig, quick=True)[:OBJECTS]
+    shapes = typical_shapes(rig)[:OBJECTS]
     sensor = SensorModel()
     now = [echoes_of(rig, shape, sensor)["matt"] for shape in shapes]
 

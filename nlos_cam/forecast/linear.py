@@ -123,7 +123,7 @@ def echoes_of(
     wins = {name: every.three_bounce & (own > direct) for name, own in light.items()}
     if not any(mask.any() for mask in wins.values()):
         return found
-    chosen = every.select(np.any(list(wins.values()), axis=0))
+    chosen = ChosenBeams(every, np.any(list(wins.values()), axis=0))
     span_m = box.z_far_m - box.z_near_m
     by_outline = chosen.jacobian("albedo")[0]
     by_depth, path_by_depth = (part * np.float32(span_m) for part in chosen.jacobian("depth"))
@@ -147,6 +147,17 @@ def echoes_of(
             margin=1 - direct[wins[name]] / own,
         )
     return found
+
+
+class ChosenBeams(Gradients):
+    """Gradients of some of the beams that three bounces win: Jacobians cost in proportion."""
+
+    def __init__(self, every: Gradients, beams: Mask) -> None:
+        vars(self).update(vars(every))
+        kept = beams[every.three_bounce]
+        self.three_bounce = every.three_bounce & beams
+        self._peak = self._peak[kept]
+        self._path = self._path[kept]
 
 
 def _light(every: Gradients, scene: Scene, shape: Shape, material: Material) -> Float64:
@@ -195,7 +206,7 @@ class Basis:
     @cached_property
     def precision(self) -> Float64:
         """Inverse of the covariance."""
-        return np.linalg.inv(self.covariance)
+        return np.linalg.inv(self.covariance).astype(np.float64)
 
 
 def _components(covariance: Float64, count: int) -> Float64:
@@ -253,7 +264,7 @@ def posterior(basis: Basis, shape: Shape, echoes: Echoes, frames: int, seed: int
     sensed = np.concatenate([by_outline @ off + by_depth @ deeper, by_path @ deeper]) + noise
 
     information = rates.T @ rates
-    covariance = np.linalg.inv(information + basis.precision)
+    covariance: Float64 = np.linalg.inv(information + basis.precision).astype(np.float64)
     found = covariance @ (rates.T @ sensed)
     outline = basis.mean_outline + basis.outline @ found[:count]
     depth_found = basis.mean_depth + basis.depth @ found[count:]
@@ -263,13 +274,14 @@ def posterior(basis: Basis, shape: Shape, echoes: Echoes, frames: int, seed: int
     # trace(I - C^-1 P) of a block: how far the posterior P is below the prior C.
     numbers: list[float] = []
     for block in (slice(None, count), slice(count, None)):
-        own = np.linalg.solve(basis.covariance[block, block], covariance[block, block])
-        numbers.append(float(len(own) - np.trace(own)))
+        left = np.linalg.solve(basis.covariance[block, block], covariance[block, block])
+        numbers.append(float(len(left) - np.trace(left)))
     rmse = float(np.sqrt(np.mean((depth_found + fine - depth)[both] ** 2))) if both.any() else 0.0
     return Posterior(
         float((inside & seen).sum() / max((inside | seen).sum(), 1)),
         rmse,
-        *numbers,
+        numbers[0],
+        numbers[1],
         _deviation(basis.outline, covariance[:count, :count]),
         _deviation(basis.depth, covariance[count:, count:]),
     )

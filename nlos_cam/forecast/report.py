@@ -78,11 +78,10 @@ def table_of(found: Forecast) -> Table:
         "error, mm",
         "cells",
     )
-    kinds = dict.fromkeys(
-        (row.conditions.material, row.conditions.radiometry) for row in found.expectations
-    )
     rows: list[tuple[str, ...]] = []
-    for material, radiometry in kinds:
+    for first in [row.conditions for row in found.expectations if row.conditions.frames == 1]:
+        material = first.material
+        radiometry = first.radiometry
         own = [found.at(n, material, radiometry) for n in frames]
         once = own[0]
         rows.append(

@@ -11,7 +11,6 @@ is the light-weighted mean rate of the path lengths in the bin: the mean of the 
 moves through the bins.
 """
 
-from copy import copy
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Literal
@@ -207,20 +206,6 @@ class Gradients:
         """
         self._peak = echoes.peak[self.three_bounce]
         self._path = echoes.path_m[self.three_bounce]
-
-    def select(self, beams: Mask) -> "Gradients":
-        """Return the gradients of some beams (rows, columns) alone, of those that three bounces
-        win.
-        """
-        few = copy(self)
-        few.three_bounce = self.three_bounce & beams
-        kept = beams[self.three_bounce]
-        few._peak = self._peak[kept]
-        few._path = self._path[kept]
-        # What an earlier call worked out for all beams is not these beams'.
-        for name in ("_maybe_job", "_scene", "_tilts", "_lidar_rates", "_lidar_points"):
-            few.__dict__.pop(name, None)
-        return few
 
     def pull(self, intensity: Float64 | None = None, path_m: Float64 | None = None) -> SceneVector:
         """Return J^T w: the derivative of the sum of both reported maps times weights (rows,

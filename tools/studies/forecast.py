@@ -134,14 +134,19 @@ def left_out(linear: Float64, network: Float64) -> Float64:
     return np.array(errors)
 
 
-def fit(rows: list[Measured], forecasts: list[Forecast], guess: tuple[float, float]) -> Any:
+def fit(
+    rows: list[Measured], forecasts: list[Forecast], guess: tuple[float, float]
+) -> dict[str, Any]:
     """Return the line through guess and rigs, and its errors with each rig left out."""
     linear = np.array([found.at().linear_iou for found in forecasts])
     network = np.array([row.network_iou for row in rows])
     errors = left_out(linear, network)
     both = np.append(linear, guess[0]), np.append(network, guess[1])
     slope, offset = line(*both)
-    rmse = [row.network_rmse_mm / 1e3 / f.at().depth_rmse_m for row, f in zip(rows, forecasts, strict=False)]
+    rmse = [
+        row.network_rmse_mm / 1e3 / f.at().depth_rmse_m
+        for row, f in zip(rows, forecasts, strict=False)
+    ]
     return {
         "rigs": len(rows),
         "slope": slope,
@@ -155,11 +160,11 @@ def fit(rows: list[Measured], forecasts: list[Forecast], guess: tuple[float, flo
 
 def rank_correlation(one: Float64, other: Float64) -> float:
     """Return Spearman's rank correlation."""
-    ranks = [np.argsort(np.argsort(values)) for values in (one, other)]
-    return float(np.corrcoef(*ranks)[0, 1])
+    ranks = np.stack([np.argsort(np.argsort(values)) for values in (one, other)])
+    return float(np.corrcoef(ranks)[0, 1])
 
 
-def draw(rows: list[Measured], forecasts: list[Forecast], found: Any) -> Figure:
+def draw(rows: list[Measured], forecasts: list[Forecast], found: dict[str, Any]) -> Figure:
     """Return a figure of network over linear IoU with the line."""
     figure = Figure(figsize=(6, 5), layout="constrained")
     axis = figure.subplots()
