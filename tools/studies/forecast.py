@@ -36,7 +36,11 @@ PRIOR = harness.ROOT / "nlos_cam" / "forecast" / "prior.npz"
 FIRST_SEED = 5_000_000
 """Between the seeds of training and of the held-out objects."""
 MAX_OUTSIDE = 0.1
-"""Share of frames outside the trained range above which aligned weights do not serve a rig."""
+REACH_M = 0.0101
+REACH_DEG = 15.0
+"""Limits within which aligned weights stand for weights of the rig's own: share of frames outside
+the trained range, and distance and yaw from the home rig (the loss there is 0.01 to 0.07).
+"""
 
 
 @dataclass(frozen=True)
@@ -113,9 +117,13 @@ def measured_in(path: Path) -> Iterator[Measured]:
         )
 
 
-def serves(one: Measured) -> bool:
-    """Return whether a network's figure is one of a rig that it can read."""
-    return one.outside <= MAX_OUTSIDE
+def serves(one: Measured, home: Rig) -> bool:
+    """Return whether a network's figure is about that of one trained for the rig."""
+    if one.trained != "aligned":
+        return True
+    off_m = abs(one.rig.lidar.distance_m - home.lidar.distance_m)
+    off_deg = abs(one.rig.lidar.yaw_deg - home.lidar.yaw_deg)
+    return one.outside <= MAX_OUTSIDE and off_m <= REACH_M and off_deg <= REACH_DEG
 
 
 def line(linear: Float64, network: Float64) -> tuple[float, float]:
@@ -217,7 +225,7 @@ def main() -> None:
         now = forecasts[-1].at()
         text = f"{now.linear_iou:.3f}, network {row.network_iou:.3f}, outside {row.outside:.2f}"
         print(f"{row.name} ({row.trained}): linear {text}", flush=True)
-    used = [i for i, row in enumerate(measured) if serves(row)]
+    used = [i for i, row in enumerate(measured) if serves(row, home)]
     guess = forecasts[0].guess_iou, 0.39
     chosen = [measured[i] for i in used]
     fitted = fit(chosen, [forecasts[i] for i in used], guess)
@@ -226,7 +234,7 @@ def main() -> None:
             "name": row.name,
             "trained": row.trained,
             "outside": row.outside,
-            "in_fit": serves(row),
+            "in_fit": serves(row, home),
             "network_iou": row.network_iou,
             "network_rmse_mm": row.network_rmse_mm,
             "linear_iou": found.at().linear_iou,
