@@ -10,7 +10,7 @@ import nlos_calibration as walls
 import typer
 from rich.table import Table
 
-from nlos_cam import forecast
+from nlos_cam import forecast, objects
 from nlos_cam.cli.common import (
     Json,
     Overwrite,
@@ -21,7 +21,6 @@ from nlos_cam.cli.common import (
     tracked,
 )
 from nlos_cam.cli.render import hidden_depth
-from nlos_cam.objects import object_box
 
 if TYPE_CHECKING:
     from nlos_calibration import Rig
@@ -48,7 +47,8 @@ def predict(
         Path | None, typer.Option("--out", help="Page (.html) or picture (.png) with the maps.")
     ] = None,
     quick: Annotated[
-        bool, typer.Option("--quick", help="Matt objects, 1 and 100 frames, no advice: a few seconds.")
+        bool,
+        typer.Option("--quick", help="Matt objects, 1 and 100 frames, no advice: a few seconds."),
     ] = False,
     size_m: Annotated[
         float | None, typer.Option("--size-m", help="Size of OBJECT in meters.")
@@ -67,7 +67,7 @@ def predict(
     shape = None
     if hidden is not None:
         depth_m = hidden_depth(hidden, own, {"size_m": size_m, "tilt_y_deg": turn_deg})
-        shape = forecast.Shape.of(depth_m, object_box(own))
+        shape = forecast.Shape.of(depth_m, objects.object_box(own))
     elif size_m is not None or turn_deg is not None:
         raise typer.BadParameter("--size-m and --tilt-y-deg are of an OBJECT: name one")
     with interrupted_by_signals():

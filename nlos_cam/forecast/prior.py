@@ -24,7 +24,7 @@ GRID = 32
 OUTLINE_RADIUS = 13.0
 DEPTH_RADIUS = 9.0
 """Modes with sqrt(kx^2 + ky^2) below these have a full covariance: 150 and 76."""
-LEAST_VARIANCE = 1e-6
+MIN_VARIANCE = 1e-6
 """Floor of a mode's variance: a mode that no object has would be known for certain."""
 FILE = Path(__file__).with_name("prior.npz")
 
@@ -127,7 +127,7 @@ def fit_prior(depths_m: Iterable[Float32], box: ObjectBox) -> Prior:
     covariance[high] = 0
     covariance[:, high] = 0
     covariance[high, high] = own
-    covariance += LEAST_VARIANCE * np.eye(len(covariance))
+    covariance += MIN_VARIANCE * np.eye(len(covariance))
     shape = GRID, GRID
     return Prior(mean_outline.reshape(shape), mean_depth.reshape(shape), covariance, len(shapes))
 
