@@ -51,6 +51,7 @@ COMMANDS = {
     "doctor": Command("devices", START, "Explain why a camera is not found, and how to fix it."),
     "devices": Command("devices", START, "List cameras, real and simulated."),
     "config": Command("config", START, "Show the settings of nlos-cam.toml and the environment."),
+    "predict": Command("predict", BENCH, "Forecast what a bench can see, and what to change."),
     "calibrate": Command(
         "calibrate", BENCH, "Measure a bare wall, a printed board or the occluder."
     ),

@@ -1,0 +1,112 @@
+"""`predict`: what a bench can see, before it is built or anything is trained."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import nlos_calibration as walls
+import typer
+from rich.table import Table
+
+from nlos_cam import forecast, objects
+from nlos_cam.cli.common import (
+    Json,
+    Overwrite,
+    finish,
+    interrupted_by_signals,
+    output_path,
+    show,
+    tracked,
+)
+from nlos_cam.cli.render import hidden_depth
+
+if TYPE_CHECKING:
+    from nlos_calibration import Rig
+
+SUFFIXES = ".html", ".png"
+
+
+def predict(
+    rig: Annotated[
+        str,
+        typer.Argument(
+            metavar="RIG_OR_BENCH",
+            help="Name of a packaged rig, a rig's TOML file, a wall.toml, or a bench folder.",
+        ),
+    ] = "paper-rig",
+    hidden: Annotated[
+        str | None,
+        typer.Argument(
+            metavar="[OBJECT]",
+            help="A category's name, a mesh or a .npy depth map; default: typical objects.",
+        ),
+    ] = None,
+    out: Annotated[
+        Path | None, typer.Option("--out", help="Page (.html) or picture (.png) with the maps.")
+    ] = None,
+    quick: Annotated[
+        bool,
+        typer.Option("--quick", help="Matt objects, 1 and 100 frames, no advice: a few seconds."),
+    ] = False,
+    size_m: Annotated[
+        float | None, typer.Option("--size-m", help="Size of OBJECT in meters.")
+    ] = None,
+    turn_deg: Annotated[
+        float | None, typer.Option("--tilt-y-deg", help="Rotation of OBJECT about the wall's y.")
+    ] = None,
+    overwrite: Overwrite = False,
+    json: Json = False,
+) -> None:
+    """Forecast what a bench can see: silhouettes, depths, by frames and material; what to change."""
+    if out is not None and out.suffix not in SUFFIXES:
+        raise typer.BadParameter(f"--out {out}: choose a name that ends in .html or .png")
+    path = output_path(out, "forecast", ".html", overwrite=overwrite) if out else None
+    own = rig_of(rig)
+    shape = None
+    if hidden is not None:
+        depth_m = hidden_depth(hidden, own, {"size_m": size_m, "tilt_y_deg": turn_deg})
+        shape = forecast.Shape.of(depth_m, objects.object_box(own))
+    elif size_m is not None or turn_deg is not None:
+        raise typer.BadParameter("--size-m and --tilt-y-deg are of an OBJECT: name one")
+    with interrupted_by_signals():
+        found = forecast.forecast(own, quick=quick, shape=shape)
+        advice: list[forecast.Change] = []
+        if not quick and shape is None:
+            with tracked("trying changes of the bench") as on_progress:
+                advice = forecast.changes(own, on_progress)
+    if path is not None:
+        forecast.write_report(found, path, advice, hidden or "")
+    facts = found.as_json() | {
+        "object": hidden,
+        "changes": [
+            {name: value for name, value in asdict(change).items() if name != "rig"}
+            for change in advice
+        ],
+        "out": path and str(path),
+    }
+    lines = forecast.words_of(found, hidden or "")
+    if advice:
+        lines += ["What to change:", *(f"  {line}" for line in forecast.change_words(advice))]
+    lines += [f"Written: {path}"] if path else []
+    if not json:
+        show(_table(found))
+        lines.insert(0, forecast.COLUMNS)
+    finish(facts, as_json=json, text="\n".join(lines))
+
+
+def rig_of(name: str) -> Rig:
+    """Return a packaged rig, or that of a rig's file, a wall record or a bench folder's wall."""
+    folder = Path(name)
+    if folder.is_dir():
+        return walls.rig_named(str(folder / "wall.toml"))
+    return walls.rig_named(name)
+
+
+def _table(found: forecast.Forecast) -> Table:
+    content = forecast.table_of(found)
+    table = Table(*content.head)
+    for row in content.rows:
+        table.add_row(*row)
+    return table

@@ -1,0 +1,26 @@
+__all__ = [
+    "CAVEATS",
+    "COLUMNS",
+    "FRAMES",
+    "Change",
+    "Conditions",
+    "Expectation",
+    "Forecast",
+    "Prior",
+    "Shape",
+    "change_words",
+    "changes",
+    "fit_prior",
+    "forecast",
+    "network_iou",
+    "shipped_prior",
+    "table_of",
+    "words_of",
+    "write_report",
+]
+
+from .advice import Change, changes
+from .curve import network_iou
+from .expectation import FRAMES, Conditions, Expectation, Forecast, forecast
+from .prior import Prior, Shape, fit_prior, shipped_prior
+from .report import CAVEATS, COLUMNS, change_words, table_of, words_of, write_report

@@ -1,0 +1,39 @@
+"""`predict`: refusals in one line, and a bench folder in place of a rig."""
+
+import json
+from pathlib import Path
+
+import pytest
+from nlos_calibration import dump_toml, load_rig
+
+from nlos_cam.cli.main import main
+
+
+def test_predict_takes_a_rig_file_and_names_what_it_sees(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    home = load_rig("paper-rig")
+    assert home.occluder
+    closed = home.occluder.model_copy(update={"z_min_m": 1e-6})
+    file = tmp_path / "mine.toml"
+    file.write_text(dump_toml(home.model_copy(update={"occluder": closed, "name": "mine"})))
+    page = tmp_path / "mine.html"
+
+    assert main(["predict", str(file), "--quick", "--json", "--out", str(page)]) == 0
+
+    found = json.loads(capsys.readouterr().out.splitlines()[-1])
+    assert found["rig"] == "mine"
+    assert found["expectations"][0]["cells"] == 0
+    assert "sees nothing" in page.read_text()
+
+
+@pytest.mark.parametrize("wrong", ["nowhere.toml", "papper-rig", "bare-wall", "empty-folder"])
+def test_predict_refuses_what_is_no_rig_in_one_line(
+    wrong: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "empty-folder").mkdir()
+    monkeypatch.chdir(tmp_path)
+
+    assert main(["predict", wrong, "--quick"]) in {2, 4}
+
+    assert len(capsys.readouterr().err.strip().splitlines()) == 1
