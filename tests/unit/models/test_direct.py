@@ -266,16 +266,6 @@ def _train(
     return train_direct(_recipe(**changes), Source(), small_maps(4, 1), folder, running)
 
 
-def test_run_stopped_halfway_resumes_exactly(tmp_path: Path) -> None:
-    whole, figures = _train(tmp_path / "whole")
-    with pytest.raises(KeyboardInterrupt):
-        _train(tmp_path / "cut", Running(stop=iter([False] * 4 + [True]).__next__))
-    resumed, again = _train(tmp_path / "cut")
-
-    assert not changed_tensors(whole.state_dict(), resumed.state_dict())
-    assert figures == again
-
-
 def test_run_follows_its_recipe(tmp_path: Path) -> None:
     whole, _ = _train(tmp_path / "whole")
     for name, changes in (

@@ -47,15 +47,19 @@ def _assert_same(one: SmallRun, other: SmallRun) -> None:
     assert one.log == other.log
 
 
-@pytest.mark.parametrize("schedule", ["one-cycle", "plateau"])
+@pytest.mark.parametrize(
+    "how", [{"schedule": "one-cycle"}, {"schedule": "plateau"}, {"average": 0.9}], ids=str
+)
 @pytest.mark.parametrize("fail_at", [1, STEPS, STEPS + 2, 3 * STEPS])
-def test_resumed_run_equals_uninterrupted(tmp_path: Path, schedule: str, fail_at: int) -> None:
-    whole = _trained(tmp_path / "whole", schedule=schedule)
+def test_resumed_run_equals_uninterrupted(
+    tmp_path: Path, how: dict[str, object], fail_at: int
+) -> None:
+    whole = _trained(tmp_path / "whole", **how)
     with pytest.raises(Stopped):
         SmallRun(whole.recipe, tmp_path / "failed").go(fail_at)
     torch.manual_seed(99)
 
-    _assert_same(_trained(tmp_path / "failed", schedule=schedule), whole)
+    _assert_same(_trained(tmp_path / "failed", **how), whole)
 
 
 @pytest.mark.slow
