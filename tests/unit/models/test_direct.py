@@ -23,9 +23,10 @@ from nlos_models.training.checkpoints import save_direct
 from nlos_models.training.data import InMemory, MapNoise, MapSet, as_images
 from nlos_models.training.direct import NormalBatch, _stains, train_direct, transfer_direct, vary
 from nlos_models.training.distributed import open_fabric
-from nlos_models.training.loop import BEST, LAST, MINUTES, Running, Scores
+from nlos_models.training.loop import MINUTES, Running, Scores
 from nlos_models.training.losses import two_heads_error
 from nlos_models.training.recipe import DirectSize, recipe_of
+from nlos_models.training.run_files import BEST, LAST
 from nlos_models.training.runs import (
     TrainingRun,
     direct_start,
