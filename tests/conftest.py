@@ -8,6 +8,7 @@ import pytest
 from fake_librealsense import FakeSdk
 from fake_lidar import FakeLidar, NapClock
 from nlos_calibration import Rig, load_rig
+from noise_bags import make_all
 
 from nlos_cam.camera import Recording, SimulatedCamera
 from nlos_cam.camera.l515 import L515Camera
@@ -122,3 +123,11 @@ def fake_camera() -> Callable[..., L515Camera]:
         return L515Camera(uri, serial, sdk=sdk, clock=clock or NapClock(), recording=recording)
 
     return make
+
+
+@pytest.fixture(scope="session")
+def noise_bags(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """Forty frames of noise, recorded "packed" and "plain", and each of them "-unindexed" as a kill
+    leaves it.
+    """
+    return make_all(tmp_path_factory.mktemp("noise"))

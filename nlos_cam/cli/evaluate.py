@@ -20,6 +20,13 @@ from nlos_cam.cli.common import (
     tracked,
 )
 
+Count = Annotated[
+    int | None,
+    typer.Option(
+        "--count", min=1, help="Number of random objects, instead of the 54 test objects."
+    ),
+]
+
 
 def evaluate(
     out: Annotated[
@@ -48,12 +55,7 @@ def evaluate(
             "--wall", help="Bare wall for difference maps, wall.toml (default: rendered)."
         ),
     ] = None,
-    count: Annotated[
-        int | None,
-        typer.Option(
-            "--count", min=1, help="Number of random objects, instead of the 54 test objects."
-        ),
-    ] = None,
+    count: Count = None,
     no_nearest: Annotated[
         bool,
         typer.Option(

@@ -16,7 +16,6 @@ from nlos_models.errors import ModelError, lacks_memory, missing_extra
 from typer.main import get_command
 
 from nlos_cam.cli import common
-from nlos_cam.cli import run as run  # noqa: PLC0414  scripts of earlier installations find it here
 from nlos_cam.cli.config import shared_options
 from nlos_cam.cli.plain_help import plain_help
 from nlos_cam.cli.usage import usage_lines, usage_reason

@@ -14,6 +14,7 @@ import typer
 from nlos_cam import evaluate as measure
 from nlos_cam import render as renderer
 from nlos_cam.cli import common
+from nlos_cam.cli.evaluate import Count
 from nlos_cam.cli.render import hidden_depth
 from nlos_cam.files import cache_folder
 
@@ -70,12 +71,7 @@ def reconstruct(
             help="Folder of weights, paper, or direct; repeat to compare (default: both).",
         ),
     ] = None,
-    count: Annotated[
-        int | None,
-        typer.Option(
-            "--count", min=1, help="Number of random objects, instead of the 54 test objects."
-        ),
-    ] = None,
+    count: Count = None,
     overwrite: common.Overwrite = False,
     json: common.Json = False,
 ) -> None:

@@ -5,7 +5,6 @@ __all__ = [
     "HELD_OUT_OUTLIERS",
     "HELD_OUT_SEED",
     "ORDINARY",
-    "PART_PATTERN",
     "REQUIRED_ARRAYS",
     "SHAPE_OUTLIERS",
     "SHARD_PATTERN",
@@ -72,7 +71,6 @@ from .ray_backend import ray_farm
 from .reader import Dataset, open_dataset
 from .samples import objects_from_folder, procedural_images, sense_color, sense_object
 from .shards import (
-    PART_PATTERN,
     REQUIRED_ARRAYS,
     SHARD_PATTERN,
     check_arrays,

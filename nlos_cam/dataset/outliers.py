@@ -8,6 +8,7 @@ covers kinds the network has not met.
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
+from functools import wraps
 from typing import NamedTuple
 
 import cv2
@@ -50,6 +51,16 @@ OutlierKind = Callable[[Generator, Stimulus], Stimulus]
 """Makes an outlier from an ordinary stimulus that has no object yet."""
 
 
+def hides(shape: Callable[[Generator, ObjectBox], Float32]) -> OutlierKind:
+    """Return the kind that hides a shape: a function of the box that returns its depth map."""
+
+    @wraps(shape)
+    def kind(generator: Generator, stimulus: Stimulus) -> Stimulus:
+        return replace(stimulus, depth_m=shape(generator, stimulus.box))
+
+    return kind
+
+
 def draw_object(generator: Generator, box: ObjectBox, **pose: float) -> Float32:
     """Return the depth map of an object of any category in a random pose, except for the given
     values.
@@ -71,16 +82,16 @@ def smooth_pattern(generator: Generator, across: int) -> Float32:
     return ((pattern - pattern.min()) / np.ptp(pattern)).astype(np.float32)
 
 
-def ordinary(generator: Generator, stimulus: Stimulus) -> Stimulus:
+@hides
+def ordinary(generator: Generator, box: ObjectBox) -> Float32:
     """Add an object like those of the training set."""
-    return replace(stimulus, depth_m=draw_object(generator, stimulus.box))
+    return draw_object(generator, box)
 
 
-def generic(generator: Generator, stimulus: Stimulus) -> Stimulus:
+@hides
+def generic(generator: Generator, box: ObjectBox) -> Float32:
     """Add a generic shape, as in training sets with a share of them."""
-    return replace(
-        stimulus, depth_m=shapes.generic_depth(int(generator.integers(2**31)), stimulus.box)[1]
-    )
+    return shapes.generic_depth(int(generator.integers(2**31)), box)[1]
 
 
 class BenchSpread(NamedTuple):
@@ -139,53 +150,46 @@ def vary_empty_bench(
     return bench, model
 
 
-def small(generator: Generator, stimulus: Stimulus) -> Stimulus:
+@hides
+def small(generator: Generator, box: ObjectBox) -> Float32:
     """Add an object of 15 to 35 % of the box."""
-    width_m = shapes.box_width_m(stimulus.box)
+    width_m = shapes.box_width_m(box)
     size_m = width_m * generator.uniform(0.15, 0.35)
     (x_m, y_m) = generator.uniform(-0.3, 0.3, 2) * width_m
-    return replace(
-        stimulus, depth_m=draw_object(generator, stimulus.box, size_m=size_m, x_m=x_m, y_m=y_m)
-    )
+    return draw_object(generator, box, size_m=size_m, x_m=x_m, y_m=y_m)
 
 
-def large(generator: Generator, stimulus: Stimulus) -> Stimulus:
+@hides
+def large(generator: Generator, box: ObjectBox) -> Float32:
     """Add an object of 125 to 180 % of the box, whose sides are cut off."""
-    size_m = shapes.box_width_m(stimulus.box) * generator.uniform(1.25, 1.8)
-    return replace(stimulus, depth_m=draw_object(generator, stimulus.box, size_m=size_m))
+    size_m = shapes.box_width_m(box) * generator.uniform(1.25, 1.8)
+    return draw_object(generator, box, size_m=size_m)
 
 
-def far(generator: Generator, stimulus: Stimulus) -> Stimulus:
+@hides
+def far(generator: Generator, box: ObjectBox) -> Float32:
     """Add an object 0.12 to 0.35 m farther from the wall, most of it behind the box."""
-    return replace(
-        stimulus,
-        depth_m=draw_object(generator, stimulus.box) + np.float32(generator.uniform(0.12, 0.35)),
-    )
+    return draw_object(generator, box) + np.float32(generator.uniform(0.12, 0.35))
 
 
-def near(generator: Generator, stimulus: Stimulus) -> Stimulus:
+@hides
+def near(generator: Generator, box: ObjectBox) -> Float32:
     """Add an object that sticks out of the box, 40 to 90 mm nearer to the wall."""
-    depth_m = draw_object(generator, stimulus.box, front_m=0.0) - np.float32(
-        generator.uniform(0.04, 0.09)
-    )
-    return replace(stimulus, depth_m=depth_m)
+    return draw_object(generator, box, front_m=0.0) - np.float32(generator.uniform(0.04, 0.09))
 
 
-def half_out(generator: Generator, stimulus: Stimulus) -> Stimulus:
+@hides
+def half_out(generator: Generator, box: ObjectBox) -> Float32:
     """Add an object of ordinary size, 35 to 60 % of which lies beside the box."""
-    box = stimulus.box
     pose = shapes.random_pose(generator, box)
     out_m = (shapes.box_width_m(box) + pose.size_m) / 2 - pose.size_m * generator.uniform(0.4, 0.65)
     angle = np.radians(90) * int(generator.integers(4))
-    return replace(
-        stimulus,
-        depth_m=draw_object(generator, box, x_m=out_m * np.cos(angle), y_m=out_m * np.sin(angle)),
-    )
+    return draw_object(generator, box, x_m=out_m * np.cos(angle), y_m=out_m * np.sin(angle))
 
 
-def several(generator: Generator, stimulus: Stimulus) -> Stimulus:
+@hides
+def several(generator: Generator, box: ObjectBox) -> Float32:
     """Add two or three separate objects."""
-    box = stimulus.box
     count = int(generator.integers(2, 4))
     start = generator.uniform(0, 2 * np.pi)
     depths_m = list[Float32]()
@@ -199,18 +203,18 @@ def several(generator: Generator, stimulus: Stimulus) -> Stimulus:
         depths_m.append(
             draw_object(generator, box, size_m=size_m, x_m=x_m, y_m=y_m, front_m=front_m)
         )
-    return replace(stimulus, depth_m=np.fmin.reduce(depths_m))
+    return np.fmin.reduce(depths_m)
 
 
-def blobs(generator: Generator, stimulus: Stimulus) -> Stimulus:
+@hides
+def blobs(generator: Generator, box: ObjectBox) -> Float32:
     """Add smooth random shapes of smooth random depth."""
-    box = stimulus.box
     covered = smooth_pattern(generator, int(generator.integers(3, 9))) > generator.uniform(
         0.35, 0.75
     )
     share = smooth_pattern(generator, int(generator.integers(3, 9))) * generator.uniform(0.3, 1.0)
     depth_m = box.z_near_m + share * np.float32(box.z_far_m - box.z_near_m)
-    return replace(stimulus, depth_m=np.where(covered, depth_m, np.float32(np.nan)))
+    return np.where(covered, depth_m, np.float32(np.nan))
 
 
 def dim(generator: Generator, stimulus: Stimulus) -> Stimulus:
@@ -220,24 +224,26 @@ def dim(generator: Generator, stimulus: Stimulus) -> Stimulus:
     )
 
 
-def posts(generator: Generator, stimulus: Stimulus) -> Stimulus:
+@hides
+def posts(generator: Generator, box: ObjectBox) -> Float32:
     """Add an object on a post, with another post above it."""
-    depth_m = draw_object(generator, stimulus.box)
+    depth_m = draw_object(generator, box)
     for _ in range(2):
         depth_m = np.where(np.isnan(depth_m), shapes.post(depth_m, generator), depth_m)[::-1]
-    return replace(stimulus, depth_m=np.ascontiguousarray(depth_m))
+    return np.ascontiguousarray(depth_m)
 
 
-def tilted(generator: Generator, stimulus: Stimulus) -> Stimulus:
+@hides
+def tilted(generator: Generator, box: ObjectBox) -> Float32:
     """Add an object tilted by 40 to 75 degrees, up or down and to a side."""
     tilts = np.radians(generator.uniform(40, 75, 2)) * generator.choice([-1, 1], 2)
     pose = {"tilt_x_rad": float(tilts[0]), "tilt_y_rad": float(tilts[1])}
-    return replace(stimulus, depth_m=draw_object(generator, stimulus.box, **pose))
+    return draw_object(generator, box, **pose)
 
 
-def plates(generator: Generator, stimulus: Stimulus) -> Stimulus:
+@hides
+def plates(generator: Generator, box: ObjectBox) -> Float32:
     """Add a large slanted plate without relief."""
-    box = stimulus.box
     steps = np.linspace(-0.5, 0.5, OBJECT_PIXELS)
     x, y = np.meshgrid(steps, -steps)
     slope_x, slope_y = generator.uniform(-1, 1, 2)
@@ -246,7 +252,7 @@ def plates(generator: Generator, stimulus: Stimulus) -> Stimulus:
     )
     half_x, half_y = generator.uniform(0.3, 0.5, 2)
     covered = (abs(x) < half_x) & (abs(y) < half_y) & (depth_m > 0.5 * box.z_near_m)
-    return replace(stimulus, depth_m=np.where(covered, depth_m, np.nan).astype(np.float32))
+    return np.where(covered, depth_m, np.nan).astype(np.float32)
 
 
 def other_rig(generator: Generator, stimulus: Stimulus) -> Stimulus:
@@ -265,9 +271,10 @@ def other_sensor(generator: Generator, stimulus: Stimulus) -> Stimulus:
     return replace(ordinary(generator, stimulus), sensor=sensor)
 
 
-def warped(generator: Generator, stimulus: Stimulus) -> Stimulus:
+@hides
+def warped(generator: Generator, box: ObjectBox) -> Float32:
     """Add a warped object: every pixel is displaced by up to a sixth of the box, smoothly."""
-    whole_m = draw_object(generator, stimulus.box)
+    whole_m = draw_object(generator, box)
     steps = np.arange(OBJECT_PIXELS, dtype=np.float32)
     x, y = np.meshgrid(steps, steps)
     off = [
@@ -275,30 +282,32 @@ def warped(generator: Generator, stimulus: Stimulus) -> Stimulus:
         for _ in range(2)
     ]
     bent = cv2.remap(whole_m, x + off[0], y + off[1], cv2.INTER_NEAREST, borderValue=float("nan"))
-    return replace(stimulus, depth_m=bent.astype(np.float32))
+    return bent.astype(np.float32)
 
 
-def inside_out(generator: Generator, stimulus: Stimulus) -> Stimulus:
+@hides
+def inside_out(generator: Generator, box: ObjectBox) -> Float32:
     """Add an object turned inside out: near parts become far ones, and relief doubles."""
-    box = stimulus.box
     whole_m = draw_object(generator, box)
     depth_m = np.nanmin(whole_m) + 2 * (np.nanmax(whole_m) - whole_m)
-    return replace(stimulus, depth_m=np.minimum(depth_m, np.float32(1.5 * box.z_far_m)))
+    return np.minimum(depth_m, np.float32(1.5 * box.z_far_m))
 
 
-def cut_out(generator: Generator, stimulus: Stimulus) -> Stimulus:
+@hides
+def cut_out(generator: Generator, box: ObjectBox) -> Float32:
     """Add the flat silhouette of an object, with holes."""
-    whole_m = draw_object(generator, stimulus.box)
+    whole_m = draw_object(generator, box)
     holes = smooth_pattern(generator, int(generator.integers(4, 10))) > generator.uniform(
         0.45, 0.75
     )
     flat = np.where(holes | np.isnan(whole_m), np.nan, np.nanmedian(whole_m))
-    return replace(stimulus, depth_m=flat.astype(np.float32))
+    return flat.astype(np.float32)
 
 
-def scrambled(generator: Generator, stimulus: Stimulus) -> Stimulus:
+@hides
+def scrambled(generator: Generator, box: ObjectBox) -> Float32:
     """Add an object cut into 3 x 3 or 4 x 4 tiles, shuffled."""
-    whole_m = draw_object(generator, stimulus.box)
+    whole_m = draw_object(generator, box)
     n = int(generator.choice([3, 4]))
     side = OBJECT_PIXELS // n
     tiles = [
@@ -309,9 +318,7 @@ def scrambled(generator: Generator, stimulus: Stimulus) -> Stimulus:
     order = generator.permutation(n * n)
     mixed_m = np.block([[tiles[order[i * n + j]] for j in range(n)] for i in range(n)])
     margin = OBJECT_PIXELS - n * side
-    return replace(
-        stimulus, depth_m=np.pad(mixed_m, (0, margin), constant_values=np.nan).astype(np.float32)
-    )
+    return np.pad(mixed_m, (0, margin), constant_values=np.nan).astype(np.float32)
 
 
 GLOSSY_LOBES = phong(0.1, 0.9, 80.0), retroreflective(0.1, 0.9, 80.0)
@@ -320,41 +327,36 @@ MIN_PIXELS = 12
 """Fewest pixels of an outlier."""
 
 
-def panels(generator: Generator, stimulus: Stimulus) -> Stimulus:
+@hides
+def panels(generator: Generator, box: ObjectBox) -> Float32:
     """Add an object in front of a panel that fills most of the box."""
-    box = stimulus.box
     depth_m = draw_object(generator, box)
-    return replace(
-        stimulus,
-        depth_m=np.where(np.isnan(depth_m), shapes.panel(depth_m, box, generator), depth_m),
-    )
+    return np.where(np.isnan(depth_m), shapes.panel(depth_m, box, generator), depth_m)
 
 
-def noise_sheet(generator: Generator, stimulus: Stimulus) -> Stimulus:
+@hides
+def noise_sheet(generator: Generator, box: ObjectBox) -> Float32:
     """Add a sheet of random depth in every pixel."""
-    box = stimulus.box
     depth_m = generator.uniform(box.z_near_m, box.z_far_m, (OBJECT_PIXELS, OBJECT_PIXELS))
     depth_m[generator.random(depth_m.shape) < generator.uniform(0, 0.5)] = np.nan
-    return replace(stimulus, depth_m=depth_m.astype(np.float32))
+    return depth_m.astype(np.float32)
 
 
-def bars(generator: Generator, stimulus: Stimulus) -> Stimulus:
+@hides
+def bars(generator: Generator, box: ObjectBox) -> Float32:
     """Add a cage of parallel bars, upright or lying."""
-    box = stimulus.box
     period = int(generator.integers(10, 24))
     at = (np.arange(OBJECT_PIXELS) + int(generator.integers(period))) % period < max(2, period // 4)
     depth_m = np.where(at, generator.uniform(box.z_near_m, 0.7 * box.z_far_m), np.nan).astype(
         np.float32
     )
     sheet = np.ascontiguousarray(np.broadcast_to(depth_m, (OBJECT_PIXELS, OBJECT_PIXELS)))
-    return replace(
-        stimulus, depth_m=sheet if generator.random() < 0.5 else np.ascontiguousarray(sheet.T)
-    )
+    return sheet if generator.random() < 0.5 else np.ascontiguousarray(sheet.T)
 
 
-def rings(generator: Generator, stimulus: Stimulus) -> Stimulus:
+@hides
+def rings(generator: Generator, box: ObjectBox) -> Float32:
     """Add a torus in any orientation."""
-    box = stimulus.box
     ring = trimesh.creation.torus(
         1.0, generator.uniform(0.15, 0.35), major_sections=32, minor_sections=16
     )
@@ -363,11 +365,8 @@ def rings(generator: Generator, stimulus: Stimulus) -> Stimulus:
         size_m=shapes.box_width_m(box) * generator.uniform(0.55, 0.9),
         front_m=generator.uniform(0, 0.1),
     )
-    return replace(
-        stimulus,
-        depth_m=shapes.orthographic_depth(
-            shapes.place(np.asarray(ring.triangles) @ turn.T, pose, box), box
-        ),
+    return shapes.orthographic_depth(
+        shapes.place(np.asarray(ring.triangles) @ turn.T, pose, box), box
     )
 
 

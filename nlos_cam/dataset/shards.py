@@ -30,7 +30,6 @@ from nlos_cam.files import (
 )
 
 SHARD_PATTERN = "shard-*.h5"
-PART_PATTERN = "*shard-*.part"
 REQUIRED_ARRAYS = ("depth_m", "intensity", "image", "object_depth_m", "seed", "category", "scene")
 NO_ROOM = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
 """No space left, a quota reached, or a limit on the size of files."""

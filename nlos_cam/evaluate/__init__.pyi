@@ -1,7 +1,6 @@
 __all__ = [
     "LABELS",
     "NETWORKS",
-    "QUIET",
     "REPORT",
     "SMALLER_IS_BETTER",
     "TARGETS",
@@ -87,7 +86,6 @@ from .render_tradeoff import (
 )
 from .report import REPORT, Evaluation, as_figures, evaluate, format_interval, write_report
 from .subjects import (
-    QUIET,
     HeldOutObjects,
     SeededObject,
     Subject,

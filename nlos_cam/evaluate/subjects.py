@@ -52,10 +52,6 @@ TEST_SETS: dict[TestSet, str] = {
     "kinds": "fixed test objects",
     "unseen": "fixed objects of kinds never seen",
 }
-QUIET = SensorModel(
-    range_noise_m=0, range_noise_per_m=0, read_noise_counts=0, shot_noise=0, dead_share=0
-)
-"""Sensor without noise or dead pixels; saturation and quantisation stay."""
 
 
 @dataclass(frozen=True)

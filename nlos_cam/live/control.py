@@ -34,6 +34,8 @@ RECENT_FRAMES = 300
 STRAIN_FRAMES = 60
 MAX_DROPS = 3
 """Of so many frames (2 s), the number of dropped ones above which the run is too slow."""
+LOADING_S = 4.0
+"""Time that the networks take to load, between a pre-rendering and the first frame."""
 COMMAND_WAIT_S = 0.5
 """Time after which a command without an answer waits: most take milliseconds."""
 MAX_NUMBER = 1e9
@@ -98,7 +100,7 @@ class RunControl:
         message = f"pre-rendering the simulated scene, {done} of {total}"
         if done > 1:
             left_s = (now_s - self._rendering_start_s) * (total - done) / done
-            message += f", first frame in about {left_s + 4:.0f} s"
+            message += f", first frame in about {left_s + LOADING_S:.0f} s"
         self.set_state("connecting", message)
 
     def attach(self, camera: Camera, pipeline: Pipeline) -> None:

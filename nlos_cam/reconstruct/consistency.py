@@ -27,6 +27,7 @@ from nlos_calibration.arrays import Float64, Mask
 from nlos_cam.frames import MAP_COLUMNS, MAP_ROWS, SATURATED, LidarMaps
 from nlos_cam.objects import object_box, object_depth
 from nlos_cam.reconstruct.bench import CalibratedRig
+from nlos_cam.reconstruct.physics_check import bare_rendering
 from nlos_cam.render import Scene, cast, render
 
 OFF_WALL_M = 0.009
@@ -119,7 +120,7 @@ class MapConsistency:
     def __init__(self, bench: CalibratedRig) -> None:
         rig = bench.rig
         self._information = information(rig)  # pyright: ignore[reportArgumentType]  frozen, hashable
-        self._depth_m, self._light = _bare_wall(rig)  # pyright: ignore[reportArgumentType]
+        self._depth_m, self._light = _bare_wall(rig)
         if bench.reference is not None:
             self._take_measured(bench.reference, bench.range_offset_m)
 
@@ -269,12 +270,11 @@ def _tilt(light: Float64, at_wall: Mask) -> float:
     return float(solved[1])
 
 
-@lru_cache(maxsize=4)
 def _bare_wall(rig: Rig) -> tuple[Float64, Float64]:
     """Return depth along the optical axis in metres and light (64, 80) of the cells that see the
     wall alone; NaN and 0 elsewhere.
     """
-    bare = render(Scene(rig))
+    bare = bare_rendering(rig)  # pyright: ignore[reportArgumentType]
     on_wall = cast(rig, rig.pinhole.scaled(MAP_COLUMNS, MAP_ROWS)).on_wall
     sees_wall = _inner(on_wall.reshape(MAP_ROWS, MAP_COLUMNS)) & (bare.intensity > 0)
     return np.where(sees_wall, bare.depth_m, np.nan), np.where(sees_wall, bare.intensity, 0.0)

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from nlos_calibration import ObjectBox, Rig
-from nlos_calibration.arrays import Float32, Float64
+from nlos_calibration.arrays import Float32
 from nlos_models import MIN_V, Answer, UncertaintyModel, ask
 
 from nlos_cam.frames import OBJECT_PIXELS, LidarMaps
@@ -83,17 +83,6 @@ class Reconstruction:
     """Seconds by stage."""
     uncertainty: Uncertainty | None = None
     """None without an uncertainty model."""
-
-    @property
-    def wall_from_object(self) -> Float64:
-        """(4, 4); the object frame has the wall's axes and its origin on the wall, before the
-        middle of the box.
-        """
-        box = self.box
-        pose = np.eye(4)
-        pose[0, 3] = (box.x_min_m + box.x_max_m) / 2
-        pose[1, 3] = (box.y_min_m + box.y_max_m) / 2
-        return pose
 
     @property
     def points_m(self) -> Float32:

@@ -283,7 +283,8 @@ def check_reconstruction(
     range offset (`CalibratedRig.correct_range`).
     """
     start_s = clock()
-    bare = _bare(rig)  # pyright: ignore[reportArgumentType]  frozen, so hashable
+    nothing_hidden = bare_rendering(rig)  # pyright: ignore[reportArgumentType]  frozen, so hashable
+    bare = _expected(nothing_hidden, rig, None)
     expected = bare
     shows_surface = depth_m is not None and bool(np.isfinite(depth_m).any())
     has_surface = shows_surface and rig.object_box is not None
@@ -305,8 +306,11 @@ def check_reconstruction(
 
 
 @lru_cache(maxsize=4)
-def _bare(rig: Rig) -> Expected:
-    return _expected(render(Scene(rig)), rig, None)
+def bare_rendering(rig: Rig) -> Rendering:
+    """Return the rendering of a rig with nothing hidden, which every check of a frame compares
+    with.
+    """
+    return render(Scene(rig))
 
 
 def _expected(rendering: Rendering, rig: Rig, bare: Expected | None) -> Expected:

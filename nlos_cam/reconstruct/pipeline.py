@@ -24,7 +24,7 @@ from nlos_cam.frames import Frame, LidarMaps, MapMean, maps_from_frame
 from nlos_cam.objects import SurfaceMesh
 from nlos_cam.reconstruct.alignment import MapAlignment, alignment, rig_to_align_with, training_rig
 from nlos_cam.reconstruct.bench import BenchObservation, CalibratedRig
-from nlos_cam.reconstruct.consistency import MapConsistency, MapFindings
+from nlos_cam.reconstruct.consistency import COMPLETE, MapConsistency, MapFindings
 from nlos_cam.reconstruct.frame_reader import Arrival
 from nlos_cam.reconstruct.network import Clock, Network, Reconstruction, reconstruct_all
 from nlos_cam.reconstruct.physics_check import (
@@ -125,7 +125,8 @@ class PreparedBench(NamedTuple):
 
     bench: CalibratedRig
     aligned: MapAlignment | None
-    consistency: MapConsistency
+    consistency: MapConsistency | None
+    """None without an uncertainty model: then no verdict depends on it."""
 
 
 @dataclass(frozen=True)
@@ -193,8 +194,9 @@ class Pipeline:
     @bench.setter
     def bench(self, bench: CalibratedRig) -> None:
         aligned = alignment(bench.rig, self._trained, bench.reference) if self._trained else None
+        consistency = MapConsistency(bench) if self.uncertainty_model else None
         # in one assignment: `prepare` must not see half of it
-        self._bench = PreparedBench(bench, aligned, MapConsistency(bench))
+        self._bench = PreparedBench(bench, aligned, consistency)
 
     @property
     def average(self) -> int:
@@ -231,7 +233,7 @@ class Pipeline:
             network_input = difference
         else:
             network_input = corrected
-        findings = consistency.examine(corrected)
+        findings = consistency.examine(corrected) if consistency else COMPLETE
         frozen = self._frozen.add(arrival.frame)
         observed_s = clock()
 

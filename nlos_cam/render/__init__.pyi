@@ -2,6 +2,7 @@ __all__ = [
     "DEPTH_UNIT_M",
     "EFFECTS",
     "JUMP_M",
+    "QUIET",
     "RENDERING_VERSION",
     "STOPS",
     "Accuracy",
@@ -98,6 +99,6 @@ from .scene_file import (
 )
 from .sensor.bias import ripples, smooth_patches
 from .sensor.effects import sensor_effects
-from .sensor.model import DEPTH_UNIT_M, SensorModel
+from .sensor.model import DEPTH_UNIT_M, QUIET, SensorModel
 from .sensor.sensor import SensedImages, Sensor
 from .wall_paths import WallGrid, WallPaths

@@ -59,12 +59,6 @@ class Stopped(Exception):  # noqa: N818  a stand-in for a fault
     """Fault that ends a run."""
 
 
-def stop_halfway(step: int, total: int) -> None:
-    """Fail one step after the middle of a run."""
-    if step == total // 2 + 1:
-        raise Stopped
-
-
 class SmallRun:
     """Regression with noise and, unless `plain`, dropout and a batch norm: all state that resuming
     must restore.

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from nlos_cam.render import ripples, smooth_patches
 
+PINHOLE = walls.load_rig("bare-wall").pinhole.scaled(160, 120)
 LONGEST_DEPTH_M = 4.0
 DEAD_SHARE = 0.03
 
@@ -179,3 +180,12 @@ def depth_statistics(
     for _ in range(frames):
         mean.add(depth_frame(with_outliers(depth_m, flicker, generator), generator, noise))
     return mean
+
+
+def measured(
+    depth_m: Float64, seed: int = 0, *, frames: int = 8, noise: float = 1.0
+) -> walls.WallFit:
+    """Return the wall that noisy frames of a depth map, seen through PINHOLE, are fitted by."""
+    generator = np.random.default_rng(seed)
+    mean = depth_statistics(depth_m, generator, frames=frames, noise=noise)
+    return walls.fit_wall(mean.mean_m(), PINHOLE, generator, mean.noise())

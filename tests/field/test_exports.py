@@ -3,7 +3,7 @@
 import csv
 import json
 import struct
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 import pytest
 import trimesh
+from rewritten_bags import Messages, number_of
 
 from nlos_cam.camera import Sample
 from nlos_cam.recording import SAMPLE, BagReader
@@ -18,12 +19,7 @@ from nlos_cam.recording.export import PngSink
 
 Run = Callable[..., Any]
 Remake = Callable[..., Path]
-Messages = Iterable[tuple[int, bytes]]
 FRAMES_END = "/image/data"
-
-
-def number_of(raw: bytes) -> int:
-    return int.from_bytes(raw[:4], "little")
 
 
 def odd_frames(topic: str, time_ns: int, raw: bytes) -> Messages:

@@ -2,12 +2,13 @@
 
 import sqlite3
 import struct
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from rewritten_bags import Messages, number_of
 from rosbags.rosbag1 import Writer
 from rosbags.typesys import Stores, get_typestore
 from sdk_playback import SdkReplay
@@ -17,12 +18,7 @@ from nlos_cam.recording.bag_messages import IMAGE
 
 Run = Callable[..., Any]
 Remake = Callable[..., Path]
-Messages = Iterable[tuple[int, bytes]]
 FRAMES_END = "/image/data"
-
-
-def number_of(raw: bytes) -> int:
-    return int.from_bytes(raw[:4], "little")
 
 
 def depth_of(path: Path) -> list[tuple[int, bytes]]:

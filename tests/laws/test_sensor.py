@@ -11,7 +11,7 @@ from numpy.random import default_rng
 
 from nlos_cam.frames import SATURATED
 from nlos_cam.objects import object_depth
-from nlos_cam.render import MultiBounce, Rendering, Scene, SensedImages, Sensor, cast, render
+from nlos_cam.render import QUIET, MultiBounce, Rendering, Scene, SensedImages, Sensor, cast, render
 from nlos_cam.render.sensor.bias import (
     PATCHES_SEED,
     RIPPLES_SEED,
@@ -22,9 +22,6 @@ from nlos_cam.render.sensor.bias import (
 )
 from nlos_cam.render.sensor.model import DEPTH_UNIT_M, MAX_CONFIDENCE, SensorModel, WarmUp
 
-QUIET = SensorModel(
-    range_noise_m=0, range_noise_per_m=0, read_noise_counts=0, shot_noise=0, dead_share=0
-)
 RICH = SensorModel(ambient_counts=40, read_noise_counts=1.5, dead_share=0)
 BIAS: dict[str, object] = {
     "warm_up": WarmUp(

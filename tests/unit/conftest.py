@@ -1,6 +1,6 @@
 import importlib
 import sys
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from datetime import date
 from pathlib import Path
 from types import ModuleType
@@ -18,8 +18,7 @@ from nlos_calibration.rig import load_rig
 from nlos_calibration.wall import fit_wall, wall_depth
 from nlos_calibration.wall_record import MeasuredWall, new_wall_record
 from nlos_models import compressor, vae
-from noise_bags import make_all
-from rosbags.rosbag1 import Reader, Writer
+from rewritten_bags import Edit, rewrite
 
 settings.register_profile("no clock", deadline=None)  # a machine that is busy fails no law
 settings.load_profile("no clock")
@@ -34,14 +33,6 @@ def tool() -> Iterator[Callable[[str], ModuleType]]:
     sys.path.insert(0, str(TOOLS))
     yield importlib.import_module
     sys.path.remove(str(TOOLS))
-
-
-@pytest.fixture(scope="session")
-def noise_bags(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
-    """Forty frames of noise, recorded "packed" and "plain", and each of them "-unindexed" as a kill
-    leaves it.
-    """
-    return make_all(tmp_path_factory.mktemp("noise"))
 
 
 @pytest.fixture
@@ -67,29 +58,6 @@ def real_bag() -> Path:
     if path := next((path for path in found if path.is_file()), None):
         return path
     pytest.skip(f"no {DATA} in this checkout, or in a folder beside it")
-
-
-Edit = Callable[[str, int, bytes], Iterable[tuple[int, bytes]]]
-
-
-def rewrite(source: Path, target: Path, edit: Edit, compression: str | None = None) -> Path:
-    """A recording whose messages (topic, time in ns, bytes) are those that `edit` makes of
-    another's.
-    """
-    writer = Writer(target)
-    if compression:
-        writer.set_compression(Writer.CompressionFormat[compression])
-    with Reader(source) as reader, writer:
-        made = {
-            found.id: writer.add_connection(
-                found.topic, found.msgtype, msgdef=found.msgdef.data, md5sum=found.digest
-            )
-            for found in reader.connections
-        }
-        for connection, time_ns, raw in reader.messages():
-            for new_time_ns, new_raw in edit(connection.topic, time_ns, raw):
-                writer.write(made[connection.id], new_time_ns, new_raw)
-    return target
 
 
 @pytest.fixture

@@ -210,9 +210,9 @@ def read_weights(path: Path, _folder: Path, _random: np.random.Generator) -> Non
 
 def read_state(path: Path, _folder: Path, _random: np.random.Generator) -> None:
     """Read the last state of a training run."""
-    from nlos_models.training import loop as train
+    from nlos_models.training import run_files
 
-    train.read_last(path.parent, lambda _: None)
+    run_files.read_last(path.parent, lambda _: None)
 
 
 def read_label(path: Path, _folder: Path, _random: np.random.Generator) -> None:
@@ -332,7 +332,7 @@ def make_inputs(home: Path, group: str) -> dict[str, Input]:
 
 def _place_torch(home: Path, direct: Path, place: Callable[..., None]) -> None:
     import torch
-    from nlos_models.training import loop as train
+    from nlos_models.training import run_files
 
     from nlos_cam.dataset import open_dataset
 
@@ -350,5 +350,7 @@ def _place_torch(home: Path, direct: Path, place: Callable[..., None]) -> None:
         place(name, weights / name, read_weights, weights)
     state = {"recipe": "{}", "module": {"x": torch.zeros(3)}, "epoch": 1, "rows": [{"loss": 1.0}]}
     torch.save(state, content := io.BytesIO())
-    place(train.LAST, hashlib.sha256(content.getvalue()).digest() + content.getvalue(), read_state)
+    place(
+        run_files.LAST, hashlib.sha256(content.getvalue()).digest() + content.getvalue(), read_state
+    )
     place("short.truth.toml", b'category = "cup"\nsize_m = 0.15\nseed = 1\n', read_label)

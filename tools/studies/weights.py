@@ -43,7 +43,6 @@ from nlos_models.training import MapSet, latent_error, load_encoder, run
 from nlos_cam.cli.common import tracked
 from nlos_cam.dataset import TEST_SEED, TRAINING_SEED, DatasetPlan
 from nlos_cam.evaluate import (
-    QUIET,
     SMALLER_IS_BETTER,
     TARGETS,
     Figures,
@@ -65,6 +64,7 @@ from nlos_cam.files import cache_folder
 from nlos_cam.frames import LidarMaps
 from nlos_cam.objects import benchmark_objects, object_box
 from nlos_cam.reconstruct import estimate_uncertainty
+from nlos_cam.render import QUIET
 
 FRAMES = 10, 100
 DISTANCES_M = (0.15, 0.2, 0.25, 0.3)

@@ -1,5 +1,4 @@
-"""Training loop with exact resume, on one or several processes, and the files of a run: checkpoints
-and logs.
+"""Training loop with exact resume, on one or several processes.
 
 The order of the batches follows from the recipe's seed and the epoch; the noise of a step from
 these, the step and the process. So no state of a random generator is saved, and a run killed at any
@@ -8,12 +7,9 @@ differ from one only in their noise, in the samples behind their batch norms, an
 sums.
 """
 
-import csv
 import hashlib
-import io
 import json
 import math
-import os
 import time
 from collections.abc import Callable, Generator, Iterable
 from contextlib import closing, contextmanager, nullcontext
@@ -26,7 +22,6 @@ import torch
 from lightning_fabric import Fabric
 from torch import Tensor, nn
 
-from nlos_cam.files import TENSOR_LIMIT, atomic_file, read_bounded
 from nlos_models.errors import CheckpointError, ModelError, RecipeError, TrainingError
 from nlos_models.training.distributed import (
     Loss,
@@ -37,25 +32,26 @@ from nlos_models.training.distributed import (
     share_of,
 )
 from nlos_models.training.recipe import Recipe, recipe_of
+from nlos_models.training.run_files import (
+    OnMessage,
+    Scores,
+    State,
+    TensorBoardLog,
+    read_best,
+    read_last,
+    write_best,
+    write_last,
+    write_log,
+)
 from nlos_models.training.schedule import has_ended, schedule_of
 
-LAST = "last.ckpt"
-PREVIOUS = "previous.ckpt"
-BEST = "best.ckpt"
-LOG = "log.csv"
 MINUTES = "minutes.log"
 MINUTE_S = 60.0
 """Interval between lines of MINUTES."""
-DIGEST = hashlib.sha256().digest_size
-"""Bytes at the start of a checkpoint: the SHA-256 of the rest."""
 COMPILERS = ("torch._dynamo", "torch._inductor")
 STOP_CHECK_STEPS = 10
 """Several processes agree every so often, in steps, on whether to stop."""
 
-Scores = dict[str, float]
-"""Held-out metrics by name."""
-State = dict[str, Any]
-OnMessage = Callable[[str], None]
 OnStep = Callable[[int, int], None]
 """Called with the number of steps done and of all steps."""
 Batches = Callable[[torch.Generator], Iterable[Any]]
@@ -64,60 +60,8 @@ Score = Callable[[], Scores]
 Network = TypeVar("Network", bound=Callable[..., Any])
 
 
-def write_last(folder: Path, state: State) -> None:
-    """Write the run's last state; the one before it becomes the previous state. Raises
-    TrainingError.
-    """
-    _write(folder / LAST, _pack(state), folder / PREVIOUS)
-
-
-def write_best(folder: Path, state: State) -> None:
-    """Write the run's best state. Raises TrainingError where it cannot be written."""
-    _write(folder / BEST, _pack(state))
-
-
-def write_log(folder: Path, rows: list[Scores]) -> None:
-    """Write the whole log, one row per epoch. Raises TrainingError where it cannot be written."""
-    text = io.StringIO(newline="")
-    writer = csv.DictWriter(text, list(rows[0]))
-    writer.writeheader()
-    writer.writerows(rows)
-    _write(folder / LOG, text.getvalue().encode())
-
-
-def read_last(folder: Path, on_message: OnMessage) -> State | None:
-    """Return the newest intact state, or None before the first; a damaged last state is reported
-    and skipped.
-
-    Raises CheckpointError where there are states and all of them are damaged.
-    """
-    # The last state is replaced by a rename, and the one before it is kept: whatever a power cut
-    # leaves, one of both is whole.
-    damaged: list[Path] = []
-    for path in (folder / LAST, folder / PREVIOUS):
-        if path.exists():
-            if (state := _unpack(path)) is not None:
-                if damaged:
-                    on_message(
-                        f"{damaged[0]} is damaged: resuming from {path.name}, a few minutes earlier"
-                    )
-                return state
-            damaged.append(path)
-    if damaged:
-        raise CheckpointError(
-            f"{' and '.join(map(str, damaged))} damaged: delete {folder}, or choose another --out"
-        )
-    return None
-
-
-def read_best(folder: Path) -> State:
-    """Return the best state. Raises CheckpointError where it is missing or damaged."""
-    state = _unpack(folder / BEST) if (folder / BEST).exists() else None
-    if state is None:
-        raise CheckpointError(
-            f"{folder / BEST} is missing or damaged: train again into another --out"
-        )
-    return state
+def _ignore(*_: object) -> None:
+    """Do nothing."""
 
 
 def digest_of(*parts: nn.Module | str | None) -> str:
@@ -131,106 +75,6 @@ def digest_of(*parts: nn.Module | str | None) -> str:
         for name, tensor in tensors.items():
             digest.update(name.encode() + tensor.cpu().contiguous().numpy().tobytes())
     return digest.hexdigest()
-
-
-def _pack(state: State) -> bytes:
-    # In memory first: the digest has to stand before the content.
-    buffer = io.BytesIO()
-    torch.save(state, buffer)
-    content = buffer.getbuffer()
-    return hashlib.sha256(content).digest() + content
-
-
-def _unpack(path: Path) -> State | None:
-    """Return the state in a file, or None where it is none, or its digest does not match."""
-    try:
-        raw = read_bounded(path, TENSOR_LIMIT)
-        if len(raw) < DIGEST or hashlib.sha256(memoryview(raw)[DIGEST:]).digest() != raw[:DIGEST]:
-            return None
-        # `weights_only`: a pickle from outside could run any program.
-        state = torch.load(io.BytesIO(raw[DIGEST:]), map_location="cpu", weights_only=True)
-    except Exception:  # noqa: BLE001  the unpickler raises almost anything for crafted bytes
-        return None
-    return cast("State", state) if isinstance(state, dict) else None
-
-
-def _write(path: Path, content: bytes, previous: Path | None = None) -> None:
-    """Replace a file, and keep the one before it as `previous`, if given. Raises TrainingError."""
-    try:
-        with atomic_file(path) as part:
-            with part.open("wb") as file:
-                file.write(content)
-                file.flush()
-                os.fsync(file.fileno())  # what it replaces goes when there is room for the new
-            if previous and path.exists():
-                path.replace(previous)
-    except OSError as error:
-        reason = error.strerror or error
-        raise TrainingError(
-            f"{path} cannot be written ({reason}): free some space and repeat the command, which"
-            " resumes the run"
-        ) from error
-
-
-class TensorBoardLog:
-    """TensorBoard event file of one start of a run; hides rows that an earlier start logged from
-    `epoch` on.
-
-    Starts a writer thread; `fit` closes it. Raises TrainingError without the package tensorboard.
-    """
-
-    def __init__(self, folder: Path, epoch: int) -> None:
-        try:
-            from torch.utils.tensorboard.writer import SummaryWriter
-        except ImportError as error:
-            raise TrainingError(
-                "TensorBoard logs need the package tensorboard: pip install 'nlos-cam[train]', or"
-                " drop --tensorboard"
-            ) from error
-        self._writer: Any = SummaryWriter(str(folder / "tensorboard"), purge_step=epoch)
-
-    def add(self, row: Scores) -> None:
-        """Log one epoch's figures."""
-        for name, value in row.items():
-            if name != "epoch":
-                self._writer.add_scalar(name, value, int(row["epoch"]))
-        self._writer.flush()
-
-    def close(self) -> None:
-        """Close the file and end the writer thread."""
-        self._writer.close()
-
-
-def compile_network(network: Network) -> Network:
-    """Wrap a network, or a part of one, in torch.compile; it is compiled on its first forward and
-    backward pass.
-
-    Random numbers are drawn as without compilation, so that a run may be resumed either way.
-    """
-    # Draws of dropout and noise come from torch's own generator either way.
-    return cast("Network", torch.compile(network, options={"fallback_random": True}))
-
-
-@contextmanager
-def explain_compile_errors() -> Generator[None]:
-    """Raise TrainingError where torch.compile fails in a step forwards and back; other errors
-    pass.
-    """
-    try:
-        yield
-    except RuntimeError as error:
-        if not type(error).__module__.startswith(COMPILERS):
-            raise
-        # A missing compiler shows itself at the first step, inside the compiler's own errors.
-        reason = str(getattr(error, "inner_exception", error)).strip().splitlines()[0]
-        raise TrainingError(
-            f"--compile does not work here ({reason}): install a C++ compiler (g++), or drop"
-            " --compile"
-        ) from error
-
-
-def _ignore(*_: object) -> None:
-    """Do nothing."""
 
 
 @dataclass(frozen=True)
@@ -584,3 +428,31 @@ class _Run:
         self.rows = state["rows"]
         self.total = state["total"].to(self.fabric.device)
         self.average = state.get("average", self.average)
+
+
+def compile_network(network: Network) -> Network:
+    """Wrap a network, or a part of one, in torch.compile; it is compiled on its first forward and
+    backward pass.
+
+    Random numbers are drawn as without compilation, so that a run may be resumed either way.
+    """
+    # Draws of dropout and noise come from torch's own generator either way.
+    return cast("Network", torch.compile(network, options={"fallback_random": True}))
+
+
+@contextmanager
+def explain_compile_errors() -> Generator[None]:
+    """Raise TrainingError where torch.compile fails in a step forwards and back; other errors
+    pass.
+    """
+    try:
+        yield
+    except RuntimeError as error:
+        if not type(error).__module__.startswith(COMPILERS):
+            raise
+        # A missing compiler shows itself at the first step, inside the compiler's own errors.
+        reason = str(getattr(error, "inner_exception", error)).strip().splitlines()[0]
+        raise TrainingError(
+            f"--compile does not work here ({reason}): install a C++ compiler (g++), or drop"
+            " --compile"
+        ) from error

@@ -92,3 +92,9 @@ class SensorModel(Record):
         return warm.to_celsius - (warm.to_celsius - warm.from_celsius) * exp(
             -seconds / warm.time_constant_s
         )
+
+
+QUIET = SensorModel(
+    range_noise_m=0, range_noise_per_m=0, read_noise_counts=0, shot_noise=0, dead_share=0
+)
+"""Sensor without noise or dead pixels; saturation and quantisation stay."""

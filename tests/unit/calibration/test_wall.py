@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from nlos_calibration import MeanNoise, depth_noise_m, load_rig, normal_from_angles
+from nlos_calibration import MeanNoise, depth_noise_m, normal_from_angles
 from nlos_calibration.arrays import Float64
 from nlos_calibration.errors import CalibrationError, WallRefusedError
 from nlos_calibration.flatness import Flatness, Ripples, flatness, ripples
@@ -19,9 +19,8 @@ from nlos_calibration.wall import (
     measures_of,
     warnings,
 )
-from synthetic_walls import view
+from synthetic_walls import PINHOLE, view
 
-PINHOLE = load_rig("bare-wall").pinhole.scaled(160, 120)
 RAYS = PINHOLE.rays()
 COLUMN = np.broadcast_to(np.arange(160), (120, 160))
 ROW = np.broadcast_to(np.arange(120)[:, np.newaxis], (120, 160))
@@ -70,13 +69,6 @@ def test_fit_wall_has_the_angles_of_its_pose() -> None:
     assert fit.yaw_deg == pytest.approx(30.0)
     assert fit.pitch_deg == pytest.approx(-10.0)
     assert fit.facing_deg == pytest.approx(np.degrees(facing_rad))
-
-
-def test_fit_wall_refuses_an_object_before_the_wall() -> None:
-    depth_m = bare(yaw_deg=75.0)
-    depth_m[:, -30:] = 0.5
-    with pytest.raises(WallRefusedError, match="in front"):
-        fit_wall(depth_m, PINHOLE, np.random.default_rng(0))
 
 
 def test_fit_wall_refuses_a_corrugated_wall() -> None:

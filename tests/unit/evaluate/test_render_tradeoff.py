@@ -107,12 +107,6 @@ def test_effects_of_the_scene_are_left_out_in_turn(rows: list[RenderRow]) -> Non
     assert "colour" not in names
 
 
-def test_error_grows_without_tilt(rows: list[RenderRow]) -> None:
-    without = _errors(rows, "without tilt").intensity_error_median
-
-    assert without > 2 * _errors(rows, "standard").intensity_error_median
-
-
 def test_error_is_whole_without_three_bounces(rows: list[RenderRow]) -> None:
     nothing = _errors(rows, "without three-bounce")
 

@@ -4,7 +4,6 @@ images.
 
 from pathlib import Path
 
-import numpy as np
 import pytest
 import small_maps as small
 import torch
@@ -13,7 +12,7 @@ from nlos_models import checkpoint, load_uncertainty_network
 from nlos_models.compressor import Compressor
 from nlos_models.training import checkpoints
 from nlos_models.vae import ResVae
-from small_uncertainty import small_uncertainty_set, untrained_uncertainty, watched_weights
+from small_uncertainty import untrained_uncertainty, watched_weights
 from torch import nn
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -40,15 +39,6 @@ def test_small_networks_have_shapes_and_parts_of_real_ones() -> None:
             isinstance(part, nn.BatchNorm1d | nn.BatchNorm2d) for part in vae.decoder.modules()
         )
         assert vae.decoder.output.weight.requires_grad
-
-
-@pytest.mark.parametrize("seed", [0, 1])
-def test_small_maps_show_their_images_and_nothing_else(seed: int) -> None:
-    maps = small.small_maps(3, seed)
-
-    np.testing.assert_array_equal(maps.image, small.small_images(3, seed))
-    np.testing.assert_array_equal(~np.isnan(maps.depth_m[:, :, 8:-8]), maps.image > 0)
-    assert not maps.intensity[np.isnan(maps.depth_m)].any()
 
 
 @pytest.mark.parametrize("steps", ["two", "one"])
@@ -91,18 +81,3 @@ def test_hard_maps_have_the_named_extremes(channels: tuple[int, ...]) -> None:
     assert [float(d.isnan().float().mean()) for d in depth] == [0, 0, 0, 0.5, 1]
     assert [float(i.max()) for i in intensity] == [10, 0, 255, 10, 10]
     assert {i.shape for i in intensity} == {(1, *channels, 64, 80)}
-
-
-def test_small_uncertainty_set_has_all_kinds_and_varying_errors() -> None:
-    some = small_uncertainty_set(40, 0)
-
-    assert some.nothing.sum() == 20
-    assert some.outside.sum() == 10
-    assert not (some.nothing & some.outside).any()
-    assert not some.truth[some.nothing].any()
-
-    off = np.abs(some.made.astype(float) - some.truth)
-    dark = off[(some.truth > 0) & (some.truth.astype(float) < 0.5)]
-    bright = off[some.truth.astype(float) > 0.5]
-
-    assert dark.min() > 5 * bright.max() > 0

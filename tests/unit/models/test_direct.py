@@ -23,9 +23,10 @@ from nlos_models.training.checkpoints import save_direct
 from nlos_models.training.data import InMemory, MapNoise, MapSet, as_images
 from nlos_models.training.direct import NormalBatch, _stains, train_direct, transfer_direct, vary
 from nlos_models.training.distributed import open_fabric
-from nlos_models.training.loop import BEST, LAST, MINUTES, Running, Scores
+from nlos_models.training.loop import MINUTES, Running, Scores
 from nlos_models.training.losses import two_heads_error
 from nlos_models.training.recipe import DirectSize, recipe_of
+from nlos_models.training.run_files import BEST, LAST
 from nlos_models.training.runs import (
     TrainingRun,
     direct_start,
@@ -264,16 +265,6 @@ def _train(
     folder: Path, running: Running | None = None, **changes: object
 ) -> tuple[DirectNetwork, Scores]:
     return train_direct(_recipe(**changes), Source(), small_maps(4, 1), folder, running)
-
-
-def test_run_stopped_halfway_resumes_exactly(tmp_path: Path) -> None:
-    whole, figures = _train(tmp_path / "whole")
-    with pytest.raises(KeyboardInterrupt):
-        _train(tmp_path / "cut", Running(stop=iter([False] * 4 + [True]).__next__))
-    resumed, again = _train(tmp_path / "cut")
-
-    assert not changed_tensors(whole.state_dict(), resumed.state_dict())
-    assert figures == again
 
 
 def test_run_follows_its_recipe(tmp_path: Path) -> None:

@@ -24,7 +24,7 @@ import small_run
 import torch
 from nlos_models.errors import CheckpointError, RecipeError, TrainingError
 from nlos_models.training import loop as train
-from nlos_models.training import schedule
+from nlos_models.training import run_files, schedule
 from nlos_models.training.direct import NormalBatch
 from nlos_models.training.distributed import launch, open_fabric, precision_on, seed_of, share_of
 from small_run import STEPS, SmallRun, Stopped, changed_tensors, small_recipe, state_of
@@ -47,15 +47,19 @@ def _assert_same(one: SmallRun, other: SmallRun) -> None:
     assert one.log == other.log
 
 
-@pytest.mark.parametrize("schedule", ["one-cycle", "plateau"])
+@pytest.mark.parametrize(
+    "how", [{"schedule": "one-cycle"}, {"schedule": "plateau"}, {"average": 0.9}], ids=str
+)
 @pytest.mark.parametrize("fail_at", [1, STEPS, STEPS + 2, 3 * STEPS])
-def test_resumed_run_equals_uninterrupted(tmp_path: Path, schedule: str, fail_at: int) -> None:
-    whole = _trained(tmp_path / "whole", schedule=schedule)
+def test_resumed_run_equals_uninterrupted(
+    tmp_path: Path, how: dict[str, object], fail_at: int
+) -> None:
+    whole = _trained(tmp_path / "whole", **how)
     with pytest.raises(Stopped):
         SmallRun(whole.recipe, tmp_path / "failed").go(fail_at)
     torch.manual_seed(99)
 
-    _assert_same(_trained(tmp_path / "failed", schedule=schedule), whole)
+    _assert_same(_trained(tmp_path / "failed", **how), whole)
 
 
 @pytest.mark.slow
@@ -77,7 +81,7 @@ def test_run_killed_at_random_moments_equals_uninterrupted(tmp_path: Path) -> No
         ends.append(child.exitcode)
 
     assert ends[:3] == [-signal.SIGKILL] * 3
-    assert (tmp_path / "killed" / train.LAST).exists()
+    assert (tmp_path / "killed" / run_files.LAST).exists()
     _assert_same(_trained(tmp_path / "killed", schedule="one-cycle", epochs=2), whole)
 
 
@@ -149,9 +153,9 @@ def test_run_of_other_recipe_or_origin_is_refused(tmp_path: Path) -> None:
     with pytest.raises(RecipeError, match="weights"):
         SmallRun(run.recipe, tmp_path).go(origin="those weights")
 
-    state = train.read_last(tmp_path, pytest.fail)
+    state = run_files.read_last(tmp_path, pytest.fail)
     del state["origin"]  # a state that does not name its origin is accepted
-    train.write_last(tmp_path, state)
+    run_files.write_last(tmp_path, state)
     SmallRun(run.recipe, tmp_path).go(origin="those weights")
 
 
@@ -204,7 +208,7 @@ def test_diverged_run_keeps_earlier_epochs(tmp_path: Path, monkeypatch: pytest.M
     with pytest.raises(TrainingError, match="epoch 0"):
         _trained(tmp_path / "nan")
 
-    assert not (tmp_path / "nan" / train.BEST).exists()
+    assert not (tmp_path / "nan" / run_files.BEST).exists()
 
 
 def _state(step: int) -> dict[str, object]:
@@ -222,22 +226,24 @@ def _damage(path: Path, how: str) -> None:
 
 
 def test_read_last_returns_last_state_written(tmp_path: Path) -> None:
-    assert train.read_last(tmp_path, pytest.fail) is None
+    assert run_files.read_last(tmp_path, pytest.fail) is None
 
     for step in range(3):
-        train.write_last(tmp_path, _state(step))
+        run_files.write_last(tmp_path, _state(step))
 
-    torch.testing.assert_close(train.read_last(tmp_path, pytest.fail), _state(2), rtol=0, atol=0)
-    assert {path.name for path in tmp_path.iterdir()} == {train.LAST, train.PREVIOUS}
+    torch.testing.assert_close(
+        run_files.read_last(tmp_path, pytest.fail), _state(2), rtol=0, atol=0
+    )
+    assert {path.name for path in tmp_path.iterdir()} == {run_files.LAST, run_files.PREVIOUS}
 
-    (tmp_path / train.LAST).unlink()  # as a kill between the two renames leaves it
+    (tmp_path / run_files.LAST).unlink()  # as a kill between the two renames leaves it
 
-    assert train.read_last(tmp_path, pytest.fail)["step"] == 1
+    assert run_files.read_last(tmp_path, pytest.fail)["step"] == 1
 
-    (tmp_path / "folder" / train.LAST).mkdir(parents=True)
+    (tmp_path / "folder" / run_files.LAST).mkdir(parents=True)
 
     with pytest.raises(CheckpointError, match="damaged"):
-        train.read_last(tmp_path / "folder", print)
+        run_files.read_last(tmp_path / "folder", print)
 
 
 def test_run_of_fewer_objects_than_a_batch_is_refused(tmp_path: Path) -> None:
@@ -248,56 +254,56 @@ def test_run_of_fewer_objects_than_a_batch_is_refused(tmp_path: Path) -> None:
 @pytest.mark.parametrize("how", ["cut", "flipped", "empty"])
 def test_read_last_falls_back_to_the_previous_state(tmp_path: Path, how: str) -> None:
     for step in (1, 2):
-        train.write_last(tmp_path, _state(step))
-    _damage(tmp_path / train.LAST, how)
+        run_files.write_last(tmp_path, _state(step))
+    _damage(tmp_path / run_files.LAST, how)
     messages: list[str] = []
 
-    assert train.read_last(tmp_path, messages.append)["step"] == 1
-    assert [str(tmp_path / train.LAST) in message for message in messages] == [True]
+    assert run_files.read_last(tmp_path, messages.append)["step"] == 1
+    assert [str(tmp_path / run_files.LAST) in message for message in messages] == [True]
 
 
 @pytest.mark.parametrize("how", ["cut", "flipped", "empty"])
 def test_read_best_refuses_a_missing_or_damaged_state(tmp_path: Path, how: str) -> None:
-    with pytest.raises(CheckpointError, match=train.BEST):
-        train.read_best(tmp_path)
-    train.write_best(tmp_path, _state(3))
+    with pytest.raises(CheckpointError, match=run_files.BEST):
+        run_files.read_best(tmp_path)
+    run_files.write_best(tmp_path, _state(3))
 
-    assert train.read_best(tmp_path)["step"] == 3
+    assert run_files.read_best(tmp_path)["step"] == 3
 
-    _damage(tmp_path / train.BEST, how)
-    with pytest.raises(CheckpointError, match=train.BEST):
-        train.read_best(tmp_path)
+    _damage(tmp_path / run_files.BEST, how)
+    with pytest.raises(CheckpointError, match=run_files.BEST):
+        run_files.read_best(tmp_path)
 
 
 def test_read_last_refuses_where_both_states_are_damaged(tmp_path: Path) -> None:
     for step in (1, 2):
-        train.write_last(tmp_path, _state(step))
-    _damage(tmp_path / train.LAST, "flipped")
-    _damage(tmp_path / train.PREVIOUS, "flipped")
+        run_files.write_last(tmp_path, _state(step))
+    _damage(tmp_path / run_files.LAST, "flipped")
+    _damage(tmp_path / run_files.PREVIOUS, "flipped")
 
-    with pytest.raises(CheckpointError, match=train.LAST) as caught:
-        train.read_last(tmp_path, pytest.fail)
+    with pytest.raises(CheckpointError, match=run_files.LAST) as caught:
+        run_files.read_last(tmp_path, pytest.fail)
 
     assert caught.value.exit_code == 4
     assert "\n" not in str(caught.value)
 
 
 def test_full_disk_keeps_earlier_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    train.write_last(tmp_path, _state(1))
-    train.write_log(tmp_path, [{"loss": 1.0}])
+    run_files.write_last(tmp_path, _state(1))
+    run_files.write_log(tmp_path, [{"loss": 1.0}])
     monkeypatch.setattr(
         os, "fsync", Mock(side_effect=OSError(errno.ENOSPC, "No space left on device"))
     )
     for write in (
-        lambda: train.write_last(tmp_path, _state(2)),
-        lambda: train.write_log(tmp_path, [{"loss": 2.0}]),
+        lambda: run_files.write_last(tmp_path, _state(2)),
+        lambda: run_files.write_log(tmp_path, [{"loss": 2.0}]),
     ):
         with pytest.raises(TrainingError, match="No space left on device"):
             write()
 
-    assert train.read_last(tmp_path, pytest.fail)["step"] == 1
-    assert {path.name for path in tmp_path.iterdir()} == {train.LAST, train.LOG}
-    assert "1.0" in (tmp_path / train.LOG).read_text(encoding="utf-8")
+    assert run_files.read_last(tmp_path, pytest.fail)["step"] == 1
+    assert {path.name for path in tmp_path.iterdir()} == {run_files.LAST, run_files.LOG}
+    assert "1.0" in (tmp_path / run_files.LOG).read_text(encoding="utf-8")
 
 
 def test_digest_depends_on_every_bit_and_order() -> None:
@@ -334,7 +340,7 @@ def test_tensorboard_logs_figures_of_each_epoch(tmp_path: Path) -> None:
 def test_missing_tensorboard_names_extra(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "torch.utils.tensorboard.writer", None)
     with pytest.raises(TrainingError, match=r"nlos-cam\[train\]"):
-        train.TensorBoardLog(tmp_path, 0)
+        run_files.TensorBoardLog(tmp_path, 0)
 
 
 @pytest.fixture
@@ -418,7 +424,7 @@ def test_state_of_another_kind_is_refused(
 ) -> None:
     content = io.BytesIO()
     torch.save(state, content)
-    for name in (train.LAST, train.PREVIOUS):
+    for name in (run_files.LAST, run_files.PREVIOUS):
         (tmp_path / name).write_bytes(
             hashlib.sha256(content.getvalue()).digest() + content.getvalue()
         )

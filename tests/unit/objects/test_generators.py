@@ -181,9 +181,6 @@ def test_categories_and_seeds_make_the_same_objects_as_ever() -> None:
 
 UNIT = st.floats(0, 1)
 ENDS = st.integers(-500, 500).map(lambda tenths: tenths / 10)
-SETTINGS = {
-    f"{name}.{key}": s for name, kind in CATEGORIES.items() for key, s in kind.settings.items()
-}
 
 
 @st.composite
@@ -228,28 +225,6 @@ def test_setting_never_draws_held_out_values(setting: Setting, unit: float) -> N
     ):
         low, high = setting.held_out
         assert not low < value < high
-
-
-@pytest.mark.parametrize("name", SETTINGS)
-def test_category_setting_steps_over_its_held_out_interval(name: str) -> None:
-    """A seed reaches a setting only through one number in [0, 1], in which it is monotonic: true of
-    every seed.
-    """
-    setting = SETTINGS[name]
-    low, high = setting.held_out or (np.inf, np.inf)
-    drawn = [setting.draw(unit) for unit in np.linspace(0, 1, 501)]
-    below = [k for k, value in enumerate(drawn) if value <= low]
-    above = [k for k, value in enumerate(drawn) if value >= high]
-
-    assert drawn == sorted(drawn)
-    assert below + above == list(range(501))
-
-    if below and above:  # bisect to the very numbers where it steps over what is held out
-        under = below[-1] / 500
-        over = above[0] / 500
-        while under < (middle := (under + over) / 2) < over:
-            under, over = (middle, over) if setting.draw(middle) <= low else (under, middle)
-        assert setting.draw(under) <= low < high <= setting.draw(over)
 
 
 @settings(max_examples=50, deadline=None)

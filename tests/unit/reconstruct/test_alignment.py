@@ -17,13 +17,10 @@ from nlos_cam.evaluate import per_object
 from nlos_cam.frames import LidarMaps
 from nlos_cam.objects import benchmark_objects, image_from_depth, object_box
 from nlos_cam.reconstruct import Arrival, CalibratedRig, MapAlignment, alignment
-from nlos_cam.render import Scene, Sensor, SensorModel, render
+from nlos_cam.render import QUIET, Scene, Sensor, SensorModel, render
 
 RIG = load_rig("paper-rig")
 THINGS = benchmark_objects(object_box(RIG))[1::9]
-QUIET = SensorModel(
-    range_noise_m=0, range_noise_per_m=0, read_noise_counts=0, shot_noise=0, dead_share=0
-)
 
 
 def trained(rig: Rig = RIG, **changes: Any) -> Any:

@@ -13,7 +13,7 @@ from threading import Event
 import lz4.frame
 import numpy as np
 import pytest
-from mutations import BAG_WAYS, Bag, Message, mutate_bag, read_bag, write_bag
+from mutations import Bag, mutate_bag, read_bag, write_bag
 
 from nlos_cam.errors import RecordingError
 from nlos_cam.recording import (
@@ -242,21 +242,8 @@ def test_consistent_mutation_ends_in_frames_or_a_line(
     noise_bags: dict[str, Path], tmp_path: Path, seed: int
 ) -> None:
     path = tmp_path / "mutated.bag"
-    ways, content = mutate_bag(noise_bags["packed"].read_bytes(), np.random.default_rng(seed))
-
-    assert (ways, content) == mutate_bag(
-        noise_bags["packed"].read_bytes(), np.random.default_rng(seed)
-    )
-    assert set(ways.split("+")) <= {way.__name__ for way in BAG_WAYS}
-
+    _, content = mutate_bag(noise_bags["packed"].read_bytes(), np.random.default_rng(seed))
     path.write_bytes(content)
 
     assert "\n" not in line_of(lambda: use(path))
     assert "\n" not in line_of(lambda: repair_recording(path, path.with_name("repaired.bag")))
-
-
-def test_messages_keep_their_fields() -> None:
-    message = Message(3, (1, 2), b"x")
-    bag = Bag({3: ("/a", "std_msgs/String")}, [message])
-
-    assert read_bag(write_bag(bag, np.random.default_rng(1), packed=True)) == bag

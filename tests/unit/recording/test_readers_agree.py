@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from rewritten_bags import Messages, number_of
 from sdk_playback import SdkReplay
 
 from nlos_cam.camera import intrinsics_of, load_sdk, sample_from_sdk
@@ -19,7 +20,6 @@ from nlos_cam.frames import Frame
 from nlos_cam.recording import BagReader, ReplayCamera
 
 IMAGE = "/image/data"
-Messages = Iterable[tuple[int, bytes]]
 
 
 def values_of(recorded: Iterable[Frame]) -> list[Any]:
@@ -58,10 +58,6 @@ def with_gaps(topic: str, time_ns: int, raw: bytes) -> Messages:
     missing = {8: "Infrared_0", 12: "Confidence_0", 19: "Depth_0"}.get(number, "none")
     if number not in {3, 4} and missing not in topic:
         yield time_ns, raw
-
-
-def number_of(raw: bytes) -> int:
-    return int.from_bytes(raw[:4], "little")
 
 
 @pytest.mark.parametrize("edit", [as_recorded, before_2_49, around_a_wrap, with_gaps])

@@ -255,10 +255,3 @@ def test_repair_recovers_every_chunk_of_a_killed_capture(noise_world: Any, tmp_p
         assert_exposed(frame, world.images(frame.frame_number))
 
     assert played.arrived == found.recovered_frames
-
-
-def test_naive_reader_finds_chunks_of_an_unfinished_recording(noise_bags: Bags) -> None:
-    for name in ("packed", "plain"):
-        found = list(chunks_in(noise_bags[f"{name}-unindexed"]))
-        assert found == list(chunks_in(noise_bags[name]))[:-1]
-        assert found

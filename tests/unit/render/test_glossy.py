@@ -91,13 +91,5 @@ def test_echoes_are_strongest_bins_bit_for_bit(
 
 
 @pytest.mark.slow
-def test_beams_do_not_depend_on_the_others() -> None:
-    job = job_of(retroreflective(0.2, 0.8, 40), every=9)
-    some = np.arange(0, len(job.length_m), 7)
-
-    np.testing.assert_array_equal(glossy.histograms(job)[some], glossy.histograms(job.select(some)))
-
-
-@pytest.mark.slow
 def test_histograms_are_never_negative() -> None:
     assert glossy.histograms(job_of(retroreflective(0.0, 1.0, 300))).min() >= 0

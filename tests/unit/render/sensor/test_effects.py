@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from nlos_calibration import load_rig
 
-from nlos_cam.render import MultiBounce, SensedImages, Sensor, included, sensor_effects
+from nlos_cam.render import QUIET, MultiBounce, SensedImages, Sensor, included, sensor_effects
 from nlos_cam.render.sensor.bias import BIASES
 from nlos_cam.render.sensor.model import DEPTH_UNIT_M, SensorModel, WarmUp
 
@@ -26,9 +26,6 @@ CHAIN = (
     ),
 )
 FORMAT = {"gain", "saturation", "quantisation"}
-QUIET = SensorModel(
-    range_noise_m=0, range_noise_per_m=0, read_noise_counts=0, shot_noise=0, dead_share=0
-)
 WARM_UP = WarmUp(from_celsius=25, to_celsius=45, time_constant_s=600)
 COLD = 25.0
 HAS = {

@@ -18,6 +18,7 @@ from nlos_cam.errors import SceneError
 from nlos_cam.frames import maps_from_frame
 from nlos_cam.objects.placement import object_depth
 from nlos_cam.render import (
+    QUIET,
     STOPS,
     MultiBounce,
     Radiometry,
@@ -35,9 +36,6 @@ from nlos_cam.render.sensor.sensor import cell_of_pixels
 
 RIG = load_rig("paper-rig")
 BARE = load_rig("bare-wall")
-QUIET = SensorModel(
-    range_noise_m=0, range_noise_per_m=0, read_noise_counts=0, shot_noise=0, dead_share=0
-)
 DARK = np.zeros((64, 80), np.float32)
 NO_ECHO = MultiBounce(DARK, DARK, np.full_like(DARK, np.nan))
 
