@@ -25,7 +25,7 @@ from nlos_cam.live.run_commands import (
     RunContext,
     SavingCommands,
 )
-from nlos_cam.live.statistics import camera_ms
+from nlos_cam.live.statistics import WARM_UP_FRAMES, camera_ms
 from nlos_cam.reconstruct import Clock, Pipeline, ignore
 from nlos_cam.view import Moment
 
@@ -34,6 +34,8 @@ RECENT_FRAMES = 300
 STRAIN_FRAMES = 60
 MAX_DROPS = 3
 """Of so many frames (2 s), the number of dropped ones above which the run is too slow."""
+MAX_FILES = 12
+"""Last files that the page offers for download."""
 COMMAND_WAIT_S = 0.5
 """Time after which a command without an answer waits: most take milliseconds."""
 MAX_NUMBER = 1e9
@@ -70,6 +72,8 @@ class RunControl:
         """Monotonic time at which the command that runs began."""
         self._drops: deque[int] = deque(maxlen=STRAIN_FRAMES)
         """Number of frames that processing dropped so far, after each of the last results."""
+        self._drops_at_start: int | None = None
+        """The same while the run warms up."""
         self._too_slow = False
         """True for good once too many were dropped."""
         self._state = "connecting"
@@ -127,8 +131,10 @@ class RunControl:
 
     def note_drops(self, count: int) -> None:
         """Take the number of frames that processing was too slow for so far, after each result."""
+        if self._drops_at_start is None or len(self._recent) < WARM_UP_FRAMES:
+            self._drops_at_start = count
         self._drops.append(count)
-        if count - self._drops[0] > MAX_DROPS:
+        if count - max(self._drops[0], self._drops_at_start) > MAX_DROPS:
             self._too_slow = True
 
     def end(self) -> None:
@@ -183,8 +189,8 @@ class RunControl:
         except OSError as error:
             place = error.filename or self._run.folder.name or "the folder of the run"
             raise NlosCamError(
-                f"{command}: {place} cannot be written ({error.strerror or error}): check that its"
-                " folder is still there and has room"
+                f"{place} cannot be written ({error.strerror or error}): check that its folder is"
+                " still there and has room"
             ) from error
         except TypeError as error:
             raise NlosCamError(f"{command} does not take {dict(arguments)!r}") from error
@@ -193,6 +199,10 @@ class RunControl:
         finally:
             self._command_start_s = None
             self._command_lock.release()
+
+    def file(self, name: str) -> Path | None:
+        """Return the path of a file that a command wrote, by its name; None for any other."""
+        return self._run.files.get(name)
 
     def status(self) -> dict[str, Any]:
         """Return the run's state, pace and controls, ready for JSON."""
@@ -258,6 +268,8 @@ class RunControl:
             "paused": self.pipeline.paused,
             "recording": self.recording.recording is not None,
             "saving": self.saving.is_saving,
+            "files": list(self._run.files)[-MAX_FILES:],
+            "no_reference": self.bench.no_reference,
             "note": (
                 f"{self._camera_name} has no laser or near-wall settings" if has_no_options else ""
             ),

@@ -52,7 +52,7 @@ def test_page_shows_every_layer_name_and_new_moment(
                 lambda page=page, number=first + 5: page.state()["frame"] == number,
                 "the next moment",
             )
-            assert page.state()["headline"] == "Shape not reliable"
+            assert page.state()["headline"] == "Outside the trained range"
             viewer.show(full_moment(first + 6, Verdict.NOTHING))
             page.wait_until(lambda page=page: page.state()["quads"] == 0, "an empty bench")
             assert page.page.evaluate("document.documentElement.scrollWidth") <= size[0], (
@@ -74,7 +74,7 @@ def test_page_says_ended_and_comes_back_with_the_next_run(browser: Any) -> None:
     with WebViewer(RIG, port=port) as viewer:
         viewer.show(full_moment(3))
         page.wait_until(lambda: page.state()["frame"] == 3, "the next run")
-        assert page.state()["headline"] == "Object detected"
+        assert page.state()["headline"] == "Object seen"
         page.close()
 
 
