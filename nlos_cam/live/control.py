@@ -72,8 +72,8 @@ class RunControl:
         """Monotonic time at which the command that runs began."""
         self._drops: deque[int] = deque(maxlen=STRAIN_FRAMES)
         """Number of frames that processing dropped so far, after each of the last results."""
-        self._drops_at_start: int | None = None
-        """The same while the run warms up."""
+        self._noted = 0
+        """Results so far: the first ones, late while the run warms up, say nothing of its pace."""
         self._too_slow = False
         """True for good once too many were dropped."""
         self._state = "connecting"
@@ -131,10 +131,11 @@ class RunControl:
 
     def note_drops(self, count: int) -> None:
         """Take the number of frames that processing was too slow for so far, after each result."""
-        if self._drops_at_start is None or len(self._recent) < WARM_UP_FRAMES:
-            self._drops_at_start = count
+        self._noted += 1
+        if self._noted <= WARM_UP_FRAMES:
+            self._drops.clear()
         self._drops.append(count)
-        if count - max(self._drops[0], self._drops_at_start) > MAX_DROPS:
+        if count - self._drops[0] > MAX_DROPS:
             self._too_slow = True
 
     def end(self) -> None:
