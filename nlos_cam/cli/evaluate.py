@@ -19,6 +19,7 @@ from nlos_cam.cli.common import (
     say,
     tracked,
 )
+from nlos_cam.errors import RecordingError
 
 Count = Annotated[
     int | None,
@@ -72,6 +73,12 @@ def evaluate(
         raise typer.BadParameter(
             "--training is searched for the nearest neighbour: omit it or --no-nearest"
         )
+    # Before what takes seconds to import.
+    for option, given in (("--dataset", data), ("--training", training)):
+        if given and not given.exists():
+            raise RecordingError(
+                f"{option} {given} does not exist: make one with `nlos-cam dataset build`"
+            )
     folder = output_path(out, "evaluation", "", overwrite=overwrite)
     start_s = time.perf_counter()
     with interrupted_by_signals():

@@ -315,10 +315,7 @@ def _loss_lines(report: loop.RunReport) -> list[str]:
 
 
 def _verdict_line(report: loop.RunReport) -> str:
-    phrases = {reconstruct.Verdict.SEEN.value: "object detected"}
-    verdicts = [
-        f"{phrases.get(verdict, verdict)} in {count}" for verdict, count in report.verdicts.items()
-    ]
+    verdicts = [f"{verdict} in {count}" for verdict, count in report.verdicts.items()]
     verdicts[0] = f"{verdicts[0]} of {report.frames} frames".capitalize()
     return ", ".join(verdicts)
 

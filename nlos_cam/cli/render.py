@@ -355,6 +355,9 @@ def _save(
         np.savez_compressed(part, allow_pickle=False, **arrays)
 
 
+MARGIN_POWER = 0.3
+
+
 def _effects(
     scene: renderer.Scene,
     rendering: renderer.Rendering,
@@ -383,18 +386,26 @@ def _table(effects: list[dict[str, Any]]) -> Table:
 
 
 def _draw(path: Path, title: str, depth_m: Float32, rendering: renderer.Rendering) -> None:
+    from matplotlib.colors import PowerNorm
+
     from nlos_cam.files import atomic_file
     from nlos_cam.report import figure_of
 
     figure = figure_of(13, 3.3)
-    maps = {
-        "hidden depth (m from the wall)": depth_m,
-        "lidar depth (m)": rendering.depth_m,
-        "lidar intensity (in units of $I_0$)": rendering.intensity,
-        "margin of the winning echo (0: a tie)": rendering.margin,
+    maps: dict[str, tuple[Float32, dict[str, Any]]] = {
+        "hidden depth (cm from the wall)": (100 * depth_m, {"cmap": "inferno_r"}),
+        "lidar depth (cm)": (100 * rendering.depth_m, {"cmap": "inferno_r"}),
+        "lidar intensity (in units of $I_0$)": (rendering.intensity, {"cmap": "gray"}),
+        # Where the object wins, the margin is some hundredths: it is black on a plain scale.
+        "margin of the winning echo (0: a tie)": (
+            rendering.margin,
+            {"cmap": "cividis", "norm": PowerNorm(MARGIN_POWER, 0.0, 1.0)},
+        ),
     }
-    for axis, (name, image) in zip(figure.subplots(1, len(maps)), maps.items(), strict=True):
-        figure.colorbar(axis.imshow(image, cmap="magma"), ax=axis)
+    for axis, (name, (image, style)) in zip(
+        figure.subplots(1, len(maps)), maps.items(), strict=True
+    ):
+        figure.colorbar(axis.imshow(image, **style), ax=axis)
         axis.set_title(name, fontsize=10)
         axis.axis("off")
     figure.suptitle(title)

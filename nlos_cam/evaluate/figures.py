@@ -33,7 +33,7 @@ DIFFERENCE_V = 0.5
 """Difference in v at the ends of the colour map; 0.1 is 31 mm in the paper's box."""
 Scale = tuple[str, float, float]
 """Name of a colour map, and the values at its ends."""
-VALUE: Scale = ("magma", 0.0, 1.0)
+VALUE: Scale = ("inferno", 0.0, 1.0)
 DIFFERENCE: Scale = ("coolwarm", -DIFFERENCE_V, DIFFERENCE_V)
 TILE = 70
 HEAD = 16
@@ -59,7 +59,8 @@ def draw_sheet(path: Path, image: Float32, truth: Float32, titles: Sequence[str]
         wide_in * columns + 1.8, BLOCK / TILE * wide_in * -(-len(shown) // columns) + 0.2
     )
     axis = figure.subplots()
-    _mosaic(axis, image[shown], truth[shown], [titles[int(k)] for k in shown], columns, wide_in)
+    names = [short(titles[int(k)]) for k in shown]
+    _mosaic(axis, image[shown], truth[shown], names, columns, wide_in)
     _color_bars(figure, axis)
     figure.savefig(path, dpi=100)
 
@@ -81,11 +82,11 @@ def draw_gallery(
             axis,
             image[chosen],
             truth[chosen],
-            [f"{short(titles[int(k)])}: {iou[k]:.2f}" for k in chosen],
+            [f"{short(titles[int(k)])}\nIoU {iou[k]:.2f}" for k in chosen],
             worst,
             1.5,
         )
-        axis.set_title(f"{title} silhouettes (IoU)", fontsize=11)
+        axis.set_title(f"{title} silhouettes", fontsize=11)
     _color_bars(figure, list(axes))
     figure.savefig(path, dpi=90)
 
@@ -100,9 +101,9 @@ def _mosaic(
     axis: Any, image: Float32, truth: Float32, titles: Sequence[str], columns: int, wide_in: float
 ) -> None:
     """Draw truth, reconstruction and difference below each other as one image, each object
-    `wide_in` inches wide.
+    `wide_in` inches wide, with titles of at most two lines.
     """
-    size = min(7.5 * wide_in, 10.0)
+    size = min(7.5 * wide_in, 8.5)
     axis.imshow(mosaic(image, truth, columns))
     axis.set_axis_off()
     for k, title in enumerate(titles):
@@ -110,7 +111,7 @@ def _mosaic(
         axis.text(
             column * TILE + 32,
             block * BLOCK + HEAD - 3,
-            short(title),
+            title,
             fontsize=size,
             ha="center",
             va="bottom",

@@ -25,7 +25,7 @@ from nlos_cam.live.run_commands import (
     RunContext,
     SavingCommands,
 )
-from nlos_cam.live.statistics import camera_ms
+from nlos_cam.live.statistics import WARM_UP_FRAMES, camera_ms
 from nlos_cam.reconstruct import Clock, Pipeline, ignore
 from nlos_cam.view import Moment
 
@@ -36,6 +36,8 @@ MAX_DROPS = 3
 """Of so many frames (2 s), the number of dropped ones above which the run is too slow."""
 LOADING_S = 4.0
 """Time that the networks take to load, between a pre-rendering and the first frame."""
+MAX_FILES = 12
+"""Last files that the page offers for download."""
 COMMAND_WAIT_S = 0.5
 """Time after which a command without an answer waits: most take milliseconds."""
 MAX_NUMBER = 1e9
@@ -72,6 +74,8 @@ class RunControl:
         """Monotonic time at which the command that runs began."""
         self._drops: deque[int] = deque(maxlen=STRAIN_FRAMES)
         """Number of frames that processing dropped so far, after each of the last results."""
+        self._noted = 0
+        """Results so far: the first ones, late while the run warms up, say nothing of its pace."""
         self._too_slow = False
         """True for good once too many were dropped."""
         self._state = "connecting"
@@ -129,6 +133,9 @@ class RunControl:
 
     def note_drops(self, count: int) -> None:
         """Take the number of frames that processing was too slow for so far, after each result."""
+        self._noted += 1
+        if self._noted <= WARM_UP_FRAMES:
+            self._drops.clear()
         self._drops.append(count)
         if count - self._drops[0] > MAX_DROPS:
             self._too_slow = True
@@ -185,8 +192,8 @@ class RunControl:
         except OSError as error:
             place = error.filename or self._run.folder.name or "the folder of the run"
             raise NlosCamError(
-                f"{command}: {place} cannot be written ({error.strerror or error}): check that its"
-                " folder is still there and has room"
+                f"{place} cannot be written ({error.strerror or error}): check that its folder is"
+                " still there and has room"
             ) from error
         except TypeError as error:
             raise NlosCamError(f"{command} does not take {dict(arguments)!r}") from error
@@ -195,6 +202,10 @@ class RunControl:
         finally:
             self._command_start_s = None
             self._command_lock.release()
+
+    def file(self, name: str) -> Path | None:
+        """Return the path of a file that a command wrote, by its name; None for any other."""
+        return self._run.files.get(name)
 
     def status(self) -> dict[str, Any]:
         """Return the run's state, pace and controls, ready for JSON."""
@@ -260,6 +271,8 @@ class RunControl:
             "paused": self.pipeline.paused,
             "recording": self.recording.recording is not None,
             "saving": self.saving.is_saving,
+            "files": list(self._run.files)[-MAX_FILES:],
+            "no_reference": self.bench.no_reference,
             "note": (
                 f"{self._camera_name} has no laser or near-wall settings" if has_no_options else ""
             ),

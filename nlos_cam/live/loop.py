@@ -2,10 +2,12 @@
 display.
 """
 
+import logging
 import time
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 from threading import Event
+from typing import Self
 
 from nlos_cam.camera import Camera
 from nlos_cam.frames import Frame
@@ -23,6 +25,9 @@ from nlos_cam.reconstruct import (
 )
 from nlos_cam.recording import Telemetry, with_telemetry
 from nlos_cam.view import Moment, Viewer
+
+ADVICE = "plug it straight into a USB 3 port; `nlos-cam doctor` says what is wrong"
+"""What to do about a silent camera that has not said itself what it does about it."""
 
 
 class LiveDisplay:
@@ -73,6 +78,26 @@ class LiveDisplay:
         return now_s - result.timestamp_s - self._reader.offset_s
 
 
+class CameraNotes(logging.Handler):
+    """The camera's newest warning while entered, for the page: what it does about a stall, and why;
+    the terminal shows the same.
+    """
+
+    def __init__(self) -> None:
+        super().__init__(logging.WARNING)
+        self.newest = ""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        self.newest = record.getMessage()
+
+    def __enter__(self) -> Self:
+        logging.getLogger("nlos_cam.camera").addHandler(self)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        logging.getLogger("nlos_cam.camera").removeHandler(self)
+
+
 def pace(frames: Iterable[Frame], stop: Event, clock: Clock) -> Iterator[Frame]:
     """Yield recorded frames at the intervals of their timestamps, or later."""
     offset_s: float | None = None
@@ -120,7 +145,8 @@ def run_live(
 
     def on_idle() -> None:
         if statistics.stall.update(clock(), reader.newest_s):
-            control.set_state("stalled", f"no frame for {clock() - (reader.newest_s or 0.0):.0f} s")
+            silent_s = clock() - (reader.newest_s or 0.0)
+            control.set_state("stalled", f"no frame for {silent_s:.0f} s: {notes.newest or ADVICE}")
             display.show_stall()
 
     def count_dropped() -> int:
@@ -139,13 +165,15 @@ def run_live(
         abandon_source=lambda: camera.__exit__(None, None, None),
         on_idle=on_idle,
     )
+    notes = CameraNotes()
     display = LiveDisplay(viewer, count_dropped, reader, telemetry, clock)
     results = iterate_results(
         reader, pipeline, clock, statistics.fail, telemetry, lambda: control.pipeline.paused
     )
     try:
-        with reader, pipeline.checks:
+        with notes, reader, pipeline.checks:
             for result in results:
+                notes.newest = ""
                 moment = display.show(result)
                 statistics.add(result, clock() - result.published_s)
                 statistics.pace.update(statistics.frames, len(reader.dropped))

@@ -1,6 +1,8 @@
 """Commands of a live run, by group: pipeline, saved views, recording, camera and bench."""
 
+import glob
 import re
+import socket
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
@@ -64,6 +66,8 @@ class RunContext:
     newest: Moment | None = None
     ended: bool = False
     """True once no more frames come."""
+    files: dict[str, Path] = field(default_factory=dict[str, Path])
+    """Whole files that commands wrote, by name."""
     on_frame: list[OnFrame] = field(default_factory=list[OnFrame])
     """Called with each frame of the camera, in the reader's thread."""
 
@@ -72,6 +76,14 @@ class RunContext:
         if self.camera is None or self.pipeline is None:
             raise NlosCamError("the camera is not running yet: wait for the first frame")
         return self.camera, self.pipeline
+
+    def note_files(self, path: Path) -> str:
+        """Note that a file, and those beside it of the same stem, are whole; return where they
+        are.
+        """
+        for each in sorted(path.parent.glob(f"{glob.escape(path.stem)}.*")):
+            self.files[each.name] = each
+        return f"in {path.parent.resolve()} on {socket.gethostname()}"
 
     def new_file(self, stem: str, suffix: str) -> Path:
         """Return a path with the present date, to a millisecond."""
@@ -104,7 +116,9 @@ class PipelineCommands:
         _, pipeline = self._run.attached()
         count = int(frames)
         if not 1 <= count <= MAX_AVERAGE or count != frames:
-            raise NlosCamError(f"average {frames}: give a whole number from 1 to {MAX_AVERAGE}")
+            raise NlosCamError(
+                f"{frames} frames to average: give a whole number from 1 to {MAX_AVERAGE}"
+            )
         pipeline.average = count
         older_s = (count - 1) / 2 / FRAMES_PER_S
         return f"the mean of {count} frame{'s' if count > 1 else ''}, {older_s:.2f} s older"
@@ -143,7 +157,9 @@ class SavingCommands:
         moment = self._run.newest
         if moment is None:
             raise NlosCamError("there is no frame yet: wait for the first one")
-        return views.save_moment(self._run.new_file("snapshot", ".npz"), moment)
+        path = self._run.new_file("snapshot", ".npz")
+        outcome = views.save_moment(path, moment)
+        return f"{outcome}, {self._run.note_files(path)}"
 
     def save_session(self) -> str:
         """Save what the page shows from now on as one HTML file."""
@@ -164,7 +180,8 @@ class SavingCommands:
         file, entered = self._session
         self._session = None
         entered.close()
-        return f"saved {file.kept} moments to {file.path}: any browser plays it"
+        place = self._run.note_files(file.path)
+        return f"saved {file.kept} moments to {file.path}, {place}: any browser plays it"
 
 
 class RecordingCommands:
@@ -198,7 +215,8 @@ class RecordingCommands:
             raise NlosCamError("nothing is being recorded")
         self.recording = None
         self._run.on_frame.remove(recording.add)
-        return recording.stop()
+        outcome = recording.stop()
+        return f"{outcome}, {self._run.note_files(recording.path)}"
 
 
 class BenchCommands:
@@ -214,6 +232,20 @@ class BenchCommands:
     @property
     def commands(self) -> Commands:
         return {"option": self.set_option, "take_reference": self.take_reference}
+
+    @property
+    def no_reference(self) -> str:
+        """Reason why no reference can be taken here; empty if it can."""
+        camera = self._run.camera
+        pipeline = self._run.pipeline
+        if camera is None or pipeline is None or pipeline.bench.measured:
+            return ""
+        if camera.rig is None or camera.rig.occluder is None:
+            return ""
+        return (
+            "No reference can be taken: this bench has an occluder, and no wall record says where"
+            " the wall is. Start with --wall wall.toml (`nlos-cam calibrate --wall` measures one)."
+        )
 
     def read_options(self) -> None:
         """Read the camera's options."""
@@ -242,7 +274,8 @@ class BenchCommands:
         count = int(frames)
         if not 1 <= count <= MAX_REFERENCE_FRAMES or count != frames:
             raise NlosCamError(
-                f"take_reference {frames}: give a whole number from 1 to {MAX_REFERENCE_FRAMES}"
+                f"{frames} frames for a reference: give a whole number from 1 to"
+                f" {MAX_REFERENCE_FRAMES}"
             )
         passing: Any = _PassingFrames(self._run, camera)  # all that measuring needs of a camera
         self._run.on_frame.append(passing.frames.put)
@@ -261,7 +294,7 @@ class BenchCommands:
         self.on_bench(pipeline.bench)
         return (
             f"reference of {capture.statistics.depth.frames} frames ({record.verdict}:"
-            f" {record.advice}); wrote {path}"
+            f" {record.advice}); wrote {path}, {self._run.note_files(path)}"
         )
 
 

@@ -55,6 +55,8 @@ def percentiles_ms(seconds: Float64) -> Percentiles:
     return {f"p{share}": 1e3 * float(value) for share, value in zip(SHARES, values, strict=True)}
 
 
+WARM_UP_FRAMES = 45
+"""First frames (1.5 s) that raise no alarm when they are late: caches fill and libraries load."""
 SLOW_FRAMES = 150
 MAX_SLOW_SHARE = 0.02
 """Of this many frames (5 s), the share dropped by slow processing above which there is a
@@ -71,11 +73,15 @@ class PaceWatch:
         self.warnings: tuple[str, ...] = ()
         self._on_warning = on_warning
         self._before = (0, 0)
+        self._is_warm = False
 
     def update(self, frames: int, dropped: int) -> None:
         """Take the numbers of frames with a result and of frames dropped so far; judged every
         SLOW_FRAMES.
         """
+        if not self._is_warm:
+            self._before = frames, dropped
+            self._is_warm = frames + dropped >= WARM_UP_FRAMES
         new = frames - self._before[0]
         lost = dropped - self._before[1]
         if new + lost < SLOW_FRAMES:

@@ -6,8 +6,9 @@ Built from a rig and networks, whose mismatches it lists.
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
+import numpy as np
 from nlos_calibration import Rig, rig_difference
 from nlos_calibration.arrays import Float32
 from nlos_calibration.errors import CalibrationError
@@ -26,7 +27,13 @@ from nlos_cam.reconstruct.alignment import MapAlignment, alignment, rig_to_align
 from nlos_cam.reconstruct.bench import BenchObservation, CalibratedRig
 from nlos_cam.reconstruct.consistency import COMPLETE, MapConsistency, MapFindings
 from nlos_cam.reconstruct.frame_reader import Arrival
-from nlos_cam.reconstruct.network import Clock, Network, Reconstruction, reconstruct_all
+from nlos_cam.reconstruct.network import (
+    Clock,
+    Network,
+    Quality,
+    Reconstruction,
+    reconstruct_all,
+)
 from nlos_cam.reconstruct.physics_check import (
     UNEXPLAINED,
     UNEXPLAINED_EMPTY,
@@ -42,6 +49,11 @@ from nlos_cam.reconstruct.verdict import (
     VerdictLimits,
 )
 
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+MAX_UNCERTAINTY_MM = 30.0
+"""Uncertainty drawn brightest."""
 CHECK_HOLDS_FRAMES = 150
 """Frames (5 s) for which a physics check counts: it runs once a second, longer on a busy machine."""
 TRUSTED_MISSING = 0.02
@@ -50,7 +62,7 @@ fitted to had none."""
 FROZEN = "the camera repeats the same frame: unplug it and plug it in again"
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class FrameResult:
     """Result of one frame: the hidden surface with its uncertainty and verdict."""
 
@@ -98,6 +110,28 @@ class FrameResult:
         """
         return self.reconstruction.points_m
 
+    @property
+    def quality(self) -> Quality | None:
+        """Predicted quality: outline (IoU) and depth error; None without a surface or a quality
+        model.
+        """
+        return self.reconstruction.quality
+
+    def __repr__(self) -> str:
+        words = [f"frame {self.frame_number}", str(self.verdict or "no verdict")]
+        if self.reconstruction.has_surface:
+            seen_cm = 100 * self.depth_m[np.isfinite(self.depth_m)]
+            words.append(f"{seen_cm.size} pixels, {seen_cm.min():.1f} to {seen_cm.max():.1f} cm")
+        if self.quality:
+            words.append(f"outline typically {self.quality.iou[1]:.0%} right")
+        return f"<FrameResult: {', '.join(words)}>"
+
+    def plot(self) -> "Figure":
+        """Return a figure of hidden depth in cm and its uncertainty in mm, over wall coordinates in
+        cm, in the colors of the page.
+        """
+        return plot_result(self)
+
     def to_mesh(self) -> SurfaceMesh:
         """Return the hidden surface as a mesh in the wall frame; its `save` writes .ply, .glb,
         .obj, .csv or .npz.
@@ -118,6 +152,29 @@ class FrameResult:
     def truth_depth_m(self) -> Float32 | None:
         """Ground truth of `depth_m` from a simulated camera; else None."""
         return self.frame.truth_depth_m
+
+
+def plot_result(result: FrameResult) -> "Figure":
+    """Draw a result; see `FrameResult.plot`."""
+    from nlos_cam.report import figure_of
+
+    box = result.reconstruction.box
+    sides_m = box.x_min_m, box.x_max_m, box.y_min_m, box.y_max_m
+    extent_cm = tuple(100 * side_m for side_m in sides_m)
+    near_cm, far_cm = 100 * box.z_near_m, 100 * box.z_far_m
+    maps = [("distance from the wall (cm)", 100 * result.depth_m, "inferno_r", near_cm, far_cm)]
+    if result.uncertainty_m is not None:
+        shown_mm = np.where(np.isnan(result.depth_m), np.nan, 1e3 * result.uncertainty_m)
+        maps.append(("uncertainty (mm)", shown_mm, "viridis", 0.0, MAX_UNCERTAINTY_MM))
+
+    figure = figure_of(4.2 * len(maps), 3.6)
+    axes = figure.subplots(1, len(maps), squeeze=False)[0]
+    for axis, (name, values, colors, low, high) in zip(axes, maps, strict=True):
+        drawn = axis.imshow(values, cmap=colors, vmin=low, vmax=high, extent=extent_cm)
+        axis.set(xlabel="wall x (cm)", ylabel="wall y (cm)")
+        figure.colorbar(drawn, ax=axis, label=name)
+    figure.suptitle(f"frame {result.frame_number}: {result.verdict or 'no verdict'}")
+    return figure
 
 
 class PreparedBench(NamedTuple):

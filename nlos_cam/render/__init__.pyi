@@ -27,6 +27,7 @@ __all__ = [
     "Stop",
     "Stopwatch",
     "Surface",
+    "TransientAxes",
     "TransportJob",
     "WallGrid",
     "WallPaths",
@@ -60,6 +61,7 @@ __all__ = [
     "smooth_patches",
     "three_bounce",
     "transient",
+    "transient_axes",
     "with_pulse",
 ]
 
@@ -84,7 +86,16 @@ from .job import TransportJob
 from .material import Material, Surface, phong, retroreflective
 from .patches import JUMP_M
 from .planning import prepare
-from .renderer import Rendering, render, render_all, render_scan, three_bounce, transient
+from .renderer import (
+    Rendering,
+    TransientAxes,
+    render,
+    render_all,
+    render_scan,
+    three_bounce,
+    transient,
+    transient_axes,
+)
 from .scene import Radiometry, Scene
 from .scene_file import (
     RENDERING_VERSION,

@@ -12,7 +12,7 @@ from math import ceil
 from typing import Any
 
 import numpy as np
-from nlos_calibration.arrays import Float32
+from nlos_calibration.arrays import Float32, Float64
 from numpy.typing import NDArray
 
 from nlos_cam.errors import SceneError
@@ -123,6 +123,40 @@ def transient(
     parts = [_waveforms(problem, beam_histograms(problem, job, backend)) for job in jobs]
     shaped = [part.reshape(*problem.beams.shape, -1) for part in parts]
     return np.stack(shaped, -1) if problem.color_jobs else shaped[0]
+
+
+@dataclass(frozen=True)
+class TransientAxes:
+    """What the numbers of `transient` are over, in the wall frame in metres."""
+
+    path_m: Float64
+    """(bins,); middle of each bin: bin k holds paths from k to k + 1 times `bin_m`."""
+    bin_m: float
+    """Width of a bin as path length; the first begins at the lidar (path 0), when the pulse
+    leaves. Divided by the speed of light it is the time of flight.
+    """
+    lidar_m: Float64
+    """(3,); where all light leaves and comes back."""
+    laser_spots_m: Float64
+    """(rows, columns, 3); where each beam lands; NaN where it meets nothing."""
+    relay_m: Float64
+    """(n, 3); centers of the relay wall's cells from which light comes back."""
+
+
+def transient_axes(scene: Scene, accuracy: str | Accuracy = "standard") -> TransientAxes:
+    """Return bins, beams and relay points of `transient` of the same scene and accuracy."""
+    facts = SceneFacts(scene, accuracy_named(accuracy))
+    beams = facts.beams()
+    relay = facts.relay
+    device = scene.rig.device
+    bins = gate_bins(device)
+    return TransientAxes(
+        (np.arange(bins) + 0.5) * device.bin_m,
+        device.bin_m,
+        beams.lidar_m,
+        beams.laser_spot_m.reshape(*beams.shape, 3),
+        np.column_stack([relay.x_m, relay.y_m, np.zeros(len(relay.x_m))]),
+    )
 
 
 def three_bounce(

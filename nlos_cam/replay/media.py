@@ -160,20 +160,20 @@ def draw_contact_sheet(path: Path, results: list[FrameResult]) -> None:
 
 
 def _rows(results: list[FrameResult]) -> list[Row]:
-    lidar_m = [each.maps.depth_m for each in results]
+    lidar_cm = [100 * each.maps.depth_m for each in results]
     counts = [each.maps.intensity for each in results]
     differences_mm = [1e3 * each.difference.depth_m for each in results if each.difference]
-    hidden_m = [each.depth_m for each in results]
+    hidden_cm = [100 * each.depth_m for each in results]
     uncertainties_mm = [
         np.where(np.isnan(each.depth_m), np.float32(np.nan), 1e3 * each.uncertainty_m)
         for each in results
         if each.uncertainty_m is not None
     ]
     return [
-        Row("lidar depth (m)", "turbo_r", _limits(lidar_m), lidar_m),
+        Row("lidar depth (cm)", "inferno_r", _limits(lidar_cm), lidar_cm),
         Row("infrared (counts)", "gray", _limits(counts), counts),
         Row("difference (mm)", "coolwarm", _symmetric_limits(differences_mm), differences_mm),
-        Row("hidden depth (m)", "inferno_r", _limits(hidden_m), hidden_m),
+        Row("hidden depth (cm)", "inferno_r", _limits(hidden_cm), hidden_cm),
         Row("uncertainty (mm)", "viridis", (0.0, 1e3 * views.MAX_UNCERTAINTY_M), uncertainties_mm),
     ]
 

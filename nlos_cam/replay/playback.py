@@ -2,6 +2,8 @@
 exported.
 """
 
+import glob
+import socket
 from collections.abc import Mapping
 from datetime import datetime
 from functools import cached_property
@@ -50,6 +52,8 @@ class Playback(PlaybackViewer):
         self._calibrated = bench
         self._folder = folder
         self._exporting = Lock()
+        self._files = dict[str, Path]()
+        """Exported files, by name."""
         self._state = "loading the networks"
 
     def reconstruct(self, stop: Event) -> None:
@@ -86,10 +90,15 @@ class Playback(PlaybackViewer):
         """Return the state for the page."""
         message = "" if self._state == "whole" else f"{self._state}, {self.frames} frames so far"
         return {
-            "state": "recording",
+            "state": "playback",
             "message": message,
             "camera": self._camera.uri,
-            "control": {"commands": ["export"], "options": [], "note": ""},
+            "control": {
+                "commands": ["export"],
+                "options": [],
+                "note": "",
+                "files": list(self._files),
+            },
         }
 
     def run(self, command: str, arguments: Mapping[str, Any]) -> str:
@@ -116,4 +125,11 @@ class Playback(PlaybackViewer):
         with FrameReader([frame], lossless=True, stop=Event()) as reader:
             (result,) = iterate_batched(reader, self._pipeline())
         path = self._folder / f"{bag.stem}-{number:06d}-{datetime.now().astimezone():%H%M%S}.npz"
-        return save_moment(path, Moment.recorded(result))
+        outcome = save_moment(path, Moment.recorded(result))
+        for each in sorted(path.parent.glob(f"{glob.escape(path.stem)}.*")):
+            self._files[each.name] = each
+        return f"{outcome}, in {path.parent.resolve()} on {socket.gethostname()}"
+
+    def file(self, name: str) -> Path | None:
+        """Return the path of an exported file, by its name; None for any other."""
+        return self._files.get(name)

@@ -36,18 +36,15 @@ class Assessment:
         return RGB[self.tone]
 
 
-WORDS: dict[Verdict | None, tuple[str, str, Tone]] = {
-    Verdict.NOTHING: ("Nothing detected", "the returning light is that of an empty box", "quiet"),
-    Verdict.OUTSIDE: (
-        "Shape not reliable",
-        "unlike the training data, or not explained by physics",
-        "warning",
-    ),
-    Verdict.SATURATED: ("Sensor saturated", "lower the laser power or shade the light", "alarm"),
-    Verdict.WALL_MOVED: ("Wall or lidar have moved", "calibrate the wall again", "alarm"),
-    Verdict.STALLED: ("Camera stalled", "no new frame: the pictures are old", "alarm"),
-    None: ("Object shape, error unknown", "these weights have no uncertainty model", "quiet"),
+WORDS: dict[Verdict | None, tuple[str, Tone]] = {
+    Verdict.NOTHING: ("the returning light is that of an empty box", "quiet"),
+    Verdict.OUTSIDE: ("shape not reliable: unlike the training data, or not explained", "warning"),
+    Verdict.SATURATED: ("lower the laser power or shade the light", "alarm"),
+    Verdict.WALL_MOVED: ("the wall or the lidar: calibrate the wall again", "alarm"),
+    Verdict.STALLED: ("no new frame: the pictures are old", "alarm"),
+    None: ("error unknown: these weights have no uncertainty model", "quiet"),
 }
+"""Detail and tone by verdict; the headline is the verdict itself, as everywhere."""
 
 
 def assess(moment: Moment) -> Assessment:
@@ -61,7 +58,8 @@ def assess(moment: Moment) -> Assessment:
     verdict = moment.result.verdict
     found = moment.result.reconstruction
     if verdict is not Verdict.SEEN:
-        headline, detail, tone = WORDS[verdict]
+        detail, tone = WORDS[verdict]
+        headline = verdict.capitalize() if verdict else "No verdict"
         return Assessment(headline, detail, tone, trusted=verdict is None)
 
     tone = "estimate"
@@ -81,7 +79,7 @@ def assess(moment: Moment) -> Assessment:
             f"outline about {overlap:.0%} right, depth to about {1e3 * error_m:.0f} mm (the"
             " model's own estimate)"
         )
-    return Assessment("Object detected", detail, tone, trusted=True)
+    return Assessment(verdict.capitalize(), detail, tone, trusted=True)
 
 
 def expected_overlap(found: Reconstruction) -> float | None:

@@ -8,6 +8,7 @@ class Bench {
     this.parts = null;
     this.quads = [];
     this.labels = [];
+    this.marks = [];
     this.reset();
     this.listen();
     new ResizeObserver(() => this.draw()).observe(host);
@@ -46,7 +47,29 @@ class Bench {
       this.zoom(Math.exp(event.deltaY * 0.001));
       this.draw();
     }, { passive: false });
-    this.canvas.addEventListener("dblclick", () => { this.reset(); this.draw(); });
+    this.canvas.addEventListener("dblclick", () => {
+      this.reset();
+      this.draw();
+    });
+    this.canvas.addEventListener("keydown", (event) => {
+      if (!this.key(event.key)) return;
+      event.preventDefault();
+      event.stopPropagation();
+    });
+  }
+
+  // Turn, zoom or reset by a key; return false for another key.
+  key(key) {
+    const turns = { ArrowLeft: [0.1, 0], ArrowRight: [-0.1, 0], ArrowUp: [0, 0.1], ArrowDown: [0, -0.1] };
+    const zooms = { "+": 0.9, "=": 0.9, "-": 1.1 };
+    if (key in turns) {
+      this.yaw += turns[key][0];
+      this.pitch = Math.min(1.5, Math.max(-1.5, this.pitch + turns[key][1]));
+    } else if (key in zooms) this.zoom(zooms[key]);
+    else if (key === "0") this.reset();
+    else return false;
+    this.draw();
+    return true;
   }
 
   zoom(factor) {
@@ -64,6 +87,28 @@ class Bench {
   setSurface(quads) {
     this.quads = quads;
     this.draw();
+  }
+
+  // Points to mark: {point: [x, y, z], color}; two ends of a measurement are joined.
+  setMarks(marks) {
+    this.marks = marks;
+    this.draw();
+  }
+
+  drawMarks() {
+    const ends = this.marks.filter((mark) => mark.end);
+    if (ends.length === 2) this.line(ends.map((mark) => mark.point), "#ffd250", 2, [5, 4]);
+    for (const { point, end } of this.marks) {
+      const [x, y] = this.project(point);
+      this.pen.beginPath();
+      this.pen.arc(x, y, 6, 0, 7);
+      this.pen.strokeStyle = "#0d1011";
+      this.pen.lineWidth = 5;
+      this.pen.stroke();
+      this.pen.strokeStyle = end ? "#ffd250" : "#ffffff";
+      this.pen.lineWidth = 2;
+      this.pen.stroke();
+    }
   }
 
   // Perspective from a point on a sphere about the middle; returns [x, y, distance] in pixels.
@@ -111,6 +156,7 @@ class Bench {
     this.name("object box", [x1, y0, z1], 0, 12);
     if (this.quads.length) this.name("hidden surface", this.quads[0].corners[0], 24, -14, "#ffd27a");
     this.name("lidar", parts.lidar, -22, 14, "#ff8f7d");
+    this.drawMarks();
   }
 
   area(corners, fill, stroke) {

@@ -41,12 +41,12 @@ def hidden_rgb(depth_m: Float32, box: ObjectBox) -> UInt8:
 
 
 def lidar_rgb(depth_m: Float32, near_m: float, far_m: float) -> UInt8:
-    """Return lidar depth (height, width) as a picture, red (near) to blue (far), dark without a
-    return.
+    """Return lidar depth (height, width) as a picture, bright (near) to dark (far), in the colors of
+    hidden depth; the background's without a return.
     """
     share = np.clip((depth_m - near_m) / max(far_m - near_m, 1e-6), 0.0, 1.0)
-    counts = np.nan_to_num(1.0 - share) * 255
-    return _in_color_map(counts, cv2.COLORMAP_TURBO, np.isnan(depth_m))
+    nearness = np.nan_to_num(1.0 - 0.9 * share)
+    return _in_color_map(_from_darkest(nearness), cv2.COLORMAP_INFERNO, np.isnan(depth_m))
 
 
 def infrared_grey(ir: UInt8) -> UInt8:

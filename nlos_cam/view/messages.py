@@ -40,7 +40,6 @@ view.
 COLOR_MAPS = {
     "depth": cv2.COLORMAP_INFERNO,
     "error": cv2.COLORMAP_VIRIDIS,
-    "lidar": cv2.COLORMAP_TURBO,
 }
 
 Arrays = Mapping[str, UInt8]
@@ -95,6 +94,7 @@ def bench_message(rig: Rig, measured: MeasuredWall | None = None) -> bytes:
         "rig": rig.name,
         "parts": parts,
         "box": [box.x_min_m, box.x_max_m, box.y_min_m, box.y_max_m, box.z_near_m, box.z_far_m],
+        "lidar_view": _lidar_view(rig),
         "error_step_m": ERROR_STEP_M,
         "background": BACKGROUND_RGB,
     }
@@ -132,6 +132,17 @@ def _frustum(rig: Rig) -> Corners:
     slopes = (pixels - [pinhole.ppx, pinhole.ppy]) / [pinhole.fx, pinhole.fy]
     rays = np.column_stack([slopes, np.ones(4)])
     return (pose[:3, 3] + FRUSTUM_M * rays @ pose[:3, :3].T).tolist()
+
+
+def _lidar_view(rig: Rig) -> dict[str, Any]:
+    """Return what turns a lidar pixel's depth into a point in the wall frame: pose (3, 4), and the
+    slopes x/z and y/z at the picture's left, right, top and bottom edge.
+    """
+    pinhole = rig.pinhole
+    # Pixel centers are whole numbers: a picture begins half a pixel before its first.
+    edges_x = [(x - pinhole.ppx) / pinhole.fx for x in (-0.5, pinhole.width - 0.5)]
+    edges_y = [(y - pinhole.ppy) / pinhole.fy for y in (-0.5, pinhole.height - 0.5)]
+    return {"pose": rig.wall_from_lidar[:3].tolist(), "slopes": [*edges_x, *edges_y]}
 
 
 def _light_path(rig: Rig, box: ObjectBox) -> Corners:
@@ -172,10 +183,14 @@ class MomentPacker:
             check = moment.result.check
             if check:
                 arrays["residual"] = signed_bytes(check.residual_depth_m, RESIDUAL_SPAN_M)
-            step = max(1, round(frame.ir.shape[1] / self._width))
+            step = self._step(moment.result)
             arrays["lidar"] = depth_bytes(frame.depth_m[::step, ::step], *self._span_m)
             arrays["infrared"] = frame.ir[::step, ::step]
         return pack(self._fields(moment, moment.time_s - self._start_s), arrays)
+
+    def _step(self, result: FrameResult) -> int:
+        """Return the pixels from one column of a thinned lidar picture to the next."""
+        return max(1, round(result.frame.ir.shape[1] / self._width))
 
     def _fields(self, moment: Moment, time_s: float) -> dict[str, Any]:
         result = moment.result
@@ -200,6 +215,7 @@ class MomentPacker:
             "quality": _quality_fields(result.reconstruction.quality),
             "warnings": result.warnings,
             "lidar_span_m": self._span_m,
+            "lidar_step": self._step(result),
             "change_span_m": self._change_span_m,
             "residual_span_m": RESIDUAL_SPAN_M,
             "score": round(score, 3) if np.isfinite(score) else None,

@@ -5,13 +5,15 @@ const INSIDE = [255, 255, 255], MISSED = [90, 170, 255], INVENTED = [255, 140, 6
 const DIFFERENCE_SPAN_CM = 5;
 const DARKEST = 60; // where in the color map the farthest surface starts, so that it stands out from the background
 const MAX_ERROR_MM = 30;
+const find = (selector) => document.querySelector(selector);
+const escape = (text) => String(text).replace(/[&<>"]/g, (sign) => `&#${sign.charCodeAt(0)};`);
 
 class Pictures {
   constructor(bench) {
     this.box = bench.box;
     this.errorStepMm = 1e3 * bench.error_step_m;
     this.ground = bench.background;
-    this.maps = { depth: bench.arrays.map_depth, error: bench.arrays.map_error, lidar: bench.arrays.map_lidar };
+    this.maps = { depth: bench.arrays.map_depth, error: bench.arrays.map_error };
     this.fit = null;
     const pale = (rgb) => rgb.map((value) => 0.35 * value + 0.65 * ((rgb[0] + rgb[1] + rgb[2]) / 3));
     this.tables = {
@@ -19,7 +21,7 @@ class Pictures {
       faded: this.table((byte) => (byte ? pale(this.depthRgb(byte)) : this.ground)),
       error: this.table((byte) => this.errorRgb(byte)),
       grey: this.table((byte) => Array(3).fill(byte * 0.8)),
-      lidar: this.table((byte) => (byte ? this.color("lidar", 1 - (byte - 1) / 254) : this.ground)),
+      lidar: this.table((byte) => this.depthRgb(byte)),
       signed: this.table((byte) => this.signedRgb(byte)),
       signs: this.table((index) => [INSIDE, INVENTED, MISSED][index] || INSIDE),
     };
@@ -87,18 +89,29 @@ class Pictures {
         contour(pen, moment.arrays.surface, level, 8, dash, width);
   }
 
-  // Red: reconstructed nearer to the wall than the truth; blue: farther; where only one has a surface, its own color.
+  // Red: reconstructed nearer to the wall than the truth; blue: farther; where only one has a surface, its own
+  // color and hatch.
   difference(figure, depth, truth) {
-    const step = this.cm(2) - this.cm(1), { signed, signs } = this.tables, perCount = (127 * step) / DIFFERENCE_SPAN_CM;
-    let both = 0, either = 0, sum = 0;
-    this.paint(figure, depth.rows, depth.columns, (i) => {
-      const a = depth.data[i], b = truth.data[i];
-      if (a || b) either++;
-      if (!a || !b) return a ? signs[1] : b ? signs[2] : signed[0];
+    const step = this.cm(2) - this.cm(1);
+    const { signed, signs } = this.tables;
+    const perCount = (127 * step) / DIFFERENCE_SPAN_CM;
+    const only = []; // cells where only one has a surface: [index, whether it is extra]
+    let both = 0;
+    let sum = 0;
+    const pen = this.paint(figure, depth.rows, depth.columns, (i) => {
+      const a = depth.data[i];
+      const b = truth.data[i];
+      if (!a && !b) return signed[0];
+      if (!a || !b) {
+        only.push([i, a > 0]);
+        return a ? signs[1] : signs[2];
+      }
       both++;
       sum += Math.abs(a - b);
       return signed[Math.max(1, Math.min(255, Math.round(128 + perCount * (a - b))))];
     }, 8);
+    hatch(pen, only, depth.columns, 8);
+    const either = both + only.length;
     return { overlap: either ? both / either : 1, errorMm: both ? (10 * step * sum) / both : 0 };
   }
 
@@ -164,10 +177,31 @@ class Pictures {
     this.paint(figure, rows, columns, (i) => this.tables.depth[Math.max(i, 1)]);
   }
 
+  // Its colors beside a title, from the least value to the largest.
   swatch(name) {
-    const at = (share) => (name === "signed" ? this.signedRgb(1 + Math.round(254 * share)) : name === "grey" ? Array(3).fill(255 * share) : this.color(name, name === "lidar" ? 1 - share : share));
-    return `<i style="background: linear-gradient(90deg, ${[0, 0.25, 0.5, 0.75, 1].map((share) => `rgb(${at(share).map(Math.round)})`).join(", ")})"></i>`;
+    const colors = {
+      signed: (share) => this.signedRgb(1 + Math.round(254 * share)),
+      grey: (share) => Array(3).fill(255 * share),
+      lidar: (share) => this.depthRgb(1 + Math.round(254 * share)),
+      error: (share) => this.color("error", share),
+    };
+    const stops = [0, 0.25, 0.5, 0.75, 1].map((share) => `rgb(${colors[name](share).map(Math.round)})`);
+    return `<i style="background: linear-gradient(90deg, ${stops.join(", ")})"></i>`;
   }
+}
+
+// Lines through cells, rising where the surface is extra and falling where it is missing.
+function hatch(pen, cells, columns, scale) {
+  pen.beginPath();
+  for (const [i, extra] of cells) {
+    const x = (i % columns) * scale;
+    const y = Math.floor(i / columns) * scale;
+    pen.moveTo(x, extra ? y + scale : y);
+    pen.lineTo(x + scale, extra ? y : y + scale);
+  }
+  pen.strokeStyle = "#0d1011";
+  pen.lineWidth = 2;
+  pen.stroke();
 }
 
 // Lines where a map crosses a level: marching squares over pixel centres.

@@ -20,15 +20,18 @@ from dataclasses import dataclass, field, replace
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from io import BytesIO
+from pathlib import Path
 from socketserver import TCPServer
 from threading import BoundedSemaphore, Condition, Thread
 from typing import Any
+from urllib.parse import unquote
 
 from nlos_cam.errors import NlosCamError
 
 LOOPBACK = "127.0.0.1"
 STREAM_PATH = "/stream"
 COMMAND_PATH = "/command"
+FILES_PATH = "/files/"
 TIMEOUT_S = 5.0
 """Seconds for a whole request, and for each piece of an answer, after which a browser is cut."""
 PIECE_BYTES = 1 << 18
@@ -74,7 +77,9 @@ class Served:
     command: Command | None = None
     """None for a view without controls."""
     token: str = ""
-    """Secret that a command must bring."""
+    """Secret that a command, or who asks for a file, must bring."""
+    file: Callable[[str], Path | None] = field(default=lambda _: None)
+    """Path of a file that a command wrote, by its name alone."""
     max_streams: int = MAX_STREAMS
     known: Callable[[str], bool] = field(default=lambda _: False)
     """Check of a Host header."""
@@ -144,12 +149,33 @@ class Handler(BaseHTTPRequestHandler):
     def _get(self, path: str) -> None:
         if path == STREAM_PATH:
             self._answer_stream()
+        elif path.startswith(FILES_PATH):
+            self._answer_file(unquote(path.removeprefix(FILES_PATH)))
         elif path in self.served.assets:
             kind, content = self.served.assets[path]
             self._begin(HTTPStatus.OK, kind, len(content))
             self._send(content)
         else:
             self._say(HTTPStatus.NOT_FOUND, "there is nothing here: the view is at /")
+
+    def _answer_file(self, name: str) -> None:
+        """Send a file that a command wrote, to who may command."""
+        path = self.served.file(name)
+        if not self._has_token():
+            self._forbid(
+                "read-only: open the address that was printed, with its token, to download"
+            )
+        elif path is None or not path.is_file():
+            self._say(HTTPStatus.NOT_FOUND, "this run wrote no such file, or it was moved away")
+        else:
+            with path.open("rb") as file:
+                self._begin(HTTPStatus.OK, "application/octet-stream", path.stat().st_size)
+                while piece := file.read(PIECE_BYTES):
+                    self._send(piece)
+
+    def _has_token(self) -> bool:
+        token = self.headers.get("X-Token", "")
+        return hmac.compare_digest(token.encode(), self.served.token.encode())
 
     def _answer_stream(self) -> None:
         if not self.streams.acquire(blocking=False):
@@ -168,10 +194,9 @@ class Handler(BaseHTTPRequestHandler):
 
     def _post(self, path: str) -> None:
         run = self.served.command
-        token = self.headers.get("X-Token", "")
         if path != COMMAND_PATH or run is None:
             self._say(HTTPStatus.NOT_FOUND, "this view has no controls")
-        elif not hmac.compare_digest(token.encode(), self.served.token.encode()):
+        elif not self._has_token():
             self._forbid("read-only: open the address that was printed, with its token, to control")
         else:
             self._run_command(run)

@@ -32,6 +32,8 @@ MAX_BYTES = 512 << 20
 """Largest size: browsers cannot load much more."""
 SESSION_MARK = b"nlos-cam session"
 SESSION_SUFFIX = ".html"
+SCRIPTS = "bench.js", "pictures.js", "inspect.js", "player.js", "controls.js", "page.js"
+"""Scripts of the page, in their order."""
 
 
 def page_html(mode: str) -> str:
@@ -40,7 +42,7 @@ def page_html(mode: str) -> str:
     """
     folder = resources.files("nlos_cam.view")
     page = (folder / "page.html").read_text(encoding="utf-8")
-    for name in ("bench.js", "pictures.js", "page.js"):
+    for name in SCRIPTS:
         script = (folder / name).read_text(encoding="utf-8")
         page = page.replace(f'<script src="{name}"></script>', f"<script>\n{script}</script>")
     return page.replace('data-mode="live"', f'data-mode="{mode}"')

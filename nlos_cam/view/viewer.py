@@ -3,6 +3,7 @@
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any, Protocol, Self
 
 from nlos_cam.reconstruct import FrameResult
@@ -40,6 +41,10 @@ class Controls(Protocol):
 
     def run(self, command: str, arguments: Mapping[str, Any]) -> str:
         """Run a command and return its outcome in words. Raises NlosCamError with the reason."""
+        ...
+
+    def file(self, name: str) -> Path | None:
+        """Return the path of a file that a command wrote, by its name; None for any other."""
         ...
 
 

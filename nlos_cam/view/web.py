@@ -6,6 +6,7 @@ import secrets
 import tempfile
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from threading import Condition, Event, Lock, Thread
 from typing import NamedTuple, Self
@@ -60,8 +61,10 @@ class Website:
 
     def __enter__(self) -> Self:
         port = PREFERRED_PORT if self._port is None else self._port
-        command = self._controls.run if self._controls else None
-        served = Served(self._assets(), self._stream, command, self._token)
+        served = Served(self._assets(), self._stream, token=self._token)
+        command = self._controls
+        if command:
+            served = replace(served, command=command.run, file=command.file)
         self._server = ViewServer(served, port, host=self._host, exact=self._port is not None)
         self.address = self._server.address + (f"#{self._token}" if command else "")
         return self

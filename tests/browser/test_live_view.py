@@ -90,10 +90,8 @@ def test_controls_of_a_live_run_do_what_they_say(
     save_snapshot(page, tmp_path)
     change_run(page)
     save_session(page, browser, tmp_path)
-    assert "bare wall" in page.click("#reference"), (
-        "with an object hidden, the reference is refused, and why"
-    )
-    assert page.page.evaluate("document.querySelector('#answer').className") == "failed"
+    assert page.page.is_disabled("#reference"), "this bench has an occluder and no wall record"
+    assert "--wall" in page.page.inner_text("#reason")
     assert page.hosts == {"127.0.0.1"}, "the page fetched from elsewhere"
     assert page.errors == []
     assert program.interrupt() == 130
@@ -148,6 +146,38 @@ def save_session(page: Page, browser: Any, folder: Path) -> None:
     page.page.wait_for_timeout(1500)
     assert "any browser" in page.click("#session")
     Page(browser, only(folder, "session-*.html").as_uri()).drawn().close()
+
+
+def test_keys_record_pause_save_and_replay_without_a_pointer(
+    start: Callable[..., Program], browser: Any, tmp_path: Path
+) -> None:
+    program = start("live", "--camera", "sim")
+    page = Page(browser, program.address).drawn()
+    page.wait_until(lambda: page.page.query_selector("#record") is not None, "the controls")
+    keys = page.page.keyboard
+    assert "recording" in page.answer(lambda: keys.press("r"))
+    page.wait_until(lambda: page.page.inner_text("#record") == "Stop recording", "the button")
+    page.page.wait_for_timeout(1500)
+    assert str(tmp_path) in page.answer(lambda: keys.press("r")), "the folder is named"
+
+    page.answer(lambda: keys.press("Space"))
+    page.wait_until(lambda: page.state()["headline"] == "Paused", "the pause")
+    page.answer(lambda: keys.press("Space"))
+    assert "wrote" in page.answer(lambda: keys.press("s"))
+    page.wait_until(lambda: page.page.query_selector("[data-file$='.npz']") is not None, "the file")
+    with page.page.expect_download() as download:
+        page.page.focus("[data-file$='.npz']")
+        keys.press("Enter")
+    assert Path(download.value.path()).read_bytes() == only(tmp_path, "*.npz").read_bytes()
+    assert program.interrupt() == 130
+
+    replay = Page(browser, start("view", only(tmp_path, "live-*.bag").name).address).drawn()
+    replay.wait_until(lambda: not replay.state()["status"].get("message"), "the whole recording")
+    frame = replay.state()["frame"]
+    replay.page.keyboard.press("ArrowRight")
+    replay.wait_until(lambda: replay.state()["frame"] > frame, "the next frame")
+    replay.page.keyboard.press("Space")
+    assert replay.state()["playing"]
 
 
 def test_page_without_the_token_is_read_only(start: Callable[..., Program], browser: Any) -> None:

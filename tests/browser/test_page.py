@@ -52,7 +52,7 @@ def test_page_shows_every_layer_name_and_new_moment(
                 lambda page=page, number=first + 5: page.state()["frame"] == number,
                 "the next moment",
             )
-            assert page.state()["headline"] == "Shape not reliable"
+            assert page.state()["headline"] == "Outside the trained range"
             viewer.show(full_moment(first + 6, Verdict.NOTHING))
             page.wait_until(lambda page=page: page.state()["quads"] == 0, "an empty bench")
             assert page.page.evaluate("document.documentElement.scrollWidth") <= size[0], (
@@ -74,7 +74,7 @@ def test_page_says_ended_and_comes_back_with_the_next_run(browser: Any) -> None:
     with WebViewer(RIG, port=port) as viewer:
         viewer.show(full_moment(3))
         page.wait_until(lambda: page.state()["frame"] == 3, "the next run")
-        assert page.state()["headline"] == "Object detected"
+        assert page.state()["headline"] == "Object seen"
         page.close()
 
 
@@ -212,12 +212,73 @@ def settled() -> tuple[int, int, float]:
     return before
 
 
+UNDER_TEXT = """() => {
+  const box = (element) => element.getBoundingClientRect();
+  const texts = [...document.querySelectorAll("#status, #verdict, figcaption, figure small, #readout, #tabbed")];
+  const pictures = [...document.querySelectorAll("figure div, #bench")];
+  const meet = (a, b) => a.left < b.right - 1 && b.left < a.right - 1 && a.top < b.bottom - 1 && b.top < a.bottom - 1;
+  return pictures.flatMap((picture) => texts.filter((text) => meet(box(picture), box(text))).map((text) => text.textContent));
+}"""
+
+
+@pytest.mark.parametrize("size", [(1280, 720), (1366, 657), (1920, 1080), (390, 844)])
+def test_no_text_lies_over_a_picture_however_many_warnings(
+    browser: Any, size: tuple[int, int]
+) -> None:
+    with WebViewer(RIG) as viewer:
+        viewer.show(with_result(full_moment(0), warnings=("a long warning about the bench",) * 12))
+        page = Page(browser, viewer.address or "", size).drawn()
+        assert page.page.evaluate(UNDER_TEXT) == []
+
+
+def test_point_has_values_and_marks_in_every_map_and_a_distance(browser: Any) -> None:
+    with WebViewer(RIG) as viewer:
+        viewer.show(full_moment(0))
+        page = Page(browser, viewer.address or "").drawn()
+        box = page.page.query_selector("#found div").bounding_box()
+        middle_px = box["y"] + 0.51 * box["height"]
+        page.page.mouse.move(box["x"] + 0.32 * box["width"], middle_px)
+        for part in ("depth 2", "truth", "wall x", "pixel row 32, column 20"):
+            assert part in page.state()["readout"]
+        assert (page.state()["marks"], page.state()["benchMarks"]) == (5, 1)
+
+        page.page.keyboard.press("m")
+        for share in (0.25, 0.4):
+            page.page.mouse.click(box["x"] + share * box["width"], middle_px)
+        assert "distance" in page.state()["readout"]
+        page.page.keyboard.press("Escape")
+        page.page.mouse.click(box["x"] + 0.3 * box["width"], middle_px)
+        assert page.page.query_selector("#found.large") is not None
+        assert page.errors == []
+
+
+def test_ended_run_can_be_played_and_saved_and_nothing_else(browser: Any, tmp_path: Path) -> None:
+    with WebViewer(RIG) as viewer:
+        page = Page(browser, viewer.address or "")
+        for number in range(12):
+            viewer.show(with_result(full_moment(number), warnings=("hot",)))
+            time.sleep(0.15)
+        page.drawn()
+        viewer.show(full_moment(20))
+        page.wait_until(lambda: page.state()["frame"] == 20, "the last moment")
+    page.wait_until(lambda: page.state()["headline"] == "The run has ended", "the end")
+    assert page.page.inner_text("#warnings") == ""
+    with page.page.expect_download() as download:
+        page.page.click("#save-last")
+    download.value.save_as(tmp_path / "session.html")
+    page.page.click("#play-last")
+    page.wait_until(lambda: page.state()["frame"] < 20, "it plays")
+    page.close()
+    saved = Page(browser, (tmp_path / "session.html").as_uri()).drawn()
+    assert saved.errors == []
+
+
 def test_page_without_truth_shows_the_errors_in_its_place(browser: Any) -> None:
     with WebViewer(RIG) as viewer:
         real = full_moment(0)
         frame = replace(real.result.frame, truth_depth_m=None)
         viewer.show(with_result(real, frame=frame))
         page = Page(browser, viewer.address or "").drawn()
-        assert page.page.inner_text("#truth figcaption").startswith("Error")
+        assert page.page.inner_text("#truth figcaption").startswith("Uncertainty")
         assert not page.page.is_visible("#errors")
         page.close()

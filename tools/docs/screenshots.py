@@ -43,26 +43,26 @@ CUP = 'rig = "paper-rig"\n[object]\ncategory = "cup"\n'
 ASIDE = f"{CUP}size_m = 0.06\nx_m = 0.08\n"
 UNPLUG = '[[faults]]\nkind = "unplug"\nat_frame = 300\nframes = 900\n'
 SITUATIONS: dict[str, tuple[list[str], str, str]] = {
-    "object": (["live", "sim"], "", "Object detected"),
+    "object": (["live", "sim"], "", "Object seen"),
     "nothing": (
         ["live", "sim:{folder}/nothing.toml"],
         'name = "empty"\nrig = "paper-rig"\n',
-        "Nothing detected",
+        "Nothing there",
     ),
     "outside": (
         ["live", "sim:{folder}/outside.toml"],
         f'name = "outside"\n{ASIDE}',
-        "Shape not reliable",
+        "Outside the trained range",
     ),
-    "calibrated": (["live", "sim", "--wall", "{folder}/wall.toml"], "", "Object detected"),
-    "moved": (["live", "sim", "--wall", "{folder}/wall.toml"], "", "Wall or lidar have moved"),
+    "calibrated": (["live", "sim", "--wall", "{folder}/wall.toml"], "", "Object seen"),
+    "moved": (["live", "sim", "--wall", "{folder}/wall.toml"], "", "Wall moved"),
     "stalled": (
         ["live", "sim:{folder}/stalled.toml"],
         f'name = "stalled"\n{CUP}{UNPLUG}',
         "Camera stalled",
     ),
     "ended": (["live", "sim", "--seconds", "12"], "", "The run has ended"),
-    "phone": (["live", "sim"], "", "Object detected"),
+    "phone": (["live", "sim"], "", "Object seen"),
 }
 """Arguments of the program, its scene, and the headline to wait for."""
 SIZES = {"phone": (390, 844)}

@@ -307,7 +307,7 @@ def test_summary_has_a_sentence_per_fact() -> None:
     assert summary(report).splitlines()[2:] == [
         "Dropped 5 frames: 2 at the camera, 3 because processing was too slow",
         "Warning: 33% of the frames dropped, median latency 9 ms: close other programs",
-        "Object detected in 7 of 10 frames, nothing there in 3",
+        "Object seen in 7 of 10 frames, nothing there in 3",
         "Irregular: 1 blank",
         "Stalled for 1.2 s without a frame",
         "Warning in 4 frames: the lidar has drifted",

@@ -124,7 +124,7 @@ def titles(figure: Figure) -> list[str]:
 
 def test_sheet_has_a_row_per_map_and_a_column_per_frame(figures: list[Any]) -> None:
     draw_contact_sheet(Path("sheet.png"), [wall_result(3), wall_result(9)])
-    rows = ["lidar depth (m)", "infrared (counts)", "hidden depth (m)"]
+    rows = ["lidar depth (cm)", "infrared (counts)", "hidden depth (cm)"]
 
     assert titles(figures[0]) == ["frame 3", "frame 9", *rows]
 

@@ -51,12 +51,14 @@ def test_depth_pictures_show_missing_depth_as_background() -> None:
     ).tolist() == [[5, 6]]
 
 
+def test_lidar_depth_darkens_all_the_way_in_the_colors_of_hidden_depth() -> None:
+    rgb = images.lidar_rgb(np.linspace(0.1, 1.0, 40, dtype=np.float32)[None], 0.1, 1.0)[0]
+    luminance = rgb @ np.array([0.2126, 0.7152, 0.0722])
+
+    assert (np.diff(luminance) <= 0).all()
+
+
 def test_near_is_red_far_is_blue_and_equal_is_grey() -> None:
-    near, far = images.lidar_rgb(np.array([[0.1, 1.0]], np.float32), 0.1, 1.0)[0]
-
-    assert near[0] > near[2]
-    assert far[2] > far[0]
-
     near, same, far, nothing = images.difference_rgb(
         np.array([-0.01, 0.0, 0.01, np.nan]), 0.01
     ).astype(int)

@@ -321,7 +321,7 @@ def test_bench_message_names_every_part(measured: object) -> None:
     )
     assert fields["parts"]["lidar"] == pytest.approx([0.0, 0.0, 0.2])
     assert ("footprint" in fields["parts"]) == (measured is not None)
-    assert {"map_depth", "map_error", "map_lidar"} <= set(arrays)
+    assert {"map_depth", "map_error"} <= set(arrays)
 
 
 def with_uncertainty(
