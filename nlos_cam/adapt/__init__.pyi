@@ -7,7 +7,9 @@ __all__ = [
     "bench_sensor",
     "calibration_spread",
     "install",
+    "write_page",
 ]
 
 from .plan import Plan, Stage, bench_sensor, calibration_spread
+from .report import write_page
 from .run import Adaptation, AdaptResult, adapt, install

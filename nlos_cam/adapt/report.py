@@ -3,16 +3,15 @@ minutes would bring.
 """
 
 import csv
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from nlos_cam.adapt.plan import Plan, Stage
-from nlos_cam.evaluate import LABELS, TARGETS, format_interval
+from nlos_cam.adapt.run import NETWORK, REPORT, AdaptResult
 from nlos_cam.report import (
     Banner,
     Commands,
@@ -27,7 +26,6 @@ from nlos_cam.report import (
     write_document,
 )
 
-PAGE = "adapt.html"
 LATE_SHARE = 0.5
 """The gain of further work is read off the second half of a run."""
 
@@ -105,27 +103,14 @@ def draw_curves(curves: Sequence[Curve]) -> bytes:
     return png(figure)
 
 
-def write_page(
-    folder: Path,
-    plan: Plan,
-    figures: tuple[Mapping[str, Any], Mapping[str, Any]],
-    curves: Sequence[Curve],
-    sheet: Path,
-) -> Path:
-    """Write the report of an adaptation; `figures` are those before and after it.
-
-    Returns the path of the page.
+def write_page(result: AdaptResult, rows: Sequence[tuple[str, str, str]], page: Path) -> None:
+    """Write the report of an adaptation; `rows` hold the name of a metric, and its text before and
+    after.
     """
-    before, after = figures
-    rows = [
-        (LABELS[metric], format_interval(before[metric]), format_interval(after[metric]))
-        for metric in TARGETS
-    ]
-    better = after["silhouette_iou"]["value"] > before["silhouette_iou"]["value"]
-    headline = (
-        f"Silhouette IoU {before['silhouette_iou']['value']:.3f} ->"
-        f" {after['silhouette_iou']['value']:.3f}"
-    )
+    plan = result.plan
+    curves = read_curves(plan, [folder / NETWORK / "log.csv" for folder in result.folders])
+    before, after = (each["silhouette_iou"]["value"] for each in (result.before, result.after))
+    headline = f"Silhouette IoU {before:.3f} -> {after:.3f}"
     spread = plan.spread
     facts = {
         "objects rendered for this bench": f"{plan.stages[-1].objects}",
@@ -145,7 +130,8 @@ def write_page(
         "54 test objects, rendered on this bench with the sensor's noise. Simulated light.",
         [
             Section(
-                "", [Banner("good" if better else "doubtful", headline, outlook(plan, curves))]
+                "",
+                [Banner("good" if after > before else "doubtful", headline, outlook(plan, curves))],
             ),
             Section(
                 "Before and after",
@@ -166,9 +152,12 @@ def write_page(
                 "On 400 objects that no training saw.",
                 draw_curves(curves),
             ),
-            saved_picture("Truth, reconstruction and difference", "The 54 test objects.", sheet),
+            saved_picture(
+                "Truth, reconstruction and difference",
+                "The 54 test objects.",
+                result.folders[-1] / REPORT / "sheet.png",
+            ),
             Section("Next commands", [Commands(["nlos-cam live --bench BENCH"])]),
         ],
     )
-    write_document(document, folder / PAGE)
-    return folder / PAGE
+    write_document(document, page)

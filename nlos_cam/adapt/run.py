@@ -21,7 +21,6 @@ from nlos_calibration import Rig
 from nlos_models import training
 
 from nlos_cam import dataset as data
-from nlos_cam import evaluate as measure
 from nlos_cam.adapt.plan import (
     BATCH,
     FIRST_OBJECTS,
@@ -31,9 +30,8 @@ from nlos_cam.adapt.plan import (
     Stage,
     load_plan,
 )
-from nlos_cam.adapt.report import read_curves, write_page
 from nlos_cam.errors import OutputExistsError, SceneError
-from nlos_cam.files import atomic_directory, atomic_file, cache_folder, checksums_of, claim
+from nlos_cam.files import atomic_directory, cache_folder, checksums_of, claim
 from nlos_cam.render import SensorModel
 
 OBJECTS = "objects"
@@ -43,9 +41,9 @@ QUALITY = "quality"
 NETWORK = "network"
 WEIGHTS = "weights"
 PACKED = "packed"
-BEFORE = "before.json"
-AFTER = "after.json"
+BEFORE = "before"
 REPORT = "report"
+FIGURES = "figures.json"
 HELD_OUT_OBJECTS = 400
 QUALITY_SEED = 40_000_000
 JUDGED_SEED = 30_000_000
@@ -61,6 +59,9 @@ PACE_STEPS = 6
 RECIPE = "doubt"
 
 Farm = Any
+Measure = Callable[[Path | None, Path], None]
+"""Measures weights (None: the shipped ones) on the bench's test objects: writes FIGURES and a report
+into a folder."""
 Tracked = Callable[[str], AbstractContextManager[Callable[[int, int], None]]]
 
 
@@ -87,13 +88,12 @@ class AdaptResult:
     """Weights of a bench, with their figures."""
 
     weights: Path
-    minutes: float
-    objects: int
+    plan: Plan
+    folders: list[Path]
+    """Of the stages; the last one's holds the report of the weights."""
     before: dict[str, Any]
     """Figures of the start weights, aligned, on the 54 test objects on this bench."""
     after: dict[str, Any]
-    page: Path
-    """Report."""
     was_there: bool
     """True where the adaptation of so many minutes was finished before."""
 
@@ -106,6 +106,7 @@ def _untracked(_: str) -> Generator[Callable[[int, int], None]]:
 def adapt(
     job: Adaptation,
     minutes: float,
+    measure: Measure,
     *,
     tracked: Tracked = _untracked,
     watch: training.Watch | None = None,
@@ -120,19 +121,18 @@ def adapt(
     job.folder.mkdir(parents=True, exist_ok=True)
     with claim(job.folder, inside=True):
         plan = _plan_for(job, minutes, tracked)
-        weights = job.folder / _stage_name(len(plan.stages) - 1) / WEIGHTS
-        was_there = (weights.parent / AFTER).exists()
-        before = _figures(job, job.start, job.folder / BEFORE, tracked)
+        folders = [job.folder / _stage_name(number) for number in range(len(plan.stages))]
+        weights = folders[-1] / WEIGHTS
+        was_there = (folders[-1] / REPORT / FIGURES).exists()
+        before = _figures(measure, job.start, job.folder / BEFORE)
         for number, stage in enumerate(plan.stages):
             on_message(
                 f"stage {number + 1} of {len(plan.stages)}: {stage.objects} objects,"
                 f" {stage.epochs * stage.steps * BATCH} samples"
             )
             _run_stage(job, plan, number, tracked, watch)
-        after = _figures(job, weights, weights.parent / AFTER, tracked)
-        page = _draw_report(job, plan, (before, after), tracked)
-        objects = plan.stages[-1].objects
-        return AdaptResult(weights, plan.minutes, objects, before, after, page, was_there)
+        after = _figures(measure, weights, folders[-1] / REPORT)
+        return AdaptResult(weights, plan, folders, before, after, was_there)
 
 
 def _stage_name(number: int) -> str:
@@ -424,39 +424,11 @@ def _uncertainty_recipe() -> training.UncertaintyRecipe:
     return recipe
 
 
-def _figures(job: Adaptation, weights: Path | None, path: Path, tracked: Tracked) -> dict[str, Any]:
-    """Return the figures of weights on the 54 test objects on the bench; measured once."""
-    if path.exists():
-        return json.loads(path.read_text(encoding="utf-8"))
-    evaluation = _evaluated(job, weights, tracked)
-    figures = measure.as_figures(evaluation)
-    with atomic_file(path) as part:
-        part.write_text(json.dumps(figures, indent=1) + "\n", encoding="utf-8")
-    return figures
-
-
-def _evaluated(job: Adaptation, weights: Path | None, tracked: Tracked) -> measure.Evaluation:
-    objects = measure.rendered_objects(job.rig, tracked=tracked, sensor=job.sensor)
-    return measure.evaluate(weights, objects, nearest=False, tracked=tracked)
-
-
-def _draw_report(
-    job: Adaptation,
-    plan: Plan,
-    figures: tuple[dict[str, Any], dict[str, Any]],
-    tracked: Tracked,
-) -> Path:
-    """Write the report of the last stage, and return its page; with the weights' own report beside
-    it.
-    """
-    folders = [job.folder / _stage_name(number) for number in range(len(plan.stages))]
-    weights = folders[-1] / WEIGHTS
-    details = folders[-1] / REPORT
-    if not details.exists():
-        evaluation = _evaluated(job, weights, tracked)
-        measure.write_report(details, evaluation, figures[1])
-    curves = read_curves(plan, [folder / NETWORK / "log.csv" for folder in folders])
-    return write_page(job.folder, plan, figures, curves, details / "sheet.png")
+def _figures(measure: Measure, weights: Path | None, folder: Path) -> dict[str, Any]:
+    """Return the figures of weights, measured once into a folder."""
+    if not (folder / FIGURES).exists():
+        measure(weights, folder)
+    return json.loads((folder / FIGURES).read_text(encoding="utf-8"))
 
 
 def install(weights: Path, target: Path) -> None:

@@ -9,12 +9,13 @@ import nlos_calibration as walls
 import typer
 
 from nlos_cam import adapt as adaptation
-from nlos_cam import evaluate as measure
+from nlos_cam import evaluate as evaluation
 from nlos_cam.cli import common
 from nlos_cam.cli.train import watched_run
 from nlos_cam.errors import OutputExistsError
 
 WALL = "wall.toml"
+PAGE = "adapt.html"
 WORK = "adapt"
 WEIGHTS = "weights"
 
@@ -83,26 +84,41 @@ def adapt(
         accelerator=accelerator,
         **optional,
     )
+
+    def measure(start: Path | None, folder: Path) -> None:
+        objects = evaluation.rendered_objects(rig, tracked=common.tracked, sensor=job.sensor)
+        found = evaluation.evaluate(start, objects, nearest=False, tracked=common.tracked)
+        evaluation.write_report(folder, found, evaluation.as_figures(found))
+
     try:
         result = adaptation.adapt(
-            job, minutes, tracked=common.tracked, watch=watched_run, on_message=common.say
+            job, minutes, measure, tracked=common.tracked, watch=watched_run, on_message=common.say
         )
     except KeyboardInterrupt:
         common.exit_interrupted(f"what was made is kept in {work}; give the same command to go on")
     adaptation.install(result.weights, target)
 
-    iou = "silhouette_iou"
-    before, after = (measure.format_interval(each[iou]) for each in (result.before, result.after))
+    rows = [
+        (
+            evaluation.LABELS[metric],
+            evaluation.format_interval(result.before[metric]),
+            evaluation.format_interval(result.after[metric]),
+        )
+        for metric in evaluation.TARGETS
+    ]
+    page = work / PAGE
+    adaptation.write_page(result, rows, page)
+    _, before, after = rows[0]
     state = "was finished before" if result.was_there else "done"
     text = (
-        f"{state}: silhouette IoU {before} -> {after} on this bench; weights in {target}, report"
-        f" {result.page}"
+        f"{state}: {rows[0][0]} {before} -> {after} on this bench; weights in {target}, report"
+        f" {page}"
     )
     facts = {
         "out": str(target),
-        "report": str(result.page),
-        "minutes": result.minutes,
-        "objects": result.objects,
+        "report": str(page),
+        "minutes": result.plan.minutes,
+        "objects": result.plan.stages[-1].objects,
         "before": result.before,
         "after": result.after,
     }

@@ -26,6 +26,12 @@ def until_judged(description: str) -> Generator[Callable[[int, int], None]]:
     yield lambda _done, _total: None
 
 
+def no_figures(_weights: Path | None, folder: Path) -> None:
+    """Measure nothing."""
+    folder.mkdir(exist_ok=True)
+    (folder / "figures.json").write_text("{}")
+
+
 def stopping_after(steps: int) -> training.Watch:
     """Return a watch that stops a run after some of its steps."""
 
@@ -62,6 +68,7 @@ def job_in(folder: Path, rig: Rig) -> Adaptation:
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(900)
 def test_a_stopped_adaptation_goes_on_to_the_same_weights(tmp_path: Path) -> None:
     rig = load_rig("paper-rig")
     network = Path("stage-1", "network", "direct.safetensors")
@@ -69,12 +76,12 @@ def test_a_stopped_adaptation_goes_on_to_the_same_weights(tmp_path: Path) -> Non
     broken = job_in(tmp_path / "broken", rig)
 
     with pytest.raises(KeyboardInterrupt):
-        adapt(whole, 1.0, tracked=until_judged)
+        adapt(whole, 1.0, no_figures, tracked=until_judged)
     for steps in (2, 3):
         with pytest.raises(KeyboardInterrupt):
-            adapt(broken, 1.0, watch=stopping_after(steps))
+            adapt(broken, 1.0, no_figures, watch=stopping_after(steps))
     with pytest.raises(KeyboardInterrupt):
-        adapt(broken, 1.0, tracked=until_judged)
+        adapt(broken, 1.0, no_figures, tracked=until_judged)
 
     assert (broken.folder / network).read_bytes() == (whole.folder / network).read_bytes()
 
@@ -83,7 +90,7 @@ def test_two_adaptations_in_one_folder_are_one_too_many(tmp_path: Path) -> None:
     job = job_in(tmp_path / "work", load_rig("paper-rig"))
 
     with claim(job.folder, inside=True), pytest.raises(FileBusyError):
-        adapt(job, 1.0)
+        adapt(job, 1.0, no_figures)
 
 
 def test_a_bench_that_was_calibrated_again_is_refused(tmp_path: Path) -> None:
@@ -93,4 +100,4 @@ def test_a_bench_that_was_calibrated_again_is_refused(tmp_path: Path) -> None:
     moved = rig.model_copy(update={"lidar": lidar})
 
     with pytest.raises(SceneError, match="calibrated again"):
-        adapt(replace(job, rig=moved), 1.0)
+        adapt(replace(job, rig=moved), 1.0, no_figures)
