@@ -89,8 +89,8 @@ def moved(
 
 def measured_on_the_map(home: Rig) -> Iterator[Measured]:
     """Yield the direct weights' figures over distance and angle, but those moved aside."""
-    cells = json.loads((harness.DOCS / "figures" / "rig_map.json").read_text())["cells"]
-    for cell in cells:
+    rig_map = json.loads((harness.DOCS / "figures" / "rig_map.json").read_text())
+    for cell in rig_map["cells"] + rig_map["benches"]:
         if cell["aside_m"] or cell["up_m"]:
             continue
         place = cell["distance_m"], cell["yaw_deg"], cell["pitch_deg"]
