@@ -9,7 +9,8 @@ any false alarm in the whole family (Westfall and Young, 1993).
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
 from math import sqrt
 
 import cv2
@@ -111,16 +112,33 @@ class Group:
     patch: int
     values: Float64
     """(blocks, n); in the channel's unit."""
-    noise: Float64
-    """(n,); standard deviation of one block, of the noise alone."""
+    frame_noise: Float64
+    """(n,); standard deviation of one block by the noise of frames alone."""
     used: Mask
     """(64, 80)."""
+
+    @cached_property
+    def noise(self) -> Float64:
+        """Standard deviation (n,) of one block, with what there is between turns beside the frames'
+        noise: levelling's own errors, drift that is not linear.
+        """
+        # The median over the cells of the blocks' mean square, over its expectation, says how much
+        # more there is; the median of chi^2 / N is about (1 - 2 / 9N)^3.
+        ratio = np.median(np.mean(self.values**2, axis=0) / self.frame_noise**2)
+        excess = float(ratio) / (1.0 - 2.0 / (9.0 * len(self.values))) ** 3
+        return self.frame_noise * sqrt(max(excess, 1.0))
+
+    def without_effect(self) -> "Group":
+        """Return the group less its mean contrast: what is left is noise of the same size."""
+        blocks = len(self.values)
+        rest = (self.values - self.values.mean(axis=0)) * sqrt(blocks / (blocks - 1.0))
+        return replace(self, values=rest)
 
     def scores(self, signs: Float64) -> Float64:
         """Return significances (patterns, n) of the mean contrast under patterns of signs."""
         return (signs @ self.values) / (self.moderated * sqrt(len(self.values)))
 
-    @property
+    @cached_property
     def moderated(self) -> Float64:
         """Standard deviation (n,) of one block, from the noise and the blocks' own squares."""
         return moderate(self.values, self.noise)
@@ -139,8 +157,12 @@ def analyze(
     plan: Plan,
     turns: list[Turn],
     on_step: Callable[[int, int], None] = lambda done, total: None,
+    *,
+    with_power: bool = True,
 ) -> Analysis:
     """Return the verdict on all whole blocks of the turns, in the plan's order.
+
+    Without `with_power` the smallest effects are NaN, and it takes a third of the time.
 
     Raises RecordingError for too few blocks to reach the plan's `alpha`.
     """
@@ -156,25 +178,21 @@ def analyze(
         raise RecordingError("no cell has a return in every turn: is the wall in view?")
     signs = sign_patterns(blocks)
 
-    highest = np.empty((len(groups), len(signs)))
+    scale = Scale.of(groups, signs, plan.alpha, on_step)
+    # Power is that of the noise alone: an effect that was found would count as noise otherwise.
+    rest = [group.without_effect() for group in groups] if with_power else []
+    rest_scale = Scale.of(rest, signs, plan.alpha) if with_power else None
+
+    findings: list[Finding] = []
     for number, group in enumerate(groups):
-        for part in np.array_split(np.arange(len(signs)), max(1, len(signs) // 256)):
-            highest[number, part] = np.abs(group.scores(signs[part])).max(axis=1)
-        on_step(number + 1, len(groups))
-
-    # Median and spread over all patterns, the observed one among them, put the groups on one scale;
-    # both are the same whichever pattern was observed, so the test stays exact.
-    middle = np.median(highest, axis=1, keepdims=True)
-    spread = np.median(np.abs(highest - middle), axis=1, keepdims=True)
-    spread = np.where(spread > 0, spread, np.maximum(middle, 1e-12))
-    family = ((highest - middle) / spread).max(axis=0)
-    scale = Scale(middle[:, 0], spread[:, 0], family, plan.alpha)
-
-    findings = [
-        _finding(group, number, scale, float(highest[number, 0]))
-        for number, group in enumerate(groups)
-    ]
+        smallest = np.full(2, np.nan)
+        if rest_scale:
+            noises = smallest_in_noises(rest[number], number, rest_scale)
+            smallest = noises * np.quantile(rest[number].noise, [0.5, 0.1])
+        findings.append(_finding(group, number, scale, smallest))
+        on_step(len(groups) + number + 1, 2 * len(groups))
     findings.sort(key=lambda each: (each.p_value, -each.peak))
+    family = scale.family
     p_value = float(np.mean(family >= family[0]))
     celsius = [each.celsius[LASER] for each in turns if LASER in each.celsius]
     return Analysis(
@@ -255,15 +273,7 @@ def _patches(
     total = _sums(weight, patch)
     values = np.stack([_sums(np.where(used, weight * each, 0.0), patch) for each in contrast])
     values = values[:, used] / total[used]
-    alone = 1.0 / np.sqrt(total[used])
-
-    # Between turns there is more than the frames' noise: levelling's own errors, drift that is not
-    # linear. The median over the cells of the blocks' mean square, over its expectation, says how
-    # much more; the median of chi^2 / N is about (1 - 2 / 9N)^3.
-    blocks = len(values)
-    ratio = np.median(np.mean(values**2, axis=0) / alone**2)
-    excess = float(ratio) / (1.0 - 2.0 / (9.0 * blocks)) ** 3
-    return Group(setting, channel, patch, values, alone * sqrt(max(excess, 1.0)), used)
+    return Group(setting, channel, patch, values, 1.0 / np.sqrt(total[used]), used)
 
 
 def _sums(values: Float64, patch: int) -> Float64:
@@ -284,14 +294,39 @@ class Scale:
     """(patterns,); the observed pattern first."""
     alpha: float
 
-    def p_value(self, group: int, highest: float) -> float:
-        """Return the probability of this value in a group, anywhere in the family."""
-        scaled = (highest - self.middle[group]) / self.spread[group]
+    highest: Float64
+    """(groups, patterns); largest absolute significance over the cells."""
+
+    @classmethod
+    def of(
+        cls,
+        groups: list[Group],
+        signs: Float64,
+        alpha: float,
+        on_step: Callable[[int, int], None] = lambda done, total: None,
+    ) -> "Scale":
+        """Return the scale of groups under patterns of signs (patterns, blocks)."""
+        highest = np.empty((len(groups), len(signs)))
+        for number, group in enumerate(groups):
+            for part in np.array_split(np.arange(len(signs)), max(1, len(signs) // 256)):
+                highest[number, part] = np.abs(group.scores(signs[part])).max(axis=1)
+            on_step(number + 1, 2 * len(groups))
+        # Median and spread over all patterns, the observed one among them, put the groups on one
+        # scale; both are the same whichever pattern was observed, so the test stays exact.
+        middle = np.median(highest, axis=1)
+        spread = np.median(np.abs(highest - middle[:, None]), axis=1)
+        spread = np.where(spread > 0, spread, np.maximum(middle, 1e-12))
+        family = ((highest - middle[:, None]) / spread[:, None]).max(axis=0)
+        return cls(middle, spread, family, alpha, highest)
+
+    def p_value(self, group: int) -> float:
+        """Return the probability of a group's observed value anywhere in the family."""
+        scaled = (self.highest[group, 0] - self.middle[group]) / self.spread[group]
         larger = np.count_nonzero(self.family[1:] >= scaled)
         return (1.0 + float(larger)) / len(self.family)
 
 
-def _finding(group: Group, number: int, scale: Scale, highest: float) -> Finding:
+def _finding(group: Group, number: int, scale: Scale, smallest: Float64) -> Finding:
     observed = group.scores(np.ones((1, len(group.values))))[0]
     peak = int(np.argmax(np.abs(observed)))
     mean = group.values.mean(axis=0)
@@ -300,17 +335,16 @@ def _finding(group: Group, number: int, scale: Scale, highest: float) -> Finding
     contrast = np.full(group.used.shape, np.nan)
     contrast[group.used] = mean
     row, column = np.argwhere(group.used)[peak]
-    noises = smallest_in_noises(group, number, scale)
     return Finding(
         group.setting,
         group.channel,
         group.patch,
-        float(scale.p_value(number, highest)),
+        scale.p_value(number),
         float(abs(observed[peak])),
         (int(row), int(column)),
         float(mean[peak]),
-        noises * float(np.median(group.noise)),
-        noises * float(np.quantile(group.noise, 0.1)),
+        float(smallest[0]),
+        float(smallest[1]),
         significance,
         contrast,
     )
@@ -318,15 +352,15 @@ def _finding(group: Group, number: int, scale: Scale, highest: float) -> Finding
 
 def smallest_in_noises(group: Group, number: int, scale: Scale) -> float:
     """Return the effect in one patch, in noises of one block, that is found with a probability of
-    POWER.
+    POWER; the group is one without effect.
     """
-    # By injection: residuals of random cells under random signs are draws of the noise. An effect
+    # By injection: values of random cells under random signs are draws of the noise. An effect
     # is added, and the whole test is run again on those cells; the others keep their largest value,
     # which is that of a random pattern. An effect that fills a patch also lies in the patches that
     # overlap with it, which compete with it under flipped signs.
     generator = np.random.default_rng(POWER_SEED)
     blocks = len(group.values)
-    rest = (group.values - group.values.mean(axis=0)) * sqrt(blocks / (blocks - 1.0)) / group.noise
+    rest = group.values / group.noise
     cells, share = _overlapping(group, generator)
     draws = rest[:, cells] * generator.choice([-1.0, 1.0], (blocks, len(cells), 1))
     patterns = np.arange(len(scale.family))

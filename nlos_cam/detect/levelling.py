@@ -75,8 +75,9 @@ def _robust_fit(basis: Float64, values: Float64, weight: Float64) -> Float64:
     extra = np.ones(len(values))
     found = np.zeros(2)
     for _ in range(ROUNDS):
-        scaled = weight * np.sqrt(extra)
-        found = np.linalg.lstsq(basis * scaled[:, None], values * scaled, rcond=None)[0]
+        # The normal equations: two centered columns, so nothing is lost by squaring them.
+        weighted = basis * (weight**2 * extra)[:, None]
+        found = np.linalg.lstsq(weighted.T @ basis, weighted.T @ values, rcond=None)[0]
         residual = np.abs((values - basis @ found) * weight)
         scale = 1.4826 * float(np.median(residual))
         extra = np.minimum(1.0, HUBER * scale / np.maximum(residual, 1e-300))

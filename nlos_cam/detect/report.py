@@ -30,14 +30,20 @@ UNITS = {"depth": (1e3, "mm"), "infrared": (1.0, "counts"), "confidence": (1.0, 
 MAX_DRAWN_SETTINGS = 6
 DRAWN_PATCH = 3
 CAVEATS = (
-    "The test says that the readings depend on the object. Whether by three-bounce light, by stray"
-    " light past the occluder, or by the hands that move it, only controls can say: the same"
-    " protocol with an empty hand (--control), with the gap to the object closed by a black sheet,"
-    " and with an object of another brightness.",
-    "A negative result holds for effects at least as large as those stated, on this bench, with"
-    " these settings.",
-    "Levelling subtracts gain and offset of each map: an effect that is the same in all cells would"
-    " be subtracted with them.",
+    (
+        "The test says that the readings depend on the object. Whether by three-bounce light, by"
+        " stray light past the occluder, or by the hands that move it, only controls can say: the"
+        " same protocol with an empty hand (--control), with the gap to the object closed by a"
+        " black sheet, and with an object of another brightness."
+    ),
+    (
+        "A negative result holds for effects at least as large as those stated, on this bench, with"
+        " these settings."
+    ),
+    (
+        "Levelling subtracts gain and offset of each map: an effect that is the same in all cells"
+        " would be subtracted with them."
+    ),
 )
 
 

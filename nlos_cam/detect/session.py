@@ -56,15 +56,6 @@ class Session:
         path = folder / PLAN
         try:
             content = json.loads(read_bounded(path, TEXT_LIMIT))
-            if not isinstance(content, dict) or content.get("kind") != "detection":  # pyright: ignore[reportUnknownMemberType]
-                raise RecordingError(f"{path} is not the plan of a detection: choose its folder")
-            return cls(folder, Plan.model_validate(content))
-        except RecordingError:
-            raise
-        except ValidationError as error:
-            raise RecordingError(
-                f"{path} is not a valid plan ({first_problem(error)}): restore it, or begin again"
-            ) from error
         except OSError as error:
             raise RecordingError(
                 f"{folder} is not a detection (no {PLAN} can be read): give a folder that"
@@ -72,6 +63,12 @@ class Session:
             ) from error
         except (ValueError, RecursionError) as error:
             raise RecordingError(f"{path} is not JSON: restore it, or begin again") from error
+        try:
+            return cls(folder, Plan.model_validate(content))
+        except ValidationError as error:
+            raise RecordingError(
+                f"{path} is not a valid plan ({first_problem(error)}): restore it, or begin again"
+            ) from error
 
     def path(self, turn: int) -> Path:
         """Return the file of a turn, counted from 0."""
