@@ -102,6 +102,8 @@ on a bench.
 """
 PRESET_SETTLES_S = 0.5
 LASER_POWER = "laser_power"
+ADJUSTABLE = (LASER_POWER, "digital_gain", "receiver_gain", *NEAR_WALL)
+"""Options that can be changed while the camera runs, where the firmware offers them."""
 SETS_IN_FLIGHT = 3
 """Sets that may have been exposed before the last change."""
 SETS_MEASURED = 3
@@ -265,15 +267,14 @@ class L515Camera(LiveCamera):
         return sum(shares) / len(shares)
 
     def adjustable(self) -> list[dict[str, Any]]:
-        """Return name, value, min, max and step of laser power and near-wall options, as the
+        """Return name, value, min, max and step of laser power, gains and near-wall options, as the
         firmware offers them.
         """
         with self._changing:
             options = Options(self._session.sensor, self._sdk) if self._session else None
             if options is None or self._session is None:
                 return []
-            names = (LASER_POWER, *NEAR_WALL)
-            found = [(name, options.get(name), options.limits(name)) for name in names]
+            found = [(name, options.get(name), options.limits(name)) for name in ADJUSTABLE]
         offered = [
             (name, value, limits) for name, value, limits in found if limits and value is not None
         ]
@@ -285,10 +286,8 @@ class L515Camera(LiveCamera):
 
         Raises CameraError where the firmware refuses it, or while the camera does not run.
         """
-        if name != LASER_POWER and name not in NEAR_WALL:
-            raise CameraError(
-                f"{name} cannot be set here: choose from {', '.join((LASER_POWER, *NEAR_WALL))}"
-            )
+        if name not in ADJUSTABLE:
+            raise CameraError(f"{name} cannot be set here: choose from {', '.join(ADJUSTABLE)}")
         with self._changing:
             if self._session is None:
                 raise CameraError(f"{self.uri} is not running: wait until it is back")

@@ -168,6 +168,8 @@ class SimulatedCamera(LiveCamera):
         faults: Sequence[Fault] = (),
     ) -> None:
         self._world = world
+        self._full_world = world
+        self._empty_world: World | None = None
         self._clock = clock or WallClock()
         self._faults = tuple(faults)
         world.images(0)  # compiles, which would delay the first frames
@@ -252,6 +254,14 @@ class SimulatedCamera(LiveCamera):
     def _truth_depth_m(self, number: int) -> Float32 | None:
         instant = self._instants.get(number)
         return None if instant is None else self._world.truth_depth_m(instant)
+
+    def place_object(self, *, present: bool) -> None:
+        """Put the hidden object in, or take it away, from the next image computed on; the time of
+        the world goes on.
+        """
+        if not present and self._empty_world is None:
+            self._empty_world = self._full_world.without_object()
+        self._world = self._full_world if present else (self._empty_world or self._full_world)
 
     def telemetry(self, ending: str = "") -> Mapping[str, float]:
         """Return the options with the temperatures of the present instant; the SDK's own stay

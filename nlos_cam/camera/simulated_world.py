@@ -51,6 +51,12 @@ class World:
         """Rig with the lidar in this world."""
         return self.scene.rig
 
+    def without_object(self) -> "World":
+        """Return the same world with its hidden object taken away."""
+        bare = self.scene.model_copy(update={"hidden": None})
+        echoes, _ = render_loop(bare)
+        return World(bare, echoes, [None])
+
     def images(self, number: int) -> renderer.SensedImages:
         """Return the images of frame `number`, the same bits each time."""
         generator = np.random.default_rng([number, len(self._echoes)])

@@ -34,9 +34,11 @@ class Setting(NamedTuple):
 
 
 SETTINGS = {
-    "camera": Setting(frozenset({"live", "capture", "calibrate"}), "sim", "CAMERA"),
+    "camera": Setting(frozenset({"live", "capture", "calibrate", "detect"}), "sim", "CAMERA"),
     "wall": Setting(
-        frozenset({"live", "replay", "capture"}), None, "--wall, unless another CAMERA is given"
+        frozenset({"live", "replay", "capture", "detect"}),
+        None,
+        "--wall, unless another CAMERA is given",
     ),
     "weights": Setting(frozenset({"live", "replay", "evaluate"}), None, "--weights"),
     "view_port": Setting(frozenset({"live", "view"}), None, "--view-port"),

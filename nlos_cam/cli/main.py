@@ -55,6 +55,9 @@ COMMANDS = {
         "calibrate", BENCH, "Measure a bare wall, a printed board or the occluder."
     ),
     "adapt": Command("adapt", BENCH, "Make weights for one bench, from its calibration."),
+    "detect": Command(
+        "detect", BENCH, "Test whether a hidden object changes anything: in and out, in turns."
+    ),
     "board": Command("calibrate", BENCH, "Write the calibration board as a PDF to print."),
     "capture": Command(
         "capture", RECORDINGS, "Record a camera to a .bag file and check the recording."

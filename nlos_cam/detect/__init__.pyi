@@ -1,0 +1,32 @@
+__all__ = [
+    "BASELINE",
+    "BLOCK_TURNS",
+    "CHANNELS",
+    "REPORT",
+    "SETTLING_FRAMES",
+    "Analysis",
+    "Finding",
+    "Hands",
+    "Plan",
+    "Session",
+    "Setting",
+    "SimulatedHands",
+    "Turn",
+    "analyze",
+    "is_session",
+    "measure_turn",
+    "measure_turns",
+    "min_blocks",
+    "power_text",
+    "swept_settings",
+    "verdict",
+    "write_report",
+]
+
+from .analysis import Analysis, Finding, analyze
+from .hands import Hands, SimulatedHands
+from .measure import SETTLING_FRAMES, measure_turn, measure_turns, swept_settings
+from .plan import BASELINE, BLOCK_TURNS, Plan, Setting, min_blocks
+from .report import REPORT, power_text, verdict, write_report
+from .session import Session, is_session
+from .turns import CHANNELS, Turn

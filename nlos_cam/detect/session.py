@@ -1,0 +1,104 @@
+"""Session: the folder of a detection, with its plan and one file for each turn."""
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+
+from nlos_calibration import first_problem
+from pydantic import ValidationError
+
+from nlos_cam.detect.plan import Plan
+from nlos_cam.detect.turns import Turn
+from nlos_cam.errors import OutputExistsError, RecordingError
+from nlos_cam.files import TEXT_LIMIT, atomic_file, read_bounded
+
+PLAN = "detection.json"
+TOGETHER = ("serial", "turns", "frames", "alpha", "control", "settings", "rig")
+"""Fields of the plan that a command must repeat in order to go on with a session."""
+
+
+@dataclass(frozen=True)
+class Session:
+    """Folder of a detection."""
+
+    folder: Path
+    plan: Plan
+
+    @classmethod
+    def start(cls, folder: Path, plan: Plan) -> "Session":
+        """Create a session in an empty or new folder, or return the one in it that has this plan.
+
+        Date, camera's name, version and order are those of the session that exists. Raises
+        RecordingError where its plan is another, OutputExistsError where the folder holds others'
+        files.
+        """
+        if is_session(folder):
+            session = cls.open(folder)
+            for name in TOGETHER:
+                if getattr(session.plan, name) != getattr(plan, name):
+                    raise RecordingError(
+                        f"{folder} was begun with another {name}: repeat that command, or choose"
+                        " another folder (a plan that changes midway has no false-alarm rate)"
+                    )
+            return session
+        if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+            raise OutputExistsError(
+                f"{folder} exists and is no detection: choose another name for --out"
+            )
+        folder.mkdir(parents=True, exist_ok=True)
+        with atomic_file(folder / PLAN) as part:
+            part.write_text(plan.model_dump_json(indent=1), encoding="utf-8")
+        return cls(folder, plan)
+
+    @classmethod
+    def open(cls, folder: Path) -> "Session":
+        """Return the session in a folder. Raises RecordingError where there is none."""
+        path = folder / PLAN
+        try:
+            content = json.loads(read_bounded(path, TEXT_LIMIT))
+        except OSError as error:
+            raise RecordingError(
+                f"{folder} is not a detection (no {PLAN} can be read): give a folder that"
+                " `nlos-cam detect` wrote"
+            ) from error
+        except (ValueError, RecursionError) as error:
+            raise RecordingError(f"{path} is not JSON: restore it, or begin again") from error
+        try:
+            return cls(folder, Plan.model_validate(content))
+        except ValidationError as error:
+            raise RecordingError(
+                f"{path} is not a valid plan ({first_problem(error)}): restore it, or begin again"
+            ) from error
+
+    def path(self, turn: int) -> Path:
+        """Return the file of a turn, counted from 0."""
+        return self.folder / f"turn-{turn + 1:04d}.npz"
+
+    def missing(self) -> list[int]:
+        """Return the turns that are still to be measured, in order."""
+        return [turn for turn in range(self.plan.turns) if not self.path(turn).exists()]
+
+    def turns(self) -> list[Turn]:
+        """Read the turns of all whole blocks from the start on. Raises RecordingError for a file
+        that is none, or of the other label.
+        """
+        missing = self.missing()
+        # A later turn is never used without those before it.
+        count = missing[0] if missing else self.plan.turns
+        order = self.plan.order()
+        turns: list[Turn] = []
+        for number in range(count):
+            turn = Turn.load(self.path(number), len(self.plan.settings))
+            if turn.object_in != order[number]:
+                raise RecordingError(
+                    f"{self.path(number)} is a turn with the object"
+                    f" {'in' if turn.object_in else 'out'}, which contradicts {PLAN}: files of two"
+                    " sessions are mixed"
+                )
+            turns.append(turn)
+        return turns
+
+
+def is_session(folder: Path) -> bool:
+    """Return True if the folder has a plan."""
+    return (folder / PLAN).is_file()

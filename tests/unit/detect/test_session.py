@@ -1,0 +1,166 @@
+"""Laws of a session: resumed equals unbroken, half of the turns have the object, wrong folders."""
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from made_turns import made_plan, made_turns
+from nlos_calibration import load_rig
+
+from nlos_cam.detect import Session, analyze, measure_turns, swept_settings, write_report
+from nlos_cam.detect.session import PLAN
+from nlos_cam.errors import CameraLostError, NlosCamError, OutputExistsError, RecordingError
+from nlos_cam.frames import Frame
+
+PINHOLE = load_rig("bare-wall").pinhole.scaled(80, 64)
+
+
+class FakeCamera:
+    """Camera of small frames whose noise depends on the frame's number alone."""
+
+    uri = "l515"
+    limit = 10_000
+
+    def __init__(self, first: int = 0) -> None:
+        self.number = first
+        self.present = False
+        self.options = {"laser_power": 100.0, "min_distance": 0.0}
+
+    def __iter__(self) -> Iterator[Frame]:
+        while self.number < self.limit:
+            generator = np.random.default_rng(self.number)
+            depth = 0.25 + 1e-3 * self.present + 1e-3 * generator.standard_normal((64, 80))
+            image = np.full((64, 80), 40, np.uint8)
+            yield Frame(depth.astype(np.float32), image, image, self.number / 30, 0, PINHOLE)
+            self.number += 1
+
+    def telemetry(self, ending: str = "") -> dict[str, float]:
+        return {f"ldd{ending}": 40.0}
+
+    def place(self, turn: int, *, object_in: bool) -> None:
+        del turn
+        self.present = object_in
+
+    def adjustable(self) -> list[dict[str, Any]]:
+        return [
+            {"name": name, "value": value, "min": 0.0, "max": 100.0, "step": 1.0}
+            for name, value in self.options.items()
+        ]
+
+    def set_option(self, name: str, value: float) -> str:
+        self.options[name] = value
+        return name
+
+
+def measured(session: Session, camera: Any) -> None:
+    measure_turns(session, camera, camera)
+
+
+def test_resumed_session_equals_an_unbroken_one(tmp_path: Path) -> None:
+    plan = made_plan(frames=3)
+    whole = Session.start(tmp_path / "whole", plan)
+    measured(whole, FakeCamera())
+
+    broken = Session.start(tmp_path / "broken", plan)
+    camera = FakeCamera()
+    camera.limit = 180  # ends within the eleventh turn of 18 frames
+    with pytest.raises(CameraLostError):
+        measured(broken, camera)
+    assert broken.missing()[0] == 10
+    # The other plan's seed is not used: the order is that of the session that exists.
+    again = Session.start(tmp_path / "broken", made_plan(7, frames=3))
+    measured(again, FakeCamera(180))
+    for one, other in zip(whole.turns(), again.turns(), strict=True):
+        assert one.object_in == other.object_in
+        np.testing.assert_array_equal(one.mean, other.mean)
+
+
+def test_order_has_the_object_in_half_of_each_block() -> None:
+    order = made_plan(turns=64).order().reshape(16, 4)
+    assert (order.sum(axis=1) == 2).all()
+    assert (order[:, 0] == order[:, 3]).all()
+    assert 0 < order[:, 0].sum() < 16
+
+
+def test_sweep_changes_one_option_at_a_time_and_restores_it() -> None:
+    camera = FakeCamera()
+    settings = swept_settings(camera)  # pyright: ignore[reportArgumentType]
+    start = settings[0].options
+    changes = [sum(each.options[k] != start[k] for k in start) for each in settings[1:]]
+    assert set(changes) == {1}
+    assert len(settings) == 4
+    assert camera.options == start
+
+
+def test_sweep_is_measured_under_each_setting(tmp_path: Path) -> None:
+    camera = FakeCamera()
+    settings = swept_settings(camera)  # pyright: ignore[reportArgumentType]
+    session = Session.start(tmp_path / "s", made_plan(frames=2, settings=settings))
+    measured(session, camera)
+    assert session.turns()[0].mean.shape == (len(settings), 3, 64, 80)
+
+
+@pytest.mark.parametrize(
+    "change", [{"turns": 36}, {"frames": 5}, {"alpha": 0.02}, {"control": True}]
+)
+def test_plan_never_changes_midway(tmp_path: Path, change: dict[str, Any]) -> None:
+    Session.start(tmp_path / "s", made_plan())
+    with pytest.raises(RecordingError, match=next(iter(change))):
+        Session.start(tmp_path / "s", made_plan(**change))
+
+
+@pytest.mark.parametrize("turns", [10, 16])
+def test_plan_that_cannot_reach_its_rate_is_refused(turns: int) -> None:
+    with pytest.raises(ValueError, match="turns"):
+        made_plan(turns=turns)
+
+
+def damaged(folder: Path, kind: str) -> None:
+    """Make a folder that is no session, or a damaged one."""
+    if kind == "empty":
+        folder.mkdir()
+        return
+    plan = made_plan()
+    session = Session.start(folder, plan)
+    for number, turn in enumerate(made_turns(plan)):
+        turn.save(session.path(number))
+    first = session.path(0)
+    if kind == "cut turn":
+        first.write_bytes(first.read_bytes()[:100])
+    elif kind == "other label":
+        other = next(n for n in range(32) if plan.order()[n] != plan.order()[0])
+        first.write_bytes(session.path(other).read_bytes())
+    elif kind == "no json":
+        (folder / PLAN).write_text("{", encoding="utf-8")
+    elif kind == "a list":
+        (folder / PLAN).write_text("[]", encoding="utf-8")
+    else:
+        (folder / PLAN).write_text('{"kind": "dataset"}', encoding="utf-8")
+
+
+@pytest.mark.parametrize("kind", ["empty", "cut turn", "other label", "no json", "a list", "other"])
+def test_wrong_folder_is_one_line_with_exit_code_4(tmp_path: Path, kind: str) -> None:
+    damaged(tmp_path / "s", kind)
+    with pytest.raises(NlosCamError) as found:
+        Session.open(tmp_path / "s").turns()
+    assert found.value.exit_code == 4
+    assert "\n" not in str(found.value)
+
+
+def test_folder_of_other_files_is_left_alone(tmp_path: Path) -> None:
+    (tmp_path / "mine.txt").touch()
+    with pytest.raises(OutputExistsError):
+        Session.start(tmp_path, made_plan())
+
+
+def test_page_hides_the_serial_number_unless_asked(tmp_path: Path) -> None:
+    plan = made_plan(camera="l515:F1234567", serial="F1234567")
+    analysis = analyze(plan, made_turns(plan), with_power=False)
+    pages = {}
+    for shown in (False, True):
+        write_report(analysis, tmp_path / "page.html", show_serial=shown)
+        pages[shown] = (tmp_path / "page.html").read_text(encoding="utf-8")
+    assert "F1234567" not in pages[False]
+    assert "F1234567" in pages[True]
