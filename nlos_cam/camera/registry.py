@@ -67,5 +67,5 @@ def open_camera(
 
 def full_uri(uri: str) -> str:
     """Return a camera's name; that of a recording's path, run.bag, is bag:run.bag."""
-    is_path = uri.endswith(".bag") and not uri.startswith(("bag:", "sim:", "l515:"))
-    return f"bag:{uri}" if is_path else uri
+    is_path = uri.endswith((".bag", ".db3", ".mcap")) or (Path(uri) / "metadata.yaml").is_file()
+    return f"bag:{uri}" if is_path and not uri.startswith(("bag:", "sim:", "l515:")) else uri

@@ -62,6 +62,25 @@ AsObject = Annotated[
         ),
     ),
 ]
+Ros2 = Annotated[
+    Path | None,
+    typer.Option(
+        "--ros2",
+        metavar="FOLDER",
+        help="Write a bag of ROS 2 (rosbag2) with the topics of the driver realsense2_camera.",
+    ),
+]
+RosStorage = Annotated[
+    Literal["sqlite3", "mcap"],
+    typer.Option("--storage", help="Storage of the bag of ROS 2 (default: sqlite3, a .db3)."),
+]
+Metres = Annotated[
+    bool,
+    typer.Option(
+        "--metres",
+        help="Depth of the bag of ROS 2 in metres (32FC1): every bit kept, not rounded to mm.",
+    ),
+]
 MAX_REPORTED = 5
 
 
@@ -119,17 +138,28 @@ def export(
     streams: Streams = "",
     every: Every = 1,
     as_object: AsObject = "",
+    ros2: Ros2 = None,
+    storage: RosStorage = "sqlite3",
+    metres: Metres = False,
     overwrite: common.Overwrite = False,
     json: common.Json = False,
 ) -> None:
     """Write a recording's frames as files, or a replay's hidden surfaces for other programs."""
+    if ros2 is not None:
+        if out or form != "png" or ply or streams or every != 1 or as_object:
+            raise typer.BadParameter("--ros2 writes a whole recording: drop the other options")
+        folder = common.output_path(ros2, "ros2", "", overwrite=overwrite)
+        _export_ros2(bag, folder, bags.RosOptions(storage, metres), as_json=json)
+        return
+    if metres or storage != "sqlite3":
+        raise typer.BadParameter("--metres and --storage need --ros2")
     folder = common.output_path(out, "export", "", overwrite=overwrite)
     if bag.suffix == ".npz" or as_object:
         _export_objects(bag, folder, object_formats(as_object), every, as_json=json)
         return
     names = [name.strip() for name in streams.split(",") if name.strip()]
     options = bags.ExportOptions(form, ply, names, every)
-    recording = bags.BagReader(bag)
+    recording = bags.open_recording(bag)
     total = sum(
         info.frames for name, info in recording.streams.items() if not names or name in names
     )
@@ -151,6 +181,24 @@ def export(
     )
     if stop.is_set():
         common.exit_interrupted(f"{exported.out} holds the frames until then")
+
+
+def _export_ros2(bag: Path, folder: Path, options: bags.RosOptions, *, as_json: bool) -> None:
+    recording = bags.open_recording(bag)
+    total = sum(info.frames for info in recording.streams.values())
+    with common.stop_on_signals() as stop, common.progress() as bar:
+        task = bar.add_task("exporting", total=total)
+        exported = bags.export_ros2(
+            recording, folder, options, stop=stop, on_frame=lambda: bar.advance(task)
+        )
+    if exported.damage:
+        raise RecordingError(f"{exported.damage}; the frames before the damage are in {folder}")
+    counts = ", ".join(f"{count} {name}" for name, count in exported.frames.items())
+    unit = "metres (32FC1)" if options.metres else "millimetres (16UC1), rounded"
+    text = f"{counts} images; depth in {unit}\nWrote {folder}"
+    common.finish({"frames": exported.frames, "out": str(folder)}, as_json=as_json, text=text)
+    if stop.is_set():
+        common.exit_interrupted(f"{folder} holds the frames until then")
 
 
 def _export_objects(

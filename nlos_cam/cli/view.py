@@ -27,6 +27,7 @@ from nlos_cam.cli.common import (
     say,
     stop_on_signals,
 )
+from nlos_cam.recording import is_ros2
 
 NoView = Annotated[bool, typer.Option("--no-view", help="Serve no live view.")]
 ViewPort = Annotated[
@@ -150,11 +151,12 @@ def view(
     """
     host = view_host or views.LOOPBACK
     announce = partial(announce_view, host=view_host, port=view_port, open_it=open_view)
-    if file.suffix != ".bag" and wall is not None:
+    is_recording = file.suffix == ".bag" or is_ros2(file)
+    if not is_recording and wall is not None:
         raise typer.BadParameter(
             "--wall is for a recording (.bag): a saved session holds its pictures"
         )
-    if file.suffix == ".bag":
+    if is_recording:
         with interrupted_by_signals():
             opened = cameras.open_camera(f"bag:{file}")
             playback = replays.Playback(

@@ -10,7 +10,14 @@ from nlos_models import load_record
 
 from nlos_cam.errors import RecordingError
 from nlos_cam.files import CHECKSUMS, TEXT_LIMIT, checksums_of, read_bounded
-from nlos_cam.info.files import Description, count, describe_npz, problem_of, read_json
+from nlos_cam.info.files import (
+    Description,
+    count,
+    describe_bag,
+    describe_npz,
+    problem_of,
+    read_json,
+)
 
 
 def describe_dataset(folder: Path, verify: bool) -> Description:
@@ -179,6 +186,7 @@ def _json(path: Path) -> Mapping[str, dict[str, float]]:
 
 
 FOLDERS: list[tuple[str, str, Callable[[Path, bool], Description]]] = [
+    ("metadata.yaml", "recording", describe_bag),
     ("shard-*.h5", "dataset", describe_dataset),
     ("log.csv", "training run", describe_run),
     ("checkpoint.json", "weights", describe_weights),

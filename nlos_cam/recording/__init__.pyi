@@ -10,6 +10,8 @@ __all__ = [
     "QualityMeter",
     "RepairResult",
     "ReplayCamera",
+    "RosOptions",
+    "RosReader",
     "Sidecar",
     "SidecarFile",
     "Summary",
@@ -17,11 +19,14 @@ __all__ = [
     "Telemetry",
     "VerifyResult",
     "export_recording",
+    "export_ros2",
     "finalize",
+    "is_ros2",
     "load_measured_wall",
     "load_sidecar",
     "no_frames",
     "open_lidar_bag",
+    "open_recording",
     "repair_recording",
     "sidecar_path",
     "verify",
@@ -31,9 +36,12 @@ __all__ = [
 from .bag_reader import SAMPLE, BagReader, no_frames
 from .capture import CaptureResult, CaptureSession, CaptureTarget, finalize
 from .export import ExportOptions, ExportResult, Format, export_recording
+from .formats import is_ros2, open_recording
 from .playback import ReplayCamera, VerifyResult, open_lidar_bag, verify
 from .quality import QualityMeter
 from .repair import RepairResult, repair_recording
+from .ros_reader import RosReader
+from .ros_writer import RosOptions, export_ros2
 from .sidecar import (
     Sidecar,
     SidecarFile,

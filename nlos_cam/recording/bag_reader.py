@@ -326,7 +326,13 @@ class BagReader:
 
     def samples(self, streams: Iterable[str]) -> Iterator[Sample]:
         """Yield all frames of these streams, in the order of recording."""
-        return (self.sample(place.stream, place.index) for place in self.order(streams))
+        return (sample for _, sample in self.timed_samples(streams))
+
+    def timed_samples(self, streams: Iterable[str]) -> Iterator[tuple[int, Sample]]:
+        """Yield the recorder's time in ns of each frame with it, in the order of recording."""
+        return (
+            (place.time_ns, self.sample(place.stream, place.index)) for place in self.order(streams)
+        )
 
     def sample(self, stream: str, index: int) -> Sample:
         """Return a frame by its index in its stream. Raises IndexError beyond the last."""

@@ -12,7 +12,7 @@ from math import isfinite
 from pathlib import Path
 from tempfile import TemporaryFile
 from threading import Event
-from typing import IO, Any, Literal
+from typing import IO, TYPE_CHECKING, Any, Literal
 
 import cv2
 import numpy as np
@@ -24,6 +24,9 @@ from nlos_cam.camera import FORMATS, OPTIONAL, SAME_INSTANT_S, FrameSynchronizer
 from nlos_cam.errors import NlosCamError, RecordingError
 from nlos_cam.files import TEXT_LIMIT, atomic_directory, read_bounded
 from nlos_cam.recording.bag_reader import BagReader, no_frames
+
+if TYPE_CHECKING:
+    from nlos_cam.recording.ros_reader import RosReader
 
 POINTS = "points"
 RECENT_INSTANTS = 30
@@ -55,6 +58,8 @@ class PngSink:
 
     def add(self, sample: Sample) -> None:
         """Write a frame. Raises NlosCamError for an encoding that PNG does not have."""
+        if sample.pixels.dtype.kind == "f":  # OpenCV would round metres to whole numbers
+            raise self._not_a_png(sample)
         self._repeats[sample.number] += 1
         suffix = f"-{self._repeats[sample.number]}" if self._repeats[sample.number] > 1 else ""
         path = self._folder / f"{sample.number:06d}{suffix}.png"
@@ -218,7 +223,7 @@ class ExportOptions:
 
 
 def export_recording(
-    bag: BagReader,
+    bag: "BagReader | RosReader",
     out: Path,
     options: ExportOptions,
     *,
@@ -243,7 +248,8 @@ def export_recording(
                 closing.callback(sink.close)
             try:
                 instants = _Instants()
-                for sample in bag.samples({*sinks, *(points.streams if points else ())}):
+                wanted = {*sinks, *(points.streams if points else ())}
+                for sample in bag.samples(wanted):
                     if stop.is_set():
                         break
                     on_frame()
@@ -294,11 +300,11 @@ class _Instants:
         return self._begun - 1
 
 
-def _streams(bag: BagReader, options: ExportOptions) -> list[str]:
+def _streams(bag: "BagReader | RosReader", options: ExportOptions) -> list[str]:
     """Return the streams to write. Raises RecordingError for one that the recording does not
     have.
     """
-    if not bag.streams:
+    if isinstance(bag, BagReader) and not bag.streams:
         raise RecordingError(no_frames(bag))
     present = [name for name, info in bag.streams.items() if info.format]
     if not present:
@@ -316,7 +322,9 @@ def _streams(bag: BagReader, options: ExportOptions) -> list[str]:
     return [name for name in present if not options.streams or name in options.streams]
 
 
-def _sink(bag: BagReader, stream: str, folder: Path, form: Format) -> PngSink | NpzSink:
+def _sink(
+    bag: "BagReader | RosReader", stream: str, folder: Path, form: Format
+) -> PngSink | NpzSink:
     info = bag.streams[stream]
     if form == "png":
         return PngSink(folder, stream, info.format)
@@ -325,7 +333,7 @@ def _sink(bag: BagReader, stream: str, folder: Path, form: Format) -> PngSink | 
     return NpzSink(folder, stream, {**pinhole, **unit, "encoding": np.array(info.format)})
 
 
-def _points(bag: BagReader, options: ExportOptions, folder: Path) -> PointSink | None:
+def _points(bag: "BagReader | RosReader", options: ExportOptions, folder: Path) -> PointSink | None:
     has_sets = all(_has(bag, stream) for stream in FORMATS if stream not in OPTIONAL)
     if not options.points and (options.streams or not has_sets):
         return None
@@ -337,12 +345,12 @@ def _points(bag: BagReader, options: ExportOptions, folder: Path) -> PointSink |
     return PointSink(folder, pinhole.rays(), bag.depth_unit_m(), streams, limit)
 
 
-def _has(bag: BagReader, stream: str) -> bool:
+def _has(bag: "BagReader | RosReader", stream: str) -> bool:
     """Return whether a recording has one of the lidar's streams, in the lidar's format."""
     return stream in bag.streams and bag.streams[stream].format == FORMATS[stream]
 
 
-def _info(bag: BagReader, options: ExportOptions) -> dict[str, Any]:
+def _info(bag: "BagReader | RosReader", options: ExportOptions) -> dict[str, Any]:
     """Return facts of the whole recording for JSON: device, settings, intrinsics by stream, and its
     sidecar.
     """
@@ -369,13 +377,13 @@ def _info(bag: BagReader, options: ExportOptions) -> dict[str, Any]:
     }
 
 
-def _distortion(bag: BagReader, stream: str) -> dict[str, Any]:
+def _distortion(bag: "BagReader | RosReader", stream: str) -> dict[str, Any]:
     """Return the distortion model of a stream, by the SDK's name, and its coefficients."""
     model, coefficients = bag.lens(stream)
     return {"model": model, "coefficients": [_or_none(value) for value in coefficients.tolist()]}
 
 
-def _pose(bag: BagReader, stream: str) -> dict[str, Any] | None:
+def _pose(bag: "BagReader | RosReader", stream: str) -> dict[str, Any] | None:
     """Return reference_from_stream (4, 4), by rows in metres, and the reference stream.
 
     That is depth, or the first stream where there is no depth; None where the recording has no

@@ -5,7 +5,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Self
+from typing import TYPE_CHECKING, Self
 
 from nlos_calibration import Intrinsics, Rig
 
@@ -13,7 +13,11 @@ from nlos_cam.camera import FORMATS, OPTIONAL, ClockUnwrap, FrameSynchronizer, S
 from nlos_cam.errors import CameraError, RecordingError, StreamMissingError
 from nlos_cam.frames import Frame
 from nlos_cam.recording.bag_reader import BagReader, no_frames
+from nlos_cam.recording.formats import open_recording
 from nlos_cam.recording.renumbering import renumbered
+
+if TYPE_CHECKING:
+    from nlos_cam.recording.ros_reader import RosReader
 
 log = logging.getLogger(__name__)
 
@@ -93,9 +97,8 @@ class ReplayCamera:
         # A device's own clock is a counter that wraps.
         is_counter = self._bag.metadata("depth", 0).domain == "hardware_clock"
         unwrap = ClockUnwrap().add if is_counter else float
-        for place in self._bag.order(self._streams):
-            sample = self._bag.sample(place.stream, place.index)
-            yield place.time_ns, replace(sample, timestamp_s=unwrap(sample.timestamp_s))
+        for time_ns, sample in self._bag.timed_samples(self._streams):
+            yield time_ns, replace(sample, timestamp_s=unwrap(sample.timestamp_s))
 
     def _end(self, pairing: FrameSynchronizer) -> None:
         pairing.finish()
@@ -110,12 +113,12 @@ class ReplayCamera:
         return {name: value for name, value in self._settings.items() if name.endswith(ending)}
 
 
-def open_lidar_bag(path: Path) -> BagReader:
-    """Open a recording of an L515. Raises StreamMissingError without depth or infrared,
+def open_lidar_bag(path: Path) -> "BagReader | RosReader":
+    """Open a recording of an L515, by librealsense or a ROS driver. Raises StreamMissingError without depth or infrared,
     RecordingError. Logs a warning for one without confidence.
     """
-    bag = BagReader(path)
-    if not bag.streams:
+    bag = open_recording(path)
+    if isinstance(bag, BagReader) and not bag.streams:
         raise RecordingError(no_frames(bag))
     present = {name: info.format for name, info in bag.streams.items()}
     missing = [stream for stream, wanted in FORMATS.items() if present.get(stream) != wanted]
@@ -137,7 +140,7 @@ def open_lidar_bag(path: Path) -> BagReader:
     return bag
 
 
-def streams_of(bag: BagReader) -> list[str]:
+def streams_of(bag: "BagReader | RosReader") -> list[str]:
     """Return the lidar's streams that a recording has, in the lidar's formats."""
     return [
         stream
@@ -146,7 +149,7 @@ def streams_of(bag: BagReader) -> list[str]:
     ]
 
 
-def identity_of(bag: BagReader) -> dict[str, str]:
+def identity_of(bag: "BagReader | RosReader") -> dict[str, str]:
     """Return name, serial, firmware and usb_type of the recorded device, as far as recorded."""
     return {ours: bag.device[theirs] for ours, theirs in IDENTITY.items() if theirs in bag.device}
 

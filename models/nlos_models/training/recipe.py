@@ -322,7 +322,7 @@ def recipe_of(facts: dict[str, Any]) -> Recipe:
     another task.
     """
     task = facts.get("task")
-    if task not in KINDS:
+    if not isinstance(task, str) or task not in KINDS:
         raise ValueError(f"task: must be one of {', '.join(KINDS)} (got {task!r})")
     return KINDS[task].model_validate(facts)
 

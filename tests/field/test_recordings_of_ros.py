@@ -1,0 +1,321 @@
+"""Someone records with the ROS driver of a RealSense camera, or takes a recording to ROS."""
+
+import json
+import os
+import shutil
+import sqlite3
+from collections.abc import Callable
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from backports import zstd
+from rosbags.rosbag1 import Writer as Ros1Writer
+from rosbags.rosbag2 import Reader, StoragePlugin, Writer, storage_mcap
+from rosbags.typesys import Stores, get_typestore
+
+from nlos_cam.errors import RecordingError
+from nlos_cam.recording import SAMPLE, BagReader, ReplayCamera, open_recording
+from nlos_cam.recording.bag_messages import CAMERA, IMAGE
+
+Run = Callable[..., Any]
+ROS1 = get_typestore(Stores.ROS1_NOETIC)
+ROS2 = get_typestore(Stores.ROS2_HUMBLE)
+
+
+def frames_of(path: Path) -> list[tuple[Any, ...]]:
+    with ReplayCamera(path) as camera:
+        return [
+            (
+                frame.frame_number,
+                frame.timestamp_s,
+                frame.depth_m.tobytes(),
+                frame.ir.tobytes(),
+                frame.confidence.tobytes(),
+            )
+            for frame in camera
+        ]
+
+
+@pytest.fixture(scope="module")
+def bags(tmp_path_factory: pytest.TempPathFactory) -> SimpleNamespace:
+    """Export the sample in both storages, with depth in metres."""
+    from nlos_cam.cli.main import main
+
+    folder = tmp_path_factory.mktemp("ros")
+    found = SimpleNamespace(sqlite3=folder / "sqlite3", mcap=folder / "mcap")
+    for storage, out in vars(found).items():
+        options = ["--storage", storage, "--metres", "--json"]
+        assert main(["export", str(SAMPLE), "--ros2", str(out), *options]) == 0
+    return found
+
+
+@pytest.mark.parametrize("storage", ["sqlite3", "mcap"])
+def test_bag_of_ros_2_gives_the_same_frames(bags: SimpleNamespace, storage: str) -> None:
+    folder = getattr(bags, storage)
+    file = next(path for path in folder.iterdir() if path.suffix != ".yaml")
+
+    assert frames_of(folder) == frames_of(SAMPLE)
+    assert frames_of(file) == frames_of(SAMPLE)
+
+
+@pytest.mark.slow
+def test_bag_of_ros_2_gives_the_same_reconstructions(bags: SimpleNamespace, run: Run) -> None:
+    run("replay", SAMPLE, "--out", "whole")
+    run("replay", bags.mcap, "--out", "other")
+    with np.load("whole/reconstruction.npz") as whole, np.load("other/reconstruction.npz") as other:
+        assert whole.files == other.files
+        assert all(whole[name].tobytes() == other[name].tobytes() for name in whole.files)
+
+
+def test_millimetres_are_rounded(run: Run) -> None:
+    run("export", SAMPLE, "--ros2", "mm")
+    with ReplayCamera(SAMPLE) as exact, ReplayCamera(Path("mm")) as rounded:
+        for one, other in zip(exact, rounded, strict=True):
+            np.testing.assert_allclose(other.depth_m, one.depth_m, atol=0.5001e-3)
+
+
+def test_bag_of_ros_2_keeps_pinholes_and_poses(bags: SimpleNamespace) -> None:
+    ours = open_recording(bags.sqlite3)
+    bag = BagReader(SAMPLE)
+    for name, info in bag.streams.items():
+        assert ours.streams[name].intrinsics == info.intrinsics
+        np.testing.assert_allclose(ours.pose("depth", name), bag.pose("depth", name), atol=1e-9)
+
+
+class Driver:
+    """Messages as a driver publishes them, of ROS 1 or 2, from the sample."""
+
+    def __init__(self, writer: Any, types: Any, base: str) -> None:
+        self._writer = writer
+        self._types = types
+        self._is_ros1 = types is ROS1
+        self._base = base
+        self._topics: dict[str, Any] = {}
+
+    def _new(self, kind: str, **fields: Any) -> Any:
+        return self._types.types[kind](**fields)
+
+    def _write(self, topic: str, kind: str, time_ns: int, message: Any) -> None:
+        if topic not in self._topics:
+            self._topics[topic] = self._writer.add_connection(topic, kind, typestore=self._types)
+        serialize = self._types.serialize_ros1 if self._is_ros1 else self._types.serialize_cdr
+        self._writer.write(self._topics[topic], time_ns, serialize(message, kind))
+
+    def publish(self, sample: Any, pinhole: Any, *, info: bool = True) -> None:
+        name, encoding = {
+            "depth": ("depth", "16UC1"),
+            "infrared": ("infra", "mono8"),
+            "confidence": ("confidence", "mono8"),
+        }[sample.stream]
+        nanosec = round(sample.timestamp_s * 1e9)
+        stamp = self._new("builtin_interfaces/msg/Time", sec=7, nanosec=nanosec % 10**9)
+        seq = {"seq": 0} if self._is_ros1 else {}
+        header = self._new("std_msgs/msg/Header", stamp=stamp, frame_id=name, **seq)
+        pixels = sample.pixels
+        if sample.stream == "depth":
+            pixels = np.rint(pixels * 0.25).astype("<u2")
+        image = self._new(
+            IMAGE,
+            header=header,
+            height=pixels.shape[0],
+            width=pixels.shape[1],
+            encoding=encoding,
+            is_bigendian=0,
+            step=pixels.nbytes // pixels.shape[0],
+            data=pixels.view(np.uint8).reshape(-1),
+        )
+        self._write(f"{self._base}/{name}/image_rect_raw", IMAGE, nanosec + 1, image)
+        if info:
+            camera = self._info(header, pinhole)
+            self._write(f"{self._base}/{name}/camera_info", CAMERA, nanosec + 1, camera)
+
+    def _info(self, header: Any, pinhole: Any) -> Any:
+        k = np.array([pinhole.fx, 0, pinhole.ppx, 0, pinhole.fy, pinhole.ppy, 0, 0, 1.0])
+        arrays = {"d": np.zeros(5), "k": k, "r": np.eye(3).reshape(-1), "p": np.zeros(12)}
+        if self._is_ros1:
+            arrays = {name.upper(): value for name, value in arrays.items()}
+        region = self._new(
+            "sensor_msgs/msg/RegionOfInterest",
+            x_offset=0,
+            y_offset=0,
+            height=0,
+            width=0,
+            do_rectify=False,
+        )
+        return self._new(
+            CAMERA,
+            header=header,
+            height=pinhole.height,
+            width=pinhole.width,
+            distortion_model="plumb_bob",
+            binning_x=0,
+            binning_y=0,
+            roi=region,
+            **arrays,
+        )
+
+
+def driven(path: Path, version: int, streams: tuple[str, ...], *, info: bool = True) -> Path:
+    """Write the sample as the driver for ROS 1 or 2 does, in millimetres and without metadata."""
+    bag = BagReader(SAMPLE)
+    if version == 1:
+        writer, types, base = Ros1Writer(path), ROS1, "/camera"
+    else:
+        writer = Writer(path, version=8, storage_plugin=StoragePlugin.MCAP)
+        types, base = ROS2, "/camera/camera"
+    with writer:
+        driver = Driver(writer, types, base)
+        for sample in bag.samples(streams):
+            driver.publish(sample, bag.streams[sample.stream].intrinsics, info=info)
+    return path
+
+
+LIDAR = ("depth", "infrared", "confidence")
+
+
+@pytest.mark.parametrize(("name", "version"), [("driver.bag", 1), ("driver", 2)])
+def test_recording_of_a_driver_replays(run: Run, name: str, version: int) -> None:
+    path = driven(Path(name), version, LIDAR)
+    with ReplayCamera(SAMPLE) as exact, ReplayCamera(path) as found:
+        pairs = list(zip(exact, found, strict=True))
+
+    assert [frame.frame_number for _, frame in pairs] == list(range(8))
+    for one, other in pairs:
+        np.testing.assert_allclose(other.depth_m, one.depth_m, atol=0.5001e-3)
+        np.testing.assert_array_equal(other.ir, one.ir)
+    assert run("info", path, "--verify")["whole"]
+
+
+def test_driver_without_infrared_is_named(run: Run) -> None:
+    path = driven(Path("depth"), 2, ("depth",))
+    assert "no infrared" in run("replay", path, "--out", "r", code=4).err
+
+
+def test_driver_without_camera_info_is_named(run: Run) -> None:
+    path = driven(Path("blind.bag"), 1, LIDAR, info=False)
+    assert "/camera/depth/camera_info" in run("replay", path, "--out", "r", code=4).err
+
+
+def edit_yaml(folder: Path, old: str, new: str) -> None:
+    file = folder / "metadata.yaml"
+    text = file.read_text(encoding="utf-8")
+    assert old in text
+    file.write_text(text.replace(old, new), encoding="utf-8")
+
+
+def no_yaml(folder: Path) -> None:
+    (folder / "metadata.yaml").write_text("[" * 100_000, encoding="utf-8")
+
+
+def huge_yaml(folder: Path) -> None:
+    with (folder / "metadata.yaml").open("ab") as file:
+        file.truncate(1 << 30)
+
+
+def compressed(folder: Path) -> None:
+    edit_yaml(folder, "compression_mode: ''", "compression_mode: FILE")
+
+
+def outside(folder: Path) -> None:
+    edit_yaml(folder, "sqlite3.db3", "../../other.db3")
+
+
+def pipe(folder: Path) -> None:
+    (folder / "sqlite3.db3").unlink()
+    os.mkfifo(folder / "sqlite3.db3")
+
+
+def cut(folder: Path) -> None:
+    file = folder / "sqlite3.db3"
+    file.write_bytes(file.read_bytes()[:500_000])
+
+
+def no_database(folder: Path) -> None:
+    (folder / "sqlite3.db3").write_bytes(b"SQLite format 3\0" + bytes(range(256)) * 10)
+
+
+def endless_view(folder: Path) -> None:
+    with sqlite3.connect(folder / "sqlite3.db3") as file:
+        file.execute("alter table messages rename to real")
+        file.execute(
+            "create view messages as with recursive n(id) as (select 1 union all select id + 1"
+            " from n) select id, 1 as topic_id, id as timestamp, zeroblob(100000000) as data from n"
+        )
+    file.close()
+
+
+def computed_blob(folder: Path) -> None:
+    with sqlite3.connect(folder / "sqlite3.db3") as file:
+        file.execute("drop table messages")
+        file.execute(
+            "create table messages (id integer, topic_id integer, timestamp integer,"
+            " data blob as (zeroblob(900000000)))"
+        )
+    file.close()
+
+
+def other_messages(folder: Path) -> None:
+    with sqlite3.connect(folder / "sqlite3.db3") as file:
+        file.execute("update messages set data = substr(data, 1, 60)")
+    file.close()
+
+
+HOSTILE = [
+    no_yaml,
+    huge_yaml,
+    compressed,
+    outside,
+    pipe,
+    cut,
+    no_database,
+    endless_view,
+    computed_blob,
+    other_messages,
+]
+
+
+@pytest.mark.parametrize("damage", HOSTILE, ids=lambda damage: damage.__name__)
+def test_hostile_bag_of_ros_2_gets_one_line(
+    bags: SimpleNamespace, run: Run, damage: Callable[[Path], None]
+) -> None:
+    folder = Path("sqlite3")
+    shutil.copytree(bags.sqlite3, folder)
+    damage(folder)
+    answer = run("replay", folder, "--out", "r", code=4)
+
+    assert answer["error"]["message"].count("\n") == 0
+    assert "sqlite3" in answer["error"]["message"]
+    assert not Path("r").exists()
+
+
+@pytest.mark.parametrize("size", [8, 100, 1_000_000])
+def test_cut_mcap_is_refused(bags: SimpleNamespace, size: int) -> None:
+    file = Path("other.mcap")
+    file.write_bytes(next(bags.mcap.glob("*.mcap")).read_bytes()[:size])
+    with pytest.raises(RecordingError) as raised:
+        frames_of(file)
+
+    assert str(file) in str(raised.value)
+
+
+def test_chunk_of_mcap_unpacks_no_more_than_it_declares(bags: SimpleNamespace) -> None:
+    open_recording(bags.mcap)
+    bomb = zstd.compress(bytes(1 << 28))
+    unpack = storage_mcap.DECOMPRESSORS["zstd"]
+
+    assert len(unpack(bomb, 1000)) == 1001
+    with pytest.raises(ValueError, match="a chunk of"):
+        unpack(bomb, 1 << 28)
+
+
+def test_metadata_of_a_bag_are_those_of_the_driver(bags: SimpleNamespace) -> None:
+    with Reader(bags.sqlite3) as reader:
+        topics = {connection.topic: connection for connection in reader.connections}
+        found = next(reader.messages([topics["/camera/depth/metadata"]]))[2]
+
+    assert json.loads(found[found.index(b"{") : found.rindex(b"}") + 1])["frame_number"] == 0
+    assert "/camera/infra/image_rect_raw" in topics
+    assert "/tf_static" in topics
