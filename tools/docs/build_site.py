@@ -3,9 +3,11 @@ other sites.
 
 `make docs` runs it. `--check` builds into a temporary folder: a gate of tools/checks/check.py.
 Addresses of other sites are checked for their form only, without a network. mkdocs.yml names this
-file as its hook.
+file as its hook. A line `<!-- run NAME -->` of a page becomes the code of examples/gallery/NAME.py,
+what it printed and the pictures it drew: the build runs it.
 """
 
+import logging
 import os
 import re
 import subprocess
@@ -18,6 +20,7 @@ from typing import Any
 from urllib.parse import unquote, urlsplit
 
 import markdown
+from mkdocs.structure.files import File
 
 ROOT = Path(__file__).parents[2]
 OUTSIDE = ("README.md", "CHANGELOG.md", "models/cards/*.md", "calibration/records/*.md")
@@ -32,6 +35,9 @@ FETCHING = {
 }
 """Elements that a browser follows by itself, and their attribute."""
 ADDRESS = re.compile(r"https://[a-z0-9.-]+\.[a-z]{2,}(/\S*)?")
+RUN = re.compile(r"<!-- run (\w+) -->")
+SCRIPT_TIMEOUT_S = 600
+log = logging.getLogger("mkdocs.hooks.gallery")
 
 
 class Page(HTMLParser):
@@ -155,6 +161,60 @@ def _paths(nav: str | Sequence[Any] | Mapping[str, Any]) -> Iterator[str]:
         return
     for each in nav.values() if isinstance(nav, Mapping) else nav:
         yield from _paths(each)
+
+
+def run_script(script: Path) -> tuple[str, dict[str, bytes]]:
+    """Run a script in an empty folder; return what it printed and its pictures by name.
+
+    Raises CalledProcessError if it fails, TimeoutExpired if it takes longer than SCRIPT_TIMEOUT_S.
+    """
+    with TemporaryDirectory() as folder:
+        ended = subprocess.run(
+            [sys.executable, script],
+            cwd=folder,
+            capture_output=True,
+            text=True,
+            check=True,
+            timeout=SCRIPT_TIMEOUT_S,
+        )
+        pictures = {path.name: path.read_bytes() for path in sorted(Path(folder).glob("*.png"))}
+    return ended.stdout, pictures
+
+
+def on_files(files: Any, config: Any) -> Any:
+    """Run the scripts that pages name, and add their pictures to the site; MkDocs calls this
+    hook.
+    """
+    root = Path(config["config_file_path"]).parent
+    shown: dict[str, str] = {}
+    for page in files.documentation_pages():
+        for name in RUN.findall(page.content_string):
+            script = root / "examples" / "gallery" / f"{name}.py"
+            try:
+                output, pictures = run_script(script)
+            except (subprocess.SubprocessError, OSError) as error:
+                told = getattr(error, "stderr", None) or error
+                log.warning("%s failed: %s", script.name, str(told).strip().splitlines()[-1])
+                continue
+            for picture, content in pictures.items():
+                files.append(File.generated(config, f"images/built/{picture}", content=content))
+            shown[name] = as_section(script, output, pictures)
+    config["extra"]["scripts"] = shown
+    return files
+
+
+def as_section(script: Path, output: str, pictures: Iterable[str]) -> str:
+    """Return a script, its output and its pictures as Markdown."""
+    code = script.read_text(encoding="utf-8").strip()
+    drawn = "\n".join(f"![Drawn by {script.name}](images/built/{name})" for name in pictures)
+    return f"```python\n{code}\n```\n\n```text\n{output.strip()}\n```\n\n{drawn}\n"
+
+
+def on_page_markdown(markdown: str, page: Any, config: Any, files: Any) -> str:
+    """Put the scripts' sections in place of their lines; MkDocs calls this hook."""
+    del page, files
+    shown = config["extra"].get("scripts", {})
+    return RUN.sub(lambda found: shown.get(found[1], ""), markdown)
 
 
 def main() -> int:
