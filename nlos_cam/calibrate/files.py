@@ -7,6 +7,7 @@ from pathlib import Path
 
 from nlos_calibration import BareWall, MeasuredWall, WallRecord, dump_toml, save_reference
 
+from nlos_cam.bench import MAIN, StationRecord, edit_bench, station_folder
 from nlos_cam.calibrate.report import report_html
 from nlos_cam.errors import OutputExistsError
 from nlos_cam.files import atomic_file
@@ -54,4 +55,46 @@ def write_record(files: WallFiles, record: WallRecord, reference: BareWall | Non
         html = report_html(MeasuredWall(record, reference), files.record.name)
         parts.enter_context(atomic_file(files.report)).write_text(html, encoding="utf-8")
         record_part.write_text(dump_toml(record), encoding="utf-8")
+    return record
+
+
+def files_in_bench(
+    folder: Path, *, occluder: bool, overwrite: bool, station: str = MAIN
+) -> WallFiles:
+    """Return the paths of a measurement in a bench folder: of the bare wall, or with its occluder.
+
+    Raises OutputExistsError for an existing file without `overwrite`.
+    """
+    record = folder / station_folder(station) / ("occluder.toml" if occluder else "wall.toml")
+    if record.exists() and not overwrite:
+        raise OutputExistsError(
+            f"{record} exists: choose another bench, or add --overwrite to replace it"
+        )
+    return WallFiles.beside(record, overwrite=overwrite)
+
+
+def write_to_bench(
+    folder: Path,
+    files: WallFiles,
+    record: WallRecord,
+    reference: BareWall | None,
+    station: str = MAIN,
+) -> WallRecord:
+    """Write a measurement to its `files_in_bench` and enter it in the bench, which is made if it is
+    missing; return the record, which names its reference.
+
+    A wall that is measured again drops the occluder found before; the object box stays.
+    """
+    with edit_bench(folder) as edit:
+        files.record.parent.mkdir(parents=True, exist_ok=True)
+        record = write_record(files, record, reference)
+        name = files.record.relative_to(folder).as_posix()
+        before = edit.stations.get(station)
+        box = before.object_box if before else record.rig.object_box
+        if files.record.stem == "occluder" and before:
+            entry = StationRecord(wall=before.wall, occluder=name, object_box=box)
+        else:
+            entry = StationRecord(wall=name, object_box=box)
+        edit.set_station(station, entry, record)
+        edit.add(files.record, *([files.reference] if reference else []))
     return record

@@ -1,0 +1,68 @@
+"""The option --bench: a bench folder in place of --wall, --weights and --rig."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, NamedTuple
+
+import nlos_calibration as walls
+import typer
+
+from nlos_cam import bench as benches
+from nlos_cam import camera as cameras
+from nlos_cam import reconstruct
+
+BenchFolder = Annotated[
+    Path | None,
+    typer.Option("--bench", help="Bench folder of `calibrate --bench`, in place of --wall."),
+]
+BenchOrWeights = Annotated[
+    Path | None,
+    typer.Option(
+        "--bench", help="Bench folder of `calibrate --bench`, in place of --wall and --weights."
+    ),
+]
+BenchOrRig = Annotated[
+    Path | None,
+    typer.Option("--bench", help="Bench folder of `calibrate --bench`, in place of --rig."),
+]
+
+
+class Choice(NamedTuple):
+    """Bench, wall record and weights that a command was given."""
+
+    bench: benches.Bench | None
+    record: Path | None
+    """Wall record, of the bench or on its own."""
+    weights: Path | None
+    """Folder of weights: those named, else the bench's own; None for the shipped ones."""
+
+    def open(self, camera: cameras.Camera) -> reconstruct.CalibratedRig:
+        """Return the rig for an opened camera. Raises CalibrationError where they do not fit."""
+        if self.bench:
+            return self.bench.for_camera(camera)
+        return reconstruct.open_bench(self.record, camera)
+
+
+def choose(bench: Path | None, wall: Path | None = None, weights: Path | None = None) -> Choice:
+    """Load the bench folder, if there is one. Raises RecordFileError, and typer.BadParameter for a
+    bench and a wall record.
+    """
+    if bench is None:
+        return Choice(None, wall, weights)
+    if wall is not None:
+        raise typer.BadParameter("--bench and --wall each name a measured wall: give one")
+    loaded = benches.load_bench(bench)
+    return Choice(loaded, loaded.wall, weights or loaded.weights)
+
+
+def rig_of(bench: Path | None, rig: str | None, default: str | None = None) -> walls.Rig | None:
+    """Return the rig of a bench folder, of a name or file, or the default's. Raises
+    typer.BadParameter for both.
+    """
+    if bench is not None and rig is not None:
+        raise typer.BadParameter("--bench and --rig each name a rig: give one")
+    if bench is not None:
+        return benches.load_bench(bench).rig
+    name = rig or default
+    return walls.rig_named(name) if name else None
