@@ -23,6 +23,7 @@ from typing import Self
 from nlos_calibration import Rig
 
 from nlos_cam import reconstruct
+from nlos_cam.bench import load_bench
 from nlos_cam.camera import Camera, OnProgress, open_camera
 from nlos_cam.errors import NlosCamError
 from nlos_cam.live import RunStatistics
@@ -108,6 +109,7 @@ def open_stream(
     uri: str,
     *,
     wall: str | Path | None = None,
+    bench: str | Path | None = None,
     weights: str | Path | None = None,
     average: int = 1,
     on_progress: OnProgress | None = None,
@@ -117,20 +119,28 @@ def open_stream(
     `nlos_cam.open`.
 
     `uri` is `l515`, `l515:SERIAL`, `sim`, `sim:bare-wall`, `sim:scene.toml` or `bag:run.bag`;
-    `wall` a record of `calibrate --wall`, `weights` a folder of other weights than the shipped
-    ones; maps are the mean of the last `average` frames. `on_progress` is called while a simulated
-    scene is pre-rendered, which takes time on its first run. Raises the errors of
-    `nlos_cam.errors`; RecordFileError and CalibrationError for the wall, CheckpointError for the
-    weights.
+    `wall` a record of `calibrate --wall`, or `bench` a bench folder of `calibrate --bench`, which
+    brings its wall and its own weights; `weights` a folder of other weights than these or the
+    shipped ones; maps are the mean of the last `average` frames. `on_progress` is called while a
+    simulated scene is pre-rendered, which takes time on its first run. Raises the errors of
+    `nlos_cam.errors`; RecordFileError and CalibrationError for wall and bench, CheckpointError for
+    the weights.
     """
+    if wall and bench:
+        raise NlosCamError(f"wall {wall} and bench {bench} each name a measured wall: give one")
+    loaded = load_bench(bench) if bench else None
     camera = open_camera(uri, on_progress=on_progress)
-    bench = reconstruct.open_bench(Path(wall) if wall else None, camera)
-    folder = Path(weights) if weights else None
+    if loaded:
+        calibrated = loaded.for_camera(camera)
+    else:
+        calibrated = reconstruct.open_bench(Path(wall) if wall else None, camera)
+    own = loaded.weights if loaded else None
+    folder = Path(weights) if weights else own
     network = reconstruct.load_networks(folder)
     uncertainty_model = reconstruct.load_uncertainty(folder)
     pipeline = reconstruct.build_pipeline(
-        bench, network, average, uncertainty_model=uncertainty_model
+        calibrated, network, average, uncertainty_model=uncertainty_model
     )
     reconstruct.warm_up(camera, pipeline)
-    notes = tuple(reconstruct.compatibility_warnings(bench, network.record, uncertainty_model))
+    notes = tuple(reconstruct.compatibility_warnings(calibrated, network.record, uncertainty_model))
     return Stream(camera, pipeline, lossless=uri.startswith("bag:"), notes=notes, clock=clock)

@@ -63,6 +63,7 @@ __all__ = [
     "on_plane",
     "packaged_rigs",
     "points_m",
+    "read_record",
     "record_kind",
     "rig_difference",
     "rig_named",
@@ -112,6 +113,7 @@ from .rig import (
     first_problem,
     load_rig,
     packaged_rigs,
+    read_record,
     record_kind,
 )
 from .rig_check import (

@@ -37,7 +37,13 @@ FocalLength = Annotated[float, Field(ge=1, le=1e6)]
 PixelPlace = Annotated[float, Field(ge=-1e5, le=1e5)]
 Pixels = Annotated[int, Field(gt=0, le=16384)]
 R = TypeVar("R", bound=BaseModel)
-KINDS = {"schema_version": "wall record", "task": "training recipe", "lidar": "rig", "rig": "scene"}
+KINDS = {
+    "schema_version": "wall record",
+    "bench_version": "bench",
+    "task": "training recipe",
+    "lidar": "rig",
+    "rig": "scene",
+}
 """Kind of a TOML file by a field of it, in this order: a wall record has a rig too."""
 WORDING = {
     "^Value error, ": "",

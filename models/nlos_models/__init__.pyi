@@ -3,6 +3,7 @@ __all__ = [
     "BLACK_V",
     "GOOD_IOU",
     "MIN_V",
+    "RECORD",
     "SHIPPED",
     "SIMULATION_ONLY",
     "SMALLER_IS_BETTER",
@@ -73,6 +74,7 @@ from .pipeline import (
 )
 from .quality import GOOD_IOU, quality_features
 from .records import (
+    RECORD,
     SHIPPED,
     SIMULATION_ONLY,
     CheckpointRecord,

@@ -6,7 +6,7 @@ import hashlib
 from collections.abc import Iterable, Sequence
 from importlib import resources
 from pathlib import Path
-from typing import Self
+from typing import Any, Self
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, ValidationInfo, field_validator
 
@@ -49,6 +49,8 @@ class CheckpointRecord(BaseModel):
 
     rig_name: str
     rig_checksum: str
+    rig: dict[str, Any] | None = None
+    """The rig itself, for weights of a measured bench; None for those of a packaged rig."""
     input: MapKind = "raw maps"
     """The compressor's input; difference maps are maps minus the bare wall's."""
     vae_recipe: VaeRecipe | None = None

@@ -157,7 +157,10 @@ def write_page(result: AdaptResult, rows: Sequence[tuple[str, str, str]], page: 
                 "The 54 test objects.",
                 result.folders[-1] / REPORT / "sheet.png",
             ),
-            Section("Next commands", [Commands(["nlos-cam live --bench BENCH"])]),
+            Section(
+                "Next commands",
+                [Commands(["nlos-cam live --bench BENCH", "nlos-cam adapt BENCH --minutes MORE"])],
+            ),
         ],
     )
     write_document(document, page)

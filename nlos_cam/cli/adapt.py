@@ -9,15 +9,17 @@ import nlos_calibration as walls
 import typer
 
 from nlos_cam import adapt as adaptation
+from nlos_cam import bench as benches
 from nlos_cam import evaluate as evaluation
 from nlos_cam.cli import common
 from nlos_cam.cli.train import watched_run
 from nlos_cam.errors import OutputExistsError
+from nlos_cam.files import checksums_of
 
-WALL = "wall.toml"
 PAGE = "adapt.html"
 WORK = "adapt"
 WEIGHTS = "weights"
+NETWORK = "direct.safetensors"
 
 
 def adapt(
@@ -62,8 +64,9 @@ def adapt(
 
     Killed at any moment, the same command goes on. More --minutes go on from what is there.
     """
+    folder = Path(bench) if out is None and Path(bench).is_dir() else None
     rig, measured = _rig_of(bench)
-    home = out or (Path(bench) if Path(bench).is_dir() else Path(f"adapted-{rig.name}"))
+    home = out or folder or Path(f"adapted-{rig.name}")
     target = home / WEIGHTS
     work = home / WORK
     if not overwrite:
@@ -96,7 +99,10 @@ def adapt(
         )
     except KeyboardInterrupt:
         common.exit_interrupted(f"what was made is kept in {work}; give the same command to go on")
-    adaptation.install(result.weights, target)
+    if folder:
+        benches.write_weights(folder, result.weights)
+    else:
+        adaptation.install(result.weights, target)
 
     rows = [
         (
@@ -127,9 +133,11 @@ def adapt(
 
 def _rig_of(bench: str) -> tuple[walls.Rig, walls.MeasuredWall | None]:
     """Return a bench's rig and, where it was measured, its wall."""
-    path = Path(bench) / WALL if Path(bench).is_dir() else Path(bench)
-    is_record = path.is_file() and "schema_version" in path.read_text("utf-8", errors="replace")
-    if path.name == WALL or is_record:
+    path = Path(bench)
+    if path.is_dir():
+        measured = benches.load_bench(path).measured
+        return measured.record.rig, measured
+    if path.is_file() and "schema_version" in path.read_text("utf-8", errors="replace"):
         measured = walls.load_measured(path)
         return measured.record.rig, measured
     return walls.rig_named(bench), None
@@ -137,11 +145,11 @@ def _rig_of(bench: str) -> tuple[walls.Rig, walls.MeasuredWall | None]:
 
 def _refuse_others(target: Path, work: Path) -> None:
     """Raise OutputExistsError where the bench has weights that no adaptation in `work` made."""
-    sums = target / "SHA256SUMS"
     if not target.exists():
         return
-    ours = [path.read_bytes() for path in work.glob(f"stage-*/{WEIGHTS}/SHA256SUMS")]
-    if not sums.exists() or sums.read_bytes() not in ours:
+    # the network's file: a bench adds its rig to the record
+    ours = [checksums_of(folder).get(NETWORK) for folder in work.glob(f"stage-*/{WEIGHTS}")]
+    if checksums_of(target).get(NETWORK, "") not in ours:
         raise OutputExistsError(
             f"{target} holds weights that were not made here: move them, or give --overwrite"
         )

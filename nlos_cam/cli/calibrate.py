@@ -4,11 +4,12 @@ it.
 
 from __future__ import annotations
 
+import shlex
 import sys
 from collections.abc import Callable
 from pathlib import Path
 from threading import Event, Thread
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal, NamedTuple
 
 import nlos_calibration as walls
 import typer
@@ -16,8 +17,10 @@ from rich.live import Live
 from rich.markup import escape
 from rich.table import Table
 
+from nlos_cam import bench as benches
 from nlos_cam import calibrate as bench
 from nlos_cam import camera as cameras
+from nlos_cam.cli import benches as options
 from nlos_cam.cli.common import (
     Camera,
     Json,
@@ -138,7 +141,8 @@ Bag = Annotated[Path | None, typer.Option("--bag", help="Recording of the bare w
 BareRecord = Annotated[
     Path | None,
     typer.Option(
-        "--occluder", help="Find the occluder in front of the wall of this record (wall.toml)."
+        "--occluder",
+        help="Find the occluder in front of the wall of this record (wall.toml) or bench folder.",
     ),
 ]
 Frames = Annotated[int, typer.Option("--frames", min=1, help="Number of frames to average.")]
@@ -187,6 +191,10 @@ OccluderGap = Annotated[
     ),
 ]
 Out = Annotated[Path | None, typer.Option("--out", help="Record to write (TOML).")]
+BenchToWrite = Annotated[
+    Path | None,
+    typer.Option("--bench", help="Bench folder to write to, in place of --out; made if missing."),
+]
 JSON_FIELDS = {
     "distance_m",
     "distance_std_m",
@@ -225,6 +233,7 @@ def calibrate(
     occluder_x_m: OccluderX = None,
     occluder_gap_m: OccluderGap = None,
     out: Out = None,
+    bench_folder: BenchToWrite = None,
     overwrite: Overwrite = False,
     json: Json = False,
 ) -> None:
@@ -233,33 +242,15 @@ def calibrate(
 
     Beside the record wall.toml it writes wall.npz, the bare wall's reference for difference maps,
     and wall.html, the report. Once the occluder stands, --occluder wall.toml finds it and takes a
-    new reference, with no object hidden.
+    new reference, with no object hidden. With --bench bench/ all of them go into one folder, which
+    other commands take as --bench; the occluder is then found with --occluder bench/.
     """
     uri = _source(camera, bag, wall=wall, occluder=occluder)
-    if not board and (paper or square_mm):
-        raise typer.BadParameter("--paper and --square-mm need --board")
-    if board and tape_m is not None:
-        raise typer.BadParameter(
-            "give one of --tape-m and --board: each measures the lidar's range offset"
-        )
     by_hand = _entered(occluder_x_m, occluder_gap_m)
-    if occluder and (board or tape_m is not None or by_hand):
-        raise typer.BadParameter(
-            "--occluder uses a wall that was measured before: drop --board, --tape-m,"
-            " --occluder-x-m, -gap-m"
-        )
-    if occluder and watch:
-        raise typer.BadParameter(
-            "--watch shows the bare wall: position the lidar with it first, then add the occluder"
-        )
-    if occluder and out and out.resolve() == occluder.resolve():
-        raise typer.BadParameter(
-            f"--out {out} is the record of the bare wall, which stays: choose another name"
-        )
-    bare = walls.load_measured(occluder) if occluder else None
-    files = bench.WallFiles.beside(
-        output_path(out, "wall", ".toml", overwrite=overwrite), overwrite=overwrite
-    )
+    measured = board or tape_m is not None or by_hand
+    _refuse_board_options(board=board, paper=paper, square_mm=square_mm, tape_m=tape_m)
+    _refuse_occluder_options(occluder, out, measured=bool(measured), watch=watch)
+    target = Target.of(bench_folder, occluder, out, overwrite=overwrite)
     if watch:
         say("Position the lidar. [bold]Enter[/] measures, Ctrl-C cancels.", marked=True)
         with _opened(uri) as source:
@@ -268,8 +259,8 @@ def calibrate(
             stderr.print(panel(last))
     capture = _capture(uri, frames)
     inliers: NDArray[np.bool_] | None
-    if bare:
-        record, inliers = bench.measure_occluder(capture, bare)
+    if target.bare:
+        record, inliers = bench.measure_occluder(capture, target.bare)
     else:
         if board:
             fit, facts = bench.measure_by_board(capture, walls.BOARDS[paper or "a4"], square_mm)
@@ -277,12 +268,113 @@ def calibrate(
             fit, facts = bench.measure_by_depth(capture, tape_m)
         record = capture.record(fit, facts, by_hand)
         inliers = fit.inliers if isinstance(fit, walls.WallFit) else None
-    record = bench.write_record(
-        files, record, None if inliers is None else capture.reference(inliers)
-    )
+    record = target.write(record, None if inliers is None else capture.reference(inliers))
     fields = record.model_dump(mode="json", include=JSON_FIELDS)
+    files = target.files
     result = fields | {"out": str(files.record), "report": str(files.report)}
-    finish(result, as_json=json, text=format_result(record, files), marked=True)
+    text = format_result(record, files)
+    if target.folder:
+        result["bench"] = str(target.folder)
+        text += f"\nNext: {escape(_next_step(target.folder, record))}"
+    finish(result, as_json=json, text=text, marked=True)
+
+
+def _refuse_board_options(
+    *, board: bool, paper: str | None, square_mm: float | None, tape_m: float | None
+) -> None:
+    if not board and (paper or square_mm):
+        raise typer.BadParameter("--paper and --square-mm need --board")
+    if board and tape_m is not None:
+        raise typer.BadParameter(
+            "give one of --tape-m and --board: each measures the lidar's range offset"
+        )
+
+
+def _refuse_occluder_options(
+    occluder: Path | None, out: Path | None, *, measured: bool, watch: bool
+) -> None:
+    """Raise typer.BadParameter for options of the bare wall, `measured` by them, beside
+    --occluder.
+    """
+    if occluder is None:
+        return
+    if measured:
+        raise typer.BadParameter(
+            "--occluder uses a wall that was measured before: drop --board, --tape-m,"
+            " --occluder-x-m, -gap-m"
+        )
+    if watch:
+        raise typer.BadParameter(
+            "--watch shows the bare wall: position the lidar with it first, then add the occluder"
+        )
+    if out and out.resolve() == occluder.resolve():
+        raise typer.BadParameter(
+            f"--out {out} is the record of the bare wall, which stays: choose another name"
+        )
+
+
+class Target(NamedTuple):
+    """Bare wall to start from, and what to write: a record of its own, or into a bench folder."""
+
+    folder: Path | None
+    """Bench folder; None for a record of its own."""
+    bare: walls.MeasuredWall | None
+    """Measured bare wall in front of which the occluder is found; None to measure the wall."""
+    files: bench.WallFiles
+
+    @classmethod
+    def of(
+        cls, folder: Path | None, occluder: Path | None, out: Path | None, *, overwrite: bool
+    ) -> Target:
+        """Return the target of the options, before anything is measured."""
+        folder = _bench_folder(folder, occluder, out)
+        bare = _bare_wall(occluder) if occluder else None
+        if folder:
+            files = options.files_in_bench(folder, occluder=bool(bare), overwrite=overwrite)
+        else:
+            path = output_path(out, "wall", ".toml", overwrite=overwrite)
+            files = bench.WallFiles.beside(path, overwrite=overwrite)
+        return cls(folder, bare, files)
+
+    def write(self, record: walls.WallRecord, reference: walls.BareWall | None) -> walls.WallRecord:
+        """Write the measurement, and return the record, which names its reference."""
+        if self.folder:
+            return options.write_to_bench(self.folder, self.files, record, reference)
+        return bench.write_record(self.files, record, reference)
+
+
+def _bench_folder(folder: Path | None, occluder: Path | None, out: Path | None) -> Path | None:
+    """Return the bench folder to write to: --bench, or the one that --occluder names; None for a
+    record of its own.
+    """
+    if occluder and occluder.is_dir():
+        if folder and folder.resolve() != occluder.resolve():
+            raise typer.BadParameter(
+                f"--occluder {occluder} and --bench {folder} are two benches: name one"
+            )
+        folder = occluder
+    elif occluder and folder:
+        raise typer.BadParameter(
+            f"--occluder {occluder} is a record of its own: give --occluder {folder}, the bench"
+            " whose bare wall was measured"
+        )
+    if folder and out:
+        raise typer.BadParameter("--bench and --out each name what to write: give one")
+    if folder:
+        benches.check_new(folder)
+    return folder
+
+
+def _bare_wall(source: Path) -> walls.MeasuredWall:
+    """Return the bare wall of a record, or of a bench folder. Raises RecordFileError."""
+    return benches.load_bench(source).bare if source.is_dir() else walls.load_measured(source)
+
+
+def _next_step(folder: Path, record: walls.WallRecord) -> str:
+    name = shlex.quote(str(folder))
+    if record.occluder is None:
+        return f"put the occluder up, then nlos-cam calibrate --occluder {name}"
+    return f"nlos-cam live --bench {name}"
 
 
 def _source(camera: str | None, bag: Path | None, *, wall: bool, occluder: Path | None) -> str:

@@ -16,7 +16,7 @@ from rich.progress import Progress
 
 from nlos_cam import camera as cameras
 from nlos_cam import recording as recordings
-from nlos_cam.cli import common
+from nlos_cam.cli import benches, common
 from nlos_cam.errors import NlosCamError
 
 FIGURES = ("saturated_share", "invalid_share", "temporal_noise_mm")
@@ -165,6 +165,7 @@ def capture(
     pause_s: Pause = None,
     label: Labels = None,
     wall: Wall = None,
+    bench_folder: benches.BenchFolder = None,
     out: Out = None,
     overwrite: common.Overwrite = False,
     json: common.Json = False,
@@ -173,7 +174,8 @@ def capture(
     each file.
     """
     targets = _targets(_base(seconds, frames, takes, out), takes, label or [], overwrite=overwrite)
-    measured = recordings.load_measured_wall(wall) if wall else None
+    chosen = benches.choose(bench_folder, wall)
+    measured = recordings.load_measured_wall(chosen.record) if chosen.record else None
     recording = cameras.Recording(
         targets[0].path, frames=frames, seconds=seconds, last=takes == 1, overwrite=overwrite
     )
@@ -188,6 +190,9 @@ def capture(
         text = f"Interrupted before the first frame; {NOTHING}"
         common.finish(result, as_json=json, text=text)
         common.exit_interrupted(NOTHING)
+    if chosen.bench:
+        chosen.bench.for_camera(source)  # a recording of another camera is refused now, not later
+        measured = chosen.bench.rig, measured[1]
     limit = frames or (round(seconds * cameras.FRAMES_PER_S) if seconds else None)
     _check_disk(source, targets, limit)
     with common.stop_on_signals() as stop:

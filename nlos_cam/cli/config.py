@@ -40,11 +40,18 @@ SETTINGS = {
         None,
         "--wall, unless another CAMERA is given",
     ),
+    "bench": Setting(
+        frozenset({"live", "replay", "capture", "evaluate"}),
+        None,
+        "--bench, unless another CAMERA, --wall or --rig is given",
+    ),
     "weights": Setting(frozenset({"live", "replay", "evaluate"}), None, "--weights"),
     "view_port": Setting(frozenset({"live", "view"}), None, "--view-port"),
     "cache": Setting(frozenset(), None, "folder for rendered scenes and exported networks"),
 }
 """Settings by their key in the file; the environment variable of `camera` is NLOS_CAM_CAMERA."""
+PARAMETERS = {"bench": "bench_folder"}
+"""Parameters of commands that are not named like their setting."""
 
 
 class Value(NamedTuple):
@@ -160,6 +167,7 @@ def shared_options(name: str, command: Callable[..., None]) -> Callable[..., Non
         used = {key: value for key, value in settings.items() if name in SETTINGS[key].commands}
         if takes_camera:
             _choose_camera(values, used)
+        _choose_bench(values, used)
         _fill(values, used)
         try:
             with _cache_at(settings["cache"]) if name != "config" else nullcontext():
@@ -203,6 +211,7 @@ def _choose_camera(values: dict[str, Any], used: dict[str, Value]) -> None:
     given = option if argument is None else argument
     if given is not None and given != used["camera"].value:
         used.pop("wall", None)
+        used.pop("bench", None)
     values["camera"] = (
         used["camera"].value if given is None and values.get("bag") is None else given
     )
@@ -212,14 +221,27 @@ def _choose_camera(values: dict[str, Any], used: dict[str, Value]) -> None:
         values["camera"] = full_uri(str(values["camera"]))
 
 
+def _choose_bench(values: Mapping[str, Any], used: dict[str, Value]) -> None:
+    """Drop the settings that contradict the bench, wall, rig or dataset that was given.
+
+    A bench has its own wall and weights, so those of the settings are for commands without one.
+    """
+    if any(values.get(name) is not None for name in ("wall", "rig", "data")):
+        used.pop("bench", None)
+    if values.get("bench_folder") is not None or ("bench" in used and used["bench"].value):
+        used.pop("wall", None)
+        used.pop("weights", None)
+
+
 def _fill(values: dict[str, Any], used: Mapping[str, Value]) -> None:
     """Enter the settings of options that were not given, and print them if details are wanted."""
     for key, (value, source) in used.items():
-        if key == "camera" or value is None or values.get(key) is not None:
+        parameter = PARAMETERS.get(key, key)
+        if key == "camera" or value is None or values.get(parameter) is not None:
             continue
         if key == "view_port" and values.get("no_view"):
             continue
-        values[key] = value if key == "view_port" else Path(str(value))
+        values[parameter] = value if key == "view_port" else Path(str(value))
         if Detail.verbose:
             say(f"{key} = {value} (from {source})")
 

@@ -6,10 +6,10 @@ import time
 from pathlib import Path
 from typing import Annotated, Any
 
-import nlos_calibration as walls
 import typer
 
 from nlos_cam import evaluate as measure
+from nlos_cam.cli import benches
 from nlos_cam.cli.common import (
     Json,
     Overwrite,
@@ -56,6 +56,7 @@ def evaluate(
             "--wall", help="Bare wall for difference maps, wall.toml (default: rendered)."
         ),
     ] = None,
+    bench_folder: benches.BenchOrRig = None,
     count: Count = None,
     no_nearest: Annotated[
         bool,
@@ -67,8 +68,10 @@ def evaluate(
     json: Json = False,
 ) -> None:
     """Measure weights on held-out objects, beside trivial baselines."""
-    if data and (count or rig):
-        raise typer.BadParameter("--dataset has its own objects and rig: omit --count and --rig")
+    if data and (count or rig or bench_folder):
+        raise typer.BadParameter(
+            "--dataset has its own objects and rig: omit --count, --rig and --bench"
+        )
     if training and no_nearest:
         raise typer.BadParameter(
             "--training is searched for the nearest neighbour: omit it or --no-nearest"
@@ -79,13 +82,16 @@ def evaluate(
             raise RecordingError(
                 f"{option} {given} does not exist: make one with `nlos-cam dataset build`"
             )
+    its_rig = benches.rig_of(bench_folder, rig)
+    if bench_folder:
+        weights = benches.choose(bench_folder, wall, weights).weights
     folder = output_path(out, "evaluation", "", overwrite=overwrite)
     start_s = time.perf_counter()
     with interrupted_by_signals():
         evaluation = measure.evaluate(
             weights,
             data,
-            rig=walls.rig_named(rig) if rig else None,
+            rig=its_rig,
             count=count,
             wall=wall,
             training=training,

@@ -17,7 +17,7 @@ from nlos_cam import live as loop
 from nlos_cam import reconstruct
 from nlos_cam import replay as replays
 from nlos_cam import view as views
-from nlos_cam.cli import common
+from nlos_cam.cli import benches, common
 from nlos_cam.cli import view as viewing
 from nlos_cam.cli.recordings import AsObject, object_formats
 
@@ -91,6 +91,7 @@ def demo(
 def live(
     camera: common.Camera = "sim",
     wall: Wall = None,
+    bench_folder: benches.BenchOrWeights = None,
     seconds: viewing.Seconds = None,
     no_view: viewing.NoView = False,
     view_port: viewing.ViewPort = None,
@@ -108,6 +109,7 @@ def live(
     """Show what is hidden around the corner, live, in a browser."""
     if no_view and open_view:
         raise typer.BadParameter("--open needs a view: drop --no-view")
+    chosen = benches.choose(bench_folder, wall, weights)
     check_output = partial(_check_output, overwrite=overwrite)
     recording = None
     if record:
@@ -125,10 +127,10 @@ def live(
         with common.interrupted_by_signals():
             opened = _open_camera(camera, recording, control, announce)
             announce()
-            bench = reconstruct.open_bench(wall, opened)
+            bench = chosen.open(opened)
             checks = loop.BackgroundPhysicsCheck(bench.rig, on_error=_warn_once)
             control.set_state("connecting", "loading the networks, first frame in a few seconds")
-            pipeline = _load_pipeline(bench, weights, average, checks)
+            pipeline = _load_pipeline(bench, chosen, average, checks)
             reconstruct.warm_up(opened, pipeline)
             if not no_view:
                 views.prepare_saving()
@@ -184,6 +186,7 @@ def _open_camera(
 def replay(
     bag: BagFile,
     wall: Wall = None,
+    bench_folder: benches.BenchOrWeights = None,
     out: Out = None,
     weights: Weights = None,
     average: Average = 1,
@@ -197,12 +200,13 @@ def replay(
 ) -> None:
     """Reconstruct every frame of a recording: the same frames and the same bits each time."""
     formats = object_formats(as_object)
+    chosen = benches.choose(bench_folder, wall, weights)
     path = common.output_path(out, "replay", "", overwrite=overwrite)
     with common.interrupted_by_signals():
         opened = cameras.open_camera(f"bag:{bag}")
-        bench = reconstruct.open_bench(wall, opened)
+        bench = chosen.open(opened)
         checks = reconstruct.PeriodicPhysicsCheck(bench.rig, on_error=_warn_once)
-        pipeline = _load_pipeline(bench, weights, average, checks)
+        pipeline = _load_pipeline(bench, chosen, average, checks)
     with opened as source, common.stop_on_signals() as stop, common.progress() as bar:
         task = bar.add_task("reconstructing", total=None)
         report = replays.replay_recording(
@@ -234,15 +238,15 @@ def _check_output(path: Path, option: str, *suffixes: str, overwrite: bool) -> P
 
 def _load_pipeline(
     bench: reconstruct.CalibratedRig,
-    weights: Path | None,
+    chosen: benches.Choice,
     average: int,
     checks: reconstruct.PhysicsCheck,
 ) -> reconstruct.Pipeline:
     """Load the networks and build their pipeline, and print the model's name and its mismatches
     with the bench.
     """
-    network = reconstruct.load_networks(weights)
-    uncertainty_model = reconstruct.load_uncertainty(weights)
+    network = reconstruct.load_networks(chosen.weights)
+    uncertainty_model = reconstruct.load_uncertainty(chosen.weights)
     common.say(f"Loaded model {network.record.rig_name} ({network.runtime})")
     for warning in reconstruct.compatibility_warnings(bench, network.record, uncertainty_model):
         common.say(f"note: {warning}")

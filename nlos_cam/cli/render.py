@@ -13,8 +13,9 @@ from rich.table import Table
 
 from nlos_cam import objects
 from nlos_cam import render as renderer
+from nlos_cam.cli import benches
 from nlos_cam.cli import transients as transient_options
-from nlos_cam.cli.common import Json, Overwrite, finish, output_path, say, stderr
+from nlos_cam.cli.common import PAPER_RIG, Json, Overwrite, finish, output_path, say, stderr
 
 if TYPE_CHECKING:
     from nlos_calibration.arrays import Float32
@@ -232,8 +233,12 @@ def render(
         typer.Option("--scene", help="A scene.toml, of which OBJECT replaces the object."),
     ] = None,
     rig: Annotated[
-        str, typer.Option("--rig", help="Name of a packaged rig, or a rig's TOML file.")
-    ] = "paper-rig",
+        str | None,
+        typer.Option(
+            "--rig", help="Name of a packaged rig, or a rig's TOML file.", show_default=PAPER_RIG
+        ),
+    ] = None,
+    bench_folder: benches.BenchOrRig = None,
     accuracy: Stop = None,
     max_error: MaxError = None,
     max_seconds: MaxSeconds = None,
@@ -287,7 +292,8 @@ def render(
     else:
         path = output_path(out and out.with_suffix(".npz"), "render", ".npz", overwrite=overwrite)
     file = renderer.load_scene(scene) if scene else None
-    bare = file.bare if file else renderer.Scene(walls.rig_named(rig))
+    its_rig = benches.rig_of(bench_folder, rig, PAPER_RIG)
+    bare = file.bare if file else renderer.Scene(its_rig)
     surface = {"kind": material, "specular": specular, "exponent": exponent, "albedo": albedo}
     bare = scene_of(bare, surface, {"radiometry": radiometry, "pulse_ns": pulse_ns})
     angles = {"tilt_x_deg": tilt_x_deg, "tilt_y_deg": tilt_y_deg, "turn_deg": turn_deg}

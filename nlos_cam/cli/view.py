@@ -19,6 +19,7 @@ from nlos_cam import live as loop
 from nlos_cam import reconstruct
 from nlos_cam import replay as replays
 from nlos_cam import view as views
+from nlos_cam.cli import benches
 from nlos_cam.cli.common import (
     Json,
     exit_interrupted,
@@ -140,6 +141,7 @@ Seconds = Annotated[
 def view(
     file: ViewFile,
     wall: Wall = None,
+    bench_folder: benches.BenchFolder = None,
     seconds: Seconds = None,
     view_port: ViewPort = None,
     view_host: ViewHost = None,
@@ -152,16 +154,15 @@ def view(
     host = view_host or views.LOOPBACK
     announce = partial(announce_view, host=view_host, port=view_port, open_it=open_view)
     is_recording = file.suffix == ".bag" or is_ros2(file)
-    if not is_recording and wall is not None:
+    if not is_recording and (wall or bench_folder):
         raise typer.BadParameter(
-            "--wall is for a recording (.bag): a saved session holds its pictures"
+            "--wall and --bench are for a recording (.bag): a saved session holds its pictures"
         )
+    chosen = benches.choose(bench_folder, wall)
     if is_recording:
         with interrupted_by_signals():
             opened = cameras.open_camera(f"bag:{file}")
-            playback = replays.Playback(
-                opened, reconstruct.open_bench(wall, opened), host=host, port=view_port
-            )
+            playback = replays.Playback(opened, chosen.open(opened), host=host, port=view_port)
         with stop_on_signals() as stop, playback:
             announce(playback, what="recording")
             playback.reconstruct(stop)

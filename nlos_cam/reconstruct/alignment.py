@@ -25,6 +25,7 @@ from nlos_calibration import BareWall, ObjectBox, Occluder, Rig, load_rig
 from nlos_calibration.arrays import Float32, Float64, Int64, Mask
 from nlos_calibration.errors import RecordFileError
 from nlos_models import CheckpointRecord
+from pydantic import ValidationError
 
 from nlos_cam.frames import MAP_COLUMNS, MAP_ROWS, LidarMaps
 from nlos_cam.objects import object_box
@@ -243,8 +244,9 @@ def training_rig(trained: CheckpointRecord) -> Rig | None:
     machine.
     """
     try:
-        rig = load_rig(trained.rig_name)
-    except RecordFileError:
+        known = trained.rig
+        rig = load_rig(trained.rig_name) if known is None else Rig.model_validate(known)
+    except (RecordFileError, ValidationError):
         return None
     return rig if rig.checksum == trained.rig_checksum else None
 

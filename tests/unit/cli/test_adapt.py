@@ -10,7 +10,7 @@ import pytest
     ("bench", "why", "code"),
     [
         ("no-such-rig", "no-such-rig", 2),
-        ("folder", "wall.toml", 4),
+        ("folder", "folder", 4),
         ("empty.toml", "empty.toml", 4),
         ("record.toml", "record.toml", 4),
     ],

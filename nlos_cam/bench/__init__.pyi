@@ -1,0 +1,30 @@
+__all__ = [
+    "MAIN",
+    "MANIFEST",
+    "WEIGHTS",
+    "Bench",
+    "BenchEdit",
+    "BenchRecord",
+    "StationRecord",
+    "check_new",
+    "edit_bench",
+    "is_bench",
+    "load_bench",
+    "load_bench_record",
+    "station_folder",
+    "write_file",
+    "write_weights",
+]
+
+from .edit import BenchEdit, check_new, edit_bench, write_file, write_weights
+from .folder import Bench, load_bench
+from .record import (
+    MAIN,
+    MANIFEST,
+    WEIGHTS,
+    BenchRecord,
+    StationRecord,
+    is_bench,
+    load_bench_record,
+    station_folder,
+)

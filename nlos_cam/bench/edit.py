@@ -1,0 +1,151 @@
+"""Writing of a bench folder: files first, then its record with their checksums."""
+
+import os
+import shutil
+from collections.abc import Generator
+from contextlib import contextmanager
+from datetime import UTC, datetime
+from pathlib import Path
+
+import nlos_calibration as walls
+from nlos_calibration.errors import CalibrationError, RecordFileError
+from nlos_models import RECORD, load_record
+
+from nlos_cam import __version__
+from nlos_cam.bench.folder import load_bench
+from nlos_cam.bench.record import (
+    MANIFEST,
+    WEIGHTS,
+    BenchRecord,
+    CameraRecord,
+    StationRecord,
+    is_bench,
+    load_bench_record,
+    sha256_of,
+)
+from nlos_cam.errors import OutputExistsError
+from nlos_cam.files import CHECKSUMS, atomic_directory, atomic_file, write_checked
+
+
+class BenchEdit:
+    """Changes of a bench folder, which this process holds."""
+
+    def __init__(self, folder: Path, before: BenchRecord | None) -> None:
+        self.folder = folder
+        self.before = before
+        """Record as it was; None for a new bench."""
+        self.camera = before.camera if before else None
+        self.stations = dict(before.stations) if before else {}
+        self._files = dict(before.files) if before else {}
+
+    def set_station(self, name: str, station: StationRecord, wall: walls.WallRecord) -> None:
+        """Enter a station whose record in use is `wall`, and its camera. The files of an
+        occluder that it no longer names are removed.
+
+        Raises CalibrationError where other stations were measured with another camera.
+        """
+        camera = CameraRecord(serial=wall.serial, intrinsics=wall.rig.intrinsics)
+        if self.camera and self.camera != camera and set(self.stations) - {name}:
+            raise CalibrationError(
+                f"{self.folder} has stations of camera {self.camera.serial}: make another bench for"
+                f" {wall.serial or 'this camera'}"
+            )
+        before = self.stations.get(name)
+        self.camera = camera
+        self.stations[name] = station
+        if before and before.occluder and before.occluder != station.occluder:
+            for suffix in (".toml", ".npz", ".html"):
+                path = Path(before.occluder).with_suffix(suffix)
+                self._files.pop(path.as_posix(), None)
+                (self.folder / path).unlink(missing_ok=True)
+
+    def add(self, *paths: Path) -> None:
+        """Enter files that were written, or written again, with their checksums."""
+        for path in paths:
+            self._files[path.relative_to(self.folder).as_posix()] = sha256_of(path)
+
+    def record(self) -> BenchRecord:
+        """Return the record of the bench with its changes. Raises RecordFileError without a
+        station.
+        """
+        if self.camera is None or not self.stations:
+            raise RecordFileError(
+                f"{self.folder} has no measured wall: run `nlos-cam calibrate --wall --bench"
+                f" {self.folder}` first"
+            )
+        now = datetime.now(UTC).replace(microsecond=0)
+        return BenchRecord(
+            created=self.before.created if self.before else now,
+            changed=now,
+            program=f"nlos-cam {__version__}",
+            camera=self.camera,
+            stations=self.stations,
+            files=dict(sorted(self._files.items())),
+        )
+
+
+def check_new(folder: Path) -> None:
+    """Raise OutputExistsError where a bench cannot be made or continued at a path."""
+    if os.path.lexists(folder) and not folder.is_dir():
+        raise OutputExistsError(f"{folder} is a file, but --bench must be a folder: choose another")
+    if not folder.absolute().parent.is_dir():
+        raise OutputExistsError(f"the folder of {folder} does not exist: create it first")
+    if folder.is_dir() and any(folder.iterdir()) and not is_bench(folder):
+        raise OutputExistsError(
+            f"{folder} holds other files and no bench: choose another name for --bench"
+        )
+
+
+@contextmanager
+def edit_bench(folder: Path) -> Generator[BenchEdit]:
+    """Hold a bench folder, which is made if it is missing, and write its record on success.
+
+    The record comes last: a kill before leaves files that do not match it, which `load_bench`
+    names. Raises FileBusyError while another process holds it, RecordFileError for a damaged one.
+    """
+    folder.mkdir(exist_ok=True)
+    with atomic_file(folder / MANIFEST) as part:
+        before = load_bench_record(folder) if (folder / MANIFEST).exists() else None
+        edit = BenchEdit(folder, before)
+        yield edit
+        part.write_text(walls.dump_toml(edit.record()), encoding="utf-8")
+
+
+def write_file(folder: Path, name: str, content: bytes) -> Path:
+    """Write a file, such as report.html, into a bench and enter its checksum; return its path."""
+    with edit_bench(folder) as edit:
+        path = folder / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with atomic_file(path) as part:
+            part.write_bytes(content)
+        edit.add(path)
+    return path
+
+
+def write_weights(folder: Path, source: Path) -> Path:
+    """Copy a folder of weights, with uncertainty and quality, into a bench as its own; return where
+    they are.
+
+    Weights of exactly this bench's rig get the rig into their record, by which `weights_serve`
+    knows them when the bench is measured again. Raises CheckpointError for a folder without
+    weights, RecordFileError for a bench that is damaged.
+    """
+    record = load_record(source)
+    rig = load_bench(folder).rig
+    out = folder / WEIGHTS
+    with edit_bench(folder) as edit:
+        names = sorted(path.name for path in source.iterdir() if path.is_file())
+        with atomic_directory(out) as part:
+            for name in names:
+                shutil.copyfile(source / name, part / name)
+            if record.rig_checksum == rig.checksum:
+                known = record.model_copy(update={"rig": rig.model_dump(mode="json")})
+                write_checked(part, {RECORD: f"{known.model_dump_json(indent=2)}\n".encode()})
+            elif not (part / CHECKSUMS).exists():
+                write_checked(part, {name: (part / name).read_bytes() for name in names})
+        # an uncertainty network of earlier weights would watch others than those beside it
+        for left in out.iterdir():
+            if left.is_file() and left.name not in {*names, CHECKSUMS}:
+                left.unlink()
+        edit.add(out / CHECKSUMS)
+    return out

@@ -1,0 +1,158 @@
+"""Bench folder as commands use it: the measured wall of a station, and weights."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import nlos_calibration as walls
+from nlos_calibration.errors import CalibrationError, RecordFileError
+
+from nlos_cam.bench.record import (
+    MAIN,
+    MANIFEST,
+    WEIGHTS,
+    BenchRecord,
+    StationRecord,
+    load_bench_record,
+    sha256_of,
+)
+from nlos_cam.camera import Camera
+from nlos_cam.files import CHECKSUMS
+from nlos_cam.reconstruct import CalibratedRig, check_intrinsics
+
+
+@dataclass(frozen=True)
+class Bench:
+    """A loaded bench folder, whose files fit together and are unchanged since they were written."""
+
+    folder: Path
+    record: BenchRecord
+    stations: Mapping[str, walls.MeasuredWall]
+    """Measured wall of each station, with the bench's object box in its rig."""
+    station: str
+    """Name of the station in use."""
+    weights: Path | None
+    """Folder of the bench's own weights, with uncertainty and quality; None if there are none."""
+
+    @property
+    def measured(self) -> walls.MeasuredWall:
+        """Measured wall of the station in use."""
+        return self.stations[self.station]
+
+    @property
+    def bare(self) -> walls.MeasuredWall:
+        """Bare wall of the station in use, as it was before the occluder, with the object box."""
+        path = self.folder / self.record.stations[self.station].wall
+        return _with_box(walls.load_measured(path), self.rig.object_box)
+
+    @property
+    def rig(self) -> walls.Rig:
+        """Rig of the station in use."""
+        return self.measured.record.rig
+
+    @property
+    def wall(self) -> Path:
+        """Wall record of the station in use, with the occluder if that was measured."""
+        return self.folder / self.record.stations[self.station].in_use
+
+    @property
+    def calibrated(self) -> CalibratedRig:
+        """New rig with reference and drift, which starts at its first frame."""
+        return CalibratedRig(self.rig, self.measured, self._notes())
+
+    def for_camera(self, camera: Camera) -> CalibratedRig:
+        """Return `calibrated` for an opened camera. Raises CalibrationError for another camera than
+        the one that the bench was measured with.
+        """
+        for intrinsics in (
+            self.measured.record.rig.pinhole,
+            *([self.measured.reference.intrinsics] if self.measured.reference else []),
+        ):
+            check_intrinsics(intrinsics, camera.intrinsics)
+        measured = self.record.camera.serial
+        given = camera.identity.get("serial", "")
+        if measured and given and measured != given:
+            raise CalibrationError(
+                f"{self.folder} was measured with camera {measured}, this is {given}: use that"
+                " camera, or calibrate the bench with this one"
+            )
+        return self.calibrated
+
+    def _notes(self) -> tuple[str, ...]:
+        if self.measured.record.occluder:
+            return ()
+        return (
+            (
+                "the occluder has not been measured, the paper's is assumed: put it up and run"
+                f" `nlos-cam calibrate --occluder {self.folder}`"
+            ),
+        )
+
+
+def load_bench(folder: str | Path, station: str = MAIN) -> Bench:
+    """Load a bench folder, and check its files against their checksums and each other.
+
+    Raises RecordFileError, with the first problem.
+    """
+    folder = Path(folder)
+    record = load_bench_record(folder)
+    if station not in record.stations:
+        raise RecordFileError(
+            f"{folder} has no station {station!r}: choose from {', '.join(record.stations)}"
+        )
+    _check_files(folder, record)
+    stations = {name: _measured(folder, record, one) for name, one in record.stations.items()}
+    has_weights = f"{WEIGHTS}/{CHECKSUMS}" in record.files
+    return Bench(folder, record, stations, station, folder / WEIGHTS if has_weights else None)
+
+
+def _check_files(folder: Path, record: BenchRecord) -> None:
+    for one in record.stations.values():
+        if one.in_use not in record.files:
+            raise RecordFileError(
+                f"{folder / MANIFEST} has no checksum of {one.in_use}: calibrate the bench again"
+            )
+    for name, digest in record.files.items():
+        path = folder / name
+        again = "adapt" if name.startswith(f"{WEIGHTS}/") else "calibrate"
+        try:
+            found = sha256_of(path)
+        except OSError as error:
+            raise RecordFileError(
+                f"{path} of the bench cannot be read ({error.strerror}): put it back, or"
+                f" {again} the bench again"
+            ) from error
+        if found != digest:
+            raise RecordFileError(
+                f"{path} has changed since the bench was written (its checksum differs from"
+                f" {MANIFEST}): put the original back, or {again} the bench again"
+            )
+
+
+def _measured(folder: Path, record: BenchRecord, station: StationRecord) -> walls.MeasuredWall:
+    """Return a station's wall, with the bench's object box. Raises RecordFileError where it does
+    not fit the bench.
+    """
+    path = folder / station.in_use
+    measured = walls.load_measured(path)
+    wall = measured.record
+    if wall.serial != record.camera.serial:
+        raise RecordFileError(
+            f"{path} was measured with camera {wall.serial or 'unknown'}, the bench with"
+            f" {record.camera.serial or 'unknown'}: calibrate the bench again"
+        )
+    if wall.rig.intrinsics != record.camera.intrinsics:
+        raise RecordFileError(
+            f"{path} has other intrinsics than {MANIFEST}: calibrate the bench again"
+        )
+    if station.occluder and walls.load_wall(folder / station.wall).rig.lidar != wall.rig.lidar:
+        raise RecordFileError(
+            f"{path} is of another wall than {station.wall}: find the occluder again with"
+            f" `nlos-cam calibrate --occluder {folder}`"
+        )
+    return _with_box(measured, station.object_box)
+
+
+def _with_box(measured: walls.MeasuredWall, box: walls.ObjectBox | None) -> walls.MeasuredWall:
+    rig = measured.record.rig.model_copy(update={"object_box": box})
+    return replace(measured, record=measured.record.model_copy(update={"rig": rig}))

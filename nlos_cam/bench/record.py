@@ -1,0 +1,116 @@
+"""Record of a bench folder, `bench.toml`: camera, stations, and the checksums of its files."""
+
+import hashlib
+from datetime import datetime
+from pathlib import Path, PurePosixPath
+from typing import Annotated, Any, Literal
+
+from nlos_calibration import ObjectBox, PinholeRecord, Record, read_record, record_kind
+from nlos_calibration.errors import RecordFileError
+from pydantic import AfterValidator, BeforeValidator, Field
+
+from nlos_cam.files import read_toml
+
+MANIFEST = "bench.toml"
+MAIN = "main"
+"""Name of the station that is used where none is named."""
+WEIGHTS = "weights"
+"""Folder of a bench with its own weights."""
+VERSION = 1
+MAKE_ONE = "make a bench with `nlos-cam calibrate --wall --bench bench/`"
+
+
+def _known_version(version: Any) -> Any:
+    if isinstance(version, int) and version != VERSION:
+        raise ValueError(
+            f"this nlos-cam reads version {VERSION} only: calibrate the bench again, or use the"
+            " nlos-cam that wrote it"
+        )
+    return version
+
+
+def _inside(name: str) -> str:
+    """Return a path below the bench folder. Raises ValueError for any other."""
+    path = PurePosixPath(name)
+    if path.is_absolute() or ".." in path.parts or "\\" in name or not path.parts:
+        raise ValueError("must be a path inside the bench folder")
+    return name
+
+
+Inside = Annotated[str, AfterValidator(_inside)]
+Sha256 = Annotated[str, Field(pattern="^[0-9a-f]{64}$")]
+
+
+class CameraRecord(Record):
+    """The camera that a bench was measured with."""
+
+    serial: str = ""
+    """Serial number; empty where unknown."""
+    intrinsics: PinholeRecord
+
+
+class StationRecord(Record):
+    """One pose of the lidar, with its measurements. A second pose has a wall frame of its own."""
+
+    wall: Inside
+    """Record of the bare wall: its path in the bench folder."""
+    occluder: Inside | None = None
+    """Record of the same wall with the occluder in place; None until that was measured."""
+    object_box: ObjectBox | None = None
+    """Box of the hidden object in the station's wall frame; to be edited by hand."""
+
+    @property
+    def in_use(self) -> str:
+        """Path of the record that describes the bench as it stands."""
+        return self.occluder or self.wall
+
+
+class BenchRecord(Record):
+    """Content of a bench folder, except for the measurements, which are in files of their own."""
+
+    bench_version: Annotated[Literal[1], BeforeValidator(_known_version)] = VERSION
+    created: datetime
+    changed: datetime
+    program: str
+    """Program and version that wrote it last."""
+    camera: CameraRecord
+    stations: Annotated[dict[str, StationRecord], Field(min_length=1)]
+    files: dict[Inside, Sha256]
+    """SHA-256 of each file by its path; weights count by their own SHA256SUMS."""
+
+
+def station_folder(name: str) -> str:
+    """Return the path of a station's files in the bench folder."""
+    return f"stations/{name}"
+
+
+def is_bench(folder: Path) -> bool:
+    """Return whether a path is a folder with the record of a bench; a damaged record counts."""
+    path = folder / MANIFEST
+    if not path.is_file():
+        return False
+    try:
+        kind = record_kind(read_toml(path))
+    except (OSError, ValueError):
+        return True
+    return kind in {"", "bench"}
+
+
+def load_bench_record(folder: Path) -> BenchRecord:
+    """Read the record of a bench folder, without its files. Raises RecordFileError."""
+    if folder.is_file():
+        raise RecordFileError(
+            f"{folder} is a file, not a bench folder: name the folder that holds {MANIFEST}, or"
+            " give a wall record as --wall"
+        )
+    if not folder.exists():
+        raise RecordFileError(f"no bench folder {folder}: {MAKE_ONE}")
+    if not (folder / MANIFEST).exists():
+        raise RecordFileError(f"{folder} is not a bench folder (no {MANIFEST}): {MAKE_ONE}")
+    return read_record(folder / MANIFEST, BenchRecord, "bench", MAKE_ONE)
+
+
+def sha256_of(path: Path) -> str:
+    """Return the checksum of a file, 64 hexadecimal digits. Raises OSError."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()

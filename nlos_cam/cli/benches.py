@@ -1,0 +1,114 @@
+"""The option --bench: a bench folder in place of --wall, --weights and --rig."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, NamedTuple
+
+import nlos_calibration as walls
+import typer
+
+from nlos_cam import bench as benches
+from nlos_cam import calibrate
+from nlos_cam import camera as cameras
+from nlos_cam import reconstruct
+from nlos_cam.errors import OutputExistsError
+
+BenchFolder = Annotated[
+    Path | None,
+    typer.Option("--bench", help="Bench folder of `calibrate --bench`, in place of --wall."),
+]
+BenchOrWeights = Annotated[
+    Path | None,
+    typer.Option(
+        "--bench", help="Bench folder of `calibrate --bench`, in place of --wall and --weights."
+    ),
+]
+BenchOrRig = Annotated[
+    Path | None,
+    typer.Option("--bench", help="Bench folder of `calibrate --bench`, in place of --rig."),
+]
+
+
+class Choice(NamedTuple):
+    """Bench, wall record and weights that a command was given."""
+
+    bench: benches.Bench | None
+    record: Path | None
+    """Wall record, of the bench or on its own."""
+    weights: Path | None
+    """Folder of weights: those named, else the bench's own; None for the shipped ones."""
+
+    def open(self, camera: cameras.Camera) -> reconstruct.CalibratedRig:
+        """Return the rig for an opened camera. Raises CalibrationError where they do not fit."""
+        if self.bench:
+            return self.bench.for_camera(camera)
+        return reconstruct.open_bench(self.record, camera)
+
+
+def choose(bench: Path | None, wall: Path | None = None, weights: Path | None = None) -> Choice:
+    """Load the bench folder, if there is one. Raises RecordFileError, and typer.BadParameter for a
+    bench and a wall record.
+    """
+    if bench is None:
+        return Choice(None, wall, weights)
+    if wall is not None:
+        raise typer.BadParameter("--bench and --wall each name a measured wall: give one")
+    loaded = benches.load_bench(bench)
+    return Choice(loaded, loaded.wall, weights or loaded.weights)
+
+
+def rig_of(bench: Path | None, rig: str | None, default: str | None = None) -> walls.Rig | None:
+    """Return the rig of a bench folder, of a name or file, or the default's. Raises
+    typer.BadParameter for both.
+    """
+    if bench is not None and rig is not None:
+        raise typer.BadParameter("--bench and --rig each name a rig: give one")
+    if bench is not None:
+        return benches.load_bench(bench).rig
+    name = rig or default
+    return walls.rig_named(name) if name else None
+
+
+def files_in_bench(
+    folder: Path, *, occluder: bool, overwrite: bool, station: str = benches.MAIN
+) -> calibrate.WallFiles:
+    """Return the paths of a measurement in a bench folder: of the bare wall, or with its occluder.
+
+    Raises OutputExistsError for an existing file without `overwrite`.
+    """
+    record = (
+        folder / benches.station_folder(station) / ("occluder.toml" if occluder else "wall.toml")
+    )
+    if record.exists() and not overwrite:
+        raise OutputExistsError(
+            f"{record} exists: choose another bench, or add --overwrite to replace it"
+        )
+    return calibrate.WallFiles.beside(record, overwrite=overwrite)
+
+
+def write_to_bench(
+    folder: Path,
+    files: calibrate.WallFiles,
+    record: walls.WallRecord,
+    reference: walls.BareWall | None,
+    station: str = benches.MAIN,
+) -> walls.WallRecord:
+    """Write a measurement to its `files_in_bench` and enter it in the bench, which is made if it is
+    missing; return the record, which names its reference.
+
+    A wall that is measured again drops the occluder found before; the object box stays.
+    """
+    with benches.edit_bench(folder) as edit:
+        files.record.parent.mkdir(parents=True, exist_ok=True)
+        record = calibrate.write_record(files, record, reference)
+        name = files.record.relative_to(folder).as_posix()
+        before = edit.stations.get(station)
+        box = before.object_box if before else record.rig.object_box
+        if files.record.stem == "occluder" and before:
+            entry = benches.StationRecord(wall=before.wall, occluder=name, object_box=box)
+        else:
+            entry = benches.StationRecord(wall=name, object_box=box)
+        edit.set_station(station, entry, record)
+        edit.add(files.record, *([files.reference] if reference else []))
+    return record
