@@ -215,6 +215,7 @@ class Host:
     container: str = ""
     """Type of the container; empty outside one."""
     is_wsl: bool = False
+    is_jetson: bool = False
     modules: Mapping[str, str] = field(default_factory=dict[str, str])
     """Each of MODULES: loaded, built in, available or missing; unknown without the kernel's
     lists.
@@ -275,6 +276,8 @@ def read_host(
         platform=on,
         container=_container(root),
         is_wsl="microsoft" in read_text(root / "proc/version").lower(),
+        is_jetson=path_exists(root / "etc/nv_tegra_release")
+        or "jetson" in read_text(root / "proc/device-tree/model").lower(),
         modules=_modules(root),
         has_iio=path_exists(root / "sys/bus/iio"),
         patched_uvc="realsense" in read_text(root / "sys/module/uvcvideo/version"),
