@@ -327,8 +327,7 @@ KNOWN_MESSAGES = (
     (
         r"same frame|frozen|frame number.{0,40}(again|repeat|not increas|stuck)|stalled",
         "the camera sends one frame again and again: its firmware stands still",
-        "unplug the camera, wait 5 s, plug it straight into a USB 3 port; then `nlos-cam live"
-        " --camera l515`",
+        "unplug the camera, wait 5 s, plug it in, and run `nlos-cam live --camera l515`",
     ),
 )
 """Messages of librealsense and its viewer that owners report: pattern, meaning and fix."""
