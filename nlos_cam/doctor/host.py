@@ -215,7 +215,6 @@ class Host:
     container: str = ""
     """Type of the container; empty outside one."""
     is_wsl: bool = False
-    is_jetson: bool = False
     modules: Mapping[str, str] = field(default_factory=dict[str, str])
     """Each of MODULES: loaded, built in, available or missing; unknown without the kernel's
     lists.
@@ -230,6 +229,7 @@ class Host:
     holders: tuple[Holder, ...] = ()
     closed_processes: int = 0
     """Number of processes whose open files this user may not read."""
+    is_jetson: bool = False
 
 
 def this_platform() -> Platform:
