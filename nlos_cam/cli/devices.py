@@ -154,15 +154,24 @@ WriteUdev = Annotated[
     Path | None,
     typer.Option("--write-udev", help="Write the udev rules for the L515 to this file."),
 ]
+Message = Annotated[
+    str,
+    typer.Option("--message", help="Explain this message of librealsense or of its viewer."),
+]
 
 
-def doctor(write_udev: WriteUdev = None, overwrite: Overwrite = False, json: Json = False) -> None:
+def doctor(
+    write_udev: WriteUdev = None,
+    message: Message = "",
+    overwrite: Overwrite = False,
+    json: Json = False,
+) -> None:
     """Check everything between a camera and this program, and print fixes; the exit code is 0 even
     if checks fail.
     """
     if write_udev is not None:
         _write(output_path(write_udev, "", ".rules", overwrite=overwrite))
-    checks = diagnosis.diagnose(diagnosis.gather_facts())
+    checks = diagnosis.diagnose(diagnosis.gather_facts(message))
     if not json:
         show(_checks_table(checks))
     failures = sum(check.status == "failed" for check in checks)

@@ -24,6 +24,14 @@ HID_OPTIONS = "CONFIG_HID_SENSOR_HUB, CONFIG_HID_SENSOR_ACCEL_3D and CONFIG_HID_
 MIN_SENSORS = 2
 """Accelerometer and gyroscope: without both, librealsense on Linux does not list an L515."""
 JOIN = "`sudo usermod -aG plugdev,video $USER`, and log in again"
+JETSON_FIX = (
+    "git clone -b v2.54.2 --depth 1 https://github.com/IntelRealSense/librealsense && cmake -S"
+    " librealsense -B build -DFORCE_RSUSB_BACKEND=ON -DBUILD_PYTHON_BINDINGS=ON"
+    " -DCMAKE_BUILD_TYPE=Release && sudo cmake --build build --target install"
+)
+"""Build of librealsense that reads USB itself: a Jetson's kernel has no drivers that it could
+use.
+"""
 DESKTOP_SERVICES = {"pipewire", "wireplumber"}
 """Desktop services that keep a camera's node open without streaming."""
 
@@ -148,6 +156,8 @@ def _sensor_fix(facts: Facts, camera: KernelCamera) -> str:
         )
     if host.container and not host.has_iio:
         return f"{CONTAINER_FIX}: this one hides /sys/bus/iio"
+    if host.is_jetson:
+        return JETSON_FIX
     if missing := [name for name in HID_MODULES if host.modules.get(name) == "missing"]:
         return (
             f"this kernel has no {', '.join(missing)} (as on JetPack 6): install one with"
@@ -298,7 +308,53 @@ def _load_fix(error: str, on: str) -> str:
     return f"pip install {_wheel(on)} libusb-package"
 
 
+KNOWN_MESSAGES = (
+    (
+        r"fatal error.{0,20}\b16\b",
+        "the laser's hardware alarm: the depth sensor is broken, and no software mends it",
+        "return or replace the camera; until then: `nlos-cam demo`",
+    ),
+    (
+        r"set power state",
+        "the system does not let librealsense take the camera, as macOS 12 and later without root",
+        "sudo nlos-cam doctor",
+    ),
+    (
+        r"platform camera",
+        "librealsense 2.55 and later have no driver for the L515: Windows' own camera is listed",
+        f"pip install {WHEEL}",
+    ),
+    (
+        r"same frame|frozen|frame number.{0,40}(again|repeat|not increas|stuck)|stalled",
+        "the camera sends one frame again and again: its firmware stands still",
+        "unplug the camera, wait 5 s, plug it in, and run `nlos-cam live --camera l515`",
+    ),
+)
+"""Messages of librealsense and its viewer that owners report: pattern, meaning and fix."""
+
+
+def _known(message: str) -> tuple[str, str] | None:
+    """Return meaning and fix of a message of librealsense; None for an unknown one."""
+    for pattern, meaning, fix in KNOWN_MESSAGES:
+        if re.search(pattern, message, re.IGNORECASE):
+            return meaning, fix
+    return None
+
+
+def reported(facts: Facts) -> Finding:
+    """Explain a message that another program showed."""
+    if not facts.reported:
+        return ok("no message was given: --message TEXT explains one")
+    if known := _known(facts.reported):
+        return failed(*known)
+    return warning(
+        f"{facts.reported[:80]!r} is not known here", "look at the other checks, then replug"
+    )
+
+
 def _query_fix(error: str) -> str:
+    if known := _known(error):
+        return known[1]
     if "attribute" in error:  # a folder or file called pyrealsense2 shadows the wheel
         return (
             "remove any folder or file of your own called pyrealsense2; `pip install"
@@ -313,13 +369,19 @@ def _query_fix(error: str) -> str:
 def sdk_version(facts: Facts) -> Finding:
     """Check that this librealsense has the L515's driver, which was removed in 2.55."""
     if not facts.sdk.packages:
+        if facts.sdk.has_platform_camera and any(not pair.sdk for pair in facts.pairs):
+            return failed(
+                "librealsense lists the L515 as 'Platform Camera': it has no driver for it",
+                f"pip install {_wheel(facts.host.platform.system)}",
+            )
         return skipped("no package of librealsense is installed, so its version is unknown")
     newest = max(facts.sdk.packages, key=lambda package: version_numbers(package[1]))[1]
     fix = f"pip install {_wheel(facts.host.platform.system)}"
     if version_numbers(newest)[:2] >= REMOVED:
+        lists = "'Platform Camera'" if facts.sdk.has_platform_camera else "no device"
         return failed(
             f"librealsense {newest} has no driver for the L515 (the last with it is 2.54.2): it"
-            " reports no device",
+            f" reports {lists}",
             fix,
         )
     if version_numbers(newest)[:3] != TESTED:

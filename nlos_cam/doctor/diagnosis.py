@@ -53,6 +53,8 @@ def _hidden(facts: Facts, cameras: str) -> Finding:
     causes = {name: finding for name, finding in found.items() if finding.status == "failed"}
     if not causes:
         fix = REPLUG_WINDOWS if facts.host.platform.system == "windows" else REPLUG
+        if facts.host.is_jetson:
+            fix = checks.JETSON_FIX
         return failed(f"USB shows {cameras}, librealsense does not; no check found the cause", fix)
     reasons = "; ".join(f"{name}: {finding.detail}" for name, finding in causes.items())
     return failed(
@@ -79,6 +81,7 @@ IN_ORDER: tuple[Callable[[Facts], Finding], ...] = (
     sdk_camera,
     checks.firmware,
     checks.metadata,
+    checks.reported,
 )
 CHECKS = {check.__name__.replace("_", "-"): check for check in IN_ORDER}
 """Every check by its name, in the order of the output."""

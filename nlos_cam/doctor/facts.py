@@ -13,6 +13,10 @@ from nlos_cam.doctor.host import Host, read_host
 from nlos_cam.doctor.usb import UsbDevice, UsbScan, scan_usb, sdk_serial
 from nlos_cam.errors import CameraError
 
+PLATFORM_CAMERA = "Platform Camera"
+"""The SDK's name on Windows of any camera that it has no driver for: a webcam, or since 2.55 an
+L515.
+"""
 LIDAR_NAMES = ("L515", "L500")
 """The SDK's names of this family; in recovery mode a camera is called L51X."""
 
@@ -43,6 +47,11 @@ class Sdk:
     def lidars(self) -> list[DeviceInfo]:
         """Cameras of the L515's family."""
         return [info for info in self.devices if any(name in info.name for name in LIDAR_NAMES)]
+
+    @property
+    def has_platform_camera(self) -> bool:
+        """Return whether it lists a camera that it has no driver for, as it does on Windows."""
+        return any(info.name == PLATFORM_CAMERA for info in self.devices)
 
 
 @dataclass(frozen=True)
@@ -102,6 +111,8 @@ class Facts:
     host: Host
     usb: UsbScan
     sdk: Sdk
+    reported: str = ""
+    """Message that another program showed, as the user gives it."""
 
     @property
     def pairs(self) -> list[Pair]:
@@ -109,12 +120,12 @@ class Facts:
         return match_devices(self.usb.of_kind("camera"), self.sdk.lidars)
 
 
-def gather_facts() -> Facts:
-    """Return the facts of this machine; never raises."""
+def gather_facts(reported: str = "") -> Facts:
+    """Return the facts of this machine, and the message given; never raises."""
     host = read_host()
     usb = scan_usb()
     # The SDK last: it opens device nodes of its own, which the host's check would find held.
-    return Facts(host, usb, query_sdk())
+    return Facts(host, usb, query_sdk(), reported)
 
 
 def query_sdk(

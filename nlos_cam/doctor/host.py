@@ -229,6 +229,7 @@ class Host:
     holders: tuple[Holder, ...] = ()
     closed_processes: int = 0
     """Number of processes whose open files this user may not read."""
+    is_jetson: bool = False
 
 
 def this_platform() -> Platform:
@@ -275,6 +276,8 @@ def read_host(
         platform=on,
         container=_container(root),
         is_wsl="microsoft" in read_text(root / "proc/version").lower(),
+        is_jetson=path_exists(root / "etc/nv_tegra_release")
+        or "jetson" in read_text(root / "proc/device-tree/model").lower(),
         modules=_modules(root),
         has_iio=path_exists(root / "sys/bus/iio"),
         patched_uvc="realsense" in read_text(root / "sys/module/uvcvideo/version"),

@@ -7,7 +7,7 @@ import json
 from collections import Counter, deque
 from collections.abc import Callable, Collection
 from contextlib import ExitStack
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from math import isfinite
 from pathlib import Path
 from tempfile import TemporaryFile
@@ -161,10 +161,15 @@ class PointSink:
         self.streams = streams
         self._pairing = FrameSynchronizer((rays.shape[0], rays.shape[1]), streams)
         self._repeats: Counter[int] = Counter()
+        self._numbers: dict[int, int] = {}
+        """Number of the depth frame of each instant that waits for its other frames."""
         self.written = 0
 
-    def add(self, sample: Sample) -> None:
-        """Take a frame. Raises RecordingError for depth of another size than its camera's."""
+    def add(self, sample: Sample, instant: int) -> None:
+        """Take a frame, and the number of its instant, by which frames are paired.
+
+        Raises RecordingError for depth of another size than its camera's.
+        """
         if self.written == self._limit or sample.stream not in self.streams:
             return
         if "infrared" not in self.streams:
@@ -174,8 +179,11 @@ class PointSink:
                     f" {self._rays.shape[:2]}: no point cloud can be made of it"
                 )
             self._write(sample.number, sample.pixels)
-        elif found := self._pairing.add(sample):
-            self._write(found.number, found.depth_z16, found.ir)
+            return
+        if sample.stream == "depth":
+            self._numbers[instant] = sample.number
+        if found := self._pairing.add(replace(sample, number=instant)):
+            self._write(self._numbers.pop(found.number), found.depth_z16, found.ir)
 
     def _write(
         self, number: int, depth_z16: NDArray[np.uint16], ir: NDArray[np.uint8] | None = None
@@ -253,13 +261,14 @@ def export_recording(
                     if stop.is_set():
                         break
                     on_frame()
-                    if instants.count(sample) % options.every:
+                    instant = instants.count(sample)
+                    if instant % options.every:
                         continue
                     if sample.stream in sinks:
                         sinks[sample.stream].add(sample)
                         written[sample.stream] += 1
                     if points:
-                        points.add(sample)
+                        points.add(sample, instant)
             except RecordingError as error:
                 damage = str(error)
         if not written.total() and not stop.is_set():

@@ -240,6 +240,7 @@ class Bench:
         self.sdk_devices = [FakeLidar()]
         self.sdk_error: BaseException | None = None
         self.installed = {"pyrealsense2": "2.54.2.5684", "numpy": "2.0"}
+        self.reported = ""
 
     def unplug(self) -> None:
         self.usb.devices.clear()
@@ -290,7 +291,10 @@ class Bench:
             SimpleNamespace(name=name, version=version) for name, version in self.installed.items()
         ]
         return Facts(
-            host, scan_usb(self.usb, self.linux.root), query_sdk(self.load_sdk, lambda: packages)
+            host,
+            scan_usb(self.usb, self.linux.root),
+            query_sdk(self.load_sdk, lambda: packages),
+            self.reported,
         )
 
     def checks(self) -> dict[str, Check]:

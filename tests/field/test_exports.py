@@ -69,6 +69,20 @@ def test_cloud_needs_depth_alone(remake: Remake, run: Run) -> None:
     np.testing.assert_array_equal(*clouds)
 
 
+def test_clouds_pair_streams_by_time(remake: Remake, run: Run, noise: Path) -> None:
+    def counted_apart(topic: str, time_ns: int, raw: bytes) -> Messages:
+        if topic.endswith(FRAMES_END) and "Infrared" in topic:
+            raw = (number_of(raw) + 500).to_bytes(4, "little") + raw[4:]
+        yield time_ns, raw
+
+    run("export", noise, "--ply", "--out", "plain")
+    run("export", remake(counted_apart, source=noise), "--ply", "--out", "apart")
+    plain = {path.name: path.read_bytes() for path in Path("plain/points").iterdir()}
+
+    assert len(plain) == 40
+    assert {path.name: path.read_bytes() for path in Path("apart/points").iterdir()} == plain
+
+
 def test_cloud_without_depth_is_refused(remake: Remake, run: Run) -> None:
     def without_depth(topic: str, time_ns: int, raw: bytes) -> Messages:
         if "Depth" not in topic:

@@ -311,6 +311,37 @@ LIBREALSENSE = [
     ),
 ]
 
+JETSON = write("proc/device-tree/model", "NVIDIA Jetson Orin Nano")
+NEWER_SDK = put("installed", {"pyrealsense2": "2.57.3.1"})
+AS_PLATFORM_CAMERA = of_bench("show", name="Platform Camera", serial_number="12a32f8f")
+NO_POWER_STATE = Mock(context=Mock(side_effect=RuntimeError("failed to set power state")))
+REPORTED = {
+    "Fatal error occurred (16)": "broken|replace the camera",
+    "RuntimeError: failed to set power state": "root|sudo nlos-cam doctor",
+    "cannot parse device name from 'Platform Camera'": f"pip install {WHEEL}",
+    "the same frame number again and again": "stands still|unplug the camera",
+}
+
+OWNERS_MEET = [
+    Case(
+        [run_on("windows"), NEWER_SDK, AS_PLATFORM_CAMERA],
+        "sdk-version",
+        words=f"'Platform Camera'|pip install {WHEEL}",
+        also_failed="sdk-camera",
+    ),
+    Case(
+        [run_on("windows"), put("installed", {}), AS_PLATFORM_CAMERA],
+        "sdk-version",
+        words=f"'Platform Camera'|pip install {WHEEL}",
+        also_failed="sdk-camera",
+    ),
+    Case([JETSON, HIDE_FROM_SDK], "sdk-camera", words="-DFORCE_RSUSB_BACKEND=ON"),
+    Case([JETSON, SECOND_WITHOUT_SENSORS], "hid-sensors", words="-DFORCE_RSUSB_BACKEND=ON"),
+    Case([put("load_sdk", lambda: NO_POWER_STATE)], "sdk", words="sudo nlos-cam doctor"),
+    *(Case([put("reported", text)], "reported", words=words) for text, words in REPORTED.items()),
+    Case([put("reported", "something else")], "reported", "warning"),
+]
+
 
 @pytest.mark.parametrize(
     "case",
@@ -324,6 +355,7 @@ LIBREALSENSE = [
         *TIMES_OF_FRAMES,
         *PYTHON,
         *LIBREALSENSE,
+        *OWNERS_MEET,
     ],
     ids=lambda case: f"{case.check}-{case.status}",
 )

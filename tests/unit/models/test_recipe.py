@@ -211,3 +211,11 @@ def test_one_cycle_schedule_rises_to_rate_and_falls_to_end() -> None:
     assert rates == sorted(rates[: peak + 1]) + sorted(rates[peak + 1 :], reverse=True)
     assert optimizer.param_groups[0]["lr"] < SMALLEST_RATE
     assert not has_ended(recipe, 0.0)
+
+
+@pytest.mark.parametrize("task", ['["vae"]', '{ name = "vae" }'])
+def test_recipe_whose_task_is_no_text_is_refused(tmp_path: Path, task: str) -> None:
+    path = tmp_path / "recipe.toml"
+    path.write_text(f"task = {task}\n", encoding="utf-8")
+    with pytest.raises(RecipeError, match="task: must be one of"):
+        load_recipe(path)
