@@ -15,7 +15,7 @@ CAVEATS = (
     "Networks gain less from averaged frames than the linear estimate does: on the home rig nothing.",
     (
         "The linear estimate holds the winner of each cell and the edges of shadows; it knows the true"
-        " shape that it is linear about. Its depth error is a lower bound: networks err three to five"
+        " shape that it is linear about. Its depth error is a lower bound: networks err four to five"
         " times as much."
     ),
     "The paper's radiometry is brighter than any measured third bounce; the Lambertian one dimmer.",

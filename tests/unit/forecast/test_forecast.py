@@ -88,5 +88,5 @@ def test_shipped_prior_is_small_and_positive() -> None:
 
 
 def test_rig_without_object_box_is_refused() -> None:
-    with pytest.raises(SceneError, match="object box"):
+    with pytest.raises(SceneError, match="object_box"):
         forecast(HOME.model_copy(update={"object_box": None}))
