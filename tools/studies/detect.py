@@ -207,7 +207,8 @@ def main() -> None:
         "empty": found(empty, 32, 30, given.runs),
         "paper": found(paper, 32, 2, given.power_runs),
         "lambertian": [
-            found(lambertian, 32, frames, given.power_runs) for frames in (30, 60, 100, 150, 200, 300)
+            found(lambertian, 32, frames, given.power_runs)
+            for frames in (30, 60, 100, 150, 200, 300)
         ],
         "lambertian_more_turns": [found(lambertian, 96, 50, given.power_runs)],
         "lambertian_effect_mm": {
