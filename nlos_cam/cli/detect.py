@@ -212,7 +212,11 @@ def _run(
     with progress() as bar:
         per_turn = len(plan.settings) * (plan.frames + detection.SETTLING_FRAMES)
         task = bar.add_task("Measuring turns", total=per_turn * len(session.missing()))
-        detection.measure_turns(session, source, hands, lambda: bar.advance(task))
+
+        def advance() -> None:
+            bar.advance(task)
+
+        detection.measure_turns(session, source, hands, advance)
 
 
 def _report(session: detection.Session, *, show_serial: bool, as_json: bool) -> None:

@@ -157,7 +157,7 @@ def moderate(values: Float64, noise: Float64) -> Float64:
 def analyze(
     plan: Plan,
     turns: list[Turn],
-    on_step: Callable[[int, int], None] = lambda done, total: None,
+    on_step: Callable[[int, int], None] = lambda *_: None,
     *,
     with_power: bool = True,
 ) -> Analysis:
@@ -304,7 +304,7 @@ class Scale:
         groups: list[Group],
         signs: Float64,
         alpha: float,
-        on_step: Callable[[int, int], None] = lambda done, total: None,
+        on_step: Callable[[int, int], None] = lambda *_: None,
     ) -> "Scale":
         """Return the scale of groups under patterns of signs (patterns, blocks)."""
         highest = np.empty((len(groups), len(signs)))
