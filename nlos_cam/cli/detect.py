@@ -14,8 +14,6 @@ from typing import Annotated, Any, Literal
 
 import nlos_calibration as walls
 import typer
-from nlos_calibration import first_problem
-from pydantic import ValidationError
 
 from nlos_cam import camera as cameras
 from nlos_cam import detect as detection
@@ -159,6 +157,8 @@ class _Asked:
         self, source: cameras.Camera, rig: walls.Rig | None, before: detection.Plan | None
     ) -> detection.Plan:
         """Return the plan for an entered camera. Raises typer.BadParameter for a wrong number."""
+        from pydantic import ValidationError  # not for the help page
+
         swept = detection.swept_settings(source) if self.sweep else (detection.BASELINE,)
         try:
             return detection.Plan(
@@ -175,7 +175,7 @@ class _Asked:
                 settings=swept,
             )
         except ValidationError as error:
-            raise typer.BadParameter(first_problem(error)) from error
+            raise typer.BadParameter(walls.first_problem(error)) from error
 
 
 def _measure(uri: str, wall: Path | None, asked: _Asked, folder: Path) -> detection.Session:
@@ -212,7 +212,11 @@ def _run(
     with progress() as bar:
         per_turn = len(plan.settings) * (plan.frames + detection.SETTLING_FRAMES)
         task = bar.add_task("Measuring turns", total=per_turn * len(session.missing()))
-        detection.measure_turns(session, source, hands, lambda: bar.advance(task))
+
+        def advance() -> None:
+            bar.advance(task)
+
+        detection.measure_turns(session, source, hands, advance)
 
 
 def _report(session: detection.Session, *, show_serial: bool, as_json: bool) -> None:

@@ -22,6 +22,7 @@ from nlos_cam.detect.levelling import level, quiet_cells
 from nlos_cam.detect.plan import BLOCK_TURNS, Plan, min_blocks
 from nlos_cam.detect.turns import CHANNELS, Turn
 from nlos_cam.errors import RecordingError
+from nlos_cam.frames import MAP_COLUMNS, MAP_ROWS
 from nlos_cam.render import DEPTH_UNIT_M
 
 PATCHES = 1, 3, 9
@@ -156,7 +157,7 @@ def moderate(values: Float64, noise: Float64) -> Float64:
 def analyze(
     plan: Plan,
     turns: list[Turn],
-    on_step: Callable[[int, int], None] = lambda done, total: None,
+    on_step: Callable[[int, int], None] = lambda *_: None,
     *,
     with_power: bool = True,
 ) -> Analysis:
@@ -248,7 +249,7 @@ def make_groups(plan: Plan, turns: list[Turn]) -> list[Group]:
         for channel, name in enumerate(CHANNELS):
             maps = np.stack([each.mean[number, channel] for each in turns]).astype(np.float64)
             std = np.stack([each.std[number, channel] for each in turns]).astype(np.float64)
-            used = np.isfinite(maps).all(axis=0)
+            used: Mask = np.asarray(np.isfinite(maps).all(axis=0))
             if not used.any():
                 continue
             floor = QUANTA[channel] / sqrt(12.0 * PIXELS_PER_CELL)
@@ -303,7 +304,7 @@ class Scale:
         groups: list[Group],
         signs: Float64,
         alpha: float,
-        on_step: Callable[[int, int], None] = lambda done, total: None,
+        on_step: Callable[[int, int], None] = lambda *_: None,
     ) -> "Scale":
         """Return the scale of groups under patterns of signs (patterns, blocks)."""
         highest = np.empty((len(groups), len(signs)))
@@ -397,7 +398,8 @@ def _overlapping(group: Group, generator: np.random.Generator) -> tuple[NDArray[
     """Return used cells (draws, k), each the middle of a patch and of those that overlap with it,
     and the share (draws, k) of an effect in the first that lies in each.
     """
-    index = np.full(group.used.shape, -1)
+    rows, columns = MAP_ROWS, MAP_COLUMNS
+    index = np.full((rows, columns), -1)
     index[group.used] = np.arange(np.count_nonzero(group.used))
     places = np.argwhere(group.used)
     centers = places[generator.integers(len(places), size=POWER_DRAWS)]
@@ -408,7 +410,7 @@ def _overlapping(group: Group, generator: np.random.Generator) -> tuple[NDArray[
         for right in steps:
             row = centers[:, 0] + down
             column = centers[:, 1] + right
-            inside = (row >= 0) & (row < index.shape[0]) & (column >= 0) & (column < index.shape[1])
+            inside = (row >= 0) & (row < rows) & (column >= 0) & (column < columns)
             at = np.where(inside, index[row * inside, column * inside], -1)
             overlap = (1.0 - abs(down) / group.patch) * (1.0 - abs(right) / group.patch)
             shares.append(np.where(at >= 0, overlap, 0.0))

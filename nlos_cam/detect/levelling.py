@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from nlos_cam.errors import SceneError
 from nlos_cam.frames import MAP_COLUMNS, MAP_ROWS, OBJECT_PIXELS
+from nlos_cam.objects import object_box
 
 QUIET_SHARE = 0.5
 """Share of the wall's cells that levelling may use: those that see least of the object box."""
@@ -17,19 +18,24 @@ HUBER = 1.5
 """Residual, in robust standard deviations, from which a cell counts less."""
 
 
-@lru_cache(maxsize=4)
 def quiet_cells(rig: Rig | None) -> NDArray[np.bool_]:
     """Return the cells (64, 80) that receive least three-bounce light from a sheet which fills the
     object box, relative to their direct return; all cells without a rig or a box.
     """
-    shape = MAP_ROWS, MAP_COLUMNS
     if rig is None or rig.object_box is None:
-        return np.ones(shape, np.bool_)
+        return np.ones((MAP_ROWS, MAP_COLUMNS), np.bool_)
+    return _dimmest_cells(rig.model_dump_json())
+
+
+@lru_cache(maxsize=4)
+def _dimmest_cells(rig_json: str) -> NDArray[np.bool_]:
+    rig = Rig.model_validate_json(rig_json)
+    shape = MAP_ROWS, MAP_COLUMNS
     from nlos_cam.render import Scene, cast, three_bounce
 
     # The rendering equation, not the paper's law: the choice needs only an order of cells, and a
     # matt sheet in the middle of the box lights all cells that any object there can light.
-    box = rig.object_box
+    box = object_box(rig)
     middle_m = (box.z_near_m + box.z_far_m) / 2.0
     sheet_m = np.full((OBJECT_PIXELS, OBJECT_PIXELS), middle_m, np.float32)
     try:
@@ -77,7 +83,8 @@ def _robust_fit(basis: Float64, values: Float64, weight: Float64) -> Float64:
     for _ in range(ROUNDS):
         # The normal equations: two centered columns, so nothing is lost by squaring them.
         weighted = basis * (weight**2 * extra)[:, None]
-        found = np.linalg.lstsq(weighted.T @ basis, weighted.T @ values, rcond=None)[0]
+        solved = np.linalg.lstsq(weighted.T @ basis, weighted.T @ values, rcond=None)[0]
+        found = solved.astype(np.float64)
         residual = np.abs((values - basis @ found) * weight)
         scale = 1.4826 * float(np.median(residual))
         extra = np.minimum(1.0, HUBER * scale / np.maximum(residual, 1e-300))

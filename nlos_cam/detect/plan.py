@@ -16,6 +16,14 @@ BLOCK_TURNS = 4
 """
 
 
+def source_checksum() -> str:
+    """Return twelve hexadecimal digits that change with this package's source."""
+    digest = hashlib.sha256()
+    for path in sorted(Path(__file__).parent.glob("*.py")):
+        digest.update(path.read_bytes())
+    return digest.hexdigest()[:12]
+
+
 class Setting(Record):
     """Options of the camera under which every turn is measured."""
 
@@ -38,7 +46,7 @@ class Plan(Record):
     created: str
     """Date and time, ISO 8601."""
     version: str = Field(default_factory=lambda: version("nlos-cam"))
-    source: str = Field(default_factory=lambda: source_checksum())
+    source: str = Field(default_factory=source_checksum)
     """Checksum of the analysis's source files."""
     camera: str
     serial: str = ""
@@ -87,11 +95,3 @@ def min_blocks(alpha: float) -> int:
     """Return the least number of blocks with which a p-value can be `alpha`."""
     # 2^(N - 1) patterns of signs differ, since flipping all blocks changes no absolute value.
     return ceil(1.0 - log2(alpha))
-
-
-def source_checksum() -> str:
-    """Return twelve hexadecimal digits that change with this package's source."""
-    digest = hashlib.sha256()
-    for path in sorted(Path(__file__).parent.glob("*.py")):
-        digest.update(path.read_bytes())
-    return digest.hexdigest()[:12]

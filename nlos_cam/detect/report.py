@@ -1,8 +1,7 @@
 """Page of a detection, to publish: verdict, power, significance maps, settings, turns."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -183,9 +182,13 @@ def _family_table(analysis: Analysis) -> Table:
     return Table(head, rows)
 
 
-def _order(plan: Plan) -> Any:
+def _order(plan: Plan) -> Callable[[Finding], tuple[int, int, int]]:
     names = [each.name for each in plan.settings]
-    return lambda each: (names.index(each.setting), CHANNELS.index(each.channel), each.patch)
+
+    def place(found: Finding) -> tuple[int, int, int]:
+        return names.index(found.setting), CHANNELS.index(found.channel), found.patch
+
+    return place
 
 
 def _settings_table(plan: Plan) -> Table:
