@@ -1,4 +1,4 @@
-"""What accuracy costs in time: one scene at three stops, against the finest."""
+"""Accuracy against time: one scene at three stops, compared with the finest."""
 
 import time
 

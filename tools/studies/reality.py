@@ -15,7 +15,7 @@ import argparse
 import json
 import os
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -31,6 +31,7 @@ from nlos_calibration import (
     Rig,
 )
 from nlos_calibration.arrays import Float64
+from numpy.typing import NDArray
 from PIL import Image
 
 from nlos_cam.objects import orthographic_depth
@@ -53,14 +54,20 @@ SIZES_M = 0.02, 0.3, 0.6
 authors reconstruct, and all of it.
 """
 SHAPES: dict[str, Sequence[tuple[float, float]]] = {
-    "E": [(0, 0), (6, 0), (6, 2), (2, 2), (2, 4), (5, 4), (5, 6), (2, 6), (2, 8), (6, 8), (6, 10)]
-    + [(0, 10)],
-    "K": [(0, 0), (2, 0), (2, 4), (4.5, 0), (7, 0), (3.5, 5), (7, 10), (4.5, 10), (2, 6), (2, 10)]
-    + [(0, 10)],
+    "E": [
+        *[(0, 0), (6, 0), (6, 2), (2, 2), (2, 4), (5, 4), (5, 6), (2, 6), (2, 8), (6, 8)],
+        *[(6, 10), (0, 10)],
+    ],
+    "K": [
+        *[(0, 0), (2, 0), (2, 4), (4.5, 0), (7, 0), (3.5, 5), (7, 10), (4.5, 10), (2, 6)],
+        *[(2, 10), (0, 10)],
+    ],
     "Y": [(3, 0), (5, 0), (5, 4), (8, 10), (5.7, 10), (4, 6), (2.3, 10), (0, 10), (3, 4)],
     "Mannequin": [(1, 0), (4, 0), (5, 8), (3, 8.4), (3, 10), (2, 10), (2, 8.4), (0, 8)],
-    "Mannequin_Assymetric": [(1, 0), (4, 0), (5, 7.5), (8, 9), (7.5, 9.8), (3, 8.4), (3, 10)]
-    + [(2, 10), (2, 8.4), (0, 8)],
+    "Mannequin_Assymetric": [
+        *[(1, 0), (4, 0), (5, 7.5), (8, 9), (7.5, 9.8), (3, 8.4), (3, 10), (2, 10), (2, 8.4)],
+        (0, 8),
+    ],
     "U": [(0, 0), (4.6, 0), (4.6, 5.5), (3.6, 5.5), (3.6, 1.1), (1, 1.1), (1, 5.5), (0, 5.5)],
 }
 """Outlines as seen from the wall, drawn by us: the sets give none."""
@@ -101,70 +108,84 @@ def outline(name: str, height_m: float) -> Float64:
     return (points * height_m / np.ptp(points[:, 1]))[triangulate(points)]
 
 
-def rendered(
-    rig: Rig,
-    triangles: Float64,
-    look: tuple[str, Surface],
-    relay_cells: int,
-    beams: Sequence[int] | Float64,
-    cells: int = 32,
-) -> tuple[Float64, RenderProblem]:
-    """Return three-bounce histograms (beams, bins), every path by itself, and the problem.
+def prepared(
+    rig: Rig, box: ObjectBox, triangles: Float64, look: tuple[str, Surface], relay_cells: int
+) -> RenderProblem:
+    """Return the problem of an object before a wall, every path by itself.
 
     The line of sight is left out: both sensors look at the wall, with the object behind or beside.
     """
-    assert rig.object_box is not None
-
-    depth = orthographic_depth(triangles, rig.object_box, cells)
     radiometry, surface = look
+    depth = orthographic_depth(triangles, box, 20)
     scene = Scene(rig, depth, surface, radiometry)  # pyright: ignore[reportArgumentType]
     accuracy = Accuracy("reality", relay_cells, relay_cells, sub_bins=0)
     chosen = {"direct", "three-bounce", "brdf"}
     verdicts = tuple(Effect(name, name in chosen, "chosen by the study", 0.0) for name in EFFECTS)
-    problem = RenderProblem.of(SceneFacts(scene, accuracy), verdicts)
-    assert problem.job is not None
-
-    # Every beam lights the wall in these rigs, so beams of the map and of the job are the same.
-    return histograms(problem.job.select(np.asarray(beams, np.int64))), problem
+    return RenderProblem.of(SceneFacts(scene, accuracy), verdicts)
 
 
-def confocal_rig(center_m: Float64, half_m: float, bin_s: float) -> Rig:
-    """Return a rig whose laser and detector look at one wall point, the origin.
+def transported(
+    problem: RenderProblem, shift_m: Float64, beams: Sequence[int] | NDArray[np.int64], bins: int
+) -> Float64:
+    """Return the three-bounce histograms (beams, bins) of a problem's object, moved by a shift
+    (3,).
+    """
+    job = problem.job
+    if job is None:
+        raise SystemExit("error: no light reaches the object")
+    # Only the patches move: the flat objects have no shadows that would move with them.
+    patches = replace(job.patches, point_m=job.patches.point_m + shift_m)
+    # All beams light the wall in these rigs, so beams of the map and of the job are the same.
+    some = job.select(np.asarray(beams, np.int64))
+    return histograms(replace(some, patches=patches, bins=bins))
+
+
+HOME_M = np.array([0.0, -0.3, 0.8])
+"""Place at which an object before one wall point is prepared."""
+
+
+def box_about(center_m: Float64, half_m: float) -> ObjectBox:
+    """Return a box about a place."""
+    x, y, z = (float(value) for value in center_m)
+    return ObjectBox(
+        x_min_m=x - half_m,
+        x_max_m=x + half_m,
+        y_min_m=y - half_m,
+        y_max_m=y + half_m,
+        z_near_m=z - 0.1,
+        z_far_m=z + 0.1,
+    )
+
+
+def confocal_problem(
+    name: str, height_m: float, look: tuple[str, Surface], bin_s: float
+) -> RenderProblem:
+    """Return the problem of an object at HOME_M, with laser and detector at one wall point, the
+    origin.
 
     A lens of 1e6 pixels makes all beams one, and a relay wall of 2 mm, as one cell, the detector's
     spot.
     """
-    x, y, z = center_m
-    spot = Extent(x_min_m=-1e-3, x_max_m=1e-3, y_min_m=-1e-3, y_max_m=1e-3)
-    return Rig(
+    box = box_about(HOME_M, height_m * 0.52)
+    rig = Rig(
         name="one-point",
         lidar=LidarPose(distance_m=LIDAR_M, yaw_deg=0),
         intrinsics=PinholeRecord(fx=1e6, fy=1e6),
         wall=Extent(x_min_m=-3, x_max_m=3, y_min_m=-3, y_max_m=3),
-        relay=spot,
-        object_box=ObjectBox(
-            x_min_m=x - half_m,
-            x_max_m=x + half_m,
-            y_min_m=y - half_m,
-            y_max_m=y + half_m,
-            z_near_m=z - 0.1,
-            z_far_m=z + 0.1,
-        ),
+        relay=Extent(x_min_m=-1e-3, x_max_m=1e-3, y_min_m=-1e-3, y_max_m=1e-3),
+        object_box=box,
         device=DeviceConstants(bin_m=LIGHT_M_PER_S * bin_s),
     )
+    return prepared(rig, box, outline(name, height_m) + HOME_M, look, 1)
 
 
-def confocal(
-    name: str, height_m: float, center_m: Float64, look: tuple[str, Surface], bin_s: float
-) -> tuple[float, float]:
-    """Return arrival in bins after the direct light, and light, of an object at a place."""
-    triangles = outline(name, height_m) + center_m
-    rig = confocal_rig(center_m, height_m * 0.52, bin_s)
-    histogram = rendered(rig, triangles, look, 1, [MIDDLE_BEAM], cells=20)[0][0]
+def confocal(problem: RenderProblem, center_m: Float64) -> tuple[float, float]:
+    """Return arrival in bins after the direct light, and light, of an object moved to a place."""
+    histogram = transported(problem, center_m - HOME_M, [MIDDLE_BEAM], 1400)[0]
     total = float(histogram.sum())
     # Light of bin k has lengths from k to k + 1 bins.
     middle = float(histogram @ (np.arange(len(histogram)) + 0.5)) / total
-    return middle - 2 * LIDAR_M / rig.device.bin_m, total
+    return middle - 2 * LIDAR_M / problem.scene.rig.device.bin_m, total
 
 
 def point_arrival(center_m: Float64, bin_s: float) -> Float64:
@@ -185,7 +206,8 @@ def arrival_model(name: str, height_m: float, bin_s: float) -> Model:
     axes = (np.linspace(-0.65, 0.65, 5), np.linspace(-0.5, 0.15, 4), np.linspace(0.55, 1.1, 3))
     places = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
     look = ("lambertian", MATERIALS["retroreflective"])
-    arrivals = np.array([confocal(name, height_m, at, look, bin_s)[0] for at in places])
+    problem = confocal_problem(name, height_m, look, bin_s)
+    arrivals = np.array([confocal(problem, at)[0] for at in places])
     off = arrivals - point_arrival(places, bin_s)
     terms, *_ = np.linalg.lstsq(_monomials(places), off, rcond=None)
     return lambda center_m: point_arrival(center_m, bin_s) + _monomials(center_m) @ terms
@@ -204,11 +226,19 @@ def fit_offsets(scan: Scan, model: Model) -> tuple[Float64, Float64]:
     """Return the offsets (3,) of the object's middle in metres that fit arrivals best, and the
     residuals (n,) in bins that are left.
     """
-    # A place above the spot fits like one below it: the search begins below, within the bounds
-    # where the model holds.
+    # A place above the spot fits like one below it: the search stays below, within the bounds
+    # where the model holds, and begins at three heights.
     low = np.array([-0.15, -0.2, -0.15])
-    high = np.array([0.15, 0.45, 0.35])
-    offset = np.array([0.0, 0.15, 0.05])
+    high = np.array([0.15, 0.33, 0.35])
+    starts = [np.array([0.0, up_m, 0.05]) for up_m in (-0.1, 0.1, 0.3)]
+    found = [_descend(scan, model, start, (low, high)) for start in starts]
+    return min(found, key=lambda each: rms(each[1]))
+
+
+def _descend(
+    scan: Scan, model: Model, offset: Float64, bounds: tuple[Float64, Float64]
+) -> tuple[Float64, Float64]:
+    """Return the offsets and residuals that a descent from one start finds."""
     step_m = 1e-4
     for _ in range(60):
         left = scan.arrival_bins - model(scan.center_m + offset)
@@ -220,7 +250,7 @@ def fit_offsets(scan: Scan, model: Model) -> tuple[Float64, Float64]:
         ]
         # Gauss-Newton, damped by half: the model is nearly linear in metres.
         step, *_ = np.linalg.lstsq(np.stack(slope, 1), left, rcond=None)
-        offset = np.clip(offset + 0.5 * step, low, high)
+        offset = np.clip(offset + 0.5 * step, *bounds)
     return offset, scan.arrival_bins - model(scan.center_m + offset)
 
 
@@ -291,11 +321,12 @@ def falls(data: Path) -> dict[str, Any]:
             "farthest_m": float(np.linalg.norm(scan.center_m, axis=1).max()),
             "measured": exponents(scan.center_m, scan.total),
         }
-        some = scan.center_m[::8]
+        some = scan.center_m[::3]
         for radiometry in RADIOMETRIES:
             for material, surface in MATERIALS.items():
                 look = (radiometry, surface)
-                light = [confocal(name, 0.3, at, look, scan.bin_s)[1] for at in some]
+                problem = confocal_problem(name, 0.3, look, scan.bin_s)
+                light = [confocal(problem, at)[1] for at in some]
                 row[f"{radiometry} {material}"] = exponents(some, np.array(light))
         rows.append(row)
     return {"rows": rows}
@@ -359,34 +390,25 @@ def response(zones: Zones) -> Float64:
     return mean - min(mean[:3].mean(), mean[-3:].mean())
 
 
-def zone_rig(sensor_m: Float64, bin_s: float) -> tuple[Rig, Float64]:
-    """Return the rig of one place, with the wall frame's origin at the sensor's foot, and the
-    triangles of the U in it.
+def zone_problem(look: tuple[str, Surface], bin_s: float) -> RenderProblem:
+    """Return the problem of the U straight before the sensor, with the origin at its foot.
 
     By reciprocity, light that floods all zones and returns into one travels as light from that
     zone that returns into all: the zone's beams scan, and the relay wall is what all zones see.
     """
     half = REACH * WALL_M
-    middle = U_CENTER_M - sensor_m[:2]
-    depth = WALL_M - U_Z_M
-    relay = Extent(x_min_m=-half, x_max_m=half, y_min_m=-half, y_max_m=half)
+    center = np.array([0.0, 0.0, WALL_M - U_Z_M])
+    box = box_about(center, 0.3)
     rig = Rig(
         name="zones",
         lidar=LidarPose(distance_m=WALL_M, yaw_deg=0),
         intrinsics=PinholeRecord(fx=320 / REACH, fy=240 / REACH),
         wall=Extent(x_min_m=-3, x_max_m=3, y_min_m=-3, y_max_m=3),
-        relay=relay,
-        object_box=ObjectBox(
-            x_min_m=middle[0] - 0.3,
-            x_max_m=middle[0] + 0.3,
-            y_min_m=middle[1] - 0.3,
-            y_max_m=middle[1] + 0.3,
-            z_near_m=depth - 0.1,
-            z_far_m=depth + 0.1,
-        ),
+        relay=Extent(x_min_m=-half, x_max_m=half, y_min_m=-half, y_max_m=half),
+        object_box=box,
         device=DeviceConstants(bin_m=LIGHT_M_PER_S * bin_s),
     )
-    return rig, outline("U", U_HEIGHT_M) + np.array([*middle, depth])
+    return prepared(rig, box, outline("U", U_HEIGHT_M) + center, look, 10)
 
 
 def render_zones(zones: Zones, look: tuple[str, Surface]) -> tuple[Zones, Float64]:
@@ -394,22 +416,20 @@ def render_zones(zones: Zones, look: tuple[str, Surface]) -> tuple[Zones, Float6
     their direct peak, and the same before the background is taken off.
     """
     pulse = response(zones)
-    beams = np.add.outer(np.arange(2, 64, 6) * 80, np.arange(2, 80, 6)).ravel()
+    beams = np.add.outer(np.arange(3, 64, 7) * 80, np.arange(4, 80, 8)).ravel()
     tangent = zones.ray[:, :2] / zones.ray[:, 2:]
+    problem = zone_problem(look, zones.bin_s)
+    spot = problem.beams.laser_spot_m[beams, :2] / WALL_M
+    zone = np.linalg.norm(spot[:, None] - tangent, axis=-1).argmin(1)
+    direct = np.bincount(zone, problem.beams.direct[beams], 9)[:, None]
+    bins = zones.counts.shape[-1]
     every: list[Float64] = []
     for sensor_m in zones.sensor_m:
-        rig, triangles = zone_rig(sensor_m, zones.bin_s)
-        third, problem = rendered(rig, triangles, look, 12, beams, cells=24)
-        spot = problem.beams.laser_spot_m[beams, :2] / WALL_M
-        zone = np.linalg.norm(spot[:, None] - tangent, axis=-1).argmin(1)
-        light = np.stack([third[zone == number].sum(0) for number in range(9)])
-        direct = [problem.beams.direct[beams][zone == number].sum() for number in range(9)]
-        light /= np.array(direct)[:, None]
-        whole = np.zeros((9, zones.counts.shape[-1]))
-        kept = min(light.shape[1], whole.shape[1] - TMF_START_BIN)
-        whole[:, TMF_START_BIN : TMF_START_BIN + kept] = light[:, :kept]
-        spread = [np.convolve(row, pulse)[5 : 5 + whole.shape[1]] for row in whole]
-        every.append(np.array(spread))
+        shift = np.array([*(U_CENTER_M - sensor_m[:2]), 0.0])
+        third = transported(problem, shift, beams, bins - TMF_START_BIN)
+        light = np.stack([third[zone == number].sum(0) for number in range(9)]) / direct
+        whole = np.pad(light, ((0, 0), (TMF_START_BIN, 0)))
+        every.append(np.array([np.convolve(row, pulse)[5 : 5 + bins] for row in whole]))
     length = WALL_M / zones.ray[:, 2]
     # Light of the direct path fills a bin about its middle, as the third bounce does.
     direct_bin = TMF_START_BIN + 2 * length / (LIGHT_M_PER_S * zones.bin_s) - 0.5
