@@ -66,7 +66,7 @@ def rendered(name: str, depth_m: Float32, folder: Path) -> dict[str, float]:
 
 def captures(python: str, folder: Path) -> tuple[dict[str, Any], Figure]:
     """Return seconds and tal's peaks for each object and capture, and the pictures."""
-    figure = Figure(figsize=(7.2, 5.2), layout="constrained")
+    figure = Figure(figsize=(7.2, 8.0), layout="constrained")
     axes = figure.subplots(len(OBJECTS), 1 + len(CAPTURES))
     rows: dict[str, Any] = {}
     extent = BOX.x_min_m, BOX.x_max_m, BOX.y_min_m, BOX.y_max_m
