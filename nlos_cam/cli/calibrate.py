@@ -20,6 +20,7 @@ from rich.table import Table
 from nlos_cam import bench as benches
 from nlos_cam import calibrate as bench
 from nlos_cam import camera as cameras
+from nlos_cam.cli import benches as benching
 from nlos_cam.cli.common import (
     Camera,
     Json,
@@ -271,7 +272,11 @@ def calibrate(
     fields = record.model_dump(mode="json", include=JSON_FIELDS)
     files = target.files
     result = fields | {"out": str(files.record), "report": str(files.report)}
+    own = benches.load_bench(target.folder).weights if target.folder else None
+    served = benching.weights_verdict(record.rig, own, target.folder)
+    result["weights"] = {"serve": served.serve, "verdict": served.sentence}
     text = format_result(record, files)
+    text += f"\n{escape(served.sentence[:1].upper() + served.sentence[1:])}"
     if target.folder:
         result["bench"] = str(target.folder)
         text += f"\nNext: {escape(_next_step(target.folder, record))}"

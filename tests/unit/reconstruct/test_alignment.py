@@ -28,7 +28,8 @@ QUIET = SensorModel(
 
 def trained(rig: Rig = RIG, **changes: Any) -> Any:
     return SimpleNamespace(
-        **{"rig_name": rig.name, "rig_checksum": rig.checksum, "input": "raw maps"} | changes
+        **{"rig_name": rig.name, "rig_checksum": rig.checksum, "rig": None, "input": "raw maps"}
+        | changes
     )
 
 
