@@ -142,5 +142,7 @@ def open_stream(
         calibrated, network, average, uncertainty_model=uncertainty_model
     )
     reconstruct.warm_up(camera, pipeline)
-    notes = tuple(reconstruct.compatibility_warnings(calibrated, network.record, uncertainty_model))
+    notes = calibrated.warnings + tuple(
+        reconstruct.compatibility_warnings(calibrated, network.record, uncertainty_model)
+    )
     return Stream(camera, pipeline, lossless=uri.startswith("bag:"), notes=notes, clock=clock)

@@ -53,6 +53,7 @@ __all__ = [
     "fit_wall",
     "fit_with_tape_distance",
     "footprint",
+    "is_wall_record",
     "lidar_visible_share",
     "load_measured",
     "load_rig",
@@ -75,6 +76,7 @@ __all__ = [
     "wall_from_zero",
     "wall_points_m",
     "wall_with_board",
+    "with_base",
     "with_degrees",
     "with_mm",
     "with_occluder",
@@ -115,6 +117,7 @@ from .rig import (
     packaged_rigs,
     read_record,
     record_kind,
+    with_base,
 )
 from .rig_check import (
     GAP_RANGE_M,
@@ -140,6 +143,7 @@ from .wall_record import (
     MeasuredWall,
     WallRecord,
     depth_offset_m,
+    is_wall_record,
     load_measured,
     load_wall,
     new_wall_record,

@@ -5,12 +5,12 @@ validated TOML.
 import hashlib
 import re
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from difflib import get_close_matches
 from importlib.resources.abc import Traversable
 from math import degrees, radians
 from pathlib import Path
-from typing import Annotated, Literal, Self, TypeVar
+from typing import Annotated, Any, Literal, Self, TypeVar
 
 import numpy as np
 import tomli_w
@@ -41,6 +41,7 @@ KINDS = {
     "schema_version": "wall record",
     "bench_version": "bench",
     "task": "training recipe",
+    "base": "rig",
     "lidar": "rig",
     "rig": "scene",
 }
@@ -260,17 +261,64 @@ def load_rig(name_or_path: str | Path) -> Rig:
         raise UnknownRigError(
             f"no rig {source.stem!r}.{hint} Give {' or '.join(packaged)}, or a rig's TOML file"
         )
-    return read_record(source, Rig, "rig", "give a packaged name (paper-rig) or a file")
+    return read_record(
+        source,
+        Rig,
+        "rig",
+        "give a packaged name (paper-rig) or a file",
+        lambda content: with_base(content, source.parent, source.stem),
+    )
 
 
-def read_record(source: Traversable, model: type[R], kind: str, advice: str) -> R:
-    """Read a validated record from a TOML file. Raises RecordFileError, with `advice` if there is
-    no such file.
+def with_base(content: dict[str, Any], folder: Path, name: str) -> dict[str, Any]:
+    """Return a rig's fields with those of the rig that its `base` names, where it has none of its
+    own; without a `base` as they are.
+
+    The base is a packaged rig, or a whole rig's file in `folder`; `name` is the name of a rig that
+    gives none. Raises RecordFileError for a base that cannot be used.
     """
-    content: dict[str, object] = {}
+    if "base" not in content:
+        return content
+    base = content["base"]
+    if not isinstance(base, str) or not base:
+        raise RecordFileError(f"base must be the name or file of a rig (got {base!r:.40})")
+    beside = folder / base
+    if beside.is_file():
+        try:
+            nested = "base" in read_toml(beside)
+        except (OSError, ValueError):
+            nested = False  # load_rig says what is wrong with it
+        if nested:
+            raise RecordFileError(f"base {beside} has a base of its own: name a whole rig")
+    whole = load_rig(beside if beside.is_file() else base).model_dump()
+    changes = {key: value for key, value in content.items() if key != "base"}
+    return _merged(whole, {"name": name} | changes)
+
+
+def _merged(whole: dict[str, Any], changes: dict[str, Any]) -> dict[str, Any]:
+    """Return nested tables with the values that `changes` has; others stay."""
+    merged = dict(whole)
+    for key, value in changes.items():
+        before = merged.get(key)
+        both = isinstance(before, dict) and isinstance(value, dict)
+        merged[key] = _merged(before, value) if both else value
+    return merged
+
+
+def read_record(
+    source: Traversable,
+    model: type[R],
+    kind: str,
+    advice: str,
+    complete: Callable[[dict[str, Any]], dict[str, Any]] = lambda content: content,
+) -> R:
+    """Read a validated record from a TOML file, whose content `complete` may add to. Raises
+    RecordFileError, with `advice` if there is no such file.
+    """
+    content: dict[str, Any] = {}
     try:
         content = read_toml(Path(str(source)))
-        return model.model_validate(content)
+        return model.model_validate(complete(content))
     except FileNotFoundError as error:
         raise RecordFileError(f"no {kind} {source}: {advice}") from error
     except ValidationError as error:

@@ -210,11 +210,14 @@ def rig_named(name: str) -> Rig:
     """Return a packaged rig by name, or the rig of a file: a rig.toml, or the wall.toml that
     `calibrate` writes.
     """
+    return load_wall(Path(name)).rig if is_wall_record(name) else load_rig(name)
+
+
+def is_wall_record(name: str) -> bool:
+    """Return whether a name is that of a wall record's file."""
     # Only a wall record has a schema version; a rig's own file has none.
     path = Path(name)
-    if path.is_file() and "schema_version" in path.read_text(encoding="utf-8", errors="replace"):
-        return load_wall(path).rig
-    return load_rig(name)
+    return path.is_file() and "schema_version" in path.read_text(encoding="utf-8", errors="replace")
 
 
 @dataclass(frozen=True)

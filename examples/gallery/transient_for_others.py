@@ -12,9 +12,9 @@ if importlib.util.find_spec("tal") is None:
     sys.exit()
 
 import tal
-from nlos_cam.transients import render_transient, save_transient
 
 from nlos_cam.render import paper_scene
+from nlos_cam.transients import render_transient, save_transient
 
 path = Path("airplane.hdf5")
 save_transient(path, render_transient(paper_scene().scene_at(0), accuracy="draft"))

@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+import shlex
 from pathlib import Path
 from typing import Annotated, NamedTuple
 
 import nlos_calibration as walls
+import nlos_models as models
 import typer
 
 from nlos_cam import bench as benches
-from nlos_cam import calibrate
+from nlos_cam import calibrate, reconstruct
 from nlos_cam import camera as cameras
-from nlos_cam import reconstruct
+from nlos_cam.cli import common
 from nlos_cam.errors import OutputExistsError
 
 BenchFolder = Annotated[
@@ -65,9 +67,29 @@ def rig_of(bench: Path | None, rig: str | None, default: str | None = None) -> w
     if bench is not None and rig is not None:
         raise typer.BadParameter("--bench and --rig each name a rig: give one")
     if bench is not None:
-        return benches.load_bench(bench).rig
+        loaded = benches.load_bench(bench)
+        for warning in loaded.calibrated.warnings:
+            common.say(f"note: {warning}")
+        return loaded.rig
     name = rig or default
-    return walls.rig_named(name) if name else None
+    if name is None:
+        return None
+    found = walls.rig_named(name)
+    if walls.is_wall_record(name) and (record := walls.load_wall(Path(name))).verdict == "doubtful":
+        common.say(f"note: {name} calls itself doubtful: {record.advice}")
+    return found
+
+
+def weights_verdict(
+    rig: walls.Rig, weights: Path | None, bench: Path | None
+) -> reconstruct.WeightsVerdict:
+    """Return whether weights (None: the shipped ones) serve a rig, for the user.
+
+    The forecast of the expected IoU goes in here, for all commands at once.
+    """
+    record = models.load_record(models.weights_folder(weights))
+    folder = shlex.quote(str(bench)) if bench else "bench/"
+    return reconstruct.weights_serve(rig, record, bench=folder)
 
 
 def files_in_bench(

@@ -20,7 +20,7 @@ from rich.table import Table
 from nlos_cam import bench as benches
 from nlos_cam import calibrate as bench
 from nlos_cam import camera as cameras
-from nlos_cam.cli import benches as options
+from nlos_cam.cli import benches as benching
 from nlos_cam.cli.common import (
     Camera,
     Json,
@@ -272,7 +272,11 @@ def calibrate(
     fields = record.model_dump(mode="json", include=JSON_FIELDS)
     files = target.files
     result = fields | {"out": str(files.record), "report": str(files.report)}
+    own = benches.load_bench(target.folder).weights if target.folder else None
+    served = benching.weights_verdict(record.rig, own, target.folder)
+    result["weights"] = {"serve": served.serve, "verdict": served.sentence}
     text = format_result(record, files)
+    text += f"\n{escape(served.sentence[:1].upper() + served.sentence[1:])}"
     if target.folder:
         result["bench"] = str(target.folder)
         text += f"\nNext: {escape(_next_step(target.folder, record))}"
@@ -330,7 +334,7 @@ class Target(NamedTuple):
         folder = _bench_folder(folder, occluder, out)
         bare = _bare_wall(occluder) if occluder else None
         if folder:
-            files = options.files_in_bench(folder, occluder=bool(bare), overwrite=overwrite)
+            files = benching.files_in_bench(folder, occluder=bool(bare), overwrite=overwrite)
         else:
             path = output_path(out, "wall", ".toml", overwrite=overwrite)
             files = bench.WallFiles.beside(path, overwrite=overwrite)
@@ -339,7 +343,7 @@ class Target(NamedTuple):
     def write(self, record: walls.WallRecord, reference: walls.BareWall | None) -> walls.WallRecord:
         """Write the measurement, and return the record, which names its reference."""
         if self.folder:
-            return options.write_to_bench(self.folder, self.files, record, reference)
+            return benching.write_to_bench(self.folder, self.files, record, reference)
         return bench.write_record(self.files, record, reference)
 
 

@@ -8,7 +8,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Literal
 
-import nlos_calibration as walls
 import nlos_models as models
 import typer
 from rich.progress import ProgressColumn, Task
@@ -17,7 +16,7 @@ from rich.text import Text
 from nlos_cam import dataset as data
 from nlos_cam import objects as shapes
 from nlos_cam import render as renderer
-from nlos_cam.cli import common
+from nlos_cam.cli import benches, common
 
 PROCEDURAL = "procedural"
 
@@ -159,6 +158,7 @@ def build(
     count: Count,
     seed: Seed = 0,
     rig: RigName = None,
+    bench_folder: benches.BenchOrRig = None,
     scene: SceneToml = None,
     objects: HiddenObjects = PROCEDURAL,
     without: LeftOut = "",
@@ -179,15 +179,14 @@ def build(
     """Render random objects into HDF5 shards; give the same command again to resume after an
     interruption.
     """
-    if scene and rig is not None:
-        raise typer.BadParameter(f"{scene} has its own rig: drop --rig")
+    if scene and (rig or bench_folder):
+        raise typer.BadParameter(f"{scene} has its own rig: drop --rig and --bench")
+    its_rig = benches.rig_of(bench_folder, rig, common.PAPER_RIG)
     spread = data.RigSpread(
         place_m=rig_spread_mm / 1e3, angle_deg=rig_spread_deg, gain_share=gain_spread_percent / 100
     )
     plan = data.DatasetPlan.of_scene(
-        renderer.load_scene(scene)
-        if scene
-        else renderer.SceneFile(name="bare", rig=walls.rig_named(rig or common.PAPER_RIG)),
+        renderer.load_scene(scene) if scene else renderer.SceneFile(name="bare", rig=its_rig),
         seed,
         objects=_objects(objects, without, backgrounds, share_generic),
         accuracy=renderer.accuracy_named(accuracy).name,
@@ -241,6 +240,7 @@ def label(
     recordings: Recordings,
     out: NewOut,
     wall: Wall = None,
+    bench_folder: benches.BenchFolder = None,
     frames: Frames = 8,
     overwrite: common.Overwrite = False,
     json: common.Json = False,
@@ -252,11 +252,17 @@ def label(
     (the fields of a scene file's object; by default of the mesh LABEL.stl, .obj or .ply), or
     LABEL.npy (a depth map).
     """
+    chosen = benches.choose(bench_folder, wall)
     folder = common.output_path(out, "dataset", "", overwrite=overwrite)
     with common.tracked("reading recordings") as on_progress:
         command = _command(context, "label")
         labelled = data.label_recordings(
-            recordings, folder, wall=wall, frames=frames, command=command, on_progress=on_progress
+            recordings,
+            folder,
+            wall=chosen.bench or wall,
+            frames=frames,
+            command=command,
+            on_progress=on_progress,
         )
     samples = len(labelled.label)
     labels = sorted(set(labelled.label))

@@ -4,14 +4,22 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Annotated
 
 import nlos_calibration as walls
+import typer
 from nlos_models import training
 
 from nlos_cam import camera as cameras
 from nlos_cam import objects as shapes
 from nlos_cam import render as renderer
 from nlos_cam.cli.common import Json, finish
+
+RigName = Annotated[
+    str | None,
+    typer.Argument(metavar="NAME", help="Packaged rig, rig's TOML file, or wall record."),
+]
+HEAD = "# A whole rig: change what differs, and name the file as --rig or in a scene"
 
 
 def scenes(json: Json = False) -> None:
@@ -27,8 +35,16 @@ def objects(json: Json = False) -> None:
     _print("objects", varies, as_json=json)
 
 
-def rigs(json: Json = False) -> None:
-    """List the packaged rigs, for --rig and scene files."""
+def rigs(name: RigName = None, json: Json = False) -> None:
+    """List the packaged rigs, for --rig and scene files; with NAME, print the rig whole, as TOML.
+
+    A file with base = "paper-rig" needs only the keys that it changes.
+    """
+    if name is not None:
+        rig = walls.rig_named(name)
+        text = f"{HEAD}\n{walls.dump_toml(rig)}".rstrip()
+        finish({"rig": rig.model_dump(mode="json")}, as_json=json, text=text)
+        return
     _print("rigs", {path.stem: _title(path) for path in walls.packaged_rigs()}, as_json=json)
 
 

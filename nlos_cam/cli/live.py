@@ -248,6 +248,9 @@ def _load_pipeline(
     network = reconstruct.load_networks(chosen.weights)
     uncertainty_model = reconstruct.load_uncertainty(chosen.weights)
     common.say(f"Loaded model {network.record.rig_name} ({network.runtime})")
+    served = benches.weights_verdict(bench.rig, chosen.weights, None)
+    if served.service == "trained for it":
+        common.say(served.sentence[:1].upper() + served.sentence[1:])
     for warning in reconstruct.compatibility_warnings(bench, network.record, uncertainty_model):
         common.say(f"note: {warning}")
     return reconstruct.build_pipeline(

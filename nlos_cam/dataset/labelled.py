@@ -16,6 +16,7 @@ from nlos_models.training import MapSet
 from pydantic import ValidationError
 
 from nlos_cam import objects as shapes
+from nlos_cam.bench import Bench
 from nlos_cam.dataset.build import SHARD
 from nlos_cam.dataset.plan import DatasetPlan, scene_row
 from nlos_cam.dataset.reader import MAP_CHANNELS
@@ -166,7 +167,7 @@ def read_labelled(
     recordings: Sequence[Path],
     *,
     known: KnownObjects = benchmark_depths,
-    wall: Path | None = None,
+    wall: Bench | Path | None = None,
     frames: int = FRAMES_PER_RECORDING,
     on_progress: OnProgress = ignore,
 ) -> Labelled:
@@ -174,7 +175,7 @@ def read_labelled(
     labels.
 
     Maps are of single frames, as in `live`, so that each has noise of its own. They are corrected
-    by `wall`, the bench's wall record; without one the rig is the sidecars', or the paper's. Frames
+    by `wall`, the bench or its wall record; without one the rig is the sidecars', or the paper's. Frames
     without any return are left out. Raises RecordingError for a recording without a label, a truth
     or a frame, and for recordings of two benches.
     """
@@ -200,7 +201,10 @@ def read_labelled(
 
 
 def _read(
-    path: Path, objects_on: Callable[[Rig], Mapping[str, Float32]], wall: Path | None, frames: int
+    path: Path,
+    objects_on: Callable[[Rig], Mapping[str, Float32]],
+    wall: Bench | Path | None,
+    frames: int,
 ) -> Labelled:
     sidecar = load_sidecar(sidecar_path(path))
     if not sidecar.label:
@@ -237,13 +241,17 @@ def spread(count: int, wanted: int) -> frozenset[int]:
     return frozenset(((np.arange(wanted) + 0.5) * count / wanted).astype(int).tolist())
 
 
-def _bench(path: Path, sidecar: Sidecar, wall: Path | None, camera: ReplayCamera) -> CalibratedRig:
+def _bench(
+    path: Path, sidecar: Sidecar, wall: Bench | Path | None, camera: ReplayCamera
+) -> CalibratedRig:
+    if isinstance(wall, Bench):
+        return wall.for_camera(camera)
     if wall is not None:
         return open_bench(wall, camera)
     if sidecar.wall is not None:
         raise RecordingError(
             f"{path} was captured with --wall {sidecar.wall.path}, which corrects its maps: give"
-            " --wall here too"
+            " --wall here too, or --bench"
         )
     return CalibratedRig(
         sidecar.rig if sidecar.rig and sidecar.rig.object_box else load_rig("paper-rig")
@@ -264,7 +272,7 @@ def label_recordings(
     recordings: Path,
     out: Path,
     *,
-    wall: Path | None = None,
+    wall: Bench | Path | None = None,
     frames: int = FRAMES_PER_RECORDING,
     command: str = "",
     on_progress: OnProgress = ignore,

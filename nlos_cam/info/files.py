@@ -246,7 +246,7 @@ def describe_toml(path: Path, _verify: bool) -> Description | None:
         return Description(
             "training recipe", facts, checked=checked, next=[f"nlos-cam train {recipe.task} --help"]
         )
-    if {"pinhole", "lidar"} & set(keys):
+    if {"pinhole", "lidar", "base"} & set(keys):
         rig = load_rig(str(path))
         facts = {"name": rig.name, "checksum": rig.checksum, **_pose(rig)}
         return Description(

@@ -21,6 +21,7 @@ __all__ = [
     "VerdictFilter",
     "WarningLog",
     "WarningSpan",
+    "WeightsVerdict",
     "align_all",
     "align_samples",
     "alignment",
@@ -44,6 +45,7 @@ __all__ = [
     "rig_to_align_with",
     "verdict_limits",
     "warm_up",
+    "weights_serve",
 ]
 
 from .alignment import MapAlignment, align_all, align_samples, alignment, rig_to_align_with
@@ -69,6 +71,7 @@ from .pipeline import (
     load_uncertainty,
     verdict_limits,
 )
+from .serving import WeightsVerdict, weights_serve
 from .streaming import iterate_batched, iterate_results, warm_up
 from .summaries import (
     OnWarning,

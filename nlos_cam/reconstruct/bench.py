@@ -43,13 +43,23 @@ class CalibratedRig:
         self.rig = rig
         self.measured = measured
         self.notes = notes
-        """Warnings that hold for every frame."""
+        """Warnings about how the bench was set up."""
         self.reference: walls.BareWall | None = measured.reference if measured else None
         self._drift: walls.DriftCheck | None = None
         if measured and measured.reference:
             self._drift = walls.DriftCheck(
                 measured.reference, walls.wall_from_zero(measured.record)
             )
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """Warnings that hold for every frame: the notes, and a record that calls itself
+        doubtful.
+        """
+        if self.measured is None or self.measured.record.verdict != "doubtful":
+            return self.notes
+        advice = self.measured.record.advice
+        return (*self.notes, f"the wall's record calls itself doubtful: {advice}")
 
     def update_temperatures(self, celsius: Mapping[str, float]) -> None:
         """Pass one reading of the device's temperatures to the drift check."""
@@ -61,10 +71,10 @@ class CalibratedRig:
         this frame.
         """
         if self.reference is None or self._drift is None:
-            return BenchObservation(None, self.notes)
+            return BenchObservation(None, self.warnings)
         self._drift.observe(frame.depth_m, frame.settings)
         difference = self._subtract_drift(subtract_reference(maps, self.reference))
-        return BenchObservation(difference, self.notes + self._drift.warnings, self._drift.moved)
+        return BenchObservation(difference, self.warnings + self._drift.warnings, self._drift.moved)
 
     def _subtract_drift(self, difference: LidarMaps) -> LidarMaps:
         """Return the difference less the range drift of the last second, if all depths have drifted

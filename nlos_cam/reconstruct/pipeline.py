@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from nlos_calibration import Rig, rig_difference
 from nlos_calibration.arrays import Float32
 from nlos_calibration.errors import CalibrationError
 from nlos_models import (
@@ -23,7 +22,7 @@ from nlos_models import (
 from nlos_cam.files import cache_folder
 from nlos_cam.frames import Frame, LidarMaps, MapMean, maps_from_frame
 from nlos_cam.objects import SurfaceMesh
-from nlos_cam.reconstruct.alignment import MapAlignment, alignment, rig_to_align_with, training_rig
+from nlos_cam.reconstruct.alignment import MapAlignment, alignment
 from nlos_cam.reconstruct.bench import BenchObservation, CalibratedRig
 from nlos_cam.reconstruct.consistency import COMPLETE, MapConsistency, MapFindings
 from nlos_cam.reconstruct.frame_reader import Arrival
@@ -41,6 +40,7 @@ from nlos_cam.reconstruct.physics_check import (
     PhysicsCheck,
     PhysicsCheckResult,
 )
+from nlos_cam.reconstruct.serving import weights_serve
 from nlos_cam.reconstruct.verdict import (
     FrameConditions,
     FrozenFrames,
@@ -418,9 +418,8 @@ def compatibility_warnings(
     bench: CalibratedRig, trained: CheckpointRecord, uncertainty_model: UncertaintyModel | None
 ) -> list[str]:
     """Return the mismatches between networks and bench, one sentence each; empty if all fits."""
-    warnings = _rig_warnings(bench.rig, trained)
-    if bench.measured and bench.measured.record.verdict == "doubtful":
-        warnings.append(f"the wall's record calls itself doubtful: {bench.measured.record.advice}")
+    served = weights_serve(bench.rig, trained)
+    warnings = [] if served.service == "trained for it" else [served.sentence]
     if bench.measured and not bench.reference:
         warnings.append(
             "this wall record has no reference: no difference maps, and a moved lidar goes"
@@ -431,19 +430,3 @@ def compatibility_warnings(
             "these weights have no uncertainty model (`train doubt`): no uncertainty and no verdict"
         )
     return warnings
-
-
-def _rig_warnings(rig: Rig, trained: CheckpointRecord) -> list[str]:
-    wanted = training_rig(trained)
-    if wanted is None:
-        if trained.rig_checksum == rig.checksum:
-            return []
-        return [f"the networks were trained for another rig than {rig.name}: expect larger errors"]
-
-    difference = rig_difference(rig, wanted)
-    if not difference:
-        return []
-    outcome = "cannot be aligned with that rig's, expect wrong shapes"
-    if rig_to_align_with(rig, trained):
-        outcome = "are aligned with that rig's, expect larger errors"
-    return [f"this rig differs from the training rig ({'; '.join(difference)}): its maps {outcome}"]

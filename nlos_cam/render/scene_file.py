@@ -7,10 +7,18 @@ import tomllib
 from dataclasses import replace
 from math import pi, radians, sin
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, Literal, Self, cast
 
 import numpy as np
-from nlos_calibration import Record, Rig, first_problem, load_rig, record_kind, rig_named
+from nlos_calibration import (
+    Record,
+    Rig,
+    first_problem,
+    load_rig,
+    record_kind,
+    rig_named,
+    with_base,
+)
 from nlos_calibration.arrays import Float64
 from nlos_calibration.errors import RecordFileError
 from pydantic import (
@@ -365,6 +373,9 @@ def _from_folder(content: dict[str, Any], folder: Path) -> dict[str, Any]:
     if isinstance(rig := content.get("rig"), str):
         beside = folder / rig
         content["rig"] = rig_named(str(beside if beside.is_file() else rig)).model_dump()
+    elif isinstance(rig, dict):
+        fields = cast("dict[str, Any]", rig)
+        content["rig"] = with_base(fields, folder, str(content.get("name", "scene")))
     hidden = content.get("object", content.get("hidden"))
     if isinstance(hidden, dict) and isinstance(file := hidden.get("file"), str):
         hidden["file"] = str((folder / file).resolve())

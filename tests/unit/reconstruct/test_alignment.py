@@ -25,7 +25,8 @@ THINGS = benchmark_objects(object_box(RIG))[1::9]
 
 def trained(rig: Rig = RIG, **changes: Any) -> Any:
     return SimpleNamespace(
-        **{"rig_name": rig.name, "rig_checksum": rig.checksum, "input": "raw maps"} | changes
+        **{"rig_name": rig.name, "rig_checksum": rig.checksum, "rig": None, "input": "raw maps"}
+        | changes
     )
 
 

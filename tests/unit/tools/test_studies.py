@@ -123,7 +123,9 @@ def test_rig_map_has_a_cell_for_every_place(
     tool: Tool, run: Read, weights: list[Path], monkeypatch: Patch
 ) -> None:
     module = tool("weights")
-    record = SimpleNamespace(input="raw maps", rig_name=RIG.name, rig_checksum=RIG.checksum)
+    record = SimpleNamespace(
+        rig=None, input="raw maps", rig_name=RIG.name, rig_checksum=RIG.checksum
+    )
     network = type("Plate", (), {"record": record, "__call__": sheet_network})()
     monkeypatch.setattr(module, "load_reconstructor", lambda *_: network)
     monkeypatch.setattr(module, "load_uncertainty_model", lambda *_, **__: None)

@@ -1,0 +1,83 @@
+"""Verdict on weights for a bench: whether networks that were trained for one rig serve another."""
+
+from dataclasses import dataclass
+from typing import Literal
+
+from nlos_calibration import Rig, rig_difference
+from nlos_models import CheckpointRecord
+
+from nlos_cam.reconstruct.alignment import rig_to_align_with, training_rig
+
+NEAR_M = 0.010
+NEAR_DEG = 2.0
+NEAR_OCCLUDER_M = 0.005
+"""Differences of rigs that cost at most 0.07 of silhouette IoU, once maps are aligned
+(docs/where-it-works.md)."""
+
+Service = Literal["trained for it", "near", "far", "not"]
+
+
+@dataclass(frozen=True)
+class WeightsVerdict:
+    """How well weights serve a bench."""
+
+    service: Service
+    """"near" and "far" are benches whose maps are aligned with the rig of the weights."""
+    sentence: str
+    """Verdict with its reason, for the user."""
+    expected_iou: float | None = None
+    """Silhouette IoU that weights trained for this bench can be expected to reach; None where it
+    was not forecast."""
+
+    @property
+    def serve(self) -> bool:
+        """True if pictures are about as right as on the rig of the weights."""
+        return self.service in {"trained for it", "near"}
+
+
+def weights_serve(
+    rig: Rig, trained: CheckpointRecord, *, expected_iou: float | None = None, bench: str = "bench/"
+) -> WeightsVerdict:
+    """Return whether weights serve the rig of a bench, by its distance from their own rig.
+
+    `expected_iou` is a forecast for weights trained for this rig, and `bench` the folder to train
+    them in.
+    """
+    wanted = training_rig(trained)
+    if trained.rig_checksum == rig.checksum or (wanted and not rig_difference(rig, wanted)):
+        sentence = "the weights serve this bench: they were trained for its rig"
+        return WeightsVerdict("trained for it", sentence, expected_iou)
+
+    forecast = "" if expected_iou is None else f" (expected silhouette IoU {expected_iou:.2f})"
+    advice = f"`nlos-cam adapt {bench}` trains weights for it{forecast}"
+    if wanted is None:
+        sentence = (
+            f"the networks were trained for another rig than {rig.name}: expect larger errors;"
+            f" {advice}"
+        )
+        return WeightsVerdict("not", sentence, expected_iou)
+
+    service: Service = "not"
+    outcome = "do not serve this bench: its maps cannot be aligned with their rig's"
+    if rig_to_align_with(rig, trained):
+        service = "near" if _is_near(rig, wanted) else "far"
+        outcome = "may not serve this bench: its maps are aligned with their rig's, from far"
+        if service == "near":
+            outcome = "serve this bench, aligned with their rig, with larger errors"
+    difference = "; ".join(rig_difference(rig, wanted))
+    return WeightsVerdict(service, f"the weights {outcome} ({difference}); {advice}", expected_iou)
+
+
+def _is_near(rig: Rig, wanted: Rig) -> bool:
+    here = rig.lidar
+    there = wanted.lidar
+    turned_deg = max(abs(here.yaw_deg - there.yaw_deg), abs(here.pitch_deg - there.pitch_deg))
+    moved_m = 0.0
+    if rig.occluder and wanted.occluder:
+        along_m = abs(rig.occluder.x_m - wanted.occluder.x_m)
+        moved_m = max(along_m, abs(rig.occluder.z_min_m - wanted.occluder.z_min_m))
+    return (
+        abs(here.distance_m - there.distance_m) <= NEAR_M
+        and turned_deg <= NEAR_DEG
+        and moved_m <= NEAR_OCCLUDER_M
+    )

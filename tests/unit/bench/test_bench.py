@@ -1,0 +1,158 @@
+"""Bench folder: it gives back what was written, and nothing that does not fit."""
+
+import shutil
+from pathlib import Path
+
+import pytest
+from made_benches import SERIAL, make_bench, wall_of, write_wall
+from nlos_calibration import load_measured
+from nlos_calibration.errors import CalibrationError, RecordFileError
+from nlos_models import load_record, shipped_folder
+from small_frames import FrameCamera
+
+from nlos_cam.bench import (
+    MANIFEST,
+    check_new,
+    edit_bench,
+    is_bench,
+    load_bench,
+    write_file,
+    write_weights,
+)
+from nlos_cam.errors import OutputExistsError
+from nlos_cam.files import read_toml
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    return make_bench(tmp_path / "bench")
+
+
+def set_line(folder: Path, start: str, line: str) -> None:
+    """Replace the first line of bench.toml that starts so."""
+    lines = (folder / MANIFEST).read_text(encoding="utf-8").splitlines()
+    number = next(n for n, text in enumerate(lines) if text.startswith(start))
+    lines[number] = line
+    (folder / MANIFEST).write_text("\n".join(lines), encoding="utf-8")
+
+
+def camera_of(folder: Path, serial: str = SERIAL) -> FrameCamera:
+    camera = FrameCamera(1)
+    camera.intrinsics = load_bench(folder).rig.pinhole
+    camera.identity = {"serial": serial}
+    return camera
+
+
+def test_bench_gives_back_the_wall_that_was_measured(folder: Path) -> None:
+    bench = load_bench(folder)
+    record = load_measured(folder / "stations/main/occluder.toml").record
+
+    assert bench.measured.record == record
+    assert bench.rig == bench.calibrated.rig == record.rig
+    assert bench.calibrated.reference is not None
+    assert set(bench.stations) == {"main"}
+    assert bench.record.camera.serial == SERIAL
+    assert bench.weights is None
+    assert bench.calibrated.notes == ()
+
+
+def test_bench_of_a_bare_wall_says_what_is_not_measured(tmp_path: Path) -> None:
+    write_wall(tmp_path / "bench", wall_of())
+
+    (note,) = load_bench(tmp_path / "bench").calibrated.notes
+
+    assert "calibrate --occluder" in note
+
+
+def test_object_box_of_the_bench_is_that_of_its_rig(folder: Path) -> None:
+    set_line(folder, "x_max_m", "x_max_m = 0.6")
+
+    assert load_bench(folder).rig.object_box.x_max_m == 0.6
+    assert load_bench(folder).bare.record.rig.object_box.x_max_m == 0.6
+
+
+def test_wall_measured_again_drops_the_occluder_and_keeps_the_box(folder: Path) -> None:
+    set_line(folder, "x_max_m", "x_max_m = 0.6")
+    write_wall(folder, wall_of(), overwrite=True)
+    bench = load_bench(folder)
+
+    assert bench.measured.record.occluder is None
+    assert bench.rig.object_box.x_max_m == 0.6
+    assert not (folder / "stations/main/occluder.toml").exists()
+
+
+def test_existing_measurement_stays_unless_overwritten(folder: Path) -> None:
+    with pytest.raises(OutputExistsError, match="--overwrite"):
+        write_wall(folder, wall_of())
+
+
+def test_camera_of_the_bench_opens_it_and_no_other(folder: Path) -> None:
+    bench = load_bench(folder)
+
+    assert bench.for_camera(camera_of(folder)).rig == bench.rig
+
+    with pytest.raises(CalibrationError, match="other-one"):
+        bench.for_camera(camera_of(folder, "other-one"))
+    smaller = camera_of(folder)
+    smaller.intrinsics = smaller.intrinsics.scaled(48, 36)
+    with pytest.raises(CalibrationError, match="48x36"):
+        bench.for_camera(smaller)
+
+
+def test_weights_come_back_with_the_rig_of_their_bench(folder: Path, tmp_path: Path) -> None:
+    source = tmp_path / "own"
+    shutil.copytree(shipped_folder(), source)
+    write_weights(folder, source)
+    bench = load_bench(folder)
+
+    assert bench.weights == folder / "weights"
+    assert load_record(bench.weights).rig is None  # of the packaged rig
+
+    record = load_record(source).model_copy(update={"rig_checksum": bench.rig.checksum})
+    (source / "SHA256SUMS").unlink()
+    (source / "doubt.json").unlink()
+    (source / "checkpoint.json").write_text(record.model_dump_json(), encoding="utf-8")
+    write_weights(folder, source)
+
+    assert load_record(folder / "weights").rig == bench.rig.model_dump(mode="json")
+    assert not (folder / "weights/doubt.json").exists()
+
+
+def test_added_file_is_checked(folder: Path) -> None:
+    path = write_file(folder, "report.html", b"<html>")
+
+    assert path.read_bytes() == b"<html>"
+    assert "report.html" in load_bench(folder).record.files
+
+    path.write_bytes(b"other")
+    with pytest.raises(RecordFileError, match=r"report\.html has changed"):
+        load_bench(folder)
+
+
+def test_interrupted_edit_leaves_the_bench_as_it_was(folder: Path) -> None:
+    before = read_toml(folder / MANIFEST)
+
+    def interrupt() -> None:
+        with edit_bench(folder) as edit:
+            edit.add(folder / "stations/main/wall.html")
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        interrupt()
+
+    assert read_toml(folder / MANIFEST) == before
+    assert load_bench(folder).rig
+
+
+def test_folder_with_other_files_does_not_become_a_bench(folder: Path, tmp_path: Path) -> None:
+    check_new(folder)
+    check_new(tmp_path / "new")
+    (tmp_path / "photos").mkdir()
+    (tmp_path / "photos/one.png").touch()
+    (tmp_path / "file").touch()
+
+    assert is_bench(folder)
+    for taken in ("photos", "file", "none/bench"):
+        assert not is_bench(tmp_path / taken)
+        with pytest.raises(OutputExistsError):
+            check_new(tmp_path / taken)

@@ -1,0 +1,198 @@
+"""The option --bench: a bench folder in place of --wall, --weights and --rig."""
+
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from made_benches import make_bench, wall_of, write_wall
+from nlos_calibration import dump_toml, load_rig
+
+from nlos_cam.bench import MANIFEST, load_bench
+
+Run = Callable[..., Any]
+FAR = """name = "far"
+[rig]
+base = "paper-rig"
+[rig.lidar]
+distance_m = 0.22
+yaw_deg = 40.0
+"""
+HIDDEN = """[motion]
+poses = 1
+[object]
+category = "cup"
+"""
+
+
+@pytest.fixture
+def bench() -> Path:
+    return make_bench(Path("bench"))
+
+
+def change(folder: Path, name: str, before: str, after: str) -> None:
+    """Replace the first occurrence of a text in a file of a bench."""
+    path = folder / name
+    text = path.read_text(encoding="utf-8")
+    assert before in text
+    path.write_text(text.replace(before, after, 1), encoding="utf-8")
+
+
+def missing(folder: Path) -> None:
+    shutil.rmtree(folder)
+
+
+def a_file(folder: Path) -> None:
+    shutil.rmtree(folder)
+    folder.write_text("wall", encoding="utf-8")
+
+
+def without_record(folder: Path) -> None:
+    (folder / MANIFEST).unlink()
+
+
+def a_wall_record(folder: Path) -> None:
+    shutil.copy(folder / "stations/main/wall.toml", folder / MANIFEST)
+
+
+def a_scene(folder: Path) -> None:
+    (folder / MANIFEST).write_text(FAR, encoding="utf-8")
+
+
+def noise(folder: Path) -> None:
+    (folder / MANIFEST).write_bytes(bytes(range(256)))
+
+
+def a_later_version(folder: Path) -> None:
+    change(folder, MANIFEST, "bench_version = 1", "bench_version = 2")
+
+
+def outside(folder: Path) -> None:
+    change(folder, MANIFEST, '"stations/main/occluder.toml"', '"../occluder.toml"')
+
+
+def changed_wall(folder: Path) -> None:
+    change(folder, "stations/main/occluder.toml", "frames = 30", "frames = 31")
+
+
+def lost_reference(folder: Path) -> None:
+    (folder / "stations/main/occluder.npz").unlink()
+
+
+def other_serial(folder: Path) -> None:
+    change(folder, MANIFEST, 'serial = "f0123456"', 'serial = "f9999999"')
+
+
+def other_intrinsics(folder: Path) -> None:
+    change(folder, MANIFEST, "fx = ", "fx = 1")
+
+
+def other_size(folder: Path) -> None:
+    """Of a camera with the sample recording's serial, at another resolution."""
+    shutil.rmtree(folder)
+    make_bench(folder, serial="")
+
+
+def other_camera(folder: Path) -> None:
+    shutil.rmtree(folder)
+    make_bench(folder, serial="f9999999")
+
+
+@pytest.mark.parametrize(
+    ("spoil", "word", "code"),
+    [
+        (missing, "no bench folder", 4),
+        (a_file, "not a bench folder", 4),
+        (without_record, "no bench.toml", 4),
+        (a_wall_record, "wall record", 4),
+        (a_scene, "scene", 4),
+        (noise, "binary", 4),
+        (a_later_version, "version 1 only", 4),
+        (outside, "inside the bench folder", 4),
+        (changed_wall, "has changed", 4),
+        (lost_reference, "cannot be read", 4),
+        (other_serial, "f9999999", 4),
+        (other_intrinsics, "other intrinsics", 4),
+        (other_size, "the wall was measured at 96x72", 1),
+        (other_camera, "the wall was measured at 96x72", 1),
+    ],
+)
+def test_no_bench_and_benches_of_others_give_one_line(
+    shown: Run, bench: Path, spoil: Callable[[Path], None], word: str, code: int
+) -> None:
+    spoil(bench)
+
+    out, err = shown("replay", "sample", "--bench", bench, "--out", "out", code=code)
+
+    (line,) = err.splitlines()
+    assert line.startswith("error: ")
+    assert word in line
+    assert out == ""
+    assert not Path("out").exists()
+
+
+@pytest.mark.parametrize(
+    ("words", "word"),
+    [
+        (["replay", "sample", "--bench", "bench", "--wall", "wall.toml"], "--bench and --wall"),
+        (["render", "cup", "--bench", "bench", "--rig", "paper-rig"], "--bench and --rig"),
+        (["calibrate", "--wall", "--bench", "bench", "--out", "w.toml"], "--bench and --out"),
+        (["calibrate", "--occluder", "w.toml", "--bench", "bench"], "--occluder bench"),
+    ],
+)
+def test_bench_contradicts_a_record_or_rig(
+    run: Run, bench: Path, words: list[str], word: str
+) -> None:
+    answer = run(*words, code=2)
+
+    assert bench.exists()
+    assert word in answer.err
+
+
+def test_render_takes_the_rig_of_the_bench(run: Run, bench: Path) -> None:
+    pytest.importorskip("matplotlib")
+    import numpy as np
+
+    run("render", "cup", "--accuracy", "draft", "--bench", bench, "--out", "cup.npz")
+
+    assert str(np.load("cup.npz")["rig_checksum"]) == load_bench(bench).rig.checksum
+
+
+def test_doubtful_record_is_named_where_its_rig_is_used(run: Run) -> None:
+    doubtful = wall_of(verdict="doubtful", advice="measure again")
+    write_wall(Path("bench"), doubtful)
+    words = "render", "cup", "--accuracy", "draft", "--overwrite", "--out", "cup.npz"
+
+    assert "measure again" in run(*words, "--bench", "bench").err
+    assert "measure again" in run(*words, "--rig", "bench/stations/main/wall.toml").err
+
+
+def test_rigs_prints_a_whole_rig_that_can_be_used(shown: Run) -> None:
+    text = shown("rigs", "paper-rig").out
+    Path("mine.toml").write_text(text, encoding="utf-8")
+
+    assert load_rig("mine.toml") == load_rig("paper-rig")
+    assert dump_toml(load_rig("paper-rig")) in text
+
+
+@pytest.mark.slow
+def test_three_commands_lead_from_recordings_to_pictures(run: Run) -> None:
+    """A bench that is not the home rig; no number is copied from one command to the next."""
+    bare = '[rig]\nbase = "bare-wall"\n[rig.lidar]\ndistance_m = 0.22\nyaw_deg = 40.0\n'
+    scenes = {
+        "bare": f'name = "far"\n{bare}',
+        "empty": FAR,
+        "cup": FAR.replace("[rig]", HIDDEN + "[rig]", 1),
+    }
+    for name, text in scenes.items():
+        Path(f"{name}.toml").write_text(text, encoding="utf-8")
+        run("capture", f"sim:{name}.toml", "--frames", "20", "--out", f"{name}.bag")
+
+    run("calibrate", "--wall", "--bag", "bare.bag", "--bench", "bench")
+    run("calibrate", "--occluder", "bench", "--bag", "empty.bag")
+    report = run("replay", "cup.bag", "--bench", "bench", "--stills", "1", "--out", "pictures")
+
+    assert report["frames"] == 20
+    assert list(Path("pictures").glob("*.png"))
+    assert load_bench(Path("bench")).rig.lidar.distance_m == pytest.approx(0.22, abs=1e-3)

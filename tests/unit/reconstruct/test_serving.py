@@ -1,0 +1,50 @@
+"""Verdict on weights for a bench, by the distance of its rig from theirs."""
+
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+from nlos_calibration import Rig, load_rig
+
+from nlos_cam.reconstruct import weights_serve
+
+RIG = load_rig("paper-rig")
+
+
+def trained(rig: Rig = RIG, *, known: bool = False) -> Any:
+    record = rig.model_dump(mode="json") if known else None
+    return SimpleNamespace(
+        rig_name=rig.name, rig_checksum=rig.checksum, rig=record, input="raw maps"
+    )
+
+
+def posed(**changes: float) -> Rig:
+    lidar = RIG.lidar.model_copy(update=changes)
+    return RIG.model_copy(update={"name": "measured", "lidar": lidar})
+
+
+@pytest.mark.parametrize(
+    ("rig", "service"),
+    [
+        (RIG, "trained for it"),
+        (posed(distance_m=0.2001), "trained for it"),
+        (posed(distance_m=0.206, yaw_deg=46.0), "near"),
+        (posed(yaw_deg=60.0), "far"),
+        (posed(distance_m=0.30, yaw_deg=15.0), "not"),
+    ],
+)
+def test_service_falls_with_the_distance_of_the_rigs(rig: Rig, service: str) -> None:
+    verdict = weights_serve(rig, trained(), expected_iou=0.61, bench="mine")
+
+    assert verdict.service == service
+    assert verdict.serve == (service in {"trained for it", "near"})
+    assert ("adapt mine" in verdict.sentence) == (service != "trained for it")
+    assert ("0.61" in verdict.sentence) == (service != "trained for it")
+
+
+def test_weights_that_hold_their_rig_are_known_after_a_new_measurement() -> None:
+    bench = posed(distance_m=0.25, yaw_deg=30.0)
+    again = posed(distance_m=0.2502, yaw_deg=30.02)
+
+    assert weights_serve(again, trained(bench, known=True)).service == "trained for it"
+    assert weights_serve(again, trained(bench)).service == "not"
