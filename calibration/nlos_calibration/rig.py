@@ -10,7 +10,7 @@ from difflib import get_close_matches
 from importlib.resources.abc import Traversable
 from math import degrees, radians
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self, TypeVar
+from typing import Annotated, Any, Literal, Self, TypeVar, cast
 
 import numpy as np
 import tomli_w
@@ -299,9 +299,9 @@ def _merged(whole: dict[str, Any], changes: dict[str, Any]) -> dict[str, Any]:
     """Return nested tables with the values that `changes` has; others stay."""
     merged = dict(whole)
     for key, value in changes.items():
-        before = merged.get(key)
+        before: Any = merged.get(key)
         both = isinstance(before, dict) and isinstance(value, dict)
-        merged[key] = _merged(before, value) if both else value
+        merged[key] = _merged(cast("dict[str, Any]", before), value) if both else value
     return merged
 
 

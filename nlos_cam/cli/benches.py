@@ -60,7 +60,14 @@ def choose(bench: Path | None, wall: Path | None = None, weights: Path | None = 
     return Choice(loaded, loaded.wall, weights or loaded.weights)
 
 
-def rig_of(bench: Path | None, rig: str | None, default: str | None = None) -> walls.Rig | None:
+def rig_of(bench: Path | None, rig: str | None) -> walls.Rig | None:
+    """Return the rig of a bench folder, or of a name or file; None without either. Raises
+    typer.BadParameter for both.
+    """
+    return rig_or_default(bench, rig, common.PAPER_RIG) if bench or rig else None
+
+
+def rig_or_default(bench: Path | None, rig: str | None, default: str) -> walls.Rig:
     """Return the rig of a bench folder, of a name or file, or the default's. Raises
     typer.BadParameter for both.
     """
@@ -72,8 +79,6 @@ def rig_of(bench: Path | None, rig: str | None, default: str | None = None) -> w
             common.say(f"note: {warning}")
         return loaded.rig
     name = rig or default
-    if name is None:
-        return None
     found = walls.rig_named(name)
     if walls.is_wall_record(name) and (record := walls.load_wall(Path(name))).verdict == "doubtful":
         common.say(f"note: {name} calls itself doubtful: {record.advice}")

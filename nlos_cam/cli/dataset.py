@@ -181,7 +181,7 @@ def build(
     """
     if scene and (rig or bench_folder):
         raise typer.BadParameter(f"{scene} has its own rig: drop --rig and --bench")
-    its_rig = benches.rig_of(bench_folder, rig, common.PAPER_RIG)
+    its_rig = benches.rig_or_default(bench_folder, rig, common.PAPER_RIG)
     spread = data.RigSpread(
         place_m=rig_spread_mm / 1e3, angle_deg=rig_spread_deg, gain_share=gain_spread_percent / 100
     )
@@ -259,7 +259,7 @@ def label(
         labelled = data.label_recordings(
             recordings,
             folder,
-            wall=chosen.bench or wall,
+            wall=chosen.open if chosen.bench else wall,
             frames=frames,
             command=command,
             on_progress=on_progress,

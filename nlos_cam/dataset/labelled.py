@@ -16,7 +16,6 @@ from nlos_models.training import MapSet
 from pydantic import ValidationError
 
 from nlos_cam import objects as shapes
-from nlos_cam.bench import Bench
 from nlos_cam.dataset.build import SHARD
 from nlos_cam.dataset.plan import DatasetPlan, scene_row
 from nlos_cam.dataset.reader import MAP_CHANNELS
@@ -42,6 +41,9 @@ KnownObjects = Callable[[ObjectBox], Mapping[str, Float32]]
 """Returns the depths (64, 64) over a box of the objects that need no file of their own, by
 label.
 """
+
+OpenBench = Callable[[ReplayCamera], CalibratedRig]
+"""Opens a bench for a recording's camera, or raises where they do not fit."""
 
 
 def benchmark_depths(box: ObjectBox) -> Mapping[str, Float32]:
@@ -167,7 +169,7 @@ def read_labelled(
     recordings: Sequence[Path],
     *,
     known: KnownObjects = benchmark_depths,
-    wall: Bench | Path | None = None,
+    wall: OpenBench | Path | None = None,
     frames: int = FRAMES_PER_RECORDING,
     on_progress: OnProgress = ignore,
 ) -> Labelled:
@@ -175,7 +177,7 @@ def read_labelled(
     labels.
 
     Maps are of single frames, as in `live`, so that each has noise of its own. They are corrected
-    by `wall`, the bench or its wall record; without one the rig is the sidecars', or the paper's. Frames
+    by `wall`, a wall record or what opens the bench for a camera; without one the rig is the sidecars', or the paper's. Frames
     without any return are left out. Raises RecordingError for a recording without a label, a truth
     or a frame, and for recordings of two benches.
     """
@@ -203,7 +205,7 @@ def read_labelled(
 def _read(
     path: Path,
     objects_on: Callable[[Rig], Mapping[str, Float32]],
-    wall: Bench | Path | None,
+    wall: OpenBench | Path | None,
     frames: int,
 ) -> Labelled:
     sidecar = load_sidecar(sidecar_path(path))
@@ -242,12 +244,12 @@ def spread(count: int, wanted: int) -> frozenset[int]:
 
 
 def _bench(
-    path: Path, sidecar: Sidecar, wall: Bench | Path | None, camera: ReplayCamera
+    path: Path, sidecar: Sidecar, wall: OpenBench | Path | None, camera: ReplayCamera
 ) -> CalibratedRig:
-    if isinstance(wall, Bench):
-        return wall.for_camera(camera)
-    if wall is not None:
+    if isinstance(wall, Path):
         return open_bench(wall, camera)
+    if wall is not None:
+        return wall(camera)
     if sidecar.wall is not None:
         raise RecordingError(
             f"{path} was captured with --wall {sidecar.wall.path}, which corrects its maps: give"
@@ -272,7 +274,7 @@ def label_recordings(
     recordings: Path,
     out: Path,
     *,
-    wall: Bench | Path | None = None,
+    wall: OpenBench | Path | None = None,
     frames: int = FRAMES_PER_RECORDING,
     command: str = "",
     on_progress: OnProgress = ignore,

@@ -50,6 +50,10 @@ LASER = "ldd_temperature"
 Mask = NDArray[np.bool_]
 
 
+def _no_progress(_done: int, _total: int) -> None:
+    """Show nothing."""
+
+
 @dataclass(frozen=True)
 class Finding:
     """Result for one setting, channel and size of patches."""
@@ -157,7 +161,7 @@ def moderate(values: Float64, noise: Float64) -> Float64:
 def analyze(
     plan: Plan,
     turns: list[Turn],
-    on_step: Callable[[int, int], None] = lambda *_: None,
+    on_step: Callable[[int, int], None] = _no_progress,
     *,
     with_power: bool = True,
 ) -> Analysis:
@@ -304,7 +308,7 @@ class Scale:
         groups: list[Group],
         signs: Float64,
         alpha: float,
-        on_step: Callable[[int, int], None] = lambda *_: None,
+        on_step: Callable[[int, int], None] = _no_progress,
     ) -> "Scale":
         """Return the scale of groups under patterns of signs (patterns, blocks)."""
         highest = np.empty((len(groups), len(signs)))

@@ -126,7 +126,9 @@ def echoes_of(
     chosen = ChosenBeams(every, np.any(list(wins.values()), axis=0))
     span_m = box.z_far_m - box.z_near_m
     by_outline = chosen.jacobian("albedo")[0]
-    by_depth, path_by_depth = (part * np.float32(span_m) for part in chosen.jacobian("depth"))
+    by_depth, path_by_depth = (
+        (part * span_m).astype(np.float32) for part in chosen.jacobian("depth")
+    )
     noise_m = sensor.range_noise_m + sensor.range_noise_per_m * every.depth_m.astype(np.float64)
     pixels = rig.pinhole.width * rig.pinhole.height / every.intensity.size
     for name in materials:

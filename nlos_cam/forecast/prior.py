@@ -181,9 +181,10 @@ def _extended(values: Float32) -> Float32:
     seen = ~np.isnan(values)
     if not seen.any():
         return np.full_like(values, 0.5)
-    _, label = cv2.distanceTransformWithLabels(
+    _, labels = cv2.distanceTransformWithLabels(
         (~seen).astype(np.uint8), cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL
     )
+    label = np.asarray(labels, np.intp)
     nearest = np.zeros(label.max() + 1, np.float32)
     nearest[label[seen]] = values[seen]
     return nearest[label]

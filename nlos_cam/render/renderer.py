@@ -151,7 +151,7 @@ def transient_axes(scene: Scene, accuracy: str | Accuracy = "standard") -> Trans
     device = scene.rig.device
     bins = gate_bins(device)
     return TransientAxes(
-        (np.arange(bins) + 0.5) * device.bin_m,
+        (np.arange(bins, dtype=np.float64) + 0.5) * device.bin_m,
         device.bin_m,
         beams.lidar_m,
         beams.laser_spot_m.reshape(*beams.shape, 3),
