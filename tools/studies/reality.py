@@ -248,9 +248,16 @@ def _descend(
             / step_m
             for step in step_m * np.eye(3)
         ]
-        # Gauss-Newton, damped by half: the model is nearly linear in metres.
-        step, *_ = np.linalg.lstsq(np.stack(slope, 1), left, rcond=None)
-        offset = np.clip(offset + 0.5 * step, *bounds)
+        # Gauss-Newton, damped by half: the model is nearly linear in metres. A coordinate whose
+        # bound keeps it from going on is left out, so that the others find their own minimum.
+        jacobian = np.stack(slope, 1)
+        downhill = jacobian.T @ left
+        low, high = bounds
+        free = ~(((offset <= low) & (downhill < 0)) | ((offset >= high) & (downhill > 0)))
+        step = np.zeros(3)
+        if free.any():
+            step[free], *_ = np.linalg.lstsq(jacobian[:, free], left, rcond=None)
+        offset = np.clip(offset + 0.5 * step, low, high)
     return offset, scan.arrival_bins - model(scan.center_m + offset)
 
 
