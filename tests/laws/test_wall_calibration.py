@@ -90,6 +90,21 @@ def test_fit_moves_with_its_points(
     assert fit.distance_m == pytest.approx(0.2 - normal @ shift, abs=1e-6)
 
 
+@few
+@given(distances_m, st.floats(-60.0, 60.0), st.floats(15.0, 120.0))
+def test_two_walls_in_a_corner_are_refused(
+    distance_m: float, yaw_deg: float, bend_deg: float
+) -> None:
+    """The second wall turns from the first along an edge through the middle of the view."""
+    first_m = view(distance_m, yaw_deg, 0.0, PINHOLE).depth_m
+    column = np.arange(160) - 80
+    slope = np.tan(np.radians(bend_deg / 2.0 + 8.0)) / PINHOLE.fx
+    second_m = first_m[:, 80:81] / (1.0 + column * slope)
+    second_m = np.where(second_m > 0.0, second_m, np.nan)
+    with pytest.raises(WallRefusedError):
+        measured(np.where(column < 0, first_m, second_m))
+
+
 @dataclass(frozen=True)
 class PaperBench:
     """Depths of the paper's rig by each of its paths; NaN where a beam does not take it."""

@@ -119,7 +119,7 @@ def test_wall_faced_squarely_is_measured(frames: int) -> None:
 
 
 @pytest.mark.parametrize("share", [0.25, 0.5])
-@pytest.mark.parametrize("bend_deg", [-60.0, -20.0, -8.0, -4.0, 4.0, 8.0, 20.0, 45.0, 100.0])
+@pytest.mark.parametrize("bend_deg", [-60.0, -20.0, -8.0, -4.0, 4.0, 8.0, 20.0, 45.0])
 @pytest.mark.parametrize("direction_rad", [0.0, 0.8, 1.6])
 def test_two_walls_in_a_corner_are_refused_or_doubted(
     direction_rad: float, bend_deg: float, share: float
