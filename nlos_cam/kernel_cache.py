@@ -15,7 +15,14 @@ from typing import Any, Self
 from numba.core import caching
 
 PACKAGE = Path(__file__).parent
-SOURCES = "frames.py", "objects/*.py", "recording/*.py", "render/*.py", "render/sensor/*.py"
+SOURCES = (
+    "frames.py",
+    "objects/*.py",
+    "recording/*.py",
+    "render/*.py",
+    "render/sensor/*.py",
+    "transients/*.py",
+)
 """Files with kernels, and with the functions, constants and records that kernels use."""
 PREFIX = "kernels-"
 

@@ -98,14 +98,16 @@ def weights_verdict(
 
 
 def files_in_bench(
-    folder: Path, *, occluder: bool, overwrite: bool, station: str = benches.MAIN
+    folder: Path, *, occluder: bool, overwrite: bool, station: str | None = None
 ) -> calibrate.WallFiles:
     """Return the paths of a measurement in a bench folder: of the bare wall, or with its occluder.
 
     Raises OutputExistsError for an existing file without `overwrite`.
     """
     record = (
-        folder / benches.station_folder(station) / ("occluder.toml" if occluder else "wall.toml")
+        folder
+        / benches.station_folder(station or benches.MAIN)
+        / ("occluder.toml" if occluder else "wall.toml")
     )
     if record.exists() and not overwrite:
         raise OutputExistsError(
@@ -119,13 +121,14 @@ def write_to_bench(
     files: calibrate.WallFiles,
     record: walls.WallRecord,
     reference: walls.BareWall | None,
-    station: str = benches.MAIN,
+    station: str | None = None,
 ) -> walls.WallRecord:
     """Write a measurement to its `files_in_bench` and enter it in the bench, which is made if it is
     missing; return the record, which names its reference.
 
     A wall that is measured again drops the occluder found before; the object box stays.
     """
+    station = station or benches.MAIN
     with benches.edit_bench(folder) as edit:
         files.record.parent.mkdir(parents=True, exist_ok=True)
         record = calibrate.write_record(files, record, reference)

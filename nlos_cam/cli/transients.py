@@ -8,8 +8,8 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
+import nlos_calibration as walls
 import typer
-from nlos_calibration import Extent
 
 from nlos_cam import render as renderer
 from nlos_cam import transients
@@ -123,13 +123,13 @@ def capture_of(
     )
 
 
-def _extent(text: str | None) -> Extent | None:
+def _extent(text: str | None) -> walls.Extent | None:
     from pydantic import ValidationError
 
     if not (ends := _numbers("--wall-extent", text, 4)):
         return None
     try:
-        return Extent(x_min_m=ends[0], x_max_m=ends[1], y_min_m=ends[2], y_max_m=ends[3])
+        return walls.Extent(x_min_m=ends[0], x_max_m=ends[1], y_min_m=ends[2], y_max_m=ends[3])
     except ValidationError as error:
         raise typer.BadParameter(
             f"--wall-extent {text}: give X0,X1,Y0,Y1 in meters, X0 below X1 and Y0 below Y1, within"

@@ -17,6 +17,7 @@ import typer
 from nlos_cam import camera as cameras
 from nlos_cam import live as loop
 from nlos_cam import reconstruct
+from nlos_cam import recording as recordings
 from nlos_cam import replay as replays
 from nlos_cam import view as views
 from nlos_cam.cli import benches
@@ -28,7 +29,6 @@ from nlos_cam.cli.common import (
     say,
     stop_on_signals,
 )
-from nlos_cam.recording import is_ros2
 
 NoView = Annotated[bool, typer.Option("--no-view", help="Serve no live view.")]
 ViewPort = Annotated[
@@ -153,7 +153,7 @@ def view(
     """
     host = view_host or views.LOOPBACK
     announce = partial(announce_view, host=view_host, port=view_port, open_it=open_view)
-    is_recording = file.suffix == ".bag" or is_ros2(file)
+    is_recording = file.suffix == ".bag" or recordings.is_ros2(file)
     if not is_recording and (wall or bench_folder):
         raise typer.BadParameter(
             "--wall and --bench are for a recording (.bag): a saved session holds its pictures"

@@ -35,6 +35,7 @@ __all__ = [
     "random_pose",
     "read_depth_map",
     "read_mesh",
+    "triangulate",
     "turn_upright",
     "unseen_objects",
     "without_absent",
@@ -73,5 +74,6 @@ from .placement import (
     post,
     random_pose,
 )
+from .polygons import triangulate
 from .surface_mesh import SurfaceMesh, mesh_from_depth
 from .textures import TEXTURES, Coat, image_from_albedo, paint

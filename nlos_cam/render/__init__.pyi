@@ -9,6 +9,7 @@ __all__ = [
     "Agreement",
     "Beams",
     "EchoMaps",
+    "Effect",
     "Effects",
     "Fault",
     "FaultKind",
@@ -17,8 +18,10 @@ __all__ = [
     "Material",
     "MultiBounce",
     "Radiometry",
+    "RenderProblem",
     "Rendering",
     "Scene",
+    "SceneFacts",
     "SceneFile",
     "SceneVector",
     "SensedImages",
@@ -72,7 +75,7 @@ from .backend_cpu import histograms
 from .backend_torch import device_named, histograms_of_all
 from .echoes import MultiBounce, with_pulse
 from .effect_costs import Stopwatch, Work, costs, least_seconds
-from .effects import EFFECTS, Effects, included
+from .effects import EFFECTS, Effect, Effects, included
 from .geometry import Beams, cast
 from .gradients import (
     Gradients,
@@ -85,7 +88,7 @@ from .gradients import (
 from .job import TransportJob
 from .material import Material, Surface, phong, retroreflective
 from .patches import JUMP_M
-from .planning import prepare
+from .planning import RenderProblem, prepare
 from .renderer import (
     Rendering,
     TransientAxes,
@@ -97,6 +100,7 @@ from .renderer import (
     transient_axes,
 )
 from .scene import Radiometry, Scene
+from .scene_facts import SceneFacts
 from .scene_file import (
     RENDERING_VERSION,
     Fault,

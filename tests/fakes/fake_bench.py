@@ -285,7 +285,7 @@ class Bench:
         sdk.lidars = self.sdk_devices
         return sdk
 
-    def facts(self) -> Facts:
+    def facts(self, reported: str = "") -> Facts:
         host = read_host(self.linux.root, self.platform, self.open_node)
         packages = [
             SimpleNamespace(name=name, version=version) for name, version in self.installed.items()
@@ -294,7 +294,7 @@ class Bench:
             host,
             scan_usb(self.usb, self.linux.root),
             query_sdk(self.load_sdk, lambda: packages),
-            self.reported,
+            reported or self.reported,
         )
 
     def checks(self) -> dict[str, Check]:

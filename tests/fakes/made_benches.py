@@ -7,7 +7,7 @@ import pytest
 from measured_walls import exact_wall
 from nlos_calibration import MeasuredWall, OccluderRecord
 
-from nlos_cam.calibrate import files_in_bench, write_to_bench
+from nlos_cam.cli.benches import files_in_bench, write_to_bench
 
 SERIAL = "f0123456"
 OCCLUDER = OccluderRecord(source="detected", x_m=0.2, gap_m=0.1)

@@ -34,13 +34,18 @@ from nlos_calibration.arrays import Float64
 from numpy.typing import NDArray
 from PIL import Image
 
-from nlos_cam.objects import orthographic_depth
-from nlos_cam.objects.polygons import triangulate
-from nlos_cam.render import Accuracy, Scene, Surface, retroreflective
-from nlos_cam.render.backend_reference import histograms
-from nlos_cam.render.effects import EFFECTS, Effect
-from nlos_cam.render.planning import RenderProblem
-from nlos_cam.render.scene_facts import SceneFacts
+from nlos_cam.objects import orthographic_depth, triangulate
+from nlos_cam.render import (
+    EFFECTS,
+    Accuracy,
+    Effect,
+    RenderProblem,
+    Scene,
+    SceneFacts,
+    Surface,
+    backend_reference,
+    retroreflective,
+)
 
 LIGHT_M_PER_S = 299_792_458.0
 OBJECTS = "E", "K", "Y", "Mannequin", "Mannequin_Assymetric"
@@ -137,7 +142,7 @@ def transported(
     patches = replace(job.patches, point_m=job.patches.point_m + shift_m)
     # All beams light the wall in these rigs, so beams of the map and of the job are the same.
     some = job.select(np.asarray(beams, np.int64))
-    return histograms(replace(some, patches=patches, bins=bins))
+    return backend_reference.histograms(replace(some, patches=patches, bins=bins))
 
 
 HOME_M = np.array([0.0, -0.3, 0.8])

@@ -90,6 +90,7 @@ def guessing(monkeypatch: Patch) -> list[DatasetPlan]:
     kept.
     """
     asked: list[DatasetPlan] = []
+    Path("held-out").mkdir()
 
     def training_maps(plan: DatasetPlan, *_: object) -> Stored:
         asked.append(plan)
@@ -200,7 +201,7 @@ def test_evaluate_subtracts_bare_wall_for_the_weights_alone(
 
 def test_evaluate_refuses_wall_for_weights_of_raw_maps(run: Run) -> None:
     assert "--wall" in run(*JUDGE, *STORED, "--wall", "wall.toml", code=1)["error"]["message"]
-    assert not list(Path().iterdir())
+    assert [*Path().iterdir()] == [Path("held-out")]
 
 
 SMALL = {name: replace(stop, relay_columns=8, relay_rows=4) for name, stop in STOPS.items()}
@@ -329,7 +330,7 @@ def test_tradeoff_keeps_rows_measured_before_signal(
         )
     else:
         assert result["out"] is None
-        assert not list(Path().iterdir())
+        assert [*Path().iterdir()] == [Path("held-out")]
 
 
 def test_tradeoff_refuses_color_weights_before_rendering(run: Run) -> None:

@@ -101,7 +101,7 @@ def test_gallery_shows_the_worst_and_the_best_each_once(
     iou = np.random.default_rng(0).permutation(count) / 20
     names = [f"hat {2_000_000_000 + k}" for k in range(count)]
     draw_gallery(tmp_path / "gallery.png", _images(count), _images(count), names, iou)
-    order = [f"hat {k}: {iou[k]:.2f}" for k in np.argsort(iou)]
+    order = [f"hat {k}\nIoU {iou[k]:.2f}" for k in np.argsort(iou)]
     worst = min(6, -(-count // 2))
 
     assert _titles(figures[0]) == [*order[:worst], *order[worst:][::-1][:6]]
