@@ -196,3 +196,16 @@ def test_three_commands_lead_from_recordings_to_pictures(run: Run) -> None:
     assert report["frames"] == 20
     assert list(Path("pictures").glob("*.png"))
     assert load_bench(Path("bench")).rig.lidar.distance_m == pytest.approx(0.22, abs=1e-3)
+
+
+def test_info_describes_a_bench_and_its_damage(run: Run, bench: Path) -> None:
+    answer = run("info", bench)
+
+    assert answer["kind"] == "bench"
+    assert answer["facts"]["camera"] == "f0123456"
+    assert answer["next"] == ["nlos-cam live --bench bench"]
+    assert run("info", bench / MANIFEST)["kind"] == "record of a bench"
+
+    changed_wall(bench)
+
+    assert "has changed" in run("info", bench, code=4)["problem"]
