@@ -59,9 +59,9 @@ def choose(bench: Path | None, wall: Path | None = None, weights: Path | None = 
     return Choice(loaded, loaded.wall, weights or loaded.weights)
 
 
-def rig_of(bench: Path | None, rig: str | None, default: str | None = None) -> walls.Rig | None:
-    """Return the rig of a bench folder, of a name or file, or the default's. Raises
-    typer.BadParameter for both.
+def rig_of(bench: Path | None, rig: str | None) -> walls.Rig:
+    """Return the rig of a bench folder, or of a name or file (default: the paper's), and print what
+    a user of it has to know. Raises typer.BadParameter for both.
     """
     if bench is not None and rig is not None:
         raise typer.BadParameter("--bench and --rig each name a rig: give one")
@@ -70,9 +70,7 @@ def rig_of(bench: Path | None, rig: str | None, default: str | None = None) -> w
         for warning in loaded.calibrated.warnings:
             common.say(f"note: {warning}")
         return loaded.rig
-    name = rig or default
-    if name is None:
-        return None
+    name = rig or common.PAPER_RIG
     found = walls.rig_named(name)
     if walls.is_wall_record(name) and (record := walls.load_wall(Path(name))).verdict == "doubtful":
         common.say(f"note: {name} calls itself doubtful: {record.advice}")
@@ -80,12 +78,11 @@ def rig_of(bench: Path | None, rig: str | None, default: str | None = None) -> w
 
 
 def weights_verdict(
-    rig: walls.Rig, weights: Path | None, bench: Path | None
+    rig: walls.Rig, trained: models.CheckpointRecord, bench: Path | None
 ) -> reconstruct.WeightsVerdict:
-    """Return whether weights (None: the shipped ones) serve a rig, for the user.
+    """Return whether weights serve a rig, for the user, with the bench folder to train others in.
 
-    The forecast of the expected IoU goes in here, for all commands at once.
+    The forecast of the expected IoU goes in here, for `calibrate`, `live` and `replay` at once.
     """
-    record = models.load_record(models.weights_folder(weights))
     folder = shlex.quote(str(bench)) if bench else "bench/"
-    return reconstruct.weights_serve(rig, record, bench=folder)
+    return reconstruct.weights_serve(rig, trained, bench=folder)

@@ -190,7 +190,7 @@ def capture(
         text = f"Interrupted before the first frame; {NOTHING}"
         common.finish(result, as_json=json, text=text)
         common.exit_interrupted(NOTHING)
-    if chosen.bench:
+    if chosen.bench and measured:
         chosen.bench.for_camera(source)  # a recording of another camera is refused now, not later
         measured = chosen.bench.rig, measured[1]
     limit = frames or (round(seconds * cameras.FRAMES_PER_S) if seconds else None)

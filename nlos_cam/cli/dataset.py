@@ -173,7 +173,7 @@ def build(
     """
     if scene and (rig or bench_folder):
         raise typer.BadParameter(f"{scene} has its own rig: drop --rig and --bench")
-    its_rig = benches.rig_of(bench_folder, rig, common.PAPER_RIG)
+    its_rig = benches.rig_of(bench_folder, rig)
     spread = data.RigSpread(
         place_m=rig_spread_mm / 1e3, angle_deg=rig_spread_deg, gain_share=gain_spread_percent / 100
     )

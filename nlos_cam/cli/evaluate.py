@@ -73,7 +73,7 @@ def evaluate(
         raise typer.BadParameter(
             "--training is searched for the nearest neighbour: omit it or --no-nearest"
         )
-    its_rig = benches.rig_of(bench_folder, rig)
+    its_rig = benches.rig_of(bench_folder, rig) if bench_folder or rig else None
     if bench_folder:
         weights = benches.choose(bench_folder, wall, weights).weights
     folder = output_path(out, "evaluation", "", overwrite=overwrite)

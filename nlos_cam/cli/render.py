@@ -272,7 +272,7 @@ def render(
         )
     path = output_path(out and out.with_suffix(".npz"), "render", ".npz", overwrite=overwrite)
     file = renderer.load_scene(scene) if scene else None
-    its_rig = benches.rig_of(bench_folder, rig, PAPER_RIG)
+    its_rig = benches.rig_of(bench_folder, rig)
     bare = file.bare if file else renderer.Scene(its_rig)
     surface = {"kind": material, "specular": specular, "exponent": exponent, "albedo": albedo}
     bare = scene_of(bare, surface, {"radiometry": radiometry, "pulse_ns": pulse_ns})
