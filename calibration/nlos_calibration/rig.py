@@ -10,7 +10,7 @@ from difflib import get_close_matches
 from importlib.resources.abc import Traversable
 from math import degrees, radians
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self, TypeVar
+from typing import Annotated, Any, Literal, Self, TypeVar, cast
 
 import numpy as np
 import tomli_w
@@ -300,8 +300,9 @@ def _merged(whole: dict[str, Any], changes: dict[str, Any]) -> dict[str, Any]:
     merged = dict(whole)
     for key, value in changes.items():
         before = merged.get(key)
-        both = isinstance(before, dict) and isinstance(value, dict)
-        merged[key] = _merged(before, value) if both else value
+        if isinstance(before, dict) and isinstance(value, dict):
+            value = _merged(cast("dict[str, Any]", before), cast("dict[str, Any]", value))
+        merged[key] = value
     return merged
 
 
@@ -316,6 +317,8 @@ def read_record(
     RecordFileError, with `advice` if there is no such file.
     """
     content: dict[str, Any] = {}
+    if source.is_dir():
+        raise RecordFileError(f"{source} is a folder, not a {kind}: give a bench folder as --bench")
     try:
         content = read_toml(Path(str(source)))
         return model.model_validate(complete(content))

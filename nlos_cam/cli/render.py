@@ -270,6 +270,8 @@ def render(
         raise typer.BadParameter(
             f"--out {out}: choose a name that ends in .npz; the picture has the same name in .png"
         )
+    if scene and bench_folder:
+        raise typer.BadParameter("--bench and --scene each name a rig: give one")
     path = output_path(out and out.with_suffix(".npz"), "render", ".npz", overwrite=overwrite)
     file = renderer.load_scene(scene) if scene else None
     its_rig = benches.rig_of(bench_folder, rig)

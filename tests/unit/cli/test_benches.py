@@ -137,6 +137,7 @@ def test_no_bench_and_benches_of_others_give_one_line(
     [
         (["replay", "sample", "--bench", "bench", "--wall", "wall.toml"], "--bench and --wall"),
         (["render", "cup", "--bench", "bench", "--rig", "paper-rig"], "--bench and --rig"),
+        (["render", "cup", "--bench", "bench", "--scene", "cup"], "--bench and --scene"),
         (["calibrate", "--wall", "--bench", "bench", "--out", "w.toml"], "--bench and --out"),
         (["calibrate", "--occluder", "w.toml", "--bench", "bench"], "--occluder bench"),
     ],
@@ -209,3 +210,9 @@ def test_info_describes_a_bench_and_its_damage(run: Run, bench: Path) -> None:
     changed_wall(bench)
 
     assert "has changed" in run("info", bench, code=4)["problem"]
+
+
+def test_bench_folder_given_as_a_record_names_its_option(run: Run, bench: Path) -> None:
+    answer = run("replay", "sample", "--wall", bench, "--out", "out", code=4)
+
+    assert "--bench" in answer.err

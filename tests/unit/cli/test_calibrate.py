@@ -100,6 +100,7 @@ def test_calibrate_json_is_what_the_record_holds(run: Run) -> None:
 
     assert result.pop("out") == "wall.toml"
     assert result.pop("report") == "wall.html"
+    assert result.pop("weights")["serve"]
     assert result == load_wall(OUT).model_dump(mode="json", include=set(result))
     assert set(result) >= JSON_FIELDS
 

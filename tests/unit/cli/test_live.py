@@ -196,7 +196,7 @@ def test_live_record_overwrites_only_when_asked(opened: Opened, run: Run) -> Non
 def test_replay_on_a_wall_notes_that_the_rig_differs(run: Run) -> None:
     write_wall(Path("wall.toml"))
 
-    assert "training rig" in run(*WALLED, "wall.toml").err
+    assert "aligned with their rig" in run(*WALLED, "wall.toml").err
 
     with np.load("out/reconstruction.npz") as file:
         assert str(file["rig_name"]) == "measured"
