@@ -301,8 +301,10 @@ def _merged(whole: dict[str, Any], changes: dict[str, Any]) -> dict[str, Any]:
     for key, value in changes.items():
         before = merged.get(key)
         if isinstance(before, dict) and isinstance(value, dict):
-            value = _merged(cast("dict[str, Any]", before), cast("dict[str, Any]", value))
-        merged[key] = value
+            tables = cast("tuple[dict[str, Any], dict[str, Any]]", (before, value))
+            merged[key] = _merged(*tables)
+        else:
+            merged[key] = value
     return merged
 
 
