@@ -316,6 +316,8 @@ def read_record(
     RecordFileError, with `advice` if there is no such file.
     """
     content: dict[str, Any] = {}
+    if source.is_dir():
+        raise RecordFileError(f"{source} is a folder, not a {kind}: give a bench folder as --bench")
     try:
         content = read_toml(Path(str(source)))
         return model.model_validate(complete(content))

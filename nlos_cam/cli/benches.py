@@ -86,13 +86,12 @@ def rig_or_default(bench: Path | None, rig: str | None, default: str) -> walls.R
 
 
 def weights_verdict(
-    rig: walls.Rig, weights: Path | None, bench: Path | None
+    rig: walls.Rig, trained: models.CheckpointRecord, bench: Path | None
 ) -> reconstruct.WeightsVerdict:
-    """Return whether weights (None: the shipped ones) serve a rig, for the user.
+    """Return whether weights serve a rig, for the user, with the bench folder to train others in.
 
-    The forecast of the expected IoU goes in here, for all commands at once.
+    The forecast of the expected IoU goes in here, for `calibrate`, `live` and `replay` at once.
     """
-    record = models.load_record(models.weights_folder(weights))
     folder = shlex.quote(str(bench)) if bench else "bench/"
     return reconstruct.weights_serve(rig, record, bench=folder)
 

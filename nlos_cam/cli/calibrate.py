@@ -12,6 +12,7 @@ from threading import Event, Thread
 from typing import TYPE_CHECKING, Annotated, Literal, NamedTuple
 
 import nlos_calibration as walls
+import nlos_models as models
 import typer
 from rich.live import Live
 from rich.markup import escape
@@ -273,7 +274,8 @@ def calibrate(
     files = target.files
     result = fields | {"out": str(files.record), "report": str(files.report)}
     own = benches.load_bench(target.folder).weights if target.folder else None
-    served = benching.weights_verdict(record.rig, own, target.folder)
+    trained = models.load_record(models.weights_folder(own))
+    served = benching.weights_verdict(record.rig, trained, target.folder)
     result["weights"] = {"serve": served.serve, "verdict": served.sentence}
     text = format_result(record, files)
     text += f"\n{escape(served.sentence[:1].upper() + served.sentence[1:])}"

@@ -248,10 +248,13 @@ def _load_pipeline(
     network = reconstruct.load_networks(chosen.weights)
     uncertainty_model = reconstruct.load_uncertainty(chosen.weights)
     common.say(f"Loaded model {network.record.rig_name} ({network.runtime})")
-    served = benches.weights_verdict(bench.rig, chosen.weights, None)
+    folder = chosen.bench.folder if chosen.bench else None
+    served = benches.weights_verdict(bench.rig, network.record, folder)
     if served.service == "trained for it":
         common.say(served.sentence[:1].upper() + served.sentence[1:])
-    for warning in reconstruct.compatibility_warnings(bench, network.record, uncertainty_model):
+    for warning in reconstruct.compatibility_warnings(
+        bench, network.record, uncertainty_model, served
+    ):
         common.say(f"note: {warning}")
     return reconstruct.build_pipeline(
         bench, network, average, uncertainty_model=uncertainty_model, checks=checks

@@ -239,7 +239,7 @@ def describe_toml(path: Path, _verify: bool) -> Description | None:
     quoted = shlex.quote(str(path))
     checked = "all fields"
     if {"created", "verdict"} & set(keys):
-        return _wall(path, quoted)
+        return _wall(path, quoted) if "bench_version" not in keys else _bench_record(path)
     if "task" in keys:
         recipe = load_recipe(path)
         facts = {"task": recipe.task, "epochs": str(recipe.epochs)}
@@ -270,6 +270,11 @@ def describe_toml(path: Path, _verify: bool) -> Description | None:
             "settings", {key: str(value) for key, value in keys.items()}, next=["nlos-cam config"]
         )
     return None
+
+
+def _bench_record(path: Path) -> Description:
+    folder = shlex.quote(str(path.parent))
+    return Description("record of a bench", next=[f"nlos-cam info {folder}"])
 
 
 def _wall(path: Path, quoted: str) -> Description:

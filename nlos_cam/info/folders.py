@@ -8,6 +8,7 @@ from pathlib import Path
 
 from nlos_models import load_record
 
+from nlos_cam.bench import MANIFEST, is_bench, load_bench
 from nlos_cam.errors import RecordingError
 from nlos_cam.files import CHECKSUMS, TEXT_LIMIT, checksums_of, read_bounded
 from nlos_cam.info.files import (
@@ -18,6 +19,38 @@ from nlos_cam.info.files import (
     problem_of,
     read_json,
 )
+
+
+def describe_bench(folder: Path, _verify: bool) -> Description | None:
+    """Describe a bench folder from its record; its checksums are always compared."""
+    if not is_bench(folder):
+        return None
+    bench = load_bench(folder)
+    record = bench.record
+    quoted = shlex.quote(str(folder))
+    facts = {"camera": record.camera.serial or "not known"}
+    following = [f"nlos-cam live --bench {quoted}"]
+    for name, measured in bench.stations.items():
+        wall = measured.record
+        facts[f"station {name}"] = (
+            f"{1e3 * wall.distance_m:.1f} mm and {wall.facing_deg:.1f} degrees from the wall, occluder"
+            f" {wall.occluder.source if wall.occluder else 'not measured'}"
+        )
+        facts[f"verdict on {name}"] = f"{wall.verdict}: {wall.advice}"
+        if wall.occluder is None:
+            following.insert(0, f"nlos-cam calibrate --occluder {quoted}")
+    facts["weights"] = "its own" if bench.weights else "none: the shipped ones are used"
+    created = f"{record.created:%Y-%m-%d %H:%M:%S} UTC"
+    changed = f"{record.changed:%Y-%m-%d %H:%M:%S} UTC"
+    return Description(
+        "bench",
+        facts | {"changed": changed},
+        created,
+        record.program,
+        "",
+        "checksums of all files but the tensors'",
+        following,
+    )
 
 
 def describe_dataset(folder: Path, verify: bool) -> Description:

@@ -40,7 +40,7 @@ from nlos_cam.reconstruct.physics_check import (
     PhysicsCheck,
     PhysicsCheckResult,
 )
-from nlos_cam.reconstruct.serving import weights_serve
+from nlos_cam.reconstruct.serving import WeightsVerdict, weights_serve
 from nlos_cam.reconstruct.verdict import (
     FrameConditions,
     FrozenFrames,
@@ -415,10 +415,16 @@ def build_pipeline(
 
 
 def compatibility_warnings(
-    bench: CalibratedRig, trained: CheckpointRecord, uncertainty_model: UncertaintyModel | None
+    bench: CalibratedRig,
+    trained: CheckpointRecord,
+    uncertainty_model: UncertaintyModel | None,
+    served: WeightsVerdict | None = None,
 ) -> list[str]:
-    """Return the mismatches between networks and bench, one sentence each; empty if all fits."""
-    served = weights_serve(bench.rig, trained)
+    """Return the mismatches between networks and bench, one sentence each; empty if all fits.
+
+    `served` is the verdict of `weights_serve`, for callers that have more to say in it.
+    """
+    served = served or weights_serve(bench.rig, trained)
     warnings = [] if served.service == "trained for it" else [served.sentence]
     if bench.measured and not bench.reference:
         warnings.append(

@@ -61,7 +61,9 @@ def weights_serve(
     outcome = "do not serve this bench: its maps cannot be aligned with their rig's"
     if rig_to_align_with(rig, trained):
         service = "near" if _is_near(rig, wanted) else "far"
-        outcome = "may not serve this bench: its maps are aligned with their rig's, from far"
+        outcome = (
+            "may not serve this bench: it is far from their rig, with which its maps are aligned"
+        )
         if service == "near":
             outcome = "serve this bench, aligned with their rig, with larger errors"
     difference = "; ".join(rig_difference(rig, wanted))

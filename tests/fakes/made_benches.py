@@ -27,10 +27,14 @@ def write_wall(folder: Path, measured: MeasuredWall, *, overwrite: bool = False)
     write_to_bench(folder, files, measured.record, measured.reference)
 
 
+def _no_report(*_: object) -> str:
+    return "report"
+
+
 def make_bench(folder: Path, **changes: Any) -> Path:
     """A bench of a bare wall, then of its occluder."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("nlos_cam.calibrate.files.report_html", lambda *_: "report")
+        patch.setattr("nlos_cam.calibrate.files.report_html", _no_report)
         write_wall(folder, wall_of(**changes))
         write_wall(folder, wall_of(occluder=True, **changes))
     return folder

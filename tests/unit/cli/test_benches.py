@@ -137,6 +137,7 @@ def test_no_bench_and_benches_of_others_give_one_line(
     [
         (["replay", "sample", "--bench", "bench", "--wall", "wall.toml"], "--bench and --wall"),
         (["render", "cup", "--bench", "bench", "--rig", "paper-rig"], "--bench and --rig"),
+        (["render", "cup", "--bench", "bench", "--scene", "cup"], "--bench and --scene"),
         (["calibrate", "--wall", "--bench", "bench", "--out", "w.toml"], "--bench and --out"),
         (["calibrate", "--occluder", "w.toml", "--bench", "bench"], "--occluder bench"),
     ],
@@ -196,3 +197,22 @@ def test_three_commands_lead_from_recordings_to_pictures(run: Run) -> None:
     assert report["frames"] == 20
     assert list(Path("pictures").glob("*.png"))
     assert load_bench(Path("bench")).rig.lidar.distance_m == pytest.approx(0.22, abs=1e-3)
+
+
+def test_info_describes_a_bench_and_its_damage(run: Run, bench: Path) -> None:
+    answer = run("info", bench)
+
+    assert answer["kind"] == "bench"
+    assert answer["facts"]["camera"] == "f0123456"
+    assert answer["next"] == ["nlos-cam live --bench bench"]
+    assert run("info", bench / MANIFEST)["kind"] == "record of a bench"
+
+    changed_wall(bench)
+
+    assert "has changed" in run("info", bench, code=4)["problem"]
+
+
+def test_bench_folder_given_as_a_record_names_its_option(run: Run, bench: Path) -> None:
+    answer = run("replay", "sample", "--wall", bench, "--out", "out", code=4)
+
+    assert "--bench" in answer.err

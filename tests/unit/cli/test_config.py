@@ -4,7 +4,7 @@ refused.
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import pytest
 import typer
@@ -130,3 +130,42 @@ def test_verbose_prints_settings_in_use(
 
     assert f"wall = bench.toml (from {FILE})" in shown("-v", "live").err
     assert len(live) == 1
+
+
+@pytest.mark.parametrize(
+    ("words", "given"),
+    [
+        ([], ("mine", None, None)),
+        (["--bench", "other"], ("other", None, None)),
+        (["--wall", "w.toml"], (None, "w.toml", "own")),
+        (["--weights", "direct"], ("mine", None, "direct")),
+        (["sim:a"], (None, None, "own")),
+    ],
+)
+def test_bench_of_the_settings_gives_way_to_what_is_given(
+    monkeypatch: pytest.MonkeyPatch, words: list[str], given: tuple[str | None, ...]
+) -> None:
+    calls: list[tuple[str | None, ...]] = []
+
+    def command(
+        camera: Camera = "sim",
+        wall: Path | None = None,
+        bench_folder: Annotated[Path | None, typer.Option("--bench")] = None,
+        weights: Path | None = None,
+    ) -> None:
+        del camera
+        found = bench_folder, wall, weights
+        calls.append(tuple(None if one is None else str(one) for one in found))
+
+    def build_app(_: str | None) -> typer.Typer:
+        app = typer.Typer()
+        app.callback()(lambda: None)
+        app.command("live")(shared_options("live", command))
+        return app
+
+    monkeypatch.setattr(module, "build_app", build_app)
+    text = 'bench = "mine"\nwall = "wall.toml"\nweights = "own"\n'
+    Path(FILE).write_text(text, encoding="utf-8")
+
+    assert main(["live", *words]) == 0
+    assert calls == [given]
