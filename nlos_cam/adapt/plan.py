@@ -36,7 +36,7 @@ WHOLE_MINUTES = 100.0
 MIN_SHARE = 0.04
 CERTAIN_TIMES = 2.0
 """Standard uncertainties that a bench may be off its record by: 95 % of benches are within."""
-LEAST_SPREAD = RigSpread(place_m=0.0005, angle_deg=0.1, gain_share=0.05)
+MIN_SPREAD = RigSpread(place_m=0.0005, angle_deg=0.1, gain_share=0.05)
 """A fit's own uncertainty leaves out what it has no model of: a bent wall, a bench that settles.
 One column of cells at the occluder's edge flips between wall and occluder at 0.2 mm."""
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
@@ -178,17 +178,17 @@ def load_plan(folder: Path) -> Plan | None:
 
 def calibration_spread(measured: MeasuredWall | None) -> RigSpread:
     """Return how far a bench may be off its record: CERTAIN_TIMES the standard uncertainties of its
-    calibration, and at least LEAST_SPREAD.
+    calibration, and at least MIN_SPREAD.
     """
     if measured is None:
-        return LEAST_SPREAD
+        return MIN_SPREAD
     record = measured.record
     place_m = [record.distance_std_m, record.range_offset_std_m or 0.0]
     angle_deg = [record.yaw_std_deg, record.pitch_std_deg]
     return RigSpread(
-        place_m=max(LEAST_SPREAD.place_m, CERTAIN_TIMES * max(place_m)),
-        angle_deg=max(LEAST_SPREAD.angle_deg, CERTAIN_TIMES * max(angle_deg)),
-        gain_share=LEAST_SPREAD.gain_share,
+        place_m=max(MIN_SPREAD.place_m, CERTAIN_TIMES * max(place_m)),
+        angle_deg=max(MIN_SPREAD.angle_deg, CERTAIN_TIMES * max(angle_deg)),
+        gain_share=MIN_SPREAD.gain_share,
     )
 
 

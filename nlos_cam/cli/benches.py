@@ -93,7 +93,7 @@ def weights_verdict(
     The forecast of the expected IoU goes in here, for `calibrate`, `live` and `replay` at once.
     """
     folder = shlex.quote(str(bench)) if bench else "bench/"
-    return reconstruct.weights_serve(rig, record, bench=folder)
+    return reconstruct.weights_serve(rig, trained, bench=folder)
 
 
 def files_in_bench(

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from nlos_models import load_record
 
-from nlos_cam.bench import MANIFEST, is_bench, load_bench
+from nlos_cam.bench import is_bench, load_bench
 from nlos_cam.errors import RecordingError
 from nlos_cam.files import CHECKSUMS, TEXT_LIMIT, checksums_of, read_bounded
 from nlos_cam.info.files import (

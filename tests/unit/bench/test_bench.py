@@ -71,7 +71,7 @@ def test_object_box_of_the_bench_is_that_of_its_rig(folder: Path) -> None:
     assert load_bench(folder).bare.record.rig.object_box.x_max_m == 0.6
 
 
-def test_wall_measured_again_drops_the_occluder_and_keeps_the_box(folder: Path) -> None:
+def test_wall_measured_again_drops_the_occluder_keeps_the_box(folder: Path) -> None:
     set_line(folder, "x_max_m", "x_max_m = 0.6")
     write_wall(folder, wall_of(), overwrite=True)
     bench = load_bench(folder)

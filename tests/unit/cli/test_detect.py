@@ -48,7 +48,7 @@ def test_recording_has_no_turns(run: Run) -> None:
     assert "without turns" in run("detect", "run.bag", code=2).err
 
 
-def test_terminal_asks_for_every_turn_and_stops_at_the_end_of_stdin(
+def test_terminal_asks_for_each_turn_until_stdin_ends(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     lines = iter(["\n", ""])

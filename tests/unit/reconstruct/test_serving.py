@@ -42,7 +42,7 @@ def test_service_falls_with_the_distance_of_the_rigs(rig: Rig, service: str) -> 
     assert ("0.61" in verdict.sentence) == (service != "trained for it")
 
 
-def test_weights_that_hold_their_rig_are_known_after_a_new_measurement() -> None:
+def test_weights_that_hold_their_rig_are_known_later() -> None:
     bench = posed(distance_m=0.25, yaw_deg=30.0)
     again = posed(distance_m=0.2502, yaw_deg=30.02)
 

@@ -51,7 +51,7 @@ def test_depth_pictures_show_missing_depth_as_background() -> None:
     ).tolist() == [[5, 6]]
 
 
-def test_lidar_depth_darkens_all_the_way_in_the_colors_of_hidden_depth() -> None:
+def test_lidar_depth_darkens_all_the_way() -> None:
     rgb = images.lidar_rgb(np.linspace(0.1, 1.0, 40, dtype=np.float32)[None], 0.1, 1.0)[0]
     luminance = rgb @ np.array([0.2126, 0.7152, 0.0722])
 
