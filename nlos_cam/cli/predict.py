@@ -10,6 +10,7 @@ import nlos_calibration as walls
 import typer
 from rich.table import Table
 
+from nlos_cam import bench as benches
 from nlos_cam import forecast, objects
 from nlos_cam.cli.common import (
     Json,
@@ -97,10 +98,9 @@ def predict(
 
 
 def rig_of(name: str) -> Rig:
-    """Return a packaged rig, or that of a rig's file, a wall record or a bench folder's wall."""
-    folder = Path(name)
-    if folder.is_dir():
-        return walls.rig_named(str(folder / "wall.toml"))
+    """Return a packaged rig, or that of a rig's file, a wall record or a bench folder."""
+    if Path(name).is_dir():
+        return benches.load_bench(name).rig
     return walls.rig_named(name)
 
 

@@ -279,6 +279,8 @@ def render(
     json: Json = False,
 ) -> None:
     """Render the maps that a lidar which reports its strongest echo gets of a hidden object."""
+    if scene and bench_folder:
+        raise typer.BadParameter("--bench and --scene each name a rig: give one")
     if out is not None and out.suffix not in {"", ".npz", ".png"}:
         raise typer.BadParameter(
             f"--out {out}: choose a name that ends in .npz; the picture has the same name in .png"

@@ -28,8 +28,8 @@ FILES: dict[str, tuple[str, Describe]] = {
 """Word for a damaged file, and reader, by suffix."""
 KINDS = (
     "recordings (.bag) and their sidecars (.json), .npz files, saved views and reports (.html),"
-    " wall, scene, rig and recipe files (.toml), dataset shards (.h5), transients (.hdf5), and the folders of datasets,"
-    " training runs, weights, replays, exports, evaluations and trade-offs"
+    " wall, scene, rig and recipe files (.toml), dataset shards (.h5), transients (.hdf5), and the folders of benches,"
+    " datasets, training runs, weights, replays, exports, evaluations and trade-offs"
 )
 
 

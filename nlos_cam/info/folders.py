@@ -8,7 +8,7 @@ from pathlib import Path
 
 from nlos_models import load_record
 
-from nlos_cam.bench import is_bench, load_bench
+from nlos_cam.bench import MANIFEST, is_bench, load_bench
 from nlos_cam.errors import RecordingError
 from nlos_cam.files import CHECKSUMS, TEXT_LIMIT, checksums_of, read_bounded
 from nlos_cam.info.files import (
@@ -218,7 +218,8 @@ def _json(path: Path) -> Mapping[str, dict[str, float]]:
     return found
 
 
-FOLDERS: list[tuple[str, str, Callable[[Path, bool], Description]]] = [
+FOLDERS: list[tuple[str, str, Callable[[Path, bool], Description | None]]] = [
+    (MANIFEST, "bench", describe_bench),
     ("metadata.yaml", "recording", describe_bag),
     ("shard-*.h5", "dataset", describe_dataset),
     ("log.csv", "training run", describe_run),
