@@ -12,7 +12,7 @@ from typing import Any
 
 import torch
 from lightning_fabric import Fabric
-from nlos_models.training import Recipe, loop
+from nlos_models.training import Recipe, run_files
 from nlos_models.training.loop import Running, fit
 from nlos_models.training.recipe import recipe_of
 from torch import Tensor, nn
@@ -153,12 +153,12 @@ def run_watched(recipe: Recipe, folder: Path, executioner: Executioner) -> Small
         executioner()
         return replace(path, target)
 
-    loop.os.fsync = watched_fsync
+    run_files.os.fsync = watched_fsync
     Path.replace = watched_replace  # type: ignore[method-assign]
     try:
         run.go(stop=lambda: bool(executioner()), checkpoint_s=0.0)
     finally:
-        loop.os.fsync = fsync
+        run_files.os.fsync = fsync
         Path.replace = replace  # type: ignore[method-assign]
     return run
 
