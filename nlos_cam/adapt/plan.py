@@ -14,7 +14,7 @@ from nlos_calibration import MeasuredWall, Record
 from nlos_models.training import DirectRecipe, UncertaintyRecipe
 from pydantic import Field, ValidationError
 
-from nlos_cam.dataset import RigSpread
+from nlos_cam.dataset import SHARD, RigSpread
 from nlos_cam.errors import RecordingError
 from nlos_cam.files import TEXT_LIMIT, atomic_file, read_bounded
 from nlos_cam.render import SensorModel
@@ -23,7 +23,6 @@ PLAN = "plan.json"
 BATCH = 256
 NETWORK_SHARE = 0.7
 """Share of the minutes for the network itself; uncertainty, quality and figures get the rest."""
-SHARD = 100
 FIRST_OBJECTS = 1000
 """Objects that are there before training begins."""
 RENDERED_AFTER = 0.8
@@ -62,6 +61,11 @@ class Stage(Record):
     epochs: Count
     steps: Count
     """Of an epoch."""
+
+    @property
+    def samples(self) -> int:
+        """Number of samples of all epochs."""
+        return self.epochs * self.steps * BATCH
 
     def recipe(self) -> DirectRecipe:
         """Return the recipe: the one that trains the shipped weights on, at a length of this
@@ -105,8 +109,6 @@ class Plan(Record):
     """Everything that decides the weights of an adaptation."""
 
     rig_checksum: str
-    start_checksum: str
-    """Of the weights that the first stage starts from."""
     spread: RigSpread
     sensor: SensorModel
     seed: Annotated[int, Field(ge=0)]

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from nlos_cam.adapt.plan import Plan, Stage
+from nlos_cam.adapt.plan import Plan
 from nlos_cam.adapt.run import NETWORK, REPORT, AdaptResult
 from nlos_cam.report import (
     Banner,
@@ -46,7 +46,7 @@ def read_curves(plan: Plan, logs: Sequence[Path]) -> list[Curve]:
     for stage, path in zip(plan.stages, logs, strict=True):
         with path.open(encoding="utf-8", newline="") as file:
             rows = list(csv.DictReader(file))
-        samples = stage.steps * _batch(stage)
+        samples = stage.samples // stage.epochs
         curves.append(
             Curve(
                 [before + samples * (k + 1) for k in range(len(rows))],
@@ -55,10 +55,6 @@ def read_curves(plan: Plan, logs: Sequence[Path]) -> list[Curve]:
         )
         before += samples * len(rows)
     return curves
-
-
-def _batch(stage: Stage) -> int:
-    return stage.recipe().batch
 
 
 def gain_by_doubling(curves: Sequence[Curve]) -> float | None:

@@ -9,7 +9,7 @@ import os
 import shutil
 import time
 from collections.abc import Callable, Generator
-from contextlib import AbstractContextManager, closing, contextmanager
+from contextlib import closing, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from threading import Event, Thread
@@ -24,14 +24,13 @@ from nlos_cam import dataset as data
 from nlos_cam.adapt.plan import (
     BATCH,
     FIRST_OBJECTS,
-    SHARD,
     Pace,
     Plan,
     Stage,
     load_plan,
 )
 from nlos_cam.errors import OutputExistsError, SceneError
-from nlos_cam.files import atomic_directory, cache_folder, checksums_of, claim
+from nlos_cam.files import CHECKSUMS, atomic_directory, cache_folder, checksums_of, claim
 from nlos_cam.render import SensorModel
 
 OBJECTS = "objects"
@@ -62,7 +61,6 @@ Farm = Any
 Measure = Callable[[Path | None, Path], None]
 """Measures weights (None: the shipped ones) on the bench's test objects: writes FIGURES and a report
 into a folder."""
-Tracked = Callable[[str], AbstractContextManager[Callable[[int, int], None]]]
 
 
 @dataclass(frozen=True)
@@ -98,17 +96,12 @@ class AdaptResult:
     """True where the adaptation of so many minutes was finished before."""
 
 
-@contextmanager
-def _untracked(_: str) -> Generator[Callable[[int, int], None]]:
-    yield lambda _done, _total: None
-
-
 def adapt(
     job: Adaptation,
     minutes: float,
     measure: Measure,
     *,
-    tracked: Tracked = _untracked,
+    tracked: data.Tracked = data.untracked,
     watch: training.Watch | None = None,
     on_message: Callable[[str], None] = print,
 ) -> AdaptResult:
@@ -128,7 +121,7 @@ def adapt(
         for number, stage in enumerate(plan.stages):
             on_message(
                 f"stage {number + 1} of {len(plan.stages)}: {stage.objects} objects,"
-                f" {stage.epochs * stage.steps * BATCH} samples"
+                f" {stage.samples} samples"
             )
             _run_stage(job, plan, number, tracked, watch)
         after = _figures(measure, weights, folders[-1] / REPORT)
@@ -139,19 +132,16 @@ def _stage_name(number: int) -> str:
     return f"stage-{number + 1}"
 
 
-def _plan_for(job: Adaptation, minutes: float, tracked: Tracked) -> Plan:
+def _plan_for(job: Adaptation, minutes: float, tracked: data.Tracked) -> Plan:
     """Return the folder's plan, extended to `minutes`, or a new one after a measurement of the
     machine.
     """
-    start = models.weights_folder(job.start)
     plan = load_plan(job.folder)
     if plan is None:
         with tracked("measuring the pace of this machine") as on_progress:
             pace = _measure_pace(job, on_progress)
-        checksum = json.dumps(checksums_of(start), sort_keys=True)
         plan = Plan(
             rig_checksum=job.rig.checksum,
-            start_checksum=training.digest_of(checksum),
             spread=job.spread,
             sensor=job.sensor,
             seed=job.seed,
@@ -188,15 +178,13 @@ def _measure_pace(job: Adaptation, on_progress: Callable[[int, int], None]) -> P
     folder = job.folder / OBJECTS
 
     # the first objects compile kernels and start the workers
-    data.build_dataset(
-        plan, SHARD, folder, workers=1, on_progress=lambda _done, _total: None, farm=job.farm
-    )
+    data.build_dataset(plan, data.SHARD, folder, workers=1, on_progress=data.ignore, farm=job.farm)
     report = data.build_dataset(
         plan,
-        SHARD + PACE_OBJECTS,
+        data.SHARD + PACE_OBJECTS,
         folder,
         workers=job.workers,
-        on_progress=lambda done, _: on_progress(done - SHARD, total),
+        on_progress=lambda done, _: on_progress(done - data.SHARD, total),
         farm=job.farm,
     )
     objects_per_s = report.objects_per_s or 1.0
@@ -213,17 +201,13 @@ def _measure_pace(job: Adaptation, on_progress: Callable[[int, int], None]) -> P
         if step == 1:  # the first one allocates
             start_s = time.perf_counter()
         with torch.autocast(device.type, torch.bfloat16, enabled=device.type != "cpu"):
-            loss = sum(part.float().square().mean() for part in _parts(network.logits(normal)))
+            loss = network.logits(normal).float().square().mean()
         optimizer.zero_grad(set_to_none=True)
-        loss.backward()  # type: ignore[union-attr]  a sum of at least one tensor
+        loss.backward()
         optimizer.step()
         on_progress(PACE_OBJECTS + step + 1, total)
     seconds = time.perf_counter() - start_s
     return Pace(objects_per_s=objects_per_s, samples_per_s=(PACE_STEPS - 1) * BATCH / seconds)
-
-
-def _parts(outputs: Any) -> tuple[torch.Tensor, ...]:
-    return outputs if isinstance(outputs, tuple) else (outputs,)
 
 
 def _probe_recipe() -> training.DirectRecipe:
@@ -231,7 +215,7 @@ def _probe_recipe() -> training.DirectRecipe:
 
 
 def _run_stage(
-    job: Adaptation, plan: Plan, number: int, tracked: Tracked, watch: training.Watch | None
+    job: Adaptation, plan: Plan, number: int, tracked: data.Tracked, watch: training.Watch | None
 ) -> None:
     """Train a stage's network, its uncertainty network and its quality model, each unless it is
     there.
@@ -239,7 +223,7 @@ def _run_stage(
     folder = job.folder / _stage_name(number)
     before = job.folder / _stage_name(number - 1) / NETWORK if number else job.start
     weights = folder / WEIGHTS
-    if not (folder / NETWORK / "SHA256SUMS").exists():
+    if not (folder / NETWORK / CHECKSUMS).exists():
         _train_network(job, plan, number, before, tracked, watch)
     is_last = number == len(plan.stages) - 1
     if not is_last or (weights / "quality.json").exists():
@@ -281,8 +265,8 @@ class _Rendering:
     def wait_for(self, objects: int, stop: Callable[[], bool] = lambda: False) -> None:
         """Wait until the first `objects` are on disk. Raises what ended the rendering before."""
         folder = self._job.folder / OBJECTS
-        seeds = range(self._job.seed, self._job.seed + objects, SHARD)
-        missing = [folder / f"shard-{seed:09d}.h5" for seed in seeds]
+        seeds = range(self._job.seed, self._job.seed + objects, data.SHARD)
+        missing = [data.shard_path(folder, seed) for seed in seeds]
         while missing := [path for path in missing if not path.exists()]:
             if stop():
                 raise KeyboardInterrupt
@@ -317,7 +301,7 @@ def _train_network(
     plan: Plan,
     number: int,
     before: Path | None,
-    tracked: Tracked,
+    tracked: data.Tracked,
     watch: training.Watch | None,
 ) -> None:
     """Train on from the weights `before`, on objects that are rendered meanwhile."""
@@ -336,7 +320,7 @@ def _train_network(
         def shards_of(epoch: int) -> int:
             objects = stage.objects_at(epoch, there)
             rendering.wait_for(objects, watched.stop)
-            return objects // SHARD
+            return objects // data.SHARD
 
         with tracked("rendering the first objects"):
             rendering.wait_for(stage.objects_at(0, there))
@@ -359,7 +343,9 @@ def _train_network(
     shutil.rmtree(out.parent / PACKED, ignore_errors=True)  # made again from the objects if needed
 
 
-def _noisy_set(job: Adaptation, name: str, first_seed: int, count: int, tracked: Tracked) -> Path:
+def _noisy_set(
+    job: Adaptation, name: str, first_seed: int, count: int, tracked: data.Tracked
+) -> Path:
     """Return a folder of `count` objects on the rig itself, with the sensor's noise."""
     folder = job.folder / name
     with tracked(f"rendering {count} objects ({name})") as on_progress:
@@ -375,7 +361,7 @@ def _noisy_set(job: Adaptation, name: str, first_seed: int, count: int, tracked:
 
 
 def _train_uncertainty(
-    job: Adaptation, plan: Plan, folder: Path, tracked: Tracked, watch: training.Watch | None
+    job: Adaptation, plan: Plan, folder: Path, tracked: data.Tracked, watch: training.Watch | None
 ) -> None:
     """Train the uncertainty network of a stage's network, and fit its quality model."""
     watched = folder / NETWORK
@@ -439,5 +425,5 @@ def install(weights: Path, target: Path) -> None:
     if target.exists() and not target.is_dir():
         raise OutputExistsError(f"{target} is a file, but weights are a folder: move it away")
     with atomic_directory(target) as part:
-        for name in (*checksums_of(weights), "SHA256SUMS"):
+        for name in (*checksums_of(weights), CHECKSUMS):
             shutil.copy2(weights / name, part / name)

@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
+from functools import cache
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-import nlos_calibration as walls
 import typer
 
 from nlos_cam import adapt as adaptation
 from nlos_cam import bench as benches
 from nlos_cam import evaluate as evaluation
 from nlos_cam.cli import common
+from nlos_cam.cli.benches import bench_or_rig
 from nlos_cam.cli.train import watched_run
 from nlos_cam.errors import OutputExistsError
 from nlos_cam.files import checksums_of
@@ -65,7 +66,7 @@ def adapt(
     Killed at any moment, the same command goes on. More --minutes go on from what is there.
     """
     folder = Path(bench) if out is None and Path(bench).is_dir() else None
-    rig, measured = _rig_of(bench)
+    rig, measured = bench_or_rig(bench)
     home = out or folder or Path(f"adapted-{rig.name}")
     target = home / WEIGHTS
     work = home / WORK
@@ -88,9 +89,13 @@ def adapt(
         **optional,
     )
 
+    @cache
+    def test_objects() -> evaluation.HeldOutObjects:
+        """Render the test objects once, for the start weights and for the new ones."""
+        return evaluation.rendered_objects(rig, tracked=common.tracked, sensor=job.sensor)
+
     def measure(start: Path | None, folder: Path) -> None:
-        objects = evaluation.rendered_objects(rig, tracked=common.tracked, sensor=job.sensor)
-        found = evaluation.evaluate(start, objects, nearest=False, tracked=common.tracked)
+        found = evaluation.evaluate(start, test_objects(), nearest=False, tracked=common.tracked)
         evaluation.write_report(folder, found, evaluation.as_figures(found))
 
     try:
@@ -129,18 +134,6 @@ def adapt(
         "after": result.after,
     }
     common.finish(facts, as_json=json, text=text)
-
-
-def _rig_of(bench: str) -> tuple[walls.Rig, walls.MeasuredWall | None]:
-    """Return a bench's rig and, where it was measured, its wall."""
-    path = Path(bench)
-    if path.is_dir():
-        measured = benches.load_bench(path).measured
-        return measured.record.rig, measured
-    if path.is_file() and "schema_version" in path.read_text("utf-8", errors="replace"):
-        measured = walls.load_measured(path)
-        return measured.record.rig, measured
-    return walls.rig_named(bench), None
 
 
 def _refuse_others(target: Path, work: Path) -> None:

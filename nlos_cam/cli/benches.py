@@ -85,6 +85,19 @@ def rig_or_default(bench: Path | None, rig: str | None, default: str) -> walls.R
     return found
 
 
+def bench_or_rig(name: str) -> tuple[walls.Rig, walls.MeasuredWall | None]:
+    """Return the rig of a bench folder, a wall record, a rig's file or a packaged rig and, where it
+    was measured, its wall.
+    """
+    if Path(name).is_dir():
+        measured = benches.load_bench(name).measured
+    elif walls.is_wall_record(name):
+        measured = walls.load_measured(Path(name))
+    else:
+        return walls.rig_named(name), None
+    return measured.record.rig, measured
+
+
 def weights_verdict(
     rig: walls.Rig, trained: models.CheckpointRecord, bench: Path | None
 ) -> reconstruct.WeightsVerdict:

@@ -7,6 +7,7 @@ __all__ = [
     "ORDINARY",
     "REQUIRED_ARRAYS",
     "SHAPE_OUTLIERS",
+    "SHARD",
     "SHARD_PATTERN",
     "TEST_SEED",
     "TRAINING_OUTLIERS",
@@ -20,11 +21,13 @@ __all__ = [
     "PackedMaps",
     "RigSpread",
     "Stimulus",
+    "Tracked",
     "build_dataset",
     "build_transients",
     "check_arrays",
     "check_uncertainty_data",
     "draw_outlier",
+    "ignore",
     "label_recordings",
     "list_recordings",
     "measured_bare_wall",
@@ -43,12 +46,14 @@ __all__ = [
     "sense_color",
     "sense_object",
     "shard_origin",
+    "shard_path",
     "shards_of",
     "uncertainty_sets",
+    "untracked",
     "write_shards",
 ]
 
-from .build import HELD_OUT_SEED, TEST_SEED, TRAINING_SEED, BuildReport, build_dataset
+from .build import HELD_OUT_SEED, SHARD, TEST_SEED, TRAINING_SEED, BuildReport, build_dataset
 from .labelled import (
     FRAMES_PER_RECORDING,
     Labelled,
@@ -69,13 +74,22 @@ from .packed import PackedMaps, open_packed_maps
 from .plan import DatasetPlan, Objects, RigSpread
 from .ray_backend import ray_farm
 from .reader import Dataset, open_dataset
-from .samples import objects_from_folder, procedural_images, sense_color, sense_object
+from .samples import (
+    Tracked,
+    ignore,
+    objects_from_folder,
+    procedural_images,
+    sense_color,
+    sense_object,
+    untracked,
+)
 from .shards import (
     REQUIRED_ARRAYS,
     SHARD_PATTERN,
     check_arrays,
     read_head,
     shard_origin,
+    shard_path,
     shards_of,
 )
 from .training_maps import BareMaps, measured_bare_wall, read_maps, render_bare_wall

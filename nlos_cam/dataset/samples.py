@@ -4,7 +4,8 @@ seed alone.
 Torch must not be imported here: workers do not need it, and its import takes seconds.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Generator, Mapping, Sequence
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
@@ -37,6 +38,17 @@ OnProgress = Callable[[int, int], None]
 
 def ignore(*_: object) -> None:
     """Do nothing: the default of callbacks."""
+
+
+Tracked = Callable[[str], AbstractContextManager[OnProgress]]
+"""Opens a progress bar with a description; yields the function that takes (done, total)."""
+
+
+@contextmanager
+def untracked(description: str) -> Generator[OnProgress]:
+    """Show no progress."""
+    del description
+    yield ignore
 
 
 def procedural_images(

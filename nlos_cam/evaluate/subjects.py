@@ -3,8 +3,7 @@ dataset.
 """
 
 import os
-from collections.abc import Callable, Generator, Iterable, Sequence
-from contextlib import AbstractContextManager, contextmanager
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -19,6 +18,7 @@ from nlos_models.training import MapSet, subtract_bare_wall
 from nlos_cam import dataset as data
 from nlos_cam import objects as shapes
 from nlos_cam.camera import OnProgress, World
+from nlos_cam.dataset import Tracked, untracked
 from nlos_cam.errors import SceneError
 from nlos_cam.evaluate import baselines as trivial
 from nlos_cam.evaluate.metrics import Predictions
@@ -35,17 +35,6 @@ from nlos_cam.reconstruct import (
     verdict_limits,
 )
 from nlos_cam.render import MultiBounce, Scene, SceneFile, SensorModel, render
-
-Tracked = Callable[[str], AbstractContextManager[OnProgress]]
-"""Opens a progress bar with a description; yields the function that takes (done, total)."""
-
-
-@contextmanager
-def untracked(description: str) -> Generator[OnProgress]:
-    """Show no progress."""
-    del description
-    yield lambda _done, _total: None
-
 
 TestSet = Literal["kinds", "unseen"]
 TEST_SETS: dict[TestSet, str] = {

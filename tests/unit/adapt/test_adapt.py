@@ -57,7 +57,6 @@ def job_in(folder: Path, rig: Rig) -> Adaptation:
     stage = Stage(minutes=1.0, objects=300, epochs=2, steps=3)
     Plan(
         rig_checksum=rig.checksum,
-        start_checksum="0",
         spread=spread,
         sensor=SensorModel(),
         seed=0,

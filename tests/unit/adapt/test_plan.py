@@ -6,7 +6,8 @@ import pytest
 from nlos_calibration import load_rig
 
 from nlos_cam.adapt import Plan, Stage, calibration_spread
-from nlos_cam.adapt.plan import PLAN, SHARD, Pace, load_plan
+from nlos_cam.adapt.plan import PLAN, Pace, load_plan
+from nlos_cam.dataset import SHARD
 from nlos_cam.errors import RecordingError
 from nlos_cam.render import SensorModel
 
@@ -14,7 +15,6 @@ from nlos_cam.render import SensorModel
 def plan_at(objects_per_s: float = 50.0, samples_per_s: float = 400.0) -> Plan:
     return Plan(
         rig_checksum=load_rig("paper-rig").checksum,
-        start_checksum="0",
         spread=calibration_spread(None),
         sensor=SensorModel(),
         seed=0,
@@ -23,7 +23,7 @@ def plan_at(objects_per_s: float = 50.0, samples_per_s: float = 400.0) -> Plan:
 
 
 def samples(plan: Plan) -> int:
-    return sum(stage.epochs * stage.recipe().objects for stage in plan.stages)
+    return sum(stage.samples for stage in plan.stages)
 
 
 @pytest.mark.parametrize("minutes", [1.0, 10.0, 60.0])
