@@ -1,8 +1,6 @@
 """Commands of a live run, by group: pipeline, saved views, recording, camera and bench."""
 
-import glob
 import re
-import socket
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
@@ -23,7 +21,7 @@ from nlos_cam.errors import NlosCamError
 from nlos_cam.frames import Frame
 from nlos_cam.live.live_recording import LiveRecording
 from nlos_cam.reconstruct import CalibratedRig, Clock, Pipeline, ignore
-from nlos_cam.view import Moment
+from nlos_cam.view import Moment, WrittenFiles
 
 REFERENCE_FRAMES = 60
 MAX_REFERENCE_FRAMES = 1800
@@ -66,8 +64,7 @@ class RunContext:
     newest: Moment | None = None
     ended: bool = False
     """True once no more frames come."""
-    files: dict[str, Path] = field(default_factory=dict[str, Path])
-    """Whole files that commands wrote, by name."""
+    files: WrittenFiles = field(default_factory=WrittenFiles)
     on_frame: list[OnFrame] = field(default_factory=list[OnFrame])
     """Called with each frame of the camera, in the reader's thread."""
 
@@ -76,14 +73,6 @@ class RunContext:
         if self.camera is None or self.pipeline is None:
             raise NlosCamError("the camera is not running yet: wait for the first frame")
         return self.camera, self.pipeline
-
-    def note_files(self, path: Path) -> str:
-        """Note that a file, and those beside it of the same stem, are whole; return where they
-        are.
-        """
-        for each in sorted(path.parent.glob(f"{glob.escape(path.stem)}.*")):
-            self.files[each.name] = each
-        return f"in {path.parent.resolve()} on {socket.gethostname()}"
 
     def new_file(self, stem: str, suffix: str) -> Path:
         """Return a path with the present date, to a millisecond."""
@@ -159,7 +148,7 @@ class SavingCommands:
             raise NlosCamError("there is no frame yet: wait for the first one")
         path = self._run.new_file("snapshot", ".npz")
         outcome = views.save_moment(path, moment)
-        return f"{outcome}, {self._run.note_files(path)}"
+        return f"{outcome}, {self._run.files.note(path)}"
 
     def save_session(self) -> str:
         """Save what the page shows from now on as one HTML file."""
@@ -180,7 +169,7 @@ class SavingCommands:
         file, entered = self._session
         self._session = None
         entered.close()
-        place = self._run.note_files(file.path)
+        place = self._run.files.note(file.path)
         return f"saved {file.kept} moments to {file.path}, {place}: any browser plays it"
 
 
@@ -216,7 +205,7 @@ class RecordingCommands:
         self.recording = None
         self._run.on_frame.remove(recording.add)
         outcome = recording.stop()
-        return f"{outcome}, {self._run.note_files(recording.path)}"
+        return f"{outcome}, {self._run.files.note(recording.path)}"
 
 
 class BenchCommands:
@@ -294,7 +283,7 @@ class BenchCommands:
         self.on_bench(pipeline.bench)
         return (
             f"reference of {capture.statistics.depth.frames} frames ({record.verdict}:"
-            f" {record.advice}); wrote {path}, {self._run.note_files(path)}"
+            f" {record.advice}); wrote {path}, {self._run.files.note(path)}"
         )
 
 

@@ -2,8 +2,6 @@
 exported.
 """
 
-import glob
-import socket
 from collections.abc import Mapping
 from datetime import datetime
 from functools import cached_property
@@ -27,7 +25,7 @@ from nlos_cam.reconstruct import (
     load_uncertainty,
 )
 from nlos_cam.recording import with_telemetry
-from nlos_cam.view import Moment, PlaybackViewer, save_moment
+from nlos_cam.view import Moment, PlaybackViewer, WrittenFiles, save_moment
 
 
 class Playback(PlaybackViewer):
@@ -52,8 +50,7 @@ class Playback(PlaybackViewer):
         self._calibrated = bench
         self._folder = folder
         self._exporting = Lock()
-        self._files = dict[str, Path]()
-        """Exported files, by name."""
+        self._files = WrittenFiles()
         self._state = "loading the networks"
 
     def reconstruct(self, stop: Event) -> None:
@@ -126,9 +123,7 @@ class Playback(PlaybackViewer):
             (result,) = iterate_batched(reader, self._pipeline())
         path = self._folder / f"{bag.stem}-{number:06d}-{datetime.now().astimezone():%H%M%S}.npz"
         outcome = save_moment(path, Moment.recorded(result))
-        for each in sorted(path.parent.glob(f"{glob.escape(path.stem)}.*")):
-            self._files[each.name] = each
-        return f"{outcome}, in {path.parent.resolve()} on {socket.gethostname()}"
+        return f"{outcome}, {self._files.note(path)}"
 
     def file(self, name: str) -> Path | None:
         """Return the path of an exported file, by its name; None for any other."""

@@ -14,6 +14,7 @@ __all__ = [
     "Viewer",
     "Viewers",
     "WebViewer",
+    "WrittenFiles",
     "element",
     "exposed",
     "prepare_saving",
@@ -21,7 +22,7 @@ __all__ = [
     "unpack",
 ]
 
-from .frame_files import prepare_saving, save_moment
+from .frame_files import WrittenFiles, prepare_saving, save_moment
 from .images import MAX_UNCERTAINTY_M
 from .messages import unpack
 from .server import LOOPBACK, exposed

@@ -1,5 +1,7 @@
 """One frame's result as files: arrays, picture and mesh."""
 
+import glob
+import socket
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -9,6 +11,18 @@ import numpy as np
 from nlos_cam.files import atomic_file
 from nlos_cam.view.video import Still
 from nlos_cam.view.viewer import Moment
+
+
+class WrittenFiles(dict[str, Path]):
+    """Whole files that the commands of a page wrote, by name; the page offers them for download."""
+
+    def note(self, path: Path) -> str:
+        """Note a file, and those beside it of the same stem; return where they are, for a person
+        whose browser may run on another machine.
+        """
+        for each in sorted(path.parent.glob(f"{glob.escape(path.stem)}.*")):
+            self[each.name] = each
+        return f"in {path.parent.resolve()} on {socket.gethostname()}"
 
 
 def prepare_saving() -> None:
