@@ -22,6 +22,7 @@ __all__ = [
     "DriftCheck",
     "Extent",
     "Finite",
+    "Gravity",
     "Intrinsics",
     "LidarPose",
     "MeanNoise",
@@ -40,6 +41,7 @@ __all__ = [
     "WallByBoard",
     "WallFit",
     "WallRecord",
+    "WayUp",
     "board_agreement",
     "corner_rays",
     "depth_noise_m",
@@ -53,6 +55,7 @@ __all__ = [
     "fit_wall",
     "fit_with_tape_distance",
     "footprint",
+    "is_gravity",
     "is_wall_record",
     "lidar_visible_share",
     "load_measured",
@@ -68,14 +71,17 @@ __all__ = [
     "record_kind",
     "rig_difference",
     "rig_named",
+    "roll_deg",
     "save_reference",
     "settings_changed",
+    "turn_problem",
     "wall_depth",
     "wall_facts",
     "wall_from_plane",
     "wall_from_zero",
     "wall_points_m",
     "wall_with_board",
+    "way_up",
     "with_base",
     "with_degrees",
     "with_mm",
@@ -87,6 +93,7 @@ from .board_pose import PrintErrors, fit_board
 from .board_wall import BoardRecord, WallByBoard, wall_with_board
 from .drift import WINDOW_FRAMES, Drift, DriftCheck, settings_changed
 from .geometry import Intrinsics, facing_angle_rad, normal_from_angles, wall_from_plane
+from .gravity import Gravity, WayUp, is_gravity, roll_deg, turn_problem, way_up
 from .noise import (
     INTERVAL_STDS,
     QUANTUM_M,

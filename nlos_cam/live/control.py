@@ -36,8 +36,6 @@ MAX_DROPS = 3
 """Of so many frames (2 s), the number of dropped ones above which the run is too slow."""
 LOADING_S = 4.0
 """Time that the networks take to load, between a pre-rendering and the first frame."""
-MAX_FILES = 12
-"""Last files that the page offers for download."""
 COMMAND_WAIT_S = 0.5
 """Time after which a command without an answer waits: most take milliseconds."""
 MAX_NUMBER = 1e9
@@ -271,7 +269,7 @@ class RunControl:
             "paused": self.pipeline.paused,
             "recording": self.recording.recording is not None,
             "saving": self.saving.is_saving,
-            "files": list(self._run.files)[-MAX_FILES:],
+            "files": self._run.files.newest,
             "no_reference": self.bench.no_reference,
             "note": (
                 f"{self._camera_name} has no laser or near-wall settings" if has_no_options else ""

@@ -301,6 +301,8 @@ def measure_bench(
         except OccluderRefusedError:  # a bare wall, without one
             pass
     fit, facts = calibrate.measure_by_depth(capture)
+    if measured and capture.gravity_m_s2 is None:
+        facts["way_up"] = measured.record.way_up
     return capture.record(fit, facts), fit.inliers
 
 
