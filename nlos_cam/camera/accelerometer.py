@@ -40,8 +40,8 @@ class Accelerometer:
     """
 
     def __init__(self, sensor: Any, profile: Any, depth: Any) -> None:
-        self._sensor = sensor
-        self._profile = profile
+        self._sensor: Any = sensor
+        self._profile: Any = profile
         self._lidar_from_sensor = _rotation(profile, depth)
         self._samples = deque[Acceleration](maxlen=profile.fps())
         self._lock = Lock()

@@ -12,7 +12,6 @@ from nlos_cam.files import atomic_file
 from nlos_cam.view.video import Still
 from nlos_cam.view.viewer import Moment
 
-
 MAX_LISTED = 12
 """Last files that a page lists for download."""
 

@@ -1,5 +1,6 @@
 """Laws of the way up of a lidar: rolls add up, and a turn is found by its angle."""
 
+from itertools import pairwise
 from math import cos, radians, sin
 
 import numpy as np
@@ -93,5 +94,5 @@ def test_only_a_mean_as_long_as_gravity_is_gravity(length: float) -> None:
 
 def test_turns_add_up_about_one_axis() -> None:
     rolls = np.linspace(0, 90, 7)
-    steps = [turned_deg(gravity(a), gravity(b)) for a, b in zip(rolls, rolls[1:], strict=False)]
+    steps = [turned_deg(gravity(a), gravity(b)) for a, b in pairwise(rolls)]
     assert sum(steps) == pytest.approx(turned_deg(gravity(0), gravity(90)))

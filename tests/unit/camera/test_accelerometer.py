@@ -82,10 +82,10 @@ def test_moved_or_silent_accelerometer_gives_no_gravity(samples: list[Any]) -> N
 class Stubborn:
     """Motion sensor that does not start."""
 
-    def open(self, *_: Any) -> None:
+    def refuse(self, *_: Any) -> None:
         raise RuntimeError("no permission")
 
-    stop = close = start = open
+    open = start = stop = close = refuse
 
 
 def test_accelerometer_that_does_not_start_is_no_error() -> None:
