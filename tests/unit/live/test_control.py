@@ -12,6 +12,7 @@ from nlos_calibration import load_measured
 from small_frames import FrameCamera, sheet_network
 from view_streams import saved_moments
 
+from nlos_cam.camera import SimulatedCamera
 from nlos_cam.errors import NlosCamError
 from nlos_cam.live import RunControl, RunReport, run_live
 from nlos_cam.live.statistics import WARM_UP_FRAMES
@@ -304,3 +305,26 @@ def test_reference_ends_with_the_run(control: RunControl, monkeypatch: pytest.Mo
     control.end()
     with pytest.raises(NlosCamError, match="ended"):
         control.run("take_reference", {"frames": 5})
+
+
+def test_page_says_that_a_recording_has_no_room(
+    tmp_path: Path, noise_world: Any, hurried_clock: Any
+) -> None:
+    control = RunControl(folder=tmp_path)
+    with SimulatedCamera("sim:noise", noise_world(), clock=hurried_clock()) as camera:
+        control.attach(camera, Pipeline(CalibratedRig(RIG), sheet_network))
+        frames = control.watch(camera)
+        next(frames)
+        control.run("record", {})
+        before = control.status()
+        control.recording.recording._recording._free = lambda _: 0
+        for _ in range(40):
+            next(frames)
+        during = control.status()
+        answer = control.run("stop_recording", {})
+
+    assert before["warnings"] == []
+    assert "the recording has ended" in during["warnings"][0]
+    assert during["recording"]["seconds"] < 1.1
+    assert "the disk is full" in answer
+    assert control.status()["warnings"] == []
