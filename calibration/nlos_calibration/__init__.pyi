@@ -4,6 +4,7 @@ __all__ = [
     "FACING_RANGE_DEG",
     "FULL_SCALE",
     "GAP_RANGE_M",
+    "G_M_S2",
     "INTERVAL_STDS",
     "MAP_SHAPE",
     "PAPER_MM",
@@ -93,7 +94,7 @@ from .board_pose import PrintErrors, fit_board
 from .board_wall import BoardRecord, WallByBoard, wall_with_board
 from .drift import WINDOW_FRAMES, Drift, DriftCheck, settings_changed
 from .geometry import Intrinsics, facing_angle_rad, normal_from_angles, wall_from_plane
-from .gravity import Gravity, WayUp, is_gravity, roll_deg, turn_problem, way_up
+from .gravity import G_M_S2, Gravity, WayUp, is_gravity, roll_deg, turn_problem, way_up
 from .noise import (
     INTERVAL_STDS,
     QUANTUM_M,

@@ -7,9 +7,8 @@ from threading import Event, Thread
 from typing import Any, Self
 
 import numpy as np
-from nlos_calibration import Gravity, Intrinsics, Rig
+from nlos_calibration import G_M_S2, Gravity, Intrinsics, Rig
 from nlos_calibration.arrays import Float32
-from nlos_calibration.gravity import G_M_S2
 from numpy.typing import NDArray
 
 from nlos_cam.camera.fault_injection import Delivery, FaultyDevice

@@ -84,6 +84,7 @@ def test_camera_upside_down_is_refused(run: Run, said: tuple[str, ...]) -> None:
     assert not RECORD.exists()
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("upside_down")
 def test_camera_that_hangs_on_purpose_is_measured(run: Run) -> None:
     assert run(*BARE, "--upside-down")["way_up"] == "upside down"
@@ -100,6 +101,7 @@ def test_upright_camera_is_recorded_by_gravity(run: Run) -> None:
     assert "by gravity" in REPORT.read_text(encoding="utf-8")
 
 
+@pytest.mark.slow
 def test_upright_camera_contradicts_upside_down(run: Run) -> None:
     answer = run(*BARE, "--upside-down", code=1)
     assert "leave out --upside-down" in answer["error"]["message"]
@@ -138,6 +140,7 @@ def test_owner_who_says_upside_down_hears_what_to_do(
     assert not RECORD.exists()
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("without_accelerometer")
 @pytest.mark.parametrize(
     ("options", "way_up"),

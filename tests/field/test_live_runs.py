@@ -132,6 +132,7 @@ def test_camera_turned_over_since_its_calibration_is_said(
     assert any("turned by 180°" in warning for warning in found["warnings"])
 
 
+@pytest.mark.slow
 def test_camera_rolled_a_little_is_no_other_camera(
     run: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -143,6 +144,7 @@ def test_camera_rolled_a_little_is_no_other_camera(
     assert not any("turned" in warning for warning in found["warnings"])
 
 
+@pytest.mark.slow
 def test_camera_upside_down_without_a_record_is_said(
     run: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from nlos_calibration import roll_deg, way_up
 from nlos_calibration.gravity import G_M_S2
+from rewritten_bags import Messages, rewrite
 
 from nlos_cam.camera import SimulatedCamera, gravity_of
 from nlos_cam.camera.accelerometer import Accelerometer
@@ -62,6 +63,17 @@ def test_recording_replays_its_gravity(
 
     assert len(found) == 20
     np.testing.assert_allclose(found, np.tile(expected, (20, 1)), atol=1e-5)
+
+
+def test_damaged_accelerometer_costs_no_frame(noise_bag: Path, tmp_path: Path) -> None:
+    def cut(topic: str, time_ns: int, raw: bytes) -> Messages:
+        yield time_ns, raw[:40] if topic.endswith("/imu/data") else raw
+
+    with ReplayCamera(rewrite(noise_bag, tmp_path / "cut.bag", cut)) as camera:
+        frames = list(camera)
+
+    assert len(frames) == 20
+    assert frames[-1].gravity_m_s2 is None
 
 
 def test_gravity_is_rotated_into_the_lidars_frame() -> None:

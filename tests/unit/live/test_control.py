@@ -17,7 +17,7 @@ from nlos_cam.errors import NlosCamError
 from nlos_cam.live import RunControl, RunReport, run_live
 from nlos_cam.live.statistics import WARM_UP_FRAMES
 from nlos_cam.reconstruct import CalibratedRig, Pipeline
-from nlos_cam.view import NullViewer
+from nlos_cam.view import NullViewer, WrittenFiles
 
 
 @pytest.fixture
@@ -328,3 +328,14 @@ def test_page_says_that_a_recording_has_no_room(
     assert during["recording"]["seconds"] < 1.1
     assert "the disk is full" in answer
     assert control.status()["warnings"] == []
+
+
+def test_page_lists_the_last_files_and_keeps_all(tmp_path: Path) -> None:
+    files = WrittenFiles()
+    for number in range(20):
+        path = tmp_path / f"{number}.npz"
+        path.touch()
+        files.note(path)
+
+    assert files.newest == [f"{number}.npz" for number in range(8, 20)]
+    assert files["0.npz"] == tmp_path / "0.npz"
