@@ -9,7 +9,7 @@ from typing import Any, TypeVar
 
 import numba
 import numpy as np
-from nlos_calibration import Intrinsics
+from nlos_calibration import Gravity, Intrinsics
 from nlos_calibration.arrays import Float32, Int32
 from numpy.typing import NDArray
 
@@ -66,6 +66,10 @@ class Frame:
     intrinsics: Intrinsics
     settings: Mapping[str, float] = field(default_factory=dict[str, float])
     """The device's options as read back at the start of streaming."""
+    gravity_m_s2: Gravity | None = None
+    """Mean of the device's accelerometer over the last second, pointing down, in the lidar frame;
+    None without one, and while the device is moved.
+    """
     truth_depth_m: Float32 | None = None
     """(64, 64) hidden depth over the object box, if known (as by a simulated camera)."""
 

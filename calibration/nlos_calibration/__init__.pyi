@@ -4,6 +4,7 @@ __all__ = [
     "FACING_RANGE_DEG",
     "FULL_SCALE",
     "GAP_RANGE_M",
+    "G_M_S2",
     "INTERVAL_STDS",
     "MAP_SHAPE",
     "PAPER_MM",
@@ -22,6 +23,7 @@ __all__ = [
     "DriftCheck",
     "Extent",
     "Finite",
+    "Gravity",
     "Intrinsics",
     "LidarPose",
     "MeanNoise",
@@ -40,6 +42,7 @@ __all__ = [
     "WallByBoard",
     "WallFit",
     "WallRecord",
+    "WayUp",
     "board_agreement",
     "corner_rays",
     "depth_noise_m",
@@ -53,6 +56,7 @@ __all__ = [
     "fit_wall",
     "fit_with_tape_distance",
     "footprint",
+    "is_gravity",
     "is_wall_record",
     "lidar_visible_share",
     "load_measured",
@@ -68,14 +72,17 @@ __all__ = [
     "record_kind",
     "rig_difference",
     "rig_named",
+    "roll_deg",
     "save_reference",
     "settings_changed",
+    "turn_problem",
     "wall_depth",
     "wall_facts",
     "wall_from_plane",
     "wall_from_zero",
     "wall_points_m",
     "wall_with_board",
+    "way_up",
     "with_base",
     "with_degrees",
     "with_mm",
@@ -87,6 +94,7 @@ from .board_pose import PrintErrors, fit_board
 from .board_wall import BoardRecord, WallByBoard, wall_with_board
 from .drift import WINDOW_FRAMES, Drift, DriftCheck, settings_changed
 from .geometry import Intrinsics, facing_angle_rad, normal_from_angles, wall_from_plane
+from .gravity import G_M_S2, Gravity, WayUp, is_gravity, roll_deg, turn_problem, way_up
 from .noise import (
     INTERVAL_STDS,
     QUANTUM_M,

@@ -4,6 +4,7 @@ The report, the live view and the terminal all show these rows.
 """
 
 from nlos_calibration.board_wall import BoardRecord
+from nlos_calibration.gravity import roll_deg
 from nlos_calibration.noise import with_degrees, with_mm
 from nlos_calibration.wall_record import WallRecord
 
@@ -60,10 +61,20 @@ def wall_facts(record: WallRecord) -> list[Row]:
     view = f"{100.0 * record.footprint_share:.1f} %"
     rows.append(("view on the wall", view, "of the map's 64 x 80 cells"))
     rows.append(("measured on", f"{record.created}", f"{record.frames} frames averaged"))
+    rows.append(_way_up_row(record))
     if celsius := record.temperatures_c.values():
         span = dict.fromkeys(f"{value:.1f}" for value in (min(celsius), max(celsius)))
         rows.append(("temperature", f"{' to '.join(span)} °C", "of the camera"))
     return rows
+
+
+def _way_up_row(record: WallRecord) -> Row:
+    if record.gravity_m_s2 is not None:
+        roll = roll_deg(record.gravity_m_s2)
+        return "camera", record.way_up, f"by gravity: rolled by {roll:+z.1f}° about its axis"
+    if record.way_up == "unknown":
+        return "camera", "upright?", "not known: it has no accelerometer, and nobody was asked"
+    return "camera", record.way_up, "as its owner said: it has no accelerometer"
 
 
 def board_agreement(board: BoardRecord) -> str:

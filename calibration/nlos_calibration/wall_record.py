@@ -14,6 +14,7 @@ from pydantic import BeforeValidator, Field, model_validator
 from nlos_calibration.arrays import Float64
 from nlos_calibration.board_wall import BoardRecord, WallByBoard
 from nlos_calibration.geometry import Intrinsics
+from nlos_calibration.gravity import Gravity, WayUp
 from nlos_calibration.occluder import OccluderFit
 from nlos_calibration.range_offset import Cause
 from nlos_calibration.reference import BareWall, load_reference
@@ -64,6 +65,10 @@ class WallRecord(Record):
     """Device options as read back when streaming began."""
     temperatures_c: dict[str, Finite] = Field(default_factory=dict)
     """Means during the measurement, by the SDK's name; empty where the device reports none."""
+    gravity_m_s2: Gravity | None = None
+    """Mean of the accelerometer in the lidar frame, pointing down; None without one."""
+    way_up: WayUp = "unknown"
+    """By gravity, or as the owner said."""
     frames: Annotated[int, Field(gt=0)]
     """Number of frames averaged."""
     distance_m: Positive

@@ -1,7 +1,9 @@
 __all__ = [
+    "TURN_IT",
     "CaptureStatistics",
     "FrameFit",
     "WallFiles",
+    "check_way_up",
     "collect_statistics",
     "fit_frame",
     "measure_by_board",
@@ -14,8 +16,10 @@ __all__ = [
 from .board_pdf import write_board_pdf
 from .files import WallFiles, write_record
 from .measure import (
+    TURN_IT,
     CaptureStatistics,
     FrameFit,
+    check_way_up,
     collect_statistics,
     fit_frame,
     measure_by_board,

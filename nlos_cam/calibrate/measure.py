@@ -33,6 +33,8 @@ class CaptureStatistics:
     serial: str
     firmware: str
     settings: Mapping[str, float]
+    gravity_m_s2: walls.Gravity | None = None
+    """By the accelerometer's last second; None without one."""
 
     def reference(self, inliers: NDArray[np.bool_]) -> walls.BareWall:
         """Return the bench's reference for difference maps; `inliers` (height, width) are the
@@ -47,6 +49,8 @@ class CaptureStatistics:
             "firmware": self.firmware,
             "settings": dict(self.settings),
             "temperatures_c": self.statistics.celsius(),
+            "gravity_m_s2": self.gravity_m_s2,
+            "way_up": walls.way_up(self.gravity_m_s2),
         }
 
     def record(
@@ -77,10 +81,12 @@ def collect_statistics(
     """
     statistics = walls.BareWallStatistics(camera.intrinsics)
     settings = dict[str, float]()
+    gravity_m_s2: walls.Gravity | None = None
     for number, frame in enumerate(islice(camera, frames)):
         maps = maps_from_frame(frame)
         statistics.add(frame.depth_m, frame.ir, maps.depth_m, maps.intensity)
         settings = dict(frame.settings)
+        gravity_m_s2 = frame.gravity_m_s2 or gravity_m_s2
         if number % CELSIUS_EVERY == 0:
             statistics.add_temperatures(camera.telemetry("_temperature"))
         on_frame()
@@ -90,7 +96,36 @@ def collect_statistics(
         )
     serial = camera.identity.get("serial", "")
     firmware = camera.identity.get("firmware", "")
-    return CaptureStatistics(camera.uri, statistics, camera.intrinsics, serial, firmware, settings)
+    return CaptureStatistics(
+        camera.uri, statistics, camera.intrinsics, serial, firmware, settings, gravity_m_s2
+    )
+
+
+TURN_IT = (
+    "and pictures would be too: turn it over, with the thread of its screw down and the object's"
+    " side on the right of its view, or accept that with --upside-down"
+)
+
+
+def check_way_up(gravity_m_s2: walls.Gravity | None, said: walls.WayUp) -> walls.WayUp:
+    """Return the way up of a camera: by gravity or, where that is not known, as its owner `said`.
+
+    Raises CalibrationError for a camera that is not upright, unless the owner said so, and where
+    gravity contradicts the owner.
+    """
+    found = walls.way_up(gravity_m_s2)
+    if found == "unknown":
+        return said
+    if found == said or (found == "upright" and said == "unknown"):
+        return found
+    if found == "upright":
+        raise CalibrationError("by gravity the camera is upright: leave out --upside-down")
+    if found == "on its side":
+        raise CalibrationError(
+            "by gravity the camera is on its side, and the object's side must be on the right of"
+            " its view: turn it upright, with the thread of its screw down"
+        )
+    raise CalibrationError(f"by gravity the camera is upside down, {TURN_IT}")
 
 
 NEAR_WALL_M = 0.02
@@ -172,6 +207,8 @@ def measure_occluder(
             f"the bare wall was measured with the camera {record.serial}, this is {capture.serial}:"
             " use that camera, or calibrate the bare wall with this one"
         )
+    if turned := walls.turn_problem(capture.gravity_m_s2, record.gravity_m_s2, record.way_up):
+        raise WallRefusedError(turned)
     offset_m = walls.depth_offset_m(record)
     depth_m = statistics.mean_m() + offset_m
     noise = statistics.noise()

@@ -158,11 +158,32 @@ def _quantities(by: walls.BoardRecord | walls.WallRecord) -> tuple[str, ...]:
     )
 
 
-UPRIGHT = (
-    "Not measured: which way is up. A bench is symmetric about the lidar's height, so a camera that"
-    " hangs upside down shows the mirror image, with every check content. Look at the picture: the"
-    " top of the view is the top of the room."
+NOT_KNOWN = (
+    "Not known: which way up the camera is. A bench is symmetric about the lidar's height, so that"
+    " no image shows it, and pictures of a camera upside down are too, with every check content."
+    " Look: is the thread of its screw down? To record the answer, measure again with --upright."
 )
+TURNED = (
+    "Pictures turn with the camera: their top is the side that is up in the camera's own image. On"
+    " the wall, x still points from the lidar's foot to the object's side, and y to that top."
+)
+
+
+def way_up(record: walls.WallRecord) -> str:
+    """Return in words which way up the camera is, and how that is known."""
+    if record.way_up == "unknown" and record.gravity_m_s2 is None:
+        return NOT_KNOWN
+    if record.way_up == "unknown":
+        return "The camera looks steeply up or down, so that no side of its pictures is up."
+    if record.gravity_m_s2 is None:
+        text = f"The camera is {record.way_up}, as its owner said: it has no accelerometer."
+    else:
+        roll = walls.roll_deg(record.gravity_m_s2)
+        text = (
+            f"The camera is {record.way_up}: by gravity it is rolled by {roll:+z.1f}° about its"
+            " optical axis. live and replay compare with that."
+        )
+    return text if record.way_up == "upright" else f"{text} {TURNED}"
 
 
 def device(wall: walls.MeasuredWall) -> str:
@@ -187,7 +208,7 @@ def device(wall: walls.MeasuredWall) -> str:
     )
     return (
         "<section><h2>What it was measured with</h2>"
-        f"<div class='columns'>{tables}</div><p>{UPRIGHT}</p></section>"
+        f"<div class='columns'>{tables}</div><p>{escape(way_up(record))}</p></section>"
     )
 
 

@@ -28,6 +28,7 @@ __all__ = [
     "frame_in_si",
     "free_bytes",
     "full_uri",
+    "gravity_of",
     "intrinsics_of",
     "load_sdk",
     "open_camera",
@@ -42,6 +43,7 @@ __all__ = [
     "stream_name",
 ]
 
+from .accelerometer import gravity_of
 from .l515 import DeviceInfo, connected, find_l515, shared_context
 from .protocol import Camera, OnProgress, WallClock
 from .recorder import RESERVE_BYTES, Recording, check_room, free_bytes, recording_s, repair_command

@@ -10,6 +10,7 @@ from typing import Any, Self
 from nlos_calibration import Intrinsics, Rig
 from nlos_calibration.arrays import Float32
 
+from nlos_cam.camera.accelerometer import Accelerometer
 from nlos_cam.camera.protocol import WaitingClock, WallClock
 from nlos_cam.camera.recorder import Recording
 from nlos_cam.camera.recovery import NO_INTRINSICS, Hooks, Recovery
@@ -106,7 +107,8 @@ class LiveCamera:
             sensor, profiles = find_streams(self._device, self._size)
             missing = [stream for stream in FORMATS if stream not in profiles]
             if not missing:
-                return Session(sensor, profiles, SampleQueue(self._on_set))
+                accelerometer = Accelerometer.of(self._device, profiles["depth"])
+                return Session(sensor, profiles, SampleQueue(self._on_set), accelerometer)
         except RuntimeError as error:
             raise CameraError(
                 f"{self.uri} cannot be read ({error}): unplug it, wait 10 s, plug it in again"

@@ -13,6 +13,7 @@ from nlos_calibration import Intrinsics
 from nlos_calibration.arrays import Float32
 
 from nlos_cam.camera import streams
+from nlos_cam.camera.accelerometer import Accelerometer
 from nlos_cam.camera.timestamps import ClockUnwrap
 from nlos_cam.frames import Frame
 from nlos_cam.threads import BoundedQueue
@@ -142,13 +143,20 @@ class Session:
     Samples come on the SDK's threads. Errors are the SDK's RuntimeError.
     """
 
-    def __init__(self, sensor: Any, profiles: Mapping[str, Any], inbox: SampleQueue) -> None:
+    def __init__(
+        self,
+        sensor: Any,
+        profiles: Mapping[str, Any],
+        inbox: SampleQueue,
+        accelerometer: Accelerometer | None = None,
+    ) -> None:
         self.inbox = inbox
         self.settings: dict[str, float] = {}
         self.intrinsics: Intrinsics = streams.intrinsics_of(profiles["depth"])
         inbox.expect((self.intrinsics.height, self.intrinsics.width))
         self._sensor: Any = sensor
         self._profiles = list(profiles.values())
+        self._accelerometer = accelerometer
         if (unit_m := read_settings(sensor).get("depth_units")) is None:
             raise RuntimeError("it does not report its depth unit")
         self._unit_m = unit_m
@@ -166,6 +174,8 @@ class Session:
 
         Raises RuntimeError when the device vanishes during this.
         """
+        if self._accelerometer:  # first, so that a recording has it
+            self._accelerometer.start()
         self._sensor.open(self._profiles)
         self._listening = False
         self._sensor.start(self._on_frame)
@@ -237,11 +247,14 @@ class Session:
             # A device that vanished or never started is already stopped.
             with suppress(RuntimeError):
                 end()
+        if self._accelerometer:
+            self._accelerometer.stop()
         self._sensor = None
         self._profiles.clear()
 
     def frame(self, found: streams.FrameSet, truth_depth_m: Float32 | None = None) -> Frame:
         """Return a set in SI units."""
+        gravity_m_s2 = self._accelerometer.gravity() if self._accelerometer else None
         return streams.frame_in_si(
-            found, self._unit_m, self.intrinsics, self.settings, truth_depth_m
+            found, self._unit_m, self.intrinsics, self.settings, truth_depth_m, gravity_m_s2
         )

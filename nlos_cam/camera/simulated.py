@@ -2,11 +2,12 @@
 
 from collections import deque
 from collections.abc import Collection, Mapping, Sequence
+from math import cos, radians, sin
 from threading import Event, Thread
 from typing import Any, Self
 
 import numpy as np
-from nlos_calibration import Intrinsics, Rig
+from nlos_calibration import G_M_S2, Gravity, Intrinsics, Rig
 from nlos_calibration.arrays import Float32
 from numpy.typing import NDArray
 
@@ -24,6 +25,7 @@ from nlos_cam.render import DEPTH_UNIT_M, Fault, SensedImages
 NAME = "Simulated L515"
 SERIAL = "simulated"
 SENSOR_NAME = "L500 Depth Sensor"
+MOTION_NAME = "Motion Module"
 
 
 class SoftwareLidar:
@@ -32,7 +34,7 @@ class SoftwareLidar:
     It has the L515's sensor name, streams, formats and depth unit, and streams at one size; with
     `has_other_size` also at half the rows and columns. Timestamps are host time, or the device's
     with `has_own_clock`. Its options are the depth unit and the temperatures `celsius`, by the
-    SDK's names, which stay constant.
+    SDK's names, which stay constant. With `has_accelerometer` it has an L515's second sensor too.
     """
 
     def __init__(
@@ -43,6 +45,7 @@ class SoftwareLidar:
         celsius: Mapping[str, float] | None = None,
         has_other_size: bool = False,
         has_own_clock: bool = False,
+        has_accelerometer: bool = False,
     ) -> None:
         self._sdk = sdk
         domains = sdk.timestamp_domain
@@ -60,6 +63,7 @@ class SoftwareLidar:
         for size in sizes if has_other_size else sizes[:1]:
             for stream in FORMATS:
                 self._profiles[stream, (size.height, size.width)] = self._add(stream, size)
+        self._motion = self._add_accelerometer() if has_accelerometer else None
         self._register_extrinsics()
 
     def _add(self, stream: str, size: Intrinsics) -> Any:
@@ -88,13 +92,29 @@ class SoftwareLidar:
         lens.coeffs = [0.0] * 5
         return lens
 
+    def _add_accelerometer(self) -> tuple[Any, Any]:
+        """Return the motion sensor and the profile of its accelerometer."""
+        sensor = self.device.add_sensor(MOTION_NAME)
+        motion = self._sdk.motion_stream()
+        motion.type = self._sdk.stream.accel
+        motion.index = 0
+        motion.uid = len(self._profiles)
+        motion.fps = FRAMES_PER_S
+        motion.fmt = self._sdk.format.motion_xyz32f
+        exact = self._sdk.motion_device_intrinsic()
+        exact.data = np.eye(3, 4).tolist()
+        exact.noise_variances = exact.bias_variances = [0.0] * 3
+        motion.intrinsics = exact
+        return sensor, sensor.add_motion_stream(motion, True).as_motion_stream_profile()
+
     def _register_extrinsics(self) -> None:
         """Declare that all streams share one origin; without it, playback fails."""
         same = self._sdk.extrinsics()
         same.rotation = np.eye(3).ravel().tolist()
         same.translation = [0.0] * 3
-        for one in self._profiles.values():
-            for other in self._profiles.values():
+        profiles = [*self._profiles.values(), *([self._motion[1]] if self._motion else [])]
+        for one in profiles:
+            for other in profiles:
                 if one is not other:
                     one.register_extrinsics_to(other, same)
 
@@ -116,6 +136,20 @@ class SoftwareLidar:
         for (stream, shape), profile in self._profiles.items():
             if stream in streams and shape == images.ir.shape:
                 self._push(profile, stream, number, timestamp_s, pixels[stream])
+
+    def push_gravity(self, number: int, timestamp_s: float, gravity_m_s2: Gravity) -> None:
+        """Deliver a sample of the accelerometer, if there is one, of a device at rest."""
+        if self._motion is None:
+            return
+        up = self._sdk.vector()
+        up.x, up.y, up.z = (-component for component in gravity_m_s2)
+        frame = self._sdk.software_motion_frame()
+        frame.data = up
+        frame.timestamp = timestamp_s * 1e3
+        frame.frame_number = number
+        frame.domain = self._domain
+        sensor, frame.profile = self._motion
+        sensor.on_motion_frame(frame)
 
     def _push(
         self, profile: Any, stream: str, number: int, timestamp_s: float, pixels: NDArray[Any]
@@ -152,11 +186,14 @@ class SimulatedCamera(LiveCamera):
     `faults`.
 
     A thread of its own delivers frames while entered; the world goes on through faults of the
-    device. Not modeled: the seconds that a start takes, options and presets beyond depth unit and
-    temperatures, other resolutions, the color camera and motion sensors, per-frame metadata, clock
-    drift and jitter, faults that are not given, and the cooling of an unplugged device. For the
-    images, see `World` and `Sensor`.
+    device. Its accelerometer has one sample a frame, without noise. Not modeled: the seconds that
+    a start takes, options and presets beyond depth unit and temperatures, other resolutions, the
+    color camera and gyroscope, per-frame metadata, clock drift and jitter, faults that are not
+    given, and the cooling of an unplugged device. For the images, see `World` and `Sensor`.
     """
+
+    roll_deg = 0.0
+    """Roll of camera and bench together, 180 upside down: only the accelerometer shows it."""
 
     def __init__(
         self,
@@ -209,6 +246,7 @@ class SimulatedCamera(LiveCamera):
             celsius=self._world.celsius(instant),
             has_other_size=self._model.has_other_size,
             has_own_clock=self._model.has_own_clock,
+            has_accelerometer=True,
         )
 
     def _begin(self, inbox: SampleQueue) -> None:
@@ -293,6 +331,7 @@ class SimulatedCamera(LiveCamera):
 
             if self._clock.wait(self._stopping, due_s - self._clock.now()):
                 return
+            self._lidar.push_gravity(instant, due_s, level_gravity(self._world.rig, self.roll_deg))
             for delivery in self._model.deliver(instant, due_s, images):
                 self._push(delivery)
 
@@ -305,3 +344,15 @@ class SimulatedCamera(LiveCamera):
         if len(self._instants) > MAX_TRUTHS:
             del self._instants[next(iter(self._instants))]
         self._lidar.push(delivery.number, delivery.timestamp_s, delivery.images, delivery.streams)
+
+
+def level_gravity(rig: Rig, roll_deg: float = 0.0) -> Gravity:
+    """Return gravity in the lidar frame of a bench that stands level, or rolled by an angle
+    clockwise about the optical axis.
+    """
+    # The second row of the rotation is the wall's y axis, which is up, in the lidar frame. Rolled
+    # clockwise, the lidar sees all else turn counterclockwise: from its y (down) to its x (right).
+    x, y, z = -G_M_S2 * rig.wall_from_lidar[1, :3]
+    cosine = cos(radians(roll_deg))
+    sine = sin(radians(roll_deg))
+    return float(cosine * x + sine * y), float(cosine * y - sine * x), float(z)

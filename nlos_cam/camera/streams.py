@@ -9,7 +9,7 @@ from math import isfinite
 from typing import Any
 
 import numpy as np
-from nlos_calibration import Intrinsics
+from nlos_calibration import Gravity, Intrinsics
 from nlos_calibration.arrays import Float32
 from numpy.typing import NDArray
 
@@ -294,6 +294,7 @@ def frame_in_si(
     intrinsics: Intrinsics,
     settings: Mapping[str, float],
     truth_depth_m: Float32 | None = None,
+    gravity_m_s2: Gravity | None = None,
 ) -> Frame:
     """Return the frame of a set whose depth counts in units of `unit_m`; a count of 0 is NaN."""
     depth_m = found.depth_z16 * np.float32(unit_m)
@@ -306,5 +307,6 @@ def frame_in_si(
         frame_number=found.number,
         intrinsics=intrinsics,
         settings=settings,
+        gravity_m_s2=gravity_m_s2,
         truth_depth_m=truth_depth_m,
     )

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Literal, NamedTuple
 import nlos_calibration as walls
 import nlos_models as models
 import typer
+from nlos_calibration.errors import CalibrationError
 from rich.live import Live
 from rich.markup import escape
 from rich.table import Table
@@ -191,6 +192,13 @@ OccluderGap = Annotated[
         help="Gap between occluder's edge and wall measured by hand, in metres.",
     ),
 ]
+Upright = Annotated[
+    bool | None,
+    typer.Option(
+        "--upright/--upside-down",
+        help="Which way up the camera is, where it has no accelerometer (default: asked once).",
+    ),
+]
 Out = Annotated[Path | None, typer.Option("--out", help="Record to write (TOML).")]
 BenchToWrite = Annotated[
     Path | None,
@@ -216,6 +224,8 @@ JSON_FIELDS = {
     "warnings",
     "frames",
     "reference",
+    "gravity_m_s2",
+    "way_up",
 }
 """Fields of the record that --json prints."""
 
@@ -233,6 +243,7 @@ def calibrate(
     square_mm: SquareMm = None,
     occluder_x_m: OccluderX = None,
     occluder_gap_m: OccluderGap = None,
+    upright: Upright = None,
     out: Out = None,
     bench_folder: BenchToWrite = None,
     overwrite: Overwrite = False,
@@ -248,7 +259,7 @@ def calibrate(
     """
     uri = _source(camera, bag, wall=wall, occluder=occluder)
     by_hand = _entered(occluder_x_m, occluder_gap_m)
-    measured = board or tape_m is not None or by_hand
+    measured = board or tape_m is not None or by_hand or upright is not None
     _refuse_board_options(board=board, paper=paper, square_mm=square_mm, tape_m=tape_m)
     _refuse_occluder_options(occluder, out, measured=bool(measured), watch=watch)
     target = Target.of(bench_folder, occluder, out, overwrite=overwrite)
@@ -263,11 +274,12 @@ def calibrate(
     if target.bare:
         record, inliers = bench.measure_occluder(capture, target.bare)
     else:
+        way_up = _way_up(capture, upright)
         if board:
             fit, facts = bench.measure_by_board(capture, walls.BOARDS[paper or "a4"], square_mm)
         else:
             fit, facts = bench.measure_by_depth(capture, tape_m)
-        record = capture.record(fit, facts, by_hand)
+        record = capture.record(fit, facts | {"way_up": way_up}, by_hand)
         inliers = fit.inliers if isinstance(fit, walls.WallFit) else None
     record = target.write(record, None if inliers is None else capture.reference(inliers))
     fields = record.model_dump(mode="json", include=JSON_FIELDS)
@@ -306,7 +318,7 @@ def _refuse_occluder_options(
         return
     if measured:
         raise typer.BadParameter(
-            "--occluder uses a wall that was measured before: drop --board, --tape-m,"
+            "--occluder uses a wall that was measured before: drop --board, --tape-m, --upright,"
             " --occluder-x-m, -gap-m"
         )
     if watch:
@@ -418,6 +430,22 @@ def _capture(uri: str, frames: int) -> bench.CaptureStatistics:
     with _opened(uri) as source, progress() as bar:
         task = bar.add_task("Measuring the wall", total=frames)
         return bench.collect_statistics(source, frames, lambda: bar.advance(task))
+
+
+def _way_up(capture: bench.CaptureStatistics, upright: bool | None) -> walls.WayUp:
+    """Return the way up of a camera; a person at a terminal is asked where it has no accelerometer.
+
+    Raises CalibrationError as `check_way_up`.
+    """
+    said: walls.WayUp = "unknown"
+    if upright is not None:
+        said = "upright" if upright else "upside down"
+    elif capture.gravity_m_s2 is None and sys.stdin.isatty():
+        question = "Is the camera upright, with the thread of its screw down?"
+        if not typer.confirm(question, default=True, err=True):
+            raise CalibrationError(f"the camera is upside down, {bench.TURN_IT}")
+        said = "upright"
+    return bench.check_way_up(capture.gravity_m_s2, said)
 
 
 SheetOut = Annotated[Path | None, typer.Option("--out", help="PDF to write.")]

@@ -67,13 +67,7 @@ def problem_of(check: Callable[[], object]) -> str:
 def describe_bag(path: Path, verify: bool) -> Description:
     """Describe a recording from its index, or with `verify` from every message."""
     from nlos_cam.camera import FORMATS, OPTIONAL
-    from nlos_cam.recording import (
-        BagReader,
-        load_sidecar,
-        no_frames,
-        open_recording,
-        sidecar_path,
-    )
+    from nlos_cam.recording import load_sidecar, open_recording, sidecar_path
 
     bag = open_recording(path)
     facts = {
@@ -104,8 +98,6 @@ def describe_bag(path: Path, verify: bool) -> Description:
         except (RecordingError, KeyError) as error:
             facts["sidecar"] = f"not readable: {error}"
     problem = problem_of(bag.check) if verify else ""
-    if isinstance(bag, BagReader) and not bag.streams:
-        problem = no_frames(bag)
     quoted = shlex.quote(str(path))
     is_lidar = all(
         stream in bag.streams and bag.streams[stream].format == form

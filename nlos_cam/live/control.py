@@ -36,8 +36,6 @@ MAX_DROPS = 3
 """Of so many frames (2 s), the number of dropped ones above which the run is too slow."""
 LOADING_S = 4.0
 """Time that the networks take to load, between a pre-rendering and the first frame."""
-MAX_FILES = 12
-"""Last files that the page offers for download."""
 COMMAND_WAIT_S = 0.5
 """Time after which a command without an answer waits: most take milliseconds."""
 MAX_NUMBER = 1e9
@@ -215,7 +213,7 @@ class RunControl:
             "state": "paused" if is_paused else self._state,
             "message": self._message,
             "camera": self._camera_name,
-            "warnings": list(self.warnings),
+            "warnings": [*self.warnings, *self.recording.problems],
             **self._pace(now_s),
         }
         camera = self._run.camera
@@ -225,7 +223,7 @@ class RunControl:
             with suppress(OSError):  # the folder may have gone away
                 free = free_bytes(self._run.folder / "any.bag")
                 status["disk_s"] = round(recording_s(camera.intrinsics, free))
-        if recording := self._recording_status(now_s):
+        if recording := self._recording_status():
             status["recording"] = recording
         status["control"] = self._control_status()
         return status
@@ -248,11 +246,10 @@ class RunControl:
             "dropped": newest.dropped,
         }
 
-    def _recording_status(self, now_s: float) -> dict[str, Any] | None:
+    def _recording_status(self) -> dict[str, Any] | None:
         """Return path and duration of the recording that runs, by a command or by --record."""
         if by_command := self.recording.recording:
-            seconds = now_s - by_command.start_s
-            return {"path": str(by_command.path), "seconds": round(seconds, 1)}
+            return {"path": str(by_command.path), "seconds": round(by_command.seconds, 1)}
         camera = self._run.camera
         by_option = camera.recording if isinstance(camera, RecordableCamera) else None
         if by_option:
@@ -271,7 +268,7 @@ class RunControl:
             "paused": self.pipeline.paused,
             "recording": self.recording.recording is not None,
             "saving": self.saving.is_saving,
-            "files": list(self._run.files)[-MAX_FILES:],
+            "files": self._run.files.newest,
             "no_reference": self.bench.no_reference,
             "note": (
                 f"{self._camera_name} has no laser or near-wall settings" if has_no_options else ""

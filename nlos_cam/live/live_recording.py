@@ -8,7 +8,6 @@ from nlos_cam import recording as recordings
 from nlos_cam.camera import FRAMES_PER_S, Camera, Recording
 from nlos_cam.errors import NlosCamError
 from nlos_cam.frames import Frame
-from nlos_cam.reconstruct import Clock
 
 
 @runtime_checkable
@@ -36,13 +35,12 @@ class LiveRecording:
     Raises NlosCamError for a camera that cannot be recorded, and the errors of `Recording`.
     """
 
-    def __init__(self, camera: Camera, path: Path, label: str | None, clock: Clock) -> None:
+    def __init__(self, camera: Camera, path: Path, label: str | None) -> None:
         if not isinstance(camera, RecordableCamera):
             raise NlosCamError(
                 f"{camera.uri} cannot be recorded: only a live camera (l515, sim) can"
             )
         self.path = path
-        self.start_s = clock()
         self._recordable = camera
         self._counts = camera.counts
         self._target = recordings.CaptureTarget(path, label)
@@ -60,6 +58,18 @@ class LiveRecording:
         if self._recording.covers(frame.timestamp_s):
             self._meter.add(frame)
             self._sidecar.on_frame(frame)
+
+    @property
+    def seconds(self) -> float:
+        """Recorded time so far."""
+        return self._recording.sets / FRAMES_PER_S
+
+    @property
+    def problem(self) -> str:
+        """Reason why no more is recorded, for the page; empty while frames are."""
+        if not self._recording.disk_full:
+            return ""
+        return f"{self.path.name} cannot grow (disk full?): the recording has ended, stop it"
 
     def stop(self) -> str:
         """Close the file, read it back, write the sidecar's end, and return the outcome in words.

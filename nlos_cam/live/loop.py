@@ -89,6 +89,9 @@ class CameraNotes(logging.Handler):
 
     def emit(self, record: logging.LogRecord) -> None:
         self.newest = record.getMessage()
+        # Without any other handler Python prints a warning itself; this one would keep it from that.
+        if logging.lastResort and not logging.getLogger().handlers:
+            logging.lastResort.handle(record)
 
     def __enter__(self) -> Self:
         logging.getLogger("nlos_cam.camera").addHandler(self)

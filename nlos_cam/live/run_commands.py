@@ -185,6 +185,12 @@ class RecordingCommands:
     def commands(self) -> Commands:
         return {"record": self.record, "stop_recording": self.stop_recording}
 
+    @property
+    def problems(self) -> list[str]:
+        """Reason why the recording that runs takes no more; empty while it does, or none runs."""
+        recording = self.recording
+        return [recording.problem] if recording and recording.problem else []
+
     def record(self, label: str = "") -> str:
         """Record the camera's streams from now on, with a sidecar that holds the label."""
         camera, _ = self._run.attached()
@@ -193,7 +199,7 @@ class RecordingCommands:
         label = str(label)
         name = re.sub(r"[^\w.-]+", "-", label).strip("-.")[:60]
         path = self._run.new_file(name or "live", ".bag")
-        self.recording = LiveRecording(camera, path, label or None, self._run.clock)
+        self.recording = LiveRecording(camera, path, label or None)
         self._run.on_frame.append(self.recording.add)
         return f"recording {path}"
 
@@ -301,6 +307,8 @@ def measure_bench(
         except OccluderRefusedError:  # a bare wall, without one
             pass
     fit, facts = calibrate.measure_by_depth(capture)
+    if measured and capture.gravity_m_s2 is None:
+        facts["way_up"] = measured.record.way_up
     return capture.record(fit, facts), fit.inliers
 
 

@@ -25,7 +25,7 @@ class BenchObservation:
     """Maps less those of the bare wall, valid where both are; None without a reference."""
     warnings: tuple[str, ...]
     moved: bool = False
-    """The lidar has moved, or something hides the wall from it."""
+    """The lidar has moved or was turned, or something hides the wall from it."""
 
 
 class CalibratedRig:
@@ -53,13 +53,16 @@ class CalibratedRig:
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """Warnings that hold for every frame: the notes, and a record that calls itself
-        doubtful.
+        """Warnings that hold for every frame: the notes, a record that calls itself doubtful, and
+        one of a camera that is upside down.
         """
-        if self.measured is None or self.measured.record.verdict != "doubtful":
-            return self.notes
-        advice = self.measured.record.advice
-        return (*self.notes, f"the wall's record calls itself doubtful: {advice}")
+        notes = list(self.notes)
+        record = self.measured.record if self.measured else None
+        if record and record.verdict == "doubtful":
+            notes.append(f"the wall's record calls itself doubtful: {record.advice}")
+        if record and record.way_up not in {"upright", "unknown"}:
+            notes.append(f"the camera is {record.way_up}, as its record says: so are the pictures")
+        return tuple(notes)
 
     def update_temperatures(self, celsius: Mapping[str, float]) -> None:
         """Pass one reading of the device's temperatures to the drift check."""
@@ -70,11 +73,23 @@ class CalibratedRig:
         """Return the difference of the maps, which may be a mean over frames, and the drift up to
         this frame.
         """
+        turned = self.turn_problem(frame)
+        warnings = (*self.warnings, turned) if turned else self.warnings
         if self.reference is None or self._drift is None:
-            return BenchObservation(None, self.warnings)
+            return BenchObservation(None, warnings, bool(turned))
         self._drift.observe(frame.depth_m, frame.settings)
         difference = self._subtract_drift(subtract_reference(maps, self.reference))
-        return BenchObservation(difference, self.warnings + self._drift.warnings, self._drift.moved)
+        moved = self._drift.moved or bool(turned)
+        return BenchObservation(difference, warnings + self._drift.warnings, moved)
+
+    def turn_problem(self, frame: Frame) -> str:
+        """Return in one line how the lidar was turned since its wall was measured, by gravity;
+        empty where it was not, or has no accelerometer.
+        """
+        if self.measured is None:
+            return walls.turn_problem(frame.gravity_m_s2)
+        record = self.measured.record
+        return walls.turn_problem(frame.gravity_m_s2, record.gravity_m_s2, record.way_up)
 
     def _subtract_drift(self, difference: LidarMaps) -> LidarMaps:
         """Return the difference less the range drift of the last second, if all depths have drifted

@@ -24,7 +24,6 @@ __all__ = [
     "is_ros2",
     "load_measured_wall",
     "load_sidecar",
-    "no_frames",
     "open_lidar_bag",
     "open_recording",
     "repair_recording",
@@ -33,7 +32,7 @@ __all__ = [
     "with_telemetry",
 ]
 
-from .bag_reader import SAMPLE, BagReader, no_frames
+from .bag_reader import SAMPLE, BagReader
 from .capture import CaptureResult, CaptureSession, CaptureTarget, finalize
 from .export import ExportOptions, ExportResult, Format, export_recording
 from .formats import is_ros2, open_recording

@@ -45,6 +45,7 @@ INFO = "realsense_msgs/msg/StreamInfo"
 CAMERA = "sensor_msgs/msg/CameraInfo"
 IMAGE = "sensor_msgs/msg/Image"
 NUMBER = "std_msgs/msg/Float32"
+MOTION = "sensor_msgs/msg/Imu"
 PAIR = "diagnostic_msgs/msg/KeyValue"
 TRANSFORM = "geometry_msgs/msg/Transform"
 MAX_PIXELS = 1 << 23
@@ -178,6 +179,12 @@ def pose_of(transform: Any) -> Float64:
     pose[:3, :3] += 2.0 * w * cross + 2.0 * cross @ cross
     pose[:3, 3] = shift.x, shift.y, shift.z
     return pose
+
+
+def acceleration_of(motion: Any) -> tuple[float, float, float]:
+    """Return the acceleration of a motion sample in m/s^2."""
+    found = motion.linear_acceleration
+    return float(found.x), float(found.y), float(found.z)
 
 
 @dataclass(frozen=True)

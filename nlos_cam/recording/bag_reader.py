@@ -18,12 +18,12 @@ from typing import Any, NamedTuple, TypeVar, cast
 
 import numpy as np
 from lz4.frame import LZ4FrameDecompressor
-from nlos_calibration import Intrinsics
+from nlos_calibration import Gravity, Intrinsics
 from nlos_calibration.arrays import Float64
 from rosbags.rosbag1 import Reader
 from rosbags.rosbag1.reader import Header, RecordType, read_uint32
 
-from nlos_cam.camera import Sample, repair_command
+from nlos_cam.camera import Sample, gravity_of, repair_command
 from nlos_cam.errors import RecordingError
 from nlos_cam.files import describe, is_claimed
 from nlos_cam.recording import bag_messages, rosbag
@@ -32,6 +32,8 @@ from nlos_cam.recording.frame_order import AGREED_S, corrected_times_ns
 DEVICE = "/device_0"
 STREAM = re.compile(DEVICE + r"/sensor_([0-9]{1,3})/([A-Za-z_]{1,40})_([0-9]{1,3})(?=/image/data$)")
 OPTION = re.compile(DEVICE + r"/sensor_([0-9]{1,3})/option/(.{1,80})/value")
+ACCELERATION = re.compile(f"({DEVICE}/sensor_[0-9]{{1,3}}/Accel_[0-9]{{1,3}})/imu/data")
+MAX_ACCELERATIONS = 1000
 MAX_STREAMS = 64
 MIN_READS = 2_000_000
 BYTES_PER_READ = 100
@@ -392,18 +394,39 @@ class BagReader:
 
         Raises RecordingError where the recording holds no common reference of the two.
         """
-        mine = self._poses(stream)
-        others = self._poses(other)
+        mine = self._poses(self.streams[stream].topic)
+        others = self._poses(self.streams[other].topic)
         if not (groups := mine.keys() & others.keys()):
             raise RecordingError(f"{self.path} has no extrinsics between {stream} and {other}")
         group = min(groups)
         return mine[group] @ np.linalg.inv(others[group])
 
-    def _poses(self, stream: str) -> dict[str, Float64]:
+    def gravity(self) -> Gravity | None:
+        """Return gravity in the frame of the depth stream by the first second of the accelerometer;
+        None without one, where it was moved, and where its samples are damaged.
+        """
+        topic = next(filter(ACCELERATION.fullmatch, self.entries), "")
+        entries = self.entries.get(topic, [])[:MAX_ACCELERATIONS]
+        first = [entry for entry in entries if entry.time_ns - entries[0].time_ns < 1e9]
+        with suppress(RecordingError):
+            samples = [
+                self.read(topic, entry, bag_messages.MOTION, bag_messages.acceleration_of)
+                for entry in first
+            ]
+            mine = self._poses(self.streams["depth"].topic)
+            others = self._poses(topic.removesuffix("/imu/data"))
+            shared = mine.keys() & others.keys()
+            pose = np.eye(4)  # the SDK aligns the axes of both
+            for group in sorted(shared)[:1]:
+                pose = mine[group] @ np.linalg.inv(others[group])
+            return gravity_of(samples, pose[:3, :3])
+        return None
+
+    def _poses(self, stream_topic: str) -> dict[str, Float64]:
         """Return stream_from_reference (4, 4) by group; the streams of a group share one
         reference.
         """
-        start = f"{self.streams[stream].topic}/tf/"
+        start = f"{stream_topic}/tf/"
         poses = dict[str, Float64]()
         for topic, entries in self.entries.items():
             if topic.startswith(start) and entries:

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from nlos_cam.camera import FORMATS, OPTIONAL, SAME_INSTANT_S, FrameSynchronizer, Sample
 from nlos_cam.errors import NlosCamError, RecordingError
 from nlos_cam.files import TEXT_LIMIT, atomic_directory, read_bounded
-from nlos_cam.recording.bag_reader import BagReader, no_frames
+from nlos_cam.recording.bag_reader import BagReader
 
 if TYPE_CHECKING:
     from nlos_cam.recording.ros_reader import RosReader
@@ -313,8 +313,6 @@ def _streams(bag: "BagReader | RosReader", options: ExportOptions) -> list[str]:
     """Return the streams to write. Raises RecordingError for one that the recording does not
     have.
     """
-    if isinstance(bag, BagReader) and not bag.streams:
-        raise RecordingError(no_frames(bag))
     present = [name for name, info in bag.streams.items() if info.format]
     if not present:
         encodings = ", ".join(f"{name} {info.encoding}" for name, info in bag.streams.items())

@@ -21,7 +21,9 @@ def is_ros2(path: Path) -> bool:
 
 
 def open_recording(path: Path) -> "BagReader | RosReader":
-    """Open a recording of librealsense or of a ROS driver. Raises RecordingError."""
+    """Open a recording of librealsense or of a ROS driver. Raises RecordingError, also for one
+    without frames.
+    """
     if is_ros2(path):
         if not path.exists():
             raise RecordingError(f"{path} does not exist: give the path of a recording")
@@ -29,15 +31,15 @@ def open_recording(path: Path) -> "BagReader | RosReader":
 
         return RosReader(path)
     bag = BagReader(path)
+    if bag.streams:
+        return bag
+    from nlos_cam.recording.ros_reader import IMAGE_TOPIC, RosReader
+
     images = [
         topic
         for topic, entries in bag.entries.items()
         if entries and bag.types[topic] == IMAGE and not topic.startswith(DEVICE)
     ]
-    if bag.streams or not images:
-        return bag
-    from nlos_cam.recording.ros_reader import IMAGE_TOPIC, RosReader
-
-    if not any(map(IMAGE_TOPIC.match, images)):
-        raise RecordingError(no_frames(bag))
-    return RosReader(bag.path, bag)
+    if any(map(IMAGE_TOPIC.match, images)):
+        return RosReader(bag.path, bag)
+    raise RecordingError(no_frames(bag))

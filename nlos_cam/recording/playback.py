@@ -12,7 +12,7 @@ from nlos_calibration import Intrinsics, Rig
 from nlos_cam.camera import FORMATS, OPTIONAL, ClockUnwrap, FrameSynchronizer, Sample, frame_in_si
 from nlos_cam.errors import CameraError, RecordingError, StreamMissingError
 from nlos_cam.frames import Frame
-from nlos_cam.recording.bag_reader import BagReader, no_frames
+from nlos_cam.recording.bag_reader import BagReader
 from nlos_cam.recording.formats import open_recording
 from nlos_cam.recording.renumbering import renumbered
 
@@ -46,6 +46,7 @@ class ReplayCamera:
         self._bag = open_lidar_bag(path)
         self._streams = streams_of(self._bag)
         self._unit_m = self._bag.depth_unit_m()
+        self._gravity_m_s2 = self._bag.gravity()
         self.identity: Mapping[str, str] = identity_of(self._bag)
         self.intrinsics: Intrinsics = self._bag.streams["depth"].intrinsics
         self.incomplete = self.dropped = 0
@@ -85,7 +86,13 @@ class ReplayCamera:
             if found:
                 self._count(pairing)
                 self._settings = self._bag.settings(time_ns)
-                yield frame_in_si(found, self._unit_m, self.intrinsics, self._settings)
+                yield frame_in_si(
+                    found,
+                    self._unit_m,
+                    self.intrinsics,
+                    self._settings,
+                    gravity_m_s2=self._gravity_m_s2,
+                )
             if iteration != self._iterations:  # the context was left, or another iteration started
                 return
         self._end(pairing)
@@ -118,8 +125,6 @@ def open_lidar_bag(path: Path) -> "BagReader | RosReader":
     RecordingError. Logs a warning for one without confidence.
     """
     bag = open_recording(path)
-    if isinstance(bag, BagReader) and not bag.streams:
-        raise RecordingError(no_frames(bag))
     present = {name: info.format for name, info in bag.streams.items()}
     missing = [stream for stream, wanted in FORMATS.items() if present.get(stream) != wanted]
     if set(missing) <= OPTIONAL:

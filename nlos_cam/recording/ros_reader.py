@@ -232,6 +232,9 @@ class RosReader:
         """Return the distortion model of a stream and its coefficients."""
         return self._lenses[stream]
 
+    def gravity(self) -> None:
+        """Return None: the driver's accelerometer is not read."""
+
     def depth_unit_m(self) -> float:
         """Return metres per depth count, by the encoding."""
         encoding = self._images["depth"][1]

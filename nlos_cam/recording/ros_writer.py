@@ -20,7 +20,7 @@ from nlos_cam.camera import Sample
 from nlos_cam.errors import DiskFullError, RecordingError
 from nlos_cam.files import atomic_directory
 from nlos_cam.recording.bag_messages import CAMERA, IMAGE
-from nlos_cam.recording.bag_reader import BagReader, StreamInfo, no_frames
+from nlos_cam.recording.bag_reader import BagReader, StreamInfo
 from nlos_cam.recording.export import ExportResult
 from nlos_cam.recording.ros_messages import METADATA, TRANSFORMS, ros2_types
 
@@ -64,8 +64,6 @@ def export_ros2(
     Setting `stop` ends it early and keeps the frames so far, and so does damage within the
     recording. Raises RecordingError without a stream to write.
     """
-    if isinstance(bag, BagReader) and not bag.streams:
-        raise RecordingError(no_frames(bag))
     streams = [name for name, info in bag.streams.items() if _is_writable(info)]
     if not streams:
         encodings = ", ".join(f"{name} {info.encoding}" for name, info in bag.streams.items())

@@ -94,7 +94,7 @@ class Playback(PlaybackViewer):
                 "commands": ["export"],
                 "options": [],
                 "note": "",
-                "files": list(self._files),
+                "files": self._files.newest,
             },
         }
 

@@ -12,9 +12,17 @@ from nlos_cam.files import atomic_file
 from nlos_cam.view.video import Still
 from nlos_cam.view.viewer import Moment
 
+MAX_LISTED = 12
+"""Last files that a page lists for download."""
+
 
 class WrittenFiles(dict[str, Path]):
     """Whole files that the commands of a page wrote, by name; the page offers them for download."""
+
+    @property
+    def newest(self) -> list[str]:
+        """Names of the last files, as the page lists them; earlier ones can still be had."""
+        return list(self)[-MAX_LISTED:]
 
     def note(self, path: Path) -> str:
         """Note a file, and those beside it of the same stem; return where they are, for a person

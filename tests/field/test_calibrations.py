@@ -1,17 +1,22 @@
-"""Someone measures a bare wall with a lidar whose ranges are off."""
+"""Someone measures a bare wall with a lidar whose ranges are off, or that is upside down."""
 
+import sys
+from collections.abc import Callable
+from io import StringIO
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
-from nlos_calibration import load_rig
+from nlos_calibration import load_rig, load_wall
 from nlos_calibration.errors import CalibrationError, WallRefusedError
 from nlos_calibration.geometry import normal_from_angles, wall_from_plane
 from nlos_calibration.noise import depth_noise_m
 from nlos_calibration.wall import wall_depth
 
 from nlos_cam.calibrate import measure
+from nlos_cam.camera import SimulatedCamera
 
 TAPE_M = 0.2
 PINHOLE = load_rig("paper-rig").pinhole.scaled(64, 48)
@@ -56,3 +61,96 @@ def test_clutter_is_not_called_an_offset() -> None:
     depth_m[20:40, 10:40] -= 0.05
     with pytest.raises(WallRefusedError, match="remove"):
         measured(depth_m)
+
+
+Run = Callable[..., Any]
+BARE = "calibrate", "--wall", "--camera", "sim:bare-wall", "--frames", 15, "--out", "wall.toml"
+RECORD = Path("wall.toml")
+REPORT = Path("wall.html")
+
+
+@pytest.fixture
+def upside_down(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(SimulatedCamera, "roll_deg", 180.0)
+
+
+@pytest.mark.usefixtures("upside_down")
+@pytest.mark.parametrize("said", [(), ("--upright",)])
+def test_camera_upside_down_is_refused(run: Run, said: tuple[str, ...]) -> None:
+    answer = run(*BARE, *said, code=1)
+
+    assert "upside down" in answer["error"]["message"]
+    assert "turn it over" in answer["error"]["message"]
+    assert not RECORD.exists()
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("upside_down")
+def test_camera_that_hangs_on_purpose_is_measured(run: Run) -> None:
+    assert run(*BARE, "--upside-down")["way_up"] == "upside down"
+    assert load_wall(RECORD).way_up == "upside down"
+    assert "Pictures turn with the camera" in REPORT.read_text(encoding="utf-8")
+
+
+def test_upright_camera_is_recorded_by_gravity(run: Run) -> None:
+    run(*BARE)
+    record = load_wall(RECORD)
+
+    assert record.way_up == "upright"
+    assert record.gravity_m_s2[1] == pytest.approx(9.81, abs=0.01)
+    assert "by gravity" in REPORT.read_text(encoding="utf-8")
+
+
+@pytest.mark.slow
+def test_upright_camera_contradicts_upside_down(run: Run) -> None:
+    answer = run(*BARE, "--upside-down", code=1)
+    assert "leave out --upside-down" in answer["error"]["message"]
+
+
+@pytest.fixture
+def without_accelerometer(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("nlos_cam.camera.live_camera.Accelerometer.of", lambda *_: None)
+
+
+class Terminal(StringIO):
+    """Keyboard of a person at a terminal."""
+
+    def isatty(self) -> bool:
+        return True
+
+
+@pytest.mark.usefixtures("without_accelerometer")
+def test_owner_is_asked_once_whether_the_camera_is_upright(
+    run: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sys, "stdin", Terminal("\n"))
+
+    assert run(*BARE).err.count("Is the camera upright") == 1
+    assert load_wall(RECORD).way_up == "upright"
+    assert "its owner said" in REPORT.read_text(encoding="utf-8")
+
+
+@pytest.mark.usefixtures("without_accelerometer")
+def test_owner_who_says_upside_down_hears_what_to_do(
+    run: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sys, "stdin", Terminal("n\n"))
+
+    assert "turn it over" in run(*BARE, code=1)["error"]["message"]
+    assert not RECORD.exists()
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("without_accelerometer")
+@pytest.mark.parametrize(
+    ("options", "way_up"),
+    [((), "unknown"), (("--upright",), "upright"), (("--upside-down",), "upside down")],
+)
+def test_nobody_is_asked_without_a_terminal(
+    run: Run, options: tuple[str, ...], way_up: str
+) -> None:
+    run(*BARE, *options)
+    report = REPORT.read_text(encoding="utf-8")
+
+    assert load_wall(RECORD).way_up == way_up
+    assert ("Not known: which way up" in report) == (way_up == "unknown")

@@ -5,6 +5,8 @@ import os
 import shutil
 import sqlite3
 from collections.abc import Callable
+from contextlib import closing
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -237,30 +239,23 @@ def no_database(folder: Path) -> None:
     (folder / "sqlite3.db3").write_bytes(b"SQLite format 3\0" + bytes(range(256)) * 10)
 
 
-def endless_view(folder: Path) -> None:
-    with sqlite3.connect(folder / "sqlite3.db3") as file:
-        file.execute("alter table messages rename to real")
-        file.execute(
-            "create view messages as with recursive n(id) as (select 1 union all select id + 1"
-            " from n) select id, 1 as topic_id, id as timestamp, zeroblob(100000000) as data from n"
-        )
-    file.close()
+SQL = {
+    "endless view": (
+        "alter table messages rename to real; create view messages as with recursive n(id) as"
+        " (select 1 union all select id + 1 from n) select id, 1 as topic_id, id as timestamp,"
+        " zeroblob(100000000) as data from n"
+    ),
+    "computed blob": (
+        "drop table messages; create table messages (id integer, topic_id integer,"
+        " timestamp integer, data blob as (zeroblob(900000000)))"
+    ),
+    "other messages": "update messages set data = substr(data, 1, 60)",
+}
 
 
-def computed_blob(folder: Path) -> None:
-    with sqlite3.connect(folder / "sqlite3.db3") as file:
-        file.execute("drop table messages")
-        file.execute(
-            "create table messages (id integer, topic_id integer, timestamp integer,"
-            " data blob as (zeroblob(900000000)))"
-        )
-    file.close()
-
-
-def other_messages(folder: Path) -> None:
-    with sqlite3.connect(folder / "sqlite3.db3") as file:
-        file.execute("update messages set data = substr(data, 1, 60)")
-    file.close()
+def by_sql(folder: Path, name: str) -> None:
+    with closing(sqlite3.connect(folder / "sqlite3.db3")) as file:
+        file.executescript(SQL[name])
 
 
 HOSTILE = [
@@ -271,13 +266,16 @@ HOSTILE = [
     pipe,
     cut,
     no_database,
-    endless_view,
-    computed_blob,
-    other_messages,
 ]
 
 
-@pytest.mark.parametrize("damage", HOSTILE, ids=lambda damage: damage.__name__)
+@pytest.mark.parametrize(
+    "damage",
+    [
+        *(pytest.param(damage, id=damage.__name__) for damage in HOSTILE),
+        *(pytest.param(partial(by_sql, name=name), id=name) for name in SQL),
+    ],
+)
 def test_hostile_bag_of_ros_2_gets_one_line(
     bags: SimpleNamespace, run: Run, damage: Callable[[Path], None]
 ) -> None:

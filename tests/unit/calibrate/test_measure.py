@@ -6,6 +6,7 @@ from datetime import date
 import numpy as np
 import pytest
 from fake_wall import SERIAL, WallCamera
+from nlos_calibration import WayUp
 from nlos_calibration.errors import CalibrationError, OccluderRefusedError, WallRefusedError
 from nlos_calibration.geometry import Intrinsics
 from nlos_calibration.reference import BareWall, BareWallStatistics
@@ -158,6 +159,51 @@ def test_measure_occluder_refuses_a_lidar_that_moved(
 ) -> None:
     with pytest.raises(WallRefusedError, match=amount):
         measure_occluder(bench_seen(lidar=lidar), bare)
+
+
+def test_measure_occluder_refuses_a_lidar_that_was_turned_over(bare: MeasuredWall) -> None:
+    upright = bare.record.model_copy(update={"gravity_m_s2": (0.0, 9.81, 0.0)})
+    over = replace(bench_seen(), gravity_m_s2=(0.0, -9.81, 0.0))
+    with pytest.raises(WallRefusedError, match="turned by 180"):
+        measure_occluder(over, MeasuredWall(upright, None))
+
+
+UP = (0.0, 9.81, 0.0)
+OVER = (0.0, -9.81, 0.0)
+SIDE = (9.81, 0.0, 0.0)
+
+
+@pytest.mark.parametrize(
+    ("gravity", "said", "known"),
+    [
+        (UP, "unknown", "upright"),
+        (UP, "upright", "upright"),
+        (OVER, "upside down", "upside down"),
+        (None, "upside down", "upside down"),
+        (None, "unknown", "unknown"),
+    ],
+)
+def test_way_up_is_gravitys_or_the_owners(
+    gravity: tuple[float, float, float] | None, said: WayUp, known: WayUp
+) -> None:
+    assert measure.check_way_up(gravity, said) == known
+
+
+@pytest.mark.parametrize(
+    ("gravity", "said", "advice"),
+    [
+        (OVER, "unknown", "turn it over"),
+        (OVER, "upright", "turn it over"),
+        (UP, "upside down", "leave out"),
+        (SIDE, "unknown", "on its side"),
+        (SIDE, "upside down", "on its side"),
+    ],
+)
+def test_camera_that_is_not_as_said_is_refused(
+    gravity: tuple[float, float, float], said: WayUp, advice: str
+) -> None:
+    with pytest.raises(CalibrationError, match=advice):
+        measure.check_way_up(gravity, said)
 
 
 def test_measure_occluder_is_not_moved_by_an_origin_offset(seen: CaptureStatistics) -> None:

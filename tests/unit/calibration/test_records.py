@@ -86,6 +86,8 @@ def test_rig_and_its_checksum_survive_a_file(tmp_path: Path, name: str) -> None:
 
 
 DEVICE = {
+    "gravity_m_s2": (0.1, 9.8, -0.3),
+    "way_up": "upright",
     "serial": "f0246262",
     "firmware": "1.5.8.1",
     "settings": {"laser_power": 80.0},
@@ -380,3 +382,21 @@ def test_absurd_numbers_of_a_rig_are_refused(changed: dict[str, Any], field: str
 
     with pytest.raises(ValidationError, match=field):
         Rig.model_validate(rig)
+
+
+def test_record_of_before_gravity_knows_no_way_up() -> None:
+    record = load_wall(EXAMPLE)
+
+    assert record.gravity_m_s2 is None
+    assert record.way_up == "unknown"
+
+
+@pytest.mark.parametrize(
+    "gravity", [(0.0, 0.0, 0.0), (0.0, 2.0, 0.0), (9.8, 9.8, 9.8), (0, 1e9, 0)]
+)
+def test_record_refuses_a_gravity_that_is_none(
+    tmp_path: Path, record: WallRecord, gravity: tuple[float, float, float]
+) -> None:
+    absurd = record.model_copy(update={"gravity_m_s2": gravity})
+    with pytest.raises(RecordFileError, match="gravity_m_s2"):
+        load_wall(written(tmp_path, absurd))

@@ -12,11 +12,12 @@ from nlos_calibration import load_measured
 from small_frames import FrameCamera, sheet_network
 from view_streams import saved_moments
 
+from nlos_cam.camera import SimulatedCamera
 from nlos_cam.errors import NlosCamError
 from nlos_cam.live import RunControl, RunReport, run_live
 from nlos_cam.live.statistics import WARM_UP_FRAMES
 from nlos_cam.reconstruct import CalibratedRig, Pipeline
-from nlos_cam.view import NullViewer
+from nlos_cam.view import NullViewer, WrittenFiles
 
 
 @pytest.fixture
@@ -304,3 +305,37 @@ def test_reference_ends_with_the_run(control: RunControl, monkeypatch: pytest.Mo
     control.end()
     with pytest.raises(NlosCamError, match="ended"):
         control.run("take_reference", {"frames": 5})
+
+
+def test_page_says_that_a_recording_has_no_room(
+    tmp_path: Path, noise_world: Any, hurried_clock: Any
+) -> None:
+    control = RunControl(folder=tmp_path)
+    with SimulatedCamera("sim:noise", noise_world(), clock=hurried_clock()) as camera:
+        control.attach(camera, Pipeline(CalibratedRig(RIG), sheet_network))
+        frames = control.watch(camera)
+        next(frames)
+        control.run("record", {})
+        before = control.status()
+        control.recording.recording._recording._free = lambda _: 0
+        for _ in range(40):
+            next(frames)
+        during = control.status()
+        answer = control.run("stop_recording", {})
+
+    assert before["warnings"] == []
+    assert "the recording has ended" in during["warnings"][0]
+    assert during["recording"]["seconds"] < 1.1
+    assert "the disk is full" in answer
+    assert control.status()["warnings"] == []
+
+
+def test_page_lists_the_last_files_and_keeps_all(tmp_path: Path) -> None:
+    files = WrittenFiles()
+    for number in range(20):
+        path = tmp_path / f"{number}.npz"
+        path.touch()
+        files.note(path)
+
+    assert files.newest == [f"{number}.npz" for number in range(8, 20)]
+    assert files["0.npz"] == tmp_path / "0.npz"

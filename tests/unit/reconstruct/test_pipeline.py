@@ -423,3 +423,49 @@ def test_record_that_calls_itself_doubtful_is_named(walled: CalibratedRig) -> No
     bench = CalibratedRig(RIG, replace(walled.measured, record=record))
 
     assert any("doubtful: measure again" in note for note in observe(bench).warnings)
+
+
+UP = (0.0, 9.81, 0.0)
+OVER = (0.0, -9.81, 0.0)
+
+
+@pytest.mark.parametrize(
+    ("recorded", "now", "word"),
+    [
+        ({"gravity_m_s2": UP, "way_up": "upright"}, OVER, "turned by 180"),
+        ({"gravity_m_s2": UP, "way_up": "upright"}, (1.7, 9.66, 0.0), "turned by 10"),
+        ({"way_up": "upright"}, OVER, "upside down"),
+        ({}, OVER, "upside down"),
+    ],
+)
+def test_lidar_that_was_turned_gets_no_good_verdict(
+    tmp_path: Path, recorded: dict[str, Any], now: tuple[float, float, float], word: str
+) -> None:
+    bench = open_bench(write_wall(tmp_path / "wall.toml", bare_wall(), **recorded), WallCamera(1))
+    pipeline = Pipeline(bench, sheet_network, uncertainty_model=FakeUncertainty())
+    turned = replace(wall_frame(1), gravity_m_s2=now)
+    result = pipeline.process(Arrival(turned, 0.0, ()), time.time, 0.0)
+
+    assert result.verdict is Verdict.WALL_MOVED
+    assert [each for each in result.warnings if word in each]
+
+
+@pytest.mark.parametrize("now", [None, UP, (0.2, 9.8, 0.1)])
+def test_lidar_as_it_was_measured_is_not_called_turned(
+    tmp_path: Path, now: tuple[float, float, float] | None
+) -> None:
+    wall = write_wall(tmp_path / "wall.toml", bare_wall(), gravity_m_s2=UP, way_up="upright")
+    frame = replace(wall_frame(1), gravity_m_s2=now)
+    seen = open_bench(wall, WallCamera(1)).observe(frame, maps_from_frame(frame))
+
+    assert not seen.moved
+    assert not [each for each in seen.warnings if "turned" in each]
+
+
+def test_record_of_an_upside_down_camera_is_said_in_each_run(tmp_path: Path) -> None:
+    wall = write_wall(tmp_path / "wall.toml", bare_wall(), way_up="upside down")
+    frame = replace(wall_frame(1), gravity_m_s2=OVER)
+    seen = open_bench(wall, WallCamera(1)).observe(frame, maps_from_frame(frame))
+
+    assert not seen.moved
+    assert any("upside down" in each for each in seen.warnings)
