@@ -312,6 +312,22 @@ def test_output_path_refuses_read_only_folder(tmp_path: Path, monkeypatch: Patch
         common.output_path(out, "wall", ".toml", overwrite=True)
 
 
+def test_output_path_makes_the_folders_above_it(tmp_path: Path) -> None:
+    used = common.output_path(tmp_path / "a" / "b" / "wall.toml", "", ".toml", overwrite=False)
+    used.touch()
+    unused = common.output_path(tmp_path / "c" / "d" / "wall.toml", "", ".toml", overwrite=False)
+
+    assert unused.parent.is_dir()
+
+    common.release_outputs()
+
+    assert used.exists()
+    assert not (tmp_path / "c").exists()
+
+    with pytest.raises(errors.OutputExistsError, match="is a file"):
+        common.output_path(used / "x.toml", "", ".toml", overwrite=False)
+
+
 def test_table_on_a_narrow_terminal_is_blocks_of_lines(monkeypatch: Patch, capsys: Capsys) -> None:
     table = Table("camera", "serial", "name")
     table.add_row("sim", "", "simulated: the paper's rig")
