@@ -105,9 +105,7 @@ def training_maps(
     recordings the objects are rendered on the bench's measured rig, with the simulated sensor.
     """
     accuracy = "standard" if plan.accuracy == data.RECORDED else plan.accuracy
-    plan = replace(
-        plan, first_seed=data.TRAINING_SEED, accuracy=accuracy, objects=data.Objects()
-    )
+    plan = replace(plan, first_seed=data.TRAINING_SEED, accuracy=accuracy, objects=data.Objects())
     folder = cache / "neighbours" / f"{_checksum(plan)}-{NEIGHBOURS}"
     data.build_dataset(plan, NEIGHBOURS, folder, workers=workers, on_progress=on_progress)
     return data.open_dataset(folder)

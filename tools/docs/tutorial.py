@@ -16,6 +16,8 @@ ROOT = Path(__file__).parents[2]
 PAGE = ROOT / "docs" / "tutorial.md"
 STEP = re.compile(r"```sh\n(?P<commands>.*?)```\n\n```text\n(?P<answer>.*?)```", re.DOTALL)
 """Commands, and right after them their answers."""
+BLOCK = re.compile(r"^ *```(?:sh|bash)\n(?P<commands>.*?)^ *```", re.DOTALL | re.MULTILINE)
+"""Commands of any page."""
 WIDTH = 110
 """Width of the terminal in characters."""
 PROGRESS = re.compile(r"[a-z][\w ]*: (?:\d+/\d+, )?\d+ s")
@@ -32,6 +34,13 @@ def commands_of(text: str) -> list[list[str]]:
     return [
         shlex.split(line) for step in STEP.finditer(text) for line in step["commands"].splitlines()
     ]
+
+
+def printed_commands(text: str) -> list[list[str]]:
+    """Return every command in the shell blocks of any page, as words without comments."""
+    blocks = (block["commands"].replace("\\\n", " ") for block in BLOCK.finditer(text))
+    lines = (shlex.split(line, comments=True) for block in blocks for line in block.splitlines())
+    return [words for words in lines if words]
 
 
 def answered(text: str, run: Runner) -> str:

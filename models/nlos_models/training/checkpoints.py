@@ -30,7 +30,6 @@ from nlos_models.records import (
 )
 from nlos_models.vae import Encoder, ResVae
 
-
 WEIGHT_SUFFIXES = ".safetensors", ".onnx", ".json"
 
 
@@ -86,7 +85,7 @@ def _save(folder: Path, parts: dict[str, nn.Module], record: CheckpointRecord) -
     # Readers of earlier versions refuse fields that they do not know, so that unset ones are not
     # written.
     unset = {
-        name for name in ("note", "direct_recipe") if not getattr(record, name)
+        name for name in ("note", "direct_recipe", "program") if not getattr(record, name)
     }  # older readers refuse these
     text = json.dumps(record.model_dump(mode="json", exclude=unset), indent=2)
     save_parts(folder, parts, {RECORD: text})

@@ -12,7 +12,7 @@ from typing import Any, Generic, TypeVar
 import torch
 from lightning_fabric import Fabric
 
-from nlos_cam.files import OutputExistsError, claim
+from nlos_cam.files import OutputExistsError, claim, program_name
 from nlos_models.arrays import Float16
 from nlos_models.checkpoint import load_network, load_pipeline
 from nlos_models.direct import DirectNetwork
@@ -60,7 +60,6 @@ from nlos_models.training.tasks import (
 from nlos_models.training.uncertainty import UncertaintySet, calibrate, train_uncertainty
 from nlos_models.uncertainty_network import save_uncertainty_network
 from nlos_models.vae import Encoder, ResVae
-
 
 FITTED = "fitted"
 """Folder, in a transfer's output, of new weights that are worse than those that it started from."""
@@ -150,9 +149,11 @@ def record_run(
         )
     # A transfer that made things worse has its own weights there, and the earlier ones in `out`.
     own = out / FITTED if (out / FITTED / RECORD).exists() else out
-    if (own / RECORD).exists() and load_record(own).model_copy(update={"figures": {}}) != record:
-        raise OutputExistsError(f"{out} holds weights from another run: choose another --out")
-    return record
+    if (own / RECORD).exists():
+        earlier = load_record(own).model_copy(update={"figures": {}, "program": ""})
+        if earlier != record:
+            raise OutputExistsError(f"{out} holds weights from another run: choose another --out")
+    return record.model_copy(update={"program": program_name()})
 
 
 def record_uncertainty_run(
@@ -165,7 +166,9 @@ def record_uncertainty_run(
     """
     if out.resolve() == watched.resolve() or (out / UNCERTAINTY_RECORD).exists():
         raise OutputExistsError(f"{out} holds weights already: choose another --out")
-    return UncertaintyRecord(watches=checksum_of_watched(watched), recipe=recipe, learnt=kinds)
+    return UncertaintyRecord(
+        watches=checksum_of_watched(watched), recipe=recipe, program=program_name(), learnt=kinds
+    )
 
 
 def run_vae(

@@ -13,7 +13,6 @@ import time
 import weakref
 from collections.abc import Callable
 from contextlib import suppress
-from importlib.metadata import version
 from pathlib import Path
 from threading import Event
 from typing import Any
@@ -41,6 +40,7 @@ from nlos_cam.cli.main import (
     main,
 )
 from nlos_cam.cli.plain_help import plain_help, range_text
+from nlos_cam.files import program_name
 
 CODES = {
     1: (
@@ -272,7 +272,7 @@ def test_help_names_every_command_with_json_and_version(shown: Run) -> None:
     for name, callback in commands:
         assert "json" in getattr(callback, "__annotations__", {}), name
 
-    assert shown("--version").out == shown("-V").out == f"nlos-cam {version('nlos-cam')}\n"
+    assert shown("--version").out == shown("-V").out == f"{program_name()}\n"
 
 
 @pytest.mark.parametrize("command", COMMANDS)
