@@ -12,6 +12,8 @@ from collections.abc import Callable
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
+from nlos_cam.info import describe_program
+
 ROOT = Path(__file__).parents[2]
 PAGE = ROOT / "docs" / "tutorial.md"
 STEP = re.compile(r"```sh\n(?P<commands>.*?)```\n\n```text\n(?P<answer>.*?)```", re.DOTALL)
@@ -20,8 +22,11 @@ BLOCK = re.compile(r"^ *```(?:sh|bash)\n(?P<commands>.*?)^ *```", re.DOTALL | re
 """Commands of any page."""
 WIDTH = 110
 """Width of the terminal in characters."""
-PROGRESS = re.compile(r"[a-z][\w ]*: (?:\d+/\d+, )?\d+ s")
+PROGRESS = re.compile(r"[A-Za-z][\w ]*: (?:\d+/\d+, )?\d+ s")
 """A line of progress, which only a slow machine prints."""
+
+SOURCE = re.compile(r"nlos-cam \d\S*, weights `direct` [0-9a-f]{12}")
+"""What gave the answers, in the page's head."""
 
 Runner = Callable[[list[str]], str]
 """Runs one command, given as its words, and returns its output. Raises CalledProcessError where it
@@ -54,6 +59,12 @@ def answered(text: str, run: Runner) -> str:
     return STEP.sub(step, text)
 
 
+def source() -> str:
+    """Return the program and the weights, as the page names what gave its answers."""
+    facts = describe_program()
+    return f"nlos-cam {facts['version']}, weights `direct` {facts['weights']['direct']}"
+
+
 def as_program(words: list[str]) -> list[str]:
     """Return the words that start a command with this Python."""
     if words[0] == "python":
@@ -81,6 +92,7 @@ def main() -> int:
     """Run all commands in a temporary folder."""
     with TemporaryDirectory() as folder:
         text = answered(PAGE.read_text(encoding="utf-8"), run_in(Path(folder)))
+    text = SOURCE.sub(source(), text)
     PAGE.write_text(text, encoding="utf-8")
     return 0
 
