@@ -11,6 +11,7 @@ import nlos_calibration as walls
 from nlos_calibration.errors import CalibrationError, RecordFileError
 from nlos_models import RECORD, load_record
 
+from nlos_cam import __version__
 from nlos_cam.bench.folder import load_bench
 from nlos_cam.bench.record import (
     MANIFEST,
@@ -23,7 +24,7 @@ from nlos_cam.bench.record import (
     sha256_of,
 )
 from nlos_cam.errors import OutputExistsError
-from nlos_cam.files import CHECKSUMS, atomic_directory, atomic_file, program_name, write_checked
+from nlos_cam.files import CHECKSUMS, atomic_directory, atomic_file, write_checked
 
 
 class BenchEdit:
@@ -76,7 +77,7 @@ class BenchEdit:
         return BenchRecord(
             created=self.before.created if self.before else now,
             changed=now,
-            program=program_name(),
+            program=f"nlos-cam {__version__}",
             camera=self.camera,
             stations=self.stations,
             files=dict(sorted(self._files.items())),
