@@ -386,13 +386,13 @@ def transfer(
     recipe = run.recipe(training.TransferRecipe)
     fabric = run.fabric(recipe)
     pipeline, start = training.transfer_start(recipe, weights, partial=partial, on_report=say)
+    # Half of loaded weights are nothing to go back to.
+    earlier = None if partial else training.transfer_weights(recipe, weights)
     encoder = training.load_encoder(vae_folder or weights)
     maps = data_sets.read_maps(recipe, data, held_out_data, wall, start=start)
     recipe = maps.limit_recipe(recipe)
     record = training.record_run(recipe, run.out, maps.rig, start.runs, weights)
     job = run.training(recipe, record, training.digest_of(pipeline, encoder, maps.digest))
-    # Half of loaded weights are nothing to go back to.
-    earlier = None if partial else training.transfer_weights(recipe, weights)
     figures = training.launch(
         fabric,
         training.run_transfer,
