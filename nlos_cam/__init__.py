@@ -7,7 +7,7 @@ if TYPE_CHECKING:
     from nlos_cam.api import open_stream as open  # noqa: A004  as gzip.open: always called as nlos_cam.open
     from nlos_cam.reconstruct import FrameResult
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"
 __all__ = ["FrameResult", "Stream", "__version__", "open"]
 
 LATE = {

@@ -65,6 +65,8 @@ class CheckpointRecord(BaseModel):
     """Recipes of the runs before those above, the oldest first."""
     figures: dict[str, float] = {}
     """Held-out figures at the end of training."""
+    program: str = ""
+    """Program that trained them, with its version and commit; empty in weights before 0.2.0."""
     note: str = Field(default="", validate_default=True)
     """SIMULATION_ONLY for color weights, else empty, whatever value is passed in."""
 
@@ -169,6 +171,8 @@ class UncertaintyRecord(BaseModel):
     watches: str
     """`checksum_of_watched` of the weights whose images it judges."""
     recipe: UncertaintyRecipe
+    program: str = ""
+    """As in CheckpointRecord."""
     learnt: list[str]
     """Kinds of outliers in its training set."""
     temperatures: tuple[float, float] = (1.0, 1.0)

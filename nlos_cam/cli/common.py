@@ -315,8 +315,9 @@ def output_path(out: Path | None, stem: str, suffix: str, *, overwrite: bool) ->
 
     It is reserved until `release_outputs`: raises FileBusyError, with the holder, where another
     process writes to it. Without a suffix the output is a folder, which may exist if it is empty.
-    Raises OutputExistsError if something would be replaced without `overwrite`, or if the path
-    cannot be written.
+    Missing folders above it are made; those still empty at the end of the command go again. Raises
+    OutputExistsError if something would be replaced without `overwrite`, or if the path cannot be
+    written.
     """
     path = out or Path(f"{stem}-{datetime.now().astimezone():%Y%m%d-%H%M%S}{suffix}")
     if suffix and path.is_dir():
@@ -326,8 +327,7 @@ def output_path(out: Path | None, stem: str, suffix: str, *, overwrite: bool) ->
             f"{path} is a file, but --out must be a folder: choose another name"
         )
     _refuse_existing(path, overwrite=overwrite)
-    if not path.parent.is_dir():
-        raise OutputExistsError(f"the folder of {path} does not exist: create {path.parent} first")
+    _make_parents(path)
     if not os.access(path.parent, os.W_OK):
         raise OutputExistsError(
             f"the folder of {path} cannot be written to: choose another, or change its permissions"
@@ -338,6 +338,30 @@ def output_path(out: Path | None, stem: str, suffix: str, *, overwrite: bool) ->
     _reserved.append(path)
     _refuse_existing(path, overwrite=overwrite)  # it may have appeared before it was reserved
     return path
+
+
+def _make_parents(path: Path) -> None:
+    """Make the folders above an output. Raises OutputExistsError where one is a file or read-only."""
+    missing = [folder for folder in path.parents if not folder.exists()]
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+    except (FileExistsError, NotADirectoryError) as error:
+        raise OutputExistsError(
+            f"the folder of {path} cannot be made, because a part of its path is a file: choose"
+            " another --out"
+        ) from error
+    except PermissionError as error:
+        raise OutputExistsError(
+            f"the folder of {path} cannot be made without permission to write above it: choose"
+            " another --out"
+        ) from error
+    for folder in reversed(missing):  # they are taken away in the opposite order, the lowest first
+        _outputs.callback(_remove_if_empty, folder)
+
+
+def _remove_if_empty(folder: Path) -> None:
+    with suppress(OSError):  # it holds the output
+        folder.rmdir()
 
 
 def _refuse_existing(path: Path, *, overwrite: bool) -> None:

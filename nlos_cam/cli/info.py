@@ -19,8 +19,13 @@ UNITS = (1e9, "GB"), (1e6, "MB"), (1e3, "kB")
 
 def info(
     path: Annotated[
-        Path, typer.Argument(metavar="FILE", help="File or folder that nlos-cam wrote or reads.")
-    ],
+        Path | None,
+        typer.Argument(
+            metavar="FILE",
+            help="File or folder that nlos-cam wrote or reads.",
+            show_default="the program itself",
+        ),
+    ] = None,
     verify: Annotated[
         bool, typer.Option("--verify", help="Read all of it, not its index or heads alone.")
     ] = False,
@@ -34,9 +39,15 @@ def info(
     overwrite: Overwrite = False,
     json: Json = False,
 ) -> None:
-    """Describe a file or folder: kind, origin, content, whether it is whole, next commands."""
+    """Describe a file or folder: kind, origin, content, whether it is whole, next commands; without
+    one the program: version, commit, rendering version, weights.
+    """
     if out is not None and out.suffix not in {".html", ".png"}:
         raise typer.BadParameter(f"--out {out}: choose a name that ends in .html or .png")
+    if path is None:
+        facts = inspect.describe_program()
+        finish({**facts}, as_json=json, text=_format_program(facts))
+        return
     with interrupted_by_signals():
         found = inspect.describe(path, verify=verify)
         if out is not None and not found.problem:
@@ -47,6 +58,20 @@ def info(
     finish(result, as_json=json, text=_format(path, found))
     if found.problem:
         raise typer.Exit(RecordingError.exit_code)
+
+
+def _format_program(facts: inspect.ProgramFacts) -> str:
+    weights = {f"weights {name}": checksum for name, checksum in facts["weights"].items()}
+    rows = {
+        "commit": facts["commit"] or "not known",
+        "rendering version": str(facts["rendering_version"]),
+        **weights,
+        "python": facts["python"],
+    }
+    width = max(map(len, rows))
+    return "\n".join(
+        [facts["program"], *(f"  {name:{width}}  {row}" for name, row in rows.items())]
+    )
 
 
 def _format(path: Path, found: inspect.Description) -> str:

@@ -104,9 +104,9 @@ COMPLETION = "_NLOS_CAM_COMPLETE"
 
 def _print_version(wanted: bool) -> None:
     if wanted:
-        from importlib.metadata import version
+        from nlos_cam.files import program_name
 
-        print(f"nlos-cam {version('nlos-cam')}")  # noqa: T201  the answer
+        print(program_name())  # noqa: T201  the answer
         raise typer.Exit
 
 
@@ -115,7 +115,11 @@ def _root(
     version: Annotated[
         bool,
         typer.Option(
-            "--version", "-V", help="Print the version.", callback=_print_version, is_eager=True
+            "--version",
+            "-V",
+            help="Print the version and the commit.",
+            callback=_print_version,
+            is_eager=True,
         ),
     ] = False,
 ) -> None:

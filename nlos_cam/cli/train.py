@@ -125,26 +125,33 @@ class RunOptions:
             recipe, self.out, record, origin, self.tensorboard, self.compiled, watched_run
         )
 
-    def finish(
-        self,
-        recipe: training.Recipe,
-        figures: training.Scores,
-        before: training.Scores | None = None,
-    ) -> None:
-        """End a command with the figures of its weights, and of those that a transfer started
-        from.
-        """
-        result = {"out": str(self.out), **figures}
-        text = f"weights in {self.out}: {_values(figures)}"
-        if before is not None:
-            result = {**result, "before": before}
-            text = f"{text}; before: {_values(before)}"
+    def finish(self, recipe: training.Recipe, figures: training.Scores) -> None:
+        """End a command with the figures of its weights."""
         finish(
-            result,
+            {"out": str(self.out), **figures},
             as_json=self.json,
-            text=text,
+            text=f"weights in {self.out}: {_values(figures)}",
             note=models.SIMULATION_ONLY if recipe.colour else "",
         )
+
+    def finish_transfer(
+        self, before: training.Scores, after: training.Scores, *, can_keep: bool
+    ) -> None:
+        """End a transfer with the figures of the weights before and after, and say which of both
+        are in `out`.
+        """
+        better = training.is_better(after, before) or not can_keep
+        fitted = self.out if better else self.out / training.FITTED
+        compared = f"{_values(after)}; before: {_values(before)}"
+        text = (
+            f"weights in {self.out}: {compared}"
+            if better
+            else f"The fitted weights are not better: {compared}\n"
+            f"{self.out} holds the earlier weights, {fitted} the fitted ones"
+        )
+        kept = "fitted" if better else "earlier"
+        result = {"out": str(self.out), **after, "before": before, "kept": kept}
+        finish({**result, "fitted": str(fitted)}, as_json=self.json, text=text)
 
 
 @contextmanager
@@ -372,19 +379,31 @@ def transfer(
 ) -> None:
     """Fine-tune synthetic weights on a bench's recordings (SI 4): all layers first, then the
     classifier alone.
+
+    If the held-out loss has not fallen, --out gets a copy of the earlier weights, and the fitted
+    ones lie in its folder `fitted`.
     """
     recipe = run.recipe(training.TransferRecipe)
     fabric = run.fabric(recipe)
     pipeline, start = training.transfer_start(recipe, weights, partial=partial, on_report=say)
+    # Half of loaded weights are nothing to go back to.
+    earlier = None if partial else training.transfer_weights(recipe, weights)
     encoder = training.load_encoder(vae_folder or weights)
     maps = data_sets.read_maps(recipe, data, held_out_data, wall, start=start)
     recipe = maps.limit_recipe(recipe)
     record = training.record_run(recipe, run.out, maps.rig, start.runs, weights)
     job = run.training(recipe, record, training.digest_of(pipeline, encoder, maps.digest))
     figures = training.launch(
-        fabric, training.run_transfer, job, pipeline, encoder, maps.training, maps.held_out
+        fabric,
+        training.run_transfer,
+        job,
+        pipeline,
+        encoder,
+        maps.training,
+        maps.held_out,
+        earlier,
     )
-    run.finish(recipe, figures["after"], figures["before"])
+    run.finish_transfer(**figures, can_keep=not partial)
 
 
 def doubt(

@@ -5,6 +5,7 @@ __all__ = [
     "HELD_OUT_OUTLIERS",
     "HELD_OUT_SEED",
     "ORDINARY",
+    "RECORDED",
     "REQUIRED_ARRAYS",
     "SHAPE_OUTLIERS",
     "SHARD",
@@ -56,6 +57,7 @@ __all__ = [
 from .build import HELD_OUT_SEED, SHARD, TEST_SEED, TRAINING_SEED, BuildReport, build_dataset
 from .labelled import (
     FRAMES_PER_RECORDING,
+    RECORDED,
     Labelled,
     label_recordings,
     list_recordings,

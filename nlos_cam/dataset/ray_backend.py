@@ -6,10 +6,10 @@ writes the shards.
 
 from collections.abc import Generator, Sequence
 from contextlib import chdir
-from importlib.metadata import version
 from itertools import islice
 from typing import Any
 
+from nlos_cam import __version__
 from nlos_cam.dataset.plan import DatasetPlan
 from nlos_cam.dataset.samples import Samples, make_samples
 from nlos_cam.dataset.worker import use_one_thread
@@ -18,7 +18,7 @@ from nlos_cam.processes import package_folder, safe_children
 
 MAX_RETRIES = 5
 """Deaths of its worker that a piece survives."""
-VERSION = version("nlos-cam")
+VERSION = __version__
 PIECES_PER_CPU = 3
 """Pieces submitted ahead for each processor of the cluster: no worker waits, and few results do."""
 

@@ -7,7 +7,6 @@ import hashlib
 from collections.abc import Generator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from importlib.metadata import version
 from io import BytesIO
 from itertools import pairwise
 from pathlib import Path
@@ -17,6 +16,7 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
+from nlos_cam import __version__
 from nlos_cam.dataset.plan import SCENE_COLUMNS, DatasetPlan
 from nlos_cam.dataset.samples import Samples
 from nlos_cam.errors import DiskFullError, FolderBusyError, OutputExistsError, RecordingError
@@ -25,8 +25,10 @@ from nlos_cam.files import (
     atomic_file,
     claim,
     describe,
+    program_commit,
     read_hdf5,
     read_hdf5_text,
+    with_commit,
 )
 
 SHARD_PATTERN = "shard-*.h5"
@@ -91,13 +93,14 @@ def read_head(path: Path) -> Shard:
 
 
 def shard_origin(path: Path) -> tuple[str, str]:
-    """Return the version of nlos-cam and the command that made a shard; "unknown" as far as it does
-    not say.
+    """Return the version of nlos-cam, with its commit, and the command that made a shard; "unknown"
+    as far as it does not say.
     """
     with open_shard(path) as file:
-        return read_hdf5_text(file, "package_version", "unknown"), read_hdf5_text(
-            file, "command", "unknown"
-        )
+        version = read_hdf5_text(file, "package_version", "unknown")
+        commit = read_hdf5_text(file, "commit", "")
+        command = read_hdf5_text(file, "command", "unknown")
+    return with_commit(version, commit), command
 
 
 def read_arrays(head: Shard, names: Sequence[str]) -> list[NDArray[Any]]:
@@ -143,7 +146,8 @@ def _as_bytes(samples: Samples, provenance: str, command: str) -> bytes:
         file.attrs.update(
             {"plan": provenance, "plan_sha256": _digest(provenance.encode()), "command": command}
         )
-        file.attrs["package_version"] = version("nlos-cam")
+        file.attrs["package_version"] = __version__
+        file.attrs["commit"] = program_commit()
         file.attrs.update({"first_seed": int(seeds[0]), "last_seed": int(seeds[-1])})
         for name, values in samples.items():
             if values.dtype == object:

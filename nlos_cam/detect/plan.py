@@ -1,7 +1,6 @@
 """Plan of a detection: settings, turns and their order, drawn before the first frame."""
 
 import hashlib
-from importlib.metadata import version
 from math import ceil, log2
 from pathlib import Path
 from typing import Literal, Self
@@ -10,6 +9,9 @@ import numpy as np
 from nlos_calibration import Record, Rig
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
+
+from nlos_cam import __version__
+from nlos_cam.files import program_commit, with_commit
 
 BLOCK_TURNS = 4
 """Turns of a block, out-in-in-out or in-out-out-in: either cancels a drift that is linear in time.
@@ -45,7 +47,7 @@ class Plan(Record):
     kind: Literal["detection"] = "detection"
     created: str
     """Date and time, ISO 8601."""
-    version: str = Field(default_factory=lambda: version("nlos-cam"))
+    version: str = Field(default_factory=lambda: with_commit(__version__, program_commit()))
     source: str = Field(default_factory=source_checksum)
     """Checksum of the analysis's source files."""
     camera: str

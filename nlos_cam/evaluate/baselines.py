@@ -101,9 +101,11 @@ def training_maps(
     """Build the first NEIGHBOURS training objects on the plan's rig and sensor into the cache,
     once.
 
-    An interrupted build resumes. The folder's name is a checksum of rig, sensor and objects.
+    An interrupted build resumes. The folder's name is a checksum of rig, sensor and objects. For
+    recordings the objects are rendered on the bench's measured rig, with the simulated sensor.
     """
-    plan = replace(plan, first_seed=data.TRAINING_SEED, objects=data.Objects())
+    accuracy = "standard" if plan.accuracy == data.RECORDED else plan.accuracy
+    plan = replace(plan, first_seed=data.TRAINING_SEED, accuracy=accuracy, objects=data.Objects())
     folder = cache / "neighbours" / f"{_checksum(plan)}-{NEIGHBOURS}"
     data.build_dataset(plan, NEIGHBOURS, folder, workers=workers, on_progress=on_progress)
     return data.open_dataset(folder)

@@ -21,7 +21,7 @@ from nlos_cam.evaluate import figures as pictures
 from nlos_cam.evaluate import metrics, subjects
 from nlos_cam.evaluate.figures import LABELS
 from nlos_cam.evaluate.recognition import PER_KIND, recognised
-from nlos_cam.files import atomic_directory, cache_folder
+from nlos_cam.files import atomic_directory, cache_folder, program_name
 from nlos_cam.objects import CATEGORIES
 from nlos_cam.report import (
     Banner,
@@ -165,6 +165,7 @@ def evaluate(
         unseen = Unseen(second.names, second.maps.image.astype(np.float32), others.image, sure)
     facts = {
         "what": objects.description,
+        "program": program_name(),
         "weights": str(weights or SHIPPED),
         "rig": objects.plan.rig.name,
         "runtime": reconstructor.runtime,

@@ -294,6 +294,10 @@ def notes_about(
         notes.append(
             f"the nearest neighbours come from {training.folder}, whose maps are of another rig"
         )
+    if training and objects.plan.accuracy == data.RECORDED != training.plan.accuracy:
+        notes.append(
+            "the maps were recorded; the objects of the nearest neighbour are rendered for their rig"
+        )
     if unseen := sorted(set(left_out_categories(record)) & set(objects.categories)):
         notes.append(f"the weights' VAE was trained without {', '.join(unseen)}")
     return notes

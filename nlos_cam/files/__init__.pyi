@@ -13,6 +13,8 @@ __all__ = [
     "describe",
     "is_claimed",
     "load_cached",
+    "program_commit",
+    "program_name",
     "read_arrays",
     "read_bounded",
     "read_checked",
@@ -20,6 +22,7 @@ __all__ = [
     "read_hdf5_text",
     "read_toml",
     "reservations",
+    "with_commit",
     "write_checked",
 ]
 
@@ -29,6 +32,7 @@ from .checksums import CHECKSUMS, checksums_of, read_checked, write_checked
 from .claims import DISK_ERRORS, claim, is_claimed, reservations
 from .errors import FileBusyError, OutputExistsError
 from .hdf5 import read_hdf5, read_hdf5_text
+from .program import program_commit, program_name, with_commit
 from .reading import (
     TENSOR_LIMIT,
     TEXT_LIMIT,

@@ -15,7 +15,7 @@ from nlos_calibration import load_rig, load_wall
 from nlos_models.training import load_recipe
 
 from nlos_cam.errors import NlosCamError, RecordingError
-from nlos_cam.files import read_arrays, read_bounded, read_toml
+from nlos_cam.files import read_arrays, read_bounded, read_toml, with_commit
 
 MAX_TEXT_BYTES = 16 << 20
 SESSION_MARK = b"nlos-cam session"
@@ -43,6 +43,11 @@ class Description:
     """Command lines to go on with."""
     bytes: int = 0
     """Size of the file, or of all files in the folder."""
+
+
+def program_of(versions: Mapping[str, str]) -> str:
+    """Return the program that wrote a sidecar, by its versions."""
+    return with_commit(f"nlos-cam {versions.get('nlos-cam', '')}", versions.get("commit", ""))
 
 
 def size_of(path: Path) -> int:
@@ -89,7 +94,7 @@ def describe_bag(path: Path, verify: bool) -> Description:
         try:
             sidecar = load_sidecar(sidecar_path(path))
             created = f"{sidecar.started:%Y-%m-%d %H:%M:%S} UTC"
-            made_by = f"nlos-cam {sidecar.versions['nlos-cam']}"
+            made_by = program_of(sidecar.versions)
             facts |= {
                 "label": sidecar.label or "none",
                 "camera": sidecar.camera,
@@ -367,7 +372,7 @@ def _sidecar(path: Path, verify: bool) -> Description:
         problem = f"its recording {bag} is missing: put it back beside this file"
     elif verify:
         problem = describe_bag(bag, verify).problem
-    made_by = f"nlos-cam {sidecar.versions.get('nlos-cam', '')} capture"
+    made_by = f"{program_of(sidecar.versions)} capture"
     following = [] if problem else [f"nlos-cam info {shlex.quote(str(bag))}"]
     created = f"{sidecar.started:%Y-%m-%d %H:%M:%S} UTC"
     return Description(

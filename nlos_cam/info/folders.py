@@ -108,7 +108,10 @@ def describe_weights(folder: Path, _verify: bool) -> Description:
         f"nlos-cam evaluate --weights {quoted}",
         f"nlos-cam live --camera sim --weights {quoted}",
     ]
-    return Description("weights", facts, "", "", problem, f"checksums in {CHECKSUMS}", following)
+    made_by = record.program
+    return Description(
+        "weights", facts, "", made_by, problem, f"checksums in {CHECKSUMS}", following
+    )
 
 
 def _checksum_problem(folder: Path) -> str:

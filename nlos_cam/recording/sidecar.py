@@ -15,9 +15,10 @@ from typing import Annotated, Any, Literal
 from nlos_calibration import Finite, PinholeRecord, Record, Rig, first_problem, load_wall
 from pydantic import AwareDatetime, Field, ValidationError
 
+from nlos_cam import __version__
 from nlos_cam.camera import Camera
 from nlos_cam.errors import DiskFullError, RecordingError
-from nlos_cam.files import TEXT_LIMIT, atomic_file, describe, read_bounded
+from nlos_cam.files import TEXT_LIMIT, atomic_file, describe, program_commit, read_bounded
 from nlos_cam.frames import Frame
 from nlos_cam.recording.bag_messages import finite
 from nlos_cam.recording.playback import VerifyResult
@@ -31,7 +32,7 @@ the file reached the system's limit on its size. damaged: it holds fewer frames 
 """
 Share = Annotated[float, Field(ge=0, le=1)]
 Count = Annotated[int, Field(ge=0)]
-PACKAGES = ("nlos-cam", "pyrealsense2")
+SDK = "pyrealsense2"
 TEMPERATURE_INTERVAL_S = 10.0
 """Seconds between temperature readings, each of which rewrites the file."""
 MAX_TEMPERATURES = 1000
@@ -124,16 +125,17 @@ def load_sidecar(path: Path) -> Sidecar:
 
 
 def versions() -> dict[str, str]:
-    """Return the versions of this program, librealsense's Python package and Python, and the
-    platform.
+    """Return the versions of this program, its commit, librealsense's Python package and Python,
+    and the platform.
     """
     found = {
+        "nlos-cam": __version__,
+        "commit": program_commit(),
         "python": platform.python_version(),
         "platform": f"{platform.system().lower()} {platform.machine()}",
     }
-    for package in PACKAGES:
-        with suppress(PackageNotFoundError):  # librealsense has no package for some machines
-            found[package] = version(package)
+    with suppress(PackageNotFoundError):  # librealsense has no package for some machines
+        found[SDK] = version(SDK)
     return found
 
 

@@ -9,6 +9,8 @@ from pathlib import Path
 from string import Template
 from typing import TYPE_CHECKING
 
+from nlos_cam.files import program_name
+
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
@@ -57,7 +59,7 @@ PAGE = Template("""<!DOCTYPE html>
 <head><meta charset="utf-8"><meta name="viewport" content="width=device-width, initial-scale=1">
 <title>$title</title><style>$style</style></head>
 <body><header><h1>$title</h1><p class="under">$under</p></header>
-<main>$body</main></body>
+<main>$body</main><footer class="under">$program</footer></body>
 </html>
 """)
 
@@ -105,7 +107,11 @@ def png(figure: "Figure") -> bytes:
 def page(title: str, subtitle: str, parts: Iterable[str]) -> str:
     """Return a self-contained document; title and subtitle are text, the parts HTML."""
     return PAGE.substitute(
-        title=escape(title), under=escape(subtitle), style=STYLE, body="\n".join(parts)
+        title=escape(title),
+        under=escape(subtitle),
+        style=STYLE,
+        body="\n".join(parts),
+        program=escape(program_name()),
     )
 
 

@@ -7,6 +7,7 @@ refused, a command needs the token of the printed address, streams and connectio
 a browser that sends or reads too slowly is cut.
 """
 
+import gzip
 import hmac
 import ipaddress
 import json
@@ -36,6 +37,9 @@ TIMEOUT_S = 5.0
 """Seconds for a whole request, and for each piece of an answer, after which a browser is cut."""
 PIECE_BYTES = 1 << 18
 MAX_REQUEST_BYTES = 1 << 16
+MIN_PACKED_BYTES = 1 << 10
+MAX_PACKED_BYTES = 1 << 20
+"""Sizes of assets that are sent in gzip to browsers that take it."""
 MAX_STREAMS = 8
 """Browsers that watch at once."""
 MAX_CONNECTIONS = 32
@@ -89,6 +93,8 @@ class Handler(BaseHTTPRequestHandler):
     """Handler of GET, HEAD and POST; other methods are not implemented."""
 
     served: Served
+    packed: Mapping[str, bytes]
+    """Assets in gzip, by path; large ones are left out."""
     streams: BoundedSemaphore
     timeout = TIMEOUT_S
     server_version = "nlos-cam"
@@ -152,11 +158,18 @@ class Handler(BaseHTTPRequestHandler):
         elif path.startswith(FILES_PATH):
             self._answer_file(unquote(path.removeprefix(FILES_PATH)))
         elif path in self.served.assets:
-            kind, content = self.served.assets[path]
-            self._begin(HTTPStatus.OK, kind, len(content))
-            self._send(content)
+            self._answer_asset(path)
         else:
             self._say(HTTPStatus.NOT_FOUND, "there is nothing here: the view is at /")
+
+    def _answer_asset(self, path: str) -> None:
+        kind, content = self.served.assets[path]
+        headers = {"Vary": "Accept-Encoding"}
+        if path in self.packed and _takes_gzip(self.headers.get("Accept-Encoding", "")):
+            headers["Content-Encoding"] = "gzip"
+            content = self.packed[path]
+        self._begin(HTTPStatus.OK, kind, len(content), headers)
+        self._send(content)
 
     def _answer_file(self, name: str) -> None:
         """Send a file that a command wrote, to who may command."""
@@ -230,9 +243,15 @@ class Handler(BaseHTTPRequestHandler):
         self._begin(status, "text/plain; charset=utf-8", len(content))
         self._send(content)
 
-    def _begin(self, status: HTTPStatus, kind: str, length: int | None = None) -> None:
+    def _begin(
+        self,
+        status: HTTPStatus,
+        kind: str,
+        length: int | None = None,
+        others: Mapping[str, str] | None = None,
+    ) -> None:
         self.send_response(status)
-        headers = {"Content-Type": kind, **HEADERS}
+        headers = {"Content-Type": kind, **HEADERS, **(others or {})}
         if length is not None:
             headers["Content-Length"] = str(length)
         for name, value in headers.items():
@@ -247,6 +266,24 @@ class Handler(BaseHTTPRequestHandler):
 
     def log_message(self, format: str, *args: object) -> None:  # noqa: A002  the name http.server uses
         pass
+
+
+def _takes_gzip(accepted: str) -> bool:
+    """Return True for an Accept-Encoding that names gzip, and not with a weight of zero."""
+    for part in accepted.lower().replace(" ", "").split(","):
+        name, _, weight = part.partition(";")
+        if name == "gzip":
+            return weight.rstrip("0") not in {"q=", "q=0."}
+    return False
+
+
+def _packed(assets: Assets) -> dict[str, bytes]:
+    """Compress assets, once for all browsers; large ones hold pictures, which do not shrink."""
+    return {
+        path: gzip.compress(content, mtime=0)
+        for path, (_, content) in assets.items()
+        if MIN_PACKED_BYTES <= len(content) <= MAX_PACKED_BYTES
+    }
 
 
 def _request_bytes(content: bytes) -> int:
@@ -417,6 +454,7 @@ class ViewServer:
         family, self._host = resolved(host)
         members = {
             "served": replace(served, known=names_of(host, self._host)),
+            "packed": _packed(served.assets),
             "streams": BoundedSemaphore(served.max_streams),
         }
         self._server = self._listening(

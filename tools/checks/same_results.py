@@ -50,7 +50,18 @@ COMMANDS: dict[str, tuple[str, ...]] = {
     "replay": ("replay", "sample"),
     "evaluate": ("evaluate", "--no-nearest"),
 }
-OF_THE_RUN = ("seconds", "_s", "_ms", "time", "date", "version", "path", "machine", "command")
+OF_THE_RUN = (
+    "seconds",
+    "_s",
+    "_ms",
+    "time",
+    "date",
+    "version",
+    "path",
+    "machine",
+    "command",
+    "program",
+)
 
 
 @contextmanager

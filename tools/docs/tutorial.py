@@ -12,14 +12,21 @@ from collections.abc import Callable
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
+from nlos_cam.info import describe_program
+
 ROOT = Path(__file__).parents[2]
 PAGE = ROOT / "docs" / "tutorial.md"
 STEP = re.compile(r"```sh\n(?P<commands>.*?)```\n\n```text\n(?P<answer>.*?)```", re.DOTALL)
 """Commands, and right after them their answers."""
+BLOCK = re.compile(r"^ *```(?:sh|bash)\n(?P<commands>.*?)^ *```", re.DOTALL | re.MULTILINE)
+"""Commands of any page."""
 WIDTH = 110
 """Width of the terminal in characters."""
-PROGRESS = re.compile(r"[a-z][\w ]*: (?:\d+/\d+, )?\d+ s")
+PROGRESS = re.compile(r"[A-Za-z][\w ]*: (?:\d+/\d+, )?\d+ s")
 """A line of progress, which only a slow machine prints."""
+
+SOURCE = re.compile(r"nlos-cam \d\S*, weights `direct` [0-9a-f]{12}")
+"""What gave the answers, in the page's head."""
 
 Runner = Callable[[list[str]], str]
 """Runs one command, given as its words, and returns its output. Raises CalledProcessError where it
@@ -34,6 +41,13 @@ def commands_of(text: str) -> list[list[str]]:
     ]
 
 
+def printed_commands(text: str) -> list[list[str]]:
+    """Return every command in the shell blocks of any page, as words without comments."""
+    blocks = (block["commands"].replace("\\\n", " ") for block in BLOCK.finditer(text))
+    lines = (shlex.split(line, comments=True) for block in blocks for line in block.splitlines())
+    return [words for words in lines if words]
+
+
 def answered(text: str, run: Runner) -> str:
     """Return the page with the present answers of its commands."""
 
@@ -43,6 +57,12 @@ def answered(text: str, run: Runner) -> str:
         return f"```sh\n{found['commands']}```\n\n```text\n{''.join(answers)}```"
 
     return STEP.sub(step, text)
+
+
+def source() -> str:
+    """Return the program and the weights, as the page names what gave its answers."""
+    facts = describe_program()
+    return f"nlos-cam {facts['version']}, weights `direct` {facts['weights']['direct']}"
 
 
 def as_program(words: list[str]) -> list[str]:
@@ -72,6 +92,7 @@ def main() -> int:
     """Run all commands in a temporary folder."""
     with TemporaryDirectory() as folder:
         text = answered(PAGE.read_text(encoding="utf-8"), run_in(Path(folder)))
+    text = SOURCE.sub(source(), text)
     PAGE.write_text(text, encoding="utf-8")
     return 0
 

@@ -1,4 +1,5 @@
 __all__ = [
+    "FITTED",
     "CompressorRecipe",
     "DirectRecipe",
     "InMemory",
@@ -25,6 +26,7 @@ __all__ = [
     "digest_of",
     "direct_start",
     "first_of",
+    "is_better",
     "latent_error",
     "launch",
     "load_encoder",
@@ -46,6 +48,7 @@ __all__ = [
     "subtract_bare_wall",
     "train_direct",
     "transfer_start",
+    "transfer_weights",
     "unwatched",
     "vae_start",
 ]
@@ -64,7 +67,7 @@ from .data import (
 )
 from .direct import NormalBatch, NormalSource, train_direct
 from .distributed import launch, open_fabric
-from .loop import Running, Scores, digest_of
+from .loop import Running, digest_of
 from .losses import latent_error
 from .quality import QualitySet
 from .recipe import (
@@ -78,11 +81,14 @@ from .recipe import (
     load_recipe,
     packaged_recipes,
 )
+from .run_files import Scores
 from .runs import (
+    FITTED,
     TrainingRun,
     Watch,
     compressor_start,
     direct_start,
+    is_better,
     record_run,
     record_uncertainty_run,
     run_compressor,
@@ -92,6 +98,7 @@ from .runs import (
     run_uncertainty,
     run_vae,
     transfer_start,
+    transfer_weights,
     unwatched,
     vae_start,
 )

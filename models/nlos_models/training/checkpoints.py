@@ -1,11 +1,13 @@
 """Checkpoints of training runs: weights to save, and networks that only training starts from."""
 
 import json
+import shutil
 from pathlib import Path
 from typing import NamedTuple
 
 from torch import nn
 
+from nlos_cam.files import CHECKSUMS, atomic_file
 from nlos_models.checkpoint import (
     PIPELINE_PARTS,
     load_part,
@@ -27,6 +29,8 @@ from nlos_models.records import (
     weights_folder,
 )
 from nlos_models.vae import Encoder, ResVae
+
+WEIGHT_SUFFIXES = ".safetensors", ".onnx", ".json"
 
 
 class LoadReport(NamedTuple):
@@ -81,10 +85,27 @@ def _save(folder: Path, parts: dict[str, nn.Module], record: CheckpointRecord) -
     # Readers of earlier versions refuse fields that they do not know, so that unset ones are not
     # written.
     unset = {
-        name for name in ("note", "direct_recipe") if not getattr(record, name)
+        name for name in ("note", "direct_recipe", "program") if not getattr(record, name)
     }  # older readers refuse these
     text = json.dumps(record.model_dump(mode="json", exclude=unset), indent=2)
     save_parts(folder, parts, {RECORD: text})
+
+
+def copy_weights(folder: Path, target: Path) -> None:
+    """Copy weights with their record, graphs, uncertainty network and checksums into a folder.
+    Raises CheckpointError.
+    """
+    target.mkdir(parents=True, exist_ok=True)
+    try:
+        for path in sorted(folder.iterdir()):
+            if path.suffix in WEIGHT_SUFFIXES or path.name == CHECKSUMS:
+                with atomic_file(target / path.name) as part:
+                    shutil.copyfile(path, part)
+    except OSError as error:
+        raise CheckpointError(
+            f"{folder} cannot be copied to {target} ({error.strerror}): free some space and run"
+            " again"
+        ) from error
 
 
 def load_vae(folder: Path | None = None) -> tuple[ResVae, CheckpointRecord]:

@@ -381,6 +381,7 @@ class _Run:
         if self.recipe.keep == "best":
             self.fabric.barrier()  # the leader may still be writing it
             best = read_best(self.folder)
+            self.fabric.barrier()  # the leader removes it at the end of the run
             self.module.load_state_dict(best["module"])
             row = self.rows[best["epoch"]]
         return {

@@ -6,20 +6,23 @@ A state file begins with the SHA-256 of the rest, so that a torn or damaged one 
 import csv
 import hashlib
 import io
+import json
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any, cast
 
 import torch
 
-from nlos_cam.files import TENSOR_LIMIT, atomic_file, read_bounded
-from nlos_models.errors import CheckpointError, TrainingError
+from nlos_cam.files import TENSOR_LIMIT, TEXT_LIMIT, atomic_file, read_bounded
+from nlos_models.errors import CheckpointError, RecipeError, TrainingError
 
 LAST = "last.ckpt"
 PREVIOUS = "previous.ckpt"
 BEST = "best.ckpt"
 LOG = "log.csv"
+FINISHED = "finished.json"
+"""Origin and figures of a run that has ended; its states are gone."""
 DIGEST = hashlib.sha256().digest_size
 
 Scores = dict[str, float]
@@ -82,6 +85,40 @@ def read_best(folder: Path) -> State:
             f"{folder / BEST} is missing or damaged: train again into another --out"
         )
     return state
+
+
+def write_finished(folder: Path, origin: str, figures: Scores, parts: Iterable[str] = ()) -> None:
+    """Write that the run has ended with these figures, and remove its states, also those in the
+    folders `parts`. Its weights have to be saved by then.
+
+    Raises TrainingError where it cannot be written; the states then stay.
+    """
+    text = json.dumps({"origin": origin, "figures": figures}, indent=2)
+    _write(folder / FINISHED, f"{text}\n".encode())
+    for part in (folder, *(folder / name for name in parts)):
+        for name in (LAST, PREVIOUS, BEST):
+            (part / name).unlink(missing_ok=True)
+
+
+def read_finished(folder: Path, origin: str) -> Scores | None:
+    """Return the figures of the run that has ended in a folder, or None where none has.
+
+    Raises RecipeError for a run from another origin, CheckpointError for a damaged file.
+    """
+    path = folder / FINISHED
+    if not path.exists():
+        return None
+    try:
+        found = json.loads(read_bounded(path, TEXT_LIMIT))
+        figures = {str(name): float(value) for name, value in found["figures"].items()}
+        same = found["origin"] == origin
+    except (ValueError, TypeError, KeyError, AttributeError) as error:
+        raise CheckpointError(f"{path} is damaged: choose another --out") from error
+    if not same:
+        raise RecipeError(
+            f"{folder} holds a run from other weights or objects: choose another --out"
+        )
+    return figures
 
 
 def _pack(state: State) -> bytes:

@@ -3,7 +3,7 @@ and saves.
 """
 
 import os
-from collections.abc import Callable, Generator
+from collections.abc import Callable, Generator, Iterable
 from contextlib import AbstractContextManager, ExitStack, contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -12,7 +12,7 @@ from typing import Any, Generic, TypeVar
 import torch
 from lightning_fabric import Fabric
 
-from nlos_cam.files import OutputExistsError, claim
+from nlos_cam.files import OutputExistsError, claim, program_name
 from nlos_models.arrays import Float16
 from nlos_models.checkpoint import load_network, load_pipeline
 from nlos_models.direct import DirectNetwork
@@ -35,7 +35,7 @@ from nlos_models.records import (
 from nlos_models.training import checkpoints
 from nlos_models.training.data import MapSet, MapSource
 from nlos_models.training.direct import NormalSource, train_direct, transfer_direct
-from nlos_models.training.loop import Running, Scores
+from nlos_models.training.loop import Running
 from nlos_models.training.quality import QualitySet, fit_quality, write_quality
 from nlos_models.training.recipe import (
     CompressorRecipe,
@@ -47,7 +47,9 @@ from nlos_models.training.recipe import (
     VaeRecipe,
     maps_of,
 )
+from nlos_models.training.run_files import Scores, read_finished, write_finished
 from nlos_models.training.tasks import (
+    PHASES,
     Start,
     figures_of,
     run,
@@ -58,6 +60,9 @@ from nlos_models.training.tasks import (
 from nlos_models.training.uncertainty import UncertaintySet, calibrate, train_uncertainty
 from nlos_models.uncertainty_network import save_uncertainty_network
 from nlos_models.vae import Encoder, ResVae
+
+FITTED = "fitted"
+"""Folder, in a transfer's output, of new weights that are worse than those that it started from."""
 
 
 @contextmanager
@@ -105,6 +110,19 @@ class TrainingRun(Generic[R]):
                 held.enter_context(claim(self.out, inside=True))
             yield held.enter_context(self.watch(running, self.recipe, name))
 
+    def finished(self) -> Scores | None:
+        """Return the figures of this run where it has ended already, with its weights in `out`.
+
+        Raises RecipeError where the run that ended there had another origin.
+        """
+        if not (self.out / RECORD).exists():
+            return None
+        return read_finished(self.out, self.origin)
+
+    def finish(self, figures: Scores, parts: Iterable[str] = ()) -> None:
+        """Remove the states of a run whose weights are saved, and keep its figures."""
+        write_finished(self.out, self.origin, figures, parts)
+
     def with_figures(self, figures: Scores) -> CheckpointRecord:
         """Return the record with the held-out figures."""
         return self.record.model_copy(update={"figures": figures})
@@ -129,9 +147,13 @@ def record_run(
         raise OutputExistsError(
             f"{out} holds the weights that this run starts from: choose another --out"
         )
-    if (out / RECORD).exists() and load_record(out).model_copy(update={"figures": {}}) != record:
-        raise OutputExistsError(f"{out} holds weights from another run: choose another --out")
-    return record
+    # A transfer that made things worse has its own weights there, and the earlier ones in `out`.
+    own = out / FITTED if (out / FITTED / RECORD).exists() else out
+    if (own / RECORD).exists():
+        earlier = load_record(own).model_copy(update={"figures": {}, "program": ""})
+        if earlier != record:
+            raise OutputExistsError(f"{out} holds weights from another run: choose another --out")
+    return record.model_copy(update={"program": program_name()})
 
 
 def record_uncertainty_run(
@@ -144,7 +166,9 @@ def record_uncertainty_run(
     """
     if out.resolve() == watched.resolve() or (out / UNCERTAINTY_RECORD).exists():
         raise OutputExistsError(f"{out} holds weights already: choose another --out")
-    return UncertaintyRecord(watches=checksum_of_watched(watched), recipe=recipe, learnt=kinds)
+    return UncertaintyRecord(
+        watches=checksum_of_watched(watched), recipe=recipe, program=program_name(), learnt=kinds
+    )
 
 
 def run_vae(
@@ -155,10 +179,13 @@ def run_vae(
     held_out: Float16,
 ) -> Scores:
     """Train a VAE and save it; return its held-out figures."""
+    if (ended := training.finished()) is not None:
+        return ended
     with training.watched(fabric, "VAE") as running:
         vae, figures = train_vae(training.recipe, images, held_out, training.out, running, start)
     if fabric.is_global_zero:
         checkpoints.save_vae(training.out, vae, training.with_figures(figures))
+        training.finish(figures)
     return figures
 
 
@@ -170,6 +197,8 @@ def run_compressor(
     held_out: MapSet,
 ) -> Scores:
     """Train a compressor and save it with its decoder; return its held-out figures."""
+    if (ended := training.finished()) is not None:
+        return ended
     recipe = training.recipe
     with training.watched(fabric, "compressor") as running:
         pipeline, figures = train_compressor(recipe, start, maps, held_out, training.out, running)
@@ -177,6 +206,7 @@ def run_compressor(
         encoder = start.vae.encoder if start.vae and recipe.steps != "one" else None
         checkpoints.save_pipeline(training.out, pipeline, training.with_figures(figures), encoder)
         _export(training)
+        training.finish(figures)
     return figures
 
 
@@ -188,12 +218,15 @@ def run_direct(
     held_out: MapSet,
 ) -> Scores:
     """Train a direct network and save it; return its held-out figures."""
+    if (ended := training.finished()) is not None:
+        return ended
     with training.watched(fabric, "direct network") as running:
         network, figures = train_direct(
             training.recipe, source, held_out, training.out, running, start
         )
     checkpoints.save_direct(training.out, network, training.with_figures(figures))
     _export(training)
+    training.finish(figures)
     return figures
 
 
@@ -204,12 +237,18 @@ def run_transfer(
     encoder: Encoder | None,
     maps: MapSource,
     held_out: MapSet,
+    start: Path | None = None,
 ) -> dict[str, Scores]:
     """Fine-tune weights on recordings and save them; return their held-out figures before and
     after.
+
+    Where the held-out loss has not fallen, `out` gets a copy of the weights in the folder `start`
+    (None: of no whole weights, and the new ones are kept), and the new ones lie in its FITTED.
     """
     # The same held-out maps before and after, so that their difference is the transfer's.
     before = figures_of(run(network.to(fabric.device).eval(), held_out), held_out.image)
+    if (ended := training.finished()) is not None:
+        return {"before": before, "after": ended}
     with training.watched(fabric, "transfer") as running:
         if isinstance(network, DirectNetwork):
             network, after = transfer_direct(
@@ -220,12 +259,23 @@ def run_transfer(
                 training.recipe, network, encoder, maps, held_out, training.out, running
             )
     if fabric.is_global_zero:
+        keeps_start = start is not None and not is_better(after, before)
+        folder = training.out / FITTED if keeps_start else training.out
         if isinstance(network, DirectNetwork):
-            checkpoints.save_direct(training.out, network, training.with_figures(after))
+            checkpoints.save_direct(folder, network, training.with_figures(after))
         else:
-            checkpoints.save_pipeline(training.out, network, training.with_figures(after), encoder)
-        _export(training)
+            checkpoints.save_pipeline(folder, network, training.with_figures(after), encoder)
+        if not training.record.color:
+            export_folder(folder)
+        if start and keeps_start:
+            checkpoints.copy_weights(start, training.out)
+        training.finish(after, PHASES)
     return {"before": before, "after": after}
+
+
+def is_better(after: Scores, before: Scores) -> bool:
+    """Return True if the held-out loss, which also selects the epoch, has fallen."""
+    return after["held_out_loss"] < before["held_out_loss"]
 
 
 def run_uncertainty(
@@ -249,6 +299,7 @@ def run_uncertainty(
         record = about.model_copy(update={**asdict(fitted), "figures": figures})
         save_uncertainty_network(training.out, network, record, watched)
         _export(training)
+        training.finish(figures)
     return {**figures, "error_scale": fitted.error_scale, "outside_above": fitted.outside_above}
 
 
@@ -341,16 +392,22 @@ def direct_start(
     return network, record.runs
 
 
+def transfer_weights(recipe: TransferRecipe, weights: Path | None) -> Path:
+    """Return the folder of the weights that a transfer starts from: by default the paper's where
+    the recipe aims at a latent, else the direct ones.
+    """
+    return weights_folder(weights, PAPER if recipe.latent_weight else DIRECT)
+
+
 def transfer_start(
     recipe: TransferRecipe, weights: Path | None, *, partial: bool, on_report: Callable[[str], None]
 ) -> tuple[RemappingNetwork | DirectNetwork, CheckpointRecord]:
-    """Load the networks that a transfer starts from and their record.
+    """Load the networks in `transfer_weights`, and their record.
 
-    By default they are the paper's where the recipe aims at a latent, else the direct ones. If
-    `partial`, only matching layers of the compressor are loaded, `on_report` is called with a
+    If `partial`, only matching layers of the compressor are loaded, `on_report` is called with a
     summary of them, and the others are initialised from the recipe's seed.
     """
-    folder = weights_folder(weights, PAPER if recipe.latent_weight else DIRECT)
+    folder = transfer_weights(recipe, weights)
     _check_fits(recipe, folder)
     if not partial:
         return load_network(folder)

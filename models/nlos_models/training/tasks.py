@@ -39,6 +39,7 @@ from nlos_models.vae import Encoder, ResVae
 SCORING_BATCH = 100
 ALL_LAYERS = "all-layers"
 CLASSIFIER = "classifier"
+PHASES = ALL_LAYERS, CLASSIFIER
 """Folders of a transfer's two phases."""
 CHANNELS = {"own": slice(None), "own intensity": slice(2, None)}
 """Channels that take the recordings' statistics: depth is in metres on every bench, intensity in a

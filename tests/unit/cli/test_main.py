@@ -13,7 +13,6 @@ import time
 import weakref
 from collections.abc import Callable
 from contextlib import suppress
-from importlib.metadata import version
 from pathlib import Path
 from threading import Event
 from typing import Any
@@ -41,6 +40,7 @@ from nlos_cam.cli.main import (
     main,
 )
 from nlos_cam.cli.plain_help import plain_help, range_text
+from nlos_cam.files import program_name
 
 CODES = {
     1: (
@@ -272,7 +272,7 @@ def test_help_names_every_command_with_json_and_version(shown: Run) -> None:
     for name, callback in commands:
         assert "json" in getattr(callback, "__annotations__", {}), name
 
-    assert shown("--version").out == shown("-V").out == f"nlos-cam {version('nlos-cam')}\n"
+    assert shown("--version").out == shown("-V").out == f"{program_name()}\n"
 
 
 @pytest.mark.parametrize("command", COMMANDS)
@@ -310,6 +310,22 @@ def test_output_path_refuses_read_only_folder(tmp_path: Path, monkeypatch: Patch
     monkeypatch.setattr(os, "access", lambda path, mode: not (path == tmp_path and mode == os.W_OK))
     with pytest.raises(errors.OutputExistsError, match=r"wall\.toml"):
         common.output_path(out, "wall", ".toml", overwrite=True)
+
+
+def test_output_path_makes_the_folders_above_it(tmp_path: Path) -> None:
+    used = common.output_path(tmp_path / "a" / "b" / "wall.toml", "", ".toml", overwrite=False)
+    used.touch()
+    unused = common.output_path(tmp_path / "c" / "d" / "wall.toml", "", ".toml", overwrite=False)
+
+    assert unused.parent.is_dir()
+
+    common.release_outputs()
+
+    assert used.exists()
+    assert not (tmp_path / "c").exists()
+
+    with pytest.raises(errors.OutputExistsError, match="is a file"):
+        common.output_path(used / "x.toml", "", ".toml", overwrite=False)
 
 
 def test_table_on_a_narrow_terminal_is_blocks_of_lines(monkeypatch: Patch, capsys: Capsys) -> None:

@@ -266,7 +266,8 @@ def test_train_transfer_reports_both_figures_and_keeps_decoder(
     go("transfer", "--weights", other, code=4)
     answer = go("transfer", "--weights", other, "--partial")
 
-    assert set(answer) == {"out", *FIGURES, "before"}
+    assert set(answer) == {"out", *FIGURES, "before", "kept", "fitted"}
+    assert answer["fitted"] == str(out)
     assert answer["before"]["held_out_loss"] != answer["held_out_loss"]
 
     record = load_record(out)
@@ -274,6 +275,40 @@ def test_train_transfer_reports_both_figures_and_keeps_decoder(
     assert record.runs == [*load_record(folder / "two").runs, record.transfer_recipe]
     assert _same(out, folder / "two", "decoder", "encoder") == [True, True]
     assert (out / "all-layers" / "log.csv").exists()
+
+
+@pytest.mark.slow
+def test_transfer_that_worsens_keeps_the_earlier_weights(
+    go: Run, folder: Path, out: Path, monkeypatch: Patch
+) -> None:
+    monkeypatch.setattr(runs, "figures_of", lambda *_: {"held_out_loss": 0.0, "held_out_iou": 1.0})
+    answer = go("transfer", "--weights", folder / "two")
+    fitted = out / "fitted"
+
+    assert answer["kept"] == "earlier"
+    assert answer["fitted"] == str(fitted)
+    assert _same(out, folder / "two", "compressor", "decoder") == [True, True]
+    assert _same(fitted, folder / "two", "compressor") == [False]
+    assert load_record(out).runs == load_record(folder / "two").runs
+    assert load_record(fitted).transfer_recipe is not None
+    assert go("transfer", "--weights", folder / "two") == answer
+
+
+def test_finished_run_keeps_no_states_and_is_not_repeated(
+    go: Run, folder: Path, out: Path, monkeypatch: Patch
+) -> None:
+    answer = go("two", "--vae", folder / "vae")
+
+    assert not [*out.rglob("*.ckpt")]
+
+    monkeypatch.setattr(runs, "train_compressor", pytest.fail)
+
+    assert go("two", "--vae", folder / "vae") == answer
+
+    other = SmallDataset(small_maps(8, 1), PLAN)
+    monkeypatch.setattr("nlos_cam.dataset.training_maps.open_dataset", lambda *_, **__: other)
+
+    assert "choose another --out" in go("two", "--vae", folder / "vae", code=4)["error"]["message"]
 
 
 @pytest.mark.parametrize(

@@ -467,18 +467,27 @@ def test_module_does_not_import(modules: str, without: str) -> None:
 
 
 PIECES = [range(k, k + 2) for k in range(0, 40, 2)]
-LOCAL = """
+CLUSTER = """
+import sys
+from pathlib import Path
 import numpy as np
-from nlos_calibration import load_rig
-from nlos_cam.dataset import DatasetPlan, ray_farm
+from ray.cluster_utils import Cluster
+from nlos_cam.cli.main import main
+from nlos_cam.dataset import open_dataset
 from nlos_cam.dataset.samples import make_samples
-plan = DatasetPlan(load_rig("paper-rig"), 0, accuracy="draft")
-made = dict(ray_farm("local")(plan, [range(0, 1), range(1, 3)]))
-for piece, samples in made.items():
-    for name, values in make_samples(plan, piece).items():
-        np.testing.assert_array_equal(samples[name], values)
-assert len(made) == 2
+
+cluster = Cluster(initialize_head=True, head_node_args={"num_cpus": 1})
+cluster.add_node(num_cpus=1)
+assert len(cluster.list_all_nodes()) == 2
+build = f"dataset build --ray {cluster.address} --count 20 --accuracy draft --out"
+assert main([*build.split(), sys.argv[1]]) == 0
+found = open_dataset(Path(sys.argv[1]))
+expected = make_samples(found.plan, range(20))
+for name in ("depth_m", "intensity", "image", "seed"):
+    np.testing.assert_array_equal(found.column(name), expected[name])
+cluster.shutdown()
 """
+"""Two workers on the loopback, as two machines would be, and the command for them."""
 
 
 class RayError(Exception):
@@ -596,10 +605,9 @@ def test_ray_worker_of_another_version_is_refused() -> None:
 
 @pytest.mark.slow
 @pytest.mark.skipif(find_spec("ray") is None, reason="needs Ray (the extra `many`)")
-def test_local_cluster_makes_equal_samples() -> None:
+def test_cluster_of_two_machines_makes_equal_samples(tmp_path: Path) -> None:
     """Runs in a process of its own, since Ray leaves threads behind."""
-    done = subprocess.run(
-        [sys.executable, "-c", LOCAL], capture_output=True, text=True, check=False, timeout=280
-    )
+    command = [sys.executable, "-c", CLUSTER, str(tmp_path / "data")]
+    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=280)
 
     assert done.returncode == 0, done.stdout + done.stderr

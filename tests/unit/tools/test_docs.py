@@ -193,6 +193,14 @@ def test_every_command_block_is_followed_by_its_answer(tool: Tool) -> None:
     )
 
 
+def test_answers_of_the_tutorial_are_of_todays_weights(tool: Tool) -> None:
+    tutorial = tool("tutorial")
+    found = tutorial.SOURCE.search(tutorial.PAGE.read_text(encoding="utf-8"))
+
+    assert found is not None
+    assert found[0] == tutorial.source(), "run `python tools/docs/tutorial.py`"
+
+
 def test_the_version_is_the_same_everywhere() -> None:
     cited = re.search(r"^version: (\S+)$", (ROOT / "CITATION.cff").read_text("utf-8"), re.MULTILINE)
 

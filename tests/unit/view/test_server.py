@@ -1,3 +1,4 @@
+import gzip
 import re
 import socket
 from collections.abc import Iterator, Mapping
@@ -20,6 +21,7 @@ from nlos_cam.view.server import (
     names_of,
     resolved,
 )
+from nlos_cam.view.session_file import page_html
 
 
 @pytest.fixture
@@ -60,6 +62,27 @@ def test_server_sends_whole_files_and_refuses_any_other_request(server: ViewServ
     assert {
         status_of(server.address, "/", method=name) for name in ("PUT", "DELETE", "OPTIONS")
     } == {501}
+
+
+@pytest.mark.parametrize(
+    ("accepted", "is_packed"),
+    [("gzip, deflate, br", True), ("br;q=1, gzip;q=0.5", True), ("gzip;q=0.0", False), ("", False)],
+)
+def test_page_is_packed_for_browsers_that_take_it(accepted: str, is_packed: bool) -> None:
+    page = page_html("live").encode()
+    served = Served({"/": ("text/html", page)}, lambda _: None)
+    with (
+        closing(ViewServer(served, 0)) as server,
+        closing(ask(server.address, "/", Accept_Encoding=accepted)) as answer,
+    ):
+        content = answer.read()
+
+        assert len(content) == int(answer.headers["Content-Length"])
+        assert answer.headers["Vary"] == "Accept-Encoding"
+        assert answer.headers.get("Content-Encoding") == ("gzip" if is_packed else None)
+
+    assert (gzip.decompress(content) if is_packed else content) == page
+    assert len(content) <= 51_000 or not is_packed
 
 
 def test_server_closes_connections_beyond_its_limit(
