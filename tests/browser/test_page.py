@@ -13,6 +13,7 @@ import pytest
 from browser_page import DEADLINE_S, Page
 from made_up_moments import RIG, full_moment, with_result
 from measured_walls import exact_wall
+from screenshots import UNDER_TEXT
 from view_streams import ask
 
 from nlos_cam.reconstruct import Verdict
@@ -210,15 +211,6 @@ def settled() -> tuple[int, int, float]:
             return now
         before = now
     return before
-
-
-UNDER_TEXT = """() => {
-  const box = (element) => element.getBoundingClientRect();
-  const texts = [...document.querySelectorAll("#status, #verdict, figcaption, figure small, #readout, #tabbed")];
-  const pictures = [...document.querySelectorAll("figure div, #bench")];
-  const meet = (a, b) => a.left < b.right - 1 && b.left < a.right - 1 && a.top < b.bottom - 1 && b.top < a.bottom - 1;
-  return pictures.flatMap((picture) => texts.filter((text) => meet(box(picture), box(text))).map((text) => text.textContent));
-}"""
 
 
 @pytest.mark.parametrize("size", [(1280, 720), (1366, 657), (1920, 1080), (390, 844)])
