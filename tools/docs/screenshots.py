@@ -100,7 +100,8 @@ SITUATIONS = {
     "recording": Situation(("live", "sim"), "nlos.state().statusText.includes('REC')", key="r"),
     "ended": Situation(("live", "sim", "--seconds", "30"), _headline("The run has ended")),
     "playback": Situation(
-        ("view", str(SAMPLE.resolve())), "nlos.state().end > 1 && !nlos.state().status.message"
+        ("view", str(SAMPLE.resolve())),
+        "nlos.state().status.state === 'playback' && !nlos.state().status.message",
     ),
     "calibrated": Situation(MEASURED, _headline("Object seen"), wall_yaw_deg=45.0),
     "moved": Situation(MEASURED, _headline("Wall moved"), wall_yaw_deg=43.0),
