@@ -1,7 +1,11 @@
 # %% Open a recording
 # `nlos_cam.open` finds the camera and loads the networks; `with` starts it. A recording that comes with the package:
+from matplotlib.figure import Figure
+
 import nlos_cam
+from nlos_cam.cli.main import main
 from nlos_cam.recording import SAMPLE
+from nlos_cam.render import paper_scene, transient, transient_axes
 
 with nlos_cam.open(f"bag:{SAMPLE}") as stream:
     results = list(stream)
@@ -28,11 +32,7 @@ print("mesh", result.to_mesh().faces.shape)
 
 # %% A transient with its axes
 # `transient` is all light that comes back, over the length of the whole path; `transient_axes` says what its numbers
-# are over: bins from the moment the pulse leaves, where each beam meets the wall, the points of the relay wall.
-from matplotlib.figure import Figure
-
-from nlos_cam.render import paper_scene, transient, transient_axes
-
+# are over: bins up to the gate, from the moment the pulse leaves, where each beam meets the wall, the points of the relay wall.
 scene = paper_scene().scene_at(0)
 light = transient(scene, "draft")
 axes = transient_axes(scene, "draft")
@@ -42,15 +42,13 @@ print("this beam meets the wall at", axes.laser_spots_m[row, column].round(3), "
 
 figure = Figure((7, 2.4), layout="constrained")
 axis = figure.subplots()
-axis.semilogy(axes.path_m, light[row, column] + 1e-12)
-axis.set(xlim=(0.3, 1.8), ylim=(1e-9, None), xlabel="path length (m)", ylabel="light")
+axis.semilogy(axes.path_m[: light.shape[2]], light[row, column] + 1e-12)
+axis.set(ylim=(1e-9, None), xlabel="path length (m)", ylabel="light")
 figure.savefig("notebook_transient.png", dpi=70)
 
 # %% A bench of your own
 # `bench=` takes a folder of `nlos-cam calibrate --bench`: its wall, its occluder, and weights made for it if it has some.
 # Here a simulated bare wall is measured first, by the same command that an owner types.
-from nlos_cam.cli import main
-
 main(["calibrate", "--wall", "--camera", "sim:bare-wall", "--bench", "bench", "--quiet"])
 with nlos_cam.open("sim:bare-wall", bench="bench") as stream:
     print(stream.rig.name, f"{stream.rig.lidar.distance_m:.4f} m to the wall")
