@@ -36,7 +36,7 @@ print("mesh", result.to_mesh().faces.shape)
 scene = paper_scene().scene_at(0)
 light = transient(scene, "draft")
 axes = transient_axes(scene, "draft")
-row, column = 32, 60
+row, column = 32, 30
 print("light", light.shape, "over", axes.path_m.shape, f"bins of {100 * axes.bin_m:.0f} cm")
 print("this beam meets the wall at", axes.laser_spots_m[row, column].round(3), "m")
 

@@ -223,6 +223,15 @@ def test_no_text_lies_over_a_picture_however_many_warnings(
         assert page.page.evaluate(UNDER_TEXT) == []
 
 
+def test_color_bar_keeps_its_labels_apart_when_the_window_narrows(browser: Any) -> None:
+    with WebViewer(RIG) as viewer:
+        viewer.show(full_moment(0))
+        page = Page(browser, viewer.address or "").drawn()
+        page.page.set_viewport_size({"width": 390, "height": 844})
+        places = "[...document.querySelectorAll('#bar span')].map((each) => each.offsetLeft)"
+        page.wait_until(lambda: len(set(page.page.evaluate(places))) == 5, "labels side by side")
+
+
 def test_point_has_values_and_marks_in_every_map_and_a_distance(browser: Any) -> None:
     with WebViewer(RIG) as viewer:
         viewer.show(full_moment(0))
