@@ -152,6 +152,9 @@ def test_playback_plays_scrubs_and_changes_speed(browser: Any) -> None:
         page = Page(browser, viewer.address or "").drawn()
         page.wait_until(lambda: page.state()["end"] == pytest.approx(29.5), "the whole recording")
         play_through(page)
+        for width, height in SIZES:
+            page.page.set_viewport_size({"width": width, "height": height})
+            assert page.page.evaluate(UNDER_TEXT) == []
         page.close()
 
 

@@ -110,7 +110,7 @@ IN_DOCS = {"object": "object", "calibrated": "calibrated", "phone": "object"}
 """Situation of each picture that the docs show."""
 UNDER_TEXT = """() => {
   const box = (element) => element.getBoundingClientRect();
-  const texts = [...document.querySelectorAll("#status, #verdict, figcaption, figure small, #readout, #tabbed")];
+  const texts = [...document.querySelectorAll("#status, #verdict, #player, figcaption, figure small, #readout, #tabbed")];
   const pictures = [...document.querySelectorAll("figure div, #bench")];
   const meet = (a, b) => a.left < b.right - 1 && b.left < a.right - 1 && a.top < b.bottom - 1 && b.top < a.bottom - 1;
   return pictures.flatMap((picture) => texts.filter((text) => meet(box(picture), box(text))).map((text) => text.textContent));

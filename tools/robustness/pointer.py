@@ -31,17 +31,20 @@ OUT = Path(__file__).parents[2] / "docs/figures/pointer.json"
 WARM_UP_S = 15.0
 TURN_S = 12.0
 """Longer than the 10 s over which the page's figures are."""
-MAPS = "#found div", "#truth div", "#depth div", "#infrared div"
+BOXES = """[...document.querySelectorAll("figure.map div")].slice(0, 4).map((each) => {
+  const box = each.getBoundingClientRect();
+  return [box.left, box.top, box.width, box.height];
+})"""
 
 
 def move(page: Any) -> None:
     """Move the pointer over the maps, back and forth, for a turn."""
+    boxes = page.evaluate(BOXES)
     end_s = time.monotonic() + TURN_S
     step = 0
     while time.monotonic() < end_s:
-        box = page.locator(MAPS[step // 40 % len(MAPS)]).bounding_box()
-        share = step % 40 / 40
-        page.mouse.move(box["x"] + share * box["width"], box["y"] + 0.5 * box["height"])
+        left, top, width, height = boxes[step // 40 % len(boxes)]
+        page.mouse.move(left + step % 40 / 40 * width, top + 0.5 * height)
         page.wait_for_timeout(30)
         step += 1
 
@@ -54,7 +57,8 @@ def rest(page: Any) -> None:
 
 def turns(page: Any, rounds: int) -> dict[str, list[dict[str, float]]]:
     """Return the loop's latency in each turn."""
-    page.wait_for_function("!!window.nlos && nlos.state().shown > 0", timeout=240e3)
+    while not page.evaluate("!!window.nlos && nlos.state().shown > 0"):
+        page.wait_for_timeout(100)
     page.wait_for_timeout(1e3 * WARM_UP_S)
     found: dict[str, list[dict[str, float]]] = {"rests": [], "moves": []}
     for _ in range(rounds):
