@@ -5,7 +5,7 @@ why one is missing.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -158,11 +158,20 @@ Message = Annotated[
     str,
     typer.Option("--message", help="Explain this message of librealsense or of its viewer."),
 ]
+Watch = Annotated[
+    str | None,
+    typer.Option(
+        "--camera",
+        metavar="CAMERA",
+        help="Watch this camera for 5 s, for frames that stand still: l515, sim, ...",
+    ),
+]
 
 
 def doctor(
     write_udev: WriteUdev = None,
     message: Message = "",
+    watched: Watch = None,
     overwrite: Overwrite = False,
     json: Json = False,
 ) -> None:
@@ -171,7 +180,10 @@ def doctor(
     """
     if write_udev is not None:
         _write(output_path(write_udev, "", ".rules", overwrite=overwrite))
-    checks = diagnosis.diagnose(diagnosis.gather_facts(message))
+    facts = diagnosis.gather_facts(message)
+    if watched is not None:
+        facts = replace(facts, watched=diagnosis.watch(cameras.full_uri(watched)))
+    checks = diagnosis.diagnose(facts)
     if not json:
         show(_checks_table(checks))
     failures = sum(check.status == "failed" for check in checks)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shlex
 import sys
 import webbrowser
 from collections.abc import Callable, Generator
@@ -29,6 +30,7 @@ from nlos_cam.cli.common import (
     say,
     stop_on_signals,
 )
+from nlos_cam.errors import RecordingError
 
 NoView = Annotated[bool, typer.Option("--no-view", help="Serve no live view.")]
 ViewPort = Annotated[
@@ -153,6 +155,11 @@ def view(
     """
     host = view_host or views.LOOPBACK
     announce = partial(announce_view, host=view_host, port=view_port, open_it=open_view)
+    if file.suffix in {".hdf5", ".h5"}:
+        raise RecordingError(
+            f"{file} is no recording: a transient is drawn by `nlos-cam info {shlex.quote(str(file))}"
+            " --out look.html`"
+        )
     is_recording = file.suffix == ".bag" or recordings.is_ros2(file)
     if not is_recording and (wall or bench_folder):
         raise typer.BadParameter(

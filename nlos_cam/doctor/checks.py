@@ -308,6 +308,7 @@ def _load_fix(error: str, on: str) -> str:
     return f"pip install {_wheel(on)} libusb-package"
 
 
+FROZEN_FIX = "unplug the camera, wait 5 s, plug it in, and run `nlos-cam live --camera l515`"
 KNOWN_MESSAGES = (
     (
         r"fatal error.{0,20}\b16\b",
@@ -327,7 +328,7 @@ KNOWN_MESSAGES = (
     (
         r"same frame|frozen|frame number.{0,40}(again|repeat|not increas|stuck)|stalled",
         "the camera sends one frame again and again: its firmware stands still",
-        "unplug the camera, wait 5 s, plug it in, and run `nlos-cam live --camera l515`",
+        FROZEN_FIX,
     ),
 )
 """Messages of librealsense and its viewer that owners report: pattern, meaning and fix."""
@@ -339,6 +340,20 @@ def _known(message: str) -> tuple[str, str] | None:
         if re.search(pattern, message, re.IGNORECASE):
             return meaning, fix
     return None
+
+
+def stream(facts: Facts) -> Finding:
+    """Check that the camera's frames come, and that each is another."""
+    found = facts.watched
+    if found is None:
+        return ok("no camera was watched: --camera l515 watches one for some seconds")
+    if found.error:
+        return failed(f"{found.camera}: {found.error}", "look at the other checks, then replug")
+    if not found.frames:
+        return failed(f"no frame of {found.camera} in {found.seconds:.0f} s", FROZEN_FIX)
+    if found.is_frozen:
+        return failed(f"{found.camera} sends one frame again and again", FROZEN_FIX)
+    return ok(f"{found.frames} frames of {found.camera}, each another")
 
 
 def reported(facts: Facts) -> Finding:

@@ -81,6 +81,7 @@ IN_ORDER: tuple[Callable[[Facts], Finding], ...] = (
     sdk_camera,
     checks.firmware,
     checks.metadata,
+    checks.stream,
     checks.reported,
 )
 CHECKS = {check.__name__.replace("_", "-"): check for check in IN_ORDER}

@@ -105,6 +105,19 @@ class Pair:
 
 
 @dataclass(frozen=True)
+class Watched:
+    """Frames of a camera over some seconds."""
+
+    camera: str
+    frames: int
+    seconds: float
+    is_frozen: bool = False
+    """True if it sent the same frame again and again."""
+    error: str = ""
+    """Why it could not be watched; empty otherwise."""
+
+
+@dataclass(frozen=True)
 class Facts:
     """Facts of one moment: host, USB and SDK."""
 
@@ -113,6 +126,8 @@ class Facts:
     sdk: Sdk
     reported: str = ""
     """Message that another program showed, as the user gives it."""
+    watched: Watched | None = None
+    """Frames of the camera that the user named."""
 
     @property
     def pairs(self) -> list[Pair]:

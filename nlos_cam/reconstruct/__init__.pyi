@@ -6,6 +6,7 @@ __all__ = [
     "FrameConditions",
     "FrameReader",
     "FrameResult",
+    "FrozenFrames",
     "MapAlignment",
     "OnWarning",
     "PeriodicPhysicsCheck",
@@ -82,4 +83,4 @@ from .summaries import (
     describe_counts,
     frames_by_verdict,
 )
-from .verdict import FrameConditions, Verdict, VerdictFilter, frame_issues
+from .verdict import FrameConditions, FrozenFrames, Verdict, VerdictFilter, frame_issues

@@ -130,7 +130,9 @@ class TransientAxes:
     """What the numbers of `transient` are over, in the wall frame in metres."""
 
     path_m: Float64
-    """(bins,); middle of each bin: bin k holds paths from k to k + 1 times `bin_m`."""
+    """(n,); middle of each bin up to the gate: bin k holds paths from k to k + 1 times `bin_m`.
+    `transient` ends with the last bin that can hold light: its bins are the first of these.
+    """
     bin_m: float
     """Width of a bin as path length; the first begins at the lidar (path 0), when the pulse
     leaves. Divided by the speed of light it is the time of flight.

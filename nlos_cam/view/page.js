@@ -205,7 +205,8 @@ function drawTruth(depth, truth) {
   title("#wrong", `Difference ${pictures.swatch("signed")} ±${DIFFERENCE_SPAN_CM} cm`);
   const { overlap, errorMm } = pictures.difference(find("#wrong"), depth, truth);
   const box = (name) => `<i class="hatch-${name}" style="width: 9px"></i> ${name}`;
-  const text = `outline ${(100 * overlap).toFixed(0)} %, ${errorMm.toFixed(0)} mm ${box("extra")} ${box("missing")}`;
+  const off = errorMm === null ? "" : `, ${errorMm.toFixed(0)} mm`;
+  const text = `outline ${(100 * overlap).toFixed(0)} %${off} ${box("extra")} ${box("missing")}`;
   const small = find("#wrong small");
   if (small.dataset.html === text) return;
   small.dataset.html = text;
@@ -398,7 +399,7 @@ function statusParts(word) {
   const live = mode === "live" && !["ended", "no connection"].includes(now.state);
   const calm = ["running", "playback", "saved session"].includes(word);
   const parts = [[`<b class="${calm ? "" : "on"}">${escape(word)}</b>`, "state of the run"]];
-  if (now.message) parts.push([escape(now.message), ""]);
+  if (now.message && !(OVER[word] && state.moment)) parts.push([escape(now.message), ""]);
   if (now.camera) parts.push([`<b>${escape(now.camera)}</b>`, "where the frames come from"]);
   if (live && now.fps !== undefined) {
     parts.push([`<b>${now.fps.toFixed(1)}</b> frames/s`, "reconstructed per second, over the last 10 s"]);
@@ -456,6 +457,7 @@ const inspector = new Inspector(readPoint, pointOf, bench);
 document.body.classList.toggle("recorded", mode !== "live");
 listenToTabs();
 addEventListener("keydown", onKey);
+matchMedia("(max-width: 820px)").addEventListener("change", () => pictures && drawBar());
 find("#keys").addEventListener("click", () => showHelp(true));
 find("#help").addEventListener("click", () => showHelp(false));
 find("#play").addEventListener("click", () => player.toggle());

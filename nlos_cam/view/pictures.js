@@ -112,7 +112,7 @@ class Pictures {
     }, 8);
     hatch(pen, only, depth.columns, 8);
     const either = both + only.length;
-    return { overlap: either ? both / either : 1, errorMm: both ? (10 * step * sum) / both : 0 };
+    return { overlap: either ? both / either : 1, errorMm: both ? (10 * step * sum) / both : null };
   }
 
   error(figure, error) {

@@ -13,6 +13,7 @@ import pytest
 from browser_page import DEADLINE_S, Page
 from made_up_moments import RIG, full_moment, with_result
 from measured_walls import exact_wall
+from screenshots import UNDER_TEXT
 from view_streams import ask
 
 from nlos_cam.reconstruct import Verdict
@@ -151,6 +152,9 @@ def test_playback_plays_scrubs_and_changes_speed(browser: Any) -> None:
         page = Page(browser, viewer.address or "").drawn()
         page.wait_until(lambda: page.state()["end"] == pytest.approx(29.5), "the whole recording")
         play_through(page)
+        for width, height in SIZES:
+            page.page.set_viewport_size({"width": width, "height": height})
+            assert page.page.evaluate(UNDER_TEXT) == []
         page.close()
 
 
@@ -212,15 +216,6 @@ def settled() -> tuple[int, int, float]:
     return before
 
 
-UNDER_TEXT = """() => {
-  const box = (element) => element.getBoundingClientRect();
-  const texts = [...document.querySelectorAll("#status, #verdict, figcaption, figure small, #readout, #tabbed")];
-  const pictures = [...document.querySelectorAll("figure div, #bench")];
-  const meet = (a, b) => a.left < b.right - 1 && b.left < a.right - 1 && a.top < b.bottom - 1 && b.top < a.bottom - 1;
-  return pictures.flatMap((picture) => texts.filter((text) => meet(box(picture), box(text))).map((text) => text.textContent));
-}"""
-
-
 @pytest.mark.parametrize("size", [(1280, 720), (1366, 657), (1920, 1080), (390, 844)])
 def test_no_text_lies_over_a_picture_however_many_warnings(
     browser: Any, size: tuple[int, int]
@@ -229,6 +224,15 @@ def test_no_text_lies_over_a_picture_however_many_warnings(
         viewer.show(with_result(full_moment(0), warnings=("a long warning about the bench",) * 12))
         page = Page(browser, viewer.address or "", size).drawn()
         assert page.page.evaluate(UNDER_TEXT) == []
+
+
+def test_color_bar_keeps_its_labels_apart_when_the_window_narrows(browser: Any) -> None:
+    with WebViewer(RIG) as viewer:
+        viewer.show(full_moment(0))
+        page = Page(browser, viewer.address or "").drawn()
+        page.page.set_viewport_size({"width": 390, "height": 844})
+        places = "[...document.querySelectorAll('#bar span')].map((each) => each.offsetLeft)"
+        page.wait_until(lambda: len(set(page.page.evaluate(places))) == 5, "labels side by side")
 
 
 def test_point_has_values_and_marks_in_every_map_and_a_distance(browser: Any) -> None:

@@ -4,7 +4,8 @@ other sites.
 `make docs` runs it. `--check` builds into a temporary folder: a gate of tools/checks/check.py.
 Addresses of other sites are checked for their form only, without a network. mkdocs.yml names this
 file as its hook. A line `<!-- run NAME -->` of a page becomes the code of examples/gallery/NAME.py,
-what it printed and the pictures it drew: the build runs it.
+what it printed and the pictures it drew: the build runs it. A script with cells (`# %% Title`, then
+comments) becomes a heading, text, code and output for each.
 """
 
 import logging
@@ -36,6 +37,10 @@ FETCHING = {
 """Elements that a browser follows by itself, and their attribute."""
 ADDRESS = re.compile(r"https://[a-z0-9.-]+\.[a-z]{2,}(/\S*)?")
 RUN = re.compile(r"<!-- run (\w+) -->")
+CELL = re.compile(r"^# %% (.+)$", re.MULTILINE)
+PROSE = re.compile(r"\A(?:# .*\n)+", re.MULTILINE)
+"""Comments that a cell begins with."""
+END_OF_CELL = "\x1e"
 SCRIPT_TIMEOUT_S = 600
 log = logging.getLogger("mkdocs.hooks.gallery")
 
@@ -164,13 +169,16 @@ def _paths(nav: str | Sequence[Any] | Mapping[str, Any]) -> Iterator[str]:
 
 
 def run_script(script: Path) -> tuple[str, dict[str, bytes]]:
-    """Run a script in an empty folder; return what it printed and its pictures by name.
+    """Run a script in an empty folder; return what it printed, with END_OF_CELL before each cell,
+    and its pictures by name.
 
     Raises CalledProcessError if it fails, TimeoutExpired if it takes longer than SCRIPT_TIMEOUT_S.
     """
+    code = script.read_text(encoding="utf-8")
     with TemporaryDirectory() as folder:
+        marked = CELL.sub(lambda found: f"print({END_OF_CELL!r}, end='')  # {found[1]}", code)
         ended = subprocess.run(
-            [sys.executable, script],
+            [sys.executable, "-c", marked],
             cwd=folder,
             capture_output=True,
             text=True,
@@ -204,10 +212,31 @@ def on_files(files: Any, config: Any) -> Any:
 
 
 def as_section(script: Path, output: str, pictures: Iterable[str]) -> str:
-    """Return a script, its output and its pictures as Markdown."""
+    """Return a script, its output and its pictures as Markdown, cell by cell if it has some."""
     code = script.read_text(encoding="utf-8").strip()
-    drawn = "\n".join(f"![Drawn by {script.name}](images/built/{name})" for name in pictures)
-    return f"```python\n{code}\n```\n\n```text\n{output.strip()}\n```\n\n{drawn}\n"
+    if not CELL.search(code):
+        return _block(code, output, pictures)
+    titles_and_bodies = CELL.split(code)[1:]
+    sections: list[str] = []
+    for title, body, printed in zip(
+        titles_and_bodies[::2],
+        titles_and_bodies[1::2],
+        output.split(END_OF_CELL)[1:],
+        strict=True,
+    ):
+        prose = PROSE.match(body.lstrip("\n"))
+        text = prose[0].replace("# ", "").strip() if prose else ""
+        rest = PROSE.sub("", body.lstrip("\n")).strip()
+        own = [name for name in pictures if name in body]
+        sections.append(f"## {title}\n\n{text}\n\n{_block(rest, printed, own)}")
+    return "\n".join(sections)
+
+
+def _block(code: str, output: str, pictures: Iterable[str]) -> str:
+    """Return code, what it printed and drew as Markdown."""
+    drawn = "\n".join(f"![Drawn by this code: {name}](images/built/{name})" for name in pictures)
+    printed = f"```text\n{output.strip()}\n```\n\n" if output.strip() else ""
+    return f"```python\n{code}\n```\n\n{printed}{drawn}\n"
 
 
 def on_page_markdown(markdown: str, page: Any, config: Any, files: Any) -> str:

@@ -27,6 +27,7 @@ from nlos_cam.files import cache_folder
 
 ROOT = Path(__file__).parents[2]
 DOCS = ROOT / "docs"
+DIGITS = 5
 PRODUCT = "nlos_cam", "calibration", "models"
 
 Record = dict[str, Any]
@@ -108,10 +109,21 @@ def difference(figure: Mapping[str, float | None]) -> str:
 
 
 def write(name: str, facts: Any, folder: Path | None = None) -> None:
-    """Write docs/figures/NAME.json, or the same in another folder."""
+    """Write docs/figures/NAME.json, or the same in another folder, with DIGITS of each number."""
     path = (folder or DOCS) / "figures" / f"{name}.json"
     path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(json.dumps(facts, indent=2) + "\n", encoding="utf-8")
+    path.write_text(json.dumps(rounded(facts), indent=1) + "\n", encoding="utf-8")
+
+
+def rounded(facts: Any) -> Any:
+    """Return facts whose fractions have DIGITS significant digits: no figure is known better."""
+    if isinstance(facts, float) and not facts.is_integer() and abs(facts) < 10**DIGITS:
+        return float(f"{facts:.{DIGITS}g}")
+    if isinstance(facts, dict):
+        return {name: rounded(value) for name, value in facts.items()}
+    if isinstance(facts, list | tuple):
+        return [rounded(value) for value in facts]
+    return facts
 
 
 def save(name: str, figure: Figure, folder: Path | None = None, dpi: int = 100) -> None:

@@ -18,7 +18,7 @@ from nlos_cam.errors import CameraError
 
 NAMES = (
     "python system sdk sdk-version sdk-alone libusb usb-camera recovery link container udev-rules"
-    " permissions video-driver hid-sensors in-use sdk-camera firmware metadata reported"
+    " permissions video-driver hid-sensors in-use sdk-camera firmware metadata stream reported"
 )
 words = st.sampled_from(
     [

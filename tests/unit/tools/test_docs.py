@@ -98,6 +98,33 @@ def test_each_way_to_break_is_told(
     assert any(told in problem for problem in tool("build_site").problems(root / "site", root))
 
 
+CELLS = """# %% First
+# What it does.
+print("one")
+
+# %% Second
+from pathlib import Path
+
+Path("drawn.png").write_bytes(b"picture")
+print("two")
+"""
+
+
+def test_script_with_cells_becomes_a_section_for_each(tool: Tool, tmp_path: Path) -> None:
+    script = tmp_path / "cells.py"
+    script.write_text(CELLS, encoding="utf-8")
+    builder = tool("build_site")
+    output, pictures = builder.run_script(script)
+    first, second = builder.as_section(script, output, pictures).split("## Second")
+
+    assert first.startswith("## First\n\nWhat it does.\n\n```python\nprint")
+    assert "```text\none\n```" in first
+    assert "```text\ntwo\n```" in second
+    assert "images/built/drawn.png" in second
+    assert "images/built/drawn.png" not in first
+    assert pictures == {"drawn.png": b"picture"}
+
+
 def test_the_gate_and_make_run_it(tool: Tool) -> None:
     assert ("python", "tools/docs/build_site.py", "--check") in tool("check").GATES
     assert "tools/docs/build_site.py" in (ROOT / "Makefile").read_text(encoding="utf-8")

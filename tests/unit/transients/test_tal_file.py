@@ -195,6 +195,18 @@ def test_command_renders_a_transient_and_describes_it(
     assert "x 0.150 to 0.450 m" in described["facts"]["laser points"]
 
 
+def test_view_names_the_command_that_draws_a_transient(
+    saved: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["view", str(saved / "single.hdf5")]) == 4
+
+    told = capsys.readouterr().err.strip()
+
+    assert told.count("\n") == 0
+    assert "nlos-cam info" in told
+    assert "--out look.html" in told
+
+
 def tal_python() -> str | None:
     """Return a Python that has y-tal: this one, or NLOS_CAM_TAL_PYTHON."""
     return (
