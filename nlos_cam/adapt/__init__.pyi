@@ -1,4 +1,5 @@
 __all__ = [
+    "NETWORK_FILE",
     "AdaptResult",
     "Adaptation",
     "Plan",
@@ -12,4 +13,4 @@ __all__ = [
 
 from .plan import Plan, Stage, bench_sensor, calibration_spread
 from .report import write_page
-from .run import Adaptation, AdaptResult, adapt, install
+from .run import NETWORK_FILE, Adaptation, AdaptResult, adapt, install

@@ -109,6 +109,8 @@ class Plan(Record):
     """Everything that decides the weights of an adaptation."""
 
     rig_checksum: str
+    start: str
+    """SHA-256 of the start weights' network."""
     spread: RigSpread
     sensor: SensorModel
     seed: Annotated[int, Field(ge=0)]

@@ -50,7 +50,7 @@ def read_curves(plan: Plan, logs: Sequence[Path]) -> list[Curve]:
         curves.append(
             Curve(
                 [before + samples * (k + 1) for k in range(len(rows))],
-                [float(row["silhouette_iou"]) for row in rows],
+                [float(row["held_out_iou"]) for row in rows],
             )
         )
         before += samples * len(rows)

@@ -10,7 +10,8 @@ import shutil
 import time
 from collections.abc import Callable, Generator
 from contextlib import closing, contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from hashlib import sha256
 from pathlib import Path
 from threading import Event, Thread
 from typing import Any, Literal
@@ -39,6 +40,7 @@ JUDGED = "judged"
 QUALITY = "quality"
 NETWORK = "network"
 WEIGHTS = "weights"
+NETWORK_FILE = "direct.safetensors"
 PACKED = "packed"
 BEFORE = "before"
 REPORT = "report"
@@ -114,6 +116,7 @@ def adapt(
     job.folder.mkdir(parents=True, exist_ok=True)
     with claim(job.folder, inside=True):
         plan = _plan_for(job, minutes, tracked)
+        job = replace(job, spread=plan.spread, sensor=plan.sensor, seed=plan.seed)
         folders = [job.folder / _stage_name(number) for number in range(len(plan.stages))]
         weights = folders[-1] / WEIGHTS
         was_there = (folders[-1] / REPORT / FIGURES).exists()
@@ -146,15 +149,34 @@ def _plan_for(job: Adaptation, minutes: float, tracked: data.Tracked) -> Plan:
             sensor=job.sensor,
             seed=job.seed,
             pace=pace,
+            start=_start_checksum(job),
         )
     if plan.rig_checksum != job.rig.checksum:
         raise SceneError(
             f"{job.folder} is an adaptation to another rig: the bench was calibrated again since;"
             " delete or rename that folder"
         )
+    # the shipped weights of another version are no change of mind, once they are trained on
+    has_begun = (job.folder / _stage_name(0) / NETWORK / CHECKSUMS).exists()
+    if (job.start or not has_begun) and plan.start != _start_checksum(job):
+        raise SceneError(
+            f"{job.folder} began from other start weights than {job.start or 'the shipped ones'}:"
+            " give those as --weights, or delete or rename that folder to begin again"
+        )
     plan = plan.extended(minutes)
     plan.save(job.folder)
     return plan
+
+
+def _start_checksum(job: Adaptation) -> str:
+    """Return the checksum of the start weights. Raises SceneError for no direct network."""
+    folder = models.weights_folder(job.start)
+    try:
+        return sha256((folder / NETWORK_FILE).read_bytes()).hexdigest()
+    except OSError as error:
+        raise SceneError(
+            f"the start weights {folder} are no direct network: choose others with --weights"
+        ) from error
 
 
 def _data_plan(job: Adaptation, first_seed: int, *, expected: bool) -> data.DatasetPlan:

@@ -20,7 +20,6 @@ from nlos_cam.files import checksums_of
 PAGE = "adapt.html"
 WORK = "adapt"
 WEIGHTS = "weights"
-NETWORK = "direct.safetensors"
 
 
 def adapt(
@@ -105,7 +104,7 @@ def adapt(
     except KeyboardInterrupt:
         common.exit_interrupted(f"what was made is kept in {work}; give the same command to go on")
     if folder:
-        benches.write_weights(folder, result.weights)
+        benches.write_weights(folder, result.weights, result.after["silhouette_iou"]["value"])
     else:
         adaptation.install(result.weights, target)
 
@@ -141,8 +140,11 @@ def _refuse_others(target: Path, work: Path) -> None:
     if not target.exists():
         return
     # the network's file: a bench adds its rig to the record
-    ours = [checksums_of(folder).get(NETWORK) for folder in work.glob(f"stage-*/{WEIGHTS}")]
-    if checksums_of(target).get(NETWORK, "") not in ours:
+    ours = [
+        checksums_of(folder).get(adaptation.NETWORK_FILE)
+        for folder in work.glob(f"stage-*/{WEIGHTS}")
+    ]
+    if checksums_of(target).get(adaptation.NETWORK_FILE, "") not in ours:
         raise OutputExistsError(
             f"{target} holds weights that were not made here: move them, or give --overwrite"
         )

@@ -273,10 +273,16 @@ def calibrate(
     fields = record.model_dump(mode="json", include=JSON_FIELDS)
     files = target.files
     result = fields | {"out": str(files.record), "report": str(files.report)}
-    own = benches.load_bench(target.folder).weights if target.folder else None
-    trained = models.load_record(models.weights_folder(own))
-    served = benching.weights_verdict(record.rig, trained, target.folder)
-    result["weights"] = {"serve": served.serve, "verdict": served.sentence}
+    if target.folder:
+        benching.store_forecast(target.folder)
+    loaded = benches.load_bench(target.folder) if target.folder else None
+    trained = models.load_record(models.weights_folder(loaded.weights if loaded else None))
+    served = benching.weights_verdict(loaded.rig if loaded else record.rig, trained, loaded)
+    result["weights"] = {
+        "serve": served.serve,
+        "verdict": served.sentence,
+        "expected_iou": served.expected_iou,
+    }
     text = format_result(record, files)
     text += f"\n{escape(served.sentence[:1].upper() + served.sentence[1:])}"
     if target.folder:

@@ -3,13 +3,14 @@
 from collections.abc import Callable, Generator
 from contextlib import contextmanager
 from dataclasses import replace
+from hashlib import sha256
 from pathlib import Path
 
 import pytest
 from nlos_calibration import Rig, load_rig
-from nlos_models import training
+from nlos_models import shipped_folder, training
 
-from nlos_cam.adapt import Adaptation, Plan, Stage, adapt, calibration_spread
+from nlos_cam.adapt import NETWORK_FILE, Adaptation, Plan, Stage, adapt, calibration_spread
 from nlos_cam.adapt.plan import Pace
 from nlos_cam.errors import SceneError
 from nlos_cam.files import FileBusyError, claim
@@ -57,6 +58,7 @@ def job_in(folder: Path, rig: Rig) -> Adaptation:
     stage = Stage(minutes=1.0, objects=300, epochs=2, steps=3)
     Plan(
         rig_checksum=rig.checksum,
+        start=sha256((shipped_folder() / NETWORK_FILE).read_bytes()).hexdigest(),
         spread=spread,
         sensor=SensorModel(),
         seed=0,
@@ -83,6 +85,20 @@ def test_a_stopped_adaptation_goes_on_to_the_same_weights(tmp_path: Path) -> Non
         adapt(broken, 1.0, no_figures, tracked=until_judged)
 
     assert (broken.folder / network).read_bytes() == (whole.folder / network).read_bytes()
+
+
+def test_other_start_weights_are_not_ignored(tmp_path: Path) -> None:
+    rig = load_rig("paper-rig")
+    job = job_in(tmp_path / "work", rig)
+    others = tmp_path / "others"
+    others.mkdir()
+    (others / NETWORK_FILE).write_bytes(b"other weights")
+    finished = job.folder / "stage-1" / "network"
+    finished.mkdir(parents=True)
+    (finished / "SHA256SUMS").touch()
+
+    with pytest.raises(SceneError, match="other start weights"):
+        adapt(replace(job, start=others), 1.0, no_figures)
 
 
 def test_two_adaptations_in_one_folder_are_one_too_many(tmp_path: Path) -> None:
