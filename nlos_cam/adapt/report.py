@@ -11,7 +11,8 @@ from pathlib import Path
 import numpy as np
 
 from nlos_cam.adapt.plan import Plan
-from nlos_cam.adapt.run import NETWORK, REPORT, AdaptResult
+from nlos_cam.adapt.recordings import Transfer
+from nlos_cam.adapt.run import AFTER, NETWORK, REPORT, AdaptResult
 from nlos_cam.report import (
     Banner,
     Commands,
@@ -26,6 +27,7 @@ from nlos_cam.report import (
     write_document,
 )
 
+FRAMES_PER_S = 30
 LATE_SHARE = 0.5
 """The gain of further work is read off the second half of a run."""
 
@@ -99,10 +101,49 @@ def draw_curves(curves: Sequence[Curve]) -> bytes:
     return png(figure)
 
 
-def write_page(result: AdaptResult, rows: Sequence[tuple[str, str, str]], page: Path) -> None:
-    """Write the report of an adaptation; `rows` hold the name of a metric, and its text before and
-    after.
-    """
+Rows = Sequence[tuple[str, str, str]]
+"""Name of a metric, and its text before and after."""
+
+
+def transfer_words(found: Transfer) -> str:
+    """Return what recordings of known objects brought, in words."""
+    before, after = (each["silhouette_iou"]["value"] for each in (found.before, found.after))
+    outcome = "kept" if found.is_better else "no better, so not kept"
+    return (
+        f"fitted to {found.recordings} recordings: silhouette IoU {before:.3f} -> {after:.3f} on"
+        f" {len(found.parts['judged'])} objects held out, {outcome}"
+    )
+
+
+def _transfer_parts(found: Transfer, rows: Rows) -> list[Section | Picture]:
+    words = transfer_words(found)
+    objects = {
+        "trained on": ", ".join(found.parts["adaptation"]),
+        "chose the epoch": ", ".join(found.parts["validation"]),
+        "judged on": ", ".join(found.parts["judged"]),
+    }
+    table = Table(("metric (95 % interval over objects)", "before", "fitted to recordings"), rows)
+    section = Section(
+        "Recordings of known objects",
+        [Banner("good" if found.is_better else "doubtful", words, ""), table, Facts(objects)],
+    )
+    sheet = saved_picture(
+        "Objects held out, after the fit", "One frame each.", found.folder / AFTER / "sheet.png"
+    )
+    return [section, sheet]
+
+
+@dataclass(frozen=True)
+class Tables:
+    """Figures before and after, in words."""
+
+    test_objects: Rows
+    recordings: Rows = ()
+    """On the objects held out of the recordings."""
+
+
+def write_page(result: AdaptResult, tables: Tables, commands: Sequence[str], page: Path) -> None:
+    """Write the report of an adaptation, with commands to go on with."""
     plan = result.plan
     curves = read_curves(plan, [folder / NETWORK / "log.csv" for folder in result.folders])
     before, after = (each["silhouette_iou"]["value"] for each in (result.before, result.after))
@@ -121,9 +162,18 @@ def write_page(result: AdaptResult, rows: Sequence[tuple[str, str, str]], page: 
             f" {spread.gain_share:.0%} of the gain"
         ),
     }
+    title = "Weights for this bench"
+    subtitle = "54 test objects, rendered on this bench with the sensor's noise. Simulated light."
+    if locked := plan.locked:
+        title = "What locked differences show on this bench"
+        subtitle = (
+            f"54 test objects ({locked.material.kind}), {locked.radiometry} radiometry, pulse of"
+            f" {plan.sensor.pulse_ns:g} ns; object in less object out over {locked.frames} frames"
+            f" ({locked.frames / FRAMES_PER_S:.0f} s). Simulated light."
+        )
     document = Document(
-        "Weights for this bench",
-        "54 test objects, rendered on this bench with the sensor's noise. Simulated light.",
+        title,
+        subtitle,
         [
             Section(
                 "",
@@ -135,10 +185,10 @@ def write_page(result: AdaptResult, rows: Sequence[tuple[str, str, str]], page: 
                     Table(
                         (
                             "metric (95 % interval over objects)",
-                            "start weights, aligned",
+                            "a guess: the mean object" if plan.locked else "start weights, aligned",
                             "adapted",
                         ),
-                        rows,
+                        tables.test_objects,
                     ),
                     Facts(facts),
                 ],
@@ -151,12 +201,10 @@ def write_page(result: AdaptResult, rows: Sequence[tuple[str, str, str]], page: 
             saved_picture(
                 "Truth, reconstruction and difference",
                 "The 54 test objects.",
-                result.folders[-1] / REPORT / "sheet.png",
+                result.weights.parent / REPORT / "sheet.png",
             ),
-            Section(
-                "Next commands",
-                [Commands(["nlos-cam live --bench BENCH", "nlos-cam adapt BENCH --minutes MORE"])],
-            ),
+            *(_transfer_parts(result.transfer, tables.recordings) if result.transfer else []),
+            Section("Next commands", [Commands(commands)]),
         ],
     )
     write_document(document, page)

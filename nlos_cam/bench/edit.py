@@ -27,7 +27,6 @@ from nlos_cam.bench.record import (
 from nlos_cam.errors import OutputExistsError
 from nlos_cam.files import CHECKSUMS, atomic_directory, atomic_file, write_checked
 
-
 TEST_IOU = "test_iou"
 """Figure of a bench's weights: silhouette IoU on the 54 test objects on its rig."""
 

@@ -27,7 +27,7 @@ def until_judged(description: str) -> Generator[Callable[[int, int], None]]:
     yield lambda _done, _total: None
 
 
-def no_figures(_weights: Path | None, folder: Path) -> None:
+def no_figures(_weights: Path | None, folder: Path, _objects: Path | None = None) -> None:
     """Measure nothing."""
     folder.mkdir(exist_ok=True)
     (folder / "figures.json").write_text("{}")
