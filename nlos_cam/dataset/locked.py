@@ -12,6 +12,7 @@ from functools import lru_cache
 import numpy as np
 from nlos_calibration import Rig
 from nlos_calibration.arrays import Float32, Float64
+from numpy.typing import NDArray
 
 from nlos_cam.frames import MAP_COLUMNS, MAP_ROWS, LidarMaps
 from nlos_cam.render import Radiometry, Scene, Sensor, SensorModel, cast, render, transient
@@ -37,7 +38,7 @@ def locked_difference(scene: Scene, sensor: SensorModel) -> LidarMaps:
         scene.pulse_ns,
     )
     if scene.pulse_ns:
-        place_m, peak = _peaks(scene)
+        place_m, peak = _peaks(scene, _waves(scene), bare.top)
         depth_m = place_m - bare.depth_m
     else:
         found = render(scene, ACCURACY)
@@ -71,8 +72,12 @@ class _Bare:
         rendering = render(scene, ACCURACY)
         device = Sensor(scene.rig, sensor, scene.radiometry)
         self.counts = device.maps(rendering.multi, None).intensity.astype(np.float64)
+        self.top = np.zeros((MAP_ROWS, MAP_COLUMNS), np.int64)
+        """Bin of each cell's peak: light of the object moves the peak within it."""
         if scene.pulse_ns:
-            self.depth_m, self.peak = _peaks(scene)
+            waves = _waves(scene)
+            self.top = np.clip(waves.argmax(axis=-1), STENCIL, waves.shape[-1] - STENCIL - 1)
+            self.depth_m, self.peak = _peaks(scene, waves, self.top)
         else:
             self.depth_m = rendering.depth_m.astype(np.float64)
             self.peak = rendering.intensity.astype(np.float64)
@@ -83,12 +88,15 @@ def _bare(rig: Rig, sensor: SensorModel, radiometry: Radiometry, pulse_ns: float
     return _Bare(Scene(rig, None, radiometry=radiometry, pulse_ns=pulse_ns), sensor)
 
 
-def _peaks(scene: Scene) -> tuple[Float64, Float64]:
-    """Return depth in m and height of each cell's peak (64, 80), for a receiver that interpolates
-    between its samples; the renderer reports the middle of a bin. NaN depth where nothing returns.
+def _waves(scene: Scene) -> Float64:
+    return transient(scene, ACCURACY).astype(np.float64)
+
+
+def _peaks(scene: Scene, wave: Float64, top: NDArray[np.int64]) -> tuple[Float64, Float64]:
+    """Return depth in m and height of each cell's peak (64, 80), about the bin `top`, for a receiver
+    that interpolates between its samples; the renderer reports the middle of a bin. NaN depth where
+    nothing returns.
     """
-    wave = transient(scene, ACCURACY).astype(np.float64)
-    top = np.clip(wave.argmax(axis=-1), STENCIL, wave.shape[-1] - STENCIL - 1)
     steps = (-STENCIL, 0, STENCIL)
     samples = [np.take_along_axis(wave, (top + k)[..., None], -1)[..., 0] for k in steps]
     # The logarithm of a Gaussian is a parabola: its top from three samples.
