@@ -28,6 +28,10 @@ from nlos_cam.report import (
 )
 
 FRAMES_PER_S = 30
+SCATTER_IOU = 0.06
+"""Largest error of a forecast (docs/predict.md)."""
+MIN_EPOCHS = 8
+"""A slope over fewer epochs is that of the learning rate, not of the minutes."""
 LATE_SHARE = 0.5
 """The gain of further work is read off the second half of a run."""
 
@@ -70,15 +74,24 @@ def gain_by_doubling(curves: Sequence[Curve]) -> float | None:
     if len(ends) > 1:
         (fewer, worse), (more, better) = list(pairwise(ends))[-1]
         return (better - worse) / np.log2(more / fewer)
-    if not ends or len(curves[0].iou) < 4:
+    if not ends or len(curves[0].iou) < MIN_EPOCHS:
         return None
     late = int(LATE_SHARE * len(curves[0].iou))
     slope, _ = np.polyfit(np.log2(curves[0].samples[late:]), curves[0].iou[late:], 1)
     return float(slope)
 
 
-def outlook(plan: Plan, curves: Sequence[Curve]) -> str:
-    """Return in words what more minutes would bring."""
+def outlook(
+    plan: Plan, curves: Sequence[Curve], reached_iou: float, expected_iou: float | None
+) -> str:
+    """Return in words what more minutes would bring, by the forecast where that is far, else by the
+    learning curve.
+    """
+    if expected_iou is not None and reached_iou < expected_iou - SCATTER_IOU:
+        return (
+            f"The forecast for this bench is {expected_iou:.2f}: more minutes bring it nearer"
+            f" ({plan.minutes:.0f} so far)."
+        )
     gain = gain_by_doubling(curves)
     if gain is None:
         return "Too few epochs to say what more minutes would bring."
@@ -140,6 +153,8 @@ class Tables:
     test_objects: Rows
     recordings: Rows = ()
     """On the objects held out of the recordings."""
+    expected_iou: float | None = None
+    """Silhouette IoU by the forecast of the bench; None where there is none."""
 
 
 def write_page(result: AdaptResult, tables: Tables, commands: Sequence[str], page: Path) -> None:
@@ -152,6 +167,9 @@ def write_page(result: AdaptResult, tables: Tables, commands: Sequence[str], pag
     facts = {
         "objects rendered for this bench": f"{plan.stages[-1].objects}",
         "samples trained on": f"{curves[-1].samples[-1]}",
+        "expected by the forecast": (
+            "" if tables.expected_iou is None else f"{tables.expected_iou:.2f}"
+        ),
         "minutes, as planned": f"{plan.minutes:.0f}",
         "this machine": (
             f"{plan.pace.objects_per_s:.0f} objects and {plan.pace.samples_per_s:.0f} samples a"
@@ -162,6 +180,7 @@ def write_page(result: AdaptResult, tables: Tables, commands: Sequence[str], pag
             f" {spread.gain_share:.0%} of the gain"
         ),
     }
+    advice = outlook(plan, curves, after, tables.expected_iou)
     title = "Weights for this bench"
     subtitle = "54 test objects, rendered on this bench with the sensor's noise. Simulated light."
     if locked := plan.locked:
@@ -177,7 +196,7 @@ def write_page(result: AdaptResult, tables: Tables, commands: Sequence[str], pag
         [
             Section(
                 "",
-                [Banner("good" if after > before else "doubtful", headline, outlook(plan, curves))],
+                [Banner("good" if after > before else "doubtful", headline, advice)],
             ),
             Section(
                 "Before and after",
@@ -190,7 +209,7 @@ def write_page(result: AdaptResult, tables: Tables, commands: Sequence[str], pag
                         ),
                         tables.test_objects,
                     ),
-                    Facts(facts),
+                    Facts({name: value for name, value in facts.items() if value}),
                 ],
             ),
             Picture(

@@ -419,8 +419,9 @@ def _train_network(
         with tracked("rendering the first objects"):
             rendering.wait_for(stage.objects_at(0, there))
         if noise:
-            rendering.wait_for(FIRST_OBJECTS)
-            first = islice(data.open_dataset(job.folder / OBJECTS).chunks(), FIRST_OBJECTS // SHARD)
+            count = min(FIRST_OBJECTS, stage.objects)
+            rendering.wait_for(count)
+            first = islice(data.open_dataset(job.folder / OBJECTS).chunks(), count // SHARD)
             recipe = noise.fitted(recipe, start.normal, list(first))
         store = data.open_packed_maps(
             [job.folder / OBJECTS],

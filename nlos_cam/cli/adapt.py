@@ -127,6 +127,7 @@ def adapt(
     except KeyboardInterrupt:
         common.exit_interrupted(f"what was made is kept in {work}; give the same command to go on")
     target = result.weights if locked else _install(result, folder, home / WEIGHTS)
+    expected_iou = None if locked else forecast.forecast(rig, quick=True).expected_iou
     name = shlex.quote(bench)
     more = f"nlos-cam adapt {name} --minutes {2 * result.plan.minutes:g}"
     commands = [f"nlos-cam evaluate --rig {name} --weights {shlex.quote(str(target))}"]
@@ -136,7 +137,7 @@ def adapt(
     if folder:
         commands = [f"nlos-cam live --camera l515 --bench {name}"]
     more += f" --out {shlex.quote(str(out))}" if out else ""
-    _report(result, target, [*commands, more], work / PAGE, as_json=json)
+    _report(result, target, [*commands, more], work / PAGE, expected_iou, as_json=json)
 
 
 def _recordings(folder: Path) -> adaptation.Recordings | None:
@@ -178,13 +179,15 @@ def _report(
     target: Path,
     commands: list[str],
     page: Path,
+    expected_iou: float | None,
     *,
     as_json: bool,
 ) -> None:
     """Write the page, and print what the minutes brought."""
     rows = _rows(result.before, result.after)
     transfer = result.transfer
-    tables = adaptation.Tables(rows, _rows(transfer.before, transfer.after) if transfer else ())
+    recorded = _rows(transfer.before, transfer.after) if transfer else ()
+    tables = adaptation.Tables(rows, recorded, expected_iou)
     adaptation.write_page(result, tables, commands, page)
     _, before, after = rows[0]
     state = "was finished before" if result.was_there else "done"
@@ -197,6 +200,7 @@ def _report(
         "report": str(page),
         "minutes": result.plan.minutes,
         "objects": result.plan.stages[-1].objects,
+        "expected_iou": expected_iou,
         "before": result.before,
         "after": result.after,
     }

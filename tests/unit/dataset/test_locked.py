@@ -28,13 +28,13 @@ def test_nothing_hidden_changes_nothing() -> None:
 
 
 def test_object_moves_the_peak_by_micrometers() -> None:
-    depth_m = benchmark_objects(object_box(RIG))[0].depth_m
+    depth_m = benchmark_objects(object_box(RIG))[20].depth_m
     found = locked_difference(scene_of(depth_m), SENSOR)
 
-    # docs/detect.md: 13 um in the 99th percentile, 25 um at most, for another object
-    assert 2e-6 < np.nanmax(np.abs(found.depth_m)) < 2e-4
+    # docs/detect.md: 25 um at most, for another object
+    assert 1e-5 < np.nanmax(np.abs(found.depth_m)) < 5e-5
     assert found.intensity.min() >= 0
-    assert 0.01 < found.intensity.max() < 1
+    assert 1e-4 < found.intensity.max() < 1e-2
 
 
 def test_noise_falls_with_the_root_of_the_frames() -> None:
