@@ -3,18 +3,16 @@
 from collections.abc import Callable, Generator
 from contextlib import contextmanager
 from dataclasses import replace
-from hashlib import sha256
 from pathlib import Path
 
 import pytest
-from nlos_calibration import Rig, load_rig
-from nlos_models import shipped_folder, training
+from made_adaptations import finish_network, job_in
+from nlos_calibration import load_rig
+from nlos_models import training
 
-from nlos_cam.adapt import NETWORK_FILE, Adaptation, Plan, Stage, adapt, calibration_spread
-from nlos_cam.adapt.plan import Pace
+from nlos_cam.adapt import NETWORK_FILE, adapt
 from nlos_cam.errors import SceneError
 from nlos_cam.files import FileBusyError, claim
-from nlos_cam.render import SensorModel
 
 AFTER_THE_NETWORK = "judged"
 
@@ -51,23 +49,6 @@ def stopping_after(steps: int) -> training.Watch:
     return watch
 
 
-def job_in(folder: Path, rig: Rig) -> Adaptation:
-    """Return a job whose plan, of a few steps, is there already."""
-    spread = calibration_spread(None)
-    folder.mkdir()
-    stage = Stage(minutes=1.0, objects=300, epochs=2, steps=3)
-    Plan(
-        rig_checksum=rig.checksum,
-        start=sha256((shipped_folder() / NETWORK_FILE).read_bytes()).hexdigest(),
-        spread=spread,
-        sensor=SensorModel(),
-        seed=0,
-        pace=Pace(objects_per_s=1.0, samples_per_s=1.0),
-        stages=(stage,),
-    ).save(folder)
-    return Adaptation(rig, spread, folder, workers=1)
-
-
 @pytest.mark.slow
 @pytest.mark.timeout(900)
 def test_a_stopped_adaptation_goes_on_to_the_same_weights(tmp_path: Path) -> None:
@@ -93,9 +74,7 @@ def test_other_start_weights_are_not_ignored(tmp_path: Path) -> None:
     others = tmp_path / "others"
     others.mkdir()
     (others / NETWORK_FILE).write_bytes(b"other weights")
-    finished = job.folder / "stage-1" / "network"
-    finished.mkdir(parents=True)
-    (finished / "SHA256SUMS").touch()
+    finish_network(job.folder)
 
     with pytest.raises(SceneError, match="other start weights"):
         adapt(replace(job, start=others), 1.0, no_figures)

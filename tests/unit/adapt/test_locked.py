@@ -5,9 +5,9 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from made_adaptations import job_in
 from nlos_calibration import load_rig
 from nlos_models import load_network
-from test_adapt import job_in
 
 from nlos_cam.adapt import Locked, Stage, adapt
 from nlos_cam.adapt.plan import load_plan

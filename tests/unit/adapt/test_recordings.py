@@ -1,27 +1,24 @@
 """Recordings of known objects as the second stage of an adaptation."""
 
 import json
-import shutil
 from collections.abc import Callable, Generator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from nlos_calibration import Rig
-from nlos_models import load_reconstructor, load_record, shipped_folder, silhouette_iou
+from made_adaptations import finish_network, job_in
+from nlos_models import load_reconstructor, load_record, silhouette_iou
 
-from nlos_cam.adapt import Adaptation, adapt, calibration_spread, find_recordings
-from nlos_cam.adapt.plan import Pace, Plan, Stage
+from nlos_cam.adapt import adapt, find_recordings
 from nlos_cam.adapt.recordings import MIN_OBJECTS, Transfer, parts_of
-from nlos_cam.adapt.run import _start_checksum  # pyright: ignore[reportPrivateUsage]
 from nlos_cam.bench import load_bench
 from nlos_cam.dataset import open_dataset
 from nlos_cam.evaluate import reconstruct_all
 from nlos_cam.files import cache_folder
 from nlos_cam.reconstruct import align_all
-from nlos_cam.render import SensorModel
 
 RIG = '[rig]\nbase = "{base}"\n[rig.lidar]\ndistance_m = 0.205\n'
 OBJECT = '[motion]\nposes = 1\n[object]\ncategory = "{name}"\n'
@@ -78,30 +75,6 @@ def record_bench(run: Callable[..., Any]) -> Path:
     return Path("bench")
 
 
-def job_with_network(folder: Path, rig: Rig) -> Adaptation:
-    """Return a job whose network is there already: the shipped one."""
-    job = Adaptation(rig, calibration_spread(None), folder, workers=1)
-    network = folder / "stage-1" / "network"
-    shutil.copytree(shipped_folder(), network)
-    sums = (network / "SHA256SUMS").read_text().splitlines()
-    names = "checkpoint.json", "direct.safetensors", "network.onnx"
-    kept = [line for line in sums if line.endswith(names)]
-    (network / "SHA256SUMS").write_text("\n".join(kept) + "\n")
-    for path in network.iterdir():
-        if path.name not in {*names, "SHA256SUMS"}:
-            path.unlink()
-    Plan(
-        rig_checksum=rig.checksum,
-        start=_start_checksum(job),
-        spread=calibration_spread(None),
-        sensor=SensorModel(),
-        seed=0,
-        pace=Pace(objects_per_s=1.0, samples_per_s=1.0),
-        stages=(Stage(minutes=1.0, objects=300, epochs=2, steps=3),),
-    ).save(folder)
-    return job
-
-
 def measure(weights: Path | None, folder: Path, objects: Path | None) -> None:
     """Measure weights on recordings; nothing on test objects."""
     iou = 0.0
@@ -128,10 +101,11 @@ def test_recordings_in_a_bench_fit_the_network_to_them(run: Any, tmp_path: Path)
     bench = load_bench(record_bench(run))
     found = find_recordings(bench.folder / "recordings", bench.for_camera, print)
     assert found is not None
-    job = job_with_network(tmp_path / "work", bench.rig)
+    job = job_in(tmp_path / "work", bench.rig)
+    finish_network(job.folder)
 
     with pytest.raises(KeyboardInterrupt):
-        adapt(Adaptation(**{**vars(job), "recordings": found}), 1.0, measure, tracked=until_judged)
+        adapt(replace(job, recordings=found), 1.0, measure, tracked=until_judged)
 
     (folder,) = (job.folder / "stage-1").glob("recordings-*")
     fitted = load_record(folder / "network")
