@@ -198,10 +198,10 @@ def _plan_for(job: Adaptation, minutes: float, tracked: data.Tracked) -> Plan:
             f"{job.folder} is an adaptation to another rig: the bench was calibrated again since;"
             " delete or rename that folder"
         )
-    if plan.locked != job.locked:
+    if (plan.locked, plan.sensor.pulse_ns) != (job.locked, job.sensor.pulse_ns):
         raise SceneError(
-            f"{job.folder} began with other --frames, --radiometry or --material: repeat these, or"
-            " choose another --out"
+            f"{job.folder} began with other --frames, --radiometry, --pulse-ns or --material: repeat"
+            " these, or choose another --out"
         )
     # the shipped weights of another version are no change of mind, once they are trained on
     has_begun = _is_whole(job.folder / _stage_name(0) / NETWORK, NETWORK_GRAPH)
