@@ -21,6 +21,7 @@ from rich.table import Table
 from nlos_cam import bench as benches
 from nlos_cam import calibrate as bench
 from nlos_cam import camera as cameras
+from nlos_cam import reconstruct
 from nlos_cam.cli import benches as benching
 from nlos_cam.cli.common import (
     Camera,
@@ -287,7 +288,7 @@ def calibrate(
     text += f"\n{escape(served.sentence[:1].upper() + served.sentence[1:])}"
     if target.folder:
         result["bench"] = str(target.folder)
-        text += f"\nNext: {escape(_next_step(target.folder, record))}"
+        text += f"\nNext: {escape(_next_step(target.folder, record, served))}"
     finish(result, as_json=json, text=text, marked=True)
 
 
@@ -382,11 +383,15 @@ def _bare_wall(source: Path) -> walls.MeasuredWall:
     return benches.load_bench(source).bare if source.is_dir() else walls.load_measured(source)
 
 
-def _next_step(folder: Path, record: walls.WallRecord) -> str:
+def _next_step(folder: Path, record: walls.WallRecord, served: reconstruct.WeightsVerdict) -> str:
+    """Return the command to go on with; weights of its own come before live pictures where the
+    bench needs them.
+    """
     name = shlex.quote(str(folder))
     if record.occluder is None:
         return f"put the occluder up, then nlos-cam calibrate --occluder {name}"
-    return f"nlos-cam live --bench {name}"
+    live = f"nlos-cam live --bench {name}"
+    return live if served.serve else f"nlos-cam adapt {name} --minutes 10, then {live}"
 
 
 def _source(camera: str | None, bag: Path | None, *, wall: bool, occluder: Path | None) -> str:
