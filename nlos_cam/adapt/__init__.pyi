@@ -7,6 +7,7 @@ __all__ = [
     "Locked",
     "LockedNoise",
     "Measure",
+    "Pace",
     "Plan",
     "Recordings",
     "Stage",
@@ -22,7 +23,7 @@ __all__ = [
 ]
 
 from .locked import LockedNoise
-from .plan import Locked, Plan, Stage, bench_sensor, calibration_spread
+from .plan import Locked, Pace, Plan, Stage, bench_sensor, calibration_spread
 from .recordings import RECORDINGS, Recordings, Transfer, find_recordings
 from .report import Tables, transfer_words, write_page
 from .run import NETWORK_FILE, OBJECTS, Adaptation, AdaptResult, Measure, adapt, install

@@ -24,8 +24,7 @@ from live_process import children_of
 from nlos_calibration import load_rig
 from nlos_models import shipped_folder
 
-from nlos_cam.adapt import Plan, Stage, calibration_spread
-from nlos_cam.adapt.plan import Pace
+from nlos_cam.adapt import Pace, Plan, Stage, calibration_spread
 from nlos_cam.render import SensorModel
 
 RIG = "paper-rig"

@@ -15,7 +15,7 @@ from nlos_cam.errors import SceneError
 from nlos_cam.render import SensorModel
 
 LOCKED = Locked(frames=9000)
-FEW = 20
+FEW = 16
 
 
 def guess_alone(_weights: Path | None, folder: Path, _objects: Path | None) -> None:
@@ -30,11 +30,12 @@ def test_network_is_trained_on_locked_differences(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("nlos_cam.adapt.run.HELD_OUT_OBJECTS", FEW)
+    monkeypatch.setattr("nlos_cam.adapt.plan.BATCH", FEW)
     job = job_in(tmp_path / "work", load_rig("paper-rig"))
     job = replace(job, locked=LOCKED, sensor=SensorModel(pulse_ns=1.0))
     plan = load_plan(job.folder)
     assert plan is not None
-    stage = Stage(minutes=1.0, objects=300, epochs=1, steps=1)
+    stage = Stage(minutes=1.0, objects=100, epochs=1, steps=1)
     update = {"locked": LOCKED, "sensor": job.sensor, "stages": (stage,)}
     plan.model_copy(update=update).save(job.folder)
 
