@@ -1,15 +1,29 @@
 __all__ = [
+    "NETWORK_FILE",
+    "OBJECTS",
+    "RECORDINGS",
     "AdaptResult",
     "Adaptation",
+    "Locked",
+    "LockedNoise",
+    "Measure",
+    "Pace",
     "Plan",
+    "Recordings",
     "Stage",
+    "Tables",
+    "Transfer",
     "adapt",
     "bench_sensor",
     "calibration_spread",
+    "find_recordings",
     "install",
+    "transfer_words",
     "write_page",
 ]
 
-from .plan import Plan, Stage, bench_sensor, calibration_spread
-from .report import write_page
-from .run import Adaptation, AdaptResult, adapt, install
+from .locked import LockedNoise
+from .plan import Locked, Pace, Plan, Stage, bench_sensor, calibration_spread
+from .recordings import RECORDINGS, Recordings, Transfer, find_recordings
+from .report import Tables, transfer_words, write_page
+from .run import NETWORK_FILE, OBJECTS, Adaptation, AdaptResult, Measure, adapt, install

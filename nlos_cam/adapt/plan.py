@@ -17,7 +17,7 @@ from pydantic import Field, ValidationError
 from nlos_cam.dataset import SHARD, RigSpread
 from nlos_cam.errors import RecordingError
 from nlos_cam.files import TEXT_LIMIT, atomic_file, read_bounded
-from nlos_cam.render import SensorModel
+from nlos_cam.render import Material, Radiometry, SensorModel
 
 PLAN = "plan.json"
 BATCH = 256
@@ -105,15 +105,28 @@ class Stage(Record):
         return SHARD * ((first + round(share * (self.objects - first))) // SHARD)
 
 
+class Locked(Record):
+    """Locked differences in place of maps: object in less object out, averaged over many frames."""
+
+    frames: Annotated[int, Field(ge=4, le=10**8)]
+    """Averaged in all, half of them with the object."""
+    radiometry: Radiometry = "lambertian"
+    material: Material = Material()
+
+
 class Plan(Record):
     """Everything that decides the weights of an adaptation."""
 
     rig_checksum: str
+    start: str
+    """SHA-256 of the start weights' network."""
     spread: RigSpread
     sensor: SensorModel
     seed: Annotated[int, Field(ge=0)]
     pace: Pace
     stages: tuple[Stage, ...] = ()
+    locked: Locked | None = None
+    """None: maps of single frames, in the paper's radiometry."""
 
     @property
     def minutes(self) -> float:

@@ -11,7 +11,8 @@ from pathlib import Path
 import numpy as np
 
 from nlos_cam.adapt.plan import Plan
-from nlos_cam.adapt.run import NETWORK, REPORT, AdaptResult
+from nlos_cam.adapt.recordings import Transfer
+from nlos_cam.adapt.run import AFTER, NETWORK, REPORT, AdaptResult
 from nlos_cam.report import (
     Banner,
     Commands,
@@ -26,6 +27,11 @@ from nlos_cam.report import (
     write_document,
 )
 
+FRAMES_PER_S = 30
+SCATTER_IOU = 0.06
+"""Largest error of a forecast (docs/predict.md)."""
+MIN_EPOCHS = 8
+"""A slope over fewer epochs is that of the learning rate, not of the minutes."""
 LATE_SHARE = 0.5
 """The gain of further work is read off the second half of a run."""
 
@@ -50,7 +56,7 @@ def read_curves(plan: Plan, logs: Sequence[Path]) -> list[Curve]:
         curves.append(
             Curve(
                 [before + samples * (k + 1) for k in range(len(rows))],
-                [float(row["silhouette_iou"]) for row in rows],
+                [float(row["held_out_iou"]) for row in rows],
             )
         )
         before += samples * len(rows)
@@ -68,15 +74,24 @@ def gain_by_doubling(curves: Sequence[Curve]) -> float | None:
     if len(ends) > 1:
         (fewer, worse), (more, better) = list(pairwise(ends))[-1]
         return (better - worse) / np.log2(more / fewer)
-    if not ends or len(curves[0].iou) < 4:
+    if not ends or len(curves[0].iou) < MIN_EPOCHS:
         return None
     late = int(LATE_SHARE * len(curves[0].iou))
     slope, _ = np.polyfit(np.log2(curves[0].samples[late:]), curves[0].iou[late:], 1)
     return float(slope)
 
 
-def outlook(plan: Plan, curves: Sequence[Curve]) -> str:
-    """Return in words what more minutes would bring."""
+def outlook(
+    plan: Plan, curves: Sequence[Curve], reached_iou: float, expected_iou: float | None
+) -> str:
+    """Return in words what more minutes would bring, by the forecast where that is far, else by the
+    learning curve.
+    """
+    if expected_iou is not None and reached_iou < expected_iou - SCATTER_IOU:
+        return (
+            f"The forecast for this bench is {expected_iou:.2f}: more minutes bring it nearer"
+            f" ({plan.minutes:.0f} so far)."
+        )
     gain = gain_by_doubling(curves)
     if gain is None:
         return "Too few epochs to say what more minutes would bring."
@@ -99,10 +114,51 @@ def draw_curves(curves: Sequence[Curve]) -> bytes:
     return png(figure)
 
 
-def write_page(result: AdaptResult, rows: Sequence[tuple[str, str, str]], page: Path) -> None:
-    """Write the report of an adaptation; `rows` hold the name of a metric, and its text before and
-    after.
-    """
+Rows = Sequence[tuple[str, str, str]]
+"""Name of a metric, and its text before and after."""
+
+
+def transfer_words(found: Transfer) -> str:
+    """Return what recordings of known objects brought, in words."""
+    before, after = (each["silhouette_iou"]["value"] for each in (found.before, found.after))
+    outcome = "kept" if found.is_better else "no better, so not kept"
+    return (
+        f"fitted to {found.recordings} recordings: silhouette IoU {before:.3f} -> {after:.3f} on"
+        f" {len(found.parts['judged'])} objects held out, {outcome}"
+    )
+
+
+def _transfer_parts(found: Transfer, rows: Rows) -> list[Section | Picture]:
+    words = transfer_words(found)
+    objects = {
+        "trained on": ", ".join(found.parts["adaptation"]),
+        "chose the epoch": ", ".join(found.parts["validation"]),
+        "judged on": ", ".join(found.parts["judged"]),
+    }
+    table = Table(("metric (95 % interval over objects)", "before", "fitted to recordings"), rows)
+    section = Section(
+        "Recordings of known objects",
+        [Banner("good" if found.is_better else "doubtful", words, ""), table, Facts(objects)],
+    )
+    sheet = saved_picture(
+        "Objects held out, after the fit", "One frame each.", found.folder / AFTER / "sheet.png"
+    )
+    return [section, sheet]
+
+
+@dataclass(frozen=True)
+class Tables:
+    """Figures before and after, in words."""
+
+    test_objects: Rows
+    recordings: Rows = ()
+    """On the objects held out of the recordings."""
+    expected_iou: float | None = None
+    """Silhouette IoU by the forecast of the bench; None where there is none."""
+
+
+def write_page(result: AdaptResult, tables: Tables, commands: Sequence[str], page: Path) -> None:
+    """Write the report of an adaptation, with commands to go on with."""
     plan = result.plan
     curves = read_curves(plan, [folder / NETWORK / "log.csv" for folder in result.folders])
     before, after = (each["silhouette_iou"]["value"] for each in (result.before, result.after))
@@ -111,6 +167,9 @@ def write_page(result: AdaptResult, rows: Sequence[tuple[str, str, str]], page: 
     facts = {
         "objects rendered for this bench": f"{plan.stages[-1].objects}",
         "samples trained on": f"{curves[-1].samples[-1]}",
+        "expected by the forecast": (
+            "" if tables.expected_iou is None else f"{tables.expected_iou:.2f}"
+        ),
         "minutes, as planned": f"{plan.minutes:.0f}",
         "this machine": (
             f"{plan.pace.objects_per_s:.0f} objects and {plan.pace.samples_per_s:.0f} samples a"
@@ -121,13 +180,23 @@ def write_page(result: AdaptResult, rows: Sequence[tuple[str, str, str]], page: 
             f" {spread.gain_share:.0%} of the gain"
         ),
     }
+    advice = outlook(plan, curves, after, tables.expected_iou)
+    title = "Weights for this bench"
+    subtitle = "54 test objects, rendered on this bench with the sensor's noise. Simulated light."
+    if locked := plan.locked:
+        title = "What locked differences show on this bench"
+        subtitle = (
+            f"54 test objects ({locked.material.kind}), {locked.radiometry} radiometry, pulse of"
+            f" {plan.sensor.pulse_ns:g} ns; object in less object out over {locked.frames} frames"
+            f" ({locked.frames / FRAMES_PER_S:.0f} s). Simulated light."
+        )
     document = Document(
-        "Weights for this bench",
-        "54 test objects, rendered on this bench with the sensor's noise. Simulated light.",
+        title,
+        subtitle,
         [
             Section(
                 "",
-                [Banner("good" if after > before else "doubtful", headline, outlook(plan, curves))],
+                [Banner("good" if after > before else "doubtful", headline, advice)],
             ),
             Section(
                 "Before and after",
@@ -135,12 +204,12 @@ def write_page(result: AdaptResult, rows: Sequence[tuple[str, str, str]], page: 
                     Table(
                         (
                             "metric (95 % interval over objects)",
-                            "start weights, aligned",
+                            "a guess: the mean object" if plan.locked else "start weights, aligned",
                             "adapted",
                         ),
-                        rows,
+                        tables.test_objects,
                     ),
-                    Facts(facts),
+                    Facts({name: value for name, value in facts.items() if value}),
                 ],
             ),
             Picture(
@@ -151,12 +220,10 @@ def write_page(result: AdaptResult, rows: Sequence[tuple[str, str, str]], page: 
             saved_picture(
                 "Truth, reconstruction and difference",
                 "The 54 test objects.",
-                result.folders[-1] / REPORT / "sheet.png",
+                result.weights.parent / REPORT / "sheet.png",
             ),
-            Section(
-                "Next commands",
-                [Commands(["nlos-cam live --bench BENCH", "nlos-cam adapt BENCH --minutes MORE"])],
-            ),
+            *(_transfer_parts(result.transfer, tables.recordings) if result.transfer else []),
+            Section("Next commands", [Commands(commands)]),
         ],
     )
     write_document(document, page)

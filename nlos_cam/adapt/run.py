@@ -10,7 +10,9 @@ import shutil
 import time
 from collections.abc import Callable, Generator
 from contextlib import closing, contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from hashlib import sha256
+from itertools import islice
 from pathlib import Path
 from threading import Event, Thread
 from typing import Any, Literal
@@ -21,26 +23,52 @@ from nlos_calibration import Rig
 from nlos_models import training
 
 from nlos_cam import dataset as data
+from nlos_cam.adapt.locked import LockedNoise
 from nlos_cam.adapt.plan import (
     BATCH,
     FIRST_OBJECTS,
+    Locked,
     Pace,
     Plan,
     Stage,
     load_plan,
 )
+from nlos_cam.adapt.recordings import (
+    RECORDINGS,
+    Recordings,
+    Transfer,
+    fit_to_recordings,
+    parts_of,
+    write_parts,
+)
+from nlos_cam.dataset import SHARD
 from nlos_cam.errors import OutputExistsError, SceneError
-from nlos_cam.files import CHECKSUMS, atomic_directory, cache_folder, checksums_of, claim
+from nlos_cam.files import (
+    CHECKSUMS,
+    atomic_directory,
+    cache_folder,
+    checksums_of,
+    claim,
+    write_checked,
+)
 from nlos_cam.render import SensorModel
 
 OBJECTS = "objects"
 HELD_OUT = "held-out"
 JUDGED = "judged"
 QUALITY = "quality"
+UNCERTAINTY = "uncertainty"
 NETWORK = "network"
 WEIGHTS = "weights"
+NETWORK_FILE = "direct.safetensors"
+NETWORK_GRAPH = "network.onnx"
+UNCERTAINTY_RECORD = "doubt.json"
+UNCERTAINTY_GRAPH = "doubt.onnx"
 PACKED = "packed"
 BEFORE = "before"
+AFTER = "after"
+GUESS = "mean_object"
+PARTS = "parts"
 REPORT = "report"
 FIGURES = "figures.json"
 HELD_OUT_OBJECTS = 400
@@ -57,10 +85,9 @@ PACE_OBJECTS = 200
 PACE_STEPS = 6
 RECIPE = "doubt"
 
-Farm = Any
-Measure = Callable[[Path | None, Path], None]
-"""Measures weights (None: the shipped ones) on the bench's test objects: writes FIGURES and a report
-into a folder."""
+Measure = Callable[[Path | None, Path, Path | None], None]
+"""Measures weights (None: the shipped ones) on a dataset (None: the bench's test objects): writes
+FIGURES and a report into a folder."""
 
 
 @dataclass(frozen=True)
@@ -76,9 +103,13 @@ class Adaptation:
     sensor: SensorModel = field(default_factory=SensorModel)
     seed: int = 0
     workers: int = field(default_factory=lambda: max((os.cpu_count() or 2) - 1, 1))
-    farm: Farm | None = None
+    farm: data.Farm | None = None
     """Cluster that renders in place of `workers` processes here."""
     accelerator: Literal["auto", "cpu", "cuda"] = "auto"
+    locked: Locked | None = None
+    """Locked differences in place of maps; their weights are for a study, not for `live`."""
+    recordings: Recordings | None = None
+    """Recordings of known objects on the bench, if there are any."""
 
 
 @dataclass(frozen=True)
@@ -90,10 +121,13 @@ class AdaptResult:
     folders: list[Path]
     """Of the stages; the last one's holds the report of the weights."""
     before: dict[str, Any]
-    """Figures of the start weights, aligned, on the 54 test objects on this bench."""
+    """Figures of the start weights, aligned, on the 54 test objects on this bench; of a guess where
+    the maps are locked differences, which the start weights cannot read."""
     after: dict[str, Any]
     was_there: bool
-    """True where the adaptation of so many minutes was finished before."""
+    """True where the adaptation of these minutes was finished before."""
+    transfer: Transfer | None = None
+    """Transfer to recordings of known objects; its weights are the result's if it is better."""
 
 
 def adapt(
@@ -114,18 +148,28 @@ def adapt(
     job.folder.mkdir(parents=True, exist_ok=True)
     with claim(job.folder, inside=True):
         plan = _plan_for(job, minutes, tracked)
+        job = replace(job, spread=plan.spread, sensor=plan.sensor, seed=plan.seed)
         folders = [job.folder / _stage_name(number) for number in range(len(plan.stages))]
-        weights = folders[-1] / WEIGHTS
-        was_there = (folders[-1] / REPORT / FIGURES).exists()
-        before = _figures(measure, job.start, job.folder / BEFORE)
+        before = {} if job.locked else _figures(measure, job.start, job.folder / BEFORE)
         for number, stage in enumerate(plan.stages):
             on_message(
                 f"stage {number + 1} of {len(plan.stages)}: {stage.objects} objects,"
                 f" {stage.samples} samples"
             )
-            _run_stage(job, plan, number, tracked, watch)
-        after = _figures(measure, weights, folders[-1] / REPORT)
-        return AdaptResult(weights, plan, folders, before, after, was_there)
+            if not _is_whole(folders[number] / NETWORK, NETWORK_GRAPH):
+                _train_network(job, plan, number, tracked, watch)
+        if job.locked:
+            was_there = (folders[-1] / REPORT / FIGURES).exists()
+            after = _figures(measure, folders[-1] / NETWORK, folders[-1] / REPORT)
+            guess = after["baselines"][GUESS]
+            return AdaptResult(folders[-1] / NETWORK, plan, folders, guess, after, was_there)
+
+        transfer = _transfer(job, folders[-1], measure, tracked, watch)
+        last = transfer.folder if transfer and transfer.is_better else folders[-1]
+        was_there = (last / REPORT / FIGURES).exists()
+        _train_uncertainty(job, plan, last, tracked, watch)
+        after = _figures(measure, last / WEIGHTS, last / REPORT)
+        return AdaptResult(last / WEIGHTS, plan, folders, before, after, was_there, transfer)
 
 
 def _stage_name(number: int) -> str:
@@ -146,19 +190,54 @@ def _plan_for(job: Adaptation, minutes: float, tracked: data.Tracked) -> Plan:
             sensor=job.sensor,
             seed=job.seed,
             pace=pace,
+            start=_start_checksum(job),
+            locked=job.locked,
         )
     if plan.rig_checksum != job.rig.checksum:
         raise SceneError(
             f"{job.folder} is an adaptation to another rig: the bench was calibrated again since;"
             " delete or rename that folder"
         )
+    if (plan.locked, plan.sensor.pulse_ns) != (job.locked, job.sensor.pulse_ns):
+        raise SceneError(
+            f"{job.folder} began with other --frames, --radiometry, --pulse-ns or --material: repeat"
+            " these, or choose another --out"
+        )
+    # the shipped weights of another version are no change of mind, once they are trained on
+    has_begun = _is_whole(job.folder / _stage_name(0) / NETWORK, NETWORK_GRAPH)
+    if (job.start or not has_begun) and plan.start != _start_checksum(job):
+        raise SceneError(
+            f"{job.folder} began from other start weights than {job.start or 'the shipped ones'}:"
+            " give those as --weights, or delete or rename that folder to begin again"
+        )
     plan = plan.extended(minutes)
     plan.save(job.folder)
     return plan
 
 
+def _start_checksum(job: Adaptation) -> str:
+    """Return the checksum of the start weights. Raises SceneError for no direct network."""
+    folder = models.weights_folder(job.start)
+    try:
+        return sha256((folder / NETWORK_FILE).read_bytes()).hexdigest()
+    except OSError as error:
+        raise SceneError(
+            f"the start weights {folder} are no direct network: choose others with --weights"
+        ) from error
+
+
 def _data_plan(job: Adaptation, first_seed: int, *, expected: bool) -> data.DatasetPlan:
     """Return the plan of objects on the bench as it may be; held-out ones are on the rig itself."""
+    if job.locked:
+        return data.DatasetPlan(
+            job.rig,
+            first_seed,
+            job.sensor,
+            accuracy=data.LOCKED,
+            objects=data.Objects(share_generic=SHARE_GENERIC),
+            radiometry=job.locked.radiometry,
+            material=job.locked.material,
+        )
     return data.DatasetPlan(
         job.rig,
         first_seed,
@@ -214,21 +293,31 @@ def _probe_recipe() -> training.DirectRecipe:
     return Stage(minutes=1.0, objects=FIRST_OBJECTS, epochs=1, steps=10).recipe()
 
 
-def _run_stage(
-    job: Adaptation, plan: Plan, number: int, tracked: data.Tracked, watch: training.Watch | None
-) -> None:
-    """Train a stage's network, its uncertainty network and its quality model, each unless it is
-    there.
+def _transfer(
+    job: Adaptation,
+    stage: Path,
+    measure: Measure,
+    tracked: data.Tracked,
+    watch: training.Watch | None,
+) -> Transfer | None:
+    """Fit a stage's network to recordings of known objects, unless that was done; None without
+    recordings.
     """
-    folder = job.folder / _stage_name(number)
-    before = job.folder / _stage_name(number - 1) / NETWORK if number else job.start
-    weights = folder / WEIGHTS
-    if not (folder / NETWORK / CHECKSUMS).exists():
-        _train_network(job, plan, number, before, tracked, watch)
-    is_last = number == len(plan.stages) - 1
-    if not is_last or (weights / "quality.json").exists():
-        return
-    _train_uncertainty(job, plan, folder, tracked, watch)
+    found = job.recordings
+    if found is None:
+        return None
+    folder = stage / f"{RECORDINGS}-{found.digest}"
+    parts = write_parts(found, folder / PARTS, tracked)
+    network = folder / NETWORK
+    if not _is_whole(network, NETWORK_GRAPH):
+        fit_to_recordings(
+            stage / NETWORK, parts, network, job.accelerator, watch or training.unwatched
+        )
+
+    before = _figures(measure, stage / NETWORK, folder / BEFORE, parts["judged"])
+    after = _figures(measure, network, folder / AFTER, parts["judged"])
+    count = sum(map(len, found.by_label.values()))
+    return Transfer(folder, parts_of(list(found.by_label)), count, before, after)
 
 
 class _Rendering:
@@ -300,20 +389,25 @@ def _train_network(
     job: Adaptation,
     plan: Plan,
     number: int,
-    before: Path | None,
     tracked: data.Tracked,
     watch: training.Watch | None,
 ) -> None:
-    """Train on from the weights `before`, on objects that are rendered meanwhile."""
+    """Train on from the stage before, on objects that are rendered meanwhile."""
     stage = plan.stages[number]
+    before = job.folder / _stage_name(number - 1) / NETWORK if number else job.start
     recipe = stage.recipe()
     out = job.folder / _stage_name(number) / NETWORK
     start, runs = training.direct_start(recipe, before)
     if start is None:
         raise SceneError("the start weights are no direct network: choose others")
-    held_out = _noisy_set(job, HELD_OUT, data.HELD_OUT_SEED, HELD_OUT_OBJECTS, tracked)
+    held_out = _test_set(job, HELD_OUT, data.HELD_OUT_SEED, HELD_OUT_OBJECTS, tracked)
     there = plan.objects_before(number)
     watched = _Watched(watch or training.unwatched)
+    rig = job.rig.name, job.rig.checksum
+    noise = None
+    if job.locked:
+        noise = LockedNoise.of(job.rig, job.sensor, job.locked)
+        rig = f"{job.rig.name} (locked differences)", ""
 
     with closing(_Rendering(job, stage.objects)) as rendering:
 
@@ -324,6 +418,11 @@ def _train_network(
 
         with tracked("rendering the first objects"):
             rendering.wait_for(stage.objects_at(0, there))
+        if noise:
+            count = min(FIRST_OBJECTS, stage.objects)
+            rendering.wait_for(count)
+            first = islice(data.open_dataset(job.folder / OBJECTS).chunks(), count // SHARD)
+            recipe = noise.fitted(recipe, start.normal, list(first))
         store = data.open_packed_maps(
             [job.folder / OBJECTS],
             out.parent / PACKED,
@@ -332,18 +431,17 @@ def _train_network(
             align=False,
         )
         with store as source:
-            record = training.record_run(
-                recipe, out, (job.rig.name, job.rig.checksum), runs, before
-            )
+            record = training.record_run(recipe, out, rig, runs, before)
             fabric = training.open_fabric(recipe, accelerator=job.accelerator)
             origin = training.digest_of(start, source.digest)
             run = training.TrainingRun(recipe, out, record, origin, watch=watched)
             maps = source.held_out(held_out, HELD_OUT_OBJECTS)
+            maps = noise.added_to(maps) if noise else maps
             training.run_direct(fabric, run, start, source, maps)
     shutil.rmtree(out.parent / PACKED, ignore_errors=True)  # made again from the objects if needed
 
 
-def _noisy_set(
+def _test_set(
     job: Adaptation, name: str, first_seed: int, count: int, tracked: data.Tracked
 ) -> Path:
     """Return a folder of `count` objects on the rig itself, with the sensor's noise."""
@@ -363,19 +461,25 @@ def _noisy_set(
 def _train_uncertainty(
     job: Adaptation, plan: Plan, folder: Path, tracked: data.Tracked, watch: training.Watch | None
 ) -> None:
-    """Train the uncertainty network of a stage's network, and fit its quality model."""
+    """Train the uncertainty network of a network, fit its quality model, and put all three into
+    WEIGHTS in one step, unless that is there.
+    """
+    if (folder / WEIGHTS).exists():
+        return
     watched = folder / NETWORK
-    weights = folder / WEIGHTS
+    judge = folder / UNCERTAINTY
     recipe = plan.uncertainty_recipe(_uncertainty_recipe())
     graphs = cache_folder() / "onnx"
-    if not (weights / "doubt.json").exists():
-        judged = _noisy_set(job, JUDGED, JUDGED_SEED, recipe.objects, tracked)
+    if not _is_whole(judge, UNCERTAINTY_GRAPH):
+        # a kill between its files: the training has ended, and writes them again
+        (judge / UNCERTAINTY_RECORD).unlink(missing_ok=True)
+        judged = _test_set(job, JUDGED, JUDGED_SEED, recipe.objects, tracked)
         held_out = job.folder / HELD_OUT
         pipeline = models.load_reconstructor(watched, graphs)
         sets = data.open_dataset(judged), data.open_dataset(held_out)
         data.check_uncertainty_data(recipe, pipeline, *sets)
         about = training.record_uncertainty_run(
-            recipe, weights, watched, list(data.outliers_beside(SHARE_GENERIC))
+            recipe, judge, watched, list(data.outliers_beside(SHARE_GENERIC))
         )
         with tracked("rendering empty benches and outliers") as on_progress:
             samples = data.uncertainty_sets(
@@ -384,7 +488,7 @@ def _train_uncertainty(
         fabric = training.open_fabric(recipe, accelerator=job.accelerator)
         run = training.TrainingRun(
             recipe,
-            weights,
+            judge,
             pipeline.record,
             about.watches,
             watch=watch or training.unwatched,
@@ -393,14 +497,25 @@ def _train_uncertainty(
 
     at_least, at_most = QUALITY_OBJECTS
     objects = min(max(round(QUALITY_PER_MINUTE * plan.minutes), at_least), at_most)
-    scored = _noisy_set(job, QUALITY, QUALITY_SEED, objects, tracked)
-    pipeline = models.load_reconstructor(weights, graphs)
-    judge = models.load_uncertainty_model(weights, graphs, quality=False)
-    if judge is None:
-        raise SceneError(f"{weights} has no uncertainty network: delete {folder}, and try again")
+    scored = _test_set(job, QUALITY, QUALITY_SEED, objects, tracked)
+    pipeline = models.load_reconstructor(judge, graphs)
+    uncertainty = models.load_uncertainty_model(judge, graphs, quality=False)
+    if uncertainty is None:
+        raise SceneError(f"{judge} has no uncertainty network: delete it, and try again")
     with tracked("fitting the quality model") as on_progress:
-        found = data.quality_set(pipeline, judge, data.open_dataset(scored), objects, on_progress)
-    training.run_quality(weights, found)
+        found = data.quality_set(
+            pipeline, uncertainty, data.open_dataset(scored), objects, on_progress
+        )
+    training.run_quality(judge, found)
+    names = *checksums_of(watched), *checksums_of(judge)
+    with atomic_directory(folder / WEIGHTS) as part:
+        write_checked(part, {name: (judge / name).read_bytes() for name in names})
+
+
+def _is_whole(folder: Path, last: str) -> bool:
+    """Return whether a folder of weights has all its files, of which `last` is written last."""
+    names = checksums_of(folder)
+    return last in names and all((folder / name).is_file() for name in names)
 
 
 def _uncertainty_recipe() -> training.UncertaintyRecipe:
@@ -410,10 +525,12 @@ def _uncertainty_recipe() -> training.UncertaintyRecipe:
     return recipe
 
 
-def _figures(measure: Measure, weights: Path | None, folder: Path) -> dict[str, Any]:
-    """Return the figures of weights, measured once into a folder."""
+def _figures(
+    measure: Measure, weights: Path | None, folder: Path, objects: Path | None = None
+) -> dict[str, Any]:
+    """Return the figures of weights on a dataset, measured once into a folder."""
     if not (folder / FIGURES).exists():
-        measure(weights, folder)
+        measure(weights, folder, objects)
     return json.loads((folder / FIGURES).read_text(encoding="utf-8"))
 
 

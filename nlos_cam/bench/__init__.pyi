@@ -1,10 +1,12 @@
 __all__ = [
     "MAIN",
     "MANIFEST",
+    "TEST_IOU",
     "WEIGHTS",
     "Bench",
     "BenchEdit",
     "BenchRecord",
+    "ForecastRecord",
     "StationRecord",
     "check_new",
     "edit_bench",
@@ -16,13 +18,14 @@ __all__ = [
     "write_weights",
 ]
 
-from .edit import BenchEdit, check_new, edit_bench, write_file, write_weights
+from .edit import TEST_IOU, BenchEdit, check_new, edit_bench, write_file, write_weights
 from .folder import Bench, load_bench
 from .record import (
     MAIN,
     MANIFEST,
     WEIGHTS,
     BenchRecord,
+    ForecastRecord,
     StationRecord,
     is_bench,
     load_bench_record,

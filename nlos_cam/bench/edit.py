@@ -18,6 +18,7 @@ from nlos_cam.bench.record import (
     WEIGHTS,
     BenchRecord,
     CameraRecord,
+    ForecastRecord,
     StationRecord,
     is_bench,
     load_bench_record,
@@ -25,6 +26,9 @@ from nlos_cam.bench.record import (
 )
 from nlos_cam.errors import OutputExistsError
 from nlos_cam.files import CHECKSUMS, atomic_directory, atomic_file, write_checked
+
+TEST_IOU = "test_iou"
+"""Figure of a bench's weights: silhouette IoU on the 54 test objects on its rig."""
 
 
 class BenchEdit:
@@ -58,6 +62,10 @@ class BenchEdit:
                 path = Path(before.occluder).with_suffix(suffix)
                 self._files.pop(path.as_posix(), None)
                 (self.folder / path).unlink(missing_ok=True)
+
+    def set_forecast(self, name: str, forecast: ForecastRecord) -> None:
+        """Enter the forecast of a station."""
+        self.stations[name] = self.stations[name].model_copy(update={"forecast": forecast})
 
     def add(self, *paths: Path) -> None:
         """Enter files that were written, or written again, with their checksums."""
@@ -122,12 +130,12 @@ def write_file(folder: Path, name: str, content: bytes) -> Path:
     return path
 
 
-def write_weights(folder: Path, source: Path) -> Path:
+def write_weights(folder: Path, source: Path, test_iou: float | None = None) -> Path:
     """Copy a folder of weights, with uncertainty and quality, into a bench as its own; return where
     they are.
 
     Weights of exactly this bench's rig get the rig into their record, by which `weights_serve`
-    knows them when the bench is measured again. Raises CheckpointError for a folder without
+    knows them when the bench is measured again, and their IoU on the test objects on it. Raises CheckpointError for a folder without
     weights, RecordFileError for a bench that is damaged.
     """
     record = load_record(source)
@@ -139,7 +147,9 @@ def write_weights(folder: Path, source: Path) -> Path:
             for name in names:
                 shutil.copyfile(source / name, part / name)
             if record.rig_checksum == rig.checksum:
-                known = record.model_copy(update={"rig": rig.model_dump(mode="json")})
+                figures = record.figures | ({} if test_iou is None else {TEST_IOU: test_iou})
+                update = {"rig": rig.model_dump(mode="json"), "figures": figures}
+                known = record.model_copy(update=update)
                 write_checked(part, {RECORD: f"{known.model_dump_json(indent=2)}\n".encode()})
             elif not (part / CHECKSUMS).exists():
                 write_checked(part, {name: (part / name).read_bytes() for name in names})

@@ -56,6 +56,14 @@ class Bench:
         return self.folder / self.record.stations[self.station].in_use
 
     @property
+    def expected_iou(self) -> float | None:
+        """Silhouette IoU to expect of weights trained for this rig; None where it was not
+        forecast.
+        """
+        found = self.record.stations[self.station].forecast
+        return found.expected_iou if found and found.rig_checksum == self.rig.checksum else None
+
+    @property
     def calibrated(self) -> CalibratedRig:
         """New rig with reference and drift, which starts at its first frame."""
         return CalibratedRig(self.rig, self.measured, self._notes())

@@ -49,6 +49,15 @@ class CameraRecord(Record):
     intrinsics: PinholeRecord
 
 
+class ForecastRecord(Record):
+    """Forecast of a station, stored since it takes seconds that `live` does not have."""
+
+    rig_checksum: str
+    """Rig that it was made for; of another one, the forecast is not used."""
+    expected_iou: Annotated[float, Field(ge=0, le=1)]
+    """Silhouette IoU to expect of weights that are trained for this rig."""
+
+
 class StationRecord(Record):
     """One pose of the lidar, with its measurements. A second pose has a wall frame of its own."""
 
@@ -58,6 +67,8 @@ class StationRecord(Record):
     """Record of the same wall with the occluder in place; None until that was measured."""
     object_box: ObjectBox | None = None
     """Box of the hidden object in the station's wall frame; to be edited by hand."""
+    forecast: ForecastRecord | None = None
+    """None until the occluder was measured."""
 
     @property
     def in_use(self) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from functools import cache
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -10,17 +11,21 @@ import typer
 
 from nlos_cam import adapt as adaptation
 from nlos_cam import bench as benches
+from nlos_cam import dataset, forecast, objects
 from nlos_cam import evaluate as evaluation
 from nlos_cam.cli import common
 from nlos_cam.cli.benches import bench_or_rig
+from nlos_cam.cli.dataset import Backend, rendering_farm
 from nlos_cam.cli.train import watched_run
 from nlos_cam.errors import OutputExistsError
 from nlos_cam.files import checksums_of
+from nlos_cam.frames import LidarMaps
+from nlos_cam.render import Scene
 
 PAGE = "adapt.html"
+LOCKED_WORK = "locked"
 WORK = "adapt"
 WEIGHTS = "weights"
-NETWORK = "direct.safetensors"
 
 
 def adapt(
@@ -48,6 +53,7 @@ def adapt(
         str | None,
         typer.Option("--ray", help="Ray cluster that renders: auto, HOST:PORT, local."),
     ] = None,
+    backend: Backend = "cpu",
     workers: Annotated[
         int | None,
         typer.Option(
@@ -58,82 +64,217 @@ def adapt(
         Literal["auto", "cpu", "cuda"],
         typer.Option("--accelerator", help="Device of the training; auto: a GPU if there is one."),
     ] = "auto",
+    frames: Annotated[
+        int | None,
+        typer.Option(
+            "--frames",
+            min=4,
+            help="Study: read locked differences (object in less object out) of this many frames.",
+        ),
+    ] = None,
+    radiometry: Annotated[
+        Literal["paper", "lambertian"] | None,
+        typer.Option("--radiometry", help="With --frames: radiometry (default: lambertian)."),
+    ] = None,
+    pulse_ns: Annotated[
+        float | None,
+        typer.Option("--pulse-ns", min=0, max=100, help="With --frames: the pulse (default: 1)."),
+    ] = None,
+    material: Annotated[
+        Literal["matt", "glossy", "retroreflective"] | None,
+        typer.Option("--material", help="With --frames: the objects' material (default: matt)."),
+    ] = None,
     overwrite: common.Overwrite = False,
     json: common.Json = False,
 ) -> None:
     """Make weights for one bench: render objects for exactly its rig, and train on meanwhile.
 
-    Killed at any moment, the same command goes on. More --minutes go on from what is there.
+    Killed at any moment, the same command goes on. More --minutes go on from what is there. Labelled
+    recordings of known objects in BENCH/recordings are used too.
     """
     folder = Path(bench) if out is None and Path(bench).is_dir() else None
     rig, measured = bench_or_rig(bench)
+    locked = _locked(frames, radiometry, material, given=pulse_ns is not None)
     home = out or folder or Path(f"adapted-{rig.name}")
-    target = home / WEIGHTS
-    work = home / WORK
-    if not overwrite:
-        _refuse_others(target, work)
-    optional: dict[str, Any] = {}
-    if workers:
-        optional["workers"] = workers
-    if ray:
-        from nlos_cam.dataset import ray_farm
-
-        optional["farm"] = ray_farm(ray)
+    work = home / (LOCKED_WORK if locked else WORK)
+    if not overwrite and not locked:
+        _refuse_others(home / WEIGHTS, work)
+    sensor = adaptation.bench_sensor(measured)
+    if locked:
+        sensor = sensor.model_copy(update={"pulse_ns": 1.0 if pulse_ns is None else pulse_ns})
+    optional: dict[str, Any] = {"workers": workers} if workers else {}
     job = adaptation.Adaptation(
         rig,
         adaptation.calibration_spread(measured),
         work,
         weights,
-        adaptation.bench_sensor(measured),
+        sensor,
+        farm=rendering_farm(ray, backend),
         accelerator=accelerator,
+        locked=locked,
+        recordings=_recordings(folder) if folder and not locked else None,
         **optional,
     )
-
-    @cache
-    def test_objects() -> evaluation.HeldOutObjects:
-        """Render the test objects once, for the start weights and for the new ones."""
-        return evaluation.rendered_objects(rig, tracked=common.tracked, sensor=job.sensor)
-
-    def measure(start: Path | None, folder: Path) -> None:
-        found = evaluation.evaluate(start, test_objects(), nearest=False, tracked=common.tracked)
-        evaluation.write_report(folder, found, evaluation.as_figures(found))
-
     try:
         result = adaptation.adapt(
-            job, minutes, measure, tracked=common.tracked, watch=watched_run, on_message=common.say
+            job,
+            minutes,
+            _measure_on(job),
+            tracked=common.tracked,
+            watch=watched_run,
+            on_message=common.say,
         )
     except KeyboardInterrupt:
         common.exit_interrupted(f"what was made is kept in {work}; give the same command to go on")
+    target = result.weights if locked else _install(result, folder, home / WEIGHTS)
+    expected_iou = None if locked else forecast.forecast(rig, quick=True).expected_iou
+    name = shlex.quote(bench)
+    more = f"nlos-cam adapt {name} --minutes {2 * result.plan.minutes:g}"
+    commands = [f"nlos-cam evaluate --rig {name} --weights {shlex.quote(str(target))}"]
+    if locked:
+        commands = []
+        more += f" --frames {locked.frames} --radiometry {locked.radiometry}"
     if folder:
-        benches.write_weights(folder, result.weights)
-    else:
-        adaptation.install(result.weights, target)
+        commands = [f"nlos-cam live --camera l515 --bench {name}"]
+    more += f" --out {shlex.quote(str(out))}" if out else ""
+    _report(result, target, [*commands, more], work / PAGE, expected_iou, as_json=json)
 
-    rows = [
-        (
-            evaluation.LABELS[metric],
-            evaluation.format_interval(result.before[metric]),
-            evaluation.format_interval(result.after[metric]),
+
+def _recordings(folder: Path) -> adaptation.Recordings | None:
+    """Return the labelled recordings in a bench folder, if there are any."""
+    loaded = benches.load_bench(folder)
+    return adaptation.find_recordings(folder / adaptation.RECORDINGS, loaded.for_camera, common.say)
+
+
+def _measure_on(job: adaptation.Adaptation) -> adaptation.Measure:
+    """Return what measures weights on the bench's test objects, which it renders once, or on a
+    dataset.
+    """
+
+    @cache
+    def test_objects() -> evaluation.HeldOutObjects:
+        if job.locked:
+            return _locked_objects(job, job.locked)
+        return evaluation.rendered_objects(job.rig, tracked=common.tracked, sensor=job.sensor)
+
+    def measure(weights: Path | None, folder: Path, objects: Path | None) -> None:
+        found = evaluation.evaluate(
+            weights, objects or test_objects(), nearest=False, tracked=common.tracked
         )
-        for metric in evaluation.TARGETS
-    ]
-    page = work / PAGE
-    adaptation.write_page(result, rows, page)
+        evaluation.write_report(folder, found, evaluation.as_figures(found))
+
+    return measure
+
+
+def _install(result: adaptation.AdaptResult, bench: Path | None, target: Path) -> Path:
+    """Copy the weights to where they are used, and return that folder."""
+    if bench:
+        return benches.write_weights(bench, result.weights, result.after["silhouette_iou"]["value"])
+    adaptation.install(result.weights, target)
+    return target
+
+
+def _report(
+    result: adaptation.AdaptResult,
+    target: Path,
+    commands: list[str],
+    page: Path,
+    expected_iou: float | None,
+    *,
+    as_json: bool,
+) -> None:
+    """Write the page, and print what the minutes brought."""
+    rows = _rows(result.before, result.after)
+    transfer = result.transfer
+    recorded = _rows(transfer.before, transfer.after) if transfer else ()
+    tables = adaptation.Tables(rows, recorded, expected_iou)
+    adaptation.write_page(result, tables, commands, page)
     _, before, after = rows[0]
     state = "was finished before" if result.was_there else "done"
     text = (
         f"{state}: {rows[0][0]} {before} -> {after} on this bench; weights in {target}, report"
         f" {page}"
     )
-    facts = {
+    facts: dict[str, Any] = {
         "out": str(target),
         "report": str(page),
         "minutes": result.plan.minutes,
         "objects": result.plan.stages[-1].objects,
+        "expected_iou": expected_iou,
         "before": result.before,
         "after": result.after,
     }
-    common.finish(facts, as_json=json, text=text)
+    if transfer:
+        text += f"; {adaptation.transfer_words(transfer)}"
+        facts["transfer"] = {
+            "kept": transfer.is_better,
+            "recordings": transfer.recordings,
+            "objects": transfer.parts,
+            "before": transfer.before,
+            "after": transfer.after,
+        }
+    common.finish(facts, as_json=as_json, text=text)
+
+
+def _locked(
+    frames: int | None,
+    radiometry: Literal["paper", "lambertian"] | None,
+    material: forecast.MaterialName | None,
+    *,
+    given: bool,
+) -> adaptation.Locked | None:
+    """Return the locked differences of the options; None without --frames. Raises
+    typer.BadParameter.
+    """
+    if frames is None:
+        if given or radiometry or material:
+            raise typer.BadParameter(
+                "--radiometry, --pulse-ns and --material are of locked differences: give --frames"
+            )
+        return None
+    return adaptation.Locked(
+        frames=frames,
+        radiometry=radiometry or "lambertian",
+        material=forecast.MATERIALS[material or "matt"],
+    )
+
+
+def _locked_objects(
+    job: adaptation.Adaptation, locked: adaptation.Locked
+) -> evaluation.HeldOutObjects:
+    """Return the test objects as locked differences with the noise of their frames."""
+    box = objects.object_box(job.rig)
+    subjects = objects.benchmark_objects(box)
+    pulse_ns = job.sensor.pulse_ns
+    surface = locked.material.surface
+    differences: list[LidarMaps] = []
+    with common.tracked("rendering test objects") as on_progress:
+        for subject in subjects:
+            scene = Scene(job.rig, subject.depth_m, surface, locked.radiometry, pulse_ns=pulse_ns)
+            differences.append(dataset.locked_difference(scene, job.sensor))
+            on_progress(len(differences), len(subjects))
+    maps = evaluation.as_map_set(differences, evaluation.truth_of(subjects, box))
+    noise = adaptation.LockedNoise.of(job.rig, job.sensor, locked)
+    return evaluation.HeldOutObjects(
+        f"{len(subjects)} test objects, locked differences of {locked.frames} frames",
+        [subject.name for subject in subjects],
+        [subject.category for subject in subjects],
+        noise.added_to(maps),
+        dataset.DatasetPlan(job.rig, dataset.TEST_SEED, job.sensor),
+        [job.rig] * len(subjects),
+    )
+
+
+def _rows(before: dict[str, Any], after: dict[str, Any]) -> list[tuple[str, str, str]]:
+    """Return the name of each metric with its text before and after."""
+    return [
+        (
+            evaluation.LABELS[metric],
+            evaluation.format_interval(before[metric]),
+            evaluation.format_interval(after[metric]),
+        )
+        for metric in evaluation.TARGETS
+    ]
 
 
 def _refuse_others(target: Path, work: Path) -> None:
@@ -141,8 +282,11 @@ def _refuse_others(target: Path, work: Path) -> None:
     if not target.exists():
         return
     # the network's file: a bench adds its rig to the record
-    ours = [checksums_of(folder).get(NETWORK) for folder in work.glob(f"stage-*/{WEIGHTS}")]
-    if checksums_of(target).get(NETWORK, "") not in ours:
+    ours = [
+        checksums_of(folder).get(adaptation.NETWORK_FILE)
+        for folder in work.glob(f"stage-*/**/{WEIGHTS}")
+    ]
+    if checksums_of(target).get(adaptation.NETWORK_FILE, "") not in ours:
         raise OutputExistsError(
             f"{target} holds weights that were not made here: move them, or give --overwrite"
         )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shlex
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, NamedTuple
 
@@ -30,6 +31,10 @@ BenchOrRig = Annotated[
     Path | None,
     typer.Option("--bench", help="Bench folder of `calibrate --bench`, in place of --rig."),
 ]
+
+
+POORER_IOU = 0.06
+"""Difference from the forecast that is more than its largest error (docs/predict.md)."""
 
 
 class Choice(NamedTuple):
@@ -85,10 +90,11 @@ def rig_or_default(bench: Path | None, rig: str | None, default: str) -> walls.R
     return found
 
 
-def bench_or_rig(name: str) -> tuple[walls.Rig, walls.MeasuredWall | None]:
+def bench_or_rig(name: str | Path) -> tuple[walls.Rig, walls.MeasuredWall | None]:
     """Return the rig of a bench folder, a wall record, a rig's file or a packaged rig and, where it
     was measured, its wall.
     """
+    name = str(name)
     if Path(name).is_dir():
         measured = benches.load_bench(name).measured
     elif walls.is_wall_record(name):
@@ -99,14 +105,46 @@ def bench_or_rig(name: str) -> tuple[walls.Rig, walls.MeasuredWall | None]:
 
 
 def weights_verdict(
-    rig: walls.Rig, trained: models.CheckpointRecord, bench: Path | None
+    rig: walls.Rig, trained: models.CheckpointRecord, bench: benches.Bench | None
 ) -> reconstruct.WeightsVerdict:
-    """Return whether weights serve a rig, for the user, with the bench folder to train others in.
-
-    The forecast of the expected IoU goes in here, for `calibrate`, `live` and `replay` at once.
+    """Return whether weights serve a rig, for the user, with the bench folder to train others in
+    and what to expect of them.
     """
-    folder = shlex.quote(str(bench)) if bench else "bench/"
-    return reconstruct.weights_serve(rig, trained, bench=folder)
+    if bench is None:
+        return reconstruct.weights_serve(rig, trained)
+    folder = shlex.quote(str(bench.folder))
+    expected_iou = bench.expected_iou
+    served = reconstruct.weights_serve(rig, trained, expected_iou=expected_iou, bench=folder)
+
+    # weights of few minutes are the bench's own, and may still be poor
+    reached_iou = trained.figures.get(benches.TEST_IOU)
+    if served.service != "trained for it" or reached_iou is None:
+        return served
+    sentence = f"{served.sentence} (silhouette IoU {reached_iou:.2f} on the test objects"
+    if expected_iou is not None and reached_iou < expected_iou - POORER_IOU:
+        sentence += (
+            f", where {expected_iou:.2f} is expected: more --minutes of `nlos-cam adapt {folder}`"
+        )
+    return replace(served, sentence=f"{sentence})")
+
+
+def store_forecast(folder: Path, station: str = benches.MAIN) -> None:
+    """Forecast what a bench with an occluder shows, and enter it in its record: takes seconds.
+
+    Raises RecordFileError.
+    """
+    bench = benches.load_bench(folder, station)
+    if bench.measured.record.occluder is None or bench.rig.object_box is None:
+        return
+    from nlos_cam.forecast import forecast  # not for `live`
+
+    common.say("Forecasting what this bench can show")
+    found = forecast(bench.rig, quick=True)
+    entry = benches.ForecastRecord(
+        rig_checksum=bench.rig.checksum, expected_iou=round(found.expected_iou, 3)
+    )
+    with benches.edit_bench(folder) as edit:
+        edit.set_forecast(station, entry)
 
 
 def files_in_bench(

@@ -22,6 +22,7 @@ from rich.table import Table
 from nlos_cam import bench as benches
 from nlos_cam import calibrate as bench
 from nlos_cam import camera as cameras
+from nlos_cam import reconstruct
 from nlos_cam.cli import benches as benching
 from nlos_cam.cli.common import (
     Camera,
@@ -285,15 +286,21 @@ def calibrate(
     fields = record.model_dump(mode="json", include=JSON_FIELDS)
     files = target.files
     result = fields | {"out": str(files.record), "report": str(files.report)}
-    own = benches.load_bench(target.folder).weights if target.folder else None
-    trained = models.load_record(models.weights_folder(own))
-    served = benching.weights_verdict(record.rig, trained, target.folder)
-    result["weights"] = {"serve": served.serve, "verdict": served.sentence}
+    if target.folder:
+        benching.store_forecast(target.folder)
+    loaded = benches.load_bench(target.folder) if target.folder else None
+    trained = models.load_record(models.weights_folder(loaded.weights if loaded else None))
+    served = benching.weights_verdict(loaded.rig if loaded else record.rig, trained, loaded)
+    result["weights"] = {
+        "serve": served.serve,
+        "verdict": served.sentence,
+        "expected_iou": served.expected_iou,
+    }
     text = format_result(record, files)
     text += f"\n{escape(served.sentence[:1].upper() + served.sentence[1:])}"
     if target.folder:
         result["bench"] = str(target.folder)
-        text += f"\nNext: {escape(_next_step(target.folder, record))}"
+        text += f"\nNext: {escape(_next_step(target.folder, record, served))}"
     finish(result, as_json=json, text=text, marked=True)
 
 
@@ -388,11 +395,15 @@ def _bare_wall(source: Path) -> walls.MeasuredWall:
     return benches.load_bench(source).bare if source.is_dir() else walls.load_measured(source)
 
 
-def _next_step(folder: Path, record: walls.WallRecord) -> str:
+def _next_step(folder: Path, record: walls.WallRecord, served: reconstruct.WeightsVerdict) -> str:
+    """Return the command to go on with; weights of its own come before live pictures where the
+    bench needs them.
+    """
     name = shlex.quote(str(folder))
     if record.occluder is None:
         return f"put the occluder up, then nlos-cam calibrate --occluder {name}"
-    return f"nlos-cam live --bench {name}"
+    live = f"nlos-cam live --bench {name}"
+    return live if served.serve else f"nlos-cam adapt {name} --minutes 10, then {live}"
 
 
 def _source(camera: str | None, bag: Path | None, *, wall: bool, occluder: Path | None) -> str:

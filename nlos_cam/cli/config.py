@@ -41,7 +41,7 @@ SETTINGS = {
         "--wall, unless another CAMERA is given",
     ),
     "bench": Setting(
-        frozenset({"live", "replay", "capture", "evaluate"}),
+        frozenset({"live", "replay", "capture", "evaluate", "detect", "predict"}),
         None,
         "--bench, unless another CAMERA, --wall or --rig is given",
     ),

@@ -125,6 +125,13 @@ RayAddress = Annotated[
         "--ray", help="Ray cluster to use instead: auto, HOST:PORT, ray://HOST:PORT, local."
     ),
 ]
+Backend = Annotated[
+    Literal["cpu", "torch", "cuda"],
+    typer.Option(
+        "--backend",
+        help="cpu: processes; cuda: a GPU, in batches; torch: the same on the CPU, to try it.",
+    ),
+]
 Transients = Annotated[
     bool,
     typer.Option(
@@ -173,6 +180,7 @@ def build(
     expected_maps: Expected = False,
     workers: Workers = os.cpu_count() or 1,
     ray: RayAddress = None,
+    backend: Backend = "cpu",
     transient: Transients = False,
     json: common.Json = False,
 ) -> None:
@@ -214,7 +222,7 @@ def build(
                 ),
                 on_warning=common.say,
                 command=_command(context, "build"),
-                farm=data.ray_farm(ray) if ray else None,
+                farm=rendering_farm(ray, backend),
             )
         except KeyboardInterrupt:
             common.exit_interrupted(
@@ -233,6 +241,17 @@ def build(
     new = f" ({report.made} new, {rate:.1f} per second)" if rate else ""
     note = models.SIMULATION_ONLY if colour else ""
     common.finish(result, as_json=json, text=f"{report.objects} objects in {out}{new}", note=note)
+
+
+def rendering_farm(ray: str | None, backend: str) -> data.Farm | None:
+    """Return what renders in place of processes on this machine; None for these. Raises
+    typer.BadParameter for two.
+    """
+    if ray and backend != "cpu":
+        raise typer.BadParameter(f"--ray and --backend {backend} each say who renders: give one")
+    if ray:
+        return data.ray_farm(ray)
+    return None if backend == "cpu" else data.in_batches(backend)
 
 
 def label(

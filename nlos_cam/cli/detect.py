@@ -10,13 +10,14 @@ import sys
 from collections.abc import Callable
 from datetime import datetime
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, NamedTuple
 
 import nlos_calibration as walls
 import typer
 
 from nlos_cam import camera as cameras
 from nlos_cam import detect as detection
+from nlos_cam.cli import benches
 from nlos_cam.cli.common import (
     Camera,
     Json,
@@ -66,6 +67,7 @@ def detect(
         Path | None,
         typer.Option("--wall", help="Record of the bench (wall.toml): which cells see the object."),
     ] = None,
+    bench_folder: benches.BenchFolder = None,
     turns: Annotated[
         int | None,
         typer.Option("--turns", min=8, max=4096, help="Turns, a multiple of 4 (default: 32)."),
@@ -128,30 +130,21 @@ def detect(
         folder = output_path(out, "detect", "", overwrite=True)  # a session that exists goes on
         if overwrite and detection.is_session(folder):
             shutil.rmtree(folder)
-        asked = _Asked(turns, frames, alpha, seed, control=control, sweep=settings == "sweep")
-        session = _measure(camera, wall, asked, folder)
+        chosen = benches.choose(bench_folder, wall)
+        asked = Asked(turns, frames, alpha, seed, control, settings == "sweep")
+        session = _measure(camera, chosen, asked, folder)
     _report(session, show_serial=show_serial, as_json=json)
 
 
-class _Asked:
-    """Options of the command line; those that were not given follow a session that exists."""
+class Asked(NamedTuple):
+    """Options of the command line; None for those that follow a session that exists."""
 
-    def __init__(
-        self,
-        turns: int | None,
-        frames: int | None,
-        alpha: float | None,
-        seed: int | None,
-        *,
-        control: bool,
-        sweep: bool,
-    ) -> None:
-        self.turns = turns
-        self.frames = frames
-        self.alpha = alpha
-        self.seed = seed
-        self.control = control
-        self.sweep = sweep
+    turns: int | None
+    frames: int | None
+    alpha: float | None
+    seed: int | None
+    control: bool
+    sweep: bool
 
     def plan(
         self, source: cameras.Camera, rig: walls.Rig | None, before: detection.Plan | None
@@ -178,9 +171,8 @@ class _Asked:
             raise typer.BadParameter(walls.first_problem(error)) from error
 
 
-def _measure(uri: str, wall: Path | None, asked: _Asked, folder: Path) -> detection.Session:
+def _measure(uri: str, chosen: benches.Choice, asked: Asked, folder: Path) -> detection.Session:
     before = detection.Session.open(folder).plan if detection.is_session(folder) else None
-    measured = walls.load_measured(wall) if wall else None
     with tracked("Opening the camera") as on_progress:
         source = cameras.open_camera(uri, on_progress=on_progress)
     movable = isinstance(source, cameras.SimulatedCamera)
@@ -188,9 +180,9 @@ def _measure(uri: str, wall: Path | None, asked: _Asked, folder: Path) -> detect
         raise NlosCamError(
             f"{uri} needs hands at a terminal, and stdin is none: run the command in a terminal"
         )
-    rig = measured.record.rig if measured else source.rig
     kept = f"whole turns are in {folder}; the same command goes on"
     with interrupted_by_signals(kept), source:
+        rig = chosen.open(source).rig if chosen.record else source.rig
         session = detection.Session.start(folder, asked.plan(source, rig, before))
         hands: detection.Hands = (
             detection.SimulatedHands(source, control=asked.control)

@@ -248,8 +248,7 @@ def _load_pipeline(
     network = reconstruct.load_networks(chosen.weights)
     uncertainty_model = reconstruct.load_uncertainty(chosen.weights)
     common.say(f"Loaded model {network.record.rig_name} ({network.runtime})")
-    folder = chosen.bench.folder if chosen.bench else None
-    served = benches.weights_verdict(bench.rig, network.record, folder)
+    served = benches.weights_verdict(bench.rig, network.record, chosen.bench)
     if served.service == "trained for it":
         common.say(served.sentence[:1].upper() + served.sentence[1:])
     for warning in reconstruct.compatibility_warnings(

@@ -4,15 +4,15 @@ from __future__ import annotations
 
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
-import nlos_calibration as walls
 import typer
 from rich.table import Table
 
-from nlos_cam import bench as benches
 from nlos_cam import forecast, objects
+from nlos_cam.cli import benches
 from nlos_cam.cli.common import (
+    PAPER_RIG,
     Json,
     Overwrite,
     finish,
@@ -23,20 +23,18 @@ from nlos_cam.cli.common import (
 )
 from nlos_cam.cli.render import hidden_depth
 
-if TYPE_CHECKING:
-    from nlos_calibration import Rig
-
 SUFFIXES = ".html", ".png"
 
 
 def predict(
     rig: Annotated[
-        str,
+        str | None,
         typer.Argument(
-            metavar="RIG_OR_BENCH",
-            help="Name of a packaged rig, a rig's TOML file, a wall.toml, or a bench folder.",
+            metavar="[RIG_OR_BENCH]",
+            help="Name of a packaged rig, a rig's TOML file, a wall.toml, or a bench folder;"
+            " default: paper-rig. With --bench, the first argument is OBJECT.",
         ),
-    ] = "paper-rig",
+    ] = None,
     hidden: Annotated[
         str | None,
         typer.Argument(
@@ -44,6 +42,7 @@ def predict(
             help="A category's name, a mesh or a .npy depth map; default: typical objects.",
         ),
     ] = None,
+    bench_folder: benches.BenchOrRig = None,
     out: Annotated[
         Path | None, typer.Option("--out", help="Page (.html) or picture (.png) with the maps.")
     ] = None,
@@ -64,7 +63,11 @@ def predict(
     if out is not None and out.suffix not in SUFFIXES:
         raise typer.BadParameter(f"--out {out}: choose a name that ends in .html or .png")
     path = output_path(out, "forecast", ".html", overwrite=overwrite) if out else None
-    own = rig_of(rig)
+    if bench_folder is not None:
+        if hidden is not None:
+            raise typer.BadParameter(f"--bench and {rig} each name a rig: give one")
+        rig, hidden = str(bench_folder), rig
+    own, _ = benches.bench_or_rig(rig or PAPER_RIG)
     shape = None
     if hidden is not None:
         depth_m = hidden_depth(hidden, own, {"size_m": size_m, "tilt_y_deg": turn_deg})
@@ -95,13 +98,6 @@ def predict(
         show(_table(found))
         lines.insert(0, forecast.COLUMNS)
     finish(facts, as_json=json, text="\n".join(lines))
-
-
-def rig_of(name: str) -> Rig:
-    """Return a packaged rig, or that of a rig's file, a wall record or a bench folder."""
-    if Path(name).is_dir():
-        return benches.load_bench(name).rig
-    return walls.rig_named(name)
 
 
 def _table(found: forecast.Forecast) -> Table:

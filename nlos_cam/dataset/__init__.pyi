@@ -4,6 +4,7 @@ __all__ = [
     "GENERIC",
     "HELD_OUT_OUTLIERS",
     "HELD_OUT_SEED",
+    "LOCKED",
     "ORDINARY",
     "RECORDED",
     "REQUIRED_ARRAYS",
@@ -17,8 +18,10 @@ __all__ = [
     "BuildReport",
     "Dataset",
     "DatasetPlan",
+    "Farm",
     "Labelled",
     "Objects",
+    "OpenBench",
     "PackedMaps",
     "RigSpread",
     "Stimulus",
@@ -27,10 +30,13 @@ __all__ = [
     "build_transients",
     "check_arrays",
     "check_uncertainty_data",
+    "difference_noise",
     "draw_outlier",
     "ignore",
+    "in_batches",
     "label_recordings",
     "list_recordings",
+    "locked_difference",
     "measured_bare_wall",
     "objects_from_folder",
     "open_dataset",
@@ -54,16 +60,27 @@ __all__ = [
     "write_shards",
 ]
 
-from .build import HELD_OUT_SEED, SHARD, TEST_SEED, TRAINING_SEED, BuildReport, build_dataset
+from .build import (
+    HELD_OUT_SEED,
+    SHARD,
+    TEST_SEED,
+    TRAINING_SEED,
+    BuildReport,
+    Farm,
+    build_dataset,
+    in_batches,
+)
 from .labelled import (
     FRAMES_PER_RECORDING,
     RECORDED,
     Labelled,
+    OpenBench,
     label_recordings,
     list_recordings,
     read_labelled,
     write_shards,
 )
+from .locked import LOCKED, difference_noise, locked_difference
 from .outliers import (
     HELD_OUT_OUTLIERS,
     SHAPE_OUTLIERS,

@@ -16,7 +16,7 @@ from multiprocessing.connection import wait as wait_for_any
 from pathlib import Path
 
 from nlos_cam.dataset.plan import DatasetPlan
-from nlos_cam.dataset.samples import OnProgress, Samples, ignore, join_samples
+from nlos_cam.dataset.samples import OnProgress, Samples, ignore, join_samples, make_samples
 from nlos_cam.dataset.shards import (
     SHARD_PATTERN,
     Shard,
@@ -167,6 +167,20 @@ def _store_shards(
             store(shard_path(folder, seeds.start), shard, provenance, command)
             del waiting[seeds]
         yield piece
+
+
+def in_batches(backend: str) -> Farm:
+    """Return a farm that renders in this process, a piece at a time, by a backend of the renderer:
+    `torch` or `cuda`.
+
+    Raises SceneError, when it begins, where that backend is missing.
+    """
+
+    def make(plan: DatasetPlan, pieces: Sequence[range]) -> Pieces:
+        for piece in pieces:
+            yield piece, make_samples(plan, piece, backend)
+
+    return make
 
 
 def processes(workers: int) -> Farm:

@@ -17,10 +17,11 @@ from nlos_calibration.arrays import Float32
 from numpy.typing import NDArray
 
 from nlos_cam import objects as shapes
+from nlos_cam.dataset.locked import LOCKED, locked_difference
 from nlos_cam.dataset.plan import DatasetPlan, Objects, scene_row
 from nlos_cam.errors import SceneError, SceneFileError
 from nlos_cam.frames import LidarMaps
-from nlos_cam.render import Radiometry, Scene, Sensor, SensorModel, Surface, render
+from nlos_cam.render import Radiometry, Scene, Sensor, SensorModel, Surface, render, render_all
 
 Samples = Mapping[str, NDArray[Any]]
 """Arrays with one row per object: depth_m and intensity (n, 64, 80), image and object_depth_m (n,
@@ -111,18 +112,27 @@ def sense_color(
     return replace(white, intensity=np.stack([maps.intensity for maps in colors]))
 
 
-def make_samples(plan: DatasetPlan, seeds: Sequence[int]) -> Samples:
-    """Return the samples of some seeds, with the same bits on any machine and in any order."""
+def make_samples(plan: DatasetPlan, seeds: Sequence[int], backend: str = "cpu") -> Samples:
+    """Return the samples of some seeds, with the same bits on any machine and in any order.
+
+    By another backend of the renderer, which takes them in batches, the last digits differ.
+    """
     objects = [hidden_object(plan.objects, seed, plan.box) for seed in seeds]
     rigs = [plan.bench_of(seed) for seed in seeds]
     coats = [
         _coat(seed, depth_m, plan.textures)
         for seed, (_, depth_m) in zip(seeds, objects, strict=True)
     ]
-    maps = [
-        _sense(plan, depth_m, coat, rig, model, seed)
-        for (_, depth_m), coat, (rig, model), seed in zip(objects, coats, rigs, seeds, strict=True)
-    ]
+    if backend == "cpu":
+        maps = [
+            _sense(plan, depth_m, coat, rig, model, seed)
+            for (_, depth_m), coat, (rig, model), seed in zip(
+                objects, coats, rigs, seeds, strict=True
+            )
+        ]
+    else:
+        depths_m = [depth_m for _, depth_m in objects]
+        maps = _sense_in_batches(plan, depths_m, rigs, seeds, backend)
     images = [
         _image(depth, plan.box, coat) for (_, depth), coat in zip(objects, coats, strict=True)
     ]
@@ -165,12 +175,39 @@ def _sense(
     seed: int,
 ) -> LidarMaps:
     scene = scene_of(plan, depth_m, rig, model)
+    if plan.accuracy == LOCKED:
+        return locked_difference(scene, model)
     # The records are frozen, so hashable, which pyright does not see.
     sensor = cached_sensor(rig, model, plan.radiometry)  # pyright: ignore[reportArgumentType]
     if coat is None:
         return sense_object(scene, sensor, seed, plan.accuracy, expected=plan.expected)
     painted = replace(scene, surface=Surface(coat.albedo, plan.material.brdf))
     return sense_color(painted, sensor, seed, plan.accuracy, expected=plan.expected)
+
+
+def _sense_in_batches(
+    plan: DatasetPlan,
+    depths_m: Sequence[Float32],
+    rigs: Sequence[tuple[Rig, SensorModel]],
+    seeds: Sequence[int],
+    backend: str,
+) -> list[LidarMaps]:
+    """Return the maps of unpainted objects, rendered in batches. Raises SceneError for plans that
+    only the CPU renders.
+    """
+    if plan.textures or plan.accuracy == LOCKED:
+        raise SceneError(f"backend {backend} renders no colors: drop --backend")
+    scenes = [
+        scene_of(plan, depth_m, rig, model)
+        for depth_m, (rig, model) in zip(depths_m, rigs, strict=True)
+    ]
+    rendered = render_all(scenes, plan.accuracy, backend=backend)
+    maps: list[LidarMaps] = []
+    for rendering, (rig, model), seed in zip(rendered, rigs, seeds, strict=True):
+        sensor = cached_sensor(rig, model, plan.radiometry)  # pyright: ignore[reportArgumentType]
+        generator = None if plan.expected else np.random.default_rng([seed, 1, 0])
+        maps.append(sensor.maps(rendering.multi, generator))
+    return maps
 
 
 @lru_cache(maxsize=1)

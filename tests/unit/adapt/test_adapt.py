@@ -6,14 +6,13 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from nlos_calibration import Rig, load_rig
+from made_adaptations import finish_network, job_in
+from nlos_calibration import load_rig
 from nlos_models import training
 
-from nlos_cam.adapt import Adaptation, Plan, Stage, adapt, calibration_spread
-from nlos_cam.adapt.plan import Pace
+from nlos_cam.adapt import NETWORK_FILE, adapt
 from nlos_cam.errors import SceneError
 from nlos_cam.files import FileBusyError, claim
-from nlos_cam.render import SensorModel
 
 AFTER_THE_NETWORK = "judged"
 
@@ -26,7 +25,7 @@ def until_judged(description: str) -> Generator[Callable[[int, int], None]]:
     yield lambda _done, _total: None
 
 
-def no_figures(_weights: Path | None, folder: Path) -> None:
+def no_figures(_weights: Path | None, folder: Path, _objects: Path | None = None) -> None:
     """Measure nothing."""
     folder.mkdir(exist_ok=True)
     (folder / "figures.json").write_text("{}")
@@ -50,22 +49,6 @@ def stopping_after(steps: int) -> training.Watch:
     return watch
 
 
-def job_in(folder: Path, rig: Rig) -> Adaptation:
-    """Return a job whose plan, of a few steps, is there already."""
-    spread = calibration_spread(None)
-    folder.mkdir()
-    stage = Stage(minutes=1.0, objects=300, epochs=2, steps=3)
-    Plan(
-        rig_checksum=rig.checksum,
-        spread=spread,
-        sensor=SensorModel(),
-        seed=0,
-        pace=Pace(objects_per_s=1.0, samples_per_s=1.0),
-        stages=(stage,),
-    ).save(folder)
-    return Adaptation(rig, spread, folder, workers=1)
-
-
 @pytest.mark.slow
 @pytest.mark.timeout(900)
 def test_a_stopped_adaptation_goes_on_to_the_same_weights(tmp_path: Path) -> None:
@@ -83,6 +66,18 @@ def test_a_stopped_adaptation_goes_on_to_the_same_weights(tmp_path: Path) -> Non
         adapt(broken, 1.0, no_figures, tracked=until_judged)
 
     assert (broken.folder / network).read_bytes() == (whole.folder / network).read_bytes()
+
+
+def test_other_start_weights_are_not_ignored(tmp_path: Path) -> None:
+    rig = load_rig("paper-rig")
+    job = job_in(tmp_path / "work", rig)
+    others = tmp_path / "others"
+    others.mkdir()
+    (others / NETWORK_FILE).write_bytes(b"other weights")
+    finish_network(job.folder)
+
+    with pytest.raises(SceneError, match="other start weights"):
+        adapt(replace(job, start=others), 1.0, no_figures)
 
 
 def test_two_adaptations_in_one_folder_are_one_too_many(tmp_path: Path) -> None:

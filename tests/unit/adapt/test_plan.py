@@ -15,6 +15,7 @@ from nlos_cam.render import SensorModel
 def plan_at(objects_per_s: float = 50.0, samples_per_s: float = 400.0) -> Plan:
     return Plan(
         rig_checksum=load_rig("paper-rig").checksum,
+        start="0" * 64,
         spread=calibration_spread(None),
         sensor=SensorModel(),
         seed=0,

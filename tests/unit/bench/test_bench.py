@@ -12,6 +12,7 @@ from small_frames import FrameCamera
 
 from nlos_cam.bench import (
     MANIFEST,
+    ForecastRecord,
     check_new,
     edit_bench,
     is_bench,
@@ -116,6 +117,17 @@ def test_weights_come_back_with_the_rig_of_their_bench(folder: Path, tmp_path: P
 
     assert load_record(folder / "weights").rig == bench.rig.model_dump(mode="json")
     assert not (folder / "weights/doubt.json").exists()
+
+
+def test_forecast_holds_for_the_rig_that_it_was_made_for(folder: Path) -> None:
+    forecast = ForecastRecord(rig_checksum=load_bench(folder).rig.checksum, expected_iou=0.6)
+    with edit_bench(folder) as edit:
+        edit.set_forecast("main", forecast)
+
+    assert load_bench(folder).expected_iou == 0.6
+
+    set_line(folder, "x_max_m", "x_max_m = 0.6")
+    assert load_bench(folder).expected_iou is None
 
 
 def test_added_file_is_checked(folder: Path) -> None:

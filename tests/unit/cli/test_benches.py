@@ -8,8 +8,10 @@ from typing import Any
 import pytest
 from made_benches import make_bench, wall_of, write_wall
 from nlos_calibration import dump_toml, load_rig
+from nlos_models import RECORD, load_record, shipped_folder, weights_folder
 
-from nlos_cam.bench import MANIFEST, load_bench
+from nlos_cam.bench import MANIFEST, ForecastRecord, edit_bench, load_bench, write_weights
+from nlos_cam.cli.benches import weights_verdict
 
 Run = Callable[..., Any]
 FAR = """name = "far"
@@ -175,6 +177,48 @@ def test_rigs_prints_a_whole_rig_that_can_be_used(shown: Run) -> None:
 
     assert load_rig("mine.toml") == load_rig("paper-rig")
     assert dump_toml(load_rig("paper-rig")) in text
+
+
+def forecast(folder: Path, iou: float) -> None:
+    """Enter a forecast into a bench."""
+    checksum = load_bench(folder).rig.checksum
+    with edit_bench(folder) as edit:
+        edit.set_forecast("main", ForecastRecord(rig_checksum=checksum, expected_iou=iou))
+
+
+def verdict(folder: Path) -> str:
+    """Return the verdict on the weights that a bench uses."""
+    loaded = load_bench(folder)
+    trained = load_record(weights_folder(loaded.weights))
+    return weights_verdict(loaded.rig, trained, loaded).sentence
+
+
+def test_verdict_on_weights_names_adapt_and_the_forecast(bench: Path) -> None:
+    forecast(bench, 0.64)
+    loaded = load_bench(bench)
+    lidar = loaded.rig.lidar.model_copy(update={"distance_m": 0.25})
+    farther = loaded.rig.model_copy(update={"lidar": lidar})
+
+    sentence = weights_verdict(farther, load_record(shipped_folder()), loaded).sentence
+
+    assert "nlos-cam adapt bench" in sentence
+    assert "expected silhouette IoU 0.64" in sentence
+
+
+def test_verdict_on_own_weights_says_how_far_they_are(bench: Path) -> None:
+    own = Path("own")
+    own.mkdir()
+    record = load_record(shipped_folder())
+    update = {"rig_checksum": load_bench(bench).rig.checksum}
+    (own / RECORD).write_text(record.model_copy(update=update).model_dump_json(), encoding="utf-8")
+    write_weights(bench, own, 0.45)
+
+    assert "0.45" in verdict(bench)
+    assert "adapt" not in verdict(bench)
+
+    forecast(bench, 0.64)
+    assert "where 0.64 is expected" in verdict(bench)
+    assert "more --minutes of `nlos-cam adapt bench`" in verdict(bench)
 
 
 @pytest.mark.slow

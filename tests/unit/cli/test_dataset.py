@@ -137,6 +137,14 @@ def test_build_without_ray_names_the_extra(
     assert "nlos-cam[many]" in built(tmp_path / "d", "--ray", "auto", code=1)["error"]["message"]
 
 
+def test_ray_and_a_backend_contradict(shown: Run, tmp_path: Path) -> None:
+    words = "--ray", "auto", "--backend", "torch"
+
+    err = shown("dataset", "build", "--count", 1, "--out", tmp_path / "d", *words, code=2).err
+
+    assert "--backend torch" in " ".join(err.split())
+
+
 def test_rate_is_objects_per_second_once_known() -> None:
     clock = iter(range(100))
     bar = Progress(get_time=lambda: float(next(clock)))

@@ -4,8 +4,10 @@ import json
 from pathlib import Path
 
 import pytest
+from made_benches import make_bench
 from nlos_calibration import dump_toml, load_rig
 
+from nlos_cam.bench import load_bench
 from nlos_cam.cli.main import main
 
 
@@ -25,6 +27,20 @@ def test_predict_takes_a_rig_file_and_names_what_it_sees(
     assert found["rig"] == "mine"
     assert found["expectations"][0]["cells"] == 0
     assert "sees nothing" in page.read_text()
+
+
+def test_predict_bench_takes_its_rig_and_an_object(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    folder = make_bench(Path("bench"))
+
+    assert main(["predict", "--bench", "bench", "cup", "--quick", "--json"]) == 0
+
+    found = json.loads(capsys.readouterr().out.splitlines()[-1])
+    assert found["rig_checksum"] == load_bench(folder).rig.checksum
+    assert found["object"] == "cup"
+    assert main(["predict", "--bench", "bench", "paper-rig", "cup"]) == 2
 
 
 @pytest.mark.parametrize("wrong", ["nowhere.toml", "papper-rig", "bare-wall", "empty-folder"])

@@ -1,0 +1,158 @@
+"""Recordings of known objects as the second stage of an adaptation: the transfer of SI 4.
+
+Whole objects are held out: from other poses of an object that it was trained on, a network would
+know it again. Some decide which epoch is kept, others alone whether the result is.
+"""
+
+import hashlib
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+from nlos_models import training
+
+from nlos_cam import dataset as data
+from nlos_cam.errors import RecordingError, SceneError
+from nlos_cam.recording import load_sidecar, sidecar_path
+
+RECORDINGS = "recordings"
+"""Folder of a bench with labelled recordings."""
+RECIPE = "direct-transfer"
+MIN_OBJECTS = 3
+JUDGED_EVERY = 3
+"""Every third object is held out to judge the result."""
+VALIDATION_EVERY = 4
+"""Of the others, every fourth is held out to choose the epoch."""
+DIGITS = 12
+TRUTHS = ".bag", ".json", ".toml", ".npy", ".stl", ".obj", ".ply"
+Part = Literal["adaptation", "validation", "judged"]
+
+
+@dataclass(frozen=True)
+class Recordings:
+    """Labelled recordings of known objects on one bench."""
+
+    folder: Path
+    by_label: Mapping[str, Sequence[Path]]
+    """Recordings of each object, in the order of their labels."""
+    open_bench: data.OpenBench
+    """Opens the bench for a recording's camera."""
+
+    @property
+    def digest(self) -> str:
+        """Hexadecimal digits that change with the recordings and what is said of their objects."""
+        digest = hashlib.sha256()
+        for path in sorted(self.folder.iterdir()):
+            if path.suffix in TRUTHS:
+                with path.open("rb") as file:
+                    content = hashlib.file_digest(file, "sha256").hexdigest()
+                digest.update(f"{path.name} {content}\n".encode())
+        return digest.hexdigest()[:DIGITS]
+
+    def part(self, part: Part) -> list[Path]:
+        """Return the recordings of a part; no object is in two."""
+        parts = parts_of(list(self.by_label))
+        return [path for label in parts[part] for path in self.by_label[label]]
+
+
+@dataclass(frozen=True)
+class Transfer:
+    """Result of a transfer to recordings."""
+
+    folder: Path
+    parts: Mapping[Part, Sequence[str]]
+    """Labels of the objects in each part."""
+    recordings: int
+    before: dict[str, Any]
+    """Figures of the weights on the judged recordings."""
+    after: dict[str, Any]
+
+    @property
+    def is_better(self) -> bool:
+        """True if the outlines of the judged objects are nearer than before."""
+        before, after = (each["silhouette_iou"]["value"] for each in (self.before, self.after))
+        return after > before
+
+
+def parts_of(labels: Sequence[str]) -> dict[Part, list[str]]:
+    """Return the objects of each part, by their places in the alphabet: more recordings of them
+    change nothing.
+    """
+    judged = [*labels][JUDGED_EVERY - 1 :: JUDGED_EVERY]
+    others = [label for label in labels if label not in judged]
+    validation = others[::VALIDATION_EVERY]
+    adaptation = [label for label in others if label not in validation]
+    return {"adaptation": adaptation, "validation": validation, "judged": judged}
+
+
+def find_recordings(
+    folder: Path, open_bench: data.OpenBench, on_message: Callable[[str], None]
+) -> Recordings | None:
+    """Return the labelled recordings of a folder; None where there are none, or of too few objects,
+    with a message.
+    """
+    by_label: dict[str, list[Path]] = {}
+    for path in sorted(folder.glob("*.bag")) if folder.is_dir() else []:
+        try:
+            label = load_sidecar(sidecar_path(path)).label
+        except RecordingError as error:
+            on_message(f"note: {path} is left out: {error}")
+            continue
+        if label:
+            by_label.setdefault(label, []).append(path)
+        else:
+            on_message(f"note: {path} is left out: it has no label")
+    if 0 < len(by_label) < MIN_OBJECTS:
+        on_message(
+            f"note: {folder} holds recordings of {len(by_label)} objects: from {MIN_OBJECTS} on,"
+            " weights are fitted to them and judged on others"
+        )
+    if len(by_label) < MIN_OBJECTS:
+        return None
+    return Recordings(folder, dict(sorted(by_label.items())), open_bench)
+
+
+def write_parts(found: Recordings, folder: Path, tracked: data.Tracked) -> dict[Part, Path]:
+    """Write each part as a dataset into a folder, unless it is there; return their folders.
+
+    Raises RecordingError for a recording of which the truth is not known.
+    """
+    folders: dict[Part, Path] = {}
+    for part in parts_of(list(found.by_label)):
+        folders[part] = folder / part
+        if (folder / part).is_dir():
+            continue
+        frames = 1 if part == "judged" else data.FRAMES_PER_RECORDING
+        with tracked(f"reading recordings ({part})") as on_progress:
+            labelled = data.read_labelled(
+                found.part(part), wall=found.open_bench, frames=frames, on_progress=on_progress
+            )
+        data.write_shards(labelled, folder / part)
+    return folders
+
+
+def fit_to_recordings(
+    start: Path,
+    parts: Mapping[Part, Path],
+    out: Path,
+    accelerator: Literal["auto", "cpu", "cuda"],
+    watch: training.Watch,
+) -> None:
+    """Fine-tune the network in `start` on recordings in SI 4's two phases: all layers, then the
+    last ones.
+
+    A run that was stopped goes on.
+    """
+    recipe = training.load_recipe(training.packaged_recipes()[RECIPE])
+    if not isinstance(recipe, training.TransferRecipe):
+        raise SceneError(f"{RECIPE} is no recipe of a transfer")
+    recipe = recipe.of_objects(len(data.open_dataset(parts["adaptation"])))
+    network, trained = training.transfer_start(recipe, start, partial=False, on_report=data.ignore)
+    maps = data.read_maps(recipe, parts["adaptation"], parts["validation"], None, start=trained)
+    recipe = recipe.model_copy(update={"held_out": len(maps.held_out.image)})
+    record = training.record_run(recipe, out, maps.rig, trained.runs, start)
+    fabric = training.open_fabric(recipe, accelerator=accelerator)
+    origin = training.digest_of(network, maps.digest)
+    run = training.TrainingRun(recipe, out, record, origin, watch=watch)
+    training.run_transfer(fabric, run, network, None, maps.training, maps.held_out)

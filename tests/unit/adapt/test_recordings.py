@@ -1,0 +1,118 @@
+"""Recordings of known objects as the second stage of an adaptation."""
+
+import json
+from collections.abc import Callable, Generator
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from made_adaptations import finish_network, job_in
+from nlos_models import load_reconstructor, load_record, silhouette_iou
+
+from nlos_cam.adapt import adapt, find_recordings
+from nlos_cam.adapt.recordings import MIN_OBJECTS, Transfer, parts_of
+from nlos_cam.bench import load_bench
+from nlos_cam.dataset import open_dataset
+from nlos_cam.evaluate import reconstruct_all
+from nlos_cam.files import cache_folder
+from nlos_cam.reconstruct import align_all
+
+RIG = '[rig]\nbase = "{base}"\n[rig.lidar]\ndistance_m = 0.205\n'
+OBJECT = '[motion]\nposes = 1\n[object]\ncategory = "{name}"\n'
+OBJECTS = "bowl", "cup", "rocket"
+
+
+def no_bench(_camera: object) -> Any:
+    raise AssertionError("nothing is opened to list recordings")
+
+
+def test_no_object_is_in_two_parts() -> None:
+    labels = [f"object-{number:02d}" for number in range(20)]
+
+    for count in range(MIN_OBJECTS, len(labels)):
+        parts = parts_of(labels[:count])
+        assert sorted(label for part in parts.values() for label in part) == labels[:count]
+        assert all(parts.values())
+
+
+def test_recordings_without_a_label_are_left_out(tmp_path: Path) -> None:
+    (tmp_path / "one.bag").touch()
+    said: list[str] = []
+
+    assert find_recordings(tmp_path, no_bench, said.append) is None
+    assert "one.bag" in said[0]
+    assert find_recordings(tmp_path / "none", no_bench, said.append) is None
+
+
+@pytest.mark.parametrize(("after", "kept"), [(0.51, True), (0.5, False), (0.4, False)])
+def test_only_a_better_fit_is_kept(after: float, kept: bool, tmp_path: Path) -> None:
+    figures = [{"silhouette_iou": {"value": value}} for value in (0.5, after)]
+
+    assert Transfer(tmp_path, {}, 3, *figures).is_better is kept
+
+
+def record_bench(run: Callable[..., Any]) -> Path:
+    """Measure a simulated bench, and record three objects on it."""
+    scenes = {
+        "bare": RIG.format(base="bare-wall"),
+        "empty": RIG.format(base="paper-rig"),
+        **{name: OBJECT.format(name=name) + RIG.format(base="paper-rig") for name in OBJECTS},
+    }
+    for name, text in scenes.items():
+        Path(f"{name}.toml").write_text(f'name = "{name}"\n{text}', encoding="utf-8")
+    run("calibrate", "--wall", "--camera", "sim:bare.toml", "--frames", "20", "--bench", "bench")
+    run("calibrate", "--occluder", "bench", "--camera", "sim:empty.toml", "--frames", "20")
+
+    folder = Path("bench/recordings")
+    folder.mkdir()
+    for name in OBJECTS:
+        take = "--frames", "10", "--label", name, "--out", folder / f"{name}.bag"
+        run("capture", f"sim:{name}.toml", "--bench", "bench", *take)
+        (folder / f"{name}.truth.toml").write_text(f'category = "{name}"\n', encoding="utf-8")
+    return Path("bench")
+
+
+def measure(weights: Path | None, folder: Path, objects: Path | None) -> None:
+    """Measure weights on recordings; nothing on test objects."""
+    iou = 0.0
+    if objects:
+        opened = open_dataset(objects)
+        network = load_reconstructor(weights, cache_folder() / "onnx")
+        maps = align_all(opened.arrays(), opened.benches(), network.record)
+        iou = float(np.mean(silhouette_iou(reconstruct_all(network, maps), maps.image)))
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / "figures.json").write_text(json.dumps({"silhouette_iou": {"value": iou}}))
+
+
+@contextmanager
+def until_judged(description: str) -> Generator[Callable[[int, int], None]]:
+    """Stop when the transfer is done: the rest has tests of its own."""
+    if "judged)" in description and "rendering" in description:
+        raise KeyboardInterrupt
+    yield lambda _done, _total: None
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(900)
+def test_recordings_in_a_bench_fit_the_network_to_them(run: Any, tmp_path: Path) -> None:
+    bench = load_bench(record_bench(run))
+    found = find_recordings(bench.folder / "recordings", bench.for_camera, print)
+    assert found is not None
+    job = job_in(tmp_path / "work", bench.rig)
+    finish_network(job.folder)
+
+    with pytest.raises(KeyboardInterrupt):
+        adapt(replace(job, recordings=found), 1.0, measure, tracked=until_judged)
+
+    (folder,) = (job.folder / "stage-1").glob("recordings-*")
+    fitted = load_record(folder / "network")
+    assert len(fitted.runs) > 1
+    assert [len(open_dataset(folder / "parts" / part)) for part in parts_of([])] == [8, 8, 1]
+    before, after = (
+        json.loads((folder / name / "figures.json").read_text())["silhouette_iou"]["value"]
+        for name in ("before", "after")
+    )
+    assert 0.2 < before != after > 0.2
