@@ -44,6 +44,9 @@ SAME_ECHO_M = 0.08
 BEYOND_CELLS = 3
 """Columns over which maps are extrapolated at most, towards the occluder, where intensities rise;
 farther ones, and rows outside the view, repeat the last."""
+SEEN_CELLS = 0.5
+"""Cells past the last one that sees the wall which still count as seen, where maps are not
+extrapolated."""
 HIDDEN_CELLS = 4
 """Columns that the bench's occluder may hide of those that the training rig sees."""
 BEAMS = 8
@@ -67,6 +70,8 @@ class Neighbors(NamedTuple):
     """(4, n): their bilinear shares, which extrapolate past the last cell that sees the wall."""
     nearest: Cells
     """(n,): the nearest cell that sees the wall."""
+    seen: Mask
+    """(n,): true where the bench itself sees the wall there, to half a cell."""
 
 
 class MapAlignment:
@@ -83,6 +88,7 @@ class MapAlignment:
         there = cast(trained, trained.pinhole.scaled(MAP_COLUMNS, MAP_ROWS))
         sees_wall = _cells_on_wall(bench)
         self._neighbors = _neighbors_of(bench, spot_m, sees_wall)
+        self._blank = trained.occluder is None
         self._keep_training_rig(trained, there)
         self._keep_bare_wall(here, bare)
 
@@ -166,6 +172,10 @@ class MapAlignment:
         light[self._cells] *= np.exp(ratio - gain)
         depth_m = depth_m.reshape(SHAPE)
         light = light.reshape(SHAPE)
+        if self._blank:
+            unseen = np.ones(depth_m.size, bool)
+            unseen[self._cells] = ~self._neighbors.seen
+            depth_m[unseen.reshape(SHAPE)] = np.nan
         valid = np.isfinite(depth_m)
         return LidarMaps(depth_m, np.where(valid, light, np.float32(0)), valid)
 
@@ -338,6 +348,7 @@ def _neighbors_of(bench: Rig, spot_m: Float64, sees_wall: Mask) -> Neighbors:
     first, last = _columns_on_wall(sees_wall)
 
     # Rows outside the view repeat its first or last row, so their share is 0 or 1.
+    in_view = (row > first_row - SEEN_CELLS) & (row < last_row + SEEN_CELLS)
     row = np.clip(row, first_row, last_row)
     top = np.clip(np.floor(row).astype(int), first_row, max(last_row - 1, first_row))
     bottom = np.minimum(top + 1, last_row)
@@ -346,6 +357,7 @@ def _neighbors_of(bench: Rig, spot_m: Float64, sees_wall: Mask) -> Neighbors:
     # follows the rise of intensity towards the occluder; far out they would only amplify noise.
     low = np.maximum(first[top], first[bottom])
     high = np.minimum(last[top], last[bottom])
+    in_view &= (column > low - SEEN_CELLS) & (column < high + SEEN_CELLS)
     column = np.clip(column, low - BEYOND_CELLS, high + BEYOND_CELLS)
     left = np.clip(np.floor(column).astype(int), low, np.maximum(high - 1, low))
     right = np.minimum(left + 1, MAP_COLUMNS - 1)
@@ -358,4 +370,4 @@ def _neighbors_of(bench: Rig, spot_m: Float64, sees_wall: Mask) -> Neighbors:
     around = np.stack([top, top, bottom, bottom]), np.stack([left, right, left, right])
     nearest_row = np.clip(np.rint(row).astype(int), first_row, last_row)
     nearest_column = np.clip(np.rint(column).astype(int), first[nearest_row], last[nearest_row])
-    return Neighbors(around, shares, (nearest_row, nearest_column))
+    return Neighbors(around, shares, (nearest_row, nearest_column), in_view)
