@@ -4,6 +4,7 @@ __all__ = [
     "GENERIC",
     "HELD_OUT_OUTLIERS",
     "HELD_OUT_SEED",
+    "OBJECTS_PER_RIG",
     "ORDINARY",
     "REQUIRED_ARRAYS",
     "SHAPE_OUTLIERS",
@@ -19,6 +20,7 @@ __all__ = [
     "Labelled",
     "Objects",
     "PackedMaps",
+    "RigRange",
     "RigSpread",
     "Stimulus",
     "Tracked",
@@ -74,6 +76,7 @@ from .packed import PackedMaps, open_packed_maps
 from .plan import DatasetPlan, Objects, RigSpread
 from .ray_backend import ray_farm
 from .reader import Dataset, open_dataset
+from .rig_range import OBJECTS_PER_RIG, RigRange
 from .samples import (
     Tracked,
     ignore,

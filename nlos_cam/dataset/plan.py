@@ -230,11 +230,17 @@ class DatasetPlan:
 
     def bench_of(self, seed: int) -> tuple[Rig, SensorModel]:
         """Return the rig and the sensor of one object."""
-        return self.spread.draw(self.known_rig(seed), self.sensor, seed // self.objects_per_rig)
+        return self.spread.draw(self.nominal_rig(seed), self.sensor, seed // self.objects_per_rig)
+
+    def nominal_rig(self, seed: int) -> Rig:
+        """Return the rig of one object without the spread."""
+        return self.rigs.draw(self.rig, seed // self.objects_per_rig) if self.rigs else self.rig
 
     def known_rig(self, seed: int) -> Rig:
-        """Return the rig of one object as its owner knows it, without the spread."""
-        return self.rigs.draw(self.rig, seed // self.objects_per_rig) if self.rigs else self.rig
+        """Return the rig that maps of one object are aligned by: its bench's, but of a plan of many
+        rigs without the spread, which is then what their records are off by.
+        """
+        return self.nominal_rig(seed) if self.rigs else self.bench_of(seed)[0]
 
     def differences(self, other: "DatasetPlan") -> list[str]:
         """Return the names of fields that differ; empty where both plans make the same bits."""

@@ -13,6 +13,8 @@ Metres = Annotated[float, Field(ge=-1, le=1)]
 Degrees = Annotated[float, Field(gt=-90, lt=90)]
 Range = tuple[Metres, Metres]
 """Lowest and highest value, drawn uniformly."""
+OBJECTS_PER_RIG = 25
+"""Objects that share a rig: what depends on the rig alone is then computed once."""
 MARGIN_M = 0.005
 """Distance that stays between the occluder's edge and the line of sight from the lidar to the box."""
 _STREAM = 4

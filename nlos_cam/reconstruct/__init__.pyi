@@ -1,5 +1,6 @@
 __all__ = [
     "UNEXPLAINED",
+    "WALL_GRID",
     "Arrival",
     "CalibratedRig",
     "Clock",
@@ -34,7 +35,9 @@ __all__ = [
     "estimate_uncertainty",
     "frame_issues",
     "frames_by_verdict",
+    "grid_of",
     "ignore",
+    "is_wall_grid",
     "iterate_batched",
     "iterate_results",
     "load_networks",
@@ -83,3 +86,4 @@ from .summaries import (
     frames_by_verdict,
 )
 from .verdict import FrameConditions, Verdict, VerdictFilter, frame_issues
+from .wall_grid import WALL_GRID, grid_of, is_wall_grid
