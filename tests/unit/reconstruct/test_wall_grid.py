@@ -58,7 +58,7 @@ def test_bare_walls_agree_where_both_benches_see(bench: Rig) -> None:
     off_m = np.abs(home.depth_m - there.depth_m)[both]
     assert np.quantile(off_m, 0.98) < 1e-3
     log_ratio = np.log(there.intensity[both] / home.intensity[both])
-    assert np.quantile(np.abs(log_ratio - np.median(log_ratio)), 0.95) < 0.06  # but for the gain
+    assert np.quantile(np.abs(log_ratio - np.median(log_ratio)), 0.95) < 0.08  # but for the gain
 
 
 @pytest.mark.parametrize("bench", [NEAR, TURNED], ids=["near", "turned"])
