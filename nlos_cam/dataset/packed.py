@@ -125,7 +125,7 @@ class PackedMaps:
             )
         self._color = color
         pixels = (OBJECT_PIXELS, OBJECT_PIXELS)
-        self._rows = {
+        self._rows: dict[str, tuple[int, ...]] = {
             MAPS: (channels_of(color=color), MAP_ROWS, MAP_COLUMNS),
             IMAGES: (3, *pixels) if color else pixels,
         }

@@ -3,7 +3,15 @@
 from typing import Annotated, Self
 
 import numpy as np
-from nlos_calibration import ObjectBox, Occluder, Record, Rig
+from nlos_calibration import (
+    DISTANCE_RANGE_M,
+    FACING_RANGE_DEG,
+    GAP_RANGE_M,
+    ObjectBox,
+    Occluder,
+    Record,
+    Rig,
+)
 from pydantic import Field, model_validator
 
 from nlos_cam.errors import SceneError
@@ -29,10 +37,10 @@ class RigRange(Record):
     known of a rig is a RigSpread.
     """
 
-    distance_m: Range = (0.15, 0.30)
-    yaw_deg: tuple[Degrees, Degrees] = (15.0, 75.0)
+    distance_m: Range = DISTANCE_RANGE_M
+    yaw_deg: tuple[Degrees, Degrees] = FACING_RANGE_DEG
     pitch_deg: tuple[Degrees, Degrees] = (-2.0, 2.0)
-    gap_m: Range = (0.05, 0.20)
+    gap_m: Range = GAP_RANGE_M
     """From the occluder's edge to the wall. A gap through which the lidar would see the box is not
     drawn."""
     along_m: Range = (-0.05, 0.05)
