@@ -76,7 +76,13 @@ def weights_serve(
 def _grid_serves(
     rig: Rig, trained: CheckpointRecord, expected_iou: float | None, bench: str
 ) -> WeightsVerdict:
-    """Return whether weights for any rig serve one: within what they were trained for."""
+    """Return whether weights on the wall grid serve a rig: their own bench, or one among all that
+    they were trained for.
+    """
+    own = Rig.model_validate(trained.rig) if trained.rig else None
+    if own and not rig_difference(rig, own):
+        sentence = "the weights serve this bench: they were trained for its rig"
+        return WeightsVerdict("trained for it", sentence, expected_iou)
     advice = f"`nlos-cam adapt {bench}` trains better ones for it"
     if expected_iou is not None:
         advice += f" (expected silhouette IoU {expected_iou:.2f})"
@@ -85,6 +91,11 @@ def _grid_serves(
             "its lidar sees too little of the wall past the occluder, or its box has another size"
         )
         return WeightsVerdict("not", f"the weights do not serve this bench: {reason}", expected_iou)
+
+    if own:
+        difference = "; ".join(rig_difference(rig, own))
+        sentence = f"the weights may not serve this bench: they are another's ({difference})"
+        return WeightsVerdict("far", f"{sentence}; {advice}", expected_iou)
 
     beyond = [
         f"{name} {value:g} {unit}, {low:g} to {high:g} trained"

@@ -68,3 +68,12 @@ def test_weights_for_any_rig_need_an_occluder() -> None:
     bare = posed().model_copy(update={"occluder": None})
 
     assert weights_serve(bare, trained(WALL_GRID)).service == "not"
+
+
+def test_weights_for_any_rig_that_went_on_for_one_know_it() -> None:
+    bench = posed(distance_m=0.25, yaw_deg=30.0)
+    adapted = trained(WALL_GRID)
+    adapted.rig = bench.model_dump(mode="json")
+
+    assert weights_serve(bench, adapted).service == "trained for it"
+    assert weights_serve(posed(yaw_deg=60.0), adapted).service == "far"
