@@ -51,6 +51,7 @@ from nlos_cam.files import (
     claim,
     write_checked,
 )
+from nlos_cam.reconstruct import can_align, grid_of
 from nlos_cam.render import SensorModel
 
 OBJECTS = "objects"
@@ -405,6 +406,14 @@ def _train_network(
     watched = _Watched(watch or training.unwatched)
     rig = job.rig.name, job.rig.checksum
     noise = None
+    frame = None if job.locked else grid_of(models.load_record(models.weights_folder(before)))
+    if frame and not can_align(job.rig, frame):
+        raise SceneError(
+            f"the start weights cannot see {job.rig.name}: its lidar sees too little of the wall past"
+            " the occluder, or its box has another size; choose others with --weights"
+        )
+    if frame:
+        rig = job.rig.name, frame.checksum
     if job.locked:
         noise = LockedNoise.of(job.rig, job.sensor, job.locked)
         rig = f"{job.rig.name} (locked differences)", ""
@@ -429,9 +438,11 @@ def _train_network(
             normal=start.normal,
             growth=shards_of,
             align=False,
+            frame=frame,
         )
         with store as source:
-            record = training.record_run(recipe, out, rig, runs, before)
+            bench = None if job.locked else job.rig.model_dump(mode="json")
+            record = training.record_run(recipe, out, rig, runs, before, bench=bench)
             fabric = training.open_fabric(recipe, accelerator=job.accelerator)
             origin = training.digest_of(start, source.digest)
             run = training.TrainingRun(recipe, out, record, origin, watch=watched)

@@ -102,6 +102,14 @@ ObjectsPerRig = Annotated[
         help="Objects that share a draw of the spreads; 50 render 4 times as fast.",
     ),
 ]
+AnyRig = Annotated[
+    bool,
+    typer.Option(
+        "--any-rig",
+        help="Draw a rig for every 25 objects, over all that the paper allows, for weights that"
+        " know them all.",
+    ),
+]
 Expected = Annotated[
     bool,
     typer.Option(
@@ -175,6 +183,7 @@ def build(
     rig_spread_mm: SpreadMm = 0.0,
     rig_spread_deg: SpreadDeg = 0.0,
     gain_spread_percent: GainSpread = 0.0,
+    any_rig: AnyRig = False,
     objects_per_rig: ObjectsPerRig = 1,
     accuracy: AccuracyName = "standard",
     expected_maps: Expected = False,
@@ -201,7 +210,8 @@ def build(
         spread=spread,
         textures=tuple(shapes.TEXTURES) if colour else (),
         expected=expected_maps,
-        objects_per_rig=objects_per_rig,
+        objects_per_rig=data.OBJECTS_PER_RIG if any_rig else objects_per_rig,
+        rigs=data.RigRange() if any_rig else None,
     )
     with common.progress(Rate()) as bar:
         checks, renders = (

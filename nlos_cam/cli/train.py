@@ -31,6 +31,7 @@ from nlos_cam.cli.common import (
 )
 from nlos_cam.errors import SceneError
 from nlos_cam.files import cache_folder
+from nlos_cam.reconstruct import grid_of
 
 if TYPE_CHECKING:
     from lightning_fabric import Fabric
@@ -338,13 +339,19 @@ def direct(
     with ExitStack() as held:
         with tracked("packing maps") as on_progress:
             normal = start.normal if start else None
+            frame = grid_of(models.load_record(models.weights_folder(weights))) if start else None
             packed = data_sets.open_packed_maps(
-                data, store or run.out / "packed", on_progress, normal, color=recipe.colour
+                data,
+                store or run.out / "packed",
+                on_progress,
+                normal,
+                color=recipe.colour,
+                frame=frame,
             )
             source = held.enter_context(packed)
         held_out = source.held_out(held_out_data, recipe.held_out)
         recipe = recipe.model_copy(update={"held_out": len(held_out.image)})
-        rig = source.plan.rig
+        rig = source.frame
         record = training.record_run(recipe, run.out, (rig.name, rig.checksum), runs, weights)
         job = run.training(
             recipe, record, training.digest_of(start, source.digest) if start else source.digest

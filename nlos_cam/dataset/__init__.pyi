@@ -5,6 +5,7 @@ __all__ = [
     "HELD_OUT_OUTLIERS",
     "HELD_OUT_SEED",
     "LOCKED",
+    "OBJECTS_PER_RIG",
     "ORDINARY",
     "RECORDED",
     "REQUIRED_ARRAYS",
@@ -15,6 +16,7 @@ __all__ = [
     "TRAINING_OUTLIERS",
     "TRAINING_SEED",
     "BareMaps",
+    "Benches",
     "BuildReport",
     "Dataset",
     "DatasetPlan",
@@ -23,6 +25,7 @@ __all__ = [
     "Objects",
     "OpenBench",
     "PackedMaps",
+    "RigRange",
     "RigSpread",
     "Stimulus",
     "Tracked",
@@ -93,6 +96,7 @@ from .packed import PackedMaps, open_packed_maps
 from .plan import DatasetPlan, Objects, RigSpread
 from .ray_backend import ray_farm
 from .reader import Dataset, open_dataset
+from .rig_range import OBJECTS_PER_RIG, RigRange
 from .samples import (
     Tracked,
     ignore,
@@ -117,6 +121,7 @@ from .uncertainty_samples import (
     EMPTY,
     GENERIC,
     ORDINARY,
+    Benches,
     check_uncertainty_data,
     quality_set,
     samples_on_disk,

@@ -15,22 +15,25 @@ from pathlib import Path
 import numpy as np
 import torch
 from nlos_calibration import Rig
+from nlos_calibration.arrays import Float16
 from nlos_models import CellNormal, channels_of
 from nlos_models.training import MapNoise, MapSet, NormalBatch, first_of
 
 from nlos_cam.dataset.plan import DatasetPlan, RigSpread
 from nlos_cam.dataset.reader import MAP_CHANNELS, open_dataset
+from nlos_cam.dataset.rig_range import RigRange
 from nlos_cam.dataset.samples import OnProgress, ignore
 from nlos_cam.dataset.shards import SHARD_PATTERN, Shard, read_arrays, read_head
 from nlos_cam.errors import RecordingError, SceneError
 from nlos_cam.files import atomic_file, claim, read_bounded
 from nlos_cam.files import read_arrays as read_npz
 from nlos_cam.frames import MAP_COLUMNS, MAP_ROWS, OBJECT_PIXELS
-from nlos_cam.reconstruct import align_samples
+from nlos_cam.reconstruct import WALL_GRID, align_samples, is_wall_grid
 
 INDEX = "index.json"
 MAPS = "maps.f16"
 IMAGES = "images.f16"
+COUNTS = "counts.f16"
 CELLS = "cells.npz"
 INDEX_LIMIT = 1 << 26
 """Bytes of the index: some hundred thousand shards."""
@@ -82,19 +85,21 @@ class PackedMaps:
         color: bool = False,
         growth: Growth | None = None,
         align: bool = True,
+        frame: Rig | None = None,
     ) -> None:
         """Open or make the store: use `open_packed_maps`, which holds its claim meanwhile.
 
         Maps are normalised as `normal` does, by default by their own statistics. `growth` decides
-        how many objects an epoch sees (default: all that are there). Without `align` a spread of
-        rigs stays in the maps, as a deviation that is not known. Raises
-        RecordingError for no dataset, SceneError for datasets of two rigs or a store that is
-        normalised otherwise.
+        how many objects an epoch sees (default: all that are there). They are aligned with the rig
+        `frame`, by default the plan's, and the wall grid for a plan of many rigs. Without `align`
+        a spread of rigs stays in the maps, as a deviation that is not known; so does the spread of
+        a plan of many rigs. Raises RecordingError for no dataset, SceneError for datasets of two
+        rigs or a store that is normalised otherwise.
         """
         opened = [open_dataset(folder, color=color, expected=True) for folder in datasets]
         self.plan: DatasetPlan = opened[0].plan
         """Of the first dataset."""
-        if others := [one.folder for one in opened if one.plan.rig != self.plan.rig]:
+        if others := [one.folder for one in opened if _rigs_of(one.plan) != _rigs_of(self.plan)]:
             raise SceneError(
                 f"{others[0]} and {datasets[0]} were rendered for different rigs: give datasets"
                 " of one"
@@ -110,6 +115,8 @@ class PackedMaps:
         self._store = store
         self._growth = growth
         self._align = align
+        self.frame: Rig = frame or (WALL_GRID if self.plan.rigs else self.plan.rig)
+        """Rig that the maps are aligned with."""
         self.normal = CellNormal(color=color)
         if color and self.plan.spread != RigSpread():
             raise SceneError(
@@ -118,17 +125,21 @@ class PackedMaps:
             )
         self._color = color
         pixels = (OBJECT_PIXELS, OBJECT_PIXELS)
-        self._rows = {
+        self._rows: dict[str, tuple[int, ...]] = {
             MAPS: (channels_of(color=color), MAP_ROWS, MAP_COLUMNS),
             IMAGES: (3, *pixels) if color else pixels,
         }
+        if self._stores_counts:
+            self._rows[COUNTS] = MAP_ROWS, MAP_COLUMNS
         self._index = _read_index(store)
         if not (store / CELLS).exists():
             if normal:
                 self.normal.load_state_dict(normal.state_dict())
             else:
                 some = [
-                    self._read(shard) for one in opened for shard in one.shards[:STATISTICS_SHARDS]
+                    self._read(shard)[0]
+                    for one in opened
+                    for shard in one.shards[:STATISTICS_SHARDS]
                 ]
                 depth_m, intensity = (
                     [getattr(one, name) for one in some] for name in MAP_CHANNELS[:2]
@@ -165,8 +176,13 @@ class PackedMaps:
     def digest(self) -> str:
         """SHA-256 of the rig and of the cells' statistics: a run with others cannot be resumed."""
         return hashlib.sha256(
-            self.plan.rig.checksum.encode() + (self._store / CELLS).read_bytes()
+            self.frame.checksum.encode() + (self._store / CELLS).read_bytes()
         ).hexdigest()
+
+    @property
+    def _stores_counts(self) -> bool:
+        """True where noise is drawn of light that alignment has scaled."""
+        return self.noise is not None and is_wall_grid(self.frame)
 
     def refresh(self, on_progress: OnProgress = ignore, shards: int | None = None) -> None:
         """Add the shards that appeared in the datasets since the last time, of the first `shards`
@@ -186,13 +202,16 @@ class PackedMaps:
             ) as file:  # rows after the last indexed one are left by an interruption
                 file.truncate(size)
         for number, path in enumerate(new, 1):
-            maps = self._read(read_head(path))
+            maps, log_counts = self._read(read_head(path))
             normal = (
                 self.normal(torch.from_numpy(maps.depth_m), torch.from_numpy(maps.intensity))
                 .half()
                 .numpy()
             )
-            for name, values in ((MAPS, normal), (IMAGES, maps.image.astype(np.float16))):
+            columns = {MAPS: normal, IMAGES: maps.image.astype(np.float16)}
+            if self._stores_counts:
+                columns[COUNTS] = log_counts
+            for name, values in columns.items():
                 with (self._store / name).open("ab") as file:
                     file.write(np.ascontiguousarray(values).tobytes())
             known[str(path.resolve())] = len(maps.image)
@@ -204,19 +223,19 @@ class PackedMaps:
         with atomic_file(self._store / INDEX) as part:
             part.write_text(json.dumps(self._index), encoding="utf-8")
 
-    def _read(self, shard: Shard) -> MapSet:
+    def _read(self, shard: Shard) -> tuple[MapSet, Float16]:
+        """Return a shard's samples as `frame` sees them, and log(1 + counts) of the bench."""
         maps = MapSet(*read_arrays(shard, MAP_CHANNELS))
-        if not self._align:
-            return maps
-        rigs = (shard.plan.bench_of(seed)[0] for seed in shard.seeds)
-        return _aligned(maps, rigs, self.plan.rig)
+        plan = shard.plan
+        rig_of = plan.known_rig if self._align else plan.nominal_rig
+        return _aligned(maps, map(rig_of, shard.seeds), self.frame)
 
     def held_out(self, folder: Path, count: int) -> MapSet:
-        """Return up to `count` samples of another dataset as the store has its own: as the plan's
-        rig sees them.
+        """Return up to `count` samples of another dataset as the store has its own: aligned with
+        the same rig.
         """
         opened = open_dataset(folder, color=self._color)
-        return _aligned(first_of(opened.arrays(), count), opened.benches(), self.plan.rig)
+        return _aligned(first_of(opened.arrays(), count), opened.benches(), self.frame)[0]
 
     def batches(self, batch: int, generator: torch.Generator) -> Iterator[NormalBatch]:
         """Yield one pass over the objects in random order, without the last, smaller batch.
@@ -245,10 +264,17 @@ class PackedMaps:
             yield NormalBatch(*(torch.from_numpy(file[rows]) for file in files))
 
 
-def _aligned(maps: MapSet, benches: Iterable[Rig], rig: Rig) -> MapSet:
-    """Return samples as a rig sees them, less those of benches that cannot be aligned with it."""
-    maps, seen = align_samples(maps, benches, rig)
-    return MapSet(*(getattr(maps, name)[seen] for name in MAP_CHANNELS))
+def _rigs_of(plan: DatasetPlan) -> tuple[Rig, RigRange | None]:
+    return plan.rig, plan.rigs
+
+
+def _aligned(maps: MapSet, benches: Iterable[Rig], rig: Rig) -> tuple[MapSet, Float16]:
+    """Return samples as a rig sees them, less those of benches that cannot be aligned with it, and
+    the log(1 + counts) (n, 64, 80) behind them.
+    """
+    maps, seen, counts = align_samples(maps, benches, rig)
+    kept = MapSet(*(getattr(maps, name)[seen] for name in MAP_CHANNELS))
+    return kept, np.log1p(counts[seen]).astype(np.float16)
 
 
 @contextmanager
@@ -261,6 +287,7 @@ def open_packed_maps(
     color: bool = False,
     growth: Growth | None = None,
     align: bool = True,
+    frame: Rig | None = None,
 ) -> Generator[PackedMaps]:
     """Open or make a store, and hold the right to write it until the end of the block.
 
@@ -269,5 +296,12 @@ def open_packed_maps(
     store.mkdir(parents=True, exist_ok=True)
     with claim(store, inside=True):
         yield PackedMaps(
-            datasets, store, on_progress, normal, color=color, growth=growth, align=align
+            datasets,
+            store,
+            on_progress,
+            normal,
+            color=color,
+            growth=growth,
+            align=align,
+            frame=frame,
         )

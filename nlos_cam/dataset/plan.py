@@ -13,6 +13,7 @@ from nlos_calibration import NotNegative, ObjectBox, Record, Rig
 from nlos_models import SIMULATION_ONLY
 from pydantic import TypeAdapter
 
+from nlos_cam.dataset.rig_range import RigRange
 from nlos_cam.errors import SceneError
 from nlos_cam.objects import CATEGORIES, find_category, object_box
 from nlos_cam.render import JUMP_M, RENDERING_VERSION, Material, Radiometry, SceneFile, SensorModel
@@ -170,6 +171,8 @@ class DatasetPlan:
     """Consecutive seeds that share a draw of the spread, so that the renderer keeps what depends on
     the rig alone.
     """
+    rigs: RigRange | None = None
+    """Rigs that objects are on in place of `rig`: known ones, from which `spread` is a deviation."""
 
     @classmethod
     def of_scene(cls, scene: SceneFile, first_seed: int, **others: Any) -> Self:
@@ -206,6 +209,8 @@ class DatasetPlan:
             del facts["expected"]  # likewise
         if self.objects_per_rig == 1:
             del facts["objects_per_rig"]
+        if self.rigs is None:
+            del facts["rigs"]
         if not self.objects.share_generic:
             del facts["objects"]["share_generic"]  # and checksums of older plans stay
         return json.dumps({**facts, "rig_checksum": self.rig.checksum})
@@ -225,7 +230,17 @@ class DatasetPlan:
 
     def bench_of(self, seed: int) -> tuple[Rig, SensorModel]:
         """Return the rig and the sensor of one object."""
-        return self.spread.draw(self.rig, self.sensor, seed // self.objects_per_rig)
+        return self.spread.draw(self.nominal_rig(seed), self.sensor, seed // self.objects_per_rig)
+
+    def nominal_rig(self, seed: int) -> Rig:
+        """Return the rig of one object without the spread."""
+        return self.rigs.draw(self.rig, seed // self.objects_per_rig) if self.rigs else self.rig
+
+    def known_rig(self, seed: int) -> Rig:
+        """Return the rig that maps of one object are aligned by: its bench's, but of a plan of many
+        rigs without the spread, which is then what their records are off by.
+        """
+        return self.nominal_rig(seed) if self.rigs else self.bench_of(seed)[0]
 
     def differences(self, other: "DatasetPlan") -> list[str]:
         """Return the names of fields that differ; empty where both plans make the same bits."""
@@ -237,13 +252,14 @@ class DatasetPlan:
     def check(self) -> None:
         """Raise SceneError where no sample can be made by this plan."""
         _ = self.box
-        self.spread.check(self.rig)
+        if self.rigs is None:
+            self.spread.check(self.rig)
         if self.textures and self.material.albedo != 1:
             raise SceneError(
                 "the scene's object has an albedo, but in color its albedo comes from textures:"
                 " remove it"
             )
-        if self.objects_per_rig > 1 and self.spread == RigSpread():
+        if self.objects_per_rig > 1 and self.spread == RigSpread() and not self.rigs:
             raise SceneError(
                 "without a spread all objects share one rig: drop --objects-per-rig, or give a"
                 " spread"

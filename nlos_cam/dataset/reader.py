@@ -44,8 +44,8 @@ class Dataset:
         return np.concatenate([read_arrays(shard, [name])[0] for shard in self.shards])
 
     def benches(self) -> Iterator[Rig]:
-        """Yield each sample's rig, in their order."""
-        return (self.plan.bench_of(seed)[0] for shard in self.shards for seed in shard.seeds)
+        """Yield each sample's rig as it is known, in their order."""
+        return (self.plan.known_rig(seed) for shard in self.shards for seed in shard.seeds)
 
     def arrays(self) -> MapSet:
         """Read all maps and images."""

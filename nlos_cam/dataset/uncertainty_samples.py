@@ -4,7 +4,9 @@ on disk.
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from hashlib import sha256
 from pathlib import Path
+from typing import Self
 from zlib import crc32
 
 import nlos_models as models
@@ -24,12 +26,15 @@ from numpy.typing import NDArray
 from nlos_cam.dataset import outliers
 from nlos_cam.dataset.build import HELD_OUT_SEED, TRAINING_SEED
 from nlos_cam.dataset.packed import map_noise
+from nlos_cam.dataset.plan import DatasetPlan
 from nlos_cam.dataset.reader import Dataset
+from nlos_cam.dataset.rig_range import RigRange
 from nlos_cam.dataset.samples import OnProgress, cached_sensor, ignore
 from nlos_cam.errors import SceneError
 from nlos_cam.files import atomic_file, read_arrays
 from nlos_cam.frames import OBJECT_PIXELS, LidarMaps, maps_from_frame
 from nlos_cam.objects import CATEGORIES, image_from_depth
+from nlos_cam.reconstruct import MapAlignment, align_all, grid_of
 from nlos_cam.render import Rendering, SensorModel, render
 
 EMPTY = "empty"
@@ -87,20 +92,50 @@ class UncertaintySamples:
         return UncertaintySamples(**{name: values[chosen] for name, values in vars(self).items()})
 
 
-def make_samples(
-    kind: str, seeds: Sequence[int], rig: Rig, sensor: SensorModel, accuracy: str = "draft"
-) -> UncertaintySamples:
+@dataclass(frozen=True)
+class Benches:
+    """Benches of samples: around one rig, or around rigs of a range, with their sensor."""
+
+    rig: Rig
+    sensor: SensorModel
+    rigs: RigRange | None = None
+    """Range of the benches' rigs in place of `rig`."""
+    frame: Rig | None = None
+    """Rig that maps are aligned with, by the benches' records; None where they stay as they are."""
+    accuracy: str = "draft"
+
+    @classmethod
+    def of(cls, plan: DatasetPlan, trained: models.CheckpointRecord) -> Self:
+        """Return the benches of a dataset, as weights see them."""
+        return cls(plan.rig, plan.sensor, plan.rigs, grid_of(trained), plan.accuracy)
+
+    @property
+    def name(self) -> str:
+        """Name that files of samples bear: it differs where the samples would."""
+        frame = self.frame.checksum if self.frame else ""
+        text = (self.rigs.model_dump_json() if self.rigs else "") + frame
+        beside = f"-{sha256(text.encode()).hexdigest()[:12]}" if text else ""
+        return f"v{VERSION}-{self.rig.checksum}-{self.accuracy}{beside}"
+
+    def record(self, seed: int) -> Rig:
+        """Return the rig of the bench of a seed, by its record."""
+        return self.rigs.draw(self.rig, seed // SEEDS_PER_BENCH) if self.rigs else self.rig
+
+
+def make_samples(kind: str, seeds: Sequence[int], benches: Benches) -> UncertaintySamples:
     """Return samples of one kind, the same bits for the same seeds; SEEDS_PER_BENCH consecutive
     ones share a bench.
 
-    Datasets hold ordinary objects on the given bench. Here these are on benches that deviate
+    Datasets hold ordinary objects on the given benches. Here these are on benches that deviate
     slightly, outliers on such benches and the given one in turn, and empty benches may deviate
     widely.
     """
-    stimuli = [_stimulus(kind, seed, rig, sensor) for seed in seeds]
-    renderings = [render(stimulus.scene, accuracy) for stimulus in stimuli]
+    stimuli = [_stimulus(kind, seed, benches.record(seed), benches.sensor) for seed in seeds]
+    renderings = [render(stimulus.scene, benches.accuracy) for stimulus in stimuli]
     noises = [_generator(kind, seed, 2) for seed in seeds]
     maps = [_sense(*each) for each in zip(stimuli, renderings, noises, strict=True)]
+    if benches.frame:
+        maps = _aligned(maps, [benches.record(seed) for seed in seeds], benches.frame)
     return UncertaintySamples(
         np.stack([one.depth_m for one in maps]),
         np.stack([one.intensity for one in maps]),
@@ -141,6 +176,16 @@ def _sense(
     return maps_from_frame(images.frame(stimulus.rig.pinhole))
 
 
+def _aligned(maps: Sequence[LidarMaps], records: Sequence[Rig], frame: Rig) -> list[LidarMaps]:
+    alignments = dict[str, MapAlignment]()
+    for record in records:
+        if record.checksum not in alignments:
+            alignments[record.checksum] = MapAlignment(record, frame)
+    return [
+        alignments[record.checksum].align(one) for one, record in zip(maps, records, strict=True)
+    ]
+
+
 def _truth(stimulus: outliers.Stimulus) -> NDArray[np.float16]:
     empty = np.full((OBJECT_PIXELS, OBJECT_PIXELS), np.nan, np.float32)
     depth_m = empty if stimulus.depth_m is None else stimulus.depth_m
@@ -157,17 +202,15 @@ def samples_on_disk(
     folder: Path,
     counts: Mapping[str, int],
     first_seed: int,
-    rig: Rig,
-    sensor: SensorModel,
+    benches: Benches,
     *,
-    accuracy: str = "draft",
     on_progress: OnProgress = ignore,
 ) -> UncertaintySamples:
     """Return `counts` samples of each kind; those missing in the folder are made and stored
     there.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    about = f"v{VERSION}-{rig.checksum}-{accuracy}"
+    about = benches.name
     done = 0
     total = sum(counts.values())
     parts = list[UncertaintySamples]()
@@ -176,7 +219,7 @@ def samples_on_disk(
         try:
             part = UncertaintySamples(**read_arrays(path))
         except (OSError, ValueError, TypeError):  # absent, or damaged: it is made again
-            part = make_samples(kind, seeds, rig, sensor, accuracy)
+            part = make_samples(kind, seeds, benches)
             with atomic_file(path) as unfinished, unfinished.open("wb") as file:
                 np.savez(file, **vars(part))
         parts.append(part)
@@ -258,12 +301,13 @@ def uncertainty_sets(
             folder,
             kinds,
             seed,
-            plan.rig,
-            plan.sensor,
-            accuracy=plan.accuracy,
+            Benches.of(plan, pipeline.record),
             on_progress=on_progress,
         )
-        sets.append(_uncertainty_set(pipeline, first_of(dataset.arrays(), objects), samples))
+        ordinary = first_of(dataset.arrays(), objects)
+        if grid_of(pipeline.record):
+            ordinary = align_all(ordinary, dataset.benches(), pipeline.record)
+        sets.append(_uncertainty_set(pipeline, ordinary, samples))
     return sets
 
 
@@ -279,10 +323,7 @@ def quality_set(
 
     Raises SceneError where weights and dataset do not fit together.
     """
-    if (
-        pipeline.record.input != "raw maps"
-        or dataset.plan.rig.checksum != pipeline.record.rig_checksum
-    ):
+    if pipeline.record.input != "raw maps" or not _fit(dataset.plan, pipeline.record):
         raise SceneError(
             "the quality model needs raw maps of the weights' own rig: use another --dataset or"
             " --weights"
@@ -293,10 +334,14 @@ def quality_set(
     done = 0
     kinds = dataset.column("category").astype(np.str_)[:objects]
     noise = map_noise(dataset.plan) if dataset.plan.expected else None
+    benches = dataset.benches()
     for expected in dataset.chunks():
         if done == len(kinds):
             break
         maps = noise.expose(expected, done) if noise else expected
+        if grid_of(pipeline.record):
+            its_benches = [next(benches) for _ in range(len(maps.image))]
+            maps = align_all(maps, its_benches, pipeline.record)
         for part in parts_of(np.arange(min(len(maps.image), len(kinds) - done))):
             depth_m = maps.depth_m[part]
             intensity = maps.intensity[part]
@@ -325,6 +370,11 @@ def shared_error_v(image: Float32, truth: Float32) -> Float32:
     return np.where(count > 0, total / np.maximum(count, 1), np.nan).astype(np.float32)
 
 
+def _fit(plan: DatasetPlan, trained: models.CheckpointRecord) -> bool:
+    """Return whether a dataset is of the weights' own rig, or the weights are for any."""
+    return bool(grid_of(trained)) or plan.rig.checksum == trained.rig_checksum
+
+
 def check_uncertainty_data(
     recipe: UncertaintyRecipe, pipeline: models.Reconstructor, training: Dataset, held_out: Dataset
 ) -> None:
@@ -334,7 +384,7 @@ def check_uncertainty_data(
             f"weights expect {pipeline.record.input}, but the uncertainty network needs raw maps:"
             " use others"
         )
-    if not training.plan.rig.checksum == held_out.plan.rig.checksum == pipeline.record.rig_checksum:
+    if not (_fit(training.plan, pipeline.record) and _fit(held_out.plan, pipeline.record)):
         raise SceneError(
             "--dataset, --held-out and --weights are not all of one rig: use others, or build the"
             " maps again"

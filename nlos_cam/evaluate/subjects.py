@@ -31,6 +31,7 @@ from nlos_cam.reconstruct import (
     VerdictFilter,
     align_all,
     estimate_uncertainty,
+    grid_of,
     rig_to_align_with,
     verdict_limits,
 )
@@ -175,9 +176,11 @@ class HeldOutObjects:
 
 
 def rig_of(record: CheckpointRecord) -> Rig:
-    """Return the rig that weights were trained for. Raises SceneError if it is neither packaged nor
-    a file here.
+    """Return the rig that weights were trained for; of weights for any rig, the paper's. Raises
+    SceneError if it is neither packaged nor a file here.
     """
+    if grid_of(record):
+        return rig_named("paper-rig")
     try:
         return rig_named(record.rig_name)
     except RecordFileError as error:

@@ -1,5 +1,6 @@
 __all__ = [
     "UNEXPLAINED",
+    "WALL_GRID",
     "Arrival",
     "CalibratedRig",
     "Clock",
@@ -27,6 +28,7 @@ __all__ = [
     "align_samples",
     "alignment",
     "build_pipeline",
+    "can_align",
     "check_intrinsics",
     "check_reconstruction",
     "compatibility_warnings",
@@ -35,7 +37,9 @@ __all__ = [
     "estimate_uncertainty",
     "frame_issues",
     "frames_by_verdict",
+    "grid_of",
     "ignore",
+    "is_wall_grid",
     "iterate_batched",
     "iterate_results",
     "load_networks",
@@ -49,7 +53,14 @@ __all__ = [
     "weights_serve",
 ]
 
-from .alignment import MapAlignment, align_all, align_samples, alignment, rig_to_align_with
+from .alignment import (
+    MapAlignment,
+    align_all,
+    align_samples,
+    alignment,
+    can_align,
+    rig_to_align_with,
+)
 from .bench import CalibratedRig, check_intrinsics, open_bench
 from .frame_reader import Arrival, FrameReader, ignore
 from .network import Clock, Quality, Reconstruction, estimate_uncertainty, reconstruct
@@ -84,3 +95,4 @@ from .summaries import (
     frames_by_verdict,
 )
 from .verdict import FrameConditions, FrozenFrames, Verdict, VerdictFilter, frame_issues
+from .wall_grid import WALL_GRID, grid_of, is_wall_grid

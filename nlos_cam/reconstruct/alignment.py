@@ -13,7 +13,8 @@ what the bench measured at the cell's point of the wall:
   three bounces they do not fall with d1.
 
 Cells that the bench does not see past its occluder are extrapolated from their neighbors, a few
-cells far.
+cells far. Networks for many rigs are trained on a grid on the wall in place of a rig's cells
+(`wall_grid`): there such cells have no return, and the rig's numbers stand in the last column.
 """
 
 from collections.abc import Iterable
@@ -29,6 +30,14 @@ from pydantic import ValidationError
 
 from nlos_cam.frames import MAP_COLUMNS, MAP_ROWS, LidarMaps
 from nlos_cam.objects import object_box
+from nlos_cam.reconstruct.wall_grid import (
+    NUMBERS_COLUMN,
+    WALL_GRID,
+    grid_of,
+    is_wall_grid,
+    numbers_column,
+    rig_numbers,
+)
 from nlos_cam.render import SensorModel, cast
 
 if TYPE_CHECKING:  # MapSet imports torch, which `live` does without
@@ -44,6 +53,11 @@ SAME_ECHO_M = 0.08
 BEYOND_CELLS = 3
 """Columns over which maps are extrapolated at most, towards the occluder, where intensities rise;
 farther ones, and rows outside the view, repeat the last."""
+SEEN_CELLS = 0.5
+"""Cells past the last one that sees the wall which still count as seen, where maps are not
+extrapolated."""
+MIN_SEEN = 0.04
+"""Share of the wall grid that a bench must see: less holds too little of a hidden object."""
 HIDDEN_CELLS = 4
 """Columns that the bench's occluder may hide of those that the training rig sees."""
 BEAMS = 8
@@ -67,6 +81,8 @@ class Neighbors(NamedTuple):
     """(4, n): their bilinear shares, which extrapolate past the last cell that sees the wall."""
     nearest: Cells
     """(n,): the nearest cell that sees the wall."""
+    seen: Mask
+    """(n,): true where the bench itself sees the wall there, to half a cell."""
 
 
 class MapAlignment:
@@ -83,7 +99,10 @@ class MapAlignment:
         there = cast(trained, trained.pinhole.scaled(MAP_COLUMNS, MAP_ROWS))
         sees_wall = _cells_on_wall(bench)
         self._neighbors = _neighbors_of(bench, spot_m, sees_wall)
+        self._numbers = numbers_column(rig_numbers(bench)) if is_wall_grid(trained) else None
         self._keep_training_rig(trained, there)
+        self._unseen = np.ones(SHAPE, bool)
+        self._unseen.flat[self._cells] = ~self._neighbors.seen
         self._keep_bare_wall(here, bare)
 
         # An echo over three bounces ends at the lidar too, from wherever on the wall that the
@@ -130,6 +149,14 @@ class MapAlignment:
         with np.errstate(divide="ignore"):
             self._log_light = np.log(light)
 
+    def counts_behind(self, maps: LidarMaps) -> Float32:
+        """Return the bench's own intensities (64, 80) behind the cells of `align`: they decide the
+        noise there.
+        """
+        counts = np.zeros(SHAPE, np.float32)
+        counts.flat[self._cells] = maps.intensity[self._neighbors.nearest]
+        return counts
+
     def align(self, maps: LidarMaps, beyond_wall_m: Float32 | None = None) -> LidarMaps:
         """Return maps of the bench as those of the training rig.
 
@@ -166,6 +193,10 @@ class MapAlignment:
         light[self._cells] *= np.exp(ratio - gain)
         depth_m = depth_m.reshape(SHAPE)
         light = light.reshape(SHAPE)
+        if self._numbers is not None:
+            depth_m[self._unseen] = np.nan
+            depth_m[:, NUMBERS_COLUMN] = self._numbers
+            light[:, NUMBERS_COLUMN] = 0.0
         valid = np.isfinite(depth_m)
         return LidarMaps(depth_m, np.where(valid, light, np.float32(0)), valid)
 
@@ -190,14 +221,17 @@ def align_all(maps: "MapSet", benches: Iterable[Rig], trained: CheckpointRecord)
     return align_samples(maps, benches, wanted)[0] if wanted else maps
 
 
-def align_samples(maps: "MapSet", benches: Iterable[Rig], wanted: Rig) -> tuple["MapSet", Mask]:
-    """Return samples, each of its own bench, as the rig `wanted` sees them, and a mask (n,) of
-    those that it can see.
+def align_samples(
+    maps: "MapSet", benches: Iterable[Rig], wanted: Rig
+) -> tuple["MapSet", Mask, Float32]:
+    """Return samples, each of its own bench, as the rig `wanted` sees them, a mask (n,) of those
+    that it can see, and the benches' own intensities (n, 64, 80) behind them.
 
     The others, of benches that cannot be aligned with it, stay as they are.
     """
     depth_m = maps.depth_m.copy()
     intensity = maps.intensity.copy()
+    counts = maps.intensity
     seen = np.ones(len(maps.image), bool)
     bench = wanted
     aligned: MapAlignment | None = None
@@ -210,10 +244,14 @@ def align_samples(maps: "MapSet", benches: Iterable[Rig], wanted: Rig) -> tuple[
             aligned = MapAlignment(bench, wanted) if possible and bench != wanted else None
         seen[n] = possible
         if aligned:
-            one = aligned.align(LidarMaps(depth_m[n], intensity[n], np.isfinite(depth_m[n])))
+            sensed = LidarMaps(depth_m[n], intensity[n], np.isfinite(depth_m[n]))
+            one = aligned.align(sensed)
+            if counts is maps.intensity:
+                counts = counts.copy()
+            counts[n] = aligned.counts_behind(sensed)
             depth_m[n] = one.depth_m
             intensity[n] = one.intensity
-    return replace(maps, depth_m=depth_m, intensity=intensity), seen
+    return replace(maps, depth_m=depth_m, intensity=intensity), seen, counts
 
 
 def rig_to_align_with(bench: Rig, trained: CheckpointRecord) -> Rig | None:
@@ -236,13 +274,17 @@ def can_align(bench: Rig, trained: Rig) -> bool:
         return False
     # The networks' image spans the box: in a box of another size every pixel would be elsewhere.
     apart_m = np.subtract(_size_m(bench.object_box), _size_m(trained.object_box))
-    return bool(np.abs(apart_m).max() <= SAME_BOX_M and _is_in_view(bench, trained))
+    if np.abs(apart_m).max() > SAME_BOX_M:
+        return False
+    return _sees_grid(bench) if is_wall_grid(trained) else _is_in_view(bench, trained)
 
 
 def training_rig(trained: CheckpointRecord) -> Rig | None:
     """Return the rig that weights were trained for; None where it is the rig of a file on another
     machine.
     """
+    if grid := grid_of(trained):
+        return grid
     try:
         known = trained.rig
         rig = load_rig(trained.rig_name) if known is None else Rig.model_validate(known)
@@ -265,6 +307,17 @@ def _is_in_view(bench: Rig, trained: Rig) -> bool:
     nearest_row = np.clip(np.rint(row).astype(int), top, bottom)
     hidden_cells = (column - last[nearest_row]).max()
     return bool(hidden_cells <= HIDDEN_CELLS)
+
+
+def _sees_grid(bench: Rig) -> bool:
+    """Return whether the bench sees some of the wall grid past its occluder."""
+    if bench.occluder is None:
+        return False
+    sees_wall = _cells_on_wall(bench)
+    if not sees_wall.any():
+        return False
+    _, _, spot_m = _spots_of(bench, WALL_GRID)
+    return bool(_neighbors_of(bench, spot_m, sees_wall).seen.mean() >= MIN_SEEN)
 
 
 def _rows_on_wall(sees_wall: Mask) -> tuple[int, int]:
@@ -338,6 +391,7 @@ def _neighbors_of(bench: Rig, spot_m: Float64, sees_wall: Mask) -> Neighbors:
     first, last = _columns_on_wall(sees_wall)
 
     # Rows outside the view repeat its first or last row, so their share is 0 or 1.
+    in_view = (row > first_row - SEEN_CELLS) & (row < last_row + SEEN_CELLS)
     row = np.clip(row, first_row, last_row)
     top = np.clip(np.floor(row).astype(int), first_row, max(last_row - 1, first_row))
     bottom = np.minimum(top + 1, last_row)
@@ -346,6 +400,7 @@ def _neighbors_of(bench: Rig, spot_m: Float64, sees_wall: Mask) -> Neighbors:
     # follows the rise of intensity towards the occluder; far out they would only amplify noise.
     low = np.maximum(first[top], first[bottom])
     high = np.minimum(last[top], last[bottom])
+    in_view &= (column > low - SEEN_CELLS) & (column < high + SEEN_CELLS)
     column = np.clip(column, low - BEYOND_CELLS, high + BEYOND_CELLS)
     left = np.clip(np.floor(column).astype(int), low, np.maximum(high - 1, low))
     right = np.minimum(left + 1, MAP_COLUMNS - 1)
@@ -358,4 +413,4 @@ def _neighbors_of(bench: Rig, spot_m: Float64, sees_wall: Mask) -> Neighbors:
     around = np.stack([top, top, bottom, bottom]), np.stack([left, right, left, right])
     nearest_row = np.clip(np.rint(row).astype(int), first_row, last_row)
     nearest_column = np.clip(np.rint(column).astype(int), first[nearest_row], last[nearest_row])
-    return Neighbors(around, shares, (nearest_row, nearest_column))
+    return Neighbors(around, shares, (nearest_row, nearest_column), in_view)

@@ -3,10 +3,11 @@
 from dataclasses import dataclass
 from typing import Literal
 
-from nlos_calibration import Rig, rig_difference
+from nlos_calibration import DISTANCE_RANGE_M, FACING_RANGE_DEG, Rig, rig_difference
 from nlos_models import CheckpointRecord
 
 from nlos_cam.reconstruct.alignment import rig_to_align_with, training_rig
+from nlos_cam.reconstruct.wall_grid import grid_of
 
 NEAR_M = 0.010
 NEAR_DEG = 2.0
@@ -43,6 +44,8 @@ def weights_serve(
     `expected_iou` is a forecast for weights trained for this rig, and `bench` the folder to train
     them in.
     """
+    if grid_of(trained):
+        return _grid_serves(rig, trained, expected_iou, bench)
     wanted = training_rig(trained)
     if trained.rig_checksum == rig.checksum or (wanted and not rig_difference(rig, wanted)):
         sentence = "the weights serve this bench: they were trained for its rig"
@@ -68,6 +71,46 @@ def weights_serve(
             outcome = "serve this bench, aligned with their rig, with larger errors"
     difference = "; ".join(rig_difference(rig, wanted))
     return WeightsVerdict(service, f"the weights {outcome} ({difference}); {advice}", expected_iou)
+
+
+def _grid_serves(
+    rig: Rig, trained: CheckpointRecord, expected_iou: float | None, bench: str
+) -> WeightsVerdict:
+    """Return whether weights on the wall grid serve a rig: their own bench, or one among all that
+    they were trained for.
+    """
+    own = Rig.model_validate(trained.rig) if trained.rig else None
+    if own and not rig_difference(rig, own):
+        sentence = "the weights serve this bench: they were trained for its rig"
+        return WeightsVerdict("trained for it", sentence, expected_iou)
+    advice = f"`nlos-cam adapt {bench}` trains better ones for it"
+    if expected_iou is not None:
+        advice += f" (expected silhouette IoU {expected_iou:.2f})"
+    if not rig_to_align_with(rig, trained):
+        reason = (
+            "its lidar sees too little of the wall past the occluder, or its box has another size"
+        )
+        return WeightsVerdict("not", f"the weights do not serve this bench: {reason}", expected_iou)
+
+    if own:
+        difference = "; ".join(rig_difference(rig, own))
+        sentence = f"the weights may not serve this bench: they are another's ({difference})"
+        return WeightsVerdict("far", f"{sentence}; {advice}", expected_iou)
+
+    beyond = [
+        f"{name} {value:g} {unit}, {low:g} to {high:g} trained"
+        for name, value, unit, (low, high) in (
+            ("distance", rig.lidar.distance_m, "m", DISTANCE_RANGE_M),
+            ("yaw", rig.lidar.yaw_deg, "degrees", FACING_RANGE_DEG),
+        )
+        if not low <= round(value, 3) <= high
+    ]
+    if beyond:
+        outside = "; ".join(beyond)
+        sentence = f"the weights may not serve this bench: it is beyond their rigs ({outside})"
+        return WeightsVerdict("far", f"{sentence}; {advice}", expected_iou)
+    sentence = f"the weights serve this bench as one of the many that they know; {advice}"
+    return WeightsVerdict("near", sentence, expected_iou)
 
 
 def _is_near(rig: Rig, wanted: Rig) -> bool:

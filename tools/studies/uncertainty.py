@@ -37,6 +37,7 @@ from nlos_cam.dataset import (
     SHAPE_OUTLIERS,
     TEST_SEED,
     TRAINING_OUTLIERS,
+    Benches,
     open_dataset,
     samples_on_disk,
 )
@@ -223,9 +224,7 @@ def study(
                 samples,
                 wanted,
                 TEST_SEED,
-                rig,
-                sensor,
-                accuracy="draft" if kind in FEWER else "standard",
+                Benches(rig, sensor, accuracy="draft" if kind in FEWER else "standard"),
                 on_progress=on_progress,
             )
         answers = [

@@ -6,15 +6,19 @@
     python tools/studies/weights.py rigs [--weights [NAME=]DIR ...]
         docs/figures/rig_map.json and docs/images/rig_map.png
 
+    python tools/studies/weights.py edge [--weights [NAME=]DIR ...]
+        docs/figures/edge.json
+
 `limits` evaluates with one thing removed or added at a time. `rigs` moves the lidar over the
 distances and angles of SI 1 and by what a bench built with a ruler is off, while occluder and
-object box stay, and resumes.
+object box stay, and resumes. `edge` measures what a record costs that is off by fractions of a
+millimetre, with either sign: one column of cells at the occluder's edge then sees the other thing.
 """
 
 import argparse
 import hashlib
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, astuple, dataclass
+from dataclasses import asdict, astuple, dataclass, replace
 from itertools import repeat
 from pathlib import Path
 from typing import Any
@@ -254,6 +258,8 @@ BENCHES = [
 """What a bench built with a ruler is off by; the last is that of examples/bench.toml."""
 
 
+OFFSETS_MM = 0.2, 0.5, 1.0, 2.0, 5.0
+OFFSETS_DEG = 0.1, 0.2, 0.5, 1.0
 OFF = Place(0.001, 0.2, 0.2, 0.001, 0.001)
 """Error of a bench's record."""
 
@@ -320,30 +326,45 @@ def cell(
     }
 
 
-def rigs(asked: argparse.Namespace) -> None:
-    """Map the figures of weights over the rigs of SI 1."""
-    folders: dict[str, Path | None] = harness.by_name(asked.weights) or {"shipped": None}
+def loaded(asked: argparse.Namespace) -> dict[str, Judged]:
+    """Return the asked weights by name, by default the shipped ones."""
     graphs = cache_folder() / "onnx"
-    weights = dict[str, Judged]()
-    for name, folder in folders.items():
-        weights[name] = (
+    return {
+        name: (
             load_reconstructor(folder, graphs),
             load_uncertainty_model(folder, graphs, quality=False),
         )
+        for name, folder in folders_of(asked).items()
+    }
+
+
+def folders_of(asked: argparse.Namespace) -> dict[str, Path | None]:
+    """Return the folders of the asked weights by name; None for the shipped ones."""
+    return harness.by_name(asked.weights) or {"shipped": None}
+
+
+def key_of(asked: argparse.Namespace) -> str:
+    """Return a checksum of the asked weights, by which finished parts are known again."""
+    files = [
+        file
+        for folder in folders_of(asked).values()
+        for file in sorted(weights_folder(folder).iterdir())
+    ]
+    content = b"".join(file.read_bytes() for file in files if file.is_file())
+    return hashlib.sha256(content).hexdigest()
+
+
+def rigs(asked: argparse.Namespace) -> None:
+    """Map the figures of weights over the rigs of SI 1."""
+    weights = loaded(asked)
     rig = load_rig(asked.rig)
     subjects = benchmark_objects(object_box(rig))
     places = [
         *(Place(distance_m, yaw_deg) for distance_m in DISTANCES_M for yaw_deg in ANGLES_DEG),
         *BENCHES,
     ]
-    files = [
-        file for folder in folders.values() for file in sorted(weights_folder(folder).iterdir())
-    ]
-    key = hashlib.sha256(
-        b"".join(file.read_bytes() for file in files if file.is_file())
-    ).hexdigest()
     measured = harness.collect(
-        "rigs", places, lambda place, _: cell(place, rig, subjects, weights), key=key
+        "rigs", places, lambda place, _: cell(place, rig, subjects, weights), key=key_of(asked)
     )
     cells = measured[: -len(BENCHES)]
     benches = measured[-len(BENCHES) :]
@@ -360,6 +381,40 @@ def rigs(asked: argparse.Namespace) -> None:
                 f"    {name}: IoU {iou:.3f}, RMSE {rmse_mm:.0f} mm, flagged"
                 f" {figures.get('outside')}"
             )
+
+
+def edge(asked: argparse.Namespace) -> None:
+    """Measure weights on benches that are a little off the record that their maps are aligned by."""
+    weights = loaded(asked)
+    rig = load_rig(asked.rig)
+    subjects = benchmark_objects(object_box(rig))
+    here = Place(rig.lidar.distance_m, rig.lidar.yaw_deg)
+    moves = [0.0, *(sign * off for off in OFFSETS_MM for sign in (1, -1))]
+    turns = [sign * off for off in OFFSETS_DEG for sign in (1, -1)]
+    places = [
+        *(replace(here, distance_m=here.distance_m + off / 1e3) for off in moves),
+        *(replace(here, yaw_deg=here.yaw_deg + off) for off in turns),
+    ]
+
+    def measured(place: Place, _: Any) -> dict[str, Any]:
+        bench = place.rig(rig)
+        truth = truth_of(subjects, object_box(bench))
+        maps = as_map_set(sense(echoes_of(subjects, bench, lambda *_: None), bench), truth)
+        found = dict[str, Any]()
+        for label, (network, _) in weights.items():
+            taken = network_input(maps, None, repeat(rig), network.record)
+            images = reconstruct_all(network, taken)
+            figures = plain(judge(images, truth, object_box(bench)))
+            found[label] = round(figures["silhouette_iou"]["value"], 4)
+        return {"silhouette_iou": found}
+
+    rows = harness.collect("edge", places, measured, key=key_of(asked))
+    harness.write("edge", {"objects": len(subjects), "rows": rows}, asked.out)
+    for row in rows:
+        off_mm = 1e3 * (row["distance_m"] - here.distance_m)
+        print(
+            f"{off_mm:+.1f} mm, {row['yaw_deg'] - here.yaw_deg:+.1f} degrees", row["silhouette_iou"]
+        )
 
 
 def draw_rigs(cells: Sequence[Mapping[str, Any]], rig: Rig) -> Figure:
@@ -418,17 +473,18 @@ def main() -> None:
     commands = parser.add_subparsers(required=True)
     parts = {
         work.__name__: commands.add_parser(work.__name__, help=work.__doc__)
-        for work in (limits, rigs)
+        for work in (limits, rigs, edge)
     }
-    for work in (limits, rigs):
+    for work in (limits, rigs, edge):
         parts[work.__name__].set_defaults(run=work)
         parts[work.__name__].add_argument(
             "--out", type=Path, help="folder of the results (default: docs)"
         )
     parts["limits"].add_argument("--weights", type=Path, default=shipped_folder("paper"))
     parts["limits"].add_argument("--frames", type=int, nargs="*", default=list(FRAMES))
-    parts["rigs"].add_argument("--weights", type=harness.named, action="append", default=[])
-    parts["rigs"].add_argument("--rig", default="paper-rig")
+    for name in ("rigs", "edge"):
+        parts[name].add_argument("--weights", type=harness.named, action="append", default=[])
+        parts[name].add_argument("--rig", default="paper-rig")
     asked = parser.parse_args()
     with harness.one_line_errors():
         asked.run(asked)

@@ -17,6 +17,8 @@ training adds.
 """
 ROUNDING_VARIANCE = 1 / 12
 """Of a pixel's whole counts, in counts squared."""
+SMALLEST_COUNTS = 0.5
+"""Divisor of the noise's share where the sensor counted less."""
 
 
 @dataclass(frozen=True)
@@ -91,13 +93,25 @@ class MapNoise:
         light = self.shot_variance * (counts + self.ambient_counts)
         return ((self.read_variance + light + ROUNDING_VARIANCE) / self.pixels).sqrt()
 
-    def add(self, counts: Tensor, generator: torch.Generator | None = None) -> Tensor:
-        """Return intensities with noise drawn for each, in counts, none below 0."""
+    def add(
+        self,
+        counts: Tensor,
+        generator: torch.Generator | None = None,
+        *,
+        behind: Tensor | None = None,
+    ) -> Tensor:
+        """Return intensities with noise drawn for each, in counts, none below 0.
+
+        Of intensities that are scaled, `behind` are those that the sensor counted, (n, 64, 80).
+        """
         deviates = torch.randn(
             counts.shape, generator=generator, device=counts.device, dtype=counts.dtype
         )
         # Normal, since a cell's mean over tens of pixels is nearly so; a count is not negative.
-        return (counts + self.deviation(counts) * deviates).clamp(min=0)
+        if behind is None:
+            return (counts + self.deviation(counts) * deviates).clamp(min=0)
+        share = self.deviation(behind) / behind.clamp(min=SMALLEST_COUNTS)
+        return (counts + counts * share[:, None] * deviates).clamp(min=0)
 
     def draw(self, depth_m: Tensor, intensity: Tensor, generator: torch.Generator) -> Tensor:
         """Return the intensities of expected maps with noise drawn; a cell without a return keeps

@@ -28,6 +28,9 @@ class NormalBatch(NamedTuple):
     """(b, 2, 64, 80), or in color (b, 4, 64, 80), float16."""
     image: Tensor
     """(b, 64, 64), or in color (b, 3, 64, 64), float16."""
+    log_counts: Tensor | None = None
+    """(b, 64, 80), float16: log(1 + intensity) on the bench itself, of maps that are aligned with
+    another rig; its light decides the noise. None where the maps' own does."""
 
 
 class NormalSource(Protocol):
@@ -77,7 +80,7 @@ def train_direct(
 
     def loss(batch: NormalBatch, _: float) -> Tensor:
         # Maps are rendered once, without noise; each step draws its own, so that none is learnt.
-        normal = _varied(recipe, network.normal, batch.normal.float(), source.noise)
+        normal = _varied(recipe, network.normal, batch, source.noise)
         return two_heads_error(
             logits(normal + recipe.noise * torch.randn_like(normal)), batch.image
         )
@@ -168,11 +171,12 @@ def transfer_direct(
 
 
 def _varied(
-    recipe: DirectRecipe, cells: CellNormal, normal: Tensor, noise: MapNoise | None
+    recipe: DirectRecipe, cells: CellNormal, batch: NormalBatch, noise: MapNoise | None
 ) -> Tensor:
-    """Return normalised maps (n, 2, 64, 80) with noise, and on walls and with range offsets as the
-    recipe has them.
+    """Return a batch's normalised maps (n, 2, 64, 80) with noise, and on walls and with range
+    offsets as the recipe has them.
     """
+    normal = batch.normal.float()
     reflectance = offset_m = None
     if recipe.wall_texture:
         # Every strength from none to the recipe's: a network must be right on a clean wall too.
@@ -183,7 +187,8 @@ def _varied(
     # Nothing to vary: the round trip through counts would only round.
     if noise is None and reflectance is None and offset_m is None:
         return normal
-    return vary(cells, normal, noise, reflectance, offset_m)
+    own = None if batch.log_counts is None else torch.expm1(batch.log_counts.float())
+    return vary(cells, normal, noise, reflectance, offset_m, own)
 
 
 def vary(
@@ -192,12 +197,14 @@ def vary(
     noise: MapNoise | None,
     log_reflectance: Tensor | None,
     offset_m: Tensor | None,
+    own_counts: Tensor | None = None,
 ) -> Tensor:
     """Return the maps (n, 2, 64, 80), normalised as `cells` does, as another bench or moment would
     give them.
 
     Noise is the sensor's, drawn for the intensity of expected maps; the logarithm of the wall's
     reflectance (n, 64, 80) adds to that of the light, and a range offset (n,) to all depths.
+    `own_counts` (n, 64, 80) are the intensities behind aligned maps.
     """
     depth = normal[:, :1]  # (n, 1, 64, 80)
     light = normal[:, 1:]  # (n, 1 or 3, 64, 80)
@@ -210,7 +217,7 @@ def vary(
     if log_reflectance is not None:
         counts = counts * log_reflectance.exp()[:, None]
     if noise is not None:
-        counts = noise.add(counts)
+        counts = noise.add(counts, behind=own_counts)
     if offset_m is not None:
         depth = depth + offset_m[:, None, None, None] / cells.spread[:1]
 

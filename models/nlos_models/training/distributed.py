@@ -140,10 +140,10 @@ def seed_of(*parts: int) -> int:
 
 
 def share_of(batch: Any, rank: int, world: int) -> Any:
-    """Return the share of a batch (a tensor, or a tuple of them) that belongs to process `rank` of
-    `world`.
+    """Return the share of a batch (a tensor, a tuple of them, or None) that belongs to process
+    `rank` of `world`.
     """
-    if world == 1:
+    if world == 1 or batch is None:
         return batch
     if isinstance(batch, Tensor):
         return batch[rank::world]

@@ -3,7 +3,7 @@ and saves.
 """
 
 import os
-from collections.abc import Callable, Generator, Iterable
+from collections.abc import Callable, Generator, Iterable, Mapping
 from contextlib import AbstractContextManager, ExitStack, contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -129,16 +129,26 @@ class TrainingRun(Generic[R]):
 
 
 def record_run(
-    recipe: Recipe, out: Path, rig: tuple[str, str], before: list[Recipe], *starts: Path | None
+    recipe: Recipe,
+    out: Path,
+    rig: tuple[str, str],
+    before: list[Recipe],
+    *starts: Path | None,
+    bench: Mapping[str, Any] | None = None,
 ) -> CheckpointRecord:
     """Return the record of the weights that a recipe makes after the runs `before`; `rig` is its
     (name, checksum).
+
+    `bench` are the fields of that rig where it is a measured one, which another machine does not
+    know by its name.
 
     Raises OutputExistsError where the run would write over a file, over a folder that it starts
     from, or over other weights.
     """
     # Before an hour of training, not after it: the same checks as at the end.
     record = CheckpointRecord.of([*before, recipe], rig, maps_of(recipe))
+    if bench is not None:
+        record = record.model_copy(update={"rig": dict(bench)})
     if os.path.lexists(out) and not out.is_dir():
         raise OutputExistsError(
             f"{out} is a file, but --out must be a directory: choose another --out"

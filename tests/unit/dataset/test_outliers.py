@@ -36,6 +36,7 @@ from nlos_cam.dataset.uncertainty_samples import (
     GENERIC,
     ORDINARY,
     SEEDS_PER_BENCH,
+    Benches,
     UncertaintySamples,
     _stimulus,
     make_samples,
@@ -45,6 +46,7 @@ from nlos_cam.render import SensorModel
 
 RIG = load_rig("paper-rig")
 SENSOR = SensorModel()
+BENCHES = Benches(RIG, SENSOR)
 BOX = object_box(RIG)
 PLAIN = Stimulus(RIG, SENSOR)
 SEEDS = range(6)
@@ -184,7 +186,7 @@ def test_empty_benches_are_plain_wide_or_without_occluder() -> None:
 @pytest.fixture(scope="module")
 def two_of() -> Callable[[str], UncertaintySamples]:
     """Two samples of a kind."""
-    return cache(lambda kind: make_samples(kind, range(2), RIG, SENSOR))
+    return cache(lambda kind: make_samples(kind, range(2), BENCHES))
 
 
 def test_sample_of_empty_bench_shows_nothing(two_of: Callable[[str], UncertaintySamples]) -> None:
@@ -205,7 +207,7 @@ def test_sample_shows_its_object(two_of: Callable[[str], UncertaintySamples], ki
 
 
 def test_sample_depends_on_its_seed_alone(two_of: Callable[[str], UncertaintySamples]) -> None:
-    alone = make_samples(ORDINARY, [1], RIG, SENSOR)
+    alone = make_samples(ORDINARY, [1], BENCHES)
 
     np.testing.assert_array_equal(alone.depth_m[0], two_of(ORDINARY).depth_m[1])
     np.testing.assert_array_equal(alone.intensity[0], two_of(ORDINARY).intensity[1])
@@ -259,7 +261,7 @@ def test_counts_follow_recipe_and_share_of_generic_shapes(share: float, kinds: i
 
 
 def test_generic_shape_repeats_by_seed_on_a_bench_slightly_off() -> None:
-    one, same = (make_samples(GENERIC, [SEEDS_PER_BENCH], RIG, SENSOR) for _ in range(2))
+    one, same = (make_samples(GENERIC, [SEEDS_PER_BENCH], BENCHES) for _ in range(2))
 
     np.testing.assert_array_equal(one.depth_m, same.depth_m)
     assert _stimulus(GENERIC, 0, RIG, SENSOR).rig != RIG
@@ -286,7 +288,7 @@ WITH_FAR = {EMPTY: 150, "far": 20}
 
 
 def _on_disk(folder: Path, counts: dict[str, int], **options: Any) -> UncertaintySamples:
-    return uncertainty_samples.samples_on_disk(folder, counts, 7, RIG, SENSOR, **options)
+    return uncertainty_samples.samples_on_disk(folder, counts, 7, BENCHES, **options)
 
 
 def test_samples_on_disk_makes_only_missing_samples(

@@ -101,7 +101,7 @@ class Source:
 
     def batches(self, batch: int, generator: torch.Generator) -> Iterable[NormalBatch]:
         for rows in torch.randperm(12, generator=generator).split(batch):
-            yield NormalBatch(*(values[rows] for values in self.batch))
+            yield NormalBatch(*(values[rows] for values in self.batch if values is not None))
 
 
 def _shaken() -> DirectNetwork:

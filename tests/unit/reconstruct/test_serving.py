@@ -6,7 +6,7 @@ from typing import Any
 import pytest
 from nlos_calibration import Rig, load_rig
 
-from nlos_cam.reconstruct import weights_serve
+from nlos_cam.reconstruct import WALL_GRID, weights_serve
 
 RIG = load_rig("paper-rig")
 
@@ -48,3 +48,32 @@ def test_weights_that_hold_their_rig_are_known_later() -> None:
 
     assert weights_serve(again, trained(bench, known=True)).service == "trained for it"
     assert weights_serve(again, trained(bench)).service == "not"
+
+
+def test_weights_for_any_rig_serve_one_in_their_range() -> None:
+    verdict = weights_serve(posed(distance_m=0.25, yaw_deg=30.0), trained(WALL_GRID))
+
+    assert verdict.serve
+    assert "adapt" in verdict.sentence
+
+
+def test_weights_for_any_rig_say_which_number_is_beyond() -> None:
+    verdict = weights_serve(posed(distance_m=0.34), trained(WALL_GRID))
+
+    assert verdict.service == "far"
+    assert "distance 0.34 m" in verdict.sentence
+
+
+def test_weights_for_any_rig_need_an_occluder() -> None:
+    bare = posed().model_copy(update={"occluder": None})
+
+    assert weights_serve(bare, trained(WALL_GRID)).service == "not"
+
+
+def test_weights_for_any_rig_that_went_on_for_one_know_it() -> None:
+    bench = posed(distance_m=0.25, yaw_deg=30.0)
+    adapted = trained(WALL_GRID)
+    adapted.rig = bench.model_dump(mode="json")
+
+    assert weights_serve(bench, adapted).service == "trained for it"
+    assert weights_serve(posed(yaw_deg=60.0), adapted).service == "far"
