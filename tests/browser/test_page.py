@@ -226,7 +226,7 @@ def test_no_text_lies_over_a_picture_however_many_warnings(
         assert page.page.evaluate(UNDER_TEXT) == []
 
 
-def test_color_bar_keeps_its_labels_apart_when_the_window_narrows(browser: Any) -> None:
+def test_color_bar_keeps_its_labels_apart_in_narrow_windows(browser: Any) -> None:
     with WebViewer(RIG) as viewer:
         viewer.show(full_moment(0))
         page = Page(browser, viewer.address or "").drawn()

@@ -4,7 +4,7 @@ other sites.
 `make docs` runs it. `--check` builds into a temporary folder: a gate of tools/checks/check.py.
 Addresses of other sites are checked for their form only, without a network. mkdocs.yml names this
 file as its hook. A line `<!-- run NAME -->` of a page becomes the code of examples/gallery/NAME.py,
-what it printed and the pictures it drew: the build runs it. A script with cells (`# %% Title`, then
+its output and its pictures: the build runs it. A script with cells (`# %% Title`, then
 comments) becomes a heading, text, code and output for each.
 """
 
@@ -169,8 +169,8 @@ def _paths(nav: str | Sequence[Any] | Mapping[str, Any]) -> Iterator[str]:
 
 
 def run_script(script: Path) -> tuple[str, dict[str, bytes]]:
-    """Run a script in an empty folder; return what it printed, with END_OF_CELL before each cell,
-    and its pictures by name.
+    """Run a script in an empty folder; return its output, with END_OF_CELL before each cell, and its
+    pictures by name.
 
     Raises CalledProcessError if it fails, TimeoutExpired if it takes longer than SCRIPT_TIMEOUT_S.
     """
@@ -233,7 +233,7 @@ def as_section(script: Path, output: str, pictures: Iterable[str]) -> str:
 
 
 def _block(code: str, output: str, pictures: Iterable[str]) -> str:
-    """Return code, what it printed and drew as Markdown."""
+    """Return code, output and pictures as Markdown."""
     drawn = "\n".join(f"![Drawn by this code: {name}](images/built/{name})" for name in pictures)
     printed = f"```text\n{output.strip()}\n```\n\n" if output.strip() else ""
     return f"```python\n{code}\n```\n\n{printed}{drawn}\n"

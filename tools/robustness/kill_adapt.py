@@ -76,7 +76,7 @@ def finish(folder: Path) -> float:
 
 
 def kill_once(folder: Path, after_s: float) -> str:
-    """Kill the command after some seconds, and return what it had begun last; empty where it was
+    """Kill the command after some seconds, and return the step that it had begun last; empty where it was
     done before.
     """
     process = started(folder)

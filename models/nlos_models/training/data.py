@@ -110,6 +110,8 @@ class MapNoise:
         # Normal, since a cell's mean over tens of pixels is nearly so; a count is not negative.
         if behind is None:
             return (counts + self.deviation(counts) * deviates).clamp(min=0)
+        # Alignment scales the light of a cell, and with it the noise: its share of the light stays
+        # what it was when the sensor counted it.
         share = self.deviation(behind) / behind.clamp(min=SMALLEST_COUNTS)
         return (counts + counts * share[:, None] * deviates).clamp(min=0)
 

@@ -187,6 +187,7 @@ def _varied(
     # Nothing to vary: the round trip through counts would only round.
     if noise is None and reflectance is None and offset_m is None:
         return normal
+    # The logarithm fits into float16 at any number of counts, which the counts do not.
     own = None if batch.log_counts is None else torch.expm1(batch.log_counts.float())
     return vary(cells, normal, noise, reflectance, offset_m, own)
 
