@@ -5,13 +5,13 @@ from __future__ import annotations
 import shlex
 from functools import cache
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
 from nlos_cam import adapt as adaptation
 from nlos_cam import bench as benches
-from nlos_cam import dataset, forecast, objects
+from nlos_cam import dataset, forecast, objects, render
 from nlos_cam import evaluate as evaluation
 from nlos_cam.cli import common
 from nlos_cam.cli.benches import bench_or_rig
@@ -19,8 +19,9 @@ from nlos_cam.cli.dataset import Backend, rendering_farm
 from nlos_cam.cli.train import watched_run
 from nlos_cam.errors import OutputExistsError
 from nlos_cam.files import checksums_of
-from nlos_cam.frames import LidarMaps
-from nlos_cam.render import Scene
+
+if TYPE_CHECKING:
+    from nlos_cam.frames import LidarMaps
 
 PAGE = "adapt.html"
 LOCKED_WORK = "locked"
@@ -250,7 +251,9 @@ def _locked_objects(
     differences: list[LidarMaps] = []
     with common.tracked("rendering test objects") as on_progress:
         for subject in subjects:
-            scene = Scene(job.rig, subject.depth_m, surface, locked.radiometry, pulse_ns=pulse_ns)
+            scene = render.Scene(
+                job.rig, subject.depth_m, surface, locked.radiometry, pulse_ns=pulse_ns
+            )
             differences.append(dataset.locked_difference(scene, job.sensor))
             on_progress(len(differences), len(subjects))
     maps = evaluation.as_map_set(differences, evaluation.truth_of(subjects, box))

@@ -128,11 +128,12 @@ def weights_verdict(
     return replace(served, sentence=f"{sentence})")
 
 
-def store_forecast(folder: Path, station: str = benches.MAIN) -> None:
+def store_forecast(folder: Path, station: str | None = None) -> None:
     """Forecast what a bench with an occluder shows, and enter it in its record: takes seconds.
 
     Raises RecordFileError.
     """
+    station = station or benches.MAIN
     bench = benches.load_bench(folder, station)
     if bench.measured.record.occluder is None or bench.rig.object_box is None:
         return

@@ -19,6 +19,7 @@ from nlos_models import training
 
 from nlos_cam import dataset as data_sets
 from nlos_cam import objects as shapes
+from nlos_cam import reconstruct
 from nlos_cam.cli.common import (
     PAPER_RIG,
     Json,
@@ -31,7 +32,6 @@ from nlos_cam.cli.common import (
 )
 from nlos_cam.errors import SceneError
 from nlos_cam.files import cache_folder
-from nlos_cam.reconstruct import grid_of
 
 if TYPE_CHECKING:
     from lightning_fabric import Fabric
@@ -339,7 +339,11 @@ def direct(
     with ExitStack() as held:
         with tracked("packing maps") as on_progress:
             normal = start.normal if start else None
-            frame = grid_of(models.load_record(models.weights_folder(weights))) if start else None
+            frame = (
+                reconstruct.grid_of(models.load_record(models.weights_folder(weights)))
+                if start
+                else None
+            )
             packed = data_sets.open_packed_maps(
                 data,
                 store or run.out / "packed",

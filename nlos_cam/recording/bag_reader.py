@@ -285,7 +285,10 @@ class BagReader:
         """Return the frames of a stream in their order, which is found once."""
         if stream not in self._ordered:
             entries = self.entries[f"{self.streams[stream].topic}/image/data"]
-            times_ns = corrected_times_ns(entries, self._stamp)
+            try:
+                times_ns = corrected_times_ns(entries, self._stamp)
+            except RecordingError:  # damaged further on: what comes before it can be played
+                times_ns = [entry.time_ns for entry in entries]
             pairs = sorted(zip(times_ns, entries, strict=True))
             self._ordered[stream] = [entry for _, entry in pairs]
             self._times_ns[stream] = [time_ns for time_ns, _ in pairs]

@@ -91,7 +91,7 @@ def test_build_options_set_plan_and_are_stored_as_command(tmp_path: Path, built:
         f"nlos-cam dataset build --out '{folder}' --count 4 --seed 7 "
     )
     assert " --without 'hat, boat' " in _command(folder)
-    assert _command(folder).endswith(" --workers 1")
+    assert _command(folder).endswith(" --workers 1 --backend cpu")
 
 
 def test_build_in_color_is_noted_as_simulation_only(tmp_path: Path, built: Run) -> None:

@@ -153,7 +153,6 @@ render cup --front-m 0.5 | 0.5 m
 render cup --max-error -1 | -1
 render cup --beams-per-cell 0 | 0
 render cup --out taken.npz | --overwrite
-render cup --out nowhere/maps.npz | nowhere
 render cup --out precious/thesis.txt/a.npz | precious
 board --out taken.pdf | --overwrite
 capture bag:none.bag --seconds 1 | recording

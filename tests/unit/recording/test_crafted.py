@@ -21,6 +21,7 @@ from nlos_cam.recording import (
     ExportOptions,
     ReplayCamera,
     export_recording,
+    open_recording,
     repair_recording,
 )
 from nlos_cam.recording.rosbag import MAGIC, pack_chunk_head, pack_file_header, pack_record
@@ -52,7 +53,7 @@ def crafted(noise_bags: dict[str, Path], tmp_path: Path) -> Callable[[Change], P
 
 def use(path: Path) -> None:
     out = path.parent / "export"
-    made = export_recording(BagReader(path), out, ExportOptions(points=True), stop=Event())
+    made = export_recording(open_recording(path), out, ExportOptions(points=True), stop=Event())
     if made.damage:
         raise RecordingError(made.damage)
     with ReplayCamera(path) as camera:
@@ -74,7 +75,7 @@ def line_of(act: Callable[[], object]) -> str:
 def assert_refused(path: Path, word: str) -> None:
     """The recording is refused in one line that holds the word; it is used, if there is none."""
     line = line_of(lambda: use(path))
-    assert (bool(line), word in line, "\n" in line) == (bool(word), True, False)
+    assert (bool(line), word in line, "\n" in line) == (bool(word), True, False), line[:300]
 
 
 def rename(bag: Bag, old: str, new: str) -> None:

@@ -115,7 +115,10 @@ class SdkPlayback:
         self.device = {
             name: playback.get_info(info) for name, info in infos if playback.supports(info)
         }
-        for profile in (profiles := sensor.get_stream_profiles()):
+        profiles = _pictures(sensor)
+        if not profiles:
+            return
+        for profile in profiles:
             stream = profile.stream_type().name
             self.profiles[stream] = profile.format().name, profile.fps(), intrinsics_of(profile)
             self.settings[stream] = read_settings(sensor)
@@ -140,6 +143,11 @@ class SdkPlayback:
         }
         self.metadata[sample.stream].append((frame.get_frame_timestamp_domain().name, values))
         self.samples[sample.stream].append(sample)
+
+
+def _pictures(sensor: Any) -> list[Any]:
+    """Return the profiles of a sensor that are pictures: an accelerometer has none."""
+    return [one for one in sensor.get_stream_profiles() if one.is_video_stream_profile()]
 
 
 @pytest.fixture(scope="module")
@@ -217,11 +225,7 @@ def test_lenses_and_poses_agree_with_librealsense(
 ) -> None:
     bag = BagReader(request.getfixturevalue(kind))
     sensors = load_sdk().context().load_device(str(bag.path)).as_playback().query_sensors()
-    cameras = {
-        profile.stream_type().name: profile
-        for one in sensors
-        for profile in one.get_stream_profiles()
-    }
+    cameras = {profile.stream_type().name: profile for one in sensors for profile in _pictures(one)}
     for stream, camera in cameras.items():
         theirs = camera.as_video_stream_profile().get_intrinsics()
         model, coefficients = bag.lens(stream)
