@@ -185,6 +185,32 @@ def test_drift_is_measured_in_tolerances(drift: Drift, tolerances: float) -> Non
     assert drift.tolerances(4.0) < tolerances
 
 
+@pytest.mark.parametrize(
+    ("change", "is_apart"),
+    [
+        ({}, False),
+        ({"distance_m": 0.0009}, False),
+        ({"distance_m": -0.0011}, True),
+        ({"yaw_deg": 0.19}, False),
+        ({"yaw_deg": 0.15, "pitch_deg": -0.15}, True),
+        ({"pitch_deg": -0.21}, True),
+        ({"range_m": 0.0, "uniform": True}, True),
+    ],
+)
+def test_drifts_apart_by_a_tolerance_or_in_kind(change: dict[str, float], is_apart: bool) -> None:
+    moved = replace(STILL, distance_m=0.004, yaw_deg=0.3, pitch_deg=0.2)
+    values = {name: getattr(moved, name) + value for name, value in change.items()}
+    other = replace(moved, **values)
+
+    assert moved.apart(other) == is_apart
+    assert other.apart(moved) == is_apart
+
+
+def test_ranges_apart_by_a_tolerance() -> None:
+    ranges = [replace(STILL, range_m=range_m, uniform=True) for range_m in (0.0, 0.0009, 0.0011)]
+    assert [ranges[0].apart(each) for each in ranges] == [False, False, True]
+
+
 def test_drift_text_holds_amounts_and_uncertainties() -> None:
     moved = str(
         replace(STILL, distance_m=0.0018, distance_std_m=0.0002, yaw_deg=-0.3, pitch_deg=0.4)

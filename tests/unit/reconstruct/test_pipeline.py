@@ -23,7 +23,7 @@ from fake_wall import (
 from nlos_calibration.errors import CalibrationError, RecordFileError
 from nlos_calibration.geometry import Intrinsics
 from nlos_calibration.rig import load_rig
-from small_frames import SheetNetwork, sheet_network
+from small_frames import NOTHING, SheetNetwork, sheet_network
 
 from nlos_cam.frames import LidarMaps, maps_from_frame
 from nlos_cam.reconstruct import (
@@ -46,9 +46,15 @@ from nlos_cam.reconstruct.bench import (
     open_bench,
     subtract_reference,
 )
-from nlos_cam.reconstruct.consistency import COMPLETE
+from nlos_cam.reconstruct.consistency import COMPLETE, MapFindings, MapProblem
+from nlos_cam.reconstruct.network import Quality, Uncertainty
 from nlos_cam.reconstruct.physics_check import PeriodicPhysicsCheck, PhysicsCheckResult
-from nlos_cam.reconstruct.pipeline import compatibility_warnings, frame_conditions
+from nlos_cam.reconstruct.pipeline import (
+    TRUSTED_MISSING,
+    compatibility_warnings,
+    frame_conditions,
+    with_quality_of_maps,
+)
 from nlos_cam.reconstruct.streaming import BATCH_FRAMES, MAX_BATCHES_AHEAD
 from nlos_cam.recording import with_telemetry
 
@@ -425,6 +431,7 @@ def test_record_that_calls_itself_doubtful_is_named(walled: CalibratedRig) -> No
     assert any("doubtful: measure again" in note for note in observe(bench).warnings)
 
 
+TRUSTED = Quality(iou=(0.7, 0.8, 0.9), good=0.95, error_m=0.01, trusted=True)
 UP = (0.0, 9.81, 0.0)
 OVER = (0.0, -9.81, 0.0)
 
@@ -469,3 +476,45 @@ def test_record_of_an_upside_down_camera_is_said_in_each_run(tmp_path: Path) -> 
 
     assert not seen.moved
     assert any("upside down" in each for each in seen.warnings)
+
+
+def judged(missing: float, *problems: MapProblem) -> Quality:
+    """Return the predicted quality of a trusted frame whose maps have these findings."""
+    estimate = Uncertainty(0.0, 0.0, NOTHING.depth_m, NOTHING.depth_m, TRUSTED)
+    conditions = FrameConditions(findings=MapFindings(missing, 0.0, problems))
+    found = with_quality_of_maps(replace(NOTHING, uncertainty=estimate), conditions).quality
+    assert found is not None
+    return found
+
+
+def test_quality_of_whole_maps_stays_as_predicted() -> None:
+    assert judged(0.0) == TRUSTED
+
+
+def test_quality_falls_with_each_missing_cell() -> None:
+    medians = [judged(missing).iou[1] for missing in (0.0, 0.001, 0.01, 0.1, 0.5, 1.0)]
+
+    assert medians == sorted(set(medians), reverse=True)
+    assert medians[-1] == 0.0
+
+
+@pytest.mark.parametrize(
+    ("missing", "trusted"), [(0.019, True), (TRUSTED_MISSING, False), (0.1, False)]
+)
+def test_frame_without_some_cells_is_not_trusted(missing: float, trusted: bool) -> None:
+    assert judged(missing).trusted == trusted
+
+
+@pytest.mark.parametrize("missing", [0.0, 0.001])
+def test_frame_of_impossible_maps_is_not_trusted(missing: float) -> None:
+    assert not judged(missing, MapProblem.TORN).trusted
+
+
+def test_reconstruction_without_uncertainty_has_no_quality() -> None:
+    assert NOTHING.with_quality(TRUSTED) is NOTHING
+
+
+def test_pipeline_averages_as_it_was_told() -> None:
+    pipeline = Pipeline(CalibratedRig(RIG), sheet_network)
+    pipeline.average = 3
+    assert pipeline.average == 3
