@@ -41,7 +41,6 @@ from nlos_cam.adapt.recordings import (
     parts_of,
     write_parts,
 )
-from nlos_cam.dataset import SHARD
 from nlos_cam.errors import OutputExistsError, SceneError
 from nlos_cam.files import (
     CHECKSUMS,
@@ -79,8 +78,6 @@ QUALITY_OBJECTS = 600, 6000
 """Objects that the quality model is fitted to, at least and at most."""
 QUALITY_PER_MINUTE = 60
 SHARE_GENERIC = 0.5
-OBJECTS_PER_RIG = 25
-"""Objects that share a draw of the bench's uncertainty, whose tables are then made once."""
 POLL_S = 0.2
 PACE_OBJECTS = 200
 PACE_STEPS = 6
@@ -247,7 +244,7 @@ def _data_plan(job: Adaptation, first_seed: int, *, expected: bool) -> data.Data
         objects=data.Objects(share_generic=SHARE_GENERIC),
         spread=job.spread if expected else data.RigSpread(),
         expected=expected,
-        objects_per_rig=OBJECTS_PER_RIG if expected else 1,
+        objects_per_rig=data.OBJECTS_PER_RIG if expected else 1,
     )
 
 
@@ -430,7 +427,7 @@ def _train_network(
         if noise:
             count = min(FIRST_OBJECTS, stage.objects)
             rendering.wait_for(count)
-            first = islice(data.open_dataset(job.folder / OBJECTS).chunks(), count // SHARD)
+            first = islice(data.open_dataset(job.folder / OBJECTS).chunks(), count // data.SHARD)
             recipe = noise.fitted(recipe, start.normal, list(first))
         store = data.open_packed_maps(
             [job.folder / OBJECTS],

@@ -210,7 +210,9 @@ def build(
         spread=spread,
         textures=tuple(shapes.TEXTURES) if colour else (),
         expected=expected_maps,
-        objects_per_rig=data.OBJECTS_PER_RIG if any_rig else objects_per_rig,
+        objects_per_rig=(
+            data.OBJECTS_PER_RIG if any_rig and objects_per_rig == 1 else objects_per_rig
+        ),
         rigs=data.RigRange() if any_rig else None,
     )
     with common.progress(Rate()) as bar:

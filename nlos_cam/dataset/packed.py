@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 import torch
 from nlos_calibration import Rig
-from nlos_calibration.arrays import Float16
+from nlos_calibration.arrays import Float32, Mask
 from nlos_models import CellNormal, channels_of
 from nlos_models.training import MapNoise, MapSet, NormalBatch, first_of
 
@@ -202,7 +202,7 @@ class PackedMaps:
             ) as file:  # rows after the last indexed one are left by an interruption
                 file.truncate(size)
         for number, path in enumerate(new, 1):
-            maps, log_counts = self._read(read_head(path))
+            maps, counts = self._read(read_head(path))
             normal = (
                 self.normal(torch.from_numpy(maps.depth_m), torch.from_numpy(maps.intensity))
                 .half()
@@ -210,7 +210,7 @@ class PackedMaps:
             )
             columns = {MAPS: normal, IMAGES: maps.image.astype(np.float16)}
             if self._stores_counts:
-                columns[COUNTS] = log_counts
+                columns[COUNTS] = np.log1p(counts).astype(np.float16)
             for name, values in columns.items():
                 with (self._store / name).open("ab") as file:
                     file.write(np.ascontiguousarray(values).tobytes())
@@ -223,19 +223,20 @@ class PackedMaps:
         with atomic_file(self._store / INDEX) as part:
             part.write_text(json.dumps(self._index), encoding="utf-8")
 
-    def _read(self, shard: Shard) -> tuple[MapSet, Float16]:
-        """Return a shard's samples as `frame` sees them, and log(1 + counts) of the bench."""
+    def _read(self, shard: Shard) -> tuple[MapSet, Float32]:
+        """Return a shard's samples as `frame` sees them, and the bench's own counts behind them."""
         maps = MapSet(*read_arrays(shard, MAP_CHANNELS))
         plan = shard.plan
         rig_of = plan.known_rig if self._align else plan.nominal_rig
-        return _aligned(maps, map(rig_of, shard.seeds), self.frame)
+        maps, _, counts = aligned_with(maps, map(rig_of, shard.seeds), self.frame)
+        return maps, counts
 
     def held_out(self, folder: Path, count: int) -> MapSet:
         """Return up to `count` samples of another dataset as the store has its own: aligned with
         the same rig.
         """
         opened = open_dataset(folder, color=self._color)
-        return _aligned(first_of(opened.arrays(), count), opened.benches(), self.frame)[0]
+        return aligned_with(first_of(opened.arrays(), count), opened.benches(), self.frame)[0]
 
     def batches(self, batch: int, generator: torch.Generator) -> Iterator[NormalBatch]:
         """Yield one pass over the objects in random order, without the last, smaller batch.
@@ -268,13 +269,13 @@ def _rigs_of(plan: DatasetPlan) -> tuple[Rig, RigRange | None]:
     return plan.rig, plan.rigs
 
 
-def _aligned(maps: MapSet, benches: Iterable[Rig], rig: Rig) -> tuple[MapSet, Float16]:
-    """Return samples as a rig sees them, less those of benches that cannot be aligned with it, and
-    the log(1 + counts) (n, 64, 80) behind them.
+def aligned_with(maps: MapSet, benches: Iterable[Rig], rig: Rig) -> tuple[MapSet, Mask, Float32]:
+    """Return samples as a rig sees them, less those of benches that cannot be aligned with it; the
+    mask of those that are left; and the benches' own intensities (n, 64, 80) behind them.
     """
     maps, seen, counts = align_samples(maps, benches, rig)
     kept = MapSet(*(getattr(maps, name)[seen] for name in MAP_CHANNELS))
-    return kept, np.log1p(counts[seen]).astype(np.float16)
+    return kept, seen, counts[seen]
 
 
 @contextmanager

@@ -85,11 +85,12 @@ def sense_object(
     """Return the maps of one rendered scene, by the sensor model and the reduction of live frames,
     or expected ones.
     """
-    echoes = render(scene, accuracy).multi
-    generator = (
-        None if expected else np.random.default_rng([seed, 1, exposure])
-    )  # numpy: [seed, 1, 0] is [seed, 1]
-    return sensor.maps(echoes, generator)
+    return sensor.maps(render(scene, accuracy).multi, _noise(seed, exposure, expected=expected))
+
+
+def _noise(seed: int, exposure: int = 0, *, expected: bool) -> np.random.Generator | None:
+    """Return the generator of an exposure's noise; None for expected maps."""
+    return None if expected else np.random.default_rng([seed, 1, exposure])
 
 
 def sense_color(
@@ -205,8 +206,7 @@ def _sense_in_batches(
     maps: list[LidarMaps] = []
     for rendering, (rig, model), seed in zip(rendered, rigs, seeds, strict=True):
         sensor = cached_sensor(rig, model, plan.radiometry)  # pyright: ignore[reportArgumentType]
-        generator = None if plan.expected else np.random.default_rng([seed, 1, 0])
-        maps.append(sensor.maps(rendering.multi, generator))
+        maps.append(sensor.maps(rendering.multi, _noise(seed, expected=plan.expected)))
     return maps
 
 

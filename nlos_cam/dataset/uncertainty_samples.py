@@ -5,6 +5,7 @@ on disk.
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from hashlib import sha256
+from itertools import islice
 from pathlib import Path
 from typing import Self
 from zlib import crc32
@@ -25,7 +26,7 @@ from numpy.typing import NDArray
 
 from nlos_cam.dataset import outliers
 from nlos_cam.dataset.build import HELD_OUT_SEED, TRAINING_SEED
-from nlos_cam.dataset.packed import map_noise
+from nlos_cam.dataset.packed import aligned_with, map_noise
 from nlos_cam.dataset.plan import DatasetPlan
 from nlos_cam.dataset.reader import Dataset
 from nlos_cam.dataset.rig_range import RigRange
@@ -34,7 +35,7 @@ from nlos_cam.errors import SceneError
 from nlos_cam.files import atomic_file, read_arrays
 from nlos_cam.frames import OBJECT_PIXELS, LidarMaps, maps_from_frame
 from nlos_cam.objects import CATEGORIES, image_from_depth
-from nlos_cam.reconstruct import MapAlignment, align_all, grid_of
+from nlos_cam.reconstruct import grid_of
 from nlos_cam.render import Rendering, SensorModel, render
 
 EMPTY = "empty"
@@ -134,9 +135,7 @@ def make_samples(kind: str, seeds: Sequence[int], benches: Benches) -> Uncertain
     renderings = [render(stimulus.scene, benches.accuracy) for stimulus in stimuli]
     noises = [_generator(kind, seed, 2) for seed in seeds]
     maps = [_sense(*each) for each in zip(stimuli, renderings, noises, strict=True)]
-    if benches.frame:
-        maps = _aligned(maps, [benches.record(seed) for seed in seeds], benches.frame)
-    return UncertaintySamples(
+    samples = UncertaintySamples(
         np.stack([one.depth_m for one in maps]),
         np.stack([one.intensity for one in maps]),
         np.stack([_truth(stimulus) for stimulus in stimuli]),
@@ -145,6 +144,11 @@ def make_samples(kind: str, seeds: Sequence[int], benches: Benches) -> Uncertain
         ),
         np.array([kind] * len(seeds)),
     )
+    if benches.frame is None:
+        return samples
+    sensed = MapSet(samples.depth_m, samples.intensity, samples.image)
+    aligned, seen, _ = aligned_with(sensed, map(benches.record, seeds), benches.frame)
+    return replace(samples.where(seen), depth_m=aligned.depth_m, intensity=aligned.intensity)
 
 
 def _generator(kind: str, seed: int, stream: int) -> np.random.Generator:
@@ -174,16 +178,6 @@ def _sense(
     sensor = cached_sensor(stimulus.rig, stimulus.sensor)  # pyright: ignore[reportArgumentType]
     images = sensor.expose(rendering.multi, noise)
     return maps_from_frame(images.frame(stimulus.rig.pinhole))
-
-
-def _aligned(maps: Sequence[LidarMaps], records: Sequence[Rig], frame: Rig) -> list[LidarMaps]:
-    alignments = dict[str, MapAlignment]()
-    for record in records:
-        if record.checksum not in alignments:
-            alignments[record.checksum] = MapAlignment(record, frame)
-    return [
-        alignments[record.checksum].align(one) for one, record in zip(maps, records, strict=True)
-    ]
 
 
 def _truth(stimulus: outliers.Stimulus) -> NDArray[np.float16]:
@@ -305,8 +299,8 @@ def uncertainty_sets(
             on_progress=on_progress,
         )
         ordinary = first_of(dataset.arrays(), objects)
-        if grid_of(pipeline.record):
-            ordinary = align_all(ordinary, dataset.benches(), pipeline.record)
+        if grid := grid_of(pipeline.record):
+            ordinary = aligned_with(ordinary, dataset.benches(), grid)[0]
         sets.append(_uncertainty_set(pipeline, ordinary, samples))
     return sets
 
@@ -334,15 +328,20 @@ def quality_set(
     done = 0
     kinds = dataset.column("category").astype(np.str_)[:objects]
     noise = map_noise(dataset.plan) if dataset.plan.expected else None
+    grid = grid_of(pipeline.record)
     benches = dataset.benches()
+    seen = np.ones(len(kinds), np.bool_)
     for expected in dataset.chunks():
         if done == len(kinds):
             break
         maps = noise.expose(expected, done) if noise else expected
-        if grid_of(pipeline.record):
-            its_benches = [next(benches) for _ in range(len(maps.image))]
-            maps = align_all(maps, its_benches, pipeline.record)
-        for part in parts_of(np.arange(min(len(maps.image), len(kinds) - done))):
+        end = min(done + len(maps.image), len(kinds))
+        count = end - done
+        if grid:
+            maps, kept, _ = aligned_with(first_of(maps, count), islice(benches, count), grid)
+            seen[done:end] = kept
+            count = len(maps.image)
+        for part in parts_of(np.arange(count)):
             depth_m = maps.depth_m[part]
             intensity = maps.intensity[part]
             truth = maps.image[part].astype(np.float32)
@@ -356,6 +355,8 @@ def quality_set(
             error_v.append(shared_error_v(image, truth))
             done += len(part)
             on_progress(done, len(kinds))
+        done = end
+    kinds = kinds[seen]
     found = np.concatenate(iou), np.concatenate(error_v)
     return QualitySet(np.concatenate(figures), *found, kinds, ~np.isin(kinds, tuple(CATEGORIES)))
 

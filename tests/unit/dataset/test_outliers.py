@@ -17,6 +17,7 @@ from nlos_cam.dataset import (
     HELD_OUT_OUTLIERS,
     SHAPE_OUTLIERS,
     TRAINING_OUTLIERS,
+    RigRange,
     Stimulus,
     outliers,
     uncertainty_samples,
@@ -42,6 +43,8 @@ from nlos_cam.dataset.uncertainty_samples import (
     make_samples,
 )
 from nlos_cam.objects import object_box
+from nlos_cam.reconstruct import WALL_GRID
+from nlos_cam.reconstruct.wall_grid import NUMBERS_COLUMN, numbers_column, rig_numbers
 from nlos_cam.render import SensorModel
 
 RIG = load_rig("paper-rig")
@@ -332,3 +335,12 @@ def test_samples_on_disk_makes_damaged_samples_again(
     _on_disk(tmp_path, WITH_FAR)
 
     assert pieces_made == [("far", 7)]
+
+
+def test_samples_of_many_rigs_hold_the_numbers_of_their_records() -> None:
+    benches = Benches(RIG, SENSOR, rigs=RigRange(), frame=WALL_GRID)
+    samples = make_samples(EMPTY, range(2), benches)
+
+    assert len(samples) == 2
+    wanted = numbers_column(rig_numbers(RigRange().draw(RIG, 0)))
+    np.testing.assert_array_equal(samples.depth_m[0, :, NUMBERS_COLUMN], wanted)
