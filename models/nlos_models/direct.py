@@ -114,6 +114,7 @@ class CellNormal(nn.Module):
     three intensities, and one gain.
     """
 
+    limit = CLIP
     median: Tensor
     spread: Tensor
 

@@ -3,7 +3,7 @@
 import platform
 from typing import TypedDict
 
-from nlos_models import checksum_of_watched, shipped_folder
+from nlos_models import SHIPPED, checksum_of_watched, shipped_folder
 
 from nlos_cam import __version__
 from nlos_cam.files import program_commit, program_name
@@ -26,7 +26,7 @@ class ProgramFacts(TypedDict):
 
 def describe_program() -> ProgramFacts:
     """Return the versions of the program, its renderer and its weights."""
-    weights = {name: checksum_of_watched(shipped_folder(name)) for name in ("direct", "paper")}
+    weights = {name: checksum_of_watched(shipped_folder(name)) for name in SHIPPED}
     return {
         "program": program_name(),
         "version": __version__,

@@ -44,15 +44,18 @@ def weights_serve(
     `expected_iou` is a forecast for weights trained for this rig, and `bench` the folder to train
     them in.
     """
-    if grid_of(trained):
-        return _grid_serves(rig, trained, expected_iou, bench)
     wanted = training_rig(trained)
+    if grid_of(trained):  # maps of any bench; the rig, if there is one, is where training went on
+        wanted = Rig.model_validate(trained.rig) if trained.rig else None
     if trained.rig_checksum == rig.checksum or (wanted and not rig_difference(rig, wanted)):
         sentence = "the weights serve this bench: they were trained for its rig"
         return WeightsVerdict("trained for it", sentence, expected_iou)
 
     forecast = "" if expected_iou is None else f" (expected silhouette IoU {expected_iou:.2f})"
     advice = f"`nlos-cam adapt {bench}` trains weights for it{forecast}"
+    if grid_of(trained):
+        service, sentence = _grid_serves(rig, trained, wanted)
+        return WeightsVerdict(service, f"{sentence}; {advice}", expected_iou)
     if wanted is None:
         sentence = (
             f"the networks were trained for another rig than {rig.name}: expect larger errors;"
@@ -60,7 +63,7 @@ def weights_serve(
         )
         return WeightsVerdict("not", sentence, expected_iou)
 
-    service: Service = "not"
+    service = "not"
     outcome = "do not serve this bench: its maps cannot be aligned with their rig's"
     if rig_to_align_with(rig, trained):
         service = "near" if _is_near(rig, wanted) else "far"
@@ -73,29 +76,18 @@ def weights_serve(
     return WeightsVerdict(service, f"the weights {outcome} ({difference}); {advice}", expected_iou)
 
 
-def _grid_serves(
-    rig: Rig, trained: CheckpointRecord, expected_iou: float | None, bench: str
-) -> WeightsVerdict:
-    """Return whether weights on the wall grid serve a rig: their own bench, or one among all that
-    they were trained for.
+def _grid_serves(rig: Rig, trained: CheckpointRecord, own: Rig | None) -> tuple[Service, str]:
+    """Return whether weights on the wall grid serve a rig, and the sentence that says so; `own` is
+    another rig that their training went on for, if there is one.
     """
-    own = Rig.model_validate(trained.rig) if trained.rig else None
-    if own and not rig_difference(rig, own):
-        sentence = "the weights serve this bench: they were trained for its rig"
-        return WeightsVerdict("trained for it", sentence, expected_iou)
-    advice = f"`nlos-cam adapt {bench}` trains better ones for it"
-    if expected_iou is not None:
-        advice += f" (expected silhouette IoU {expected_iou:.2f})"
     if not rig_to_align_with(rig, trained):
         reason = (
             "its lidar sees too little of the wall past the occluder, or its box has another size"
         )
-        return WeightsVerdict("not", f"the weights do not serve this bench: {reason}", expected_iou)
-
+        return "not", f"the weights do not serve this bench: {reason}"
     if own:
         difference = "; ".join(rig_difference(rig, own))
-        sentence = f"the weights may not serve this bench: they are another's ({difference})"
-        return WeightsVerdict("far", f"{sentence}; {advice}", expected_iou)
+        return "far", f"the weights may not serve this bench: they are another's ({difference})"
 
     beyond = [
         f"{name} {value:g} {unit}, {low:g} to {high:g} trained"
@@ -107,10 +99,8 @@ def _grid_serves(
     ]
     if beyond:
         outside = "; ".join(beyond)
-        sentence = f"the weights may not serve this bench: it is beyond their rigs ({outside})"
-        return WeightsVerdict("far", f"{sentence}; {advice}", expected_iou)
-    sentence = f"the weights serve this bench as one of the many that they know; {advice}"
-    return WeightsVerdict("near", sentence, expected_iou)
+        return "far", f"the weights may not serve this bench: it is beyond their rigs ({outside})"
+    return "near", "the weights serve this bench as one of the many that they know"
 
 
 def _is_near(rig: Rig, wanted: Rig) -> bool:

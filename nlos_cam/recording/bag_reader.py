@@ -397,33 +397,40 @@ class BagReader:
 
         Raises RecordingError where the recording holds no common reference of the two.
         """
-        mine = self._poses(self.streams[stream].topic)
-        others = self._poses(self.streams[other].topic)
-        if not (groups := mine.keys() & others.keys()):
+        pose = self._pose_between(self.streams[stream].topic, self.streams[other].topic)
+        if pose is None:
             raise RecordingError(f"{self.path} has no extrinsics between {stream} and {other}")
-        group = min(groups)
-        return mine[group] @ np.linalg.inv(others[group])
+        return pose
 
     def gravity(self) -> Gravity | None:
         """Return gravity in the frame of the depth stream by the first second of the accelerometer;
         None without one, where it was moved, and where its samples are damaged.
         """
-        topic = next(filter(ACCELERATION.fullmatch, self.entries), "")
-        entries = self.entries.get(topic, [])[:MAX_ACCELERATIONS]
+        topic = next(filter(ACCELERATION.fullmatch, self.entries), None)
+        if topic is None:
+            return None
+        entries = self.entries[topic][:MAX_ACCELERATIONS]
         first = [entry for entry in entries if entry.time_ns - entries[0].time_ns < 1e9]
         with suppress(RecordingError):
             samples = [
                 self.read(topic, entry, bag_messages.MOTION, bag_messages.acceleration_of)
                 for entry in first
             ]
-            mine = self._poses(self.streams["depth"].topic)
-            others = self._poses(topic.removesuffix("/imu/data"))
-            shared = mine.keys() & others.keys()
-            pose = np.eye(4)  # the SDK aligns the axes of both
-            for group in sorted(shared)[:1]:
-                pose = mine[group] @ np.linalg.inv(others[group])
+            sensor = topic.removesuffix("/imu/data")
+            pose = self._pose_between(self.streams["depth"].topic, sensor)
+            if pose is None:
+                pose = np.eye(4)  # the SDK aligns the axes of both
             return gravity_of(samples, pose[:3, :3])
         return None
+
+    def _pose_between(self, stream_topic: str, other_topic: str) -> Float64 | None:
+        """Return stream_from_other (4, 4); None where the two have no common reference."""
+        mine = self._poses(stream_topic)
+        others = self._poses(other_topic)
+        if not (groups := mine.keys() & others.keys()):
+            return None
+        group = min(groups)
+        return mine[group] @ np.linalg.inv(others[group])
 
     def _poses(self, stream_topic: str) -> dict[str, Float64]:
         """Return stream_from_reference (4, 4) by group; the streams of a group share one

@@ -275,8 +275,7 @@ def run_transfer(
             checkpoints.save_direct(folder, network, training.with_figures(after))
         else:
             checkpoints.save_pipeline(folder, network, training.with_figures(after), encoder)
-        if not training.record.color:
-            export_folder(folder)
+        _export(training, folder)
         if start and keeps_start:
             checkpoints.copy_weights(start, training.out)
         training.finish(after, PHASES)
@@ -322,12 +321,12 @@ def run_quality(weights: Path, samples: QualitySet) -> QualityRecord:
     return record
 
 
-def _export(training: TrainingRun[Any]) -> None:
-    """Write the graphs for inference without torch beside new weights; those of color stay in
-    torch.
+def _export(training: TrainingRun[Any], folder: Path | None = None) -> None:
+    """Write the graphs for inference without torch beside new weights, by default in `out`; those
+    of color stay in torch.
     """
     if not training.record.color:
-        export_folder(training.out)
+        export_folder(folder or training.out)
 
 
 def vae_start(
