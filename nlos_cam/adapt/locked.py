@@ -14,10 +14,8 @@ from nlos_cam import dataset as data
 from nlos_cam.adapt.plan import Locked
 from nlos_cam.render import SensorModel
 
-CLIP = 5.0
-"""Limit of a normalized cell in `CellNormal`, in spreads."""
 LARGEST_SHARE = 0.999
-"""Share of the differences that stay below that limit."""
+"""Share of the differences that stay below the limit of a normalized cell."""
 SEED = 0
 MIN_COUNTS = -0.9
 """Lowest difference of counts: its logarithm is taken of 1 more."""
@@ -61,7 +59,7 @@ class LockedNoise:
         std = np.where(np.isfinite(self.std) & (self.std > 0), self.std, np.inf)
         differences = np.concatenate([np.stack([one.depth_m, one.intensity], 1) for one in some])
         ratio = np.nan_to_num(np.abs(differences) / std)
-        multiple = max(1.0, float(np.quantile(ratio, LARGEST_SHARE)) / CLIP)
+        multiple = max(1.0, float(np.quantile(ratio, LARGEST_SHARE)) / normal.limit)
         spread = np.where(np.isfinite(std), multiple * std, 1.0)
         # mirrored maps need the same normalization
         spread = (spread + spread[:, ::-1]) / 2

@@ -13,6 +13,7 @@ import numpy as np
 from nlos_cam.adapt.plan import Plan
 from nlos_cam.adapt.recordings import Transfer
 from nlos_cam.adapt.run import AFTER, NETWORK, REPORT, AdaptResult
+from nlos_cam.bench import FORECAST_SCATTER_IOU
 from nlos_cam.report import (
     Banner,
     Commands,
@@ -28,8 +29,6 @@ from nlos_cam.report import (
 )
 
 FRAMES_PER_S = 30
-SCATTER_IOU = 0.06
-"""Largest error of a forecast (docs/predict.md)."""
 MIN_EPOCHS = 8
 """A slope over fewer epochs is that of the learning rate, not of the minutes."""
 LATE_SHARE = 0.5
@@ -87,7 +86,7 @@ def outlook(
     """Return in words what more minutes would bring, by the forecast where that is far, else by the
     learning curve.
     """
-    if expected_iou is not None and reached_iou < expected_iou - SCATTER_IOU:
+    if expected_iou is not None and reached_iou < expected_iou - FORECAST_SCATTER_IOU:
         return (
             f"The forecast for this bench is {expected_iou:.2f}: more minutes bring it nearer"
             f" ({plan.minutes:.0f} so far)."

@@ -1,4 +1,5 @@
 __all__ = [
+    "FORECAST_SCATTER_IOU",
     "MAIN",
     "MANIFEST",
     "TEST_IOU",
@@ -21,6 +22,7 @@ __all__ = [
 from .edit import TEST_IOU, BenchEdit, check_new, edit_bench, write_file, write_weights
 from .folder import Bench, load_bench
 from .record import (
+    FORECAST_SCATTER_IOU,
     MAIN,
     MANIFEST,
     WEIGHTS,

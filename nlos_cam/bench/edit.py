@@ -135,8 +135,8 @@ def write_weights(folder: Path, source: Path, test_iou: float | None = None) -> 
     they are.
 
     Weights of exactly this bench's rig get the rig into their record, by which `weights_serve`
-    knows them when the bench is measured again, and their IoU on the test objects on it. Raises CheckpointError for a folder without
-    weights, RecordFileError for a bench that is damaged.
+    knows them when the bench is measured again, and their IoU on the test objects on it. Raises
+    CheckpointError for a folder without weights, RecordFileError for a bench that is damaged.
     """
     record = load_record(source)
     rig = load_bench(folder).rig
@@ -146,9 +146,11 @@ def write_weights(folder: Path, source: Path, test_iou: float | None = None) -> 
         with atomic_directory(out) as part:
             for name in names:
                 shutil.copyfile(source / name, part / name)
-            if record.rig_checksum == rig.checksum:
+            fields = rig.model_dump(mode="json")
+            # weights on the wall grid name the grid, and hold the rig that they went on for
+            if record.rig_checksum == rig.checksum or record.rig == fields:
                 figures = record.figures | ({} if test_iou is None else {TEST_IOU: test_iou})
-                update = {"rig": rig.model_dump(mode="json"), "figures": figures}
+                update = {"rig": fields, "figures": figures}
                 known = record.model_copy(update=update)
                 write_checked(part, {RECORD: f"{known.model_dump_json(indent=2)}\n".encode()})
             elif not (part / CHECKSUMS).exists():

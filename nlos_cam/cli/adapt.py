@@ -7,6 +7,7 @@ from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
+import nlos_calibration as walls
 import typer
 
 from nlos_cam import adapt as adaptation
@@ -128,7 +129,7 @@ def adapt(
     except KeyboardInterrupt:
         common.exit_interrupted(f"what was made is kept in {work}; give the same command to go on")
     target = result.weights if locked else _install(result, folder, home / WEIGHTS)
-    expected_iou = None if locked else forecast.forecast(rig, quick=True).expected_iou
+    expected_iou = None if locked else _expected_iou(rig, folder)
     name = shlex.quote(bench)
     more = f"nlos-cam adapt {name} --minutes {2 * result.plan.minutes:g}"
     commands = [f"nlos-cam evaluate --rig {name} --weights {shlex.quote(str(target))}"]
@@ -139,6 +140,12 @@ def adapt(
         commands = [f"nlos-cam live --camera l515 --bench {name}"]
     more += f" --out {shlex.quote(str(out))}" if out else ""
     _report(result, target, [*commands, more], work / PAGE, expected_iou, as_json=json)
+
+
+def _expected_iou(rig: walls.Rig, folder: Path | None) -> float:
+    """Return the forecast for a rig: that which its bench holds already, else a new one."""
+    stored = benches.load_bench(folder).expected_iou if folder else None
+    return forecast.forecast(rig, quick=True).expected_iou if stored is None else stored
 
 
 def _recordings(folder: Path) -> adaptation.Recordings | None:

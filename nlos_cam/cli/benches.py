@@ -33,10 +33,6 @@ BenchOrRig = Annotated[
 ]
 
 
-POORER_IOU = 0.06
-"""Difference from the forecast that is more than its largest error (docs/predict.md)."""
-
-
 class Choice(NamedTuple):
     """Bench, wall record and weights that a command was given."""
 
@@ -121,7 +117,7 @@ def weights_verdict(
     if served.service != "trained for it" or reached_iou is None:
         return served
     sentence = f"{served.sentence} (silhouette IoU {reached_iou:.2f} on the test objects"
-    if expected_iou is not None and reached_iou < expected_iou - POORER_IOU:
+    if expected_iou is not None and reached_iou < expected_iou - benches.FORECAST_SCATTER_IOU:
         sentence += (
             f", where {expected_iou:.2f} is expected: more --minutes of `nlos-cam adapt {folder}`"
         )

@@ -12,6 +12,7 @@ from nlos_models import RECORD, load_record, shipped_folder, weights_folder
 
 from nlos_cam.bench import MANIFEST, ForecastRecord, edit_bench, load_bench, write_weights
 from nlos_cam.cli.benches import weights_verdict
+from nlos_cam.reconstruct import WALL_GRID
 
 Run = Callable[..., Any]
 FAR = """name = "far"
@@ -260,3 +261,15 @@ def test_bench_folder_given_as_a_record_names_its_option(run: Run, bench: Path) 
     answer = run("replay", "sample", "--wall", bench, "--out", "out", code=4)
 
     assert "--bench" in answer.err
+
+
+def test_own_weights_on_the_wall_grid_say_how_far_they_are(bench: Path) -> None:
+    own = Path("own")
+    own.mkdir()
+    record = load_record(shipped_folder())
+    rig = load_bench(bench).rig.model_dump(mode="json")
+    update = {"rig_checksum": WALL_GRID.checksum, "rig": rig}
+    (own / RECORD).write_text(record.model_copy(update=update).model_dump_json(), encoding="utf-8")
+    write_weights(bench, own, 0.45)
+
+    assert "0.45" in verdict(bench)
