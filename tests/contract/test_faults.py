@@ -11,15 +11,19 @@ from typing import Any
 import numpy as np
 import pytest
 from nlos_calibration import load_rig
+from rewritten_bags import rewrite
+from rosbags.rosbag1 import Reader
 from sdk_playback import SdkReplay
 from small_frames import ListViewer, sheet_network
 
 from nlos_cam.camera import Camera, Recording, SimulatedCamera, session
+from nlos_cam.camera.timestamps import WRAP_PERIOD_S
 from nlos_cam.errors import CameraLostError
 from nlos_cam.frames import Frame
 from nlos_cam.live import RunReport, run_live
 from nlos_cam.reconstruct import CalibratedRig, Pipeline, Verdict, frame_reader
 from nlos_cam.recording import ReplayCamera
+from nlos_cam.recording.bag_messages import stamp
 from nlos_cam.render import Fault, SensedImages
 from nlos_cam.view import Moment
 
@@ -255,12 +259,35 @@ def test_librealsense_replays_faults_as_they_were_captured(
     assert (replayed.incomplete, replayed.dropped) == (2, 3)
 
 
+def recorded_steadily(path: Path, target: Path) -> Path:
+    """Rewrite a recording as by a machine with nothing else to do: a frame comes when its device
+    says, and at once where it is late.
+    """
+    with Reader(path) as reader:
+        stamps = [
+            (time_ns, stamp(memoryview(raw))[1])
+            for found, time_ns, raw in reader.messages()
+            if found.topic.endswith("/image/data")
+        ]
+    steady_ns = dict[int, int]()
+    newest_s = stamps[0][1]
+    now_s = 0.0
+    for time_ns, stamp_s in stamps:
+        rise_s = (stamp_s - newest_s) % WRAP_PERIOD_S
+        if rise_s < 1.0:  # else it is late
+            now_s += rise_s
+            newest_s = stamp_s
+        steady_ns[time_ns] = round(now_s * 1e9) + len(steady_ns) + 1
+    return rewrite(path, target, lambda _, time_ns, raw: [(steady_ns.get(time_ns, time_ns), raw)])
+
+
 @pytest.mark.slow
 def test_replay_of_faults_puts_a_late_frame_in_its_place(
-    captured: tuple[Path, Camera, list[Frame]],
+    captured: tuple[Path, Camera, list[Frame]], tmp_path: Path
 ) -> None:
     path, _, seen = captured
-    with ReplayCamera(path) as replayed:
+    steady = recorded_steadily(path, tmp_path / "steady.bag")
+    with ReplayCamera(steady) as replayed:
         again = list(replayed)
     (late,) = [frame for frame in again if frame.frame_number == 9]
 
