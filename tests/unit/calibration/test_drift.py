@@ -4,9 +4,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from nlos_calibration import WINDOW_FRAMES, BareWall, Drift, DriftCheck, settings_changed
-from nlos_calibration.drift import MIN_FRAMES, MIN_PIXELS, TOLERANCE_C, DriftWindow
+from nlos_calibration.drift import (
+    BLIND_ENDS,
+    BLIND_FRAMES,
+    MIN_FRAMES,
+    MIN_PIXELS,
+    TOLERANCE_C,
+    DriftWindow,
+)
 from nlos_calibration.errors import CalibrationError
-from nlos_calibration.wall import measures_of, wall_depth
+from nlos_calibration.wall import TOLERANCE_DEG, TOLERANCE_M, measures_of, wall_depth
 from nlos_calibration.wall_tracker import (
     GRID,
     WallObservation,
@@ -26,6 +33,14 @@ SETTINGS = {
 }
 MANY = 10**6
 STILL = Drift(0.0, 0.0, 0.0, 0.0, 1e-5, 0.01, 0.01, 1e-5, uniform=False)
+
+
+@pytest.mark.parametrize("spread", ["distance_std_m", "yaw_std_deg", "pitch_std_deg"])
+def test_drift_is_sharp_to_half_a_tolerance_of_each_kind(spread: str) -> None:
+    tolerance = TOLERANCE_M if spread.endswith("_m") else TOLERANCE_DEG
+
+    assert replace(STILL, **{spread: 0.49 * tolerance}).sharp
+    assert not replace(STILL, **{spread: 0.51 * tolerance}).sharp
 
 
 @pytest.fixture
@@ -289,3 +304,32 @@ def test_wall_track_of_frames_without_the_wall_is_none(tilted: BareWall, value: 
     track = WallTrack(tilted, wall_from_lidar(TILTED))
     for _ in range(100):
         assert track.follow(np.full((SMALL.height, SMALL.width), value, np.float32)) is None
+
+
+def observed(check: DriftCheck, frame: np.ndarray, frames: int) -> DriftCheck:
+    for _ in range(frames):
+        check.observe(frame, {})
+    return check
+
+
+def test_a_wall_out_of_sight_for_ten_seconds_is_said_until_it_is_seen(tilted: BareWall) -> None:
+    check = DriftCheck(tilted, wall_from_lidar(TILTED))
+    hidden = np.full_like(tilted.depth_m, np.nan)
+
+    assert not observed(check, hidden, BLIND_FRAMES - 1).moved
+    assert observed(check, hidden, 1).moved
+    assert not observed(check, tilted.depth_m, WINDOW_FRAMES + BLIND_FRAMES // BLIND_ENDS).moved
+
+
+@pytest.mark.parametrize(("longer_m", "moved"), [(0.003, False), (0.008, True)])
+def test_small_drift_of_the_range_is_no_moved_lidar(
+    tilted: BareWall, longer_m: float, moved: bool
+) -> None:
+    check = DriftCheck(tilted, wall_from_lidar(TILTED))
+    length = np.linalg.norm(SMALL.rays(), axis=-1)
+    observed(check, (tilted.depth_m + longer_m / length).astype(np.float32), 2 * WINDOW_FRAMES)
+
+    assert check.drift is not None
+    assert check.drift.uniform
+    assert check.drift.range_m == pytest.approx(longer_m, rel=0.15)
+    assert check.moved == moved

@@ -246,3 +246,21 @@ def test_transient_has_legs_bins_and_extent(tmp_path: Path, whole: bool, legs: s
     assert facts["legs"].startswith(legs)
     assert "5 bins of 10 mm (33.36 ps)" in facts["path length"]
     assert facts["laser points"] == "2: x 0.100 to 0.300 m, y 0.000 m, z 0.000 m"
+
+
+def test_frames_of_arrays_last_from_the_first_to_the_last(tmp_path: Path) -> None:
+    path = tmp_path / "frames.npz"
+    depth_m = np.ones((3, 4, 5), np.float32)
+    np.savez(path, depth_m=depth_m, frame_number=[7, 8, 9], timestamp_s=[101.0, 101.5, 103.0])
+
+    facts = described(path).facts
+
+    assert facts["frames"] == "3, numbers 7 to 9"
+    assert facts["duration"] == "2.0 s"
+
+
+def test_text_in_place_of_a_table_is_said_to_be_binary(tmp_path: Path) -> None:
+    path = tmp_path / "rig.toml"
+    path.write_bytes(bytes(range(256)))
+
+    assert "binary file, not a .toml file" in describe(path).problem

@@ -145,3 +145,11 @@ def test_missing_cells_that_tell_nothing_are_no_problem() -> None:
     assert found.lost_share < 0.01
     assert found.missing_share == pytest.approx(0.1, abs=0.04)
     assert found.problems == ()
+
+
+def test_depth_before_the_wall_everywhere_is_off_the_record() -> None:
+    nearer = replace(MAPS[0], depth_m=MAPS[0].depth_m * np.float32(0.5))
+    farther = replace(MAPS[0], depth_m=MAPS[0].depth_m * np.float32(2.0))
+
+    assert CHECK.examine(nearer).problems == (MapProblem.OFF_RECORD,)
+    assert MapProblem.OFF_RECORD not in CHECK.examine(farther).problems

@@ -103,3 +103,21 @@ def test_rig_without_an_occluder_cannot_be_aligned() -> None:
     assert not can_align(bare, WALL_GRID)
     with pytest.raises(SceneError, match="no occluder"):
         rig_numbers(bare)
+
+
+def test_numbers_of_the_papers_rig_are_of_about_one_unit() -> None:
+    assert np.all(np.abs(rig_numbers(HOME)) <= 1.5)
+
+
+@pytest.mark.parametrize(
+    ("place", "change"),
+    [(0, {"distance_m": 0.01}), (1, {"yaw_deg": 4.0}), (5, {"pitch_deg": 0.4})],
+    ids=["distance", "yaw", "pitch"],
+)
+def test_a_number_follows_its_own_length_or_angle(place: int, change: dict[str, float]) -> None:
+    (name, by) = next(iter(change.items()))
+    moved = rig(**{name: getattr(HOME.lidar, name) + by})
+    rise = rig_numbers(moved) - rig_numbers(HOME)
+
+    assert rise[place] == pytest.approx(0.2, rel=1e-3)
+    assert np.delete(rise, place) == pytest.approx(np.zeros(6), abs=1e-6)
