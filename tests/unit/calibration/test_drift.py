@@ -312,7 +312,7 @@ def observed(check: DriftCheck, frame: np.ndarray, frames: int) -> DriftCheck:
     return check
 
 
-def test_a_wall_out_of_sight_for_ten_seconds_is_said_until_it_is_seen(tilted: BareWall) -> None:
+def test_a_wall_hidden_for_ten_seconds_is_said_until_seen(tilted: BareWall) -> None:
     check = DriftCheck(tilted, wall_from_lidar(TILTED))
     hidden = np.full_like(tilted.depth_m, np.nan)
 
