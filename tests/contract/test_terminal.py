@@ -18,7 +18,8 @@ pytestmark = [
     pytest.mark.timeout(600),
 ]
 IN_TERMINAL = """
-import fcntl, termios
+import fcntl, signal, termios
+signal.signal(signal.SIGHUP, signal.SIG_DFL)  # ignored under nohup
 fcntl.ioctl(0, termios.TIOCSCTTY, 0)
 from nlos_cam.cli import run
 run()

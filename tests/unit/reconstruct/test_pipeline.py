@@ -55,7 +55,7 @@ from nlos_cam.reconstruct.pipeline import (
     frame_conditions,
     with_quality_of_maps,
 )
-from nlos_cam.reconstruct.streaming import BATCH_FRAMES, MAX_BATCHES_AHEAD
+from nlos_cam.reconstruct.streaming import BATCH_FRAMES, MAX_BATCHES_AHEAD, warm_up
 from nlos_cam.recording import with_telemetry
 
 
@@ -518,3 +518,42 @@ def test_pipeline_averages_as_it_was_told() -> None:
     pipeline = Pipeline(CalibratedRig(RIG), sheet_network)
     pipeline.average = 3
     assert pipeline.average == 3
+
+
+def test_result_says_what_its_parts_hold() -> None:
+    (step,) = all_steps(
+        Pipeline(CalibratedRig(RIG), sheet_network, uncertainty_model=FakeUncertainty()),
+        WallCamera(1),
+    )
+    parts = step.reconstruction
+
+    assert step.depth_m is parts.depth_m
+    assert step.uncertainty_m is parts.uncertainty_m
+    np.testing.assert_array_equal(step.points_m, parts.points_m)
+    np.testing.assert_array_equal(step.to_mesh().vertices_m, parts.to_mesh().vertices_m)
+    assert (step.quality, step.truth_depth_m) == (parts.quality, step.frame.truth_depth_m)
+    assert (step.frame_number, step.timestamp_s) == (0, step.frame.timestamp_s)
+    assert repr(step).startswith(f"<FrameResult: frame 0, {step.verdict or 'no verdict'}")
+
+
+@pytest.mark.parametrize("uncertainty", [None, FakeUncertainty()], ids=["plain", "uncertain"])
+def test_picture_of_a_result_spans_its_box(uncertainty: FakeUncertainty | None) -> None:
+    (step,) = all_steps(
+        Pipeline(CalibratedRig(RIG), sheet_network, uncertainty_model=uncertainty), WallCamera(1)
+    )
+    box = step.reconstruction.box
+    maps = [axis for axis in step.plot().axes if axis.get_xlabel() == "wall x (cm)"]
+
+    assert len(maps) == (1 if uncertainty is None else 2)
+    for axis in maps:
+        assert axis.get_xlim() == pytest.approx((100 * box.x_min_m, 100 * box.x_max_m))
+        assert axis.get_ylim() == pytest.approx((100 * box.y_min_m, 100 * box.y_max_m))
+
+
+def test_warming_up_reconstructs_once_and_enters_no_camera() -> None:
+    noting = SheetNetwork()
+    camera = WallCamera(1)
+    warm_up(camera, Pipeline(CalibratedRig(RIG), noting))
+
+    assert len(noting.given) == 1
+    assert camera.asked == 0
