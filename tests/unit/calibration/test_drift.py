@@ -35,14 +35,6 @@ MANY = 10**6
 STILL = Drift(0.0, 0.0, 0.0, 0.0, 1e-5, 0.01, 0.01, 1e-5, uniform=False)
 
 
-@pytest.mark.parametrize("spread", ["distance_std_m", "yaw_std_deg", "pitch_std_deg"])
-def test_drift_is_sharp_to_half_a_tolerance_of_each_kind(spread: str) -> None:
-    tolerance = TOLERANCE_M if spread.endswith("_m") else TOLERANCE_DEG
-
-    assert replace(STILL, **{spread: 0.49 * tolerance}).sharp
-    assert not replace(STILL, **{spread: 0.51 * tolerance}).sharp
-
-
 @pytest.fixture
 def wall() -> BareWall:
     return reference_of_wall(
@@ -58,6 +50,12 @@ def wall() -> BareWall:
 @pytest.fixture
 def check(wall: BareWall) -> DriftCheck:
     return DriftCheck(wall, wall_from_lidar(POSE))
+
+
+def observed(check: DriftCheck, frame: np.ndarray, frames: int) -> DriftCheck:
+    for _ in range(frames):
+        check.observe(frame, {})
+    return check
 
 
 @pytest.mark.parametrize(
@@ -146,8 +144,7 @@ def test_drift_check_warns_of_too_few_good_pixels(wall: BareWall, left: int) -> 
     inliers = np.zeros(wall.depth_m.shape, np.bool_)
     inliers.flat[np.flatnonzero(wall.inliers)[:left]] = True
     check = DriftCheck(replace(wall, inliers=inliers), wall_from_lidar(POSE))
-    for _ in range(40):
-        check.observe(wall.depth_m, {})
+    observed(check, wall.depth_m, 40)
     (line,) = check.warnings
 
     assert str(MIN_PIXELS) in line
@@ -224,6 +221,14 @@ def test_drifts_apart_by_a_tolerance_or_in_kind(change: dict[str, float], is_apa
 def test_ranges_apart_by_a_tolerance() -> None:
     ranges = [replace(STILL, range_m=range_m, uniform=True) for range_m in (0.0, 0.0009, 0.0011)]
     assert [ranges[0].apart(each) for each in ranges] == [False, False, True]
+
+
+@pytest.mark.parametrize("spread", ["distance_std_m", "yaw_std_deg", "pitch_std_deg"])
+def test_drift_is_sharp_to_half_a_tolerance_of_each_kind(spread: str) -> None:
+    tolerance = TOLERANCE_M if spread.endswith("_m") else TOLERANCE_DEG
+
+    assert replace(STILL, **{spread: 0.49 * tolerance}).sharp
+    assert not replace(STILL, **{spread: 0.51 * tolerance}).sharp
 
 
 def test_drift_text_holds_amounts_and_uncertainties() -> None:
@@ -304,12 +309,6 @@ def test_wall_track_of_frames_without_the_wall_is_none(tilted: BareWall, value: 
     track = WallTrack(tilted, wall_from_lidar(TILTED))
     for _ in range(100):
         assert track.follow(np.full((SMALL.height, SMALL.width), value, np.float32)) is None
-
-
-def observed(check: DriftCheck, frame: np.ndarray, frames: int) -> DriftCheck:
-    for _ in range(frames):
-        check.observe(frame, {})
-    return check
 
 
 def test_a_wall_hidden_for_ten_seconds_is_said_until_seen(tilted: BareWall) -> None:

@@ -259,7 +259,7 @@ def test_frames_of_arrays_last_from_the_first_to_the_last(tmp_path: Path) -> Non
     assert facts["duration"] == "2.0 s"
 
 
-def test_text_in_place_of_a_table_is_said_to_be_binary(tmp_path: Path) -> None:
+def test_bytes_in_place_of_a_table_are_said_to_be_binary(tmp_path: Path) -> None:
     path = tmp_path / "rig.toml"
     path.write_bytes(bytes(range(256)))
 

@@ -110,13 +110,11 @@ def test_numbers_of_the_papers_rig_are_of_about_one_unit() -> None:
 
 
 @pytest.mark.parametrize(
-    ("place", "change"),
-    [(0, {"distance_m": 0.01}), (1, {"yaw_deg": 4.0}), (5, {"pitch_deg": 0.4})],
-    ids=["distance", "yaw", "pitch"],
+    ("place", "name", "change"),
+    [(0, "distance_m", 0.01), (1, "yaw_deg", 4.0), (5, "pitch_deg", 0.4)],
 )
-def test_a_number_follows_its_own_length_or_angle(place: int, change: dict[str, float]) -> None:
-    (name, by) = next(iter(change.items()))
-    moved = rig(**{name: getattr(HOME.lidar, name) + by})
+def test_a_number_follows_its_own_length_or_angle(place: int, name: str, change: float) -> None:
+    moved = rig(**{name: getattr(HOME.lidar, name) + change})
     rise = rig_numbers(moved) - rig_numbers(HOME)
 
     assert rise[place] == pytest.approx(0.2, rel=1e-3)
