@@ -66,9 +66,10 @@ MIN_ECHO_OVERLAP = 0.8
 in 95 % of unharmed frames."""
 MIN_ECHO_CELLS = 100
 BRIGHTER = 0.1
-SEAM = 0.06
-"""Mean jump of the light between two rows, in units of the largest that counts: 0.028 at most in
-unharmed frames, 0.12 at least where rows below are of another object."""
+SEAM = 0.07
+"""Mean jump of the light between two rows, in units of the largest that counts: 0.028 at most where
+nothing moves, 0.064 where an airplane flies while the rows are scanned, 0.12 mostly where the rows
+below are of another object."""
 SEAM_LIMIT = 0.3
 TILT = 0.06
 """Change of the wall's light over the height of the view, as a logarithm: three rows of shift cause

@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 from nlos_calibration import load_rig
 
+from nlos_cam.camera import open_world
 from nlos_cam.evaluate import sense
-from nlos_cam.frames import LidarMaps
+from nlos_cam.frames import LidarMaps, maps_from_frame
 from nlos_cam.objects import object_box, object_depth
 from nlos_cam.reconstruct import CalibratedRig
 from nlos_cam.reconstruct.consistency import MapConsistency, MapProblem, information
@@ -76,6 +77,15 @@ def test_unharmed_maps_have_no_problem(maps: LidarMaps) -> None:
 
     assert found.problems == ()
     assert found.kept_share == 1.0
+
+
+def test_object_that_moves_while_it_is_scanned_is_no_seam() -> None:
+    world = open_world("")
+    frames = [world.images(number).frame(RIG.pinhole) for number in (42, 43, 499, 582, 583, 589)]
+
+    found = [CHECK.examine(maps_from_frame(frame)).problems for frame in frames]
+
+    assert found == [()] * len(frames)
 
 
 @pytest.mark.parametrize("name", WRONG)
