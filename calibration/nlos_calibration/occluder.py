@@ -248,7 +248,10 @@ MAX_GAP_STD_M = 0.005
 """A ruler does better."""
 REACH_HEIGHT_M = 0.1
 """Height above the wall, the paper's gap."""
-BY_HAND = "enter its position and gap by hand (--occluder-x-m, --occluder-gap-m)"
+BY_HAND = (
+    "measure the wall again with its position and gap by hand (--wall --occluder-x-m X"
+    " --occluder-gap-m G)"
+)
 
 
 @dataclass(frozen=True, eq=False)

@@ -214,7 +214,8 @@ def vary(
     # Noise and reflectance act on counts, so that the normalisation (a logarithm) is undone.
     median = cells.median[1:]
     spread = cells.spread[1:]
-    counts = torch.expm1(light * spread + median)
+    # A cell that is clipped far below its median would have a negative light, and no logarithm.
+    counts = torch.expm1(light * spread + median).clamp(min=0)
     if log_reflectance is not None:
         counts = counts * log_reflectance.exp()[:, None]
     if noise is not None:

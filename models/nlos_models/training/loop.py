@@ -154,7 +154,11 @@ def fit(
 
                 # A batch with a few strange maps would move Adam's moments for hundreds of steps.
                 if recipe.gradient_limit:
-                    fabric.clip_gradients(run.forward, run.stepper, max_norm=recipe.gradient_limit)
+                    limit = recipe.gradient_limit
+                    norm = fabric.clip_gradients(
+                        run.forward, run.stepper, max_norm=limit, error_if_nonfinite=False
+                    )
+                    _finite("gradient", float(norm if norm is not None else 0.0), run.epoch)
                 run.stepper.step()
                 # A plateau is judged on held-out losses, once an epoch.
                 if recipe.schedule != "plateau":

@@ -389,6 +389,17 @@ def test_start_refuses_weights_that_the_recipe_cannot_hold(
         direct_start(recipe, Path("paper"))
 
 
+def test_maps_at_the_clip_stay_finite_on_any_wall() -> None:
+    cells = CellNormal()
+    cells.spread[:] = 5.0  # light that comes and goes: far below its median is below no light
+    darkest = torch.full((2, 2, 64, 80), -5.0)
+    brighter_wall = torch.full((2, 64, 80), 0.1)
+
+    varied = vary(cells, darkest, None, brighter_wall, None)
+
+    assert torch.isfinite(varied).all()
+
+
 def test_varied_maps_are_those_of_another_wall_and_range() -> None:
     """Stains and an offset on normalised maps are what they would be on the maps themselves."""
     maps = small_maps(40, 0)

@@ -1,0 +1,227 @@
+"""Benches drawn at random, from bare wall to their own weights: docs/figures/benches.json and
+docs/images/benches.png.
+
+    python tools/studies/benches.py WORK [--benches N] [--minutes M ...] [--out DIR]
+
+Each bench has a rig out of all that the paper allows, and a device and a wall of its own: range
+offset, ripples, gain, texture. Its owner's commands are run, `calibrate --wall`, `calibrate
+--occluder` and `adapt`, on its simulated camera, with the lidar's distance by tape to a millimetre,
+the occluder by ruler where no beam meets it, and the object box marked on the bench. The 54 test objects stand on the bench itself, not on its
+record, and go through the pipeline of `live`, before and after each number of minutes. WORK holds
+the benches: a second call goes on, also after a kill; more minutes go on from fewer.
+"""
+
+import argparse
+import json
+import os
+import platform
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import harness
+import numpy as np
+from matplotlib.figure import Figure
+from nlos_calibration import ObjectBox, Rig, dump_toml, load_rig
+from nlos_calibration.arrays import Float32
+
+from nlos_cam.bench import MAIN, edit_bench, load_bench
+from nlos_cam.camera import World
+from nlos_cam.cli.common import tracked
+from nlos_cam.cli.main import main as nlos_cam
+from nlos_cam.dataset import RigRange
+from nlos_cam.errors import NlosCamError
+from nlos_cam.evaluate import echoes_of, over_objects, per_object, plain, truth_of
+from nlos_cam.objects import benchmark_objects, image_from_depth, object_box
+from nlos_cam.reconstruct import (
+    Arrival,
+    Pipeline,
+    build_pipeline,
+    frame_issues,
+    load_networks,
+    load_uncertainty,
+)
+from nlos_cam.render import SceneFile, SensorModel
+
+FIRST_SEED = 70_000_000
+"""Of the benches: no training set draws its rigs from it."""
+MINUTES = 10.0, 30.0, 60.0
+FRAMES = 60
+
+
+@dataclass(frozen=True)
+class Bench:
+    """A bench as it stands, and the folder of its owner."""
+
+    scene: SceneFile
+    folder: Path
+
+    @property
+    def box(self) -> ObjectBox:
+        """Object box, as marked on the bench."""
+        return object_box(self.scene.rig)
+
+
+def draw_bench(number: int, work: Path) -> Bench:
+    """Return a bench out of all that the paper allows, before a device and a wall of its own."""
+    seed = FIRST_SEED + number
+    rig = RigRange().draw(load_rig("paper-rig"), seed)
+    rig = rig.model_copy(update={"name": f"bench {number + 1}"})
+    generator = np.random.default_rng([seed, 1])
+    sensor = SensorModel(
+        range_offset_m=round(generator.uniform(-0.005, 0.005), 4),
+        ripple_m=round(generator.uniform(0.0, 0.0015), 4),
+        bare_wall_counts=round(generator.uniform(36.0, 60.0), 1),
+        wall_texture=round(generator.uniform(0.02, 0.12), 3),
+    )
+    scene = SceneFile(name=rig.name, rig=rig, sensor=sensor)
+    return Bench(scene, work / f"bench-{number + 1}")
+
+
+def run(*words: object) -> None:
+    """Run a command of the program. Raises NlosCamError where it fails."""
+    if code := nlos_cam([str(word) for word in words]):
+        raise NlosCamError(f"nlos-cam {words[0]} ended with {code}: run this again to go on")
+
+
+def calibrate(bench: Bench) -> None:
+    """Measure the bench as its owner would, unless it was."""
+    done = bench.folder / "box-is-marked"
+    if done.exists():
+        return
+    bench.folder.parent.mkdir(parents=True, exist_ok=True)
+    empty = bench.folder.with_name(f"{bench.folder.name}-empty.toml")
+    bare = bench.folder.with_name(f"{bench.folder.name}-bare.toml")
+    rig = bench.scene.rig
+    empty.write_text(dump_toml(bench.scene), encoding="utf-8")
+    without = bench.scene.model_copy(update={"rig": rig.model_copy(update={"occluder": None})})
+    bare.write_text(dump_toml(without), encoding="utf-8")
+
+    measured = "--frames", FRAMES, "--overwrite"
+    by_tape = "--tape-m", round(rig.lidar.distance_m, 3), "--bench", bench.folder
+    wall = "calibrate", "--wall", "--camera", f"sim:{bare}", *by_tape, *measured
+    run(*wall)
+    try:
+        run("calibrate", "--occluder", bench.folder, "--camera", f"sim:{empty}", *measured)
+    except NlosCamError:  # not in view of every pose: its owner then gives it by ruler
+        edge_m = round(numbers_of(rig)["edge_m"], 3)
+        gap_m = round(numbers_of(rig)["gap_m"], 3)
+        run(*wall, "--occluder-x-m", edge_m, "--occluder-gap-m", gap_m)
+    with edit_bench(bench.folder) as edit:
+        station = edit.stations[MAIN].model_copy(update={"object_box": bench.box})
+        edit.set_station(MAIN, station, load_bench(bench.folder).measured.record)
+    done.touch()
+
+
+def shown(pipeline: Pipeline, world: World, count: int, box: ObjectBox) -> Float32:
+    """Return the images v (count, 64, 64) that `live` would show of a frame of each object."""
+    images: list[Float32] = []
+    for number in range(count):
+        frame = world.images(number).frame(world.rig.pinhole)
+        result = pipeline.process(Arrival(frame, 0.0, frame_issues(frame)), lambda: 0.0, 0.0)
+        images.append(image_from_depth(result.depth_m, box))
+    return np.stack(images)
+
+
+def judge(bench: Bench, weights: Path | None) -> dict[str, Any]:
+    """Return every metric over the 54 test objects on the bench itself."""
+    subjects = benchmark_objects(bench.box)
+    with tracked("rendering the test objects on the bench") as on_progress:
+        echoes = echoes_of(subjects, bench.scene.rig, on_progress)
+    world = World(bench.scene, echoes, [None])
+    pipeline = build_pipeline(
+        load_bench(bench.folder).calibrated,
+        load_networks(weights),
+        uncertainty_model=load_uncertainty(weights),
+    )
+    images = shown(pipeline, world, len(subjects), bench.box)
+    found = over_objects(per_object(images, truth_of(subjects, bench.box), bench.box))
+    return plain(found)
+
+
+def judged(bench: Bench, minutes: float) -> dict[str, Any]:
+    """Return the figures after some minutes, 0 for the shipped weights; they are made once."""
+    path = bench.folder.with_name(f"{bench.folder.name}-{minutes:g}.json")
+    if not path.exists():
+        weights = None
+        if minutes:
+            run("adapt", bench.folder, "--minutes", minutes)
+            weights = bench.folder / "weights"
+        path.write_text(json.dumps(judge(bench, weights)), encoding="utf-8")
+    return json.loads(path.read_text(encoding="utf-8"))
+
+
+def described(bench: Bench) -> dict[str, Any]:
+    """Return the numbers of a bench, true and as calibrated, and what was forecast."""
+    rig = bench.scene.rig
+    loaded = load_bench(bench.folder)
+    return {
+        "true": numbers_of(rig),
+        "calibrated": numbers_of(loaded.rig),
+        "verdict": loaded.measured.record.verdict,
+        "sensor": bench.scene.sensor.model_dump(exclude_defaults=True),
+        "expected_iou": loaded.expected_iou,
+    }
+
+
+def numbers_of(rig: Rig) -> dict[str, float]:
+    """Return the numbers of a rig that differ between benches."""
+    gap_m = rig.occluder.z_min_m if rig.occluder else float("nan")
+    edge_m = rig.occluder.x_m if rig.occluder else float("nan")
+    lidar = rig.lidar
+    return {
+        "distance_m": lidar.distance_m,
+        "yaw_deg": lidar.yaw_deg,
+        "pitch_deg": lidar.pitch_deg,
+        "gap_m": gap_m,
+        "edge_m": edge_m,
+        "box_from_m": object_box(rig).x_min_m,
+    }
+
+
+def draw(rows: Sequence[dict[str, Any]]) -> Figure:
+    """Draw each bench's silhouette IoU over its minutes, with its forecast."""
+    figure = Figure(figsize=(6.0, 3.6), layout="constrained")
+    axis = figure.subplots()
+    for row in rows:
+        minutes = [float(each) for each in row["minutes"]]
+        iou = [each["silhouette_iou"]["value"] for each in row["minutes"].values()]
+        (line,) = axis.plot(minutes, iou, marker="o", label=row["name"])
+        axis.plot(
+            max(MINUTES) + 4, row["expected_iou"], marker="<", color=line.get_color(), alpha=0.6
+        )
+    axis.set(xlabel="minutes of `adapt` (at the right: forecast)", ylabel="silhouette IoU")
+    axis.legend(frameon=False, ncols=2)
+    return figure
+
+
+def main() -> None:
+    """Run the study."""
+    parser = harness.options(__doc__)
+    parser.add_argument("work", type=Path)
+    parser.add_argument("--benches", type=int, default=5)
+    parser.add_argument("--minutes", type=float, nargs="+", default=MINUTES)
+    parser.add_argument("--out", type=Path, help="folder of the results (default: docs)")
+    asked: argparse.Namespace = parser.parse_args()
+
+    benches = [draw_bench(number, asked.work) for number in range(asked.benches)]
+    rows: list[dict[str, Any]] = [{} for _ in benches]
+    for minutes in (0.0, *asked.minutes):
+        for bench, row in zip(benches, rows, strict=True):
+            calibrate(bench)
+            figures = judged(bench, minutes)
+            row.update(
+                {"name": bench.scene.rig.name, **described(bench)},
+                minutes={**row.get("minutes", {}), f"{minutes:g}": figures},
+            )
+            iou = figures["silhouette_iou"]["value"]
+            print(f"{row['name']}, {minutes:g} minutes: silhouette IoU {iou:.3f}", flush=True)
+            done = [each for each in rows if each]
+            machine = f"{os.cpu_count()} cores, {platform.machine()}"
+            harness.write("benches", {"machine": machine, "benches": done}, asked.out)
+    harness.save("benches", draw(rows), asked.out, dpi=110)
+
+
+if __name__ == "__main__":
+    main()
