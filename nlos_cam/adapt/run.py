@@ -81,6 +81,8 @@ SHARE_GENERIC = 0.5
 POLL_S = 0.2
 PACE_OBJECTS = 200
 PACE_STEPS = 6
+MIN_NOTES = 4
+"""Notes of progress from which a pace is told."""
 RECIPE = "doubt"
 
 Measure = Callable[[Path | None, Path, Path | None], None]
@@ -100,7 +102,8 @@ class Adaptation:
     """Start weights; None for the shipped ones."""
     sensor: SensorModel = field(default_factory=SensorModel)
     seed: int = 0
-    workers: int = field(default_factory=lambda: max((os.cpu_count() or 2) - 1, 1))
+    workers: int = field(default_factory=lambda: max((os.cpu_count() or 2) // 2, 1))
+    """Processes that render; the other cores train meanwhile."""
     farm: data.Farm | None = None
     """Cluster that renders in place of `workers` processes here."""
     accelerator: Literal["auto", "cpu", "cuda"] = "auto"
@@ -108,6 +111,14 @@ class Adaptation:
     """Locked differences in place of maps; their weights are for a study, not for `live`."""
     recordings: Recordings | None = None
     """Recordings of known objects on the bench, if there are any."""
+
+    @property
+    def threads(self) -> int:
+        """Number of threads that train, so that none waits for a core that renders: two threads on
+        two cores, one of them rendering, took a tenth of one thread's samples.
+        """
+        cores = os.cpu_count() or 2
+        return cores if self.farm else max(cores - self.workers, 1)
 
 
 @dataclass(frozen=True)
@@ -144,7 +155,7 @@ def adapt(
     KeyboardInterrupt where it was stopped: the same call goes on.
     """
     job.folder.mkdir(parents=True, exist_ok=True)
-    with claim(job.folder, inside=True):
+    with claim(job.folder, inside=True), _threads(job.threads):
         plan = _plan_for(job, minutes, tracked)
         job = replace(job, spread=plan.spread, sensor=plan.sensor, seed=plan.seed)
         folders = [job.folder / _stage_name(number) for number in range(len(plan.stages))]
@@ -168,6 +179,17 @@ def adapt(
         _train_uncertainty(job, plan, last, tracked, watch)
         after = _figures(measure, last / WEIGHTS, last / REPORT)
         return AdaptResult(last / WEIGHTS, plan, folders, before, after, was_there, transfer)
+
+
+@contextmanager
+def _threads(count: int) -> Generator[None]:
+    """Let torch compute with a number of threads until the end of the block."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(count)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
 
 
 def _stage_name(number: int) -> str:
@@ -254,22 +276,32 @@ def _measure_pace(job: Adaptation, on_progress: Callable[[int, int], None]) -> P
     plan = _data_plan(job, job.seed, expected=True)
     folder = job.folder / OBJECTS
 
-    # the first objects compile kernels and start the workers
+    # the first objects compile kernels
     data.build_dataset(plan, data.SHARD, folder, workers=1, on_progress=data.ignore, farm=job.farm)
-    report = data.build_dataset(
-        plan,
-        data.SHARD + PACE_OBJECTS,
-        folder,
-        workers=job.workers,
-        on_progress=lambda done, _: on_progress(done - data.SHARD, total),
-        farm=job.farm,
-    )
-    objects_per_s = report.objects_per_s or 1.0
+    done_at: list[tuple[int, float]] = []
+
+    def note(done: int, _total: int) -> None:
+        done_at.append((done, time.perf_counter()))
+        on_progress(min(done - data.SHARD, PACE_OBJECTS), total)
+
+    # those that were there when a measurement was killed say nothing about the pace
+    count = data.SHARD
+    while len(done_at) < MIN_NOTES:
+        done_at.clear()
+        count += PACE_OBJECTS
+        data.build_dataset(
+            plan, count, folder, workers=job.workers, on_progress=note, farm=job.farm
+        )
+    # Workers take seconds to start, once for all objects: the pace counts from the first objects
+    # on. The first note says how many were there before.
+    (first, first_s), (last, last_s) = done_at[1], done_at[-1]
+    objects_per_s = (last - first) / (last_s - first_s)
 
     network, _ = models.load_network(models.weights_folder(job.start))
     if not isinstance(network, models.DirectNetwork):
         raise SceneError("the start weights are no direct network: choose others with --weights")
-    device = training.open_fabric(_probe_recipe(), accelerator=job.accelerator).device
+    fabric = training.open_fabric(_probe_recipe(), accelerator=job.accelerator)
+    device = fabric.device
     network = network.to(device).train()
     optimizer = torch.optim.AdamW(network.parameters(), 1e-12)
     normal = torch.randn(BATCH, 2, 64, 80, device=device)
@@ -277,7 +309,8 @@ def _measure_pace(job: Adaptation, on_progress: Callable[[int, int], None]) -> P
     for step in range(PACE_STEPS):
         if step == 1:  # the first one allocates
             start_s = time.perf_counter()
-        with torch.autocast(device.type, torch.bfloat16, enabled=device.type != "cpu"):
+        # in the training's own precision: bfloat16 is several times as fast where a CPU has it
+        with fabric.autocast():
             loss = network.logits(normal).float().square().mean()
         optimizer.zero_grad(set_to_none=True)
         loss.backward()

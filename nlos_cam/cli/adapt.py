@@ -59,7 +59,7 @@ def adapt(
     workers: Annotated[
         int | None,
         typer.Option(
-            "--workers", min=1, help="Processes that render (default: all cores but one)."
+            "--workers", min=1, help="Processes that render (default: half of the cores)."
         ),
     ] = None,
     accelerator: Annotated[

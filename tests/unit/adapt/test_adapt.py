@@ -10,11 +10,12 @@ from made_adaptations import finish_network, job_in
 from nlos_calibration import load_rig
 from nlos_models import training
 
-from nlos_cam.adapt import NETWORK_FILE, adapt
+from nlos_cam.adapt import NETWORK_FILE, Adaptation, adapt, calibration_spread
 from nlos_cam.errors import SceneError
 from nlos_cam.files import FileBusyError, claim
 
 AFTER_THE_NETWORK = "judged"
+CORES = 1, 2, 3, 8, 64
 
 
 @contextmanager
@@ -95,3 +96,17 @@ def test_a_bench_that_was_calibrated_again_is_refused(tmp_path: Path) -> None:
 
     with pytest.raises(SceneError, match="calibrated again"):
         adapt(replace(job, rig=moved), 1.0, no_figures)
+
+
+@pytest.mark.parametrize("cores", CORES)
+def test_rendering_and_training_share_the_cores(
+    cores: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A thread that waits for a core on which objects are rendered makes all the others wait."""
+    monkeypatch.setattr("os.cpu_count", lambda: cores)
+
+    job = Adaptation(load_rig("paper-rig"), calibration_spread(None), tmp_path)
+
+    assert job.workers + job.threads == max(cores, 2)
+    assert min(job.workers, job.threads) >= 1
+    assert replace(job, workers=cores).threads == 1
