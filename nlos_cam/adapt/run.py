@@ -138,6 +138,16 @@ class AdaptResult:
     transfer: Transfer | None = None
     """Transfer to recordings of known objects; its weights are the result's if it is better."""
 
+    @property
+    def is_better(self) -> bool:
+        """True if the weights serve the bench at least as well as the start weights do.
+
+        A few minutes' weights can be worse than aligned ones on a bench close to the start weights'
+        rig. A fit to the bench's own recordings that helped counts more than simulated objects.
+        """
+        before, after = (each["silhouette_iou"]["value"] for each in (self.before, self.after))
+        return after >= before or bool(self.transfer and self.transfer.is_better)
+
 
 def adapt(
     job: Adaptation,

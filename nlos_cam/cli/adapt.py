@@ -128,7 +128,9 @@ def adapt(
         )
     except KeyboardInterrupt:
         common.exit_interrupted(f"what was made is kept in {work}; give the same command to go on")
-    target = result.weights if locked else _install(result, folder, home / WEIGHTS)
+    target = result.weights
+    if result.is_better and not locked:
+        target = _install(result, folder, home / WEIGHTS)
     expected_iou = None if locked else _expected_iou(rig, folder)
     name = shlex.quote(bench)
     more = f"nlos-cam adapt {name} --minutes {2 * result.plan.minutes:g}"
@@ -136,7 +138,7 @@ def adapt(
     if locked:
         commands = []
         more += f" --frames {locked.frames} --radiometry {locked.radiometry}"
-    if folder:
+    if folder and result.is_better:
         commands = [f"nlos-cam live --camera l515 --bench {name}"]
     more += f" --out {shlex.quote(str(out))}" if out else ""
     _report(result, target, [*commands, more], work / PAGE, expected_iou, as_json=json)
@@ -199,12 +201,16 @@ def _report(
     adaptation.write_page(result, tables, commands, page)
     _, before, after = rows[0]
     state = "was finished before" if result.was_there else "done"
+    worse = ""
+    if not result.is_better and not result.plan.locked:
+        worse = ", worse, so the weights in use stay (more --minutes help)"
     text = (
-        f"{state}: {rows[0][0]} {before} -> {after} on this bench; weights in {target}, report"
-        f" {page}"
+        f"{state}: {rows[0][0]} {before} -> {after} on this bench{worse}; weights in {target},"
+        f" report {page}"
     )
     facts: dict[str, Any] = {
         "out": str(target),
+        "kept": result.is_better,
         "report": str(page),
         "minutes": result.plan.minutes,
         "objects": result.plan.stages[-1].objects,

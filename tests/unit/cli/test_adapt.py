@@ -1,9 +1,16 @@
-"""The command `adapt`, up to where its work begins."""
+"""The command `adapt`: up to where its work begins, and what it does with the result."""
 
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import pytest
+from made_adaptations import finish_network, job_in
+from nlos_calibration import load_rig
+
+from nlos_cam import adapt as adaptation
+from nlos_cam.adapt.plan import load_plan
+from nlos_cam.evaluate import TARGETS
 
 
 @pytest.mark.parametrize(
@@ -31,3 +38,29 @@ def test_weights_from_elsewhere_are_not_replaced_unasked(run: Any, out: Path) ->
     (out / "weights" / "SHA256SUMS").write_text("somebody's\n")
 
     assert "--overwrite" in run("adapt", "paper-rig", "--out", out, code=1).err
+
+
+@pytest.mark.parametrize(("after_iou", "kept"), [(0.508, False), (0.677, True), (0.7, True)])
+def test_weights_that_are_worse_do_not_replace_those_in_use(
+    run: Any, out: Path, monkeypatch: pytest.MonkeyPatch, after_iou: float, kept: bool
+) -> None:
+    job = job_in(out.with_name("work"), load_rig("paper-rig"))
+    finish_network(job.folder)
+    plan = load_plan(job.folder)
+    assert plan is not None
+    before, after = (dict.fromkeys(TARGETS, figure(iou)) for iou in (0.677, after_iou))
+    network = job.folder / "stage-1" / "network"
+    result = adaptation.AdaptResult(network, plan, [network.parent], before, after, was_there=False)
+    monkeypatch.setattr(adaptation, "adapt", Mock(return_value=result))
+    monkeypatch.setattr(adaptation, "write_page", Mock())
+    out.mkdir()
+
+    answer = run("adapt", "paper-rig", "--out", out)
+
+    assert answer["kept"] == kept
+    assert (out / "weights").exists() == kept
+
+
+def figure(value: float) -> dict[str, float]:
+    """Return a figure as a report has it."""
+    return {"value": value, "low": value, "high": value}
