@@ -9,6 +9,7 @@ import os
 import shutil
 import time
 from collections.abc import Callable, Generator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing, contextmanager
 from dataclasses import dataclass, field, replace
 from hashlib import sha256
@@ -281,53 +282,76 @@ def _data_plan(job: Adaptation, first_seed: int, *, expected: bool) -> data.Data
 
 
 def _measure_pace(job: Adaptation, on_progress: Callable[[int, int], None]) -> Pace:
-    """Measure rendering on the first objects, which are kept, and training on maps of noise."""
-    total = PACE_OBJECTS + PACE_STEPS
+    """Measure rendering on the first objects, which are kept, and training on maps of noise: side
+    by side, as the plan has them, since two threads of one core share its time.
+    """
+    step = _probe_step(job)
+    step()  # the first one allocates
+    # the first objects compile kernels
     plan = _data_plan(job, job.seed, expected=True)
     folder = job.folder / OBJECTS
-
-    # the first objects compile kernels
     data.build_dataset(plan, data.SHARD, folder, workers=1, on_progress=data.ignore, farm=job.farm)
+
+    stop = Event()
     done_at: list[tuple[int, float]] = []
 
     def note(done: int, _total: int) -> None:
+        if stop.is_set():
+            raise KeyboardInterrupt
         done_at.append((done, time.perf_counter()))
-        on_progress(min(done - data.SHARD, PACE_OBJECTS), total)
+        on_progress(min(done - data.SHARD, PACE_OBJECTS), PACE_OBJECTS)
 
-    # those that were there when a measurement was killed say nothing about the pace
-    count = data.SHARD
-    while len(done_at) < MIN_NOTES:
-        done_at.clear()
-        count += PACE_OBJECTS
-        data.build_dataset(
-            plan, count, folder, workers=job.workers, on_progress=note, farm=job.farm
-        )
+    def render() -> None:
+        # those that were there when a measurement was killed say nothing about the pace
+        count = data.SHARD
+        while len(done_at) < MIN_NOTES:
+            done_at.clear()
+            count += PACE_OBJECTS
+            data.build_dataset(
+                plan, count, folder, workers=job.workers, on_progress=note, farm=job.farm
+            )
+
+    steps = 0
+    with ThreadPoolExecutor(1) as pool:
+        start_s = time.perf_counter()
+        rendering = pool.submit(render)
+        try:
+            while steps < PACE_STEPS or not rendering.done():
+                step()
+                steps += 1
+        finally:
+            stop.set()
+        seconds = time.perf_counter() - start_s
+        rendering.result()
+
     # Workers take seconds to start, once for all objects: the pace counts from the first objects
     # on. The first note says how many were there before.
     (first, first_s), (last, last_s) = done_at[1], done_at[-1]
-    objects_per_s = (last - first) / (last_s - first_s)
+    return Pace(
+        objects_per_s=(last - first) / (last_s - first_s), samples_per_s=steps * BATCH / seconds
+    )
 
+
+def _probe_step(job: Adaptation) -> Callable[[], None]:
+    """Return a training step on maps of noise, which leaves the start weights as they are."""
     network, _ = models.load_network(models.weights_folder(job.start))
     if not isinstance(network, models.DirectNetwork):
         raise SceneError("the start weights are no direct network: choose others with --weights")
     fabric = training.open_fabric(_probe_recipe(), accelerator=job.accelerator)
-    device = fabric.device
-    network = network.to(device).train()
+    network = network.to(fabric.device).train()
     optimizer = torch.optim.AdamW(network.parameters(), 1e-12)
-    normal = torch.randn(BATCH, 2, 64, 80, device=device)
-    start_s = 0.0
-    for step in range(PACE_STEPS):
-        if step == 1:  # the first one allocates
-            start_s = time.perf_counter()
+    normal = torch.randn(BATCH, 2, 64, 80, device=fabric.device)
+
+    def step() -> None:
         # in the training's own precision: bfloat16 is several times as fast where a CPU has it
         with fabric.autocast():
             loss = network.logits(normal).float().square().mean()
         optimizer.zero_grad(set_to_none=True)
         loss.backward()
         optimizer.step()
-        on_progress(PACE_OBJECTS + step + 1, total)
-    seconds = time.perf_counter() - start_s
-    return Pace(objects_per_s=objects_per_s, samples_per_s=(PACE_STEPS - 1) * BATCH / seconds)
+        float(loss.detach())  # waits for a GPU, which would count steps that it has not done
+
+    return step
 
 
 def _probe_recipe() -> training.DirectRecipe:

@@ -48,14 +48,15 @@ def info(
         facts = inspect.describe_program()
         finish({**facts}, as_json=json, text=_format_program(facts))
         return
+    text_of_picture = ""
     with interrupted_by_signals():
         found = inspect.describe(path, verify=verify)
         if out is not None and not found.problem:
-            inspect.write_picture(
-                path, found, output_path(out, "", out.suffix, overwrite=overwrite)
-            )
+            picture = output_path(out, "", out.suffix, overwrite=overwrite)
+            inspect.write_picture(path, found, picture)
+            text_of_picture = f"\nWrote {picture}"
     result = {"path": str(path), "whole": not found.problem, **asdict(found)}
-    finish(result, as_json=json, text=_format(path, found))
+    finish(result, as_json=json, text=_format(path, found) + text_of_picture)
     if found.problem:
         raise typer.Exit(RecordingError.exit_code)
 

@@ -70,8 +70,9 @@ class RayFarm:
                 self._ray.init(address=self._address, log_to_driver=False, configure_logging=False)
         except (ConnectionError, ValueError, RuntimeError, OSError) as error:
             raise WorkersLostError(
-                f"no Ray cluster at {self._address!r} ({' '.join(str(error).split()):.120}): start"
-                " one with `ray start --head`, or omit --ray"
+                f"no Ray cluster lets us in at {self._address!r}"
+                f" ({' '.join(str(error).split()):.120}): start one with `ray start --head`, set"
+                " the RAY_AUTH_TOKEN that it has, or omit --ray"
             ) from error
 
     def _make(self, plan: DatasetPlan, pieces: Sequence[range]) -> Generator[tuple[range, Samples]]:

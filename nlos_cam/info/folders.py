@@ -104,6 +104,8 @@ def describe_weights(folder: Path, _verify: bool) -> Description:
     }
     facts |= {name: f"{value:.3g}" for name, value in record.figures.items()}
     problem = _checksum_problem(folder)
+    if not problem and facts["networks"] == "none":
+        problem = f"{folder} holds no networks (*.safetensors): copy the weights again"
     following = [
         f"nlos-cam evaluate --weights {quoted}",
         f"nlos-cam live --camera sim --weights {quoted}",

@@ -223,6 +223,10 @@ def test_changed_weights_and_lone_wall_records_are_damaged(
 
     assert "a.safetensors is missing" in describe(tmp_path).problem
 
+    (tmp_path / "SHA256SUMS").unlink()
+
+    assert "no networks" in describe(tmp_path).problem
+
 
 @pytest.mark.parametrize(
     "name", ["thesis.txt", "a.npy", "folder", "notes.toml", "list.json", "page.html", "view.rrd"]
