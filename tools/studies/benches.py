@@ -28,6 +28,7 @@ from nlos_calibration.arrays import Float32
 
 from nlos_cam.bench import MAIN, edit_bench, load_bench
 from nlos_cam.camera import World
+from nlos_cam.cli.benches import store_forecast
 from nlos_cam.cli.common import tracked
 from nlos_cam.cli.main import main as nlos_cam
 from nlos_cam.dataset import RigRange
@@ -111,6 +112,7 @@ def calibrate(bench: Bench) -> None:
     with edit_bench(bench.folder) as edit:
         station = edit.stations[MAIN].model_copy(update={"object_box": bench.box})
         edit.set_station(MAIN, station, load_bench(bench.folder).measured.record)
+    store_forecast(bench.folder)  # the one before was of the box as it was assumed
     done.touch()
 
 
