@@ -6,9 +6,10 @@ docs/images/benches.png.
 Each bench has a rig out of all that the paper allows, and a device and a wall of its own: range
 offset, ripples, gain, texture. Its owner's commands are run, `calibrate --wall`, `calibrate
 --occluder` and `adapt`, on its simulated camera, with the lidar's distance by tape to a millimetre,
-the occluder by ruler where no beam meets it, and the object box marked on the bench. The 54 test objects stand on the bench itself, not on its
-record, and go through the pipeline of `live`, before and after each number of minutes. WORK holds
-the benches: a second call goes on, also after a kill; more minutes go on from fewer.
+the occluder by ruler where no beam meets it, and the object box marked on the bench. The 54 test
+objects stand on the bench itself, not on its record, and go through the pipeline of `live`, before
+and after each number of minutes. WORK holds the benches: a second call goes on, also after a kill;
+more minutes go on from fewer.
 """
 
 import argparse
@@ -30,7 +31,6 @@ from nlos_cam.bench import MAIN, edit_bench, load_bench
 from nlos_cam.camera import World
 from nlos_cam.cli.benches import store_forecast
 from nlos_cam.cli.common import tracked
-from nlos_cam.cli.main import main as nlos_cam
 from nlos_cam.dataset import RigRange
 from nlos_cam.errors import NlosCamError
 from nlos_cam.evaluate import echoes_of, over_objects, per_object, plain, truth_of
@@ -80,12 +80,6 @@ def draw_bench(number: int, work: Path) -> Bench:
     return Bench(scene, work / f"bench-{number + 1}")
 
 
-def run(*words: object) -> None:
-    """Run a command of the program. Raises NlosCamError where it fails."""
-    if code := nlos_cam([str(word) for word in words]):
-        raise NlosCamError(f"nlos-cam {words[0]} ended with {code}: run this again to go on")
-
-
 def calibrate(bench: Bench) -> None:
     """Measure the bench as its owner would, unless it was."""
     done = bench.folder / "box-is-marked"
@@ -102,13 +96,15 @@ def calibrate(bench: Bench) -> None:
     measured = "--frames", FRAMES, "--overwrite"
     by_tape = "--tape-m", round(rig.lidar.distance_m, 3), "--bench", bench.folder
     wall = "calibrate", "--wall", "--camera", f"sim:{bare}", *by_tape, *measured
-    run(*wall)
+    harness.run_command(*wall)
     try:
-        run("calibrate", "--occluder", bench.folder, "--camera", f"sim:{empty}", *measured)
+        harness.run_command(
+            "calibrate", "--occluder", bench.folder, "--camera", f"sim:{empty}", *measured
+        )
     except NlosCamError:  # not in view of every pose: its owner then gives it by ruler
         edge_m = round(numbers_of(rig)["edge_m"], 3)
         gap_m = round(numbers_of(rig)["gap_m"], 3)
-        run(*wall, "--occluder-x-m", edge_m, "--occluder-gap-m", gap_m)
+        harness.run_command(*wall, "--occluder-x-m", edge_m, "--occluder-gap-m", gap_m)
     with edit_bench(bench.folder) as edit:
         station = edit.stations[MAIN].model_copy(update={"object_box": bench.box})
         edit.set_station(MAIN, station, load_bench(bench.folder).measured.record)
@@ -148,7 +144,7 @@ def judged(bench: Bench, minutes: float) -> dict[str, Any]:
     if not path.exists():
         weights = None
         if minutes:
-            run("adapt", bench.folder, "--minutes", minutes)
+            harness.run_command("adapt", bench.folder, "--minutes", minutes)
             weights = load_bench(bench.folder).weights  # None where the shipped ones are better
         path.write_text(json.dumps(judge(bench, weights)), encoding="utf-8")
     return json.loads(path.read_text(encoding="utf-8"))

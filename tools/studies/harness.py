@@ -21,6 +21,7 @@ from nlos_calibration.errors import CalibrationError
 from nlos_models.errors import ModelError
 
 from nlos_cam.cli.common import progress
+from nlos_cam.cli.main import main as nlos_cam
 from nlos_cam.errors import NlosCamError
 from nlos_cam.evaluate import format_interval
 from nlos_cam.files import cache_folder
@@ -36,6 +37,15 @@ Record = dict[str, Any]
 def options(doc: str | None) -> ArgumentParser:
     """Return a parser whose help is a tool's docstring."""
     return ArgumentParser(description=doc, formatter_class=RawDescriptionHelpFormatter)
+
+
+def run_command(*words: object) -> None:
+    """Run a command of the program in this process. Raises NlosCamError where it fails."""
+    arguments = [str(word) for word in words]
+    if code := nlos_cam(arguments):
+        raise NlosCamError(
+            f"nlos-cam {' '.join(arguments)} ended with {code}: see above; run this again to go on"
+        )
 
 
 def collect(

@@ -19,8 +19,6 @@ import harness
 from matplotlib.figure import Figure
 
 from nlos_cam.adapt import OBJECTS
-from nlos_cam.cli.main import main as nlos_cam
-from nlos_cam.errors import NlosCamError
 
 FRAMES_PER_S = 30
 SECONDS = 30, 300, 3600
@@ -38,8 +36,7 @@ def run(folder: Path, material: str, seconds: int, minutes: float, workers: int)
         words = ["adapt", RIG, "--minutes", minutes, "--out", folder, "--workers", workers]
         words += ["--frames", FRAMES_PER_S * seconds, "--radiometry", "lambertian"]
         words += ["--pulse-ns", PULSE_NS, "--material", material]
-        if code := nlos_cam([str(word) for word in words]):
-            raise NlosCamError(f"adapt ended with {code}: see above; run this again to go on")
+        harness.run_command(*words)
     return json.loads(done.read_text(encoding="utf-8"))
 
 

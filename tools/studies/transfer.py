@@ -32,9 +32,8 @@ from numpy.typing import NDArray
 
 from nlos_cam.camera import FRAMES_PER_S, Recording, SimulatedCamera, World
 from nlos_cam.cli.common import tracked
-from nlos_cam.cli.main import main as nlos_cam
 from nlos_cam.dataset import Labelled, list_recordings, read_labelled, write_shards
-from nlos_cam.errors import NlosCamError, RecordingError
+from nlos_cam.errors import RecordingError
 from nlos_cam.evaluate import mm_per_v, over_objects, per_object, plain, reconstruct_all
 from nlos_cam.files import cache_folder
 from nlos_cam.frames import maps_from_frame
@@ -326,11 +325,7 @@ def commanded(task: str, recipe: Path, *others: object) -> Trainer:
             *(str(part) for pair in given.items() for part in pair),
             *map(str, others),
         ]
-        if code := nlos_cam(arguments):
-            raise NlosCamError(
-                f"nlos-cam {' '.join(arguments)} ended with {code}: see above; run this again to"
-                " go on"
-            )
+        harness.run_command(*arguments)
         return lesson.out
 
     return train

@@ -154,7 +154,7 @@ def test_transfer_curve_trains_on_nested_sets(tool: Tool, monkeypatch: Patch) ->
     assert set(sets[2]) < set(sets[5]) < set(sets[9])
 
     monkeypatch.setattr(
-        transfer, "nlos_cam", lambda arguments: calls.append(arguments) or len(calls) - 1
+        transfer.harness, "nlos_cam", lambda arguments: calls.append(arguments) or len(calls) - 1
     )
     lesson = transfer.Lesson(Path("data"), Path("val"), 24, Path("run"))
     train = transfer.commanded("transfer", Path("r.toml"), "--weights", Path("w"))
