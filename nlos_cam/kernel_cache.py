@@ -6,13 +6,14 @@ name depends on the text of all of them.
 """
 
 import hashlib
+import logging
 import os
 import shutil
 from functools import cache
 from pathlib import Path
 from typing import Any, Self
 
-from numba.core import caching
+from numba.core import caching, event
 
 PACKAGE = Path(__file__).parent
 SOURCES = (
@@ -25,6 +26,8 @@ SOURCES = (
 )
 """Files with kernels, and with the functions, constants and records that kernels use."""
 PREFIX = "kernels-"
+NOTICE = "Compiling the physics for this machine, once: up to a minute and a half"
+log = logging.getLogger(__name__)
 
 
 @cache
@@ -110,8 +113,28 @@ class KernelCacheLocator(BaseLocator):
         return place
 
 
+class CompileNotice(event.Listener):
+    """Logs NOTICE when a kernel is compiled that was not in the cache, once in a process."""
+
+    def __init__(self) -> None:
+        self._is_logged = False
+
+    def on_start(self, event: Any) -> None:
+        if not self._is_logged:
+            self._is_logged = True
+            log.info(NOTICE)
+
+    def on_end(self, event: Any) -> None:
+        """Nothing to do: the result says that it is done."""
+
+
+@cache
 def install() -> None:
-    """Let numba keep this package's kernels here. A user's NUMBA_CACHE_DIR has precedence."""
+    """Let numba keep this package's kernels here, and log when it compiles any.
+
+    A user's NUMBA_CACHE_DIR has precedence.
+    """
+    event.register("numba:compile", CompileNotice())
     locators: list[Any] = getattr(caching.CacheImpl, "_locator_classes")  # noqa: B009, numba has no public list
     if KernelCacheLocator not in locators:
         locators.insert(0, KernelCacheLocator)

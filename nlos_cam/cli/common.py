@@ -4,6 +4,7 @@ signals.
 
 import errno
 import json as json_module
+import logging
 import os
 import re
 import signal
@@ -53,6 +54,8 @@ INTERRUPTED = 130
 LINE_PERIOD_S = 10.0
 """Seconds between two lines of progress where stderr is no terminal."""
 NARROW_COLUMNS = 60
+NOTICES = "nlos_cam.kernel_cache"
+"""Logger of what every user is told, not with --verbose alone: that kernels are compiled."""
 
 CONTROL_CHARACTER = re.compile(
     "[\x00-\x08\x0b-\x1f\x7f-\x9f\u200e\u200f\u202a-\u202e\u2066-\u2069\ud800-\udfff]"
@@ -87,6 +90,13 @@ class Detail:
     """Line printed about an interruption, once."""
 
 
+class MessageHandler(logging.Handler):
+    """Prints what the package logs as a message of the command."""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        say(record.getMessage())
+
+
 def set_detail(*, verbose: bool = False, quiet: bool = False) -> None:
     """Print details and the package's log too, or (`quiet`) no messages but errors, from the start
     of a command.
@@ -94,9 +104,11 @@ def set_detail(*, verbose: bool = False, quiet: bool = False) -> None:
     Detail.verbose = verbose
     stderr.quiet = quiet
     Detail.interruption = ""
+    notices = logging.getLogger(NOTICES)
+    notices.setLevel(logging.INFO)
+    notices.handlers = [MessageHandler()]
+    notices.propagate = False
     if verbose:
-        import logging
-
         logging.basicConfig(format="%(name)s: %(message)s")
         logging.getLogger("nlos_cam").setLevel(logging.DEBUG)
 

@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 
 from nlos_cam import kernel_cache
+from nlos_cam.cli import common
 
 CALLED = """
 from numba import njit
@@ -46,37 +47,61 @@ def package(tmp_path: Path) -> Path:
 
 def run(package: Path, **environment: str) -> str:
     """Return what the calling kernel prints in a process of its own."""
+    return outputs(package, **environment)[0]
+
+
+def outputs(package: Path, **environment: str) -> tuple[str, str]:
+    """Return what the calling kernel prints, and what the cache logs."""
     known = {key: value for key, value in os.environ.items() if key != "NUMBA_CACHE_DIR"}
+    program = "import logging; logging.basicConfig(level=logging.INFO); import nlos_cam.caller"
     done = subprocess.run(
-        [sys.executable, "-m", "nlos_cam.caller"],
+        [sys.executable, "-c", program],
         env={**known, "PYTHONPATH": str(package.parent), **environment},
         cwd=package.parent,
         capture_output=True,
         text=True,
         check=True,
     )
-    return done.stdout.strip()
+    return done.stdout.strip(), done.stderr.strip()
+
+
+def change(package: Path) -> None:
+    """Change the called kernel.
+
+    By another length too: Python's byte code follows a file's size and the whole second in which it
+    was changed, and a fast machine runs the kernel and changes it within one second.
+    """
+    (package / "render" / "called.py").write_text(CALLED.format(number=50))
 
 
 @pytest.mark.slow
 def test_changed_kernel_changes_its_callers(package: Path) -> None:
     assert run(package) == "2"
 
-    (package / "render" / "called.py").write_text(CALLED.format(number=5))
+    change(package)
 
-    assert run(package) == "6"
+    assert run(package) == "51"
 
 
 @pytest.mark.slow
 def test_old_folders_are_removed(package: Path) -> None:
     run(package)
     before = list((package / "__pycache__").glob("kernels-*"))
-    (package / "render" / "called.py").write_text(CALLED.format(number=5))
+    change(package)
     run(package)
     after = list((package / "__pycache__").glob("kernels-*"))
 
     assert len(before) == len(after) == 1
     assert before != after
+
+
+@pytest.mark.slow
+def test_compiling_is_logged_once_and_not_from_the_cache(package: Path) -> None:
+    _, first = outputs(package)
+    _, second = outputs(package)
+
+    assert first.count(kernel_cache.NOTICE) == 1
+    assert kernel_cache.NOTICE not in second
 
 
 @pytest.mark.slow
@@ -86,6 +111,17 @@ def test_read_only_package_is_cached_in_the_users_folder(package: Path, tmp_path
 
     assert run(package, NLOS_CAM_CACHE=str(cache)) == "2"
     assert list(cache.rglob("*.nbi"))
+
+
+@pytest.mark.parametrize("is_quiet", [False, True])
+def test_commands_say_what_is_logged(is_quiet: bool, capsys: pytest.CaptureFixture[str]) -> None:
+    try:
+        common.set_detail(quiet=is_quiet)
+        kernel_cache.log.info(kernel_cache.NOTICE)
+    finally:
+        common.set_detail()
+
+    assert (kernel_cache.NOTICE in capsys.readouterr().err) is not is_quiet
 
 
 def test_checksum_follows_a_constant_in_a_file_without_kernels(tmp_path: Path) -> None:
