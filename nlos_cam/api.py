@@ -23,7 +23,7 @@ from typing import Self
 from nlos_calibration import Rig
 
 from nlos_cam import reconstruct
-from nlos_cam.bench import load_bench
+from nlos_cam.bench import load_bench, weights_verdict
 from nlos_cam.camera import Camera, OnProgress, open_camera
 from nlos_cam.errors import NlosCamError
 from nlos_cam.live import RunStatistics
@@ -50,7 +50,9 @@ class Stream:
     ) -> None:
         self.camera = camera
         self.notes = notes
-        """Mismatches between networks and bench: expect larger errors if there are any."""
+        """Mismatches between networks and bench, as `live` prints them: expect larger errors if
+        there are any.
+        """
         self._pipeline = pipeline
         self._lossless = lossless
         self._clock = clock
@@ -142,7 +144,9 @@ def open_stream(
         calibrated, network, average, uncertainty_model=uncertainty_model
     )
     reconstruct.warm_up(camera, pipeline)
-    notes = calibrated.warnings + tuple(
-        reconstruct.compatibility_warnings(calibrated, network.record, uncertainty_model)
+    served = weights_verdict(calibrated.rig, network.record, loaded)
+    mismatches = reconstruct.compatibility_warnings(
+        calibrated, network.record, uncertainty_model, served
     )
+    notes = (*calibrated.warnings, *mismatches)
     return Stream(camera, pipeline, lossless=uri.startswith("bag:"), notes=notes, clock=clock)

@@ -119,7 +119,7 @@ class CompileNotice(event.Listener):
     def __init__(self) -> None:
         self._is_logged = False
 
-    def on_start(self, event: Any) -> None:
+    def on_start(self, event: Any) -> None:  # noqa: ARG002, numba names it
         if not self._is_logged:
             self._is_logged = True
             log.info(NOTICE)

@@ -9,18 +9,20 @@ __all__ = [
     "BenchRecord",
     "ForecastRecord",
     "StationRecord",
+    "camera_to_name",
     "check_new",
     "edit_bench",
     "is_bench",
     "load_bench",
     "load_bench_record",
     "station_folder",
+    "weights_verdict",
     "write_file",
     "write_weights",
 ]
 
 from .edit import TEST_IOU, BenchEdit, check_new, edit_bench, write_file, write_weights
-from .folder import Bench, load_bench
+from .folder import Bench, camera_to_name, load_bench
 from .record import (
     FORECAST_SCATTER_IOU,
     MAIN,
@@ -33,3 +35,4 @@ from .record import (
     load_bench_record,
     station_folder,
 )
+from .serving import weights_verdict

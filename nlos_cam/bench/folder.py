@@ -16,7 +16,7 @@ from nlos_cam.bench.record import (
     load_bench_record,
     sha256_of,
 )
-from nlos_cam.camera import Camera
+from nlos_cam.camera import SIMULATED_SERIAL, Camera
 from nlos_cam.files import CHECKSUMS
 from nlos_cam.reconstruct import CalibratedRig, check_intrinsics
 
@@ -95,6 +95,14 @@ class Bench:
                 f" `nlos-cam calibrate --occluder {self.folder}`"
             ),
         )
+
+
+def camera_to_name(wall: walls.WallRecord) -> str:
+    """Return the camera of a command to type next on a measured wall: the lidar that measured it,
+    or a scene in capitals, since a simulated bench is another scene before and after the occluder.
+    """
+    is_simulated = wall.serial == SIMULATED_SERIAL or wall.camera.startswith("sim")
+    return "sim:SCENE.toml" if is_simulated else "l515"
 
 
 def load_bench(folder: str | Path, station: str = MAIN) -> Bench:

@@ -7,6 +7,7 @@ __all__ = [
     "RESERVE_BYTES",
     "SAME_INSTANT_S",
     "SIMULATED",
+    "SIMULATED_SERIAL",
     "WHEEL",
     "WORLDS",
     "Camera",
@@ -45,7 +46,7 @@ __all__ = [
 
 from .accelerometer import gravity_of
 from .l515 import DeviceInfo, connected, find_l515, shared_context
-from .protocol import Camera, OnProgress, WallClock
+from .protocol import SIMULATED_SERIAL, Camera, OnProgress, WallClock
 from .recorder import RESERVE_BYTES, Recording, check_room, free_bytes, recording_s, repair_command
 from .registry import NAMES, SIMULATED, full_uri, open_camera
 from .sdk import MAC_WHEEL, WHEEL, load_sdk

@@ -10,6 +10,8 @@ from nlos_calibration import Intrinsics, Rig
 
 from nlos_cam.frames import Frame
 
+SIMULATED_SERIAL = "simulated"
+"""Serial number of every simulated camera."""
 OnProgress = Callable[[int, int], None]
 """Called with the poses rendered so far and in all, while a simulated world is pre-rendered."""
 

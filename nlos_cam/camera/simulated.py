@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from nlos_cam.camera.fault_injection import Delivery, FaultyDevice
 from nlos_cam.camera.live_camera import LiveCamera
-from nlos_cam.camera.protocol import WaitingClock, WallClock
+from nlos_cam.camera.protocol import SIMULATED_SERIAL, WaitingClock, WallClock
 from nlos_cam.camera.recorder import Recording
 from nlos_cam.camera.sdk import load_sdk
 from nlos_cam.camera.session import SampleQueue
@@ -23,7 +23,6 @@ from nlos_cam.errors import CameraLostError
 from nlos_cam.render import DEPTH_UNIT_M, Fault, SensedImages
 
 NAME = "Simulated L515"
-SERIAL = "simulated"
 SENSOR_NAME = "L500 Depth Sensor"
 MOTION_NAME = "Motion Module"
 
@@ -52,7 +51,7 @@ class SoftwareLidar:
         self._domain = domains.hardware_clock if has_own_clock else domains.global_time
         self.device: Any = sdk.software_device()
         self.device.update_info(sdk.camera_info.name, NAME)
-        self.device.register_info(sdk.camera_info.serial_number, SERIAL)
+        self.device.register_info(sdk.camera_info.serial_number, SIMULATED_SERIAL)
         self.device.register_info(sdk.camera_info.product_line, "L500")
         self._sensor: Any = self.device.add_sensor(SENSOR_NAME)
         self._sensor.add_read_only_option(sdk.option.depth_units, DEPTH_UNIT_M)
@@ -228,7 +227,7 @@ class SimulatedCamera(LiveCamera):
             self._clock,
         )
         self.rig: Rig | None = world.rig
-        self.identity: Mapping[str, str] = {"name": NAME, "serial": SERIAL}
+        self.identity: Mapping[str, str] = {"name": NAME, "serial": SIMULATED_SERIAL}
 
     def __enter__(self) -> Self:
         self._start_s = None

@@ -139,7 +139,8 @@ def adapt(
         commands = []
         more += f" --frames {locked.frames} --radiometry {locked.radiometry}"
     if folder and result.is_better:
-        commands = [f"nlos-cam live --camera l515 --bench {name}"]
+        camera = benches.camera_to_name(measured.record) if measured else "l515"
+        commands = [f"nlos-cam live --camera {camera} --bench {name}"]
     more += f" --out {shlex.quote(str(out))}" if out else ""
     _report(result, target, [*commands, more], work / PAGE, expected_iou, as_json=json)
 

@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-import shlex
-from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, NamedTuple
 
 import nlos_calibration as walls
-import nlos_models as models
 import typer
 
 from nlos_cam import bench as benches
@@ -98,30 +95,6 @@ def bench_or_rig(name: str | Path) -> tuple[walls.Rig, walls.MeasuredWall | None
     else:
         return walls.rig_named(name), None
     return measured.record.rig, measured
-
-
-def weights_verdict(
-    rig: walls.Rig, trained: models.CheckpointRecord, bench: benches.Bench | None
-) -> reconstruct.WeightsVerdict:
-    """Return whether weights serve a rig, for the user, with the bench folder to train others in
-    and what to expect of them.
-    """
-    if bench is None:
-        return reconstruct.weights_serve(rig, trained)
-    folder = shlex.quote(str(bench.folder))
-    expected_iou = bench.expected_iou
-    served = reconstruct.weights_serve(rig, trained, expected_iou=expected_iou, bench=folder)
-
-    # weights of few minutes are the bench's own, and may still be poor
-    reached_iou = trained.figures.get(benches.TEST_IOU)
-    if served.service != "trained for it" or reached_iou is None:
-        return served
-    sentence = f"{served.sentence} (silhouette IoU {reached_iou:.2f} on the test objects"
-    if expected_iou is not None and reached_iou < expected_iou - benches.FORECAST_SCATTER_IOU:
-        sentence += (
-            f", where {expected_iou:.2f} is expected: more --minutes of `nlos-cam adapt {folder}`"
-        )
-    return replace(served, sentence=f"{sentence})")
 
 
 def store_forecast(folder: Path, station: str | None = None) -> None:

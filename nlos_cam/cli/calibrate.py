@@ -290,7 +290,7 @@ def calibrate(
         benching.store_forecast(target.folder)
     loaded = benches.load_bench(target.folder) if target.folder else None
     trained = models.load_record(models.weights_folder(loaded.weights if loaded else None))
-    served = benching.weights_verdict(loaded.rig if loaded else record.rig, trained, loaded)
+    served = benches.weights_verdict(loaded.rig if loaded else record.rig, trained, loaded)
     result["weights"] = {
         "serve": served.serve,
         "verdict": served.sentence,
@@ -400,9 +400,11 @@ def _next_step(folder: Path, record: walls.WallRecord, served: reconstruct.Weigh
     bench needs them.
     """
     name = shlex.quote(str(folder))
+    camera = benches.camera_to_name(record)
     if record.occluder is None:
-        return f"put the occluder up, then nlos-cam calibrate --occluder {name}"
-    live = f"nlos-cam live --bench {name}"
+        occluder = f"nlos-cam calibrate --occluder {name} --camera {camera}"
+        return f"put the occluder up, then {occluder}"
+    live = f"nlos-cam live --camera {camera} --bench {name}"
     return live if served.serve else f"nlos-cam adapt {name} --minutes 10, then {live}"
 
 

@@ -12,6 +12,7 @@ from typing import Annotated
 import typer
 from rich.markup import escape
 
+from nlos_cam import bench as bench_folders
 from nlos_cam import camera as cameras
 from nlos_cam import live as loop
 from nlos_cam import reconstruct
@@ -248,8 +249,8 @@ def _load_pipeline(
     network = reconstruct.load_networks(chosen.weights)
     uncertainty_model = reconstruct.load_uncertainty(chosen.weights)
     common.say(f"Loaded model {network.record.rig_name} ({network.runtime})")
-    served = benches.weights_verdict(bench.rig, network.record, chosen.bench)
-    if served.service == "trained for it":
+    served = bench_folders.weights_verdict(bench.rig, network.record, chosen.bench)
+    if not served.is_warning:
         common.say(served.sentence[:1].upper() + served.sentence[1:])
     for warning in reconstruct.compatibility_warnings(
         bench, network.record, uncertainty_model, served

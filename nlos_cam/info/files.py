@@ -14,6 +14,7 @@ import numpy as np
 from nlos_calibration import load_rig, load_wall
 from nlos_models.training import load_recipe
 
+from nlos_cam.bench import camera_to_name
 from nlos_cam.errors import NlosCamError, RecordingError
 from nlos_cam.files import read_arrays, read_bounded, read_toml, with_commit
 
@@ -294,9 +295,12 @@ def _wall(path: Path, quoted: str) -> Description:
             if reference.exists()
             else f"its reference {reference} is missing: put it back, or calibrate again"
         )
-    following = [f"nlos-cam live --camera l515 --wall {quoted}"]
+    camera = camera_to_name(record)
+    following = [f"nlos-cam live --camera {camera} --wall {quoted}"]
     if record.occluder is None:
-        following.append(f"nlos-cam calibrate --occluder {quoted} --camera l515 --out bench.toml")
+        following.append(
+            f"nlos-cam calibrate --occluder {quoted} --camera {camera} --out bench.toml"
+        )
     return Description(
         "wall record",
         facts,

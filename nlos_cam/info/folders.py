@@ -8,7 +8,7 @@ from pathlib import Path
 
 from nlos_models import load_record
 
-from nlos_cam.bench import MANIFEST, is_bench, load_bench
+from nlos_cam.bench import MANIFEST, camera_to_name, is_bench, load_bench
 from nlos_cam.errors import RecordingError
 from nlos_cam.files import CHECKSUMS, TEXT_LIMIT, checksums_of, read_bounded
 from nlos_cam.info.files import (
@@ -29,7 +29,8 @@ def describe_bench(folder: Path, _verify: bool) -> Description | None:
     record = bench.record
     quoted = shlex.quote(str(folder))
     facts = {"camera": record.camera.serial or "not known"}
-    following = [f"nlos-cam live --bench {quoted}"]
+    camera = camera_to_name(bench.measured.record)
+    following = [f"nlos-cam live --camera {camera} --bench {quoted}"]
     for name, measured in bench.stations.items():
         wall = measured.record
         facts[f"station {name}"] = (
@@ -38,7 +39,7 @@ def describe_bench(folder: Path, _verify: bool) -> Description | None:
         )
         facts[f"verdict on {name}"] = f"{wall.verdict}: {wall.advice}"
         if wall.occluder is None:
-            following.insert(0, f"nlos-cam calibrate --occluder {quoted}")
+            following.insert(0, f"nlos-cam calibrate --occluder {quoted} --camera {camera}")
     facts["weights"] = "its own" if bench.weights else "none: the shipped ones are used"
     created = f"{record.created:%Y-%m-%d %H:%M:%S} UTC"
     changed = f"{record.changed:%Y-%m-%d %H:%M:%S} UTC"

@@ -425,7 +425,7 @@ def compatibility_warnings(
     `served` is the verdict of `weights_serve`, for callers that have more to say in it.
     """
     served = served or weights_serve(bench.rig, trained)
-    warnings = [] if served.service == "trained for it" else [served.sentence]
+    warnings = [served.sentence] if served.is_warning else []
     if bench.measured and not bench.reference:
         warnings.append(
             "this wall record has no reference: no difference maps, and a moved lidar goes"

@@ -29,6 +29,13 @@ class WeightsVerdict:
     expected_iou: float | None = None
     """Silhouette IoU that weights trained for this bench can be expected to reach; None where it
     was not forecast."""
+    falls_short: bool = False
+    """True for weights that were trained for this bench, and reached less than was forecast."""
+
+    @property
+    def is_warning(self) -> bool:
+        """True if larger errors than the bench's own good weights make are to be expected."""
+        return self.service != "trained for it" or self.falls_short
 
     @property
     def serve(self) -> bool:

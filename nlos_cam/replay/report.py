@@ -81,7 +81,7 @@ def replay_document(
         f"warning in {each.frames} frames, from {each.first} to {each.last}: {each.text}"
         for each in results.warnings.spans
     ]
-    commands = _next_commands(camera, folder, out, has_reference=bench.reference is not None)
+    commands = _next_commands(camera, folder, out)
     return Document(
         f"Replay of {camera.uri}",
         subtitle,
@@ -169,7 +169,7 @@ def _files(folder: Path) -> dict[str, str]:
     return files
 
 
-def _next_commands(camera: Camera, folder: Path, out: Path, *, has_reference: bool) -> list[str]:
+def _next_commands(camera: Camera, folder: Path, out: Path) -> list[str]:
     bag = shlex.quote(camera.uri.removeprefix("bag:"))
     commands = [f"nlos-cam info {bag}"]
     if not (folder / "object").exists():
@@ -177,6 +177,4 @@ def _next_commands(camera: Camera, folder: Path, out: Path, *, has_reference: bo
         commands.append(f"nlos-cam export {result} --object ply,glb,csv")
     if not (folder / "replay.webm").exists():
         commands.append(f"nlos-cam replay {bag} --stills 6 --video")
-    if not has_reference:
-        commands.append(f"nlos-cam replay {bag} --wall wall.toml")
     return commands

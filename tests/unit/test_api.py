@@ -11,10 +11,11 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+import made_benches
 import numpy as np
 import pytest
 from fake_uncertainty import FakeUncertainty
-from fake_wall import SERIAL, WallCamera, bare_wall, write_wall
+from fake_wall import SERIAL, WallCamera, bare_wall, measured_wall, write_wall
 from nlos_calibration.errors import RecordFileError
 from nlos_models.errors import CheckpointError
 from small_frames import SheetNetwork
@@ -22,6 +23,7 @@ from small_frames import SheetNetwork
 import nlos_cam
 from nlos_cam import api
 from nlos_cam.api import Stream
+from nlos_cam.bench import TEST_IOU, ForecastRecord, edit_bench, load_bench
 from nlos_cam.camera.protocol import Camera
 from nlos_cam.errors import CameraNotFoundError, NlosCamError
 from nlos_cam.reconstruct import FrameResult
@@ -93,6 +95,28 @@ def test_stream_of_recording_resumes_after_a_break(opened: Open) -> None:
     assert [one.timestamp_s for one in seen] == [number / 30 for number in range(9)]
     assert stream.dropped == 0
     assert stream.notes == ()
+
+
+def test_notes_say_that_a_benchs_own_weights_fall_short(
+    opened: Open, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("nlos_cam.calibrate.files.report_html", lambda *_: "report")
+        made_benches.write_wall(tmp_path / "bench", measured_wall(tmp_path))
+    rig_checksum = load_bench(tmp_path / "bench").rig.checksum
+    with edit_bench(tmp_path / "bench") as edit:
+        edit.set_forecast("main", ForecastRecord(rig_checksum=rig_checksum, expected_iou=0.64))
+    own = HalfSurface()
+    own.record.rig_checksum = rig_checksum
+    own.record.figures = {TEST_IOU: 0.45}
+    stream = opened(WallCamera(1), bench=tmp_path / "bench")
+    fine = stream.notes
+    monkeypatch.setattr(api.reconstruct, "load_networks", lambda *_: own)
+
+    stream = opened(WallCamera(1), bench=tmp_path / "bench")
+
+    assert stream.notes != fine
+    assert any("0.45" in note and "where 0.64 is expected" in note for note in stream.notes)
 
 
 def test_points_are_surface_in_wall_frame(opened: Open) -> None:

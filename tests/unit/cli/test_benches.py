@@ -10,8 +10,14 @@ from made_benches import make_bench, wall_of, write_wall
 from nlos_calibration import dump_toml, load_rig
 from nlos_models import RECORD, load_record, shipped_folder, weights_folder
 
-from nlos_cam.bench import MANIFEST, ForecastRecord, edit_bench, load_bench, write_weights
-from nlos_cam.cli.benches import weights_verdict
+from nlos_cam.bench import (
+    MANIFEST,
+    ForecastRecord,
+    edit_bench,
+    load_bench,
+    weights_verdict,
+    write_weights,
+)
 from nlos_cam.reconstruct import WALL_GRID
 
 Run = Callable[..., Any]
@@ -249,7 +255,7 @@ def test_info_describes_a_bench_and_its_damage(run: Run, bench: Path) -> None:
 
     assert answer["kind"] == "bench"
     assert answer["facts"]["camera"] == "f0123456"
-    assert answer["next"] == ["nlos-cam live --bench bench"]
+    assert answer["next"] == ["nlos-cam live --camera l515 --bench bench"]
     assert run("info", bench / MANIFEST)["kind"] == "record of a bench"
 
     changed_wall(bench)

@@ -40,7 +40,7 @@ def test_bench_has_camera_stations_weights_and_next_command(tmp_path: Path) -> N
     assert found.facts["camera"] == "f0123456"
     assert found.facts["station main"].endswith("occluder detected")
     assert found.facts["weights"].startswith("none")
-    assert found.next == [f"nlos-cam live --bench {tmp_path / 'bench'}"]
+    assert found.next == [f"nlos-cam live --camera l515 --bench {tmp_path / 'bench'}"]
 
 
 def test_record_of_a_bench_leads_to_its_folder(tmp_path: Path) -> None:

@@ -1,0 +1,36 @@
+"""Verdict on weights for a bench folder, which knows its forecast and what its own weights reached."""
+
+import shlex
+from dataclasses import replace
+
+from nlos_calibration import Rig
+from nlos_models import CheckpointRecord
+
+from nlos_cam.bench.edit import TEST_IOU
+from nlos_cam.bench.folder import Bench
+from nlos_cam.bench.record import FORECAST_SCATTER_IOU
+from nlos_cam.reconstruct import WeightsVerdict, weights_serve
+
+
+def weights_verdict(rig: Rig, trained: CheckpointRecord, bench: Bench | None) -> WeightsVerdict:
+    """Return whether weights serve a rig, for the user, with the bench folder to train others in
+    and what to expect of them.
+    """
+    if bench is None:
+        return weights_serve(rig, trained)
+    folder = shlex.quote(str(bench.folder))
+    expected_iou = bench.expected_iou
+    served = weights_serve(rig, trained, expected_iou=expected_iou, bench=folder)
+
+    reached_iou = trained.figures.get(TEST_IOU)
+    if served.service != "trained for it" or reached_iou is None:
+        return served
+    sentence = f"{served.sentence} (silhouette IoU {reached_iou:.2f} on the test objects"
+
+    # weights of few minutes are the bench's own, and may still be poor
+    falls_short = expected_iou is not None and reached_iou < expected_iou - FORECAST_SCATTER_IOU
+    if falls_short:
+        sentence += (
+            f", where {expected_iou:.2f} is expected: more --minutes of `nlos-cam adapt {folder}`"
+        )
+    return replace(served, sentence=f"{sentence})", falls_short=falls_short)
