@@ -124,5 +124,7 @@ def missing_extra(
     if name not in TRAIN:
         return None
     return MissingExtraError(
-        f'{purpose} needs {name}, which is not installed: pip install "nlos-cam[train]"'
+        f'{purpose} needs {name}, which is not installed: pip install "nlos-cam[train]", in a clone'
+        " pip install -e '.[train]'; without a GPU, first pip install torch --index-url"
+        " https://download.pytorch.org/whl/cpu, which is several GB smaller"
     )

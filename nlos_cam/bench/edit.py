@@ -96,8 +96,11 @@ def check_new(folder: Path) -> None:
     """Raise OutputExistsError where a bench cannot be made or continued at a path."""
     if os.path.lexists(folder) and not folder.is_dir():
         raise OutputExistsError(f"{folder} is a file, but --bench must be a folder: choose another")
-    if not folder.absolute().parent.is_dir():
-        raise OutputExistsError(f"the folder of {folder} does not exist: create it first")
+    nearest = next(path for path in folder.absolute().parents if os.path.lexists(path))
+    if not nearest.is_dir():
+        raise OutputExistsError(
+            f"{folder} cannot be made, because {nearest} is a file: choose another --bench"
+        )
     if folder.is_dir() and any(folder.iterdir()) and not is_bench(folder):
         raise OutputExistsError(
             f"{folder} holds other files and no bench: choose another name for --bench"
@@ -106,12 +109,13 @@ def check_new(folder: Path) -> None:
 
 @contextmanager
 def edit_bench(folder: Path) -> Generator[BenchEdit]:
-    """Hold a bench folder, which is made if it is missing, and write its record on success.
+    """Hold a bench folder, which is made if it is missing, with the folders above it, and write its
+    record on success.
 
     The record comes last: a kill before leaves files that do not match it, which `load_bench`
     names. Raises FileBusyError while another process holds it, RecordFileError for a damaged one.
     """
-    folder.mkdir(exist_ok=True)
+    folder.mkdir(parents=True, exist_ok=True)
     with atomic_file(folder / MANIFEST) as part:
         before = load_bench_record(folder) if (folder / MANIFEST).exists() else None
         edit = BenchEdit(folder, before)

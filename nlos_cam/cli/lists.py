@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from math import degrees
 from pathlib import Path
 from typing import Annotated
 
@@ -13,7 +14,7 @@ from nlos_models import training
 from nlos_cam import camera as cameras
 from nlos_cam import objects as shapes
 from nlos_cam import render as renderer
-from nlos_cam.cli.common import Json, finish
+from nlos_cam.cli.common import PAPER_RIG, Json, finish
 
 RigName = Annotated[
     str | None,
@@ -28,8 +29,19 @@ def scenes(json: Json = False) -> None:
     _print("scenes", {**cameras.SIMULATED, **examples}, as_json=json)
 
 
-def objects(json: Json = False) -> None:
+def objects(
+    test: Annotated[
+        bool,
+        typer.Option("--test", help="List the 54 test objects of `evaluate` instead."),
+    ] = False,
+    json: Json = False,
+) -> None:
     """List the kinds of hidden objects, for `render` and scene files."""
+    if test:
+        box = shapes.object_box(walls.load_rig(PAPER_RIG))
+        found = {each.name: _placed(each) for each in shapes.benchmark_objects(box)}
+        _print("objects", found, as_json=json)
+        return
     kinds = shapes.CATEGORIES.items()
     varies = {name: f"varies in {', '.join(kind.settings)}" for name, kind in kinds}
     _print("objects", varies, as_json=json)
@@ -52,6 +64,18 @@ def recipes(json: Json = False) -> None:
     """List the packaged training recipes, for --recipe."""
     titles = {name: _title(path) for name, path in training.packaged_recipes().items()}
     _print("recipes", titles, as_json=json)
+
+
+def _placed(subject: shapes.BenchmarkObject) -> str:
+    """Return the settings of a test object, and how it stands in the box."""
+    settings = ", ".join(f"{name} {value:.2f}" for name, value in subject.settings.items())
+    pose = subject.pose
+    turns = (pose.tilt_x_rad, pose.tilt_y_rad, pose.turn_z_rad)
+    angles = ", ".join(f"{degrees(turn):.0f}" for turn in turns)
+    return (
+        f"{settings}; {100 * pose.size_m:.0f} cm, front {1e3 * pose.front_m:.0f} mm behind the"
+        f" box's, turned {angles} degrees about x, y, z"
+    )
 
 
 def _title(path: Path) -> str:

@@ -150,14 +150,15 @@ def describe_run(folder: Path, _verify: bool) -> Description:
     return Description("training run", facts, "", "", "", "log", following)
 
 
+def _page_in(folder: Path) -> list[str]:
+    """Return the command that shows a folder's report, where it has one."""
+    page = folder / "report.html"
+    return [f"open {shlex.quote(str(page))}"] if page.exists() else []
+
+
 def describe_replay(folder: Path, verify: bool) -> Description:
     """Describe a replay from its result."""
     found = describe_npz(folder / "reconstruction.npz", verify)
-    page = (
-        [f"open {shlex.quote(str(folder / 'report.html'))}"]
-        if (folder / "report.html").exists()
-        else []
-    )
     return Description(
         "replay",
         found.facts,
@@ -165,7 +166,7 @@ def describe_replay(folder: Path, verify: bool) -> Description:
         "nlos-cam replay",
         found.problem,
         found.checked,
-        [*page, *found.next],
+        [*_page_in(folder), *found.next],
     )
 
 
@@ -201,7 +202,7 @@ def describe_figures(folder: Path, _verify: bool) -> Description:
             if iou["value"]
             else "none"
         )
-    following = [f"open {shlex.quote(str(folder / 'report.html'))}"]
+    following = _page_in(folder)
     return Description("evaluation", facts, "", "nlos-cam evaluate", "", "JSON", following)
 
 

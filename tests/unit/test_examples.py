@@ -54,6 +54,13 @@ def recording(folder: Path, recorded: Callable[..., Path]) -> Record:
     )
 
 
+def test_python_page_shows_the_example() -> None:
+    page = EXAMPLES.parent / "docs" / "howto-python.md"
+    code = (EXAMPLES / "live_depth.py").read_text(encoding="utf-8")
+
+    assert f"```python\n{code}```" in page.read_text(encoding="utf-8")
+
+
 @pytest.mark.slow
 def test_live_depth_and_point_cloud_find_the_cup(run: Run, recording: Record, folder: Path) -> None:
     bag = recording("still.toml", 3)

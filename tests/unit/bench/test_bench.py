@@ -159,12 +159,13 @@ def test_interrupted_edit_leaves_the_bench_as_it_was(folder: Path) -> None:
 def test_folder_with_other_files_does_not_become_a_bench(folder: Path, tmp_path: Path) -> None:
     check_new(folder)
     check_new(tmp_path / "new")
+    check_new(tmp_path / "none" / "bench")
     (tmp_path / "photos").mkdir()
     (tmp_path / "photos/one.png").touch()
     (tmp_path / "file").touch()
 
     assert is_bench(folder)
-    for taken in ("photos", "file", "none/bench"):
+    for taken in ("photos", "file", "file/bench"):
         assert not is_bench(tmp_path / taken)
         with pytest.raises(OutputExistsError):
             check_new(tmp_path / taken)

@@ -59,6 +59,7 @@ def test_command_runs_without_the_extra_or_names_it_in_one_line(
     [
         ("scenes", "sim:empty"),
         ("objects", "airplane"),
+        ("objects --test", "cup-2"),
         ("rigs", "paper-rig"),
         ("recipes", "transfer"),
     ],
@@ -66,11 +67,11 @@ def test_command_runs_without_the_extra_or_names_it_in_one_line(
 def test_list_has_a_name_and_a_line_for_each(
     kind: str, name: str, shown: Callable[..., Any]
 ) -> None:
-    rows = [line.split(maxsplit=1) for line in shown(kind).out.splitlines() if line]
+    rows = [line.split(maxsplit=1) for line in shown(*kind.split()).out.splitlines() if line]
 
     assert name in {row[0] for row in rows}
     assert all(len(row) == 2 for row in rows)
-    assert shown(kind, "--json").out.count('"description"') == len(rows)
+    assert shown(*kind.split(), "--json").out.count('"description"') == len(rows)
 
 
 def test_sample_recording_is_small() -> None:
