@@ -577,11 +577,12 @@ def _train_uncertainty(
     uncertainty = models.load_uncertainty_model(judge, graphs, quality=False)
     if uncertainty is None:
         raise SceneError(f"{judge} has no uncertainty network: delete it, and try again")
-    with tracked("fitting the quality model") as on_progress:
+    with tracked("reconstructing objects for the quality model") as on_progress:
         found = data.quality_set(
             pipeline, uncertainty, data.open_dataset(scored), objects, on_progress
         )
-    training.run_quality(judge, found)
+    with tracked("fitting the quality model") as on_progress:
+        training.run_quality(judge, found, on_progress)
     names = *checksums_of(watched), *checksums_of(judge)
     with atomic_directory(folder / WEIGHTS) as part:
         write_checked(part, {name: (judge / name).read_bytes() for name in names})

@@ -483,7 +483,8 @@ def quality(
             objects,
             on_progress,
         )
-    record = training.run_quality(weights, samples)
+    with interrupted_by_signals(), tracked("fitting the quality model") as on_progress:
+        record = training.run_quality(weights, samples, on_progress)
     values = {name: value for name, value in record.figures.items() if name.startswith("all_")}
     text = f"quality model beside {weights}; on kinds left out: {_values(values)}"
     trusted = {"trusted_above": record.trusted_above}

@@ -3,7 +3,7 @@ objects that were left out of the fit.
 """
 
 import json
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -27,6 +27,8 @@ from nlos_models.quality import (
     normalised,
 )
 
+OnFit = Callable[[int, int], None]
+"""Called with the fits done and in all."""
 FOLDS = 6
 """Groups of kinds, or of objects, that are left out in turn."""
 WIDTH = 32
@@ -92,23 +94,36 @@ def left_out_rows(count: int) -> list[tuple[Int64, Int64]]:
     return [(np.flatnonzero(group != fold), np.flatnonzero(group == fold)) for fold in range(FOLDS)]
 
 
-def fit_quality(samples: QualitySet, watches: str) -> QualityRecord:
+def fit_quality(
+    samples: QualitySet, watches: str, on_fit: OnFit = lambda _done, _total: None
+) -> QualityRecord:
     """Fit a quality model; its threshold comes from objects, its figures from kinds, left out of
     further fits.
+
+    A fit takes seconds on an idle core, and there are 13: `on_fit` is called after each.
     """
     # The threshold decides about frames of known and of unknown objects alike, so that it comes
     # from objects left out; the figures that are printed are harder, of kinds left out.
     good = samples.iou >= GOOD_IOU
     count = len(samples.iou)
-    above = trusted_above(
-        QualityEstimate.of(_left_out(samples, left_out_rows(count), watches), None).good,
-        good,
-        samples.generic,
-    )
-    outputs = _left_out(samples, left_out_folds(samples.kind.tolist()), watches)
+    by_row = left_out_rows(count)
+    by_kind = left_out_folds(samples.kind.tolist())
+    total = len(by_row) + len(by_kind) + 1
+    done = 0
+
+    def fit(rows: Int64) -> QualityRecord:
+        nonlocal done
+        found = _fit(samples, rows, watches)
+        done += 1
+        on_fit(done, total)
+        return found
+
+    known = QualityEstimate.of(_left_out(samples, by_row, fit), None)
+    above = trusted_above(known.good, good, samples.generic)
+    outputs = _left_out(samples, by_kind, fit)
     figures = judged_figures(QualityEstimate.of(outputs, above), samples)
     # What is kept has seen all frames; the fits above only measure.
-    whole = _fit(samples, np.arange(count), watches)
+    whole = fit(np.arange(count))
     return whole.model_copy(update={"trusted_above": above, "figures": figures})
 
 
@@ -120,14 +135,16 @@ def write_quality(folder: Path, record: QualityRecord) -> None:
     write_checked(folder, {QUALITY: f"{text}\n".encode()})
 
 
-def _left_out(samples: QualitySet, folds: Sequence[tuple[Int64, Int64]], watches: str) -> Float32:
+def _left_out(
+    samples: QualitySet,
+    folds: Sequence[tuple[Int64, Int64]],
+    fit: Callable[[Int64], QualityRecord],
+) -> Float32:
     """Return the outputs (n, OUTPUTS) of models that were fitted without the objects they judge."""
     # NaN where no fold judges a row, so that a forgotten one cannot pass as an answer.
     outputs = np.full((len(samples.iou), OUTPUTS), np.nan, np.float32)
     for fitted, judged in folds:
-        outputs[judged] = QualityModel(_fit(samples, fitted, watches)).outputs(
-            samples.figures[judged]
-        )
+        outputs[judged] = QualityModel(fit(fitted)).outputs(samples.figures[judged])
     return outputs
 
 

@@ -36,7 +36,7 @@ from nlos_models.training import checkpoints
 from nlos_models.training.data import MapSet, MapSource
 from nlos_models.training.direct import NormalSource, train_direct, transfer_direct
 from nlos_models.training.loop import Running
-from nlos_models.training.quality import QualitySet, fit_quality, write_quality
+from nlos_models.training.quality import OnFit, QualitySet, fit_quality, write_quality
 from nlos_models.training.recipe import (
     CompressorRecipe,
     DirectRecipe,
@@ -312,11 +312,11 @@ def run_uncertainty(
     return {**figures, "error_scale": fitted.error_scale, "outside_above": fitted.outside_above}
 
 
-def run_quality(weights: Path, samples: QualitySet) -> QualityRecord:
+def run_quality(weights: Path, samples: QualitySet, on_fit: OnFit) -> QualityRecord:
     """Fit the quality model of the uncertainty network in a folder, and write it beside that
-    network.
+    network; `on_fit` as for `fit_quality`.
     """
-    record = fit_quality(samples, checksum_of_watched(weights, UNCERTAINTY_FILES))
+    record = fit_quality(samples, checksum_of_watched(weights, UNCERTAINTY_FILES), on_fit)
     write_quality(weights, record)
     return record
 
