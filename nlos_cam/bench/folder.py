@@ -64,6 +64,11 @@ class Bench:
         return found.expected_iou if found and found.rig_checksum == self.rig.checksum else None
 
     @property
+    def has_old_forecast(self) -> bool:
+        """True if the forecast is of another rig: the object box was edited since."""
+        return bool(self.record.stations[self.station].forecast) and self.expected_iou is None
+
+    @property
     def calibrated(self) -> CalibratedRig:
         """New rig with reference and drift, which starts at its first frame."""
         return CalibratedRig(self.rig, self.measured, self._notes())

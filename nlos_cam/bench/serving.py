@@ -21,6 +21,12 @@ def weights_verdict(rig: Rig, trained: CheckpointRecord, bench: Bench | None) ->
     folder = shlex.quote(str(bench.folder))
     expected_iou = bench.expected_iou
     served = weights_serve(rig, trained, expected_iou=expected_iou, bench=folder)
+    if bench.has_old_forecast:
+        old = (
+            f"{served.sentence} (the forecast is of another object box: `nlos-cam predict {folder}`"
+            " makes it again)"
+        )
+        served = replace(served, sentence=old)
 
     reached_iou = trained.figures.get(TEST_IOU)
     if served.service != "trained for it" or reached_iou is None:

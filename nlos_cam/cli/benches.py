@@ -109,12 +109,16 @@ def store_forecast(folder: Path, station: str | None = None) -> None:
     from nlos_cam.forecast import forecast  # not for `live`
 
     common.say("Forecasting what this bench can show")
-    found = forecast(bench.rig, quick=True)
+    keep_forecast(bench, forecast(bench.rig, quick=True).expected_iou)
+
+
+def keep_forecast(bench: benches.Bench, expected_iou: float) -> None:
+    """Enter the forecast for a bench's rig in its record."""
     entry = benches.ForecastRecord(
-        rig_checksum=bench.rig.checksum, expected_iou=round(found.expected_iou, 3)
+        rig_checksum=bench.rig.checksum, expected_iou=round(expected_iou, 3)
     )
-    with benches.edit_bench(folder) as edit:
-        edit.set_forecast(station, entry)
+    with benches.edit_bench(bench.folder) as edit:
+        edit.set_forecast(bench.station, entry)
 
 
 def files_in_bench(

@@ -9,6 +9,7 @@ from typing import Annotated
 import typer
 from rich.table import Table
 
+from nlos_cam import bench as bench_folders
 from nlos_cam import forecast, objects
 from nlos_cam.cli import benches
 from nlos_cam.cli.common import (
@@ -18,6 +19,7 @@ from nlos_cam.cli.common import (
     finish,
     interrupted_by_signals,
     output_path,
+    say,
     show,
     tracked,
 )
@@ -80,6 +82,7 @@ def predict(
         if not quick and shape is None:
             with tracked("trying changes of the bench") as on_progress:
                 advice = forecast.changes(own, on_progress)
+    _renew_forecast(rig, found)
     if path is not None:
         forecast.write_report(found, path, advice, hidden or "")
     facts = found.as_json() | {
@@ -98,6 +101,16 @@ def predict(
         show(_table(found))
         lines.insert(0, forecast.COLUMNS)
     finish(facts, as_json=json, text="\n".join(lines))
+
+
+def _renew_forecast(name: str | None, found: forecast.Forecast) -> None:
+    """Enter a forecast in the record of a bench whose object box was edited since its own."""
+    if name is None or not Path(name).is_dir():
+        return
+    bench = bench_folders.load_bench(name)
+    if bench.has_old_forecast:
+        benches.keep_forecast(bench, found.expected_iou)
+        say(f"Renewed the forecast in {bench.folder}")
 
 
 def _table(found: forecast.Forecast) -> Table:

@@ -212,6 +212,23 @@ def test_verdict_on_weights_names_adapt_and_the_forecast(bench: Path) -> None:
     assert "expected silhouette IoU 0.64" in sentence
 
 
+def test_forecast_of_another_box_is_renewed_by_predict(bench: Path, run: Run) -> None:
+    forecast(bench, 0.64)
+    box = load_bench(bench).rig.object_box
+    assert box is not None
+    nearer = box.model_copy(update={"z_far_m": box.z_far_m - 0.05})
+    with edit_bench(bench) as edit:
+        station = edit.stations["main"].model_copy(update={"object_box": nearer})
+        edit.set_station("main", station, load_bench(bench).measured.record)
+    edited = verdict(bench)
+    found = run("predict", bench, "--quick")
+
+    assert "nlos-cam predict bench" in edited
+    assert "0.64" not in edited
+    assert "predict" not in verdict(bench)
+    assert load_bench(bench).expected_iou == pytest.approx(found["expected_iou"], abs=1e-3)
+
+
 def test_verdict_on_own_weights_says_how_far_they_are(bench: Path) -> None:
     own = Path("own")
     own.mkdir()
