@@ -17,6 +17,7 @@ import argparse
 import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
+from itertools import repeat
 from pathlib import Path
 from threading import Event
 from typing import Any
@@ -254,7 +255,7 @@ def on_bench(
         part: read_labelled(paths, frames=1, on_progress=on_progress)
         for part, paths in found.items()
     }
-    aligned = {part: align_all(one.maps, one.rig, trained) for part, one in read.items()}
+    aligned = {part: align_all(one.maps, repeat(one.rig), trained) for part, one in read.items()}
     return {"bench": aligned, "bench, not aligned": {part: one.maps for part, one in read.items()}}
 
 
@@ -378,7 +379,7 @@ def _reached(lesson: Lesson, trainer: Trainer, held_out: Labelled) -> dict[str, 
 def _judged(weights: Path | None, held_out: Labelled) -> dict[str, Any]:
     reconstructor = load_reconstructor(weights, cache_folder() / "onnx")
     return judge(
-        reconstructor, align_all(held_out.maps, held_out.rig, reconstructor.record), paper_box()
+        reconstructor, align_all(held_out.maps, repeat(held_out.rig), reconstructor.record), paper_box()
     )
 
 
