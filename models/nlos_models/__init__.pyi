@@ -26,6 +26,7 @@ __all__ = [
     "cut_silhouette",
     "export_folder",
     "foreground_rmse_mm",
+    "image_from_logits",
     "lift_edges",
     "load_network",
     "load_pipeline",
@@ -42,7 +43,7 @@ __all__ = [
 ]
 
 from .checkpoint import load_network, load_pipeline
-from .direct import CellNormal, DirectNetwork, channels_of
+from .direct import CellNormal, DirectNetwork, channels_of, image_from_logits
 from .export import export_folder
 from .inference import (
     Answer,

@@ -249,16 +249,23 @@ class DirectNetwork(nn.Module):
 
         In color four channels become four logits.
         """
+        return self.decode(self.encode(normal), normal.shape[1])
+
+    def encode(self, normal: Tensor) -> Tensor:
+        """Map normalised maps (n, 2 or 4, 64, 80) to features of both sides (n, 2, width)."""
         # The bottom half upside down: row k of either side is as far from the plane of symmetry.
         sides = torch.stack(
             [normal[..., : ROWS // 2, :], normal[..., ROWS // 2 :, :].flip(-2)], dim=1
         )
         x = functional.gelu(self.patch(_patches(sides, PATCH)))  # (n, 2, 8, 20, within)
         x = functional.gelu(self.merge(_patches(x.movedim(-1, 2), 2)))  # (n, 2, 4, 10, features)
-        x = self.trunk(self.into(x.flatten(2)))
+        return self.into(x.flatten(2))
+
+    def decode(self, features: Tensor, channels: int) -> Tensor:
+        """Map features of both sides (n, 2, width) to logits (n, 2 or 4, 64, 64)."""
+        x = self.trunk(features)
         x = self.out(x).unflatten(-1, self.place.shape) + self.place
         x = self.heads(self.norm(self.mixers(x)))  # (n, 2, 32, 128)
-        channels = normal.shape[1]
         x = x.unflatten(-1, (channels, TOKEN, TOKEN)).unflatten(
             2, SIDE_TOKENS
         )  # (n, side, row, column, head, y, x)

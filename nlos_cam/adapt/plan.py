@@ -9,7 +9,6 @@ import json
 from pathlib import Path
 from typing import Annotated
 
-import numpy as np
 from nlos_calibration import MeasuredWall, Record
 from nlos_models.training import DirectRecipe, UncertaintyRecipe
 from pydantic import Field, ValidationError
@@ -17,6 +16,7 @@ from pydantic import Field, ValidationError
 from nlos_cam.dataset import SHARD, RigSpread
 from nlos_cam.errors import RecordingError
 from nlos_cam.files import TEXT_LIMIT, atomic_file, read_bounded
+from nlos_cam.reconstruct import measured_counts
 from nlos_cam.render import Material, Radiometry, SensorModel
 
 PLAN = "plan.json"
@@ -211,6 +211,6 @@ def bench_sensor(measured: MeasuredWall | None) -> SensorModel:
     """Return the sensor of a bench: the simulated one, at the gain that its reference shows."""
     if measured is None or measured.reference is None:
         return SensorModel()
-    # the brightest cell of a wall without noise; a percentile, since single cells glitter
-    counts = float(np.nanpercentile(measured.reference.map_intensity, 99.5))
-    return SensorModel(bare_wall_counts=max(counts, 1.0))
+    record = measured.record
+    counts = measured_counts(record.rig, measured.reference, record.range_offset_m)
+    return SensorModel() if counts is None else SensorModel(bare_wall_counts=max(counts, 1.0))

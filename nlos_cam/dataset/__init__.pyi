@@ -40,6 +40,7 @@ __all__ = [
     "label_recordings",
     "list_recordings",
     "locked_difference",
+    "map_noise",
     "measured_bare_wall",
     "objects_from_folder",
     "open_dataset",
@@ -92,7 +93,7 @@ from .outliers import (
     draw_outlier,
     outliers_beside,
 )
-from .packed import PackedMaps, open_packed_maps
+from .packed import PackedMaps, map_noise, open_packed_maps
 from .plan import DatasetPlan, Objects, RigSpread
 from .ray_backend import ray_farm
 from .reader import Dataset, open_dataset

@@ -45,6 +45,7 @@ __all__ = [
     "load_networks",
     "load_uncertainty",
     "log_warning",
+    "measured_counts",
     "open_bench",
     "reconstruct",
     "rig_to_align_with",
@@ -62,6 +63,7 @@ from .alignment import (
     rig_to_align_with,
 )
 from .bench import CalibratedRig, check_intrinsics, open_bench
+from .flat_field import measured_counts
 from .frame_reader import Arrival, FrameReader, ignore
 from .network import Clock, Quality, Reconstruction, estimate_uncertainty, reconstruct
 from .physics_check import (

@@ -16,6 +16,7 @@ And a frame is worth what its cells are worth: `information` says how often a ce
 about objects in the box, so that missing cells count by what is lost with them.
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from enum import StrEnum
 from functools import lru_cache
@@ -27,8 +28,8 @@ from nlos_calibration.arrays import Float64, Mask
 from nlos_cam.frames import MAP_COLUMNS, MAP_ROWS, SATURATED, LidarMaps
 from nlos_cam.objects import object_box, object_depth
 from nlos_cam.reconstruct.bench import CalibratedRig
-from nlos_cam.reconstruct.physics_check import bare_rendering
-from nlos_cam.render import Scene, cast, render
+from nlos_cam.reconstruct.flat_field import MIN_WALL_CELLS, inner, same_surface, wall_as_rendered
+from nlos_cam.render import Rendering, Scene, SensorModel, cast, render
 
 OFF_WALL_M = 0.009
 """Depth beyond the wall's from which on a cell shows an echo: three times the error of a bench's
@@ -38,9 +39,6 @@ LOST_SHARE = 0.03
 """Share of the information from which on a frame is no longer judged by its networks. With a tenth
 of the rows missing a share of 0.09 is lost, and the silhouette IoU falls from 0.64 to 0.42.
 """
-SAME_WALL_M = 0.03
-"""Largest difference of measured and calibrated depth at which a cell's reference is of the wall: it
-was measured without the occluder, or with another one."""
 MOVED_M = 0.006
 """Median depth of the wall's cells off their record: beyond the error of a record and the drift of a
 range over an hour's warming."""
@@ -61,9 +59,13 @@ DARK_INSIDE_CELLS = 30
 DARK_INSIDE = 0.05
 """Light that a cell well inside a region of echoes exceeds: 97 % of unharmed frames have at most 17
 cells that do not."""
-MIN_ECHO_OVERLAP = 0.8
-"""Overlap of the cells that are deeper than the wall with those that are brighter: 0.86 and more
-in 95 % of unharmed frames."""
+DARK_INSIDE_SHARE = 0.05
+"""Share of the cells inside that has to be dark as well: large regions have more of them."""
+ECHO_OVERLAP = 0.9
+"""Smallest overlap of the cells that are deeper than the wall with those that are brighter, on a
+bench whose echoes are strong."""
+OVERLAP_MARGIN = 0.04
+"""What noise may take from the overlap of rendered objects."""
 MIN_ECHO_CELLS = 100
 BRIGHTER = 0.1
 SEAM = 0.07
@@ -76,7 +78,6 @@ TILT = 0.06
 0.09, one row 0.03."""
 TEXTURE_SPREADS = 5.0
 """Spreads of the wall's own light that a limit is raised to, for walls that are not uniform."""
-MIN_WALL_CELLS = 100
 INFORMATION_OBJECTS = 16
 INFORMATION_SEED = 910_000
 
@@ -121,20 +122,20 @@ class MapConsistency:
     def __init__(self, bench: CalibratedRig) -> None:
         rig = bench.rig
         self._information = information(rig)  # pyright: ignore[reportArgumentType]  frozen, hashable
-        self._depth_m, self._light = _bare_wall(rig)
+        self._overlap = usual_overlap(rig)  # pyright: ignore[reportArgumentType]
+        self._depth_m, self._light = wall_as_rendered(rig)
         if bench.reference is not None:
             self._take_measured(bench.reference, bench.range_offset_m)
 
     def _take_measured(self, reference: BareWall, offset_m: float) -> None:
         """Replace depth and light of the cells where the reference saw the wall of the rig."""
-        measured_m = reference.map_depth_m.astype(np.float64) + offset_m
-        same = np.abs(measured_m - self._depth_m) < SAME_WALL_M  # NaN compares false
-        same &= reference.map_intensity > 0
+        same = same_surface(reference, self._depth_m, offset_m)
         if same.sum() < MIN_WALL_CELLS:
             return
 
         # in the rendering's units, so that cells without a measurement still fit
         units = float(np.median(self._light[same] / reference.map_intensity[same]))
+        measured_m = reference.map_depth_m.astype(np.float64) + offset_m
         self._depth_m = np.where(same, measured_m, self._depth_m)
         self._light = np.where(same, units * reference.map_intensity, self._light)
 
@@ -168,7 +169,7 @@ class MapConsistency:
         problems: list[MapProblem] = []
         if nearer or abs(np.median(beyond_m[at_wall])) > MOVED_M:
             problems.append(MapProblem.OFF_RECORD)
-        if _unlike(light, spread, at_wall, echo, unsaturated):
+        if _unlike(light, spread, at_wall, echo, unsaturated, self._overlap):
             problems.append(MapProblem.UNLIKE)
         if _largest_seam(light, both) > max(SEAM, TEXTURE_SPREADS * spread / SEAM_LIMIT / 2):
             problems.append(MapProblem.TORN)
@@ -215,36 +216,47 @@ def _spread(values: Float64) -> float:
     return 1.4826 * float(np.median(np.abs(values - np.median(values))))
 
 
-def _unlike(light: Float64, spread: float, at_wall: Mask, echo: Mask, unsaturated: Mask) -> bool:
-    """Return True if light and depth name different echoes as the stronger one (2 and 3)."""
+def _unlike(
+    light: Float64,
+    spread: float,
+    at_wall: Mask,
+    echo: Mask,
+    unsaturated: Mask,
+    usual: float,
+) -> bool:
+    """Return True if light and depth name different echoes as the stronger one (2 and 3); `usual`
+    is the least overlap of both that objects on this bench have.
+    """
     texture = TEXTURE_SPREADS * spread
     if (at_wall & (np.abs(light) > max(UNLIKE_WALL, texture))).sum() >= UNLIKE_WALL_CELLS:
         return True
     if (echo & (light < min(TOO_DARK, -texture))).sum() >= TOO_DARK_CELLS:
         return True
-    if (_inner(at_wall) & (light > max(BRIGHT_INSIDE, texture))).sum() > BRIGHT_INSIDE_CELLS:
+    if (inner(at_wall) & (light > max(BRIGHT_INSIDE, texture))).sum() > BRIGHT_INSIDE_CELLS:
         return True
     # on a textured wall some of the cells inside are darker by chance: the limit falls with it
     dark = light < min(DARK_INSIDE, DARK_INSIDE + 2 * BRIGHT_INSIDE / TEXTURE_SPREADS - 2 * spread)
-    if (_inner(echo) & unsaturated & dark).sum() > DARK_INSIDE_CELLS:
+    inside = inner(echo)
+    dark_inside = (inside & unsaturated & dark).sum()
+    if dark_inside > max(DARK_INSIDE_CELLS, DARK_INSIDE_SHARE * inside.sum()):
         return True
 
+    if echo.sum() < MIN_ECHO_CELLS:
+        return False
     brighter = (at_wall | echo) & unsaturated & (light > max(BRIGHTER, texture))
-    deeper = echo & unsaturated
-    both = (brighter & deeper).sum()
-    either = (brighter | deeper).sum()
-    overlap_floor = MIN_ECHO_OVERLAP - max(texture - BRIGHTER, 0.0)
-    return bool(echo.sum() >= MIN_ECHO_CELLS and both < overlap_floor * either)
+    return _overlap(brighter, echo & unsaturated) < usual - 0.5 * max(texture - BRIGHTER, 0.0)
 
 
-def _inner(region: Mask) -> Mask:
-    """Return the cells of a region (64, 80) whose four neighbors belong to it too."""
-    inner = region.copy()
-    inner[1:] &= region[:-1]
-    inner[:-1] &= region[1:]
-    inner[:, 1:] &= region[:, :-1]
-    inner[:, :-1] &= region[:, 1:]
-    return inner
+def _overlap(brighter: Mask, deeper: Mask) -> float:
+    """Return the share (0 to 1) of cells that are brighter and deeper than the wall, or neither, of
+    those that are either.
+
+    To a cell: an echo's lead grows from zero at the region's outline, so that its rim is deeper and
+    hardly brighter, and small regions are mostly rim.
+    """
+    beside = ~inner(~deeper)
+    unlike = (brighter & ~beside) | (inner(deeper) & ~brighter)
+    return 1.0 - float(unlike.sum() / max((brighter | deeper).sum(), 1))
 
 
 def _largest_seam(light: Float64, both: Mask) -> float:
@@ -271,14 +283,36 @@ def _tilt(light: Float64, at_wall: Mask) -> float:
     return float(solved[1])
 
 
-def _bare_wall(rig: Rig) -> tuple[Float64, Float64]:
-    """Return depth along the optical axis in metres and light (64, 80) of the cells that see the
-    wall alone; NaN and 0 elsewhere.
+@lru_cache(maxsize=4)
+def usual_overlap(rig: Rig) -> float:
+    """Return the least overlap of brighter with deeper cells that objects on a bench have, less
+    what noise takes of it; at most ECHO_OVERLAP.
+
+    Where the lidar is turned or far, echoes win by little, and more of a region is rim.
     """
-    bare = bare_rendering(rig)  # pyright: ignore[reportArgumentType]
-    on_wall = cast(rig, rig.pinhole.scaled(MAP_COLUMNS, MAP_ROWS)).on_wall
-    sees_wall = _inner(on_wall.reshape(MAP_ROWS, MAP_COLUMNS)) & (bare.intensity > 0)
-    return np.where(sees_wall, bare.depth_m, np.nan), np.where(sees_wall, bare.intensity, 0.0)
+    if rig.object_box is None:
+        return ECHO_OVERLAP
+    depth_m, light = wall_as_rendered(rig)
+    # in the sensor's counts, in which a light of one count is as good as none
+    brightest = cast(rig, rig.pinhole, occluder=False).direct.max()
+    counts = SensorModel().bare_wall_counts / brightest
+    found = [ECHO_OVERLAP + OVERLAP_MARGIN]
+    for rendering in _objects_on(rig):
+        sees_wall = (light > 0) & np.isfinite(rendering.depth_m)
+        echo = sees_wall & (rendering.depth_m - depth_m >= OFF_WALL_M)
+        if echo.sum() < MIN_ECHO_CELLS:
+            continue
+        ratio = (counts * rendering.intensity + 1) / (counts * light + 1)
+        found.append(_overlap(sees_wall & (np.log(ratio) > BRIGHTER), echo))
+    return min(found) - OVERLAP_MARGIN
+
+
+def _objects_on(rig: Rig) -> Iterator[Rendering]:
+    """Render random objects in the rig's box."""
+    box = object_box(rig)
+    for seed in range(INFORMATION_SEED, INFORMATION_SEED + INFORMATION_OBJECTS):
+        _, depth_m = object_depth(seed, box)
+        yield render(Scene(rig, depth_m), "draft")
 
 
 @lru_cache(maxsize=4)
@@ -290,10 +324,7 @@ def information(rig: Rig) -> Float64:
     """
     cells = np.zeros((MAP_ROWS, MAP_COLUMNS))
     if rig.object_box is not None:
-        box = object_box(rig)
-        for seed in range(INFORMATION_SEED, INFORMATION_SEED + INFORMATION_OBJECTS):
-            _, depth_m = object_depth(seed, box)
-            rendering = render(Scene(rig, depth_m), "draft")
+        for rendering in _objects_on(rig):
             echo = rendering.multi.peak
             cells += (echo > 0) & (rendering.intensity <= echo)
     if not cells.any():

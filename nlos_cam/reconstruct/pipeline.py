@@ -25,6 +25,7 @@ from nlos_cam.objects import SurfaceMesh
 from nlos_cam.reconstruct.alignment import MapAlignment, alignment
 from nlos_cam.reconstruct.bench import BenchObservation, CalibratedRig
 from nlos_cam.reconstruct.consistency import COMPLETE, MapConsistency, MapFindings
+from nlos_cam.reconstruct.flat_field import FlatField
 from nlos_cam.reconstruct.frame_reader import Arrival
 from nlos_cam.reconstruct.network import (
     Clock,
@@ -182,6 +183,8 @@ class PreparedBench(NamedTuple):
 
     bench: CalibratedRig
     aligned: MapAlignment | None
+    flat_field: FlatField | None
+    """None where alignment takes the wall's reflectance out."""
     consistency: MapConsistency | None
     """None without an uncertainty model: then no verdict depends on it."""
 
@@ -253,7 +256,8 @@ class Pipeline:
         aligned = alignment(bench.rig, self._trained, bench.reference) if self._trained else None
         consistency = MapConsistency(bench) if self.uncertainty_model else None
         # in one assignment: `prepare` must not see half of it
-        self._bench = PreparedBench(bench, aligned, consistency)
+        flat_field = None if aligned else FlatField(bench)
+        self._bench = PreparedBench(bench, aligned, flat_field, consistency)
 
     @property
     def average(self) -> int:
@@ -274,7 +278,7 @@ class Pipeline:
     def prepare(self, arrival: Arrival, clock: Clock, start_s: float) -> PreparedFrame:
         """Return the maps of a frame as the networks need them; call in frame order."""
         taken_s = clock()
-        bench, aligned, consistency = self._bench  # another thread may replace it
+        bench, aligned, flat_field, consistency = self._bench  # another thread may replace it
         maps = maps_from_frame(arrival.frame)
         mapped_s = clock()
 
@@ -289,7 +293,7 @@ class Pipeline:
         elif self._uses_difference and difference:
             network_input = difference
         else:
-            network_input = corrected
+            network_input = flat_field.correct(corrected) if flat_field else corrected
         findings = consistency.examine(corrected) if consistency else COMPLETE
         frozen = self._frozen.add(arrival.frame)
         observed_s = clock()

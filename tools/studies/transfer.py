@@ -379,7 +379,9 @@ def _reached(lesson: Lesson, trainer: Trainer, held_out: Labelled) -> dict[str, 
 def _judged(weights: Path | None, held_out: Labelled) -> dict[str, Any]:
     reconstructor = load_reconstructor(weights, cache_folder() / "onnx")
     return judge(
-        reconstructor, align_all(held_out.maps, repeat(held_out.rig), reconstructor.record), paper_box()
+        reconstructor,
+        align_all(held_out.maps, repeat(held_out.rig), reconstructor.record),
+        paper_box(),
     )
 
 

@@ -25,7 +25,9 @@ __all__ = [
     "compressor_start",
     "digest_of",
     "direct_start",
+    "figures_of",
     "first_of",
+    "fit",
     "is_better",
     "latent_error",
     "launch",
@@ -49,8 +51,10 @@ __all__ = [
     "train_direct",
     "transfer_start",
     "transfer_weights",
+    "two_heads_error",
     "unwatched",
     "vae_start",
+    "varied",
 ]
 
 from .checkpoints import load_encoder, load_vae
@@ -65,10 +69,10 @@ from .data import (
     first_of,
     subtract_bare_wall,
 )
-from .direct import NormalBatch, NormalSource, train_direct
+from .direct import NormalBatch, NormalSource, train_direct, varied
 from .distributed import launch, open_fabric
-from .loop import Running, digest_of
-from .losses import latent_error
+from .loop import Running, digest_of, fit
+from .losses import latent_error, two_heads_error
 from .quality import QualitySet
 from .recipe import (
     CompressorRecipe,
@@ -102,5 +106,5 @@ from .runs import (
     unwatched,
     vae_start,
 )
-from .tasks import parts_of, rebuild, run
+from .tasks import figures_of, parts_of, rebuild, run
 from .uncertainty import UncertaintySet

@@ -80,7 +80,7 @@ def train_direct(
 
     def loss(batch: NormalBatch, _: float) -> Tensor:
         # Maps are rendered once, without noise; each step draws its own, so that none is learnt.
-        normal = _varied(recipe, network.normal, batch, source.noise)
+        normal = varied(recipe, network.normal, batch, source.noise)
         return two_heads_error(
             logits(normal + recipe.noise * torch.randn_like(normal)), batch.image
         )
@@ -170,7 +170,7 @@ def transfer_direct(
     return network.cpu().eval(), figures
 
 
-def _varied(
+def varied(
     recipe: DirectRecipe, cells: CellNormal, batch: NormalBatch, noise: MapNoise | None
 ) -> Tensor:
     """Return a batch's normalised maps (n, 2, 64, 80) with noise, and on walls and with range

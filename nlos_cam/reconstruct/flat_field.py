@@ -1,0 +1,104 @@
+"""Bare wall of a bench, cell by cell, and the correction of a frame's light by its reflectance.
+
+No wall is uniform, and networks that were trained for a bench's own rig saw one that is. What a
+spot of the wall reflects scales all of its light: the direct return that leaves it, and the echo of
+three bounces that ends there. The bare wall's record holds it, so that it can be divided out, as
+alignment with another rig does.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+from nlos_calibration import BareWall, Rig
+from nlos_calibration.arrays import Float32, Float64, Mask
+
+from nlos_cam.frames import MAP_COLUMNS, MAP_ROWS, LidarMaps
+from nlos_cam.reconstruct.bench import CalibratedRig
+from nlos_cam.reconstruct.physics_check import bare_rendering
+from nlos_cam.render import cast
+
+SAME_SURFACE_M = 0.03
+"""Largest difference of measured and calibrated depth at which a cell's reference is of what the rig
+has there: it may have been measured without the occluder, or with another one."""
+MIN_WALL_CELLS = 100
+MIN_COUNTS = 2.0
+"""Intensity below which a cell's reflectance is not known: counts are whole numbers."""
+LARGEST = 4.0
+"""Largest factor of the correction, either way: a black occluder's noise is not made brighter than that."""
+
+
+class FlatField:
+    """Correction of maps for the reflectance of the wall, as its record shows it.
+
+    The occluder's is taken out too: it tells nothing about what is hidden, but networks have seen
+    it as bright as the wall.
+    """
+
+    def __init__(self, bench: CalibratedRig) -> None:
+        self._factor: Float32 | None = None
+        """(64, 80); light of a uniform bench over this one's, 1 where that is not known."""
+        if bench.reference is None:
+            return
+        bare = bare_rendering(bench.rig)  # pyright: ignore[reportArgumentType]
+        known = same_surface(bench.reference, bare.depth_m, bench.range_offset_m)
+        known &= (bench.reference.map_intensity >= MIN_COUNTS) & (bare.intensity > 0)
+        wall = known & (wall_as_rendered(bench.rig)[1] > 0)
+        if wall.sum() < MIN_WALL_CELLS:
+            return
+        ratio = np.divide(
+            bare.intensity, bench.reference.map_intensity, out=np.ones(known.shape), where=known
+        )
+        # the wall's median is the device's gain, which the networks take out by themselves
+        factor = np.clip(ratio / np.median(ratio[wall]), 1 / LARGEST, LARGEST)
+        self._factor = np.where(known, factor, 1).astype(np.float32)
+
+    def correct(self, maps: LidarMaps) -> LidarMaps:
+        """Return maps (64, 80) as a uniform wall would give them."""
+        if self._factor is None:
+            return maps
+        return replace(maps, intensity=maps.intensity * self._factor)
+
+
+def measured_counts(rig: Rig, reference: BareWall, offset_m: float) -> float | None:
+    """Return the counts of the brightest bare-wall return (`SensorModel.bare_wall_counts`) that a
+    reference shows; None where too little of it is wall.
+
+    By the cells that see the wall alone: an occluder is nearer, and brighter. Their median, so that
+    the wall's texture takes no part.
+    """
+    depth_m, _ = wall_as_rendered(rig)
+    wall = same_surface(reference, depth_m, offset_m)
+    if wall.sum() < MIN_WALL_CELLS:
+        return None
+    direct = cast(rig, rig.pinhole.scaled(MAP_COLUMNS, MAP_ROWS)).direct.reshape(wall.shape)
+    brightest = float(cast(rig, rig.pinhole, occluder=False).direct.max())
+    return brightest * float(np.median(reference.map_intensity[wall] / direct[wall]))
+
+
+def wall_as_rendered(rig: Rig) -> tuple[Float64, Float64]:
+    """Return depth along the optical axis in metres and light (64, 80) of the cells that see the
+    wall alone; NaN and 0 elsewhere.
+    """
+    bare = bare_rendering(rig)  # pyright: ignore[reportArgumentType]
+    on_wall = cast(rig, rig.pinhole.scaled(MAP_COLUMNS, MAP_ROWS)).on_wall
+    sees_wall = inner(on_wall.reshape(MAP_ROWS, MAP_COLUMNS)) & (bare.intensity > 0)
+    return np.where(sees_wall, bare.depth_m, np.nan), np.where(sees_wall, bare.intensity, 0.0)
+
+
+def same_surface(reference: BareWall, depth_m: Float32 | Float64, offset_m: float) -> Mask:
+    """Return the cells (64, 80) whose reference is of a surface at `depth_m`; `offset_m` is the
+    lidar's range offset.
+    """
+    measured_m = reference.map_depth_m.astype(np.float64) + offset_m
+    # NaN compares false
+    return (np.abs(measured_m - depth_m) < SAME_SURFACE_M) & (reference.map_intensity > 0)
+
+
+def inner(region: Mask) -> Mask:
+    """Return the cells of a region (64, 80) whose four neighbors belong to it too."""
+    found = region.copy()
+    found[1:] &= region[:-1]
+    found[:-1] &= region[1:]
+    found[:, 1:] &= region[:, :-1]
+    found[:, :-1] &= region[:, 1:]
+    return found
