@@ -12,14 +12,14 @@ whatever is hidden:
 4. the scene is one exposure, so light does not jump from one row to the next along the whole row;
 5. the wall's light falls off as from the lidar's place: seen from elsewhere it is tilted.
 
-And a frame is worth what its cells are worth: `information` says how often a cell tells anything
+And a frame is worth what its cells are worth: `objects_on_bench` says how often a cell tells anything
 about objects in the box, so that missing cells count by what is lost with them.
 """
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 from enum import StrEnum
 from functools import lru_cache
+from typing import NamedTuple
 
 import numpy as np
 from nlos_calibration import BareWall, Rig
@@ -121,8 +121,8 @@ class MapConsistency:
 
     def __init__(self, bench: CalibratedRig) -> None:
         rig = bench.rig
-        self._information = information(rig)  # pyright: ignore[reportArgumentType]  frozen, hashable
-        self._overlap = usual_overlap(rig)  # pyright: ignore[reportArgumentType]
+        usual = objects_on_bench(rig)  # pyright: ignore[reportArgumentType]  frozen, hashable
+        self._information, self._overlap = usual
         self._depth_m, self._light = wall_as_rendered(rig)
         if bench.reference is not None:
             self._take_measured(bench.reference, bench.range_offset_m)
@@ -283,50 +283,48 @@ def _tilt(light: Float64, at_wall: Mask) -> float:
     return float(solved[1])
 
 
-@lru_cache(maxsize=4)
-def usual_overlap(rig: Rig) -> float:
-    """Return the least overlap of brighter with deeper cells that objects on a bench have, less
-    what noise takes of it; at most ECHO_OVERLAP.
+class ObjectsOnBench(NamedTuple):
+    """What random objects in a rig's box do to its maps."""
 
-    Where the lidar is turned or far, echoes win by little, and more of a region is rim.
-    """
-    if rig.object_box is None:
-        return ECHO_OVERLAP
-    depth_m, light = wall_as_rendered(rig)
-    # in the sensor's counts, in which a light of one count is as good as none
-    brightest = cast(rig, rig.pinhole, occluder=False).direct.max()
-    counts = SensorModel().bare_wall_counts / brightest
-    found = [ECHO_OVERLAP + OVERLAP_MARGIN]
-    for rendering in _objects_on(rig):
-        sees_wall = (light > 0) & np.isfinite(rendering.depth_m)
-        echo = sees_wall & (rendering.depth_m - depth_m >= OFF_WALL_M)
-        if echo.sum() < MIN_ECHO_CELLS:
-            continue
-        ratio = (counts * rendering.intensity + 1) / (counts * light + 1)
-        found.append(_overlap(sees_wall & (np.log(ratio) > BRIGHTER), echo))
-    return min(found) - OVERLAP_MARGIN
-
-
-def _objects_on(rig: Rig) -> Iterator[Rendering]:
-    """Render random objects in the rig's box."""
-    box = object_box(rig)
-    for seed in range(INFORMATION_SEED, INFORMATION_SEED + INFORMATION_OBJECTS):
-        _, depth_m = object_depth(seed, box)
-        yield render(Scene(rig, depth_m), "draft")
+    information: Float64
+    """(64, 80); share of what a frame tells about objects that each cell carries: how often the
+    echo of one wins there (S5), whose path is then measured. The sum is 1."""
+    overlap: float
+    """Least overlap of brighter with deeper cells, less what noise takes of it; at most
+    ECHO_OVERLAP. Where the lidar is turned or far, echoes win by little."""
 
 
 @lru_cache(maxsize=4)
-def information(rig: Rig) -> Float64:
-    """Return the share (64, 80) of what a frame tells about objects that each cell carries.
-
-    A cell tells something about an object if the object's echo wins there (S5): its path is then
-    measured, and that it won. Counted over random objects in the rig's box; the sum is 1.
+def objects_on_bench(rig: Rig) -> ObjectsOnBench:
+    """Return what INFORMATION_OBJECTS random objects show; without an object box all cells are
+    alike.
     """
     cells = np.zeros((MAP_ROWS, MAP_COLUMNS))
+    overlaps = [ECHO_OVERLAP + OVERLAP_MARGIN]
     if rig.object_box is not None:
-        for rendering in _objects_on(rig):
+        box = object_box(rig)
+        bare = wall_as_rendered(rig)
+        for seed in range(INFORMATION_SEED, INFORMATION_SEED + INFORMATION_OBJECTS):
+            _, depth_m = object_depth(seed, box)
+            rendering = render(Scene(rig, depth_m), "draft")
             echo = rendering.multi.peak
             cells += (echo > 0) & (rendering.intensity <= echo)
+            overlaps.append(_overlap_of(rendering, rig, *bare))
     if not cells.any():
         cells += 1
-    return cells / max(cells.sum(), 1.0)
+    return ObjectsOnBench(cells / max(cells.sum(), 1.0), min(overlaps) - OVERLAP_MARGIN)
+
+
+def _overlap_of(rendering: Rendering, rig: Rig, wall_m: Float64, wall_light: Float64) -> float:
+    """Return the overlap of the cells that an object makes brighter and deeper; 1 where they are
+    too few.
+    """
+    sees_wall = (wall_light > 0) & np.isfinite(rendering.depth_m)
+    echo = sees_wall & (rendering.depth_m - wall_m >= OFF_WALL_M)
+    if echo.sum() < MIN_ECHO_CELLS:
+        return 1.0
+    # in the sensor's counts, of which one is added as to measured ones
+    brightest = cast(rig, rig.pinhole, occluder=False).direct.max()
+    counts = SensorModel().bare_wall_counts / brightest
+    ratio = (counts * rendering.intensity + 1) / (counts * wall_light + 1)
+    return _overlap(sees_wall & (np.log(ratio) > BRIGHTER), echo)
