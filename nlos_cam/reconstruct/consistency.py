@@ -28,7 +28,7 @@ from nlos_calibration.arrays import Float64, Mask
 from nlos_cam.frames import MAP_COLUMNS, MAP_ROWS, SATURATED, LidarMaps
 from nlos_cam.objects import object_box, object_depth
 from nlos_cam.reconstruct.bench import CalibratedRig
-from nlos_cam.reconstruct.flat_field import MIN_WALL_CELLS, inner, same_surface, wall_as_rendered
+from nlos_cam.reconstruct.flat_field import MIN_WALL_CELLS, interior, same_surface, wall_as_rendered
 from nlos_cam.render import Rendering, Scene, SensorModel, cast, render
 
 OFF_WALL_M = 0.009
@@ -232,11 +232,11 @@ def _unlike(
         return True
     if (echo & (light < min(TOO_DARK, -texture))).sum() >= TOO_DARK_CELLS:
         return True
-    if (inner(at_wall) & (light > max(BRIGHT_INSIDE, texture))).sum() > BRIGHT_INSIDE_CELLS:
+    if (interior(at_wall) & (light > max(BRIGHT_INSIDE, texture))).sum() > BRIGHT_INSIDE_CELLS:
         return True
     # on a textured wall some of the cells inside are darker by chance: the limit falls with it
     dark = light < min(DARK_INSIDE, DARK_INSIDE + 2 * BRIGHT_INSIDE / TEXTURE_SPREADS - 2 * spread)
-    inside = inner(echo)
+    inside = interior(echo)
     dark_inside = (inside & unsaturated & dark).sum()
     if dark_inside > max(DARK_INSIDE_CELLS, DARK_INSIDE_SHARE * inside.sum()):
         return True
@@ -254,8 +254,8 @@ def _overlap(brighter: Mask, deeper: Mask) -> float:
     To a cell: an echo's lead grows from zero at the region's outline, so that its rim is deeper and
     hardly brighter, and small regions are mostly rim.
     """
-    beside = ~inner(~deeper)
-    unlike = (brighter & ~beside) | (inner(deeper) & ~brighter)
+    beside = ~interior(~deeper)
+    unlike = (brighter & ~beside) | (interior(deeper) & ~brighter)
     return 1.0 - float(unlike.sum() / max((brighter | deeper).sum(), 1))
 
 

@@ -81,7 +81,7 @@ def wall_as_rendered(rig: Rig) -> tuple[Float64, Float64]:
     """
     bare = bare_rendering(rig)  # pyright: ignore[reportArgumentType]
     on_wall = cast(rig, rig.pinhole.scaled(MAP_COLUMNS, MAP_ROWS)).on_wall
-    sees_wall = inner(on_wall.reshape(MAP_ROWS, MAP_COLUMNS)) & (bare.intensity > 0)
+    sees_wall = interior(on_wall.reshape(MAP_ROWS, MAP_COLUMNS)) & (bare.intensity > 0)
     return np.where(sees_wall, bare.depth_m, np.nan), np.where(sees_wall, bare.intensity, 0.0)
 
 
@@ -94,7 +94,7 @@ def same_surface(reference: BareWall, depth_m: Float32 | Float64, offset_m: floa
     return (np.abs(measured_m - depth_m) < SAME_SURFACE_M) & (reference.map_intensity > 0)
 
 
-def inner(region: Mask) -> Mask:
+def interior(region: Mask) -> Mask:
     """Return the cells of a region (64, 80) whose four neighbors belong to it too."""
     found = region.copy()
     found[1:] &= region[:-1]
