@@ -82,7 +82,7 @@ def predict(
         if not quick and shape is None:
             with tracked("trying changes of the bench") as on_progress:
                 advice = forecast.changes(own, on_progress)
-    _renew_forecast(rig, found)
+    _renew_forecast(rig, found, is_typical=shape is None)
     if path is not None:
         forecast.write_report(found, path, advice, hidden or "")
     facts = found.as_json() | {
@@ -103,9 +103,11 @@ def predict(
     finish(facts, as_json=json, text="\n".join(lines))
 
 
-def _renew_forecast(name: str | None, found: forecast.Forecast) -> None:
-    """Enter a forecast in the record of a bench whose object box was edited since its own."""
-    if name is None or not Path(name).is_dir():
+def _renew_forecast(name: str | None, found: forecast.Forecast, *, is_typical: bool) -> None:
+    """Enter a forecast of typical objects in the record of a bench whose object box was edited
+    since its own.
+    """
+    if name is None or not is_typical or not Path(name).is_dir():
         return
     bench = bench_folders.load_bench(name)
     if bench.has_old_forecast:

@@ -221,10 +221,13 @@ def test_forecast_of_another_box_is_renewed_by_predict(bench: Path, run: Run) ->
         station = edit.stations["main"].model_copy(update={"object_box": nearer})
         edit.set_station("main", station, load_bench(bench).measured.record)
     edited = verdict(bench)
+    run("predict", bench, "cup", "--quick")  # an object of its own says nothing about others
+    after_an_object = verdict(bench)
     found = run("predict", bench, "--quick")
 
     assert "nlos-cam predict bench" in edited
     assert "0.64" not in edited
+    assert after_an_object == edited
     assert "predict" not in verdict(bench)
     assert load_bench(bench).expected_iou == pytest.approx(found["expected_iou"], abs=1e-3)
 
