@@ -30,6 +30,7 @@ from pydantic import ValidationError
 
 from nlos_cam.frames import MAP_COLUMNS, MAP_ROWS, LidarMaps
 from nlos_cam.objects import object_box
+from nlos_cam.reconstruct.flat_field import brightest_light
 from nlos_cam.reconstruct.wall_grid import (
     NUMBERS_COLUMN,
     WALL_GRID,
@@ -128,8 +129,7 @@ class MapAlignment:
         """Keep the cells of the training rig that see the wall, and its bare bench's maps."""
         self._cells = np.flatnonzero(there.on_wall)
         # The simulated sensor's gain fixes the counts of the brightest bare wall (SensorModel).
-        brightest = cast(trained, trained.pinhole, occluder=False).direct.max()
-        counts = SensorModel().bare_wall_counts / brightest
+        counts = SensorModel().bare_wall_counts / brightest_light(trained)
         self._depth_m = (there.length_m * there.cos_axis).astype(np.float32)
         self._light = np.nan_to_num(there.direct * counts).astype(np.float32)
         # Maps hold depth along the optical axis: depth = path / 2 * cos.

@@ -28,8 +28,14 @@ from nlos_calibration.arrays import Float64, Mask
 from nlos_cam.frames import MAP_COLUMNS, MAP_ROWS, SATURATED, LidarMaps
 from nlos_cam.objects import object_box, object_depth
 from nlos_cam.reconstruct.bench import CalibratedRig
-from nlos_cam.reconstruct.flat_field import MIN_WALL_CELLS, interior, same_surface, wall_as_rendered
-from nlos_cam.render import Rendering, Scene, SensorModel, cast, render
+from nlos_cam.reconstruct.flat_field import (
+    MIN_WALL_CELLS,
+    brightest_light,
+    interior,
+    same_surface,
+    wall_as_rendered,
+)
+from nlos_cam.render import Rendering, Scene, SensorModel, render
 
 OFF_WALL_M = 0.009
 """Depth beyond the wall's from which on a cell shows an echo: three times the error of a bench's
@@ -64,6 +70,8 @@ DARK_INSIDE_SHARE = 0.05
 ECHO_OVERLAP = 0.9
 """Smallest overlap of the cells that are deeper than the wall with those that are brighter, on a
 bench whose echoes are strong."""
+OVERLAP_BY_TEXTURE = 0.5
+"""What a wall that is not uniform takes from it, for each unit of its limit above BRIGHTER."""
 OVERLAP_MARGIN = 0.04
 """What noise may take from the overlap of rendered objects."""
 MIN_ECHO_CELLS = 100
@@ -244,7 +252,8 @@ def _unlike(
     if echo.sum() < MIN_ECHO_CELLS:
         return False
     brighter = (at_wall | echo) & unsaturated & (light > max(BRIGHTER, texture))
-    return _overlap(brighter, echo & unsaturated) < usual - 0.5 * max(texture - BRIGHTER, 0.0)
+    allowed = OVERLAP_BY_TEXTURE * max(texture - BRIGHTER, 0.0)
+    return _overlap(brighter, echo & unsaturated) < usual - allowed
 
 
 def _overlap(brighter: Mask, deeper: Mask) -> float:
@@ -304,18 +313,21 @@ def objects_on_bench(rig: Rig) -> ObjectsOnBench:
     if rig.object_box is not None:
         box = object_box(rig)
         bare = wall_as_rendered(rig)
+        counts_per_light = SensorModel().bare_wall_counts / brightest_light(rig)
         for seed in range(INFORMATION_SEED, INFORMATION_SEED + INFORMATION_OBJECTS):
             _, depth_m = object_depth(seed, box)
             rendering = render(Scene(rig, depth_m), "draft")
             echo = rendering.multi.peak
             cells += (echo > 0) & (rendering.intensity <= echo)
-            overlaps.append(_overlap_of(rendering, rig, *bare))
+            overlaps.append(_overlap_of(rendering, *bare, counts_per_light))
     if not cells.any():
         cells += 1
     return ObjectsOnBench(cells / max(cells.sum(), 1.0), min(overlaps) - OVERLAP_MARGIN)
 
 
-def _overlap_of(rendering: Rendering, rig: Rig, wall_m: Float64, wall_light: Float64) -> float:
+def _overlap_of(
+    rendering: Rendering, wall_m: Float64, wall_light: Float64, counts_per_light: float
+) -> float:
     """Return the overlap of the cells that an object makes brighter and deeper; 1 where they are
     too few.
     """
@@ -324,7 +336,6 @@ def _overlap_of(rendering: Rendering, rig: Rig, wall_m: Float64, wall_light: Flo
     if echo.sum() < MIN_ECHO_CELLS:
         return 1.0
     # in the sensor's counts, of which one is added as to measured ones
-    brightest = cast(rig, rig.pinhole, occluder=False).direct.max()
-    counts = SensorModel().bare_wall_counts / brightest
-    ratio = (counts * rendering.intensity + 1) / (counts * wall_light + 1)
+    seen = counts_per_light * rendering.intensity + 1
+    ratio = seen / (counts_per_light * wall_light + 1)
     return _overlap(sees_wall & (np.log(ratio) > BRIGHTER), echo)

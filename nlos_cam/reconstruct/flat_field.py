@@ -71,8 +71,14 @@ def measured_counts(rig: Rig, reference: BareWall, offset_m: float) -> float | N
     if wall.sum() < MIN_WALL_CELLS:
         return None
     direct = cast(rig, rig.pinhole.scaled(MAP_COLUMNS, MAP_ROWS)).direct.reshape(wall.shape)
-    brightest = float(cast(rig, rig.pinhole, occluder=False).direct.max())
-    return brightest * float(np.median(reference.map_intensity[wall] / direct[wall]))
+    return brightest_light(rig) * float(np.median(reference.map_intensity[wall] / direct[wall]))
+
+
+def brightest_light(rig: Rig) -> float:
+    """Return the renderer's light of the brightest bare-wall return: `bare_wall_counts` of a sensor
+    over it are its counts for each unit of light.
+    """
+    return float(cast(rig, rig.pinhole, occluder=False).direct.max())
 
 
 def wall_as_rendered(rig: Rig) -> tuple[Float64, Float64]:
