@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -145,6 +146,15 @@ def _transfer_parts(found: Transfer, rows: Rows) -> list[Section | Picture]:
     return [section, sheet]
 
 
+class Expected(NamedTuple):
+    """What the forecast of a bench says of it."""
+
+    iou: float
+    """Silhouette IoU of weights that are trained for it."""
+    hidden_share: float
+    """Share of the test objects that change no cell of its maps."""
+
+
 @dataclass(frozen=True)
 class Tables:
     """Figures before and after, in words."""
@@ -152,8 +162,8 @@ class Tables:
     test_objects: Rows
     recordings: Rows = ()
     """On the objects held out of the recordings."""
-    expected_iou: float | None = None
-    """Silhouette IoU by the forecast of the bench; None where there is none."""
+    expected: Expected | None = None
+    """None where there is no forecast."""
 
 
 def write_page(result: AdaptResult, tables: Tables, commands: Sequence[str], page: Path) -> None:
@@ -163,11 +173,13 @@ def write_page(result: AdaptResult, tables: Tables, commands: Sequence[str], pag
     before, after = (each["silhouette_iou"]["value"] for each in (result.before, result.after))
     headline = f"Silhouette IoU {before:.3f} -> {after:.3f}"
     spread = plan.spread
+    expected = tables.expected
     facts = {
         "objects rendered for this bench": f"{plan.stages[-1].objects}",
         "samples trained on": f"{curves[-1].samples[-1]}",
-        "expected by the forecast": (
-            "" if tables.expected_iou is None else f"{tables.expected_iou:.2f}"
+        "expected by the forecast": f"{expected.iou:.2f}" if expected else "",
+        "objects that change no cell: nothing there": (
+            f"{expected.hidden_share:.0%}" if expected and expected.hidden_share else ""
         ),
         "minutes, as planned": f"{plan.minutes:.0f}",
         "this machine": (
@@ -179,7 +191,7 @@ def write_page(result: AdaptResult, tables: Tables, commands: Sequence[str], pag
             f" {spread.gain_share:.0%} of the gain"
         ),
     }
-    advice = outlook(plan, curves, after, tables.expected_iou)
+    advice = outlook(plan, curves, after, expected.iou if expected else None)
     title = "Weights for this bench"
     subtitle = "54 test objects, rendered on this bench with the sensor's noise. Simulated light."
     if locked := plan.locked:

@@ -12,6 +12,7 @@ from nlos_cam.bench.record import (
     MANIFEST,
     WEIGHTS,
     BenchRecord,
+    ForecastRecord,
     StationRecord,
     load_bench_record,
     sha256_of,
@@ -60,8 +61,22 @@ class Bench:
         """Silhouette IoU to expect of weights trained for this rig; None where it was not
         forecast.
         """
+        found = self._forecast
+        return found.expected_iou if found else None
+
+    @property
+    def hidden_share(self) -> float:
+        """Share of the test objects that change no cell of the maps of this rig; 0 where it was not
+        forecast.
+        """
+        found = self._forecast
+        return found.hidden_share if found else 0.0
+
+    @property
+    def _forecast(self) -> ForecastRecord | None:
+        """Forecast of this rig, if there is one."""
         found = self.record.stations[self.station].forecast
-        return found.expected_iou if found and found.rig_checksum == self.rig.checksum else None
+        return found if found and found.rig_checksum == self.rig.checksum else None
 
     @property
     def has_old_forecast(self) -> bool:

@@ -60,6 +60,8 @@ class ForecastRecord(Record):
     """Rig that it was made for; of another one, the forecast is not used."""
     expected_iou: Annotated[float, Field(ge=0, le=1)]
     """Silhouette IoU to expect of weights that are trained for this rig."""
+    hidden_share: Annotated[float, Field(ge=0, le=1)] = 0.0
+    """Share of the test objects that change no cell of the maps; 0 in records before 0.3."""
 
 
 class StationRecord(Record):

@@ -27,6 +27,13 @@ def weights_verdict(rig: Rig, trained: CheckpointRecord, bench: Bench | None) ->
             " makes it again)"
         )
         served = replace(served, sentence=old)
+    if bench.hidden_share > 0:
+        hidden = (
+            f"{served.sentence}; {bench.hidden_share:.0%} of the test objects change no cell of this"
+            ' bench\'s maps: they are "nothing there" (what to change: `nlos-cam predict'
+            f" {folder}`)"
+        )
+        served = replace(served, sentence=hidden)
 
     reached_iou = trained.figures.get(TEST_IOU)
     if served.service != "trained for it" or reached_iou is None:

@@ -131,7 +131,7 @@ def adapt(
     target = result.weights
     if result.is_better and not locked:
         target = _install(result, folder, home / WEIGHTS)
-    expected_iou = None if locked else _expected_iou(rig, folder)
+    expected = None if locked else _forecast(rig, folder)
     name = shlex.quote(bench)
     more = f"nlos-cam adapt {name} --minutes {2 * result.plan.minutes:g}"
     commands = [f"nlos-cam evaluate --rig {name} --weights {shlex.quote(str(target))}"]
@@ -142,13 +142,16 @@ def adapt(
         camera = benches.camera_to_name(measured.record) if measured else "l515"
         commands = [f"nlos-cam live --camera {camera} --bench {name}"]
     more += f" --out {shlex.quote(str(out))}" if out else ""
-    _report(result, target, [*commands, more], work / PAGE, expected_iou, as_json=json)
+    _report(result, target, [*commands, more], work / PAGE, expected, as_json=json)
 
 
-def _expected_iou(rig: walls.Rig, folder: Path | None) -> float:
+def _forecast(rig: walls.Rig, folder: Path | None) -> adaptation.Expected:
     """Return the forecast for a rig: that which its bench holds already, else a new one."""
-    stored = benches.load_bench(folder).expected_iou if folder else None
-    return forecast.forecast(rig, quick=True).expected_iou if stored is None else stored
+    loaded = benches.load_bench(folder) if folder else None
+    if loaded and loaded.expected_iou is not None:
+        return adaptation.Expected(loaded.expected_iou, loaded.hidden_share)
+    found = forecast.forecast(rig, quick=True)
+    return adaptation.Expected(found.expected_iou, found.hidden_share)
 
 
 def _recordings(folder: Path) -> adaptation.Recordings | None:
@@ -190,7 +193,7 @@ def _report(
     target: Path,
     commands: list[str],
     page: Path,
-    expected_iou: float | None,
+    expected: adaptation.Expected | None,
     *,
     as_json: bool,
 ) -> None:
@@ -198,7 +201,7 @@ def _report(
     rows = _rows(result.before, result.after)
     transfer = result.transfer
     recorded = _rows(transfer.before, transfer.after) if transfer else ()
-    tables = adaptation.Tables(rows, recorded, expected_iou)
+    tables = adaptation.Tables(rows, recorded, expected)
     adaptation.write_page(result, tables, commands, page)
     _, before, after = rows[0]
     state = "was finished before" if result.was_there else "done"
@@ -209,13 +212,16 @@ def _report(
         f"{state}: {rows[0][0]} {before} -> {after} on this bench{worse}; weights in {target},"
         f" report {page}"
     )
+    if expected and expected.hidden_share:
+        text += f"; {forecast.hidden_words(expected.hidden_share)}"
     facts: dict[str, Any] = {
         "out": str(target),
         "kept": result.is_better,
         "report": str(page),
         "minutes": result.plan.minutes,
         "objects": result.plan.stages[-1].objects,
-        "expected_iou": expected_iou,
+        "expected_iou": expected and expected.iou,
+        "hidden_share": expected and expected.hidden_share,
         "before": result.before,
         "after": result.after,
     }

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, NamedTuple
+from typing import TYPE_CHECKING, Annotated, NamedTuple
 
 import nlos_calibration as walls
 import typer
@@ -13,6 +13,9 @@ from nlos_cam import calibrate, reconstruct
 from nlos_cam import camera as cameras
 from nlos_cam.cli import common
 from nlos_cam.errors import OutputExistsError
+
+if TYPE_CHECKING:
+    from nlos_cam.forecast import Forecast
 
 BenchFolder = Annotated[
     Path | None,
@@ -109,13 +112,15 @@ def store_forecast(folder: Path, station: str | None = None) -> None:
     from nlos_cam.forecast import forecast  # not for `live`
 
     common.say("Forecasting what this bench can show")
-    keep_forecast(bench, forecast(bench.rig, quick=True).expected_iou)
+    keep_forecast(bench, forecast(bench.rig, quick=True))
 
 
-def keep_forecast(bench: benches.Bench, expected_iou: float) -> None:
+def keep_forecast(bench: benches.Bench, found: Forecast) -> None:
     """Enter the forecast for a bench's rig in its record."""
     entry = benches.ForecastRecord(
-        rig_checksum=bench.rig.checksum, expected_iou=round(expected_iou, 3)
+        rig_checksum=bench.rig.checksum,
+        expected_iou=round(found.expected_iou, 3),
+        hidden_share=round(found.hidden_share, 3),
     )
     with benches.edit_bench(bench.folder) as edit:
         edit.set_forecast(bench.station, entry)

@@ -111,7 +111,7 @@ def _renew_forecast(name: str | None, found: forecast.Forecast, *, is_typical: b
         return
     bench = bench_folders.load_bench(name)
     if bench.has_old_forecast:
-        benches.keep_forecast(bench, found.expected_iou)
+        benches.keep_forecast(bench, found)
         say(f"Renewed the forecast in {bench.folder}")
 
 

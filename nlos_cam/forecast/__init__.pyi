@@ -14,6 +14,7 @@ __all__ = [
     "changes",
     "fit_prior",
     "forecast",
+    "hidden_words",
     "network_iou",
     "shipped_prior",
     "table_of",
@@ -26,4 +27,4 @@ from .curve import network_iou
 from .expectation import FRAMES, Conditions, Expectation, Forecast, forecast
 from .linear import MATERIALS, MaterialName
 from .prior import Prior, Shape, fit_prior, shipped_prior
-from .report import CAVEATS, COLUMNS, change_words, table_of, words_of, write_report
+from .report import CAVEATS, COLUMNS, change_words, hidden_words, table_of, words_of, write_report

@@ -12,7 +12,7 @@ from typing import Any, Self, get_args
 
 import numpy as np
 from nlos_calibration import Rig, lidar_visible_share
-from nlos_calibration.arrays import Float64
+from nlos_calibration.arrays import Float32, Float64
 
 from nlos_cam.files import cache_folder, load_cached
 from nlos_cam.forecast.curve import network_iou
@@ -26,15 +26,17 @@ from nlos_cam.forecast.linear import (
 )
 from nlos_cam.forecast.prior import Shape, shipped_prior
 from nlos_cam.objects import benchmark_objects, object_box
-from nlos_cam.render import Radiometry, SensorModel
+from nlos_cam.render import Radiometry, Scene, SensorModel, render
 
 FRAMES = 1, 4, 30, 100
 QUICK_FRAMES = 1, 100
-VERSION = 1
+VERSION = 2
 """Raise it when the same rig gives another forecast."""
 STRIDE = 11
 """Every eleventh of the 54 test objects is a typical one: 5, the same on every rig, so that the
 curve to the networks' figures takes in how hard they are."""
+SHOWN_STRIDE = 3
+"""Every third test object, one of each category, is rendered for whether it shows at all."""
 MATERIAL_OBJECTS = 3
 """Objects whose materials are compared, each with its matt self."""
 SEED = 0
@@ -90,6 +92,9 @@ class Forecast:
     """Depth error of the prior's mean depth."""
     visible_share: float
     """Share of the object box that the lidar sees directly."""
+    hidden_share: float
+    """Share of objects that change no cell of the maps: whatever the weights, `live` cannot tell
+    them from an empty bench."""
     expectations: tuple[Expectation, ...]
     outline_std: dict[int, Float64] = field(compare=False, repr=False)
     """By frames averaged, (GRID, GRID): standard deviation of the outline over the box, matt."""
@@ -99,7 +104,7 @@ class Forecast:
     @property
     def expected_iou(self) -> float:
         """Silhouette IoU to expect of a trained network: one frame, matt, the paper's
-        radiometry.
+        radiometry. It is of the network's pictures, also of those that `live` does not show.
         """
         return self.at().network_iou
 
@@ -180,15 +185,30 @@ def forecast(
     """
     own = sensor or SensorModel()
     if shape is not None:
-        return _forecast(rig, own, [shape], quick=quick)
+        alone_m = np.where(shape.outline, shape.depth_m(object_box(rig)), np.nan)
+        return _forecast(rig, own, [shape], hidden_share(rig, [alone_m]), quick=quick)
     if not cached or own != SensorModel():
-        return _forecast(rig, own, typical_shapes(rig), quick=quick)
+        return _of_typical(rig, own, quick=quick)
     name = f"{rig.checksum}-{VERSION}-{'quick' if quick else 'full'}.npz"
 
     def make() -> bytes:
-        return _forecast(rig, own, typical_shapes(rig), quick=quick).dump()
+        return _of_typical(rig, own, quick=quick).dump()
 
     return load_cached(cache_folder() / "forecast" / name, Forecast.load, make)
+
+
+def hidden_share(rig: Rig, depths_m: Sequence[Float32]) -> float:
+    """Return the share of objects, given as depth maps (n, n), that change no cell of the maps.
+
+    Each cell returns its strongest echo (S5): where the wall's own is stronger everywhere, nothing
+    of the object is left to read.
+    """
+    empty = render(Scene(rig), "draft")
+    hidden = [
+        np.array_equal(render(Scene(rig, depth_m), "draft").intensity, empty.intensity)
+        for depth_m in depths_m
+    ]
+    return _mean(hidden)
 
 
 def typical_shapes(rig: Rig) -> list[Shape]:
@@ -203,7 +223,15 @@ def shipped_basis() -> Basis:
     return Basis.of(shipped_prior())
 
 
-def _forecast(rig: Rig, sensor: SensorModel, shapes: Sequence[Shape], *, quick: bool) -> Forecast:
+def _of_typical(rig: Rig, sensor: SensorModel, *, quick: bool) -> Forecast:
+    tested = benchmark_objects(object_box(rig))[::SHOWN_STRIDE]
+    hidden = hidden_share(rig, [one.depth_m for one in tested])
+    return _forecast(rig, sensor, typical_shapes(rig), hidden, quick=quick)
+
+
+def _forecast(
+    rig: Rig, sensor: SensorModel, shapes: Sequence[Shape], hidden: float, *, quick: bool
+) -> Forecast:
     box = object_box(rig)
     span_m = box.z_far_m - box.z_near_m
     few = 0 if quick else MATERIAL_OBJECTS
@@ -232,6 +260,7 @@ def _forecast(rig: Rig, sensor: SensorModel, shapes: Sequence[Shape], *, quick: 
         guess.linear_iou,
         guess.depth_rmse_m,
         float(lidar_visible_share(rig, box)),
+        hidden,
         tuple(rows),
         outline_std,
         depth_std_m,

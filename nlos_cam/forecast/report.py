@@ -11,6 +11,8 @@ from nlos_cam.report import Bullets, Document, Picture, Section, Table, figure_o
 
 USEFUL_GAIN = 0.1
 """IoU above a guess from which on a bench shows shapes."""
+MOSTLY_HIDDEN = 0.5
+"""Share of hidden objects from which on a bench is said to hide most."""
 CAVEATS = (
     "Networks gain less from averaged frames than the linear estimate does: on the home rig nothing.",
     (
@@ -41,6 +43,8 @@ def words_of(found: Forecast, subject: str = "") -> list[str]:
         ]
     gain = best.linear_iou - found.guess_iou
     verdict = "shows shapes" if gain >= USEFUL_GAIN else "hardly shows more than a guess"
+    if found.hidden_share >= MOSTLY_HIDDEN:
+        verdict = "hides most objects"
     whose = f"of {subject}" if subject else "of a typical matt object"
     lines = [
         (
@@ -54,12 +58,22 @@ def words_of(found: Forecast, subject: str = "") -> list[str]:
         ),
         f"The echoes stand {_margin(best)} the wall's own return.",
     ]
+    if found.hidden_share > 0 and not subject:
+        lines.insert(1, hidden_words(found.hidden_share))
     if found.visible_share > 0:
         lines.append(
             f"The lidar sees {found.visible_share:.0%} of the object box directly: this forecast"
             " leaves that light out."
         )
     return lines
+
+
+def hidden_words(hidden_share: float) -> str:
+    """Return in words what becomes of objects that change no cell."""
+    return (
+        f"{hidden_share:.0%} of the test objects change no cell of the maps: `live` says"
+        ' "nothing there" of them, whatever the weights.'
+    )
 
 
 def _margin(row: Expectation) -> str:

@@ -16,6 +16,7 @@ import argparse
 import json
 import os
 import platform
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -49,6 +50,8 @@ FIRST_SEED = 70_000_000
 """Of the benches: no training set draws its rigs from it."""
 MINUTES = 10.0, 30.0, 60.0
 FRAMES = 60
+STEADY_FRAMES = 5
+"""Frames of one object after which its verdict holds nothing of the object before."""
 
 
 @dataclass(frozen=True)
@@ -112,14 +115,26 @@ def calibrate(bench: Bench) -> None:
     done.touch()
 
 
-def shown(pipeline: Pipeline, world: World, count: int, box: ObjectBox) -> Float32:
-    """Return the images v (count, 64, 64) that `live` would show of a frame of each object."""
+def shown(
+    pipeline: Pipeline, world: World, count: int, box: ObjectBox
+) -> tuple[Float32, dict[str, int]]:
+    """Return the images v (count, 64, 64) that `live` would show of a frame of each object, and how
+    many objects have each verdict, which is a mean over frames.
+    """
     images: list[Float32] = []
+    verdicts: Counter[str] = Counter()
     for number in range(count):
-        frame = world.images(number).frame(world.rig.pinhole)
-        result = pipeline.process(Arrival(frame, 0.0, frame_issues(frame)), lambda: 0.0, 0.0)
-        images.append(image_from_depth(result.depth_m, box))
-    return np.stack(images)
+        frames = [
+            world.images(number + count * each).frame(world.rig.pinhole)
+            for each in range(STEADY_FRAMES)
+        ]
+        results = [
+            pipeline.process(Arrival(frame, 0.0, frame_issues(frame)), lambda: 0.0, 0.0)
+            for frame in frames
+        ]
+        images.append(image_from_depth(results[0].depth_m, box))
+        verdicts[results[-1].verdict or "none"] += 1
+    return np.stack(images), dict(verdicts.most_common())
 
 
 def judge(bench: Bench, weights: Path | None) -> dict[str, Any]:
@@ -133,9 +148,9 @@ def judge(bench: Bench, weights: Path | None) -> dict[str, Any]:
         load_networks(weights),
         uncertainty_model=load_uncertainty(weights),
     )
-    images = shown(pipeline, world, len(subjects), bench.box)
+    images, verdicts = shown(pipeline, world, len(subjects), bench.box)
     found = over_objects(per_object(images, truth_of(subjects, bench.box), bench.box))
-    return plain(found)
+    return plain(found) | {"verdicts": verdicts}
 
 
 def judged(bench: Bench, minutes: float) -> dict[str, Any]:
@@ -160,6 +175,7 @@ def described(bench: Bench) -> dict[str, Any]:
         "verdict": loaded.measured.record.verdict,
         "sensor": bench.scene.sensor.model_dump(exclude_defaults=True),
         "expected_iou": loaded.expected_iou,
+        "hidden_share": loaded.hidden_share,
     }
 
 

@@ -120,14 +120,17 @@ def test_weights_come_back_with_the_rig_of_their_bench(folder: Path, tmp_path: P
 
 
 def test_forecast_holds_for_the_rig_that_it_was_made_for(folder: Path) -> None:
-    forecast = ForecastRecord(rig_checksum=load_bench(folder).rig.checksum, expected_iou=0.6)
+    checksum = load_bench(folder).rig.checksum
+    forecast = ForecastRecord(rig_checksum=checksum, expected_iou=0.6, hidden_share=0.25)
     with edit_bench(folder) as edit:
         edit.set_forecast("main", forecast)
 
     assert load_bench(folder).expected_iou == 0.6
+    assert load_bench(folder).hidden_share == 0.25
 
     set_line(folder, "x_max_m", "x_max_m = 0.6")
     assert load_bench(folder).expected_iou is None
+    assert load_bench(folder).hidden_share == 0.0
 
 
 def test_added_file_is_checked(folder: Path) -> None:

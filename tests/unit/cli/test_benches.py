@@ -186,11 +186,12 @@ def test_rigs_prints_a_whole_rig_that_can_be_used(shown: Run) -> None:
     assert dump_toml(load_rig("paper-rig")) in text
 
 
-def forecast(folder: Path, iou: float) -> None:
+def forecast(folder: Path, iou: float, hidden_share: float = 0.0) -> None:
     """Enter a forecast into a bench."""
     checksum = load_bench(folder).rig.checksum
     with edit_bench(folder) as edit:
-        edit.set_forecast("main", ForecastRecord(rig_checksum=checksum, expected_iou=iou))
+        entry = ForecastRecord(rig_checksum=checksum, expected_iou=iou, hidden_share=hidden_share)
+        edit.set_forecast("main", entry)
 
 
 def verdict(folder: Path) -> str:
@@ -210,6 +211,16 @@ def test_verdict_on_weights_names_adapt_and_the_forecast(bench: Path) -> None:
 
     assert "nlos-cam adapt bench" in sentence
     assert "expected silhouette IoU 0.64" in sentence
+
+
+def test_verdict_on_weights_says_how_many_objects_are_hidden(bench: Path) -> None:
+    forecast(bench, 0.64)
+    before = verdict(bench)
+    forecast(bench, 0.48, hidden_share=0.611)
+
+    assert "nothing there" not in before
+    assert "61% of the test objects change no cell" in verdict(bench)
+    assert "nlos-cam predict bench" in verdict(bench)
 
 
 def test_forecast_of_another_box_is_renewed_by_predict(bench: Path, run: Run) -> None:

@@ -5,7 +5,14 @@ import pytest
 from nlos_calibration import Rig, load_rig
 
 from nlos_cam.errors import SceneError
-from nlos_cam.forecast import Forecast, Shape, forecast, network_iou, shipped_prior
+from nlos_cam.forecast import (
+    Forecast,
+    Shape,
+    forecast,
+    network_iou,
+    shipped_prior,
+    words_of,
+)
 from nlos_cam.objects import object_box
 from nlos_cam.render import SensorModel
 
@@ -42,6 +49,26 @@ def test_closed_gap_gives_the_priors_guess() -> None:
     assert found.sees_nothing
     assert found.at(100).linear_iou == found.guess_iou
     assert found.at(100).outline_numbers == pytest.approx(0, abs=1e-6)
+    assert found.hidden_share == 1.0
+
+
+def test_narrower_gap_never_hides_fewer_objects(home: Forecast) -> None:
+    narrow = [forecast(with_gap(gap_m), quick=True, cached=False) for gap_m in (0.05, 0.04)]
+    shares = [home.hidden_share, *(found.hidden_share for found in narrow)]
+
+    assert shares == sorted(shares)
+    assert home.hidden_share == 0.0
+    assert "nothing there" not in " ".join(words_of(home))
+    assert 0 < shares[-1] < 1
+    assert f"{shares[-1]:.0%} of the test objects" in words_of(narrow[-1])[1]
+
+
+def test_hidden_object_alone_is_said_to_be_hidden() -> None:
+    seen = forecast(HOME, quick=True, shape=disc())
+    hidden = forecast(with_gap(0.01), quick=True, shape=disc())
+
+    assert (seen.hidden_share, hidden.hidden_share) == (0.0, 1.0)
+    assert hidden.sees_nothing
 
 
 def test_less_noise_determines_more() -> None:
