@@ -67,8 +67,13 @@ from nlos_cam.objects import benchmark_objects, object_box, unseen_objects
 from nlos_cam.render import SceneFile, SensorModel
 
 RECIPE = harness.ROOT / "models" / "recipes" / "paper-rig-direct.toml"
-PLACES = {"home": (0.0, 0.20), "near": (0.0, 0.15), "back": (-0.10, 0.20)}
-"""Foot of the lidar along the wall from home's, and its distance, in metres."""
+PLACES = {
+    "home": (0.0, 0.20, 45.0),
+    "near": (0.0, 0.15, 45.0),
+    "back": (-0.10, 0.20, 45.0),
+    "fore": (0.10, 0.15, 60.0),
+}
+"""Foot of the lidar along the wall from home's and its distance, in metres, and its yaw in degrees."""
 SETS = ("home", "near", "back", "home+near")
 FIRST_SEED = 80_000_000
 HELD_OUT_SEED = 90_000_000
@@ -121,7 +126,7 @@ class StationsNetwork(nn.Module):
 def rig_at(place: str) -> Rig:
     """Return the paper's bench, seen from a place, in the wall frame of that place's lidar."""
     home = load_rig("paper-rig")
-    along_m, distance_m = PLACES[place]
+    along_m, distance_m, yaw_deg = PLACES[place]
     box = object_box(home)
     shifted = {"x_min_m": box.x_min_m - along_m, "x_max_m": box.x_max_m - along_m}
     occluder = home.occluder
@@ -130,7 +135,7 @@ def rig_at(place: str) -> Rig:
     return home.model_copy(
         update={
             "name": place,
-            "lidar": home.lidar.model_copy(update={"distance_m": distance_m}),
+            "lidar": home.lidar.model_copy(update={"distance_m": distance_m, "yaw_deg": yaw_deg}),
             "occluder": occluder.model_copy(update={"x_m": occluder.x_m - along_m}),
             "object_box": box.model_copy(update=shifted),
         }
