@@ -34,6 +34,7 @@ __all__ = [
     "compatibility_warnings",
     "describe_counts",
     "describe_failure",
+    "edge_cells",
     "estimate_uncertainty",
     "frame_issues",
     "frames_by_verdict",
@@ -63,6 +64,7 @@ from .alignment import (
     rig_to_align_with,
 )
 from .bench import CalibratedRig, check_intrinsics, open_bench
+from .edge import edge_cells
 from .flat_field import measured_counts
 from .frame_reader import Arrival, FrameReader, ignore
 from .network import Clock, Quality, Reconstruction, estimate_uncertainty, reconstruct
