@@ -111,21 +111,17 @@ class CellNormal(nn.Module):
 
     The frame's own gain is taken out of the intensity: the median ratio to the training set's
     medians over the quieter half of the cells, which hardly any object changes. In color there are
-    three intensities, and one gain. Cells at the occluder's edge may be hidden from the network.
+    three intensities, and one gain.
     """
 
     limit = CLIP
     median: Tensor
     spread: Tensor
-    hidden: Tensor
-    """(64, 80), bool; cells that are always 0. Weights from before 0.3 have none."""
 
     def __init__(self, *, color: bool = False) -> None:
         super().__init__()
         self.register_buffer("median", torch.zeros(channels_of(color=color), ROWS, COLUMNS))
         self.register_buffer("spread", torch.ones(channels_of(color=color), ROWS, COLUMNS))
-        self.register_buffer("hidden", torch.zeros(ROWS, COLUMNS, dtype=torch.bool))
-        self.register_load_state_dict_pre_hook(_with_hidden)
 
     def learn(self, depth_m: Tensor, intensity: Tensor) -> None:
         """Set the statistics to those of maps (n, 64, 80), averaged with the mirrored ones."""
@@ -144,11 +140,6 @@ class CellNormal(nn.Module):
             self.median[channel] = (median + median.flip(0)) / 2
             self.spread[channel] = (spread + spread.flip(0)) / 2
 
-    def hide(self, cells: Tensor) -> None:
-        """Hide some cells (64, 80) in place of those hidden before, and their mirror images."""
-        # the network is symmetric: a cell and its mirror image go through the same weights
-        self.hidden.copy_(cells | cells.flip(0))
-
     def shift(self, depth_m: Tensor, intensity: Tensor, channels: slice = slice(None)) -> None:
         """Shift the medians of some or all channels as maps (n, 64, 80) of another bench ask for:
         its offset, its gain.
@@ -164,14 +155,14 @@ class CellNormal(nn.Module):
 
     def forward(self, depth_m: Tensor, intensity: Tensor) -> Tensor:
         """Map maps (n, 64, 80) to (n, 2, 64, 80), in color (n, 4, 64, 80); a cell without a return
-        is 0, and so is a hidden one.
+        is 0.
         """
         # (n, 2, 64, 80), in color (n, 4, 64, 80); log(1 + counts), so that a gain is an offset
         # and shot noise grows less with the light.
         off = _channels(depth_m, intensity) - self.median
         gain = self.log_gain(off[:, 1:].mean(1))[:, None, None, None]
         normal = torch.cat([off[:, :1], off[:, 1:] - gain], dim=1) / self.spread
-        return torch.where(torch.isnan(normal) | self.hidden, 0.0, normal.clamp(-CLIP, CLIP))
+        return torch.where(torch.isnan(normal), 0.0, normal.clamp(-CLIP, CLIP))
 
     def log_gain(self, light: Tensor) -> Tensor:
         """Return the logarithm of each frame's gain (n,), of log intensities (n, 64, 80) less the
@@ -193,11 +184,6 @@ class CellNormal(nn.Module):
         number = counts.flatten(1).sum(dim=1, keepdim=True)
         middle = ordered.gather(1, ((number - 1) // 2).clamp(min=0))
         return torch.where(number > 0, middle, 0.0)[:, 0]
-
-
-def _with_hidden(_: nn.Module, state: dict[str, Tensor], prefix: str, *_others: object) -> None:
-    """Let a state without hidden cells, from before there were any, hide none."""
-    state.setdefault(f"{prefix}hidden", torch.zeros(ROWS, COLUMNS, dtype=torch.bool))
 
 
 def channels_of(*, color: bool) -> int:

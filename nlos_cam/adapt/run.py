@@ -503,7 +503,6 @@ def _train_network(
             growth=shards_of,
             align=False,
             frame=frame,
-            edge=None if job.locked else job.spread,
         )
         with store as source:
             bench = None if job.locked else job.rig.model_dump(mode="json")

@@ -351,7 +351,6 @@ def direct(
                 normal,
                 color=recipe.colour,
                 frame=frame,
-                edge=data_sets.edge_of(recipe),
             )
             source = held.enter_context(packed)
         held_out = source.held_out(held_out_data, recipe.held_out)

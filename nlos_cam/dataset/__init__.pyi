@@ -35,7 +35,6 @@ __all__ = [
     "check_uncertainty_data",
     "difference_noise",
     "draw_outlier",
-    "edge_of",
     "ignore",
     "in_batches",
     "label_recordings",
@@ -94,7 +93,7 @@ from .outliers import (
     draw_outlier,
     outliers_beside,
 )
-from .packed import PackedMaps, edge_of, map_noise, open_packed_maps
+from .packed import PackedMaps, map_noise, open_packed_maps
 from .plan import DatasetPlan, Objects, RigSpread
 from .ray_backend import ray_farm
 from .reader import Dataset, open_dataset

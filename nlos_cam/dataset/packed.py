@@ -17,10 +17,10 @@ import torch
 from nlos_calibration import Rig
 from nlos_calibration.arrays import Float32, Mask
 from nlos_models import CellNormal, channels_of
-from nlos_models.training import DirectRecipe, MapNoise, MapSet, NormalBatch, first_of
+from nlos_models.training import MapNoise, MapSet, NormalBatch, first_of
 
 from nlos_cam.dataset.plan import DatasetPlan, RigSpread
-from nlos_cam.dataset.reader import MAP_CHANNELS, Dataset, open_dataset
+from nlos_cam.dataset.reader import MAP_CHANNELS, open_dataset
 from nlos_cam.dataset.rig_range import RigRange
 from nlos_cam.dataset.samples import OnProgress, ignore
 from nlos_cam.dataset.shards import SHARD_PATTERN, Shard, read_arrays, read_head
@@ -28,7 +28,7 @@ from nlos_cam.errors import RecordingError, SceneError
 from nlos_cam.files import atomic_file, claim, read_bounded
 from nlos_cam.files import read_arrays as read_npz
 from nlos_cam.frames import MAP_COLUMNS, MAP_ROWS, OBJECT_PIXELS
-from nlos_cam.reconstruct import WALL_GRID, align_samples, edge_cells, is_wall_grid
+from nlos_cam.reconstruct import WALL_GRID, align_samples, is_wall_grid
 
 INDEX = "index.json"
 MAPS = "maps.f16"
@@ -70,15 +70,6 @@ def map_noise(plan: DatasetPlan) -> MapNoise:
     return MapNoise(sensor.read_noise_counts**2, sensor.shot_noise**2, sensor.ambient_counts, alive)
 
 
-def edge_of(recipe: DirectRecipe) -> RigSpread | None:
-    """Return how far off its record a bench may be whose edge's cells a recipe hides; None where it
-    hides none.
-    """
-    if not recipe.edge_mm and not recipe.edge_deg:
-        return None
-    return RigSpread(place_m=1e-3 * recipe.edge_mm, angle_deg=recipe.edge_deg)
-
-
 class PackedMaps:
     """Normalised maps and images of one or more datasets of one rig, in a folder that is theirs
     alone.
@@ -95,7 +86,6 @@ class PackedMaps:
         growth: Growth | None = None,
         align: bool = True,
         frame: Rig | None = None,
-        edge: RigSpread | None = None,
     ) -> None:
         """Open or make the store: use `open_packed_maps`, which holds its claim meanwhile.
 
@@ -103,9 +93,8 @@ class PackedMaps:
         how many objects an epoch sees (default: all that are there). They are aligned with the rig
         `frame`, by default the plan's, and the wall grid for a plan of many rigs. Without `align`
         a spread of rigs stays in the maps, as a deviation that is not known; so does the spread of
-        a plan of many rigs. Cells that the occluder's edge can pass on a bench as far off as `edge`
-        are hidden. Raises RecordingError for no dataset, SceneError for datasets of two rigs or a
-        store that is normalised otherwise.
+        a plan of many rigs. Raises RecordingError for no dataset, SceneError for datasets of two
+        rigs or a store that is normalised otherwise.
         """
         opened = [open_dataset(folder, color=color, expected=True) for folder in datasets]
         self.plan: DatasetPlan = opened[0].plan
@@ -143,49 +132,42 @@ class PackedMaps:
         if self._stores_counts:
             self._rows[COUNTS] = MAP_ROWS, MAP_COLUMNS
         self._index = _read_index(store)
-        if normal:
-            self.normal.load_state_dict(normal.state_dict())
-        if edge:
-            hidden = edge_cells(self.frame, edge.place_m, edge.angle_deg)
-            self.normal.hide(torch.from_numpy(hidden))
-        self._normalise(opened, learn=normal is None)
-        if growth is None:
-            self.refresh(on_progress)
-
-    def _normalise(self, opened: Sequence[Dataset], *, learn: bool) -> None:
-        """Take the normalisation that the store has, or give it one."""
-        wanted = {name: values.clone() for name, values in self.normal.state_dict().items()}
-        cells = self._store / CELLS
-        if not cells.exists():
-            if learn:
-                self._learn(opened)
-            with atomic_file(cells) as part, part.open("wb") as file:
+        if not (store / CELLS).exists():
+            if normal:
+                self.normal.load_state_dict(normal.state_dict())
+            else:
+                some = [
+                    self._read(shard)[0]
+                    for one in opened
+                    for shard in one.shards[:STATISTICS_SHARDS]
+                ]
+                depth_m, intensity = (
+                    [getattr(one, name) for one in some] for name in MAP_CHANNELS[:2]
+                )
+                self.normal.learn(
+                    *(torch.from_numpy(np.concatenate(parts)) for parts in (depth_m, intensity))
+                )
+            with atomic_file(store / CELLS) as part, part.open("wb") as file:
                 np.savez(
                     file,
                     **{name: values.numpy() for name, values in self.normal.state_dict().items()},
                 )
         try:
-            stored = read_npz(cells)
+            cells = read_npz(store / CELLS)
             self.normal.load_state_dict(
-                {name: torch.from_numpy(values) for name, values in stored.items()}
+                {name: torch.from_numpy(values) for name, values in cells.items()}
             )
         except (OSError, ValueError, TypeError, RuntimeError) as error:
-            raise _damaged(self._store, CELLS) from error
+            raise _damaged(store, CELLS) from error
         found = self.normal.state_dict()
-        given = ["hidden"] if learn else [*wanted]
-        if any(not torch.equal(wanted[name], found[name]) for name in given):
+        if normal and any(
+            not torch.equal(values, found[name]) for name, values in normal.state_dict().items()
+        ):
             raise SceneError(
-                f"{self._store} holds maps that are normalised for other weights: name another"
-                " --store"
+                f"{store} holds maps that are normalised for other weights: name another --store"
             )
-
-    def _learn(self, opened: Sequence[Dataset]) -> None:
-        """Learn each cell's statistics from the first shards of each dataset."""
-        some = [self._read(shard)[0] for one in opened for shard in one.shards[:STATISTICS_SHARDS]]
-        depth_m, intensity = ([getattr(one, name) for one in some] for name in MAP_CHANNELS[:2])
-        self.normal.learn(
-            *(torch.from_numpy(np.concatenate(parts)) for parts in (depth_m, intensity))
-        )
+        if growth is None:
+            self.refresh(on_progress)
 
     def __len__(self) -> int:
         return sum(self._index["shards"].values())
@@ -307,7 +289,6 @@ def open_packed_maps(
     growth: Growth | None = None,
     align: bool = True,
     frame: Rig | None = None,
-    edge: RigSpread | None = None,
 ) -> Generator[PackedMaps]:
     """Open or make a store, and hold the right to write it until the end of the block.
 
@@ -324,5 +305,4 @@ def open_packed_maps(
             growth=growth,
             align=align,
             frame=frame,
-            edge=edge,
         )

@@ -2,21 +2,41 @@
 
 A column of cells there sees the wall in place of the occluder, or the other way round, as soon as
 the lidar or the occluder stands some millimetres elsewhere. These few cells are then off by far more
-than an object moves any, and a network that was trained on exact benches answers them with nonsense.
+than an object moves any, and networks answer them with nonsense. What they ought to show is known: an
+occluder's cell tells nothing, and a wall's cell much what its neighbor tells.
 """
 
+from dataclasses import replace
 from itertools import product
+from typing import NamedTuple
 
 import numpy as np
 from nlos_calibration import Rig
-from nlos_calibration.arrays import Mask
+from nlos_calibration.arrays import Float64, Mask
 
-from nlos_cam.frames import MAP_COLUMNS, MAP_ROWS
-from nlos_cam.render import cast
+from nlos_cam.frames import MAP_COLUMNS, MAP_ROWS, LidarMaps
+from nlos_cam.reconstruct.bench import CalibratedRig
+from nlos_cam.reconstruct.flat_field import MIN_WALL_CELLS, same_surface
+from nlos_cam.render import Scene, cast, render
 
 BEAMS_PER_CELL = 4
 """Along each side of a cell: an edge within it counts, not only one that passes its middle."""
 SIGNS = -1, 1
+REACH_M = 0.005
+REACH_DEG = 1.0
+"""How far off its record a bench may be whose edge is repaired. Farther ones are another bench."""
+AT_WALL_M = 0.009
+"""Depth off the wall's below which a cell shows no echo: three times the error of a bench's record."""
+OTHER_SURFACE_M = 0.03
+"""Depth off its surface's from which on a cell sees the other one: most occluders stand 0.05 m and
+more before the wall, and a wall seen at a slant moves by a centimeter with a degree."""
+OTHER_CELLS = 0.1
+"""Share of a column's cells that see the other surface from which on the edge is in it."""
+OTHER_LIGHT = 0.07
+"""Logarithm of the light over the record's from which on a column holds some of both surfaces: the
+median over its cells, which neither noise nor the grain of a wall moves as far."""
+MIN_CELLS = 8
+"""Cells of one surface from which on a column is judged by their light."""
 
 
 def edge_cells(rig: Rig, place_m: float, angle_deg: float) -> Mask:
@@ -49,17 +69,140 @@ def edge_cells(rig: Rig, place_m: float, angle_deg: float) -> Mask:
     every = ~some
     for lidar, sheet in product(lidars, sheets):
         bench = rig.model_copy(update={"lidar": lidar, "occluder": sheet})
+        beams = _occluded(bench, BEAMS_PER_CELL)
         # beams of a cell follow each other along both sides
-        beams = _occluded(bench).reshape(MAP_ROWS, BEAMS_PER_CELL, MAP_COLUMNS, BEAMS_PER_CELL)
+        beams = beams.reshape(MAP_ROWS, BEAMS_PER_CELL, MAP_COLUMNS, BEAMS_PER_CELL)
         some |= beams.any((1, 3))
         every &= beams.all((1, 3))
     return some & ~every
 
 
-def _occluded(rig: Rig) -> Mask:
-    """Return which beams (256, 320) meet the occluder before the wall."""
-    finer = rig.pinhole.scaled(BEAMS_PER_CELL * MAP_COLUMNS, BEAMS_PER_CELL * MAP_ROWS)
+def _occluded(rig: Rig, beams_per_cell: int) -> Mask:
+    """Return which beams (rows, columns) meet the occluder before the wall."""
+    finer = rig.pinhole.scaled(beams_per_cell * MAP_COLUMNS, beams_per_cell * MAP_ROWS)
     alone, with_occluder = (
         cast(rig, finer, occluder=occluder).on_wall for occluder in (False, True)
     )
     return (alone & ~with_occluder).reshape(finer.height, finer.width)
+
+
+class Surface(NamedTuple):
+    """Wall or occluder as a bench's record has it, and the cells (64, 80) at the edge that see it."""
+
+    depth_m: Float64
+    """(64, 80); along the optical axis."""
+    light: Float64
+    """(64, 80); in units of the renderer's."""
+    cells: Mask
+
+
+class EdgeRepair:
+    """Repair of the cells at the occluder's edge, where it is not where the record has it.
+
+    A column is repaired if some of its cells see the other surface, or if their light is of both:
+    the occluder's cells get its own depth and light, the wall's those of the nearest column that is
+    whole, as deviations from the bare wall. Frames of a bench as it was recorded stay as they are.
+    """
+
+    def __init__(self, bench: CalibratedRig) -> None:
+        rig = bench.rig
+        band = edge_cells(rig, REACH_M, REACH_DEG)
+        self._sheet: Surface | None = None
+        if not band.any():
+            return
+        on_record = render(Scene(rig))
+        alone = render(Scene(rig.model_copy(update={"occluder": None})))
+        occluded = _occluded(rig, 1)
+        self._wall = _surface(alone.depth_m, alone.intensity, bench, band & ~occluded)
+        self._sheet = _surface(on_record.depth_m, on_record.intensity, bench, band & occluded)
+        self._whole = ~band & ~occluded
+        """Wall cells by which the light's unit is found."""
+        columns = np.arange(MAP_COLUMNS)
+        sides = [(mask.sum(0) @ columns) / max(mask.sum(), 1) for mask in (occluded, ~occluded)]
+        self._step = 1 if sides[0] > sides[1] else -1
+        """From the wall to the occluder, in columns."""
+        self._columns = np.flatnonzero(band.any(0))[:: self._step].tolist()
+
+    def repair(self, maps: LidarMaps) -> LidarMaps:
+        """Return maps (64, 80), with the range offset corrected, as the record's edge gives them."""
+        sheet = self._sheet
+        if sheet is None:
+            return maps
+        gain = self._gain(maps)
+        of_wall = [self._is_off(maps, self._wall, gain, column) for column in self._columns]
+        of_sheet = [self._is_off(maps, sheet, gain, column) for column in self._columns]
+        if not any(of_wall) and not any(of_sheet):
+            return maps
+
+        depth_m = maps.depth_m.copy()
+        intensity = maps.intensity.copy()
+        valid = maps.valid.copy()
+        for column, wall_off, sheet_off in zip(self._columns, of_wall, of_sheet, strict=True):
+            rows = sheet.cells[:, column]
+            if sheet_off and gain is not None:
+                depth_m[rows, column] = sheet.depth_m[rows, column]
+                intensity[rows, column] = gain * sheet.light[rows, column]
+                valid[rows, column] = True
+            before = column - self._step
+            rows = self._wall.cells[:, column]
+            if wall_off and 0 <= before < MAP_COLUMNS:
+                farther_m = self._wall.depth_m[rows, column] - self._wall.depth_m[rows, before]
+                brighter = self._wall.light[rows, column] / self._wall.light[rows, before]
+                depth_m[rows, column] = depth_m[rows, before] + farther_m
+                intensity[rows, column] = intensity[rows, before] * brighter
+                valid[rows, column] = valid[rows, before]
+        return replace(maps, depth_m=depth_m, intensity=intensity, valid=valid)
+
+    def _gain(self, maps: LidarMaps) -> float | None:
+        """Return a frame's counts for each unit of light, by cells that show no echo; None where
+        they are too few.
+        """
+        wall = self._wall
+        bare = self._whole & maps.valid & (wall.light > 0)
+        bare &= np.abs(maps.depth_m - wall.depth_m) < AT_WALL_M
+        if bare.sum() < MIN_WALL_CELLS:
+            return None
+        return float(np.median(maps.intensity[bare] / wall.light[bare]))
+
+    def _is_off(
+        self, maps: LidarMaps, surface: Surface, gain: float | None, column: int
+    ) -> bool:
+        """Return True if the edge is within a column of a surface's cells."""
+        rows = surface.cells[:, column] & maps.valid[:, column] & (surface.light[:, column] > 0)
+        if not rows.any():
+            return False
+        beyond_m = maps.depth_m[rows, column] - surface.depth_m[rows, column]
+        # an echo's path is longer than the wall's, so only nearer cells see the occluder
+        other = beyond_m < -OTHER_SURFACE_M
+        if surface is self._sheet:
+            other = np.abs(beyond_m) > OTHER_SURFACE_M
+        if other.mean() > OTHER_CELLS:
+            return True
+        same = np.abs(beyond_m) < AT_WALL_M
+        if gain is None or same.sum() < MIN_CELLS:
+            return False
+        expected = gain * surface.light[rows, column][same]
+        off = np.log((maps.intensity[rows, column][same] + 1) / (expected + 1))
+        return abs(float(np.median(off))) > OTHER_LIGHT
+
+
+def _surface(
+    depth_m: Float64, light: Float64, bench: CalibratedRig, cells: Mask
+) -> Surface:
+    """Return a surface as it was measured, else as rendered."""
+    depth_m = depth_m.astype(np.float64)
+    light = light.astype(np.float64)
+    reference = bench.reference
+    if reference is None:
+        return Surface(depth_m, light, cells)
+    same = same_surface(reference, depth_m, bench.range_offset_m)
+    if same.sum() < MIN_WALL_CELLS:
+        return Surface(depth_m, light, cells)
+    # in the rendering's units, so that cells without a measurement still fit
+    units = float(np.median(light[same] / reference.map_intensity[same]))
+    measured_m = reference.map_depth_m.astype(np.float64) + bench.range_offset_m
+    return Surface(
+        np.where(same, measured_m, depth_m),
+        np.where(same, units * reference.map_intensity, light),
+        cells,
+    )

@@ -69,7 +69,6 @@ def train_direct(
         # Not strict: blocks and mixers that only this recipe has stay as they are initialised,
         # that is, as identities.
         network.load_state_dict(start.state_dict(), strict=False)
-        network.normal.hidden.copy_(source.normal.hidden)
     steps = recipe.objects // recipe.batch
 
     def batches(generator: torch.Generator) -> Iterable[NormalBatch]:

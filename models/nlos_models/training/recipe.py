@@ -249,10 +249,6 @@ class DirectRecipe(Recipe, frozen=True):
     """
     range_offset_m: float = Field(default=0.0, ge=0, le=0.1)
     """Standard deviation of the range offset of each sample's lidar."""
-    edge_mm: float = Field(default=0.0, ge=0, le=20)
-    edge_deg: float = Field(default=0.0, ge=0, le=10)
-    """Cells that see the wall in place of the occluder, or the other way round, on a bench that is
-    this far off its record are hidden from the network."""
     blend: float = Field(default=1.0, gt=0, le=1)
     """Share of the trained weights in their mean with those that the run started from, which keeps
     what the new maps do not show (Wortsman et al. 2022, "Robust fine-tuning of zero-shot

@@ -12,7 +12,7 @@ import torch
 from fake_workers import samples_of
 from nlos_calibration import Rig, load_rig
 from nlos_models import CellNormal
-from nlos_models.training import DirectRecipe, MapBatch
+from nlos_models.training import MapBatch
 from nlos_models.training.data import flip_some, subtract_bare_wall
 from small_maps import SmallDataset, small_maps
 from small_run import small_recipe
@@ -24,7 +24,6 @@ from nlos_cam.dataset.packed import (
     INDEX,
     MAPS,
     PackedMaps,
-    edge_of,
     map_noise,
     open_packed_maps,
 )
@@ -432,29 +431,6 @@ def test_store_keeps_the_normalisation_of_given_weights(
 def test_store_of_another_normalisation_is_refused(folder: Path, store_folder: Path) -> None:
     with pytest.raises(SceneError, match="name another --store"):
         open_packed_maps([folder], store_folder, normal=CellNormal()).__enter__()
-
-
-def test_packed_maps_hide_the_cells_at_the_edge(folder: Path, store_folder: Path) -> None:
-    edge = RigSpread(place_m=0.002, angle_deg=0.5)
-    with open_packed_maps([folder], store_folder, edge=edge) as packed:
-        hidden = packed.normal.hidden.numpy()
-        maps, _ = _epoch(packed, 1)
-
-    assert 0 < hidden.sum() < hidden.size / 4
-    assert not maps[..., hidden].any()
-    assert maps[..., ~hidden].any()
-
-    with pytest.raises(SceneError, match="name another --store"):
-        open_packed_maps([folder], store_folder).__enter__()
-
-
-def test_recipe_says_whether_the_edge_is_hidden() -> None:
-    recipe = small_recipe(task="direct", objects=4, held_out=2)
-    assert isinstance(recipe, DirectRecipe)
-    hiding = recipe.model_copy(update={"edge_mm": 2.0})
-
-    assert edge_of(recipe) is None
-    assert edge_of(hiding) == RigSpread(place_m=0.002)
 
 
 def test_open_packed_maps_refuses_a_store_in_use(folder: Path, store_folder: Path) -> None:

@@ -167,53 +167,6 @@ def test_cells_are_normalised_symmetrically_and_clipped() -> None:
     torch.testing.assert_close(normal(depth_m.flip(-2), intensity.flip(-2)), values.flip(-2))
 
 
-def test_hidden_cells_do_not_reach_the_network() -> None:
-    network = _shaken()
-    generator = torch.Generator().manual_seed(0)
-    depth_m = 0.3 + 0.01 * torch.randn(3, 64, 80, generator=generator)
-    intensity = 20 + torch.rand(3, 64, 80, generator=generator)
-    network.normal.learn(depth_m, intensity)
-    cells = torch.zeros(64, 80, dtype=torch.bool)
-    cells[4:9, 60:62] = True
-    off_m = depth_m.clone()
-    off_m[:, 4:9, 60:62] -= 0.05
-    off_m[:, 57, 60] -= 0.05  # a mirror image of these
-
-    assert not torch.equal(network(off_m, intensity), network(depth_m, intensity))
-
-    network.normal.hide(cells)
-
-    assert torch.equal(network(off_m, intensity), network(depth_m, intensity))
-    assert int(network.normal.hidden.sum()) == 20
-
-    network.normal.hide(torch.zeros_like(cells))
-
-    assert not network.normal.hidden.any()
-
-
-def test_training_varies_hidden_cells_by_nothing() -> None:
-    source = Source()
-    source.normal.hide(torch.ones(64, 80, dtype=torch.bool))
-    maps = source.maps
-    values = source.normal(torch.from_numpy(maps.depth_m), torch.from_numpy(maps.intensity))
-    offset_m = torch.full((12,), 0.003)
-
-    varied = vary(source.normal, values, MapNoise(1.0, 1.0, 0.0, 10.0), None, offset_m)
-
-    assert not varied.any()
-
-
-def test_weights_from_before_hidden_cells_hide_none() -> None:
-    state = DirectNetwork(SIZE).state_dict()
-    del state["normal.hidden"]
-    network = DirectNetwork(SIZE)
-    network.normal.hide(torch.ones(64, 80, dtype=torch.bool))
-
-    network.load_state_dict(state)
-
-    assert not network.normal.hidden.any()
-
-
 def test_gain_of_a_frame_is_taken_out() -> None:
     normal = CellNormal()
     generator = torch.Generator().manual_seed(0)
@@ -357,9 +310,9 @@ def test_blend_is_the_mean_of_trained_and_earlier_weights(weights: Path, tmp_pat
             train_direct(recipe, Source(), small_maps(4, 1), tmp_path / f"{share}", start=start)
         )
     (trained, plain), (blended, figures) = made
-    before = dict(start.named_parameters())
-    after = dict(trained.named_parameters())
-    for name, found in blended.named_parameters():
+    before = start.state_dict()
+    after = trained.state_dict()
+    for name, found in blended.state_dict().items():
         torch.testing.assert_close(found, 0.75 * before[name] + 0.25 * after[name])
 
     assert (
@@ -416,9 +369,7 @@ def test_weights_are_exported_and_kept_apart_from_a_pipeline(weights: Path, tmp_
     inline = [
         each.name
         for each in stored
-        if len(each.dims) == 2
-        and each.data_type != TensorProto.BOOL  # the mask of hidden cells
-        and each.data_location != TensorProto.EXTERNAL
+        if len(each.dims) == 2 and each.data_location != TensorProto.EXTERNAL
     ]
 
     assert not inline  # no matrix is stored twice, the transposed ones included
