@@ -4,6 +4,7 @@ __all__ = [
     "Arrival",
     "CalibratedRig",
     "Clock",
+    "EdgeRepair",
     "FrameConditions",
     "FrameReader",
     "FrameResult",
@@ -64,7 +65,7 @@ from .alignment import (
     rig_to_align_with,
 )
 from .bench import CalibratedRig, check_intrinsics, open_bench
-from .edge import edge_cells
+from .edge import EdgeRepair, edge_cells
 from .flat_field import measured_counts
 from .frame_reader import Arrival, FrameReader, ignore
 from .network import Clock, Quality, Reconstruction, estimate_uncertainty, reconstruct

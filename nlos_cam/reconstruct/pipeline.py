@@ -25,6 +25,7 @@ from nlos_cam.objects import SurfaceMesh
 from nlos_cam.reconstruct.alignment import MapAlignment, alignment
 from nlos_cam.reconstruct.bench import BenchObservation, CalibratedRig
 from nlos_cam.reconstruct.consistency import COMPLETE, MapConsistency, MapFindings
+from nlos_cam.reconstruct.edge import EdgeRepair
 from nlos_cam.reconstruct.flat_field import FlatField
 from nlos_cam.reconstruct.frame_reader import Arrival
 from nlos_cam.reconstruct.network import (
@@ -187,6 +188,7 @@ class PreparedBench(NamedTuple):
     """None where alignment takes the wall's reflectance out."""
     consistency: MapConsistency | None
     """None without an uncertainty model: then no verdict depends on it."""
+    edge: EdgeRepair
 
 
 @dataclass(frozen=True)
@@ -257,7 +259,7 @@ class Pipeline:
         consistency = MapConsistency(bench) if self.uncertainty_model else None
         # in one assignment: `prepare` must not see half of it
         flat_field = None if aligned else FlatField(bench)
-        self._bench = PreparedBench(bench, aligned, flat_field, consistency)
+        self._bench = PreparedBench(bench, aligned, flat_field, consistency, EdgeRepair(bench))
 
     @property
     def average(self) -> int:
@@ -278,7 +280,8 @@ class Pipeline:
     def prepare(self, arrival: Arrival, clock: Clock, start_s: float) -> PreparedFrame:
         """Return the maps of a frame as the networks need them; call in frame order."""
         taken_s = clock()
-        bench, aligned, flat_field, consistency = self._bench  # another thread may replace it
+        # another thread may replace it
+        bench, aligned, flat_field, consistency, edge = self._bench
         maps = maps_from_frame(arrival.frame)
         mapped_s = clock()
 
@@ -287,13 +290,18 @@ class Pipeline:
         observation = bench.observe(arrival.frame, maps)
         difference = observation.difference
         corrected = bench.correct_range(maps)
+        repaired = edge.repair(corrected)
         if aligned:
             # The difference has no drift in it, and neither has what it adds to the training wall.
-            network_input = aligned.align(corrected, difference.depth_m if difference else None)
+            drift_free_m = difference.depth_m if difference else None
+            if drift_free_m is not None and repaired is not corrected:
+                moved_m = repaired.depth_m - corrected.depth_m
+                drift_free_m = (drift_free_m + moved_m).astype(np.float32)
+            network_input = aligned.align(repaired, drift_free_m)
         elif self._uses_difference and difference:
             network_input = difference
         else:
-            network_input = flat_field.correct(corrected) if flat_field else corrected
+            network_input = flat_field.correct(repaired) if flat_field else repaired
         findings = consistency.examine(corrected) if consistency else COMPLETE
         frozen = self._frozen.add(arrival.frame)
         observed_s = clock()

@@ -12,7 +12,8 @@
 `limits` evaluates with one thing removed or added at a time. `rigs` moves the lidar over the
 distances and angles of SI 1 and by what a bench built with a ruler is off, while occluder and
 object box stay, and resumes. `edge` measures what a record costs that is off by fractions of a
-millimetre, with either sign: one column of cells at the occluder's edge then sees the other thing.
+millimetre, with either sign: one column of cells at the occluder's edge then sees the other thing,
+which `EdgeRepair` mends.
 """
 
 import argparse
@@ -67,7 +68,7 @@ from nlos_cam.evaluate import (
 from nlos_cam.files import cache_folder
 from nlos_cam.frames import LidarMaps
 from nlos_cam.objects import benchmark_objects, object_box
-from nlos_cam.reconstruct import estimate_uncertainty
+from nlos_cam.reconstruct import CalibratedRig, EdgeRepair, estimate_uncertainty
 from nlos_cam.render import QUIET
 
 FRAMES = 10, 100
@@ -389,6 +390,7 @@ def edge(asked: argparse.Namespace) -> None:
     rig = load_rig(asked.rig)
     subjects = benchmark_objects(object_box(rig))
     here = Place(rig.lidar.distance_m, rig.lidar.yaw_deg)
+    repair = EdgeRepair(CalibratedRig(rig))
     moves = [0.0, *(sign * off for off in OFFSETS_MM for sign in (1, -1))]
     turns = [sign * off for off in OFFSETS_DEG for sign in (1, -1)]
     places = [
@@ -399,13 +401,16 @@ def edge(asked: argparse.Namespace) -> None:
     def measured(place: Place, _: Any) -> dict[str, Any]:
         bench = place.rig(rig)
         truth = truth_of(subjects, object_box(bench))
-        maps = as_map_set(sense(echoes_of(subjects, bench, lambda *_: None), bench), truth)
-        found = dict[str, Any]()
+        seen = sense(echoes_of(subjects, bench, lambda *_: None), bench)
+        repaired = [repair.repair(each) for each in seen]
+        found = dict[str, dict[str, float]]()
         for label, (network, _) in weights.items():
-            taken = network_input(maps, None, repeat(rig), network.record)
-            images = reconstruct_all(network, taken)
-            figures = plain(judge(images, truth, object_box(bench)))
-            found[label] = round(figures["silhouette_iou"]["value"], 4)
+            for way, each in (("repaired", repaired), ("as they are", seen)):
+                maps = as_map_set(each, truth)
+                taken = network_input(maps, None, repeat(rig), network.record)
+                figures = plain(judge(reconstruct_all(network, taken), truth, object_box(bench)))
+                iou = round(figures["silhouette_iou"]["value"], 4)
+                found.setdefault(label, {})[way] = iou
         return {"silhouette_iou": found}
 
     rows = harness.collect("edge", places, measured, key=key_of(asked))
