@@ -15,7 +15,7 @@ import numpy as np
 from nlos_calibration import Rig
 from nlos_calibration.arrays import Float32, Float64, Mask
 
-from nlos_cam.frames import MAP_COLUMNS, MAP_ROWS, LidarMaps
+from nlos_cam.frames import MAP_COLUMNS, MAP_ROWS, SATURATED, LidarMaps
 from nlos_cam.reconstruct.bench import CalibratedRig
 from nlos_cam.reconstruct.flat_field import MIN_WALL_CELLS, same_surface
 from nlos_cam.render import Scene, cast, render
@@ -127,8 +127,8 @@ class EdgeRepair:
         occluded = _occluded(rig, 1)[:, :, 0]
         self._wall = _surface(alone.depth_m, alone.intensity, bench, band & ~occluded)
         self._sheet = _surface(on_record.depth_m, on_record.intensity, bench, band & occluded)
-        self._whole = ~band & ~occluded
-        """Wall cells by which the light's unit is found."""
+        self._apart = ~band & ~occluded, ~band & occluded
+        """Cells of the wall, and of the occluder, by which the units of their light are found."""
         columns = np.arange(MAP_COLUMNS)
         sides = [(mask.sum(0) @ columns) / max(mask.sum(), 1) for mask in (occluded, ~occluded)]
         self._step = 1 if sides[0] > sides[1] else -1
@@ -142,22 +142,25 @@ class EdgeRepair:
         sheet = self._sheet
         if sheet is None:
             return maps
-        gain = self._gain(maps)
-        of_wall = self._off(maps, self._wall, gain)
-        of_sheet = self._off(maps, sheet, gain)
+        wall_gain = _gain(maps, self._wall, self._apart[0], AT_WALL_M)
+        # of its own: no record says how dark an occluder is
+        sheet_gain = _gain(maps, sheet, self._apart[1], OTHER_SURFACE_M)
+        of_wall = self._off(maps, self._wall, wall_gain)
+        of_sheet = self._off(maps, sheet, sheet_gain)
         if not of_wall and not of_sheet:
             return maps
-        if of_wall == self._columns_of(self._wall) or of_sheet == self._columns_of(sheet):
-            return maps  # not a little off: another bench, or one without its occluder
+        for surface, off in ((self._wall, of_wall), (sheet, of_sheet)):
+            if off and off == self._columns_of(surface):
+                return maps  # not a little off: another bench, or one without its occluder
 
         depth_m = maps.depth_m.copy()
         intensity = maps.intensity.copy()
         valid = maps.valid.copy()
         for column in self._columns:
-            if column in of_sheet and gain is not None:
+            if column in of_sheet and sheet_gain is not None:
                 rows = sheet.cells[:, column]
                 depth_m[rows, column] = sheet.depth_m[rows, column]
-                intensity[rows, column] = gain * sheet.light[rows, column]
+                intensity[rows, column] = sheet_gain * sheet.light[rows, column]
                 valid[rows, column] = True
             if column in of_wall:
                 rows = self._wall.cells[:, column]
@@ -166,20 +169,11 @@ class EdgeRepair:
                 depth_m[rows, column] = last_m + SLOPE * (last_m - depth_m[rows, earlier])
                 last = intensity[rows, before]
                 brighter = last / np.maximum(intensity[rows, earlier], 1)
-                intensity[rows, column] = last * brighter**SLOPE
-                valid[rows, column] = valid[rows, before] & valid[rows, earlier]
+                known = valid[rows, before] & valid[rows, earlier]
+                counts = np.minimum(last * brighter**SLOPE, SATURATED)
+                intensity[rows, column] = np.where(known, counts, 0)
+                valid[rows, column] = known
         return replace(maps, depth_m=depth_m, intensity=intensity, valid=valid)
-
-    def _gain(self, maps: LidarMaps) -> float | None:
-        """Return a frame's counts for each unit of light, by cells that show no echo; None where
-        they are too few.
-        """
-        wall = self._wall
-        bare = self._whole & maps.valid & (wall.light > 0)
-        bare &= np.abs(maps.depth_m - wall.depth_m) < AT_WALL_M
-        if bare.sum() < MIN_WALL_CELLS:
-            return None
-        return float(np.median(maps.intensity[bare] / wall.light[bare]))
 
     def _columns_of(self, surface: Surface) -> list[int]:
         """Return the columns at the edge that have cells of a surface."""
@@ -222,6 +216,17 @@ class EdgeRepair:
         beyond_m = maps.depth_m[rows][:, pair] - self._wall.depth_m[rows][:, pair]
         falling = beyond_m[:, 1] < beyond_m[:, 0] - FALL_M
         return float(falling.mean()) > FALLING_CELLS
+
+
+def _gain(maps: LidarMaps, surface: Surface, cells: Mask, within_m: float) -> float | None:
+    """Return a frame's counts for each unit of a surface's light, by the cells whose depth is
+    within a limit of it; None where they are too few.
+    """
+    seen = cells & maps.valid & (surface.light > 0)
+    seen &= np.abs(maps.depth_m - surface.depth_m) < within_m
+    if seen.sum() < MIN_WALL_CELLS:
+        return None
+    return float(np.median(maps.intensity[seen] / surface.light[seen]))
 
 
 def _surface(depth_m: Float32, light: Float32, bench: CalibratedRig, cells: Mask) -> Surface:

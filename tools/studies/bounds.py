@@ -1,4 +1,4 @@
-"""What the maps of one, two and four stations hold: docs/figures/bounds.json.
+"""Bounds by what the maps of one, two and four stations hold: docs/figures/bounds.json.
 
     python tools/studies/bounds.py [--objects N] [--out DIR]
 
@@ -161,7 +161,7 @@ def lights_of(subject: Subject, depth: str) -> dict[str, Light]:
 
 @dataclass(frozen=True)
 class Setting:
-    """What an estimate is given."""
+    """Data and model of an estimate."""
 
     depth: str
     stations: tuple[str, ...]

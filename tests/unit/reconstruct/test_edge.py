@@ -2,6 +2,8 @@
 its repair gives what the record's bench would have shown.
 """
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from nlos_calibration import Rig, load_rig
@@ -102,3 +104,18 @@ def test_bench_without_its_occluder_is_not_repaired(objects: list[BenchmarkObjec
     (maps,) = maps_of(objects[:1], HOME.model_copy(update={"occluder": None}))
 
     assert edge.repair(maps) is maps
+
+
+def test_black_occluder_is_repaired_as_black(objects: list[BenchmarkObject]) -> None:
+    """No record says how dark an occluder is: a frame does."""
+    edge = EdgeRepair(CalibratedRig(HOME))
+    (maps,) = maps_of(objects[:1], off_record(yaw_deg=-0.5))
+    occluder = maps.depth_m < 0.25
+    black = replace(maps, intensity=np.where(occluder, maps.intensity / 10, maps.intensity))
+
+    filled = edge.repair(black).depth_m != maps.depth_m
+
+    assert filled.any()
+    assert edge.repair(black).intensity[filled].max() == pytest.approx(
+        edge.repair(maps).intensity[filled].max() / 10, rel=0.05
+    )
