@@ -1,9 +1,14 @@
 __all__ = [
+    "ACCURACY",
+    "BLACK",
     "CAVEATS",
     "COLUMNS",
+    "EFFECTS",
     "FRAMES",
     "MATERIALS",
+    "Basis",
     "Change",
+    "ChosenBeams",
     "Conditions",
     "Expectation",
     "Forecast",
@@ -12,10 +17,12 @@ __all__ = [
     "Shape",
     "change_words",
     "changes",
+    "cut",
     "fit_prior",
     "forecast",
     "hidden_words",
     "network_iou",
+    "shipped_basis",
     "shipped_prior",
     "table_of",
     "words_of",
@@ -24,7 +31,7 @@ __all__ = [
 
 from .advice import Change, changes
 from .curve import network_iou
-from .expectation import FRAMES, Conditions, Expectation, Forecast, forecast
-from .linear import MATERIALS, MaterialName
+from .expectation import FRAMES, Conditions, Expectation, Forecast, forecast, shipped_basis
+from .linear import ACCURACY, BLACK, EFFECTS, MATERIALS, Basis, ChosenBeams, MaterialName, cut
 from .prior import Prior, Shape, fit_prior, shipped_prior
 from .report import CAVEATS, COLUMNS, change_words, hidden_words, table_of, words_of, write_report

@@ -34,9 +34,16 @@ from nlos_cam.evaluate import (
     seeded_objects,
     sense,
 )
-from nlos_cam.forecast.expectation import shipped_basis
-from nlos_cam.forecast.linear import ACCURACY, BLACK, EFFECTS, Basis, ChosenBeams, cut
-from nlos_cam.forecast.prior import Shape
+from nlos_cam.forecast import (
+    ACCURACY,
+    BLACK,
+    EFFECTS,
+    Basis,
+    ChosenBeams,
+    Shape,
+    cut,
+    shipped_basis,
+)
 from nlos_cam.objects import BenchmarkObject, benchmark_objects, object_box, unseen_objects
 from nlos_cam.reconstruct import load_networks, reconstruct
 from nlos_cam.render import Gradients, Scene, SensorModel, Surface, intensity_noise, render
