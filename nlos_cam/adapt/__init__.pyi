@@ -4,7 +4,6 @@ __all__ = [
     "RECORDINGS",
     "AdaptResult",
     "Adaptation",
-    "Expected",
     "Locked",
     "LockedNoise",
     "Measure",
@@ -26,5 +25,5 @@ __all__ = [
 from .locked import LockedNoise
 from .plan import Locked, Pace, Plan, Stage, bench_sensor, calibration_spread
 from .recordings import RECORDINGS, Recordings, Transfer, find_recordings
-from .report import Expected, Tables, transfer_words, write_page
+from .report import Tables, transfer_words, write_page
 from .run import NETWORK_FILE, OBJECTS, Adaptation, AdaptResult, Measure, adapt, install

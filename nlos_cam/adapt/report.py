@@ -7,14 +7,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 
 from nlos_cam.adapt.plan import Plan
 from nlos_cam.adapt.recordings import Transfer
 from nlos_cam.adapt.run import AFTER, NETWORK, REPORT, AdaptResult
-from nlos_cam.bench import FORECAST_SCATTER_IOU
+from nlos_cam.bench import FORECAST_SCATTER_IOU, ForecastRecord
 from nlos_cam.report import (
     Banner,
     Commands,
@@ -146,15 +145,6 @@ def _transfer_parts(found: Transfer, rows: Rows) -> list[Section | Picture]:
     return [section, sheet]
 
 
-class Expected(NamedTuple):
-    """What the forecast of a bench says of it."""
-
-    iou: float
-    """Silhouette IoU of weights that are trained for it."""
-    hidden_share: float
-    """Share of the test objects that change no cell of its maps."""
-
-
 @dataclass(frozen=True)
 class Tables:
     """Figures before and after, in words."""
@@ -162,7 +152,7 @@ class Tables:
     test_objects: Rows
     recordings: Rows = ()
     """On the objects held out of the recordings."""
-    expected: Expected | None = None
+    expected: ForecastRecord | None = None
     """None where there is no forecast."""
 
 
@@ -177,7 +167,7 @@ def write_page(result: AdaptResult, tables: Tables, commands: Sequence[str], pag
     facts = {
         "objects rendered for this bench": f"{plan.stages[-1].objects}",
         "samples trained on": f"{curves[-1].samples[-1]}",
-        "expected by the forecast": f"{expected.iou:.2f}" if expected else "",
+        "expected by the forecast": f"{expected.expected_iou:.2f}" if expected else "",
         "objects that change no cell: nothing there": (
             f"{expected.hidden_share:.0%}" if expected and expected.hidden_share else ""
         ),
@@ -191,7 +181,7 @@ def write_page(result: AdaptResult, tables: Tables, commands: Sequence[str], pag
             f" {spread.gain_share:.0%} of the gain"
         ),
     }
-    advice = outlook(plan, curves, after, expected.iou if expected else None)
+    advice = outlook(plan, curves, after, expected.expected_iou if expected else None)
     title = "Weights for this bench"
     subtitle = "54 test objects, rendered on this bench with the sensor's noise. Simulated light."
     if locked := plan.locked:

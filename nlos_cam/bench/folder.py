@@ -61,7 +61,7 @@ class Bench:
         """Silhouette IoU to expect of weights trained for this rig; None where it was not
         forecast.
         """
-        found = self._forecast
+        found = self.forecast
         return found.expected_iou if found else None
 
     @property
@@ -69,11 +69,11 @@ class Bench:
         """Share of the test objects that change no cell of the maps of this rig; 0 where it was not
         forecast.
         """
-        found = self._forecast
+        found = self.forecast
         return found.hidden_share if found else 0.0
 
     @property
-    def _forecast(self) -> ForecastRecord | None:
+    def forecast(self) -> ForecastRecord | None:
         """Forecast of this rig, if there is one."""
         found = self.record.stations[self.station].forecast
         return found if found and found.rig_checksum == self.rig.checksum else None

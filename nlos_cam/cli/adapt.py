@@ -145,13 +145,17 @@ def adapt(
     _report(result, target, [*commands, more], work / PAGE, expected, as_json=json)
 
 
-def _forecast(rig: walls.Rig, folder: Path | None) -> adaptation.Expected:
+def _forecast(rig: walls.Rig, folder: Path | None) -> benches.ForecastRecord:
     """Return the forecast for a rig: that which its bench holds already, else a new one."""
-    loaded = benches.load_bench(folder) if folder else None
-    if loaded and loaded.expected_iou is not None:
-        return adaptation.Expected(loaded.expected_iou, loaded.hidden_share)
+    stored = benches.load_bench(folder).forecast if folder else None
+    if stored:
+        return stored
     found = forecast.forecast(rig, quick=True)
-    return adaptation.Expected(found.expected_iou, found.hidden_share)
+    return benches.ForecastRecord(
+        rig_checksum=rig.checksum,
+        expected_iou=found.expected_iou,
+        hidden_share=found.hidden_share,
+    )
 
 
 def _recordings(folder: Path) -> adaptation.Recordings | None:
@@ -193,7 +197,7 @@ def _report(
     target: Path,
     commands: list[str],
     page: Path,
-    expected: adaptation.Expected | None,
+    expected: benches.ForecastRecord | None,
     *,
     as_json: bool,
 ) -> None:
@@ -220,7 +224,7 @@ def _report(
         "report": str(page),
         "minutes": result.plan.minutes,
         "objects": result.plan.stages[-1].objects,
-        "expected_iou": expected and expected.iou,
+        "expected_iou": expected and expected.expected_iou,
         "hidden_share": expected and expected.hidden_share,
         "before": result.before,
         "after": result.after,

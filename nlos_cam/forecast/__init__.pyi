@@ -6,7 +6,6 @@ __all__ = [
     "EFFECTS",
     "FRAMES",
     "MATERIALS",
-    "Basis",
     "Change",
     "ChosenBeams",
     "Conditions",
@@ -32,6 +31,6 @@ __all__ = [
 from .advice import Change, changes
 from .curve import network_iou
 from .expectation import FRAMES, Conditions, Expectation, Forecast, forecast, shipped_basis
-from .linear import ACCURACY, BLACK, EFFECTS, MATERIALS, Basis, ChosenBeams, MaterialName, cut
+from .linear import ACCURACY, BLACK, EFFECTS, MATERIALS, ChosenBeams, MaterialName, cut
 from .prior import Prior, Shape, fit_prior, shipped_prior
 from .report import CAVEATS, COLUMNS, change_words, hidden_words, table_of, words_of, write_report

@@ -22,7 +22,7 @@ from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
-from nlos_calibration import BareWall, Rig
+from nlos_calibration import Rig
 from nlos_calibration.arrays import Float64, Mask
 
 from nlos_cam.frames import MAP_COLUMNS, MAP_ROWS, SATURATED, LidarMaps
@@ -30,9 +30,9 @@ from nlos_cam.objects import object_box, object_depth
 from nlos_cam.reconstruct.bench import CalibratedRig
 from nlos_cam.reconstruct.flat_field import (
     MIN_WALL_CELLS,
+    as_measured,
     brightest_light,
     interior,
-    same_surface,
     wall_as_rendered,
 )
 from nlos_cam.render import Rendering, Scene, SensorModel, render
@@ -131,21 +131,10 @@ class MapConsistency:
         rig = bench.rig
         usual = objects_on_bench(rig)  # pyright: ignore[reportArgumentType]  frozen, hashable
         self._information, self._overlap = usual
-        self._depth_m, self._light = wall_as_rendered(rig)
+        wall = wall_as_rendered(rig)
         if bench.reference is not None:
-            self._take_measured(bench.reference, bench.range_offset_m)
-
-    def _take_measured(self, reference: BareWall, offset_m: float) -> None:
-        """Replace depth and light of the cells where the reference saw the wall of the rig."""
-        same = same_surface(reference, self._depth_m, offset_m)
-        if same.sum() < MIN_WALL_CELLS:
-            return
-
-        # in the rendering's units, so that cells without a measurement still fit
-        units = float(np.median(self._light[same] / reference.map_intensity[same]))
-        measured_m = reference.map_depth_m.astype(np.float64) + offset_m
-        self._depth_m = np.where(same, measured_m, self._depth_m)
-        self._light = np.where(same, units * reference.map_intensity, self._light)
+            wall = as_measured(*wall, bench.reference, bench.range_offset_m)
+        self._depth_m, self._light = wall
 
     def examine(self, maps: LidarMaps) -> MapFindings:
         """Return the findings of maps (64, 80) with the range offset corrected."""

@@ -13,12 +13,14 @@ from typing import NamedTuple
 
 import numpy as np
 from nlos_calibration import Rig
-from nlos_calibration.arrays import Float32, Float64, Mask
+from nlos_calibration.arrays import Float64, Mask
 
 from nlos_cam.frames import MAP_COLUMNS, MAP_ROWS, SATURATED, LidarMaps
 from nlos_cam.reconstruct.bench import CalibratedRig
-from nlos_cam.reconstruct.flat_field import MIN_WALL_CELLS, same_surface
-from nlos_cam.render import Scene, cast, render
+from nlos_cam.reconstruct.consistency import OFF_WALL_M
+from nlos_cam.reconstruct.flat_field import MIN_WALL_CELLS, as_measured
+from nlos_cam.reconstruct.physics_check import bare_rendering
+from nlos_cam.render import Rendering, cast
 
 BEAMS_PER_CELL = 4
 """Along a row: an edge within a cell counts, not only one that passes its middle."""
@@ -26,8 +28,6 @@ SIGNS = -1, 1
 REACH_M = 0.005
 REACH_DEG = 1.0
 """How far off its record a bench may be whose edge is repaired. Farther ones are another bench."""
-AT_WALL_M = 0.009
-"""Depth off the wall's below which a cell shows no echo: three times the error of a bench's record."""
 OTHER_SURFACE_M = 0.03
 """Depth off its surface's from which on a cell sees the other one: most occluders stand 0.05 m and
 more before the wall, and a wall seen at a slant moves by a centimeter with a degree."""
@@ -122,18 +122,17 @@ class EdgeRepair:
         self._sheet: Surface | None = None
         if not band.any():
             return
-        on_record = render(Scene(rig))
-        alone = render(Scene(rig.model_copy(update={"occluder": None})))
+        alone = rig.model_copy(update={"occluder": None})
         occluded = _occluded(rig, 1)[:, :, 0]
-        self._wall = _surface(alone.depth_m, alone.intensity, bench, band & ~occluded)
-        self._sheet = _surface(on_record.depth_m, on_record.intensity, bench, band & occluded)
+        self._wall = _surface(_bare(alone), bench, band & ~occluded)
+        self._sheet = _surface(_bare(rig), bench, band & occluded)
         self._apart = ~band & ~occluded, ~band & occluded
         """Cells of the wall, and of the occluder, by which the units of their light are found."""
         columns = np.arange(MAP_COLUMNS)
         sides = [(mask.sum(0) @ columns) / max(mask.sum(), 1) for mask in (occluded, ~occluded)]
         self._step = 1 if sides[0] > sides[1] else -1
         """From the wall to the occluder, in columns."""
-        columns = np.flatnonzero(band.any(0))[:: self._step]
+        columns = np.flatnonzero(band.any(0))[:: self._step].tolist()
         # a wall's column goes on from two others
         self._columns = [each for each in columns if 0 <= each - 2 * self._step < MAP_COLUMNS]
 
@@ -142,7 +141,7 @@ class EdgeRepair:
         sheet = self._sheet
         if sheet is None:
             return maps
-        wall_gain = _gain(maps, self._wall, self._apart[0], AT_WALL_M)
+        wall_gain = _gain(maps, self._wall, self._apart[0], OFF_WALL_M)
         # of its own: no record says how dark an occluder is
         sheet_gain = _gain(maps, sheet, self._apart[1], OTHER_SURFACE_M)
         of_wall = self._off(maps, self._wall, wall_gain)
@@ -196,9 +195,9 @@ class EdgeRepair:
             other = np.abs(beyond_m) > OTHER_SURFACE_M
         if other.mean() > OTHER_CELLS:
             return True
-        same = np.abs(beyond_m) < AT_WALL_M
         if surface is self._wall and self._falls_back(maps, column):
             return True
+        same = np.abs(beyond_m) < OFF_WALL_M
         if gain is None or same.sum() < MIN_CELLS:
             return False
         expected = gain * surface.light[rows, column][same]
@@ -218,6 +217,11 @@ class EdgeRepair:
         return float(falling.mean()) > FALLING_CELLS
 
 
+def _bare(rig: Rig) -> Rendering:
+    """Return the rendering of a rig with nothing hidden."""
+    return bare_rendering(rig)  # pyright: ignore[reportArgumentType]  hashable
+
+
 def _gain(maps: LidarMaps, surface: Surface, cells: Mask, within_m: float) -> float | None:
     """Return a frame's counts for each unit of a surface's light, by the cells whose depth is
     within a limit of it; None where they are too few.
@@ -229,20 +233,9 @@ def _gain(maps: LidarMaps, surface: Surface, cells: Mask, within_m: float) -> fl
     return float(np.median(maps.intensity[seen] / surface.light[seen]))
 
 
-def _surface(depth_m: Float32, light: Float32, bench: CalibratedRig, cells: Mask) -> Surface:
-    """Return a surface as it was measured, else as rendered."""
-    rendered = Surface(depth_m.astype(np.float64), light.astype(np.float64), cells)
-    reference = bench.reference
-    if reference is None:
-        return rendered
-    same = same_surface(reference, depth_m, bench.range_offset_m)
-    if same.sum() < MIN_WALL_CELLS:
-        return rendered
-    # in the rendering's units, so that cells without a measurement still fit
-    units = float(np.median(light[same] / reference.map_intensity[same]))
-    measured_m = reference.map_depth_m.astype(np.float64) + bench.range_offset_m
-    return Surface(
-        np.where(same, measured_m, rendered.depth_m),
-        np.where(same, units * reference.map_intensity, rendered.light),
-        cells,
-    )
+def _surface(rendering: Rendering, bench: CalibratedRig, cells: Mask) -> Surface:
+    """Return a surface as it was measured, else as rendered; `cells` (64, 80) see it."""
+    seen = rendering.depth_m.astype(np.float64), rendering.intensity.astype(np.float64)
+    if bench.reference is not None:
+        seen = as_measured(*seen, bench.reference, bench.range_offset_m)
+    return Surface(*seen, cells)

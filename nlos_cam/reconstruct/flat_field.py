@@ -91,6 +91,25 @@ def wall_as_rendered(rig: Rig) -> tuple[Float64, Float64]:
     return np.where(sees_wall, bare.depth_m, np.nan), np.where(sees_wall, bare.intensity, 0.0)
 
 
+def as_measured(
+    depth_m: Float64, light: Float64, reference: BareWall, offset_m: float
+) -> tuple[Float64, Float64]:
+    """Return a surface's depth and light (64, 80) as a reference measured them, as rendered in the
+    cells where it saw another surface; all as rendered where those that it saw are too few.
+    """
+    same = same_surface(reference, depth_m, offset_m)
+    if same.sum() < MIN_WALL_CELLS:
+        return depth_m, light
+
+    # in the rendering's units, so that cells without a measurement still fit
+    units = float(np.median(light[same] / reference.map_intensity[same]))
+    measured_m = reference.map_depth_m.astype(np.float64) + offset_m
+    return (
+        np.where(same, measured_m, depth_m),
+        np.where(same, units * reference.map_intensity, light),
+    )
+
+
 def same_surface(reference: BareWall, depth_m: Float32 | Float64, offset_m: float) -> Mask:
     """Return the cells (64, 80) whose reference is of a surface at `depth_m`; `offset_m` is the
     lidar's range offset.

@@ -38,7 +38,6 @@ from nlos_cam.forecast import (
     ACCURACY,
     BLACK,
     EFFECTS,
-    Basis,
     ChosenBeams,
     Shape,
     cut,
@@ -64,8 +63,10 @@ class Light:
 
     measured: Float64
     """(k,); expected, free of noise."""
-    by_outline: Float32
-    """(k, GRID^2); rate by the albedo of every cell over the box, at the assumed depth."""
+    usual: Float64
+    """(k,); of the prior's mean outline, at the assumed depth."""
+    rates: Float64
+    """(k, OUTLINES); by the prior's largest components of the outline."""
     noise: Float64
     """(k,); in one frame."""
 
@@ -81,19 +82,23 @@ def light_at(rig: Rig, truth: Shape, assumed: Shape) -> Light:
     won = data.three_bounce & (data.intensity > wall) & model.three_bounce
     noise = intensity_noise(data, SensorModel())
     won &= np.isfinite(noise)
+    basis = shipped_basis()
+    by_outline = ChosenBeams(model, won).jacobian("albedo")[0]
     return Light(
         data.intensity[won].astype(np.float64),
-        ChosenBeams(model, won).jacobian("albedo")[0],
+        by_outline @ basis.mean_outline,
+        by_outline @ basis.outline,
         noise[won],
     )
 
 
 def estimate(
-    basis: Basis, lights: Sequence[Light], frames: int, trust: float, seed: int
+    lights: Sequence[Light], frames: int, trust: float, seed: int
 ) -> tuple[Float64, float]:
     """Return the outline (GRID^2,) by the posterior mean, and how many of its numbers the maps
     determine.
     """
+    basis = shipped_basis()
     generator = np.random.default_rng(seed)
     count = basis.outline.shape[1]
     prior = basis.covariance[:count, :count]
@@ -103,8 +108,8 @@ def estimate(
         drawn = light.noise / np.sqrt(frames)
         sensed = light.measured + drawn * generator.standard_normal(len(drawn))
         spread = np.hypot(drawn, trust * light.measured)
-        rates = (light.by_outline @ basis.outline) / spread[:, None]
-        off = (sensed - light.by_outline @ basis.mean_outline) / spread
+        rates = light.rates / spread[:, None]
+        off = (sensed - light.usual) / spread
         information += rates.T @ rates
         told += rates.T @ off
     posterior = np.linalg.inv(information)
@@ -191,9 +196,7 @@ def estimated(
             for setting in (each for each in SETTINGS if each.depth == depth):
                 chosen = [lights[station] for station in setting.stations]
                 for trust in trusts[setting]:
-                    outline, numbers = estimate(
-                        shipped_basis(), chosen, setting.frames, trust, number
-                    )
+                    outline, numbers = estimate(chosen, setting.frames, trust, number)
                     figures = overlap(outline, subject.truth), numbers
                     found.setdefault((setting, trust), []).append(figures)
             on_progress(number + 1, len(subjects) * len(DEPTHS))

@@ -47,7 +47,6 @@ from nlos_cam.dataset import (
     DatasetPlan,
     Objects,
     PackedMaps,
-    RigSpread,
     build_dataset,
     map_noise,
     open_dataset,
@@ -82,7 +81,6 @@ HELD_OUT = 400
 EPOCHS = 20
 TESTS = "kinds of training", "kinds never seen", "held out"
 SHARE_GENERIC = 0.5
-OBJECTS_PER_RIG = 25
 Maps = Mapping[str, MapSet]
 """Maps of the same objects by the name of the station."""
 
@@ -144,20 +142,14 @@ def rig_at(place: str) -> Rig:
     )
 
 
-def rendered(
-    place: str, work: Path, seed: int, count: int, spread: RigSpread | None = None
-) -> Path:
-    """Render objects without noise as a place's lidar sees them, unless they are there; with a
-    `spread` on benches that are off the place's record.
-    """
-    folder = work / f"{place}{'-spread' if spread else ''}-{seed}"
+def rendered(place: str, work: Path, seed: int, count: int) -> Path:
+    """Render objects without noise as a place's lidar sees them, unless they are there."""
+    folder = work / f"{place}-{seed}"
     plan = DatasetPlan(
         rig_at(place),
         seed,
         accuracy="draft",
         objects=Objects(share_generic=SHARE_GENERIC),
-        spread=spread or RigSpread(),
-        objects_per_rig=OBJECTS_PER_RIG if spread else 1,
         expected=True,
     )
     with tracked(f"rendering {count} objects from {place}") as on_progress:
@@ -207,21 +199,16 @@ def matched(
         seed += 1
 
 
-def untrained(recipe: DirectRecipe, sources: Sequence[PackedMaps]) -> StationsNetwork:
-    """Return a network of some stations at the start that the recipe's seed draws."""
-    torch.manual_seed(recipe.seed)
-    return StationsNetwork(recipe, [source.normal for source in sources])
-
-
 def trained(
-    network: StationsNetwork,
-    what: str,
+    stations: Sequence[str],
     sources: Sequence[PackedMaps],
     recipe: DirectRecipe,
-    held: Sequence[MapSet],
+    maps: Maps,
     folder: Path,
 ) -> StationsNetwork:
-    """Train the network of some stations, or go on with it; `held` are held-out maps of each."""
+    """Train the network of some stations, or go on with it."""
+    torch.manual_seed(recipe.seed)
+    network = StationsNetwork(recipe, [source.normal for source in sources])
     steps = recipe.objects // recipe.batch
 
     def batches(generator: torch.Generator) -> Iterator[list[NormalBatch]]:
@@ -235,23 +222,19 @@ def trained(
         noisy = [normal + recipe.noise * torch.randn_like(normal) for normal in normals]
         return two_heads_error(network.logits(noisy), batch[0].image)
 
-    with tracked(f"training {what}, seed {recipe.seed}") as on_progress:
+    chosen = [maps[station] for station in stations]
+    with tracked(f"training {'+'.join(stations)}, seed {recipe.seed}") as on_progress:
         fit(
             network,
             recipe=recipe,
             steps_per_epoch=steps,
             batches=batches,
             loss=loss,
-            score=lambda: figures_of(network.images(held), held[0].image),
+            score=lambda: figures_of(network.images(chosen), chosen[0].image),
             folder=folder,
             running=Running(on_step=on_progress),
         )
     return network.cpu().eval()
-
-
-def shortened(recipe: DirectRecipe, samples: int, seed: int) -> DirectRecipe:
-    """Return the recipe with another seed and as many samples in all."""
-    return recipe.model_copy(update={"seed": seed, "epochs": EPOCHS, "objects": samples // EPOCHS})
 
 
 def judged(
@@ -344,13 +327,15 @@ def main() -> None:
         for seed in range(asked.seeds):
             for name in asked.sets:
                 stations = name.split("+")
-                own = shortened(recipe, asked.samples, seed)
+                own = recipe.model_copy(
+                    update={"seed": seed, "epochs": EPOCHS, "objects": asked.samples // EPOCHS}
+                )
                 folder = asked.work / f"{asked.objects}-{asked.samples}" / f"{name}-{seed}"
                 done = folder / "judged.json"
                 if not done.exists():
-                    chosen = [sources[each] for each in stations]
-                    held = [sets[TESTS[2]][each] for each in stations]
-                    network = trained(untrained(own, chosen), name, chosen, own, held, folder)
+                    network = trained(
+                        stations, [sources[each] for each in stations], own, sets[TESTS[2]], folder
+                    )
                     values = judged(network, sets, stations)
                     done.write_text(json.dumps(values), encoding="utf-8")
                 values = json.loads(done.read_text(encoding="utf-8"))
