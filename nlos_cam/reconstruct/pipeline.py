@@ -62,6 +62,10 @@ TRUSTED_MISSING = 0.02
 """Share of cells without a depth from which on no frame is trusted: what the quality model was
 fitted to had none."""
 FROZEN = "the camera repeats the same frame: unplug it and plug it in again"
+EDGE_IS_OFF = (
+    "the occluder's edge is not where the record has it, and its cells are repaired: if this stays,"
+    " measure wall and occluder again"
+)
 
 
 @dataclass(frozen=True, repr=False)
@@ -201,6 +205,7 @@ class PreparedFrame:
     corrected: LidarMaps
     """Raw maps with the measured range offset of the lidar added."""
     network_input: LidarMaps
+    edge_is_repaired: bool
     findings: MapFindings
     frozen: bool
     stages_s: Mapping[str, float]
@@ -291,10 +296,11 @@ class Pipeline:
         difference = observation.difference
         corrected = bench.correct_range(maps)
         repaired = edge.repair(corrected)
+        edge_is_repaired = repaired is not corrected
         if aligned:
             # The difference has no drift in it, and neither has what it adds to the training wall.
             drift_free_m = difference.depth_m if difference else None
-            if drift_free_m is not None and repaired is not corrected:
+            if drift_free_m is not None and edge_is_repaired:
                 moved_m = repaired.depth_m - corrected.depth_m
                 drift_free_m = (drift_free_m + moved_m).astype(np.float32)
             network_input = aligned.align(repaired, drift_free_m)
@@ -313,7 +319,15 @@ class Pipeline:
             "bench": observed_s - mapped_s,
         }
         return PreparedFrame(
-            arrival, maps, observation, corrected, network_input, findings, frozen, stages_s
+            arrival,
+            maps,
+            observation,
+            corrected,
+            network_input,
+            edge_is_repaired,
+            findings,
+            frozen,
+            stages_s,
         )
 
     def reconstruct(self, frames: Sequence[PreparedFrame], clock: Clock) -> list[Reconstruction]:
@@ -334,6 +348,12 @@ class Pipeline:
         conditions = frame_conditions(prepared, self.checks.newest)
         judged = with_quality_of_maps(reconstruction, conditions)
         shown, verdict = self._verdicts.decide(judged, conditions)
+        warnings = observation.warnings
+        if prepared.edge_is_repaired:
+            warnings = (*warnings, EDGE_IS_OFF)
+        if shown.uncertainty:
+            warnings += problems_of(conditions)
+
         # Raw maps are checked: they are what the renderer computes.
         self.checks.offer(frame.frame_number, prepared.corrected, shown.depth_m)
         return FrameResult(
@@ -343,7 +363,7 @@ class Pipeline:
             published_s=clock(),
             stages_s={**prepared.stages_s, **reconstruction.timings_s},
             difference=observation.difference,
-            warnings=observation.warnings + (problems_of(conditions) if shown.uncertainty else ()),
+            warnings=warnings,
             verdict=verdict,
             check=self.checks.newest,
             arrived_s=arrived_s,

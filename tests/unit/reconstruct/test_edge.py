@@ -7,12 +7,22 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from nlos_calibration import Rig, load_rig
+from small_frames import sheet_network
 
+from nlos_cam.camera import World
 from nlos_cam.evaluate import echoes_of, per_object, sense
 from nlos_cam.frames import LidarMaps
 from nlos_cam.objects import BenchmarkObject, benchmark_objects, image_from_depth, object_box
-from nlos_cam.reconstruct import CalibratedRig, EdgeRepair, edge_cells, load_networks, reconstruct
-from nlos_cam.render import Scene, render
+from nlos_cam.reconstruct import (
+    Arrival,
+    CalibratedRig,
+    EdgeRepair,
+    Pipeline,
+    edge_cells,
+    load_networks,
+    reconstruct,
+)
+from nlos_cam.render import Scene, SceneFile, SensorModel, render
 
 HOME = load_rig("paper-rig")
 BOX = object_box(HOME)
@@ -119,3 +129,18 @@ def test_black_occluder_is_repaired_as_black(objects: list[BenchmarkObject]) -> 
     assert edge.repair(black).intensity[filled].max() == pytest.approx(
         edge.repair(maps).intensity[filled].max() / 10, rel=0.05
     )
+
+
+@pytest.mark.parametrize(("yaw_deg", "says"), [(0.0, False), (0.5, True)])
+def test_result_says_that_its_edge_was_repaired(
+    yaw_deg: float, says: bool, objects: list[BenchmarkObject]
+) -> None:
+    elsewhere = off_record(yaw_deg=yaw_deg)
+    scene = SceneFile(name="elsewhere", rig=elsewhere, sensor=SensorModel())
+    world = World(scene, echoes_of(objects[:1], elsewhere, lambda _done, _of: None), [None])
+    frame = world.images(0).frame(HOME.pinhole)
+    pipeline = Pipeline(CalibratedRig(HOME), sheet_network)
+
+    result = pipeline.process(Arrival(frame, 0.0, ()), lambda: 0.0, 0.0)
+
+    assert [("edge" in warning) for warning in result.warnings] == [True] * says
