@@ -11,6 +11,7 @@ from safetensors.torch import load, save
 from torch import nn
 
 from nlos_cam.files import TENSOR_LIMIT, describe, read_checked, write_checked
+from nlos_models.byte_weights import SCALE, from_bytes
 from nlos_models.direct import DirectNetwork
 from nlos_models.errors import CheckpointError
 from nlos_models.pipeline import RemappingNetwork, new_pipeline
@@ -129,6 +130,15 @@ def read_tensors(path: Path) -> dict[str, torch.Tensor]:
     floats = {
         key: value.float() if value.is_floating_point() else value for key, value in tensors.items()
     }
+    for key in [name for name in floats if name.endswith(SCALE)]:
+        scale = floats.pop(key).numpy()
+        name = key.removesuffix(SCALE)
+        try:
+            floats[name] = torch.from_numpy(from_bytes(floats[name].numpy(), scale))
+        except (KeyError, ValueError) as error:
+            raise CheckpointError(
+                f"{path} cannot be used as weights: the scales of {name} fit no bytes ({error})"
+            ) from error
     if bad := [key for key, value in floats.items() if not torch.isfinite(value).all()]:
         raise CheckpointError(
             f"{path} cannot be used as weights: {bad[0]} is not finite; train or copy them again"

@@ -4,7 +4,7 @@ import hashlib
 import json
 import logging
 import warnings
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -19,6 +19,7 @@ from torch import Tensor, nn
 from nlos_cam.files import write_checked
 from nlos_models import inference
 from nlos_models.arrays import Float32
+from nlos_models.byte_weights import GROUP, SCALE, from_bytes
 from nlos_models.checkpoint import load_network
 from nlos_models.direct import DirectNetwork
 from nlos_models.errors import CheckpointError, ModelError
@@ -190,35 +191,56 @@ def _as_onnx(
     return model
 
 
-KINDS = {"F16": "<f2", "F32": "<f4"}
+KINDS = {"F16": "<f2", "F32": "<f4", "I8": "<i1"}
 """NumPy's names of the types of safetensors files that are linked."""
+ONNX_TYPES = {"f2": TensorProto.FLOAT16, "f4": TensorProto.FLOAT, "i1": TensorProto.INT8}
 
 
 class _StoredTensor(NamedTuple):
     """Tensor in a safetensors file, and its place there in bytes."""
 
     values: NDArray[Any]
+    """In float16, float32, or bytes."""
     location: str
     offset: int
     length: int
+    scale: "_StoredTensor | None" = None
+    """Of a weight in bytes (`byte_weights`)."""
+
+    @property
+    def is_linked(self) -> bool:
+        """Return True for a large weight; biases and norms are small, and stay in the graph."""
+        return self.values.ndim > 1 and self.values.dtype != np.float32
+
+    @property
+    def plain(self) -> Float32:
+        """Values in float32, as networks compute with them."""
+        if self.scale:
+            return from_bytes(self.values, self.scale.values)
+        return self.values.astype(np.float32)
 
 
-def _stored(path: Path, prefix: str) -> Iterator[tuple[str, _StoredTensor]]:
-    """Yield the tensors of a safetensors file: the header's length (8 bytes), the header (JSON),
+def _stored(path: Path, prefix: str) -> dict[str, _StoredTensor]:
+    """Return the tensors of a safetensors file: the header's length (8 bytes), the header (JSON),
     then the tensors.
     """
     # https://huggingface.co/docs/safetensors: offsets in the header count from the end of the
     # header.
     content = path.read_bytes()
     start = 8 + int.from_bytes(content[:8], "little")
+    found = dict[str, _StoredTensor]()
     for name, entry in json.loads(content[8:start]).items():
         if name != "__metadata__" and entry["dtype"] in KINDS:
             first, last = (start + offset for offset in entry["data_offsets"])
             values = np.frombuffer(content[first:last], KINDS[entry["dtype"]])
-            yield (
-                prefix + name,
-                _StoredTensor(values.reshape(entry["shape"]), path.name, first, last - first),
+            found[name] = _StoredTensor(
+                values.reshape(entry["shape"]), path.name, first, last - first
             )
+    return {
+        prefix + name: tensor._replace(scale=found.get(name + SCALE))
+        for name, tensor in found.items()
+        if not name.endswith(SCALE)
+    }
 
 
 def _linked_graph(
@@ -243,9 +265,9 @@ def _linked_graph(
     # The exporter names a weight as torch does, unless it has transposed it for a matrix product:
     # such a one is found by its values.
     transposed = {
-        _key(tensor.values.T): tensor
+        _key(tensor.plain.T): tensor
         for tensor in stored.values()
-        if tensor.values.dtype == np.float16 and tensor.values.ndim == 2
+        if tensor.is_linked and tensor.values.ndim == 2
     }
     nodes = list[onnx.NodeProto]()
     initializers = {initializer.name: initializer for initializer in model.graph.initializer}
@@ -276,20 +298,43 @@ def _key(values: NDArray[Any]) -> tuple[tuple[int, ...], bytes]:
     return values.shape, np.ascontiguousarray(values, np.float32).tobytes()
 
 
-def _linked_transposed(
-    name: str, tensor: _StoredTensor
-) -> tuple[list[TensorProto], list[onnx.NodeProto]]:
-    """Return the initializer and nodes of a weight that the exporter has transposed."""
-    nodes = [
-        helper.make_node("Cast", [f"{name}.half"], [f"{name}.plain"], to=TensorProto.FLOAT),
-        helper.make_node("Transpose", [f"{name}.plain"], [name], perm=[1, 0]),
+Linked = tuple[list[TensorProto], list[onnx.NodeProto]]
+"""Initializers, and the nodes that make a weight from them."""
+
+
+def _linked_transposed(name: str, tensor: _StoredTensor) -> Linked:
+    """Return what makes a weight that the exporter has transposed."""
+    initializers, nodes = _plain(f"{name}.plain", tensor)
+    transpose = helper.make_node("Transpose", [f"{name}.plain"], [name], perm=[1, 0])
+    return initializers, [*nodes, transpose]
+
+
+def _plain(name: str, tensor: _StoredTensor) -> Linked:
+    """Return what makes a weight in float32 from its stored tensor."""
+    stored = f"{name}.stored"
+    scale = tensor.scale
+    if scale is None:
+        cast = helper.make_node("Cast", [stored], [name], to=TensorProto.FLOAT)
+        return [_external(stored, tensor, tensor.values.shape)], [cast]
+
+    # the same products as `from_bytes`: a graph answers as torch does
+    initializers = [
+        _external(stored, tensor, (tensor.values.size // GROUP, GROUP)),
+        _external(f"{name}.scale", scale, scale.values.shape),
+        numpy_helper.from_array(np.array(tensor.values.shape, np.int64), f"{name}.shape"),
     ]
-    return [_external(f"{name}.half", tensor)], nodes
+    nodes = [
+        helper.make_node("Cast", [stored], [f"{name}.whole"], to=TensorProto.FLOAT),
+        helper.make_node("Mul", [f"{name}.whole", f"{name}.scale"], [f"{name}.groups"]),
+        helper.make_node("Reshape", [f"{name}.groups", f"{name}.shape"], [name]),
+    ]
+    return initializers, nodes
 
 
-def _external(name: str, tensor: _StoredTensor) -> TensorProto:
+def _external(name: str, tensor: _StoredTensor, shape: Sequence[int]) -> TensorProto:
     # ONNX external data: file, offset and length, so that the weights are stored once.
-    external = TensorProto(name=name, data_type=TensorProto.FLOAT16, dims=tensor.values.shape)
+    kind = ONNX_TYPES[tensor.values.dtype.str[1:]]
+    external = TensorProto(name=name, data_type=kind, dims=shape)
     external.data_location = TensorProto.EXTERNAL
     for key, value in (
         ("location", tensor.location),
@@ -302,23 +347,19 @@ def _external(name: str, tensor: _StoredTensor) -> TensorProto:
 
 def _linked(
     name: str, exported: NDArray[Any], stored: Mapping[str, _StoredTensor]
-) -> tuple[list[TensorProto], list[onnx.NodeProto]] | None:
-    """Return the initializers and nodes that make an exported weight from its stored float16; None
-    for small ones.
+) -> Linked | None:
+    """Return what makes an exported weight from its stored tensor; None for small ones.
 
     The exporter multiplies the weights of a convolution by gamma / sqrt(variance + epsilon) of the
     batch norm after it. The same product is left to ONNX Runtime, which computes constants once,
     when it opens the graph.
     """
-    # Biases and norms are small, and stay in the graph.
     tensor = stored[name]
-    half = f"{name}.half"
-    if tensor.values.dtype != np.float16 or tensor.values.ndim == 1:
+    if not tensor.is_linked:
         return None
-    external = _external(half, tensor)
-    plain = tensor.values.astype(np.float32)
+    plain = tensor.plain
     if np.array_equal(exported, plain):
-        return [external], [helper.make_node("Cast", [half], [name], to=TensorProto.FLOAT)]
+        return _plain(name, tensor)
     # In a Sequential the batch norm has the number after its convolution's. Its factor has to be
     # computed as the exporter did, to the last bit, or the weight is not linked.
     module, _, index = name.removesuffix(".weight").rpartition(".")
@@ -331,11 +372,10 @@ def _linked(
     factor = scale.reshape(-1, *[1] * (plain.ndim - 1))
     if not np.array_equal(exported, plain * factor):
         return None
-    nodes = [
-        helper.make_node("Cast", [half], [f"{name}.plain"], to=TensorProto.FLOAT),
-        helper.make_node("Mul", [f"{name}.plain", f"{norm}.scale"], [name]),
-    ]
-    return [external, numpy_helper.from_array(factor, f"{norm}.scale")], nodes
+    initializers, nodes = _plain(f"{name}.plain", tensor)
+    product = helper.make_node("Mul", [f"{name}.plain", f"{norm}.scale"], [name])
+    factors = numpy_helper.from_array(factor, f"{norm}.scale")
+    return [*initializers, factors], [*nodes, product]
 
 
 def checksum_of(network: nn.Module) -> str:

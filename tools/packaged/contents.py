@@ -1,9 +1,9 @@
 """Write the generated files of the wheel: graphs of the shipped weights, loops of the packaged
-scenes, the sample.
+scenes, the sample. `bytes` stores new weights in a byte each, before their graphs are written.
 
 Each is committed, and a test holds graphs and loops equal to their source.
 
-    .venv/bin/python tools/packaged/contents.py graphs|worlds|sample ...
+    .venv/bin/python tools/packaged/contents.py bytes|graphs|worlds|sample ...
 """
 
 import argparse
@@ -11,6 +11,7 @@ import sys
 from pathlib import Path
 
 from nlos_models import SHIPPED, export_folder, shipped_folder
+from nlos_models.training import store_in_bytes
 
 from nlos_cam.camera import (
     WORLDS,
@@ -24,12 +25,22 @@ from nlos_cam.camera import (
 from nlos_cam.recording import SAMPLE
 from nlos_cam.render import bare_wall_scene, paper_scene
 
+IN_BYTES = ("paper",)
+"""Shipped weights that are stored in a byte each: those whose figures keep three digits by it."""
 EVERY = 12
 WIDTH = 320
 HEIGHT = 240
 """Of the sample recording, which stays below 2 MB: every twelfth pose, in the smallest of the
 L515's depth modes.
 """
+
+
+def write_bytes() -> list[Path]:
+    """Store the weights of IN_BYTES in a byte each, unless they are; takes the extra "train"."""
+    folders = [shipped_folder(name) for name in IN_BYTES]
+    for folder in folders:
+        store_in_bytes(folder)
+    return [path for folder in folders for path in folder.glob("*.safetensors")]
 
 
 def write_graphs() -> list[Path]:
@@ -73,7 +84,12 @@ def _report(done: int, total: int) -> None:
     print(f"\r{done}/{total}", end="", file=sys.stderr)
 
 
-PARTS = {"graphs": write_graphs, "worlds": write_worlds, "sample": write_sample}
+PARTS = {
+    "bytes": write_bytes,
+    "graphs": write_graphs,
+    "worlds": write_worlds,
+    "sample": write_sample,
+}
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(

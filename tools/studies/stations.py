@@ -1,10 +1,11 @@
-"""Is it a second place of the lidar, or a closer one? docs/figures/stations.json and
+"""Is it a second place of the lidar, a closer one, or a wider gap? docs/figures/stations.json and
 docs/images/stations.png.
 
     python tools/studies/stations.py WORK [--objects N] [--samples M] [--seeds S] [--sets NAMES ...]
 
 The same objects are rendered on the paper's bench for a lidar at "home" (0.20 m from the wall),
-"near" (0.15 m) and "back" (0.10 m farther from the object). A network for each set of stations is
+"near" (0.15 m) and "back" (0.10 m farther from the object), and for an occluder whose gap is "wide"
+(0.14 m for 0.10 m). A network for each set of stations is
 trained on as many samples, seed by seed: one station's is the direct network itself; of several,
 each station has its own layers up to the trunk, which reads their sum. They are judged on the 54
 test objects, the 54 of kinds never seen and held-out ones, each station with noise of its own. WORK
@@ -17,7 +18,7 @@ import platform
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import harness
 import numpy as np
@@ -67,14 +68,27 @@ from nlos_cam.objects import benchmark_objects, object_box, unseen_objects
 from nlos_cam.render import SceneFile, SensorModel
 
 RECIPE = harness.ROOT / "models" / "recipes" / "paper-rig-direct.toml"
+
+
+class Place(NamedTuple):
+    """Place of the lidar on the paper's bench, or of its occluder."""
+
+    along_m: float = 0.0
+    """Of the lidar's foot, from home's."""
+    distance_m: float = 0.20
+    yaw_deg: float = 45.0
+    gap_m: float = 0.10
+    """Between the wall and the occluder's edge."""
+
+
 PLACES = {
-    "home": (0.0, 0.20, 45.0),
-    "near": (0.0, 0.15, 45.0),
-    "back": (-0.10, 0.20, 45.0),
-    "fore": (0.10, 0.15, 60.0),
+    "home": Place(),
+    "near": Place(distance_m=0.15),
+    "back": Place(along_m=-0.10),
+    "fore": Place(along_m=0.10, distance_m=0.15, yaw_deg=60.0),
+    "wide": Place(gap_m=0.14),
 }
-"""Foot of the lidar along the wall from home's and its distance, in metres, and its yaw in degrees."""
-SETS = ("home", "near", "back", "home+near")
+SETS = ("home", "near", "back", "home+near", "wide")
 FIRST_SEED = 80_000_000
 HELD_OUT_SEED = 90_000_000
 HELD_OUT = 400
@@ -126,7 +140,7 @@ class StationsNetwork(nn.Module):
 def rig_at(place: str) -> Rig:
     """Return the paper's bench, seen from a place, in the wall frame of that place's lidar."""
     home = load_rig("paper-rig")
-    along_m, distance_m, yaw_deg = PLACES[place]
+    along_m, distance_m, yaw_deg, gap_m = PLACES[place]
     box = object_box(home)
     shifted = {"x_min_m": box.x_min_m - along_m, "x_max_m": box.x_max_m - along_m}
     occluder = home.occluder
@@ -136,7 +150,9 @@ def rig_at(place: str) -> Rig:
         update={
             "name": place,
             "lidar": home.lidar.model_copy(update={"distance_m": distance_m, "yaw_deg": yaw_deg}),
-            "occluder": occluder.model_copy(update={"x_m": occluder.x_m - along_m}),
+            "occluder": occluder.model_copy(
+                update={"x_m": occluder.x_m - along_m, "z_min_m": gap_m}
+            ),
             "object_box": box.model_copy(update=shifted),
         }
     )

@@ -47,6 +47,7 @@ __all__ = [
     "run_transfer",
     "run_uncertainty",
     "run_vae",
+    "store_in_bytes",
     "subtract_bare_wall",
     "train_direct",
     "transfer_start",
@@ -57,6 +58,7 @@ __all__ = [
     "varied",
 ]
 
+from .byte_storage import store_in_bytes
 from .checkpoints import load_encoder, load_vae
 from .data import (
     InMemory,

@@ -1,0 +1,137 @@
+"""Weights in a byte each: rounding within its bound, networks and graphs that answer as before."""
+
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from nlos_models.byte_weights import GROUP, LARGEST, fits_bytes, from_bytes, to_bytes
+from nlos_models.checkpoint import load_pipeline, read_tensors
+from nlos_models.compressor import Compressor
+from nlos_models.errors import CheckpointError
+from nlos_models.export import export_folder
+from nlos_models.inference import load_reconstructor
+from nlos_models.pipeline import RemappingNetwork
+from nlos_models.quality import load_quality_model
+from nlos_models.records import (
+    CheckpointRecord,
+    checksum_of_watched,
+    load_uncertainty_record,
+    shipped_folder,
+)
+from nlos_models.training import store_in_bytes
+from nlos_models.training.checkpoints import save_pipeline
+from nlos_models.vae import Decoder
+from safetensors.torch import load_file, save_file
+from small_maps import noise_maps
+from small_run import small_recipe
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+RECORD = CheckpointRecord.of([small_recipe()], ("paper-rig", "0123456789ab"))
+
+
+@pytest.fixture(scope="module")
+def saved(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    torch.manual_seed(0)
+    folder = tmp_path_factory.mktemp("weights")
+    save_pipeline(folder, RemappingNetwork(Compressor(), Decoder()), RECORD)
+    return folder
+
+
+@pytest.fixture
+def folder(saved: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(saved, tmp_path / "weights"))
+
+
+@given(seed=st.integers(0, 1000), size=st.sampled_from([1e-30, 1e-3, 1.0, 1e4]))
+def test_bytes_are_within_half_a_scale(seed: int, size: float) -> None:
+    random = np.random.default_rng(seed)
+    weight = (size * random.standard_normal((8, 3, 2 * GROUP))).astype(np.float32)
+    weight[0] = 0
+
+    back = from_bytes(*to_bytes(weight))
+
+    largest = np.abs(weight).reshape(-1, GROUP).max(axis=1, keepdims=True)
+    off = np.abs(back - weight).reshape(-1, GROUP)
+    assert back.shape == weight.shape
+    assert (off <= 0.5001 * largest / LARGEST).all()
+    np.testing.assert_array_equal(back[0], 0)
+
+
+def test_storing_twice_changes_no_bit() -> None:
+    weight = np.random.default_rng(0).standard_normal((64, GROUP)).astype(np.float32)
+    once = from_bytes(*to_bytes(weight))
+
+    np.testing.assert_array_equal(from_bytes(*to_bytes(once)), once)
+
+
+@pytest.mark.parametrize(
+    ("shape", "fits"),
+    [((64, 64), True), ((256, 128, 3, 3), True), ((4096,), False), ((8, 64), False)],
+)
+def test_large_weights_in_whole_groups_fit(shape: tuple[int, ...], fits: bool) -> None:
+    assert fits_bytes(shape) == fits
+    assert not fits_bytes((100, 63))
+
+
+def test_stored_pipeline_is_half_as_large_and_answers_alike(folder: Path) -> None:
+    maps = [torch.from_numpy(part) for part in noise_maps(4)]
+    before = load_pipeline(folder)[0]
+    size = (folder / "decoder.safetensors").stat().st_size
+    with torch.inference_mode():
+        wanted = before.latent(*maps)
+
+    store_in_bytes(folder)
+    with torch.inference_mode():
+        found = load_pipeline(folder)[0].latent(*maps)
+
+    assert (folder / "decoder.safetensors").stat().st_size < 0.56 * size
+    assert float((found - wanted).abs().mean()) < 0.02 * float(wanted.std())
+
+
+@pytest.mark.slow
+def test_graph_of_bytes_equals_full_export_bit_for_bit(folder: Path, tmp_path: Path) -> None:
+    maps = noise_maps(3)
+    store_in_bytes(folder)
+    full = load_reconstructor(folder, tmp_path / "cache")
+    (graph,) = export_folder(folder)
+
+    linked = load_reconstructor(folder, tmp_path / "unused")
+
+    assert graph.stat().st_size < 400_000
+    np.testing.assert_array_equal(linked(*maps), full(*maps))
+    assert not (tmp_path / "unused").exists()
+
+
+def test_judges_of_stored_weights_are_tied_to_them(tmp_path: Path) -> None:
+    folder = Path(shutil.copytree(shipped_folder("direct"), tmp_path / "weights"))
+    before = checksum_of_watched(folder)
+
+    store_in_bytes(folder)
+
+    record = load_uncertainty_record(folder)
+    assert record is not None
+    assert record.watches == checksum_of_watched(folder) != before
+    assert load_quality_model(folder) is not None
+
+
+@pytest.mark.parametrize("harm", ["short", "alone"])
+def test_scales_that_fit_no_bytes_are_refused(folder: Path, harm: str) -> None:
+    store_in_bytes(folder)
+    path = folder / "decoder.safetensors"
+    tensors = load_file(path)
+    name = next(each for each in tensors if each.endswith(".scale"))
+    if harm == "short":
+        tensors[name] = tensors[name][:-1].clone()
+    else:
+        del tensors[name.removesuffix(".scale")]
+    path.unlink()
+    (folder / "SHA256SUMS").unlink()
+    save_file(tensors, path)
+
+    with pytest.raises(CheckpointError, match=r"decoder\.safetensors.*scales"):
+        read_tensors(path)
