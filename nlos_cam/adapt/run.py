@@ -51,7 +51,7 @@ from nlos_cam.files import (
     claim,
     write_checked,
 )
-from nlos_cam.reconstruct import can_align, grid_of
+from nlos_cam.reconstruct import can_align, grid_of, weights_for
 from nlos_cam.render import SensorModel
 
 OBJECTS = "objects"
@@ -100,7 +100,7 @@ class Adaptation:
     """How far the bench may be off its rig."""
     folder: Path
     start: Path | None = None
-    """Start weights; None for the shipped ones."""
+    """Start weights; None for the shipped ones that serve the rig best."""
     sensor: SensorModel = field(default_factory=SensorModel)
     seed: int = 0
     workers: int = field(default_factory=lambda: max((os.cpu_count() or 2) // 2, 1))
@@ -112,6 +112,11 @@ class Adaptation:
     """Locked differences in place of maps; their weights are for a study, not for `live`."""
     recordings: Recordings | None = None
     """Recordings of known objects on the bench, if there are any."""
+
+    @property
+    def start_folder(self) -> Path:
+        """Folder of the start weights."""
+        return models.weights_folder(self.start) if self.start else weights_for(self.rig)
 
     @property
     def threads(self) -> int:
@@ -170,7 +175,7 @@ def adapt(
         plan = _plan_for(job, minutes, tracked)
         job = replace(job, spread=plan.spread, sensor=plan.sensor, seed=plan.seed)
         folders = [job.folder / _stage_name(number) for number in range(len(plan.stages))]
-        before = {} if job.locked else _figures(measure, job.start, job.folder / BEFORE)
+        before = {} if job.locked else _figures(measure, job.start_folder, job.folder / BEFORE)
         for number, stage in enumerate(plan.stages):
             on_message(
                 f"stage {number + 1} of {len(plan.stages)}: {stage.objects} objects,"
@@ -248,7 +253,7 @@ def _plan_for(job: Adaptation, minutes: float, tracked: data.Tracked) -> Plan:
 
 def _start_checksum(job: Adaptation) -> str:
     """Return the checksum of the start weights. Raises SceneError for no direct network."""
-    folder = models.weights_folder(job.start)
+    folder = job.start_folder
     try:
         return sha256((folder / NETWORK_FILE).read_bytes()).hexdigest()
     except OSError as error:
@@ -334,7 +339,7 @@ def _measure_pace(job: Adaptation, on_progress: Callable[[int, int], None]) -> P
 
 def _probe_step(job: Adaptation) -> Callable[[], None]:
     """Return a training step on maps of noise, which leaves the start weights as they are."""
-    network, _ = models.load_network(models.weights_folder(job.start))
+    network, _ = models.load_network(job.start_folder)
     if not isinstance(network, models.DirectNetwork):
         raise SceneError("the start weights are no direct network: choose others with --weights")
     fabric = training.open_fabric(_probe_recipe(), accelerator=job.accelerator)
@@ -459,7 +464,7 @@ def _train_network(
 ) -> None:
     """Train on from the stage before, on objects that are rendered meanwhile."""
     stage = plan.stages[number]
-    before = job.folder / _stage_name(number - 1) / NETWORK if number else job.start
+    before = job.folder / _stage_name(number - 1) / NETWORK if number else job.start_folder
     recipe = stage.recipe()
     out = job.folder / _stage_name(number) / NETWORK
     start, runs = training.direct_start(recipe, before)
@@ -470,7 +475,8 @@ def _train_network(
     watched = _Watched(watch or training.unwatched)
     rig = job.rig.name, job.rig.checksum
     noise = None
-    frame = None if job.locked else grid_of(models.load_record(models.weights_folder(before)))
+    trained = models.load_record(before)
+    frame = None if job.locked else grid_of(trained)
     if frame and not can_align(job.rig, frame):
         raise SceneError(
             f"the start weights cannot see {job.rig.name}: its lidar sees too little of the wall past"
@@ -481,6 +487,11 @@ def _train_network(
     if job.locked:
         noise = LockedNoise.of(job.rig, job.sensor, job.locked)
         rig = f"{job.rig.name} (locked differences)", ""
+
+    # By another rig's statistics a third of the cells would lie beyond the limit of a normalized
+    # one, on a bench 5 cm nearer.
+    is_elsewhere = not (frame or noise) and trained.rig_checksum != job.rig.checksum
+    normal = None if is_elsewhere else start.normal
 
     with closing(_Rendering(job, stage.objects)) as rendering:
 
@@ -499,7 +510,7 @@ def _train_network(
         store = data.open_packed_maps(
             [job.folder / OBJECTS],
             out.parent / PACKED,
-            normal=start.normal,
+            normal=normal,
             growth=shards_of,
             align=False,
             frame=frame,

@@ -89,7 +89,9 @@ class PackedMaps:
     ) -> None:
         """Open or make the store: use `open_packed_maps`, which holds its claim meanwhile.
 
-        Maps are normalised as `normal` does, by default by their own statistics. `growth` decides
+        Maps are normalised as `normal` does, by default by the statistics of the first shards (with
+        `growth` of those that the first epoch sees, so that a run that was killed sees the same).
+        `growth` decides
         how many objects an epoch sees (default: all that are there). They are aligned with the rig
         `frame`, by default the plan's, and the wall grid for a plan of many rigs. Without `align`
         a spread of rigs stays in the maps, as a deviation that is not known; so does the spread of
@@ -136,11 +138,8 @@ class PackedMaps:
             if normal:
                 self.normal.load_state_dict(normal.state_dict())
             else:
-                some = [
-                    self._read(shard)[0]
-                    for one in opened
-                    for shard in one.shards[:STATISTICS_SHARDS]
-                ]
+                shards = min(STATISTICS_SHARDS, growth(0)) if growth else STATISTICS_SHARDS
+                some = [self._read(shard)[0] for one in opened for shard in one.shards[:shards]]
                 depth_m, intensity = (
                     [getattr(one, name) for one in some] for name in MAP_CHANNELS[:2]
                 )

@@ -57,18 +57,18 @@ def train_direct(
 ) -> tuple[DirectNetwork, Scores]:
     """Train a direct network, from scratch or on from another's weights; a second call resumes.
 
-    `start` has the source's normalisation. Where the recipe has more blocks or mixers, the new ones
+    The source's normalisation becomes the network's. Where the recipe has more blocks or mixers, the new ones
     change nothing at first. Returns the network in eval mode, with the recipe's blend of both, and
     its held-out figures.
     """
     # Initial weights follow from the recipe's seed; `fit` seeds each step by itself.
     torch.manual_seed(recipe.seed)
     network = DirectNetwork(recipe.direct, recipe.dropout, color=recipe.colour)
-    network.normal.load_state_dict(source.normal.state_dict())
     if start:
         # Not strict: blocks and mixers that only this recipe has stay as they are initialised,
         # that is, as identities.
         network.load_state_dict(start.state_dict(), strict=False)
+    network.normal.load_state_dict(source.normal.state_dict())
     steps = recipe.objects // recipe.batch
 
     def batches(generator: torch.Generator) -> Iterable[NormalBatch]:

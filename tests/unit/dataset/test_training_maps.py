@@ -395,6 +395,19 @@ def test_new_shards_enter_new_epochs(folder: Path, store_folder: Path) -> None:
         assert len(_epoch(packed, 2)[0]) == 10
 
 
+def test_statistics_are_of_the_shards_that_the_first_epoch_sees(
+    folder: Path, tmp_path: Path, store_folder: Path
+) -> None:
+    """A run that was killed before its first epoch finds more shards when it begins again."""
+    with open_packed_maps([folder], store_folder, growth=lambda _epoch: 1) as packed:
+        alone = packed.digest
+    _add(folder, 5)
+    with open_packed_maps([folder], tmp_path / "again", growth=lambda _epoch: 1) as packed:
+        assert packed.digest == alone
+    with open_packed_maps([folder], tmp_path / "more", growth=lambda _epoch: 2) as packed:
+        assert packed.digest != alone
+
+
 def test_reopened_store_shows_an_epoch_again(folder: Path, store_folder: Path) -> None:
     with open_packed_maps([folder], store_folder) as packed:
         first = _epoch(packed, 1)

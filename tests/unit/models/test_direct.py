@@ -4,6 +4,7 @@ checkpoint.
 
 import io
 from collections.abc import Iterable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -299,6 +300,21 @@ def test_training_goes_on_from_weights_that_grow(weights: Path, tmp_path: Path) 
         reconstruct(grown, Source().maps), reconstruct(start, Source().maps), atol=1e-3
     )
     assert direct_start(_recipe(), None) == (None, [])
+
+
+def test_weights_of_another_rig_take_the_cells_of_their_new_one(
+    weights: Path, tmp_path: Path
+) -> None:
+    """Their layers go on; a cell's median and spread are the new rig's."""
+    start, _ = direct_start(_recipe(start="weights"), weights)
+    nearer = Source(replace(small_maps(12, 0), depth_m=small_maps(12, 0).depth_m - 0.05))
+
+    network, _ = train_direct(
+        _recipe(start="weights"), nearer, small_maps(4, 1), tmp_path, start=start
+    )
+
+    assert torch.equal(network.normal.median, nearer.normal.median)
+    assert not torch.equal(network.normal.median, start.normal.median)
 
 
 def test_blend_is_the_mean_of_trained_and_earlier_weights(weights: Path, tmp_path: Path) -> None:
