@@ -158,7 +158,7 @@ def fit(
                     norm = fabric.clip_gradients(
                         run.forward, run.stepper, max_norm=limit, error_if_nonfinite=False
                     )
-                    _finite("gradient", float(norm if norm is not None else 0.0), run.epoch)
+                    run.require_finite("gradient", float(norm if norm is not None else 0.0))
                 run.stepper.step()
                 # A plateau is judged on held-out losses, once an epoch.
                 if recipe.schedule != "plateau":
@@ -183,14 +183,13 @@ def fit(
                     raise KeyboardInterrupt
 
             # Not a number in one process is not a number in the mean: all of them end.
-            train_loss = _finite(
-                "loss", float(run.over_all(run.total / max(run.step, 1), "mean")), run.epoch
-            )
+            train_loss = float(run.over_all(run.total / max(run.step, 1), "mean"))
+            run.require_finite("loss", train_loss)
             # Scored with the averaged weights, which are the ones that are kept.
             module.eval()
             with run.averaged():
                 figures: Scores = fabric.broadcast(score() if leads else {})
-                _finite("held-out loss", figures["held_out_loss"], run.epoch)
+                run.require_finite("held-out loss", figures["held_out_loss"])
                 run.keep_best(figures)
             run.end_epoch(train_loss, figures, running.clock() - start_s)
             if leads:
@@ -198,14 +197,6 @@ def fit(
                     board.add(run.rows[-1])
                 running.on_epoch(run.rows[-1])
     return run.restore_best()
-
-
-def _finite(name: str, value: float, epoch: int) -> float:
-    if not math.isfinite(value):
-        raise TrainingError(
-            f"the {name} is {value} in epoch {epoch}: choose a smaller learning_rate"
-        )
-    return value
 
 
 class _Run:
@@ -281,6 +272,16 @@ class _Run:
     @property
     def _rate(self) -> float:
         return self.optimizer.param_groups[0]["lr"]
+
+    def require_finite(self, name: str, value: float) -> None:
+        """Raise TrainingError where a value of this epoch is not a finite number."""
+        if math.isfinite(value):
+            return
+        advice = "choose a smaller learning_rate"
+        if self._running.compiled:
+            # Seen with torch 2.13 on a Xeon with AMX: finite without it, from the same weights.
+            advice = f"drop --compile, whose bfloat16 fails on some processors, or {advice}"
+        raise TrainingError(f"the {name} is {value} in epoch {self.epoch}: {advice}")
 
     def report(self, message: str) -> None:
         """Pass a message on from the leading process alone."""

@@ -191,12 +191,15 @@ def test_plateau_run_ends_with_its_rate_and_stays_ended(
     assert _trained(tmp_path, epochs=20).steps == []
 
 
-def test_gradient_that_is_not_finite_ends_the_run(tmp_path: Path) -> None:
+@pytest.mark.parametrize("compiled", [False, True])
+def test_gradient_that_is_not_finite_ends_the_run(tmp_path: Path, compiled: bool) -> None:
     broken = SmallRun(small_recipe(gradient_limit=1.0), tmp_path)
     broken.y = broken.y * float("nan")
 
-    with pytest.raises(TrainingError, match=r"gradient is nan in epoch 0.*learning_rate"):
-        broken.go()
+    with pytest.raises(TrainingError, match=r"gradient is nan in epoch 0.*learning_rate") as ended:
+        broken.go(compiled=compiled)
+
+    assert ("--compile" in str(ended.value)) == compiled
 
 
 def test_diverged_run_keeps_earlier_epochs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
