@@ -28,11 +28,10 @@ SIMULATION_ONLY = "simulation only: the L515's laser is infrared (860 nm)"
 
 RECORD = "checkpoint.json"
 DIRECT = "direct"
-WIDE = "wide"
 PAPER = "paper"
 SHIPPED = DIRECT, PAPER
-"""Names of the weights that come with the package, the default ones first: direct networks for the
-paper's rig and for the wide rig, and the paper's networks. DIRECT.safetensors is a direct network.
+"""Names of the weights that come with the package, the default ones first; DIRECT.safetensors is a
+direct network.
 """
 ENCODER = "encoder.safetensors"
 """File that only training reads: the shipped weights come without it."""

@@ -47,7 +47,7 @@ def evaluate(
         Path | None,
         typer.Option(
             "--weights",
-            help="Folder of weights, or direct, wide or paper (default: what serves the rig best).",
+            help="Folder of weights, paper, or direct (the default).",
         ),
     ] = None,
     rig: Annotated[

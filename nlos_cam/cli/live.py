@@ -51,7 +51,7 @@ Weights = Annotated[
     Path | None,
     typer.Option(
         "--weights",
-        help="Folder of weights, or direct, wide or paper (default: what serves the rig best).",
+        help="Folder of weights, paper, or direct (the default).",
     ),
 ]
 Average = Annotated[
