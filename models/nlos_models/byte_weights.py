@@ -19,6 +19,7 @@ SCALE = ".scale"
 
 def fits_bytes(shape: tuple[int, ...]) -> bool:
     """Return True for a weight's shape that is stored in bytes: large, in rows of whole groups."""
+    # Biases and norms are few, and a network is more sensitive to them than to single weights.
     size = int(np.prod(shape))
     return len(shape) > 1 and size >= MIN_WEIGHTS and (size // shape[0]) % GROUP == 0
 
@@ -29,6 +30,8 @@ def to_bytes(weight: Float32) -> tuple[Int8, Float32]:
     Rounding moves a weight by at most half a scale: 1/254 of the largest of its group.
     """
     groups = weight.reshape(-1, GROUP)
+    # Scales stay in float32: those of small weights, some 1e-5, have few bits left in float16.
+    # Symmetric about 0, so that a weight of nothing stays nothing.
     scale = np.abs(groups).max(axis=1, keepdims=True) / np.float32(LARGEST)
 
     # a group of zeros has no scale; any serves

@@ -1,5 +1,5 @@
-"""Checkpoints: one float16 safetensors file per network, beside a JSON record of runs, rig and
-held-out figures.
+"""Checkpoints: one safetensors file per network, in float16 or bytes, beside a JSON record of runs,
+rig and held-out figures.
 """
 
 from collections.abc import Mapping
@@ -119,17 +119,23 @@ def load_part(path: Path, module: nn.Module) -> None:
         ) from error
 
 
-def read_tensors(path: Path) -> dict[str, torch.Tensor]:
-    """Return the tensors of a file in float32. Raises CheckpointError where one is not finite."""
+def stored_tensors(path: Path) -> dict[str, torch.Tensor]:
+    """Return the tensors of a file as it has them. Raises CheckpointError."""
     try:
-        tensors = load(read_checked(path, TENSOR_LIMIT))
+        return load(read_checked(path, TENSOR_LIMIT))
     except (OSError, ValueError, SafetensorError, MemoryError) as error:
         raise CheckpointError(f"{path} cannot be read as weights: {describe(error)}") from error
+
+
+def read_tensors(path: Path) -> dict[str, torch.Tensor]:
+    """Return the tensors of a file in float32. Raises CheckpointError where one is not finite."""
+    tensors = stored_tensors(path)
     # All computing is in float32: CPUs have no fast half precision, and rounding happened once,
     # when the weights were saved.
     floats = {
         key: value.float() if value.is_floating_point() else value for key, value in tensors.items()
     }
+    # A weight in bytes has its scales beside it: both become one tensor, as networks know it.
     for key in [name for name in floats if name.endswith(SCALE)]:
         scale = floats.pop(key).numpy()
         name = key.removesuffix(SCALE)

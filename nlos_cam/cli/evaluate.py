@@ -45,10 +45,7 @@ def evaluate(
     ] = None,
     weights: Annotated[
         Path | None,
-        typer.Option(
-            "--weights",
-            help="Folder of weights, paper, or direct (the default).",
-        ),
+        typer.Option("--weights", help="Folder of weights, paper, or direct (the default)."),
     ] = None,
     rig: Annotated[
         str | None, typer.Option("--rig", help="Rig by name or file (default: the weights' own).")

@@ -49,10 +49,7 @@ Wall = Annotated[
 ]
 Weights = Annotated[
     Path | None,
-    typer.Option(
-        "--weights",
-        help="Folder of weights, paper, or direct (the default).",
-    ),
+    typer.Option("--weights", help="Folder of weights, paper, or direct (the default)."),
 ]
 Average = Annotated[
     int,
@@ -249,9 +246,8 @@ def _load_pipeline(
     """Load the networks and build their pipeline, and print the model's name and its mismatches
     with the bench.
     """
-    weights = chosen.weights or reconstruct.weights_for(bench.rig)
-    network = reconstruct.load_networks(weights)
-    uncertainty_model = reconstruct.load_uncertainty(weights)
+    network = reconstruct.load_networks(chosen.weights)
+    uncertainty_model = reconstruct.load_uncertainty(chosen.weights)
     common.say(f"Loaded model {network.record.rig_name} ({network.runtime})")
     served = bench_folders.weights_verdict(bench.rig, network.record, chosen.bench)
     if not served.is_warning:

@@ -338,22 +338,15 @@ def direct(
     start, runs = training.direct_start(recipe, weights)
     with ExitStack() as held:
         with tracked("packing maps") as on_progress:
-            frame = None
-            normal = None
-            if start:
-                trained = models.load_record(models.weights_folder(weights))
-                frame = reconstruct.grid_of(trained)
-                opened = data_sets.open_dataset(data[0], color=recipe.colour, expected=True)
-                # By another rig's statistics many cells would be cut off: its layers serve alone.
-                if frame or trained.rig_checksum == opened.plan.rig.checksum:
-                    normal = start.normal
+            trained = models.load_record(models.weights_folder(weights)) if start else None
             packed = data_sets.open_packed_maps(
                 data,
                 store or run.out / "packed",
                 on_progress,
-                normal,
+                start.normal if start else None,
+                trained=trained,
                 color=recipe.colour,
-                frame=frame,
+                frame=reconstruct.grid_of(trained) if trained else None,
             )
             source = held.enter_context(packed)
         held_out = source.held_out(held_out_data, recipe.held_out)

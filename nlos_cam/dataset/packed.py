@@ -16,11 +16,11 @@ import numpy as np
 import torch
 from nlos_calibration import Rig
 from nlos_calibration.arrays import Float32, Mask
-from nlos_models import CellNormal, channels_of
+from nlos_models import CellNormal, CheckpointRecord, channels_of
 from nlos_models.training import MapNoise, MapSet, NormalBatch, first_of
 
 from nlos_cam.dataset.plan import DatasetPlan, RigSpread
-from nlos_cam.dataset.reader import MAP_CHANNELS, open_dataset
+from nlos_cam.dataset.reader import MAP_CHANNELS, Dataset, open_dataset
 from nlos_cam.dataset.rig_range import RigRange
 from nlos_cam.dataset.samples import OnProgress, ignore
 from nlos_cam.dataset.shards import SHARD_PATTERN, Shard, read_arrays, read_head
@@ -28,7 +28,7 @@ from nlos_cam.errors import RecordingError, SceneError
 from nlos_cam.files import atomic_file, claim, read_bounded
 from nlos_cam.files import read_arrays as read_npz
 from nlos_cam.frames import MAP_COLUMNS, MAP_ROWS, OBJECT_PIXELS
-from nlos_cam.reconstruct import WALL_GRID, align_samples, is_wall_grid
+from nlos_cam.reconstruct import WALL_GRID, align_samples, grid_of, is_wall_grid
 
 INDEX = "index.json"
 MAPS = "maps.f16"
@@ -82,6 +82,7 @@ class PackedMaps:
         on_progress: OnProgress = ignore,
         normal: CellNormal | None = None,
         *,
+        trained: CheckpointRecord | None = None,
         color: bool = False,
         growth: Growth | None = None,
         align: bool = True,
@@ -89,14 +90,14 @@ class PackedMaps:
     ) -> None:
         """Open or make the store: use `open_packed_maps`, which holds its claim meanwhile.
 
-        Maps are normalised as `normal` does, by default by the statistics of the first shards (with
-        `growth` of those that the first epoch sees, so that a run that was killed sees the same).
-        `growth` decides
-        how many objects an epoch sees (default: all that are there). They are aligned with the rig
-        `frame`, by default the plan's, and the wall grid for a plan of many rigs. Without `align`
-        a spread of rigs stays in the maps, as a deviation that is not known; so does the spread of
-        a plan of many rigs. Raises RecordingError for no dataset, SceneError for datasets of two
-        rigs or a store that is normalised otherwise.
+        Maps are normalised as `normal` does, unless it belongs to weights `trained` for another
+        rig; by default by the statistics of the first shards (with `growth` of those that the first
+        epoch sees, so that a run that was killed sees the same). `growth` decides how many objects
+        an epoch sees (default: all that are there). They are aligned with the rig `frame`, by
+        default the plan's, and the wall grid for a plan of many rigs. Without `align` a spread of
+        rigs stays in the maps, as a deviation that is not known; so does the spread of a plan of
+        many rigs. Raises RecordingError for no dataset, SceneError for datasets of two rigs or a
+        store that is normalised otherwise.
         """
         opened = [open_dataset(folder, color=color, expected=True) for folder in datasets]
         self.plan: DatasetPlan = opened[0].plan
@@ -111,6 +112,10 @@ class PackedMaps:
                 f"of {others[0]} and {datasets[0]} one holds expected maps, without noise: give one"
                 " kind"
             )
+        if trained and not grid_of(trained) and trained.rig_checksum != self.plan.rig.checksum:
+            # By another rig's statistics a third of the cells would lie beyond the limit of a
+            # normalised one, on a bench 5 cm nearer: its layers serve, not its cells.
+            normal = None
         self.noise: MapNoise | None = map_noise(self.plan) if self.plan.expected else None
         """To be drawn at each step of training."""
         self._datasets = list(datasets)
@@ -135,22 +140,7 @@ class PackedMaps:
             self._rows[COUNTS] = MAP_ROWS, MAP_COLUMNS
         self._index = _read_index(store)
         if not (store / CELLS).exists():
-            if normal:
-                self.normal.load_state_dict(normal.state_dict())
-            else:
-                shards = min(STATISTICS_SHARDS, growth(0)) if growth else STATISTICS_SHARDS
-                some = [self._read(shard)[0] for one in opened for shard in one.shards[:shards]]
-                depth_m, intensity = (
-                    [getattr(one, name) for one in some] for name in MAP_CHANNELS[:2]
-                )
-                self.normal.learn(
-                    *(torch.from_numpy(np.concatenate(parts)) for parts in (depth_m, intensity))
-                )
-            with atomic_file(store / CELLS) as part, part.open("wb") as file:
-                np.savez(
-                    file,
-                    **{name: values.numpy() for name, values in self.normal.state_dict().items()},
-                )
+            self._write_cells(opened, normal)
         try:
             cells = read_npz(store / CELLS)
             self.normal.load_state_dict(
@@ -167,6 +157,25 @@ class PackedMaps:
             )
         if growth is None:
             self.refresh(on_progress)
+
+    def _write_cells(self, opened: Sequence[Dataset], normal: CellNormal | None) -> None:
+        """Write a normalisation to the store, or that of the first shards' statistics."""
+        if normal:
+            self.normal.load_state_dict(normal.state_dict())
+        else:
+            shards = STATISTICS_SHARDS
+            if self._growth:
+                shards = min(shards, self._growth(0))
+            some = [self._read(shard)[0] for one in opened for shard in one.shards[:shards]]
+            depth_m, intensity = ([getattr(one, name) for one in some] for name in MAP_CHANNELS[:2])
+            self.normal.learn(
+                *(torch.from_numpy(np.concatenate(parts)) for parts in (depth_m, intensity))
+            )
+        with atomic_file(self._store / CELLS) as part, part.open("wb") as file:
+            np.savez(
+                file,
+                **{name: values.numpy() for name, values in self.normal.state_dict().items()},
+            )
 
     def __len__(self) -> int:
         return sum(self._index["shards"].values())
@@ -284,6 +293,7 @@ def open_packed_maps(
     on_progress: OnProgress = ignore,
     normal: CellNormal | None = None,
     *,
+    trained: CheckpointRecord | None = None,
     color: bool = False,
     growth: Growth | None = None,
     align: bool = True,
@@ -300,6 +310,7 @@ def open_packed_maps(
             store,
             on_progress,
             normal,
+            trained=trained,
             color=color,
             growth=growth,
             align=align,

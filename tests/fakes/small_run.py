@@ -12,6 +12,7 @@ from typing import Any
 
 import torch
 from lightning_fabric import Fabric
+from nlos_models import CheckpointRecord
 from nlos_models.training import Recipe, run_files
 from nlos_models.training.loop import Running, fit
 from nlos_models.training.recipe import recipe_of
@@ -20,6 +21,9 @@ from torch import Tensor, nn
 SAMPLES = 24
 BATCH = 4
 STEPS = SAMPLES // BATCH
+
+RIG = "paper-rig", "0123456789ab"
+"""Name of a rig, and a checksum that is not its own."""
 
 
 def small_recipe(**changes: object) -> Recipe:
@@ -33,6 +37,11 @@ def small_recipe(**changes: object) -> Recipe:
         "learning_rate": 1e-2,
     }
     return recipe_of(facts | changes)
+
+
+def small_record() -> CheckpointRecord:
+    """Return the record of weights of that recipe."""
+    return CheckpointRecord.of([small_recipe()], RIG)
 
 
 def log_rows(folder: Path) -> list[dict[str, str]]:

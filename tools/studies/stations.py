@@ -5,11 +5,11 @@ docs/images/stations.png.
 
 The same objects are rendered on the paper's bench for a lidar at "home" (0.20 m from the wall),
 "near" (0.15 m) and "back" (0.10 m farther from the object), and for an occluder whose gap is "wide"
-(0.14 m for 0.10 m). A network for each set of stations is
-trained on as many samples, seed by seed: one station's is the direct network itself; of several,
-each station has its own layers up to the trunk, which reads their sum. They are judged on the 54
-test objects, the 54 of kinds never seen and held-out ones, each station with noise of its own. WORK
-keeps data and networks: a second call goes on, also after a kill.
+(0.14 m for 0.10 m). A network for each set of stations is trained on as many samples, seed by seed:
+one station's is the direct network itself; of several, each station has its own layers up to the
+trunk, which reads their sum. They are judged on the 54 test objects, the 54 of kinds never seen and
+held-out ones, each station with noise of its own. WORK keeps data and networks: a second call goes
+on, also after a kill.
 """
 
 import json

@@ -4,13 +4,11 @@ import json
 from pathlib import Path
 
 import torch
-from pydantic import BaseModel
-from safetensors import SafetensorError
-from safetensors.torch import load, save
+from safetensors.torch import save
 
-from nlos_cam.files import TENSOR_LIMIT, describe, read_checked, write_checked
+from nlos_cam.files import write_checked
 from nlos_models.byte_weights import SCALE, fits_bytes, to_bytes
-from nlos_models.errors import CheckpointError
+from nlos_models.checkpoint import save_parts, stored_tensors
 from nlos_models.quality import UNCERTAINTY_FILES, load_quality_model
 from nlos_models.records import (
     UNCERTAINTY_RECORD,
@@ -21,21 +19,24 @@ from nlos_models.records import (
 from nlos_models.training.quality import write_quality
 
 
-def store_in_bytes(folder: Path, names: tuple[str, ...] = ()) -> None:
-    """Store the large weights of a folder's image networks in a byte each.
+def store_in_bytes(folder: Path) -> None:
+    """Store the large weights of a folder's image networks in a byte each, unless they are.
 
-    `names` are files, by default all of the networks that make images. The uncertainty network and
-    the quality model beside them are tied to the new bytes as they are: rounding changes the
-    pictures that they judge less than noise does. Raises CheckpointError, OSError, FileBusyError.
+    The uncertainty network and the quality model beside them are tied to the new bytes as they are:
+    rounding changes the pictures that they judge less than noise does. Raises CheckpointError,
+    OSError, FileBusyError.
     """
     uncertainty = load_uncertainty_record(folder)
     quality = load_quality_model(folder)
-    for name in names or watched_files(folder):
+    # Both are read before the first file changes: afterwards they watch weights that are gone.
+    for name in watched_files(folder):
         write_checked(folder, {name: _in_bytes(folder / name)})
 
     if uncertainty:
         tied = uncertainty.model_copy(update={"watches": checksum_of_watched(folder)})
-        write_checked(folder, {UNCERTAINTY_RECORD: _text(tied)})
+        text = json.dumps(tied.model_dump(mode="json"), indent=2)
+        save_parts(folder, {}, {UNCERTAINTY_RECORD: text})
+    # The quality model watches the uncertainty network's record, which has just been written.
     if quality:
         watches = checksum_of_watched(folder, UNCERTAINTY_FILES)
         write_quality(folder, quality.record.model_copy(update={"watches": watches}))
@@ -43,20 +44,11 @@ def store_in_bytes(folder: Path, names: tuple[str, ...] = ()) -> None:
 
 def _in_bytes(path: Path) -> bytes:
     """Return a file of tensors whose large weights are in bytes, with their scales."""
-    try:
-        tensors = load(read_checked(path, TENSOR_LIMIT))
-    except (OSError, ValueError, SafetensorError) as error:
-        raise CheckpointError(f"{path} cannot be read as weights: {describe(error)}") from error
-
     stored = dict[str, torch.Tensor]()
-    for name, tensor in tensors.items():
+    for name, tensor in stored_tensors(path).items():
         stored[name] = tensor
         if tensor.is_floating_point() and fits_bytes(tuple(tensor.shape)):
             weight, scale = to_bytes(tensor.float().numpy())
             stored[name] = torch.from_numpy(weight)
             stored[name + SCALE] = torch.from_numpy(scale)
     return save(stored)
-
-
-def _text(record: BaseModel) -> bytes:
-    return f"{json.dumps(record.model_dump(mode='json'), indent=2)}\n".encode()

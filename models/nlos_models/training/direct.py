@@ -68,6 +68,7 @@ def train_direct(
         # Not strict: blocks and mixers that only this recipe has stay as they are initialised,
         # that is, as identities.
         network.load_state_dict(start.state_dict(), strict=False)
+    # After the start weights, which may be another rig's: the maps are normalised by the source.
     network.normal.load_state_dict(source.normal.state_dict())
     steps = recipe.objects // recipe.batch
 

@@ -17,7 +17,6 @@ from nlos_models.inference import load_reconstructor
 from nlos_models.pipeline import RemappingNetwork
 from nlos_models.quality import load_quality_model
 from nlos_models.records import (
-    CheckpointRecord,
     checksum_of_watched,
     load_uncertainty_record,
     shipped_folder,
@@ -27,11 +26,11 @@ from nlos_models.training.checkpoints import save_pipeline
 from nlos_models.vae import Decoder
 from safetensors.torch import load_file, save_file
 from small_maps import noise_maps
-from small_run import small_recipe
+from small_run import small_record
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
-RECORD = CheckpointRecord.of([small_recipe()], ("paper-rig", "0123456789ab"))
+RECORD = small_record()
 
 
 @pytest.fixture(scope="module")

@@ -16,14 +16,13 @@ from nlos_models.pipeline import RemappingNetwork, new_vae
 from nlos_models.training import checkpoints
 from nlos_models.vae import Decoder, ResVae
 from safetensors.torch import load_file, save
-from small_run import small_recipe, state_of
+from small_run import RIG, small_recipe, state_of
 from torch import nn
 
 from nlos_cam.files import CHECKSUMS
 
 pytestmark = pytest.mark.usefixtures("narrow_networks", "one_thread")
 
-RIG = ("paper-rig", "0123456789ab")
 RUNS = {f"v{seed}": small_recipe(seed=seed) for seed in range(3)}
 RUNS |= {f"c{seed}": small_recipe(task="compressor", seed=seed) for seed in range(2)}
 RUNS |= {f"t{seed}": small_recipe(task="transfer", seed=seed) for seed in range(2)}

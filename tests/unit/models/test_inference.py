@@ -26,7 +26,6 @@ from nlos_models.metrics import MIN_V
 from nlos_models.pipeline import RemappingNetwork, split_and_stack
 from nlos_models.records import (
     SHIPPED,
-    CheckpointRecord,
     checksum_of_watched,
     shipped_folder,
     weights_folder,
@@ -36,11 +35,11 @@ from nlos_models.training.checkpoints import save_pipeline
 from nlos_models.uncertainty_network import load_uncertainty_network
 from nlos_models.vae import Decoder
 from small_maps import HARD_MAPS, hard_maps, noise_maps
-from small_run import small_recipe
+from small_run import small_record
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
-RECORD = CheckpointRecord.of([small_recipe()], ("paper-rig", "0123456789ab"))
+RECORD = small_record()
 HANDFUL = 8
 """Pixels of an image that may fall to the other side of the silhouette's threshold."""
 Pair = tuple[Reconstructor, Reconstructor]
