@@ -29,7 +29,8 @@ SIMULATION_ONLY = "simulation only: the L515's laser is infrared (860 nm)"
 RECORD = "checkpoint.json"
 DIRECT = "direct"
 PAPER = "paper"
-SHIPPED = DIRECT, PAPER
+WIDE = "wide"
+SHIPPED = DIRECT, WIDE, PAPER
 """Names of the weights that come with the package, the default ones first; DIRECT.safetensors is a
 direct network.
 """

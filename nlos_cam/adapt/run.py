@@ -51,7 +51,7 @@ from nlos_cam.files import (
     claim,
     write_checked,
 )
-from nlos_cam.reconstruct import can_align, grid_of
+from nlos_cam.reconstruct import can_align, grid_of, weights_for
 from nlos_cam.render import SensorModel
 
 OBJECTS = "objects"
@@ -100,7 +100,7 @@ class Adaptation:
     """How far the bench may be off its rig."""
     folder: Path
     start: Path | None = None
-    """Start weights; None for the shipped ones."""
+    """Start weights; None for the shipped ones that serve the rig best."""
     sensor: SensorModel = field(default_factory=SensorModel)
     seed: int = 0
     workers: int = field(default_factory=lambda: max((os.cpu_count() or 2) // 2, 1))
@@ -116,7 +116,7 @@ class Adaptation:
     @property
     def start_folder(self) -> Path:
         """Folder of the start weights."""
-        return models.weights_folder(self.start)
+        return models.weights_folder(self.start) if self.start else weights_for(self.rig)
 
     @property
     def threads(self) -> int:
@@ -175,7 +175,7 @@ def adapt(
         plan = _plan_for(job, minutes, tracked)
         job = replace(job, spread=plan.spread, sensor=plan.sensor, seed=plan.seed)
         folders = [job.folder / _stage_name(number) for number in range(len(plan.stages))]
-        before = {} if job.locked else _figures(measure, job.start, job.folder / BEFORE)
+        before = {} if job.locked else _figures(measure, job.start_folder, job.folder / BEFORE)
         for number, stage in enumerate(plan.stages):
             on_message(
                 f"stage {number + 1} of {len(plan.stages)}: {stage.objects} objects,"

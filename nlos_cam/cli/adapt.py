@@ -49,7 +49,10 @@ def adapt(
     ] = None,
     weights: Annotated[
         Path | None,
-        typer.Option("--weights", help="Start weights (default: the shipped direct ones)."),
+        typer.Option(
+            "--weights",
+            help="Start weights (default: direct or wide, whichever serves the bench better).",
+        ),
     ] = None,
     ray: Annotated[
         str | None,

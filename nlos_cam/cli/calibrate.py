@@ -289,8 +289,10 @@ def calibrate(
     if target.folder:
         benching.store_forecast(target.folder)
     loaded = benches.load_bench(target.folder) if target.folder else None
-    trained = models.load_record(models.weights_folder(loaded.weights if loaded else None))
-    served = benches.weights_verdict(loaded.rig if loaded else record.rig, trained, loaded)
+    rig = loaded.rig if loaded else record.rig
+    own = loaded.weights if loaded else None
+    trained = models.load_record(own or reconstruct.weights_for(rig))
+    served = benches.weights_verdict(rig, trained, loaded)
     result["weights"] = {
         "serve": served.serve,
         "verdict": served.sentence,

@@ -45,7 +45,13 @@ def evaluate(
     ] = None,
     weights: Annotated[
         Path | None,
-        typer.Option("--weights", help="Folder of weights, paper, or direct (the default)."),
+        typer.Option(
+            "--weights",
+            help=(
+                "Folder of weights, or direct, wide, paper (default: direct or wide, whichever serves"
+                " the rig better)."
+            ),
+        ),
     ] = None,
     rig: Annotated[
         str | None, typer.Option("--rig", help="Rig by name or file (default: the weights' own).")

@@ -49,7 +49,13 @@ Wall = Annotated[
 ]
 Weights = Annotated[
     Path | None,
-    typer.Option("--weights", help="Folder of weights, paper, or direct (the default)."),
+    typer.Option(
+        "--weights",
+        help=(
+            "Folder of weights, or direct, wide, paper (default: direct or wide, whichever serves"
+            " the rig better)."
+        ),
+    ),
 ]
 Average = Annotated[
     int,
@@ -246,8 +252,9 @@ def _load_pipeline(
     """Load the networks and build their pipeline, and print the model's name and its mismatches
     with the bench.
     """
-    network = reconstruct.load_networks(chosen.weights)
-    uncertainty_model = reconstruct.load_uncertainty(chosen.weights)
+    weights = chosen.weights or reconstruct.weights_for(bench.rig)
+    network = reconstruct.load_networks(weights)
+    uncertainty_model = reconstruct.load_uncertainty(weights)
     common.say(f"Loaded model {network.record.rig_name} ({network.runtime})")
     served = bench_folders.weights_verdict(bench.rig, network.record, chosen.bench)
     if not served.is_warning:

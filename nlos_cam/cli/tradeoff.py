@@ -68,7 +68,7 @@ def reconstruct(
         list[Path] | None,
         typer.Option(
             "--weights",
-            help="Folder of weights, paper, or direct; repeat to compare (default: both).",
+            help="Folder of weights, direct, wide or paper; repeat to compare (default: direct and paper).",
         ),
     ] = None,
     count: Count = None,

@@ -23,6 +23,7 @@ from nlos_cam.evaluate.figures import LABELS
 from nlos_cam.evaluate.recognition import PER_KIND, recognised
 from nlos_cam.files import atomic_directory, cache_folder, program_name
 from nlos_cam.objects import CATEGORIES
+from nlos_cam.reconstruct import weights_for
 from nlos_cam.report import (
     Banner,
     Bullets,
@@ -128,7 +129,8 @@ def evaluate(
     nearest: bool = True,
     tracked: subjects.Tracked = subjects.untracked,
 ) -> Evaluation:
-    """Reconstruct held-out objects with weights (the shipped ones if None) and with the baselines.
+    """Reconstruct held-out objects with weights (by default the shipped ones that serve the rig
+    best) and with the baselines.
 
     The objects are those given, those of a dataset (a path), or rendered: the 54 test objects, or
     `count` random ones, on `rig` (the weights' own if None). `wall` is the bare wall of difference
@@ -136,6 +138,9 @@ def evaluate(
     `tracked` opens progress bars. Raises SceneError,
     RecordingError.
     """
+    named = weights
+    if weights is None and rig:
+        weights = weights_for(rig)
     reconstructor = load_reconstructor(weights, cache_folder() / "onnx")
     record = reconstructor.record
     second: subjects.HeldOutObjects | None = None
@@ -166,7 +171,7 @@ def evaluate(
     facts = {
         "what": objects.description,
         "program": program_name(),
-        "weights": str(weights or SHIPPED),
+        "weights": str(named or SHIPPED),
         "rig": objects.plan.rig.name,
         "runtime": reconstructor.runtime,
         "input": record.input,

@@ -53,6 +53,7 @@ __all__ = [
     "rig_to_align_with",
     "verdict_limits",
     "warm_up",
+    "weights_for",
     "weights_serve",
 ]
 
@@ -88,7 +89,7 @@ from .pipeline import (
     load_uncertainty,
     verdict_limits,
 )
-from .serving import WeightsVerdict, weights_serve
+from .serving import WeightsVerdict, weights_for, weights_serve
 from .streaming import iterate_batched, iterate_results, warm_up
 from .summaries import (
     OnWarning,

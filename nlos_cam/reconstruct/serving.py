@@ -1,10 +1,11 @@
 """Verdict on weights for a bench: whether networks that were trained for one rig serve another."""
 
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Literal
 
 from nlos_calibration import DISTANCE_RANGE_M, FACING_RANGE_DEG, Rig, rig_difference
-from nlos_models import CheckpointRecord
+from nlos_models import CheckpointRecord, load_record, shipped_folder
 
 from nlos_cam.reconstruct.alignment import rig_to_align_with, training_rig
 from nlos_cam.reconstruct.wall_grid import grid_of
@@ -16,6 +17,10 @@ NEAR_OCCLUDER_M = 0.005
 (docs/where-it-works.md)."""
 
 Service = Literal["trained for it", "near", "far", "not"]
+SERVICES: tuple[Service, ...] = ("trained for it", "near", "far", "not")
+"""The best first."""
+RIG_WEIGHTS = "direct", "wide"
+"""Names of the shipped weights that benches use, each for a rig of its own."""
 
 
 @dataclass(frozen=True)
@@ -73,7 +78,7 @@ def weights_serve(
     service = "not"
     outcome = "do not serve this bench: its maps cannot be aligned with their rig's"
     if rig_to_align_with(rig, trained):
-        service = "near" if _is_near(rig, wanted) else "far"
+        service = "near" if _deviation(rig, wanted) <= 1 else "far"
         outcome = (
             "may not serve this bench: it is far from their rig, with which its maps are aligned"
         )
@@ -110,7 +115,27 @@ def _grid_serves(rig: Rig, trained: CheckpointRecord, own: Rig | None) -> tuple[
     return "near", "the weights serve this bench as one of the many that they know"
 
 
-def _is_near(rig: Rig, wanted: Rig) -> bool:
+def weights_for(rig: Rig) -> Path:
+    """Return the folder of the shipped weights that serve a rig best; those for the paper's rig
+    where none does.
+    """
+    folders = [shipped_folder(name) for name in RIG_WEIGHTS]
+    return min(folders, key=lambda folder: _far_off(rig, load_record(folder)))
+
+
+def _far_off(rig: Rig, trained: CheckpointRecord) -> tuple[int, float]:
+    """Return how far off a rig is from the one of weights: its service's place in SERVICES, then
+    `_deviation`.
+    """
+    service = SERVICES.index(weights_serve(rig, trained).service)
+    wanted = training_rig(trained)
+    return service, _deviation(rig, wanted) if wanted else 0.0
+
+
+def _deviation(rig: Rig, wanted: Rig) -> float:
+    """Return the largest difference of two rigs, in units of the limits within which they are
+    near.
+    """
     here = rig.lidar
     there = wanted.lidar
     turned_deg = max(abs(here.yaw_deg - there.yaw_deg), abs(here.pitch_deg - there.pitch_deg))
@@ -118,8 +143,8 @@ def _is_near(rig: Rig, wanted: Rig) -> bool:
     if rig.occluder and wanted.occluder:
         along_m = abs(rig.occluder.x_m - wanted.occluder.x_m)
         moved_m = max(along_m, abs(rig.occluder.z_min_m - wanted.occluder.z_min_m))
-    return (
-        abs(here.distance_m - there.distance_m) <= NEAR_M
-        and turned_deg <= NEAR_DEG
-        and moved_m <= NEAR_OCCLUDER_M
+    return max(
+        abs(here.distance_m - there.distance_m) / NEAR_M,
+        turned_deg / NEAR_DEG,
+        moved_m / NEAR_OCCLUDER_M,
     )

@@ -25,7 +25,7 @@ from nlos_cam.camera import (
 from nlos_cam.recording import SAMPLE
 from nlos_cam.render import bare_wall_scene, paper_scene
 
-IN_BYTES = ("paper",)
+IN_BYTES = "wide", "paper"
 """Shipped weights that are stored in a byte each: those whose figures keep three digits by it."""
 EVERY = 12
 WIDTH = 320

@@ -43,6 +43,7 @@ from nlos_cam.reconstruct import (
     frame_issues,
     load_networks,
     load_uncertainty,
+    weights_for,
 )
 from nlos_cam.render import SceneFile, SensorModel
 
@@ -143,8 +144,10 @@ def judge(bench: Bench, weights: Path | None) -> dict[str, Any]:
     with tracked("rendering the test objects on the bench") as on_progress:
         echoes = echoes_of(subjects, bench.scene.rig, on_progress)
     world = World(bench.scene, echoes, [None])
+    calibrated = load_bench(bench.folder).calibrated
+    weights = weights or weights_for(calibrated.rig)
     pipeline = build_pipeline(
-        load_bench(bench.folder).calibrated,
+        calibrated,
         load_networks(weights),
         uncertainty_model=load_uncertainty(weights),
     )

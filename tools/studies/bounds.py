@@ -47,7 +47,14 @@ from nlos_cam.objects import BenchmarkObject, benchmark_objects, object_box, uns
 from nlos_cam.reconstruct import load_networks, reconstruct
 from nlos_cam.render import Gradients, Scene, SensorModel, Surface, intensity_noise, render
 
-SETS = ("home",), ("near",), ("home", "near"), ("home", "near", "back", "fore")
+SETS = (
+    ("home",),
+    ("near",),
+    ("home", "near"),
+    ("home", "near", "back", "fore"),
+    ("wide",),
+    ("wide", "wide-fore"),
+)
 FRAMES = 1, 30, 100
 TOO_FAR_M = 0.003
 DEPTHS = "exact", "3 mm too far", "the network's"

@@ -87,6 +87,7 @@ PLACES = {
     "back": Place(along_m=-0.10),
     "fore": Place(along_m=0.10, distance_m=0.15, yaw_deg=60.0),
     "wide": Place(gap_m=0.14),
+    "wide-fore": Place(along_m=0.10, distance_m=0.15, yaw_deg=60.0, gap_m=0.14),
 }
 SETS = ("home", "near", "back", "home+near", "wide")
 FIRST_SEED = 80_000_000

@@ -9,11 +9,15 @@
     python tools/studies/weights.py edge [--weights [NAME=]DIR ...]
         docs/figures/edge.json
 
+    python tools/studies/weights.py poses [--rig RIG] [--weights [NAME=]DIR ...]
+        docs/figures/poses.json, or poses-RIG.json for another rig than the paper's
+
 `limits` evaluates with one thing removed or added at a time. `rigs` moves the lidar over the
 distances and angles of SI 1 and by what a bench built with a ruler is off, while occluder and
 object box stay, and resumes. `edge` measures what a record costs that is off by fractions of a
 millimetre, with either sign: one column of cells at the occluder's edge then sees the other thing,
-which `EdgeRepair` mends.
+which `EdgeRepair` mends. `poses` looks at single scans: each test object on ten benches whose lidar
+is 1 mm and 0.2 degrees from its record, in a random direction.
 """
 
 import argparse
@@ -58,6 +62,7 @@ from nlos_cam.evaluate import (
     format_interval,
     judge,
     network_input,
+    per_object,
     plain,
     reconstruct_all,
     rig_of,
@@ -261,6 +266,10 @@ BENCHES = [
 
 OFFSETS_MM = 0.2, 0.5, 1.0, 2.0, 5.0
 OFFSETS_DEG = 0.1, 0.2, 0.5, 1.0
+OFF_M = 0.001
+OFF_DEG = 0.2
+DRAWS = 10
+"""Benches of `poses`, off their record by OFF_M and OFF_DEG."""
 OFF = Place(0.001, 0.2, 0.2, 0.001, 0.001)
 """Error of a bench's record."""
 
@@ -422,6 +431,58 @@ def edge(asked: argparse.Namespace) -> None:
         )
 
 
+def poses(asked: argparse.Namespace) -> None:
+    """Measure what single scans lose on benches whose lidar is not quite where its record has it."""
+    weights = loaded(asked)
+    rig = load_rig(asked.rig)
+    subjects = benchmark_objects(object_box(rig))
+    here = Place(rig.lidar.distance_m, rig.lidar.yaw_deg, rig.lidar.pitch_deg)
+    repair = EdgeRepair(CalibratedRig(rig))
+    places = [here, *(off_record(here, seed) for seed in range(DRAWS))]
+
+    def measured(place: Place, _: Any) -> dict[str, Any]:
+        bench = place.rig(rig)
+        truth = truth_of(subjects, object_box(bench))
+        seen = sense(echoes_of(subjects, bench, lambda *_: None), bench)
+        maps = as_map_set([repair.repair(each) for each in seen], truth)
+        found = dict[str, list[float]]()
+        for label, (network, _) in weights.items():
+            taken = network_input(maps, None, repeat(rig), network.record)
+            values = per_object(reconstruct_all(network, taken), truth, object_box(bench))
+            found[label] = values["silhouette_iou"].tolist()
+        return {"silhouette_iou": found}
+
+    rows = harness.collect("poses", places, measured, key=key_of(asked) + rig.checksum)
+    found = dict[str, Any]()
+    for label in weights:
+        iou = np.array([row["silhouette_iou"][label] for row in rows])
+        lost = iou[0] - iou[1:]
+        worst = np.sort(lost, axis=None)[-(lost.size // 10) :]
+        found[label] = {
+            "on_record": float(iou[0].mean()),
+            "mean_lost": float(lost.mean()),
+            "lost_at_most_in_nine_of_ten": float(np.quantile(lost, 0.9)),
+            "mean_lost_of_worst_tenth": float(worst.mean()),
+            "mean_lost_by_draw": lost.mean(1).tolist(),
+        }
+        print(label, harness.rounded(found[label]))
+    name = "poses" if rig.name == "paper-rig" else f"poses-{rig.name}"
+    harness.write(name, {"scans": DRAWS * len(subjects), "weights": found}, asked.out)
+
+
+def off_record(here: Place, seed: int) -> Place:
+    """Return a place OFF_M and OFF_DEG from another one, in a random direction and about a random
+    axis.
+    """
+    generator = np.random.default_rng(seed)
+    moved = generator.normal(size=3)
+    moved *= OFF_M / np.linalg.norm(moved)
+    turned = generator.normal(size=2)
+    turned *= OFF_DEG / np.linalg.norm(turned)
+    off = Place(moved[0], turned[0], turned[1], moved[1], moved[2])
+    return Place(*(value + each for value, each in zip(astuple(here), astuple(off), strict=True)))
+
+
 def draw_rigs(cells: Sequence[Mapping[str, Any]], rig: Rig) -> Figure:
     """Draw a heat map of each metric for each of the weights; the weights' own rig is framed."""
     names = [name for name in cells[0]["weights"] if "record off" not in name]
@@ -478,16 +539,16 @@ def main() -> None:
     commands = parser.add_subparsers(required=True)
     parts = {
         work.__name__: commands.add_parser(work.__name__, help=work.__doc__)
-        for work in (limits, rigs, edge)
+        for work in (limits, rigs, edge, poses)
     }
-    for work in (limits, rigs, edge):
+    for work in (limits, rigs, edge, poses):
         parts[work.__name__].set_defaults(run=work)
         parts[work.__name__].add_argument(
             "--out", type=Path, help="folder of the results (default: docs)"
         )
     parts["limits"].add_argument("--weights", type=Path, default=shipped_folder("paper"))
     parts["limits"].add_argument("--frames", type=int, nargs="*", default=list(FRAMES))
-    for name in ("rigs", "edge"):
+    for name in ("rigs", "edge", "poses"):
         parts[name].add_argument("--weights", type=harness.named, action="append", default=[])
         parts[name].add_argument("--rig", default="paper-rig")
     asked = parser.parse_args()

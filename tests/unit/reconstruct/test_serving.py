@@ -6,7 +6,7 @@ from typing import Any
 import pytest
 from nlos_calibration import Rig, load_rig
 
-from nlos_cam.reconstruct import WALL_GRID, weights_serve
+from nlos_cam.reconstruct import WALL_GRID, weights_for, weights_serve
 
 RIG = load_rig("paper-rig")
 
@@ -40,6 +40,27 @@ def test_service_falls_with_the_distance_of_the_rigs(rig: Rig, service: str) -> 
     assert verdict.serve == (service in {"trained for it", "near"})
     assert ("adapt mine" in verdict.sentence) == (service != "trained for it")
     assert ("0.61" in verdict.sentence) == (service != "trained for it")
+
+
+def with_gap(gap_m: float) -> Rig:
+    occluder = RIG.occluder
+    assert occluder is not None
+    wider = occluder.model_copy(update={"z_min_m": gap_m})
+    return posed(distance_m=0.203).model_copy(update={"occluder": wider})
+
+
+@pytest.mark.parametrize(
+    ("rig", "name"),
+    [
+        (RIG, "direct"),
+        (with_gap(0.108), "direct"),
+        (load_rig("wide-rig"), "wide"),
+        (with_gap(0.133), "wide"),
+        (load_rig("bare-wall"), "direct"),
+    ],
+)
+def test_bench_gets_the_weights_of_the_nearest_rig(rig: Rig, name: str) -> None:
+    assert weights_for(rig).name == name
 
 
 def test_weights_that_hold_their_rig_are_known_later() -> None:
