@@ -123,9 +123,9 @@ def open_stream(
     `uri` is `l515`, `l515:SERIAL`, `sim`, `sim:bare-wall`, `sim:scene.toml` or `bag:run.bag`;
     `wall` a record of `calibrate --wall`, or `bench` a bench folder of `calibrate --bench`, which
     brings its wall and its own weights; `weights` a folder of other weights than these or the
-    shipped ones that serve its rig best; maps are the mean of the last `average` frames. `on_progress` is called while a
-    simulated scene is pre-rendered, which takes time on its first run. Raises the errors of
-    `nlos_cam.errors`; RecordFileError and CalibrationError for wall and bench, CheckpointError for
+    shipped ones that serve its rig best; maps are the mean of the last `average` frames.
+    `on_progress` is called while a simulated scene is pre-rendered, which takes time on its first
+    run. Raises the errors of `nlos_cam.errors`; RecordFileError and CalibrationError for wall and bench, CheckpointError for
     the weights.
     """
     if wall and bench:

@@ -68,7 +68,10 @@ def reconstruct(
         list[Path] | None,
         typer.Option(
             "--weights",
-            help="Folder of weights, direct, wide or paper; repeat to compare (default: direct and paper).",
+            help=(
+                "Folder of weights, direct, wide or paper; repeat to compare (default: direct and"
+                " paper)."
+            ),
         ),
     ] = None,
     count: Count = None,

@@ -1,4 +1,5 @@
-"""Bounds by what the maps of one, two and four stations hold: docs/figures/bounds.json.
+"""Bounds by what the maps of one, two and four stations hold, and of a wider gap:
+docs/figures/bounds.json.
 
     python tools/studies/bounds.py [--objects N] [--out DIR]
 

@@ -291,7 +291,7 @@ class Estimate:
     gains: Float64
 
     def cost(self, prior: Prior, trust: float) -> float:
-        """Return half the negative logarithm of its probability."""
+        """Return -2 times the logarithm of its probability, but for a constant."""
         here = prior.components(self.state)
         left = here @ prior.precision @ here + np.sum((self.gains / GAIN_ERROR) ** 2)
         for model, gain in zip(self.models, self.gains, strict=True):
@@ -412,8 +412,9 @@ def voxels_of(box: ObjectBox) -> tuple[int, Float64]:
     return side, box.z_near_m + LAYER_M * (np.arange(LAYERS) + 0.5)
 
 
+@cache
 def dictionary_of(place: str, work: Path) -> Dictionary:
-    """Return the dictionary of a place, rendered patch by patch once."""
+    """Return the dictionary of a place, rendered patch by patch and read once."""
     path = work / f"dictionary-{place}.npz"
     if not path.exists():
         render_dictionary(place, path)
@@ -479,7 +480,7 @@ def by_lifting(seen: Sequence[Seen], choice: Choice, dictionaries: Sequence[Dict
     for each, dictionary in zip(seen, dictionaries, strict=True):
         echo = each.echo.ravel()
         light = each.light.ravel()[echo]
-        noise = choice.trust * light + 1e-12
+        noise = each.noise(choice.trust).ravel()[echo]
         rows.append(dictionary.rows(echo, each.path_m.ravel()[echo]) / noise[:, None])
         wanted.append(light / noise)
     matrix = np.vstack(rows).astype(np.float32)
@@ -566,17 +567,11 @@ def judged(
         box = object_box(load_rig("paper-rig"))
         return compared(image > 0, depth_from_image(image, box), np.asarray(subject.depth_m))
     if way == "lifted":
-        found = by_lifting(seen, choice, [kept_dictionary(place, work) for place in places])
+        found = by_lifting(seen, choice, [dictionary_of(place, work) for place in places])
     else:
         ways = {"gauss-newton": by_gauss_newton, "network in the loop": by_network_in_the_loop}
         found = ways[way](seen, choice)
     return figures_of(found, subject)
-
-
-@cache
-def kept_dictionary(place: str, work: Path) -> Dictionary:
-    """Return a place's dictionary, read once."""
-    return dictionary_of(place, work)
 
 
 def measured(
