@@ -4,6 +4,7 @@ __all__ = [
     "GOOD_IOU",
     "MIN_V",
     "RECORD",
+    "RIG_WEIGHTS",
     "SHIPPED",
     "SIMULATION_ONLY",
     "SMALLER_IS_BETTER",
@@ -77,6 +78,7 @@ from .pipeline import (
 from .quality import GOOD_IOU, quality_features
 from .records import (
     RECORD,
+    RIG_WEIGHTS,
     SHIPPED,
     SIMULATION_ONLY,
     CheckpointRecord,

@@ -30,7 +30,9 @@ RECORD = "checkpoint.json"
 DIRECT = "direct"
 PAPER = "paper"
 WIDE = "wide"
-SHIPPED = DIRECT, WIDE, PAPER
+RIG_WEIGHTS = DIRECT, WIDE
+"""Names of the shipped weights that benches use, each for a rig of its own."""
+SHIPPED = *RIG_WEIGHTS, PAPER
 """Names of the weights that come with the package, the default ones first; DIRECT.safetensors is a
 direct network.
 """

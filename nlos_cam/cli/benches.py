@@ -1,4 +1,4 @@
-"""The option --bench: a bench folder in place of --wall, --weights and --rig."""
+"""The options --bench, a bench folder in place of --wall, --weights and --rig, and --weights."""
 
 from __future__ import annotations
 
@@ -20,6 +20,16 @@ if TYPE_CHECKING:
 BenchFolder = Annotated[
     Path | None,
     typer.Option("--bench", help="Bench folder of `calibrate --bench`, in place of --wall."),
+]
+Weights = Annotated[
+    Path | None,
+    typer.Option(
+        "--weights",
+        help=(
+            "Folder of weights, or direct, wide, paper (default: direct or wide, whichever serves"
+            " the rig better)."
+        ),
+    ),
 ]
 BenchOrWeights = Annotated[
     Path | None,

@@ -43,16 +43,7 @@ def evaluate(
             "--training", help="Training maps for the nearest neighbour (default: rendered)."
         ),
     ] = None,
-    weights: Annotated[
-        Path | None,
-        typer.Option(
-            "--weights",
-            help=(
-                "Folder of weights, or direct, wide, paper (default: direct or wide, whichever serves"
-                " the rig better)."
-            ),
-        ),
-    ] = None,
+    weights: benches.Weights = None,
     rig: Annotated[
         str | None, typer.Option("--rig", help="Rig by name or file (default: the weights' own).")
     ] = None,

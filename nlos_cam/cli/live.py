@@ -47,16 +47,6 @@ Log = Annotated[
 Wall = Annotated[
     Path | None, typer.Option("--wall", help="Wall record of `calibrate --wall` (wall.toml).")
 ]
-Weights = Annotated[
-    Path | None,
-    typer.Option(
-        "--weights",
-        help=(
-            "Folder of weights, or direct, wide, paper (default: direct or wide, whichever serves"
-            " the rig better)."
-        ),
-    ),
-]
 Average = Annotated[
     int,
     typer.Option(
@@ -106,7 +96,7 @@ def live(
     open_view: viewing.Open = False,
     record: RecordTo = None,
     log: Log = None,
-    weights: Weights = None,
+    weights: benches.Weights = None,
     average: Average = 1,
     save_view: viewing.SaveView = None,
     priority: PriorityOption = "auto",
@@ -195,7 +185,7 @@ def replay(
     wall: Wall = None,
     bench_folder: benches.BenchOrWeights = None,
     out: Out = None,
-    weights: Weights = None,
+    weights: benches.Weights = None,
     average: Average = 1,
     save_view: viewing.SaveReplayView = False,
     stills: viewing.Stills = 0,

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Literal
 
 from nlos_calibration import DISTANCE_RANGE_M, FACING_RANGE_DEG, Rig, rig_difference
-from nlos_models import CheckpointRecord, load_record, shipped_folder
+from nlos_models import RIG_WEIGHTS, CheckpointRecord, load_record, shipped_folder
 
 from nlos_cam.reconstruct.alignment import rig_to_align_with, training_rig
 from nlos_cam.reconstruct.wall_grid import grid_of
@@ -19,8 +19,6 @@ NEAR_OCCLUDER_M = 0.005
 Service = Literal["trained for it", "near", "far", "not"]
 SERVICES: tuple[Service, ...] = ("trained for it", "near", "far", "not")
 """The best first."""
-RIG_WEIGHTS = "direct", "wide"
-"""Names of the shipped weights that benches use, each for a rig of its own."""
 
 
 @dataclass(frozen=True)

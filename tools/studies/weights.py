@@ -6,11 +6,11 @@
     python tools/studies/weights.py rigs [--weights [NAME=]DIR ...]
         docs/figures/rig_map.json and docs/images/rig_map.png
 
-    python tools/studies/weights.py edge [--weights [NAME=]DIR ...]
+    python tools/studies/weights.py edge [--rig RIG] [--weights [NAME=]DIR ...]
         docs/figures/edge.json
 
     python tools/studies/weights.py poses [--rig RIG] [--weights [NAME=]DIR ...]
-        docs/figures/poses.json, or poses-RIG.json for another rig than the paper's
+        docs/figures/poses.json; both are edge-RIG.json, poses-RIG.json for another rig than the paper's
 
 `limits` evaluates with one thing removed or added at a time. `rigs` moves the lidar over the
 distances and angles of SI 1 and by what a bench built with a ruler is off, while occluder and
@@ -393,6 +393,12 @@ def rigs(asked: argparse.Namespace) -> None:
             )
 
 
+def shown(subjects: Sequence[Subject], bench: Rig) -> tuple[Rig, Float32, list[LidarMaps]]:
+    """Return a bench, the true images of objects on it, and their maps, one frame each."""
+    maps = sense(echoes_of(subjects, bench, lambda *_: None), bench)
+    return bench, truth_of(subjects, object_box(bench)), maps
+
+
 def edge(asked: argparse.Namespace) -> None:
     """Measure weights on benches that are a little off the record that their maps are aligned by."""
     weights = loaded(asked)
@@ -408,9 +414,7 @@ def edge(asked: argparse.Namespace) -> None:
     ]
 
     def measured(place: Place, _: Any) -> dict[str, Any]:
-        bench = place.rig(rig)
-        truth = truth_of(subjects, object_box(bench))
-        seen = sense(echoes_of(subjects, bench, lambda *_: None), bench)
+        bench, truth, seen = shown(subjects, place.rig(rig))
         repaired = [repair.repair(each) for each in seen]
         found = dict[str, dict[str, float]]()
         for label, (network, _) in weights.items():
@@ -422,8 +426,8 @@ def edge(asked: argparse.Namespace) -> None:
                 found.setdefault(label, {})[way] = iou
         return {"silhouette_iou": found}
 
-    rows = harness.collect("edge", places, measured, key=key_of(asked))
-    harness.write("edge", {"objects": len(subjects), "rows": rows}, asked.out)
+    rows = harness.collect("edge", places, measured, key=key_of(asked) + rig.checksum)
+    harness.write(named_after("edge", rig), {"objects": len(subjects), "rows": rows}, asked.out)
     for row in rows:
         off_mm = 1e3 * (row["distance_m"] - here.distance_m)
         print(
@@ -441,9 +445,7 @@ def poses(asked: argparse.Namespace) -> None:
     places = [here, *(off_record(here, seed) for seed in range(DRAWS))]
 
     def measured(place: Place, _: Any) -> dict[str, Any]:
-        bench = place.rig(rig)
-        truth = truth_of(subjects, object_box(bench))
-        seen = sense(echoes_of(subjects, bench, lambda *_: None), bench)
+        bench, truth, seen = shown(subjects, place.rig(rig))
         maps = as_map_set([repair.repair(each) for each in seen], truth)
         found = dict[str, list[float]]()
         for label, (network, _) in weights.items():
@@ -466,8 +468,14 @@ def poses(asked: argparse.Namespace) -> None:
             "mean_lost_by_draw": lost.mean(1).tolist(),
         }
         print(label, harness.rounded(found[label]))
-    name = "poses" if rig.name == "paper-rig" else f"poses-{rig.name}"
-    harness.write(name, {"scans": DRAWS * len(subjects), "weights": found}, asked.out)
+    harness.write(
+        named_after("poses", rig), {"scans": DRAWS * len(subjects), "weights": found}, asked.out
+    )
+
+
+def named_after(study: str, rig: Rig) -> str:
+    """Return the name of a study's figures: its own for the paper's rig."""
+    return study if rig.name == "paper-rig" else f"{study}-{rig.name}"
 
 
 def off_record(here: Place, seed: int) -> Place:
