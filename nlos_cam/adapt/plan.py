@@ -38,6 +38,8 @@ CERTAIN_TIMES = 2.0
 MIN_SPREAD = RigSpread(place_m=0.0005, angle_deg=0.1, gain_share=0.05)
 """A fit's own uncertainty leaves out what it has no model of: a bent wall, a bench that settles.
 One column of cells at the occluder's edge flips between wall and occluder at 0.2 mm."""
+RULER_STD_M = 0.0005
+"""Standard uncertainty of an occluder's place that was measured with a ruler."""
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 Count = Annotated[int, Field(gt=0, le=10**9)]
 
@@ -193,12 +195,15 @@ def load_plan(folder: Path) -> Plan | None:
 
 def calibration_spread(measured: MeasuredWall | None) -> RigSpread:
     """Return how far a bench may be off its record: CERTAIN_TIMES the standard uncertainties of its
-    calibration, and at least MIN_SPREAD.
+    calibration, occluder included, and at least MIN_SPREAD.
     """
     if measured is None:
         return MIN_SPREAD
     record = measured.record
     place_m = [record.distance_std_m, record.range_offset_std_m or 0.0]
+    if record.occluder:
+        found = record.occluder.x_std_m, record.occluder.gap_std_m
+        place_m += [RULER_STD_M if std_m is None else std_m for std_m in found]
     angle_deg = [record.yaw_std_deg, record.pitch_std_deg]
     return RigSpread(
         place_m=max(MIN_SPREAD.place_m, CERTAIN_TIMES * max(place_m)),

@@ -28,6 +28,7 @@ from nlos_cam.adapt.locked import LockedNoise
 from nlos_cam.adapt.plan import (
     BATCH,
     FIRST_OBJECTS,
+    PLAN,
     Locked,
     Pace,
     Plan,
@@ -70,6 +71,7 @@ BEFORE = "before"
 AFTER = "after"
 GUESS = "mean_object"
 PARTS = "parts"
+STAGE = "stage-{}"
 REPORT = "report"
 FIGURES = "figures.json"
 HELD_OUT_OBJECTS = 400
@@ -112,6 +114,8 @@ class Adaptation:
     """Locked differences in place of maps; their weights are for a study, not for `live`."""
     recordings: Recordings | None = None
     """Recordings of known objects on the bench, if there are any."""
+    begin_again: bool = False
+    """Whether a folder that is an adaptation to another rig is emptied, in place of an error."""
 
     @property
     def start_folder(self) -> Path:
@@ -209,7 +213,7 @@ def _threads(count: int) -> Generator[None]:
 
 
 def _stage_name(number: int) -> str:
-    return f"stage-{number + 1}"
+    return STAGE.format(number + 1)
 
 
 def _plan_for(job: Adaptation, minutes: float, tracked: data.Tracked) -> Plan:
@@ -217,6 +221,14 @@ def _plan_for(job: Adaptation, minutes: float, tracked: data.Tracked) -> Plan:
     machine.
     """
     plan = load_plan(job.folder)
+    if plan and plan.rig_checksum != job.rig.checksum:
+        if not job.begin_again:
+            raise SceneError(
+                f"{job.folder} is an adaptation to another rig: the bench was calibrated again since;"
+                " give --overwrite to begin again, or another --out"
+            )
+        _forget(job.folder)
+        plan = None
     if plan is None:
         with tracked("measuring the pace of this machine") as on_progress:
             pace = _measure_pace(job, on_progress)
@@ -228,11 +240,6 @@ def _plan_for(job: Adaptation, minutes: float, tracked: data.Tracked) -> Plan:
             pace=pace,
             start=_start_checksum(job),
             locked=job.locked,
-        )
-    if plan.rig_checksum != job.rig.checksum:
-        raise SceneError(
-            f"{job.folder} is an adaptation to another rig: the bench was calibrated again since;"
-            " delete or rename that folder"
         )
     if (plan.locked, plan.sensor.pulse_ns) != (job.locked, job.sensor.pulse_ns):
         raise SceneError(
@@ -249,6 +256,14 @@ def _plan_for(job: Adaptation, minutes: float, tracked: data.Tracked) -> Plan:
     plan = plan.extended(minutes)
     plan.save(job.folder)
     return plan
+
+
+def _forget(folder: Path) -> None:
+    """Delete what an adaptation made: the plan at last, so that a stop meanwhile is repeated."""
+    for made in (folder / BEFORE, *folder.glob(STAGE.format("*"))):
+        if made.exists():
+            shutil.rmtree(made)
+    (folder / PLAN).unlink()
 
 
 def _start_checksum(job: Adaptation) -> str:

@@ -97,7 +97,8 @@ def adapt(
     Killed at any moment, the same command goes on. More --minutes go on from what is there. Labelled
     recordings of known objects in BENCH/recordings are used too.
     """
-    folder = Path(bench) if out is None and Path(bench).is_dir() else None
+    own = Path(bench) if Path(bench).is_dir() else None
+    folder = own if out is None else None
     rig, measured = bench_or_rig(bench)
     locked = _locked(frames, radiometry, material, given=pulse_ns is not None)
     home = out or folder or Path(f"adapted-{rig.name}")
@@ -117,7 +118,8 @@ def adapt(
         farm=rendering_farm(ray, backend),
         accelerator=accelerator,
         locked=locked,
-        recordings=_recordings(folder) if folder and not locked else None,
+        recordings=_recordings(own) if own and not locked else None,
+        begin_again=overwrite,
         **optional,
     )
     try:
@@ -137,10 +139,12 @@ def adapt(
     expected = None if locked else _forecast(rig, folder)
     name = shlex.quote(bench)
     more = f"nlos-cam adapt {name} --minutes {2 * result.plan.minutes:g}"
-    commands = [f"nlos-cam evaluate --rig {name} --weights {shlex.quote(str(target))}"]
+    place = f"{'--bench' if own else '--rig'} {name}"
+    commands = [f"nlos-cam evaluate {place} --weights {shlex.quote(str(target))}"]
     if locked:
         commands = []
         more += f" --frames {locked.frames} --radiometry {locked.radiometry}"
+        more += f" --pulse-ns {sensor.pulse_ns:g} --material {material or 'matt'}"
     if folder and result.is_better:
         camera = benches.camera_to_name(measured.record) if measured else "l515"
         commands = [f"nlos-cam live --camera {camera} --bench {name}"]

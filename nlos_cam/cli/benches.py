@@ -15,6 +15,8 @@ from nlos_cam.cli import common
 from nlos_cam.errors import OutputExistsError
 
 if TYPE_CHECKING:
+    import nlos_models as models
+
     from nlos_cam.forecast import Forecast
 
 BenchFolder = Annotated[
@@ -58,6 +60,25 @@ class Choice(NamedTuple):
             return self.bench.for_camera(camera)
         return reconstruct.open_bench(self.record, camera)
 
+    def load_networks(
+        self, bench: reconstruct.CalibratedRig
+    ) -> tuple[models.Reconstructor, models.UncertaintyModel | None]:
+        """Load the weights, or the shipped ones that serve a rig best, and print the model's name
+        and its mismatches with the bench. Raises CheckpointError.
+        """
+        weights = self.weights or reconstruct.weights_for(bench.rig)
+        network = reconstruct.load_networks(weights)
+        uncertainty_model = reconstruct.load_uncertainty(weights)
+        common.say(f"Loaded model {network.record.rig_name} ({network.runtime})")
+        served = benches.weights_verdict(bench.rig, network.record, self.bench)
+        if not served.is_warning:
+            common.say(served.sentence[:1].upper() + served.sentence[1:])
+        for warning in reconstruct.compatibility_warnings(
+            bench, network.record, uncertainty_model, served
+        ):
+            common.say(f"note: {warning}")
+        return network, uncertainty_model
+
 
 def choose(bench: Path | None, wall: Path | None = None, weights: Path | None = None) -> Choice:
     """Load the bench folder, if there is one. Raises RecordFileError, and typer.BadParameter for a
@@ -91,14 +112,20 @@ def rig_or_default(bench: Path | None, rig: str | None, default: str) -> walls.R
         return loaded.rig
     name = rig or default
     found = walls.rig_named(name)
-    if walls.is_wall_record(name) and (record := walls.load_wall(Path(name))).verdict == "doubtful":
-        common.say(f"note: {name} calls itself doubtful: {record.advice}")
+    if walls.is_wall_record(name):
+        _note_doubt(name, walls.load_wall(Path(name)))
     return found
+
+
+def _note_doubt(name: str, record: walls.WallRecord) -> None:
+    """Print that a wall record is doubtful by its own verdict."""
+    if record.verdict == "doubtful":
+        common.say(f"note: {name} calls itself doubtful: {record.advice}")
 
 
 def bench_or_rig(name: str | Path) -> tuple[walls.Rig, walls.MeasuredWall | None]:
     """Return the rig of a bench folder, a wall record, a rig's file or a packaged rig and, where it
-    was measured, its wall.
+    was measured, its wall; print that a record is doubtful by its own verdict.
     """
     name = str(name)
     if Path(name).is_dir():
@@ -107,6 +134,7 @@ def bench_or_rig(name: str | Path) -> tuple[walls.Rig, walls.MeasuredWall | None
         measured = walls.load_measured(Path(name))
     else:
         return walls.rig_named(name), None
+    _note_doubt(name, measured.record)
     return measured.record.rig, measured
 
 

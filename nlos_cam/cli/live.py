@@ -12,7 +12,6 @@ from typing import Annotated
 import typer
 from rich.markup import escape
 
-from nlos_cam import bench as bench_folders
 from nlos_cam import camera as cameras
 from nlos_cam import live as loop
 from nlos_cam import reconstruct
@@ -239,20 +238,8 @@ def _load_pipeline(
     average: int,
     checks: reconstruct.PhysicsCheck,
 ) -> reconstruct.Pipeline:
-    """Load the networks and build their pipeline, and print the model's name and its mismatches
-    with the bench.
-    """
-    weights = chosen.weights or reconstruct.weights_for(bench.rig)
-    network = reconstruct.load_networks(weights)
-    uncertainty_model = reconstruct.load_uncertainty(weights)
-    common.say(f"Loaded model {network.record.rig_name} ({network.runtime})")
-    served = bench_folders.weights_verdict(bench.rig, network.record, chosen.bench)
-    if not served.is_warning:
-        common.say(served.sentence[:1].upper() + served.sentence[1:])
-    for warning in reconstruct.compatibility_warnings(
-        bench, network.record, uncertainty_model, served
-    ):
-        common.say(f"note: {warning}")
+    """Load the networks that serve a bench and build their pipeline."""
+    network, uncertainty_model = chosen.load_networks(bench)
     return reconstruct.build_pipeline(
         bench, network, average, uncertainty_model=uncertainty_model, checks=checks
     )

@@ -143,7 +143,8 @@ Seconds = Annotated[
 def view(
     file: ViewFile,
     wall: Wall = None,
-    bench_folder: benches.BenchFolder = None,
+    bench_folder: benches.BenchOrWeights = None,
+    weights: benches.Weights = None,
     seconds: Seconds = None,
     view_port: ViewPort = None,
     view_host: ViewHost = None,
@@ -161,15 +162,18 @@ def view(
             " --out look.html`"
         )
     is_recording = file.suffix == ".bag" or recordings.is_ros2(file)
-    if not is_recording and (wall or bench_folder):
+    if not is_recording and (wall or bench_folder or weights):
         raise typer.BadParameter(
-            "--wall and --bench are for a recording (.bag): a saved session holds its pictures"
+            "--wall, --bench and --weights are for a recording (.bag): a saved session holds its"
+            " pictures"
         )
-    chosen = benches.choose(bench_folder, wall)
+    chosen = benches.choose(bench_folder, wall, weights)
     if is_recording:
         with interrupted_by_signals():
             opened = cameras.open_camera(f"bag:{file}")
-            playback = replays.Playback(opened, chosen.open(opened), host=host, port=view_port)
+            bench = chosen.open(opened)
+            networks = chosen.load_networks(bench)
+            playback = replays.Playback(opened, bench, networks, host=host, port=view_port)
         with stop_on_signals() as stop, playback:
             announce(playback, what="recording")
             playback.reconstruct(stop)

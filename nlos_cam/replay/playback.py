@@ -4,7 +4,6 @@ exported.
 
 from collections.abc import Mapping
 from datetime import datetime
-from functools import cached_property
 from pathlib import Path
 from threading import Event, Lock
 from typing import Any
@@ -21,8 +20,6 @@ from nlos_cam.reconstruct import (
     Pipeline,
     build_pipeline,
     iterate_batched,
-    load_networks,
-    load_uncertainty,
 )
 from nlos_cam.recording import with_telemetry
 from nlos_cam.view import Moment, PlaybackViewer, WrittenFiles, save_moment
@@ -38,6 +35,7 @@ class Playback(PlaybackViewer):
         self,
         camera: Camera,
         bench: CalibratedRig,
+        networks: tuple[Reconstructor, UncertaintyModel | None],
         *,
         folder: Path = Path(),
         host: str,
@@ -48,10 +46,11 @@ class Playback(PlaybackViewer):
         """Frames reconstructed so far."""
         self._camera = camera
         self._calibrated = bench
+        self._networks = networks
         self._folder = folder
         self._exporting = Lock()
         self._files = WrittenFiles()
-        self._state = "loading the networks"
+        self._state = "reconstructing"
 
     def reconstruct(self, stop: Event) -> None:
         """Reconstruct every frame until the end or `stop`. Raises RecordingError for a recording
@@ -60,7 +59,6 @@ class Playback(PlaybackViewer):
         with self._camera as camera:
             frames, telemetry = with_telemetry(camera)
             pipeline = self._pipeline(PeriodicPhysicsCheck(self._calibrated.rig))
-            self._state = "reconstructing"
             with FrameReader(frames, lossless=True, stop=stop) as reader, pipeline.checks:
                 for result in iterate_batched(reader, pipeline, temperatures=telemetry):
                     self.show(Moment.recorded(result, telemetry.celsius))
@@ -72,10 +70,6 @@ class Playback(PlaybackViewer):
             )
         self.finish()
         self._state = "whole"
-
-    @cached_property
-    def _networks(self) -> tuple[Reconstructor, UncertaintyModel | None]:
-        return load_networks(), load_uncertainty()
 
     def _pipeline(self, checks: PhysicsCheck | None = None) -> Pipeline:
         network, uncertainty_model = self._networks

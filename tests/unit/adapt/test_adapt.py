@@ -11,6 +11,7 @@ from nlos_calibration import Rig, load_rig
 from nlos_models import load_network, training
 
 from nlos_cam.adapt import NETWORK_FILE, Adaptation, adapt, calibration_spread
+from nlos_cam.adapt.plan import load_plan
 from nlos_cam.errors import SceneError
 from nlos_cam.files import FileBusyError, claim
 
@@ -103,8 +104,29 @@ def test_a_bench_that_was_calibrated_again_is_refused(tmp_path: Path) -> None:
     lidar = rig.lidar.model_copy(update={"distance_m": rig.lidar.distance_m + 0.01})
     moved = rig.model_copy(update={"lidar": lidar})
 
-    with pytest.raises(SceneError, match="calibrated again"):
+    with pytest.raises(SceneError, match=r"calibrated again.*--overwrite"):
         adapt(replace(job, rig=moved), 1.0, no_figures)
+
+
+def test_a_bench_calibrated_again_begins_again_when_asked(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    job = job_in(tmp_path / "work", load_rig("paper-rig"))
+    finish_network(job.folder)
+    plan = load_plan(job.folder)
+    assert plan is not None
+    monkeypatch.setattr("nlos_cam.adapt.run._measure_pace", lambda *_: plan.pace)
+
+    def stop(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        adapt(replace(job, rig=bench_elsewhere(), begin_again=True), 1.0, stop)
+
+    found = load_plan(job.folder)
+    assert found is not None
+    assert found.rig_checksum == bench_elsewhere().checksum
+    assert not list(job.folder.glob("stage-*"))
 
 
 @pytest.mark.parametrize("cores", CORES)

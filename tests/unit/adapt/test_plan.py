@@ -1,9 +1,11 @@
 """Plan of an adaptation: what fits into the minutes."""
 
 from pathlib import Path
+from typing import Any
 
 import pytest
-from nlos_calibration import load_rig
+from made_benches import wall_of
+from nlos_calibration import MeasuredWall, OccluderRecord, load_rig
 
 from nlos_cam.adapt import Plan, Stage, calibration_spread
 from nlos_cam.adapt.plan import PLAN, Pace, load_plan
@@ -85,3 +87,22 @@ def test_a_stage_of_any_length_has_a_recipe_that_averages() -> None:
     recipe = Stage(minutes=1.0, objects=SHARD, epochs=1, steps=3).recipe()
 
     assert 0 <= recipe.average < 1
+
+
+@pytest.mark.parametrize(
+    ("occluder", "place_m"),
+    [
+        ({"source": "detected", "x_std_m": 0.0001, "gap_std_m": 0.0001}, 0.0005),
+        ({"source": "detected", "x_std_m": 0.0001, "gap_std_m": 0.002}, 0.004),
+        ({"source": "detected", "x_std_m": 0.002, "gap_std_m": 0.0001}, 0.004),
+        ({"source": "entered"}, 0.001),
+    ],
+)
+def test_the_spread_has_the_occluders_uncertainty(occluder: Any, place_m: float) -> None:
+    wall = wall_of()
+    record = OccluderRecord(x_m=0.2, gap_m=0.1, **occluder)
+    with_occluder = wall.record.model_copy(update={"occluder": record})
+
+    spread = calibration_spread(MeasuredWall(with_occluder, wall.reference))
+
+    assert spread.place_m == pytest.approx(place_m)

@@ -18,6 +18,7 @@ from nlos_cam.bench import (
     weights_verdict,
     write_weights,
 )
+from nlos_cam.cli.benches import bench_or_rig
 from nlos_cam.reconstruct import WALL_GRID
 
 Run = Callable[..., Any]
@@ -176,6 +177,16 @@ def test_doubtful_record_is_named_where_its_rig_is_used(run: Run) -> None:
 
     assert "measure again" in run(*words, "--bench", "bench").err
     assert "measure again" in run(*words, "--rig", "bench/stations/main/wall.toml").err
+
+
+def test_doubtful_record_is_named_before_weights_are_made(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    write_wall(Path("bench"), wall_of(verdict="doubtful", advice="measure again"))
+
+    for name in ("bench", "bench/stations/main/wall.toml"):
+        bench_or_rig(name)
+        assert "measure again" in capsys.readouterr().err
 
 
 def test_rigs_prints_a_whole_rig_that_can_be_used(shown: Run) -> None:
