@@ -15,7 +15,14 @@ from typing import Any, NamedTuple
 import numpy as np
 from nlos_calibration import ObjectBox, Rig
 from nlos_calibration.arrays import Float32, Float64
-from nlos_models import GOOD_IOU, load_reconstructor, load_uncertainty_model, silhouette_iou
+from nlos_models import (
+    GOOD_IOU,
+    RIG_WEIGHTS,
+    load_reconstructor,
+    load_uncertainty_model,
+    shipped_folder,
+    silhouette_iou,
+)
 
 from nlos_cam.evaluate import figures as pictures
 from nlos_cam.evaluate import metrics, subjects
@@ -37,6 +44,7 @@ from nlos_cam.report import (
 )
 
 REPORT = "report.html"
+DEFAULT = RIG_WEIGHTS[0]
 UNSEEN_SHEET = "sheet-unseen.png"
 QUALITY = "quality.png"
 QUALITY_COLUMNS = {
@@ -52,7 +60,6 @@ QUALITY_COLUMNS = {
 QUALITY_TARGETS_TEXT = (
     "Wanted: a correlation of 0.7, and 0.9 of the frames shown in green with that IoU."
 )
-SHIPPED = "the shipped ones"
 SIZE = "surface, cm²"
 DETAIL = "edges per surface, cm / cm²"
 SILHOUETTE_ERROR = "1 - silhouette IoU"
@@ -138,15 +145,17 @@ def evaluate(
     `tracked` opens progress bars. Raises SceneError,
     RecordingError.
     """
-    named = weights
-    if weights is None and rig:
-        weights = weights_for(rig)
+    if isinstance(objects, Path):
+        objects = subjects.dataset_objects(objects)
+    its_rig = objects.plan.rig if objects else rig
+    name = str(weights)
+    if weights is None:
+        weights = weights_for(its_rig) if its_rig else shipped_folder()
+        name = weights.name
     reconstructor = load_reconstructor(weights, cache_folder() / "onnx")
     record = reconstructor.record
     second: subjects.HeldOutObjects | None = None
-    if isinstance(objects, Path):
-        objects = subjects.dataset_objects(objects)
-    elif objects is None:
+    if objects is None:
         rig = rig or subjects.rig_of(record)
         second = None if count else subjects.rendered_objects(rig, tracked=tracked, test="unseen")
         objects = subjects.rendered_objects(rig, count, tracked)
@@ -171,7 +180,7 @@ def evaluate(
     facts = {
         "what": objects.description,
         "program": program_name(),
-        "weights": str(named or SHIPPED),
+        "weights": name,
         "rig": objects.plan.rig.name,
         "runtime": reconstructor.runtime,
         "input": record.input,
@@ -450,9 +459,8 @@ def _kinds(figures: Mapping[str, Any] | None) -> str:
 
 
 def _next_commands(figures: Mapping[str, Any]) -> list[str]:
-    chosen = (
-        "" if figures["weights"] == SHIPPED else f" --weights {shlex.quote(figures['weights'])}"
-    )
+    named = figures["weights"]
+    chosen = "" if named == DEFAULT else f" --weights {shlex.quote(named)}"
     lines = [f"nlos-cam live --camera sim{chosen}", f"nlos-cam tradeoff reconstruct{chosen}"]
     return lines if figures["training_objects"] else [*lines, f"nlos-cam evaluate{chosen}"]
 

@@ -14,7 +14,7 @@ from unittest.mock import Mock
 
 import numpy as np
 import pytest
-from nlos_calibration import load_rig
+from nlos_calibration import Rig, load_rig
 from nlos_models import CheckpointRecord
 from nlos_models.training import MapSet, VaeRecipe
 from small_frames import SheetNetwork, sheet_network
@@ -76,8 +76,8 @@ class Stored(SmallDataset):
 
     folder = Path("stored")
 
-    def __init__(self, first_seed: int, count: int) -> None:
-        plan = DatasetPlan(RIG, first_seed)
+    def __init__(self, first_seed: int, count: int, rig: Rig = RIG) -> None:
+        plan = DatasetPlan(rig, first_seed)
         super().__init__(_maps(plan, count), plan)
 
     def column(self, name: str) -> Any:
@@ -119,6 +119,17 @@ def test_evaluate_prints_figures_of_dataset(run: Run) -> None:
     assert set(result["per_category"]) == {"cup", "hat"}
     assert set(result["shown_and_left_out"]) == {"shown", "left out"}
     assert ["cup" in note for note in result["notes"]] == [True]
+
+
+@pytest.mark.usefixtures("unwritten")
+@pytest.mark.parametrize(("rig", "weights"), [("paper-rig", "direct"), ("wide-rig", "wide")])
+def test_evaluate_names_weights_by_the_datasets_rig(
+    run: Run, monkeypatch: Patch, rig: str, weights: str
+) -> None:
+    stored = Stored(HELD_OUT_SEED, 3, load_rig(rig))
+    monkeypatch.setattr(subjects.data, "open_dataset", lambda _: stored)
+
+    assert run(*JUDGE, "--dataset", "held-out", "--no-nearest")["weights"] == weights
 
 
 @pytest.mark.usefixtures("unwritten")
