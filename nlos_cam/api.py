@@ -144,7 +144,7 @@ def open_stream(
         calibrated, network, average, uncertainty_model=uncertainty_model
     )
     reconstruct.warm_up(camera, pipeline)
-    served = weights_verdict(calibrated.rig, network.record, loaded)
+    served = weights_verdict(calibrated.rig, network.record, loaded, Path(wall) if wall else None)
     mismatches = reconstruct.compatibility_warnings(
         calibrated, network.record, uncertainty_model, served
     )

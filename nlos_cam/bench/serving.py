@@ -2,6 +2,7 @@
 
 import shlex
 from dataclasses import replace
+from pathlib import Path
 
 from nlos_calibration import Rig
 from nlos_models import CheckpointRecord
@@ -12,12 +13,15 @@ from nlos_cam.bench.record import FORECAST_SCATTER_IOU
 from nlos_cam.reconstruct import WeightsVerdict, weights_serve
 
 
-def weights_verdict(rig: Rig, trained: CheckpointRecord, bench: Bench | None) -> WeightsVerdict:
+def weights_verdict(
+    rig: Rig, trained: CheckpointRecord, bench: Bench | None, record: Path | None = None
+) -> WeightsVerdict:
     """Return whether weights serve a rig, for the user, with the bench folder to train others in
-    and what to expect of them.
+    (or the wall record, where there is none) and what to expect of them.
     """
     if bench is None:
-        return weights_serve(rig, trained)
+        place = shlex.quote(str(record or "bench/"))
+        return weights_serve(rig, trained, bench=place)
     folder = shlex.quote(str(bench.folder))
     expected_iou = bench.expected_iou
     served = weights_serve(rig, trained, expected_iou=expected_iou, bench=folder)

@@ -70,7 +70,7 @@ class Choice(NamedTuple):
         network = reconstruct.load_networks(weights)
         uncertainty_model = reconstruct.load_uncertainty(weights)
         common.say(f"Loaded model {network.record.rig_name} ({network.runtime})")
-        served = benches.weights_verdict(bench.rig, network.record, self.bench)
+        served = benches.weights_verdict(bench.rig, network.record, self.bench, self.record)
         if not served.is_warning:
             common.say(served.sentence[:1].upper() + served.sentence[1:])
         for warning in reconstruct.compatibility_warnings(

@@ -292,7 +292,7 @@ def calibrate(
     rig = loaded.rig if loaded else record.rig
     own = loaded.weights if loaded else None
     trained = models.load_record(own or reconstruct.weights_for(rig))
-    served = benches.weights_verdict(rig, trained, loaded)
+    served = benches.weights_verdict(rig, trained, loaded, files.record)
     result["weights"] = {
         "serve": served.serve,
         "verdict": served.sentence,

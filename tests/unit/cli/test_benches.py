@@ -212,6 +212,14 @@ def verdict(folder: Path) -> str:
     return weights_verdict(loaded.rig, trained, loaded).sentence
 
 
+def test_verdict_on_weights_names_the_record_without_a_bench() -> None:
+    direct = load_record(shipped_folder())
+
+    sentence = weights_verdict(load_rig("wide-rig"), direct, None, Path("my wall.toml")).sentence
+
+    assert "nlos-cam adapt 'my wall.toml'" in sentence
+
+
 def test_verdict_on_weights_names_adapt_and_the_forecast(bench: Path) -> None:
     forecast(bench, 0.64)
     loaded = load_bench(bench)
