@@ -561,11 +561,11 @@ def judged(
     subject: Subject, way: str, places: Sequence[str], choice: Choice, work: Path
 ) -> dict[str, float]:
     """Return the figures of one way for one object."""
-    seen = [seen_from(place, subject) for place in places]
     if way == "network":
-        image = answer_to(seen[0].maps).image[0]
+        image = answer_to(seen_from("home", subject).maps).image[0]
         box = object_box(load_rig("paper-rig"))
         return compared(image > 0, depth_from_image(image, box), np.asarray(subject.depth_m))
+    seen = [seen_from(place, subject) for place in places]
     if way == "lifted":
         found = by_lifting(seen, choice, [dictionary_of(place, work) for place in places])
     else:
