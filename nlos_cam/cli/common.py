@@ -32,7 +32,7 @@ from rich.progress import (
 from rich.table import Table
 from rich.text import Text
 
-from nlos_cam.errors import OutputExistsError
+from nlos_cam.errors import OutputExistsError, SceneError
 
 Camera = Annotated[
     str,
@@ -130,6 +130,12 @@ def say_interrupted(kept: str = "nothing was written") -> None:
     if not Detail.interruption:
         Detail.interruption = f"interrupted: {kept}"
         say(Detail.interruption)
+
+
+def refuse_ignored(why: str, given: dict[str, bool], instead: str = "change the recipe") -> None:
+    """Raise SceneError for the first given option that would be ignored."""
+    for option in (option for option, is_given in given.items() if is_given):
+        raise SceneError(f"{why}, so {option} would have no effect: drop it, or {instead}")
 
 
 def exit_interrupted(kept: str) -> NoReturn:
