@@ -44,7 +44,12 @@ def predict(
             help="A category's name, a mesh or a .npy depth map; default: typical objects.",
         ),
     ] = None,
-    bench_folder: benches.BenchOrRig = None,
+    bench_folder: Annotated[
+        Path | None,
+        typer.Option(
+            "--bench", help="Bench folder of `calibrate --bench`, in place of RIG_OR_BENCH."
+        ),
+    ] = None,
     out: Annotated[
         Path | None, typer.Option("--out", help="Page (.html) or picture (.png) with the maps.")
     ] = None,
@@ -68,8 +73,10 @@ def predict(
     if bench_folder is not None:
         if hidden is not None:
             raise typer.BadParameter(f"--bench and {rig} each name a rig: give one")
+        own = bench_folders.load_bench(bench_folder).rig
         rig, hidden = str(bench_folder), rig
-    own, _ = benches.bench_or_rig(rig or PAPER_RIG)
+    else:
+        own, _ = benches.bench_or_rig(rig or PAPER_RIG)
     shape = None
     if hidden is not None:
         depth_m = hidden_depth(hidden, own, {"size_m": size_m, "tilt_y_deg": turn_deg})

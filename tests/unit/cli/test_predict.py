@@ -43,6 +43,25 @@ def test_predict_bench_takes_its_rig_and_an_object(
     assert main(["predict", "--bench", "bench", "paper-rig", "cup"]) == 2
 
 
+@pytest.mark.parametrize(
+    ("wrong", "words"),
+    [("nowhere", "no bench folder nowhere"), ("empty-folder", "empty-folder is not a bench folder")],
+)
+def test_predict_bench_names_a_folder_that_is_none(
+    wrong: str,
+    words: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    (tmp_path / "empty-folder").mkdir()
+    monkeypatch.chdir(tmp_path)
+
+    assert main(["predict", "--bench", wrong, "--quick"]) == 4
+
+    assert words in capsys.readouterr().err
+
+
 @pytest.mark.parametrize("wrong", ["nowhere.toml", "papper-rig", "bare-wall", "empty-folder"])
 def test_predict_refuses_what_is_no_rig_in_one_line(
     wrong: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
