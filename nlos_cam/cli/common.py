@@ -165,13 +165,13 @@ def finish(
         PlainConsole(highlight=False).print(text, soft_wrap=True, markup=marked)
 
 
-def show(table: Table) -> None:
-    """Print a table to stdout without its empty columns; on a narrow terminal, each row as a block
-    of lines.
+def show(table: Table, *, narrow_columns: int = NARROW_COLUMNS) -> None:
+    """Print a table to stdout without its empty columns; on a terminal of fewer columns than
+    `narrow_columns`, each row as a block of lines.
     """
     console = PlainConsole(highlight=False)
     table.columns = [column for column in table.columns if any(column.cells)]
-    if console.width >= NARROW_COLUMNS:
+    if console.width >= narrow_columns:
         console.print(table)
         return
     for cells in zip(*(column.cells for column in table.columns), strict=True):

@@ -26,6 +26,8 @@ from nlos_cam.cli.common import (
 from nlos_cam.cli.render import hidden_depth
 
 SUFFIXES = ".html", ".png"
+TABLE_COLUMNS = 80
+"""Width of a terminal that the full table fits, with the longest word of its labels on a line."""
 
 
 def predict(
@@ -105,7 +107,7 @@ def predict(
         lines += ["What to change:", *(f"  {line}" for line in forecast.change_words(advice))]
     lines += [f"Written: {path}"] if path else []
     if not json:
-        show(_table(found))
+        show(_table(found), narrow_columns=TABLE_COLUMNS)
         lines.insert(0, forecast.COLUMNS)
     finish(facts, as_json=json, text="\n".join(lines))
 
@@ -124,7 +126,10 @@ def _renew_forecast(name: str | None, found: forecast.Forecast, *, is_typical: b
 
 def _table(found: forecast.Forecast) -> Table:
     content = forecast.table_of(found)
-    table = Table(*content.head)
+    table = Table(box=None, pad_edge=False)
+    table.add_column(content.head[0])
+    for name in content.head[1:]:
+        table.add_column(name, justify="right", no_wrap=True)
     for row in content.rows:
         table.add_row(*row)
     return table
