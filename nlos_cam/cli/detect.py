@@ -138,12 +138,13 @@ def detect(
     if camera.startswith("bag:"):
         raise typer.BadParameter(f"{camera} is a recording without turns: give a live camera")
     folder = output_path(out, "detect", "", overwrite=True)  # a session that exists goes on
-    if overwrite and detection.is_session(folder):
-        shutil.rmtree(folder)
     chosen = benches.choose(bench_folder, wall)
-    before = detection.Session.open(folder).plan if detection.is_session(folder) else None
+    is_there = detection.is_session(folder)
+    before = detection.Session.open(folder).plan if is_there and not overwrite else None
     asked.check(camera, before)
     source = _open(camera)
+    if is_there and overwrite:  # not before all else is in order
+        shutil.rmtree(folder)
     with interrupted_by_signals(_kept(folder)):
         session = _measure(source, chosen, asked, before, folder)
         _report(session, show_serial=show_serial, as_json=json)

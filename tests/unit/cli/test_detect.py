@@ -112,6 +112,14 @@ def test_wrong_number_of_turns_is_refused_in_one_line(run: Run, tmp_path: Path) 
     assert not (tmp_path / "s").exists()
 
 
+def test_refused_command_overwrites_no_session(run: Run, tmp_path: Path) -> None:
+    session = Session.start(tmp_path / "session", made_plan())
+
+    run("detect", "sim", "--turns", 10, "--out", session.folder, "--overwrite", code=2)
+
+    assert Session.open(session.folder).plan == session.plan
+
+
 def test_bench_folder_in_place_of_a_camera_names_bench(run: Run, tmp_path: Path) -> None:
     make_bench(tmp_path / "bench")
 
