@@ -32,7 +32,7 @@ from rich.progress import (
 from rich.table import Table
 from rich.text import Text
 
-from nlos_cam.errors import OutputExistsError
+from nlos_cam.errors import OutputExistsError, SceneError
 
 Camera = Annotated[
     str,
@@ -132,6 +132,12 @@ def say_interrupted(kept: str = "nothing was written") -> None:
         say(Detail.interruption)
 
 
+def refuse_ignored(why: str, given: dict[str, bool], instead: str = "change the recipe") -> None:
+    """Raise SceneError for the first given option that would be ignored."""
+    for option in (option for option, is_given in given.items() if is_given):
+        raise SceneError(f"{why}, so {option} would have no effect: drop it, or {instead}")
+
+
 def exit_interrupted(kept: str) -> NoReturn:
     """End an interrupted command that has kept results."""
     say_interrupted(kept)
@@ -159,13 +165,13 @@ def finish(
         PlainConsole(highlight=False).print(text, soft_wrap=True, markup=marked)
 
 
-def show(table: Table) -> None:
-    """Print a table to stdout without its empty columns; on a narrow terminal, each row as a block
-    of lines.
+def show(table: Table, *, narrow_columns: int = NARROW_COLUMNS) -> None:
+    """Print a table to stdout without its empty columns; on a terminal of fewer columns than
+    `narrow_columns`, each row as a block of lines.
     """
     console = PlainConsole(highlight=False)
     table.columns = [column for column in table.columns if any(column.cells)]
-    if console.width >= NARROW_COLUMNS:
+    if console.width >= narrow_columns:
         console.print(table)
         return
     for cells in zip(*(column.cells for column in table.columns), strict=True):

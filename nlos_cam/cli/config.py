@@ -202,10 +202,15 @@ def _optional(annotation: Any) -> Any:
 
 def _choose_camera(values: dict[str, Any], used: dict[str, Value]) -> None:
     """Enter the camera of the argument, the option or the setting; another than the setting's has
-    another wall.
+    another wall. A bench folder as the argument, beside the option, is --bench.
     """
     argument = values.pop("camera")
     option = values.pop("camera_option")
+    if None not in {argument, option} and "bench" in used and _is_bench(argument):
+        if values["bench_folder"] is not None:
+            raise typer.BadParameter(f"{argument} and --bench each name a bench folder: give one")
+        values["bench_folder"] = Path(argument)
+        argument = None
     if None not in {argument, option} and argument != option:
         raise typer.BadParameter(f"CAMERA is {argument!r} and --camera is {option!r}: give one")
     given = option if argument is None else argument
@@ -219,6 +224,15 @@ def _choose_camera(values: dict[str, Any], used: dict[str, Value]) -> None:
         from nlos_cam.camera import full_uri
 
         values["camera"] = full_uri(str(values["camera"]))
+
+
+def _is_bench(name: str) -> bool:
+    """Return True for the path of a bench folder."""
+    if not Path(name).is_dir():
+        return False
+    from nlos_cam.bench import is_bench  # not for the help page
+
+    return is_bench(Path(name))
 
 
 def _choose_bench(values: Mapping[str, Any], used: dict[str, Value]) -> None:

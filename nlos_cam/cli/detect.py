@@ -5,16 +5,19 @@ turns.
 from __future__ import annotations
 
 import secrets
+import shlex
 import shutil
 import sys
 from collections.abc import Callable
 from datetime import datetime
+from math import isfinite
 from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple
 
 import nlos_calibration as walls
 import typer
 
+from nlos_cam import bench as bench_folders
 from nlos_cam import camera as cameras
 from nlos_cam import detect as detection
 from nlos_cam.cli import benches
@@ -26,6 +29,7 @@ from nlos_cam.cli.common import (
     interrupted_by_signals,
     output_path,
     progress,
+    refuse_ignored,
     say,
     stderr,
     tracked,
@@ -91,13 +95,14 @@ def detect(
         ),
     ] = None,
     settings: Annotated[
-        Literal["as-started", "sweep"],
+        Literal["as-started", "sweep"] | None,
         typer.Option(
             "--settings",
+            show_default="as-started",
             help="sweep: in every turn also one option at a time at other values (laser power,"
             " gains, least distance, filters).",
         ),
-    ] = "as-started",
+    ] = None,
     control: Annotated[
         bool, typer.Option("--control", help="Control: the same motions with an empty hand.")
     ] = False,
@@ -121,19 +126,51 @@ def detect(
     its own. Stopped at any moment, the same command goes on. With the folder in place of CAMERA the
     stored turns are analyzed again.
     """
+    rig_option = _rig_option(bench_folder, wall)
+    asked = Asked(turns, frames, alpha, seed, control, settings == "sweep", rig_option)
     folder = Path(camera)
     if folder.is_dir():
-        session = detection.Session.open(folder)
-    else:
-        if camera.startswith("bag:"):
-            raise typer.BadParameter(f"{camera} is a recording without turns: give a live camera")
-        folder = output_path(out, "detect", "", overwrite=True)  # a session that exists goes on
-        if overwrite and detection.is_session(folder):
-            shutil.rmtree(folder)
-        chosen = benches.choose(bench_folder, wall)
-        asked = Asked(turns, frames, alpha, seed, control, settings == "sweep")
-        session = _measure(camera, chosen, asked, folder)
-    _report(session, show_serial=show_serial, as_json=json)
+        _refuse_bench(folder)
+        asked.refuse_beside(folder, {"--settings": settings is not None, "--out": out is not None})
+        with interrupted_by_signals(_kept(folder)):
+            _report(detection.Session.open(folder), show_serial=show_serial, as_json=json)
+        return
+    if camera.startswith("bag:"):
+        raise typer.BadParameter(f"{camera} is a recording without turns: give a live camera")
+    folder = output_path(out, "detect", "", overwrite=True)  # a session that exists goes on
+    chosen = benches.choose(bench_folder, wall)
+    is_there = detection.is_session(folder)
+    before = detection.Session.open(folder).plan if is_there and not overwrite else None
+    asked.check(camera, before)
+    source = _open(camera)
+    if is_there and overwrite:  # not before all else is in order
+        shutil.rmtree(folder)
+    with interrupted_by_signals(_kept(folder)):
+        session = _measure(source, chosen, asked, before, folder)
+        _report(session, show_serial=show_serial, as_json=json)
+
+
+def _kept(folder: Path) -> str:
+    return f"whole turns are in {folder}; the same command goes on"
+
+
+def _rig_option(bench_folder: Path | None, wall: Path | None) -> str:
+    """Return the option that names the rig, without the folders above it."""
+    for option, path in (("--bench", bench_folder), ("--wall", wall)):
+        if path is not None:
+            return f"{option} {shlex.quote(path.resolve().name)}"
+    return ""
+
+
+def _refuse_bench(folder: Path) -> None:
+    """Raise typer.BadParameter for a bench folder in place of CAMERA."""
+    if not bench_folders.is_bench(folder):
+        return
+    camera = bench_folders.camera_to_name(bench_folders.load_bench(folder).measured.record)
+    raise typer.BadParameter(
+        f"{folder} is a bench folder, and no camera was named: give it as --bench, for example"
+        f" `nlos-cam detect {camera} --bench {shlex.quote(str(folder))}`"
+    )
 
 
 class Asked(NamedTuple):
@@ -145,48 +182,82 @@ class Asked(NamedTuple):
     seed: int | None
     control: bool
     sweep: bool
+    rig_option: str
+
+    def refuse_beside(self, folder: Path, others: dict[str, bool]) -> None:
+        """Raise SceneError for an option that a session, to be analyzed again, would ignore."""
+        given = {
+            (self.rig_option or "--wall").split(maxsplit=1)[0]: bool(self.rig_option),
+            "--turns": self.turns is not None,
+            "--frames": self.frames is not None,
+            "--alpha": self.alpha is not None,
+            "--seed": self.seed is not None,
+            "--control": self.control,
+        }
+        why = f"the turns in {folder} are analyzed by the plan they were measured by"
+        refuse_ignored(why, given | others, "give a camera in place of the folder")
+
+    def check(self, uri: str, before: detection.Plan | None) -> None:
+        """Raise typer.BadParameter for a wrong number, before the camera is opened."""
+        self._plan(before, camera=uri)
 
     def plan(
         self, source: cameras.Camera, rig: walls.Rig | None, before: detection.Plan | None
     ) -> detection.Plan:
         """Return the plan for an entered camera. Raises typer.BadParameter for a wrong number."""
+        return self._plan(
+            before,
+            camera=source.uri,
+            serial=source.identity.get("serial", ""),
+            firmware=source.identity.get("firmware", ""),
+            rig=rig,
+            settings=detection.swept_settings(source) if self.sweep else (detection.BASELINE,),
+        )
+
+    def _plan(self, before: detection.Plan | None, **circumstances: Any) -> detection.Plan:
         from pydantic import ValidationError  # not for the help page
 
-        swept = detection.swept_settings(source) if self.sweep else (detection.BASELINE,)
         try:
             return detection.Plan(
                 created=datetime.now().astimezone().isoformat(timespec="seconds"),
-                camera=source.uri,
-                serial=source.identity.get("serial", ""),
-                firmware=source.identity.get("firmware", ""),
-                rig=rig,
                 turns=self.turns or (before.turns if before else TURNS),
                 frames=self.frames or (before.frames if before else FRAMES),
                 alpha=self.alpha or (before.alpha if before else ALPHA),
                 seed=secrets.randbits(32) if self.seed is None else self.seed,
                 control=self.control,
-                settings=swept,
+                rig_option=self.rig_option,
+                **circumstances,
             )
         except ValidationError as error:
-            raise typer.BadParameter(walls.first_problem(error)) from error
+            problem = walls.first_problem(error).removeprefix("record: ")
+            raise typer.BadParameter(problem) from error
 
 
-def _measure(uri: str, chosen: benches.Choice, asked: Asked, folder: Path) -> detection.Session:
-    before = detection.Session.open(folder).plan if detection.is_session(folder) else None
+def _open(uri: str) -> cameras.Camera:
+    """Return a camera whose object can be moved. Raises NlosCamError without hands to do it."""
     with tracked("Opening the camera") as on_progress:
         source = cameras.open_camera(uri, on_progress=on_progress)
-    movable = isinstance(source, cameras.SimulatedCamera)
-    if not movable and not sys.stdin.isatty():
+    if not isinstance(source, cameras.SimulatedCamera) and not sys.stdin.isatty():
         raise NlosCamError(
             f"{uri} needs hands at a terminal, and stdin is none: run the command in a terminal"
         )
-    kept = f"whole turns are in {folder}; the same command goes on"
-    with interrupted_by_signals(kept), source:
+    return source
+
+
+def _measure(
+    source: cameras.Camera,
+    chosen: benches.Choice,
+    asked: Asked,
+    before: detection.Plan | None,
+    folder: Path,
+) -> detection.Session:
+    movable = isinstance(source, cameras.SimulatedCamera)
+    with source:
         rig = chosen.open(source).rig if chosen.record else source.rig
         session = detection.Session.start(folder, asked.plan(source, rig, before))
         hands: detection.Hands = (
             detection.SimulatedHands(source, control=asked.control)
-            if movable
+            if isinstance(source, cameras.SimulatedCamera)
             else TerminalHands(session.plan)
         )
         _run(session, source, hands, with_bar=movable or not stderr.is_terminal)
@@ -244,7 +315,8 @@ def _fields(analysis: detection.Analysis, page: Path) -> dict[str, Any]:
                 "peak": each.peak,
                 "cell": list(each.cell),
                 "effect": each.effect,
-                "smallest": each.smallest,
+                # Not known where no size of an effect was found: JSON has no infinity.
+                "smallest": each.smallest if isfinite(each.smallest) else None,
             }
             for each in analysis.findings
         ],

@@ -26,6 +26,8 @@ from nlos_cam.cli.common import (
 from nlos_cam.cli.render import hidden_depth
 
 SUFFIXES = ".html", ".png"
+TABLE_COLUMNS = 80
+"""Width of a terminal that the full table fits, with the longest word of its labels on a line."""
 
 
 def predict(
@@ -44,7 +46,12 @@ def predict(
             help="A category's name, a mesh or a .npy depth map; default: typical objects.",
         ),
     ] = None,
-    bench_folder: benches.BenchOrRig = None,
+    bench_folder: Annotated[
+        Path | None,
+        typer.Option(
+            "--bench", help="Bench folder of `calibrate --bench`, in place of RIG_OR_BENCH."
+        ),
+    ] = None,
     out: Annotated[
         Path | None, typer.Option("--out", help="Page (.html) or picture (.png) with the maps.")
     ] = None,
@@ -68,8 +75,10 @@ def predict(
     if bench_folder is not None:
         if hidden is not None:
             raise typer.BadParameter(f"--bench and {rig} each name a rig: give one")
+        own = bench_folders.load_bench(bench_folder).rig
         rig, hidden = str(bench_folder), rig
-    own, _ = benches.bench_or_rig(rig or PAPER_RIG)
+    else:
+        own, _ = benches.bench_or_rig(rig or PAPER_RIG)
     shape = None
     if hidden is not None:
         depth_m = hidden_depth(hidden, own, {"size_m": size_m, "tilt_y_deg": turn_deg})
@@ -98,7 +107,7 @@ def predict(
         lines += ["What to change:", *(f"  {line}" for line in forecast.change_words(advice))]
     lines += [f"Written: {path}"] if path else []
     if not json:
-        show(_table(found))
+        show(_table(found), narrow_columns=TABLE_COLUMNS)
         lines.insert(0, forecast.COLUMNS)
     finish(facts, as_json=json, text="\n".join(lines))
 
@@ -117,7 +126,10 @@ def _renew_forecast(name: str | None, found: forecast.Forecast, *, is_typical: b
 
 def _table(found: forecast.Forecast) -> Table:
     content = forecast.table_of(found)
-    table = Table(*content.head)
+    table = Table(box=None, pad_edge=False)
+    table.add_column(content.head[0])
+    for name in content.head[1:]:
+        table.add_column(name, justify="right", no_wrap=True)
     for row in content.rows:
         table.add_row(*row)
     return table

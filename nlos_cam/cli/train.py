@@ -26,6 +26,7 @@ from nlos_cam.cli.common import (
     finish,
     interrupted_by_signals,
     progress,
+    refuse_ignored,
     say,
     stop_on_signals,
     tracked,
@@ -181,12 +182,6 @@ def watched_run(
             bar.update(task, description=f"{title}: {text}")
 
         yield replace(running, stop=stop.is_set, on_message=say, on_step=on_step, on_epoch=on_epoch)
-
-
-def refuse_ignored(why: str, given: dict[str, bool]) -> None:
-    """Raise SceneError for the first given option that would be ignored."""
-    for option in (option for option, is_given in given.items() if is_given):
-        raise SceneError(f"{why}, so {option} would have no effect: drop it, or change the recipe")
 
 
 def with_run_options(command: Callable[..., None]) -> Callable[..., None]:

@@ -55,6 +55,9 @@ class Plan(Record):
     firmware: str = ""
     rig: Rig | None = None
     """Set-up, from which the cells without information follow; None levels on all cells."""
+    rig_option: str = ""
+    """Option that named the rig, "--bench NAME" or "--wall NAME", without the folders above it: the
+    page may be published. Empty where the camera knew its rig."""
     turns: int = Field(ge=2 * BLOCK_TURNS, le=4096)
     """Whole blocks, half of the turns with the object."""
     frames: int = Field(ge=2, le=100_000)

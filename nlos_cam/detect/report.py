@@ -1,6 +1,7 @@
 """Page of a detection, to publish: verdict, power, significance maps, settings, turns."""
 
 from collections.abc import Callable, Sequence
+from math import isfinite
 from pathlib import Path
 
 import numpy as np
@@ -26,6 +27,8 @@ from nlos_cam.report import (
 REPORT = "detection.html"
 UNITS = {"depth": (1e3, "mm"), "infrared": (1.0, "counts"), "confidence": (1.0, "steps")}
 """Factor and unit in which a channel is reported."""
+NOT_DETERMINED = "not determined"
+"""In place of the smallest effect, where none was found with the stated probability."""
 MAX_DRAWN_SETTINGS = 6
 DRAWN_PATCH = 3
 CAVEATS = (
@@ -125,7 +128,13 @@ def finding_text(found: Finding) -> str:
 
 
 def power_text(analysis: Analysis) -> str:
-    """Return the smallest effects that would have been found."""
+    """Return the smallest effects that would have been found, or that these are not known."""
+    if not any(isfinite(each.smallest) for each in analysis.findings):
+        return (
+            f"The power was not determined: in {4 * analysis.blocks} turns of"
+            f" {analysis.plan.frames} frames no size of an effect was found with a probability of"
+            f" {POWER:.0%}. Measure more turns or frames."
+        )
     by_channel = [_smallest(analysis, channel) for channel in CHANNELS if _of(analysis, channel)]
     return (
         f"An effect would have been found with a probability of {POWER:.0%} from this size on, in"
@@ -134,11 +143,13 @@ def power_text(analysis: Analysis) -> str:
 
 
 def _smallest(analysis: Analysis, channel: str) -> str:
-    found = _of(analysis, channel)
-    cell = min((each for each in found if each.patch == 1), key=lambda each: each.smallest)
+    found = [each for each in _of(analysis, channel) if isfinite(each.smallest)]
+    if not found:
+        return f"{channel} {NOT_DETERMINED}"
+    cell = min((each.smallest for each in found if each.patch == 1), default=float("inf"))
     patch = min(found, key=lambda each: each.smallest)
     return (
-        f"{channel} {amount(channel, cell.smallest)} in one cell, {amount(channel, patch.smallest)}"
+        f"{channel} {amount(channel, cell)} in one cell, {amount(channel, patch.smallest)}"
         f" over {patch.patch} x {patch.patch}"
     )
 
@@ -148,7 +159,9 @@ def _of(analysis: Analysis, channel: str) -> list[Finding]:
 
 
 def amount(channel: str, value: float, *, signed: bool = False) -> str:
-    """Return a value in the channel's unit for people."""
+    """Return a value in the channel's unit for people; words for a power that is not known."""
+    if not isfinite(value):
+        return NOT_DETERMINED
     factor, unit = UNITS[channel]
     return f"{factor * value:{'+' if signed else ''}.2g} {unit}"
 
@@ -223,8 +236,12 @@ def facts(analysis: Analysis, *, show_serial: bool = False) -> dict[str, str]:
 
 def command_of(plan: Plan) -> str:
     """Return the command that measures by this plan."""
-    words = ["nlos-cam detect", plan.camera.split(":", maxsplit=1)[0]]
-    words += ["--wall wall.toml"] if plan.rig else []
+    camera = plan.camera.split(":", maxsplit=1)[0]
+    words = ["nlos-cam detect", camera]
+    if plan.rig_option:
+        words.append(plan.rig_option)
+    elif plan.rig and camera != "sim":  # of a session from before the option was stored
+        words.append("--wall wall.toml")
     words.append(f"--turns {plan.turns} --frames {plan.frames} --alpha {plan.alpha:g}")
     words += ["--settings sweep"] if len(plan.settings) > 1 else []
     words += ["--control"] if plan.control else []

@@ -5,12 +5,15 @@ from pathlib import Path
 
 from nlos_cam.files import atomic_file
 from nlos_cam.forecast.advice import Change
-from nlos_cam.forecast.curve import SCATTER_IOU
+from nlos_cam.forecast.curve import SCATTER_IOU, network_iou
 from nlos_cam.forecast.expectation import Expectation, Forecast
 from nlos_cam.report import Bullets, Document, Picture, Section, Table, figure_of, png
 
-USEFUL_GAIN = 0.1
-"""IoU above a guess from which on a bench shows shapes."""
+USEFUL_SHARE = 0.2
+"""Share of a guess's error, 1 less its linear IoU, from which on a bench that takes it away shows
+shapes. A difference would depend on the object: the guess at a round one is good already."""
+USEFUL_CHANGE_IOU = 0.05
+"""Gain of a change below which the order of two rigs is weaker than the forecasts' scatter."""
 MOSTLY_HIDDEN = 0.5
 """Share of hidden objects from which on a bench is said to hide most."""
 CAVEATS = (
@@ -26,9 +29,9 @@ CAVEATS = (
 
 
 COLUMNS = (
-    "IoU: of the silhouette, to expect of a network trained for the rig. For one frame: numbers of"
-    " the outline and of the depth that the maps determine, depth error of the linear estimate,"
-    " cells won by the object."
+    "IoU 1: of the silhouette, to expect of a network trained for the rig, from one frame; IoU 100:"
+    " from a hundred, averaged. For one frame: numbers of the outline and of the depth that the maps"
+    " determine, depth error of the linear estimate in mm, cells won by the object."
 )
 """Meaning of the columns of the table."""
 
@@ -36,30 +39,31 @@ COLUMNS = (
 def words_of(found: Forecast, subject: str = "") -> list[str]:
     """Return the forecast in sentences, the verdict first."""
     best = found.at()
+    alone = _alone(found, subject)
+    # Printed IoUs are all of networks, by the curve; only the verdict compares linear ones.
+    guess = f"{network_iou(found.guess_iou):.2f}"
     if found.sees_nothing:
+        of_it = f" of {alone}" if alone else ""
         return [
-            "This bench sees nothing: no cell's strongest echo comes from the object.",
-            f"Expected silhouette IoU {found.guess_iou:.2f}, which is a guess.",
+            f"This bench sees nothing{of_it}: no cell's strongest echo comes from the object.",
+            f"Expected silhouette IoU {guess}, which is a guess.",
         ]
-    gain = best.linear_iou - found.guess_iou
-    verdict = "shows shapes" if gain >= USEFUL_GAIN else "hardly shows more than a guess"
-    if found.hidden_share >= MOSTLY_HIDDEN:
-        verdict = "hides most objects"
-    whose = f"of {subject}" if subject else "of a typical matt object"
     lines = [
         (
-            f"This bench {verdict}: expected silhouette IoU {found.expected_iou:.2f} "
-            f"(± {SCATTER_IOU:.2f}) for a network trained for it."
+            f"This bench {_verdict(found, alone)}: expected silhouette IoU"
+            f" {found.expected_iou:.2f} (± {SCATTER_IOU:.2f}) for a network trained for it; a guess"
+            f" has {guess}."
         ),
         (
-            f"One frame {whose} determines {best.outline_numbers:.0f} numbers of the outline and"
-            f" {best.depth_numbers:.0f} of the depth, in {best.cells:.0f} of 5120 cells;"
-            f" signal to noise {best.signal_to_noise:.0f}."
+            f"One frame of {alone or 'a typical matt object'} determines"
+            f" {best.outline_numbers:.0f} numbers of the outline and {best.depth_numbers:.0f} of"
+            f" the depth, in {best.cells:.0f} of 5120 cells; signal to noise"
+            f" {best.signal_to_noise:.0f}."
         ),
         f"The echoes stand {_margin(best)} the wall's own return.",
     ]
-    if found.hidden_share > 0 and not subject:
-        lines.insert(1, hidden_words(found.hidden_share))
+    if found.hidden_share > 0:
+        lines.insert(1, hidden_words(found.hidden_share, alone))
     if found.visible_share > 0:
         lines.append(
             f"The lidar sees {found.visible_share:.0%} of the object box directly: this forecast"
@@ -68,8 +72,28 @@ def words_of(found: Forecast, subject: str = "") -> list[str]:
     return lines
 
 
-def hidden_words(hidden_share: float) -> str:
-    """Return in words what becomes of objects that change no cell."""
+def _alone(found: Forecast, subject: str) -> str:
+    """Return the name of the one object that was asked for; empty for typical objects."""
+    return subject or ("the object" if found.objects == 1 else "")
+
+
+def _verdict(found: Forecast, alone: str) -> str:
+    """Return the verdict on typical objects, or on the one that is named."""
+    if found.hidden_share >= MOSTLY_HIDDEN:
+        return f"hides {alone or 'most objects'}"
+    gain = found.at().linear_iou - found.guess_iou
+    if gain >= USEFUL_SHARE * (1.0 - found.guess_iou):
+        return f"shows the shape of {alone}" if alone else "shows shapes"
+    return f"hardly shows more{f' of {alone}' if alone else ''} than a guess"
+
+
+def hidden_words(hidden_share: float, alone: str = "") -> str:
+    """Return in words what becomes of objects that change no cell, or of the one that is named."""
+    if alone:
+        return (
+            f'Without {alone} the maps would be the same: `live` says "nothing there", whatever'
+            " the weights."
+        )
     return (
         f"{hidden_share:.0%} of the test objects change no cell of the maps: `live` says"
         ' "nothing there" of them, whatever the weights.'
@@ -86,10 +110,10 @@ def table_of(found: Forecast) -> Table:
     frames = sorted({row.conditions.frames for row in found.expectations})
     head = (
         "object",
-        *(f"IoU, {n} frame{'s' if n > 1 else ''}" for n in frames),
+        *(f"IoU {n}" for n in frames),  # short: on 80 columns nothing may be cut
         "outline",
         "depth",
-        "error, mm",
+        "error mm",
         "cells",
     )
     rows: list[tuple[str, ...]] = []
@@ -112,18 +136,26 @@ def table_of(found: Forecast) -> Table:
 
 
 def change_words(found: Sequence[Change], count: int = 2) -> list[str]:
-    """Return the best changes, and the place worth most as a second one, in words."""
+    """Return the best changes, and the place worth most as a second one, in words; gains below
+    USEFUL_CHANGE_IOU are none.
+    """
+    least = f"{USEFUL_CHANGE_IOU:.2f}"
     lines = [
         f"{change.words}: IoU {change.gain_iou:+.2f}"
         for change in found[:count]
-        if change.gain_iou > 0
-    ] or ["No change tried would help: " + ", ".join(change.words for change in found[:count])]
-    seconds = [change for change in found if change.as_second_gain_iou is not None]
+        if change.gain_iou >= USEFUL_CHANGE_IOU
+    ] or [f"No change tried gains {least} or more: less is within the forecasts' scatter"]
+    seconds = [
+        (change.as_second_gain_iou, change.words)
+        for change in found
+        if change.as_second_gain_iou is not None
+    ]
     if seconds:
-        best = max(seconds, key=lambda change: change.as_second_gain_iou or 0.0)
-        lines.append(
-            f"As a second place beside this one: {best.words}: IoU {best.as_second_gain_iou:+.2f}"
-        )
+        gain_iou, words = max(seconds)
+        second = f"{words}: IoU {gain_iou:+.2f}"
+        if gain_iou < USEFUL_CHANGE_IOU:
+            second = f"none tried gains {least} or more"
+        lines.append(f"As a second place beside this one: {second}")
     return lines
 
 

@@ -1,10 +1,15 @@
 """Laws of `nlos-cam detect`: hands at a terminal, stored turns, wrong folders."""
 
+import json
+import signal
 from collections.abc import Callable
+from contextlib import nullcontext
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
+from made_benches import make_bench, wall_of
 from made_turns import made_plan, made_turns, patch_effect
 
 from nlos_cam.cli.detect import TerminalHands
@@ -42,6 +47,123 @@ def test_unfinished_session_is_no_detection(run: Run, tmp_path: Path) -> None:
 def test_wrong_folder_is_one_line_with_exit_code_4(run: Run, tmp_path: Path) -> None:
     answer = run("detect", tmp_path, code=4)
     assert "is not a detection" in answer.err
+
+
+def camera_at_a_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let every camera be one without frames, before a terminal whose stdin ends at once."""
+
+    class Camera(nullcontext[None]):
+        uri = "l515"
+        identity: dict[str, str] = {}  # noqa: RUF012
+        rig = None
+        intrinsics = wall_of().record.rig.pinhole
+
+        def __iter__(self) -> Any:
+            return iter(())
+
+    def end_of_stdin(*_: Any, **__: Any) -> None:
+        raise NlosCamError("stdin ended")
+
+    terminal = SimpleNamespace(isatty=lambda: True)
+    monkeypatch.setattr("nlos_cam.camera.open_camera", lambda *_, **__: Camera())
+    monkeypatch.setattr("nlos_cam.cli.detect.sys.stdin", terminal)
+    monkeypatch.setattr(TerminalHands, "place", end_of_stdin)
+
+
+@pytest.mark.parametrize("again", [True, False])
+def test_signal_after_the_last_turn_names_the_folder(
+    run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, again: bool
+) -> None:
+    folder = stored(tmp_path / "session")
+    camera_at_a_terminal(monkeypatch)
+
+    def interrupted(*_: Any, **__: Any) -> None:
+        signal.raise_signal(signal.SIGTERM)
+
+    monkeypatch.setattr("nlos_cam.detect.analyze", interrupted)
+
+    answer = run("detect", *([folder] if again else ["l515", "--out", folder]), code=130)
+
+    assert f"whole turns are in {folder}" in answer.err
+    assert "nothing" not in answer.err
+
+
+def test_unknown_power_is_null_and_said_in_words(
+    shown: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = stored(tmp_path / "session")
+    monkeypatch.setattr("nlos_cam.detect.analysis.smallest_in_noises", lambda *_: float("inf"))
+
+    line = shown("detect", folder, "--json").out.splitlines()[-1]
+    text = shown("detect", folder).out
+
+    found = json.loads(line, parse_constant=pytest.fail)
+    assert {each["smallest"] for each in found["findings"]} == {None}
+    assert "power was not determined" in text
+    page = (folder / "detection.html").read_text(encoding="utf-8")
+    assert "power was not determined" in page
+    assert "inf mm" not in page
+
+
+def test_wrong_number_of_turns_is_refused_in_one_line(run: Run, tmp_path: Path) -> None:
+    err = run("detect", "sim", "--turns", 10, "--out", tmp_path / "s", code=2).err
+
+    assert "error: turns must be a multiple of 4 (got 10)" in err
+    assert not (tmp_path / "s").exists()
+
+
+def test_refused_command_overwrites_no_session(run: Run, tmp_path: Path) -> None:
+    session = Session.start(tmp_path / "session", made_plan())
+
+    run("detect", "sim", "--turns", 10, "--out", session.folder, "--overwrite", code=2)
+
+    assert Session.open(session.folder).plan == session.plan
+
+
+def test_bench_folder_in_place_of_a_camera_names_bench(run: Run, tmp_path: Path) -> None:
+    make_bench(tmp_path / "bench")
+
+    err = run("detect", "bench", code=2).err
+
+    assert "`nlos-cam detect l515 --bench bench`" in err
+
+
+@pytest.mark.parametrize("words", [["l515", "--bench", "bench"], ["bench", "--camera", "l515"]])
+def test_new_session_keeps_the_name_of_its_bench(
+    run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, words: list[str]
+) -> None:
+    make_bench(tmp_path / "bench")
+    camera_at_a_terminal(monkeypatch)
+
+    assert "stdin ended" in run("detect", *words, "--out", "session", code=1).err
+
+    plan = Session.open(tmp_path / "session").plan
+    assert plan.rig is not None
+    assert plan.rig_option == "--bench bench"
+
+
+@pytest.mark.parametrize(
+    "ignored",
+    [
+        ["--wall", "wall.toml"],
+        ["--bench", "bench"],
+        ["--turns", "64"],
+        ["--frames", "2"],
+        ["--alpha", "0.05"],
+        ["--settings", "as-started"],
+        ["--control"],
+        ["--seed", "0"],
+        ["--out", "other"],
+    ],
+)
+def test_stored_turns_refuse_options_of_a_measurement(
+    run: Run, tmp_path: Path, ignored: list[str]
+) -> None:
+    Session.start(tmp_path / "session", made_plan())
+
+    err = run("detect", "session", *ignored, code=1).err
+
+    assert f"{ignored[0]} would have no effect" in err
 
 
 def test_recording_has_no_turns(run: Run) -> None:

@@ -1,7 +1,10 @@
 """`predict`: refusals in one line, and a bench folder in place of a rig."""
 
 import json
+from dataclasses import replace
+from itertools import product
 from pathlib import Path
+from typing import get_args
 
 import pytest
 from made_benches import make_bench
@@ -9,6 +12,8 @@ from nlos_calibration import dump_toml, load_rig
 
 from nlos_cam.bench import load_bench
 from nlos_cam.cli.main import main
+from nlos_cam.forecast import FRAMES, MATERIALS, Conditions, forecast
+from nlos_cam.render import Radiometry
 
 
 def test_predict_takes_a_rig_file_and_names_what_it_sees(
@@ -41,6 +46,54 @@ def test_predict_bench_takes_its_rig_and_an_object(
     assert found["rig_checksum"] == load_bench(folder).rig.checksum
     assert found["object"] == "cup"
     assert main(["predict", "--bench", "bench", "paper-rig", "cup"]) == 2
+
+
+@pytest.mark.parametrize("columns", [60, 80, 100])
+def test_predict_cuts_no_label_of_the_full_table(
+    columns: int,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("COLUMNS", str(columns))
+    quick = forecast(load_rig("paper-rig"), quick=True)
+    rows = [
+        replace(quick.at(), conditions=Conditions(frames, material, radiometry))
+        for frames, material, radiometry in product(FRAMES, MATERIALS, get_args(Radiometry))
+    ]
+    full = replace(quick, expectations=tuple(rows))
+    monkeypatch.setattr("nlos_cam.forecast.forecast", lambda *_, **__: full)
+    monkeypatch.setattr("nlos_cam.forecast.changes", lambda *_: [])
+
+    assert main(["predict", "paper-rig"]) == 0
+
+    shown = capsys.readouterr().out
+    assert "…" not in shown
+    for word in ("retroreflective,", "lambertian", "IoU 100", "outline", "error mm"):
+        assert word in shown
+
+
+@pytest.mark.parametrize(
+    ("wrong", "words"),
+    [
+        ("nowhere", "no bench folder nowhere"),
+        ("empty-folder", "empty-folder is not a bench folder"),
+    ],
+)
+def test_predict_bench_names_a_folder_that_is_none(
+    wrong: str,
+    words: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    (tmp_path / "empty-folder").mkdir()
+    monkeypatch.chdir(tmp_path)
+
+    assert main(["predict", "--bench", wrong, "--quick"]) == 4
+
+    assert words in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("wrong", ["nowhere.toml", "papper-rig", "bare-wall", "empty-folder"])

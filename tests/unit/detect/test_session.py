@@ -155,6 +155,25 @@ def test_folder_of_other_files_is_left_alone(tmp_path: Path) -> None:
         Session.start(tmp_path, made_plan())
 
 
+@pytest.mark.parametrize(
+    ("fields", "command"),
+    [
+        ({"camera": "l515", "rig_option": "--bench bench"}, "detect l515 --bench bench --turns"),
+        ({"camera": "l515"}, "detect l515 --wall wall.toml --turns"),
+        ({"camera": "sim"}, "detect sim --turns"),
+    ],
+)
+def test_page_names_the_option_that_named_the_rig(
+    tmp_path: Path, fields: dict[str, str], command: str
+) -> None:
+    plan = made_plan(rig=load_rig("paper-rig"), **fields)
+    analysis = analyze(plan, made_turns(plan), with_power=False)
+
+    write_report(analysis, tmp_path / "page.html")
+
+    assert f"nlos-cam {command}" in (tmp_path / "page.html").read_text(encoding="utf-8")
+
+
 def test_page_hides_the_serial_number_unless_asked(tmp_path: Path) -> None:
     plan = made_plan(camera="l515:F1234567", serial="F1234567")
     analysis = analyze(plan, made_turns(plan), with_power=False)

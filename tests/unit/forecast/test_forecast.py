@@ -1,13 +1,17 @@
 """Laws of a forecast: what more light, less noise and no light at all do to it."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from nlos_calibration import Rig, load_rig
 
 from nlos_cam.errors import SceneError
 from nlos_cam.forecast import (
+    Change,
     Forecast,
     Shape,
+    change_words,
     forecast,
     network_iou,
     shipped_prior,
@@ -50,6 +54,8 @@ def test_closed_gap_gives_the_priors_guess() -> None:
     assert found.at(100).linear_iou == found.guess_iou
     assert found.at(100).outline_numbers == pytest.approx(0, abs=1e-6)
     assert found.hidden_share == 1.0
+    # The words have the scale of the table: that of networks.
+    assert f"IoU {found.expected_iou:.2f}, which is a guess" in words_of(found)[1]
 
 
 def test_narrower_gap_never_hides_fewer_objects(home: Forecast) -> None:
@@ -69,6 +75,50 @@ def test_hidden_object_alone_is_said_to_be_hidden() -> None:
 
     assert (seen.hidden_share, hidden.hidden_share) == (0.0, 1.0)
     assert hidden.sees_nothing
+    assert "sees nothing of the disc" in words_of(hidden, "the disc")[0]
+
+
+def test_words_of_one_object_speak_of_no_others() -> None:
+    seen = forecast(HOME, quick=True, shape=disc())
+    hidden = replace(seen, hidden_share=1.0)
+
+    words = " ".join(words_of(hidden, "disc"))
+
+    assert "hides disc" in words
+    assert "Without disc the maps would be the same" in words
+    assert "most objects" not in words
+    assert "test objects" not in words
+    assert "typical" not in " ".join(words_of(seen))
+
+
+def test_verdict_on_a_round_object_agrees_with_its_figures() -> None:
+    # The figures of the cup on the wide rig: a guess is good, and the maps gain half of the rest.
+    own = forecast(HOME, quick=True, shape=disc())
+    rows = tuple(replace(row, linear_iou=0.88) for row in own.expectations)
+
+    first = words_of(replace(own, guess_iou=0.79, expectations=rows), "disc")[0]
+
+    assert "shows the shape of disc" in first
+    assert f"IoU {network_iou(0.88):.2f}" in first
+    assert f"a guess has {network_iou(0.79):.2f}" in first
+
+
+def test_verdict_where_maps_add_little_to_a_guess(home: Forecast) -> None:
+    little = [replace(row, linear_iou=home.guess_iou + 0.05) for row in home.expectations]
+
+    assert "shows shapes" in words_of(home)[0]
+    assert "hardly shows more than" in words_of(replace(home, expectations=tuple(little)))[0]
+
+
+def test_changes_below_the_scatter_are_no_advice() -> None:
+    large = Change("gap wider", HOME, 0.11, None)
+    small = Change("lidar nearer", HOME, 0.04, 0.03)
+
+    assert change_words([large]) == ["gap wider: IoU +0.11"]
+    words = " ".join(change_words([large, small]))
+    assert "lidar nearer" not in words
+    assert "second place beside this one: none" in words
+    assert "No change tried gains 0.05" in change_words([small])[0]
 
 
 def test_less_noise_determines_more() -> None:
