@@ -13,7 +13,8 @@ import numpy as np
 from nlos_cam.adapt.plan import Plan
 from nlos_cam.adapt.recordings import Transfer
 from nlos_cam.adapt.run import AFTER, NETWORK, REPORT, AdaptResult
-from nlos_cam.bench import FORECAST_SCATTER_IOU, ForecastRecord
+from nlos_cam.bench import ForecastRecord
+from nlos_cam.forecast import SCATTER_IOU
 from nlos_cam.report import (
     Banner,
     Commands,
@@ -86,7 +87,7 @@ def outlook(
     """Return in words what more minutes would bring, by the forecast where that is far, else by the
     learning curve.
     """
-    if expected_iou is not None and reached_iou < expected_iou - FORECAST_SCATTER_IOU:
+    if expected_iou is not None and reached_iou < expected_iou - SCATTER_IOU:
         return (
             f"The forecast for this bench is {expected_iou:.2f}: more minutes bring it nearer"
             f" ({plan.minutes:.0f} so far)."

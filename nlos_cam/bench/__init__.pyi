@@ -1,5 +1,4 @@
 __all__ = [
-    "FORECAST_SCATTER_IOU",
     "MAIN",
     "MANIFEST",
     "TEST_IOU",
@@ -24,7 +23,6 @@ __all__ = [
 from .edit import TEST_IOU, BenchEdit, check_new, edit_bench, write_file, write_weights
 from .folder import Bench, camera_to_name, load_bench
 from .record import (
-    FORECAST_SCATTER_IOU,
     MAIN,
     MANIFEST,
     WEIGHTS,

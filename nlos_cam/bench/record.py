@@ -49,10 +49,6 @@ class CameraRecord(Record):
     intrinsics: PinholeRecord
 
 
-FORECAST_SCATTER_IOU = 0.06
-"""Largest error of a forecast (docs/predict.md)."""
-
-
 class ForecastRecord(Record):
     """Forecast of a station, stored since it takes seconds that `live` does not have."""
 

@@ -9,7 +9,7 @@ from nlos_models import CheckpointRecord
 
 from nlos_cam.bench.edit import TEST_IOU
 from nlos_cam.bench.folder import Bench
-from nlos_cam.bench.record import FORECAST_SCATTER_IOU
+from nlos_cam.forecast import SCATTER_IOU
 from nlos_cam.reconstruct import WeightsVerdict, weights_serve
 
 
@@ -45,7 +45,7 @@ def weights_verdict(
     sentence = f"{served.sentence} (silhouette IoU {reached_iou:.2f} on the test objects"
 
     # weights of few minutes are the bench's own, and may still be poor
-    falls_short = expected_iou is not None and reached_iou < expected_iou - FORECAST_SCATTER_IOU
+    falls_short = expected_iou is not None and reached_iou < expected_iou - SCATTER_IOU
     if falls_short:
         sentence += (
             f", where {expected_iou:.2f} is expected: more --minutes of `nlos-cam adapt {folder}`"

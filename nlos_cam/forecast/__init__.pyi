@@ -6,6 +6,7 @@ __all__ = [
     "EFFECTS",
     "FRAMES",
     "MATERIALS",
+    "SCATTER_IOU",
     "Change",
     "ChosenBeams",
     "Conditions",
@@ -29,7 +30,7 @@ __all__ = [
 ]
 
 from .advice import Change, changes
-from .curve import network_iou
+from .curve import SCATTER_IOU, network_iou
 from .expectation import FRAMES, Conditions, Expectation, Forecast, forecast, shipped_basis
 from .linear import ACCURACY, BLACK, EFFECTS, MATERIALS, ChosenBeams, MaterialName, cut
 from .prior import Prior, Shape, fit_prior, shipped_prior
