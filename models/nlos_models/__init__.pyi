@@ -75,7 +75,8 @@ from .pipeline import (
     lift_edges,
     split_and_stack,
 )
-from .quality import GOOD_IOU, quality_features
+from .quality import GOOD_IOU
+from .quality_figures import quality_features
 from .records import (
     RECORD,
     RIG_WEIGHTS,

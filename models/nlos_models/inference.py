@@ -14,12 +14,8 @@ from nlos_cam.files import TENSOR_LIMIT, load_cached, read_checked
 from nlos_models import records
 from nlos_models.arrays import Float32
 from nlos_models.errors import CheckpointError, MissingExtraError, lacks_memory, require
-from nlos_models.quality import (
-    UNCERTAINTY_FILES,
-    QualityModel,
-    UncertaintyEstimate,
-    load_quality_model,
-)
+from nlos_models.quality import UNCERTAINTY_FILES, QualityModel, load_quality_model
+from nlos_models.quality_figures import UncertaintyEstimate
 
 MAP_SHAPE = (64, 80)
 NETWORK_INPUTS = {"depth_m": MAP_SHAPE, "intensity": MAP_SHAPE}

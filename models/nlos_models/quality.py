@@ -9,7 +9,7 @@ reconstructions of known objects by `train quality` (`uncertainty`).
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple, Self
+from typing import Self
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
@@ -17,6 +17,12 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from nlos_cam.files import TEXT_LIMIT, read_checked
 from nlos_models.arrays import Float32, Mask
 from nlos_models.errors import CheckpointError, first_problem
+from nlos_models.quality_figures import (
+    FEATURES,
+    WITH_SURFACE,
+    UncertaintyEstimate,
+    quality_features,
+)
 from nlos_models.records import UNCERTAINTY, UNCERTAINTY_RECORD, checksum_of_watched
 
 QUALITY = "quality.json"
@@ -28,11 +34,6 @@ frames.
 """
 LEVELS = 0.1, 0.5, 0.9
 """Quantiles of the predicted IoU."""
-OUTLINES = 0.1, 0.3, 0.5, 0.7, 0.9
-"""Probabilities of a surface whose outlines are compared with the image's."""
-FEATURES = 35
-WITH_SURFACE = 54
-"""Figures without and with the reconstructing network's own probability of a surface."""
 OUTPUTS = len(LEVELS) + 4
 """Logits of the IoU's quantiles, of a good outline on any shape and on one of the 18 kinds, and of
 such a kind; then the logarithm of the depth error. Older records have two fewer, and do not tell
@@ -42,19 +43,6 @@ KINDS_ODDS = 0.03
 read kinds into other shapes."""
 CLIP = 4.0
 """Limit of a normalised figure, in spreads: a strange frame is not extrapolated to."""
-
-
-class UncertaintyEstimate(NamedTuple):
-    """Calibrated uncertainty of n reconstructions."""
-
-    p_empty: Float32
-    """(n,): probability that nothing is hidden."""
-    p_out_of_distribution: Float32
-    """(n,): probability that the hidden object is unlike the training objects."""
-    error_v: Float32
-    """(n, 64, 64): expected absolute error in v, given a surface."""
-    p_surface: Float32
-    """(n, 64, 64): probability that there is a surface."""
 
 
 class QualityRecord(BaseModel):
@@ -150,114 +138,6 @@ class QualityModel:
 def normalised(figures: Float32, means: Float32, spreads: Float32) -> Float32:
     """Return figures (n, k) in spreads from the mean, clipped."""
     return ((figures - means) / spreads).clip(-CLIP, CLIP)
-
-
-def quality_features(
-    image: Float32, estimate: UncertaintyEstimate, surface: Float32 | None = None
-) -> Float32:
-    """Return the figures (n, FEATURES or WITH_SURFACE) that a quality is predicted from; all are
-    finite.
-
-    `surface` (n, 64, 64) is the reconstructing network's probability of a surface. Figures are the
-    same for the mirrored image. All sums over pixels are divided by the area of the image's
-    surface.
-    """
-    # All sums are over pixels of (n, 4096), divided by the area of the image's surface, so that a
-    # figure does not depend on how large the object is; the area itself is a figure.
-    mask = image > 0
-    m, v, error = (_flat(np.asarray(each, np.float32)) for each in (mask, image, estimate.error_v))
-    area = np.maximum(m.sum(1), 1.0)
-
-    def share(values: Float32) -> Float32:
-        return values.sum(1) / area
-
-    # Overlap first: the image against the probability of a surface from another network is the
-    # best single figure.
-    outline = _outline(m, p := _flat(estimate.p_surface), area)
-    found = [*outline[:2], area / 4096, np.log(area), np.sqrt(area), *outline[2:]]
-    mean = share(v)
-    found += [share(error * m), np.sqrt(share(error * error * m)), mean]
-    found += [np.sqrt(share((v - mean[:, None]) ** 2 * m))]
-    # Rim: number of changes between surface and background along both axes. Over the area's root
-    # it is a shape's roughness, over the area its thinness.
-    edges = [np.diff(mask, axis=axis).reshape(len(mask), -1).sum(1) for axis in (1, 2)]
-    rim = np.float32(edges[0] + edges[1])
-    found += [rim / np.sqrt(area), rim / area, *_slopes(image, mask, area), *_place(mask, area)]
-    found += [_logit(estimate.p_out_of_distribution), _logit(estimate.p_empty)]
-    if surface is not None:
-        own = _flat(surface)
-        apart = np.abs(_flat(surface) - p)
-        # Sum p^2 / sum p is 1 for probabilities of 0 and 1, and p for a constant p: how decided
-        # the reconstructing network is.
-        sharp = share(own**2) / np.maximum(share(own), 1e-4)
-        found += [*_outline(m, own, area), share(apart), share(apart * m), sharp]
-    return np.stack(found, 1).astype(np.float32)
-
-
-def _outline(m: Float32, p: Float32, area: Float32) -> list[Float32]:
-    """Return how an image's surface (n, 4096) fits probabilities of one: expected overlap, and
-    outlines compared.
-    """
-    # Intersection over union with p in place of the truth: (sum of p inside) / (area + sum of p
-    # outside), all over the area.
-    inside = (p * m).sum(1) / area
-    beside = (p * (1 - m)).sum(1) / area
-    unsure = p * (1 - p)
-    overlap = inside / (1 + beside)
-    found = [
-        overlap,
-        _logit(overlap),
-        inside,
-        beside,
-        unsure.sum(1) / area,
-        (unsure * m).sum(1) / area,
-    ]
-    for level in OUTLINES:
-        above = (p > level).astype(np.float32)
-        joint = (above * m).sum(1)
-        size = above.sum(1)
-        found += [joint / np.maximum(size + m.sum(1) - joint, 1.0), size / area]
-    return found
-
-
-def _flat(images: Float32) -> Float32:
-    return images.reshape(len(images), -1)
-
-
-def _slopes(image: Float32, mask: Mask, area: Float32) -> list[Float32]:
-    """Return the mean depth step between neighbours that are both surface, down and across."""
-    down = np.abs(np.diff(image, axis=1)) * (mask[:, 1:] & mask[:, :-1])
-    across = np.abs(np.diff(image, axis=2)) * (mask[:, :, 1:] & mask[:, :, :-1])
-    return [_flat(step).sum(1) / area for step in (down, across)]
-
-
-def _place(mask: Mask, area: Float32) -> list[Float32]:
-    """Return place and extent of the surface: distance from the rig's plane of symmetry, column,
-    spreads, fill.
-    """
-    pixels = np.arange(mask.shape[1], dtype=np.float32)
-    # Moments of the silhouette. The row's distance from the middle, not the row: the figures of a
-    # mirrored frame must be the same.
-    rows, columns = (mask.sum(axis).astype(np.float32) for axis in (2, 1))
-    row = (rows @ pixels) / area
-    column = (columns @ pixels) / area
-    high = np.sqrt(np.maximum((rows @ pixels**2) / area - row**2, 0.0))
-    wide = np.sqrt(np.maximum((columns @ pixels**2) / area - column**2, 0.0))
-    middle = (mask.shape[1] - 1) / 2
-    return [
-        np.abs(row - middle),
-        column,
-        high,
-        wide,
-        high / np.maximum(wide, 1.0),
-        area / np.maximum(high * wide, 1.0),
-    ]
-
-
-def _logit(p: Float32) -> Float32:
-    # A linear layer sees 0.99 and 0.9999 as the same; their logits differ.
-    inner = p.clip(1e-4, 1 - 1e-4)
-    return np.log(inner / (1 - inner)).astype(np.float32)
 
 
 def _sigmoid(x: Float32) -> Float32:

@@ -236,57 +236,104 @@ class Posterior:
     """(GRID, GRID); share of the box's depth."""
 
 
+@dataclass(frozen=True)
+class LinearMaps:
+    """Linear model of averaged maps: rates of k cells' intensity and path, each in units of its own
+    noise.
+    """
+
+    light_by_outline: Float64
+    """(k, GRID^2); rate of the intensity by the outline."""
+    light_by_depth: Float64
+    """(k, GRID^2); rate of the intensity by the depth, as a share of the box's."""
+    path_by_depth: Float64
+    """(k, GRID^2); rate of the path by the same."""
+
+    @classmethod
+    def of(cls, echoes: Echoes, frames: int) -> Self:
+        """Return the model of echoes after averaging frames; cells without a noise are left out."""
+        light_noise, path_noise_m = echoes.scaled_noise(frames)
+        known = np.isfinite(light_noise)
+        light_noise = light_noise[known, None]
+        path_noise_m = path_noise_m[known, None]
+        return cls(
+            echoes.by_outline[known] / light_noise,
+            echoes.by_depth[known] / light_noise,
+            echoes.path_by_depth[known] / path_noise_m,
+        )
+
+    def in_basis(self, basis: Basis) -> Float64:
+        """Return the rates (2 k, OUTLINES + DEPTHS) by a basis's numbers, intensities first."""
+        path_by_outline = np.zeros((len(self.path_by_depth), basis.outline.shape[1]))
+        light = np.hstack(
+            [self.light_by_outline @ basis.outline, self.light_by_depth @ basis.depth]
+        )
+        path = np.hstack([path_by_outline, self.path_by_depth @ basis.depth])
+        return np.vstack([light, path])
+
+    def measure(self, outline_residual: Float64, depth_residual: Float64, seed: int) -> Float64:
+        """Return a simulated measurement (2 k,), with noise of deviation 1, of an object whose
+        outline and depth, both (GRID^2,), are off the prior's means by the residuals.
+        """
+        light = self.light_by_outline @ outline_residual + self.light_by_depth @ depth_residual
+        expected = np.concatenate([light, self.path_by_depth @ depth_residual])
+        return expected + np.random.default_rng(seed).standard_normal(len(expected))
+
+
 def posterior(basis: Basis, shape: Shape, echoes: Echoes, frames: int, seed: int) -> Posterior:
     """Return the posterior of an object from noisy linear maps of it."""
-    count = basis.outline.shape[1]
-    truth = shape.outline.ravel().astype(np.float64)
-    depth = shape.depth.ravel()
-    fine = depth - basis.mean_depth
-    fine = fine - basis.depth @ (basis.depth.T @ fine)
-    light_noise, path_noise = echoes.scaled_noise(frames)
-    kept = np.isfinite(light_noise)
-    light_noise = light_noise[kept]
-    path_noise = path_noise[kept]
-    by_outline = echoes.by_outline[kept] / light_noise[:, None]
-    by_depth = echoes.by_depth[kept] / light_noise[:, None]
-    by_path = echoes.path_by_depth[kept] / path_noise[:, None]
-    nothing = np.zeros((by_path.shape[0], count))
-    # One row for each cell's intensity and one for its path, in units of their noise.
-    rates = np.vstack(
-        [
-            np.hstack([by_outline @ basis.outline, by_depth @ basis.depth]),
-            np.hstack([nothing, by_path @ basis.depth]),
-        ]
-    )
-    off = truth - basis.mean_outline
     # Relief too fine for the basis is taken as known: about it, steps of centimeters are no small
     # changes, and the linear model says nothing.
-    deeper = depth - fine - basis.mean_depth
-    noise = np.random.default_rng(seed).standard_normal(len(rates))
-    sensed = np.concatenate([by_outline @ off + by_depth @ deeper, by_path @ deeper]) + noise
+    depth = shape.depth.ravel()  # (GRID^2,)
+    depth_off_mean = depth - basis.mean_depth
+    fine_relief = depth_off_mean - basis.depth @ (basis.depth.T @ depth_off_mean)
+    outline_residual = shape.outline.ravel() - basis.mean_outline  # (GRID^2,)
+    depth_residual = depth - fine_relief - basis.mean_depth
 
-    information = rates.T @ rates
-    covariance: Float64 = np.linalg.inv(information + basis.precision).astype(np.float64)
-    found = covariance @ (rates.T @ sensed)
-    outline = basis.mean_outline + basis.outline @ found[:count]
-    depth_found = basis.mean_depth + basis.depth @ found[count:]
-    inside = cut(outline)
-    seen = truth > 0
-    both = inside & seen if (inside & seen).any() else seen
-    # trace(I - C^-1 P) of a block: how far the posterior P is below the prior C.
-    numbers: list[float] = []
-    for block in (slice(None, count), slice(count, None)):
-        left = np.linalg.solve(basis.covariance[block, block], covariance[block, block])
-        numbers.append(float(len(left) - np.trace(left)))
-    rmse = float(np.sqrt(np.mean((depth_found + fine - depth)[both] ** 2))) if both.any() else 0.0
+    maps = LinearMaps.of(echoes, frames)
+    rates = maps.in_basis(basis)  # (2 k, OUTLINES + DEPTHS)
+    measured = maps.measure(outline_residual, depth_residual, seed)  # (2 k,)
+
+    # Bayes for a linear model with Gaussian prior and noise of deviation 1: the precisions add.
+    covariance: Float64 = np.linalg.inv(rates.T @ rates + basis.precision).astype(np.float64)
+    coefficients = covariance @ (rates.T @ measured)  # (OUTLINES + DEPTHS,)
+    count = basis.outline.shape[1]
+    outlines = slice(None, count)
+    depths = slice(count, None)
+    outline = basis.mean_outline + basis.outline @ coefficients[outlines]
+    depth_found = basis.mean_depth + basis.depth @ coefficients[depths] + fine_relief
+    iou, depth_rmse = _score(cut(outline), depth_found, shape)
     return Posterior(
-        float((inside & seen).sum() / max((inside | seen).sum(), 1)),
-        rmse,
-        numbers[0],
-        numbers[1],
-        _deviation(basis.outline, covariance[:count, :count]),
-        _deviation(basis.depth, covariance[count:, count:]),
+        iou,
+        depth_rmse,
+        _numbers_beyond(basis.covariance[outlines, outlines], covariance[outlines, outlines]),
+        _numbers_beyond(basis.covariance[depths, depths], covariance[depths, depths]),
+        _deviation(basis.outline, covariance[outlines, outlines]),
+        _deviation(basis.depth, covariance[depths, depths]),
     )
+
+
+def _score(inside: Mask, depth: Float64, shape: Shape) -> tuple[float, float]:
+    """Return `iou` and `depth_rmse` of a `Posterior`: those of an estimated outline and depth, both
+    (GRID^2,).
+    """
+    truly_inside = shape.outline.ravel()
+    shared = inside & truly_inside
+    iou = shared.sum() / max((inside | truly_inside).sum(), 1)
+    compared = shared if shared.any() else truly_inside
+    if not compared.any():
+        return float(iou), 0.0
+    error = (depth - shape.depth.ravel())[compared]
+    return float(iou), float(np.sqrt(np.mean(error**2)))
+
+
+def _numbers_beyond(prior: Float64, found: Float64) -> float:
+    """Return the count of numbers that maps determine beyond a prior, by both covariances (n, n).
+
+    trace(I - C^-1 P): how far the posterior P is below the prior C.
+    """
+    left = np.linalg.solve(prior, found)
+    return float(len(left) - np.trace(left))
 
 
 def cut(outline: Float64) -> Mask:

@@ -163,34 +163,49 @@ class MapAlignment:
         `beyond_wall_m` (64, 80) are the depths less those of the bare wall, where they are known
         better than from `maps`: without drift.
         """
-        # Interpolate the path beyond the wall's own, and the logarithm of the light's ratio to the
-        # wall's: the wall's slope, reflectance and a constant range error are in neither.
+        # The path beyond the wall's own, and the logarithm of the light's ratio to the wall's: the
+        # wall's slope, reflectance and a constant range error are in neither.
         beyond_m = maps.depth_m - self._wall_m if beyond_wall_m is None else beyond_wall_m
-        path_m = beyond_m * self._path_per_depth  # (64, 80)
-        ratio = np.log(np.maximum(maps.intensity, MIN_COUNTS)) - self._log_light  # (64, 80)
+        cell_beyond_m = beyond_m * self._path_per_depth  # (64, 80), cells of the bench
+        cell_log_ratio = np.log(np.maximum(maps.intensity, MIN_COUNTS)) - self._log_light
 
-        rows, columns = self._neighbors.around
+        # (n,) from here on: cells of the training rig that see the wall, still from the bench.
+        spot_beyond_m, spot_log_ratio = self._interpolate(cell_beyond_m, cell_log_ratio)
+        with np.errstate(invalid="ignore"):
+            of_wall = np.abs(spot_beyond_m) < THREE_BOUNCES_M
+
+        # As from the training rig's lidar: echoes over three bounces change, the wall's do not.
+        trained_beyond_m = np.where(of_wall, spot_beyond_m, spot_beyond_m + self._longer_m)
+        trained_log_ratio = np.where(of_wall, spot_log_ratio, spot_log_ratio + self._log_brighter)
+        log_gain = _log_gain(spot_log_ratio, of_wall)
+        return self._maps_of(trained_beyond_m, trained_log_ratio - log_gain)
+
+    def _interpolate(self, beyond_m: Float64, log_ratio: Float64) -> tuple[Float64, Float64]:
+        """Return paths beyond the wall's in m and logarithms of the light's ratio to the wall's at
+        the training rig's cells, both (n,), from those of the bench's cells, both (64, 80).
+        """
+        around = self._neighbors.around
+        nearest = self._neighbors.nearest
         shares = self._neighbors.shares
-        row, column = self._neighbors.nearest
-        paths_m = path_m[rows, columns]  # (4, n)
+        around_m = beyond_m[around]  # (4, n)
         with np.errstate(invalid="ignore"):
             # Between cells of different echoes a mean would be an echo that nothing returned:
             # there the nearest cell counts. NaN (no return) compares false and does the same.
-            same = paths_m.max(0) - paths_m.min(0) < SAME_ECHO_M
-            path_m = np.where(same, (shares * paths_m).sum(0), path_m[row, column])
-            ratio = np.where(same, (shares * ratio[rows, columns]).sum(0), ratio[row, column])
-            of_wall = np.abs(path_m) < THREE_BOUNCES_M
+            one_echo = around_m.max(0) - around_m.min(0) < SAME_ECHO_M
+            return (
+                np.where(one_echo, (shares * around_m).sum(0), beyond_m[nearest]),
+                np.where(one_echo, (shares * log_ratio[around]).sum(0), log_ratio[nearest]),
+            )
 
-        # The cells of the bare wall give the gain of the frame: their ratio should be 1.
-        gain = np.median(ratio[of_wall]) if of_wall.any() else 0.0
-        path_m = self._wall_path_m + np.where(of_wall, path_m, path_m + self._longer_m)
-        ratio = np.where(of_wall, ratio, ratio + self._log_brighter)
-
+    def _maps_of(self, beyond_m: Float64, log_ratio: Float64) -> LidarMaps:
+        """Return the training rig's maps with the given paths beyond the wall's in m and logarithms
+        of the light's ratio to the wall's, both (n,), in its cells that see the wall.
+        """
         # Cells that see no wall in training (but the occluder) keep the training rig's own value.
-        depth_m = self._depth_m.copy()
+        depth_m = self._depth_m.copy()  # (64 * 80,)
         light = self._light.copy()
-        depth_m[self._cells] = path_m * self._half_cos
-        light[self._cells] *= np.exp(ratio - gain)
+        depth_m[self._cells] = (self._wall_path_m + beyond_m) * self._half_cos
+        light[self._cells] *= np.exp(log_ratio)
         depth_m = depth_m.reshape(SHAPE)
         light = light.reshape(SHAPE)
         if self._numbers is not None:
@@ -199,6 +214,13 @@ class MapAlignment:
             light[:, NUMBERS_COLUMN] = 0.0
         valid = np.isfinite(depth_m)
         return LidarMaps(depth_m, np.where(valid, light, np.float32(0)), valid)
+
+
+def _log_gain(log_ratio: Float64, of_wall: Mask) -> float:
+    """Return the logarithm of the frame's gain: where cells (n,) see the bare wall, the light's
+    ratio to the wall's should be 1. 0 where none does.
+    """
+    return float(np.median(log_ratio[of_wall])) if of_wall.any() else 0.0
 
 
 def alignment(

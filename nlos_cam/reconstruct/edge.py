@@ -6,10 +6,11 @@ than an object moves any, and networks answer them with nonsense. What they ough
 occluder's cell tells nothing, and a wall's cell much what its neighbors tell.
 """
 
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import lru_cache
 from itertools import product
-from typing import NamedTuple
+from typing import Literal, NamedTuple, Self
 
 import numpy as np
 from nlos_calibration import Rig
@@ -99,13 +100,151 @@ def _occluded(rig: Rig, beams_per_cell: int) -> Mask:
 
 
 class Surface(NamedTuple):
-    """Wall or occluder as a bench's record has it, and the cells (64, 80) at the edge that see it."""
+    """Wall or occluder as a bench's record has it, and the cells that see it."""
 
     depth_m: Float64
     """(64, 80); along the optical axis."""
     light: Float64
     """(64, 80); in units of the renderer's."""
     cells: Mask
+    """(64, 80); cells that see it at the edge."""
+    apart: Mask
+    """(64, 80); cells that see it away from the edge, by which the units of its light are found."""
+
+
+Reason = Literal["other surface", "echoes end", "light of both"]
+
+
+class Fault(NamedTuple):
+    """Column of a surface's cells that the edge is in, against the record."""
+
+    column: int
+    surface: Surface
+    reason: Reason
+    """Cells see the other surface; or their echoes end, as where half of a cell sees the occluder;
+    or their light is of both surfaces."""
+
+
+class Edge(NamedTuple):
+    """Occluder's edge in the maps of a bench, by its record."""
+
+    wall: Surface
+    occluder: Surface
+    step: int
+    """Direction from the wall to the occluder along a row of the maps: 1 or -1 columns."""
+    columns: list[int]
+    """Columns that the edge can pass, from the wall to the occluder. Repaired in this order, the
+    wall's cells of a column go on from the two columns before it, `column - step` and
+    `column - 2 * step`; columns without two before them are left out."""
+
+    @classmethod
+    def of(cls, bench: CalibratedRig) -> Self | None:
+        """Return the edge of a bench; None where its maps have none."""
+        rig = bench.rig
+        band = edge_cells(rig, REACH_M, REACH_DEG)
+        if not band.any():
+            return None
+        occluded = _occluded(rig, 1)[:, :, 0]
+        every = np.arange(MAP_COLUMNS)
+        wall_at, occluder_at = (
+            (mask.sum(0) @ every) / max(mask.sum(), 1) for mask in (~occluded, occluded)
+        )
+        step = 1 if occluder_at > wall_at else -1
+        columns = np.flatnonzero(band.any(0))[::step].tolist()
+        return cls(
+            _surface(_bare(rig.model_copy(update={"occluder": None})), bench, band, ~occluded),
+            _surface(_bare(rig), bench, band, occluded),
+            step,
+            [each for each in columns if 0 <= each - 2 * step < MAP_COLUMNS],
+        )
+
+    def columns_of(self, surface: Surface) -> list[int]:
+        """Return the columns at the edge that have cells of a surface."""
+        return [column for column in self.columns if surface.cells[:, column].any()]
+
+    def faults(
+        self, maps: LidarMaps, wall_gain: float | None, occluder_gain: float | None
+    ) -> list[Fault]:
+        """Return the faults of maps in the order of `columns`.
+
+        Gains are counts for a unit of a surface's light, None where they are not known: then a
+        column's light is not judged.
+        """
+        found: list[Fault] = []
+        for column in self.columns:
+            for surface, gain in ((self.occluder, occluder_gain), (self.wall, wall_gain)):
+                if reason := self._reason(maps, surface, gain, column):
+                    found.append(Fault(column, surface, reason))
+        return found
+
+    def is_elsewhere(self, faults: Sequence[Fault]) -> bool:
+        """Return True if a surface has faults in all its columns: not a little off, but another
+        bench, or one without its occluder.
+        """
+        for surface in (self.wall, self.occluder):
+            off = [fault.column for fault in faults if fault.surface is surface]
+            if off and off == self.columns_of(surface):
+                return True
+        return False
+
+    def restore_occluder(self, maps: LidarMaps, column: int, gain: float) -> None:
+        """Write the occluder's own depth and light into its cells of a column, in place."""
+        rows = self.occluder.cells[:, column]
+        maps.depth_m[rows, column] = self.occluder.depth_m[rows, column]
+        maps.intensity[rows, column] = gain * self.occluder.light[rows, column]
+        maps.valid[rows, column] = True
+
+    def extend_wall(self, maps: LidarMaps, column: int) -> None:
+        """Continue the two columns before into the wall's cells of a column, in place: depth by a
+        share of their difference, light by one of its logarithm's.
+        """
+        rows = self.wall.cells[:, column]
+        before = column - self.step
+        earlier = column - 2 * self.step
+        last_m = maps.depth_m[rows, before]
+        maps.depth_m[rows, column] = last_m + SLOPE * (last_m - maps.depth_m[rows, earlier])
+        last = maps.intensity[rows, before]
+        brighter = last / np.maximum(maps.intensity[rows, earlier], 1)
+        known = maps.valid[rows, before] & maps.valid[rows, earlier]
+        counts = np.minimum(last * brighter**SLOPE, SATURATED)
+        maps.intensity[rows, column] = np.where(known, counts, 0)
+        maps.valid[rows, column] = known
+
+    def _reason(
+        self, maps: LidarMaps, surface: Surface, gain: float | None, column: int
+    ) -> Reason | None:
+        """Return the reason why the edge is within a column of a surface's cells; None where it is
+        not.
+        """
+        rows = surface.cells[:, column] & maps.valid[:, column] & (surface.light[:, column] > 0)
+        if not rows.any():
+            return None
+        beyond_m = maps.depth_m[rows, column] - surface.depth_m[rows, column]
+        # an echo's path is longer than the wall's, so only nearer cells see the occluder
+        off_m = -beyond_m if surface is self.wall else np.abs(beyond_m)
+        if (off_m > OTHER_SURFACE_M).mean() > OTHER_CELLS:
+            return "other surface"
+        if surface is self.wall and self._falls_back(maps, column):
+            return "echoes end"
+
+        same = np.abs(beyond_m) < OFF_WALL_M
+        if gain is None or same.sum() < MIN_CELLS:
+            return None
+        expected = gain * surface.light[rows, column][same]
+        log_ratio = np.log((maps.intensity[rows, column][same] + 1) / (expected + 1))
+        return "light of both" if abs(float(np.median(log_ratio))) > OTHER_LIGHT else None
+
+    def _falls_back(self, maps: LidarMaps, column: int) -> bool:
+        """Return True if echoes end at a column of the wall, as where half of each cell sees the
+        occluder.
+        """
+        pair = [column - self.step, column]
+        rows = self.wall.cells[:, column] & maps.valid[:, pair].all(1)
+        if rows.sum() < MIN_CELLS:
+            return False
+        beyond_m = maps.depth_m[rows][:, pair] - self.wall.depth_m[rows][:, pair]
+        falling = beyond_m[:, 1] < beyond_m[:, 0] - FALL_M
+        return float(falling.mean()) > FALLING_CELLS
 
 
 class EdgeRepair:
@@ -117,104 +256,33 @@ class EdgeRepair:
     """
 
     def __init__(self, bench: CalibratedRig) -> None:
-        rig = bench.rig
-        band = edge_cells(rig, REACH_M, REACH_DEG)
-        self._sheet: Surface | None = None
-        if not band.any():
-            return
-        alone = rig.model_copy(update={"occluder": None})
-        occluded = _occluded(rig, 1)[:, :, 0]
-        self._wall = _surface(_bare(alone), bench, band & ~occluded)
-        self._sheet = _surface(_bare(rig), bench, band & occluded)
-        self._apart = ~band & ~occluded, ~band & occluded
-        """Cells of the wall, and of the occluder, by which the units of their light are found."""
-        columns = np.arange(MAP_COLUMNS)
-        sides = [(mask.sum(0) @ columns) / max(mask.sum(), 1) for mask in (occluded, ~occluded)]
-        self._step = 1 if sides[0] > sides[1] else -1
-        """From the wall to the occluder, in columns."""
-        columns = np.flatnonzero(band.any(0))[:: self._step].tolist()
-        # a wall's column goes on from two others
-        self._columns = [each for each in columns if 0 <= each - 2 * self._step < MAP_COLUMNS]
+        self._edge = Edge.of(bench)
+        """None for a bench without an occluder's edge in its maps, which are never repaired."""
 
     def repair(self, maps: LidarMaps) -> LidarMaps:
-        """Return maps (64, 80), with the range offset corrected, as the record's edge gives them."""
-        sheet = self._sheet
-        if sheet is None:
+        """Return maps (64, 80), their range offset corrected, as the record's edge gives them."""
+        edge = self._edge
+        if edge is None:
             return maps
-        wall_gain = _gain(maps, self._wall, self._apart[0], OFF_WALL_M)
+        wall_gain = _gain(maps, edge.wall, OFF_WALL_M)
         # of its own: no record says how dark an occluder is
-        sheet_gain = _gain(maps, sheet, self._apart[1], OTHER_SURFACE_M)
-        of_wall = self._off(maps, self._wall, wall_gain)
-        of_sheet = self._off(maps, sheet, sheet_gain)
-        if not of_wall and not of_sheet:
+        occluder_gain = _gain(maps, edge.occluder, OTHER_SURFACE_M)
+        faults = edge.faults(maps, wall_gain, occluder_gain)
+        if not faults or edge.is_elsewhere(faults):
             return maps
-        for surface, off in ((self._wall, of_wall), (sheet, of_sheet)):
-            if off and off == self._columns_of(surface):
-                return maps  # not a little off: another bench, or one without its occluder
 
-        depth_m = maps.depth_m.copy()
-        intensity = maps.intensity.copy()
-        valid = maps.valid.copy()
-        for column in self._columns:
-            if column in of_sheet and sheet_gain is not None:
-                rows = sheet.cells[:, column]
-                depth_m[rows, column] = sheet.depth_m[rows, column]
-                intensity[rows, column] = sheet_gain * sheet.light[rows, column]
-                valid[rows, column] = True
-            if column in of_wall:
-                rows = self._wall.cells[:, column]
-                before, earlier = (column - self._step * back for back in (1, 2))
-                last_m = depth_m[rows, before]
-                depth_m[rows, column] = last_m + SLOPE * (last_m - depth_m[rows, earlier])
-                last = intensity[rows, before]
-                brighter = last / np.maximum(intensity[rows, earlier], 1)
-                known = valid[rows, before] & valid[rows, earlier]
-                counts = np.minimum(last * brighter**SLOPE, SATURATED)
-                intensity[rows, column] = np.where(known, counts, 0)
-                valid[rows, column] = known
-        return replace(maps, depth_m=depth_m, intensity=intensity, valid=valid)
-
-    def _columns_of(self, surface: Surface) -> list[int]:
-        """Return the columns at the edge that have cells of a surface."""
-        return [column for column in self._columns if surface.cells[:, column].any()]
-
-    def _off(self, maps: LidarMaps, surface: Surface, gain: float | None) -> list[int]:
-        """Return the columns of a surface's cells that the edge is in."""
-        columns = self._columns_of(surface)
-        return [each for each in columns if self._is_off(maps, surface, gain, each)]
-
-    def _is_off(self, maps: LidarMaps, surface: Surface, gain: float | None, column: int) -> bool:
-        """Return True if the edge is within a column of a surface's cells."""
-        rows = surface.cells[:, column] & maps.valid[:, column] & (surface.light[:, column] > 0)
-        if not rows.any():
-            return False
-        beyond_m = maps.depth_m[rows, column] - surface.depth_m[rows, column]
-        # an echo's path is longer than the wall's, so only nearer cells see the occluder
-        other = beyond_m < -OTHER_SURFACE_M
-        if surface is self._sheet:
-            other = np.abs(beyond_m) > OTHER_SURFACE_M
-        if other.mean() > OTHER_CELLS:
-            return True
-        if surface is self._wall and self._falls_back(maps, column):
-            return True
-        same = np.abs(beyond_m) < OFF_WALL_M
-        if gain is None or same.sum() < MIN_CELLS:
-            return False
-        expected = gain * surface.light[rows, column][same]
-        off = np.log((maps.intensity[rows, column][same] + 1) / (expected + 1))
-        return abs(float(np.median(off))) > OTHER_LIGHT
-
-    def _falls_back(self, maps: LidarMaps, column: int) -> bool:
-        """Return True if echoes end at a column of the wall, as where half of each cell sees the
-        occluder.
-        """
-        pair = [column - self._step, column]
-        rows = self._wall.cells[:, column] & maps.valid[:, pair].all(1)
-        if rows.sum() < MIN_CELLS:
-            return False
-        beyond_m = maps.depth_m[rows][:, pair] - self._wall.depth_m[rows][:, pair]
-        falling = beyond_m[:, 1] < beyond_m[:, 0] - FALL_M
-        return float(falling.mean()) > FALLING_CELLS
+        repaired = replace(
+            maps,
+            depth_m=maps.depth_m.copy(),
+            intensity=maps.intensity.copy(),
+            valid=maps.valid.copy(),
+        )
+        for fault in faults:
+            if fault.surface is edge.wall:
+                edge.extend_wall(repaired, fault.column)
+            elif occluder_gain is not None:  # else its light is not known
+                edge.restore_occluder(repaired, fault.column, occluder_gain)
+        return repaired
 
 
 def _bare(rig: Rig) -> Rendering:
@@ -222,20 +290,22 @@ def _bare(rig: Rig) -> Rendering:
     return bare_rendering(rig)  # pyright: ignore[reportArgumentType]  hashable
 
 
-def _gain(maps: LidarMaps, surface: Surface, cells: Mask, within_m: float) -> float | None:
-    """Return a frame's counts for each unit of a surface's light, by the cells whose depth is
-    within a limit of it; None where they are too few.
+def _gain(maps: LidarMaps, surface: Surface, within_m: float) -> float | None:
+    """Return a frame's counts for each unit of a surface's light, by the cells away from the edge
+    whose depth is within a limit of it; None where they are too few.
     """
-    seen = cells & maps.valid & (surface.light > 0)
+    seen = surface.apart & maps.valid & (surface.light > 0)
     seen &= np.abs(maps.depth_m - surface.depth_m) < within_m
     if seen.sum() < MIN_WALL_CELLS:
         return None
     return float(np.median(maps.intensity[seen] / surface.light[seen]))
 
 
-def _surface(rendering: Rendering, bench: CalibratedRig, cells: Mask) -> Surface:
-    """Return a surface as it was measured, else as rendered; `cells` (64, 80) see it."""
-    seen = rendering.depth_m.astype(np.float64), rendering.intensity.astype(np.float64)
+def _surface(rendering: Rendering, bench: CalibratedRig, band: Mask, sees: Mask) -> Surface:
+    """Return a surface as it was measured, else as rendered; `band` (64, 80) are the cells at the
+    edge, and `sees` (64, 80) those that see the surface.
+    """
+    depth_and_light = rendering.depth_m.astype(np.float64), rendering.intensity.astype(np.float64)
     if bench.reference is not None:
-        seen = as_measured(*seen, bench.reference, bench.range_offset_m)
-    return Surface(*seen, cells)
+        depth_and_light = as_measured(*depth_and_light, bench.reference, bench.range_offset_m)
+    return Surface(*depth_and_light, cells=band & sees, apart=~band & sees)

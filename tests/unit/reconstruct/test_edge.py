@@ -22,6 +22,7 @@ from nlos_cam.reconstruct import (
     load_networks,
     reconstruct,
 )
+from nlos_cam.reconstruct.edge import Edge
 from nlos_cam.render import Scene, SceneFile, SensorModel, render
 
 HOME = load_rig("paper-rig")
@@ -50,6 +51,11 @@ def objects() -> list[BenchmarkObject]:
 def maps_of(objects: list[BenchmarkObject], rig: Rig) -> list[LidarMaps]:
     """Return the maps of each object, with the sensor's noise."""
     return sense(echoes_of(objects, rig, lambda _done, _of: None), rig)
+
+
+def flipped(maps: LidarMaps) -> LidarMaps:
+    """Return maps with their columns in the other order."""
+    return LidarMaps(maps.depth_m[:, ::-1], maps.intensity[:, ::-1], maps.valid[:, ::-1])
 
 
 def mean_iou(objects: list[BenchmarkObject], maps: list[LidarMaps]) -> float:
@@ -129,6 +135,36 @@ def test_black_occluder_is_repaired_as_black(objects: list[BenchmarkObject]) -> 
     assert edge.repair(black).intensity[filled].max() == pytest.approx(
         edge.repair(maps).intensity[filled].max() / 10, rel=0.05
     )
+
+
+def test_faults_run_from_the_wall_to_the_occluder(objects: list[BenchmarkObject]) -> None:
+    edge = Edge.of(CalibratedRig(HOME))
+    assert edge is not None
+    (maps,) = maps_of(objects[:1], off_record(yaw_deg=-0.5))
+
+    faults = edge.faults(maps, None, None)
+
+    columns = [fault.column for fault in faults]
+    assert columns == sorted(columns, key=edge.columns.index)
+    assert {fault.reason for fault in faults} == {"other surface"}  # no gain, no light to judge
+    assert not edge.is_elsewhere(faults)
+
+
+@pytest.mark.parametrize("off", OFF_RECORD.values(), ids=OFF_RECORD.keys())
+def test_mirrored_maps_are_repaired_as_their_mirror_image(
+    off: dict[str, float], objects: list[BenchmarkObject]
+) -> None:
+    lens = HOME.intrinsics
+    turned = lens.model_copy(update={"fx": -lens.fx, "ppx": lens.width - 1 - lens.ppx})
+    mirrored = HOME.model_copy(update={"intrinsics": turned})
+    (maps,) = maps_of(objects[:1], off_record(**off))
+
+    repaired = EdgeRepair(CalibratedRig(HOME)).repair(maps)
+    other = EdgeRepair(CalibratedRig(mirrored)).repair(flipped(maps))
+
+    assert repaired is not maps
+    np.testing.assert_allclose(flipped(other).depth_m, repaired.depth_m, atol=1e-6)
+    np.testing.assert_allclose(flipped(other).intensity, repaired.intensity, rtol=1e-3)
 
 
 @pytest.mark.parametrize(("yaw_deg", "says"), [(0.0, False), (0.5, True)])
