@@ -24,7 +24,7 @@ from nlos_calibration import Rig
 from nlos_models import training
 
 from nlos_cam import dataset as data
-from nlos_cam.adapt.locked import LockedNoise
+from nlos_cam.adapt.inputs import TrainingInputs
 from nlos_cam.adapt.plan import (
     BATCH,
     FIRST_OBJECTS,
@@ -52,7 +52,7 @@ from nlos_cam.files import (
     claim,
     write_checked,
 )
-from nlos_cam.reconstruct import can_align, grid_of, weights_for
+from nlos_cam.reconstruct import weights_for
 from nlos_cam.render import SensorModel
 
 OBJECTS = "objects"
@@ -477,7 +477,7 @@ def _train_network(
     tracked: data.Tracked,
     watch: training.Watch | None,
 ) -> None:
-    """Train on from the stage before, on objects that are rendered meanwhile."""
+    """Train a stage's network on from the stage before, while its objects are rendered."""
     stage = plan.stages[number]
     before = job.folder / _stage_name(number - 1) / NETWORK if number else job.start_folder
     recipe = stage.recipe()
@@ -485,23 +485,13 @@ def _train_network(
     start, runs = training.direct_start(recipe, before)
     if start is None:
         raise SceneError("the start weights are no direct network: choose others")
+    if job.locked:
+        inputs = TrainingInputs.of_locked(job.rig, job.sensor, job.locked)
+    else:
+        inputs = TrainingInputs.of_maps(job.rig, models.load_record(before))
     held_out = _test_set(job, HELD_OUT, data.HELD_OUT_SEED, HELD_OUT_OBJECTS, tracked)
     there = plan.objects_before(number)
     watched = _Watched(watch or training.unwatched)
-    rig = job.rig.name, job.rig.checksum
-    noise = None
-    trained = models.load_record(before)
-    frame = None if job.locked else grid_of(trained)
-    if frame and not can_align(job.rig, frame):
-        raise SceneError(
-            f"the start weights cannot see {job.rig.name}: its lidar sees too little of the wall past"
-            " the occluder, or its box has another size; choose others with --weights"
-        )
-    if frame:
-        rig = job.rig.name, frame.checksum
-    if job.locked:
-        noise = LockedNoise.of(job.rig, job.sensor, job.locked)
-        rig = f"{job.rig.name} (locked differences)", ""
 
     with closing(_Rendering(job, stage.objects)) as rendering:
 
@@ -512,30 +502,35 @@ def _train_network(
 
         with tracked("rendering the first objects"):
             rendering.wait_for(stage.objects_at(0, there))
-        if noise:
-            count = min(FIRST_OBJECTS, stage.objects)
-            rendering.wait_for(count)
-            first = islice(data.open_dataset(job.folder / OBJECTS).chunks(), count // data.SHARD)
-            recipe = noise.fitted(recipe, start.normal, list(first))
+        if inputs.noise:
+            first = _first_objects(job, stage, rendering)
+            recipe = inputs.noise.fitted(recipe, start.normal, first)
         store = data.open_packed_maps(
             [job.folder / OBJECTS],
             out.parent / PACKED,
             normal=start.normal,
-            trained=None if noise else trained,
+            trained=inputs.trained,
             growth=shards_of,
             align=False,
-            frame=frame,
+            frame=inputs.frame,
         )
         with store as source:
-            bench = None if job.locked else job.rig.model_dump(mode="json")
-            record = training.record_run(recipe, out, rig, runs, before, bench=bench)
+            record = training.record_run(recipe, out, inputs.rig, runs, before, bench=inputs.bench)
             fabric = training.open_fabric(recipe, accelerator=job.accelerator)
             origin = training.digest_of(start, source.digest)
             run = training.TrainingRun(recipe, out, record, origin, watch=watched)
             maps = source.held_out(held_out, HELD_OUT_OBJECTS)
-            maps = noise.added_to(maps) if noise else maps
+            if inputs.noise:
+                maps = inputs.noise.added_to(maps)
             training.run_direct(fabric, run, start, source, maps)
     shutil.rmtree(out.parent / PACKED, ignore_errors=True)  # made again from the objects if needed
+
+
+def _first_objects(job: Adaptation, stage: Stage, rendering: _Rendering) -> list[training.MapSet]:
+    """Wait for a stage's first objects, and return them shard by shard."""
+    count = min(FIRST_OBJECTS, stage.objects)
+    rendering.wait_for(count)
+    return list(islice(data.open_dataset(job.folder / OBJECTS).chunks(), count // data.SHARD))
 
 
 def _test_set(
