@@ -87,6 +87,7 @@ class Place(NamedTuple):
     @classmethod
     def of(cls, has_surface: Mask, area: Float32) -> Self:
         """Return the place of surfaces (n, 64, 64) with their areas (n,), by their moments."""
+        # First and second moments of the sums along rows and columns.
         pixels = np.arange(has_surface.shape[1], dtype=np.float32)
         rows, columns = (has_surface.sum(axis).astype(np.float32) for axis in (2, 1))
         row = (rows @ pixels) / area
@@ -183,16 +184,21 @@ Formula = Callable[[Frames], Float32]
 # depend on how large the object is; the area itself is a figure. The order of the rows is the
 # format of quality.json: means, spreads and the first layer have a number for each.
 FIGURES: Mapping[str, Formula] = {
-    # The image against the probability from another network is the best single figure.
+    # Overlap first: the image against the probability of a surface from another network is the
+    # best single figure.
     "overlap": lambda f: f.outline.overlap,
     "logit of overlap": lambda f: _logit(f.outline.overlap),
+    # Size, which the other sums are free of.
     "area": lambda f: f.area / PIXELS,
     "log of area": lambda f: np.log(f.area),
     "root of area": lambda f: np.sqrt(f.area),
+    # The parts of the overlap, and how undecided the other network is.
     "p inside": lambda f: f.outline.inside,
     "p beside": lambda f: f.outline.beside,
     "unsure": lambda f: f.share(f.outline.unsure),
     "unsure inside": lambda f: f.share(f.outline.unsure * f.mask),
+    # The image's outline against the outlines at five probabilities of a surface: they lie
+    # far apart where that network does not know where the object ends.
     "IoU above 0.1": lambda f: f.outline.iou_above(0.1),
     "area above 0.1": lambda f: f.outline.area_above(0.1),
     "IoU above 0.3": lambda f: f.outline.iou_above(0.3),
@@ -203,24 +209,30 @@ FIGURES: Mapping[str, Formula] = {
     "area above 0.7": lambda f: f.outline.area_above(0.7),
     "IoU above 0.9": lambda f: f.outline.iou_above(0.9),
     "area above 0.9": lambda f: f.outline.area_above(0.9),
+    # Depth.
     "mean error": lambda f: f.share(f.error * f.mask),
     "RMS error": lambda f: np.sqrt(f.share(f.error * f.error * f.mask)),
     "mean v": lambda f: f.mean_v,
     "spread of v": lambda f: f.spread_v,
+    # Shape: the rim over the area's root does not depend on the size, over the area it is large
+    # for thin parts.
     "roughness": lambda f: f.rim / np.sqrt(f.area),
     "thinness": lambda f: f.rim / f.area,
     "step of v down": lambda f: f.step_down,
     "step of v across": lambda f: f.step_across,
+    # Place and extent of the silhouette.
     "rows off the middle": lambda f: f.place.off_middle,
     "column": lambda f: f.place.column,
     "height": lambda f: f.place.height,
     "width": lambda f: f.place.width,
     "height over width": lambda f: f.place.height / np.maximum(f.place.width, 1.0),
     "fill": lambda f: f.area / np.maximum(f.place.height * f.place.width, 1.0),
+    # The other network's verdicts.
     "logit of unlike the training": lambda f: _logit(f.estimate.p_out_of_distribution),
     "logit of empty": lambda f: _logit(f.estimate.p_empty),
 }
 SURFACE_FIGURES: Mapping[str, Formula] = {
+    # The rows of the overlap and the outlines once more, for the network's own probability.
     "own overlap": lambda f: f.own.overlap,
     "logit of own overlap": lambda f: _logit(f.own.overlap),
     "own p inside": lambda f: f.own.inside,
@@ -237,6 +249,7 @@ SURFACE_FIGURES: Mapping[str, Formula] = {
     "area above own 0.7": lambda f: f.own.area_above(0.7),
     "IoU above own 0.9": lambda f: f.own.iou_above(0.9),
     "area above own 0.9": lambda f: f.own.area_above(0.9),
+    # Where two networks disagree, one of them is wrong.
     "difference of the networks": lambda f: f.share(f.apart),
     "difference of the networks inside": lambda f: f.share(f.apart * f.mask),
     "own decided": lambda f: f.own_decided,
