@@ -251,7 +251,6 @@ def _measure(
     before: detection.Plan | None,
     folder: Path,
 ) -> detection.Session:
-    movable = isinstance(source, cameras.SimulatedCamera)
     with source:
         rig = chosen.open(source).rig if chosen.record else source.rig
         session = detection.Session.start(folder, asked.plan(source, rig, before))
@@ -260,7 +259,8 @@ def _measure(
             if isinstance(source, cameras.SimulatedCamera)
             else TerminalHands(session.plan)
         )
-        _run(session, source, hands, with_bar=movable or not stderr.is_terminal)
+        with_bar = isinstance(hands, detection.SimulatedHands) or not stderr.is_terminal
+        _run(session, source, hands, with_bar=with_bar)
     return session
 
 

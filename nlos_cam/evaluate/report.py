@@ -148,11 +148,8 @@ def evaluate(
     if isinstance(objects, Path):
         objects = subjects.dataset_objects(objects)
     its_rig = objects.plan.rig if objects else rig
-    name = str(weights)
-    if weights is None:
-        weights = weights_for(its_rig) if its_rig else shipped_folder()
-        name = weights.name
-    reconstructor = load_reconstructor(weights, cache_folder() / "onnx")
+    folder = weights or (weights_for(its_rig) if its_rig else shipped_folder())
+    reconstructor = load_reconstructor(folder, cache_folder() / "onnx")
     record = reconstructor.record
     second: subjects.HeldOutObjects | None = None
     if objects is None:
@@ -164,7 +161,7 @@ def evaluate(
         objects, training, nearest=nearest, tracked=tracked
     )
     uncertainty_model = (
-        load_uncertainty_model(weights, cache_folder() / "onnx")
+        load_uncertainty_model(folder, cache_folder() / "onnx")
         if record.input == "raw maps"
         else None
     )
@@ -180,7 +177,7 @@ def evaluate(
     facts = {
         "what": objects.description,
         "program": program_name(),
-        "weights": name,
+        "weights": str(weights or folder.name),
         "rig": objects.plan.rig.name,
         "runtime": reconstructor.runtime,
         "input": record.input,

@@ -393,10 +393,10 @@ def rigs(asked: argparse.Namespace) -> None:
             )
 
 
-def shown(subjects: Sequence[Subject], bench: Rig) -> tuple[Rig, Float32, list[LidarMaps]]:
-    """Return a bench, the true images of objects on it, and their maps, one frame each."""
+def shown(subjects: Sequence[Subject], bench: Rig) -> tuple[Float32, list[LidarMaps]]:
+    """Return the true images of objects on a bench, and their maps, one frame each."""
     maps = sense(echoes_of(subjects, bench, lambda *_: None), bench)
-    return bench, truth_of(subjects, object_box(bench)), maps
+    return truth_of(subjects, object_box(bench)), maps
 
 
 def edge(asked: argparse.Namespace) -> None:
@@ -414,7 +414,8 @@ def edge(asked: argparse.Namespace) -> None:
     ]
 
     def measured(place: Place, _: Any) -> dict[str, Any]:
-        bench, truth, seen = shown(subjects, place.rig(rig))
+        bench = place.rig(rig)
+        truth, seen = shown(subjects, bench)
         repaired = [repair.repair(each) for each in seen]
         found = dict[str, dict[str, float]]()
         for label, (network, _) in weights.items():
@@ -445,7 +446,8 @@ def poses(asked: argparse.Namespace) -> None:
     places = [here, *(off_record(here, seed) for seed in range(DRAWS))]
 
     def measured(place: Place, _: Any) -> dict[str, Any]:
-        bench, truth, seen = shown(subjects, place.rig(rig))
+        bench = place.rig(rig)
+        truth, seen = shown(subjects, bench)
         maps = as_map_set([repair.repair(each) for each in seen], truth)
         found = dict[str, list[float]]()
         for label, (network, _) in weights.items():
