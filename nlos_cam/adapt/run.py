@@ -298,6 +298,7 @@ def _data_plan(job: Adaptation, first_seed: int, *, expected: bool) -> data.Data
         spread=job.spread if expected else data.RigSpread(),
         expected=expected,
         objects_per_rig=data.OBJECTS_PER_RIG if expected else 1,
+        off_record=expected,
     )
 
 
@@ -511,7 +512,6 @@ def _train_network(
             normal=start.normal,
             trained=inputs.trained,
             growth=shards_of,
-            align=False,
             frame=inputs.frame,
         )
         with store as source:

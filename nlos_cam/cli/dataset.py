@@ -102,6 +102,13 @@ ObjectsPerRig = Annotated[
         help="Objects that share a draw of the spreads; 50 render 4 times as fast.",
     ),
 ]
+OffRecord = Annotated[
+    bool,
+    typer.Option(
+        "--off-record",
+        help="The rig's spread is not known: training sees benches that are off their record by it.",
+    ),
+]
 AnyRig = Annotated[
     bool,
     typer.Option(
@@ -183,6 +190,7 @@ def build(
     rig_spread_mm: SpreadMm = 0.0,
     rig_spread_deg: SpreadDeg = 0.0,
     gain_spread_percent: GainSpread = 0.0,
+    off_record: OffRecord = False,
     any_rig: AnyRig = False,
     objects_per_rig: ObjectsPerRig = 1,
     accuracy: AccuracyName = "standard",
@@ -213,6 +221,7 @@ def build(
         objects_per_rig=(
             data.OBJECTS_PER_RIG if any_rig and objects_per_rig == 1 else objects_per_rig
         ),
+        off_record=off_record,
         rigs=data.RigRange() if any_rig else None,
     )
     with common.progress(Rate()) as bar:

@@ -342,6 +342,7 @@ def direct(
                 trained=trained,
                 color=recipe.colour,
                 frame=reconstruct.grid_of(trained) if trained else None,
+                run=f"{run.out.resolve()} ",
             )
             source = held.enter_context(packed)
         held_out = source.held_out(held_out_data, recipe.held_out)

@@ -85,8 +85,8 @@ class PackedMaps:
         trained: CheckpointRecord | None = None,
         color: bool = False,
         growth: Growth | None = None,
-        align: bool = True,
         frame: Rig | None = None,
+        run: str = "",
     ) -> None:
         """Open or make the store: use `open_packed_maps`, which holds its claim meanwhile.
 
@@ -94,10 +94,11 @@ class PackedMaps:
         rig; by default by the statistics of the first shards (with `growth` of those that the first
         epoch sees, so that a run that was killed sees the same). `growth` decides how many objects
         an epoch sees (default: all that are there). They are aligned with the rig `frame`, by
-        default the plan's, and the wall grid for a plan of many rigs. Without `align` a spread of
-        rigs stays in the maps, as a deviation that is not known; so does the spread of a plan of
-        many rigs. Raises RecordingError for no dataset, SceneError for datasets of two rigs or a
-        store that is normalised otherwise.
+        default the plan's, and the wall grid for a plan of many rigs. A spread that records do not
+        have (`DatasetPlan.known_rig`) stays in the maps. `run` names the training run: another one
+        in the same store sees the objects that are there when its own epochs begin. Raises
+        RecordingError for no dataset, SceneError for datasets of two rigs or a store that is
+        normalised otherwise.
         """
         opened = [open_dataset(folder, color=color, expected=True) for folder in datasets]
         self.plan: DatasetPlan = opened[0].plan
@@ -121,7 +122,7 @@ class PackedMaps:
         self._datasets = list(datasets)
         self._store = store
         self._growth = growth
-        self._align = align
+        self._run = run
         self.frame: Rig = frame or (WALL_GRID if self.plan.rigs else self.plan.rig)
         """Rig that the maps are aligned with."""
         self.normal = CellNormal(color=color)
@@ -234,9 +235,8 @@ class PackedMaps:
     def _read(self, shard: Shard) -> tuple[MapSet, Float32]:
         """Return a shard's samples as `frame` sees them, and the bench's own counts behind them."""
         maps = MapSet(*read_arrays(shard, MAP_CHANNELS))
-        plan = shard.plan
-        rig_of = plan.known_rig if self._align else plan.nominal_rig
-        maps, _, counts = aligned_with(maps, map(rig_of, shard.seeds), self.frame)
+        benches = map(shard.plan.known_rig, shard.seeds)
+        maps, _, counts = aligned_with(maps, benches, self.frame)
         return maps, counts
 
     def held_out(self, folder: Path, count: int) -> MapSet:
@@ -249,10 +249,10 @@ class PackedMaps:
     def batches(self, batch: int, generator: torch.Generator) -> Iterator[NormalBatch]:
         """Yield one pass over the objects in random order, without the last, smaller batch.
 
-        A generator's first pass adds new shards; a generator of the same seed sees the same objects
-        again.
+        A generator's first pass in a run adds new shards; a generator of the same seed sees the
+        same objects again in that run.
         """
-        key = str(generator.initial_seed())
+        key = f"{self._run}{generator.initial_seed()}"
         epochs = self._index["epochs"]
         if key not in epochs:
             self.refresh(shards=self._growth(len(epochs)) if self._growth else None)
@@ -296,8 +296,8 @@ def open_packed_maps(
     trained: CheckpointRecord | None = None,
     color: bool = False,
     growth: Growth | None = None,
-    align: bool = True,
     frame: Rig | None = None,
+    run: str = "",
 ) -> Generator[PackedMaps]:
     """Open or make a store, and hold the right to write it until the end of the block.
 
@@ -313,6 +313,6 @@ def open_packed_maps(
             trained=trained,
             color=color,
             growth=growth,
-            align=align,
             frame=frame,
+            run=run,
         )

@@ -171,6 +171,10 @@ class DatasetPlan:
     """Consecutive seeds that share a draw of the spread, so that the renderer keeps what depends on
     the rig alone.
     """
+    off_record: bool = False
+    """The spread is not known: it is what records are off by, and stays in the maps, which are
+    aligned without it.
+    """
     rigs: RigRange | None = None
     """Rigs that objects are on in place of `rig`: known ones, from which `spread` is a deviation."""
 
@@ -209,6 +213,8 @@ class DatasetPlan:
             del facts["expected"]  # likewise
         if self.objects_per_rig == 1:
             del facts["objects_per_rig"]
+        if not self.off_record:
+            del facts["off_record"]
         if self.rigs is None:
             del facts["rigs"]
         if not self.objects.share_generic:
@@ -237,10 +243,11 @@ class DatasetPlan:
         return self.rigs.draw(self.rig, seed // self.objects_per_rig) if self.rigs else self.rig
 
     def known_rig(self, seed: int) -> Rig:
-        """Return the rig that maps of one object are aligned by: its bench's, but of a plan of many
-        rigs without the spread, which is then what their records are off by.
+        """Return the rig that maps of one object are aligned by: its bench's, or that without the
+        spread where records are off by it, as they are in a plan of many rigs.
         """
-        return self.nominal_rig(seed) if self.rigs else self.bench_of(seed)[0]
+        is_off = self.off_record or self.rigs is not None
+        return self.nominal_rig(seed) if is_off else self.bench_of(seed)[0]
 
     def differences(self, other: "DatasetPlan") -> list[str]:
         """Return the names of fields that differ; empty where both plans make the same bits."""
@@ -263,6 +270,10 @@ class DatasetPlan:
             raise SceneError(
                 "without a spread all objects share one rig: drop --objects-per-rig, or give a"
                 " spread"
+            )
+        if self.off_record and self.spread == RigSpread():
+            raise SceneError(
+                "without a spread no record is off: drop --off-record, or give a spread"
             )
         if self.expected and self.sensor.wall_texture:
             raise SceneError("expected maps are not of a wall_texture: drop --expected-maps")

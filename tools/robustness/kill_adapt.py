@@ -30,6 +30,9 @@ from nlos_cam.render import SensorModel
 RIG = "paper-rig"
 DOCS = Path(__file__).parents[2] / "docs"
 COMPARED = "direct.safetensors", "doubt.safetensors", "doubt.json", "quality.json"
+TRAINED = "adapt/stage-1/weights"
+"""Weights that are compared. A few steps' are worse than the start weights, so that they do not
+become the bench's."""
 SLICE = 0.2
 """Longest time until a kill, as a share of the whole run's."""
 
@@ -104,7 +107,7 @@ def kill_once(folder: Path, after_s: float) -> str:
 def digests(folder: Path) -> dict[str, str]:
     """Return the SHA-256 of the files that have to be the same."""
     return {
-        name: hashlib.sha256((folder / "weights" / name).read_bytes()).hexdigest()
+        name: hashlib.sha256((folder / TRAINED / name).read_bytes()).hexdigest()
         for name in COMPARED
     }
 

@@ -76,10 +76,12 @@ def test_build_options_set_plan_and_are_stored_as_command(tmp_path: Path, built:
         "--seed",
         "7",
     ]
+    spread.append("--off-record")
     built(folder := tmp_path / "a b", *spread, *others, "--expected-maps", "--workers", "1")
     plan = open_dataset(folder, expected=True).plan
 
     assert plan.spread == RigSpread(place_m=0.01, angle_deg=3, gain_share=0.2)
+    assert plan.off_record
     assert set(CATEGORIES) - set(plan.objects.categories) == {"hat", "boat"}
     assert (plan.objects.backgrounds, plan.accuracy, plan.first_seed, plan.expected) == (
         0.25,

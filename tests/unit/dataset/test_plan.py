@@ -200,6 +200,17 @@ def test_objects_share_a_rig_in_groups() -> None:
     assert benches == [SPREAD.draw(RIG, SENSOR, draw) for draw in (0, 1, 1)]
 
 
+def test_a_spread_off_the_record_is_not_known() -> None:
+    known = replace(PLAN, spread=SPREAD)
+    unknown = replace(known, off_record=True)
+
+    assert unknown.bench_of(3) == known.bench_of(3)
+    assert known.known_rig(3) == known.bench_of(3)[0]
+    assert unknown.known_rig(3) == RIG
+    assert DatasetPlan.from_provenance(unknown.provenance) == unknown
+    assert "off_record" not in known.provenance  # checksums of older plans stay
+
+
 def test_rig_without_occluder_is_drawn_without_one() -> None:
     rig, sensor = SPREAD.draw(RIG.model_copy(update={"occluder": None}), SENSOR, 1)
 
@@ -218,6 +229,7 @@ NEAR = RIG.model_copy(update={"occluder": RIG.occluder.model_copy(update={"x_m":
         ({"spread": RigSpread(gain_share=1.0)}, "100%"),
         ({"rig": NEAR, "spread": SPREAD}, "15 mm"),  # would move the occluder into the object box
         ({"objects_per_rig": 2}, "--objects-per-rig"),
+        ({"off_record": True}, "--off-record"),
         ({"material": Material(albedo=(1, 0, 0))}, "one intensity"),
         ({"material": Material(albedo=0.5), "textures": tuple(TEXTURES)}, "textures"),
         ({"material": Material(albedo=(1.0, 0.5, 0.5)), "textures": tuple(TEXTURES)}, "textures"),

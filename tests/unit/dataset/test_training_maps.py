@@ -335,6 +335,21 @@ def test_maps_that_the_one_rig_cannot_see_are_left_out(
         assert len(packed.held_out(varied, SHARD - 1).image) == sum(seen[:-1])
 
 
+def test_maps_that_are_off_their_record_stay_as_they_are(
+    tmp_path: Path, store_folder: Path
+) -> None:
+    off = _add(tmp_path / "off", 0, replace(VARIED, off_record=True))
+    samples = _samples(0)
+
+    with open_packed_maps([off], store_folder) as packed:
+        normal = _normalised(packed, samples["depth_m"], samples["intensity"])
+        wanted = dict(zip((one.tobytes() for one in samples["image"]), normal, strict=True))
+        maps, images = _epoch(packed, 1)
+
+    for image, one in zip(images, maps, strict=True):
+        np.testing.assert_array_equal(one, wanted[image.tobytes()])
+
+
 def test_maps_of_many_rigs_are_packed_as_the_one_rig_sees_them(
     tmp_path: Path, store_folder: Path, benches: list[Rig], seen: list[bool]
 ) -> None:
@@ -393,6 +408,16 @@ def test_new_shards_enter_new_epochs(folder: Path, store_folder: Path) -> None:
         _add(folder, 5)
 
         assert len(_epoch(packed, 2)[0]) == 10
+
+
+def test_another_run_in_the_same_store_sees_all_objects(folder: Path, store_folder: Path) -> None:
+    with open_packed_maps([folder], store_folder, run="one ") as packed:
+        _epoch(packed, 1, 1)
+        _add(folder, 5)
+    with open_packed_maps([folder], store_folder, run="one ") as packed:
+        assert len(_epoch(packed, 1, 1)[0]) == 5
+    with open_packed_maps([folder], store_folder, run="two ") as packed:
+        assert len(_epoch(packed, 1, 1)[0]) == 10
 
 
 def test_statistics_are_of_the_shards_that_the_first_epoch_sees(
