@@ -23,7 +23,7 @@ from typing import Self
 from nlos_calibration import Rig
 
 from nlos_cam import reconstruct
-from nlos_cam.bench import load_bench, weights_verdict
+from nlos_cam.bench import load_bench, load_serving
 from nlos_cam.camera import Camera, OnProgress, open_camera
 from nlos_cam.errors import NlosCamError
 from nlos_cam.live import RunStatistics
@@ -137,16 +137,12 @@ def open_stream(
     else:
         calibrated = reconstruct.open_bench(Path(wall) if wall else None, camera)
     own = loaded.weights if loaded else None
-    folder = Path(weights) if weights else own or reconstruct.weights_for(calibrated.rig)
-    network = reconstruct.load_networks(folder)
-    uncertainty_model = reconstruct.load_uncertainty(folder)
+    found = load_serving(
+        calibrated, Path(weights) if weights else own, loaded, Path(wall) if wall else None
+    )
     pipeline = reconstruct.build_pipeline(
-        calibrated, network, average, uncertainty_model=uncertainty_model
+        calibrated, found.network, average, uncertainty_model=found.uncertainty_model
     )
     reconstruct.warm_up(camera, pipeline)
-    served = weights_verdict(calibrated.rig, network.record, loaded, Path(wall) if wall else None)
-    mismatches = reconstruct.compatibility_warnings(
-        calibrated, network.record, uncertainty_model, served
-    )
-    notes = (*calibrated.warnings, *mismatches)
+    notes = (*calibrated.warnings, *found.mismatches)
     return Stream(camera, pipeline, lossless=uri.startswith("bag:"), notes=notes, clock=clock)

@@ -202,7 +202,7 @@ def epochs_within(seconds: float, log: Path) -> int:
     """
     if not (each := epoch_seconds(log)):
         raise SystemExit(f"{log} has no epoch: give more --minutes")
-    return max(2, int(0.95 * seconds / mean(each[1:] or each)))
+    return max(2, int(0.7 * seconds / mean(each[1:] or each)))
 
 
 def write_parts(folder: Path, names: Sequence[str], target: Path) -> list[Path]:

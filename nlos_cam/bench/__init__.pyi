@@ -7,6 +7,7 @@ __all__ = [
     "BenchEdit",
     "BenchRecord",
     "ForecastRecord",
+    "ServingNetworks",
     "StationRecord",
     "camera_to_name",
     "check_new",
@@ -14,6 +15,7 @@ __all__ = [
     "is_bench",
     "load_bench",
     "load_bench_record",
+    "load_serving",
     "station_folder",
     "weights_verdict",
     "write_file",
@@ -33,4 +35,4 @@ from .record import (
     load_bench_record,
     station_folder,
 )
-from .serving import weights_verdict
+from .serving import ServingNetworks, load_serving, weights_verdict

@@ -1,16 +1,49 @@
-"""Verdict on weights for a bench folder, which knows its forecast and what its own weights reached."""
+"""Weights that serve a bench, and the verdict on them: a bench folder knows its forecast and what
+its own weights reached.
+"""
 
 import shlex
 from dataclasses import replace
 from pathlib import Path
+from typing import NamedTuple
 
 from nlos_calibration import Rig
-from nlos_models import CheckpointRecord
+from nlos_models import CheckpointRecord, Reconstructor, UncertaintyModel
 
+from nlos_cam import reconstruct
 from nlos_cam.bench.edit import TEST_IOU
 from nlos_cam.bench.folder import Bench
 from nlos_cam.forecast import SCATTER_IOU
-from nlos_cam.reconstruct import WeightsVerdict, weights_serve
+from nlos_cam.reconstruct import CalibratedRig, WeightsVerdict, weights_serve
+
+
+class ServingNetworks(NamedTuple):
+    """Networks for a bench, and how well they serve it."""
+
+    network: Reconstructor
+    uncertainty_model: UncertaintyModel | None
+    verdict: WeightsVerdict
+    mismatches: tuple[str, ...]
+    """Sentences on what the bench and the weights disagree in: expect larger errors."""
+
+
+def load_serving(
+    calibrated: CalibratedRig,
+    weights: Path | None,
+    bench: Bench | None,
+    record: Path | None = None,
+) -> ServingNetworks:
+    """Load weights for a bench, or the shipped ones that serve its rig best, with the verdict on
+    them; `bench` and the wall `record` are as for `weights_verdict`. Raises CheckpointError.
+    """
+    folder = weights or reconstruct.weights_for(calibrated.rig)
+    network = reconstruct.load_networks(folder)
+    uncertainty_model = reconstruct.load_uncertainty(folder)
+    verdict = weights_verdict(calibrated.rig, network.record, bench, record)
+    mismatches = reconstruct.compatibility_warnings(
+        calibrated, network.record, uncertainty_model, verdict
+    )
+    return ServingNetworks(network, uncertainty_model, verdict, tuple(mismatches))
 
 
 def weights_verdict(

@@ -66,18 +66,14 @@ class Choice(NamedTuple):
         """Load the weights, or the shipped ones that serve a rig best, and print the model's name
         and its mismatches with the bench. Raises CheckpointError.
         """
-        weights = self.weights or reconstruct.weights_for(bench.rig)
-        network = reconstruct.load_networks(weights)
-        uncertainty_model = reconstruct.load_uncertainty(weights)
-        common.say(f"Loaded model {network.record.rig_name} ({network.runtime})")
-        served = benches.weights_verdict(bench.rig, network.record, self.bench, self.record)
-        if not served.is_warning:
-            common.say(served.sentence[:1].upper() + served.sentence[1:])
-        for warning in reconstruct.compatibility_warnings(
-            bench, network.record, uncertainty_model, served
-        ):
-            common.say(f"note: {warning}")
-        return network, uncertainty_model
+        found = benches.load_serving(bench, self.weights, self.bench, self.record)
+        common.say(f"Loaded model {found.network.record.rig_name} ({found.network.runtime})")
+        if not found.verdict.is_warning:
+            sentence = found.verdict.sentence
+            common.say(sentence[:1].upper() + sentence[1:])
+        for mismatch in found.mismatches:
+            common.say(f"note: {mismatch}")
+        return found.network, found.uncertainty_model
 
 
 def choose(bench: Path | None, wall: Path | None = None, weights: Path | None = None) -> Choice:
