@@ -12,15 +12,19 @@ from types import SimpleNamespace
 from typing import Any
 from unittest.mock import Mock
 
+import made_benches
 import numpy as np
 import pytest
 import typer
 from fake_uncertainty import FakeUncertainty
 from fake_wall import WallCamera, bare_wall, wall_frame, write_wall
 from made_up_moments import RIG, Recorded, full_moment
+from nlos_calibration import load_measured
+from nlos_models import shipped_folder
 from small_frames import FrameCamera, SheetNetwork, small_frame
 from view_streams import EVERYWHERE, ask
 
+from nlos_cam.bench import write_weights
 from nlos_cam.cli.live import summary
 from nlos_cam.cli.main import main
 from nlos_cam.cli.view import announce_view, opened_in_browser, viewer_of
@@ -348,6 +352,35 @@ def test_view_serves_a_saved_session_until_interrupted(
 
     assert main(["view", str(saved)]) == 130
     assert fetched == [saved.read_bytes()]
+
+
+@pytest.fixture
+def taken(opened: Opened, monkeypatch: pytest.MonkeyPatch) -> list[Path | None]:
+    """Folders of weights that were loaded."""
+    folders: list[Path | None] = []
+
+    def load(folder: Path | None = None) -> Any:
+        folders.append(folder)
+        return opened.network
+
+    monkeypatch.setattr("nlos_cam.reconstruct.load_networks", load)
+    return folders
+
+
+def test_view_of_a_recording_takes_the_weights_of_its_bench(
+    tmp_path: Path, opened: Opened, taken: list[Path | None], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("nlos_cam.calibrate.files.report_html", lambda *_: "report")
+    opened.camera = WallCamera(3)
+    write_wall(tmp_path / "wall.toml", bare_wall())
+    bench = tmp_path / "bench"
+    made_benches.write_wall(bench, load_measured(tmp_path / "wall.toml"))
+    own = write_weights(bench, shipped_folder())
+    words = ["view", "run.bag", "--seconds", "0.1"]
+
+    assert main([*words, "--bench", str(bench)]) == 0
+    assert main([*words, "--bench", str(bench), "--weights", str(tmp_path)]) == 0
+    assert taken == [own, tmp_path]
 
 
 @pytest.fixture
