@@ -319,6 +319,14 @@ def direct(
             "--store", help="Folder of the packed maps, kept for other runs (default: in --out)."
         ),
     ] = None,
+    pack_workers: Annotated[
+        int,
+        typer.Option(
+            "--pack-workers",
+            min=1,
+            help="Processes that pack new shards: more than one where a GPU would wait for them.",
+        ),
+    ] = 1,
 ) -> None:
     """Train a direct network: maps to images by two heads, without a latent; the project's own."""
     recipe = run.recipe(training.DirectRecipe)
@@ -343,6 +351,7 @@ def direct(
                 color=recipe.colour,
                 frame=reconstruct.grid_of(trained) if trained else None,
                 run=f"{run.out.resolve()} ",
+                processes=pack_workers,
             )
             source = held.enter_context(packed)
         held_out = source.held_out(held_out_data, recipe.held_out)

@@ -8,32 +8,38 @@ number of objects of every epoch, so that an interrupted run sees the same batch
 import hashlib
 import json
 import operator
-from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
 import torch
 from nlos_calibration import Rig
-from nlos_calibration.arrays import Float32, Mask
 from nlos_models import CellNormal, CheckpointRecord, channels_of
 from nlos_models.training import MapNoise, MapSet, NormalBatch, first_of
 
+from nlos_cam.dataset.packing import (
+    COUNTS,
+    IMAGES,
+    MAPS,
+    Packer,
+    Packing,
+    aligned_with,
+    packing,
+    read_aligned,
+)
 from nlos_cam.dataset.plan import DatasetPlan, RigSpread
 from nlos_cam.dataset.reader import MAP_CHANNELS, Dataset, open_dataset
 from nlos_cam.dataset.rig_range import RigRange
 from nlos_cam.dataset.samples import OnProgress, ignore
-from nlos_cam.dataset.shards import SHARD_PATTERN, Shard, read_arrays, read_head
+from nlos_cam.dataset.shards import SHARD_PATTERN
 from nlos_cam.errors import RecordingError, SceneError
 from nlos_cam.files import atomic_file, claim, read_bounded
 from nlos_cam.files import read_arrays as read_npz
 from nlos_cam.frames import MAP_COLUMNS, MAP_ROWS, OBJECT_PIXELS
-from nlos_cam.reconstruct import WALL_GRID, align_samples, grid_of, is_wall_grid
+from nlos_cam.reconstruct import WALL_GRID, grid_of, is_wall_grid
 
 INDEX = "index.json"
-MAPS = "maps.f16"
-IMAGES = "images.f16"
-COUNTS = "counts.f16"
 CELLS = "cells.npz"
 INDEX_LIMIT = 1 << 26
 """Bytes of the index: some hundred thousand shards."""
@@ -87,6 +93,7 @@ class PackedMaps:
         growth: Growth | None = None,
         frame: Rig | None = None,
         run: str = "",
+        packing: Packing | None = None,
     ) -> None:
         """Open or make the store: use `open_packed_maps`, which holds its claim meanwhile.
 
@@ -96,9 +103,9 @@ class PackedMaps:
         an epoch sees (default: all that are there). They are aligned with the rig `frame`, by
         default the plan's, and the wall grid for a plan of many rigs. A spread that records do not
         have (`DatasetPlan.known_rig`) stays in the maps. `run` names the training run: another one
-        in the same store sees the objects that are there when its own epochs begin. Raises
-        RecordingError for no dataset, SceneError for datasets of two rigs or a store that is
-        normalised otherwise.
+        in the same store sees the objects that are there when its own epochs begin. New shards are
+        made ready by the processes of `packing`, by default this one. Raises RecordingError for no
+        dataset, SceneError for datasets of two rigs or a store that is normalised otherwise.
         """
         opened = [open_dataset(folder, color=color, expected=True) for folder in datasets]
         self.plan: DatasetPlan = opened[0].plan
@@ -123,6 +130,7 @@ class PackedMaps:
         self._store = store
         self._growth = growth
         self._run = run
+        self._packing = packing or Packing(1)
         self.frame: Rig = frame or (WALL_GRID if self.plan.rigs else self.plan.rig)
         """Rig that the maps are aligned with."""
         self.normal = CellNormal(color=color)
@@ -167,7 +175,11 @@ class PackedMaps:
             shards = STATISTICS_SHARDS
             if self._growth:
                 shards = min(shards, self._growth(0))
-            some = [self._read(shard)[0] for one in opened for shard in one.shards[:shards]]
+            some = [
+                read_aligned(shard, self.frame)[0]
+                for one in opened
+                for shard in one.shards[:shards]
+            ]
             depth_m, intensity = ([getattr(one, name) for one in some] for name in MAP_CHANNELS[:2])
             self.normal.learn(
                 *(torch.from_numpy(np.concatenate(parts)) for parts in (depth_m, intensity))
@@ -210,20 +222,13 @@ class PackedMaps:
                 "r+b"
             ) as file:  # rows after the last indexed one are left by an interruption
                 file.truncate(size)
-        for number, path in enumerate(new, 1):
-            maps, counts = self._read(read_head(path))
-            normal = (
-                self.normal(torch.from_numpy(maps.depth_m), torch.from_numpy(maps.intensity))
-                .half()
-                .numpy()
-            )
-            columns = {MAPS: normal, IMAGES: maps.image.astype(np.float16)}
-            if self._stores_counts:
-                columns[COUNTS] = np.log1p(counts).astype(np.float16)
+        packer = Packer.of(self.frame, self.normal, with_counts=self._stores_counts)
+        every = zip(new, self._packing.rows_of(packer, new), strict=True)
+        for number, (path, columns) in enumerate(every, 1):
             for name, values in columns.items():
                 with (self._store / name).open("ab") as file:
                     file.write(np.ascontiguousarray(values).tobytes())
-            known[str(path.resolve())] = len(maps.image)
+            known[str(path.resolve())] = len(columns[IMAGES])
             if number % 50 == 0 or number == len(new):
                 self._write_index()
             on_progress(number, len(new))
@@ -231,13 +236,6 @@ class PackedMaps:
     def _write_index(self) -> None:
         with atomic_file(self._store / INDEX) as part:
             part.write_text(json.dumps(self._index), encoding="utf-8")
-
-    def _read(self, shard: Shard) -> tuple[MapSet, Float32]:
-        """Return a shard's samples as `frame` sees them, and the bench's own counts behind them."""
-        maps = MapSet(*read_arrays(shard, MAP_CHANNELS))
-        benches = map(shard.plan.known_rig, shard.seeds)
-        maps, _, counts = aligned_with(maps, benches, self.frame)
-        return maps, counts
 
     def held_out(self, folder: Path, count: int) -> MapSet:
         """Return up to `count` samples of another dataset as the store has its own: aligned with
@@ -277,15 +275,6 @@ def _rigs_of(plan: DatasetPlan) -> tuple[Rig, RigRange | None]:
     return plan.rig, plan.rigs
 
 
-def aligned_with(maps: MapSet, benches: Iterable[Rig], rig: Rig) -> tuple[MapSet, Mask, Float32]:
-    """Return samples as a rig sees them, less those of benches that cannot be aligned with it; the
-    mask of those that are left; and the benches' own intensities (n, 64, 80) behind them.
-    """
-    maps, seen, counts = align_samples(maps, benches, rig)
-    kept = MapSet(*(getattr(maps, name)[seen] for name in MAP_CHANNELS))
-    return kept, seen, counts[seen]
-
-
 @contextmanager
 def open_packed_maps(
     datasets: Sequence[Path],
@@ -298,13 +287,15 @@ def open_packed_maps(
     growth: Growth | None = None,
     frame: Rig | None = None,
     run: str = "",
+    processes: int = 1,
 ) -> Generator[PackedMaps]:
     """Open or make a store, and hold the right to write it until the end of the block.
 
-    Raises FileBusyError while another process holds it, and the errors of PackedMaps.
+    New shards are packed by so many `processes`. Raises FileBusyError while another process holds
+    the store, and the errors of PackedMaps.
     """
     store.mkdir(parents=True, exist_ok=True)
-    with claim(store, inside=True):
+    with claim(store, inside=True), packing(processes) as made_ready:
         yield PackedMaps(
             datasets,
             store,
@@ -315,4 +306,5 @@ def open_packed_maps(
             growth=growth,
             frame=frame,
             run=run,
+            packing=made_ready,
         )

@@ -26,7 +26,8 @@ from numpy.typing import NDArray
 
 from nlos_cam.dataset import outliers
 from nlos_cam.dataset.build import HELD_OUT_SEED, TRAINING_SEED
-from nlos_cam.dataset.packed import aligned_with, map_noise
+from nlos_cam.dataset.packed import map_noise
+from nlos_cam.dataset.packing import aligned_with
 from nlos_cam.dataset.plan import DatasetPlan
 from nlos_cam.dataset.reader import Dataset
 from nlos_cam.dataset.rig_range import RigRange

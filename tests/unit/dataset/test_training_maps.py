@@ -2,9 +2,11 @@
 subtract.
 """
 
+from concurrent.futures.process import BrokenProcessPool
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -17,7 +19,7 @@ from nlos_models.training.data import flip_some, subtract_bare_wall
 from small_maps import SmallDataset, small_maps
 from small_run import small_recipe
 
-from nlos_cam.dataset import DatasetPlan, RigSpread, training_maps
+from nlos_cam.dataset import DatasetPlan, RigSpread, packing, training_maps
 from nlos_cam.dataset.packed import (
     CELLS,
     IMAGES,
@@ -30,7 +32,7 @@ from nlos_cam.dataset.packed import (
 from nlos_cam.dataset.samples import Samples
 from nlos_cam.dataset.shards import shard_path, store
 from nlos_cam.dataset.training_maps import MapSplit, Streamed, read_maps, render_bare_wall
-from nlos_cam.errors import RecordingError, SceneError
+from nlos_cam.errors import RecordingError, SceneError, WorkersLostError
 from nlos_cam.files import FileBusyError
 from nlos_cam.frames import LidarMaps, maps_from_frame
 from nlos_cam.reconstruct import MapAlignment
@@ -418,6 +420,36 @@ def test_another_run_in_the_same_store_sees_all_objects(folder: Path, store_fold
         assert len(_epoch(packed, 1, 1)[0]) == 5
     with open_packed_maps([folder], store_folder, run="two ") as packed:
         assert len(_epoch(packed, 1, 1)[0]) == 10
+
+
+@pytest.mark.slow  # two processes start
+def test_several_processes_pack_the_same_bytes(
+    folder: Path, tmp_path: Path, store_folder: Path
+) -> None:
+    _add(folder, 5)
+    _add(folder, 10)
+
+    with (
+        open_packed_maps([folder], store_folder) as alone,
+        open_packed_maps([folder], tmp_path / "several", processes=2) as several,
+    ):
+        assert several.digest == alone.digest
+        assert len(several) == 15
+    for name in (MAPS, IMAGES):
+        assert (tmp_path / "several" / name).read_bytes() == (store_folder / name).read_bytes()
+
+
+def test_a_process_that_ends_while_it_packs_is_told(
+    folder: Path, store_folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    _add(folder, 5)
+    pool = Mock(**{"map.side_effect": BrokenProcessPool})
+    monkeypatch.setattr(packing, "ProcessPoolExecutor", lambda *_, **__: pool)
+
+    with pytest.raises(WorkersLostError, match="lower --pack-workers"):
+        open_packed_maps([folder], store_folder, processes=2).__enter__()
+
+    pool.shutdown.assert_called_once_with(cancel_futures=True)
 
 
 def test_statistics_are_of_the_shards_that_the_first_epoch_sees(

@@ -1,0 +1,137 @@
+"""Rows that the packed maps hold of a shard, made by this process or by others beside it."""
+
+import signal
+from collections.abc import Generator, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
+from dataclasses import dataclass
+from itertools import repeat
+from multiprocessing import get_context
+from pathlib import Path
+from threading import Thread
+from typing import Self
+
+import numpy as np
+import torch
+from nlos_calibration import Rig
+from nlos_calibration.arrays import Float32, Mask
+from nlos_models import CellNormal, channels_of
+from nlos_models.arrays import Float16
+from nlos_models.training import MapSet
+
+from nlos_cam.dataset.reader import MAP_CHANNELS
+from nlos_cam.dataset.shards import Shard, read_arrays, read_head
+from nlos_cam.dataset.worker import end_with_parent
+from nlos_cam.errors import WorkersLostError
+from nlos_cam.processes import safe_children
+from nlos_cam.reconstruct import align_samples
+
+MAPS = "maps.f16"
+IMAGES = "images.f16"
+COUNTS = "counts.f16"
+
+
+@dataclass(frozen=True)
+class Packer:
+    """What decides the rows of a shard."""
+
+    frame: Rig
+    """Rig that the maps are aligned with."""
+    cells: Mapping[str, Float32]
+    """State of the normalisation. Arrays, since tensors go to other processes as open files, by a
+    thread that stays.
+    """
+    with_counts: bool
+    """Keep the bench's own counts, for noise of light that alignment has scaled."""
+
+    @classmethod
+    def of(cls, frame: Rig, normal: CellNormal, *, with_counts: bool) -> Self:
+        """Return the packer of a normalisation."""
+        cells = {name: values.numpy() for name, values in normal.state_dict().items()}
+        return cls(frame, cells, with_counts)
+
+    def rows(self, path: Path) -> dict[str, Float16]:
+        """Return a shard's rows (n, ...) by the name of their file in the store."""
+        maps, counts = read_aligned(read_head(path), self.frame)
+        pair = torch.from_numpy(maps.depth_m), torch.from_numpy(maps.intensity)
+        rows = {MAPS: self._normal()(*pair).half().numpy(), IMAGES: maps.image.astype(np.float16)}
+        if self.with_counts:
+            rows[COUNTS] = np.log1p(counts).astype(np.float16)
+        return rows
+
+    def _normal(self) -> CellNormal:
+        normal = CellNormal(color=len(self.cells["median"]) == channels_of(color=True))
+        normal.load_state_dict(
+            {name: torch.from_numpy(values) for name, values in self.cells.items()}
+        )
+        return normal
+
+
+def read_aligned(shard: Shard, frame: Rig) -> tuple[MapSet, Float32]:
+    """Return a shard's samples as a rig sees them, and the bench's own counts behind them."""
+    maps = MapSet(*read_arrays(shard, MAP_CHANNELS))
+    maps, _, counts = aligned_with(maps, map(shard.plan.known_rig, shard.seeds), frame)
+    return maps, counts
+
+
+def aligned_with(maps: MapSet, benches: Iterable[Rig], rig: Rig) -> tuple[MapSet, Mask, Float32]:
+    """Return samples as a rig sees them, less those of benches that cannot be aligned with it; the
+    mask of those that are left; and the benches' own intensities (n, 64, 80) behind them.
+    """
+    maps, seen, counts = align_samples(maps, benches, rig)
+    kept = MapSet(*(getattr(maps, name)[seen] for name in MAP_CHANNELS))
+    return kept, seen, counts[seen]
+
+
+class Packing:
+    """Processes that make the rows of shards; one is this process itself."""
+
+    def __init__(self, processes: int) -> None:
+        self._processes = processes
+        self._pool: ProcessPoolExecutor | None = None
+
+    def rows_of(self, packer: Packer, paths: Sequence[Path]) -> Iterator[dict[str, Float16]]:
+        """Yield the rows of each shard, in order. Raises WorkersLostError where a process ends."""
+        if self._processes == 1 or len(paths) < 2:  # others would take longer to begin
+            yield from map(packer.rows, paths)
+            return
+        if self._pool is None:
+            self._pool = ProcessPoolExecutor(
+                self._processes, mp_context=get_context("spawn"), initializer=_begin
+            )
+        try:
+            with safe_children():
+                found = self._pool.map(_rows, repeat(packer), paths)
+            yield from found
+        except BrokenProcessPool as error:
+            raise WorkersLostError(
+                "a process that packs maps ended: free memory, or lower --pack-workers"
+            ) from error
+
+    def close(self) -> None:
+        """End the processes, whatever they do."""
+        if self._pool:
+            self._pool.shutdown(cancel_futures=True)
+            self._pool = None
+
+
+@contextmanager
+def packing(processes: int) -> Generator[Packing]:
+    """Open processes that pack, until the end of the block."""
+    opened = Packing(processes)
+    try:
+        yield opened
+    finally:
+        opened.close()
+
+
+def _rows(packer: Packer, path: Path) -> dict[str, Float16]:
+    return packer.rows(path)
+
+
+def _begin() -> None:
+    """Set up a process that packs: one thread, no reaction to Ctrl-C, an end with its parent."""
+    torch.set_num_threads(1)
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    Thread(target=end_with_parent, daemon=True).start()
