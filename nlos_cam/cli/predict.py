@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
+import nlos_calibration as walls
 import typer
 from rich.table import Table
 
@@ -23,7 +24,21 @@ from nlos_cam.cli.common import (
     show,
     tracked,
 )
-from nlos_cam.cli.render import hidden_depth
+from nlos_cam.cli.render import (
+    Front,
+    OffsetX,
+    OffsetY,
+    Seed,
+    Size,
+    TiltX,
+    TiltY,
+    Turn,
+    UpAxis,
+    hidden_depth,
+)
+
+if TYPE_CHECKING:
+    from nlos_calibration.arrays import Float32
 
 SUFFIXES = ".html", ".png"
 TABLE_COLUMNS = 80
@@ -59,16 +74,33 @@ def predict(
         bool,
         typer.Option("--quick", help="Matt objects, 1 and 100 frames, no advice: a few seconds."),
     ] = False,
-    size_m: Annotated[
-        float | None, typer.Option("--size-m", help="Size of OBJECT in meters.")
-    ] = None,
-    turn_deg: Annotated[
-        float | None, typer.Option("--tilt-y-deg", help="Rotation of OBJECT about the wall's y.")
-    ] = None,
+    seed: Seed = None,
+    up: UpAxis = None,
+    size_m: Size = None,
+    tilt_x_deg: TiltX = None,
+    tilt_y_deg: TiltY = None,
+    turn_deg: Turn = None,
+    x_m: OffsetX = None,
+    y_m: OffsetY = None,
+    front_m: Front = None,
     overwrite: Overwrite = False,
     json: Json = False,
 ) -> None:
-    """Forecast what a bench can see: silhouettes, depths, by frames and material; what to change."""
+    """Forecast what a bench can see: silhouettes, depths, by frames and material; what to change.
+
+    Of an OBJECT also what the lidar would show.
+    """
+    placement = {
+        "seed": seed,
+        "up": up,
+        "size_m": size_m,
+        "tilt_x_deg": tilt_x_deg,
+        "tilt_y_deg": tilt_y_deg,
+        "turn_deg": turn_deg,
+        "x_m": x_m,
+        "y_m": y_m,
+        "front_m": front_m,
+    }
     if out is not None and out.suffix not in SUFFIXES:
         raise typer.BadParameter(f"--out {out}: choose a name that ends in .html or .png")
     path = output_path(out, "forecast", ".html", overwrite=overwrite) if out else None
@@ -79,23 +111,21 @@ def predict(
         rig, hidden = str(bench_folder), rig
     else:
         own, _ = benches.bench_or_rig(rig or PAPER_RIG)
-    shape = None
-    if hidden is not None:
-        depth_m = hidden_depth(hidden, own, {"size_m": size_m, "tilt_y_deg": turn_deg})
-        shape = forecast.Shape.of(depth_m, objects.object_box(own))
-    elif size_m is not None or turn_deg is not None:
-        raise typer.BadParameter("--size-m and --tilt-y-deg are of an OBJECT: name one")
+    depth_m = _object_depth(hidden, own, placement)
+    shape = None if depth_m is None else forecast.Shape.of(depth_m, objects.object_box(own))
     with interrupted_by_signals():
         found = forecast.forecast(own, quick=quick, shape=shape)
+        view = None if depth_m is None else forecast.LidarView.of(own, depth_m)
         advice: list[forecast.Change] = []
         if not quick and shape is None:
             with tracked("trying changes of the bench") as on_progress:
                 advice = forecast.changes(own, on_progress)
     _renew_forecast(rig, found, is_typical=shape is None)
     if path is not None:
-        forecast.write_report(found, path, advice, hidden or "")
+        forecast.write_report(found, path, advice, hidden or "", view)
     facts = found.as_json() | {
         "object": hidden,
+        "lidar": view and view.as_json(),
         "changes": [
             {name: value for name, value in asdict(change).items() if name != "rig"}
             for change in advice
@@ -103,6 +133,7 @@ def predict(
         "out": path and str(path),
     }
     lines = forecast.words_of(found, hidden or "")
+    lines += [view.words()] if view else []
     if advice:
         lines += ["What to change:", *(f"  {line}" for line in forecast.change_words(advice))]
     lines += [f"Written: {path}"] if path else []
@@ -110,6 +141,20 @@ def predict(
         show(_table(found), narrow_columns=TABLE_COLUMNS)
         lines.insert(0, forecast.COLUMNS)
     finish(facts, as_json=json, text="\n".join(lines))
+
+
+def _object_depth(hidden: str | None, rig: walls.Rig, placement: dict[str, Any]) -> Float32 | None:
+    """Return the depth map of OBJECT, None without one. Raises typer.BadParameter for a placement of
+    none.
+    """
+    if hidden is not None:
+        return hidden_depth(hidden, rig, placement)
+    given = [
+        f"--{name.replace('_', '-')}" for name, value in placement.items() if value is not None
+    ]
+    if given:
+        raise typer.BadParameter(f"{', '.join(given)}: no OBJECT is named that it could place")
+    return None
 
 
 def _renew_forecast(name: str | None, found: forecast.Forecast, *, is_typical: bool) -> None:

@@ -12,6 +12,7 @@ __all__ = [
     "Conditions",
     "Expectation",
     "Forecast",
+    "LidarView",
     "MaterialName",
     "Prior",
     "Shape",
@@ -32,6 +33,7 @@ __all__ = [
 from .advice import Change, changes
 from .curve import SCATTER_IOU, network_iou
 from .expectation import FRAMES, Conditions, Expectation, Forecast, forecast, shipped_basis
+from .lidar_view import LidarView
 from .linear import ACCURACY, BLACK, EFFECTS, MATERIALS, ChosenBeams, MaterialName, cut
 from .prior import Prior, Shape, fit_prior, shipped_prior
 from .report import CAVEATS, COLUMNS, change_words, hidden_words, table_of, words_of, write_report

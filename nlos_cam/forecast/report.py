@@ -7,6 +7,7 @@ from nlos_cam.files import atomic_file
 from nlos_cam.forecast.advice import Change
 from nlos_cam.forecast.curve import SCATTER_IOU, network_iou
 from nlos_cam.forecast.expectation import Expectation, Forecast
+from nlos_cam.forecast.lidar_view import LidarView
 from nlos_cam.report import Bullets, Document, Picture, Section, Table, figure_of, png
 
 USEFUL_SHARE = 0.2
@@ -34,6 +35,12 @@ COLUMNS = (
     " determine, depth error of the linear estimate in mm, cells won by the object."
 )
 """Meaning of the columns of the table."""
+
+
+VIEW_CAPTION = (
+    "One frame of the simulated camera, as 64 x 80 map cells. Below, what differs from the bench with"
+    " nothing hidden, in standard deviations of the noise: red is farther or brighter."
+)
 
 
 def words_of(found: Forecast, subject: str = "") -> list[str]:
@@ -182,15 +189,24 @@ def picture_of(found: Forecast) -> bytes:
 
 
 def write_report(
-    found: Forecast, path: Path, advice: Sequence[Change] = (), subject: str = ""
+    found: Forecast,
+    path: Path,
+    advice: Sequence[Change] = (),
+    subject: str = "",
+    view: LidarView | None = None,
 ) -> None:
-    """Write the forecast as a page (.html) or as its picture alone (.png)."""
+    """Write the forecast as a page (.html), of one object with what the lidar would show of it, or
+    as its picture alone (.png).
+    """
     image = picture_of(found)
     if path.suffix == ".png":
         content = image
     else:
         lines = words_of(found, subject)
+        lines += [view.words()] if view else []
         parts: list[Section | Picture] = [Section("", lines)]
+        if view:
+            parts.append(Picture("What the lidar would show", VIEW_CAPTION, view.picture()))
         if advice:
             parts.append(Section("What to change", [Bullets("", change_words(advice))]))
         parts += [

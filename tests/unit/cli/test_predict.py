@@ -4,7 +4,7 @@ import json
 from dataclasses import replace
 from itertools import product
 from pathlib import Path
-from typing import get_args
+from typing import Any, get_args
 
 import pytest
 from made_benches import make_bench
@@ -45,7 +45,27 @@ def test_predict_bench_takes_its_rig_and_an_object(
     found = json.loads(capsys.readouterr().out.splitlines()[-1])
     assert found["rig_checksum"] == load_bench(folder).rig.checksum
     assert found["object"] == "cup"
+    assert found["lidar"]["cells"] > 100
     assert main(["predict", "--bench", "bench", "paper-rig", "cup"]) == 2
+
+
+def test_predict_places_an_object_as_render_does(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    page = tmp_path / "cup.html"
+    words = ["predict", "paper-rig", "cup", "--quick", "--json", "--out", str(page)]
+    found: list[dict[str, Any]] = []
+    for placement in ([], ["--front-m", "0.1", "--size-m", "0.12", "--overwrite"]):
+        assert main([*words, *placement]) == 0
+        found.append(json.loads(capsys.readouterr().out.splitlines()[-1]))
+
+    assert found[1]["lidar"]["cells"] < found[0]["lidar"]["cells"]
+    assert "What the lidar would show" in page.read_text()
+
+
+def test_predict_refuses_a_placement_of_nothing(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["predict", "paper-rig", "--quick", "--x-m", "0.1"]) == 2
+    assert "--x-m: no OBJECT is named" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("columns", [60, 80, 100])

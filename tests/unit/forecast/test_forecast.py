@@ -10,6 +10,7 @@ from nlos_cam.errors import SceneError
 from nlos_cam.forecast import (
     Change,
     Forecast,
+    LidarView,
     Shape,
     change_words,
     forecast,
@@ -17,7 +18,8 @@ from nlos_cam.forecast import (
     shipped_prior,
     words_of,
 )
-from nlos_cam.objects import object_box
+from nlos_cam.forecast.lidar_view import SURE
+from nlos_cam.objects import benchmark_objects, object_box
 from nlos_cam.render import SensorModel
 
 HOME = load_rig("paper-rig")
@@ -167,3 +169,23 @@ def test_shipped_prior_is_small_and_positive() -> None:
 def test_rig_without_object_box_is_refused() -> None:
     with pytest.raises(SceneError, match="object_box"):
         forecast(HOME.model_copy(update={"object_box": None}))
+
+
+def test_lidar_shows_an_object_farther_than_the_wall_alone() -> None:
+    view = LidarView.of(HOME, benchmark_objects(object_box(HOME))[0].depth_m)
+    shown = np.abs(view.depth_change) >= SURE
+
+    assert view.cells >= shown.sum() > 500
+    assert (
+        view.depth_change[shown] > 0
+    ).all()  # three bounces are a longer way than the wall's own
+    assert view.typical_margin > SURE
+    assert "behind the wall" in view.words()
+
+
+def test_lidar_shows_nothing_of_nothing() -> None:
+    nothing = LidarView.of(HOME, np.full((64, 64), np.nan, np.float32))
+
+    assert nothing.cells == 0
+    assert nothing.typical_margin == 0
+    assert "nothing of it" in nothing.words()

@@ -378,6 +378,7 @@ def test_whole_run_in_the_small(tool: Tool, tmp_path: Path, monkeypatch: Patch) 
     gpu = tool("gpu_run")
     monkeypatch.setattr(gpu, "DIRECT_SHARE", 1e-9)  # two epochs
     monkeypatch.setattr(gpu, "TIMING_SHARE", 1.0)
+    monkeypatch.setattr(gpu, "OBJECTS", 200)  # else it renders beside everything that follows
     for name, text in RECIPES.items():
         (tmp_path / f"{name}.toml").write_text(text, encoding="utf-8")
     recipes = [
