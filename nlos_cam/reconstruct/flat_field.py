@@ -1,9 +1,10 @@
-"""Bare wall of a bench, cell by cell, and the correction of a frame's light by its reflectance.
+"""Bare wall of a bench, cell by cell, and the correction of a frame by it.
 
-No wall is uniform, and networks that were trained for a bench's own rig saw one that is. What a
-spot of the wall reflects scales all of its light: the direct return that leaves it, and the echo of
-three bounces that ends there. The bare wall's record holds it, so that it can be divided out, as
-alignment with another rig does.
+No wall is uniform and no lidar's range is, and networks that were trained for a bench's own rig saw
+both as ideal. What a spot of the wall reflects scales all of its light: the direct return that
+leaves it, and the echo of three bounces that ends there. By as much as a cell's range is off, by a
+ripple of the lidar, it is off for both. The bare wall's record holds the two, so that they can be
+taken out, as alignment with another rig does.
 """
 
 from dataclasses import replace
@@ -15,7 +16,7 @@ from nlos_calibration.arrays import Float32, Float64, Mask
 from nlos_cam.frames import MAP_COLUMNS, MAP_ROWS, LidarMaps
 from nlos_cam.reconstruct.bench import CalibratedRig
 from nlos_cam.reconstruct.physics_check import bare_rendering
-from nlos_cam.render import cast
+from nlos_cam.render import Sensor, SensorModel, cast
 
 SAME_SURFACE_M = 0.03
 """Largest difference of measured and calibrated depth at which a cell's reference is of what the rig
@@ -28,15 +29,18 @@ LARGEST = 4.0
 
 
 class FlatField:
-    """Correction of maps for the reflectance of the wall, as its record shows it.
+    """Correction of maps for the reflectance of the wall and the ripples of the lidar, as the bare
+    wall's record shows them.
 
-    The occluder's is taken out too: it tells nothing about what is hidden, but networks have seen
-    it as bright as the wall.
+    The occluder's reflectance is taken out too: it tells nothing about what is hidden, but networks
+    have seen it as bright as the wall.
     """
 
     def __init__(self, bench: CalibratedRig) -> None:
         self._factor: Float32 | None = None
         """(64, 80); light of a uniform bench over this one's, 1 where that is not known."""
+        self._farther_m: Float32 | None = None
+        """(64, 80); depth of this bench less that of an exact one, 0 where that is not known."""
         if bench.reference is None:
             return
         bare = bare_rendering(bench.rig)  # pyright: ignore[reportArgumentType]
@@ -52,11 +56,24 @@ class FlatField:
         factor = np.clip(ratio / np.median(ratio[wall]), 1 / LARGEST, LARGEST)
         self._factor = np.where(known, factor, 1).astype(np.float32)
 
+        # Against maps of the sensor, not the cells' middle beams: the median depth over a cell that
+        # sees the wall at a slant is up to 0.7 mm from that of its middle.
+        exact_m = Sensor(bench.rig, SensorModel()).maps(bare.multi, None).depth_m
+        measured_m = bench.reference.map_depth_m.astype(np.float64) + bench.range_offset_m
+        known &= np.isfinite(exact_m)
+        self._farther_m = np.where(known, measured_m - exact_m, 0).astype(np.float32)
+
     def correct(self, maps: LidarMaps) -> LidarMaps:
-        """Return maps (64, 80) as a uniform wall would give them."""
-        if self._factor is None:
+        """Return maps (64, 80), their range offset corrected, as an exact lidar would give them of a
+        uniform wall.
+        """
+        if self._factor is None or self._farther_m is None:
             return maps
-        return replace(maps, intensity=maps.intensity * self._factor)
+        return replace(
+            maps,
+            depth_m=maps.depth_m - self._farther_m,
+            intensity=maps.intensity * self._factor,
+        )
 
 
 def measured_counts(rig: Rig, reference: BareWall, offset_m: float) -> float | None:
