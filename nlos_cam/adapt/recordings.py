@@ -126,7 +126,11 @@ def write_parts(found: Recordings, folder: Path, tracked: data.Tracked) -> dict[
         frames = 1 if part == "judged" else data.FRAMES_PER_RECORDING
         with tracked(f"reading recordings ({part})") as on_progress:
             labelled = data.read_labelled(
-                found.part(part), wall=found.open_bench, frames=frames, on_progress=on_progress
+                found.part(part),
+                wall=found.open_bench,
+                frames=frames,
+                for_own_weights=True,
+                on_progress=on_progress,
             )
         data.write_shards(labelled, folder / part)
     return folders

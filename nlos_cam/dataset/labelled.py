@@ -24,7 +24,7 @@ from nlos_cam.dataset.shards import SHARD_PATTERN, shard_path, store
 from nlos_cam.errors import DiskFullError, RecordingError
 from nlos_cam.files import atomic_directory, read_toml
 from nlos_cam.frames import OBJECT_PIXELS, maps_from_frame
-from nlos_cam.reconstruct import CalibratedRig, open_bench
+from nlos_cam.reconstruct import CalibratedRig, OwnMaps, open_bench
 from nlos_cam.recording import ReplayCamera, Sidecar, load_sidecar, open_lidar_bag, sidecar_path
 from nlos_cam.render import HiddenObject, SceneFile
 
@@ -171,14 +171,16 @@ def read_labelled(
     known: KnownObjects = benchmark_depths,
     wall: OpenBench | Path | None = None,
     frames: int = FRAMES_PER_RECORDING,
+    for_own_weights: bool = False,
     on_progress: OnProgress = ignore,
 ) -> Labelled:
     """Return maps of `frames` frames spread evenly over each recording, with the truth of their
     labels.
 
     Maps are of single frames, as in `live`, so that each has noise of its own. They are corrected
-    by `wall`, a wall record or what opens the bench for a camera; without one the rig is the sidecars', or the paper's. Frames
-    without any return are left out. Raises RecordingError for a recording without a label, a truth
+    by `wall`, a wall record or what opens the bench for a camera: the range, and `for_own_weights`
+    of the bench all that `live` corrects for them. Without it the rig is the sidecars', or the
+    paper's. Frames without any return are left out. Raises RecordingError for a recording without a label, a truth
     or a frame, and for recordings of two benches.
     """
     parts: list[Labelled] = []
@@ -190,7 +192,7 @@ def read_labelled(
         return objects[rig.checksum]
 
     for path in recordings:
-        parts.append(_read(path, objects_on, wall, frames))
+        parts.append(_read(path, objects_on, wall, frames, for_own_weights=for_own_weights))
         one = parts[0].rig
         other = parts[-1].rig
         if one != other:
@@ -207,6 +209,8 @@ def _read(
     objects_on: Callable[[Rig], Mapping[str, Float32]],
     wall: OpenBench | Path | None,
     frames: int,
+    *,
+    for_own_weights: bool,
 ) -> Labelled:
     sidecar = load_sidecar(sidecar_path(path))
     if not sidecar.label:
@@ -219,7 +223,8 @@ def _read(
         bench = _bench(path, sidecar, wall, camera)
         truth_m = truth_depth_m(path, sidecar.label, bench.rig, objects_on(bench.rig))
         raw = (maps_from_frame(frame) for number, frame in enumerate(camera) if number in chosen)
-        maps = [bench.correct_range(one) for one in raw if one.valid.any()]
+        correct = OwnMaps(bench).correct if for_own_weights else bench.correct_range
+        maps = [correct(one) for one in raw if one.valid.any()]
     if not maps:
         raise RecordingError(
             f"{path} has no frame with any return: inspect it with `nlos-cam replay`"

@@ -11,6 +11,7 @@ __all__ = [
     "FrozenFrames",
     "MapAlignment",
     "OnWarning",
+    "OwnMaps",
     "PeriodicPhysicsCheck",
     "PhysicsCheck",
     "PhysicsCheckResult",
@@ -70,6 +71,7 @@ from .edge import EdgeRepair, edge_cells
 from .flat_field import measured_counts
 from .frame_reader import Arrival, FrameReader, ignore
 from .network import Clock, Quality, Reconstruction, estimate_uncertainty, reconstruct
+from .own_maps import OwnMaps
 from .physics_check import (
     UNEXPLAINED,
     PeriodicPhysicsCheck,

@@ -5,6 +5,7 @@ as written.
 import shutil
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 from unittest.mock import Mock
 
@@ -24,11 +25,13 @@ from nlos_cam.dataset.build import SHARD
 from nlos_cam.dataset.labelled import RECORDED, Labelled, benchmark_depths, spread, truth_depth_m
 from nlos_cam.dataset.shards import store
 from nlos_cam.errors import DiskFullError, NlosCamError, RecordingError, SceneError
-from nlos_cam.frames import maps_from_frame
+from nlos_cam.frames import LidarMaps, maps_from_frame
 from nlos_cam.objects import benchmark_objects as fixed_set
 from nlos_cam.objects import cell_centers_m, image_from_depth, object_box
+from nlos_cam.reconstruct import CalibratedRig, OwnMaps
 from nlos_cam.recording import ReplayCamera, SidecarFile, sidecar_path
 from nlos_cam.recording.sidecar import WallFile
+from nlos_cam.render import Scene, Sensor, SensorModel, render
 
 RIG = load_rig("paper-rig")
 BOX = object_box(RIG)
@@ -153,6 +156,26 @@ def test_read_labelled_corrects_by_wall_record(
     assert found.rig.name == "measured"
     np.testing.assert_allclose(found.maps.depth_m, plain.maps.depth_m + 0.004, atol=1e-6)
     np.testing.assert_array_equal(found.maps.intensity, plain.maps.intensity)
+
+
+def test_labelled_maps_for_own_weights_are_corrected_as_live_does(
+    labelled: Label, corrected: Path
+) -> None:
+    bench: Any = CalibratedRig(RIG)
+    bare = Sensor(RIG, SensorModel()).maps(render(Scene(RIG)).multi, None)
+    bench.reference = SimpleNamespace(
+        map_depth_m=bare.depth_m + np.float32(0.002), map_intensity=1.5 * bare.intensity
+    )
+    plain = read_labelled([labelled("b")], known=known, frames=2).maps
+
+    found = read_labelled(
+        [corrected], known=known, wall=lambda _: bench, frames=2, for_own_weights=True
+    ).maps
+
+    for depth_m, *raw in zip(found.depth_m, plain.depth_m, plain.intensity, strict=True):
+        maps = LidarMaps(*raw, ~np.isnan(raw[0]))
+        np.testing.assert_array_equal(depth_m, OwnMaps(bench).correct(maps).depth_m)
+    assert not np.array_equal(found.depth_m, plain.depth_m)
 
 
 def test_read_labelled_refuses_wall_record_of_another_size(

@@ -32,6 +32,7 @@ from nlos_cam.reconstruct import (
     FrameConditions,
     FrameReader,
     FrameResult,
+    OwnMaps,
     Pipeline,
     Verdict,
     build_pipeline,
@@ -47,7 +48,6 @@ from nlos_cam.reconstruct.bench import (
     subtract_reference,
 )
 from nlos_cam.reconstruct.consistency import COMPLETE, MapFindings, MapProblem
-from nlos_cam.reconstruct.flat_field import FlatField
 from nlos_cam.reconstruct.network import Quality, Uncertainty
 from nlos_cam.reconstruct.physics_check import PeriodicPhysicsCheck, PhysicsCheckResult
 from nlos_cam.reconstruct.pipeline import (
@@ -102,7 +102,7 @@ def test_pipeline_feeds_the_mean_of_raw_or_difference_maps(walled: CalibratedRig
     mean_m = np.mean([wall_frame(number).depth_m for number in range(2, 6)], axis=0)
     raw = replace(done[5].maps, depth_m=mean_m.astype(np.float32))
 
-    np.testing.assert_allclose(noting.given[5], FlatField(walled).correct(raw).depth_m, atol=1e-6)
+    np.testing.assert_allclose(noting.given[5], OwnMaps(walled).correct(raw).depth_m, atol=1e-6)
     np.testing.assert_allclose(noting.given[11], mean_m - walled.reference.map_depth_m, atol=1e-6)
     assert done[5].frame.frame_number == 5
     np.testing.assert_array_equal(done[5].difference.depth_m, noting.given[11])
@@ -120,8 +120,7 @@ def test_pipeline_adds_the_measured_offset_to_raw_maps(
     bench = CalibratedRig(RIG, replace(walled.measured, record=record))
     (step,) = all_steps(Pipeline(bench, noting), WallCamera(1))
 
-    moved = replace(step.maps, depth_m=step.maps.depth_m + np.float32(offset_m))
-    np.testing.assert_array_equal(noting.given[0], FlatField(bench).correct(moved).depth_m)
+    np.testing.assert_array_equal(noting.given[0], OwnMaps(bench).correct(step.maps).depth_m)
 
 
 def test_pipeline_watches_drift_in_the_frame_not_the_mean(walled: CalibratedRig) -> None:
@@ -279,7 +278,7 @@ def test_build_pipeline_feeds_the_networks_their_kind_of_maps(
 
     assert pipeline.network is network
 
-    flat = FlatField(walled).correct(done[0].maps)
+    flat = OwnMaps(walled).correct(done[0].maps)
     fed = {"raw maps": flat, "difference maps": done[0].difference}[eats]
 
     np.testing.assert_array_equal(network.given[0], fed.depth_m)
