@@ -80,8 +80,12 @@ def aligned_with(maps: MapSet, benches: Iterable[Rig], rig: Rig) -> tuple[MapSet
     mask of those that are left; and the benches' own intensities (n, 64, 80) behind them.
     """
     maps, seen, counts = align_samples(maps, benches, rig)
-    kept = MapSet(*(getattr(maps, name)[seen] for name in MAP_CHANNELS))
-    return kept, seen, counts[seen]
+    return kept_of(maps, seen), seen, counts[seen]
+
+
+def kept_of(maps: MapSet, kept: Mask) -> MapSet:
+    """Return the samples that a mask (n,) keeps."""
+    return MapSet(*(getattr(maps, name)[kept] for name in MAP_CHANNELS))
 
 
 class Packing:

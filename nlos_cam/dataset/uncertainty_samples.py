@@ -4,8 +4,9 @@ on disk.
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from hashlib import sha256
-from itertools import islice
+from itertools import compress, islice
 from pathlib import Path
 from typing import Self
 from zlib import crc32
@@ -13,7 +14,7 @@ from zlib import crc32
 import nlos_models as models
 import numpy as np
 from nlos_calibration import Rig
-from nlos_calibration.arrays import Float32
+from nlos_calibration.arrays import Float32, Mask
 from nlos_models.training import (
     MapSet,
     QualitySet,
@@ -27,7 +28,7 @@ from numpy.typing import NDArray
 from nlos_cam.dataset import outliers
 from nlos_cam.dataset.build import HELD_OUT_SEED, TRAINING_SEED
 from nlos_cam.dataset.packed import map_noise
-from nlos_cam.dataset.packing import aligned_with
+from nlos_cam.dataset.packing import aligned_with, kept_of
 from nlos_cam.dataset.plan import DatasetPlan
 from nlos_cam.dataset.reader import Dataset
 from nlos_cam.dataset.rig_range import RigRange
@@ -37,7 +38,7 @@ from nlos_cam.files import atomic_file, read_arrays
 from nlos_cam.frames import OBJECT_PIXELS, LidarMaps, maps_from_frame
 from nlos_cam.objects import CATEGORIES, image_from_depth
 from nlos_cam.reconstruct import grid_of
-from nlos_cam.render import Rendering, SensorModel, render
+from nlos_cam.render import Rendering, Scene, Sensor, SensorModel, render
 
 EMPTY = "empty"
 ORDINARY = "ordinary"
@@ -62,8 +63,12 @@ KINDS = {
     **outliers.HELD_OUT_OUTLIERS,
 }
 MIN_CELLS = 8
-"""Training leaves out outliers that change fewer cells of the maps: they hardly differ from an
-empty bench.
+"""Training leaves out objects that change fewer cells of the maps: they hardly differ from an empty
+bench, and called "not nothing" they would teach that an empty bench is not empty.
+"""
+MIN_VISIBLE = 16
+"""Fewest visible objects of a dataset that stand for all: on a bench that hides more, none is left
+out.
 """
 HELD_OUT_SHARE = 0.15
 """Held-out outliers and empty benches, relative to the number of training ones."""
@@ -300,10 +305,31 @@ def uncertainty_sets(
             on_progress=on_progress,
         )
         ordinary = first_of(dataset.arrays(), objects)
+        visible = visible_objects(ordinary, dataset)
+        benches = compress(dataset.benches(), visible)
+        ordinary = kept_of(ordinary, visible)
         if grid := grid_of(pipeline.record):
-            ordinary = aligned_with(ordinary, dataset.benches(), grid)[0]
+            ordinary = aligned_with(ordinary, benches, grid)[0]
         sets.append(_uncertainty_set(pipeline, ordinary, samples))
     return sets
+
+
+def visible_objects(maps: MapSet, dataset: Dataset) -> Mask:
+    """Return which objects (n,) of a dataset, of which these are the first maps, change MIN_CELLS
+    cells or more against their bench with nothing hidden; all where fewer than MIN_VISIBLE do.
+    """
+    cells: list[int] = []
+    for depth_m, rig in zip(maps.depth_m, islice(dataset.benches(), len(maps.image)), strict=True):
+        # The records are frozen, so hashable, which pyright does not see.
+        bare_m = _bare_depth_m(rig, dataset.plan.sensor)  # pyright: ignore[reportArgumentType]
+        cells.append(int(np.count_nonzero(np.abs(depth_m - bare_m) > BESIDE_M)))
+    visible = np.array(cells) >= MIN_CELLS
+    return visible if visible.sum() >= MIN_VISIBLE else np.ones(len(visible), np.bool_)
+
+
+@lru_cache(maxsize=1)
+def _bare_depth_m(rig: Rig, sensor: SensorModel) -> Float32:
+    return Sensor(rig, sensor).maps(render(Scene(rig)).multi, None).depth_m
 
 
 def quality_set(

@@ -4,13 +4,16 @@ cached and follow their seeds.
 
 from collections.abc import Callable
 from functools import cache
+from itertools import repeat
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 from unittest.mock import Mock
 
 import numpy as np
 import pytest
 from nlos_calibration import Rig, load_rig
+from nlos_models.training import MapSet
 from small_run import small_recipe
 
 from nlos_cam.dataset import (
@@ -33,19 +36,23 @@ from nlos_cam.dataset.outliers import (
 )
 from nlos_cam.dataset.plan import move_lidar
 from nlos_cam.dataset.uncertainty_samples import (
+    BESIDE_M,
     EMPTY,
     GENERIC,
+    MIN_CELLS,
+    MIN_VISIBLE,
     ORDINARY,
     SEEDS_PER_BENCH,
     Benches,
     UncertaintySamples,
     _stimulus,
     make_samples,
+    visible_objects,
 )
 from nlos_cam.objects import object_box
 from nlos_cam.reconstruct import WALL_GRID
 from nlos_cam.reconstruct.wall_grid import NUMBERS_COLUMN, numbers_column, rig_numbers
-from nlos_cam.render import SensorModel
+from nlos_cam.render import Scene, Sensor, SensorModel, render
 
 RIG = load_rig("paper-rig")
 SENSOR = SensorModel()
@@ -344,3 +351,29 @@ def test_samples_of_many_rigs_hold_the_numbers_of_their_records() -> None:
     assert len(samples) == 2
     wanted = numbers_column(rig_numbers(RigRange().draw(RIG, 0)))
     np.testing.assert_array_equal(samples.depth_m[0, :, NUMBERS_COLUMN], wanted)
+
+
+BARE = Sensor(RIG, SensorModel()).maps(render(Scene(RIG)).multi, None)
+
+
+def maps_with(changed: list[int]) -> Any:
+    """Maps of the empty bench, in which so many cells of each are farther, and their dataset."""
+    depth_m = np.stack([BARE.depth_m] * len(changed))
+    for one, count in zip(depth_m, changed, strict=True):
+        one.flat[:count] += np.float32(2 * BESIDE_M)
+    intensity = np.stack([BARE.intensity] * len(changed))
+    maps = MapSet(depth_m, intensity, np.zeros((len(changed), 64, 64), np.float16))
+    plan = SimpleNamespace(sensor=SensorModel())
+    return maps, SimpleNamespace(plan=plan, benches=lambda: repeat(RIG))
+
+
+def test_objects_that_change_hardly_a_cell_are_not_visible() -> None:
+    changed = [0, MIN_CELLS - 1, *[MIN_CELLS] * MIN_VISIBLE]
+
+    found = visible_objects(*maps_with(changed))
+
+    assert found.tolist() == [False, False, *[True] * MIN_VISIBLE]
+
+
+def test_bench_that_hides_nearly_all_objects_leaves_none_out() -> None:
+    assert visible_objects(*maps_with([0, 0, MIN_CELLS])).all()
