@@ -202,7 +202,7 @@ def epoch_seconds(log: Path) -> list[float]:
 
 def epochs_within(seconds: float, log: Path) -> int:
     """Return the epochs that fit, by those in a training log without the first, which starts
-    slowly: later ones too take up the objects that were rendered meanwhile.
+    slowly: later ones too take up the objects that were rendered while it ran.
     """
     if not (each := epoch_seconds(log)):
         raise SystemExit(f"{log} has no epoch: give more --minutes")
@@ -238,7 +238,7 @@ def join_parts(first: Path, out: Path) -> None:
 
 
 def train_direct(chosen: Namespace, clock: Clock, facts: Facts) -> int:
-    """Render, and train the direct network meanwhile; return the number of objects of its rig."""
+    """Render, and train the direct network beside it; return the number of objects of its rig."""
     out: Path = chosen.out
     held_out = out / "held-out"
     kinds = ANY_RIG if chosen.any_rig else ONE_RIG

@@ -12,8 +12,8 @@ from nlos_cam.report import figure_of, png
 
 EXPOSURES = 64
 """Exposures of the empty bench that a cell's noise is taken from: its error is 9 %."""
-LEAST_DEPTH_NOISE_M = DEPTH_UNIT_M / 12**0.5
-LEAST_LIGHT_NOISE = 0.05
+MIN_DEPTH_NOISE_M = DEPTH_UNIT_M / 12**0.5
+MIN_LIGHT_NOISE = 0.05
 """Smallest noise of a cell, of depth (its rounding) and of counts: a cell that has the same value in
 every exposure is not without any."""
 SURE = 5.0
@@ -55,8 +55,8 @@ class LidarView:
         )
         farther_m = one.depth_m - depths_m.mean(0)
         brighter = one.intensity - lights.mean(0)
-        depth_noise_m = np.maximum(depths_m.std(0), LEAST_DEPTH_NOISE_M)
-        light_noise = np.maximum(lights.std(0), LEAST_LIGHT_NOISE)
+        depth_noise_m = np.maximum(depths_m.std(0), MIN_DEPTH_NOISE_M)
+        light_noise = np.maximum(lights.std(0), MIN_LIGHT_NOISE)
         return cls(
             one.depth_m,
             one.intensity,

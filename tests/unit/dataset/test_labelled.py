@@ -158,9 +158,7 @@ def test_read_labelled_corrects_by_wall_record(
     np.testing.assert_array_equal(found.maps.intensity, plain.maps.intensity)
 
 
-def test_labelled_maps_for_own_weights_are_corrected_as_live_does(
-    labelled: Label, corrected: Path
-) -> None:
+def test_maps_for_own_weights_are_corrected_as_live_does(labelled: Label, corrected: Path) -> None:
     bench: Any = CalibratedRig(RIG)
     bare = Sensor(RIG, SensorModel()).maps(render(Scene(RIG)).multi, None)
     bench.reference = SimpleNamespace(
