@@ -3,7 +3,8 @@ follows.
 """
 
 from collections.abc import Collection
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from math import nan
 from typing import Literal
 
 from nlos_cam.errors import SceneError, UnknownNameError, did_you_mean
@@ -71,6 +72,17 @@ def decide(
 
 def _asked(findings: Collection[tuple[str, float, str]], effects: Collection[str]) -> Plan:
     """Return the plan with exactly some effects, each with its bound all the same."""
+    return tuple(
+        replace(verdict, reason=f"{verdict.reason}; {reason}", bound=bound)
+        for verdict, (_, bound, reason) in zip(requested(effects), findings, strict=True)
+    )
+
+
+def requested(effects: Collection[str]) -> Plan:
+    """Return the plan with exactly some effects, without a look at the scene: bounds are NaN.
+
+    Raises SceneError for an unknown name, or if no light arrives.
+    """
     names = {effects} if isinstance(effects, str) else set(effects)
     if unknown := names - set(EFFECTS):
         near = did_you_mean(min(unknown), EFFECTS)
@@ -82,8 +94,7 @@ def _asked(findings: Collection[tuple[str, float, str]], effects: Collection[str
             f"effects {', '.join(sorted(names)) or 'none'}: no light arrives: add direct or"
             " three-bounce"
         )
-    verdicts: list[Effect] = []
-    for name, bound, reason in findings:
-        why = "requested" if name in names else "left out on request"
-        verdicts.append(Effect(name, name in names, f"{why}; {reason}", bound))
-    return tuple(verdicts)
+    return tuple(
+        Effect(name, name in names, "requested" if name in names else "left out on request", nan)
+        for name in EFFECTS
+    )

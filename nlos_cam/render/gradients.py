@@ -172,7 +172,8 @@ class Gradients:
         if isinstance(scene, RenderProblem):
             problem = scene
         else:
-            problem = prepare(scene, replace(accuracy_named(accuracy), finest_cells=0), effects)
+            exact = replace(accuracy_named(accuracy), finest_cells=0)
+            problem = prepare(scene, exact, effects, bounded=False)
         self.problem = problem
         beams = problem.beams
         if missing := sorted({effect.name for effect in problem.plan if effect.included} - COVERED):

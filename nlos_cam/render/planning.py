@@ -14,7 +14,7 @@ from nlos_cam.errors import SceneError
 from nlos_cam.frames import MAP_ROWS
 from nlos_cam.render.accuracy import Accuracy
 from nlos_cam.render.echoes import pulse_bins
-from nlos_cam.render.effects import Effects, Plan, decide, included
+from nlos_cam.render.effects import Effects, Plan, decide, included, requested
 from nlos_cam.render.energy_survey import CAUTION, occluder_meets, shaded
 from nlos_cam.render.geometry import (
     NO_OCCLUDER,
@@ -226,12 +226,20 @@ class RenderProblem:
         return included(self.plan, effect)
 
 
-def prepare(scene: Scene, accuracy: Accuracy, effects: Effects = "auto") -> RenderProblem:
+def prepare(
+    scene: Scene, accuracy: Accuracy, effects: Effects = "auto", *, bounded: bool = True
+) -> RenderProblem:
     """Return the render problem of a scene with the effects that it calls for, or exactly those
     named.
+
+    Bounds of named effects can take longer than the transport; without `bounded` they are NaN.
     """
     facts = SceneFacts(scene, accuracy)
-    return RenderProblem.of(facts, plan(facts, effects))
+    if bounded or effects == "auto":
+        verdicts = plan(facts, effects)
+    else:
+        verdicts = requested(effects)
+    return RenderProblem.of(facts, verdicts)
 
 
 def _job(

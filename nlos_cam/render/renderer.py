@@ -118,7 +118,7 @@ def transient(
     With beams_per_cell k they are (64 k, 80 k, bins); with the color effect a channel axis (3)
     follows.
     """
-    problem = prepare(scene, accuracy_named(accuracy), effects)
+    problem = prepare(scene, accuracy_named(accuracy), effects, bounded=False)
     jobs = problem.color_jobs or (problem.job,)
     parts = [_waveforms(problem, beam_histograms(problem, job, backend)) for job in jobs]
     shaped = [part.reshape(*problem.beams.shape, -1) for part in parts]
@@ -171,7 +171,7 @@ def three_bounce(
     """Return the three-bounce histograms (n, bins) alone, of chosen beams (flat indices) or of
     all.
     """
-    problem = prepare(scene, accuracy_named(accuracy), effects)
+    problem = prepare(scene, accuracy_named(accuracy), effects, bounded=False)
     return beam_histograms(problem, problem.job, backend, chosen)
 
 
