@@ -69,8 +69,8 @@ def reconstruct(
         typer.Option(
             "--weights",
             help=(
-                "Folder of weights, direct, wide or paper; repeat to compare (default: direct and"
-                " paper)."
+                "Folder of weights, direct, wide or paper, each measured on its own rig; repeat to"
+                " compare (default: direct and paper)."
             ),
         ),
     ] = None,
@@ -78,7 +78,9 @@ def reconstruct(
     overwrite: common.Overwrite = False,
     json: common.Json = False,
 ) -> None:
-    """Measure both networks, with 1 to 64 averaged frames, on the test objects (about a minute)."""
+    """Measure networks, with 1 to 64 averaged frames, on the test objects and on kinds never seen
+    (two minutes).
+    """
     folder = common.output_path(out, "tradeoff", "", overwrite=overwrite)
     networks = {str(path): path for path in weights} if weights else measure.NETWORKS
     rows: list[measure.ReconstructRow] = []
@@ -89,7 +91,7 @@ def reconstruct(
         )
     asked = measure.reconstruct_settings(bench.networks)
     interrupted = _collect(measure.measure_reconstructions(asked, bench), rows, len(asked))
-    table = measure.reconstruct_facts(rows, len(asked), len(bench.truth), measure.machine())
+    table = measure.reconstruct_facts(rows, len(asked), bench.objects, measure.machine())
     if rows:
         measure.write_reconstructions(folder, table, rows)
     _finish(table, folder, len(rows), len(asked), as_json=json, interrupted=interrupted)

@@ -1,4 +1,5 @@
-"""Trade-off of accuracy against time in reconstruction: both networks, and averaged frames.
+"""Trade-off of accuracy against time in reconstruction: networks, each on the bench it was trained
+for, and averaged frames; kinds of training and kinds never seen.
 
 Number formats, runtimes and threads were measured too, and are not worth a choice: a decision
 record says what they gave. All settings here run as in `live`: ONNX Runtime, on one thread.
@@ -8,24 +9,24 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import nlos_models as models
 import numpy as np
 from nlos_calibration import ObjectBox, Rig, rig_named
 from nlos_calibration.arrays import Float32
+from nlos_models.training import MapSet
 
 from nlos_cam.camera import FRAMES_PER_S
 from nlos_cam.dataset import TEST_SEED
 from nlos_cam.errors import SceneError
 from nlos_cam.evaluate import subjects
 from nlos_cam.evaluate.figures import LABELS
-from nlos_cam.evaluate.metrics import SMALLER_IS_BETTER, TARGETS, Figures, judge, plain
+from nlos_cam.evaluate.metrics import SMALLER_IS_BETTER, TARGETS, Figures, Interval, judge, plain
 from nlos_cam.evaluate.render_tradeoff import INCOMPLETE, undominated, write_table
 from nlos_cam.files import atomic_directory
-from nlos_cam.frames import LidarMaps
-from nlos_cam.objects import benchmark_objects, object_box
-from nlos_cam.render import MultiBounce
+from nlos_cam.objects import benchmark_objects, object_box, unseen_objects
+from nlos_cam.render import MultiBounce, paper_scene
 from nlos_cam.report import (
     Banner,
     Bullets,
@@ -37,6 +38,9 @@ from nlos_cam.report import (
     figure_of,
     saved_picture,
 )
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 NETWORKS: Mapping[str, Path | None] = {"direct": Path("direct"), "paper": Path("paper")}
 """Weights that are compared if none are named."""
@@ -63,6 +67,8 @@ class ReconstructSetting:
     runtime: str
     frames: int
     """Frames averaged, as by `live --average`."""
+    rig: str
+    """On which it is measured: the one that the weights were trained for."""
 
 
 @dataclass(frozen=True)
@@ -74,6 +80,9 @@ class ReconstructRow:
     """Median time of one call on one object's maps."""
     milliseconds_p90: float
     figures: Figures
+    """On the kinds of training."""
+    unseen: Figures
+    """On kinds never seen."""
 
     @property
     def wait_ms(self) -> float:
@@ -82,15 +91,50 @@ class ReconstructRow:
 
 
 @dataclass(frozen=True)
-class ReconstructBench:
-    """Networks, and objects with their echoes, on which every setting is measured."""
+class ObjectSet:
+    """Objects on a rig, with their echoes."""
 
-    networks: Mapping[str, models.Reconstructor]
     rig: Rig
     box: ObjectBox
     truth: Float32
     """(n, 64, 64) in v."""
     echoes: list[MultiBounce]
+
+    @classmethod
+    def of(
+        cls, objects: Sequence[subjects.Subject], rig: Rig, tracked: subjects.Tracked
+    ) -> "ObjectSet":
+        """Render objects on a rig."""
+        box = object_box(rig)
+        with tracked(f"rendering on {rig.name}") as on_progress:
+            echoes = subjects.echoes_of(objects, rig, on_progress)
+        return cls(rig, box, subjects.truth_of(objects, box), echoes)
+
+    def maps(self, frames: int) -> MapSet:
+        """Return maps averaged over frames, as `live` forms them."""
+        sensed = subjects.sense(self.echoes, self.rig, frames=frames)
+        return subjects.as_map_set(sensed, self.truth)
+
+
+class BothSets(NamedTuple):
+    """Both sets of objects on one rig."""
+
+    kinds: ObjectSet
+    unseen: ObjectSet
+
+
+@dataclass(frozen=True)
+class ReconstructBench:
+    """Networks, and objects with their echoes, on which every setting is measured."""
+
+    networks: Mapping[str, models.Reconstructor]
+    sets: Mapping[str, BothSets]
+    """By the name of the weights, on the rig that they were trained for."""
+
+    @property
+    def objects(self) -> int:
+        """Return the number of objects of the kinds of training."""
+        return max(len(sets.kinds.truth) for sets in self.sets.values())
 
 
 def open_reconstruct_bench(
@@ -99,38 +143,39 @@ def open_reconstruct_bench(
     count: int | None = None,
     tracked: subjects.Tracked = subjects.untracked,
 ) -> ReconstructBench:
-    """Load networks, and render the 54 test objects, or `count` random ones, on their rig.
+    """Load networks, and render the 54 test objects, or `count` random ones, and as many of kinds
+    never seen on the rig of each.
 
-    Raises SceneError if the weights are for different rigs or expect difference maps,
-    CheckpointError for color.
+    Raises SceneError if weights expect difference maps, CheckpointError for color.
     """
     networks = {name: models.load_reconstructor(folder, cache) for name, folder in weights.items()}
-    rigs = {network.record.rig_name for network in networks.values()}
-    if len(rigs) > 1:
-        raise SceneError(
-            f"the weights are for different rigs ({', '.join(sorted(rigs))}): compare weights of"
-            " one rig"
-        )
     inputs = {network.record.input for network in networks.values()} - {"raw maps"}
     if inputs:
         raise SceneError(
             f"the weights expect {inputs.pop()} but the test maps are raw: use weights for raw maps"
         )
 
-    rig = rig_named(rigs.pop())
+    rigs = {name: network.record.rig_name for name, network in networks.items()}
+    rendered = {name: _both_sets(rig_named(name), count, tracked) for name in set(rigs.values())}
+    return ReconstructBench(networks, {name: rendered[rig] for name, rig in rigs.items()})
+
+
+def _both_sets(rig: Rig, count: int | None, tracked: subjects.Tracked) -> BothSets:
     box = object_box(rig)
-    objects = subjects.seeded_objects(TEST_SEED, count, box) if count else benchmark_objects(box)
-    truth = subjects.truth_of(objects, box)
-    with tracked("rendering") as on_progress:
-        echoes = subjects.echoes_of(objects, rig, on_progress)
-    return ReconstructBench(networks, rig, box, truth, echoes)
+    kinds = subjects.seeded_objects(TEST_SEED, count, box) if count else benchmark_objects(box)
+    unseen = unseen_objects(box)[:count]
+    return BothSets(ObjectSet.of(kinds, rig, tracked), ObjectSet.of(unseen, rig, tracked))
 
 
 def reconstruct_settings(networks: Mapping[str, models.Reconstructor]) -> list[ReconstructSetting]:
     """Return all settings to measure, the quickest to wait for first."""
     return [
         ReconstructSetting(
-            f"{name}, {frames} frame{'s' * (frames > 1)}", name, network.runtime, frames
+            f"{name}, {frames} frame{'s' * (frames > 1)}",
+            name,
+            network.runtime,
+            frames,
+            network.record.rig_name,
         )
         for frames in FRAMES
         for name, network in networks.items()
@@ -143,33 +188,47 @@ def measure_reconstructions(
     clock: Clock = time.perf_counter,
 ) -> Iterator[ReconstructRow]:
     """Measure each setting and yield its row."""
-    maps: dict[int, list[LidarMaps]] = {}
+    # both networks of a rig see the same maps
+    maps: dict[tuple[str, int], tuple[MapSet, MapSet]] = {}
     for setting in asked:
-        frames = setting.frames
-        if frames not in maps:
-            maps = {frames: subjects.sense(bench.echoes, bench.rig, frames=frames)}
+        sets = bench.sets[setting.weights]
+        key = sets.kinds.rig.name, setting.frames
+        if key not in maps:
+            maps = {one: both for one, both in maps.items() if one[1] == setting.frames}
+            maps[key] = sets.kinds.maps(setting.frames), sets.unseen.maps(setting.frames)
+        kinds, unseen = maps[key]
         network = bench.networks[setting.weights]
-        image, seconds = _timed(network, maps[frames], bench.truth, clock)
+        images, seconds = _timed(network, kinds, clock)
         middle, late = 1000 * np.quantile(seconds, [0.5, 0.9])
-        figures = judge(image, bench.truth, bench.box)
-        yield ReconstructRow(setting, float(middle), float(late), figures)
+        yield ReconstructRow(
+            setting,
+            float(middle),
+            float(late),
+            judge(images, sets.kinds.truth, sets.kinds.box),
+            judge(_answers(network, unseen), sets.unseen.truth, sets.unseen.box),
+        )
 
 
 def _timed(
-    network: models.Reconstructor, maps: Sequence[LidarMaps], truth: Float32, clock: Clock
+    network: models.Reconstructor, maps: MapSet, clock: Clock
 ) -> tuple[Float32, list[float]]:
     """Return images of all maps and the seconds of every call but the first, which allocates."""
-    both = subjects.as_map_set(maps, truth)
-    network(both.depth_m[:1], both.intensity[:1])
+    network(maps.depth_m[:1], maps.intensity[:1])
     images: list[Float32] = []
     seconds: list[float] = []
-    for _ in range(-(-MIN_CALLS // len(truth))):
+    for _ in range(-(-MIN_CALLS // len(maps.image))):
         images.clear()
-        for depth_m, intensity in zip(both.depth_m, both.intensity, strict=True):
+        for depth_m, intensity in zip(maps.depth_m, maps.intensity, strict=True):
             start_s = clock()
             images.append(network(depth_m[None], intensity[None]))
             seconds.append(clock() - start_s)
     return np.concatenate(images), seconds
+
+
+def _answers(network: models.Reconstructor, maps: MapSet) -> Float32:
+    """Return the images of all maps, one object at a time."""
+    pairs = zip(maps.depth_m, maps.intensity, strict=True)
+    return np.concatenate([network(depth_m[None], intensity[None]) for depth_m, intensity in pairs])
 
 
 def losses(row: ReconstructRow, base: ReconstructRow) -> dict[str, float]:
@@ -222,13 +281,15 @@ HEAD = (
     "p90",
     "wait for frames, ms",
     *LABELS.values(),
+    f"{LABELS['silhouette_iou']}, kinds never seen",
     "loses accuracy",
 )
 NOTES = (
-    "Times are of one call on one object's maps: medians over all objects, after a first call that"
-    " is not counted; they are from this machine and run. More frames cost no network time: their"
-    ' maps are averaged while the next arrive, and the picture is as old as the wait. "Loses'
-    ' accuracy": worse than the most accurate row by more than any of'
+    "Each network is measured on the rig that it was trained for. Times are of one call on one"
+    " object's maps: medians over all objects, after a first call that is not counted; they are"
+    " from this machine and run. More frames cost no network time: their maps are averaged while"
+    ' the next arrive, and the picture is as old as the wait. "Loses accuracy": worse than the most'
+    " accurate row by more than any of"
     f" {', '.join(f'{least:g} of {LABELS[name]}' for name, least in AS_GOOD.items())}."
 )
 PLOT_CAPTION = "Upper left is better: a larger IoU, sooner. Lines: 95 % intervals over objects."
@@ -250,6 +311,7 @@ def reconstruct_facts(
                 "milliseconds_p90": row.milliseconds_p90,
                 "wait_ms": row.wait_ms,
                 **plain(row.figures),
+                "unseen": plain(row.unseen),
                 "loses_accuracy": loses_accuracy(row, most_accurate(rows)),
             }
             for row in rows
@@ -275,8 +337,9 @@ def reconstruct_document(table: Mapping[str, Any], folder: Path | None = None) -
             f"Recommended: {pick['name']}",
             "The first setting that is as good as the most accurate one.",
         )
+        camera = " sim" * (row["rig"] == paper_scene().rig.name)
         commands.insert(
-            0, f"nlos-cam live sim --weights {row['weights']} --average {row['frames']}"
+            0, f"nlos-cam live{camera} --weights {row['weights']} --average {row['frames']}"
         )
     parts: list[Section | Picture] = [
         Section("", [banner, Bullets("Note", [] if table["complete"] else [INCOMPLETE])]),
@@ -292,6 +355,7 @@ def reconstruct_document(table: Mapping[str, Any], folder: Path | None = None) -
 
 def _line(row: Mapping[str, Any]) -> tuple[str, ...]:
     metrics = [_short(row[name]["value"]) for name in TARGETS]
+    metrics.append(_short(row["unseen"]["silhouette_iou"]["value"]))
     times = f"{row['milliseconds']:.1f}", f"{row['milliseconds_p90']:.1f}", f"{row['wait_ms']:.0f}"
     return row["name"], *times, *metrics, "yes" if row["loses_accuracy"] else "no"
 
@@ -312,26 +376,35 @@ def write_reconstructions(
 
 
 def draw_reconstructions(path: Path, rows: Sequence[ReconstructRow]) -> None:
-    """Draw silhouette IoU against the time from the first frame to the picture."""
-    figure = figure_of(9, 5.5)
-    axis = figure.subplots()
+    """Draw silhouette IoU against the time from the first frame to the picture, for both sets."""
+    figure = figure_of(12, 5.5)
+    kinds, unseen = figure.subplots(1, 2, sharey=True)
     for weights in dict.fromkeys(row.setting.weights for row in rows):
         own = [row for row in rows if row.setting.weights == weights]
-        times_ms = [_ready_ms(row) for row in own]
-        (line,) = axis.plot(times_ms, [_overlap(row) for row in own], "o-", label=weights)
-        for time_ms, row in zip(times_ms, own, strict=True):
-            iou = row.figures["silhouette_iou"]
-            low = iou.low or 0.0
-            high = iou.high or 0.0
-            axis.plot([time_ms, time_ms], [low, high], color=line.get_color(), alpha=0.35)
-            words = f"{row.setting.frames} frame{'s' * (row.setting.frames > 1)}"
-            place = (time_ms, _overlap(row))
-            axis.annotate(words, place, (4, 4), textcoords="offset points", fontsize=8)
-    axis.set(
-        xscale="log",
-        xlabel="milliseconds from the first frame to the picture (log)",
-        ylabel="silhouette IoU, 95 % interval over objects",
-    )
-    axis.grid(alpha=0.3)
-    axis.legend()
+        for axis, part in (
+            (kinds, [row.figures for row in own]),
+            (unseen, [row.unseen for row in own]),
+        ):
+            iou = [figures["silhouette_iou"] for figures in part]
+            _draw_line(axis, weights, own, iou)
+    kinds.set(title="kinds of training", ylabel="silhouette IoU, 95 % interval over objects")
+    unseen.set(title="kinds never seen")
+    for axis in (kinds, unseen):
+        axis.set(xscale="log", xlabel="milliseconds from the first frame to the picture (log)")
+        axis.grid(alpha=0.3)
+    kinds.legend()
     figure.savefig(path, dpi=100)
+
+
+def _draw_line(
+    axis: "Axes", weights: str, rows: Sequence[ReconstructRow], iou: Sequence[Interval]
+) -> None:
+    """Draw one network's values over the time, with their intervals."""
+    times_ms = [_ready_ms(row) for row in rows]
+    values = [each.value or 0.0 for each in iou]
+    (line,) = axis.plot(times_ms, values, "o-", label=weights)
+    for time_ms, row, value, each in zip(times_ms, rows, values, iou, strict=True):
+        ends = [each.low or 0.0, each.high or 0.0]
+        axis.plot([time_ms, time_ms], ends, color=line.get_color(), alpha=0.35)
+        words = f"{row.setting.frames} frame{'s' * (row.setting.frames > 1)}"
+        axis.annotate(words, (time_ms, value), (4, 4), textcoords="offset points", fontsize=8)

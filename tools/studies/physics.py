@@ -3,24 +3,25 @@ docs/figures/physics.json and docs/images/physics.png.
 
     python tools/studies/physics.py WORK [--objects N] [--sets NAMES ...] [--out DIR]
 
-The schedule is fixed: two test objects of each set were seen while this was written, for mistakes of
-the code, and no setting was chosen on them. Objects: the 54 of the kinds of training
-and the 54 of kinds never seen, maps of FRAMES averaged frames as `live` forms them, from one place
-(home), two (home and near) and four. Outline and depth over 32 x 32 cells, started from the shipped
-network's answer at home. Three ways:
+Objects: the 54 of the kinds of training and the 54 of kinds never seen, maps of FRAMES averaged frames
+as `live` forms them, from one place (home), two (home and near) and four. Outline and depth over 32 x
+32 cells, started from the shipped network's answer at home. Three ways:
 
 - "gauss-newton": outline and depth together in the principal components of the forecast's prior, its
-  mean and covariance as the prior, the steps of SCHEDULE, the model rendered anew before each (tilt and
-  self-occlusion in it); intensity and path of every cell that is an echo in data and model.
+  mean and covariance as the prior, the damped steps of SCHEDULE, the model rendered anew before each
+  (tilt and self-occlusion in it); intensity and path of every cell that is an echo in data and model.
 - "network in the loop": the same steps, with the network's answer as the prior's mean and a share of
-  the covariance. Before each step the network answers again, to the maps plus the model's residual.
-- "lifted": each cell a mixture over LAYERS of depth, patches that face the wall and hide nothing.
-  Linear in the mixture, so convex: the light of each echo at its measured path, the prior on the
-  outline, at most one prior depth for each cell, no negative albedo.
+  the covariance. After each step the network answers again, to the maps plus the model's residual.
+- "lifted": each cell a mixture over LAYERS of depth. Linear in the mixture, so convex: the light of
+  each echo at its measured path, the network's answer as the prior's mean, no negative albedo. Patches
+  face the wall and hide nothing; the renderer's light of the network's answer, tilt and self-occlusion
+  in it, corrects each beam.
 
 How far the model is trusted, the share of the covariance and the weight of the depth's prior are
-chosen by the IoU of TUNING other objects, seen from home and near. WORK keeps the figures of each
-object: a second call goes on.
+chosen by the IoU of TUNING other objects, seen from home and near. Of the first two ways the figures
+hold what the estimate, its start and the truth leave of the light ("cost", of one echo): a truth that
+costs more than the estimate says that the light and the model do not tell them apart, one that costs
+less that the search has not found it. WORK keeps the figures of each object: a second call goes on.
 """
 
 import json
@@ -73,19 +74,33 @@ from nlos_cam.render import (
 SETS = "home", "home+near", "home+near+back+fore"
 WAYS = "network", "gauss-newton", "network in the loop", "lifted"
 FRAMES = 30
-SCHEDULE = 4.0, 2.0, 1.0, 1.0, 1.0
+SCHEDULE = (4.0, 4.0, 2.0, 2.0, *[1.0] * 6)
 """Steps, by how much looser than at the end the model's light is trusted."""
-STEPS = 1.0, 0.5, 0.25
-"""Shares of a Gauss-Newton step to try: outlines are cut off at 0 and 1, which it does not know."""
+DAMPING = 1.0
+"""At first, as a multiple of the prior's precision: a step is not to leave what the linear model
+holds for."""
+RELAXED = 4.0
+"""Factor by which damping falls after a step that improves."""
+TIGHTENED = 5.0
+"""Factor by which it rises after one that does not."""
+MAX_DAMPING = 1e5
+TRIES = 5
+"""Of one step."""
 TUNING = 12
 TUNING_SEED = 96_000_000
 TUNED_ON = "home+near"
-TRUSTS = 0.05, 0.1, 0.2
+TRUSTS = 0.1, 0.2, 0.4
 """Errors of the model relative to the light to choose from."""
-SHARES = 0.03, 0.1, 0.3
+LOOSE_TRUSTS = 0.1, 0.3, 1.0
+"""Of the lifted form."""
+SHARES = 0.1, 0.3
 """Of the prior's covariance about the network's answer."""
-WEIGHTS = 0.03, 0.3, 3.0
+WEIGHTS = 0.1, 1.0
 """Of the depth's prior in the lifted form."""
+DEPTH_STD = 0.1
+"""Deviation of the network's depth in the lifted form, of the box's depth."""
+MAX_CORRECTION = 3.0
+"""Of a beam's light by tilt and self-occlusion, from the median of all."""
 PATH_ERROR_M = 0.01
 MAX_OFF = 3.0
 """Largest residual of a path, in units of PATH_ERROR_M."""
@@ -133,6 +148,15 @@ class State:
     depth: Float64
     """(GRID^2,); share of the box's depth."""
 
+    @classmethod
+    def of(cls, surface: Mask, depth_m: Float32) -> Self:
+        """Return a depth map and where it is a surface in these cells."""
+        shape = Shape.of(depth_m, object_box(load_rig("paper-rig")))
+        outline = cv2.resize(
+            surface.astype(np.float32), shape.depth.shape, interpolation=cv2.INTER_AREA
+        )
+        return cls(outline.ravel().astype(np.float64), shape.depth.ravel())
+
     def shape(self) -> Shape:
         """Return it as the model takes it."""
         side = int(np.sqrt(len(self.outline)))
@@ -145,8 +169,8 @@ class Choice:
     """Settings of the three ways, chosen on other objects."""
 
     trust: float = TRUSTS[1]
-    share: float = SHARES[1]
-    weight: float = WEIGHTS[1]
+    share: float = SHARES[0]
+    weight: float = WEIGHTS[0]
 
 
 @dataclass(frozen=True)
@@ -188,11 +212,7 @@ def network_state(answer: Answer) -> State:
     """Return a network's answer (one image) in the cells of the forecast."""
     surface = answer.image[0] > 0 if answer.surface is None else answer.surface[0]
     box = object_box(load_rig("paper-rig"))
-    shape = Shape.of(depth_from_image(answer.image[0], box), box)
-    outline = cv2.resize(
-        surface.astype(np.float32), shape.depth.shape, interpolation=cv2.INTER_AREA
-    )
-    return State(outline.ravel().astype(np.float64), shape.depth.ravel())
+    return State.of(surface, depth_from_image(answer.image[0], box))
 
 
 @dataclass(frozen=True)
@@ -300,18 +320,21 @@ class Estimate:
         return float(left)
 
 
-def improved(estimate: Estimate, prior: Prior, trust: float) -> Estimate:
-    """Return the estimate after a Gauss-Newton step towards the most probable one, halved until it
-    is more probable than before; the same one if no step is.
+def improved(
+    estimate: Estimate, prior: Prior, trust: float, damping: float
+) -> tuple[Estimate, float]:
+    """Return the estimate after a damped Gauss-Newton step towards the most probable one, and the
+    damping of the next; the same estimate if no step makes it more probable.
     """
     basis = shipped_basis()
     count = basis.outline.shape[1]
     here = prior.components(estimate.state)
     places = len(estimate.models)
-    information = np.zeros((len(here) + places, len(here) + places))
-    information[: len(here), : len(here)] = prior.precision
-    information[len(here) :, len(here) :] = np.eye(places) / GAIN_ERROR**2
-    told = -information @ np.concatenate([here, estimate.gains])
+    precision = np.zeros((len(here) + places, len(here) + places))
+    precision[: len(here), : len(here)] = prior.precision
+    precision[len(here) :, len(here) :] = np.eye(places) / GAIN_ERROR**2
+    information = precision.copy()
+    told = -precision @ np.concatenate([here, estimate.gains])
     for place, (model, gain) in enumerate(zip(estimate.models, estimate.gains, strict=True)):
         off, rates, by_gain = model.rows(trust, gain)
         column = np.zeros((len(off), places))
@@ -319,44 +342,62 @@ def improved(estimate: Estimate, prior: Prior, trust: float) -> Estimate:
         rates = np.hstack([rates, column])
         information += rates.T @ rates
         told += rates.T @ off
-    change = np.linalg.solve(information, told)
+
     before = estimate.cost(prior, trust)
-    for share in STEPS:
-        outline = estimate.state.outline + share * basis.outline @ change[:count]
-        depth = estimate.state.depth + share * basis.depth @ change[count : len(here)]
+    for _ in range(TRIES):
+        change = np.linalg.solve(information + damping * precision, told)
+        outline = estimate.state.outline + basis.outline @ change[:count]
+        depth = estimate.state.depth + basis.depth @ change[count : len(here)]
         state = State(np.clip(outline, -0.1, 1.1), depth)
         models = [Model.of(model.seen, state) for model in estimate.models]
-        found = Estimate(state, models, estimate.gains + share * change[len(here) :])
+        found = Estimate(state, models, estimate.gains + change[len(here) :])
         if found.cost(prior, trust) < before:
-            return found
-    return estimate
+            return found, damping / RELAXED
+        damping *= TIGHTENED
+    return estimate, damping
+
+
+def estimated(seen: Sequence[Seen], state: State) -> Estimate:
+    """Return a state with its models."""
+    return Estimate(state, [Model.of(each, state) for each in seen], np.zeros(len(seen)))
 
 
 def started(seen: Sequence[Seen]) -> Estimate:
     """Return the network's answer as an estimate."""
-    state = network_state(answer_to(seen[0].maps))
-    return Estimate(state, [Model.of(each, state) for each in seen], np.zeros(len(seen)))
+    return estimated(seen, network_state(answer_to(seen[0].maps)))
 
 
-def by_gauss_newton(seen: Sequence[Seen], choice: Choice) -> State:
+def by_gauss_newton(seen: Sequence[Seen], choice: Choice) -> Estimate:
     """Return outline and depth under the forecast's prior."""
-    basis = shipped_basis()
-    prior = Prior(State(basis.mean_outline, basis.mean_depth), basis.precision)
+    prior = forecast_prior()
     estimate = started(seen)
+    damping = DAMPING
     for looser in SCHEDULE:
-        estimate = improved(estimate, prior, looser * choice.trust)
-    return estimate.state
+        estimate, damping = improved(estimate, prior, looser * choice.trust, damping)
+        if damping > MAX_DAMPING:
+            break
+    return estimate
 
 
-def by_network_in_the_loop(seen: Sequence[Seen], choice: Choice) -> State:
+def forecast_prior() -> Prior:
+    """Return mean and covariance of the training generators' objects."""
+    basis = shipped_basis()
+    return Prior(State(basis.mean_outline, basis.mean_depth), basis.precision)
+
+
+def by_network_in_the_loop(seen: Sequence[Seen], choice: Choice) -> Estimate:
     """Return outline and depth about the network's answers to corrected maps."""
     precision = shipped_basis().precision / choice.share
     estimate = started(seen)
     mean = estimate.state
+    damping = DAMPING
     for looser in SCHEDULE:
-        estimate = improved(estimate, Prior(mean, precision), looser * choice.trust)
+        prior = Prior(mean, precision)
+        estimate, damping = improved(estimate, prior, looser * choice.trust, damping)
+        if damping > MAX_DAMPING:
+            break
         mean = network_state(answer_to(corrected(seen[0], estimate.models[0].every)))
-    return estimate.state
+    return estimate
 
 
 def corrected(seen: Seen, model: Gradients) -> LidarMaps:
@@ -472,32 +513,35 @@ def after_the_patch(waves: Float32, first_m: Float64, bin_m: float, bins: int) -
 
 
 def by_lifting(seen: Sequence[Seen], choice: Choice, dictionaries: Sequence[Dictionary]) -> State:
-    """Return outline and depth of the mixture that explains the echoes best, under the prior."""
+    """Return outline and depth of the mixture that explains the echoes best, about the network's
+    answer.
+    """
     basis = shipped_basis()
     box = object_box(seen[0].rig)
     side, layers_m = voxels_of(box)
+    share = (layers_m - box.z_near_m) / (box.z_far_m - box.z_near_m)
+    start = started(seen)
+    mixed = mixture_of(start.state, share)
     rows = list[Float32]()
     wanted = list[Float64]()
-    for each, dictionary in zip(seen, dictionaries, strict=True):
+    for model, dictionary in zip(start.models, dictionaries, strict=True):
+        each = model.seen
         echo = each.echo.ravel()
-        light = each.light.ravel()[echo]
         noise = each.noise(choice.trust).ravel()[echo]
-        rows.append(dictionary.rows(echo, each.path_m.ravel()[echo]) / noise[:, None])
-        wanted.append(light / noise)
+        facing = dictionary.rows(echo, each.path_m.ravel()[echo])
+        factor = correction(model.held.ravel()[echo], facing @ mixed)
+        rows.append(facing * (factor / noise)[:, None])
+        wanted.append(each.light.ravel()[echo] / noise)
     matrix = np.vstack(rows).astype(np.float32)
     data = np.concatenate(wanted).astype(np.float32)
 
     count = basis.outline.shape[1]
     inner = np.linalg.inv(basis.covariance[:count, :count]) - np.eye(count) / UNMODELLED
-    depth_std = np.sqrt(
-        np.einsum("ik,kl,il->i", basis.depth, basis.covariance[count:, count:], basis.depth)
-    )
-    share = (layers_m - box.z_near_m) / (box.z_far_m - box.z_near_m)
-    unlikely = 0.5 * ((share[:, None] - basis.mean_depth) / np.maximum(depth_std, 0.02)) ** 2
+    unlikely = 0.5 * ((share[:, None] - start.state.depth) / DEPTH_STD) ** 2
 
     def slope(mixture: Float32) -> Float32:
         outline = mixture.reshape(LAYERS, -1).sum(0)
-        off = outline - basis.mean_outline
+        off = outline - start.state.outline
         pull = off / UNMODELLED + basis.outline @ (inner @ (basis.outline.T @ off))
         layered = pull[None] + choice.weight * unlikely
         return matrix.T @ (matrix @ mixture - data) + layered.ravel().astype(np.float32)
@@ -506,7 +550,31 @@ def by_lifting(seen: Sequence[Seen], choice: Choice, dictionaries: Sequence[Dict
     layered = mixture.reshape(LAYERS, side * side)
     outline = layered.sum(0).astype(np.float64)
     depth = (layered * share[:, None]).sum(0) / np.maximum(outline, 1e-6)
-    return State(outline, np.where(outline > 1e-3, depth, basis.mean_depth))
+    return State(outline, np.where(outline > 1e-3, depth, start.state.depth))
+
+
+def mixture_of(state: State, share: Float64) -> Float32:
+    """Return an estimate as a mixture (voxels,): each cell's albedo in the two layers about its
+    depth.
+    """
+    at = np.interp(state.depth, share, np.arange(LAYERS))
+    low = np.minimum(at.astype(int), LAYERS - 2)
+    mixture = np.zeros((LAYERS, len(at)), np.float32)
+    cell = np.arange(len(at))
+    albedo = np.clip(state.outline, 0, 1)
+    mixture[low, cell] = (low + 1 - at) * albedo
+    mixture[low + 1, cell] = (at - low) * albedo
+    return mixture.ravel()
+
+
+def correction(rendered: Float64, facing: Float32) -> Float64:
+    """Return what tilt and self-occlusion change of each echo's light (k,)."""
+    both = (rendered > 0) & (facing > 0)
+    if not both.any():
+        return np.ones(len(rendered))
+    factor = np.divide(rendered, facing, out=np.ones(len(rendered)), where=both)
+    middle = np.median(factor[both])
+    return np.clip(np.where(both, factor, middle), middle / MAX_CORRECTION, middle * MAX_CORRECTION)
 
 
 def descend(slope: Callable[[Float32], Float32], count: int) -> Float32:
@@ -570,10 +638,25 @@ def judged(
     seen = [seen_from(place, subject) for place in places]
     if way == "lifted":
         found = by_lifting(seen, choice, [dictionary_of(place, work) for place in places])
-    else:
-        ways = {"gauss-newton": by_gauss_newton, "network in the loop": by_network_in_the_loop}
-        found = ways[way](seen, choice)
-    return figures_of(found, subject)
+        return figures_of(found, subject)
+    ways = {"gauss-newton": by_gauss_newton, "network in the loop": by_network_in_the_loop}
+    estimate = ways[way](seen, choice)
+    costs = {
+        "cost": estimate,
+        "cost_of_the_start": started(seen),
+        "cost_of_the_truth": estimated(seen, true_state(subject)),
+    }
+    echoes = sum(int(each.echo.sum()) for each in seen)
+    prior = forecast_prior()
+    return figures_of(estimate.state, subject) | {
+        name: each.cost(prior, choice.trust) / echoes for name, each in costs.items()
+    }
+
+
+def true_state(subject: Subject) -> State:
+    """Return the truth in the cells of the forecast."""
+    truth_m = np.asarray(subject.depth_m)
+    return State.of(~np.isnan(truth_m), truth_m)
 
 
 def measured(
@@ -601,9 +684,9 @@ def tuned(way: str, work: Path) -> Choice:
     subjects = seeded_objects(TUNING_SEED, TUNING, box)
     options = [Choice()] if way == "network" else [Choice(trust=trust) for trust in TRUSTS]
     if way == "network in the loop":
-        options = [Choice(trust, share) for trust, share in product(TRUSTS[:2], SHARES)]
+        options = [Choice(trust, share) for trust, share in product(TRUSTS[1:], SHARES)]
     if way == "lifted":
-        options = [Choice(trust, weight=weight) for trust, weight in product(TRUSTS, WEIGHTS)]
+        options = [Choice(trust, weight=weight) for trust, weight in product(LOOSE_TRUSTS, WEIGHTS)]
 
     def mean_iou(choice: Choice) -> float:
         name = f"tuning {way} {choice.trust:g} {choice.share:g} {choice.weight:g}"

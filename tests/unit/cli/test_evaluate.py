@@ -296,6 +296,15 @@ def test_tradeoff_reconstruct_writes_table_and_plot(run: Run) -> None:
     assert result["recommended"]["name"] in {row["name"] for row in result["settings"]}
 
 
+@pytest.mark.usefixtures("plates")
+def test_tradeoff_reconstruct_measures_each_rig_s_weights_on_it(run: Run) -> None:
+    result = run(*RECONSTRUCT, "--count", "1", "--weights", "wide", "--weights", "direct")
+
+    rigs = {row["weights"]: row["rig"] for row in result["settings"]}
+    assert rigs == {"wide": "wide-rig", "direct": "paper-rig"}
+    assert all(set(TARGETS) <= set(row["unseen"]) for row in result["settings"])
+
+
 @pytest.mark.slow
 def test_tradeoff_render_uses_object_that_render_renders(run: Run, small: list[Scene]) -> None:
     run(*RENDER, "--object", "bowl", "--seed", "4")

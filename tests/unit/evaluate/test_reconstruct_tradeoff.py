@@ -24,15 +24,17 @@ from nlos_cam.evaluate import (
 )
 from nlos_cam.evaluate.metrics import Interval
 from nlos_cam.evaluate.reconstruct_tradeoff import (
+    ObjectSet,
     ReconstructBench,
     ReconstructSetting,
+    BothSets,
     draw_reconstructions,
     losses,
     pareto_front,
     recommended,
     reconstruct_document,
 )
-from nlos_cam.evaluate.subjects import echoes_of, seeded_objects, truth_of
+from nlos_cam.evaluate.subjects import seeded_objects, untracked
 from nlos_cam.objects.depth_map import object_box
 
 RIG = load_rig("paper-rig")
@@ -46,8 +48,8 @@ def row_of(name: str, milliseconds: float, iou: float, frames: int = 1) -> Recon
         "accuracy_within_2_percent": Interval(0.7, 0.6, 0.8),
         "foreground_rmse_mm": Interval(20.0, 10.0, 30.0),
     }
-    setting = ReconstructSetting(name, "shipped", "a runtime", frames)
-    return ReconstructRow(setting, milliseconds, 2 * milliseconds, figures)
+    setting = ReconstructSetting(name, "shipped", "a runtime", frames, RIG.name)
+    return ReconstructRow(setting, milliseconds, 2 * milliseconds, figures, figures)
 
 
 ROWS = [
@@ -100,7 +102,10 @@ def test_front_is_undominated_in_time_to_the_picture_and_iou() -> None:
 
 
 def test_settings_are_every_network_with_every_number_of_frames() -> None:
-    networks = {name: SimpleNamespace(runtime="a runtime") for name in ("small", "large")}
+    record = SimpleNamespace(rig_name=RIG.name)
+    networks = {
+        name: SimpleNamespace(runtime="a runtime", record=record) for name in ("small", "large")
+    }
 
     asked = reconstruct_settings(networks)  # type: ignore[arg-type]
 
@@ -111,7 +116,7 @@ def test_settings_are_every_network_with_every_number_of_frames() -> None:
 
 
 def test_time_is_the_median_of_calls_by_the_given_clock() -> None:
-    subjects = seeded_objects(TEST_SEED, 1, BOX)
+    one = ObjectSet.of(seeded_objects(TEST_SEED, 1, BOX), RIG, untracked)
     calls = list[tuple[int, ...]]()
     seconds = ticking(0.0, 0.003)  # each call lasts one tick
 
@@ -122,18 +127,17 @@ def test_time_is_the_median_of_calls_by_the_given_clock() -> None:
 
     bench = ReconstructBench(
         {"mine": plate},  # type: ignore[dict-item]
-        RIG,
-        BOX,
-        truth_of(subjects, BOX),
-        echoes_of(subjects, RIG, lambda *_: None),
+        {"mine": BothSets(one, one)},
     )
-    asked = [ReconstructSetting("plate", "mine", "any", frames) for frames in (1, 2)]
+    asked = [ReconstructSetting("plate", "mine", "any", frames, RIG.name) for frames in (1, 2)]
 
     rows = list(measure_reconstructions(asked, bench, lambda: next(seconds)))
 
-    assert calls == [(1, 64, 80)] * 2 * (1 + reconstruct_tradeoff.MIN_CALLS)
+    # a first call, the timed ones, and one on the object of the other set
+    assert calls == [(1, 64, 80)] * 2 * (1 + reconstruct_tradeoff.MIN_CALLS + 1)
     assert [row.milliseconds for row in rows] == pytest.approx([3, 3])
     assert 0 < rows[0].figures["silhouette_iou"].value < 1
+    assert rows[0].unseen == rows[0].figures
     assert rows[1].wait_ms == pytest.approx(2 * rows[0].wait_ms)
 
 
