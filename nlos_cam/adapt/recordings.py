@@ -64,15 +64,20 @@ class Transfer:
     parts: Mapping[Part, Sequence[str]]
     """Labels of the objects in each part."""
     recordings: int
+    start: dict[str, Any]
+    """Figures of the start weights, aligned, on the judged recordings."""
     before: dict[str, Any]
-    """Figures of the weights on the judged recordings."""
+    """Figures of the weights that were fitted, on the same."""
     after: dict[str, Any]
 
     @property
     def is_better(self) -> bool:
-        """True if the outlines of the judged objects are nearer than before."""
-        before, after = (each["silhouette_iou"]["value"] for each in (self.before, self.after))
-        return after > before
+        """True if the outlines of the judged objects are nearer than before, and no farther than
+        those of the start weights: after a few minutes, the weights before can be worse than these.
+        """
+        figures = self.start, self.before, self.after
+        start, before, after = (each["silhouette_iou"]["value"] for each in figures)
+        return after > before and after >= start
 
 
 def parts_of(labels: Sequence[str]) -> dict[Part, list[str]]:

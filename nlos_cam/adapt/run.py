@@ -59,6 +59,7 @@ OBJECTS = "objects"
 HELD_OUT = "held-out"
 JUDGED = "judged"
 QUALITY = "quality"
+OUTLIERS = "outliers"
 UNCERTAINTY = "uncertainty"
 NETWORK = "network"
 WEIGHTS = "weights"
@@ -68,6 +69,7 @@ UNCERTAINTY_RECORD = "doubt.json"
 UNCERTAINTY_GRAPH = "doubt.onnx"
 PACKED = "packed"
 BEFORE = "before"
+START = "start"
 AFTER = "after"
 GUESS = "mean_object"
 PARTS = "parts"
@@ -221,12 +223,13 @@ def _plan_for(job: Adaptation, minutes: float, tracked: data.Tracked) -> Plan:
     machine.
     """
     plan = load_plan(job.folder)
-    if plan and plan.rig_checksum != job.rig.checksum:
-        if not job.begin_again:
-            raise SceneError(
-                f"{job.folder} is an adaptation to another rig: the bench was calibrated again since;"
-                " give --overwrite to begin again, or another --out"
-            )
+    if plan and plan.rig_checksum != job.rig.checksum and not job.begin_again:
+        raise SceneError(
+            f"{job.folder} is an adaptation to another rig: the bench was calibrated again since;"
+            " give --overwrite to begin again, or another --out"
+        )
+    # without a plan, what is there may be another rig's too
+    if job.begin_again and (plan is None or plan.rig_checksum != job.rig.checksum):
         _forget(job.folder)
         plan = None
     if plan is None:
@@ -259,11 +262,14 @@ def _plan_for(job: Adaptation, minutes: float, tracked: data.Tracked) -> Plan:
 
 
 def _forget(folder: Path) -> None:
-    """Delete what an adaptation made: the plan at last, so that a stop meanwhile is repeated."""
-    for made in (folder / BEFORE, *folder.glob(STAGE.format("*"))):
+    """Delete what an adaptation made, objects of its rig included: the plan at last, so that a stop
+    meanwhile is repeated.
+    """
+    of_its_rig = (BEFORE, OBJECTS, HELD_OUT, JUDGED, QUALITY, OUTLIERS)
+    for made in (*(folder / name for name in of_its_rig), *folder.glob(STAGE.format("*"))):
         if made.exists():
             shutil.rmtree(made)
-    (folder / PLAN).unlink()
+    (folder / PLAN).unlink(missing_ok=True)
 
 
 def _start_checksum(job: Adaptation) -> str:
@@ -400,10 +406,15 @@ def _transfer(
             stage / NETWORK, parts, network, job.accelerator, watch or training.unwatched
         )
 
-    before = _figures(measure, stage / NETWORK, folder / BEFORE, parts["judged"])
-    after = _figures(measure, network, folder / AFTER, parts["judged"])
-    count = sum(map(len, found.by_label.values()))
-    return Transfer(folder, parts_of(list(found.by_label)), count, before, after)
+    judged = parts["judged"]
+    return Transfer(
+        folder,
+        parts_of(list(found.by_label)),
+        recordings=sum(map(len, found.by_label.values())),
+        start=_figures(measure, job.start_folder, folder / START, judged),
+        before=_figures(measure, stage / NETWORK, folder / BEFORE, judged),
+        after=_figures(measure, network, folder / AFTER, judged),
+    )
 
 
 class _Rendering:
@@ -575,7 +586,7 @@ def _train_uncertainty(
         )
         with tracked("rendering empty benches and outliers") as on_progress:
             samples = data.uncertainty_sets(
-                recipe, pipeline, sets, job.folder / "outliers", on_progress
+                recipe, pipeline, sets, job.folder / OUTLIERS, on_progress
             )
         fabric = training.open_fabric(recipe, accelerator=job.accelerator)
         run = training.TrainingRun(

@@ -12,6 +12,7 @@ __all__ = [
     "camera_to_name",
     "check_new",
     "edit_bench",
+    "iou_in_use",
     "is_bench",
     "load_bench",
     "load_bench_record",
@@ -22,7 +23,15 @@ __all__ = [
     "write_weights",
 ]
 
-from .edit import TEST_IOU, BenchEdit, check_new, edit_bench, write_file, write_weights
+from .edit import (
+    TEST_IOU,
+    BenchEdit,
+    check_new,
+    edit_bench,
+    iou_in_use,
+    write_file,
+    write_weights,
+)
 from .folder import Bench, camera_to_name, load_bench
 from .record import (
     MAIN,

@@ -10,6 +10,7 @@ from pathlib import Path
 import nlos_calibration as walls
 from nlos_calibration.errors import CalibrationError, RecordFileError
 from nlos_models import RECORD, load_record
+from nlos_models.errors import CheckpointError
 
 from nlos_cam import __version__
 from nlos_cam.bench.folder import load_bench
@@ -132,6 +133,22 @@ def write_file(folder: Path, name: str, content: bytes) -> Path:
             part.write_bytes(content)
         edit.add(path)
     return path
+
+
+def iou_in_use(folder: Path) -> float | None:
+    """Return the silhouette IoU of a bench's own weights on the test objects on it; None where it
+    has none of this rig that can be read.
+    """
+    loaded = load_bench(folder)
+    if loaded.weights is None:
+        return None
+    try:
+        record = load_record(loaded.weights)
+    except CheckpointError:
+        return None
+    return (
+        record.figures.get(TEST_IOU) if record.rig == loaded.rig.model_dump(mode="json") else None
+    )
 
 
 def write_weights(folder: Path, source: Path, test_iou: float | None = None) -> Path:

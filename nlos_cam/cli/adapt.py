@@ -134,7 +134,8 @@ def adapt(
     except KeyboardInterrupt:
         common.exit_interrupted(f"what was made is kept in {work}; give the same command to go on")
     target = result.weights
-    if result.is_better and not locked:
+    kept = result.is_better if locked else _is_worth_keeping(result, folder)
+    if kept and not locked:
         target = _install(result, folder, home / WEIGHTS)
     expected = None if locked else _forecast(rig, folder)
     name = shlex.quote(bench)
@@ -145,11 +146,12 @@ def adapt(
         commands = []
         more += f" --frames {locked.frames} --radiometry {locked.radiometry}"
         more += f" --pulse-ns {sensor.pulse_ns:g} --material {material or 'matt'}"
-    if folder and result.is_better:
+    if folder and kept:
         camera = benches.camera_to_name(measured.record) if measured else "l515"
         commands = [f"nlos-cam live --camera {camera} --bench {name}"]
     more += f" --out {shlex.quote(str(out))}" if out else ""
-    _report(result, target, [*commands, more], work / PAGE, expected, as_json=json)
+    commands.append(more)
+    _report(result, target, commands, work / PAGE, expected, kept=kept, as_json=json)
 
 
 def _forecast(rig: walls.Rig, folder: Path | None) -> benches.ForecastRecord:
@@ -191,6 +193,16 @@ def _measure_on(job: adaptation.Adaptation) -> adaptation.Measure:
     return measure
 
 
+def _is_worth_keeping(result: adaptation.AdaptResult, bench: Path | None) -> bool:
+    """Return whether weights are better than those that they would replace: than the start weights,
+    and on the test objects than the bench's own, unless they were fitted to recordings on it.
+    """
+    in_use = benches.iou_in_use(bench) if bench else None
+    fitted = result.transfer is not None and result.transfer.is_better
+    after = result.after["silhouette_iou"]["value"]
+    return result.is_better and (fitted or in_use is None or after >= in_use)
+
+
 def _install(result: adaptation.AdaptResult, bench: Path | None, target: Path) -> Path:
     """Copy the weights to where they are used, and return that folder."""
     if bench:
@@ -206,6 +218,7 @@ def _report(
     page: Path,
     expected: benches.ForecastRecord | None,
     *,
+    kept: bool,
     as_json: bool,
 ) -> None:
     """Write the page, and print what the minutes brought."""
@@ -217,8 +230,8 @@ def _report(
     _, before, after = rows[0]
     state = "was finished before" if result.was_there else "done"
     worse = ""
-    if not result.is_better and not result.plan.locked:
-        worse = ", worse, so the weights in use stay (more --minutes help)"
+    if not kept and not result.plan.locked:
+        worse = ", worse than the weights in use, which stay (more --minutes help)"
     text = (
         f"{state}: {rows[0][0]} {before} -> {after} on this bench{worse}; weights in {target},"
         f" report {page}"
@@ -227,7 +240,7 @@ def _report(
         text += f"; {forecast.hidden_words(expected.hidden_share)}"
     facts: dict[str, Any] = {
         "out": str(target),
-        "kept": result.is_better,
+        "kept": kept,
         "report": str(page),
         "minutes": result.plan.minutes,
         "objects": result.plan.stages[-1].objects,
@@ -242,6 +255,7 @@ def _report(
             "kept": transfer.is_better,
             "recordings": transfer.recordings,
             "objects": transfer.parts,
+            "start": transfer.start,
             "before": transfer.before,
             "after": transfer.after,
         }

@@ -442,7 +442,8 @@ def doubt(
         sets = data_sets.uncertainty_sets(
             recipe, pipeline, datasets, run.out / SAMPLES, on_progress
         )
-    job = run.training(recipe, pipeline.record, about.watches)
+    plans = (each.plan.provenance for each in datasets)
+    job = run.training(recipe, pipeline.record, training.digest_of(about.watches, *plans))
     run.finish(
         recipe, training.launch(fabric, training.run_uncertainty, job, about, watched, *sets)
     )

@@ -187,7 +187,9 @@ def render_bare_wall(plan: DatasetPlan, frames: int = BARE_WALL_FRAMES) -> BareM
             " --wall"
         )
     sensor = Sensor(plan.rig, plan.sensor, plan.radiometry)
-    echoes = render(Scene(plan.rig, radiometry=plan.radiometry), plan.accuracy).multi
+    # with the samples' pulse: the sensor's gain makes up for what it takes from the peaks
+    bare = Scene(plan.rig, radiometry=plan.radiometry, pulse_ns=plan.sensor.pulse_ns)
+    echoes = render(bare, plan.accuracy).multi
     depth, intensity = (Moments((MAP_ROWS, MAP_COLUMNS)) for _ in range(2))
     for frame in range(frames):
         images = sensor.expose(echoes, np.random.default_rng([frame, 2]))

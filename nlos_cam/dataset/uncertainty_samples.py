@@ -38,7 +38,7 @@ from nlos_cam.files import atomic_file, read_arrays
 from nlos_cam.frames import OBJECT_PIXELS, LidarMaps, maps_from_frame
 from nlos_cam.objects import CATEGORIES, image_from_depth
 from nlos_cam.reconstruct import grid_of
-from nlos_cam.render import Rendering, Scene, Sensor, SensorModel, render
+from nlos_cam.render import Material, Rendering, Scene, Sensor, SensorModel, render
 
 EMPTY = "empty"
 ORDINARY = "ordinary"
@@ -121,6 +121,8 @@ class Benches:
         """Name that files of samples bear: it differs where the samples would."""
         frame = self.frame.checksum if self.frame else ""
         text = (self.rigs.model_dump_json() if self.rigs else "") + frame
+        if self.sensor != SensorModel():
+            text += self.sensor.model_dump_json()
         beside = f"-{sha256(text.encode()).hexdigest()[:12]}" if text else ""
         return f"v{VERSION}-{self.rig.checksum}-{self.accuracy}{beside}"
 
@@ -329,7 +331,10 @@ def visible_objects(maps: MapSet, dataset: Dataset) -> Mask:
 
 @lru_cache(maxsize=1)
 def _bare_depth_m(rig: Rig, sensor: SensorModel) -> Float32:
-    return Sensor(rig, sensor).maps(render(Scene(rig)).multi, None).depth_m
+    # the wall's texture changes no depth, and has no expected maps
+    even = sensor.model_copy(update={"wall_texture": 0.0})
+    bare = render(Scene(rig, pulse_ns=sensor.pulse_ns))
+    return Sensor(rig, even).maps(bare.multi, None).depth_m
 
 
 def quality_set(
@@ -412,10 +417,16 @@ def check_uncertainty_data(
             f"weights expect {pipeline.record.input}, but the uncertainty network needs raw maps:"
             " use others"
         )
-    if not (_fit(training.plan, pipeline.record) and _fit(held_out.plan, pipeline.record)):
+    both = training, held_out
+    if not all(_fit(data.plan, pipeline.record) for data in both):
         raise SceneError(
             "--dataset, --held-out and --weights are not all of one rig: use others, or build the"
             " maps again"
+        )
+    if any(data.plan.radiometry != "paper" or data.plan.material != Material() for data in both):
+        raise SceneError(
+            "--dataset or --held-out is of another radiometry or material, but empty benches and"
+            " outliers are rendered matt, in the paper's: build the maps again without them"
         )
     if len(training) < recipe.objects:
         count = f"--dataset holds {len(training)} objects, the recipe needs {recipe.objects}"

@@ -77,14 +77,14 @@ def _candidates(rig: Rig) -> Iterator[tuple[str, Rig, bool]]:
     low_deg, high_deg = FACING_RANGE_DEG
     tries: list[tuple[str, Rig, bool]] = []
     for step_m, word in ((-NEARER_M, "nearer to the wall"), (NEARER_M, "farther from the wall")):
-        distance_m = float(np.clip(lidar.distance_m + step_m, low_m, high_m))
+        distance_m = _stepped(lidar.distance_m, step_m, low_m, high_m)
         moved = lidar.model_copy(update={"distance_m": distance_m})
         text = f"lidar {word}: {distance_m:.2f} m in place of {lidar.distance_m:.2f} m"
         tries.append((text, rig.model_copy(update={"lidar": moved}), True))
     for step_deg, word in ((-TURN_DEG, "less"), (TURN_DEG, "more")):
         # The wall's normal is at 0: a turn away from it goes on in the direction of the yaw.
         side = -1.0 if lidar.yaw_deg < 0 else 1.0
-        yaw_deg = side * float(np.clip(abs(lidar.yaw_deg) + step_deg, low_deg, high_deg))
+        yaw_deg = side * _stepped(abs(lidar.yaw_deg), step_deg, low_deg, high_deg)
         turned = lidar.model_copy(update={"yaw_deg": yaw_deg})
         text = f"lidar turned {word}: {yaw_deg:.0f} degrees in place of {lidar.yaw_deg:.0f}"
         tries.append((text, rig.model_copy(update={"lidar": turned}), True))
@@ -93,7 +93,7 @@ def _candidates(rig: Rig) -> Iterator[tuple[str, Rig, bool]]:
         tries.append((text, _along(rig, step_m), True))
     if rig.occluder is not None:
         for step_m, word in ((-GAP_M, "narrower"), (GAP_M, "wider")):
-            gap_m = float(np.clip(rig.occluder.z_min_m + step_m, *GAP_RANGE_M))
+            gap_m = _stepped(rig.occluder.z_min_m, step_m, *GAP_RANGE_M)
             occluder = rig.occluder.model_copy(update={"z_min_m": gap_m})
             text = f"gap {word}: {gap_m:.2f} m in place of {rig.occluder.z_min_m:.2f} m"
             tries.append((text, rig.model_copy(update={"occluder": occluder}), False))
@@ -101,6 +101,14 @@ def _candidates(rig: Rig) -> Iterator[tuple[str, Rig, bool]]:
         same = other.lidar == rig.lidar and other.occluder == rig.occluder
         if not same and lidar_visible_share(other, object_box(other)) <= direct:
             yield text, other, moves_lidar
+
+
+def _stepped(value: float, step: float, low: float, high: float) -> float:
+    """Return a value after a step that ends at a range's limits; the value itself where the range
+    lies the other way.
+    """
+    there = float(np.clip(value + step, low, high))
+    return there if (there - value) * step > 0 else value
 
 
 def _along(rig: Rig, step_m: float) -> Rig:

@@ -31,13 +31,18 @@ SHARED = OBJECTS, "held-out"
 
 def run(folder: Path, material: str, seconds: int, minutes: float, workers: int) -> dict[str, Any]:
     """Adapt to one averaging time, or go on with it, and return the figures."""
-    done = folder / "locked" / "stage-1" / "report" / "figures.json"
-    if not done.exists():
-        words = ["adapt", RIG, "--minutes", minutes, "--out", folder, "--workers", workers]
-        words += ["--frames", FRAMES_PER_S * seconds, "--radiometry", "lambertian"]
-        words += ["--pulse-ns", PULSE_NS, "--material", material]
-        harness.run_command(*words)
-    return json.loads(done.read_text(encoding="utf-8"))
+    words = ["adapt", RIG, "--minutes", minutes, "--out", folder, "--workers", workers]
+    words += ["--frames", FRAMES_PER_S * seconds, "--radiometry", "lambertian"]
+    words += ["--pulse-ns", PULSE_NS, "--material", material]
+    harness.run_command(*words)
+    last = f"stage-{len(plan_of(folder)['stages'])}"
+    figures = folder / "locked" / last / "report" / "figures.json"
+    return json.loads(figures.read_text(encoding="utf-8"))
+
+
+def plan_of(folder: Path) -> dict[str, Any]:
+    """Return the plan of an adaptation to locked differences."""
+    return json.loads((folder / "locked" / "plan.json").read_text(encoding="utf-8"))
 
 
 def share(first: Path, folder: Path, seconds: int) -> None:
@@ -54,7 +59,7 @@ def share(first: Path, folder: Path, seconds: int) -> None:
             copy_function=os.link,
             ignore=shutil.ignore_patterns(".*"),
         )
-    plan = json.loads((first / "locked" / "plan.json").read_text(encoding="utf-8"))
+    plan = plan_of(first)
     plan["locked"]["frames"] = FRAMES_PER_S * seconds
     (part / "locked" / "plan.json").write_text(json.dumps(plan), encoding="utf-8")
     part.rename(folder)
@@ -97,11 +102,10 @@ def main() -> None:
             if folder != first:
                 share(first, folder, seconds)
             figures = run(folder, material, seconds, asked.minutes, asked.workers)
-            plan = json.loads((folder / "locked" / "plan.json").read_text(encoding="utf-8"))
             row = {
                 "material": material,
                 "seconds": seconds,
-                "objects": plan["stages"][-1]["objects"],
+                "objects": plan_of(folder)["stages"][-1]["objects"],
                 "silhouette_iou": figures["silhouette_iou"],
                 "foreground_rmse_mm": figures["foreground_rmse_mm"],
                 "guess": figures["baselines"]["mean_object"]["silhouette_iou"],

@@ -12,6 +12,7 @@ from nlos_models import load_network, training
 
 from nlos_cam.adapt import NETWORK_FILE, Adaptation, adapt, calibration_spread
 from nlos_cam.adapt.plan import load_plan
+from nlos_cam.dataset import DatasetPlan, build_dataset, ignore
 from nlos_cam.errors import SceneError
 from nlos_cam.files import FileBusyError, claim
 
@@ -113,13 +114,15 @@ def test_a_bench_calibrated_again_begins_again_when_asked(
 ) -> None:
     job = job_in(tmp_path / "work", load_rig("paper-rig"))
     finish_network(job.folder)
-    plan = load_plan(job.folder)
-    assert plan is not None
-    monkeypatch.setattr("nlos_cam.adapt.run._measure_pace", lambda *_: plan.pace)
+    for name in ("objects", "held-out"):
+        build_dataset(DatasetPlan(job.rig, 0), 1, job.folder / name, workers=1, on_progress=ignore)
 
     def stop(*_: object) -> None:
         raise KeyboardInterrupt
 
+    # the pace is measured on objects of the new rig
+    monkeypatch.setattr("nlos_cam.adapt.run.PACE_OBJECTS", 1)
+    monkeypatch.setattr("nlos_cam.adapt.run.PACE_STEPS", 1)
     with pytest.raises(KeyboardInterrupt):
         adapt(replace(job, rig=bench_elsewhere(), begin_again=True), 1.0, stop)
 

@@ -47,9 +47,12 @@ def test_recordings_without_a_label_are_left_out(tmp_path: Path) -> None:
     assert find_recordings(tmp_path / "none", no_bench, said.append) is None
 
 
-@pytest.mark.parametrize(("after", "kept"), [(0.51, True), (0.5, False), (0.4, False)])
-def test_only_a_better_fit_is_kept(after: float, kept: bool, tmp_path: Path) -> None:
-    figures = [{"silhouette_iou": {"value": value}} for value in (0.5, after)]
+@pytest.mark.parametrize(
+    ("start", "after", "kept"),
+    [(0.45, 0.51, True), (0.45, 0.5, False), (0.45, 0.4, False), (0.6, 0.51, False)],
+)
+def test_only_a_better_fit_is_kept(start: float, after: float, kept: bool, tmp_path: Path) -> None:
+    figures = [{"silhouette_iou": {"value": value}} for value in (start, 0.5, after)]
 
     assert Transfer(tmp_path, {}, 3, *figures).is_better is kept
 

@@ -15,6 +15,7 @@ from nlos_cam.bench import (
     ForecastRecord,
     check_new,
     edit_bench,
+    iou_in_use,
     is_bench,
     load_bench,
     write_file,
@@ -116,6 +117,11 @@ def test_weights_come_back_with_the_rig_of_their_bench(folder: Path, tmp_path: P
     write_weights(folder, source)
 
     assert load_record(folder / "weights").rig == bench.rig.model_dump(mode="json")
+    assert iou_in_use(folder) is None
+
+    write_weights(folder, source, 0.61)
+
+    assert iou_in_use(folder) == 0.61
     assert not (folder / "weights/doubt.json").exists()
 
 

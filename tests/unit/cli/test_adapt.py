@@ -9,7 +9,9 @@ from made_adaptations import finish_network, job_in
 from nlos_calibration import load_rig
 
 from nlos_cam import adapt as adaptation
+from nlos_cam import bench as benches
 from nlos_cam.adapt.plan import load_plan
+from nlos_cam.cli.adapt import _is_worth_keeping
 from nlos_cam.evaluate import TARGETS
 
 
@@ -59,6 +61,18 @@ def test_weights_that_are_worse_do_not_replace_those_in_use(
 
     assert answer["kept"] == kept
     assert (out / "weights").exists() == kept
+
+
+@pytest.mark.parametrize(("after_iou", "kept"), [(0.58, False), (0.6, True), (0.62, True)])
+def test_a_bench_keeps_the_better_of_two_adaptations(
+    monkeypatch: pytest.MonkeyPatch, after_iou: float, kept: bool
+) -> None:
+    monkeypatch.setattr(benches, "iou_in_use", lambda _: 0.6)
+    before, after = (dict.fromkeys(TARGETS, figure(iou)) for iou in (0.55, after_iou))
+    result = adaptation.AdaptResult(Path(), Mock(), [], before, after, was_there=False)
+
+    assert _is_worth_keeping(result, Path("bench")) is kept
+    assert _is_worth_keeping(result, None)
 
 
 def figure(value: float) -> dict[str, float]:

@@ -3,6 +3,7 @@ cached and follow their seeds.
 """
 
 from collections.abc import Callable
+from dataclasses import replace
 from functools import cache
 from itertools import repeat
 from pathlib import Path
@@ -13,6 +14,7 @@ from unittest.mock import Mock
 import numpy as np
 import pytest
 from nlos_calibration import Rig, load_rig
+from nlos_models import load_record, shipped_folder
 from nlos_models.training import MapSet
 from small_run import small_recipe
 
@@ -34,7 +36,7 @@ from nlos_cam.dataset.outliers import (
     vary_bench,
     vary_empty_bench,
 )
-from nlos_cam.dataset.plan import move_lidar
+from nlos_cam.dataset.plan import DatasetPlan, move_lidar
 from nlos_cam.dataset.uncertainty_samples import (
     BESIDE_M,
     EMPTY,
@@ -46,13 +48,15 @@ from nlos_cam.dataset.uncertainty_samples import (
     Benches,
     UncertaintySamples,
     _stimulus,
+    check_uncertainty_data,
     make_samples,
     visible_objects,
 )
+from nlos_cam.errors import SceneError
 from nlos_cam.objects import object_box
 from nlos_cam.reconstruct import WALL_GRID
 from nlos_cam.reconstruct.wall_grid import NUMBERS_COLUMN, numbers_column, rig_numbers
-from nlos_cam.render import Scene, Sensor, SensorModel, render
+from nlos_cam.render import Material, Scene, Sensor, SensorModel, render
 
 RIG = load_rig("paper-rig")
 SENSOR = SensorModel()
@@ -356,14 +360,14 @@ def test_samples_of_many_rigs_hold_the_numbers_of_their_records() -> None:
 BARE = Sensor(RIG, SensorModel()).maps(render(Scene(RIG)).multi, None)
 
 
-def maps_with(changed: list[int]) -> Any:
+def maps_with(changed: list[int], sensor: SensorModel = SENSOR) -> Any:
     """Maps of the empty bench, in which so many cells of each are farther, and their dataset."""
     depth_m = np.stack([BARE.depth_m] * len(changed))
     for one, count in zip(depth_m, changed, strict=True):
         one.flat[:count] += np.float32(2 * BESIDE_M)
     intensity = np.stack([BARE.intensity] * len(changed))
     maps = MapSet(depth_m, intensity, np.zeros((len(changed), 64, 64), np.float16))
-    plan = SimpleNamespace(sensor=SensorModel())
+    plan = SimpleNamespace(sensor=sensor)
     return maps, SimpleNamespace(plan=plan, benches=lambda: repeat(RIG))
 
 
@@ -375,5 +379,23 @@ def test_objects_that_change_hardly_a_cell_are_not_visible() -> None:
     assert found.tolist() == [False, False, *[True] * MIN_VISIBLE]
 
 
+def test_a_textured_wall_hides_no_object() -> None:
+    textured = SensorModel(wall_texture=0.05)
+
+    assert visible_objects(*maps_with([MIN_CELLS] * MIN_VISIBLE, textured)).all()
+
+
 def test_bench_that_hides_nearly_all_objects_leaves_none_out() -> None:
     assert visible_objects(*maps_with([0, 0, MIN_CELLS])).all()
+
+
+@pytest.mark.parametrize(
+    "other", [{"radiometry": "lambertian"}, {"material": Material(kind="retroreflective")}]
+)
+def test_data_of_another_light_than_the_samples_are_refused(other: dict[str, Any]) -> None:
+    ours = SimpleNamespace(plan=DatasetPlan(RIG, 0))
+    theirs = SimpleNamespace(plan=replace(ours.plan, **other))
+    pipeline = SimpleNamespace(record=load_record(shipped_folder()))
+
+    with pytest.raises(SceneError, match="radiometry or material"):
+        check_uncertainty_data(small_recipe(), pipeline, ours, theirs)  # type: ignore[arg-type]

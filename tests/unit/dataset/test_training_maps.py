@@ -37,7 +37,7 @@ from nlos_cam.files import FileBusyError
 from nlos_cam.frames import LidarMaps, maps_from_frame
 from nlos_cam.reconstruct import MapAlignment
 from nlos_cam.reconstruct.alignment import can_align
-from nlos_cam.render import Scene, Sensor, render
+from nlos_cam.render import Scene, Sensor, SensorModel, render
 
 PLAN = DatasetPlan(load_rig("paper-rig"), 0)
 OTHER = replace(PLAN, rig=PLAN.rig.model_copy(update={"name": "other"}))
@@ -154,6 +154,17 @@ def test_rendered_bare_wall_cancels_a_frame_of_bare_wall() -> None:
     assert abs(np.median((maps.depth_m - depth_m)[valid])) < 1e-3
     assert abs(np.median((maps.intensity - intensity)[valid])) < 0.05 * np.median(intensity[valid])
     assert np.median(depth_m[valid]) > 0.1
+
+
+def test_bare_wall_has_the_pulse_of_the_samples() -> None:
+    """Without it the gain, which makes up for the pulse, would saturate every cell."""
+    plan = replace(PLAN, sensor=SensorModel(pulse_ns=1.0))
+
+    _, intensity = render_bare_wall(plan, frames=8)
+    _, instant = render_bare_wall(PLAN, frames=8)
+
+    lit = np.isfinite(intensity) & (instant > 0)
+    assert abs(np.median(intensity[lit] / instant[lit]) - 1) < 0.05
 
 
 def test_bare_wall_of_many_rigs_is_refused() -> None:

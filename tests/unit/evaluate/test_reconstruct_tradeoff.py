@@ -24,10 +24,10 @@ from nlos_cam.evaluate import (
 )
 from nlos_cam.evaluate.metrics import Interval
 from nlos_cam.evaluate.reconstruct_tradeoff import (
+    BothSets,
     ObjectSet,
     ReconstructBench,
     ReconstructSetting,
-    BothSets,
     draw_reconstructions,
     losses,
     pareto_front,

@@ -18,6 +18,7 @@ from nlos_cam.forecast import (
     shipped_prior,
     words_of,
 )
+from nlos_cam.forecast.advice import _candidates
 from nlos_cam.forecast.lidar_view import SURE
 from nlos_cam.objects import benchmark_objects, object_box
 from nlos_cam.render import SensorModel
@@ -121,6 +122,15 @@ def test_changes_below_the_scatter_are_no_advice() -> None:
     assert "lidar nearer" not in words
     assert "second place beside this one: none" in words
     assert "No change tried gains 0.05" in change_words([small])[0]
+
+
+def test_no_change_leads_the_other_way() -> None:
+    """A rig beyond a range is not told to step into it by a word for stepping out."""
+    lidar = HOME.lidar.model_copy(update={"distance_m": 0.12})
+    words = [text for text, *_ in _candidates(HOME.model_copy(update={"lidar": lidar}))]
+
+    assert any("farther" in text for text in words)
+    assert not any("nearer" in text for text in words)
 
 
 def test_less_noise_determines_more() -> None:
