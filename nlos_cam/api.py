@@ -145,4 +145,6 @@ def open_stream(
     )
     reconstruct.warm_up(camera, pipeline)
     notes = (*calibrated.warnings, *found.mismatches)
-    return Stream(camera, pipeline, lossless=uri.startswith("bag:"), notes=notes, clock=clock)
+    return Stream(
+        camera, pipeline, lossless=camera.uri.startswith("bag:"), notes=notes, clock=clock
+    )

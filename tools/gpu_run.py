@@ -375,7 +375,10 @@ def options() -> ArgumentParser:
 
 
 if __name__ == "__main__":
-    given = options().parse_args()
+    parser = options()
+    given = parser.parse_args()
+    if given.any_rig and not given.direct_only:
+        parser.error("--any-rig needs --direct-only: the paper's compressor is for one rig")
     if given.join:
         join_parts(given.join, given.out)
     else:

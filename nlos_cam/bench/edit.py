@@ -16,6 +16,7 @@ from nlos_cam import __version__
 from nlos_cam.bench.folder import load_bench
 from nlos_cam.bench.record import (
     MANIFEST,
+    STATIONS,
     WEIGHTS,
     BenchRecord,
     CameraRecord,
@@ -102,10 +103,15 @@ def check_new(folder: Path) -> None:
         raise OutputExistsError(
             f"{folder} cannot be made, because {nearest} is a file: choose another --bench"
         )
-    if folder.is_dir() and any(folder.iterdir()) and not is_bench(folder):
+    if folder.is_dir() and not is_bench(folder) and not all(map(_is_unfinished, folder.iterdir())):
         raise OutputExistsError(
             f"{folder} holds other files and no bench: choose another name for --bench"
         )
+
+
+def _is_unfinished(path: Path) -> bool:
+    """Return whether something in a folder is what a first measurement leaves that was stopped."""
+    return path.name == STATIONS or path.name.startswith(".")
 
 
 @contextmanager
@@ -139,12 +145,12 @@ def iou_in_use(folder: Path) -> float | None:
     """Return the silhouette IoU of a bench's own weights on the test objects on it; None where it
     has none of this rig that can be read.
     """
-    loaded = load_bench(folder)
-    if loaded.weights is None:
-        return None
     try:
-        record = load_record(loaded.weights)
-    except CheckpointError:
+        loaded = load_bench(folder)
+        record = load_record(loaded.weights) if loaded.weights else None
+    except (CheckpointError, RecordFileError):  # of the weights: what is measured is checked before
+        return None
+    if record is None:
         return None
     return (
         record.figures.get(TEST_IOU) if record.rig == loaded.rig.model_dump(mode="json") else None
@@ -160,7 +166,7 @@ def write_weights(folder: Path, source: Path, test_iou: float | None = None) -> 
     CheckpointError for a folder without weights, RecordFileError for a bench that is damaged.
     """
     record = load_record(source)
-    rig = load_bench(folder).rig
+    rig = load_bench(folder, weights=False).rig
     out = folder / WEIGHTS
     with edit_bench(folder) as edit:
         names = sorted(path.name for path in source.iterdir() if path.is_file())

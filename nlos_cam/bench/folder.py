@@ -125,10 +125,11 @@ def camera_to_name(wall: walls.WallRecord) -> str:
     return "sim:SCENE.toml" if is_simulated else "l515"
 
 
-def load_bench(folder: str | Path, station: str = MAIN) -> Bench:
+def load_bench(folder: str | Path, station: str = MAIN, *, weights: bool = True) -> Bench:
     """Load a bench folder, and check its files against their checksums and each other.
 
-    Raises RecordFileError, with the first problem.
+    Without `weights` its own are neither checked nor named: for commands that replace them, also
+    where they are lost or damaged. Raises RecordFileError, with the first problem.
     """
     folder = Path(folder)
     record = load_bench_record(folder)
@@ -136,19 +137,21 @@ def load_bench(folder: str | Path, station: str = MAIN) -> Bench:
         raise RecordFileError(
             f"{folder} has no station {station!r}: choose from {', '.join(record.stations)}"
         )
-    _check_files(folder, record)
+    _check_files(folder, record, weights=weights)
     stations = {name: _measured(folder, record, one) for name, one in record.stations.items()}
-    has_weights = f"{WEIGHTS}/{CHECKSUMS}" in record.files
+    has_weights = weights and f"{WEIGHTS}/{CHECKSUMS}" in record.files
     return Bench(folder, record, stations, station, folder / WEIGHTS if has_weights else None)
 
 
-def _check_files(folder: Path, record: BenchRecord) -> None:
+def _check_files(folder: Path, record: BenchRecord, *, weights: bool) -> None:
     for one in record.stations.values():
         if one.in_use not in record.files:
             raise RecordFileError(
                 f"{folder / MANIFEST} has no checksum of {one.in_use}: calibrate the bench again"
             )
     for name, digest in record.files.items():
+        if name.startswith(f"{WEIGHTS}/") and not weights:
+            continue
         path = folder / name
         again = "adapt" if name.startswith(f"{WEIGHTS}/") else "calibrate"
         try:

@@ -14,6 +14,7 @@ from nlos_cam.files import read_toml
 MANIFEST = "bench.toml"
 MAIN = "main"
 """Name of the station that is used where none is named."""
+STATIONS = "stations"
 WEIGHTS = "weights"
 """Folder of a bench with its own weights."""
 VERSION = 1
@@ -94,7 +95,7 @@ class BenchRecord(Record):
 
 def station_folder(name: str) -> str:
     """Return the path of a station's files in the bench folder."""
-    return f"stations/{name}"
+    return f"{STATIONS}/{name}"
 
 
 def is_bench(folder: Path) -> bool:

@@ -298,6 +298,7 @@ class L515Camera(LiveCamera):
                 raise CameraError(f"{name}: {problem}")
             if name == LASER_POWER:
                 self._laser_power = wanted
+            self._session.read_settings()
         return f"{name} is {wanted:g}" + ("" if wanted == value else f", the nearest to {value:g}")
 
     def _is_connected(self) -> bool:

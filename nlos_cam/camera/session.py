@@ -180,7 +180,7 @@ class Session:
         self._listening = False
         self._sensor.start(self._on_frame)
         prepare(self._sensor)
-        self.settings = read_settings(self._sensor)
+        self.read_settings()
         if not self.settings:
             raise RuntimeError("it vanished while it was set up")
         if self._preview.arrived:
@@ -189,6 +189,10 @@ class Session:
         ready()
         self._listening = True
         self._preview.close()
+
+    def read_settings(self) -> None:
+        """Read the options that frames bear: again after one of them was set."""
+        self.settings = read_settings(self._sensor)
 
     def look(self, timeout_s: float) -> streams.FrameSet | None:
         """Return the next set to come while the sensor is prepared; None after the timeout or

@@ -156,7 +156,7 @@ def adapt(
 
 def _forecast(rig: walls.Rig, folder: Path | None) -> benches.ForecastRecord:
     """Return the forecast for a rig: that which its bench holds already, else a new one."""
-    stored = benches.load_bench(folder).forecast if folder else None
+    stored = benches.load_bench(folder, weights=False).forecast if folder else None
     if stored:
         return stored
     found = forecast.forecast(rig, quick=True)
@@ -169,7 +169,7 @@ def _forecast(rig: walls.Rig, folder: Path | None) -> benches.ForecastRecord:
 
 def _recordings(folder: Path) -> adaptation.Recordings | None:
     """Return the labelled recordings in a bench folder, if there are any."""
-    loaded = benches.load_bench(folder)
+    loaded = benches.load_bench(folder, weights=False)
     return adaptation.find_recordings(folder / adaptation.RECORDINGS, loaded.for_camera, common.say)
 
 

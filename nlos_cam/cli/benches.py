@@ -125,7 +125,7 @@ def bench_or_rig(name: str | Path) -> tuple[walls.Rig, walls.MeasuredWall | None
     """
     name = str(name)
     if Path(name).is_dir():
-        measured = benches.load_bench(name).measured
+        measured = benches.load_bench(name, weights=False).measured
     elif walls.is_wall_record(name):
         measured = walls.load_measured(Path(name))
     else:
@@ -140,7 +140,7 @@ def store_forecast(folder: Path, station: str | None = None) -> None:
     Raises RecordFileError.
     """
     station = station or benches.MAIN
-    bench = benches.load_bench(folder, station)
+    bench = benches.load_bench(folder, station, weights=False)
     if bench.measured.record.occluder is None or bench.rig.object_box is None:
         return
     from nlos_cam.forecast import forecast  # not for `live`

@@ -394,7 +394,11 @@ def _bench_folder(folder: Path | None, occluder: Path | None, out: Path | None) 
 
 def _bare_wall(source: Path) -> walls.MeasuredWall:
     """Return the bare wall of a record, or of a bench folder. Raises RecordFileError."""
-    return benches.load_bench(source).bare if source.is_dir() else walls.load_measured(source)
+    return (
+        benches.load_bench(source, weights=False).bare
+        if source.is_dir()
+        else walls.load_measured(source)
+    )
 
 
 def _next_step(folder: Path, record: walls.WallRecord, served: reconstruct.WeightsVerdict) -> str:

@@ -54,6 +54,10 @@ PARAMETERS = {"bench": "bench_folder"}
 """Parameters of commands that are not named like their setting."""
 
 
+DEFAULT = "default"
+"""Source of a setting that nobody has made."""
+
+
 class Value(NamedTuple):
     """Value of a setting, and the place that it comes from."""
 
@@ -74,7 +78,7 @@ def read_settings(
     """Return every setting. Raises RecordingError for a file that cannot be used, BadParameter for
     a variable.
     """
-    values = {name: Value(setting.default, "default") for name, setting in SETTINGS.items()}
+    values = {name: Value(setting.default, DEFAULT) for name, setting in SETTINGS.items()}
 
     # from the weakest source to the strongest
     for place in (user_folder or Path(typer.get_app_dir("nlos-cam")), folder or Path()):
@@ -214,9 +218,10 @@ def _choose_camera(values: dict[str, Any], used: dict[str, Value]) -> None:
     if None not in {argument, option} and argument != option:
         raise typer.BadParameter(f"CAMERA is {argument!r} and --camera is {option!r}: give one")
     given = option if argument is None else argument
-    if given is not None and given != used["camera"].value:
-        used.pop("wall", None)
-        used.pop("bench", None)
+    if given is not None and _is_another(given, used["camera"]):
+        for key in ("wall", "bench"):
+            if key in used and (left := used.pop(key)).value is not None:
+                say(f"note: {key} = {left.value} (from {left.source}) is not used with {given}")
     values["camera"] = (
         used["camera"].value if given is None and values.get("bag") is None else given
     )
@@ -224,6 +229,22 @@ def _choose_camera(values: dict[str, Any], used: dict[str, Value]) -> None:
         from nlos_cam.camera import full_uri
 
         values["camera"] = full_uri(str(values["camera"]))
+
+
+def _is_another(given: str, setting: Value) -> bool:
+    """Return whether a camera is another one than that of the settings, whose wall is not its own.
+
+    Without a camera in the settings, their wall is a real camera's; l515 is any L515.
+    """
+    wanted = str(setting.value)
+    if given == wanted:
+        return False
+    if setting.source == DEFAULT:
+        return given.startswith("sim")
+    return (
+        "l515" not in {given, wanted}
+        or given.split(":", maxsplit=1)[0] != wanted.split(":", maxsplit=1)[0]
+    )
 
 
 def _is_bench(name: str) -> bool:

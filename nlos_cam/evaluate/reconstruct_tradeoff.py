@@ -8,12 +8,13 @@ record says what they gave. All settings here run as in `live`: ONNX Runtime, on
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
+from itertools import repeat
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import nlos_models as models
 import numpy as np
-from nlos_calibration import ObjectBox, Rig, rig_named
+from nlos_calibration import ObjectBox, Rig
 from nlos_calibration.arrays import Float32
 from nlos_models.training import MapSet
 
@@ -155,9 +156,17 @@ def open_reconstruct_bench(
             f"the weights expect {inputs.pop()} but the test maps are raw: use weights for raw maps"
         )
 
-    rigs = {name: network.record.rig_name for name, network in networks.items()}
-    rendered = {name: _both_sets(rig_named(name), count, tracked) for name in set(rigs.values())}
-    return ReconstructBench(networks, {name: rendered[rig] for name, rig in rigs.items()})
+    rigs = {name: _rig_of(network.record) for name, network in networks.items()}
+    rendered = {
+        checksum: _both_sets(rig, count, tracked)
+        for checksum, rig in {rig.checksum: rig for rig in rigs.values()}.items()
+    }
+    return ReconstructBench(networks, {name: rendered[rig.checksum] for name, rig in rigs.items()})
+
+
+def _rig_of(record: models.CheckpointRecord) -> Rig:
+    """Return the rig that weights were trained for: a bench's own hold it, others name it."""
+    return Rig.model_validate(record.rig) if record.rig else subjects.rig_of(record)
 
 
 def _both_sets(rig: Rig, count: int | None, tracked: subjects.Tracked) -> BothSets:
@@ -192,12 +201,15 @@ def measure_reconstructions(
     maps: dict[tuple[str, int], tuple[MapSet, MapSet]] = {}
     for setting in asked:
         sets = bench.sets[setting.weights]
-        key = sets.kinds.rig.name, setting.frames
+        key = sets.kinds.rig.checksum, setting.frames
         if key not in maps:
             maps = {one: both for one, both in maps.items() if one[1] == setting.frames}
             maps[key] = sets.kinds.maps(setting.frames), sets.unseen.maps(setting.frames)
-        kinds, unseen = maps[key]
         network = bench.networks[setting.weights]
+        kinds, unseen = (
+            subjects.network_input(each, None, repeat(sets.kinds.rig), network.record)
+            for each in maps[key]
+        )
         images, seconds = _timed(network, kinds, clock)
         middle, late = 1000 * np.quantile(seconds, [0.5, 0.9])
         yield ReconstructRow(

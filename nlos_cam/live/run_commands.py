@@ -12,7 +12,8 @@ from typing import Any, Protocol, runtime_checkable
 
 from nlos_calibration import MeasuredWall, WallRecord
 from nlos_calibration.arrays import Mask
-from nlos_calibration.errors import OccluderRefusedError
+from nlos_calibration.errors import CalibrationError, OccluderRefusedError
+from nlos_calibration.wall_record import UNUSABLE
 
 from nlos_cam import calibrate
 from nlos_cam import view as views  # both load their heavy parts when they are used
@@ -263,7 +264,8 @@ class BenchCommands:
         and drift.
 
         With a wall record the occluder is found again; without one the wall is measured as it is
-        now. The record is written beside the other files, for --wall.
+        now. The record is written beside the other files, for --wall. Raises CalibrationError where
+        something is in the way.
         """
         camera, pipeline = self._run.attached()
         count = int(frames)
@@ -281,6 +283,8 @@ class BenchCommands:
 
         bench = pipeline.bench
         record, inliers = measure_bench(capture, bench.measured)
+        if record.advice.startswith(UNUSABLE):
+            raise CalibrationError(record.advice)
         path = self._run.new_file("bench", ".toml")
         reference = capture.reference(inliers)
         files = calibrate.WallFiles.beside(path, overwrite=False)
@@ -299,13 +303,16 @@ def measure_bench(
     """Return the record of an empty bench and the wall's pixels; the occluder is found if the wall
     was measured.
 
-    Raises CalibrationError where the depth is not that of a wall.
+    Raises CalibrationError where the depth is not that of a wall, or where the record's occluder is
+    not found.
     """
     if measured:
         try:
             return calibrate.measure_occluder(capture, measured)
-        except OccluderRefusedError:  # a bare wall, without one
-            pass
+        except OccluderRefusedError:
+            # a bare wall has none; one that was entered by hand is out of view, and must not be lost
+            if measured.record.occluder:
+                raise
     fit, facts = calibrate.measure_by_depth(capture)
     if measured and capture.gravity_m_s2 is None:
         facts["way_up"] = measured.record.way_up

@@ -51,6 +51,10 @@ class CalibratedRig:
                 measured.reference, walls.wall_from_zero(measured.record)
             )
 
+    def afresh(self) -> "CalibratedRig":
+        """Return the same bench, of which no frame has been observed."""
+        return CalibratedRig(self.rig, self.measured, self.notes)
+
     @property
     def warnings(self) -> tuple[str, ...]:
         """Warnings that hold for every frame: the notes, a record that calls itself doubtful, and
@@ -125,6 +129,11 @@ def subtract_reference(maps: LidarMaps, reference: walls.BareWall) -> LidarMaps:
     )
 
 
+NOT_MEASURED = (
+    "no wall was measured, so the paper's rig is assumed: calibrate the bench, or name it (--bench)"
+)
+
+
 def open_bench(wall: Path | None, camera: Camera) -> CalibratedRig:
     """Return the bench of a wall record; without one, the camera's own if it has an object box,
     else the paper's.
@@ -132,9 +141,9 @@ def open_bench(wall: Path | None, camera: Camera) -> CalibratedRig:
     Raises RecordFileError, and CalibrationError if the wall was measured with other intrinsics.
     """
     if wall is None:
-        return CalibratedRig(
-            camera.rig if camera.rig and camera.rig.object_box else walls.load_rig("paper-rig")
-        )
+        if camera.rig and camera.rig.object_box:
+            return CalibratedRig(camera.rig)
+        return CalibratedRig(walls.load_rig("paper-rig"), notes=(NOT_MEASURED,))
     measured = walls.load_measured(wall)
     for intrinsics in [
         measured.record.rig.pinhole,

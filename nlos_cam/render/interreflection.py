@@ -157,11 +157,11 @@ def patch_to_wall(
 @inner()
 def _add(target: Float32, at: int, weight: float, source: Float32) -> None:
     """Add a histogram to another from bin `at` on, scaled."""
-    # A detour only delays, so no light is lost before the first bin; past the last one it is cut.
-    start = max(at, 0)
+    # Histograms begin at different bins, so a source may begin before its target. A detour only
+    # delays, so that its bins there are empty but for rounding; past the last one light is cut.
     scale = np.float32(weight)
-    for k in range(min(len(source), len(target) - start)):
-        target[start + k] += scale * source[k]
+    for k in range(min(len(source), len(target) - at)):
+        target[max(at + k, 0)] += scale * source[k]
 
 
 @numba.njit(cache=True, parallel=True)

@@ -58,7 +58,8 @@ class Playback(PlaybackViewer):
         """
         with self._camera as camera:
             frames, telemetry = with_telemetry(camera)
-            pipeline = self._pipeline(PeriodicPhysicsCheck(self._calibrated.rig))
+            checks = PeriodicPhysicsCheck(self._calibrated.rig)
+            pipeline = self._pipeline(self._calibrated, checks)
             with FrameReader(frames, lossless=True, stop=stop) as reader, pipeline.checks:
                 for result in iterate_batched(reader, pipeline, temperatures=telemetry):
                     self.show(Moment.recorded(result, telemetry.celsius))
@@ -71,11 +72,9 @@ class Playback(PlaybackViewer):
         self.finish()
         self._state = "whole"
 
-    def _pipeline(self, checks: PhysicsCheck | None = None) -> Pipeline:
+    def _pipeline(self, bench: CalibratedRig, checks: PhysicsCheck | None = None) -> Pipeline:
         network, uncertainty_model = self._networks
-        return build_pipeline(
-            self._calibrated, network, uncertainty_model=uncertainty_model, checks=checks
-        )
+        return build_pipeline(bench, network, uncertainty_model=uncertainty_model, checks=checks)
 
     def status(self) -> dict[str, Any]:
         """Return the state for the page."""
@@ -114,7 +113,7 @@ class Playback(PlaybackViewer):
             raise NlosCamError(f"{bag} has no frame {number}")
 
         with FrameReader([frame], lossless=True, stop=Event()) as reader:
-            (result,) = iterate_batched(reader, self._pipeline())
+            (result,) = iterate_batched(reader, self._pipeline(self._calibrated.afresh()))
         path = self._folder / f"{bag.stem}-{number:06d}-{datetime.now().astimezone():%H%M%S}.npz"
         outcome = save_moment(path, Moment.recorded(result))
         return f"{outcome}, {self._files.note(path)}"

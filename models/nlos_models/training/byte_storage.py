@@ -8,7 +8,7 @@ from safetensors.torch import save
 
 from nlos_cam.files import write_checked
 from nlos_models.byte_weights import SCALE, fits_bytes, to_bytes
-from nlos_models.checkpoint import save_parts, stored_tensors
+from nlos_models.checkpoint import FULL, save_parts, stored_tensors
 from nlos_models.quality import UNCERTAINTY_FILES, load_quality_model
 from nlos_models.records import (
     UNCERTAINTY_RECORD,
@@ -43,11 +43,14 @@ def store_in_bytes(folder: Path) -> None:
 
 
 def _in_bytes(path: Path) -> bytes:
-    """Return a file of tensors whose large weights are in bytes, with their scales."""
+    """Return a file of tensors whose large weights are in bytes, with their scales; normalizations
+    stay in full.
+    """
     stored = dict[str, torch.Tensor]()
     for name, tensor in stored_tensors(path).items():
         stored[name] = tensor
-        if tensor.is_floating_point() and fits_bytes(tuple(tensor.shape)):
+        in_full = name.rpartition(".")[2] in FULL
+        if tensor.is_floating_point() and not in_full and fits_bytes(tuple(tensor.shape)):
             weight, scale = to_bytes(tensor.float().numpy())
             stored[name] = torch.from_numpy(weight)
             stored[name + SCALE] = torch.from_numpy(scale)

@@ -125,6 +125,29 @@ def test_weights_come_back_with_the_rig_of_their_bench(folder: Path, tmp_path: P
     assert not (folder / "weights/doubt.json").exists()
 
 
+def test_lost_weights_do_not_lock_the_bench(folder: Path) -> None:
+    """Deleted, or half replaced by a kill: commands that make new ones can load it."""
+    write_weights(folder, shipped_folder())
+    shutil.rmtree(folder / "weights")
+
+    with pytest.raises(RecordFileError, match="adapt the bench again"):
+        load_bench(folder)
+    assert load_bench(folder, weights=False).weights is None
+    assert iou_in_use(folder) is None
+
+    write_weights(folder, shipped_folder())
+
+    assert load_bench(folder).weights == folder / "weights"
+
+
+def test_a_stopped_first_measurement_is_repeated(tmp_path: Path) -> None:
+    (tmp_path / "bench/stations/main").mkdir(parents=True)
+
+    write_wall(tmp_path / "bench", wall_of())
+
+    assert is_bench(tmp_path / "bench")
+
+
 def test_forecast_holds_for_the_rig_that_it_was_made_for(folder: Path) -> None:
     checksum = load_bench(folder).rig.checksum
     forecast = ForecastRecord(rig_checksum=checksum, expected_iou=0.6, hidden_share=0.25)

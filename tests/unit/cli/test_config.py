@@ -11,7 +11,15 @@ import typer
 
 from nlos_cam.cli import main as module
 from nlos_cam.cli.common import Camera
-from nlos_cam.cli.config import FILE, SETTINGS, read_settings, shared_options, variable
+from nlos_cam.cli.config import (
+    FILE,
+    SETTINGS,
+    Value,
+    _is_another,
+    read_settings,
+    shared_options,
+    variable,
+)
 from nlos_cam.cli.main import main
 from nlos_cam.errors import RecordingError
 
@@ -140,6 +148,8 @@ def test_verbose_prints_settings_in_use(
         (["--wall", "w.toml"], (None, "w.toml", "own")),
         (["--weights", "direct"], ("mine", None, "direct")),
         (["sim:a"], (None, None, "own")),
+        (["l515"], ("mine", None, None)),
+        (["l515:f01"], ("mine", None, None)),
     ],
 )
 def test_bench_of_the_settings_gives_way_to_what_is_given(
@@ -169,3 +179,17 @@ def test_bench_of_the_settings_gives_way_to_what_is_given(
 
     assert main(["live", *words]) == 0
     assert calls == [given]
+
+
+@pytest.mark.parametrize(
+    ("setting", "given", "another"),
+    [
+        ("l515", "l515:f01", False),
+        ("l515:f01", "l515", False),
+        ("l515:f01", "l515:f02", True),
+        ("l515", "sim", True),
+        ("sim:a", "l515", True),
+    ],
+)
+def test_wall_of_the_settings_is_of_their_camera(setting: str, given: str, another: bool) -> None:
+    assert _is_another(given, Value(setting, FILE)) is another

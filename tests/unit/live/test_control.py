@@ -2,6 +2,7 @@ import json
 import threading
 from pathlib import Path
 from threading import Event
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -9,6 +10,7 @@ import pytest
 from fake_wall import wall_frame
 from made_up_moments import RIG, Recorded, full_moment, moment
 from nlos_calibration import load_measured
+from nlos_calibration.wall_record import UNUSABLE
 from small_frames import FrameCamera, sheet_network
 from view_streams import saved_moments
 
@@ -216,6 +218,35 @@ def test_reference_is_taken_from_the_passing_frames(tmp_path: Path) -> None:
     measured = load_measured(next(tmp_path.glob("bench-*.toml")))
 
     np.testing.assert_array_equal(measured.reference.map_depth_m, bench.reference.map_depth_m)
+
+
+def test_reference_with_something_in_the_way_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    hidden = SimpleNamespace(advice=f"{UNUSABLE}: an object seems to be hidden; remove it")
+    monkeypatch.setattr("nlos_cam.live.run_commands.measure_bench", lambda *_: (hidden, None))
+    control = RunControl(folder=tmp_path)
+    outcomes = list[Exception]()
+
+    def take() -> None:
+        try:
+            control.run("take_reference", {"frames": 2})
+        except NlosCamError as error:
+            outcomes.append(error)
+
+    command = threading.Thread(target=take)
+
+    def act(number: int) -> None:
+        if number == 3:
+            command.start()
+        elif number > 3:
+            command.join(0.02)
+
+    run(FrameCamera(60, act, make=wall_frame, uri="sim"), control)
+    command.join()
+
+    assert "remove it" in str(outcomes[0])
+    assert not list(tmp_path.iterdir())
 
 
 def test_run_is_under_strain_while_a_command_waits(

@@ -92,6 +92,19 @@ def test_stored_pipeline_is_half_as_large_and_answers_alike(folder: Path) -> Non
     assert float((found - wanted).abs().mean()) < 0.02 * float(wanted.std())
 
 
+def test_normalization_is_stored_in_full(tmp_path: Path) -> None:
+    """Training had it exactly, and mirrored maps need the same numbers on both sides."""
+    folder = Path(shutil.copytree(shipped_folder("direct"), tmp_path / "weights"))
+    before = load_file(folder / "direct.safetensors")
+
+    store_in_bytes(folder)
+
+    after = load_file(folder / "direct.safetensors")
+    for name in ("normal.median", "normal.spread"):
+        assert torch.equal(after[name], before[name])
+        assert torch.equal(after[name], after[name].flip(-2))
+
+
 @pytest.mark.slow
 def test_graph_of_bytes_equals_full_export_bit_for_bit(folder: Path, tmp_path: Path) -> None:
     maps = noise_maps(3)

@@ -366,6 +366,20 @@ def test_patch_to_patch_is_reciprocal_and_loses_energy(job: TransportJob) -> Non
     assert near.sum(1).max() <= 1
 
 
+@pytest.mark.parametrize(("shift", "place"), [(-8, 2), (0, 10), (5, 15), (-12, 0), (30, None)])
+def test_carried_light_lands_where_its_path_says(shift: int, place: int | None) -> None:
+    """Histograms begin at different bins, so a shift may be negative."""
+    spike = np.zeros((1, 20), np.float32)
+    spike[0, 10] = 1
+
+    found = interreflection._carry(np.full((1, 1), 0.5), np.array([[shift]]), spike, 24)
+
+    expected = np.zeros((1, 24), np.float32)
+    if place is not None:
+        expected[0, place] = 0.5
+    np.testing.assert_array_equal(found, expected)
+
+
 def test_wall_factors_sum_to_at_most_1(job: TransportJob) -> None:
     cells = interreflection.wall_cells(job)
     side = interreflection.WALL_CELLS
