@@ -4,8 +4,7 @@ docs/figures/lambertian.json and docs/images/lambertian.png.
 `lambertian.py RUNS [--minutes M] [--workers N] [--seconds S ...] [--out DIR]`. For matt and
 retroreflective objects on the paper's rig, with a pulse of 1 ns, `nlos-cam adapt --frames` trains a
 network for each averaging time at 30 frames a second; objects are rendered once for each material.
-RUNS holds the runs: a second call goes on, also after a kill. With --minutes 120 the objects take
-an hour and a half of a core for each material.
+RUNS holds the runs: a second call goes on, also after a kill.
 """
 
 import json

@@ -42,6 +42,7 @@ from nlos_cam.reconstruct import (
     load_networks,
 )
 from nlos_cam.reconstruct.bench import (
+    NOT_MEASURED,
     BenchObservation,
     CalibratedRig,
     open_bench,
@@ -325,7 +326,7 @@ def test_open_bench_takes_a_record_or_the_cameras_rig(wall: Path, tmp_path: Path
     look = observe(bench)
 
     assert bench.rig == RIG
-    assert (look.difference, look.warnings, bench.reference) == (None, (), None)
+    assert (look.difference, look.warnings, bench.reference) == (None, (NOT_MEASURED,), None)
 
     bench = open_bench(wall, camera())
 
