@@ -24,7 +24,7 @@ from nlos_calibration import Rig
 
 from nlos_cam import reconstruct
 from nlos_cam.bench import load_bench, load_serving
-from nlos_cam.camera import Camera, OnProgress, open_camera
+from nlos_cam.camera import Camera, OnProgress, full_uri, open_camera
 from nlos_cam.errors import NlosCamError
 from nlos_cam.live import RunStatistics
 from nlos_cam.recording import with_telemetry
@@ -146,5 +146,5 @@ def open_stream(
     reconstruct.warm_up(camera, pipeline)
     notes = (*calibrated.warnings, *found.mismatches)
     return Stream(
-        camera, pipeline, lossless=camera.uri.startswith("bag:"), notes=notes, clock=clock
+        camera, pipeline, lossless=full_uri(uri).startswith("bag:"), notes=notes, clock=clock
     )

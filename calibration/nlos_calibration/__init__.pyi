@@ -11,6 +11,7 @@ __all__ = [
     "QUANTUM_M",
     "TOLERANCE_DEG",
     "TOLERANCE_M",
+    "UNUSABLE",
     "WINDOW_FRAMES",
     "BareWall",
     "BareWallStatistics",
@@ -148,6 +149,7 @@ from .wall import (
     wall_depth,
 )
 from .wall_record import (
+    UNUSABLE,
     MeasuredWall,
     WallRecord,
     depth_offset_m,

@@ -10,10 +10,9 @@ from pathlib import Path
 from queue import Empty, Queue
 from typing import Any, Protocol, runtime_checkable
 
-from nlos_calibration import MeasuredWall, WallRecord
+from nlos_calibration import UNUSABLE, MeasuredWall, WallRecord
 from nlos_calibration.arrays import Mask
 from nlos_calibration.errors import CalibrationError, OccluderRefusedError
-from nlos_calibration.wall_record import UNUSABLE
 
 from nlos_cam import calibrate
 from nlos_cam import view as views  # both load their heavy parts when they are used

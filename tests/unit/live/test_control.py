@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 from fake_wall import wall_frame
 from made_up_moments import RIG, Recorded, full_moment, moment
-from nlos_calibration import load_measured
-from nlos_calibration.wall_record import UNUSABLE
+from nlos_calibration import UNUSABLE, load_measured
 from small_frames import FrameCamera, sheet_network
 from view_streams import saved_moments
 
