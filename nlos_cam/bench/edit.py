@@ -150,11 +150,9 @@ def iou_in_use(folder: Path) -> float | None:
         record = load_record(loaded.weights) if loaded.weights else None
     except (CheckpointError, RecordFileError):  # of the weights: what is measured is checked before
         return None
-    if record is None:
+    if record is None or record.rig != loaded.rig.model_dump(mode="json"):
         return None
-    return (
-        record.figures.get(TEST_IOU) if record.rig == loaded.rig.model_dump(mode="json") else None
-    )
+    return record.figures.get(TEST_IOU)
 
 
 def write_weights(folder: Path, source: Path, test_iou: float | None = None) -> Path:

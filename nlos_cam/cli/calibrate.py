@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Literal, NamedTuple
 import nlos_calibration as walls
 import nlos_models as models
 import typer
-from nlos_calibration.errors import CalibrationError
+from nlos_calibration.errors import CalibrationError, RecordFileError
 from rich.live import Live
 from rich.markup import escape
 from rich.table import Table
@@ -288,7 +288,7 @@ def calibrate(
     result = fields | {"out": str(files.record), "report": str(files.report)}
     if target.folder:
         benching.store_forecast(target.folder)
-    loaded = benches.load_bench(target.folder) if target.folder else None
+    loaded = _written_bench(target.folder) if target.folder else None
     rig = loaded.rig if loaded else record.rig
     own = loaded.weights if loaded else None
     trained = models.load_record(own or reconstruct.weights_for(rig))
@@ -390,6 +390,18 @@ def _bench_folder(folder: Path | None, occluder: Path | None, out: Path | None) 
     if folder:
         benches.check_new(folder)
     return folder
+
+
+def _written_bench(folder: Path) -> benches.Bench:
+    """Return the bench that was just written, without its weights where they are lost or damaged:
+    those stop no calibration. Raises RecordFileError.
+    """
+    try:
+        return benches.load_bench(folder)
+    except RecordFileError as error:
+        found = benches.load_bench(folder, weights=False)
+        say(f"note: {error}")
+        return found
 
 
 def _bare_wall(source: Path) -> walls.MeasuredWall:

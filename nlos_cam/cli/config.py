@@ -52,8 +52,6 @@ SETTINGS = {
 """Settings by their key in the file; the environment variable of `camera` is NLOS_CAM_CAMERA."""
 PARAMETERS = {"bench": "bench_folder"}
 """Parameters of commands that are not named like their setting."""
-
-
 DEFAULT = "default"
 """Source of a setting that nobody has made."""
 
@@ -241,10 +239,8 @@ def _is_another(given: str, setting: Value) -> bool:
         return False
     if setting.source == DEFAULT:
         return given.startswith("sim")
-    return (
-        "l515" not in {given, wanted}
-        or given.split(":", maxsplit=1)[0] != wanted.split(":", maxsplit=1)[0]
-    )
+    kinds = {name.partition(":")[0] for name in (given, wanted)}
+    return "l515" not in {given, wanted} or len(kinds) > 1
 
 
 def _is_bench(name: str) -> bool:

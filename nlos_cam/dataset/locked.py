@@ -13,7 +13,6 @@ from functools import lru_cache
 import numpy as np
 from nlos_calibration import Rig
 from nlos_calibration.arrays import Float32, Float64
-from numpy.typing import NDArray
 
 from nlos_cam.frames import MAP_COLUMNS, MAP_ROWS, LidarMaps
 from nlos_cam.render import (
@@ -34,7 +33,7 @@ reader takes them for maps."""
 ACCURACY = "draft"
 OF_THE_OBJECT = ("three-bounce", "occluder", "self-occlusion", "tilt", "brdf")
 """Effects of the light that an object adds. Inter-reflection is not among them: it comes later, past
-most of the pulse, and changes a difference by 1.7 % at most (8 of the test objects, 1 ns)."""
+most of the pulse, and changes a difference by 2.5 % at most (14 of the test objects, 1 ns)."""
 STENCIL = 5
 """Bins between the three samples through which a peak is interpolated."""
 STEPS = np.array([-STENCIL, 0, STENCIL])
@@ -54,7 +53,7 @@ def locked_difference(scene: Scene, sensor: SensorModel) -> LidarMaps:
     )
     if bare.receiver:
         added = three_bounce(scene, ACCURACY, OF_THE_OBJECT)
-        depth_m, peak = bare.receiver.peaks(bare.samples + bare.receiver.samples(added))
+        depth_m, peak = bare.receiver.peaks(added)
     else:
         found = render(scene, ACCURACY)
         depth_m = found.depth_m.astype(np.float64)
@@ -90,10 +89,10 @@ class _Receiver:
     middle of a bin.
     """
 
-    def __init__(self, scene: Scene, top: NDArray[np.int64]) -> None:
-        """Take a scene, and the strongest bin (n,) of each cell of its bare wall."""
+    def __init__(self, scene: Scene, returns: Float32) -> None:
+        """Take a scene, and the light (n, bins) of its bare wall before the pulse."""
         bin_m = scene.rig.device.bin_m
-        self._top = top
+        self._top = returns.argmax(axis=1)
         # A lone bin's light is spread over itself and `half` bins on each side.
         half = with_pulse(np.ones((1, 1), np.float32), scene.pulse_ns, bin_m).shape[1] - 1
         self._reach = half + STENCIL
@@ -106,8 +105,9 @@ class _Receiver:
         beams = cast(rig, intrinsics, lambertian=scene.radiometry == "lambertian")
         self._depth_of_bin_m = bin_m / 2.0 * beams.cos_axis
         self._returns = beams.direct > 0
+        self._bare = self._samples(returns)
 
-    def samples(self, histograms: Float32) -> Float64:
+    def _samples(self, histograms: Float32) -> Float64:
         """Return the waveform (n, 3) at the three samples, of light (n, bins) before the pulse."""
         reach = self._reach
         after = max(int(self._top.max()) + reach + 1 - histograms.shape[1], 0)
@@ -117,10 +117,11 @@ class _Receiver:
         light = np.take_along_axis(padded, near, axis=1)
         return (light @ self._weights).astype(np.float64)
 
-    def peaks(self, samples: Float64) -> tuple[Float64, Float64]:
-        """Return depth in m and height of each cell's peak (64, 80), of samples (n, 3); NaN depth
-        where nothing returns.
+    def peaks(self, added: Float32 | None = None) -> tuple[Float64, Float64]:
+        """Return depth in m and height of each cell's peak (64, 80), of the bare wall and light
+        (n, bins) added to it; NaN depth where nothing returns.
         """
+        samples = self._bare if added is None else self._bare + self._samples(added)
         # The logarithm of a Gaussian is a parabola: its top from three samples.
         before, middle, after = np.log(np.maximum(samples, 1e-30)).T
         curved = before - 2.0 * middle + after
@@ -140,15 +141,12 @@ class _Bare:
         device = Sensor(scene.rig, sensor, scene.radiometry)
         self.counts = device.maps(rendering.multi, None).intensity.astype(np.float64)
         self.receiver: _Receiver | None = None
-        self.samples = np.zeros((MAP_ROWS * MAP_COLUMNS, 3))
         self.depth_m = rendering.depth_m.astype(np.float64)
         self.peak = rendering.intensity.astype(np.float64)
         if scene.pulse_ns:
             returns = transient(replace(scene, pulse_ns=0.0), ACCURACY)
-            returns = returns.reshape(len(self.samples), -1)
-            self.receiver = _Receiver(scene, returns.argmax(axis=1))
-            self.samples = self.receiver.samples(returns)
-            self.depth_m, self.peak = self.receiver.peaks(self.samples)
+            self.receiver = _Receiver(scene, returns.reshape(MAP_ROWS * MAP_COLUMNS, -1))
+            self.depth_m, self.peak = self.receiver.peaks()
 
 
 @lru_cache(maxsize=2)

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import nlos_models as models
 import numpy as np
-from nlos_calibration import ObjectBox, Rig
+from nlos_calibration import Rig
 from nlos_calibration.arrays import Float32
 from nlos_models.training import MapSet
 
@@ -96,7 +96,6 @@ class ObjectSet:
     """Objects on a rig, with their echoes."""
 
     rig: Rig
-    box: ObjectBox
     truth: Float32
     """(n, 64, 64) in v."""
     echoes: list[MultiBounce]
@@ -106,10 +105,9 @@ class ObjectSet:
         cls, objects: Sequence[subjects.Subject], rig: Rig, tracked: subjects.Tracked
     ) -> "ObjectSet":
         """Render objects on a rig."""
-        box = object_box(rig)
         with tracked(f"rendering on {rig.name}") as on_progress:
             echoes = subjects.echoes_of(objects, rig, on_progress)
-        return cls(rig, box, subjects.truth_of(objects, box), echoes)
+        return cls(rig, subjects.truth_of(objects, object_box(rig)), echoes)
 
     def maps(self, frames: int) -> MapSet:
         """Return maps averaged over frames, as `live` forms them."""
@@ -211,13 +209,14 @@ def measure_reconstructions(
             for each in maps[key]
         )
         images, seconds = _timed(network, kinds, clock)
+        box = object_box(sets.kinds.rig)
         middle, late = 1000 * np.quantile(seconds, [0.5, 0.9])
         yield ReconstructRow(
             setting,
             float(middle),
             float(late),
-            judge(images, sets.kinds.truth, sets.kinds.box),
-            judge(_answers(network, unseen), sets.unseen.truth, sets.unseen.box),
+            judge(images, sets.kinds.truth, box),
+            judge(subjects.reconstruct_all(network, unseen), sets.unseen.truth, box),
         )
 
 
@@ -235,12 +234,6 @@ def _timed(
             images.append(network(depth_m[None], intensity[None]))
             seconds.append(clock() - start_s)
     return np.concatenate(images), seconds
-
-
-def _answers(network: models.Reconstructor, maps: MapSet) -> Float32:
-    """Return the images of all maps, one object at a time."""
-    pairs = zip(maps.depth_m, maps.intensity, strict=True)
-    return np.concatenate([network(depth_m[None], intensity[None]) for depth_m, intensity in pairs])
 
 
 def losses(row: ReconstructRow, base: ReconstructRow) -> dict[str, float]:

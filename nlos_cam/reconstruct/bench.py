@@ -15,6 +15,9 @@ MAX_INTRINSICS_MISMATCH_PX = 0.25
 """Largest distance between a beam's pixels in two calibrations: 0.14 mm of depth at 0.25 m and 45
 degrees.
 """
+NOT_MEASURED = (
+    "no wall was measured, so the paper's rig is assumed: calibrate the bench, or name it (--bench)"
+)
 
 
 @dataclass(frozen=True)
@@ -127,11 +130,6 @@ def subtract_reference(maps: LidarMaps, reference: walls.BareWall) -> LidarMaps:
     return LidarMaps(
         depth_m, np.where(valid, maps.intensity - reference.map_intensity, np.float32(0.0)), valid
     )
-
-
-NOT_MEASURED = (
-    "no wall was measured, so the paper's rig is assumed: calibrate the bench, or name it (--bench)"
-)
 
 
 def open_bench(wall: Path | None, camera: Camera) -> CalibratedRig:

@@ -237,6 +237,7 @@ def test_options_are_changed_while_the_camera_runs(fake_camera: Make) -> None:
         assert lidar.options["laser_power"] == limits["min"] + 2 * limits["step"]
         assert "nearest" in camera.set_option("laser_power", 1e6)
         assert lidar.options["laser_power"] == limits["max"]
+        assert camera._session.settings["laser_power"] == limits["max"]
         lidar.refused = {"noise_filtering"}
         with pytest.raises(CameraError, match=r"noise_filtering: .*out of range"):
             camera.set_option("noise_filtering", 1.0)

@@ -19,6 +19,7 @@ from nlos_cam.bench import (
     write_weights,
 )
 from nlos_cam.cli.benches import bench_or_rig
+from nlos_cam.cli.calibrate import _written_bench
 from nlos_cam.reconstruct import WALL_GRID
 
 Run = Callable[..., Any]
@@ -276,6 +277,14 @@ def test_verdict_on_own_weights_says_how_far_they_are(bench: Path) -> None:
     forecast(bench, 0.64)
     assert "where 0.64 is expected" in verdict(bench)
     assert "more --minutes of `nlos-cam adapt bench`" in verdict(bench)
+
+
+def test_lost_weights_stop_no_calibration(bench: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    write_weights(bench, shipped_folder())
+    shutil.rmtree(bench / "weights")
+
+    assert _written_bench(bench).weights is None
+    assert "adapt the bench again" in capsys.readouterr().err
 
 
 @pytest.mark.slow

@@ -249,7 +249,9 @@ def plates(monkeypatch: Patch) -> None:
 
     def loaded(folder: Path, cache: Path) -> Any:
         record = load(folder, cache).record
-        return Mock(side_effect=sheet_network, record=record, runtime="plate")
+        network = Mock(spec=("record", "runtime"), side_effect=sheet_network)
+        network.configure_mock(record=record, runtime="plate")
+        return network
 
     monkeypatch.setattr(reconstruct_tradeoff.models, "load_reconstructor", loaded)
     monkeypatch.setattr(reconstruct_tradeoff, "MIN_CALLS", 2)

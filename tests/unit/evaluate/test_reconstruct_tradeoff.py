@@ -127,10 +127,9 @@ def test_time_is_the_median_of_calls_by_the_given_clock() -> None:
         calls.append(depth_m.shape)
         return np.full((1, 64, 64), 0.5, np.float32)
 
-    bench = ReconstructBench(
-        {"mine": Mock(side_effect=plate, record=load_record(shipped_folder()))},
-        {"mine": BothSets(one, one)},
-    )
+    network = Mock(spec=("record",), side_effect=plate)
+    network.record = load_record(shipped_folder())
+    bench = ReconstructBench({"mine": network}, {"mine": BothSets(one, one)})
     asked = [ReconstructSetting("plate", "mine", "any", frames, RIG.name) for frames in (1, 2)]
 
     rows = list(measure_reconstructions(asked, bench, lambda: next(seconds)))

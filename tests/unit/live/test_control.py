@@ -1,5 +1,6 @@
 import json
 import threading
+from collections.abc import Callable
 from pathlib import Path
 from threading import Event
 from types import SimpleNamespace
@@ -190,6 +191,18 @@ def test_run_ends_a_session_that_is_being_saved(tmp_path: Path) -> None:
     assert saved_moments(next(tmp_path.glob("session-*.html")))
 
 
+def beside(command: threading.Thread) -> Callable[[int], None]:
+    """Return what starts a command at the third frame, and lets later ones wait for it."""
+
+    def act(number: int) -> None:
+        if number == 3:
+            command.start()
+        elif number > 3:
+            command.join(0.02)
+
+    return act
+
+
 def test_reference_is_taken_from_the_passing_frames(tmp_path: Path) -> None:
     control = RunControl(folder=tmp_path)
     benches = list[CalibratedRig]()
@@ -199,13 +212,7 @@ def test_reference_is_taken_from_the_passing_frames(tmp_path: Path) -> None:
         target=lambda: outcomes.append(control.run("take_reference", {"frames": 8}))
     )
 
-    def act(number: int) -> None:
-        if number == 3:
-            command.start()
-        elif number > 3:
-            command.join(0.02)
-
-    run(FrameCamera(200, act, make=wall_frame, uri="sim"), control)
+    run(FrameCamera(200, beside(command), make=wall_frame, uri="sim"), control)
     command.join()
 
     assert "reference of 8 frames" in outcomes[0]
@@ -235,13 +242,7 @@ def test_reference_with_something_in_the_way_is_refused(
 
     command = threading.Thread(target=take)
 
-    def act(number: int) -> None:
-        if number == 3:
-            command.start()
-        elif number > 3:
-            command.join(0.02)
-
-    run(FrameCamera(60, act, make=wall_frame, uri="sim"), control)
+    run(FrameCamera(60, beside(command), make=wall_frame, uri="sim"), control)
     command.join()
 
     assert "remove it" in str(outcomes[0])
