@@ -18,6 +18,7 @@ __all__ = [
     "Board",
     "BoardRecord",
     "Corners",
+    "CorrectedWall",
     "DepthMean",
     "DeviceConstants",
     "Drift",
@@ -55,6 +56,7 @@ __all__ = [
     "first_problem",
     "fit_board",
     "fit_wall",
+    "fit_with_board_distance",
     "fit_with_tape_distance",
     "footprint",
     "is_gravity",
@@ -88,11 +90,12 @@ __all__ = [
     "with_degrees",
     "with_mm",
     "with_occluder",
+    "with_range_offset",
 ]
 
 from .board import BOARDS, PAPER_MM, Board, Corners, Paper, find_corners
 from .board_pose import PrintErrors, fit_board
-from .board_wall import BoardRecord, WallByBoard, wall_with_board
+from .board_wall import BoardRecord, WallByBoard, wall_with_board, with_range_offset
 from .drift import WINDOW_FRAMES, Drift, DriftCheck, settings_changed
 from .geometry import Intrinsics, facing_angle_rad, normal_from_angles, wall_from_plane
 from .gravity import G_M_S2, Gravity, WayUp, is_gravity, roll_deg, turn_problem, way_up
@@ -106,7 +109,7 @@ from .noise import (
     with_mm,
 )
 from .occluder import OccluderFit, find_occluder
-from .range_offset import fit_with_tape_distance
+from .range_offset import CorrectedWall, fit_with_board_distance, fit_with_tape_distance
 from .reference import FULL_SCALE, BareWall, BareWallStatistics, Moments, save_reference
 from .rig import (
     DeviceConstants,

@@ -4,11 +4,11 @@ record.
 The board is seen in infrared, through the lidar's own pinhole. Depth and board each give slopes =
 -normal / distance_m (3,) with a covariance. Where they agree, they are averaged by weight. Where
 they do not, an average would be neither: one is used, and the likely causes are listed with
-amounts.
+amounts. A measured board also gives the depth's range offset, where that explains the difference.
 """
 
-from dataclasses import dataclass, replace
-from math import degrees, sqrt
+from dataclasses import dataclass, field, fields, replace
+from math import degrees, hypot, sqrt
 from typing import Annotated, Literal
 
 import numpy as np
@@ -20,8 +20,16 @@ from nlos_calibration.board import Board, find_corners
 from nlos_calibration.board_pose import fit_board
 from nlos_calibration.errors import WallRefusedError
 from nlos_calibration.geometry import Intrinsics, plane_from_slopes, wall_from_plane
+from nlos_calibration.range_offset import CorrectedWall
 from nlos_calibration.rig import Finite, NotNegative, Positive, Record
-from nlos_calibration.wall import Verdict, WallFit, WallMeasures, measures_of, out_of_range
+from nlos_calibration.wall import (
+    Verdict,
+    WallFit,
+    WallMeasures,
+    measures_of,
+    out_of_range,
+    range_verdict,
+)
 
 Used = Literal["both", "depth", "board"]
 
@@ -163,6 +171,8 @@ class WallByBoard(WallMeasures):
 
     wall_from_lidar: Float64
     """(4, 4)."""
+    covariance: Float64 = field(repr=False)
+    """(3, 3) of -normal / distance."""
     verdict: Verdict
     advice: str
     warnings: tuple[str, ...] = ()
@@ -251,6 +261,7 @@ def _by_board(plane: UncertainPlane, refusal: WallRefusedError) -> WallByBoard:
     return WallByBoard(
         **vars(measures),
         wall_from_lidar=pose,
+        covariance=plane.covariance,
         verdict="doubtful",
         advice="; ".join([reason, *problems]),
     )
@@ -279,3 +290,36 @@ def _by_both(depth: WallFit, both: Combined) -> WallFit:
         depth, **vars(measures), wall_from_lidar=pose, covariance=both.plane.covariance
     )
     return replace(fitted, verdict=verdict, advice=advice)
+
+
+def with_range_offset(
+    by_board: WallFit | WallByBoard, depth: WallFit | WallRefusedError, corrected: CorrectedWall
+) -> WallFit | None:
+    """Return a measured board's wall with the depth as its range offset corrects it; None where the
+    two are still turned against each other.
+
+    It stays doubtful, unless the bend of the uncorrected `depth` shows the offset by itself.
+    """
+    # The offset was chosen for the distance, so that only the angles can contradict it.
+    fit = corrected.fit
+    for angle in ("yaw", "pitch"):
+        apart_deg = getattr(fit, f"{angle}_deg") - getattr(by_board, f"{angle}_deg")
+        std_deg = hypot(getattr(fit, f"{angle}_std_deg"), getattr(by_board, f"{angle}_std_deg"))
+        if abs(apart_deg) > AGREE_SIGMAS * std_deg:
+            return None
+
+    amount = f"a range offset of {1e3 * corrected.offset_m:+.1f} mm"
+    verdict: Verdict = "doubtful"
+    advice = f"{by_board.advice}; {amount} is added to the depth, which then agrees"
+    was_bent = isinstance(depth, WallRefusedError) or depth.verdict == "doubtful"
+    if was_bent and fit.verdict != "doubtful":
+        verdict, advice = range_verdict(by_board.distance_m, by_board.facing_deg)
+        advice = f"{advice}; depth and board agree with {amount}"
+    return replace(
+        fit,
+        **{one.name: getattr(by_board, one.name) for one in fields(WallMeasures)},
+        wall_from_lidar=by_board.wall_from_lidar,
+        covariance=by_board.covariance,
+        verdict=verdict,
+        advice=advice,
+    )

@@ -1,4 +1,4 @@
-"""Range offset of the lidar from a distance measured by tape, and its effect on the pose.
+"""Range offset of the lidar from a distance measured by tape or board, and its effect on the pose.
 
 Sign: true depth = the lidar's depth + offset_m, along the optical axis; the truth counts from the
 front glass. The tape goes from the point of the glass on the optical axis to the wall, along the
@@ -12,6 +12,9 @@ Two causes look alike where the wall is faced squarely; on an oblique wall the f
   cos(facing).
 - depth: the beams meet in the glass, and every depth is too short by offset_m. That bends and turns
   an oblique wall (by 0.2 degrees at 45 degrees and 4.5 mm); the corrected depths are fitted again.
+
+A printed board is seen through the lidar's own pinhole, so its distance counts from the point where
+the beams meet: it shows an offset of the depth, and none of the origin.
 """
 
 from collections.abc import Callable
@@ -44,11 +47,13 @@ FitAlongRays = Callable[[float], WallFit]
 
 
 @dataclass(frozen=True)
-class TapedWall:
-    """A wall at the distance measured by tape, and the lidar's offset that follows from it."""
+class CorrectedWall:
+    """A wall at the distance measured by tape or board, and the lidar's offset that follows from
+    it.
+    """
 
     fit: WallFit
-    """Wall with the tape's distance and the tape's uncertainty."""
+    """Wall with that distance and its uncertainty."""
     offset_m: float
     """Length to add to the lidar's depth."""
     offset_std_m: float
@@ -57,7 +62,7 @@ class TapedWall:
 
 def fit_with_tape_distance(
     fit_with: FitWith, tape_m: float, fit_along_rays: FitAlongRays | None = None
-) -> TapedWall:
+) -> CorrectedWall:
     """Find the offset that puts the wall at `tape_m`, with the cause that makes the wall flatter.
 
     Raises CalibrationError where tape and lidar cannot both be right, and names the offset where
@@ -70,10 +75,12 @@ def fit_with_tape_distance(
         plain = fit_with(0.0, 0.0)
     except WallRefusedError:
         # A large offset bends an oblique wall so far that it looks like clutter.
-        found = _searched(lambda offset_m: fit_with(offset_m, 0.0), tape_m)
+        found = _searched(lambda offset_m: fit_with(offset_m, 0.0), tape_m, TAPE_STD_M)
         if found and abs(found.offset_m) <= MAX_OFFSET_M:
             return found
-        along = None if found or not fit_along_rays else _searched(fit_along_rays, tape_m)
+        along = None
+        if not found and fit_along_rays:
+            along = _searched(fit_along_rays, tape_m, TAPE_STD_M)
         if not (found or along):
             raise
         raise _named(found, along, tape_m) from None
@@ -85,15 +92,37 @@ def fit_with_tape_distance(
             f" an offset of {abs(origin_m) * 1e3:.0f} mm ({MAX_OFFSET_M * 1e3:.0f} mm allowed):"
             " measure from the front glass to the wall, along the wall's normal"
         )
-    moved = _taped(fit_with(0.0, origin_m), origin_m, axis_share, "origin")
-    corrected = _corrected(fit_with, plain, origin_m, tape_m)
+    moved = _with_offset(fit_with(0.0, origin_m), origin_m, axis_share, TAPE_STD_M, "origin")
+    corrected = _corrected(fit_with, plain, origin_m, tape_m, TAPE_STD_M)
     if corrected is not None and corrected.fit.bend_deg < plain.bend_deg:
         return corrected
     return moved
 
 
-def _searched(fit_with: Callable[[float], WallFit], tape_m: float) -> TapedWall | None:
-    """Return the smallest offset that makes the depth a bare wall at `tape_m`; None without any.
+def fit_with_board_distance(
+    fit_with: FitWith, board_m: float, board_std_m: float
+) -> CorrectedWall | None:
+    """Find the offset of the depth that puts the wall at a board's distance and makes it flatter.
+
+    None where no offset up to MAX_OFFSET_M does, as for a board of another size than was measured.
+    """
+    try:
+        plain = fit_with(0.0, 0.0)
+    except WallRefusedError:
+        found = _searched(lambda offset_m: fit_with(offset_m, 0.0), board_m, board_std_m)
+    else:
+        missing_m = board_m - plain.distance_m
+        found = _corrected(fit_with, plain, missing_m, board_m, board_std_m)
+        if found and found.fit.bend_deg >= plain.bend_deg:
+            return None
+    return found if found and abs(found.offset_m) <= MAX_OFFSET_M else None
+
+
+def _searched(
+    fit_with: Callable[[float], WallFit], distance_m: float, std_m: float
+) -> CorrectedWall | None:
+    """Return the smallest offset that makes the depth a bare wall at `distance_m`; None without
+    any.
 
     One number has to do both, so clutter or a bent wall does not pass.
     """
@@ -104,21 +133,24 @@ def _searched(fit_with: Callable[[float], WallFit], tape_m: float) -> TapedWall 
             start = fit_with(offset_m)
         except WallRefusedError:
             continue
-        missing_m = tape_m - start.distance_m
+        missing_m = distance_m - start.distance_m
         if abs(missing_m) > SEARCH_STEP_M:
             continue
         found = _corrected(
             lambda added_m, _origin_m, at_m=offset_m: fit_with(at_m + added_m),
             start,
             missing_m,
-            tape_m,
+            distance_m,
+            std_m,
         )
         if found:
             return replace(found, offset_m=offset_m + found.offset_m)
     return None
 
 
-def _named(found: TapedWall | None, along: TapedWall | None, tape_m: float) -> CalibrationError:
+def _named(
+    found: CorrectedWall | None, along: CorrectedWall | None, tape_m: float
+) -> CalibrationError:
     """Return the error that names an offset too large, or along the rays, to be corrected."""
     offset_m = found.offset_m if found else along.offset_m if along else 0.0
     kind = "depths" if found else "ranges along the rays"
@@ -132,10 +164,10 @@ def _named(found: TapedWall | None, along: TapedWall | None, tape_m: float) -> C
 
 
 def _corrected(
-    fit_with: FitWith, plain: WallFit, offset_m: float, tape_m: float
-) -> TapedWall | None:
-    """Solve distance(offset) = tape_m by the secant method; None where no correction leaves a wall
-    there.
+    fit_with: FitWith, plain: WallFit, offset_m: float, distance_m: float, std_m: float
+) -> CorrectedWall | None:
+    """Solve distance(offset) = distance_m by the secant method, from a first `offset_m` on; None
+    where no correction leaves a wall there.
     """
     before = plain
     step_m = offset_m
@@ -150,16 +182,20 @@ def _corrected(
         if effect <= 0.0:
             return None
         before = fit
-        step_m = (tape_m - fit.distance_m) / effect
+        step_m = (distance_m - fit.distance_m) / effect
         if abs(step_m) < AGREED_M:
-            return _taped(fit, offset_m, effect, "depth")
+            return _with_offset(fit, offset_m, effect, std_m, "depth")
         offset_m += step_m
     return None
 
 
-def _taped(fit: WallFit, offset_m: float, effect: float, cause: Cause) -> TapedWall:
-    """Return the result; `effect` is the change of distance per change of offset."""
-    # offset = (tape - distance) / effect, so the two independent uncertainties add in squares and
-    # divide by the effect
-    std_m = hypot(TAPE_STD_M, fit.distance_std_m) / effect
-    return TapedWall(replace(fit, distance_std_m=TAPE_STD_M), offset_m, std_m, cause)
+def _with_offset(
+    fit: WallFit, offset_m: float, effect: float, std_m: float, cause: Cause
+) -> CorrectedWall:
+    """Return the result; `effect` is the change of distance per change of offset, `std_m` the
+    uncertainty of the distance by tape or board.
+    """
+    # offset = (measured - distance) / effect, so the two independent uncertainties add in squares
+    # and divide by the effect
+    offset_std_m = hypot(std_m, fit.distance_std_m) / effect
+    return CorrectedWall(replace(fit, distance_std_m=std_m), offset_m, offset_std_m, cause)

@@ -326,6 +326,8 @@ def read_record(
     except ValidationError as error:
         # A scene given for a wall lacks a dozen fields: its kind says more than the first of them.
         if (other := record_kind(content)) not in {"", kind}:
+            if other == "bench":
+                advice = f"name its folder, {Path(str(source)).parent}, as a bench"
             raise RecordFileError(f"{source} is a {other}, not a {kind}: {advice}") from error
         raise RecordFileError(f"{source} is not a {kind}: {first_problem(error)}") from error
     except UnicodeDecodeError as error:

@@ -55,7 +55,8 @@ def wall_facts(record: WallRecord) -> list[Row]:
             with_mm(board.distance_m, board.distance_std_m),
             with_degrees(board.facing_deg, board.facing_std_deg),
         )
-        meaning = f"{board.corners} corners; used: {board.used}. {board_agreement(board)}"
+        compared = board_agreement(board, record.range_offset_m)
+        meaning = f"{board.corners} corners; used: {board.used}. {compared}"
         rows.append(("printed board", ", ".join(plane), meaning))
     rows += _depth_rows(record)
     view = f"{100.0 * record.footprint_share:.1f} %"
@@ -77,18 +78,23 @@ def _way_up_row(record: WallRecord) -> Row:
     return "camera", record.way_up, "as its owner said: it has no accelerometer"
 
 
-def board_agreement(board: BoardRecord) -> str:
-    """Return how far the plane of a printed board is from the plane of the depth."""
+def board_agreement(board: BoardRecord, range_offset_m: float = 0.0) -> str:
+    """Return how far the plane of a printed board is from the plane of the depth, before the range
+    offset of the record was added to that.
+    """
+    offset = ""
+    if range_offset_m:
+        offset = f" With the range offset, {1e3 * range_offset_m:+.1f} mm, the two agree."
     if (
         board.disagreement_m is None
         or board.disagreement_deg is None
         or board.disagreement_sigmas is None
     ):
-        return f"The depth was refused: {board.depth_refused}."
+        return f"The depth was refused: {board.depth_refused}.{offset}"
     return (
         f"The board's plane is {1e3 * board.disagreement_m:+z.2f} mm and"
         f" {board.disagreement_deg:.3f}° from the depth's: {board.disagreement_sigmas:.1f} standard"
-        " deviations."
+        f" deviations.{offset}"
     )
 
 

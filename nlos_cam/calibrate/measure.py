@@ -5,6 +5,7 @@ fitted to them.
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from datetime import datetime
+from functools import partial
 from itertools import islice
 from math import hypot
 
@@ -135,36 +136,58 @@ edge.
 
 
 def measure_by_depth(
-    capture: CaptureStatistics, tape_m: float | None = None
+    capture: CaptureStatistics,
+    tape_m: float | None = None,
+    known: walls.WallRecord | None = None,
 ) -> tuple[walls.WallFit, dict[str, object]]:
-    """Fit the wall to its depth; return the fit and, with a distance by tape, the record's
-    range-offset fields.
+    """Fit the wall to its depth; return the fit and the record's range-offset fields, by the
+    distance by tape or else as an earlier record has `known` them.
 
     Raises WallRefusedError, and CalibrationError where tape and lidar cannot both be right.
     """
-    depth_m = capture.statistics.depth.mean_m()
-    noise = capture.statistics.depth.noise()
-
-    def fit_with(offset_m: float, origin_m: float) -> walls.WallFit:
-        return walls.fit_wall(
-            depth_m + offset_m, capture.intrinsics, np.random.default_rng(0), noise, origin_m
-        )
-
     if tape_m is None:
-        return fit_with(0.0, 0.0), {}
+        return _fit_with_known_offset(capture, known) if known else (_fit_depth(capture, 0.0), {})
 
     def fit_along_rays(offset_m: float) -> walls.WallFit:
         # depth = range * cos(angle to the axis), and a ray of unit depth has the length 1 / cos
         length = np.linalg.norm(capture.intrinsics.rays(), axis=-1)
-        return walls.fit_wall(
-            depth_m + offset_m / length, capture.intrinsics, np.random.default_rng(0), noise
-        )
+        return _fit_depth(capture, offset_m / length)
 
-    taped = walls.fit_with_tape_distance(fit_with, tape_m, fit_along_rays)
-    return taped.fit, {
-        "range_offset_m": taped.offset_m,
-        "range_offset_std_m": taped.offset_std_m,
-        "range_offset_cause": taped.cause,
+    taped = walls.fit_with_tape_distance(partial(_fit_depth, capture), tape_m, fit_along_rays)
+    return taped.fit, _offset_fields(taped)
+
+
+def _fit_with_known_offset(
+    capture: CaptureStatistics, known: walls.WallRecord
+) -> tuple[walls.WallFit, dict[str, object]]:
+    """Fit the wall to its depth with a record's range offset, whose uncertainty is the distance's
+    too; return the fit and the record's range-offset fields.
+    """
+    offset_m = walls.depth_offset_m(known)
+    fit = _fit_depth(capture, offset_m, known.range_offset_m - offset_m)
+    std_m = hypot(fit.distance_std_m, known.range_offset_std_m or 0.0)
+    names = ("range_offset_m", "range_offset_std_m", "range_offset_cause")
+    return replace(fit, distance_std_m=std_m), {name: getattr(known, name) for name in names}
+
+
+def _fit_depth(
+    capture: CaptureStatistics, offset_m: float | NDArray[np.float64], origin_m: float = 0.0
+) -> walls.WallFit:
+    """Fit the wall to the mean depth with a length added, the pose's origin `origin_m` behind the
+    zero of depth.
+    """
+    depth = capture.statistics.depth
+    depth_m = depth.mean_m() + offset_m
+    generator = np.random.default_rng(0)
+    return walls.fit_wall(depth_m, capture.intrinsics, generator, depth.noise(), origin_m)
+
+
+def _offset_fields(corrected: walls.CorrectedWall) -> dict[str, object]:
+    """Return the record's fields of a range offset."""
+    return {
+        "range_offset_m": corrected.offset_m,
+        "range_offset_std_m": corrected.offset_std_m,
+        "range_offset_cause": corrected.cause,
     }
 
 
@@ -174,9 +197,10 @@ def measure_by_board(
     square_mm: float | None,
 ) -> tuple[walls.WallFit | walls.WallByBoard, dict[str, object]]:
     """Fit the wall to its depth, unless that is refused, and to a printed board; return the fit and
-    the board's record.
+    the record's fields of board and range offset.
 
-    The board is searched in the mean infrared. Raises BoardRefusedError.
+    The board is searched in the mean infrared. Where its squares were measured (`square_mm`) and it
+    contradicts the depth, a range offset that explains this is corrected. Raises BoardRefusedError.
     """
     try:
         depth = measure_by_depth(capture)[0]
@@ -187,6 +211,15 @@ def measure_by_board(
     fit, record = walls.wall_with_board(
         depth, capture.statistics.ir_mean(), capture.intrinsics, board, measured=measured
     )
+    if measured and record.used == "board":
+        corrected = walls.fit_with_board_distance(
+            partial(_fit_depth, capture), record.distance_m, record.distance_std_m
+        )
+        agreed = walls.with_range_offset(fit, depth, corrected) if corrected else None
+        if corrected and agreed:
+            if agreed.verdict != "doubtful":
+                record = record.model_copy(update={"causes": ()})
+            return agreed, {"board": record, **_offset_fields(corrected)}
     return fit, {"board": record}
 
 
@@ -201,7 +234,8 @@ def measure_occluder(
     """
     record = bare.record
     statistics = capture.statistics.depth
-    check_intrinsics(record.rig.pinhole, capture.intrinsics)
+    for known in (record.rig.pinhole, *([bare.reference.intrinsics] if bare.reference else [])):
+        check_intrinsics(known, capture.intrinsics)
     if record.serial and capture.serial and record.serial != capture.serial:
         raise CalibrationError(
             f"the bare wall was measured with the camera {record.serial}, this is {capture.serial}:"
@@ -227,8 +261,17 @@ def measure_occluder(
     off_m = np.abs(walls.points_m(record, depth_m - offset_m, capture.intrinsics)[..., 2])
     beside = np.where((off_m < NEAR_WALL_M) & ~found.pixels, depth_m, np.nan)
     origin_m = record.range_offset_m - offset_m
-    wall = walls.fit_wall(beside, capture.intrinsics, np.random.default_rng(0), noise, origin_m)
-    _raise_if_moved(record, wall)
+
+    def fit_beside(wall_m: NDArray[np.float64]) -> walls.WallFit:
+        generator = np.random.default_rng(0)
+        return walls.fit_wall(wall_m, capture.intrinsics, generator, noise, origin_m)
+
+    wall = fit_beside(beside)
+    if bare.reference is None:
+        _raise_if_moved(record, wall)
+    else:
+        then_m, now_m = _in_common(bare.reference, offset_m, beside)
+        _raise_if_moved(fit_beside(then_m), fit_beside(now_m))
     found = replace(found, x_std_m=hypot(found.x_std_m, _edge_std_from_offset_m(record, found)))
     changes = walls.settings_changed(bare.reference, capture.settings) if bare.reference else ()
     if changes:
@@ -252,15 +295,29 @@ def _edge_std_from_offset_m(record: walls.WallRecord, found: walls.OccluderFit) 
     return abs(float(per_offset)) * (record.range_offset_std_m or 0.0)
 
 
-def _raise_if_moved(record: walls.WallRecord, wall: walls.WallFit) -> None:
-    """Raise WallRefusedError if the lidar has moved since `record`.
+def _in_common(
+    reference: walls.BareWall, offset_m: float, beside_m: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the wall's depths (height, width) of the reference, with an offset added, and of now,
+    in the pixels that both have.
+    """
+    # A range offset that is not corrected bends the depth's wall and turns it against the record's
+    # pose, which may be a printed board's, and ripples do so otherwise in each part of the view.
+    # The same pixels of the same lidar have the same errors, unless it has moved.
+    then_m = reference.depth_m.astype(np.float64) + offset_m
+    both = reference.inliers & np.isfinite(then_m) & np.isfinite(beside_m)
+    return np.where(both, then_m, np.nan), np.where(both, beside_m, np.nan)
+
+
+def _raise_if_moved(then: walls.WallRecord | walls.WallFit, wall: walls.WallFit) -> None:
+    """Raise WallRefusedError if the lidar has moved since the bare wall was as `then`.
 
     Yaw and pitch are compared, not the facing angle: on a wall faced obliquely, pitch hardly
     changes that.
     """
-    apart_m = wall.distance_m - record.distance_m
-    yaw_deg = wall.yaw_deg - record.yaw_deg
-    pitch_deg = wall.pitch_deg - record.pitch_deg
+    apart_m = wall.distance_m - then.distance_m
+    yaw_deg = wall.yaw_deg - then.yaw_deg
+    pitch_deg = wall.pitch_deg - then.pitch_deg
     turn_deg = max(abs(yaw_deg), abs(pitch_deg))
     if abs(apart_m) <= walls.TOLERANCE_M and turn_deg <= walls.TOLERANCE_DEG:
         return

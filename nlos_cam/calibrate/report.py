@@ -113,7 +113,7 @@ def measures(record: walls.WallRecord) -> str:
     """Return the measured quantities with the half width of each 95 % interval."""
     hint = ""
     if record.range_offset_std_m is None:
-        hint = "<p>Range offset not measured: give --tape-m.</p>"
+        hint = "<p>Range offset not measured: give --tape-m, or --board and --square-mm.</p>"
     rows = table(walls.wall_facts(record), ("", "measured (± 95 %)", "meaning"))
     return f"<section><h2>What was measured</h2>{rows}{hint}</section>"
 
@@ -135,8 +135,8 @@ def board(record: walls.WallRecord) -> str:
         f" {found.printed.square_mm:.2f} mm"
     )
     facts = (
-        f"{walls.board_agreement(found)} The record's plane is of {used}. {found.corners} corners"
-        f" of {printed} ({size}),"
+        f"{walls.board_agreement(found, record.range_offset_m)} The record's plane is of {used}."
+        f" {found.corners} corners of {printed} ({size}),"
         f" {found.residual_px:.2f} pixels RMS off; stretched by {100.0 * found.stretch:+z.2f} %,"
         f" bowed by {1e3 * found.bow_m:+z.2f} mm."
     )

@@ -161,8 +161,9 @@ class L515Camera(LiveCamera):
     """L515 by serial number, or the only one; 640 x 480 at 30 frames/s, 320 x 240 on USB 2.
 
     After the start it sets the options for a near wall and lowers the laser power until returns do
-    not saturate; then frames are delivered and recorded. `Frame.settings` holds the options as read
-    back. Raises CameraNotFoundError.
+    not saturate; then frames are delivered and recorded. Options that were changed by `set_option`
+    are set again when the device comes back. `Frame.settings` holds the options as read back.
+    Raises CameraNotFoundError.
     """
 
     differences: Mapping[str, str]
@@ -198,14 +199,17 @@ class L515Camera(LiveCamera):
         super()._clear_state()
         self._laser_power: float | None = None
         """The power that did not saturate, for when the device comes back."""
+        self._by_hand: dict[str, float] = {}
+        """Options of `set_option`, for when the device comes back."""
 
     def _prepare(self, sensor: Any) -> None:
         """Set the preset first, since it changes other options, and after the start, which resets
-        it.
+        it; options set by hand last, for the same reason.
         """
         options = Options(sensor, self._sdk)
         off = {name: 0.0 for name in MODES_OFF if options.get(name) not in {None, 0.0}}
-        differences = self._put(options, off | PRESET) | self._put(options, NEAR_WALL)
+        near_wall = NEAR_WALL | self._by_hand
+        differences = self._put(options, off | PRESET) | self._put(options, near_wall)
         for name, difference in differences.items():
             if self.differences.get(name) != difference:
                 log.warning("%s: %s: %s", self.uri, name, difference)
@@ -227,17 +231,21 @@ class L515Camera(LiveCamera):
 
     def _turn_down(self, options: Options) -> None:
         """Lower the laser power until returns do not saturate, from its last power if the device
-        came back.
+        came back; a power that was set by hand stays.
         """
         limits = options.limits(LASER_POWER)
-        preset = options.get(LASER_POWER)
-        if limits is None or preset is None:
+        present = options.get(LASER_POWER)
+        if limits is None or present is None:
             return
-        power = preset if self._laser_power is None else self._laser_power
-        if power != preset:
+        by_hand = LASER_POWER in self._by_hand and LASER_POWER not in self.differences
+        power = present if by_hand or self._laser_power is None else self._laser_power
+        if power != present:
             options.put(LASER_POWER, power)
         settled = turn_down(
-            power, limits, self._saturated_share, lambda lower: not options.put(LASER_POWER, lower)
+            power,
+            limits,
+            self._saturated_share,
+            lambda lower: not by_hand and not options.put(LASER_POWER, lower),
         )
         self._laser_power = settled.power
         if settled.power < power:
@@ -296,8 +304,7 @@ class L515Camera(LiveCamera):
             wanted = limits.nearest(value) if limits else value
             if problem := options.put(name, wanted):
                 raise CameraError(f"{name}: {problem}")
-            if name == LASER_POWER:
-                self._laser_power = wanted
+            self._by_hand[name] = wanted
             self._session.read_settings()
         return f"{name} is {wanted:g}" + ("" if wanted == value else f", the nearest to {value:g}")
 

@@ -1,8 +1,8 @@
 """Physics checks in a separate process of low priority, which never delays the live loop.
 
-`python -m nlos_cam.live.physics_check_process` is that process. It reads rig and accuracy from
-stdin, then frames, each as a pickle, and answers each with a PhysicsCheckResult, or with a text if
-the check failed. It exits as soon as stdin closes, even during a check, so it never outlives its
+`python -m nlos_cam.live.physics_check_process` is that process. It reads the accuracy from stdin,
+then frames with their rig, each as a pickle, and answers each with a PhysicsCheckResult, or with a
+text if the check failed. It exits as soon as stdin closes, even during a check, so it never outlives its
 parent.
 """
 
@@ -56,14 +56,15 @@ class BackgroundPhysicsCheck:
         self.newest: PhysicsCheckResult | None = None
         self.dropped = 0
         """Due frames that a newer one replaced."""
-        self._setup = (rig, accuracy)
+        self._rig = rig
+        self._accuracy: Stop = accuracy
         self._period_s = period_s
         self._clock = clock
         self._on_error = on_error
         self._reported = False
         self._command = command
         self._due_s = -float("inf")
-        self._queue = BoundedQueue[tuple[int, LidarMaps, Float32]](1)
+        self._queue = BoundedQueue[tuple[int, LidarMaps, Float32, Rig]](1)
         self.process: subprocess.Popen[bytes] | None = None
         """None if it could not be started."""
 
@@ -85,13 +86,17 @@ class BackgroundPhysicsCheck:
             _end(self.process)
             self._thread.join(END_WITHIN_S)
 
+    def use_rig(self, rig: Rig) -> None:
+        """Compare the frames that are offered from now on with this rig."""
+        self._rig = rig
+
     def offer(self, frame_number: int, maps: LidarMaps, depth_m: Float32) -> None:
         """Have this frame checked if a check is due."""
         now_s = self._clock()
         if now_s < self._due_s:
             return
         self._due_s = now_s + self._period_s
-        self.dropped += self._queue.put((frame_number, maps, depth_m)) is not None
+        self.dropped += self._queue.put((frame_number, maps, depth_m, self._rig)) is not None
 
     @property
     def waits(self) -> bool:
@@ -116,7 +121,7 @@ class BackgroundPhysicsCheck:
         from_worker = process.stdout
         if to_worker is None or from_worker is None:
             return
-        _send(to_worker, self._setup)
+        _send(to_worker, self._accuracy)
         while (frame := self._queue.take()) is not None:
             _send(to_worker, frame)
             answer = pickle.load(from_worker)  # noqa: S301  from our own process, through a private pipe
@@ -171,13 +176,13 @@ def serve(from_parent: IO[bytes], to_parent: IO[bytes], leave: Callable[[], None
     """Answer every frame until there are no more; calls `leave` then, even during a check."""
     messages: SimpleQueue[Any] = SimpleQueue()
     Thread(target=_listen, args=(from_parent, messages, leave), daemon=True).start()
-    rig, accuracy = messages.get()
+    accuracy = messages.get()
     from nlos_cam.reconstruct import (
         check_reconstruction,
     )  # takes a second: stdin is watched already
 
     while (message := messages.get()) is not None:
-        frame_number, maps, depth_m = message
+        frame_number, maps, depth_m, rig = message
         try:
             answer: object = check_reconstruction(
                 maps, depth_m, rig, frame_number=frame_number, accuracy=accuracy

@@ -1,6 +1,7 @@
 """Commands of a live run, by group: pipeline, saved views, recording, camera and bench."""
 
 import re
+import shlex
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
@@ -10,7 +11,7 @@ from pathlib import Path
 from queue import Empty, Queue
 from typing import Any, Protocol, runtime_checkable
 
-from nlos_calibration import UNUSABLE, MeasuredWall, WallRecord
+from nlos_calibration import UNUSABLE, MeasuredWall, Rig, WallRecord
 from nlos_calibration.arrays import Mask
 from nlos_calibration.errors import CalibrationError, OccluderRefusedError
 
@@ -20,7 +21,7 @@ from nlos_cam.camera import FRAMES_PER_S, Camera
 from nlos_cam.errors import NlosCamError
 from nlos_cam.frames import Frame
 from nlos_cam.live.live_recording import LiveRecording
-from nlos_cam.reconstruct import CalibratedRig, Clock, Pipeline, ignore
+from nlos_cam.reconstruct import CalibratedRig, Clock, Pipeline, ignore, weights_serve
 from nlos_cam.view import Moment, WrittenFiles
 
 REFERENCE_FRAMES = 60
@@ -30,6 +31,10 @@ REFERENCE_TIMEOUT_S = 10.0
 POLL_S = 0.2
 """Interval at which a wait for a frame looks whether the run has ended."""
 MAX_AVERAGE = 1000
+OCCLUDER_ASSUMED = (
+    "the occluder has not been measured, the paper's is assumed: put it up and run `nlos-cam"
+    " calibrate --occluder {path}`"
+)
 
 OnFrame = Callable[[Frame], None]
 Commands = dict[str, Callable[..., str]]
@@ -259,8 +264,8 @@ class BenchCommands:
         return outcome
 
     def take_reference(self, frames: int = REFERENCE_FRAMES) -> str:
-        """Measure the empty bench (nothing hidden) and use it as the reference of difference maps
-        and drift.
+        """Measure the empty bench (nothing hidden), and use its rig from now on, and its frames as
+        the reference of difference maps and drift.
 
         With a wall record the occluder is found again; without one the wall is measured as it is
         now. The record is written beside the other files, for --wall. Raises CalibrationError where
@@ -285,15 +290,46 @@ class BenchCommands:
         if record.advice.startswith(UNUSABLE):
             raise CalibrationError(record.advice)
         path = self._run.new_file("bench", ".toml")
+        record = record.model_copy(update={"rig": measured_rig(bench.rig, record)})
         reference = capture.reference(inliers)
         files = calibrate.WallFiles.beside(path, overwrite=False)
         record = calibrate.write_record(files, record, reference)
-        pipeline.bench = CalibratedRig(bench.rig, MeasuredWall(record, reference), bench.notes)
+        # What was noted before is of a wall or an occluder that had not been measured.
+        assumed = bool(bench.notes) and record.occluder is None
+        notes = (OCCLUDER_ASSUMED.format(path=path),) if assumed else ()
+        pipeline.bench = CalibratedRig(record.rig, MeasuredWall(record, reference), notes)
         self.on_bench(pipeline.bench)
-        return (
-            f"reference of {capture.statistics.depth.frames} frames ({record.verdict}:"
-            f" {record.advice}); wrote {path}, {self._run.files.note(path)}"
-        )
+        taken = capture.statistics.depth.frames
+        place = f"{1e3 * record.distance_m:.1f} mm away, faced at {record.facing_deg:.1f} degrees"
+        outcomes = [
+            f"reference of {taken} frames ({record.verdict}: {record.advice})",
+            f"from now on the wall is {place}",
+            *notes,
+            *_weights_warnings(record.rig, pipeline, path),
+            f"wrote {path}, {self._run.files.note(path)}",
+        ]
+        return "; ".join(outcomes)
+
+
+def measured_rig(rig: Rig, record: WallRecord) -> Rig:
+    """Return the rig of a run with lidar, intrinsics and, if it was found, occluder of a new
+    record.
+    """
+    measured = record.rig
+    changed = {name: getattr(measured, name) for name in ("name", "lidar", "intrinsics")}
+    if record.occluder:
+        changed["occluder"] = measured.occluder
+    return rig.model_copy(update=changed)
+
+
+def _weights_warnings(rig: Rig, pipeline: Pipeline, record: Path) -> list[str]:
+    """Return the verdict on the run's weights for the rig of a wall record, if larger errors are to
+    be expected.
+    """
+    if pipeline.trained is None:
+        return []
+    served = weights_serve(rig, pipeline.trained, bench=shlex.quote(str(record)))
+    return [served.sentence] if served.is_warning else []
 
 
 def measure_bench(
@@ -312,9 +348,10 @@ def measure_bench(
             # a bare wall has none; one that was entered by hand is out of view, and must not be lost
             if measured.record.occluder:
                 raise
-    fit, facts = calibrate.measure_by_depth(capture)
-    if measured and capture.gravity_m_s2 is None:
-        facts["way_up"] = measured.record.way_up
+    known = measured.record if measured else None
+    fit, facts = calibrate.measure_by_depth(capture, known=known)
+    if known and capture.gravity_m_s2 is None:
+        facts["way_up"] = known.way_up
     return capture.record(fit, facts), fit.inliers
 
 

@@ -88,6 +88,10 @@ class PhysicsCheck(Protocol):
 
     def __exit__(self, *_: object) -> None: ...
 
+    def use_rig(self, rig: Rig) -> None:
+        """Compare the frames that are offered from now on with this rig."""
+        ...
+
     def offer(self, frame_number: int, maps: LidarMaps, depth_m: Float32) -> None:
         """Offer a frame's maps and the hidden depth (64, 64) reconstructed from them."""
         ...
@@ -102,6 +106,9 @@ class NullPhysicsCheck:
         return self
 
     def __exit__(self, *_: object) -> None:
+        pass
+
+    def use_rig(self, rig: Rig) -> None:
         pass
 
     def offer(self, frame_number: int, maps: LidarMaps, depth_m: Float32) -> None:
@@ -359,6 +366,10 @@ class PeriodicPhysicsCheck(NullPhysicsCheck):
         self._accuracy: Stop = accuracy
         self._on_error = on_error
         self._failed = False
+
+    def use_rig(self, rig: Rig) -> None:
+        """Compare the frames that are offered from now on with this rig."""
+        self._rig = rig
 
     def offer(self, frame_number: int, maps: LidarMaps, depth_m: Float32) -> None:
         """Check this frame if it is the first of its group."""

@@ -241,7 +241,8 @@ class Pipeline:
             )
         self.network = network
         self.uncertainty_model = uncertainty_model
-        self._trained = trained
+        self.trained = trained
+        """Record of the networks' training; None where it is not known."""
         self.checks = checks or NullPhysicsCheck()
         self._verdicts = VerdictFilter(
             verdict_limits(uncertainty_model) if uncertainty_model else None
@@ -253,17 +254,18 @@ class Pipeline:
 
     @property
     def bench(self) -> CalibratedRig:
-        """Bench of the frames; setting it aligns their maps with the training rig again. Any thread
-        may set it.
+        """Bench of the frames; setting it aligns their maps with the training rig again, and has
+        the physics check compare with its rig. Any thread may set it.
         """
         return self._bench.bench
 
     @bench.setter
     def bench(self, bench: CalibratedRig) -> None:
-        aligned = alignment(bench.rig, self._trained, bench.reference) if self._trained else None
+        aligned = alignment(bench.rig, self.trained, bench.reference) if self.trained else None
         consistency = MapConsistency(bench) if self.uncertainty_model else None
         # in one assignment: `prepare` must not see half of it
         flat_field = None if aligned else FlatField(bench)
+        self.checks.use_rig(bench.rig)
         self._bench = PreparedBench(bench, aligned, flat_field, consistency, EdgeRepair(bench))
 
     @property

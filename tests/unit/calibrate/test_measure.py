@@ -221,6 +221,21 @@ def test_measure_occluder_is_not_moved_by_an_origin_offset(seen: CaptureStatisti
     assert record.occluder.x_std_m == pytest.approx(0.0005, rel=0.02)  # the tape's
 
 
+@pytest.mark.parametrize("tape_m", [0.2, 0.204])
+@pytest.mark.parametrize("short_m", [0.0, 0.004])
+def test_known_range_offset_gives_the_wall_by_tape_again(tape_m: float, short_m: float) -> None:
+    depth_m = wall_depth(RIG.wall_from_lidar, INTRINSICS) - short_m
+    seen = seen_of(depth_m, 10)
+    taped = measured(seen, tape_m).record
+    fit, facts = measure.measure_by_depth(seen, known=taped)
+    offset = {name: getattr(taped, f"range_offset_{name}") for name in ("m", "std_m", "cause")}
+
+    assert facts == {f"range_offset_{name}": value for name, value in offset.items()}
+    assert fit.distance_m == pytest.approx(taped.distance_m, abs=1e-9)
+    assert fit.yaw_deg == pytest.approx(taped.yaw_deg, abs=1e-9)
+    assert fit.distance_std_m >= taped.range_offset_std_m
+
+
 def test_measure_occluder_refuses_another_image_size(bare: MeasuredWall) -> None:
     with pytest.raises(CalibrationError, match=r"160x120.*80x60"):
         measure_occluder(bench_seen(RIG.pinhole.scaled(80, 60)), bare)

@@ -5,8 +5,15 @@ import numpy as np
 import pytest
 from nlos_calibration import BOARDS, BoardRecord, board_wall, load_rig, normal_from_angles
 from nlos_calibration.arrays import Float64
-from nlos_calibration.board_wall import Combined, UncertainPlane, combine, wall_with_board
+from nlos_calibration.board_wall import (
+    Combined,
+    UncertainPlane,
+    combine,
+    wall_with_board,
+    with_range_offset,
+)
 from nlos_calibration.errors import BoardRefusedError, WallRefusedError
+from nlos_calibration.range_offset import CorrectedWall
 from nlos_calibration.wall import WallFit, fit_wall
 from synthetic_scenes import at_near_edge, clean_infrared, infrared_frames
 from synthetic_walls import View, depth_statistics
@@ -127,6 +134,35 @@ def test_board_alone_advises_to_move_a_lidar_too_far_away() -> None:
 
     assert fit.distance_m == pytest.approx(2.0 * TRUE_M, abs=0.005)
     assert "10 cm" in fit.advice
+
+
+@pytest.mark.parametrize("refused", [True, False])
+def test_range_offset_that_the_bend_shows_ends_the_doubt(depth: WallFit, *, refused: bool) -> None:
+    bent = REFUSAL if refused else replace(depth, verdict="doubtful")
+    by_board, _ = wall_with_board(bent, infrared(), PINHOLE, A4, measured=True)
+    fit = with_range_offset(by_board, bent, CorrectedWall(depth, 0.0045, 5e-4, "depth"))
+
+    assert fit.verdict == "good"
+    assert "+4.5 mm" in fit.advice
+    assert (fit.distance_m, fit.yaw_deg) == (by_board.distance_m, by_board.yaw_deg)
+    np.testing.assert_array_equal(fit.wall_from_lidar, by_board.wall_from_lidar)
+    assert fit.residual_m == depth.residual_m
+
+
+def test_range_offset_that_no_bend_shows_leaves_the_doubt(depth: WallFit) -> None:
+    by_board, _ = wall_with_board(depth, infrared(0.97), PINHOLE, A4, measured=True)
+    fit = with_range_offset(by_board, depth, CorrectedWall(depth, 0.0045, 5e-4, "depth"))
+
+    assert fit.verdict == "doubtful"
+    assert by_board.advice in fit.advice
+    assert "+4.5 mm" in fit.advice
+
+
+def test_range_offset_that_leaves_the_wall_turned_is_none(depth: WallFit) -> None:
+    by_board, _ = wall_with_board(REFUSAL, infrared(), PINHOLE, A4, measured=True)
+    turned = replace(depth, yaw_deg=depth.yaw_deg + 1.0)
+
+    assert with_range_offset(by_board, REFUSAL, CorrectedWall(turned, 0.01, 5e-4, "depth")) is None
 
 
 def test_image_without_a_board_is_refused(depth: WallFit) -> None:

@@ -255,6 +255,9 @@ def test_file_of_another_kind_or_none_is_refused(tmp_path: Path, content: bytes)
     ):
         with pytest.raises(RecordFileError, match=word):
             load_wall(read)
+    (tmp_path / "bench.toml").write_text("bench_version = 1\n")
+    with pytest.raises(RecordFileError, match=f"is a bench.*{tmp_path.name}, as a bench"):
+        load_wall(tmp_path / "bench.toml")
     for name in ("no-such-rig", "."):
         with pytest.raises(RecordFileError):
             load_rig(name)

@@ -4,7 +4,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from measured_walls import BOARD, exact_wall
-from nlos_calibration import INTERVAL_STDS, OccluderRecord, wall_facts, with_degrees, with_mm
+from nlos_calibration import (
+    INTERVAL_STDS,
+    OccluderRecord,
+    board_agreement,
+    wall_facts,
+    with_degrees,
+    with_mm,
+)
 
 RECORD = exact_wall().record
 OFFSET = {"range_offset_m": -0.0045, "range_offset_std_m": 0.0005, "range_offset_cause": "depth"}
@@ -64,6 +71,14 @@ def test_facts_leave_out_what_was_not_measured() -> None:
     facts = values(temperatures_c={})
     for name in ("range offset", "printed board", "occluder's tilt", "temperature"):
         assert name not in facts
+
+
+def test_board_agrees_with_the_range_offset_of_its_record() -> None:
+    apart = board_agreement(BOARD)
+
+    assert "agree" not in apart
+    assert board_agreement(BOARD, 0.0047).startswith(apart)
+    assert "+4.7 mm, the two agree" in board_agreement(BOARD, 0.0047)
 
 
 def test_facts_hold_offset_board_occluder_and_footprint() -> None:

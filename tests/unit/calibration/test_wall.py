@@ -9,7 +9,13 @@ from nlos_calibration.arrays import Float64
 from nlos_calibration.errors import CalibrationError, WallRefusedError
 from nlos_calibration.flatness import Flatness, Ripples, flatness, ripples
 from nlos_calibration.plane import PlaneFit, fit_depth
-from nlos_calibration.range_offset import TAPE_STD_M, FitWith, fit_with_tape_distance
+from nlos_calibration.range_offset import (
+    MAX_OFFSET_M,
+    TAPE_STD_M,
+    FitWith,
+    fit_with_board_distance,
+    fit_with_tape_distance,
+)
 from nlos_calibration.wall import (
     WallFit,
     WallMeasures,
@@ -369,3 +375,39 @@ def test_tape_offset_is_less_certain_on_an_oblique_wall() -> None:
 def test_tape_far_from_the_measured_distance_is_refused(tape_m: float) -> None:
     with pytest.raises(CalibrationError, match=f"{1e3 * tape_m:.1f} mm"):
         fit_with_tape_distance(read_as(bare(0.2, 45.0, PITCH_DEG)), tape_m)
+
+
+BOARD_STD_M = 0.0005
+
+
+@pytest.mark.parametrize("offset_m", [-0.02, -0.0045, 0.003, 0.02])
+@pytest.mark.parametrize("yaw_deg", [20.0, 45.0, 65.0])
+def test_board_distance_gives_the_offset_of_the_depth(yaw_deg: float, offset_m: float) -> None:
+    found = fit_with_board_distance(
+        read_as(bare(0.2, yaw_deg, PITCH_DEG) - offset_m), 0.2, BOARD_STD_M
+    )
+
+    assert found.cause == "depth"
+    assert found.offset_m == pytest.approx(offset_m, abs=3e-5)
+    assert found.fit.distance_std_m == BOARD_STD_M
+    np.testing.assert_allclose(
+        found.fit.wall_from_lidar, view(0.2, yaw_deg, PITCH_DEG, PINHOLE).pose, atol=3e-4
+    )
+
+
+def test_offset_by_a_board_is_as_uncertain_as_its_distance() -> None:
+    short = read_as(bare() - 0.003)
+    one, two = (fit_with_board_distance(short, 0.2, n * BOARD_STD_M).offset_std_m for n in (1, 2))
+
+    assert two == pytest.approx(2.0 * one, rel=0.01)
+    assert one == pytest.approx(BOARD_STD_M, rel=0.5)
+
+
+@pytest.mark.parametrize("board_m", [0.19, 0.21, 0.2 + 1.5 * MAX_OFFSET_M])
+def test_board_at_another_distance_than_a_flat_wall_gives_none(board_m: float) -> None:
+    assert fit_with_board_distance(read_as(bare()), board_m, BOARD_STD_M) is None
+
+
+def test_board_distance_gives_no_offset_too_large_to_correct() -> None:
+    far_off = read_as(bare() - 1.5 * MAX_OFFSET_M)
+    assert fit_with_board_distance(far_off, 0.2, BOARD_STD_M) is None

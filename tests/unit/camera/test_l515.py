@@ -166,6 +166,55 @@ def test_laser_power_is_kept_when_a_device_comes_back(fake_camera: Make) -> None
     assert lidar.did[lidar.did.index("unplugged") :].count("laser_power") == 1
 
 
+BY_HAND = {
+    "digital_gain": 2.0,
+    "receiver_gain": 14.0,
+    "noise_filtering": 4.0,
+    "laser_power": 70.0,
+}
+
+
+def fall_silent(lidar: FakeLidar) -> None:
+    lidar.stop()
+    lidar.options = dict(lidar.factory)
+
+
+def vanish_for_a_while(lidar: FakeLidar) -> None:
+    lidar.unplug()
+    lidar.back_after = 2
+
+
+@pytest.mark.parametrize(
+    ("fail", "event"), [(fall_silent, "restarted"), (vanish_for_a_while, "replugged")]
+)
+def test_options_set_by_hand_hold_after_a_recovery(
+    fake_camera: Make, fail: Callable[[FakeLidar], None], event: str
+) -> None:
+    gains = {"digital_gain": 0.0, "receiver_gain": 9.0}
+    lidar = FakeLidar(usb="2.1", runs=ENDLESS * 2, laser_power=93.0, **gains)
+    lidar.saturated_share = lambda power: 0.3 if power > 60.0 else 0.0
+    with fake_camera(lidar) as camera:
+        camera.silence_s = 0.3
+        frames = iter(camera)
+        next(frames)
+        for name, value in BY_HAND.items():
+            camera.set_option(name, value)
+        fail(lidar)
+        while not camera.counts[event]:
+            found = next(frames)
+
+    assert {name: found.settings[name] for name in BY_HAND} == BY_HAND
+
+
+def test_options_set_by_hand_end_with_the_run(fake_camera: Make) -> None:
+    lidar = FakeLidar(laser_power=93.0)
+    camera = fake_camera(lidar)
+    with camera:
+        camera.set_option("noise_filtering", 4.0)
+    with camera:
+        assert lidar.options["noise_filtering"] == NEAR_WALL["noise_filtering"]
+
+
 def test_two_cameras_share_a_context_and_keep_their_devices() -> None:
     sdk = FakeSdk(*(FakeLidar(serial, usb="2.1", runs=ENDLESS) for serial in ("f1", "f2")))
     made = [

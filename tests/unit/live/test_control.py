@@ -1,6 +1,7 @@
 import json
 import threading
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from threading import Event
 from types import SimpleNamespace
@@ -10,15 +11,27 @@ import numpy as np
 import pytest
 from fake_wall import wall_frame
 from made_up_moments import RIG, Recorded, full_moment, moment
-from nlos_calibration import UNUSABLE, load_measured
-from small_frames import FrameCamera, sheet_network
+from nlos_calibration import (
+    UNUSABLE,
+    LidarPose,
+    MeasuredWall,
+    OccluderRecord,
+    load_measured,
+    load_rig,
+    wall_depth,
+)
+from nlos_models import load_record, shipped_folder
+from small_frames import SMALL, FrameCamera, sheet_network
 from view_streams import saved_moments
 
 from nlos_cam.camera import SimulatedCamera
 from nlos_cam.errors import NlosCamError
+from nlos_cam.frames import Frame
 from nlos_cam.live import RunControl, RunReport, run_live
+from nlos_cam.live.run_commands import measured_rig
 from nlos_cam.live.statistics import WARM_UP_FRAMES
 from nlos_cam.reconstruct import CalibratedRig, Pipeline
+from nlos_cam.reconstruct.bench import NOT_MEASURED
 from nlos_cam.view import NullViewer, WrittenFiles
 
 
@@ -166,8 +179,8 @@ def test_one_command_runs_at_a_time(control: RunControl) -> None:
     assert control.pipeline.paused
 
 
-def run(camera: FrameCamera, control: RunControl) -> RunReport:
-    pipeline = Pipeline(CalibratedRig(RIG), sheet_network)
+def run(camera: FrameCamera, control: RunControl, pipeline: Pipeline | None = None) -> RunReport:
+    pipeline = pipeline or Pipeline(CalibratedRig(RIG), sheet_network)
     return run_live(camera, pipeline, NullViewer(), stop=Event(), control=control, recorded=True)
 
 
@@ -218,12 +231,78 @@ def test_reference_is_taken_from_the_passing_frames(tmp_path: Path) -> None:
     assert "reference of 8 frames" in outcomes[0]
 
     (bench,) = benches
-
-    assert bench.rig is RIG
-
     measured = load_measured(next(tmp_path.glob("bench-*.toml")))
 
     np.testing.assert_array_equal(measured.reference.map_depth_m, bench.reference.map_depth_m)
+
+
+ELSEWHERE = LidarPose(distance_m=0.25, yaw_deg=40.0, pitch_deg=2.0)
+
+
+def frame_elsewhere(number: int) -> Frame:
+    """Return a frame of a bare wall that is not where the paper's is."""
+    pose = RIG.model_copy(update={"lidar": ELSEWHERE}).wall_from_lidar
+    wall_m = wall_depth(pose, SMALL)
+    noise_m = np.random.default_rng(number).normal(0.0, 5e-4, wall_m.shape)
+    depth_m = np.where(wall_m < 0.6, wall_m + noise_m, np.nan).astype(np.float32)
+    return replace(wall_frame(number), depth_m=depth_m)
+
+
+@pytest.fixture
+def taken(tmp_path: Path) -> tuple[str, Pipeline, MeasuredWall]:
+    """Answer, pipeline and record of a reference in a run whose wall was not measured."""
+    pipeline = Pipeline(CalibratedRig(RIG, notes=(NOT_MEASURED,)), sheet_network)
+    pipeline.trained = load_record(shipped_folder("direct"))
+    control = RunControl(folder=tmp_path)
+    outcomes = list[str]()
+    command = threading.Thread(
+        target=lambda: outcomes.append(control.run("take_reference", {"frames": 8}))
+    )
+    run(FrameCamera(200, beside(command), make=frame_elsewhere, uri="l515"), control, pipeline)
+    command.join()
+    return outcomes[0], pipeline, load_measured(next(tmp_path.glob("bench-*.toml")))
+
+
+def test_reference_gives_the_rig_of_a_run_without_a_record(
+    taken: tuple[str, Pipeline, MeasuredWall],
+) -> None:
+    _, pipeline, measured = taken
+    rig = pipeline.bench.rig
+
+    assert rig.lidar.distance_m == pytest.approx(ELSEWHERE.distance_m, abs=5e-4)
+    assert rig.lidar.yaw_deg == pytest.approx(ELSEWHERE.yaw_deg, abs=0.1)
+    assert rig.lidar.pitch_deg == pytest.approx(ELSEWHERE.pitch_deg, abs=0.1)
+    assert rig.pinhole == SMALL
+    assert (rig.occluder, rig.object_box) == (RIG.occluder, RIG.object_box)
+    assert rig == measured.record.rig
+
+
+def test_reference_says_which_rig_is_used_and_assumed(
+    taken: tuple[str, Pipeline, MeasuredWall],
+) -> None:
+    answer, pipeline, measured = taken
+    (warning,) = pipeline.bench.warnings
+
+    assert f"{1e3 * measured.record.distance_m:.1f} mm" in answer
+    assert "occluder has not been measured" in warning
+    assert "calibrate --occluder" in warning
+    assert warning in answer
+    assert "adapt" in answer, "the weights are of another rig"
+
+
+def test_reference_with_an_occluder_gives_its_place() -> None:
+    found = load_rig("wide-rig").occluder
+    record: Any = SimpleNamespace(
+        rig=RIG.model_copy(update={"name": "measured", "lidar": ELSEWHERE, "occluder": found}),
+        occluder=OccluderRecord(source="detected", x_m=found.x_m, gap_m=found.z_min_m),
+    )
+    boxed = RIG.model_copy(update={"object_box": None})
+
+    assert measured_rig(boxed, record) == record.rig.model_copy(update={"object_box": None})
+
+    record.occluder = None
+
+    assert measured_rig(boxed, record).occluder == RIG.occluder
 
 
 def test_reference_with_something_in_the_way_is_refused(

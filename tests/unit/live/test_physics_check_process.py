@@ -24,6 +24,11 @@ DARK = LidarMaps(
     np.zeros((64, 80), np.float32),
     np.zeros((64, 80), np.bool_),
 )
+LIT = LidarMaps(
+    np.full((64, 80), 0.3, np.float32),
+    np.full((64, 80), 40.0, np.float32),
+    np.ones((64, 80), np.bool_),
+)
 SILENT = "import sys; sys.stdin.buffer.read()"
 GONE = "import sys; sys.exit(3)"
 DEAF = (
@@ -71,6 +76,20 @@ def test_background_check_equals_a_check_in_this_process() -> None:
     assert checks.newest.frame_number == 5
     assert checks.newest.score == check_reconstruction(DARK, NOTHING, RIG, accuracy="draft").score
     assert checks.process.returncode is not None
+
+
+def test_background_check_compares_with_the_rig_in_use() -> None:
+    paper = load_rig("paper-rig")
+    with BackgroundPhysicsCheck(RIG, accuracy="draft") as checks:
+        checks.use_rig(paper)
+        checks.offer(5, LIT, NOTHING)
+        wait_until(lambda: checks.newest is not None or checks.ended)
+
+    residual_m = checks.newest.residual_depth_m
+    by_paper, by_start = (check_reconstruction(LIT, NOTHING, rig) for rig in (paper, RIG))
+
+    np.testing.assert_array_equal(residual_m, by_paper.residual_depth_m)
+    assert not np.array_equal(residual_m, by_start.residual_depth_m, equal_nan=True)
 
 
 def test_background_checks_take_the_newest_frame_once_a_period() -> None:
@@ -169,7 +188,7 @@ def test_background_process_ends_with_a_killed_parent() -> None:
 
 def answers(*frames: object, end: bytes = b"") -> list[Any]:
     left = Event()
-    asked = BytesIO(b"".join(pickle.dumps(each) for each in ((RIG, "draft"), *frames)) + end)
+    asked = BytesIO(b"".join(pickle.dumps(each) for each in ("draft", *frames)) + end)
     told = BytesIO()
     serve(asked, told, left.set)
     assert left.wait(10.0)
@@ -181,7 +200,9 @@ def answers(*frames: object, end: bytes = b"") -> list[Any]:
 
 
 def test_worker_answers_each_frame_in_order_or_names_its_error() -> None:
-    found, error, later = answers((4, DARK, NOTHING), (1, "no maps", NOTHING), (9, DARK, NOTHING))
+    found, error, later = answers(
+        (4, DARK, NOTHING, RIG), (1, "no maps", NOTHING, RIG), (9, DARK, NOTHING, RIG)
+    )
 
     assert found.frame_number == 4
     assert later.frame_number == 9
@@ -189,9 +210,9 @@ def test_worker_answers_each_frame_in_order_or_names_its_error() -> None:
     assert error.startswith("AttributeError: ")
 
 
-@pytest.mark.parametrize("end", [b"", pickle.dumps((3, DARK, NOTHING))[:-9], b"not a pickle"])
+@pytest.mark.parametrize("end", [b"", pickle.dumps((3, DARK, NOTHING, RIG))[:-9], b"not a pickle"])
 def test_worker_leaves_when_its_parent_is_gone(end: bytes) -> None:
-    assert len(answers((1, DARK, NOTHING), end=end)) == 1
+    assert len(answers((1, DARK, NOTHING, RIG), end=end)) == 1
 
 
 def test_worker_is_nice_and_keeps_prints_out_of_its_answers(

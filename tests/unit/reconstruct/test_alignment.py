@@ -16,7 +16,7 @@ from nlos_cam import reconstruct
 from nlos_cam.evaluate import per_object
 from nlos_cam.frames import LidarMaps
 from nlos_cam.objects import benchmark_objects, image_from_depth, object_box
-from nlos_cam.reconstruct import Arrival, CalibratedRig, MapAlignment, alignment
+from nlos_cam.reconstruct import Arrival, CalibratedRig, MapAlignment, OwnMaps, alignment
 from nlos_cam.render import QUIET, Scene, Sensor, SensorModel, render
 
 RIG = load_rig("paper-rig")
@@ -196,3 +196,20 @@ def test_pipeline_aligns_with_the_bench_that_it_has() -> None:
         pipeline.bench = CalibratedRig(RIG)
         prepared = pipeline.prepare(arrival(RIG), lambda: 0.0, 0.0)
         np.testing.assert_array_equal(prepared.network_input.depth_m, prepared.corrected.depth_m)
+
+
+def test_corrected_maps_are_aligned_as_live_aligns_them() -> None:
+    """Labelled recordings are corrected by the bare wall first, and aligned without it."""
+    rig = BENCHES["all of it"]
+    model = SensorModel(wall_texture=0.1, ripple_m=0.001)
+    bare = maps_of(rig, None, model, seed=1)
+    seen = maps_of(rig, THINGS[0].depth_m, model, seed=2)
+    walled: Any = CalibratedRig(rig)
+    walled.reference = SimpleNamespace(map_depth_m=bare.depth_m, map_intensity=bare.intensity)
+    live = MapAlignment(rig, RIG, walled.reference).align(seen, seen.depth_m - bare.depth_m)
+
+    found = MapAlignment(rig, RIG).align(OwnMaps(walled).correct(seen))
+
+    np.testing.assert_array_equal(found.valid, live.valid)
+    np.testing.assert_allclose(found.depth_m, live.depth_m, rtol=0, atol=0.001)
+    np.testing.assert_allclose(found.intensity, live.intensity, rtol=0.01)

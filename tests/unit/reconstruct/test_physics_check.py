@@ -267,6 +267,17 @@ def test_periodic_check_reports_a_failure_once(caplog: pytest.LogCaptureFixture)
     assert "SceneError: 100 % wrong" in caplog.messages[1]
 
 
+def test_check_compares_with_the_bench_that_is_set() -> None:
+    checks = PeriodicPhysicsCheck(RIG, every=1, accuracy="draft")
+    pipeline = Pipeline(CalibratedRig(RIG), sheet_network, checks=checks)
+    other = load_rig("bare-wall")
+    pipeline.bench = CalibratedRig(other)
+    checks.offer(0, seen(None), EMPTY)
+
+    assert checks.newest.score == check_reconstruction(seen(None), EMPTY, other).score
+    assert checks.newest.score != check_reconstruction(seen(None), EMPTY, RIG).score
+
+
 def test_live_loop_shows_the_newest_check_with_each_frame() -> None:
     viewer = ListViewer()
     checks = PeriodicPhysicsCheck(RIG, every=2, accuracy="draft")
