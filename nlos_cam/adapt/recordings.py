@@ -134,7 +134,6 @@ def write_parts(found: Recordings, folder: Path, tracked: data.Tracked) -> dict[
                 found.part(part),
                 wall=found.open_bench,
                 frames=frames,
-                for_own_weights=True,
                 on_progress=on_progress,
             )
         data.write_shards(labelled, folder / part)

@@ -285,14 +285,14 @@ def label(
     overwrite: common.Overwrite = False,
     json: common.Json = False,
 ) -> None:
-    """Make a dataset from labelled recordings of known objects: maps of single frames, with the
-    hidden depth.
+    """Make a dataset from labelled recordings of known objects: maps of single frames, as `live`
+    gives them to the bench's own weights, with the hidden depth.
 
     A label is the name of a benchmark object, or of files beside the recordings: LABEL.truth.toml
     (the fields of a scene file's object; by default of the mesh LABEL.stl, .obj or .ply), or
     LABEL.npy (a depth map).
     """
-    chosen = benches.choose(bench_folder, wall)
+    chosen = benches.choose(bench_folder, wall, reconstructs=False)
     folder = common.output_path(out, "dataset", "", overwrite=overwrite)
     with common.tracked("reading recordings") as on_progress:
         command = _command(context, "label")

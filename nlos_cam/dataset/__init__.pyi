@@ -76,7 +76,6 @@ from .build import (
 )
 from .labelled import (
     FRAMES_PER_RECORDING,
-    RECORDED,
     Labelled,
     OpenBench,
     label_recordings,
@@ -94,7 +93,7 @@ from .outliers import (
     outliers_beside,
 )
 from .packed import PackedMaps, map_noise, open_packed_maps
-from .plan import DatasetPlan, Objects, RigSpread
+from .plan import RECORDED, DatasetPlan, Objects, RigSpread
 from .ray_backend import ray_farm
 from .reader import Dataset, open_dataset
 from .rig_range import OBJECTS_PER_RIG, RigRange

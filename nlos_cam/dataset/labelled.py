@@ -11,19 +11,19 @@ from typing import Any
 
 import numpy as np
 from nlos_calibration import ObjectBox, Rig, first_problem, load_rig
-from nlos_calibration.arrays import Float32
+from nlos_calibration.arrays import Float16, Float32
 from nlos_models.training import MapSet
 from pydantic import ValidationError
 
 from nlos_cam import objects as shapes
 from nlos_cam.dataset.build import SHARD
-from nlos_cam.dataset.plan import DatasetPlan, scene_row
+from nlos_cam.dataset.plan import RECORDED, DatasetPlan, scene_row
 from nlos_cam.dataset.reader import MAP_CHANNELS
 from nlos_cam.dataset.samples import OnProgress, Samples, ignore
 from nlos_cam.dataset.shards import SHARD_PATTERN, shard_path, store
 from nlos_cam.errors import DiskFullError, RecordingError
 from nlos_cam.files import atomic_directory, read_toml
-from nlos_cam.frames import OBJECT_PIXELS, maps_from_frame
+from nlos_cam.frames import OBJECT_PIXELS, LidarMaps, maps_from_frame
 from nlos_cam.reconstruct import CalibratedRig, OwnMaps, open_bench
 from nlos_cam.recording import ReplayCamera, Sidecar, load_sidecar, open_lidar_bag, sidecar_path
 from nlos_cam.render import HiddenObject, SceneFile
@@ -34,8 +34,6 @@ rig's object box.
 """
 FRAMES_PER_RECORDING = 8
 """Frames of a recording differ by their noise alone: more of them add little."""
-RECORDED = "recorded"
-"""Accuracy of a plan whose samples were not rendered."""
 
 KnownObjects = Callable[[ObjectBox], Mapping[str, Float32]]
 """Returns the depths (64, 64) over a box of the objects that need no file of their own, by
@@ -59,12 +57,13 @@ def truth_depth_m(recording: Path, label: str, rig: Rig, known: Mapping[str, Flo
     recording's or its label; else from the `known` objects. Raises RecordingError for no truth or
     two, SceneError for an invalid one.
     """
-    for name in dict.fromkeys((recording.stem, Path(label).name)):
+    names = dict.fromkeys((recording.stem, Path(label).name))
+    for name in names:
         if (file := _truth_file(recording.parent, name)) is not None:
             return (
                 _depth_map(file, shapes.object_box(rig))
                 if file.suffix == shapes.DEPTH_MAP_SUFFIX
-                else _placed(file, name, rig)
+                else _placed(file, [name, *names], rig)
             )
     if label in known:
         return known[label]
@@ -110,21 +109,21 @@ def _depth_map(path: Path, box: ObjectBox) -> Float32:
     return depth_m
 
 
-def _placed(path: Path, name: str, rig: Rig) -> Float32:
+def _placed(path: Path, names: Sequence[str], rig: Rig) -> Float32:
     """Return the depth of a truth file's object; without `category` or `file` it is the mesh beside
-    the truth file.
+    the truth file that has the first of the names.
     """
-    hidden = _hidden(path, name)
+    hidden = _hidden(path, names)
     depth_m = SceneFile(name=hidden.label, rig=rig, object=hidden).scene_at(0).object_depth_m
     if depth_m is None or np.isnan(depth_m).all():
         raise shapes.invisible_object_error(hidden.label, shapes.object_box(rig))
     return depth_m
 
 
-def _hidden(path: Path, name: str) -> HiddenObject:
+def _hidden(path: Path, names: Sequence[str]) -> HiddenObject:
     try:
         fields: dict[str, Any] = read_toml(path)
-        meshes = _meshes(path.parent, name)
+        meshes = [mesh for name in names for mesh in _meshes(path.parent, name)]
         if not fields.keys() & {"category", "file"} and meshes:
             fields["file"] = meshes[0].name
         if isinstance(file := fields.get("file"), str):
@@ -143,7 +142,11 @@ class Labelled:
     """Samples (n) of labelled recordings, one recording after another."""
 
     maps: MapSet
-    """Maps, with the images of the truth."""
+    """Maps as `live` gives them to networks of the bench's own rig, with the images of the
+    truth.
+    """
+    recorded: MapSet
+    """The same frames' maps as the lidar measured them, from which difference maps are made."""
     object_depth_m: Float32
     """(n, 64, 64); NaN for background."""
     label: tuple[str, ...]
@@ -171,17 +174,17 @@ def read_labelled(
     known: KnownObjects = benchmark_depths,
     wall: OpenBench | Path | None = None,
     frames: int = FRAMES_PER_RECORDING,
-    for_own_weights: bool = False,
     on_progress: OnProgress = ignore,
 ) -> Labelled:
     """Return maps of `frames` frames spread evenly over each recording, with the truth of their
     labels.
 
     Maps are of single frames, as in `live`, so that each has noise of its own. They are corrected
-    by `wall`, a wall record or what opens the bench for a camera: the range, and `for_own_weights`
-    of the bench all that `live` corrects for them. Without it the rig is the sidecars', or the
-    paper's. Frames without any return are left out. Raises RecordingError for a recording without a label, a truth
-    or a frame, and for recordings of two benches.
+    as `live` does it, by `wall`, a wall record or what opens the bench for a camera: range, cells
+    at the occluder's edge, reflectance of the wall and ripples of the lidar. The lidar's drift
+    stays in them. Without `wall` the rig is the sidecars', or the paper's. Frames without any
+    return are left out. Raises RecordingError for a recording without a label, a truth or a frame,
+    and for recordings of two benches.
     """
     parts: list[Labelled] = []
     objects: dict[str, Mapping[str, Float32]] = {}
@@ -192,7 +195,7 @@ def read_labelled(
         return objects[rig.checksum]
 
     for path in recordings:
-        parts.append(_read(path, objects_on, wall, frames, for_own_weights=for_own_weights))
+        parts.append(_read(path, objects_on, wall, frames))
         one = parts[0].rig
         other = parts[-1].rig
         if one != other:
@@ -209,8 +212,6 @@ def _read(
     objects_on: Callable[[Rig], Mapping[str, Float32]],
     wall: OpenBench | Path | None,
     frames: int,
-    *,
-    for_own_weights: bool,
 ) -> Labelled:
     sidecar = load_sidecar(sidecar_path(path))
     if not sidecar.label:
@@ -222,21 +223,28 @@ def _read(
     with ReplayCamera(path) as camera:
         bench = _bench(path, sidecar, wall, camera)
         truth_m = truth_depth_m(path, sidecar.label, bench.rig, objects_on(bench.rig))
-        raw = (maps_from_frame(frame) for number, frame in enumerate(camera) if number in chosen)
-        correct = OwnMaps(bench).correct if for_own_weights else bench.correct_range
-        maps = [correct(one) for one in raw if one.valid.any()]
-    if not maps:
+        every = (maps_from_frame(frame) for number, frame in enumerate(camera) if number in chosen)
+        recorded = [maps for maps in every if maps.valid.any()]
+    if not recorded:
         raise RecordingError(
             f"{path} has no frame with any return: inspect it with `nlos-cam replay`"
         )
-    depth_m, intensity = (
-        np.stack([getattr(one, name) for one in maps]) for name in ("depth_m", "intensity")
-    )
-    truths_m = np.repeat(truth_m[None], len(maps), axis=0)
+    own = OwnMaps(bench)
+    truths_m = np.repeat(truth_m[None], len(recorded), axis=0)
     image = shapes.image_from_depth(truths_m, shapes.object_box(bench.rig)).astype(np.float16)
-    labels = (sidecar.label,) * len(maps)
-    names = (path.name,) * len(maps)
-    return Labelled(MapSet(depth_m, intensity, image), truths_m, labels, names, bench.rig)
+    return Labelled(
+        maps=_map_set([own.correct(maps) for maps in recorded], image),
+        recorded=_map_set(recorded, image),
+        object_depth_m=truths_m,
+        label=(sidecar.label,) * len(recorded),
+        recording=(path.name,) * len(recorded),
+        rig=bench.rig,
+    )
+
+
+def _map_set(maps: Sequence[LidarMaps], image: Float16) -> MapSet:
+    depth_m = np.stack([one.depth_m for one in maps])
+    return MapSet(depth_m, np.stack([one.intensity for one in maps]), image)
 
 
 def spread(count: int, wanted: int) -> frozenset[int]:
@@ -266,13 +274,18 @@ def _bench(
 
 
 def _join(parts: Sequence[Labelled]) -> Labelled:
-    maps = (np.concatenate([getattr(one.maps, name) for one in parts]) for name in MAP_CHANNELS)
-    depth_m = np.concatenate([one.object_depth_m for one in parts])
-    labels, names = (
-        tuple(chain(*texts))
-        for texts in ((one.label for one in parts), (one.recording for one in parts))
+    return Labelled(
+        maps=_joined([one.maps for one in parts]),
+        recorded=_joined([one.recorded for one in parts]),
+        object_depth_m=np.concatenate([one.object_depth_m for one in parts]),
+        label=tuple(chain(*(one.label for one in parts))),
+        recording=tuple(chain(*(one.recording for one in parts))),
+        rig=parts[0].rig,
     )
-    return Labelled(MapSet(*maps), depth_m, labels, names, parts[0].rig)
+
+
+def _joined(parts: Sequence[MapSet]) -> MapSet:
+    return MapSet(*(np.concatenate([getattr(one, name) for one in parts]) for name in MAP_CHANNELS))
 
 
 def label_recordings(
@@ -323,6 +336,8 @@ def _samples(labelled: Labelled, plan: DatasetPlan) -> Samples:
         "depth_m": maps.depth_m,
         "intensity": maps.intensity,
         "image": maps.image,
+        "recorded_depth_m": labelled.recorded.depth_m,
+        "recorded_intensity": labelled.recorded.intensity,
         "object_depth_m": labelled.object_depth_m,
         "seed": np.arange(len(labelled.label)),
         "scene": np.tile([*geometry, np.nan], (len(labelled.label), 1)),

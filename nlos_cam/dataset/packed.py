@@ -2,12 +2,11 @@
 into memory.
 
 A store grows: shards that appear in the datasets are added when an epoch begins. It keeps the
-number of objects of every epoch, so that an interrupted run sees the same batches again.
+number of objects of every epoch, so that an interrupted run sees the same batches again. It knows
+its datasets and the rig that their maps are aligned with, and serves no others (`packed_index`).
 """
 
 import hashlib
-import json
-import operator
 from collections.abc import Callable, Generator, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -18,6 +17,7 @@ from nlos_calibration import Rig
 from nlos_models import CellNormal, CheckpointRecord, channels_of
 from nlos_models.training import MapNoise, MapSet, NormalBatch, first_of
 
+from nlos_cam.dataset.packed_index import StoreIndex, damaged, shard_key
 from nlos_cam.dataset.packing import (
     COUNTS,
     IMAGES,
@@ -32,40 +32,18 @@ from nlos_cam.dataset.plan import DatasetPlan, RigSpread
 from nlos_cam.dataset.reader import MAP_CHANNELS, Dataset, open_dataset
 from nlos_cam.dataset.rig_range import RigRange
 from nlos_cam.dataset.samples import OnProgress, ignore
-from nlos_cam.dataset.shards import SHARD_PATTERN
+from nlos_cam.dataset.shards import SHARD_PATTERN, read_head
 from nlos_cam.errors import RecordingError, SceneError
-from nlos_cam.files import atomic_file, claim, read_bounded
+from nlos_cam.files import atomic_file, claim
 from nlos_cam.files import read_arrays as read_npz
 from nlos_cam.frames import MAP_COLUMNS, MAP_ROWS, OBJECT_PIXELS
 from nlos_cam.reconstruct import WALL_GRID, grid_of, is_wall_grid
 
-INDEX = "index.json"
 CELLS = "cells.npz"
-INDEX_LIMIT = 1 << 26
-"""Bytes of the index: some hundred thousand shards."""
 Growth = Callable[[int], int]
 """Returns the number of shards that an epoch sees, once they are there."""
 STATISTICS_SHARDS = 40
 """Shards of each dataset that the cells' statistics are taken from: 4,000 objects."""
-
-
-def _read_index(store: Path) -> dict[str, dict[str, int]]:
-    if not (store / INDEX).exists():
-        return {"shards": {}, "epochs": {}}
-    try:
-        found = json.loads(read_bounded(store / INDEX, INDEX_LIMIT))
-        return {
-            kind: {str(key): operator.index(found[kind][key]) for key in found[kind]}
-            for kind in ("shards", "epochs")
-        }
-    except (OSError, ValueError, TypeError, KeyError, RecursionError) as error:
-        raise _damaged(store, INDEX) from error
-
-
-def _damaged(store: Path, name: str) -> RecordingError:
-    return RecordingError(
-        f"{store / name} is damaged: delete {store}, the packed maps are then made again"
-    )
 
 
 def map_noise(plan: DatasetPlan) -> MapNoise:
@@ -105,7 +83,8 @@ class PackedMaps:
         have (`DatasetPlan.known_rig`) stays in the maps. `run` names the training run: another one
         in the same store sees the objects that are there when its own epochs begin. New shards are
         made ready by the processes of `packing`, by default this one. Raises RecordingError for no
-        dataset, SceneError for datasets of two rigs or a store that is normalised otherwise.
+        dataset, SceneError for datasets of two rigs or a store of other data, aligned with another
+        rig, or normalised otherwise.
         """
         opened = [open_dataset(folder, color=color, expected=True) for folder in datasets]
         self.plan: DatasetPlan = opened[0].plan
@@ -147,7 +126,9 @@ class PackedMaps:
         }
         if self._stores_counts:
             self._rows[COUNTS] = MAP_ROWS, MAP_COLUMNS
-        self._index = _read_index(store)
+        self._keys = {shard.path: shard_key(shard) for one in opened for shard in one.shards}
+        self._index = StoreIndex.read(store)
+        self._index.open_for(self.frame, opened, self._keys)
         if not (store / CELLS).exists():
             self._write_cells(opened, normal)
         try:
@@ -156,7 +137,7 @@ class PackedMaps:
                 {name: torch.from_numpy(values) for name, values in cells.items()}
             )
         except (OSError, ValueError, TypeError, RuntimeError) as error:
-            raise _damaged(store, CELLS) from error
+            raise damaged(store, CELLS) from error
         found = self.normal.state_dict()
         if normal and any(
             not torch.equal(values, found[name]) for name, values in normal.state_dict().items()
@@ -191,7 +172,7 @@ class PackedMaps:
             )
 
     def __len__(self) -> int:
-        return sum(self._index["shards"].values())
+        return sum(self._index.shards.values())
 
     @property
     def digest(self) -> str:
@@ -209,33 +190,35 @@ class PackedMaps:
         """Add the shards that appeared in the datasets since the last time, of the first `shards`
         where that is given.
         """
-        known = self._index["shards"]
+        known = self._index.shards
         paths = [path for folder in self._datasets for path in sorted(folder.glob(SHARD_PATTERN))]
-        new = [path for path in paths[:shards] if str(path.resolve()) not in known]
+        new = {key: path for path in paths[:shards] if (key := self._key(path)) not in known}
         for name, shape in self._rows.items():
             path = self._store / name
             size = 2 * len(self) * int(np.prod(shape))
             path.touch()
             if path.stat().st_size < size:
-                raise _damaged(self._store, name)
+                raise damaged(self._store, name)
             with path.open(
                 "r+b"
             ) as file:  # rows after the last indexed one are left by an interruption
                 file.truncate(size)
         packer = Packer.of(self.frame, self.normal, with_counts=self._stores_counts)
-        every = zip(new, self._packing.rows_of(packer, new), strict=True)
-        for number, (path, columns) in enumerate(every, 1):
+        every = zip(new, self._packing.rows_of(packer, [*new.values()]), strict=True)
+        for number, (key, columns) in enumerate(every, 1):
             for name, values in columns.items():
                 with (self._store / name).open("ab") as file:
                     file.write(np.ascontiguousarray(values).tobytes())
-            known[str(path.resolve())] = len(columns[IMAGES])
+            known[key] = len(columns[IMAGES])
             if number % 50 == 0 or number == len(new):
-                self._write_index()
+                self._index.write()
             on_progress(number, len(new))
 
-    def _write_index(self) -> None:
-        with atomic_file(self._store / INDEX) as part:
-            part.write_text(json.dumps(self._index), encoding="utf-8")
+    def _key(self, path: Path) -> str:
+        """Return the `shard_key` of a shard, which is read once."""
+        if path not in self._keys:
+            self._keys[path] = shard_key(read_head(path))
+        return self._keys[path]
 
     def held_out(self, folder: Path, count: int) -> MapSet:
         """Return up to `count` samples of another dataset as the store has its own: aligned with
@@ -251,11 +234,11 @@ class PackedMaps:
         same objects again in that run.
         """
         key = f"{self._run}{generator.initial_seed()}"
-        epochs = self._index["epochs"]
+        epochs = self._index.epochs
         if key not in epochs:
             self.refresh(shards=self._growth(len(epochs)) if self._growth else None)
             epochs[key] = len(self)
-            self._write_index()
+            self._index.write()
         count = int(epochs[key])
         if count < batch:
             raise RecordingError(

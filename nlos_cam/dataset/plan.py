@@ -37,6 +37,8 @@ SCENE_COLUMNS = (
     "bare_wall_counts",
 )
 """Values that differ between objects; NaN where there is no occluder."""
+RECORDED = "recorded"
+"""Accuracy of a plan whose samples were not rendered."""
 _RIG_STREAM = 2
 """Stream of an object's random numbers; its noise has stream 1."""
 

@@ -1,7 +1,7 @@
 """Reader of datasets: whole, or streamed in shuffled batches where they are larger than memory."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import accumulate
 from pathlib import Path
 from typing import Any
@@ -14,10 +14,12 @@ from nlos_models.training import MapBatch, MapSet, as_batch
 from numpy.typing import NDArray
 
 from nlos_cam.dataset.plan import DatasetPlan
-from nlos_cam.dataset.shards import Shard, read_arrays, shards_of
+from nlos_cam.dataset.shards import Shard, array_names, read_arrays, shards_of
 from nlos_cam.errors import RecordingError, SceneError
 
 MAP_CHANNELS = ("depth_m", "intensity", "image")
+RECORDED_CHANNELS = ("recorded_depth_m", "recorded_intensity", "image")
+"""Maps of labelled recordings as the lidar measured them; the others are corrected by the bench."""
 BUFFER = 40
 """Shards that are shuffled together and kept in memory (twice as many while a batch spans two such
 blocks).
@@ -33,6 +35,8 @@ class Dataset:
     folder: Path
     plan: DatasetPlan
     shards: tuple[Shard, ...]
+    channels: tuple[str, ...] = MAP_CHANNELS
+    """Arrays of the maps and images."""
 
     def __len__(self) -> int:
         return sum(len(shard.seeds) for shard in self.shards)
@@ -47,16 +51,28 @@ class Dataset:
         """Yield each sample's rig as it is known, in their order."""
         return (self.plan.known_rig(seed) for shard in self.shards for seed in shard.seeds)
 
+    def as_recorded(self) -> "Dataset":
+        """Return the dataset with maps as the lidar measured them, from which a measured bare wall
+        is subtracted; itself where it has no others.
+        """
+        if not array_names(self.shards[0]).issuperset(RECORDED_CHANNELS):
+            return self
+        return replace(self, channels=RECORDED_CHANNELS)
+
     def arrays(self) -> MapSet:
         """Read all maps and images."""
         return MapSet(
-            *(np.concatenate(parts) for parts in zip(*map(_maps, self.shards), strict=True))
+            *(np.concatenate(parts) for parts in zip(*map(self.read, self.shards), strict=True))
         )
 
     def chunks(self) -> Iterator[MapSet]:
         """Yield all maps and images in order, one shard at a time."""
         for shard in self.shards:
-            yield MapSet(*_maps(shard))
+            yield MapSet(*self.read(shard))
+
+    def read(self, shard: Shard) -> list[NDArray[Any]]:
+        """Read a shard's maps and images."""
+        return read_arrays(shard, self.channels)
 
     def batches(
         self, seed: int, epoch: int, batch: int, *, rank: int = 0, world: int = 1
@@ -126,7 +142,7 @@ class _Window:
         }
         for shard in wanted:
             if shard not in self._held:
-                self._held[shard] = _maps(self._dataset.shards[shard])
+                self._held[shard] = self._dataset.read(self._dataset.shards[shard])
         arrays = [np.empty((len(rows), *of.shape[1:]), of.dtype) for of in self._held[wanted[0]]]
         for shard in wanted:
             here = shards == shard
@@ -168,7 +184,3 @@ def open_dataset(folder: Path, *, color: bool = False, expected: bool = False) -
             " --colour`"
         )
     return Dataset(folder, plan, tuple(shards))
-
-
-def _maps(shard: Shard) -> list[NDArray[Any]]:
-    return read_arrays(shard, MAP_CHANNELS)

@@ -117,9 +117,14 @@ def read_arrays(head: Shard, names: Sequence[str]) -> list[NDArray[Any]]:
 
 def check_arrays(head: Shard) -> None:
     """Read all arrays. Raises RecordingError where the shard is damaged."""
-    with open_shard(head.path) as file:
-        names = {*map(str, file), *REQUIRED_ARRAYS}
+    names = {*array_names(head), *REQUIRED_ARRAYS}
     read_arrays(head, sorted(names))
+
+
+def array_names(head: Shard) -> set[str]:
+    """Return the names of a shard's arrays. Raises RecordingError where it cannot be read."""
+    with open_shard(head.path) as file:
+        return set(map(str, file))
 
 
 def store(path: Path, samples: Samples, provenance: str, command: str) -> None:

@@ -25,7 +25,7 @@ from nlos_models.training import (
 )
 
 from nlos_cam.dataset.packed import map_noise
-from nlos_cam.dataset.plan import DatasetPlan, RigSpread
+from nlos_cam.dataset.plan import RECORDED, DatasetPlan, RigSpread
 from nlos_cam.dataset.reader import MAP_CHANNELS, Dataset, open_dataset
 from nlos_cam.errors import SceneError
 from nlos_cam.frames import MAP_COLUMNS, MAP_ROWS, maps_from_frame
@@ -121,23 +121,9 @@ def read_maps(
         raise SceneError(
             f"--wall {wall} only applies to difference maps; this recipe uses raw maps"
         )
-    if data.resolve() == held_out_data.resolve():
-        raise SceneError(
-            f"--dataset and --held-out are the same folder ({data}): hold out different objects"
-        )
-    dataset = open_dataset(data, color=recipe.colour, expected=recipe.maps == "raw maps")
-    other = open_dataset(held_out_data, color=recipe.colour)
+    dataset, other = _open_both(recipe, data, held_out_data)
     plan = dataset.plan
     count = len(dataset)
-    if count < recipe.objects:
-        raise SceneError(
-            f"{data} holds {count} objects, the recipe needs {recipe.objects}: build more, or lower"
-            " --objects"
-        )
-    if plan.rig != other.plan.rig:
-        raise SceneError(
-            f"{data} and {held_out_data} were rendered for different rigs: build one of them again"
-        )
     if stream and count != recipe.objects:
         raise SceneError(
             f"{data} holds {count} objects, and a stream reads all of them: give --objects {count}"
@@ -163,6 +149,30 @@ def read_maps(
     return MapSplit(training, held_out, plan, (rig.name, rig.checksum))
 
 
+def _open_both(recipe: MapRecipe, data: Path, held_out_data: Path) -> tuple[Dataset, Dataset]:
+    """Open the datasets of training and held-out maps; of recordings, for difference maps, as the
+    lidar measured them.
+    """
+    if data.resolve() == held_out_data.resolve():
+        raise SceneError(
+            f"--dataset and --held-out are the same folder ({data}): hold out different objects"
+        )
+    dataset = open_dataset(data, color=recipe.colour, expected=recipe.maps == "raw maps")
+    other = open_dataset(held_out_data, color=recipe.colour)
+    if len(dataset) < recipe.objects:
+        raise SceneError(
+            f"{data} holds {len(dataset)} objects, the recipe needs {recipe.objects}: build more,"
+            " or lower --objects"
+        )
+    if dataset.plan.rig != other.plan.rig:
+        raise SceneError(
+            f"{data} and {held_out_data} were rendered for different rigs: build one of them again"
+        )
+    if recipe.maps == "difference maps":
+        return dataset.as_recorded(), other.as_recorded()
+    return dataset, other
+
+
 def measured_bare_wall(path: Path) -> BareMaps:
     """Return depth and intensity, each (64, 80), of the bare wall that `calibrate --wall`
     recorded.
@@ -179,8 +189,14 @@ def render_bare_wall(plan: DatasetPlan, frames: int = BARE_WALL_FRAMES) -> BareM
     """Return depth and intensity, each (64, 80), of the rig with nothing hidden: the mean of some
     noisy frames.
 
-    Raises SceneError where the rig varies between objects, which then have no bare wall in common.
+    Raises SceneError where the rig varies between objects, which then have no bare wall in common,
+    and for recordings, whose bare wall is the bench's own.
     """
+    if plan.accuracy == RECORDED:
+        raise SceneError(
+            f"the maps of this dataset were recorded on {plan.rig.name}, whose bare wall cannot be"
+            " rendered: give the bench's measured one with --wall"
+        )
     if plan.spread != RigSpread():
         raise SceneError(
             "the rig of this dataset varies between objects: difference maps need one rig, or"

@@ -29,7 +29,7 @@ from nlos_cam.dataset import outliers
 from nlos_cam.dataset.build import HELD_OUT_SEED, TRAINING_SEED
 from nlos_cam.dataset.packed import map_noise
 from nlos_cam.dataset.packing import aligned_with, kept_of
-from nlos_cam.dataset.plan import DatasetPlan
+from nlos_cam.dataset.plan import RECORDED, DatasetPlan
 from nlos_cam.dataset.reader import Dataset
 from nlos_cam.dataset.rig_range import RigRange
 from nlos_cam.dataset.samples import OnProgress, cached_sensor, ignore
@@ -113,8 +113,13 @@ class Benches:
 
     @classmethod
     def of(cls, plan: DatasetPlan, trained: models.CheckpointRecord) -> Self:
-        """Return the benches of a dataset, as weights see them."""
-        return cls(plan.rig, plan.sensor, plan.rigs, grid_of(trained), plan.accuracy)
+        """Return the benches of a dataset, as weights see them; beside recordings they are
+        rendered in draft accuracy.
+        """
+        # on the weights' own rig there is nothing to align
+        frame = _frame_of(plan, trained) if plan.rigs or grid_of(trained) else None
+        accuracy = "draft" if plan.accuracy == RECORDED else plan.accuracy
+        return cls(plan.rig, plan.sensor, plan.rigs, frame, accuracy)
 
     @property
     def name(self) -> str:
@@ -309,9 +314,8 @@ def uncertainty_sets(
         ordinary = first_of(dataset.arrays(), objects)
         visible = visible_objects(ordinary, dataset)
         benches = compress(dataset.benches(), visible)
-        ordinary = kept_of(ordinary, visible)
-        if grid := grid_of(pipeline.record):
-            ordinary = aligned_with(ordinary, benches, grid)[0]
+        frame = _frame_of(plan, pipeline.record)
+        ordinary, _, _ = aligned_with(kept_of(ordinary, visible), benches, frame)
         sets.append(_uncertainty_set(pipeline, ordinary, samples))
     return sets
 
@@ -360,7 +364,7 @@ def quality_set(
     done = 0
     kinds = dataset.column("category").astype(np.str_)[:objects]
     noise = map_noise(dataset.plan) if dataset.plan.expected else None
-    grid = grid_of(pipeline.record)
+    frame = _frame_of(dataset.plan, pipeline.record)
     benches = dataset.benches()
     seen = np.ones(len(kinds), np.bool_)
     for expected in dataset.chunks():
@@ -369,11 +373,9 @@ def quality_set(
         maps = noise.expose(expected, done) if noise else expected
         end = min(done + len(maps.image), len(kinds))
         count = end - done
-        if grid:
-            maps, kept, _ = aligned_with(first_of(maps, count), islice(benches, count), grid)
-            seen[done:end] = kept
-            count = len(maps.image)
-        for part in parts_of(np.arange(count)):
+        maps, kept, _ = aligned_with(first_of(maps, count), islice(benches, count), frame)
+        seen[done:end] = kept
+        for part in parts_of(np.arange(len(maps.image))):
             depth_m = maps.depth_m[part]
             intensity = maps.intensity[part]
             truth = maps.image[part].astype(np.float32)
@@ -401,6 +403,13 @@ def shared_error_v(image: Float32, truth: Float32) -> Float32:
     total = (np.abs(image - truth) * shared).sum((1, 2))
     count = shared.sum((1, 2))
     return np.where(count > 0, total / np.maximum(count, 1), np.nan).astype(np.float32)
+
+
+def _frame_of(plan: DatasetPlan, trained: models.CheckpointRecord) -> Rig:
+    """Return the rig that a dataset's maps are aligned with for weights, each from its known rig:
+    the wall grid, or the weights' own rig, which is the dataset's (`_fit`).
+    """
+    return grid_of(trained) or plan.rig
 
 
 def _fit(plan: DatasetPlan, trained: models.CheckpointRecord) -> bool:

@@ -154,17 +154,12 @@ def open_reconstruct_bench(
             f"the weights expect {inputs.pop()} but the test maps are raw: use weights for raw maps"
         )
 
-    rigs = {name: _rig_of(network.record) for name, network in networks.items()}
+    rigs = {name: subjects.rig_of(network.record) for name, network in networks.items()}
     rendered = {
         checksum: _both_sets(rig, count, tracked)
         for checksum, rig in {rig.checksum: rig for rig in rigs.values()}.items()
     }
     return ReconstructBench(networks, {name: rendered[rig.checksum] for name, rig in rigs.items()})
-
-
-def _rig_of(record: models.CheckpointRecord) -> Rig:
-    """Return the rig that weights were trained for: a bench's own hold it, others name it."""
-    return Rig.model_validate(record.rig) if record.rig else subjects.rig_of(record)
 
 
 def _both_sets(rig: Rig, count: int | None, tracked: subjects.Tracked) -> BothSets:

@@ -165,12 +165,12 @@ def evaluate(
         if record.input == "raw maps"
         else None
     )
-    maps = subjects.network_input(objects.maps, bare, objects.benches, record)
+    maps = objects.input_of(record, bare)
     answers = subjects.answer_all(reconstructor, maps)
     predicted = subjects.predict_quality(answers, maps, uncertainty_model, objects.plan.rig)
     unseen = None
     if second:
-        maps = subjects.network_input(second.maps, bare, second.benches, record)
+        maps = second.input_of(record, bare)
         others = subjects.answer_all(reconstructor, maps)
         sure = subjects.predict_quality(others, maps, uncertainty_model, second.plan.rig)
         unseen = Unseen(second.names, second.maps.image.astype(np.float32), others.image, sure)

@@ -72,11 +72,13 @@ def truth_of(subjects: Sequence[Subject], box: ObjectBox) -> Float32:
     return np.stack([shapes.image_from_depth(subject.depth_m, box) for subject in subjects])
 
 
-def echoes_of(subjects: Sequence[Subject], rig: Rig, on_progress: OnProgress) -> list[MultiBounce]:
-    """Render the echoes of each object on a rig, without a sensor."""
+def echoes_of(
+    subjects: Sequence[Subject], rig: Rig, on_progress: OnProgress, pulse_ns: float = 0.0
+) -> list[MultiBounce]:
+    """Render the echoes of each object on a rig, without a sensor but for its pulse."""
     echoes: list[MultiBounce] = []
     for subject in subjects:
-        echoes.append(render(Scene(rig, subject.depth_m)).multi)
+        echoes.append(render(Scene(rig, subject.depth_m, pulse_ns=pulse_ns)).multi)
         on_progress(len(echoes), len(subjects))
     return echoes
 
@@ -173,12 +175,23 @@ class HeldOutObjects:
     plan: data.DatasetPlan
     benches: list[Rig]
     """The rig of each object."""
+    recorded: MapSet | None = None
+    """Maps as a lidar measured them, from which difference maps are made; None where `maps` are."""
+
+    def input_of(self, record: CheckpointRecord, bare: data.BareMaps | None) -> MapSet:
+        """Return the maps that the network takes; see `network_input`."""
+        maps = self.recorded if bare and self.recorded else self.maps
+        return network_input(maps, bare, self.benches, record)
 
 
 def rig_of(record: CheckpointRecord) -> Rig:
-    """Return the rig that weights were trained for; of weights for any rig, the paper's. Raises
-    SceneError if it is neither packaged nor a file here.
+    """Return the rig that weights were trained for: a bench's own hold it, others name it; of
+    weights for any rig, the paper's.
+
+    Raises SceneError if a named one is neither packaged nor a file here.
     """
+    if record.rig:
+        return Rig.model_validate(record.rig)
     if grid_of(record):
         return rig_named("paper-rig")
     try:
@@ -201,11 +214,12 @@ def rendered_objects(
     """Render the 54 test objects of a set, or `count` random ones, with a sensor's noise (the
     simulated camera's by default) on a rig.
     """
-    plan = data.DatasetPlan(rig, data.TEST_SEED, sensor or SensorModel())
+    sensor = sensor or SensorModel()
+    plan = data.DatasetPlan(rig, data.TEST_SEED, sensor)
     fixed = shapes.benchmark_objects if test == "kinds" else shapes.unseen_objects
     subjects = seeded_objects(plan.first_seed, count, plan.box) if count else fixed(plan.box)
     with tracked("rendering test objects") as on_progress:
-        echoes = echoes_of(subjects, rig, on_progress)
+        echoes = echoes_of(subjects, rig, on_progress, sensor.pulse_ns)
     maps = as_map_set(sense(echoes, rig, sensor), truth_of(subjects, plan.box))
     kind = "random objects" if count else TEST_SETS[test]
     description = f"{len(subjects)} held-out {kind}, with the sensor's noise"
@@ -222,8 +236,15 @@ def dataset_objects(folder: Path) -> HeldOutObjects:
         f"{category} {seed}"
         for category, seed in zip(categories, opened.column("seed"), strict=True)
     ]
+    recorded = opened.as_recorded()
     return HeldOutObjects(
-        f"Maps of {folder}", names, categories, opened.arrays(), opened.plan, [*opened.benches()]
+        f"Maps of {folder}",
+        names,
+        categories,
+        opened.arrays(),
+        opened.plan,
+        [*opened.benches()],
+        recorded=None if recorded is opened else recorded.arrays(),
     )
 
 

@@ -78,6 +78,9 @@ class SmallDataset:
     def __len__(self) -> int:
         return len(self._maps.image)
 
+    def as_recorded(self) -> "SmallDataset":
+        return self
+
     def arrays(self) -> MapSet:
         return self._maps
 

@@ -256,7 +256,8 @@ def on_bench(
         for part, paths in found.items()
     }
     aligned = {part: align_all(one.maps, repeat(one.rig), trained) for part, one in read.items()}
-    return {"bench": aligned, "bench, not aligned": {part: one.maps for part, one in read.items()}}
+    measured = {part: one.recorded for part, one in read.items()}
+    return {"bench": aligned, "bench, not aligned": measured}
 
 
 def figures(asked: argparse.Namespace) -> None:

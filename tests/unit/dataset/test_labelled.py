@@ -4,8 +4,8 @@ as written.
 
 import shutil
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 from unittest.mock import Mock
 
@@ -17,21 +17,33 @@ from hypothesis import strategies as st
 from nlos_calibration import Rig, dump_toml, load_rig
 from nlos_calibration.errors import CalibrationError
 from nlos_models.training import MapSet
+from small_frames import sheet_network
+from small_run import small_recipe
 
-from nlos_cam.camera import Recording, SimulatedCamera
-from nlos_cam.dataset import DatasetPlan, build_dataset, open_dataset, read_labelled, write_shards
+from nlos_cam.camera import Recording, SimulatedCamera, World
+from nlos_cam.dataset import (
+    DatasetPlan,
+    build_dataset,
+    label_recordings,
+    open_dataset,
+    read_labelled,
+    read_maps,
+    training_maps,
+    write_shards,
+)
 from nlos_cam.dataset import labelled as labelled_shards
 from nlos_cam.dataset.build import SHARD
 from nlos_cam.dataset.labelled import RECORDED, Labelled, benchmark_depths, spread, truth_depth_m
+from nlos_cam.dataset.plan import move_lidar
 from nlos_cam.dataset.shards import store
 from nlos_cam.errors import DiskFullError, NlosCamError, RecordingError, SceneError
 from nlos_cam.frames import LidarMaps, maps_from_frame
 from nlos_cam.objects import benchmark_objects as fixed_set
 from nlos_cam.objects import cell_centers_m, image_from_depth, object_box
-from nlos_cam.reconstruct import CalibratedRig, OwnMaps
+from nlos_cam.reconstruct import Arrival, CalibratedRig, Pipeline, open_bench
 from nlos_cam.recording import ReplayCamera, SidecarFile, sidecar_path
 from nlos_cam.recording.sidecar import WallFile
-from nlos_cam.render import Scene, Sensor, SensorModel, render
+from nlos_cam.render import Scene, SceneFile, render
 
 RIG = load_rig("paper-rig")
 BOX = object_box(RIG)
@@ -50,6 +62,25 @@ def _sidecar(path: Path, rig: Rig | None = None, **facts: Any) -> Path:
     camera.rig = rig or camera.rig
     SidecarFile(sidecar_path(path), camera, **facts)
     return path
+
+
+def live_maps(
+    recording: Path, bench: CalibratedRig, frames: int, *, difference: bool = False
+) -> list[LidarMaps]:
+    """Return the maps that a pipeline gives to networks of the bench's own rig, of those frames
+    that are labelled.
+    """
+    pipeline = Pipeline(bench.afresh(), sheet_network, uses_difference=difference)
+    with ReplayCamera(recording) as camera:
+        prepared = [pipeline.prepare(Arrival(frame, 0.0, ()), lambda: 0.0, 0.0) for frame in camera]
+    chosen = sorted(spread(len(prepared), frames))
+    return [prepared[number].network_input for number in chosen]
+
+
+def assert_same(found: MapSet, wanted: list[LidarMaps]) -> None:
+    """Compare all bits of maps."""
+    np.testing.assert_array_equal(found.depth_m, np.stack([one.depth_m for one in wanted]))
+    np.testing.assert_array_equal(found.intensity, np.stack([one.intensity for one in wanted]))
 
 
 Label = Callable[..., Path]
@@ -72,7 +103,7 @@ def paths(labelled: Label) -> list[Path]:
     return [labelled("a"), labelled("b", "half")]
 
 
-def test_read_labelled_takes_maps_of_frames(paths: list[Path], noise_world: Any) -> None:
+def test_read_labelled_keeps_maps_as_recorded(paths: list[Path], noise_world: Any) -> None:
     world = noise_world()
 
     found = read_labelled(paths, known=known, frames=4)
@@ -80,8 +111,9 @@ def test_read_labelled_takes_maps_of_frames(paths: list[Path], noise_world: Any)
     images = [world.images(number) for number in (2, 7, 12, 17)]
     frames = [maps_from_frame(one.frame(world.rig.pinhole)) for one in images]
 
-    np.testing.assert_array_equal(found.maps.depth_m[:4], [maps.depth_m for maps in frames])
-    np.testing.assert_array_equal(found.maps.intensity[:4], [maps.intensity for maps in frames])
+    for name in ("depth_m", "intensity"):
+        wanted = [getattr(maps, name) for maps in frames]
+        np.testing.assert_array_equal(getattr(found.recorded, name)[:4], wanted)
     assert found.rig == RIG
 
 
@@ -146,34 +178,77 @@ def test_read_labelled_asks_for_the_wall_record_of_the_sidecar(corrected: Path) 
         read_labelled([corrected], known=known)
 
 
-def test_read_labelled_corrects_by_wall_record(
-    labelled: Label, corrected: Path, wall: Callable[..., Path]
-) -> None:
-    plain = read_labelled([labelled("b")], known=known, frames=2)
+def test_read_labelled_corrects_by_wall_record(corrected: Path, wall: Callable[..., Path]) -> None:
+    record = wall(range_offset_m=0.004)
+    with ReplayCamera(corrected) as camera:
+        bench = open_bench(record, camera)
 
-    found = read_labelled([corrected], known=known, wall=wall(range_offset_m=0.004), frames=2)
+    found = read_labelled([corrected], known=known, wall=record, frames=2)
 
     assert found.rig.name == "measured"
-    np.testing.assert_allclose(found.maps.depth_m, plain.maps.depth_m + 0.004, atol=1e-6)
-    np.testing.assert_array_equal(found.maps.intensity, plain.maps.intensity)
+    assert_same(found.maps, live_maps(corrected, bench, 2))
+    assert np.nanmax(found.maps.depth_m - found.recorded.depth_m) > 0.0039
 
 
-def test_maps_for_own_weights_are_corrected_as_live_does(labelled: Label, corrected: Path) -> None:
-    bench: Any = CalibratedRig(RIG)
-    bare = Sensor(RIG, SensorModel()).maps(render(Scene(RIG)).multi, None)
-    bench.reference = SimpleNamespace(
-        map_depth_m=bare.depth_m + np.float32(0.002), map_intensity=1.5 * bare.intensity
-    )
-    plain = read_labelled([labelled("b")], known=known, frames=2).maps
+@pytest.fixture
+def walled(measured: Callable[..., Any]) -> CalibratedRig:
+    """A bench with a range offset, and the bare wall's record."""
+    wall = measured(yaw_deg=45.0, pitch_deg=0.0, range_offset_m=0.004)
+    return CalibratedRig(wall.record.rig, wall)
 
-    found = read_labelled(
-        [corrected], known=known, wall=lambda _: bench, frames=2, for_own_weights=True
-    ).maps
 
-    for depth_m, *raw in zip(found.depth_m, plain.depth_m, plain.intensity, strict=True):
-        maps = LidarMaps(*raw, ~np.isnan(raw[0]))
-        np.testing.assert_array_equal(depth_m, OwnMaps(bench).correct(maps).depth_m)
-    assert not np.array_equal(found.depth_m, plain.depth_m)
+def test_labelled_maps_are_those_that_live_gives(
+    labelled: Label, walled: CalibratedRig, tmp_path: Path
+) -> None:
+    recording = labelled("a", "cup-1")
+
+    label_recordings(tmp_path, tmp_path / "data", wall=lambda _: walled, frames=3)
+
+    found = open_dataset(tmp_path / "data")
+    raw = found.as_recorded().arrays()
+    assert_same(found.arrays(), live_maps(recording, walled, 3))
+    assert np.nanmax(np.abs(found.arrays().depth_m - raw.depth_m)) > 0.004
+    assert not np.array_equal(found.arrays().intensity, raw.intensity)
+
+
+def test_labelled_maps_have_the_occluders_edge_repaired(tmp_path: Path, hurried_clock: Any) -> None:
+    scene = SceneFile(name="off", rig=move_lidar(RIG, -0.002, 0.0, 0.0))
+    world = World(scene, [render(Scene(scene.rig, KNOWN["half"]), "draft").multi], [None])
+    recording = Recording(tmp_path / "off.bag", frames=2)
+    with SimulatedCamera("sim:off", world, clock=hurried_clock(), recording=recording) as camera:
+        assert len(list(camera)) >= 1
+    path = _sidecar(tmp_path / "off.bag", RIG, label="slope")
+
+    found = read_labelled([path], known=known, frames=2)
+
+    assert_same(found.maps, live_maps(path, CalibratedRig(RIG), 2))
+    assert not np.array_equal(found.maps.depth_m, found.recorded.depth_m)
+
+
+def test_difference_maps_of_recordings_are_those_of_live(
+    labelled: Label, walled: CalibratedRig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    recording = labelled("a", "cup-1")
+    for name in ("data", "other"):
+        label_recordings(tmp_path, tmp_path / name, wall=lambda _: walled, frames=4)
+    reference: Any = walled.reference
+    bare = reference.map_depth_m, reference.map_intensity
+    monkeypatch.setattr(training_maps, "measured_bare_wall", lambda _: bare)
+    recipe = small_recipe(task="compressor", objects=4, held_out=4, maps="difference maps")
+
+    found = read_maps(recipe, tmp_path / "data", tmp_path / "other", Path("wall.toml"))
+
+    assert_same(found.held_out, live_maps(recording, walled, 4, difference=True))
+    assert_same(found.training.first(4), live_maps(recording, walled, 4, difference=True))
+
+
+def test_difference_maps_of_recordings_need_a_measured_wall(tmp_path: Path) -> None:
+    for name in ("data", "other"):
+        write_shards(_samples(4), tmp_path / name)
+    recipe = small_recipe(task="compressor", objects=4, held_out=4, maps="difference maps")
+
+    with pytest.raises(SceneError, match="--wall"):
+        read_maps(recipe, tmp_path / "data", tmp_path / "other", None)
 
 
 def test_read_labelled_refuses_wall_record_of_another_size(
@@ -309,6 +384,19 @@ def test_truth_of_mesh_stands_at_its_pose(tmp_path: Path, mesh: str, named: str)
     assert np.nanmin(depth_m) == pytest.approx(BOX.z_near_m + 0.06, abs=0.001)
 
 
+def test_takes_of_one_mesh_have_poses_of_their_own(tmp_path: Path) -> None:
+    BALL.export(tmp_path / "mug.stl")
+    for take, x_m in (("mug-01", 0.0), ("mug-02", 0.05)):
+        text = f"size_m = 0.1\nx_m = {x_m}\n"
+        (tmp_path / f"{take}.truth.toml").write_text(text, encoding="utf-8")
+
+    first, second = (_truth(tmp_path, name=take) for take in ("mug-01", "mug-02"))
+
+    x_m, _ = cell_centers_m(BOX)
+    middles_m = [x_m[np.nonzero(~np.isnan(depth_m))[1]].mean() for depth_m in (first, second)]
+    assert middles_m[1] - middles_m[0] == pytest.approx(0.05, abs=0.002)
+
+
 def test_truth_file_gives_a_category(tmp_path: Path) -> None:
     _write_truth(tmp_path, 'category = "cup"\nseed = 3\nsize_m = 0.15\n')
 
@@ -379,7 +467,8 @@ def _samples(count: int) -> Labelled:
     truth_m = generator.uniform(0.12, 0.4, (count, 64, 64)).astype(np.float32)
     maps = MapSet(depth_m, intensity, truth_m.astype(np.float16))
     names = tuple(f"cup-{k}" for k in range(count))
-    return Labelled(maps, truth_m, names, names, RIG)
+    recorded = replace(maps, depth_m=maps.depth_m + 1, intensity=maps.intensity + 1)
+    return Labelled(maps, recorded, truth_m, names, names, RIG)
 
 
 @pytest.mark.parametrize("count", [3, SHARD + 7])
@@ -395,6 +484,9 @@ def test_labelled_shards_are_read_as_written(tmp_path: Path, count: int) -> None
     for name in ("depth_m", "intensity", "image"):
         np.testing.assert_array_equal(getattr(maps, name), getattr(samples.maps, name))
 
+    recorded = data.as_recorded().arrays()
+    np.testing.assert_array_equal(recorded.depth_m, samples.recorded.depth_m)
+    np.testing.assert_array_equal(recorded.intensity, samples.recorded.intensity)
     assert tuple(data.column("category")) == samples.label
     np.testing.assert_array_equal(data.column("object_depth_m"), samples.object_depth_m)
 

@@ -15,7 +15,7 @@ from nlos_calibration import load_rig
 from nlos_models.training import MapBatch, MapSet
 
 from nlos_cam.dataset import DatasetPlan, reader
-from nlos_cam.dataset.reader import MAP_CHANNELS, Dataset, _maps, _Window, open_dataset
+from nlos_cam.dataset.reader import MAP_CHANNELS, Dataset, _Window, open_dataset
 from nlos_cam.dataset.shards import shard_path, store
 from nlos_cam.errors import RecordingError, SceneError
 
@@ -139,8 +139,8 @@ def test_samples_of_three_shards_are_shuffled_together(data: Dataset) -> None:
 
 
 def test_shards_are_read_once(data: Dataset, monkeypatch: pytest.MonkeyPatch) -> None:
-    read = Mock(wraps=_maps)
-    monkeypatch.setattr(reader, "_maps", read)
+    read = Mock(wraps=reader.read_arrays)
+    monkeypatch.setattr(reader, "read_arrays", read)
 
     assert len(_every_row(data)) == COUNT
 

@@ -2,10 +2,13 @@
 subtract.
 """
 
+import json
+import shutil
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 from unittest.mock import Mock
 
 import numpy as np
@@ -23,19 +26,20 @@ from nlos_cam.dataset import DatasetPlan, RigSpread, packing, training_maps
 from nlos_cam.dataset.packed import (
     CELLS,
     IMAGES,
-    INDEX,
     MAPS,
     PackedMaps,
     map_noise,
     open_packed_maps,
 )
+from nlos_cam.dataset.packed_index import INDEX
+from nlos_cam.dataset.plan import RECORDED
 from nlos_cam.dataset.samples import Samples
 from nlos_cam.dataset.shards import shard_path, store
 from nlos_cam.dataset.training_maps import MapSplit, Streamed, read_maps, render_bare_wall
 from nlos_cam.errors import RecordingError, SceneError, WorkersLostError
 from nlos_cam.files import FileBusyError
 from nlos_cam.frames import LidarMaps, maps_from_frame
-from nlos_cam.reconstruct import MapAlignment
+from nlos_cam.reconstruct import WALL_GRID, MapAlignment
 from nlos_cam.reconstruct.alignment import can_align
 from nlos_cam.render import Scene, Sensor, SensorModel, render
 
@@ -512,6 +516,109 @@ def test_store_keeps_the_normalisation_of_given_weights(
 def test_store_of_another_normalisation_is_refused(folder: Path, store_folder: Path) -> None:
     with pytest.raises(SceneError, match="name another --store"):
         open_packed_maps([folder], store_folder, normal=CellNormal()).__enter__()
+
+
+def _assert_refused(store: Path, dataset: Path, words: str, **options: Any) -> None:
+    with pytest.raises(SceneError, match=words) as refused:
+        open_packed_maps([dataset], store, **options).__enter__()
+
+    assert "name another --store" in str(refused.value)
+    assert "\n" not in str(refused.value)
+
+
+@pytest.fixture
+def begun(folder: Path, store_folder: Path) -> Path:
+    """A store of the dataset `folder`."""
+    with open_packed_maps([folder], store_folder) as packed:
+        assert len(packed) == SHARD
+    return store_folder
+
+
+@pytest.mark.parametrize(
+    ("plan", "words"),
+    [
+        (OTHER, "aligned with rig paper-rig"),
+        (replace(PLAN, expected=True), "differ in: expected"),
+        (replace(PLAN, first_seed=5), "differ in: first seed"),
+        (replace(PLAN, sensor=SensorModel(ambient_counts=20)), "differ in: sensor"),
+    ],
+)
+def test_store_of_a_dataset_that_was_built_again_is_refused(
+    folder: Path, begun: Path, plan: DatasetPlan, words: str
+) -> None:
+    shutil.rmtree(folder)
+    _add(folder, 0, plan)
+
+    _assert_refused(begun, folder, words)
+
+
+def test_store_that_is_aligned_with_another_rig_is_refused(folder: Path, begun: Path) -> None:
+    _assert_refused(begun, folder, "aligned with rig paper-rig.*wall grid", frame=WALL_GRID)
+
+
+def test_store_of_other_objects_is_refused(tmp_path: Path, begun: Path) -> None:
+    _assert_refused(begun, _add(tmp_path / "b", 20), "shard-000000000.h5 is another one")
+
+
+def test_store_without_a_shard_knows_its_data(tmp_path: Path, folder: Path) -> None:
+    """Statistics of the cells are taken before a shard is packed."""
+    with open_packed_maps([folder], tmp_path / "store", growth=lambda _: 1) as packed:
+        assert len(packed) == 0
+
+    _assert_refused(tmp_path / "store", _add(tmp_path / "b", 20), "other data")
+
+
+def test_store_of_recordings_that_were_labelled_again_is_refused(
+    tmp_path: Path, store_folder: Path
+) -> None:
+    plan = replace(PLAN, accuracy=RECORDED)
+    labelled = _add(tmp_path / "labelled", 0, plan)
+    with open_packed_maps([labelled], store_folder):
+        pass
+
+    others = {**_samples(0), "intensity": _samples(5)["intensity"]}
+    store(shard_path(labelled, 0), others, plan.provenance, "")
+
+    _assert_refused(store_folder, labelled, "other data")
+
+
+def test_store_goes_on_with_another_dataset_beside_its_own(
+    folder: Path, tmp_path: Path, begun: Path
+) -> None:
+    folders = [_add(tmp_path / "b", 20), folder]
+
+    with open_packed_maps(folders, begun) as packed:
+        assert len(packed) == 2 * SHARD
+
+
+def test_store_knows_its_dataset_in_another_place(
+    folder: Path, tmp_path: Path, begun: Path
+) -> None:
+    moved = folder.rename(tmp_path / "moved")
+    _add(moved, 5)
+
+    with open_packed_maps([moved], begun) as packed:
+        assert len(packed) == 2 * SHARD
+
+
+@pytest.fixture
+def old(folder: Path, begun: Path) -> Path:
+    """The store as nlos-cam 0.2.0 wrote it: shards by their paths, and no origin."""
+    shards = {str(path.resolve()): SHARD for path in folder.glob("shard-*.h5")}
+    (begun / INDEX).write_text(json.dumps({"shards": shards, "epochs": {}}), encoding="utf-8")
+    return begun
+
+
+def test_old_store_goes_on_with_its_own_dataset(folder: Path, old: Path) -> None:
+    _add(folder, 5)
+
+    with open_packed_maps([folder], old) as packed:
+        assert len(packed) == 2 * SHARD
+    _assert_refused(old, folder, "aligned with rig paper-rig", frame=WALL_GRID)
+
+
+def test_old_store_of_another_dataset_is_refused(tmp_path: Path, old: Path) -> None:
+    _assert_refused(old, _add(tmp_path / "b", 20), "other data")
 
 
 def test_open_packed_maps_refuses_a_store_in_use(folder: Path, store_folder: Path) -> None:

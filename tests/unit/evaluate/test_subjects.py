@@ -19,9 +19,11 @@ from nlos_cam.dataset import (
     TEST_SEED,
     TRAINING_SEED,
     DatasetPlan,
+    Labelled,
     Objects,
     RigSpread,
     procedural_images,
+    write_shards,
 )
 from nlos_cam.dataset.samples import make_samples
 from nlos_cam.dataset.shards import shard_path, store
@@ -50,7 +52,7 @@ from nlos_cam.objects import (
     unseen_objects,
 )
 from nlos_cam.reconstruct import MapAlignment
-from nlos_cam.render import QUIET, MultiBounce, SceneFile
+from nlos_cam.render import QUIET, MultiBounce, Scene, SceneFile, render
 
 RIG = load_rig("paper-rig")
 BOX = object_box(RIG)
@@ -95,6 +97,20 @@ def test_rendered_objects_are_seeded_objects() -> None:
     assert judged.maps.depth_m.shape == (1, 64, 80)
     assert len(judged.names) == 1
     assert judged.plan == PLAN
+
+
+def test_objects_are_rendered_with_the_pulse_of_the_sensor() -> None:
+    # The sensor's gain makes up for what a pulse takes from the peaks: echoes without the pulse
+    # would be too bright.
+    sensor = QUIET.model_copy(update={"pulse_ns": 0.1})
+    _, depth_m = object_depth(TEST_SEED, BOX)
+    echoes = render(Scene(RIG, depth_m, pulse_ns=sensor.pulse_ns)).multi
+    (seen,) = sense([echoes], RIG, sensor)
+
+    judged = module.rendered_objects(RIG, 1, sensor=sensor)
+
+    np.testing.assert_array_equal(judged.maps.intensity[0], seen.intensity)
+    np.testing.assert_array_equal(judged.maps.depth_m[0], seen.depth_m)
 
 
 def test_second_set_is_of_other_kinds_in_the_same_poses() -> None:
@@ -153,6 +169,20 @@ def test_note_says_that_objects_have_rigs_of_their_own(of_many_rigs: HeldOutObje
     assert "a rig of its own" in note
 
 
+def test_difference_maps_of_recordings_are_of_maps_as_recorded(tmp_path: Path) -> None:
+    maps = small_maps(2, 0)
+    recorded = replace(maps, depth_m=maps.depth_m + 1, intensity=maps.intensity + 2)
+    truth_m = np.full((2, 64, 64), 0.2, np.float32)
+    write_shards(Labelled(maps, recorded, truth_m, ("cup",) * 2, ("a",) * 2, RIG), tmp_path)
+    objects = module.dataset_objects(tmp_path)
+    flat = np.zeros((64, 80), np.float32)
+    difference = RECORD.model_copy(update={"input": "difference maps"})
+
+    np.testing.assert_array_equal(objects.input_of(RECORD, None).depth_m, maps.depth_m)
+    less_flat = objects.input_of(difference, (flat, flat))
+    np.testing.assert_array_equal(less_flat.depth_m, recorded.depth_m)
+
+
 def test_sense_matches_simulated_camera(echoes: list[MultiBounce]) -> None:
     world = World(SceneFile(name="any", rig=RIG), echoes, [None, None])
 
@@ -194,6 +224,15 @@ def test_reconstruct_all_takes_one_object_at_a_time(echoes: list[MultiBounce]) -
 
 def test_rig_of_weights_is_known() -> None:
     assert rig_of(RECORD) == RIG
+
+
+def test_rig_of_a_benchs_weights_is_in_their_record() -> None:
+    own = RIG.model_copy(update={"name": "my bench"})
+    record = CheckpointRecord(
+        rig_name=own.name, rig_checksum=own.checksum, rig=own.model_dump(mode="json")
+    )
+
+    assert rig_of(record) == own
 
 
 def test_unknown_rig_of_weights_is_asked_for() -> None:
