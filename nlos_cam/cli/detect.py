@@ -9,6 +9,7 @@ import shlex
 import shutil
 import sys
 from collections.abc import Callable
+from contextlib import suppress
 from datetime import datetime
 from math import isfinite
 from pathlib import Path
@@ -42,11 +43,24 @@ ALPHA = 0.01
 CONTROL_WORDS = ": the same motions with an EMPTY hand"
 
 
+def read_fresh_line() -> str:
+    """Return the next line that is typed, "" where stdin ends.
+
+    What was typed before it is dropped: an Enter during the last turn answers no later question.
+    """
+    if sys.stdin.isatty():
+        with suppress(ImportError):  # Windows has none
+            import termios
+
+            termios.tcflush(sys.stdin, termios.TCIFLUSH)
+    return sys.stdin.readline()
+
+
 class TerminalHands:
     """Person at the terminal who moves the object and presses Enter."""
 
     def __init__(
-        self, plan: detection.Plan, read_line: Callable[[], str] = sys.stdin.readline
+        self, plan: detection.Plan, read_line: Callable[[], str] = read_fresh_line
     ) -> None:
         self._plan = plan
         self._read_line = read_line
@@ -89,7 +103,7 @@ def detect(
         float | None,
         typer.Option(
             "--alpha",
-            min=1e-6,
+            min=1e-3,
             max=0.2,
             help="Rate of false alarms, for the whole family of tests (default: 0.01).",
         ),
@@ -138,20 +152,18 @@ def detect(
     if camera.startswith("bag:"):
         raise typer.BadParameter(f"{camera} is a recording without turns: give a live camera")
     folder = output_path(out, "detect", "", overwrite=True)  # a session that exists goes on
-    chosen = benches.choose(bench_folder, wall)
-    is_there = detection.is_session(folder)
-    before = detection.Session.open(folder).plan if is_there and not overwrite else None
+    chosen = benches.choose(bench_folder, wall, reconstructs=False)
+    goes_on = detection.is_session(folder) and not overwrite
+    before = detection.Session.open(folder).plan if goes_on else None
     asked.check(camera, before)
     source = _open(camera)
-    if is_there and overwrite:  # not before all else is in order
-        shutil.rmtree(folder)
     with interrupted_by_signals(_kept(folder)):
         session = _measure(source, chosen, asked, before, folder)
         _report(session, show_serial=show_serial, as_json=json)
 
 
 def _kept(folder: Path) -> str:
-    return f"whole turns are in {folder}; the same command goes on"
+    return f"whole turns are in {folder}; the same command goes on with --out {folder}"
 
 
 def _rig_option(bench_folder: Path | None, wall: Path | None) -> str:
@@ -200,6 +212,11 @@ class Asked(NamedTuple):
     def check(self, uri: str, before: detection.Plan | None) -> None:
         """Raise typer.BadParameter for a wrong number, before the camera is opened."""
         self._plan(before, camera=uri)
+        if before and self.seed not in {None, before.seed}:
+            raise typer.BadParameter(
+                f"--seed {self.seed} draws another order of turns than the session that goes on"
+                f" (seed {before.seed}): omit it, or choose another folder"
+            )
 
     def plan(
         self, source: cameras.Camera, rig: walls.Rig | None, before: detection.Plan | None
@@ -253,7 +270,10 @@ def _measure(
 ) -> detection.Session:
     with source:
         rig = chosen.open(source).rig if chosen.record else source.rig
-        session = detection.Session.start(folder, asked.plan(source, rig, before))
+        plan = asked.plan(source, rig, before)
+        if before is None and detection.is_session(folder):  # --overwrite, all else in order
+            shutil.rmtree(folder)
+        session = detection.Session.start(folder, plan)
         hands: detection.Hands = (
             detection.SimulatedHands(source, control=asked.control)
             if isinstance(source, cameras.SimulatedCamera)

@@ -11,7 +11,7 @@ any false alarm in the whole family (Westfall and Young, 1993).
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
-from math import sqrt
+from math import ceil, sqrt
 
 import cv2
 import numpy as np
@@ -38,10 +38,14 @@ that rounding no cell is believed to be quiet.
 """
 POWER = 0.9
 POWER_DRAWS = 100
-POWER_PATTERNS = 512
 MAX_NOISES = 1e4
-"""Draws of noise from which the smallest effect with this power is found, patterns of signs it is
-tested with, and the effect, in noises, beyond which the search ends.
+"""Draws of noise from which the smallest effect with this power is found, and the effect, in
+noises, beyond which the search ends.
+"""
+POWER_PATTERNS = 512
+POWER_LARGER = 4
+"""Patterns of signs that the power is tested with: this many, or as many more as let so many of
+them be larger at the rate of false alarms.
 """
 POWER_SEED = 1
 PATTERN_SEED = 0
@@ -65,7 +69,7 @@ class Finding:
     p_value: float
     """Probability of a value as large anywhere in the family, without any effect."""
     peak: float
-    """Largest absolute significance, in standard deviations of the noise."""
+    """Mean contrast where it is most significant, in standard deviations of the noise of a mean."""
     cell: tuple[int, int]
     """Row and column of that patch's middle."""
     effect: float
@@ -75,7 +79,7 @@ class Finding:
     smallest_best: float
     """The same at the quietest tenth of the cells."""
     significance: Float64
-    """(64, 80); signed, NaN where a cell is not used."""
+    """(64, 80); signed scores of the test, NaN where a cell is not used."""
     contrast: Float64
     """(64, 80); in the channel's unit."""
 
@@ -100,12 +104,6 @@ class Analysis:
     def complete(self) -> bool:
         """True once every planned block was measured."""
         return self.blocks == self.plan.blocks
-
-    def found_in(self, channel: str) -> bool:
-        """Return True if something in this channel is significant by itself."""
-        return any(
-            each.p_value <= self.plan.alpha for each in self.findings if each.channel == channel
-        )
 
 
 @dataclass(frozen=True)
@@ -140,7 +138,10 @@ class Group:
         return replace(self, values=rest)
 
     def scores(self, signs: Float64) -> Float64:
-        """Return significances (patterns, n) of the mean contrast under patterns of signs."""
+        """Return significances (patterns, n) of the mean contrast under patterns of signs.
+
+        Their scale has the effect itself in it: none is above sqrt((PRIOR + 1) blocks).
+        """
         return (signs @ self.values) / (self.moderated * sqrt(len(self.values)))
 
     @cached_property
@@ -175,7 +176,7 @@ def analyze(
     if blocks < (least := min_blocks(plan.alpha)):
         raise RecordingError(
             f"{len(turns)} turns are too few for a false-alarm rate of {plan.alpha:g}: measure at"
-            f" least {least * BLOCK_TURNS}; the same command goes on"
+            f" least {least * BLOCK_TURNS}; the same command goes on with --out and its folder"
         )
     turns = turns[: blocks * BLOCK_TURNS]
     groups = make_groups(plan, turns)
@@ -345,7 +346,7 @@ def _finding(group: Group, number: int, scale: Scale, smallest: Float64) -> Find
         group.channel,
         group.patch,
         scale.p_value(number),
-        float(abs(observed[peak])),
+        float(abs(mean[peak]) * sqrt(len(group.values)) / group.noise[peak]),
         (int(row), int(column)),
         float(mean[peak]),
         float(smallest[0]),
@@ -369,8 +370,9 @@ def smallest_in_noises(group: Group, number: int, scale: Scale) -> float:
     cells, share = _overlapping(group, generator)
     draws = rest[:, cells] * generator.choice([-1.0, 1.0], (blocks, len(cells), 1))
     patterns = np.arange(len(scale.family))
-    if len(patterns) > POWER_PATTERNS:
-        drawn = generator.choice(patterns[1:], POWER_PATTERNS - 1, replace=False)
+    wanted = max(POWER_PATTERNS, ceil(POWER_LARGER / scale.alpha))
+    if len(patterns) > wanted:
+        drawn = generator.choice(patterns[1:], wanted - 1, replace=False)
         patterns = np.concatenate([[0], drawn])
     signs = sign_patterns(blocks)[patterns]
     others = np.stack(

@@ -113,7 +113,7 @@ def measure_turn(
             if frame is None:
                 raise CameraLostError(
                     f"{camera.uri} ended within a turn: the turns before it are in"
-                    f" {session.folder}; the same command goes on"
+                    f" {session.folder}; the same command goes on with --out {session.folder}"
                 )
             if number >= SETTLING_FRAMES:
                 sums.add(frame)

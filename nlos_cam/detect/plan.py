@@ -13,6 +13,10 @@ from pydantic import Field, model_validator
 from nlos_cam import __version__
 from nlos_cam.files import program_commit, with_commit
 
+MIN_ALPHA = 1e-3
+"""Least rate of false alarms that the analysis resolves: of more than 4096 patterns of signs it
+draws 4096, of which four may then be as large as the observed one.
+"""
 BLOCK_TURNS = 4
 """Turns of a block, out-in-in-out or in-out-out-in: either cancels a drift that is linear in time.
 """
@@ -62,7 +66,7 @@ class Plan(Record):
     """Whole blocks, half of the turns with the object."""
     frames: int = Field(ge=2, le=100_000)
     """Frames of each turn and setting."""
-    alpha: float = Field(default=0.01, gt=0, lt=0.5)
+    alpha: float = Field(default=0.01, ge=MIN_ALPHA, lt=0.5)
     """Probability that anything is reported where the object has no effect at all."""
     seed: int = Field(ge=0)
     """Seed of the order of the turns."""

@@ -94,7 +94,8 @@ def verdict(analysis: Analysis) -> Banner:
             "doubtful",
             "Not finished",
             f"{analysis.blocks} of {plan.blocks} blocks; p = {analysis.p_value:.2g} so far. The"
-            " false-alarm rate holds for the whole plan only: the same command goes on.",
+            " false-alarm rate holds for the whole plan only: the same command goes on with --out"
+            " and this folder.",
         )
     rate = f"A bench without any effect is called so in at most {plan.alpha:.2g} of such sessions"
     if analysis.detected:
@@ -235,12 +236,14 @@ def facts(analysis: Analysis, *, show_serial: bool = False) -> dict[str, str]:
 
 
 def command_of(plan: Plan) -> str:
-    """Return the command that measures by this plan."""
-    camera = plan.camera.split(":", maxsplit=1)[0]
+    """Return the command that measures by this plan, without a serial number or folders."""
+    kind, _, rest = plan.camera.partition(":")
+    simulated = kind.startswith("sim") and rest
+    camera = f"{kind}:{Path(rest).name}" if simulated else kind
     words = ["nlos-cam detect", camera]
     if plan.rig_option:
         words.append(plan.rig_option)
-    elif plan.rig and camera != "sim":  # of a session from before the option was stored
+    elif plan.rig and kind != "sim":  # of a session from before the option was stored
         words.append("--wall wall.toml")
     words.append(f"--turns {plan.turns} --frames {plan.frames} --alpha {plan.alpha:g}")
     words += ["--settings sweep"] if len(plan.settings) > 1 else []
@@ -269,8 +272,8 @@ def _map_of(setting: str, findings: Sequence[Finding]) -> Picture:
         axis.set(xlabel="column", ylabel="row")
         figure.colorbar(image, ax=axis, shrink=0.8)
     caption = (
-        "Significance in standard deviations of the noise, means over 3 x 3 cells; red: larger with"
-        " the object in. p holds for the whole family of tests. The scale of significances is not"
-        " that of a single test: several standard deviations somewhere are usual."
+        "Scores of the test, means over 3 x 3 cells; red: larger with the object in. p holds for"
+        " the whole family of tests. A score is a mean over its standard deviation, of which the"
+        " effect is a part: a strong one saturates it, and several somewhere are usual."
     )
     return Picture(f"Significance, setting: {setting}", caption, png(figure))

@@ -28,13 +28,14 @@ class Session:
     def start(cls, folder: Path, plan: Plan) -> "Session":
         """Create a session in an empty or new folder, or return the one in it that has this plan.
 
-        Date, camera's name, version and order are those of the session that exists. Raises
-        RecordingError where its plan is another, OutputExistsError where the folder holds others'
-        files.
+        Date, version and order are those of the session that exists. Raises RecordingError where
+        its plan is another, OutputExistsError where the folder holds others' files.
         """
         if is_session(folder):
             session = cls.open(folder)
-            for name in TOGETHER:
+            # A real camera is known by its serial number; simulated ones share theirs.
+            simulated = plan.camera.startswith("sim")
+            for name in (*TOGETHER, "camera") if simulated else TOGETHER:
                 if getattr(session.plan, name) != getattr(plan, name):
                     raise RecordingError(
                         f"{folder} was begun with another {name}: repeat that command, or choose"

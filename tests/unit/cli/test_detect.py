@@ -1,7 +1,9 @@
 """Laws of `nlos-cam detect`: hands at a terminal, stored turns, wrong folders."""
 
 import json
+import os
 import signal
+import termios
 from collections.abc import Callable
 from contextlib import nullcontext
 from pathlib import Path
@@ -12,7 +14,7 @@ import pytest
 from made_benches import make_bench, wall_of
 from made_turns import made_plan, made_turns, patch_effect
 
-from nlos_cam.cli.detect import TerminalHands
+from nlos_cam.cli.detect import TerminalHands, read_fresh_line
 from nlos_cam.detect import Session
 from nlos_cam.errors import NlosCamError
 
@@ -128,6 +130,26 @@ def test_bench_folder_in_place_of_a_camera_names_bench(run: Run, tmp_path: Path)
     assert "`nlos-cam detect l515 --bench bench`" in err
 
 
+def test_camera_that_cannot_be_swept_overwrites_no_session(run: Run, tmp_path: Path) -> None:
+    session = Session.start(tmp_path / "session", made_plan())
+    sweep = "--settings", "sweep"
+
+    err = run("detect", "sim:bare-wall", *sweep, "--out", session.folder, "--overwrite", code=3).err
+
+    assert "no options to sweep" in err
+    assert Session.open(session.folder).plan == session.plan
+
+
+def test_session_of_another_seed_is_refused(run: Run, tmp_path: Path) -> None:
+    session = Session.start(tmp_path / "session", made_plan(seed=3, camera="sim:bare-wall"))
+    session.path(0).write_bytes(b"measured")
+
+    err = run("detect", "sim:bare-wall", "--seed", 4, "--out", session.folder, code=2).err
+
+    assert "the session that goes on (seed 3)" in err
+    assert session.path(0).read_bytes() == b"measured"
+
+
 @pytest.mark.parametrize("words", [["l515", "--bench", "bench"], ["bench", "--camera", "l515"]])
 def test_new_session_keeps_the_name_of_its_bench(
     run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, words: list[str]
@@ -168,6 +190,22 @@ def test_stored_turns_refuse_options_of_a_measurement(
 
 def test_recording_has_no_turns(run: Run) -> None:
     assert "without turns" in run("detect", "run.bag", code=2).err
+
+
+def test_enter_during_a_turn_answers_no_later_question(monkeypatch: pytest.MonkeyPatch) -> None:
+    keyboard, terminal = os.openpty()
+    os.write(keyboard, b"early\n")
+    flush = termios.tcflush
+
+    def typed_after(*queue: int) -> None:
+        flush(*queue)
+        os.write(keyboard, b"late\n")
+
+    monkeypatch.setattr(termios, "tcflush", typed_after)
+    with os.fdopen(terminal) as stdin:
+        monkeypatch.setattr("nlos_cam.cli.detect.sys.stdin", stdin)
+        assert read_fresh_line() == "late\n"
+    os.close(keyboard)
 
 
 def test_terminal_asks_for_each_turn_until_stdin_ends(

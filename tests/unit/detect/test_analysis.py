@@ -5,6 +5,7 @@ from math import comb
 import numpy as np
 import pytest
 from made_turns import STD, made_plan, made_turns, patch_effect, swapped
+from pydantic import ValidationError
 
 from nlos_cam.detect import Analysis, analyze
 from nlos_cam.detect.analysis import lock_weights, sign_patterns
@@ -30,11 +31,38 @@ def judged(seed: int, **changes: object) -> Analysis:
     return analyze(plan, turns, with_power=False)
 
 
-def test_false_alarm_rate_is_the_stated_one() -> None:
-    alarms = sum(judged(seed).detected for seed in range(RUNS))
-    # 16 patterns: the largest reachable rate up to 0.1 is 1 / 16.
-    low, high = binomial_bounds(RUNS, 1 / 16)
-    assert low <= alarms <= high
+@pytest.fixture(scope="module")
+def without_effect() -> list[Analysis]:
+    """Verdicts on runs without any effect."""
+    return [judged(seed) for seed in range(RUNS)]
+
+
+@pytest.mark.parametrize("rate", [1 / 16, 1 / 4, 1 / 2])  # of 16 patterns
+def test_p_values_without_effect_are_evenly_spread(
+    without_effect: list[Analysis], rate: float
+) -> None:
+    low, high = binomial_bounds(RUNS, rate)
+    assert low <= sum(each.p_value <= rate for each in without_effect) <= high
+
+
+def test_false_alarms_are_those_of_the_rate(without_effect: list[Analysis]) -> None:
+    for each in without_effect:
+        assert each.detected == (each.p_value <= each.plan.alpha)
+
+
+def test_smallest_rate_of_many_turns_finds_and_knows_its_power() -> None:
+    # of 14 blocks 4096 patterns are drawn
+    plan = made_plan(turns=56, alpha=1e-3)
+    best = analyze(plan, made_turns(plan, effect=patch_effect(1e-2, 3))).findings[0]
+    assert best.p_value <= 1e-3
+    assert best.smallest < 1e-3
+    # the noise of a mean over 14 blocks is some micrometers
+    assert best.peak > 100
+
+
+def test_rate_that_no_pattern_resolves_is_refused() -> None:
+    with pytest.raises(ValidationError, match="alpha"):
+        made_plan(turns=80, alpha=1e-4)
 
 
 def test_drift_of_a_hundred_noises_raises_no_more_alarms() -> None:

@@ -103,7 +103,14 @@ def test_sweep_is_measured_under_each_setting(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "change", [{"turns": 36}, {"frames": 5}, {"alpha": 0.02}, {"control": True}]
+    "change",
+    [
+        {"turns": 36},
+        {"frames": 5},
+        {"alpha": 0.02},
+        {"control": True},
+        {"camera": "sim:bare-wall"},
+    ],
 )
 def test_plan_never_changes_midway(tmp_path: Path, change: dict[str, Any]) -> None:
     Session.start(tmp_path / "s", made_plan())
@@ -161,6 +168,7 @@ def test_folder_of_other_files_is_left_alone(tmp_path: Path) -> None:
         ({"camera": "l515", "rig_option": "--bench bench"}, "detect l515 --bench bench --turns"),
         ({"camera": "l515"}, "detect l515 --wall wall.toml --turns"),
         ({"camera": "sim"}, "detect sim --turns"),
+        ({"camera": "sim:mine/farther.toml"}, "detect sim:farther.toml --turns"),
     ],
 )
 def test_page_names_the_option_that_named_the_rig(
