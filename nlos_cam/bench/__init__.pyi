@@ -19,7 +19,6 @@ __all__ = [
     "load_serving",
     "station_folder",
     "weights_verdict",
-    "write_file",
     "write_weights",
 ]
 
@@ -29,7 +28,6 @@ from .edit import (
     check_new,
     edit_bench,
     iou_in_use,
-    write_file,
     write_weights,
 )
 from .folder import Bench, camera_to_name, load_bench

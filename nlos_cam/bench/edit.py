@@ -130,17 +130,6 @@ def edit_bench(folder: Path) -> Generator[BenchEdit]:
         part.write_text(walls.dump_toml(edit.record()), encoding="utf-8")
 
 
-def write_file(folder: Path, name: str, content: bytes) -> Path:
-    """Write a file, such as report.html, into a bench and enter its checksum; return its path."""
-    with edit_bench(folder) as edit:
-        path = folder / name
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with atomic_file(path) as part:
-            part.write_bytes(content)
-        edit.add(path)
-    return path
-
-
 def iou_in_use(folder: Path) -> float | None:
     """Return the silhouette IoU of a bench's own weights on the test objects on it; None where it
     has none of this rig that can be read.

@@ -76,12 +76,19 @@ class Bench:
     def forecast(self) -> ForecastRecord | None:
         """Forecast of this rig, if there is one."""
         found = self.record.stations[self.station].forecast
-        return found if found and found.rig_checksum == self.rig.checksum else None
+        return found if found and found.holds_for(self.rig) else None
+
+    @property
+    def can_be_forecast(self) -> bool:
+        """True if the occluder was measured, and there is an object box."""
+        return self.measured.record.occluder is not None and self.rig.object_box is not None
 
     @property
     def has_old_forecast(self) -> bool:
-        """True if the forecast is of another rig: the object box was edited since."""
-        return bool(self.record.stations[self.station].forecast) and self.expected_iou is None
+        """True if the forecast is of another rig, since the object box was edited, or of an earlier
+        version.
+        """
+        return bool(self.record.stations[self.station].forecast) and self.forecast is None
 
     @property
     def calibrated(self) -> CalibratedRig:

@@ -3,13 +3,17 @@
 import hashlib
 from datetime import datetime
 from pathlib import Path, PurePosixPath
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 
-from nlos_calibration import ObjectBox, PinholeRecord, Record, read_record, record_kind
+from nlos_calibration import ObjectBox, PinholeRecord, Record, Rig, read_record, record_kind
 from nlos_calibration.errors import RecordFileError
 from pydantic import AfterValidator, BeforeValidator, Field
 
 from nlos_cam.files import read_toml
+from nlos_cam.forecast import FORECAST_VERSION
+
+if TYPE_CHECKING:
+    from nlos_cam.forecast import Forecast
 
 MANIFEST = "bench.toml"
 MAIN = "main"
@@ -53,12 +57,28 @@ class CameraRecord(Record):
 class ForecastRecord(Record):
     """Forecast of a station, stored since it takes seconds that `live` does not have."""
 
+    version: int = 0
+    """FORECAST_VERSION when it was made; of another one, the forecast is not used."""
     rig_checksum: str
-    """Rig that it was made for; of another one, the forecast is not used."""
+    """Rig that it was made for, likewise."""
     expected_iou: Annotated[float, Field(ge=0, le=1)]
     """Silhouette IoU to expect of weights that are trained for this rig."""
     hidden_share: Annotated[float, Field(ge=0, le=1)] = 0.0
-    """Share of the test objects that change no cell of the maps; 0 in records before 0.3."""
+    """Share of the test objects that change no cell of the maps."""
+
+    @classmethod
+    def of(cls, found: "Forecast") -> Self:
+        """Return what a bench keeps of a forecast."""
+        return cls(
+            version=FORECAST_VERSION,
+            rig_checksum=found.rig_checksum,
+            expected_iou=round(found.expected_iou, 3),
+            hidden_share=round(found.hidden_share, 3),
+        )
+
+    def holds_for(self, rig: Rig) -> bool:
+        """Return whether it is of this rig, and made as forecasts are made today."""
+        return self.version == FORECAST_VERSION and self.rig_checksum == rig.checksum
 
 
 class StationRecord(Record):

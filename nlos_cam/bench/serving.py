@@ -60,8 +60,8 @@ def weights_verdict(
     served = weights_serve(rig, trained, expected_iou=expected_iou, bench=folder)
     if bench.has_old_forecast:
         old = (
-            f"{served.sentence} (the forecast is of another object box: `nlos-cam predict {folder}`"
-            " makes it again)"
+            f"{served.sentence} (the forecast is of another object box or an earlier version:"
+            f" `nlos-cam predict {folder}` makes it again)"
         )
         served = replace(served, sentence=old)
     if bench.hidden_share > 0:

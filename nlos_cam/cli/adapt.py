@@ -159,12 +159,7 @@ def _forecast(rig: walls.Rig, folder: Path | None) -> benches.ForecastRecord:
     stored = benches.load_bench(folder, weights=False).forecast if folder else None
     if stored:
         return stored
-    found = forecast.forecast(rig, quick=True)
-    return benches.ForecastRecord(
-        rig_checksum=rig.checksum,
-        expected_iou=found.expected_iou,
-        hidden_share=found.hidden_share,
-    )
+    return benches.ForecastRecord.of(forecast.forecast(rig, quick=True))
 
 
 def _recordings(folder: Path) -> adaptation.Recordings | None:

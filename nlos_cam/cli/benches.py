@@ -76,15 +76,21 @@ class Choice(NamedTuple):
         return found.network, found.uncertainty_model
 
 
-def choose(bench: Path | None, wall: Path | None = None, weights: Path | None = None) -> Choice:
-    """Load the bench folder, if there is one. Raises RecordFileError, and typer.BadParameter for a
-    bench and a wall record.
+def choose(
+    bench: Path | None,
+    wall: Path | None = None,
+    weights: Path | None = None,
+    *,
+    reconstructs: bool = True,
+) -> Choice:
+    """Load the bench folder, if there is one; its own weights only where it `reconstructs`, by no
+    others. Raises RecordFileError, and typer.BadParameter for a bench and a wall record.
     """
     if bench is None:
         return Choice(None, wall, weights)
     if wall is not None:
         raise typer.BadParameter("--bench and --wall each name a measured wall: give one")
-    loaded = benches.load_bench(bench)
+    loaded = benches.load_bench(bench, weights=reconstructs and weights is None)
     return Choice(loaded, loaded.wall, weights or loaded.weights)
 
 
@@ -102,15 +108,20 @@ def rig_or_default(bench: Path | None, rig: str | None, default: str) -> walls.R
     if bench is not None and rig is not None:
         raise typer.BadParameter("--bench and --rig each name a rig: give one")
     if bench is not None:
-        loaded = benches.load_bench(bench)
-        for warning in loaded.calibrated.warnings:
-            common.say(f"note: {warning}")
+        loaded = benches.load_bench(bench, weights=False)
+        _note_warnings(loaded)
         return loaded.rig
     name = rig or default
     found = walls.rig_named(name)
     if walls.is_wall_record(name):
         _note_doubt(name, walls.load_wall(Path(name)))
     return found
+
+
+def _note_warnings(bench: benches.Bench) -> None:
+    """Print the warnings about a bench that hold for every frame."""
+    for warning in bench.calibrated.warnings:
+        common.say(f"note: {warning}")
 
 
 def _note_doubt(name: str, record: walls.WallRecord) -> None:
@@ -121,12 +132,14 @@ def _note_doubt(name: str, record: walls.WallRecord) -> None:
 
 def bench_or_rig(name: str | Path) -> tuple[walls.Rig, walls.MeasuredWall | None]:
     """Return the rig of a bench folder, a wall record, a rig's file or a packaged rig and, where it
-    was measured, its wall; print that a record is doubtful by its own verdict.
+    was measured, its wall; print what is doubtful about it.
     """
     name = str(name)
     if Path(name).is_dir():
-        measured = benches.load_bench(name, weights=False).measured
-    elif walls.is_wall_record(name):
+        loaded = benches.load_bench(name, weights=False)
+        _note_warnings(loaded)
+        return loaded.rig, loaded.measured
+    if walls.is_wall_record(name):
         measured = walls.load_measured(Path(name))
     else:
         return walls.rig_named(name), None
@@ -134,14 +147,13 @@ def bench_or_rig(name: str | Path) -> tuple[walls.Rig, walls.MeasuredWall | None
     return measured.record.rig, measured
 
 
-def store_forecast(folder: Path, station: str | None = None) -> None:
+def store_forecast(folder: Path) -> None:
     """Forecast what a bench with an occluder shows, and enter it in its record: takes seconds.
 
     Raises RecordFileError.
     """
-    station = station or benches.MAIN
-    bench = benches.load_bench(folder, station, weights=False)
-    if bench.measured.record.occluder is None or bench.rig.object_box is None:
+    bench = benches.load_bench(folder, weights=False)
+    if not bench.can_be_forecast:
         return
     from nlos_cam.forecast import forecast  # not for `live`
 
@@ -150,28 +162,18 @@ def store_forecast(folder: Path, station: str | None = None) -> None:
 
 
 def keep_forecast(bench: benches.Bench, found: Forecast) -> None:
-    """Enter the forecast for a bench's rig in its record."""
-    entry = benches.ForecastRecord(
-        rig_checksum=bench.rig.checksum,
-        expected_iou=round(found.expected_iou, 3),
-        hidden_share=round(found.hidden_share, 3),
-    )
+    """Enter a forecast in a bench's record."""
     with benches.edit_bench(bench.folder) as edit:
-        edit.set_forecast(bench.station, entry)
+        edit.set_forecast(bench.station, benches.ForecastRecord.of(found))
 
 
-def files_in_bench(
-    folder: Path, *, occluder: bool, overwrite: bool, station: str | None = None
-) -> calibrate.WallFiles:
+def files_in_bench(folder: Path, *, occluder: bool, overwrite: bool) -> calibrate.WallFiles:
     """Return the paths of a measurement in a bench folder: of the bare wall, or with its occluder.
 
     Raises OutputExistsError for an existing file without `overwrite`.
     """
-    record = (
-        folder
-        / benches.station_folder(station or benches.MAIN)
-        / ("occluder.toml" if occluder else "wall.toml")
-    )
+    name = "occluder.toml" if occluder else "wall.toml"
+    record = folder / benches.station_folder(benches.MAIN) / name
     if record.exists() and not overwrite:
         raise OutputExistsError(
             f"{record} exists: choose another bench, or add --overwrite to replace it"
@@ -184,24 +186,22 @@ def write_to_bench(
     files: calibrate.WallFiles,
     record: walls.WallRecord,
     reference: walls.BareWall | None,
-    station: str | None = None,
 ) -> walls.WallRecord:
     """Write a measurement to its `files_in_bench` and enter it in the bench, which is made if it is
     missing; return the record, which names its reference.
 
     A wall that is measured again drops the occluder found before; the object box stays.
     """
-    station = station or benches.MAIN
     with benches.edit_bench(folder) as edit:
         files.record.parent.mkdir(parents=True, exist_ok=True)
         record = calibrate.write_record(files, record, reference)
         name = files.record.relative_to(folder).as_posix()
-        before = edit.stations.get(station)
+        before = edit.stations.get(benches.MAIN)
         box = before.object_box if before else record.rig.object_box
         if files.record.stem == "occluder" and before:
             entry = benches.StationRecord(wall=before.wall, occluder=name, object_box=box)
         else:
             entry = benches.StationRecord(wall=name, object_box=box)
-        edit.set_station(station, entry, record)
+        edit.set_station(benches.MAIN, entry, record)
         edit.add(files.record, *([files.reference] if reference else []))
     return record

@@ -174,7 +174,7 @@ def capture(
     each file.
     """
     targets = _targets(_base(seconds, frames, takes, out), takes, label or [], overwrite=overwrite)
-    chosen = benches.choose(bench_folder, wall)
+    chosen = benches.choose(bench_folder, wall, reconstructs=False)
     measured = recordings.load_measured_wall(chosen.record) if chosen.record else None
     recording = cameras.Recording(
         targets[0].path, frames=frames, seconds=seconds, last=takes == 1, overwrite=overwrite

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
 import typer
+from nlos_calibration.errors import CalibrationError
 from rich.table import Table
 
 from nlos_cam.cli.common import Detail, Json, finish, say, say_interrupted, set_detail, show
@@ -167,10 +168,11 @@ def shared_options(name: str, command: Callable[..., None]) -> Callable[..., Non
         set_detail(verbose=verbose, quiet=quiet)
         settings = read_settings()
         used = {key: value for key, value in settings.items() if name in SETTINGS[key].commands}
-        if takes_camera:
-            _choose_camera(values, used)
+        named = _choose_camera(values, used) if takes_camera else True
         _choose_bench(values, used)
         _fill(values, used)
+        if not named:
+            _take_camera_of_bench(values)
         try:
             with _cache_at(settings["cache"]) if name != "config" else nullcontext():
                 command(**values)
@@ -202,9 +204,10 @@ def _optional(annotation: Any) -> Any:
     return Annotated[annotation.__origin__ | None, *annotation.__metadata__]
 
 
-def _choose_camera(values: dict[str, Any], used: dict[str, Value]) -> None:
+def _choose_camera(values: dict[str, Any], used: dict[str, Value]) -> bool:
     """Enter the camera of the argument, the option or the setting; another than the setting's has
-    another wall. A bench folder as the argument, beside the option, is --bench.
+    another wall. A bench folder as the argument, beside the option, is --bench. Return whether
+    anything named a camera, or a recording in place of one.
     """
     argument = values.pop("camera")
     option = values.pop("camera_option")
@@ -227,6 +230,27 @@ def _choose_camera(values: dict[str, Any], used: dict[str, Value]) -> None:
         from nlos_cam.camera import full_uri
 
         values["camera"] = full_uri(str(values["camera"]))
+    is_default = given is None and used["camera"].source == DEFAULT
+    return not is_default or values.get("bag") is not None
+
+
+def _take_camera_of_bench(values: dict[str, Any]) -> None:
+    """Enter the lidar that measured the bench: its frames are no simulated camera's.
+
+    A bench that was measured on a simulated scene names none: it was another scene then.
+    """
+    folder = values.get("bench_folder") or values.get("occluder")
+    if folder is None or not _is_bench(str(folder)):
+        return
+    from nlos_cam.bench import load_bench_record
+    from nlos_cam.camera import SIMULATED_SERIAL
+
+    try:
+        serial = load_bench_record(Path(folder)).camera.serial
+    except CalibrationError:  # the command says what is wrong with it
+        return
+    if serial not in {"", SIMULATED_SERIAL}:
+        values["camera"] = "l515"
 
 
 def _is_another(given: str, setting: Value) -> bool:

@@ -107,10 +107,9 @@ def predict(
     if bench_folder is not None:
         if hidden is not None:
             raise typer.BadParameter(f"--bench and {rig} each name a rig: give one")
-        own = bench_folders.load_bench(bench_folder).rig
+        bench_folders.load_bench_record(bench_folder)  # refuses what is no bench folder
         rig, hidden = str(bench_folder), rig
-    else:
-        own, _ = benches.bench_or_rig(rig or PAPER_RIG)
+    own, _ = benches.bench_or_rig(rig or PAPER_RIG)
     depth_m = _object_depth(hidden, own, placement)
     shape = None if depth_m is None else forecast.Shape.of(depth_m, objects.object_box(own))
     with interrupted_by_signals():
@@ -120,7 +119,6 @@ def predict(
         if not quick and shape is None:
             with tracked("trying changes of the bench") as on_progress:
                 advice = forecast.changes(own, on_progress)
-    _renew_forecast(rig, found, is_typical=shape is None)
     if path is not None:
         forecast.write_report(found, path, advice, hidden or "", view)
     facts = found.as_json() | {
@@ -141,6 +139,8 @@ def predict(
         show(_table(found), narrow_columns=TABLE_COLUMNS)
         lines.insert(0, forecast.COLUMNS)
     finish(facts, as_json=json, text="\n".join(lines))
+    if shape is None and rig is not None and Path(rig).is_dir():  # last: it can be refused
+        _renew_forecast(Path(rig), found)
 
 
 def _object_depth(hidden: str | None, rig: walls.Rig, placement: dict[str, Any]) -> Float32 | None:
@@ -157,14 +157,10 @@ def _object_depth(hidden: str | None, rig: walls.Rig, placement: dict[str, Any])
     return None
 
 
-def _renew_forecast(name: str | None, found: forecast.Forecast, *, is_typical: bool) -> None:
-    """Enter a forecast of typical objects in the record of a bench whose object box was edited
-    since its own.
-    """
-    if name is None or not is_typical or not Path(name).is_dir():
-        return
-    bench = bench_folders.load_bench(name)
-    if bench.has_old_forecast:
+def _renew_forecast(folder: Path, found: forecast.Forecast) -> None:
+    """Enter a forecast of typical objects in the record of a bench that has none of its rig."""
+    bench = bench_folders.load_bench(folder, weights=False)
+    if bench.can_be_forecast and bench.forecast is None:
         benches.keep_forecast(bench, found)
         say(f"Renewed the forecast in {bench.folder}")
 

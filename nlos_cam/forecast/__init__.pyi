@@ -4,6 +4,7 @@ __all__ = [
     "CAVEATS",
     "COLUMNS",
     "EFFECTS",
+    "FORECAST_VERSION",
     "FRAMES",
     "MATERIALS",
     "SCATTER_IOU",
@@ -31,7 +32,7 @@ __all__ = [
 ]
 
 from .advice import Change, changes
-from .curve import SCATTER_IOU, network_iou
+from .curve import FORECAST_VERSION, SCATTER_IOU, network_iou
 from .expectation import FRAMES, Conditions, Expectation, Forecast, forecast, shipped_basis
 from .lidar_view import LidarView
 from .linear import ACCURACY, BLACK, EFFECTS, MATERIALS, ChosenBeams, MaterialName, cut

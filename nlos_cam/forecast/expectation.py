@@ -5,7 +5,7 @@ determine.
 import io
 import json
 from collections.abc import Iterable, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field, fields, replace
 from functools import cache
 from itertools import product
 from typing import Any, Self, get_args
@@ -30,7 +30,7 @@ from nlos_cam.render import Radiometry, Scene, SensorModel, render
 
 FRAMES = 1, 4, 30, 100
 QUICK_FRAMES = 1, 100
-VERSION = 2
+VERSION = 3
 """Raise it when the same rig gives another forecast."""
 STRIDE = 11
 """Every eleventh of the 54 test objects is a typical one: 5, the same on every rig, so that the
@@ -297,10 +297,22 @@ def _by_material(
             own = [one["matt"] for one in echoes]
             reference = expectation(base.conditions, posteriors(shapes, own, frames), own, span_m)
             row = expectation(conditions, posteriors(shapes, now, frames), now, span_m)
-            shift = base.linear_iou - reference.linear_iou
-            row = replace(row, linear_iou=float(np.clip(row.linear_iou + shift, 0, 1)))
+            row = _as_far_from(base, reference, row)
             rows.append(at_least(row, rows[-1]) if i else row)
     return rows
+
+
+def _as_far_from(base: Expectation, reference: Expectation, row: Expectation) -> Expectation:
+    """Return a row's conditions with every figure as far from the base's as the row's is from the
+    reference's.
+    """
+    moved: dict[str, float] = {}
+    for each in fields(Expectation):
+        if each.name != "conditions":
+            values = [getattr(one, each.name) for one in (row, base, reference)]
+            moved[each.name] = max(values[0] + values[1] - values[2], 0.0)
+    moved["linear_iou"] = min(moved["linear_iou"], 1.0)
+    return replace(row, **moved)
 
 
 def posteriors(shapes: Sequence[Shape], echoes: Sequence[Echoes], frames: int) -> list[Posterior]:

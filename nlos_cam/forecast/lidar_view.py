@@ -19,6 +19,8 @@ every exposure is not without any."""
 SURE = 5.0
 """Change, in standard deviations of the noise, from which on a cell shows the object in one frame: by
 noise alone one of 5120 cells does in about twenty frames."""
+MIN_RETURNS = EXPOSURES // 2
+"""Exposures in which an empty bench's cell must have a return: of fewer its noise is not known."""
 SHOWN = 30.0
 """Largest change in the picture, in standard deviations."""
 
@@ -33,11 +35,11 @@ class LidarView:
     """(64, 80); in counts."""
     depth_change: Float64
     """(64, 80); depth less the empty bench's, in standard deviations of its noise; 0 where either
-    has no return."""
+    has no return, the empty bench's in less than half of its exposures."""
     light_change: Float64
     """(64, 80); of the intensity, likewise."""
     farther_m: float
-    """Largest depth less the empty bench's, in meters."""
+    """Largest depth less the empty bench's of a cell whose depth shows the object, in meters."""
 
     @classmethod
     def of(cls, rig: Rig, object_depth_m: Float32, seed: int = 0) -> Self:
@@ -53,16 +55,21 @@ class LidarView:
         one = sensor.maps(
             render(Scene(rig, object_depth_m)).multi, np.random.default_rng([seed, EXPOSURES])
         )
-        farther_m = one.depth_m - depths_m.mean(0)
+        # a cell whose return drops out now and then still has a mean
+        returns = np.ma.masked_invalid(depths_m)
+        known = returns.count(0) >= MIN_RETURNS
+        farther_m = np.where(known, one.depth_m - returns.mean(0).filled(np.nan), np.nan)
         brighter = one.intensity - lights.mean(0)
-        depth_noise_m = np.maximum(depths_m.std(0), MIN_DEPTH_NOISE_M)
+        depth_noise_m = np.maximum(returns.std(0).filled(0.0), MIN_DEPTH_NOISE_M)
         light_noise = np.maximum(lights.std(0), MIN_LIGHT_NOISE)
+
+        depth_change = np.nan_to_num(farther_m / depth_noise_m)
         return cls(
             one.depth_m,
             one.intensity,
-            np.nan_to_num(farther_m / depth_noise_m),
+            depth_change,
             np.where(np.isfinite(farther_m), brighter / light_noise, 0.0),
-            float(np.nanmax(farther_m, initial=0.0)),
+            float(np.max(farther_m[depth_change >= SURE], initial=0.0)),
         )
 
     @property
@@ -96,8 +103,12 @@ class LidarView:
             )
         return (
             f"In one frame the lidar would show it in {self.cells} of 5120 cells, typically by"
-            f" {self.typical_margin:.0f} times the noise, and up to {1e3 * self.farther_m:.0f} mm"
-            " behind the wall."
+            f" {self.typical_margin:.0f} times the noise"
+            + (
+                f", and up to {1e3 * self.farther_m:.0f} mm behind the wall."
+                if self.farther_m
+                else ", in infrared alone."
+            )
         )
 
     def picture(self) -> bytes:

@@ -1,5 +1,6 @@
 """Dispatch of files and folders to the description of their kind."""
 
+import csv
 from collections.abc import Callable
 from dataclasses import replace
 from datetime import UTC, datetime
@@ -29,7 +30,7 @@ FILES: dict[str, tuple[str, Describe]] = {
 KINDS = (
     "recordings (.bag) and their sidecars (.json), .npz files, saved views and reports (.html),"
     " wall, scene, rig and recipe files (.toml), dataset shards (.h5), transients (.hdf5), and the folders of benches,"
-    " datasets, training runs, weights, replays, exports, evaluations and trade-offs"
+    " datasets, training runs, weights, replays, exports, evaluations, detections and trade-offs"
 )
 
 
@@ -59,6 +60,7 @@ def describe(path: Path, *, verify: bool = False) -> files.Description:
             TypeError,
             ValueError,
             AttributeError,
+            csv.Error,
         ) as error:  # fields that the program never wrote
             found = files.Description(
                 kind,

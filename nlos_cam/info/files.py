@@ -132,6 +132,7 @@ ARRAYS = (
     ({"inliers", "map_depth_m", "facts"}, "reference of a bare wall"),
     ({"pixels", "frame_number", "timestamp_s"}, "exported stream"),
     ({"vertices_m", "faces"}, "mesh of a hidden surface"),
+    ({"time_s", "mean", "std", "facts"}, "turn of a detection"),
 )
 """Names that all files of a kind have."""
 COUNTED = {
@@ -299,7 +300,7 @@ def _wall(path: Path, quoted: str) -> Description:
     following = [f"nlos-cam live --camera {camera} --wall {quoted}"]
     if record.occluder is None:
         following.append(
-            f"nlos-cam calibrate --occluder {quoted} --camera {camera} --out bench.toml"
+            f"nlos-cam calibrate --occluder {quoted} --camera {camera} --out occluder.toml"
         )
     return Description(
         "wall record",
@@ -333,6 +334,7 @@ def _binary(path: Path) -> RecordingError:
 
 
 JSON_KINDS = {
+    "alpha": "plan of a detection",
     "bars": "figures of an evaluation",
     "pareto_front": "table of a trade-off",
     "recording": "record of an export",

@@ -5,6 +5,7 @@ import hashlib
 import shlex
 from collections.abc import Callable, Mapping
 from pathlib import Path
+from typing import Any
 
 from nlos_models import load_record
 
@@ -217,7 +218,21 @@ def describe_tradeoff(folder: Path, _verify: bool) -> Description:
     return Description("trade-off", facts, "", "nlos-cam tradeoff", "", "JSON", following)
 
 
-def _json(path: Path) -> Mapping[str, dict[str, float]]:
+def describe_detection(folder: Path, _verify: bool) -> Description:
+    """Describe a detection from its plan."""
+    plan = _json(folder / "detection.json")
+    turns = len([*folder.glob("turn-*.npz")])
+    facts = {name: str(plan[name]) for name in ("camera", "frames", "alpha", "control")}
+    facts |= {"turns": f"{turns} of {plan['turns']}", "settings": str(len(plan["settings"]))}
+    quoted = shlex.quote(str(folder))
+    following = [f"nlos-cam detect {quoted}"]
+    if (page := folder / "detection.html").exists():
+        following.insert(0, f"open {shlex.quote(str(page))}")
+    made_by = f"nlos-cam {plan['version']}: detect"
+    return Description("detection", facts, str(plan["created"]), made_by, "", "plan", following)
+
+
+def _json(path: Path) -> Mapping[str, Any]:
     """Return a JSON object. Raises RecordingError for anything else."""
     found = read_json(path, read_bounded(path, TEXT_LIMIT))
     if not isinstance(found, dict):
@@ -235,5 +250,6 @@ FOLDERS: list[tuple[str, str, Callable[[Path, bool], Description | None]]] = [
     ("export.json", "export of a recording", describe_export),
     ("figures.json", "evaluation", describe_figures),
     ("tradeoff.json", "trade-off", describe_tradeoff),
+    ("detection.json", "detection", describe_detection),
 ]
 """File that each kind holds, kind and reader; the first that fits is taken."""

@@ -26,6 +26,7 @@ from nlos_cam.api import Stream
 from nlos_cam.bench import TEST_IOU, ForecastRecord, edit_bench, load_bench
 from nlos_cam.camera.protocol import Camera
 from nlos_cam.errors import CameraNotFoundError, NlosCamError
+from nlos_cam.forecast import FORECAST_VERSION
 from nlos_cam.reconstruct import FrameResult
 
 LATE = """
@@ -106,7 +107,10 @@ def test_notes_say_that_a_benchs_own_weights_fall_short(
         made_benches.write_wall(tmp_path / "bench", measured_wall(tmp_path))
     rig_checksum = load_bench(tmp_path / "bench").rig.checksum
     with edit_bench(tmp_path / "bench") as edit:
-        edit.set_forecast("main", ForecastRecord(rig_checksum=rig_checksum, expected_iou=0.64))
+        edit.set_forecast(
+            "main",
+            ForecastRecord(version=FORECAST_VERSION, rig_checksum=rig_checksum, expected_iou=0.64),
+        )
     own = HalfSurface()
     own.record.rig_checksum = rig_checksum
     own.record.figures = {TEST_IOU: 0.45}

@@ -18,11 +18,11 @@ from nlos_cam.bench import (
     iou_in_use,
     is_bench,
     load_bench,
-    write_file,
     write_weights,
 )
 from nlos_cam.errors import OutputExistsError
 from nlos_cam.files import read_toml
+from nlos_cam.forecast import FORECAST_VERSION
 
 
 @pytest.fixture
@@ -150,7 +150,9 @@ def test_a_stopped_first_measurement_is_repeated(tmp_path: Path) -> None:
 
 def test_forecast_holds_for_the_rig_that_it_was_made_for(folder: Path) -> None:
     checksum = load_bench(folder).rig.checksum
-    forecast = ForecastRecord(rig_checksum=checksum, expected_iou=0.6, hidden_share=0.25)
+    forecast = ForecastRecord(
+        version=FORECAST_VERSION, rig_checksum=checksum, expected_iou=0.6, hidden_share=0.25
+    )
     with edit_bench(folder) as edit:
         edit.set_forecast("main", forecast)
 
@@ -163,9 +165,11 @@ def test_forecast_holds_for_the_rig_that_it_was_made_for(folder: Path) -> None:
 
 
 def test_added_file_is_checked(folder: Path) -> None:
-    path = write_file(folder, "report.html", b"<html>")
+    path = folder / "report.html"
+    path.write_bytes(b"<html>")
+    with edit_bench(folder) as edit:
+        edit.add(path)
 
-    assert path.read_bytes() == b"<html>"
     assert "report.html" in load_bench(folder).record.files
 
     path.write_bytes(b"other")

@@ -20,6 +20,7 @@ from nlos_cam.bench import (
 )
 from nlos_cam.cli.benches import bench_or_rig
 from nlos_cam.cli.calibrate import _written_bench
+from nlos_cam.forecast import FORECAST_VERSION
 from nlos_cam.reconstruct import WALL_GRID
 
 Run = Callable[..., Any]
@@ -198,11 +199,15 @@ def test_rigs_prints_a_whole_rig_that_can_be_used(shown: Run) -> None:
     assert dump_toml(load_rig("paper-rig")) in text
 
 
-def forecast(folder: Path, iou: float, hidden_share: float = 0.0) -> None:
+def forecast(
+    folder: Path, iou: float, hidden_share: float = 0.0, version: int = FORECAST_VERSION
+) -> None:
     """Enter a forecast into a bench."""
     checksum = load_bench(folder).rig.checksum
     with edit_bench(folder) as edit:
-        entry = ForecastRecord(rig_checksum=checksum, expected_iou=iou, hidden_share=hidden_share)
+        entry = ForecastRecord(
+            version=version, rig_checksum=checksum, expected_iou=iou, hidden_share=hidden_share
+        )
         edit.set_forecast("main", entry)
 
 
@@ -241,6 +246,22 @@ def test_verdict_on_weights_says_how_many_objects_are_hidden(bench: Path) -> Non
     assert "nothing there" not in before
     assert "61% of the test objects change no cell" in verdict(bench)
     assert "nlos-cam predict bench" in verdict(bench)
+
+
+def test_forecast_of_an_earlier_version_is_made_again_by_predict(bench: Path, run: Run) -> None:
+    forecast(bench, 0.123, version=FORECAST_VERSION - 1)
+    before = verdict(bench)
+    own = Path("own")
+    own.mkdir()
+    (own / RECORD).write_text(load_record(shipped_folder()).model_dump_json(), encoding="utf-8")
+    shutil.rmtree(write_weights(bench, own, 0.45))  # lost weights are in no forecast's way
+
+    found = run("predict", "--bench", bench, "--quick")
+
+    assert "nlos-cam predict bench" in before
+    assert "0.12" not in before
+    kept = load_bench(bench, weights=False).expected_iou
+    assert kept == pytest.approx(found["expected_iou"], abs=1e-3)
 
 
 def test_forecast_of_another_box_is_renewed_by_predict(bench: Path, run: Run) -> None:

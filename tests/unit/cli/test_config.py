@@ -8,6 +8,7 @@ from typing import Annotated, Any
 
 import pytest
 import typer
+from made_benches import make_bench
 
 from nlos_cam.cli import main as module
 from nlos_cam.cli.common import Camera
@@ -179,6 +180,41 @@ def test_bench_of_the_settings_gives_way_to_what_is_given(
 
     assert main(["live", *words]) == 0
     assert calls == [given]
+
+
+@pytest.mark.parametrize(
+    ("serial", "words", "camera"),
+    [
+        ("f0000001", ["--bench", "bench"], "l515"),
+        ("f0000001", ["--bench", "bench", "sim:a"], "sim:a"),
+        ("simulated", ["--bench", "bench"], "sim"),
+        ("f0000001", [], "sim"),
+        ("f0000001", ["--bench", "no-bench"], "sim"),
+    ],
+)
+def test_bench_names_the_lidar_that_measured_it(
+    monkeypatch: pytest.MonkeyPatch, serial: str, words: list[str], camera: str
+) -> None:
+    make_bench(Path("bench"), serial=serial)
+    calls: list[str] = []
+
+    def command(
+        camera: Camera = "sim",
+        bench_folder: Annotated[Path | None, typer.Option("--bench")] = None,
+    ) -> None:
+        del bench_folder
+        calls.append(camera)
+
+    def build_app(_: str | None) -> typer.Typer:
+        app = typer.Typer()
+        app.callback()(lambda: None)
+        app.command("live")(shared_options("live", command))
+        return app
+
+    monkeypatch.setattr(module, "build_app", build_app)
+
+    assert main(["live", *words]) == 0
+    assert calls == [camera]
 
 
 @pytest.mark.parametrize(

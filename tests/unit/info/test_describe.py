@@ -14,12 +14,14 @@ from threading import Event
 import numpy as np
 import pytest
 from fake_workers import samples_of
+from made_turns import made_plan, made_turns
 from nlos_calibration.rig import load_rig
 from nlos_models import shipped_folder
 
 from nlos_cam.calibrate import WallFiles, write_record
 from nlos_cam.dataset.plan import DatasetPlan
 from nlos_cam.dataset.shards import shard_path, store
+from nlos_cam.detect import Session
 from nlos_cam.errors import RecordingError
 from nlos_cam.info import Description, describe
 from nlos_cam.recording import BagReader, ExportOptions, export_recording
@@ -90,6 +92,11 @@ def files(
         made[kind] = folder / kind
     made["figures of an evaluation"] = made["evaluation"] / "figures.json"
     made["table of a trade-off"] = made["trade-off"] / "tradeoff.json"
+    session = Session.start(folder / "detection", made_plan())
+    made_turns(session.plan)[0].save(session.path(0))
+    made["detection"] = session.folder
+    made["plan of a detection"] = session.folder / "detection.json"
+    made["turn of a detection"] = session.path(0)
     return made
 
 
@@ -112,6 +119,7 @@ KINDS = [
         "training run",
     ),
     *("figures of an evaluation", "table of a trade-off"),
+    *("detection", "plan of a detection", "turn of a detection"),
 ]
 
 
@@ -200,6 +208,12 @@ def test_damaged_file_has_one_line_that_says_so(
 
     if damage in {"cut", "noise"} and kind not in {"training run", "scene of the simulated camera"}:
         assert str(place) in found.problem or source.name in found.problem
+
+
+def test_field_that_no_log_has_is_one_line(tmp_path: Path) -> None:
+    (tmp_path / "log.csv").write_text(f"epoch,loss\n1,{'5' * 200_000}\n")
+
+    assert "is damaged" in describe(tmp_path).problem
 
 
 def test_changed_weights_and_lone_wall_records_are_damaged(
