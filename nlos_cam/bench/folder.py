@@ -19,7 +19,7 @@ from nlos_cam.bench.record import (
 )
 from nlos_cam.camera import SIMULATED_SERIAL, Camera
 from nlos_cam.files import CHECKSUMS
-from nlos_cam.reconstruct import CalibratedRig, check_intrinsics
+from nlos_cam.reconstruct import CalibratedRig, check_intrinsics, occluder_assumed
 
 
 @dataclass(frozen=True)
@@ -116,12 +116,7 @@ class Bench:
     def _notes(self) -> tuple[str, ...]:
         if self.measured.record.occluder:
             return ()
-        return (
-            (
-                "the occluder has not been measured, the paper's is assumed: put it up and run"
-                f" `nlos-cam calibrate --occluder {self.folder}`"
-            ),
-        )
+        return (occluder_assumed(self.folder),)
 
 
 def camera_to_name(wall: walls.WallRecord) -> str:

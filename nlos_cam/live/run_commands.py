@@ -21,7 +21,14 @@ from nlos_cam.camera import FRAMES_PER_S, Camera
 from nlos_cam.errors import NlosCamError
 from nlos_cam.frames import Frame
 from nlos_cam.live.live_recording import LiveRecording
-from nlos_cam.reconstruct import CalibratedRig, Clock, Pipeline, ignore, weights_serve
+from nlos_cam.reconstruct import (
+    CalibratedRig,
+    Clock,
+    Pipeline,
+    ignore,
+    occluder_assumed,
+    weights_serve,
+)
 from nlos_cam.view import Moment, WrittenFiles
 
 REFERENCE_FRAMES = 60
@@ -31,10 +38,6 @@ REFERENCE_TIMEOUT_S = 10.0
 POLL_S = 0.2
 """Interval at which a wait for a frame looks whether the run has ended."""
 MAX_AVERAGE = 1000
-OCCLUDER_ASSUMED = (
-    "the occluder has not been measured, the paper's is assumed: put it up and run `nlos-cam"
-    " calibrate --occluder {path}`"
-)
 
 OnFrame = Callable[[Frame], None]
 Commands = dict[str, Callable[..., str]]
@@ -296,7 +299,7 @@ class BenchCommands:
         record = calibrate.write_record(files, record, reference)
         # What was noted before is of a wall or an occluder that had not been measured.
         assumed = bool(bench.notes) and record.occluder is None
-        notes = (OCCLUDER_ASSUMED.format(path=path),) if assumed else ()
+        notes = (occluder_assumed(path),) if assumed else ()
         pipeline.bench = CalibratedRig(record.rig, MeasuredWall(record, reference), notes)
         self.on_bench(pipeline.bench)
         taken = capture.statistics.depth.frames

@@ -49,6 +49,7 @@ __all__ = [
     "load_uncertainty",
     "log_warning",
     "measured_counts",
+    "occluder_assumed",
     "open_bench",
     "reconstruct",
     "rig_to_align_with",
@@ -66,7 +67,7 @@ from .alignment import (
     can_align,
     rig_to_align_with,
 )
-from .bench import CalibratedRig, check_intrinsics, open_bench
+from .bench import CalibratedRig, check_intrinsics, occluder_assumed, open_bench
 from .edge import EdgeRepair, edge_cells
 from .flat_field import measured_counts
 from .frame_reader import Arrival, FrameReader, ignore

@@ -1,5 +1,6 @@
 """Rig of a bench with its measured bare wall: difference maps, drift, range offset."""
 
+import shlex
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -149,6 +150,14 @@ def open_bench(wall: Path | None, camera: Camera) -> CalibratedRig:
     ]:
         check_intrinsics(intrinsics, camera.intrinsics)
     return CalibratedRig(measured.record.rig, measured, _notes(measured.record, camera))
+
+
+def occluder_assumed(place: Path) -> str:
+    """Return the note on a bench whose occluder has not been measured, by its record or folder."""
+    return (
+        "the occluder has not been measured, the paper's is assumed: put it up and run `nlos-cam"
+        f" calibrate --occluder {shlex.quote(str(place))}`"
+    )
 
 
 def check_intrinsics(measured: walls.Intrinsics, given: walls.Intrinsics) -> None:
