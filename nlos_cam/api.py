@@ -130,6 +130,10 @@ def open_stream(
     """
     if wall and bench:
         raise NlosCamError(f"wall {wall} and bench {bench} each name a measured wall: give one")
+    if not 1 <= average <= reconstruct.MAX_AVERAGE:
+        raise NlosCamError(
+            f"average is {average}: give a number of frames from 1 to {reconstruct.MAX_AVERAGE}"
+        )
     loaded = load_bench(bench) if bench else None
     camera = open_camera(uri, on_progress=on_progress)
     if loaded:

@@ -49,11 +49,12 @@ class Options:
         failed.
         """
         option = self._option(name)
-        if not self._sensor.supports(option):
-            return NOT_OFFERED
-        limits = self.limits(name)
-        value = limits.nearest(wanted) if limits else wanted
+        value = wanted
         try:
+            if not self._sensor.supports(option):
+                return NOT_OFFERED
+            limits = self.limits(name)
+            value = limits.nearest(wanted) if limits else wanted
             self._sensor.set_option(option, value)
         except RuntimeError as error:
             return f"{value:g} was refused ({error})"

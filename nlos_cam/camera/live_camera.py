@@ -276,6 +276,8 @@ class LiveCamera:
                 raise CameraError(
                     f"{self.recording.path} is being recorded (--record) until the run ends"
                 )
+            if self._recording:  # it ended by itself, as on a full disk
+                self._recording.close()
             # Before it begins: the SDK's thread must pass it a set, as a boundary.
             self._recording = recording
             try:

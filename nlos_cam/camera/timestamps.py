@@ -45,7 +45,7 @@ SAME_CLOCK_S = 1.0
 
 
 class Continuity:
-    """Renumbering over restarts of a device, so that numbers and timestamps rise together at 30
+    """Renumbering over restarts of a device or its count, so that numbers and timestamps rise together at 30
     frames/s.
 
     Stateful: feed frames in order, from one thread. An outage lasts as long as the device's clock
@@ -71,8 +71,9 @@ class Continuity:
 
     def add(self, frame: Frame, arrived_s: float) -> Frame:
         """Return the frame renumbered; `arrived_s` is on the host's clock."""
-        if self._restarted and self._last:
-            self._splice(self._last, frame, arrived_s)
+        last = self._last
+        if last and (self._restarted or frame.frame_number + self._add_number < last.frame_number):
+            self._splice(last, frame, arrived_s)  # also where the device restarts its count alone
         self._restarted = False
         self._counted = 0
         if self._add_number or self._add_s:

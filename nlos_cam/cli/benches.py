@@ -11,6 +11,7 @@ import typer
 from nlos_cam import bench as benches
 from nlos_cam import calibrate, reconstruct
 from nlos_cam import camera as cameras
+from nlos_cam import recording as recordings
 from nlos_cam.cli import common
 from nlos_cam.errors import OutputExistsError
 
@@ -59,6 +60,14 @@ class Choice(NamedTuple):
         if self.bench:
             return self.bench.for_camera(camera)
         return reconstruct.open_bench(self.record, camera)
+
+    @property
+    def recorded_wall(self) -> tuple[walls.Rig, recordings.WallFile] | None:
+        """Rig and measured wall as sidecars of recordings name them; None without a record."""
+        if self.record is None:
+            return None
+        rig, file = recordings.load_measured_wall(self.record)
+        return (self.bench.rig if self.bench else rig), file
 
     def load_networks(
         self, bench: reconstruct.CalibratedRig

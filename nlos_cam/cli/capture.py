@@ -175,7 +175,7 @@ def capture(
     """
     targets = _targets(_base(seconds, frames, takes, out), takes, label or [], overwrite=overwrite)
     chosen = benches.choose(bench_folder, wall, reconstructs=False)
-    measured = recordings.load_measured_wall(chosen.record) if chosen.record else None
+    measured = chosen.recorded_wall
     recording = cameras.Recording(
         targets[0].path, frames=frames, seconds=seconds, last=takes == 1, overwrite=overwrite
     )
@@ -190,9 +190,8 @@ def capture(
         text = f"Interrupted before the first frame; {NOTHING}"
         common.finish(result, as_json=json, text=text)
         common.exit_interrupted(NOTHING)
-    if chosen.bench and measured:
+    if chosen.bench:
         chosen.bench.for_camera(source)  # a recording of another camera is refused now, not later
-        measured = chosen.bench.rig, measured[1]
     limit = frames or (round(seconds * cameras.FRAMES_PER_S) if seconds else None)
     _check_disk(source, targets, limit)
     with common.stop_on_signals() as stop:

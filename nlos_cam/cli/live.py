@@ -15,6 +15,7 @@ from rich.markup import escape
 from nlos_cam import camera as cameras
 from nlos_cam import live as loop
 from nlos_cam import reconstruct
+from nlos_cam import recording as recordings
 from nlos_cam import replay as replays
 from nlos_cam import view as views
 from nlos_cam.cli import benches, common
@@ -110,11 +111,13 @@ def live(
     recording = None
     if record:
         path = check_output(record, "--record", ".bag")
+        sidecar = recordings.sidecar_path(path)
+        common.output_path(sidecar, "", sidecar.suffix, overwrite=overwrite)
         recording = cameras.Recording(path, optional=True, overwrite=overwrite)
     frame_log = loop.FrameLog(check_output(log, "--log", *loop.LOG_SUFFIXES)) if log else None
     view_file = check_output(save_view, "--save-view", views.SESSION_SUFFIX) if save_view else None
     clock = cameras.WallClock().now  # the system's may jump
-    control = loop.RunControl(camera, clock=clock)
+    control = loop.RunControl(camera, clock=clock, wall=chosen.recorded_wall)
     viewer = viewing.viewer_of(control, no_view=no_view, host=view_host, port=view_port)
     announce = cache(
         partial(viewing.announce_view, viewer, host=view_host, port=view_port, open_it=open_view)
@@ -140,6 +143,8 @@ def live(
             loop.low_latency_interpreter(),
             opened as source,
         ):
+            if recording and recording.started:  # that of the recording which this one replaces
+                recordings.sidecar_path(recording.path).unlink(missing_ok=True)
             report = loop.run_live(
                 source,
                 pipeline,
@@ -158,6 +163,8 @@ def live(
         common.say(f"Logged each frame to {log}")
     if recording:
         common.say(f"Recorded {recording.sets} frames to {recording.path}")
+        if recording.error:
+            common.say(f"note: {recording.error}")
     if view_file:
         common.say(f"Saved the view: open {view_file} in a browser")
     text = summary(report, verbose=common.Detail.verbose)

@@ -107,8 +107,11 @@ def repair(
     if out is not None and out.suffix != ".bag":
         raise typer.BadParameter(f"--out {out}: the name of a recording must end in .bag")
     path = common.output_path(out, "repaired", ".bag", overwrite=overwrite)
+    sidecar = bags.sidecar_path(path)
+    common.output_path(sidecar, "", sidecar.suffix, overwrite=overwrite)
     with common.interrupted_by_signals(), common.tracked("repairing") as report:
         repaired = bags.repair_recording(bag, path, report, take_from=take_from)
+    sidecar.unlink(missing_ok=True)  # of the recording that this one replaces
     result = {
         "recovered_frames": repaired.recovered_frames,
         "chunks": repaired.chunks,

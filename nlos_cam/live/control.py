@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from nlos_calibration import Rig
 from nlos_calibration.errors import CalibrationError
 
 from nlos_cam.camera import FRAMES_PER_S, Camera, free_bytes, recording_s
@@ -27,6 +28,7 @@ from nlos_cam.live.run_commands import (
 )
 from nlos_cam.live.statistics import WARM_UP_FRAMES, camera_ms
 from nlos_cam.reconstruct import Clock, Pipeline, ignore
+from nlos_cam.recording import WallFile
 from nlos_cam.view import Moment
 
 RECENT_FRAMES = 300
@@ -51,16 +53,23 @@ class RunControl:
     a time.
 
     A command returns its outcome in words, and raises NlosCamError with the reason if it fails.
-    Files get dated names in `folder`, and replace nothing. The loop calls `attach`, `watch`, `add`
+    Files get dated names in `folder`, and replace nothing; recordings name the measured `wall`. The loop calls `attach`, `watch`, `add`
     and `end`.
     """
 
-    def __init__(self, uri: str = "", *, folder: Path = Path(), clock: Clock = time.time) -> None:
+    def __init__(
+        self,
+        uri: str = "",
+        *,
+        folder: Path = Path(),
+        clock: Clock = time.time,
+        wall: tuple[Rig, WallFile] | None = None,
+    ) -> None:
         self.thread_start: Callable[[], None] = ignore
         """Called in a command's thread before it works."""
         self.warnings: tuple[str, ...] = ()
         """Warnings about the run's pace."""
-        self._run = RunContext(uri, folder, clock)
+        self._run = RunContext(uri, folder, clock, wall=wall)
         self.pipeline = PipelineCommands(self._run)
         self.saving = SavingCommands(self._run)
         self.recording = RecordingCommands(self._run)
@@ -141,18 +150,22 @@ class RunControl:
     def end(self) -> None:
         """End recording and session while the camera still runs; errors are logged, since the run
         ends anyway.
+
+        A command that runs is waited for. None begins any more: nobody would end what it began.
         """
-        running: list[Callable[[], str]] = []
-        if self.recording.recording:
-            running.append(self.recording.stop_recording)
-        if self.saving.is_saving:
-            running.append(self.saving.end_session)
-        for stop in running:
-            try:
-                stop()
-            except CONTROL_ERRORS as error:
-                log.warning("%s", error)
         self._run.ended = True
+        with self._command_lock:
+            running: list[Callable[[], str]] = []
+            if self.recording.recording:
+                self._message = "closing the recording and reading it back"
+                running.append(self.recording.stop_recording)
+            if self.saving.is_saving:
+                running.append(self.saving.end_session)
+            for stop in running:
+                try:
+                    stop()
+                except CONTROL_ERRORS as error:
+                    log.warning("%s", error)
         self.set_state("ended")
 
     def strain_of(self, stop: threading.Event) -> Callable[[], str]:
@@ -247,14 +260,16 @@ class RunControl:
         }
 
     def _recording_status(self) -> dict[str, Any] | None:
-        """Return path and duration of the recording that runs, by a command or by --record."""
+        """Return name and duration of the recording that runs, by a command or by --record; not its
+        folder, since others may see the page.
+        """
         if by_command := self.recording.recording:
-            return {"path": str(by_command.path), "seconds": round(by_command.seconds, 1)}
+            return {"path": by_command.path.name, "seconds": round(by_command.seconds, 1)}
         camera = self._run.camera
         by_option = camera.recording if isinstance(camera, RecordableCamera) else None
         if by_option:
             seconds = by_option.sets / FRAMES_PER_S
-            return {"path": str(by_option.path), "seconds": round(seconds, 1)}
+            return {"path": by_option.path.name, "seconds": round(seconds, 1)}
         return None
 
     def _control_status(self) -> dict[str, Any]:
@@ -262,7 +277,7 @@ class RunControl:
         pipeline = self._run.pipeline
         has_no_options = pipeline and not self.bench.options
         return {
-            "commands": list(self._commands) if pipeline else [],
+            "commands": list(self._commands) if pipeline and not self._run.ended else [],
             "options": self.bench.options,
             "average": pipeline.average if pipeline else 1,
             "paused": self.pipeline.paused,

@@ -4,6 +4,8 @@ from collections import Counter
 from pathlib import Path
 from typing import Protocol, runtime_checkable
 
+from nlos_calibration import Rig
+
 from nlos_cam import recording as recordings
 from nlos_cam.camera import FRAMES_PER_S, Camera, Recording
 from nlos_cam.errors import NlosCamError
@@ -35,7 +37,13 @@ class LiveRecording:
     Raises NlosCamError for a camera that cannot be recorded, and the errors of `Recording`.
     """
 
-    def __init__(self, camera: Camera, path: Path, label: str | None) -> None:
+    def __init__(
+        self,
+        camera: Camera,
+        path: Path,
+        label: str | None,
+        wall: tuple[Rig, recordings.WallFile] | None = None,
+    ) -> None:
         if not isinstance(camera, RecordableCamera):
             raise NlosCamError(
                 f"{camera.uri} cannot be recorded: only a live camera (l515, sim) can"
@@ -43,8 +51,11 @@ class LiveRecording:
         self.path = path
         self._recordable = camera
         self._counts = camera.counts
+        self._counts_before = Counter(camera.counts)
         self._target = recordings.CaptureTarget(path, label)
-        self._sidecar = recordings.SidecarFile(recordings.sidecar_path(path), camera, label=label)
+        self._sidecar = recordings.SidecarFile(
+            recordings.sidecar_path(path), camera, label=label, wall=wall
+        )
         self._meter = recordings.QualityMeter()
         self._recording = Recording(path, optional=True, last=False)
         try:
@@ -67,9 +78,16 @@ class LiveRecording:
     @property
     def problem(self) -> str:
         """Reason why no more is recorded, for the page; empty while frames are."""
-        if not self._recording.disk_full:
-            return ""
-        return f"{self.path.name} cannot grow (disk full?): the recording has ended, stop it"
+        if self._recording.disk_full:
+            return f"{self.path.name} cannot grow (disk full?): the recording has ended, stop it"
+        if self._fell_silent:
+            return f"{self.path.name} ended as the camera fell silent: stop it, and record again"
+        return ""
+
+    @property
+    def _fell_silent(self) -> bool:
+        """True if the camera closed the file, since no frame came."""
+        return self._recording.done and not self._recording.disk_full
 
     def stop(self) -> str:
         """Close the file, read it back, write the sidecar's end, and return the outcome in words.
@@ -77,9 +95,10 @@ class LiveRecording:
         Raises RecordingError for a damaged file, DiskFullError where there was no room.
         """
         sets = self._recording.sets
+        fell_silent = self._fell_silent
         self._recordable.stop_recording()
         error = self._recording.error
-        state: recordings.TakeState = "complete"
+        state: recordings.TakeState = "lost" if fell_silent else "complete"
         if self._recording.disk_full or error:
             state = "size limit" if self._recording.at_size_limit else "disk full"
         result = recordings.CaptureResult(
@@ -91,15 +110,15 @@ class LiveRecording:
             error=error,
             closed=error is None,
             follows_another=True,
-            events=Counter(self._counts),
+            events=Counter(self._counts) - self._counts_before,
         )
         final = recordings.finalize(result, recordings.verify)
         if final.error:
             raise final.error
         if not final.sets:
             return "nothing was recorded: no frame came"
-        full = "; the disk is full" if state == "disk full" else ""
+        ends = {"disk full": "; the disk is full", "lost": "; it ended as the camera fell silent"}
         return (
             f"recorded {final.sets} frames ({final.sets / FRAMES_PER_S:.1f} s) to {self.path};"
-            f" verified{full}"
+            f" verified{ends.get(state, '')}"
         )

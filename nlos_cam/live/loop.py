@@ -179,10 +179,10 @@ def run_live(
                 notes.newest = ""
                 moment = display.show(result)
                 statistics.add(result, clock() - result.published_s)
-                statistics.pace.update(statistics.frames, len(reader.dropped))
+                statistics.pace.update(statistics.frames, reader.dropped)
                 control.warnings = statistics.pace.warnings
                 control.add(moment)
-                control.note_drops(len(reader.dropped))
+                control.note_drops(reader.dropped)
                 on_moment(moment)
     except Exception:
         on_error(report())

@@ -22,6 +22,7 @@ from nlos_cam.errors import NlosCamError
 from nlos_cam.frames import Frame
 from nlos_cam.live.live_recording import LiveRecording
 from nlos_cam.reconstruct import (
+    MAX_AVERAGE,
     CalibratedRig,
     Clock,
     Pipeline,
@@ -29,6 +30,7 @@ from nlos_cam.reconstruct import (
     occluder_assumed,
     weights_serve,
 )
+from nlos_cam.recording import WallFile, load_measured_wall
 from nlos_cam.view import Moment, WrittenFiles
 
 REFERENCE_FRAMES = 60
@@ -37,7 +39,6 @@ MAX_REFERENCE_FRAMES = 1800
 REFERENCE_TIMEOUT_S = 10.0
 POLL_S = 0.2
 """Interval at which a wait for a frame looks whether the run has ended."""
-MAX_AVERAGE = 1000
 
 OnFrame = Callable[[Frame], None]
 Commands = dict[str, Callable[..., str]]
@@ -71,13 +72,17 @@ class RunContext:
     pipeline: Pipeline | None = None
     newest: Moment | None = None
     ended: bool = False
-    """True once no more frames come."""
+    """True once the run ends: no more frames come, and no command begins anything."""
+    wall: tuple[Rig, WallFile] | None = None
+    """Rig and record of the measured wall, for sidecars of recordings."""
     files: WrittenFiles = field(default_factory=WrittenFiles)
     on_frame: list[OnFrame] = field(default_factory=list[OnFrame])
     """Called with each frame of the camera, in the reader's thread."""
 
     def attached(self) -> tuple[Camera, Pipeline]:
-        """Return camera and pipeline. Raises NlosCamError before they run."""
+        """Return camera and pipeline. Raises NlosCamError before they run, and once the run ends."""
+        if self.ended:
+            raise NlosCamError("the run ends: start it again")
         if self.camera is None or self.pipeline is None:
             raise NlosCamError("the camera is not running yet: wait for the first frame")
         return self.camera, self.pipeline
@@ -207,7 +212,7 @@ class RecordingCommands:
         label = str(label)
         name = re.sub(r"[^\w.-]+", "-", label).strip("-.")[:60]
         path = self._run.new_file(name or "live", ".bag")
-        self.recording = LiveRecording(camera, path, label or None)
+        self.recording = LiveRecording(camera, path, label or None, self._run.wall)
         self._run.on_frame.append(self.recording.add)
         return f"recording {path}"
 
@@ -301,6 +306,7 @@ class BenchCommands:
         assumed = bool(bench.notes) and record.occluder is None
         notes = (occluder_assumed(path),) if assumed else ()
         pipeline.bench = CalibratedRig(record.rig, MeasuredWall(record, reference), notes)
+        self._run.wall = load_measured_wall(path)
         self.on_bench(pipeline.bench)
         taken = capture.statistics.depth.frames
         place = f"{1e3 * record.distance_m:.1f} mm away, faced at {record.facing_deg:.1f} degrees"

@@ -234,7 +234,7 @@ class RunStatistics:
         return {
             "incomplete": camera.incomplete,
             "dropped_camera": camera.dropped,
-            "dropped_loop": len(reader.dropped),
+            "dropped_loop": reader.dropped,
             "failed": self.failed,
         }
 

@@ -1,4 +1,5 @@
 __all__ = [
+    "MAX_AVERAGE",
     "UNEXPLAINED",
     "WALL_GRID",
     "Arrival",
@@ -53,6 +54,7 @@ __all__ = [
     "open_bench",
     "reconstruct",
     "rig_to_align_with",
+    "training_rig",
     "verdict_limits",
     "warm_up",
     "weights_for",
@@ -66,6 +68,7 @@ from .alignment import (
     alignment,
     can_align,
     rig_to_align_with,
+    training_rig,
 )
 from .bench import CalibratedRig, check_intrinsics, occluder_assumed, open_bench
 from .edge import EdgeRepair, edge_cells
@@ -83,6 +86,7 @@ from .physics_check import (
     log_warning,
 )
 from .pipeline import (
+    MAX_AVERAGE,
     FrameResult,
     Pipeline,
     PreparedFrame,

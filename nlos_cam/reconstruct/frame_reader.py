@@ -41,7 +41,7 @@ def ignore(*_: object) -> None:
 class FrameReader:
     """Thread that reads frames into a bounded queue while entered; iterate from one other thread.
 
-    A full queue drops its oldest frame and records its number, or, if `lossless`, blocks the
+    A full queue drops its oldest frame and counts it, or, if `lossless`, blocks the
     camera. Iteration ends with the frames, once `stop` is set, or once `should_stop` returns True,
     and raises the exception of the frames' source. While no frame comes, it calls `on_idle` every
     POLL_S. Leaving calls `abandon_source` if the thread has not ended after ABANDON_AFTER_S, and
@@ -59,8 +59,8 @@ class FrameReader:
         abandon_source: Callable[[], None] = ignore,
         on_idle: Callable[[], None] = ignore,
     ) -> None:
-        self.dropped: list[int] = []
-        """Frame numbers."""
+        self.dropped = 0
+        """Number of frames."""
         self.issues = Counter[str]()
         """Number of frames by issue, dropped ones included."""
         self.newest_s: float | None = None
@@ -123,9 +123,8 @@ class FrameReader:
         self.newest_s = arrival.arrived_s
         delay_s = arrival.arrived_s - arrival.frame.timestamp_s
         self._shortest_delay_s = min(self._shortest_delay_s, delay_s)
-        dropped = self._queue.put(arrival)
-        if dropped is not None:
-            self.dropped.append(dropped.frame.frame_number)
+        if self._queue.put(arrival) is not None:
+            self.dropped += 1
 
     @property
     def offset_s(self) -> float:

@@ -61,6 +61,8 @@ CHECK_HOLDS_FRAMES = 150
 TRUSTED_MISSING = 0.02
 """Share of cells without a depth from which on no frame is trusted: what the quality model was
 fitted to had none."""
+MAX_AVERAGE = 1000
+"""Largest number of frames that maps are the mean of: half a minute."""
 FROZEN = "the camera repeats the same frame: unplug it and plug it in again"
 EDGE_IS_OFF = (
     "the occluder's edge is not where the record has it, and its cells are repaired: if this stays,"

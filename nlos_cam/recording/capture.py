@@ -2,10 +2,10 @@
 
 from collections import Counter
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from threading import Event
+from threading import Event, Thread
 
 from nlos_calibration import Rig
 
@@ -23,6 +23,12 @@ from nlos_cam.recording.sidecar import (
     sidecar_path,
     summary_of,
 )
+
+POLL_S = 0.1
+LAST_FRAME_S = 1.0
+"""Interval at which a capture looks whether it is to stop, and the time in which a frame may still
+come that ends it.
+"""
 
 
 @dataclass(frozen=True)
@@ -139,14 +145,18 @@ class CaptureSession:
         meter = QualityMeter()
         state: TakeState = "complete"
         error: NlosCamError | None = None
+        counts_before = Counter(self._camera.counts)
         try:
-            for frame in self._recorded(frames):
-                meter.add(frame)
-                sidecar.on_frame(frame)
-                on_sets(self._recording.sets)
-                if stop.is_set():
-                    state = "interrupted"
-                    break
+            with _leaving_on(stop, self._camera) as left:
+                for frame in self._recorded(frames):
+                    meter.add(frame)
+                    sidecar.on_frame(frame)
+                    on_sets(self._recording.sets)
+                    if stop.is_set():
+                        state = "interrupted"
+                        break
+            if left.is_set():
+                state = "interrupted"
         except CameraError as lost:
             state = "lost"
             error = lost
@@ -156,7 +166,7 @@ class CaptureSession:
                 f"less than {RESERVE_BYTES / 1e6:.0f} MB were left for {target.path}: free some, or"
                 " choose an --out on another disk"
             )
-        events = Counter(self._camera.counts)
+        events = Counter(self._camera.counts) - counts_before
         return CaptureResult(
             target, state, self._recording.sets, meter.quality(), sidecar, error, events=events
         )
@@ -168,6 +178,34 @@ class CaptureSession:
                 yield frame
             elif self._recording.done:
                 return
+
+
+@contextmanager
+def _leaving_on(stop: Event, camera: Camera) -> Generator[Event]:
+    """Leave a camera that gives no frame after `stop`, which ends its iteration; yield an event that
+    tells so.
+
+    A silent camera restarts its device and waits for it for minutes, in which no frame asks for
+    `stop`.
+    """
+    ended = Event()
+    left = Event()
+
+    def watch() -> None:
+        while not ended.wait(POLL_S):
+            if stop.is_set():
+                if not ended.wait(LAST_FRAME_S):
+                    left.set()
+                    camera.__exit__(None, None, None)
+                return
+
+    thread = Thread(target=watch, name="stop of a capture", daemon=True)
+    thread.start()
+    try:
+        yield left
+    finally:
+        ended.set()
+        thread.join()
 
 
 def finalize(

@@ -83,6 +83,12 @@ def test_import_is_cheap_and_recording_needs_no_sdk(noise_bag: Path) -> None:
     assert frames == 20
 
 
+@pytest.mark.parametrize("average", [0, -1, 1001])
+def test_average_out_of_range_is_refused(average: int) -> None:
+    with pytest.raises(NlosCamError, match=f"average is {average}"):
+        api.open_stream("bag:sample", average=average)
+
+
 def test_stream_of_recording_resumes_after_a_break(opened: Open) -> None:
     with opened(WallCamera(9)) as stream:
         seen = [next(stream), next(stream)]

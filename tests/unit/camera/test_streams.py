@@ -377,14 +377,16 @@ def test_continuity_keeps_first_run_and_counts_missed_once() -> None:
     assert continuity.missed == 29 - 25
 
 
+@pytest.mark.parametrize("told", [True, False], ids=["streams restarted", "the count alone"])
 @pytest.mark.parametrize(
     "zero_s", [1009.0, 0.0, 500_000.0], ids=["host's clock", "restarted", "jumped"]
 )
-def test_numbers_and_seconds_rise_together_over_an_outage(zero_s: float) -> None:
+def test_numbers_and_seconds_rise_together_over_an_outage(zero_s: float, told: bool) -> None:
     """The second run starts nine seconds after the first, whatever the device's clock says."""
     continuity = Continuity()
     before = passed_on(continuity, range(30), zero_s=1000.0, arrived_s=50.0)
-    continuity.restart(counted=0)
+    if told:
+        continuity.restart(counted=0)
     after = passed_on(continuity, range(30), zero_s, arrived_s=59.0)
     for one, next_one in pairwise(before + after):
         later = next_one.frame_number - one.frame_number

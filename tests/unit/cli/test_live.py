@@ -1,3 +1,4 @@
+import errno
 import os
 import re
 import signal
@@ -27,12 +28,12 @@ from view_streams import EVERYWHERE, ask
 from nlos_cam.bench import write_weights
 from nlos_cam.cli.live import summary
 from nlos_cam.cli.main import main
-from nlos_cam.cli.view import announce_view, opened_in_browser, viewer_of
+from nlos_cam.cli.view import announce_view, opened_in_browser, saving, viewer_of
 from nlos_cam.errors import NlosCamError
 from nlos_cam.frames import Frame, maps_from_frame
 from nlos_cam.live import RunControl
 from nlos_cam.live.statistics import RunReport
-from nlos_cam.reconstruct import OwnMaps, open_bench
+from nlos_cam.reconstruct import CalibratedRig, OwnMaps, open_bench
 from nlos_cam.reconstruct.consistency import COMPLETE, MapConsistency
 from nlos_cam.reconstruct.verdict import Verdict
 from nlos_cam.view import NullViewer, SessionFile
@@ -195,6 +196,13 @@ def test_live_record_overwrites_only_when_asked(opened: Opened, run: Run) -> Non
     assert run(*arguments, code=1)["error"]["type"] == "OutputExistsError"
 
     run(*arguments, "--overwrite")
+
+
+@pytest.mark.usefixtures("opened")
+def test_live_record_takes_no_sidecar_of_another_recording(run: Run) -> None:
+    Path("run.json").write_text("of another recording")
+
+    assert run(*SIMULATED, "--record", "run.bag", code=1)["error"]["type"] == "OutputExistsError"
 
 
 @pytest.mark.usefixtures("opened")
@@ -404,6 +412,18 @@ def serve(
     """Serve a view with these options, print where, and end it."""
     with viewer_of(RunControl(), no_view=no_view, host=host, port=port) as viewer:
         announce_view(viewer, host=host, port=port, open_it=open_it)
+
+
+def test_saved_view_that_fails_is_a_note_not_the_runs_end(
+    tmp_path: Path, printed: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    error = OSError(errno.ENOSPC, "No space left")
+    monkeypatch.setattr("nlos_cam.view.session_file.element", Mock(side_effect=error))
+    with saving(NullViewer(), CalibratedRig(RIG), tmp_path / "view.html") as viewers:
+        viewers.show(full_moment(0))
+    [line] = printed
+
+    assert "view.html ended early (No space left)" in line
 
 
 def test_view_on_all_addresses_notes_who_can_see_it(printed: list[str]) -> None:

@@ -37,6 +37,20 @@ def test_repair_reports_new_file_and_overwrites_if_asked(
     assert found["chunks"] > 2
 
 
+def test_repair_leaves_no_sidecar_of_what_it_replaces(
+    run: Run, noise_bags: dict[str, Path], tmp_path: Path
+) -> None:
+    sidecar = tmp_path / "good.json"
+    sidecar.write_text("{}", encoding="utf-8")
+    command = "repair", noise_bags["packed"], "--out", tmp_path / "good.bag"
+    assert run(*command, code=1)["error"]["type"] == "OutputExistsError"
+    assert sidecar.exists()
+
+    run(*command, "--overwrite")
+
+    assert not sidecar.exists()
+
+
 def test_repair_prints_what_was_recovered_and_lost(
     shown: Run, noise_bags: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -32,6 +32,7 @@ from nlos_cam.live.run_commands import measured_rig
 from nlos_cam.live.statistics import WARM_UP_FRAMES
 from nlos_cam.reconstruct import CalibratedRig, Pipeline
 from nlos_cam.reconstruct.bench import NOT_MEASURED
+from nlos_cam.recording import WallFile, load_sidecar
 from nlos_cam.view import NullViewer, WrittenFiles
 
 
@@ -412,9 +413,69 @@ def test_command_says_that_its_folder_went_away(
 
 def test_reference_ends_with_the_run(control: RunControl, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("nlos_cam.live.run_commands.POLL_S", 0.001)
+    entered = Event()
+    control.thread_start = entered.set
+    answers: list[str] = []
+
+    def measure() -> None:
+        try:
+            control.run("take_reference", {"frames": 5})
+        except NlosCamError as error:
+            answers.append(str(error))
+
+    thread = threading.Thread(target=measure)
+    thread.start()
+    assert entered.wait(60.0)
     control.end()
-    with pytest.raises(NlosCamError, match="ended"):
-        control.run("take_reference", {"frames": 5})
+    thread.join()
+
+    assert "ended" in answers[0] or "the run ends" in answers[0]
+
+
+def test_no_command_begins_while_the_run_ends(
+    control: RunControl, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def stop() -> str:  # reading a recording back takes a minute, in which the page still answers
+        with pytest.raises(NlosCamError, match="another command"):
+            control.run("save_session", {})
+        return "stopped"
+
+    control.recording.recording = SimpleNamespace(problem="")  # type: ignore[assignment]
+    monkeypatch.setattr(control.recording, "stop_recording", stop)
+    control.end()
+    control.recording.recording = None
+
+    for command in ("save_session", "record", "snapshot", "take_reference"):
+        with pytest.raises(NlosCamError, match="the run ends"):
+            control.run(command, {})
+    assert not control.saving.is_saving
+    assert control.status()["control"]["commands"] == []
+
+
+def test_recording_that_the_camera_ended_is_called_lost(
+    tmp_path: Path, noise_world: Any, hurried_clock: Any
+) -> None:
+    wall = RIG, WallFile(path="wall.toml", sha256="0" * 64)
+    control = RunControl(folder=tmp_path, wall=wall)
+    with SimulatedCamera("sim:noise", noise_world(), clock=hurried_clock()) as camera:
+        control.attach(camera, Pipeline(CalibratedRig(RIG), sheet_network))
+        frames = control.watch(camera)
+        next(frames)
+        camera.counts["duplicate"] = 4  # before the recording
+        control.run("record", {})
+        for _ in range(10):
+            next(frames)
+        camera._end_recording("the camera fell silent")
+        during = control.status()
+        answer = control.run("stop_recording", {})
+
+    assert "fell silent" in during["warnings"][0]
+    assert "fell silent" in answer
+    sidecar = load_sidecar(next(tmp_path.glob("*.json")))
+    assert sidecar.state == "lost"
+    assert sidecar.wall == wall[1]
+    assert sidecar.summary
+    assert "duplicate" not in sidecar.summary.events
 
 
 def test_page_says_that_a_recording_has_no_room(

@@ -34,7 +34,7 @@ def reported(
     **camera: Any,
 ) -> RunReport:
     counters = {"incomplete": 0, "dropped": 0, "counts": Counter[str](), **camera}
-    reader: Any = SimpleNamespace(dropped=list(range(dropped_loop)), offset_s=0.0, issues=issues)
+    reader: Any = SimpleNamespace(dropped=dropped_loop, offset_s=0.0, issues=issues)
     lidar: Any = SimpleNamespace(**counters)
     return statistics.report(lidar, reader)
 

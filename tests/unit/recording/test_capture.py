@@ -1,5 +1,5 @@
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from contextlib import closing
 from pathlib import Path
 from threading import Event
@@ -9,6 +9,7 @@ import pytest
 
 from nlos_cam.camera import FORMATS, Recording, SimulatedCamera
 from nlos_cam.errors import CameraLostError, DiskFullError, RecordingError
+from nlos_cam.frames import Frame
 from nlos_cam.recording.capture import CaptureResult, CaptureSession, CaptureTarget, finalize
 from nlos_cam.recording.playback import VerifyResult, verify
 from nlos_cam.recording.sidecar import load_sidecar, sidecar_path
@@ -84,6 +85,29 @@ def test_sidecar_agrees_with_its_take(run: Run) -> None:
     assert found.summary.frames == 5
     assert found.summary.streams["infrared"] == 5
     assert found.rig
+
+
+def test_capture_of_a_silent_camera_stops_when_told(session: Any, monkeypatch: Patch) -> None:
+    gone = Event()
+    leave = SimulatedCamera.__exit__
+
+    def silent(_: SimulatedCamera) -> Iterator[Frame]:
+        assert gone.wait(60.0), "nobody left the camera"
+        yield from ()
+
+    def left(camera: SimulatedCamera, *error: object) -> None:
+        gone.set()
+        leave(camera, *error)
+
+    monkeypatch.setattr(SimulatedCamera, "__iter__", silent)
+    monkeypatch.setattr(SimulatedCamera, "__exit__", left)
+    monkeypatch.setattr("nlos_cam.recording.capture.LAST_FRAME_S", 0.05)
+    stop = Event()
+    stop.set()
+
+    (take,) = (finalize(take, verify) for take in session()[0].record(stop, lambda _: None))
+
+    assert take.state == "interrupted"
 
 
 def test_quality_of_a_take_is_that_of_its_images(run: Run, noise_world: Any) -> None:
