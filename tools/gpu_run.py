@@ -316,6 +316,7 @@ def judge(chosen: Namespace, facts: Facts, name: str) -> None:
     out: Path = chosen.out
     figures = out / f"{name}-figures"
     command = ["evaluate", "--weights", str(out / name), "--out", str(figures), "--no-nearest"]
+    command += [] if chosen.any_rig else ["--rig", chosen.rig]
     go(out, f"{name}-evaluate", [*command, "--overwrite"])
     found = json.loads((figures / "figures.json").read_text(encoding="utf-8"))
     facts.add(name, {key: found[key] for key in KEPT_FIGURES})

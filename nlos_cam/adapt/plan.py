@@ -13,7 +13,7 @@ from nlos_calibration import MeasuredWall, Record
 from nlos_models.training import DirectRecipe, UncertaintyRecipe
 from pydantic import Field, ValidationError
 
-from nlos_cam.dataset import SHARD, RigSpread
+from nlos_cam.dataset import HELD_OUT_SEED, SHARD, RigSpread
 from nlos_cam.errors import RecordingError
 from nlos_cam.files import TEXT_LIMIT, atomic_file, read_bounded
 from nlos_cam.reconstruct import measured_counts
@@ -153,7 +153,8 @@ class Plan(Record):
         epochs = min(max(steps // STEPS_PER_EPOCH, MIN_EPOCHS), MAX_EPOCHS)
         stage = Stage(
             minutes=further,
-            objects=before + max(rendered, FIRST_OBJECTS),
+            # seeds of training end where those of held-out objects begin
+            objects=min(before + max(rendered, FIRST_OBJECTS), HELD_OUT_SEED - self.seed),
             epochs=epochs,
             steps=steps // epochs,
         )

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
+from nlos_calibration import TOLERANCE_DEG, TOLERANCE_M, Rig
 from nlos_models import training
 
 from nlos_cam import dataset as data
@@ -20,6 +21,9 @@ RECORDINGS = "recordings"
 """Folder of a bench with labelled recordings."""
 RECIPE = "direct-transfer"
 MIN_OBJECTS = 3
+MAX_SIMULATED_LOSS = 0.1
+"""Silhouette IoU on simulated test objects that a fit to recordings may cost: they are another
+bench than the real one, and the judged recordings may be few."""
 JUDGED_EVERY = 3
 """Every third object is held out to judge the result."""
 VALIDATION_EVERY = 4
@@ -92,19 +96,25 @@ def parts_of(labels: Sequence[str]) -> dict[Part, list[str]]:
 
 
 def find_recordings(
-    folder: Path, open_bench: data.OpenBench, on_message: Callable[[str], None]
+    folder: Path, rig: Rig, open_bench: data.OpenBench, on_message: Callable[[str], None]
 ) -> Recordings | None:
-    """Return the labelled recordings of a folder; None where there are none, or of too few objects,
-    with a message.
+    """Return the labelled recordings of a folder that were made on a rig; None where there are
+    none, or of too few objects, with a message.
     """
     by_label: dict[str, list[Path]] = {}
     for path in sorted(folder.glob("*.bag")) if folder.is_dir() else []:
         try:
-            label = load_sidecar(sidecar_path(path)).label
+            sidecar = load_sidecar(sidecar_path(path))
         except RecordingError as error:
             on_message(f"note: {path} is left out: {error}")
             continue
-        if label:
+        label = sidecar.label
+        if sidecar.rig and not _is_as_before(sidecar.rig, rig):
+            on_message(
+                f"note: {path} is left out: lidar or occluder have moved since, as this bench was"
+                " calibrated again; record its object once more"
+            )
+        elif label:
             by_label.setdefault(label, []).append(path)
         else:
             on_message(f"note: {path} is left out: it has no label")
@@ -116,6 +126,19 @@ def find_recordings(
     if len(by_label) < MIN_OBJECTS:
         return None
     return Recordings(folder, dict(sorted(by_label.items())), open_bench)
+
+
+def _is_as_before(recorded: Rig, rig: Rig) -> bool:
+    """Return whether two calibrations can be of one bench that has not moved."""
+    one, other = recorded.lidar, rig.lidar
+    lengths_m = [(one.distance_m, other.distance_m)]
+    if recorded.occluder and rig.occluder:
+        lengths_m.append((recorded.occluder.x_m, rig.occluder.x_m))
+        lengths_m.append((recorded.occluder.z_min_m, rig.occluder.z_min_m))
+    angles_deg = (one.yaw_deg, other.yaw_deg), (one.pitch_deg, other.pitch_deg)
+    return max(abs(a - b) for a, b in lengths_m) <= TOLERANCE_M and (
+        max(abs(a - b) for a, b in angles_deg) <= TOLERANCE_DEG
+    )
 
 
 def write_parts(found: Recordings, folder: Path, tracked: data.Tracked) -> dict[Part, Path]:
@@ -159,7 +182,7 @@ def fit_to_recordings(
     network, trained = training.transfer_start(recipe, start, partial=False, on_report=data.ignore)
     maps = data.read_maps(recipe, parts["adaptation"], parts["validation"], None, start=trained)
     recipe = recipe.model_copy(update={"held_out": len(maps.held_out.image)})
-    record = training.record_run(recipe, out, maps.rig, trained.runs, start)
+    record = training.record_run(recipe, out, maps.rig, trained.runs, start, bench=trained.rig)
     fabric = training.open_fabric(recipe, accelerator=accelerator)
     origin = training.digest_of(network, maps.digest)
     run = training.TrainingRun(recipe, out, record, origin, watch=watch)

@@ -165,7 +165,8 @@ def _forecast(rig: walls.Rig, folder: Path | None) -> benches.ForecastRecord:
 def _recordings(folder: Path) -> adaptation.Recordings | None:
     """Return the labelled recordings in a bench folder, if there are any."""
     loaded = benches.load_bench(folder, weights=False)
-    return adaptation.find_recordings(folder / adaptation.RECORDINGS, loaded.for_camera, common.say)
+    recordings = folder / adaptation.RECORDINGS
+    return adaptation.find_recordings(recordings, loaded.rig, loaded.for_camera, common.say)
 
 
 def _measure_on(job: adaptation.Adaptation) -> adaptation.Measure:
@@ -189,13 +190,11 @@ def _measure_on(job: adaptation.Adaptation) -> adaptation.Measure:
 
 
 def _is_worth_keeping(result: adaptation.AdaptResult, bench: Path | None) -> bool:
-    """Return whether weights are better than those that they would replace: than the start weights,
-    and on the test objects than the bench's own, unless they were fitted to recordings on it.
+    """Return whether weights are as good as those that they would replace: as the start weights,
+    and as the bench's own.
     """
     in_use = benches.iou_in_use(bench) if bench else None
-    fitted = result.transfer is not None and result.transfer.is_better
-    after = result.after["silhouette_iou"]["value"]
-    return result.is_better and (fitted or in_use is None or after >= in_use)
+    return result.is_better and (in_use is None or result.serves_as_well_as(in_use))
 
 
 def _install(result: adaptation.AdaptResult, bench: Path | None, target: Path) -> Path:

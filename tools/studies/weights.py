@@ -374,14 +374,16 @@ def rigs(asked: argparse.Namespace) -> None:
         *BENCHES,
     ]
     measured = harness.collect(
-        "rigs", places, lambda place, _: cell(place, rig, subjects, weights), key=key_of(asked)
+        "rigs",
+        places,
+        lambda place, _: cell(place, rig, subjects, weights),
+        key=key_of(asked) + rig.checksum,
     )
     cells = measured[: -len(BENCHES)]
     benches = measured[-len(BENCHES) :]
-    harness.write(
-        "rig_map", {"objects": len(subjects), "cells": cells, "benches": benches}, asked.out
-    )
-    harness.save("rig_map", draw_rigs(cells, rig), asked.out, dpi=80)
+    found = {"objects": len(subjects), "cells": cells, "benches": benches}
+    harness.write(named_after("rig_map", rig), found, asked.out)
+    harness.save(named_after("rig_map", rig), draw_rigs(cells, rig), asked.out, dpi=80)
     for one in measured:
         print({key: one[key] for key in asdict(Place())})
         for name, figures in one["weights"].items():

@@ -5,11 +5,13 @@ from collections.abc import Callable, Generator
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 from made_adaptations import finish_network, job_in
+from nlos_calibration import load_rig
 from nlos_models import load_reconstructor, load_record, silhouette_iou
 
 from nlos_cam.adapt import adapt, find_recordings
@@ -23,6 +25,7 @@ from nlos_cam.reconstruct import align_all
 RIG = '[rig]\nbase = "{base}"\n[rig.lidar]\ndistance_m = 0.205\n'
 OBJECT = '[motion]\nposes = 1\n[object]\ncategory = "{name}"\n'
 OBJECTS = "bowl", "cup", "rocket"
+HOME = load_rig("paper-rig")
 
 
 def no_bench(_camera: object) -> Any:
@@ -42,9 +45,29 @@ def test_recordings_without_a_label_are_left_out(tmp_path: Path) -> None:
     (tmp_path / "one.bag").touch()
     said: list[str] = []
 
-    assert find_recordings(tmp_path, no_bench, said.append) is None
+    assert find_recordings(tmp_path, HOME, no_bench, said.append) is None
     assert "one.bag" in said[0]
-    assert find_recordings(tmp_path / "none", no_bench, said.append) is None
+    assert find_recordings(tmp_path / "none", HOME, no_bench, said.append) is None
+
+
+@pytest.mark.parametrize(("moved_m", "found"), [(0.0, True), (0.0005, True), (0.003, False)])
+def test_recordings_of_a_bench_that_moved_are_left_out(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, moved_m: float, found: bool
+) -> None:
+    def sidecar_of(path: Path) -> Any:
+        return SimpleNamespace(label=path.stem, rig=HOME)
+
+    monkeypatch.setattr("nlos_cam.adapt.recordings.load_sidecar", sidecar_of)
+    lidar = HOME.lidar.model_copy(update={"distance_m": HOME.lidar.distance_m + moved_m})
+    now = HOME.model_copy(update={"lidar": lidar})
+    for number in range(MIN_OBJECTS):
+        (tmp_path / f"object-{number}.bag").touch()
+    said: list[str] = []
+
+    recordings = find_recordings(tmp_path, now, no_bench, said.append)
+
+    assert (recordings is not None) is found
+    assert any("calibrated again" in line for line in said) is not found
 
 
 @pytest.mark.parametrize(
@@ -102,7 +125,7 @@ def until_judged(description: str) -> Generator[Callable[[int, int], None]]:
 @pytest.mark.timeout(900)
 def test_recordings_in_a_bench_fit_the_network_to_them(run: Any, tmp_path: Path) -> None:
     bench = load_bench(record_bench(run))
-    found = find_recordings(bench.folder / "recordings", bench.for_camera, print)
+    found = find_recordings(bench.folder / "recordings", bench.rig, bench.for_camera, print)
     assert found is not None
     job = job_in(tmp_path / "work", bench.rig)
     finish_network(job.folder)

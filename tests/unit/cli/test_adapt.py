@@ -75,6 +75,21 @@ def test_a_bench_keeps_the_better_of_two_adaptations(
     assert _is_worth_keeping(result, None)
 
 
+@pytest.mark.parametrize(("after_iou", "kept"), [(0.45, False), (0.52, True)])
+def test_a_fit_to_recordings_may_cost_little_in_simulation(
+    monkeypatch: pytest.MonkeyPatch, after_iou: float, kept: bool
+) -> None:
+    monkeypatch.setattr(benches, "iou_in_use", lambda _: 0.6)
+    before, after = (dict.fromkeys(TARGETS, figure(iou)) for iou in (0.55, after_iou))
+    judged = [{"silhouette_iou": {"value": iou}} for iou in (0.3, 0.4, 0.5)]
+    fit = adaptation.Transfer(Path(), {}, 3, *judged)
+    result = adaptation.AdaptResult(
+        Path(), Mock(), [], before, after, was_there=False, transfer=fit
+    )
+
+    assert _is_worth_keeping(result, Path("bench")) is kept
+
+
 def figure(value: float) -> dict[str, float]:
     """Return a figure as a report has it."""
     return {"value": value, "low": value, "high": value}
