@@ -6,7 +6,6 @@ bare wall's, at a coarse and at a fine scale, and the image; the two branches me
 """
 
 import json
-import shutil
 from pathlib import Path
 from typing import NamedTuple
 
@@ -14,6 +13,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from nlos_cam.files import write_checked
 from nlos_models import records
 from nlos_models.checkpoint import load_part, save_parts
 from nlos_models.compressor import conv_norm
@@ -169,10 +169,11 @@ def save_uncertainty_network(
             f"{watched} changed during the training of its uncertainty network: train again"
         )
     text = json.dumps(record.model_dump(mode="json"), indent=2)
-    save_parts(folder, {records.UNCERTAINTY: network}, {records.UNCERTAINTY_RECORD: text})
+    # The copies first: with the record of the uncertainty network the folder is whole.
     if folder.resolve() != watched.resolve():
-        for name in (*records.watched_files(watched), records.RECORD):
-            shutil.copyfile(watched / name, folder / name)
+        names = (*records.watched_files(watched), records.RECORD)
+        write_checked(folder, {name: (watched / name).read_bytes() for name in names})
+    save_parts(folder, {records.UNCERTAINTY: network}, {records.UNCERTAINTY_RECORD: text})
 
 
 def load_uncertainty_network(

@@ -398,9 +398,19 @@ def transfer(
     recipe = run.recipe(training.TransferRecipe)
     fabric = run.fabric(recipe)
     pipeline, start = training.transfer_start(recipe, weights, partial=partial, on_report=say)
+    refuse_ignored(
+        "the weights are a direct network",
+        {
+            "--vae": bool(vae_folder and start.direct_recipe),
+            "--compile": bool(run.compiled and start.direct_recipe),
+        },
+        instead="choose weights with a latent",
+    )
     # Half of loaded weights are nothing to go back to.
     earlier = None if partial else training.transfer_weights(recipe, weights)
     encoder = training.load_encoder(vae_folder or weights)
+    if vae_folder and encoder is None:
+        raise SceneError(f"--vae {vae_folder} has no encoder: give a folder from `train vae`")
     maps = data_sets.read_maps(recipe, data, held_out_data, wall, start=start)
     recipe = maps.limit_recipe(recipe)
     record = training.record_run(recipe, run.out, maps.rig, start.runs, weights)
@@ -442,8 +452,8 @@ def doubt(
         sets = data_sets.uncertainty_sets(
             recipe, pipeline, datasets, run.out / SAMPLES, on_progress
         )
-    plans = (each.plan.provenance for each in datasets)
-    job = run.training(recipe, pipeline.record, training.digest_of(about.watches, *plans))
+    keys = map(data_sets.data_key, datasets)
+    job = run.training(recipe, pipeline.record, training.digest_of(about.watches, *keys))
     run.finish(
         recipe, training.launch(fabric, training.run_uncertainty, job, about, watched, *sets)
     )

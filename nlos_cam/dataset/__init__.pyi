@@ -9,6 +9,7 @@ __all__ = [
     "ORDINARY",
     "RECORDED",
     "REQUIRED_ARRAYS",
+    "SEEDS_PER_BENCH",
     "SHAPE_OUTLIERS",
     "SHARD",
     "SHARD_PATTERN",
@@ -33,6 +34,7 @@ __all__ = [
     "build_transients",
     "check_arrays",
     "check_uncertainty_data",
+    "data_key",
     "difference_noise",
     "draw_outlier",
     "ignore",
@@ -93,6 +95,7 @@ from .outliers import (
     outliers_beside,
 )
 from .packed import PackedMaps, map_noise, open_packed_maps
+from .packed_index import data_key
 from .plan import RECORDED, DatasetPlan, Objects, RigSpread
 from .ray_backend import ray_farm
 from .reader import Dataset, open_dataset
@@ -121,6 +124,7 @@ from .uncertainty_samples import (
     EMPTY,
     GENERIC,
     ORDINARY,
+    SEEDS_PER_BENCH,
     Benches,
     check_uncertainty_data,
     quality_set,

@@ -27,12 +27,12 @@ from nlos_cam.dataset.shards import (
     store,
 )
 from nlos_cam.dataset.worker import Worker
-from nlos_cam.errors import OutputExistsError, RecordingError, WorkersLostError
+from nlos_cam.errors import OutputExistsError, RecordingError, SceneError, WorkersLostError
 
 TRAINING_SEED = 0
 HELD_OUT_SEED = 10_000_000
 TEST_SEED = 20_000_000
-"""First seeds: no training run reaches the seeds of held-out and test objects."""
+"""First seeds: no training run reaches the seeds of held-out and test objects; see `check_seeds`."""
 SHARD = 100
 """Objects in a shard: as many can be lost of each unfinished shard when a build is killed."""
 PIECE = 10
@@ -63,6 +63,16 @@ class BuildReport:
         return self.made / self.seconds if self.made else None
 
 
+def check_seeds(first_seed: int, count: int) -> None:
+    """Raise SceneError where objects that begin below the held-out or the test ones reach them."""
+    for name, reserved in (("held-out", HELD_OUT_SEED), ("test", TEST_SEED)):
+        if first_seed < reserved < first_seed + count:
+            raise SceneError(
+                f"seeds {first_seed} to {first_seed + count - 1} reach the {name} objects, from"
+                f" {reserved} on: choose another --seed or a lower --count"
+            )
+
+
 def build_dataset(
     plan: DatasetPlan,
     count: int,
@@ -78,11 +88,12 @@ def build_dataset(
     """Bring a folder up to `count` objects, by `workers` processes on this machine or by another
     `farm`.
 
-    Raises OutputExistsError for a folder of other files, RecordingError for one with shards of
-    another plan, FolderBusyError where another build uses it, and DiskFullError and
-    WorkersLostError, with all finished shards kept.
+    Raises SceneError for seeds that reach reserved ones (`check_seeds`), OutputExistsError for a
+    folder of other files, RecordingError for one with shards of another plan, FolderBusyError where
+    another build uses it, and DiskFullError and WorkersLostError, with all finished shards kept.
     """
     plan.check()
+    check_seeds(plan.first_seed, count)
     if folder.is_dir() and not any(folder.glob(SHARD_PATTERN)) and any(folder.glob("[!.]*")):
         raise OutputExistsError(f"{folder} holds other files and no dataset: choose another --out")
     try:

@@ -135,6 +135,14 @@ def shard_key(shard: Shard) -> str:
     return f"{digest.hexdigest()[:DIGITS]}/{shard.path.name}"
 
 
+def data_key(dataset: Dataset) -> str:
+    """Return what tells a dataset's samples from others, wherever it lies: its plan; of recordings,
+    which no plan decides, also the keys of its shards.
+    """
+    keys = map(shard_key, dataset.shards) if dataset.plan.accuracy == RECORDED else ()
+    return "\n".join([dataset.plan.provenance, *keys])
+
+
 @lru_cache(maxsize=8)
 def _is_recorded(provenance: str) -> bool:
     return DatasetPlan.from_provenance(provenance).accuracy == RECORDED

@@ -67,25 +67,21 @@ class RigSpread(Record):
     gain_share: NotNegative = 0.0
     """Relative deviation of the counts of the brightest bare-wall return."""
 
-    def check(self, rig: Rig) -> None:
-        """Raise SceneError where a draw could be an impossible rig."""
-        limit_m = min(
-            rig.lidar.distance_m, rig.occluder.z_min_m if rig.occluder else rig.lidar.distance_m
-        )
+    def check(self, *rigs: Rig) -> None:
+        """Raise SceneError where a draw around one of the rigs could be an impossible rig."""
+        spread_mm = self.place_m * 1e3
+        limit_m = min(_nearest_m(rig) for rig in rigs)
         if self.place_m >= limit_m:
             raise SceneError(
-                f"a spread of {self.place_m * 1e3:g} mm reaches the wall: keep it below"
-                f" {limit_m * 1e3:g}"
+                f"a spread of {spread_mm:g} mm reaches the wall: keep it below {limit_m * 1e3:g} mm"
             )
-        box = object_box(rig)
-        occluder = rig.occluder
-        if occluder and occluder.x_m <= box.x_min_m < occluder.x_m + self.place_m:
-            free_mm = f"{(box.x_min_m - occluder.x_m) * 1e3:g} mm"
+        free_m = min(map(_free_m, rigs))
+        if self.place_m > free_m:
             raise SceneError(
-                f"a spread of {self.place_m * 1e3:g} mm moves the occluder into the object box:"
-                f" keep it below {free_mm}"
+                f"a spread of {spread_mm:g} mm moves the occluder into the object box: keep it"
+                f" below {free_m * 1e3:g} mm"
             )
-        if self.angle_deg + max(abs(rig.lidar.yaw_deg), abs(rig.lidar.pitch_deg)) >= 90:
+        if self.angle_deg + max(map(_turn_deg, rigs)) >= 90:
             raise SceneError(
                 f"a spread of {self.angle_deg:g} degrees turns the lidar away from the wall:"
                 " lower it"
@@ -114,6 +110,27 @@ class RigSpread(Record):
         )
         counts = {"bare_wall_counts": sensor.bare_wall_counts * (1 + self.gain_share * gain)}
         return drawn.model_copy(update={"occluder": occluder}), sensor.model_copy(update=counts)
+
+
+def _nearest_m(rig: Rig) -> float:
+    """Return the distance from the wall of what is nearest to it: the lidar, or the occluder."""
+    distance_m = rig.lidar.distance_m
+    return min(distance_m, rig.occluder.z_min_m) if rig.occluder else distance_m
+
+
+def _free_m(rig: Rig) -> float:
+    """Return how far the occluder can move before it is in the object box; infinite where there is
+    no occluder, or it is behind the box's edge.
+    """
+    if rig.occluder is None:
+        return np.inf
+    free_m = object_box(rig).x_min_m - rig.occluder.x_m
+    return free_m if free_m >= 0 else np.inf
+
+
+def _turn_deg(rig: Rig) -> float:
+    """Return the lidar's larger turn of yaw and pitch."""
+    return max(abs(rig.lidar.yaw_deg), abs(rig.lidar.pitch_deg))
 
 
 @dataclass(frozen=True)
@@ -261,8 +278,7 @@ class DatasetPlan:
     def check(self) -> None:
         """Raise SceneError where no sample can be made by this plan."""
         _ = self.box
-        if self.rigs is None:
-            self.spread.check(self.rig)
+        self.spread.check(*(self.rigs.extremes(self.rig) if self.rigs else [self.rig]))
         if self.textures and self.material.albedo != 1:
             raise SceneError(
                 "the scene's object has an albedo, but in color its albedo comes from textures:"

@@ -1,5 +1,7 @@
 """Rigs that an owner may build, drawn at random: those that the paper allows (SI 1)."""
 
+from collections.abc import Sequence
+from itertools import product
 from typing import Annotated, Self
 
 import numpy as np
@@ -25,6 +27,8 @@ OBJECTS_PER_RIG = 25
 """Objects that share a rig: what depends on the rig alone is then computed once."""
 MARGIN_M = 0.005
 """Distance that stays between the occluder's edge and the line of sight from the lidar to the box."""
+SHARES = 7
+"""Random numbers of a rig, one for each range."""
 _STREAM = 4
 """Stream of a rig's random numbers; see `plan._RIG_STREAM`."""
 
@@ -61,9 +65,18 @@ class RigRange(Record):
 
     def draw(self, rig: Rig, seed: int) -> Rig:
         """Return the rig of a draw. Raises SceneError for a rig without an occluder."""
+        return self._rig_at(rig, np.random.default_rng([seed, _STREAM]).random(SHARES).tolist())
+
+    def extremes(self, rig: Rig) -> list[Rig]:
+        """Return the rigs at the ends of all ranges: none that is drawn is nearer to the wall or
+        more turned. Raises SceneError as `draw` does.
+        """
+        return [self._rig_at(rig, share) for share in product((0.0, 1.0), repeat=SHARES)]
+
+    def _rig_at(self, rig: Rig, share: Sequence[float]) -> Rig:
+        """Return the rig at a share of each range, from 0 at its lower end to 1."""
         if rig.occluder is None:
             raise SceneError(f"{rig.name} has no occluder, whose gap would be drawn")
-        share = np.random.default_rng([seed, _STREAM]).random(7).tolist()
 
         distance_m = _between(self.distance_m, share[0])
         along_m = _between(self.along_m, share[4])

@@ -3,7 +3,7 @@ subtract.
 """
 
 import hashlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
@@ -25,11 +25,12 @@ from nlos_models.training import (
 )
 
 from nlos_cam.dataset.packed import map_noise
+from nlos_cam.dataset.packed_index import data_key
 from nlos_cam.dataset.plan import RECORDED, DatasetPlan, RigSpread
 from nlos_cam.dataset.reader import MAP_CHANNELS, Dataset, open_dataset
 from nlos_cam.errors import SceneError
 from nlos_cam.frames import MAP_COLUMNS, MAP_ROWS, maps_from_frame
-from nlos_cam.reconstruct import align_all, rig_to_align_with
+from nlos_cam.reconstruct import align_all, rig_to_align_with, training_rig
 from nlos_cam.render import Scene, Sensor, render
 
 BARE_WALL_FRAMES = 60
@@ -47,11 +48,14 @@ class MapSplit(NamedTuple):
     plan: DatasetPlan
     rig: tuple[str, str]
     """Name and checksum of the rig that the maps are of, or aligned with."""
+    key: str
+    """What tells the maps from others of the same objects."""
 
     @property
     def digest(self) -> str:
-        """SHA-256 of the rig and the training objects: a run with another one cannot be resumed."""
-        return hashlib.sha256(self.rig[1].encode() + self.training.image.tobytes()).hexdigest()
+        """SHA-256 of rig, maps and training objects: a run with another one cannot be resumed."""
+        decided = f"{self.rig[1]}\n{self.key}\n"
+        return hashlib.sha256(decided.encode() + self.training.image.tobytes()).hexdigest()
 
     def limit_recipe(self, recipe: MapRecipe) -> MapRecipe:
         """Return the recipe with the number of held-out objects available, which may be lower than
@@ -122,6 +126,8 @@ def read_maps(
             f"--wall {wall} only applies to difference maps; this recipe uses raw maps"
         )
     dataset, other = _open_both(recipe, data, held_out_data)
+    for each in (dataset, other):
+        _check_one_rig(each.plan, recipe, start)
     plan = dataset.plan
     count = len(dataset)
     if stream and count != recipe.objects:
@@ -146,7 +152,33 @@ def read_maps(
         maps = subtract_bare_wall(maps, *bare) if bare else maps
         source = InMemory(align_all(maps, dataset.benches(), start) if start else maps)
     training = WithNoise(source, map_noise(plan)) if plan.expected else source
-    return MapSplit(training, held_out, plan, (rig.name, rig.checksum))
+    key = _key_of((dataset, other), bare if wall else None)
+    return MapSplit(training, held_out, plan, (rig.name, rig.checksum), key)
+
+
+def _key_of(datasets: Sequence[Dataset], measured: BareMaps | None) -> str:
+    """Return what tells the maps of datasets, less a measured bare wall, from others."""
+    # A rendered bare wall follows from the plan, which `data_key` has.
+    wall = hashlib.sha256()
+    for values in measured or ():
+        wall.update(values.tobytes())
+    return "\n".join([*map(data_key, datasets), wall.hexdigest() if measured else ""])
+
+
+def _check_one_rig(plan: DatasetPlan, recipe: MapRecipe, start: CheckpointRecord | None) -> None:
+    """Raise SceneError for a dataset of many rigs whose maps nothing aligns with one."""
+    if plan.rigs is None:
+        return
+    if recipe.maps == "difference maps":
+        raise SceneError(
+            "the rig of this dataset varies between objects, which have no bare wall in common:"
+            " build it without --any-rig for difference maps"
+        )
+    if start is None or training_rig(start) is None:
+        raise SceneError(
+            "the rig of this dataset varies between objects, and nothing aligns their maps: build"
+            " it without --any-rig, or train with `train direct`"
+        )
 
 
 def _open_both(recipe: MapRecipe, data: Path, held_out_data: Path) -> tuple[Dataset, Dataset]:
@@ -197,7 +229,7 @@ def render_bare_wall(plan: DatasetPlan, frames: int = BARE_WALL_FRAMES) -> BareM
             f"the maps of this dataset were recorded on {plan.rig.name}, whose bare wall cannot be"
             " rendered: give the bench's measured one with --wall"
         )
-    if plan.spread != RigSpread():
+    if plan.spread != RigSpread() or plan.rigs:
         raise SceneError(
             "the rig of this dataset varies between objects: difference maps need one rig, or"
             " --wall"

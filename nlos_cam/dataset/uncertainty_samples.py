@@ -20,6 +20,7 @@ from nlos_models.training import (
     QualitySet,
     UncertaintyRecipe,
     UncertaintySet,
+    can_leave_out,
     first_of,
     parts_of,
 )
@@ -255,6 +256,16 @@ def counts_of(recipe: UncertaintyRecipe, share_generic: float = 0.0) -> dict[str
     return {EMPTY: recipe.empties, ORDINARY: usual - sum(shapes.values()), **shapes, **per_kind}
 
 
+def held_out_of(counts: Mapping[str, int]) -> dict[str, int]:
+    """Return the number of held-out samples of each kind: at least one of each that training has,
+    since the calibration needs them all.
+    """
+    return {
+        kind: max(1, round(HELD_OUT_SHARE * count)) if count else 0
+        for kind, count in counts.items()
+    }
+
+
 def _uncertainty_set(
     pipeline: models.Reconstructor, ordinary_maps: MapSet, samples: UncertaintySamples
 ) -> UncertaintySet:
@@ -297,7 +308,7 @@ def uncertainty_sets(
     kept in `folder`.
     """
     counts = counts_of(recipe, datasets[0].plan.objects.share_generic)
-    held_out_counts = {kind: round(HELD_OUT_SHARE * count) for kind, count in counts.items()}
+    held_out_counts = held_out_of(counts)
     sets: list[UncertaintySet] = []
     for dataset, objects, kinds, seed in (
         (datasets[0], recipe.objects, counts, TRAINING_SEED),
@@ -351,7 +362,8 @@ def quality_set(
     """Return figures and true quality of the reconstructions of a dataset's first objects; expected
     maps get noise.
 
-    Raises SceneError where weights and dataset do not fit together.
+    Raises SceneError where weights and dataset do not fit together, or the dataset has too few
+    kinds.
     """
     if pipeline.record.input != "raw maps" or not _fit(dataset.plan, pipeline.record):
         raise SceneError(
@@ -363,6 +375,11 @@ def quality_set(
     error_v = list[Float32]()
     done = 0
     kinds = dataset.column("category").astype(np.str_)[:objects]
+    if not can_leave_out(kinds.tolist()):
+        raise SceneError(
+            f"the quality model is judged on kinds left out of its fit, but {dataset.folder} has"
+            f" too few ({', '.join(np.unique(kinds)[:3])}): use a --dataset of more kinds"
+        )
     noise = map_noise(dataset.plan) if dataset.plan.expected else None
     frame = _frame_of(dataset.plan, pipeline.record)
     benches = dataset.benches()

@@ -22,6 +22,7 @@ __all__ = [
     "Watch",
     "WithNoise",
     "as_batch",
+    "can_leave_out",
     "compressor_start",
     "digest_of",
     "direct_start",
@@ -75,7 +76,7 @@ from .direct import NormalBatch, NormalSource, train_direct, varied
 from .distributed import launch, open_fabric
 from .loop import Running, digest_of, fit
 from .losses import latent_error, two_heads_error
-from .quality import QualitySet
+from .quality import QualitySet, can_leave_out
 from .recipe import (
     CompressorRecipe,
     DirectRecipe,

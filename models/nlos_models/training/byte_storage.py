@@ -6,7 +6,7 @@ from pathlib import Path
 import torch
 from safetensors.torch import save
 
-from nlos_cam.files import write_checked
+from nlos_cam.files import atomic_directory, write_checked
 from nlos_models.byte_weights import SCALE, fits_bytes, to_bytes
 from nlos_models.checkpoint import FULL, save_parts, stored_tensors
 from nlos_models.quality import UNCERTAINTY_FILES, load_quality_model
@@ -16,6 +16,7 @@ from nlos_models.records import (
     load_uncertainty_record,
     watched_files,
 )
+from nlos_models.training.checkpoints import copy_weights
 from nlos_models.training.quality import write_quality
 
 
@@ -23,9 +24,15 @@ def store_in_bytes(folder: Path) -> None:
     """Store the large weights of a folder's image networks in a byte each, unless they are.
 
     The uncertainty network and the quality model beside them are tied to the new bytes as they are:
-    rounding changes the pictures that they judge less than noise does. Raises CheckpointError,
-    OSError, FileBusyError.
+    rounding changes the pictures that they judge less than noise does. All files change in one step,
+    so that an interrupted call may be repeated. Raises CheckpointError, OSError, FileBusyError.
     """
+    with atomic_directory(folder) as part:
+        copy_weights(folder, part)
+        _store_in_bytes(part)
+
+
+def _store_in_bytes(folder: Path) -> None:
     uncertainty = load_uncertainty_record(folder)
     quality = load_quality_model(folder)
     # Both are read before the first file changes: afterwards they watch weights that are gone.

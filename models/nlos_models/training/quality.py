@@ -85,6 +85,11 @@ def left_out_folds(kinds: Sequence[str]) -> list[tuple[Int64, Int64]]:
     return folds
 
 
+def can_leave_out(kinds: Sequence[str]) -> bool:
+    """Return whether objects of these kinds remain for a fit without any group of them."""
+    return all(len(fitted) for fitted, _ in left_out_folds(kinds))
+
+
 def left_out_rows(count: int) -> list[tuple[Int64, Int64]]:
     """Return (rows to fit, rows to judge) for each of FOLDS groups of rows at random, the same for
     a count.

@@ -26,6 +26,7 @@ from nlos_models.records import (
     RECORD,
     SIMULATION_ONLY,
     UNCERTAINTY_RECORD,
+    WATCHED,
     CheckpointRecord,
     UncertaintyRecord,
     checksum_of_watched,
@@ -172,13 +173,28 @@ def record_uncertainty_run(
     """Return the record of an uncertainty network that watches the weights in a folder and learns
     kinds of outliers.
 
-    Raises OutputExistsError where `out` is that folder or holds an uncertainty network.
+    Raises OutputExistsError where `out` is that folder, or holds an uncertainty network or other
+    weights.
     """
-    if out.resolve() == watched.resolve() or (out / UNCERTAINTY_RECORD).exists():
+    same = out.resolve() == watched.resolve()
+    if same or (out / UNCERTAINTY_RECORD).exists() or _holds_other_weights(out, watched):
         raise OutputExistsError(f"{out} holds weights already: choose another --out")
     return UncertaintyRecord(
         watches=checksum_of_watched(watched), recipe=recipe, program=program_name(), learnt=kinds
     )
+
+
+def _holds_other_weights(out: Path, watched: Path) -> bool:
+    """Return whether a folder holds a record or weights that are not copies of those of another."""
+    # A run that was stopped while it saved leaves copies: it may be repeated.
+    for name in (RECORD, f"{DIRECT}.safetensors", *WATCHED):
+        own = out / name
+        if not own.exists():
+            continue
+        theirs = watched / name
+        if not theirs.exists() or own.read_bytes() != theirs.read_bytes():
+            return True
+    return False
 
 
 def run_vae(

@@ -39,6 +39,7 @@ RECIPES = {
     "joint": 'task = "compressor"\nsteps = "two-then-joint"\n' + BASE + LOSS,
     "difference": 'task = "compressor"\nmaps = "difference maps"\n' + BASE + LOSS,
     "transfer": 'task = "transfer"\nstatistics = "own"\nall_layers_epochs = 1\n' + BASE + LOSS,
+    "direct": 'task = "transfer"\nlatent_weight = 0\nimage_weight = 1\n' + BASE,
     "doubt": 'task = "doubt"\noutliers = 7\nempties = 14\n' + BASE,
 }
 FIGURES = {"held_out_loss", "held_out_iou"}
@@ -323,6 +324,9 @@ def test_finished_run_keeps_no_states_and_is_not_repeated(
         ("two --weights w", 1, "--weights"),
         ("joint --weights w --vae v", 1, "--vae"),
         ("transfer --weights two --objects 9", 1, "9"),
+        ("transfer --weights two --vae none", 1, "--vae none"),
+        ("transfer --recipe direct.toml --weights direct --vae two", 1, "--vae"),
+        ("transfer --recipe direct.toml --weights direct --compile", 1, "--compile"),
     ],
 )
 def test_train_refuses_options_that_do_not_fit(

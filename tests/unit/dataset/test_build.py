@@ -25,6 +25,8 @@ from nlos_calibration import load_rig
 import nlos_cam
 from nlos_cam import errors
 from nlos_cam.dataset import (
+    HELD_OUT_SEED,
+    TEST_SEED,
     BuildReport,
     DatasetPlan,
     build_dataset,
@@ -116,6 +118,16 @@ def test_build_stores_samples_in_seed_order(tmp_path: Path) -> None:
 
     for name, values in samples_of(range(40, 40 + COUNT)).items():
         np.testing.assert_array_equal(found.column(name), values)
+
+
+@pytest.mark.parametrize("reserved", [HELD_OUT_SEED, TEST_SEED])
+def test_build_keeps_reserved_seeds_out_of_others(tmp_path: Path, reserved: int) -> None:
+    with pytest.raises(SceneError, match=str(reserved)):
+        _build(tmp_path / "out", plan=replace(PLAN, first_seed=reserved - 4), count=5)
+    assert not (tmp_path / "out").exists()
+
+    _build(tmp_path / "below", plan=replace(PLAN, first_seed=reserved - 5), count=5)
+    _build(tmp_path / "from", plan=replace(PLAN, first_seed=reserved), count=5)
 
 
 def test_build_reports_progress(tmp_path: Path) -> None:

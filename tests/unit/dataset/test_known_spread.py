@@ -18,6 +18,7 @@ from nlos_models.training import MapSet
 from nlos_cam.dataset import (
     RECORDED,
     Benches,
+    Dataset,
     DatasetPlan,
     RigRange,
     RigSpread,
@@ -29,6 +30,7 @@ from nlos_cam.dataset import (
 )
 from nlos_cam.dataset.shards import shard_path, store
 from nlos_cam.dataset.uncertainty_samples import EMPTY, UncertaintySamples
+from nlos_cam.errors import SceneError
 from nlos_cam.reconstruct import WALL_GRID
 
 OBJECTS = 4
@@ -109,6 +111,21 @@ def test_quality_model_sees_maps_as_the_direct_network_does(
     assert len(found.figures) == len(aligned.image)
     np.testing.assert_array_equal(np.stack(network.depth_m), aligned.depth_m)
     np.testing.assert_array_equal(np.stack(network.intensity), aligned.intensity)
+
+
+def test_quality_model_of_one_kind_is_refused_before_its_work(
+    built: Callable[..., Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    dataset = open_dataset(built("maps"))
+    kinds = np.array(["cup"] * OBJECTS, object)
+    monkeypatch.setattr(Dataset, "column", lambda *_: kinds)
+    network = Network()
+    judge: Any = lambda *_: None  # noqa: E731
+
+    with pytest.raises(SceneError, match=r"too few \(cup\)"):
+        quality_set(network, judge, dataset, OBJECTS, lambda *_: None)
+
+    assert not network.depth_m
 
 
 @pytest.mark.usefixtures("small_models")

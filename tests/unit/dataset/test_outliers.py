@@ -274,6 +274,14 @@ def test_counts_follow_recipe_and_share_of_generic_shapes(share: float, kinds: i
     assert counts.get(GENERIC, 0) == share * kinds * 10
 
 
+def test_calibration_has_a_sample_of_every_kind() -> None:
+    counts = {EMPTY: 3, "plates": 2, ORDINARY: 100, GENERIC: 0}
+
+    held_out = uncertainty_samples.held_out_of(counts)
+
+    assert held_out == {EMPTY: 1, "plates": 1, ORDINARY: 15, GENERIC: 0}
+
+
 def test_generic_shape_repeats_by_seed_on_a_bench_slightly_off() -> None:
     one, same = (make_samples(GENERIC, [SEEDS_PER_BENCH], BENCHES) for _ in range(2))
 

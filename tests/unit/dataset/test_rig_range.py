@@ -59,3 +59,37 @@ def test_rig_without_an_occluder_cannot_be_drawn_around() -> None:
 def test_range_needs_its_lower_end_first() -> None:
     with pytest.raises(ValidationError, match="lower end"):
         RigRange(gap_m=(0.2, 0.1))
+
+
+@pytest.mark.parametrize(
+    ("spread", "words"),
+    [
+        (RigSpread(place_m=0.1), "reaches the wall"),
+        (RigSpread(angle_deg=15), "15 degrees"),
+        (RigSpread(gain_share=1.5), "150%"),
+    ],
+)
+def test_spread_around_a_range_has_to_keep_every_rig(spread: RigSpread, words: str) -> None:
+    with pytest.raises(SceneError, match=words):
+        DatasetPlan(HOME, 0, rigs=RigRange(), spread=spread).check()
+
+
+def test_occluder_moves_into_the_box_from_the_end_of_its_range() -> None:
+    rigs = RigRange(occluder_m=(-0.02, 0.11), gap_m=(0.08, 0.1), distance_m=(0.4, 0.5))
+
+    with pytest.raises(SceneError, match="below 15 mm"):
+        DatasetPlan(HOME, 0, rigs=rigs, spread=RigSpread(place_m=0.02)).check()
+
+
+def test_spread_of_the_documented_range_is_possible() -> None:
+    spread = RigSpread(place_m=0.001, angle_deg=0.2, gain_share=0.1)
+
+    DatasetPlan(HOME, 0, rigs=RigRange(), spread=spread).check()
+
+
+def test_no_drawn_rig_is_beyond_the_extremes() -> None:
+    extremes = RigRange().extremes(HOME)
+    gap_m = min(rig.occluder.z_min_m for rig in extremes)
+
+    assert all(rig.occluder.z_min_m >= gap_m for rig in DRAWN)
+    assert min(rig.lidar.distance_m for rig in extremes) == pytest.approx(0.15)

@@ -22,7 +22,15 @@ from nlos_models.training.data import flip_some, subtract_bare_wall
 from small_maps import SmallDataset, small_maps
 from small_run import small_recipe
 
-from nlos_cam.dataset import DatasetPlan, RigSpread, packing, training_maps
+from nlos_cam.dataset import (
+    DatasetPlan,
+    RigRange,
+    RigSpread,
+    data_key,
+    open_dataset,
+    packing,
+    training_maps,
+)
 from nlos_cam.dataset.packed import (
     CELLS,
     IMAGES,
@@ -45,6 +53,9 @@ from nlos_cam.render import Scene, Sensor, SensorModel, render
 
 PLAN = DatasetPlan(load_rig("paper-rig"), 0)
 OTHER = replace(PLAN, rig=PLAN.rig.model_copy(update={"name": "other"}))
+MANY = replace(PLAN, rigs=RigRange())
+PLANS = {"many": MANY, "dim1": replace(PLAN, sensor=SensorModel(bare_wall_counts=30.0))}
+"""Plans of datasets by their names."""
 RECIPE = small_recipe(task="compressor", objects=4, held_out=2)
 WALL = Path("wall.toml")
 
@@ -54,6 +65,7 @@ def _datasets(monkeypatch: pytest.MonkeyPatch) -> None:
     def opened(of: Path, *, color: bool, expected: bool = False) -> SmallDataset:
         assert not color
         plan = replace(PLAN, expected=True) if expected and of.name == "expected" else PLAN
+        plan = PLANS.get(of.name, plan)
         return SmallDataset(small_maps(6, len(of.name)), OTHER if "rig" in of.name else plan)
 
     monkeypatch.setattr(training_maps, "open_dataset", opened)
@@ -91,6 +103,32 @@ def test_digest_of_read_maps_is_of_objects_and_rig() -> None:
 
     assert digests[0] == digests[1]
     assert len(set(digests)) == 3
+
+
+def test_digest_of_read_maps_is_of_sensor_and_held_out_maps() -> None:
+    pairs = (("data", "other"), ("dim1", "other"), ("data", "dim1"))
+
+    assert len({_read(*pair).digest for pair in pairs}) == 3
+
+
+def test_digest_of_recordings_is_of_their_samples(tmp_path: Path) -> None:
+    plan = replace(PLAN, accuracy=RECORDED)
+    folder = _add(tmp_path / "labelled", 0, plan)
+    before = data_key(open_dataset(folder))
+    assert data_key(open_dataset(folder)) == before
+
+    others = {**_samples(0), "intensity": _samples(5)["intensity"]}
+    store(shard_path(folder, 0), others, plan.provenance, "")
+
+    assert data_key(open_dataset(folder)) != before
+
+
+@pytest.mark.parametrize(("data", "other"), [("many", "other"), ("data", "many")])
+def test_maps_of_many_rigs_need_something_that_aligns_them(data: str, other: str) -> None:
+    with pytest.raises(SceneError, match="--any-rig"):
+        _read(data, other)
+    with pytest.raises(SceneError, match="bare wall in common"):
+        _read(data, other, WALL, maps="difference maps")
 
 
 def _first_batch(data: str, seed: int, *, stream: bool) -> MapBatch:
@@ -171,9 +209,10 @@ def test_bare_wall_has_the_pulse_of_the_samples() -> None:
     assert abs(np.median(intensity[lit] / instant[lit]) - 1) < 0.05
 
 
-def test_bare_wall_of_many_rigs_is_refused() -> None:
+@pytest.mark.parametrize("plan", [replace(PLAN, spread=RigSpread(place_m=0.01)), MANY])
+def test_bare_wall_of_many_rigs_is_refused(plan: DatasetPlan) -> None:
     with pytest.raises(SceneError, match="--wall"):
-        render_bare_wall(replace(PLAN, spread=RigSpread(place_m=0.01)))
+        render_bare_wall(plan)
 
 
 @pytest.fixture
@@ -194,6 +233,7 @@ def test_difference_maps_subtract_rendered_or_measured_wall(
 ) -> None:
     made = _read(wall=wall, maps="difference maps")
 
+    assert (made.digest == _read(maps="difference maps").digest) == (wall is None)
     pairs = ((made.training.first(4), small_maps(6, 4)), (made.held_out, small_maps(6, 5)))
     for maps, raw in pairs:
         count = len(maps.image)

@@ -2,6 +2,7 @@
 
 import shutil
 from pathlib import Path
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -21,7 +22,7 @@ from nlos_models.records import (
     load_uncertainty_record,
     shipped_folder,
 )
-from nlos_models.training import store_in_bytes
+from nlos_models.training import byte_storage, store_in_bytes
 from nlos_models.training.checkpoints import save_pipeline
 from nlos_models.vae import Decoder
 from safetensors.torch import load_file, save_file
@@ -129,6 +130,23 @@ def test_judges_of_stored_weights_are_tied_to_them(tmp_path: Path) -> None:
     assert record is not None
     assert record.watches == checksum_of_watched(folder) != before
     assert load_quality_model(folder) is not None
+
+
+def test_interrupted_storage_leaves_weights_whole(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = Path(shutil.copytree(shipped_folder("direct"), tmp_path / "weights"))
+    before = {path.name: path.read_bytes() for path in folder.iterdir()}
+
+    # The weights are in bytes by then, and the uncertainty network is not yet tied to them.
+    with monkeypatch.context() as patch:
+        patch.setattr(byte_storage, "save_parts", Mock(side_effect=KeyboardInterrupt))
+        with pytest.raises(KeyboardInterrupt):
+            store_in_bytes(folder)
+
+    assert {path.name: path.read_bytes() for path in folder.iterdir()} == before
+    store_in_bytes(folder)
+    assert load_uncertainty_record(folder) is not None
 
 
 @pytest.mark.parametrize("harm", ["short", "alone"])

@@ -15,10 +15,17 @@ from nlos_models.pipeline import RemappingNetwork
 from nlos_models.training import runs
 from nlos_models.training.checkpoints import save_direct, save_pipeline, save_vae
 from nlos_models.training.recipe import Recipe
-from nlos_models.training.runs import compressor_start, record_run, transfer_start, vae_start
+from nlos_models.training.runs import (
+    compressor_start,
+    record_run,
+    record_uncertainty_run,
+    transfer_start,
+    vae_start,
+)
 from safetensors.torch import load_file, save_file
 from small_maps import SmallCompressor, SmallVae, use_small_networks
 from small_run import changed_tensors, small_recipe
+from small_uncertainty import watched_weights
 
 from nlos_cam.files import CHECKSUMS, OutputExistsError
 
@@ -190,3 +197,21 @@ def test_record_of_a_run_refuses_a_file_and_its_own_start(tmp_path: Path) -> Non
     for name, starts in (("file", ()), ("run", (tmp_path / "x" / ".." / "run",))):
         with pytest.raises(OutputExistsError, match="--out"):
             _record(tmp_path / name, VAE, starts=starts)
+
+
+@pytest.mark.parametrize(
+    "name", ["checkpoint.json", "compressor.safetensors", "direct.safetensors"]
+)
+def test_uncertainty_run_keeps_other_weights_in_its_folder(tmp_path: Path, name: str) -> None:
+    watched = watched_weights(tmp_path / "watched")
+    recipe = small_recipe(task="doubt", outliers=2, empties=2)
+    (out := tmp_path / "out").mkdir()
+    # Copies of the watched weights: of a run that was stopped while it saved.
+    for path in watched.iterdir():
+        (out / path.name).write_bytes(path.read_bytes())
+    record_uncertainty_run(recipe, out, watched, [])
+
+    (out / name).write_bytes(b"another network")
+
+    with pytest.raises(OutputExistsError, match="--out"):
+        record_uncertainty_run(recipe, out, watched, [])

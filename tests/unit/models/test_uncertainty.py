@@ -17,6 +17,7 @@ from nlos_models.training import quality as quality_training
 from nlos_models.training import uncertainty
 from nlos_models.training.quality import (
     QualitySet,
+    can_leave_out,
     families,
     fit_quality,
     left_out_folds,
@@ -31,6 +32,8 @@ from nlos_models.uncertainty_network import (
 )
 from small_maps import HARD_MAPS, hard_maps, noise_maps
 from small_uncertainty import DARK_V, small_uncertainty_set, untrained_uncertainty, watched_weights
+
+from nlos_cam.files import TEXT_LIMIT, checksums_of, read_checked
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -276,6 +279,16 @@ def test_saved_bare_wall_is_exact_and_watched_weights_stay(
         uncertainty_network.save_uncertainty_network(tmp_path / "other", network, record, watched)
 
 
+@pytest.mark.usefixtures("record")
+def test_copies_of_watched_weights_have_checksums(tmp_path: Path, watched: Path) -> None:
+    sums = checksums_of(tmp_path / "run")
+
+    for name in (*records.WATCHED, records.RECORD):
+        content = read_checked(tmp_path / "run" / name, TEXT_LIMIT)
+        assert content == (watched / name).read_bytes()
+        assert name in sums
+
+
 @pytest.mark.slow
 def test_uncertainty_onnx_equals_torch_and_is_exported_once(
     tmp_path: Path, record: UncertaintyRecord
@@ -405,6 +418,18 @@ def test_left_out_families_are_judged_once_and_never_fitted() -> None:
         assert not any(min(families(kinds[row])) in seen for row in rows)
 
     assert sorted(judged) == list(range(len(kinds)))
+
+
+@pytest.mark.parametrize(
+    ("kinds", "enough"),
+    [
+        (["cup", "cup"], False),
+        (["cup", "cup and hat"], False),
+        (["cup", "hat"], True),
+    ],
+)
+def test_a_fit_needs_objects_without_any_group_of_kinds(kinds: list[str], enough: bool) -> None:
+    assert can_leave_out(kinds) == enough
 
 
 def test_fit_predicts_the_quality_of_kinds_that_it_never_saw() -> None:
