@@ -7,13 +7,14 @@ import shlex
 import sys
 import webbrowser
 from collections.abc import Callable, Generator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Protocol
 from urllib.parse import urlsplit
 
 import typer
+from rich.markup import escape
 
 from nlos_cam import camera as cameras
 from nlos_cam import live as loop
@@ -194,9 +195,22 @@ def view(
 def saving(
     viewer: views.Viewer, bench: reconstruct.CalibratedRig, path: Path | None
 ) -> Generator[views.Viewer]:
-    """Yield an entered viewer, joined by one that saves the session to `path` if given."""
+    """Yield an entered viewer, joined by one that saves the session to `path` if given.
+
+    A file that cannot be opened is an error; one that ends early is a note, and the run goes on to
+    its summary.
+    """
     if path is None:
         yield viewer
-    else:
-        with views.SessionFile(path, bench.rig, bench.measured) as session:
-            yield views.Viewers([viewer, session])
+        return
+    entered = ExitStack()
+    session = entered.enter_context(views.SessionFile(path, bench.rig, bench.measured))
+    try:
+        yield views.Viewers([viewer, session])
+    finally:
+        with suppress(Exception):  # whatever it was, `problem` says it
+            entered.close()
+        if session.problem:
+            say(f"[yellow]warning:[/] {escape(session.problem)}", marked=True)
+        elif session.left_out:
+            say(f"note: {path} lacks {session.left_out} moments for which there was no time")

@@ -226,7 +226,7 @@ class RunControl:
             "state": "paused" if is_paused else self._state,
             "message": self._message,
             "camera": self._camera_name,
-            "warnings": [*self.warnings, *self.recording.problems],
+            "warnings": [*self.warnings, *self.recording.problems, *self.saving.problems],
             **self._pace(now_s),
         }
         camera = self._run.camera

@@ -146,6 +146,14 @@ class SavingCommands:
         """True while a session is being saved."""
         return self._session is not None
 
+    @property
+    def problems(self) -> list[str]:
+        """Reason why the session that is being saved takes no more; empty while it does, or none
+        is.
+        """
+        session = self._session
+        return [session[0].problem] if session and session[0].problem else []
+
     def show(self, moment: Moment) -> None:
         """Add a moment to the session that is being saved, if any."""
         if session := self._session:
@@ -180,10 +188,12 @@ class SavingCommands:
         if not self._session:
             raise NlosCamError("no session is being saved")
         file, entered = self._session
+        problem = file.problem
         self._session = None
         entered.close()
         place = self._run.files.note(file.path)
-        return f"saved {file.kept} moments to {file.path}, {place}: any browser plays it"
+        saved = f"saved {file.kept} moments to {file.path}, {place}: any browser plays it"
+        return f"{saved}; {problem}" if problem else saved
 
 
 class RecordingCommands:

@@ -1,6 +1,7 @@
 """Media of a replay: contact sheet of some frames, saved view, still pictures, video."""
 
 import shutil
+from collections import Counter
 from collections.abc import Generator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -12,12 +13,12 @@ from nlos_calibration.arrays import Float32
 from nlos_cam import view as views
 from nlos_cam.objects import object_box
 from nlos_cam.reconstruct import CalibratedRig, FrameResult
-from nlos_cam.replay.object_files import ObjectFiles
+from nlos_cam.replay.object_files import ObjectFiles, frame_stem
 from nlos_cam.report import figure_of
 
 VIEW = "view.html"
 VIDEO = "replay.webm"
-STILL = "still-{:06d}.png"
+STILL = "still-{}.png"
 STILLS = "still-*.png"
 OBJECT = "object"
 """Folder of the hidden objects' files."""
@@ -97,8 +98,11 @@ class ReplayMedia:
             yield
         if self._stills:
             moments = [views.Moment.recorded(result) for result in self._stills.results()]
+            drawn = Counter[int]()
             for moment in moments:
-                path = folder / STILL.format(moment.result.frame_number)
+                number = moment.result.frame_number
+                drawn[number] += 1
+                path = folder / STILL.format(frame_stem(number, drawn[number]))
                 views.Still(moments[0]).save(path, moment)
         self._names = {path.name for path in _media_in(folder)}
 

@@ -1,7 +1,8 @@
 """Hidden objects of a replay as files of other programs: a mesh or a point cloud per frame."""
 
+from collections import Counter
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from threading import Event
 from typing import Any
@@ -22,7 +23,7 @@ OBJECT_FORMATS = ("ply", "glb", "obj", "csv", "npz", "points")
 @dataclass
 class ObjectFiles:
     """Writer of each frame's hidden surface, named by its number, in every format; skips frames
-    without one.
+    without one. A number that comes again, as a device that restarts counts anew, gets a suffix.
     """
 
     folder: Path
@@ -35,6 +36,8 @@ class ObjectFiles:
     """Frames with a surface so far."""
     came: int = 0
     """Frames so far."""
+    _repeats: Counter[int] = field(default_factory=Counter[int])
+    """Frames with a surface so far, by number."""
 
     def add(self, number: int, depth_m: Float32, uncertainty_m: Float32 | None) -> None:
         """Write a frame's depth map (64, 64), if it is due and has a surface."""
@@ -44,14 +47,21 @@ class ObjectFiles:
             return
         mesh = mesh_from_depth(depth_m, self.box, uncertainty_m)
         self.folder.mkdir(exist_ok=True)
+        self._repeats[number] += 1
+        stem = frame_stem(number, self._repeats[number])
         for name in self.formats:
             if name == "points":
-                path = self.folder / f"{number:06d}-points.ply"
+                path = self.folder / f"{stem}-points.ply"
                 path.write_bytes(mesh.points_only.as_bytes(".ply"))
             else:
-                path = self.folder / f"{number:06d}.{name}"
+                path = self.folder / f"{stem}.{name}"
                 path.write_bytes(mesh.as_bytes(f".{name}"))
         self.written += 1
+
+
+def frame_stem(number: int, occurrence: int) -> str:
+    """Return the stem of a frame's files: 000123, and 000123-2 for the second of that number."""
+    return f"{number:06d}" if occurrence == 1 else f"{number:06d}-{occurrence}"
 
 
 def export_objects(

@@ -12,6 +12,7 @@ from nlos_models import Reconstructor, UncertaintyModel
 
 from nlos_cam.camera import Camera, open_camera
 from nlos_cam.errors import NlosCamError, RecordingError
+from nlos_cam.frames import Frame
 from nlos_cam.reconstruct import (
     CalibratedRig,
     FrameReader,
@@ -24,11 +25,16 @@ from nlos_cam.reconstruct import (
 from nlos_cam.recording import with_telemetry
 from nlos_cam.view import Moment, PlaybackViewer, WrittenFiles, save_moment
 
+SAME_S = 1e-3
+"""Difference of two times, in seconds, below which they are one: the page's are rounded."""
+
 
 class Playback(PlaybackViewer):
     """View of a recording, served while entered. `reconstruct` fills it; the page plays meanwhile.
 
-    Its one command, `export`, writes a frame's arrays, picture and mesh into `folder`.
+    Its one command, `export`, writes a frame's arrays, picture and mesh into `folder`. Its arguments
+    are the frame's number and, as a number may come again, `time_s` as the page shows it; without
+    `time_s` the first frame of that number is exported.
     """
 
     def __init__(
@@ -44,7 +50,10 @@ class Playback(PlaybackViewer):
         super().__init__(bench.rig, bench.measured, host=host, port=port, controls=self)
         self.frames = 0
         """Frames reconstructed so far."""
+        self._start_s = 0.0
+        """Timestamp of the first frame, from which the page counts."""
         self._camera = camera
+        self._bag = Path(camera.uri.removeprefix("bag:"))
         self._calibrated = bench
         self._networks = networks
         self._folder = folder
@@ -62,12 +71,14 @@ class Playback(PlaybackViewer):
             pipeline = self._pipeline(self._calibrated, checks)
             with FrameReader(frames, lossless=True, stop=stop) as reader, pipeline.checks:
                 for result in iterate_batched(reader, pipeline, temperatures=telemetry):
+                    if not self.frames:
+                        self._start_s = result.timestamp_s
                     self.show(Moment.recorded(result, telemetry.celsius))
                     self.frames += 1
 
         if not self.frames and not stop.is_set():
             raise RecordingError(
-                f"{camera.uri} has no frame with depth, infrared and confidence: record it again"
+                f"{camera.uri} has no frame with depth and infrared: record it again"
             )
         self.finish()
         self._state = "whole"
@@ -82,7 +93,7 @@ class Playback(PlaybackViewer):
         return {
             "state": "playback",
             "message": message,
-            "camera": self._camera.uri,
+            "camera": f"bag:{self._bag.name}",  # without its folder: others may see the page
             "control": {
                 "commands": ["export"],
                 "options": [],
@@ -92,31 +103,49 @@ class Playback(PlaybackViewer):
         }
 
     def run(self, command: str, arguments: Mapping[str, Any]) -> str:
-        """Export a frame by its number. Raises NlosCamError for another command, number, or while
-        exporting.
+        """Export a frame by its number. Raises NlosCamError for another command or number, and for
+        files that cannot be read or written.
         """
         number = arguments.get("frame")
-        if command != "export" or not isinstance(number, int):
+        time_s = arguments.get("time_s")
+        has_time = isinstance(time_s, int | float | None)
+        if command != "export" or not isinstance(number, int) or not has_time:
             raise NlosCamError(
                 f"no command {command!r} with {dict(arguments)!r}: this view exports a frame by"
                 " number"
             )
-        with self._exporting:
-            return self._export(number)
+        try:
+            with self._exporting:
+                return self._export(number, time_s)
+        except NlosCamError:
+            raise
+        except OSError as error:
+            place = error.filename or self._folder.resolve()
+            raise NlosCamError(
+                f"{place}: {error.strerror or error}: check that it is still there and that its"
+                " folder has room and can be written"
+            ) from error
 
-    def _export(self, number: int) -> str:
+    def _export(self, number: int, time_s: float | None) -> str:
         """Reconstruct one frame again, since the page's copy is rounded, and write its files."""
-        bag = Path(self._camera.uri.removeprefix("bag:"))
         with open_camera(self._camera.uri) as camera:
-            frame = next((each for each in camera if each.frame_number == number), None)
+            found = (each for each in camera if self._is_at(each, number, time_s))
+            frame = next(found, None)
         if frame is None:
-            raise NlosCamError(f"{bag} has no frame {number}")
+            raise NlosCamError(f"{self._bag.name} has no frame {number}")
 
         with FrameReader([frame], lossless=True, stop=Event()) as reader:
             (result,) = iterate_batched(reader, self._pipeline(self._calibrated.afresh()))
-        path = self._folder / f"{bag.stem}-{number:06d}-{datetime.now().astimezone():%H%M%S}.npz"
+        now = f"{datetime.now().astimezone():%H%M%S}"
+        path = self._folder / f"{self._bag.stem}-{number:06d}-{now}.npz"
         outcome = save_moment(path, Moment.recorded(result))
         return f"{outcome}, {self._files.note(path)}"
+
+    def _is_at(self, frame: Frame, number: int, time_s: float | None) -> bool:
+        """Return True for the frame of a number, at a time that the page shows if given."""
+        if frame.frame_number != number:
+            return False
+        return time_s is None or abs(frame.timestamp_s - self._start_s - time_s) < SAME_S
 
     def file(self, name: str) -> Path | None:
         """Return the path of an exported file, by its name; None for any other."""

@@ -62,8 +62,9 @@ def replay_recording(
     names are replaced.
 
     Difference maps are written if the bench has a reference; else those of an earlier replay are
-    removed. Setting `stop` ends the replay early and keeps its results. Raises RecordingError for a
-    recording without a complete frame, and the camera's errors.
+    removed. Setting `stop` ends the replay early and keeps its results; before the first frame it
+    raises KeyboardInterrupt and writes nothing. Raises RecordingError for a recording without a
+    complete frame, and the camera's errors.
     """
     start_s = clock()
     bench = pipeline.bench
@@ -80,8 +81,10 @@ def replay_recording(
                 media.add(result, telemetry.celsius)
                 on_frame()
         if not results.numbers:
+            if stop.is_set():
+                raise KeyboardInterrupt  # before the first frame, which is no fault of the recording
             raise RecordingError(
-                f"{camera.uri} has no frame with depth, infrared and confidence: record it again"
+                f"{camera.uri} has no frame with depth and infrared: record it again"
             )
 
         np.savez_compressed(part / RESULT, **results.hidden_arrays(bench.rig))

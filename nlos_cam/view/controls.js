@@ -180,7 +180,7 @@ function plays() {
 }
 
 function saveFrame() {
-  if (state.status.state === "playback" && state.status.controls) command("export", { frame: state.moment.frame });
+  if (state.status.state === "playback" && state.status.controls) command("export", { frame: state.moment.frame, time_s: state.moment.time_s });
   else if (state.moment) player.save();
 }
 
@@ -289,6 +289,9 @@ const plots = {
     const height = (canvas.height = canvas.clientHeight);
     const pen = canvas.getContext("2d");
     const values = this.history.flatMap((each) => Object.values(each[name]));
+    const legend = series.map((each, k) => `<span style="color:${this.colors[k % 6]}">${escape(each.replaceAll("_", " "))}</span>`);
+    canvas.parentElement.querySelector(".legend").innerHTML = legend.join(" ");
+    if (!values.length) return; // a recording without temperatures: the canvas is clear
     const high = Math.max(...values, 1e-3) * 1.1;
     const low = name.startsWith("Temp") ? Math.min(...values) - 1 : 0;
     const start = this.history[0].time;
@@ -302,8 +305,6 @@ const plots = {
     pen.fillText(`last ${span.toFixed(0)} s`, width - 60, height - 1);
     pen.strokeStyle = "#2a3237";
     pen.strokeRect(33.5, 4.5, width - 38, height - 16);
-    const legend = series.map((each, k) => `<span style="color:${this.colors[k % 6]}">${escape(each.replaceAll("_", " "))}</span>`);
-    canvas.parentElement.querySelector(".legend").innerHTML = legend.join(" ");
     series.forEach((each, k) => {
       pen.beginPath();
       for (const point of this.history) if (each in point[name]) pen.lineTo(x(point.time), y(point[name][each]));

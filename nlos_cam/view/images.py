@@ -1,7 +1,9 @@
 """Pictures from maps, and the banner of stills and videos: pure functions from arrays to arrays."""
 
+from collections.abc import Callable
 from functools import cache
 from math import floor, log10
+from typing import Generic, TypeVar
 
 import cv2
 import numpy as np
@@ -11,6 +13,8 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
 from nlos_cam.objects import image_from_depth
+
+Span = TypeVar("Span")
 
 BACKGROUND_RGB = (13, 16, 17)
 """Color of the page's background, for pixels without surface."""
@@ -81,6 +85,23 @@ def faded(rgb: UInt8) -> UInt8:
     """Return a picture (..., 3) with little color left, for an unreliable reconstruction."""
     grey = rgb.mean(axis=-1, keepdims=True)
     return np.rint(grey + FADED * (rgb - grey)).astype(np.uint8)
+
+
+class LastingSpan(Generic[Span]):
+    """Range of the values of a run's first frame that has any, which holds for all later ones."""
+
+    def __init__(self, span_of: Callable[[Float32], Span]) -> None:
+        self._span_of = span_of
+        self._span: Span | None = None
+
+    def of(self, values: Float32) -> Span:
+        """Return the run's range; until there is one, what `span_of` says of no value."""
+        if self._span is not None:
+            return self._span
+        span = self._span_of(values)
+        if np.isfinite(values).any():
+            self._span = span
+        return span
 
 
 def depth_span_m(depth_m: Float32) -> tuple[float, float]:

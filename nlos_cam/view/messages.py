@@ -21,7 +21,7 @@ from nlos_cam.objects import object_box
 from nlos_cam.reconstruct import FrameResult, Quality
 from nlos_cam.view.assessment import assess
 from nlos_cam.view.calibration import calibration_facts, outline_m, wall_pictures
-from nlos_cam.view.images import BACKGROUND_RGB, change_span_m, depth_span_m
+from nlos_cam.view.images import BACKGROUND_RGB, LastingSpan, change_span_m, depth_span_m
 from nlos_cam.view.viewer import Moment
 
 HEAD = struct.Struct("<II")
@@ -157,12 +157,16 @@ def _light_path(rig: Rig, box: ObjectBox) -> Corners:
 
 
 class MomentPacker:
-    """Packer of one run's moments; the first one's ranges of depth and change hold for all."""
+    """Packer of one run's moments; the first ranges of depth and change that are known hold for
+    all.
+    """
 
     def __init__(self, *, picture_width: int = PICTURE_WIDTH) -> None:
         self._width = picture_width
         self._start_s: float | None = None
         self._span_m = (0.0, 1.0)
+        self._span = LastingSpan(depth_span_m)
+        self._change_span = LastingSpan(change_span_m)
         self._change_span_m = 0.0
 
     def pack(self, moment: Moment, *, with_lidar: bool = True) -> bytes:
@@ -172,13 +176,13 @@ class MomentPacker:
         frame = moment.result.frame
         if self._start_s is None:
             self._start_s = moment.time_s
-            self._span_m = depth_span_m(frame.depth_m)
+        self._span_m = self._span.of(frame.depth_m)
 
         arrays = _hidden_arrays(moment.result)
         if with_lidar:
             difference = moment.result.difference
             if difference is not None:
-                self._change_span_m = self._change_span_m or change_span_m(difference.depth_m)
+                self._change_span_m = self._change_span.of(difference.depth_m)
                 arrays["change"] = signed_bytes(difference.depth_m, self._change_span_m)
             check = moment.result.check
             if check:

@@ -111,6 +111,7 @@ function handle(message) {
 function setBench(message) {
   state.bench = message;
   state.lidar = null;
+  if (mode === "live") kept.clear(); // its moments are of the bench before
   kept.bench = message.raw;
   pictures = new Pictures(message);
   bench.setBench(message.parts, message.box);

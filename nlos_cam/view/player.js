@@ -135,7 +135,8 @@ const kept = {
 
   add(moment) {
     const last = this.moments.at(-1);
-    if (last && moment.time_s <= last.time_s) return;
+    if (last && moment.time_s === last.time_s) return; // sent again to a page that came back
+    if (last && moment.time_s < last.time_s) this.clear(); // the time began anew, with another bench
     this.moments.push(moment);
     while (moment.time_s - this.moments[0].time_s > KEPT_S) this.moments.shift();
   },

@@ -340,14 +340,17 @@ def exposed(host: str, port: int) -> str:
 
 def names_of(host: str, address: str) -> Callable[[str], bool]:
     """Return the check of a Host header: this machine's names, or an address (which no name server
-    can forge).
+    can forge). On the loopback only the host itself, its address and the usual names.
     """
-    names = LOCAL_NAMES | {host.lower(), socket.gethostname().lower()}
     local_only = is_loopback(address)
+    names = LOCAL_NAMES | {host.lower(), address.lower()}
+    if not local_only:
+        names |= {socket.gethostname().lower()}
+    names -= {""}  # what a malformed header names
 
     def known(header: str) -> bool:
         name = name_in(header)
-        return name in LOCAL_NAMES if local_only else name in names or _is_address(name)
+        return name in names or (not local_only and _is_address(name))
 
     return known
 

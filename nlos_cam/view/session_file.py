@@ -14,18 +14,16 @@ from nlos_calibration import MeasuredWall, Rig
 
 from nlos_cam.threads import BoundedQueue
 from nlos_cam.view.messages import MomentPacker, bench_message, pack
-from nlos_cam.view.viewer import Moment
+from nlos_cam.view.viewer import SLACK_S, Moment, Schedule
 
 PERIOD_S = 0.1
 """Seconds between saved moments, by their own clock."""
-SLACK_S = 0.01
-"""Frames come at 30 per second: every third is kept, and not every fourth because of a
-thousandth.
-"""
 CHUNK_S = 1.0
 """Seconds of moments compressed together, and that a kill may cost."""
 LIDAR_S = 1.0
 """Seconds between pictures of the lidar, which are most of a moment's bytes."""
+FALL_S = 0.1
+"""Seconds shown between two moments where the time falls back: how long it was, nobody knows."""
 PICTURE_WIDTH = 160
 QUEUE_MOMENTS = 4
 MAX_BYTES = 512 << 20
@@ -49,27 +47,39 @@ def page_html(mode: str) -> str:
 
 
 class Chunks:
-    """Packer of moments into chunks: messages of CHUNK_S, compressed together."""
+    """Packer of moments into chunks: messages of CHUNK_S, compressed together.
+
+    The times of a chunk, by which the page finds its moments, never fall: where the moments' own
+    time falls back, as a device's clock may, they go on FALL_S after the last one.
+    """
 
     def __init__(self, packer: MomentPacker) -> None:
         self._packer = packer
         self._messages = list[bytes]()
         self._times_s: list[float] = []
-        self._lidar_due_s = float("-inf")
+        self._lidar = Schedule(LIDAR_S)
         self._start_s: float | None = None
+        self._last_s: float | None = None
+        self._later_s = 0.0
+        """Seconds by which the chunks' time is later than the moments' own, after falls."""
 
     def add(self, moment: Moment) -> bytes | None:
         """Add a moment, and return the chunk before it if that is complete."""
-        now_s = moment.time_s
+        now_s = self._unfallen_s(moment.time_s)
         is_full = self._times_s and now_s - self._times_s[0] >= CHUNK_S - SLACK_S
         complete = self.rest() if is_full else None
 
-        with_lidar = now_s >= self._lidar_due_s or not self._messages
-        if with_lidar:
-            self._lidar_due_s = now_s + LIDAR_S - SLACK_S
+        with_lidar = self._lidar.is_due(now_s) or not self._messages
         self._messages.append(self._packer.pack(moment, with_lidar=with_lidar))
         self._times_s.append(now_s)
         return complete
+
+    def _unfallen_s(self, time_s: float) -> float:
+        """Return a moment's time on a clock that does not fall."""
+        if self._last_s is not None and time_s < self._last_s:
+            self._later_s += self._last_s - time_s + FALL_S
+        self._last_s = time_s
+        return time_s + self._later_s
 
     def rest(self) -> bytes | None:
         """Return the last chunk, which may be shorter; None without moments."""
@@ -88,7 +98,8 @@ class SessionFile:
     """Writer of ten moments per second to an HTML file, in its own thread while entered.
 
     A moment that finds the queue full is skipped, or waited for with `keeps_all`. An existing file
-    is replaced. After a kill the file lacks its last second and plays.
+    is replaced. After a kill the file lacks its last second and plays. A file that takes no more,
+    as the disk is full, says so in `problem`; leaving it then raises the error.
     """
 
     address: str | None = None
@@ -100,14 +111,14 @@ class SessionFile:
         self.kept = 0
         """Moments written."""
         self.left_out = 0
-        """Moments that were due and did not fit."""
+        """Moments that were due while the file took any, and found the queue full."""
         self.full = False
         """True if the file ended before the run."""
         self._bench = bench_message(rig, measured)
         self._keeps_all = keeps_all
         self._chunks = Chunks(MomentPacker(picture_width=PICTURE_WIDTH))
         self._queue = BoundedQueue[Moment](QUEUE_MOMENTS)
-        self._due_s = float("-inf")
+        self._schedule = Schedule(PERIOD_S)
         self._error: Exception | None = None
         self._thread = Thread(target=self._write, name="saved session")
 
@@ -117,6 +128,20 @@ class SessionFile:
         self._thread.start()
         return self
 
+    @property
+    def problem(self) -> str:
+        """Reason why no more is saved, for the page and the terminal; empty while moments are.
+
+        May be read at any time, also after the file was left.
+        """
+        if self.full:
+            limit = f"a browser plays no more than {MAX_BYTES >> 20} MB"
+            return f"{self.path.name} is full ({limit}): it ends here and plays"
+        if self._error:
+            reason = getattr(self._error, "strerror", None) or repr(self._error)
+            return f"{self.path.name} ended early ({reason}): it holds only what came before"
+        return ""
+
     def __exit__(self, *_: object) -> None:
         self._queue.finish()
         self._thread.join()
@@ -125,9 +150,8 @@ class SessionFile:
 
     def show(self, moment: Moment) -> None:
         """Queue a moment if one is due."""
-        if self.full or moment.time_s < self._due_s:
+        if self.full or self._error or not self._schedule.is_due(moment.time_s):
             return
-        self._due_s = moment.time_s + PERIOD_S - SLACK_S
         if self._keeps_all:
             while self._thread.is_alive() and not self._queue.wait_for_room(CHUNK_S):
                 pass

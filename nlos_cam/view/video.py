@@ -17,7 +17,7 @@ from nlos_cam.errors import NlosCamError
 from nlos_cam.reconstruct import FrameResult
 from nlos_cam.view import images
 from nlos_cam.view.assessment import Assessment, assess
-from nlos_cam.view.viewer import Moment
+from nlos_cam.view.viewer import Moment, Schedule
 
 WIDTH = 1280
 HEIGHT = 720
@@ -39,12 +39,13 @@ BAR_STEPS = 64
 
 
 class Still:
-    """Pictures of one run's moments; the first one's color ranges hold for all."""
+    """Pictures of one run's moments; the first color ranges that are known hold for all."""
 
     def __init__(self, first: Moment) -> None:
         self._start_s = first.time_s
-        self._span_m = images.depth_span_m(first.result.frame.depth_m)
+        self._span = images.LastingSpan(images.depth_span_m)
         self._lidar_frame = first.result.frame
+        self._span.of(self._lidar_frame.depth_m)
 
     def rgb(self, moment: Moment, *, with_lidar: bool = True) -> UInt8:
         """Return the picture (720, 1280, 3); the lidar's pictures, hard to compress, stay unless
@@ -68,7 +69,7 @@ class Still:
         x, y = RIGHT_AT
         size = LIDAR_WIDTH, SMALL
         frame = self._lidar_frame
-        depth = images.lidar_rgb(frame.depth_m, *self._span_m)
+        depth = images.lidar_rgb(frame.depth_m, *self._span.of(frame.depth_m))
         page.picture((x, y), "What the lidar sees: depth", depth, size)
         infrared = np.repeat(images.infrared_grey(frame.ir)[..., np.newaxis], 3, axis=-1)
         page.picture((x, y + LOWER), "Infrared", infrared, size)
@@ -182,10 +183,6 @@ def _fitted(rgb: UInt8, width: int, height: int) -> UInt8:
 
 
 FRAMES_PER_S = 15.0
-SLACK_S = 0.01
-"""Frames come at 30 per second: every second is filmed, and not every third because of a
-thousandth.
-"""
 LIDAR_EVERY = 5
 CODEC = "VP80"
 
@@ -202,7 +199,7 @@ class VideoFile:
         """Pictures."""
         self._path = path
         self._still: Still | None = None
-        self._due_s = float("-inf")
+        self._schedule = Schedule(1.0 / FRAMES_PER_S)
 
     def __enter__(self) -> Self:
         self._writer = _writer(self._path)
@@ -213,9 +210,8 @@ class VideoFile:
 
     def show(self, moment: Moment) -> None:
         """Add a moment if one is due."""
-        if moment.time_s < self._due_s:
+        if not self._schedule.is_due(moment.time_s):
             return
-        self._due_s = moment.time_s + 1.0 / FRAMES_PER_S - SLACK_S
         self._still = self._still or Still(moment)
         rgb = self._still.rgb(moment, with_lidar=self.filmed % LIDAR_EVERY == 0)
         self._writer.write(rgb[..., ::-1].copy())

@@ -32,6 +32,30 @@ class Moment:
         return cls(result, result.timestamp_s, sum(stages_s.values()), celsius=celsius or {})
 
 
+SLACK_S = 0.01
+"""Frames come at 30 per second: of a schedule of 0.1 s every third is due, and not every fourth
+because of a thousandth.
+"""
+
+
+class Schedule:
+    """Times a period apart by the moments' own clock; begins anew where that clock falls back."""
+
+    def __init__(self, period_s: float) -> None:
+        self._period_s = period_s
+        self._last_s = float("-inf")
+        self._due_s = float("-inf")
+
+    def is_due(self, time_s: float) -> bool:
+        """Return True for the first moment after each period; give it every moment, in order."""
+        fell_back = time_s < self._last_s
+        self._last_s = time_s
+        if time_s < self._due_s and not fell_back:
+            return False
+        self._due_s = time_s + self._period_s - SLACK_S
+        return True
+
+
 class Controls(Protocol):
     """Status and commands of a run, for a page; both may be called from any thread."""
 

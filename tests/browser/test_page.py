@@ -79,6 +79,36 @@ def test_page_says_ended_and_comes_back_with_the_next_run(browser: Any) -> None:
         page.close()
 
 
+def test_page_keeps_the_moments_of_a_new_reference(browser: Any) -> None:
+    with WebViewer(RIG) as viewer:
+        viewer.show(full_moment(0))
+        page = Page(browser, viewer.address or "").drawn()
+        viewer.show(full_moment(300))
+        page.wait_until(lambda: page.state()["time_s"] == 10, "time passes")
+        viewer.begin(RIG)
+        for number in (400, 403):
+            viewer.show(full_moment(number))
+            page.wait_until(lambda n=number: page.state()["frame"] == n, "a moment of the new one")
+        assert page.page.evaluate("kept.moments.map((each) => each.frame)") == [400, 403]
+        page.close()
+
+
+def test_plot_without_values_is_empty(browser: Any) -> None:
+    with WebViewer(RIG) as viewer:
+        viewer.show(replace(full_moment(0), celsius={}))
+        page = Page(browser, viewer.address or "")
+        page.page.evaluate(
+            "window.texts = []; const write = CanvasRenderingContext2D.prototype.fillText;"
+            " CanvasRenderingContext2D.prototype.fillText = function (text, ...at) {"
+            " texts.push(text); return write.call(this, text, ...at); }; undefined"
+        )
+        page.drawn().page.click("#tabs button[data-panel='plots']")
+        page.wait_until(lambda: page.page.evaluate("texts.length") > 0, "the plots")
+        assert "Infinity" not in page.page.evaluate("texts")
+        assert page.errors == []
+        page.close()
+
+
 def test_five_pages_and_one_that_never_reads_share_a_view(browser: Any) -> None:
     with WebViewer(RIG) as viewer, socket.socket() as deaf:
         viewer.show(full_moment(0))

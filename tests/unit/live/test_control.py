@@ -33,7 +33,7 @@ from nlos_cam.live.statistics import WARM_UP_FRAMES
 from nlos_cam.reconstruct import CalibratedRig, Pipeline
 from nlos_cam.reconstruct.bench import NOT_MEASURED
 from nlos_cam.recording import WallFile, load_sidecar
-from nlos_cam.view import NullViewer, WrittenFiles
+from nlos_cam.view import NullViewer, SessionFile, WrittenFiles
 
 
 @pytest.fixture
@@ -127,6 +127,15 @@ def test_session_is_saved_between_two_commands(control: RunControl, tmp_path: Pa
 
     assert shown[0] == 30
     assert set(shown) <= set(range(30, 60))
+
+
+def test_session_that_stopped_is_told(control: RunControl, monkeypatch: pytest.MonkeyPatch) -> None:
+    control.run("save_session", {})
+    monkeypatch.setattr(SessionFile, "problem", "the session is full")
+
+    assert "the session is full" in control.status()["warnings"]
+    assert "the session is full" in control.run("end_session", {})
+    assert control.status()["warnings"] == []
 
 
 def test_average_changes_the_pipeline(control: RunControl) -> None:

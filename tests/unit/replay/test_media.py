@@ -1,23 +1,24 @@
 from dataclasses import replace
 from pathlib import Path
+from threading import Event
 from typing import Any
 
 import cv2
 import numpy as np
 import pytest
 from fake_wall import wall_frame
-from made_up_moments import full_moment
+from made_up_moments import full_moment, with_result
 from matplotlib.figure import Figure
 from replays import BENCH, NAMES, replay_moments
-from small_frames import NOTHING, result_of
+from small_frames import NOTHING, FrameCamera, SheetNetwork, result_of
 from view_streams import saved_moments
 
 from nlos_cam.frames import LidarMaps, maps_from_frame
-from nlos_cam.reconstruct import FrameResult, Verdict
-from nlos_cam.replay import REPORT, VIDEO, ReplayMedia
+from nlos_cam.reconstruct import FrameResult, Pipeline, Verdict
+from nlos_cam.replay import REPORT, VIDEO, ReplayMedia, replay_recording
 from nlos_cam.replay.media import VIEW, FrameSampler, draw_contact_sheet
 from nlos_cam.replay.replay import RESULT
-from nlos_cam.view import Moment
+from nlos_cam.view import Moment, Still
 
 FULL = full_moment(0)
 
@@ -54,6 +55,42 @@ def test_video_has_every_second_frame(media: Path) -> None:
 
 def test_view_has_every_third_frame(media: Path) -> None:
     assert [each["frame"] for each in saved_moments(media / VIEW)] == list(range(0, 30, 3))
+
+
+@pytest.fixture(scope="module")
+def fallen(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Folder of a replay of frames 0 to 4 twice, as a device counts that restarts."""
+    out = tmp_path_factory.mktemp("fallen")
+    camera = FrameCamera(10, make=lambda number: full_moment(number % 5).result.frame)
+    camera.intrinsics = FULL.result.frame.intrinsics
+    media = ReplayMedia(BENCH, view=True, stills=10, video=True, objects=["csv", "points"])
+    replay_recording(camera, Pipeline(BENCH, SheetNetwork()), out, stop=Event(), media=media)
+    return out
+
+
+def test_number_that_comes_again_overwrites_no_file(fallen: Path) -> None:
+    names = {path.name for path in (fallen / "object").iterdir()}
+
+    assert len(names) == 20
+    assert names > {"000003.csv", "000003-2.csv", "000003-points.ply", "000003-2-points.ply"}
+    assert len(list(fallen.glob("still-*.png"))) == 10
+
+
+def test_view_and_video_go_on_where_the_time_falls_back(fallen: Path) -> None:
+    video = cv2.VideoCapture(str(fallen / VIDEO))
+    frames = [each["frame"] for each in saved_moments(fallen / VIEW)]
+
+    assert frames == [0, 3, 0, 3]
+    assert video.get(cv2.CAP_PROP_FRAME_COUNT) == 6
+
+
+def test_still_of_a_blind_start_has_the_later_frames_colors() -> None:
+    blind_m = np.full_like(FULL.result.frame.depth_m, np.nan)
+    blind = with_result(FULL, frame=replace(FULL.result.frame, depth_m=blind_m))
+    still = Still(blind)
+    still.rgb(blind)
+
+    np.testing.assert_array_equal(still.rgb(FULL), Still(FULL).rgb(FULL))
 
 
 def test_media_change_no_result(media: Path, tmp_path: Path) -> None:

@@ -133,6 +133,15 @@ def test_interrupted_replay_keeps_its_results(tmp_path: Path) -> None:
     assert "Interrupted" in text_of(out)
 
 
+def test_replay_stopped_before_a_frame_is_no_bad_recording(tmp_path: Path) -> None:
+    stop = Event()
+    stop.set()
+    with pytest.raises(KeyboardInterrupt):
+        replay_noise(tmp_path / "out", 9, stop=stop)
+
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_replay_of_an_empty_recording_writes_nothing(tmp_path: Path) -> None:
     with pytest.raises(RecordingError, match="no frame"):
         replay_noise(tmp_path / "out", 0)

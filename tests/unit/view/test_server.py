@@ -197,6 +197,17 @@ def test_names_of_a_host_are_this_machines() -> None:
     assert not names_of("127.0.0.1", "127.0.0.1")(socket.gethostname() + ".evil.example")
 
 
+@pytest.mark.parametrize(
+    ("host", "address"), [("127.0.0.2", "127.0.0.2"), ("bench.lan", "127.0.1.1")]
+)
+def test_names_of_a_loopback_host_are_itself_alone(host: str, address: str) -> None:
+    is_known = names_of(host, address)
+
+    assert all(is_known(name) for name in (f"{host.upper()}:9090", f"{address}:1", "localhost"))
+    assert not any(is_known(name) for name in ("evil.example", f"{host}.evil.example", "10.0.0.1"))
+    assert not names_of("", address)("")
+
+
 def test_loopback_is_told_from_hosts_that_others_can_reach() -> None:
     for host, loopback in (("127.0.0.1", True), ("localhost", True), (EVERYWHERE, False)):
         family, address = resolved(host)

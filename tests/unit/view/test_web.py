@@ -2,7 +2,7 @@ import base64
 import json
 import threading
 from collections.abc import Iterator
-from contextlib import closing
+from contextlib import ExitStack, closing
 from dataclasses import replace
 from pathlib import Path
 from threading import Event
@@ -13,11 +13,12 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from made_up_moments import NOTHING, RIG, bump, full_moment, moment, with_result
+from made_up_moments import NO_MAPS, NOTHING, RIG, bump, full_moment, moment, with_result
 from measured_walls import exact_wall
 from view_streams import ask, messages, messages_of, saved_moments
 
 from nlos_cam.errors import RecordingError
+from nlos_cam.frames import LidarMaps
 from nlos_cam.objects import object_box
 from nlos_cam.reconstruct.network import Quality, Uncertainty
 from nlos_cam.reconstruct.verdict import Verdict
@@ -32,7 +33,7 @@ from nlos_cam.view.messages import (
     signed_bytes,
     unpack,
 )
-from nlos_cam.view.session_file import MAX_BYTES, SessionFile
+from nlos_cam.view.session_file import FALL_S, MAX_BYTES, Chunks, SessionFile
 from nlos_cam.view.viewer import Viewers
 
 
@@ -218,6 +219,69 @@ def test_session_that_cannot_be_written_is_an_error(
     monkeypatch.setattr(base64, "b64encode", lambda _: 1 / 0)
     with pytest.raises(ZeroDivisionError), SessionFile(tmp_path / "view.html", RIG) as session:
         session.show(moment(0))
+
+
+def test_full_session_has_a_problem_that_names_the_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("nlos_cam.view.session_file.MAX_BYTES", 1)
+    with SessionFile(tmp_path / "view.html", RIG, keeps_all=True) as session:
+        assert session.problem == ""
+        for number in range(0, 300, 3):
+            session.show(moment(number))
+
+    assert "view.html is full" in session.problem
+
+
+def test_session_that_the_disk_ends_has_a_problem(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(base64, "b64encode", Mock(side_effect=OSError(28, "No space left")))
+    entered = ExitStack()
+    session = entered.enter_context(SessionFile(tmp_path / "view.html", RIG))
+    session._thread.join()
+    session.show(moment(0))
+    with pytest.raises(OSError, match="No space"):
+        entered.close()
+
+    assert "view.html ended early (No space left)" in session.problem
+    assert str(tmp_path) not in session.problem
+    assert session.left_out == 0
+
+
+def test_session_goes_on_where_the_time_falls_back(tmp_path: Path) -> None:
+    with SessionFile(tmp_path / "view.html", RIG, keeps_all=True) as session:
+        for number in (*range(100, 130), *range(30)):
+            session.show(full_moment(number))
+    found = saved_moments(tmp_path / "view.html")
+
+    assert [each["frame"] for each in found] == [*range(100, 130, 3), *range(0, 30, 3)]
+
+
+def test_times_of_chunks_never_fall() -> None:
+    chunks = Chunks(MomentPacker())
+    made = [chunks.add(full_moment(number)) for number in (*range(600, 640), *range(40))]
+    made.append(chunks.rest())
+    times_s = [each for chunk in made if chunk for each in unpack(chunk)[0]["times_s"]]
+
+    assert len(times_s) == 80
+    assert times_s == sorted(times_s)
+    assert times_s[-1] == pytest.approx(39 / 30 + FALL_S + 39 / 30, abs=1e-3)
+
+
+def test_scales_wait_for_the_first_frame_with_depth() -> None:
+    far_m = np.linspace(-0.3, 0.3, 64 * 80, dtype=np.float32).reshape(64, 80)
+    difference = LidarMaps(far_m, far_m, np.isfinite(far_m))
+    full = with_result(full_moment(0), difference=difference)
+    depth_m = np.full_like(full.result.frame.depth_m, np.nan)
+    blind = with_result(full, frame=replace(full.result.frame, depth_m=depth_m), difference=NO_MAPS)
+    packer = MomentPacker()
+    before, first, later = (unpack(packer.pack(each))[0] for each in (blind, full, full_moment(1)))
+    expected = unpack(MomentPacker().pack(full))[0]
+
+    assert before["lidar_span_m"] == [0.0, 1.0]
+    for name in ("lidar_span_m", "change_span_m"):
+        assert first[name] == later[name] == expected[name] != before[name]
 
 
 def test_viewers_show_every_moment_and_begin_all_or_none() -> None:

@@ -1,0 +1,74 @@
+"""View of a recording: its status and its one command, export."""
+
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from threading import Event
+
+import numpy as np
+import pytest
+from made_up_moments import full_moment
+from replays import BENCH
+from small_frames import FrameCamera, SheetNetwork
+
+from nlos_cam.errors import NlosCamError
+from nlos_cam.replay import Playback
+
+
+def recording() -> FrameCamera:
+    """Return a recording of frames 0 to 4 twice, as a device counts that restarts."""
+    frames = [full_moment(number).result.frame for number in (*range(60, 65), *range(60, 65))]
+    for number, frame in enumerate(frames):
+        object.__setattr__(frame, "timestamp_s", 100.0 + number / 30)
+    camera = FrameCamera(len(frames), make=frames.__getitem__, uri="bag:/home/someone/run.bag")
+    camera.intrinsics = frames[0].intrinsics
+    return camera
+
+
+@pytest.fixture
+def playback(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Playback]:
+    """A playback that has reconstructed its recording; exports go to a folder of the test."""
+    monkeypatch.setattr("nlos_cam.replay.playback.open_camera", lambda _: recording())
+    networks = SheetNetwork(), None
+    with Playback(recording(), BENCH, networks, folder=tmp_path, host="127.0.0.1") as playback:
+        playback.reconstruct(Event())
+        yield playback
+
+
+def exported_s(folder: Path) -> float:
+    """Return the timestamp of the exported frame."""
+    with np.load(next(folder.glob("*.npz"))) as arrays:
+        return float(arrays["timestamp_s"])
+
+
+def test_page_names_the_recording_without_its_folder(playback: Playback) -> None:
+    assert playback.status()["camera"] == "bag:run.bag"
+
+
+def test_export_takes_the_frame_shown_of_two_of_a_number(
+    playback: Playback, tmp_path: Path
+) -> None:
+    playback.run("export", {"frame": 61, "time_s": 0.2})
+    assert exported_s(tmp_path) == pytest.approx(100.2)
+
+
+def test_export_by_number_alone_takes_the_first(playback: Playback, tmp_path: Path) -> None:
+    playback.run("export", {"frame": 61})
+    assert exported_s(tmp_path) == pytest.approx(100.0 + 1 / 30)
+
+
+@pytest.mark.parametrize(
+    "arguments", [{"frame": 99}, {"frame": 61, "time_s": 7}, {"frame": 61, "time_s": "now"}]
+)
+def test_export_of_no_frame_is_refused(
+    playback: Playback, tmp_path: Path, arguments: dict[str, object]
+) -> None:
+    with pytest.raises(NlosCamError, match=r"frame"):
+        playback.run("export", arguments)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_export_into_a_lost_folder_says_why(playback: Playback, tmp_path: Path) -> None:
+    tmp_path.rmdir()
+    with pytest.raises(NlosCamError, match=re.escape(str(tmp_path))):
+        playback.run("export", {"frame": 61})
