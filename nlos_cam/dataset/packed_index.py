@@ -124,7 +124,7 @@ class StoreIndex:
 
 
 def shard_key(shard: Shard) -> str:
-    """Return what tells a shard's samples from others, wherever it lies: digits of its plan, which
+    """Return the key of a shard's samples, the same wherever it lies: digits of its plan, which
     decides them, and its name; of recordings, which no plan decides, also digits of the samples.
     """
     digest = hashlib.sha256(shard.provenance.encode())
@@ -136,7 +136,7 @@ def shard_key(shard: Shard) -> str:
 
 
 def data_key(dataset: Dataset) -> str:
-    """Return what tells a dataset's samples from others, wherever it lies: its plan; of recordings,
+    """Return the key of a dataset's samples, the same wherever it lies: its plan; of recordings,
     which no plan decides, also the keys of its shards.
     """
     keys = map(shard_key, dataset.shards) if dataset.plan.accuracy == RECORDED else ()

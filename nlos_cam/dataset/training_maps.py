@@ -49,7 +49,7 @@ class MapSplit(NamedTuple):
     rig: tuple[str, str]
     """Name and checksum of the rig that the maps are of, or aligned with."""
     key: str
-    """What tells the maps from others of the same objects."""
+    """Key of the maps: other maps of the same objects have another."""
 
     @property
     def digest(self) -> str:
@@ -157,7 +157,7 @@ def read_maps(
 
 
 def _key_of(datasets: Sequence[Dataset], measured: BareMaps | None) -> str:
-    """Return what tells the maps of datasets, less a measured bare wall, from others."""
+    """Return the key of the maps of datasets, less a measured bare wall."""
     # A rendered bare wall follows from the plan, which `data_key` has.
     wall = hashlib.sha256()
     for values in measured or ():

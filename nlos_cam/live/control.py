@@ -151,7 +151,7 @@ class RunControl:
         """End recording and session while the camera still runs; errors are logged, since the run
         ends anyway.
 
-        A command that runs is waited for. None begins any more: nobody would end what it began.
+        A command that runs is waited for. No other begins, since what it starts would have no end.
         """
         self._run.ended = True
         with self._command_lock:

@@ -23,7 +23,7 @@ OBJECT_FORMATS = ("ply", "glb", "obj", "csv", "npz", "points")
 @dataclass
 class ObjectFiles:
     """Writer of each frame's hidden surface, named by its number, in every format; skips frames
-    without one. A number that comes again, as a device that restarts counts anew, gets a suffix.
+    without one. A number that comes again, as after a restart of the device, gets a suffix.
     """
 
     folder: Path

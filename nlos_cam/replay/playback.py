@@ -30,7 +30,7 @@ SAME_S = 1e-3
 
 
 class Playback(PlaybackViewer):
-    """View of a recording, served while entered. `reconstruct` fills it; the page plays meanwhile.
+    """View of a recording, served while entered. `reconstruct` fills it while the page plays.
 
     Its one command, `export`, writes a frame's arrays, picture and mesh into `folder`. Its arguments
     are the frame's number and, as a number may come again, `time_s` as the page shows it; without
