@@ -190,7 +190,7 @@ def main(arguments: list[str]) -> int:
 
 
 def _escape_foreign_characters() -> None:
-    """Print characters that the locale does not have as escapes, not as an error of the encoding."""
+    """Print characters that the locale does not have as escapes, not as an encoding error."""
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")
