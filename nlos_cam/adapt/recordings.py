@@ -15,6 +15,7 @@ from nlos_models import training
 
 from nlos_cam import dataset as data
 from nlos_cam.errors import RecordingError, SceneError
+from nlos_cam.reconstruct import differences_of
 from nlos_cam.recording import load_sidecar, sidecar_path
 
 RECORDINGS = "recordings"
@@ -130,15 +131,9 @@ def find_recordings(
 
 def _is_as_before(recorded: Rig, rig: Rig) -> bool:
     """Return whether two calibrations can be of one bench that has not moved."""
-    one, other = recorded.lidar, rig.lidar
-    lengths_m = [(one.distance_m, other.distance_m)]
-    if recorded.occluder and rig.occluder:
-        lengths_m.append((recorded.occluder.x_m, rig.occluder.x_m))
-        lengths_m.append((recorded.occluder.z_min_m, rig.occluder.z_min_m))
-    angles_deg = (one.yaw_deg, other.yaw_deg), (one.pitch_deg, other.pitch_deg)
-    return max(abs(a - b) for a, b in lengths_m) <= TOLERANCE_M and (
-        max(abs(a - b) for a, b in angles_deg) <= TOLERANCE_DEG
-    )
+    apart = differences_of(recorded, rig)
+    moved_m = max(apart.distance_m, apart.occluder_m)
+    return moved_m <= TOLERANCE_M and apart.turned_deg <= TOLERANCE_DEG
 
 
 def write_parts(found: Recordings, folder: Path, tracked: data.Tracked) -> dict[Part, Path]:

@@ -233,8 +233,8 @@ def _read(
     truths_m = np.repeat(truth_m[None], len(recorded), axis=0)
     image = shapes.image_from_depth(truths_m, shapes.object_box(bench.rig)).astype(np.float16)
     return Labelled(
-        maps=_map_set([own.correct(maps) for maps in recorded], image),
-        recorded=_map_set(recorded, image),
+        maps=as_map_set([own.correct(maps) for maps in recorded], image),
+        recorded=as_map_set(recorded, image),
         object_depth_m=truths_m,
         label=(sidecar.label,) * len(recorded),
         recording=(path.name,) * len(recorded),
@@ -242,9 +242,9 @@ def _read(
     )
 
 
-def _map_set(maps: Sequence[LidarMaps], image: Float16) -> MapSet:
-    depth_m = np.stack([one.depth_m for one in maps])
-    return MapSet(depth_m, np.stack([one.intensity for one in maps]), image)
+def as_map_set(maps: Sequence[LidarMaps], image: Float16 | Float32) -> MapSet:
+    """Return maps with their true images v (n, 64, 64)."""
+    return MapSet(np.stack([m.depth_m for m in maps]), np.stack([m.intensity for m in maps]), image)
 
 
 def spread(count: int, wanted: int) -> frozenset[int]:

@@ -18,7 +18,7 @@ from nlos_models.training import MapSet, subtract_bare_wall
 from nlos_cam import dataset as data
 from nlos_cam import objects as shapes
 from nlos_cam.camera import OnProgress, World
-from nlos_cam.dataset import Tracked, untracked
+from nlos_cam.dataset import Tracked, as_map_set, untracked
 from nlos_cam.errors import SceneError
 from nlos_cam.evaluate import baselines as trivial
 from nlos_cam.evaluate.metrics import Predictions
@@ -103,11 +103,6 @@ def _averaged(world: World, numbers: Sequence[int]) -> LidarMaps:
     mean = MapMean(len(numbers))
     frames = (world.images(number).frame(world.rig.pinhole) for number in numbers)
     return [mean.add(maps_from_frame(frame)) for frame in frames][-1]
-
-
-def as_map_set(maps: Sequence[LidarMaps], truth: Float32) -> MapSet:
-    """Return maps with their true images v (n, 64, 64)."""
-    return MapSet(np.stack([m.depth_m for m in maps]), np.stack([m.intensity for m in maps]), truth)
 
 
 def reconstruct_all(reconstructor: Reconstructor, maps: MapSet) -> Float32:

@@ -37,6 +37,7 @@ __all__ = [
     "compatibility_warnings",
     "describe_counts",
     "describe_failure",
+    "differences_of",
     "edge_cells",
     "estimate_uncertainty",
     "frame_issues",
@@ -96,7 +97,7 @@ from .pipeline import (
     load_uncertainty,
     verdict_limits,
 )
-from .serving import WeightsVerdict, weights_for, weights_serve
+from .serving import WeightsVerdict, differences_of, weights_for, weights_serve
 from .streaming import iterate_batched, iterate_results, warm_up
 from .summaries import (
     OnWarning,

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Literal, NamedTuple
 
 from nlos_calibration import DISTANCE_RANGE_M, FACING_RANGE_DEG, Rig, rig_difference
 from nlos_models import RIG_WEIGHTS, CheckpointRecord, load_record, shipped_folder
@@ -134,15 +134,32 @@ def _deviation(rig: Rig, wanted: Rig) -> float:
     """Return the largest difference of two rigs, in units of the limits within which they are
     near.
     """
+    apart = differences_of(rig, wanted)
+    return max(
+        apart.distance_m / NEAR_M,
+        apart.turned_deg / NEAR_DEG,
+        apart.occluder_m / NEAR_OCCLUDER_M,
+    )
+
+
+class RigDifferences(NamedTuple):
+    """Absolute differences of two rigs."""
+
+    distance_m: float
+    """Of the lidars from the wall."""
+    turned_deg: float
+    """The larger of yaw and pitch."""
+    occluder_m: float
+    """The larger of the occluders' edges and gaps; 0 where a rig has none."""
+
+
+def differences_of(rig: Rig, other: Rig) -> RigDifferences:
+    """Return how far apart two rigs are."""
     here = rig.lidar
-    there = wanted.lidar
+    there = other.lidar
     turned_deg = max(abs(here.yaw_deg - there.yaw_deg), abs(here.pitch_deg - there.pitch_deg))
     moved_m = 0.0
-    if rig.occluder and wanted.occluder:
-        along_m = abs(rig.occluder.x_m - wanted.occluder.x_m)
-        moved_m = max(along_m, abs(rig.occluder.z_min_m - wanted.occluder.z_min_m))
-    return max(
-        abs(here.distance_m - there.distance_m) / NEAR_M,
-        turned_deg / NEAR_DEG,
-        moved_m / NEAR_OCCLUDER_M,
-    )
+    if rig.occluder and other.occluder:
+        along_m = abs(rig.occluder.x_m - other.occluder.x_m)
+        moved_m = max(along_m, abs(rig.occluder.z_min_m - other.occluder.z_min_m))
+    return RigDifferences(abs(here.distance_m - there.distance_m), turned_deg, moved_m)

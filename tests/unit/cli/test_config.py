@@ -42,6 +42,18 @@ def folders(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[Path, Path
     return here, users / "nlos-cam"
 
 
+def serve_as_live(monkeypatch: pytest.MonkeyPatch, command: Callable[..., None]) -> None:
+    """Let the program have one command, `live`, which is this function."""
+
+    def build_app(_: str | None) -> typer.Typer:
+        app = typer.Typer()
+        app.callback()(lambda: None)
+        app.command("live")(shared_options("live", command))
+        return app
+
+    monkeypatch.setattr(module, "build_app", build_app)
+
+
 @pytest.fixture
 def live(monkeypatch: pytest.MonkeyPatch) -> list[dict[str, Any]]:
     """The values that a command named live was called with."""
@@ -52,13 +64,7 @@ def live(monkeypatch: pytest.MonkeyPatch) -> list[dict[str, Any]]:
     ) -> None:
         calls.append({"camera": camera, "wall": wall, "view_port": view_port})
 
-    def build_app(_: str | None) -> typer.Typer:
-        app = typer.Typer()
-        app.callback()(lambda: None)
-        app.command("live")(shared_options("live", command))
-        return app
-
-    monkeypatch.setattr(module, "build_app", build_app)
+    serve_as_live(monkeypatch, command)
     return calls
 
 
@@ -168,13 +174,7 @@ def test_bench_of_the_settings_gives_way_to_what_is_given(
         found = bench_folder, wall, weights
         calls.append(tuple(None if one is None else str(one) for one in found))
 
-    def build_app(_: str | None) -> typer.Typer:
-        app = typer.Typer()
-        app.callback()(lambda: None)
-        app.command("live")(shared_options("live", command))
-        return app
-
-    monkeypatch.setattr(module, "build_app", build_app)
+    serve_as_live(monkeypatch, command)
     text = 'bench = "mine"\nwall = "wall.toml"\nweights = "own"\n'
     Path(FILE).write_text(text, encoding="utf-8")
 
@@ -205,13 +205,7 @@ def test_bench_names_the_lidar_that_measured_it(
         del bench_folder
         calls.append(camera)
 
-    def build_app(_: str | None) -> typer.Typer:
-        app = typer.Typer()
-        app.callback()(lambda: None)
-        app.command("live")(shared_options("live", command))
-        return app
-
-    monkeypatch.setattr(module, "build_app", build_app)
+    serve_as_live(monkeypatch, command)
 
     assert main(["live", *words]) == 0
     assert calls == [camera]
