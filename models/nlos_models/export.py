@@ -14,9 +14,11 @@ import onnx
 import torch
 from numpy.typing import NDArray
 from onnx import TensorProto, helper, numpy_helper
+from onnxscript import ir
+from pydantic import BaseModel
 from torch import Tensor, nn
 
-from nlos_cam.files import write_checked
+from nlos_cam.files import cache_folder, load_cached, write_checked
 from nlos_models import inference
 from nlos_models.arrays import Float32
 from nlos_models.byte_weights import GROUP, SCALE, from_bytes
@@ -36,6 +38,8 @@ from nlos_models.uncertainty_network import load_uncertainty_network
 OPSET = 18
 IR_VERSION = 10
 """ONNX Runtime 1.20 reads both."""
+TRACES = "traces"
+"""Folder in the cache: of graphs by their network's architecture."""
 NORM_EPSILON = np.float32(1e-5)
 """Of torch's batch norms."""
 
@@ -166,13 +170,38 @@ def write_onnx(
 def _as_onnx(
     network: nn.Module, inputs: Mapping[str, tuple[int, int]], outputs: list[str]
 ) -> onnx.ModelProto:
+    """Return a network as torch's exporter makes it.
+
+    The exporter traces a network for tens of seconds, and the trace depends on its architecture
+    alone: it is kept in the cache without weights, and those of this network are entered.
+    """
+    network = network.eval()
+    weights = {name: tensor.numpy(force=True) for name, tensor in network.state_dict().items()}
+
+    def entered(trace: bytes) -> onnx.ModelProto:
+        model = onnx.ModelProto.FromString(trace)
+        for initializer in model.graph.initializer:
+            if initializer.name in weights:
+                values = numpy_helper.from_array(weights[initializer.name], initializer.name)
+                initializer.CopyFrom(values)
+        return model
+
+    path = cache_folder() / TRACES / f"{_architecture_of(network, inputs, outputs)}.onnx"
+    model = load_cached(path, entered, lambda: _trace(network, inputs, outputs))
+    program = torch.onnx.ONNXProgram(ir.serde.deserialize_model(model), None)
+    program.optimize()
+    return program.model_proto
+
+
+def _trace(network: nn.Module, inputs: Mapping[str, tuple[int, int]], outputs: list[str]) -> bytes:
+    """Return the ONNX graph of a network's architecture, not optimized: its weights are empty."""
     # The exporter reports its passes at the level of warnings.
     for noisy in ("onnxscript", "torch.onnx"):
         logging.getLogger(noisy).setLevel(logging.ERROR)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # the exporter warns about its own internals
         program = torch.onnx.export(
-            network.eval(),
+            network,
             # Two samples: with one, the exporter takes the batch for a constant.
             tuple(torch.ones(2, *shape) for shape in inputs.values()),
             dynamo=True,
@@ -181,6 +210,7 @@ def _as_onnx(
             dynamic_shapes=tuple({0: torch.export.Dim("n")} for _ in inputs),
             opset_version=OPSET,
             verbose=False,
+            optimize=False,  # which folds weights into other numbers
         )
     if program is None:
         raise ModelError(
@@ -188,7 +218,39 @@ def _as_onnx(
         )
     model = program.model_proto
     model.ir_version = IR_VERSION
-    return model
+    names = set(network.state_dict())
+    for initializer in model.graph.initializer:
+        if initializer.name in names:
+            initializer.ClearField("raw_data")
+    for node in model.graph.node:  # places in the source
+        node.doc_string = ""
+        del node.metadata_props[:]
+    return model.SerializeToString()
+
+
+def _architecture_of(
+    network: nn.Module, inputs: Mapping[str, tuple[int, int]], outputs: list[str]
+) -> str:
+    """Return a checksum of all that a trace depends on: exporter, this package's code, the modules
+    and their settings, and the shapes of their weights.
+    """
+    digest = _digest_of_code()
+    digest.update(repr((sorted(inputs.items()), outputs)).encode())
+    for name, module in network.named_modules():
+        settings = {
+            key: value
+            for key, value in vars(module).items()
+            if not key.startswith("_")
+            and isinstance(value, bool | int | float | str | tuple | BaseModel)
+        }
+        digest.update(repr((name, type(module).__qualname__, sorted(settings.items()))).encode())
+    weights = network.state_dict()
+    for name, tensor in sorted(weights.items()):
+        digest.update(repr((name, tuple(tensor.shape), str(tensor.dtype))).encode())
+    for name, tensor in sorted(network.named_buffers()):
+        if name not in weights:  # a constant of the trace
+            digest.update(name.encode() + tensor.contiguous().numpy(force=True).tobytes())
+    return digest.hexdigest()[:16]
 
 
 KINDS = {"F16": "<f2", "F32": "<f4", "I8": "<i1"}
@@ -286,9 +348,6 @@ def _linked_graph(
     # A graph's nodes are in the order of their use: those that make weights come first.
     rest = list(model.graph.node)
     del model.graph.node[:]
-    for node in rest:
-        node.doc_string = ""
-        del node.metadata_props[:]
     model.graph.node.extend([*nodes, *rest])
     helper.set_model_props(model, {inference.CHECKSUM: checksum_of_watched(folder, sources)})
     return model.SerializeToString()
@@ -382,10 +441,17 @@ def checksum_of(network: nn.Module) -> str:
     """Return a checksum of all that an exported network depends on: exporter, weights and this
     package's code.
     """
-    # Code as well as weights: a changed forward pass exports to another graph.
-    digest = hashlib.sha256(f"{torch.__version__} {OPSET}".encode())
-    for source in sorted(Path(__file__).parent.glob("*.py")):
-        digest.update(source.read_bytes())
+    digest = _digest_of_code()
     for name, tensor in sorted(network.state_dict().items()):
         digest.update(name.encode() + tensor.contiguous().numpy().tobytes())
     return digest.hexdigest()[:16]
+
+
+def _digest_of_code() -> Any:
+    """Return a digest of the exporter and this package's code: a changed forward pass exports to
+    another graph.
+    """
+    digest = hashlib.sha256(f"{torch.__version__} {OPSET}".encode())
+    for source in sorted(Path(__file__).parent.glob("*.py")):
+        digest.update(source.read_bytes())
+    return digest

@@ -37,16 +37,16 @@ class Setting(NamedTuple):
 SETTINGS = {
     "camera": Setting(frozenset({"live", "capture", "calibrate", "detect"}), "sim", "CAMERA"),
     "wall": Setting(
-        frozenset({"live", "replay", "capture", "detect"}),
+        frozenset({"live", "replay", "view", "capture", "detect"}),
         None,
         "--wall, unless another CAMERA is given",
     ),
     "bench": Setting(
-        frozenset({"live", "replay", "capture", "evaluate", "detect", "predict"}),
+        frozenset({"live", "replay", "view", "capture", "evaluate", "detect", "predict"}),
         None,
         "--bench, unless another CAMERA, --wall or --rig is given",
     ),
-    "weights": Setting(frozenset({"live", "replay", "evaluate"}), None, "--weights"),
+    "weights": Setting(frozenset({"live", "replay", "view", "evaluate"}), None, "--weights"),
     "view_port": Setting(frozenset({"live", "view"}), None, "--view-port"),
     "cache": Setting(frozenset(), None, "folder for rendered scenes and exported networks"),
 }
@@ -128,6 +128,10 @@ def _checked(path: Path, name: str, value: object) -> str | int:
         raise RecordingError(f"{path}: {name} must be a text in quotes (got {value!r:.40})")
     scheme, colon, rest = value.rpartition(":") if name == "camera" else ("", "", value)
     is_path = name != "camera" or rest.endswith((".toml", ".bag"))
+    if name == "weights":
+        from nlos_models import SHIPPED  # not for the help page
+
+        is_path = value not in SHIPPED or (path.parent / value).exists()
     return f"{scheme}{colon}{path.parent / Path(rest).expanduser()}" if is_path else value
 
 
@@ -277,10 +281,14 @@ def _is_bench(name: str) -> bool:
 
 
 def _choose_bench(values: Mapping[str, Any], used: dict[str, Value]) -> None:
-    """Drop the settings that contradict the bench, wall, rig or dataset that was given.
+    """Drop the settings that contradict the bench, wall, rig, dataset or saved session that was
+    given.
 
     A bench has its own wall and weights, so those of the settings are for commands without one.
     """
+    if Path(values.get("file") or "").suffix == ".html":  # it holds its pictures
+        for name in ("bench", "wall", "weights"):
+            used.pop(name, None)
     if any(values.get(name) is not None for name in ("wall", "rig", "data")):
         used.pop("bench", None)
     if values.get("bench_folder") is not None or ("bench" in used and used["bench"].value):

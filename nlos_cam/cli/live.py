@@ -165,8 +165,6 @@ def live(
         common.say(f"Recorded {recording.sets} frames to {recording.path}")
         if recording.error:
             common.say(f"note: {recording.error}")
-    if view_file:
-        common.say(f"Saved the view: open {view_file} in a browser")
     text = summary(report, verbose=common.Detail.verbose)
     common.finish(asdict(report), as_json=json, text=text)
     if stop.is_set():

@@ -214,3 +214,5 @@ def saving(
             say(f"[yellow]warning:[/] {escape(session.problem)}", marked=True)
         elif session.left_out:
             say(f"note: {path} lacks {session.left_out} moments for which there was no time")
+    if not session.problem:
+        say(f"Saved the view: open {path} in a browser")

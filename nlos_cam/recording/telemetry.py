@@ -36,11 +36,12 @@ class Telemetry:
     def watch(self, frames: Iterable[Frame]) -> Iterator[Frame]:
         """Yield the same frames, and read when due."""
         first_s = None
-        due_s = float("-inf")
+        read_s = float("-inf")
         for frame in frames:
-            if frame.timestamp_s >= due_s:
+            # A clock that went back starts the interval again.
+            if not read_s <= frame.timestamp_s < read_s + self._every_s:
                 first_s = frame.timestamp_s if first_s is None else first_s
-                due_s = frame.timestamp_s + self._every_s
+                read_s = frame.timestamp_s
                 if celsius := self._read(frame.timestamp_s - first_s):
                     self._readings.append((frame.frame_number, celsius))
             yield frame

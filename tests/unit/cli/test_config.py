@@ -42,13 +42,13 @@ def folders(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[Path, Path
     return here, users / "nlos-cam"
 
 
-def serve_as_live(monkeypatch: pytest.MonkeyPatch, command: Callable[..., None]) -> None:
-    """Let the program have one command, `live`, which is this function."""
+def serve_as(monkeypatch: pytest.MonkeyPatch, name: str, command: Callable[..., None]) -> None:
+    """Let the program have one command of this name, which is this function."""
 
     def build_app(_: str | None) -> typer.Typer:
         app = typer.Typer()
         app.callback()(lambda: None)
-        app.command("live")(shared_options("live", command))
+        app.command(name)(shared_options(name, command))
         return app
 
     monkeypatch.setattr(module, "build_app", build_app)
@@ -64,7 +64,7 @@ def live(monkeypatch: pytest.MonkeyPatch) -> list[dict[str, Any]]:
     ) -> None:
         calls.append({"camera": camera, "wall": wall, "view_port": view_port})
 
-    serve_as_live(monkeypatch, command)
+    serve_as(monkeypatch, "live", command)
     return calls
 
 
@@ -104,6 +104,39 @@ def test_paths_of_the_users_file_are_relative_to_it(folders: tuple[Path, Path]) 
 
     assert settings["wall"].value == str(folders[1] / "bench.toml")
     assert settings["camera"].value == f"sim:{folders[1] / 'scene.toml'}"
+
+
+def test_shipped_weights_are_named_in_the_users_file(folders: tuple[Path, Path]) -> None:
+    (folders[1] / FILE).write_text('weights = "wide"', encoding="utf-8")
+    named = read_settings({})["weights"].value
+    (folders[1] / "wide").mkdir()
+    folder = read_settings({})["weights"].value
+
+    assert (named, folder) == ("wide", str(folders[1] / "wide"))
+
+
+@pytest.mark.parametrize(
+    ("file", "given"), [("run.bag", ("mine", None)), ("view.html", (None, None))]
+)
+def test_bench_of_the_settings_is_for_recordings_in_view(
+    monkeypatch: pytest.MonkeyPatch, file: str, given: tuple[str | None, ...]
+) -> None:
+    calls: list[tuple[str | None, ...]] = []
+
+    def command(
+        file: Path,
+        wall: Path | None = None,
+        bench_folder: Annotated[Path | None, typer.Option("--bench")] = None,
+        weights: Path | None = None,
+    ) -> None:
+        del file, wall
+        calls.append(tuple(None if one is None else str(one) for one in (bench_folder, weights)))
+
+    serve_as(monkeypatch, "view", command)
+    Path(FILE).write_text('bench = "mine"\nweights = "own"\n', encoding="utf-8")
+
+    assert main(["view", file]) == 0
+    assert calls == [given]
 
 
 WRONG = {'camrea = "sim"': "Did you mean 'camera'", "camera = 3": "text", "camera = ": "TOML"}
@@ -174,7 +207,7 @@ def test_bench_of_the_settings_gives_way_to_what_is_given(
         found = bench_folder, wall, weights
         calls.append(tuple(None if one is None else str(one) for one in found))
 
-    serve_as_live(monkeypatch, command)
+    serve_as(monkeypatch, "live", command)
     text = 'bench = "mine"\nwall = "wall.toml"\nweights = "own"\n'
     Path(FILE).write_text(text, encoding="utf-8")
 
@@ -205,7 +238,7 @@ def test_bench_names_the_lidar_that_measured_it(
         del bench_folder
         calls.append(camera)
 
-    serve_as_live(monkeypatch, command)
+    serve_as(monkeypatch, "live", command)
 
     assert main(["live", *words]) == 0
     assert calls == [camera]

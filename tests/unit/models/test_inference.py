@@ -14,6 +14,7 @@ import torch
 from nlos_models import errors, export, inference
 from nlos_models.checkpoint import load_network, load_pipeline
 from nlos_models.compressor import Compressor
+from nlos_models.direct import DirectNetwork
 from nlos_models.errors import CheckpointError, MissingExtraError, ModelError
 from nlos_models.export import TorchReconstructor
 from nlos_models.inference import (
@@ -32,6 +33,7 @@ from nlos_models.records import (
 )
 from nlos_models.training import checkpoints
 from nlos_models.training.checkpoints import save_pipeline
+from nlos_models.training.recipe import DirectSize
 from nlos_models.uncertainty_network import load_uncertainty_network
 from nlos_models.vae import Decoder
 from small_maps import HARD_MAPS, hard_maps, noise_maps
@@ -140,6 +142,29 @@ def test_exports_are_named_by_their_weights(pipeline: RemappingNetwork) -> None:
 
     assert export.checksum_of(pipeline) == before
     assert export.checksum_of(RemappingNetwork(pipeline.compressor, Decoder())) != before
+
+
+@pytest.mark.slow
+def test_trace_of_an_architecture_serves_other_weights(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("NLOS_CAM_CACHE", str(tmp_path))
+    size = DirectSize(features=8, width=8, blocks=1, token=8, mixers=1)
+    first, second = (DirectNetwork(size).eval() for _ in range(2))
+    maps = noise_maps(3)
+    export.export_onnx(first)
+    with monkeypatch.context() as patch:
+        patch.setattr(export, "_trace", lambda *_: pytest.fail("traced again"))
+        graph = OnnxReconstructor(export.export_onnx(second), RECORD)
+
+    found = graph.answer(*maps)
+    wanted = TorchReconstructor(second, RECORD, "cpu").answer(*maps)
+    np.testing.assert_allclose(found.surface, wanted.surface, atol=1e-5)
+    np.testing.assert_allclose(found.image, wanted.image, atol=1e-4)
+
+    second.norm.eps = 1.0  # of the same weights, another function
+    other = OnnxReconstructor(export.export_onnx(second), RECORD)
+    assert not np.allclose(other.answer(*maps).surface, wanted.surface, atol=1e-3)
 
 
 @pytest.mark.slow

@@ -1,4 +1,5 @@
 from collections.abc import Mapping
+from dataclasses import replace
 from datetime import UTC, datetime
 from itertools import count as count_up
 from pathlib import Path
@@ -47,6 +48,15 @@ def test_telemetry_is_read_periodically_by_the_frames_clock() -> None:
 
     assert list(telemetry.watch(FRAMES)) == FRAMES
     assert [call.args[0] for call in read.call_args_list] == pytest.approx([0.0, 1.0, 2.0, 3.0])
+
+
+def test_a_clock_that_goes_back_does_not_stop_the_readings() -> None:
+    telemetry = Telemetry(warming(), every_s=1.0)
+    later = [replace(frame, timestamp_s=frame.timestamp_s + 3600.0) for frame in FRAMES[:2]]
+
+    given = readings(telemetry, [*later, *FRAMES[2:]])
+
+    assert [bool(celsius) for celsius in given][:6] == [True, False, True, False, False, True]
 
 
 def test_readings_of_dropped_frames_are_superseded() -> None:
