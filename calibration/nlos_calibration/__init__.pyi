@@ -11,7 +11,6 @@ __all__ = [
     "QUANTUM_M",
     "TOLERANCE_DEG",
     "TOLERANCE_M",
-    "UNUSABLE",
     "WINDOW_FRAMES",
     "BareWall",
     "BareWallStatistics",
@@ -66,6 +65,7 @@ __all__ = [
     "load_rig",
     "load_wall",
     "measures_of",
+    "missing_wall",
     "new_wall_record",
     "normal_from_angles",
     "on_plane",
@@ -79,6 +79,7 @@ __all__ = [
     "save_reference",
     "settings_changed",
     "turn_problem",
+    "view_difference_deg",
     "wall_depth",
     "wall_facts",
     "wall_from_plane",
@@ -137,8 +138,10 @@ from .rig_check import (
     corner_rays,
     footprint,
     lidar_visible_share,
+    missing_wall,
     on_plane,
     rig_difference,
+    view_difference_deg,
 )
 from .summary import board_agreement, wall_facts
 from .wall import (
@@ -152,7 +155,6 @@ from .wall import (
     wall_depth,
 )
 from .wall_record import (
-    UNUSABLE,
     MeasuredWall,
     WallRecord,
     depth_offset_m,

@@ -128,6 +128,8 @@ class OccluderRecord(Record):
     """Tilt of the sheet against the plane x = x_m, about wall y; positive leans away from the
     lidar.
     """
+    warnings: tuple[str, ...] = ()
+    """Remarks of its measurement, which are among the wall record's too."""
 
 
 class LidarPose(Record):
@@ -209,6 +211,32 @@ class Rig(Record):
         # Pydantic writes fields in the order of their declaration, and floats in their shortest
         # exact form: equal rigs give equal bytes on every machine.
         return hashlib.sha256(self.model_dump_json().encode()).hexdigest()[:12]
+
+    def seen_from(self, eye_m: NDArray[np.float64]) -> "Rig":
+        """Return the same bench with the lidar at another point (3,) of the wall frame, in that
+        point's own wall frame, whose origin is its foot.
+        """
+        along_m, up_m, distance_m = (float(value) for value in eye_m)
+
+        def moved(part: Extent | Occluder | ObjectBox) -> dict[str, float]:
+            lengths = part.model_dump()
+            for name in lengths:
+                if name.startswith("x_"):
+                    lengths[name] -= along_m
+                elif name.startswith("y_"):
+                    lengths[name] -= up_m
+            return lengths
+
+        changed: dict[str, object] = {
+            "lidar": self.lidar.model_copy(update={"distance_m": distance_m}),
+            "wall": Extent(**moved(self.wall)),
+            "relay": Extent(**moved(self.relay)),
+        }
+        if self.occluder:
+            changed["occluder"] = Occluder(**moved(self.occluder))
+        if self.object_box:
+            changed["object_box"] = ObjectBox(**moved(self.object_box))
+        return self.model_copy(update=changed)
 
 
 def first_problem(error: ValidationError) -> str:

@@ -34,6 +34,7 @@ def rig_difference(rig: Rig, other: Rig) -> tuple[str, ...]:
         _turned("pitch", lidar.pitch_deg - theirs.pitch_deg),
         *_occluder(rig, other),
         _field(rig.pinhole, other.pinhole),
+        _wall(rig, other),
         "another object box" if rig.object_box != other.object_box else "",
         "other device constants" if rig.device != other.device else "",
     ]
@@ -64,21 +65,49 @@ def _occluder(rig: Rig, other: Rig) -> tuple[str, ...]:
 
 
 def _field(here: Intrinsics, there: Intrinsics) -> str:
-    # Angles, not focal lengths: the same view at another resolution is no difference.
+    if (apart_deg := view_difference_deg(here, there)) <= TOLERANCE_DEG:
+        return ""
     across, down = _view_angles_deg(here)
     across_there, down_there = _view_angles_deg(there)
     if max(abs(across - across_there), abs(down - down_there)) <= TOLERANCE_DEG:
-        return ""
+        return f"a view whose middle is {apart_deg:.1f} degrees aside"
     return (
         f"a field of view of {across:.1f} x {down:.1f} degrees, not {across_there:.1f} x"
         f" {down_there:.1f}"
     )
 
 
+def view_difference_deg(here: Intrinsics, there: Intrinsics) -> float:
+    """Return the largest angle in degrees between the same edges of two fields of view, or between
+    their widths or heights.
+    """
+    # Angles, not pixels: the same view at another resolution is no difference.
+    edges = np.arctan(_view_edges(here)) - np.arctan(_view_edges(there))
+    widths = edges[:, 1] - edges[:, 0]
+    return float(np.degrees(max(np.abs(edges).max(), np.abs(widths).max())))
+
+
 def _view_angles_deg(pinhole: Intrinsics) -> tuple[float, float]:
     """Return the width and height of the field of view in degrees."""
     (left, right), (top, bottom) = _view_edges(pinhole)
     return degrees(atan(right) - atan(left)), degrees(atan(bottom) - atan(top))
+
+
+SMALLER_WALL = 0.02
+"""Share of the view that a wall may leave out and still be called the same."""
+
+
+def _wall(rig: Rig, other: Rig) -> str:
+    if (missing := missing_wall(rig, other)) <= SMALLER_WALL:
+        return ""
+    return f"a smaller wall, which {missing:.0%} of the view misses"
+
+
+def missing_wall(rig: Rig, other: Rig) -> float:
+    """Return the share of a rig's view that would meet the other rig's wall, and misses its own."""
+    pose = rig.wall_from_lidar
+    own, theirs = (footprint(pose, rig.pinhole, wall) for wall in (rig.wall, other.wall))
+    return float((theirs.on_wall & ~own.on_wall).mean())
 
 
 MAP_SHAPE = 64, 80

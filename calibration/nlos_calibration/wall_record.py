@@ -13,6 +13,7 @@ from pydantic import BeforeValidator, Field, model_validator
 
 from nlos_calibration.arrays import Float64
 from nlos_calibration.board_wall import BoardRecord, WallByBoard
+from nlos_calibration.errors import CalibrationError
 from nlos_calibration.geometry import Intrinsics
 from nlos_calibration.gravity import Gravity, WayUp
 from nlos_calibration.occluder import OccluderFit
@@ -107,6 +108,9 @@ class WallRecord(Record):
     reference_sha256: Annotated[str, Field(pattern="^([0-9a-f]{64})?$")] = ""
     verdict: Verdict
     advice: str
+    wall_verdict: Verdict | None = None
+    """Of the wall alone, like `wall_advice`: without the rig's problems. None in older records."""
+    wall_advice: str = ""
     warnings: tuple[str, ...] = ()
     rig: Rig
 
@@ -129,6 +133,18 @@ class WallRecord(Record):
                 "wall_from_lidar differs from the pose of rig.lidar: measure the wall again"
             )
         return self
+
+    @property
+    def beam_rig(self) -> Rig:
+        """Rig of the lidar's beams: with the lidar where they meet, and in the wall frame of that
+        point's foot.
+
+        `rig` has the lidar in its front glass, which tapes and rulers reach. A range offset whose
+        cause is the origin lies between the two: some millimetres of distance and of foot.
+        """
+        if self.range_offset_cause != "origin":
+            return self.rig
+        return self.rig.seen_from(wall_from_zero(self)[:3, 3])
 
 
 def new_wall_record(
@@ -164,44 +180,51 @@ def new_wall_record(
     }
     verdict, advice = combined(fit.verdict, fit.advice, judge_rig(rig, view, occluder))
     measured |= {"verdict": verdict, "advice": advice, **(others or {})}
+    measured |= {"wall_verdict": fit.verdict, "wall_advice": fit.advice}
     return WallRecord.model_validate(
         measured | {"camera": camera, "frames": frames, "created": created, "rig": rig}
     )
 
 
 UNUSABLE = "do not use this record"
+"""How the advice of an older record begins that was taken with something hidden."""
 
 
 def with_occluder(record: WallRecord, fit: OccluderFit) -> WallRecord:
     """Return the record with an occluder that was detected since.
 
-    Signs of a hidden object make it doubtful. Doubts about the wall itself stay; remarks on the
-    previous occluder, the paper's or an earlier one, go.
+    Doubts about the wall itself stay; remarks on the previous occluder, the paper's or an earlier
+    one, go. Raises CalibrationError where something seems to be hidden.
     """
+    if fit.why_unusable:
+        raise CalibrationError(f"{fit.why_unusable}; remove the object and measure again")
     measured = {
         name: value for name, value in vars(fit).items() if name in OccluderRecord.model_fields
     }
     occluder = OccluderRecord(source="detected", **measured)
     rig = rig_with_occluder(record.rig, occluder.x_m, occluder.gap_m)
     pose = np.array(record.wall_from_lidar)
-    # The verdict joins the wall's doubts with the rig's problems in one sentence. Those of the
-    # previous occluder are taken out of it again; a wall without doubts is judged anew by its
-    # range.
-    if record.verdict == "doubtful" and not record.advice.startswith(UNUSABLE):
-        view = footprint(pose, record.rig.pinhole, record.rig.wall)
-        earlier = "".join(f"; {one}" for one in judge_rig(record.rig, view, record.occluder))
-        verdict = record.verdict
-        advice = record.advice.removesuffix(earlier)
-    else:
-        verdict, advice = range_verdict(record.distance_m, record.facing_deg)
+    verdict, advice = _of_wall_alone(record)
     problems = judge_rig(rig, footprint(pose, rig.pinhole, rig.wall), occluder)
     verdict, advice = combined(verdict, advice, problems)
-    if fit.why_unusable:
-        verdict = "doubtful"
-        advice = f"{UNUSABLE}: {fit.why_unusable}; remove the object and measure again"
     changed = {"occluder": occluder, "rig": rig, "verdict": verdict, "advice": advice}
-    changed |= {"warnings": tuple(dict.fromkeys((*record.warnings, *fit.warnings)))}
+    former = record.occluder.warnings if record.occluder else ()
+    of_wall = [one for one in record.warnings if one not in former]
+    changed |= {"warnings": tuple(dict.fromkeys((*of_wall, *fit.warnings)))}
     return WallRecord.model_validate(record.model_dump() | changed)
+
+
+def _of_wall_alone(record: WallRecord) -> tuple[Verdict, str]:
+    """Return a record's verdict and advice without the problems of its rig and occluder."""
+    if record.wall_verdict is not None:
+        return record.wall_verdict, record.wall_advice
+    # An older record joins the wall's doubts with the rig's problems in one sentence, from which
+    # these are taken out again; a wall without doubts is judged anew by its range.
+    if record.verdict == "doubtful" and not record.advice.startswith(UNUSABLE):
+        view = footprint(np.array(record.wall_from_lidar), record.rig.pinhole, record.rig.wall)
+        earlier = "".join(f"; {one}" for one in judge_rig(record.rig, view, record.occluder))
+        return record.verdict, record.advice.removesuffix(earlier)
+    return range_verdict(record.distance_m, record.facing_deg)
 
 
 def load_wall(path: Path) -> WallRecord:
@@ -213,9 +236,9 @@ def load_wall(path: Path) -> WallRecord:
 
 def rig_named(name: str) -> Rig:
     """Return a packaged rig by name, or the rig of a file: a rig.toml, or the wall.toml that
-    `calibrate` writes.
+    `calibrate` writes, as its beams see it.
     """
-    return load_wall(Path(name)).rig if is_wall_record(name) else load_rig(name)
+    return load_wall(Path(name)).beam_rig if is_wall_record(name) else load_rig(name)
 
 
 def is_wall_record(name: str) -> bool:

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from nlos_calibration.arrays import Float32, Float64, Mask
 from nlos_calibration.noise import depth_noise_m, measured_noise
+from nlos_calibration.plane import MIN_SCALE
 from nlos_calibration.reference import BareWall
 
 GRID = 18, 24
@@ -90,7 +91,8 @@ def noise_scale(reference: BareWall) -> float:
     depth_m, spread_m = (
         array.ravel().astype(np.float64) for array in (reference.depth_m, reference.depth_std_m)
     )
-    return measured_noise(depth_m, spread_m, np.full(depth_m.size, reference.frames)).scale
+    scale = measured_noise(depth_m, spread_m, np.full(depth_m.size, reference.frames)).scale
+    return max(scale, MIN_SCALE)
 
 
 class WallTrack:

@@ -9,7 +9,7 @@ import json
 from pathlib import Path
 from typing import Annotated
 
-from nlos_calibration import MeasuredWall, Record
+from nlos_calibration import MeasuredWall, Record, depth_offset_m
 from nlos_models.training import DirectRecipe, UncertaintyRecipe
 from pydantic import Field, ValidationError
 
@@ -218,5 +218,6 @@ def bench_sensor(measured: MeasuredWall | None) -> SensorModel:
     if measured is None or measured.reference is None:
         return SensorModel()
     record = measured.record
-    counts = measured_counts(record.rig, measured.reference, record.range_offset_m)
+    offset_m = depth_offset_m(record)
+    counts = measured_counts(record.beam_rig, measured.reference, offset_m)
     return SensorModel() if counts is None else SensorModel(bare_wall_counts=max(counts, 1.0))

@@ -133,7 +133,8 @@ def _is_as_before(recorded: Rig, rig: Rig) -> bool:
     """Return whether two calibrations can be of one bench that has not moved."""
     apart = differences_of(recorded, rig)
     moved_m = max(apart.distance_m, apart.occluder_m)
-    return moved_m <= TOLERANCE_M and apart.turned_deg <= TOLERANCE_DEG
+    turned_deg = max(apart.turned_deg, apart.view_deg)
+    return moved_m <= TOLERANCE_M and turned_deg <= TOLERANCE_DEG
 
 
 def write_parts(found: Recordings, folder: Path, tracked: data.Tracked) -> dict[Part, Path]:

@@ -536,6 +536,7 @@ def _train_network(
             trained=inputs.trained,
             growth=shards_of,
             frame=inputs.frame,
+            locked=job.locked is not None,
         )
         with store as source:
             record = training.record_run(recipe, out, inputs.rig, runs, before, bench=inputs.bench)
@@ -553,7 +554,8 @@ def _first_objects(job: Adaptation, stage: Stage, rendering: _Rendering) -> list
     """Wait for a stage's first objects, and return them shard by shard."""
     count = min(FIRST_OBJECTS, stage.objects)
     rendering.wait_for(count)
-    return list(islice(data.open_dataset(job.folder / OBJECTS).chunks(), count // data.SHARD))
+    objects = data.open_dataset(job.folder / OBJECTS, locked=True)
+    return list(islice(objects.chunks(), count // data.SHARD))
 
 
 def _test_set(

@@ -9,11 +9,11 @@ __all__ = [
     "ForecastRecord",
     "ServingNetworks",
     "StationRecord",
-    "camera_to_name",
     "check_new",
     "edit_bench",
     "iou_in_use",
     "is_bench",
+    "load_bare_wall",
     "load_bench",
     "load_bench_record",
     "load_serving",
@@ -30,7 +30,7 @@ from .edit import (
     iou_in_use,
     write_weights,
 )
-from .folder import Bench, camera_to_name, load_bench
+from .folder import Bench, load_bare_wall, load_bench
 from .record import (
     MAIN,
     MANIFEST,

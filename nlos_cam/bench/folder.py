@@ -17,7 +17,7 @@ from nlos_cam.bench.record import (
     load_bench_record,
     sha256_of,
 )
-from nlos_cam.camera import SIMULATED_SERIAL, Camera
+from nlos_cam.camera import Camera
 from nlos_cam.files import CHECKSUMS
 from nlos_cam.reconstruct import CalibratedRig, check_intrinsics, occluder_assumed
 
@@ -41,15 +41,9 @@ class Bench:
         return self.stations[self.station]
 
     @property
-    def bare(self) -> walls.MeasuredWall:
-        """Bare wall of the station in use, as it was before the occluder, with the object box."""
-        path = self.folder / self.record.stations[self.station].wall
-        return _with_box(walls.load_measured(path), self.rig.object_box)
-
-    @property
     def rig(self) -> walls.Rig:
-        """Rig of the station in use."""
-        return self.measured.record.rig
+        """Rig of the station in use, as its lidar's beams see it."""
+        return self.measured.record.beam_rig
 
     @property
     def wall(self) -> Path:
@@ -119,14 +113,6 @@ class Bench:
         return (occluder_assumed(self.folder),)
 
 
-def camera_to_name(wall: walls.WallRecord) -> str:
-    """Return the camera of a command to type next on a measured wall: the lidar that measured it,
-    or a scene in capitals, since a simulated bench is another scene before and after the occluder.
-    """
-    is_simulated = wall.serial == SIMULATED_SERIAL or wall.camera.startswith("sim")
-    return "sim:SCENE.toml" if is_simulated else "l515"
-
-
 def load_bench(folder: str | Path, station: str = MAIN, *, weights: bool = True) -> Bench:
     """Load a bench folder, and check its files against their checksums and each other.
 
@@ -145,29 +131,47 @@ def load_bench(folder: str | Path, station: str = MAIN, *, weights: bool = True)
     return Bench(folder, record, stations, station, folder / WEIGHTS if has_weights else None)
 
 
+def load_bare_wall(folder: str | Path, station: str = MAIN) -> walls.MeasuredWall:
+    """Load the bare wall of a bench's station, as it was before the occluder, with the object box.
+
+    Of the other files none is read: the occluder's, which are to be replaced, may be lost or
+    damaged. Raises RecordFileError.
+    """
+    folder = Path(folder)
+    record = load_bench_record(folder)
+    place = record.stations[station]
+    if place.wall in record.files:
+        _check_file(folder, record, place.wall)
+    return _with_box(walls.load_measured(folder / place.wall), place.object_box)
+
+
 def _check_files(folder: Path, record: BenchRecord, *, weights: bool) -> None:
     for one in record.stations.values():
         if one.in_use not in record.files:
             raise RecordFileError(
                 f"{folder / MANIFEST} has no checksum of {one.in_use}: calibrate the bench again"
             )
-    for name, digest in record.files.items():
-        if name.startswith(f"{WEIGHTS}/") and not weights:
-            continue
-        path = folder / name
-        again = "adapt" if name.startswith(f"{WEIGHTS}/") else "calibrate"
-        try:
-            found = sha256_of(path)
-        except OSError as error:
-            raise RecordFileError(
-                f"{path} of the bench cannot be read ({error.strerror}): put it back, or"
-                f" {again} the bench again"
-            ) from error
-        if found != digest:
-            raise RecordFileError(
-                f"{path} has changed since the bench was written (its checksum differs from"
-                f" {MANIFEST}): put the original back, or {again} the bench again"
-            )
+    for name in record.files:
+        if weights or not name.startswith(f"{WEIGHTS}/"):
+            _check_file(folder, record, name)
+
+
+def _check_file(folder: Path, record: BenchRecord, name: str) -> None:
+    """Raise RecordFileError where a file of a bench is lost or has changed."""
+    path = folder / name
+    again = "adapt" if name.startswith(f"{WEIGHTS}/") else "calibrate"
+    try:
+        found = sha256_of(path)
+    except OSError as error:
+        raise RecordFileError(
+            f"{path} of the bench cannot be read ({error.strerror}): put it back, or"
+            f" {again} the bench again"
+        ) from error
+    if found != record.files[name]:
+        raise RecordFileError(
+            f"{path} has changed since the bench was written (its checksum differs from"
+            f" {MANIFEST}): put the original back, or {again} the bench again"
+        )
 
 
 def _measured(folder: Path, record: BenchRecord, station: StationRecord) -> walls.MeasuredWall:

@@ -2,16 +2,18 @@
 fitted to them.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from datetime import datetime
 from functools import partial
 from itertools import islice
-from math import hypot
+from math import ceil, hypot
+from typing import Any
 
 import nlos_calibration as walls
 import numpy as np
-from nlos_calibration.arrays import Float32
+from nlos_calibration.arrays import Float64
 from nlos_calibration.errors import CalibrationError, WallRefusedError
 from numpy.typing import NDArray
 
@@ -21,6 +23,10 @@ from nlos_cam.reconstruct import check_intrinsics
 
 CELSIUS_EVERY = 30
 """Frames between temperature readings: each costs a command to the device."""
+PARTS = 4
+"""Parts of a capture whose walls are compared: the lidar must stand still from the first to the
+last."""
+MIN_PART_FRAMES = 15
 
 
 @dataclass(frozen=True)
@@ -36,6 +42,8 @@ class CaptureStatistics:
     settings: Mapping[str, float]
     gravity_m_s2: walls.Gravity | None = None
     """By the accelerometer's last second; None without one."""
+    parts_m: Sequence[Float64] = ()
+    """Mean depth of each part of the capture, of `thinned` frames."""
 
     def reference(self, inliers: NDArray[np.bool_]) -> walls.BareWall:
         """Return the bench's reference for difference maps; `inliers` (height, width) are the
@@ -83,9 +91,15 @@ def collect_statistics(
     statistics = walls.BareWallStatistics(camera.intrinsics)
     settings = dict[str, float]()
     gravity_m_s2: walls.Gravity | None = None
+    parts: list[walls.DepthMean] = []
+    part_frames = max(MIN_PART_FRAMES, ceil(frames / PARTS))
     for number, frame in enumerate(islice(camera, frames)):
         maps = maps_from_frame(frame)
         statistics.add(frame.depth_m, frame.ir, maps.depth_m, maps.intensity)
+        few_m, _ = thinned(frame.depth_m, frame.intrinsics)
+        if number % part_frames == 0:
+            parts.append(walls.DepthMean(*few_m.shape))
+        parts[-1].add(few_m)
         settings = dict(frame.settings)
         gravity_m_s2 = frame.gravity_m_s2 or gravity_m_s2
         if number % CELSIUS_EVERY == 0:
@@ -98,7 +112,14 @@ def collect_statistics(
     serial = camera.identity.get("serial", "")
     firmware = camera.identity.get("firmware", "")
     return CaptureStatistics(
-        camera.uri, statistics, camera.intrinsics, serial, firmware, settings, gravity_m_s2
+        camera.uri,
+        statistics,
+        camera.intrinsics,
+        serial,
+        firmware,
+        settings,
+        gravity_m_s2,
+        tuple(part.mean_m() for part in parts),
     )
 
 
@@ -143,8 +164,10 @@ def measure_by_depth(
     """Fit the wall to its depth; return the fit and the record's range-offset fields, by the
     distance by tape or else as an earlier record has `known` them.
 
-    Raises WallRefusedError, and CalibrationError where tape and lidar cannot both be right.
+    Raises WallRefusedError, also where the lidar moved meanwhile, and CalibrationError where tape
+    and lidar cannot both be right.
     """
+    _raise_if_disturbed(capture)
     if tape_m is None:
         return _fit_with_known_offset(capture, known) if known else (_fit_depth(capture, 0.0), {})
 
@@ -200,8 +223,10 @@ def measure_by_board(
     the record's fields of board and range offset.
 
     The board is searched in the mean infrared. Where its squares were measured (`square_mm`) and it
-    contradicts the depth, a range offset that explains this is corrected. Raises BoardRefusedError.
+    contradicts the depth, a range offset that explains this is corrected. Raises BoardRefusedError,
+    and WallRefusedError where the lidar moved meanwhile.
     """
+    _raise_if_disturbed(capture)
     try:
         depth = measure_by_depth(capture)[0]
     except WallRefusedError as error:
@@ -267,6 +292,7 @@ def measure_occluder(
         return walls.fit_wall(wall_m, capture.intrinsics, generator, noise, origin_m)
 
     wall = fit_beside(beside)
+    _raise_if_disturbed(capture, np.isfinite(beside))
     if bare.reference is None:
         _raise_if_moved(record, wall)
     else:
@@ -310,7 +336,38 @@ def _in_common(
 
 
 def _raise_if_moved(then: walls.WallRecord | walls.WallFit, wall: walls.WallFit) -> None:
-    """Raise WallRefusedError if the lidar has moved since the bare wall was as `then`.
+    """Raise WallRefusedError if the lidar has moved since the bare wall was as `then`."""
+    if moved := _how_moved(then, wall):
+        raise WallRefusedError(
+            f"the lidar has moved since the bare wall was measured: {moved}: calibrate the bare"
+            " wall again, then put the occluder back"
+        )
+
+
+def _raise_if_disturbed(
+    capture: CaptureStatistics, of_wall: NDArray[np.bool_] | None = None
+) -> None:
+    """Raise WallRefusedError if the lidar moved while the capture was taken; `of_wall` (height,
+    width) are the pixels of the wall where it does not fill the view.
+    """
+    everywhere = np.ones((capture.intrinsics.height, capture.intrinsics.width), bool)
+    seen, few = thinned(everywhere if of_wall is None else of_wall, capture.intrinsics)
+    fits: list[walls.WallFit] = []
+    for part_m in capture.parts_m:
+        with suppress(WallRefusedError):  # the whole capture's own refusal says why
+            wall_m = np.where(seen, part_m, np.nan)
+            fits.append(walls.fit_wall(wall_m, few, np.random.default_rng(0)))
+    for later in fits[1:]:
+        if moved := _how_moved(fits[0], later):
+            raise WallRefusedError(
+                f"the lidar moved while it measured the wall: {moved}: let it stand still, and"
+                " measure again"
+            )
+
+
+def _how_moved(then: walls.WallRecord | walls.WallFit, wall: walls.WallFit) -> str:
+    """Return in words how the lidar stands against a wall that was as `then`; empty within the
+    tolerances.
 
     Yaw and pitch are compared, not the facing angle: on a wall faced obliquely, pitch hardly
     changes that.
@@ -320,12 +377,10 @@ def _raise_if_moved(then: walls.WallRecord | walls.WallFit, wall: walls.WallFit)
     pitch_deg = wall.pitch_deg - then.pitch_deg
     turn_deg = max(abs(yaw_deg), abs(pitch_deg))
     if abs(apart_m) <= walls.TOLERANCE_M and turn_deg <= walls.TOLERANCE_DEG:
-        return
-    raise WallRefusedError(
-        "the lidar has moved since the bare wall was measured: the wall is"
-        f" {1e3 * abs(apart_m):.1f} mm {'farther' if apart_m > 0 else 'nearer'}, the lidar turned"
-        f" by {yaw_deg:+z.2f} degrees in yaw and {pitch_deg:+z.2f} in pitch: calibrate the bare"
-        " wall again, then put the occluder back"
+        return ""
+    return (
+        f"the wall is {1e3 * abs(apart_m):.1f} mm {'farther' if apart_m > 0 else 'nearer'}, the"
+        f" lidar turned by {yaw_deg:+z.2f} degrees in yaw and {pitch_deg:+z.2f} in pitch"
     )
 
 
@@ -358,11 +413,13 @@ def fit_frame(frame: Frame) -> FrameFit:
         return FrameFit(None, str(error), saturated)
 
 
-def thinned(depth_m: Float32, intrinsics: walls.Intrinsics) -> tuple[Float32, walls.Intrinsics]:
-    """Return every n-th pixel of every n-th row, and their intrinsics."""
+def thinned(
+    image: NDArray[Any], intrinsics: walls.Intrinsics
+) -> tuple[NDArray[Any], walls.Intrinsics]:
+    """Return every n-th pixel of every n-th row of an image, and their intrinsics."""
     step = max(1, round(intrinsics.width / MAX_FIT_COLUMNS))
     first = step // 2
-    few = depth_m[first::step, first::step]
+    few = image[first::step, first::step]
     center = (intrinsics.ppx - first) / step, (intrinsics.ppy - first) / step
     return few, walls.Intrinsics(
         few.shape[1], few.shape[0], intrinsics.fx / step, intrinsics.fy / step, *center

@@ -9,6 +9,7 @@ import nlos_calibration as walls
 
 from nlos_cam.calibrate.report_drawings import bench_picture, footprint_picture
 from nlos_cam.calibrate.report_maps import wall_maps
+from nlos_cam.camera import camera_to_name
 from nlos_cam.report import Picture, bullets, commands, figure, page, pairs, table
 
 BAR_WIDTH = 640.0
@@ -214,15 +215,12 @@ def device(wall: walls.MeasuredWall) -> str:
 
 def usage(record: walls.WallRecord, record_file: str) -> str:
     """Return the files that belong together, and the commands that use them."""
-    facts = {"record": record_file, "rig's checksum": record.rig.checksum}
+    facts = {"record": record_file, "rig's checksum": record.beam_rig.checksum}
     if record.reference:
         facts |= {"bare wall's reference": record.reference, "its SHA-256": record.reference_sha256}
     name = shlex.quote(record_file)
-    kind = record.camera.split(":", maxsplit=1)[0]
-    camera = {"sim": "sim", "bag": "l515"}.get(kind, shlex.quote(record.camera))
-    lines = commands(
-        [f"nlos-cam live --camera {camera} --wall {name}", f"nlos-cam render cup --rig {name}"]
-    )
+    live = f"nlos-cam live --camera {camera_to_name(record)} --wall {name}"
+    lines = commands([live, f"nlos-cam render cup --rig {name}"])
     use = (
         "Keep the files together. The first command shows the hidden object live; the second"
         " renders for this bench."

@@ -22,6 +22,7 @@ __all__ = [
     "SoftwareLidar",
     "WallClock",
     "World",
+    "camera_to_name",
     "check_room",
     "connected",
     "find_l515",
@@ -48,7 +49,7 @@ from .accelerometer import gravity_of
 from .l515 import DeviceInfo, connected, find_l515, shared_context
 from .protocol import SIMULATED_SERIAL, Camera, OnProgress, WallClock
 from .recorder import RESERVE_BYTES, Recording, check_room, free_bytes, recording_s, repair_command
-from .registry import NAMES, SIMULATED, full_uri, open_camera
+from .registry import NAMES, SIMULATED, camera_to_name, full_uri, open_camera
 from .sdk import MAC_WHEEL, WHEEL, load_sdk
 from .session import find_streams
 from .simulated import SimulatedCamera, SoftwareLidar

@@ -6,7 +6,9 @@ from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from nlos_cam.camera.protocol import Camera, OnProgress
+from nlos_calibration import WallRecord
+
+from nlos_cam.camera.protocol import SIMULATED_SERIAL, Camera, OnProgress
 from nlos_cam.errors import NlosCamError, UnknownCameraError, did_you_mean
 
 if TYPE_CHECKING:
@@ -69,3 +71,11 @@ def full_uri(uri: str) -> str:
     """Return a camera's name; that of a recording's path, run.bag, is bag:run.bag."""
     is_path = uri.endswith((".bag", ".db3", ".mcap")) or (Path(uri) / "metadata.yaml").is_file()
     return f"bag:{uri}" if is_path and not uri.startswith(("bag:", "sim:", "l515:")) else uri
+
+
+def camera_to_name(wall: WallRecord) -> str:
+    """Return the camera of a command to type next on a measured wall: the lidar that measured it,
+    or a scene in capitals, since a simulated bench is another scene before and after the occluder.
+    """
+    is_simulated = wall.serial == SIMULATED_SERIAL or wall.camera.startswith("sim")
+    return "sim:SCENE.toml" if is_simulated else "l515"

@@ -12,6 +12,7 @@ import typer
 
 from nlos_cam import adapt as adaptation
 from nlos_cam import bench as benches
+from nlos_cam import camera as cameras
 from nlos_cam import dataset, forecast, objects, render
 from nlos_cam import evaluate as evaluation
 from nlos_cam.cli import common
@@ -147,7 +148,7 @@ def adapt(
         more += f" --frames {locked.frames} --radiometry {locked.radiometry}"
         more += f" --pulse-ns {sensor.pulse_ns:g} --material {material or 'matt'}"
     if folder and kept:
-        camera = benches.camera_to_name(measured.record) if measured else "l515"
+        camera = cameras.camera_to_name(measured.record) if measured else "l515"
         commands = [f"nlos-cam live --camera {camera} --bench {name}"]
     more += f" --out {shlex.quote(str(out))}" if out else ""
     commands.append(more)

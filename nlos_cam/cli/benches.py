@@ -153,7 +153,7 @@ def bench_or_rig(name: str | Path) -> tuple[walls.Rig, walls.MeasuredWall | None
     else:
         return walls.rig_named(name), None
     _note_doubt(name, measured.record)
-    return measured.record.rig, measured
+    return measured.record.beam_rig, measured
 
 
 def store_forecast(folder: Path) -> None:

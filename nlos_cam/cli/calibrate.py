@@ -289,7 +289,7 @@ def calibrate(
     if target.folder:
         benching.store_forecast(target.folder)
     loaded = _written_bench(target.folder) if target.folder else None
-    rig = loaded.rig if loaded else record.rig
+    rig = loaded.rig if loaded else record.beam_rig
     own = loaded.weights if loaded else None
     trained = models.load_record(own or reconstruct.weights_for(rig))
     served = benches.weights_verdict(rig, trained, loaded, files.record)
@@ -406,11 +406,7 @@ def _written_bench(folder: Path) -> benches.Bench:
 
 def _bare_wall(source: Path) -> walls.MeasuredWall:
     """Return the bare wall of a record, or of a bench folder. Raises RecordFileError."""
-    return (
-        benches.load_bench(source, weights=False).bare
-        if source.is_dir()
-        else walls.load_measured(source)
-    )
+    return benches.load_bare_wall(source) if source.is_dir() else walls.load_measured(source)
 
 
 def _next_step(folder: Path, record: walls.WallRecord, served: reconstruct.WeightsVerdict) -> str:
@@ -418,7 +414,9 @@ def _next_step(folder: Path, record: walls.WallRecord, served: reconstruct.Weigh
     bench needs them.
     """
     name = shlex.quote(str(folder))
-    camera = benches.camera_to_name(record)
+    camera = cameras.camera_to_name(record)
+    if record.verdict == "doubtful":
+        return "mend what makes the record doubtful, and measure again"
     if record.occluder is None:
         occluder = f"nlos-cam calibrate --occluder {name} --camera {camera}"
         return f"put the occluder up, then {occluder}"

@@ -224,34 +224,15 @@ def build(
         off_record=off_record,
         rigs=data.RigRange() if any_rig else None,
     )
-    with common.progress(Rate()) as bar:
-        checks, renders = (
-            bar.add_task(name, total=None, visible=False)
-            for name in ("checking shards", "rendering")
-        )
-        try:
-            report = data.build_dataset(
-                plan,
-                count,
-                out,
-                workers=workers,
-                on_progress=lambda done, total: bar.update(
-                    renders, completed=done, total=total, visible=True
-                ),
-                on_check=lambda done, total: bar.update(
-                    checks, completed=done, total=total, visible=done < total
-                ),
-                on_warning=common.say,
-                command=_command(context, "build"),
-                farm=rendering_farm(ray, backend),
-            )
-        except KeyboardInterrupt:
-            common.exit_interrupted(
-                f"finished shards are kept in {out}; give the same command to resume"
-            )
-    if transient:
-        with common.tracked("rendering transients") as on_progress:
-            data.build_transients(plan, count, out, on_progress)
+    farm = rendering_farm(ray, backend)
+    try:
+        report = _build(plan, count, out, workers, _command(context, "build"), farm)
+        if transient:
+            with common.tracked("rendering transients") as on_progress:
+                data.build_transients(plan, count, out, on_progress)
+    except KeyboardInterrupt:
+        kept = "finished shards and transients are" if transient else "finished shards are"
+        common.exit_interrupted(f"{kept} kept in {out}; give the same command to resume")
     rate = report.objects_per_s
     facts = {
         "objects": report.objects,
@@ -262,6 +243,37 @@ def build(
     new = f" ({report.made} new, {rate:.1f} per second)" if rate else ""
     note = models.SIMULATION_ONLY if colour else ""
     common.finish(result, as_json=json, text=f"{report.objects} objects in {out}{new}", note=note)
+
+
+def _build(
+    plan: data.DatasetPlan,
+    count: int,
+    out: Path,
+    workers: int,
+    command: str,
+    farm: data.Farm | None,
+) -> data.BuildReport:
+    """Build a dataset with bars of its progress."""
+    with common.progress(Rate()) as bar:
+        checks, renders = (
+            bar.add_task(name, total=None, visible=False)
+            for name in ("checking shards", "rendering")
+        )
+        return data.build_dataset(
+            plan,
+            count,
+            out,
+            workers=workers,
+            on_progress=lambda done, total: bar.update(
+                renders, completed=done, total=total, visible=True
+            ),
+            on_check=lambda done, total: bar.update(
+                checks, completed=done, total=total, visible=done < total
+            ),
+            on_warning=common.say,
+            command=command,
+            farm=farm,
+        )
 
 
 def rendering_farm(ray: str | None, backend: str) -> data.Farm | None:

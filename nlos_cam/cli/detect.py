@@ -178,7 +178,7 @@ def _refuse_bench(folder: Path) -> None:
     """Raise typer.BadParameter for a bench folder in place of CAMERA."""
     if not bench_folders.is_bench(folder):
         return
-    camera = bench_folders.camera_to_name(bench_folders.load_bench(folder).measured.record)
+    camera = cameras.camera_to_name(bench_folders.load_bench(folder).measured.record)
     raise typer.BadParameter(
         f"{folder} is a bench folder, and no camera was named: give it as --bench, for example"
         f" `nlos-cam detect {camera} --bench {shlex.quote(str(folder))}`"

@@ -73,6 +73,11 @@ def evaluate(
         raise typer.BadParameter(
             "--training is searched for the nearest neighbour: omit it or --no-nearest"
         )
+    if data and training and data.resolve() == training.resolve():
+        raise typer.BadParameter(
+            f"--dataset and --training are the same folder ({data}): each object would be its own"
+            " nearest neighbour"
+        )
     # Before what takes seconds to import.
     for option, given in (("--dataset", data), ("--training", training)):
         if given and not given.exists():

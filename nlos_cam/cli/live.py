@@ -220,12 +220,22 @@ def replay(
             media=replays.ReplayMedia(
                 bench, view=save_view, stills=stills, video=video, objects=formats, every=every
             ),
+            options=_choice_words(bench_folder, wall, weights, average),
         )
     took = f"Reconstructed {report.frames} frames in {report.seconds:.1f} s"
     text = f"{took}: open {path / replays.REPORT}"
     common.finish(asdict(report), as_json=json, text=text)
     if stop.is_set():
         common.exit_interrupted(f"{path} holds the first {report.frames} frames")
+
+
+def _choice_words(
+    bench_folder: Path | None, wall: Path | None, weights: Path | None, average: int
+) -> list[str]:
+    """Return the words of the command line that chose bench, weights and average."""
+    given = {"--bench": bench_folder, "--wall": wall, "--weights": weights}
+    words = [word for name, path in given.items() if path for word in (name, str(path))]
+    return words if average == 1 else [*words, "--average", str(average)]
 
 
 def _check_output(path: Path, option: str, *suffixes: str, overwrite: bool) -> Path:

@@ -223,4 +223,4 @@ def _export_objects(
     )
     common.finish({"frames": {"objects": count}, "out": str(folder)}, as_json=as_json, text=text)
     if stop.is_set():
-        raise typer.Exit(common.INTERRUPTED)
+        common.exit_interrupted(f"{folder} holds the surfaces until then")

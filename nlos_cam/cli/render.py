@@ -90,9 +90,13 @@ PulseNs = Annotated[
 
 
 def scene_of(
-    bare: renderer.Scene, material: dict[str, Any], options: dict[str, Any]
+    bare: renderer.Scene,
+    own: renderer.Material,
+    material: dict[str, Any],
+    options: dict[str, Any],
 ) -> renderer.Scene:
-    """Return a scene with the options that are not None: fields of Material, and of Scene.
+    """Return a scene with the options that are not None: fields that replace those of the scene's
+    own Material, and fields of Scene.
 
     Raises typer.BadParameter or SceneError with the field, the value and the range.
     """
@@ -103,9 +107,15 @@ def scene_of(
         given["albedo"] = _numbers(text)
     if given:
         try:
-            bare = replace(bare, surface=renderer.Material(**given).surface)
+            changed = renderer.Material(**{**dict(own), **given})
         except ValidationError as error:
             raise typer.BadParameter(_as_option(walls.first_problem(error))) from error
+        if changed.kind == "lambertian" and given.keys() & {"specular", "exponent"}:
+            raise typer.BadParameter(
+                "--specular and --exponent are of a lobe, which a Lambertian surface lacks: add"
+                " --material phong or --material retroreflective"
+            )
+        bare = replace(bare, surface=changed.surface)
     return replace(bare, **{name: value for name, value in options.items() if value is not None})
 
 
@@ -279,12 +289,25 @@ def render(
     json: Json = False,
 ) -> None:
     """Render the maps that a lidar which reports its strongest echo gets of a hidden object."""
-    if scene and bench_folder:
-        raise typer.BadParameter("--bench and --scene each name a rig: give one")
+    if scene and (bench_folder or rig):
+        raise typer.BadParameter("--scene, --bench and --rig each name a rig: give one")
     if out is not None and out.suffix not in {"", ".npz", ".png"}:
         raise typer.BadParameter(
             f"--out {out}: choose a name that ends in .npz; the picture has the same name in .png"
         )
+    for_transient = transient_options.CaptureOptions(
+        capture=capture,
+        wall_cells=wall_cells,
+        wall_extent=wall_extent,
+        laser=laser,
+        bin_mm=bin_mm,
+        start_m=start_m,
+        bins=bins,
+        wall_to_wall=wall_to_wall,
+        photons=photons,
+        background=background,
+        noise_seed=noise_seed,
+    )
     if transient is not None:
         if out is not None or explain or effects != "auto":
             raise typer.BadParameter(
@@ -292,12 +315,15 @@ def render(
             )
         path = transient_options.transient_path(transient, overwrite=overwrite)
     else:
+        for_transient.refuse_unused()
         path = output_path(out and out.with_suffix(".npz"), "render", ".npz", overwrite=overwrite)
+        output_path(path.with_suffix(".png"), "render", ".png", overwrite=overwrite)
     file = renderer.load_scene(scene) if scene else None
     its_rig = benches.rig_or_default(bench_folder, rig, PAPER_RIG)
     bare = file.bare if file else renderer.Scene(its_rig)
     surface = {"kind": material, "specular": specular, "exponent": exponent, "albedo": albedo}
-    bare = scene_of(bare, surface, {"radiometry": radiometry, "pulse_ns": pulse_ns})
+    own = file.hidden.material if file and file.hidden else renderer.Material()
+    bare = scene_of(bare, own, surface, {"radiometry": radiometry, "pulse_ns": pulse_ns})
     angles = {"tilt_x_deg": tilt_x_deg, "tilt_y_deg": tilt_y_deg, "turn_deg": turn_deg}
     place = {"size_m": size_m, "x_m": x_m, "y_m": y_m, "front_m": front_m}
     depth_m = hidden_depth(hidden, bare.rig, {"seed": seed, "up": up, **angles, **place})
@@ -307,19 +333,8 @@ def render(
     )
     setting = accuracy_of(accuracy, max_error, max_seconds, beams_per_cell)
     if transient is not None:
-        wanted_capture = transient_options.capture_of(
-            capture,
-            wall_cells,
-            wall_extent,
-            laser,
-            bin_mm,
-            start_m,
-            bins,
-            wall_to_wall=wall_to_wall,
-            noise=(photons, background, noise_seed),
-        )
         transient_options.write_transient(
-            path, target, wanted_capture, setting, backend, as_json=json
+            path, target, for_transient.to_capture(), setting, backend, as_json=json
         )
         return
     start_s = time.perf_counter()

@@ -89,7 +89,7 @@ def reconstruct(
         bench = measure.open_reconstruct_bench(
             networks, cache_folder() / "onnx", count, common.tracked
         )
-    asked = measure.reconstruct_settings(bench.networks)
+    asked = measure.reconstruct_settings(bench)
     interrupted = _collect(measure.measure_reconstructions(asked, bench), rows, len(asked))
     table = measure.reconstruct_facts(rows, len(asked), bench.objects, measure.machine())
     if rows:

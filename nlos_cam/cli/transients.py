@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal, NamedTuple
 
 import nlos_calibration as walls
 import typer
@@ -81,7 +81,8 @@ WallToWall = Annotated[
 Photons = Annotated[
     float | None,
     typer.Option(
-        "--photons", help="Count photons with noise: this many in the brightest histogram."
+        "--photons",
+        help="Count photons with noise: this many, above 0, in the brightest histogram.",
     ),
 ]
 Background = Annotated[
@@ -90,37 +91,58 @@ Background = Annotated[
 NoiseSeed = Annotated[int, typer.Option("--noise-seed", min=0, help="Seed of the photons' noise.")]
 
 
-def capture_of(
-    kind: transients.CaptureKind,
-    cells: int | None,
-    extent: str | None,
-    laser: str | None,
-    bin_mm: float | None,
-    start_m: float,
-    bins: int | None,
-    *,
-    wall_to_wall: bool,
-    noise: tuple[float | None, float, int],
-) -> transients.Capture:
-    """Return the capture that options describe; `noise` is photons, background and seed.
+class CaptureOptions(NamedTuple):
+    """Options of the command line that only a transient takes, by their names."""
 
-    Raises typer.BadParameter or SceneError with the option's value and its range.
-    """
-    photons, background, seed = noise
-    if background and photons is None:
-        raise typer.BadParameter("--background is in photons: give --photons too")
-    point = _numbers("--laser", laser, 2)
-    return transients.Capture(
-        kind,
-        cells,
-        _extent(extent),
-        (point[0], point[1]) if point else None,
-        None if bin_mm is None else bin_mm / 1e3,
-        start_m,
-        bins,
-        first_and_last=not wall_to_wall,
-        noise=None if photons is None else transients.Noise(photons, background, seed),
-    )
+    capture: transients.CaptureKind = "lidar"
+    wall_cells: int | None = None
+    wall_extent: str | None = None
+    laser: str | None = None
+    bin_mm: float | None = None
+    start_m: float = 0.0
+    bins: int | None = None
+    wall_to_wall: bool = False
+    photons: float | None = None
+    background: float = 0.0
+    noise_seed: int = 0
+
+    def refuse_unused(self) -> None:
+        """Raise typer.BadParameter if any option is given, as no transient is asked for."""
+        given = [
+            f"--{name.replace('_', '-')}"
+            for name, default in self._field_defaults.items()
+            if getattr(self, name) != default
+        ]
+        if given:
+            raise typer.BadParameter(
+                f"{', '.join(given)}: no transient is written: drop this, or add --transient"
+                " FILE.hdf5"
+            )
+
+    def to_capture(self) -> transients.Capture:
+        """Return the capture that the options describe.
+
+        Raises typer.BadParameter or SceneError with the option's value and its range.
+        """
+        if self.background and self.photons is None:
+            raise typer.BadParameter("--background is in photons: give --photons too")
+        point = _numbers("--laser", self.laser, 2)
+        noise = None
+        if self.photons is not None:
+            if not self.photons > 0:
+                raise typer.BadParameter(f"--photons must be above 0, got {self.photons:g}")
+            noise = transients.Noise(self.photons, self.background, self.noise_seed)
+        return transients.Capture(
+            self.capture,
+            self.wall_cells,
+            _extent(self.wall_extent),
+            (point[0], point[1]) if point else None,
+            None if self.bin_mm is None else self.bin_mm / 1e3,
+            self.start_m,
+            self.bins,
+            first_and_last=not self.wall_to_wall,
+            noise=noise,
+        )
 
 
 def _extent(text: str | None) -> walls.Extent | None:
@@ -174,7 +196,8 @@ def write_transient(
     with tracked("rendering the transient", at_once=False) as on_progress:
         found = transients.render_transient(scene, capture, accuracy, backend, on_progress)
     seconds = time.perf_counter() - start_s
-    if not found.histograms.any():
+    # With noise, which may count no photon, the light was tested before it.
+    if capture.noise is None and not found.histograms.any():
         raise SceneError(
             "no light returns within the bins: move the object into the box, or widen --bins,"
             " --start-m and --wall-extent"

@@ -3,7 +3,7 @@ label.
 """
 
 import tomllib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
@@ -23,7 +23,7 @@ from nlos_cam.dataset.samples import OnProgress, Samples, ignore
 from nlos_cam.dataset.shards import SHARD_PATTERN, shard_path, store
 from nlos_cam.errors import DiskFullError, RecordingError
 from nlos_cam.files import atomic_directory, read_toml
-from nlos_cam.frames import OBJECT_PIXELS, LidarMaps, maps_from_frame
+from nlos_cam.frames import OBJECT_PIXELS, Frame, LidarMaps, maps_from_frame
 from nlos_cam.reconstruct import CalibratedRig, OwnMaps, open_bench
 from nlos_cam.recording import ReplayCamera, Sidecar, load_sidecar, open_lidar_bag, sidecar_path
 from nlos_cam.render import HiddenObject, SceneFile
@@ -219,12 +219,11 @@ def _read(
             f"{path} has no label: record it with `nlos-cam capture --label NAME`, or write its"
             f" name as label into {sidecar_path(path)}"
         )
-    chosen = spread(open_lidar_bag(path).streams["depth"].frames, frames)
+    images = open_lidar_bag(path).streams["depth"].frames
     with ReplayCamera(path) as camera:
         bench = _bench(path, sidecar, wall, camera)
         truth_m = truth_depth_m(path, sidecar.label, bench.rig, objects_on(bench.rig))
-        every = (maps_from_frame(frame) for number, frame in enumerate(camera) if number in chosen)
-        recorded = [maps for maps in every if maps.valid.any()]
+        recorded = [maps for maps in spread_maps(camera, images, frames) if maps.valid.any()]
     if not recorded:
         raise RecordingError(
             f"{path} has no frame with any return: inspect it with `nlos-cam replay`"
@@ -254,6 +253,22 @@ def spread(count: int, wanted: int) -> frozenset[int]:
     if wanted >= count:
         return frozenset(range(count))
     return frozenset(((np.arange(wanted) + 0.5) * count / wanted).astype(int).tolist())
+
+
+def spread_maps(camera: Iterable[Frame], count: int, wanted: int) -> list[LidarMaps]:
+    """Return maps of `wanted` frames evenly spread over a recording, which has about `count`."""
+    while True:
+        chosen = spread(count, wanted)
+        found: list[LidarMaps] = []
+        complete = 0
+        for frame in camera:
+            if complete in chosen:
+                found.append(maps_from_frame(frame))
+            complete += 1
+        if complete == count:
+            return found
+        # Depth images without their infrared make no frame: chosen again over those that are.
+        count = complete
 
 
 def _bench(
@@ -308,15 +323,15 @@ def label_recordings(
 
 
 def write_shards(labelled: Labelled, folder: Path, command: str = "") -> None:
-    """Write samples as a dataset, with their numbers as seeds; earlier shards are replaced once all
-    are on disk.
+    """Write samples as a dataset, with their numbers as seeds; earlier shards go in the same step
+    in which these appear.
 
     Raises DiskFullError where they do not fit, OutputExistsError where `folder` is a file.
     """
     plan = DatasetPlan(labelled.rig, first_seed=0, accuracy=RECORDED)
     samples = _samples(labelled, plan)
     folder.parent.mkdir(parents=True, exist_ok=True)
-    with atomic_directory(folder) as whole:
+    with atomic_directory(folder, drop=SHARD_PATTERN) as whole:
         for start in range(0, len(labelled.label), SHARD):
             part = {name: values[start : start + SHARD] for name, values in samples.items()}
             try:
@@ -325,8 +340,6 @@ def write_shards(labelled: Labelled, folder: Path, command: str = "") -> None:
                 raise DiskFullError(
                     f"no room for the dataset {folder}: the earlier one is kept; free some space"
                 ) from error
-        for shard in folder.glob(SHARD_PATTERN):  # else an interruption could leave shards of both
-            shard.unlink()
 
 
 def _samples(labelled: Labelled, plan: DatasetPlan) -> Samples:

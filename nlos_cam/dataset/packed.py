@@ -17,6 +17,7 @@ from nlos_calibration import Rig
 from nlos_models import CellNormal, CheckpointRecord, channels_of
 from nlos_models.training import MapNoise, MapSet, NormalBatch, first_of
 
+from nlos_cam.dataset.build import SHARD
 from nlos_cam.dataset.packed_index import StoreIndex, damaged, shard_key
 from nlos_cam.dataset.packing import (
     COUNTS,
@@ -72,6 +73,7 @@ class PackedMaps:
         frame: Rig | None = None,
         run: str = "",
         packing: Packing | None = None,
+        locked: bool = False,
     ) -> None:
         """Open or make the store: use `open_packed_maps`, which holds its claim meanwhile.
 
@@ -82,11 +84,14 @@ class PackedMaps:
         default the plan's, and the wall grid for a plan of many rigs. A spread that records do not
         have (`DatasetPlan.known_rig`) stays in the maps. `run` names the training run: another one
         in the same store sees the objects that are there when its own epochs begin. New shards are
-        made ready by the processes of `packing`, by default this one. Raises RecordingError for no
-        dataset, SceneError for datasets of two rigs or a store of other data, aligned with another
-        rig, or normalised otherwise.
+        made ready by the processes of `packing`, by default this one. Datasets of locked
+        differences are taken only where `locked`. Raises RecordingError for no dataset, SceneError
+        for datasets of two rigs or a store of other data, aligned with another rig, or normalised
+        otherwise.
         """
-        opened = [open_dataset(folder, color=color, expected=True) for folder in datasets]
+        opened = [
+            open_dataset(folder, color=color, expected=True, locked=locked) for folder in datasets
+        ]
         self.plan: DatasetPlan = opened[0].plan
         """Of the first dataset."""
         if others := [one.folder for one in opened if _rigs_of(one.plan) != _rigs_of(self.plan)]:
@@ -119,6 +124,7 @@ class PackedMaps:
                 " a spread"
             )
         self._color = color
+        self._locked = locked
         pixels = (OBJECT_PIXELS, OBJECT_PIXELS)
         self._rows: dict[str, tuple[int, ...]] = {
             MAPS: (channels_of(color=color), MAP_ROWS, MAP_COLUMNS),
@@ -126,7 +132,9 @@ class PackedMaps:
         }
         if self._stores_counts:
             self._rows[COUNTS] = MAP_ROWS, MAP_COLUMNS
-        self._keys = {shard.path: shard_key(shard) for one in opened for shard in one.shards}
+        shards = [shard for one in opened for shard in one.shards]
+        self._keys = {shard.path: shard_key(shard) for shard in shards}
+        self._sizes = {shard.path: len(shard.seeds) for shard in shards}
         self._index = StoreIndex.read(store)
         self._index.open_for(self.frame, opened, self._keys)
         if not (store / CELLS).exists():
@@ -188,11 +196,13 @@ class PackedMaps:
 
     def refresh(self, on_progress: OnProgress = ignore, shards: int | None = None) -> None:
         """Add the shards that appeared in the datasets since the last time, of the first `shards`
-        where that is given.
+        where that is given; of one that has grown since, its further objects.
         """
-        known = self._index.shards
+        index = self._index
+        known = index.shards
         paths = [path for folder in self._datasets for path in sorted(folder.glob(SHARD_PATTERN))]
-        new = {key: path for path in paths[:shards] if (key := self._key(path)) not in known}
+        keys = {self._key(path): path for path in paths[:shards]}
+        new = {key: path for key, path in keys.items() if index.lacks(key, self._sizes[path])}
         for name, shape in self._rows.items():
             path = self._store / name
             size = 2 * len(self) * int(np.prod(shape))
@@ -206,25 +216,31 @@ class PackedMaps:
         packer = Packer.of(self.frame, self.normal, with_counts=self._stores_counts)
         every = zip(new, self._packing.rows_of(packer, [*new.values()]), strict=True)
         for number, (key, columns) in enumerate(every, 1):
+            # A shard grows by further seeds, whose order packing keeps: its first rows are there.
+            packed = known.get(key, 0)
             for name, values in columns.items():
                 with (self._store / name).open("ab") as file:
-                    file.write(np.ascontiguousarray(values).tobytes())
+                    file.write(np.ascontiguousarray(values[packed:]).tobytes())
             known[key] = len(columns[IMAGES])
+            index.sizes[key] = self._sizes[new[key]]
             if number % 50 == 0 or number == len(new):
-                self._index.write()
+                index.write()
             on_progress(number, len(new))
 
     def _key(self, path: Path) -> str:
-        """Return the `shard_key` of a shard, which is read once."""
-        if path not in self._keys:
-            self._keys[path] = shard_key(read_head(path))
+        """Return the `shard_key` of a shard, which is read once, its head until it is full."""
+        if self._sizes.get(path, 0) < SHARD:
+            head = read_head(path)
+            self._sizes[path] = len(head.seeds)
+            if path not in self._keys:
+                self._keys[path] = shard_key(head)
         return self._keys[path]
 
     def held_out(self, folder: Path, count: int) -> MapSet:
         """Return up to `count` samples of another dataset as the store has its own: aligned with
         the same rig.
         """
-        opened = open_dataset(folder, color=self._color)
+        opened = open_dataset(folder, color=self._color, locked=self._locked)
         return aligned_with(first_of(opened.arrays(), count), opened.benches(), self.frame)[0]
 
     def batches(self, batch: int, generator: torch.Generator) -> Iterator[NormalBatch]:
@@ -271,6 +287,7 @@ def open_packed_maps(
     frame: Rig | None = None,
     run: str = "",
     processes: int = 1,
+    locked: bool = False,
 ) -> Generator[PackedMaps]:
     """Open or make a store, and hold the right to write it until the end of the block.
 
@@ -290,4 +307,5 @@ def open_packed_maps(
             frame=frame,
             run=run,
             packing=made_ready,
+            locked=locked,
         )

@@ -60,11 +60,19 @@ class StoreIndex:
 
     store: Path
     shards: dict[str, int] = field(default_factory=dict)
-    """Number of objects of each packed shard, by its `shard_key`, in the order of their rows."""
+    """Number of packed objects of each shard, by its `shard_key`."""
     epochs: dict[str, int] = field(default_factory=dict)
     """Number of objects that each epoch sees."""
     origin: Origin | None = None
     """None for a store that is new, or was written by nlos-cam 0.2.0 or earlier."""
+    sizes: dict[str, int] = field(default_factory=dict)
+    """Number of objects of each shard when it was packed, also of those that cannot be aligned;
+    stores of earlier versions lack it.
+    """
+
+    def lacks(self, key: str, size: int) -> bool:
+        """Return whether objects of a shard of `size` are not packed yet."""
+        return self.sizes.get(key, self.shards.get(key, 0)) < size
 
     @classmethod
     def read(cls, store: Path) -> "StoreIndex":
@@ -81,13 +89,18 @@ class StoreIndex:
                 _counts(found["shards"]),
                 _counts(found["epochs"]),
                 origin and Origin(*(str(origin[name]) for name in Origin._fields)),
+                _counts(found.get("sizes", {})),
             )
         except (OSError, ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
             raise damaged(store, INDEX) from error
 
     def write(self) -> None:
         """Write the index to its store."""
-        facts: dict[str, Any] = {"shards": self.shards, "epochs": self.epochs}
+        facts: dict[str, Any] = {
+            "shards": self.shards,
+            "epochs": self.epochs,
+            "sizes": self.sizes,
+        }
         if self.origin:
             facts["origin"] = self.origin._asdict()
         with atomic_file(self.store / INDEX) as part:

@@ -13,6 +13,7 @@ from nlos_models import SIMULATION_ONLY
 from nlos_models.training import MapBatch, MapSet, as_batch
 from numpy.typing import NDArray
 
+from nlos_cam.dataset.locked import LOCKED
 from nlos_cam.dataset.plan import DatasetPlan
 from nlos_cam.dataset.shards import Shard, array_names, read_arrays, shards_of
 from nlos_cam.errors import RecordingError, SceneError
@@ -152,9 +153,11 @@ class _Window:
         return MapSet(*arrays)
 
 
-def open_dataset(folder: Path, *, color: bool = False, expected: bool = False) -> Dataset:
+def open_dataset(
+    folder: Path, *, color: bool = False, expected: bool = False, locked: bool = False
+) -> Dataset:
     """Open a folder's dataset, of depth or in color; one of expected maps only where `expected`
-    maps will do.
+    maps will do, one of `locked` differences only where these will.
 
     Raises RecordingError where there is none, one of another kind, or shards of two datasets.
     """
@@ -169,6 +172,11 @@ def open_dataset(folder: Path, *, color: bool = False, expected: bool = False) -
             raise RecordingError(
                 f"{shard.path} is of another dataset than {shards[0].path.name}: remove one of them"
             )
+    if plan.accuracy == LOCKED and not locked:
+        raise RecordingError(
+            f"{folder} holds locked differences (`adapt --frames`), which are no maps: give another"
+            " dataset"
+        )
     if plan.textures and not color:
         raise RecordingError(
             f"{folder} holds a dataset in color ({SIMULATION_ONLY}): give one of depth"

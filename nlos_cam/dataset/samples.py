@@ -69,7 +69,7 @@ def procedural_images(
     images = list[NDArray[np.float16]]()
     for seed in range(first_seed, first_seed + count):
         depth_m = shapes.object_depth(seed, box, categories, backgrounds=backgrounds)[1]
-        images.append(_image(depth_m, box, _coat(seed, depth_m, textures)).astype(np.float16))
+        images.append(_image(depth_m, box, coat_of(seed, depth_m, textures)).astype(np.float16))
     return np.stack(images)
 
 
@@ -121,7 +121,7 @@ def make_samples(plan: DatasetPlan, seeds: Sequence[int], backend: str = "cpu") 
     objects = [hidden_object(plan.objects, seed, plan.box) for seed in seeds]
     rigs = [plan.bench_of(seed) for seed in seeds]
     coats = [
-        _coat(seed, depth_m, plan.textures)
+        coat_of(seed, depth_m, plan.textures)
         for seed, (_, depth_m) in zip(seeds, objects, strict=True)
     ]
     if backend == "cpu":
@@ -150,7 +150,8 @@ def make_samples(plan: DatasetPlan, seeds: Sequence[int], backend: str = "cpu") 
     }
 
 
-def _coat(seed: int, depth_m: Float32, textures: Sequence[str]) -> shapes.Coat | None:
+def coat_of(seed: int, depth_m: Float32, textures: Sequence[str]) -> shapes.Coat | None:
+    """Return the paint of an object; None without textures."""
     return shapes.paint(seed, depth_m, textures) if textures else None
 
 
@@ -162,9 +163,16 @@ def _image(depth_m: Float32, box: ObjectBox, coat: shapes.Coat | None) -> Float3
     )
 
 
-def scene_of(plan: DatasetPlan, depth_m: Float32, rig: Rig, model: SensorModel) -> Scene:
-    """Return the scene of one object, unpainted, on its rig."""
-    return Scene(rig, depth_m, plan.material.surface, plan.radiometry, plan.jump_m, model.pulse_ns)
+def scene_of(
+    plan: DatasetPlan,
+    depth_m: Float32,
+    rig: Rig,
+    model: SensorModel,
+    coat: shapes.Coat | None = None,
+) -> Scene:
+    """Return the scene of one object, unpainted or with its coat, on its rig."""
+    surface = Surface(coat.albedo, plan.material.brdf) if coat else plan.material.surface
+    return Scene(rig, depth_m, surface, plan.radiometry, plan.jump_m, model.pulse_ns)
 
 
 def _sense(
@@ -175,15 +183,14 @@ def _sense(
     model: SensorModel,
     seed: int,
 ) -> LidarMaps:
-    scene = scene_of(plan, depth_m, rig, model)
+    scene = scene_of(plan, depth_m, rig, model, coat)
     if plan.accuracy == LOCKED:
         return locked_difference(scene, model)
     # The records are frozen, so hashable, which pyright does not see.
     sensor = cached_sensor(rig, model, plan.radiometry)  # pyright: ignore[reportArgumentType]
     if coat is None:
         return sense_object(scene, sensor, seed, plan.accuracy, expected=plan.expected)
-    painted = replace(scene, surface=Surface(coat.albedo, plan.material.brdf))
-    return sense_color(painted, sensor, seed, plan.accuracy, expected=plan.expected)
+    return sense_color(scene, sensor, seed, plan.accuracy, expected=plan.expected)
 
 
 def _sense_in_batches(

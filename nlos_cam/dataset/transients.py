@@ -5,7 +5,7 @@ each object, by its seed.
 from pathlib import Path
 
 from nlos_cam.dataset.plan import DatasetPlan
-from nlos_cam.dataset.samples import OnProgress, hidden_object, ignore, scene_of
+from nlos_cam.dataset.samples import OnProgress, coat_of, hidden_object, ignore, scene_of
 from nlos_cam.dataset.shards import only_builder
 from nlos_cam.transients import render_transient, save_transient
 
@@ -16,7 +16,7 @@ def build_transients(
     plan: DatasetPlan, count: int, folder: Path, on_progress: OnProgress = ignore
 ) -> Path:
     """Write the transients of `count` objects that are not there yet as FOLDER/transients/SEED.hdf5;
-    return their folder.
+    return their folder. Painted objects count by their mean albedo.
 
     Raises SceneError for an object that cannot be rendered, and FolderBusyError where another
     build uses the folder.
@@ -29,7 +29,8 @@ def build_transients(
             if not path.exists():
                 depth_m = hidden_object(plan.objects, seed, plan.box)[1]
                 rig, model = plan.bench_of(seed)
-                scene = scene_of(plan, depth_m, rig, model)
+                coat = coat_of(seed, depth_m, plan.textures)
+                scene = scene_of(plan, depth_m, rig, model, coat)
                 save_transient(path, render_transient(scene, accuracy=plan.accuracy))
             on_progress(done, count)
     return target

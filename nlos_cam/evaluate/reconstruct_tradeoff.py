@@ -69,7 +69,9 @@ class ReconstructSetting:
     frames: int
     """Frames averaged, as by `live --average`."""
     rig: str
-    """On which it is measured: the one that the weights were trained for."""
+    """Name of the one on which it is measured: that of the weights' training, or the paper's for
+    weights of any rig.
+    """
 
 
 @dataclass(frozen=True)
@@ -169,7 +171,7 @@ def _both_sets(rig: Rig, count: int | None, tracked: subjects.Tracked) -> BothSe
     return BothSets(ObjectSet.of(kinds, rig, tracked), ObjectSet.of(unseen, rig, tracked))
 
 
-def reconstruct_settings(networks: Mapping[str, models.Reconstructor]) -> list[ReconstructSetting]:
+def reconstruct_settings(bench: ReconstructBench) -> list[ReconstructSetting]:
     """Return all settings to measure, the quickest to wait for first."""
     return [
         ReconstructSetting(
@@ -177,10 +179,10 @@ def reconstruct_settings(networks: Mapping[str, models.Reconstructor]) -> list[R
             name,
             network.runtime,
             frames,
-            network.record.rig_name,
+            bench.sets[name].kinds.rig.name,
         )
         for frames in FRAMES
-        for name, network in networks.items()
+        for name, network in bench.networks.items()
     ]
 
 
@@ -337,9 +339,10 @@ def reconstruct_document(table: Mapping[str, Any], folder: Path | None = None) -
             f"Recommended: {pick['name']}",
             "The first setting that is as good as the most accurate one.",
         )
-        camera = " sim" * (row["rig"] == paper_scene().rig.name)
+        # The simulated camera is on the paper's rig: weights of another one are for a real bench.
+        camera = "sim" if row["rig"] == paper_scene().rig.name else "l515"
         commands.insert(
-            0, f"nlos-cam live{camera} --weights {row['weights']} --average {row['frames']}"
+            0, f"nlos-cam live {camera} --weights {row['weights']} --average {row['frames']}"
         )
     parts: list[Section | Picture] = [
         Section("", [banner, Bullets("Note", [] if table["complete"] else [INCOMPLETE])]),

@@ -304,7 +304,7 @@ def notes_about(
             f"the weights were trained for rig {record.rig_name} but the maps are of rig"
             f" {rig.name}{aligned}"
         )
-    if objects.plan.spread != data.RigSpread():
+    if objects.plan.spread != data.RigSpread() or objects.plan.rigs:
         notes.append(
             f"each object is on a rig of its own around {rig.name}, and aligned with it where"
             " possible"

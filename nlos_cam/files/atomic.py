@@ -5,6 +5,7 @@ import os
 import shutil
 from collections.abc import Generator
 from contextlib import contextmanager, suppress
+from fnmatch import fnmatch
 from pathlib import Path
 
 from nlos_cam.files.claims import claim
@@ -52,12 +53,14 @@ def _link_exclusively(part: Path, path: Path) -> None:
 
 
 @contextmanager
-def atomic_directory(out: Path) -> Generator[Path]:
+def atomic_directory(out: Path, *, drop: str = "") -> Generator[Path]:
     """Yield an empty directory; on success flush it to disk and let it take the place of `out` in
     one rename.
 
-    Entries of `out` with other names stay. Raises OutputExistsError where `out` is a file, or
-    appeared meanwhile, and FileBusyError while another process writes it.
+    Entries of `out` with other names stay, but for files that match the pattern `drop`, as in
+    `fnmatch`: they go in the same step, or after the new entries where there is no such step.
+    Raises OutputExistsError where `out` is a file, or appeared meanwhile, and FileBusyError while
+    another process writes it.
     """
     if os.path.lexists(out) and not out.is_dir():
         raise OutputExistsError(
@@ -71,7 +74,7 @@ def atomic_directory(out: Path) -> Generator[Path]:
         yield part
         _flush_directory(part)
         if existed:
-            _replace_directory(part, out, folder)
+            _replace_directory(part, out, folder, drop)
         else:
             _rename_new(part, out)
         _flush_entries(out.parent)
@@ -110,9 +113,11 @@ def _rename_new(part: Path, out: Path) -> None:
         ) from error
 
 
-def _replace_directory(part: Path, out: Path, folder: Path) -> None:
+def _replace_directory(part: Path, out: Path, folder: Path, drop: str) -> None:
     replaced = [entry.name for entry in part.iterdir()]
     others = [entry for entry in out.iterdir() if entry.name not in replaced]
+    dropped = [entry for entry in others if fnmatch(entry.name, drop) and not entry.is_dir()]
+    others = [entry for entry in others if entry not in dropped]
 
     fixed = Path.cwd().is_relative_to(out) or any(entry.is_mount() for entry in (out, *others))
     if not fixed and _link_all(others, part) and _exchange(part, out):
@@ -123,6 +128,8 @@ def _replace_directory(part: Path, out: Path, folder: Path) -> None:
         if (out / name).is_dir():
             (out / name).rename(folder / f"old {name}")
         (part / name).replace(out / name)
+    for entry in dropped:
+        entry.unlink()
 
 
 def _link_all(entries: list[Path], target: Path) -> bool:

@@ -14,7 +14,7 @@ import numpy as np
 from nlos_calibration import load_rig, load_wall
 from nlos_models.training import load_recipe
 
-from nlos_cam.bench import camera_to_name
+from nlos_cam.camera import camera_to_name
 from nlos_cam.errors import NlosCamError, RecordingError
 from nlos_cam.files import read_arrays, read_bounded, read_toml, with_commit
 

@@ -9,7 +9,8 @@ from typing import Any
 
 from nlos_models import load_record
 
-from nlos_cam.bench import MANIFEST, camera_to_name, is_bench, load_bench
+from nlos_cam.bench import MANIFEST, is_bench, load_bench
+from nlos_cam.camera import camera_to_name
 from nlos_cam.errors import RecordingError
 from nlos_cam.files import CHECKSUMS, TEXT_LIMIT, checksums_of, read_bounded
 from nlos_cam.info.files import (

@@ -88,6 +88,8 @@ class BackgroundPhysicsCheck:
 
     def use_rig(self, rig: Rig) -> None:
         """Compare the frames that are offered from now on with this rig."""
+        if rig != self._rig:
+            self.newest = None
         self._rig = rig
 
     def offer(self, frame_number: int, maps: LidarMaps, depth_m: Float32) -> None:
@@ -126,7 +128,8 @@ class BackgroundPhysicsCheck:
             _send(to_worker, frame)
             answer = pickle.load(from_worker)  # noqa: S301  from our own process, through a private pipe
             if isinstance(answer, PhysicsCheckResult):
-                self.newest = answer
+                # one of a rig that is no longer used says nothing
+                self.newest = answer if frame[-1] == self._rig else self.newest
             else:
                 self._report(describe_failure(frame[0], str(answer)))
 

@@ -11,9 +11,9 @@ from pathlib import Path
 from queue import Empty, Queue
 from typing import Any, Protocol, runtime_checkable
 
-from nlos_calibration import UNUSABLE, MeasuredWall, Rig, WallRecord
+from nlos_calibration import MeasuredWall, Rig, WallRecord
 from nlos_calibration.arrays import Mask
-from nlos_calibration.errors import CalibrationError, OccluderRefusedError
+from nlos_calibration.errors import OccluderRefusedError
 
 from nlos_cam import calibrate
 from nlos_cam import view as views  # both load their heavy parts when they are used
@@ -305,17 +305,16 @@ class BenchCommands:
 
         bench = pipeline.bench
         record, inliers = measure_bench(capture, bench.measured)
-        if record.advice.startswith(UNUSABLE):
-            raise CalibrationError(record.advice)
         path = self._run.new_file("bench", ".toml")
-        record = record.model_copy(update={"rig": measured_rig(bench.rig, record)})
+        before = bench.measured.record.rig if bench.measured else bench.rig
+        record = record.model_copy(update={"rig": measured_rig(before, record)})
         reference = capture.reference(inliers)
         files = calibrate.WallFiles.beside(path, overwrite=False)
         record = calibrate.write_record(files, record, reference)
         # What was noted before is of a wall or an occluder that had not been measured.
         assumed = bool(bench.notes) and record.occluder is None
         notes = (occluder_assumed(path),) if assumed else ()
-        pipeline.bench = CalibratedRig(record.rig, MeasuredWall(record, reference), notes)
+        pipeline.bench = CalibratedRig(record.beam_rig, MeasuredWall(record, reference), notes)
         self._run.wall = load_measured_wall(path)
         self.on_bench(pipeline.bench)
         taken = capture.statistics.depth.frames
@@ -324,7 +323,7 @@ class BenchCommands:
             f"reference of {taken} frames ({record.verdict}: {record.advice})",
             f"from now on the wall is {place}",
             *notes,
-            *_weights_warnings(record.rig, pipeline, path),
+            *_weights_warnings(record.beam_rig, pipeline, path),
             f"wrote {path}, {self._run.files.note(path)}",
         ]
         return "; ".join(outcomes)

@@ -30,6 +30,10 @@ class BenchObservation:
     warnings: tuple[str, ...]
     moved: bool = False
     """The lidar has moved or was turned, or something hides the wall from it."""
+    drift_m: float = 0.0
+    """Range drift since the wall was measured, over the last second, if all depths have drifted
+    alike; else 0.
+    """
 
 
 class CalibratedRig:
@@ -86,9 +90,14 @@ class CalibratedRig:
         if self.reference is None or self._drift is None:
             return BenchObservation(None, warnings, bool(turned))
         self._drift.observe(frame.depth_m, frame.settings)
-        difference = self._subtract_drift(subtract_reference(maps, self.reference))
+        drift = self._drift.drift
+        # That removes most of the effect of a change of temperature
+        # (docs/calibration-measured.md).
+        drift_m = drift.range_m if drift and drift.uniform else 0.0
+        difference = subtract_reference(maps, self.reference)
+        difference = replace(difference, depth_m=difference.depth_m - np.float32(drift_m))
         moved = self._drift.moved or bool(turned)
-        return BenchObservation(difference, warnings + self._drift.warnings, moved)
+        return BenchObservation(difference, warnings + self._drift.warnings, moved, drift_m)
 
     def turn_problem(self, frame: Frame) -> str:
         """Return in one line how the lidar was turned since its wall was measured, by gravity;
@@ -99,29 +108,21 @@ class CalibratedRig:
         record = self.measured.record
         return walls.turn_problem(frame.gravity_m_s2, record.gravity_m_s2, record.way_up)
 
-    def _subtract_drift(self, difference: LidarMaps) -> LidarMaps:
-        """Return the difference less the range drift of the last second, if all depths have drifted
-        alike.
-
-        That removes most of the effect of a change of temperature (docs/calibration-measured.md).
+    def correct_range(self, maps: LidarMaps, drift_m: float = 0.0) -> LidarMaps:
+        """Return the maps with the measured offset of the lidar's depth added, if there is one,
+        less the drift since.
         """
-        drift = self._drift.drift if self._drift else None
-        if drift is None or not drift.uniform:
-            return difference
-        return replace(difference, depth_m=difference.depth_m - np.float32(drift.range_m))
-
-    def correct_range(self, maps: LidarMaps) -> LidarMaps:
-        """Return the maps with the measured range offset of the lidar (`range_offset`) added, if
-        there is one.
-        """
-        if not self.range_offset_m:
+        added_m = self.range_offset_m - drift_m
+        if not added_m:
             return maps
-        return replace(maps, depth_m=maps.depth_m + np.float32(self.range_offset_m))
+        return replace(maps, depth_m=maps.depth_m + np.float32(added_m))
 
     @property
     def range_offset_m(self) -> float:
-        """Range offset of the lidar as it was measured; 0 if it was not."""
-        return self.measured.record.range_offset_m if self.measured else 0.0
+        """Range offset of the lidar's depth as it was measured; 0 if it was not, or is the
+        origin's, which is in the rig (`WallRecord.beam_rig`).
+        """
+        return walls.depth_offset_m(self.measured.record) if self.measured else 0.0
 
 
 def subtract_reference(maps: LidarMaps, reference: walls.BareWall) -> LidarMaps:
@@ -149,7 +150,7 @@ def open_bench(wall: Path | None, camera: Camera) -> CalibratedRig:
         *([measured.reference.intrinsics] if measured.reference else []),
     ]:
         check_intrinsics(intrinsics, camera.intrinsics)
-    return CalibratedRig(measured.record.rig, measured, _notes(measured.record, camera))
+    return CalibratedRig(measured.record.beam_rig, measured, _notes(measured.record, camera))
 
 
 def occluder_assumed(place: Path) -> str:

@@ -41,6 +41,9 @@ OFF_WALL_M = 0.009
 """Depth beyond the wall's from which on a cell shows an echo: three times the error of a bench's
 record, and far below the shortest detour over an object in a box (0.1 m).
 """
+NO_ECHO_M = 0.03
+"""Depth beyond the wall's below which no echo of an object in a box is: it is a wall that is farther
+than its record."""
 LOST_SHARE = 0.03
 """Share of the information from which on a frame is no longer judged by its networks. With a tenth
 of the rows missing a share of 0.09 is lost, and the silhouette IoU falls from 0.64 to 0.42.
@@ -158,7 +161,8 @@ class MapConsistency:
         echo = both & (beyond_m >= OFF_WALL_M)
         nearer = (beyond_m < -NEARER_M).sum() > NEARER_CELLS
         if at_wall.sum() < MIN_WALL_CELLS:
-            return [MapProblem.OFF_RECORD] if nearer else []
+            farther = (echo & (beyond_m < NO_ECHO_M)).sum() >= MIN_WALL_CELLS
+            return [MapProblem.OFF_RECORD] if nearer or farther else []
 
         light = self._log_light(maps, both, at_wall)
         spread = _spread(light[at_wall])

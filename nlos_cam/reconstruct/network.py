@@ -113,8 +113,10 @@ class Reconstruction:
 
     @property
     def without_surface(self) -> "Reconstruction":
-        """The same with NaN as depth everywhere."""
-        return replace(self, depth_m=np.full_like(self.depth_m, np.nan))
+        """The same with NaN as depth everywhere, and no quality."""
+        uncertainty = replace(self.uncertainty, quality=None) if self.uncertainty else None
+        nothing_m = np.full_like(self.depth_m, np.nan)
+        return replace(self, depth_m=nothing_m, uncertainty=uncertainty)
 
 
 def reconstruct(

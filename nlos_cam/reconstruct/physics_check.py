@@ -89,7 +89,9 @@ class PhysicsCheck(Protocol):
     def __exit__(self, *_: object) -> None: ...
 
     def use_rig(self, rig: Rig) -> None:
-        """Compare the frames that are offered from now on with this rig."""
+        """Compare the frames that are offered from now on with this rig, and forget what was found
+        on another.
+        """
         ...
 
     def offer(self, frame_number: int, maps: LidarMaps, depth_m: Float32) -> None:
@@ -369,6 +371,8 @@ class PeriodicPhysicsCheck(NullPhysicsCheck):
 
     def use_rig(self, rig: Rig) -> None:
         """Compare the frames that are offered from now on with this rig."""
+        if rig != self._rig:
+            self.newest = None
         self._rig = rig
 
     def offer(self, frame_number: int, maps: LidarMaps, depth_m: Float32) -> None:

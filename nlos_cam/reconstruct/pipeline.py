@@ -190,8 +190,7 @@ class PreparedBench(NamedTuple):
 
     bench: CalibratedRig
     aligned: MapAlignment | None
-    flat_field: FlatField | None
-    """None where alignment takes the wall's reflectance out."""
+    flat_field: FlatField
     consistency: MapConsistency | None
     """None without an uncertainty model: then no verdict depends on it."""
     edge: EdgeRepair
@@ -205,7 +204,7 @@ class PreparedFrame:
     maps: LidarMaps
     observation: BenchObservation
     corrected: LidarMaps
-    """Raw maps with the measured range offset of the lidar added."""
+    """Maps as an exact lidar would give them of a uniform wall, on the bench's record (`OwnMaps`)."""
     network_input: LidarMaps
     edge_is_repaired: bool
     findings: MapFindings
@@ -265,10 +264,10 @@ class Pipeline:
     def bench(self, bench: CalibratedRig) -> None:
         aligned = alignment(bench.rig, self.trained, bench.reference) if self.trained else None
         consistency = MapConsistency(bench) if self.uncertainty_model else None
-        # in one assignment: `prepare` must not see half of it
-        flat_field = None if aligned else FlatField(bench)
+        prepared = PreparedBench(bench, aligned, FlatField(bench), consistency, EdgeRepair(bench))
         self.checks.use_rig(bench.rig)
-        self._bench = PreparedBench(bench, aligned, flat_field, consistency, EdgeRepair(bench))
+        # in one assignment: `prepare` must not see half of it
+        self._bench = prepared
 
     @property
     def average(self) -> int:
@@ -298,21 +297,22 @@ class Pipeline:
         maps = self._mean.add(maps)
         observation = bench.observe(arrival.frame, maps)
         difference = observation.difference
-        corrected = bench.correct_range(maps)
-        repaired = edge.repair(corrected)
-        edge_is_repaired = repaired is not corrected
+        ranged = bench.correct_range(maps, observation.drift_m)
+        repaired = edge.repair(ranged)
+        edge_is_repaired = repaired is not ranged
+        corrected = flat_field.correct(repaired)
         if aligned:
             # The difference has no drift in it, and neither has what it adds to the training wall.
             drift_free_m = difference.depth_m if difference else None
             if drift_free_m is not None and edge_is_repaired:
-                moved_m = repaired.depth_m - corrected.depth_m
+                moved_m = repaired.depth_m - ranged.depth_m
                 drift_free_m = (drift_free_m + moved_m).astype(np.float32)
             network_input = aligned.align(repaired, drift_free_m)
         elif self._uses_difference and difference:
             network_input = difference
         else:
-            network_input = flat_field.correct(repaired) if flat_field else repaired
-        findings = consistency.examine(corrected) if consistency else COMPLETE
+            network_input = corrected
+        findings = consistency.examine(ranged) if consistency else COMPLETE
         frozen = self._frozen.add(arrival.frame)
         observed_s = clock()
 
@@ -358,7 +358,8 @@ class Pipeline:
         if shown.uncertainty:
             warnings += problems_of(conditions)
 
-        # Raw maps are checked: they are what the renderer computes.
+        # What the renderer computes knows no ripples of the lidar and no texture of the wall: they
+        # would make an empty bench one that shows something.
         self.checks.offer(frame.frame_number, prepared.corrected, shown.depth_m)
         return FrameResult(
             frame,
@@ -385,7 +386,10 @@ def frame_conditions(prepared: PreparedFrame, newest: PhysicsCheckResult | None)
     and the newest physics check, if that is recent.
     """
     frame, _, issues = prepared.arrival
-    recent = newest is not None and frame.frame_number - newest.frame_number <= CHECK_HOLDS_FRAMES
+    # A device that starts again counts its frames from 0.
+    recent = (
+        newest is not None and 0 <= frame.frame_number - newest.frame_number <= CHECK_HOLDS_FRAMES
+    )
     return FrameConditions(
         saturated="saturated" in issues,
         invalid="blank" in issues or "half_invalid" in issues,

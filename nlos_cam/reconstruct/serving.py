@@ -4,7 +4,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, NamedTuple
 
-from nlos_calibration import DISTANCE_RANGE_M, FACING_RANGE_DEG, Rig, rig_difference
+from nlos_calibration import (
+    DISTANCE_RANGE_M,
+    FACING_RANGE_DEG,
+    Rig,
+    missing_wall,
+    rig_difference,
+    view_difference_deg,
+)
 from nlos_models import RIG_WEIGHTS, CheckpointRecord, load_record, shipped_folder
 
 from nlos_cam.reconstruct.alignment import rig_to_align_with, training_rig
@@ -13,8 +20,11 @@ from nlos_cam.reconstruct.wall_grid import grid_of
 NEAR_M = 0.010
 NEAR_DEG = 2.0
 NEAR_OCCLUDER_M = 0.005
+NEAR_BOX_M = 0.005
 """Differences of rigs that cost at most 0.07 of silhouette IoU, once maps are aligned
 (docs/where-it-works.md)."""
+NEAR_WALL = 0.05
+"""Share of the view that a smaller wall may leave without any."""
 
 Service = Literal["trained for it", "near", "far", "not"]
 SERVICES: tuple[Service, ...] = ("trained for it", "near", "far", "not")
@@ -132,13 +142,18 @@ def _far_off(rig: Rig, trained: CheckpointRecord) -> tuple[int, float]:
 
 def _deviation(rig: Rig, wanted: Rig) -> float:
     """Return the largest difference of two rigs, in units of the limits within which they are
-    near.
+    near; infinite where only one has an occluder.
     """
+    if (rig.occluder is None) != (wanted.occluder is None):
+        return float("inf")
     apart = differences_of(rig, wanted)
     return max(
         apart.distance_m / NEAR_M,
         apart.turned_deg / NEAR_DEG,
+        apart.view_deg / NEAR_DEG,
         apart.occluder_m / NEAR_OCCLUDER_M,
+        apart.box_m / NEAR_BOX_M,
+        missing_wall(rig, wanted) / NEAR_WALL,
     )
 
 
@@ -149,8 +164,12 @@ class RigDifferences(NamedTuple):
     """Of the lidars from the wall."""
     turned_deg: float
     """The larger of yaw and pitch."""
+    view_deg: float
+    """The largest of the four edges of the lidars' views."""
     occluder_m: float
     """The larger of the occluders' edges and gaps; 0 where a rig has none."""
+    box_m: float
+    """The largest of the object boxes' sides, from the lidars' feet; 0 where a rig has none."""
 
 
 def differences_of(rig: Rig, other: Rig) -> RigDifferences:
@@ -158,8 +177,18 @@ def differences_of(rig: Rig, other: Rig) -> RigDifferences:
     here = rig.lidar
     there = other.lidar
     turned_deg = max(abs(here.yaw_deg - there.yaw_deg), abs(here.pitch_deg - there.pitch_deg))
-    moved_m = 0.0
+    occluder_m = 0.0
     if rig.occluder and other.occluder:
         along_m = abs(rig.occluder.x_m - other.occluder.x_m)
-        moved_m = max(along_m, abs(rig.occluder.z_min_m - other.occluder.z_min_m))
-    return RigDifferences(abs(here.distance_m - there.distance_m), turned_deg, moved_m)
+        occluder_m = max(along_m, abs(rig.occluder.z_min_m - other.occluder.z_min_m))
+    box_m = 0.0
+    if rig.object_box and other.object_box:
+        sides = zip(vars(rig.object_box).values(), vars(other.object_box).values(), strict=True)
+        box_m = max(abs(one_m - other_m) for one_m, other_m in sides)
+    return RigDifferences(
+        abs(here.distance_m - there.distance_m),
+        turned_deg,
+        view_difference_deg(rig.pinhole, other.pinhole),
+        occluder_m,
+        box_m,
+    )

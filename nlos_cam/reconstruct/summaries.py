@@ -62,23 +62,34 @@ class WarningSpan:
     """Frame numbers; the warning may have ended and begun again between."""
 
 
+ENDS_AFTER_FRAMES = 30
+"""Frames without a warning after which it has ended: one that holds in every other frame would
+begin and end many times a second."""
+
+
 class WarningLog:
-    """Record of warnings by frame. Calls `on_warning` when one begins or ends, not when its numbers
-    change.
+    """Record of warnings by frame. Calls `on_warning` when one begins or has ended, not when its
+    numbers change.
     """
 
     def __init__(self, on_warning: OnWarning = ignore) -> None:
         self._spans: dict[str, WarningSpan] = {}
         self._on_warning = on_warning
-        self._present = set[str]()
+        self._frames_since: dict[str, int] = {}
+        """Frames since a warning that has not ended was there, by its subject."""
 
     def add(self, result: FrameResult) -> None:
-        before = self._present
-        self._present = {self._count(warning, result.frame_number) for warning in result.warnings}
+        present = {self._count(warning, result.frame_number) for warning in result.warnings}
         for subject, span in self._spans.items():
-            begins = subject in self._present
-            if begins != (subject in before):
-                self._on_warning(span.text, begins)
+            if subject in present:
+                if subject not in self._frames_since:
+                    self._on_warning(span.text, True)
+                self._frames_since[subject] = 0
+            elif subject in self._frames_since:
+                self._frames_since[subject] += 1
+                if self._frames_since[subject] == ENDS_AFTER_FRAMES:
+                    del self._frames_since[subject]
+                    self._on_warning(span.text, False)
 
     def _count(self, warning: str, number: int) -> str:
         """Count a frame for a warning, and return the warning's subject: its text without

@@ -143,7 +143,7 @@ def load_measured_wall(path: Path) -> tuple[Rig, WallFile]:
     """Return the rig of a wall record, and its path and checksum. Raises RecordFileError for any
     other file.
     """
-    return load_wall(path).rig, WallFile(
+    return load_wall(path).beam_rig, WallFile(
         path=str(path), sha256=hashlib.sha256(path.read_bytes()).hexdigest()
     )
 

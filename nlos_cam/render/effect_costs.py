@@ -4,7 +4,7 @@ import time
 from collections.abc import Callable
 
 from nlos_cam.render.accuracy import Accuracy
-from nlos_cam.render.effects import Plan
+from nlos_cam.render.effects import Plan, brings_light
 from nlos_cam.render.renderer import render
 from nlos_cam.render.scene import Scene
 
@@ -35,7 +35,7 @@ def costs(
     clock: Callable[[], float] = time.perf_counter,
 ) -> dict[str, float]:
     """Return the seconds that each included effect adds to a rendering, by name; 0 for effects left
-    out.
+    out, and for the only one that brings light, without which nothing can be rendered.
     """
     names = [effect.name for effect in plan if effect.included]
 
@@ -48,6 +48,7 @@ def costs(
     whole = least(names)
 
     def added(name: str) -> float:
-        return max(whole - least([other for other in names if other != name]), 0.0)
+        rest = [other for other in names if other != name]
+        return max(whole - least(rest), 0.0) if brings_light(rest) else 0.0
 
     return {effect.name: added(effect.name) if effect.included else 0.0 for effect in plan}

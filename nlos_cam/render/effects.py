@@ -78,6 +78,11 @@ def _asked(findings: Collection[tuple[str, float, str]], effects: Collection[str
     )
 
 
+def brings_light(effects: Collection[str]) -> bool:
+    """Return whether any light arrives with only these effects."""
+    return not {"direct", "three-bounce"}.isdisjoint(effects)
+
+
 def requested(effects: Collection[str]) -> Plan:
     """Return the plan with exactly some effects, without a look at the scene: bounds are NaN.
 
@@ -89,7 +94,7 @@ def requested(effects: Collection[str]) -> Plan:
         raise UnknownNameError(
             f"no effect {min(unknown)!r}.{near} Choose from {', '.join(EFFECTS)}, or auto"
         )
-    if not names & {"direct", "three-bounce"}:
+    if not brings_light(names):
         raise SceneError(
             f"effects {', '.join(sorted(names)) or 'none'}: no light arrives: add direct or"
             " three-bounce"

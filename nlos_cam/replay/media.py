@@ -1,9 +1,9 @@
 """Media of a replay: contact sheet of some frames, saved view, still pictures, video."""
 
-import shutil
+import re
 from collections import Counter
 from collections.abc import Generator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import NamedTuple
 
@@ -11,15 +11,16 @@ import numpy as np
 from nlos_calibration.arrays import Float32
 
 from nlos_cam import view as views
+from nlos_cam.errors import OutputExistsError
 from nlos_cam.objects import object_box
 from nlos_cam.reconstruct import CalibratedRig, FrameResult
-from nlos_cam.replay.object_files import ObjectFiles, frame_stem
+from nlos_cam.replay.object_files import OBJECT_FILE, STEM, ObjectFiles, frame_stem
 from nlos_cam.report import figure_of
 
 VIEW = "view.html"
 VIDEO = "replay.webm"
 STILL = "still-{}.png"
-STILLS = "still-*.png"
+STILLS = re.compile(rf"still-{STEM}\.png")
 OBJECT = "object"
 """Folder of the hidden objects' files."""
 USUAL_PERCENT = 95
@@ -78,7 +79,8 @@ class ReplayMedia:
         self._objects: ObjectFiles | None = None
         self._viewers: list[views.Viewer] = []
         self._stills = FrameSampler(stills) if stills else None
-        self._names: set[str] = set()
+        self._names: set[Path] = set()
+        """Files of this replay, relative to its folder."""
 
     @contextmanager
     def into(self, folder: Path) -> Generator[None]:
@@ -104,7 +106,7 @@ class ReplayMedia:
                 drawn[number] += 1
                 path = folder / STILL.format(frame_stem(number, drawn[number]))
                 views.Still(moments[0]).save(path, moment)
-        self._names = {path.name for path in _media_in(folder)}
+        self._names = {path.relative_to(folder) for path in _media_in(folder)}
 
     def add(self, result: FrameResult, celsius: Mapping[str, float]) -> None:
         if self._viewers:
@@ -116,17 +118,35 @@ class ReplayMedia:
         if self._objects:
             self._objects.add(result.frame_number, result.depth_m, result.uncertainty_m)
 
+    def check_folder(self, out: Path, *, replayed: bool) -> None:
+        """Raise OutputExistsError where the hidden objects' folder, which is replaced as a whole,
+        holds what no replay wrote.
+        """
+        old = out / OBJECT
+        if not self._formats or not old.is_dir():
+            return
+        for path in sorted(old.iterdir()):
+            if not (replayed and OBJECT_FILE.fullmatch(path.name)):
+                raise OutputExistsError(
+                    f"{path} is not of a replay, and {old} would be replaced: move it, or choose"
+                    " another --out"
+                )
+
     def remove_stale(self, out: Path) -> None:
         """Remove the media of an earlier replay from a folder."""
         for path in _media_in(out):
-            if path.name not in self._names:
-                shutil.rmtree(path) if path.is_dir() else path.unlink()
+            if path.relative_to(out) not in self._names:
+                path.unlink()
+        with suppress(OSError):  # there is none, or it holds something else
+            (out / OBJECT).rmdir()
 
 
 def _media_in(folder: Path) -> list[Path]:
-    return [folder / name for name in (VIEW, VIDEO, OBJECT) if (folder / name).exists()] + list(
-        folder.glob(STILLS)
-    )
+    """Return the files in a folder that have the names of media."""
+    stills = [path for path in folder.iterdir() if STILLS.fullmatch(path.name)]
+    objects = [path for path in (folder / OBJECT).glob("*") if OBJECT_FILE.fullmatch(path.name)]
+    named = [folder / VIEW, folder / VIDEO, *stills, *objects]
+    return [path for path in named if path.is_file()]
 
 
 class Row(NamedTuple):

@@ -1,5 +1,6 @@
 """Hidden objects of a replay as files of other programs: a mesh or a point cloud per frame."""
 
+import re
 from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
@@ -18,6 +19,10 @@ from nlos_cam.reconstruct import ignore
 
 OBJECT_FORMATS = ("ply", "glb", "obj", "csv", "npz", "points")
 """Suffixes of `SurfaceMesh.save`, and "points" for a .ply without faces."""
+STEM = r"\d{6,}(-\d+)?"
+"""Pattern of `frame_stem`."""
+OBJECT_FILE = re.compile(rf"{STEM}(-points\.ply|\.(ply|glb|obj|csv|npz))")
+"""Names that ObjectFiles gives."""
 
 
 @dataclass

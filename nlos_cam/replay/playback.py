@@ -2,7 +2,9 @@
 exported.
 """
 
+from collections import deque
 from collections.abc import Mapping
+from dataclasses import replace
 from datetime import datetime
 from pathlib import Path
 from threading import Event, Lock
@@ -19,6 +21,7 @@ from nlos_cam.reconstruct import (
     PeriodicPhysicsCheck,
     PhysicsCheck,
     Pipeline,
+    Verdict,
     build_pipeline,
     iterate_batched,
 )
@@ -27,6 +30,10 @@ from nlos_cam.view import Moment, PlaybackViewer, WrittenFiles, save_moment
 
 SAME_S = 1e-3
 """Difference of two times, in seconds, below which they are one: the page's are rounded."""
+FRAMES_BEFORE = 30
+"""Frames before an exported one that are reconstructed too: the lidar's drift, which the maps are
+corrected by, is a median over as many.
+"""
 
 
 class Playback(PlaybackViewer):
@@ -52,6 +59,8 @@ class Playback(PlaybackViewer):
         """Frames reconstructed so far."""
         self._start_s = 0.0
         """Timestamp of the first frame, from which the page counts."""
+        self._verdicts: dict[tuple[int, float], Verdict | None] = {}
+        """Verdicts of the page, by number and timestamp. They depend on all frames before."""
         self._camera = camera
         self._bag = Path(camera.uri.removeprefix("bag:"))
         self._calibrated = bench
@@ -74,6 +83,7 @@ class Playback(PlaybackViewer):
                     if not self.frames:
                         self._start_s = result.timestamp_s
                     self.show(Moment.recorded(result, telemetry.celsius))
+                    self._verdicts[result.frame_number, result.timestamp_s] = result.verdict
                     self.frames += 1
 
         if not self.frames and not stop.is_set():
@@ -127,19 +137,31 @@ class Playback(PlaybackViewer):
             ) from error
 
     def _export(self, number: int, time_s: float | None) -> str:
-        """Reconstruct one frame again, since the page's copy is rounded, and write its files."""
-        with open_camera(self._camera.uri) as camera:
-            found = (each for each in camera if self._is_at(each, number, time_s))
-            frame = next(found, None)
-        if frame is None:
-            raise NlosCamError(f"{self._bag.name} has no frame {number}")
-
-        with FrameReader([frame], lossless=True, stop=Event()) as reader:
-            (result,) = iterate_batched(reader, self._pipeline(self._calibrated.afresh()))
+        """Reconstruct one frame again, since the page's copy is rounded, and write its files with the
+        page's verdict.
+        """
+        frames = self._frames_up_to(number, time_s)
+        with FrameReader(frames, lossless=True, stop=Event()) as reader:
+            results = iterate_batched(reader, self._pipeline(self._calibrated.afresh()))
+            (result,) = deque(results, maxlen=1)
+        shown = self._verdicts.get((result.frame_number, result.timestamp_s), result.verdict)
+        result = replace(result, verdict=shown)
         now = f"{datetime.now().astimezone():%H%M%S}"
         path = self._folder / f"{self._bag.stem}-{number:06d}-{now}.npz"
         outcome = save_moment(path, Moment.recorded(result))
         return f"{outcome}, {self._files.note(path)}"
+
+    def _frames_up_to(self, number: int, time_s: float | None) -> list[Frame]:
+        """Return a frame, the last, and those before it. Raises NlosCamError where it is not
+        there.
+        """
+        frames = deque[Frame](maxlen=FRAMES_BEFORE + 1)
+        with open_camera(self._camera.uri) as camera:
+            for frame in camera:
+                frames.append(frame)
+                if self._is_at(frame, number, time_s):
+                    return [*frames]
+        raise NlosCamError(f"{self._bag.name} has no frame {number}")
 
     def _is_at(self, frame: Frame, number: int, time_s: float | None) -> bool:
         """Return True for the frame of a number, at a time that the page shows if given."""

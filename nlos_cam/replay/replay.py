@@ -3,7 +3,7 @@ report.
 """
 
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -15,7 +15,16 @@ import numpy as np
 from nlos_cam.camera import Camera
 from nlos_cam.errors import RecordingError
 from nlos_cam.files import atomic_directory
-from nlos_cam.reconstruct import Clock, FrameReader, OnWarning, Pipeline, ignore, iterate_batched
+from nlos_cam.reconstruct import (
+    UNEXPLAINED,
+    Clock,
+    FrameReader,
+    OnWarning,
+    Pipeline,
+    ignore,
+    iterate_batched,
+    verdict_limits,
+)
 from nlos_cam.recording import with_telemetry
 from nlos_cam.replay.media import FrameSampler, ReplayMedia, draw_contact_sheet
 from nlos_cam.replay.report import replay_document
@@ -56,47 +65,55 @@ def replay_recording(
     on_frame: Callable[[], None] = ignore,
     on_warning: OnWarning = ignore,
     media: ReplayMedia | None = None,
+    options: Sequence[str] = (),
     clock: Clock = time.time,
 ) -> ReplayReport:
     """Reconstruct every frame of an entered recording into the folder `out`; files of the same
     names are replaced.
 
     Difference maps are written if the bench has a reference; else those of an earlier replay are
-    removed. Setting `stop` ends the replay early and keeps its results; before the first frame it
-    raises KeyboardInterrupt and writes nothing. Raises RecordingError for a recording without a
-    complete frame, and the camera's errors.
+    removed, like its media. `options` are the words of the command line that chose bench, weights
+    and average, which the report repeats. Setting `stop` ends the replay early and keeps its
+    results; before the first frame it raises KeyboardInterrupt and writes nothing. Raises
+    RecordingError for a recording without a complete frame, OutputExistsError where hidden objects
+    would replace what no replay wrote, and the camera's errors.
     """
     start_s = clock()
     bench = pipeline.bench
     media = media or ReplayMedia(bench)
     samples = FrameSampler(SHEET_FRAMES)
+    replayed = (out / RESULT).is_file()
+    media.check_folder(out, replayed=replayed)
     with atomic_directory(out) as part, ExitStack() as files:
-        results = ReplayResults(lambda: files.enter_context(TemporaryFile(dir=part)), on_warning)
-        files.enter_context(media.into(part))
+        results = ReplayResults(
+            lambda: files.enter_context(TemporaryFile(dir=part)),
+            on_warning,
+            _unexplained_empty(pipeline),
+        )
         frames, telemetry = with_telemetry(camera)
-        with FrameReader(frames, lossless=True, stop=stop, clock=clock) as reader, pipeline.checks:
-            for result in iterate_batched(reader, pipeline, clock, telemetry):
-                results.add(result)
-                samples.add(result)
-                media.add(result, telemetry.celsius)
-                on_frame()
-        if not results.numbers:
-            if stop.is_set():
-                raise KeyboardInterrupt  # before the first frame, which is no fault of the recording
-            raise RecordingError(
-                f"{camera.uri} has no frame with depth and infrared: record it again"
-            )
+        reader = FrameReader(frames, lossless=True, stop=stop, clock=clock)
+        with media.into(part):
+            with reader, pipeline.checks:
+                for result in iterate_batched(reader, pipeline, clock, telemetry):
+                    results.add(result)
+                    samples.add(result)
+                    media.add(result, telemetry.celsius)
+                    on_frame()
+            _require_frames(camera, results, stop)
 
         np.savez_compressed(part / RESULT, **results.hidden_arrays(bench.rig))
         if bench.reference:
             np.savez_compressed(part / DIFFERENCE, **results.difference_arrays(bench))
         draw_contact_sheet(part / SHEET, samples.results())
-        document = replay_document(camera, bench, results, part, out=out, interrupted=stop.is_set())
+        document = replay_document(
+            camera, bench, results, part, out=out, options=options, interrupted=stop.is_set()
+        )
         write_document(document, part / REPORT)
 
-    if not bench.reference:
-        (out / DIFFERENCE).unlink(missing_ok=True)
-    media.remove_stale(out)
+    if replayed:
+        if not bench.reference:
+            (out / DIFFERENCE).unlink(missing_ok=True)
+        media.remove_stale(out)
     return ReplayReport(
         frames=len(results.numbers),
         seconds=clock() - start_s,
@@ -105,3 +122,22 @@ def replay_recording(
         verdicts=results.verdicts,
         quality=results.quality.summary,
     )
+
+
+def _unexplained_empty(pipeline: Pipeline) -> float:
+    """Return the score of the physics check from which on a verdict without a surface changes;
+    without verdicts, that of a surface.
+    """
+    model = pipeline.uncertainty_model
+    return verdict_limits(model).unexplained_empty if model else UNEXPLAINED
+
+
+def _require_frames(camera: Camera, results: ReplayResults, stop: Event) -> None:
+    """Raise for a replay without a frame: KeyboardInterrupt if it was stopped before the first,
+    which is no fault of the recording, else RecordingError.
+    """
+    if results.numbers:
+        return
+    if stop.is_set():
+        raise KeyboardInterrupt
+    raise RecordingError(f"{camera.uri} has no frame with depth and infrared: record it again")

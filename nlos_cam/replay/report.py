@@ -3,6 +3,7 @@ commands.
 """
 
 import shlex
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -64,10 +65,11 @@ def replay_document(
     folder: Path,
     *,
     out: Path,
+    options: Sequence[str] = (),
     interrupted: bool = False,
 ) -> Document:
     """Return the report on a replay whose other files are in `folder`, which will be renamed to
-    `out`.
+    `out`. `options` are the words of the command line that another replay needs too.
 
     `camera` has delivered its last frame: its counters are those of the recording.
     """
@@ -81,7 +83,7 @@ def replay_document(
         f"warning in {each.frames} frames, from {each.first} to {each.last}: {each.text}"
         for each in results.warnings.spans
     ]
-    commands = _next_commands(camera, folder, out)
+    commands = _next_commands(camera, folder, out, options)
     return Document(
         f"Replay of {camera.uri}",
         subtitle,
@@ -132,11 +134,12 @@ def _reconstruction(results: ReplayResults, bench: CalibratedRig) -> dict[str, s
             f"{quality['expected_error_mm']:.0f} mm (medians of the frames with an object)"
         )
     if scores := [*results.check_scores.values()]:
-        unexplained = sum(score >= UNEXPLAINED for score in scores)
+        empty = results.unexplained_empty
+        without = f" ({empty:g} without a surface)" if empty != UNEXPLAINED else ""
         facts["physics check"] = (
             f"score {np.median(scores):.2f} (median; 0: the reconstruction explains the"
-            f" maps, 1: no better than an empty bench); {unexplained} of {len(scores)} checked"
-            f" frames at {UNEXPLAINED:g} or more"
+            f" maps, 1: no better than an empty bench); {sum(results.unexplained.values())} of"
+            f" {len(scores)} checked frames at {UNEXPLAINED:g} or more{without}"
         )
     if bench.reference:
         facts["difference maps"] = (
@@ -169,12 +172,13 @@ def _files(folder: Path) -> dict[str, str]:
     return files
 
 
-def _next_commands(camera: Camera, folder: Path, out: Path) -> list[str]:
+def _next_commands(camera: Camera, folder: Path, out: Path, options: Sequence[str]) -> list[str]:
     bag = shlex.quote(camera.uri.removeprefix("bag:"))
     commands = [f"nlos-cam info {bag}"]
     if not (folder / "object").exists():
         result = shlex.quote(str(out / "reconstruction.npz"))
         commands.append(f"nlos-cam export {result} --object ply,glb,csv")
     if not (folder / "replay.webm").exists():
-        commands.append(f"nlos-cam replay {bag} --stills 6 --video")
+        words = shlex.join([*options, "--stills", "6", "--video"])
+        commands.append(f"nlos-cam replay {bag} {words}")
     return commands

@@ -11,6 +11,7 @@ from nlos_calibration.arrays import Float32
 from nlos_cam.frames import MAP_COLUMNS, MAP_ROWS, OBJECT_PIXELS
 from nlos_cam.objects import object_box
 from nlos_cam.reconstruct import (
+    UNEXPLAINED,
     CalibratedRig,
     FrameResult,
     OnWarning,
@@ -45,9 +46,16 @@ class ArrayStack:
 
 
 class ReplayResults:
-    """Collector of the frames' results; `new_file` opens the files of the large arrays."""
+    """Collector of the frames' results; `new_file` opens the files of the large arrays.
 
-    def __init__(self, new_file: NewFile, on_warning: OnWarning) -> None:
+    `unexplained_empty` is the score of the physics check from which on maps without a surface are
+    not explained; with one it is UNEXPLAINED.
+    """
+
+    def __init__(
+        self, new_file: NewFile, on_warning: OnWarning, unexplained_empty: float = UNEXPLAINED
+    ) -> None:
+        self.unexplained_empty = unexplained_empty
         self.numbers: list[int] = []
         self.timestamps_s: list[float] = []
         self.frames_with_surface = 0
@@ -55,6 +63,8 @@ class ReplayResults:
         """Median over the surface, by frame with a surface and an uncertainty model."""
         self.check_scores: dict[int, float] = {}
         """Scores of the physics check by number of the checked frame."""
+        self.unexplained: dict[int, bool] = {}
+        """True where that score is one from which on the maps are not explained."""
         self.quality = QualityLog()
         self.warnings = WarningLog(on_warning)
         self._verdicts: list[Verdict | None] = []
@@ -72,7 +82,9 @@ class ReplayResults:
         self.quality.add(result)
         self.warnings.add(result)
         if result.check:
+            limit = UNEXPLAINED if result.check.has_surface else self.unexplained_empty
             self.check_scores[result.check.frame_number] = result.check.score
+            self.unexplained[result.check.frame_number] = result.check.score >= limit
         quality = result.reconstruction.quality
         self._expected.append((quality.iou[1], quality.error_m) if quality else (np.nan, np.nan))
 
@@ -98,8 +110,10 @@ class ReplayResults:
 
     @property
     def duration_s(self) -> float:
-        """Recorded time from the first frame to the last."""
-        return self.timestamps_s[-1] - self.timestamps_s[0]
+        """Recorded time from the first frame to the last, without steps of the clock backwards, as
+        after a restart of the device.
+        """
+        return float(np.maximum(np.diff(self.timestamps_s), 0.0).sum())
 
     def hidden_arrays(self, rig: Rig) -> dict[str, Any]:
         """Return the arrays of reconstruction.npz."""

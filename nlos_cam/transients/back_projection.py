@@ -9,6 +9,7 @@ import numba
 import numpy as np
 from nlos_calibration.arrays import Float32, Float64
 
+from nlos_cam.errors import RecordingError
 from nlos_cam.transients.transient import Transient
 
 MAX_SUMS = 4e9
@@ -17,6 +18,10 @@ it.
 """
 MIN_SIDE = 12
 DEFAULT_SIDE = 48
+MIN_ALONG_AXIS = 0.94
+"""Smallest component of a wall's unit normal along x, y or z: 20 degrees off it. The box of a
+volume has its sides along the axes.
+"""
 
 
 @dataclass(frozen=True)
@@ -45,27 +50,23 @@ class Volume:
     def of(cls, transient: Transient, side: int = DEFAULT_SIDE) -> "Volume":
         """Return the volume that nlos-cam wrote down, or else the space in front of the points, as
         deep as they are wide.
+
+        Raises RecordingError for a wall that does not face along x, y or z.
         """
         pairs = transient.matrix[0].size
         side = max(MIN_SIDE, min(side, int((MAX_SUMS / pairs) ** (1 / 3))))
         if box := _written(transient):
             return cls(*box, (side, side, side))
         points = np.concatenate(transient.points)
+        axis, sign = _facing_axis(transient)
         low = points.min(0)
-        high = points.max(0)
-        width = max(float((high - low)[:2].max()), transient.bin_m)
+        high = np.maximum(points.max(0), low + 1e-3)
+        width = max(float(np.delete(np.ptp(points, 0), axis).max()), transient.bin_m)
         # No point deeper than half the longest path is ever met.
         deep = min(width, transient.end_m / 2)
-        z = float(points[:, 2].mean())
-        return cls(
-            (float(low[0]), float(low[1]), z + 0.02 * deep),
-            (
-                max(float(high[0]), float(low[0]) + 1e-3),
-                max(float(high[1]), float(low[1]) + 1e-3),
-                z + deep,
-            ),
-            (side, side, side),
-        )
+        wall = float(points[:, axis].mean())
+        low[axis], high[axis] = sorted((wall + sign * 0.02 * deep, wall + sign * deep))
+        return cls(tuple(low.tolist()), tuple(high.tolist()), (side, side, side))
 
 
 def _written(
@@ -81,6 +82,34 @@ def _written(
     if not (np.isfinite(center).all() and np.isfinite(half).all() and (half > 0).all()):
         return None
     return tuple((center - half).tolist()), tuple((center + half).tolist())
+
+
+def outward(transient: Transient) -> Float64:
+    """Return the unit vector (3,) from the wall into the hidden space: the mean of the normals that
+    the file has, or else +z.
+    """
+    known = [
+        normals.reshape(-1, 3)
+        for normals in (transient.laser_normals, transient.detector_normals)
+        if normals is not None and normals.size
+    ]
+    mean = np.concatenate(known).mean(0) if known else np.zeros(3)
+    length = float(np.linalg.norm(mean))
+    return mean / length if length else np.array([0.0, 0.0, 1.0])
+
+
+def _facing_axis(transient: Transient) -> tuple[int, float]:
+    """Return the axis that a wall faces along, and its sign. Raises RecordingError for an oblique
+    wall.
+    """
+    normal = outward(transient)
+    axis = int(np.argmax(np.abs(normal)))
+    if abs(normal[axis]) < MIN_ALONG_AXIS:
+        raise RecordingError(
+            "the wall of this transient faces ({:.2f}, {:.2f}, {:.2f}): turn its points so that it"
+            " faces along x, y or z".format(*normal)
+        )
+    return axis, float(np.sign(normal[axis]))
 
 
 class _Legs(NamedTuple):

@@ -9,7 +9,7 @@ import numpy as np
 from nlos_calibration.arrays import Float32
 
 from nlos_cam.report import Document, Facts, Picture, Section, figure_of, png
-from nlos_cam.transients.back_projection import Volume, back_projection, peak_m
+from nlos_cam.transients.back_projection import Volume, back_projection, outward, peak_m
 from nlos_cam.transients.transient import Transient
 
 if TYPE_CHECKING:
@@ -69,10 +69,13 @@ def transient_document(title: str, transient: Transient, facts: Mapping[str, str
     """Return a report: facts, and the picture of a transient."""
     volume = Volume.of(transient)
     x, y, z = peak_m(back_projection(transient, volume), volume)
+    from_wall_m = np.array([x, y, z]) - np.concatenate(transient.points).mean(0)
     caption = (
         "A line of histograms through the strongest one; their sum; and the largest values of a"
         " plain back-projection (no filter, no weights) seen along z, y and x. It is brightest at"
-        f" ({x:.3f}, {y:.3f}, {z:.3f}) m; z is the distance from the wall."
+        f" ({x:.3f}, {y:.3f}, {z:.3f}) m, {from_wall_m @ outward(transient):.3f} m from the wall."
     )
+    if transient.laser_normals is None and transient.detector_normals is None:
+        caption += " The file has no normals: the wall is taken to face along +z."
     picture = Picture("Slice and back-projection", caption, png(transient_figure(transient)))
     return Document(title, transient.kind, [Section("Content", [Facts(dict(facts))]), picture])

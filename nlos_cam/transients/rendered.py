@@ -30,7 +30,7 @@ class Noise:
     """Noise of counted photons."""
 
     photons: float
-    """Photons expected in the histogram that holds most light: sets the exposure."""
+    """Photons expected in the histogram that holds most light: sets the exposure. Above 0."""
     background: float = 0.0
     """Further photons expected in each bin: ambient light and dark counts."""
     seed: int = 0
@@ -40,11 +40,20 @@ class Noise:
             value = getattr(self, name)
             if not 0 <= value <= 1e9:
                 raise SceneError(f"{name} is {value}: give 0 to 1e9")
+        if not self.photons:
+            raise SceneError("photons is 0: give more than 0, or leave the noise out")
 
     def applied(self, histograms: Float32) -> Float32:
-        """Return counts (n, bins) drawn for the light (n, bins)."""
+        """Return counts (n, bins) drawn for the light (n, bins). Raises SceneError where there is
+        none, which the noise would hide.
+        """
         most = float(histograms.sum(1, dtype=np.float64).max(initial=0))
-        expected = histograms * (self.photons / most if most else 0.0) + self.background
+        if not most:
+            raise SceneError(
+                "no light returns within the bins, so that no photons can be counted: move the"
+                " object into the box, or take more bins, an earlier start or a larger wall"
+            )
+        expected = histograms * (self.photons / most) + self.background
         return np.random.default_rng(self.seed).poisson(expected).astype(np.float32)
 
 

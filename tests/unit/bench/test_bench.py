@@ -17,6 +17,7 @@ from nlos_cam.bench import (
     edit_bench,
     iou_in_use,
     is_bench,
+    load_bare_wall,
     load_bench,
     write_weights,
 )
@@ -70,7 +71,15 @@ def test_object_box_of_the_bench_is_that_of_its_rig(folder: Path) -> None:
     set_line(folder, "x_max_m", "x_max_m = 0.6")
 
     assert load_bench(folder).rig.object_box.x_max_m == 0.6
-    assert load_bench(folder).bare.record.rig.object_box.x_max_m == 0.6
+    assert load_bare_wall(folder).record.rig.object_box.x_max_m == 0.6
+
+
+def test_bare_wall_stays_where_the_occluders_files_are_lost(folder: Path) -> None:
+    (folder / "stations/main/occluder.toml").write_text("half of it", encoding="utf-8")
+
+    with pytest.raises(RecordFileError, match="has changed"):
+        load_bench(folder)
+    assert load_bare_wall(folder).record.occluder is None
 
 
 def test_wall_measured_again_drops_the_occluder_keeps_the_box(folder: Path) -> None:

@@ -79,6 +79,15 @@ def test_statistics_read_temperatures_now_and_then() -> None:
     assert capture.reference(ALL).celsius_span == {"ldd_temperature": 2.0}
 
 
+@pytest.mark.parametrize("moved", [range(30), range(45, 60)])
+def test_a_lidar_that_moved_while_it_measured_is_refused(moved: range) -> None:
+    capture = collect_statistics(WallCamera(60, moved), 60)
+
+    with pytest.raises(WallRefusedError, match="let it stand still"):
+        measure.measure_by_depth(capture)
+    measure.measure_by_depth(collect_statistics(WallCamera(60), 60))
+
+
 def seen_of(
     depth_m: np.ndarray, frames: int, intrinsics: Intrinsics = INTRINSICS, seed: int = 0
 ) -> CaptureStatistics:
@@ -131,6 +140,23 @@ def test_measure_occluder_finds_it_beside_the_known_wall(
     assert record.verdict == "good"
     assert record.rig.occluder == Occluder(x_m=found.x_m, z_min_m=found.gap_m)
     assert record.rig.lidar == bare.record.rig.lidar
+
+
+@pytest.mark.parametrize("offset_m", [0.0045, -0.0045])
+def test_beams_see_the_bench_from_where_they_meet(seen: CaptureStatistics, offset_m: float) -> None:
+    """A tape is held to the glass, from which an offset of the origin is as far as it says."""
+    tape_m = RIG.lidar.distance_m + offset_m * np.cos(np.radians(RIG.facing_deg))
+    bare = measured(seen, tape_m)
+    record, _ = measure_occluder(bench_seen(), bare)
+    beams = record.beam_rig
+
+    assert record.range_offset_cause == "origin"
+    assert record.rig.lidar.distance_m == pytest.approx(tape_m, abs=1e-4)
+    assert beams.lidar.distance_m == pytest.approx(RIG.lidar.distance_m, abs=1e-4)
+    assert beams.occluder.x_m == pytest.approx(BENCH.occluder.x_m, abs=0.001)
+    assert beams.occluder.x_m - record.rig.occluder.x_m == pytest.approx(
+        -offset_m * np.sin(np.radians(RIG.facing_deg)), abs=1e-4
+    )
 
 
 def test_walls_pixels_are_those_beside_the_occluder(bare: MeasuredWall) -> None:

@@ -283,6 +283,14 @@ def test_noise_scale_is_that_of_the_reference(tilted: BareWall) -> None:
     assert noise_scale(single) == 1.0
 
 
+def test_a_reference_without_noise_is_where_it_was(tilted: BareWall) -> None:
+    quiet = replace(tilted, depth_std_m=np.zeros_like(tilted.depth_std_m))
+    check = observed(DriftCheck(quiet, wall_from_lidar(POSE)), quiet.depth_m, 40)
+
+    assert not check.moved
+    assert check.warnings == ()
+
+
 @pytest.mark.parametrize(
     "shift", [(0.0, 0.0, 0.0), (0.001, 0.2, -0.2), (-0.004, 1.0, 2.0), (0.03, -6.0, 5.0)]
 )

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from nlos_calibration.errors import RecordFileError
+from nlos_calibration.errors import CalibrationError, RecordFileError
 from nlos_calibration.geometry import Intrinsics
 from nlos_calibration.occluder import OccluderFit
 from nlos_calibration.reference import (
@@ -20,6 +20,7 @@ from nlos_calibration.reference import (
 )
 from nlos_calibration.rig import ObjectBox, Occluder, Rig, dump_toml, load_rig
 from nlos_calibration.wall_record import (
+    UNUSABLE,
     VERSION,
     MeasuredWall,
     WallRecord,
@@ -146,7 +147,9 @@ GOOD = replace(NEAR, gap_m=0.1)
 
 @pytest.fixture
 def doubtful(record: WallRecord) -> WallRecord:
-    return record.model_copy(update={"verdict": "doubtful", "advice": "average more frames"})
+    doubt = {"verdict": "doubtful", "advice": "average more frames"}
+    of_wall = {f"wall_{name}": value for name, value in doubt.items()}
+    return record.model_copy(update=doubt | of_wall)
 
 
 def test_sheet_too_near_is_added_to_the_walls_advice(doubtful: WallRecord) -> None:
@@ -164,17 +167,47 @@ def test_occluder_measured_again_replaces_the_first_advice(doubtful: WallRecord)
     assert again.warnings == ("a stray",)
 
 
-def test_sign_of_an_object_makes_the_record_unusable(record: WallRecord) -> None:
+def test_doubt_of_an_older_record_is_found_in_its_advice(doubtful: WallRecord) -> None:
+    older = with_occluder(doubtful, NEAR).model_copy(
+        update={"wall_verdict": None, "wall_advice": ""}
+    )
+    again = with_occluder(older, GOOD)
+
+    assert (again.verdict, again.advice) == ("doubtful", "average more frames")
+
+
+def test_sign_of_an_object_refuses_the_occluder(record: WallRecord) -> None:
     hidden = replace(GOOD, why_unusable="an object seems to be hidden")
-    unusable = with_occluder(record, hidden)
 
-    assert unusable.verdict == "doubtful"
-    assert "do not use" in unusable.advice
+    with pytest.raises(CalibrationError, match="hidden; remove the object"):
+        with_occluder(record, hidden)
 
 
-def test_unusable_record_is_good_once_measured_again(record: WallRecord) -> None:
-    unusable = with_occluder(record, replace(GOOD, why_unusable="an object seems to be hidden"))
+def test_older_unusable_record_is_good_once_measured_again(record: WallRecord) -> None:
+    older = {"verdict": "doubtful", "advice": f"{UNUSABLE}: an object seems to be hidden"}
+    unusable = record.model_copy(update={**older, "wall_verdict": None})
+
     assert with_occluder(unusable, GOOD).verdict == "good"
+
+
+def test_remarks_on_an_occluder_go_when_another_is_found(doubtful: WallRecord) -> None:
+    remarked = with_occluder(doubtful, replace(GOOD, warnings=("an unlike cell",)))
+    again = with_occluder(remarked, GOOD)
+
+    assert remarked.warnings == ("an unlike cell",)
+    assert again.warnings == ("a stray",)
+
+
+def test_problems_of_another_box_are_not_kept(record: WallRecord) -> None:
+    box = record.rig.object_box
+    assert box is not None
+    seen = box.model_copy(update={"x_min_m": 0.02, "x_max_m": 0.27})
+    edited = record.model_copy(update={"rig": record.rig.model_copy(update={"object_box": seen})})
+    problems = with_occluder(edited, GOOD)
+    back = problems.model_copy(update={"rig": record.rig})
+
+    assert problems.verdict != "good"
+    assert with_occluder(back, GOOD).verdict == "good"
 
 
 @pytest.mark.parametrize("version", [VERSION - 1, VERSION + 1])

@@ -9,6 +9,7 @@ from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import h5py
 import numpy as np
@@ -94,6 +95,17 @@ def test_build_options_set_plan_and_are_stored_as_command(tmp_path: Path, built:
     )
     assert " --without 'hat, boat' " in _command(folder)
     assert _command(folder).endswith(" --workers 1 --backend cpu")
+
+
+def test_build_interrupted_at_transients_says_what_it_kept(
+    tmp_path: Path, built: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    interrupted = Mock(side_effect=KeyboardInterrupt)
+    monkeypatch.setattr("nlos_cam.dataset.build_transients", interrupted)
+    result = built(tmp_path, "--transient", code=130)
+
+    assert "finished shards and transients are kept" in result.err
+    assert "nothing was written" not in result.err
 
 
 def test_build_in_color_is_noted_as_simulation_only(tmp_path: Path, built: Run) -> None:

@@ -46,7 +46,7 @@ JUDGE, RENDER, RECONSTRUCT = (
         ("tradeoff reconstruct", OUT),
     )
 )
-STORED = ["--dataset", "held-out", "--training", "held-out"]
+STORED = ["--dataset", "held-out", "--training", "held-out/training"]
 
 
 class Guesser(SheetNetwork):
@@ -90,7 +90,7 @@ def guessing(monkeypatch: Patch) -> list[DatasetPlan]:
     kept.
     """
     asked: list[DatasetPlan] = []
-    Path("held-out").mkdir()
+    Path("held-out/training").mkdir(parents=True)
 
     def training_maps(plan: DatasetPlan, *_: object) -> Stored:
         asked.append(plan)

@@ -231,6 +231,15 @@ def test_replay_writes_its_folder_and_one_json_object(opened: Opened, run: Run) 
     assert opened.calls == [("bag:run.bag", {})] * 2
 
 
+@pytest.mark.usefixtures("opened")
+def test_replay_suggests_a_command_with_its_options(run: Run) -> None:
+    write_wall(Path("wall.toml"))
+    run(*WALLED, "wall.toml", "--average", "3")
+    text = Path("out/report.md").read_text(encoding="utf-8")
+
+    assert "run.bag --wall wall.toml --average 3 --stills 6 --video" in text
+
+
 @pytest.mark.parametrize("command", [RECORDED, REPLAY])
 def test_interrupted_command_keeps_its_results(
     opened: Opened, run: Run, command: list[str]
@@ -264,6 +273,7 @@ def test_begin_and_end_of_a_warning_print_once(
     run: Run, monkeypatch: pytest.MonkeyPatch, command: list[str]
 ) -> None:
     monkeypatch.setattr("nlos_cam.reconstruct.frame_reader.QUEUE_FRAMES", 1000)
+    monkeypatch.setattr("nlos_cam.reconstruct.summaries.ENDS_AFTER_FRAMES", 5)
     report = run(*command, "--wall", "wall.toml")
     [(warning, frames)] = report["warnings"].items()
 
@@ -283,7 +293,8 @@ def test_average_is_over_as_many_frames_as_asked(walled: Opened) -> None:
     bench = open_bench(Path("wall.toml"), WallCamera(1))
     wanted = OwnMaps(bench).correct(replace(each[0], depth_m=mean_m))
 
-    np.testing.assert_allclose(walled.network.given[25], wanted.depth_m, atol=1e-6)
+    # but for the drift, which is measured to a few hundredths of a millimetre
+    np.testing.assert_allclose(walled.network.given[25], wanted.depth_m, atol=1e-4)
 
 
 def test_weights_of_difference_maps_need_a_wall(walled: Opened, run: Run) -> None:

@@ -6,6 +6,7 @@ import os
 import signal
 from collections.abc import Callable
 from pathlib import Path
+from threading import Event
 from typing import Any
 
 import numpy as np
@@ -88,6 +89,20 @@ def test_repair_interrupted_is_exit_code_130_without_output(
     run("repair", noise_bags["plain"], "--out", tmp_path / "a.bag", code=130)
 
     assert list(tmp_path.iterdir()) == []
+
+
+def test_interrupted_export_of_objects_says_what_it_kept(
+    shown: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def interrupted(*_: Any, stop: Event, **__: Any) -> int:
+        stop.set()
+        return 2
+
+    monkeypatch.setattr("nlos_cam.replay.export_objects", interrupted)
+    printed = shown("export", "a.npz", "--object", "ply", "--out", tmp_path / "out", code=130)
+
+    assert "holds the surfaces until then" in printed.err
+    assert "nothing was written" not in printed.err
 
 
 def test_export_reports_its_files_and_overwrites_if_asked(

@@ -16,6 +16,7 @@ from nlos_cam.objects.placement import object_depth
 from nlos_cam.render import (
     EFFECTS,
     HiddenObject,
+    Material,
     Scene,
     SceneFile,
     SensorModel,
@@ -143,6 +144,43 @@ def test_render_takes_a_material_and_an_albedo(plate: str, rendered: Run) -> Non
     (_, black), (_, white) = (rendered(plate, "--albedo", albedo) for albedo in "01")
 
     assert (white["intensity"] > black["intensity"]).any()
+
+
+def test_render_keeps_the_material_of_a_scene(
+    plate: str, run: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    glossy = Material(kind="phong", specular=0.6, exponent=9)
+    hidden = HiddenObject(category="cup", material=glossy)
+    scene = SceneFile(name="glossy", rig=RIG, object=hidden)
+    Path("scene.toml").write_text(dump_toml(scene), encoding="utf-8")
+    scenes = list[Scene]()
+    draw = "nlos_cam.cli.render.renderer.render"
+    monkeypatch.setattr(draw, lambda scene, *_: scenes.append(scene) or render(Scene(RIG), "draft"))
+    run("render", plate, *DRAFT, "--scene", "scene.toml", "--albedo", "0.5")
+    run("render", plate, *DRAFT, "--scene", "scene.toml", "--specular", "0.1")
+
+    assert scenes[0].surface.brdf == glossy.brdf
+    assert scenes[0].surface.albedo == 0.5
+    assert scenes[1].surface.brdf == Material(kind="phong", specular=0.1, exponent=9).brdf
+
+
+def test_render_replaces_a_picture_only_when_asked(plate: str, run: Run) -> None:
+    Path("maps.png").write_text("mine")
+    result = run("render", plate, "--accuracy", "draft", "--out", "maps.npz", code=1)
+
+    assert "maps.png" in result["error"]["message"]
+    assert Path("maps.png").read_text() == "mine"
+    assert not Path("maps.npz").exists()
+
+    run("render", plate, *DRAFT)
+
+
+def test_render_explains_an_empty_scene(rendered: Run) -> None:
+    np.save("none.npy", np.full((16, 16), np.nan, np.float32))
+    result, _ = rendered("none.npy", "--explain")
+    seconds = {effect["name"]: effect["seconds"] for effect in result["effects"]}
+
+    assert seconds["direct"] == 0.0
 
 
 def test_render_with_three_albedos_gives_color(plate: str, rendered: Run) -> None:

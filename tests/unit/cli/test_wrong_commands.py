@@ -88,6 +88,12 @@ render cup --max-error 0.1 --accuracy fine | --accuracy
 render none.stl --seed 1 | --seed
 render plate.npy --size-m 0.1 --up z | --size-m
 render cup --out maps.txt | .npz
+render cup --scene paper --rig paper-rig | --rig
+render cup --specular 0.3 | --material
+render cup --material lambertian --exponent 4 | --exponent
+render cup --capture confocal | --capture
+render cup --noise-seed 1 | --transient
+render cup --transient cup.hdf5 --photons 0 | --photons
 dataset | build, label
 dataset bild | build, label
 dataset build --count 1 | --out
@@ -101,6 +107,7 @@ train compressor --recipe recipe.toml --out d --dataset x | --held-out
 evaluate --dataset d --count 3 | --count
 evaluate --training d --no-nearest | --no-nearest
 evaluate --dataset d --rig paper-rig | --rig
+evaluate --dataset d --training ./d | --training
 tradeoff render --seed 3 | --object
 doctor --fix | no option
 """

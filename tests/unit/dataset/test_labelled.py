@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 from nlos_calibration import Rig, dump_toml, load_rig
 from nlos_calibration.errors import CalibrationError
 from nlos_models.training import MapSet
-from small_frames import sheet_network
+from small_frames import FrameCamera, sheet_network, small_frame
 from small_run import small_recipe
 
 from nlos_cam.camera import Recording, SimulatedCamera, World
@@ -33,7 +33,14 @@ from nlos_cam.dataset import (
 )
 from nlos_cam.dataset import labelled as labelled_shards
 from nlos_cam.dataset.build import SHARD
-from nlos_cam.dataset.labelled import RECORDED, Labelled, benchmark_depths, spread, truth_depth_m
+from nlos_cam.dataset.labelled import (
+    RECORDED,
+    Labelled,
+    benchmark_depths,
+    spread,
+    spread_maps,
+    truth_depth_m,
+)
 from nlos_cam.dataset.plan import move_lidar
 from nlos_cam.dataset.shards import store
 from nlos_cam.errors import DiskFullError, NlosCamError, RecordingError, SceneError
@@ -329,6 +336,9 @@ def test_recording_of_dark_frames_alone_is_refused(dark: Callable[[int], Path]) 
         read_labelled([path], known=known)
 
 
+IR = [np.full((64, 80), number, np.uint8) for number in range(6)]
+
+
 def _truth(folder: Path, label: str = "mug", name: str = "F") -> np.ndarray:
     return truth_depth_m(folder / f"{name}.bag", label, RIG, {"cup-1": CUP})
 
@@ -506,6 +516,27 @@ def test_labelled_shards_are_not_extended(tmp_path: Path) -> None:
 
     with pytest.raises(RecordingError, match="--out"):
         build_dataset(DatasetPlan(RIG, 0), 4, tmp_path, workers=1, on_progress=lambda *_: None)
+
+
+def test_labelled_shards_survive_an_error_at_the_end(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write_shards(_samples(SHARD + 7), tmp_path)
+    before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
+    full = Mock(side_effect=OSError("no space left"))
+    monkeypatch.setattr("nlos_cam.files.atomic._flush_directory", full)
+
+    with pytest.raises(OSError, match="no space"):
+        write_shards(_samples(3), tmp_path)
+
+    assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
+
+
+def test_frames_are_spread_over_the_complete_ones() -> None:
+    camera = FrameCamera(6, make=lambda number: replace(small_frame(number), ir=IR[number]))
+    found = spread_maps(camera, 10, 3)
+
+    assert [maps.intensity[0, 0] for maps in found] == [1, 3, 5]
 
 
 def test_labelled_shards_survive_full_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -15,6 +15,7 @@ from nlos_calibration import load_rig
 from nlos_models.training import MapBatch, MapSet
 
 from nlos_cam.dataset import DatasetPlan, reader
+from nlos_cam.dataset.locked import LOCKED
 from nlos_cam.dataset.reader import MAP_CHANNELS, Dataset, _Window, open_dataset
 from nlos_cam.dataset.shards import shard_path, store
 from nlos_cam.errors import RecordingError, SceneError
@@ -197,6 +198,16 @@ def test_reader_opens_expected_maps_where_asked_alone(tmp_path: Path) -> None:
         open_dataset(tmp_path)
 
     assert open_dataset(tmp_path, expected=True).plan.expected
+
+
+def test_reader_opens_locked_differences_where_asked_alone(tmp_path: Path) -> None:
+    locked = replace(PLAN, accuracy=LOCKED)
+    store(shard_path(tmp_path, 40), samples_of([40]), locked.provenance, "")
+
+    with pytest.raises(RecordingError, match="locked differences"):
+        open_dataset(tmp_path)
+
+    assert open_dataset(tmp_path, locked=True).plan.accuracy == LOCKED
 
 
 def test_reader_refuses_shards_of_two_datasets(tmp_path: Path, folder: Path) -> None:

@@ -467,6 +467,39 @@ def test_new_shards_enter_new_epochs(folder: Path, store_folder: Path) -> None:
         assert len(_epoch(packed, 2)[0]) == 10
 
 
+@pytest.mark.parametrize("sizes", ["known", "of a store before they were kept"])
+def test_store_takes_the_rest_of_a_shard_that_grew(
+    folder: Path, store_folder: Path, sizes: str
+) -> None:
+    with open_packed_maps([folder], store_folder) as packed:
+        first = _epoch(packed, 1, 1)
+    if sizes != "known":
+        index = json.loads((store_folder / INDEX).read_text())
+        del index["sizes"]
+        (store_folder / INDEX).write_text(json.dumps(index))
+    grown = {name: np.concatenate([of, _samples(5)[name]]) for name, of in _samples(0).items()}
+    store(shard_path(folder, 0), grown, PLAN.provenance, "")
+
+    with open_packed_maps([folder], store_folder) as packed:
+        assert len(packed) == 10
+        for one, other in zip(_epoch(packed, 1, 1), first, strict=True):
+            np.testing.assert_array_equal(one, other)
+        wanted = _normalised(packed, grown["depth_m"], grown["intensity"])
+        found = _epoch(packed, 2, 1)[0]
+        assert {maps.tobytes() for maps in found} == {maps.tobytes() for maps in wanted}
+    with open_packed_maps([folder], store_folder) as packed:
+        assert len(packed) == 10
+
+
+def test_shard_that_grows_enters_the_next_epoch(folder: Path, store_folder: Path) -> None:
+    with open_packed_maps([folder], store_folder) as packed:
+        _epoch(packed, 1, 1)
+        grown = {name: np.concatenate([of, _samples(5)[name]]) for name, of in _samples(0).items()}
+        store(shard_path(folder, 0), grown, PLAN.provenance, "")
+
+        assert len(_epoch(packed, 2, 1)[0]) == 10
+
+
 def test_another_run_in_the_same_store_sees_all_objects(folder: Path, store_folder: Path) -> None:
     with open_packed_maps([folder], store_folder, run="one ") as packed:
         _epoch(packed, 1, 1)

@@ -104,13 +104,16 @@ def test_front_is_undominated_in_time_to_the_picture_and_iou() -> None:
 
 
 def test_settings_are_every_network_with_every_number_of_frames() -> None:
-    record = SimpleNamespace(rig_name=RIG.name)
-    networks = {
+    record = SimpleNamespace(rig_name="wall-grid")  # of weights for any rig
+    networks: dict[str, Any] = {
         name: SimpleNamespace(runtime="a runtime", record=record) for name in ("small", "large")
     }
+    objects = ObjectSet(RIG, np.zeros((0, 64, 64), np.float32), [])
+    sets = dict.fromkeys(networks, BothSets(objects, objects))
 
-    asked = reconstruct_settings(networks)  # type: ignore[arg-type]
+    asked = reconstruct_settings(ReconstructBench(networks, sets))
 
+    assert {one.rig for one in asked} == {RIG.name}
     assert len({one.name for one in asked}) == len(asked)
 
     for weights in networks:
@@ -159,6 +162,14 @@ def test_table_shows_the_measured_rows(measured: int) -> None:
     page = read_page(reconstruct_document(table).as_html())
 
     assert all(name in page.text for name in names)
+
+
+@pytest.mark.parametrize(("rig", "camera"), [(RIG.name, "sim"), ("wide-rig", "l515")])
+def test_command_is_of_a_camera_on_the_measured_rig(rig: str, camera: str) -> None:
+    rows = [replace(ROWS[0], setting=replace(ROWS[0].setting, rig=rig))]
+    page = read_page(reconstruct_document(facts_of(rows, 1)).as_html())
+
+    assert f"nlos-cam live {camera} --weights" in page.text
 
 
 def test_plot_is_a_picture(tmp_path: Path) -> None:

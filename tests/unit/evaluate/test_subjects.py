@@ -21,6 +21,7 @@ from nlos_cam.dataset import (
     DatasetPlan,
     Labelled,
     Objects,
+    RigRange,
     RigSpread,
     procedural_images,
     write_shards,
@@ -165,8 +166,11 @@ def test_each_object_of_many_rigs_is_aligned_from_its_own(
 
 def test_note_says_that_objects_have_rigs_of_their_own(of_many_rigs: HeldOutObjects) -> None:
     (note,) = notes_about(RECORD, of_many_rigs, None)
+    any_rig = replace(of_many_rigs, plan=DatasetPlan(RIG, 0, rigs=RigRange()))
+    (other,) = notes_about(RECORD, any_rig, None)
 
     assert "a rig of its own" in note
+    assert "a rig of its own" in other
 
 
 def test_difference_maps_of_recordings_are_of_maps_as_recorded(tmp_path: Path) -> None:

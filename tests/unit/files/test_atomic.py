@@ -110,18 +110,23 @@ def test_atomic_directory_replaces_entries_by_name(
         (out / folder).mkdir(parents=True)
         (out / folder / "old.txt").write_text("old")
     (out / "mine.txt").write_text("mine")
+    (out / "stale-1.txt").write_text("old")
+    (out / "stale-2.txt").write_text("old")
     if way == "no exchange":
         monkeypatch.setattr("nlos_cam.files.atomic._exchange", lambda *_: False)
     if way == "no links":
         monkeypatch.setattr("nlos_cam.files.atomic._link_all", lambda *_: False)
     if way == "current folder":
         monkeypatch.chdir(out)
-    with atomic_directory(out) as part:
+    with atomic_directory(out, drop="stale-*.txt") as part:
         (part / "inner").mkdir()
         (part / "inner" / "new.txt").write_text("new")
+        (part / "stale-2.txt").write_text("new")
+        assert (out / "stale-1.txt").read_text() == "old"
     files = sorted(str(path.relative_to(out)) for path in out.rglob("*.txt"))
 
-    assert files == ["inner/new.txt", "kept/deep/old.txt", "mine.txt"]
+    assert files == ["inner/new.txt", "kept/deep/old.txt", "mine.txt", "stale-2.txt"]
+    assert (out / "stale-2.txt").read_text() == "new"
     assert [path.name for path in tmp_path.iterdir()] == ["out"]
 
 

@@ -6,13 +6,13 @@ from pathlib import Path
 from threading import Event
 from types import SimpleNamespace
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
 from fake_wall import wall_frame
 from made_up_moments import RIG, Recorded, full_moment, moment
 from nlos_calibration import (
-    UNUSABLE,
     LidarPose,
     MeasuredWall,
     OccluderRecord,
@@ -20,6 +20,7 @@ from nlos_calibration import (
     load_rig,
     wall_depth,
 )
+from nlos_calibration.errors import CalibrationError
 from nlos_models import load_record, shipped_folder
 from small_frames import SMALL, FrameCamera, sheet_network
 from view_streams import saved_moments
@@ -318,8 +319,8 @@ def test_reference_with_an_occluder_gives_its_place() -> None:
 def test_reference_with_something_in_the_way_is_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    hidden = SimpleNamespace(advice=f"{UNUSABLE}: an object seems to be hidden; remove it")
-    monkeypatch.setattr("nlos_cam.live.run_commands.measure_bench", lambda *_: (hidden, None))
+    hidden = Mock(side_effect=CalibrationError("an object seems to be hidden; remove it"))
+    monkeypatch.setattr("nlos_cam.live.run_commands.measure_bench", hidden)
     control = RunControl(folder=tmp_path)
     outcomes = list[Exception]()
 

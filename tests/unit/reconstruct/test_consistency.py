@@ -64,6 +64,14 @@ WRONG: dict[str, tuple[MapProblem, Change]] = {
         MapProblem.OFF_RECORD,
         lambda maps, _: replace(maps, depth_m=maps.depth_m + np.float32(0.007)),
     ),
+    "wall 12 mm off": (
+        MapProblem.OFF_RECORD,
+        lambda maps, _: replace(maps, depth_m=maps.depth_m + np.float32(0.012)),
+    ),
+    "wall 20 mm off": (
+        MapProblem.OFF_RECORD,
+        lambda maps, _: replace(maps, depth_m=maps.depth_m + np.float32(0.020)),
+    ),
     "turned up by four rows": (
         MapProblem.TILTED,
         everywhere(lambda array: np.roll(array, 4, axis=0)),

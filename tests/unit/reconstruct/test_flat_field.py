@@ -15,6 +15,7 @@ from nlos_cam.frames import LidarMaps
 from nlos_cam.objects import object_box, object_depth
 from nlos_cam.reconstruct import measured_counts
 from nlos_cam.reconstruct.flat_field import FlatField
+from nlos_cam.reconstruct.physics_check import UNEXPLAINED_EMPTY, check_reconstruction
 from nlos_cam.render import Scene, SensorModel, render
 
 HOME = load_rig("paper-rig")
@@ -48,6 +49,19 @@ def depth_off_m(found: LidarMaps, wanted: LidarMaps) -> float:
     same = np.abs(off_m) < 0.01
     assert same.mean() > 0.95
     return float(np.sqrt(np.mean(np.square(off_m[same]))))
+
+
+def test_an_empty_bench_with_ripples_and_texture_is_explained() -> None:
+    model = SensorModel(wall_texture=0.1, ripple_m=0.0015)
+    bare = sense([EMPTY], RIG, model, frames=60)[0]
+    seen = sense([EMPTY, EMPTY], RIG, model)[1]
+
+    raw, corrected = (
+        check_reconstruction(maps, None, RIG).score
+        for maps in (seen, FlatField(bench_of(bare)).correct(seen))
+    )
+
+    assert corrected < UNEXPLAINED_EMPTY < raw
 
 
 def test_textured_wall_looks_uniform_also_behind_an_object() -> None:

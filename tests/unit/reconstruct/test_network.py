@@ -88,7 +88,8 @@ def test_hidden_surface_keeps_its_uncertainty(uncertain: Reconstruction) -> None
     assert uncertain.has_surface
     assert not hidden.has_surface
     assert hidden.uncertainty_m is uncertain.uncertainty_m
-    assert hidden.uncertainty is uncertain.uncertainty
+    assert hidden.uncertainty.error_m is uncertain.uncertainty.error_m
+    assert hidden.quality is None
 
 
 def test_maps_without_returns_have_uncertainty_and_no_surface(

@@ -234,6 +234,49 @@ def test_frame_conditions_follow_frame_issues_and_bench(missing: int, saturated:
     )
 
 
+def test_an_offset_of_the_origin_is_in_the_rig_not_the_depth(tmp_path: Path) -> None:
+    offset = {"range_offset_m": 0.004, "range_offset_cause": "origin"}
+    bench = open_bench(write_wall(tmp_path / "wall.toml", bare_wall(), **offset), WallCamera(1))
+    maps = maps_from_frame(wall_frame(0))
+
+    assert bench.correct_range(maps) is maps
+    assert bench.rig != bench.measured.record.rig
+    moved_m = bench.rig.lidar.distance_m - RIG.lidar.distance_m
+    assert moved_m == pytest.approx(-0.004 * np.cos(np.radians(RIG.facing_deg)), abs=1e-6)
+
+
+def test_a_check_of_later_frames_does_not_count() -> None:
+    """A device that starts again counts its frames from 0."""
+    frame = wall_frame(3)
+    prepared = SimpleNamespace(
+        arrival=Arrival(frame, 0.0, ()),
+        observation=BenchObservation(None, ()),
+        frozen=False,
+        findings=COMPLETE,
+    )
+    check = PhysicsCheckResult(50_000, frame.depth_m, frame.depth_m, score=1.0, seconds=0.0)
+
+    assert frame_conditions(prepared, check).check is None  # type: ignore[arg-type]
+
+
+def test_checked_maps_are_without_the_ranges_drift(walled: CalibratedRig) -> None:
+    offered: list[LidarMaps] = []
+    checks = SimpleNamespace(
+        newest=None,
+        use_rig=lambda _: None,
+        offer=lambda _number, maps, _depth_m: offered.append(maps),
+    )
+    pipeline = Pipeline(walled, sheet_network, checks=checks)  # type: ignore[arg-type]
+    for number in range(40):
+        frame = wall_frame(number, nearer_m=-0.0008)
+        pipeline.process(Arrival(frame, 0.0, ()), lambda: 0.0, 0.0)
+
+    exact = OwnMaps(walled).correct(maps_from_frame(wall_frame(39)))
+    off_m = np.nanmean(offered[-1].depth_m - exact.depth_m)
+    assert abs(off_m) < 2e-4
+    assert np.nanmean(offered[0].depth_m - exact.depth_m) == pytest.approx(8e-4, abs=1e-4)
+
+
 DOUBTER: Any = object()
 
 

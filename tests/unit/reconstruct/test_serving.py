@@ -42,6 +42,39 @@ def test_service_falls_with_the_distance_of_the_rigs(rig: Rig, service: str) -> 
     assert ("0.61" in verdict.sentence) == (service != "trained for it")
 
 
+def with_box_moved(**by_m: float) -> Rig:
+    box = RIG.object_box
+    assert box is not None
+    sides = {f"{axis}_{end}": by_m[axis] for axis in by_m for end in ("min_m", "max_m")}
+    moved = {side: getattr(box, side) + off_m for side, off_m in sides.items()}
+    return RIG.model_copy(update={"object_box": box.model_copy(update=moved)})
+
+
+def with_focal_length(px: float) -> Rig:
+    return RIG.model_copy(update={"intrinsics": RIG.intrinsics.model_copy(update={"fx": px})})
+
+
+def with_wall_to(y_max_m: float) -> Rig:
+    return RIG.model_copy(update={"wall": RIG.wall.model_copy(update={"y_max_m": y_max_m})})
+
+
+@pytest.mark.parametrize(
+    ("rig", "service"),
+    [
+        (with_box_moved(x=0.004), "near"),
+        (with_box_moved(x=0.03), "far"),
+        (with_box_moved(x=-0.05), "far"),
+        (with_box_moved(y=0.1), "far"),
+        (with_focal_length(700.0), "far"),
+        (with_wall_to(0.15), "not"),
+        (with_wall_to(0.2), "near"),
+        (RIG.model_copy(update={"occluder": None}), "far"),
+    ],
+)
+def test_box_view_wall_and_occluder_count_too(rig: Rig, service: str) -> None:
+    assert weights_serve(rig, trained()).service == service
+
+
 def with_gap(gap_m: float) -> Rig:
     occluder = RIG.occluder
     assert occluder is not None

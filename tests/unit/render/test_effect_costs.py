@@ -35,3 +35,12 @@ def test_costs_are_the_seconds_that_each_effect_adds(monkeypatch: pytest.MonkeyP
     assert list(found) == [effect.name for effect in plan]
     assert list(found.values()) == pytest.approx(expected)
     assert sum(effect.included for effect in plan) >= 4
+
+
+def test_only_light_of_an_empty_scene_costs_nothing() -> None:
+    scene = Scene(load_rig("paper-rig"))
+    plan = render(scene, "draft").plan
+    found = costs(scene, "draft", plan)
+
+    assert not [one for one in plan if one.name == "three-bounce" and one.included]
+    assert found["direct"] == 0.0

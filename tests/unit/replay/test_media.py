@@ -9,10 +9,11 @@ import pytest
 from fake_wall import wall_frame
 from made_up_moments import full_moment, with_result
 from matplotlib.figure import Figure
-from replays import BENCH, NAMES, replay_moments
+from replays import BENCH, NAMES, replay_moments, text_of
 from small_frames import NOTHING, FrameCamera, SheetNetwork, result_of
 from view_streams import saved_moments
 
+from nlos_cam.errors import OutputExistsError
 from nlos_cam.frames import LidarMaps, maps_from_frame
 from nlos_cam.reconstruct import FrameResult, Pipeline, Verdict
 from nlos_cam.replay import REPORT, VIDEO, ReplayMedia, replay_recording
@@ -41,6 +42,17 @@ def test_stills_are_spread_over_the_replay(media: Path) -> None:
     assert len(numbers) == 3
     assert numbers[0] == 0
     assert numbers[-1] >= 20
+
+
+def test_report_lists_the_media(media: Path) -> None:
+    text = text_of(media)
+
+    assert "3 frames as pictures" in text
+    assert "view.html" in text
+
+
+def test_duration_skips_steps_of_the_clock_backwards(fallen: Path) -> None:
+    assert "10 frames, 0.3 s" in text_of(fallen)
 
 
 def test_video_has_every_second_frame(media: Path) -> None:
@@ -108,6 +120,42 @@ def test_replay_removes_media_of_an_earlier_one(tmp_path: Path) -> None:
     (out / "mine.png").write_text("keep me")
 
     assert replay_moments(out, 3, stills=1) == NAMES | {"mine.png", "still-000000.png"}
+
+
+def test_replay_removes_only_files_of_an_earlier_one(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    replay_moments(out, 2, objects=["csv"])
+    (out / "object" / "notes.csv").write_text("mine")
+    (out / "still-life.png").write_text("mine")
+    replay_moments(out, 2)
+
+    assert [path.name for path in (out / "object").iterdir()] == ["notes.csv"]
+    assert (out / "still-life.png").is_file()
+
+
+def test_replay_removes_nothing_where_none_was_before(tmp_path: Path) -> None:
+    mine = {"view.html", "replay.webm", "difference.npz", "object"}
+    for name in mine - {"object"}:
+        (tmp_path / name).write_text("mine")
+    (tmp_path / "object").mkdir()
+    (tmp_path / "object" / "000001.csv").write_text("mine")
+
+    assert replay_moments(tmp_path, 2) == NAMES | mine
+    assert (tmp_path / "object" / "000001.csv").is_file()
+
+
+def test_replay_refuses_to_replace_objects_of_others(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    replay_moments(out, 2, objects=["csv"])
+    replay_moments(out, 1, objects=["csv"])
+
+    assert len([*(out / "object").iterdir()]) == 1
+
+    (out / "object" / "notes.txt").write_text("mine")
+    with pytest.raises(OutputExistsError, match=r"notes\.txt"):
+        replay_moments(out, 2, objects=["csv"])
+
+    assert (out / "object" / "notes.txt").is_file()
 
 
 def test_media_of_a_failed_replay_have_no_stills(tmp_path: Path) -> None:

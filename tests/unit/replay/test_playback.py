@@ -7,12 +7,16 @@ from threading import Event
 
 import numpy as np
 import pytest
+from fake_uncertainty import FakeUncertainty
 from made_up_moments import full_moment
 from replays import BENCH
 from small_frames import FrameCamera, SheetNetwork
 
 from nlos_cam.errors import NlosCamError
+from nlos_cam.reconstruct.consistency import COMPLETE, MapConsistency
 from nlos_cam.replay import Playback
+
+HERE = "127.0.0.1"
 
 
 def recording() -> FrameCamera:
@@ -30,7 +34,7 @@ def playback(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Playba
     """A playback that has reconstructed its recording; exports go to a folder of the test."""
     monkeypatch.setattr("nlos_cam.replay.playback.open_camera", lambda _: recording())
     networks = SheetNetwork(), None
-    with Playback(recording(), BENCH, networks, folder=tmp_path, host="127.0.0.1") as playback:
+    with Playback(recording(), BENCH, networks, folder=tmp_path, host=HERE) as playback:
         playback.reconstruct(Event())
         yield playback
 
@@ -55,6 +59,37 @@ def test_export_takes_the_frame_shown_of_two_of_a_number(
 def test_export_by_number_alone_takes_the_first(playback: Playback, tmp_path: Path) -> None:
     playback.run("export", {"frame": 61})
     assert exported_s(tmp_path) == pytest.approx(100.0 + 1 / 30)
+
+
+def test_export_has_the_verdict_of_the_page(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("nlos_cam.replay.playback.open_camera", lambda _: recording())
+    monkeypatch.setattr(MapConsistency, "examine", lambda *_: COMPLETE)
+    outside = iter([0.9] * 10)  # of the page; the same frames again look like known objects
+    uncertainty_model = FakeUncertainty(lambda *_: (0.0, next(outside, 0.0)))
+    networks = SheetNetwork(), uncertainty_model
+    with Playback(recording(), BENCH, networks, folder=tmp_path, host=HERE) as playback:
+        playback.reconstruct(Event())
+        playback.run("export", {"frame": 64, "time_s": 0.3})
+
+    with np.load(next(tmp_path.glob("*.npz"))) as arrays:
+        assert str(arrays["verdict"]) == "outside the trained range"
+
+
+def test_export_reconstructs_the_frames_before_too(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("nlos_cam.replay.playback.open_camera", lambda _: recording())
+    monkeypatch.setattr("nlos_cam.replay.playback.FRAMES_BEFORE", 3)
+    network = SheetNetwork()
+    with Playback(recording(), BENCH, (network, None), folder=tmp_path, host=HERE) as playback:
+        playback.run("export", {"frame": 62})
+        early = len(network.given)
+        playback.run("export", {"frame": 64})
+
+    assert early == 3
+    assert len(network.given) == 3 + 4
 
 
 @pytest.mark.parametrize(

@@ -8,12 +8,15 @@ import pytest
 from fake_uncertainty import FakeUncertainty
 from fake_wall import WallCamera, measured_wall, wall_frame
 from made_up_moments import RIG
+from nlos_calibration.arrays import Float32
 from page_reader import read_page
 from replays import BENCH, NAMES, TEXT, left_half, replay_noise, replay_wall, text_of
 
 from nlos_cam.errors import OutputExistsError, RecordingError
-from nlos_cam.reconstruct import PeriodicPhysicsCheck, Pipeline
+from nlos_cam.frames import LidarMaps
+from nlos_cam.reconstruct import PeriodicPhysicsCheck, PhysicsCheckResult, Pipeline
 from nlos_cam.reconstruct.consistency import COMPLETE, MapConsistency
+from nlos_cam.reconstruct.physics_check import NullPhysicsCheck
 from nlos_cam.reconstruct.streaming import BATCH_FRAMES, MAX_BATCHES_AHEAD
 from nlos_cam.replay import REPORT, replay_recording
 from nlos_cam.replay.replay import DIFFERENCE, RESULT, SHEET
@@ -117,6 +120,36 @@ def test_replay_writes_the_scores_of_checked_frames(checked: tuple[Path, Path]) 
         assert result["check_score"].shape == (2,)
         assert (result["check_score"] > 0.5).all()
     assert "of 2 checked frames" in text_of(checked[0])
+
+
+class EmptyCheck(NullPhysicsCheck):
+    """Check that compares the empty bench with every frame, at a score between both limits."""
+
+    def offer(self, frame_number: int, maps: LidarMaps, depth_m: Float32) -> None:
+        del depth_m
+        residual = np.zeros_like(maps.depth_m)
+        self.newest = PhysicsCheckResult(
+            frame_number, residual, residual, score=0.6, seconds=0.0, has_surface=False
+        )
+
+
+def test_report_counts_checks_by_the_limit_that_applied(tmp_path: Path) -> None:
+    model = FakeUncertainty(lambda *_: (0.9, 0.0))
+    replay_noise(
+        tmp_path / "out",
+        3,
+        pipeline=Pipeline(BENCH, left_half, uncertainty_model=model, checks=EmptyCheck()),
+    )
+    found = "3 of 3 checked frames at 0.84 or more (0.5 without a surface)"
+
+    assert found in text_of(tmp_path / "out")
+
+
+def test_report_suggests_a_replay_of_the_same_bench(tmp_path: Path) -> None:
+    replay_noise(tmp_path / "out", options=["--wall", "my wall.toml", "--average", "4"])
+    command = "replay fake.bag --wall 'my wall.toml' --average 4 --stills 6 --video"
+
+    assert command in text_of(tmp_path / "out")
 
 
 def test_interrupted_replay_keeps_its_results(tmp_path: Path) -> None:

@@ -162,6 +162,11 @@ def test_noise_counts_the_photons_it_was_given() -> None:
     assert np.mean((counts - expected) ** 2 / expected) == pytest.approx(1, abs=0.15)
 
 
+def test_noise_does_not_hide_that_no_light_returns() -> None:
+    with pytest.raises(SceneError, match="no light returns"):
+        rendered(Scene(RIG), "confocal", noise=Noise(100.0, background=2.0))
+
+
 def test_points_that_the_lidar_cannot_see_give_no_light() -> None:
     found = rendered(MATT, "exhaustive").histograms.sum(0)
     points, _ = rendered(MATT, "exhaustive").points
@@ -193,3 +198,9 @@ def test_points_that_the_lidar_cannot_see_give_no_light() -> None:
 def test_capture_out_of_range_is_refused(options: dict[str, object], word: str) -> None:
     with pytest.raises(SceneError, match=word):
         render_transient(MATT, Capture(**options), EXACT)  # pyright: ignore[reportArgumentType]
+
+
+@pytest.mark.parametrize("photons", [0.0, -1.0, float("nan")])
+def test_noise_of_no_photons_is_refused(photons: float) -> None:
+    with pytest.raises(SceneError, match="photons is"):
+        Noise(photons)

@@ -5,9 +5,11 @@ one.
 import importlib.util
 import json
 import os
+import re
 import subprocess
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +17,7 @@ import h5py
 import numpy as np
 import pytest
 from nlos_calibration import rig_named
+from nlos_calibration.arrays import Float64
 
 from nlos_cam.cli.main import main
 from nlos_cam.errors import RecordingError
@@ -30,6 +33,7 @@ from nlos_cam.transients import (
     peak_m,
     render_transient,
     save_transient,
+    transient_document,
 )
 
 ROOT = Path(__file__).parents[3]
@@ -91,6 +95,45 @@ def test_back_projection_is_brightest_at_the_object(kind: str, saved: Path) -> N
     volume = Volume.of(found, 24)
 
     assert off_the_object_m(peak_m(back_projection(found, volume), volume)) < NEAR_M
+
+
+TURNS = {
+    "-z": np.diag([1.0, -1.0, -1.0]),
+    "x": np.array([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]]),
+    "oblique": np.array([[0.8, 0.0, 0.6], [0.0, 1.0, 0.0], [-0.6, 0.0, 0.8]]),
+}
+SHIFT_M = np.array([0.3, -0.2, 1.0])
+
+
+def turned(found: Transient, turn: Float64) -> Transient:
+    """Return a capture in other axes and of unknown volume, as another program may write it."""
+    moved: dict[str, Any] = {
+        name: getattr(found, name) @ turn.T + SHIFT_M
+        for name in ("laser_grid_m", "detector_grid_m", "laser_m", "detector_m")
+    }
+    for name in ("laser_normals", "detector_normals"):
+        moved[name] = getattr(found, name) @ turn.T
+    return replace(found, scene="", **moved)
+
+
+@pytest.mark.parametrize("facing", ["-z", "x"])
+def test_wall_of_any_direction_is_projected_along_normal(
+    facing: str, transients: dict[str, Transient]
+) -> None:
+    turn = TURNS[facing]
+    found = turned(transients["confocal"], turn)
+    volume = Volume.of(found, 24)
+    peak = np.array(peak_m(back_projection(found, volume), volume)) - SHIFT_M
+    original_m = (peak @ turn).tolist()
+    caption = transient_document("turned", found, {}).as_markdown()
+
+    assert off_the_object_m(original_m) < NEAR_M
+    assert re.search(r"\) m, 0\.[12]\d\d m from the wall", caption)
+
+
+def test_picture_of_oblique_wall_is_refused(transients: dict[str, Transient]) -> None:
+    with pytest.raises(RecordingError, match=r"faces \(0\.60, 0\.00, 0\.80\)"):
+        Volume.of(turned(transients["confocal"], TURNS["oblique"]))
 
 
 def test_fields_are_those_of_tal(saved: Path) -> None:
