@@ -180,11 +180,11 @@ def read_labelled(
     labels.
 
     Maps are of single frames, as in `live`, so that each has noise of its own. They are corrected
-    as `live` does it, by `wall`, a wall record or what opens the bench for a camera: range, cells
-    at the occluder's edge, reflectance of the wall and ripples of the lidar. The lidar's drift
-    stays in them. Without `wall` the rig is the sidecars', or the paper's. Frames without any
-    return are left out. Raises RecordingError for a recording without a label, a truth or a frame,
-    and for recordings of two benches.
+    as `live` does it, by `wall`, a wall record or what opens the bench for a camera: range and its
+    drift, cells at the occluder's edge, reflectance of the wall and ripples of the lidar. Without
+    `wall` the rig is the sidecars', or the paper's. Frames without any return are left out. Raises
+    RecordingError for a recording without a label, a truth or a frame, and for recordings of two
+    benches.
     """
     parts: list[Labelled] = []
     objects: dict[str, Mapping[str, Float32]] = {}
@@ -223,16 +223,23 @@ def _read(
     with ReplayCamera(path) as camera:
         bench = _bench(path, sidecar, wall, camera)
         truth_m = truth_depth_m(path, sidecar.label, bench.rig, objects_on(bench.rig))
-        recorded = [maps for maps in spread_maps(camera, images, frames) if maps.valid.any()]
+        drifts_m: list[float] = []
+        every = spread_maps(
+            camera, images, frames, lambda frame: drifts_m.append(bench.follow(frame))
+        )
+        recorded = [maps for maps in every if maps.valid.any()]
     if not recorded:
         raise RecordingError(
             f"{path} has no frame with any return: inspect it with `nlos-cam replay`"
         )
     own = OwnMaps(bench)
+    # The last one, also for the first frames, at which it was not known yet: in some seconds the
+    # range does not drift.
+    drift_m = drifts_m[-1]
     truths_m = np.repeat(truth_m[None], len(recorded), axis=0)
     image = shapes.image_from_depth(truths_m, shapes.object_box(bench.rig)).astype(np.float16)
     return Labelled(
-        maps=as_map_set([own.correct(maps) for maps in recorded], image),
+        maps=as_map_set([own.correct(maps, drift_m) for maps in recorded], image),
         recorded=as_map_set(recorded, image),
         object_depth_m=truths_m,
         label=(sidecar.label,) * len(recorded),
@@ -255,13 +262,21 @@ def spread(count: int, wanted: int) -> frozenset[int]:
     return frozenset(((np.arange(wanted) + 0.5) * count / wanted).astype(int).tolist())
 
 
-def spread_maps(camera: Iterable[Frame], count: int, wanted: int) -> list[LidarMaps]:
-    """Return maps of `wanted` frames evenly spread over a recording, which has about `count`."""
+def spread_maps(
+    camera: Iterable[Frame],
+    count: int,
+    wanted: int,
+    on_frame: Callable[[Frame], object] = ignore,
+) -> list[LidarMaps]:
+    """Return maps of `wanted` frames evenly spread over a recording, which has about `count`; give
+    every frame to `on_frame`.
+    """
     while True:
         chosen = spread(count, wanted)
         found: list[LidarMaps] = []
         complete = 0
         for frame in camera:
+            on_frame(frame)
             if complete in chosen:
                 found.append(maps_from_frame(frame))
             complete += 1

@@ -89,15 +89,24 @@ class CalibratedRig:
         warnings = (*self.warnings, turned) if turned else self.warnings
         if self.reference is None or self._drift is None:
             return BenchObservation(None, warnings, bool(turned))
-        self._drift.observe(frame.depth_m, frame.settings)
-        drift = self._drift.drift
-        # That removes most of the effect of a change of temperature
-        # (docs/calibration-measured.md).
-        drift_m = drift.range_m if drift and drift.uniform else 0.0
+        drift_m = self.follow(frame)
         difference = subtract_reference(maps, self.reference)
         difference = replace(difference, depth_m=difference.depth_m - np.float32(drift_m))
         moved = self._drift.moved or bool(turned)
         return BenchObservation(difference, warnings + self._drift.warnings, moved, drift_m)
+
+    def follow(self, frame: Frame) -> float:
+        """Pass a frame to the drift check, and return the range's drift over the last second in
+        metres; 0 where not all depths have drifted alike, or it is not known.
+
+        Without it most of the effect of a change of temperature is gone
+        (docs/calibration-measured.md).
+        """
+        if self._drift is None:
+            return 0.0
+        self._drift.observe(frame.depth_m, frame.settings)
+        drift = self._drift.drift
+        return drift.range_m if drift and drift.uniform else 0.0
 
     def turn_problem(self, frame: Frame) -> str:
         """Return in one line how the lidar was turned since its wall was measured, by gravity;

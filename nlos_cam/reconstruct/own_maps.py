@@ -16,7 +16,9 @@ class OwnMaps:
         self._edge = EdgeRepair(bench)
         self._flat_field = FlatField(bench)
 
-    def correct(self, maps: LidarMaps) -> LidarMaps:
-        """Return maps (64, 80) as an exact lidar would give them on the bench's record."""
-        ranged = self._bench.correct_range(maps)
+    def correct(self, maps: LidarMaps, drift_m: float = 0.0) -> LidarMaps:
+        """Return maps (64, 80) as an exact lidar would give them on the bench's record; `drift_m`
+        is that of the range since.
+        """
+        ranged = self._bench.correct_range(maps, drift_m)
         return self._flat_field.correct(self._edge.repair(ranged))

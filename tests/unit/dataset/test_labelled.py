@@ -124,6 +124,18 @@ def test_read_labelled_keeps_maps_as_recorded(paths: list[Path], noise_world: An
     assert found.rig == RIG
 
 
+def test_maps_of_a_recording_are_without_its_drift(
+    paths: list[Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    drifts_m = iter(np.linspace(0.0, 0.001, 20).tolist() * 2)
+    monkeypatch.setattr(CalibratedRig, "follow", lambda *_: next(drifts_m))
+
+    found = read_labelled(paths, known=known, frames=4)
+
+    off_m = found.maps.depth_m - found.recorded.depth_m
+    assert float(np.nanmedian(off_m)) == pytest.approx(-0.001, abs=1e-6)
+
+
 def test_read_labelled_pairs_frames_with_truth_of_their_label(paths: list[Path]) -> None:
     found = read_labelled(paths, known=known, frames=4)
 
