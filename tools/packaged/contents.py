@@ -25,8 +25,6 @@ from nlos_cam.camera import (
 from nlos_cam.recording import SAMPLE
 from nlos_cam.render import bare_wall_scene, paper_scene
 
-IN_BYTES = "wide", "paper"
-"""Shipped weights that are stored in a byte each: those whose figures keep three digits by it."""
 EVERY = 12
 WIDTH = 320
 HEIGHT = 240
@@ -36,8 +34,8 @@ L515's depth modes.
 
 
 def write_bytes() -> list[Path]:
-    """Store the weights of IN_BYTES in a byte each, unless they are; takes the extra "train"."""
-    folders = [shipped_folder(name) for name in IN_BYTES]
+    """Store the shipped weights in a byte each, unless they are; takes the extra "train"."""
+    folders = [shipped_folder(name) for name in SHIPPED]
     for folder in folders:
         store_in_bytes(folder)
     return [path for folder in folders for path in folder.glob("*.safetensors")]

@@ -16,7 +16,7 @@ from nlos_models.errors import CheckpointError
 from nlos_models.export import export_folder
 from nlos_models.inference import load_reconstructor
 from nlos_models.pipeline import RemappingNetwork
-from nlos_models.quality import load_quality_model
+from nlos_models.quality import UNCERTAINTY_FILES, load_quality_model
 from nlos_models.records import (
     checksum_of_watched,
     load_uncertainty_record,
@@ -25,9 +25,11 @@ from nlos_models.records import (
 from nlos_models.training import byte_storage, store_in_bytes
 from nlos_models.training.checkpoints import save_pipeline
 from nlos_models.vae import Decoder
-from safetensors.torch import load_file, save_file
+from safetensors.torch import load_file, save, save_file
 from small_maps import noise_maps
 from small_run import small_record
+
+from nlos_cam.files import write_checked
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -45,6 +47,26 @@ def saved(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture
 def folder(saved: Path, tmp_path: Path) -> Path:
     return Path(shutil.copytree(saved, tmp_path / "weights"))
+
+
+@pytest.fixture
+def halves(tmp_path: Path) -> Path:
+    """Shipped weights as they were trained, in float16, with the judges that watch them."""
+    folder = Path(shutil.copytree(shipped_folder("direct"), tmp_path / "halves"))
+    watched = checksum_of_watched(folder), checksum_of_watched(folder, UNCERTAINTY_FILES)
+    tensors = {
+        name: tensor if name.startswith("normal.") else tensor.half()
+        for name, tensor in read_tensors(folder / "direct.safetensors").items()
+    }
+    write_checked(folder, {"direct.safetensors": save(tensors)})
+
+    def tie(name: str, before: str, now: str) -> None:
+        text = (folder / name).read_text(encoding="utf-8").replace(before, now)
+        write_checked(folder, {name: text.encode()})
+
+    tie("doubt.json", watched[0], checksum_of_watched(folder))
+    tie("quality.json", watched[1], checksum_of_watched(folder, UNCERTAINTY_FILES))
+    return folder
 
 
 @given(seed=st.integers(0, 1000), size=st.sampled_from([1e-30, 1e-3, 1.0, 1e4]))
@@ -93,14 +115,13 @@ def test_stored_pipeline_is_half_as_large_and_answers_alike(folder: Path) -> Non
     assert float((found - wanted).abs().mean()) < 0.02 * float(wanted.std())
 
 
-def test_normalization_is_stored_in_full(tmp_path: Path) -> None:
+def test_normalization_is_stored_in_full(halves: Path) -> None:
     """Training had it exactly, and mirrored maps need the same numbers on both sides."""
-    folder = Path(shutil.copytree(shipped_folder("direct"), tmp_path / "weights"))
-    before = load_file(folder / "direct.safetensors")
+    before = load_file(halves / "direct.safetensors")
 
-    store_in_bytes(folder)
+    store_in_bytes(halves)
 
-    after = load_file(folder / "direct.safetensors")
+    after = load_file(halves / "direct.safetensors")
     for name in ("normal.median", "normal.spread"):
         assert torch.equal(after[name], before[name])
         assert torch.equal(after[name], after[name].flip(-2))
@@ -120,33 +141,31 @@ def test_graph_of_bytes_equals_full_export_bit_for_bit(folder: Path, tmp_path: P
     assert not (tmp_path / "unused").exists()
 
 
-def test_judges_of_stored_weights_are_tied_to_them(tmp_path: Path) -> None:
-    folder = Path(shutil.copytree(shipped_folder("direct"), tmp_path / "weights"))
-    before = checksum_of_watched(folder)
+def test_judges_of_stored_weights_are_tied_to_them(halves: Path) -> None:
+    before = checksum_of_watched(halves)
 
-    store_in_bytes(folder)
+    store_in_bytes(halves)
 
-    record = load_uncertainty_record(folder)
+    record = load_uncertainty_record(halves)
     assert record is not None
-    assert record.watches == checksum_of_watched(folder) != before
-    assert load_quality_model(folder) is not None
+    assert record.watches == checksum_of_watched(halves) != before
+    assert load_quality_model(halves) is not None
 
 
 def test_interrupted_storage_leaves_weights_whole(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    halves: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    folder = Path(shutil.copytree(shipped_folder("direct"), tmp_path / "weights"))
-    before = {path.name: path.read_bytes() for path in folder.iterdir()}
+    before = {path.name: path.read_bytes() for path in halves.iterdir()}
 
     # The weights are in bytes by then, and the uncertainty network is not yet tied to them.
     with monkeypatch.context() as patch:
         patch.setattr(byte_storage, "save_parts", Mock(side_effect=KeyboardInterrupt))
         with pytest.raises(KeyboardInterrupt):
-            store_in_bytes(folder)
+            store_in_bytes(halves)
 
-    assert {path.name: path.read_bytes() for path in folder.iterdir()} == before
-    store_in_bytes(folder)
-    assert load_uncertainty_record(folder) is not None
+    assert {path.name: path.read_bytes() for path in halves.iterdir()} == before
+    store_in_bytes(halves)
+    assert load_uncertainty_record(halves) is not None
 
 
 @pytest.mark.parametrize("harm", ["short", "alone"])
