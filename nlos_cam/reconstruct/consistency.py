@@ -59,8 +59,8 @@ UNLIKE_WALL = 0.2
 """Logarithm of light over the wall's, in a cell of the wall's depth. Without texture, cells differ
 by 0.01."""
 TOO_DARK_CELLS = 4
-TOO_DARK = -0.15
-"""The same in a cell that shows an echo."""
+TOO_DARK = 0.15
+"""The same, below the wall's, in a cell that shows an echo."""
 BRIGHT_INSIDE_CELLS = 8
 BRIGHT_INSIDE = 0.06
 """The same well inside a region of the wall's depth."""
@@ -87,6 +87,11 @@ SEAM_LIMIT = 0.3
 TILT = 0.06
 """Change of the wall's light over the height of the view, as a logarithm: three rows of shift cause
 0.09, one row 0.03."""
+NOISE_SIGMAS = 4.0
+"""What a limit is raised to by the sensor's noise, in cells of a few counts."""
+CELL_PIXELS = 60
+"""Pixels of a cell, of 640 x 480 of a frame."""
+SENSOR = SensorModel()
 TEXTURE_SPREADS = 5.0
 """Spreads of the wall's own light that a limit is raised to, for walls that are not uniform."""
 INFORMATION_OBJECTS = 16
@@ -164,13 +169,13 @@ class MapConsistency:
             farther = (echo & (beyond_m < NO_ECHO_M)).sum() >= MIN_WALL_CELLS
             return [MapProblem.OFF_RECORD] if nearer or farther else []
 
-        light = self._log_light(maps, both, at_wall)
+        light, noise = self._log_light(maps, both, at_wall)
         spread = _spread(light[at_wall])
         unsaturated = maps.intensity < SATURATED
         problems: list[MapProblem] = []
         if nearer or abs(np.median(beyond_m[at_wall])) > MOVED_M:
             problems.append(MapProblem.OFF_RECORD)
-        if _unlike(light, spread, at_wall, echo, unsaturated, self._overlap):
+        if _unlike(light, noise, spread, at_wall, echo, unsaturated, self._overlap):
             problems.append(MapProblem.UNLIKE)
         if _largest_seam(light, both) > max(SEAM, TEXTURE_SPREADS * spread / SEAM_LIMIT / 2):
             problems.append(MapProblem.TORN)
@@ -178,8 +183,9 @@ class MapConsistency:
             problems.append(MapProblem.TILTED)
         return problems
 
-    def _log_light(self, maps: LidarMaps, both: Mask, at_wall: Mask) -> Float64:
-        """Return the logarithm of each cell's light over the bare wall's, 0 where it has no depth.
+    def _log_light(self, maps: LidarMaps, both: Mask, at_wall: Mask) -> tuple[Float64, Float64]:
+        """Return the logarithm of each cell's light over the bare wall's, 0 where it has no depth,
+        and what noise may do to it.
 
         The device's gain and the room's light are fitted to the cells that show the wall, twice:
         the second time without those that the first fit explains least.
@@ -187,12 +193,14 @@ class MapConsistency:
         counts = maps.intensity.astype(np.float64)
         used = at_wall & (counts > 0)
         light = np.zeros(counts.shape)
+        expected = light
         for _ in range(2):
-            expected = _fitted(self._light, counts, used)
+            expected = np.maximum(_fitted(self._light, counts, used), 0)
             # one count is added to both, so that dark cells, known to a count, differ by less
-            light = np.log((counts + 1) / (np.maximum(expected, 0) + 1))
+            light = np.log((counts + 1) / (expected + 1))
             used &= np.abs(light) < max(3 * _spread(light[used]), BRIGHTER)
-        return np.where(both, light, 0.0)
+        variance = (SENSOR.read_noise_counts**2 + SENSOR.shot_noise**2 * expected) / CELL_PIXELS
+        return np.where(both, light, 0.0), NOISE_SIGMAS * np.sqrt(variance) / (expected + 1)
 
 
 def _fitted(light: Float64, counts: Float64, used: Mask) -> Float64:
@@ -219,6 +227,7 @@ def _spread(values: Float64) -> float:
 
 def _unlike(
     light: Float64,
+    noise: Float64,
     spread: float,
     at_wall: Mask,
     echo: Mask,
@@ -229,11 +238,13 @@ def _unlike(
     is the least overlap of both that objects on this bench have.
     """
     texture = TEXTURE_SPREADS * spread
-    if (at_wall & (np.abs(light) > max(UNLIKE_WALL, texture))).sum() >= UNLIKE_WALL_CELLS:
+    allowed = np.maximum(noise, texture)
+    if (at_wall & (np.abs(light) > np.maximum(UNLIKE_WALL, allowed))).sum() >= UNLIKE_WALL_CELLS:
         return True
-    if (echo & (light < min(TOO_DARK, -texture))).sum() >= TOO_DARK_CELLS:
+    if (echo & (light < -np.maximum(TOO_DARK, allowed))).sum() >= TOO_DARK_CELLS:
         return True
-    if (interior(at_wall) & (light > max(BRIGHT_INSIDE, texture))).sum() > BRIGHT_INSIDE_CELLS:
+    bright = interior(at_wall) & (light > np.maximum(BRIGHT_INSIDE, allowed))
+    if bright.sum() > BRIGHT_INSIDE_CELLS:
         return True
     # on a textured wall some of the cells inside are darker by chance: the limit falls with it
     dark = light < min(DARK_INSIDE, DARK_INSIDE + 2 * BRIGHT_INSIDE / TEXTURE_SPREADS - 2 * spread)
@@ -245,8 +256,8 @@ def _unlike(
     if echo.sum() < MIN_ECHO_CELLS:
         return False
     brighter = (at_wall | echo) & unsaturated & (light > max(BRIGHTER, texture))
-    allowed = OVERLAP_BY_TEXTURE * max(texture - BRIGHTER, 0.0)
-    return _overlap(brighter, echo & unsaturated) < usual - allowed
+    by_texture = OVERLAP_BY_TEXTURE * max(texture - BRIGHTER, 0.0)
+    return _overlap(brighter, echo & unsaturated) < usual - by_texture
 
 
 def _overlap(brighter: Mask, deeper: Mask) -> float:

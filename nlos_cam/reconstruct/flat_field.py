@@ -41,6 +41,8 @@ class FlatField:
         """(64, 80); light of a uniform bench over this one's, 1 where that is not known."""
         self._farther_m: Float32 | None = None
         """(64, 80); depth of this bench less that of an exact one, 0 where that is not known."""
+        self._to_middle_m = np.zeros((MAP_ROWS, MAP_COLUMNS), np.float32)
+        """(64, 80); depth of the cells' middle beams, less that of an exact bench's maps."""
         if bench.reference is None:
             return
         bare = bare_rendering(bench.rig)  # pyright: ignore[reportArgumentType]
@@ -62,6 +64,7 @@ class FlatField:
         measured_m = bench.reference.map_depth_m.astype(np.float64) + bench.range_offset_m
         known &= np.isfinite(exact_m)
         self._farther_m = np.where(known, measured_m - exact_m, 0).astype(np.float32)
+        self._to_middle_m = np.where(known, bare.depth_m - exact_m, 0).astype(np.float32)
 
     def correct(self, maps: LidarMaps) -> LidarMaps:
         """Return maps (64, 80), their range offset corrected, as an exact lidar would give them of a
@@ -74,6 +77,12 @@ class FlatField:
             depth_m=maps.depth_m - self._farther_m,
             intensity=maps.intensity * self._factor,
         )
+
+    def as_rendered(self, corrected: LidarMaps) -> LidarMaps:
+        """Return maps that `correct` has corrected as the renderer computes them: by the middle beam
+        of each cell.
+        """
+        return replace(corrected, depth_m=corrected.depth_m + self._to_middle_m)
 
 
 def measured_counts(rig: Rig, reference: BareWall, offset_m: float) -> float | None:

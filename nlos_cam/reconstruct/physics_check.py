@@ -8,9 +8,10 @@ With r = measured less expected and s a tolerance that covers the noise:
     h     = (depth r / s)^2 + (log intensity r / s)^2
             + (log of how much the other echo is stronger / s)^2
     cost  = h / (1 + h)         0 explained, 1 not at all; averaged over the cells
-    score = (cost - NOISE_COST) / (cost of the bare bench - NOISE_COST)
+    score = (cost - noise) / (cost of the bare bench - noise)
 
-The numerator is at least 0, the denominator at least MIN_UNEXPLAINED.
+The numerator is at least 0, the denominator at least MIN_UNEXPLAINED. The noise is the cost of an
+empty bench on this rig (`noise_cost`): where a lidar faces the wall at a slant, its cells are large.
 
 Two unknowns are fitted: the device's gain, from the cells that show the bare wall, and the object's
 albedo, to within a factor of MAX_ALBEDO, as the one of least cost. A wider range of albedos would
@@ -28,9 +29,9 @@ import numpy as np
 from nlos_calibration import Rig
 from nlos_calibration.arrays import Float32, Float64
 
-from nlos_cam.frames import MAP_COLUMNS, MAP_ROWS, SATURATED, LidarMaps
+from nlos_cam.frames import MAP_COLUMNS, MAP_ROWS, SATURATED, LidarMaps, maps_from_frame
 from nlos_cam.reconstruct.network import Clock
-from nlos_cam.render import Rendering, Scene, SensorModel, Stop, cast, render
+from nlos_cam.render import Rendering, Scene, Sensor, SensorModel, Stop, cast, render
 
 UNEXPLAINED_EMPTY = 0.5
 """Score from which on the empty bench does not explain the maps. Empty benches score 0.00, and any
@@ -129,7 +130,8 @@ MAX_ALBEDO = 4 / 3
 ALBEDOS = 5
 """Factors of the training set's albedo that are tried, from 1 / MAX_ALBEDO to MAX_ALBEDO."""
 NOISE_COST = 0.006
-"""Cost of an explained bare bench: the sensor's noise, and cells of many pixels."""
+"""Smallest cost of an explained bare bench, that of the paper's rig: the sensor's noise, and cells
+of many pixels."""
 MIN_UNEXPLAINED = 0.02
 """Smallest denominator of the score, for benches without an object; objects cost a bare bench 0.14
 or more.
@@ -182,7 +184,9 @@ class Explanation:
     """Counts for an intensity of I0."""
 
 
-def explain(maps: LidarMaps, expected: Expected, bare: Expected) -> Explanation:
+def explain(
+    maps: LidarMaps, expected: Expected, bare: Expected, noise: float = NOISE_COST
+) -> Explanation:
     """Return the best explanation of maps by an object, scored against that of the bare bench."""
     gain = fit_gain(maps, bare)
     albedos = np.ones(1)
@@ -192,8 +196,8 @@ def explain(maps: LidarMaps, expected: Expected, bare: Expected) -> Explanation:
     best = int(np.argmin(costs))
     # Noise costs something on a perfect explanation too; an empty bench leaves nothing to explain,
     # and its score would be a ratio of two noises.
-    unexplained = max(mean_cost(maps, bare, gain, 1.0) - NOISE_COST, MIN_UNEXPLAINED)
-    return Explanation(max(costs[best] - NOISE_COST, 0.0) / unexplained, float(albedos[best]), gain)
+    unexplained = max(mean_cost(maps, bare, gain, 1.0) - noise, MIN_UNEXPLAINED)
+    return Explanation(max(costs[best] - noise, 0.0) / unexplained, float(albedos[best]), gain)
 
 
 def fit_gain(maps: LidarMaps, bare: Expected) -> float:
@@ -300,7 +304,8 @@ def check_reconstruction(
     if has_surface:
         expected = _expected(render(Scene(rig, depth_m), accuracy), rig, bare)
 
-    best = explain(maps, expected, bare)
+    noise = noise_cost(rig)  # pyright: ignore[reportArgumentType]
+    best = explain(maps, expected, bare, noise)
     rendered_m, rendered = expected.noiseless_maps(best.albedo, best.gain)
     measured_m = np.where(maps.valid, maps.depth_m, np.float32(np.nan))
     return PhysicsCheckResult(
@@ -320,6 +325,18 @@ def bare_rendering(rig: Rig) -> Rendering:
     with.
     """
     return render(Scene(rig))
+
+
+@lru_cache(maxsize=4)
+def noise_cost(rig: Rig) -> float:
+    """Return the cost of an empty bench on a rig, as the simulated sensor sees it; NOISE_COST at
+    least.
+    """
+    empty = bare_rendering(rig)  # pyright: ignore[reportArgumentType]
+    images = Sensor(rig, NOISE).expose(empty.multi, np.random.default_rng(0))
+    maps = maps_from_frame(images.frame(rig.pinhole))
+    bare = _expected(empty, rig, None)
+    return max(mean_cost(maps, bare, fit_gain(maps, bare), 1.0), NOISE_COST)
 
 
 def _expected(rendering: Rendering, rig: Rig, bare: Expected | None) -> Expected:

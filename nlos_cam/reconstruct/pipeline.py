@@ -203,8 +203,8 @@ class PreparedFrame:
     arrival: Arrival
     maps: LidarMaps
     observation: BenchObservation
-    corrected: LidarMaps
-    """Maps as an exact lidar would give them of a uniform wall, on the bench's record (`OwnMaps`)."""
+    checked: LidarMaps
+    """Maps for the physics check: as the renderer would give them, of a uniform wall."""
     network_input: LidarMaps
     edge_is_repaired: bool
     findings: MapFindings
@@ -326,7 +326,7 @@ class Pipeline:
             arrival,
             maps,
             observation,
-            corrected,
+            flat_field.as_rendered(corrected),
             network_input,
             edge_is_repaired,
             findings,
@@ -360,7 +360,7 @@ class Pipeline:
 
         # What the renderer computes knows no ripples of the lidar and no texture of the wall: they
         # would make an empty bench one that shows something.
-        self.checks.offer(frame.frame_number, prepared.corrected, shown.depth_m)
+        self.checks.offer(frame.frame_number, prepared.checked, shown.depth_m)
         return FrameResult(
             frame,
             prepared.maps,

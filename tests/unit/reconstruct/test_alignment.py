@@ -188,14 +188,12 @@ def test_pipeline_aligns_with_the_bench_that_it_has() -> None:
         pipeline = reconstruct.Pipeline(CalibratedRig(rig), SheetNetwork(), trained=record)
         prepared = pipeline.prepare(arrival(rig), lambda: 0.0, 0.0)
         assert (
-            np.array_equal(
-                prepared.network_input.depth_m, prepared.corrected.depth_m, equal_nan=True
-            )
+            np.array_equal(prepared.network_input.depth_m, prepared.checked.depth_m, equal_nan=True)
             != changed
         )
         pipeline.bench = CalibratedRig(RIG)
         prepared = pipeline.prepare(arrival(RIG), lambda: 0.0, 0.0)
-        np.testing.assert_array_equal(prepared.network_input.depth_m, prepared.corrected.depth_m)
+        np.testing.assert_array_equal(prepared.network_input.depth_m, prepared.checked.depth_m)
 
 
 def test_corrected_maps_are_aligned_as_live_aligns_them() -> None:
