@@ -45,6 +45,7 @@ __all__ = [
     "WallRecord",
     "WayUp",
     "board_agreement",
+    "box_difference_m",
     "corner_rays",
     "depth_noise_m",
     "depth_offset_m",
@@ -135,6 +136,7 @@ from .rig import (
 from .rig_check import (
     GAP_RANGE_M,
     MAP_SHAPE,
+    box_difference_m,
     corner_rays,
     footprint,
     lidar_visible_share,

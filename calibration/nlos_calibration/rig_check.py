@@ -35,7 +35,7 @@ def rig_difference(rig: Rig, other: Rig) -> tuple[str, ...]:
         *_occluder(rig, other),
         _field(rig.pinhole, other.pinhole),
         _wall(rig, other),
-        "another object box" if rig.object_box != other.object_box else "",
+        "another object box" if box_difference_m(rig, other) > SAME_BOX_M else "",
         "other device constants" if rig.device != other.device else "",
     ]
     return tuple(line for line in lines if line)
@@ -91,6 +91,20 @@ def _view_angles_deg(pinhole: Intrinsics) -> tuple[float, float]:
     """Return the width and height of the field of view in degrees."""
     (left, right), (top, bottom) = _view_edges(pinhole)
     return degrees(atan(right) - atan(left)), degrees(atan(bottom) - atan(top))
+
+
+SAME_BOX_M = 1e-4
+"""Difference of two boxes' sides that is none: the frame of a box, the lidar's foot, is measured."""
+
+
+def box_difference_m(rig: Rig, other: Rig) -> float:
+    """Return the largest difference between the sides of two rigs' object boxes; infinite where
+    only one has a box.
+    """
+    if rig.object_box is None or other.object_box is None:
+        return 0.0 if rig.object_box == other.object_box else float("inf")
+    sides = zip(vars(rig.object_box).values(), vars(other.object_box).values(), strict=True)
+    return max(abs(one_m - other_m) for one_m, other_m in sides)
 
 
 SMALLER_WALL = 0.02

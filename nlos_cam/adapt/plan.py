@@ -28,6 +28,8 @@ FIRST_OBJECTS = 1000
 RENDERED_AFTER = 0.8
 """Share of the epochs after which all objects are there: the last ones are seen as well."""
 STEPS_PER_EPOCH = 40
+SAME_MINUTES = 1e-6
+"""Difference of two sums of minutes that is rounding's."""
 MIN_EPOCHS = 4
 MAX_EPOCHS = 60
 WHOLE_MINUTES = 100.0
@@ -144,7 +146,7 @@ class Plan(Record):
         are not.
         """
         further = minutes - self.minutes
-        if further <= 0:
+        if further <= SAME_MINUTES:
             return self
         seconds = 60 * further * NETWORK_SHARE
         before = self.objects_before(len(self.stages))

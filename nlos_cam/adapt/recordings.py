@@ -74,15 +74,22 @@ class Transfer:
     before: dict[str, Any]
     """Figures of the weights that were fitted, on the same."""
     after: dict[str, Any]
+    simulated_loss: float = 0.0
+    """Silhouette IoU that the fit costs on the simulated test objects on the bench."""
 
     @property
-    def is_better(self) -> bool:
+    def is_nearer(self) -> bool:
         """True if the outlines of the judged objects are nearer than before, and no farther than
         those of the start weights: after a few minutes, the weights before can be worse than these.
         """
         figures = self.start, self.before, self.after
         start, before, after = (each["silhouette_iou"]["value"] for each in figures)
         return after > before and after >= start
+
+    @property
+    def is_better(self) -> bool:
+        """True if the fit helped, and costs at most MAX_SIMULATED_LOSS in simulation."""
+        return self.is_nearer and self.simulated_loss <= MAX_SIMULATED_LOSS
 
 
 def parts_of(labels: Sequence[str]) -> dict[Part, list[str]]:
@@ -112,8 +119,8 @@ def find_recordings(
         label = sidecar.label
         if sidecar.rig and not _is_as_before(sidecar.rig, rig):
             on_message(
-                f"note: {path} is left out: lidar or occluder have moved since, as this bench was"
-                " calibrated again; record its object once more"
+                f"note: {path} is left out: lidar, occluder or object box have moved since, as this"
+                " bench was calibrated again or its box edited; record its object once more"
             )
         elif label:
             by_label.setdefault(label, []).append(path)
@@ -132,7 +139,8 @@ def find_recordings(
 def _is_as_before(recorded: Rig, rig: Rig) -> bool:
     """Return whether two calibrations can be of one bench that has not moved."""
     apart = differences_of(recorded, rig)
-    moved_m = max(apart.distance_m, apart.occluder_m)
+    # The truth of a recording counts from the box in which its object stood.
+    moved_m = max(apart.distance_m, apart.occluder_m, apart.box_m)
     turned_deg = max(apart.turned_deg, apart.view_deg)
     return moved_m <= TOLERANCE_M and turned_deg <= TOLERANCE_DEG
 

@@ -122,6 +122,8 @@ def transfer_words(found: Transfer) -> str:
     """Return what recordings of known objects brought, in words."""
     before, after = (each["silhouette_iou"]["value"] for each in (found.before, found.after))
     outcome = "kept" if found.is_better else "no better, so not kept"
+    if found.is_nearer and not found.is_better:
+        outcome = f"but {found.simulated_loss:.2f} worse on simulated objects, so not kept"
     return (
         f"fitted to {found.recordings} recordings: silhouette IoU {before:.3f} -> {after:.3f} on"
         f" {len(found.parts['judged'])} objects held out, {outcome}"

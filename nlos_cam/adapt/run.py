@@ -59,7 +59,7 @@ from nlos_cam.render import SensorModel
 OBJECTS = "objects"
 HELD_OUT = "held-out"
 JUDGED = "judged"
-QUALITY = "quality"
+QUALITY = "scored"
 OUTLIERS = "outliers"
 UNCERTAINTY = "uncertainty"
 NETWORK = "network"
@@ -72,12 +72,15 @@ PACKED = "packed"
 BEFORE = "before"
 START = "start"
 AFTER = "after"
+SIMULATED = "simulated"
 GUESS = "mean_object"
 PARTS = "parts"
 STAGE = "stage-{}"
 REPORT = "report"
 FIGURES = "figures.json"
 HELD_OUT_OBJECTS = 400
+EARLIER_QUALITY = "quality"
+"""Of nlos-cam 0.2.0: objects on the rig itself."""
 QUALITY_SEED = 40_000_000
 JUDGED_SEED = 35_000_000
 """Of objects that the network was not trained on: no seeds of the shipped weights' trainings."""
@@ -277,7 +280,7 @@ def _forget(folder: Path) -> None:
     """Delete what an adaptation made, objects of its rig included: the plan at last, so that a stop
     meanwhile is repeated.
     """
-    of_its_rig = (BEFORE, OBJECTS, HELD_OUT, JUDGED, QUALITY, OUTLIERS)
+    of_its_rig = (BEFORE, OBJECTS, HELD_OUT, JUDGED, QUALITY, EARLIER_QUALITY, OUTLIERS)
     for made in (*(folder / name for name in of_its_rig), *folder.glob(STAGE.format("*"))):
         if made.exists():
             shutil.rmtree(made)
@@ -295,8 +298,13 @@ def _start_checksum(job: Adaptation) -> str:
         ) from error
 
 
-def _data_plan(job: Adaptation, first_seed: int, *, expected: bool) -> data.DatasetPlan:
-    """Return the plan of objects on the bench as it may be; held-out ones are on the rig itself."""
+def _data_plan(
+    job: Adaptation, first_seed: int, *, expected: bool, off_record: bool | None = None
+) -> data.DatasetPlan:
+    """Return the plan of objects, on the bench as it may be where `off_record`, by default
+    `expected` ones; held-out ones are on the rig itself.
+    """
+    off_record = expected if off_record is None else off_record
     if job.locked:
         return data.DatasetPlan(
             job.rig,
@@ -313,10 +321,10 @@ def _data_plan(job: Adaptation, first_seed: int, *, expected: bool) -> data.Data
         job.sensor,
         accuracy="draft",
         objects=data.Objects(share_generic=SHARE_GENERIC),
-        spread=job.spread if expected else data.RigSpread(),
+        spread=job.spread if off_record else data.RigSpread(),
         expected=expected,
-        objects_per_rig=data.OBJECTS_PER_RIG if expected else 1,
-        off_record=expected,
+        objects_per_rig=data.OBJECTS_PER_RIG if off_record else 1,
+        off_record=off_record,
     )
 
 
@@ -419,7 +427,7 @@ def _transfer(
         )
 
     judged = parts["judged"]
-    return Transfer(
+    transfer = Transfer(
         folder,
         parts_of(list(found.by_label)),
         recordings=sum(map(len, found.by_label.values())),
@@ -427,6 +435,16 @@ def _transfer(
         before=_figures(measure, stage / NETWORK, folder / BEFORE, judged),
         after=_figures(measure, network, folder / AFTER, judged),
     )
+    if not transfer.is_nearer:
+        return transfer
+    before, after = (
+        _figures(measure, weights, figures)["silhouette_iou"]["value"]
+        for weights, figures in (
+            (stage / NETWORK, stage / SIMULATED),
+            (network, folder / SIMULATED),
+        )
+    )
+    return replace(transfer, simulated_loss=before - after)
 
 
 class _Rendering:
@@ -559,13 +577,21 @@ def _first_objects(job: Adaptation, stage: Stage, rendering: _Rendering) -> list
 
 
 def _test_set(
-    job: Adaptation, name: str, first_seed: int, count: int, tracked: data.Tracked
+    job: Adaptation,
+    name: str,
+    first_seed: int,
+    count: int,
+    tracked: data.Tracked,
+    *,
+    off_record: bool = False,
 ) -> Path:
-    """Return a folder of `count` objects on the rig itself, with the sensor's noise."""
+    """Return a folder of `count` objects with the sensor's noise, on the rig itself or on the bench
+    as it may be.
+    """
     folder = job.folder / name
     with tracked(f"rendering {count} objects ({name})") as on_progress:
         data.build_dataset(
-            _data_plan(job, first_seed, expected=False),
+            _data_plan(job, first_seed, expected=False, off_record=off_record),
             count,
             folder,
             workers=job.workers + 1,
@@ -614,7 +640,8 @@ def _train_uncertainty(
 
     at_least, at_most = QUALITY_OBJECTS
     objects = min(max(round(QUALITY_PER_MINUTE * plan.minutes), at_least), at_most)
-    scored = _test_set(job, QUALITY, QUALITY_SEED, objects, tracked)
+    # A frame is trusted by what is predicted of it, and a real bench is off its record.
+    scored = _test_set(job, QUALITY, QUALITY_SEED, objects, tracked, off_record=True)
     pipeline = models.load_reconstructor(judge, graphs)
     uncertainty = models.load_uncertainty_model(judge, graphs, quality=False)
     if uncertainty is None:

@@ -28,6 +28,7 @@ from nlos_cam.bench.record import (
 )
 from nlos_cam.errors import OutputExistsError
 from nlos_cam.files import CHECKSUMS, atomic_directory, atomic_file, write_checked
+from nlos_cam.reconstruct import weights_serve
 
 TEST_IOU = "test_iou"
 """Figure of a bench's weights: silhouette IoU on the 54 test objects on its rig."""
@@ -139,7 +140,7 @@ def iou_in_use(folder: Path) -> float | None:
         record = load_record(loaded.weights) if loaded.weights else None
     except (CheckpointError, RecordFileError):  # of the weights: what is measured is checked before
         return None
-    if record is None or record.rig != loaded.rig.model_dump(mode="json"):
+    if record is None or weights_serve(loaded.rig, record).service != "trained for it":
         return None
     return record.figures.get(TEST_IOU)
 

@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import nlos_calibration as walls
 import typer
+from nlos_models import load_record
+from nlos_models.errors import CheckpointError
 
 from nlos_cam import adapt as adaptation
 from nlos_cam import bench as benches
@@ -320,9 +322,19 @@ def _rows(before: dict[str, Any], after: dict[str, Any]) -> list[tuple[str, str,
     ]
 
 
+def _was_adapted(weights: Path) -> bool:
+    """Return whether weights in a bench were written there by an adaptation, also by one whose work
+    is gone.
+    """
+    try:
+        return benches.TEST_IOU in load_record(weights).figures
+    except CheckpointError:
+        return False
+
+
 def _refuse_others(target: Path, work: Path) -> None:
     """Raise OutputExistsError where the bench has weights that no adaptation in `work` made."""
-    if not target.exists():
+    if not target.exists() or _was_adapted(target):
         return
     # the network's file: a bench adds its rig to the record
     ours = [

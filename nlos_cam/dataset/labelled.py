@@ -4,7 +4,7 @@ label.
 
 import tomllib
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import chain
 from pathlib import Path
 from typing import Any
@@ -236,16 +236,26 @@ def _read(
     # The last one, also for the first frames, at which it was not known yet: in some seconds the
     # range does not drift.
     drift_m = drifts_m[-1]
+    if bench.moved:
+        raise RecordingError(
+            f"{path}: the lidar was not where the wall's record has it: record the object again"
+            " after `nlos-cam calibrate`, or take the file away"
+        )
     truths_m = np.repeat(truth_m[None], len(recorded), axis=0)
     image = shapes.image_from_depth(truths_m, shapes.object_box(bench.rig)).astype(np.float16)
     return Labelled(
         maps=as_map_set([own.correct(maps, drift_m) for maps in recorded], image),
-        recorded=as_map_set(recorded, image),
+        recorded=as_map_set([without(maps, drift_m) for maps in recorded], image),
         object_depth_m=truths_m,
         label=(sidecar.label,) * len(recorded),
         recording=(path.name,) * len(recorded),
         rig=bench.rig,
     )
+
+
+def without(maps: LidarMaps, drift_m: float) -> LidarMaps:
+    """Return maps less the range's drift."""
+    return replace(maps, depth_m=maps.depth_m - np.float32(drift_m))
 
 
 def as_map_set(maps: Sequence[LidarMaps], image: Float16 | Float32) -> MapSet:

@@ -92,7 +92,7 @@ class CalibratedRig:
         drift_m = self.follow(frame)
         difference = subtract_reference(maps, self.reference)
         difference = replace(difference, depth_m=difference.depth_m - np.float32(drift_m))
-        moved = self._drift.moved or bool(turned)
+        moved = self.moved or bool(turned)
         return BenchObservation(difference, warnings + self._drift.warnings, moved, drift_m)
 
     def follow(self, frame: Frame) -> float:
@@ -107,6 +107,11 @@ class CalibratedRig:
         self._drift.observe(frame.depth_m, frame.settings)
         drift = self._drift.drift
         return drift.range_m if drift and drift.uniform else 0.0
+
+    @property
+    def moved(self) -> bool:
+        """Whether the frames that were followed show that the lidar has moved, or no wall."""
+        return self._drift is not None and self._drift.moved
 
     def turn_problem(self, frame: Frame) -> str:
         """Return in one line how the lidar was turned since its wall was measured, by gravity;

@@ -136,6 +136,7 @@ MIN_UNEXPLAINED = 0.02
 """Smallest denominator of the score, for benches without an object; objects cost a bare bench 0.14
 or more.
 """
+COUNTS_STEP = 0.2
 MIN_BARE_CELLS = 50
 """Cells showing the bare wall that are needed to fit the gain to them alone."""
 NOISE = SensorModel()
@@ -217,10 +218,7 @@ def mean_cost(maps: LidarMaps, expected: Expected, gain: float, albedo: float) -
     measured_m = np.where(maps.valid, maps.depth_m, np.nan).astype(np.float64)
     log_light = _log(maps.intensity.astype(np.float64) / gain)  # in units of I0
     lead = _log(echo) - _log(expected.direct)
-    sensor = Exposure(
-        counts_of_i0=NOISE.bare_wall_counts / max(float(expected.direct.max()), 1e-12),
-        log_full_scale=np.log(SATURATED / gain),
-    )
+    sensor = Exposure(counts_of_i0=gain, log_full_scale=np.log(SATURATED / gain))
 
     # The lidar reports one of two echoes: the one that explains the cell better is taken.
     off_wall = (measured_m - expected.direct_m) / WALL_TOLERANCE_M
@@ -240,7 +238,7 @@ class Exposure(NamedTuple):
     """Scale of a frame's intensities."""
 
     counts_of_i0: float
-    """Counts of an intensity of I0 by the simulated sensor, whose noise is known in counts."""
+    """Counts of an intensity of I0: noise is known in counts."""
     log_full_scale: float
     """Logarithm of the saturated intensity in units of I0."""
 
@@ -304,7 +302,10 @@ def check_reconstruction(
     if has_surface:
         expected = _expected(render(Scene(rig, depth_m), accuracy), rig, bare)
 
-    noise = noise_cost(rig)  # pyright: ignore[reportArgumentType]
+    counts = fit_gain(maps, bare) * max(float(bare.direct.max()), 1e-12)
+    # In steps of a fifth, so that few are computed.
+    steps = round(np.log(max(counts, 1.0)) / COUNTS_STEP)
+    noise = noise_cost(rig, float(np.exp(steps * COUNTS_STEP)))  # pyright: ignore[reportArgumentType]
     best = explain(maps, expected, bare, noise)
     rendered_m, rendered = expected.noiseless_maps(best.albedo, best.gain)
     measured_m = np.where(maps.valid, maps.depth_m, np.float32(np.nan))
@@ -327,13 +328,14 @@ def bare_rendering(rig: Rig) -> Rendering:
     return render(Scene(rig))
 
 
-@lru_cache(maxsize=4)
-def noise_cost(rig: Rig) -> float:
-    """Return the cost of an empty bench on a rig, as the simulated sensor sees it; NOISE_COST at
-    least.
+@lru_cache(maxsize=16)
+def noise_cost(rig: Rig, counts: float) -> float:
+    """Return the cost of an empty bench on a rig, as the simulated sensor sees it at a gain: the
+    `counts` of the brightest cell. NOISE_COST at least.
     """
     empty = bare_rendering(rig)  # pyright: ignore[reportArgumentType]
-    images = Sensor(rig, NOISE).expose(empty.multi, np.random.default_rng(0))
+    sensor = NOISE.model_copy(update={"bare_wall_counts": counts})
+    images = Sensor(rig, sensor).expose(empty.multi, np.random.default_rng(0))
     maps = maps_from_frame(images.frame(rig.pinhole))
     bare = _expected(empty, rig, None)
     return max(mean_cost(maps, bare, fit_gain(maps, bare), 1.0), NOISE_COST)

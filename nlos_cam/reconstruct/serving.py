@@ -8,6 +8,7 @@ from nlos_calibration import (
     DISTANCE_RANGE_M,
     FACING_RANGE_DEG,
     Rig,
+    box_difference_m,
     missing_wall,
     rig_difference,
     view_difference_deg,
@@ -169,7 +170,7 @@ class RigDifferences(NamedTuple):
     occluder_m: float
     """The larger of the occluders' edges and gaps; 0 where a rig has none."""
     box_m: float
-    """The largest of the object boxes' sides, from the lidars' feet; 0 where a rig has none."""
+    """The largest of the object boxes' sides, from the lidars' feet."""
 
 
 def differences_of(rig: Rig, other: Rig) -> RigDifferences:
@@ -181,14 +182,10 @@ def differences_of(rig: Rig, other: Rig) -> RigDifferences:
     if rig.occluder and other.occluder:
         along_m = abs(rig.occluder.x_m - other.occluder.x_m)
         occluder_m = max(along_m, abs(rig.occluder.z_min_m - other.occluder.z_min_m))
-    box_m = 0.0
-    if rig.object_box and other.object_box:
-        sides = zip(vars(rig.object_box).values(), vars(other.object_box).values(), strict=True)
-        box_m = max(abs(one_m - other_m) for one_m, other_m in sides)
     return RigDifferences(
         abs(here.distance_m - there.distance_m),
         turned_deg,
         view_difference_deg(rig.pinhole, other.pinhole),
         occluder_m,
-        box_m,
+        box_difference_m(rig, other),
     )

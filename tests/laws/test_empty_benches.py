@@ -26,9 +26,10 @@ def rigs() -> dict[str, Rig]:
     return {"paper-rig": home, "wide-rig": load_rig("wide-rig"), **drawn}
 
 
-def empty_maps(rig: Rig, seed: int) -> LidarMaps:
+def empty_maps(rig: Rig, seed: int, counts: float = 48.0) -> LidarMaps:
     echoes = render(Scene(rig)).multi
-    images = Sensor(rig, SensorModel()).expose(echoes, np.random.default_rng(seed))
+    sensor = Sensor(rig, SensorModel(bare_wall_counts=counts))
+    images = sensor.expose(echoes, np.random.default_rng(seed))
     return maps_from_frame(images.frame(rig.pinhole))
 
 
@@ -41,3 +42,12 @@ def test_an_empty_bench_shows_nothing(name: str) -> None:
         maps = empty_maps(rig, seed)
         assert consistency.examine(maps).problems == ()
         assert check_reconstruction(maps, None, rig).score < UNEXPLAINED_EMPTY / 5
+
+
+@pytest.mark.parametrize("counts", [12.0, 24.0, 160.0])
+@pytest.mark.parametrize("name", ["paper-rig", "wide-rig", "rig 0"])
+def test_a_dark_or_bright_wall_is_no_object(name: str, counts: float) -> None:
+    rig = rigs()[name]
+    maps = empty_maps(rig, 1, counts)
+
+    assert check_reconstruction(maps, None, rig).score < UNEXPLAINED_EMPTY / 2

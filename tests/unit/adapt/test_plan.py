@@ -49,6 +49,13 @@ def test_fewer_minutes_than_were_spent_change_nothing() -> None:
     assert plan.extended(10.0) == plan
 
 
+def test_minutes_that_are_there_add_no_stage() -> None:
+    """The sum of the stages' minutes is off by rounding."""
+    plan = plan_at().extended(15.4).extended(31.8)
+
+    assert plan.extended(31.8) == plan
+
+
 def test_epochs_see_whole_shards_that_only_become_more() -> None:
     stage = plan_at().extended(20.0).stages[0]
 

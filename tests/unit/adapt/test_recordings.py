@@ -16,6 +16,7 @@ from nlos_models import load_reconstructor, load_record, silhouette_iou
 
 from nlos_cam.adapt import adapt, find_recordings
 from nlos_cam.adapt.recordings import MIN_OBJECTS, Transfer, parts_of
+from nlos_cam.adapt.report import transfer_words
 from nlos_cam.bench import load_bench
 from nlos_cam.dataset import open_dataset
 from nlos_cam.evaluate import reconstruct_all
@@ -78,6 +79,36 @@ def test_only_a_better_fit_is_kept(start: float, after: float, kept: bool, tmp_p
     figures = [{"silhouette_iou": {"value": value}} for value in (start, 0.5, after)]
 
     assert Transfer(tmp_path, {}, 3, *figures).is_better is kept
+
+
+@pytest.mark.parametrize(("loss", "kept"), [(-0.05, True), (0.09, True), (0.2, False)])
+def test_a_fit_that_costs_much_in_simulation_is_not_kept(
+    loss: float, kept: bool, tmp_path: Path
+) -> None:
+    figures = [{"silhouette_iou": {"value": value}} for value in (0.3, 0.4, 0.5)]
+    fit = Transfer(tmp_path, {"judged": ["cup"]}, 3, *figures, simulated_loss=loss)
+
+    assert fit.is_better is kept
+    assert ("worse on simulated objects" in transfer_words(fit)) is not kept
+
+
+def test_recordings_in_another_box_are_left_out(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    box = HOME.object_box
+    assert box is not None
+    aside = box.model_copy(update={"x_min_m": box.x_min_m + 0.03, "x_max_m": box.x_max_m + 0.03})
+    now = HOME.model_copy(update={"object_box": aside})
+    monkeypatch.setattr(
+        "nlos_cam.adapt.recordings.load_sidecar",
+        lambda path: SimpleNamespace(label=path.stem, rig=HOME),
+    )
+    for number in range(MIN_OBJECTS):
+        (tmp_path / f"object-{number}.bag").touch()
+    said: list[str] = []
+
+    assert find_recordings(tmp_path, now, no_bench, said.append) is None
+    assert all("object box have moved" in line for line in said[:MIN_OBJECTS])
 
 
 def record_bench(run: Callable[..., Any]) -> Path:

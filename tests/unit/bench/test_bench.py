@@ -131,7 +131,25 @@ def test_weights_come_back_with_the_rig_of_their_bench(folder: Path, tmp_path: P
     write_weights(folder, source, 0.61)
 
     assert iou_in_use(folder) == 0.61
+
     assert not (folder / "weights/doubt.json").exists()
+
+
+def test_weights_are_known_on_a_bench_that_is_nearly_the_same(folder: Path, tmp_path: Path) -> None:
+    source = Path(shutil.copytree(shipped_folder(), tmp_path / "own"))
+    checksum = load_bench(folder).rig.checksum
+    record = load_record(source).model_copy(update={"rig_checksum": checksum})
+    for name in ("SHA256SUMS", "doubt.json"):
+        (source / name).unlink()
+    (source / "checkpoint.json").write_text(record.model_dump_json(), encoding="utf-8")
+    write_weights(folder, source, 0.61)
+
+    set_line(folder, "x_max_m", "x_max_m = 0.57503")  # by less than they can notice
+    near = iou_in_use(folder)
+    set_line(folder, "x_max_m", "x_max_m = 0.6")
+
+    assert near == 0.61
+    assert iou_in_use(folder) is None
 
 
 def test_lost_weights_do_not_lock_the_bench(folder: Path) -> None:

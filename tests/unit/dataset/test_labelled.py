@@ -127,13 +127,24 @@ def test_read_labelled_keeps_maps_as_recorded(paths: list[Path], noise_world: An
 def test_maps_of_a_recording_are_without_its_drift(
     paths: list[Path], monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    still = read_labelled(paths, known=known, frames=4)
     drifts_m = iter(np.linspace(0.0, 0.001, 20).tolist() * 2)
     monkeypatch.setattr(CalibratedRig, "follow", lambda *_: next(drifts_m))
 
     found = read_labelled(paths, known=known, frames=4)
 
-    off_m = found.maps.depth_m - found.recorded.depth_m
-    assert float(np.nanmedian(off_m)) == pytest.approx(-0.001, abs=1e-6)
+    for name in ("maps", "recorded"):
+        off_m = getattr(found, name).depth_m - getattr(still, name).depth_m
+        assert float(np.nanmedian(off_m)) == pytest.approx(-0.001, abs=1e-6)
+
+
+def test_a_recording_on_which_the_lidar_moved_is_refused(
+    paths: list[Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(CalibratedRig, "moved", True)
+
+    with pytest.raises(RecordingError, match=r"a\.bag: the lidar was not where"):
+        read_labelled(paths, known=known)
 
 
 def test_read_labelled_pairs_frames_with_truth_of_their_label(paths: list[Path]) -> None:

@@ -61,6 +61,7 @@ def with_wall_to(y_max_m: float) -> Rig:
 @pytest.mark.parametrize(
     ("rig", "service"),
     [
+        (with_box_moved(x=1e-6), "trained for it"),
         (with_box_moved(x=0.004), "near"),
         (with_box_moved(x=0.03), "far"),
         (with_box_moved(x=-0.05), "far"),
