@@ -6,10 +6,12 @@ __all__ = [
     "OPTIONAL",
     "RESERVE_BYTES",
     "SAME_INSTANT_S",
+    "SIDECAR_SUFFIX",
     "SIMULATED",
     "SIMULATED_SERIAL",
     "WHEEL",
     "WORLDS",
+    "WRAP_PERIOD_S",
     "Camera",
     "ClockUnwrap",
     "DeviceInfo",
@@ -41,6 +43,7 @@ __all__ = [
     "render_loop",
     "repair_command",
     "sample_from_sdk",
+    "sdk_serial",
     "shared_context",
     "stream_name",
 ]
@@ -48,9 +51,17 @@ __all__ = [
 from .accelerometer import gravity_of
 from .l515 import DeviceInfo, connected, find_l515, shared_context
 from .protocol import SIMULATED_SERIAL, Camera, OnProgress, WallClock
-from .recorder import RESERVE_BYTES, Recording, check_room, free_bytes, recording_s, repair_command
+from .recorder import (
+    RESERVE_BYTES,
+    SIDECAR_SUFFIX,
+    Recording,
+    check_room,
+    free_bytes,
+    recording_s,
+    repair_command,
+)
 from .registry import NAMES, SIMULATED, camera_to_name, full_uri, open_camera
-from .sdk import MAC_WHEEL, WHEEL, load_sdk
+from .sdk import MAC_WHEEL, WHEEL, load_sdk, sdk_serial
 from .session import find_streams
 from .simulated import SimulatedCamera, SoftwareLidar
 from .simulated_world import WORLDS, World, open_world, pack_loop, read_packaged, render_loop
@@ -67,4 +78,4 @@ from .streams import (
     sample_from_sdk,
     stream_name,
 )
-from .timestamps import ClockUnwrap
+from .timestamps import WRAP_PERIOD_S, ClockUnwrap

@@ -10,7 +10,7 @@ from nlos_cam.camera.laser_power import PowerLimits, turn_down
 from nlos_cam.camera.live_camera import LiveCamera
 from nlos_cam.camera.protocol import WaitingClock
 from nlos_cam.camera.recorder import Recording
-from nlos_cam.camera.sdk import load_sdk
+from nlos_cam.camera.sdk import load_sdk, sdk_serial
 from nlos_cam.camera.session import FrameSize
 from nlos_cam.errors import CameraError, CameraNotFoundError
 from nlos_cam.frames import MAX_SATURATED, saturated_share
@@ -326,7 +326,8 @@ def find_l515(sdk: Any, context: Any, serial: str) -> tuple[Any, DeviceInfo]:
     """
     there = connected(sdk, context)
     lidars = [(device, info) for device, info in there if "L515" in info.name]
-    chosen = [(device, info) for device, info in lidars if serial in {"", info.serial}]
+    wanted_serial = sdk_serial(serial)  # as on the label, which has leading zeros and capitals
+    chosen = [pair for pair in lidars if not serial or sdk_serial(pair[1].serial) == wanted_serial]
     if len(chosen) == 1:
         return chosen[0]
     if chosen:

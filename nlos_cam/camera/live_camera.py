@@ -304,5 +304,5 @@ class LiveCamera:
     def _on_set(self, found: FrameSet) -> None:
         recording = self._recording
         session = self._session
-        if recording and session and recording.add(found):
+        if recording and session and recording.add(found, self._clock.now()):
             session.inbox.finish()

@@ -9,8 +9,8 @@ import logging
 import os
 import shutil
 import time
-from collections.abc import Callable
-from contextlib import ExitStack
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack, suppress
 from math import inf
 from pathlib import Path
 from shlex import quote
@@ -20,6 +20,7 @@ from typing import Any
 from nlos_calibration import Intrinsics
 
 from nlos_cam.camera.streams import BYTES_PER_PIXEL, FRAMES_PER_S, SAME_INSTANT_S, FrameSet
+from nlos_cam.camera.timestamps import SAME_CLOCK_S
 from nlos_cam.errors import DiskFullError, OutputExistsError, RecordingError
 from nlos_cam.files import FileBusyError, claim
 from nlos_cam.threads import BoundedQueue
@@ -30,6 +31,19 @@ CHUNK_BYTES = 4_000_000
 """Upper bound of what the SDK has buffered; it writes in chunks of 0.75 MB."""
 INDEX_SHARE = 1e-3
 """Upper bound of the index at the end, as a share of the recording."""
+SIDECAR_SUFFIX = ".json"
+"""Ending of the file beside a recording that describes it."""
+GONE = "its file or disk is gone"
+
+
+def closing_bytes(recorded_bytes: int) -> int:
+    """Return the bytes that a recording of this size still needs until it is closed."""
+    return CHUNK_BYTES + int(recorded_bytes * INDEX_SHARE)
+
+
+def spare_bytes(recorded_bytes: int) -> int:
+    """Return the disk space that must be left beside a recording of this size while it grows."""
+    return RESERVE_BYTES + closing_bytes(recorded_bytes)
 
 
 def bytes_per_frame(intrinsics: Intrinsics) -> int:
@@ -47,18 +61,23 @@ def free_bytes(path: Path) -> int:
 
 
 def recording_s(intrinsics: Intrinsics, free: int) -> float:
-    """Return the shortest time in s until a recording leaves only the reserve."""
-    return max(0, free - RESERVE_BYTES) / (bytes_per_frame(intrinsics) * FRAMES_PER_S)
+    """Return the shortest time in s until a recording leaves only what its end needs, and the
+    reserve.
+    """
+    # It ends at the size n with free - n = spare_bytes(n), and the index grows in proportion to n.
+    size_bytes = max(0, free - spare_bytes(0)) / (1 + INDEX_SHARE)
+    return size_bytes / (bytes_per_frame(intrinsics) * FRAMES_PER_S)
 
 
 def check_room(path: Path, intrinsics: Intrinsics, frames: int, free: int) -> None:
     """Raise DiskFullError unless this number of frames fits and leaves the reserve."""
     needed = frames * bytes_per_frame(intrinsics)
-    if free < needed + RESERVE_BYTES:
+    spare = spare_bytes(needed)
+    if free < needed + spare:
         size = f"{intrinsics.width} x {intrinsics.height}"
         raise DiskFullError(
             f"{path}: {frames} frames of {size} need up to {needed / 1e9:.2f} GB,"
-            f" {RESERVE_BYTES / 1e9:.1f} GB must stay free, and {free / 1e9:.2f} GB are free: free"
+            f" {spare / 1e9:.1f} GB must stay free, and {free / 1e9:.2f} GB are free: free"
             " space, record less, or choose --out on another disk"
         )
 
@@ -68,18 +87,25 @@ def can_grow(path: Path, by_bytes: int) -> bool:
 
     It has its old length afterwards. Nothing else may write to it during the call.
     """
-    length = path.stat().st_size
+    try:
+        length = path.stat().st_size
+    except OSError:
+        return False
+    block = bytes(min(by_bytes, CHUNK_BYTES))
+    left = by_bytes
     try:
         with path.open("r+b", buffering=0) as file:
             file.seek(length)
-            wrote = file.write(bytes(by_bytes))
+            while left > 0:
+                left -= file.write(block[:left])
             os.fsync(file.fileno())
     except OSError:
         return False
     else:
-        return wrote == by_bytes
+        return True
     finally:
-        os.truncate(path, length)
+        with suppress(OSError):  # a file that is gone has no length
+            os.truncate(path, length)
 
 
 def size_limit() -> float:
@@ -150,7 +176,8 @@ class SdkRecorder:
         self._size_limit = size_limit()
         self._now = now
         self._grew_s = now()
-        self._bytes = 0
+        self.bytes = 0
+        """Size of the file when it was last looked at."""
         try:
             str(path).encode()
         except UnicodeEncodeError as error:  # librealsense takes no other names
@@ -167,21 +194,31 @@ class SdkRecorder:
 
     def watch(self) -> None:
         """Check that the file grows; call about once a second while frames come."""
-        size = self.path.stat().st_size
-        if size >= self._size_limit:
-            self._fail("")
-        elif size != self._bytes:
-            self._bytes = size
+        before = self.bytes
+        if not self._measure():
+            self.fail(GONE)
+        elif self.bytes >= self._size_limit:
+            self.fail("")
+        elif self.bytes != before:
             self._grew_s = self._now()
         elif self._now() - self._grew_s > STILL_S:
-            self._fail(f"nothing written for {STILL_S:.0f} s")
+            self.fail(f"nothing written for {STILL_S:.0f} s")
 
-    def _fail(self, reason: str) -> None:
+    def _measure(self) -> bool:
+        """Look at the size of the file, and return whether the file is there."""
+        try:
+            self.bytes = self.path.stat().st_size
+        except OSError:
+            return False
+        return True
+
+    def fail(self, reason: str) -> None:
         """Note a failed write, and the reason for it where that is not the limit on a file's
         size.
         """
-        margin_bytes = CHUNK_BYTES + int(self.path.stat().st_size * INDEX_SHARE)
-        self.at_size_limit = self.path.stat().st_size + margin_bytes > self._size_limit
+        is_there = self._measure()
+        end_bytes = self.bytes + closing_bytes(self.bytes)
+        self.at_size_limit = is_there and end_bytes > self._size_limit
         self.failure = (
             f"it reached the limit on a file's size, {self._size_limit / 1e6:.3g} MB"
             if self.at_size_limit
@@ -198,9 +235,10 @@ class SdkRecorder:
         Raises DiskFullError where there is no room for it: the SDK would abort the program.
         """
         self._flush()
-        closing_bytes = CHUNK_BYTES + int(self.path.stat().st_size * INDEX_SHARE)
-        if self.failure is None and not can_grow(self.path, closing_bytes):
-            self._fail("no room for its index")
+        if self.failure is None and not self._measure():
+            self.fail(GONE)
+        if self.failure is None and not can_grow(self.path, closing_bytes(self.bytes)):
+            self.fail("no room for its index")
         if self.failure:
             self._abandon()
         self._recorder = None
@@ -212,14 +250,17 @@ class SdkRecorder:
             self.pause()
             if self.failure or self._now() - start_s < FLUSH_S:
                 return
-        self._fail("the disk no longer accepts data")
+        self.fail("the disk no longer accepts data")
 
     def _abandon(self) -> None:
         """Raise DiskFullError, and leave the file as it is."""
         # One reference too many: never deleted, not even at exit.
         ctypes.pythonapi.Py_IncRef(ctypes.py_object(self._recorder))
         self._recorder = None
-        remedy = "raise the limit (ulimit -f)" if self.at_size_limit else "free some space"
+        if self.at_size_limit:
+            remedy = "raise the limit (ulimit -f)"
+        else:
+            remedy = "look for the disk" if self.failure == GONE else "free some space"
         raise DiskFullError(
             f"{self.path} could not be completed ({self.failure}): {remedy}, and recover its"
             f" frames with `{repair_command(self.path)}`"
@@ -232,12 +273,48 @@ BOUNDARY_WAIT_S = 1.0
 log = logging.getLogger(__name__)
 
 
+class _Replaced:
+    """Files that a recording replaces, in the folder of its claim until it has its first set."""
+
+    def __init__(self, paths: Sequence[Path], folder: Path) -> None:
+        self._kept = {path: folder / path.name for path in paths}
+        self._free: list[Path] = []
+        """Paths that are the new recording's by now."""
+
+    def take_away(self) -> None:
+        """Move the files into the folder. Raises OSError."""
+        for path, kept in self._kept.items():
+            with suppress(FileNotFoundError):
+                path.replace(kept)
+            self._free.append(path)
+
+    def drop(self) -> None:
+        """Delete the files: the new recording stands."""
+        self._free.clear()
+        for kept in self._kept.values():
+            with suppress(OSError):  # they go with the folder
+                kept.unlink(missing_ok=True)
+
+    def put_back(self) -> None:
+        """Put the files in the place of a recording without a set; without effect after `drop`."""
+        for path in self._free:
+            try:
+                path.unlink(missing_ok=True)
+                with suppress(FileNotFoundError):
+                    self._kept[path].replace(path)
+            except OSError as error:
+                log.warning("%s: the file from before cannot be put back (%s)", path, error)
+        self._free.clear()
+
+
 class Recording:
     """Recording of a camera to `path`, up to a number of `frames` or `seconds`, if given.
 
     Give it to `open_camera`: the camera begins it on entering and closes it on leaving. One that is
     not the `last` take leaves the camera running when it is full, until `next_take`. `add` is
-    called on an SDK thread, the rest by the thread that iterates over the camera.
+    called on an SDK thread, the rest by the thread that iterates over the camera. A recording that
+    this one replaces, and its sidecar, are kept until the first set, and are back after `close`
+    where none came; new ones without a set are gone then.
     """
 
     def __init__(
@@ -273,7 +350,9 @@ class Recording:
         self._overwrite = overwrite
         self._claim = ExitStack()
         self._before_s = float("-inf")
+        self._replaced = _Replaced((), path)
         self._first_s = 0.0
+        self._first_arrived_s = 0.0
         self._last_s = 0.0
         self._stopping = Event()
         self._paused = Event()
@@ -291,27 +370,43 @@ class Recording:
         now.
         """
         self._source = device, sdk
-        self._own()
+        self._take_away(self._own())
         self._recorder = SdkRecorder(self.path, device, sdk)
         self.error = None
         self.started = True
 
-    def _own(self) -> None:
-        """Claim the path until `close`, so that no other process writes to it."""
+    def _own(self) -> Path:
+        """Claim the path until `close`, so that no other process writes to it; return the claim's
+        folder.
+        """
         self._claim.close()
         try:
-            self._claim.enter_context(claim(self.path))
+            folder = self._claim.enter_context(claim(self.path))
         except FileBusyError:
             raise
         except OSError as error:
-            raise RecordingError(
-                f"{self.path} cannot be written ({error.strerror}): choose another --out"
-            ) from error
+            raise self._cannot_be_written(error) from error
         if not self._overwrite and not self.started and os.path.lexists(self.path):
             self._claim.close()
             raise OutputExistsError(
                 f"{self.path} exists by now: choose another --out, or add --overwrite"
             )
+        return folder
+
+    def _take_away(self, folder: Path) -> None:
+        """Move the recording that this one replaces, and its sidecar, into a folder."""
+        paths = self.path, self.path.with_suffix(SIDECAR_SUFFIX)
+        self._replaced = _Replaced(paths, folder)
+        self._claim.callback(self._replaced.put_back)
+        try:
+            self._replaced.take_away()
+        except OSError as error:
+            raise self._cannot_be_written(error) from error
+
+    def _cannot_be_written(self, error: OSError) -> RecordingError:
+        return RecordingError(
+            f"{self.path} cannot be written ({error.strerror}): choose another --out"
+        )
 
     def join(self, device: Any, sdk: Any) -> None:
         """Begin with the next set of a device that runs. Raises RecordingError where nothing can be
@@ -343,9 +438,11 @@ class Recording:
             self._changing.clear()
             self._changed.set()
 
-    def add(self, found: FrameSet) -> bool:
+    def add(self, found: FrameSet, arrived_s: float) -> bool:
         """Count a passing set, on an SDK thread; return True once no more is recorded, in this or a
         later take.
+
+        `arrived_s` is on a clock that does not jump.
         """
         if self._changing.is_set():
             self._before_s = found.timestamp_s
@@ -353,36 +450,52 @@ class Recording:
             self._changed.wait(BOUNDARY_WAIT_S)
             return False
         if self._recorder and not self._paused.is_set():
-            self._count(found, self._recorder)
+            self._count(found, arrived_s, self._recorder)
         if self.disk_full:
             return self._paused.is_set() and not self.optional
         return self._paused.is_set() and self._last
 
-    def _count(self, found: FrameSet, recorder: SdkRecorder) -> None:
+    def _count(self, found: FrameSet, arrived_s: float, recorder: SdkRecorder) -> None:
         if self.sets == 0:
+            self._replaced.drop()
             self._first_s = found.timestamp_s
+            self._first_arrived_s = arrived_s
         self._last_s = found.timestamp_s
         self.sets += 1
         is_due = self.sets % FRAMES_PER_S == 1  # once a second
         self.disk_full = is_due and self._is_disk_full(recorder)
-        if self.disk_full or self._is_full(found.timestamp_s) or self._stopping.is_set():
+        is_full = self._is_full(found.timestamp_s, arrived_s)
+        if self.disk_full or is_full or self._stopping.is_set():
             recorder.pause()  # queued behind the frames so far: none of them is lost
             self._paused.set()
         if self.disk_full and self.optional:
-            reason = "limit on a file's size" if recorder.at_size_limit else "disk full"
+            reason = recorder.failure or "disk full"
             log.warning("%s: %s, the recording ends", self.path, reason)
 
     def _is_disk_full(self, recorder: SdkRecorder) -> bool:
         recorder.watch()
-        return recorder.failure is not None or self._free(self.path) < RESERVE_BYTES
+        if recorder.failure:
+            return True
+        try:
+            free = self._free(self.path)
+        except OSError:  # the SDK would swallow it, on its thread
+            recorder.fail(GONE)
+            return True
+        return free < spare_bytes(recorder.bytes)
 
-    def _is_full(self, timestamp_s: float) -> bool:
+    def _is_full(self, timestamp_s: float, arrived_s: float) -> bool:
         if self._frames is not None and self.sets >= self._frames:
             return True
         if self._seconds is None:
             return False
+        length_s = timestamp_s - self._first_s
+        arrived_after_s = arrived_s - self._first_arrived_s
+        # Timestamps are finer than arrivals, but may be on the host's time of day, which can be
+        # set during a take.
+        if abs(length_s - arrived_after_s) > SAME_CLOCK_S:
+            length_s = arrived_after_s
         # A set lasts a period, and timestamps jitter by less than half of one.
-        end_s = timestamp_s - self._first_s + 2 * SAME_INSTANT_S
+        end_s = length_s + 2 * SAME_INSTANT_S
         return end_s > self._seconds - SAME_INSTANT_S
 
     @property

@@ -26,6 +26,11 @@ def wheel_for(python: tuple[int, int], system: str, machine: str) -> str | None:
     )
 
 
+def sdk_serial(serial: str) -> str:
+    """Return a serial number as the SDK writes it: lower case, without leading zeros."""
+    return serial.strip().lower().lstrip("0")
+
+
 @cache
 def load_sdk() -> Any:
     """Return the pyrealsense2 module. Raises CameraError where it cannot be loaded."""

@@ -103,6 +103,8 @@ def format_take(take: recordings.CaptureResult) -> str:
     if take.recoverable is not None:
         frames = f"{take.summary.frames} of {take.sets} frames"
         return f"{ending}Recorded {frames}; the file has no index\nWrote {take.target.path}"
+    if not take.closed:
+        return f"{ending}{take.sets} frames came; the file cannot be read back"
     if take.verified is None:
         return f"{ending}Recorded {take.sets} frames; not verified\nWrote {take.target.path}"
     size_mb = take.target.path.stat().st_size / 1e6

@@ -254,7 +254,7 @@ def _take_camera_of_bench(values: dict[str, Any]) -> None:
     except CalibrationError:  # the command says what is wrong with it
         return
     if serial not in {"", SIMULATED_SERIAL}:
-        values["camera"] = "l515"
+        values["camera"] = f"l515:{serial}"  # others may be connected
 
 
 def _is_another(given: str, setting: Value) -> bool:

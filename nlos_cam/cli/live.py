@@ -143,8 +143,6 @@ def live(
             loop.low_latency_interpreter(),
             opened as source,
         ):
-            if recording and recording.started:  # that of the recording which this one replaces
-                recordings.sidecar_path(recording.path).unlink(missing_ok=True)
             report = loop.run_live(
                 source,
                 pipeline,
@@ -162,7 +160,8 @@ def live(
     if log:
         common.say(f"Logged each frame to {log}")
     if recording:
-        common.say(f"Recorded {recording.sets} frames to {recording.path}")
+        recorded = f"{recording.sets} frames to {recording.path}" if recording.sets else "no frame"
+        common.say(f"Recorded {recorded}")
         if recording.error:
             common.say(f"note: {recording.error}")
     text = summary(report, verbose=common.Detail.verbose)

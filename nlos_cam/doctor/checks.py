@@ -308,6 +308,8 @@ def _load_fix(error: str, on: str) -> str:
     return f"pip install {_wheel(on)} libusb-package"
 
 
+MIN_FRAMES_SHARE = 0.5
+"""Share of the expected frames below which a camera is too slow."""
 FROZEN_FIX = "unplug the camera, wait 5 s, plug it in, and run `nlos-cam live --camera l515`"
 KNOWN_MESSAGES = (
     (
@@ -349,10 +351,15 @@ def stream(facts: Facts) -> Finding:
         return ok("no camera was watched: --camera l515 watches one for some seconds")
     if found.error:
         return failed(f"{found.camera}: {found.error}", "look at the other checks, then replug")
-    if not found.frames:
-        return failed(f"no frame of {found.camera} in {found.seconds:.0f} s", FROZEN_FIX)
     if found.is_frozen:
         return failed(f"{found.camera} sends one frame again and again", FROZEN_FIX)
+    if not found.frames:
+        return failed(f"no frame of {found.camera} in {found.seconds:.0f} s", FROZEN_FIX)
+    if found.frames < MIN_FRAMES_SHARE * found.frames_expected:
+        return warning(
+            f"{found.frames} frames of {found.camera}, of {found.frames_expected:.0f} expected",
+            "use a USB 3 port of the computer itself, close other programs, then replug",
+        )
     return ok(f"{found.frames} frames of {found.camera}, each another")
 
 

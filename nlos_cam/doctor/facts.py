@@ -8,9 +8,9 @@ from functools import partial
 from importlib import metadata
 from typing import Any, Literal
 
-from nlos_cam.camera import DeviceInfo, connected, load_sdk, shared_context
+from nlos_cam.camera import DeviceInfo, connected, load_sdk, sdk_serial, shared_context
 from nlos_cam.doctor.host import Host, read_host
-from nlos_cam.doctor.usb import UsbDevice, UsbScan, scan_usb, sdk_serial
+from nlos_cam.doctor.usb import UsbDevice, UsbScan, scan_usb
 from nlos_cam.errors import CameraError
 
 PLATFORM_CAMERA = "Platform Camera"
@@ -113,6 +113,8 @@ class Watched:
     seconds: float
     is_frozen: bool = False
     """True if it sent the same frame again and again."""
+    frames_expected: float = 0.0
+    """Frames that a sound camera sends in the time for which it was watched."""
     error: str = ""
     """Why it could not be watched; empty otherwise."""
 

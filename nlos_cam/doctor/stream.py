@@ -3,7 +3,7 @@
 import time
 from threading import Event
 
-from nlos_cam.camera import Camera, open_camera
+from nlos_cam.camera import FRAMES_PER_S, Camera, open_camera
 from nlos_cam.doctor.facts import Watched
 from nlos_cam.errors import NlosCamError
 
@@ -26,7 +26,8 @@ def watch_camera(camera: Camera, uri: str, seconds: float) -> Watched:
     is_frozen = False
     frames = 0
     with camera:
-        end_s = time.monotonic() + seconds
+        start_s = time.monotonic()
+        end_s = start_s + seconds
         reader = FrameReader(
             camera,
             lossless=True,  # every frame is compared with the one before it
@@ -38,4 +39,8 @@ def watch_camera(camera: Camera, uri: str, seconds: float) -> Watched:
             for arrival in reader:
                 frames += 1
                 is_frozen = frozen.add(arrival.frame) or is_frozen
-    return Watched(uri, frames, seconds, is_frozen)
+        watched_s = min(seconds, time.monotonic() - start_s)
+    # A frame that comes again under its number makes no other one: the camera only counts it, and
+    # some counts are complete when it has stopped.
+    is_frozen = is_frozen or camera.counts["duplicate"] > frames
+    return Watched(uri, frames, seconds, is_frozen, frames_expected=watched_s * FRAMES_PER_S)

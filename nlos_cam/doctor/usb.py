@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from nlos_cam.camera import sdk_serial
 from nlos_cam.doctor.host import INTEL, LIDARS, OTHERS, Kind, read_text
 
 SPEEDS = {
@@ -182,8 +183,3 @@ def firmware_of(bcd_device: int) -> str:
     if second or major == 0 or max(major, minor, patch) > 9:
         return ""
     return f"{major}.{minor}.{patch}"
-
-
-def sdk_serial(serial: str) -> str:
-    """Return a serial number as the SDK writes it: lower case, without leading zeros."""
-    return serial.strip().lower().lstrip("0")

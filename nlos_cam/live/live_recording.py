@@ -53,15 +53,16 @@ class LiveRecording:
         self._counts = camera.counts
         self._counts_before = Counter(camera.counts)
         self._target = recordings.CaptureTarget(path, label)
-        self._sidecar = recordings.SidecarFile(
-            recordings.sidecar_path(path), camera, label=label, wall=wall
-        )
         self._meter = recordings.QualityMeter()
         self._recording = Recording(path, optional=True, last=False)
+        camera.start_recording(self._recording)
         try:
-            camera.start_recording(self._recording)
+            self._sidecar = recordings.SidecarFile(
+                recordings.sidecar_path(path), camera, label=label, wall=wall
+            )
         except BaseException:
-            self._sidecar.path.unlink(missing_ok=True)
+            camera.stop_recording()
+            path.unlink(missing_ok=True)
             raise
 
     def add(self, frame: Frame) -> None:

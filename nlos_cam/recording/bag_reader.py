@@ -23,7 +23,7 @@ from nlos_calibration.arrays import Float64
 from rosbags.rosbag1 import Reader
 from rosbags.rosbag1.reader import Header, RecordType, read_uint32
 
-from nlos_cam.camera import Sample, gravity_of, repair_command
+from nlos_cam.camera import WRAP_PERIOD_S, Sample, gravity_of, repair_command
 from nlos_cam.errors import RecordingError
 from nlos_cam.files import describe, is_claimed
 from nlos_cam.recording import bag_messages, rosbag
@@ -43,6 +43,8 @@ COMPRESSED_IMAGE = "sensor_msgs/msg/CompressedImage"
 MAX_NAMED = 4
 ENDS = 4
 """Frames at each end among which one has a stamp that agrees with the next."""
+MAX_DRIFT_S = 10.0
+"""Bound between the durations by the device's clock and by the recorder's, apart from wraps."""
 STATIC_NS = 1
 """The time that librealsense gives to values in force when the recording began."""
 SAMPLE = Path(__file__).parent / "sample.bag"
@@ -303,7 +305,8 @@ class BagReader:
         """Return the time from the first frame of a stream to its last.
 
         It is that of the device's clock, between the outermost stamps that agree with those beside
-        them; of the recorder's where none do, or the device's clock started again.
+        them, and over its wraps; of the recorder's where none do, or the device's clock started
+        again.
         """
         frames = self._frames(stream)
         times_ns = self._times_ns[stream]
@@ -312,9 +315,14 @@ class BagReader:
         last = self._first_agreed_s(
             list(zip(frames[: -ENDS - 1 : -1], times_ns[: -ENDS - 1 : -1], strict=True))
         )
-        if first is None or last is None or last < first:
+        if first is None or last is None:
             return max(recorded_s, 0.0)
-        return last - first
+        device_s = last - first
+        wraps = round((recorded_s - device_s) / WRAP_PERIOD_S)
+        unwrapped_s = device_s + wraps * WRAP_PERIOD_S
+        if wraps > 0 and abs(recorded_s - unwrapped_s) < MAX_DRIFT_S:
+            return unwrapped_s
+        return max(recorded_s, 0.0) if device_s < 0 else device_s
 
     def _first_agreed_s(self, frames: list[tuple[Entry, int]]) -> float | None:
         """Return the first stamp, in s, that is as far from the next as the recorder says; of a

@@ -102,7 +102,7 @@ class CaptureSession:
         take: CaptureResult | None = None
         try:
             with ExitStack() as entered:
-                frames = self._enter(entered)
+                frames = iter(entered.enter_context(self._camera))
                 for number, target in enumerate(self.targets):
                     if take:
                         self._recording.close()
@@ -123,14 +123,6 @@ class CaptureSession:
             yield replace(
                 take, sets=self._recording.sets
             )  # with the set that was in flight at its end
-
-    def _enter(self, entered: ExitStack) -> Iterator[Frame]:
-        try:
-            return iter(entered.enter_context(self._camera))
-        except BaseException:
-            if self._recording.started:  # and holds nothing
-                self._recording.path.unlink(missing_ok=True)
-            raise
 
     def _take(
         self,
@@ -163,8 +155,8 @@ class CaptureSession:
         if self._recording.disk_full:
             state = "disk full"
             error = DiskFullError(
-                f"less than {RESERVE_BYTES / 1e6:.0f} MB were left for {target.path}: free some, or"
-                " choose an --out on another disk"
+                f"less than {RESERVE_BYTES / 1e6:.0f} MB and room for its index were left for"
+                f" {target.path}: free some, or choose an --out on another disk"
             )
         events = Counter(self._camera.counts) - counts_before
         return CaptureResult(
@@ -211,14 +203,12 @@ def _leaving_on(stop: Event, camera: Camera) -> Generator[Event]:
 def finalize(
     take: CaptureResult, read_back: Callable[[Path], VerifyResult | None]
 ) -> CaptureResult:
-    """Verify a closed take with `read_back`, and write its outcome into the sidecar; delete one
-    without any frame.
+    """Verify a closed take with `read_back`, and write its outcome into the sidecar.
 
-    `read_back` returns None when interrupted.
+    One without any frame has no files: its `Recording` has put back those from before. `read_back`
+    returns None when interrupted.
     """
     if take.sets == 0:
-        for path in (take.target.path, take.sidecar.path):
-            path.unlink(missing_ok=True)
         return take
     final = _verify(take, read_back) if take.closed else _count(take)
     try:

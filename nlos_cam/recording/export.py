@@ -24,6 +24,7 @@ from nlos_cam.camera import FORMATS, OPTIONAL, SAME_INSTANT_S, FrameSynchronizer
 from nlos_cam.errors import NlosCamError, RecordingError
 from nlos_cam.files import TEXT_LIMIT, atomic_directory, read_bounded
 from nlos_cam.recording.bag_reader import BagReader
+from nlos_cam.recording.device_clock import unwrapped_samples
 
 if TYPE_CHECKING:
     from nlos_cam.recording.ros_reader import RosReader
@@ -257,7 +258,7 @@ def export_recording(
             try:
                 instants = _Instants()
                 wanted = {*sinks, *(points.streams if points else ())}
-                for sample in bag.samples(wanted):
+                for _, sample in unwrapped_samples(bag, wanted):
                     if stop.is_set():
                         break
                     on_frame()

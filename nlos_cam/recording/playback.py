@@ -3,16 +3,17 @@
 import logging
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Self
 
 from nlos_calibration import Intrinsics, Rig
 
-from nlos_cam.camera import FORMATS, OPTIONAL, ClockUnwrap, FrameSynchronizer, Sample, frame_in_si
+from nlos_cam.camera import FORMATS, OPTIONAL, FrameSynchronizer, frame_in_si
 from nlos_cam.errors import CameraError, RecordingError, StreamMissingError
 from nlos_cam.frames import Frame
 from nlos_cam.recording.bag_reader import BagReader
+from nlos_cam.recording.device_clock import unwrapped_samples
 from nlos_cam.recording.formats import open_recording
 from nlos_cam.recording.renumbering import renumbered
 
@@ -80,7 +81,8 @@ class ReplayCamera:
             raise
 
     def _frames(self, pairing: FrameSynchronizer, iteration: int) -> Iterator[Frame]:
-        for time_ns, sample in renumbered(self._samples(), self._streams):
+        samples = unwrapped_samples(self._bag, self._streams)
+        for time_ns, sample in renumbered(samples, self._streams):
             self.arrived[sample.stream] += 1
             found = pairing.add(sample)
             if found:
@@ -96,16 +98,6 @@ class ReplayCamera:
             if iteration != self._iterations:  # the context was left, or another iteration started
                 return
         self._end(pairing)
-
-    def _samples(self) -> Iterator[tuple[int, Sample]]:
-        """Yield the recorder's time in ns of each sample, and the sample on a clock that does not
-        wrap.
-        """
-        # A device's own clock is a counter that wraps.
-        is_counter = self._bag.metadata("depth", 0).domain == "hardware_clock"
-        unwrap = ClockUnwrap().add if is_counter else float
-        for time_ns, sample in self._bag.timed_samples(self._streams):
-            yield time_ns, replace(sample, timestamp_s=unwrap(sample.timestamp_s))
 
     def _end(self, pairing: FrameSynchronizer) -> None:
         pairing.finish()

@@ -16,7 +16,7 @@ from nlos_calibration import Finite, PinholeRecord, Record, Rig, first_problem, 
 from pydantic import AwareDatetime, Field, ValidationError
 
 from nlos_cam import __version__
-from nlos_cam.camera import Camera
+from nlos_cam.camera import SIDECAR_SUFFIX, Camera
 from nlos_cam.errors import DiskFullError, RecordingError
 from nlos_cam.files import TEXT_LIMIT, atomic_file, describe, program_commit, read_bounded
 from nlos_cam.frames import Frame
@@ -107,7 +107,7 @@ class Sidecar(Record):
 
 def sidecar_path(recording: Path) -> Path:
     """Return F.json for F.bag."""
-    return recording.with_suffix(".json")
+    return recording.with_suffix(SIDECAR_SUFFIX)
 
 
 def load_sidecar(path: Path) -> Sidecar:
@@ -200,7 +200,8 @@ class SidecarFile:
         if self._first_s is None:
             self._first_s = frame.timestamp_s
             self._sidecar = self._sidecar.model_copy(update={"settings": finite(frame.settings)})
-        if frame.timestamp_s - self._read_s >= self._every_s:
+        # A clock that went back starts the interval again.
+        if not self._read_s <= frame.timestamp_s < self._read_s + self._every_s:
             self._read_s = frame.timestamp_s
             self._read_temperatures(frame.timestamp_s - self._first_s)
             with suppress(DiskFullError):  # the end of the recording raises it

@@ -34,6 +34,12 @@ def test_camera_that_is_not_found_lists_what_is(
         fake_camera(*lidars, serial=serial)
 
 
+def test_serial_may_be_written_as_on_the_label(fake_camera: Make) -> None:
+    camera = fake_camera(FakeLidar("f0246262"), FakeLidar("f1"), serial="00000000F0246262")
+
+    assert camera.identity["serial"] == "f0246262"
+
+
 @pytest.mark.parametrize(("usb", "size"), [("3.2", (640, 480)), ("2.1", (320, 240))])
 def test_usb_link_decides_the_resolution(
     fake_camera: Make, caplog: pytest.LogCaptureFixture, usb: str, size: tuple[int, int]

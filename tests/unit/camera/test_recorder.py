@@ -1,8 +1,10 @@
+import errno
 import os
 import subprocess
 import sys
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from itertools import islice
 from pathlib import Path
 from threading import Event
@@ -16,6 +18,7 @@ from nlos_calibration import Intrinsics
 from nlos_cam.camera import (
     FORMATS,
     RESERVE_BYTES,
+    FrameSet,
     Recording,
     SimulatedCamera,
     check_room,
@@ -24,11 +27,13 @@ from nlos_cam.camera import (
 )
 from nlos_cam.camera.recorder import (
     FLUSH_S,
+    GONE,
     MAX_FLUSHES,
     STILL_S,
     SdkRecorder,
     bytes_per_frame,
     can_grow,
+    spare_bytes,
 )
 from nlos_cam.camera.session import CAPACITY
 from nlos_cam.errors import DiskFullError, OutputExistsError, RecordingError
@@ -160,8 +165,7 @@ def test_next_take_starts_though_no_frame_comes(
         recording.next_take(tmp_path / "b.bag", last=True)
         assert recording.started
         assert not recording.done
-
-    assert (tmp_path / "b.bag").exists()
+        assert (tmp_path / "b.bag").exists()
 
 
 @pytest.mark.parametrize("ending", ["little space", "no index"])
@@ -202,6 +206,13 @@ class FakeRecorder:
 
 SDK = SimpleNamespace(recorder=FakeRecorder)
 CLOCK = NapClock()
+
+
+@pytest.fixture
+def found(noise_world: Any) -> FrameSet:
+    """Return one set of a NoiseWorld."""
+    images = noise_world().images(0)
+    return FrameSet(0, 0.0, images.depth_z16, images.ir, images.confidence)
 
 
 @pytest.fixture
@@ -307,14 +318,121 @@ def test_check_room_needs_frames_and_a_reserve(
     assert free_bytes(tmp_path / "none.bag") > 0 < free_bytes(Path("none.bag"))
 
     path = tmp_path / "a.bag"
-    free = RESERVE_BYTES + 30 * seconds * bytes_per_frame(VGA)
+    recorded = 30 * seconds * bytes_per_frame(VGA)
+    free = recorded + spare_bytes(recorded)
 
-    assert recording_s(VGA, free) == seconds
+    assert recording_s(VGA, free) == pytest.approx(seconds)
     assert recording_s(VGA, 0) == 0
 
     check_room(path, VGA, 30 * seconds, free)
     with pytest.raises(DiskFullError, match=rf"a\.bag.*{30 * seconds or ''}"):
         check_room(path, VGA, 30 * seconds, free - 1)
+
+
+def test_recording_stops_while_there_is_room_for_its_index(tmp_path: Path, found: FrameSet) -> None:
+    """Check a recording of 1 TB, whose index is larger than the reserve."""
+    recording = Recording(tmp_path / "a.bag", free=lambda _: 2 * RESERVE_BYTES)
+    recording.begin("device", SDK)
+    os.truncate(recording.path, 10**12)
+    recording.add(found, 0.0)
+
+    assert recording.disk_full
+    assert recording.done
+
+    os.truncate(recording.path, 0)
+    recording.close()
+
+
+def test_recording_without_a_file_ends_with_its_reason(tmp_path: Path, found: FrameSet) -> None:
+    recording = Recording(tmp_path / "a.bag")
+    recording.begin("device", SDK)
+    recording.path.unlink()
+    ends = recording.add(found, 0.0)
+
+    assert ends
+    assert recording.disk_full
+
+    with pytest.raises(DiskFullError, match=GONE):
+        recording.close()
+
+
+def test_recording_without_a_disk_ends_with_its_reason(tmp_path: Path, found: FrameSet) -> None:
+    def fail(_: Path) -> int:
+        raise OSError(errno.EIO, "it was unplugged")
+
+    recording = Recording(tmp_path / "a.bag", free=fail)
+    recording.begin("device", SDK)
+
+    assert recording.add(found, 0.0)
+    with pytest.raises(DiskFullError, match=GONE):
+        recording.close()
+
+
+def test_recorder_whose_file_goes_before_its_end_fails(made: SdkRecorder) -> None:
+    made.path.unlink()
+    with pytest.raises(DiskFullError, match=GONE):
+        made.close()
+
+
+@pytest.mark.parametrize("step_s", [86_400.0, -86_400.0])
+def test_step_of_the_clock_changes_no_take(tmp_path: Path, found: FrameSet, step_s: float) -> None:
+    recording = Recording(tmp_path / "a.bag", seconds=2.0, free=lambda _: 10 * RESERVE_BYTES)
+    recording.begin("device", SDK)
+    for number in range(100):
+        passed_s = number / 30
+        timestamp_s = 1e9 + passed_s + (step_s if number > 20 else 0.0)
+        if recording.add(replace(found, number=number, timestamp_s=timestamp_s), passed_s):
+            break
+    recording.close()
+
+    assert recording.sets == 60
+
+
+def old_pair(folder: Path) -> dict[str, str]:
+    """Write a recording and its sidecar, and return their contents."""
+    pair = {"a.bag": "an old file", "a.json": "its sidecar"}
+    for name, text in pair.items():
+        (folder / name).write_text(text)
+    return pair
+
+
+def contents(folder: Path) -> dict[str, str]:
+    return {path.name: path.read_text() for path in folder.iterdir() if path.is_file()}
+
+
+def test_recording_without_a_set_leaves_no_file(tmp_path: Path) -> None:
+    recording = Recording(tmp_path / "a.bag", overwrite=False)
+    for _ in range(2):  # as after a restart of the device
+        recording.begin("device", SDK)
+        recording.path.with_suffix(".json").write_text("a new one")
+    recording.close()
+
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_recording_without_a_set_puts_the_old_pair_back(tmp_path: Path) -> None:
+    pair = old_pair(tmp_path)
+    recording = Recording(tmp_path / "a.bag")
+    for _ in range(2):  # as after a restart of the device
+        recording.begin("device", SDK)
+        recording.path.with_suffix(".json").write_text("a new one")
+
+    assert contents(tmp_path) == {"a.bag": "recorded", "a.json": "a new one"}
+
+    recording.close()
+
+    assert contents(tmp_path) == pair
+
+
+def test_first_set_drops_the_old_pair(tmp_path: Path, found: FrameSet) -> None:
+    old_pair(tmp_path)
+    recording = Recording(tmp_path / "a.bag")
+    recording.begin("device", SDK)
+    recording.add(found, 0.0)
+    recording.close()
+
+    assert contents(tmp_path) == {"a.bag": "recorded"}
+    assert [path.name for path in tmp_path.iterdir()] == ["a.bag"]
 
 
 def test_can_grow_finds_a_limit_and_changes_nothing(tmp_path: Path) -> None:

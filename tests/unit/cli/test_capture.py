@@ -130,7 +130,7 @@ def test_capture_without_a_limit_reports_remaining_time(
     ended = CaptureResult(
         CaptureTarget(OUT), "interrupted", 0, Quality(), beside
     )  # before the first frame
-    monkeypatch.setattr("nlos_cam.camera.free_bytes", lambda _: 200_000_000 + 64 * 48 * 4 * 30 * 90)
+    monkeypatch.setattr("nlos_cam.camera.free_bytes", lambda _: 204_100_000 + 64 * 48 * 4 * 30 * 90)
     monkeypatch.setattr(
         "nlos_cam.recording.CaptureSession.record", lambda *_: (one for one in [ended])
     )

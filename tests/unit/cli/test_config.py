@@ -218,7 +218,7 @@ def test_bench_of_the_settings_gives_way_to_what_is_given(
 @pytest.mark.parametrize(
     ("serial", "words", "camera"),
     [
-        ("f0000001", ["--bench", "bench"], "l515"),
+        ("f0000001", ["--bench", "bench"], "l515:f0000001"),
         ("f0000001", ["--bench", "bench", "sim:a"], "sim:a"),
         ("simulated", ["--bench", "bench"], "sim"),
         ("f0000001", [], "sim"),

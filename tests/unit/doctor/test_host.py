@@ -23,10 +23,11 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from usb.backend.libusb1 import _LibUSB
 
+from nlos_cam.camera import sdk_serial
 from nlos_cam.doctor import host
 from nlos_cam.doctor.host import LIDARS, OTHERS
 from nlos_cam.doctor.udev import FILE_NAME, RELOAD, WRITE_AND_INSTALL, install_command, rules_text
-from nlos_cam.doctor.usb import SPEEDS, UsbDevice, firmware_of, scan_usb, sdk_serial
+from nlos_cam.doctor.usb import SPEEDS, UsbDevice, firmware_of, scan_usb
 
 LINUX = host.Platform("linux", "x86_64", (3, 11))
 READ = (

@@ -41,6 +41,24 @@ def test_camera_that_repeats_one_frame_is_frozen() -> None:
     assert "replug" in finding(found).fix or "plug it in" in finding(found).fix
 
 
+def test_camera_that_repeats_one_number_is_frozen() -> None:
+    camera = FrameCamera(1, make=noisy)
+    camera.counts["duplicate"] = 149
+    found = watch_camera(camera, "l515", 60.0)
+
+    assert found.is_frozen
+    assert "again and again" in finding(found).detail
+
+
+def test_camera_with_few_frames_is_a_warning() -> None:
+    few = finding(Watched("l515", 70, 5.0, frames_expected=150.0))
+    enough = finding(Watched("l515", 80, 5.0, frames_expected=150.0))
+
+    assert few.status == "warning"
+    assert "70 frames" in few.detail
+    assert enough.status == "ok"
+
+
 def test_camera_without_frames_ends_with_a_fix() -> None:
     found = watch_camera(FrameCamera(0), "l515", 60.0)
 

@@ -8,6 +8,7 @@ from typing import Any
 import pytest
 
 from nlos_cam.camera import FORMATS, Recording, SimulatedCamera
+from nlos_cam.cli.capture import format_take
 from nlos_cam.errors import CameraLostError, DiskFullError, RecordingError
 from nlos_cam.frames import Frame
 from nlos_cam.recording.capture import CaptureResult, CaptureSession, CaptureTarget, finalize
@@ -186,6 +187,31 @@ def test_take_without_a_frame_or_a_start_leaves_no_file(
 
     assert (take.state, take.sets, take.verified) == ("lost", 0, None)
     assert list(tmp_path.iterdir()) == []
+
+
+def test_take_without_a_frame_leaves_the_old_pair(session: Any, world: Any, tmp_path: Path) -> None:
+    for name in ("0.bag", "0.json"):
+        (tmp_path / name).write_text("old")
+    takes, _ = session()
+    world.fails_at = 0
+    (take,) = [finalize(take, verify) for take in takes.record(Event(), print)]
+
+    assert (take.state, take.sets) == ("lost", 0)
+    assert {path.name: path.read_text() for path in tmp_path.iterdir()} == {
+        "0.bag": "old",
+        "0.json": "old",
+    }
+
+
+def test_take_whose_file_goes_away_ends_with_its_reason(session: Any, tmp_path: Path) -> None:
+    takes, _ = session(frames=500)
+    recorded = takes.record(Event(), lambda _: (tmp_path / "0.bag").unlink(missing_ok=True))
+    (take,) = [finalize(take, verify) for take in recorded]
+
+    assert (take.state, take.closed, take.recoverable) == ("disk full", False, None)
+    assert "gone" in str(take.error)
+    assert take.sets < 500
+    assert "cannot be read back" in format_take(take)
 
 
 @pytest.mark.parametrize("indexed", [True, False])

@@ -134,10 +134,17 @@ def test_replay_refuses_a_recording_of_no_frames(
     noise_world: Any, hurried_clock: Any, tmp_path: Path
 ) -> None:
     path = tmp_path / "nothing.bag"
-    camera = SimulatedCamera("sim", noise_world(), clock=hurried_clock(), recording=Recording(path))
+    recording = Recording(tmp_path / "deleted.bag")
+    camera = SimulatedCamera("sim", noise_world(), clock=hurried_clock(), recording=recording)
     camera._world.fails_at = 0
-    with pytest.raises(ZeroDivisionError), camera:
-        next(iter(camera))
+
+    def record() -> None:
+        with camera:
+            path.hardlink_to(recording.path)  # which goes at the end, as it is empty
+            next(iter(camera))
+
+    with pytest.raises(ZeroDivisionError):
+        record()
     with pytest.raises(RecordingError, match=r"nothing\.bag holds no frames"):
         ReplayCamera(path)
 

@@ -5,6 +5,7 @@ import time
 from collections import defaultdict
 from collections.abc import Callable, Iterable
 from pathlib import Path
+from threading import Event
 from typing import Any
 
 import numpy as np
@@ -17,7 +18,7 @@ from nlos_cam.camera.session import read_settings
 from nlos_cam.camera.timestamps import WRAP_PERIOD_S
 from nlos_cam.errors import RecordingError
 from nlos_cam.frames import Frame
-from nlos_cam.recording import BagReader, ReplayCamera
+from nlos_cam.recording import BagReader, ExportOptions, ReplayCamera, export_recording
 
 IMAGE = "/image/data"
 
@@ -87,6 +88,36 @@ def test_replay_unwraps_the_device_clock(rewritten: Any) -> None:
     with ReplayCamera(rewritten(around_a_wrap)) as camera:
         times_s = [frame.timestamp_s for frame in camera]
     assert times_s == pytest.approx(WRAP_PERIOD_S + 0.033333 * np.arange(-10, 10))
+
+
+def test_export_unwraps_the_device_clock(rewritten: Any, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    options = ExportOptions(format="npz", streams=["infrared"])
+    export_recording(BagReader(rewritten(around_a_wrap)), out, options, stop=Event())
+    times_s = np.load(out / "infrared.npz")["timestamp_s"]
+
+    assert times_s == pytest.approx(WRAP_PERIOD_S + 0.033333 * np.arange(-10, 10))
+
+
+OUTAGE_S = 4300
+
+
+def over_an_outage(topic: str, time_ns: int, raw: bytes) -> Messages:
+    """Let no frame come for longer than the counter's period, before the tenth frame."""
+    if topic.endswith(IMAGE):
+        number = number_of(raw)
+        gap_s = OUTAGE_S if number >= 10 else 0
+        stamp_us = (number * 33_333 + gap_s * 10**6) % 2**32
+        raw = raw[:4] + struct.pack("<II", stamp_us // 10**6, stamp_us % 10**6 * 1000) + raw[12:]
+        time_ns += gap_s * 10**9
+    yield time_ns, raw
+
+
+@pytest.mark.parametrize(("edit", "gap_s"), [(around_a_wrap, 0), (over_an_outage, OUTAGE_S)])
+def test_duration_counts_the_wraps_of_the_clock(rewritten: Any, edit: Any, gap_s: int) -> None:
+    bag = BagReader(rewritten(edit))
+
+    assert bag.duration_s("depth") == pytest.approx(gap_s + 19 * 0.033333)
 
 
 class SdkPlayback:

@@ -109,6 +109,18 @@ def test_sidecar_samples_temperatures_over_device_time(path: Path) -> None:
     assert load_sidecar(path).temperatures == []
 
 
+def test_sidecar_goes_on_after_a_clock_that_went_back(path: Path) -> None:
+    sidecar = SidecarFile(path, Warm())
+    for time_s in (1e9, 1e9 - 3600.0, 1e9 - 3599.0, 1e9 - 3600.0 + TEMPERATURE_INTERVAL_S):
+        sidecar.on_frame(frame(time_s))
+
+    assert [look.time_s for look in load_sidecar(path).temperatures] == [
+        0.0,
+        -3600.0,
+        -3600.0 + TEMPERATURE_INTERVAL_S,
+    ]
+
+
 def test_sidecar_thins_a_long_series_evenly(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("nlos_cam.recording.sidecar.MAX_TEMPERATURES", 10)
     sidecar = SidecarFile(path, Warm())
