@@ -216,6 +216,8 @@ class Rig(Record):
         """Return the same bench with the lidar at another point (3,) of the wall frame, in that
         point's own wall frame, whose origin is its foot.
         """
+        # The frame's axes are the wall's and the lidar's, which a shift of the lidar does not turn:
+        # what stands on the bench moves along the wall by as much as the foot does, the other way.
         along_m, up_m, distance_m = (float(value) for value in eye_m)
 
         def moved(part: Extent | Occluder | ObjectBox) -> dict[str, float]:

@@ -83,6 +83,7 @@ def view_difference_deg(here: Intrinsics, there: Intrinsics) -> float:
     """
     # Angles, not pixels: the same view at another resolution is no difference.
     edges = np.arctan(_view_edges(here)) - np.arctan(_view_edges(there))
+    # Two edges that are off by a little each, in opposite directions, are a width that is off more.
     widths = edges[:, 1] - edges[:, 0]
     return float(np.degrees(max(np.abs(edges).max(), np.abs(widths).max())))
 
@@ -119,6 +120,7 @@ def _wall(rig: Rig, other: Rig) -> str:
 
 def missing_wall(rig: Rig, other: Rig) -> float:
     """Return the share of a rig's view that would meet the other rig's wall, and misses its own."""
+    # Both walls from the same place: what the poses differ by is no difference of the walls.
     pose = rig.wall_from_lidar
     own, theirs = (footprint(pose, rig.pinhole, wall) for wall in (rig.wall, other.wall))
     return float((theirs.on_wall & ~own.on_wall).mean())

@@ -208,6 +208,7 @@ def with_occluder(record: WallRecord, fit: OccluderFit) -> WallRecord:
     problems = judge_rig(rig, footprint(pose, rig.pinhole, rig.wall), occluder)
     verdict, advice = combined(verdict, advice, problems)
     changed = {"occluder": occluder, "rig": rig, "verdict": verdict, "advice": advice}
+    # The record has the remarks on wall and occluder in one list, the occluder its own as well.
     former = record.occluder.warnings if record.occluder else ()
     of_wall = [one for one in record.warnings if one not in former]
     changed |= {"warnings": tuple(dict.fromkeys((*of_wall, *fit.warnings)))}

@@ -92,6 +92,7 @@ def noise_scale(reference: BareWall) -> float:
         array.ravel().astype(np.float64) for array in (reference.depth_m, reference.depth_std_m)
     )
     scale = measured_noise(depth_m, spread_m, np.full(depth_m.size, reference.frames)).scale
+    # Simulated frames may have no noise at all, and errors are divided by it.
     return max(scale, MIN_SCALE)
 
 

@@ -179,6 +179,8 @@ def _as_onnx(
     weights = {name: tensor.numpy(force=True) for name, tensor in network.state_dict().items()}
 
     def entered(trace: bytes) -> onnx.ModelProto:
+        # Before the optimizer runs, which folds weights into other numbers: there, the exporter's
+        # initializers have the names and the values of torch's.
         model = onnx.ModelProto.FromString(trace)
         for initializer in model.graph.initializer:
             if initializer.name in weights:
@@ -186,8 +188,10 @@ def _as_onnx(
                 initializer.CopyFrom(values)
         return model
 
+    # An entry that another version made has another name, as the code is in its checksum.
     path = cache_folder() / TRACES / f"{_architecture_of(network, inputs, outputs)}.onnx"
     model = load_cached(path, entered, lambda: _trace(network, inputs, outputs))
+    # The same passes as in an export of the whole: its graph is the same but for names of values.
     program = torch.onnx.ONNXProgram(ir.serde.deserialize_model(model), None)
     program.optimize()
     return program.model_proto
@@ -218,6 +222,7 @@ def _trace(network: nn.Module, inputs: Mapping[str, tuple[int, int]], outputs: l
         )
     model = program.model_proto
     model.ir_version = IR_VERSION
+    # Forty megabytes that are another network's the next time: what is kept has their names.
     names = set(network.state_dict())
     for initializer in model.graph.initializer:
         if initializer.name in names:
@@ -235,6 +240,7 @@ def _architecture_of(
     and their settings, and the shapes of their weights.
     """
     digest = _digest_of_code()
+    # A setting that no weight's shape shows, such as a norm's epsilon, makes another graph.
     digest.update(repr((sorted(inputs.items()), outputs)).encode())
     for name, module in network.named_modules():
         settings = {
