@@ -78,4 +78,6 @@ def camera_to_name(wall: WallRecord) -> str:
     or a scene in capitals, since a simulated bench is another scene before and after the occluder.
     """
     is_simulated = wall.serial == SIMULATED_SERIAL or wall.camera.startswith("sim")
-    return "sim:SCENE.toml" if is_simulated else "l515"
+    if is_simulated:
+        return "sim:SCENE.toml"
+    return wall.camera if wall.camera.startswith("l515") else "l515"

@@ -33,7 +33,9 @@ def bare_wall_m() -> np.ndarray:
 def measured(depth_m: np.ndarray) -> Any:
     noise_m = np.random.default_rng(1).normal(0.0, depth_noise_m(depth_m)) / 8.0
     depth = SimpleNamespace(mean_m=lambda: depth_m + noise_m, noise=lambda: None)
-    capture: Any = SimpleNamespace(statistics=SimpleNamespace(depth=depth), intrinsics=PINHOLE)
+    capture: Any = SimpleNamespace(
+        statistics=SimpleNamespace(depth=depth), intrinsics=PINHOLE, parts_m=()
+    )
     return measure.measure_by_depth(capture, TAPE_M)
 
 

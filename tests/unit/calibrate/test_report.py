@@ -199,7 +199,7 @@ def test_report_device_has_temperatures_and_settings(measured: Measured) -> None
     ("camera", "record_file", "live"),
     [
         ("l515:f0246262", "wall.toml", "live --camera l515:f0246262 --wall wall.toml"),
-        ("sim:bare-wall", "wall.toml", "live --camera sim --wall wall.toml"),
+        ("sim:bare-wall", "wall.toml", "live --camera sim:SCENE.toml --wall wall.toml"),
         ("bag:my wall.bag", "my wall.toml", "live --camera l515 --wall 'my wall.toml'"),
     ],
 )

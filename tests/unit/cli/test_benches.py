@@ -149,7 +149,7 @@ def test_no_bench_and_benches_of_others_give_one_line(
     [
         (["replay", "sample", "--bench", "bench", "--wall", "wall.toml"], "--bench and --wall"),
         (["render", "cup", "--bench", "bench", "--rig", "paper-rig"], "--bench and --rig"),
-        (["render", "cup", "--bench", "bench", "--scene", "cup"], "--bench and --scene"),
+        (["render", "cup", "--bench", "bench", "--scene", "cup"], "--bench and --rig"),
         (["calibrate", "--wall", "--bench", "bench", "--out", "w.toml"], "--bench and --out"),
         (["calibrate", "--occluder", "w.toml", "--bench", "bench"], "--occluder bench"),
     ],
