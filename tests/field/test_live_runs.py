@@ -103,7 +103,7 @@ def test_recording_of_the_page_reaches_a_size_limit(tmp_path: Path) -> None:
         page = Page(run)
         RESOURCE.prlimit(run.process.pid, RESOURCE.RLIMIT_FSIZE, (SIZE_LIMIT, SIZE_LIMIT))
         page.begin_recording()
-        wait_until(run, "limit on a file's size, the recording ends")
+        wait_until(run, "MB, the recording ends")
         status, answer = page.command("stop_recording")
         goes_on = page.command("average", frames=2)
         run.process.send_signal(signal.SIGINT)
