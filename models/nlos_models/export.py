@@ -240,8 +240,8 @@ def _architecture_of(
     and their settings, and the shapes of their weights.
     """
     digest = _digest_of_code()
-    # A setting that no weight's shape shows, such as a norm's epsilon, makes another graph.
     digest.update(repr((sorted(inputs.items()), outputs)).encode())
+    # A setting that no weight's shape shows, such as a norm's epsilon, makes another graph.
     for name, module in network.named_modules():
         settings = {
             key: value

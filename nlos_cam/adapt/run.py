@@ -299,12 +299,11 @@ def _start_checksum(job: Adaptation) -> str:
 
 
 def _data_plan(
-    job: Adaptation, first_seed: int, *, expected: bool, off_record: bool | None = None
+    job: Adaptation, first_seed: int, *, expected: bool, off_record: bool
 ) -> data.DatasetPlan:
-    """Return the plan of objects, on the bench as it may be where `off_record`, by default
-    `expected` ones; held-out ones are on the rig itself.
+    """Return the plan of objects on the bench as it may be where `off_record`, else on the rig
+    itself.
     """
-    off_record = expected if off_record is None else off_record
     if job.locked:
         return data.DatasetPlan(
             job.rig,
@@ -335,7 +334,7 @@ def _measure_pace(job: Adaptation, on_progress: Callable[[int, int], None]) -> P
     step = _probe_step(job)
     step()  # the first one allocates
     # the first objects compile kernels
-    plan = _data_plan(job, job.seed, expected=True)
+    plan = _data_plan(job, job.seed, expected=True, off_record=True)
     folder = job.folder / OBJECTS
     data.build_dataset(plan, data.SHARD, folder, workers=1, on_progress=data.ignore, farm=job.farm)
 
@@ -468,7 +467,7 @@ class _Rendering:
 
         try:
             data.build_dataset(
-                _data_plan(self._job, self._job.seed, expected=True),
+                _data_plan(self._job, self._job.seed, expected=True, off_record=True),
                 self._count,
                 self._job.folder / OBJECTS,
                 workers=self._job.workers,

@@ -228,7 +228,7 @@ def measure_by_board(
     """
     _raise_if_disturbed(capture)
     try:
-        depth = measure_by_depth(capture)[0]
+        depth = _fit_depth(capture, 0.0)
     except WallRefusedError as error:
         depth = error
     measured = square_mm is not None

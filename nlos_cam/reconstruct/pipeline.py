@@ -25,8 +25,6 @@ from nlos_cam.objects import SurfaceMesh
 from nlos_cam.reconstruct.alignment import MapAlignment, alignment
 from nlos_cam.reconstruct.bench import BenchObservation, CalibratedRig
 from nlos_cam.reconstruct.consistency import COMPLETE, MapConsistency, MapFindings
-from nlos_cam.reconstruct.edge import EdgeRepair
-from nlos_cam.reconstruct.flat_field import FlatField
 from nlos_cam.reconstruct.frame_reader import Arrival
 from nlos_cam.reconstruct.network import (
     Clock,
@@ -35,6 +33,7 @@ from nlos_cam.reconstruct.network import (
     Reconstruction,
     reconstruct_all,
 )
+from nlos_cam.reconstruct.own_maps import OwnMaps
 from nlos_cam.reconstruct.physics_check import (
     UNEXPLAINED,
     UNEXPLAINED_EMPTY,
@@ -190,10 +189,9 @@ class PreparedBench(NamedTuple):
 
     bench: CalibratedRig
     aligned: MapAlignment | None
-    flat_field: FlatField
+    own: OwnMaps
     consistency: MapConsistency | None
     """None without an uncertainty model: then no verdict depends on it."""
-    edge: EdgeRepair
 
 
 @dataclass(frozen=True)
@@ -264,7 +262,7 @@ class Pipeline:
     def bench(self, bench: CalibratedRig) -> None:
         aligned = alignment(bench.rig, self.trained, bench.reference) if self.trained else None
         consistency = MapConsistency(bench) if self.uncertainty_model else None
-        prepared = PreparedBench(bench, aligned, FlatField(bench), consistency, EdgeRepair(bench))
+        prepared = PreparedBench(bench, aligned, OwnMaps(bench), consistency)
         self.checks.use_rig(bench.rig)
         # in one assignment: `prepare` must not see half of it
         self._bench = prepared
@@ -289,7 +287,7 @@ class Pipeline:
         """Return the maps of a frame as the networks need them; call in frame order."""
         taken_s = clock()
         # another thread may replace it
-        bench, aligned, flat_field, consistency, edge = self._bench
+        bench, aligned, own, consistency = self._bench
         maps = maps_from_frame(arrival.frame)
         mapped_s = clock()
 
@@ -297,22 +295,19 @@ class Pipeline:
         maps = self._mean.add(maps)
         observation = bench.observe(arrival.frame, maps)
         difference = observation.difference
-        ranged = bench.correct_range(maps, observation.drift_m)
-        repaired = edge.repair(ranged)
-        edge_is_repaired = repaired is not ranged
-        corrected = flat_field.correct(repaired)
+        corrected = own.steps(maps, observation.drift_m)
         if aligned:
             # The difference has no drift in it, and neither has what it adds to the training wall.
             drift_free_m = difference.depth_m if difference else None
-            if drift_free_m is not None and edge_is_repaired:
-                moved_m = repaired.depth_m - ranged.depth_m
+            if drift_free_m is not None and corrected.edge_is_repaired:
+                moved_m = corrected.repaired.depth_m - corrected.ranged.depth_m
                 drift_free_m = (drift_free_m + moved_m).astype(np.float32)
-            network_input = aligned.align(repaired, drift_free_m)
+            network_input = aligned.align(corrected.repaired, drift_free_m)
         elif self._uses_difference and difference:
             network_input = difference
         else:
-            network_input = corrected
-        findings = consistency.examine(ranged) if consistency else COMPLETE
+            network_input = corrected.exact
+        findings = consistency.examine(corrected.ranged) if consistency else COMPLETE
         frozen = self._frozen.add(arrival.frame)
         observed_s = clock()
 
@@ -326,9 +321,9 @@ class Pipeline:
             arrival,
             maps,
             observation,
-            flat_field.as_rendered(corrected),
+            own.as_rendered(corrected.exact),
             network_input,
-            edge_is_repaired,
+            corrected.edge_is_repaired,
             findings,
             frozen,
             stages_s,
