@@ -15,7 +15,7 @@ from math import inf
 from pathlib import Path
 from shlex import quote
 from threading import Event, Thread
-from typing import Any
+from typing import Any, Literal
 
 from nlos_calibration import Intrinsics
 
@@ -34,6 +34,14 @@ INDEX_SHARE = 1e-3
 SIDECAR_SUFFIX = ".json"
 """Ending of the file beside a recording that describes it."""
 GONE = "its file or disk is gone"
+
+WriteFailure = Literal["disk full", "size limit", "file gone"]
+"""Why a recording's file could not grow."""
+REMEDIES: dict[WriteFailure, str] = {
+    "disk full": "free some space",
+    "size limit": "raise the limit (ulimit -f)",
+    "file gone": "look for the disk",
+}
 
 
 def closing_bytes(recorded_bytes: int) -> int:
@@ -170,9 +178,9 @@ class SdkRecorder:
     ) -> None:
         self.path = path
         self.failure: str | None = None
-        """Reason of a failed write."""
-        self.at_size_limit = False
-        """True if that is the limit on a file's size, and not the disk."""
+        """Reason of a failed write, in words."""
+        self.cause: WriteFailure = "disk full"
+        """What it comes down to, once there is a `failure`."""
         self._size_limit = size_limit()
         self._now = now
         self._grew_s = now()
@@ -213,17 +221,14 @@ class SdkRecorder:
         return True
 
     def fail(self, reason: str) -> None:
-        """Note a failed write, and the reason for it where that is not the limit on a file's
-        size.
-        """
+        """Note a failed write, and its reason where that is not the limit on a file's size."""
         is_there = self._measure()
-        end_bytes = self.bytes + closing_bytes(self.bytes)
-        self.at_size_limit = is_there and end_bytes > self._size_limit
-        self.failure = (
-            f"it reached the limit on a file's size, {self._size_limit / 1e6:.3g} MB"
-            if self.at_size_limit
-            else reason
-        )
+        if is_there and self.bytes + closing_bytes(self.bytes) > self._size_limit:
+            self.cause = "size limit"
+            self.failure = f"it reached the limit on a file's size, {self._size_limit / 1e6:.3g} MB"
+        else:
+            self.cause = "file gone" if reason == GONE else "disk full"
+            self.failure = reason
 
     def pause(self) -> None:
         """Stop recording. Frames so far are written before this returns, if the disk has room."""
@@ -257,10 +262,7 @@ class SdkRecorder:
         # One reference too many: never deleted, not even at exit.
         ctypes.pythonapi.Py_IncRef(ctypes.py_object(self._recorder))
         self._recorder = None
-        if self.at_size_limit:
-            remedy = "raise the limit (ulimit -f)"
-        else:
-            remedy = "look for the disk" if self.failure == GONE else "free some space"
+        remedy = REMEDIES[self.cause]
         raise DiskFullError(
             f"{self.path} could not be completed ({self.failure}): {remedy}, and recover its"
             f" frames with `{repair_command(self.path)}`"
@@ -338,9 +340,11 @@ class Recording:
         self.started = False
         """True once the file is this take's, and no longer the one it replaces."""
         self.disk_full = False
-        """True if it stopped for want of disk space, or at the limit on a file's size."""
-        self.at_size_limit = False
-        """True if it was that limit."""
+        """True if it stopped for want of disk space, at the limit on a file's size, or as its file
+        or disk went away.
+        """
+        self.cause: WriteFailure = "disk full"
+        """Which of these it was."""
         self.error: DiskFullError | None = None
         """Reason for which this take's file has no index."""
         self._frames = frames
@@ -531,7 +535,7 @@ class Recording:
                 raise
             log.warning("%s", error)
         finally:
-            self.at_size_limit = recorder.at_size_limit if recorder else self.at_size_limit
+            self.cause = recorder.cause if recorder else self.cause
             self._claim.close()
 
 

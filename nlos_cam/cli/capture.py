@@ -25,6 +25,7 @@ ENDINGS: dict[recordings.TakeState, str] = {
     "lost": "Camera lost. ",
     "disk full": "Disk full. ",
     "size limit": "Limit on a file's size reached. ",
+    "file gone": "File gone. ",
     "damaged": "File damaged. ",
 }
 NOTHING = "nothing was recorded"

@@ -101,7 +101,7 @@ class LiveRecording:
         error = self._recording.error
         state: recordings.TakeState = "lost" if fell_silent else "complete"
         if self._recording.disk_full or error:
-            state = "size limit" if self._recording.at_size_limit else "disk full"
+            state = self._recording.cause
         result = recordings.CaptureResult(
             self._target,
             state,

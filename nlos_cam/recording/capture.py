@@ -117,8 +117,7 @@ class CaptureSession:
         except DiskFullError as error:
             if take is None:
                 raise
-            state = "size limit" if self._recording.at_size_limit else "disk full"
-            take = replace(take, state=state, error=error, closed=False)
+            take = replace(take, state=self._recording.cause, error=error, closed=False)
         if take:
             yield replace(
                 take, sets=self._recording.sets

@@ -25,10 +25,18 @@ from nlos_cam.recording.playback import VerifyResult
 from nlos_cam.recording.quality import Quality
 
 TakeState = Literal[
-    "recording", "complete", "interrupted", "lost", "disk full", "size limit", "damaged"
+    "recording",
+    "complete",
+    "interrupted",
+    "lost",
+    "disk full",
+    "size limit",
+    "file gone",
+    "damaged",
 ]
 """recording: in progress, or killed. interrupted: by Ctrl-C. lost: the camera vanished. size limit:
-the file reached the system's limit on its size. damaged: it holds fewer frames than came.
+the file reached the system's limit on its size. file gone: the file, or its disk, went away.
+damaged: it holds fewer frames than came.
 """
 Share = Annotated[float, Field(ge=0, le=1)]
 Count = Annotated[int, Field(ge=0)]

@@ -367,6 +367,8 @@ def test_recording_without_a_disk_ends_with_its_reason(tmp_path: Path, found: Fr
     with pytest.raises(DiskFullError, match=GONE):
         recording.close()
 
+    assert recording.cause == "file gone"
+
 
 def test_recorder_whose_file_goes_before_its_end_fails(made: SdkRecorder) -> None:
     made.path.unlink()

@@ -208,8 +208,9 @@ def test_take_whose_file_goes_away_ends_with_its_reason(session: Any, tmp_path: 
     recorded = takes.record(Event(), lambda _: (tmp_path / "0.bag").unlink(missing_ok=True))
     (take,) = [finalize(take, verify) for take in recorded]
 
-    assert (take.state, take.closed, take.recoverable) == ("disk full", False, None)
+    assert (take.state, take.closed, take.recoverable) == ("file gone", False, None)
     assert "gone" in str(take.error)
+    assert "look for the disk" in str(take.error)
     assert take.sets < 500
     assert "cannot be read back" in format_take(take)
 
