@@ -21,6 +21,7 @@ from nlos_cam.errors import DiskFullError, RecordingError
 from nlos_cam.files import atomic_directory
 from nlos_cam.recording.bag_messages import CAMERA, IMAGE
 from nlos_cam.recording.bag_reader import BagReader, StreamInfo
+from nlos_cam.recording.device_clock import unwrapped_samples
 from nlos_cam.recording.export import ExportResult
 from nlos_cam.recording.ros_messages import METADATA, TRANSFORMS, ros2_types
 
@@ -78,7 +79,7 @@ def export_ros2(
             with Writer(folder, version=8, storage_plugin=plugin) as writer:
                 topics = _Topics(writer, bag, streams, options)
                 try:
-                    for time_ns, sample in bag.timed_samples(streams):
+                    for time_ns, sample in unwrapped_samples(bag, streams):
                         if stop.is_set():
                             break
                         topics.write(time_ns, sample)

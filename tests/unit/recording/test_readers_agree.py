@@ -18,7 +18,15 @@ from nlos_cam.camera.session import read_settings
 from nlos_cam.camera.timestamps import WRAP_PERIOD_S
 from nlos_cam.errors import RecordingError
 from nlos_cam.frames import Frame
-from nlos_cam.recording import BagReader, ExportOptions, ReplayCamera, export_recording
+from nlos_cam.recording import (
+    BagReader,
+    ExportOptions,
+    ReplayCamera,
+    RosOptions,
+    export_recording,
+    export_ros2,
+    open_recording,
+)
 
 IMAGE = "/image/data"
 
@@ -97,6 +105,14 @@ def test_export_unwraps_the_device_clock(rewritten: Any, tmp_path: Path) -> None
     times_s = np.load(out / "infrared.npz")["timestamp_s"]
 
     assert times_s == pytest.approx(WRAP_PERIOD_S + 0.033333 * np.arange(-10, 10))
+
+
+def test_export_to_ros_unwraps_the_device_clock(rewritten: Any, tmp_path: Path) -> None:
+    out = tmp_path / "ros"
+    export_ros2(BagReader(rewritten(around_a_wrap)), out, RosOptions(), stop=Event())
+    stamps_s = [each.timestamp_s for _, each in open_recording(out).timed_samples(["depth"])]
+
+    assert stamps_s == pytest.approx(WRAP_PERIOD_S + 0.033333 * np.arange(-10, 10))
 
 
 OUTAGE_S = 4300
