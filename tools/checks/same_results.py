@@ -153,6 +153,8 @@ def main() -> int:
                 results.append(figures(out))
             here, there = results
             unlike = differences(here, there)
+            if not here:
+                raise SystemExit(f"{name}: nothing was written that could be compared")
             unequal += len(unlike)
             verdict = f"{len(unlike)} differ: {', '.join(unlike[:8])}" if unlike else "all equal"
             print(f"{name}: {len(here)} arrays and figures, {verdict}", flush=True)

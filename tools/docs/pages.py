@@ -61,7 +61,8 @@ def default_of(parameter: Any) -> str:
     if parameter.required:
         return "**must be given**"
     shown = parameter.show_default if isinstance(parameter.show_default, str) else parameter.default
-    return "" if shown in {None, False, ""} else f"`{shown}`"
+    # not `in`: 0 equals False, and is a default to be shown
+    return "" if shown is None or shown is False or shown == "" else f"`{shown}`"
 
 
 def option_row(parameter: Any) -> str:
@@ -151,12 +152,15 @@ def by_limit(limits: Mapping[str, Any]) -> str:
 
 
 def filled(text: str, tables: Mapping[str, str]) -> str:
-    """Return a page with its tables, each between `<!-- name -->` and the next `<!-- end`."""
+    """Return a page with its tables, each between `<!-- name -->` and the next `<!-- end`. Raises
+    ValueError where a table has no place.
+    """
     for name, table in tables.items():
         place = re.compile(rf"(?<=<!-- {name} -->\n).*?(?=<!-- end)", re.DOTALL)
-        text = place.sub(
-            lambda _, new=table: new, text, count=1
-        )  # an empty place would match twice
+        # once: an empty place would match twice
+        text, places = place.subn(lambda _, new=table: new, text, count=1)
+        if not places:
+            raise ValueError(f"the page has no place <!-- {name} --> for its table: put one back")
     return text
 
 

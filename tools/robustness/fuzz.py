@@ -3,8 +3,8 @@
 `fuzz.py [--count N] [--minutes M] [--only NAME] [--first NUMBER] [--out FILE] [--keep FOLDER]
 [--files FOLDER]`. Each case runs in a process forked from one that has loaded the program, and has
 30 s of processor time and, with the program, 1 GiB. A case is known by its input and number, which
-make the same damage again. A second call resumes. A bad case is printed; its file stays in --keep.
-Exits with 1 where a case is bad.
+make the same damage again. A second call resumes, and starts anew where the program has changed
+since. A bad case is printed; its file stays in --keep. Exits with 1 where a case is bad.
 """
 
 import argparse
@@ -35,6 +35,7 @@ from fuzz_inputs import DONE, Input, WrongResultError, link_or_copy, make_files,
 from mutations import mutate
 from nlos_calibration.errors import CalibrationError
 from nlos_models.errors import ModelError
+from program_state import program_digest
 
 from nlos_cam.cli.main import build_app
 from nlos_cam.errors import NlosCamError
@@ -54,7 +55,7 @@ OURS = NlosCamError, CalibrationError, ModelError
 MAX_KEPT_BYTES = 20_000
 GOOD = "done", "refused"
 ANSWER_BYTES = 1 << 20
-COUNTS = "by_input", "most_mib", "most_cpu_s"
+COUNTS = "by_input", "most_mib", "most_cpu_s", "numbers"
 
 
 class Verdict(NamedTuple):
@@ -160,9 +161,20 @@ class Findings:
     most_mib: dict[str, int] = field(default_factory=dict)
     most_cpu_s: dict[str, float] = field(default_factory=dict)
     bad: list[dict[str, str | int]] = field(default_factory=list)
+    numbers: dict[str, list[list[int]]] = field(default_factory=dict)
+    """Numbers of the cases of an input, as ranges [first, end)."""
 
-    def add(self, name: str, verdict: Verdict) -> None:
+    def has(self, name: str, number: int) -> bool:
+        """Return whether a case is among them."""
+        return any(first <= number < end for first, end in self.numbers.get(name, []))
+
+    def add(self, name: str, number: int, verdict: Verdict) -> None:
         """Count a case of an input."""
+        ranges = self.numbers.setdefault(name, [])
+        if ranges and ranges[-1][1] == number:
+            ranges[-1][1] = number + 1
+        else:
+            ranges.append([number, number + 1])
         counts = self.by_input.setdefault(name, {})
         counts[verdict.kind] = counts.get(verdict.kind, 0) + 1
         self.most_mib[name] = max(self.most_mib.get(name, 0), verdict.mib)
@@ -188,12 +200,15 @@ class Findings:
             "inputs": len(self.by_input),
             "verdicts": dict(verdicts),
         }
-        return {"machine": machine(), **limits, **totals, **vars(self)}
+        of = {"machine": machine(), "program": program_digest()}
+        return {**of, **limits, **totals, **vars(self)}
 
 
 def read_findings(path: Path) -> Findings:
-    """Return the findings of earlier calls; none without the file."""
+    """Return the findings of earlier calls; none without the file, or of another program."""
     found = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
+    if found.get("program") != program_digest():
+        return Findings()
     return Findings(**{name: found[name] for name in vars(Findings()) if name in found})
 
 
@@ -264,13 +279,10 @@ def fuzz(group: str, home: Path, chosen: argparse.Namespace) -> None:
 
     for number in range(chosen.first, chosen.first + chosen.count):
         for name, each in inputs.items():
-            if (
-                number < chosen.first + sum(findings.by_input.get(name, {}).values())
-                or time.monotonic() > until_s
-            ):
+            if findings.has(name, number) or time.monotonic() > until_s:
                 continue
             verdict, ways = fuzz_one(name, each, number, chosen.keep)
-            findings.add(name, verdict)
+            findings.add(name, number, verdict)
             if verdict.kind not in GOOD:
                 row = {
                     "input": name,
@@ -297,7 +309,7 @@ def main() -> int:
     parser.add_argument("--first", type=int, default=0, help="number of the first one")
     parser.add_argument("--minutes", type=float, default=1e6, help="limit of each group's time")
     parser.add_argument("--only", default="", help="only inputs with this in their name")
-    parser.add_argument("--group", default="", help=f"only {' or '.join(GROUPS)}")
+    parser.add_argument("--group", choices=GROUPS, help="only inputs of this group")
     parser.add_argument("--out", type=Path, default=DOCS / "figures" / "fuzz.json")
     parser.add_argument("--keep", type=Path, default=Path(tempfile.gettempdir()))
     parser.add_argument(
@@ -312,7 +324,9 @@ def main() -> int:
         chosen.files = chosen.files or Path(folder)
         made = [] if (chosen.files / DONE).exists() else [partial(make_files, chosen.files)]
         groups = [
-            partial(fuzz, group, chosen.files, chosen) for group in GROUPS if chosen.group in group
+            partial(fuzz, group, chosen.files, chosen)
+            for group in GROUPS
+            if chosen.group in {None, group}
         ]
         for steps in (made, groups):
             processes = [spawn.Process(target=step) for step in steps]
@@ -323,7 +337,10 @@ def main() -> int:
                 process.join()
             if any(process.exitcode for process in processes):
                 raise SystemExit("a process of the fuzz itself failed")
-    return int(bool(read_findings(chosen.out).bad))
+    found = read_findings(chosen.out)
+    if not any(chosen.only in name for name in found.by_input):
+        raise SystemExit(f"no case was judged: no input has {chosen.only!r} in its name")
+    return int(bool(found.bad))
 
 
 if __name__ == "__main__":

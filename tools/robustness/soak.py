@@ -14,6 +14,7 @@ import tempfile
 import time
 from contextlib import suppress
 from dataclasses import asdict, dataclass
+from http import HTTPStatus
 from http.client import HTTPConnection, HTTPException
 from pathlib import Path
 from threading import Event, Thread
@@ -56,17 +57,21 @@ class Minute:
 
 
 def watch(address: str, stop: Event, visits: list[int], visit_s: float) -> None:
-    """Read the view's stream for `visit_s`, leave, and come again, until told to stop."""
+    """Read the view's stream for `visit_s`, leave, and come again, until told to stop; `visits`
+    counts those who were shown something.
+    """
     while not stop.wait(PAUSE_S):
         until_s = time.monotonic() + visit_s
+        shown = False
         connection = HTTPConnection(urlsplit(address).netloc, timeout=WATCH_S)
         with suppress(OSError, HTTPException):
             connection.request("GET", "/stream")
             stream = connection.getresponse()
             while time.monotonic() < until_s and stream.read1(1 << 16) and not stop.is_set():
-                pass
+                shown = stream.status == HTTPStatus.OK
         connection.close()
-        visits.append(1)
+        if shown:
+            visits.append(1)
 
 
 def state_of(pid: int) -> tuple[float, int, int]:
@@ -172,7 +177,9 @@ def main() -> int:
                 draw(minutes, DOCS / "images" / f"{chosen.out.stem}.png")
                 print(minutes[-1], file=sys.stderr)
             stop.set()
-            run.ended_within(END_TIMEOUT_S + MINUTE_S)
+            if run.ended_within(END_TIMEOUT_S + MINUTE_S) is None:
+                print("the run does not end", file=sys.stderr)
+                return 1
             return run.process.returncode or 0
 
 

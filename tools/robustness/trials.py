@@ -23,6 +23,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 from noise_recordings import record
+from program_state import program_digest
 
 from nlos_cam.cli.main import build_app, main
 from nlos_cam.dataset import REQUIRED_ARRAYS, SHARD_PATTERN, build, open_dataset
@@ -381,15 +382,17 @@ def options(about: str | None, file: str, **counts: int) -> argparse.ArgumentPar
 
 class Results:
     """Rows of trials in a JSON file, which is written after each; a second call of a tool resumes
-    there.
+    there, and starts anew where the program has changed since.
     """
 
     def __init__(self, path: Path, seed: int) -> None:
         self._path = path
         self._seed = seed
-        self.facts: dict[str, Any] = {"machine": in_fork(machine)}  # it starts numba's threads
-        if path.exists():
-            self.facts = json.loads(path.read_text(encoding="utf-8"))
+        earlier = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
+        if earlier.get("program") == program_digest():
+            self.facts: dict[str, Any] = earlier
+        else:  # a machine's description starts numba's threads
+            self.facts = {"machine": in_fork(machine), "program": program_digest()}
 
     def repeat(
         self, name: str, kind: str, count: int, trial: Callable[[random.Random], Row]

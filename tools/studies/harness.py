@@ -29,7 +29,7 @@ from nlos_cam.files import cache_folder
 ROOT = Path(__file__).parents[2]
 DOCS = ROOT / "docs"
 DIGITS = 5
-PRODUCT = "nlos_cam", "calibration", "models"
+SOURCES = "nlos_cam", "calibration", "models", "tools/studies"
 
 Record = dict[str, Any]
 
@@ -84,8 +84,10 @@ def collect(
 
 
 def fingerprint(settings: Sequence[Any], seeds: int, key: str = "") -> str:
-    """Return a checksum of a grid, a key and the state of the product's source files."""
-    files = sorted(path for folder in PRODUCT for path in (ROOT / folder).rglob("*.py"))
+    """Return a checksum of a grid, a key and the state of the source files, the product's and the
+    studies'.
+    """
+    files = sorted(path for folder in SOURCES for path in (ROOT / folder).rglob("*.py"))
     state = [(str(path), path.stat().st_mtime_ns) for path in files]
     return hashlib.sha256(repr([state, list(settings), seeds, key]).encode()).hexdigest()[:16]
 

@@ -281,10 +281,11 @@ def soak_faults(seed: int) -> list[str]:
 
 
 def soak(options: argparse.Namespace) -> None:
-    """Render random small scenes and hold them against the reference; continue where a run
-    stopped.
+    """Render random small scenes and hold them against the reference; continue where a run of the
+    same code stopped.
     """
-    store = cache_folder() / "studies" / "renderer-soak.json"
+    name = f"renderer-soak-{harness.fingerprint([], 1)}.json"
+    store = cache_folder() / "studies" / name
     store.parent.mkdir(parents=True, exist_ok=True)
     done = (
         json.loads(store.read_text(encoding="utf-8"))
@@ -303,6 +304,7 @@ def soak(options: argparse.Namespace) -> None:
         part.write_text(json.dumps(done), encoding="utf-8")
         part.replace(store)
     harness.write("renderer_soak", {"machine": evaluate.machine(), **done})
+    store.unlink()
 
 
 def jobs_of(

@@ -70,8 +70,8 @@ def test_findings_of_two_groups_are_joined(tool: Tool) -> None:
     fuzz = tool("fuzz")
     light = fuzz.Findings()
     torch = fuzz.Findings()
-    light.add("a.bag", fuzz.Verdict("refused", "", 200, 0.1))
-    torch.add("b.h5", fuzz.Verdict("crash", "", 300, 0.2))
+    light.add("a.bag", 0, fuzz.Verdict("refused", "", 200, 0.1))
+    torch.add("b.h5", 0, fuzz.Verdict("crash", "", 300, 0.2))
     torch.bad.append({"input": "b.h5"})
     facts = light.replaced(torch, ["b.h5"]).facts()
 
@@ -79,6 +79,31 @@ def test_findings_of_two_groups_are_joined(tool: Tool) -> None:
     assert facts["verdicts"] == {"refused": 1, "crash": 1}
     assert facts["most_mib"] == {"a.bag": 200, "b.h5": 300}
     assert facts["bad"] == [{"input": "b.h5"}]
+
+
+def test_findings_know_their_cases_by_number(tool: Tool) -> None:
+    fuzz = tool("fuzz")
+    found = fuzz.Findings()
+    for number in (0, 1, 2, 7):
+        found.add("a.bag", number, fuzz.Verdict("done", ""))
+
+    assert found.numbers == {"a.bag": [[0, 3], [7, 8]]}
+    assert [n for n in range(9) if found.has("a.bag", n)] == [0, 1, 2, 7]
+    assert not found.has("b.h5", 0)
+
+
+@pytest.mark.parametrize("kept", [True, False])
+def test_results_go_on_with_the_same_program_alone(
+    tool: Tool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kept: bool
+) -> None:
+    out = tmp_path / "results.json"
+    monkeypatch.setattr(tool("trials"), "machine", lambda: "a machine")
+    tool("trials").Results(out, 0).repeat("render", "kills", 2, lambda _: {"wrong": ""})
+    if not kept:
+        monkeypatch.setattr(tool("trials"), "program_digest", lambda: "of another")
+    rows = tool("trials").Results(out, 0).facts.get("render", {}).get("kills", [])
+
+    assert len(rows) == (2 if kept else 0)
 
 
 def test_trials_resume_and_a_failed_one_is_a_finding(tool: Tool, tmp_path: Path) -> None:
