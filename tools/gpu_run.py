@@ -304,7 +304,9 @@ def train_compressor(chosen: Namespace, clock: Clock, facts: Facts, objects: int
     if left_s <= 0:
         return
     epochs = chosen.compressor_epochs
-    ready = recipe_with(chosen.compressor, out / "compressor.toml", objects=objects, epochs=epochs)
+    ready = out / "compressor.toml"
+    if not ready.exists():  # an interrupted run keeps its objects: more may be there by now
+        recipe_with(chosen.compressor, ready, objects=objects, epochs=epochs)
     command = ["train", "compressor", "--recipe", str(ready), "--vae", str(out / "encoder")]
     command += ["--held-out", str(out / "held-out"), "--dataset", str(out / "training"), *device]
     command += ["--out", str(out / "compressor")]
@@ -380,6 +382,12 @@ if __name__ == "__main__":
     given = parser.parse_args()
     if given.any_rig and not given.direct_only:
         parser.error("--any-rig needs --direct-only: the paper's compressor is for one rig")
+    end_seed = given.seed + OBJECTS * len(ANY_RIG if given.any_rig else ONE_RIG)
+    if given.seed <= HELD_OUT_SEED + given.held_out and end_seed > HELD_OUT_SEED:
+        parser.error(
+            f"--seed {given.seed}: objects up to {end_seed} would be among those held out, from"
+            f" {HELD_OUT_SEED}: give another one"
+        )
     if given.join:
         join_parts(given.join, given.out)
     else:

@@ -54,6 +54,8 @@ class CheckpointRecord(BaseModel):
     rig_checksum: str
     rig: dict[str, Any] | None = None
     """The rig itself, for weights of a measured bench; None for those of a packaged rig."""
+    bare_wall_counts: float | None = None
+    """Counts of the brightest bare wall in training; None for those of the simulated sensor."""
     input: MapKind = "raw maps"
     """The compressor's input; difference maps are maps minus the bare wall's."""
     vae_recipe: VaeRecipe | None = None

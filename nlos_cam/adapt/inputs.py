@@ -29,11 +29,14 @@ class TrainingInputs:
     for a normalization that is fitted to the maps, and always taken."""
     frame: Rig | None = None
     """Wall grid that maps are aligned with; None where they stay in the rig's own cells."""
+    bare_wall_counts: float | None = None
+    """Counts of the brightest bare wall in maps of the rig's own cells; None on the wall grid, on
+    which all light is that of one sensor."""
     noise: LockedNoise | None = None
     """Noise of locked differences; None for maps, whose noise is the sensor's."""
 
     @classmethod
-    def of_maps(cls, rig: Rig, trained: CheckpointRecord) -> Self:
+    def of_maps(cls, rig: Rig, sensor: SensorModel, trained: CheckpointRecord) -> Self:
         """Return the maps of a rig for start weights: on the wall grid where they were trained on
         it, else in the rig's own cells.
 
@@ -42,7 +45,8 @@ class TrainingInputs:
         bench = rig.model_dump(mode="json")
         grid = grid_of(trained)
         if grid is None:
-            return cls((rig.name, rig.checksum), bench, trained)
+            counts = sensor.bare_wall_counts
+            return cls((rig.name, rig.checksum), bench, trained, bare_wall_counts=counts)
         if not can_align(rig, grid):
             raise SceneError(
                 f"the start weights cannot see {rig.name}: its lidar sees too little of the wall"

@@ -186,7 +186,7 @@ def fit_to_recordings(
     network, trained = training.transfer_start(recipe, start, partial=False, on_report=data.ignore)
     maps = data.read_maps(recipe, parts["adaptation"], parts["validation"], None, start=trained)
     recipe = recipe.model_copy(update={"held_out": len(maps.held_out.image)})
-    record = training.record_run(recipe, out, maps.rig, trained.runs, start, bench=trained.rig)
+    record = maps.record_run(recipe, out, trained.runs, start, trained=trained)
     fabric = training.open_fabric(recipe, accelerator=accelerator)
     origin = training.digest_of(network, maps.digest)
     run = training.TrainingRun(recipe, out, record, origin, watch=watch)

@@ -529,7 +529,7 @@ def _train_network(
     if job.locked:
         inputs = TrainingInputs.of_locked(job.rig, job.sensor, job.locked)
     else:
-        inputs = TrainingInputs.of_maps(job.rig, models.load_record(before))
+        inputs = TrainingInputs.of_maps(job.rig, job.sensor, models.load_record(before))
     held_out = _test_set(job, HELD_OUT, data.HELD_OUT_SEED, HELD_OUT_OBJECTS, tracked)
     there = plan.objects_before(number)
     watched = _Watched(watch or training.unwatched)
@@ -556,7 +556,15 @@ def _train_network(
             locked=job.locked is not None,
         )
         with store as source:
-            record = training.record_run(recipe, out, inputs.rig, runs, before, bench=inputs.bench)
+            record = training.record_run(
+                recipe,
+                out,
+                inputs.rig,
+                runs,
+                before,
+                bench=inputs.bench,
+                bare_wall_counts=inputs.bare_wall_counts,
+            )
             fabric = training.open_fabric(recipe, accelerator=job.accelerator)
             origin = training.digest_of(start, source.digest)
             run = training.TrainingRun(recipe, out, record, origin, watch=watched)

@@ -241,7 +241,9 @@ def vae(
     )
     fabric = run.fabric(recipe)
     start, runs = training.vae_start(recipe, weights) if recipe.start != "scratch" else (None, [])
-    record = training.record_run(recipe, run.out, (rig.name, rig.checksum), runs, weights)
+    name = rig.name, rig.checksum
+    fields = reconstruct.rig_fields(rig)
+    record = training.record_run(recipe, run.out, name, runs, weights, bench=fields)
     job = run.training(recipe, record, training.digest_of(start, rig.checksum))
     say(f"generating {recipe.objects + recipe.held_out} objects")
     box = data_sets.DatasetPlan(rig, 0).box
@@ -290,7 +292,7 @@ def compressor(
     start, runs = training.compressor_start(recipe, vae_folder, weights)
     maps = data_sets.read_maps(recipe, data, held_out_data, wall, stream=stream)
     recipe = maps.limit_recipe(recipe)
-    record = training.record_run(recipe, run.out, maps.rig, runs, weights, vae_folder)
+    record = maps.record_run(recipe, run.out, runs, weights, vae_folder)
     job = run.training(recipe, record, training.digest_of(start.vae, start.pipeline, maps.digest))
     run.finish(
         recipe,
@@ -354,10 +356,11 @@ def direct(
                 processes=pack_workers,
             )
             source = held.enter_context(packed)
+        if not training.has_state(run.out):
+            source.forget_run()
         held_out = source.held_out(held_out_data, recipe.held_out)
         recipe = recipe.model_copy(update={"held_out": len(held_out.image)})
-        rig = source.frame
-        record = training.record_run(recipe, run.out, (rig.name, rig.checksum), runs, weights)
+        record = source.record_run(recipe, run.out, runs, weights)
         job = run.training(
             recipe, record, training.digest_of(start, source.digest) if start else source.digest
         )
@@ -413,7 +416,7 @@ def transfer(
         raise SceneError(f"--vae {vae_folder} has no encoder: give a folder from `train vae`")
     maps = data_sets.read_maps(recipe, data, held_out_data, wall, start=start)
     recipe = maps.limit_recipe(recipe)
-    record = training.record_run(recipe, run.out, maps.rig, start.runs, weights)
+    record = maps.record_run(recipe, run.out, start.runs, weights, trained=start)
     job = run.training(recipe, record, training.digest_of(pipeline, encoder, maps.digest))
     figures = training.launch(
         fabric,

@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from nlos_calibration import Rig
 from nlos_models import CellNormal, CheckpointRecord, channels_of
-from nlos_models.training import MapNoise, MapSet, NormalBatch, first_of
+from nlos_models.training import MapNoise, MapSet, NormalBatch, Recipe, first_of, record_run
 
 from nlos_cam.dataset.build import SHARD
 from nlos_cam.dataset.packed_index import StoreIndex, damaged, shard_key
@@ -30,7 +30,7 @@ from nlos_cam.dataset.packing import (
     read_aligned,
 )
 from nlos_cam.dataset.plan import DatasetPlan, RigSpread
-from nlos_cam.dataset.reader import MAP_CHANNELS, Dataset, open_dataset
+from nlos_cam.dataset.reader import MAP_CHANNELS, Dataset, check_held_out, open_dataset
 from nlos_cam.dataset.rig_range import RigRange
 from nlos_cam.dataset.samples import OnProgress, ignore
 from nlos_cam.dataset.shards import SHARD_PATTERN, read_head
@@ -38,7 +38,8 @@ from nlos_cam.errors import RecordingError, SceneError
 from nlos_cam.files import atomic_file, claim
 from nlos_cam.files import read_arrays as read_npz
 from nlos_cam.frames import MAP_COLUMNS, MAP_ROWS, OBJECT_PIXELS
-from nlos_cam.reconstruct import WALL_GRID, grid_of, is_wall_grid
+from nlos_cam.reconstruct import WALL_GRID, is_wall_grid, rig_fields
+from nlos_cam.render import Material, SensorModel
 
 CELLS = "cells.npz"
 Growth = Callable[[int], int]
@@ -94,29 +95,22 @@ class PackedMaps:
         ]
         self.plan: DatasetPlan = opened[0].plan
         """Of the first dataset."""
-        if others := [one.folder for one in opened if _rigs_of(one.plan) != _rigs_of(self.plan)]:
-            raise SceneError(
-                f"{others[0]} and {datasets[0]} were rendered for different rigs: give datasets"
-                " of one"
-            )
-        if others := [one.folder for one in opened if one.plan.expected != self.plan.expected]:
-            raise SceneError(
-                f"of {others[0]} and {datasets[0]} one holds expected maps, without noise: give one"
-                " kind"
-            )
-        if trained and not grid_of(trained) and trained.rig_checksum != self.plan.rig.checksum:
+        _check_of_one_kind(opened)
+        self.frame: Rig = frame or (WALL_GRID if self.plan.rigs else self.plan.rig)
+        """Rig that the maps are aligned with."""
+        if trained and trained.rig_checksum != self.frame.checksum:
             # By another rig's statistics a third of the cells would lie beyond the limit of a
-            # normalised one, on a bench 5 cm nearer: its layers serve, not its cells.
+            # normalised one, on a bench 5 cm nearer: its layers serve, not its cells. The wall
+            # grid counts as another rig, also beside the rig that its maps are drawn around.
             normal = None
         self.noise: MapNoise | None = map_noise(self.plan) if self.plan.expected else None
         """To be drawn at each step of training."""
         self._datasets = list(datasets)
+        self._opened = opened
         self._store = store
         self._growth = growth
         self._run = run
         self._packing = packing or Packing(1)
-        self.frame: Rig = frame or (WALL_GRID if self.plan.rigs else self.plan.rig)
-        """Rig that the maps are aligned with."""
         self.normal = CellNormal(color=color)
         if color and self.plan.spread != RigSpread():
             raise SceneError(
@@ -239,9 +233,46 @@ class PackedMaps:
     def held_out(self, folder: Path, count: int) -> MapSet:
         """Return up to `count` samples of another dataset as the store has its own: aligned with
         the same rig.
+
+        Raises SceneError for a dataset of the same objects, or of benches that cannot be aligned.
         """
         opened = open_dataset(folder, color=self._color, locked=self._locked)
-        return aligned_with(first_of(opened.arrays(), count), opened.benches(), self.frame)[0]
+        for training in self._opened:
+            check_held_out(training, opened)
+        maps = aligned_with(first_of(opened.arrays(), count), opened.benches(), self.frame)[0]
+        if not len(maps.image):
+            raise SceneError(
+                f"no object of {folder} can be aligned with {self.frame.name}: its box has another"
+                " size, or its occluder hides more; hold out objects of the same rig"
+            )
+        return maps
+
+    def record_run(
+        self, recipe: Recipe, out: Path, runs: list[Recipe], *starts: Path | None
+    ) -> CheckpointRecord:
+        """Return the record of the weights that a recipe makes of these maps after `runs`. Raises
+        OutputExistsError as `nlos_models.training.record_run`.
+        """
+        rig = self.frame
+        # the wall grid's light is that of one sensor
+        counts = None if is_wall_grid(rig) else self.plan.sensor.bare_wall_counts
+        return record_run(
+            recipe,
+            out,
+            (rig.name, rig.checksum),
+            runs,
+            *starts,
+            bench=rig_fields(rig),
+            bare_wall_counts=counts,
+        )
+
+    def forget_run(self) -> None:
+        """Forget how many objects the epochs of this run saw: it begins anew."""
+        if self._run:
+            epochs = self._index.epochs
+            for key in [each for each in epochs if each.startswith(self._run)]:
+                del epochs[key]
+            self._index.write()
 
     def batches(self, batch: int, generator: torch.Generator) -> Iterator[NormalBatch]:
         """Yield one pass over the objects in random order, without the last, smaller batch.
@@ -268,6 +299,26 @@ class PackedMaps:
         for start in range(0, count - batch + 1, batch):
             rows = np.sort(order[start : start + batch])
             yield NormalBatch(*(torch.from_numpy(file[rows]) for file in files))
+
+
+def _check_of_one_kind(opened: Sequence[Dataset]) -> None:
+    """Raise SceneError for datasets of two rigs or sensors, or with and without noise."""
+    first = opened[0]
+    for other in opened[1:]:
+        both = f"{other.folder} and {first.folder}"
+        if _rigs_of(other.plan) != _rigs_of(first.plan):
+            raise SceneError(f"{both} were rendered for different rigs: give datasets of one")
+        if other.plan.expected != first.plan.expected:
+            raise SceneError(f"of {both} one holds expected maps, without noise: give one kind")
+        # the noise that training adds is that of one sensor
+        if _light_of(other.plan) != _light_of(first.plan):
+            raise SceneError(
+                f"{both} differ in sensor, radiometry or material: give datasets of one kind"
+            )
+
+
+def _light_of(plan: DatasetPlan) -> tuple[SensorModel, str, Material]:
+    return plan.sensor, plan.radiometry, plan.material
 
 
 def _rigs_of(plan: DatasetPlan) -> tuple[Rig, RigRange | None]:

@@ -14,7 +14,7 @@ from nlos_models.training import MapBatch, MapSet, as_batch
 from numpy.typing import NDArray
 
 from nlos_cam.dataset.locked import LOCKED
-from nlos_cam.dataset.plan import DatasetPlan
+from nlos_cam.dataset.plan import RECORDED, DatasetPlan
 from nlos_cam.dataset.shards import Shard, array_names, read_arrays, shards_of
 from nlos_cam.errors import RecordingError, SceneError
 
@@ -41,6 +41,11 @@ class Dataset:
 
     def __len__(self) -> int:
         return sum(len(shard.seeds) for shard in self.shards)
+
+    @property
+    def seeds(self) -> set[int]:
+        """Seeds of all objects."""
+        return {seed for shard in self.shards for seed in shard.seeds}
 
     def column(self, name: str) -> NDArray[Any]:
         """Return an array over all samples: seed, category (n,), scene (n, 6), object_depth_m (n,
@@ -151,6 +156,25 @@ class _Window:
             for target, source in zip(arrays, self._held[shard], strict=True):
                 target[here] = source[within]
         return MapSet(*arrays)
+
+
+def check_held_out(training: Dataset, held_out: Dataset) -> None:
+    """Raise SceneError where held-out objects are training objects: in the same folder, or rendered
+    from the same seeds.
+    """
+    if training.folder.resolve() == held_out.folder.resolve():
+        raise SceneError(
+            f"--dataset and --held-out are the same folder ({training.folder}): hold out different"
+            " objects"
+        )
+    if RECORDED in {training.plan.accuracy, held_out.plan.accuracy}:
+        return  # their seeds number recordings
+    both = training.seeds & held_out.seeds
+    if both:
+        raise SceneError(
+            f"{len(both)} objects of {held_out.folder} have the seeds of objects in"
+            f" {training.folder}, from {min(both)}: build the held-out ones with another --seed"
+        )
 
 
 def open_dataset(

@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from nlos_calibration import Moments, load_measured
+from nlos_calibration import Moments, Rig, load_measured
 from nlos_calibration.arrays import Float16, Float32
 from nlos_models import CheckpointRecord
 from nlos_models.training import (
@@ -19,18 +19,20 @@ from nlos_models.training import (
     MapRecipe,
     MapSet,
     MapSource,
+    Recipe,
     WithNoise,
     first_of,
+    record_run,
     subtract_bare_wall,
 )
 
 from nlos_cam.dataset.packed import map_noise
 from nlos_cam.dataset.packed_index import data_key
 from nlos_cam.dataset.plan import RECORDED, DatasetPlan, RigSpread
-from nlos_cam.dataset.reader import MAP_CHANNELS, Dataset, open_dataset
+from nlos_cam.dataset.reader import MAP_CHANNELS, Dataset, check_held_out, open_dataset
 from nlos_cam.errors import SceneError
 from nlos_cam.frames import MAP_COLUMNS, MAP_ROWS, maps_from_frame
-from nlos_cam.reconstruct import align_all, rig_to_align_with, training_rig
+from nlos_cam.reconstruct import align_all, rig_fields, rig_to_align_with, training_rig
 from nlos_cam.render import Scene, Sensor, render
 
 BARE_WALL_FRAMES = 60
@@ -46,16 +48,42 @@ class MapSplit(NamedTuple):
     training: MapSource
     held_out: MapSet
     plan: DatasetPlan
-    rig: tuple[str, str]
-    """Name and checksum of the rig that the maps are of, or aligned with."""
+    rig: Rig
+    """The rig that the maps are of, or aligned with."""
     key: str
     """Key of the maps: other maps of the same objects have another."""
 
     @property
     def digest(self) -> str:
         """SHA-256 of rig, maps and training objects: a run with another one cannot be resumed."""
-        decided = f"{self.rig[1]}\n{self.key}\n"
+        decided = f"{self.rig.checksum}\n{self.key}\n"
         return hashlib.sha256(decided.encode() + self.training.image.tobytes()).hexdigest()
+
+    def record_run(
+        self,
+        recipe: Recipe,
+        out: Path,
+        runs: list[Recipe],
+        *starts: Path | None,
+        trained: CheckpointRecord | None = None,
+    ) -> CheckpointRecord:
+        """Return the record of the weights that a recipe makes of these maps after `runs`, which
+        began with weights `trained` where it is a transfer. Raises OutputExistsError as
+        `nlos_models.training.record_run`.
+        """
+        rig = self.rig
+        is_trained = trained is not None and trained.rig_checksum == rig.checksum
+        counts = self.plan.sensor.bare_wall_counts
+        return record_run(
+            recipe,
+            out,
+            (rig.name, rig.checksum),
+            runs,
+            *starts,
+            # of weights for any rig too, whose record holds the bench that they were made for
+            bench=trained.rig if trained and is_trained else rig_fields(rig),
+            bare_wall_counts=trained.bare_wall_counts if trained and is_trained else counts,
+        )
 
     def limit_recipe(self, recipe: MapRecipe) -> MapRecipe:
         """Return the recipe with the number of held-out objects available, which may be lower than
@@ -153,7 +181,7 @@ def read_maps(
         source = InMemory(align_all(maps, dataset.benches(), start) if start else maps)
     training = WithNoise(source, map_noise(plan)) if plan.expected else source
     key = _key_of((dataset, other), bare if wall else None)
-    return MapSplit(training, held_out, plan, (rig.name, rig.checksum), key)
+    return MapSplit(training, held_out, plan, rig, key)
 
 
 def _key_of(datasets: Sequence[Dataset], measured: BareMaps | None) -> str:
@@ -185,12 +213,9 @@ def _open_both(recipe: MapRecipe, data: Path, held_out_data: Path) -> tuple[Data
     """Open the datasets of training and held-out maps; of recordings, for difference maps, as the
     lidar measured them.
     """
-    if data.resolve() == held_out_data.resolve():
-        raise SceneError(
-            f"--dataset and --held-out are the same folder ({data}): hold out different objects"
-        )
     dataset = open_dataset(data, color=recipe.colour, expected=recipe.maps == "raw maps")
     other = open_dataset(held_out_data, color=recipe.colour)
+    check_held_out(dataset, other)
     if len(dataset) < recipe.objects:
         raise SceneError(
             f"{data} holds {len(dataset)} objects, the recipe needs {recipe.objects}: build more,"

@@ -31,7 +31,7 @@ from nlos_cam.dataset.build import HELD_OUT_SEED, TRAINING_SEED
 from nlos_cam.dataset.packed import map_noise
 from nlos_cam.dataset.packing import aligned_with, kept_of
 from nlos_cam.dataset.plan import RECORDED, DatasetPlan
-from nlos_cam.dataset.reader import Dataset
+from nlos_cam.dataset.reader import Dataset, check_held_out
 from nlos_cam.dataset.rig_range import RigRange
 from nlos_cam.dataset.samples import OnProgress, cached_sensor, ignore
 from nlos_cam.errors import SceneError
@@ -454,6 +454,7 @@ def check_uncertainty_data(
             "--dataset or --held-out is of another radiometry or material, but empty benches and"
             " outliers are rendered matt, in the paper's: build the maps again without them"
         )
+    check_held_out(training, held_out)
     if len(training) < recipe.objects:
         count = f"--dataset holds {len(training)} objects, the recipe needs {recipe.objects}"
         raise SceneError(f"{count}: build more, or lower --objects")

@@ -62,6 +62,21 @@ def plain(figures: Figures) -> dict[str, dict[str, float | None]]:
     return {name: asdict(figure) for name, figure in figures.items()}
 
 
+def by_object(values: Mapping[str, Float64], of_object: NDArray[np.int64]) -> PerObject:
+    """Return the mean of each metric over the frames of every object; `of_object` (n,) are the
+    objects of the frames, numbered from 0.
+
+    Frames of one object differ by their noise alone: only objects may be resampled for an interval.
+    """
+    found: PerObject = {}
+    for name, value in values.items():
+        known = ~np.isnan(value)
+        count = np.bincount(of_object, known)
+        total = np.bincount(of_object, np.where(known, value, 0.0))
+        found[name] = np.where(count > 0, total / np.maximum(count, 1), np.nan)
+    return found
+
+
 def over_objects(values: Mapping[str, Float64]) -> Figures:
     """Return the mean of each metric over objects with its interval."""
     return {name: interval(value) for name, value in values.items()}

@@ -23,6 +23,7 @@ from nlos_models import (
     shipped_folder,
     silhouette_iou,
 )
+from numpy.typing import NDArray
 
 from nlos_cam.evaluate import figures as pictures
 from nlos_cam.evaluate import metrics, subjects
@@ -103,9 +104,32 @@ class Evaluation:
     """None without a quality model, or for weights of difference maps."""
 
     @cached_property
+    def of_object(self) -> NDArray[np.int64]:
+        """Return the number of each frame's object (n,): those of one kind and one truth are frames
+        of one recorded object.
+        """
+        numbers: dict[tuple[str, bytes], int] = {}
+        keys = zip(self.categories, map(np.ndarray.tobytes, self.truth), strict=True)
+        return np.array([numbers.setdefault(key, len(numbers)) for key in keys], np.int64)
+
+    @cached_property
+    def objects(self) -> NDArray[np.int64]:
+        """Return the number of each object's first frame."""
+        return np.unique(self.of_object, return_index=True)[1]
+
+    @cached_property
+    def object_categories(self) -> list[str]:
+        """Return the category of each object."""
+        return [self.categories[int(first)] for first in self.objects]
+
+    @cached_property
     def ours(self) -> metrics.PerObject:
-        """Return every metric of every object."""
+        """Return every metric of every frame."""
         return metrics.per_object(self.image, self.truth, self.box)
+
+    def of_objects(self, image: Float32) -> metrics.PerObject:
+        """Return every metric of images (n, 64, 64) for every object, over its frames."""
+        return metrics.by_object(metrics.per_object(image, self.truth, self.box), self.of_object)
 
     @cached_property
     def surfaces(self) -> dict[str, Float64]:
@@ -203,11 +227,10 @@ def evaluate(
 
 def as_figures(evaluation: Evaluation) -> dict[str, Any]:
     """Return all figures, ready for JSON."""
-    ours = evaluation.ours
-    theirs = {
-        name: metrics.per_object(guess, evaluation.truth, evaluation.box)
-        for name, guess in evaluation.guesses.items()
-    }
+    ours = evaluation.of_objects(evaluation.image)
+    theirs = {name: evaluation.of_objects(guess) for name, guess in evaluation.guesses.items()}
+    categories = evaluation.object_categories
+    errors = metrics.by_object(evaluation.errors, evaluation.of_object)
     overall = metrics.over_objects(ours)
     nearest = theirs.get("nearest_neighbour")
     return {
@@ -221,12 +244,14 @@ def as_figures(evaluation: Evaluation) -> dict[str, Any]:
         "bars": metrics.targets_met(overall),
         "per_category": {
             name: metrics.plain(figures)
-            for name, figures in metrics.per_category(ours, evaluation.categories).items()
+            for name, figures in metrics.per_category(ours, categories).items()
         },
-        "shown_and_left_out": _by_shown(evaluation),
+        "shown_and_left_out": _by_shown(ours, categories, evaluation.left_out),
         "rank_correlation": {
-            f"{error_name} with {measure_name}": asdict(metrics.rank_correlation(measure, error))
-            for error_name, error in evaluation.errors.items()
+            f"{error_name} with {measure_name}": asdict(
+                metrics.rank_correlation(measure[evaluation.objects], error)
+            )
+            for error_name, error in errors.items()
             for measure_name, measure in evaluation.surfaces.items()
         },
         "where_the_error_is": {
@@ -242,7 +267,8 @@ def as_figures(evaluation: Evaluation) -> dict[str, Any]:
             or None
         ),
         "recognised": _recognised(evaluation),
-        "objects": len(evaluation.truth),
+        "objects": len(evaluation.objects),
+        "frames": len(evaluation.truth),
         **evaluation.facts,
     }
 
@@ -280,29 +306,24 @@ def _recognised(evaluation: Evaluation) -> dict[str, Any] | None:
     if not set(evaluation.categories) <= CATEGORIES.keys():
         return None
     each = {"reconstructions": evaluation.image, "truth": evaluation.truth}
-    return metrics.plain(
-        metrics.over_objects(
-            {
-                name: recognised(images, evaluation.categories, evaluation.box)
-                for name, images in each.items()
-            }
-        )
-    )
+    shares = {
+        name: recognised(images, evaluation.categories, evaluation.box)
+        for name, images in each.items()
+    }
+    return metrics.plain(metrics.over_objects(metrics.by_object(shares, evaluation.of_object)))
 
 
-def _by_shown(evaluation: Evaluation) -> dict[str, Any] | None:
+def _by_shown(
+    ours: metrics.PerObject, categories: Sequence[str], left_out: Sequence[str]
+) -> dict[str, Any] | None:
     """Return the figures of left-out and of trained categories; None if none of these was left
     out.
     """
-    if not set(evaluation.left_out) & set(evaluation.categories):
+    if not set(left_out) & set(categories):
         return None
-    shown = [
-        "left out" if category in evaluation.left_out else "shown"
-        for category in evaluation.categories
-    ]
+    shown = ["left out" if category in left_out else "shown" for category in categories]
     return {
-        name: metrics.plain(figures)
-        for name, figures in metrics.per_category(evaluation.ours, shown).items()
+        name: metrics.plain(figures) for name, figures in metrics.per_category(ours, shown).items()
     }
 
 
@@ -338,14 +359,17 @@ def _draw(folder: Path, evaluation: Evaluation) -> None:
     image = evaluation.image
     truth = evaluation.truth
     names = evaluation.names
-    ours = evaluation.ours
+    ours = evaluation.of_objects(image)
+    categories = evaluation.object_categories
     pictures.draw_sheet(folder / "sheet.png", image, truth, names)
     if second := evaluation.unseen:
         pictures.draw_sheet(folder / UNSEEN_SHEET, second.image, second.truth, second.names)
-    pictures.draw_gallery(folder / "gallery.png", image, truth, names, ours["silhouette_iou"])
+    pictures.draw_gallery(
+        folder / "gallery.png", image, truth, names, evaluation.ours["silhouette_iou"]
+    )
     pictures.draw_categories(
         folder / "categories.png",
-        metrics.per_category(ours, evaluation.categories),
+        metrics.per_category(ours, categories),
         metrics.over_objects(ours),
     )
     if sets := _predicted_sets(evaluation):
@@ -368,9 +392,11 @@ def document(figures: Mapping[str, Any], folder: Path) -> Document:
     met = sum(bar["met"] for bar in figures["bars"].values())
     count = len(figures["bars"])
     headline = f"Silhouette IoU {format_interval(figures['silhouette_iou'])}"
+    several = figures["frames"] > figures["objects"]
+    frames = f" ({figures['frames']} frames)" if several else ""
     advice = (
-        f"{met} of {count} targets met, on {figures['objects']} objects. In brackets: 95 % interval"
-        " over objects."
+        f"{met} of {count} targets met, on {figures['objects']} objects{frames}. In brackets: 95 %"
+        " interval over objects."
     )
     head = (
         "metric",

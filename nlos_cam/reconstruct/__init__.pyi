@@ -54,6 +54,7 @@ __all__ = [
     "occluder_assumed",
     "open_bench",
     "reconstruct",
+    "rig_fields",
     "rig_to_align_with",
     "training_rig",
     "verdict_limits",
@@ -68,6 +69,7 @@ from .alignment import (
     align_samples,
     alignment,
     can_align,
+    rig_fields,
     rig_to_align_with,
     training_rig,
 )

@@ -19,7 +19,7 @@ cells far. Networks for many rigs are trained on a grid on the wall in place of 
 
 from collections.abc import Iterable
 from dataclasses import replace
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from nlos_calibration import BareWall, ObjectBox, Occluder, Rig, load_rig
@@ -91,17 +91,24 @@ class MapAlignment:
     module.
 
     With the bench's own bare wall, its reflectance and a constant error of range are taken out as
-    well.
+    well. `bare_wall_counts` are those of the brightest bare wall in training (default: the
+    simulated sensor's).
     """
 
-    def __init__(self, bench: Rig, trained: Rig, bare: BareWall | None = None) -> None:
+    def __init__(
+        self,
+        bench: Rig,
+        trained: Rig,
+        bare: BareWall | None = None,
+        bare_wall_counts: float | None = None,
+    ) -> None:
         bench, shift_m, spot_m = _spots_of(bench, trained)
         here = cast(bench, bench.pinhole.scaled(MAP_COLUMNS, MAP_ROWS), occluder=False)
         there = cast(trained, trained.pinhole.scaled(MAP_COLUMNS, MAP_ROWS))
         sees_wall = _cells_on_wall(bench)
         self._neighbors = _neighbors_of(bench, spot_m, sees_wall)
         self._numbers = numbers_column(rig_numbers(bench)) if is_wall_grid(trained) else None
-        self._keep_training_rig(trained, there)
+        self._keep_training_rig(trained, there, bare_wall_counts)
         self._unseen = np.ones(SHAPE, bool)
         self._unseen.flat[self._cells] = ~self._neighbors.seen
         self._keep_bare_wall(here, bare)
@@ -125,11 +132,11 @@ class MapAlignment:
             (wanted_m**-2).mean() / (last_m**-2).mean()
         )
 
-    def _keep_training_rig(self, trained: Rig, there: "Beams") -> None:
+    def _keep_training_rig(self, trained: Rig, there: "Beams", brightest: float | None) -> None:
         """Keep the cells of the training rig that see the wall, and its bare bench's maps."""
         self._cells = np.flatnonzero(there.on_wall)
-        # The simulated sensor's gain fixes the counts of the brightest bare wall (SensorModel).
-        counts = SensorModel().bare_wall_counts / brightest_light(trained)
+        # A sensor's gain is given by the counts of the brightest bare wall (SensorModel).
+        counts = (brightest or SensorModel().bare_wall_counts) / brightest_light(trained)
         self._depth_m = (there.length_m * there.cos_axis).astype(np.float32)
         self._light = np.nan_to_num(there.direct * counts).astype(np.float32)
         # Maps hold depth along the optical axis: depth = path / 2 * cos.
@@ -230,7 +237,7 @@ def alignment(
     none.
     """
     rig = rig_to_align_with(bench, trained)
-    return MapAlignment(bench, rig, bare) if rig else None
+    return MapAlignment(bench, rig, bare, trained.bare_wall_counts) if rig else None
 
 
 def align_all(maps: "MapSet", benches: Iterable[Rig], trained: CheckpointRecord) -> "MapSet":
@@ -240,14 +247,16 @@ def align_all(maps: "MapSet", benches: Iterable[Rig], trained: CheckpointRecord)
     There may be more benches than samples.
     """
     wanted = training_rig(trained) if trained.input == "raw maps" else None
-    return align_samples(maps, benches, wanted)[0] if wanted else maps
+    counts = trained.bare_wall_counts
+    return align_samples(maps, benches, wanted, counts)[0] if wanted else maps
 
 
 def align_samples(
-    maps: "MapSet", benches: Iterable[Rig], wanted: Rig
+    maps: "MapSet", benches: Iterable[Rig], wanted: Rig, bare_wall_counts: float | None = None
 ) -> tuple["MapSet", Mask, Float32]:
-    """Return samples, each of its own bench, as the rig `wanted` sees them, a mask (n,) of those
-    that it can see, and the benches' own intensities (n, 64, 80) behind them.
+    """Return samples, each of its own bench, as the rig `wanted` sees them (`bare_wall_counts` as
+    for `MapAlignment`), a mask (n,) of those that it can see, and the benches' own intensities (n,
+    64, 80) behind them.
 
     The others, of benches that cannot be aligned with it, stay as they are.
     """
@@ -263,7 +272,9 @@ def align_samples(
         if its_bench is not bench and its_bench != bench:
             bench = its_bench
             possible = bench == wanted or can_align(bench, wanted)
-            aligned = MapAlignment(bench, wanted) if possible and bench != wanted else None
+            aligned = None
+            if possible and bench != wanted:
+                aligned = MapAlignment(bench, wanted, bare_wall_counts=bare_wall_counts)
         seen[n] = possible
         if aligned:
             sensed = LidarMaps(depth_m[n], intensity[n], np.isfinite(depth_m[n]))
@@ -313,6 +324,19 @@ def training_rig(trained: CheckpointRecord) -> Rig | None:
     except (RecordFileError, ValidationError):
         return None
     return rig if rig.checksum == trained.rig_checksum else None
+
+
+def rig_fields(rig: Rig) -> dict[str, Any] | None:
+    """Return the fields of a rig for the record of weights, by which `training_rig` knows it on any
+    machine; None for a packaged rig and the wall grid, which are known without.
+    """
+    if is_wall_grid(rig):
+        return None
+    try:
+        is_packaged = load_rig(rig.name).checksum == rig.checksum
+    except RecordFileError:
+        is_packaged = False
+    return None if is_packaged else rig.model_dump(mode="json")
 
 
 def _is_in_view(bench: Rig, trained: Rig) -> bool:

@@ -69,11 +69,13 @@ def hard_maps(name: str, channels: tuple[int, ...] = ()) -> tuple[Tensor, Tensor
 
 
 class SmallDataset:
-    """Stand-in for a dataset of two shards on disk."""
+    """Stand-in for a dataset of two shards on disk, in a folder or in the current one."""
 
-    def __init__(self, maps: MapSet, plan: Any) -> None:
+    def __init__(self, maps: MapSet, plan: Any, folder: Path = Path(), first_seed: int = 0) -> None:
         self._maps = maps
         self.plan = plan
+        self.folder = folder
+        self.seeds = set(range(first_seed, first_seed + len(maps.image)))
 
     def __len__(self) -> int:
         return len(self._maps.image)

@@ -55,8 +55,8 @@ BUILD = "dataset build --count 12 --workers 2 --accuracy draft --out"
 CACHE = "capture sim:{inputs}/scene.toml --frames 2 --out {folder}"
 SAVE = "live sim:bare-wall --no-view --seconds 2 --save-view"
 TRAIN = (
-    "train direct --recipe {inputs}/small.toml --dataset {inputs}/data --held-out {inputs}/data"
-    " --out"
+    "train direct --recipe {inputs}/small.toml --dataset {inputs}/data"
+    " --held-out {inputs}/held-out --out"
 )
 
 Row = dict[str, Any]
@@ -355,7 +355,8 @@ def make_inputs(folder: Path) -> None:
     in_fork(lambda: bool(record(folder / "noise.bag", packed=True, frames=8)))
     (folder / "small.toml").write_text(RECIPE, encoding="utf-8")
     (folder / "scene.toml").write_text(SCENE, encoding="utf-8")
-    for arguments in (f"{BUILD} {folder}/data", f"{TRAIN} {folder}/run"):
+    held_out = f"{BUILD} {folder}/held-out --seed 1000"
+    for arguments in (f"{BUILD} {folder}/data", held_out, f"{TRAIN} {folder}/run"):
         with empty_folder() as empty:
             if (ended := finish(Command(arguments, "", _folder()), empty, folder)).poll():
                 raise RuntimeError(ended.said)

@@ -29,6 +29,7 @@ __all__ = [
     "figures_of",
     "first_of",
     "fit",
+    "has_state",
     "is_better",
     "latent_error",
     "launch",
@@ -88,7 +89,7 @@ from .recipe import (
     load_recipe,
     packaged_recipes,
 )
-from .run_files import Scores
+from .run_files import Scores, has_state
 from .runs import (
     FITTED,
     TrainingRun,

@@ -28,6 +28,7 @@ from nlos_models.records import (
     shipped_folder,
     weights_folder,
 )
+from nlos_models.training.run_files import FINISHED
 from nlos_models.vae import Encoder, ResVae
 
 WEIGHT_SUFFIXES = ".safetensors", ".onnx", ".json"
@@ -98,7 +99,9 @@ def copy_weights(folder: Path, target: Path) -> None:
     target.mkdir(parents=True, exist_ok=True)
     try:
         for path in sorted(folder.iterdir()):
-            if path.suffix in WEIGHT_SUFFIXES or path.name == CHECKSUMS:
+            # The run that ended in `folder` is not that of `target`.
+            is_weights = path.suffix in WEIGHT_SUFFIXES and path.name != FINISHED
+            if is_weights or path.name == CHECKSUMS:
                 with atomic_file(target / path.name) as part:
                     shutil.copyfile(path, part)
     except OSError as error:

@@ -138,9 +138,11 @@ def transfer_direct(
         # Depth is in metres on every bench, intensity in the counts of a device: the latter may
         # be taken alone.
         channels = slice(1, None) if recipe.statistics == "own intensity" else slice(None)
-        network.normal.shift(
-            torch.from_numpy(seen.depth_m), torch.from_numpy(seen.intensity), channels
+        device = network.normal.median.device
+        depth_m, intensity = (
+            torch.from_numpy(values).to(device) for values in (seen.depth_m, seen.intensity)
         )
+        network.normal.shift(depth_m, intensity, channels)
 
     def loss(batch: MapBatch, _: float) -> Tensor:
         normal = network.normal(batch.depth_m, batch.intensity)

@@ -52,6 +52,11 @@ def write_log(folder: Path, rows: list[Scores]) -> None:
     _write(folder / LOG, text.getvalue().encode())
 
 
+def has_state(folder: Path) -> bool:
+    """Return whether a run in a folder has a state, from which the same command goes on."""
+    return any((folder / name).exists() for name in (LAST, PREVIOUS))
+
+
 def read_last(folder: Path, on_message: OnMessage) -> State | None:
     """Return the newest intact state, or None before the first; a damaged last state is reported
     and skipped.

@@ -48,7 +48,7 @@ from nlos_models.training.recipe import (
     VaeRecipe,
     maps_of,
 )
-from nlos_models.training.run_files import Scores, read_finished, write_finished
+from nlos_models.training.run_files import Scores, has_state, read_finished, write_finished
 from nlos_models.training.tasks import (
     PHASES,
     Start,
@@ -136,12 +136,14 @@ def record_run(
     before: list[Recipe],
     *starts: Path | None,
     bench: Mapping[str, Any] | None = None,
+    bare_wall_counts: float | None = None,
 ) -> CheckpointRecord:
     """Return the record of the weights that a recipe makes after the runs `before`; `rig` is its
     (name, checksum).
 
-    `bench` are the fields of that rig where it is a measured one, which another machine does not
-    know by its name.
+    `bench` are the fields of that rig where it is not packaged, which another machine does not know
+    by its name. `bare_wall_counts` are those of the brightest bare wall in training, where they are
+    not the simulated sensor's.
 
     Raises OutputExistsError where the run would write over a file, over a folder that it starts
     from, or over other weights.
@@ -150,6 +152,7 @@ def record_run(
     record = CheckpointRecord.of([*before, recipe], rig, maps_of(recipe))
     if bench is not None:
         record = record.model_copy(update={"rig": dict(bench)})
+    record = record.model_copy(update={"bare_wall_counts": bare_wall_counts})
     if os.path.lexists(out) and not out.is_dir():
         raise OutputExistsError(
             f"{out} is a file, but --out must be a directory: choose another --out"
@@ -173,11 +176,12 @@ def record_uncertainty_run(
     """Return the record of an uncertainty network that watches the weights in a folder and learns
     kinds of outliers.
 
-    Raises OutputExistsError where `out` is that folder, or holds an uncertainty network or other
-    weights.
+    Raises OutputExistsError where `out` is that folder, or holds other weights, or an uncertainty
+    network that is not of a run which was stopped while it saved.
     """
     same = out.resolve() == watched.resolve()
-    if same or (out / UNCERTAINTY_RECORD).exists() or _holds_other_weights(out, watched):
+    made = (out / UNCERTAINTY_RECORD).exists() and not has_state(out)
+    if same or made or _holds_other_weights(out, watched):
         raise OutputExistsError(f"{out} holds weights already: choose another --out")
     return UncertaintyRecord(
         watches=checksum_of_watched(watched), recipe=recipe, program=program_name(), learnt=kinds

@@ -85,7 +85,8 @@ def exported(tmp_path_factory: pytest.TempPathFactory) -> Iterator[list[Path]]:
         use_small_networks(patch, tasks, checkpoint, checkpoints, runs)
         counts = {"data": 8, "held-out": 4}
         sets = {
-            name: SmallDataset(small_maps(count, len(name)), PLAN) for name, count in counts.items()
+            name: SmallDataset(small_maps(count, len(name)), PLAN, Path(name), 100 * number)
+            for number, (name, count) in enumerate(counts.items())
         }
         for module in ("nlos_cam.dataset", "nlos_cam.dataset.training_maps"):
             patch.setattr(f"{module}.open_dataset", lambda of, **_: sets[of.name])
@@ -306,8 +307,13 @@ def test_finished_run_keeps_no_states_and_is_not_repeated(
 
     assert go("two", "--vae", folder / "vae") == answer
 
-    other = SmallDataset(small_maps(8, 1), PLAN)
-    monkeypatch.setattr("nlos_cam.dataset.training_maps.open_dataset", lambda *_, **__: other)
+    others = {
+        name: SmallDataset(small_maps(8, 1), PLAN, Path(name), 100 * number)
+        for number, name in enumerate(("data", "held-out"))
+    }
+    monkeypatch.setattr(
+        "nlos_cam.dataset.training_maps.open_dataset", lambda of, **_: others[of.name]
+    )
 
     assert "choose another --out" in go("two", "--vae", folder / "vae", code=4)["error"]["message"]
 

@@ -74,13 +74,15 @@ def built(tmp_path: Path) -> Callable[..., Path]:
 
 
 @pytest.fixture
-def wanted(tmp_path: Path) -> Callable[[Path], MapSet]:
+def wanted(built: Callable[..., Path], tmp_path: Path) -> Callable[[Path], MapSet]:
     """Return a dataset's maps as `train direct` takes them."""
 
     def read(folder: Path) -> MapSet:
-        with open_packed_maps([folder], tmp_path / f"packed-{folder.name}") as packed:
-            assert 0 < len(packed) < OBJECTS
-            return packed.held_out(folder, OBJECTS)
+        beside = built(f"beside-{folder.name}", replace(PLAN, first_seed=1000))
+        with open_packed_maps([beside], tmp_path / f"packed-{folder.name}") as packed:
+            maps = packed.held_out(folder, OBJECTS)
+        assert 0 < len(maps.image) < OBJECTS
+        return maps
 
     return read
 

@@ -10,6 +10,7 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 from unittest.mock import Mock
+from zlib import crc32
 
 import numpy as np
 import pytest
@@ -66,7 +67,9 @@ def _datasets(monkeypatch: pytest.MonkeyPatch) -> None:
         assert not color
         plan = replace(PLAN, expected=True) if expected and of.name == "expected" else PLAN
         plan = PLANS.get(of.name, plan)
-        return SmallDataset(small_maps(6, len(of.name)), OTHER if "rig" in of.name else plan)
+        plan = OTHER if "rig" in of.name else plan
+        first_seed = 10 * crc32(of.name.removesuffix(" again").encode())
+        return SmallDataset(small_maps(6, len(of.name)), plan, of, first_seed)
 
     monkeypatch.setattr(training_maps, "open_dataset", opened)
 
@@ -173,6 +176,7 @@ def test_noise_has_its_stated_deviation_in_intensity_alone(stream: bool) -> None
     ("held_out", "wall", "stream", "word"),
     [
         ("other/../data", None, False, "--held-out"),
+        ("data again", None, False, "6 objects of .* seeds"),
         ("other", WALL, False, r"wall\.toml"),
         ("other-rig", None, False, "rigs"),
         ("other", None, True, "--objects 6"),
@@ -389,7 +393,75 @@ def test_maps_that_the_one_rig_cannot_see_are_left_out(
 
     with open_packed_maps([varied], store_folder) as packed:
         assert len(packed) == sum(seen)
+
+
+def test_held_out_maps_that_the_one_rig_cannot_see_are_left_out(
+    tmp_path: Path, store_folder: Path, seen: list[bool]
+) -> None:
+    varied = _add(tmp_path / "varied", 0, VARIED)
+    training = _add(tmp_path / "training", 100)
+
+    with open_packed_maps([training], store_folder) as packed:
         assert len(packed.held_out(varied, SHARD - 1).image) == sum(seen[:-1])
+
+
+@pytest.mark.parametrize(
+    ("first", "plan", "why"),
+    [
+        (0, PLAN, "same folder"),
+        (SHARD - 1, PLAN, "1 objects of .*held-out have the seeds"),
+        (100, replace(PLAN, rig=PLAN.rig.model_copy(update={"object_box": None})), "be aligned"),
+    ],
+)
+def test_held_out_maps_that_hold_nothing_out_are_refused(
+    tmp_path: Path, store_folder: Path, first: int, plan: DatasetPlan, why: str
+) -> None:
+    training = _add(tmp_path / "training", 0)
+    held_out = training if not first else _add(tmp_path / "held-out", first, plan)
+
+    with (
+        open_packed_maps([training], store_folder) as packed,
+        pytest.raises(SceneError, match=why),
+    ):
+        packed.held_out(held_out, 2)
+
+
+@pytest.mark.parametrize(("plan", "kept"), [(PLAN, True), (MANY, False), (OTHER, False)])
+def test_cells_of_trained_weights_serve_maps_of_their_own_rig_alone(
+    tmp_path: Path, store_folder: Path, plan: DatasetPlan, kept: bool
+) -> None:
+    normal = CellNormal()
+    normal.median += 7.0
+    record: Any = SimpleNamespace(rig_checksum=PLAN.rig.checksum)
+    data = _add(tmp_path / "data", 0, plan)
+
+    with open_packed_maps([data], store_folder, normal=normal, trained=record) as packed:
+        assert torch.equal(packed.normal.median, normal.median) == kept
+
+
+def test_datasets_of_two_sensors_are_refused(tmp_path: Path, store_folder: Path) -> None:
+    folders = [_add(tmp_path / "a", 0), _add(tmp_path / "b", 100, PLANS["dim1"])]
+
+    with (
+        pytest.raises(SceneError, match="sensor"),
+        open_packed_maps(folders, store_folder),
+    ):
+        pass
+
+
+def test_run_that_begins_anew_sees_the_objects_that_are_there(
+    tmp_path: Path, store_folder: Path
+) -> None:
+    data = _add(tmp_path / "data", 0)
+    counts: list[int] = []
+    for begins_anew in (False, False, True):
+        with open_packed_maps([data], store_folder, run="one ") as packed:
+            if begins_anew:
+                packed.forget_run()
+            counts.append(len(_epoch(packed, 1, batch=1)[0]))
+        _add(data, 100)
+
+    assert counts == [SHARD, SHARD, 2 * SHARD]
 
 
 def test_maps_that_are_off_their_record_stay_as_they_are(
@@ -428,13 +500,13 @@ def test_maps_of_many_rigs_are_packed_as_the_one_rig_sees_them(
 COLOR = replace(PLAN, textures=("plain",))
 
 
-def _add_in_color(folder: Path, plan: DatasetPlan) -> Path:
-    samples = _samples(0)
+def _add_in_color(folder: Path, plan: DatasetPlan, first: int = 0) -> Path:
+    samples = _samples(first)
     painted = {name: np.stack([samples[name]] * 3, 1) for name in ("intensity", "image")}
     texture = np.array(["plain"] * SHARD, object)
     folder.mkdir()
     shard = {**samples, **painted, "texture": texture}
-    store(shard_path(folder, 0), shard, plan.provenance, "")
+    store(shard_path(folder, first), shard, plan.provenance, "")
     return folder
 
 
@@ -445,7 +517,7 @@ def test_maps_in_color_are_packed_with_three_intensities(
 
     with open_packed_maps([one], store_folder, color=True) as packed:
         maps, images = _epoch(packed, 1)
-        held_out = packed.held_out(one, 2)
+        held_out = packed.held_out(_add_in_color(tmp_path / "other", COLOR, 100), 2)
 
     assert held_out.intensity.shape == (2, 3, 64, 80)
     assert maps.shape[1:] == (4, 64, 80)

@@ -106,6 +106,23 @@ def test_figures_count_objects_and_compare_with_baselines() -> None:
     assert figures["advantage_over_nearest_neighbour"]["silhouette_iou"]["value"] > 0
 
 
+def test_frames_of_one_object_make_no_interval_narrower() -> None:
+    one = _judgement()
+    several = replace(
+        one,
+        names=[name for name in one.names for _ in range(4)],
+        categories=[kind for kind in one.categories for _ in range(4)],
+        truth=np.repeat(one.truth, 4, axis=0),
+        image=np.repeat(one.image, 4, axis=0),
+        guesses={name: np.repeat(guess, 4, axis=0) for name, guess in one.guesses.items()},
+    )
+    found = _figures(several)
+
+    assert (found["objects"], found["frames"]) == (7, 28)
+    for name in (*TARGETS, "advantage_over_nearest_neighbour", "per_category", "rank_correlation"):
+        assert found[name] == _usual()[name]
+
+
 def test_figures_share_the_error_between_zones() -> None:
     zones = _usual()["where_the_error_is"].values()
 

@@ -4,6 +4,7 @@ checkpoint.
 
 import io
 from collections.abc import Iterable
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -468,6 +469,27 @@ def test_shift_follows_another_bench_and_nothing_else() -> None:
     assert (change[0] == 0).all()
     torch.testing.assert_close(change[1], torch.full_like(change[1], float(change[1, 0, 0])))
     assert float(change[1, 0, 0]) == pytest.approx(0.4, abs=0.1)
+
+
+def test_transfer_takes_statistics_to_the_device_of_the_network(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    network = _shaken()
+    shifted: list[torch.device] = []
+    network.normal.to("meta")  # which refuses tensors of another device, as a GPU does
+
+    def stop(normal: CellNormal, depth_m: Tensor, intensity: Tensor, _: slice) -> None:
+        del normal
+        shifted.extend([depth_m.device, intensity.device])
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(CellNormal, "shift", stop)
+    recipe = _transfer_recipe(all_layers_epochs=1, epochs=1, average=0.0)
+    recipe = recipe.model_copy(update={"statistics": "own intensity"})
+    with suppress(KeyboardInterrupt):
+        transfer_direct(recipe, network, InMemory(Source().maps), small_maps(4, 1), tmp_path)
+
+    assert [device.type for device in shifted] == ["meta", "meta"]
 
 
 def test_transfer_learns_the_bench_in_two_phases_and_resumes(tmp_path: Path) -> None:

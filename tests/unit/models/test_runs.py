@@ -2,6 +2,7 @@
 overwritten.
 """
 
+from contextlib import nullcontext
 from functools import partial
 from pathlib import Path
 
@@ -12,9 +13,16 @@ from nlos_models import CheckpointRecord, checkpoint
 from nlos_models.direct import DirectNetwork
 from nlos_models.errors import TrainingError
 from nlos_models.pipeline import RemappingNetwork
+from nlos_models.records import UNCERTAINTY_RECORD
 from nlos_models.training import runs
-from nlos_models.training.checkpoints import save_direct, save_pipeline, save_vae
+from nlos_models.training.checkpoints import (
+    copy_weights,
+    save_direct,
+    save_pipeline,
+    save_vae,
+)
 from nlos_models.training.recipe import Recipe
+from nlos_models.training.run_files import FINISHED, LAST
 from nlos_models.training.runs import (
     compressor_start,
     record_run,
@@ -215,3 +223,25 @@ def test_uncertainty_run_keeps_other_weights_in_its_folder(tmp_path: Path, name:
 
     with pytest.raises(OutputExistsError, match="--out"):
         record_uncertainty_run(recipe, out, watched, [])
+
+
+@pytest.mark.parametrize("stopped", [True, False])
+def test_uncertainty_run_stopped_while_it_saved_goes_on(tmp_path: Path, stopped: bool) -> None:
+    watched = watched_weights(tmp_path / "watched")
+    recipe = small_recipe(task="doubt", outliers=2, empties=2)
+    (out := tmp_path / "out").mkdir()
+    (out / UNCERTAINTY_RECORD).touch()
+    if stopped:  # its state goes once everything is saved
+        (out / LAST).touch()
+
+    with nullcontext() if stopped else pytest.raises(OutputExistsError, match="--out"):
+        record_uncertainty_run(recipe, out, watched, [])
+
+
+def test_copied_weights_bring_no_end_of_another_run(tmp_path: Path) -> None:
+    start = watched_weights(tmp_path / "start")
+    (start / FINISHED).write_text("{}")
+    copy_weights(start, tmp_path / "out")
+
+    assert (tmp_path / "out" / "checkpoint.json").exists()
+    assert not (tmp_path / "out" / FINISHED).exists()

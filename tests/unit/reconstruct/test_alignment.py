@@ -24,9 +24,9 @@ THINGS = benchmark_objects(object_box(RIG))[1::9]
 
 
 def trained(rig: Rig = RIG, **changes: Any) -> Any:
+    name = {"rig_name": rig.name, "rig_checksum": rig.checksum}
     return SimpleNamespace(
-        **{"rig_name": rig.name, "rig_checksum": rig.checksum, "rig": None, "input": "raw maps"}
-        | changes
+        **{**name, "rig": None, "input": "raw maps", "bare_wall_counts": None} | changes
     )
 
 
@@ -104,6 +104,19 @@ def test_networks_keep_their_silhouettes_on_aligned_benches() -> None:
         assert iou[f"{name} True"] > max(
             iou["as trained False"] - 0.08, iou[f"{name} False"] + 0.2
         ), iou
+
+
+@pytest.mark.parametrize("counts", [30.0, 90.0])
+def test_aligned_light_is_that_of_the_training_sensor(counts: float) -> None:
+    rig = BENCHES["all of it"]
+    sensed = maps_of(rig, None)
+    wanted = maps_of(RIG, None, QUIET.model_copy(update={"bare_wall_counts": counts}))
+    aligned = alignment(rig, trained(bare_wall_counts=counts))
+    assert aligned
+
+    ratio = aligned.align(sensed).intensity / wanted.intensity
+
+    assert np.median(np.abs(np.log(ratio))) < 0.02
 
 
 @pytest.mark.parametrize(("gain", "offset_m"), [(0.8, 0.0), (1.0, 0.004), (1.3, -0.003)])

@@ -285,7 +285,9 @@ DOUBTER: Any = object()
 def trained(
     rig_name: str = RIG.name, rig_checksum: str = RIG.checksum, eats: str = "raw maps"
 ) -> Any:
-    return SimpleNamespace(rig_name=rig_name, rig_checksum=rig_checksum, rig=None, input=eats)
+    return SimpleNamespace(
+        rig_name=rig_name, rig_checksum=rig_checksum, rig=None, input=eats, bare_wall_counts=None
+    )
 
 
 def test_warnings_name_mismatches_with_the_training(
