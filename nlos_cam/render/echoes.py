@@ -13,6 +13,8 @@ from numpy.typing import NDArray
 from nlos_cam.render.geometry import SPEED_OF_LIGHT_M_PER_S, Beams
 
 SIGMAS_PER_FWHM = 1 / np.sqrt(8 * np.log(2))
+TRANSFORM_VALUES = 1 << 23
+"""Values of the waveforms that are transformed at once."""
 
 
 @dataclass(frozen=True)
@@ -85,11 +87,30 @@ def _two_strongest(histogram: NDArray[np.floating]) -> tuple[NDArray[np.int64], 
     return winner, peak, second
 
 
-def strongest(histogram: NDArray[np.floating], bin_m: float) -> MultiBounce:
+@numba.njit(cache=True, parallel=True)
+def _strongest_beyond(
+    histogram: NDArray[np.floating], winner: NDArray[np.int64], beyond: int
+) -> Float32:
+    """Return the strongest bin of each row that is more than `beyond` bins from its winner."""
+    rows, bins = histogram.shape
+    found = np.zeros(rows, np.float32)
+    for i in numba.prange(rows):
+        for k in range(bins):
+            if abs(k - winner[i]) > beyond:
+                found[i] = max(found[i], np.float32(histogram[i, k]))
+    return found
+
+
+def strongest(histogram: NDArray[np.floating], bin_m: float, pulse_ns: float = 0.0) -> MultiBounce:
     """Return the strongest and second strongest bins of histograms (n, bins); ties go to the
     shortest path.
+
+    After a pulse the second one is of another echo: more than the pulse's full width away.
     """
     winner, peak, second = _two_strongest(histogram)
+    if pulse_ns:
+        beyond = int(np.ceil(pulse_bins(pulse_ns, bin_m) / SIGMAS_PER_FWHM))
+        second = _strongest_beyond(histogram, winner, beyond)
     path = np.where(peak > 0, (winner + 0.5) * bin_m, np.nan).astype(np.float32)
     return MultiBounce(peak, second, path)
 
@@ -147,11 +168,17 @@ def with_pulse(histogram: Float32, pulse_ns: float, bin_m: float) -> Float32:
     size = histogram.shape[1] + 2 * half
     # Convolution theorem; zero padding by the kernel's length keeps the end from wrapping to the
     # start.
-    spectrum = np.fft.rfft(histogram.astype(np.float64), size, axis=1) * np.fft.rfft(kernel, size)
-    # What would come before time 0 is cut.
-    wide = np.fft.irfft(spectrum, size, axis=1)[:, half:]
-    # Rounding of the transform leaves tiny values below 0 where there is no light.
-    return np.maximum(wide, 0).astype(np.float32)
+    of_pulse = np.fft.rfft(kernel, size)
+    wide = np.empty((len(histogram), size - half), np.float32)
+    # A transform takes several times the memory of what it transforms: some rows at a time.
+    at_once = max(1, TRANSFORM_VALUES // size)
+    for start in range(0, len(histogram), at_once):
+        rows = slice(start, start + at_once)
+        spectrum = np.fft.rfft(histogram[rows].astype(np.float64), size, axis=1) * of_pulse
+        # What would come before time 0 is cut, and rounding of the transform leaves tiny values
+        # below 0 where there is no light.
+        wide[rows] = np.maximum(np.fft.irfft(spectrum, size, axis=1)[:, half:], 0)
+    return wide
 
 
 def peak_share(pulse_ns: float, bin_m: float) -> float:

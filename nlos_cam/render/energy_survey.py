@@ -14,7 +14,7 @@ import numpy as np
 from nlos_calibration.arrays import Float64
 from numpy.typing import NDArray
 
-from nlos_cam.render.geometry import NO_OCCLUDER, Beams, Relay, softened_leg
+from nlos_cam.render.geometry import NO_OCCLUDER, Beams, Relay, softened_leg, spread
 from nlos_cam.render.interreflection import AROUND_M
 from nlos_cam.render.job import TransportJob
 from nlos_cam.render.patches import Patches
@@ -77,7 +77,8 @@ class EnergySurvey:
         # A BRDF may give the changed patches up to `uneven` times the others' light.
         whole = float(self.energy.sum())
         part = CAUTION * self.uneven * float(change.sum())
-        return min(part / whole, 1.0) if whole > 0 else float(part > 0)
+        # Where the sample finds no light at all, nothing is known of what an effect changes.
+        return min(part / whole, 1.0) if whole > 0 else float(change.size > 0)
 
     @property
     def tilt(self) -> float:
@@ -103,8 +104,8 @@ def survey(job: TransportJob, uneven: float) -> EnergySurvey:
     `uneven` is the largest ratio of light between two patches that a BRDF may cause.
     """
     relay = job.relay
-    lit = slice(None, None, max(len(job.laser_spot_m) // SAMPLE_BEAMS, 1))
-    some = slice(None, None, max(len(relay.x_m) // SAMPLE_CELLS, 1))
+    lit = spread(len(job.laser_spot_m), SAMPLE_BEAMS)
+    some = spread(len(relay.x_m), SAMPLE_CELLS)
     weight = job.beam_weight[lit]
     # Every leg from a spot's beam to the lidar is free: the beam would not light the wall else.
     feet = _contiguous(

@@ -19,6 +19,7 @@ NEIGHBOR_GAIN = 1.2
 """Factor on the near-contact term, as neighbors receive too: at 1 a plane of square cells receives
 7 % more than was sent. Sufficient for cells up to twice as long as wide.
 """
+GOLDEN = (5**0.5 - 1) / 2
 Area = TypeVar("Area", Float64, float)
 
 
@@ -254,6 +255,18 @@ class Relay:
     def behind(self, edge_m: tuple[float, float], lidar_m: Float64) -> Mask:
         """Return a mask (n,) of the cells that an occluder with that edge hides from the lidar."""
         return behind(edge_m, self.x_m, np.zeros_like(self.x_m), lidar_m)
+
+
+def spread(count: int, sample: int) -> NDArray[np.int64]:
+    """Return the indices of about `sample` of `count` points of a grid in the order of its rows,
+    spread over rows and columns; all where there are no more.
+    """
+    if count <= sample:
+        return np.arange(count)
+    # One of each of `sample` equal runs, at a place that goes by the golden ratio: every so many
+    # points alone could all lie in one column of the grid.
+    run = np.arange(sample)
+    return ((run + run * GOLDEN % 1) * count / sample).astype(np.int64)
 
 
 def occluder_edge(rig: Rig) -> tuple[float, float]:

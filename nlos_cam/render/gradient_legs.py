@@ -29,6 +29,8 @@ from nlos_cam.render.legs import (
 from nlos_cam.render.planning import RenderProblem
 from nlos_cam.render.visibility import HeightField
 
+CONTACT_M2 = np.float32(1e-20)
+"""Smallest square of a leg's length that is divided by."""
 CHUNKS = 16
 """Parts of the patches, each summed by one thread: the result does not depend on the number of
 threads.
@@ -289,7 +291,8 @@ def _pull_legs(
         # A leg behind the patch has no weight, and must not divide by its cosine.
         front = light[i] / across if faces and across > nothing else nothing
         # d length / d patch = -v / length, in the same direction as the weight's fall.
-        pulled = light[i] * _fall(squared, soft, optics) - longer[i] / np.sqrt(squared)
+        length = np.sqrt(max(squared, CONTACT_M2))
+        pulled = light[i] * _fall(squared, soft, optics) - longer[i] / length
         total += light[i]
         facing += front
         facing_x += front * dx
@@ -302,7 +305,8 @@ def _pull_legs(
         points_out[2, i] += longer[i]
         points_out[3, i] += light[i]
     # v_z = -z for every leg, so that the z components come out of the sums.
-    height = total / z if outgoing or optics.lambertian else nothing
+    # Where the object touches the wall, its cosine is 0, and the derivative is left out.
+    height = total / z if (outgoing or optics.lambertian) and z > nothing else nothing
     patch[0] += away_x - nx * facing
     patch[1] += away_y - ny * facing
     patch[2] += height - z * away - nz * facing
@@ -339,7 +343,7 @@ def _push_legs(
     # its plane.
     faces = optics.lambertian or not outgoing
     nothing = np.float32(0)
-    height = pz / z if outgoing or optics.lambertian else nothing
+    height = pz / z if (outgoing or optics.lambertian) and z > nothing else nothing
     for i in range(len(light)):
         # v = point - patch changes by (vx, vy, -pz): the wall's points stay in its plane.
         dx = points.x_m[i] - x
@@ -353,7 +357,7 @@ def _push_legs(
         turned = nx * vx + ny * vy - nz * pz + tx * dx + ty * dy - tz * z
         front = turned / across if faces and across > nothing else nothing
         light[i] = front - _fall(squared, soft, optics) * along + height + moved.light[i]
-        longer[i] = along / np.sqrt(squared) + moved.length[i]
+        longer[i] = along / np.sqrt(max(squared, CONTACT_M2)) + moved.length[i]
 
 
 @numba.njit(cache=True)

@@ -39,6 +39,7 @@ from nlos_cam.render.gradient_legs import (
     softened_slope,
 )
 from nlos_cam.render.job import TransportJob
+from nlos_cam.render.material import brdf_mean
 from nlos_cam.render.planning import RenderProblem, prepare
 from nlos_cam.render.scene import Scene
 from nlos_cam.render.scene_facts import bins_of
@@ -129,7 +130,6 @@ def moved(
         patches=patches,
         relay=relay,
         lidar_m=beams.lidar_m,
-        map_spots_m=spots,
         laser_spot_m=spots,
         length_m=beams.length_m[lit],
         cos_incidence=beams.cos_incidence[lit],
@@ -255,7 +255,7 @@ class Gradients:
 
         # A cell's depth moves its own patch along z, and tilts it and its neighbors.
         depth = point[:, 2] + self._tilts.transposed(normal, strength)
-        albedo = strength * job.patches.area_m2
+        albedo = strength * job.patches.area_m2 * self._of_albedo
         return SceneVector(self.image(depth), self.image(albedo), point, lidar, wall)
 
     def push(self, change: SceneVector) -> tuple[Float64, Float64]:
@@ -302,7 +302,8 @@ class Gradients:
             return np.zeros((0, 0), np.float32), np.zeros((0, 0), np.float32)
         if parameters == "albedo":
             nowhere = np.zeros_like(self.echo_job.patches.normal)
-            return self._each(nowhere, nowhere, self.echo_job.patches.area_m2)
+            strength = self.echo_job.patches.area_m2 * self._of_albedo
+            return self._each(nowhere, nowhere, strength)
         tilts = self._tilts
         still = np.zeros(len(self._tilts.beta))
         up = np.tile([0.0, 0.0, 1.0], (len(still), 1))
@@ -346,10 +347,19 @@ class Gradients:
             normal = normal + turned
             strength = strength + stronger
         if change.albedo is not None:
-            strength = strength + np.asarray(change.albedo, np.float64)[where] * patches.area_m2
+            rate = np.asarray(change.albedo, np.float64)[where] * self._of_albedo
+            strength = strength + rate * patches.area_m2
         return PatchChange(
             *(np.ascontiguousarray(part, np.float32) for part in (point, normal, strength))
         )
+
+    @property
+    def _of_albedo(self) -> float:
+        """Rate of a patch's own albedo by the scene's: a BRDF that is left out is a factor of
+        it.
+        """
+        brdf = self.problem.scene.surface.brdf
+        return 1.0 if brdf is None else brdf_mean(brdf)
 
     def image(self, values: Float64) -> Float64:
         """Return the patches' values as an image of the depth map, 0 for background."""

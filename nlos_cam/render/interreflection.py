@@ -15,7 +15,7 @@ from nlos_calibration.arrays import Float32, Float64, Int64
 from numpy.typing import NDArray
 
 from nlos_cam.frames import inner
-from nlos_cam.render.geometry import contact_m2, softened_leg
+from nlos_cam.render.geometry import contact_m2, softened_leg, spread
 from nlos_cam.render.job import PatchArrays, TransportJob
 from nlos_cam.render.visibility import HeightField, occluded, segment_blocked, visible
 
@@ -282,16 +282,18 @@ def interreflection_share(job: TransportJob, incident: Float64, returned: Float6
     `incident` and `returned` (n,) are the light that each patch gives on, and the share of it that
     reaches the lidar.
     """
-    step = -(-len(incident) // SAMPLE_PATCHES)
-    # Energy of three bounces: sum_a I_a R_a. With one more: sum_a I_a sum_b F(a, b) R_b. Every
-    # step-th patch stands for `step` of them, so its area counts `step` times.
-    patches = PatchArrays._make(column[::step].copy() for column in job.patch_arrays)
-    patches = patches._replace(strength=step * patches.strength, soft_m2=step * patches.soft_m2)
-    incident = incident[::step]
-    returned = returned[::step]
+    some = spread(len(incident), SAMPLE_PATCHES)
+    # Energy of three bounces: sum_a I_a R_a. With one more: sum_a I_a sum_b F(a, b) R_b. A patch of
+    # the sample stands for `each` of them, so its area counts as often.
+    each = len(incident) / max(len(some), 1)
+    patches = PatchArrays._make(column[some].copy() for column in job.patch_arrays)
+    patches = patches._replace(strength=each * patches.strength, soft_m2=each * patches.soft_m2)
+    incident = incident[some]
+    returned = returned[some]
     over_object = patch_to_patch(patches, job.field, job.near_m, job.lambertian) @ returned
     there, back = wall_factors(job, wall_cells(job), patches)
     # Over the wall the energy goes by two matrices, n m each, as in `add_interreflection`.
     by_wall = there @ (back.T @ returned)
     whole = float((incident * returned).sum())
-    return float((incident * (over_object + by_wall)).sum()) / whole if whole > 0 else 0.0
+    # Where the sample finds no light, as for the survey: nothing is known.
+    return float((incident * (over_object + by_wall)).sum()) / whole if whole > 0 else 1.0

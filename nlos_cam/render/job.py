@@ -54,10 +54,6 @@ class TransportJob:
     bin_m: float
     bins: int
     accuracy: Accuracy
-    map_spots_m: Float64
-    """(k, 3); laser spots of the whole map: BRDF tables are laid out among these, whichever beams
-    are rendered.
-    """
     wall_m: tuple[float, float, float, float]
     """(x_min, x_max, y_min, y_max) of the physical wall, for interreflection."""
     brdf: Brdf | None = None

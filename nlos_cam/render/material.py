@@ -65,13 +65,20 @@ class Material(Record):
     albedo: float | tuple[float, float, float] = 1.0
     """One number, or three for red, green and blue."""
 
-    @field_validator("albedo")
+    @field_validator("albedo", mode="before")
     @classmethod
-    def _check_albedo(
-        cls, albedo: float | tuple[float, float, float]
-    ) -> float | tuple[float, float, float]:
-        if not all(0 <= value <= 1 for value in np.atleast_1d(albedo)):
-            raise PydanticCustomError("albedo", "must be from 0 to 1")
+    def _check_albedo(cls, albedo: object) -> object:
+        values = albedo if isinstance(albedo, list | tuple) else (albedo,)
+        numbers = [
+            value
+            for value in values
+            if isinstance(value, int | float) and not isinstance(value, bool) and 0 <= value <= 1
+        ]
+        wanted = 3 if values is albedo else 1
+        if len(numbers) != len(values) or len(values) != wanted:
+            raise PydanticCustomError(
+                "albedo", "must be one number from 0 to 1, or three for red, green and blue"
+            )
         return albedo
 
     @property
@@ -129,6 +136,11 @@ class Surface:
                 f"albedo has {albedo.shape[:2]} cells but the depth map has {shape}: use one shape"
             )
         return np.broadcast_to(albedo, (*shape, albedo.shape[-1]))
+
+
+def brdf_mean(brdf: Brdf) -> float:
+    """Return the value that stands for a BRDF that is left out: the middle of its range."""
+    return float(np.mean(brdf_range(brdf)))
 
 
 def brdf_range(brdf: Brdf) -> tuple[float, float]:

@@ -9,6 +9,7 @@ from math import sqrt
 from typing import Self
 
 import numpy as np
+from nlos_calibration.arrays import Float64
 
 from nlos_cam.errors import SceneError
 from nlos_cam.frames import MAP_ROWS
@@ -26,6 +27,8 @@ from nlos_cam.render.geometry import (
 )
 from nlos_cam.render.interreflection import AROUND_M
 from nlos_cam.render.job import TransportJob
+from nlos_cam.render.line_of_sight import DirectVisibility
+from nlos_cam.render.material import Surface, brdf_mean
 from nlos_cam.render.patches import Patches
 from nlos_cam.render.scene import Scene
 from nlos_cam.render.scene_facts import SceneFacts
@@ -63,7 +66,7 @@ def _occluder(facts: SceneFacts) -> Finding:
     if facts.rig.occluder is None:
         return "occluder", 0.0, "the rig has none"
     beams = facts.beams()
-    if stopped := int((~beams.on_wall & np.isfinite(beams.length_m)).sum()):
+    if stopped := facts.stopped_by_occluder:
         return "occluder", 1.0, f"{stopped} beams return from it"
     if facts.patches is None or facts.light is None:
         return "occluder", 0.0, "no beam meets it, and nothing is hidden"
@@ -188,6 +191,9 @@ class RenderProblem:
     """
     color_jobs: tuple[TransportJob | None, ...]
     """The same for red, green and blue if the plan includes color; else empty."""
+    tint: Float64 | None = None
+    """(n, 3); direct return of each beam in red, green and blue, relative to the mean; None where
+    all of them return from something white."""
 
     @classmethod
     def of(cls, facts: SceneFacts, verdicts: Plan, rows: tuple[int, int] | None = None) -> Self:
@@ -197,17 +203,24 @@ class RenderProblem:
         scene = facts.scene
         per_cell = facts.accuracy.beams_per_cell
         with_occluder = included(verdicts, "occluder")
-        # What is left out is left out everywhere: beams, relay cells and legs see the same edge.
+        # What is left out is left out everywhere: beams, relay cells and legs see the same edge. An
+        # occluder that no beam meets has no part in the facts themselves.
+        if not with_occluder and facts.stopped_by_occluder:
+            facts = facts.without_occluder()
         edge_m = occluder_edge(scene.rig) if with_occluder else NO_OCCLUDER
         beams = facts.beams(occluder=with_occluder)
         hidden = facts.relay.behind(edge_m, beams.lidar_m)
+        tint = None
         if included(verdicts, "line-of-sight") and (blocked := facts.line_of_sight) is not None:
-            albedo = facts.albedo[blocked.row, blocked.column]
+            albedo = facts.albedo[blocked.row, blocked.column] * _returned_by(
+                scene.surface, blocked, with_brdf=included(verdicts, "brdf")
+            )
             solid = solid_angle(lambertian=facts.lambertian)
             beams = beams.with_hits(
                 scene.rig, blocked.beam, blocked.length_m, blocked.cosine, albedo, solid
             )
             hidden |= blocked.hidden
+            tint = _tint(facts, blocked, len(beams.direct))
         if not included(verdicts, "direct"):
             beams = beams.without_direct()
         relay = facts.relay.select(~hidden)
@@ -217,9 +230,16 @@ class RenderProblem:
             _job(facts, verdicts, beams, (start, end), relay, edge_m, channel)
             for channel in (None, *range(3 if colored else 0))
         ]
-        return cls(
-            scene, facts.accuracy, verdicts, beams.rows(start, end), jobs[0], tuple(jobs[1:])
-        )
+        if tint is not None:
+            tint = tint[start * beams.shape[1] : end * beams.shape[1]]
+        seen = beams.rows(start, end)
+        return cls(scene, facts.accuracy, verdicts, seen, jobs[0], tuple(jobs[1:]), tint)
+
+    def beams_of(self, channel: int) -> Beams:
+        """Return the beams with the direct returns of one channel."""
+        if self.tint is None:
+            return self.beams
+        return replace(self.beams, direct=self.beams.direct * self.tint[:, channel])
 
     def includes(self, effect: str) -> bool:
         """Return whether the plan includes an effect."""
@@ -254,8 +274,7 @@ def _job(
     """Return the transport of the beams in some rows with the albedo of one channel, or with the
     mean of all.
 
-    Bins and BRDF nodes come from the beams of the whole map, so that they do not depend on the
-    rows.
+    Bins come from the beams of the whole map, so that they do not depend on the rows.
     """
     # Rows of the image are runs of the flattened beams.
     ends = (row * beams.shape[1] for row in rows)
@@ -289,6 +308,30 @@ def _job(
     return job
 
 
+def _returned_by(
+    surface: Surface, blocked: DirectVisibility, *, with_brdf: bool
+) -> Float64 | float:
+    """Return what the BRDF sends straight back to the lidar of each beam that the object stops,
+    relative to a diffuse surface.
+    """
+    if surface.brdf is None:
+        return 1.0
+    if not with_brdf:
+        return brdf_mean(surface.brdf)
+    return surface.brdf(blocked.cosine, blocked.cosine, 1.0)
+
+
+def _tint(facts: SceneFacts, blocked: DirectVisibility, beams: int) -> Float64 | None:
+    """Return RenderProblem's `tint` of the beams that the object stops."""
+    if not facts.scene.surface.colored:
+        return None
+    found = facts.channels[blocked.row, blocked.column]
+    mean = found.mean(-1, keepdims=True)
+    tint = np.ones((beams, found.shape[-1]))
+    tint[blocked.beam] = np.where(mean > 0, found / np.where(mean > 0, mean, 1), 1.0)
+    return tint
+
+
 def _patches(facts: SceneFacts, verdicts: Plan, channel: int | None) -> Patches | None:
     """Return the patches with tilt and BRDF as the plan includes them."""
     patches = facts.patches
@@ -299,5 +342,5 @@ def _patches(facts: SceneFacts, verdicts: Plan, channel: int | None) -> Patches 
     if not included(verdicts, "tilt"):
         patches = patches.level()
     if facts.scene.surface.brdf is not None and not included(verdicts, "brdf"):
-        patches = replace(patches, albedo=patches.albedo * np.mean(facts.brdf_range))
+        patches = replace(patches, albedo=patches.albedo * brdf_mean(facts.scene.surface.brdf))
     return patches

@@ -140,9 +140,11 @@ class TransientAxes:
     lidar_m: Float64
     """(3,); where all light leaves and comes back."""
     laser_spots_m: Float64
-    """(rows, columns, 3); where each beam lands; NaN where it meets nothing."""
+    """(rows, columns, 3); where each beam lands on wall or occluder as if nothing were hidden; NaN
+    where it meets nothing."""
     relay_m: Float64
-    """(n, 3); centers of the relay wall's cells from which light comes back."""
+    """(n, 3); centers of the relay wall's cells as if nothing stood in front of it: none comes back
+    from those that occluder or object hide."""
 
 
 def transient_axes(scene: Scene, accuracy: str | Accuracy = "standard") -> TransientAxes:
@@ -254,7 +256,7 @@ def _rendering(problem: RenderProblem, echoes: MultiBounce, backend: str) -> Ren
     """Return the maps of a problem from the strongest bins (n,) of its beams: S5, cells, color."""
     echoes = echoes.reshape(problem.beams.shape)
     depth, intensity, margin = compete(problem.beams, echoes)
-    color = _color(problem, echoes, backend) if problem.color_jobs else None
+    color = _color(problem, echoes, depth, backend) if problem.color_jobs else None
     near = count_near_legs(problem.job) if problem.job else 0
     return Rendering(
         *_cells(depth, intensity, margin), echoes, problem.plan, problem.accuracy, near, color
@@ -269,7 +271,8 @@ def _strongest(problem: RenderProblem, histograms: Histograms | None) -> MultiBo
     bin_m = problem.scene.rig.device.bin_m
     if problem.includes("pulse"):
         whole = _waveforms(problem, _spread_over(lit, histograms))
-        return replace(strongest(whole, bin_m), direct_included=True)
+        found = strongest(whole, bin_m, problem.scene.pulse_ns)
+        return replace(found, direct_included=True)
     if histograms is None:
         return no_echoes(len(lit))
     return strongest(histograms, bin_m).spread_over(lit)
@@ -288,9 +291,9 @@ def _waveforms(problem: RenderProblem, histograms: Histograms) -> Float32:
     return whole[:, : gate_bins(device)]
 
 
-def _color(problem: RenderProblem, echoes: MultiBounce, backend: str) -> Float32:
-    """Return the intensity (64, 80, 3) of each channel in the bin of the winning echo; the wall is
-    white.
+def _color(problem: RenderProblem, echoes: MultiBounce, depth: Float32, backend: str) -> Float32:
+    """Return the intensity (64, 80, 3) of each channel in the bin of the winning echo, of the depth
+    map (rows, columns) of the beams; the wall is white.
     """
     bin_m = problem.scene.rig.device.bin_m
     beams = np.arange(echoes.peak.size)
@@ -299,14 +302,17 @@ def _color(problem: RenderProblem, echoes: MultiBounce, backend: str) -> Float32
     wins = (echoes.peak.ravel() > problem.beams.direct) | echoes.direct_included
     at = np.nan_to_num(echoes.path_m.ravel() / bin_m, nan=0).astype(np.int64)
     channels: list[Float32] = []
-    for job in problem.color_jobs:
-        histogram = beam_histograms(problem, job, backend).astype(np.float32, copy=False)
+    for number, job in enumerate(problem.color_jobs):
+        own = replace(problem, beams=problem.beams_of(number))
+        histogram = beam_histograms(own, job, backend).astype(np.float32, copy=False)
         if echoes.direct_included:
-            histogram = _waveforms(problem, histogram)
+            histogram = _waveforms(own, histogram)
         value = np.where(
-            wins, histogram[beams, np.minimum(at, histogram.shape[1] - 1)], problem.beams.direct
+            wins, histogram[beams, np.minimum(at, histogram.shape[1] - 1)], own.beams.direct
         )
-        channels.append(_cell_mean(value.reshape(echoes.peak.shape)).astype(np.float32))
+        value = value.reshape(echoes.peak.shape).astype(np.float32)
+        # over the beams that make a cell's intensity: the channels' mean is that intensity
+        channels.append(_cells(depth, value, echoes.peak)[1])
     return np.stack(channels, -1)
 
 

@@ -19,8 +19,8 @@ same paths.
 """
 MAX_PULSE_NS = 100
 FINEST_GRID = 256
-"""Cells along a side of a depth map: sixteen times the default's number, and tables within a
-gigabyte.
+"""Cells along a side of a depth map: sixteen times the default's number, and tables of some
+gigabytes in `fine`.
 """
 
 

@@ -1,6 +1,6 @@
 """Facts of a scene at an accuracy, each computed at most once: the input of the effect plan."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -37,14 +37,19 @@ class SceneFacts:
     accuracy: Accuracy
 
     @property
+    def channels(self) -> Float64:
+        """Albedo (rows, columns, channels) of the accuracy's grid: mean of each block of cells."""
+        size = len(self.depth_m)
+        stride = self.stride
+        every = self.scene.surface.over((size * stride, size * stride))
+        return every.reshape(size, stride, size, stride, -1).mean((1, 3))
+
+    @property
     def albedo(self) -> Float64:
         """Albedo (rows, columns) of the accuracy's grid: mean of the channels and of each block of
         cells.
         """
-        size = len(self.depth_m)
-        stride = self.stride
-        every = self.scene.surface.over((size * stride, size * stride)).mean(-1)
-        return every.reshape(size, stride, size, stride).mean((1, 3))
+        return self.channels.mean(-1)
 
     @property
     def lambertian(self) -> bool:
@@ -62,6 +67,17 @@ class SceneFacts:
         """
         intrinsics = self.scene.intrinsics(self.accuracy.beams_per_cell)
         return cast(self.rig, intrinsics, lambertian=self.lambertian, occluder=occluder)
+
+    @cached_property
+    def stopped_by_occluder(self) -> int:
+        """Number of beams that return from the occluder."""
+        beams = self.beams()
+        return int((~beams.on_wall & np.isfinite(beams.length_m)).sum())
+
+    def without_occluder(self) -> "SceneFacts":
+        """Return the facts of the same scene with the occluder taken away."""
+        rig = self.rig.model_copy(update={"occluder": None})
+        return replace(self, scene=replace(self.scene, rig=rig))
 
     @property
     def stride(self) -> int:
@@ -93,6 +109,8 @@ class SceneFacts:
         """
         if np.isnan(self.depth_m).all() or not self.beams().on_wall.any():
             return None
+        if not self.relay.x_m.size:
+            return None
         # The shortest path of three bounces goes twice between wall and object: at least 2 z.
         if 2 * np.nanmin(self.depth_m) >= SPEED_OF_LIGHT_M_PER_S * self.rig.device.gate_s:
             return None
@@ -114,10 +132,13 @@ class SceneFacts:
 
     @cached_property
     def relay(self) -> Relay:
-        """Whole relay wall, with nothing in front of it."""
-        return relay_cells(
-            self.rig, self.beams().lidar_m, self.accuracy.relay_columns, self.accuracy.relay_rows
-        )
+        """Relay wall with nothing in front of it: the cells that lie on the physical wall."""
+        columns = self.accuracy.relay_columns
+        cells = relay_cells(self.rig, self.beams().lidar_m, columns, self.accuracy.relay_rows)
+        wall = self.rig.wall
+        on_wall = (cells.x_m >= wall.x_min_m) & (cells.x_m <= wall.x_max_m)
+        on_wall &= (cells.y_m >= wall.y_min_m) & (cells.y_m <= wall.y_max_m)
+        return cells if on_wall.all() else cells.select(on_wall)
 
     @cached_property
     def _whole_job(self) -> TransportJob | None:
@@ -186,7 +207,6 @@ class SceneFacts:
             bin_m=device.bin_m,
             bins=bins_of(beams, patches, relay, device),
             accuracy=self.accuracy,
-            map_spots_m=spots,
             wall_m=(wall.x_min_m, wall.x_max_m, wall.y_min_m, wall.y_max_m),
         )
 

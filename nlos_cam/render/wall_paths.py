@@ -128,7 +128,6 @@ class WallPaths:
             laser_spot_m=np.ascontiguousarray(laser_m),
             length_m=length_m,
             cos_incidence=beams.lidar_m[2] / length_m,
-            map_spots_m=laser_m,
             brdf=scene.surface.brdf,
         )
         cell_m = cells.points_m.reshape(-1, 3)

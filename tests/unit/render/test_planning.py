@@ -8,7 +8,7 @@ import pytest
 from depth_maps import depth_map
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from nlos_calibration import load_rig
+from nlos_calibration import Occluder, load_rig
 
 from nlos_cam.errors import SceneError
 from nlos_cam.objects import object_box, object_depth
@@ -22,7 +22,7 @@ from nlos_cam.render.accuracy import (
 )
 from nlos_cam.render.effects import EFFECTS, decide, included
 from nlos_cam.render.energy_survey import CAUTION, EnergySurvey
-from nlos_cam.render.geometry import NO_OCCLUDER, SPEED_OF_LIGHT_M_PER_S
+from nlos_cam.render.geometry import NO_OCCLUDER, SPEED_OF_LIGHT_M_PER_S, spread
 from nlos_cam.render.planning import RenderProblem, plan, prepare
 from nlos_cam.render.scene_facts import SceneFacts
 
@@ -276,8 +276,9 @@ def test_survey_share_is_cautious_and_at_most_1() -> None:
         assert found.tilt == found.occluder == 0
     dark = EnergySurvey(none, two, two, two, two, two, 1.0)
 
+    # A sample without light bounds nothing.
     assert dark.share(two) == 1
-    assert dark.share(none) == 0
+    assert dark.share(none) == 1
 
 
 @pytest.mark.parametrize("z_m", [0.0, 1e-9])
@@ -294,6 +295,61 @@ def test_survey_bounds_the_energy_of_a_patch_on_the_wall(z_m: float) -> None:
 
     assert np.isfinite(light.energy).all()
     assert light.energy.max() < 1e3 * np.median(light.energy)
+
+
+@pytest.mark.parametrize("per_cell", [2, 4, 5, 8])
+def test_bound_depends_little_on_how_many_beams_a_cell_has(per_cell: int) -> None:
+    """At five beams a cell, every so many beams of the paper's rig lie in one column."""
+    at = np.linspace(-1, 1, 32)
+    bump = (0.2 + 0.1 * (at[:, None] ** 2 + at**2)).astype(np.float32)
+    scene = Scene(RIG, bump, jump_m=0.5)
+    one, several = (
+        SceneFacts(scene, Accuracy("some", 24, 24, sub_bins=64, beams_per_cell=count)).light
+        for count in (1, per_cell)
+    )
+
+    assert one is not None
+    assert several is not None
+    assert (several.energy > 0).mean() == pytest.approx((one.energy > 0).mean(), abs=0.05)
+    assert several.tilt == pytest.approx(one.tilt, rel=0.2)
+
+
+@pytest.mark.parametrize(("count", "sample"), [(5, 8), (320 * 295, 160), (64 * 80, 96), (48, 48)])
+def test_sample_of_a_grid_is_spread_over_rows_and_columns(count: int, sample: int) -> None:
+    found = spread(count, sample)
+    columns = 295 if count % 295 == 0 else 80
+
+    assert len(found) == min(count, sample)
+    assert (np.diff(found) > 0).all()
+    assert found[-1] < count
+    if count > sample:
+        shares = np.histogram(found % columns, 4, (0, columns))[0] / len(found)
+        np.testing.assert_allclose(shares, 0.25, atol=0.1)
+
+
+def test_occluder_that_is_left_out_stands_nowhere() -> None:
+    # it hides the whole wall from this lidar
+    wide = RIG.model_copy(update={"occluder": Occluder(x_m=0.005, z_min_m=0.02)})
+    open_rig = RIG.model_copy(update={"occluder": None})
+    effects = ["direct", "three-bounce", "line-of-sight"]
+    without, none = (
+        prepare(Scene(rig, np.full((8, 8), 0.12, np.float32)), COARSE, effects)
+        for rig in (wide, open_rig)
+    )
+
+    assert without.job is not None
+    np.testing.assert_array_equal(without.beams.direct, none.beams.direct)
+    np.testing.assert_array_equal(without.beams.on_wall, none.beams.on_wall)
+    np.testing.assert_array_equal(without.job.laser_spot_m, none.job.laser_spot_m)
+
+
+def test_no_light_comes_back_from_beyond_the_wall() -> None:
+    wall = RIG.wall.model_copy(update={"x_max_m": 0.3})
+    facts = SceneFacts(Scene(RIG.model_copy(update={"wall": wall}), LEVEL), COARSE)
+
+    assert RIG.relay.x_max_m > 0.3
+    assert 0 < len(facts.relay.x_m) < len(SceneFacts(Scene(RIG, LEVEL), COARSE).relay.x_m)
+    assert facts.relay.x_m.max() <= 0.3
 
 
 LEVEL = np.full((8, 8), 0.25, np.float32)

@@ -24,8 +24,9 @@ from nlos_cam.render import (
     render,
     transient,
 )
+from nlos_cam.render import echoes as echoes_module
 from nlos_cam.render.backend_numba import echoes, histograms
-from nlos_cam.render.echoes import MultiBounce, compete, no_echoes, strongest
+from nlos_cam.render.echoes import MultiBounce, compete, no_echoes, strongest, with_pulse
 from nlos_cam.render.effects import Effect
 from nlos_cam.render.geometry import Beams
 from nlos_cam.render.job import TransportJob
@@ -85,6 +86,47 @@ def test_color_is_the_winning_echo_in_each_channel() -> None:
         ),
         rtol=1e-6,
     )
+
+
+def test_color_of_what_the_lidar_sees_itself_is_its_own() -> None:
+    rig = load_rig("bare-wall").model_copy(update={"object_box": RIG.object_box})
+    albedo = np.array([1.0, 0.5, 0.0])
+    scene = Scene(rig, np.full((8, 8), 0.06, np.float32), Surface(albedo))
+    rendering = render(scene, COARSE)
+    in_sight = rendering.depth_m < render(Scene(rig), COARSE).depth_m - 0.01
+
+    assert in_sight.any()
+    np.testing.assert_allclose(
+        rendering.color[in_sight],
+        rendering.intensity[in_sight, None] * albedo / albedo.mean(),
+        rtol=1e-5,
+    )
+
+
+@pytest.mark.parametrize("pulse_ns", [0.0, 0.05])
+def test_mean_of_the_channels_is_the_intensity(pulse_ns: float) -> None:
+    albedo = np.array([1.0, 0.5, 0.2])
+    finer = replace(COARSE, beams_per_cell=2)
+    rendering = render(Scene(RIG, DEPTH, Surface(albedo), pulse_ns=pulse_ns), finer)
+
+    np.testing.assert_allclose(rendering.color.mean(-1), rendering.intensity, rtol=1e-5, atol=1e-30)
+
+
+def test_lone_return_has_no_rival_under_a_pulse() -> None:
+    found = render(Scene(load_rig("bare-wall"), pulse_ns=1.0), COARSE)
+    lit = found.intensity > 0
+
+    assert lit.any()
+    # A Gaussian has 1/16 of its peak one full width away.
+    np.testing.assert_allclose(found.margin[lit], 1 - 1 / 16, atol=0.02)
+
+
+def test_pulse_spreads_some_rows_at_a_time_as_all(monkeypatch: pytest.MonkeyPatch) -> None:
+    light = np.random.default_rng(0).random((7, 60), np.float32)
+    whole = with_pulse(light, 1.0, BIN_M)
+    monkeypatch.setattr(echoes_module, "TRANSFORM_VALUES", 2 * whole.shape[1])
+
+    np.testing.assert_array_equal(with_pulse(light, 1.0, BIN_M), whole)
 
 
 BIN_M = 0.01

@@ -5,6 +5,7 @@ from typing import Any
 import numpy as np
 import pytest
 from nlos_calibration.rig import load_rig
+from pydantic import ValidationError
 
 from nlos_cam.errors import SceneError
 from nlos_cam.render.material import Material, Surface, brdf_range, phong, retroreflective
@@ -121,6 +122,14 @@ def test_material_makes_the_brdf_of_its_kind() -> None:
         )
         assert material.surface.colored
         assert material.brdf(0.6, 0.7, 0.8) == pytest.approx(make(0.7, 0.3, 7)(0.6, 0.7, 0.8))
+
+
+@pytest.mark.parametrize("albedo", [(0.5, 0.6), 1.5, (0.1, 0.2, -1.0), "white", True, (0.5,)])
+def test_material_says_what_an_albedo_may_be(albedo: Any) -> None:
+    with pytest.raises(ValidationError, match="one number from 0 to 1, or three") as refused:
+        Material(albedo=albedo)
+
+    assert [error["loc"] for error in refused.value.errors()] == [("albedo",)]
 
 
 def test_brdf_range_holds_the_lobe() -> None:

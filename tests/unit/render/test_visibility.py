@@ -19,6 +19,7 @@ from nlos_cam.render import (
 from nlos_cam.render.backend_numba import NumbaJob
 from nlos_cam.render.legs import DARK, FREE, NumbaOptics, NumbaSurface, judge
 from nlos_cam.render.line_of_sight import first_hits
+from nlos_cam.render.material import brdf_range, retroreflective
 from nlos_cam.render.scene_facts import SceneFacts
 from nlos_cam.render.visibility import (
     FACES,
@@ -318,6 +319,26 @@ def test_sight_stops_beams_and_hides_relay_cells() -> None:
     ).beams.direct[sight.beam]
 
     np.testing.assert_allclose(ready.beams.direct[sight.beam], 0.5 * white)
+
+
+def test_retroreflector_in_sight_returns_its_lobe() -> None:
+    depth = np.full((8, 8), 0.06, np.float32)
+    coat = retroreflective(0.5, 0.5, 20)
+    matt, bright, plain = (
+        prepare(Scene(OPEN, depth, Surface(0.5, brdf)), COARSE, effects).beams.direct
+        for brdf, effects in (
+            (None, "auto"),
+            (coat, "auto"),
+            (coat, ["direct", "three-bounce", "line-of-sight"]),
+        )
+    )
+    seen = SceneFacts(Scene(OPEN, depth), COARSE).line_of_sight.beam
+
+    # 0.5 + 0.5 (n + 2) / 2 straight back, whatever the incidence
+    np.testing.assert_allclose(bright[seen], 6.0 * matt[seen])
+    np.testing.assert_allclose(plain[seen], np.mean(brdf_range(coat)) * matt[seen])
+    others = np.setdiff1d(np.arange(len(matt)), seen)
+    np.testing.assert_array_equal(bright[others], matt[others])
 
 
 UP = np.array([0.0, 0.0, 1.0])
