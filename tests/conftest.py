@@ -1,3 +1,5 @@
+import os
+import shutil
 import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -9,10 +11,25 @@ from fake_librealsense import FakeSdk
 from fake_lidar import FakeLidar, NapClock
 from nlos_calibration import Rig, load_rig
 from noise_bags import make_all
+from program_state import program_digest
 
 from nlos_cam.camera import Recording, SimulatedCamera
 from nlos_cam.camera.l515 import L515Camera
 from nlos_cam.render import SensedImages
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Keep what tests cache apart from the user's own cache, and from what another state of the
+    program has cached: a result that no longer follows from the code must not pass.
+    """
+    if "NLOS_CAM_CACHE" in os.environ:  # also in the processes of xdist, which inherit it
+        return
+    caches = config.rootpath / ".pytest_cache" / "nlos-cam"
+    own = caches / program_digest()
+    for other in caches.glob("*"):
+        if other != own:
+            shutil.rmtree(other, ignore_errors=True)
+    os.environ["NLOS_CAM_CACHE"] = str(own)
 
 
 @pytest.fixture(autouse=True)

@@ -214,7 +214,7 @@ def one_wrap(faults: tuple[Fault, ...]) -> tuple[Fault, ...]:
     return faults
 
 
-RENDERING_VERSION = 6
+RENDERING_VERSION = 7
 """Number to raise with any change of rendering results or of datasets' noise: cached worlds are
 rendered again, and datasets of another number are not continued.
 """

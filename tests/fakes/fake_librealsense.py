@@ -11,9 +11,14 @@ from typing import Any
 
 from fake_lidar import FakeFrame, FakeLidar, FakeProfile, Named
 
+from nlos_cam.camera.l515 import ADJUSTABLE
+
 SIZES = [(1024, 768), (640, 480), (320, 240)]
 COLOUR_SIZES = [(1920, 1080), (1280, 720), (960, 540), (640, 480)]
 GONE = "failed to set power state"
+DEPENDENT = ADJUSTABLE
+"""Options that a preset sets; firmware 1.5.8.1 and librealsense 2.54 have some more."""
+CUSTOM = 0.0
 
 
 class FakeSensor:
@@ -81,8 +86,18 @@ class FakeSensor:
         low, high, _ = self.lidar.ranges.get(option.name, (0.0, 100.0, 1.0))
         if option.name in self.lidar.refused or not low <= value <= high:
             raise RuntimeError("out of range")
-        if option.name not in self.lidar.stubborn:
-            self.lidar.options[option.name] = value
+        if option.name in self.lidar.stubborn:
+            return
+        options = self.lidar.options
+        options[option.name] = value
+        # As in librealsense: a preset sets the options that depend on it anew, and an option that
+        # is set by hand makes the preset a custom one.
+        if option.name == "visual_preset":
+            factory = self.lidar.factory
+            offered = [name for name in DEPENDENT if name in options and name in factory]
+            options |= {name: factory[name] for name in offered}
+        elif option.name in DEPENDENT and "visual_preset" in options:
+            options["visual_preset"] = CUSTOM
 
 
 class FakeDevice:

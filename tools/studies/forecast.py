@@ -133,12 +133,14 @@ def line(linear: Float64, network: Float64) -> tuple[float, float]:
     return slope, float(network.mean() - slope * linear.mean())
 
 
-def left_out(linear: Float64, network: Float64) -> Float64:
-    """Return each rig's error of the line fitted to all others."""
+def left_out(linear: Float64, network: Float64, guess: tuple[float, float]) -> Float64:
+    """Return each rig's error of the line through the guess and all others."""
     errors: list[float] = []
     for i in range(len(linear)):
         others = np.arange(len(linear)) != i
-        slope, offset = line(linear[others], network[others])
+        slope, offset = line(
+            np.append(linear[others], guess[0]), np.append(network[others], guess[1])
+        )
         errors.append(float(offset + slope * linear[i] - network[i]))
     return np.array(errors)
 
@@ -149,7 +151,7 @@ def fit(
     """Return the line through guess and rigs, and its errors with each rig left out."""
     linear = np.array([found.at().linear_iou for found in forecasts])
     network = np.array([row.network_iou for row in rows])
-    errors = left_out(linear, network)
+    errors = left_out(linear, network, guess)
     both = np.append(linear, guess[0]), np.append(network, guess[1])
     slope, offset = line(*both)
     rmse = [

@@ -35,6 +35,7 @@ from itertools import product
 from math import sqrt
 from pathlib import Path
 from typing import Any, Self
+from zlib import crc32
 
 import cv2
 import harness
@@ -43,8 +44,9 @@ from matplotlib.figure import Figure
 from nlos_calibration import ObjectBox, Rig, load_rig
 from nlos_calibration.arrays import Float32, Float64, Mask
 from nlos_models import Answer, ask
-from stations import rig_at
+from stations import PLACES, rig_at
 
+from nlos_cam.camera import World
 from nlos_cam.cli.common import tracked
 from nlos_cam.evaluate import (
     Subject,
@@ -53,15 +55,15 @@ from nlos_cam.evaluate import (
     over_objects,
     plain,
     seeded_objects,
-    sense,
 )
 from nlos_cam.forecast import ACCURACY, BLACK, EFFECTS, Shape, cut, shipped_basis
-from nlos_cam.frames import LidarMaps
+from nlos_cam.frames import LidarMaps, MapMean, maps_from_frame
 from nlos_cam.objects import benchmark_objects, depth_from_image, object_box, unseen_objects
 from nlos_cam.reconstruct import load_networks
 from nlos_cam.render import (
     Gradients,
     Scene,
+    SceneFile,
     SensorModel,
     Surface,
     cast,
@@ -193,11 +195,25 @@ def bare_of(place: str) -> Bare:
     return Bare(model, cosine, SensorModel().bare_wall_counts / float(brightest))
 
 
+def averaged_from(place: str, subject: Subject) -> LidarMaps:
+    """Return the mean maps of frames of an object; every object has noise of its own at every
+    place.
+    """
+    rig = rig_at(place)
+    scene = SceneFile(name=place, rig=rig, sensor=SensorModel())
+    world = World(scene, echoes_of([subject], rig, lambda *_: None), [None])
+    number = crc32(subject.name.encode()) * len(PLACES) + [*PLACES].index(place)
+    mean = MapMean(FRAMES)
+    numbers = range(number * FRAMES, (number + 1) * FRAMES)
+    frames = (world.images(frame).frame(rig.pinhole) for frame in numbers)
+    return [mean.add(maps_from_frame(frame)) for frame in frames][-1]
+
+
 def seen_from(place: str, subject: Subject) -> Seen:
     """Return the averaged maps of an object from a place."""
     rig = rig_at(place)
     bare = bare_of(place)
-    (maps,) = sense(echoes_of([subject], rig, lambda *_: None), rig, frames=FRAMES)
+    maps = averaged_from(place, subject)
     with np.errstate(invalid="ignore"):
         echo = maps.valid & (np.abs(maps.depth_m - bare.model.depth_m) > BESIDE_M)
     path_m = 2 * maps.depth_m / bare.cos_axis

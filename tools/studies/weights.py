@@ -406,7 +406,7 @@ def edge(asked: argparse.Namespace) -> None:
     weights = loaded(asked)
     rig = load_rig(asked.rig)
     subjects = benchmark_objects(object_box(rig))
-    here = Place(rig.lidar.distance_m, rig.lidar.yaw_deg)
+    here = Place(rig.lidar.distance_m, rig.lidar.yaw_deg, rig.lidar.pitch_deg)
     repair = EdgeRepair(CalibratedRig(rig))
     moves = [0.0, *(sign * off for off in OFFSETS_MM for sign in (1, -1))]
     turns = [sign * off for off in OFFSETS_DEG for sign in (1, -1)]

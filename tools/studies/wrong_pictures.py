@@ -21,7 +21,7 @@ from nlos_calibration.arrays import Float32
 
 from nlos_cam.camera import World
 from nlos_cam.dataset import TEST_SEED, DatasetPlan
-from nlos_cam.evaluate import Subject, echoes_of, truth_of
+from nlos_cam.evaluate import Subject, echoes_of, interval, truth_of
 from nlos_cam.frames import Frame
 from nlos_cam.objects import benchmark_objects, image_from_depth, object_box, unseen_objects
 from nlos_cam.reconstruct import (
@@ -250,18 +250,40 @@ def measure(group: str, subjects: Sequence[Subject], rig: Rig) -> list[Outcome]:
 
 def summarise(outcomes: Sequence[Outcome], unharmed: dict[str, Outcome]) -> dict[str, Any]:
     """Return the shares of some outcomes; `unharmed` holds each object's frame without a harm."""
-    bad = [o for o in outcomes if o.verdict == Verdict.SEEN and o.iou < BAD_IOU]
-    new = [o for o in bad if unharmed[o.subject].iou >= BAD_IOU]
-    count = len(outcomes)
+
+    def is_bad(outcome: Outcome) -> bool:
+        return outcome.verdict == Verdict.SEEN and outcome.iou < BAD_IOU
+
+    tests: dict[str, Callable[[Outcome], bool]] = {
+        "seen": lambda o: o.verdict == Verdict.SEEN,
+        "seen_wrong": is_bad,
+        "seen_wrong_by_the_harm": lambda o: is_bad(o) and unharmed[o.subject].iou >= BAD_IOU,
+        "nothing": lambda o: o.verdict == Verdict.NOTHING,
+        "green": lambda o: o.trusted,
+        "green_wrong": lambda o: o.trusted and o.iou < GREEN_IOU,
+    }
+    return {name: share(outcomes, test) for name, test in tests.items()}
+
+
+def share(outcomes: Sequence[Outcome], test: Callable[[Outcome], bool]) -> dict[str, Any]:
+    """Return the share of outcomes that pass a test, with a 95 % interval over objects: frames of
+    one object with many harms are no independent trials.
+    """
+    passed: dict[str, list[bool]] = {}
+    for each in outcomes:
+        passed.setdefault(each.subject, []).append(test(each))
+    count = sum(map(sum, passed.values()))
+    of_objects = interval(np.array([np.mean(every) for every in passed.values()]))
+    # Of no object at all nothing can be resampled: a bound by Wilson's score for as many objects.
+    if count in {0, len(outcomes)}:
+        bound = harness.wilson(len(passed) if count else 0, len(passed))
+        of_objects = replace(of_objects, low=bound["low"], high=bound["high"])
     return {
-        "seen": harness.wilson(sum(o.verdict == Verdict.SEEN for o in outcomes), count),
-        "seen_wrong": harness.wilson(len(bad), count),
-        "seen_wrong_by_the_harm": harness.wilson(len(new), count),
-        "nothing": harness.wilson(sum(o.verdict == Verdict.NOTHING for o in outcomes), count),
-        "green": harness.wilson(sum(o.trusted for o in outcomes), count),
-        "green_wrong": harness.wilson(
-            sum(o.trusted and o.iou < GREEN_IOU for o in outcomes), count
-        ),
+        "count": count,
+        "of": len(outcomes),
+        "share": of_objects.value,
+        "low": of_objects.low,
+        "high": of_objects.high,
     }
 
 

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from fake_librealsense import FakeSdk, FakeSensor
+from fake_librealsense import CUSTOM, FakeSdk, FakeSensor
 from fake_lidar import FakeLidar, NapClock
 
 from nlos_cam.camera.l515 import NEAR_WALL, L515Camera, Options, connected
@@ -111,7 +111,7 @@ def test_setting_that_takes_late_is_set_once_more(fake_camera: Make) -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "nap", "wanted"), [("visual_preset", 0, 5.0), ("min_distance", 1, 0.0)]
+    ("name", "nap", "wanted"), [("visual_preset", 0, CUSTOM), ("min_distance", 1, 0.0)]
 )
 def test_setting_that_the_start_resets_is_set_again(
     fake_camera: Make, name: str, nap: int, wanted: float
@@ -123,7 +123,8 @@ def test_setting_that_the_start_resets_is_set_again(
     ) as camera:
         assert camera.differences == {}
 
-    assert lidar.options[name] == wanted
+    assert lidar.did.count(name) == 2
+    assert lidar.options[name] == wanted  # options set after the preset make it a custom one
 
 
 def test_modes_that_alter_infrared_are_turned_off(fake_camera: Make) -> None:

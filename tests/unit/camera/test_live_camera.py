@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from fake_librealsense import CUSTOM
 from fake_lidar import FakeLidar, NapClock
 
 from nlos_cam.camera import Recording, SimulatedCamera
@@ -101,7 +102,8 @@ def test_silent_device_delivers_again_as_set(
     assert camera.dropped + camera.incomplete == holes(frames) > 0
     assert lidar.did.count("reset") == counts.get("reset", 0)
     assert {name: lidar.options[name] for name in NEAR_WALL} == NEAR_WALL
-    assert lidar.options["visual_preset"] == 5.0
+    assert lidar.did.index("visual_preset") < lidar.did.index("min_distance")
+    assert lidar.options["visual_preset"] == CUSTOM  # as options after it make it
     assert frames[-1].settings["min_distance"] == 0.0
 
 

@@ -9,9 +9,11 @@ from typing import Any
 import numpy as np
 import pytest
 import trimesh
+from nlos_calibration import Extent
 from nlos_calibration.rig import Rig, dump_toml, load_rig
 
 from nlos_cam.cli.render import hidden_depth
+from nlos_cam.errors import SceneError
 from nlos_cam.objects.placement import object_depth
 from nlos_cam.render import (
     EFFECTS,
@@ -23,6 +25,7 @@ from nlos_cam.render import (
     render,
     sensor_effects,
 )
+from nlos_cam.transients import Capture, Noise
 
 Run = Callable[..., Any]
 DRAFT = "--accuracy", "draft", "--out", "maps.npz", "--overwrite"
@@ -265,3 +268,27 @@ def test_hidden_depth_warns_of_object_cut_or_flattened_by_box(
     assert np.isnan(half[:, 0]).all()
     assert all(word in of_flat for word in (mesh, "0.3 m", "0.08 m"))
     assert np.nanmax(flat) <= RIG.object_box.z_far_m + 1e-6
+
+
+def test_every_option_of_a_transient_reaches_the_capture(
+    plate: str, run: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    captures: list[Capture] = []
+
+    def keep(_: Scene, capture: Capture, *__: object) -> None:
+        captures.append(capture)
+        raise SceneError("nothing is rendered here")
+
+    monkeypatch.setattr("nlos_cam.transients.render_transient", keep)
+    options = (
+        "--capture single --wall-cells 5 --wall-extent 0.4,0.6,-0.1,0.1 --laser 0.5,0.02"
+        " --bin-mm 2.5 --start-m 0.25 --bins 40 --wall-to-wall --photons 900 --background 3"
+        " --noise-seed 7"
+    )
+    run("render", plate, "--transient", "light.hdf5", *options.split(), code=1)
+    noise = Noise(900.0, 3.0, 7)
+    wall = Extent(x_min_m=0.4, x_max_m=0.6, y_min_m=-0.1, y_max_m=0.1)
+
+    assert captures == [
+        Capture("single", 5, wall, (0.5, 0.02), 0.0025, 0.25, 40, first_and_last=False, noise=noise)
+    ]

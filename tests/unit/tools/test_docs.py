@@ -9,7 +9,7 @@ import sys
 from collections.abc import Callable, Mapping
 from itertools import pairwise
 from pathlib import Path
-from types import ModuleType
+from types import ModuleType, SimpleNamespace
 
 import numpy as np
 import pytest
@@ -148,6 +148,36 @@ def test_stale_page_fails_the_check_until_written(
         assert tool("pages").main() == code
 
     assert "out of date" in capsys.readouterr().out
+
+
+def test_table_without_a_place_is_refused(tool: Tool) -> None:
+    page = "<!-- one -->\nold\n<!-- end -->\n"
+
+    assert tool("pages").filled(page, {"one": "new\n"}) == "<!-- one -->\nnew\n<!-- end -->\n"
+    with pytest.raises(ValueError, match="<!-- two -->"):
+        tool("pages").filled(page, {"two": "new\n"})
+
+
+def test_default_of_nothing_is_shown_as_zero_alone(tool: Tool) -> None:
+    def default(value: object) -> str:
+        return tool("pages").default_of(
+            SimpleNamespace(required=False, show_default=True, default=value)
+        )
+
+    assert [default(value) for value in (0, 0.0, 2)] == ["`0`", "`0.0`", "`2`"]
+    assert [default(value) for value in (None, False, "")] == ["", "", ""]
+
+
+PROSE = sorted({*(ROOT / "docs").glob("*.md"), *ROOT.glob("*.md")} - {ROOT / "CHANGELOG.md"})
+"""Pages about what is there now."""
+PLACE = re.compile(r"`((?:tests|tools|nlos_cam|models|calibration|examples|docs)/[\w./-]+)")
+
+
+@pytest.mark.parametrize("page", PROSE, ids=lambda page: page.stem)
+def test_page_names_files_that_are_there(page: Path) -> None:
+    named = PLACE.findall(page.read_text(encoding="utf-8"))
+
+    assert [name for name in named if not (ROOT / name.rstrip("/.")).exists()] == []
 
 
 def test_things_unlike_training_lie_in_the_box_and_are_drawn(tool: Tool, tmp_path: Path) -> None:
