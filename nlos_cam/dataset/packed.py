@@ -267,7 +267,7 @@ class PackedMaps:
         )
 
     def forget_run(self) -> None:
-        """Forget how many objects the epochs of this run saw: it begins anew."""
+        """Forget how many objects the epochs of this run saw: it begins again."""
         if self._run:
             epochs = self._index.epochs
             for key in [each for each in epochs if each.startswith(self._run)]:

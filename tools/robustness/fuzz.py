@@ -3,7 +3,7 @@
 `fuzz.py [--count N] [--minutes M] [--only NAME] [--first NUMBER] [--out FILE] [--keep FOLDER]
 [--files FOLDER]`. Each case runs in a process forked from one that has loaded the program, and has
 30 s of processor time and, with the program, 1 GiB. A case is known by its input and number, which
-make the same damage again. A second call resumes, and starts anew where the program has changed
+make the same damage again. A second call resumes, and begins again where the program has changed
 since. A bad case is printed; its file stays in --keep. Exits with 1 where a case is bad.
 """
 

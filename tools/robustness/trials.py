@@ -383,7 +383,7 @@ def options(about: str | None, file: str, **counts: int) -> argparse.ArgumentPar
 
 class Results:
     """Rows of trials in a JSON file, which is written after each; a second call of a tool resumes
-    there, and starts anew where the program has changed since.
+    there, and begins again where the program has changed since.
     """
 
     def __init__(self, path: Path, seed: int) -> None:

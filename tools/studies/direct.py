@@ -204,7 +204,7 @@ def as_markdown(rows: list[dict[str, Any]]) -> str:
 
 
 def budget_of(rows: list[dict[str, Any]]) -> str:
-    """Return what the trained variants have in common."""
+    """Return the budget that the trained variants share."""
     trained = [row["samples"] for row in rows if row["samples_per_s"]]
     if not trained:
         return "weights as they were given"

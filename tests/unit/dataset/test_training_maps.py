@@ -427,7 +427,7 @@ def test_held_out_maps_that_hold_nothing_out_are_refused(
 
 
 @pytest.mark.parametrize(("plan", "kept"), [(PLAN, True), (MANY, False), (OTHER, False)])
-def test_cells_of_trained_weights_serve_maps_of_their_own_rig_alone(
+def test_cells_of_weights_serve_maps_of_their_own_rig_alone(
     tmp_path: Path, store_folder: Path, plan: DatasetPlan, kept: bool
 ) -> None:
     normal = CellNormal()

@@ -153,7 +153,7 @@ def test_light_is_of_first_degree_in_the_albedo(brdf: Any) -> None:
     assert 0.6 * found.jacobian("albedo")[0].sum() == pytest.approx(whole, rel=0.03)
 
 
-def test_derivatives_stay_finite_where_the_object_touches_the_wall() -> None:
+def test_derivatives_are_finite_where_object_and_wall_touch() -> None:
     depth = bent_plate(0.01).object_depth_m.copy()
     depth[2, 2] = 0.0
     scene = replace(bent_plate(0.01), object_depth_m=depth, jump_m=0.5)
