@@ -45,7 +45,12 @@ class SheetNetwork:
     def __init__(self) -> None:
         self.given: list[np.ndarray] = []
         self.record = SimpleNamespace(
-            rig_name=RIG.name, rig_checksum=RIG.checksum, rig=None, input="raw maps", figures={}
+            rig_name=RIG.name,
+            rig_checksum=RIG.checksum,
+            rig=None,
+            bare_wall_counts=None,
+            input="raw maps",
+            figures={},
         )
 
     def __call__(self, depth_m: np.ndarray, intensity: np.ndarray) -> np.ndarray:

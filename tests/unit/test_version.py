@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -133,10 +134,12 @@ def test_folder_of_0_1_0_is_whole(folder: str) -> None:
     assert describe(EARLIER / folder, verify=True).problem == ""
 
 
-def test_dataset_of_0_1_0_is_of_todays_renderer() -> None:
+def test_dataset_of_0_1_0_is_read_but_not_continued() -> None:
     stored = open_dataset(EARLIER / "dataset")
+    today = replace(stored.plan, rendering_version=RENDERING_VERSION)
 
-    assert stored.plan.rendering_version == RENDERING_VERSION
+    assert stored.plan.rendering_version == 6 < RENDERING_VERSION
+    assert stored.plan.differences(today) == ["rendering version"]
     assert stored.arrays().depth_m.shape == (1, 64, 80)
     assert shard_origin(EARLIER / "dataset" / "shard-000000000.h5")[0] == "0.1.0"
 

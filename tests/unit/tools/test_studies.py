@@ -124,7 +124,11 @@ def test_rig_map_has_a_cell_for_every_place(
 ) -> None:
     module = tool("weights")
     record = SimpleNamespace(
-        rig=None, input="raw maps", rig_name=RIG.name, rig_checksum=RIG.checksum
+        rig=None,
+        bare_wall_counts=None,
+        input="raw maps",
+        rig_name=RIG.name,
+        rig_checksum=RIG.checksum,
     )
     network = type("Plate", (), {"record": record, "__call__": sheet_network})()
     monkeypatch.setattr(module, "load_reconstructor", lambda *_: network)
