@@ -1,6 +1,7 @@
 __all__ = [
     "NETWORK_FILE",
     "OBJECTS",
+    "PLAN",
     "RECORDINGS",
     "AdaptResult",
     "Adaptation",
@@ -23,7 +24,7 @@ __all__ = [
 ]
 
 from .locked import LockedNoise
-from .plan import Locked, Pace, Plan, Stage, bench_sensor, calibration_spread
+from .plan import PLAN, Locked, Pace, Plan, Stage, bench_sensor, calibration_spread
 from .recordings import RECORDINGS, Recordings, Transfer, find_recordings
 from .report import Tables, transfer_words, write_page
 from .run import NETWORK_FILE, OBJECTS, Adaptation, AdaptResult, Measure, adapt, install

@@ -30,8 +30,8 @@ class TrainingInputs:
     frame: Rig | None = None
     """Wall grid that maps are aligned with; None where they stay in the rig's own cells."""
     bare_wall_counts: float | None = None
-    """Counts of the brightest bare wall in maps of the rig's own cells; None on the wall grid, on
-    which all light is that of one sensor."""
+    """Counts of the brightest bare wall in maps of the rig's own cells; None for those of the
+    simulated sensor, as all light on the wall grid is."""
     noise: LockedNoise | None = None
     """Noise of locked differences; None for maps, whose noise is the sensor's."""
 
@@ -45,7 +45,8 @@ class TrainingInputs:
         bench = rig.model_dump(mode="json")
         grid = grid_of(trained)
         if grid is None:
-            counts = sensor.bare_wall_counts
+            default = SensorModel().bare_wall_counts
+            counts = None if sensor.bare_wall_counts == default else sensor.bare_wall_counts
             return cls((rig.name, rig.checksum), bench, trained, bare_wall_counts=counts)
         if not can_align(rig, grid):
             raise SceneError(

@@ -118,6 +118,10 @@ class Locked(Record):
     material: Material = Material()
 
 
+FIRST_RENDERING = 6
+"""Version of the renderer of plans that do not name it."""
+
+
 class Plan(Record):
     """Everything that decides the weights of an adaptation."""
 
@@ -131,6 +135,8 @@ class Plan(Record):
     stages: tuple[Stage, ...] = ()
     locked: Locked | None = None
     """None: maps of single frames, in the paper's radiometry."""
+    rendering_version: int = FIRST_RENDERING
+    """Of the renderer of its objects."""
 
     @property
     def minutes(self) -> float:

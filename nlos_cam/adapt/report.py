@@ -159,8 +159,12 @@ class Tables:
     """None where there is no forecast."""
 
 
-def write_page(result: AdaptResult, tables: Tables, commands: Sequence[str], page: Path) -> None:
-    """Write the report of an adaptation, with commands to go on with."""
+def write_page(
+    result: AdaptResult, tables: Tables, commands: Sequence[str], page: Path, *, kept: bool
+) -> None:
+    """Write the report of an adaptation, with commands to go on with; `kept` where its weights are
+    those in use now.
+    """
     plan = result.plan
     curves = read_curves(plan, [folder / NETWORK / "log.csv" for folder in result.folders])
     before, after = (each["silhouette_iou"]["value"] for each in (result.before, result.after))
@@ -184,6 +188,8 @@ def write_page(result: AdaptResult, tables: Tables, commands: Sequence[str], pag
             f" {spread.gain_share:.0%} of the gain"
         ),
     }
+    if not (kept or plan.locked):
+        headline += "; the weights in use stay"
     advice = outlook(plan, curves, after, expected.expected_iou if expected else None)
     title = "Weights for this bench"
     subtitle = "54 test objects, rendered on this bench with the sensor's noise. Simulated light."
@@ -200,7 +206,7 @@ def write_page(result: AdaptResult, tables: Tables, commands: Sequence[str], pag
         [
             Section(
                 "",
-                [Banner("good" if after > before else "doubtful", headline, advice)],
+                [Banner("good" if kept else "doubtful", headline, advice)],
             ),
             Section(
                 "Before and after",

@@ -54,7 +54,7 @@ from nlos_cam.files import (
     write_checked,
 )
 from nlos_cam.reconstruct import weights_for
-from nlos_cam.render import SensorModel
+from nlos_cam.render import RENDERING_VERSION, SensorModel
 
 OBJECTS = "objects"
 HELD_OUT = "held-out"
@@ -233,18 +233,28 @@ def _stage_name(number: int) -> str:
     return STAGE.format(number + 1)
 
 
+def _other_than(job: Adaptation, plan: Plan) -> str:
+    """Return why a plan's objects are not those of an adaptation; empty where they are."""
+    if plan.rig_checksum != job.rig.checksum:
+        return "to another rig: the bench was calibrated again since"
+    if plan.rendering_version != RENDERING_VERSION:
+        return "of another version of nlos-cam, whose renderer differs"
+    return ""
+
+
 def _plan_for(job: Adaptation, minutes: float, tracked: data.Tracked) -> Plan:
     """Return the folder's plan, extended to `minutes`, or a new one after a measurement of the
     machine.
     """
     plan = load_plan(job.folder)
-    if plan and plan.rig_checksum != job.rig.checksum and not job.begin_again:
+    other = _other_than(job, plan) if plan else ""
+    if other and not job.begin_again:
         raise SceneError(
-            f"{job.folder} is an adaptation to another rig: the bench was calibrated again since;"
-            " give --overwrite to begin again, or another --out"
+            f"{job.folder} is an adaptation {other}; give --overwrite to begin again, or another"
+            " --out"
         )
     # without a plan, what is there may be another rig's too
-    if job.begin_again and (plan is None or plan.rig_checksum != job.rig.checksum):
+    if job.begin_again and (plan is None or other):
         _forget(job.folder)
         plan = None
     if plan is None:
@@ -258,6 +268,7 @@ def _plan_for(job: Adaptation, minutes: float, tracked: data.Tracked) -> Plan:
             pace=pace,
             start=_start_checksum(job),
             locked=job.locked,
+            rendering_version=RENDERING_VERSION,
         )
     if (plan.locked, plan.sensor.pulse_ns) != (job.locked, job.sensor.pulse_ns):
         raise SceneError(

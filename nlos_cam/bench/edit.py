@@ -1,6 +1,7 @@
 """Writing of a bench folder: files first, then its record with their checksums."""
 
 import os
+import shlex
 import shutil
 from collections.abc import Generator
 from contextlib import contextmanager
@@ -82,7 +83,7 @@ class BenchEdit:
         if self.camera is None or not self.stations:
             raise RecordFileError(
                 f"{self.folder} has no measured wall: run `nlos-cam calibrate --wall --bench"
-                f" {self.folder}` first"
+                f" {shlex.quote(str(self.folder))}` first"
             )
         now = datetime.now(UTC).replace(microsecond=0)
         return BenchRecord(

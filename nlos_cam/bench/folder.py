@@ -1,5 +1,6 @@
 """Bench folder as commands use it: the measured wall of a station, and weights."""
 
+import shlex
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -193,7 +194,7 @@ def _measured(folder: Path, record: BenchRecord, station: StationRecord) -> wall
     if station.occluder and walls.load_wall(folder / station.wall).rig.lidar != wall.rig.lidar:
         raise RecordFileError(
             f"{path} is of another wall than {station.wall}: find the occluder again with"
-            f" `nlos-cam calibrate --occluder {folder}`"
+            f" `nlos-cam calibrate --occluder {shlex.quote(str(folder))} --overwrite`"
         )
     return _with_box(measured, station.object_box)
 

@@ -9,13 +9,14 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import nlos_calibration as walls
 import typer
+from nlos_calibration.errors import CalibrationError
 from nlos_models import load_record
 from nlos_models.errors import CheckpointError
 
 from nlos_cam import adapt as adaptation
 from nlos_cam import bench as benches
 from nlos_cam import camera as cameras
-from nlos_cam import dataset, forecast, objects, render
+from nlos_cam import dataset, forecast, objects, reconstruct, render
 from nlos_cam import evaluate as evaluation
 from nlos_cam.cli import common
 from nlos_cam.cli.benches import bench_or_rig
@@ -29,6 +30,7 @@ if TYPE_CHECKING:
 
 PAGE = "adapt.html"
 LOCKED_WORK = "locked"
+MAX_MINUTES = 6000
 WORK = "adapt"
 WEIGHTS = "weights"
 
@@ -43,7 +45,10 @@ def adapt(
     minutes: Annotated[
         float,
         typer.Option(
-            "--minutes", min=1, max=6000, help="Minutes of work in all; more go on from fewer."
+            "--minutes",
+            min=1,
+            max=MAX_MINUTES,
+            help="Minutes of work in all; more go on from fewer.",
         ),
     ] = 10.0,
     out: Annotated[
@@ -140,19 +145,35 @@ def adapt(
     kept = result.is_better if locked else _is_worth_keeping(result, folder)
     if kept and not locked:
         target = _install(result, folder, home / WEIGHTS)
-    expected = None if locked else _forecast(rig, folder)
+    with common.interrupted_by_signals(f"the weights are in {target}; the page is not written"):
+        expected = None if locked else _forecast(rig, folder)
     name = shlex.quote(bench)
-    more = f"nlos-cam adapt {name} --minutes {2 * result.plan.minutes:g}"
+    more = f"nlos-cam adapt {name} --minutes {min(2 * result.plan.minutes, MAX_MINUTES):g}"
     place = f"{'--bench' if own else '--rig'} {name}"
     commands = [f"nlos-cam evaluate {place} --weights {shlex.quote(str(target))}"]
     if locked:
         commands = []
         more += f" --frames {locked.frames} --radiometry {locked.radiometry}"
         more += f" --pulse-ns {sensor.pulse_ns:g} --material {material or 'matt'}"
-    if folder and kept:
+    if folder and not locked:
         camera = cameras.camera_to_name(measured.record) if measured else "l515"
-        commands = [f"nlos-cam live --camera {camera} --bench {name}"]
-    more += f" --out {shlex.quote(str(out))}" if out else ""
+        live = f"nlos-cam live --camera {camera} --bench {name}"
+        if kept:
+            commands = [live]
+        elif _has_weights_of_another_rig(folder):
+            start = shlex.quote(str(weights or reconstruct.weights_for(rig).name))
+            commands = [f"{live} --weights {start}"]
+    # the pace that the plan was made with is that of these
+    machines: dict[str, Any] = {
+        "--out": out,
+        "--weights": weights,
+        "--ray": ray,
+        "--backend": backend if backend != "cpu" else None,
+        "--workers": workers,
+        "--accelerator": accelerator if accelerator != "auto" else None,
+    }
+    for option, value in machines.items():
+        more += f" {option} {shlex.quote(str(value))}" if value is not None else ""
     commands.append(more)
     _report(result, target, commands, work / PAGE, expected, kept=kept, as_json=json)
 
@@ -200,6 +221,15 @@ def _is_worth_keeping(result: adaptation.AdaptResult, bench: Path | None) -> boo
     return result.is_better and (in_use is None or result.serves_as_well_as(in_use))
 
 
+def _has_weights_of_another_rig(bench: Path) -> bool:
+    """Return whether a bench's own weights are of a rig that it was before."""
+    try:
+        own = benches.load_bench(bench).weights
+    except CalibrationError:  # they are damaged, and named so by other commands
+        return False
+    return own is not None and benches.iou_in_use(bench) is None
+
+
 def _install(result: adaptation.AdaptResult, bench: Path | None, target: Path) -> Path:
     """Copy the weights to where they are used, and return that folder."""
     if bench:
@@ -223,12 +253,14 @@ def _report(
     transfer = result.transfer
     recorded = _rows(transfer.before, transfer.after) if transfer else ()
     tables = adaptation.Tables(rows, recorded, expected)
-    adaptation.write_page(result, tables, commands, page)
+    adaptation.write_page(result, tables, commands, page, kept=kept)
     _, before, after = rows[0]
     state = "was finished before" if result.was_there else "done"
     worse = ""
     if not kept and not result.plan.locked:
-        worse = ", worse than the weights in use, which stay (more --minutes help)"
+        worse = ", worse than the start weights" if not result.is_better else ""
+        worse = worse or ", worse than the weights in use, which stay"
+        worse += " (more --minutes help)"
     text = (
         f"{state}: {rows[0][0]} {before} -> {after} on this bench{worse}; weights in {target},"
         f" report {page}"

@@ -19,16 +19,20 @@ from rich.live import Live
 from rich.markup import escape
 from rich.table import Table
 
+from nlos_cam import adapt as adaptation
 from nlos_cam import bench as benches
 from nlos_cam import calibrate as bench
 from nlos_cam import camera as cameras
 from nlos_cam import reconstruct
 from nlos_cam.cli import benches as benching
+from nlos_cam.cli.adapt import WORK
 from nlos_cam.cli.common import (
     Camera,
     Json,
     Overwrite,
+    ask,
     finish,
+    interrupted_by_signals,
     output_path,
     progress,
     say,
@@ -265,7 +269,7 @@ def calibrate(
     _refuse_occluder_options(occluder, out, measured=bool(measured), watch=watch)
     target = Target.of(bench_folder, occluder, out, overwrite=overwrite)
     if watch:
-        say("Position the lidar. [bold]Enter[/] measures, Ctrl-C cancels.", marked=True)
+        ask("Position the lidar. [bold]Enter[/] measures, Ctrl-C cancels.", marked=True)
         with _opened(uri) as source:
             last = watch_wall(source, until_enter())
         if last is not None:
@@ -287,7 +291,10 @@ def calibrate(
     files = target.files
     result = fields | {"out": str(files.record), "report": str(files.report)}
     if target.folder:
-        benching.store_forecast(target.folder)
+        with interrupted_by_signals(
+            f"{files.record} is written; `nlos-cam predict` makes the forecast of the bench"
+        ):
+            benching.store_forecast(target.folder)
     loaded = _written_bench(target.folder) if target.folder else None
     rig = loaded.rig if loaded else record.beam_rig
     own = loaded.weights if loaded else None
@@ -421,7 +428,9 @@ def _next_step(folder: Path, record: walls.WallRecord, served: reconstruct.Weigh
         occluder = f"nlos-cam calibrate --occluder {name} --camera {camera}"
         return f"put the occluder up, then {occluder}"
     live = f"nlos-cam live --camera {camera} --bench {name}"
-    return live if served.serve else f"nlos-cam adapt {name} --minutes 10, then {live}"
+    # An adaptation from before is to the rig that was just replaced.
+    again = " --overwrite" if (folder / WORK / adaptation.PLAN).exists() else ""
+    return live if served.serve else f"nlos-cam adapt {name} --minutes 10{again}, then {live}"
 
 
 def _source(camera: str | None, bag: Path | None, *, wall: bool, occluder: Path | None) -> str:

@@ -311,12 +311,13 @@ def _verify(bar: Progress, sets: int, path: Path) -> recordings.VerifyResult | N
 
 def _pause(bar: Progress, stop: Event, pause_s: float | None, text: str) -> None:
     """Print `text` and wait `pause_s`, or for Enter at a terminal; Ctrl-C sets `stop`."""
-    common.say(text)
     if pause_s is not None or not sys.stdin.isatty():
+        common.say(text)
         stop.wait(pause_s or 0.0)
         return
     bar.stop()
-    common.say("Press Enter to start the next take")
+    common.ask(text)
+    common.ask("Press Enter to start the next take")
     try:
         with common.interrupted_by_signals():
             sys.stdin.readline()

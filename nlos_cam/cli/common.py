@@ -149,6 +149,16 @@ def say(text: str, *, marked: bool = False) -> None:
     stderr.print(text, soft_wrap=True, markup=marked)
 
 
+def ask(text: str, *, marked: bool = False) -> None:
+    """Print what hands have to do before the command goes on, also if quiet."""
+    quiet = stderr.quiet
+    stderr.quiet = False
+    try:
+        say(text, marked=marked)
+    finally:
+        stderr.quiet = quiet
+
+
 def finish(
     result: dict[str, Any], *, as_json: bool, text: str, note: str = "", marked: bool = False
 ) -> None:

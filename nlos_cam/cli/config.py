@@ -238,6 +238,10 @@ def _choose_camera(values: dict[str, Any], used: dict[str, Value]) -> bool:
     return not is_default or values.get("bag") is not None
 
 
+ROS2_RECORD = "metadata.yaml"
+"""File in the folder of a bag of ROS 2."""
+
+
 def _take_camera_of_bench(values: dict[str, Any]) -> None:
     """Enter the lidar that measured the bench: its frames are no simulated camera's.
 
@@ -266,7 +270,7 @@ def _is_another(given: str, setting: Value) -> bool:
     if given == wanted:
         return False
     if setting.source == DEFAULT:
-        return given.startswith("sim")
+        return given.partition(":")[0] == "sim"
     kinds = {name.partition(":")[0] for name in (given, wanted)}
     return "l515" not in {given, wanted} or len(kinds) > 1
 
@@ -280,13 +284,24 @@ def _is_bench(name: str) -> bool:
     return is_bench(Path(name))
 
 
+def _is_result(given: object) -> bool:
+    """Return True for what holds its own pictures or turns: a saved session, or a folder that is
+    neither a bench nor a recording of ROS 2.
+    """
+    if not isinstance(given, str | Path) or not str(given):
+        return False
+    path = Path(given)
+    is_folder = path.is_dir() and not (path / ROS2_RECORD).exists() and not _is_bench(str(path))
+    return path.suffix == ".html" or is_folder
+
+
 def _choose_bench(values: Mapping[str, Any], used: dict[str, Value]) -> None:
     """Drop the settings that contradict the bench, wall, rig, dataset or saved session that was
     given.
 
     A bench has its own wall and weights, so those of the settings are for commands without one.
     """
-    if Path(values.get("file") or "").suffix == ".html":  # it holds its pictures
+    if any(_is_result(values.get(name)) for name in ("file", "camera")):
         for name in ("bench", "wall", "weights"):
             used.pop(name, None)
     if any(values.get(name) is not None for name in ("wall", "rig", "data")):

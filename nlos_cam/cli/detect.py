@@ -26,12 +26,12 @@ from nlos_cam.cli.common import (
     Camera,
     Json,
     Overwrite,
+    ask,
     finish,
     interrupted_by_signals,
     output_path,
     progress,
     refuse_ignored,
-    say,
     stderr,
     tracked,
 )
@@ -60,9 +60,13 @@ class TerminalHands:
     """Person at the terminal who moves the object and presses Enter."""
 
     def __init__(
-        self, plan: detection.Plan, read_line: Callable[[], str] = read_fresh_line
+        self,
+        plan: detection.Plan,
+        folder: Path,
+        read_line: Callable[[], str] = read_fresh_line,
     ) -> None:
         self._plan = plan
+        self._folder = folder
         self._read_line = read_line
 
     def place(self, turn: int, *, object_in: bool) -> None:
@@ -72,10 +76,11 @@ class TerminalHands:
         words = "take the object out, put it back IN" if object_in else "put it in, take it OUT"
         if self._plan.control:
             words += CONTROL_WORDS
-        say(f"Turn {turn + 1} of {self._plan.turns}: {words}. Step back and press Enter.")
+        ask(f"Turn {turn + 1} of {self._plan.turns}: {words}. Step back and press Enter.")
         if not self._read_line():
             raise NlosCamError(
-                f"stdin ended before turn {turn + 1}: run the same command in a terminal to go on"
+                f"stdin ended before turn {turn + 1}: run the same command in a terminal, with"
+                f" --out {shlex.quote(str(self._folder))}, to go on"
             )
 
 
@@ -146,7 +151,7 @@ def detect(
     if folder.is_dir():
         _refuse_bench(folder)
         asked.refuse_beside(folder, {"--settings": settings is not None, "--out": out is not None})
-        with interrupted_by_signals(_kept(folder)):
+        with interrupted_by_signals(f"the turns in {folder} are as they were"):
             _report(detection.Session.open(folder), show_serial=show_serial, as_json=json)
         return
     if camera.startswith("bag:"):
@@ -163,7 +168,8 @@ def detect(
 
 
 def _kept(folder: Path) -> str:
-    return f"whole turns are in {folder}; the same command goes on with --out {folder}"
+    out = shlex.quote(str(folder))
+    return f"whole turns are in {folder}; the same command goes on with --out {out}"
 
 
 def _rig_option(bench_folder: Path | None, wall: Path | None) -> str:
@@ -277,7 +283,7 @@ def _measure(
         hands: detection.Hands = (
             detection.SimulatedHands(source, control=asked.control)
             if isinstance(source, cameras.SimulatedCamera)
-            else TerminalHands(session.plan)
+            else TerminalHands(session.plan, session.folder)
         )
         with_bar = isinstance(hands, detection.SimulatedHands) or not stderr.is_terminal
         _run(session, source, hands, with_bar=with_bar)

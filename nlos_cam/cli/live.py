@@ -135,6 +135,8 @@ def live(
                 views.prepare_saving()
         viewer.begin(bench.rig, bench.measured)
         control.bench.on_bench = lambda bench: viewer.begin(bench.rig, bench.measured)
+        if view_file:
+            control.bench.is_saving = lambda: True
         with (
             common.stop_on_signals() as stop,
             loop.RealtimePriority(priority, control.strain_of(stop)),

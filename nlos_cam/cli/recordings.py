@@ -158,6 +158,10 @@ def export(
         raise typer.BadParameter("--metres and --storage need --ros2")
     folder = common.output_path(out, "export", "", overwrite=overwrite)
     if bag.suffix == ".npz" or as_object:
+        if form != "png" or ply or streams:
+            raise typer.BadParameter(
+                "hidden surfaces have no streams: drop --format, --ply and --streams"
+            )
         _export_objects(bag, folder, object_formats(as_object), every, as_json=json)
         return
     names = [name.strip() for name in streams.split(",") if name.strip()]

@@ -291,7 +291,7 @@ def render(
     """Render the maps that a lidar which reports its strongest echo gets of a hidden object."""
     if scene and (bench_folder or rig):
         raise typer.BadParameter("--scene, --bench and --rig each name a rig: give one")
-    if out is not None and out.suffix not in {"", ".npz", ".png"}:
+    if out is not None and (not out.name or out.suffix not in {"", ".npz", ".png"}):
         raise typer.BadParameter(
             f"--out {out}: choose a name that ends in .npz; the picture has the same name in .png"
         )

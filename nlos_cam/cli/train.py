@@ -341,6 +341,10 @@ def direct(
         )
     fabric = run.fabric(recipe)
     start, runs = training.direct_start(recipe, weights)
+    held_out_maps = data_sets.open_dataset(held_out_data, color=recipe.colour)
+    for folder in data:
+        opened = data_sets.open_dataset(folder, color=recipe.colour, expected=True)
+        data_sets.check_held_out(opened, held_out_maps)
     with ExitStack() as held:
         with tracked("packing maps") as on_progress:
             trained = models.load_record(models.weights_folder(weights)) if start else None

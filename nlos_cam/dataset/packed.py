@@ -98,6 +98,7 @@ class PackedMaps:
         _check_of_one_kind(opened)
         self.frame: Rig = frame or (WALL_GRID if self.plan.rigs else self.plan.rig)
         """Rig that the maps are aligned with."""
+        given = normal
         if trained and trained.rig_checksum != self.frame.checksum:
             # By another rig's statistics a third of the cells would lie beyond the limit of a
             # normalised one, on a bench 5 cm nearer: its layers serve, not its cells. The wall
@@ -140,10 +141,9 @@ class PackedMaps:
             )
         except (OSError, ValueError, TypeError, RuntimeError) as error:
             raise damaged(store, CELLS) from error
-        found = self.normal.state_dict()
-        if normal and any(
-            not torch.equal(values, found[name]) for name, values in normal.state_dict().items()
-        ):
+        # Cells of another rig's weights are what stores of before 2026-11-28 may hold.
+        is_foreign = given is not None and normal is None and _alike(given, self.normal)
+        if is_foreign or (normal and not _alike(normal, self.normal)):
             raise SceneError(
                 f"{store} holds maps that are normalised for other weights: name another --store"
             )
@@ -254,8 +254,9 @@ class PackedMaps:
         OutputExistsError as `nlos_models.training.record_run`.
         """
         rig = self.frame
-        # the wall grid's light is that of one sensor
-        counts = None if is_wall_grid(rig) else self.plan.sensor.bare_wall_counts
+        # Light of the wall grid, and of aligned maps, is that of the simulated sensor.
+        is_own = not is_wall_grid(rig) and self.plan.stays_in_maps
+        counts = self.plan.sensor.bare_wall_counts if is_own else None
         return record_run(
             recipe,
             out,
@@ -263,14 +264,16 @@ class PackedMaps:
             runs,
             *starts,
             bench=rig_fields(rig),
-            bare_wall_counts=counts,
+            bare_wall_counts=None if counts == SensorModel().bare_wall_counts else counts,
         )
 
     def forget_run(self) -> None:
         """Forget how many objects the epochs of this run saw: it begins again."""
         if self._run:
             epochs = self._index.epochs
-            for key in [each for each in epochs if each.startswith(self._run)]:
+            # a run is a path and a blank, its keys end with the seeds of their epochs
+            own = [key for key in epochs if key.startswith(self._run)]
+            for key in [each for each in own if each[len(self._run) :].isdigit()]:
                 del epochs[key]
             self._index.write()
 
@@ -299,6 +302,12 @@ class PackedMaps:
         for start in range(0, count - batch + 1, batch):
             rows = np.sort(order[start : start + batch])
             yield NormalBatch(*(torch.from_numpy(file[rows]) for file in files))
+
+
+def _alike(one: CellNormal, other: CellNormal) -> bool:
+    """Return whether two normalisations are the same."""
+    found = other.state_dict()
+    return all(torch.equal(values, found[name]) for name, values in one.state_dict().items())
 
 
 def _check_of_one_kind(opened: Sequence[Dataset]) -> None:

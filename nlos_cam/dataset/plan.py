@@ -268,6 +268,12 @@ class DatasetPlan:
         is_off = self.off_record or self.rigs is not None
         return self.nominal_rig(seed) if is_off else self.bench_of(seed)[0]
 
+    @property
+    def stays_in_maps(self) -> bool:
+        """True where maps are used as they are: of one rig, or with a spread that no record has."""
+        is_known = bool(self.spread.place_m or self.spread.angle_deg) and not self.off_record
+        return not (is_known or self.rigs)
+
     def differences(self, other: "DatasetPlan") -> list[str]:
         """Return the names of fields that differ; empty where both plans make the same bits."""
         names = [one.name for one in fields(self)]

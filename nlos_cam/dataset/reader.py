@@ -169,6 +169,8 @@ def check_held_out(training: Dataset, held_out: Dataset) -> None:
         )
     if RECORDED in {training.plan.accuracy, held_out.plan.accuracy}:
         return  # their seeds number recordings
+    if training.plan.objects.meshes != held_out.plan.objects.meshes:
+        return  # a seed is another object
     both = training.seeds & held_out.seeds
     if both:
         raise SceneError(

@@ -33,7 +33,7 @@ from nlos_cam.dataset.reader import MAP_CHANNELS, Dataset, check_held_out, open_
 from nlos_cam.errors import SceneError
 from nlos_cam.frames import MAP_COLUMNS, MAP_ROWS, maps_from_frame
 from nlos_cam.reconstruct import align_all, rig_fields, rig_to_align_with, training_rig
-from nlos_cam.render import Scene, Sensor, render
+from nlos_cam.render import Scene, Sensor, SensorModel, render
 
 BARE_WALL_FRAMES = 60
 """Frames to average: the default of `calibrate`."""
@@ -72,8 +72,12 @@ class MapSplit(NamedTuple):
         `nlos_models.training.record_run`.
         """
         rig = self.rig
-        is_trained = trained is not None and trained.rig_checksum == rig.checksum
+        start = trained if trained and trained.rig_checksum == rig.checksum else None
         counts = self.plan.sensor.bare_wall_counts
+        if start:
+            counts = start.bare_wall_counts
+        elif counts == SensorModel().bare_wall_counts:
+            counts = None
         return record_run(
             recipe,
             out,
@@ -81,8 +85,8 @@ class MapSplit(NamedTuple):
             runs,
             *starts,
             # of weights for any rig too, whose record holds the bench that they were made for
-            bench=trained.rig if trained and is_trained else rig_fields(rig),
-            bare_wall_counts=trained.bare_wall_counts if trained and is_trained else counts,
+            bench=(start.rig if start else None) or rig_fields(rig),
+            bare_wall_counts=counts,
         )
 
     def limit_recipe(self, recipe: MapRecipe) -> MapRecipe:

@@ -39,7 +39,15 @@ from nlos_cam.files import atomic_file, read_arrays
 from nlos_cam.frames import OBJECT_PIXELS, LidarMaps, maps_from_frame
 from nlos_cam.objects import CATEGORIES, image_from_depth
 from nlos_cam.reconstruct import grid_of
-from nlos_cam.render import Material, Rendering, Scene, Sensor, SensorModel, render
+from nlos_cam.render import (
+    RENDERING_VERSION,
+    Material,
+    Rendering,
+    Scene,
+    Sensor,
+    SensorModel,
+    render,
+)
 
 EMPTY = "empty"
 ORDINARY = "ordinary"
@@ -130,7 +138,7 @@ class Benches:
         if self.sensor != SensorModel():
             text += self.sensor.model_dump_json()
         beside = f"-{sha256(text.encode()).hexdigest()[:12]}" if text else ""
-        return f"v{VERSION}-{self.rig.checksum}-{self.accuracy}{beside}"
+        return f"v{VERSION}.{RENDERING_VERSION}-{self.rig.checksum}-{self.accuracy}{beside}"
 
     def record(self, seed: int) -> Rig:
         """Return the rig of the bench of a seed, by its record."""

@@ -337,7 +337,9 @@ def write_report(folder: Path, evaluation: Evaluation, figures: Mapping[str, Any
 
 
 def _write_objects(path: Path, evaluation: Evaluation) -> None:
-    """Write one row per object; a field without a value is empty."""
+    """Write one row per frame, of which an object that was rendered has one; a field without a
+    value is empty.
+    """
     columns = {
         **evaluation.ours,
         "surface_cm2": evaluation.surfaces[SIZE],
@@ -374,16 +376,15 @@ def _draw(folder: Path, evaluation: Evaluation) -> None:
     )
     if sets := _predicted_sets(evaluation):
         pictures.draw_quality(folder / QUALITY, sets)
+    errors = metrics.by_object(evaluation.errors, evaluation.of_object)
+    surfaces = {name: each[evaluation.objects] for name, each in evaluation.surfaces.items()}
     curves = {
         measure_name: {
-            error_name: metrics.curve(measure, error)
-            for error_name, error in evaluation.errors.items()
+            error_name: metrics.curve(measure, error) for error_name, error in errors.items()
         }
-        for measure_name, measure in evaluation.surfaces.items()
+        for measure_name, measure in surfaces.items()
     }
-    pictures.draw_against_surface(
-        folder / "surface.png", evaluation.surfaces, evaluation.errors, curves
-    )
+    pictures.draw_against_surface(folder / "surface.png", surfaces, errors, curves)
 
 
 def document(figures: Mapping[str, Any], folder: Path) -> Document:

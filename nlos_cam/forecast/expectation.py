@@ -26,7 +26,7 @@ from nlos_cam.forecast.linear import (
 )
 from nlos_cam.forecast.prior import Shape, shipped_prior
 from nlos_cam.objects import benchmark_objects, object_box
-from nlos_cam.render import Radiometry, Scene, SensorModel, render
+from nlos_cam.render import RENDERING_VERSION, Radiometry, Scene, SensorModel, render
 
 FRAMES = 1, 4, 30, 100
 QUICK_FRAMES = 1, 100
@@ -189,7 +189,8 @@ def forecast(
         return _forecast(rig, own, [shape], hidden_share(rig, [alone_m]), quick=quick)
     if not cached or own != SensorModel():
         return _of_typical(rig, own, quick=quick)
-    name = f"{rig.checksum}-{VERSION}-{'quick' if quick else 'full'}.npz"
+    version = f"{VERSION}.{RENDERING_VERSION}"
+    name = f"{rig.checksum}-{version}-{'quick' if quick else 'full'}.npz"
 
     def make() -> bytes:
         return _of_typical(rig, own, quick=quick).dump()

@@ -31,6 +31,8 @@ from nlos_cam.reconstruct import Clock, Pipeline, ignore
 from nlos_cam.recording import WallFile
 from nlos_cam.view import Moment
 
+STALE_S = 2.0
+"""Age of the newest result from which on its pace is no longer the run's."""
 RECENT_FRAMES = 300
 """Frames (10 s) over which the status gives rate and latency."""
 STRAIN_FRAMES = 60
@@ -74,6 +76,7 @@ class RunControl:
         self.saving = SavingCommands(self._run)
         self.recording = RecordingCommands(self._run)
         self.bench = BenchCommands(self._run)
+        self.bench.is_saving = lambda: self.saving.is_saving
         groups = self.recording, self.saving, self.pipeline, self.bench
         self._commands = {name: call for group in groups for name, call in group.commands.items()}
         self._command_lock = threading.Lock()
@@ -137,6 +140,11 @@ class RunControl:
         self.set_state("running")
         self._recent.append((moment.time_s, moment.latency_s))
         self.saving.show(moment)
+
+    def pass_frame(self) -> None:
+        """Note a frame that is not reconstructed, as the run is paused."""
+        self.set_state("running")
+        self._recent.clear()  # the pace of before says nothing of the one after
 
     def note_drops(self, count: int) -> None:
         """Take the number of frames that processing was too slow for so far, after each result."""
@@ -242,10 +250,12 @@ class RunControl:
         return status
 
     def _pace(self, now_s: float) -> dict[str, Any]:
-        """Return rate, latency and losses of the last frames; empty before the second."""
+        """Return rate, latency and losses of the last frames; empty before the second, and while
+        none comes.
+        """
         newest = self._run.newest
         recent = list(self._recent)
-        if newest is None or len(recent) < 2:
+        if newest is None or len(recent) < 2 or now_s - recent[-1][0] > STALE_S:
             return {}
         times_s, latencies_s = np.array(recent).T
         p50_s, p99_s = np.percentile(latencies_s, [50, 99])

@@ -6,6 +6,7 @@ import logging
 import time
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
+from functools import partial
 from threading import Event
 from typing import Self
 
@@ -14,6 +15,7 @@ from nlos_cam.frames import Frame
 from nlos_cam.live.control import RunControl
 from nlos_cam.live.statistics import DELIVERY, RunReport, RunStatistics
 from nlos_cam.reconstruct import (
+    Arrival,
     Clock,
     FrameReader,
     FrameResult,
@@ -112,6 +114,16 @@ def pace(frames: Iterable[Frame], stop: Event, clock: Clock) -> Iterator[Frame]:
         yield frame
 
 
+def _is_paused(control: RunControl, statistics: RunStatistics, arrival: Arrival) -> bool:
+    """Return whether a frame is not reconstructed, as the run is paused, and note that it came."""
+    if not control.pipeline.paused:
+        return False
+    # Frames are there: a stall is over, though nothing is reconstructed.
+    statistics.stall.frame_arrived(arrival.arrived_s)
+    control.pass_frame()
+    return True
+
+
 def run_live(
     camera: Camera,
     pipeline: Pipeline,
@@ -169,10 +181,9 @@ def run_live(
         on_idle=on_idle,
     )
     notes = CameraNotes()
+    skips = partial(_is_paused, control, statistics)
     display = LiveDisplay(viewer, count_dropped, reader, telemetry, clock)
-    results = iterate_results(
-        reader, pipeline, clock, statistics.fail, telemetry, lambda: control.pipeline.paused
-    )
+    results = iterate_results(reader, pipeline, clock, statistics.fail, telemetry, skips)
     try:
         with notes, reader, pipeline.checks:
             for result in results:

@@ -136,6 +136,7 @@ class BackgroundPhysicsCheck:
     def _give_up(self, reason: str) -> None:
         self._report(f"no more physics checks: {reason}")
         self._queue.close()
+        self.newest = None  # it would be shown for good
 
     def _report(self, text: str) -> None:
         if not (self._reported or self.ended):

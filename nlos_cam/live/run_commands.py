@@ -110,6 +110,9 @@ class PipelineCommands:
         return "paused: frames are read and not reconstructed"
 
     def resume(self) -> str:
+        """Reconstruct again, with a new mean: the object may have been changed in between."""
+        if self._run.pipeline:
+            self._run.pipeline.begin_mean()
         self.paused = False
         return "reconstructing again"
 
@@ -245,6 +248,8 @@ class BenchCommands:
         """Name, value and range of the options that the camera lets one change."""
         self.on_bench: Callable[[CalibratedRig], None] = ignore
         """Called with the bench once it has another reference."""
+        self.is_saving: Callable[[], bool] = lambda: False
+        """Returns whether a session with the present bench is being saved."""
         self._run = run
 
     @property
@@ -254,6 +259,11 @@ class BenchCommands:
     @property
     def no_reference(self) -> str:
         """Reason why no reference can be taken here; empty if it can."""
+        if self.is_saving():
+            return (
+                "No reference can be taken while a session is saved, which holds one bench: end it"
+                " first (with --save-view it ends with the run)."
+            )
         camera = self._run.camera
         pipeline = self._run.pipeline
         if camera is None or pipeline is None or pipeline.bench.measured:
@@ -272,13 +282,14 @@ class BenchCommands:
 
     def set_option(self, name: str, value: float) -> str:
         """Set an option of the device, such as laser_power, to the nearest allowed value."""
-        camera, _ = self._run.attached()
+        camera, pipeline = self._run.attached()
         if not isinstance(camera, AdjustableCamera):
             raise NlosCamError(
                 f"{camera.uri} has no option {name}: laser and near-wall settings are an L515's"
             )
         outcome = camera.set_option(str(name), float(value))
         self.read_options()
+        pipeline.begin_mean()  # light of two settings has no mean
         return outcome
 
     def take_reference(self, frames: int = REFERENCE_FRAMES) -> str:
@@ -290,6 +301,8 @@ class BenchCommands:
         something is in the way.
         """
         camera, pipeline = self._run.attached()
+        if self.is_saving():
+            raise NlosCamError(self.no_reference)
         count = int(frames)
         if not 1 <= count <= MAX_REFERENCE_FRAMES or count != frames:
             raise NlosCamError(

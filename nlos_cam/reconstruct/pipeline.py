@@ -275,7 +275,11 @@ class Pipeline:
     @average.setter
     def average(self, frames: int) -> None:
         self._average = frames
-        self._mean = MapMean(frames)
+        self.begin_mean()
+
+    def begin_mean(self) -> None:
+        """Average from the next frame on: those before are of another scene or setting."""
+        self._mean = MapMean(self._average)
 
     def process(self, arrival: Arrival, clock: Clock, start_s: float) -> FrameResult:
         """Return the result of one frame; `start_s` is when the loop began to wait for it."""

@@ -65,15 +65,15 @@ def iterate_results(
     clock: Clock = time.time,
     on_failure: OnFailure = _raise_error,
     temperatures: Temperatures | None = None,
-    is_paused: Callable[[], bool] = lambda: False,
+    is_paused: Callable[[Arrival], bool] = lambda _: False,
 ) -> Generator[FrameResult]:
-    """Yield the result of every frame of an entered reader, in order; frames that come while paused
+    """Yield the result of every frame of an entered reader, in order; frames for which `is_paused`
     have none.
     """
     start_s = clock()
     in_a_row = 0
     for arrival in reader:
-        if is_paused():
+        if is_paused(arrival):
             start_s = clock()
             continue
 

@@ -16,6 +16,7 @@ import numpy as np
 from nlos_calibration.arrays import Float32, Float64, Int32
 from numpy.typing import NDArray
 
+from nlos_cam.errors import SceneError
 from nlos_cam.frames import inner, int64
 from nlos_cam.render.beam_sums import (
     NumbaScene,
@@ -47,6 +48,8 @@ LANES = 16
 """Bins by which the rows of tables are padded: whole widest vectors."""
 COUNTERS = 4
 """Histograms of a patch that are counted at once, by turns."""
+MAX_TABLE_BYTES = 8 << 30
+"""Largest tables that are tried at all."""
 
 
 @numba.njit(cache=True, error_model="numpy", fastmath=FAST, inline="always")
@@ -245,8 +248,19 @@ class NumbaJob:
         )
 
     def tables(self, *, second_only: bool = False) -> NumbaTables:
-        """Return the patches' tables; `second_only` leaves the light out that met the object once."""
+        """Return the patches' tables; `second_only` leaves the light out that met the object once.
+
+        Raises SceneError where they would take more than MAX_TABLE_BYTES.
+        """
         per_bin = self.job.accuracy.sub_bins
+        # sub-bins of each patch, and their sums to bins for each shift
+        values = len(self.first) * per_bin * (2 * self.width + WINDOW)
+        if (needed := values * np.dtype(np.float32).itemsize) > MAX_TABLE_BYTES:
+            raise SceneError(
+                f"tables of {len(self.first)} patches with bins of {1e3 * self.job.bin_m:g} mm need"
+                f" {needed / 2**30:.1f} GiB, at most {MAX_TABLE_BYTES >> 30}: widen the bins, or"
+                " hide an object of fewer cells"
+            )
         sites = self.surface, self.relay, *self.sites[3:]
         fine = sub_bins(*sites, self.first, per_bin, self.width)
         found = fine

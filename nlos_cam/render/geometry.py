@@ -266,7 +266,8 @@ def spread(count: int, sample: int) -> NDArray[np.int64]:
     # One of each of `sample` equal runs, at a place that goes by the golden ratio: every so many
     # points alone could all lie in one column of the grid.
     run = np.arange(sample)
-    return ((run + run * GOLDEN % 1) * count / sample).astype(np.int64)
+    # of runs of one or two points, two neighbors may give the same
+    return np.unique(((run + run * GOLDEN % 1) * count / sample).astype(np.int64))
 
 
 def occluder_edge(rig: Rig) -> tuple[float, float]:

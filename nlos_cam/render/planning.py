@@ -235,11 +235,14 @@ class RenderProblem:
         seen = beams.rows(start, end)
         return cls(scene, facts.accuracy, verdicts, seen, jobs[0], tuple(jobs[1:]), tint)
 
-    def beams_of(self, channel: int) -> Beams:
-        """Return the beams with the direct returns of one channel."""
-        if self.tint is None:
-            return self.beams
-        return replace(self.beams, direct=self.beams.direct * self.tint[:, channel])
+    def of_channel(self, channel: int) -> Self:
+        """Return the problem of red, green or blue light alone: its transport and its direct
+        returns.
+        """
+        beams = self.beams
+        if self.tint is not None:
+            beams = replace(beams, direct=beams.direct * self.tint[:, channel])
+        return replace(self, beams=beams, job=self.color_jobs[channel], color_jobs=(), tint=None)
 
     def includes(self, effect: str) -> bool:
         """Return whether the plan includes an effect."""

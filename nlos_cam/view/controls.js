@@ -34,11 +34,25 @@ async function command(name, values = {}) {
     const headers = { "Content-Type": "application/json", "X-Token": token };
     const answer = await fetch("command", { method: "POST", headers, body: JSON.stringify({ command: name, ...values }) });
     const text = (await answer.text()).trim();
+    if (answer.status === 403) forgetToken();
     if (!answer.ok) throw new Error(text);
     tellAnswer(text);
   } catch (error) {
     tellAnswer(`${words}: ${error.message}`, true);
   }
+}
+
+// The token was another run's: nothing can be controlled until the address of this one is opened.
+function forgetToken() {
+  token = "";
+  sessionStorage.removeItem("token");
+  controls.able();
+}
+
+// A number that was typed; an empty field gets its value back.
+function typed(box, value, send) {
+  if (box.value.trim() === "") box.value = value;
+  else send(Number(box.value));
 }
 
 // A file that the run wrote, into this browser's downloads: the program may run on another machine.
@@ -142,9 +156,13 @@ const controls = {
     on("#snapshot", "click", () => command("snapshot"));
     on("#pause", "click", () => this.pause());
     on("#reference", "click", () => command("take_reference"));
-    on("#average", "change", (event) => command("average", { frames: Number(event.target.value) }));
-    for (const box of document.querySelectorAll("[data-option]"))
-      box.addEventListener("change", () => command("option", { name: box.dataset.option, value: Number(box.value) }));
+    const now = () => state.status.control;
+    on("#average", "change", (event) => typed(event.target, now().average, (frames) => command("average", { frames })));
+    for (const box of document.querySelectorAll("[data-option]")) {
+      const name = box.dataset.option;
+      const shown = () => (now().options.find((each) => each.name === name) || { value: "" }).value;
+      box.addEventListener("change", () => typed(box, shown(), (value) => command("option", { name, value })));
+    }
   },
 
   record() {

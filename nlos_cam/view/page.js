@@ -3,8 +3,10 @@
 
 const source = document.documentElement.outerHTML; // as it came, for a session saved by the page
 const mode = document.documentElement.dataset.mode;
-const token = location.hash.slice(1) || sessionStorage.getItem("token") || "";
+let token = location.hash.slice(1) || sessionStorage.getItem("token") || "";
 if (token) sessionStorage.setItem("token", token);
+// The same address with another token is no navigation: the page is the one that is open.
+addEventListener("hashchange", () => location.reload());
 const state = { bench: null, moment: null, status: { state: "connecting" }, statusAt: 0, shown: 0, answer: "" };
 const bench = new Bench(find("#bench"));
 let pictures = null;
@@ -74,7 +76,8 @@ async function follow() {
   for (;;) {
     let reason = "the connection was lost: is the program still running? Trying again";
     const leaving = new AbortController();
-    const ended = whenHidden(() => leaving.abort());
+    // A recording is played on where it stands: its stream is not asked for twice.
+    const ended = mode === "recorded" ? () => {} : whenHidden(() => leaving.abort());
     try {
       await receive(leaving.signal);
     } catch (error) {
@@ -97,7 +100,8 @@ function begin() {
 }
 
 function handle(message) {
-  if (message.kind === "hello" && mode !== "session") begin();
+  if (message.kind === "hello" && message.mode !== mode) location.reload(); // another program, with another page
+  else if (message.kind === "hello") begin();
   else if (message.kind === "bench") setBench(message);
   else if (message.kind === "moment") {
     kept.add(message);
@@ -223,7 +227,7 @@ function drawUncertainty([errorAt, surfaceAt], error, surface) {
     caption(errorAt, "expected error of a surface");
   }
   if (surface) {
-    title(surfaceAt, `Surface ${pictures.swatch("grey")} 0 to 100 %`);
+    title(surfaceAt, `Surface ${pictures.swatch("surface")} 0 to 100 %`);
     pictures.probability(find(surfaceAt), surface);
     caption(surfaceAt, "probability; line: 50 %");
   }
@@ -245,8 +249,10 @@ function drawOther(change, residual, moment) {
   if (residual) maps.push(["residual", "Physics check: residual"]);
   for (const [name, title] of Object.entries(state.bench.wall_pictures || {})) maps.push([name, title]);
   fillSelect(find("#other select"), maps.length ? maps : [["", "Physics check: residual"]]);
-  const name = find("#other select").value;
+  const select = find("#other select");
+  const name = select.value;
   const span = otherSpan(moment, name);
+  find("#other div").setAttribute("aria-label", select.selectedOptions[0] ? select.selectedOptions[0].text : "");
   if (span && moment.arrays[name]) {
     pictures.signed(find("#other"), moment.arrays[name]);
     const score = name === "residual" && moment.score !== null ? `; score ${moment.score.toFixed(2)}` : "";
@@ -254,7 +260,10 @@ function drawOther(change, residual, moment) {
   } else if (state.bench.arrays[name]) {
     pictures.rgb(find("#other"), state.bench.arrays[name]);
     caption("#other", "");
-  } else caption("#other", "first check to come");
+  } else {
+    pictures.clear(find("#other"));
+    caption("#other", "first check to come");
+  }
 }
 
 function otherSpan(moment, name) {
@@ -438,7 +447,8 @@ function drawOver(word) {
 
 function drawNote(word) {
   const { message } = state.status;
-  const what = mode === "session" ? "Loading the session…" : `${word === "ended" ? OVER.ended : word}${message ? `: ${message}` : "…"}`;
+  const session = state.statusAt ? "The session holds no picture." : "Loading the session…";
+  const what = mode === "session" ? session : `${word === "ended" ? OVER.ended : word}${message ? `: ${message}` : "…"}`;
   find("#note").hidden = false;
   setText("#note", what);
 }
@@ -466,7 +476,14 @@ find("#time").addEventListener("input", (event) => {
   player.playing = false;
   player.seek(Number(event.target.value));
 });
-find("#time").addEventListener("change", (event) => event.target.blur());
+// While it is dragged, the slider's place is the hand's; keys move it as any control.
+for (const [event, dragged] of [["pointerdown", true], ["pointerup", false], ["pointercancel", false]])
+  find("#time").addEventListener(event, () => (player.dragged = dragged));
+// Space is for pause or go on after a click with the mouse, not for the button that was clicked.
+addEventListener("click", (event) => {
+  const button = event.target.closest("#controls button, #player button");
+  if (button && event.detail > 0) button.blur();
+});
 find("#save").addEventListener("click", saveFrame);
 for (const select of document.querySelectorAll("figure select, #bench select")) select.addEventListener("change", drawMoment);
 openTab(find(`#tabs [data-panel="${mode === "session" ? "plots" : "controls"}"]`));

@@ -5,6 +5,7 @@ const INSIDE = [255, 255, 255], MISSED = [90, 170, 255], INVENTED = [255, 140, 6
 const DIFFERENCE_SPAN_CM = 5;
 const DARKEST = 60; // where in the color map the farthest surface starts, so that it stands out from the background
 const MAX_ERROR_MM = 30;
+const GREY = 0.8; // brightness of a certain surface, on which the line at 50 % is seen
 const find = (selector) => document.querySelector(selector);
 const escape = (text) => String(text).replace(/[&<>"]/g, (sign) => `&#${sign.charCodeAt(0)};`);
 
@@ -20,7 +21,7 @@ class Pictures {
       depth: this.table((byte) => this.depthRgb(byte)),
       faded: this.table((byte) => (byte ? pale(this.depthRgb(byte)) : this.ground)),
       error: this.table((byte) => this.errorRgb(byte)),
-      grey: this.table((byte) => Array(3).fill(byte * 0.8)),
+      grey: this.table((byte) => Array(3).fill(GREY * byte)),
       lidar: this.table((byte) => this.depthRgb(byte)),
       signed: this.table((byte) => this.signedRgb(byte)),
       signs: this.table((index) => [INSIDE, INVENTED, MISSED][index] || INSIDE),
@@ -60,6 +61,11 @@ class Pictures {
   }
 
   // Paint (rows, columns) pixels, scaled by a whole number; `colorAt` gives each one's number from a table.
+  clear(figure) {
+    const canvas = figure.querySelector("canvas");
+    canvas.getContext("2d").clearRect(0, 0, canvas.width, canvas.height);
+  }
+
   paint(figure, rows, columns, colorAt, scale = 1) {
     const canvas = figure.querySelector("canvas");
     const small = (figure.small ||= Object.assign(document.createElement("canvas"), { width: 0 }));
@@ -140,7 +146,7 @@ class Pictures {
     this.fit = this.fit ? [0.9 * this.fit[0] + 0.1 * low, 0.9 * this.fit[1] + 0.1 * high] : [low, high];
     const [black, white] = this.fit, span = Math.max(white - black, 8);
     this.bytes(figure, image, this.table((value) => Array(3).fill((255 * (value - black)) / span)));
-    return [Math.round(black), Math.round(white)];
+    return [Math.round(black), Math.round(black + span)];
   }
 
   signed(figure, map) {
@@ -182,6 +188,7 @@ class Pictures {
     const colors = {
       signed: (share) => this.signedRgb(1 + Math.round(254 * share)),
       grey: (share) => Array(3).fill(255 * share),
+      surface: (share) => Array(3).fill(GREY * 255 * share),
       lidar: (share) => this.depthRgb(1 + Math.round(254 * share)),
       error: (share) => this.color("error", share),
     };

@@ -13,6 +13,7 @@ const player = {
   cache: new Map(),
   at: 0,
   playing: false,
+  dragged: false,
   wanted: -1,
 
   clear() {
@@ -91,7 +92,9 @@ const player = {
   tell() {
     const message = state.status.state === "playback" ? state.status.message : "";
     find("#clock").textContent = `${this.at.toFixed(1)} of ${this.end().toFixed(1)} s${message ? ` (${message})` : ""}`;
-    if (document.activeElement !== find("#time")) find("#time").value = this.at;
+    const slider = find("#time");
+    if (!this.dragged) slider.value = this.at;
+    slider.setAttribute("aria-valuetext", `${this.at.toFixed(1)} of ${this.end().toFixed(1)} s`);
     find("#play").textContent = this.playing ? "Pause" : "Play";
   },
 
@@ -103,7 +106,8 @@ const player = {
       if (!this.playing) return;
       const next = this.at + ((now - before) / 1000) * Number(find("#speed").value);
       before = now;
-      if (next >= this.end() && mode !== "recorded") this.playing = false;
+      const grows = mode === "recorded" && (state.status.state !== "playback" || state.status.message);
+      if (next >= this.end() && !grows) this.playing = false;
       this.seek(Math.min(next, this.end()));
       requestAnimationFrame(step);
     };

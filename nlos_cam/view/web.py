@@ -242,8 +242,14 @@ class PlaybackViewer(Website):
 
     def _stream(self, send: Send) -> None:
         send(pack({"kind": "hello", "mode": self.mode}) + self._bench)
+        due_s = time.monotonic()
         for chunk in self._kept():
-            send(chunk or self._status())
+            if chunk:
+                send(chunk)
+            # Chunks may come one after another for as long as the recording is reconstructed.
+            if not chunk or time.monotonic() >= due_s:
+                send(self._status())
+                due_s = time.monotonic() + STATUS_S
         send(ENDED)
 
     def _kept(self) -> Iterator[bytes]:
@@ -261,6 +267,10 @@ class PlaybackViewer(Website):
                     chunk = self._file.read(self._ends[sent + 1] - self._ends[sent])
                     sent = sent + 1
             yield chunk
+
+
+SESSION = "session"
+"""Mode of the page of a saved session."""
 
 
 class RecordedView(Website):
@@ -288,4 +298,7 @@ class RecordedView(Website):
         return {"/": (HTML, self._content)}
 
     def _stream(self, send: Send) -> None:
-        """Send nothing: the file holds it all."""
+        """Send the kind of page alone: the file holds the rest. A page of another run that asks here
+        loads this one.
+        """
+        send(pack({"kind": "hello", "mode": SESSION}))

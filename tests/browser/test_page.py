@@ -6,6 +6,7 @@ import time
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 from urllib.parse import urlsplit
 
@@ -76,6 +77,26 @@ def test_page_says_ended_and_comes_back_with_the_next_run(browser: Any) -> None:
         viewer.show(full_moment(3))
         page.wait_until(lambda: page.state()["frame"] == 3, "the next run")
         assert page.state()["headline"] == "Object seen"
+        page.close()
+
+
+def test_page_takes_the_token_of_the_next_run(browser: Any) -> None:
+    controls: Any = SimpleNamespace(
+        status=lambda: {"state": "running"}, run=lambda *_: "done", file=lambda _: None
+    )
+    with WebViewer(RIG, controls=controls) as viewer:
+        port = urlsplit(viewer.address).port
+        viewer.show(full_moment(0))
+        page = Page(browser, viewer.address or "").drawn()
+    with WebViewer(RIG, port=port, controls=controls) as viewer:
+        viewer.show(full_moment(3))
+        page.wait_until(lambda: page.state()["frame"] == 3, "the next run")
+        page.page.evaluate("command('pause')")
+        page.wait_until(lambda: page.page.evaluate("token") == "", "the token is forgotten")
+        token = urlsplit(viewer.address).fragment
+        page.page.evaluate(f"void (location.hash = '{token}')")
+        page.wait_until(lambda: page.state()["frame"] == 3, "the page is loaded again")
+        assert page.page.evaluate("token") == token
         page.close()
 
 

@@ -10,7 +10,7 @@ from nlos_models import shipped_folder
 from nlos_cam.adapt import NETWORK_FILE, Adaptation, Plan, Stage, calibration_spread
 from nlos_cam.adapt.plan import Pace
 from nlos_cam.files import CHECKSUMS, checksums_of
-from nlos_cam.render import SensorModel
+from nlos_cam.render import RENDERING_VERSION, SensorModel
 
 NETWORK = "checkpoint.json", NETWORK_FILE, "network.onnx"
 
@@ -21,6 +21,7 @@ def job_in(folder: Path, rig: Rig) -> Adaptation:
     folder.mkdir()
     stage = Stage(minutes=1.0, objects=300, epochs=2, steps=3)
     Plan(
+        rendering_version=RENDERING_VERSION,
         rig_checksum=rig.checksum,
         start=sha256((shipped_folder() / NETWORK_FILE).read_bytes()).hexdigest(),
         spread=spread,

@@ -25,7 +25,7 @@ from nlos_calibration import load_rig
 from nlos_models import shipped_folder
 
 from nlos_cam.adapt import Pace, Plan, Stage, calibration_spread
-from nlos_cam.render import SensorModel
+from nlos_cam.render import RENDERING_VERSION, SensorModel
 
 RIG = "paper-rig"
 DOCS = Path(__file__).parents[2] / "docs"
@@ -46,6 +46,7 @@ def prepare(folder: Path) -> None:
     rig = load_rig(RIG)
     network = (shipped_folder() / "direct.safetensors").read_bytes()
     Plan(
+        rendering_version=RENDERING_VERSION,
         rig_checksum=rig.checksum,
         start=hashlib.sha256(network).hexdigest(),
         spread=calibration_spread(None),

@@ -7,6 +7,7 @@ import json
 import multiprocessing
 import os
 import random
+import shutil
 import subprocess
 import sys
 import tempfile
@@ -345,13 +346,16 @@ def inputs_of(chosen: argparse.Namespace) -> Generator[Path]:
     with tempfile.TemporaryDirectory() as name:
         folder = Path(chosen.inputs or name).resolve()
         folder.mkdir(parents=True, exist_ok=True)
-        if not (folder / DONE).exists():
+        done = folder / DONE
+        if not done.exists() or done.read_text(encoding="ascii") != program_digest():
             make_inputs(folder)
         yield folder
 
 
 def make_inputs(folder: Path) -> None:
-    """Write the inputs of all commands into a folder."""
+    """Write the inputs of all commands into a folder; those of another program go."""
+    for name in ("data", "held-out", "run"):
+        shutil.rmtree(folder / name, ignore_errors=True)
     in_fork(lambda: bool(record(folder / "noise.bag", packed=True, frames=8)))
     (folder / "small.toml").write_text(RECIPE, encoding="utf-8")
     (folder / "scene.toml").write_text(SCENE, encoding="utf-8")
@@ -360,7 +364,7 @@ def make_inputs(folder: Path) -> None:
         with empty_folder() as empty:
             if (ended := finish(Command(arguments, "", _folder()), empty, folder)).poll():
                 raise RuntimeError(ended.said)
-    (folder / DONE).touch()
+    (folder / DONE).write_text(program_digest(), encoding="ascii")
 
 
 def options(about: str | None, file: str, **counts: int) -> argparse.ArgumentParser:

@@ -85,9 +85,8 @@ def save_direct(folder: Path, network: DirectNetwork, record: CheckpointRecord) 
 def _save(folder: Path, parts: dict[str, nn.Module], record: CheckpointRecord) -> None:
     # Readers of earlier versions refuse fields that they do not know, so that unset ones are not
     # written.
-    unset = {
-        name for name in ("note", "direct_recipe", "program") if not getattr(record, name)
-    }  # older readers refuse these
+    optional = "note", "direct_recipe", "program", "bare_wall_counts"
+    unset = {name for name in optional if not getattr(record, name)}
     text = json.dumps(record.model_dump(mode="json", exclude=unset), indent=2)
     save_parts(folder, parts, {RECORD: text})
 

@@ -165,7 +165,11 @@ def record_run(
     own = out / FITTED if (out / FITTED / RECORD).exists() else out
     if (own / RECORD).exists():
         earlier = load_record(own).model_copy(update={"figures": {}, "program": ""})
-        if earlier != record:
+        # Records of before 2026-11-28 name neither the rig of a file nor the light of training.
+        unnamed = {
+            name: None for name in ("rig", "bare_wall_counts") if getattr(earlier, name) is None
+        }
+        if earlier != record.model_copy(update=unnamed):
             raise OutputExistsError(f"{out} holds weights from another run: choose another --out")
     return record.model_copy(update={"program": program_name()})
 

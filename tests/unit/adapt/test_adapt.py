@@ -15,6 +15,7 @@ from nlos_cam.adapt.plan import load_plan
 from nlos_cam.dataset import DatasetPlan, build_dataset, ignore
 from nlos_cam.errors import SceneError
 from nlos_cam.files import FileBusyError, claim
+from nlos_cam.render import RENDERING_VERSION
 
 AFTER_THE_NETWORK = "judged"
 CORES = 1, 2, 3, 8, 64
@@ -107,6 +108,16 @@ def test_a_bench_that_was_calibrated_again_is_refused(tmp_path: Path) -> None:
 
     with pytest.raises(SceneError, match=r"calibrated again.*--overwrite"):
         adapt(replace(job, rig=moved), 1.0, no_figures)
+
+
+def test_objects_of_another_renderer_are_not_gone_on_with(tmp_path: Path) -> None:
+    job = job_in(tmp_path / "work", load_rig("paper-rig"))
+    plan = load_plan(job.folder)
+    assert plan
+    plan.model_copy(update={"rendering_version": RENDERING_VERSION - 1}).save(job.folder)
+
+    with pytest.raises(SceneError, match=r"renderer differs.*--overwrite"):
+        adapt(job, 1.0, no_figures)
 
 
 def test_a_bench_calibrated_again_begins_again_when_asked(

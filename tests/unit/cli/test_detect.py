@@ -86,7 +86,7 @@ def test_signal_after_the_last_turn_names_the_folder(
 
     answer = run("detect", *([folder] if again else ["l515", "--out", folder]), code=130)
 
-    assert f"whole turns are in {folder}" in answer.err
+    assert (f"the turns in {folder}" if again else f"whole turns are in {folder}") in answer.err
     assert "nothing" not in answer.err
 
 
@@ -212,7 +212,7 @@ def test_terminal_asks_for_each_turn_until_stdin_ends(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     lines = iter(["\n", ""])
-    hands = TerminalHands(made_plan(control=True), lambda: next(lines))
+    hands = TerminalHands(made_plan(control=True), Path("a session"), lambda: next(lines))
     hands.place(0, object_in=True)
     assert "Turn 1 of 32" in capsys.readouterr().err
     with pytest.raises(NlosCamError, match="stdin ended"):

@@ -25,6 +25,7 @@ from small_run import small_recipe
 
 from nlos_cam.dataset import (
     DatasetPlan,
+    Objects,
     RigRange,
     RigSpread,
     data_key,
@@ -426,6 +427,15 @@ def test_held_out_maps_that_hold_nothing_out_are_refused(
         packed.held_out(held_out, 2)
 
 
+def test_meshes_of_the_same_seeds_are_other_objects(tmp_path: Path, store_folder: Path) -> None:
+    training = _add(tmp_path / "training", 0)
+    meshes = Objects(categories=(), meshes=(("cup.obj", "0" * 64),))
+    held_out = _add(tmp_path / "held-out", 0, replace(PLAN, objects=meshes))
+
+    with open_packed_maps([training], store_folder) as packed:
+        assert len(packed.held_out(held_out, 2).image) == 2
+
+
 @pytest.mark.parametrize(("plan", "kept"), [(PLAN, True), (MANY, False), (OTHER, False)])
 def test_cells_of_weights_serve_maps_of_their_own_rig_alone(
     tmp_path: Path, store_folder: Path, plan: DatasetPlan, kept: bool
@@ -437,6 +447,58 @@ def test_cells_of_weights_serve_maps_of_their_own_rig_alone(
 
     with open_packed_maps([data], store_folder, normal=normal, trained=record) as packed:
         assert torch.equal(packed.normal.median, normal.median) == kept
+
+
+def test_store_with_the_cells_of_another_rig_is_refused(tmp_path: Path, store_folder: Path) -> None:
+    normal = CellNormal()
+    normal.median += 7.0
+    record: Any = SimpleNamespace(rig_checksum=OTHER.rig.checksum)
+    data = _add(tmp_path / "data", 0, MANY)
+    with open_packed_maps([data], store_folder, normal=normal):
+        pass  # as it was filled before such cells were dropped
+
+    with (
+        pytest.raises(SceneError, match="other weights: name another --store"),
+        open_packed_maps([data], store_folder, normal=normal, trained=record),
+    ):
+        pass
+
+
+DIM = SensorModel(bare_wall_counts=30.0)
+KNOWN = RigSpread(place_m=0.001)
+
+
+@pytest.mark.parametrize(
+    ("plan", "counts"),
+    [
+        (PLAN, None),  # the simulated sensor's
+        (replace(PLAN, sensor=DIM), 30.0),
+        (replace(PLAN, sensor=DIM, spread=KNOWN, off_record=True), 30.0),
+        (replace(PLAN, sensor=DIM, spread=KNOWN), None),  # aligned with the plan's rig
+        (replace(MANY, sensor=DIM), None),
+    ],
+)
+def test_record_names_the_light_of_the_maps(
+    tmp_path: Path, store_folder: Path, plan: DatasetPlan, counts: float | None
+) -> None:
+    data = _add(tmp_path / "data", 0, plan)
+    recipe = small_recipe(task="direct", objects=4, held_out=2)
+
+    with open_packed_maps([data], store_folder) as packed:
+        record = packed.record_run(recipe, tmp_path / "out", [])
+
+    assert record.bare_wall_counts == counts
+    assert record.rig is None  # it is packaged
+
+
+def test_record_holds_a_rig_of_ones_own(tmp_path: Path, store_folder: Path) -> None:
+    data = _add(tmp_path / "data", 0, OTHER)
+    recipe = small_recipe(task="direct", objects=4, held_out=2)
+
+    with open_packed_maps([data], store_folder) as packed:
+        record = packed.record_run(recipe, tmp_path / "out", [])
+
+    assert Rig.model_validate(record.rig) == OTHER.rig
 
 
 def test_datasets_of_two_sensors_are_refused(tmp_path: Path, store_folder: Path) -> None:

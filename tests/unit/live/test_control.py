@@ -28,7 +28,7 @@ from view_streams import saved_moments
 from nlos_cam.camera import SimulatedCamera
 from nlos_cam.errors import NlosCamError
 from nlos_cam.frames import Frame
-from nlos_cam.live import RunControl, RunReport, run_live
+from nlos_cam.live import RunControl, RunReport, run_commands, run_live
 from nlos_cam.live.run_commands import measured_rig
 from nlos_cam.live.statistics import WARM_UP_FRAMES
 from nlos_cam.reconstruct import CalibratedRig, Pipeline
@@ -40,7 +40,7 @@ from nlos_cam.view import NullViewer, SessionFile, WrittenFiles
 @pytest.fixture
 def control(tmp_path: Path) -> RunControl:
     """Controls of a running camera, with a first frame."""
-    control = RunControl(folder=tmp_path, clock=lambda: 10.0)
+    control = RunControl(folder=tmp_path, clock=lambda: 2.0)
     control.attach(Recorded(0), Pipeline(CalibratedRig(RIG), sheet_network))  # type: ignore[arg-type]
     for number in range(30):
         control.add(full_moment(number))
@@ -57,8 +57,54 @@ def test_status_is_json_and_gives_pace_age_and_disk(control: RunControl) -> None
     assert status["state"] == "running"
     assert status["fps"] == pytest.approx(30.0)
     assert status["p50_ms"] == status["p99_ms"] == pytest.approx(20.0)
-    assert status["age_s"] == pytest.approx(10.0 - 29 / 30 + 0.02, abs=0.01)
+    assert status["age_s"] == pytest.approx(2.0 - 29 / 30 + 0.02, abs=0.01)
     assert status["disk_s"] > 0
+
+
+def test_paused_run_has_frames_and_no_pace(control: RunControl) -> None:
+    control.set_state("stalled", "no frame for 3 s")
+    control.run("pause", {})
+
+    assert control.status()["state"] == "stalled"
+
+    control.pass_frame()  # the camera is back
+
+    assert control.status()["state"] == "paused"
+    assert "fps" not in control.status()
+
+
+def test_old_results_say_nothing_of_the_pace(tmp_path: Path) -> None:
+    control = RunControl(folder=tmp_path, clock=lambda: 10.0)
+    for number in range(30):  # of ten seconds ago
+        control.add(full_moment(number))
+
+    assert "fps" not in control.status()
+
+
+@pytest.mark.parametrize("command", [("resume", {}), ("option", {"name": "gain", "value": 2})])
+def test_what_changes_the_scene_begins_a_new_mean(
+    control: RunControl, monkeypatch: pytest.MonkeyPatch, command: tuple[str, Any]
+) -> None:
+    begun = Mock()
+    monkeypatch.setattr(Pipeline, "begin_mean", begun)
+    monkeypatch.setattr(run_commands, "AdjustableCamera", Recorded)
+    monkeypatch.setattr(Recorded, "set_option", lambda *_: "set", raising=False)
+    monkeypatch.setattr(Recorded, "adjustable", lambda _: [], raising=False)
+    control.run(*command)
+
+    assert begun.call_count == 1
+
+
+def test_no_reference_is_taken_while_a_session_is_saved(control: RunControl) -> None:
+    control.run("save_session", {})
+
+    assert "end it first" in control.status()["control"]["no_reference"]
+    with pytest.raises(NlosCamError, match="session is saved"):
+        control.run("take_reference", {})
+
+    control.run("end_session", {})
+
+    assert control.status()["control"]["no_reference"] == ""
 
 
 @pytest.fixture

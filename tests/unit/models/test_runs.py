@@ -200,6 +200,14 @@ def test_record_run_refuses_weights_of_another_run(
         _record(tmp_path, *recipes)
 
 
+def test_record_of_before_may_lack_the_rig_and_the_light(tmp_path: Path) -> None:
+    (out := tmp_path / "out").mkdir()
+    earlier = record_run(VAE, out, NAMED, [])
+    (out / "checkpoint.json").write_text(earlier.model_dump_json(exclude={"bare_wall_counts"}))
+
+    record_run(VAE, out, NAMED, [], bench={"name": "mine"}, bare_wall_counts=60.0)
+
+
 def test_record_of_a_run_refuses_a_file_and_its_own_start(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     for name, starts in (("file", ()), ("run", (tmp_path / "x" / ".." / "run",))):

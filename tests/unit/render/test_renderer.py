@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from nlos_calibration.rig import load_rig
 
+from nlos_cam.errors import SceneError
 from nlos_cam.objects import object_box, object_depth
 from nlos_cam.render import (
     STOPS,
@@ -103,6 +104,25 @@ def test_color_of_what_the_lidar_sees_itself_is_its_own() -> None:
     )
 
 
+def test_transient_of_what_the_lidar_sees_has_its_color() -> None:
+    rig = load_rig("bare-wall").model_copy(update={"object_box": RIG.object_box})
+    albedo = np.array([1.0, 0.5, 0.0])
+    depth = np.full((8, 8), 0.06, np.float32)
+    problem = prepare(Scene(rig, depth, Surface(albedo)), COARSE)
+    hit = (problem.tint != 1).any(-1)
+    light = transient(
+        Scene(rig, depth, Surface(albedo)),
+        COARSE,
+        ["direct", "three-bounce", "line-of-sight", "colour"],
+    )
+    at = np.floor(2 * problem.beams.length_m[hit] / rig.device.bin_m).astype(int)
+    direct = light.reshape(-1, *light.shape[2:])[np.flatnonzero(hit), at]
+
+    assert hit.any()
+    assert (direct[:, 0] > direct[:, 1]).all()
+    assert (direct[:, 1] > direct[:, 2]).all()
+
+
 @pytest.mark.parametrize("pulse_ns", [0.0, 0.05])
 def test_mean_of_the_channels_is_the_intensity(pulse_ns: float) -> None:
     albedo = np.array([1.0, 0.5, 0.2])
@@ -110,6 +130,14 @@ def test_mean_of_the_channels_is_the_intensity(pulse_ns: float) -> None:
     rendering = render(Scene(RIG, DEPTH, Surface(albedo), pulse_ns=pulse_ns), finer)
 
     np.testing.assert_allclose(rendering.color.mean(-1), rendering.intensity, rtol=1e-5, atol=1e-30)
+
+
+def test_tables_beyond_memory_are_refused_in_a_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    job = prepare(Scene(RIG, DEPTH), COARSE).job
+    monkeypatch.setattr(backend_numba, "MAX_TABLE_BYTES", 1 << 10)
+
+    with pytest.raises(SceneError, match=r"tables of \d+ patches with bins of 10 mm.*widen"):
+        histograms(job)
 
 
 def test_lone_return_has_no_rival_under_a_pulse() -> None:

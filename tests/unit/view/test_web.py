@@ -4,8 +4,10 @@ import threading
 from collections.abc import Iterator
 from contextlib import ExitStack, closing
 from dataclasses import replace
+from itertools import islice
 from pathlib import Path
 from threading import Event
+from types import SimpleNamespace
 from typing import Any
 from unittest.mock import MagicMock, Mock, call
 
@@ -154,6 +156,26 @@ def test_playback_keeps_every_moment_for_every_browser() -> None:
                 if len(times_s) == 70:
                     break
             assert times_s == pytest.approx([number / 30 for number in range(70)], abs=1e-3)
+
+
+def test_playback_sends_its_status_while_chunks_come() -> None:
+    controls: Any = SimpleNamespace(
+        status=lambda: {"state": "playback"}, run=lambda *_: "", file=lambda _: None
+    )
+    with PlaybackViewer(RIG, controls=controls) as viewer:
+        for number in range(70):
+            viewer.show(full_moment(number))
+        kinds = [each["kind"] for each in islice(frames(viewer), 4)]
+
+    assert kinds[:3] == ["hello", "bench", "chunk"]
+    assert kinds[3] == "status"
+
+
+def test_page_of_another_run_is_sent_to_the_session(saved: Path) -> None:
+    with RecordedView(saved) as viewer, closing(ask(viewer.address or "", "/stream")) as answer:
+        (hello,) = messages(answer)
+
+    assert (hello["kind"], hello["mode"]) == ("hello", "session")
 
 
 @pytest.mark.parametrize(
