@@ -436,7 +436,7 @@ def test_train_quality_replaces_a_damaged_model(
 def test_train_direct_refuses_a_store_in_use(tmp_path: Path, out: Path, shown: Run) -> None:
     (recipe := tmp_path / "direct.toml").write_text('task = "direct"\n' + BASE)
     (store := tmp_path / "store").mkdir()
-    maps = "--dataset", tmp_path, "--held-out", tmp_path, "--store", store
+    maps = "--dataset", "data", "--held-out", "held-out", "--store", store
     with claim(store, inside=True):
         assert (
             "being written"
