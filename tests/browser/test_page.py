@@ -94,7 +94,8 @@ def test_page_takes_the_token_of_the_next_run(browser: Any) -> None:
         page.page.evaluate("command('pause')")
         page.wait_until(lambda: page.page.evaluate("token") == "", "the token is forgotten")
         token = urlsplit(viewer.address).fragment
-        page.page.evaluate(f"void (location.hash = '{token}')")
+        with page.page.expect_event("load"):
+            page.page.evaluate(f"void (location.hash = '{token}')")
         page.wait_until(lambda: page.state()["frame"] == 3, "the page is loaded again")
         assert page.page.evaluate("token") == token
         page.close()
