@@ -11,7 +11,7 @@ from nlos_models import CheckpointRecord
 from nlos_cam.adapt.locked import LockedNoise
 from nlos_cam.adapt.plan import Locked
 from nlos_cam.errors import SceneError
-from nlos_cam.reconstruct import can_align, grid_of
+from nlos_cam.reconstruct import can_align, grid_of, recorded_counts
 from nlos_cam.render import SensorModel
 
 
@@ -45,8 +45,7 @@ class TrainingInputs:
         bench = rig.model_dump(mode="json")
         grid = grid_of(trained)
         if grid is None:
-            default = SensorModel().bare_wall_counts
-            counts = None if sensor.bare_wall_counts == default else sensor.bare_wall_counts
+            counts = recorded_counts(sensor)
             return cls((rig.name, rig.checksum), bench, trained, bare_wall_counts=counts)
         if not can_align(rig, grid):
             raise SceneError(

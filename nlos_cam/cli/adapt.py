@@ -258,9 +258,8 @@ def _report(
     state = "was finished before" if result.was_there else "done"
     worse = ""
     if not kept and not result.plan.locked:
-        worse = ", worse than the start weights" if not result.is_better else ""
-        worse = worse or ", worse than the weights in use, which stay"
-        worse += " (more --minutes help)"
+        better = "weights in use, which stay" if result.is_better else "start weights"
+        worse = f", worse than the {better} (more --minutes help)"
     text = (
         f"{state}: {rows[0][0]} {before} -> {after} on this bench{worse}; weights in {target},"
         f" report {page}"

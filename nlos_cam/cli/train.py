@@ -341,10 +341,6 @@ def direct(
         )
     fabric = run.fabric(recipe)
     start, runs = training.direct_start(recipe, weights)
-    held_out_maps = data_sets.open_dataset(held_out_data, color=recipe.colour)
-    for folder in data:
-        opened = data_sets.open_dataset(folder, color=recipe.colour, expected=True)
-        data_sets.check_held_out(opened, held_out_maps)
     with ExitStack() as held:
         with tracked("packing maps") as on_progress:
             trained = models.load_record(models.weights_folder(weights)) if start else None
@@ -358,6 +354,7 @@ def direct(
                 frame=reconstruct.grid_of(trained) if trained else None,
                 run=f"{run.out.resolve()} ",
                 processes=pack_workers,
+                held_out=held_out_data,
             )
             source = held.enter_context(packed)
         if not training.has_state(run.out):

@@ -34,7 +34,6 @@ __all__ = [
     "build_dataset",
     "build_transients",
     "check_arrays",
-    "check_held_out",
     "check_uncertainty_data",
     "data_key",
     "difference_noise",
@@ -101,7 +100,7 @@ from .packed import PackedMaps, map_noise, open_packed_maps
 from .packed_index import data_key
 from .plan import RECORDED, DatasetPlan, Objects, RigSpread
 from .ray_backend import ray_farm
-from .reader import Dataset, check_held_out, open_dataset
+from .reader import Dataset, open_dataset
 from .rig_range import OBJECTS_PER_RIG, RigRange
 from .samples import (
     Tracked,

@@ -38,7 +38,7 @@ from nlos_cam.errors import RecordingError, SceneError
 from nlos_cam.files import atomic_file, claim
 from nlos_cam.files import read_arrays as read_npz
 from nlos_cam.frames import MAP_COLUMNS, MAP_ROWS, OBJECT_PIXELS
-from nlos_cam.reconstruct import WALL_GRID, is_wall_grid, rig_fields
+from nlos_cam.reconstruct import WALL_GRID, is_wall_grid, recorded_counts, rig_fields
 from nlos_cam.render import Material, SensorModel
 
 CELLS = "cells.npz"
@@ -75,6 +75,7 @@ class PackedMaps:
         run: str = "",
         packing: Packing | None = None,
         locked: bool = False,
+        held_out: Path | None = None,
     ) -> None:
         """Open or make the store: use `open_packed_maps`, which holds its claim meanwhile.
 
@@ -86,7 +87,8 @@ class PackedMaps:
         have (`DatasetPlan.known_rig`) stays in the maps. `run` names the training run: another one
         in the same store sees the objects that are there when its own epochs begin. New shards are
         made ready by the processes of `packing`, by default this one. Datasets of locked
-        differences are taken only where `locked`. Raises RecordingError for no dataset, SceneError
+        differences are taken only where `locked`. Objects to hold out, if given, are looked at
+        before anything is packed, as by the method `held_out`. Raises RecordingError for no dataset, SceneError
         for datasets of two rigs or a store of other data, aligned with another rig, or normalised
         otherwise.
         """
@@ -120,6 +122,8 @@ class PackedMaps:
             )
         self._color = color
         self._locked = locked
+        if held_out:
+            self._open_held_out(held_out)
         pixels = (OBJECT_PIXELS, OBJECT_PIXELS)
         self._rows: dict[str, tuple[int, ...]] = {
             MAPS: (channels_of(color=color), MAP_ROWS, MAP_COLUMNS),
@@ -236,9 +240,7 @@ class PackedMaps:
 
         Raises SceneError for a dataset of the same objects, or of benches that cannot be aligned.
         """
-        opened = open_dataset(folder, color=self._color, locked=self._locked)
-        for training in self._opened:
-            check_held_out(training, opened)
+        opened = self._open_held_out(folder)
         maps = aligned_with(first_of(opened.arrays(), count), opened.benches(), self.frame)[0]
         if not len(maps.image):
             raise SceneError(
@@ -246,6 +248,12 @@ class PackedMaps:
                 " size, or its occluder hides more; hold out objects of the same rig"
             )
         return maps
+
+    def _open_held_out(self, folder: Path) -> Dataset:
+        opened = open_dataset(folder, color=self._color, locked=self._locked)
+        for training in self._opened:
+            check_held_out(training, opened)
+        return opened
 
     def record_run(
         self, recipe: Recipe, out: Path, runs: list[Recipe], *starts: Path | None
@@ -256,7 +264,6 @@ class PackedMaps:
         rig = self.frame
         # Light of the wall grid, and of aligned maps, is that of the simulated sensor.
         is_own = not is_wall_grid(rig) and self.plan.stays_in_maps
-        counts = self.plan.sensor.bare_wall_counts if is_own else None
         return record_run(
             recipe,
             out,
@@ -264,7 +271,7 @@ class PackedMaps:
             runs,
             *starts,
             bench=rig_fields(rig),
-            bare_wall_counts=None if counts == SensorModel().bare_wall_counts else counts,
+            bare_wall_counts=recorded_counts(self.plan.sensor) if is_own else None,
         )
 
     def forget_run(self) -> None:
@@ -348,6 +355,7 @@ def open_packed_maps(
     run: str = "",
     processes: int = 1,
     locked: bool = False,
+    held_out: Path | None = None,
 ) -> Generator[PackedMaps]:
     """Open or make a store, and hold the right to write it until the end of the block.
 
@@ -368,4 +376,5 @@ def open_packed_maps(
             run=run,
             packing=made_ready,
             locked=locked,
+            held_out=held_out,
         )

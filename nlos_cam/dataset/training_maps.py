@@ -32,8 +32,14 @@ from nlos_cam.dataset.plan import RECORDED, DatasetPlan, RigSpread
 from nlos_cam.dataset.reader import MAP_CHANNELS, Dataset, check_held_out, open_dataset
 from nlos_cam.errors import SceneError
 from nlos_cam.frames import MAP_COLUMNS, MAP_ROWS, maps_from_frame
-from nlos_cam.reconstruct import align_all, rig_fields, rig_to_align_with, training_rig
-from nlos_cam.render import Scene, Sensor, SensorModel, render
+from nlos_cam.reconstruct import (
+    align_all,
+    recorded_counts,
+    rig_fields,
+    rig_to_align_with,
+    training_rig,
+)
+from nlos_cam.render import Scene, Sensor, render
 
 BARE_WALL_FRAMES = 60
 """Frames to average: the default of `calibrate`."""
@@ -73,11 +79,7 @@ class MapSplit(NamedTuple):
         """
         rig = self.rig
         start = trained if trained and trained.rig_checksum == rig.checksum else None
-        counts = self.plan.sensor.bare_wall_counts
-        if start:
-            counts = start.bare_wall_counts
-        elif counts == SensorModel().bare_wall_counts:
-            counts = None
+        counts = start.bare_wall_counts if start else recorded_counts(self.plan.sensor)
         return record_run(
             recipe,
             out,

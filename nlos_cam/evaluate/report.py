@@ -127,9 +127,9 @@ class Evaluation:
         """Return every metric of every frame."""
         return metrics.per_object(self.image, self.truth, self.box)
 
-    def of_objects(self, image: Float32) -> metrics.PerObject:
-        """Return every metric of images (n, 64, 64) for every object, over its frames."""
-        return metrics.by_object(metrics.per_object(image, self.truth, self.box), self.of_object)
+    def by_object(self, values: Mapping[str, Float64]) -> metrics.PerObject:
+        """Return values of every frame for every object, over its frames."""
+        return metrics.by_object(values, self.of_object)
 
     @cached_property
     def surfaces(self) -> dict[str, Float64]:
@@ -227,10 +227,13 @@ def evaluate(
 
 def as_figures(evaluation: Evaluation) -> dict[str, Any]:
     """Return all figures, ready for JSON."""
-    ours = evaluation.of_objects(evaluation.image)
-    theirs = {name: evaluation.of_objects(guess) for name, guess in evaluation.guesses.items()}
+    ours = evaluation.by_object(evaluation.ours)
+    theirs = {
+        name: evaluation.by_object(metrics.per_object(guess, evaluation.truth, evaluation.box))
+        for name, guess in evaluation.guesses.items()
+    }
     categories = evaluation.object_categories
-    errors = metrics.by_object(evaluation.errors, evaluation.of_object)
+    errors = evaluation.by_object(evaluation.errors)
     overall = metrics.over_objects(ours)
     nearest = theirs.get("nearest_neighbour")
     return {
@@ -310,7 +313,7 @@ def _recognised(evaluation: Evaluation) -> dict[str, Any] | None:
         name: recognised(images, evaluation.categories, evaluation.box)
         for name, images in each.items()
     }
-    return metrics.plain(metrics.over_objects(metrics.by_object(shares, evaluation.of_object)))
+    return metrics.plain(metrics.over_objects(evaluation.by_object(shares)))
 
 
 def _by_shown(
@@ -361,7 +364,7 @@ def _draw(folder: Path, evaluation: Evaluation) -> None:
     image = evaluation.image
     truth = evaluation.truth
     names = evaluation.names
-    ours = evaluation.of_objects(image)
+    ours = evaluation.by_object(evaluation.ours)
     categories = evaluation.object_categories
     pictures.draw_sheet(folder / "sheet.png", image, truth, names)
     if second := evaluation.unseen:
@@ -376,7 +379,7 @@ def _draw(folder: Path, evaluation: Evaluation) -> None:
     )
     if sets := _predicted_sets(evaluation):
         pictures.draw_quality(folder / QUALITY, sets)
-    errors = metrics.by_object(evaluation.errors, evaluation.of_object)
+    errors = evaluation.by_object(evaluation.errors)
     surfaces = {name: each[evaluation.objects] for name, each in evaluation.surfaces.items()}
     curves = {
         measure_name: {

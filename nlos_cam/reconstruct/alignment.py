@@ -339,6 +339,14 @@ def rig_fields(rig: Rig) -> dict[str, Any] | None:
     return None if is_packaged else rig.model_dump(mode="json")
 
 
+def recorded_counts(sensor: SensorModel) -> float | None:
+    """Return the counts of the brightest bare wall for the record of weights; None for those of the
+    simulated sensor, with which weights without a number were trained.
+    """
+    counts = sensor.bare_wall_counts
+    return None if counts == SensorModel().bare_wall_counts else counts
+
+
 def _is_in_view(bench: Rig, trained: Rig) -> bool:
     """Return whether the bench sees the wall of the training rig to within HIDDEN_CELLS of its
     occluder's edge.

@@ -235,14 +235,18 @@ class RenderProblem:
         seen = beams.rows(start, end)
         return cls(scene, facts.accuracy, verdicts, seen, jobs[0], tuple(jobs[1:]), tint)
 
-    def of_channel(self, channel: int) -> Self:
-        """Return the problem of red, green or blue light alone: its transport and its direct
-        returns.
+    @property
+    def channels(self) -> list[Self]:
+        """The problems of red, green and blue light alone, with their transport and their direct
+        returns, if the plan includes color; else none.
         """
-        beams = self.beams
-        if self.tint is not None:
-            beams = replace(beams, direct=beams.direct * self.tint[:, channel])
-        return replace(self, beams=beams, job=self.color_jobs[channel], color_jobs=(), tint=None)
+        found: list[Self] = []
+        for channel, job in enumerate(self.color_jobs):
+            beams = self.beams
+            if self.tint is not None:
+                beams = replace(beams, direct=beams.direct * self.tint[:, channel])
+            found.append(replace(self, beams=beams, job=job, color_jobs=(), tint=None))
+        return found
 
     def includes(self, effect: str) -> bool:
         """Return whether the plan includes an effect."""

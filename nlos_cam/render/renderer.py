@@ -119,11 +119,8 @@ def transient(
     follows.
     """
     problem = prepare(scene, accuracy_named(accuracy), effects, bounded=False)
-    if problem.color_jobs:
-        channels = [problem.of_channel(number) for number in range(len(problem.color_jobs))]
-    else:
-        channels = [problem]
-    parts = [_waveforms(each, beam_histograms(each, each.job, backend)) for each in channels]
+    lights = problem.channels or [problem]
+    parts = [_waveforms(each, beam_histograms(each, each.job, backend)) for each in lights]
     shaped = [part.reshape(*problem.beams.shape, -1) for part in parts]
     return np.stack(shaped, -1) if problem.color_jobs else shaped[0]
 
@@ -305,8 +302,7 @@ def _color(problem: RenderProblem, echoes: MultiBounce, depth: Float32, backend:
     wins = (echoes.peak.ravel() > problem.beams.direct) | echoes.direct_included
     at = np.nan_to_num(echoes.path_m.ravel() / bin_m, nan=0).astype(np.int64)
     channels: list[Float32] = []
-    for number in range(len(problem.color_jobs)):
-        own = problem.of_channel(number)
+    for own in problem.channels:
         histogram = beam_histograms(own, own.job, backend).astype(np.float32, copy=False)
         if echoes.direct_included:
             histogram = _waveforms(own, histogram)

@@ -60,12 +60,12 @@ class Pictures {
     return new Uint32Array(bytes.buffer);
   }
 
-  // Paint (rows, columns) pixels, scaled by a whole number; `colorAt` gives each one's number from a table.
   clear(figure) {
     const canvas = figure.querySelector("canvas");
     canvas.getContext("2d").clearRect(0, 0, canvas.width, canvas.height);
   }
 
+  // Paint (rows, columns) pixels, scaled by a whole number; `colorAt` gives each one's number from a table.
   paint(figure, rows, columns, colorAt, scale = 1) {
     const canvas = figure.querySelector("canvas");
     const small = (figure.small ||= Object.assign(document.createElement("canvas"), { width: 0 }));
