@@ -87,9 +87,11 @@ class UncertaintyNetwork(nn.Module):
         """Set the bare wall to each cell's median over maps (n, 64, 80) of benches with nothing
         hidden.
         """
-        # The median: a cell with a few wrong returns has the right value, a mean has not.
+        # The median: a cell with a few wrong returns has the right value, a mean has not. On the
+        # wall grid each bench sees other cells: those without a return have no light either.
+        light = torch.where(torch.isnan(depth_m), torch.nan, intensity)
         self.bare_depth_m.copy_(torch.nan_to_num(depth_m.nanmedian(0).values))
-        self.bare_intensity.copy_(intensity.median(0).values)
+        self.bare_intensity.copy_(torch.nan_to_num(light.nanmedian(0).values))
 
     def features(self, depth_m: Tensor, intensity: Tensor) -> Tensor:
         """Return (n, 5, 64, 80): differences from the bare wall, each from -1 to 1, and 1 for cells

@@ -3,6 +3,8 @@ __all__ = [
     "OBJECTS",
     "PLAN",
     "RECORDINGS",
+    "SHIPPED_WEIGHTS",
+    "START_WEIGHTS",
     "AdaptResult",
     "Adaptation",
     "Locked",
@@ -27,4 +29,14 @@ from .locked import LockedNoise
 from .plan import PLAN, Locked, Pace, Plan, Stage, bench_sensor, calibration_spread
 from .recordings import RECORDINGS, Recordings, Transfer, find_recordings
 from .report import Tables, transfer_words, write_page
-from .run import NETWORK_FILE, OBJECTS, Adaptation, AdaptResult, Measure, adapt, install
+from .run import (
+    NETWORK_FILE,
+    OBJECTS,
+    SHIPPED_WEIGHTS,
+    START_WEIGHTS,
+    Adaptation,
+    AdaptResult,
+    Measure,
+    adapt,
+    install,
+)

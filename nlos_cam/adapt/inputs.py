@@ -10,8 +10,7 @@ from nlos_models import CheckpointRecord
 
 from nlos_cam.adapt.locked import LockedNoise
 from nlos_cam.adapt.plan import Locked
-from nlos_cam.errors import SceneError
-from nlos_cam.reconstruct import can_align, grid_of, recorded_counts
+from nlos_cam.reconstruct import check_alignable, grid_of, recorded_counts
 from nlos_cam.render import SensorModel
 
 
@@ -47,11 +46,7 @@ class TrainingInputs:
         if grid is None:
             counts = recorded_counts(sensor)
             return cls((rig.name, rig.checksum), bench, trained, bare_wall_counts=counts)
-        if not can_align(rig, grid):
-            raise SceneError(
-                f"the start weights cannot see {rig.name}: its lidar sees too little of the wall"
-                " past the occluder, or its box has another size; choose others with --weights"
-            )
+        check_alignable(rig, trained)
         return cls((rig.name, grid.checksum), bench, trained, frame=grid)
 
     @classmethod

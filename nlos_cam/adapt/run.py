@@ -53,7 +53,7 @@ from nlos_cam.files import (
     claim,
     write_checked,
 )
-from nlos_cam.reconstruct import weights_for
+from nlos_cam.reconstruct import check_alignable, weights_for
 from nlos_cam.render import RENDERING_VERSION, SensorModel
 
 OBJECTS = "objects"
@@ -71,6 +71,7 @@ UNCERTAINTY_GRAPH = "doubt.onnx"
 PACKED = "packed"
 BEFORE = "before"
 START = "start"
+SHIPPED = "shipped"
 AFTER = "after"
 SIMULATED = "simulated"
 GUESS = "mean_object"
@@ -94,6 +95,9 @@ PACE_STEPS = 6
 MIN_NOTES = 4
 """Notes of progress from which a pace is told."""
 RECIPE = "doubt"
+
+START_WEIGHTS = "start weights"
+SHIPPED_WEIGHTS = "shipped weights"
 
 Measure = Callable[[Path | None, Path, Path | None], None]
 """Measures weights (None: the shipped ones) on a dataset (None: the bench's test objects): writes
@@ -123,11 +127,15 @@ class Adaptation:
     """Recordings of known objects on the bench, if there are any."""
     begin_again: bool = False
     """Whether a folder that is an adaptation to another rig is emptied, in place of an error."""
+    began_from: Path | None = None
+    """Shipped weights that the folder's work began from, which another version may not choose."""
 
     @property
     def start_folder(self) -> Path:
         """Folder of the start weights."""
-        return models.weights_folder(self.start) if self.start else weights_for(self.rig)
+        if self.start:
+            return models.weights_folder(self.start)
+        return self.began_from or weights_for(self.rig)
 
     @property
     def threads(self) -> int:
@@ -154,15 +162,27 @@ class AdaptResult:
     """True where the adaptation of these minutes was finished before."""
     transfer: Transfer | None = None
     """Transfer to recordings of known objects; its weights are the result's if it is better."""
+    shipped_iou: float | None = None
+    """Silhouette IoU of the shipped weights that serve the rig best, where the start weights are
+    others."""
 
     @property
     def is_better(self) -> bool:
-        """True if the weights serve the bench at least as well as the start weights do.
+        """True if the weights serve the bench at least as well as those that it would have without
+        them: the start weights, and the shipped ones.
 
         A few minutes' weights can be worse than aligned ones on a bench close to the start weights'
         rig.
         """
-        return self.serves_as_well_as(self.before["silhouette_iou"]["value"])
+        start_iou: float = self.before["silhouette_iou"]["value"]
+        return self.serves_as_well_as(max(start_iou, self.shipped_iou or 0.0))
+
+    @property
+    def better(self) -> str:
+        """Better ones of START_WEIGHTS and SHIPPED_WEIGHTS, in words."""
+        start_iou = self.before["silhouette_iou"]["value"]
+        is_shipped = self.shipped_iou is not None and self.shipped_iou > start_iou
+        return SHIPPED_WEIGHTS if is_shipped else START_WEIGHTS
 
     def serves_as_well_as(self, other_iou: float) -> bool:
         """Return whether the weights are as good as others with this silhouette IoU on the test
@@ -193,6 +213,7 @@ def adapt(
     """
     job.folder.mkdir(parents=True, exist_ok=True)
     with claim(job.folder, inside=True), _threads(job.threads):
+        job = _from_where_it_began(job)
         plan = _plan_for(job, minutes, tracked)
         job = replace(job, spread=plan.spread, sensor=plan.sensor, seed=plan.seed)
         folders = [job.folder / _stage_name(number) for number in range(len(plan.stages))]
@@ -215,7 +236,42 @@ def adapt(
         was_there = (last / REPORT / FIGURES).exists()
         _train_uncertainty(job, plan, last, tracked, watch)
         after = _figures(measure, last / WEIGHTS, last / REPORT)
-        return AdaptResult(last / WEIGHTS, plan, folders, before, after, was_there, transfer)
+        return AdaptResult(
+            last / WEIGHTS,
+            plan,
+            folders,
+            before,
+            after,
+            was_there,
+            transfer,
+            _shipped_iou(job, measure),
+        )
+
+
+def _shipped_iou(job: Adaptation, measure: Measure) -> float | None:
+    """Return the silhouette IoU of the shipped weights that serve the rig best; None where they are
+    the start weights, which are measured anyway.
+    """
+    shipped = weights_for(job.rig)
+    if shipped == job.start_folder:
+        return None
+    return _figures(measure, shipped, job.folder / SHIPPED)["silhouette_iou"]["value"]
+
+
+def _from_where_it_began(job: Adaptation) -> Adaptation:
+    """Return the adaptation with the shipped weights that its folder's work began from, where none
+    were asked for.
+    """
+    plan = load_plan(job.folder)
+    if job.start or plan is None or job.locked or (job.begin_again and _other_than(job, plan)):
+        return job
+    folders = [models.shipped_folder(name) for name in models.SHIPPED]
+    began = [
+        folder
+        for folder in folders
+        if (path := folder / NETWORK_FILE).exists() and _checksum(path) == plan.start
+    ]
+    return replace(job, began_from=began[0]) if began else job
 
 
 @contextmanager
@@ -258,6 +314,8 @@ def _plan_for(job: Adaptation, minutes: float, tracked: data.Tracked) -> Plan:
         _forget(job.folder)
         plan = None
     if plan is None:
+        if not job.locked:  # before minutes of measuring and rendering
+            check_alignable(job.rig, models.load_record(job.start_folder))
         with tracked("measuring the pace of this machine") as on_progress:
             pace = _measure_pace(job, on_progress)
         plan = Plan(
@@ -291,7 +349,7 @@ def _forget(folder: Path) -> None:
     """Delete what an adaptation made, objects of its rig included: the plan at last, so that a stop
     meanwhile is repeated.
     """
-    of_its_rig = (BEFORE, OBJECTS, HELD_OUT, JUDGED, QUALITY, EARLIER_QUALITY, OUTLIERS)
+    of_its_rig = (BEFORE, SHIPPED, OBJECTS, HELD_OUT, JUDGED, QUALITY, EARLIER_QUALITY, OUTLIERS)
     for made in (*(folder / name for name in of_its_rig), *folder.glob(STAGE.format("*"))):
         if made.exists():
             shutil.rmtree(made)
@@ -302,11 +360,15 @@ def _start_checksum(job: Adaptation) -> str:
     """Return the checksum of the start weights. Raises SceneError for no direct network."""
     folder = job.start_folder
     try:
-        return sha256((folder / NETWORK_FILE).read_bytes()).hexdigest()
+        return _checksum(folder / NETWORK_FILE)
     except OSError as error:
         raise SceneError(
             f"the start weights {folder} are no direct network: choose others with --weights"
         ) from error
+
+
+def _checksum(path: Path) -> str:
+    return sha256(path.read_bytes()).hexdigest()
 
 
 def _data_plan(

@@ -161,8 +161,9 @@ def adapt(
         if kept:
             commands = [live]
         elif _has_weights_of_another_rig(folder):
-            start = shlex.quote(str(weights or reconstruct.weights_for(rig).name))
-            commands = [f"{live} --weights {start}"]
+            start = weights if result.better == adaptation.START_WEIGHTS else None
+            best = shlex.quote(str(start or reconstruct.weights_for(rig).name))
+            commands = [f"{live} --weights {best}"]
     # the pace that the plan was made with is that of these
     machines: dict[str, Any] = {
         "--out": out,
@@ -258,7 +259,7 @@ def _report(
     state = "was finished before" if result.was_there else "done"
     worse = ""
     if not kept and not result.plan.locked:
-        better = "weights in use, which stay" if result.is_better else "start weights"
+        better = "weights in use, which stay" if result.is_better else result.better
         worse = f", worse than the {better} (more --minutes help)"
     text = (
         f"{state}: {rows[0][0]} {before} -> {after} on this bench{worse}; weights in {target},"

@@ -76,7 +76,8 @@ class Choice(NamedTuple):
         and its mismatches with the bench. Raises CheckpointError.
         """
         found = benches.load_serving(bench, self.weights, self.bench, self.record)
-        common.say(f"Loaded model {found.network.record.rig_name} ({found.network.runtime})")
+        name = reconstruct.rig_in_words(found.network.record)
+        common.say(f"Loaded model {name} ({found.network.runtime})")
         if not found.verdict.is_warning:
             sentence = found.verdict.sentence
             common.say(sentence[:1].upper() + sentence[1:])

@@ -45,7 +45,11 @@ def evaluate(
     ] = None,
     weights: benches.Weights = None,
     rig: Annotated[
-        str | None, typer.Option("--rig", help="Rig by name or file (default: the weights' own).")
+        str | None,
+        typer.Option(
+            "--rig",
+            help="Rig by name or file (default: that of the weights; of those for any, the paper's).",
+        ),
     ] = None,
     wall: Annotated[
         Path | None,

@@ -261,16 +261,18 @@ class PackedMaps:
         """Return the record of the weights that a recipe makes of these maps after `runs`. Raises
         OutputExistsError as `nlos_models.training.record_run`.
         """
-        rig = self.frame
+        on_grid = is_wall_grid(self.frame)
+        # On the grid too, objects of one rig make weights for that rig.
+        rig = self.plan.rig if on_grid and self.plan.rigs is None else self.frame
         # Light of the wall grid, and of aligned maps, is that of the simulated sensor.
-        is_own = not is_wall_grid(rig) and self.plan.stays_in_maps
+        is_own = not on_grid and self.plan.stays_in_maps
         return record_run(
             recipe,
             out,
-            (rig.name, rig.checksum),
+            (rig.name, self.frame.checksum),
             runs,
             *starts,
-            bench=rig_fields(rig),
+            bench=rig_fields(rig, packaged=on_grid),
             bare_wall_counts=recorded_counts(self.plan.sensor) if is_own else None,
         )
 

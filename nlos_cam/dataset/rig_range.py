@@ -18,6 +18,12 @@ from pydantic import Field, model_validator
 
 from nlos_cam.errors import SceneError
 from nlos_cam.objects import object_box
+from nlos_cam.reconstruct import (
+    ALONG_RANGE_M,
+    ASIDE_RANGE_M,
+    OCCLUDER_RANGE_M,
+    PITCH_RANGE_DEG,
+)
 
 Metres = Annotated[float, Field(ge=-1, le=1)]
 Degrees = Annotated[float, Field(gt=-90, lt=90)]
@@ -43,16 +49,16 @@ class RigRange(Record):
 
     distance_m: Range = DISTANCE_RANGE_M
     yaw_deg: tuple[Degrees, Degrees] = FACING_RANGE_DEG
-    pitch_deg: tuple[Degrees, Degrees] = (-2.0, 2.0)
+    pitch_deg: tuple[Degrees, Degrees] = PITCH_RANGE_DEG
     gap_m: Range = GAP_RANGE_M
     """From the occluder's edge to the wall. A gap through which the lidar would see the box is not
     drawn."""
-    along_m: Range = (-0.05, 0.05)
+    along_m: Range = ALONG_RANGE_M
     """Move of the lidar's foot along the wall, away from occluder and box: they move the other way
     in the wall frame."""
-    aside_m: Range = (-0.01, 0.01)
+    aside_m: Range = ASIDE_RANGE_M
     """Move of the box's middle, wall y."""
-    occluder_m: Range = (-0.02, 0.02)
+    occluder_m: Range = OCCLUDER_RANGE_M
     """Move of the occluder, wall x, against the box."""
 
     @model_validator(mode="after")

@@ -38,7 +38,7 @@ from nlos_cam.errors import SceneError
 from nlos_cam.files import atomic_file, read_arrays
 from nlos_cam.frames import OBJECT_PIXELS, LidarMaps, maps_from_frame
 from nlos_cam.objects import CATEGORIES, image_from_depth
-from nlos_cam.reconstruct import grid_of
+from nlos_cam.reconstruct import grid_of, own_rig
 from nlos_cam.render import (
     RENDERING_VERSION,
     Material,
@@ -438,8 +438,13 @@ def _frame_of(plan: DatasetPlan, trained: models.CheckpointRecord) -> Rig:
 
 
 def _fit(plan: DatasetPlan, trained: models.CheckpointRecord) -> bool:
-    """Return whether a dataset is of the weights' own rig, or the weights are for any."""
-    return bool(grid_of(trained)) or plan.rig.checksum == trained.rig_checksum
+    """Return whether a dataset is of the weights' own rig, or of many where they are for any."""
+    if grid_of(trained) is None:
+        return plan.rig.checksum == trained.rig_checksum
+    if trained.rig is None:
+        return plan.rigs is not None
+    own = own_rig(trained)
+    return plan.rigs is None and own is not None and plan.rig.checksum == own.checksum
 
 
 def check_uncertainty_data(

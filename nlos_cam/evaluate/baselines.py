@@ -1,7 +1,9 @@
 """Trivial baselines: background only, mean object, nearest training object."""
 
 import hashlib
+from collections.abc import Iterator
 from dataclasses import replace
+from itertools import islice
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +15,7 @@ from torch import Tensor
 
 from nlos_cam import dataset as data
 from nlos_cam.camera import OnProgress
+from nlos_cam.reconstruct import WALL_GRID, align_samples
 
 NEIGHBOURS = 2000
 """Training objects searched for the nearest neighbour, unless a training set is given."""
@@ -46,12 +49,13 @@ def answers_with_nearest(
 
     Nearest in the sum of squares over all cells of depth and intensity, each channel (left, right)
     minus its mean and divided by its spread over the first NEIGHBOURS training objects. A cell
-    without a return counts as average.
+    without a return counts as average. Training maps of many rigs are aligned with the wall grid, as
+    `maps` have to be.
     """
     search = _Search(maps, *_statistics(training))
     total = np.zeros(maps.image.shape[1:])
     done = 0
-    for chunk in training.chunks():
+    for chunk in _on_one_rig(training):
         search.update(chunk)
         total += chunk.image.sum(0, dtype=np.float64)
         done += len(chunk.image)
@@ -88,11 +92,21 @@ def _stacked(maps: MapSet) -> Tensor:
 
 def _statistics(training: data.Dataset) -> tuple[Tensor, Tensor]:
     parts = list[Tensor]()
-    for chunk in training.chunks():
+    for chunk in _on_one_rig(training):
         parts.append(_stacked(chunk))
         if sum(map(len, parts)) >= NEIGHBOURS:
             break
     return channel_statistics(torch.cat(parts))
+
+
+def _on_one_rig(training: data.Dataset) -> Iterator[MapSet]:
+    """Yield a dataset's maps in parts; those of many rigs aligned with the wall grid."""
+    if training.plan.rigs is None:
+        yield from training.chunks()
+        return
+    benches = training.benches()
+    for chunk in training.chunks():
+        yield align_samples(chunk, islice(benches, len(chunk.image)), WALL_GRID)[0]
 
 
 def training_maps(

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
-from nlos_calibration import ObjectBox, Rig, rig_named
+from nlos_calibration import ObjectBox, Rig, rig_difference, rig_named
 from nlos_calibration.arrays import Float32
 from nlos_calibration.errors import RecordFileError
 from nlos_models import Answer, CheckpointRecord, Reconstructor, UncertaintyModel, ask
@@ -25,13 +25,16 @@ from nlos_cam.evaluate.metrics import Predictions
 from nlos_cam.files import cache_folder
 from nlos_cam.frames import LidarMaps, MapMean, maps_from_frame
 from nlos_cam.reconstruct import (
+    WALL_GRID,
     FrameConditions,
     Reconstruction,
     Verdict,
     VerdictFilter,
     align_all,
+    align_samples,
     estimate_uncertainty,
     grid_of,
+    own_rig,
     rig_to_align_with,
     verdict_limits,
 )
@@ -173,6 +176,13 @@ class HeldOutObjects:
     recorded: MapSet | None = None
     """Maps as a lidar measured them, from which difference maps are made; None where `maps` are."""
 
+    @property
+    def on_one_rig(self) -> MapSet:
+        """Maps that are compared with each other: of many rigs they are aligned with the wall grid."""
+        if self.plan.rigs is None:
+            return self.maps
+        return align_samples(self.maps, self.benches, WALL_GRID)[0]
+
     def input_of(self, record: CheckpointRecord, bare: data.BareMaps | None) -> MapSet:
         """Return the maps that the network takes; see `network_input`."""
         maps = self.recorded if bare and self.recorded else self.maps
@@ -186,7 +196,12 @@ def rig_of(record: CheckpointRecord) -> Rig:
     Raises SceneError if a named one is neither packaged nor a file here.
     """
     if record.rig:
-        return Rig.model_validate(record.rig)
+        if own := own_rig(record):
+            return own
+        raise SceneError(
+            f"the weights were trained for {record.rig_name}, whose rig another version of nlos-cam"
+            " wrote: give one with --rig"
+        )
     if grid_of(record):
         return rig_named("paper-rig")
     try:
@@ -287,7 +302,7 @@ def baseline_answers(
                 objects.plan, cache_folder(), os.cpu_count() or 1, on_progress
             )
     with tracked("searching the nearest neighbours") as on_progress:
-        return trivial.answers_with_nearest(objects.maps, opened, on_progress), opened
+        return trivial.answers_with_nearest(objects.on_one_rig, opened, on_progress), opened
 
 
 def notes_about(
@@ -297,18 +312,7 @@ def notes_about(
     know.
     """
     rig = objects.plan.rig
-    notes = list[str]()
-    if record.rig_checksum != rig.checksum:
-        aligned = ", and aligned with it" if rig_to_align_with(rig, record) else ""
-        notes.append(
-            f"the weights were trained for rig {record.rig_name} but the maps are of rig"
-            f" {rig.name}{aligned}"
-        )
-    if objects.plan.spread != data.RigSpread() or objects.plan.rigs:
-        notes.append(
-            f"each object is on a rig of its own around {rig.name}, and aligned with it where"
-            " possible"
-        )
+    notes = _notes_about_rig(record, objects.plan)
     if training and training.plan.rig.checksum != rig.checksum:
         notes.append(
             f"the nearest neighbours come from {training.folder}, whose maps are of another rig"
@@ -319,6 +323,35 @@ def notes_about(
         )
     if unseen := sorted(set(left_out_categories(record)) & set(objects.categories)):
         notes.append(f"the weights' VAE was trained without {', '.join(unseen)}")
+    return notes
+
+
+def _notes_about_rig(record: CheckpointRecord, plan: data.DatasetPlan) -> list[str]:
+    """List what a reader has to know of the rigs of weights and maps."""
+    rig = plan.rig
+    notes = list[str]()
+    if grid_of(record) is not None:
+        own = own_rig(record)
+        if own is None:
+            notes.append("the weights are for any rig: maps are aligned with the grid on the wall")
+        elif rig_difference(rig, own):
+            notes.append(
+                f"the weights were trained for rig {own.name} but the maps are of rig {rig.name};"
+                " both are aligned with the grid on the wall"
+            )
+    elif record.rig_checksum != rig.checksum:
+        aligned = ", and aligned with it" if rig_to_align_with(rig, record) else ""
+        notes.append(
+            f"the weights were trained for rig {record.rig_name} but the maps are of rig"
+            f" {rig.name}{aligned}"
+        )
+    if plan.rigs:
+        notes.append("each object is on a rig of its own, of all that the paper allows")
+    elif plan.spread != data.RigSpread():
+        notes.append(
+            f"each object is on a rig of its own around {rig.name}, and aligned with it where"
+            " possible"
+        )
     return notes
 
 

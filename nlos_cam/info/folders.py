@@ -21,6 +21,7 @@ from nlos_cam.info.files import (
     problem_of,
     read_json,
 )
+from nlos_cam.reconstruct import rig_in_words
 
 
 def describe_bench(folder: Path, _verify: bool) -> Description | None:
@@ -70,16 +71,17 @@ def describe_dataset(folder: Path, verify: bool) -> Description:
         "seeds": f"{shards[0].seeds.start} to {shards[-1].seeds.stop - 1}"
         + (", with gaps" if objects < span else ""),
         "kind": "color" if plan.textures else "depth",
-        "rig": plan.rig.name,
+        "rig": "many, of all that the paper allows" if plan.rigs else plan.rig.name,
     }
     problem = problem_of(lambda: [check_arrays(shard) for shard in shards]) if verify else ""
     others = {shard.path.name for shard in shards if shard.provenance != shards[0].provenance}
     if others and not problem:
         facts["other plans"] = f"{count(len(others), 'shard')}, such as {min(others)}"
     quoted = shlex.quote(str(folder))
+    task = "direct" if plan.rigs else "compressor"
     following = [
         f"nlos-cam evaluate --dataset {quoted}",
-        f"nlos-cam train compressor --dataset {quoted} --help",
+        f"nlos-cam train {task} --dataset {quoted} --help",
     ]
     checked = (
         "checksums of all arrays" if verify else "checksums of plans and seeds; --verify reads all"
@@ -96,7 +98,7 @@ def describe_weights(folder: Path, _verify: bool) -> Description:
     record = load_record(folder)
     quoted = shlex.quote(str(folder))
     facts = {
-        "rig": f"{record.rig_name} {record.rig_checksum}",
+        "rig": f"{rig_in_words(record)} {record.rig_checksum}",
         "input": record.input,
         "runs": ", ".join(
             f"{recipe.task} ({count(recipe.epochs, 'epoch')})" for recipe in record.runs

@@ -1,5 +1,9 @@
 __all__ = [
+    "ALONG_RANGE_M",
+    "ASIDE_RANGE_M",
     "MAX_AVERAGE",
+    "OCCLUDER_RANGE_M",
+    "PITCH_RANGE_DEG",
     "UNEXPLAINED",
     "WALL_GRID",
     "Arrival",
@@ -32,6 +36,7 @@ __all__ = [
     "alignment",
     "build_pipeline",
     "can_align",
+    "check_alignable",
     "check_intrinsics",
     "check_reconstruction",
     "compatibility_warnings",
@@ -43,6 +48,7 @@ __all__ = [
     "frame_issues",
     "frames_by_verdict",
     "grid_of",
+    "grid_refusal",
     "ignore",
     "is_wall_grid",
     "iterate_batched",
@@ -53,9 +59,11 @@ __all__ = [
     "measured_counts",
     "occluder_assumed",
     "open_bench",
+    "own_rig",
     "reconstruct",
     "recorded_counts",
     "rig_fields",
+    "rig_in_words",
     "rig_to_align_with",
     "training_rig",
     "verdict_limits",
@@ -70,6 +78,9 @@ from .alignment import (
     align_samples,
     alignment,
     can_align,
+    check_alignable,
+    grid_refusal,
+    own_rig,
     recorded_counts,
     rig_fields,
     rig_to_align_with,
@@ -113,4 +124,13 @@ from .summaries import (
     frames_by_verdict,
 )
 from .verdict import FrameConditions, FrozenFrames, Verdict, VerdictFilter, frame_issues
-from .wall_grid import WALL_GRID, grid_of, is_wall_grid
+from .wall_grid import (
+    ALONG_RANGE_M,
+    ASIDE_RANGE_M,
+    OCCLUDER_RANGE_M,
+    PITCH_RANGE_DEG,
+    WALL_GRID,
+    grid_of,
+    is_wall_grid,
+    rig_in_words,
+)

@@ -28,6 +28,7 @@ from nlos_calibration.errors import RecordFileError
 from nlos_models import CheckpointRecord
 from pydantic import ValidationError
 
+from nlos_cam.errors import SceneError
 from nlos_cam.frames import MAP_COLUMNS, MAP_ROWS, LidarMaps
 from nlos_cam.objects import object_box
 from nlos_cam.reconstruct.flat_field import brightest_light
@@ -215,7 +216,10 @@ class MapAlignment:
         light[self._cells] *= np.exp(log_ratio)
         depth_m = depth_m.reshape(SHAPE)
         light = light.reshape(SHAPE)
-        if self._numbers is not None:
+        if not np.isfinite(beyond_m).any():
+            # a frame without a return, not even the wall's, has no picture either
+            depth_m[:] = np.nan
+        elif self._numbers is not None:
             depth_m[self._unseen] = np.nan
             depth_m[:, NUMBERS_COLUMN] = self._numbers
             light[:, NUMBERS_COLUMN] = 0.0
@@ -244,11 +248,19 @@ def align_all(maps: "MapSet", benches: Iterable[Rig], trained: CheckpointRecord)
     """Return samples, each of its own bench, as the rig of weights sees them; as they are where
     that is not possible.
 
-    There may be more benches than samples.
+    There may be more benches than samples. Raises SceneError for weights on the wall grid and a
+    bench that cannot be aligned with it.
     """
     wanted = training_rig(trained) if trained.input == "raw maps" else None
-    counts = trained.bare_wall_counts
-    return align_samples(maps, benches, wanted, counts)[0] if wanted else maps
+    if wanted is None:
+        return maps
+    aligned, seen, _ = align_samples(maps, benches, wanted, trained.bare_wall_counts)
+    if is_wall_grid(wanted) and not seen.all():
+        raise SceneError(
+            f"the weights cannot see {(~seen).sum()} of {len(seen)} objects: their lidar sees too"
+            " little of the wall past the occluder, or their box has another size; use other weights"
+        )
+    return aligned
 
 
 def align_samples(
@@ -305,11 +317,31 @@ def can_align(bench: Rig, trained: Rig) -> bool:
     """
     if not (bench.object_box and trained.object_box):
         return False
-    # The networks' image spans the box: in a box of another size every pixel would be elsewhere.
-    apart_m = np.subtract(_size_m(bench.object_box), _size_m(trained.object_box))
-    if np.abs(apart_m).max() > SAME_BOX_M:
+    if not _have_one_size(bench.object_box, trained.object_box):
         return False
     return _sees_grid(bench) if is_wall_grid(trained) else _is_in_view(bench, trained)
+
+
+def grid_refusal(bench: Rig) -> str:
+    """Return why maps of a bench cannot be aligned with the wall grid; empty where they can."""
+    box = bench.object_box
+    if box is None:
+        return "it has no object box"
+    if bench.occluder is None:
+        return "its occluder's place is not known (`nlos-cam calibrate --occluder` measures it)"
+    if not _have_one_size(box, object_box(WALL_GRID)):
+        return "its object box has another size than in training"
+    return "" if _sees_grid(bench) else "its lidar sees too little of the wall past the occluder"
+
+
+def check_alignable(bench: Rig, trained: CheckpointRecord) -> None:
+    """Raise SceneError for weights on the wall grid, and a bench whose maps cannot be aligned with
+    it: of its own cells they would make a picture of nothing.
+    """
+    if grid_of(trained) and (why := grid_refusal(bench)):
+        raise SceneError(
+            f"the weights cannot see {bench.name}: {why}; choose others with --weights"
+        )
 
 
 def training_rig(trained: CheckpointRecord) -> Rig | None:
@@ -318,20 +350,33 @@ def training_rig(trained: CheckpointRecord) -> Rig | None:
     """
     if grid := grid_of(trained):
         return grid
+    rig = own_rig(trained)
+    if trained.rig is None:
+        try:
+            rig = load_rig(trained.rig_name)
+        except RecordFileError:
+            return None
+    return rig if rig and rig.checksum == trained.rig_checksum else None
+
+
+def own_rig(trained: CheckpointRecord) -> Rig | None:
+    """Return the rig that a record of weights holds: a bench's, also of weights on the wall grid that
+    were trained on for it. None without one, or for one of another version of the program.
+    """
     try:
-        known = trained.rig
-        rig = load_rig(trained.rig_name) if known is None else Rig.model_validate(known)
-    except (RecordFileError, ValidationError):
+        return Rig.model_validate(trained.rig) if trained.rig else None
+    except ValidationError:
         return None
-    return rig if rig.checksum == trained.rig_checksum else None
 
 
-def rig_fields(rig: Rig) -> dict[str, Any] | None:
+def rig_fields(rig: Rig, *, packaged: bool = False) -> dict[str, Any] | None:
     """Return the fields of a rig for the record of weights, by which `training_rig` knows it on any
-    machine; None for a packaged rig and the wall grid, which are known without.
+    machine; None for the wall grid and, unless `packaged`, a packaged rig, which are known without.
     """
     if is_wall_grid(rig):
         return None
+    if packaged:
+        return rig.model_dump(mode="json")
     try:
         is_packaged = load_rig(rig.name).checksum == rig.checksum
     except RecordFileError:
@@ -409,6 +454,12 @@ def _cells_at(bench: Rig, spot_m: Float64) -> tuple[Float64, Float64]:
     x, y, z = ((spot_m - pose[:3, 3]) @ pose[:3, :3]).T
     z = np.maximum(z, 1e-9)  # points behind the lidar are far out of view
     return pinhole.ppy + pinhole.fy * y / z, pinhole.ppx + pinhole.fx * x / z
+
+
+def _have_one_size(one: ObjectBox, other: ObjectBox) -> bool:
+    """Return whether two boxes have the same size, at the same distance from the wall."""
+    # The networks' image spans the box: in a box of another size every pixel would be elsewhere.
+    return bool(np.abs(np.subtract(_size_m(one), _size_m(other))).max() <= SAME_BOX_M)
 
 
 def _size_m(box: ObjectBox) -> tuple[float, ...]:

@@ -22,7 +22,7 @@ from nlos_models import (
 from nlos_cam.files import cache_folder
 from nlos_cam.frames import Frame, LidarMaps, MapMean, maps_from_frame
 from nlos_cam.objects import SurfaceMesh
-from nlos_cam.reconstruct.alignment import MapAlignment, alignment
+from nlos_cam.reconstruct.alignment import MapAlignment, alignment, check_alignable
 from nlos_cam.reconstruct.bench import BenchObservation, CalibratedRig
 from nlos_cam.reconstruct.consistency import COMPLETE, MapConsistency, MapFindings
 from nlos_cam.reconstruct.frame_reader import Arrival
@@ -254,13 +254,17 @@ class Pipeline:
     @property
     def bench(self) -> CalibratedRig:
         """Bench of the frames; setting it aligns their maps with the training rig again, and has
-        the physics check compare with its rig. Any thread may set it.
+        the physics check compare with its rig. Any thread may set it. Raises SceneError as
+        `check_alignable`.
         """
         return self._bench.bench
 
     @bench.setter
     def bench(self, bench: CalibratedRig) -> None:
-        aligned = alignment(bench.rig, self.trained, bench.reference) if self.trained else None
+        aligned = None
+        if self.trained:
+            check_alignable(bench.rig, self.trained)
+            aligned = alignment(bench.rig, self.trained, bench.reference)
         consistency = MapConsistency(bench) if self.uncertainty_model else None
         prepared = PreparedBench(bench, aligned, OwnMaps(bench), consistency)
         self.checks.use_rig(bench.rig)

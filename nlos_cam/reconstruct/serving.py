@@ -5,18 +5,24 @@ from pathlib import Path
 from typing import Literal, NamedTuple
 
 from nlos_calibration import (
-    DISTANCE_RANGE_M,
-    FACING_RANGE_DEG,
     Rig,
     box_difference_m,
+    lidar_visible_share,
+    load_rig,
     missing_wall,
     rig_difference,
     view_difference_deg,
 )
 from nlos_models import RIG_WEIGHTS, CheckpointRecord, load_record, shipped_folder
 
-from nlos_cam.reconstruct.alignment import rig_to_align_with, training_rig
-from nlos_cam.reconstruct.wall_grid import grid_of
+from nlos_cam.objects import object_box
+from nlos_cam.reconstruct.alignment import (
+    grid_refusal,
+    own_rig,
+    rig_to_align_with,
+    training_rig,
+)
+from nlos_cam.reconstruct.wall_grid import beyond_trained, grid_of
 
 NEAR_M = 0.010
 NEAR_DEG = 2.0
@@ -24,6 +30,8 @@ NEAR_OCCLUDER_M = 0.005
 NEAR_BOX_M = 0.005
 """Differences of rigs that cost at most 0.07 of silhouette IoU, once maps are aligned
 (docs/where-it-works.md)."""
+SEEN_BOX = 0.001
+"""Share of the object box that the lidar may see directly."""
 NEAR_WALL = 0.05
 """Share of the view that a smaller wall may leave without any."""
 
@@ -65,9 +73,8 @@ def weights_serve(
     `expected_iou` is a forecast for weights trained for this rig, and `bench` the folder to train
     them in.
     """
-    wanted = training_rig(trained)
-    if grid_of(trained):  # maps of any bench; the rig, if there is one, is where training went on
-        wanted = Rig.model_validate(trained.rig) if trained.rig else None
+    # of maps of any bench the rig, if there is one, is where training went on
+    wanted = own_rig(trained) if grid_of(trained) else training_rig(trained)
     if trained.rig_checksum == rig.checksum or (wanted and not rig_difference(rig, wanted)):
         sentence = "the weights serve this bench: they were trained for its rig"
         return WeightsVerdict("trained for it", sentence, expected_iou)
@@ -75,7 +82,7 @@ def weights_serve(
     forecast = "" if expected_iou is None else f" (expected silhouette IoU {expected_iou:.2f})"
     advice = f"`nlos-cam adapt {bench}` trains weights for it{forecast}"
     if grid_of(trained):
-        service, sentence = _grid_serves(rig, trained, wanted)
+        service, sentence = _grid_serves(rig, wanted)
         return WeightsVerdict(service, f"{sentence}; {advice}", expected_iou)
     if wanted is None:
         sentence = (
@@ -97,31 +104,30 @@ def weights_serve(
     return WeightsVerdict(service, f"the weights {outcome} ({difference}); {advice}", expected_iou)
 
 
-def _grid_serves(rig: Rig, trained: CheckpointRecord, own: Rig | None) -> tuple[Service, str]:
+def _grid_serves(rig: Rig, own: Rig | None) -> tuple[Service, str]:
     """Return whether weights on the wall grid serve a rig, and the sentence that says so; `own` is
     another rig that their training went on for, if there is one.
     """
-    if not rig_to_align_with(rig, trained):
-        reason = (
-            "its lidar sees too little of the wall past the occluder, or its box has another size"
-        )
-        return "not", f"the weights do not serve this bench: {reason}"
+    if why := grid_refusal(rig):
+        return "not", f"the weights do not serve this bench: {why}"
     if own:
         difference = "; ".join(rig_difference(rig, own))
+        if _deviation(rig, own) <= 1:
+            return "near", f"the weights serve this bench, with larger errors ({difference})"
         return "far", f"the weights may not serve this bench: they are another's ({difference})"
 
-    beyond = [
-        f"{name} {value:g} {unit}, {low:g} to {high:g} trained"
-        for name, value, unit, (low, high) in (
-            ("distance", rig.lidar.distance_m, "m", DISTANCE_RANGE_M),
-            ("yaw", rig.lidar.yaw_deg, "degrees", FACING_RANGE_DEG),
-        )
-        if not low <= round(value, 3) <= high
-    ]
+    beyond = beyond_trained(rig)
+    if missing_wall(rig, load_rig("paper-rig")) > NEAR_WALL:
+        beyond.append("its wall ends in the lidar's view")
+    if lidar_visible_share(rig, object_box(rig)) > SEEN_BOX:
+        beyond.append("the lidar sees into the object box")
     if beyond:
         outside = "; ".join(beyond)
         return "far", f"the weights may not serve this bench: it is beyond their rigs ({outside})"
-    return "near", "the weights serve this bench as one of the many that they know"
+    return "near", (
+        "the weights serve this bench as one of the many that they know, with larger errors than"
+        " weights of its own"
+    )
 
 
 def weights_for(rig: Rig) -> Path:
@@ -129,16 +135,15 @@ def weights_for(rig: Rig) -> Path:
     where none does.
     """
     folders = [shipped_folder(name) for name in RIG_WEIGHTS]
-    return min(folders, key=lambda folder: _far_off(rig, load_record(folder)))
+    if rig.occluder is None:  # how wide its gap is decides
+        return folders[0]
 
-
-def _far_off(rig: Rig, trained: CheckpointRecord) -> tuple[int, float]:
-    """Return how far off a rig is from the one of weights: its service's place in SERVICES, then
-    `_deviation`.
-    """
-    service = SERVICES.index(weights_serve(rig, trained).service)
-    wanted = training_rig(trained)
-    return service, _deviation(rig, wanted) if wanted else 0.0
+    services = [weights_serve(rig, load_record(folder)).service for folder in folders]
+    by_service = dict(zip(services, folders, strict=True))  # of two alike the last one
+    # Of two rigs that a bench's maps can be aligned with, the one with the wider gap has weights
+    # that are 0.06 to 0.15 of IoU better there, even if its lidar is the farther one
+    # (tools/studies/serving.py).
+    return next(by_service[service] for service in SERVICES if service in by_service)
 
 
 def _deviation(rig: Rig, wanted: Rig) -> float:

@@ -12,9 +12,11 @@ from nlos_models import load_network, training
 
 from nlos_cam.adapt import NETWORK_FILE, Adaptation, adapt, calibration_spread
 from nlos_cam.adapt.plan import load_plan
+from nlos_cam.adapt.run import _from_where_it_began
 from nlos_cam.dataset import DatasetPlan, build_dataset, ignore
 from nlos_cam.errors import SceneError
 from nlos_cam.files import FileBusyError, claim
+from nlos_cam.reconstruct import weights_for
 from nlos_cam.render import RENDERING_VERSION
 
 AFTER_THE_NETWORK = "judged"
@@ -91,6 +93,13 @@ def test_other_start_weights_are_not_ignored(tmp_path: Path) -> None:
 
     with pytest.raises(SceneError, match="other start weights"):
         adapt(replace(job, start=others), 1.0, no_figures)
+
+
+def test_work_goes_on_from_the_weights_that_it_began_from(tmp_path: Path) -> None:
+    job = job_in(tmp_path / "work", load_rig("wide-rig"))  # from `direct`
+
+    assert weights_for(job.rig).name == "wide"
+    assert _from_where_it_began(job).start_folder.name == "direct"
 
 
 def test_two_adaptations_in_one_folder_are_one_too_many(tmp_path: Path) -> None:

@@ -75,6 +75,16 @@ def test_a_bench_keeps_the_better_of_two_adaptations(
     assert _is_worth_keeping(result, None)
 
 
+def test_weights_worse_than_the_shipped_ones_are_not_kept() -> None:
+    before, after = (dict.fromkeys(TARGETS, figure(iou)) for iou in (0.5, 0.55))
+    result = adaptation.AdaptResult(
+        Path(), Mock(), [], before, after, was_there=False, shipped_iou=0.6
+    )
+
+    assert not _is_worth_keeping(result, None)
+    assert result.better == adaptation.SHIPPED_WEIGHTS
+
+
 @pytest.mark.parametrize(("after_iou", "kept"), [(0.45, False), (0.52, True)])
 def test_a_fit_to_recordings_may_cost_little_in_simulation(
     monkeypatch: pytest.MonkeyPatch, after_iou: float, kept: bool

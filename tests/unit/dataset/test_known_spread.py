@@ -6,6 +6,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -164,6 +165,24 @@ def test_samples_of_many_rigs_are_aligned_with_the_weights_rig() -> None:
     assert Benches.of(many, RECORD).frame == PLAN.rig
     assert Benches.of(many, grid).frame == WALL_GRID
     assert Benches.of(PLAN, RECORD).frame is None
+
+
+@pytest.mark.parametrize(
+    ("bench", "plan"),
+    [
+        (None, PLAN),  # weights for any rig, objects of one
+        (PLAN.rig.model_dump(mode="json"), replace(PLAN, rigs=RigRange())),
+        (load_rig("wide-rig").model_dump(mode="json"), PLAN),
+    ],
+)
+def test_quality_on_the_wall_grid_is_of_the_weights_own_rigs(
+    built: Callable[..., Path], bench: dict[str, Any] | None, plan: DatasetPlan
+) -> None:
+    network: Any = Network()
+    network.record = RECORD.model_copy(update={"rig_checksum": WALL_GRID.checksum, "rig": bench})
+
+    with pytest.raises(SceneError, match="own rig"):
+        quality_set(network, Mock(), open_dataset(built("maps", plan)), OBJECTS, Mock())
 
 
 def test_samples_beside_recordings_are_rendered() -> None:

@@ -501,6 +501,17 @@ def test_record_holds_a_rig_of_ones_own(tmp_path: Path, store_folder: Path) -> N
     assert Rig.model_validate(record.rig) == OTHER.rig
 
 
+def test_one_rig_on_the_wall_grid_makes_weights_for_it(tmp_path: Path, store_folder: Path) -> None:
+    data = _add(tmp_path / "data", 0, PLAN)
+    recipe = small_recipe(task="direct", objects=4, held_out=2)
+
+    with open_packed_maps([data], store_folder, frame=WALL_GRID) as packed:
+        record = packed.record_run(recipe, tmp_path / "out", [])
+
+    assert (record.rig_name, record.rig_checksum) == (PLAN.rig.name, WALL_GRID.checksum)
+    assert Rig.model_validate(record.rig) == PLAN.rig
+
+
 def test_datasets_of_two_sensors_are_refused(tmp_path: Path, store_folder: Path) -> None:
     folders = [_add(tmp_path / "a", 0), _add(tmp_path / "b", 100, PLANS["dim1"])]
 

@@ -293,6 +293,7 @@ class Chunked(SimpleNamespace):
 
     maps: MapSet
     size: int
+    plan = SimpleNamespace(rigs=None)
 
     def __len__(self) -> int:
         return len(self.maps.image)

@@ -59,6 +59,18 @@ def test_features_are_zero_at_the_median_bare_wall(
     assert float(network.features(bare_m[None] + 0.05, counts[None] + 5)[:, :4].min()) > 0.4
 
 
+def test_bare_light_of_a_cell_is_that_of_the_benches_that_see_it(
+    network: UncertaintyNetwork,
+) -> None:
+    depth_m = torch.ones(5, 64, 80)
+    counts = torch.full((5, 64, 80), 20.0)
+    depth_m[:3, 2, 7] = torch.nan  # as on the wall grid: three benches of five do not see the cell
+    counts[:3, 2, 7] = 0.0
+    network.learn_bare(depth_m, counts)
+
+    assert float(network.bare_intensity[2, 7]) == 20.0
+
+
 def test_features_mark_a_cell_without_return(network: UncertaintyNetwork) -> None:
     depth_m = torch.ones(1, 64, 80)
     depth_m[0, 3, 4] = torch.nan

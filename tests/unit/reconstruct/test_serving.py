@@ -76,11 +76,11 @@ def test_box_view_wall_and_occluder_count_too(rig: Rig, service: str) -> None:
     assert weights_serve(rig, trained()).service == service
 
 
-def with_gap(gap_m: float) -> Rig:
+def with_gap(gap_m: float, **lidar: float) -> Rig:
     occluder = RIG.occluder
     assert occluder is not None
     wider = occluder.model_copy(update={"z_min_m": gap_m})
-    return posed(distance_m=0.203).model_copy(update={"occluder": wider})
+    return posed(**{"distance_m": 0.203, **lidar}).model_copy(update={"occluder": wider})
 
 
 @pytest.mark.parametrize(
@@ -90,6 +90,7 @@ def with_gap(gap_m: float) -> Rig:
         (with_gap(0.108), "direct"),
         (load_rig("wide-rig"), "wide"),
         (with_gap(0.133), "wide"),
+        (with_gap(0.139, yaw_deg=63.0), "wide"),
         (load_rig("bare-wall"), "direct"),
     ],
 )
@@ -119,6 +120,31 @@ def test_weights_for_any_rig_say_which_number_is_beyond() -> None:
     assert "distance 0.34 m" in verdict.sentence
 
 
+@pytest.mark.parametrize(
+    ("rig", "what"),
+    [
+        (with_gap(0.3), "gap 0.3 m"),
+        (with_gap(0.03), "gap 0.03 m"),
+        (posed(pitch_deg=10.0), "pitch 10 degrees"),
+        (with_box_moved(y=0.1), "box aside by 0.1 m"),
+        (with_box_moved(x=0.1), "box nearer by -0.1 m"),
+        (with_wall_to(0.15), "its wall ends"),
+        (with_gap(0.2), "the lidar sees into the object box"),
+    ],
+)
+def test_each_number_of_a_rig_can_be_beyond_training(rig: Rig, what: str) -> None:
+    verdict = weights_serve(rig, trained(WALL_GRID))
+
+    assert verdict.service == "far"
+    assert what in verdict.sentence
+
+
+def test_rigs_at_the_end_of_a_range_are_within_it() -> None:
+    end = posed(distance_m=0.3009, yaw_deg=75.1)
+
+    assert weights_serve(end, trained(WALL_GRID)).service == "near"
+
+
 def test_weights_for_any_rig_need_an_occluder() -> None:
     bare = posed().model_copy(update={"occluder": None})
 
@@ -131,4 +157,6 @@ def test_weights_for_any_rig_that_went_on_for_one_know_it() -> None:
     adapted.rig = bench.model_dump(mode="json")
 
     assert weights_serve(bench, adapted).service == "trained for it"
+    again = posed(distance_m=0.253, yaw_deg=30.0)
+    assert weights_serve(again, adapted).service == "near"
     assert weights_serve(posed(yaw_deg=60.0), adapted).service == "far"

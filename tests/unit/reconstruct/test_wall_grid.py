@@ -1,16 +1,25 @@
 """Maps of any bench on one grid of the relay wall: seen cells agree, unseen ones have no return."""
 
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
 from nlos_calibration import Rig, load_rig
 from nlos_calibration.arrays import Float32
+from nlos_models import load_record, shipped_folder
 
 from nlos_cam.errors import SceneError
 from nlos_cam.frames import LidarMaps
 from nlos_cam.objects import benchmark_objects, object_box
-from nlos_cam.reconstruct import WALL_GRID, MapAlignment, is_wall_grid
+from nlos_cam.reconstruct import (
+    WALL_GRID,
+    CalibratedRig,
+    MapAlignment,
+    Pipeline,
+    grid_refusal,
+    is_wall_grid,
+)
 from nlos_cam.reconstruct.alignment import can_align
 from nlos_cam.reconstruct.wall_grid import NUMBERS_COLUMN, numbers_column, rig_numbers
 from nlos_cam.render import QUIET, Scene, Sensor, render
@@ -31,6 +40,13 @@ def rig(box_up_m: float = 0.0, **lidar: float) -> Rig:
 
 NEAR = rig(distance_m=0.16)
 TURNED = rig(yaw_deg=35.0, distance_m=0.23)
+
+
+def resized() -> Rig:
+    box = object_box(HOME)
+    return HOME.model_copy(
+        update={"object_box": box.model_copy(update={"z_far_m": box.z_far_m + 0.05})}
+    )
 
 
 def on_grid(bench: Rig, depth_m: Float32 | None = None) -> LidarMaps:
@@ -95,6 +111,38 @@ def test_numbers_stand_in_the_last_column() -> None:
     column = on_grid(TURNED).depth_m[:, NUMBERS_COLUMN]
 
     np.testing.assert_array_equal(column, numbers_column(rig_numbers(TURNED)))
+
+
+def test_frame_without_a_return_stays_empty() -> None:
+    nothing = np.full((64, 80), np.nan, np.float32)
+    dark = LidarMaps(nothing, np.zeros_like(nothing), np.zeros(nothing.shape, bool))
+
+    for frame in (WALL_GRID, rig(distance_m=0.205)):
+        assert not MapAlignment(TURNED, frame).align(dark).valid.any()
+
+
+@pytest.mark.parametrize(
+    ("bench", "why"),
+    [
+        (HOME.model_copy(update={"occluder": None}), "occluder"),
+        (HOME.model_copy(update={"object_box": None}), "no object box"),
+        (resized(), "another size"),
+        (HOME, ""),
+    ],
+)
+def test_refusal_names_what_the_grid_needs(bench: Rig, why: str) -> None:
+    refusal = grid_refusal(bench)
+
+    assert why in refusal
+    assert bool(refusal) == bool(why)
+
+
+def test_pipeline_refuses_a_bench_that_its_weights_cannot_see() -> None:
+    trained = load_record(shipped_folder()).model_copy(update={"rig_checksum": WALL_GRID.checksum})
+    bare = CalibratedRig(HOME.model_copy(update={"occluder": None}))
+
+    with pytest.raises(SceneError, match="choose others with --weights"):
+        Pipeline(bare, Mock(), trained=trained)
 
 
 def test_rig_without_an_occluder_cannot_be_aligned() -> None:
