@@ -21,7 +21,7 @@ from torch import Tensor, nn
 from nlos_cam.files import cache_folder, load_cached, write_checked
 from nlos_models import inference
 from nlos_models.arrays import Float32
-from nlos_models.byte_weights import GROUP, SCALE, from_bytes
+from nlos_models.byte_weights import SCALE, from_bytes, group_of
 from nlos_models.checkpoint import load_network
 from nlos_models.direct import DirectNetwork
 from nlos_models.errors import CheckpointError, ModelError
@@ -383,13 +383,15 @@ def _plain(name: str, tensor: _StoredTensor) -> Linked:
         return [_external(stored, tensor, tensor.values.shape)], [cast]
 
     # the same products as `from_bytes`: a graph answers as torch does
+    group = group_of(tensor.values, scale.values)
     initializers = [
-        _external(stored, tensor, (tensor.values.size // GROUP, GROUP)),
-        _external(f"{name}.scale", scale, scale.values.shape),
+        _external(stored, tensor, (tensor.values.size // group, group)),
+        _external(f"{name}.scale.stored", scale, scale.values.shape),
         numpy_helper.from_array(np.array(tensor.values.shape, np.int64), f"{name}.shape"),
     ]
     nodes = [
         helper.make_node("Cast", [stored], [f"{name}.whole"], to=TensorProto.FLOAT),
+        helper.make_node("Cast", [f"{name}.scale.stored"], [f"{name}.scale"], to=TensorProto.FLOAT),
         helper.make_node("Mul", [f"{name}.whole", f"{name}.scale"], [f"{name}.groups"]),
         helper.make_node("Reshape", [f"{name}.groups", f"{name}.shape"], [name]),
     ]

@@ -9,7 +9,7 @@ from zipfile import BadZipFile
 
 import numpy as np
 from nlos_calibration import Rig
-from nlos_calibration.arrays import Float32
+from nlos_calibration.arrays import Float32, UInt8
 
 from nlos_cam import render as renderer
 from nlos_cam.camera.protocol import OnProgress
@@ -131,17 +131,34 @@ def pack_loop(echoes: list[renderer.MultiBounce], truths: list[Float32]) -> byte
     packed = BytesIO()
     np.savez_compressed(
         packed,
-        peak=np.stack([echo.peak for echo in echoes]),
-        runner_up=np.stack([echo.runner_up for echo in echoes]),
-        path_m=np.stack([echo.path_m for echo in echoes]),
+        peak_by_byte=_by_byte(echo.peak for echo in echoes),
+        runner_up_by_byte=_by_byte(echo.runner_up for echo in echoes),
+        path_m_by_byte=_by_byte(echo.path_m for echo in echoes),
         direct_included=echoes[0].direct_included,
-        truth_m=np.stack(truths),
+        truth_m_by_byte=_by_byte(truths),
     )
     return packed.getvalue()
 
 
 def _unpack(content: bytes) -> Loop:
     with np.load(BytesIO(content)) as file:
-        poses = zip(file["peak"], file["runner_up"], file["path_m"], strict=True)
+        stored = (file[f"{name}_by_byte"] for name in ("peak", "runner_up", "path_m", "truth_m"))
+        *channels, truth_m = map(_joined, stored)
         mixed = bool(file["direct_included"])
-        return [renderer.MultiBounce(*pose, mixed) for pose in poses], list(file["truth_m"])
+        poses = zip(*channels, strict=True)
+        return [renderer.MultiBounce(*pose, mixed) for pose in poses], list(truth_m)
+
+
+def _by_byte(poses: Iterable[Float32]) -> UInt8:
+    """Return the bytes of values (n, rows, columns) as (4, n, rows, columns): the first bytes of
+    all, then the second ones.
+    """
+    # Neighbors share their high bytes, which a packer finds only where they stand together: a
+    # quarter less to store.
+    values = np.stack(list(poses))
+    return np.moveaxis(values[..., None].view(np.uint8), -1, 0)
+
+
+def _joined(by_byte: UInt8) -> Float32:
+    """Return the values of `_by_byte`."""
+    return np.ascontiguousarray(np.moveaxis(by_byte, 0, -1)).view(np.float32)[..., 0]

@@ -8,7 +8,7 @@ from safetensors.torch import save
 
 from nlos_cam.files import atomic_directory, write_checked
 from nlos_models.byte_weights import SCALE, fits_bytes, to_bytes
-from nlos_models.checkpoint import FULL, save_parts, stored_tensors
+from nlos_models.checkpoint import FULL, read_tensors, save_parts, stored_tensors
 from nlos_models.quality import UNCERTAINTY_FILES, load_quality_model
 from nlos_models.records import (
     UNCERTAINTY_RECORD,
@@ -53,12 +53,17 @@ def _in_bytes(path: Path) -> bytes:
     """Return a file of tensors whose large weights are in bytes, with their scales; normalizations
     stay in full.
     """
+    found = stored_tensors(path)
+    full = read_tensors(path)
     stored = dict[str, torch.Tensor]()
-    for name, tensor in stored_tensors(path).items():
-        stored[name] = tensor
+    for name, weight in full.items():
         in_full = name.rpartition(".")[2] in FULL
-        if tensor.is_floating_point() and not in_full and fits_bytes(tuple(tensor.shape)):
-            weight, scale = to_bytes(tensor.float().numpy())
-            stored[name] = torch.from_numpy(weight)
+        if weight.is_floating_point() and not in_full and fits_bytes(tuple(weight.shape)):
+            # also of bytes with scales of 32 bits, which keep their bytes
+            in_bytes, scale = to_bytes(weight.numpy())
+            stored[name] = torch.from_numpy(in_bytes)
             stored[name + SCALE] = torch.from_numpy(scale)
+        else:
+            # in full now what an earlier version stored in bytes
+            stored[name] = weight if name + SCALE in found else found[name]
     return save(stored)
