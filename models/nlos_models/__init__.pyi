@@ -1,6 +1,9 @@
 __all__ = [
+    "ANY",
     "BACKGROUND_BELOW_V",
+    "BENCH_WEIGHTS",
     "BLACK_V",
+    "DIRECT",
     "GOOD_IOU",
     "MIN_V",
     "RECORD",
@@ -9,6 +12,7 @@ __all__ = [
     "SIMULATION_ONLY",
     "SMALLER_IS_BETTER",
     "SMALLEST_SPREAD",
+    "WIDE",
     "Answer",
     "CellNormal",
     "CheckpointRecord",
@@ -78,10 +82,14 @@ from .pipeline import (
 from .quality import GOOD_IOU
 from .quality_figures import quality_features
 from .records import (
+    ANY,
+    BENCH_WEIGHTS,
+    DIRECT,
     RECORD,
     RIG_WEIGHTS,
     SHIPPED,
     SIMULATION_ONLY,
+    WIDE,
     CheckpointRecord,
     checksum_of_watched,
     load_record,

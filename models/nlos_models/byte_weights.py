@@ -1,7 +1,7 @@
 """Weights stored in a byte each: a quarter of float32, half of float16.
 
-Neighbors in a row share a scale, so that one large weight does not round its whole row. Only storage
-changes: networks compute in float32 (see docs/decisions).
+Neighbors in a row share a scale, so that one large weight does not round its whole row. Only
+storage changes: networks compute in float32 (see docs/decisions).
 """
 
 import numpy as np
@@ -56,8 +56,8 @@ def group_of(stored: Int8, scale: Float16 | Float32) -> int:
 
 
 def from_bytes(stored: Int8, scale: Float16 | Float32) -> Float32:
-    """Return the weight of `to_bytes`; versions before 0.3 wrote scales of 32 bits. Raises ValueError
-    as `group_of`.
+    """Return the weight of `to_bytes`; earlier files have scales of 32 bits. Raises ValueError as
+    `group_of`.
     """
     groups = stored.reshape(-1, group_of(stored, scale)).astype(np.float32)
     return (groups * scale.astype(np.float32)).reshape(stored.shape)

@@ -30,9 +30,12 @@ RECORD = "checkpoint.json"
 DIRECT = "direct"
 PAPER = "paper"
 WIDE = "wide"
+ANY = "any"
 RIG_WEIGHTS = DIRECT, WIDE
-"""Names of the shipped weights that benches use, each for a rig of its own."""
-SHIPPED = *RIG_WEIGHTS, PAPER
+"""Names of the shipped weights for one rig each."""
+BENCH_WEIGHTS = *RIG_WEIGHTS, ANY
+"""Names of the shipped weights that benches use: those for one rig, and those for any."""
+SHIPPED = *BENCH_WEIGHTS, PAPER
 """Names of the weights that come with the package, the default ones first; DIRECT.safetensors is a
 direct network.
 """

@@ -135,6 +135,8 @@ class Adaptation:
         """Folder of the start weights."""
         if self.start:
             return models.weights_folder(self.start)
+        if self.locked:  # differences in the bench's own cells, which the wall grid has not
+            return weights_for(self.rig, models.RIG_WEIGHTS)
         return self.began_from or weights_for(self.rig)
 
     @property
@@ -165,6 +167,8 @@ class AdaptResult:
     shipped_iou: float | None = None
     """Silhouette IoU of the shipped weights that serve the rig best, where the start weights are
     others."""
+    start: str = ""
+    """Name or folder of the start weights."""
 
     @property
     def is_better(self) -> bool:
@@ -178,8 +182,8 @@ class AdaptResult:
         return self.serves_as_well_as(max(start_iou, self.shipped_iou or 0.0))
 
     @property
-    def better(self) -> str:
-        """Better ones of START_WEIGHTS and SHIPPED_WEIGHTS, in words."""
+    def better_weights(self) -> str:
+        """Better ones of START_WEIGHTS and SHIPPED_WEIGHTS."""
         start_iou = self.before["silhouette_iou"]["value"]
         is_shipped = self.shipped_iou is not None and self.shipped_iou > start_iou
         return SHIPPED_WEIGHTS if is_shipped else START_WEIGHTS
@@ -213,7 +217,7 @@ def adapt(
     """
     job.folder.mkdir(parents=True, exist_ok=True)
     with claim(job.folder, inside=True), _threads(job.threads):
-        job = _from_where_it_began(job)
+        job = _with_first_start(job)
         plan = _plan_for(job, minutes, tracked)
         job = replace(job, spread=plan.spread, sensor=plan.sensor, seed=plan.seed)
         folders = [job.folder / _stage_name(number) for number in range(len(plan.stages))]
@@ -244,21 +248,25 @@ def adapt(
             after,
             was_there,
             transfer,
-            _shipped_iou(job, measure),
+            _shipped_iou(job, plan, measure),
+            str(job.start or job.start_folder.name),
         )
 
 
-def _shipped_iou(job: Adaptation, measure: Measure) -> float | None:
+def _shipped_iou(job: Adaptation, plan: Plan, measure: Measure) -> float | None:
     """Return the silhouette IoU of the shipped weights that serve the rig best; None where they are
     the start weights, which are measured anyway.
     """
     shipped = weights_for(job.rig)
-    if shipped == job.start_folder:
+    checksum = _checksum(shipped / NETWORK_FILE)
+    if checksum == plan.start:
         return None
-    return _figures(measure, shipped, job.folder / SHIPPED)["silhouette_iou"]["value"]
+    # of another version of the program they are others
+    folder = job.folder / f"{SHIPPED}-{checksum[:12]}"
+    return _figures(measure, shipped, folder)["silhouette_iou"]["value"]
 
 
-def _from_where_it_began(job: Adaptation) -> Adaptation:
+def _with_first_start(job: Adaptation) -> Adaptation:
     """Return the adaptation with the shipped weights that its folder's work began from, where none
     were asked for.
     """
@@ -349,8 +357,9 @@ def _forget(folder: Path) -> None:
     """Delete what an adaptation made, objects of its rig included: the plan at last, so that a stop
     meanwhile is repeated.
     """
-    of_its_rig = (BEFORE, SHIPPED, OBJECTS, HELD_OUT, JUDGED, QUALITY, EARLIER_QUALITY, OUTLIERS)
-    for made in (*(folder / name for name in of_its_rig), *folder.glob(STAGE.format("*"))):
+    of_its_rig = (BEFORE, OBJECTS, HELD_OUT, JUDGED, QUALITY, EARLIER_QUALITY, OUTLIERS)
+    numbered = (*folder.glob(STAGE.format("*")), *folder.glob(f"{SHIPPED}-*"))
+    for made in (*(folder / name for name in of_its_rig), *numbered):
         if made.exists():
             shutil.rmtree(made)
     (folder / PLAN).unlink(missing_ok=True)

@@ -142,10 +142,12 @@ def pack_loop(echoes: list[renderer.MultiBounce], truths: list[Float32]) -> byte
 
 def _unpack(content: bytes) -> Loop:
     with np.load(BytesIO(content)) as file:
-        stored = (file[f"{name}_by_byte"] for name in ("peak", "runner_up", "path_m", "truth_m"))
-        *channels, truth_m = map(_joined, stored)
+        peak = _joined(file["peak_by_byte"])
+        runner_up = _joined(file["runner_up_by_byte"])
+        path_m = _joined(file["path_m_by_byte"])
+        truth_m = _joined(file["truth_m_by_byte"])
         mixed = bool(file["direct_included"])
-        poses = zip(*channels, strict=True)
+        poses = zip(peak, runner_up, path_m, strict=True)
         return [renderer.MultiBounce(*pose, mixed) for pose in poses], list(truth_m)
 
 
@@ -154,7 +156,7 @@ def _by_byte(poses: Iterable[Float32]) -> UInt8:
     all, then the second ones.
     """
     # Neighbors share their high bytes, which a packer finds only where they stand together: a
-    # quarter less to store.
+    # fifth less to store.
     values = np.stack(list(poses))
     return np.moveaxis(values[..., None].view(np.uint8), -1, 0)
 

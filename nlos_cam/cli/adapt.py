@@ -59,7 +59,7 @@ def adapt(
         Path | None,
         typer.Option(
             "--weights",
-            help="Start weights (default: direct or wide, whichever serves the bench better).",
+            help="Start weights (default: of direct, wide and any those that serve the bench best).",
         ),
     ] = None,
     ray: Annotated[
@@ -161,9 +161,7 @@ def adapt(
         if kept:
             commands = [live]
         elif _has_weights_of_another_rig(folder):
-            start = weights if result.better == adaptation.START_WEIGHTS else None
-            best = shlex.quote(str(start or reconstruct.weights_for(rig).name))
-            commands = [f"{live} --weights {best}"]
+            commands = [f"{live} --weights {shlex.quote(_better_weights(result, rig))}"]
     # the pace that the plan was made with is that of these
     machines: dict[str, Any] = {
         "--out": out,
@@ -222,6 +220,13 @@ def _is_worth_keeping(result: adaptation.AdaptResult, bench: Path | None) -> boo
     return result.is_better and (in_use is None or result.serves_as_well_as(in_use))
 
 
+def _better_weights(result: adaptation.AdaptResult, rig: walls.Rig) -> str:
+    """Return the name or folder of the better ones of start weights and shipped weights."""
+    if result.better_weights == adaptation.SHIPPED_WEIGHTS:
+        return reconstruct.weights_for(rig).name
+    return result.start
+
+
 def _has_weights_of_another_rig(bench: Path) -> bool:
     """Return whether a bench's own weights are of a rig that it was before."""
     try:
@@ -259,8 +264,12 @@ def _report(
     state = "was finished before" if result.was_there else "done"
     worse = ""
     if not kept and not result.plan.locked:
-        better = "weights in use, which stay" if result.is_better else result.better
+        better = "weights in use, which stay" if result.is_better else result.better_weights
         worse = f", worse than the {better} (more --minutes help)"
+        if better == adaptation.SHIPPED_WEIGHTS:
+            worse = (
+                f", worse than the {better} ({result.shipped_iou or 0:.3f}; more --minutes help)"
+            )
     text = (
         f"{state}: {rows[0][0]} {before} -> {after} on this bench{worse}; weights in {target},"
         f" report {page}"
@@ -277,6 +286,7 @@ def _report(
         "hidden_share": expected and expected.hidden_share,
         "before": result.before,
         "after": result.after,
+        "shipped_iou": result.shipped_iou,
     }
     if transfer:
         text += f"; {adaptation.transfer_words(transfer)}"

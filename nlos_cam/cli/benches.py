@@ -29,8 +29,8 @@ Weights = Annotated[
     typer.Option(
         "--weights",
         help=(
-            "Folder of weights, or direct, wide, paper (default: direct or wide, whichever serves"
-            " the rig better)."
+            "Folder of weights, or direct, wide, any, paper (default: of the first three those that"
+            " serve the rig best)."
         ),
     ),
 ]

@@ -69,8 +69,8 @@ def reconstruct(
         typer.Option(
             "--weights",
             help=(
-                "Folder of weights, direct, wide or paper, each measured on its own rig; repeat to"
-                " compare (default: direct and paper)."
+                "Folder of weights, direct, wide, any or paper, each measured on its own rig (any on"
+                " the paper's); repeat to compare (default: direct and paper)."
             ),
         ),
     ] = None,

@@ -1,13 +1,14 @@
 """Trivial baselines: background only, mean object, nearest training object."""
 
 import hashlib
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from itertools import islice
 from pathlib import Path
 
 import numpy as np
 import torch
+from nlos_calibration import Rig
 from nlos_calibration.arrays import Float16, Float32
 from nlos_models import SMALLEST_SPREAD, channel_statistics, split_and_stack
 from nlos_models.training import MapSet
@@ -15,7 +16,7 @@ from torch import Tensor
 
 from nlos_cam import dataset as data
 from nlos_cam.camera import OnProgress
-from nlos_cam.reconstruct import WALL_GRID, align_samples
+from nlos_cam.reconstruct import NUMBERS_COLUMN, WALL_GRID, align_samples
 
 NEIGHBOURS = 2000
 """Training objects searched for the nearest neighbour, unless a training set is given."""
@@ -42,20 +43,20 @@ def mean_image(images: Float16) -> Float32:
 
 
 def answers_with_nearest(
-    maps: MapSet, training: data.Dataset, on_progress: OnProgress
+    maps: MapSet, training: data.Dataset, on_progress: OnProgress, *, on_grid: bool = False
 ) -> dict[str, Float32]:
     """Return the trivial answers and the image of the nearest training object; one part at a time
     is in memory.
 
     Nearest in the sum of squares over all cells of depth and intensity, each channel (left, right)
     minus its mean and divided by its spread over the first NEIGHBOURS training objects. A cell
-    without a return counts as average. Training maps of many rigs are aligned with the wall grid, as
-    `maps` have to be.
+    without a return counts as average. With `on_grid` training maps are compared as `on_wall_grid`,
+    as `maps` have to be.
     """
-    search = _Search(maps, *_statistics(training))
+    search = _Search(maps, *_statistics(training, on_grid=on_grid))
     total = np.zeros(maps.image.shape[1:])
     done = 0
-    for chunk in _on_one_rig(training):
+    for chunk in _parts(training, on_grid=on_grid):
         search.update(chunk)
         total += chunk.image.sum(0, dtype=np.float64)
         done += len(chunk.image)
@@ -90,23 +91,31 @@ def _stacked(maps: MapSet) -> Tensor:
     return split_and_stack(torch.from_numpy(maps.depth_m), torch.from_numpy(maps.intensity))
 
 
-def _statistics(training: data.Dataset) -> tuple[Tensor, Tensor]:
+def _statistics(training: data.Dataset, *, on_grid: bool) -> tuple[Tensor, Tensor]:
     parts = list[Tensor]()
-    for chunk in _on_one_rig(training):
+    for chunk in _parts(training, on_grid=on_grid):
         parts.append(_stacked(chunk))
         if sum(map(len, parts)) >= NEIGHBOURS:
             break
     return channel_statistics(torch.cat(parts))
 
 
-def _on_one_rig(training: data.Dataset) -> Iterator[MapSet]:
-    """Yield a dataset's maps in parts; those of many rigs aligned with the wall grid."""
-    if training.plan.rigs is None:
+def _parts(training: data.Dataset, *, on_grid: bool) -> Iterator[MapSet]:
+    """Yield a dataset's maps in parts, as they are or `on_wall_grid`."""
+    if not on_grid:
         yield from training.chunks()
         return
     benches = training.benches()
     for chunk in training.chunks():
-        yield align_samples(chunk, islice(benches, len(chunk.image)), WALL_GRID)[0]
+        yield on_wall_grid(chunk, islice(benches, len(chunk.image)))
+
+
+def on_wall_grid(maps: MapSet, benches: Iterable[Rig]) -> MapSet:
+    """Return maps as the wall grid sees them, without the rigs' numbers, which are no light."""
+    aligned = align_samples(maps, benches, WALL_GRID)[0]
+    aligned.depth_m[:, :, NUMBERS_COLUMN] = np.nan
+    aligned.intensity[:, :, NUMBERS_COLUMN] = 0.0
+    return aligned
 
 
 def training_maps(

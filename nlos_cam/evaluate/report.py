@@ -16,6 +16,7 @@ import numpy as np
 from nlos_calibration import ObjectBox, Rig
 from nlos_calibration.arrays import Float32, Float64
 from nlos_models import (
+    ANY,
     GOOD_IOU,
     RIG_WEIGHTS,
     load_reconstructor,
@@ -25,7 +26,6 @@ from nlos_models import (
 )
 from numpy.typing import NDArray
 
-from nlos_cam.errors import SceneError
 from nlos_cam.evaluate import figures as pictures
 from nlos_cam.evaluate import metrics, subjects
 from nlos_cam.evaluate.figures import LABELS
@@ -173,12 +173,10 @@ def evaluate(
     if isinstance(objects, Path):
         objects = subjects.dataset_objects(objects)
     its_rig = objects.plan.rig if objects else rig
-    if weights is None and objects and objects.plan.rigs:
-        raise SceneError(
-            "the objects are on many rigs, which no single rig's weights serve: name weights for any"
-            " rig with --weights"
-        )
-    folder = weights or (weights_for(its_rig) if its_rig else shipped_folder())
+    if objects and objects.plan.rigs:
+        folder = weights or shipped_folder(ANY)
+    else:
+        folder = weights or (weights_for(its_rig) if its_rig else shipped_folder())
     reconstructor = load_reconstructor(folder, cache_folder() / "onnx")
     record = reconstructor.record
     second: subjects.HeldOutObjects | None = None

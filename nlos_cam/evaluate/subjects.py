@@ -4,7 +4,8 @@ dataset.
 
 import os
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from itertools import groupby
 from pathlib import Path
 from typing import Literal
 
@@ -31,7 +32,7 @@ from nlos_cam.reconstruct import (
     Verdict,
     VerdictFilter,
     align_all,
-    align_samples,
+    can_align,
     estimate_uncertainty,
     grid_of,
     own_rig,
@@ -176,13 +177,6 @@ class HeldOutObjects:
     recorded: MapSet | None = None
     """Maps as a lidar measured them, from which difference maps are made; None where `maps` are."""
 
-    @property
-    def on_one_rig(self) -> MapSet:
-        """Maps that are compared with each other: of many rigs they are aligned with the wall grid."""
-        if self.plan.rigs is None:
-            return self.maps
-        return align_samples(self.maps, self.benches, WALL_GRID)[0]
-
     def input_of(self, record: CheckpointRecord, bare: data.BareMaps | None) -> MapSet:
         """Return the maps that the network takes; see `network_input`."""
         maps = self.recorded if bare and self.recorded else self.maps
@@ -239,7 +233,9 @@ def rendered_objects(
 
 
 def dataset_objects(folder: Path) -> HeldOutObjects:
-    """Return the objects and maps of a dataset."""
+    """Return the objects and maps of a dataset; of many rigs without those that see too little of
+    the wall, as in training.
+    """
     opened = data.open_dataset(folder)
     categories = [str(category) for category in opened.column("category")]
     names = [
@@ -247,7 +243,7 @@ def dataset_objects(folder: Path) -> HeldOutObjects:
         for category, seed in zip(categories, opened.column("seed"), strict=True)
     ]
     recorded = opened.as_recorded()
-    return HeldOutObjects(
+    found = HeldOutObjects(
         f"Maps of {folder}",
         names,
         categories,
@@ -255,6 +251,32 @@ def dataset_objects(folder: Path) -> HeldOutObjects:
         opened.plan,
         [*opened.benches()],
         recorded=None if recorded is opened else recorded.arrays(),
+    )
+    return found if opened.plan.rigs is None else _seen_on_the_grid(found)
+
+
+def _seen_on_the_grid(objects: HeldOutObjects) -> HeldOutObjects:
+    """Return the objects on rigs that can be aligned with the wall grid. Raises SceneError where none
+    is.
+    """
+    # objects of one rig follow each other
+    runs = [(rig, len([*same])) for rig, same in groupby(objects.benches)]
+    seen = np.repeat([can_align(rig, WALL_GRID) for rig, _ in runs], [count for _, count in runs])
+    if seen.all():
+        return objects
+    if not seen.any():
+        raise SceneError(
+            f"{objects.description}: all are of lidars that see too little of the wall; build others"
+        )
+    kept = np.flatnonzero(seen)
+    arrays = [values[kept] for values in vars(objects.maps).values()]
+    return replace(
+        objects,
+        description=f"{objects.description}, {(~seen).sum()} left out that see too little of the wall",
+        names=[objects.names[k] for k in kept],
+        categories=[objects.categories[k] for k in kept],
+        maps=MapSet(*arrays),
+        benches=[objects.benches[k] for k in kept],
     )
 
 
@@ -302,7 +324,11 @@ def baseline_answers(
                 objects.plan, cache_folder(), os.cpu_count() or 1, on_progress
             )
     with tracked("searching the nearest neighbours") as on_progress:
-        return trivial.answers_with_nearest(objects.on_one_rig, opened, on_progress), opened
+        if objects.plan.rigs is None and opened.plan.rigs is None:
+            return trivial.answers_with_nearest(objects.maps, opened, on_progress), opened
+        # maps of two rigs are compared where both see the same points of the wall
+        sought = trivial.on_wall_grid(objects.maps, objects.benches)
+        return trivial.answers_with_nearest(sought, opened, on_progress, on_grid=True), opened
 
 
 def notes_about(
@@ -346,7 +372,8 @@ def _notes_about_rig(record: CheckpointRecord, plan: data.DatasetPlan) -> list[s
             f" {rig.name}{aligned}"
         )
     if plan.rigs:
-        notes.append("each object is on a rig of its own, of all that the paper allows")
+        aligned = "" if grid_of(record) else f", and aligned with {rig.name} where possible"
+        notes.append(f"each object is on a rig of its own, of all that the paper allows{aligned}")
     elif plan.spread != data.RigSpread():
         notes.append(
             f"each object is on a rig of its own around {rig.name}, and aligned with it where"

@@ -1,11 +1,15 @@
 __all__ = [
     "ALONG_RANGE_M",
     "ASIDE_RANGE_M",
+    "HOME_IOU",
     "MAX_AVERAGE",
+    "NUMBERS_COLUMN",
     "OCCLUDER_RANGE_M",
     "PITCH_RANGE_DEG",
     "UNEXPLAINED",
     "WALL_GRID",
+    "AlignedTerms",
+    "AnyTerms",
     "Arrival",
     "CalibratedRig",
     "Clock",
@@ -33,7 +37,9 @@ __all__ = [
     "WeightsVerdict",
     "align_all",
     "align_samples",
+    "aligned_terms",
     "alignment",
+    "any_terms",
     "build_pipeline",
     "can_align",
     "check_alignable",
@@ -112,7 +118,17 @@ from .pipeline import (
     load_uncertainty,
     verdict_limits,
 )
-from .serving import WeightsVerdict, differences_of, weights_for, weights_serve
+from .serving import (
+    HOME_IOU,
+    AlignedTerms,
+    AnyTerms,
+    WeightsVerdict,
+    aligned_terms,
+    any_terms,
+    differences_of,
+    weights_for,
+    weights_serve,
+)
 from .streaming import iterate_batched, iterate_results, warm_up
 from .summaries import (
     OnWarning,
@@ -127,6 +143,7 @@ from .verdict import FrameConditions, FrozenFrames, Verdict, VerdictFilter, fram
 from .wall_grid import (
     ALONG_RANGE_M,
     ASIDE_RANGE_M,
+    NUMBERS_COLUMN,
     OCCLUDER_RANGE_M,
     PITCH_RANGE_DEG,
     WALL_GRID,

@@ -19,6 +19,7 @@ cells far. Networks for many rigs are trained on a grid on the wall in place of 
 
 from collections.abc import Iterable
 from dataclasses import replace
+from itertools import islice
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -254,11 +255,13 @@ def align_all(maps: "MapSet", benches: Iterable[Rig], trained: CheckpointRecord)
     wanted = training_rig(trained) if trained.input == "raw maps" else None
     if wanted is None:
         return maps
-    aligned, seen, _ = align_samples(maps, benches, wanted, trained.bare_wall_counts)
+    its_bench = list(islice(benches, len(maps.image)))
+    aligned, seen, _ = align_samples(maps, its_bench, wanted, trained.bare_wall_counts)
     if is_wall_grid(wanted) and not seen.all():
+        first = its_bench[int(np.argmin(seen))]
         raise SceneError(
-            f"the weights cannot see {(~seen).sum()} of {len(seen)} objects: their lidar sees too"
-            " little of the wall past the occluder, or their box has another size; use other weights"
+            f"the weights cannot see {(~seen).sum()} of {len(seen)} maps: of {first.name},"
+            f" {grid_refusal(first)}; choose other weights"
         )
     return aligned
 
@@ -315,11 +318,11 @@ def can_align(bench: Rig, trained: Rig) -> bool:
     """Return whether two rigs have object boxes of one size, and the bench's occluder hides little
     more of the wall.
     """
+    if is_wall_grid(trained):
+        return not grid_refusal(bench)
     if not (bench.object_box and trained.object_box):
         return False
-    if not _have_one_size(bench.object_box, trained.object_box):
-        return False
-    return _sees_grid(bench) if is_wall_grid(trained) else _is_in_view(bench, trained)
+    return _have_one_size(bench.object_box, trained.object_box) and _is_in_view(bench, trained)
 
 
 def grid_refusal(bench: Rig) -> str:
@@ -335,8 +338,9 @@ def grid_refusal(bench: Rig) -> str:
 
 
 def check_alignable(bench: Rig, trained: CheckpointRecord) -> None:
-    """Raise SceneError for weights on the wall grid, and a bench whose maps cannot be aligned with
-    it: of its own cells they would make a picture of nothing.
+    """Raise SceneError for weights on the wall grid and a bench whose maps cannot be aligned with it.
+
+    They cannot read the bench's own cells.
     """
     if grid_of(trained) and (why := grid_refusal(bench)):
         raise SceneError(
@@ -410,8 +414,6 @@ def _is_in_view(bench: Rig, trained: Rig) -> bool:
 
 def _sees_grid(bench: Rig) -> bool:
     """Return whether the bench sees some of the wall grid past its occluder."""
-    if bench.occluder is None:
-        return False
     sees_wall = _cells_on_wall(bench)
     if not sees_wall.any():
         return False

@@ -1,9 +1,11 @@
 """Verdict on weights for a bench: whether networks that were trained for one rig serve another."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, NamedTuple
 
+import numpy as np
 from nlos_calibration import (
     Rig,
     box_difference_m,
@@ -13,7 +15,7 @@ from nlos_calibration import (
     rig_difference,
     view_difference_deg,
 )
-from nlos_models import RIG_WEIGHTS, CheckpointRecord, load_record, shipped_folder
+from nlos_models import BENCH_WEIGHTS, DIRECT, WIDE, CheckpointRecord, load_record, shipped_folder
 
 from nlos_cam.objects import object_box
 from nlos_cam.reconstruct.alignment import (
@@ -22,7 +24,7 @@ from nlos_cam.reconstruct.alignment import (
     rig_to_align_with,
     training_rig,
 )
-from nlos_cam.reconstruct.wall_grid import beyond_trained, grid_of
+from nlos_cam.reconstruct.wall_grid import beyond_trained, grid_of, is_wall_grid
 
 NEAR_M = 0.010
 NEAR_DEG = 2.0
@@ -35,9 +37,13 @@ SEEN_BOX = 0.001
 NEAR_WALL = 0.05
 """Share of the view that a smaller wall may leave without any."""
 
+HOME_IOU = {DIRECT: 0.790, WIDE: 0.834}
+"""Silhouette IoU of the shipped weights of one rig on it."""
+GUESS_IOU = 0.3
+"""Of weights that a rig is beyond: no better than a guess."""
+_PAPERS_YAW_DEG = 45.0
+
 Service = Literal["trained for it", "near", "far", "not"]
-SERVICES: tuple[Service, ...] = ("trained for it", "near", "far", "not")
-"""The best first."""
 
 
 @dataclass(frozen=True)
@@ -73,7 +79,7 @@ def weights_serve(
     `expected_iou` is a forecast for weights trained for this rig, and `bench` the folder to train
     them in.
     """
-    # of maps of any bench the rig, if there is one, is where training went on
+    # Weights on the wall grid hold a rig where training went on for it.
     wanted = own_rig(trained) if grid_of(trained) else training_rig(trained)
     if trained.rig_checksum == rig.checksum or (wanted and not rig_difference(rig, wanted)):
         sentence = "the weights serve this bench: they were trained for its rig"
@@ -81,7 +87,7 @@ def weights_serve(
 
     forecast = "" if expected_iou is None else f" (expected silhouette IoU {expected_iou:.2f})"
     advice = f"`nlos-cam adapt {bench}` trains weights for it{forecast}"
-    if grid_of(trained):
+    if grid_of(trained) and (wanted or not trained.rig):
         service, sentence = _grid_serves(rig, wanted)
         return WeightsVerdict(service, f"{sentence}; {advice}", expected_iou)
     if wanted is None:
@@ -130,20 +136,79 @@ def _grid_serves(rig: Rig, own: Rig | None) -> tuple[Service, str]:
     )
 
 
-def weights_for(rig: Rig) -> Path:
-    """Return the folder of the shipped weights that serve a rig best; those for the paper's rig
-    where none does.
-    """
-    folders = [shipped_folder(name) for name in RIG_WEIGHTS]
-    if rig.occluder is None:  # how wide its gap is decides
-        return folders[0]
+class AlignedTerms(NamedTuple):
+    """Differences of a rig from that of weights, by which its aligned maps lose."""
 
-    services = [weights_serve(rig, load_record(folder)).service for folder in folders]
-    by_service = dict(zip(services, folders, strict=True))  # of two alike the last one
-    # Of two rigs that a bench's maps can be aligned with, the one with the wider gap has weights
-    # that are 0.06 to 0.15 of IoU better there, even if its lidar is the farther one
-    # (tools/studies/serving.py).
-    return next(by_service[service] for service in SERVICES if service in by_service)
+    farther_m: float
+    """Of the lidar from the wall."""
+    nearer_m2: float
+    """Squared: a lidar that is 2 cm nearer loses little."""
+    turned_deg: float
+    gap_m: float
+
+
+class AnyTerms(NamedTuple):
+    """Numbers of a rig by which weights for any rig do well or badly on it."""
+
+    always: float
+    gap_m: float
+    flatter_deg: float
+    """Of the lidar's axis to the wall's normal, from the paper's 45 degrees on."""
+    distance_m: float
+    """Of the lidar from the wall."""
+
+
+LOSSES = AlignedTerms(farther_m=1.971, nearer_m2=40.68, turned_deg=0.00354, gap_m=1.461)
+"""Silhouette IoU that aligned maps lose by each (tools/studies/serving.py: to 0.046)."""
+ANY_GAINS = AnyTerms(always=0.4907, gap_m=2.181, flatter_deg=-0.00292, distance_m=-0.412)
+"""Silhouette IoU of the shipped weights for any rig by each (the same study: to 0.039)."""
+ENOUGH_GAP_M = 0.13
+"""Gap from which on a wider one brings those weights nothing more."""
+
+
+def aligned_terms(rig: Rig, own: Rig) -> AlignedTerms:
+    """Return the differences of a rig from that of weights; both have an occluder."""
+    farther_m = rig.lidar.distance_m - own.lidar.distance_m
+    return AlignedTerms(
+        max(farther_m, 0.0),
+        min(farther_m, 0.0) ** 2,
+        abs(rig.lidar.yaw_deg - own.lidar.yaw_deg),
+        abs(_gap_m(rig) - _gap_m(own)),
+    )
+
+
+def any_terms(rig: Rig) -> AnyTerms:
+    """Return the numbers of a rig that has an occluder."""
+    flatter_deg = max(_PAPERS_YAW_DEG - rig.lidar.yaw_deg, 0.0)
+    return AnyTerms(1.0, min(_gap_m(rig), ENOUGH_GAP_M), flatter_deg, rig.lidar.distance_m)
+
+
+def _gap_m(rig: Rig) -> float:
+    return rig.occluder.z_min_m if rig.occluder else 0.0
+
+
+def weights_for(rig: Rig, names: Sequence[str] = BENCH_WEIGHTS) -> Path:
+    """Return the folder of the shipped weights, of those named, that can be expected to serve a rig
+    best; the first where none serves.
+    """
+    if rig.occluder is None:  # how wide its gap is decides
+        return shipped_folder(names[0])
+    return shipped_folder(max(names, key=lambda name: _shipped_iou(rig, name)))
+
+
+def _shipped_iou(rig: Rig, name: str) -> float:
+    """Return the silhouette IoU that can be expected of shipped weights on a rig with an occluder, 0
+    where they do not serve it.
+    """
+    trained = load_record(shipped_folder(name))
+    service = weights_serve(rig, trained).service
+    if service == "not":
+        return 0.0
+    own = training_rig(trained)
+    if own is None or is_wall_grid(own):
+        return float(np.dot(ANY_GAINS, any_terms(rig))) if service == "near" else GUESS_IOU
+    lost = float(np.dot(LOSSES, aligned_terms(rig, own)))
+    return max(HOME_IOU[name] - lost, GUESS_IOU)
 
 
 def _deviation(rig: Rig, wanted: Rig) -> float:

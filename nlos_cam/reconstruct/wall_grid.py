@@ -117,18 +117,18 @@ def numbers_column(numbers: Float32) -> Float32:
 
 
 def beyond_trained(rig: Rig) -> list[str]:
-    """Return what of a rig lies beyond those that networks on the wall grid are trained on (those of
-    `dataset.RigRange`), a phrase each; empty within. Raises SceneError as `rig_numbers`.
+    """Return a phrase for each number of a rig that is beyond the rigs which networks on the wall grid
+    are trained on (`dataset.RigRange`); the occluder's only where there is one. Raises SceneError for
+    a rig without a box.
     """
-    rig_numbers(rig)
     box = object_box(rig)
     lidar = rig.lidar
     found = [
         _beyond("distance", lidar.distance_m, "m", DISTANCE_RANGE_M),
         _beyond("yaw", lidar.yaw_deg, "degrees", FACING_RANGE_DEG),
         _beyond("pitch", lidar.pitch_deg, "degrees", PITCH_RANGE_DEG),
-        _beyond("box nearer by", _BOX.x_min_m - box.x_min_m, "m", ALONG_RANGE_M),
-        _beyond("box aside by", (box.y_min_m + box.y_max_m) / 2, "m", ASIDE_RANGE_M),
+        _beyond("box moved along the wall by", box.x_min_m - _BOX.x_min_m, "m", ALONG_RANGE_M),
+        _beyond("box moved up by", (box.y_min_m + box.y_max_m) / 2, "m", ASIDE_RANGE_M),
     ]
     if occluder := rig.occluder:
         move_m = occluder.x_m - box.x_min_m - USUAL_OCCLUDER_M
@@ -138,10 +138,9 @@ def beyond_trained(rig: Rig) -> list[str]:
 
 
 def _beyond(name: str, value: float, unit: str, trained: tuple[float, float]) -> str:
-    """Return a phrase on a number beyond its range; empty within, or beyond it by what a calibration
-    may be off.
-    """
+    """Return a phrase on a number beyond its range; empty within it."""
     low, high = trained
+    # A calibration may be off by its tolerance.
     allowed = TOLERANCE_M if unit == "m" else TOLERANCE_DEG
     if low - allowed <= value <= high + allowed:
         return ""

@@ -96,7 +96,7 @@ def test_info_without_a_file_names_versions_and_weights(answer: Callable[..., di
     assert facts["program"] == program_name()
     assert facts["version"] == nlos_cam.__version__
     assert facts["rendering_version"] == RENDERING_VERSION
-    assert sorted(facts["weights"]) == ["direct", "paper", "wide"]
+    assert sorted(facts["weights"]) == ["any", "direct", "paper", "wide"]
 
 
 def test_report_names_the_program() -> None:

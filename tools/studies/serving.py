@@ -4,12 +4,13 @@
         docs/figures/serving.json
 
 Rigs are drawn over all that the paper allows, and nearer to the rigs of the weights `direct` and
-`wide`. The 54 test objects stand on each, one frame with noise; maps are aligned as in `live`. The
-figures decide the order in which `weights_for` looks at the weights.
+`wide`; the twenty of the map (`weights.py rigs`) are added. The 54 test objects stand on each, one
+frame with noise; maps are aligned as in `live`. By these figures `weights_for` chooses: put the
+losses and gains that are printed into nlos_cam/reconstruct/serving.py.
 """
 
 import argparse
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import repeat
 from pathlib import Path
@@ -18,7 +19,16 @@ from typing import Any
 import harness
 import numpy as np
 from nlos_calibration import Rig, load_rig
-from nlos_models import RIG_WEIGHTS, Reconstructor, load_reconstructor, weights_folder
+from nlos_models import (
+    ANY,
+    BENCH_WEIGHTS,
+    DIRECT,
+    WIDE,
+    Reconstructor,
+    load_reconstructor,
+    weights_folder,
+)
+from weights import ANGLES_DEG, DISTANCES_M, Place
 
 from nlos_cam.dataset import RigRange
 from nlos_cam.evaluate import (
@@ -33,20 +43,30 @@ from nlos_cam.evaluate import (
 )
 from nlos_cam.files import cache_folder
 from nlos_cam.objects import benchmark_objects, object_box
-from nlos_cam.reconstruct import weights_for, weights_serve
+from nlos_cam.reconstruct import (
+    HOME_IOU,
+    AlignedTerms,
+    AnyTerms,
+    aligned_terms,
+    any_terms,
+    weights_serve,
+)
 
 FIRST_SEED = 71_000_000
 """Of the rigs: no training set draws its rigs from it."""
-FAMILIES = {"paper-rig": 12, "wide-rig": 12, "any": 24}
-"""Rigs that are drawn near a packaged one, and over all that the paper allows."""
+MAP = [(distance_m, yaw_deg) for distance_m in DISTANCES_M for yaw_deg in ANGLES_DEG]
+FAMILIES = {"paper-rig": 20, "wide-rig": 20, "any": 32, "map": len(MAP)}
+"""Rigs that are drawn near a packaged one, and over all that the paper allows; those of the map."""
 NEAR = {
-    "distance_m": 0.03,
-    "yaw_deg": 20.0,
+    "distance_m": 0.05,
+    "yaw_deg": 25.0,
     "gap_m": 0.03,
     "along_m": 0.03,
     "occluder_m": 0.01,
 }
 """Largest difference of a rig that is drawn near another one."""
+HOMES = {DIRECT: "paper-rig", WIDE: "wide-rig"}
+"""Rigs of the shipped weights for one."""
 
 
 @dataclass(frozen=True)
@@ -58,6 +78,8 @@ class Draw:
 
     def rig(self) -> Rig:
         """Return the rig."""
+        if self.family == "map":
+            return Place(*MAP[self.number]).rig(load_rig("paper-rig"))
         seed = FIRST_SEED + list(FAMILIES).index(self.family) * 1000 + self.number
         if self.family == "any":
             return RigRange().draw(load_rig("paper-rig"), seed)
@@ -81,7 +103,7 @@ def range_near(rig: Rig) -> RigRange:
 
 
 def measure(rig: Rig, networks: Mapping[str, Reconstructor]) -> dict[str, Any]:
-    """Return the figures of all weights on one rig, with the verdict that `live` would give."""
+    """Return the figures of all weights on one rig, with their service."""
     box = object_box(rig)
     subjects = benchmark_objects(box)
     truth = truth_of(subjects, box)
@@ -98,7 +120,6 @@ def measure(rig: Rig, networks: Mapping[str, Reconstructor]) -> dict[str, Any]:
         }
     return {
         "rig": rig.model_dump(mode="json", include={"lidar", "occluder", "object_box"}),
-        "chosen": weights_for(rig).name,
         "weights": found,
     }
 
@@ -111,7 +132,7 @@ def main() -> None:
     asked: argparse.Namespace = parser.parse_args()
 
     folders: dict[str, Path] = {
-        **{name: weights_folder(Path(name)) for name in RIG_WEIGHTS},
+        **{name: weights_folder(Path(name)) for name in BENCH_WEIGHTS},
         **harness.by_name(asked.weights),
     }
     graphs = cache_folder() / "onnx"
@@ -124,10 +145,75 @@ def main() -> None:
             lambda draw, _: measure(draw.rig(), networks),
             key=repr(sorted((name, network.record.figures) for name, network in networks.items())),
         )
-    harness.write("serving", {"rigs": rows}, asked.out)
-    for name in networks:
-        ious = [row["weights"][name]["silhouette_iou"] for row in rows]
-        print(f"{name}: mean IoU {np.mean(ious):.3f}, worst {np.min(ious):.3f}")
+    found = summary(rows)
+    harness.write("serving", {"summary": found, "rigs": rows}, asked.out)
+    for name, value in found.items():
+        print(name, harness.rounded(value))
+
+
+def summary(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """Return what each difference of a rig costs weights that its maps are aligned with, what each of
+    its numbers brings those for any rig; and the mean IoU of all weights over each family of rigs, of
+    those that these numbers choose, and of the best ones.
+    """
+    losses = fitted(
+        (HOME_IOU[name] - iou_of(row, name), aligned_terms(rig_of(row), load_rig(home)))
+        for row in rows
+        for name, home in HOMES.items()
+        if row["weights"][name]["service"] != "not"
+    )
+    gains = fitted((iou_of(row, ANY), any_terms(rig_of(row))) for row in rows)
+    found: dict[str, Any] = {
+        "losses": dict(zip(AlignedTerms._fields, losses.factors, strict=True)),
+        "losses_scatter": losses.scatter,
+        "gains_of_any": dict(zip(AnyTerms._fields, gains.factors, strict=True)),
+        "gains_scatter": gains.scatter,
+    }
+    for family in FAMILIES:
+        own = [row for row in rows if row["family"] == family]
+        means = {name: float(np.mean([iou_of(row, name) for row in own])) for name in BENCH_WEIGHTS}
+        chosen = [iou_of(row, choice(row, losses.factors, gains.factors)) for row in own]
+        best = [max(iou_of(row, name) for name in BENCH_WEIGHTS) for row in own]
+        found[family] = means | {"chosen": float(np.mean(chosen)), "best": float(np.mean(best))}
+    return found
+
+
+@dataclass(frozen=True)
+class Fit:
+    """Linear fit."""
+
+    factors: list[float]
+    scatter: float
+    """Root of the mean squared error."""
+
+
+def fitted(points: Iterable[tuple[float, Sequence[float]]]) -> Fit:
+    """Return the fit of values to their terms."""
+    values, terms = (np.array(each) for each in zip(*points, strict=True))
+    factors, *_ = np.linalg.lstsq(terms, values, rcond=None)
+    return Fit(factors.tolist(), float(np.sqrt(np.mean((values - terms @ factors) ** 2))))
+
+
+def choice(row: Mapping[str, Any], losses: Sequence[float], gains: Sequence[float]) -> str:
+    """Return the name of the weights that are expected to be best."""
+    rig = rig_of(row)
+    expected = {
+        name: HOME_IOU[name] - float(np.dot(losses, aligned_terms(rig, load_rig(home))))
+        for name, home in HOMES.items()
+        if row["weights"][name]["service"] != "not"
+    }
+    expected[ANY] = float(np.dot(gains, any_terms(rig)))
+    return max(expected, key=lambda name: expected[name])
+
+
+def iou_of(row: Mapping[str, Any], name: str) -> float:
+    """Return the silhouette IoU of weights on a rig."""
+    return row["weights"][name]["silhouette_iou"]
+
+
+def rig_of(row: Mapping[str, Any]) -> Rig:
+    """Return the rig of a row."""
+    return Draw(row["family"], row["number"]).rig()
 
 
 if __name__ == "__main__":

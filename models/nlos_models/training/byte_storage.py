@@ -59,11 +59,9 @@ def _in_bytes(path: Path) -> bytes:
     for name, weight in full.items():
         in_full = name.rpartition(".")[2] in FULL
         if weight.is_floating_point() and not in_full and fits_bytes(tuple(weight.shape)):
-            # also of bytes with scales of 32 bits, which keep their bytes
             in_bytes, scale = to_bytes(weight.numpy())
             stored[name] = torch.from_numpy(in_bytes)
             stored[name + SCALE] = torch.from_numpy(scale)
         else:
-            # in full now what an earlier version stored in bytes
-            stored[name] = weight if name + SCALE in found else found[name]
+            stored[name] = weight if in_full else found[name]
     return save(stored)

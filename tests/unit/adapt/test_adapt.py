@@ -12,7 +12,7 @@ from nlos_models import load_network, training
 
 from nlos_cam.adapt import NETWORK_FILE, Adaptation, adapt, calibration_spread
 from nlos_cam.adapt.plan import load_plan
-from nlos_cam.adapt.run import _from_where_it_began
+from nlos_cam.adapt.run import _with_first_start
 from nlos_cam.dataset import DatasetPlan, build_dataset, ignore
 from nlos_cam.errors import SceneError
 from nlos_cam.files import FileBusyError, claim
@@ -99,7 +99,7 @@ def test_work_goes_on_from_the_weights_that_it_began_from(tmp_path: Path) -> Non
     job = job_in(tmp_path / "work", load_rig("wide-rig"))  # from `direct`
 
     assert weights_for(job.rig).name == "wide"
-    assert _from_where_it_began(job).start_folder.name == "direct"
+    assert _with_first_start(job).start_folder.name == "direct"
 
 
 def test_two_adaptations_in_one_folder_are_one_too_many(tmp_path: Path) -> None:

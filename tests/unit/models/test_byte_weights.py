@@ -98,7 +98,7 @@ def test_scales_of_32_bits_keep_their_bytes() -> None:
     random = np.random.default_rng(0)
     weight = random.integers(-127, 128, (64, 64), np.int8)
     weight[:, 0] = LARGEST
-    scale = random.uniform(1e-5, 1e-3, (64, 1)).astype(np.float32)
+    scale = random.uniform(1e-4, 1e-3, (64, 1)).astype(np.float32)  # as the shipped ones
 
     again, _ = to_bytes(from_bytes(weight, scale))
 

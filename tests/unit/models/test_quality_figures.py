@@ -4,7 +4,7 @@ import json
 
 import numpy as np
 import pytest
-from nlos_models import RIG_WEIGHTS, quality_features, shipped_folder
+from nlos_models import BENCH_WEIGHTS, quality_features, shipped_folder
 from nlos_models.quality import QUALITY
 from nlos_models.quality_figures import FIGURES, SURFACE_FIGURES, UncertaintyEstimate
 
@@ -71,7 +71,7 @@ def test_tables_have_the_order_of_stored_models() -> None:
     assert list(SURFACE_FIGURES) == SURFACE_ORDER
 
 
-@pytest.mark.parametrize("name", RIG_WEIGHTS)
+@pytest.mark.parametrize("name", BENCH_WEIGHTS)
 def test_shipped_models_have_a_number_for_each_figure(name: str) -> None:
     record = json.loads((shipped_folder(name) / QUALITY).read_text(encoding="utf-8"))
 

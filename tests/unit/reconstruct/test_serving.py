@@ -5,8 +5,9 @@ from typing import Any
 
 import pytest
 from nlos_calibration import Rig, load_rig
+from nlos_models import ANY, load_record, shipped_folder
 
-from nlos_cam.reconstruct import WALL_GRID, weights_for, weights_serve
+from nlos_cam.reconstruct import WALL_GRID, grid_of, weights_for, weights_serve
 
 RIG = load_rig("paper-rig")
 
@@ -91,11 +92,18 @@ def with_gap(gap_m: float, **lidar: float) -> Rig:
         (load_rig("wide-rig"), "wide"),
         (with_gap(0.133), "wide"),
         (with_gap(0.139, yaw_deg=63.0), "wide"),
+        (posed(yaw_deg=60.0), "direct"),
+        (posed(distance_m=0.25, yaw_deg=30.0), "any"),
+        (posed(distance_m=0.34), "any"),
         (load_rig("bare-wall"), "direct"),
     ],
 )
-def test_bench_gets_the_weights_of_the_nearest_rig(rig: Rig, name: str) -> None:
+def test_bench_gets_the_weights_that_serve_it_best(rig: Rig, name: str) -> None:
     assert weights_for(rig).name == name
+
+
+def test_shipped_weights_for_any_rig_know_todays_grid() -> None:
+    assert grid_of(load_record(shipped_folder(ANY)))
 
 
 def test_weights_that_hold_their_rig_are_known_later() -> None:
@@ -126,8 +134,8 @@ def test_weights_for_any_rig_say_which_number_is_beyond() -> None:
         (with_gap(0.3), "gap 0.3 m"),
         (with_gap(0.03), "gap 0.03 m"),
         (posed(pitch_deg=10.0), "pitch 10 degrees"),
-        (with_box_moved(y=0.1), "box aside by 0.1 m"),
-        (with_box_moved(x=0.1), "box nearer by -0.1 m"),
+        (with_box_moved(y=0.1), "box moved up by 0.1 m"),
+        (with_box_moved(x=0.1), "box moved along the wall by 0.1 m"),
         (with_wall_to(0.15), "its wall ends"),
         (with_gap(0.2), "the lidar sees into the object box"),
     ],
