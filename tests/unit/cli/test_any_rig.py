@@ -52,6 +52,11 @@ def test_weights_for_any_rig_answer_on_another_one(folder: Path, run: Run) -> No
     assert record.rig_checksum == WALL_GRID.checksum
     assert record.rig_name == "wall grid"
 
+    judged = run(
+        "evaluate", "--dataset", folder / "held", "--no-nearest", "--out", folder / "figures"
+    )
+    assert judged["silhouette_iou"]["value"] > 0.4  # by the shipped weights for any rig
+
     far = load_rig("paper-rig")
     far = far.model_copy(
         update={"lidar": far.lidar.model_copy(update={"distance_m": 0.25, "yaw_deg": 30.0})}

@@ -40,6 +40,7 @@ from nlos_cam.evaluate import (
 from nlos_cam.evaluate import subjects as module
 from nlos_cam.evaluate.baselines import (
     answers_with_nearest,
+    on_wall_grid,
     training_maps,
 )
 from nlos_cam.evaluate.subjects import notes_about, rig_of, seeded_objects, sense, truth_of
@@ -52,7 +53,7 @@ from nlos_cam.objects import (
     object_depth,
     unseen_objects,
 )
-from nlos_cam.reconstruct import MapAlignment
+from nlos_cam.reconstruct import NUMBERS_COLUMN, MapAlignment
 from nlos_cam.render import QUIET, MultiBounce, Scene, SceneFile, render
 
 RIG = load_rig("paper-rig")
@@ -309,6 +310,20 @@ def _guesses(
 ) -> dict[str, np.ndarray]:
     options = {"on_progress": lambda *_: None, **others}
     return answers_with_nearest(sought, Chunked(maps=training, size=size), **options)  # type: ignore[arg-type]
+
+
+def test_maps_of_many_rigs_are_compared_without_the_rigs_numbers() -> None:
+    rig = load_rig("paper-rig")
+    maps = MapSet(
+        np.ones((2, 64, 80), np.float32),
+        np.ones((2, 64, 80), np.float32),
+        np.zeros((2, 64, 64), np.float32),
+    )
+    compared = on_wall_grid(maps, [rig, rig])
+
+    assert np.isnan(compared.depth_m[:, :, NUMBERS_COLUMN]).all()
+    assert np.isfinite(compared.depth_m[:, :, :NUMBERS_COLUMN]).any()
+    assert np.isfinite(maps.depth_m).all()
 
 
 def test_baselines_without_training_maps_are_two(monkeypatch: pytest.MonkeyPatch) -> None:
