@@ -3,8 +3,6 @@ __all__ = [
     "OBJECTS",
     "PLAN",
     "RECORDINGS",
-    "SHIPPED_WEIGHTS",
-    "START_WEIGHTS",
     "AdaptResult",
     "Adaptation",
     "Locked",
@@ -32,8 +30,6 @@ from .report import Tables, transfer_words, write_page
 from .run import (
     NETWORK_FILE,
     OBJECTS,
-    SHIPPED_WEIGHTS,
-    START_WEIGHTS,
     Adaptation,
     AdaptResult,
     Measure,

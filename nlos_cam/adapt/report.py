@@ -12,7 +12,7 @@ import numpy as np
 
 from nlos_cam.adapt.plan import Plan
 from nlos_cam.adapt.recordings import Transfer
-from nlos_cam.adapt.run import AFTER, NETWORK, REPORT, SHIPPED_WEIGHTS, AdaptResult
+from nlos_cam.adapt.run import AFTER, NETWORK, REPORT, AdaptResult
 from nlos_cam.bench import ForecastRecord
 from nlos_cam.forecast import SCATTER_IOU
 from nlos_cam.report import (
@@ -190,7 +190,7 @@ def write_page(
     }
     if not (kept or plan.locked):
         headline += "; the weights in use stay"
-        if result.better_weights == SHIPPED_WEIGHTS:
+        if result.shipped_are_better:
             headline += f" (the shipped ones have {result.shipped_iou or 0:.2f})"
     advice = outlook(plan, curves, after, expected.expected_iou if expected else None)
     title = "Weights for this bench"

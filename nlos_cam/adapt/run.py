@@ -96,9 +96,6 @@ MIN_NOTES = 4
 """Notes of progress from which a pace is told."""
 RECIPE = "doubt"
 
-START_WEIGHTS = "start weights"
-SHIPPED_WEIGHTS = "shipped weights"
-
 Measure = Callable[[Path | None, Path, Path | None], None]
 """Measures weights (None: the shipped ones) on a dataset (None: the bench's test objects): writes
 FIGURES and a report into a folder."""
@@ -182,11 +179,10 @@ class AdaptResult:
         return self.serves_as_well_as(max(start_iou, self.shipped_iou or 0.0))
 
     @property
-    def better_weights(self) -> str:
-        """Better ones of START_WEIGHTS and SHIPPED_WEIGHTS."""
-        start_iou = self.before["silhouette_iou"]["value"]
-        is_shipped = self.shipped_iou is not None and self.shipped_iou > start_iou
-        return SHIPPED_WEIGHTS if is_shipped else START_WEIGHTS
+    def shipped_are_better(self) -> bool:
+        """True if the shipped weights that serve the rig best are better than the start weights."""
+        start_iou: float = self.before["silhouette_iou"]["value"]
+        return self.shipped_iou is not None and self.shipped_iou > start_iou
 
     def serves_as_well_as(self, other_iou: float) -> bool:
         """Return whether the weights are as good as others with this silhouette IoU on the test

@@ -222,9 +222,16 @@ def _is_worth_keeping(result: adaptation.AdaptResult, bench: Path | None) -> boo
 
 def _better_weights(result: adaptation.AdaptResult, rig: walls.Rig) -> str:
     """Return the name or folder of the better ones of start weights and shipped weights."""
-    if result.better_weights == adaptation.SHIPPED_WEIGHTS:
-        return reconstruct.weights_for(rig).name
-    return result.start
+    return reconstruct.weights_for(rig).name if result.shipped_are_better else result.start
+
+
+def _better_words(result: adaptation.AdaptResult) -> str:
+    """Return which weights are better than those of an adaptation that is not kept."""
+    if result.is_better:
+        return "weights in use, which stay (more --minutes help)"
+    if result.shipped_are_better:
+        return f"shipped weights ({result.shipped_iou:.3f}; more --minutes help)"
+    return "start weights (more --minutes help)"
 
 
 def _has_weights_of_another_rig(bench: Path) -> bool:
@@ -262,14 +269,7 @@ def _report(
     adaptation.write_page(result, tables, commands, page, kept=kept)
     _, before, after = rows[0]
     state = "was finished before" if result.was_there else "done"
-    worse = ""
-    if not kept and not result.plan.locked:
-        better = "weights in use, which stay" if result.is_better else result.better_weights
-        worse = f", worse than the {better} (more --minutes help)"
-        if better == adaptation.SHIPPED_WEIGHTS:
-            worse = (
-                f", worse than the {better} ({result.shipped_iou or 0:.3f}; more --minutes help)"
-            )
+    worse = "" if kept or result.plan.locked else f", worse than the {_better_words(result)}"
     text = (
         f"{state}: {rows[0][0]} {before} -> {after} on this bench{worse}; weights in {target},"
         f" report {page}"

@@ -97,7 +97,7 @@ def rig_numbers(rig: Rig) -> Float32:
         (rig.lidar.yaw_deg - 45) / 20,
         (rig.occluder.x_m - box.x_min_m - USUAL_OCCLUDER_M) / 0.02,
         (rig.occluder.z_min_m - 0.1) / 0.03,
-        (box.x_min_m - 0.325) / 0.03,
+        (box.x_min_m - _BOX.x_min_m) / 0.03,
     ]
     odd = [rig.lidar.pitch_deg / 2, middle_m / 0.01]
     return np.array([*even, *odd], np.float32)

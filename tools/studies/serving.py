@@ -28,18 +28,15 @@ from nlos_models import (
     load_reconstructor,
     weights_folder,
 )
-from weights import ANGLES_DEG, DISTANCES_M, Place
+from weights import ANGLES_DEG, DISTANCES_M, Place, shown
 
 from nlos_cam.dataset import RigRange
 from nlos_cam.evaluate import (
     as_map_set,
-    echoes_of,
     judge,
     network_input,
     plain,
     reconstruct_all,
-    sense,
-    truth_of,
 )
 from nlos_cam.files import cache_folder
 from nlos_cam.objects import benchmark_objects, object_box
@@ -106,8 +103,8 @@ def measure(rig: Rig, networks: Mapping[str, Reconstructor]) -> dict[str, Any]:
     """Return the figures of all weights on one rig, with their service."""
     box = object_box(rig)
     subjects = benchmark_objects(box)
-    truth = truth_of(subjects, box)
-    maps = as_map_set(sense(echoes_of(subjects, rig, lambda *_: None), rig), truth)
+    truth, seen = shown(subjects, rig)
+    maps = as_map_set(seen, truth)
 
     found = dict[str, Any]()
     for name, network in networks.items():
