@@ -144,7 +144,7 @@ Pause = Annotated[
         "--pause-s",
         min=0.0,
         max=MAX_S,
-        help="Seconds between takes (default: wait for Enter, at a terminal).",
+        help="With --takes, seconds between them (default: wait for Enter, at a terminal).",
     ),
 ]
 Labels = Annotated[
@@ -176,7 +176,8 @@ def capture(
     """Record depth, infrared and confidence to .bag until --seconds, --frames or Ctrl-C, and verify
     each file.
     """
-    targets = _targets(_base(seconds, frames, takes, out), takes, label or [], overwrite=overwrite)
+    base = _base(seconds, frames, takes, pause_s, out)
+    targets = _targets(base, takes, label or [], overwrite=overwrite)
     chosen = benches.choose(bench_folder, wall, reconstructs=False)
     measured = chosen.recorded_wall
     recording = cameras.Recording(
@@ -217,7 +218,9 @@ def capture(
         common.exit_interrupted(f"{sum(take.sets for take in results)} frames are kept")
 
 
-def _base(seconds: float | None, frames: int | None, takes: int, out: Path | None) -> Path:
+def _base(
+    seconds: float | None, frames: int | None, takes: int, pause_s: float | None, out: Path | None
+) -> Path:
     """Return the path before takes are numbered. Raises typer.BadParameter for options that
     contradict each other.
     """
@@ -225,6 +228,10 @@ def _base(seconds: float | None, frames: int | None, takes: int, out: Path | Non
         raise typer.BadParameter("give either --seconds or --frames, not both")
     if takes > 1 and seconds is None and frames is None:
         raise typer.BadParameter(f"--takes {takes} needs --seconds or --frames")
+    if takes == 1 and pause_s is not None:
+        raise typer.BadParameter(
+            f"--pause-s {pause_s:g} is the time between takes: give --takes, or drop it"
+        )
     if out is not None and out.suffix != ".bag":
         raise typer.BadParameter(f"--out {out}: the name of a recording must end in .bag")
     return out or common.output_path(None, "capture", ".bag", overwrite=False)

@@ -45,6 +45,9 @@ def info(
     if out is not None and out.suffix not in {".html", ".png"}:
         raise typer.BadParameter(f"--out {out}: choose a name that ends in .html or .png")
     if path is None:
+        if verify or out is not None:
+            option = "--verify" if verify else "--out"
+            raise typer.BadParameter(f"{option} is about a file: name it, or drop {option}")
         facts = inspect.describe_program()
         finish({**facts}, as_json=json, text=_format_program(facts))
         return

@@ -67,7 +67,8 @@ Out = Annotated[
     Path | None, typer.Option("--out", help="Directory to write (default: a dated one).")
 ]
 Every = Annotated[
-    int, typer.Option("--every", min=1, help="With --object, only every Nth frame (default: 1).")
+    int | None,
+    typer.Option("--every", min=1, help="With --object, only every Nth frame (default: 1)."),
 ]
 
 
@@ -196,12 +197,16 @@ def replay(
     stills: viewing.Stills = 0,
     video: viewing.Video = False,
     as_object: AsObject = "",
-    every: Every = 1,
+    every: Every = None,
     overwrite: common.Overwrite = False,
     json: common.Json = False,
 ) -> None:
     """Reconstruct every frame of a recording: the same frames and the same bits each time."""
     formats = object_formats(as_object)
+    if every is not None and not formats:
+        raise typer.BadParameter(
+            f"--every {every} is about the files of --object: give --object, or drop it"
+        )
     chosen = benches.choose(bench_folder, wall, weights)
     path = common.output_path(out, "replay", "", overwrite=overwrite)
     with common.interrupted_by_signals():
@@ -219,7 +224,7 @@ def replay(
             on_frame=lambda: bar.advance(task),
             on_warning=warn,
             media=replays.ReplayMedia(
-                bench, view=save_view, stills=stills, video=video, objects=formats, every=every
+                bench, view=save_view, stills=stills, video=video, objects=formats, every=every or 1
             ),
             options=_choice_words(bench_folder, wall, weights, average),
         )

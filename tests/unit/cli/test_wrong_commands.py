@@ -56,8 +56,10 @@ capture --seconds 1 --frames 2 | --frames
 capture --takes 2 | --takes
 capture --takes 3 --frames 1 --label a --label b | --label
 capture --out run.mp4 | .bag
+capture --frames 2 --pause-s 1 | --takes
 replay | missing
 replay random.bag --object fbx | fbx
+replay random.bag --every 2 | --object
 repair run.bag --out run.txt | .bag
 calibrate | --wall
 calibrate --wall --occluder wall.toml | --wall
@@ -109,6 +111,8 @@ evaluate --training d --no-nearest | --no-nearest
 evaluate --dataset d --rig paper-rig | --rig
 evaluate --dataset d --training ./d | --training
 tradeoff render --seed 3 | --object
+info --verify | --verify
+info --out slice.png | --out
 doctor --fix | no option
 """
 FILES = """
