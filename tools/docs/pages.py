@@ -68,7 +68,9 @@ def default_of(parameter: Any) -> str:
 def option_row(parameter: Any) -> str:
     """Return a line of a command's table."""
     is_argument = not parameter.opts[0].startswith("-")
-    name = parameter.metavar or parameter.name.upper() if is_argument else ", ".join(parameter.opts)
+    # the second name of a pair, as --upside-down of --upright
+    options = [*parameter.opts, *parameter.secondary_opts]
+    name = parameter.metavar or parameter.name.upper() if is_argument else ", ".join(options)
     text = (parameter.help or "").replace("|", "\\|")
     return f"| `{name}` | {kind_of(parameter)} | {default_of(parameter)} | {text} |"
 
