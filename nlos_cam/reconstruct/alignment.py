@@ -32,7 +32,7 @@ from pydantic import ValidationError
 from nlos_cam.errors import SceneError
 from nlos_cam.frames import MAP_COLUMNS, MAP_ROWS, LidarMaps
 from nlos_cam.objects import object_box
-from nlos_cam.reconstruct.flat_field import brightest_light
+from nlos_cam.reconstruct.bare_bench import brightest_light
 from nlos_cam.reconstruct.wall_grid import (
     NUMBERS_COLUMN,
     WALL_GRID,

@@ -27,14 +27,9 @@ from nlos_calibration.arrays import Float64, Mask
 
 from nlos_cam.frames import MAP_COLUMNS, MAP_ROWS, SATURATED, LidarMaps
 from nlos_cam.objects import object_box, object_depth
+from nlos_cam.reconstruct.bare_bench import brightest_light, interior, wall_as_rendered
 from nlos_cam.reconstruct.bench import CalibratedRig
-from nlos_cam.reconstruct.flat_field import (
-    MIN_WALL_CELLS,
-    as_measured,
-    brightest_light,
-    interior,
-    wall_as_rendered,
-)
+from nlos_cam.reconstruct.flat_field import MIN_WALL_CELLS, as_measured
 from nlos_cam.render import Rendering, Scene, SensorModel, render
 
 OFF_WALL_M = 0.009

@@ -17,10 +17,10 @@ from nlos_calibration import Rig
 from nlos_calibration.arrays import Float64, Mask
 
 from nlos_cam.frames import MAP_COLUMNS, MAP_ROWS, SATURATED, LidarMaps
+from nlos_cam.reconstruct.bare_bench import bare_rendering
 from nlos_cam.reconstruct.bench import CalibratedRig
 from nlos_cam.reconstruct.consistency import OFF_WALL_M
 from nlos_cam.reconstruct.flat_field import MIN_WALL_CELLS, as_measured
-from nlos_cam.reconstruct.physics_check import bare_rendering
 from nlos_cam.render import Rendering, cast
 
 BEAMS_PER_CELL = 4

@@ -14,8 +14,8 @@ from nlos_calibration import BareWall, Rig
 from nlos_calibration.arrays import Float32, Float64, Mask
 
 from nlos_cam.frames import MAP_COLUMNS, MAP_ROWS, LidarMaps
+from nlos_cam.reconstruct.bare_bench import bare_rendering, brightest_light, wall_as_rendered
 from nlos_cam.reconstruct.bench import CalibratedRig
-from nlos_cam.reconstruct.physics_check import bare_rendering
 from nlos_cam.render import Sensor, SensorModel, cast
 
 SAME_SURFACE_M = 0.03
@@ -100,23 +100,6 @@ def measured_counts(rig: Rig, reference: BareWall, offset_m: float) -> float | N
     return brightest_light(rig) * float(np.median(reference.map_intensity[wall] / direct[wall]))
 
 
-def brightest_light(rig: Rig) -> float:
-    """Return the renderer's light of the brightest bare-wall return: `bare_wall_counts` of a sensor
-    over it are its counts for each unit of light.
-    """
-    return float(cast(rig, rig.pinhole, occluder=False).direct.max())
-
-
-def wall_as_rendered(rig: Rig) -> tuple[Float64, Float64]:
-    """Return depth along the optical axis in metres and light (64, 80) of the cells that see the
-    wall alone; NaN and 0 elsewhere.
-    """
-    bare = bare_rendering(rig)  # pyright: ignore[reportArgumentType]
-    on_wall = cast(rig, rig.pinhole.scaled(MAP_COLUMNS, MAP_ROWS)).on_wall
-    sees_wall = interior(on_wall.reshape(MAP_ROWS, MAP_COLUMNS)) & (bare.intensity > 0)
-    return np.where(sees_wall, bare.depth_m, np.nan), np.where(sees_wall, bare.intensity, 0.0)
-
-
 def as_measured(
     depth_m: Float64, light: Float64, reference: BareWall, offset_m: float
 ) -> tuple[Float64, Float64]:
@@ -143,13 +126,3 @@ def same_surface(reference: BareWall, depth_m: Float32 | Float64, offset_m: floa
     measured_m = reference.map_depth_m.astype(np.float64) + offset_m
     # NaN compares false
     return (np.abs(measured_m - depth_m) < SAME_SURFACE_M) & (reference.map_intensity > 0)
-
-
-def interior(region: Mask) -> Mask:
-    """Return the cells of a region (64, 80) whose four neighbors belong to it too."""
-    found = region.copy()
-    found[1:] &= region[:-1]
-    found[:-1] &= region[1:]
-    found[:, 1:] &= region[:, :-1]
-    found[:, :-1] &= region[:, 1:]
-    return found

@@ -7,11 +7,13 @@ With r = measured less expected and s a tolerance that covers the noise:
 
     h     = (depth r / s)^2 + (log intensity r / s)^2
             + (log of how much the other echo is stronger / s)^2
-    cost  = h / (1 + h)         0 explained, 1 not at all; averaged over the cells
+    cost  = h / (1 + h)         0 explained, 1 not at all; averaged over the cells on the wall
     score = (cost - noise) / (cost of the bare bench - noise)
 
 The numerator is at least 0, the denominator at least MIN_UNEXPLAINED. The noise is the cost of an
 empty bench on this rig (`noise_cost`): where a lidar faces the wall at a slant, its cells are large.
+
+The occluder's cells take no part: nothing tells how much it reflects, and no object changes them.
 
 Two unknowns are fitted: the device's gain, from the cells that show the bare wall, and the object's
 albedo, to within a factor of MAX_ALBEDO, as the one of least cost. A wider range of albedos would
@@ -21,15 +23,16 @@ explain any missing object as a dark one.
 import logging
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import NamedTuple, Protocol, Self
 
 import numpy as np
 from nlos_calibration import Rig
-from nlos_calibration.arrays import Float32, Float64
+from nlos_calibration.arrays import Float32, Float64, Mask
 
 from nlos_cam.frames import MAP_COLUMNS, MAP_ROWS, SATURATED, LidarMaps, maps_from_frame
+from nlos_cam.reconstruct.bare_bench import bare_rendering, brightest_light, cells_on_wall
 from nlos_cam.reconstruct.network import Clock
 from nlos_cam.render import Rendering, Scene, Sensor, SensorModel, Stop, cast, render
 
@@ -154,12 +157,14 @@ class Expected:
     echo_m: Float64
     """Depth of the three-bounce echo; NaN where there is none."""
     echo: Float64
+    sees_wall: Mask
+    """Cells that see the wall alone, which are compared."""
 
     @property
     def bare(self) -> "Expected":
         """The same without three-bounce echoes."""
-        return Expected(
-            self.direct_m, self.direct, np.full_like(self.echo_m, np.nan), np.zeros_like(self.echo)
+        return replace(
+            self, echo_m=np.full_like(self.echo_m, np.nan), echo=np.zeros_like(self.echo)
         )
 
     def noiseless_maps(self, albedo: float, gain: float) -> tuple[Float32, Float32]:
@@ -206,14 +211,16 @@ def fit_gain(maps: LidarMaps, bare: Expected) -> float:
     all if too few.
     """
     # The median ignores the few cells in which an echo happens to lie at the wall's depth.
-    lit = maps.valid & (maps.intensity > 0) & (bare.direct > 0)
+    lit = bare.sees_wall & maps.valid & (maps.intensity > 0) & (bare.direct > 0)
     shows_wall = lit & (np.abs(maps.depth_m - bare.direct_m) < 3 * WALL_TOLERANCE_M)
     cells = shows_wall if shows_wall.sum() >= MIN_BARE_CELLS else lit
     return float(np.median(maps.intensity[cells] / bare.direct[cells])) if cells.any() else 1.0
 
 
 def mean_cost(maps: LidarMaps, expected: Expected, gain: float, albedo: float) -> float:
-    """Return the mean cost, 0 to 1, over the cells with a measured or expected return."""
+    """Return the mean cost, 0 to 1, over the cells on the wall with a measured or expected
+    return.
+    """
     echo = albedo * expected.echo
     measured_m = np.where(maps.valid, maps.depth_m, np.nan).astype(np.float64)
     log_light = _log(maps.intensity.astype(np.float64) / gain)  # in units of I0
@@ -230,7 +237,7 @@ def mean_cost(maps: LidarMaps, expected: Expected, gain: float, albedo: float) -
     # h / (1 + h) tends to 1 for h -> infinity, but inf / inf is NaN.
     cost = np.where(np.isfinite(h), h / (1 + np.where(np.isfinite(h), h, 0)), 1.0)
     # A cell without a return, where none is expected either, tells nothing.
-    counted = maps.valid | (expected.direct > 0) | (echo > 0)
+    counted = expected.sees_wall & (maps.valid | (expected.direct > 0) | (echo > 0))
     return float(cost[counted].mean()) if counted.any() else 0.0
 
 
@@ -302,7 +309,7 @@ def check_reconstruction(
     if has_surface:
         expected = _expected(render(Scene(rig, depth_m), accuracy), rig, bare)
 
-    counts = fit_gain(maps, bare) * max(float(bare.direct.max()), 1e-12)
+    counts = fit_gain(maps, bare) * brightest_light(rig)
     # In steps of a fifth, so that few are computed.
     steps = round(np.log(max(counts, 1.0)) / COUNTS_STEP)
     noise = noise_cost(rig, float(np.exp(steps * COUNTS_STEP)))  # pyright: ignore[reportArgumentType]
@@ -320,18 +327,10 @@ def check_reconstruction(
     )
 
 
-@lru_cache(maxsize=4)
-def bare_rendering(rig: Rig) -> Rendering:
-    """Return the rendering of a rig with nothing hidden, which every check of a frame compares
-    with.
-    """
-    return render(Scene(rig))
-
-
 @lru_cache(maxsize=16)
 def noise_cost(rig: Rig, counts: float) -> float:
     """Return the cost of an empty bench on a rig, as the simulated sensor sees it at a gain: the
-    `counts` of the brightest cell. NOISE_COST at least.
+    `counts` of the brightest return of its wall. NOISE_COST at least.
     """
     empty = bare_rendering(rig)  # pyright: ignore[reportArgumentType]
     sensor = NOISE.model_copy(update={"bare_wall_counts": counts})
@@ -352,7 +351,7 @@ def _expected(rendering: Rendering, rig: Rig, bare: Expected | None) -> Expected
     direct = rendering.intensity.astype(np.float64)
     direct_m = rendering.depth_m.astype(np.float64)
     if bare is None:
-        return Expected(direct_m, direct, echo_m, echo)
+        return Expected(direct_m, direct, echo_m, echo, cells_on_wall(rig))
 
     # The rendering holds the stronger echo of each cell: where that has three bounces, the wall's
     # own is taken from the bare bench, which the object does not change.
@@ -362,6 +361,7 @@ def _expected(rendering: Rendering, rig: Rig, bare: Expected | None) -> Expected
         direct=np.where(bounced, bare.direct, direct),
         echo_m=echo_m,
         echo=echo,
+        sees_wall=bare.sees_wall,
     )
 
 

@@ -23,7 +23,7 @@ from nlos_cam.reconstruct.physics_check import (
     log_warning,
     mean_cost,
 )
-from nlos_cam.render import Scene, render
+from nlos_cam.render import Scene, Sensor, SensorModel, cast, render
 
 SHAPE = 64, 80
 GAIN = 1e5
@@ -31,7 +31,10 @@ RIGHT = np.broadcast_to(np.arange(80) >= 40, SHAPE)
 WALL_M = np.broadcast_to(np.linspace(0.2, 0.6, 80), SHAPE)
 
 
-NO_ECHO = Expected(np.full(SHAPE, np.nan), np.zeros(SHAPE), np.full(SHAPE, np.nan), np.zeros(SHAPE))
+ALL_WALL = np.ones(SHAPE, np.bool_)
+NO_ECHO = Expected(
+    np.full(SHAPE, np.nan), np.zeros(SHAPE), np.full(SHAPE, np.nan), np.zeros(SHAPE), ALL_WALL
+)
 """Neither wall nor object."""
 
 
@@ -39,7 +42,8 @@ def expected_object(echo_m: float = 0.5, strength: float = 4.0) -> Expected:
     """Return a wall and, on the right half, an object's echo, `strength` times the wall's own."""
     direct = np.full(SHAPE, 3e-4)
     echo = np.where(RIGHT, strength * direct, 0.0)
-    return Expected(WALL_M, direct, np.where(echo > 0, echo_m + np.zeros(SHAPE), np.nan), echo)
+    depth_m = np.where(echo > 0, echo_m + np.zeros(SHAPE), np.nan)
+    return Expected(WALL_M, direct, depth_m, echo, ALL_WALL)
 
 
 def maps_of(
@@ -198,13 +202,35 @@ def test_check_finds_an_object_where_none_is() -> None:
 def rendered_bench(monkeypatch: pytest.MonkeyPatch) -> None:
     """Let nothing be rendered but the bare bench, which was."""
     check_reconstruction(seen(None), EMPTY, RIG)
-    path = "nlos_cam.reconstruct.physics_check.render"
-    monkeypatch.setattr(path, lambda *_: pytest.fail("rendered again"))
+    for module in ("bare_bench", "physics_check"):
+        path = f"nlos_cam.reconstruct.{module}.render"
+        monkeypatch.setattr(path, lambda *_: pytest.fail("rendered again"))
 
 
 @pytest.mark.usefixtures("rendered_bench")
 def test_bare_bench_explains_itself_and_is_rendered_once() -> None:
     assert check_reconstruction(seen(None), EMPTY, RIG).score < 0.05
+
+
+@pytest.mark.parametrize("reflects", [0.05, 0.2, 4.0])
+def test_occluder_of_any_reflectance_leaves_the_score(reflects: float) -> None:
+    cells = cast(RIG, RIG.pinhole.scaled(80, 64)).on_wall.reshape(SHAPE)
+    factor = np.where(cells, 1, reflects).astype(np.float32)
+    empty, full = seen(None), seen(SEEDS[0])
+    dark = [replace(maps, intensity=factor * maps.intensity) for maps in (empty, full)]
+
+    assert check_reconstruction(dark[0], EMPTY, RIG).score < 0.05
+    assert check_reconstruction(dark[1], hidden(SEEDS[0]), RIG).score < 0.05
+
+
+def test_noise_is_that_of_a_wall_as_bright_as_measured() -> None:
+    """An occluder nearer than the wall is no measure of its light."""
+    pose = RIG.lidar.model_copy(update={"distance_m": 0.3, "yaw_deg": 58.0})
+    far = RIG.model_copy(update={"lidar": pose})
+    sensor = Sensor(far, SensorModel(bare_wall_counts=10.0))
+    maps = sensor.maps(render(Scene(far)).multi, np.random.default_rng(1))
+
+    assert check_reconstruction(maps, None, far).score < 0.01
 
 
 def test_bare_bench_does_not_explain_an_object() -> None:
