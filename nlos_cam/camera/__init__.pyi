@@ -4,6 +4,8 @@ __all__ = [
     "MAC_WHEEL",
     "NAMES",
     "OPTIONAL",
+    "PLAIN_NAMES",
+    "QUEUED_SETS",
     "RESERVE_BYTES",
     "SAME_INSTANT_S",
     "SIDECAR_SUFFIX",
@@ -60,9 +62,9 @@ from .recorder import (
     recording_s,
     repair_command,
 )
-from .registry import NAMES, SIMULATED, camera_to_name, full_uri, open_camera
+from .registry import NAMES, PLAIN_NAMES, SIMULATED, camera_to_name, full_uri, open_camera
 from .sdk import MAC_WHEEL, WHEEL, load_sdk, sdk_serial
-from .session import find_streams
+from .session import QUEUED_SETS, find_streams
 from .simulated import SimulatedCamera, SoftwareLidar
 from .simulated_world import WORLDS, World, open_world, pack_loop, read_packaged, render_loop
 from .streams import (

@@ -21,6 +21,8 @@ SIMULATED = {
 """Packaged simulated worlds and their descriptions."""
 PLAYBACK = "nlos_cam.recording.playback"
 """Module of `ReplayCamera`, by name: it stands in a layer above this one."""
+PLAIN_NAMES = frozenset({"l515", "sim"})
+"""Names of cameras that a folder may happen to have too."""
 NAMES = "l515, l515:SERIAL, sim, sim:bare-wall, sim:SCENE.toml or FILE.bag"
 
 

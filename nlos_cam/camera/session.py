@@ -18,7 +18,7 @@ from nlos_cam.camera.timestamps import ClockUnwrap
 from nlos_cam.frames import Frame
 from nlos_cam.threads import BoundedQueue
 
-CAPACITY = 8
+QUEUED_SETS = 8
 """Sets: a quarter of a second, and 10 MB at 640 x 480."""
 
 
@@ -36,7 +36,7 @@ class SampleQueue:
         self._on_set = on_set
         self._pairing = streams.FrameSynchronizer()
         self._evicted = 0
-        self._sets = BoundedQueue[streams.FrameSet](CAPACITY)
+        self._sets = BoundedQueue[streams.FrameSet](QUEUED_SETS)
 
     @property
     def incomplete(self) -> int:

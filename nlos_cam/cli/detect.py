@@ -148,7 +148,8 @@ def detect(
     rig_option = _rig_option(bench_folder, wall)
     asked = Asked(turns, frames, alpha, seed, control, settings == "sweep", rig_option)
     folder = Path(camera)
-    if folder.is_dir():
+    # A folder that happens to be named like a camera is given as ./sim.
+    if folder.is_dir() and camera not in cameras.PLAIN_NAMES:
         _refuse_bench(folder)
         asked.refuse_beside(folder, {"--settings": settings is not None, "--out": out is not None})
         with interrupted_by_signals(f"the turns in {folder} are as they were"):
@@ -157,6 +158,7 @@ def detect(
     if camera.startswith("bag:"):
         raise typer.BadParameter(f"{camera} is a recording without turns: give a live camera")
     folder = output_path(out, "detect", "", overwrite=True)  # a session that exists goes on
+    folder = folder.resolve() if folder.is_symlink() else folder  # --overwrite keeps a link
     chosen = benches.choose(bench_folder, wall, reconstructs=False)
     goes_on = detection.is_session(folder) and not overwrite
     before = detection.Session.open(folder).plan if goes_on else None
@@ -234,8 +236,18 @@ class Asked(NamedTuple):
             serial=source.identity.get("serial", ""),
             firmware=source.identity.get("firmware", ""),
             rig=rig,
-            settings=detection.swept_settings(source) if self.sweep else (detection.BASELINE,),
+            settings=self._settings(source, before),
         )
+
+    def _settings(
+        self, source: cameras.Camera, before: detection.Plan | None
+    ) -> tuple[detection.Setting, ...]:
+        """Return the settings of every turn; a session that goes on keeps those it began with."""
+        if before and (len(before.settings) > 1) == self.sweep:
+            return before.settings
+        if self.sweep:
+            return detection.swept_settings(source)
+        return (detection.setting_as_started(source),)
 
     def _plan(self, before: detection.Plan | None, **circumstances: Any) -> detection.Plan:
         from pydantic import ValidationError  # not for the help page

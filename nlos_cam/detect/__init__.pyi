@@ -18,6 +18,7 @@ __all__ = [
     "measure_turns",
     "min_blocks",
     "power_text",
+    "setting_as_started",
     "swept_settings",
     "verdict",
     "write_report",
@@ -25,7 +26,13 @@ __all__ = [
 
 from .analysis import Analysis, Finding, analyze
 from .hands import Hands, SimulatedHands
-from .measure import SETTLING_FRAMES, measure_turn, measure_turns, swept_settings
+from .measure import (
+    SETTLING_FRAMES,
+    measure_turn,
+    measure_turns,
+    setting_as_started,
+    swept_settings,
+)
 from .plan import BASELINE, BLOCK_TURNS, Plan, Setting, min_blocks
 from .report import REPORT, power_text, verdict, write_report
 from .session import Session, is_session

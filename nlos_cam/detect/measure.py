@@ -5,7 +5,7 @@ from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 
-from nlos_cam.camera import Camera
+from nlos_cam.camera import QUEUED_SETS, Camera
 from nlos_cam.detect.hands import Hands
 from nlos_cam.detect.plan import BASELINE, Setting
 from nlos_cam.detect.session import Session
@@ -13,8 +13,9 @@ from nlos_cam.detect.turns import Turn, TurnSums
 from nlos_cam.errors import CameraError, CameraLostError
 from nlos_cam.frames import Frame
 
-SETTLING_FRAMES = 15
-"""Frames that are left out after a change: those in flight, and half a second to come to rest."""
+SETTLING_FRAMES = 15 + QUEUED_SETS
+"""Frames that are left out after a change: those that wait in the camera's queue, and half a second
+to come to rest."""
 SWEPT = {
     "laser_power": (0.1, 0.5, 1.0),
     "digital_gain": (0.0, 1.0),
@@ -42,18 +43,32 @@ class AdjustableCamera(Protocol):
         ...
 
 
+def setting_as_started(camera: Camera) -> Setting:
+    """Return the options that an entered camera started with, so that a session which goes on later
+    is measured under them too: a lidar may choose its laser power at every start.
+    """
+    options = {name: float(each["value"]) for name, each in _swept_options(camera).items()}
+    return Setting(name=BASELINE.name, options=options)
+
+
+def _swept_options(camera: Camera) -> dict[str, dict[str, Any]]:
+    """Return the options of an entered camera that a sweep changes; none of one without options."""
+    options = camera.adjustable() if isinstance(camera, AdjustableCamera) else []
+    return {each["name"]: each for each in options if each["name"] in SWEPT}
+
+
 def swept_settings(camera: Camera) -> tuple[Setting, ...]:
     """Return the settings of a sweep that an entered camera accepts: as it started, then one option
     changed at a time.
 
     Raises CameraError for a camera without options.
     """
-    options = camera.adjustable() if isinstance(camera, AdjustableCamera) else []
-    if not isinstance(camera, AdjustableCamera) or not options:
+    swept = _swept_options(camera)
+    if not isinstance(camera, AdjustableCamera) or not swept:
         raise CameraError(f"{camera.uri} offers no options to sweep: leave out --settings sweep")
-    swept = {each["name"]: each for each in options if each["name"] in SWEPT}
-    start = {name: float(each["value"]) for name, each in swept.items()}
-    settings = [Setting(name=BASELINE.name, options=start)]
+    as_started = setting_as_started(camera)
+    start = as_started.options
+    settings = [as_started]
     for name, each in swept.items():
         for share in SWEPT[name]:
             steps = round(share * (each["max"] - each["min"]) / each["step"])

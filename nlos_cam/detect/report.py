@@ -6,11 +6,12 @@ from pathlib import Path
 
 import numpy as np
 
+from nlos_cam import __version__
 from nlos_cam.detect.analysis import POWER, Analysis, Finding
 from nlos_cam.detect.levelling import quiet_cells
-from nlos_cam.detect.plan import Plan
+from nlos_cam.detect.plan import Plan, source_checksum
 from nlos_cam.detect.turns import CHANNELS
-from nlos_cam.files import atomic_file
+from nlos_cam.files import atomic_file, program_commit, with_commit
 from nlos_cam.report import (
     Banner,
     Bullets,
@@ -137,9 +138,11 @@ def power_text(analysis: Analysis) -> str:
             f" {POWER:.0%}. Measure more turns or frames."
         )
     by_channel = [_smallest(analysis, channel) for channel in CHANNELS if _of(analysis, channel)]
+    settings = analysis.plan.settings
+    under = f' with the setting "{settings[0].name}"' if len(settings) > 1 else ""
     return (
-        f"An effect would have been found with a probability of {POWER:.0%} from this size on, in"
-        f" the median cell and over the best size of patch: {'; '.join(by_channel)}."
+        f"An effect would have been found{under} with a probability of {POWER:.0%} from this size"
+        f" on, in the median cell and over the best size of patch: {'; '.join(by_channel)}."
     )
 
 
@@ -156,7 +159,11 @@ def _smallest(analysis: Analysis, channel: str) -> str:
 
 
 def _of(analysis: Analysis, channel: str) -> list[Finding]:
-    return [each for each in analysis.findings if each.channel == channel]
+    """Return a channel's findings under the first setting: the best of several would promise more
+    than any one of them sees.
+    """
+    first = analysis.plan.settings[0].name
+    return [each for each in analysis.findings if each.channel == channel and each.setting == first]
 
 
 def amount(channel: str, value: float, *, signed: bool = False) -> str:
@@ -192,6 +199,14 @@ def _family_table(analysis: Analysis) -> Table:
         )
         for each in analysis.findings
     ]
+    # Without a row, what was never tested would read as "no effect".
+    tested = {(each.setting, each.channel) for each in analysis.findings}
+    rows += [
+        (f"{setting.name}: {channel}", "", "not tested: no cell returned in every turn", "", "", "")
+        for setting in analysis.plan.settings
+        for channel in CHANNELS
+        if (setting.name, channel) not in tested
+    ]
     head = ("setting and channel", "cells", "p, family-wise", "largest", "change", "row, column")
     return Table(head, rows)
 
@@ -216,8 +231,9 @@ def _settings_table(plan: Plan) -> Table:
 def facts(analysis: Analysis, *, show_serial: bool = False) -> dict[str, str]:
     """Return the session's circumstances by name."""
     plan = analysis.plan
-    kind = plan.camera.split(":", maxsplit=1)[0]
-    camera = plan.camera if show_serial or kind != "l515" else kind
+    camera = plan.camera if show_serial and not _is_simulated(plan) else _public_camera(plan)
+    now = f"{with_commit(__version__, program_commit())}, {source_checksum()}"
+    measured = f"{plan.version}, {plan.source}"
     found = {
         "camera": camera,
         "serial number": (plan.serial or "not known") if show_serial else "hidden",
@@ -227,7 +243,7 @@ def facts(analysis: Analysis, *, show_serial: bool = False) -> dict[str, str]:
         "false-alarm rate": f"{plan.alpha:g} for the whole family",
         "patterns of signs": str(analysis.patterns),
         "seed of the order": str(plan.seed),
-        "version, analysis": f"{plan.version}, {plan.source}",
+        "version, analysis": measured if measured == now else f"{now}; planned by {measured}",
     }
     if analysis.celsius:
         low, high = analysis.celsius
@@ -237,10 +253,8 @@ def facts(analysis: Analysis, *, show_serial: bool = False) -> dict[str, str]:
 
 def command_of(plan: Plan) -> str:
     """Return the command that measures by this plan, without a serial number or folders."""
-    kind, _, rest = plan.camera.partition(":")
-    simulated = kind.startswith("sim") and rest
-    camera = f"{kind}:{Path(rest).name}" if simulated else kind
-    words = ["nlos-cam detect", camera]
+    kind = plan.camera.partition(":")[0]
+    words = ["nlos-cam detect", _public_camera(plan)]
     if plan.rig_option:
         words.append(plan.rig_option)
     elif plan.rig and kind != "sim":  # of a session from before the option was stored
@@ -249,6 +263,16 @@ def command_of(plan: Plan) -> str:
     words += ["--settings sweep"] if len(plan.settings) > 1 else []
     words += ["--control"] if plan.control else []
     return " ".join([*words, "--out FOLDER"])
+
+
+def _is_simulated(plan: Plan) -> bool:
+    return plan.camera.startswith("sim")
+
+
+def _public_camera(plan: Plan) -> str:
+    """Return the camera without a serial number, and without the folders of a simulated scene."""
+    kind, _, rest = plan.camera.partition(":")
+    return f"{kind}:{Path(rest).name}" if _is_simulated(plan) and rest else kind
 
 
 def _maps(analysis: Analysis) -> list[Picture]:

@@ -90,6 +90,11 @@ class Session:
         turns: list[Turn] = []
         for number in range(count):
             turn = Turn.load(self.path(number), len(self.plan.settings))
+            if turn.frames != self.plan.frames:
+                raise RecordingError(
+                    f"{self.path(number)} is a turn of {turn.frames} frames, but {PLAN} has"
+                    f" {self.plan.frames}: files of two sessions are mixed"
+                )
             if turn.object_in != order[number]:
                 raise RecordingError(
                     f"{self.path(number)} is a turn with the object"

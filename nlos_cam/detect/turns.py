@@ -63,7 +63,7 @@ class Turn:
                 int(facts["frames"]),
                 {str(name): float(value) for name, value in facts["celsius"].items()},
             )
-        except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+        except (OSError, ValueError, KeyError, TypeError, AttributeError, OverflowError) as error:
             raise RecordingError(
                 f"{path} is not a turn of `nlos-cam detect`: delete it, and the same command"
                 " measures it again"
@@ -73,6 +73,11 @@ class Turn:
             raise RecordingError(
                 f"{path} has arrays of shapes {shapes}, not those of {settings} settings: delete"
                 " it, and the same command measures it again"
+            )
+        if not np.isfinite(turn.time_s).all():
+            raise RecordingError(
+                f"{path} holds no time for a setting: delete it, and the same command measures it"
+                " again"
             )
         return turn
 

@@ -3,7 +3,7 @@
 import csv
 import hashlib
 import shlex
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -221,10 +221,24 @@ def describe_tradeoff(folder: Path, _verify: bool) -> Description:
     return Description("trade-off", facts, "", "nlos-cam tradeoff", "", "JSON", following)
 
 
-def describe_detection(folder: Path, _verify: bool) -> Description:
-    """Describe a detection from its plan."""
+def _problem_of_arrays(paths: Sequence[Path]) -> str:
+    """Return the first problem of .npz files, all of which is read; empty without one."""
+    for path in paths:
+        try:
+            problem = describe_npz(path, verify=True).problem
+        except RecordingError as error:
+            problem = str(error)
+        if problem:
+            return problem
+    return ""
+
+
+def describe_detection(folder: Path, verify: bool) -> Description:
+    """Describe a detection from its plan, or with `verify` from every turn too."""
     plan = _json(folder / "detection.json")
-    turns = len([*folder.glob("turn-*.npz")])
+    paths = sorted(folder.glob("turn-*.npz"))
+    problem = _problem_of_arrays(paths) if verify else ""
+    turns = len(paths)
     facts = {name: str(plan[name]) for name in ("camera", "frames", "alpha", "control")}
     facts |= {"turns": f"{turns} of {plan['turns']}", "settings": str(len(plan["settings"]))}
     quoted = shlex.quote(str(folder))
@@ -232,7 +246,9 @@ def describe_detection(folder: Path, _verify: bool) -> Description:
     if (page := folder / "detection.html").exists():
         following.insert(0, f"open {shlex.quote(str(page))}")
     made_by = f"nlos-cam {plan['version']}: detect"
-    return Description("detection", facts, str(plan["created"]), made_by, "", "plan", following)
+    checked = "plan, and checksums of all turns" if verify else "plan; --verify reads all turns"
+    created = str(plan["created"])
+    return Description("detection", facts, created, made_by, problem, checked, following)
 
 
 def _json(path: Path) -> Mapping[str, Any]:

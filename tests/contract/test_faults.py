@@ -41,7 +41,7 @@ def camera(noise_world: Any, hurried_clock: Any, monkeypatch: pytest.MonkeyPatch
     """Make a camera in a world without saturated noise, which drops nothing because the machine is
     slow.
     """
-    monkeypatch.setattr(session, "CAPACITY", PLENTY)
+    monkeypatch.setattr(session, "QUEUED_SETS", PLENTY)
     monkeypatch.setattr(frame_reader, "QUEUE_FRAMES", PLENTY)
 
     class QuietWorld(noise_world):

@@ -35,7 +35,7 @@ from nlos_cam.camera.recorder import (
     can_grow,
     spare_bytes,
 )
-from nlos_cam.camera.session import CAPACITY
+from nlos_cam.camera.session import QUEUED_SETS
 from nlos_cam.errors import DiskFullError, OutputExistsError, RecordingError
 from nlos_cam.files import FileBusyError
 from nlos_cam.recording import ReplayCamera, verify
@@ -148,7 +148,7 @@ def test_only_the_last_take_ends_the_iteration(camera: Make, tmp_path: Path) -> 
         assert recording.done
         recording.close()
         recording.next_take(tmp_path / "b.bag", last=True)
-        assert len(list(source)) <= CAPACITY + 1 + 3
+        assert len(list(source)) <= QUEUED_SETS + 1 + 3
 
     assert recording.sets == 3
 

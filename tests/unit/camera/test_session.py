@@ -7,7 +7,7 @@ import pytest
 from fake_librealsense import FakeDevice, FakeSensor
 from fake_lidar import FakeLidar
 
-from nlos_cam.camera.session import CAPACITY, SampleQueue, Session, find_streams, read_settings
+from nlos_cam.camera.session import QUEUED_SETS, SampleQueue, Session, find_streams, read_settings
 from nlos_cam.camera.streams import FORMATS, Sample
 
 
@@ -27,11 +27,11 @@ def take_all(inbox: SampleQueue) -> list[int]:
 def test_live_queue_drops_its_oldest_when_full() -> None:
     numbers: list[int] = []
     inbox = SampleQueue(on_set=lambda found: numbers.append(found.number))
-    put(inbox, range(CAPACITY + 3))
+    put(inbox, range(QUEUED_SETS + 3))
 
-    assert take_all(inbox) == list(range(3, CAPACITY + 3))
+    assert take_all(inbox) == list(range(3, QUEUED_SETS + 3))
     assert inbox.dropped == 3
-    assert numbers == list(range(CAPACITY + 3))
+    assert numbers == list(range(QUEUED_SETS + 3))
     assert inbox.take(0.001) is None
 
 

@@ -38,6 +38,13 @@ def test_stored_turns_are_analyzed_again(run: Run, tmp_path: Path) -> None:
     assert Path(answer["out"]).read_text(encoding="utf-8").count("data:image/png") == 1
 
 
+def test_folder_may_be_named_like_a_camera(run: Run, tmp_path: Path) -> None:
+    folder = stored(tmp_path / "sim")
+
+    assert "multiple of 4" in run("detect", "sim", "--turns", 10, "--out", folder, code=2).err
+    assert run("detect", "./sim")["detected"]
+
+
 def test_unfinished_session_is_no_detection(run: Run, tmp_path: Path) -> None:
     folder = stored(tmp_path / "session", turns=40)
     (folder / "turn-0038.npz").unlink()

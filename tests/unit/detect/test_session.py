@@ -1,6 +1,7 @@
 """Laws of a session: resumed equals unbroken, half of the turns have the object, wrong folders."""
 
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -9,7 +10,15 @@ import pytest
 from made_turns import made_plan, made_turns
 from nlos_calibration import load_rig
 
-from nlos_cam.detect import Session, analyze, measure_turns, swept_settings, write_report
+from nlos_cam.detect import (
+    SETTLING_FRAMES,
+    Session,
+    analyze,
+    measure_turns,
+    setting_as_started,
+    swept_settings,
+    write_report,
+)
 from nlos_cam.detect.session import PLAN
 from nlos_cam.errors import CameraLostError, NlosCamError, OutputExistsError, RecordingError
 from nlos_cam.frames import Frame
@@ -65,16 +74,40 @@ def test_resumed_session_equals_an_unbroken_one(tmp_path: Path) -> None:
 
     broken = Session.start(tmp_path / "broken", plan)
     camera = FakeCamera()
-    camera.limit = 180  # ends within the eleventh turn of 18 frames
+    camera.limit = 10 * (3 + SETTLING_FRAMES)  # the eleventh turn has no frame
     with pytest.raises(CameraLostError):
         measured(broken, camera)
     assert broken.missing()[0] == 10
     # The other plan's seed is not used: the order is that of the session that exists.
     again = Session.start(tmp_path / "broken", made_plan(7, frames=3))
-    measured(again, FakeCamera(180))
+    measured(again, FakeCamera(camera.limit))
     for one, other in zip(whole.turns(), again.turns(), strict=True):
         assert one.object_in == other.object_in
         np.testing.assert_array_equal(one.mean, other.mean)
+
+
+def test_turn_of_another_session_is_found_by_its_frames(tmp_path: Path) -> None:
+    session = Session.start(tmp_path / "s", made_plan(frames=3))
+    other = Session.start(tmp_path / "other", made_plan(frames=4))
+    measured(session, FakeCamera())
+    measured(other, FakeCamera())
+    other.path(0).replace(session.path(0))
+
+    with pytest.raises(RecordingError, match="4 frames"):
+        session.turns()
+
+
+@pytest.mark.parametrize("damage", ["frames", "time"])
+def test_turn_without_numbers_is_refused(tmp_path: Path, damage: str) -> None:
+    session = Session.start(tmp_path / "s", made_plan(frames=3))
+    turn = made_turns(session.plan)[0]
+    wrong: Any = (
+        {"frames": float("inf")} if damage == "frames" else {"time_s": turn.time_s * np.nan}
+    )
+    replace(turn, **wrong).save(session.path(0))
+
+    with pytest.raises(RecordingError, match="measures it again"):
+        session.turns()
 
 
 def test_order_has_the_object_in_half_of_each_block() -> None:
@@ -92,6 +125,19 @@ def test_sweep_changes_one_option_at_a_time_and_restores_it() -> None:
     assert set(changes) == {1}
     assert len(settings) == 4
     assert camera.options == start
+
+
+def test_session_goes_on_under_the_options_it_began_with(tmp_path: Path) -> None:
+    """A lidar may choose another laser power at its next start."""
+    camera = FakeCamera()
+    start = setting_as_started(camera)  # pyright: ignore[reportArgumentType]
+    session = Session.start(tmp_path / "s", made_plan(frames=2, settings=(start,)))
+    later = FakeCamera()
+    later.options["laser_power"] = 60.0
+
+    measured(session, later)
+
+    assert later.options == FakeCamera().options
 
 
 def test_sweep_is_measured_under_each_setting(tmp_path: Path) -> None:
@@ -191,3 +237,26 @@ def test_page_hides_the_serial_number_unless_asked(tmp_path: Path) -> None:
         pages[shown] = (tmp_path / "page.html").read_text(encoding="utf-8")
     assert "F1234567" not in pages[False]
     assert "F1234567" in pages[True]
+
+
+def test_page_says_which_settings_were_not_tested(tmp_path: Path) -> None:
+    """Without a row, a channel in which nothing returned would read as one without an effect."""
+    plan = made_plan()
+    turns = made_turns(plan)
+    blind = [replace(turn, mean=turn.mean.copy()) for turn in turns]
+    for turn in blind:
+        turn.mean[:, 0] = np.nan
+
+    pages = []
+    for measured_turns in (turns, blind):
+        write_report(analyze(plan, measured_turns, with_power=False), tmp_path / "page.html")
+        pages.append((tmp_path / "page.html").read_text(encoding="utf-8"))
+
+    assert ["not tested" in page for page in pages] == [False, True]
+
+
+def test_page_hides_the_folders_of_a_scene(tmp_path: Path) -> None:
+    plan = made_plan(camera="sim:/home/owner/cup.toml")
+    write_report(analyze(plan, made_turns(plan), with_power=False), tmp_path / "page.html")
+
+    assert "/home/owner" not in (tmp_path / "page.html").read_text(encoding="utf-8")

@@ -10,11 +10,13 @@ import numpy as np
 import pytest
 from fake_workers import samples_of
 from made_benches import make_bench
+from made_turns import made_plan, made_turns
 from nlos_calibration import load_rig
 from rewritten_bags import Messages, rewrite
 
 from nlos_cam.dataset.plan import DatasetPlan
 from nlos_cam.dataset.shards import shard_path, store
+from nlos_cam.detect import Session
 from nlos_cam.info import Description, describe
 from nlos_cam.recording import ReplayCamera, SidecarFile, sidecar_path
 from nlos_cam.recording.quality import Quality
@@ -212,6 +214,16 @@ def test_verify_finds_the_shard_whose_bytes_were_changed(
 
     assert describe(tmp_path, verify=False).problem == ""
     assert shard.name in describe(tmp_path, verify=True).problem
+
+
+def test_verify_reads_every_turn_of_a_detection(tmp_path: Path) -> None:
+    session = Session.start(tmp_path / "session", made_plan())
+    turn = session.path(1)
+    made_turns(session.plan)[1].save(turn)
+    turn.write_bytes(turn.read_bytes()[:-200])
+
+    assert describe(session.folder, verify=False).problem == ""
+    assert turn.name in describe(session.folder, verify=True).problem
 
 
 @pytest.mark.parametrize("verify", [False, True])
