@@ -313,6 +313,7 @@ def render(
             raise typer.BadParameter(
                 "--transient writes no maps and takes all effects: drop --out, --explain, --effects"
             )
+        for_transient.check_backend(backend)
         path = transient_options.transient_path(transient, overwrite=overwrite)
     else:
         for_transient.refuse_unused()

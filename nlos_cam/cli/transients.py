@@ -106,6 +106,14 @@ class CaptureOptions(NamedTuple):
     background: float = 0.0
     noise_seed: int = 0
 
+    def check_backend(self, backend: str) -> None:
+        """Raise typer.BadParameter for a backend that the capture would ignore."""
+        if backend != "cpu" and self.capture != "lidar":
+            raise typer.BadParameter(
+                f"--backend {backend} renders the capture lidar alone, {self.capture} is summed"
+                " path by path on the CPU: drop it"
+            )
+
     def refuse_unused(self) -> None:
         """Raise typer.BadParameter if any option is given, as no transient is asked for."""
         given = [
@@ -124,8 +132,9 @@ class CaptureOptions(NamedTuple):
 
         Raises typer.BadParameter or SceneError with the option's value and its range.
         """
-        if self.background and self.photons is None:
-            raise typer.BadParameter("--background is in photons: give --photons too")
+        if self.photons is None and (self.background or self.noise_seed):
+            option = "--background" if self.background else "--noise-seed"
+            raise typer.BadParameter(f"{option} is of counted photons: give --photons too")
         point = _numbers("--laser", self.laser, 2)
         noise = None
         if self.photons is not None:

@@ -77,7 +77,7 @@ def _written(
     try:
         center = np.array(facts["center"], np.float64).reshape(3)
         half = np.array(facts["size"], np.float64).reshape(3) / 2
-    except (TypeError, KeyError, ValueError):
+    except (TypeError, KeyError, ValueError, OverflowError):
         return None
     if not (np.isfinite(center).all() and np.isfinite(half).all() and (half > 0).all()):
         return None

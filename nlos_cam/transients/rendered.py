@@ -126,7 +126,7 @@ def render_transient(
     laser_m = _laser_points(capture, grid)
     is_lidar = capture.kind == "lidar"
     rows = grid.size**2 if capture.kind == "exhaustive" else grid.size
-    _check_size(rows, capture.bins or 1, side)
+    _check_size(rows, capture.bins or 1, side, "or fewer bins")
     cells = (
         WallGrid(scene.rig.relay, setting.relay_columns, setting.relay_rows) if is_lidar else grid
     )
@@ -136,12 +136,15 @@ def render_transient(
     _, longest_m = paths.range_m(first_and_last=capture.first_and_last)
     tail = _pulse_tail(scene.pulse_ns, bin_m)
     count = capture.bins or max(ceil(longest_m / bin_m) + tail + SPARE_BINS - first, 1)
-    _check_size(rows, count, side)
-    pairs = _pairs(capture.kind, laser_m.size // 3, grid.size)
 
-    # Light outside the window reaches into it by the pulse's tail.
+    # Light outside the window reaches into it by the pulse's tail. One detector that sees all cells
+    # is computed over all paths, whatever the window is.
     margin = min(tail, first)
     window = first - margin, count + margin + tail
+    computed = max(sum(window), ceil(longest_m / bin_m)) if is_lidar else window[1]
+    advice = "or wider bins" if is_lidar else "wider bins, or give start and bins"
+    _check_size(rows, computed, side, advice)
+    pairs = _pairs(capture.kind, laser_m.size // 3, grid.size)
     if pairs is None:
         light = paths.summed(*window, backend)
     else:
@@ -182,12 +185,12 @@ def _pulse_tail(pulse_ns: float, bin_m: float) -> int:
     )
 
 
-def _check_size(rows: int, bins: int, side: int) -> None:
+def _check_size(rows: int, bins: int, side: int, advice: str) -> None:
     size = rows * bins * 4
     if size > MAX_BYTES:
         raise SceneError(
             f"{rows} histograms of {bins} bins need {size / 2**30:.1f} GiB, at most"
-            f" {MAX_BYTES >> 30}: take fewer cells than {side}, wider bins, or give start and bins"
+            f" {MAX_BYTES >> 30}: take fewer cells than {side}, {advice}"
         )
 
 

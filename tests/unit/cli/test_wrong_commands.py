@@ -96,6 +96,8 @@ render cup --material lambertian --exponent 4 | --exponent
 render cup --capture confocal | --capture
 render cup --noise-seed 1 | --transient
 render cup --transient cup.hdf5 --photons 0 | --photons
+render cup --transient cup.hdf5 --noise-seed 3 | --photons
+render cup --transient cup.hdf5 --capture confocal --backend torch | --backend
 dataset | build, label
 dataset bild | build, label
 dataset build --count 1 | --out

@@ -188,6 +188,7 @@ def test_points_that_the_lidar_cannot_see_give_no_light() -> None:
     ("options", "word"),
     [
         ({"kind": "exhaustive", "cells": 128}, "GiB"),
+        ({"kind": "lidar", "cells": 128, "bin_m": 1e-5, "bins": 100}, "GiB"),
         ({"kind": "lidar", "first_and_last": False}, "wide detector"),
         ({"kind": "confokal"}, "confocal"),
         ({"bin_m": 0.0}, "bin_m"),
