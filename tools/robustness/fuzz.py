@@ -53,6 +53,8 @@ STILL_S = 0.5
 machine in which it spends less than STILL_S of processor time where it waits for ever."""
 OURS = NlosCamError, CalibrationError, ModelError
 MAX_KEPT_BYTES = 20_000
+LAST_TRIES = 50
+"""Tries to write the last findings while the other group's process writes its own."""
 GOOD = "done", "refused"
 ANSWER_BYTES = 1 << 20
 COUNTS = "by_input", "most_mib", "most_cpu_s", "numbers"
@@ -271,10 +273,9 @@ def fuzz(group: str, home: Path, chosen: argparse.Namespace) -> None:
     inputs = {name: each for name, each in make_inputs(home, group).items() if chosen.only in name}
 
     def write() -> None:
-        with suppress(FileBusyError), atomic_file(chosen.out) as part:
-            both = read_findings(chosen.out).replaced(
-                findings, [*inputs]
-            )  # the other group writes there too
+        # the other group writes there too
+        with atomic_file(chosen.out) as part:
+            both = read_findings(chosen.out).replaced(findings, [*inputs])
             part.write_text(json.dumps(both.facts(), indent=1) + "\n", encoding="utf-8")
 
     for number in range(chosen.first, chosen.first + chosen.count):
@@ -293,8 +294,14 @@ def fuzz(group: str, home: Path, chosen: argparse.Namespace) -> None:
                 }
                 findings.bad.append(row)
             if time.monotonic() > written_s + 30 or verdict.kind not in GOOD:
-                write()
+                with suppress(FileBusyError):  # the next one holds these too
+                    write()
                 written_s = time.monotonic()
+    for _ in range(LAST_TRIES):
+        with suppress(FileBusyError):
+            write()
+            return
+        time.sleep(0.1)
     write()
 
 
@@ -322,7 +329,12 @@ def main() -> int:
     spawn = multiprocessing.get_context("spawn")
     with tempfile.TemporaryDirectory() as folder:
         chosen.files = chosen.files or Path(folder)
-        made = [] if (chosen.files / DONE).exists() else [partial(make_files, chosen.files)]
+        # Files of an earlier program are all refused, and nothing is fuzzed.
+        mark = chosen.files / DONE
+        fresh = mark.exists() and mark.read_text(encoding="utf-8") == program_digest()
+        if mark.exists() and not fresh:
+            raise SystemExit(f"{chosen.files} holds an earlier program's files: delete it")
+        made = [] if fresh else [partial(make_files, chosen.files)]
         groups = [
             partial(fuzz, group, chosen.files, chosen)
             for group in GROUPS

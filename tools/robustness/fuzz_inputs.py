@@ -23,6 +23,7 @@ from nlos_calibration import load_rig, load_wall, reference
 from nlos_models import load_record, shipped_folder
 from nlos_models.training import load_recipe
 from noise_recordings import record
+from program_state import program_digest
 from rosbags.rosbag1 import Reader
 
 from nlos_cam.camera import open_camera, simulated_world
@@ -40,7 +41,7 @@ MAX_LINES = 12
 PROGRESS = re.compile(r": (\d+/\d+.*)?\d+ s$")
 """Lines that a slow command prints now and then."""
 DONE = "done"
-"""File that marks a complete folder of files."""
+"""File that marks a complete folder of files, with the checksum of the program that made them."""
 RARE = 0.05
 """Share of the recordings that also go through the slow commands."""
 SCENE = (
@@ -261,7 +262,7 @@ def make_files(home: Path) -> None:
         mesh.save(home / f"mesh.{suffix}")
     trimesh.Trimesh(vertices_m, faces).export(home / "mesh.stl")
     np.save(home / "depth.npy", np.full((16, 16), 0.3, np.float32))
-    (home / DONE).touch()
+    (home / DONE).write_text(program_digest(), encoding="utf-8")
 
 
 def link_or_copy(source: str, target: str) -> None:

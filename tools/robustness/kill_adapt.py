@@ -4,7 +4,8 @@
 steps runs through; another with the same plan is killed (SIGKILL) N times, rendering and training
 included, and goes on by the same command each time. Its weights, uncertainty network and quality
 model have to be the same bytes, and nothing half-written may be left over. Exits with 1 where they
-differ. A second call with the same --work goes on.
+differ. A second call with the same --work takes over the run that was not killed, unless the
+program has changed since.
 """
 
 import argparse
@@ -23,6 +24,7 @@ from random import Random
 from live_process import children_of
 from nlos_calibration import load_rig
 from nlos_models import shipped_folder
+from program_state import program_digest
 
 from nlos_cam.adapt import Pace, Plan, Stage, calibration_spread
 from nlos_cam.render import RENDERING_VERSION, SensorModel
@@ -122,8 +124,18 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=DOCS / "figures" / "kill_adapt.json")
     asked = parser.parse_args()
 
+    if asked.kills < 1:
+        parser.error("--kills: without a kill nothing is compared")
+
     whole = asked.work / "whole"
     timed = asked.work / "seconds.json"
+    mark = asked.work / "program.txt"
+    # Another program's weights differ without any fault.
+    if not mark.exists() or mark.read_text() != program_digest():
+        shutil.rmtree(whole, ignore_errors=True)
+        timed.unlink(missing_ok=True)
+        asked.work.mkdir(parents=True, exist_ok=True)
+        mark.write_text(program_digest())
     prepare(whole)
     if not timed.exists():
         timed.write_text(json.dumps(finish(whole)))
@@ -148,6 +160,7 @@ def main() -> None:
     left = [str(path) for path in killed.rglob("*.part")]
     result = {
         "machine": f"{os.cpu_count()} cores, {platform.machine()}",
+        "program": program_digest(),
         "seconds_unkilled": round(seconds, 1),
         "kills": kills,
         "same_weights": same,
@@ -155,7 +168,7 @@ def main() -> None:
     }
     asked.out.write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
     print(f"{len(kills)} kills, the same weights: {same}, left over: {left}")
-    if not same or left:
+    if not same or left or not kills:
         raise SystemExit(1)
 
 

@@ -174,7 +174,10 @@ def main() -> int:
                     "minutes": list(map(asdict, minutes)),
                 }
                 chosen.out.write_text(json.dumps(facts, indent=1) + "\n", encoding="utf-8")
-                draw(minutes, DOCS / "images" / f"{chosen.out.stem}.png")
+                # Beside a file of one's own; the docs' picture is that of the docs' figures.
+                in_docs = chosen.out.resolve().parent == (DOCS / "figures").resolve()
+                pictures = DOCS / "images" if in_docs else chosen.out.parent
+                draw(minutes, pictures / f"{chosen.out.stem}.png")
                 print(minutes[-1], file=sys.stderr)
             stop.set()
             if run.ended_within(END_TIMEOUT_S + MINUTE_S) is None:

@@ -387,17 +387,18 @@ def options(about: str | None, file: str, **counts: int) -> argparse.ArgumentPar
 
 class Results:
     """Rows of trials in a JSON file, which is written after each; a second call of a tool resumes
-    there, and begins again where the program has changed since.
+    there, and begins again where the program has changed since, or the seed is another one.
     """
 
     def __init__(self, path: Path, seed: int) -> None:
         self._path = path
         self._seed = seed
         earlier = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
-        if earlier.get("program") == program_digest():
+        begun = {"program": program_digest(), "seed": seed}
+        if all(earlier.get(key) == value for key, value in begun.items()):
             self.facts: dict[str, Any] = earlier
         else:  # a machine's description starts numba's threads
-            self.facts = {"machine": in_fork(machine), "program": program_digest()}
+            self.facts = {"machine": in_fork(machine), **begun}
 
     def repeat(
         self, name: str, kind: str, count: int, trial: Callable[[random.Random], Row]
