@@ -60,8 +60,8 @@ BESIDE_M = 0.01
 path-length bin.
 """
 SEEDS_PER_BENCH = 10
-"""Consecutive seeds on the same bench, whose sensor is computed once."""
-VERSION = 2
+"""Consecutive seeds on the same bench around one rig, whose sensor is computed once."""
+VERSION = 3
 """Raise it when a seed makes another sample."""
 _STREAM = 5
 """Seeds these random numbers apart from those of datasets."""
@@ -140,20 +140,30 @@ class Benches:
         beside = f"-{sha256(text.encode()).hexdigest()[:12]}" if text else ""
         return f"v{VERSION}.{RENDERING_VERSION}-{self.rig.checksum}-{self.accuracy}{beside}"
 
-    def record(self, seed: int) -> Rig:
-        """Return the rig of the bench of a seed, by its record."""
-        return self.rigs.draw(self.rig, seed // SEEDS_PER_BENCH) if self.rigs else self.rig
+    def number(self, seed: int) -> int:
+        """Return the number of the bench of a seed: around one rig SEEDS_PER_BENCH consecutive ones
+        share it.
+
+        Of many rigs each sample has its own: outliers on few rigs, ordinary objects on others, and
+        a network learns the rigs in place of the outliers.
+        """
+        return seed if self.rigs else seed // SEEDS_PER_BENCH
+
+    def record(self, kind: str, seed: int) -> Rig:
+        """Return the rig of the bench of a sample, by its record."""
+        if self.rigs is None:
+            return self.rig
+        return self.rigs.draw(self.rig, (crc32(kind.encode()) << 32) + self.number(seed))
 
 
 def make_samples(kind: str, seeds: Sequence[int], benches: Benches) -> UncertaintySamples:
-    """Return samples of one kind, the same bits for the same seeds; SEEDS_PER_BENCH consecutive
-    ones share a bench.
+    """Return samples of one kind, the same bits for the same seeds.
 
     Datasets hold ordinary objects on the given benches. Here these are on benches that deviate
     slightly, outliers on such benches and the given one in turn, and empty benches may deviate
     widely.
     """
-    stimuli = [_stimulus(kind, seed, benches.record(seed), benches.sensor) for seed in seeds]
+    stimuli = [_stimulus(kind, seed, benches) for seed in seeds]
     renderings = [render(stimulus.scene, benches.accuracy) for stimulus in stimuli]
     noises = [_generator(kind, seed, 2) for seed in seeds]
     maps = [_sense(*each) for each in zip(stimuli, renderings, noises, strict=True)]
@@ -169,7 +179,8 @@ def make_samples(kind: str, seeds: Sequence[int], benches: Benches) -> Uncertain
     if benches.frame is None:
         return samples
     sensed = MapSet(samples.depth_m, samples.intensity, samples.image)
-    aligned, seen, _ = aligned_with(sensed, map(benches.record, seeds), benches.frame)
+    records = [benches.record(kind, seed) for seed in seeds]
+    aligned, seen, _ = aligned_with(sensed, records, benches.frame)
     return replace(samples.where(seen), depth_m=aligned.depth_m, intensity=aligned.intensity)
 
 
@@ -180,11 +191,14 @@ def _generator(kind: str, seed: int, stream: int) -> np.random.Generator:
     return np.random.default_rng([crc32(kind.encode()), seed, _STREAM, stream])
 
 
-def _stimulus(kind: str, seed: int, rig: Rig, sensor: SensorModel) -> outliers.Stimulus:
-    bench_generator = _generator(kind, seed // SEEDS_PER_BENCH, 0)
+def _stimulus(kind: str, seed: int, benches: Benches) -> outliers.Stimulus:
+    rig = benches.record(kind, seed)
+    sensor = benches.sensor
+    number = benches.number(seed)
+    bench_generator = _generator(kind, number, 0)
     if kind == EMPTY:
         return outliers.Stimulus(*outliers.vary_empty_bench(rig, sensor, bench_generator))
-    slight = kind in USUAL or seed // SEEDS_PER_BENCH % 2
+    slight = kind in USUAL or number % 2
     bench = (
         outliers.vary_bench(rig, sensor, outliers.SLIGHT, bench_generator)
         if slight
@@ -331,7 +345,7 @@ def uncertainty_sets(
             on_progress=on_progress,
         )
         ordinary = first_of(dataset.arrays(), objects)
-        visible = visible_objects(ordinary, dataset)
+        visible = visible_objects(ordinary, dataset, on_progress)
         benches = compress(dataset.benches(), visible)
         frame = _frame_of(plan, pipeline.record)
         ordinary, _, _ = aligned_with(kept_of(ordinary, visible), benches, frame)
@@ -339,7 +353,7 @@ def uncertainty_sets(
     return sets
 
 
-def visible_objects(maps: MapSet, dataset: Dataset) -> Mask:
+def visible_objects(maps: MapSet, dataset: Dataset, on_progress: OnProgress = ignore) -> Mask:
     """Return which objects (n,) of a dataset, of which these are the first maps, change MIN_CELLS
     cells or more against their bench with nothing hidden; all where fewer than MIN_VISIBLE do.
     """
@@ -348,6 +362,8 @@ def visible_objects(maps: MapSet, dataset: Dataset) -> Mask:
         # The records are frozen, so hashable, which pyright does not see.
         bare_m = _bare_depth_m(rig, dataset.plan.sensor)  # pyright: ignore[reportArgumentType]
         cells.append(int(np.count_nonzero(np.abs(depth_m - bare_m) > BESIDE_M)))
+        # Of many rigs, each has its empty bench rendered: minutes, like the samples before.
+        on_progress(len(cells), len(maps.image))
     visible = np.array(cells) >= MIN_CELLS
     return visible if visible.sum() >= MIN_VISIBLE else np.ones(len(visible), np.bool_)
 
@@ -466,6 +482,11 @@ def check_uncertainty_data(
         raise SceneError(
             "--dataset or --held-out is of another radiometry or material, but empty benches and"
             " outliers are rendered matt, in the paper's: build the maps again without them"
+        )
+    if any(data.plan.off_record for data in both):
+        raise SceneError(
+            "--dataset or --held-out is of benches off their record, but half of the outliers are on"
+            " benches as recorded, and would be known by that: build the maps without --off-record"
         )
     check_held_out(training, held_out)
     if len(training) < recipe.objects:

@@ -230,7 +230,7 @@ def test_sample_depends_on_its_seed_alone(two_of: Callable[[str], UncertaintySam
 def _benches(kind: str) -> list[Rig]:
     """Return the rigs of a first bench's first and last seed, and of the next bench."""
     seeds = (0, SEEDS_PER_BENCH - 1, SEEDS_PER_BENCH)
-    return [_stimulus(kind, seed, RIG, SENSOR).rig for seed in seeds]
+    return [_stimulus(kind, seed, BENCHES).rig for seed in seeds]
 
 
 def test_half_of_the_outlier_benches_lie_slightly_off() -> None:
@@ -257,7 +257,7 @@ def test_kinds_share_no_bench() -> None:
     """A shared bench would let a network tell outliers from ordinary objects."""
     kinds = ("plates", "blobs", ORDINARY)
 
-    slight = [_stimulus(kind, SEEDS_PER_BENCH, RIG, SENSOR) for kind in kinds]
+    slight = [_stimulus(kind, SEEDS_PER_BENCH, BENCHES) for kind in kinds]
 
     assert len({stimulus.rig.checksum for stimulus in slight}) == 3
     assert len({stimulus.sensor.bare_wall_counts for stimulus in slight}) == 3
@@ -286,7 +286,7 @@ def test_generic_shape_repeats_by_seed_on_a_bench_slightly_off() -> None:
     one, same = (make_samples(GENERIC, [SEEDS_PER_BENCH], BENCHES) for _ in range(2))
 
     np.testing.assert_array_equal(one.depth_m, same.depth_m)
-    assert _stimulus(GENERIC, 0, RIG, SENSOR).rig != RIG
+    assert _stimulus(GENERIC, 0, BENCHES).rig != RIG
 
 
 @pytest.fixture
@@ -361,8 +361,16 @@ def test_samples_of_many_rigs_hold_the_numbers_of_their_records() -> None:
     samples = make_samples(EMPTY, range(2), benches)
 
     assert len(samples) == 2
-    wanted = numbers_column(rig_numbers(RigRange().draw(RIG, 0)))
-    np.testing.assert_array_equal(samples.depth_m[0, :, NUMBERS_COLUMN], wanted)
+    for seed in range(2):
+        wanted = numbers_column(rig_numbers(benches.record(EMPTY, seed)))
+        np.testing.assert_array_equal(samples.depth_m[seed, :, NUMBERS_COLUMN], wanted)
+
+
+def test_each_sample_of_many_rigs_has_a_rig_of_its_own() -> None:
+    benches = Benches(RIG, SENSOR, rigs=RigRange())
+    rigs = [benches.record(kind, seed) for kind in (GENERIC, "far") for seed in range(20)]
+
+    assert len({rig.checksum for rig in rigs}) == len(rigs)
 
 
 BARE = Sensor(RIG, SensorModel()).maps(render(Scene(RIG)).multi, None)
@@ -406,4 +414,14 @@ def test_data_of_another_light_than_the_samples_are_refused(other: dict[str, Any
     pipeline = SimpleNamespace(record=load_record(shipped_folder()))
 
     with pytest.raises(SceneError, match="radiometry or material"):
+        check_uncertainty_data(small_recipe(), pipeline, ours, theirs)  # type: ignore[arg-type]
+
+
+def test_data_off_their_record_are_refused() -> None:
+    """Half of the outliers are on benches as recorded: they would be known by that."""
+    ours = SimpleNamespace(plan=DatasetPlan(RIG, 0))
+    theirs = SimpleNamespace(plan=replace(ours.plan, off_record=True))
+    pipeline = SimpleNamespace(record=load_record(shipped_folder()))
+
+    with pytest.raises(SceneError, match="without --off-record"):
         check_uncertainty_data(small_recipe(), pipeline, ours, theirs)  # type: ignore[arg-type]
