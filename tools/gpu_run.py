@@ -52,7 +52,7 @@ KEPT_FIGURES = "silhouette_iou", "foreground_rmse_mm", "unseen", "recognised"
 SEED = 2_000_000
 HELD_OUT_SEED = 10_000_000
 OBJECTS = 1_000_000
-"""Upper limit of what is rendered; the time ends it earlier."""
+"""Upper limit of the rendered objects; the time ends it earlier."""
 PROGRAM = (
     sys.executable,
     "-P",

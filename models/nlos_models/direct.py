@@ -11,7 +11,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from nlos_models.metrics import MIN_V
+from nlos_models.metrics import CUTS, MIN_V
 from nlos_models.training.recipe import DirectSize
 
 ROWS = 64
@@ -19,10 +19,6 @@ COLUMNS = 80
 PIXELS = 64
 CLIP = 5.0
 """Limit of a normalised cell, in spreads."""
-CUTS = 0.3, 0.34, 0.38, 0.42, 0.46, 0.5
-"""Probabilities of a surface that an image may be cut at; lower ones would cost more of the mean
-absolute error.
-"""
 SMALLEST_SHARE = 0.3
 """Smallest spread of a cell, as a share of the median spread: quiet cells would otherwise show
 noise alone.
@@ -32,8 +28,8 @@ MIN_LIGHT_SPREAD = 0.04
 does not.
 """
 GAIN_COLUMNS = 4
-"""Every so many columns give cells that tell a frame's gain; all rows, so that mirrored maps have
-the same gain.
+"""A frame's gain is taken from every fourth column of cells; from all rows, so that mirrored maps
+have the same gain.
 """
 PATCH = 4
 TOKEN = 8
@@ -144,8 +140,8 @@ class CellNormal(nn.Module):
         """Shift the medians of some or all channels as maps (n, 64, 80) of another bench ask for:
         its offset, its gain.
 
-        One number a channel, the median over the cells: a few objects do not tell each cell's own
-        median.
+        One number a channel, the median over the cells: of a few objects each cell's own
+        median is not known.
         """
         # Differences from the training rig's medians, and their median: an offset of the device
         # or a gain of the bench is common to all cells, an object is not.
@@ -301,14 +297,12 @@ def image_from_logits(logits: Tensor) -> Tensor:
     """Return images (n, 64, 64) of logits (n, 2, 64, 64), each cut where its silhouette's expected
     overlap is largest.
 
-    Four logits, in color, make images (n, 3, 64, 64). Of a silhouette and pixels with probabilities
-    p of a surface, the expected intersection over union is about the sum of p inside over the sum
-    of p everywhere and 1 - p inside.
+    Four logits, in color, make images (n, 3, 64, 64).
     """
     # A cut at 0.5 is best for single pixels, not for the overlap: a small object of probability
-    # 0.4 throughout would vanish. The expected overlap (sum of p inside) / (area + sum of p
-    # outside) is computed at six cuts, and the best taken; in the fraction, area + sum of all p -
-    # sum of p inside is that denominator.
+    # 0.4 throughout would vanish. With p the probability of a surface, the expected intersection
+    # over union is about (sum of p inside) / (area + sum of p outside). It is computed at six cuts
+    # and the best is taken; sum of p outside = sum of all p - sum of p inside.
     every = torch.sigmoid(logits.float())
     share = every[:, 0]
     values = every[:, 1:] if every.shape[1] > 2 else every[:, 1]

@@ -77,8 +77,9 @@ class _Answering(nn.Module):
 
     @property
     def outputs(self) -> list[str]:
-        """Names of the outputs."""
-        return list(inference.Answer._fields[: 1 + isinstance(self.network, DirectNetwork)])
+        """Names of the outputs: those of `forward`, as an Answer has them."""
+        has_surface = isinstance(self.network, DirectNetwork)
+        return ["image", "surface"] if has_surface else ["image"]
 
     def forward(self, depth_m: Tensor, intensity: Tensor) -> tuple[Tensor, ...]:
         """Return the images of maps, and a direct network's probability of a surface."""

@@ -144,7 +144,7 @@ def open_session(model: Path | bytes, checksum: str = "") -> Any:
     # the other cores have the camera, the view and the check by physics.
     options.intra_op_num_threads = 1
     # Errors are raised too; a log of a library on stderr would break the command's own output.
-    options.log_severity_level = 4  # errors are raised too
+    options.log_severity_level = 4
     name = model if isinstance(model, Path) else "the cached network"
     try:
         if isinstance(model, Path):

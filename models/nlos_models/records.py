@@ -56,7 +56,8 @@ class CheckpointRecord(BaseModel):
     rig_name: str
     rig_checksum: str
     rig: dict[str, Any] | None = None
-    """The rig itself, for weights of a measured bench; None for those of a packaged rig."""
+    """Fields of the rig that the weights are for: a measured one, or one that weights on the wall
+    grid were trained on for. None for a packaged rig, known by its name, and for any rig."""
     bare_wall_counts: float | None = None
     """Counts of the brightest bare wall in training; None for those of the simulated sensor."""
     input: MapKind = "raw maps"

@@ -19,20 +19,22 @@ class TrainingInputs:
     """Maps that a network is trained on, and the rig that its record names for them."""
 
     rig: tuple[str, str]
-    """Name and checksum of the rig in the weights' record: of the wall grid's maps its checksum,
-    and none of locked differences, by which no bench takes the weights for those of its maps."""
+    """Rig name and checksum for the record of the new weights. The checksum is the wall grid's
+    where maps are aligned with it. It is empty for locked differences: by the rig's own checksum,
+    `live` would take the weights for weights of the rig's maps."""
     bench: dict[str, Any] | None
-    """Fields of the measured rig in that record; None for locked differences."""
+    """Fields of the rig, for the same record; None for locked differences."""
     trained: CheckpointRecord | None
-    """Record of the start weights, whose normalization serves maps of their own cells alone; None
-    for a normalization that is fitted to the maps, and always taken."""
+    """Record of the start weights. Their normalization is used if they were trained for the rig
+    that the maps are aligned with, else one is fitted to the maps. None: the start network's
+    normalization is used as it stands, since `LockedNoise.fitted` has set it."""
     frame: Rig | None = None
-    """Wall grid that maps are aligned with; None where they stay in the rig's own cells."""
+    """Wall grid that the maps are aligned with; None where they stay in the rig's own cells."""
     bare_wall_counts: float | None = None
-    """Counts of the brightest bare wall in maps of the rig's own cells; None for those of the
-    simulated sensor, as all light on the wall grid is."""
+    """Counts of the brightest bare wall, for the same record; None for the simulated sensor's, to
+    which all maps on the wall grid are scaled."""
     noise: LockedNoise | None = None
-    """Noise of locked differences; None for maps, whose noise is the sensor's."""
+    """Noise of locked differences; None for maps, to which training adds the sensor's noise."""
 
     @classmethod
     def of_maps(cls, rig: Rig, sensor: SensorModel, trained: CheckpointRecord) -> Self:

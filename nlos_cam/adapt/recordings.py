@@ -61,6 +61,11 @@ class Recordings:
         return [path for label in parts[part] for path in self.by_label[label]]
 
 
+def iou_of(figures: Mapping[str, Any]) -> float:
+    """Return the silhouette IoU from the figures of weights (figures.json)."""
+    return figures["silhouette_iou"]["value"]
+
+
 @dataclass(frozen=True)
 class Transfer:
     """Result of a transfer to recordings."""
@@ -79,12 +84,12 @@ class Transfer:
 
     @property
     def is_nearer(self) -> bool:
-        """True if the outlines of the judged objects are nearer than before, and no farther than
-        those of the start weights: after a few minutes, the weights before can be worse than these.
+        """True if the fit has a larger silhouette IoU on the judged objects than the weights before
+        it, and no smaller one than the start weights, which after a few minutes of adaptation may
+        still be the better ones.
         """
-        figures = self.start, self.before, self.after
-        start, before, after = (each["silhouette_iou"]["value"] for each in figures)
-        return after > before and after >= start
+        after = iou_of(self.after)
+        return after > iou_of(self.before) and after >= iou_of(self.start)
 
     @property
     def is_better(self) -> bool:

@@ -11,9 +11,10 @@ from pathlib import Path
 import numpy as np
 
 from nlos_cam.adapt.plan import Plan
-from nlos_cam.adapt.recordings import Transfer
+from nlos_cam.adapt.recordings import Transfer, iou_of
 from nlos_cam.adapt.run import AFTER, NETWORK, REPORT, AdaptResult
 from nlos_cam.bench import ForecastRecord
+from nlos_cam.camera import FRAMES_PER_S
 from nlos_cam.forecast import SCATTER_IOU
 from nlos_cam.report import (
     Banner,
@@ -29,7 +30,6 @@ from nlos_cam.report import (
     write_document,
 )
 
-FRAMES_PER_S = 30
 MIN_EPOCHS = 8
 """A slope over fewer epochs is that of the learning rate, not of the minutes."""
 LATE_SHARE = 0.5
@@ -120,7 +120,8 @@ Rows = Sequence[tuple[str, str, str]]
 
 def transfer_words(found: Transfer) -> str:
     """Return what recordings of known objects brought, in words."""
-    before, after = (each["silhouette_iou"]["value"] for each in (found.before, found.after))
+    before = iou_of(found.before)
+    after = iou_of(found.after)
     outcome = "kept" if found.is_better else "no better, so not kept"
     if found.is_nearer and not found.is_better:
         outcome = f"but {found.simulated_loss:.2f} worse on simulated objects, so not kept"
@@ -167,7 +168,8 @@ def write_page(
     """
     plan = result.plan
     curves = read_curves(plan, [folder / NETWORK / "log.csv" for folder in result.folders])
-    before, after = (each["silhouette_iou"]["value"] for each in (result.before, result.after))
+    before = iou_of(result.before)
+    after = iou_of(result.after)
     headline = f"Silhouette IoU {before:.3f} -> {after:.3f}"
     spread = plan.spread
     expected = tables.expected

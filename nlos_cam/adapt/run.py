@@ -41,6 +41,7 @@ from nlos_cam.adapt.recordings import (
     Recordings,
     Transfer,
     fit_to_recordings,
+    iou_of,
     parts_of,
     write_parts,
 )
@@ -64,10 +65,7 @@ OUTLIERS = "outliers"
 UNCERTAINTY = "uncertainty"
 NETWORK = "network"
 WEIGHTS = "weights"
-NETWORK_FILE = "direct.safetensors"
-NETWORK_GRAPH = "network.onnx"
-UNCERTAINTY_RECORD = "doubt.json"
-UNCERTAINTY_GRAPH = "doubt.onnx"
+NETWORK_FILE = f"{models.DIRECT}.safetensors"
 PACKED = "packed"
 BEFORE = "before"
 START = "start"
@@ -81,10 +79,11 @@ REPORT = "report"
 FIGURES = "figures.json"
 HELD_OUT_OBJECTS = 400
 EARLIER_QUALITY = "quality"
-"""Of nlos-cam 0.2.0: objects on the rig itself."""
+"""Folder of the quality model's objects in nlos-cam 0.2.0, where they were on the rig itself."""
 QUALITY_SEED = 40_000_000
 JUDGED_SEED = 35_000_000
-"""Of objects that the network was not trained on: no seeds of the shipped weights' trainings."""
+"""First seeds of the objects that the quality model and the uncertainty network are fitted to:
+neither a bench's network nor shipped weights were trained on these."""
 QUALITY_OBJECTS = 600, 6000
 """Objects that the quality model is fitted to, at least and at most."""
 QUALITY_PER_MINUTE = 60
@@ -93,7 +92,7 @@ POLL_S = 0.2
 PACE_OBJECTS = 200
 PACE_STEPS = 6
 MIN_NOTES = 4
-"""Notes of progress from which a pace is told."""
+"""Fewest calls of `on_progress` that a pace is measured by."""
 RECIPE = "doubt"
 
 Measure = Callable[[Path | None, Path, Path | None], None]
@@ -103,7 +102,7 @@ FIGURES and a report into a folder."""
 
 @dataclass(frozen=True)
 class Adaptation:
-    """What is adapted, and by whom."""
+    """Request for an adaptation: the bench, the weights to start from, and the processes to use."""
 
     rig: Rig
     spread: data.RigSpread
@@ -123,9 +122,10 @@ class Adaptation:
     recordings: Recordings | None = None
     """Recordings of known objects on the bench, if there are any."""
     begin_again: bool = False
-    """Whether a folder that is an adaptation to another rig is emptied, in place of an error."""
+    """True to empty a folder that holds an adaptation to another rig; else that is an error."""
     began_from: Path | None = None
-    """Shipped weights that the folder's work began from, which another version may not choose."""
+    """Shipped weights that the work in the folder began from. They stay the start weights, also
+    where a later version of the program would choose others."""
 
     @property
     def start_folder(self) -> Path:
@@ -175,14 +175,12 @@ class AdaptResult:
         A few minutes' weights can be worse than aligned ones on a bench close to the start weights'
         rig.
         """
-        start_iou: float = self.before["silhouette_iou"]["value"]
-        return self.serves_as_well_as(max(start_iou, self.shipped_iou or 0.0))
+        return self.serves_as_well_as(max(iou_of(self.before), self.shipped_iou or 0.0))
 
     @property
     def shipped_are_better(self) -> bool:
         """True if the shipped weights that serve the rig best are better than the start weights."""
-        start_iou: float = self.before["silhouette_iou"]["value"]
-        return self.shipped_iou is not None and self.shipped_iou > start_iou
+        return self.shipped_iou is not None and self.shipped_iou > iou_of(self.before)
 
     def serves_as_well_as(self, other_iou: float) -> bool:
         """Return whether the weights are as good as others with this silhouette IoU on the test
@@ -193,7 +191,7 @@ class AdaptResult:
         """
         fitted = self.transfer is not None and self.transfer.is_better
         allowed = MAX_SIMULATED_LOSS if fitted else 0.0
-        return self.after["silhouette_iou"]["value"] >= other_iou - allowed
+        return iou_of(self.after) >= other_iou - allowed
 
 
 def adapt(
@@ -223,7 +221,7 @@ def adapt(
                 f"stage {number + 1} of {len(plan.stages)}: {stage.objects} objects,"
                 f" {stage.samples} samples"
             )
-            if not _is_whole(folders[number] / NETWORK, NETWORK_GRAPH):
+            if not _is_whole(folders[number] / NETWORK, models.NETWORK_ONNX):
                 _train_network(job, plan, number, tracked, watch)
         if job.locked:
             was_there = (folders[-1] / REPORT / FIGURES).exists()
@@ -259,7 +257,7 @@ def _shipped_iou(job: Adaptation, plan: Plan, measure: Measure) -> float | None:
         return None
     # of another version of the program they are others
     folder = job.folder / f"{SHIPPED}-{checksum[:12]}"
-    return _figures(measure, shipped, folder)["silhouette_iou"]["value"]
+    return iou_of(_figures(measure, shipped, folder))
 
 
 def _with_first_start(job: Adaptation) -> Adaptation:
@@ -338,7 +336,7 @@ def _plan_for(job: Adaptation, minutes: float, tracked: data.Tracked) -> Plan:
             " these, or choose another --out"
         )
     # the shipped weights of another version are no change of mind, once they are trained on
-    has_begun = _is_whole(job.folder / _stage_name(0) / NETWORK, NETWORK_GRAPH)
+    has_begun = _is_whole(job.folder / _stage_name(0) / NETWORK, models.NETWORK_ONNX)
     if (job.start or not has_begun) and plan.start != _start_checksum(job):
         raise SceneError(
             f"{job.folder} began from other start weights than {job.start or 'the shipped ones'}:"
@@ -350,8 +348,8 @@ def _plan_for(job: Adaptation, minutes: float, tracked: data.Tracked) -> Plan:
 
 
 def _forget(folder: Path) -> None:
-    """Delete what an adaptation made, objects of its rig included: the plan at last, so that a stop
-    meanwhile is repeated.
+    """Delete all files of an adaptation. The plan goes last: while it is there, a call that was
+    stopped here begins again.
     """
     of_its_rig = (BEFORE, OBJECTS, HELD_OUT, JUDGED, QUALITY, EARLIER_QUALITY, OUTLIERS)
     numbered = (*folder.glob(STAGE.format("*")), *folder.glob(f"{SHIPPED}-*"))
@@ -498,7 +496,7 @@ def _transfer(
     folder = stage / f"{RECORDINGS}-{found.digest}"
     parts = write_parts(found, folder / PARTS, tracked)
     network = folder / NETWORK
-    if not _is_whole(network, NETWORK_GRAPH):
+    if not _is_whole(network, models.NETWORK_ONNX):
         fit_to_recordings(
             stage / NETWORK, parts, network, job.accelerator, watch or training.unwatched
         )
@@ -514,14 +512,9 @@ def _transfer(
     )
     if not transfer.is_nearer:
         return transfer
-    before, after = (
-        _figures(measure, weights, figures)["silhouette_iou"]["value"]
-        for weights, figures in (
-            (stage / NETWORK, stage / SIMULATED),
-            (network, folder / SIMULATED),
-        )
-    )
-    return replace(transfer, simulated_loss=before - after)
+    before = _figures(measure, stage / NETWORK, stage / SIMULATED)
+    after = _figures(measure, network, folder / SIMULATED)
+    return replace(transfer, simulated_loss=iou_of(before) - iou_of(after))
 
 
 class _Rendering:
@@ -694,52 +687,74 @@ def _train_uncertainty(
     """
     if (folder / WEIGHTS).exists():
         return
-    watched = folder / NETWORK
-    judge = folder / UNCERTAINTY
-    recipe = plan.uncertainty_recipe(_uncertainty_recipe())
-    graphs = cache_folder() / "onnx"
-    if not _is_whole(judge, UNCERTAINTY_GRAPH):
-        # a kill between its files: the training has ended, and writes them again
-        (judge / UNCERTAINTY_RECORD).unlink(missing_ok=True)
-        judged = _test_set(job, JUDGED, JUDGED_SEED, recipe.objects, tracked)
-        held_out = job.folder / HELD_OUT
-        pipeline = models.load_reconstructor(watched, graphs)
-        sets = data.open_dataset(judged), data.open_dataset(held_out)
-        data.check_uncertainty_data(recipe, pipeline, *sets)
-        about = training.record_uncertainty_run(
-            recipe, judge, watched, list(data.outliers_beside(SHARE_GENERIC))
-        )
-        with tracked("rendering empty benches and outliers") as on_progress:
-            samples = data.uncertainty_sets(
-                recipe, pipeline, sets, job.folder / OUTLIERS, on_progress
-            )
-        fabric = training.open_fabric(recipe, accelerator=job.accelerator)
-        run = training.TrainingRun(
-            recipe,
-            judge,
-            pipeline.record,
-            about.watches,
-            watch=watch or training.unwatched,
-        )
-        training.run_uncertainty(fabric, run, about, watched, *samples)
 
+    network = folder / NETWORK
+    uncertainty = folder / UNCERTAINTY  # gets copies of the network's files too
+    if not _is_whole(uncertainty, models.UNCERTAINTY_ONNX):
+        _train_uncertainty_network(job, plan, network, uncertainty, tracked, watch)
+    _fit_quality(job, plan, uncertainty, tracked)
+
+    names = *checksums_of(network), *checksums_of(uncertainty)
+    with atomic_directory(folder / WEIGHTS) as part:
+        write_checked(part, {name: (uncertainty / name).read_bytes() for name in names})
+
+
+def _train_uncertainty_network(
+    job: Adaptation,
+    plan: Plan,
+    watched: Path,
+    out: Path,
+    tracked: data.Tracked,
+    watch: training.Watch | None,
+) -> None:
+    """Train the uncertainty network of the weights in `watched`: on objects that these were not
+    trained on, empty benches and outliers.
+    """
+    # A kill between its files: the training has ended, and writes them again.
+    (out / models.UNCERTAINTY_RECORD).unlink(missing_ok=True)
+
+    recipe = plan.uncertainty_recipe(_uncertainty_recipe())
+    objects = _test_set(job, JUDGED, JUDGED_SEED, recipe.objects, tracked)
+    sets = data.open_dataset(objects), data.open_dataset(job.folder / HELD_OUT)
+    pipeline = models.load_reconstructor(watched, cache_folder() / "onnx")
+    data.check_uncertainty_data(recipe, pipeline, *sets)
+
+    kinds = list(data.outliers_beside(SHARE_GENERIC))
+    record = training.record_uncertainty_run(recipe, out, watched, kinds)
+    with tracked("rendering empty benches and outliers") as on_progress:
+        samples = data.uncertainty_sets(recipe, pipeline, sets, job.folder / OUTLIERS, on_progress)
+
+    fabric = training.open_fabric(recipe, accelerator=job.accelerator)
+    run = training.TrainingRun(
+        recipe,
+        out,
+        pipeline.record,
+        record.watches,
+        watch=watch or training.unwatched,
+    )
+    training.run_uncertainty(fabric, run, record, watched, *samples)
+
+
+def _fit_quality(job: Adaptation, plan: Plan, weights: Path, tracked: data.Tracked) -> None:
+    """Fit the quality model beside weights and their uncertainty network: to objects on benches
+    that are off their record, as a real one is.
+    """
     at_least, at_most = QUALITY_OBJECTS
-    objects = min(max(round(QUALITY_PER_MINUTE * plan.minutes), at_least), at_most)
-    # A frame is trusted by what is predicted of it, and a real bench is off its record.
-    scored = _test_set(job, QUALITY, QUALITY_SEED, objects, tracked, off_record=True)
-    pipeline = models.load_reconstructor(judge, graphs)
-    uncertainty = models.load_uncertainty_model(judge, graphs, quality=False)
+    count = min(max(round(QUALITY_PER_MINUTE * plan.minutes), at_least), at_most)
+    objects = _test_set(job, QUALITY, QUALITY_SEED, count, tracked, off_record=True)
+
+    graphs = cache_folder() / "onnx"
+    pipeline = models.load_reconstructor(weights, graphs)
+    uncertainty = models.load_uncertainty_model(weights, graphs, quality=False)
     if uncertainty is None:
-        raise SceneError(f"{judge} has no uncertainty network: delete it, and try again")
+        raise SceneError(f"{weights} has no uncertainty network: delete it, and try again")
+
     with tracked("reconstructing objects for the quality model") as on_progress:
         found = data.quality_set(
-            pipeline, uncertainty, data.open_dataset(scored), objects, on_progress
+            pipeline, uncertainty, data.open_dataset(objects), count, on_progress
         )
     with tracked("fitting the quality model") as on_progress:
-        training.run_quality(judge, found, on_progress)
-    names = *checksums_of(watched), *checksums_of(judge)
-    with atomic_directory(folder / WEIGHTS) as part:
-        write_checked(part, {name: (judge / name).read_bytes() for name in names})
+        training.run_quality(weights, found, on_progress)
 
 
 def _is_whole(folder: Path, last: str) -> bool:

@@ -89,15 +89,20 @@ class FaultyDevice:
         if self._has_fault(instant, "stall"):
             self._counted_from += 1
             return late
-        own_s = (instant - self._clock_from) / FRAMES_PER_S % WRAP_PERIOD_S
-        frame = Delivery(
-            instant, instant - self._counted_from, own_s if self.has_own_clock else due_s, images
-        )
-        frames = [] if self._has_fault(instant, "drops") else [self._apply(frame, instant)]
+        if self._has_fault(instant, "drops"):
+            frames: list[Delivery] = []
+        else:
+            own_s = (instant - self._clock_from) / FRAMES_PER_S % WRAP_PERIOD_S
+            timestamp_s = own_s if self.has_own_clock else due_s
+            number = instant - self._counted_from
+            frames = [self._apply(Delivery(instant, number, timestamp_s, images), instant)]
+
         if self._is_held(instant):
             self._held = frames
             return late
-        return [*frames * (2 if self._has_fault(instant, "duplicate") else 1), *late]
+        if self._has_fault(instant, "duplicate"):
+            frames = frames * 2
+        return [*frames, *late]
 
     def _apply(self, delivery: Delivery, instant: int) -> Delivery:
         images = delivery.images

@@ -242,12 +242,12 @@ class L515Camera(LiveCamera):
         power = present if by_hand or self._laser_power is None else self._laser_power
         if power != present:
             options.put(LASER_POWER, power)
-        settled = turn_down(
-            power,
-            limits,
-            self._saturated_share,
-            lambda lower: not by_hand and not options.put(LASER_POWER, lower),
-        )
+
+        def put(lower: float) -> bool:
+            """Set a lower power, unless one was set by hand; return True if it held."""
+            return not by_hand and not options.put(LASER_POWER, lower)
+
+        settled = turn_down(power, limits, self._saturated_share, put)
         self._laser_power = settled.power
         if settled.power < power:
             log.warning(
@@ -272,7 +272,8 @@ class L515Camera(LiveCamera):
             found = self._session.look(LOOK_TIMEOUT_S) if self._session else None
             if found is None:
                 return None
-            shares += [saturated_share(found.ir)] if index >= SETS_IN_FLIGHT else []
+            if index >= SETS_IN_FLIGHT:
+                shares.append(saturated_share(found.ir))
         return sum(shares) / len(shares)
 
     def adjustable(self) -> list[dict[str, Any]]:

@@ -353,18 +353,30 @@ class Recording:
         self._free = free
         self._overwrite = overwrite
         self._claim = ExitStack()
-        self._before_s = float("-inf")
         self._replaced = _Replaced((), path)
+        self._source: tuple[Any, Any] = (None, None)
+        """Device and SDK, for the next take."""
+        self._recorder: SdkRecorder | None = None
+
+        self._before_s = float("-inf")
+        """Timestamp of the last set before this take."""
         self._first_s = 0.0
         self._first_arrived_s = 0.0
+        """Timestamp and arrival of the take's first set, by which its length is measured."""
         self._last_s = 0.0
+        """Timestamp of the take's newest set."""
+
+        # Between `add`, on the SDK's thread, and the thread that iterates:
         self._stopping = Event()
+        """Set by `stop`: the take ends with the next set."""
         self._paused = Event()
+        """Set once no more is recorded in this take."""
         self._changing = Event()
+        """Set by `next_take` while it replaces the file: `add` records nothing."""
         self._at_boundary = Event()
+        """Set by `add` when it has seen that, between two sets: now the file may be replaced."""
         self._changed = Event()
-        self._source: tuple[Any, Any] = (None, None)
-        self._recorder: SdkRecorder | None = None
+        """Set by `next_take` when the file is replaced: `add` may let the SDK go on."""
 
     def begin(self, device: Any, sdk: Any) -> None:
         """Record the device's streams.

@@ -72,7 +72,8 @@ class SampleQueue:
             complete = self._pairing.add(sample)
             if complete is None:
                 return
-            self._evicted += self._sets.put(complete) is not None
+            if self._sets.put(complete) is not None:
+                self._evicted += 1
         if self._on_set:
             self._on_set(complete)
 
@@ -98,6 +99,7 @@ FrameSize = tuple[int, int]
 NOT_YET = -9999.0
 """Reading of a temperature not measured yet: the photodiode's, until 5 s after the start."""
 BOUNDARY_WAIT_S = 0.2
+"""Time to wait for a whole set before frames are delivered, so that delivery begins between two."""
 
 
 def find_streams(device: Any, size: FrameSize | None = None) -> tuple[Any, dict[str, Any]]:
@@ -225,8 +227,10 @@ class Session:
             self._previewed_s = max(self._previewed_s, sample.timestamp_s)
             return False
         began_before = abs(sample.timestamp_s - self._previewed_s) <= streams.SAME_INSTANT_S
-        self._held_back += began_before
-        return not began_before or self._held_back >= len(streams.FORMATS)
+        if not began_before:
+            return True
+        self._held_back += 1
+        return self._held_back >= len(streams.FORMATS)
 
     @property
     def sensor(self) -> Any:

@@ -86,9 +86,12 @@ def open_world(name: str, on_progress: OnProgress | None = None) -> World:
     The loops of the first two come with the package; others are rendered on first use and stored in
     the cache folder. Raises SceneError for an invalid scene.
     """
-    scene = {"": renderer.paper_scene, "bare-wall": renderer.bare_wall_scene}.get(
-        name, lambda: renderer.load_scene(Path(name))
-    )()
+    if name == "":
+        scene = renderer.paper_scene()
+    elif name == "bare-wall":
+        scene = renderer.bare_wall_scene()
+    else:
+        scene = renderer.load_scene(Path(name))
     loop = read_packaged(scene)
     if loop is None:
         cached = cache_folder() / "worlds" / f"{scene.checksum}.npz"

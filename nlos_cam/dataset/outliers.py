@@ -390,22 +390,23 @@ def _by_name(*kinds: OutlierKind) -> Mapping[str, OutlierKind]:
 
 
 TRAINING_OUTLIERS = _by_name(
-    *(
-        small,
-        large,
-        far,
-        near,
-        half_out,
-        several,
-        blobs,
-        dim,
-        posts,
-        tilted,
-        plates,
-        other_rig,
-        other_sensor,
-    ),
-    *(warped, inside_out, cut_out, scrambled),
+    small,
+    large,
+    far,
+    near,
+    half_out,
+    several,
+    blobs,
+    dim,
+    posts,
+    tilted,
+    plates,
+    other_rig,
+    other_sensor,
+    warped,
+    inside_out,
+    cut_out,
+    scrambled,
 )
 HELD_OUT_OUTLIERS = _by_name(panels, noise_sheet, bars, rings, glossy, two_tone)
 COVERED_BY_GENERIC = frozenset(

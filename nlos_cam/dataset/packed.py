@@ -77,20 +77,26 @@ class PackedMaps:
         locked: bool = False,
         held_out: Path | None = None,
     ) -> None:
-        """Open or make the store: use `open_packed_maps`, which holds its claim meanwhile.
+        """Open or make the store: use `open_packed_maps`, which claims its folder.
 
-        Maps are normalised as `normal` does, unless it belongs to weights `trained` for another
-        rig; by default by the statistics of the first shards (with `growth` of those that the first
-        epoch sees, so that a run that was killed sees the same). `growth` decides how many objects
-        an epoch sees (default: all that are there). They are aligned with the rig `frame`, by
-        default the plan's, and the wall grid for a plan of many rigs. A spread that records do not
-        have (`DatasetPlan.known_rig`) stays in the maps. `run` names the training run: another one
-        in the same store sees the objects that are there when its own epochs begin. New shards are
-        made ready by the processes of `packing`, by default this one. Datasets of locked
-        differences are taken only where `locked`. Objects to hold out, if given, are looked at
-        before anything is packed, as by the method `held_out`. Raises RecordingError for no dataset, SceneError
-        for datasets of two rigs or a store of other data, aligned with another rig, or normalised
-        otherwise.
+        Normalisation: `normal`, unless it belongs to weights `trained` for another rig than the
+        maps are aligned with. Else it is fitted to the first shards; with `growth`, to those that
+        the first epoch sees, so that a killed run fits the same one again.
+
+        Objects of an epoch: the shards that `growth` allows it, by default all that are there.
+        `run` names the training run, which has epochs of its own in a store that runs share.
+
+        Alignment: with the rig `frame`, by default the plan's, or the wall grid for a plan of many
+        rigs. A spread that the benches' records do not hold (`DatasetPlan.known_rig`) stays in the
+        maps.
+
+        New shards are packed by the processes of `packing`, by default by this one. Datasets of
+        locked differences are refused unless `locked`. A dataset `held_out` is checked before
+        anything is packed.
+
+        Raises RecordingError for no dataset, SceneError for datasets of two rigs, for held-out
+        objects that are training objects, and for a store of other data, aligned with another rig,
+        or normalised otherwise.
         """
         opened = [
             open_dataset(folder, color=color, expected=True, locked=locked) for folder in datasets
@@ -100,12 +106,12 @@ class PackedMaps:
         _check_of_one_kind(opened)
         self.frame: Rig = frame or (WALL_GRID if self.plan.rigs else self.plan.rig)
         """Rig that the maps are aligned with."""
-        given = normal
-        if trained and trained.rig_checksum != self.frame.checksum:
-            # By another rig's statistics a third of the cells would lie beyond the limit of a
-            # normalised one, on a bench 5 cm nearer: its layers serve, not its cells. The wall
-            # grid counts as another rig, also beside the rig that its maps are drawn around.
-            normal = None
+        # By another rig's statistics a third of the cells would lie beyond the limit of a
+        # normalised one, on a bench 5 cm nearer: its layers serve, not its cells. The wall grid
+        # counts as another rig, also beside the rig that its maps are drawn around.
+        is_foreign = trained is not None and trained.rig_checksum != self.frame.checksum
+        wanted = None if is_foreign else normal
+
         self.noise: MapNoise | None = map_noise(self.plan) if self.plan.expected else None
         """To be drawn at each step of training."""
         self._datasets = list(datasets)
@@ -115,6 +121,7 @@ class PackedMaps:
         self._run = run
         self._packing = packing or Packing(1)
         self.normal = CellNormal(color=color)
+
         if color and self.plan.spread != RigSpread():
             raise SceneError(
                 f"{datasets[0]} varies the rig, but maps in color are not aligned: build it without"
@@ -124,6 +131,7 @@ class PackedMaps:
         self._locked = locked
         if held_out:
             self._open_held_out(held_out)
+
         pixels = (OBJECT_PIXELS, OBJECT_PIXELS)
         self._rows: dict[str, tuple[int, ...]] = {
             MAPS: (channels_of(color=color), MAP_ROWS, MAP_COLUMNS),
@@ -131,13 +139,15 @@ class PackedMaps:
         }
         if self._stores_counts:
             self._rows[COUNTS] = MAP_ROWS, MAP_COLUMNS
+
         shards = [shard for one in opened for shard in one.shards]
         self._keys = {shard.path: shard_key(shard) for shard in shards}
         self._sizes = {shard.path: len(shard.seeds) for shard in shards}
         self._index = StoreIndex.read(store)
         self._index.open_for(self.frame, opened, self._keys)
+
         if not (store / CELLS).exists():
-            self._write_cells(opened, normal)
+            self._write_cells(opened, wanted)
         try:
             cells = read_npz(store / CELLS)
             self.normal.load_state_dict(
@@ -145,9 +155,9 @@ class PackedMaps:
             )
         except (OSError, ValueError, TypeError, RuntimeError) as error:
             raise damaged(store, CELLS) from error
-        # Cells of another rig's weights are what stores of before 2026-11-28 may hold.
-        is_foreign = given is not None and normal is None and _alike(given, self.normal)
-        if is_foreign or (normal and not _alike(normal, self.normal)):
+        # Stores from before 2026-11-28 may hold the normalisation of another rig's weights.
+        holds_foreign = is_foreign and normal is not None and _alike(normal, self.normal)
+        if holds_foreign or (wanted and not _alike(wanted, self.normal)):
             raise SceneError(
                 f"{store} holds maps that are normalised for other weights: name another --store"
             )
@@ -207,9 +217,8 @@ class PackedMaps:
             path.touch()
             if path.stat().st_size < size:
                 raise damaged(self._store, name)
-            with path.open(
-                "r+b"
-            ) as file:  # rows after the last indexed one are left by an interruption
+            # Rows after the last indexed one were left by an interruption.
+            with path.open("r+b") as file:
                 file.truncate(size)
         packer = Packer.of(self.frame, self.normal, with_counts=self._stores_counts)
         every = zip(new, self._packing.rows_of(packer, [*new.values()]), strict=True)
@@ -280,10 +289,11 @@ class PackedMaps:
         """Forget how many objects the epochs of this run saw: it begins again."""
         if self._run:
             epochs = self._index.epochs
-            # a run is a path and a blank, its keys end with the seeds of their epochs
-            own = [key for key in epochs if key.startswith(self._run)]
-            for key in [each for each in own if each[len(self._run) :].isdigit()]:
-                del epochs[key]
+            # The key of an epoch is its run, a path and a blank, followed by the epoch's seed. The
+            # path of another run may begin with the same text.
+            for key in list(epochs):
+                if key.startswith(self._run) and key[len(self._run) :].isdigit():
+                    del epochs[key]
             self._index.write()
 
     def batches(self, batch: int, generator: torch.Generator) -> Iterator[NormalBatch]:

@@ -137,8 +137,11 @@ class StoreIndex:
 
 
 def shard_key(shard: Shard) -> str:
-    """Return the key of a shard's samples, the same wherever it lies: digits of its plan, which
-    decides them, and its name; of recordings, which no plan decides, also digits of the samples.
+    """Return the key of a shard's samples, which does not depend on the folder: a digest, and the
+    shard's name.
+
+    The digest is that of the plan, which decides rendered samples; for recordings it covers the
+    checksums of the samples too.
     """
     digest = hashlib.sha256(shard.provenance.encode())
     if _is_recorded(shard.provenance):
@@ -149,8 +152,8 @@ def shard_key(shard: Shard) -> str:
 
 
 def data_key(dataset: Dataset) -> str:
-    """Return the key of a dataset's samples, the same wherever it lies: its plan; of recordings,
-    which no plan decides, also the keys of its shards.
+    """Return the key of a dataset's samples, which does not depend on the folder: its plan, and for
+    recordings, which no plan decides, the keys of its shards.
     """
     keys = map(shard_key, dataset.shards) if dataset.plan.accuracy == RECORDED else ()
     return "\n".join([dataset.plan.provenance, *keys])

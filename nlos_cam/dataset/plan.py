@@ -23,11 +23,21 @@ OBJECTS_VERSION = 2
 FIRST_OBJECTS = {
     "version": 1,
     "categories": (
-        *("airplane", "bell", "birdhouse", "boat", "bowl", "car"),
-        *("cup", "hat", "lamp", "rocket", "table", "tower"),
+        "airplane",
+        "bell",
+        "birdhouse",
+        "boat",
+        "bowl",
+        "car",
+        "cup",
+        "hat",
+        "lamp",
+        "rocket",
+        "table",
+        "tower",
     ),
 }
-"""Objects of datasets whose plan does not name any: they are from before it did."""
+"""Objects of the oldest datasets, whose plans do not name them."""
 SCENE_COLUMNS = (
     "lidar_distance_m",
     "lidar_yaw_deg",
@@ -191,11 +201,12 @@ class DatasetPlan:
     the rig alone.
     """
     off_record: bool = False
-    """The spread is not known: it is what records are off by, and stays in the maps, which are
-    aligned without it.
+    """True where `spread` is the error of a bench's record: maps are aligned by the rig of the
+    record, so that the error stays in them. False where each object's deviation is known.
     """
     rigs: RigRange | None = None
-    """Rigs that objects are on in place of `rig`: known ones, from which `spread` is a deviation."""
+    """Range from which the rig of each object's record is drawn, in place of `rig`; `spread` is
+    then the error of that record."""
 
     @classmethod
     def of_scene(cls, scene: SceneFile, first_seed: int, **others: Any) -> Self:
@@ -262,17 +273,19 @@ class DatasetPlan:
         return self.rigs.draw(self.rig, seed // self.objects_per_rig) if self.rigs else self.rig
 
     def known_rig(self, seed: int) -> Rig:
-        """Return the rig that maps of one object are aligned by: its bench's, or that without the
-        spread where records are off by it, as they are in a plan of many rigs.
+        """Return the rig that maps of one object are aligned by: that of its bench's record.
+
+        It is the bench's own rig, less the spread where that is the record's error: with
+        `off_record`, and in a plan of many rigs.
         """
         is_off = self.off_record or self.rigs is not None
         return self.nominal_rig(seed) if is_off else self.bench_of(seed)[0]
 
     @property
     def stays_in_maps(self) -> bool:
-        """True where maps are used as they are: of one rig, or with a spread that no record has."""
-        is_known = bool(self.spread.place_m or self.spread.angle_deg) and not self.off_record
-        return not (is_known or self.rigs)
+        """True where no map has to be aligned: all objects have the plan's rig on their record."""
+        varies = bool(self.spread.place_m or self.spread.angle_deg)
+        return self.rigs is None and (self.off_record or not varies)
 
     def differences(self, other: "DatasetPlan") -> list[str]:
         """Return the names of fields that differ; empty where both plans make the same bits."""

@@ -16,6 +16,7 @@ from typing import Literal, Self
 import numpy as np
 from nlos_calibration import Rig
 from nlos_calibration.arrays import Float32, Float64, Mask
+from nlos_models import CUTS
 
 from nlos_cam.forecast.prior import DEPTH_RADIUS, GRID, OUTLINE_RADIUS, Prior, Shape, modes
 from nlos_cam.objects import object_box
@@ -48,7 +49,6 @@ EFFECTS = "three-bounce", "occluder", "self-occlusion", "tilt"
 OUTLINES = 360
 DEPTHS = 90
 """Principal components that the maps are asked for."""
-CUTS = 0.3, 0.34, 0.38, 0.42, 0.46, 0.5
 
 
 @dataclass(frozen=True)

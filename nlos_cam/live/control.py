@@ -37,7 +37,9 @@ RECENT_FRAMES = 300
 """Frames (10 s) over which the status gives rate and latency."""
 STRAIN_FRAMES = 60
 MAX_DROPS = 3
-"""Of so many frames (2 s), the number of dropped ones above which the run is too slow."""
+"""A run is too slow for good, and loses its real-time priority, once more than MAX_DROPS frames are
+dropped within STRAIN_FRAMES (2 s). The warning about its pace has a limit of its own
+(`statistics.MAX_SLOW_SHARE`)."""
 LOADING_S = 4.0
 """Time that the networks take to load, between a pre-rendering and the first frame."""
 COMMAND_WAIT_S = 0.5
@@ -55,8 +57,8 @@ class RunControl:
     a time.
 
     A command returns its outcome in words, and raises NlosCamError with the reason if it fails.
-    Files get dated names in `folder`, and replace nothing; recordings name the measured `wall`. The loop calls `attach`, `watch`, `add`
-    and `end`.
+    Files get dated names in `folder`, and replace nothing; recordings name the measured `wall`. The
+    loop calls `attach`, `watch`, `add` and `end`.
     """
 
     def __init__(
@@ -68,7 +70,7 @@ class RunControl:
         wall: tuple[Rig, WallFile] | None = None,
     ) -> None:
         self.thread_start: Callable[[], None] = ignore
-        """Called in a command's thread before it works."""
+        """Called first in the thread of each command: there, the view lets it yield to the loop."""
         self.warnings: tuple[str, ...] = ()
         """Warnings about the run's pace."""
         self._run = RunContext(uri, folder, clock, wall=wall)

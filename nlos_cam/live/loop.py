@@ -29,7 +29,7 @@ from nlos_cam.recording import Telemetry, with_telemetry
 from nlos_cam.view import Moment, Viewer
 
 ADVICE = "plug it straight into a USB 3 port; `nlos-cam doctor` says what is wrong"
-"""What to do about a silent camera that has not said itself what it does about it."""
+"""Advice on the page while no frame comes, unless the camera has logged a warning of its own."""
 
 
 class LiveDisplay:
@@ -114,11 +114,11 @@ def pace(frames: Iterable[Frame], stop: Event, clock: Clock) -> Iterator[Frame]:
         yield frame
 
 
-def _is_paused(control: RunControl, statistics: RunStatistics, arrival: Arrival) -> bool:
-    """Return whether a frame is not reconstructed, as the run is paused, and note that it came."""
+def _note_if_paused(control: RunControl, statistics: RunStatistics, arrival: Arrival) -> bool:
+    """Return True, and note the frame, if the run is paused: then it is not reconstructed."""
     if not control.pipeline.paused:
         return False
-    # Frames are there: a stall is over, though nothing is reconstructed.
+    # The camera delivers: a stall is over, though nothing is reconstructed.
     statistics.stall.frame_arrived(arrival.arrived_s)
     control.pass_frame()
     return True
@@ -181,9 +181,9 @@ def run_live(
         on_idle=on_idle,
     )
     notes = CameraNotes()
-    skips = partial(_is_paused, control, statistics)
+    is_paused = partial(_note_if_paused, control, statistics)
     display = LiveDisplay(viewer, count_dropped, reader, telemetry, clock)
-    results = iterate_results(reader, pipeline, clock, statistics.fail, telemetry, skips)
+    results = iterate_results(reader, pipeline, clock, statistics.fail, telemetry, is_paused)
     try:
         with notes, reader, pipeline.checks:
             for result in results:

@@ -98,7 +98,9 @@ class BackgroundPhysicsCheck:
         if now_s < self._due_s:
             return
         self._due_s = now_s + self._period_s
-        self.dropped += self._queue.put((frame_number, maps, depth_m, self._rig)) is not None
+        replaced = self._queue.put((frame_number, maps, depth_m, self._rig))
+        if replaced is not None:
+            self.dropped += 1
 
     @property
     def waits(self) -> bool:
@@ -181,9 +183,8 @@ def serve(from_parent: IO[bytes], to_parent: IO[bytes], leave: Callable[[], None
     messages: SimpleQueue[Any] = SimpleQueue()
     Thread(target=_listen, args=(from_parent, messages, leave), daemon=True).start()
     accuracy = messages.get()
-    from nlos_cam.reconstruct import (
-        check_reconstruction,
-    )  # takes a second: stdin is watched already
+    # This import takes a second, in which the thread above already watches stdin.
+    from nlos_cam.reconstruct import check_reconstruction
 
     while (message := messages.get()) is not None:
         frame_number, maps, depth_m, rig = message

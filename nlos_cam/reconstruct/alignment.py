@@ -107,7 +107,7 @@ class MapAlignment:
         bench, shift_m, spot_m = _spots_of(bench, trained)
         here = cast(bench, bench.pinhole.scaled(MAP_COLUMNS, MAP_ROWS), occluder=False)
         there = cast(trained, trained.pinhole.scaled(MAP_COLUMNS, MAP_ROWS))
-        sees_wall = _cells_on_wall(bench)
+        sees_wall = _cells_wholly_on_wall(bench)
         self._neighbors = _neighbors_of(bench, spot_m, sees_wall)
         self._numbers = numbers_column(rig_numbers(bench)) if is_wall_grid(trained) else None
         self._keep_training_rig(trained, there, bare_wall_counts)
@@ -374,8 +374,11 @@ def own_rig(trained: CheckpointRecord) -> Rig | None:
 
 
 def rig_fields(rig: Rig, *, packaged: bool = False) -> dict[str, Any] | None:
-    """Return the fields of a rig for the record of weights, by which `training_rig` knows it on any
-    machine; None for the wall grid and, unless `packaged`, a packaged rig, which are known without.
+    """Return the fields of a rig for the record of weights, so that `training_rig` finds it on any
+    machine.
+
+    None for the wall grid, and for a packaged rig, which is known by its name. With `packaged`, a
+    packaged rig has fields too: weights on the wall grid bear the grid's checksum, not the rig's.
     """
     if is_wall_grid(rig):
         return None
@@ -401,7 +404,7 @@ def _is_in_view(bench: Rig, trained: Rig) -> bool:
     occluder's edge.
     """
     bench, _, spot_m = _spots_of(bench, trained)
-    sees_wall = _cells_on_wall(bench)
+    sees_wall = _cells_wholly_on_wall(bench)
     if not sees_wall.any():
         return False
     row, column = _cells_at(bench, spot_m)
@@ -414,7 +417,7 @@ def _is_in_view(bench: Rig, trained: Rig) -> bool:
 
 def _sees_grid(bench: Rig) -> bool:
     """Return whether the bench sees some of the wall grid past its occluder."""
-    sees_wall = _cells_on_wall(bench)
+    sees_wall = _cells_wholly_on_wall(bench)
     if not sees_wall.any():
         return False
     _, _, spot_m = _spots_of(bench, WALL_GRID)
@@ -481,9 +484,13 @@ def _with_occluder(bench: Rig, usual: Occluder | None, along_m: float) -> Rig:
     )
 
 
-def _cells_on_wall(rig: Rig) -> Mask:
-    """Return a mask (64, 80) of the cells that see the wall alone, past the occluder."""
-    # A cell is the mean over 8 x 8 beams: one at an edge mixes wall and occluder.
+def _cells_wholly_on_wall(rig: Rig) -> Mask:
+    """Return a mask (64, 80) of the cells all of whose BEAMS x BEAMS beams meet the wall, past the
+    occluder.
+
+    `bare_bench.cells_on_wall` is another rule: by the cells' middle beams, less a margin of a cell.
+    """
+    # A cell is the mean over its beams: one at an edge mixes wall and occluder.
     on_wall = cast(rig, rig.pinhole.scaled(BEAMS * MAP_COLUMNS, BEAMS * MAP_ROWS)).on_wall
     return np.all(on_wall.reshape(MAP_ROWS, BEAMS, MAP_COLUMNS, BEAMS), axis=(1, 3))
 

@@ -26,8 +26,8 @@ def brightest_light(rig: Rig) -> float:
 
 
 def cells_on_wall(rig: Rig) -> Mask:
-    """Return the cells (64, 80) that see the wall alone: neither the occluder nor its edge, whose
-    depth and light are not known.
+    """Return the cells (64, 80) that see the wall alone: those whose middle beam meets it, as do
+    their four neighbors', since depth and light of an edge are not known.
     """
     on_wall = cast(rig, rig.pinhole.scaled(MAP_COLUMNS, MAP_ROWS)).on_wall
     return interior(on_wall.reshape(MAP_ROWS, MAP_COLUMNS))

@@ -37,58 +37,68 @@ OFF_WALL_M = 0.009
 record, and far below the shortest detour over an object in a box (0.1 m).
 """
 NO_ECHO_M = 0.03
-"""Depth beyond the wall's below which no echo of an object in a box is: it is a wall that is farther
-than its record."""
+"""Depth beyond the wall's below which no echo of an object in a box lies: cells between OFF_WALL_M
+and this show a wall that is farther away than its record."""
 LOST_SHARE = 0.03
 """Share of the information from which on a frame is no longer judged by its networks. With a tenth
 of the rows missing a share of 0.09 is lost, and the silhouette IoU falls from 0.64 to 0.42.
 """
 MOVED_M = 0.006
-"""Median depth of the wall's cells off their record: beyond the error of a record and the drift of a
-range over an hour's warming."""
+"""Largest median distance of the wall's cells from their record, by the error of a record and the
+drift of a range over an hour's warming: beyond it the wall is not where it was calibrated."""
 NEARER_CELLS = 4
 NEARER_M = 0.01
-"""What half a degree of an unnoticed turn moves the farthest cells by."""
+"""The wall is not where it was calibrated either if more than NEARER_CELLS cells read nearer than
+it by NEARER_M: half a degree of an unnoticed turn moves the farthest cells that far."""
 UNLIKE_WALL_CELLS = 4
 UNLIKE_WALL = 0.2
-"""Logarithm of light over the wall's, in a cell of the wall's depth. Without texture, cells differ
-by 0.01."""
-TOO_DARK_CELLS = 4
-TOO_DARK = 0.15
-"""The same, below the wall's, in a cell that shows an echo."""
+"""Rule 2 is broken by this number of cells at the wall's depth whose light differs from the wall's
+by this logarithm. Without texture, cells differ by 0.01."""
 BRIGHT_INSIDE_CELLS = 8
 BRIGHT_INSIDE = 0.06
-"""The same well inside a region of the wall's depth."""
+"""Rule 2 is also broken by more cells than these that are brighter than the wall by this logarithm,
+well inside a region at the wall's depth."""
+TOO_DARK_CELLS = 4
+TOO_DARK = 0.15
+"""Rule 3 is broken by this number of cells with an echo that are darker than the wall by this
+logarithm."""
 DARK_INSIDE_CELLS = 30
 DARK_INSIDE = 0.05
-"""Light that a cell well inside a region of echoes exceeds: 97 % of unharmed frames have at most 17
-cells that do not."""
+"""Rule 3 is also broken by more cells than these, well inside a region of echoes, that are not
+brighter than the wall by this logarithm. 97 % of unharmed frames have at most 17 of them."""
 DARK_INSIDE_SHARE = 0.05
-"""Share of the cells inside that has to be dark as well: large regions have more of them."""
+"""Share of the cells inside that may be dark if it is more than DARK_INSIDE_CELLS, as in a large
+region."""
 ECHO_OVERLAP = 0.9
-"""Smallest overlap of the cells that are deeper than the wall with those that are brighter, on a
+"""Smallest `_overlap` of the cells that are deeper than the wall with those that are brighter, on a
 bench whose echoes are strong."""
 OVERLAP_BY_TEXTURE = 0.5
-"""What a wall that is not uniform takes from it, for each unit of its limit above BRIGHTER."""
+"""Overlap that a textured wall may take, for each unit by which TEXTURE_SPREADS of its light exceed
+BRIGHTER."""
 OVERLAP_MARGIN = 0.04
-"""What noise may take from the overlap of rendered objects."""
+"""Overlap that noise may take from that of rendered objects."""
 MIN_ECHO_CELLS = 100
+"""Cells with an echo below which the overlap is not judged."""
 BRIGHTER = 0.1
+"""Logarithm of light over the wall's above which a cell counts as brighter."""
 SEAM = 0.07
 """Mean jump of the light between two rows, in units of the largest that counts: 0.028 at most where
 nothing moves, 0.064 where an airplane flies while the rows are scanned, 0.12 mostly where the rows
 below are of another object."""
 SEAM_LIMIT = 0.3
+"""Largest jump that counts, as a logarithm of light."""
 TILT = 0.06
 """Change of the wall's light over the height of the view, as a logarithm: three rows of shift cause
 0.09, one row 0.03."""
 NOISE_SIGMAS = 4.0
-"""What a limit is raised to by the sensor's noise, in cells of a few counts."""
+"""A limit on the light is at least this number of standard deviations of the sensor's noise, which
+counts in cells of a few counts."""
 CELL_PIXELS = 60
 """Pixels of a cell, of 640 x 480 of a frame."""
 SENSOR = SensorModel()
 TEXTURE_SPREADS = 5.0
-"""Spreads of the wall's own light that a limit is raised to, for walls that are not uniform."""
+"""A limit on the light is at least this number of standard deviations of the wall's own light, for
+walls with texture."""
 INFORMATION_OBJECTS = 16
 INFORMATION_SEED = 910_000
 
@@ -227,40 +237,51 @@ def _unlike(
     at_wall: Mask,
     echo: Mask,
     unsaturated: Mask,
-    usual: float,
+    min_overlap: float,
 ) -> bool:
-    """Return True if light and depth name different echoes as the stronger one (2 and 3); `usual`
-    is the least overlap of both that objects on this bench have.
+    """Return True if light and depth name different echoes as the stronger one (rules 2 and 3).
+
+    `light` (64, 80) is the logarithm of each cell's light over the bare wall's, `noise` (64, 80) a
+    bound on its noise, and `spread` its standard deviation over the wall. `min_overlap` is the
+    least overlap of brighter with deeper cells that objects on this bench have.
     """
     texture = TEXTURE_SPREADS * spread
     allowed = np.maximum(noise, texture)
-    if (at_wall & (np.abs(light) > np.maximum(UNLIKE_WALL, allowed))).sum() >= UNLIKE_WALL_CELLS:
+
+    # Rule 2: a cell at the wall's depth returns the wall's light.
+    other_light = at_wall & (np.abs(light) > np.maximum(UNLIKE_WALL, allowed))
+    if other_light.sum() >= UNLIKE_WALL_CELLS:
         return True
-    if (echo & (light < -np.maximum(TOO_DARK, allowed))).sum() >= TOO_DARK_CELLS:
-        return True
-    bright = interior(at_wall) & (light > np.maximum(BRIGHT_INSIDE, allowed))
-    if bright.sum() > BRIGHT_INSIDE_CELLS:
-        return True
-    # on a textured wall some of the cells inside are darker by chance: the limit falls with it
-    dark = light < min(DARK_INSIDE, DARK_INSIDE + 2 * BRIGHT_INSIDE / TEXTURE_SPREADS - 2 * spread)
-    inside = interior(echo)
-    dark_inside = (inside & unsaturated & dark).sum()
-    if dark_inside > max(DARK_INSIDE_CELLS, DARK_INSIDE_SHARE * inside.sum()):
+    bright_inside = interior(at_wall) & (light > np.maximum(BRIGHT_INSIDE, allowed))
+    if bright_inside.sum() > BRIGHT_INSIDE_CELLS:
         return True
 
+    # Rule 3: a cell with an echo returns at least the wall's light, and more inside its region.
+    too_dark = echo & (light < -np.maximum(TOO_DARK, allowed))
+    if too_dark.sum() >= TOO_DARK_CELLS:
+        return True
+    # Texture makes some inner cells darker by chance, so the limit falls by two of its spreads,
+    # counted from the spread at which texture begins to raise BRIGHT_INSIDE.
+    lowered = DARK_INSIDE + 2 * BRIGHT_INSIDE / TEXTURE_SPREADS - 2 * spread
+    inside = interior(echo)
+    dark_inside = inside & unsaturated & (light < min(DARK_INSIDE, lowered))
+    if dark_inside.sum() > max(DARK_INSIDE_CELLS, DARK_INSIDE_SHARE * inside.sum()):
+        return True
+
+    # Both rules together: the same cells are brighter and deeper.
     if echo.sum() < MIN_ECHO_CELLS:
         return False
     brighter = (at_wall | echo) & unsaturated & (light > max(BRIGHTER, texture))
     by_texture = OVERLAP_BY_TEXTURE * max(texture - BRIGHTER, 0.0)
-    return _overlap(brighter, echo & unsaturated) < usual - by_texture
+    return _overlap(brighter, echo & unsaturated) < min_overlap - by_texture
 
 
 def _overlap(brighter: Mask, deeper: Mask) -> float:
-    """Return the share (0 to 1) of cells that are brighter and deeper than the wall, or neither, of
-    those that are either.
+    """Return the overlap, 0 to 1, of the cells that are brighter than the wall with those that are
+    deeper: 1 less the cells that are only one of both, over those that are either.
 
-    To a cell: an echo's lead grows from zero at the region's outline, so that its rim is deeper and
-    hardly brighter, and small regions are mostly rim.
+    A difference of one cell in the outline does not count: an echo's lead grows from zero there, so
+    that its rim is deeper and hardly brighter, and small regions are mostly rim.
     """
     beside = ~interior(~deeper)
     unlike = (brighter & ~beside) | (interior(deeper) & ~brighter)

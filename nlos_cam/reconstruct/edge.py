@@ -1,9 +1,9 @@
 """Cells at the occluder's edge, where a bench that is a little off its record differs most from it.
 
 A column of cells there sees the wall in place of the occluder, or the other way round, as soon as
-the lidar or the occluder stands some millimetres elsewhere. These few cells are then off by far more
-than an object moves any, and networks answer them with nonsense. What they ought to show is known: an
-occluder's cell tells nothing, and a wall's cell much what its neighbors tell.
+the lidar or the occluder stands some millimetres elsewhere. The error of these few cells is then
+far larger than the change by any object, and networks answer with nonsense. But their right values
+are known: an occluder's cell holds no information, and a wall's cell about that of its neighbors.
 """
 
 from collections.abc import Sequence
@@ -28,7 +28,7 @@ BEAMS_PER_CELL = 4
 SIGNS = -1, 1
 REACH_M = 0.005
 REACH_DEG = 1.0
-"""How far off its record a bench may be whose edge is repaired. Farther ones are another bench."""
+"""Largest error of a bench's record up to which its edge is repaired, in place and in angle."""
 OTHER_SURFACE_M = 0.03
 """Depth off its surface's from which on a cell sees the other one: most occluders stand 0.05 m and
 more before the wall, and a wall seen at a slant moves by a centimeter with a degree."""
@@ -45,8 +45,9 @@ FALLING_CELLS = 0.06
 the occluder is in it. Of 108 unharmed frames no column has more than 0.03: echoes do not end just
 where the occluder begins."""
 SLOPE = 0.5
-"""Share of the last step, from column to column, that the next one takes: at 2 mm and half a degree
-a whole one is as good, at 5 mm and a degree, where an echo may end, worse by 0.02 of IoU."""
+"""Share of the step between the two columns before, by which a repaired column of the wall goes on.
+On benches 2 mm and half a degree off their record, 1 is as good; at 5 mm and a degree, where an
+echo may end, 1 costs 0.02 of IoU."""
 
 
 def edge_cells(rig: Rig, place_m: float, angle_deg: float) -> Mask:
@@ -145,11 +146,7 @@ class Edge(NamedTuple):
         if not band.any():
             return None
         occluded = _occluded(rig, 1)[:, :, 0]
-        every = np.arange(MAP_COLUMNS)
-        wall_at, occluder_at = (
-            (mask.sum(0) @ every) / max(mask.sum(), 1) for mask in (~occluded, occluded)
-        )
-        step = 1 if occluder_at > wall_at else -1
+        step = 1 if _mean_column(occluded) > _mean_column(~occluded) else -1
         columns = np.flatnonzero(band.any(0))[::step].tolist()
         return cls(
             _surface(_bare(rig.model_copy(update={"occluder": None})), bench, band, ~occluded),
@@ -283,6 +280,12 @@ class EdgeRepair:
             elif occluder_gain is not None:  # else its light is not known
                 edge.restore_occluder(repaired, fault.column, occluder_gain)
         return repaired
+
+
+def _mean_column(cells: Mask) -> float:
+    """Return the mean column of some cells; 0 for none."""
+    columns = np.arange(MAP_COLUMNS)
+    return float(cells.sum(0) @ columns / max(cells.sum(), 1))
 
 
 def _bare(rig: Rig) -> Rendering:

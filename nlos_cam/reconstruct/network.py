@@ -173,10 +173,7 @@ def _run_network(batch: Sequence[LidarMaps], network: Network) -> Answer:
     for such maps.
     """
     shape = len(batch), OBJECT_PIXELS, OBJECT_PIXELS
-    images = np.zeros(shape, np.float32)
-    # v is 0 where there is no surface: a direct network's graph has cut each image, of six cuts of
-    # the probability p of a surface, at the one whose expected IoU is largest, sum of p inside over
-    # sum of p everywhere and of 1 - p inside.
+    images = np.zeros(shape, np.float32)  # v is 0 where there is no surface
     valid = [index for index, maps in enumerate(batch) if maps.valid.any()]
     if not valid:
         return Answer(images, None)

@@ -21,7 +21,7 @@ from nlos_models import (
 
 from nlos_cam.files import cache_folder
 from nlos_cam.frames import Frame, LidarMaps, MapMean, maps_from_frame
-from nlos_cam.objects import SurfaceMesh
+from nlos_cam.objects import MAX_UNCERTAINTY_M, SurfaceMesh
 from nlos_cam.reconstruct.alignment import MapAlignment, alignment, check_alignable
 from nlos_cam.reconstruct.bench import BenchObservation, CalibratedRig
 from nlos_cam.reconstruct.consistency import COMPLETE, MapConsistency, MapFindings
@@ -53,8 +53,6 @@ from nlos_cam.reconstruct.verdict import (
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-MAX_UNCERTAINTY_MM = 30.0
-"""Uncertainty drawn brightest."""
 CHECK_HOLDS_FRAMES = 150
 """Frames (5 s) for which a physics check counts: it runs once a second, longer on a busy machine."""
 TRUSTED_MISSING = 0.02
@@ -172,7 +170,7 @@ def plot_result(result: FrameResult) -> "Figure":
     maps = [("distance from the wall (cm)", 100 * result.depth_m, "inferno_r", near_cm, far_cm)]
     if result.uncertainty_m is not None:
         shown_mm = np.where(np.isnan(result.depth_m), np.nan, 1e3 * result.uncertainty_m)
-        maps.append(("uncertainty (mm)", shown_mm, "viridis", 0.0, MAX_UNCERTAINTY_MM))
+        maps.append(("uncertainty (mm)", shown_mm, "viridis", 0.0, 1e3 * MAX_UNCERTAINTY_M))
 
     figure = figure_of(4.2 * len(maps), 3.6)
     axes = figure.subplots(1, len(maps), squeeze=False)[0]
@@ -305,7 +303,8 @@ class Pipeline:
         difference = observation.difference
         corrected = own.steps(maps, observation.drift_m)
         if aligned:
-            # The difference has no drift in it, and neither has what it adds to the training wall.
+            # The difference is free of drift, but was taken before the edge was repaired: the depth
+            # that the repair adds comes on top.
             drift_free_m = difference.depth_m if difference else None
             if drift_free_m is not None and corrected.edge_is_repaired:
                 moved_m = corrected.repaired.depth_m - corrected.ranged.depth_m
@@ -326,15 +325,15 @@ class Pipeline:
             "bench": observed_s - mapped_s,
         }
         return PreparedFrame(
-            arrival,
-            maps,
-            observation,
-            own.as_rendered(corrected.exact),
-            network_input,
-            corrected.edge_is_repaired,
-            findings,
-            frozen,
-            stages_s,
+            arrival=arrival,
+            maps=maps,
+            observation=observation,
+            checked=own.as_rendered(corrected.exact),
+            network_input=network_input,
+            edge_is_repaired=corrected.edge_is_repaired,
+            findings=findings,
+            frozen=frozen,
+            stages_s=stages_s,
         )
 
     def reconstruct(self, frames: Sequence[PreparedFrame], clock: Clock) -> list[Reconstruction]:
@@ -361,8 +360,8 @@ class Pipeline:
         if shown.uncertainty:
             warnings += problems_of(conditions)
 
-        # What the renderer computes knows no ripples of the lidar and no texture of the wall: they
-        # would make an empty bench one that shows something.
+        # The check renders a uniform wall as an exact lidar sees it, and gets maps corrected to
+        # that: else ripples of the lidar and texture of the wall would look like an object.
         self.checks.offer(frame.frame_number, prepared.checked, shown.depth_m)
         return FrameResult(
             frame,

@@ -38,9 +38,9 @@ NEAR_WALL = 0.05
 """Share of the view that a smaller wall may leave without any."""
 
 HOME_IOU = {DIRECT: 0.790, WIDE: 0.834}
-"""Silhouette IoU of the shipped weights of one rig on it."""
+"""Silhouette IoU of the shipped weights for one rig, by their name, on that rig."""
 GUESS_IOU = 0.3
-"""Of weights that a rig is beyond: no better than a guess."""
+"""Silhouette IoU of a guess: weights on a rig far from theirs are expected to do no better."""
 _PAPERS_YAW_DEG = 45.0
 
 Service = Literal["trained for it", "near", "far", "not"]
@@ -97,17 +97,22 @@ def weights_serve(
         )
         return WeightsVerdict("not", sentence, expected_iou)
 
-    service = "not"
-    outcome = "do not serve this bench: its maps cannot be aligned with their rig's"
-    if rig_to_align_with(rig, trained):
-        service = "near" if _deviation(rig, wanted) <= 1 else "far"
-        outcome = (
-            "may not serve this bench: it is far from their rig, with which its maps are aligned"
-        )
-        if service == "near":
-            outcome = "serve this bench, aligned with their rig, with larger errors"
+    service, outcome = _aligned_serves(rig, trained, wanted)
     difference = "; ".join(rig_difference(rig, wanted))
     return WeightsVerdict(service, f"the weights {outcome} ({difference}); {advice}", expected_iou)
+
+
+def _aligned_serves(rig: Rig, trained: CheckpointRecord, own: Rig) -> tuple[Service, str]:
+    """Return whether weights that were trained for one rig, `own`, serve another, and the predicate
+    of the sentence that says so.
+    """
+    if not rig_to_align_with(rig, trained):
+        return "not", "do not serve this bench: its maps cannot be aligned with their rig's"
+    if _deviation(rig, own) <= 1:
+        return "near", "serve this bench, aligned with their rig, with larger errors"
+    return "far", (
+        "may not serve this bench: it is far from their rig, with which its maps are aligned"
+    )
 
 
 def _grid_serves(rig: Rig, own: Rig | None) -> tuple[Service, str]:
@@ -137,33 +142,39 @@ def _grid_serves(rig: Rig, own: Rig | None) -> tuple[Service, str]:
 
 
 class AlignedTerms(NamedTuple):
-    """Differences of a rig from that of weights, by which its aligned maps lose."""
+    """Differences of a rig from that of weights, which cost IoU although its maps are aligned."""
 
     farther_m: float
-    """Of the lidar from the wall."""
+    """Distance from lidar to wall beyond that of the weights' rig; 0 for a nearer lidar."""
     nearer_m2: float
-    """Squared: a lidar that is 2 cm nearer loses little."""
+    """Distance from lidar to wall short of that of the weights' rig, squared: 2 cm cost little."""
     turned_deg: float
+    """Absolute difference in yaw."""
     gap_m: float
+    """Absolute difference in the occluder's gap."""
 
 
 class AnyTerms(NamedTuple):
-    """Numbers of a rig by which weights for any rig do well or badly on it."""
+    """Numbers of a rig that decide how well weights for any rig do on it."""
 
     always: float
+    """1, whose gain is the constant of the fit."""
     gap_m: float
+    """Occluder's gap, at most ENOUGH_GAP_M."""
     flatter_deg: float
-    """Of the lidar's axis to the wall's normal, from the paper's 45 degrees on."""
+    """Yaw below the paper's 45 degrees; 0 for a larger one."""
     distance_m: float
-    """Of the lidar from the wall."""
+    """Distance from lidar to wall."""
 
 
 LOSSES = AlignedTerms(farther_m=1.971, nearer_m2=40.68, turned_deg=0.00354, gap_m=1.461)
-"""Silhouette IoU that aligned maps lose by each (tools/studies/serving.py: to 0.046)."""
+"""Loss of silhouette IoU for a unit of each term; the fit of tools/studies/serving.py errs by 0.046
+(root mean square)."""
 ANY_GAINS = AnyTerms(always=0.4907, gap_m=2.181, flatter_deg=-0.00292, distance_m=-0.412)
-"""Silhouette IoU of the shipped weights for any rig by each (the same study: to 0.039)."""
+"""Gain of silhouette IoU of the shipped weights for any rig, for a unit of each term; the fit of
+the same study errs by 0.039."""
 ENOUGH_GAP_M = 0.13
-"""Gap from which on a wider one brings those weights nothing more."""
+"""Gap beyond which a wider one does not help the weights for any rig."""
 
 
 def aligned_terms(rig: Rig, own: Rig) -> AlignedTerms:

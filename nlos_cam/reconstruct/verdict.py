@@ -24,12 +24,14 @@ class Verdict(StrEnum):
     """Reliability of one frame's reconstruction; if several verdicts hold, the last of them in this
     order is given.
 
-    SEEN: there is an object like those of the training set. NOTHING: the bench is empty; no surface
-    is shown. OUTSIDE: what is shown, also if it is nothing, is not reliable, because it is out of
-    distribution (OOD), or the physics check does not explain the maps by it, or the maps cannot be
-    those of any object on this bench (`MapConsistency`), or there is no surface, or half of the
-    frame has no depth. SATURATED, WALL_MOVED: the lidar's data are not usable, whatever was
-    reconstructed. STALLED: no newer frame has come, or the same one again and again.
+    SEEN: there is an object like those of the training set.
+    NOTHING: the bench is empty; no surface is shown.
+    OUTSIDE: the picture, also an empty one, is not reliable. The object is out of distribution
+    (OOD); or the physics check does not explain the maps by the picture; or the maps cannot be
+    those of any object on this bench (`MapConsistency`); or half of the frame has no depth; or the
+    bench does not look empty, and no surface was found.
+    SATURATED, WALL_MOVED: the lidar's data are not usable, whatever was reconstructed.
+    STALLED: no newer frame has come, or the same one again and again.
     """
 
     SEEN = "object seen"
@@ -51,8 +53,8 @@ class VerdictLimits:
     nothing: float
     """Probability that nothing is hidden: 999 of 1,000 empty benches reach it; at most 0.5."""
     outside: float
-    """Probability of an object out of distribution: 15 % of ordinary objects reach it, the price
-    for nine in ten of those that are.
+    """Probability that the object is out of distribution. At this limit 15 % of ordinary objects
+    count as such, and nine in ten of those that are.
     """
     unexplained: float = float("inf")
     """Score of the physics check; see UNEXPLAINED."""
@@ -163,8 +165,10 @@ class VerdictFilter:
 
     @staticmethod
     def _is_unexplained(conditions: FrameConditions, limit: float, *, shown: bool) -> bool:
-        """Return True if the check of a like picture, of a surface or of none, did not explain the
-        maps.
+        """Return True if the check did not explain the maps, with a score of at least `limit`.
+
+        A recent check counts only for pictures of its own kind: with a surface if `shown`, else of
+        an empty bench.
         """
         check = conditions.check
         return check is not None and check.has_surface == shown and check.score >= limit

@@ -527,9 +527,6 @@ def _patch_rows(
         return
 
     # Then the needed nodes, LANES at a time; the last vector may not be full, and its spare lanes
-    # keep the axes of earlier nodes, which no beam reads.
-
-    # Then the needed nodes, LANES at a time; the last vector may not be full, and its spare lanes
     # keep the axes of earlier nodes: no beam reads their rows.
     chunks = _chunks(cells)
     axes = np.zeros((4, LANES), np.float32)

@@ -235,9 +235,6 @@ def _fall(squared: np.float32, soft: np.float32, optics: NumbaOptics) -> np.floa
     # The weight is [cosines' ends] d^-k / g, with g = d^2 + soft ramp^2 (S2, limited at contact)
     # and ramp = 1 - d^2 / near^2. So -2 d log / d(d^2) = k / d^2 + 2 g' / g, and
     # g' = 1 - 2 soft ramp / near^2. Each of k cosines divides by d once.
-    # The weight is [cosines' ends] d^-k / g, with g = d^2 + soft ramp^2 (S2, limited at contact)
-    # and ramp = 1 - d^2 / near^2. So -2 d log / d(d^2) = k / d^2 + 2 g' / g, and
-    # g' = 1 - 2 soft ramp / near^2.
     ramp = max(one - squared / optics.near_m2, np.float32(0))
     lengths = two if optics.lambertian else one
     return lengths / squared + two * (one - two * soft * ramp / optics.near_m2) / (
@@ -345,7 +342,6 @@ def _push_legs(
     nothing = np.float32(0)
     height = pz / z if (outgoing or optics.lambertian) and z > nothing else nothing
     for i in range(len(light)):
-        # v = point - patch changes by (vx, vy, -pz): the wall's points stay in its plane.
         dx = points.x_m[i] - x
         dy = points.y_m[i] - y
         vx = moved.x[i] - px

@@ -12,7 +12,7 @@ from nlos_calibration.arrays import Float32, Mask, UInt8
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
-from nlos_cam.objects import image_from_depth
+from nlos_cam.objects import MAX_UNCERTAINTY_M, image_from_depth
 
 Span = TypeVar("Span")
 
@@ -30,8 +30,6 @@ CHANGED_M = 0.01
 FEW_CHANGED = 0.02
 QUIET_SPAN_M = 0.02
 """Differences below are noise and ripples; if few cells differ by more, the span shows these."""
-MAX_UNCERTAINTY_M = 0.03
-"""Uncertainty drawn brightest; the object box is 0.28 m deep."""
 FADED = 0.35
 """Share of color left in an untrusted picture."""
 

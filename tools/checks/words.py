@@ -1,5 +1,7 @@
 """Check that docstrings and docs use the field's words: rates of five prose patterns per package.
 
+The texts below fields and constants count as docstrings.
+
 Prints one line per package and exits with 1 where a rate is above its limit, naming the lines to
 rewrite. Options set the limits: `--begin` in percent of docstrings, the others per 1,000 words.
 """
@@ -9,6 +11,7 @@ import ast
 import re
 import sys
 from collections.abc import Iterator
+from itertools import pairwise
 from pathlib import Path
 
 ROOT = Path(__file__).parents[2]
@@ -36,6 +39,15 @@ Text = tuple[str, int, str]
 """File, number of its first line, and text."""
 
 
+def of_fields(body: list[ast.stmt]) -> Iterator[tuple[int, str]]:
+    """Yield first line and text of the docs that follow the fields or constants of a body."""
+    for before, after in pairwise(body):
+        follows = isinstance(before, ast.Assign | ast.AnnAssign) and isinstance(after, ast.Expr)
+        text = after.value.value if follows and isinstance(after.value, ast.Constant) else None
+        if isinstance(text, str):
+            yield after.lineno, text
+
+
 def scan(folder: Path) -> tuple[list[Text], list[str]]:
     """Return the docstrings below a folder, and the lines that define a MOST_, LEAST_ or SOME_
     name.
@@ -48,6 +60,7 @@ def scan(folder: Path) -> tuple[list[Text], list[str]]:
             if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef):
                 if doc := ast.get_docstring(node, clean=False):
                     docs.append((file, node.body[0].lineno, doc))
+                docs += [(file, line, text) for line, text in of_fields(node.body)]
             elif (
                 isinstance(node, ast.Name)
                 and isinstance(node.ctx, ast.Store)

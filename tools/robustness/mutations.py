@@ -60,9 +60,7 @@ TYPES += ["sensor_msgs/PointCloud2", "evil_msgs/Unknown"]
 SENSORS = "0", "1", "99", "9" * 5000, "-1", "٣"
 DEPTH = 20_000
 LENGTH = re.compile(rb"(?s)....(?=(?:compression|conn|count|index_pos|op|size|topic|time)=)")
-"""The length of a record's field; what is 4 bytes before it may be the length of the record's
-header.
-"""
+"""The length of a record's field; the 4 bytes before it may be the length of the record's header."""
 ABSURD = (0, 1, 0x7FFFFFFF, 0x80000000, 0xFFFFFFFF, 0xFFFFFFF0)
 
 

@@ -57,7 +57,7 @@ class Minute:
 
 
 def watch(address: str, stop: Event, visits: list[int], visit_s: float) -> None:
-    """Read the view's stream for `visit_s`, leave, and come again, until told to stop; `visits`
+    """Read the view's stream for `visit_s`, leave, and come again, until `stop`; `visits`
     counts those who were shown something.
     """
     while not stop.wait(PAUSE_S):

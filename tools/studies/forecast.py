@@ -164,15 +164,9 @@ def fit(
         "offset": offset,
         "scatter_left_out": float(np.sqrt(np.mean(errors**2))),
         "largest_error_left_out": float(np.abs(errors).max()),
-        "rank_correlation": rank_correlation(linear, network),
+        "rank_correlation": harness.rank_correlation(linear, network),
         "network_rmse_over_linear": [float(v) for v in np.percentile(rmse, (10, 50, 90))],
     }
-
-
-def rank_correlation(one: Float64, other: Float64) -> float:
-    """Return Spearman's rank correlation."""
-    ranks = np.stack([np.argsort(np.argsort(values)) for values in (one, other)])
-    return float(np.corrcoef(ranks)[0, 1])
 
 
 def draw(rows: list[Measured], forecasts: list[Forecast], found: dict[str, Any]) -> Figure:

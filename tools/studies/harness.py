@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
+from nlos_calibration.arrays import Float64
 from nlos_calibration.errors import CalibrationError
 from nlos_models.errors import ModelError
 
@@ -105,6 +106,13 @@ def wilson(count: int, of: int) -> dict[str, Any]:
         "low": max(0.0, middle - half),
         "high": min(1.0, middle + half),
     }
+
+
+def rank_correlation(one: Float64, other: Float64) -> float:
+    """Return Spearman's rank correlation."""
+    # a rank is a value's place in the order: the inverse of the permutation that sorts
+    ranks = [np.argsort(np.argsort(values)) for values in (one, other)]
+    return float(np.corrcoef(ranks)[0, 1])
 
 
 def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:

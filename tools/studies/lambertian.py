@@ -18,8 +18,8 @@ import harness
 from matplotlib.figure import Figure
 
 from nlos_cam.adapt import OBJECTS
+from nlos_cam.camera import FRAMES_PER_S
 
-FRAMES_PER_S = 30
 SECONDS = 30, 300, 3600
 MATERIALS = "matt", "retroreflective"
 RIG = "paper-rig"

@@ -19,9 +19,9 @@ as `live` forms them, from one place (home), two (home and near) and four. Outli
 
 How far the model is trusted, the share of the covariance and the weight of the depth's prior are
 chosen by the IoU of TUNING other objects, seen from home and near. Of the first two ways the figures
-hold what the estimate, its start and the truth leave of the light ("cost", of one echo): a truth that
-costs more than the estimate says that the light and the model do not tell them apart, one that costs
-less that the search has not found it. WORK keeps the figures of each object: a second call goes on.
+hold the light that the estimate, its start and the truth leave unexplained ("cost", of one echo).
+Where the truth costs more than the estimate, light and model do not distinguish them; where it costs
+less, the search has not found it. WORK keeps the figures of each object: a second call goes on.
 """
 
 import json
@@ -79,30 +79,31 @@ FRAMES = 30
 SCHEDULE = (4.0, 4.0, 2.0, 2.0, *[1.0] * 6)
 """Steps, by how much looser than at the end the model's light is trusted."""
 DAMPING = 1.0
-"""At first, as a multiple of the prior's precision: a step is not to leave what the linear model
-holds for."""
+"""At first, as a multiple of the prior's precision: a step must stay where the linear model
+holds."""
 RELAXED = 4.0
 """Factor by which damping falls after a step that improves."""
 TIGHTENED = 5.0
 """Factor by which it rises after one that does not."""
 MAX_DAMPING = 1e5
 TRIES = 5
-"""Of one step."""
+"""Dampings that are tried for one step."""
 TUNING = 12
 TUNING_SEED = 96_000_000
 TUNED_ON = "home+near"
 TRUSTS = 0.1, 0.2, 0.4
 """Errors of the model relative to the light to choose from."""
 LOOSE_TRUSTS = 0.1, 0.3, 1.0
-"""Of the lifted form."""
+"""The same for "lifted", whose model is rougher."""
 SHARES = 0.1, 0.3
-"""Of the prior's covariance about the network's answer."""
+"""Shares of the forecast prior's covariance that "network in the loop" chooses its own from."""
 WEIGHTS = 0.1, 1.0
-"""Of the depth's prior in the lifted form."""
+"""Weights of the prior of the depth that "lifted" chooses from."""
 DEPTH_STD = 0.1
-"""Deviation of the network's depth in the lifted form, of the box's depth."""
+"""Standard deviation of the network's depth in "lifted", as a share of the box's depth."""
 MAX_CORRECTION = 3.0
-"""Of a beam's light by tilt and self-occlusion, from the median of all."""
+"""Largest factor by which a beam's correction for tilt and self-occlusion may differ from the
+median of all beams."""
 PATH_ERROR_M = 0.01
 MAX_OFF = 3.0
 """Largest residual of a path, in units of PATH_ERROR_M."""
@@ -118,7 +119,7 @@ UNMODELLED = 0.02
 """Variance of an outline's cell beyond the prior's components."""
 DESCENTS = 150
 BEAM_STEP = 16
-"""Every so many beams tell how long light takes from a patch on, which is the same for all."""
+"""One beam of this number gives the path length from a patch on, which is the same for all."""
 
 
 @dataclass(frozen=True)

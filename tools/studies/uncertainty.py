@@ -139,11 +139,6 @@ def coverage(expected: Float64, observed: Float64) -> list[dict[str, float]]:
     ]
 
 
-def rank_correlation(one: Float64, other: Float64) -> float:
-    """Return Spearman's rank correlation."""
-    return float(np.corrcoef(*(np.argsort(np.argsort(values)) for values in (one, other)))[0, 1])
-
-
 def of_objects(answers: Sequence[Answer], truth: NDArray[np.floating], rig: Rig) -> dict[str, Any]:
     """Summarize ordinary objects: false alarms, and quality of the uncertainty."""
     truth_m = depth_from_image(np.asarray(truth, np.float32), object_box(rig))
@@ -166,8 +161,8 @@ def of_objects(answers: Sequence[Answer], truth: NDArray[np.floating], rig: Rig)
         ),
         "expected_mm": 1e3 * expected.mean(),
         "observed_mm": 1e3 * observed.mean(),
-        "rank_correlation_of_pixels": rank_correlation(expected, observed),
-        "rank_correlation_of_objects": rank_correlation(*np.array(both).T),
+        "rank_correlation_of_pixels": harness.rank_correlation(expected, observed),
+        "rank_correlation_of_objects": harness.rank_correlation(*np.array(both).T),
         "reliability": reliability(expected, observed),
         "coverage": coverage(expected, observed),
         "surface": [
