@@ -21,7 +21,7 @@ from nlos_calibration.arrays import Float64
 from nlos_calibration.errors import CalibrationError
 from nlos_models.errors import ModelError
 
-from nlos_cam.cli.common import progress
+from nlos_cam.cli.common import tracked
 from nlos_cam.cli.main import main as nlos_cam
 from nlos_cam.errors import NlosCamError
 from nlos_cam.evaluate import format_interval
@@ -71,15 +71,14 @@ def collect(
         else []
     )
     grid = [(i, seed) for i in range(len(settings)) for seed in range(seeds)]
-    with progress() as bar, store.open("a", encoding="utf-8") as file:
-        for i, seed in bar.track(
-            grid[len(done) :], total=len(grid), completed=len(done), description=name
-        ):
+    with tracked(name) as on_progress, store.open("a", encoding="utf-8") as file:
+        for i, seed in grid[len(done) :]:
             measured = measure(settings[i], np.random.default_rng([i, seed]))
             line = json.dumps(asdict(settings[i]) | {"seed": seed} | dict(measured))
             file.write(line + "\n")
             file.flush()
             done.append(json.loads(line))
+            on_progress(len(done), len(grid))
     store.unlink()
     return done
 
