@@ -140,8 +140,8 @@ class CellNormal(nn.Module):
         """Shift the medians of some or all channels as maps (n, 64, 80) of another bench ask for:
         its offset, its gain.
 
-        One number a channel, the median over the cells: of a few objects each cell's own
-        median is not known.
+        One number a channel, the median over the cells: a few objects are too few for each
+        cell's own median.
         """
         # Differences from the training rig's medians, and their median: an offset of the device
         # or a gain of the bench is common to all cells, an object is not.

@@ -36,8 +36,8 @@ LEVELS = 0.1, 0.5, 0.9
 """Quantiles of the predicted IoU."""
 OUTPUTS = len(LEVELS) + 4
 """Logits of the IoU's quantiles, of a good outline on any shape and on one of the 18 kinds, and of
-such a kind; then the logarithm of the depth error. Older records have two fewer, for
-lack of those on kinds."""
+such a kind; then the logarithm of the depth error. Older records have two fewer:
+they lack those on kinds."""
 KINDS_ODDS = 0.03
 """Factor on the fit's odds of one of the 18 kinds: a user's object is seldom one, and the networks
 read kinds into other shapes."""

@@ -47,7 +47,11 @@ def setting_as_started(camera: Camera) -> Setting:
     """Return the options that an entered camera started with, so that a session which goes on later
     is measured under them too: a lidar may choose its laser power at every start.
     """
-    options = {name: float(each["value"]) for name, each in _swept_options(camera).items()}
+    return _as_started(_swept_options(camera))
+
+
+def _as_started(swept: Mapping[str, Mapping[str, Any]]) -> Setting:
+    options = {name: float(each["value"]) for name, each in swept.items()}
     return Setting(name=BASELINE.name, options=options)
 
 
@@ -66,7 +70,7 @@ def swept_settings(camera: Camera) -> tuple[Setting, ...]:
     swept = _swept_options(camera)
     if not isinstance(camera, AdjustableCamera) or not swept:
         raise CameraError(f"{camera.uri} offers no options to sweep: leave out --settings sweep")
-    as_started = setting_as_started(camera)
+    as_started = _as_started(swept)
     start = as_started.options
     settings = [as_started]
     for name, each in swept.items():

@@ -86,6 +86,11 @@ class Plan(Record):
         return self
 
     @property
+    def is_simulated(self) -> bool:
+        """True for a simulated camera."""
+        return self.camera.startswith("sim")
+
+    @property
     def blocks(self) -> int:
         """Number of blocks."""
         return self.turns // BLOCK_TURNS

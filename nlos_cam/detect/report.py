@@ -231,7 +231,7 @@ def _settings_table(plan: Plan) -> Table:
 def facts(analysis: Analysis, *, show_serial: bool = False) -> dict[str, str]:
     """Return the session's circumstances by name."""
     plan = analysis.plan
-    camera = plan.camera if show_serial and not _is_simulated(plan) else _public_camera(plan)
+    camera = plan.camera if show_serial and not plan.is_simulated else _public_camera(plan)
     now = f"{with_commit(__version__, program_commit())}, {source_checksum()}"
     measured = f"{plan.version}, {plan.source}"
     found = {
@@ -253,11 +253,10 @@ def facts(analysis: Analysis, *, show_serial: bool = False) -> dict[str, str]:
 
 def command_of(plan: Plan) -> str:
     """Return the command that measures by this plan, without a serial number or folders."""
-    kind = plan.camera.partition(":")[0]
     words = ["nlos-cam detect", _public_camera(plan)]
     if plan.rig_option:
         words.append(plan.rig_option)
-    elif plan.rig and kind != "sim":  # of a session from before the option was stored
+    elif plan.rig and not plan.is_simulated:  # of a session from before the option was stored
         words.append("--wall wall.toml")
     words.append(f"--turns {plan.turns} --frames {plan.frames} --alpha {plan.alpha:g}")
     words += ["--settings sweep"] if len(plan.settings) > 1 else []
@@ -265,14 +264,10 @@ def command_of(plan: Plan) -> str:
     return " ".join([*words, "--out FOLDER"])
 
 
-def _is_simulated(plan: Plan) -> bool:
-    return plan.camera.startswith("sim")
-
-
 def _public_camera(plan: Plan) -> str:
     """Return the camera without a serial number, and without the folders of a simulated scene."""
     kind, _, rest = plan.camera.partition(":")
-    return f"{kind}:{Path(rest).name}" if _is_simulated(plan) and rest else kind
+    return f"{kind}:{Path(rest).name}" if plan.is_simulated and rest else kind
 
 
 def _maps(analysis: Analysis) -> list[Picture]:

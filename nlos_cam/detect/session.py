@@ -34,8 +34,7 @@ class Session:
         if is_session(folder):
             session = cls.open(folder)
             # A real camera is known by its serial number; simulated ones share theirs.
-            simulated = plan.camera.startswith("sim")
-            for name in (*TOGETHER, "camera") if simulated else TOGETHER:
+            for name in (*TOGETHER, "camera") if plan.is_simulated else TOGETHER:
                 if getattr(session.plan, name) != getattr(plan, name):
                     raise RecordingError(
                         f"{folder} was begun with another {name}: repeat that command, or choose"

@@ -130,12 +130,13 @@ def main() -> None:
     whole = asked.work / "whole"
     timed = asked.work / "seconds.json"
     mark = asked.work / "program.txt"
+    program = program_digest()
     # Another program's weights differ without any fault.
-    if not mark.exists() or mark.read_text() != program_digest():
+    if not mark.exists() or mark.read_text() != program:
         shutil.rmtree(whole, ignore_errors=True)
         timed.unlink(missing_ok=True)
         asked.work.mkdir(parents=True, exist_ok=True)
-        mark.write_text(program_digest())
+        mark.write_text(program)
     prepare(whole)
     if not timed.exists():
         timed.write_text(json.dumps(finish(whole)))
@@ -160,7 +161,7 @@ def main() -> None:
     left = [str(path) for path in killed.rglob("*.part")]
     result = {
         "machine": f"{os.cpu_count()} cores, {platform.machine()}",
-        "program": program_digest(),
+        "program": program,
         "seconds_unkilled": round(seconds, 1),
         "kills": kills,
         "same_weights": same,

@@ -57,8 +57,8 @@ class Minute:
 
 
 def watch(address: str, stop: Event, visits: list[int], visit_s: float) -> None:
-    """Read the view's stream for `visit_s`, leave, and come again, until `stop`; `visits`
-    counts those who were shown something.
+    """Read the view's stream for `visit_s`, leave, and come again, until `stop`; `visits` counts
+    those who were shown something.
     """
     while not stop.wait(PAUSE_S):
         until_s = time.monotonic() + visit_s
