@@ -26,6 +26,7 @@ from noise_recordings import record
 from program_state import program_digest
 from rosbags.rosbag1 import Reader
 
+from nlos_cam.bench import load_bench
 from nlos_cam.camera import open_camera, simulated_world
 from nlos_cam.cli.config import read_settings
 from nlos_cam.cli.main import main
@@ -34,6 +35,8 @@ from nlos_cam.files import checksums_of, load_cached
 from nlos_cam.objects import SurfaceMesh, read_depth_map, read_mesh
 from nlos_cam.recording import load_sidecar
 from nlos_cam.render import bare_wall_scene, load_scene
+from nlos_cam.transients import load_transient
+from nlos_cam.view import RecordedView
 
 ROOT = Path(__file__).parents[2]
 EXIT_CODES = {0, 1, 2, 3, 4}
@@ -153,6 +156,27 @@ def read_replayed(path: Path, folder: Path, _random: np.random.Generator) -> Non
     _refuse(refused)
 
 
+def read_transient(path: Path, folder: Path, _random: np.random.Generator) -> None:
+    """Describe, draw and load a transient, whose counts have to be finite."""
+    command("info", path)
+    command("info", path, "--out", folder / "look.html")
+    if not np.isfinite(load_transient(path).histograms).all():
+        raise WrongResultError("light that is not finite was accepted")
+
+
+def read_detection(path: Path, _folder: Path, _random: np.random.Generator) -> None:
+    """Describe the folder of a detection, and analyze its turns again."""
+    refused = command("info", path.parent) is None
+    refused += command("detect", path.parent) is None
+    _refuse(refused)
+
+
+def read_bench(path: Path, _folder: Path, _random: np.random.Generator) -> None:
+    """Describe a bench folder, and load it."""
+    command("info", path.parent)
+    load_bench(path.parent)
+
+
 def read_cache(path: Path, _folder: Path, _random: np.random.Generator, content: bytes) -> None:
     """Read a cached world whose file may be damaged: it has to be as made, and whole the next
     time.
@@ -224,6 +248,12 @@ def read_label(path: Path, _folder: Path, _random: np.random.Generator) -> None:
     labelled._placed(path, "short", load_rig("paper-rig"))  # noqa: SLF001
 
 
+def make(*arguments: str | Path) -> None:
+    """Run a command that makes a whole file. Raises RuntimeError where it refuses."""
+    if command(*arguments) is None:
+        raise RuntimeError(f"{' '.join(map(str, arguments))} made nothing")
+
+
 def make_files(home: Path) -> None:
     """Write the whole files that commands make, into an empty folder; to be called in a process of
     its own.
@@ -231,7 +261,7 @@ def make_files(home: Path) -> None:
     os.environ["NLOS_CAM_CACHE"] = str(home / "cache")
     for name in ("packed", "plain"):
         record(home / f"{name}.bag", packed=name == "packed", frames=4)
-    command(
+    make(
         "dataset",
         "build",
         "--count",
@@ -243,12 +273,17 @@ def make_files(home: Path) -> None:
         "--out",
         home / "data",
     )
-    command("calibrate", "--wall", "sim:bare-wall", "--frames", "8", "--out", home / "wall.toml")
-    command(
-        "capture", "sim:bare-wall", "--frames", "3", "--label", "cup", "--out", home / "short.bag"
-    )
-    command("replay", home / "short.bag", "--out", home / "replayed")
-    command("render", "cup", "--accuracy", "draft", "--out", home / "cup.npz")
+    make("calibrate", "--wall", "sim:bare-wall", "--frames", "8", "--out", home / "wall.toml")
+    make("capture", "sim:bare-wall", "--frames", "3", "--label", "cup", "--out", home / "short.bag")
+    make("replay", home / "short.bag", "--out", home / "replayed")
+    make("render", "cup", "--accuracy", "draft", "--out", home / "cup.npz")
+    transient = "--capture", "confocal", "--wall-cells", "8", "--transient", home / "light.hdf5"
+    make("render", "cup", "--accuracy", "draft", *transient)
+    make("calibrate", "--wall", "sim:bare-wall", "--frames", "8", "--bench", home / "bench")
+    few = "--turns", "16", "--frames", "2", "--seed", "0", "--alpha", "0.2"
+    make("detect", "sim", *few, "--out", home / "detection")
+    saved = "--seconds", "2", "--save-view", home / "session.html"
+    make("live", "sim:bare-wall", "--no-view", *saved)
     scene = bare_wall_scene()
     world = simulated_world.pack_loop(
         *(simulated_world.read_packaged(scene) or simulated_world.render_loop(scene))
@@ -311,11 +346,16 @@ def make_inputs(home: Path, group: str) -> dict[str, Input]:
         ),
         "sidecar.json": (home / "short.json", load_sidecar),
         "rendering.npz": (home / "cup.npz", lambda _: None),
+        "session.html": (home / "session.html", RecordedView),
         "depth.npy": (home / "depth.npy", read_depth_map),
         **{name: (home / name, read_mesh) for name in ("mesh.obj", "mesh.ply", "mesh.stl")},
     }
     for name, (source, load) in readers.items():
         place(name, source, partial(read_text, load=load))
+    place("light.hdf5", home / "light.hdf5", read_transient)
+    place("bench.toml", home / "bench" / "bench.toml", read_bench, home / "bench")
+    for name in ("detection.json", "turn-0001.npz"):
+        place(name, home / "detection" / name, read_detection, home / "detection")
     place("reconstruction.npz", home / "replayed" / "reconstruction.npz", read_replayed)
     entry = next((home / "worlds").iterdir())
     place("world.npz", entry, partial(read_cache, content=entry.read_bytes()))

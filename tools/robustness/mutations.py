@@ -409,6 +409,28 @@ def mutate_shard(content: bytes, random: Random) -> tuple[str, bytes]:
     return way, memory.getvalue()
 
 
+def mutate_transient(content: bytes, random: Random) -> tuple[str, bytes]:
+    """Change a field of a transient with the library."""
+    memory = io.BytesIO(content)
+    with h5py.File(memory, "r+") as file:
+        name = pick(random, list(file))
+        way = pick(random, ("value", "shape", "type", "rank", "gone"))
+        values = np.array(file[name])
+        if way == "value" and values.dtype.kind == "f":
+            values.reshape(-1)[int(random.integers(values.size))] = pick(random, FLOATS)
+            file[name][...] = values
+            return f"{way} {name}", memory.getvalue()
+        del file[name]
+        if way == "shape":
+            size = int(pick(random, NUMBERS))
+            file.create_dataset(name, (size,), "f4", chunks=(1 << 10,), compression="gzip")
+        elif way == "type":
+            file[name] = pick(random, TEXTS[:3])
+        elif way == "rank":
+            file[name] = values[None]
+    return f"{way} {name}", memory.getvalue()
+
+
 def mutate_tensors(content: bytes, random: Random) -> tuple[str, bytes]:
     """Change the header of a safetensors file with its length right again, or its tensors."""
     start = 8 + int.from_bytes(content[:8], "little")
@@ -525,6 +547,7 @@ def mutate_state(content: bytes, random: Random) -> tuple[str, bytes]:
 FORMATS: Mapping[str, Callable[[bytes, Random], tuple[str, bytes]]] = {
     ".bag": mutate_bag,
     ".h5": mutate_shard,
+    ".hdf5": mutate_transient,
     ".safetensors": mutate_tensors,
     ".npz": mutate_arrays,
     ".toml": mutate_text,

@@ -7,10 +7,11 @@ with a documented exit code, and leave nothing half-written. A second call resum
 after a finding.
 """
 
+import os
 import subprocess
 import sys
 import tempfile
-from collections.abc import Generator
+from collections.abc import Generator, Sequence
 from contextlib import contextmanager
 from functools import cache, partial
 from pathlib import Path
@@ -84,9 +85,7 @@ def starve(command: Command, inputs: Path, way: str, random: Random) -> Row:
         if way == "memory_mib":
             line = ["prlimit", f"--as={amount << 20}", *line]
         line = [*NO_SHM, *line] if way == "no_shm" else line
-        ended = subprocess.run(
-            line, capture_output=True, text=True, timeout=trials.TIMEOUT_S, check=False
-        )
+        ended = run_in(folder, line)
         said = ended.stderr.strip().splitlines()[-1:] if ended.returncode else []
         row = {"said": "".join(said), "wrong": wrong_with(command, folder, inputs, ended)}
     for place in (folder, inputs, ROOT):  # their names say nothing about the trial
@@ -100,12 +99,25 @@ def starve(command: Command, inputs: Path, way: str, random: Random) -> Row:
     }
 
 
+def run_in(folder: Path, line: Sequence[str]) -> subprocess.CompletedProcess[str]:
+    """Run a command line whose current folder and cache are a trial's, not the owner's."""
+    return subprocess.run(
+        line,
+        cwd=folder,
+        env=os.environ | {"NLOS_CAM_CACHE": str(folder / "cache")},
+        capture_output=True,
+        text=True,
+        timeout=trials.TIMEOUT_S,
+        check=False,
+    )
+
+
 @cache
 def need_kib(command: Command, inputs: Path) -> int:
     """Return the size of everything that a command writes, in KiB."""
     with tempfile.TemporaryDirectory() as name:
         line = [*PROGRAM, *trials.line_of(command.arguments, Path(name), inputs)]
-        subprocess.run(line, check=True, capture_output=True, timeout=trials.TIMEOUT_S)
+        run_in(Path(name), line).check_returncode()
         return (
             sum(path.stat().st_size for path in Path(name).rglob("*") if path.is_file()) // 1024
             + MIN_KIB

@@ -222,6 +222,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path, help="folder of the results (default: docs)")
     asked: argparse.Namespace = parser.parse_args()
 
+    harness.claim(asked.work)
     benches = [draw_bench(number, asked.work) for number in range(asked.benches)]
     rows: list[dict[str, Any]] = [{} for _ in benches]
     for minutes in (0.0, *asked.minutes):

@@ -12,6 +12,7 @@ from argparse import ArgumentParser, ArgumentTypeError, RawDescriptionHelpFormat
 from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -25,12 +26,14 @@ from nlos_cam.cli.common import tracked
 from nlos_cam.cli.main import main as nlos_cam
 from nlos_cam.errors import NlosCamError
 from nlos_cam.evaluate import format_interval
-from nlos_cam.files import cache_folder
+from nlos_cam.files import CHECKSUMS, cache_folder
 
 ROOT = Path(__file__).parents[2]
 DOCS = ROOT / "docs"
 DIGITS = 5
 SOURCES = "nlos_cam", "calibration", "models", "tools/studies"
+CLAIM = "results-of.json"
+"""File that says what the results in a folder are of."""
 
 Record = dict[str, Any]
 
@@ -84,12 +87,39 @@ def collect(
 
 
 def fingerprint(settings: Sequence[Any], seeds: int, key: str = "") -> str:
-    """Return a checksum of a grid, a key and the state of the source files, the product's and the
-    studies'.
+    """Return a checksum of a grid, a key and the program."""
+    grid = repr([program_digest(), list(settings), seeds, key])
+    return hashlib.sha256(grid.encode()).hexdigest()[:16]
+
+
+@cache
+def program_digest() -> str:
+    """Return a checksum of the program, its studies and its weights, by the files' contents."""
+    digest = hashlib.sha256()
+    for folder in SOURCES:
+        for pattern in ("*.py", "*.toml", CHECKSUMS):
+            for path in sorted((ROOT / folder).rglob(pattern)):
+                digest.update(f"{path.relative_to(ROOT)}\n".encode())
+                digest.update(path.read_bytes())
+    return digest.hexdigest()[:16]
+
+
+def claim(work: Path, **of: object) -> None:
+    """Tie a folder to this program and to what its results are of (names and values), so that a
+    later call does not mix them with others. Ends the program where the folder is tied to others.
     """
-    files = sorted(path for folder in SOURCES for path in (ROOT / folder).rglob("*.py"))
-    state = [(str(path), path.stat().st_mtime_ns) for path in files]
-    return hashlib.sha256(repr([state, list(settings), seeds, key]).encode()).hexdigest()[:16]
+    work.mkdir(parents=True, exist_ok=True)
+    mark = work / CLAIM
+    own = {"program": program_digest()} | {name: str(value) for name, value in of.items()}
+    if not mark.exists():
+        mark.write_text(json.dumps(own, indent=1) + "\n", encoding="utf-8")
+        return
+    found = json.loads(mark.read_text(encoding="utf-8"))
+    if other := [name for name in {**found, **own} if found.get(name) != own.get(name)]:
+        raise SystemExit(
+            f"error: the results in {work} are of another {', '.join(other)}: name an empty folder,"
+            f" or remove {mark} to go on with them all the same"
+        )
 
 
 def wilson(count: int, of: int) -> dict[str, Any]:

@@ -739,7 +739,7 @@ def main() -> None:
     parser.add_argument("--ways", nargs="+", default=list(WAYS), choices=WAYS)
     parser.add_argument("--out", type=Path, help="folder of the results (default: docs)")
     asked = parser.parse_args()
-    asked.work.mkdir(parents=True, exist_ok=True)
+    harness.claim(asked.work)
 
     box = object_box(load_rig("paper-rig"))
     groups = {"kinds of training": benchmark_objects, "kinds never seen": unseen_objects}

@@ -325,6 +325,7 @@ def main() -> None:
     parser.add_argument("--sets", nargs="+", default=SETS, help="stations joined by +")
     parser.add_argument("--out", type=Path, help="folder of the results (default: docs)")
     asked = parser.parse_args()
+    harness.claim(asked.work)
 
     places = [place for place in PLACES if any(place in each.split("+") for each in asked.sets)]
     folders = {place: rendered(place, asked.work, FIRST_SEED, asked.objects) for place in places}

@@ -1,10 +1,11 @@
 """Transfer to a bench: its recordings, figures on it and on the paper's rig, and the learning curve
 over recordings.
 
-python tools/studies/transfer.py record DIR [--scene examples/bench.toml] [--frames 8] python
-tools/studies/transfer.py figures DIR [--weights W]      docs/figures/transfer.json python
-tools/studies/transfer.py curve DIR RUNS --recipe direct-transfer [--weights W]
-docs/figures/transfer_curve.json, .png
+    python tools/studies/transfer.py record DIR [--scene examples/bench.toml] [--frames 8]
+    python tools/studies/transfer.py figures DIR [--weights W]
+        docs/figures/transfer.json
+    python tools/studies/transfer.py curve DIR RUNS --recipe direct-transfer [--weights W]
+        docs/figures/transfer_curve.json, .png
 
 DIR holds the 54 test objects as labelled recordings of a simulated bench, for adaptation,
 validation and judging: of 8 frames of 640 x 480 they take 0.4 GB and two minutes, and a second call
@@ -28,7 +29,7 @@ from matplotlib.figure import Figure
 from nlos_calibration import ObjectBox, load_rig
 from nlos_calibration.arrays import Float32
 from nlos_models import CheckpointRecord, Reconstructor, load_reconstructor, surface
-from nlos_models.training import MapSet
+from nlos_models.training import MapSet, load_recipe
 from numpy.typing import NDArray
 
 from nlos_cam.camera import FRAMES_PER_S, Recording, SimulatedCamera, World
@@ -36,7 +37,7 @@ from nlos_cam.cli.common import tracked
 from nlos_cam.dataset import Labelled, list_recordings, read_labelled, write_shards
 from nlos_cam.errors import RecordingError
 from nlos_cam.evaluate import mm_per_v, over_objects, per_object, plain, reconstruct_all
-from nlos_cam.files import cache_folder
+from nlos_cam.files import cache_folder, checksums_of
 from nlos_cam.frames import maps_from_frame
 from nlos_cam.objects import (
     CATEGORIES,
@@ -411,6 +412,12 @@ def draw(points: Sequence[Point]) -> Figure:
 
 def run_curve(asked: argparse.Namespace) -> None:
     """Train on growing numbers of recordings, and judge."""
+    harness.claim(
+        asked.runs,
+        recordings=asked.folder.resolve(),
+        recipe=load_recipe(asked.recipe),
+        weights=checksums_of(asked.weights) if asked.weights else "shipped",
+    )
     given = ["--weights", asked.weights] if asked.weights else []
     trainers = {"transfer": commanded("transfer", asked.recipe, *given)}
     points = list[Point]()

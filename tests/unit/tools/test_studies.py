@@ -75,6 +75,16 @@ def test_interrupted_collection_resumes_with_the_same_records(harness: ModuleTyp
     assert harness.fingerprint(grid, 2) != harness.fingerprint(grid, 2, "other weights")
 
 
+def test_folder_of_results_takes_no_results_of_others(harness: ModuleType, tmp_path: Path) -> None:
+    harness.claim(tmp_path / "work", weights="one")
+    harness.claim(tmp_path / "work", weights="one")
+
+    with pytest.raises(SystemExit, match="of another weights: name an empty folder, or remove"):
+        harness.claim(tmp_path / "work", weights="two")
+    (tmp_path / "work" / harness.CLAIM).unlink()
+    harness.claim(tmp_path / "work", weights="two")
+
+
 def test_interval_of_a_share_narrows_with_its_count(harness: ModuleType) -> None:
     few = harness.wilson(1, 10)
     many = harness.wilson(100, 1000)
