@@ -28,7 +28,7 @@ class TrainingInputs:
     """Record of the start weights. Their normalization is used if they were trained for the rig
     that the maps are aligned with, else one is fitted to the maps. None: the start network's
     normalization is used as it stands, since `LockedNoise.fitted` has set it."""
-    frame: Rig | None = None
+    maps_rig: Rig | None = None
     """Wall grid that the maps are aligned with; None where they stay in the rig's own cells."""
     bare_wall_counts: float | None = None
     """Counts of the brightest bare wall, for the same record; None for the simulated sensor's, to
@@ -49,7 +49,7 @@ class TrainingInputs:
             counts = recorded_counts(sensor)
             return cls((rig.name, rig.checksum), bench, trained, bare_wall_counts=counts)
         check_alignable(rig, trained)
-        return cls((rig.name, grid.checksum), bench, trained, frame=grid)
+        return cls((rig.name, grid.checksum), bench, trained, maps_rig=grid)
 
     @classmethod
     def of_locked(cls, rig: Rig, sensor: SensorModel, locked: Locked) -> Self:

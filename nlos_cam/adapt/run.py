@@ -623,7 +623,7 @@ def _train_network(
             normal=start.normal,
             trained=inputs.trained,
             growth=shards_of,
-            frame=inputs.frame,
+            maps_rig=inputs.maps_rig,
             locked=job.locked is not None,
         )
         with store as source:

@@ -351,7 +351,7 @@ def direct(
                 start.normal if start else None,
                 trained=trained,
                 color=recipe.colour,
-                frame=reconstruct.grid_of(trained) if trained else None,
+                maps_rig=reconstruct.grid_of(trained) if trained else None,
                 run=f"{run.out.resolve()} ",
                 processes=pack_workers,
                 held_out=held_out_data,

@@ -28,6 +28,7 @@ from nlos_cam.dataset.packing import (
     aligned_with,
     packing,
     read_aligned,
+    rig_of_weights,
 )
 from nlos_cam.dataset.plan import DatasetPlan, RigSpread
 from nlos_cam.dataset.reader import MAP_CHANNELS, Dataset, check_held_out, open_dataset
@@ -71,7 +72,7 @@ class PackedMaps:
         trained: CheckpointRecord | None = None,
         color: bool = False,
         growth: Growth | None = None,
-        frame: Rig | None = None,
+        maps_rig: Rig | None = None,
         run: str = "",
         packing: Packing | None = None,
         locked: bool = False,
@@ -86,8 +87,8 @@ class PackedMaps:
         Objects of an epoch: the shards that `growth` allows it, by default all that are there.
         `run` names the training run, which has epochs of its own in a store that runs share.
 
-        Alignment: with the rig `frame`, by default the plan's, or the wall grid for a plan of many
-        rigs. A spread that the benches' records do not hold (`DatasetPlan.known_rig`) stays in the
+        Alignment: with the rig `maps_rig`, by default the plan's, or the wall grid for a plan of
+        many rigs. A spread that the benches' records do not hold (`DatasetPlan.known_rig`) stays in the
         maps.
 
         New shards are packed by the processes of `packing`, by default by this one. Datasets of
@@ -104,12 +105,12 @@ class PackedMaps:
         self.plan: DatasetPlan = opened[0].plan
         """Of the first dataset."""
         _check_of_one_kind(opened)
-        self.frame: Rig = frame or (WALL_GRID if self.plan.rigs else self.plan.rig)
+        self.maps_rig: Rig = maps_rig or (WALL_GRID if self.plan.rigs else self.plan.rig)
         """Rig that the maps are aligned with."""
         # By another rig's statistics a third of the cells would lie beyond the limit of a
         # normalised one, on a bench 5 cm nearer: its layers serve, not its cells. The wall grid
         # counts as another rig, also beside the rig that its maps are drawn around.
-        is_foreign = trained is not None and trained.rig_checksum != self.frame.checksum
+        is_foreign = trained is not None and trained.rig_checksum != self.maps_rig.checksum
         wanted = None if is_foreign else normal
 
         self.noise: MapNoise | None = map_noise(self.plan) if self.plan.expected else None
@@ -144,7 +145,7 @@ class PackedMaps:
         self._keys = {shard.path: shard_key(shard) for shard in shards}
         self._sizes = {shard.path: len(shard.seeds) for shard in shards}
         self._index = StoreIndex.read(store)
-        self._index.open_for(self.frame, opened, self._keys)
+        self._index.open_for(self.maps_rig, opened, self._keys)
 
         if not (store / CELLS).exists():
             self._write_cells(opened, wanted)
@@ -173,7 +174,7 @@ class PackedMaps:
             if self._growth:
                 shards = min(shards, self._growth(0))
             some = [
-                read_aligned(shard, self.frame)[0]
+                read_aligned(shard, self.maps_rig)[0]
                 for one in opened
                 for shard in one.shards[:shards]
             ]
@@ -194,13 +195,13 @@ class PackedMaps:
     def digest(self) -> str:
         """SHA-256 of the rig and of the cells' statistics: a run with others cannot be resumed."""
         return hashlib.sha256(
-            self.frame.checksum.encode() + (self._store / CELLS).read_bytes()
+            self.maps_rig.checksum.encode() + (self._store / CELLS).read_bytes()
         ).hexdigest()
 
     @property
     def _stores_counts(self) -> bool:
         """True where noise is drawn of light that alignment has scaled."""
-        return self.noise is not None and is_wall_grid(self.frame)
+        return self.noise is not None and is_wall_grid(self.maps_rig)
 
     def refresh(self, on_progress: OnProgress = ignore, shards: int | None = None) -> None:
         """Add the shards that appeared in the datasets since the last time, of the first `shards`
@@ -220,7 +221,7 @@ class PackedMaps:
             # Rows after the last indexed one were left by an interruption.
             with path.open("r+b") as file:
                 file.truncate(size)
-        packer = Packer.of(self.frame, self.normal, with_counts=self._stores_counts)
+        packer = Packer.of(self.maps_rig, self.normal, with_counts=self._stores_counts)
         every = zip(new, self._packing.rows_of(packer, [*new.values()]), strict=True)
         for number, (key, columns) in enumerate(every, 1):
             # A shard grows by further seeds, whose order packing keeps: its first rows are there.
@@ -250,10 +251,10 @@ class PackedMaps:
         Raises SceneError for a dataset of the same objects, or of benches that cannot be aligned.
         """
         opened = self._open_held_out(folder)
-        maps = aligned_with(first_of(opened.arrays(), count), opened.benches(), self.frame)[0]
+        maps = aligned_with(first_of(opened.arrays(), count), opened.benches(), self.maps_rig)[0]
         if not len(maps.image):
             raise SceneError(
-                f"no object of {folder} can be aligned with {self.frame.name}: its box has another"
+                f"no object of {folder} can be aligned with {self.maps_rig.name}: its box has another"
                 " size, or its occluder hides more; hold out objects of the same rig"
             )
         return maps
@@ -270,15 +271,14 @@ class PackedMaps:
         """Return the record of the weights that a recipe makes of these maps after `runs`. Raises
         OutputExistsError as `nlos_models.training.record_run`.
         """
-        on_grid = is_wall_grid(self.frame)
-        # On the grid too, objects of one rig make weights for that rig.
-        rig = self.plan.rig if on_grid and self.plan.rigs is None else self.frame
+        on_grid = is_wall_grid(self.maps_rig)
+        rig = rig_of_weights(self.plan, self.maps_rig)
         # Light of the wall grid, and of aligned maps, is that of the simulated sensor.
         is_own = not on_grid and self.plan.stays_in_maps
         return record_run(
             recipe,
             out,
-            (rig.name, self.frame.checksum),
+            (rig.name, self.maps_rig.checksum),
             runs,
             *starts,
             bench=rig_fields(rig, packaged=on_grid),
@@ -363,7 +363,7 @@ def open_packed_maps(
     trained: CheckpointRecord | None = None,
     color: bool = False,
     growth: Growth | None = None,
-    frame: Rig | None = None,
+    maps_rig: Rig | None = None,
     run: str = "",
     processes: int = 1,
     locked: bool = False,
@@ -384,7 +384,7 @@ def open_packed_maps(
             trained=trained,
             color=color,
             growth=growth,
-            frame=frame,
+            maps_rig=maps_rig,
             run=run,
             packing=made_ready,
             locked=locked,

@@ -37,14 +37,14 @@ class Origin(NamedTuple):
     """`shard_key` of that dataset's first shard: the cells' statistics are of it, too."""
 
     @classmethod
-    def of(cls, frame: Rig, dataset: Dataset) -> "Origin":
+    def of(cls, maps_rig: Rig, dataset: Dataset) -> "Origin":
         """Return the origin of a store that is begun now."""
         first = dataset.shards[0]
-        return cls(frame.name, frame.checksum, first.provenance, shard_key(first))
+        return cls(maps_rig.name, maps_rig.checksum, first.provenance, shard_key(first))
 
-    def is_aligned_with(self, frame: Rig) -> bool:
+    def is_aligned_with(self, maps_rig: Rig) -> bool:
         """Return True if the maps are aligned with a rig."""
-        return self.rig_checksum == frame.checksum
+        return self.rig_checksum == maps_rig.checksum
 
     def differences(self, plan: DatasetPlan) -> list[str]:
         """Return the names of the fields in which the first dataset's plan differs from another."""
@@ -106,9 +106,11 @@ class StoreIndex:
         with atomic_file(self.store / INDEX) as part:
             part.write_text(json.dumps(facts), encoding="utf-8")
 
-    def open_for(self, frame: Rig, datasets: Sequence[Dataset], keys: Mapping[Path, str]) -> None:
+    def open_for(
+        self, maps_rig: Rig, datasets: Sequence[Dataset], keys: Mapping[Path, str]
+    ) -> None:
         """Begin a new store, or go on with one whose maps are of these datasets, aligned with the
-        rig `frame`; `keys` are the `shard_key` of their shards, by path.
+        rig `maps_rig`; `keys` are the `shard_key` of their shards, by path.
 
         A store of nlos-cam 0.2.0 or earlier does not say what it is aligned with. If its shards are
         those of the datasets, by their paths, it is taken for this one's. Raises SceneError for a
@@ -117,13 +119,13 @@ class StoreIndex:
         if self.origin is None:
             by_path = {str(path.resolve()): key for path, key in keys.items()}
             self.shards = {by_path.get(name, name): count for name, count in self.shards.items()}
-            origin = Origin.of(frame, datasets[0])
+            origin = Origin.of(maps_rig, datasets[0])
         else:
             origin = self.origin
-        if not origin.is_aligned_with(frame):
+        if not origin.is_aligned_with(maps_rig):
             raise SceneError(
                 f"{self.store} holds maps aligned with rig {origin.rig} ({origin.rig_checksum}),"
-                f" not with {frame.name} ({frame.checksum}): name another --store"
+                f" not with {maps_rig.name} ({maps_rig.checksum}): name another --store"
             )
         here = set(keys.values())
         if missing := [key for key in (origin.first, *self.shards) if key not in here]:

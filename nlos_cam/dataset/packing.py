@@ -14,18 +14,19 @@ from typing import Self
 
 import numpy as np
 import torch
-from nlos_calibration import Rig
+from nlos_calibration import Rig, rig_difference
 from nlos_calibration.arrays import Float32, Mask
-from nlos_models import CellNormal, channels_of
+from nlos_models import CellNormal, CheckpointRecord, channels_of
 from nlos_models.arrays import Float16
 from nlos_models.training import MapSet
 
+from nlos_cam.dataset.plan import DatasetPlan
 from nlos_cam.dataset.reader import MAP_CHANNELS
 from nlos_cam.dataset.shards import Shard, read_arrays, read_head
 from nlos_cam.dataset.worker import end_with_parent
 from nlos_cam.errors import WorkersLostError
 from nlos_cam.processes import safe_children
-from nlos_cam.reconstruct import align_samples
+from nlos_cam.reconstruct import align_samples, is_wall_grid, own_rig
 
 MAPS = "maps.f16"
 IMAGES = "images.f16"
@@ -36,7 +37,7 @@ COUNTS = "counts.f16"
 class Packer:
     """What decides the rows of a shard."""
 
-    frame: Rig
+    maps_rig: Rig
     """Rig that the maps are aligned with."""
     cells: Mapping[str, Float32]
     """State of the normalisation. Arrays, since tensors go to other processes as open files, by a
@@ -46,14 +47,14 @@ class Packer:
     """Keep the bench's own counts, for noise of light that alignment has scaled."""
 
     @classmethod
-    def of(cls, frame: Rig, normal: CellNormal, *, with_counts: bool) -> Self:
+    def of(cls, maps_rig: Rig, normal: CellNormal, *, with_counts: bool) -> Self:
         """Return the packer of a normalisation."""
         cells = {name: values.numpy() for name, values in normal.state_dict().items()}
-        return cls(frame, cells, with_counts)
+        return cls(maps_rig, cells, with_counts)
 
     def rows(self, path: Path) -> dict[str, Float16]:
         """Return a shard's rows (n, ...) by the name of their file in the store."""
-        maps, counts = read_aligned(read_head(path), self.frame)
+        maps, counts = read_aligned(read_head(path), self.maps_rig)
         pair = torch.from_numpy(maps.depth_m), torch.from_numpy(maps.intensity)
         rows = {MAPS: self._normal()(*pair).half().numpy(), IMAGES: maps.image.astype(np.float16)}
         if self.with_counts:
@@ -68,10 +69,10 @@ class Packer:
         return normal
 
 
-def read_aligned(shard: Shard, frame: Rig) -> tuple[MapSet, Float32]:
+def read_aligned(shard: Shard, maps_rig: Rig) -> tuple[MapSet, Float32]:
     """Return a shard's samples as a rig sees them, and the bench's own counts behind them."""
     maps = MapSet(*read_arrays(shard, MAP_CHANNELS))
-    maps, _, counts = aligned_with(maps, map(shard.plan.known_rig, shard.seeds), frame)
+    maps, _, counts = aligned_with(maps, map(shard.plan.known_rig, shard.seeds), maps_rig)
     return maps, counts
 
 
@@ -81,6 +82,19 @@ def aligned_with(maps: MapSet, benches: Iterable[Rig], rig: Rig) -> tuple[MapSet
     """
     maps, seen, counts = align_samples(maps, benches, rig)
     return kept_of(maps, seen), seen, counts[seen]
+
+
+def rig_of_weights(
+    plan: DatasetPlan, maps_rig: Rig, trained: CheckpointRecord | None = None
+) -> Rig:
+    """Return the rig that weights are for, which maps of a dataset train: the one that the maps are
+    aligned with; on the wall grid the bench that they are of, as the start weights `trained` know
+    it where it is theirs, and the grid itself for a plan of many rigs.
+    """
+    if not is_wall_grid(maps_rig) or plan.rigs:
+        return maps_rig
+    known = own_rig(trained) if trained else None
+    return known if known and not rig_difference(plan.rig, known) else plan.rig
 
 
 def kept_of(maps: MapSet, kept: Mask) -> MapSet:

@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from nlos_calibration import Moments, Rig, load_measured, rig_difference
+from nlos_calibration import Moments, Rig, load_measured
 from nlos_calibration.arrays import Float16, Float32
 from nlos_models import CheckpointRecord
 from nlos_models.training import (
@@ -28,6 +28,7 @@ from nlos_models.training import (
 
 from nlos_cam.dataset.packed import map_noise
 from nlos_cam.dataset.packed_index import data_key
+from nlos_cam.dataset.packing import rig_of_weights
 from nlos_cam.dataset.plan import RECORDED, DatasetPlan, RigSpread
 from nlos_cam.dataset.reader import MAP_CHANNELS, Dataset, check_held_out, open_dataset
 from nlos_cam.errors import SceneError
@@ -35,7 +36,6 @@ from nlos_cam.frames import MAP_COLUMNS, MAP_ROWS, maps_from_frame
 from nlos_cam.reconstruct import (
     align_all,
     is_wall_grid,
-    own_rig,
     recorded_counts,
     rig_fields,
     rig_to_align_with,
@@ -79,7 +79,7 @@ class MapSplit(NamedTuple):
         began with weights `trained` where it is a transfer. Raises OutputExistsError as
         `nlos_models.training.record_run`.
         """
-        rig = self._rig_in_use(trained)
+        rig = rig_of_weights(self.plan, self.rig, trained)
         start = trained if trained and trained.rig_checksum == self.rig.checksum else None
         counts = start.bare_wall_counts if start else recorded_counts(self.plan.sensor)
         on_grid = is_wall_grid(self.rig)
@@ -93,15 +93,6 @@ class MapSplit(NamedTuple):
             bench=bench or rig_fields(rig, packaged=on_grid),
             bare_wall_counts=counts,
         )
-
-    def _rig_in_use(self, trained: CheckpointRecord | None) -> Rig:
-        """Return the rig that a run's weights are for: of maps on the wall grid the bench that they
-        are of, as the start weights know it where it is theirs.
-        """
-        if not is_wall_grid(self.rig) or self.plan.rigs:
-            return self.rig
-        known = own_rig(trained) if trained else None
-        return known if known and not rig_difference(self.plan.rig, known) else self.plan.rig
 
     def limit_recipe(self, recipe: MapRecipe) -> MapRecipe:
         """Return the recipe with the number of held-out objects available, which may be lower than

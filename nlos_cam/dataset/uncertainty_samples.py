@@ -116,7 +116,7 @@ class Benches:
     sensor: SensorModel
     rigs: RigRange | None = None
     """Range of the benches' rigs in place of `rig`."""
-    frame: Rig | None = None
+    maps_rig: Rig | None = None
     """Rig that maps are aligned with, by the benches' records; None where they stay as they are."""
     accuracy: str = "draft"
 
@@ -126,15 +126,15 @@ class Benches:
         rendered in draft accuracy.
         """
         # on the weights' own rig there is nothing to align
-        frame = _frame_of(plan, trained) if plan.rigs or grid_of(trained) else None
+        maps_rig = _maps_rig_of(plan, trained) if plan.rigs or grid_of(trained) else None
         accuracy = "draft" if plan.accuracy == RECORDED else plan.accuracy
-        return cls(plan.rig, plan.sensor, plan.rigs, frame, accuracy)
+        return cls(plan.rig, plan.sensor, plan.rigs, maps_rig, accuracy)
 
     @property
     def name(self) -> str:
         """Name that files of samples bear: it differs where the samples would."""
-        frame = self.frame.checksum if self.frame else ""
-        text = (self.rigs.model_dump_json() if self.rigs else "") + frame
+        maps_rig = self.maps_rig.checksum if self.maps_rig else ""
+        text = (self.rigs.model_dump_json() if self.rigs else "") + maps_rig
         if self.sensor != SensorModel():
             text += self.sensor.model_dump_json()
         beside = f"-{sha256(text.encode()).hexdigest()[:12]}" if text else ""
@@ -176,11 +176,11 @@ def make_samples(kind: str, seeds: Sequence[int], benches: Benches) -> Uncertain
         ),
         np.array([kind] * len(seeds)),
     )
-    if benches.frame is None:
+    if benches.maps_rig is None:
         return samples
     sensed = MapSet(samples.depth_m, samples.intensity, samples.image)
     records = [benches.record(kind, seed) for seed in seeds]
-    aligned, seen, _ = aligned_with(sensed, records, benches.frame)
+    aligned, seen, _ = aligned_with(sensed, records, benches.maps_rig)
     return replace(samples.where(seen), depth_m=aligned.depth_m, intensity=aligned.intensity)
 
 
@@ -347,8 +347,8 @@ def uncertainty_sets(
         ordinary = first_of(dataset.arrays(), objects)
         visible = visible_objects(ordinary, dataset, on_progress)
         benches = compress(dataset.benches(), visible)
-        frame = _frame_of(plan, pipeline.record)
-        ordinary, _, _ = aligned_with(kept_of(ordinary, visible), benches, frame)
+        maps_rig = _maps_rig_of(plan, pipeline.record)
+        ordinary, _, _ = aligned_with(kept_of(ordinary, visible), benches, maps_rig)
         sets.append(_uncertainty_set(pipeline, ordinary, samples))
     return sets
 
@@ -405,7 +405,7 @@ def quality_set(
             f" too few ({', '.join(np.unique(kinds)[:3])}): use a --dataset of more kinds"
         )
     noise = map_noise(dataset.plan) if dataset.plan.expected else None
-    frame = _frame_of(dataset.plan, pipeline.record)
+    maps_rig = _maps_rig_of(dataset.plan, pipeline.record)
     benches = dataset.benches()
     seen = np.ones(len(kinds), np.bool_)
     for expected in dataset.chunks():
@@ -414,7 +414,7 @@ def quality_set(
         maps = noise.expose(expected, done) if noise else expected
         end = min(done + len(maps.image), len(kinds))
         count = end - done
-        maps, kept, _ = aligned_with(first_of(maps, count), islice(benches, count), frame)
+        maps, kept, _ = aligned_with(first_of(maps, count), islice(benches, count), maps_rig)
         seen[done:end] = kept
         for part in parts_of(np.arange(len(maps.image))):
             depth_m = maps.depth_m[part]
@@ -446,7 +446,7 @@ def shared_error_v(image: Float32, truth: Float32) -> Float32:
     return np.where(count > 0, total / np.maximum(count, 1), np.nan).astype(np.float32)
 
 
-def _frame_of(plan: DatasetPlan, trained: models.CheckpointRecord) -> Rig:
+def _maps_rig_of(plan: DatasetPlan, trained: models.CheckpointRecord) -> Rig:
     """Return the rig that a dataset's maps are aligned with for weights, each from its known rig:
     the wall grid, or the weights' own rig, which is the dataset's (`_fit`).
     """

@@ -19,7 +19,7 @@ ON_GRID = TRAINED.model_copy(update={"rig_checksum": WALL_GRID.checksum})
 def test_maps_stay_in_the_cells_of_the_bench() -> None:
     inputs = TrainingInputs.of_maps(RIG, SENSOR, TRAINED)
 
-    assert inputs.frame is None
+    assert inputs.maps_rig is None
     assert inputs.noise is None
     assert inputs.trained is TRAINED
     assert inputs.rig == (RIG.name, RIG.checksum)
@@ -30,7 +30,7 @@ def test_maps_stay_in_the_cells_of_the_bench() -> None:
 def test_maps_are_on_the_grid_that_start_weights_know() -> None:
     inputs = TrainingInputs.of_maps(RIG, SENSOR, ON_GRID)
 
-    assert inputs.frame is WALL_GRID
+    assert inputs.maps_rig is WALL_GRID
     assert inputs.trained is ON_GRID
     assert inputs.rig == (RIG.name, WALL_GRID.checksum)
     assert inputs.bare_wall_counts is None
@@ -50,5 +50,5 @@ def test_weights_of_locked_differences_name_no_rig() -> None:
     assert inputs.noise is not None
     assert inputs.rig[1] == ""
     assert inputs.bench is None
-    assert inputs.frame is None
+    assert inputs.maps_rig is None
     assert inputs.trained is None

@@ -357,7 +357,7 @@ def test_samples_on_disk_makes_damaged_samples_again(
 
 
 def test_samples_of_many_rigs_hold_the_numbers_of_their_records() -> None:
-    benches = Benches(RIG, SENSOR, rigs=RigRange(), frame=WALL_GRID)
+    benches = Benches(RIG, SENSOR, rigs=RigRange(), maps_rig=WALL_GRID)
     samples = make_samples(EMPTY, range(2), benches)
 
     assert len(samples) == 2

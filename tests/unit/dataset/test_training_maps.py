@@ -505,7 +505,7 @@ def test_one_rig_on_the_wall_grid_makes_weights_for_it(tmp_path: Path, store_fol
     data = _add(tmp_path / "data", 0, PLAN)
     recipe = small_recipe(task="direct", objects=4, held_out=2)
 
-    with open_packed_maps([data], store_folder, frame=WALL_GRID) as packed:
+    with open_packed_maps([data], store_folder, maps_rig=WALL_GRID) as packed:
         record = packed.record_run(recipe, tmp_path / "out", [])
 
     assert (record.rig_name, record.rig_checksum) == (PLAN.rig.name, WALL_GRID.checksum)
@@ -771,7 +771,7 @@ def test_store_of_a_dataset_that_was_built_again_is_refused(
 
 
 def test_store_that_is_aligned_with_another_rig_is_refused(folder: Path, begun: Path) -> None:
-    _assert_refused(begun, folder, "aligned with rig paper-rig.*wall grid", frame=WALL_GRID)
+    _assert_refused(begun, folder, "aligned with rig paper-rig.*wall grid", maps_rig=WALL_GRID)
 
 
 def test_store_of_other_objects_is_refused(tmp_path: Path, begun: Path) -> None:
@@ -832,7 +832,7 @@ def test_old_store_goes_on_with_its_own_dataset(folder: Path, old: Path) -> None
 
     with open_packed_maps([folder], old) as packed:
         assert len(packed) == 2 * SHARD
-    _assert_refused(old, folder, "aligned with rig paper-rig", frame=WALL_GRID)
+    _assert_refused(old, folder, "aligned with rig paper-rig", maps_rig=WALL_GRID)
 
 
 def test_old_store_of_another_dataset_is_refused(tmp_path: Path, old: Path) -> None:
