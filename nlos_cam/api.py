@@ -73,16 +73,18 @@ class Stream:
         return sum(self._statistics.lost(self.camera, self._reader).values())
 
     def __enter__(self) -> Self:
-        camera = self._entered.enter_context(self.camera)
-        frames, telemetry = with_telemetry(camera)
-        reader = reconstruct.FrameReader(
-            frames,
-            lossless=self._lossless,
-            stop=Event(),
-            clock=self._clock,
-            abandon_source=lambda: camera.__exit__(None, None, None),
-        )
-        self._reader = self._entered.enter_context(reader)
+        with ExitStack() as entered:  # leaves the camera if a later step fails
+            camera = entered.enter_context(self.camera)
+            frames, telemetry = with_telemetry(camera)
+            reader = reconstruct.FrameReader(
+                frames,
+                lossless=self._lossless,
+                stop=Event(),
+                clock=self._clock,
+                abandon_source=lambda: camera.__exit__(None, None, None),
+            )
+            self._reader = entered.enter_context(reader)
+            self._entered = entered.pop_all()
         self._results = reconstruct.iterate_results(
             reader, self._pipeline, self._clock, self._statistics.fail, telemetry
         )

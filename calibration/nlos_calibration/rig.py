@@ -219,25 +219,26 @@ class Rig(Record):
         # The frame's axes are the wall's and the lidar's, which a shift of the lidar does not turn:
         # what stands on the bench moves along the wall by as much as the foot does, the other way.
         along_m, up_m, distance_m = (float(value) for value in eye_m)
+        shifts_m = {"x": along_m, "y": up_m}
 
-        def moved(part: Extent | Occluder | ObjectBox) -> dict[str, float]:
-            lengths = part.model_dump()
-            for name in lengths:
-                if name.startswith("x_"):
-                    lengths[name] -= along_m
-                elif name.startswith("y_"):
-                    lengths[name] -= up_m
-            return lengths
+        def moved(part: R) -> R:
+            places_m = {
+                name: place_m - shifts_m[name[0]]
+                for name, place_m in part
+                if name.startswith(("x_", "y_"))
+            }
+            # Not validated: an endless wall's numbers may lie on the bounds of a file's.
+            return part.model_copy(update=places_m)
 
         changed: dict[str, object] = {
             "lidar": self.lidar.model_copy(update={"distance_m": distance_m}),
-            "wall": Extent(**moved(self.wall)),
-            "relay": Extent(**moved(self.relay)),
+            "wall": moved(self.wall),
+            "relay": moved(self.relay),
         }
         if self.occluder:
-            changed["occluder"] = Occluder(**moved(self.occluder))
+            changed["occluder"] = moved(self.occluder)
         if self.object_box:
-            changed["object_box"] = ObjectBox(**moved(self.object_box))
+            changed["object_box"] = moved(self.object_box)
         return self.model_copy(update=changed)
 
 

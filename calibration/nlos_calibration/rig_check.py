@@ -203,7 +203,11 @@ def lidar_visible_share(rig: Rig, box: ObjectBox) -> float:
     # slice is a convex polygon.
     middles = (np.arange(SLICES) + 0.5) / SLICES
     slices_m = box.y_min_m + middles * (box.y_max_m - box.y_min_m)
-    past = [_past_edge(rig.occluder, (0.0, rig.lidar.distance_m))] if rig.occluder else []
+    past: list[Float64] = []
+    occluder = rig.occluder
+    # A sheet on the other side of the lidar than the box hides nothing of it.
+    if occluder is not None and occluder.x_m * (box.x_min_m + box.x_max_m) > 0.0:
+        past = [_past_edge(occluder, (0.0, rig.lidar.distance_m))]
     shares = [_visible_share(box, [*past, *_field_half_planes(rig, y_m)]) for y_m in slices_m]
     return float(np.mean(shares))
 
@@ -236,10 +240,11 @@ def _past_edge(occluder: Occluder, eye: tuple[float, float]) -> Float64:
     z).
     """
     # The line from the eye to (x, z) meets the sheet at eye_z + (z - eye_z) run / (x - eye_x),
-    # visible if that is below the edge: (z - eye_z) run <= rise (x - eye_x).
+    # visible if that is below the edge: (z - eye_z) run <= rise (x - eye_x), or >= where x - eye_x
+    # is negative, as run then is.
     run_m = occluder.x_m - eye[0]
     rise_m = occluder.z_min_m - eye[1]
-    return np.array([rise_m, -run_m, run_m * eye[1] - rise_m * eye[0]])
+    return np.copysign(1.0, run_m) * np.array([rise_m, -run_m, run_m * eye[1] - rise_m * eye[0]])
 
 
 def _field_half_planes(rig: Rig, y_m: float) -> list[Float64]:

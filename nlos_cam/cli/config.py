@@ -18,7 +18,7 @@ from nlos_calibration.errors import CalibrationError
 from rich.table import Table
 
 from nlos_cam.cli.common import Detail, Json, finish, say, say_interrupted, set_detail, show
-from nlos_cam.errors import RecordingError, did_you_mean
+from nlos_cam.errors import RecordingError, UnknownNameError, did_you_mean
 from nlos_cam.files import read_toml
 
 FILE = "nlos-cam.toml"
@@ -284,6 +284,26 @@ def _is_bench(name: str) -> bool:
     return is_bench(Path(name))
 
 
+def names_object(argument: str) -> bool:
+    """Return True for a first argument of `predict` that is its OBJECT, and no rig or bench: a mesh,
+    a depth map, or a category that no file and no bench folder has the name of.
+    """
+    from nlos_cam.objects import object_kind  # not for the help page
+
+    try:
+        kind = object_kind(argument)
+    except UnknownNameError:
+        return False
+    return kind != "category" or not (Path(argument).is_file() or _is_bench(argument))
+
+
+def _names_rig(values: Mapping[str, Any]) -> bool:
+    """Return True for a rig that was given. The only argument of `predict` may be its object."""
+    rig = values.get("rig")
+    is_alone = "hidden" in values and values["hidden"] is None
+    return rig is not None and not (is_alone and names_object(rig))
+
+
 def _is_result(given: object) -> bool:
     """Return True for what holds its own pictures or turns: a saved session, or a folder that is
     neither a bench nor a recording of ROS 2.
@@ -304,7 +324,7 @@ def _choose_bench(values: Mapping[str, Any], used: dict[str, Value]) -> None:
     if any(_is_result(values.get(name)) for name in ("file", "camera")):
         for name in ("bench", "wall", "weights"):
             used.pop(name, None)
-    if any(values.get(name) is not None for name in ("wall", "rig", "data")):
+    if any(values.get(name) is not None for name in ("wall", "data")) or _names_rig(values):
         used.pop("bench", None)
     if values.get("bench_folder") is not None or ("bench" in used and used["bench"].value):
         used.pop("wall", None)

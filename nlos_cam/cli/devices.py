@@ -17,6 +17,7 @@ from nlos_cam import camera as cameras
 from nlos_cam import doctor as diagnosis
 from nlos_cam.cli.common import Json, Overwrite, finish, output_path, say, show
 from nlos_cam.errors import NlosCamError
+from nlos_cam.files import atomic_file
 
 VISIBLE = {True: "yes", False: "[red]no[/]", None: ""}
 """Cell for a camera that is listed, not listed, and not searched for."""
@@ -193,7 +194,8 @@ def doctor(
 
 def _write(path: Path) -> None:
     try:
-        path.write_text(diagnosis.rules_text(), encoding="utf-8")
+        with atomic_file(path) as part:
+            part.write_text(diagnosis.rules_text(), encoding="utf-8")
     except OSError as error:
         raise NlosCamError(
             f"cannot write {path} ({error.strerror}): write it to this folder, then install it"

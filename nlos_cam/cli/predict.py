@@ -24,6 +24,7 @@ from nlos_cam.cli.common import (
     show,
     tracked,
 )
+from nlos_cam.cli.config import names_object
 from nlos_cam.cli.render import (
     Front,
     OffsetX,
@@ -51,7 +52,8 @@ def predict(
         typer.Argument(
             metavar="[RIG_OR_BENCH]",
             help="Name of a packaged rig, a rig's TOML file, a wall.toml, or a bench folder;"
-            " default: paper-rig. With --bench, the first argument is OBJECT.",
+            " default: the bench of --bench or of the settings, else paper-rig. It may be left out"
+            " before OBJECT.",
         ),
     ] = None,
     hidden: Annotated[
@@ -109,6 +111,8 @@ def predict(
             raise typer.BadParameter(f"--bench and {rig} each name a rig: give one")
         bench_folders.load_bench_record(bench_folder)  # refuses what is no bench folder
         rig, hidden = str(bench_folder), rig
+    elif hidden is None and rig is not None and names_object(rig):
+        rig, hidden = None, rig
     own, _ = benches.bench_or_rig(rig or PAPER_RIG)
     depth_m = _object_depth(hidden, own, placement)
     shape = None if depth_m is None else forecast.Shape.of(depth_m, objects.object_box(own))

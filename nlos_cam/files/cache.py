@@ -22,7 +22,8 @@ def cache_folder() -> Path:
     """Return NLOS_CAM_CACHE, or "nlos-cam" in the user's cache directory."""
     if chosen := os.environ.get("NLOS_CAM_CACHE"):
         return Path(chosen)
-    return Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "nlos-cam"
+    # An empty variable counts as none, by the XDG specification: it would name the current folder.
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "nlos-cam"
 
 
 def load_cached(path: Path, read: Callable[[bytes], T], make: Callable[[], bytes]) -> T:

@@ -8,7 +8,6 @@ from nlos_calibration import (
     DISTANCE_RANGE_M,
     FACING_RANGE_DEG,
     GAP_RANGE_M,
-    Extent,
     Rig,
     lidar_visible_share,
 )
@@ -90,7 +89,8 @@ def _candidates(rig: Rig) -> Iterator[tuple[str, Rig, bool]]:
         tries.append((text, rig.model_copy(update={"lidar": turned}), True))
     for step_m, word in ((-ALONG_M, "away from the object"), (ALONG_M, "towards the object")):
         text = f"lidar {ALONG_M * 100:.0f} cm along the wall, {word}"
-        tries.append((text, _along(rig, step_m), True))
+        place_m = np.array([step_m, 0.0, lidar.distance_m])
+        tries.append((text, rig.seen_from(place_m), True))
     if rig.occluder is not None:
         for step_m, word in ((-GAP_M, "narrower"), (GAP_M, "wider")):
             gap_m = _stepped(rig.occluder.z_min_m, step_m, *GAP_RANGE_M)
@@ -98,8 +98,7 @@ def _candidates(rig: Rig) -> Iterator[tuple[str, Rig, bool]]:
             text = f"gap {word}: {gap_m:.2f} m in place of {rig.occluder.z_min_m:.2f} m"
             tries.append((text, rig.model_copy(update={"occluder": occluder}), False))
     for text, other, moves_lidar in tries:
-        same = other.lidar == rig.lidar and other.occluder == rig.occluder
-        if not same and lidar_visible_share(other, object_box(other)) <= direct:
+        if other != rig and lidar_visible_share(other, object_box(other)) <= direct:
             yield text, other, moves_lidar
 
 
@@ -109,24 +108,3 @@ def _stepped(value: float, step: float, low: float, high: float) -> float:
     """
     there = float(np.clip(value + step, low, high))
     return there if (there - value) * step > 0 else value
-
-
-def _along(rig: Rig, step_m: float) -> Rig:
-    """Return the rig with its lidar moved along the wall's x.
-
-    The wall frame's origin is the lidar's foot: everything else moves the other way.
-    """
-    update: dict[str, object] = {
-        "wall": _shifted(rig.wall, -step_m),
-        "relay": _shifted(rig.relay, -step_m),
-        "object_box": _shifted(object_box(rig), -step_m),
-    }
-    if rig.occluder is not None:
-        x_m = rig.occluder.x_m - step_m
-        update["occluder"] = rig.occluder.model_copy(update={"x_m": x_m})
-    return rig.model_copy(update=update)
-
-
-def _shifted(extent: Extent, step_m: float) -> Extent:
-    update = {"x_min_m": extent.x_min_m + step_m, "x_max_m": extent.x_max_m + step_m}
-    return extent.model_copy(update=update)

@@ -10,6 +10,7 @@ import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import made_benches
 import numpy as np
@@ -171,6 +172,19 @@ def test_stream_stops_camera_after_error_and_needs_a_start(opened: Open) -> None
         next(stream)
     with pytest.raises(ZeroDivisionError), stream:
         next(stream).frame_number // 0
+
+    assert camera.closed.is_set()
+
+
+def test_stream_that_cannot_start_leaves_its_camera(
+    opened: Open, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    camera = WallCamera(10**9)
+    stream = opened(camera, "sim")
+    monkeypatch.setattr(threading.Thread, "start", Mock(side_effect=RuntimeError("no thread")))
+
+    with pytest.raises(RuntimeError, match="no thread"), stream:
+        pass
 
     assert camera.closed.is_set()
 

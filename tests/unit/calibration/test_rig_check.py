@@ -144,6 +144,33 @@ def test_judge_rig_advises_the_least_move_that_hides(bench: Rig) -> None:
     assert leak(by_m) <= 0.001 < leak(by_m - 0.01)
 
 
+def test_endless_wall_is_seen_from_another_foot() -> None:
+    endless = on_wall(PAPER, -100.0, 100.0, -100.0, 100.0)
+
+    moved = endless.seen_from(np.array([0.003, -0.002, 0.2]))
+
+    assert (moved.wall.x_min_m, moved.wall.y_max_m) == pytest.approx((-100.003, 100.002))
+    assert moved.occluder
+    assert PAPER.occluder
+    assert moved.occluder.x_m == pytest.approx(PAPER.occluder.x_m - 0.003)
+
+
+def test_sheet_behind_the_lidar_hides_nothing() -> None:
+    open_share = lidar_visible_share(changed(occluder=None), BOX)
+
+    assert lidar_visible_share(rig(-0.01), BOX) == open_share > 0.01
+
+
+@pytest.mark.parametrize("gap_m", [0.1, 0.15, 0.2])
+def test_mirrored_bench_shows_the_lidar_as_much(gap_m: float) -> None:
+    bench = rig(gap_m=gap_m)
+    sides = {"x_min_m": -BOX.x_max_m, "x_max_m": -BOX.x_min_m}
+
+    mirrored = lidar_visible_share(rig(-0.2, gap_m, yaw_deg=-45.0), BOX.model_copy(update=sides))
+
+    assert mirrored == pytest.approx(lidar_visible_share(bench, BOX), abs=1e-9)
+
+
 def with_low_box(bench: Rig, x_min_m: float) -> Rig:
     """Return the bench with a small box near the wall, which a lower edge does not hide."""
     size = {"x_min_m": x_min_m, "x_max_m": x_min_m + 0.05, "z_near_m": 0.01, "z_far_m": 0.06}

@@ -49,6 +49,49 @@ def test_predict_bench_takes_its_rig_and_an_object(
     assert main(["predict", "--bench", "bench", "paper-rig", "cup"]) == 2
 
 
+def test_predict_of_an_object_alone_takes_the_configured_bench(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    folder = make_bench(Path("bench"))
+    Path("nlos-cam.toml").write_text('bench = "bench"\n', encoding="utf-8")
+
+    assert main(["predict", "cup", "--quick", "--json"]) == 0
+
+    found = json.loads(capsys.readouterr().out.splitlines()[-1])
+    assert found["rig_checksum"] == load_bench(folder).rig.checksum
+    assert found["object"] == "cup"
+
+
+def test_predict_of_an_object_alone_takes_the_papers_rig(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+
+    assert main(["predict", "cup", "--quick", "--json"]) == 0
+
+    found = json.loads(capsys.readouterr().out.splitlines()[-1])
+    assert (found["rig"], found["object"]) == ("paper-rig", "cup")
+
+
+@pytest.mark.parametrize("rig", ["paper-rig", "mine.toml", "cup"])
+def test_predict_of_a_rig_leaves_the_configured_bench(
+    rig: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    make_bench(Path("bench"))
+    Path("nlos-cam.toml").write_text('bench = "bench"\n', encoding="utf-8")
+    text = dump_toml(load_rig("paper-rig"))
+    for name in ("mine.toml", "cup"):  # a file may have the name of a category
+        Path(name).write_text(text, encoding="utf-8")
+
+    assert main(["predict", rig, "--quick", "--json"]) == 0
+
+    found = json.loads(capsys.readouterr().out.splitlines()[-1])
+    assert found["rig_checksum"] == load_rig("paper-rig").checksum
+    assert found["object"] is None
+
+
 def test_predict_places_an_object_as_render_does(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

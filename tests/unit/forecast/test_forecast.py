@@ -18,7 +18,7 @@ from nlos_cam.forecast import (
     shipped_prior,
     words_of,
 )
-from nlos_cam.forecast.advice import _candidates
+from nlos_cam.forecast.advice import ALONG_M, _candidates
 from nlos_cam.forecast.lidar_view import SURE
 from nlos_cam.objects import benchmark_objects, object_box
 from nlos_cam.render import SensorModel
@@ -131,6 +131,17 @@ def test_no_change_leads_the_other_way() -> None:
 
     assert any("farther" in text for text in words)
     assert not any("nearer" in text for text in words)
+
+
+def test_no_change_moves_the_lidar_past_the_occluder() -> None:
+    """From beyond the sheet the object is in plain sight: another task."""
+    near = HOME.seen_from(np.array([0.11, 0.0, HOME.lidar.distance_m]))
+    changes = {text: rig for text, rig, _ in _candidates(near)}
+
+    assert near.occluder
+    assert 0 < near.occluder.x_m < ALONG_M
+    assert any("away from the object" in text for text in changes)
+    assert all(rig.occluder and rig.occluder.x_m > 0 for rig in changes.values())
 
 
 def test_less_noise_determines_more() -> None:
