@@ -49,6 +49,7 @@ __all__ = [
     "corner_rays",
     "depth_noise_m",
     "depth_offset_m",
+    "distance_per_offset",
     "dump_toml",
     "facing_angle_rad",
     "find_corners",
@@ -111,7 +112,12 @@ from .noise import (
     with_mm,
 )
 from .occluder import OccluderFit, find_occluder
-from .range_offset import CorrectedWall, fit_with_board_distance, fit_with_tape_distance
+from .range_offset import (
+    CorrectedWall,
+    distance_per_offset,
+    fit_with_board_distance,
+    fit_with_tape_distance,
+)
 from .reference import FULL_SCALE, BareWall, BareWallStatistics, Moments, save_reference
 from .rig import (
     DeviceConstants,

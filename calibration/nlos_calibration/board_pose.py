@@ -252,6 +252,7 @@ def fit_board(
     _check_print(pose)
     slopes, covariance = pose.slopes()
     _check_certain(slopes, covariance)
+    _check_faced(slopes)
     return BoardFit(
         slopes=slopes,
         # A print larger by a share moves the plane away by that share: the slopes change along
@@ -371,4 +372,13 @@ def _check_certain(slopes: Float64, covariance: Float64) -> None:
             f"the board determines the wall's angle only to {angle_std_deg:.1f} degrees,"
             f" {MAX_ANGLE_STD_DEG:g} needed: it is too far away, edge on, or mostly out of view;"
             " move it to the near side of the view"
+        )
+
+
+def _check_faced(slopes: Float64) -> None:
+    """Raise BoardRefusedError for a plane that the optical axis never meets."""
+    # along the axis 1 / z = slopes[2]; at the side of the view such a plane is visible all the same
+    if slopes[2] <= 0.0:
+        raise BoardRefusedError(
+            "the optical axis never meets the board's plane: turn the lidar towards the wall"
         )

@@ -20,7 +20,7 @@ from nlos_calibration.board import Board, find_corners
 from nlos_calibration.board_pose import fit_board
 from nlos_calibration.errors import WallRefusedError
 from nlos_calibration.geometry import Intrinsics, plane_from_slopes, wall_from_plane
-from nlos_calibration.range_offset import CorrectedWall
+from nlos_calibration.range_offset import MAX_OFFSET_M, CorrectedWall, distance_per_offset
 from nlos_calibration.rig import Finite, NotNegative, Positive, Record
 from nlos_calibration.wall import (
     Verdict,
@@ -35,9 +35,8 @@ Used = Literal["both", "depth", "board"]
 
 AGREE_SIGMAS = 4.0
 """Chance alone puts two planes farther apart once in 900 times (chi-square of three unknowns)."""
-MAX_OFFSET_M = 0.03
 MAX_SCALE = 0.2
-"""Largest plausible range offset of a lidar, and scale error of a printer."""
+"""Largest plausible scale error of a printer."""
 
 
 @dataclass(frozen=True)
@@ -87,9 +86,14 @@ class Combined:
     """Likely causes of a disagreement, each with its amount; empty where they agree."""
 
 
-def combine(depth: UncertainPlane, board: UncertainPlane, *, measured: bool) -> Combined:
+def combine(
+    depth: UncertainPlane, board: UncertainPlane, *, measured: bool, per_offset: float = 1.0
+) -> Combined:
     """Average both planes where they agree; else use the board's if its squares were `measured`, or
     the depth's.
+
+    `per_offset` is the growth of the depth's distance per length added to each depth
+    (`distance_per_offset`).
     """
     apart = disagreement(depth, board)
     if apart.sigmas <= AGREE_SIGMAS:
@@ -101,9 +105,8 @@ def combine(depth: UncertainPlane, board: UncertainPlane, *, measured: bool) -> 
         return Combined(average, "both", apart, ())
     # Which of two is wrong only a ruler tells: a measured print is trusted, a drawing is not.
     used: Used = "board" if measured else "depth"
-    return Combined(
-        board if measured else depth, used, apart, _causes(depth, board, apart, measured=measured)
-    )
+    causes = _causes(depth, board, apart, measured=measured, per_offset=per_offset)
+    return Combined(board if measured else depth, used, apart, causes)
 
 
 def disagreement(depth: UncertainPlane, board: UncertainPlane) -> Disagreement:
@@ -134,16 +137,21 @@ def _sigmas(axes: Float64, difference: Float64, covariance: Float64) -> float:
 
 
 def _causes(
-    depth: UncertainPlane, board: UncertainPlane, apart: Disagreement, *, measured: bool
+    depth: UncertainPlane,
+    board: UncertainPlane,
+    apart: Disagreement,
+    *,
+    measured: bool,
+    per_offset: float,
 ) -> tuple[str, ...]:
     """Return the usual causes of a disagreement that could explain this one, each with its
     amount.
     """
     causes: list[str] = []
-    # A board's distance is proportional to the assumed size of its squares. An offset acts along
-    # the optical axis, where the same change is longer than along the normal, by 1 / cos(facing).
+    # A board's distance is proportional to the assumed size of its squares. The offset that it
+    # shows is one of the depth (`range_offset`).
     scale = depth.distance_m / board.distance_m
-    offset_m = apart.distance_m / max(-float(depth.normal[2]), 1e-3)
+    offset_m = apart.distance_m / max(per_offset, 1e-3)
     if apart.distance_sigmas > AGREE_SIGMAS:
         if abs(scale - 1.0) <= MAX_SCALE and not measured:
             causes.append(
@@ -152,8 +160,8 @@ def _causes(
             )
         if abs(offset_m) <= MAX_OFFSET_M:
             causes.append(
-                f"the lidar's range offset: {1e3 * offset_m:+.1f} mm along its axis would explain"
-                " the distance; measure with a tape and give --tape-m"
+                f"the lidar's range offset: {1e3 * offset_m:+.1f} mm added to each depth would"
+                " explain the distance; measure with a tape and give --tape-m"
             )
     if apart.angle_sigmas > AGREE_SIGMAS:
         causes.append(
@@ -239,7 +247,8 @@ def wall_with_board(
         return _by_board(plane, depth), record.model_copy(update={"depth_refused": str(depth)})
     # In slopes both are linear, and their covariances add; distance and angles would not be.
     by_depth = UncertainPlane(-depth.wall_from_lidar[2, :3] / depth.distance_m, depth.covariance)
-    both = combine(by_depth, plane, measured=measured)
+    per_offset = distance_per_offset(depth, intrinsics)
+    both = combine(by_depth, plane, measured=measured, per_offset=per_offset)
     apart = both.disagreement
     comparison = {
         "used": both.used,

@@ -14,7 +14,7 @@ import numpy as np
 from nlos_calibration.arrays import Float32, Float64
 from nlos_calibration.errors import CalibrationError
 from nlos_calibration.noise import SCATTER_PER_MEDIAN, with_degrees, with_mm
-from nlos_calibration.reference import BareWall
+from nlos_calibration.reference import BareWall, is_temperature
 from nlos_calibration.wall import TOLERANCE_DEG, TOLERANCE_M
 from nlos_calibration.wall_tracker import WallObservation, WallTrack
 
@@ -169,10 +169,6 @@ TOLERANCE_C = 5.0
 """Nobody has published how the range of an L515 moves with its temperatures, so this is a guess
 between warming up and a room's fluctuations. The resulting change of range is measured from the
 depth itself."""
-ABSOLUTE_ZERO_C = -273.15
-"""Lower readings are invalid: an L515 reports -9999 until it has measured the photodiode's
-temperature.
-"""
 HOST_OPTIONS = frozenset(
     {"error_polling_enabled", "frames_queue_size", "global_time_enabled", "host_performance"}
 )
@@ -262,7 +258,7 @@ class DriftCheck:
         value.
         """
         for name, now_c in celsius.items():
-            if name in self._reference.celsius and now_c > ABSOLUTE_ZERO_C:
+            if name in self._reference.celsius and is_temperature(now_c):
                 self._about_celsius[name] = self._about_temperature(name, now_c)
 
     @property

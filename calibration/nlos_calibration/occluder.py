@@ -95,11 +95,14 @@ class SheetFit:
     @property
     def tilt_std_deg(self) -> float:
         """Upper limit of the standard uncertainty of `tilt_deg`."""
-        # tilt^2 = lean^2 + twist^2 for small angles, so its uncertainty is at most that of both.
+        # tilt = atan(h) with h^2 = lean^2 + twist^2, so that dh is at most the hypotenuse of both
+        # uncertainties, and d tilt = dh / (1 + h^2): a sheet that faces the lidar is as surely
+        # tilted as an upright one is not
         twist_std = propagated_std(
             np.array([-self.twist, -1.0, 0.0]) / self.normal[0], self.covariance
         )
-        return degrees(hypot(self.lean_std, twist_std))
+        per_tangent = 1.0 / (1.0 + self.lean**2 + self.twist**2)
+        return degrees(hypot(self.lean_std, twist_std) * per_tangent)
 
     def x_m(self, z_m: float) -> float:
         """Return x of the plane at a height over the wall and y = 0."""

@@ -7,6 +7,7 @@ import json
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, fields
 from io import BytesIO
+from math import inf
 from pathlib import Path
 from typing import Any
 from zipfile import ZipFile
@@ -26,6 +27,14 @@ MAX_BYTES = 1 << 28
 """Bound on a reference file, and on its unpacked content: one of 640 x 480 pixels has some 20
 MB.
 """
+ABSOLUTE_ZERO_C = -273.15
+
+
+def is_temperature(celsius: float) -> bool:
+    """Return False for a reading that is none: an L515 reports -9999 until it has measured the
+    photodiode's temperature, and a broken thermometer may read NaN or infinity.
+    """
+    return ABSOLUTE_ZERO_C < celsius < inf
 
 
 class Moments:
@@ -121,9 +130,12 @@ class BareWallStatistics:
         self._map_intensity.add(np.where(np.isfinite(map_depth_m), map_intensity, np.nan))
 
     def add_temperatures(self, celsius: Mapping[str, float]) -> None:
-        """Add one reading of the device's temperatures, by the SDK's name; may be empty."""
+        """Add one reading of the device's temperatures, by the SDK's name; may be empty. Values
+        that are no temperatures are left out.
+        """
         for name, value in celsius.items():
-            self._celsius.setdefault(name, []).append(value)
+            if is_temperature(value):
+                self._celsius.setdefault(name, []).append(value)
 
     def ir_mean(self) -> Float64:
         """Return the mean infrared (height, width) in counts; NaN before the first frame."""

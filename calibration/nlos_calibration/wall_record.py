@@ -30,9 +30,11 @@ from nlos_calibration.rig import (
     Rig,
     load_rig,
     read_record,
+    record_kind,
 )
 from nlos_calibration.rig_check import combined, footprint, judge_rig, rig_with_occluder
 from nlos_calibration.wall import Verdict, WallFit, range_verdict
+from nlos_cam.files import read_toml
 
 Row = tuple[Finite, Finite, Finite, Finite]
 POSE_TOLERANCE = 1e-6
@@ -243,10 +245,14 @@ def rig_named(name: str) -> Rig:
 
 
 def is_wall_record(name: str) -> bool:
-    """Return whether a name is that of a wall record's file."""
-    # Only a wall record has a schema version; a rig's own file has none.
+    """Return whether a name is that of a wall record's file; False for one that is no TOML."""
     path = Path(name)
-    return path.is_file() and "schema_version" in path.read_text(encoding="utf-8", errors="replace")
+    if not path.is_file():
+        return False
+    try:
+        return record_kind(read_toml(path)) == "wall record"
+    except (OSError, ValueError):
+        return False  # whoever reads it as a rig says what is wrong with it
 
 
 @dataclass(frozen=True)

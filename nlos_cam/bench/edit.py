@@ -159,7 +159,8 @@ def write_weights(folder: Path, source: Path, test_iou: float | None = None) -> 
     out = folder / WEIGHTS
     with edit_bench(folder) as edit:
         names = sorted(path.name for path in source.iterdir() if path.is_file())
-        with atomic_directory(out) as part:
+        # an uncertainty network of earlier weights would watch others than those beside it
+        with atomic_directory(out, drop="*") as part:
             for name in names:
                 shutil.copyfile(source / name, part / name)
             fields = rig.model_dump(mode="json")
@@ -171,9 +172,5 @@ def write_weights(folder: Path, source: Path, test_iou: float | None = None) -> 
                 write_checked(part, {RECORD: f"{known.model_dump_json(indent=2)}\n".encode()})
             elif not (part / CHECKSUMS).exists():
                 write_checked(part, {name: (part / name).read_bytes() for name in names})
-        # an uncertainty network of earlier weights would watch others than those beside it
-        for left in out.iterdir():
-            if left.is_file() and left.name not in {*names, CHECKSUMS}:
-                left.unlink()
         edit.add(out / CHECKSUMS)
     return out

@@ -122,10 +122,7 @@ def load_bench(folder: str | Path, station: str = MAIN, *, weights: bool = True)
     """
     folder = Path(folder)
     record = load_bench_record(folder)
-    if station not in record.stations:
-        raise RecordFileError(
-            f"{folder} has no station {station!r}: choose from {', '.join(record.stations)}"
-        )
+    _check_station(folder, record, station)
     _check_files(folder, record, weights=weights)
     stations = {name: _measured(folder, record, one) for name, one in record.stations.items()}
     has_weights = weights and f"{WEIGHTS}/{CHECKSUMS}" in record.files
@@ -140,10 +137,18 @@ def load_bare_wall(folder: str | Path, station: str = MAIN) -> walls.MeasuredWal
     """
     folder = Path(folder)
     record = load_bench_record(folder)
+    _check_station(folder, record, station)
     place = record.stations[station]
     if place.wall in record.files:
         _check_file(folder, record, place.wall)
     return _with_box(walls.load_measured(folder / place.wall), place.object_box)
+
+
+def _check_station(folder: Path, record: BenchRecord, station: str) -> None:
+    if station not in record.stations:
+        raise RecordFileError(
+            f"{folder} has no station {station!r}: choose from {', '.join(record.stations)}"
+        )
 
 
 def _check_files(folder: Path, record: BenchRecord, *, weights: bool) -> None:

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from datetime import datetime
 from functools import partial
 from itertools import islice
-from math import ceil, hypot
+from math import cos, hypot, isfinite, radians
 from typing import Any
 
 import nlos_calibration as walls
@@ -23,10 +23,10 @@ from nlos_cam.reconstruct import check_intrinsics
 
 CELSIUS_EVERY = 30
 """Frames between temperature readings: each costs a command to the device."""
-PARTS = 4
-"""Parts of a capture whose walls are compared: the lidar must stand still from the first to the
-last."""
+MAX_PARTS = 8
 MIN_PART_FRAMES = 15
+"""Number and length of the parts of a capture whose walls are compared: the lidar must stand still
+from the first to the last."""
 
 
 @dataclass(frozen=True)
@@ -92,15 +92,20 @@ def collect_statistics(
     settings = dict[str, float]()
     gravity_m_s2: walls.Gravity | None = None
     parts: list[walls.DepthMean] = []
-    part_frames = max(MIN_PART_FRAMES, ceil(frames / PARTS))
+    part_frames = MIN_PART_FRAMES
     for number, frame in enumerate(islice(camera, frames)):
         maps = maps_from_frame(frame)
         statistics.add(frame.depth_m, frame.ir, maps.depth_m, maps.intensity)
         few_m, _ = thinned(frame.depth_m, frame.intrinsics)
         if number % part_frames == 0:
+            # A recording may end long before the number of frames that were asked for: so parts are
+            # short at first, and every second one goes as they become many.
+            if len(parts) == MAX_PARTS:
+                parts = parts[::2]
+                part_frames *= 2
             parts.append(walls.DepthMean(*few_m.shape))
         parts[-1].add(few_m)
-        settings = dict(frame.settings)
+        settings = {name: value for name, value in frame.settings.items() if isfinite(value)}
         gravity_m_s2 = frame.gravity_m_s2 or gravity_m_s2
         if number % CELSIUS_EVERY == 0:
             statistics.add_temperatures(camera.telemetry("_temperature"))
@@ -183,12 +188,16 @@ def measure_by_depth(
 def _fit_with_known_offset(
     capture: CaptureStatistics, known: walls.WallRecord
 ) -> tuple[walls.WallFit, dict[str, object]]:
-    """Fit the wall to its depth with a record's range offset, whose uncertainty is the distance's
-    too; return the fit and the record's range-offset fields.
+    """Fit the wall to its depth with a record's range offset, whose uncertainty makes the distance
+    uncertain too; return the fit and the record's range-offset fields.
     """
     offset_m = walls.depth_offset_m(known)
     fit = _fit_depth(capture, offset_m, known.range_offset_m - offset_m)
-    std_m = hypot(fit.distance_std_m, known.range_offset_std_m or 0.0)
+    # an origin that moves along the optical axis moves away from the wall by the cosine of that
+    per_offset = cos(radians(fit.facing_deg))
+    if known.range_offset_cause == "depth":
+        per_offset = walls.distance_per_offset(fit, capture.intrinsics)
+    std_m = hypot(fit.distance_std_m, per_offset * (known.range_offset_std_m or 0.0))
     names = ("range_offset_m", "range_offset_std_m", "range_offset_cause")
     return replace(fit, distance_std_m=std_m), {name: getattr(known, name) for name in names}
 

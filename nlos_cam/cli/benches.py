@@ -184,11 +184,15 @@ def files_in_bench(folder: Path, *, occluder: bool, overwrite: bool) -> calibrat
     """
     name = "occluder.toml" if occluder else "wall.toml"
     record = folder / benches.station_folder(benches.MAIN) / name
+    _refuse_existing(record, overwrite=overwrite)
+    return calibrate.WallFiles.beside(record, overwrite=overwrite)
+
+
+def _refuse_existing(record: Path, *, overwrite: bool) -> None:
     if record.exists() and not overwrite:
         raise OutputExistsError(
             f"{record} exists: choose another bench, or add --overwrite to replace it"
         )
-    return calibrate.WallFiles.beside(record, overwrite=overwrite)
 
 
 def write_to_bench(
@@ -196,13 +200,17 @@ def write_to_bench(
     files: calibrate.WallFiles,
     record: walls.WallRecord,
     reference: walls.BareWall | None,
+    *,
+    overwrite: bool,
 ) -> walls.WallRecord:
     """Write a measurement to its `files_in_bench` and enter it in the bench, which is made if it is
     missing; return the record, which names its reference.
 
-    A wall that is measured again drops the occluder found before; the object box stays.
+    A wall that is measured again drops the occluder found before; the object box stays. Raises
+    OutputExistsError without `overwrite` for a record that another process wrote meanwhile.
     """
     with benches.edit_bench(folder) as edit:
+        _refuse_existing(files.record, overwrite=overwrite)
         files.record.parent.mkdir(parents=True, exist_ok=True)
         record = calibrate.write_record(files, record, reference)
         name = files.record.relative_to(folder).as_posix()

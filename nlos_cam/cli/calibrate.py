@@ -178,6 +178,7 @@ SquareMm = Annotated[
     typer.Option(
         "--square-mm",
         min=1.0,
+        max=1000.0,
         help="Measured side of the board's squares in mm: length of its bar x 0.3.",
     ),
 ]
@@ -186,6 +187,7 @@ OccluderX = Annotated[
     typer.Option(
         "--occluder-x-m",
         min=0.01,
+        max=100.0,
         help="Occluder's edge measured by hand, in metres along the wall from the lidar's foot.",
     ),
 ]
@@ -194,6 +196,7 @@ OccluderGap = Annotated[
     typer.Option(
         "--occluder-gap-m",
         min=0.001,
+        max=100.0,
         help="Gap between occluder's edge and wall measured by hand, in metres.",
     ),
 ]
@@ -355,6 +358,7 @@ class Target(NamedTuple):
     bare: walls.MeasuredWall | None
     """Measured bare wall in front of which the occluder is found; None to measure the wall."""
     files: bench.WallFiles
+    overwrite: bool
 
     @classmethod
     def of(
@@ -368,12 +372,14 @@ class Target(NamedTuple):
         else:
             path = output_path(out, "wall", ".toml", overwrite=overwrite)
             files = bench.WallFiles.beside(path, overwrite=overwrite)
-        return cls(folder, bare, files)
+        return cls(folder, bare, files, overwrite)
 
     def write(self, record: walls.WallRecord, reference: walls.BareWall | None) -> walls.WallRecord:
         """Write the measurement, and return the record, which names its reference."""
         if self.folder:
-            return benching.write_to_bench(self.folder, self.files, record, reference)
+            return benching.write_to_bench(
+                self.folder, self.files, record, reference, overwrite=self.overwrite
+            )
         return bench.write_record(self.files, record, reference)
 
 

@@ -24,7 +24,7 @@ def write_wall(folder: Path, measured: MeasuredWall, *, overwrite: bool = False)
     """Write a measurement into a bench folder, as `calibrate` does."""
     occluder = measured.record.occluder is not None
     files = files_in_bench(folder, occluder=occluder, overwrite=overwrite)
-    write_to_bench(folder, files, measured.record, measured.reference)
+    write_to_bench(folder, files, measured.record, measured.reference, overwrite=overwrite)
 
 
 def _no_report(*_: object) -> str:

@@ -21,6 +21,7 @@ from nlos_cam.bench import (
     load_bench,
     write_weights,
 )
+from nlos_cam.cli.benches import files_in_bench, write_to_bench
 from nlos_cam.errors import OutputExistsError
 from nlos_cam.files import read_toml
 from nlos_cam.forecast import FORECAST_VERSION
@@ -90,6 +91,23 @@ def test_wall_measured_again_drops_the_occluder_keeps_the_box(folder: Path) -> N
     assert bench.measured.record.occluder is None
     assert bench.rig.object_box.x_max_m == 0.6
     assert not (folder / "stations/main/occluder.toml").exists()
+
+
+def test_bare_wall_of_no_station_is_refused(folder: Path) -> None:
+    with pytest.raises(RecordFileError, match="choose from main"):
+        load_bare_wall(folder, "left")
+
+
+def test_measurement_of_another_process_meanwhile_stays(tmp_path: Path) -> None:
+    first = wall_of()
+    files = files_in_bench(tmp_path / "bench", occluder=False, overwrite=False)
+    write_wall(tmp_path / "bench", first)
+
+    with pytest.raises(OutputExistsError, match="--overwrite"):
+        write_to_bench(
+            tmp_path / "bench", files, wall_of(frames=7).record, first.reference, overwrite=False
+        )
+    assert load_bench(tmp_path / "bench").measured.record.frames == first.record.frames
 
 
 def test_existing_measurement_stays_unless_overwritten(folder: Path) -> None:

@@ -297,6 +297,19 @@ def test_fit_board_refuses_a_board_edge_on() -> None:
         fit_board(Corners(np.arange(40), pixels + 0.2 * noise_px()), A4, PINHOLE)
 
 
+@pytest.mark.parametrize("yaw_deg", [92.0, 100.0])
+def test_fit_board_refuses_a_board_beside_the_optical_axis(yaw_deg: float) -> None:
+    right, up, normal = wall_from_plane(normal_from_angles(np.radians(yaw_deg), 0.0), 0.1)[:3, :3]
+    x_m, y_m, _ = (A4.corners_m - [0.09, 0.135, 0.0]).T
+    at_m = 0.25 * np.array([-0.7, 0.0, 1.0]) + np.outer(x_m, right) - np.outer(y_m, up)
+    pixels = (at_m @ PINHOLE.matrix.T)[:, :2] / at_m[:, 2:]
+
+    assert np.all(at_m[:, 2] > 0.0)
+    assert np.all(at_m @ normal < 0.0)  # its printed side is towards the lidar
+    with pytest.raises(BoardRefusedError, match="optical axis"):
+        fit_board(Corners(np.arange(40), pixels + 0.05 * noise_px()), A4, PINHOLE)
+
+
 def test_fit_board_refuses_a_tiny_board_far_away() -> None:
     tiny = A4.measured(1.0)
     middle_m = np.array([0.0875, 0.131, 0.0])

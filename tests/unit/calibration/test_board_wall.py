@@ -1,3 +1,4 @@
+import re
 from dataclasses import replace
 from functools import cache
 
@@ -268,18 +269,28 @@ def test_combined_plane_holds_the_truth_as_often_as_stated(drawings: list[Combin
     assert np.mean(inside) == pytest.approx(0.95, abs=0.02)
 
 
-def causes_of(board: UncertainPlane, *, measured: bool = False) -> str:
-    return "\n".join(combine(plane(0.2), board, measured=measured).causes)
+def causes_of(board: UncertainPlane, *, measured: bool = False, per_offset: float = 1.0) -> str:
+    both = combine(plane(0.2), board, measured=measured, per_offset=per_offset)
+    return "\n".join(both.causes)
 
 
 def test_cause_of_a_distance_is_scale_or_offset_with_amounts() -> None:
-    causes = causes_of(plane(PRINTED_AT_97_PERCENT_M, std_m=5e-4))
-    # along the axis the same wall is farther than along its normal
-    offset_m = (PRINTED_AT_97_PERCENT_M - TRUE_M) / (np.cos(np.radians(45.0)) * np.cos(0.1))
+    causes = causes_of(plane(PRINTED_AT_97_PERCENT_M, std_m=5e-4), per_offset=0.8)
+    offset_m = (PRINTED_AT_97_PERCENT_M - TRUE_M) / 0.8
 
     assert "97.0 %" in causes
     assert f"{1e3 * offset_m:+.1f} mm" in causes
     assert "angle" not in causes
+
+
+def test_cause_of_short_depths_is_their_offset() -> None:
+    depth_m = View(RIG.wall_from_lidar, PINHOLE).depth_m - 0.008
+    mean = depth_statistics(depth_m, np.random.default_rng(0), frames=5)
+    short = fit_wall(mean.mean_m(), PINHOLE, np.random.default_rng(0), mean.noise())
+    _, record = wall_with_board(short, infrared(), PINHOLE, A4, measured=True)
+
+    (amount_mm,) = re.findall(r"offset: ([+-]\d+\.\d) mm", " ".join(record.causes))
+    assert float(amount_mm) == pytest.approx(8.0, abs=0.6)  # the print's scale
 
 
 def test_cause_of_a_turn_is_the_angle_alone() -> None:

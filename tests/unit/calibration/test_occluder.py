@@ -171,6 +171,15 @@ def test_find_occluder_refuses_a_sheet_it_cannot_trust(
         found(sheet, yaw_deg)
 
 
+@pytest.mark.parametrize("from_column", [80, 130])
+def test_find_occluder_refuses_a_sheet_along_the_wall(seen: View, from_column: int) -> None:
+    depth_m = seen.depth_m.copy()
+    depth_m[:, from_column:] *= 0.7
+
+    with pytest.raises(OccluderRefusedError, match=r"(89|90)\.\d degrees off"):
+        fitted(seen, noisy(depth_m))
+
+
 def test_find_occluder_refuses_a_box_beside_the_sheet(seen: View) -> None:
     box = bench_depth(seen, Sheet(0.08, 0.05, height_m=0.06))
     with pytest.raises(OccluderRefusedError, match=r"\d+%"):

@@ -13,6 +13,7 @@ from nlos_calibration.range_offset import (
     MAX_OFFSET_M,
     TAPE_STD_M,
     FitWith,
+    distance_per_offset,
     fit_with_board_distance,
     fit_with_tape_distance,
 )
@@ -351,6 +352,15 @@ def test_tape_offset_of_the_origin_moves_the_pose_along_the_axis(
     assert taped.fit.distance_m == pytest.approx(0.2 + offset_m * cosine, abs=1e-9)
     assert taped.fit.wall_from_lidar[2, 3] == taped.fit.distance_m
     np.testing.assert_allclose(taped.fit.wall_from_lidar[:3, :3], true[:3, :3], atol=3e-4)
+
+
+@pytest.mark.parametrize("yaw_deg", [0.0, 20.0, -45.0, 75.0])
+def test_distance_per_offset_is_that_of_the_fits(yaw_deg: float) -> None:
+    fit_with = read_as(bare(0.2, yaw_deg, PITCH_DEG))
+    before = fit_with(0.0, 0.0)
+    growth_m = fit_with(0.001, 0.0).distance_m - before.distance_m
+
+    assert distance_per_offset(before, PINHOLE) == pytest.approx(growth_m / 0.001, rel=0.01)
 
 
 def test_tape_that_agrees_changes_only_the_uncertainty() -> None:

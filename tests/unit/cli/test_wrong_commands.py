@@ -65,6 +65,8 @@ calibrate | --wall
 calibrate --wall --occluder wall.toml | --wall
 calibrate --wall sim --bag run.bag | --bag
 calibrate --wall --occluder-x-m 0.2 | together
+calibrate --wall --occluder-x-m inf --occluder-gap-m 0.1 | to 100
+calibrate --wall --board --square-mm inf | to 1000
 calibrate --wall --board --tape-m 0.2 | --tape-m
 calibrate --wall --square-mm 30 | --board
 calibrate --wall --paper a4 | --board
