@@ -20,9 +20,10 @@ from numpy.typing import NDArray
 from nlos_cam.camera import Camera
 from nlos_cam.frames import Frame, maps_from_frame, saturated_share
 from nlos_cam.reconstruct import check_intrinsics
+from nlos_cam.recording import with_telemetry
 
-CELSIUS_EVERY = 30
-"""Frames between temperature readings: each costs a command to the device."""
+CELSIUS_EVERY_S = 1.0
+"""Time between temperature readings: each costs a command to the device."""
 MAX_PARTS = 8
 MIN_PART_FRAMES = 15
 """Number and length of the parts of a capture whose walls are compared: the lidar must stand still
@@ -93,7 +94,8 @@ def collect_statistics(
     gravity_m_s2: walls.Gravity | None = None
     parts: list[walls.DepthMean] = []
     part_frames = MIN_PART_FRAMES
-    for number, frame in enumerate(islice(camera, frames)):
+    passing, telemetry = with_telemetry(camera, CELSIUS_EVERY_S)
+    for number, frame in enumerate(islice(passing, frames)):
         maps = maps_from_frame(frame)
         statistics.add(frame.depth_m, frame.ir, maps.depth_m, maps.intensity)
         few_m, _ = thinned(frame.depth_m, frame.intrinsics)
@@ -107,8 +109,8 @@ def collect_statistics(
         parts[-1].add(few_m)
         settings = {name: value for name, value in frame.settings.items() if isfinite(value)}
         gravity_m_s2 = frame.gravity_m_s2 or gravity_m_s2
-        if number % CELSIUS_EVERY == 0:
-            statistics.add_temperatures(camera.telemetry("_temperature"))
+        if celsius := telemetry.at(frame):
+            statistics.add_temperatures(celsius)
         on_frame()
     if statistics.depth.frames == 0:
         raise WallRefusedError(

@@ -216,5 +216,7 @@ def _checks_table(checks: Sequence[diagnosis.Check]) -> Table:
 def _fixes(checks: Sequence[diagnosis.Check], failures: int) -> str:
     """Return the fixes, each on a line that can be copied, and the number of failures."""
     fixes = [f"[bold]{check.name}[/]: {escape(check.fix)}" for check in checks if check.fix]
-    total = f"{failures} of {len(checks)} checks failed" if failures else "All checks passed"
+    total = "No check failed" if fixes else "All checks passed"
+    if failures:
+        total = f"{failures} of {len(checks)} checks failed"
     return "\n".join(["", *(["Fixes, in this order:", *fixes, ""] if fixes else []), total])

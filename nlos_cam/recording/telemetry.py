@@ -54,11 +54,11 @@ class Telemetry:
         return newest
 
 
-def telemetry_of(camera: Camera) -> Telemetry:
+def telemetry_of(camera: Camera, every_s: float = TEMPERATURE_INTERVAL_S) -> Telemetry:
     """Return the telemetry of a device, or of a recording's sidecar if it has one."""
     path = sidecar_path(Path(camera.uri.removeprefix(RECORDED)))
     if not camera.uri.startswith(RECORDED) or not path.is_file():
-        return Telemetry(lambda _: camera.telemetry("_temperature"))
+        return Telemetry(lambda _: camera.telemetry("_temperature"), every_s)
     try:
         series = load_sidecar(path).temperatures
     except RecordingError as error:
@@ -67,11 +67,14 @@ def telemetry_of(camera: Camera) -> Telemetry:
     return Telemetry(
         lambda time_s: next(
             (each.celsius for each in reversed(series) if each.time_s <= time_s), {}
-        )
+        ),
+        every_s,
     )
 
 
-def with_telemetry(camera: Camera) -> tuple[Iterator[Frame], Telemetry]:
+def with_telemetry(
+    camera: Camera, every_s: float = TEMPERATURE_INTERVAL_S
+) -> tuple[Iterator[Frame], Telemetry]:
     """Return the camera's frames and its telemetry, which is read as they pass."""
-    telemetry = telemetry_of(camera)
+    telemetry = telemetry_of(camera, every_s)
     return telemetry.watch(camera), telemetry

@@ -2,9 +2,9 @@
 on disk.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from datetime import date
+from datetime import UTC, date, datetime
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +17,7 @@ from nlos_calibration.wall_record import MeasuredWall, load_measured, new_wall_r
 from small_frames import RIG, SERIAL, SMALL, FrameCamera
 
 from nlos_cam.frames import Frame, maps_from_frame
+from nlos_cam.recording.sidecar import Sidecar, Temperatures, sidecar_path
 
 NOISE_M = 5e-4
 WALL_M = wall_depth(RIG.wall_from_lidar, SMALL)
@@ -74,6 +75,22 @@ def write_wall(
     record = new_wall_record(FIT, intrinsics, **about, others={"serial": SERIAL, **others})
     path.write_text(dump_toml(record), encoding="utf-8")
     return path
+
+
+def write_sidecar(bag: Path, temperatures: Sequence[Temperatures]) -> None:
+    """A sidecar of the wall's recording, with temperatures."""
+    sidecar = Sidecar(
+        label=None,
+        camera="l515",
+        state="complete",
+        intrinsics=vars(SMALL),
+        device={},
+        versions={},
+        settings={},
+        started=datetime(2026, 1, 2, tzinfo=UTC),
+        temperatures=list(temperatures),
+    )
+    sidecar_path(bag).write_text(sidecar.model_dump_json())
 
 
 def measured_wall(folder: Path) -> MeasuredWall:

@@ -2,10 +2,11 @@ import re
 from collections.abc import Mapping
 from dataclasses import replace
 from datetime import date
+from pathlib import Path
 
 import numpy as np
 import pytest
-from fake_wall import SERIAL, WallCamera
+from fake_wall import SERIAL, WallCamera, write_sidecar
 from nlos_calibration import WayUp
 from nlos_calibration.errors import CalibrationError, OccluderRefusedError, WallRefusedError
 from nlos_calibration.geometry import Intrinsics
@@ -22,12 +23,15 @@ from nlos_cam.calibrate.measure import (
     measure_occluder,
 )
 from nlos_cam.frames import Frame, maps_from_frame
+from nlos_cam.recording.sidecar import Temperatures
 from nlos_cam.render.geometry import cast
 
 RIG = load_rig("bare-wall")
 BENCH = load_rig("paper-rig")
 INTRINSICS = RIG.pinhole.scaled(160, 120)
 ALL = np.ones((64, 80), np.bool_)
+TWO_SECONDS = 61
+"""Frames, the first and the last one two seconds apart."""
 
 
 class Warming(WallCamera):
@@ -73,7 +77,7 @@ def test_collect_statistics_refuses_a_camera_without_frames() -> None:
 
 
 def test_statistics_read_temperatures_now_and_then() -> None:
-    capture = collect_statistics(Warming(2 * measure.CELSIUS_EVERY + 1, celsius=30.0), 1000)
+    capture = collect_statistics(Warming(TWO_SECONDS, celsius=30.0), 1000)
 
     assert capture.facts()["temperatures_c"] == {"ldd_temperature": 32.0}
     assert capture.reference(ALL).celsius_span == {"ldd_temperature": 2.0}
@@ -91,12 +95,24 @@ class Mad(WallCamera):
 
 @pytest.mark.parametrize("value", [float("nan"), float("inf"), -9999.0])
 def test_statistics_leave_out_what_is_no_temperature(value: float) -> None:
-    camera = Mad(measure.CELSIUS_EVERY + 1, celsius=30.0)
+    camera = Mad(TWO_SECONDS, celsius=30.0)
     camera._celsius_at_first = value
     capture = collect_statistics(camera, 1000)
 
     assert capture.facts()["temperatures_c"] == {"ldd_temperature": 30.0}
     assert capture.reference(ALL).celsius_span == {"ldd_temperature": 0.0}
+
+
+def test_recording_has_the_temperatures_of_its_sidecar(tmp_path: Path) -> None:
+    series = [Temperatures(time_s=t_s, celsius={"ldd_temperature": 40.0 + t_s}) for t_s in (0, 1)]
+    bag = tmp_path / "wall.bag"
+    write_sidecar(bag, temperatures=series)
+    camera = WallCamera(TWO_SECONDS, celsius=99.0)
+    camera.uri = f"bag:{bag}"
+
+    capture = collect_statistics(camera, 1000)
+
+    assert capture.reference(ALL).celsius_span == {"ldd_temperature": 1.0}
 
 
 @pytest.mark.parametrize("wanted", [60, 1000])

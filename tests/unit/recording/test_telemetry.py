@@ -1,6 +1,5 @@
 from collections.abc import Mapping
 from dataclasses import replace
-from datetime import UTC, datetime
 from itertools import count as count_up
 from pathlib import Path
 from types import SimpleNamespace
@@ -8,10 +7,10 @@ from typing import Any
 from unittest.mock import Mock
 
 import pytest
-from fake_wall import SMALL, wall_frame
+from fake_wall import wall_frame, write_sidecar
 
 from nlos_cam.frames import Frame
-from nlos_cam.recording.sidecar import Sidecar, Temperatures, sidecar_path
+from nlos_cam.recording.sidecar import Temperatures, sidecar_path
 from nlos_cam.recording.telemetry import Telemetry, telemetry_of
 
 FRAMES = [wall_frame(number) for number in range(1, 100, 10)]
@@ -83,19 +82,8 @@ def bag(tmp_path: Path) -> Path:
     series = [
         Temperatures(time_s=10.0 * k, celsius={"ldd_temperature": 40.0 + k}) for k in range(4)
     ]
-    sidecar = Sidecar(
-        label=None,
-        camera="l515",
-        state="complete",
-        intrinsics=vars(SMALL),
-        device={},
-        versions={},
-        settings={},
-        started=datetime(2026, 1, 2, tzinfo=UTC),
-        temperatures=series,
-    )
     path = tmp_path / "wall.bag"
-    sidecar_path(path).write_text(sidecar.model_dump_json())
+    write_sidecar(path, series)
     return path
 
 
