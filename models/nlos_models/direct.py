@@ -271,6 +271,11 @@ class DirectNetwork(nn.Module):
         return torch.cat([x[:, 0], x[:, 1].flip(-2)], dim=-2)
 
     @property
+    def intensities(self) -> int:
+        """Number of intensities of the maps: one, three in color."""
+        return len(self.normal.median) - 1
+
+    @property
     def last_layers(self) -> list[nn.Module]:
         """Layers that the second phase of a transfer trains."""
         return [self.norm, self.heads]

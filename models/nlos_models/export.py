@@ -153,7 +153,7 @@ def export_onnx(pipeline: RemappingNetwork | DirectNetwork) -> bytes:
     """Return the pipeline, preprocessing included, as an ONNX file for any batch size. Raises
     ModelError for color.
     """
-    if isinstance(pipeline, RemappingNetwork) and pipeline.intensities > 1:
+    if pipeline.intensities > 1:
         raise ModelError(
             f"color networks ({SIMULATION_ONLY}) cannot be exported: use them in torch"
         )

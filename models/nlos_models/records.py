@@ -6,7 +6,7 @@ import hashlib
 from collections.abc import Iterable, Sequence
 from importlib import resources
 from pathlib import Path
-from typing import Any, Self
+from typing import Annotated, Any, Self
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, ValidationInfo, field_validator
 
@@ -93,10 +93,11 @@ class CheckpointRecord(BaseModel):
         """
         last = dict[str, Recipe]()
         earlier = list[Recipe]()
-        # A new compressor is fitted to its VAE, so that an earlier transfer of another one is
-        # history; a new VAE replaces the VAE alone.
+        # A transfer fits the network that was trained before it: where another run of that network
+        # follows, both are history. A new VAE replaces the VAE alone.
         for recipe in runs:
-            replaced = ("compressor", "transfer") if recipe.task == "compressor" else (recipe.task,)
+            fitted = ("transfer",) if recipe.task in {"compressor", "direct"} else ()
+            replaced = (recipe.task, *fitted)
             earlier += [last.pop(task) for task in replaced if task in last]
             last[recipe.task] = recipe
         recipes = {f"{task}_recipe": recipe for task, recipe in last.items()}
@@ -172,6 +173,9 @@ def load_record(folder: Path) -> CheckpointRecord:
         ) from error
 
 
+Positive = Annotated[float, Field(gt=0)]
+
+
 class UncertaintyRecord(BaseModel):
     """Watched weights, recipe, calibration and held-out figures of an uncertainty network."""
 
@@ -184,9 +188,9 @@ class UncertaintyRecord(BaseModel):
     """As in CheckpointRecord."""
     learnt: list[str]
     """Kinds of outliers in its training set."""
-    temperatures: tuple[float, float] = (1.0, 1.0)
+    temperatures: tuple[Positive, Positive] = (1.0, 1.0)
     """Divisors of the logits of nothing and of outside (out of distribution)."""
-    error_scale: float = Field(default=1.0, gt=0)
+    error_scale: Positive = 1.0
     """Factor of the expected error."""
     nothing_above: float = Field(default=0.5, ge=0, le=1)
     """Lowest probability of the verdict that nothing is hidden."""

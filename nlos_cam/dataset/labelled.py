@@ -106,6 +106,11 @@ def _depth_map(path: Path, box: ObjectBox) -> Float32:
             f"{path} has shape {depth_m.shape}: the depth map of a label needs {OBJECT_PIXELS} x"
             f" {OBJECT_PIXELS} cells"
         )
+    if behind := int((depth_m > np.float32(box.z_far_m)).sum()):
+        raise RecordingError(
+            f"{path} has {behind} of {depth_m.size} cells behind the object box ({box.z_far_m:g} m"
+            " from the wall): the depth map of a label lies within it, with NaN for background"
+        )
     return depth_m
 
 

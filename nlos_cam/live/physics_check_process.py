@@ -14,7 +14,7 @@ import time
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from queue import SimpleQueue
-from threading import Thread
+from threading import Lock, Thread
 from typing import IO, Any, Self
 
 from nlos_calibration import Rig
@@ -57,6 +57,8 @@ class BackgroundPhysicsCheck:
         self.dropped = 0
         """Due frames that a newer one replaced."""
         self._rig = rig
+        self._of_one_rig = Lock()
+        """Held while `newest` is made to fit the rig, or the rig to change."""
         self._accuracy: Stop = accuracy
         self._period_s = period_s
         self._clock = clock
@@ -88,9 +90,10 @@ class BackgroundPhysicsCheck:
 
     def use_rig(self, rig: Rig) -> None:
         """Compare the frames that are offered from now on with this rig."""
-        if rig != self._rig:
-            self.newest = None
-        self._rig = rig
+        with self._of_one_rig:
+            if rig != self._rig:
+                self.newest = None
+            self._rig = rig
 
     def offer(self, frame_number: int, maps: LidarMaps, depth_m: Float32) -> None:
         """Have this frame checked if a check is due."""
@@ -130,8 +133,9 @@ class BackgroundPhysicsCheck:
             _send(to_worker, frame)
             answer = pickle.load(from_worker)  # noqa: S301  from our own process, through a private pipe
             if isinstance(answer, PhysicsCheckResult):
-                # one of a rig that is no longer used says nothing
-                self.newest = answer if frame[-1] == self._rig else self.newest
+                with self._of_one_rig:
+                    # one of a rig that is no longer used says nothing
+                    self.newest = answer if frame[-1] == self._rig else self.newest
             else:
                 self._report(describe_failure(frame[0], str(answer)))
 

@@ -120,7 +120,8 @@ FEW_FACES = 0.05
 
 
 def without_absent(depth_m: Float32, label: str, box: ObjectBox) -> tuple[Float32, tuple[str, ...]]:
-    """Return a depth map with NaN where a depth of 0 stands for "no data", and what was changed.
+    """Return a depth map with NaN where a depth of 0 stands for "no data", and what was changed or
+    lies behind the box.
 
     Depth cameras write 0 there, and a depth of 0 is the relay wall itself. Raises SceneError for
     other depths nearer than the box.
@@ -134,9 +135,15 @@ def without_absent(depth_m: Float32, label: str, box: ObjectBox) -> tuple[Float3
             f" ({box.z_near_m:g} m from the wall): depths are from the wall into the room, NaN or 0"
             " for background"
         )
-    if not absent.any():
-        return found, ()
-    return found, (f"{label}: {absent.sum()} cells with a depth of 0 are taken as background",)
+    notes = list[str]()
+    if absent.any():
+        notes.append(f"{label}: {absent.sum()} cells with a depth of 0 are taken as background")
+    if farther := int((found > np.float32(box.z_far_m)).sum()):
+        notes.append(
+            f"{label}: {farther} of its {depth_m.size} cells lie behind the object box"
+            f" ({box.z_far_m:g} m from the wall), where no reconstruction can place them"
+        )
+    return found, tuple(notes)
 
 
 def _vanishing(label: str, triangles: Float64, depth_m: Float32) -> list[str]:

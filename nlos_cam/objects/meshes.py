@@ -35,6 +35,7 @@ if TYPE_CHECKING:
 _PLAIN = bytes(range(128)).replace(b"\t", b" ") + b"?" * 128
 """Translation of bytes: tab to blank, non-ASCII (only in names and comments) to "?"."""
 _COMMENT = re.compile(rb"#[^\n]*")
+_INDENT = re.compile(rb"^ +", re.MULTILINE)
 _RELATIVE = re.compile(rb" -(\d+)")
 _RELATIVE_FACE = re.compile(rb"^f [^\n]*-", re.MULTILINE)
 _DECIMAL_COMMA = re.compile(rb"^vn? [^\n]*\d,\d[^\n]*", re.MULTILINE)
@@ -57,7 +58,8 @@ def plain(content: bytes, suffix: str) -> bytes:
         content = header.replace(b"element edge ", b"element wire ") + end + body
     if b"\0" in content:
         return _checked_binary(content, suffix)
-    text = content.removeprefix(b"\xef\xbb\xbf").replace(b"\r\n", b"\n").translate(_PLAIN)
+    text = content.removeprefix(b"\xef\xbb\xbf").replace(b"\r\n", b"\n").replace(b"\r", b"\n")
+    text = text.translate(_PLAIN)
     return _plain_obj(text) if suffix == ".obj" else text
 
 
@@ -89,6 +91,7 @@ def _whole_stl(content: bytes) -> bytes:
 
 def _plain_obj(text: bytes) -> bytes:
     text = _COMMENT.sub(b"", text.replace(b"\\\n", b" "))
+    text = _INDENT.sub(b"", text)  # trimesh passes over indented lines
     if _RELATIVE_FACE.search(text):
         text = _with_absolute_indices(text)
     if _VERTEX_0.search(text):
@@ -209,10 +212,17 @@ def read_depth_map(path: Path) -> Float32:
     return np.array(stored, np.float32)
 
 
+def _check_openable(path: Path, kind: str) -> None:
+    """Raise SceneFileError for a pipe or a device: opening one would wait for a writer."""
+    if path.exists() and not (path.is_file() or path.is_dir()):
+        raise SceneFileError(f"{path} is not a file: give the path of a {kind}")
+
+
 @contextmanager
 def _readable(path: Path, kind: str, advice: str) -> Generator[None]:
     """Raise any error of a parser on a missing or damaged file as one SceneFileError."""
     try:
+        _check_openable(path, kind)
         yield
     except SceneError:
         raise
@@ -256,13 +266,18 @@ def _parts(content: bytes, suffix: str) -> list[trimesh.Trimesh]:
 def _triangles_of(content: bytes, suffix: str) -> Float64:
     """Return the triangles (n, 3, 3) of a file's content."""
     if suffix == ".ply" and _has_strips(content):
-        return ply_triangles(content)
+        return _ply_polygons(content)
     parts = _parts(content, suffix)
     triangles = np.concatenate([np.empty((0, 3, 3)), *(_triangles(part) for part in parts)])
     # More triangles than faces: the parser cut polygons as fans.
     if suffix == ".ply" and len(triangles) > _ply_face_count(content):
-        return ply_triangles(content)
+        return _ply_polygons(content)
     return triangles
+
+
+def _ply_polygons(content: bytes) -> Float64:
+    with _strict():  # plyfile warns of a face without corners
+        return ply_triangles(content)
 
 
 def _has_strips(content: bytes) -> bool:

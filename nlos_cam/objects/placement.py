@@ -66,8 +66,10 @@ def panel(depth_m: Float32, box: ObjectBox, generator: np.random.Generator) -> F
     """Return a panel (rows, columns) behind the object, parallel to the wall, over 60 to 100 % of
     the box's sides.
     """
-    # Behind the whole object, so that the panel never hides a part of it.
-    z_m = generator.uniform(np.nanmax(depth_m), box.z_far_m)
+    # Behind the whole object, so that the panel never hides a part of it. Rounded to float32, an
+    # object that ends at the back of the box ends behind it.
+    back_m = min(float(np.nanmax(depth_m)), box.z_far_m)
+    z_m = generator.uniform(back_m, box.z_far_m)
     rows, columns = (
         np.abs((np.arange(cells) + 0.5) / cells - 0.5) <= generator.uniform(0.6, 1.0) / 2
         for cells in depth_m.shape

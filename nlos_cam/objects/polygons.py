@@ -28,9 +28,12 @@ def triangulate(points: Float64) -> Corners:
 
     A polygon without an area, or with fewer than three corners, gives none.
     """
+    no_triangles = np.empty((0, 3), np.int64)
+    if len(points) < 3:
+        return no_triangles
     normal = newell_normal(points)
-    if len(points) < 3 or not np.abs(normal).max() > 0:
-        return np.empty((0, 3), np.int64)
+    if not np.abs(normal).max() > 0:
+        return no_triangles
     if is_convex(points, normal):
         fan = np.arange(1, len(points) - 1)
         return np.stack([np.zeros_like(fan), fan, fan + 1], 1)

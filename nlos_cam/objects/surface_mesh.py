@@ -21,7 +21,7 @@ patches.
 MAX_UNCERTAINTY_M = 0.03
 """Uncertainty drawn brightest, in meshes, view and plots; the object box is 0.28 m deep."""
 NEUTRAL = 180, 180, 180, 255
-"""RGBA of a vertex of unknown uncertainty."""
+"""RGBA of the vertices of a mesh without uncertainty."""
 
 
 @dataclass(frozen=True)

@@ -93,8 +93,9 @@ class MapAlignment:
     module.
 
     With the bench's own bare wall, its reflectance and a constant error of range are taken out as
-    well. `bare_wall_counts` are those of the brightest bare wall in training (default: the
-    simulated sensor's).
+    well; `range_offset_m` is what is added to the lidar's depths (`CalibratedRig.range_offset_m`).
+    `bare_wall_counts` are those of the brightest bare wall in training (default: the simulated
+    sensor's).
     """
 
     def __init__(
@@ -103,6 +104,7 @@ class MapAlignment:
         trained: Rig,
         bare: BareWall | None = None,
         bare_wall_counts: float | None = None,
+        range_offset_m: float = 0.0,
     ) -> None:
         bench, shift_m, spot_m = _spots_of(bench, trained)
         here = cast(bench, bench.pinhole.scaled(MAP_COLUMNS, MAP_ROWS), occluder=False)
@@ -113,7 +115,7 @@ class MapAlignment:
         self._keep_training_rig(trained, there, bare_wall_counts)
         self._unseen = np.ones(SHAPE, bool)
         self._unseen.flat[self._cells] = ~self._neighbors.seen
-        self._keep_bare_wall(here, bare)
+        self._keep_bare_wall(here, bare, range_offset_m)
 
         # An echo over three bounces ends at the lidar too, from wherever on the wall that the
         # lidar sees: its last leg d4 differs between the rigs by the mean over those points.
@@ -145,14 +147,22 @@ class MapAlignment:
         self._wall_path_m = 2 * there.length_m[self._cells]
         self._half_cos = there.cos_axis[self._cells] / 2
 
-    def _keep_bare_wall(self, here: "Beams", bare: BareWall | None) -> None:
+    def _keep_bare_wall(self, here: "Beams", bare: BareWall | None, range_offset_m: float) -> None:
         """Keep the bench's bare wall, as measured, or by its geometry where it was not."""
         wall_m = (here.length_m * here.cos_axis).reshape(SHAPE)
         light = here.direct.reshape(SHAPE)
+        # Counts for a unit of the light that the maps are compared with. A frame in which no cell
+        # sees the wall has no gain of its own: then the simulated sensor's counts.
+        usual_gain = SensorModel().bare_wall_counts / light.max()
         if bare:
             known = (bare.map_intensity > 0) & np.isfinite(bare.map_depth_m)
-            wall_m = np.where(known, bare.map_depth_m, wall_m)
-            light = np.where(known, bare.map_intensity, light)
+            wall_m = np.where(known, bare.map_depth_m + range_offset_m, wall_m)
+            # in the reference's counts, so that cells without a measurement fit the others
+            lit = known & (light > 0)
+            counts = np.median(bare.map_intensity[lit] / light[lit]) if lit.any() else usual_gain
+            light = np.where(known, bare.map_intensity, counts * light)
+            usual_gain = 1.0
+        self._usual_log_gain = float(np.log(usual_gain))
         self._wall_m = wall_m
         self._path_per_depth = (2 / here.cos_axis).reshape(SHAPE)
         with np.errstate(divide="ignore"):
@@ -166,15 +176,13 @@ class MapAlignment:
         counts.flat[self._cells] = maps.intensity[self._neighbors.nearest]
         return counts
 
-    def align(self, maps: LidarMaps, beyond_wall_m: Float32 | None = None) -> LidarMaps:
-        """Return maps of the bench as those of the training rig.
-
-        `beyond_wall_m` (64, 80) are the depths less those of the bare wall, where they are known
-        better than from `maps`: without drift.
+    def align(self, maps: LidarMaps) -> LidarMaps:
+        """Return maps of the bench, with the range offset corrected, as those of the training
+        rig.
         """
         # The path beyond the wall's own, and the logarithm of the light's ratio to the wall's: the
         # wall's slope, reflectance and a constant range error are in neither.
-        beyond_m = maps.depth_m - self._wall_m if beyond_wall_m is None else beyond_wall_m
+        beyond_m = maps.depth_m - self._wall_m
         cell_beyond_m = beyond_m * self._path_per_depth  # (64, 80), cells of the bench
         cell_log_ratio = np.log(np.maximum(maps.intensity, MIN_COUNTS)) - self._log_light
 
@@ -186,7 +194,9 @@ class MapAlignment:
         # As from the training rig's lidar: echoes over three bounces change, the wall's do not.
         trained_beyond_m = np.where(of_wall, spot_beyond_m, spot_beyond_m + self._longer_m)
         trained_log_ratio = np.where(of_wall, spot_log_ratio, spot_log_ratio + self._log_brighter)
-        log_gain = _log_gain(spot_log_ratio, of_wall)
+        # Where cells see the bare wall, the light's ratio to the wall's should be 1.
+        seen_gain = spot_log_ratio[of_wall]
+        log_gain = float(np.median(seen_gain)) if of_wall.any() else self._usual_log_gain
         return self._maps_of(trained_beyond_m, trained_log_ratio - log_gain)
 
     def _interpolate(self, beyond_m: Float64, log_ratio: Float64) -> tuple[Float64, Float64]:
@@ -228,21 +238,19 @@ class MapAlignment:
         return LidarMaps(depth_m, np.where(valid, light, np.float32(0)), valid)
 
 
-def _log_gain(log_ratio: Float64, of_wall: Mask) -> float:
-    """Return the logarithm of the frame's gain: where cells (n,) see the bare wall, the light's
-    ratio to the wall's should be 1. 0 where none does.
-    """
-    return float(np.median(log_ratio[of_wall])) if of_wall.any() else 0.0
-
-
 def alignment(
-    bench: Rig, trained: CheckpointRecord, bare: BareWall | None = None
+    bench: Rig,
+    trained: CheckpointRecord,
+    bare: BareWall | None = None,
+    range_offset_m: float = 0.0,
 ) -> MapAlignment | None:
-    """Return the alignment of a bench with the rig of weights; None where `rig_to_align_with` has
-    none.
+    """Return the alignment of a bench with the rig of weights, `bare` and `range_offset_m` as for
+    `MapAlignment`; None where `rig_to_align_with` has none.
     """
     rig = rig_to_align_with(bench, trained)
-    return MapAlignment(bench, rig, bare, trained.bare_wall_counts) if rig else None
+    if rig is None:
+        return None
+    return MapAlignment(bench, rig, bare, trained.bare_wall_counts, range_offset_m)
 
 
 def align_all(maps: "MapSet", benches: Iterable[Rig], trained: CheckpointRecord) -> "MapSet":

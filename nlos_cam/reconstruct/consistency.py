@@ -5,7 +5,8 @@ tell a wrong answer from maps that no object can cause. This check needs no answ
 returns the stronger of two echoes (S5): that of the bare wall, or that of three bounces. So,
 whatever is hidden:
 
-1. a three-bounce path is longer than the direct one, so no cell measures less than the wall;
+1. a three-bounce path is longer than the direct one, so no cell measures less than the wall; nor
+   does a path over an object in the box have any length (`echo_range_m`);
 2. a cell that measures the wall's depth returns the wall's light;
 3. a cell that measures more returns at least the wall's light, or its echo would not have won; and
    since the echo's lead grows from zero at the region's outline, it returns more inside;
@@ -30,7 +31,7 @@ from nlos_cam.objects import object_box, object_depth
 from nlos_cam.reconstruct.bare_bench import brightest_light, interior, wall_as_rendered
 from nlos_cam.reconstruct.bench import CalibratedRig
 from nlos_cam.reconstruct.flat_field import MIN_WALL_CELLS, as_measured
-from nlos_cam.render import Rendering, Scene, SensorModel, render
+from nlos_cam.render import Rendering, Scene, SensorModel, cast, render
 
 OFF_WALL_M = 0.009
 """Depth beyond the wall's from which on a cell shows an echo: three times the error of a bench's
@@ -148,6 +149,7 @@ class MapConsistency:
         if bench.reference is not None:
             wall = as_measured(*wall, bench.reference, bench.range_offset_m)
         self._depth_m, self._light = wall
+        self._nearest_echo_m, self._farthest_echo_m = echo_range_m(rig)
 
     def examine(self, maps: LidarMaps) -> MapFindings:
         """Return the findings of maps (64, 80) with the range offset corrected."""
@@ -171,8 +173,11 @@ class MapConsistency:
         echo = both & (beyond_m >= OFF_WALL_M)
         nearer = (beyond_m < -NEARER_M).sum() > NEARER_CELLS
         if at_wall.sum() < MIN_WALL_CELLS:
-            farther = (echo & (beyond_m < NO_ECHO_M)).sum() >= MIN_WALL_CELLS
-            return [MapProblem.OFF_RECORD] if nearer or farther else []
+            # An object may win in every cell. Or the lidar looks at something else.
+            too_near = beyond_m < self._nearest_echo_m
+            no_path = echo & (too_near | (beyond_m > self._farthest_echo_m))
+            elsewhere = nearer or no_path.sum() >= MIN_WALL_CELLS
+            return [MapProblem.OFF_RECORD] if elsewhere else []
 
         light, noise = self._log_light(maps, both, at_wall)
         spread = _spread(light[at_wall])
@@ -206,6 +211,45 @@ class MapConsistency:
             used &= np.abs(light) < max(3 * _spread(light[used]), BRIGHTER)
         variance = (SENSOR.read_noise_counts**2 + SENSOR.shot_noise**2 * expected) / CELL_PIXELS
         return np.where(both, light, 0.0), NOISE_SIGMAS * np.sqrt(variance) / (expected + 1)
+
+
+def echo_range_m(rig: Rig) -> tuple[Float64, Float64]:
+    """Return the least and the largest depth beyond the wall's, each (64, 80), that a path of three
+    bounces over a point of a rig's box can have in each cell.
+
+    At least NO_ECHO_M; without an object box any depth from there on.
+    """
+    shape = MAP_ROWS, MAP_COLUMNS
+    if rig.object_box is None:
+        return np.full(shape, NO_ECHO_M), np.full(shape, np.inf)
+
+    beams = cast(rig, rig.pinhole.scaled(MAP_COLUMNS, MAP_ROWS))
+    spot_m = beams.laser_spot_m
+    seen_m = spot_m[beams.on_wall]
+    last_m = np.linalg.norm(seen_m - beams.lidar_m, axis=1)
+
+    # The path beyond the wall's is d2 + d3 + d4 - d1: from the spot to the box, from there to a
+    # point of the wall that the lidar sees, and back. Least and largest values of d2 and of d3 + d4
+    # apart bound their sum, whatever the object.
+    nearest_m, farthest_m = _box_distances_m(rig, spot_m)
+    back_near_m, back_far_m = _box_distances_m(rig, seen_m)
+    shortest_m = nearest_m - beams.length_m + (back_near_m + last_m).min()
+    longest_m = farthest_m - beams.length_m + (back_far_m + last_m).max()
+    half_cos = beams.cos_axis / 2  # of depth along the optical axis
+    return (
+        np.maximum(half_cos * shortest_m, NO_ECHO_M).reshape(shape),
+        (half_cos * longest_m).reshape(shape),
+    )
+
+
+def _box_distances_m(rig: Rig, points_m: Float64) -> tuple[Float64, Float64]:
+    """Return the distances (n,) of points (n, 3) to the nearest and farthest point of a rig's box."""
+    box = object_box(rig)
+    low_m = np.array([box.x_min_m, box.y_min_m, box.z_near_m])
+    high_m = np.array([box.x_max_m, box.y_max_m, box.z_far_m])
+    nearest_m = points_m - np.clip(points_m, low_m, high_m)
+    farthest_m = np.maximum(np.abs(points_m - low_m), np.abs(points_m - high_m))
+    return np.linalg.norm(nearest_m, axis=1), np.linalg.norm(farthest_m, axis=1)
 
 
 def _fitted(light: Float64, counts: Float64, used: Mask) -> Float64:

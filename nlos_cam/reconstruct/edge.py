@@ -188,7 +188,8 @@ class Edge(NamedTuple):
         """Write the occluder's own depth and light into its cells of a column, in place."""
         rows = self.occluder.cells[:, column]
         maps.depth_m[rows, column] = self.occluder.depth_m[rows, column]
-        maps.intensity[rows, column] = gain * self.occluder.light[rows, column]
+        counts = gain * self.occluder.light[rows, column]
+        maps.intensity[rows, column] = np.minimum(counts, SATURATED)
         maps.valid[rows, column] = True
 
     def extend_wall(self, maps: LidarMaps, column: int) -> None:

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
+from nlos_calibration import Rig
 from nlos_calibration.arrays import Float32
 from nlos_calibration.errors import CalibrationError
 from nlos_models import (
@@ -197,6 +198,8 @@ class PreparedFrame:
     """Frame with the maps that go into the networks."""
 
     arrival: Arrival
+    rig: Rig
+    """Rig of the bench that the maps were prepared for."""
     maps: LidarMaps
     observation: BenchObservation
     checked: LidarMaps
@@ -262,12 +265,13 @@ class Pipeline:
         aligned = None
         if self.trained:
             check_alignable(bench.rig, self.trained)
-            aligned = alignment(bench.rig, self.trained, bench.reference)
+            aligned = alignment(bench.rig, self.trained, bench.reference, bench.range_offset_m)
         consistency = MapConsistency(bench) if self.uncertainty_model else None
-        prepared = PreparedBench(bench, aligned, OwnMaps(bench), consistency)
-        self.checks.use_rig(bench.rig)
         # in one assignment: `prepare` must not see half of it
-        self._bench = prepared
+        self._bench = PreparedBench(bench, aligned, OwnMaps(bench), consistency)
+        # After it: a frame of this bench that is still compared with the old rig is forgotten, one
+        # of the old bench that is compared with this rig would not be.
+        self.checks.use_rig(bench.rig)
 
     @property
     def average(self) -> int:
@@ -303,13 +307,7 @@ class Pipeline:
         difference = observation.difference
         corrected = own.steps(maps, observation.drift_m)
         if aligned:
-            # The difference is free of drift, but was taken before the edge was repaired: the depth
-            # that the repair adds comes on top.
-            drift_free_m = difference.depth_m if difference else None
-            if drift_free_m is not None and corrected.edge_is_repaired:
-                moved_m = corrected.repaired.depth_m - corrected.ranged.depth_m
-                drift_free_m = (drift_free_m + moved_m).astype(np.float32)
-            network_input = aligned.align(corrected.repaired, drift_free_m)
+            network_input = aligned.align(corrected.repaired)
         elif self._uses_difference and difference:
             network_input = difference
         else:
@@ -326,6 +324,7 @@ class Pipeline:
         }
         return PreparedFrame(
             arrival=arrival,
+            rig=bench.rig,
             maps=maps,
             observation=observation,
             checked=own.as_rendered(corrected.exact),
@@ -337,21 +336,29 @@ class Pipeline:
         )
 
     def reconstruct(self, frames: Sequence[PreparedFrame], clock: Clock) -> list[Reconstruction]:
-        """Return the reconstruction of each frame; reads and changes no state, so any thread may
-        call it.
+        """Return the reconstruction of each frame, all of one bench; reads and changes no state, so
+        any thread may call it.
         """
         maps = [frame.network_input for frame in frames]
-        return reconstruct_all(maps, self.bench.rig, self.network, clock, self.uncertainty_model)
+        return reconstruct_all(maps, frames[0].rig, self.network, clock, self.uncertainty_model)
 
     def finish(
         self, prepared: PreparedFrame, reconstruction: Reconstruction, clock: Clock
     ) -> FrameResult:
-        """Return the result of a frame with its verdict, and offer it to the physics check; call in
-        frame order.
+        """Offer a frame to the physics check, and return its result with the verdict; call in frame
+        order.
         """
         frame, arrived_s, _ = prepared.arrival
         observation = prepared.observation
-        conditions = frame_conditions(prepared, self.checks.newest)
+        # The check renders a uniform wall as an exact lidar sees it, and gets maps corrected to
+        # that: else ripples of the lidar and texture of the wall would look like an object. It
+        # knows the newest bench alone, which another thread may have set since `prepare`.
+        if prepared.rig is self.bench.rig:
+            hidden_m = self._verdicts.shown(reconstruction).depth_m
+            self.checks.offer(frame.frame_number, prepared.checked, hidden_m)
+        # Read after the offer: a check in this thread has judged this very frame.
+        newest = self.checks.newest
+        conditions = frame_conditions(prepared, newest)
         judged = with_quality_of_maps(reconstruction, conditions)
         shown, verdict = self._verdicts.decide(judged, conditions)
         warnings = observation.warnings
@@ -360,9 +367,6 @@ class Pipeline:
         if shown.uncertainty:
             warnings += problems_of(conditions)
 
-        # The check renders a uniform wall as an exact lidar sees it, and gets maps corrected to
-        # that: else ripples of the lidar and texture of the wall would look like an object.
-        self.checks.offer(frame.frame_number, prepared.checked, shown.depth_m)
         return FrameResult(
             frame,
             prepared.maps,
@@ -372,7 +376,7 @@ class Pipeline:
             difference=observation.difference,
             warnings=warnings,
             verdict=verdict,
-            check=self.checks.newest,
+            check=newest,
             arrived_s=arrived_s,
         )
 

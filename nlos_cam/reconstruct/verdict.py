@@ -127,12 +127,24 @@ class VerdictFilter:
         self._limits = limits
         self._outside: deque[float] = deque(maxlen=STEADY_FRAMES)
 
+    def shown(self, reconstruction: Reconstruction) -> Reconstruction:
+        """Return the reconstruction to show: without surface if nothing is hidden, as decided on
+        this frame alone.
+        """
+        return reconstruction.without_surface if self._is_empty(reconstruction) else reconstruction
+
+    def _is_empty(self, reconstruction: Reconstruction) -> bool:
+        """Return True if the networks say that nothing is hidden."""
+        limits = self._limits
+        uncertainty = reconstruction.uncertainty
+        if limits is None or uncertainty is None:
+            return False
+        return uncertainty.p_empty >= limits.nothing
+
     def decide(
         self, reconstruction: Reconstruction, conditions: FrameConditions
     ) -> tuple[Reconstruction, Verdict | None]:
-        """Return the reconstruction to show, without surface if nothing is hidden, and the
-        verdict.
-        """
+        """Return the reconstruction to show (`shown`) and the verdict."""
         # Whatever was reconstructed from data that are not usable is not usable either: these two
         # go before the verdict of the networks.
         of_lidar = None
@@ -148,13 +160,13 @@ class VerdictFilter:
         if limits is None or uncertainty is None:
             return reconstruction, of_lidar
 
-        if uncertainty.p_empty >= limits.nothing:
+        if self._is_empty(reconstruction):
             # Decided on this frame alone; a new object must not be averaged with the one that left.
             self._outside.clear()
             unlike_empty = self._is_unexplained(conditions, limits.unexplained_empty, shown=False)
             wrong = conditions.contradicted or unlike_empty
             verdict = Verdict.OUTSIDE if wrong else Verdict.NOTHING
-            return reconstruction.without_surface, of_lidar or verdict
+            return self.shown(reconstruction), of_lidar or verdict
 
         # "Outside" needs a mean over frames: noise moves the probability across the limit.
         self._outside.append(uncertainty.p_out_of_distribution)

@@ -58,6 +58,8 @@ TAIL_BYTES = 4
 TEXT_AT = 12
 """Offset of an image's first text: behind number, seconds and nanoseconds."""
 UNIT_TOLERANCE = 1e-3
+HARDWARE_CLOCK = "hardware_clock"
+"""Domain of timestamps by the device's own counter, which wraps."""
 
 
 @cache

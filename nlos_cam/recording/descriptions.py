@@ -5,7 +5,7 @@ from pathlib import Path
 
 from nlos_cam.errors import RecordingError
 from nlos_cam.recording import rosbag
-from nlos_cam.recording.bag_reader import STREAM, BagReader
+from nlos_cam.recording.bag_reader import STREAM, BagReader, raise_as_recording_error
 from nlos_cam.recording.salvage import Chunk, Scan, scan_bag
 
 FRAMES = "/image/"
@@ -53,7 +53,8 @@ def with_descriptions(part: Scan, path: Path, first: Path) -> Scan:
                 + rosbag.SET_UP_TIME
                 + len(content).to_bytes(4, "little")
             )
-            content += _message(connection.number, bytes(bag.raw(entry)))
+            with raise_as_recording_error(bag.path, "is damaged"):
+                content += _message(connection.number, bytes(bag.raw(entry)))
     chunk = Chunk(0, "none", len(content), 0, len(content), bytes(content), index)
     return replace(part, chunks=[chunk, *part.chunks], connections=connections)
 

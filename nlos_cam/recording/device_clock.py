@@ -5,6 +5,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from nlos_cam.camera import FORMATS, ClockUnwrap, Sample
+from nlos_cam.recording.bag_messages import HARDWARE_CLOCK
 
 if TYPE_CHECKING:
     from nlos_cam.recording.bag_reader import BagReader
@@ -24,7 +25,7 @@ def unwrapped_samples(
         stream = sample.stream
         if stream not in clocks:
             # A device's own clock is a counter that wraps; the lidar's streams share theirs.
-            is_counter = bag.metadata(stream, 0).domain == "hardware_clock"
+            is_counter = bag.metadata(stream, 0).domain == HARDWARE_CLOCK
             own = lidar if stream in FORMATS else ClockUnwrap()
             clocks[stream] = own if is_counter else None
         clock = clocks[stream]

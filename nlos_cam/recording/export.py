@@ -25,6 +25,7 @@ from nlos_cam.errors import NlosCamError, RecordingError
 from nlos_cam.files import TEXT_LIMIT, atomic_directory, read_bounded
 from nlos_cam.recording.bag_reader import BagReader
 from nlos_cam.recording.device_clock import unwrapped_samples
+from nlos_cam.recording.sidecar import sidecar_path
 
 if TYPE_CHECKING:
     from nlos_cam.recording.ros_reader import RosReader
@@ -43,6 +44,21 @@ INTERLEAVED = {"yuyv", "uyvy"}
 """Formats of two bytes a pixel, of which the second belongs to two pixels."""
 
 
+class _FrameNames:
+    """Names of files of single frames, by frame number: a number that comes again, as after a
+    restart of the device, gets a suffix.
+    """
+
+    def __init__(self) -> None:
+        self._repeats: Counter[int] = Counter()
+
+    def stem(self, number: int) -> str:
+        """Return the stem of the next file of a number: 000123, then 000123-2."""
+        self._repeats[number] += 1
+        repeats = self._repeats[number]
+        return f"{number:06d}" if repeats == 1 else f"{number:06d}-{repeats}"
+
+
 class PngSink:
     """Writer of one PNG per frame, named by its number (16 bit depth in raw units), and a table of
     timestamps.
@@ -55,15 +71,13 @@ class PngSink:
         self._table = (folder / f"{stream}.csv").open("w", newline="", encoding="utf-8")
         self._rows = csv.writer(self._table)
         self._rows.writerow(["file", "frame_number", "timestamp_s"])
-        self._repeats: Counter[int] = Counter()
+        self._names = _FrameNames()
 
     def add(self, sample: Sample) -> None:
         """Write a frame. Raises NlosCamError for an encoding that PNG does not have."""
         if sample.pixels.dtype.kind == "f":  # OpenCV would round metres to whole numbers
             raise self._not_a_png(sample)
-        self._repeats[sample.number] += 1
-        suffix = f"-{self._repeats[sample.number]}" if self._repeats[sample.number] > 1 else ""
-        path = self._folder / f"{sample.number:06d}{suffix}.png"
+        path = self._folder / f"{self._names.stem(sample.number)}.png"
         try:
             done, png = cv2.imencode(".png", self._for_opencv(sample.pixels))
         except cv2.error as error:  # such as an odd width of pixels that share their color
@@ -161,7 +175,7 @@ class PointSink:
         self._folder.mkdir()
         self.streams = streams
         self._pairing = FrameSynchronizer((rays.shape[0], rays.shape[1]), streams)
-        self._repeats: Counter[int] = Counter()
+        self._names = _FrameNames()
         self._numbers: dict[int, int] = {}
         """Number of the depth frame of each instant that waits for its other frames."""
         self.written = 0
@@ -191,11 +205,12 @@ class PointSink:
     ) -> None:
         valid = depth_z16 > 0
         points_m = self._rays[valid] * (depth_z16[valid] * self._unit_m)[:, np.newaxis]
-        gray = None if ir is None else np.repeat(ir[valid][:, np.newaxis], 3, axis=1)
-        cloud: Any = trimesh.PointCloud(points_m, colors=gray)
-        self._repeats[number] += 1
-        suffix = f"-{self._repeats[number]}" if self._repeats[number] > 1 else ""
-        path = self._folder / f"{number:06d}{suffix}.ply"
+        # Colors without a point make trimesh write an empty cloud, as of a frame without any depth.
+        is_gray = ir is not None or not len(points_m)
+        gray = np.zeros(len(points_m), np.uint8) if ir is None else ir[valid]
+        colors = np.repeat(gray[:, np.newaxis], 3, axis=1) if is_gray else None
+        cloud: Any = trimesh.PointCloud(points_m, colors=colors)
+        path = self._folder / f"{self._names.stem(number)}.ply"
         path.write_bytes(cloud.export(file_type="ply"))
         self.written += 1
 
@@ -381,7 +396,7 @@ def _info(bag: "BagReader | RosReader", options: ExportOptions) -> dict[str, Any
         **unit,
         "every": options.every,
         "streams": streams,
-        "capture": _read_json(bag.path.with_suffix(".json")),
+        "capture": _read_json(sidecar_path(bag.path)),
     }
 
 

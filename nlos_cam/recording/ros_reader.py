@@ -14,11 +14,11 @@ from nlos_calibration import Intrinsics
 from nlos_calibration.arrays import Float64
 from numpy.typing import NDArray
 
-from nlos_cam.camera import FRAMES_PER_S, SAME_INSTANT_S, Sample
+from nlos_cam.camera import FRAMES_PER_S, SAME_INSTANT_S, ClockUnwrap, Sample
 from nlos_cam.errors import RecordingError
 from nlos_cam.files import describe
 from nlos_cam.recording import bag_messages
-from nlos_cam.recording.bag_messages import CAMERA, IMAGE, FrameMetadata
+from nlos_cam.recording.bag_messages import CAMERA, HARDWARE_CLOCK, IMAGE, FrameMetadata
 from nlos_cam.recording.bag_reader import BagReader, StreamInfo
 from nlos_cam.recording.ros_messages import TRANSFORMS, Ros1Source, Ros2Source, Source
 
@@ -210,12 +210,17 @@ class RosReader:
             pass
 
     def duration_s(self, stream: str) -> float:
-        """Return the time from the first frame of a stream to its last, by their stamps."""
+        """Return the time from the first frame of a stream to its last, by their stamps, and over
+        the wraps of a device's own clock.
+        """
         with self._raise():
             times_s = [
                 bag_messages.timestamp_s(image)
                 for _, _, image in self._source.messages({self._images[stream][0]})
             ]
+        if self._domain == HARDWARE_CLOCK:
+            clock = ClockUnwrap()
+            times_s = [clock.add(time_s) for time_s in times_s]
         return max(times_s) - min(times_s)
 
     def metadata(self, stream: str, index: int) -> FrameMetadata:

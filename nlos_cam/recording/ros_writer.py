@@ -13,6 +13,14 @@ import apsw
 import numpy as np
 from nlos_calibration.arrays import Float64
 from numpy.typing import NDArray
+from rosbags.interfaces import (
+    Qos,
+    QosDurability,
+    QosHistory,
+    QosLiveliness,
+    QosReliability,
+    QosTime,
+)
 from rosbags.rosbag2 import StoragePlugin, Writer
 from trimesh.transformations import quaternion_from_matrix
 
@@ -39,6 +47,22 @@ ENCODINGS = {"y8": "mono8", "raw8": "mono8", "y16": "mono16"}
 COLORS = {"rgb8", "bgr8", "rgba8", "bgra8"}
 MAX_COUNT = 65535
 MM_PER_M = 1e3
+FOREVER = QosTime(9223372036, 854775807)
+"""ROS's spelling of a time without end: 2**63 - 1 ns."""
+LATCHED = Qos(
+    history=QosHistory.KEEP_LAST,
+    depth=1,
+    reliability=QosReliability.RELIABLE,
+    durability=QosDurability.TRANSIENT_LOCAL,
+    deadline=FOREVER,
+    lifespan=FOREVER,
+    liveliness=QosLiveliness.AUTOMATIC,
+    liveliness_lease_duration=FOREVER,
+    avoid_ros_namespace_conventions=False,
+)
+"""Quality of service of static transforms, which `ros2 bag play` offers: tf2 subscribes to
+/tf_static as transient local, and receives nothing from a publisher that is not.
+"""
 
 
 @dataclass(frozen=True)
@@ -122,12 +146,14 @@ class _Topics:
             image = "image_raw" if name == "color" else "image_rect_raw"
             for topic, kind in ((image, IMAGE), ("camera_info", CAMERA), ("metadata", METADATA)):
                 self._connections[name, kind] = self._add(f"{base}/{topic}", kind)
-        self._tf = self._add("/tf_static", TRANSFORMS)
+        self._tf = self._add("/tf_static", TRANSFORMS, LATCHED)
         self._streams = streams
         self._offset_ns: int | None = None
 
-    def _add(self, topic: str, kind: str) -> Any:
-        return self._writer.add_connection(topic, kind, typestore=self._types)
+    def _add(self, topic: str, kind: str, *offered: Qos) -> Any:
+        return self._writer.add_connection(
+            topic, kind, typestore=self._types, offered_qos_profiles=offered
+        )
 
     def write(self, time_ns: int, sample: Sample) -> None:
         """Write a frame with its camera_info and metadata; before the first, the transforms."""

@@ -236,5 +236,5 @@ class SidecarFile:
                 part.write_text(self._sidecar.model_dump_json(indent=2) + "\n", encoding="utf-8")
         except OSError as error:
             raise DiskFullError(
-                f"{self.path} cannot be written ({error.strerror}): free some space"
+                f"{self.path} cannot be written ({describe(error)}): free some space"
             ) from error

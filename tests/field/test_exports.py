@@ -69,6 +69,19 @@ def test_cloud_needs_depth_alone(remake: Remake, run: Run) -> None:
     np.testing.assert_array_equal(*clouds)
 
 
+def test_cloud_of_a_frame_without_depth_is_empty(remake: Remake, run: Run) -> None:
+    def dark_at_first(topic: str, time_ns: int, raw: bytes) -> Messages:
+        if topic.endswith(FRAMES_END) and number_of(raw) == 0:
+            pixel_bytes = 2 * 320 * 240
+            raw = raw[: -pixel_bytes - 4] + bytes(pixel_bytes) + raw[-4:]
+        yield from depth_alone(topic, time_ns, raw)
+
+    found = run("export", remake(dark_at_first), "--ply", "--out", "out")["frames"]
+
+    assert found == {"depth": 8, "points": 8}
+    assert b"element vertex 0\n" in Path("out/points/000000.ply").read_bytes()
+
+
 def test_clouds_pair_streams_by_time(remake: Remake, run: Run, noise: Path) -> None:
     def counted_apart(topic: str, time_ns: int, raw: bytes) -> Messages:
         if topic.endswith(FRAMES_END) and "Infrared" in topic:

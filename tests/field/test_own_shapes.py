@@ -1,5 +1,6 @@
 """Someone brings a shape from another program: what is hidden is what the file says."""
 
+import os
 import struct
 from collections.abc import Callable
 from pathlib import Path
@@ -10,7 +11,7 @@ import pytest
 from nlos_calibration import load_rig
 
 from nlos_cam.errors import SceneError
-from nlos_cam.objects import load_object, object_box
+from nlos_cam.objects import load_object, object_box, read_depth_map, read_mesh, triangulate
 
 Run = Callable[..., Any]
 BOX = object_box(load_rig("paper-rig"))
@@ -94,6 +95,45 @@ def test_depth_map_nearer_than_the_box_is_refused(tmp_path: Path) -> None:
 
     with pytest.raises(SceneError, match="128 of 4096 cells"):
         load_object(str(tmp_path / "near.npy"), BOX)
+
+
+def test_depth_map_behind_the_box_is_named(tmp_path: Path) -> None:
+    depth_m = np.full((64, 64), BOX.z_far_m, np.float32)
+    np.save(tmp_path / "back.npy", depth_m)
+    depth_m[:2] = 0.5
+    np.save(tmp_path / "behind.npy", depth_m)
+
+    assert load_object(str(tmp_path / "back.npy"), BOX).warnings == ()
+    assert "128 of its 4096 cells" in load_object(str(tmp_path / "behind.npy"), BOX).warnings[0]
+
+
+@pytest.mark.parametrize("line_end", ["\n   ", "\n\t", "\r"], ids=["blanks", "tab", "old Mac"])
+def test_obj_laid_out_otherwise_is_read(tmp_path: Path, line_end: str) -> None:
+    lines = ["v 0 0 0", "v 1 0 0", "v 1 1 0", "v 0 1 0", "f -4 -3 -2 -1", ""]
+    path = tmp_path / "square.obj"
+    path.write_bytes(line_end.join(lines).encode())
+
+    assert read_mesh(path).triangles.shape == (2, 3, 3)
+
+
+def test_face_without_corners_is_passed_over(tmp_path: Path) -> None:
+    path = tmp_path / "star.ply"
+    path.write_bytes(as_text_ply(STAR).replace(b"element face 1", b"element face 2") + b"0\n")
+    alone = tmp_path / "alone.ply"
+    alone.write_bytes(as_text_ply(STAR))
+
+    assert len(triangulate(np.empty((0, 3)))) == 0
+    np.testing.assert_array_equal(read_mesh(path).triangles, read_mesh(alone).triangles)
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="Windows has no named pipes")
+@pytest.mark.parametrize("name", ["pipe.obj", "pipe.npy"])
+def test_pipe_in_place_of_a_shape_is_refused(tmp_path: Path, name: str) -> None:
+    os.mkfifo(tmp_path / name)
+    read = read_depth_map if name.endswith("npy") else read_mesh
+
+    with pytest.raises(SceneError, match="not a file"):
+        read(tmp_path / name)
 
 
 def test_stray_face_far_away_is_named(tmp_path: Path) -> None:

@@ -13,7 +13,8 @@ from rosbags.rosbag1 import Writer
 from rosbags.typesys import Stores, get_typestore
 from sdk_playback import SdkReplay
 
-from nlos_cam.recording import SAMPLE, ReplayCamera, repair_recording, verify
+from nlos_cam.errors import RecordingError
+from nlos_cam.recording import SAMPLE, BagReader, ReplayCamera, repair_recording, verify
 from nlos_cam.recording.bag_messages import IMAGE
 
 Run = Callable[..., Any]
@@ -115,6 +116,19 @@ def test_librealsense_plays_a_part_with_descriptions(remake: Remake) -> None:
 def test_repair_names_what_a_later_part_lacks(remake: Remake) -> None:
     repaired = repair_recording(remake(second_part), Path("good.bag"))
     assert "--from" in repaired.damages[0].why
+
+
+def test_repair_names_damage_of_the_first_part(remake: Remake) -> None:
+    first = remake(lambda _, time_ns, raw: [(time_ns, raw)], name="first.bag")
+    bag = BagReader(first)
+    option = next(each[0] for topic, each in bag.entries.items() if "/option/" in topic)
+    content = bytearray(first.read_bytes())
+    start = content.index(b"time=", option.chunk_pos + option.offset)
+    content[start + 5 : start + 13] = bytes(8)
+    first.write_bytes(content)
+
+    with pytest.raises(RecordingError, match=r"first\.bag is damaged"):
+        repair_recording(remake(second_part), Path("joined.bag"), take_from=first)
 
 
 def test_repair_refuses_the_first_part_of_another(remake: Remake, run: Run, noise: Path) -> None:

@@ -6,6 +6,7 @@ import shutil
 import sqlite3
 from collections.abc import Callable
 from contextlib import closing
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
@@ -18,9 +19,11 @@ from rosbags.rosbag1 import Writer as Ros1Writer
 from rosbags.rosbag2 import Reader, StoragePlugin, Writer, storage_mcap
 from rosbags.typesys import Stores, get_typestore
 
+from nlos_cam.camera import WRAP_PERIOD_S
 from nlos_cam.errors import RecordingError
 from nlos_cam.recording import SAMPLE, BagReader, ReplayCamera, open_recording
 from nlos_cam.recording.bag_messages import CAMERA, IMAGE
+from nlos_cam.recording.ros_messages import METADATA, ros2_types
 
 Run = Callable[..., Any]
 ROS1 = get_typestore(Stores.ROS1_NOETIC)
@@ -106,14 +109,17 @@ class Driver:
         serialize = self._types.serialize_ros1 if self._is_ros1 else self._types.serialize_cdr
         self._writer.write(self._topics[topic], time_ns, serialize(message, kind))
 
-    def publish(self, sample: Any, pinhole: Any, *, info: bool = True) -> None:
+    def publish(
+        self, sample: Any, pinhole: Any, *, info: bool = True, recorded_ns: int | None = None
+    ) -> None:
         name, encoding = {
             "depth": ("depth", "16UC1"),
             "infrared": ("infra", "mono8"),
             "confidence": ("confidence", "mono8"),
         }[sample.stream]
         nanosec = round(sample.timestamp_s * 1e9)
-        stamp = self._new("builtin_interfaces/msg/Time", sec=7, nanosec=nanosec % 10**9)
+        sec = 7 + nanosec // 10**9
+        stamp = self._new("builtin_interfaces/msg/Time", sec=sec, nanosec=nanosec % 10**9)
         seq = {"seq": 0} if self._is_ros1 else {}
         header = self._new("std_msgs/msg/Header", stamp=stamp, frame_id=name, **seq)
         pixels = sample.pixels
@@ -129,10 +135,20 @@ class Driver:
             step=pixels.nbytes // pixels.shape[0],
             data=pixels.view(np.uint8).reshape(-1),
         )
-        self._write(f"{self._base}/{name}/image_rect_raw", IMAGE, nanosec + 1, image)
+        time_ns = nanosec + 1 if recorded_ns is None else recorded_ns
+        self._write(f"{self._base}/{name}/image_rect_raw", IMAGE, time_ns, image)
         if info:
             camera = self._info(header, pinhole)
-            self._write(f"{self._base}/{name}/camera_info", CAMERA, nanosec + 1, camera)
+            self._write(f"{self._base}/{name}/camera_info", CAMERA, time_ns, camera)
+
+    def publish_clock(self, domain: str) -> None:
+        header = self._new(
+            "std_msgs/msg/Header",
+            stamp=self._new("builtin_interfaces/msg/Time", sec=0, nanosec=0),
+            frame_id="depth",
+        )
+        found = self._new(METADATA, header=header, json_data=json.dumps({"clock_domain": domain}))
+        self._write(f"{self._base}/depth/metadata", METADATA, 1, found)
 
     def _info(self, header: Any, pinhole: Any) -> Any:
         k = np.array([pinhole.fx, 0, pinhole.ppx, 0, pinhole.fy, pinhole.ppy, 0, 0, 1.0])
@@ -307,6 +323,37 @@ def test_chunk_of_mcap_unpacks_no_more_than_it_declares(bags: SimpleNamespace) -
     assert len(unpack(bomb, 1000)) == 1001
     with pytest.raises(ValueError, match="a chunk of"):
         unpack(bomb, 1 << 28)
+
+
+@pytest.mark.parametrize("storage", ["sqlite3", "mcap"])
+def test_static_transforms_reach_late_listeners(bags: SimpleNamespace, storage: str) -> None:
+    with Reader(getattr(bags, storage)) as reader:
+        topics = {each.topic: each.ext.offered_qos_profiles for each in reader.connections}
+
+    assert [one.durability.name for one in topics["/tf_static"]] == ["TRANSIENT_LOCAL"]
+    assert topics["/camera/depth/image_rect_raw"] == []
+
+
+@pytest.mark.parametrize(
+    ("domain", "duration_s"), [("hardware_clock", 0.3), ("system_time", WRAP_PERIOD_S - 1 / 30)]
+)
+def test_duration_counts_a_wrap_of_the_device_clock(
+    tmp_path: Path, domain: str, duration_s: float
+) -> None:
+    bag = BagReader(SAMPLE)
+    pinhole = bag.streams["depth"].intrinsics
+    first = next(bag.samples(["depth"]))
+    with Writer(tmp_path / "wrapped", version=8, storage_plugin=StoragePlugin.MCAP) as writer:
+        driver = Driver(writer, ros2_types(), "/camera/camera")
+        driver.publish_clock(domain)
+        for k in range(10):
+            time_s = (WRAP_PERIOD_S - 0.1 + k / 30) % WRAP_PERIOD_S
+            sample = replace(first, number=k, timestamp_s=time_s)
+            driver.publish(sample, pinhole, recorded_ns=2 + k * 33_000_000)
+
+    found_s = open_recording(tmp_path / "wrapped").duration_s("depth")
+
+    assert found_s == pytest.approx(duration_s, abs=0.04)
 
 
 def test_metadata_of_a_bag_are_those_of_the_driver(bags: SimpleNamespace) -> None:

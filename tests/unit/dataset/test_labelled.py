@@ -476,6 +476,15 @@ def test_truth_of_another_size_is_refused(tmp_path: Path) -> None:
         _truth(tmp_path)
 
 
+def test_truth_behind_the_object_box_is_refused(tmp_path: Path) -> None:
+    depth_m = np.full((64, 64), BOX.z_far_m, np.float32)
+    depth_m[0] = 0.5
+    np.save(tmp_path / "mug.npy", depth_m)
+
+    with pytest.raises(RecordingError, match="64 of 4096 cells behind"):
+        _truth(tmp_path)
+
+
 @pytest.mark.parametrize("label", ["../mug", "a/mug"])
 def test_label_that_leads_elsewhere_is_refused(tmp_path: Path, label: str) -> None:
     (tmp_path / "a").mkdir()

@@ -26,6 +26,7 @@ pytestmark = pytest.mark.usefixtures("narrow_networks", "one_thread")
 RUNS = {f"v{seed}": small_recipe(seed=seed) for seed in range(3)}
 RUNS |= {f"c{seed}": small_recipe(task="compressor", seed=seed) for seed in range(2)}
 RUNS |= {f"t{seed}": small_recipe(task="transfer", seed=seed) for seed in range(2)}
+RUNS |= {f"d{seed}": small_recipe(task="direct", seed=seed) for seed in range(2)}
 RUNS["j"] = small_recipe(task="compressor", seed=9, steps="two-then-joint", image_weight=1.0)
 RECORD = CheckpointRecord.of([RUNS["v0"]], RIG).model_copy(
     update={"figures": {"held_out_iou": 0.5}}
@@ -247,6 +248,8 @@ def test_save_refuses_weights_beyond_float16_or_on_full_disk(
         ("v0 c0 v1 c1", ["v1", "c1", ""], "v0 c0"),
         ("v0 c0 t0 t1", ["v0", "c0", "t1"], "t0"),
         ("v0 c0 t0 j", ["v0", "j", ""], "c0 t0"),
+        ("d0 t0", ["", "", "t0"], ""),
+        ("d0 t0 d1", ["", "", ""], "d0 t0"),
     ],
 )
 def test_record_names_last_run_of_each_task_and_keeps_others(

@@ -135,6 +135,8 @@ def test_color_networks_are_not_exported(
     color = RemappingNetwork(pipeline.compressor, Decoder(3, 512), intensities=3)
     with pytest.raises(ModelError, match="simulation only"):
         export.export_onnx(color)
+    with pytest.raises(ModelError, match="simulation only"):
+        export.export_onnx(DirectNetwork(color=True))
 
 
 def test_exports_are_named_by_their_weights(pipeline: RemappingNetwork) -> None:

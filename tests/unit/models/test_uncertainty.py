@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from fake_uncertainty import RECIPE
+from fake_uncertainty import RECIPE, FakeUncertainty
 from nlos_models import load_uncertainty_model, quality, records, uncertainty_network
 from nlos_models.errors import CheckpointError
 from nlos_models.inference import UncertaintyEstimate
@@ -30,6 +30,7 @@ from nlos_models.uncertainty_network import (
     UncertaintyNetwork,
     UncertaintyOutput,
 )
+from pydantic import ValidationError
 from small_maps import HARD_MAPS, hard_maps, noise_maps
 from small_uncertainty import DARK_V, small_uncertainty_set, untrained_uncertainty, watched_weights
 
@@ -256,6 +257,13 @@ def test_uncertainty_network_is_restored_with_its_weights(
 
     with pytest.raises(CheckpointError, match="compressor"):
         records.checksum_of_watched(tmp_path)
+
+
+@pytest.mark.parametrize("temperature", [0.0, -1.0, np.nan])
+def test_temperature_that_is_not_positive_is_refused(temperature: float) -> None:
+    facts = FakeUncertainty().record.model_dump()
+    with pytest.raises(ValidationError, match="temperatures"):
+        UncertaintyRecord.model_validate(facts | {"temperatures": (temperature, 1.0)})
 
 
 @pytest.mark.usefixtures("record")

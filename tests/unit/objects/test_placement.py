@@ -216,6 +216,15 @@ def test_post_is_level_from_the_underside_to_the_bottom(thing: Float32) -> None:
     )
 
 
+def test_panel_fits_behind_an_object_at_the_back() -> None:
+    at_the_back = np.full((64, 64), np.nan, np.float32)
+    at_the_back[20:40, 20:40] = BOX.z_far_m  # as float32, 6 nm behind the box
+
+    found = panel(at_the_back, BOX, np.random.default_rng(0))
+
+    assert np.nanmin(found) == np.float32(BOX.z_far_m)
+
+
 @pytest.mark.parametrize("thing", OBJECTS)
 def test_panel_is_a_rectangle_behind_the_object(thing: Float32) -> None:
     board = panel(thing, BOX, np.random.default_rng(2))

@@ -141,9 +141,44 @@ def test_bare_wall_takes_reflectance_gain_and_offset_out(gain: float, offset_m: 
     assert np.quantile(np.abs(found.depth_m - wanted.depth_m)[of_wall], 0.98) < 1e-3
     assert np.quantile(np.abs(np.log(found.intensity / wanted.intensity))[of_wall], 0.98) < 0.04
 
-    known = aligned.align(replace(seen, depth_m=seen.depth_m + 0.5), seen.depth_m - empty.depth_m)
+    offset = alignment(rig, trained(), reference, range_offset_m=0.5)
+    assert offset
+    known = offset.align(replace(seen, depth_m=seen.depth_m + 0.5))
 
-    np.testing.assert_array_equal(known.depth_m, found.depth_m)
+    np.testing.assert_allclose(known.depth_m, found.depth_m, rtol=0, atol=1e-6)
+
+
+def test_cells_that_the_reference_lacks_are_of_the_geometry() -> None:
+    rig = BENCHES["all of it"]
+    empty = maps_of(rig, None)
+    hole = np.zeros((64, 80), bool)
+    hole[20:30, 40:50] = True
+    lacking: Any = SimpleNamespace(
+        map_depth_m=np.where(hole, np.nan, empty.depth_m),
+        map_intensity=np.where(hole, np.nan, empty.intensity),
+    )
+    whole: Any = SimpleNamespace(map_depth_m=empty.depth_m, map_intensity=empty.intensity)
+    seen = maps_of(rig, THINGS[0].depth_m)
+    found, wanted = (MapAlignment(rig, RIG, bare).align(seen) for bare in (lacking, whole))
+
+    np.testing.assert_array_equal(found.valid, wanted.valid)
+    np.testing.assert_allclose(found.depth_m, wanted.depth_m, rtol=0, atol=0.002)
+    np.testing.assert_allclose(found.intensity, wanted.intensity, rtol=0.05)
+
+
+@pytest.mark.parametrize("measured", [False, True])
+def test_light_of_a_frame_without_the_wall_is_in_counts(measured: bool) -> None:
+    rig = BENCHES["all of it"]
+    empty = maps_of(rig, None)
+    reference: Any = SimpleNamespace(map_depth_m=empty.depth_m, map_intensity=empty.intensity)
+    aligned = MapAlignment(rig, RIG, reference if measured else None)
+    beyond = aligned.align(replace(empty, depth_m=empty.depth_m + np.float32(0.05)))
+    of_wall = aligned.align(empty)
+    lit = of_wall.intensity > 1
+
+    ratio = beyond.intensity[lit] / of_wall.intensity[lit]
+
+    assert 0.5 < np.median(ratio) < 2
 
 
 def test_what_cannot_be_aligned_is_left_alone() -> None:
@@ -217,7 +252,7 @@ def test_corrected_maps_are_aligned_as_live_aligns_them() -> None:
     seen = maps_of(rig, THINGS[0].depth_m, model, seed=2)
     walled: Any = CalibratedRig(rig)
     walled.reference = SimpleNamespace(map_depth_m=bare.depth_m, map_intensity=bare.intensity)
-    live = MapAlignment(rig, RIG, walled.reference).align(seen, seen.depth_m - bare.depth_m)
+    live = MapAlignment(rig, RIG, walled.reference).align(seen)
 
     found = MapAlignment(rig, RIG).align(OwnMaps(walled).correct(seen))
 

@@ -14,7 +14,12 @@ from nlos_cam.evaluate import sense
 from nlos_cam.frames import LidarMaps, maps_from_frame
 from nlos_cam.objects import object_box, object_depth
 from nlos_cam.reconstruct import CalibratedRig
-from nlos_cam.reconstruct.consistency import MapConsistency, MapProblem, objects_on_bench
+from nlos_cam.reconstruct.consistency import (
+    MapConsistency,
+    MapProblem,
+    echo_range_m,
+    objects_on_bench,
+)
 from nlos_cam.render import Scene, SensorModel, render
 
 RIG = load_rig("paper-rig")
@@ -194,7 +199,39 @@ def test_missing_cells_that_tell_nothing_are_no_problem() -> None:
 
 def test_depth_before_the_wall_everywhere_is_off_the_record() -> None:
     nearer = replace(MAPS[0], depth_m=MAPS[0].depth_m * np.float32(0.5))
-    farther = replace(MAPS[0], depth_m=MAPS[0].depth_m * np.float32(2.0))
 
     assert CHECK.examine(nearer).problems == (MapProblem.OFF_RECORD,)
-    assert MapProblem.OFF_RECORD not in CHECK.examine(farther).problems
+
+
+@pytest.mark.parametrize("farther_m", [0.04, 1.0, 60.0])
+def test_depth_of_no_path_over_the_box_is_off_the_record(farther_m: float) -> None:
+    for maps in (MAPS[0], sense([EMPTY], RIG)[0]):
+        farther = replace(maps, depth_m=maps.depth_m + np.float32(farther_m))
+        assert CHECK.examine(farther).problems == (MapProblem.OFF_RECORD,)
+
+
+def test_object_whose_echo_wins_in_every_cell_is_no_problem() -> None:
+    rig = load_rig("wide-rig")
+    hidden_m = object_depth(3_000_012, object_box(rig))[1]
+    echoes = render(Scene(rig, hidden_m), "draft").multi
+    check = MapConsistency(CalibratedRig(rig))
+    (maps,) = sense([echoes], rig)
+    wall_m = render(Scene(rig), "draft").depth_m
+
+    assert not (np.abs(maps.depth_m - wall_m) < 0.01)[:, :60].any()
+    assert check.examine(maps).problems == ()
+
+
+@pytest.mark.parametrize("name", ["paper-rig", "wide-rig"])
+def test_echoes_of_objects_in_the_box_are_within_their_range(name: str) -> None:
+    rig = load_rig(name)
+    least_m, largest_m = echo_range_m(rig)
+    wall_m = render(Scene(rig), "draft").depth_m
+    for seed in SEEDS:
+        rendering = render(Scene(rig, object_depth(seed, object_box(rig))[1]), "draft")
+        bounced = rendering.intensity <= rendering.multi.peak
+        bounced &= rendering.multi.peak > 0
+        beyond_m = (rendering.depth_m - wall_m)[bounced]
+
+        assert (beyond_m >= least_m[bounced]).all()
+        assert (beyond_m <= largest_m[bounced]).all()

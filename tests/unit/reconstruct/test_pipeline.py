@@ -51,7 +51,11 @@ from nlos_cam.reconstruct.bench import (
 from nlos_cam.reconstruct.consistency import COMPLETE, MapFindings, MapProblem
 from nlos_cam.reconstruct.flat_field import FlatField
 from nlos_cam.reconstruct.network import Quality, Uncertainty
-from nlos_cam.reconstruct.physics_check import PeriodicPhysicsCheck, PhysicsCheckResult
+from nlos_cam.reconstruct.physics_check import (
+    NullPhysicsCheck,
+    PeriodicPhysicsCheck,
+    PhysicsCheckResult,
+)
 from nlos_cam.reconstruct.pipeline import (
     TRUSTED_MISSING,
     compatibility_warnings,
@@ -277,6 +281,60 @@ def test_checked_maps_are_without_the_ranges_drift(walled: CalibratedRig) -> Non
     off_m = np.nanmean(offered[-1].depth_m - exact.depth_m)
     assert abs(off_m) < 2e-4
     assert np.nanmean(offered[0].depth_m - exact.depth_m) == pytest.approx(8e-4, abs=1e-4)
+
+
+class ScoringCheck(NullPhysicsCheck):
+    """Check in the caller's thread that finds one score for every frame."""
+
+    def __init__(self, score: float) -> None:
+        self.newest: PhysicsCheckResult | None = None
+        self.offered: list[int] = []
+        self._score = score
+
+    def offer(self, frame_number: int, maps: LidarMaps, depth_m: np.ndarray) -> None:
+        self.offered.append(frame_number)
+        has_surface = bool(np.isfinite(depth_m).any())
+        self.newest = PhysicsCheckResult(
+            frame_number, maps.depth_m, maps.depth_m, self._score, 0.0, has_surface=has_surface
+        )
+
+
+@pytest.mark.parametrize(
+    ("score", "nothing", "verdict"),
+    [
+        (0.1, 0.0, Verdict.SEEN),
+        (0.1, 0.9, Verdict.NOTHING),
+        (1.0, 0.0, Verdict.OUTSIDE),
+        (1.0, 0.9, Verdict.OUTSIDE),
+    ],
+)
+def test_frame_is_judged_by_its_own_check(score: float, nothing: float, verdict: Verdict) -> None:
+    doubter = FakeUncertainty(lambda *_: (nothing, 0.0))
+    checks = ScoringCheck(score)
+    bench = CalibratedRig(RIG)
+    pipeline = Pipeline(bench, sheet_network, uncertainty_model=doubter, checks=checks)
+
+    result = pipeline.process(Arrival(wall_frame(0), 0.0, ()), lambda: 0.0, 0.0)
+
+    assert result.check is not None
+    assert result.check.frame_number == 0
+    assert result.verdict == verdict
+
+
+def test_frame_of_the_bench_before_stays_on_it_unchecked() -> None:
+    box = RIG.object_box
+    assert box
+    aside = box.model_copy(update={"x_min_m": box.x_min_m + 0.1, "x_max_m": box.x_max_m + 0.1})
+    checks = ScoringCheck(0.0)
+    pipeline = Pipeline(CalibratedRig(RIG), sheet_network, checks=checks)
+    prepared = pipeline.prepare(Arrival(wall_frame(0), 0.0, ()), lambda: 0.0, 0.0)
+
+    pipeline.bench = CalibratedRig(RIG.model_copy(update={"object_box": aside}))
+    (made,) = pipeline.reconstruct([prepared], lambda: 0.0)
+    pipeline.finish(prepared, made, lambda: 0.0)
+
+    assert made.box == box
+    assert checks.offered == []
 
 
 DOUBTER: Any = object()
