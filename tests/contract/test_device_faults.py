@@ -2,10 +2,12 @@
 ends in one line.
 
 Each stream may be late, missing, doubled, out of order, of another size, frozen, or wrong in
-number, time or content; the device may vanish or fail in each call of the SDK, once or for good.
+number, time or content; the device may fail in each call of the SDK, at its start or after it was
+unplugged, twice or for good.
 """
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from itertools import islice, pairwise
 from typing import Any
 
@@ -15,11 +17,14 @@ import pytest
 from nlos_cam.camera import FORMATS, SimulatedCamera, SoftwareLidar, simulated
 from nlos_cam.errors import CameraError
 from nlos_cam.frames import Frame
+from nlos_cam.render import Fault
 
 FROM = 5
 UNTIL = 9
 WANTED = 30
 """Numbers with the fault (from, until), and frames to be read."""
+FOREVER = 10**9
+UNPLUGGED = Fault(kind="unplug", at_frame=FROM, frames=30)
 Push = tuple[int, float, np.ndarray]
 """Number, timestamp in s, and pixels of one frame of a stream."""
 
@@ -76,55 +81,68 @@ CALLS = (
 )
 
 
-class Proxy:
-    """SDK object that fails in one method, from a number of calls on, for so many calls."""
+@dataclass
+class Failures:
+    """Number of calls of one method of the SDK that are still to fail, and of those that failed."""
 
-    def __init__(self, inner: Any, method: str, calls: list[int], failing: range) -> None:
+    method: str
+    left: int = 0
+    failed: int = 0
+
+    def note(self, name: str) -> None:
+        """Fail, if this call is to fail."""
+        if name == self.method and self.left:
+            self.left -= 1
+            self.failed += 1
+            raise RuntimeError("the device was disconnected")
+
+
+class Proxy:
+    """SDK object whose calls fail as `failures` say, and those of its sensors."""
+
+    def __init__(self, inner: Any, failures: Failures) -> None:
         self._inner = inner
-        self._method = method
-        self._calls = calls
-        self._failing = failing
+        self._failures = failures
 
     def __getattr__(self, name: str) -> Any:
         value = getattr(self._inner, name)
-        if name == "query_sensors":
-            self._note(name)
-            return lambda: [
-                Proxy(each, self._method, self._calls, self._failing) for each in value()
-            ]
         if not callable(value):
             return value
 
         def call(*arguments: Any) -> Any:
-            self._note(name)
-            return value(*arguments)
+            self._failures.note(name)
+            found = value(*arguments)
+            if name == "query_sensors":
+                return [Proxy(each, self._failures) for each in found]
+            return found
 
         return call
 
-    def _note(self, name: str) -> None:
-        if name == self._method:
-            self._calls.append(1)
-            if len(self._calls) - 1 in self._failing:
-                raise RuntimeError("the device was disconnected")
-
 
 @pytest.fixture
-def camera(noise_world: Any, hurried_clock: Any) -> Callable[[], SimulatedCamera]:
-    def make() -> SimulatedCamera:
-        made = SimulatedCamera("sim:faulty", noise_world(), clock=hurried_clock())
+def camera(noise_world: Any, hurried_clock: Any) -> Callable[..., SimulatedCamera]:
+    def make(*faults: Fault) -> SimulatedCamera:
+        made = SimulatedCamera("sim:faulty", noise_world(), clock=hurried_clock(), faults=faults)
         made.silence_s = 0.5
         return made
 
     return make
 
 
-def outcome(make: Callable[[], SimulatedCamera]) -> list[Frame] | str:
-    """Return the frames that come, or the line with which the camera ends; both are checked."""
+def outcome(
+    source: SimulatedCamera, at_frame: Callable[[], None] | None = None
+) -> list[Frame] | str:
+    """Return the frames that come, or the line with which the camera ends; both are checked.
+    `at_frame` is called once FROM frames came.
+    """
     frames = list[Frame]()
     line = ""
     try:
-        with make() as source:
-            frames += islice(source, WANTED)
+        with source:
+            frames += islice(source, FROM)
+            if at_frame:
+                at_frame()
+            frames += islice(source, WANTED - FROM)
     except CameraError as error:
         line = str(error)
     if line:
@@ -142,46 +160,80 @@ def outcome(make: Callable[[], SimulatedCamera]) -> list[Frame] | str:
 )
 @pytest.mark.parametrize("way", WAYS)
 def test_camera_goes_on_after_a_fault_of_its_streams(
-    camera: Callable[[], SimulatedCamera],
+    camera: Callable[..., SimulatedCamera],
     monkeypatch: pytest.MonkeyPatch,
     way: str,
     streams: tuple[str, ...],
 ) -> None:
     device = type("Device", (Tampered,), {"streams": streams, "tamper": staticmethod(WAYS[way])})
     monkeypatch.setattr(simulated, "SoftwareLidar", device)
-    frames = outcome(camera)
+    frames = outcome(camera())
 
-    assert len(frames) == WANTED
     assert not isinstance(frames, str), frames
+    assert len(frames) == WANTED
 
 
-@pytest.mark.parametrize("lasts", ["once", "for good"])
+def with_failures(camera: SimulatedCamera, failures: Failures) -> SimulatedCamera:
+    """Put the failures in front of each device that is plugged in from now on."""
+    plug_in = camera._plug_in
+
+    def proxied(instant: int) -> None:
+        plug_in(instant)
+        camera._lidar.device = Proxy(camera._lidar.device, failures)
+
+    camera._plug_in = proxied  # type: ignore[method-assign]
+    return camera
+
+
 @pytest.mark.parametrize("method", CALLS)
-def test_camera_goes_on_or_ends_in_a_line_when_a_call_fails(
-    camera: Callable[[], SimulatedCamera], method: str, lasts: str
+def test_camera_whose_calls_fail_at_its_start_ends_in_a_line(
+    camera: Callable[..., SimulatedCamera], method: str
 ) -> None:
-    calls: list[int] = []
-    failing = range(1, 2) if lasts == "once" else range(1, 10**9)
+    failures = Failures(method, left=FOREVER)
+    found = outcome(with_failures(camera(), failures))
 
-    def make() -> SimulatedCamera:
-        made = camera()
-        plug_in = made._plug_in
+    assert isinstance(found, str)
+    assert failures.failed > 0
 
-        def proxied(instant: int) -> None:
-            plug_in(instant)
-            made._lidar.device = Proxy(made._lidar.device, method, calls, failing)
 
-        made._plug_in = proxied  # type: ignore[method-assign]
-        return made
+@pytest.mark.slow
+@pytest.mark.parametrize("method", CALLS)
+def test_camera_goes_on_though_calls_fail_after_a_replug(
+    camera: Callable[..., SimulatedCamera], method: str
+) -> None:
+    """Two calls: the first may be the accelerometer's, without which a camera goes on."""
+    failures = Failures(method)
+    frames = outcome(
+        with_failures(camera(UNPLUGGED), failures), lambda: setattr(failures, "left", 2)
+    )
 
-    assert outcome(make)
+    assert not isinstance(frames, str), frames
+    assert len(frames) == WANTED
+    assert failures.failed == 2
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("method", CALLS)
+def test_camera_whose_calls_fail_for_good_ends_in_a_line(
+    camera: Callable[..., SimulatedCamera], method: str
+) -> None:
+    failures = Failures(method)
+    found = outcome(
+        with_failures(camera(UNPLUGGED), failures), lambda: setattr(failures, "left", FOREVER)
+    )
+
+    assert isinstance(found, str)
+    assert "unplugged" in found
+    assert failures.failed > 2
 
 
 @pytest.mark.parametrize("value", [float("nan"), float("inf"), -9999.0, 1e30])
 def test_camera_goes_on_with_a_mad_thermometer(
-    camera: Callable[[], SimulatedCamera], monkeypatch: pytest.MonkeyPatch, value: float
+    camera: Callable[..., SimulatedCamera], monkeypatch: pytest.MonkeyPatch, value: float
 ) -> None:
-    make = camera()
-    monkeypatch.setattr(type(make._world), "celsius", lambda *_: {"ldd_temperature": value})
+    made = camera()
+    monkeypatch.setattr(type(made._world), "celsius", lambda *_: {"ldd_temperature": value})
+    frames = outcome(made)
 
-    assert len(outcome(lambda: make)) == WANTED
+    assert not isinstance(frames, str), frames
+    assert len(frames) == WANTED

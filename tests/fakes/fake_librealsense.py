@@ -44,21 +44,35 @@ class FakeSensor:
     def get_stream_profiles(self) -> list[FakeProfile]:
         return self.profiles
 
-    def open(self, profiles: list[FakeProfile]) -> None:
+    def _need_state(self, *, is_open: bool, is_streaming: bool) -> None:
+        """Refuse a call out of turn, as librealsense does."""
         self._check()
+        if (self.lidar.is_open, self.lidar.is_streaming) != (is_open, is_streaming):
+            raise RuntimeError("the sensor is in another state")
+
+    def open(self, profiles: list[FakeProfile]) -> None:
+        self._need_state(is_open=False, is_streaming=False)
         self.lidar.opened = list(profiles)
+        self.lidar.is_open = True
 
     def start(self, callback: Callable[[FakeFrame], None]) -> None:
-        self._check()
-        self.lidar.start(callback)
+        self._need_state(is_open=True, is_streaming=False)
+        self.lidar.is_streaming = True
+        try:
+            self.lidar.start(callback)
+        except RuntimeError:
+            self.lidar.is_streaming = False
+            raise
 
     def stop(self) -> None:
         self.lidar.stop()
-        self._check()
+        self._need_state(is_open=True, is_streaming=True)
+        self.lidar.is_streaming = False
 
     def close(self) -> None:
         self.lidar.did.append("close")
-        self._check()
+        self._need_state(is_open=True, is_streaming=False)
+        self.lidar.is_open = False
 
     def get_supported_options(self) -> list[Named]:
         return [Named(name=name) for name in self.lidar.options]

@@ -143,6 +143,9 @@ class FakeLidar:
         self.refused: set[str] = set()
         self.did: list[str] = []
         self.opened: list[FakeProfile] = []
+        self.is_open = False
+        self.is_streaming = False
+        """State of its sensors, of which one runs at a time."""
         self.start_error: Exception | None = None
         self.uncalibrated = False
         self.reset_takes = 2
@@ -174,6 +177,8 @@ class FakeLidar:
         self.generation = self.generation + 1
         self._stopping.set()
         self._callback = None
+        self.is_open = False
+        self.is_streaming = False
         self.options = dict(self.factory)
 
     def plug_in(self) -> None:

@@ -79,5 +79,5 @@ class Recorded(FrameCamera):
         super().__init__(count, make=lambda number: full_moment(number).result.frame)
         self.intrinsics = full_moment(0).result.frame.intrinsics
 
-    def telemetry(self, _: str = "") -> dict[str, float]:
-        return {"ldd_temperature": 41.0}
+    def telemetry(self, ending: str = "") -> dict[str, float]:
+        return {"ldd_temperature": 41.0} if "ldd_temperature".endswith(ending) else {}

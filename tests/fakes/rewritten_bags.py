@@ -1,8 +1,10 @@
 """Recordings made of others, message by message."""
 
+import struct
 from collections.abc import Callable, Iterable
 from pathlib import Path
 
+import numpy as np
 from rosbags.interfaces import Connection
 from rosbags.rosbag1 import Reader, Writer
 
@@ -26,6 +28,29 @@ def rewrite(source: Path, target: Path, edit: Edit, compression: str | None = No
                     )
                 writer.write(made[found.id], new_time_ns, new_raw)
     return target
+
+
+TURNED = np.array(
+    [
+        [0.28, 0.0, -0.96, 0.026],
+        [0.0, 1.0, 0.0, 0.02],
+        [0.96, 0.0, 0.28, -0.018],
+        [0.0, 0.0, 0.0, 1.0],
+    ]
+)
+"""Pose of the infrared camera of `turned_infrared` in the frame of the depth stream."""
+LENS = [0.15, -0.5, -0.001, 0.0006, 0.47]
+
+
+def turned_infrared(topic: str, time_ns: int, raw: bytes) -> Messages:
+    """Give a camera's infrared a pose and a lens of its own, so that none passes by chance."""
+    if topic.endswith("/Infrared_0/tf/1"):
+        raw = struct.pack("<7d", 0.01, -0.02, 0.03, 0.0, 0.6, 0.0, 0.8)  # the inverse of TURNED
+    if topic.endswith("/Infrared_0/info/camera_info"):
+        none = struct.pack("<I4sI5d", 4, b"None", 5, *[0.0] * 5)
+        assert none in raw
+        raw = raw.replace(none, struct.pack("<I13sI5d", 13, b"Brown Conrady", 5, *LENS))
+    yield time_ns, raw
 
 
 def number_of(raw: bytes) -> int:

@@ -112,7 +112,8 @@ class FrameCamera:
     def __exit__(self, *_: object) -> None:
         self.closed.set()
 
-    def telemetry(self, _: str = "") -> Mapping[str, float]:
+    def telemetry(self, ending: str = "") -> Mapping[str, float]:
+        del ending
         return {}
 
     def __iter__(self) -> Iterator[Frame]:

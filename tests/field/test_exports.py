@@ -11,10 +11,10 @@ import cv2
 import numpy as np
 import pytest
 import trimesh
-from rewritten_bags import Messages, number_of
+from rewritten_bags import LENS, TURNED, Messages, number_of, turned_infrared
 
 from nlos_cam.camera import Sample
-from nlos_cam.recording import SAMPLE, BagReader
+from nlos_cam.recording import SAMPLE
 from nlos_cam.recording.export import PngSink
 
 Run = Callable[..., Any]
@@ -140,15 +140,18 @@ def test_recorded_yuyv_is_exported_as_color(remake: Remake, run: Run, noise: Pat
     assert image.dtype == np.uint8
 
 
-def test_export_holds_distortion_and_pose(run: Run) -> None:
-    run("export", SAMPLE, "--out", "out")
+def test_export_holds_distortion_and_pose(remake: Remake, run: Run) -> None:
+    run("export", remake(turned_infrared), "--out", "out")
     streams = json.loads(Path("out/export.json").read_text())["streams"]
-    bag = BagReader(SAMPLE)
-    for name, stream in streams.items():
-        model, coefficients = bag.lens(name)
-        assert stream["distortion"] == {"model": model, "coefficients": coefficients.tolist()}
-        assert stream["pose"]["in_frame_of"] == "depth"
-        np.testing.assert_array_equal(stream["pose"]["matrix"], bag.pose("depth", name))
+    lenses = {
+        "depth": ("none", [0.0] * 5, np.eye(4)),
+        "infrared": ("brown_conrady", LENS, TURNED),
+        "confidence": ("none", [0.0] * 5, np.eye(4)),
+    }
+    for name, (model, coefficients, pose) in lenses.items():
+        assert streams[name]["distortion"] == {"model": model, "coefficients": coefficients}
+        assert streams[name]["pose"]["in_frame_of"] == "depth"
+        np.testing.assert_allclose(streams[name]["pose"]["matrix"], pose, atol=1e-9)
 
 
 def test_surfaces_are_counted_not_their_numbers(run: Run) -> None:

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 import pytest
 from backports import zstd
+from rewritten_bags import TURNED, turned_infrared
 from rosbags.rosbag1 import Writer as Ros1Writer
 from rosbags.rosbag2 import Reader, StoragePlugin, Writer, storage_mcap
 from rosbags.typesys import Stores, get_typestore
@@ -82,11 +83,20 @@ def test_millimetres_are_rounded(run: Run) -> None:
             np.testing.assert_allclose(other.depth_m, one.depth_m, atol=0.5001e-3)
 
 
-def test_bag_of_ros_2_keeps_pinholes_and_poses(bags: SimpleNamespace) -> None:
-    ours = open_recording(bags.sqlite3)
-    bag = BagReader(SAMPLE)
+def test_bag_of_ros_2_keeps_pinholes_lenses_and_poses(
+    remake: Callable[..., Path], run: Run
+) -> None:
+    path = remake(turned_infrared)
+    run("export", path, "--ros2", "out")
+    ours = open_recording(Path("out"))
+    bag = BagReader(path)
+
+    assert ours.lens("infrared")[0] == "brown_conrady"
+    np.testing.assert_allclose(bag.pose("depth", "infrared"), TURNED, atol=1e-9)
+
     for name, info in bag.streams.items():
         assert ours.streams[name].intrinsics == info.intrinsics
+        np.testing.assert_allclose(ours.lens(name)[1], bag.lens(name)[1], atol=1e-9)
         np.testing.assert_allclose(ours.pose("depth", name), bag.pose("depth", name), atol=1e-9)
 
 

@@ -46,12 +46,12 @@ def test_wall_interval_holds_the_truth_as_often_as_stated(noise: float, frames: 
         ),
         (
             300,
-            0,
+            290,
             0.86,
             {"scene": "rippled", "frames": 20},
         ),  # what neighbouring pixels have in common
-        (300, 0, 0.86, {"scene": "patchy", "frames": 20}),
-        (80, 0, 0.87, {"flicker": 0.05, "frames": 20}),
+        (300, 290, 0.86, {"scene": "patchy", "frames": 20}),
+        (80, 75, 0.87, {"flicker": 0.05, "frames": 20}),
     ],
 )
 def test_interval_allows_outliers_ripples_and_flicker(

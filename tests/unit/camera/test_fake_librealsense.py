@@ -104,3 +104,44 @@ def test_color_camera_is_described_as_the_sdk_does() -> None:
 
     np.testing.assert_allclose(turn @ turn.T, np.eye(3), atol=1e-12)
     assert np.linalg.det(turn) == pytest.approx(1.0)
+
+
+ORDERS = [
+    [],
+    ["open"],
+    ["open", "start"],
+    ["open", "start", "stop"],
+    ["open", "start", "stop", "close"],
+]
+"""Calls of a sensor in turn."""
+
+
+def refused(sensor: Any, profiles: list[Any], name: str) -> bool:
+    """Return True where the sensor refuses a call."""
+    arguments = {"open": [profiles], "start": [lambda _: None]}.get(name, [])
+    try:
+        getattr(sensor, name)(*arguments)
+    except RuntimeError:
+        return True
+    return False
+
+
+@pytest.mark.parametrize("order", ORDERS, ids=" ".join)
+@pytest.mark.parametrize("then", ["open", "start", "stop", "close"])
+def test_fake_refuses_calls_out_of_turn_as_the_sdk_does(
+    noise_world: Any, order: list[str], then: str
+) -> None:
+    device = SoftwareLidar(noise_world().rig.pinhole, load_sdk()).device
+    real, streams = find_streams(device)
+    fake = FakeSensor(FakeLidar(runs=(0,)), 0)
+    profiles = {real: list(streams.values()), fake: fake.get_stream_profiles()[:3]}
+    found = [
+        [refused(sensor, profiles[sensor], name) for name in (*order, then)]
+        for sensor in (real, fake)
+    ]
+    for sensor in (real, fake):
+        for name in ("stop", "close"):
+            refused(sensor, [], name)
+
+    assert found[0] == found[1]
+    assert not any(found[0][:-1])

@@ -429,3 +429,8 @@ def test_fake_bus_has_the_methods_of_the_real_one(bench: Any) -> None:
         real = list(inspect.signature(getattr(_LibUSB, name)).parameters)
         assert list(inspect.signature(getattr(type(bench.usb), name)).parameters) == real
         assert hasattr(usb.backend.IBackend, name)
+
+
+def test_fake_bus_notes_what_changes_a_device(bench: Any) -> None:
+    usb.core.find(backend=bench.usb).set_configuration()
+    assert [what.split(" ")[0] for what in bench.usb.meddled] == ["configure"]

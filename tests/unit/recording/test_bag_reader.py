@@ -320,7 +320,11 @@ def test_absurd_size_is_not_allocated(
 ) -> None:
     content = request.getfixturevalue(kind).read_bytes()
     path = tmp_path / "absurd.bag"
-    for at in [found.end() for found in re.finditer(re.escape(field), content)][:3]:
+    places = [found.end() for found in re.finditer(re.escape(field), content)][:3]
+
+    assert places
+
+    for at in places:
         path.write_bytes(content[:at] + b"\xff\xff\xff\xff" + content[at + 4 :])
         tracemalloc.start()
         with pytest.raises(RecordingError):

@@ -9,6 +9,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from threading import Event
+from types import ModuleType
 
 import lz4.frame
 import numpy as np
@@ -225,17 +226,23 @@ def bomb(kind: str) -> bytes:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ["topics", "messages", "nested"])
-def test_repair_of_a_bomb_is_bounded_in_work_and_memory(tmp_path: Path, kind: str) -> None:
+def test_repair_of_a_bomb_is_bounded_in_work_and_memory(
+    tool: Callable[[str], ModuleType], tmp_path: Path, kind: str
+) -> None:
+    """In a process of its own, which may take a minute of processor time and 1 GiB more than this
+    one has: the most that this one ever took may be another test's.
+    """
     path = tmp_path / "bomb.bag"
     path.write_bytes(bomb(kind))
-    before_s, before_kib = (resource.getrusage(resource.RUSAGE_SELF)[k] for k in (0, 2))
+    fuzz = tool("fuzz")
+    pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[1])
+    verdict = fuzz.judge(
+        lambda: repair_recording(path, tmp_path / "out.bag"),
+        memory_bytes=pages * resource.getpagesize() + (1 << 30),
+        timeout_s=60.0,
+    )
 
-    assert "\n" not in line_of(lambda: repair_recording(path, tmp_path / "out.bag"))
-
-    after_s, after_kib = (resource.getrusage(resource.RUSAGE_SELF)[k] for k in (0, 2))
-
-    assert after_kib - before_kib < 1 << 20
-    assert after_s - before_s < 60
+    assert verdict.kind in fuzz.GOOD, verdict
 
 
 @pytest.mark.parametrize("seed", range(12))

@@ -111,9 +111,13 @@ def test_settings_are_those_at_the_time_of_the_frame(rewritten: Any) -> None:
         return [] if topic.endswith("/metadata") else [(time_ns, raw), *changes]
 
     with ReplayCamera(rewritten(changing)) as camera:
-        for frame in camera:
-            assert frame.settings["frames_queue_size"] == (7.0 if frame.frame_number >= 5 else 0.0)
-            assert camera.telemetry() == frame.settings
+        seen = [(frame.frame_number, frame.settings, camera.telemetry()) for frame in camera]
+
+    assert len(seen) == 20
+
+    for number, settings, telemetry in seen:
+        assert settings["frames_queue_size"] == (7.0 if number >= 5 else 0.0)
+        assert telemetry == settings
 
 
 @pytest.mark.parametrize("missing", [("infrared", "confidence"), ("infrared",), ("depth",)])
