@@ -18,7 +18,7 @@ from nlos_cam.evaluate.metrics import (
     Bin,
     Figures,
     Interval,
-    Predictions,
+    PredictedFrames,
 )
 from nlos_cam.report import figure_of
 
@@ -201,12 +201,12 @@ def _points(axis: Any, figures: Sequence[Interval]) -> None:
             axis.plot(figure.value, k, "o", color="tab:blue")
 
 
-def draw_quality(path: Path, sets: Mapping[str, tuple[Predictions, Float64]]) -> None:
+def draw_quality(path: Path, sets: Mapping[str, PredictedFrames]) -> None:
     """Draw the true IoU of each set's objects against the predicted one with its interval; trusted
     ones in green.
     """
     figure = figure_of(5 * len(sets), 4.6)
-    for axis, (name, (predicted, iou)) in zip(
+    for axis, (name, (predicted, iou, _)) in zip(
         figure.subplots(1, len(sets), squeeze=False)[0], sets.items(), strict=True
     ):
         axis.hlines(iou, predicted.low, predicted.high, colors="tab:blue", alpha=0.25)

@@ -5,7 +5,7 @@ And the error against size and detail of the surface, and by zone of the image (
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import asdict, dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import cv2
 import nlos_models as models
@@ -166,16 +166,34 @@ class Predictions:
         return Predictions(**{name: values[chosen] for name, values in vars(self).items()})
 
 
+class PredictedFrames(NamedTuple):
+    """Predicted and true quality of n frames."""
+
+    predicted: Predictions
+    iou: Float64
+    """(n,): true silhouette IoU."""
+    of_object: NDArray[np.int64]
+    """(n,): number of each frame's object."""
+
+    def where(self, chosen: NDArray[np.bool_]) -> "PredictedFrames":
+        """Return those of a mask (n,)."""
+        return PredictedFrames(
+            self.predicted.where(chosen), self.iou[chosen], self.of_object[chosen]
+        )
+
+
 QUALITY_TARGETS = {"correlation": 0.7, "trusted_good": 0.9}
 """Lower limits: correlation of predicted with true IoU, and share of trusted frames with an IoU of
 GOOD_IOU.
 """
 
 
-def quality_figures(predicted: Predictions, iou: Float64) -> dict[str, Any]:
-    """Return how well the IoU (n,) was predicted, and how many trusted frames were good; None
+def quality_figures(frames: PredictedFrames) -> dict[str, Any]:
+    """Return how well the IoU of frames was predicted, and how many trusted frames were good; None
     without any of them.
     """
+    predicted = frames.predicted
+    iou = frames.iou
     good = iou >= models.GOOD_IOU
     trusted = predicted.trusted
     known = len(iou) > 2 and np.ptp(iou) > 0 and np.ptp(predicted.iou) > 0
@@ -188,7 +206,7 @@ def quality_figures(predicted: Predictions, iou: Float64) -> dict[str, Any]:
         ),
         "good": float(good.mean()),
         "trusted": float(trusted.mean()),
-        "trusted_objects": int(trusted.sum()),
+        "trusted_objects": len(np.unique(frames.of_object[trusted])),
         "trusted_good": float(good[trusted].mean()) if trusted.any() else None,
         "targets": QUALITY_TARGETS,
     }

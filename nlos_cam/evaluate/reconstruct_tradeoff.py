@@ -5,6 +5,7 @@ Number formats, runtimes and threads were measured too, and are not worth a choi
 record says what they gave. All settings here run as in `live`: ONNX Runtime, on one thread.
 """
 
+import shlex
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
@@ -234,13 +235,18 @@ def _timed(
 
 
 def losses(row: ReconstructRow, base: ReconstructRow) -> dict[str, float]:
-    """Return by how much a row is worse than the base, by metric; infinite without a value."""
+    """Return by how much a row is worse than the base, by metric; infinite if only one of the two
+    has a value.
+    """
     worse: dict[str, float] = {}
     for name in TARGETS:
         own = row.figures[name].value
         best = base.figures[name].value
         sign = 1 if name in SMALLER_IS_BETTER else -1
-        worse[name] = float("inf") if own is None or best is None else sign * (own - best)
+        if own is not None and best is not None:
+            worse[name] = sign * (own - best)
+        else:
+            worse[name] = 0.0 if own is best else float("inf")
     return worse
 
 
@@ -341,9 +347,8 @@ def reconstruct_document(table: Mapping[str, Any], folder: Path | None = None) -
         )
         # The simulated camera is on the paper's rig: weights of another one are for a real bench.
         camera = "sim" if row["rig"] == paper_scene().rig.name else "l515"
-        commands.insert(
-            0, f"nlos-cam live {camera} --weights {row['weights']} --average {row['frames']}"
-        )
+        weights = shlex.quote(row["weights"])
+        commands.insert(0, f"nlos-cam live {camera} --weights {weights} --average {row['frames']}")
     parts: list[Section | Picture] = [
         Section("", [banner, Bullets("Note", [] if table["complete"] else [INCOMPLETE])]),
         Section("Settings", [Table(HEAD, [_line(row) for row in table["settings"]]), NOTES]),

@@ -268,7 +268,7 @@ def as_figures(evaluation: Evaluation) -> dict[str, Any]:
         "unseen": _unseen_figures(evaluation),
         "quality": (
             {
-                name: metrics.quality_figures(*each)
+                name: metrics.quality_figures(each)
                 for name, each in _predicted_sets(evaluation).items()
             }
             or None
@@ -288,21 +288,25 @@ def _unseen_figures(evaluation: Evaluation) -> dict[str, Any] | None:
     }
 
 
-def _predicted_sets(evaluation: Evaluation) -> dict[str, tuple[metrics.Predictions, Float64]]:
+def _predicted_sets(evaluation: Evaluation) -> dict[str, metrics.PredictedFrames]:
     """Return predicted and true quality of each set of objects, by its name; mixed objects also by
     share.
     """
-    sets = dict[str, tuple[metrics.Predictions, Float64]]()
+    sets = dict[str, metrics.PredictedFrames]()
     second = evaluation.unseen
-    if predicted := evaluation.predicted:
+    if evaluation.predicted:
         iou = evaluation.ours["silhouette_iou"]
+        whole = metrics.PredictedFrames(evaluation.predicted, iou, evaluation.of_object)
         kinds = np.isin(evaluation.categories, tuple(CATEGORIES))
-        sets["objects"] = predicted, iou
+        sets["objects"] = whole
         if kinds.any() and not kinds.all():
-            sets |= {"the 18 kinds": (predicted.where(kinds), iou[kinds])}
-            sets |= {"generic shapes": (predicted.where(~kinds), iou[~kinds])}
+            sets["the 18 kinds"] = whole.where(kinds)
+            sets["generic shapes"] = whole.where(~kinds)
     if second and second.predicted:
-        sets["kinds never seen"] = second.predicted, silhouette_iou(second.image, second.truth)
+        iou = silhouette_iou(second.image, second.truth)
+        sets["kinds never seen"] = metrics.PredictedFrames(
+            second.predicted, iou, np.arange(len(iou))
+        )
     return sets
 
 

@@ -140,6 +140,8 @@ class RunControl:
         """Take a new result, in the loop's thread."""
         self._run.newest = moment
         self.set_state("running")
+        if self._recent and moment.time_s - self._recent[-1][0] > STALE_S:
+            self._recent.clear()  # the pace of before a stall says nothing of the one after
         self._recent.append((moment.time_s, moment.latency_s))
         self.saving.show(moment)
 

@@ -30,7 +30,7 @@ def log_line(moment: Moment) -> dict[str, Any]:
         "expected_iou": round(quality.iou[1], 4) if quality else None,
         "expected_error_mm": round(1e3 * quality.error_m, 2) if quality else None,
         "check_score": round(result.check.score, 4) if result.check else None,
-        "celsius": max(moment.celsius.values(), default=None),
+        "celsius": max(moment.known_celsius.values(), default=None),
     }
 
 

@@ -40,7 +40,7 @@ class BackgroundPhysicsCheck:
 
     `offer`, for one thread, returns at once: a frame that is due while another is checked waits,
     until a newer one replaces it. A thread talks to the process. `on_error` is called for the first
-    failed check, or if the process ends; the loop continues without.
+    failed check, and if the process ends; the loop continues without.
     """
 
     def __init__(
@@ -63,7 +63,8 @@ class BackgroundPhysicsCheck:
         self._period_s = period_s
         self._clock = clock
         self._on_error = on_error
-        self._reported = False
+        self._has_failed = False
+        """True once a failed check was reported."""
         self._command = command
         self._due_s = -float("inf")
         self._queue = BoundedQueue[tuple[int, LidarMaps, Float32, Rig]](1)
@@ -137,16 +138,17 @@ class BackgroundPhysicsCheck:
                     # one of a rig that is no longer used says nothing
                     self.newest = answer if frame[-1] == self._rig else self.newest
             else:
-                self._report(describe_failure(frame[0], str(answer)))
+                self._report_failure(describe_failure(frame[0], str(answer)))
 
     def _give_up(self, reason: str) -> None:
-        self._report(f"no more physics checks: {reason}")
+        if not self.ended:
+            self._on_error(f"no more physics checks: {reason}")
         self._queue.close()
         self.newest = None  # it would be shown for good
 
-    def _report(self, text: str) -> None:
-        if not (self._reported or self.ended):
-            self._reported = True
+    def _report_failure(self, text: str) -> None:
+        if not (self._has_failed or self.ended):
+            self._has_failed = True
             self._on_error(text)
 
 

@@ -6,7 +6,6 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass, field
-from datetime import datetime
 from pathlib import Path
 from queue import Empty, Queue
 from typing import Any, Protocol, runtime_checkable
@@ -88,9 +87,17 @@ class RunContext:
         return self.camera, self.pipeline
 
     def new_file(self, stem: str, suffix: str) -> Path:
-        """Return a path with the present date, to a millisecond."""
-        date = f"{datetime.now().astimezone():%Y%m%d-%H%M%S-%f}"[:-3]
-        return self.folder / f"{stem}-{date}{suffix}"
+        """Return a path with the present date in the run's folder."""
+        return views.dated_file(self.folder, stem, suffix)
+
+
+def _checked_count(frames: object, most: int, purpose: str) -> int:
+    """Return a number of frames. Raises NlosCamError unless it is a whole number from 1 to
+    `most`.
+    """
+    if not isinstance(frames, int | float) or not 1 <= frames <= most or frames != int(frames):
+        raise NlosCamError(f"{frames} frames {purpose}: give a whole number from 1 to {most}")
+    return int(frames)
 
 
 class PipelineCommands:
@@ -119,11 +126,7 @@ class PipelineCommands:
     def average(self, frames: int) -> str:
         """Average the maps of the last `frames` frames (1 to 1000) from now on."""
         _, pipeline = self._run.attached()
-        count = int(frames)
-        if not 1 <= count <= MAX_AVERAGE or count != frames:
-            raise NlosCamError(
-                f"{frames} frames to average: give a whole number from 1 to {MAX_AVERAGE}"
-            )
+        count = _checked_count(frames, MAX_AVERAGE, "to average")
         pipeline.average = count
         older_s = (count - 1) / 2 / FRAMES_PER_S
         return f"the mean of {count} frame{'s' if count > 1 else ''}, {older_s:.2f} s older"
@@ -237,6 +240,8 @@ class RecordingCommands:
         self.recording = None
         self._run.on_frame.remove(recording.add)
         outcome = recording.stop()
+        if not recording.path.exists():  # no frame came
+            return outcome
         return f"{outcome}, {self._run.files.note(recording.path)}"
 
 
@@ -280,13 +285,15 @@ class BenchCommands:
         camera = self._run.camera
         self.options = camera.adjustable() if isinstance(camera, AdjustableCamera) else []
 
-    def set_option(self, name: str, value: float) -> str:
+    def set_option(self, name: str, value: float | str) -> str:
         """Set an option of the device, such as laser_power, to the nearest allowed value."""
         camera, pipeline = self._run.attached()
         if not isinstance(camera, AdjustableCamera):
             raise NlosCamError(
                 f"{camera.uri} has no option {name}: laser and near-wall settings are an L515's"
             )
+        if isinstance(value, str):
+            raise NlosCamError(f"{name} {value!r} is no number: give one")
         outcome = camera.set_option(str(name), float(value))
         self.read_options()
         pipeline.begin_mean()  # light of two settings has no mean
@@ -303,12 +310,7 @@ class BenchCommands:
         camera, pipeline = self._run.attached()
         if self.is_saving():
             raise NlosCamError(self.no_reference)
-        count = int(frames)
-        if not 1 <= count <= MAX_REFERENCE_FRAMES or count != frames:
-            raise NlosCamError(
-                f"{frames} frames for a reference: give a whole number from 1 to"
-                f" {MAX_REFERENCE_FRAMES}"
-            )
+        count = _checked_count(frames, MAX_REFERENCE_FRAMES, "for a reference")
         passing: Any = _PassingFrames(self._run, camera)  # all that measuring needs of a camera
         self._run.on_frame.append(passing.frames.put)
         try:

@@ -91,7 +91,9 @@ class FrameResult:
     unless the lidar moved or is saturated.
     """
     check: PhysicsCheckResult | None = None
-    """Newest physics check, of this frame or an earlier one; None until there is one."""
+    """Newest physics check, of this frame or one shortly before; None until there is one, and where
+    the newest is old.
+    """
     arrived_s: float | None = None
     """Time at which the reader received the frame."""
 
@@ -376,7 +378,7 @@ class Pipeline:
             difference=observation.difference,
             warnings=warnings,
             verdict=verdict,
-            check=newest,
+            check=conditions.check,
             arrived_s=arrived_s,
         )
 

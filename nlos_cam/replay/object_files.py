@@ -105,7 +105,7 @@ def export_objects(
 
 def _frames(count: int, every: int) -> str:
     frames = f"its {count} frame{'' if count == 1 else 's'}"
-    return frames if every == 1 else f"every {every}th of {frames}"
+    return frames if every == 1 else f"one in {every} of {frames}"
 
 
 DIMENSIONS = {

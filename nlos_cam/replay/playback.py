@@ -5,7 +5,6 @@ exported.
 from collections import deque
 from collections.abc import Mapping
 from dataclasses import replace
-from datetime import datetime
 from pathlib import Path
 from threading import Event, Lock
 from typing import Any
@@ -26,7 +25,7 @@ from nlos_cam.reconstruct import (
     iterate_batched,
 )
 from nlos_cam.recording import with_telemetry
-from nlos_cam.view import Moment, PlaybackViewer, WrittenFiles, save_moment
+from nlos_cam.view import Moment, PlaybackViewer, WrittenFiles, dated_file, save_moment
 
 SAME_S = 1e-3
 """Difference of two times, in seconds, below which they are one: the page's are rounded."""
@@ -146,8 +145,7 @@ class Playback(PlaybackViewer):
             (result,) = deque(results, maxlen=1)
         shown = self._verdicts.get((result.frame_number, result.timestamp_s), result.verdict)
         result = replace(result, verdict=shown)
-        now = f"{datetime.now().astimezone():%H%M%S}"
-        path = self._folder / f"{self._bag.stem}-{number:06d}-{now}.npz"
+        path = dated_file(self._folder, f"{self._bag.stem}-{number:06d}", ".npz")
         outcome = save_moment(path, Moment.recorded(result))
         return f"{outcome}, {self._files.note(path)}"
 

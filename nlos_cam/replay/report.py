@@ -28,16 +28,16 @@ ADVICE = {
     Verdict.SEEN: (
         "The object resembles the training set. Expect blurred outlines and missing thin parts."
     ),
-    Verdict.NOTHING: "No hidden surface was found in most frames.",
+    Verdict.NOTHING: "No hidden surface was found in these frames.",
     Verdict.OUTSIDE: (
-        "The shape in most frames is not reliable: the object or the bench is unlike the training"
+        "The shape in these frames is not reliable: the object or the bench is unlike the training"
         " set."
     ),
     Verdict.SATURATED: "Reduce the laser power or the gain, then record again.",
     Verdict.WALL_MOVED: "The lidar or the wall moved since the calibration: calibrate again.",
 }
 STATES: dict[Verdict, State] = {
-    Verdict.SEEN: "good",
+    Verdict.SEEN: "doubtful",
     Verdict.NOTHING: "doubtful",
     Verdict.OUTSIDE: "doubtful",
 }
@@ -108,7 +108,18 @@ def _banner(results: ReplayResults) -> Banner:
     most = max(verdicts, key=lambda verdict: verdicts[verdict])
     headline = f"{most.capitalize()} in {verdicts[most]} of {frames} frames"
     verdict = Verdict(most)
-    return Banner(STATES.get(verdict, "out-of-range"), headline, ADVICE.get(verdict, ""))
+    state = STATES.get(verdict, "out-of-range")
+    if verdict is Verdict.SEEN and _is_green(results, verdicts[most]):
+        state = "good"
+    return Banner(state, headline, ADVICE.get(verdict, ""))
+
+
+def _is_green(results: ReplayResults, seen: int) -> bool:
+    """Return True if most frames are green on the live page, which means that their outlines are
+    expected to be right; in `seen` of the frames an object is seen.
+    """
+    trusted = seen * results.quality.summary.get("trusted", 0.0)
+    return trusted > len(results.numbers) / 2
 
 
 def _verdicts(results: ReplayResults) -> Table | str:

@@ -15,6 +15,7 @@ __all__ = [
     "Viewers",
     "WebViewer",
     "WrittenFiles",
+    "dated_file",
     "element",
     "exposed",
     "prepare_saving",
@@ -22,7 +23,7 @@ __all__ = [
     "unpack",
 ]
 
-from .frame_files import WrittenFiles, prepare_saving, save_moment
+from .frame_files import WrittenFiles, dated_file, prepare_saving, save_moment
 from .images import MAX_UNCERTAINTY_M
 from .messages import unpack
 from .server import LOOPBACK, exposed

@@ -52,8 +52,8 @@ def assess(moment: Moment) -> Assessment:
     and the depth error.
 
     Both come from the quality model, with the interval that holds 80 % of like frames; it was
-    fitted to known objects, of which none of the shown kind may have been (docs/doubt.md). Without
-    one they are the uncertainty model's own.
+    fitted to known objects, of which none of the shown kind may have been (docs/uncertainty.md).
+    Without one they are the uncertainty model's own.
     """
     verdict = moment.result.verdict
     found = moment.result.reconstruction

@@ -27,18 +27,30 @@ function tellAnswer(text, failed = false) {
   box.textContent = text;
 }
 
+// The program's refusal, in its own words; other errors are in the browser's.
+class Refusal extends Error {}
+
+// Return the program's answer. Throws a Refusal.
+async function asked(path, options) {
+  const answer = await fetch(path, options);
+  if (answer.ok) return answer;
+  if (answer.status === 403) forgetToken();
+  throw new Refusal((await answer.text()).trim());
+}
+
+function reasonOf(error) {
+  return error instanceof Refusal ? error.message : "no answer: is the program still running?";
+}
+
 async function command(name, values = {}) {
   const words = NAMES[name] || name;
   tellAnswer(`${words}…`);
   try {
     const headers = { "Content-Type": "application/json", "X-Token": token };
-    const answer = await fetch("command", { method: "POST", headers, body: JSON.stringify({ command: name, ...values }) });
-    const text = (await answer.text()).trim();
-    if (answer.status === 403) forgetToken();
-    if (!answer.ok) throw new Error(text);
-    tellAnswer(text);
+    const answer = await asked("command", { method: "POST", headers, body: JSON.stringify({ command: name, ...values }) });
+    tellAnswer((await answer.text()).trim());
   } catch (error) {
-    tellAnswer(`${words}: ${error.message}`, true);
+    tellAnswer(`${words}: ${reasonOf(error)}`, true);
   }
 }
 
@@ -59,12 +71,11 @@ function typed(box, value, send) {
 async function fetchFile(name) {
   tellAnswer(`Download of ${name}…`);
   try {
-    const answer = await fetch(`files/${encodeURIComponent(name)}`, { headers: { "X-Token": token } });
-    if (!answer.ok) throw new Error((await answer.text()).trim());
+    const answer = await asked(`files/${encodeURIComponent(name)}`, { headers: { "X-Token": token } });
     download(await answer.blob(), name);
     tellAnswer(`${name} is in this browser's downloads`);
   } catch (error) {
-    tellAnswer(`${name}: ${error.message}`, true);
+    tellAnswer(`${name}: ${reasonOf(error)}`, true);
   }
 }
 
@@ -185,12 +196,16 @@ const controls = {
 
 // ---- keys -----------------------------------------------------------------------------------------------------
 
+let focusBefore = null; // the element that had the focus before the help was shown
+
 function showHelp(shown) {
   const box = find("#help");
   const rows = KEYS.map(([key, does]) => `<tr><td><kbd>${escape(key)}</kbd></td><td>${escape(does)}</td></tr>`);
   box.firstElementChild.innerHTML = `<h2>Keys</h2><table>${rows.join("")}</table><p><button>Close</button></p>`;
+  if (shown && box.hidden) focusBefore = document.activeElement;
   box.hidden = !shown;
   if (shown) box.querySelector("button").focus();
+  else if (focusBefore) focusBefore.focus();
 }
 
 function plays() {
@@ -225,6 +240,11 @@ function onKey(event) {
   if (event.key === "Escape") {
     if (!find("#help").hidden) showHelp(false);
     else inspector.close();
+    return;
+  }
+  if (!find("#help").hidden && event.key !== "?") {
+    // The dialog has one button, and the page behind it is out of reach.
+    if (event.key === "Tab") event.preventDefault();
     return;
   }
   const at = document.activeElement;
@@ -276,6 +296,11 @@ const PLOTS = {
 
 const plots = {
   history: [],
+
+  clear() {
+    this.history = [];
+  },
+
   colors: ["#ebf0f5", "#5aaaff", "#ffbe5a", "#50dc78", "#e678dc", "#78dcdc"],
   dashes: [[], [6, 3], [2, 2], [9, 3, 2, 3], [4, 4], [1, 3]],
 

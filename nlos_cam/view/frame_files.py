@@ -2,6 +2,7 @@
 
 import glob
 import socket
+from datetime import datetime
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -31,6 +32,14 @@ class WrittenFiles(dict[str, Path]):
         for each in sorted(path.parent.glob(f"{glob.escape(path.stem)}.*")):
             self[each.name] = each
         return f"in {path.parent.resolve()} on {socket.gethostname()}"
+
+
+def dated_file(folder: Path, stem: str, suffix: str) -> Path:
+    """Return a path in a folder with the present date, to a millisecond, so that it replaces
+    nothing.
+    """
+    date = f"{datetime.now().astimezone():%Y%m%d-%H%M%S-%f}"[:-3]
+    return folder / f"{stem}-{date}{suffix}"
 
 
 def prepare_saving() -> None:

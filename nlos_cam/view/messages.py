@@ -209,7 +209,7 @@ class MomentPacker:
             "dropped": moment.dropped,
             "celsius": {
                 name.removesuffix("_temperature"): round(value, 1)
-                for name, value in moment.celsius.items()
+                for name, value in moment.known_celsius.items()
             },
             "verdict": result.verdict,
             "headline": assessment.headline,

@@ -55,8 +55,7 @@ const seen = () => new Promise((resume) => {
 });
 
 async function receive(signal) {
-  const answer = await fetch("stream", { signal });
-  if (!answer.ok) throw new Error((await answer.text()).trim());
+  const answer = await asked("stream", { signal });
   const reader = answer.body.getReader();
   let rest = new Uint8Array(0);
   for (;;) {
@@ -81,7 +80,7 @@ async function follow() {
     try {
       await receive(leaving.signal);
     } catch (error) {
-      if (error.message && !/fetch|network/i.test(error.message)) reason = error.message;
+      if (error instanceof Refusal) reason = error.message;
     }
     ended();
     if (leaving.signal.aborted) reason = "out of sight: goes on when it is looked at";
@@ -97,6 +96,7 @@ function begin() {
   find("#offers").innerHTML = "";
   player.clear();
   kept.clear();
+  plots.clear();
 }
 
 function handle(message) {
@@ -173,6 +173,7 @@ function title(id, html) {
 function caption(id, text) {
   const box = find(`${id} small`);
   if (box.textContent === text) return;
+  delete box.dataset.html;
   box.textContent = text;
   box.title = text;
 }
@@ -220,7 +221,13 @@ function drawTruth(depth, truth) {
 }
 
 function drawUncertainty([errorAt, surfaceAt], error, surface) {
-  if (errorAt === "#truth" && !error) for (const id of [errorAt, surfaceAt]) title(id, "no truth, no uncertainty");
+  // The pictures there may be those of a run before.
+  if (errorAt === "#truth" && !error)
+    for (const id of [errorAt, surfaceAt]) {
+      title(id, "no truth, no uncertainty");
+      caption(id, "");
+      pictures.clear(find(id));
+    }
   if (error) {
     title(errorAt, `Uncertainty ${pictures.swatch("error")} 0 to ${MAX_ERROR_MM} mm`);
     pictures.error(find(errorAt), error);

@@ -3,6 +3,7 @@
 
 const KEPT_S = 60;
 const CHUNK_MOMENTS = 12;
+const CACHED_CHUNKS = 12;
 // In pieces, so that no reader of this script takes them for elements.
 const SESSION_MARK = ["<!", "-- nlos-cam session --", ">"].join("");
 const [MESSAGE_START, MESSAGE_END] = [["<", 'script type="text/x-message">'].join(""), ["</", "script>\n"].join("")];
@@ -44,13 +45,16 @@ const player = {
 
   async moments(index) {
     if (Array.isArray(this.chunks[index])) return this.chunks[index];
-    if (!this.cache.has(index)) {
+    const { cache } = this; // `clear` begins another one, for another recording
+    if (!cache.has(index)) {
       const stream = new Blob([this.chunks[index]]).stream().pipeThrough(new DecompressionStream("deflate"));
       const bytes = new Uint8Array(await new Response(stream).arrayBuffer());
-      this.cache.set(index, split(bytes)[0].map(decode));
-      if (this.cache.size > 12) this.cache.delete(this.cache.keys().next().value);
+      const moments = split(bytes)[0].map(decode);
+      cache.set(index, moments);
+      if (cache.size > CACHED_CHUNKS) cache.delete(cache.keys().next().value);
+      return moments;
     }
-    return this.cache.get(index);
+    return cache.get(index);
   },
 
   // Number of the last moment at or before a time.
@@ -106,13 +110,18 @@ const player = {
       if (!this.playing) return;
       const next = this.at + ((now - before) / 1000) * Number(find("#speed").value);
       before = now;
-      const grows = mode === "recorded" && (state.status.state !== "playback" || state.status.message);
-      if (next >= this.end() && !grows) this.playing = false;
+      if (next >= this.end() && !this.grows()) this.playing = false;
       this.seek(Math.min(next, this.end()));
       requestAnimationFrame(step);
     };
     if (this.playing) requestAnimationFrame(step);
     this.tell();
+  },
+
+  // Whether more moments are to come: the program reconstructs, or has not said that it is done.
+  grows() {
+    const { state: word, message } = state.status;
+    return mode === "recorded" && (word === "connecting" || (word === "playback" && Boolean(message)));
   },
 
   // The frame's depth map as a file, made by the browser itself.

@@ -3,6 +3,7 @@
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field
+from math import isfinite
 from pathlib import Path
 from typing import Any, Protocol, Self
 
@@ -24,6 +25,11 @@ class Moment:
     """Frames lost so far."""
     celsius: Mapping[str, float] = field(default_factory=dict[str, float])
     """The device's last temperatures, by name; empty where none were read."""
+
+    @property
+    def known_celsius(self) -> dict[str, float]:
+        """Temperatures that are numbers: a device may answer NaN, which JSON does not have."""
+        return {name: value for name, value in self.celsius.items() if isfinite(value)}
 
     @classmethod
     def recorded(cls, result: FrameResult, celsius: Mapping[str, float] | None = None) -> Self:

@@ -162,9 +162,9 @@ def test_samples_of_many_rigs_are_aligned_with_the_weights_rig() -> None:
     many = replace(PLAN, rigs=RigRange())
     grid = RECORD.model_copy(update={"rig_checksum": WALL_GRID.checksum})
 
-    assert Benches.of(many, RECORD).frame == PLAN.rig
-    assert Benches.of(many, grid).frame == WALL_GRID
-    assert Benches.of(PLAN, RECORD).frame is None
+    assert Benches.of(many, RECORD).maps_rig == PLAN.rig
+    assert Benches.of(many, grid).maps_rig == WALL_GRID
+    assert Benches.of(PLAN, RECORD).maps_rig is None
 
 
 @pytest.mark.parametrize(

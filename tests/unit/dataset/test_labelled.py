@@ -322,7 +322,7 @@ def test_read_labelled_refuses_recording_without_sidecar(labelled: Label) -> Non
     path = labelled("a")
     sidecar_path(path).unlink()
 
-    with pytest.raises(RecordingError, match="a"):
+    with pytest.raises(RecordingError, match=r"a\.json"):
         read_labelled([path], known=known)
 
 

@@ -301,21 +301,26 @@ def test_error_on_an_empty_truth_is_far_background() -> None:
 IOU = np.linspace(0.4, 0.95, 50)
 
 
+def of_frames(predicted: metrics.Predictions) -> metrics.PredictedFrames:
+    """Return frames of these predictions with IOU, two of each object."""
+    return metrics.PredictedFrames(predicted, IOU, np.arange(50) // 2)
+
+
 def test_quality_figures_of_exact_predictions() -> None:
     exact = metrics.Predictions(IOU - 0.05, IOU, IOU + 0.05, np.full(50, 10.0), IOU >= 0.8)
 
-    found = metrics.quality_figures(exact, IOU)
+    found = metrics.quality_figures(of_frames(exact))
 
     assert (found["correlation"], found["mean_error"], found["bias"]) == pytest.approx((1, 0, 0))
     assert found["within_80_percent_interval"] == found["trusted_good"] == 1
-    assert found["trusted_objects"] == (IOU >= 0.8).sum()
+    assert found["trusted_objects"] == -(-(IOU >= 0.8).sum() // 2)
 
 
 def test_quality_figures_of_blind_predictions() -> None:
     low, middle, high = (np.full(50, value) for value in (0.9, 0.95, 1.0))
     blind = metrics.Predictions(low, middle, high, IOU, np.zeros(50, bool))
 
-    found = metrics.quality_figures(blind, IOU)
+    found = metrics.quality_figures(of_frames(blind))
 
     assert found["correlation"] is found["trusted_good"] is None
     assert found["bias"] > 0.2

@@ -79,6 +79,13 @@ def test_setting_without_a_value_is_not_recommended() -> None:
     assert recommended([ROWS[0], replace(ROWS[1], figures=blind)]).setting.name == "exact"
 
 
+def test_setting_is_recommended_where_none_has_a_depth_error() -> None:
+    blind = {**ROWS[0].figures, "foreground_rmse_mm": Interval(None, None, None)}
+    rows = [replace(row, figures=blind) for row in ROWS[:2]]
+
+    assert recommended(rows).setting.name == "quick"
+
+
 def test_losses_are_positive_where_a_row_is_worse() -> None:
     worse = {
         **ROWS[0].figures,
@@ -170,6 +177,13 @@ def test_command_is_of_a_camera_on_the_measured_rig(rig: str, camera: str) -> No
     page = read_page(reconstruct_document(facts_of(rows, 1)).as_html())
 
     assert f"nlos-cam live {camera} --weights" in page.text
+
+
+def test_command_quotes_the_folder_of_weights() -> None:
+    rows = [replace(ROWS[0], setting=replace(ROWS[0].setting, weights="my weights"))]
+    page = read_page(reconstruct_document(facts_of(rows, 1)).as_html())
+
+    assert "--weights 'my weights' --average" in page.text
 
 
 def test_plot_is_a_picture(tmp_path: Path) -> None:

@@ -81,6 +81,14 @@ def test_old_results_say_nothing_of_the_pace(tmp_path: Path) -> None:
     assert "fps" not in control.status()
 
 
+def test_pace_after_a_stall_is_that_of_the_new_frames(tmp_path: Path) -> None:
+    control = RunControl(folder=tmp_path, clock=lambda: 21.0)
+    for number in (*range(30), *range(600, 630)):
+        control.add(full_moment(number))
+
+    assert control.status()["fps"] == pytest.approx(30.0)
+
+
 @pytest.mark.parametrize("command", [("resume", {}), ("option", {"name": "gain", "value": 2})])
 def test_what_changes_the_scene_begins_a_new_mean(
     control: RunControl, monkeypatch: pytest.MonkeyPatch, command: tuple[str, Any]
@@ -186,7 +194,8 @@ def test_session_that_stopped_is_told(control: RunControl, monkeypatch: pytest.M
 
 
 def test_average_changes_the_pipeline(control: RunControl) -> None:
-    pipeline = control._run.pipeline
+    pipeline = Pipeline(CalibratedRig(RIG), sheet_network)
+    control.attach(Recorded(0), pipeline)  # type: ignore[arg-type]
     control.run("average", {"frames": 4})
 
     assert pipeline.average == control.status()["control"]["average"] == 4
@@ -197,7 +206,8 @@ def test_average_changes_the_pipeline(control: RunControl) -> None:
     [
         ("fly", {}, "no command"),
         ("average", {"frames": 0}, "1 to 1000"),
-        ("average", {"frames": "x"}, "average"),
+        ("average", {"frames": "x"}, "whole number"),
+        ("take_reference", {"frames": "x"}, "whole number"),
         ("average", {"of": 3}, "does not take"),
         ("stop_recording", {}, "nothing is being recorded"),
         ("end_session", {}, "no session"),
@@ -532,6 +542,16 @@ def test_recording_that_the_camera_ended_is_called_lost(
     assert sidecar.wall == wall[1]
     assert sidecar.summary
     assert "duplicate" not in sidecar.summary.events
+
+
+def test_recording_without_a_frame_is_in_no_folder(control: RunControl, tmp_path: Path) -> None:
+    nothing = SimpleNamespace(
+        path=tmp_path / "live.bag", problem="", add=Mock(), stop=lambda: "nothing was recorded"
+    )
+    control.recording.recording = nothing  # type: ignore[assignment]
+    control._run.on_frame.append(nothing.add)
+
+    assert control.run("stop_recording", {}) == "nothing was recorded"
 
 
 def test_page_says_that_a_recording_has_no_room(

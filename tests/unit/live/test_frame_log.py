@@ -53,6 +53,16 @@ def test_log_line_holds_times_verdict_and_warmest_reading(tmp_path: Path, suffix
     assert other["verdict"] in {None, ""}
 
 
+def test_log_leaves_out_a_temperature_that_is_none(tmp_path: Path) -> None:
+    path = tmp_path / "log.jsonl"
+    with FrameLog(path) as log:
+        log.add(replace(moment(0), celsius={"ldd_temperature": float("nan")}))
+
+    (line,) = lines_of(path)
+
+    assert line["celsius"] is None
+
+
 def test_log_keeps_its_columns_when_a_stage_comes_later(tmp_path: Path) -> None:
     path = tmp_path / "log.csv"
     with FrameLog(path) as log:

@@ -43,6 +43,15 @@ while True:
     pickle.dump("no", sys.stdout.buffer)
     sys.stdout.buffer.flush()
 """
+REFUSES_ONCE = """
+import pickle, sys
+pickle.load(sys.stdin.buffer)
+pickle.load(sys.stdin.buffer)
+pickle.dump("no", sys.stdout.buffer)
+sys.stdout.buffer.flush()
+pickle.load(sys.stdin.buffer)
+sys.exit(3)
+"""
 PARENT = """
 import os, signal, sys, time
 from nlos_calibration.rig import load_rig
@@ -169,6 +178,19 @@ def test_background_checks_report_a_missing_process_once(command: tuple[str, ...
         assert not checks.waits
 
     assert (len(errors), checks.newest) == (1, None)
+
+
+def test_background_checks_report_their_end_after_a_failure() -> None:
+    checks, errors = background(python(REFUSES_ONCE))
+    with checks:
+        checks.offer(0, DARK, NOTHING)
+        wait_until(lambda: bool(errors))
+        checks.offer(1, DARK, NOTHING)
+        wait_until(lambda: checks.ended)
+    failed, ended = errors
+
+    assert "frame 0" in failed
+    assert "no more" in ended
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="SIGKILL is POSIX")

@@ -205,7 +205,7 @@ def test_result_shows_what_its_verdict_says(
     doubter = FakeUncertainty(lambda *_: (nothing, 0.0))
     pipeline = Pipeline(walled, noting, uses_difference=True, average=3, uncertainty_model=doubter)
     done = all_steps(pipeline, WallCamera(100, moved=range(50, 100)))
-    for step, asked, given in zip(done[:50], doubter.asked, noting.given, strict=False):
+    for step, asked, given in zip(done[:50], doubter.asked[:50], noting.given[:50], strict=True):
         assert step.verdict == verdict
         assert step.reconstruction.has_surface == (verdict is Verdict.SEEN)
         assert step.reconstruction.uncertainty_m is not None
@@ -321,6 +321,20 @@ def test_frame_is_judged_by_its_own_check(score: float, nothing: float, verdict:
     assert result.verdict == verdict
 
 
+def test_result_has_no_check_that_is_too_old_for_its_verdict() -> None:
+    checks = ScoringCheck(0.1)
+    pipeline = Pipeline(CalibratedRig(RIG), sheet_network, checks=checks)
+    pipeline.process(Arrival(wall_frame(0), 0.0, ()), lambda: 0.0, 0.0)
+    checks.offer = lambda *_: None  # type: ignore[method-assign]
+    first, last = (
+        pipeline.process(Arrival(wall_frame(number), 0.0, ()), lambda: 0.0, 0.0)
+        for number in (150, 151)
+    )
+
+    assert first.check is not None
+    assert last.check is None
+
+
 def test_frame_of_the_bench_before_stays_on_it_unchecked() -> None:
     box = RIG.object_box
     assert box
@@ -388,7 +402,7 @@ def test_build_pipeline_feeds_the_networks_their_kind_of_maps(
     fed = {"raw maps": flat, "difference maps": done[0].difference}[eats]
 
     np.testing.assert_array_equal(network.given[0], fed.depth_m)
-    assert len(pipeline._mean._last) == 7
+    assert pipeline.average == 7
 
 
 def test_load_networks_exports_into_the_cache(

@@ -56,6 +56,15 @@ def test_export_takes_the_frame_shown_of_two_of_a_number(
     assert exported_s(tmp_path) == pytest.approx(100.2)
 
 
+def test_export_of_the_other_frame_of_a_number_replaces_nothing(
+    playback: Playback, tmp_path: Path
+) -> None:
+    for time_s in (1 / 30, 0.2):
+        playback.run("export", {"frame": 61, "time_s": time_s})
+
+    assert len([*tmp_path.glob("run-000061-*.npz")]) == 2
+
+
 def test_export_by_number_alone_takes_the_first(playback: Playback, tmp_path: Path) -> None:
     playback.run("export", {"frame": 61})
     assert exported_s(tmp_path) == pytest.approx(100.0 + 1 / 30)

@@ -1,25 +1,32 @@
 import re
+from contextlib import ExitStack
+from dataclasses import replace
 from itertools import count as count_up
 from pathlib import Path
+from tempfile import TemporaryFile
 from threading import Event
 
 import numpy as np
 import pytest
 from fake_uncertainty import FakeUncertainty
 from fake_wall import WallCamera, measured_wall, wall_frame
-from made_up_moments import RIG
+from made_up_moments import RIG, Recorded, full_moment
 from nlos_calibration.arrays import Float32
 from page_reader import read_page
 from replays import BENCH, NAMES, TEXT, left_half, replay_noise, replay_wall, text_of
 
 from nlos_cam.errors import OutputExistsError, RecordingError
 from nlos_cam.frames import LidarMaps
-from nlos_cam.reconstruct import PeriodicPhysicsCheck, PhysicsCheckResult, Pipeline
+from nlos_cam.reconstruct import PeriodicPhysicsCheck, PhysicsCheckResult, Pipeline, Quality, ignore
 from nlos_cam.reconstruct.consistency import COMPLETE, MapConsistency
+from nlos_cam.reconstruct.network import Uncertainty
 from nlos_cam.reconstruct.physics_check import NullPhysicsCheck
 from nlos_cam.reconstruct.streaming import BATCH_FRAMES, MAX_BATCHES_AHEAD
 from nlos_cam.replay import REPORT, replay_recording
 from nlos_cam.replay.replay import DIFFERENCE, RESULT, SHEET
+from nlos_cam.replay.report import replay_document
+from nlos_cam.replay.results import ReplayResults
+from nlos_cam.report import figure_of, png
 
 
 @pytest.fixture(scope="module")
@@ -143,6 +150,25 @@ def test_report_counts_checks_by_the_limit_that_applied(tmp_path: Path) -> None:
     found = "3 of 3 checked frames at 0.84 or more (0.5 without a surface)"
 
     assert found in text_of(tmp_path / "out")
+
+
+@pytest.mark.parametrize(("green", "state"), [(0, "doubtful"), (4, "doubtful"), (6, "good")])
+def test_report_is_green_where_most_frames_are_on_the_page(
+    tmp_path: Path, green: int, state: str
+) -> None:
+    (tmp_path / SHEET).write_bytes(png(figure_of(1.0, 1.0)))
+    with ExitStack() as files:
+        results = ReplayResults(lambda: files.enter_context(TemporaryFile()), ignore)
+        for number in range(10):
+            shown = full_moment(number).result
+            cells = np.ones((64, 64), np.float32)
+            quality = Quality((0.7, 0.8, 0.9), 0.9, 0.01, trusted=number < green)
+            uncertainty = Uncertainty(0.0, 0.0, cells, cells, quality)
+            found = replace(shown.reconstruction, uncertainty=uncertainty)
+            results.add(replace(shown, reconstruction=found))
+        document = replay_document(Recorded(0), BENCH, results, tmp_path, out=tmp_path)
+
+    assert f"verdict {state}" in document.as_html()
 
 
 def test_report_suggests_a_replay_of_the_same_bench(tmp_path: Path) -> None:

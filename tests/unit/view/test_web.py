@@ -397,6 +397,13 @@ def test_moment_without_surface_sends_uncertainty_in_valid_json() -> None:
     assert not arrays["lidar"].any()
 
 
+def test_moment_message_leaves_out_a_temperature_that_is_none() -> None:
+    shown = replace(full_moment(0), celsius={"ldd_temperature": np.nan, "mc_temperature": 35.0})
+    fields, _ = unpack(MomentPacker().pack(shown))
+
+    assert fields["celsius"] == {"mc": 35.0}
+
+
 @pytest.mark.parametrize("measured", [None, exact_wall()])
 def test_bench_message_names_every_part(measured: object) -> None:
     fields, arrays = unpack(bench_message(RIG, measured))  # type: ignore[arg-type]
