@@ -103,6 +103,10 @@ def _read(file: h5py.File) -> Transient:
     histograms = read_hdf5(file, "H")
     if histograms.dtype.kind not in "fiu":
         raise ValueError("H does not hold numbers")
+    # Not a number is neither within the limit nor beyond it.
+    ends = float(histograms.min(initial=0)), float(histograms.max(initial=0))
+    if not all(abs(end) <= float(np.finfo(np.float32).max) for end in ends):
+        raise ValueError("H holds light that is not finite")
     start = _number(file, "t_start") if _is_given(file, "t_start") else 0.0
     return Transient(
         histograms.astype(np.float32, copy=False),

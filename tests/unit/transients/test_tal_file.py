@@ -195,6 +195,8 @@ WRONG: dict[str, Callable[[Path], object]] = {
     "unknown format": replaced("H_format", 9),
     "other axes": replaced("H", np.ones((9, 16, 16, 2), np.float32)),
     "texts": replaced("H", np.array([b"a"], "S1")),
+    "no light at all": replaced("H", np.full((9, 16, 16), np.nan)),
+    "light beyond float32": replaced("H", np.full((9, 16, 16), 1e308)),
     "other grid": replaced("sensor_grid_xyz", np.zeros((3, 3, 3))),
     "points at infinity": replaced("laser_grid_xyz", np.full((16, 16, 3), np.inf)),
     "bins of no width": replaced("delta_t", 0.0),
