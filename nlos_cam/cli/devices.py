@@ -17,7 +17,7 @@ from nlos_cam import camera as cameras
 from nlos_cam import doctor as diagnosis
 from nlos_cam.cli.common import Json, Overwrite, finish, output_path, say, show
 from nlos_cam.errors import NlosCamError
-from nlos_cam.files import atomic_file
+from nlos_cam.files import atomic_file, describe
 
 VISIBLE = {True: "yes", False: "[red]no[/]", None: ""}
 """Cell for a camera that is listed, not listed, and not searched for."""
@@ -198,7 +198,7 @@ def _write(path: Path) -> None:
             part.write_text(diagnosis.rules_text(), encoding="utf-8")
     except OSError as error:
         raise NlosCamError(
-            f"cannot write {path} ({error.strerror}): write it to this folder, then install it"
+            f"cannot write {path} ({describe(error)}): write it to this folder, then install it"
         ) from error
     command = diagnosis.install_command(str(path))
     say(f"Wrote {path}. To install it, run this, then plug the camera in again:\n  {command}")

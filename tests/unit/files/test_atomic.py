@@ -17,6 +17,8 @@ from nlos_cam.files import FileBusyError, atomic_directory, atomic_file, cache_f
         ({"NLOS_CAM_CACHE": "chosen", "XDG_CACHE_HOME": "other"}, "chosen"),
         ({"NLOS_CAM_CACHE": "", "XDG_CACHE_HOME": "other"}, "other/nlos-cam"),
         ({"XDG_CACHE_HOME": "other"}, "other/nlos-cam"),
+        ({"XDG_CACHE_HOME": ""}, ".cache/nlos-cam"),
+        ({"NLOS_CAM_CACHE": ""}, ".cache/nlos-cam"),
         ({}, ".cache/nlos-cam"),
     ],
 )

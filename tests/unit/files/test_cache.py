@@ -5,7 +5,7 @@ from unittest.mock import Mock
 
 import pytest
 
-from nlos_cam.files import cache_folder, load_cached
+from nlos_cam.files import load_cached
 
 
 def upper(content: bytes) -> str:
@@ -48,15 +48,3 @@ def test_unusable_cache_or_entry_is_a_warning(
 
     assert load_cached(tmp_path / "a.npz", upper, lambda: b"new") == "NEW"
     assert "making it again" in caplog.text
-
-
-@pytest.mark.parametrize("empty", ["XDG_CACHE_HOME", "NLOS_CAM_CACHE"])
-def test_empty_variable_is_no_place_for_the_cache(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, empty: str
-) -> None:
-    for name in ("XDG_CACHE_HOME", "NLOS_CAM_CACHE"):
-        monkeypatch.delenv(name, raising=False)
-    monkeypatch.setenv("HOME", str(tmp_path))
-    monkeypatch.setenv(empty, "")
-
-    assert cache_folder() == tmp_path / ".cache" / "nlos-cam"
