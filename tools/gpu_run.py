@@ -190,10 +190,12 @@ def wait_for(folder: Path, objects: int, limit_s: float) -> None:
 
 
 def recipe_with(source: Path, target: Path, **changes: float) -> Path:
-    """Write a copy of a recipe with other numbers."""
+    """Write a copy of a recipe with other numbers. Raises SystemExit for one that it does not have."""
     text = source.read_text(encoding="utf-8")
     for key, value in changes.items():
-        text = re.sub(rf"(?m)^{key} = .*$", f"{key} = {value}", text)
+        text, found = re.subn(rf"(?m)^{key} = .*$", f"{key} = {value}", text)
+        if not found:
+            raise SystemExit(f"{source} has no line `{key} = ...`: add one, its number is replaced")
     target.write_text(text, encoding="utf-8")
     return target
 
@@ -221,6 +223,8 @@ def write_parts(folder: Path, names: Sequence[str], target: Path) -> list[Path]:
             archive.write(folder / name, name)
     content = whole.read_bytes()
     whole.unlink()
+    for old in parts_of(target):  # an earlier run's, which would be joined too
+        old.unlink()
     parts = list[Path]()
     for number, start in enumerate(range(0, len(content), PART_BYTES)):
         parts.append(target.with_suffix(f".{number:02d}"))
@@ -228,14 +232,15 @@ def write_parts(folder: Path, names: Sequence[str], target: Path) -> list[Path]:
     return parts
 
 
+def parts_of(target: Path) -> list[Path]:
+    """Return the parts of a file, or of one of its parts, in order."""
+    return sorted(target.parent.glob(f"{target.stem}.[0-9][0-9]"))
+
+
 def join_parts(first: Path, out: Path) -> None:
     """Put weights in parts together again, into the folder `out`."""
     whole = out.with_suffix(".joining")
-    whole.write_bytes(
-        b"".join(
-            part.read_bytes() for part in sorted(first.parent.glob(f"{first.stem}.[0-9][0-9]"))
-        )
-    )
+    whole.write_bytes(b"".join(part.read_bytes() for part in parts_of(first)))
     with zipfile.ZipFile(whole) as archive:
         archive.extractall(out)
     whole.unlink()

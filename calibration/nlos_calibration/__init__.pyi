@@ -61,6 +61,7 @@ __all__ = [
     "fit_with_tape_distance",
     "footprint",
     "is_gravity",
+    "is_temperature",
     "is_wall_record",
     "lidar_visible_share",
     "load_measured",
@@ -118,7 +119,14 @@ from .range_offset import (
     fit_with_board_distance,
     fit_with_tape_distance,
 )
-from .reference import FULL_SCALE, BareWall, BareWallStatistics, Moments, save_reference
+from .reference import (
+    FULL_SCALE,
+    BareWall,
+    BareWallStatistics,
+    Moments,
+    is_temperature,
+    save_reference,
+)
 from .rig import (
     DeviceConstants,
     Extent,

@@ -17,6 +17,7 @@ from nlos_calibration.flatness import ripples
 from nlos_calibration.geometry import Intrinsics, propagated_std
 from nlos_calibration.noise import SCATTER_PER_MEDIAN, MeanNoise, depth_noise_m, with_mm
 from nlos_calibration.plane import GATE_SIGMAS, PlaneFit, fit_depth, plane_depth_m
+from nlos_calibration.rig import OBJECT_SIDE
 
 WALL_BAND_M = 0.004
 """Distance of a wall point from the plane by errors of the wall's pose and the lidar's ripples,
@@ -403,9 +404,7 @@ def _check_upright(sheet: SheetFit, middle_m: float) -> None:
         )
     if (x_m := sheet.x_m(middle_m)) <= 0.0:
         raise OccluderRefusedError(
-            f"the occluder stands at x = {x_m:.3f} m, on the wrong side of the lidar: the hidden"
-            " object must be at positive x, to the lidar's right; mirror the bench or turn the"
-            " lidar upside down"
+            f"the occluder stands at x = {x_m:.3f} m, on the wrong side of the lidar: {OBJECT_SIDE}"
         )
 
 

@@ -5,7 +5,8 @@ front glass. The tape goes from the point of the glass on the optical axis to th
 wall's normal. The data sheet puts 4.5 mm between the glass and the zero of depth, and its readers
 disagree about the sign: so it is measured.
 
-Two causes look alike where the wall is faced squarely; on an oblique wall the flatter one is right:
+Two causes look alike where the wall is faced squarely, and the origin's is taken; on an oblique
+wall the flatter one is right:
 
 - origin: the beams meet in the zero of depth, which lies offset_m before the glass. The measured
   wall is flat; the pose's origin moves along the optical axis, and the distance by offset_m x
@@ -25,6 +26,7 @@ from typing import Literal
 import numpy as np
 
 from nlos_calibration.errors import CalibrationError, WallRefusedError
+from nlos_calibration.flatness import SURE_SIGMAS
 from nlos_calibration.geometry import Intrinsics, plane_gradients
 from nlos_calibration.noise import depth_noise_m
 from nlos_calibration.wall import WallFit
@@ -83,7 +85,8 @@ def distance_per_offset(fit: WallFit, intrinsics: Intrinsics) -> float:
 def fit_with_tape_distance(
     fit_with: FitWith, tape_m: float, fit_along_rays: FitAlongRays | None = None
 ) -> CorrectedWall:
-    """Find the offset that puts the wall at `tape_m`, with the cause that makes the wall flatter.
+    """Find the offset that puts the wall at `tape_m`, with the cause that makes the wall flatter:
+    the depth where it does so by more than noise, else the origin.
 
     Raises CalibrationError where tape and lidar cannot both be right, and names the offset where
     the depth is that of a bare wall but for it; WallRefusedError where it is of no bare wall.
@@ -114,9 +117,12 @@ def fit_with_tape_distance(
         )
     moved = _with_offset(fit_with(0.0, origin_m), origin_m, axis_share, TAPE_STD_M, "origin")
     corrected = _corrected(fit_with, plain, origin_m, tape_m, TAPE_STD_M)
-    if corrected is not None and corrected.fit.bend_deg < plain.bend_deg:
-        return corrected
-    return moved
+    # Both fits have the same noise, and a wall faced squarely shows no more than that: the halves'
+    # bends then differ by chance, and the depth stays as it was read.
+    if corrected is None:
+        return moved
+    flatter_deg = plain.bend_deg - corrected.fit.bend_deg
+    return corrected if flatter_deg > SURE_SIGMAS * plain.bend_std_deg else moved
 
 
 def fit_with_board_distance(

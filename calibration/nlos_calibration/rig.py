@@ -91,9 +91,16 @@ class Extent(Record):
         )
 
 
+OBJECT_SIDE = (
+    "the hidden object must be at positive x, to the lidar's right: mirror the bench, or turn the"
+    " lidar upside down"
+)
+"""Maps end with the column farthest from the lidar's foot, as the networks learn them."""
+
+
 class ObjectBox(Extent):
-    """Box that holds the hidden object: an extent, and the depths of v = 1 (near) and v = 0.1
-    (far).
+    """Box that holds the hidden object: an extent at positive x, and the depths of v = 1 (near) and
+    v = 0.1 (far).
     """
 
     z_near_m: Length
@@ -103,6 +110,8 @@ class ObjectBox(Extent):
     def _deep(self) -> Self:
         if self.z_near_m >= self.z_far_m:
             raise ValueError("an object box needs z_near_m < z_far_m")
+        if self.x_max_m <= 0:
+            raise ValueError(f"an object box needs x_max_m > 0: {OBJECT_SIDE}")
         return self
 
 

@@ -13,7 +13,15 @@ import numpy as np
 
 from nlos_calibration.arrays import Float64, Mask
 from nlos_calibration.geometry import Intrinsics
-from nlos_calibration.rig import Extent, LidarPose, ObjectBox, Occluder, OccluderRecord, Rig
+from nlos_calibration.rig import (
+    OBJECT_SIDE,
+    Extent,
+    LidarPose,
+    ObjectBox,
+    Occluder,
+    OccluderRecord,
+    Rig,
+)
 from nlos_calibration.wall import FACING_RANGE_DEG, TOLERANCE_DEG, TOLERANCE_M, Verdict, at_least
 
 
@@ -332,7 +340,11 @@ def judge_rig(rig: Rig, view: Footprint, occluder: OccluderRecord | None) -> tup
     if rig.occluder and not occluder:
         name += " (not measured, the paper's is assumed)"
     problems = _too_little_wall(rig, view)
-    if rig.occluder is not None:
+    if rig.occluder is not None and rig.occluder.x_m < 0.0 > rig.lidar.yaw_deg:
+        # The lidar looks that way too: nothing is misplaced, the whole bench is a mirror image.
+        place = f"{name} stands at x = {rig.occluder.x_m:.3f} m, where the lidar looks"
+        problems.append(f"{place}: {OBJECT_SIDE}")
+    elif rig.occluder is not None:
         tilt_deg = occluder.tilt_deg if occluder else None
         problems += _occluder_position(rig.occluder, rig.object_box, tilt_deg or 0.0, name)
     if rig.object_box is not None and _between(rig.occluder, rig.object_box):

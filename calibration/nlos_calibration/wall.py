@@ -280,6 +280,8 @@ class WallFit(WallMeasures):
     bend_m: float
     bend_deg: float
     """Largest difference between planes through half of the view and through the whole."""
+    bend_std_deg: float
+    """Standard uncertainty of that angle by noise alone."""
     verdict: Verdict
     advice: str
     """One sentence: the reason for the verdict, or the remedy."""
@@ -341,6 +343,7 @@ def fit_wall(
         ripple_m=rippled.rms_m,
         bend_m=flat.bend_m,
         bend_deg=flat.bend_deg,
+        bend_std_deg=flat.bend_std_deg,
         verdict=verdict,
         advice=advice,
         warnings=warnings(rippled.rms_m, scale),

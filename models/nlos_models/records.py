@@ -27,6 +27,8 @@ SIMULATION_ONLY = "simulation only: the L515's laser is infrared (860 nm)"
 """Note on all data, weights and results in color."""
 
 RECORD = "checkpoint.json"
+TRAINING_LOG = "log.csv"
+"""A training run's figures, a row per epoch."""
 DIRECT = "direct"
 PAPER = "paper"
 WIDE = "wide"

@@ -9,6 +9,7 @@ from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
+from nlos_models import TRAINING_LOG
 
 from nlos_cam.adapt.plan import Plan
 from nlos_cam.adapt.recordings import Transfer, iou_of
@@ -167,7 +168,7 @@ def write_page(
     those in use now.
     """
     plan = result.plan
-    curves = read_curves(plan, [folder / NETWORK / "log.csv" for folder in result.folders])
+    curves = read_curves(plan, [folder / NETWORK / TRAINING_LOG for folder in result.folders])
     before = iou_of(result.before)
     after = iou_of(result.after)
     headline = f"Silhouette IoU {before:.3f} -> {after:.3f}"

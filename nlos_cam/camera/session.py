@@ -9,7 +9,7 @@ from dataclasses import replace
 from math import inf
 from typing import Any
 
-from nlos_calibration import Intrinsics
+from nlos_calibration import Intrinsics, is_temperature
 from nlos_calibration.arrays import Float32
 
 from nlos_cam.camera import streams
@@ -96,8 +96,10 @@ class SampleQueue:
 
 FrameSize = tuple[int, int]
 """Width and height in pixels."""
-NOT_YET = -9999.0
-"""Reading of a temperature not measured yet: the photodiode's, until 5 s after the start."""
+THERMOMETER = "_temperature"
+"""End of the names of options that read a temperature: the photodiode's is none until 5 s after the
+start.
+"""
 BOUNDARY_WAIT_S = 0.2
 """Time to wait for a whole set before frames are delivered, so that delivery begins between two."""
 
@@ -126,8 +128,8 @@ def _has(profile: Any, size: FrameSize) -> bool:
 
 
 def read_settings(sensor: Any, ending: str = "") -> dict[str, float]:
-    """Return every readable option whose name ends so, by the SDK's name; empty when the sensor is
-    gone.
+    """Return every readable option whose name ends so, by the SDK's name, but for temperatures that
+    are none; empty when the sensor is gone.
     """
     settings: dict[str, float] = {}
     for option in sensor.get_supported_options():
@@ -135,7 +137,11 @@ def read_settings(sensor: Any, ending: str = "") -> dict[str, float]:
             continue
         with suppress(RuntimeError):  # listed, but not readable in this state
             settings[option.name] = float(sensor.get_option(option))
-    return {name: value for name, value in settings.items() if value != NOT_YET}
+    return {
+        name: value
+        for name, value in settings.items()
+        if not name.endswith(THERMOMETER) or is_temperature(value)
+    }
 
 
 class Session:

@@ -13,6 +13,8 @@ __all__ = [
     "SHAPE_OUTLIERS",
     "SHARD",
     "SHARD_PATTERN",
+    "STENCIL",
+    "STEPS",
     "TEST_SEED",
     "TRAINING_OUTLIERS",
     "TRAINING_SEED",
@@ -40,6 +42,7 @@ __all__ = [
     "draw_outlier",
     "ignore",
     "in_batches",
+    "interpolated_peak",
     "label_recordings",
     "list_recordings",
     "locked_difference",
@@ -87,7 +90,14 @@ from .labelled import (
     read_labelled,
     write_shards,
 )
-from .locked import LOCKED, difference_noise, locked_difference
+from .locked import (
+    LOCKED,
+    STENCIL,
+    STEPS,
+    difference_noise,
+    interpolated_peak,
+    locked_difference,
+)
 from .outliers import (
     HELD_OUT_OUTLIERS,
     SHAPE_OUTLIERS,

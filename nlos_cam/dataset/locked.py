@@ -37,6 +37,7 @@ most of the pulse, and changes a difference by 2.5 % at most (14 of the test obj
 STENCIL = 5
 """Bins between the three samples through which a peak is interpolated."""
 STEPS = np.array([-STENCIL, 0, STENCIL])
+"""Bins of those samples, from the strongest one."""
 NOISE_DRAWS = 60
 
 
@@ -83,6 +84,18 @@ def difference_noise(rig: Rig, sensor: SensorModel, radiometry: Radiometry, fram
     return (maps.std(axis=0, ddof=1) * 2.0 / np.sqrt(frames)).astype(np.float32)
 
 
+def interpolated_peak(samples: Float64) -> tuple[Float64, Float64]:
+    """Return the place, in bins from the middle one, and the height of the peak through three
+    samples (..., 3) of a waveform, STENCIL bins apart; no shift where they do not bend down.
+    """
+    # The logarithm of a Gaussian is a parabola: its top from three samples.
+    before, middle, after = np.moveaxis(np.log(np.maximum(samples, 1e-30)), -1, 0)
+    curved = before - 2.0 * middle + after
+    bent = np.where(curved < 0.0, curved, -np.inf)
+    shift = (before - after) / (2.0 * bent)
+    return shift * STENCIL, np.exp(middle - (before - after) ** 2 / (8.0 * bent))
+
+
 class _Receiver:
     """Receiver that interpolates each cell's peak between three samples of the waveform, about the
     bare wall's strongest bin: light of an object moves the peak within it. The renderer reports the
@@ -122,13 +135,8 @@ class _Receiver:
         (n, bins) added to it; NaN depth where nothing returns.
         """
         samples = self._bare if added is None else self._bare + self._samples(added)
-        # The logarithm of a Gaussian is a parabola: its top from three samples.
-        before, middle, after = np.log(np.maximum(samples, 1e-30)).T
-        curved = before - 2.0 * middle + after
-        bent = np.where(curved < 0.0, curved, -np.inf)
-        shift = (before - after) / (2.0 * bent)
-        height = np.exp(middle - (before - after) ** 2 / (8.0 * bent))
-        depth_m = (self._top + 0.5 + shift * STENCIL) * self._depth_of_bin_m
+        shift, height = interpolated_peak(samples)
+        depth_m = (self._top + 0.5 + shift) * self._depth_of_bin_m
         depth_m = np.where(self._returns, depth_m, np.nan)
         return depth_m.reshape(MAP_ROWS, MAP_COLUMNS), height.reshape(MAP_ROWS, MAP_COLUMNS)
 

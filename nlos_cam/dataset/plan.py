@@ -15,8 +15,8 @@ from pydantic import TypeAdapter
 
 from nlos_cam.dataset.rig_range import RigRange
 from nlos_cam.errors import SceneError
-from nlos_cam.objects import CATEGORIES, find_category, object_box
-from nlos_cam.render import JUMP_M, RENDERING_VERSION, Material, Radiometry, SceneFile, SensorModel
+from nlos_cam.objects import CATEGORIES, JUMP_M, find_category, object_box
+from nlos_cam.render import RENDERING_VERSION, Material, Radiometry, SceneFile, SensorModel
 
 OBJECTS_VERSION = 2
 """Raise it when a seed makes another object of the same categories."""

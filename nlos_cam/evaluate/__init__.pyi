@@ -45,6 +45,7 @@ __all__ = [
     "rig_of",
     "seeded_objects",
     "sense",
+    "spearman",
     "truth_of",
     "write_reconstructions",
     "write_renders",
@@ -64,6 +65,7 @@ from .metrics import (
     over_objects,
     per_object,
     plain,
+    spearman,
 )
 from .reconstruct_tradeoff import (
     NETWORKS,

@@ -196,9 +196,11 @@ def draw_categories(path: Path, categories: Mapping[str, Figures], overall: Figu
 def _points(axis: Any, figures: Sequence[Interval]) -> None:
     """Draw estimates and intervals as points and lines: the axis does not begin at 0."""
     for k, figure in enumerate(figures):
-        if figure.value is not None:
+        if figure.value is None:
+            continue
+        axis.plot(figure.value, k, "o", color="tab:blue")
+        if figure.low is not None:
             axis.plot([figure.low, figure.high], [k, k], color="tab:blue", linewidth=2, alpha=0.6)
-            axis.plot(figure.value, k, "o", color="tab:blue")
 
 
 def draw_quality(path: Path, sets: Mapping[str, PredictedFrames]) -> None:
@@ -252,7 +254,8 @@ def _curve(axis: Any, bins: Sequence[Bin]) -> None:
         if error.value is None:
             continue
         axis.plot([one.low, one.high], [error.value] * 2, color="tab:red", linewidth=2, label=label)
-        axis.plot(
-            [(one.low + one.high) / 2] * 2, [error.low, error.high], color="tab:red", linewidth=1
-        )
         label = None
+        if error.low is None:
+            continue
+        middle = (one.low + one.high) / 2
+        axis.plot([middle] * 2, [error.low, error.high], color="tab:red", linewidth=1)

@@ -35,6 +35,7 @@ class Interval:
     value: float | None
     """None if no object has a value (no reconstruction shares a pixel with its truth)."""
     low: float | None
+    """None, like `high`, for fewer than two values: one object shows no spread."""
     high: float | None
 
 
@@ -114,10 +115,14 @@ def advantage(
 
 
 def interval(values: Float64) -> Interval:
-    """Return the mean of values (n,) and its bootstrap 95 % interval; NaN are left out."""
+    """Return the mean of values (n,) and its bootstrap 95 % interval, without ends for one value;
+    NaN are left out.
+    """
     values = values[~np.isnan(values)]
     if not values.size:
         return Interval(None, None, None)
+    if values.size == 1:  # every resample is that value, and would make it look certain
+        return Interval(float(values[0]), None, None)
     means = values[resampled(len(values))].mean(1)
     low, high = np.quantile(means, [0.025, 0.975])
     return Interval(float(values.mean()), float(low), float(high))
@@ -290,12 +295,28 @@ def rank_correlation(measure: Float64, error: Float64) -> Interval:
     None for fewer than three objects, or if either is constant. Resamples keep the ranks of the
     whole set.
     """
-    valid = ~(np.isnan(measure) | np.isnan(error))
-    if valid.sum() < 3 or np.ptp(measure[valid]) == 0 or np.ptp(error[valid]) == 0:
+    ranks = _ranked_pairs(measure, error)
+    if ranks is None:
         return Interval(None, None, None)
-    ranks = np.stack([_ranks(values[valid]) for values in (measure, error)])
     low, high = np.nanquantile(_correlation(ranks[:, resampled(ranks.shape[1])]), [0.025, 0.975])
     return Interval(float(_correlation(ranks[:, None])[0]), float(low), float(high))
+
+
+def spearman(one: Float64, other: Float64) -> float | None:
+    """Return Spearman's correlation of pairs (n,), without an interval; NaN are left out.
+
+    None for fewer than three pairs, or if either is constant.
+    """
+    ranks = _ranked_pairs(one, other)
+    return None if ranks is None else float(_correlation(ranks[:, None])[0])
+
+
+def _ranked_pairs(one: Float64, other: Float64) -> Float64 | None:
+    """Return the ranks (2, m) of the pairs without NaN; None where they have no correlation."""
+    valid = ~(np.isnan(one) | np.isnan(other))
+    if valid.sum() < 3 or np.ptp(one[valid]) == 0 or np.ptp(other[valid]) == 0:
+        return None
+    return np.stack([_ranks(values[valid]) for values in (one, other)])
 
 
 def _ranks(values: Float64) -> Float64:

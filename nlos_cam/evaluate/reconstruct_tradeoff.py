@@ -412,7 +412,8 @@ def _draw_line(
     values = [each.value or 0.0 for each in iou]
     (line,) = axis.plot(times_ms, values, "o-", label=weights)
     for time_ms, row, value, each in zip(times_ms, rows, values, iou, strict=True):
-        ends = [each.low or 0.0, each.high or 0.0]
-        axis.plot([time_ms, time_ms], ends, color=line.get_color(), alpha=0.35)
+        if each.low is not None and each.high is not None:
+            ends = [each.low, each.high]
+            axis.plot([time_ms, time_ms], ends, color=line.get_color(), alpha=0.35)
         words = f"{row.setting.frames} frame{'s' * (row.setting.frames > 1)}"
         axis.annotate(words, (time_ms, value), (4, 4), textcoords="offset points", fontsize=8)

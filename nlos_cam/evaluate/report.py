@@ -504,12 +504,14 @@ def format_interval(
     figure: Mapping[str, float | None] | metrics.Interval, digits: int | None = None
 ) -> str:
     """Format an estimate and its interval, by default with two digits of the half width, "0.696
-    (0.660 to 0.731)".
+    (0.660 to 0.731)"; of one object "0.696 (one object: no interval)".
     """
     parts = asdict(figure) if isinstance(figure, metrics.Interval) else figure
     value, low, high = (parts[name] for name in ("value", "low", "high"))
-    if value is None or low is None or high is None:
+    if value is None:
         return "none"
+    if low is None or high is None:
+        return f"{value:.{3 if digits is None else digits}f} (one object: no interval)"
     if digits is None:
         digits = min(max(1 - floor(log10((high - low) / 2)), 0), 3) if high > low else 3
     return f"{value:.{digits}f} ({low:.{digits}f} to {high:.{digits}f})"

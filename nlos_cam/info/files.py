@@ -17,10 +17,9 @@ from nlos_models.training import load_recipe
 from nlos_cam.camera import camera_to_name
 from nlos_cam.errors import NlosCamError, RecordingError
 from nlos_cam.files import read_arrays, read_bounded, read_toml, with_commit
+from nlos_cam.view import SESSION_MARK
 
 MAX_TEXT_BYTES = 16 << 20
-SESSION_MARK = b"nlos-cam session"
-"""In the head of a saved view."""
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from nlos_models import load_record
+from nlos_models import RECORD, TRAINING_LOG, load_record
 
 from nlos_cam.bench import MANIFEST, is_bench, load_bench
 from nlos_cam.camera import camera_to_name
@@ -136,9 +136,9 @@ def _checksum_problem(folder: Path) -> str:
 
 def describe_run(folder: Path, _verify: bool) -> Description:
     """Describe a training run from its log."""
-    with (folder / "log.csv").open(encoding="utf-8", newline="") as file:
+    with (folder / TRAINING_LOG).open(encoding="utf-8", newline="") as file:
         rows = [*csv.DictReader(file)]
-    finished = (folder / "checkpoint.json").exists()
+    finished = (folder / RECORD).exists()
     facts = {
         "epochs": str(len(rows)),
         "state": "finished" if finished else "not finished: the same command resumes",
@@ -201,13 +201,21 @@ def describe_figures(folder: Path, _verify: bool) -> Description:
         if name in figures
     }
     if iou := figures.get("silhouette_iou"):
-        facts["silhouette IoU"] = (
-            f"{iou['value']:.3f} ({iou['low']:.3f} to {iou['high']:.3f})"
-            if iou["value"]
-            else "none"
-        )
+        facts["silhouette IoU"] = _interval(iou)
     following = _page_in(folder)
     return Description("evaluation", facts, "", "nlos-cam evaluate", "", "JSON", following)
+
+
+def _interval(figure: Mapping[str, float | None]) -> str:
+    """Return an estimate with its interval, which one object does not have."""
+    value = figure["value"]
+    low = figure["low"]
+    high = figure["high"]
+    if value is None:
+        return "none"
+    if low is None or high is None:
+        return f"{value:.3f} (one object: no interval)"
+    return f"{value:.3f} ({low:.3f} to {high:.3f})"
 
 
 def describe_tradeoff(folder: Path, _verify: bool) -> Description:
@@ -263,8 +271,8 @@ FOLDERS: list[tuple[str, str, Callable[[Path, bool], Description | None]]] = [
     (MANIFEST, "bench", describe_bench),
     ("metadata.yaml", "recording", describe_bag),
     ("shard-*.h5", "dataset", describe_dataset),
-    ("log.csv", "training run", describe_run),
-    ("checkpoint.json", "weights", describe_weights),
+    (TRAINING_LOG, "training run", describe_run),
+    (RECORD, "weights", describe_weights),
     ("reconstruction.npz", "replay", describe_replay),
     ("export.json", "export of a recording", describe_export),
     ("figures.json", "evaluation", describe_figures),

@@ -1,6 +1,7 @@
 __all__ = [
     "CATEGORIES",
     "DEPTH_MAP_SUFFIX",
+    "JUMP_M",
     "MAX_UNCERTAINTY_M",
     "MESH_SUFFIXES",
     "OBJECTS_PER_CATEGORY",
@@ -76,5 +77,5 @@ from .placement import (
     random_pose,
 )
 from .polygons import triangulate
-from .surface_mesh import MAX_UNCERTAINTY_M, SurfaceMesh, mesh_from_depth
+from .surface_mesh import JUMP_M, MAX_UNCERTAINTY_M, SurfaceMesh, mesh_from_depth
 from .textures import TEXTURES, Coat, image_from_albedo, paint

@@ -15,8 +15,8 @@ from nlos_cam.files import atomic_file
 from nlos_cam.objects.depth_map import cell_centers_m
 
 JUMP_M = 0.02
-"""Depth difference above which neighbouring cells are separate surfaces, as in the renderer's
-patches.
+"""Depth difference above which neighbouring cells are separate surfaces: neither a triangle of a
+mesh nor a curtain of the renderer's patches (beta, S3) may join them.
 """
 MAX_UNCERTAINTY_M = 0.03
 """Uncertainty drawn brightest, in meshes, view and plots; the object box is 0.28 m deep."""

@@ -19,7 +19,7 @@ cells far. Networks for many rigs are trained on a grid on the wall in place of 
 
 from collections.abc import Iterable
 from dataclasses import replace
-from itertools import islice
+from itertools import islice, product
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -498,9 +498,16 @@ def _cells_wholly_on_wall(rig: Rig) -> Mask:
 
     `bare_bench.cells_on_wall` is another rule: by the cells' middle beams, less a margin of a cell.
     """
-    # A cell is the mean over its beams: one at an edge mixes wall and occluder.
-    on_wall = cast(rig, rig.pinhole.scaled(BEAMS * MAP_COLUMNS, BEAMS * MAP_ROWS)).on_wall
-    return np.all(on_wall.reshape(MAP_ROWS, BEAMS, MAP_COLUMNS, BEAMS), axis=(1, 3))
+    # A cell is the mean over its beams: one at an edge mixes wall and occluder. The beams that meet
+    # the wall lie within its four sides and below the occluder's edge, which are planes through the
+    # lidar: a convex cone, which holds all beams of a cell where it holds those at its corners.
+    fine = rig.pinhole.scaled(BEAMS * MAP_COLUMNS, BEAMS * MAP_ROWS)
+    coarse = rig.pinhole.scaled(MAP_COLUMNS, MAP_ROWS)
+    found = np.ones((MAP_ROWS, MAP_COLUMNS), np.bool_)
+    for right, down in product((0, BEAMS - 1), repeat=2):
+        corner = replace(coarse, ppx=(fine.ppx - right) / BEAMS, ppy=(fine.ppy - down) / BEAMS)
+        found &= cast(rig, corner).on_wall.reshape(found.shape)
+    return found
 
 
 def _neighbors_of(bench: Rig, spot_m: Float64, sees_wall: Mask) -> Neighbors:

@@ -25,6 +25,7 @@ from nlos_cam.errors import NlosCamError, RecordingError
 from nlos_cam.files import TEXT_LIMIT, atomic_directory, read_bounded
 from nlos_cam.recording.bag_reader import BagReader
 from nlos_cam.recording.device_clock import unwrapped_samples
+from nlos_cam.recording.frame_names import FrameNames
 from nlos_cam.recording.sidecar import sidecar_path
 
 if TYPE_CHECKING:
@@ -44,21 +45,6 @@ INTERLEAVED = {"yuyv", "uyvy"}
 """Formats of two bytes a pixel, of which the second belongs to two pixels."""
 
 
-class _FrameNames:
-    """Names of files of single frames, by frame number: a number that comes again, as after a
-    restart of the device, gets a suffix.
-    """
-
-    def __init__(self) -> None:
-        self._repeats: Counter[int] = Counter()
-
-    def stem(self, number: int) -> str:
-        """Return the stem of the next file of a number: 000123, then 000123-2."""
-        self._repeats[number] += 1
-        repeats = self._repeats[number]
-        return f"{number:06d}" if repeats == 1 else f"{number:06d}-{repeats}"
-
-
 class PngSink:
     """Writer of one PNG per frame, named by its number (16 bit depth in raw units), and a table of
     timestamps.
@@ -71,7 +57,7 @@ class PngSink:
         self._table = (folder / f"{stream}.csv").open("w", newline="", encoding="utf-8")
         self._rows = csv.writer(self._table)
         self._rows.writerow(["file", "frame_number", "timestamp_s"])
-        self._names = _FrameNames()
+        self._names = FrameNames()
 
     def add(self, sample: Sample) -> None:
         """Write a frame. Raises NlosCamError for an encoding that PNG does not have."""
@@ -175,7 +161,7 @@ class PointSink:
         self._folder.mkdir()
         self.streams = streams
         self._pairing = FrameSynchronizer((rays.shape[0], rays.shape[1]), streams)
-        self._names = _FrameNames()
+        self._names = FrameNames()
         self._numbers: dict[int, int] = {}
         """Number of the depth frame of each instant that waits for its other frames."""
         self.written = 0

@@ -24,6 +24,8 @@ from nlos_cam.recording.formats import METADATA_FILE
 METADATA = "realsense2_camera_msgs/msg/Metadata"
 METADATA_DEFINITION = "std_msgs/Header header\nstring json_data\n"
 TRANSFORMS = "tf2_msgs/msg/TFMessage"
+SDK_LENSES = {"plumb_bob": "brown_conrady", "equidistant": "kannala_brandt4"}
+"""The SDK's names of distortion models by those of ROS (sensor_msgs), where they differ."""
 COMPUTED = re.compile(r"\bas\s*\(|\bvirtual\b|\bgenerated\b", re.IGNORECASE)
 """Words of a table's definition whose columns are computed: their size is not the file's."""
 

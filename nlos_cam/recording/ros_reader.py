@@ -20,15 +20,19 @@ from nlos_cam.files import describe
 from nlos_cam.recording import bag_messages
 from nlos_cam.recording.bag_messages import CAMERA, HARDWARE_CLOCK, IMAGE, FrameMetadata
 from nlos_cam.recording.bag_reader import BagReader, StreamInfo
-from nlos_cam.recording.ros_messages import TRANSFORMS, Ros1Source, Ros2Source, Source
+from nlos_cam.recording.ros_messages import (
+    SDK_LENSES,
+    TRANSFORMS,
+    Ros1Source,
+    Ros2Source,
+    Source,
+)
 
 IMAGE_TOPIC = re.compile(
     r"(?:/[^/]{1,100}){0,6}?/(depth|infra|infrared|confidence|color)([12]?)/image(_rect)?(_raw)?$"
 )
 ROLES = {"infra": "infrared"}
 """The SDK's names of streams by the driver's, where they differ."""
-LENSES = {"plumb_bob": "brown_conrady"}
-"""The SDK's names of distortion models by those of ROS, where they differ."""
 DEPTH_UNITS_M = {"16UC1": 1e-3, "mono16": 1e-3, "32FC1": 1.0}
 """Depth in metres per count, by encoding (REP 118: millimetres as integers, metres as floats)."""
 PIXELS = {
@@ -131,7 +135,7 @@ class RosReader:
         self._frame_ids[name] = str(image.header.frame_id)
         coefficients = np.asarray(_field(info, "D"), np.float64)
         model = bag_messages.sdk_name(info.distortion_model)
-        self._lenses[name] = LENSES.get(model, model), coefficients
+        self._lenses[name] = SDK_LENSES.get(model, model), coefficients
         frames = self._source.topics[topic][1]
         sdk_encoding = SDK_ENCODINGS[role].get(encoding, encoding)
         self.streams[name] = StreamInfo(

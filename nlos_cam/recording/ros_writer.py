@@ -1,6 +1,7 @@
 """Export of a recording to a bag of ROS 2, with the topics of Intel's driver realsense2_camera."""
 
 import json
+import logging
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -31,7 +32,7 @@ from nlos_cam.recording.bag_messages import CAMERA, IMAGE
 from nlos_cam.recording.bag_reader import BagReader, StreamInfo
 from nlos_cam.recording.device_clock import unwrapped_samples
 from nlos_cam.recording.export import ExportResult
-from nlos_cam.recording.ros_messages import METADATA, TRANSFORMS, ros2_types
+from nlos_cam.recording.ros_messages import METADATA, SDK_LENSES, TRANSFORMS, ros2_types
 
 if TYPE_CHECKING:
     from nlos_cam.recording.ros_reader import RosReader
@@ -45,6 +46,15 @@ forward.
 ENCODINGS = {"y8": "mono8", "raw8": "mono8", "y16": "mono16"}
 """Encodings of the driver by the SDK's format, where they differ from each other."""
 COLORS = {"rgb8", "bgr8", "rgba8", "bgra8"}
+PLUMB_BOB = "plumb_bob"
+ROS_LENSES = {"rational_polynomial": "rational_polynomial"} | {
+    model: name for name, model in SDK_LENSES.items()
+}
+"""ROS's names of distortion models by the SDK's, with the same formulas in both."""
+LIKE_PLUMB_BOB = {"modified_brown_conrady", "inverse_brown_conrady"}
+"""Models of other formulas, which are ROS's where there is no distortion."""
+EQUIDISTANT_COEFFICIENTS = 4
+"""The SDK has a fifth, which it does not use."""
 MAX_COUNT = 65535
 MM_PER_M = 1e3
 FOREVER = QosTime(9223372036, 854775807)
@@ -63,6 +73,7 @@ LATCHED = Qos(
 """Quality of service of static transforms, which `ros2 bag play` offers: tf2 subscribes to
 /tf_static as transient local, and receives nothing from a publisher that is not.
 """
+log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -121,6 +132,23 @@ def export_ros2(
         if not written.total() and not stop.is_set():
             raise RecordingError(f"{bag.path} has no frame to write" + (damage and f" ({damage})"))
     return ExportResult(dict(written), str(out), damage)
+
+
+def ros_lens(model: str, coefficients: Float64) -> tuple[str, Float64]:
+    """Return the distortion model by ROS's name, and its coefficients, of a lens by the SDK's.
+
+    A model that ROS does not have keeps the SDK's name: image_geometry then takes the distortion
+    for unknown, and rectifies nothing, in place of rectifying by another model's formula.
+    """
+    # librealsense's rsutil.h: the modified model scales x and y by the radial polynomial before its
+    # tangential terms, the inverse one leads from distorted to ideal points.
+    if model == "none":
+        return PLUMB_BOB, np.zeros(5)
+    tangential = coefficients[2:4] if model == "modified_brown_conrady" else coefficients
+    if model in LIKE_PLUMB_BOB and not tangential.any():
+        return PLUMB_BOB, coefficients
+    name = ROS_LENSES.get(model, model)
+    return name, coefficients[:EQUIDISTANT_COEFFICIENTS] if name == "equidistant" else coefficients
 
 
 def _is_writable(info: StreamInfo) -> bool:
@@ -215,6 +243,14 @@ class _Topics:
 
     def _camera_info(self, stream: str) -> Any:
         pinhole = self._bag.streams[stream].intrinsics
+        model, coefficients = ros_lens(*self._bag.lens(stream))
+        if model not in {PLUMB_BOB, *ROS_LENSES.values()}:
+            log.warning(
+                "%s: ROS has no distortion model %s: its camera_info names it all the same, and"
+                " ROS's tools do not rectify these images",
+                stream,
+                model,
+            )
         matrix = np.array([[pinhole.fx, 0, pinhole.ppx], [0, pinhole.fy, pinhole.ppy], [0, 0, 1.0]])
         region = self._new(
             "sensor_msgs/msg/RegionOfInterest",
@@ -229,8 +265,8 @@ class _Topics:
             header=self._header(0, ""),
             height=pinhole.height,
             width=pinhole.width,
-            distortion_model="plumb_bob",
-            d=np.asarray(self._bag.lens(stream)[1], np.float64),
+            distortion_model=model,
+            d=np.asarray(coefficients, np.float64),
             k=matrix.reshape(-1),
             r=np.eye(3).reshape(-1),
             p=np.hstack([matrix, np.zeros((3, 1))]).reshape(-1),

@@ -1,7 +1,6 @@
 __all__ = [
     "DEPTH_UNIT_M",
     "EFFECTS",
-    "JUMP_M",
     "QUIET",
     "RENDERING_VERSION",
     "STOPS",
@@ -87,7 +86,6 @@ from .gradients import (
 )
 from .job import TransportJob
 from .material import Material, Surface, phong, retroreflective
-from .patches import JUMP_M
 from .planning import RenderProblem, prepare
 from .renderer import (
     Rendering,

@@ -9,12 +9,7 @@ from nlos_calibration import ObjectBox
 from nlos_calibration.arrays import Float64
 from numpy.typing import NDArray
 
-from nlos_cam.objects import cell_centers_m
-
-JUMP_M = 0.02
-"""Neighbors farther apart in depth than this are separate surfaces, which beta (S3) must not join
-by a curtain.
-"""
+from nlos_cam.objects import JUMP_M, cell_centers_m
 
 
 @dataclass(frozen=True)

@@ -9,9 +9,9 @@ from nlos_calibration.arrays import Float32
 
 from nlos_cam.errors import SceneError
 from nlos_cam.frames import MAP_COLUMNS, MAP_ROWS
-from nlos_cam.objects import object_box
+from nlos_cam.objects import JUMP_M, object_box
 from nlos_cam.render.material import Surface
-from nlos_cam.render.patches import JUMP_M, Patches, make_patches
+from nlos_cam.render.patches import Patches, make_patches
 
 Radiometry = Literal["paper", "lambertian"]
 """"paper" is S1 to S5 to the letter, "lambertian" the rendering equation with every cosine for the

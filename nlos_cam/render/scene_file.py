@@ -37,7 +37,6 @@ from nlos_cam import objects as shapes
 from nlos_cam.errors import SceneError, SceneFileError
 from nlos_cam.files import read_toml
 from nlos_cam.render.material import Material
-from nlos_cam.render.patches import JUMP_M
 from nlos_cam.render.scene import Radiometry, Scene
 from nlos_cam.render.sensor.model import SensorModel
 
@@ -232,7 +231,7 @@ class SceneFile(Record):
     motion: Motion = Motion(poses=1)
     sensor: SensorModel = SensorModel()
     radiometry: Radiometry = "paper"
-    jump_m: float = Field(default=JUMP_M, ge=0, allow_inf_nan=False)
+    jump_m: float = Field(default=shapes.JUMP_M, ge=0, allow_inf_nan=False)
     """Neighbors farther apart in depth than this are separate surfaces."""
     faults: Annotated[tuple[Fault, ...], AfterValidator(one_wrap)] = ()
     """Faults of the simulated camera; they do not affect the rendering."""

@@ -1,7 +1,6 @@
 """Media of a replay: contact sheet of some frames, saved view, still pictures, video."""
 
 import re
-from collections import Counter
 from collections.abc import Generator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -14,13 +13,14 @@ from nlos_cam import view as views
 from nlos_cam.errors import OutputExistsError
 from nlos_cam.objects import object_box
 from nlos_cam.reconstruct import CalibratedRig, FrameResult
-from nlos_cam.replay.object_files import OBJECT_FILE, STEM, ObjectFiles, frame_stem
+from nlos_cam.recording import FRAME_STEM, FrameNames
+from nlos_cam.replay.object_files import OBJECT_FILE, ObjectFiles
 from nlos_cam.report import figure_of
 
 VIEW = "view.html"
 VIDEO = "replay.webm"
 STILL = "still-{}.png"
-STILLS = re.compile(rf"still-{STEM}\.png")
+STILLS = re.compile(rf"still-{FRAME_STEM}\.png")
 OBJECT = "object"
 """Folder of the hidden objects' files."""
 USUAL_PERCENT = 95
@@ -100,11 +100,9 @@ class ReplayMedia:
             yield
         if self._stills:
             moments = [views.Moment.recorded(result) for result in self._stills.results()]
-            drawn = Counter[int]()
+            names = FrameNames()
             for moment in moments:
-                number = moment.result.frame_number
-                drawn[number] += 1
-                path = folder / STILL.format(frame_stem(number, drawn[number]))
+                path = folder / STILL.format(names.stem(moment.result.frame_number))
                 views.Still(moments[0]).save(path, moment)
         self._names = {path.relative_to(folder) for path in _media_in(folder)}
 

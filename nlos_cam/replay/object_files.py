@@ -1,7 +1,6 @@
 """Hidden objects of a replay as files of other programs: a mesh or a point cloud per frame."""
 
 import re
-from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -16,12 +15,11 @@ from nlos_cam.errors import RecordingError
 from nlos_cam.files import atomic_directory, read_arrays
 from nlos_cam.objects import mesh_from_depth
 from nlos_cam.reconstruct import ignore
+from nlos_cam.recording import FRAME_STEM, FrameNames
 
 OBJECT_FORMATS = ("ply", "glb", "obj", "csv", "npz", "points")
 """Suffixes of `SurfaceMesh.save`, and "points" for a .ply without faces."""
-STEM = r"\d{6,}(-\d+)?"
-"""Pattern of `frame_stem`."""
-OBJECT_FILE = re.compile(rf"{STEM}(-points\.ply|\.(ply|glb|obj|csv|npz))")
+OBJECT_FILE = re.compile(rf"{FRAME_STEM}(-points\.ply|\.(ply|glb|obj|csv|npz))")
 """Names that ObjectFiles gives."""
 
 
@@ -41,8 +39,7 @@ class ObjectFiles:
     """Frames with a surface so far."""
     came: int = 0
     """Frames so far."""
-    _repeats: Counter[int] = field(default_factory=Counter[int])
-    """Frames with a surface so far, by number."""
+    _names: FrameNames = field(default_factory=FrameNames)
 
     def add(self, number: int, depth_m: Float32, uncertainty_m: Float32 | None) -> None:
         """Write a frame's depth map (64, 64), if it is due and has a surface."""
@@ -52,8 +49,7 @@ class ObjectFiles:
             return
         mesh = mesh_from_depth(depth_m, self.box, uncertainty_m)
         self.folder.mkdir(exist_ok=True)
-        self._repeats[number] += 1
-        stem = frame_stem(number, self._repeats[number])
+        stem = self._names.stem(number)
         for name in self.formats:
             if name == "points":
                 path = self.folder / f"{stem}-points.ply"
@@ -62,11 +58,6 @@ class ObjectFiles:
                 path = self.folder / f"{stem}.{name}"
                 path.write_bytes(mesh.as_bytes(f".{name}"))
         self.written += 1
-
-
-def frame_stem(number: int, occurrence: int) -> str:
-    """Return the stem of a frame's files: 000123, and 000123-2 for the second of that number."""
-    return f"{number:06d}" if occurrence == 1 else f"{number:06d}-{occurrence}"
 
 
 def export_objects(

@@ -144,13 +144,14 @@ def _reconstruction(results: ReplayResults, bench: CalibratedRig) -> dict[str, s
             f"outline typically {quality['expected_iou']:.0%} right, depth to "
             f"{quality['expected_error_mm']:.0f} mm (medians of the frames with an object)"
         )
-    if scores := [*results.check_scores.values()]:
+    if checks := results.checks:
         empty = results.unexplained_empty
         without = f" ({empty:g} without a surface)" if empty != UNEXPLAINED else ""
+        middle = np.median([each.score for each in checks])
         facts["physics check"] = (
-            f"score {np.median(scores):.2f} (median; 0: the reconstruction explains the"
-            f" maps, 1: no better than an empty bench); {sum(results.unexplained.values())} of"
-            f" {len(scores)} checked frames at {UNEXPLAINED:g} or more{without}"
+            f"score {middle:.2f} (median; 0: the reconstruction explains the"
+            f" maps, 1: no better than an empty bench); {sum(each.unexplained for each in checks)} of"
+            f" {len(checks)} checked frames at {UNEXPLAINED:g} or more{without}"
         )
     if bench.reference:
         facts["difference maps"] = (

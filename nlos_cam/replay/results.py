@@ -2,7 +2,7 @@
 
 from collections import Counter
 from collections.abc import Callable
-from typing import IO, Any
+from typing import IO, Any, NamedTuple
 
 import numpy as np
 from nlos_calibration import Rig
@@ -15,6 +15,7 @@ from nlos_cam.reconstruct import (
     CalibratedRig,
     FrameResult,
     OnWarning,
+    PhysicsCheckResult,
     QualityLog,
     Verdict,
     WarningLog,
@@ -45,6 +46,15 @@ class ArrayStack:
         return np.memmap(self._file, np.float32, "r", shape=(self._count, *self._shape))
 
 
+class CheckedFrame(NamedTuple):
+    """Frame with a physics check."""
+
+    number: int
+    score: float
+    unexplained: bool
+    """True if the score is one from which on the maps are not explained."""
+
+
 class ReplayResults:
     """Collector of the frames' results; `new_file` opens the files of the large arrays.
 
@@ -61,10 +71,9 @@ class ReplayResults:
         self.frames_with_surface = 0
         self.uncertainty_mm: list[float] = []
         """Median over the surface, by frame with a surface and an uncertainty model."""
-        self.check_scores: dict[int, float] = {}
-        """Scores of the physics check by number of the checked frame."""
-        self.unexplained: dict[int, bool] = {}
-        """True where that score is one from which on the maps are not explained."""
+        self.checks: list[CheckedFrame] = []
+        self._newest: PhysicsCheckResult | None = None
+        """Last check; each holds for several frames, whose numbers a restarted device repeats."""
         self.quality = QualityLog()
         self.warnings = WarningLog(on_warning)
         self._verdicts: list[Verdict | None] = []
@@ -81,10 +90,11 @@ class ReplayResults:
         self._verdicts.append(result.verdict)
         self.quality.add(result)
         self.warnings.add(result)
-        if result.check:
+        if result.check and result.check is not self._newest:
+            self._newest = result.check
             limit = UNEXPLAINED if result.check.has_surface else self.unexplained_empty
-            self.check_scores[result.check.frame_number] = result.check.score
-            self.unexplained[result.check.frame_number] = result.check.score >= limit
+            score = result.check.score
+            self.checks.append(CheckedFrame(result.check.frame_number, score, score >= limit))
         quality = result.reconstruction.quality
         self._expected.append((quality.iou[1], quality.error_m) if quality else (np.nan, np.nan))
 
@@ -135,8 +145,8 @@ class ReplayResults:
             "pitch_m": pitch_m,
             "z_near_m": box.z_near_m,
             "z_far_m": box.z_far_m,
-            "check_frame_number": np.array([*self.check_scores], np.int64),
-            "check_score": np.array([*self.check_scores.values()], np.float64),
+            "check_frame_number": np.array([each.number for each in self.checks], np.int64),
+            "check_score": np.array([each.score for each in self.checks], np.float64),
         }
 
     def difference_arrays(self, bench: CalibratedRig) -> dict[str, Any]:

@@ -55,8 +55,11 @@ POLICY = (
 """The browser itself refuses to fetch anything from elsewhere, or to show the view inside another's
 page.
 """
+SANDBOX = f"{POLICY}; sandbox allow-scripts allow-downloads"
+"""Policy for a page that came as a file, from anybody: its scripts run in an origin of their own,
+and so have neither the storage, the stream nor the commands of a live run at the same address.
+"""
 HEADERS = {
-    "Content-Security-Policy": POLICY,
     "Cache-Control": "no-store",
     "X-Content-Type-Options": "nosniff",
     "Cross-Origin-Resource-Policy": "same-origin",
@@ -87,6 +90,8 @@ class Served:
     max_streams: int = MAX_STREAMS
     known: Callable[[str], bool] = field(default=lambda _: False)
     """Check of a Host header."""
+    policy: str = POLICY
+    """Content-Security-Policy of every answer."""
 
 
 class Handler(BaseHTTPRequestHandler):
@@ -251,7 +256,8 @@ class Handler(BaseHTTPRequestHandler):
         others: Mapping[str, str] | None = None,
     ) -> None:
         self.send_response(status)
-        headers = {"Content-Type": kind, **HEADERS, **(others or {})}
+        policy = {"Content-Security-Policy": self.served.policy}
+        headers = {"Content-Type": kind, **policy, **HEADERS, **(others or {})}
         if length is not None:
             headers["Content-Length"] = str(length)
         for name, value in headers.items():

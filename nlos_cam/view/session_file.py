@@ -28,8 +28,6 @@ PICTURE_WIDTH = 160
 QUEUE_MOMENTS = 4
 MAX_BYTES = 512 << 20
 """Largest size: browsers cannot load much more."""
-SESSION_MARK = b"nlos-cam session"
-SESSION_SUFFIX = ".html"
 SCRIPTS = "bench.js", "pictures.js", "inspect.js", "player.js", "controls.js", "page.js"
 """Scripts of the page, in their order."""
 

@@ -3,9 +3,10 @@
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field
-from math import isfinite
 from pathlib import Path
 from typing import Any, Protocol, Self
+
+from nlos_calibration import is_temperature
 
 from nlos_cam.reconstruct import FrameResult
 
@@ -28,8 +29,8 @@ class Moment:
 
     @property
     def known_celsius(self) -> dict[str, float]:
-        """Temperatures that are numbers: a device may answer NaN, which JSON does not have."""
-        return {name: value for name, value in self.celsius.items() if isfinite(value)}
+        """Temperatures, without readings that are none, as a recording may have them."""
+        return {name: value for name, value in self.celsius.items() if is_temperature(value)}
 
     @classmethod
     def recorded(cls, result: FrameResult, celsius: Mapping[str, float] | None = None) -> Self:

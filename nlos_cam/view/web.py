@@ -16,8 +16,9 @@ from nlos_calibration import MeasuredWall, Rig
 from nlos_cam.errors import RecordingError
 from nlos_cam.threads import LatestValue
 from nlos_cam.view.messages import MomentPacker, bench_message, pack
-from nlos_cam.view.server import LOOPBACK, Assets, Send, Served, ViewServer
-from nlos_cam.view.session_file import SESSION_MARK, Chunks, page_html
+from nlos_cam.view.server import LOOPBACK, POLICY, SANDBOX, Assets, Send, Served, ViewServer
+from nlos_cam.view.session_file import Chunks, page_html
+from nlos_cam.view.session_mark import SESSION_MARK
 from nlos_cam.view.viewer import Controls, Moment
 
 PREFERRED_PORT = 9090
@@ -48,6 +49,7 @@ class Website:
     """
 
     mode = "live"
+    policy = POLICY
 
     def __init__(
         self, *, host: str = LOOPBACK, port: int | None = None, controls: Controls | None = None
@@ -61,7 +63,7 @@ class Website:
 
     def __enter__(self) -> Self:
         port = PREFERRED_PORT if self._port is None else self._port
-        served = Served(self._assets(), self._stream, token=self._token)
+        served = Served(self._assets(), self._stream, token=self._token, policy=self.policy)
         command = self._controls
         if command:
             served = replace(served, command=command.run, file=command.file)
@@ -271,28 +273,38 @@ class PlaybackViewer(Website):
 
 SESSION = "session"
 """Mode of the page of a saved session."""
+NO_STORAGE = b"""<script>
+Object.defineProperty(window, "sessionStorage", { value: { getItem: () => null, setItem() {}, removeItem() {} } });
+</script>
+"""
+"""What the page finds in place of its storage, which a sandbox refuses with an error."""
 
 
 class RecordedView(Website):
     """View of a session saved as one HTML file, served while entered. Raises RecordingError for
     another file.
+
+    Its scripts are the file's, and its address may have been a live run's, or become one's: they
+    run in a sandbox.
     """
 
     mode = "recorded"
+    policy = SANDBOX
 
     def __init__(self, path: Path, *, host: str = LOOPBACK, port: int | None = None) -> None:
         super().__init__(host=host, port=port)
         try:
-            self._content = path.read_bytes()
+            content = path.read_bytes()
         except OSError as error:
             raise RecordingError(
                 f"{path} cannot be read ({error.strerror}): name a saved session (.html)"
             ) from error
-        if SESSION_MARK not in self._content[:1000]:
+        if SESSION_MARK not in content[:1000]:
             raise RecordingError(
                 f"{path} is no saved session: make one with `live --save-view` or `replay"
                 " --save-view`"
             )
+        self._content = content.replace(b"<script", NO_STORAGE + b"<script", 1)
 
     def _assets(self) -> Assets:
         return {"/": (HTML, self._content)}

@@ -192,8 +192,22 @@ def test_saved_session_plays_from_the_file_alone(browser: Any, tmp_path: Path) -
     assert saved[0] == "row,column,depth_m,expected_error_m"
     assert len(saved) > 100
     page.close()
+
+
+def test_served_session_knows_nothing_of_live_runs_there(browser: Any, tmp_path: Path) -> None:
+    with SessionFile(tmp_path / "view.html", RIG, keeps_all=True) as session:
+        for number in range(60):
+            session.show(replace(full_moment(number), time_s=0.5 * number))
     with RecordedView(tmp_path / "view.html") as view:
-        Page(browser, view.address or "").drawn().close()
+        page = Page(browser, view.address or "").drawn()
+        play_through(page)
+        with page.page.expect_download():
+            page.page.click("#save")
+        for asked in ("localStorage.length", "document.cookie", "fetch('stream')"):
+            refused = f"(async () => {{ try {{ await {asked}; return ''; }} catch (e) {{ return `${{e}}`; }} }})()"
+            assert page.page.evaluate(refused), asked
+        assert page.errors == []
+        page.close()
 
 
 def test_playback_plays_scrubs_and_changes_speed(browser: Any) -> None:

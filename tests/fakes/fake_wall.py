@@ -41,6 +41,7 @@ FIT = WallFit(
     ripple_m=0.0,
     bend_m=0.0,
     bend_deg=0.0,
+    bend_std_deg=0.001,
     verdict="good",
     advice="fine",
     warnings=(),

@@ -1,7 +1,7 @@
 """Recordings made of others, message by message."""
 
 import struct
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -46,11 +46,22 @@ def turned_infrared(topic: str, time_ns: int, raw: bytes) -> Messages:
     """Give a camera's infrared a pose and a lens of its own, so that none passes by chance."""
     if topic.endswith("/Infrared_0/tf/1"):
         raw = struct.pack("<7d", 0.01, -0.02, 0.03, 0.0, 0.6, 0.0, 0.8)  # the inverse of TURNED
-    if topic.endswith("/Infrared_0/info/camera_info"):
-        none = struct.pack("<I4sI5d", 4, b"None", 5, *[0.0] * 5)
-        assert none in raw
-        raw = raw.replace(none, struct.pack("<I13sI5d", 13, b"Brown Conrady", 5, *LENS))
-    yield time_ns, raw
+    yield from infrared_lens("Brown Conrady", LENS)(topic, time_ns, raw)
+
+
+def infrared_lens(model: str, coefficients: Sequence[float]) -> Edit:
+    """Return the edit that gives a camera's infrared a lens, by the SDK's name of its model."""
+
+    def edit(topic: str, time_ns: int, raw: bytes) -> Messages:
+        if topic.endswith("/Infrared_0/info/camera_info"):
+            none = struct.pack("<I4sI5d", 4, b"None", 5, *[0.0] * 5)
+            assert none in raw
+            name = model.encode()
+            lens = struct.pack(f"<I{len(name)}sI5d", len(name), name, 5, *coefficients)
+            raw = raw.replace(none, lens)
+        yield time_ns, raw
+
+    return edit
 
 
 def number_of(raw: bytes) -> int:

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import pytest
 from backports import zstd
-from rewritten_bags import TURNED, turned_infrared
+from rewritten_bags import LENS, TURNED, infrared_lens, turned_infrared
 from rosbags.rosbag1 import Writer as Ros1Writer
 from rosbags.rosbag2 import Reader, StoragePlugin, Writer, storage_mcap
 from rosbags.typesys import Stores, get_typestore
@@ -98,6 +98,52 @@ def test_bag_of_ros_2_keeps_pinholes_lenses_and_poses(
         assert ours.streams[name].intrinsics == info.intrinsics
         np.testing.assert_allclose(ours.lens(name)[1], bag.lens(name)[1], atol=1e-9)
         np.testing.assert_allclose(ours.pose("depth", name), bag.pose("depth", name), atol=1e-9)
+
+
+STRAIGHT = [0.0] * 5
+RADIAL = [0.15, -0.5, 0.0, 0.0, 0.47]
+
+
+@pytest.mark.parametrize(
+    ("model", "coefficients", "name", "written"),
+    [
+        ("None", STRAIGHT, "plumb_bob", STRAIGHT),
+        ("Brown Conrady", LENS, "plumb_bob", LENS),
+        ("Modified Brown Conrady", RADIAL, "plumb_bob", RADIAL),
+        ("Modified Brown Conrady", LENS, "modified_brown_conrady", LENS),
+        ("Inverse Brown Conrady", STRAIGHT, "plumb_bob", STRAIGHT),
+        ("Inverse Brown Conrady", RADIAL, "inverse_brown_conrady", RADIAL),
+        ("Kannala Brandt4", LENS, "equidistant", LENS[:4]),
+        ("Ftheta", RADIAL, "ftheta", RADIAL),
+    ],
+)
+def test_lens_has_the_name_that_ros_has_for_it(
+    remake: Callable[..., Path],
+    run: Run,
+    caplog: pytest.LogCaptureFixture,
+    model: str,
+    coefficients: list[float],
+    name: str,
+    written: list[float],
+) -> None:
+    run("export", remake(infrared_lens(model, coefficients)), "--ros2", "out")
+    with Reader("out") as reader:
+        wanted = [each for each in reader.connections if each.topic == "/camera/infra/camera_info"]
+        raw = next(reader.messages(wanted))[2]
+    info = ROS2.deserialize_cdr(raw, CAMERA)
+    said = [each for each in caplog.messages if "infrared" in each]
+
+    assert info.distortion_model == name
+    np.testing.assert_allclose(info.d, written, atol=1e-9)
+    assert len(said) == (name not in {"plumb_bob", "equidistant"})
+
+
+def test_fisheye_lens_comes_back_from_ros_by_the_sdks_name(
+    remake: Callable[..., Path], run: Run
+) -> None:
+    run("export", remake(infrared_lens("Kannala Brandt4", LENS)), "--ros2", "out")
+
+    assert open_recording(Path("out")).lens("infrared")[0] == "kannala_brandt4"
 
 
 class Driver:

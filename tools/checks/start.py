@@ -168,8 +168,10 @@ def main() -> int:
         metavar="WORD",
         help="measure only the programs whose name has this word",
     )
-    parser.add_argument("--out", type=Path, default=DOCS / "figures" / "start.json", metavar="FILE")
+    parser.add_argument("--out", type=Path, metavar="FILE", help="default with --only: none")
     asked = parser.parse_args()
+    # Some of the programs alone must not replace the figures of all.
+    out = asked.out or (None if asked.only else DOCS / "figures" / "start.json")
     chosen = {
         name: run for name, run in programs().items() if name in {BARE, NUMPY} or asked.only in name
     }
@@ -185,7 +187,8 @@ def main() -> int:
     load = {"before": load_before, "after": os.getloadavg()[0]}
     rows = {name: times._asdict() for name, times in medians.items()}
     facts = {"machine": machine(), "load": load, "runs": asked.runs, "medians": rows}
-    asked.out.write_text(json.dumps(facts, indent=1) + "\n", encoding="utf-8")
+    if out:
+        out.write_text(json.dumps(facts, indent=1) + "\n", encoding="utf-8")
     print(
         f"{facts['machine']}; load {load['before']:.1f} before, {load['after']:.1f} after;"
         f" {asked.runs} runs\n"

@@ -11,6 +11,7 @@ over 5 s. As root the run may ask for real-time priority; `--user` runs it as an
 import argparse
 import json
 import os
+import platform
 import pwd
 import signal
 import subprocess
@@ -70,7 +71,8 @@ class Trial:
         """Return the trial with the slowest answer to each command, and the number of answers."""
         slowest_s = {name: max(each) for name, each in self.command_s.items()}
         answers = sum(map(len, self.command_s.values()))
-        return {**asdict(self), "command_s": slowest_s, "answers": answers}
+        machine = f"{os.cpu_count()} cores, {platform.machine()}"
+        return {**asdict(self), "machine": machine, "command_s": slowest_s, "answers": answers}
 
     def findings(self) -> list[str]:
         """Return what is out of bounds."""
@@ -187,6 +189,7 @@ def main() -> int:
     trials = json.loads(chosen.out.read_text(encoding="utf-8")) if chosen.out.exists() else {}
     kept = chosen.out.open("w", encoding="utf-8")  # before the user is another
     json.dump(trials, kept)
+    kept.flush()  # the trials of other users stay, whatever ends this one
     os.sched_setaffinity(0, {chosen.processor})
     with tempfile.TemporaryDirectory() as name:
         if chosen.user:

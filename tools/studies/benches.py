@@ -160,12 +160,26 @@ def judged(bench: Bench, minutes: float) -> dict[str, Any]:
     """Return the figures after some minutes, 0 for the shipped weights; they are made once."""
     path = bench.folder.with_name(f"{bench.folder.name}-{minutes:g}.json")
     if not path.exists():
+        _refuse_after_more(bench, minutes)
         weights = None
         if minutes:
             harness.run_command("adapt", bench.folder, "--minutes", minutes)
             weights = load_bench(bench.folder).weights  # None where the shipped ones are better
         path.write_text(json.dumps(judge(bench, weights)), encoding="utf-8")
     return json.loads(path.read_text(encoding="utf-8"))
+
+
+def _refuse_after_more(bench: Bench, minutes: float) -> None:
+    """Raise NlosCamError for fewer minutes than a bench's weights have had: they would be judged as
+    weights of the fewer.
+    """
+    done = bench.folder.parent.glob(f"{bench.folder.name}-*.json")
+    spent = [float(each.stem.removeprefix(f"{bench.folder.name}-")) for each in done]
+    if more := [each for each in spent if each > minutes]:
+        raise NlosCamError(
+            f"{bench.folder} was adapted for {max(more):g} minutes: {minutes:g} come before, in an"
+            " empty WORK"
+        )
 
 
 def described(bench: Bench) -> dict[str, Any]:
@@ -225,7 +239,7 @@ def main() -> None:
     harness.claim(asked.work)
     benches = [draw_bench(number, asked.work) for number in range(asked.benches)]
     rows: list[dict[str, Any]] = [{} for _ in benches]
-    for minutes in (0.0, *asked.minutes):
+    for minutes in sorted({0.0, *asked.minutes}):
         for bench, row in zip(benches, rows, strict=True):
             calibrate(bench)
             figures = judged(bench, minutes)

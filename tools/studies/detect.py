@@ -19,6 +19,7 @@ from harness import DOCS, options
 from nlos_calibration.arrays import Float64
 
 from nlos_cam.cli.common import tracked
+from nlos_cam.dataset import STENCIL, STEPS, interpolated_peak
 from nlos_cam.detect import Plan, Turn, analyze
 from nlos_cam.render import (
     Radiometry,
@@ -43,8 +44,6 @@ RANGE_GAIN_PER_CELSIUS = 1e-5
 INFRARED_GAIN_PER_CELSIUS = -3e-3
 """Assumed: no figures are published."""
 NOISE_DRAWS = 60
-STENCIL = 5
-"""Bins between the samples of the interpolated peak."""
 ALPHA = 0.01
 
 
@@ -100,19 +99,12 @@ def peak_shift_m(bare: Scene, full: Scene) -> Float64:
     """
     waves = [transient(scene).astype(np.float64) for scene in (bare, full)]
     top = np.clip(waves[0].argmax(axis=-1), STENCIL, waves[0].shape[-1] - STENCIL - 1)
-    places: list[Float64] = []
-    for wave in waves:
-        # The logarithm of a Gaussian is a parabola: its top from three samples.
-        steps = (-STENCIL, 0, STENCIL)
-        samples = [np.take_along_axis(wave, (top + k)[..., None], -1)[..., 0] for k in steps]
-        before, middle, after = np.log(np.maximum(samples, 1e-30))
-        curved = before - 2.0 * middle + after
-        flat = curved >= 0.0
-        places.append(np.where(flat, 0.0, (before - after) / np.where(flat, 1.0, 2.0 * curved)))
+    near = top[..., None] + STEPS
+    places = [interpolated_peak(np.take_along_axis(wave, near, -1))[0] for wave in waves]
     # There and back: half of the path; bins of path along the beam, depth along the axis.
     beams = cast(bare.rig, bare.cell_intrinsics, lambertian=bare.radiometry == "lambertian")
     along = beams.cos_axis.reshape(top.shape)
-    shift_m = (places[1] - places[0]) * STENCIL * bare.rig.device.bin_m / 2.0 * along
+    shift_m = (places[1] - places[0]) * bare.rig.device.bin_m / 2.0 * along
     return np.where(beams.direct.reshape(top.shape) > 0, shift_m, 0.0)
 
 

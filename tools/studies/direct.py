@@ -230,6 +230,7 @@ def compare(chosen: Namespace, source: PackedMaps) -> None:
     }
     torch.set_num_threads(1)  # after rendering, whose threads set the number anew
     path = chosen.out / "figures" / "direct_ablations.json"
+    path.parent.mkdir(parents=True, exist_ok=True)
     rows = json.loads(path.read_text(encoding="utf-8")) if path.exists() else []
     jobs = [partial(judged, text, source, sets) for text in chosen.weights]
     jobs += [

@@ -3,8 +3,8 @@
     python tools/studies/gradients.py [cost] [bound] [pose] [--trials 6]
         docs/figures/gradients.json, docs/images/gradients.png
 
-Each part that is named (default: all) replaces its own part of the JSON; the picture belongs to
-`bound`.
+Each part that is named (default: all) replaces its own part of the JSON, with its machine; the
+picture belongs to `bound`.
 """
 
 import json
@@ -193,7 +193,7 @@ def main() -> None:
         table: dict[str, Any] = (
             json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
         )
-        harness.write("gradients", table | {"machine": machine(), name: result})
+        harness.write("gradients", table | {name: result | {"machine": machine()}})
 
 
 if __name__ == "__main__":

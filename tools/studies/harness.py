@@ -8,17 +8,16 @@ docs/, `table` prints Markdown.
 
 import hashlib
 import json
+import sys
 from argparse import ArgumentParser, ArgumentTypeError, RawDescriptionHelpFormatter
 from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict
-from functools import cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
-from nlos_calibration.arrays import Float64
 from nlos_calibration.errors import CalibrationError
 from nlos_models.errors import ModelError
 
@@ -26,12 +25,15 @@ from nlos_cam.cli.common import tracked
 from nlos_cam.cli.main import main as nlos_cam
 from nlos_cam.errors import NlosCamError
 from nlos_cam.evaluate import format_interval
-from nlos_cam.files import CHECKSUMS, cache_folder
+from nlos_cam.files import cache_folder
 
 ROOT = Path(__file__).parents[2]
+sys.path.append(str(ROOT / "tools" / "robustness"))
+from program_state import program_digest  # noqa: E402  a study's own folder is all that Python looks in
+
 DOCS = ROOT / "docs"
 DIGITS = 5
-SOURCES = "nlos_cam", "calibration", "models", "tools/studies"
+STUDIES = "tools/studies"
 CLAIM = "results-of.json"
 """File that says what the results in a folder are of."""
 
@@ -68,11 +70,7 @@ def collect(
     """
     store = cache_folder() / "studies" / f"{name}-{fingerprint(settings, seeds, key)}.jsonl"
     store.parent.mkdir(parents=True, exist_ok=True)
-    done = (
-        [json.loads(line) for line in store.read_text(encoding="utf-8").splitlines()]
-        if store.exists()
-        else []
-    )
+    done = [json.loads(line) for line in whole_lines(store)]
     grid = [(i, seed) for i in range(len(settings)) for seed in range(seeds)]
     with tracked(name) as on_progress, store.open("a", encoding="utf-8") as file:
         for i, seed in grid[len(done) :]:
@@ -86,22 +84,23 @@ def collect(
     return done
 
 
+def whole_lines(path: Path) -> list[str]:
+    """Return the lines of a file of results, none where it is not there. A last line that a kill cut
+    short is taken away, so that the next one does not go on in it.
+    """
+    if not path.exists():
+        return []
+    lines = path.read_text(encoding="utf-8").splitlines(keepends=True)
+    if lines and not lines[-1].endswith("\n"):
+        lines.pop()
+        path.write_text("".join(lines), encoding="utf-8")
+    return lines
+
+
 def fingerprint(settings: Sequence[Any], seeds: int, key: str = "") -> str:
     """Return a checksum of a grid, a key and the program."""
-    grid = repr([program_digest(), list(settings), seeds, key])
+    grid = repr([program_digest(STUDIES), list(settings), seeds, key])
     return hashlib.sha256(grid.encode()).hexdigest()[:16]
-
-
-@cache
-def program_digest() -> str:
-    """Return a checksum of the program, its studies and its weights, by the files' contents."""
-    digest = hashlib.sha256()
-    for folder in SOURCES:
-        for pattern in ("*.py", "*.toml", CHECKSUMS):
-            for path in sorted((ROOT / folder).rglob(pattern)):
-                digest.update(f"{path.relative_to(ROOT)}\n".encode())
-                digest.update(path.read_bytes())
-    return digest.hexdigest()[:16]
 
 
 def claim(work: Path, **of: object) -> None:
@@ -110,7 +109,7 @@ def claim(work: Path, **of: object) -> None:
     """
     work.mkdir(parents=True, exist_ok=True)
     mark = work / CLAIM
-    own = {"program": program_digest()} | {name: str(value) for name, value in of.items()}
+    own = {"program": program_digest(STUDIES)} | {name: str(value) for name, value in of.items()}
     if not mark.exists():
         mark.write_text(json.dumps(own, indent=1) + "\n", encoding="utf-8")
         return
@@ -135,13 +134,6 @@ def wilson(count: int, of: int) -> dict[str, Any]:
         "low": max(0.0, middle - half),
         "high": min(1.0, middle + half),
     }
-
-
-def rank_correlation(one: Float64, other: Float64) -> float:
-    """Return Spearman's rank correlation."""
-    # a rank is a value's place in the order: the inverse of the permutation that sorts
-    ranks = [np.argsort(np.argsort(values)) for values in (one, other)]
-    return float(np.corrcoef(ranks)[0, 1])
 
 
 def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
@@ -197,6 +189,18 @@ def by_name(weights: Sequence[tuple[str, Path]]) -> dict[str, Path]:
     if twice := sorted({name for name in names if names.count(name) > 1}):
         raise SystemExit(f"two weights are called {twice[0]!r}: give them names with NAME=DIR")
     return dict(weights)
+
+
+def weights_key(folders: Mapping[str, Path]) -> str:
+    """Return a checksum of weights by their names, which records bear, and by their contents."""
+    digest = hashlib.sha256()
+    for name, folder in folders.items():
+        digest.update(f"{name}\n".encode())
+        for path in sorted(folder.iterdir()):
+            if path.is_file():
+                digest.update(f"{path.name}\n".encode())
+                digest.update(path.read_bytes())
+    return digest.hexdigest()
 
 
 @contextmanager

@@ -91,7 +91,7 @@ def main() -> None:
     parser.add_argument("--seconds", type=int, nargs="+", default=SECONDS)
     parser.add_argument("--out", type=Path, help="folder of the results (default: docs)")
     asked = parser.parse_args()
-    asked.runs.mkdir(parents=True, exist_ok=True)
+    harness.claim(asked.runs, minutes=asked.minutes)
 
     rows: list[dict[str, Any]] = []
     for material in MATERIALS:

@@ -684,8 +684,7 @@ def measured(
 ) -> list[dict[str, float]]:
     """Return the figures of all objects; those that WORK has are not made again."""
     path = work / f"{name.replace(' ', '-')}.jsonl"
-    lines = path.read_text(encoding="utf-8").splitlines() if path.exists() else []
-    found = [json.loads(line) for line in lines][: len(subjects)]
+    found = [json.loads(line) for line in harness.whole_lines(path)][: len(subjects)]
     with tracked(name) as on_progress, path.open("a", encoding="utf-8") as file:
         for subject in subjects[len(found) :]:
             found.append(dict(make(subject)))
@@ -772,7 +771,7 @@ def main() -> None:
             row[f"{group}, gain"] = plain(advantage(mine, its))
     facts = {
         "machine": f"{os.cpu_count()} cores, {platform.machine()}",
-        "objects": asked.objects,
+        "objects": min(asked.objects, len(benchmark_objects(box))),
         "frames": FRAMES,
         "rows": rows,
     }

@@ -110,9 +110,10 @@ def measure(rig: Rig, networks: Mapping[str, Reconstructor]) -> dict[str, Any]:
     for name, network in networks.items():
         taken = network_input(maps, None, repeat(rig), network.record)
         figures = plain(judge(reconstruct_all(network, taken), truth, box))
+        rmse_mm = figures["foreground_rmse_mm"]["value"]  # None where no pixel is shared
         found[name] = {
             "silhouette_iou": round(figures["silhouette_iou"]["value"], 4),
-            "foreground_rmse_mm": round(figures["foreground_rmse_mm"]["value"], 2),
+            "foreground_rmse_mm": None if rmse_mm is None else round(rmse_mm, 2),
             "service": weights_serve(rig, network.record).service,
         }
     return {
@@ -140,7 +141,7 @@ def main() -> None:
             "serving",
             draws,
             lambda draw, _: measure(draw.rig(), networks),
-            key=repr(sorted((name, network.record.figures) for name, network in networks.items())),
+            key=harness.weights_key(folders),
         )
     found = summary(rows)
     harness.write("serving", {"summary": found, "rigs": rows}, asked.out)

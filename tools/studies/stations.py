@@ -342,6 +342,12 @@ def main() -> None:
             place: opened.enter_context(open_packed_maps([folder], asked.work / f"packed-{place}"))
             for place, folder in folders.items()
         }
+        for place, source in sources.items():
+            if len(source) != asked.objects:  # an earlier call's, which the figures would be of
+                raise SceneError(
+                    f"{folders[place]} holds {len(source)} objects, not {asked.objects}: ask for"
+                    " as many, or name an empty WORK"
+                )
         for seed in range(asked.seeds):
             for name in asked.sets:
                 stations = name.split("+")

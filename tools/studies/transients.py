@@ -109,7 +109,7 @@ def beside_mitransient(python: str, folder: Path) -> dict[str, Any]:
     """
     rig = RIG.model_copy(update={"occluder": None})
     capture = Capture("single")
-    rows: dict[str, Any] = {}
+    rows: dict[str, Any] = {"machine": machine()}
     for name in OBJECTS:
         depth_m = load_object(name, BOX).depth_m
         scene = renderer.Scene(rig, depth_m, radiometry="lambertian")
@@ -188,7 +188,8 @@ def main() -> None:
         found, figure = captures(options.tal_python, Path(folder))
     save(figure)
     facts = {"machine": machine(), "load_average_1_min": os.getloadavg()[0], "objects": found}
-    old = json.loads((harness.DOCS / "figures/transients.json").read_text(encoding="utf-8"))
+    path = harness.DOCS / "figures" / "transients.json"
+    old = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
     facts["beside_mitransient"] = old.get("beside_mitransient")
     if options.mitransient_python:
         with TemporaryDirectory() as folder:

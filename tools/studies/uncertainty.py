@@ -43,7 +43,7 @@ from nlos_cam.dataset import (
     samples_on_disk,
 )
 from nlos_cam.errors import SceneError
-from nlos_cam.evaluate import echoes_of, rig_of, sense, truth_of
+from nlos_cam.evaluate import echoes_of, rig_of, sense, spearman, truth_of
 from nlos_cam.files import cache_folder
 from nlos_cam.frames import LidarMaps
 from nlos_cam.objects import benchmark_objects, depth_from_image, object_box
@@ -161,8 +161,8 @@ def of_objects(answers: Sequence[Answer], truth: NDArray[np.floating], rig: Rig)
         ),
         "expected_mm": 1e3 * expected.mean(),
         "observed_mm": 1e3 * observed.mean(),
-        "rank_correlation_of_pixels": harness.rank_correlation(expected, observed),
-        "rank_correlation_of_objects": harness.rank_correlation(*np.array(both).T),
+        "rank_correlation_of_pixels": spearman(expected, observed),
+        "rank_correlation_of_objects": spearman(*np.array(both).T),
         "reliability": reliability(expected, observed),
         "coverage": coverage(expected, observed),
         "surface": [

@@ -21,7 +21,6 @@ is 1 mm and 0.2 degrees from its record, in a random direction.
 """
 
 import argparse
-import hashlib
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, astuple, dataclass, replace
 from itertools import repeat
@@ -355,13 +354,8 @@ def folders_of(asked: argparse.Namespace) -> dict[str, Path | None]:
 
 def key_of(asked: argparse.Namespace) -> str:
     """Return a checksum of the asked weights, by which finished parts are known again."""
-    files = [
-        file
-        for folder in folders_of(asked).values()
-        for file in sorted(weights_folder(folder).iterdir())
-    ]
-    content = b"".join(file.read_bytes() for file in files if file.is_file())
-    return hashlib.sha256(content).hexdigest()
+    named = {name: weights_folder(folder) for name, folder in folders_of(asked).items()}
+    return harness.weights_key(named)
 
 
 def rigs(asked: argparse.Namespace) -> None:
@@ -389,10 +383,8 @@ def rigs(asked: argparse.Namespace) -> None:
         for name, figures in one["weights"].items():
             iou = figures["silhouette_iou"]["value"]
             rmse_mm = figures["foreground_rmse_mm"]["value"]
-            print(
-                f"    {name}: IoU {iou:.3f}, RMSE {rmse_mm:.0f} mm, flagged"
-                f" {figures.get('outside')}"
-            )
+            rmse = "none" if rmse_mm is None else f"{rmse_mm:.0f} mm"
+            print(f"    {name}: IoU {iou:.3f}, RMSE {rmse}, flagged {figures.get('outside')}")
 
 
 def shown(subjects: Sequence[Subject], bench: Rig) -> tuple[Float32, list[LidarMaps]]:

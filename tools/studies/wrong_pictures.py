@@ -20,6 +20,7 @@ from nlos_calibration import Rig, load_rig
 from nlos_calibration.arrays import Float32
 
 from nlos_cam.camera import World
+from nlos_cam.cli.common import tracked
 from nlos_cam.dataset import TEST_SEED, DatasetPlan
 from nlos_cam.evaluate import Subject, echoes_of, interval, truth_of
 from nlos_cam.frames import Frame
@@ -216,10 +217,11 @@ def measure(group: str, subjects: Sequence[Subject], rig: Rig) -> list[Outcome]:
     uncertainty_model = load_uncertainty()
     bench = CalibratedRig(rig)
     outcomes: list[Outcome] = []
-    with harness.progress() as bar:
+    with tracked(group) as on_progress:
         echoes: list[MultiBounce] = echoes_of(subjects, rig, lambda _done, _total: None)
         world = World(SceneFile(name=group, rig=rig, sensor=SensorModel()), echoes, [None])
-        for index, subject in bar.track(list(enumerate(subjects)), description=group):
+        for index, subject in enumerate(subjects):
+            on_progress(index, len(subjects))
             other = (index + len(subjects) // 2 + 1) % len(subjects)
             own = frames_of(world, index, FRAMES, len(subjects))
             others = frames_of(world, other, FRAMES, len(subjects))
@@ -332,7 +334,7 @@ def main() -> None:
     ]
     facts = report(outcomes)
     print(markdown(facts))
-    if not arguments.objects:
+    if arguments.objects is None:
         harness.write("wrong_pictures", facts)
 
 

@@ -16,11 +16,11 @@ import torch
 
 from nlos_cam.files import TENSOR_LIMIT, TEXT_LIMIT, atomic_file, read_bounded
 from nlos_models.errors import CheckpointError, RecipeError, TrainingError
+from nlos_models.records import TRAINING_LOG
 
 LAST = "last.ckpt"
 PREVIOUS = "previous.ckpt"
 BEST = "best.ckpt"
-LOG = "log.csv"
 FINISHED = "finished.json"
 """Origin and figures of a run that has ended; its states are gone."""
 DIGEST = hashlib.sha256().digest_size
@@ -49,7 +49,7 @@ def write_log(folder: Path, rows: list[Scores]) -> None:
     writer = csv.DictWriter(text, list(rows[0]))
     writer.writeheader()
     writer.writerows(rows)
-    _write(folder / LOG, text.getvalue().encode())
+    _write(folder / TRAINING_LOG, text.getvalue().encode())
 
 
 def has_state(folder: Path) -> bool:

@@ -243,6 +243,12 @@ MATRIX_END = "0.0,\n        0.0,\n        0.0,\n        "
             "z_far_m = 0.1",
             r"box: .*z_near_m < z_far_m \(got .*, z_far_m = 0.1\)",
         ),
+        (
+            load_rig,
+            "x_min_m = 0.325\nx_max_m = 0.575",
+            "x_min_m = -0.575\nx_max_m = -0.325",
+            r"object_box: .*mirror the bench.* \(got x_max_m = -0.325\)",
+        ),
         (load_rig, 'name = "paper-rig"', 'name = "paper-rig"\nroof = 1', r"roof: .*\(got "),
         (
             load_wall,

@@ -122,6 +122,13 @@ def test_judge_rig_advises_on_a_misplaced_sheet(
     assert move in problem
 
 
+def test_judge_rig_says_that_a_bench_is_a_mirror_image() -> None:
+    (problem,) = problems(rig(-0.2, yaw_deg=-45.0))
+
+    assert "x = -0.200 m" in problem
+    assert "mirror the bench" in problem
+
+
 @pytest.mark.parametrize("tilt_deg", [-1.5, 1.5])
 def test_slight_tilt_is_no_problem(tilt_deg: float) -> None:
     assert problems(rig(), tilt_deg=tilt_deg) == ()

@@ -43,8 +43,9 @@ def test_finish_of_a_live_device_counts_no_half_set() -> None:
     assert inbox.incomplete == 0
 
 
-def test_read_settings_omits_unreadable_and_unmeasured_options() -> None:
-    sensor = FakeSensor(FakeLidar(apd_temperature=-9999.0, ldd_temperature=40.0), 0)
+@pytest.mark.parametrize("none", [-9999.0, float("nan"), float("inf")])
+def test_read_settings_omits_unreadable_and_unmeasured_options(none: float) -> None:
+    sensor = FakeSensor(FakeLidar(apd_temperature=none, ldd_temperature=40.0), 0)
     listed = [
         SimpleNamespace(name=name)
         for name in ("not_while_idle", "apd_temperature", "ldd_temperature")

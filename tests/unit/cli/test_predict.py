@@ -169,3 +169,32 @@ def test_predict_refuses_what_is_no_rig_in_one_line(
     assert main(["predict", wrong, "--quick"]) in {1, 2, 4}
 
     assert len(capsys.readouterr().err.strip().splitlines()) == 1
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["predict", "mirrored.toml", "--quick"],
+        ["render", "cup", "--rig", "mirrored.toml"],
+        ["evaluate", "--rig", "mirrored.toml", "--out", "figures"],
+    ],
+    ids=lambda words: words[0],
+)
+def test_mirrored_bench_is_refused_by_every_command(
+    words: list[str],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    box = "[object_box]\nx_min_m = -0.575\nx_max_m = -0.325\n"
+    turned = "[lidar]\nyaw_deg = -45.0\n\n[occluder]\nx_m = -0.2\n"
+    Path("mirrored.toml").write_text(f'base = "paper-rig"\n\n{turned}\n{box}', encoding="utf-8")
+
+    assert main([*words, "--json"]) == 4
+
+    out, err = capsys.readouterr()
+    message = json.loads(out.splitlines()[-1])["error"]["message"]
+    assert "mirror the bench" in message
+    assert "\n" not in message
+    assert "Traceback" not in err

@@ -16,6 +16,7 @@ from nlos_cam.evaluate.metrics import (
     interval,
     meets,
     rank_correlation,
+    spearman,
     surface_cm2,
 )
 from nlos_cam.evaluate.recognition import recognise, recognised
@@ -80,12 +81,14 @@ def test_interval_lies_about_the_mean_and_repeats() -> None:
 @pytest.mark.parametrize(
     ("values", "expected"), [([np.nan] * 2, None), ([0.5], 0.5), ([np.nan, 2], 2)]
 )
-def test_interval_leaves_out_objects_without_a_value(
+def test_interval_of_fewer_than_two_values_has_no_ends(
     values: list[float], expected: float | None
 ) -> None:
     found = interval(np.array(values))
 
-    assert found.value == found.low == found.high == expected
+    assert found.value == expected
+    assert found.low is None
+    assert found.high is None
 
 
 def test_interval_shrinks_with_root_of_object_count() -> None:
@@ -237,6 +240,11 @@ def test_rank_correlation_is_of_order_alone(
     one: np.ndarray, other: np.ndarray, expected: float
 ) -> None:
     assert rank_correlation(one, other).value == pytest.approx(expected)
+
+
+def test_spearman_is_the_rank_correlation_also_of_ties() -> None:
+    assert spearman(COARSE, LIKE) == rank_correlation(COARSE, LIKE).value
+    assert spearman(COARSE, COARSE[::-1] * 0) is None
 
 
 def test_rank_correlation_is_equal_in_any_order_of_objects() -> None:

@@ -294,6 +294,16 @@ def test_object_without_value_has_an_empty_field(tmp_path: Path) -> None:
     assert format_interval(figures["foreground_rmse_mm"]) == "none"
 
 
+def test_report_of_one_object_has_no_interval(tmp_path: Path) -> None:
+    one = _judgement(1)
+    figures = _figures(one)
+
+    write_report(tmp_path / "out", one, figures)
+
+    assert figures["silhouette_iou"]["low"] is None
+    assert "(one object: no interval)" in (tmp_path / "out" / "report.md").read_text()
+
+
 @pytest.mark.parametrize(
     ("values", "text"),
     [
@@ -301,9 +311,10 @@ def test_object_without_value_has_an_empty_field(tmp_path: Path) -> None:
         ((21.61, 19.3, 24.2), "21.6 (19.3 to 24.2)"),
         ((116.4, 96.0, 137.0), "116 (96 to 137)"),
         ((0.0, 0.0, 0.0), "0.000 (0.000 to 0.000)"),
+        ((0.5, None, None), "0.500 (one object: no interval)"),
     ],
 )
 def test_interval_has_two_digits_of_its_half_width(
-    values: tuple[float, float, float], text: str
+    values: tuple[float, float | None, float | None], text: str
 ) -> None:
     assert format_interval(Interval(*values)) == text

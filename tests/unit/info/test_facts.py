@@ -157,6 +157,7 @@ def test_run_has_the_last_figures_of_its_log(tmp_path: Path) -> None:
     ("iou", "text"),
     [
         ({"value": 0.5, "low": 0.4, "high": 0.6}, "0.500 (0.400 to 0.600)"),
+        ({"value": 0.5, "low": None, "high": None}, "0.500 (one object: no interval)"),
         ({"value": None, "low": None, "high": None}, "none"),
     ],
 )

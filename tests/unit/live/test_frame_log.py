@@ -53,10 +53,11 @@ def test_log_line_holds_times_verdict_and_warmest_reading(tmp_path: Path, suffix
     assert other["verdict"] in {None, ""}
 
 
-def test_log_leaves_out_a_temperature_that_is_none(tmp_path: Path) -> None:
+@pytest.mark.parametrize("none", [float("nan"), -9999.0])
+def test_log_leaves_out_a_temperature_that_is_none(tmp_path: Path, none: float) -> None:
     path = tmp_path / "log.jsonl"
     with FrameLog(path) as log:
-        log.add(replace(moment(0), celsius={"ldd_temperature": float("nan")}))
+        log.add(replace(moment(0), celsius={"ldd_temperature": none}))
 
     (line,) = lines_of(path)
 

@@ -17,7 +17,8 @@ from nlos_cam.evaluate import per_object
 from nlos_cam.frames import LidarMaps
 from nlos_cam.objects import benchmark_objects, image_from_depth, object_box
 from nlos_cam.reconstruct import Arrival, CalibratedRig, MapAlignment, OwnMaps, alignment
-from nlos_cam.render import QUIET, Scene, Sensor, SensorModel, render
+from nlos_cam.reconstruct.alignment import BEAMS, _cells_wholly_on_wall
+from nlos_cam.render import QUIET, Scene, Sensor, SensorModel, cast, render
 
 RIG = load_rig("paper-rig")
 THINGS = benchmark_objects(object_box(RIG))[1::9]
@@ -65,6 +66,18 @@ def maps_of(
         None if seed is None and not model.wall_texture else np.random.default_rng(seed or 0)
     )
     return Sensor(rig, model).maps(render(Scene(rig, depth_m), "draft").multi, generator)
+
+
+@pytest.mark.parametrize("rig", BENCHES.values(), ids=BENCHES)
+def test_cell_is_wholly_on_the_wall_where_all_its_beams_are(rig: Rig) -> None:
+    """The rule looks at the beams at a cell's corners alone."""
+    fine = rig.pinhole.scaled(BEAMS * 80, BEAMS * 64)
+    beams = cast(rig, fine).on_wall.reshape(64, BEAMS, 80, BEAMS)
+
+    found = _cells_wholly_on_wall(rig)
+
+    assert 0 < found.sum() < found.size
+    np.testing.assert_array_equal(found, beams.all(axis=(1, 3)))
 
 
 @pytest.mark.parametrize("rig", list(BENCHES.values())[1:], ids=list(BENCHES)[1:])

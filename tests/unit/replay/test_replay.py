@@ -152,6 +152,20 @@ def test_report_counts_checks_by_the_limit_that_applied(tmp_path: Path) -> None:
     assert found in text_of(tmp_path / "out")
 
 
+def test_checks_of_frames_with_one_number_are_all_counted() -> None:
+    """A device that starts again repeats its numbers; one check holds for several frames."""
+    with ExitStack() as files:
+        results = ReplayResults(lambda: files.enter_context(TemporaryFile()), ignore)
+        for _ in range(2):
+            first = full_moment(0).result
+            results.add(first)
+            results.add(replace(full_moment(1).result, check=first.check))
+        arrays = results.hidden_arrays(RIG)
+
+    assert arrays["check_frame_number"].tolist() == [0, 0]
+    assert arrays["check_score"].shape == (2,)
+
+
 @pytest.mark.parametrize(("green", "state"), [(0, "doubtful"), (4, "doubtful"), (6, "good")])
 def test_report_is_green_where_most_frames_are_on_the_page(
     tmp_path: Path, green: int, state: str

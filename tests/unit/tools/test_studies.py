@@ -3,6 +3,7 @@ they are known.
 """
 
 import json
+import re
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,6 +20,7 @@ from small_frames import sheet_network
 from small_maps import untrained_weights, use_small_networks
 
 from nlos_cam.dataset import read_labelled
+from nlos_cam.errors import NlosCamError
 from nlos_cam.evaluate import TARGETS, seeded_objects
 from nlos_cam.objects import benchmark_objects, object_box
 from nlos_cam.recording import load_sidecar
@@ -53,6 +55,59 @@ def run(tool: Tool, harness: ModuleType, monkeypatch: Patch) -> Read:
         return json.loads((harness.DOCS / "figures" / f"{result}.json").read_text(encoding="utf-8"))
 
     return call
+
+
+def test_studies_and_attacks_know_one_state_of_the_program(harness: ModuleType, tool: Tool) -> None:
+    state = tool("program_state")
+
+    assert harness.program_digest is state.program_digest
+    assert state.program_digest() != state.program_digest("tools/studies")
+    assert {"*.toml", "SHA256SUMS"} < set(state.PATTERNS)
+
+
+def test_line_that_a_kill_cut_short_is_made_again(harness: ModuleType, tmp_path: Path) -> None:
+    path = tmp_path / "results.jsonl"
+    path.write_text('{"a": 1}\n{"a": 2}\n{"a"', encoding="utf-8")
+
+    assert [json.loads(line)["a"] for line in harness.whole_lines(path)] == [1, 2]
+    with path.open("a", encoding="utf-8") as file:
+        file.write('{"a": 3}\n')
+    assert [json.loads(line)["a"] for line in harness.whole_lines(path)] == [1, 2, 3]
+    assert harness.whole_lines(tmp_path / "none.jsonl") == []
+
+
+def test_studies_ask_the_harness_for_what_it_has(harness: ModuleType) -> None:
+    folder = Path(str(harness.__file__)).parent
+    asked = {
+        name
+        for path in folder.glob("*.py")
+        for name in re.findall(r"\bharness\.(\w+)", path.read_text(encoding="utf-8"))
+    }
+
+    assert len(asked) > 10
+    assert [name for name in sorted(asked) if not hasattr(harness, name)] == []
+
+
+def test_key_of_weights_is_of_their_names_and_contents(harness: ModuleType, tmp_path: Path) -> None:
+    for name in ("one", "same", "other"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "a").write_text("other" if name == "other" else "one")
+    key = harness.weights_key({"x": tmp_path / "one"})
+
+    assert key == harness.weights_key({"x": tmp_path / "same"})
+    assert key != harness.weights_key({"y": tmp_path / "one"})
+    assert key != harness.weights_key({"x": tmp_path / "other"})
+
+
+def test_bench_is_not_judged_as_adapted_for_fewer_minutes(tool: Tool, tmp_path: Path) -> None:
+    benches = tool("benches")
+    bench = benches.draw_bench(0, tmp_path)
+    (tmp_path / "bench-1-30.json").write_text("{}", encoding="utf-8")
+    (tmp_path / "bench-10-60.json").write_text("{}", encoding="utf-8")
+
+    assert benches.judged(bench, 30.0) == {}
+    with pytest.raises(NlosCamError, match="adapted for 30 minutes: 10 come before"):
+        benches.judged(bench, 10.0)
 
 
 def test_interrupted_collection_resumes_with_the_same_records(harness: ModuleType) -> None:
@@ -355,6 +410,7 @@ def test_parts_are_small_and_join_to_the_same_files(
     }
     for name, content in contents.items():
         (folder / name).write_bytes(content)
+    (tmp_path / "direct.07").write_bytes(b"of a longer run before")
     parts = gpu.write_parts(folder, list(contents), tmp_path / "direct.zip")
 
     assert len(parts) == 4
@@ -384,6 +440,9 @@ def test_epochs_go_into_the_recipe(tool: Tool, tmp_path: Path) -> None:
     made = gpu.recipe_with(recipe, tmp_path / "b.toml", epochs=70)
 
     assert made.read_text(encoding="utf-8") == "objects = 5\nepochs = 70\n"
+    recipe.write_text("objects = 5\n", encoding="utf-8")
+    with pytest.raises(SystemExit, match="no line `epochs"):
+        gpu.recipe_with(recipe, tmp_path / "b.toml", epochs=70)
 
 
 @pytest.mark.slow

@@ -178,6 +178,19 @@ def test_page_of_another_run_is_sent_to_the_session(saved: Path) -> None:
     assert (hello["kind"], hello["mode"]) == ("hello", "session")
 
 
+def test_session_is_served_in_an_origin_of_its_own(saved: Path) -> None:
+    with RecordedView(saved) as viewer, closing(ask(viewer.address or "", "/")) as answer:
+        policy = answer.headers["Content-Security-Policy"]
+        page = answer.read()
+    with WebViewer(RIG) as live, closing(ask(live.address or "", "/")) as answer:
+        live_policy = answer.headers["Content-Security-Policy"]
+
+    assert "sandbox allow-scripts" in policy
+    assert "allow-same-origin" not in policy
+    assert "sandbox" not in live_policy
+    assert len(messages_of(page)) == len(messages_of(saved.read_bytes()))
+
+
 @pytest.mark.parametrize(
     ("content", "advice"),
     [(None, "cannot be read"), (b"something else", "--save-view")],
@@ -397,8 +410,9 @@ def test_moment_without_surface_sends_uncertainty_in_valid_json() -> None:
     assert not arrays["lidar"].any()
 
 
-def test_moment_message_leaves_out_a_temperature_that_is_none() -> None:
-    shown = replace(full_moment(0), celsius={"ldd_temperature": np.nan, "mc_temperature": 35.0})
+@pytest.mark.parametrize("none", [np.nan, np.inf, -9999.0])
+def test_moment_message_leaves_out_a_temperature_that_is_none(none: float) -> None:
+    shown = replace(full_moment(0), celsius={"ldd_temperature": none, "mc_temperature": 35.0})
     fields, _ = unpack(MomentPacker().pack(shown))
 
     assert fields["celsius"] == {"mc": 35.0}
