@@ -23,6 +23,8 @@ PLAN = "plan.json"
 BATCH = 256
 NETWORK_SHARE = 0.7
 """Share of the minutes for the network itself; uncertainty, quality and figures get the rest."""
+HELD_OUT_OBJECTS = 400
+"""Objects by which an epoch is chosen, and of which as many at most calibrate the uncertainty."""
 FIRST_OBJECTS = 1000
 """Objects that are there before training begins."""
 RENDERED_AFTER = 0.8
@@ -79,7 +81,7 @@ class Stage(Record):
             task="direct",
             start="weights",
             objects=self.steps * BATCH,
-            held_out=400,
+            held_out=HELD_OUT_OBJECTS,
             epochs=self.epochs,
             batch=BATCH,
             learning_rate=1e-3,
@@ -178,7 +180,7 @@ class Plan(Record):
             for name in ("outliers", "empties", "objects")
         }
         counts["objects"] = max(counts["objects"], 2 * whole.batch)
-        held_out = min(whole.held_out, 400)
+        held_out = min(whole.held_out, HELD_OUT_OBJECTS)
         return whole.model_copy(update={**counts, "held_out": held_out})
 
     def save(self, folder: Path) -> None:

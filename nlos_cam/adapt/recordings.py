@@ -5,7 +5,7 @@ know it again. Some decide which epoch is kept, others alone whether the result 
 """
 
 import hashlib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -15,6 +15,7 @@ from nlos_models import training
 
 from nlos_cam import dataset as data
 from nlos_cam.errors import RecordingError, SceneError
+from nlos_cam.files import read_toml
 from nlos_cam.reconstruct import differences_of
 from nlos_cam.recording import load_sidecar, sidecar_path
 
@@ -43,17 +44,8 @@ class Recordings:
     """Recordings of each object, in the order of their labels."""
     open_bench: data.OpenBench
     """Opens the bench for a recording's camera."""
-
-    @property
-    def digest(self) -> str:
-        """Hexadecimal digits that change with the recordings and what is said of their objects."""
-        digest = hashlib.sha256()
-        for path in sorted(self.folder.iterdir()):
-            if path.suffix in TRUTHS:
-                with path.open("rb") as file:
-                    content = hashlib.file_digest(file, "sha256").hexdigest()
-                digest.update(f"{path.name} {content}\n".encode())
-        return digest.hexdigest()[:DIGITS]
+    digest: str
+    """Hexadecimal digits that change with the recordings and what is said of their objects."""
 
     def part(self, part: Part) -> list[Path]:
         """Return the recordings of a part; no object is in two."""
@@ -114,8 +106,12 @@ def find_recordings(
     """Return the labelled recordings of a folder that were made on a rig; None where there are
     none, or of too few objects, with a message.
     """
+    if not folder.is_dir():
+        return None
+    # Before they are listed: the work on recordings that are added meanwhile has another digest.
+    digest = _digest_of(folder)
     by_label: dict[str, list[Path]] = {}
-    for path in sorted(folder.glob("*.bag")) if folder.is_dir() else []:
+    for path in sorted(folder.glob("*.bag")):
         try:
             sidecar = load_sidecar(sidecar_path(path))
         except RecordingError as error:
@@ -138,7 +134,31 @@ def find_recordings(
         )
     if len(by_label) < MIN_OBJECTS:
         return None
-    return Recordings(folder, dict(sorted(by_label.items())), open_bench)
+    return Recordings(folder, dict(sorted(by_label.items())), open_bench, digest)
+
+
+def _digest_of(folder: Path) -> str:
+    """Return `Recordings.digest` of the files in a folder as they are now."""
+    digest = hashlib.sha256()
+    here = [path for path in sorted(folder.iterdir()) if path.suffix in TRUTHS]
+    for path in (*here, *_meshes_elsewhere(here)):
+        with path.open("rb") as file:
+            content = hashlib.file_digest(file, "sha256").hexdigest()
+        digest.update(f"{path.name} {content}\n".encode())
+    return digest.hexdigest()[:DIGITS]
+
+
+def _meshes_elsewhere(files: Sequence[Path]) -> Iterator[Path]:
+    """Yield the meshes in other folders that truth files name."""
+    for path in files:
+        if not path.name.endswith(data.TRUTH_SUFFIX):
+            continue
+        try:
+            mesh = (path.parent / str(read_toml(path).get("file", ""))).resolve()
+        except (OSError, ValueError):  # an error when the recording is read
+            continue
+        if mesh.is_file() and mesh.parent != path.parent.resolve():
+            yield mesh
 
 
 def _is_as_before(recorded: Rig, rig: Rig) -> bool:

@@ -3,15 +3,15 @@ minutes would bring.
 """
 
 import csv
+import os
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 from nlos_models import TRAINING_LOG
 
-from nlos_cam.adapt.plan import Plan
+from nlos_cam.adapt.plan import HELD_OUT_OBJECTS, Plan
 from nlos_cam.adapt.recordings import Transfer, iou_of
 from nlos_cam.adapt.run import AFTER, NETWORK, REPORT, AdaptResult
 from nlos_cam.bench import ForecastRecord
@@ -27,12 +27,14 @@ from nlos_cam.report import (
     Table,
     figure_of,
     png,
-    saved_picture,
     write_document,
 )
 
 MIN_EPOCHS = 8
 """A slope over fewer epochs is that of the learning rate, not of the minutes."""
+MIN_GROWTH = 1.25
+"""Samples of two stages' ends, one over the other, from which on their difference says more than
+chance does."""
 LATE_SHARE = 0.5
 """The gain of further work is read off the second half of a run."""
 
@@ -68,14 +70,19 @@ def gain_by_doubling(curves: Sequence[Curve]) -> float | None:
     """Return by how much the held-out IoU rises if the samples are doubled; None from too few
     points.
 
-    Between stages it is what a stage brought; within one, the slope against the logarithm of the
-    samples, which also holds what the falling rate brings: an upper bound.
+    Between stages whose samples differ by MIN_GROWTH it is what the later one brought; within the
+    first one, the slope against the logarithm of the samples, which also holds what the falling rate
+    brings: an upper bound.
     """
     ends = [(curve.samples[-1], curve.iou[-1]) for curve in curves if curve.samples]
-    if len(ends) > 1:
-        (fewer, worse), (more, better) = list(pairwise(ends))[-1]
+    if not ends:
+        return None
+    more, better = ends[-1]
+    earlier = [end for end in ends if end[0] * MIN_GROWTH <= more]
+    if earlier:
+        fewer, worse = earlier[-1]
         return (better - worse) / np.log2(more / fewer)
-    if not ends or len(curves[0].iou) < MIN_EPOCHS:
+    if len(curves[0].iou) < MIN_EPOCHS:
         return None
     late = int(LATE_SHARE * len(curves[0].iou))
     slope, _ = np.polyfit(np.log2(curves[0].samples[late:]), curves[0].iou[late:], 1)
@@ -98,8 +105,8 @@ def outlook(
         return "Too few epochs to say what more minutes would bring."
     minutes = f"{2 * plan.minutes:.0f} minutes in all"
     if gain < 0.005:
-        return f"More minutes bring little: {gain:+.3f} of IoU at {minutes}, by the last epochs."
-    return f"{minutes} would bring about {gain:+.3f} of IoU, by the last epochs."
+        return f"More minutes bring little: {gain:+.3f} of IoU at {minutes}, by the learning curve."
+    return f"{minutes} would bring about {gain:+.3f} of IoU, by the learning curve."
 
 
 def draw_curves(curves: Sequence[Curve]) -> bytes:
@@ -123,16 +130,22 @@ def transfer_words(found: Transfer) -> str:
     """Return what recordings of known objects brought, in words."""
     before = iou_of(found.before)
     after = iou_of(found.after)
-    outcome = "kept" if found.is_better else "no better, so not kept"
+    outcome = "better" if found.is_better else "no better, so not taken"
     if found.is_nearer and not found.is_better:
-        outcome = f"but {found.simulated_loss:.2f} worse on simulated objects, so not kept"
+        outcome = f"but {found.simulated_loss:.2f} worse on simulated objects, so not taken"
     return (
-        f"fitted to {found.recordings} recordings: silhouette IoU {before:.3f} -> {after:.3f} on"
-        f" {len(found.parts['judged'])} objects held out, {outcome}"
+        f"fitted to recordings of {len(found.parts['adaptation'])} objects: silhouette IoU"
+        f" {before:.3f} -> {after:.3f} on {len(found.parts['judged'])} objects held out, {outcome}"
     )
 
 
-def _transfer_parts(found: Transfer, rows: Rows) -> list[Section | Picture]:
+def _sheet(title: str, caption: str, folder: Path, page: Path) -> Picture:
+    """Return the pictures of objects in an evaluation's folder, for a page elsewhere."""
+    path = folder / "sheet.png"
+    return Picture(title, caption, path.read_bytes(), os.path.relpath(path, page.parent))
+
+
+def _transfer_parts(found: Transfer, rows: Rows, page: Path) -> list[Section | Picture]:
     words = transfer_words(found)
     objects = {
         "trained on": ", ".join(found.parts["adaptation"]),
@@ -144,10 +157,8 @@ def _transfer_parts(found: Transfer, rows: Rows) -> list[Section | Picture]:
         "Recordings of known objects",
         [Banner("good" if found.is_better else "doubtful", words, ""), table, Facts(objects)],
     )
-    sheet = saved_picture(
-        "Objects held out, after the fit", "One frame each.", found.folder / AFTER / "sheet.png"
-    )
-    return [section, sheet]
+    title = "Objects held out, after the fit"
+    return [section, _sheet(title, "One frame each.", found.folder / AFTER, page)]
 
 
 @dataclass(frozen=True)
@@ -161,6 +172,45 @@ class Tables:
     """None where there is no forecast."""
 
 
+def _heading(plan: Plan) -> tuple[str, str]:
+    """Return title and subtitle of the page."""
+    locked = plan.locked
+    if locked is None:
+        return (
+            "Weights for this bench",
+            "54 test objects, rendered on this bench with the sensor's noise. Simulated light.",
+        )
+    subtitle = (
+        f"54 test objects ({locked.material.kind}), {locked.radiometry} radiometry, pulse of"
+        f" {plan.sensor.pulse_ns:g} ns; object in less object out over {locked.frames} frames"
+        f" ({locked.frames / FRAMES_PER_S:.0f} s). Simulated light."
+    )
+    return "What locked differences show on this bench", subtitle
+
+
+def _facts(plan: Plan, curves: Sequence[Curve], expected: ForecastRecord | None) -> Facts:
+    """Return the numbers of a plan, and those of a forecast."""
+    spread = plan.spread
+    pace = plan.pace
+    facts = {
+        "objects rendered for this bench": f"{plan.stages[-1].objects}",
+        "samples trained on": f"{curves[-1].samples[-1]}",
+        "expected by the forecast": f"{expected.expected_iou:.2f}" if expected else "",
+        "objects that change no cell: nothing there": (
+            f"{expected.hidden_share:.0%}" if expected and expected.hidden_share else ""
+        ),
+        "minutes, as planned": f"{plan.minutes:.0f}",
+        "this machine": (
+            f"{pace.objects_per_s:.0f} objects and {pace.samples_per_s:.0f} samples a second"
+        ),
+        "bench may be off its record by": (
+            f"{1e3 * spread.place_m:.1f} mm, {spread.angle_deg:.2f} degrees,"
+            f" {spread.gain_share:.0%} of the gain"
+        ),
+    }
+    return Facts({name: value for name, value in facts.items() if value})
+
+
 def write_page(
     result: AdaptResult, tables: Tables, commands: Sequence[str], page: Path, *, kept: bool
 ) -> None:
@@ -172,42 +222,14 @@ def write_page(
     before = iou_of(result.before)
     after = iou_of(result.after)
     headline = f"Silhouette IoU {before:.3f} -> {after:.3f}"
-    spread = plan.spread
     expected = tables.expected
-    facts = {
-        "objects rendered for this bench": f"{plan.stages[-1].objects}",
-        "samples trained on": f"{curves[-1].samples[-1]}",
-        "expected by the forecast": f"{expected.expected_iou:.2f}" if expected else "",
-        "objects that change no cell: nothing there": (
-            f"{expected.hidden_share:.0%}" if expected and expected.hidden_share else ""
-        ),
-        "minutes, as planned": f"{plan.minutes:.0f}",
-        "this machine": (
-            f"{plan.pace.objects_per_s:.0f} objects and {plan.pace.samples_per_s:.0f} samples a"
-            " second"
-        ),
-        "bench may be off its record by": (
-            f"{1e3 * spread.place_m:.1f} mm, {spread.angle_deg:.2f} degrees,"
-            f" {spread.gain_share:.0%} of the gain"
-        ),
-    }
     if not (kept or plan.locked):
         headline += "; the weights in use stay"
         if result.shipped_are_better:
             headline += f" (the shipped ones have {result.shipped_iou or 0:.2f})"
     advice = outlook(plan, curves, after, expected.expected_iou if expected else None)
-    title = "Weights for this bench"
-    subtitle = "54 test objects, rendered on this bench with the sensor's noise. Simulated light."
-    if locked := plan.locked:
-        title = "What locked differences show on this bench"
-        subtitle = (
-            f"54 test objects ({locked.material.kind}), {locked.radiometry} radiometry, pulse of"
-            f" {plan.sensor.pulse_ns:g} ns; object in less object out over {locked.frames} frames"
-            f" ({locked.frames / FRAMES_PER_S:.0f} s). Simulated light."
-        )
     document = Document(
-        title,
-        subtitle,
+        *_heading(plan),
         [
             Section(
                 "",
@@ -224,20 +246,21 @@ def write_page(
                         ),
                         tables.test_objects,
                     ),
-                    Facts({name: value for name, value in facts.items() if value}),
+                    _facts(plan, curves, expected),
                 ],
             ),
             Picture(
                 "Learning curve",
-                "On 400 objects that no training saw.",
+                f"On {HELD_OUT_OBJECTS} objects that no training saw; by them the epoch was chosen.",
                 draw_curves(curves),
             ),
-            saved_picture(
+            _sheet(
                 "Truth, reconstruction and difference",
                 "The 54 test objects.",
-                result.weights.parent / REPORT / "sheet.png",
+                result.weights.parent / REPORT,
+                page,
             ),
-            *(_transfer_parts(result.transfer, tables.recordings) if result.transfer else []),
+            *(_transfer_parts(result.transfer, tables.recordings, page) if result.transfer else []),
             Section("Next commands", [Commands(commands)]),
         ],
     )

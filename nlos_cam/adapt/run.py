@@ -8,12 +8,13 @@ import json
 import os
 import shutil
 import time
-from collections.abc import Callable, Generator
+from collections.abc import Callable, Generator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing, contextmanager
 from dataclasses import dataclass, field, replace
 from hashlib import sha256
 from itertools import islice
+from math import ceil
 from pathlib import Path
 from threading import Event, Thread
 from typing import Any, Literal
@@ -28,6 +29,7 @@ from nlos_cam.adapt.inputs import TrainingInputs
 from nlos_cam.adapt.plan import (
     BATCH,
     FIRST_OBJECTS,
+    HELD_OUT_OBJECTS,
     PLAN,
     Locked,
     Pace,
@@ -38,6 +40,7 @@ from nlos_cam.adapt.plan import (
 from nlos_cam.adapt.recordings import (
     MAX_SIMULATED_LOSS,
     RECORDINGS,
+    Part,
     Recordings,
     Transfer,
     fit_to_recordings,
@@ -77,7 +80,6 @@ PARTS = "parts"
 STAGE = "stage-{}"
 REPORT = "report"
 FIGURES = "figures.json"
-HELD_OUT_OBJECTS = 400
 EARLIER_QUALITY = "quality"
 """Folder of the quality model's objects in nlos-cam 0.2.0, where they were on the rig itself."""
 QUALITY_SEED = 40_000_000
@@ -90,9 +92,12 @@ QUALITY_PER_MINUTE = 60
 SHARE_GENERIC = 0.5
 POLL_S = 0.2
 PACE_OBJECTS = 200
+PACE_OBJECTS_EACH = 50
+"""Objects that the pace is measured on: at least these, and these for each process that renders.
+Many processes bring their first pieces at the same moment, whatever these took."""
 PACE_STEPS = 6
-MIN_NOTES = 4
-"""Fewest calls of `on_progress` that a pace is measured by."""
+NOTES_EACH = 3
+"""Fewest calls of `on_progress` for each process that a pace is measured by."""
 RECIPE = "doubt"
 
 Measure = Callable[[Path | None, Path, Path | None], None]
@@ -135,6 +140,11 @@ class Adaptation:
         if self.locked:  # differences in the bench's own cells, which the wall grid has not
             return weights_for(self.rig, models.RIG_WEIGHTS)
         return self.began_from or weights_for(self.rig)
+
+    @property
+    def renderers(self) -> int:
+        """Number of processes that render, as far as a farm knows."""
+        return getattr(self.farm, "workers", 1) if self.farm else self.workers
 
     @property
     def threads(self) -> int:
@@ -216,13 +226,10 @@ def adapt(
         job = replace(job, spread=plan.spread, sensor=plan.sensor, seed=plan.seed)
         folders = [job.folder / _stage_name(number) for number in range(len(plan.stages))]
         before = {} if job.locked else _figures(measure, job.start_folder, job.folder / BEFORE)
-        for number, stage in enumerate(plan.stages):
-            on_message(
-                f"stage {number + 1} of {len(plan.stages)}: {stage.objects} objects,"
-                f" {stage.samples} samples"
-            )
-            if not _is_whole(folders[number] / NETWORK, models.NETWORK_ONNX):
-                _train_network(job, plan, number, tracked, watch)
+        if job.recordings and not job.locked:
+            # Now, since a recording without a truth is an error, before minutes of training.
+            _parts_of(job.recordings, folders[-1], tracked)
+        _train_stages(job, plan, folders, tracked, watch, on_message)
         if job.locked:
             was_there = (folders[-1] / REPORT / FIGURES).exists()
             after = _figures(measure, folders[-1] / NETWORK, folders[-1] / REPORT)
@@ -417,18 +424,20 @@ def _measure_pace(job: Adaptation, on_progress: Callable[[int, int], None]) -> P
     stop = Event()
     done_at: list[tuple[int, float]] = []
 
-    def note(done: int, _total: int) -> None:
+    def note(done: int, total: int) -> None:
         if stop.is_set():
             raise KeyboardInterrupt
         done_at.append((done, time.perf_counter()))
-        on_progress(min(done - data.SHARD, PACE_OBJECTS), PACE_OBJECTS)
+        on_progress(done - data.SHARD, total - data.SHARD)
 
     def render() -> None:
-        # those that were there when a measurement was killed say nothing about the pace
+        # Objects that were there when a measurement was killed say nothing about the pace. A
+        # cluster knows its processes once it has rendered.
         count = data.SHARD
-        while len(done_at) < MIN_NOTES:
+        while len(done_at) <= NOTES_EACH * job.renderers:
             done_at.clear()
-            count += PACE_OBJECTS
+            objects = max(PACE_OBJECTS, PACE_OBJECTS_EACH * job.renderers)
+            count += data.SHARD * ceil(objects / data.SHARD)
             data.build_dataset(
                 plan, count, folder, workers=job.workers, on_progress=note, farm=job.farm
             )
@@ -446,9 +455,10 @@ def _measure_pace(job: Adaptation, on_progress: Callable[[int, int], None]) -> P
         seconds = time.perf_counter() - start_s
         rendering.result()
 
-    # Workers take seconds to start, once for all objects: the pace counts from the first objects
-    # on. The first note says how many were there before.
-    (first, first_s), (last, last_s) = done_at[1], done_at[-1]
+    # Workers take seconds to start, once for all objects: the pace counts from the first piece of
+    # each on. The first note says how many objects were there before.
+    first, first_s = done_at[job.renderers]
+    last, last_s = done_at[-1]
     return Pace(
         objects_per_s=(last - first) / (last_s - first_s), samples_per_s=steps * BATCH / seconds
     )
@@ -456,10 +466,9 @@ def _measure_pace(job: Adaptation, on_progress: Callable[[int, int], None]) -> P
 
 def _probe_step(job: Adaptation) -> Callable[[], None]:
     """Return a training step on maps of noise, which leaves the start weights as they are."""
-    network, _ = models.load_network(job.start_folder)
-    if not isinstance(network, models.DirectNetwork):
-        raise SceneError("the start weights are no direct network: choose others with --weights")
-    fabric = training.open_fabric(_probe_recipe(), accelerator=job.accelerator)
+    recipe = _probe_recipe()
+    network, _ = _start(recipe, job.start_folder)
+    fabric = training.open_fabric(recipe, accelerator=job.accelerator)
     network = network.to(fabric.device).train()
     optimizer = torch.optim.AdamW(network.parameters(), 1e-12)
     normal = torch.randn(BATCH, 2, 64, 80, device=fabric.device)
@@ -474,6 +483,18 @@ def _probe_step(job: Adaptation) -> Callable[[], None]:
         float(loss.detach())  # waits for a GPU, which would count steps that it has not done
 
     return step
+
+
+def _start(
+    recipe: training.DirectRecipe, folder: Path
+) -> tuple[models.DirectNetwork, list[training.Recipe]]:
+    """Return the direct network in a folder, and the runs that made it. Raises TrainingError for
+    weights that the recipe does not go on from.
+    """
+    network, runs = training.direct_start(recipe, folder)
+    if network is None:
+        raise SceneError("the recipe of an adaptation starts from scratch")
+    return network, runs
 
 
 def _probe_recipe() -> training.DirectRecipe:
@@ -493,8 +514,8 @@ def _transfer(
     found = job.recordings
     if found is None:
         return None
-    folder = stage / f"{RECORDINGS}-{found.digest}"
-    parts = write_parts(found, folder / PARTS, tracked)
+    folder = _transfer_folder(found, stage)
+    parts = _parts_of(found, stage, tracked)
     network = folder / NETWORK
     if not _is_whole(network, models.NETWORK_ONNX):
         fit_to_recordings(
@@ -515,6 +536,16 @@ def _transfer(
     before = _figures(measure, stage / NETWORK, stage / SIMULATED)
     after = _figures(measure, network, folder / SIMULATED)
     return replace(transfer, simulated_loss=iou_of(before) - iou_of(after))
+
+
+def _transfer_folder(found: Recordings, stage: Path) -> Path:
+    """Return the folder of a transfer to recordings, in that of its stage."""
+    return stage / f"{RECORDINGS}-{found.digest}"
+
+
+def _parts_of(found: Recordings, stage: Path, tracked: data.Tracked) -> dict[Part, Path]:
+    """Return the datasets of recordings, which are written into their transfer's folder once."""
+    return write_parts(found, _transfer_folder(found, stage) / PARTS, tracked)
 
 
 class _Rendering:
@@ -553,10 +584,15 @@ class _Rendering:
         folder = self._job.folder / OBJECTS
         seeds = range(self._job.seed, self._job.seed + objects, data.SHARD)
         missing = [data.shard_path(folder, seed) for seed in seeds]
-        while missing := [path for path in missing if not path.exists()]:
+        while True:
+            # asked first: what a thread that has ended made is there by then
+            is_rendering = self._thread.is_alive()
+            missing = [path for path in missing if not path.exists()]
+            if not missing:
+                return
             if stop():
                 raise KeyboardInterrupt
-            if not self._thread.is_alive():
+            if not is_rendering:
                 raise self._error or SceneError(f"{missing[0]} was not rendered: try again")
             time.sleep(POLL_S)
 
@@ -582,6 +618,26 @@ class _Watched:
             yield watched
 
 
+def _train_stages(
+    job: Adaptation,
+    plan: Plan,
+    folders: Sequence[Path],
+    tracked: data.Tracked,
+    watch: training.Watch | None,
+    on_message: Callable[[str], None],
+) -> None:
+    """Train the networks of a plan's stages that are not whole yet, each in its folder."""
+    for number, stage in enumerate(plan.stages):
+        on_message(
+            f"stage {number + 1} of {len(plan.stages)}: {stage.objects} objects,"
+            f" {stage.samples} samples"
+        )
+        if not _is_whole(folders[number] / NETWORK, models.NETWORK_ONNX):
+            _train_network(job, plan, number, tracked, watch)
+        # Gigabytes, which are made again from the objects if needed.
+        shutil.rmtree(folders[number] / PACKED, ignore_errors=True)
+
+
 def _train_network(
     job: Adaptation,
     plan: Plan,
@@ -590,13 +646,13 @@ def _train_network(
     watch: training.Watch | None,
 ) -> None:
     """Train a stage's network on from the stage before, while its objects are rendered."""
+    # A cluster's driver changes the current folder while it connects, in the rendering's thread.
+    job = replace(job, folder=job.folder.absolute())
     stage = plan.stages[number]
     before = job.folder / _stage_name(number - 1) / NETWORK if number else job.start_folder
     recipe = stage.recipe()
     out = job.folder / _stage_name(number) / NETWORK
-    start, runs = training.direct_start(recipe, before)
-    if start is None:
-        raise SceneError("the start weights are no direct network: choose others")
+    start, runs = _start(recipe, before)
     if job.locked:
         inputs = TrainingInputs.of_locked(job.rig, job.sensor, job.locked)
     else:
@@ -643,7 +699,6 @@ def _train_network(
             if inputs.noise:
                 maps = inputs.noise.added_to(maps)
             training.run_direct(fabric, run, start, source, maps)
-    shutil.rmtree(out.parent / PACKED, ignore_errors=True)  # made again from the objects if needed
 
 
 def _first_objects(job: Adaptation, stage: Stage, rendering: _Rendering) -> list[training.MapSet]:

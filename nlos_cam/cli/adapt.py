@@ -31,6 +31,7 @@ if TYPE_CHECKING:
 PAGE = "adapt.html"
 LOCKED_WORK = "locked"
 MAX_MINUTES = 6000
+MAX_FRAMES = 10**8
 WORK = "adapt"
 WEIGHTS = "weights"
 
@@ -82,6 +83,7 @@ def adapt(
         typer.Option(
             "--frames",
             min=4,
+            max=MAX_FRAMES,
             help="Study: read locked differences (object in less object out) of this many frames.",
         ),
     ] = None,
@@ -123,7 +125,7 @@ def adapt(
         work,
         weights,
         sensor,
-        farm=rendering_farm(ray, backend),
+        farm=rendering_farm(ray, backend, workers),
         accelerator=accelerator,
         locked=locked,
         recordings=_recordings(own) if own and not locked else None,

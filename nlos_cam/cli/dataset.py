@@ -129,7 +129,7 @@ AccuracyName = Annotated[
     typer.Option("--accuracy", help="Accuracy of the renderer."),
 ]
 Workers = Annotated[
-    int,
+    int | None,
     typer.Option(
         "--workers", min=1, show_default="as many as cores", help="Processes on this machine."
     ),
@@ -195,7 +195,7 @@ def build(
     objects_per_rig: ObjectsPerRig = 1,
     accuracy: AccuracyName = "standard",
     expected_maps: Expected = False,
-    workers: Workers = os.cpu_count() or 1,
+    workers: Workers = None,
     ray: RayAddress = None,
     backend: Backend = "cpu",
     transient: Transients = False,
@@ -224,7 +224,8 @@ def build(
         off_record=off_record,
         rigs=data.RigRange() if any_rig else None,
     )
-    farm = rendering_farm(ray, backend)
+    farm = rendering_farm(ray, backend, workers)
+    workers = workers or os.cpu_count() or 1
     try:
         report = _build(plan, count, out, workers, _command(context, "build"), farm)
         if transient:
@@ -276,12 +277,17 @@ def _build(
         )
 
 
-def rendering_farm(ray: str | None, backend: str) -> data.Farm | None:
-    """Return what renders in place of processes on this machine; None for these. Raises
-    typer.BadParameter for two.
+def rendering_farm(ray: str | None, backend: str, workers: int | None) -> data.Farm | None:
+    """Return the farm that renders in place of processes on this machine; None for these. Raises
+    typer.BadParameter for two, and for a number of `workers` beside one.
     """
     if ray and backend != "cpu":
         raise typer.BadParameter(f"--ray and --backend {backend} each say who renders: give one")
+    if workers and (ray or backend != "cpu"):
+        raise typer.BadParameter(
+            "--workers counts processes on this machine, of which none renders with --ray or"
+            " --backend: drop one"
+        )
     if ray:
         return data.ray_farm(ray)
     return None if backend == "cpu" else data.in_batches(backend)

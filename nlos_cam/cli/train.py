@@ -17,6 +17,7 @@ import nlos_models as models
 import typer
 from nlos_models import training
 
+from nlos_cam import bench as benches
 from nlos_cam import dataset as data_sets
 from nlos_cam import objects as shapes
 from nlos_cam import reconstruct
@@ -362,9 +363,11 @@ def direct(
         held_out = source.held_out(held_out_data, recipe.held_out)
         recipe = recipe.model_copy(update={"held_out": len(held_out.image)})
         record = source.record_run(recipe, run.out, runs, weights)
-        job = run.training(
-            recipe, record, training.digest_of(start, source.digest) if start else source.digest
-        )
+        # The best epoch is that of these held-out maps: a run cannot go on with others.
+        judged = data_sets.data_key(data_sets.open_dataset(held_out_data, color=recipe.colour))
+        job = run.training(recipe, record, training.digest_of(start, source.digest, judged))
+        earlier = training.digest_of(start, source.digest) if start else source.digest
+        job = replace(job, earlier_origin=earlier)
         run.finish(recipe, training.run_direct(fabric, job, start, source, held_out))
 
 
@@ -485,6 +488,10 @@ def quality(
     if weights.resolve().parent == models.shipped_folder().resolve().parent:
         raise SceneError(
             f"{weights} came with the program, and is not changed: give a copy of the folder"
+        )
+    if benches.is_bench(weights.resolve().parent):
+        raise SceneError(
+            f"{weights} belongs to a bench, whose record has its checksum: give a copy of the folder"
         )
     pipeline = models.load_reconstructor(weights, graphs)
     # An old or damaged quality model is replaced, so that it is not read.

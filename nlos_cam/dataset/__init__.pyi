@@ -18,6 +18,7 @@ __all__ = [
     "TEST_SEED",
     "TRAINING_OUTLIERS",
     "TRAINING_SEED",
+    "TRUTH_SUFFIX",
     "BareMaps",
     "Benches",
     "BuildReport",
@@ -82,6 +83,7 @@ from .build import (
 )
 from .labelled import (
     FRAMES_PER_RECORDING,
+    TRUTH_SUFFIX,
     Labelled,
     OpenBench,
     as_map_set,

@@ -33,6 +33,8 @@ TRAINING_SEED = 0
 HELD_OUT_SEED = 10_000_000
 TEST_SEED = 20_000_000
 """First seeds: no training run reaches the seeds of held-out and test objects; see `check_seeds`."""
+SEEDS_END = 1_000_000_000
+"""First seed that no object has: names of shards, which are in the order of seeds, have 9 digits."""
 SHARD = 100
 """Objects in a shard: as many can be lost of each unfinished shard when a build is killed."""
 PIECE = 10
@@ -41,7 +43,7 @@ PIECE = 10
 Pieces = Generator[tuple[range, Samples]]
 Farm = Callable[[DatasetPlan, Sequence[range]], Pieces]
 """Makes the samples of ranges of seeds and yields them in any order; closing the generator ends its
-workers.
+workers. One that has several may say how many by an attribute `workers`.
 """
 
 
@@ -64,7 +66,14 @@ class BuildReport:
 
 
 def check_seeds(first_seed: int, count: int) -> None:
-    """Raise SceneError where objects that begin below the held-out or the test ones reach them."""
+    """Raise SceneError where objects that begin below the held-out or the test ones reach them, or
+    where their seeds are too large.
+    """
+    if first_seed + count > SEEDS_END:
+        raise SceneError(
+            f"seeds from {first_seed} on are too large: objects end below {SEEDS_END}, choose another"
+            " --seed or a lower --count"
+        )
     for name, reserved in (("held-out", HELD_OUT_SEED), ("test", TEST_SEED)):
         if first_seed < reserved < first_seed + count:
             raise SceneError(

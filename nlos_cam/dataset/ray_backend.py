@@ -46,6 +46,8 @@ class RayFarm:
     def __init__(self, ray: Any, address: str) -> None:
         self._ray = ray
         self._address = address
+        self.workers = 1
+        """Processors of the cluster, once it was connected to."""
 
     def __call__(
         self, plan: DatasetPlan, pieces: Sequence[range]
@@ -79,7 +81,8 @@ class RayFarm:
         ray = self._ray
         remaining = iter(pieces)
         work = ray.remote(num_cpus=1, max_retries=MAX_RETRIES)(make_piece)
-        ahead = PIECES_PER_CPU * max(1, int(ray.cluster_resources().get("CPU", 1)))
+        self.workers = max(1, int(ray.cluster_resources().get("CPU", 1)))
+        ahead = PIECES_PER_CPU * self.workers
         waiting = {work.remote(plan, piece, VERSION): piece for piece in islice(remaining, ahead)}
         while waiting:
             (ready, *_), _ = ray.wait([*waiting], num_returns=1)

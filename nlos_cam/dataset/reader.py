@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from hashlib import sha256
 from itertools import accumulate
 from pathlib import Path
 from typing import Any
@@ -159,16 +160,19 @@ class _Window:
 
 
 def check_held_out(training: Dataset, held_out: Dataset) -> None:
-    """Raise SceneError where held-out objects are training objects: in the same folder, or rendered
-    from the same seeds.
+    """Raise SceneError where held-out objects are training objects: in the same folder, rendered
+    from the same seeds, or the same frames of recordings.
     """
     if training.folder.resolve() == held_out.folder.resolve():
         raise SceneError(
             f"--dataset and --held-out are the same folder ({training.folder}): hold out different"
             " objects"
         )
-    if RECORDED in {training.plan.accuracy, held_out.plan.accuracy}:
-        return  # their seeds number recordings
+    recorded = [each.plan.accuracy == RECORDED for each in (training, held_out)]
+    if all(recorded):
+        _check_recordings(training, held_out)
+    if any(recorded):
+        return  # their seeds number frames
     if training.plan.objects.meshes != held_out.plan.objects.meshes:
         return  # a seed is another object
     both = training.seeds & held_out.seeds
@@ -176,6 +180,19 @@ def check_held_out(training: Dataset, held_out: Dataset) -> None:
         raise SceneError(
             f"{len(both)} objects of {held_out.folder} have the seeds of objects in"
             f" {training.folder}, from {min(both)}: build the held-out ones with another --seed"
+        )
+
+
+def _check_recordings(training: Dataset, held_out: Dataset) -> None:
+    """Raise SceneError where two datasets of recordings hold the same frames."""
+    known, judged = (
+        {sha256(depth_m.tobytes()).digest() for depth_m in each.column("depth_m")}
+        for each in (training, held_out)
+    )
+    if both := known & judged:
+        raise SceneError(
+            f"{len(both)} frames of {held_out.folder} are in {training.folder} too: hold out"
+            " recordings of other objects"
         )
 
 

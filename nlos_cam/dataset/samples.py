@@ -204,7 +204,8 @@ def _sense_in_batches(
     only the CPU renders.
     """
     if plan.textures or plan.accuracy == LOCKED:
-        raise SceneError(f"backend {backend} renders no colors: drop --backend")
+        what = "colors" if plan.textures else LOCKED
+        raise SceneError(f"backend {backend} renders no {what}: drop --backend")
     scenes = [
         scene_of(plan, depth_m, rig, model)
         for depth_m, (rig, model) in zip(depths_m, rigs, strict=True)

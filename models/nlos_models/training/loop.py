@@ -100,6 +100,8 @@ class Running:
     """Run the networks through torch.compile, which needs a C++ compiler."""
     origin: str = ""
     """`digest_of` the starting point; a run with another origin is not resumed."""
+    earlier_origin: str | None = None
+    """Origin that earlier versions gave such a run, which is resumed too."""
     clock: Callable[[], float] = time.monotonic
 
     def fabric_for(self, recipe: Recipe) -> Fabric:
@@ -423,7 +425,8 @@ class _Run:
         if not self.recipe.trains_like(recipe_of(json.loads(state["recipe"]))):
             raise RecipeError(f"{self.folder} holds a run of another recipe: choose another --out")
         # States of old runs have no origin.
-        if state.get("origin", self._running.origin) != self._running.origin:
+        origins = self._running.origin, self._running.earlier_origin
+        if state.get("origin", origins[0]) not in origins:
             raise RecipeError(
                 f"{self.folder} holds a run from other weights or objects: choose another --out"
             )

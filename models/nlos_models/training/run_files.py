@@ -105,10 +105,10 @@ def write_finished(folder: Path, origin: str, figures: Scores, parts: Iterable[s
             (part / name).unlink(missing_ok=True)
 
 
-def read_finished(folder: Path, origin: str) -> Scores | None:
+def read_finished(folder: Path, *origins: str | None) -> Scores | None:
     """Return the figures of the run that has ended in a folder, or None where none has.
 
-    Raises RecipeError for a run from another origin, CheckpointError for a damaged file.
+    Raises RecipeError for a run from none of these origins, CheckpointError for a damaged file.
     """
     path = folder / FINISHED
     if not path.exists():
@@ -116,7 +116,7 @@ def read_finished(folder: Path, origin: str) -> Scores | None:
     try:
         found = json.loads(read_bounded(path, TEXT_LIMIT))
         figures = {str(name): float(value) for name, value in found["figures"].items()}
-        same = found["origin"] == origin
+        same = found["origin"] in origins
     except (ValueError, TypeError, KeyError, AttributeError) as error:
         raise CheckpointError(f"{path} is damaged: choose another --out") from error
     if not same:

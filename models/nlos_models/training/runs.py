@@ -4,7 +4,7 @@ and saves.
 
 import os
 from collections.abc import Callable, Generator, Iterable, Mapping
-from contextlib import AbstractContextManager, ExitStack, contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Generic, TypeVar
@@ -95,21 +95,31 @@ class TrainingRun(Generic[R]):
     tensorboard: bool = False
     compiled: bool = False
     watch: Watch = unwatched
+    earlier_origin: str | None = None
+    """See `Running`."""
+
+    def watched(self, fabric: Fabric, name: str) -> AbstractContextManager[Running]:
+        """Open progress and interruption for a run of this name."""
+        running = Running(
+            fabric,
+            tensorboard=self.tensorboard,
+            compiled=self.compiled,
+            origin=self.origin,
+            earlier_origin=self.earlier_origin,
+        )
+        return self.watch(running, self.recipe, name)
 
     @contextmanager
-    def watched(self, fabric: Fabric, name: str) -> Generator[Running]:
-        """Open progress and interruption for a run of this name. Raises FileBusyError where another
-        run has `out`.
+    def claimed(self, fabric: Fabric) -> Generator[None]:
+        """Hold `out` until the run's weights are saved and its states removed: a second run that
+        began between the two would train again. Raises FileBusyError where another run has it.
         """
-        running = Running(
-            fabric, tensorboard=self.tensorboard, compiled=self.compiled, origin=self.origin
-        )
-        with ExitStack() as held:
-            # One process writes; a second run in the same folder is refused while it lives.
-            if fabric.is_global_zero:
-                self.out.mkdir(parents=True, exist_ok=True)
-                held.enter_context(claim(self.out, inside=True))
-            yield held.enter_context(self.watch(running, self.recipe, name))
+        if not fabric.is_global_zero:  # one process writes
+            yield
+            return
+        self.out.mkdir(parents=True, exist_ok=True)
+        with claim(self.out, inside=True):
+            yield
 
     def finished(self) -> Scores | None:
         """Return the figures of this run where it has ended already, with its weights in `out`.
@@ -118,7 +128,7 @@ class TrainingRun(Generic[R]):
         """
         if not (self.out / RECORD).exists():
             return None
-        return read_finished(self.out, self.origin)
+        return read_finished(self.out, self.origin, self.earlier_origin)
 
     def finish(self, figures: Scores, parts: Iterable[str] = ()) -> None:
         """Remove the states of a run whose weights are saved, and keep its figures."""
@@ -213,14 +223,17 @@ def run_vae(
     held_out: Float16,
 ) -> Scores:
     """Train a VAE and save it; return its held-out figures."""
-    if (ended := training.finished()) is not None:
-        return ended
-    with training.watched(fabric, "VAE") as running:
-        vae, figures = train_vae(training.recipe, images, held_out, training.out, running, start)
-    if fabric.is_global_zero:
-        checkpoints.save_vae(training.out, vae, training.with_figures(figures))
-        training.finish(figures)
-    return figures
+    with training.claimed(fabric):
+        if (ended := training.finished()) is not None:
+            return ended
+        with training.watched(fabric, "VAE") as running:
+            vae, figures = train_vae(
+                training.recipe, images, held_out, training.out, running, start
+            )
+        if fabric.is_global_zero:
+            checkpoints.save_vae(training.out, vae, training.with_figures(figures))
+            training.finish(figures)
+        return figures
 
 
 def run_compressor(
@@ -231,17 +244,22 @@ def run_compressor(
     held_out: MapSet,
 ) -> Scores:
     """Train a compressor and save it with its decoder; return its held-out figures."""
-    if (ended := training.finished()) is not None:
-        return ended
-    recipe = training.recipe
-    with training.watched(fabric, "compressor") as running:
-        pipeline, figures = train_compressor(recipe, start, maps, held_out, training.out, running)
-    if fabric.is_global_zero:
-        encoder = start.vae.encoder if start.vae and recipe.steps != "one" else None
-        checkpoints.save_pipeline(training.out, pipeline, training.with_figures(figures), encoder)
-        _export(training)
-        training.finish(figures)
-    return figures
+    with training.claimed(fabric):
+        if (ended := training.finished()) is not None:
+            return ended
+        recipe = training.recipe
+        with training.watched(fabric, "compressor") as running:
+            pipeline, figures = train_compressor(
+                recipe, start, maps, held_out, training.out, running
+            )
+        if fabric.is_global_zero:
+            encoder = start.vae.encoder if start.vae and recipe.steps != "one" else None
+            checkpoints.save_pipeline(
+                training.out, pipeline, training.with_figures(figures), encoder
+            )
+            _export(training)
+            training.finish(figures)
+        return figures
 
 
 def run_direct(
@@ -252,16 +270,17 @@ def run_direct(
     held_out: MapSet,
 ) -> Scores:
     """Train a direct network and save it; return its held-out figures."""
-    if (ended := training.finished()) is not None:
-        return ended
-    with training.watched(fabric, "direct network") as running:
-        network, figures = train_direct(
-            training.recipe, source, held_out, training.out, running, start
-        )
-    checkpoints.save_direct(training.out, network, training.with_figures(figures))
-    _export(training)
-    training.finish(figures)
-    return figures
+    with training.claimed(fabric):
+        if (ended := training.finished()) is not None:
+            return ended
+        with training.watched(fabric, "direct network") as running:
+            network, figures = train_direct(
+                training.recipe, source, held_out, training.out, running, start
+            )
+        checkpoints.save_direct(training.out, network, training.with_figures(figures))
+        _export(training)
+        training.finish(figures)
+        return figures
 
 
 def run_transfer(
@@ -281,29 +300,30 @@ def run_transfer(
     """
     # The same held-out maps before and after, so that their difference is the transfer's.
     before = figures_of(run(network.to(fabric.device).eval(), held_out), held_out.image)
-    if (ended := training.finished()) is not None:
-        return {"before": before, "after": ended}
-    with training.watched(fabric, "transfer") as running:
-        if isinstance(network, DirectNetwork):
-            network, after = transfer_direct(
-                training.recipe, network, maps, held_out, training.out, running
-            )
-        else:
-            network, after = train_transfer(
-                training.recipe, network, encoder, maps, held_out, training.out, running
-            )
-    if fabric.is_global_zero:
-        keeps_start = start is not None and not is_better(after, before)
-        folder = training.out / FITTED if keeps_start else training.out
-        if isinstance(network, DirectNetwork):
-            checkpoints.save_direct(folder, network, training.with_figures(after))
-        else:
-            checkpoints.save_pipeline(folder, network, training.with_figures(after), encoder)
-        _export(training, folder)
-        if start and keeps_start:
-            checkpoints.copy_weights(start, training.out)
-        training.finish(after, PHASES)
-    return {"before": before, "after": after}
+    with training.claimed(fabric):
+        if (ended := training.finished()) is not None:
+            return {"before": before, "after": ended}
+        with training.watched(fabric, "transfer") as running:
+            if isinstance(network, DirectNetwork):
+                network, after = transfer_direct(
+                    training.recipe, network, maps, held_out, training.out, running
+                )
+            else:
+                network, after = train_transfer(
+                    training.recipe, network, encoder, maps, held_out, training.out, running
+                )
+        if fabric.is_global_zero:
+            keeps_start = start is not None and not is_better(after, before)
+            folder = training.out / FITTED if keeps_start else training.out
+            if isinstance(network, DirectNetwork):
+                checkpoints.save_direct(folder, network, training.with_figures(after))
+            else:
+                checkpoints.save_pipeline(folder, network, training.with_figures(after), encoder)
+            _export(training, folder)
+            if start and keeps_start:
+                checkpoints.copy_weights(start, training.out)
+            training.finish(after, PHASES)
+        return {"before": before, "after": after}
 
 
 def is_better(after: Scores, before: Scores) -> bool:
@@ -322,18 +342,19 @@ def run_uncertainty(
     """Train, calibrate and save an uncertainty network beside the weights it watches; return its
     held-out figures.
     """
-    with training.watched(fabric, "uncertainty network") as running:
-        network, figures = train_uncertainty(
-            training.recipe, samples, held_out, training.out, running
-        )
-    # On held-out maps: a network is surer of those that it was trained on.
-    fitted = calibrate(network, held_out)
-    if fabric.is_global_zero:
-        record = about.model_copy(update={**asdict(fitted), "figures": figures})
-        save_uncertainty_network(training.out, network, record, watched)
-        _export(training)
-        training.finish(figures)
-    return {**figures, "error_scale": fitted.error_scale, "outside_above": fitted.outside_above}
+    with training.claimed(fabric):
+        with training.watched(fabric, "uncertainty network") as running:
+            network, figures = train_uncertainty(
+                training.recipe, samples, held_out, training.out, running
+            )
+        # On held-out maps: a network is surer of those that it was trained on.
+        fitted = calibrate(network, held_out)
+        if fabric.is_global_zero:
+            record = about.model_copy(update={**asdict(fitted), "figures": figures})
+            save_uncertainty_network(training.out, network, record, watched)
+            _export(training)
+            training.finish(figures)
+        return {**figures, "error_scale": fitted.error_scale, "outside_above": fitted.outside_above}
 
 
 def run_quality(weights: Path, samples: QualitySet, on_fit: OnFit) -> QualityRecord:

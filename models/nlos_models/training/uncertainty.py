@@ -182,11 +182,11 @@ class Calibration:
 
 def error_scale(expected: Float64, error: Float64) -> float:
     """Return the factor of expected errors b (n,) under which Laplace-distributed errors e (n,) are
-    likeliest.
+    likeliest; 1 where no pixel has an error, since the images have no surface of the truths.
 
     The sum of log(f b) + e / (f b) is least at f = mean(e / b).
     """
-    return float(np.mean(error / expected))
+    return float(np.mean(error / expected)) if error.size else 1.0
 
 
 def temperature(logits: Float64, truth: Mask) -> float:

@@ -7,6 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -15,10 +16,11 @@ from nlos_calibration import load_rig
 from nlos_models import load_reconstructor, load_record, silhouette_iou
 
 from nlos_cam.adapt import adapt, find_recordings
-from nlos_cam.adapt.recordings import MIN_OBJECTS, Transfer, parts_of
+from nlos_cam.adapt.recordings import MIN_OBJECTS, Recordings, Transfer, parts_of
 from nlos_cam.adapt.report import transfer_words
 from nlos_cam.bench import load_bench
 from nlos_cam.dataset import open_dataset
+from nlos_cam.errors import RecordingError
 from nlos_cam.evaluate import reconstruct_all
 from nlos_cam.files import cache_folder
 from nlos_cam.reconstruct import align_all
@@ -86,9 +88,11 @@ def test_a_fit_that_costs_much_in_simulation_is_not_kept(
     loss: float, kept: bool, tmp_path: Path
 ) -> None:
     figures = [{"silhouette_iou": {"value": value}} for value in (0.3, 0.4, 0.5)]
-    fit = Transfer(tmp_path, {"judged": ["cup"]}, 3, *figures, simulated_loss=loss)
+    parts = {"adaptation": ["bowl"], "validation": ["hat"], "judged": ["cup"]}
+    fit = Transfer(tmp_path, parts, 3, *figures, simulated_loss=loss)
 
     assert fit.is_better is kept
+    assert "fitted to recordings of 1 objects" in transfer_words(fit)
     assert ("worse on simulated objects" in transfer_words(fit)) is not kept
 
 
@@ -109,6 +113,69 @@ def test_recordings_in_another_box_are_left_out(
 
     assert find_recordings(tmp_path, now, no_bench, said.append) is None
     assert all("object box have moved" in line for line in said[:MIN_OBJECTS])
+
+
+def test_recordings_made_meanwhile_are_not_taken_for_read(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What is made of three recordings bears their name, also where there are four by then."""
+    monkeypatch.setattr(
+        "nlos_cam.adapt.recordings.load_sidecar",
+        lambda path: SimpleNamespace(label=path.stem, rig=HOME),
+    )
+    for number in range(MIN_OBJECTS):
+        (tmp_path / f"object-{number}.bag").touch()
+    listed = find_recordings(tmp_path, HOME, no_bench, print)
+    assert listed is not None
+
+    (tmp_path / "one-more.bag").touch()
+
+    again = find_recordings(tmp_path, HOME, no_bench, print)
+    assert again is not None
+    assert len(again.by_label) == len(listed.by_label) + 1
+    assert again.digest != listed.digest
+
+
+def test_a_mesh_elsewhere_counts_for_the_digest(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(
+        "nlos_cam.adapt.recordings.load_sidecar",
+        lambda path: SimpleNamespace(label=path.stem, rig=HOME),
+    )
+    folder = tmp_path / "recordings"
+    folder.mkdir()
+    for number in range(MIN_OBJECTS):
+        (folder / f"object-{number}.bag").touch()
+    (folder / "object-0.truth.toml").write_text('file = "../mesh.stl"\n', encoding="utf-8")
+
+    def digest() -> str:
+        found = find_recordings(folder, HOME, no_bench, print)
+        assert found is not None
+        return found.digest
+
+    (tmp_path / "mesh.stl").write_bytes(b"one")
+    before = digest()
+    assert digest() == before
+
+    (tmp_path / "mesh.stl").write_bytes(b"another")
+    assert digest() != before
+
+
+def test_a_recording_without_a_truth_stops_before_training(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    job = job_in(tmp_path / "work", HOME)
+    found = Recordings(tmp_path, {"cup": [tmp_path / "cup.bag"]}, no_bench, "0" * 12)
+    no_truth = Mock(side_effect=RecordingError("no file describes it"))
+    training = Mock()
+    monkeypatch.setattr("nlos_cam.adapt.run.write_parts", no_truth)
+    monkeypatch.setattr("nlos_cam.adapt.run._train_network", training)
+
+    with pytest.raises(RecordingError, match="describes"):
+        adapt(replace(job, recordings=found), 1.0, measure)
+
+    training.assert_not_called()
 
 
 def record_bench(run: Callable[..., Any]) -> Path:

@@ -10,8 +10,8 @@ from nlos_calibration import load_rig
 
 from nlos_cam import adapt as adaptation
 from nlos_cam import bench as benches
-from nlos_cam.adapt.plan import load_plan
-from nlos_cam.cli.adapt import _is_worth_keeping
+from nlos_cam.adapt.plan import Locked, load_plan
+from nlos_cam.cli.adapt import MAX_FRAMES, _is_worth_keeping
 from nlos_cam.evaluate import TARGETS
 
 
@@ -40,6 +40,12 @@ def test_weights_from_elsewhere_are_not_replaced_unasked(run: Any, out: Path) ->
     (out / "weights" / "SHA256SUMS").write_text("somebody's\n")
 
     assert "--overwrite" in run("adapt", "paper-rig", "--out", out, code=1).err
+
+
+def test_frames_beyond_those_of_a_plan_are_refused(shown: Any) -> None:
+    Locked(frames=MAX_FRAMES)
+
+    assert "--frames" in shown("adapt", "paper-rig", "--frames", MAX_FRAMES + 1, code=2).err
 
 
 @pytest.mark.parametrize(("after_iou", "kept"), [(0.508, False), (0.677, True), (0.7, True)])

@@ -159,6 +159,17 @@ def test_ray_and_a_backend_contradict(shown: Run, tmp_path: Path) -> None:
     assert "--backend torch" in " ".join(err.split())
 
 
+@pytest.mark.parametrize("other", [("--ray", "auto"), ("--backend", "torch")])
+def test_workers_beside_another_farm_are_refused(
+    shown: Run, tmp_path: Path, other: tuple[str, str]
+) -> None:
+    build = "dataset", "build", "--count", 1, "--out", tmp_path / "d"
+    adapt = "adapt", "paper-rig", "--out", tmp_path / "a"
+
+    for command in (build, adapt):
+        assert "--workers" in shown(*command, *other, "--workers", 2, code=2).err
+
+
 def test_rate_is_objects_per_second_once_known() -> None:
     clock = iter(range(100))
     bar = Progress(get_time=lambda: float(next(clock)))

@@ -433,6 +433,15 @@ def test_train_quality_replaces_a_damaged_model(
     )
 
 
+def test_train_quality_leaves_weights_of_a_bench_alone(tmp_path: Path, shown: Run) -> None:
+    """The record of a bench has the checksum of its weights: with another one it is damaged."""
+    (tmp_path / "bench.toml").write_text("bench_version = 1\n", encoding="utf-8")
+    untrained_uncertainty(weights := tmp_path / "weights", watched_weights(tmp_path / "watched"))
+
+    command = "train", "quality", "--weights", weights, "--dataset", tmp_path
+    assert "belongs to a bench" in shown(*command, code=1).err
+
+
 def test_train_direct_refuses_a_store_in_use(tmp_path: Path, out: Path, shown: Run) -> None:
     (recipe := tmp_path / "direct.toml").write_text('task = "direct"\n' + BASE)
     (store := tmp_path / "store").mkdir()

@@ -35,7 +35,8 @@ from nlos_cam.dataset import (
     worker,
 )
 from nlos_cam.dataset import build as dataset
-from nlos_cam.dataset.build import in_batches, processes
+from nlos_cam.dataset.build import SEEDS_END, in_batches, processes
+from nlos_cam.dataset.locked import LOCKED
 from nlos_cam.dataset.ray_backend import PIECES_PER_CPU, RayFarm, make_piece
 from nlos_cam.dataset.samples import Samples, make_samples
 from nlos_cam.dataset.shards import SHARD_PATTERN, only_builder, store
@@ -118,6 +119,14 @@ def test_build_stores_samples_in_seed_order(tmp_path: Path) -> None:
 
     for name, values in samples_of(range(40, 40 + COUNT)).items():
         np.testing.assert_array_equal(found.column(name), values)
+
+
+@pytest.mark.parametrize("first_seed", [SEEDS_END - 4, 2**63, 10**20])
+def test_build_refuses_seeds_that_no_shard_is_named_by(tmp_path: Path, first_seed: int) -> None:
+    with pytest.raises(SceneError, match="too large"):
+        _build(tmp_path / "out", plan=replace(PLAN, first_seed=first_seed), count=5)
+
+    _build(tmp_path / "below", plan=replace(PLAN, first_seed=SEEDS_END - 5), count=5)
 
 
 @pytest.mark.parametrize("reserved", [HELD_OUT_SEED, TEST_SEED])
@@ -557,9 +566,11 @@ def test_ray_farm_makes_every_piece_once() -> None:
 
 def test_ray_farm_keeps_few_pieces_waiting_and_leaves_cluster() -> None:
     ray = FakeRay()
+    farm = RayFarm(ray, "auto")
 
-    list(RayFarm(ray, "auto")(PLAN, PIECES))
+    list(farm(PLAN, PIECES))
 
+    assert farm.workers == 2
     assert ray.most_waiting == 2 * PIECES_PER_CPU
     assert not ray.running
 
@@ -623,6 +634,11 @@ def test_cluster_of_two_machines_makes_equal_samples(tmp_path: Path) -> None:
     done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=280)
 
     assert done.returncode == 0, done.stdout + done.stderr
+
+
+def test_batches_of_locked_differences_are_refused_by_name() -> None:
+    with pytest.raises(SceneError, match="torch renders no locked differences"):
+        next(in_batches("torch")(replace(PLAN, accuracy=LOCKED), [range(40, 42)]))
 
 
 def test_torch_renders_the_same_samples_in_batches() -> None:

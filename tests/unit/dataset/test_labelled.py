@@ -264,6 +264,8 @@ def test_difference_maps_of_recordings_are_those_of_live(
     reference: Any = walled.reference
     bare = reference.map_depth_m, reference.map_intensity
     monkeypatch.setattr(training_maps, "measured_bare_wall", lambda _: bare)
+    # both are of one recording, which training refuses
+    monkeypatch.setattr(training_maps, "check_held_out", lambda *_: None)
     recipe = small_recipe(task="compressor", objects=4, held_out=4, maps="difference maps")
 
     found = read_maps(recipe, tmp_path / "data", tmp_path / "other", Path("wall.toml"))
@@ -273,8 +275,10 @@ def test_difference_maps_of_recordings_are_those_of_live(
 
 
 def test_difference_maps_of_recordings_need_a_measured_wall(tmp_path: Path) -> None:
-    for name in ("data", "other"):
-        write_shards(_samples(4), tmp_path / name)
+    for name, farther_m in (("data", 0.0), ("other", 0.001)):
+        samples = _samples(4)
+        maps = replace(samples.maps, depth_m=samples.maps.depth_m + np.float32(farther_m))
+        write_shards(replace(samples, maps=maps), tmp_path / name)
     recipe = small_recipe(task="compressor", objects=4, held_out=4, maps="difference maps")
 
     with pytest.raises(SceneError, match="--wall"):

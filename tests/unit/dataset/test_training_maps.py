@@ -43,6 +43,7 @@ from nlos_cam.dataset.packed import (
 )
 from nlos_cam.dataset.packed_index import INDEX
 from nlos_cam.dataset.plan import RECORDED
+from nlos_cam.dataset.reader import Dataset, check_held_out
 from nlos_cam.dataset.samples import Samples
 from nlos_cam.dataset.shards import shard_path, store
 from nlos_cam.dataset.training_maps import MapSplit, Streamed, read_maps, render_bare_wall
@@ -425,6 +426,23 @@ def test_held_out_maps_that_hold_nothing_out_are_refused(
         pytest.raises(SceneError, match=why),
     ):
         packed.held_out(held_out, 2)
+
+
+def test_frames_of_the_same_recordings_are_not_held_out(tmp_path: Path) -> None:
+    plan = replace(PLAN, accuracy=RECORDED)
+    training = open_dataset(_add(tmp_path / "training", 0, plan))
+    others = _add(tmp_path / "others", 100, plan)
+    same = _add(tmp_path / "same", 100, plan)
+    store(shard_path(same, 100), {**_samples(100), **_maps_of(training)}, plan.provenance, "")
+
+    check_held_out(training, open_dataset(others))
+    with pytest.raises(SceneError, match=r"frames of .*same are in .*training"):
+        check_held_out(training, open_dataset(same))
+
+
+def _maps_of(dataset: Dataset) -> dict[str, np.ndarray]:
+    maps = dataset.arrays()
+    return {"depth_m": maps.depth_m, "intensity": maps.intensity, "image": maps.image}
 
 
 def test_meshes_of_the_same_seeds_are_other_objects(tmp_path: Path, store_folder: Path) -> None:

@@ -5,6 +5,7 @@ overwritten.
 from contextlib import nullcontext
 from functools import partial
 from pathlib import Path
+from unittest.mock import Mock
 
 import pytest
 import torch
@@ -14,7 +15,7 @@ from nlos_models.direct import DirectNetwork
 from nlos_models.errors import TrainingError
 from nlos_models.pipeline import RemappingNetwork
 from nlos_models.records import UNCERTAINTY_RECORD
-from nlos_models.training import runs
+from nlos_models.training import open_fabric, runs
 from nlos_models.training.checkpoints import (
     copy_weights,
     save_direct,
@@ -24,18 +25,20 @@ from nlos_models.training.checkpoints import (
 from nlos_models.training.recipe import Recipe
 from nlos_models.training.run_files import FINISHED, LAST
 from nlos_models.training.runs import (
+    TrainingRun,
     compressor_start,
     record_run,
     record_uncertainty_run,
+    run_vae,
     transfer_start,
     vae_start,
 )
 from safetensors.torch import load_file, save_file
-from small_maps import SmallCompressor, SmallVae, use_small_networks
+from small_maps import SmallCompressor, SmallVae, small_images, use_small_networks
 from small_run import changed_tensors, small_recipe
 from small_uncertainty import watched_weights
 
-from nlos_cam.files import CHECKSUMS, OutputExistsError
+from nlos_cam.files import CHECKSUMS, FileBusyError, OutputExistsError, claim
 
 RIG = load_rig("paper-rig")
 NAMED = (RIG.name, RIG.checksum)
@@ -96,6 +99,31 @@ def test_compressor_start_lists_runs_of_weights_and_vae(weights: Path, tmp_path:
     )
 
     assert (start.vae, start.pipeline, runs) == (None, None, [])
+
+
+def test_folder_is_held_until_the_weights_are_saved(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A second run that began between the two would find neither state nor end, and train anew."""
+    held: list[Path] = []
+
+    def save(folder: Path, *_: object) -> None:
+        with pytest.raises(FileBusyError), claim(folder, inside=True):
+            pass
+        held.append(folder)
+
+    trained = SmallVae(), {"held_out_loss": 1.0}
+    monkeypatch.setattr(runs, "train_vae", Mock(return_value=trained))
+    monkeypatch.setattr(runs.checkpoints, "save_vae", save)
+    training = TrainingRun(VAE, tmp_path, CheckpointRecord.of([VAE], NAMED))
+
+    run_vae(
+        open_fabric(VAE, accelerator="cpu"), training, None, small_images(2, 0), small_images(2, 1)
+    )
+
+    assert held == [tmp_path]
+    with claim(tmp_path, inside=True):
+        assert (tmp_path / FINISHED).exists()
 
 
 def _start(recipe: Recipe, weights: Path) -> object:

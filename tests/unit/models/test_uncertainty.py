@@ -218,6 +218,11 @@ def test_error_scale_undoes_factor_in_any_unit(factor: float, unit: float) -> No
     assert scale == pytest.approx(1.0, rel=0.03)
 
 
+def test_error_scale_without_an_error_is_one() -> None:
+    """That of weights whose images miss every truth: NaN would make a record that nothing reads."""
+    assert uncertainty.error_scale(np.zeros(0), np.zeros(0)) == 1.0
+
+
 @pytest.mark.parametrize("true", [1.0, 2.0, 3.0])
 def test_temperature_finds_overconfidence(true: float) -> None:
     generator = np.random.default_rng(3)
