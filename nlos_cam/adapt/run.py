@@ -227,7 +227,7 @@ def adapt(
         folders = [job.folder / _stage_name(number) for number in range(len(plan.stages))]
         before = {} if job.locked else _figures(measure, job.start_folder, job.folder / BEFORE)
         if job.recordings and not job.locked:
-            # Now, since a recording without a truth is an error, before minutes of training.
+            # Now, since one that cannot be used is an error, before minutes of training.
             _parts_of(job.recordings, folders[-1], tracked)
         _train_stages(job, plan, folders, tracked, watch, on_message)
         if job.locked:

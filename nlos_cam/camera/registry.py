@@ -23,11 +23,15 @@ PLAYBACK = "nlos_cam.recording.playback"
 """Module of `ReplayCamera`, by name: it stands in a layer above this one."""
 PLAIN_NAMES = frozenset({"l515", "sim"})
 """Names of cameras that a folder may happen to have too."""
+PACKAGED_RECORDING = "sample"
+"""Name of the recording that comes with the package."""
+BENCH_RECORD = "bench.toml"
+"""File by which a folder is known as a bench, which is no camera."""
 NAMES = "l515, l515:SERIAL, sim, sim:bare-wall, sim:SCENE.toml or FILE.bag"
 
 
 def open_camera(
-    uri: str,
+    uri: str | Path,
     *,
     on_progress: OnProgress | None = None,
     recording: "Recording | None" = None,
@@ -64,13 +68,21 @@ def open_camera(
         from nlos_cam.camera.l515 import L515Camera
 
         return L515Camera(uri, rest, recording=recording)
+    if (Path(uri) / BENCH_RECORD).is_file():
+        raise UnknownCameraError(
+            f"{uri} is a bench folder, no camera: give it as --bench {uri} (in Python bench=...)"
+        )
     raise UnknownCameraError(
         f"no camera {uri!r}.{did_you_mean(uri, ['l515', *SIMULATED])} Use {NAMES}"
     )
 
 
-def full_uri(uri: str) -> str:
-    """Return a camera's name; that of a recording's path, run.bag, is bag:run.bag."""
+def full_uri(uri: str | Path) -> str:
+    """Return a camera's name; that of a recording, run.bag or sample, is bag:run.bag, bag:sample."""
+    uri = str(uri)
+    # a session of `detect`, a folder, may be called so
+    if uri == PACKAGED_RECORDING and not Path(uri).is_dir():
+        return f"bag:{uri}"
     is_path = uri.endswith((".bag", ".db3", ".mcap")) or (Path(uri) / "metadata.yaml").is_file()
     return f"bag:{uri}" if is_path and not uri.startswith(("bag:", "sim:", "l515:")) else uri
 

@@ -188,10 +188,15 @@ def _forecast(rig: walls.Rig, folder: Path | None) -> benches.ForecastRecord:
 
 
 def _recordings(folder: Path) -> adaptation.Recordings | None:
-    """Return the labelled recordings in a bench folder, if there are any."""
+    """Return the labelled recordings in a bench folder, if there are any. Raises RecordingError for
+    one whose object is not known: it would end the work after it was done.
+    """
     loaded = benches.load_bench(folder, weights=False)
     recordings = folder / adaptation.RECORDINGS
-    return adaptation.find_recordings(recordings, loaded.rig, loaded.for_camera, common.say)
+    found = adaptation.find_recordings(recordings, loaded.rig, loaded.for_camera, common.say)
+    if found:
+        dataset.check_truths(found.by_label, loaded.rig)
+    return found
 
 
 def _measure_on(job: adaptation.Adaptation) -> adaptation.Measure:

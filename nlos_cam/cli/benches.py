@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, NamedTuple
 
 import nlos_calibration as walls
 import typer
+from nlos_calibration.errors import UnknownRigError
 
 from nlos_cam import bench as benches
 from nlos_cam import calibrate, reconstruct
@@ -44,6 +46,10 @@ BenchOrRig = Annotated[
     Path | None,
     typer.Option("--bench", help="Bench folder of `calibrate --bench`, in place of --rig."),
 ]
+
+
+FOLDER_ENDS = tuple(filter(None, (os.sep, os.altsep)))
+"""Ends of a path that can only be a folder's, also where there is none."""
 
 
 class Choice(NamedTuple):
@@ -145,16 +151,23 @@ def bench_or_rig(name: str | Path) -> tuple[walls.Rig, walls.MeasuredWall | None
     was measured, its wall; print what is doubtful about it.
     """
     name = str(name)
-    if Path(name).is_dir():
+    if Path(name).is_dir() or name.endswith(FOLDER_ENDS):
         loaded = benches.load_bench(name, weights=False)
         _note_warnings(loaded)
         return loaded.rig, loaded.measured
     if walls.is_wall_record(name):
         measured = walls.load_measured(Path(name))
     else:
-        return walls.rig_named(name), None
+        return _rig_named(name), None
     _note_doubt(name, measured.record)
     return measured.record.beam_rig, measured
+
+
+def _rig_named(name: str) -> walls.Rig:
+    try:
+        return walls.rig_named(name)
+    except UnknownRigError as error:
+        raise UnknownRigError(f"{error} or a bench folder") from error
 
 
 def store_forecast(folder: Path) -> None:

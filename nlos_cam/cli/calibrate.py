@@ -144,7 +144,13 @@ def gauge(value: float, low: float, high: float) -> str:
 Wall = Annotated[
     bool, typer.Option("--wall", help="Measure the bare wall: no object, no occluder.")
 ]
-Bag = Annotated[Path | None, typer.Option("--bag", help="Recording of the bare wall.")]
+Bag = Annotated[
+    Path | None,
+    typer.Option(
+        "--bag",
+        help="Recording in place of CAMERA: of the bare wall, or of the occluder without object.",
+    ),
+]
 BareRecord = Annotated[
     Path | None,
     typer.Option(
@@ -265,7 +271,7 @@ def calibrate(
     new reference, with no object hidden. With --bench bench/ all of them go into one folder, which
     other commands take as --bench; the occluder is then found with --occluder bench/.
     """
-    uri = _source(camera, bag, wall=wall, occluder=occluder)
+    uri = _source(camera, bag, wall=wall, occluder=occluder, watch=watch)
     by_hand = _entered(occluder_x_m, occluder_gap_m)
     measured = board or tape_m is not None or by_hand or upright is not None
     _refuse_board_options(board=board, paper=paper, square_mm=square_mm, tape_m=tape_m)
@@ -439,13 +445,19 @@ def _next_step(folder: Path, record: walls.WallRecord, served: reconstruct.Weigh
     return live if served.serve else f"nlos-cam adapt {name} --minutes 10{again}, then {live}"
 
 
-def _source(camera: str | None, bag: Path | None, *, wall: bool, occluder: Path | None) -> str:
+def _source(
+    camera: str | None, bag: Path | None, *, wall: bool, occluder: Path | None, watch: bool
+) -> str:
     """Return the URI to read from. Raises typer.BadParameter for arguments that are missing or
     contradict.
     """
     if wall == (occluder is not None):
         raise typer.BadParameter(
             "choose what to measure: --wall, or --occluder wall.toml once the wall is measured"
+        )
+    if bag is not None and watch:
+        raise typer.BadParameter(
+            "--watch is for a lidar that can still be moved: drop it, or --bag"
         )
     if bag is not None and camera is None:
         return f"bag:{bag}"

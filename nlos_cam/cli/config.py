@@ -47,7 +47,7 @@ SETTINGS = {
         "--bench, unless another CAMERA, --wall or --rig is given",
     ),
     "weights": Setting(frozenset({"live", "replay", "view", "evaluate"}), None, "--weights"),
-    "view_port": Setting(frozenset({"live", "view"}), None, "--view-port"),
+    "view_port": Setting(frozenset({"demo", "live", "view"}), None, "--view-port"),
     "cache": Setting(frozenset(), None, "folder for rendered scenes and exported networks"),
 }
 """Settings by their key in the file; the environment variable of `camera` is NLOS_CAM_CAMERA."""
@@ -176,7 +176,7 @@ def shared_options(name: str, command: Callable[..., None]) -> Callable[..., Non
         _choose_bench(values, used)
         _fill(values, used)
         if not named:
-            _take_camera_of_bench(values)
+            _take_default_camera(values)
         try:
             with _cache_at(settings["cache"]) if name != "config" else nullcontext():
                 command(**values)
@@ -223,10 +223,10 @@ def _choose_camera(values: dict[str, Any], used: dict[str, Value]) -> bool:
     if None not in {argument, option} and argument != option:
         raise typer.BadParameter(f"CAMERA is {argument!r} and --camera is {option!r}: give one")
     given = option if argument is None else argument
-    if given is not None and _is_another(given, used["camera"]):
-        for key in ("wall", "bench"):
-            if key in used and (left := used.pop(key)).value is not None:
-                say(f"note: {key} = {left.value} (from {left.source}) is not used with {given}")
+    if given is not None and (
+        _is_another(given, used["camera"]) or (given == "sim" and _is_of_a_lidar(used.get("bench")))
+    ):
+        _drop_bench(values, used, given)
     values["camera"] = (
         used["camera"].value if given is None and values.get("bag") is None else given
     )
@@ -238,27 +238,65 @@ def _choose_camera(values: dict[str, Any], used: dict[str, Value]) -> bool:
     return not is_default or values.get("bag") is not None
 
 
+def _drop_bench(values: Mapping[str, Any], used: dict[str, Value], given: str) -> None:
+    """Drop wall and bench of the settings, which are not those of what was given; say so where no
+    other is named.
+    """
+    is_named = any(values.get(name) is not None for name in ("wall", "bench_folder"))
+    for key in ("wall", "bench"):
+        if key in used and (left := used.pop(key)).value is not None and not is_named:
+            say(f"note: {key} = {left.value} (from {left.source}) is not used with {given}")
+
+
+SAMPLE = "sample"
+"""Name of the recording in the package."""
 ROS2_RECORD = "metadata.yaml"
 """File in the folder of a bag of ROS 2."""
 
 
-def _take_camera_of_bench(values: dict[str, Any]) -> None:
-    """Enter the lidar that measured the bench: its frames are no simulated camera's.
+def _take_default_camera(values: dict[str, Any]) -> None:
+    """Enter the lidar that measured the bench: its frames are no simulated camera's. Without one,
+    say that the camera is simulated.
 
     A bench that was measured on a simulated scene names none: it was another scene then.
     """
     folder = values.get("bench_folder") or values.get("occluder")
-    if folder is None or not _is_bench(str(folder)):
-        return
+    of_bench = ""
+    if folder is not None and not Path(folder).is_file():
+        serial = _serial_of(folder)
+        if serial is None:  # the command says what is wrong with it
+            return
+        if not _is_simulated(serial):
+            values["camera"] = f"l515:{serial}"  # others may be connected
+            return
+        of_bench = f"; {folder} was measured on a scene that may be another"
+    say(f"note: no CAMERA is given, so that sim is used, the simulated one{of_bench}")
+
+
+def _serial_of(folder: str | Path) -> str | None:
+    """Return the serial number of the camera that measured a bench; None for what is no bench."""
+    if not _is_bench(str(folder)):
+        return None
     from nlos_cam.bench import load_bench_record
-    from nlos_cam.camera import SIMULATED_SERIAL
 
     try:
-        serial = load_bench_record(Path(folder)).camera.serial
-    except CalibrationError:  # the command says what is wrong with it
-        return
-    if serial not in {"", SIMULATED_SERIAL}:
-        values["camera"] = f"l515:{serial}"  # others may be connected
+        return load_bench_record(Path(folder)).camera.serial
+    except CalibrationError:
+        return None
+
+
+def _is_simulated(serial: str) -> bool:
+    from nlos_cam.camera import SIMULATED_SERIAL
+
+    return serial in {"", SIMULATED_SERIAL}
+
+
+def _is_of_a_lidar(bench: Value | None) -> bool:
+    """Return True for a bench of the settings that a real lidar measured."""
+    if bench is None or bench.value is None:
+        return False
+    serial = _serial_of(str(bench.value))
+    return serial is not None and not _is_simulated(serial)
 
 
 def _is_another(given: str, setting: Value) -> bool:
@@ -315,6 +353,11 @@ def _is_result(given: object) -> bool:
     return path.suffix == ".html" or is_folder
 
 
+def _is_packaged(given: object) -> bool:
+    """Return True for the recording of the package, which is of no bench that a user has."""
+    return str(given) == SAMPLE and not Path(SAMPLE).is_file()
+
+
 def _choose_bench(values: Mapping[str, Any], used: dict[str, Value]) -> None:
     """Drop the settings that contradict the bench, wall, rig, dataset or saved session that was
     given.
@@ -324,6 +367,8 @@ def _choose_bench(values: Mapping[str, Any], used: dict[str, Value]) -> None:
     if any(_is_result(values.get(name)) for name in ("file", "camera")):
         for name in ("bench", "wall", "weights"):
             used.pop(name, None)
+    if any(_is_packaged(values.get(name)) for name in ("file", "bag")):
+        _drop_bench(values, used, SAMPLE)
     if any(values.get(name) is not None for name in ("wall", "data")) or _names_rig(values):
         used.pop("bench", None)
     if values.get("bench_folder") is not None or ("bench" in used and used["bench"].value):

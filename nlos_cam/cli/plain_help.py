@@ -15,9 +15,18 @@ PLACEHOLDERS = {
     "rig_name": "RIG",
     "ray": "ADDRESS",
     "out": "PATH",
+    "minutes": "MINUTES",
+    "max_seconds": "SECONDS",
 }
 """Placeholder of an option by its parameter; others follow from the suffix or the type."""
-SUFFIXES = {"_ms": "MS", "_m": "METRES", "_mm": "MM", "_deg": "DEGREES", "_ns": "NS"}
+SUFFIXES = {
+    "_ms": "MS",
+    "_s": "SECONDS",
+    "_m": "METRES",
+    "_mm": "MM",
+    "_deg": "DEGREES",
+    "_ns": "NS",
+}
 TYPES = {"path": "PATH", "int": "N", "float": "X", "str": "TEXT", "range": "N"}
 HUGE = 1e6
 TINY = 0.05
@@ -45,7 +54,9 @@ def _describe(parameter: Any) -> None:
     low = getattr(parameter, "min", None)
     high = getattr(parameter, "max", None)
     if text := range_text(low, high):
-        parameter.help = f"{(parameter.help or '').removesuffix('.')} ({text})."
+        sentence = parameter.help or ""
+        stem = sentence if sentence.endswith("...") else sentence.removesuffix(".")
+        parameter.help = f"{stem} ({text})."
     # typer has no public way to leave "[x>=0.1]" out
     parameter._get_number_range_help_str = lambda: None  # noqa: SLF001
     if parameter.param_type_name == "option" and parameter.metavar is None:
@@ -64,6 +75,7 @@ def placeholder(parameter: Any) -> str | None:
             return unit
     descriptor = parameter.type_descriptor
     kind = str(descriptor.path_type if descriptor.is_path else parameter.bare_type())
+    kind = kind.removeprefix("list[").removesuffix("]").lower()  # may be given several times
     return TYPES.get(kind.rsplit(" ", maxsplit=1)[-1], kind.upper())
 
 

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import nlos_calibration as walls
 import typer
+from nlos_calibration.errors import UnknownRigError
 from rich.table import Table
 
 from nlos_cam import bench as bench_folders
@@ -37,6 +38,7 @@ from nlos_cam.cli.render import (
     UpAxis,
     hidden_depth,
 )
+from nlos_cam.errors import did_you_mean
 
 if TYPE_CHECKING:
     from nlos_calibration.arrays import Float32
@@ -113,7 +115,7 @@ def predict(
         rig, hidden = str(bench_folder), rig
     elif hidden is None and rig is not None and names_object(rig):
         rig, hidden = None, rig
-    own, _ = benches.bench_or_rig(rig or PAPER_RIG)
+    own = _rig_of(rig or PAPER_RIG, is_alone=hidden is None)
     depth_m = _object_depth(hidden, own, placement)
     shape = None if depth_m is None else forecast.Shape.of(depth_m, objects.object_box(own))
     with interrupted_by_signals():
@@ -145,6 +147,19 @@ def predict(
     finish(facts, as_json=json, text="\n".join(lines))
     if shape is None and rig is not None and Path(rig).is_dir():  # last: it can be refused
         _renew_forecast(Path(rig), found)
+
+
+def _rig_of(name: str, *, is_alone: bool) -> walls.Rig:
+    """Return the rig of a name or path. Raises UnknownRigError, with the nearest object for a name
+    that is given alone, since it may be meant as one.
+    """
+    try:
+        return benches.bench_or_rig(name)[0]
+    except UnknownRigError as error:
+        if not is_alone:
+            raise
+        near = did_you_mean(name, objects.CATEGORIES)
+        raise UnknownRigError(f"{error}, or an object's name.{near}") from error
 
 
 def _object_depth(hidden: str | None, rig: walls.Rig, placement: dict[str, Any]) -> Float32 | None:

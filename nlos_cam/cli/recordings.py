@@ -48,9 +48,7 @@ Ply = Annotated[
 Streams = Annotated[
     str, typer.Option("--streams", help="Only these streams, separated by commas (default: all).")
 ]
-Every = Annotated[
-    int, typer.Option("--every", min=1, help="Only every Nth frame, counted (default: 1).")
-]
+Every = Annotated[int, typer.Option("--every", min=1, help="Only every Nth frame, counted.")]
 AsObject = Annotated[
     str,
     typer.Option(
@@ -72,7 +70,7 @@ Ros2 = Annotated[
 ]
 RosStorage = Annotated[
     Literal["sqlite3", "mcap"],
-    typer.Option("--storage", help="Storage of the bag of ROS 2 (default: sqlite3, a .db3)."),
+    typer.Option("--storage", help="Storage of the bag of ROS 2: a .db3 or an .mcap."),
 ]
 Metres = Annotated[
     bool,

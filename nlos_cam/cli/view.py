@@ -128,7 +128,8 @@ Stills = Annotated[
 ]
 Video = Annotated[bool, typer.Option("--video", help="Write a video, DIR/replay.webm.")]
 ViewFile = Annotated[
-    Path, typer.Argument(metavar="FILE", help="Recording (.bag), or saved session (.html).")
+    Path,
+    typer.Argument(metavar="FILE", help="Recording (.bag, or sample), or saved session (.html)."),
 ]
 Wall = Annotated[
     Path | None, typer.Option("--wall", help="Wall record of the recording's bench (wall.toml).")
@@ -162,7 +163,7 @@ def view(
             f"{file} is no recording: a transient is drawn by `nlos-cam info {shlex.quote(str(file))}"
             " --out look.html`"
         )
-    is_recording = file.suffix == ".bag" or recordings.is_ros2(file)
+    is_recording = recordings.is_ros2(file) or cameras.full_uri(file).startswith("bag:")
     if not is_recording and (wall or bench_folder or weights):
         raise typer.BadParameter(
             "--wall, --bench and --weights are for a recording (.bag): a saved session holds its"

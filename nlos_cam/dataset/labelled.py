@@ -74,6 +74,14 @@ def truth_depth_m(recording: Path, label: str, rig: Rig, known: Mapping[str, Flo
     )
 
 
+def check_truths(by_label: Mapping[str, Sequence[Path]], rig: Rig) -> None:
+    """Raise the errors of `truth_depth_m` that reading these recordings would end with, at once."""
+    known = benchmark_depths(shapes.object_box(rig))
+    for label, paths in by_label.items():
+        for path in paths:
+            truth_depth_m(path, label, rig, known)
+
+
 def _truth_file(folder: Path, name: str) -> Path | None:
     """Return the truth file of a name, if any. Raises RecordingError for two, or for a mesh without
     a pose.

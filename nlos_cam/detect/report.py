@@ -171,7 +171,8 @@ def amount(channel: str, value: float, *, signed: bool = False) -> str:
     if not isfinite(value):
         return NOT_DETERMINED
     factor, unit = UNITS[channel]
-    return f"{factor * value:{'+' if signed else ''}.2g} {unit}"
+    rounded = float(f"{factor * value:.2g}")
+    return f"{rounded:{'+' if signed else ''}g} {unit}"  # 300, where .2g alone writes 3e+02
 
 
 def _power_table(analysis: Analysis) -> Table:

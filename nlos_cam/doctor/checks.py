@@ -332,6 +332,21 @@ KNOWN_MESSAGES = (
         "the camera sends one frame again and again: its firmware stands still",
         FROZEN_FIX,
     ),
+    (
+        r"frames? did(n'?t| not) arrive",
+        "no frame came in time: a slow or loose USB link, a still device, or a recording's end",
+        "use its own cable in a USB 3 port, replug, then `nlos-cam doctor --camera l515`",
+    ),
+    (
+        r"resolve requests",
+        "no such streams: over USB 2 an L515 has 320 x 240 alone, which nlos-cam takes by itself",
+        "turn the plug round, or use a USB 3 cable and port",
+    ),
+    (
+        r"unindexed|wanted \d+ bytes, read",
+        "the recording was killed or cut before its index was written",
+        "nlos-cam repair F.bag --out repaired.bag",
+    ),
 )
 """Messages of librealsense and its viewer that owners report: pattern, meaning and fix."""
 
@@ -348,7 +363,7 @@ def stream(facts: Facts) -> Finding:
     """Check that the camera's frames come, and that each is another."""
     found = facts.watched
     if found is None:
-        return ok("no camera was watched: --camera l515 watches one for some seconds")
+        return skipped("no camera was watched: --camera l515 watches one for some seconds")
     if found.error:
         return failed(f"{found.camera}: {found.error}", "look at the other checks, then replug")
     if found.is_frozen:
@@ -366,7 +381,7 @@ def stream(facts: Facts) -> Finding:
 def reported(facts: Facts) -> Finding:
     """Explain a message that another program showed."""
     if not facts.reported:
-        return ok("no message was given: --message TEXT explains one")
+        return skipped("no message was given: --message TEXT explains one")
     if known := _known(facts.reported):
         return failed(*known)
     return warning(

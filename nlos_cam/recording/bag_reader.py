@@ -120,7 +120,7 @@ class BagReader:
     """
 
     def __init__(self, path: Path) -> None:
-        self.path = path = SAMPLE if str(path) == SAMPLE.stem and not path.exists() else path
+        self.path = path = SAMPLE if str(path) == SAMPLE.stem and not path.is_file() else path
         self.entries: dict[str, list[Entry]] = {}
         """Messages of each topic, in order of time."""
         self.types: dict[str, str] = {}

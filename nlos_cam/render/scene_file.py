@@ -336,8 +336,8 @@ def load_scene(path: Path) -> SceneFile:
     Raises SceneFileError with the first problem, SceneError for an object that cannot be seen.
     """
     content: dict[str, Any] = {}
-    # A bare name that is no file here is one of the packaged scenes.
-    if str(path) == path.stem and not path.exists():
+    # A bare name that is no file here is one of the packaged scenes; folders of results have such.
+    if str(path) == path.stem and not path.is_file():
         path = packaged_scenes().get(path.stem, path)
     try:
         content = read_toml(path)

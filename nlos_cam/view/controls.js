@@ -44,6 +44,7 @@ function reasonOf(error) {
 
 async function command(name, values = {}) {
   const words = NAMES[name] || name;
+  openTab(find('#tabs [data-panel="controls"]')); // a key works from every tab, the answer is in this one
   tellAnswer(`${words}…`);
   try {
     const headers = { "Content-Type": "application/json", "X-Token": token };
@@ -326,13 +327,18 @@ const plots = {
     for (const canvas of document.querySelectorAll("#plots canvas")) this.plot(canvas, canvas.dataset.name);
   },
 
+  // A piece of a series' line for the legend: its dashes tell it from the others without its color.
+  sample(k) {
+    return `<svg width="24" height="6" aria-hidden="true"><path d="M0 3H24" stroke="currentColor" stroke-width="1.5" stroke-dasharray="${this.dashes[k % 6]}"/></svg>`;
+  },
+
   plot(canvas, name) {
     const series = Object.keys(this.history.at(-1)[name]);
     const width = (canvas.width = canvas.clientWidth);
     const height = (canvas.height = canvas.clientHeight);
     const pen = canvas.getContext("2d");
     const values = this.history.flatMap((each) => Object.values(each[name]));
-    const legend = series.map((each, k) => `<span style="color:${this.colors[k % 6]}">${escape(each.replaceAll("_", " "))}</span>`);
+    const legend = series.map((each, k) => `<span style="color:${this.colors[k % 6]}">${this.sample(k)} ${escape(each.replaceAll("_", " "))}</span>`);
     canvas.parentElement.querySelector(".legend").innerHTML = legend.join(" ");
     if (!values.length) return; // a recording without temperatures: the canvas is clear
     const high = Math.max(...values, 1e-3) * 1.1;

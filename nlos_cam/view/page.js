@@ -7,7 +7,7 @@ let token = location.hash.slice(1) || sessionStorage.getItem("token") || "";
 if (token) sessionStorage.setItem("token", token);
 // The same address with another token is no navigation: the page is the one that is open.
 addEventListener("hashchange", () => location.reload());
-const state = { bench: null, moment: null, status: { state: "connecting" }, statusAt: 0, shown: 0, answer: "" };
+const state = { run: "", bench: null, moment: null, status: { state: "connecting" }, statusAt: 0, shown: 0, answer: "" };
 const bench = new Bench(find("#bench"));
 let pictures = null;
 
@@ -89,19 +89,23 @@ async function follow() {
   }
 }
 
-// Forget the run that was shown: another one begins.
-function begin() {
-  Object.assign(state, { bench: null, moment: null, status: { state: "connecting" }, statusAt: 0 });
+// A stream begins. One of another run makes the page forget; a live page that comes back to the same
+// run keeps what it saw. A recording is sent from its start each time.
+function begin(run) {
+  const comesBack = mode === "live" && Boolean(run) && run === state.run;
+  Object.assign(state, { run, status: { state: "connecting" }, statusAt: 0 });
   document.body.classList.toggle("recorded", mode !== "live");
   find("#offers").innerHTML = "";
   player.clear();
+  if (comesBack) return;
+  Object.assign(state, { bench: null, moment: null });
   kept.clear();
   plots.clear();
 }
 
 function handle(message) {
   if (message.kind === "hello" && message.mode !== mode) location.reload(); // another program, with another page
-  else if (message.kind === "hello") begin();
+  else if (message.kind === "hello") begin(message.run);
   else if (message.kind === "bench") setBench(message);
   else if (message.kind === "moment") {
     kept.add(message);
@@ -110,12 +114,16 @@ function handle(message) {
   else if (message.kind === "status") setStatus(message);
 }
 
+function sameBytes(one, other) {
+  return one !== null && one.length === other.length && one.every((byte, k) => byte === other[k]);
+}
+
 // ---- pictures -------------------------------------------------------------------------------------------------
 
 function setBench(message) {
   state.bench = message;
   state.lidar = null;
-  if (mode === "live") kept.clear(); // its moments are of the bench before
+  if (mode === "live" && !sameBytes(kept.bench, message.raw)) kept.clear(); // its moments are of the bench before
   kept.bench = message.raw;
   pictures = new Pictures(message);
   bench.setBench(message.parts, message.box);
@@ -377,10 +385,10 @@ function setStatus(status) {
   if (state.status.control) controls.update(state.status.control);
   controls.able();
   drawStatus();
-  if (mode === "live" && status.state === "ended") offer();
+  if (mode === "live" && ["ended", "no connection"].includes(status.state)) offer();
 }
 
-// After the end: what the page still holds can be played, and saved as a file.
+// After the end, which a killed program does not send: what the page still holds can be played, and saved as a file.
 function offer() {
   if (find("#offers").childElementCount || kept.moments.length < 2) return;
   const seconds = lasting(kept.seconds());
@@ -460,11 +468,13 @@ function drawNote(word) {
   setText("#note", what);
 }
 
-// For a screen reader: a verdict when it changes, and not the numbers of each frame.
+// For a screen reader: verdict and warnings when they change, and not the numbers of each frame.
 function speak() {
-  const words = state.moment ? find("#headline").textContent : find("#note").textContent;
-  if (state.spoken === words) return;
-  state.spoken = words;
+  const seen = ["#headline", "#warnings"].map((selector) => find(selector).textContent);
+  const words = state.moment ? seen.filter(Boolean).join(". ") : find("#note").textContent;
+  const news = words.replace(/[0-9.]+/g, "");
+  if (state.spoken === news) return;
+  state.spoken = news;
   find("#spoken").textContent = words;
 }
 

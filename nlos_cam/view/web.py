@@ -60,6 +60,7 @@ class Website:
         self._port = port
         self._controls = controls
         self._token = secrets.token_urlsafe(12)
+        self._hello = pack({"kind": "hello", "mode": self.mode, "run": secrets.token_hex(8)})
 
     def __enter__(self) -> Self:
         port = PREFERRED_PORT if self._port is None else self._port
@@ -171,7 +172,7 @@ class WebViewer(Website):
         with self._lock:
             self._watching += 1
         try:
-            send(pack({"kind": "hello", "mode": self.mode}))
+            send(self._hello)
             sent = Packet()
             count = 0
             while not self._closed.is_set():
@@ -243,7 +244,7 @@ class PlaybackViewer(Website):
                 self._changed.notify_all()
 
     def _stream(self, send: Send) -> None:
-        send(pack({"kind": "hello", "mode": self.mode}) + self._bench)
+        send(self._hello + self._bench)
         due_s = time.monotonic()
         for chunk in self._kept():
             if chunk:

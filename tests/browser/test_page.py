@@ -175,6 +175,7 @@ def test_refused_page_retries_and_a_hidden_one_makes_room(browser: Any) -> None:
             "window.away = false; document.dispatchEvent(new Event('visibilitychange'))"
         )
         page.wait_until(lambda: page.state()["frame"] == 30, "it goes on when it is looked at")
+        assert page.page.evaluate("kept.moments.length") > 1, "it keeps what it saw before"
         assert page.errors == []
         page.close()
 
@@ -292,6 +293,34 @@ def test_no_text_lies_over_a_picture_however_many_warnings(
         assert page.page.evaluate(UNDER_TEXT) == []
 
 
+@pytest.mark.parametrize("width", [390, 821, 900, 1180])
+def test_no_caption_of_a_picture_is_cut(browser: Any, width: int) -> None:
+    with WebViewer(RIG) as viewer:
+        viewer.show(full_moment(0))
+        page = Page(browser, viewer.address or "", (width, 800)).drawn()
+        cut = page.page.evaluate(
+            "[...document.querySelectorAll('figcaption, figure small')]"
+            ".filter((each) => each.offsetParent && each.scrollWidth > each.clientWidth)"
+            ".map((each) => each.textContent)"
+        )
+        assert cut == []
+        page.close()
+
+
+def test_legend_tells_the_lines_of_a_plot_apart_by_dashes(browser: Any) -> None:
+    with WebViewer(RIG) as viewer:
+        viewer.show(full_moment(0))
+        page = Page(browser, viewer.address or "").drawn()
+        page.page.click("#tabs button[data-panel='plots']")
+        page.wait_until(lambda: page.page.query_selector("#plots .legend svg") is not None, "plots")
+        dashes = page.page.evaluate(
+            "[...document.querySelector('#plots .legend').querySelectorAll('path')]"
+            ".map((each) => each.getAttribute('stroke-dasharray'))"
+        )
+        assert len(set(dashes)) == len(dashes) > 1
+        page.close()
+
+
 def test_color_bar_keeps_its_labels_apart_in_narrow_windows(browser: Any) -> None:
     with WebViewer(RIG) as viewer:
         viewer.show(full_moment(0))
@@ -341,6 +370,51 @@ def test_ended_run_can_be_played_and_saved_and_nothing_else(browser: Any, tmp_pa
     page.close()
     saved = Page(browser, (tmp_path / "session.html").as_uri()).drawn()
     assert saved.errors == []
+
+
+def test_page_of_a_killed_program_plays_what_it_saw(
+    browser: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("nlos_cam.view.web.ENDED", b"")
+    with WebViewer(RIG) as viewer:
+        viewer.show(full_moment(0))
+        page = Page(browser, viewer.address or "").drawn()
+        viewer.show(full_moment(20))
+        page.wait_until(lambda: page.state()["frame"] == 20, "the last moment")
+    page.wait_until(lambda: page.state()["headline"] == "No connection", "the loss")
+    page.page.click("#play-last")
+    page.wait_until(lambda: page.state()["frame"] < 20, "it plays")
+    page.close()
+
+
+def test_key_on_another_tab_shows_the_answer(browser: Any) -> None:
+    control = {"commands": ["record", "pause"], "options": [], "average": 1}
+    controls: Any = SimpleNamespace(
+        status=lambda: {"state": "running", "control": control},
+        run=lambda *_: "wrote snapshot.npz",
+        file=lambda _: None,
+    )
+    with WebViewer(RIG, controls=controls) as viewer:
+        viewer.show(full_moment(0))
+        page = Page(browser, viewer.address or "").drawn()
+        page.wait_until(lambda: page.page.query_selector("#snapshot") is not None, "the controls")
+        page.page.click("#tabs button[data-panel='plots']")
+        page.answer(lambda: page.page.keyboard.press("s"))
+        assert page.page.is_visible("#answer")
+        page.close()
+
+
+def test_warning_is_spoken_once_however_its_numbers_change(browser: Any) -> None:
+    with WebViewer(RIG) as viewer:
+        viewer.show(with_result(full_moment(0), warnings=("moved by 19.95 mm",)))
+        page = Page(browser, viewer.address or "").drawn()
+        spoken = "Object seen. moved by 19.95 mm"
+        page.wait_until(lambda: page.page.inner_text("#spoken") == spoken, "the warning")
+        viewer.show(with_result(full_moment(5), warnings=("moved by 20.1 mm",)))
+        page.wait_until(lambda: "20.1" in page.page.inner_text("#warnings"), "the next moment")
+        page.page.wait_for_timeout(600)
+        assert page.page.inner_text("#spoken") == spoken
+        page.close()
 
 
 def test_page_without_truth_shows_the_errors_in_its_place(browser: Any) -> None:

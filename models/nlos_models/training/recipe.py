@@ -346,7 +346,7 @@ def load_recipe(path: Path) -> Recipe:
     """Read a recipe from TOML, or a packaged one by name. Raises RecipeError with the first
     problem.
     """
-    if str(path) == path.stem and not path.exists():
+    if str(path) == path.stem and not path.is_file():  # the run's own folder may be called so
         path = _find_packaged(path.stem)
     try:
         return recipe_of(read_toml(path))

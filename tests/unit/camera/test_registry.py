@@ -4,11 +4,12 @@ import tomllib
 from pathlib import Path
 
 import pytest
+from made_benches import make_bench
 from packaging.requirements import Requirement
 
 from nlos_cam.camera import SIMULATED, open_camera
 from nlos_cam.camera.sdk import MAC_WHEEL, WHEEL, load_sdk, wheel_for
-from nlos_cam.errors import CameraError, CameraNotFoundError
+from nlos_cam.errors import CameraError, CameraNotFoundError, UnknownCameraError
 from nlos_cam.recording import ReplayCamera
 
 LATE = """
@@ -34,6 +35,18 @@ def test_path_of_a_recording_chooses_the_playback(noise_bag: Path, tmp_path: Pat
 
     assert isinstance(camera, ReplayCamera)
     assert camera.uri == f"bag:{path}"
+
+
+def test_recording_is_a_camera_by_its_path_and_by_its_name(noise_bag: Path) -> None:
+    assert open_camera(noise_bag).uri == f"bag:{noise_bag}"
+    assert open_camera("sample").uri == "bag:sample"
+
+
+def test_bench_folder_is_no_camera_and_names_its_option(tmp_path: Path) -> None:
+    bench = make_bench(tmp_path / "bench")
+
+    with pytest.raises(UnknownCameraError, match=f"--bench {bench}"):
+        open_camera(str(bench))
 
 
 def test_worlds_can_be_opened_and_report_progress(

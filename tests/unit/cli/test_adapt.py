@@ -1,11 +1,13 @@
 """The command `adapt`: up to where its work begins, and what it does with the result."""
 
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 from unittest.mock import Mock
 
 import pytest
 from made_adaptations import finish_network, job_in
+from made_benches import make_bench
 from nlos_calibration import load_rig
 
 from nlos_cam import adapt as adaptation
@@ -33,6 +35,23 @@ def test_what_is_no_bench_is_said_in_one_line(run: Any, bench: str, why: str, co
 
     assert why in err
     assert "Traceback" not in err
+
+
+def test_recording_of_an_unknown_object_is_refused_before_the_work(
+    run: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    make_bench(Path("bench"))
+    recordings = Path("bench/recordings")
+    recordings.mkdir()
+    for label in ("airplane-1", "bowl-1", "cup"):
+        (recordings / f"{label}.bag").touch()
+    monkeypatch.setattr(
+        "nlos_cam.adapt.recordings.load_sidecar",
+        lambda path: SimpleNamespace(label=path.stem, rig=None),
+    )
+    monkeypatch.setattr(adaptation, "adapt", Mock(side_effect=AssertionError))
+
+    assert "add cup.truth.toml" in run("adapt", "bench", code=4).err
 
 
 def test_weights_from_elsewhere_are_not_replaced_unasked(run: Any, out: Path) -> None:

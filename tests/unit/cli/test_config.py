@@ -116,7 +116,8 @@ def test_shipped_weights_are_named_in_the_users_file(folders: tuple[Path, Path])
 
 
 @pytest.mark.parametrize(
-    ("file", "given"), [("run.bag", ("mine", None)), ("view.html", (None, None))]
+    ("file", "given"),
+    [("run.bag", ("mine", None)), ("view.html", (None, None)), ("sample", (None, "own"))],
 )
 def test_bench_of_the_settings_is_for_recordings_in_view(
     monkeypatch: pytest.MonkeyPatch, file: str, given: tuple[str | None, ...]
@@ -171,6 +172,19 @@ def test_config_shows_values_and_sources(
     assert settings["camera"]["source"] == FILE
 
 
+def test_port_of_the_settings_is_for_the_demo_too(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv(variable("view_port"), "9300")
+    ports: list[int | None] = []
+
+    def command(view_port: int | None = None) -> None:
+        ports.append(view_port)
+
+    serve_as(monkeypatch, "demo", command)
+
+    assert main(["demo"]) == 0
+    assert ports == [9300]
+
+
 def test_verbose_prints_settings_in_use(
     folders: tuple[Path, Path], live: list[dict[str, Any]], shown: Run
 ) -> None:
@@ -216,6 +230,32 @@ def test_bench_of_the_settings_gives_way_to_what_is_given(
 
 
 @pytest.mark.parametrize(
+    ("serial", "words", "notes"),
+    [("f0000001", [], 1), ("f0000001", ["--bench", "other"], 0), ("simulated", [], 0)],
+)
+def test_left_out_bench_is_noted_where_no_other_is_named(
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    serial: str,
+    words: list[str],
+    notes: int,
+) -> None:
+    make_bench(Path("mine"), serial=serial)
+
+    def command(
+        camera: Camera = "sim",
+        bench_folder: Annotated[Path | None, typer.Option("--bench")] = None,
+    ) -> None:
+        del camera, bench_folder
+
+    serve_as(monkeypatch, "live", command)
+    Path(FILE).write_text('bench = "mine"\n', encoding="utf-8")
+
+    assert main(["live", "sim", *words]) == 0
+    assert capsys.readouterr().err.count("is not used with sim") == notes
+
+
+@pytest.mark.parametrize(
     ("serial", "words", "camera"),
     [
         ("f0000001", ["--bench", "bench"], "l515:f0000001"),
@@ -242,6 +282,38 @@ def test_bench_names_the_lidar_that_measured_it(
 
     assert main(["live", *words]) == 0
     assert calls == [camera]
+
+
+@pytest.mark.parametrize(
+    ("serial", "words", "note"),
+    [
+        ("simulated", [], "no CAMERA is given, so that sim is used"),
+        ("simulated", ["--bench", "bench"], "bench was measured on a scene that may be another"),
+        ("simulated", ["sim"], ""),
+        ("f0000001", ["--bench", "bench"], ""),
+    ],
+)
+def test_command_without_a_camera_says_that_sim_is_used(
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    serial: str,
+    words: list[str],
+    note: str,
+) -> None:
+    make_bench(Path("bench"), serial=serial)
+
+    def command(
+        camera: Camera = "sim",
+        bench_folder: Annotated[Path | None, typer.Option("--bench")] = None,
+    ) -> None:
+        del camera, bench_folder
+
+    serve_as(monkeypatch, "live", command)
+
+    assert main(["live", *words]) == 0
+    found = capsys.readouterr().err
+    assert note in found
+    assert bool(note) == ("sim is used" in found)
 
 
 @pytest.mark.parametrize(

@@ -356,6 +356,10 @@ def saved(tmp_path: Path) -> Path:
     return path
 
 
+def test_view_plays_the_recording_of_the_package(run: Run) -> None:
+    assert run("view", "sample", "--seconds", "0.1")["file"] == "sample"
+
+
 def test_view_of_a_saved_session_ends_after_its_seconds(saved: Path) -> None:
     assert main(["view", str(saved), "--seconds", "0.1"]) == 0
 

@@ -290,9 +290,9 @@ def test_option_help_has_placeholders_and_ranges_in_words(shown: Run) -> None:
     options = {parameter.name: parameter for parameter in parameters}
 
     assert options["seconds"].metavar == "SECONDS"
-    assert options["takes"].metavar == "N"
-    assert options["overwrite"].metavar == ""
-    assert options["takes"].help.endswith("(1 to 9999).")
+    kinds = {"takes": "N", "overwrite": "", "label": "TEXT", "pause_s": "SECONDS"}
+    assert {name: options[name].metavar for name in kinds} == kinds
+    assert options["takes"].help.endswith("F-02.bag, ... (1 to 9999).")
     assert not {"<bool>", "<=", ">="} & {*shown("capture", "--help").out.replace("[", " ").split()}
 
     texts = {(1, 65535): "1 to 65535", (0.1, None): "at least 0.1", (None, 5): "at most 5"}

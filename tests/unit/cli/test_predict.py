@@ -159,6 +159,31 @@ def test_predict_bench_names_a_folder_that_is_none(
     assert words in capsys.readouterr().err
 
 
+@pytest.mark.parametrize(
+    ("words", "code", "hint"),
+    [
+        (["predict", "cupp"], 2, "'cup'"),
+        (["predict", "cupp", "cup"], 2, "a bench folder"),
+        (["predict", "nowhere"], 2, "a bench folder"),
+        (["predict", "nowhere/"], 4, "no bench folder nowhere"),
+        (["adapt", "nowhere/"], 4, "no bench folder nowhere"),
+    ],
+)
+def test_wrong_rig_or_bench_says_what_it_might_be(
+    words: list[str],
+    code: int,
+    hint: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+
+    assert main(words) == code
+
+    assert hint in capsys.readouterr().err
+
+
 @pytest.mark.parametrize("wrong", ["nowhere.toml", "papper-rig", "bare-wall", "empty-folder"])
 def test_predict_refuses_what_is_no_rig_in_one_line(
     wrong: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]

@@ -72,6 +72,7 @@ calibrate --wall --square-mm 30 | --board
 calibrate --wall --paper a4 | --board
 calibrate --occluder wall.toml --board | --board
 calibrate --occluder wall.toml --watch | --watch
+calibrate --wall --watch --bag run.bag | --watch
 calibrate --occluder wall.toml --tape-m 0.2 | --tape-m
 calibrate --occluder wall.toml --out wall.toml --overwrite | wall.toml
 board --paper a5 | a4

@@ -9,6 +9,7 @@ from pydantic import ValidationError
 
 from nlos_cam.detect import Analysis, analyze
 from nlos_cam.detect.analysis import lock_weights, sign_patterns
+from nlos_cam.detect.report import amount
 from nlos_cam.errors import RecordingError
 
 RUNS = 40
@@ -143,3 +144,10 @@ def test_too_few_turns_are_refused() -> None:
     plan = made_plan()
     with pytest.raises(RecordingError, match="too few"):
         analyze(plan, made_turns(plan)[:12])
+
+
+@pytest.mark.parametrize(
+    ("value_m", "words"), [(0.3041, "+300 mm"), (-0.00044, "-0.44 mm"), (1.234, "+1200 mm")]
+)
+def test_effect_is_written_without_an_exponent(value_m: float, words: str) -> None:
+    assert amount("depth", value_m, signed=True) == words

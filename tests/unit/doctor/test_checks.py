@@ -320,6 +320,9 @@ REPORTED = {
     "RuntimeError: failed to set power state": "root|sudo nlos-cam doctor",
     "cannot parse device name from 'Platform Camera'": f"pip install {WHEEL}",
     "the same frame number again and again": "stands still|unplug the camera",
+    "Frame didn't arrive within 5000": "no frame came in time|doctor --camera l515",
+    "RuntimeError: Couldn't resolve requests": "320 x 240|USB 3 cable",
+    "Failed to create ros reader: Bag unindexed": "cut before its index|nlos-cam repair",
 }
 
 OWNERS_MEET = [

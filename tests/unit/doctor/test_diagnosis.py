@@ -86,7 +86,9 @@ scans = st.builds(UsbScan, st.lists(devices, max_size=2).map(tuple), st.integers
 def test_healthy_bench_passes_every_check_in_a_fixed_order(bench: Any) -> None:
     checks = bench.checks()
 
-    assert {check.status for check in checks.values()} == {"ok"}
+    unasked = {"stream", "reported"}  # by --camera and --message
+    assert {name for name, check in checks.items() if check.status == "skipped"} == unasked
+    assert {checks[name].status for name in checks.keys() - unasked} == {"ok"}
     assert "f0246262" in checks["sdk-camera"].detail
     assert list(CHECKS) == NAMES.split() == list(checks)
     assert set(CAUSES) < set(CHECKS)

@@ -33,6 +33,15 @@ def test_committed_recipe_loads_by_path_or_name(path: Path) -> None:
     )
 
 
+def test_recipe_loads_by_name_beside_the_folder_of_its_run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("vae").mkdir()  # of `train vae --recipe vae --out vae`, which goes on there
+
+    assert load_recipe(Path("vae")).task == "vae"
+
+
 def test_si_recipes_have_the_values_of_the_paper() -> None:
     vae, compressor, transfer = (
         load_recipe(RECIPES / f"si-{task}.toml") for task in ("vae", "compressor", "transfer")

@@ -136,6 +136,15 @@ def test_frames_come_in_recorded_order_and_by_index(bag: BagReader) -> None:
         np.testing.assert_array_equal(again.pixels, sample.pixels)
 
 
+def test_packaged_recording_opens_beside_a_folder_of_its_name(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("sample").mkdir()
+
+    assert BagReader(Path("sample")).streams.keys() >= {"depth", "infrared"}
+
+
 def test_sample_owns_its_pixels_and_ends_at_the_last(noise_bag: Path) -> None:
     bag = BagReader(noise_bag)
     bag.sample("depth", 0).pixels[:] = 0

@@ -347,3 +347,12 @@ def test_packaged_scenes_load_by_name() -> None:
 
     assert {"empty", "cup", "faults", "warming", "bench"} == names.keys()
     assert load_scene(Path("empty")) == load_scene(names["empty"])
+
+
+def test_packaged_scene_loads_beside_a_folder_of_its_name(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("cup").mkdir()  # such as `replay --out cup` makes
+
+    assert load_scene(Path("cup")).name == "cup"

@@ -65,6 +65,13 @@ def test_browsers_receive_bench_status_and_the_newest_moment(viewer: WebViewer) 
         assert found["bench"]["rig"] == RIG.name
 
 
+def test_run_has_a_name_by_which_a_page_knows_it_again(viewer: WebViewer) -> None:
+    first, again = (next(frames(viewer))["run"] for _ in range(2))
+    with WebViewer(RIG) as another:
+        assert next(frames(another))["run"] != first
+    assert first == again
+
+
 def test_measured_bench_is_sent_again_and_leaving_ends_streams() -> None:
     with WebViewer() as viewer:
         received = frames(viewer)
