@@ -257,14 +257,23 @@ def _edges(pixels: int, cells: int) -> NDArray[np.int64]:
 def maps_from_frame(frame: Frame) -> LidarMaps:
     """Reduce the full field of a frame to (64, 80) cells: median depth, and mean intensity near
     that median.
+
+    Raises ValueError if the depth and the infrared image differ in shape.
     """
+    # The compiled loop reads both images at the same places, without a check of its own.
+    if frame.ir.shape != frame.depth_m.shape:
+        raise ValueError(
+            f"a frame has a depth image {frame.depth_m.shape} and an infrared image"
+            f" {frame.ir.shape}: they must have one shape"
+        )
     height, width = frame.depth_m.shape
     max_samples = ceil(height / MAP_ROWS + 1) * ceil(width / MAP_COLUMNS + 1)
     edges = _edges(height, MAP_ROWS), _edges(width, MAP_COLUMNS)
     depth = np.full((MAP_ROWS, MAP_COLUMNS), np.nan, np.float32)
     intensity = np.zeros((MAP_ROWS, MAP_COLUMNS), np.float32)
     scratch = scratch_memory(max_samples)
-    _reduce_cells(frame.depth_m.view(np.int32), frame.ir, *edges, scratch, depth, intensity)
+    depth_bits = frame.depth_m.astype(np.float32, copy=False).view(np.int32)
+    _reduce_cells(depth_bits, frame.ir, *edges, scratch, depth, intensity)
     return LidarMaps(depth, intensity, ~np.isnan(depth))
 
 

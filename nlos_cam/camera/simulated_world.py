@@ -95,7 +95,9 @@ def open_world(name: str, on_progress: OnProgress | None = None) -> World:
     loop = read_packaged(scene)
     if loop is None:
         cached = cache_folder() / "worlds" / f"{scene.checksum}.npz"
-        loop = load_cached(cached, _unpack, lambda: pack_loop(*render_loop(scene, on_progress)))
+        loop = load_cached(
+            cached, _unpack_cached, lambda: pack_loop(*render_loop(scene, on_progress))
+        )
     echoes, truths = loop
     return World(scene, echoes, list(truths) if scene.hidden else [None])
 
@@ -139,8 +141,19 @@ def pack_loop(echoes: list[renderer.MultiBounce], truths: list[Float32]) -> byte
         path_m_by_byte=_by_byte(echo.path_m for echo in echoes),
         direct_included=echoes[0].direct_included,
         truth_m_by_byte=_by_byte(truths),
+        stopped_by_byte=_by_byte(_stops(echoes)),
     )
     return packed.getvalue()
+
+
+def _stops(echoes: list[renderer.MultiBounce]) -> list[Float32]:
+    """Return light and length (2, rows, columns) of the beams that the object stops in each pose;
+    (2, 0, 0) where it stops none in any.
+    """
+    if all(echo.stopped is None for echo in echoes):
+        return [np.zeros((2, 0, 0), np.float32)] * len(echoes)
+    nothing = np.full((2, *echoes[0].peak.shape), np.nan, np.float32)
+    return [nothing if echo.stopped is None else np.stack(echo.stopped) for echo in echoes]
 
 
 def _unpack(content: bytes) -> Loop:
@@ -150,8 +163,28 @@ def _unpack(content: bytes) -> Loop:
         path_m = _joined(file["path_m_by_byte"])
         truth_m = _joined(file["truth_m_by_byte"])
         mixed = bool(file["direct_included"])
-        poses = zip(peak, runner_up, path_m, strict=True)
-        return [renderer.MultiBounce(*pose, mixed) for pose in poses], list(truth_m)
+        # In the packaged scenes, which were stored without this, the object stops no beam.
+        stops = [None] * len(peak)
+        if "stopped_by_byte" in file:
+            pairs = _joined(file["stopped_by_byte"])
+            stops = [renderer.StoppedBeams(*pair) if pair.size else None for pair in pairs]
+        echoes = [
+            renderer.MultiBounce(one_peak, second, length_m, mixed, stopped)
+            for one_peak, second, length_m, stopped in zip(
+                peak, runner_up, path_m, stops, strict=True
+            )
+        ]
+        return echoes, list(truth_m)
+
+
+def _unpack_cached(content: bytes) -> Loop:
+    """Return the loop of a cache entry. Raises ValueError for one by a version that took the wall
+    to be seen through an object that stands before it.
+    """
+    with np.load(BytesIO(content)) as file:
+        if "stopped_by_byte" not in file:
+            raise ValueError("an earlier version stored it")
+    return _unpack(content)
 
 
 def _by_byte(poses: Iterable[Float32]) -> UInt8:

@@ -27,6 +27,7 @@ __all__ = [
     "Sensor",
     "SensorModel",
     "Stop",
+    "StoppedBeams",
     "Stopwatch",
     "Surface",
     "TransientAxes",
@@ -72,7 +73,7 @@ from .accuracy_table import choose
 from .agreement import Agreement, EchoMaps, agreement
 from .backend_cpu import histograms
 from .backend_torch import device_named, histograms_of_all
-from .echoes import MultiBounce, with_pulse
+from .echoes import MultiBounce, StoppedBeams, with_pulse
 from .effect_costs import Stopwatch, Work, costs, least_seconds
 from .effects import EFFECTS, Effect, Effects, included
 from .geometry import Beams, cast

@@ -254,13 +254,7 @@ class NumbaJob:
         """
         per_bin = self.job.accuracy.sub_bins
         # sub-bins of each patch, and their sums to bins for each shift
-        values = len(self.first) * per_bin * (2 * self.width + WINDOW)
-        if (needed := values * np.dtype(np.float32).itemsize) > MAX_TABLE_BYTES:
-            raise SceneError(
-                f"tables of {len(self.first)} patches with bins of {1e3 * self.job.bin_m:g} mm need"
-                f" {needed / 2**30:.1f} GiB, at most {MAX_TABLE_BYTES >> 30}: widen the bins, or"
-                " hide an object of fewer cells"
-            )
+        check_tables(self.job, len(self.first), per_bin * (2 * self.width + WINDOW))
         sites = self.surface, self.relay, *self.sites[3:]
         fine = sub_bins(*sites, self.first, per_bin, self.width)
         found = fine
@@ -282,6 +276,19 @@ class NumbaJob:
         feet = self.feet(np.ones(len(self.job.laser_spot_m)))
         tiles = np.arange(len(feet.bounds_m))
         return shift_and_add(tiles, feet, *self.sites, table, self.job.bins)[feet.place]
+
+
+def check_tables(job: TransportJob, patches: int, values: int) -> None:
+    """Raise SceneError if tables of some patches, with a number of float32 values for each, would
+    take more than MAX_TABLE_BYTES.
+    """
+    needed = patches * values * np.dtype(np.float32).itemsize
+    if needed > MAX_TABLE_BYTES:
+        raise SceneError(
+            f"tables of {patches} patches with bins of {1e3 * job.bin_m:g} mm need"
+            f" {needed / 2**30:.1f} GiB, at most {MAX_TABLE_BYTES >> 30}: widen the bins, or hide"
+            " an object of fewer cells"
+        )
 
 
 def _single(column: Float64) -> Float32:

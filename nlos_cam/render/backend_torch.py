@@ -19,7 +19,7 @@ from torch.nn.functional import avg_pool1d, embedding_bag, pad
 
 from nlos_cam.errors import SceneError
 from nlos_cam.render import backend_cpu
-from nlos_cam.render.backend_numba import horizons, table_bins
+from nlos_cam.render.backend_numba import check_tables, horizons, table_bins
 from nlos_cam.render.interreflection import add_interreflection
 from nlos_cam.render.job import TransportJob
 from nlos_cam.render.visibility import FACES, bias_m
@@ -317,6 +317,8 @@ def histograms(job: TransportJob, device: torch.device) -> Float32:
 def histograms_of_all(jobs: Sequence[TransportJob], device: torch.device) -> list[Float32]:
     """Return the histograms of many jobs; those that differ in the object alone are computed
     together.
+
+    Raises SceneError for a job whose tables would take more memory than is tried.
     """
     alike: dict[object, list[int]] = {}
     found: dict[int, Float32] = {}
@@ -381,6 +383,9 @@ class _Batch:
         # The widest table of the batch serves all: a window is as wide for each.
         self.per_bin = job.accuracy.sub_bins
         self.width = max(table_bins(one)[1] for one in jobs)
+        for one in jobs:
+            # sub-bins of each patch, and their sums to bins for each shift
+            check_tables(one, len(one.patches.beta), 2 * self.per_bin * self.width)
         self.per_m = self.per_bin / job.bin_m
 
     def histograms(self) -> list[Float32]:

@@ -4,6 +4,7 @@ spread it.
 
 from dataclasses import dataclass
 from math import erf, sqrt
+from typing import NamedTuple
 
 import numba
 import numpy as np
@@ -15,6 +16,15 @@ from nlos_cam.render.geometry import SPEED_OF_LIGHT_M_PER_S, Beams
 SIGMAS_PER_FWHM = 1 / np.sqrt(8 * np.log(2))
 TRANSFORM_VALUES = 1 << 23
 """Values of the waveforms that are transformed at once."""
+
+
+class StoppedBeams(NamedTuple):
+    """Beams that the hidden object stops on their way to the wall, and what it returns of them."""
+
+    direct: Float32
+    """(rows, columns); in units of I0, NaN for beams that it does not stop."""
+    length_m: Float32
+    """(rows, columns); d1, up to the object; NaN likewise."""
 
 
 @dataclass(frozen=True)
@@ -32,6 +42,10 @@ class MultiBounce:
     direct_included: bool = False
     """True if the waveform contains the direct return: a pulse with a width mixes it with the
     rest.
+    """
+    stopped: StoppedBeams | None = None
+    """Beams that have no direct return of the wall; None where the object stops none, or where the
+    waveform contains the direct return.
     """
 
     def reshape(self, shape: tuple[int, int]) -> "MultiBounce":

@@ -16,7 +16,7 @@ import numpy as np
 from nlos_calibration.arrays import Float32, Float64, Int32, Int64
 
 from nlos_cam.frames import inner
-from nlos_cam.render.backend_numba import NumbaJob, returns
+from nlos_cam.render.backend_numba import NumbaJob, check_tables, returns
 from nlos_cam.render.beam_sums import ROUNDED, NumbaGroups, NumbaTables, ends
 from nlos_cam.render.echoes import MultiBounce, strongest
 from nlos_cam.render.job import TransportJob
@@ -36,6 +36,11 @@ from nlos_cam.render.legs import (
 from nlos_cam.render.material import Brdf, phong
 from nlos_cam.render.visibility import HeightField
 
+IN_ORDER = FAST - {"reassoc"}
+"""Liberties of the compiler, without that of the order of a sum. Each function is compiled into
+every one that calls it: with it the copies round apart, and the process that compiles the kernels
+had other last bits than those that load them.
+"""
 LANES = 8
 """Nodes whose tables are counted together: one vector of float32."""
 CHUNK = 16
@@ -183,7 +188,7 @@ def _weights(at: np.float32, weight: Float32) -> None:
     weight[3] = (at + one) * at * (at - one) / six
 
 
-@inner(error_model="numpy", fastmath=FAST)
+@inner(error_model="numpy", fastmath=IN_ORDER)
 def _multiply_roots(values: Float32, base: Float32, fraction: int) -> None:
     """Multiply by the base to a power in 1 / 256: a square root for each binary digit."""
     root = base.copy()
@@ -198,7 +203,7 @@ def _multiply_roots(values: Float32, base: Float32, fraction: int) -> None:
         digit >>= 1
 
 
-@inner(error_model="numpy", fastmath=FAST)
+@inner(error_model="numpy", fastmath=IN_ORDER)
 def _power(values: Float32, lobe: Lobe, square: Float32) -> None:
     """Raise cosines to the lobe's exponent, in place, and set those below its cut to 0."""
     # By repeated squaring: whole vectors of products, where a logarithm would be a call for each.
@@ -298,7 +303,7 @@ def _chunks(cells: Cells) -> Chunks:
     return chunks
 
 
-@inner(error_model="numpy", fastmath=FAST)
+@inner(error_model="numpy", fastmath=IN_ORDER)
 def _fill_raised(cosines: Float32, factors: Float32, lobe: Lobe, raised: Float32) -> None:
     """Fill in the factors by which a lobe's values are raised at some cosines to its axes."""
     raised[:] = 1
@@ -320,7 +325,7 @@ def _fill_raised(cosines: Float32, factors: Float32, lobe: Lobe, raised: Float32
             raised[i * LANES + lane] += factors[lane] * terms
 
 
-@inner(error_model="numpy", fastmath=FAST)
+@inner(error_model="numpy", fastmath=IN_ORDER)
 def _count(
     axes: Float32,
     lobe: Lobe,
@@ -372,7 +377,7 @@ def _count(
     return first, last
 
 
-@inner(error_model="numpy", fastmath=FAST)
+@inner(error_model="numpy", fastmath=IN_ORDER)
 def _as_rows(
     counted: Float32,
     total: Float64,
@@ -493,7 +498,7 @@ def _corners(surface: NumbaSurface, feet: NumbaPoints, lobe: Lobe) -> Int32:
     return corners
 
 
-@inner(error_model="numpy", fastmath=FAST)
+@inner(error_model="numpy", fastmath=IN_ORDER)
 def _patch_rows(
     s: int,
     surface: NumbaSurface,
@@ -616,7 +621,7 @@ def _begins(
     return begin, bins.max()
 
 
-@inner(error_model="numpy", fastmath=FAST)
+@inner(error_model="numpy", fastmath=IN_ORDER)
 def _add_tile(
     start: int,
     size: int,
@@ -752,6 +757,8 @@ def _sums(
 ) -> tuple[Int64, Float32, Float32]:
     """Return the bin (n,) at which each beam's window begins, its sums (n, bins), and a bound (n,)
     on later bins.
+
+    Raises SceneError where the tables would take more memory than is tried.
     """
     surface, groups, centers, optics, field = numba_job.sites
     per_bin = numba_job.job.accuracy.sub_bins
@@ -772,6 +779,7 @@ def _sums(
     patches = len(surface.x_m)
     block = max(TABLE_BYTES // (4 * per_bin * nodes * span), numba.get_num_threads())
     block = min(block, patches)
+    check_tables(numba_job.job, block, nodes * (per_bin * span + table.width + 1))
     # A row is read up to a window beyond its end: into the next one's zeros, or those after the
     # last.
     flat = np.zeros(block * nodes * per_bin * span + WINDOW, np.float32)

@@ -461,7 +461,8 @@ def intensity_noise(gradients: Gradients, model: SensorModel, frames: int = 1) -
     """Return the standard deviation (rows, columns) of the intensities, as the mean over pixels and
     frames.
 
-    Shot, read and quantization noise; infinite for saturated beams, which determine nothing.
+    Shot, read and quantization noise; infinite for saturated beams, which determine nothing, and
+    for all beams of a lidar to which nothing of the wall returns.
     """
     scene = gradients.problem.scene
     shape = gradients.intensity.shape
@@ -469,6 +470,8 @@ def intensity_noise(gradients: Gradients, model: SensorModel, frames: int = 1) -
     brightest = cast(
         bare, scene.intrinsics(), lambertian=scene.radiometry == "lambertian"
     ).direct.max()
+    if brightest == 0:
+        return np.full(shape, np.inf)
     gain = model.bare_wall_counts / brightest
     # Variances of read noise, of photons (in proportion to the counts), and of rounding to whole
     # counts (1 / 12) add; the mean over a cell's pixels and frames divides them.

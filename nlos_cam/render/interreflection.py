@@ -262,6 +262,18 @@ def _wall_extent(job: TransportJob) -> Float64:
     return np.stack([np.maximum(low, wall[[0, 2]]), np.minimum(high, wall[[1, 3]])])
 
 
+def longest_detour_m(point_m: Float64) -> float:
+    """Return a bound on the way from one of some patches (n, 3) to another, directly or over the
+    wall for interreflection.
+    """
+    # The wall reaches no farther than AROUND_M beyond the object, so that a leg between the two
+    # goes at most that much farther than across the object, and as deep as the deepest patch. Over
+    # the wall there are two such legs; straight from patch to patch is shorter than one.
+    width, height, _ = np.ptp(point_m, axis=0)
+    depth = point_m[:, 2].max()
+    return 2 * float(np.linalg.norm([width + AROUND_M, height + AROUND_M, depth]))
+
+
 def wall_cell_m2(job: TransportJob) -> float:
     """Return the area of a cell of that wall."""
     return float(np.prod(np.maximum(np.diff(_wall_extent(job), axis=0), 0.0)) / WALL_CELLS**2)

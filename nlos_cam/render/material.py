@@ -15,6 +15,9 @@ from pydantic_core import PydanticCustomError
 
 from nlos_cam.errors import SceneError
 
+MAX_GIVEN_BACK = 1.0001
+"""Largest sum of a BRDF's parts: all of the light, with room for a sum of rounded parts."""
+
 
 class Brdf(NamedTuple):
     """Diffuse part and one lobe, relative to a white Lambertian surface."""
@@ -99,7 +102,7 @@ class Material(Record):
 @dataclass(frozen=True)
 class Surface:
     """Albedo and BRDF of a hidden object. Raises SceneError for an albedo of another shape or
-    outside 0 to 1.
+    outside 0 to 1, and for a BRDF that gives back more light than it gets.
     """
 
     albedo: NDArray[np.floating[Any]] | float = 1.0
@@ -118,6 +121,8 @@ class Surface:
             raise SceneError(
                 f"albedo ranges from {albedo.min():g} to {albedo.max():g}: it must be from 0 to 1"
             )
+        if self.brdf is not None:
+            _check_brdf(self.brdf)
 
     @property
     def colored(self) -> bool:
@@ -136,6 +141,17 @@ class Surface:
                 f"albedo has {albedo.shape[:2]} cells but the depth map has {shape}: use one shape"
             )
         return np.broadcast_to(albedo, (*shape, albedo.shape[-1]))
+
+
+def _check_brdf(brdf: Brdf) -> None:
+    diffuse, specular, exponent, _ = brdf
+    if not (diffuse >= 0 and specular >= 0 and diffuse + specular <= MAX_GIVEN_BACK):
+        raise SceneError(
+            f"a BRDF gives back {diffuse:g} diffusely and {specular:g} in its lobe: both must be at"
+            " least 0, and their sum at most 1"
+        )
+    if not 0 < exponent < np.inf:
+        raise SceneError(f"a BRDF's exponent is {exponent:g}: it must be finite and above 0")
 
 
 def brdf_mean(brdf: Brdf) -> float:

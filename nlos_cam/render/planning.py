@@ -9,7 +9,7 @@ from math import sqrt
 from typing import Self
 
 import numpy as np
-from nlos_calibration.arrays import Float64
+from nlos_calibration.arrays import Float64, Mask
 
 from nlos_cam.errors import SceneError
 from nlos_cam.frames import MAP_ROWS
@@ -25,7 +25,7 @@ from nlos_cam.render.geometry import (
     occluder_edge,
     solid_angle,
 )
-from nlos_cam.render.interreflection import AROUND_M
+from nlos_cam.render.interreflection import longest_detour_m
 from nlos_cam.render.job import TransportJob
 from nlos_cam.render.line_of_sight import DirectVisibility
 from nlos_cam.render.material import Surface, brdf_mean
@@ -194,6 +194,8 @@ class RenderProblem:
     tint: Float64 | None = None
     """(n, 3); direct return of each beam in red, green and blue, relative to the mean; None where
     all of them return from something white."""
+    stopped: Mask | None = None
+    """(n,); True for beams that the object stops; None where it stops none."""
 
     @classmethod
     def of(cls, facts: SceneFacts, verdicts: Plan, rows: tuple[int, int] | None = None) -> Self:
@@ -211,6 +213,7 @@ class RenderProblem:
         beams = facts.beams(occluder=with_occluder)
         hidden = facts.relay.behind(edge_m, beams.lidar_m)
         tint = None
+        stopped = None
         if included(verdicts, "line-of-sight") and (blocked := facts.line_of_sight) is not None:
             albedo = facts.albedo[blocked.row, blocked.column] * _returned_by(
                 scene.surface, blocked, with_brdf=included(verdicts, "brdf")
@@ -221,6 +224,8 @@ class RenderProblem:
             )
             hidden |= blocked.hidden
             tint = _tint(facts, blocked, len(beams.direct))
+            stopped = np.zeros_like(beams.on_wall)
+            stopped[blocked.beam] = True
         if not included(verdicts, "direct"):
             beams = beams.without_direct()
         relay = facts.relay.select(~hidden)
@@ -230,10 +235,17 @@ class RenderProblem:
             _job(facts, verdicts, beams, (start, end), relay, edge_m, channel)
             for channel in (None, *range(3 if colored else 0))
         ]
-        if tint is not None:
-            tint = tint[start * beams.shape[1] : end * beams.shape[1]]
-        seen = beams.rows(start, end)
-        return cls(scene, facts.accuracy, verdicts, seen, jobs[0], tuple(jobs[1:]), tint)
+        wanted = slice(start * beams.shape[1], end * beams.shape[1])
+        return cls(
+            scene,
+            facts.accuracy,
+            verdicts,
+            beams.rows(start, end),
+            jobs[0],
+            tuple(jobs[1:]),
+            tint=None if tint is None else tint[wanted],
+            stopped=None if stopped is None else stopped[wanted],
+        )
 
     @property
     def channels(self) -> list[Self]:
@@ -298,10 +310,8 @@ def _job(
     if included(verdicts, "brdf"):
         job = replace(job, brdf=facts.scene.surface.brdf)
     if included(verdicts, "inter-reflection"):
-        # By way of another patch, or of the wall around it, a path gets longer by at most twice
-        # across that wall.
-        longer_m = 2 * np.linalg.norm(np.ptp(patches.point_m, axis=0) + 2 * AROUND_M)
-        bins = min(job.bins + int(np.ceil(longer_m / job.bin_m)), gate_bins(facts.rig.device))
+        longer = int(np.ceil(longest_detour_m(patches.point_m) / job.bin_m))
+        bins = min(job.bins + longer, gate_bins(facts.rig.device))
         job = replace(job, more_bounces=True, bins=bins)
     if not wanted.all():
         job = job.select(np.flatnonzero(wanted[beams.on_wall]))

@@ -21,6 +21,7 @@ from nlos_cam.render import backend_cpu, backend_reference
 from nlos_cam.render.accuracy import Accuracy, accuracy_named
 from nlos_cam.render.echoes import (
     MultiBounce,
+    StoppedBeams,
     add_direct,
     compete,
     no_echoes,
@@ -82,8 +83,11 @@ def render(
 ) -> Rendering:
     """Return depth, intensity and margin of every map cell, or of the rows [first, second).
 
-    Raises SceneError for a scene that cannot be rendered.
+    Raises SceneError for a scene that cannot be rendered, or rows that the map does not have.
     """
+    start, end = rows or (0, MAP_ROWS)
+    if not 0 <= start < end <= MAP_ROWS:
+        raise SceneError(f"rows are {start} to {end}: choose some of 0 to {MAP_ROWS}")
     facts = SceneFacts(scene, accuracy_named(accuracy))
     problem = RenderProblem.of(facts, plan(facts, effects), rows)
     return _rendering(problem, _echoes(problem, backend), backend)
@@ -127,7 +131,7 @@ def transient(
 
 @dataclass(frozen=True)
 class TransientAxes:
-    """What the numbers of `transient` are over, in the wall frame in metres."""
+    """Axes of the histograms of `transient`: bins, beams and relay cells, in the wall frame."""
 
     path_m: Float64
     """(n,); middle of each bin up to the gate: bin k holds paths from k to k + 1 times `bin_m`.
@@ -186,6 +190,7 @@ def beam_histograms(
     """Return the three-bounce histograms of a problem's beams, or of the chosen; 0 for beams that
     miss the wall.
     """
+    _check_backend(backend)
     lit = problem.beams.on_wall
     chosen = np.arange(len(lit)) if chosen is None else chosen
     # A job holds the beams that light the wall alone, in their order: the running count of lit
@@ -204,10 +209,9 @@ def transport(job: TransportJob | None, backend: str) -> Histograms | None:
     An accuracy without sub-bins is the reference, on any backend. Raises SceneError if there is no
     such backend or GPU.
     """
+    _check_backend(backend)
     if job is None:
         return None
-    if backend not in BACKENDS:
-        raise SceneError(f"no backend {backend!r}: choose one of {', '.join(BACKENDS)}")
     if job.accuracy.sub_bins == 0:
         return backend_reference.histograms(job)
     if backend == "cpu":
@@ -215,6 +219,12 @@ def transport(job: TransportJob | None, backend: str) -> Histograms | None:
     from nlos_cam.render import backend_torch  # torch takes a second to import
 
     return backend_torch.histograms(job, backend_torch.device_named(backend))
+
+
+def _check_backend(backend: str) -> None:
+    """Raise SceneError if there is no backend of that name, also where nothing calls for it."""
+    if backend not in BACKENDS:
+        raise SceneError(f"no backend {backend!r}: choose one of {', '.join(BACKENDS)}")
 
 
 def _echoes(problem: RenderProblem, backend: str) -> MultiBounce:
@@ -254,13 +264,27 @@ def _spread_over(lit: NDArray[np.bool_], histograms: Histograms | None) -> Histo
 
 def _rendering(problem: RenderProblem, echoes: MultiBounce, backend: str) -> Rendering:
     """Return the maps of a problem from the strongest bins (n,) of its beams: S5, cells, color."""
-    echoes = echoes.reshape(problem.beams.shape)
+    echoes = replace(echoes.reshape(problem.beams.shape), stopped=_stopped(problem))
     depth, intensity, margin = compete(problem.beams, echoes)
     color = _color(problem, echoes, depth, backend) if problem.color_jobs else None
     near = count_near_legs(problem.job) if problem.job else 0
     return Rendering(
         *_cells(depth, intensity, margin), echoes, problem.plan, problem.accuracy, near, color
     )
+
+
+def _stopped(problem: RenderProblem) -> StoppedBeams | None:
+    """Return the beams that the object stops, with what it returns of them; None where it stops
+    none, or where a pulse mixes their returns with the rest.
+    """
+    if problem.stopped is None or not problem.stopped.any() or problem.includes("pulse"):
+        return None
+    beams = problem.beams
+    columns = (
+        np.where(problem.stopped, column, np.nan).astype(np.float32).reshape(beams.shape)
+        for column in (beams.direct, beams.length_m)
+    )
+    return StoppedBeams(*columns)
 
 
 def _strongest(problem: RenderProblem, histograms: Histograms | None) -> MultiBounce:
@@ -284,7 +308,7 @@ def _waveforms(problem: RenderProblem, histograms: Histograms) -> Float32:
     """
     device = problem.scene.rig.device
     # Convolution is linear, so one pulse over the sum of direct and three-bounce light stands for
-    # each echo's own; it comes before the gate, since light outside reaches in by the pulse's tail.
+    # each echo's own. What the pulse's tail carries beyond the gate is cut off.
     whole = add_direct(histograms.astype(np.float32, copy=False), problem.beams, device.bin_m)
     if problem.includes("pulse"):
         whole = with_pulse(whole, problem.scene.pulse_ns, device.bin_m)
@@ -405,14 +429,26 @@ def _joined(parts: list[Rendering], verdict: Effect) -> Rendering:
     multi = {
         name: stacked(name, lambda part: part.multi) for name in ("peak", "runner_up", "path_m")
     }
+    stopped = _joined_stops([part.multi for part in parts])
     return replace(
         parts[0],
         **{name: stacked(name) for name in ("depth_m", "intensity", "margin")},
-        multi=replace(parts[0].multi, **multi),
+        multi=replace(parts[0].multi, **multi, stopped=stopped),
         plan=(*parts[0].plan, verdict),
         near_legs=sum(part.near_legs for part in parts),
         color=None if any(part.color is None for part in parts) else stacked("color"),
     )
+
+
+def _joined_stops(parts: list[MultiBounce]) -> StoppedBeams | None:
+    """Return the beams that the object stops in echoes of some rows each as those of all rows."""
+    if all(part.stopped is None for part in parts):
+        return None
+    pairs: list[StoppedBeams] = []
+    for part in parts:
+        nothing = np.full_like(part.peak, np.nan)
+        pairs.append(part.stopped or StoppedBeams(nothing, nothing))
+    return StoppedBeams(*(np.concatenate(columns) for columns in zip(*pairs, strict=True)))
 
 
 def _alike(one: Scene, other: Scene) -> bool:

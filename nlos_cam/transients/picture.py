@@ -22,7 +22,11 @@ SIDES = (("x", "y", 2), ("x", "z", 1), ("z", "y", 0))
 def transient_figure(transient: Transient, title: str = "") -> "Figure":
     """Return the picture of a transient."""
     volume = Volume.of(transient)
-    light = back_projection(transient, volume)
+    return _figure(transient, title, volume, back_projection(transient, volume))
+
+
+def _figure(transient: Transient, title: str, volume: Volume, light: Float32) -> "Figure":
+    """Return the picture of a transient with the light (x, y, z) of its back-projection."""
     figure = figure_of(13, 3.4)
     slice_axis, curve_axis, *sides = figure.subplots(1, 5)
     ends = (transient.start_m, transient.end_m)
@@ -48,7 +52,8 @@ def transient_figure(transient: Transient, title: str = "") -> "Figure":
         # Two axes are left, in the order x, y, z; rows of a picture are the one that points up.
         face = light.max(over) if up < across else light.max(over).T
         axis.imshow(face, cmap="magma", origin="lower", extent=(*extent[across], *extent[up]))
-        axis.plot(peak[across], peak[up], "+", color="cyan", ms=8)
+        if light.any():
+            axis.plot(peak[across], peak[up], "+", color="cyan", ms=8)
         axis.set(title=f"back-projection, {across}{up}", xlabel=f"{across} (m)", ylabel=f"{up} (m)")
     if title:
         figure.suptitle(title, fontsize=10)
@@ -68,14 +73,22 @@ def _slice(transient: Transient) -> tuple[Float32, str]:
 def transient_document(title: str, transient: Transient, facts: Mapping[str, str]) -> Document:
     """Return a report: facts, and the picture of a transient."""
     volume = Volume.of(transient)
-    x, y, z = peak_m(back_projection(transient, volume), volume)
-    from_wall_m = np.array([x, y, z]) - np.concatenate(transient.points).mean(0)
+    light = back_projection(transient, volume)
     caption = (
         "A line of histograms through the strongest one; their sum; and the largest values of a"
-        " plain back-projection (no filter, no weights) seen along z, y and x. It is brightest at"
-        f" ({x:.3f}, {y:.3f}, {z:.3f}) m, {from_wall_m @ outward(transient):.3f} m from the wall."
+        " plain back-projection (no filter, no weights) seen along z, y and x."
     )
+    if light.any():
+        x, y, z = peak_m(light, volume)
+        from_wall_m = np.array([x, y, z]) - np.concatenate(transient.points).mean(0)
+        caption += (
+            f" It is brightest at ({x:.3f}, {y:.3f}, {z:.3f}) m,"
+            f" {from_wall_m @ outward(transient):.3f} m from the wall."
+        )
+    else:
+        caption += " No light has a path length that fits a point of its volume."
     if transient.laser_normals is None and transient.detector_normals is None:
         caption += " The file has no normals: the wall is taken to face along +z."
-    picture = Picture("Slice and back-projection", caption, png(transient_figure(transient)))
+    figure = _figure(transient, "", volume, light)
+    picture = Picture("Slice and back-projection", caption, png(figure))
     return Document(title, transient.kind, [Section("Content", [Facts(dict(facts))]), picture])

@@ -42,6 +42,8 @@ class Noise:
                 raise SceneError(f"{name} is {value}: give 0 to 1e9")
         if not self.photons:
             raise SceneError("photons is 0: give more than 0, or leave the noise out")
+        if self.seed < 0:
+            raise SceneError(f"seed is {self.seed}: it must be at least 0")
 
     def applied(self, histograms: Float32) -> Float32:
         """Return counts (n, bins) drawn for the light (n, bins). Raises SceneError where there is
@@ -88,7 +90,7 @@ class Capture:
                 f"no capture {self.kind!r}.{did_you_mean(self.kind, CAPTURES)} Choose one of"
                 f" {', '.join(CAPTURES)}"
             )
-        if not 1 <= (self.cells or 1) <= MAX_POINTS:
+        if self.cells is not None and not 1 <= self.cells <= MAX_POINTS:
             raise SceneError(f"a wall grid of {self.cells} cells: give 1 to {MAX_POINTS}")
         if self.bin_m is not None and not 1e-5 <= self.bin_m <= 10:
             raise SceneError(f"bin_m is {self.bin_m}: give 1e-5 to 10 m of path")
@@ -123,7 +125,7 @@ def render_transient(
     setting = accuracy_named(accuracy)
     side = capture.cells or DEFAULT_CELLS[capture.kind]
     grid = WallGrid(capture.wall or scene.rig.relay, side, side)
-    laser_m = _laser_points(capture, grid)
+    laser_m = _laser_points(capture, grid, scene.rig.wall)
     is_lidar = capture.kind == "lidar"
     rows = grid.size**2 if capture.kind == "exhaustive" else grid.size
     _check_size(rows, capture.bins or 1, side, "or fewer bins")
@@ -157,13 +159,23 @@ def render_transient(
     return _transient(scene, capture, grid, cells, laser_m, light, first * bin_m, bin_m)
 
 
-def _laser_points(capture: Capture, grid: WallGrid) -> Float64:
-    """Return the laser points (x, y, 3)."""
+def _laser_points(capture: Capture, grid: WallGrid, wall: Extent) -> Float64:
+    """Return the laser points (x, y, 3). Raises SceneError for a given one that is not on the
+    wall.
+    """
     if capture.kind != "single":
         return grid.points_m
     extent = grid.extent
     middle = (extent.x_min_m + extent.x_max_m) / 2, (extent.y_min_m + extent.y_max_m) / 2
-    return np.array([[[*(capture.laser_m or middle), 0.0]]])
+    x_m, y_m = capture.laser_m or middle
+    point_m = np.array([[[x_m, y_m, 0.0]]])
+    if capture.laser_m is not None and not wall.contains(point_m).all():
+        raise SceneError(
+            f"the laser point ({x_m:g}, {y_m:g}) m is not on the wall: choose x from"
+            f" {wall.x_min_m:g} to {wall.x_max_m:g} m and y from {wall.y_min_m:g} to"
+            f" {wall.y_max_m:g} m"
+        )
+    return point_m
 
 
 def _pairs(kind: CaptureKind, lasers: int, detectors: int) -> Int64 | None:

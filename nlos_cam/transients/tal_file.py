@@ -183,19 +183,13 @@ def _checked(transient: Transient) -> Transient:
             f"delta_t is {transient.bin_m:g} and t_start {transient.start_m:g}: meters of path are"
             " expected"
         )
+    if transient.end_m <= 0:
+        raise ValueError(
+            f"its last bin ends at {transient.end_m:g} m of path, before any light can arrive"
+        )
     if shape[0] > MAX_BINS:
         raise ValueError(f"H has {shape[0]} bins, more than {MAX_BINS}")
-    by_axis = {"S": transient.detector_grid_m, "L": transient.laser_grid_m}
-    for letter, grid in by_axis.items():
-        sizes = tuple(
-            size for size, axis in zip(shape, axes, strict=True) if axis.startswith(letter)
-        )
-        points = int(np.prod(grid.shape[:-1]))
-        if sizes and int(np.prod(sizes)) != points:
-            raise ValueError(f"H has {sizes} points of {letter}, but its grid has {points}")
-    lasers = int(np.prod(transient.laser_grid_m.shape[:-1]))
-    if "L" not in "".join(axes) and not transient.paired and lasers != 1:
-        raise ValueError(f"{lasers} laser points belong to no axis of H")
+    _check_grids(transient)
     if transient.first_and_last and (transient.laser_m is None or transient.detector_m is None):
         raise ValueError(
             "its times include the legs from laser and detector, whose places it lacks"
@@ -204,3 +198,22 @@ def _checked(transient: Transient) -> Transient:
         if place is not None and place.shape != (3,):
             raise ValueError(f"{name} has shape {place.shape}, not (3,)")
     return transient
+
+
+def _check_grids(transient: Transient) -> None:
+    """Raise ValueError for grids of other points than those of the axes of H."""
+    shape = transient.histograms.shape
+    axes = transient.layout.axes
+    by_axis = {"S": transient.detector_grid_m, "L": transient.laser_grid_m}
+    for letter, grid in by_axis.items():
+        sizes = tuple(
+            size for size, axis in zip(shape, axes, strict=True) if axis.startswith(letter)
+        )
+        points = grid.shape[:-1]
+        # A list of points (n, 3) may stand for a grid, but a grid must run as the axes do.
+        is_same_grid = points == sizes or min(len(points), len(sizes)) == 1
+        if sizes and not (is_same_grid and np.prod(sizes) == np.prod(points)):
+            raise ValueError(f"H has {sizes} points of {letter}, but its grid has {points}")
+    lasers = int(np.prod(transient.laser_grid_m.shape[:-1]))
+    if "L" not in "".join(axes) and not transient.paired and lasers != 1:
+        raise ValueError(f"{lasers} laser points belong to no axis of H")

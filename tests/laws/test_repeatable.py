@@ -2,7 +2,11 @@
 whole.
 """
 
+import os
+import subprocess
+import sys
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numba
@@ -113,3 +117,32 @@ def test_whole_object_repeats_at_a_named_stop() -> None:
 
     np.testing.assert_array_equal(first.intensity, again.intensity)
     np.testing.assert_array_equal(first.multi.runner_up, again.multi.runner_up)
+
+
+GLOSSY_BITS = """
+import hashlib
+from dataclasses import replace
+
+from nlos_cam.render import Surface, paper_scene, phong, render
+
+scene = replace(paper_scene().scene_at(0), surface=Surface(1.0, phong(0.5, 0.5, 20)))
+print(hashlib.sha256(render(scene, "draft").multi.peak.tobytes()).hexdigest())
+"""
+
+
+def test_run_that_compiles_has_the_bits_of_later_runs(tmp_path: Path) -> None:
+    """Functions that are compiled into several others round alike in each of them."""
+    environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path)}
+    first, second = (
+        subprocess.run(
+            [sys.executable, "-c", GLOSSY_BITS],
+            env=environment,
+            capture_output=True,
+            check=True,
+            text=True,
+        ).stdout
+        for _ in range(2)
+    )
+
+    assert list(tmp_path.rglob("*.nbc"))
+    assert first == second

@@ -2,6 +2,8 @@
 maps.
 """
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -209,3 +211,18 @@ def test_map_mean_neither_changes_nor_keeps_its_input() -> None:
     np.testing.assert_array_equal(first.depth_m, kept)
     assert_equal(mean.add(noise(5)), mean_of([noise(4), noise(5)]))
     np.testing.assert_array_equal(kept, again.depth_m)
+
+
+def test_images_of_two_shapes_are_refused() -> None:
+    whole = _frame(np.ones((480, 640)))
+    frame = replace(whole, ir=np.zeros((240, 320), np.uint8))
+
+    with pytest.raises(ValueError, match=r"\(240, 320\)"):
+        maps_from_frame(frame)
+
+
+def test_depth_in_float64_is_the_same_as_in_float32() -> None:
+    frame = _frame(np.linspace(0.2, 2.0, 480 * 640).reshape(480, 640))
+    wide = replace(frame, depth_m=frame.depth_m.astype(np.float64))
+
+    np.testing.assert_array_equal(maps_from_frame(wide).depth_m, maps_from_frame(frame).depth_m)

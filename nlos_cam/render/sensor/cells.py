@@ -17,7 +17,7 @@ import numpy as np
 from nlos_calibration.arrays import Float32, Int32, Int64
 from numpy.typing import NDArray
 
-from nlos_cam.frames import NO_SAMPLE, SATURATED, inner, reduce_cell
+from nlos_cam.frames import MAP_COLUMNS, MAP_ROWS, NO_SAMPLE, SATURATED, inner, reduce_cell
 from nlos_cam.render.sensor.model import DEPTH_UNIT_M, FARTHEST, MAX_CONFIDENCE
 
 QUANTILES = 1 << 16
@@ -81,7 +81,7 @@ class PixelOrder(NamedTuple):
     pixel: Int64
     """(p,)."""
     start: Int64
-    """(n + 1,); place in `pixel` at which each map cell begins."""
+    """(n + 1,); place in `pixel` at which each map cell begins; cells without a pixel are empty."""
     first_run: Int64
     """(n + 1,); run with which each map cell begins."""
     run_start: Int64
@@ -97,7 +97,7 @@ class PixelOrder(NamedTuple):
         cells = cell[pixel]
         echoes = echo[pixel]
         begins = np.flatnonzero(np.diff(cells, prepend=-1) | np.diff(echoes, prepend=-1))
-        numbers = np.arange(cell.max() + 2)
+        numbers = np.arange(MAP_ROWS * MAP_COLUMNS + 1)
         # A run ends where the next one begins, the last at the end of all pixels.
         run_start = np.append(begins, pixel.size)
         first_run = np.searchsorted(cells[begins], numbers)

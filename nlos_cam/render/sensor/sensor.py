@@ -32,7 +32,7 @@ from nlos_cam.frames import (
     inner,
     maps_from_frame,
 )
-from nlos_cam.render.echoes import peak_share
+from nlos_cam.render.echoes import StoppedBeams, peak_share
 from nlos_cam.render.effects import Effect, included
 from nlos_cam.render.geometry import Beams, cast
 from nlos_cam.render.renderer import MultiBounce
@@ -63,8 +63,8 @@ class Chain(NamedTuple):
 
 
 class PixelOptics(NamedTuple):
-    """Properties of each pixel (n,) that do not depend on the hidden object: its direct return and
-    its direction.
+    """Direct return and direction of each pixel (n,): of a rig alone, but for the pixels whose
+    beams the hidden object stops.
     """
 
     direct: Float32
@@ -272,6 +272,8 @@ class Sensor:
             self._deviates(generator, wanted=wanted) for wanted in (self._lights, self._ranges)
         )
         optics = self._echoes_only if multi.direct_included else self._optics
+        if multi.stopped is not None:
+            optics = _with_stops(optics, multi.stopped, cell, self._chain)
         echoes = _echoes(multi, self._chain)
         bias_m = self._bias.at_m(celsius)
         z16 = np.zeros(shape, np.uint16)
@@ -304,6 +306,10 @@ class Sensor:
             if multi.direct_included
             else optics
         )
+        if multi.stopped is not None:
+            image = self.rig.intrinsics.height, self.rig.intrinsics.width
+            cell = cell_of_pixels(image, multi.peak.shape)[order.pixel]
+            optics = _with_stops(optics, multi.stopped, cell, self._chain)
         seed = generator.integers(1 << 64, dtype=np.uint64) if generator else np.uint64(0)
         bias_m = self._bias.at_m(None)
         noise = normal_quantiles(), seed, (self._lights, self._ranges)
@@ -319,16 +325,16 @@ class Sensor:
         """Return the order of the pixels for echo maps of that shape, with the optics in it; the
         last is kept.
         """
-        if self._ordered is None or self._ordered[0] != echoes:
+        # Through a name of its own: another thread may keep maps of another shape meanwhile.
+        ordered = self._ordered
+        if ordered is None or ordered[0] != echoes:
             image = self.rig.intrinsics.height, self.rig.intrinsics.width
             maps = (MAP_ROWS, MAP_COLUMNS), (echoes[0], echoes[1])
             order = PixelOrder.of(*(cell_of_pixels(image, shape) for shape in maps))
-            self._ordered = (
-                echoes,
-                order,
-                PixelOptics._make(c[order.pixel] if c.size else c for c in self._optics),
-            )
-        return self._ordered[1:]
+            optics = PixelOptics._make(c[order.pixel] if c.size else c for c in self._optics)
+            ordered = echoes, order, optics
+            self._ordered = ordered
+        return ordered[1:]
 
     def _deviates(self, generator: np.random.Generator, *, wanted: bool) -> Float32:
         """Return one normal deviate per pixel, or none: noise that is left out is not drawn."""
@@ -370,6 +376,25 @@ def _optics(beams: Beams, chain: Chain, dead_share: float, reflectance: Float32)
     dead = np.random.default_rng(0).random(direct.size if dead_share else 0) < dead_share
     return PixelOptics(
         direct, surety, length_m, beams.cos_axis.astype(np.float32), dead, reflectance
+    )
+
+
+def _with_stops(
+    optics: PixelOptics, stopped: StoppedBeams, cell: NDArray[np.int32], chain: Chain
+) -> PixelOptics:
+    """Return the optics of pixels with their cells where the hidden object stops some beams: it
+    returns them, from nearer and without the wall's texture.
+    """
+    # The lidar sees the object itself there, and nothing of the wall behind it.
+    direct = stopped.direct.ravel()
+    of_object = ~np.isnan(direct)[cell]
+    surety = signal_surety(np.nan_to_num(direct), chain)
+    factor = optics.texture
+    return optics._replace(
+        direct=np.where(of_object, direct[cell], optics.direct),
+        surety=np.where(of_object, surety[cell], optics.surety),
+        length_m=np.where(of_object, stopped.length_m.ravel()[cell], optics.length_m),
+        texture=np.where(of_object, np.float32(1), factor) if factor.size else factor,
     )
 
 

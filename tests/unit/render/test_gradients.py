@@ -275,3 +275,11 @@ def test_scene_without_echoes_has_no_object_gradients() -> None:
 
     with pytest.raises(SceneError, match="no beam"):
         _ = found.echo_job
+
+
+def test_noise_is_infinite_where_nothing_of_the_wall_returns() -> None:
+    rig = load_rig("paper-rig")
+    device = rig.device.model_copy(update={"gate_s": 1e-12})
+    dark = Gradients(Scene(rig.model_copy(update={"device": device})))
+
+    assert np.isinf(intensity_noise(dark, SensorModel())).all()

@@ -12,7 +12,7 @@ from nlos_calibration import Occluder, load_rig
 
 from nlos_cam.errors import SceneError
 from nlos_cam.objects import object_box, object_depth
-from nlos_cam.render import Radiometry, Scene, Surface, phong
+from nlos_cam.render import Radiometry, Scene, Surface, backend_reference, phong
 from nlos_cam.render.accuracy import (
     MAX_BEAMS_PER_CELL,
     MAX_RELAY_CELLS,
@@ -392,3 +392,18 @@ def test_facts_have_no_patches_of_empty_boxes_or_beyond_the_gate() -> None:
         is None
     )
     assert SceneFacts(Scene(RIG, LEVEL), COARSE).patches is not None
+
+
+def test_bins_hold_every_detour_of_a_deep_object() -> None:
+    """An object 2.5 m off the wall: light that goes by the wall twice more comes 4 m later."""
+    box = object_box(RIG).model_copy(update={"z_near_m": 2.0, "z_far_m": 3.0})
+    rig = RIG.model_copy(update={"object_box": box, "occluder": None})
+    scene = Scene(rig, np.full((2, 2), 2.5, np.float32), radiometry="lambertian")
+    few = Accuracy("few", relay_columns=2, relay_rows=2, sub_bins=0)
+    job = prepare(scene, few, ["three-bounce", "inter-reflection"], bounded=False).job
+    some = job.select(np.arange(0, len(job.length_m), 1000))
+    light = backend_reference.histograms(some)
+    longer = backend_reference.histograms(replace(some, bins=some.bins + 300))
+
+    np.testing.assert_array_equal(longer[:, : some.bins], light)
+    assert longer.sum() == pytest.approx(light.sum(), rel=1e-12)

@@ -16,6 +16,7 @@ from nlos_cam.objects import object_box, object_depth
 from nlos_cam.render import (
     STOPS,
     Accuracy,
+    Rendering,
     Scene,
     Surface,
     backend_numba,
@@ -23,6 +24,8 @@ from nlos_cam.render import (
     phong,
     prepare,
     render,
+    render_all,
+    three_bounce,
     transient,
 )
 from nlos_cam.render import echoes as echoes_module
@@ -132,12 +135,18 @@ def test_mean_of_the_channels_is_the_intensity(pulse_ns: float) -> None:
     np.testing.assert_allclose(rendering.color.mean(-1), rendering.intensity, rtol=1e-5, atol=1e-30)
 
 
-def test_tables_beyond_memory_are_refused_in_a_line(monkeypatch: pytest.MonkeyPatch) -> None:
-    job = prepare(Scene(RIG, DEPTH), COARSE).job
+@pytest.mark.parametrize(
+    ("surface", "backend"),
+    [(Surface(), "cpu"), (Surface(1.0, phong(0.5, 0.5, 20)), "cpu"), (Surface(), "torch")],
+    ids=["matt", "glossy", "torch"],
+)
+def test_tables_beyond_memory_are_refused_in_a_line(
+    surface: Surface, backend: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(backend_numba, "MAX_TABLE_BYTES", 1 << 10)
 
     with pytest.raises(SceneError, match=r"tables of \d+ patches with bins of 10 mm.*widen"):
-        histograms(job)
+        render(Scene(RIG, DEPTH, surface), COARSE, backend=backend)
 
 
 def test_lone_return_has_no_rival_under_a_pulse() -> None:
@@ -412,3 +421,35 @@ def test_echoes_are_the_histograms_strongest_bins_bit_for_bit(
     whole = strongest(histograms(job), job.bin_m)
     for name in ("peak", "runner_up", "path_m"):
         np.testing.assert_array_equal(getattr(found, name), getattr(whole, name))
+
+
+def test_scan_keeps_the_beams_that_the_object_stops() -> None:
+    rig = load_rig("bare-wall").model_copy(update={"object_box": RIG.object_box})
+
+    def leaving(share: float) -> Scene:
+        """A plate in the lidar's sight until the middle of the scan."""
+        return Scene(rig, np.full((8, 8), 0.06 if share < 0.5 else 0.39, np.float32))
+
+    stopped = render_scan(leaving, COARSE).multi.stopped
+    whole = render(leaving(0.0), COARSE).multi.stopped
+
+    assert stopped.direct.shape == stopped.length_m.shape == (64, 80)
+    np.testing.assert_array_equal(stopped.length_m[:32], whole.length_m[:32])
+    assert np.isfinite(whole.length_m[32:]).any()
+    assert np.isnan(stopped.length_m[32:]).all()
+
+
+def _render_one_of_all(scene: Scene, *options: Any) -> list[Rendering]:
+    return list(render_all([scene], *options))
+
+
+@pytest.mark.parametrize("show", [render, transient, three_bounce, _render_one_of_all])
+def test_unknown_backend_is_refused_also_of_a_bare_wall(show: Any) -> None:
+    with pytest.raises(SceneError, match="no backend 'numpy'"):
+        show(Scene(load_rig("bare-wall")), COARSE, "auto", "numpy")
+
+
+@pytest.mark.parametrize("rows", [(-1, 4), (4, 4), (9, 4), (60, 65)])
+def test_rows_that_the_map_does_not_have_are_refused(rows: tuple[int, int]) -> None:
+    with pytest.raises(SceneError, match="rows are"):
+        render(Scene(RIG), COARSE, rows=rows)

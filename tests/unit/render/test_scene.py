@@ -8,7 +8,14 @@ from nlos_calibration.rig import load_rig
 from pydantic import ValidationError
 
 from nlos_cam.errors import SceneError
-from nlos_cam.render.material import Material, Surface, brdf_range, phong, retroreflective
+from nlos_cam.render.material import (
+    Brdf,
+    Material,
+    Surface,
+    brdf_range,
+    phong,
+    retroreflective,
+)
 from nlos_cam.render.patches import JUMP_M, Patches, clustered, coarser, make_patches
 from nlos_cam.render.scene import FINEST_GRID, Scene
 
@@ -122,6 +129,21 @@ def test_material_makes_the_brdf_of_its_kind() -> None:
         )
         assert material.surface.colored
         assert material.brdf(0.6, 0.7, 0.8) == pytest.approx(make(0.7, 0.3, 7)(0.6, 0.7, 0.8))
+
+
+@pytest.mark.parametrize(
+    "brdf",
+    [
+        phong(0.6, 0.6, 20),
+        phong(-0.1, 0.5, 20),
+        retroreflective(0.5, np.nan, 20),
+        phong(0.5, 0.5, -3),
+        retroreflective(0.5, 0.5, np.inf),
+    ],
+)
+def test_surface_refuses_brdfs_that_give_back_too_much(brdf: Brdf) -> None:
+    with pytest.raises(SceneError, match="a BRDF"):
+        Surface(1.0, brdf)
 
 
 @pytest.mark.parametrize("albedo", [(0.5, 0.6), 1.5, (0.1, 0.2, -1.0), "white", True, (0.5,)])

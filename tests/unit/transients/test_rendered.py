@@ -191,9 +191,12 @@ def test_points_that_the_lidar_cannot_see_give_no_light() -> None:
         ({"kind": "lidar", "cells": 128, "bin_m": 1e-5, "bins": 100}, "GiB"),
         ({"kind": "lidar", "first_and_last": False}, "wide detector"),
         ({"kind": "confokal"}, "confocal"),
+        ({"kind": "confocal", "cells": 0}, "0 cells"),
         ({"bin_m": 0.0}, "bin_m"),
         ({"start_m": float("nan")}, "start_m"),
         ({"kind": "confocal", "laser_m": (0.0, 0.0)}, "single"),
+        ({"kind": "single", "laser_m": (50.0, 0.0)}, "not on the wall"),
+        ({"kind": "single", "laser_m": (float("nan"), 0.0)}, "not on the wall"),
     ],
 )
 def test_capture_out_of_range_is_refused(options: dict[str, object], word: str) -> None:
@@ -205,3 +208,8 @@ def test_capture_out_of_range_is_refused(options: dict[str, object], word: str) 
 def test_noise_of_no_photons_is_refused(photons: float) -> None:
     with pytest.raises(SceneError, match="photons is"):
         Noise(photons)
+
+
+def test_noise_of_a_negative_seed_is_refused() -> None:
+    with pytest.raises(SceneError, match="seed is -1"):
+        Noise(10.0, seed=-1)

@@ -184,6 +184,11 @@ def bomb(path: Path) -> None:
         file.create_dataset("H", (1 << 20, 1 << 10, 1 << 10), "f4", chunks=(1, 1024, 1024))
 
 
+def grids_of_another_shape(path: Path) -> None:
+    for name in ("laser_grid_xyz", "sensor_grid_xyz"):
+        replaced(name, np.zeros((32, 8, 3)))(path)
+
+
 def halved(path: Path) -> None:
     path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
 
@@ -198,6 +203,8 @@ WRONG: dict[str, Callable[[Path], object]] = {
     "no light at all": replaced("H", np.full((9, 16, 16), np.nan)),
     "light beyond float32": replaced("H", np.full((9, 16, 16), 1e308)),
     "other grid": replaced("sensor_grid_xyz", np.zeros((3, 3, 3))),
+    "grids of another shape": grids_of_another_shape,
+    "before the pulse": replaced("t_start", -1e3),
     "points at infinity": replaced("laser_grid_xyz", np.full((16, 16, 3), np.inf)),
     "bins of no width": replaced("delta_t", 0.0),
     "no number": replaced("t_start", np.array([1.0, 2.0])),
@@ -270,3 +277,15 @@ def test_tal_reads_all_captures_and_finds_the_object(saved: Path) -> None:
     assert len(found) == len(CAPTURES)
     assert found["confocal.hdf5"]["confocal"]
     assert all(off_the_object_m(one["peak_m"]) < NEAR_M for one in found.values())
+
+
+def test_report_of_a_dark_transient_names_no_brightest_point(
+    transients: dict[str, Transient],
+) -> None:
+    lit = transients["confocal"]
+    dark = replace(lit, histograms=np.zeros_like(lit.histograms))
+    captions = [transient_document("", one, {}).parts[1].caption for one in (lit, dark)]
+
+    assert "brightest at" in captions[0]
+    assert "brightest at" not in captions[1]
+    assert "No light" in captions[1]

@@ -412,3 +412,49 @@ def test_deviates_are_normal_and_follow_the_seed() -> None:
         assert (np.abs(values) > 3).mean() == pytest.approx(0.0027, abs=5e-4)
 
     assert abs((light * ranges).mean()) < 0.01
+
+
+@pytest.mark.parametrize("change", [{}, {"wall_texture": 0.2}])
+@pytest.mark.parametrize("beams", [1, 2])
+def test_sensor_sees_an_object_that_stops_its_beams(change: dict[str, float], beams: int) -> None:
+    rig = BARE.model_copy(update={"object_box": RIG.object_box})
+    accuracy = replace(STOPS["draft"], beams_per_cell=beams)
+    scene = Scene(rig, np.full((8, 8), 0.06, np.float32))
+    rendering = render(scene, accuracy)
+    empty = render(Scene(rig), accuracy)
+    sensor = Sensor(rig, QUIET.model_copy(update=change))
+    found = sensor.maps(rendering.multi, default_rng(0))
+    images = sensor.expose(rendering.multi, default_rng(0))
+    nearer = rendering.depth_m < empty.depth_m - 0.05
+    counts = rendering.intensity * 48 / empty.intensity.max()
+
+    assert nearer.sum() > 100
+    # Pixels of a cell at the object's rim may see it from its front and from its side.
+    assert np.median(np.abs(found.depth_m - rendering.depth_m)[nearer]) < 0.001
+    assert np.quantile(np.abs(found.depth_m - rendering.depth_m)[nearer], 0.9) < 0.01
+    assert np.median(np.abs(found.intensity - counts)[nearer]) < 0.6
+    np.testing.assert_array_equal(found.depth_m, maps_from_frame(images.frame(rig.pinhole)).depth_m)
+
+
+def test_rendering_without_an_object_in_sight_stops_no_beam() -> None:
+    hidden = Scene(RIG, object_depth(3, RIG.object_box)[1])
+
+    assert render(hidden, "draft").multi.stopped is None
+    assert render(Scene(BARE), "draft").multi.stopped is None
+
+
+@pytest.mark.parametrize("size", [(20, 20), (33, 31), (64, 48)])
+def test_maps_of_few_pixels_are_those_of_the_images(size: tuple[int, int]) -> None:
+    """The last map cells have no pixel of their own."""
+    width, height = size
+    pixels = {"width": width, "height": height, "ppx": width / 2 - 0.5, "ppy": height / 2 - 0.5}
+    scales = {"fx": 457 * width / 640, "fy": 461 * height / 480}
+    few = RIG.intrinsics.model_copy(update=pixels | scales)
+    rig = RIG.model_copy(update={"intrinsics": few})
+    echoes = render(Scene(rig), "draft").multi
+    sensor = Sensor(rig, QUIET)
+    found = sensor.maps(echoes, default_rng(0))
+    images = sensor.expose(echoes, default_rng(0)).frame(rig.pinhole)
+
+    assert found.valid.any()
+    np.testing.assert_array_equal(found.depth_m, maps_from_frame(images).depth_m)
