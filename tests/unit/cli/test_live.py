@@ -378,7 +378,11 @@ def test_view_serves_a_saved_session_until_interrupted(
     monkeypatch.setattr("nlos_cam.cli.view.say", fetch_and_interrupt)
 
     assert main(["view", str(saved)]) == 130
-    assert fetched == [saved.read_bytes()]
+    head, body = saved.read_bytes().split(b"<script", 1)
+    (answer,) = fetched
+    # the page's storage, which a sandbox refuses, is replaced before its scripts run
+    assert answer.startswith(head)
+    assert answer.endswith(b"<script" + body)
 
 
 @pytest.fixture

@@ -23,6 +23,7 @@ import pytest
 import small_run
 import torch
 from nlos_models.errors import CheckpointError, RecipeError, TrainingError
+from nlos_models.records import TRAINING_LOG
 from nlos_models.training import loop as train
 from nlos_models.training import run_files, schedule
 from nlos_models.training.direct import NormalBatch
@@ -313,8 +314,8 @@ def test_full_disk_keeps_earlier_files(tmp_path: Path, monkeypatch: pytest.Monke
             write()
 
     assert run_files.read_last(tmp_path, pytest.fail)["step"] == 1
-    assert {path.name for path in tmp_path.iterdir()} == {run_files.LAST, run_files.LOG}
-    assert "1.0" in (tmp_path / run_files.LOG).read_text(encoding="utf-8")
+    assert {path.name for path in tmp_path.iterdir()} == {run_files.LAST, TRAINING_LOG}
+    assert "1.0" in (tmp_path / TRAINING_LOG).read_text(encoding="utf-8")
 
 
 def test_digest_depends_on_every_bit_and_order() -> None:
