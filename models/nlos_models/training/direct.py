@@ -82,8 +82,9 @@ def train_direct(
     def loss(batch: NormalBatch, _: float) -> Tensor:
         # Maps are rendered once, without noise; each step draws its own, so that none is learnt.
         normal = varied(recipe, network.normal, batch, source.noise)
-        answer = logits(normal + recipe.noise * torch.randn_like(normal))
-        return two_heads_error(answer, batch.image, recipe.rmse_weight)
+        return two_heads_error(
+            logits(normal + recipe.noise * torch.randn_like(normal)), batch.image
+        )
 
     figures = fit(
         network,

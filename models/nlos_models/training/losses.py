@@ -15,8 +15,6 @@ MAX_PRECISION = 100.0
 """Largest weight of a latent entry: one over the smallest variance that is believed."""
 OVERLAP_WEIGHT = 0.5
 DEPTH_WEIGHT = 2.0
-SMALLEST_SQUARE = 1e-6
-"""Of an error of v, added to the mean square: a thousandth of the range of depths, squared."""
 
 
 def image_error(
@@ -75,14 +73,13 @@ def latent_error(latent: Tensor, mean: Tensor, log_variance: Tensor) -> Tensor:
     return (weight * (latent.float() - mean.float()).square()).sum(1).mean()
 
 
-def two_heads_error(logits: Tensor, truth: Tensor, rmse_weight: float = 0.0) -> Tensor:
+def two_heads_error(logits: Tensor, truth: Tensor) -> Tensor:
     """Return the loss of logits (n, 2, 64, 64) against images (n, 64, 64): cross-entropy, overlap
     and depth.
 
     Cross-entropy of the silhouette, plus 0.5 (1 - soft intersection over union), plus 2 times the
-    absolute error of v over the surface, plus `rmse_weight` times the objects' mean root mean
-    square error of v over it; each is a mean over pixels or objects. In color, (n, 4, 64, 64)
-    against (n, 3, 64, 64), the errors of v are those of three.
+    absolute error of v over the surface; each is a mean over pixels or objects. In color, (n, 4,
+    64, 64) against (n, 3, 64, 64), the error of v is the mean of three.
     """
     logits = logits.float()
     truth = truth.float() if truth.dim() == 4 else truth.float()[:, None]
@@ -102,13 +99,6 @@ def two_heads_error(logits: Tensor, truth: Tensor, rmse_weight: float = 0.0) -> 
     # The absolute error, whose best answer is the median: a depth between two possible surfaces
     # would be neither. It is a mean over surface pixels alone, of the whole batch, so that large
     # and small objects have the same weight a pixel.
-    off = (MIN_V + (1 - MIN_V) * torch.sigmoid(values) - truth) * surface[:, None]
-    depth = off.abs().mean(1).sum() / surface.sum().clamp(min=1)
-    loss = entropy + OVERLAP_WEIGHT * (1 - overlap).mean() + DEPTH_WEIGHT * depth
-    if not rmse_weight:
-        return loss
-
-    # Its best answer is nearer to the mean, whose outliers are smaller. The constant keeps the
-    # root's gradient finite for an exact answer.
-    squares = off.square().mean(1).sum((1, 2)) / surface.sum((1, 2)).clamp(min=1)
-    return loss + rmse_weight * (squares + SMALLEST_SQUARE).sqrt().mean()
+    off = (MIN_V + (1 - MIN_V) * torch.sigmoid(values) - truth).abs().mean(1) * surface
+    depth = off.sum() / surface.sum().clamp(min=1)
+    return entropy + OVERLAP_WEIGHT * (1 - overlap).mean() + DEPTH_WEIGHT * depth

@@ -249,8 +249,6 @@ class DirectRecipe(Recipe, frozen=True):
     """
     range_offset_m: float = Field(default=0.0, ge=0, le=0.1)
     """Standard deviation of the range offset of each sample's lidar."""
-    rmse_weight: Weight = 0.0
-    """Weight of each object's root mean square error of v, beside 2 of the absolute error."""
     blend: float = Field(default=1.0, gt=0, le=1)
     """Share of the trained weights in their mean with those that the run started from, which keeps
     what the new maps do not show (Wortsman et al. 2022, "Robust fine-tuning of zero-shot
@@ -309,7 +307,6 @@ EARLIER: dict[str, Any] = {
     "noise": 0.0,
     "wall_texture": 0.0,
     "range_offset_m": 0.0,
-    "rmse_weight": 0.0,
     "blend": 1.0,
     "direct": DirectSize().model_dump(),
     "outliers": 0,

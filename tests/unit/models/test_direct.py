@@ -206,39 +206,6 @@ def test_loss_is_least_at_the_truth() -> None:
     assert two_heads_error(exact + torch.tensor([0.0, 0.5])[:, None, None], truth) > 0.05
 
 
-def test_the_rmse_moves_the_best_depth_towards_the_mean() -> None:
-    """Of a surface of which a quarter lies far behind the rest, the absolute error asks for the
-    rest's depth, the root mean square error for one between them.
-    """
-    truth = torch.zeros(1, 64, 64)
-    truth[:, 16:48, 16:48] = 0.9
-    truth[:, 16:48, 40:48] = 0.3
-    occupied = torch.where(truth > 0, 12.0, -12.0)
-
-    def best_v(rmse_weight: float) -> float:
-        def error(v: float) -> Tensor:
-            depth = torch.full_like(truth, np.log((v - 0.1) / (1 - v)))
-            return two_heads_error(torch.stack([occupied, depth], dim=1), truth, rmse_weight)
-
-        return min(np.arange(0.25, 0.95, 0.025).tolist(), key=lambda v: float(error(v)))
-
-    assert abs(best_v(0.0) - 0.9) < 0.01
-    assert 0.74 < best_v(50.0) < 0.8  # the mean is 0.75
-    assert best_v(50.0) < best_v(4.0) < best_v(0.0)
-
-
-def test_the_rmse_has_a_gradient_at_the_truth() -> None:
-    truth = torch.zeros(2, 64, 64)
-    truth[0, 16:48, 16:48] = 0.55  # of the other object there is no surface
-    logits = torch.stack([torch.where(truth > 0, 12.0, -12.0), torch.zeros_like(truth)], dim=1)
-    logits.requires_grad_()
-
-    two_heads_error(logits, truth, rmse_weight=2.0).backward()
-
-    assert logits.grad is not None
-    assert logits.grad.isfinite().all()
-
-
 def test_image_is_cut_where_the_expected_overlap_is_largest() -> None:
     """An object of which much is unsure is shown larger than one that is sure; nothing stays
     nothing.
