@@ -7,9 +7,9 @@ Each bench has a rig out of all that the paper allows, and a device and a wall o
 offset, ripples, gain, texture. Its owner's commands are run, `calibrate --wall`, `calibrate
 --occluder` and `adapt`, on its simulated camera, with the lidar's distance by tape to a millimetre,
 the occluder by ruler where no beam meets it, and the object box marked on the bench. The 54 test
-objects stand on the bench itself, not on its record, and go through the pipeline of `live`, before
-and after each number of minutes. WORK holds the benches: a second call goes on, also after a kill;
-more minutes go on from fewer.
+objects stand on the bench itself, not on its record, and go through the pipeline of `live`, as do
+frames of the empty bench, before and after each number of minutes. WORK holds the benches: a second
+call goes on, also after a kill; more minutes go on from fewer.
 """
 
 import argparse
@@ -17,7 +17,7 @@ import json
 import os
 import platform
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -29,7 +29,7 @@ from nlos_calibration import ObjectBox, Rig, dump_toml, load_rig
 from nlos_calibration.arrays import Float32
 
 from nlos_cam.bench import MAIN, edit_bench, load_bench
-from nlos_cam.camera import World
+from nlos_cam.camera import World, open_world
 from nlos_cam.cli.benches import store_forecast
 from nlos_cam.cli.common import tracked
 from nlos_cam.dataset import RigRange
@@ -38,6 +38,7 @@ from nlos_cam.evaluate import echoes_of, over_objects, per_object, plain, truth_
 from nlos_cam.objects import benchmark_objects, image_from_depth, object_box
 from nlos_cam.reconstruct import (
     Arrival,
+    FrameResult,
     Pipeline,
     build_pipeline,
     frame_issues,
@@ -53,6 +54,7 @@ MINUTES = 10.0, 30.0, 60.0
 FRAMES = 60
 STEADY_FRAMES = 5
 """Frames of one object after which its verdict holds nothing of the object before."""
+EMPTY_FRAMES = 100
 
 
 @dataclass(frozen=True)
@@ -66,6 +68,11 @@ class Bench:
     def box(self) -> ObjectBox:
         """Object box, as marked on the bench."""
         return object_box(self.scene.rig)
+
+    @property
+    def empty_scene(self) -> Path:
+        """Scene file of the bench with its occluder, and nothing hidden."""
+        return self.folder.with_name(f"{self.folder.name}-empty.toml")
 
 
 def draw_bench(number: int, work: Path) -> Bench:
@@ -90,10 +97,9 @@ def calibrate(bench: Bench) -> None:
     if done.exists():
         return
     bench.folder.parent.mkdir(parents=True, exist_ok=True)
-    empty = bench.folder.with_name(f"{bench.folder.name}-empty.toml")
     bare = bench.folder.with_name(f"{bench.folder.name}-bare.toml")
     rig = bench.scene.rig
-    empty.write_text(dump_toml(bench.scene), encoding="utf-8")
+    bench.empty_scene.write_text(dump_toml(bench.scene), encoding="utf-8")
     without = bench.scene.model_copy(update={"rig": rig.model_copy(update={"occluder": None})})
     bare.write_text(dump_toml(without), encoding="utf-8")
 
@@ -103,7 +109,12 @@ def calibrate(bench: Bench) -> None:
     harness.run_command(*wall)
     try:
         harness.run_command(
-            "calibrate", "--occluder", bench.folder, "--camera", f"sim:{empty}", *measured
+            "calibrate",
+            "--occluder",
+            bench.folder,
+            "--camera",
+            f"sim:{bench.empty_scene}",
+            *measured,
         )
     except NlosCamError:  # not in view of every pose: its owner then gives it by ruler
         edge_m = round(numbers_of(rig)["edge_m"], 3)
@@ -125,17 +136,27 @@ def shown(
     images: list[Float32] = []
     verdicts: Counter[str] = Counter()
     for number in range(count):
-        frames = [
-            world.images(number + count * each).frame(world.rig.pinhole)
-            for each in range(STEADY_FRAMES)
-        ]
-        results = [
-            pipeline.process(Arrival(frame, 0.0, frame_issues(frame)), lambda: 0.0, 0.0)
-            for frame in frames
-        ]
+        numbers = range(number, number + count * STEADY_FRAMES, count)
+        results = _results(pipeline, world, numbers)
         images.append(image_from_depth(results[0].depth_m, box))
         verdicts[results[-1].verdict or "none"] += 1
     return np.stack(images), dict(verdicts.most_common())
+
+
+def empty_verdicts(pipeline: Pipeline, bench: Bench) -> dict[str, int]:
+    """Return how many frames of the empty bench have each verdict."""
+    world = open_world(str(bench.empty_scene))
+    results = _results(pipeline, world, range(STEADY_FRAMES + EMPTY_FRAMES))
+    return dict(Counter(one.verdict or "none" for one in results[STEADY_FRAMES:]).most_common())
+
+
+def _results(pipeline: Pipeline, world: World, numbers: Iterable[int]) -> list[FrameResult]:
+    """Return what the pipeline makes of frames of a world."""
+    frames = (world.images(number).frame(world.rig.pinhole) for number in numbers)
+    return [
+        pipeline.process(Arrival(frame, 0.0, frame_issues(frame)), lambda: 0.0, 0.0)
+        for frame in frames
+    ]
 
 
 def judge(bench: Bench, weights: Path | None) -> dict[str, Any]:
@@ -153,7 +174,8 @@ def judge(bench: Bench, weights: Path | None) -> dict[str, Any]:
     )
     images, verdicts = shown(pipeline, world, len(subjects), bench.box)
     found = over_objects(per_object(images, truth_of(subjects, bench.box), bench.box))
-    return plain(found) | {"verdicts": verdicts}
+    empty = empty_verdicts(pipeline, bench)
+    return plain(found) | {"verdicts": verdicts, "empty_frames": empty}
 
 
 def judged(bench: Bench, minutes: float) -> dict[str, Any]:
