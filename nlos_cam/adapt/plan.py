@@ -26,9 +26,11 @@ NETWORK_SHARE = 0.7
 HELD_OUT_OBJECTS = 400
 """Objects by which an epoch is chosen, and of which as many at most calibrate the uncertainty."""
 FIRST_OBJECTS = 1000
-"""Objects that are there before training begins."""
-RENDERED_AFTER = 0.8
-"""Share of the epochs after which all objects are there: the last ones are seen as well."""
+"""Fewest objects of a stage, also where its minutes are too few for them."""
+PASSES = 6
+"""Samples of each object: with more, weights that know many rigs learn these objects by heart, with
+fewer the minutes would be better spent on training.
+"""
 STEPS_PER_EPOCH = 40
 SAME_MINUTES = 1e-6
 """Difference of two sums of minutes that is rounding's."""
@@ -84,7 +86,8 @@ class Stage(Record):
             held_out=HELD_OUT_OBJECTS,
             epochs=self.epochs,
             batch=BATCH,
-            learning_rate=1e-3,
+            # A higher rate forgets what the start weights know, and has to learn it again.
+            learning_rate=4e-4,
             betas=(0.9, 0.98),
             schedule="cosine",
             warm_up_steps=min(100, self.epochs * self.steps // 5),
@@ -93,22 +96,13 @@ class Stage(Record):
             average=min(0.998, max(0.0, 1 - 10 / (self.epochs * self.steps))),
             keep="best",
             gradient_limit=1.0,
+            dropout=0.1,
             noise=0.02,
             wall_texture=0.05,
             range_offset_m=0.002,
             precision="bf16-mixed",
             deviations=["not the paper's network: two heads, no latent (docs/direct.md)"],
         )
-
-    def objects_at(self, epoch: int, before: int) -> int:
-        """Return how many objects an epoch trains on; `before` are there from earlier stages.
-
-        Whole shards, the same at every run: rendering goes on meanwhile, and training waits for
-        it where it must.
-        """
-        first = max(before, min(FIRST_OBJECTS, self.objects))
-        share = min(1.0, epoch / max(RENDERED_AFTER * (self.epochs - 1), 1))
-        return SHARD * ((first + round(share * (self.objects - first))) // SHARD)
 
 
 class Locked(Record):
@@ -158,16 +152,22 @@ class Plan(Record):
             return self
         seconds = 60 * further * NETWORK_SHARE
         before = self.objects_before(len(self.stages))
-        rendered = SHARD * round(self.pace.objects_per_s * seconds * RENDERED_AFTER / SHARD)
-        steps = max(round(self.pace.samples_per_s * seconds / BATCH), 2 * MIN_EPOCHS)
+        objects_per_s = self.pace.objects_per_s
+        samples_per_s = self.pace.samples_per_s
+
+        # A new object costs its rendering and its samples, an earlier one its samples alone.
+        left_s = seconds - PASSES * before / samples_per_s
+        fitting = left_s / (1 / objects_per_s + PASSES / samples_per_s)
+        rendered = SHARD * max(round(fitting / SHARD), 0)
+        if not before:
+            rendered = max(rendered, FIRST_OBJECTS)
+        # Seeds of training end where those of held-out objects begin.
+        objects = min(before + rendered, HELD_OUT_SEED - self.seed)
+
+        trained_s = seconds - (objects - before) / objects_per_s
+        steps = max(round(samples_per_s * trained_s / BATCH), 2 * MIN_EPOCHS)
         epochs = min(max(steps // STEPS_PER_EPOCH, MIN_EPOCHS), MAX_EPOCHS)
-        stage = Stage(
-            minutes=further,
-            # seeds of training end where those of held-out objects begin
-            objects=min(before + max(rendered, FIRST_OBJECTS), HELD_OUT_SEED - self.seed),
-            epochs=epochs,
-            steps=steps // epochs,
-        )
+        stage = Stage(minutes=further, objects=objects, epochs=epochs, steps=steps // epochs)
         return self.model_copy(update={"stages": (*self.stages, stage)})
 
     def uncertainty_recipe(self, whole: UncertaintyRecipe) -> UncertaintyRecipe:

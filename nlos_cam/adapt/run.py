@@ -9,14 +9,12 @@ import os
 import shutil
 import time
 from collections.abc import Callable, Generator, Sequence
-from concurrent.futures import ThreadPoolExecutor
-from contextlib import closing, contextmanager
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from hashlib import sha256
 from itertools import islice
 from math import ceil
 from pathlib import Path
-from threading import Event, Thread
 from typing import Any, Literal
 
 import nlos_models as models
@@ -90,12 +88,11 @@ QUALITY_OBJECTS = 600, 6000
 """Objects that the quality model is fitted to, at least and at most."""
 QUALITY_PER_MINUTE = 60
 SHARE_GENERIC = 0.5
-POLL_S = 0.2
 PACE_OBJECTS = 200
 PACE_OBJECTS_EACH = 50
 """Objects that the pace is measured on: at least these, and these for each process that renders.
 Many processes bring their first pieces at the same moment, whatever these took."""
-PACE_STEPS = 6
+PACE_STEPS = 12
 NOTES_EACH = 3
 """Fewest calls of `on_progress` for each process that a pace is measured by."""
 RECIPE = "doubt"
@@ -117,8 +114,8 @@ class Adaptation:
     """Start weights; None for the shipped ones that serve the rig best."""
     sensor: SensorModel = field(default_factory=SensorModel)
     seed: int = 0
-    workers: int = field(default_factory=lambda: max((os.cpu_count() or 2) // 2, 1))
-    """Processes that render; the other cores train meanwhile."""
+    workers: int = field(default_factory=lambda: os.cpu_count() or 1)
+    """Processes that render."""
     farm: data.Farm | None = None
     """Cluster that renders in place of `workers` processes here."""
     accelerator: Literal["auto", "cpu", "cuda"] = "auto"
@@ -145,14 +142,6 @@ class Adaptation:
     def renderers(self) -> int:
         """Number of processes that render, as far as a farm knows."""
         return getattr(self.farm, "workers", 1) if self.farm else self.workers
-
-    @property
-    def threads(self) -> int:
-        """Number of threads that train, so that none waits for a core that renders: two threads on
-        two cores, one of them rendering, took a tenth of one thread's samples.
-        """
-        cores = os.cpu_count() or 2
-        return cores if self.farm else max(cores - self.workers, 1)
 
 
 @dataclass(frozen=True)
@@ -220,7 +209,7 @@ def adapt(
     KeyboardInterrupt where it was stopped: the same call goes on.
     """
     job.folder.mkdir(parents=True, exist_ok=True)
-    with claim(job.folder, inside=True), _threads(job.threads):
+    with claim(job.folder, inside=True), _all_cores():
         job = _with_first_start(job)
         plan = _plan_for(job, minutes, tracked)
         job = replace(job, spread=plan.spread, sensor=plan.sensor, seed=plan.seed)
@@ -284,10 +273,10 @@ def _with_first_start(job: Adaptation) -> Adaptation:
 
 
 @contextmanager
-def _threads(count: int) -> Generator[None]:
-    """Let torch compute with a number of threads until the end of the block."""
+def _all_cores() -> Generator[None]:
+    """Let torch compute with a thread for each core until the end of the block."""
     before = torch.get_num_threads()
-    torch.set_num_threads(count)
+    torch.set_num_threads(os.cpu_count() or 1)
     try:
         yield
     finally:
@@ -411,56 +400,43 @@ def _data_plan(
 
 
 def _measure_pace(job: Adaptation, on_progress: Callable[[int, int], None]) -> Pace:
-    """Measure rendering on the first objects, which are kept, and training on maps of noise: side
-    by side, as the plan has them, since two threads of one core share its time.
-    """
-    step = _probe_step(job)
-    step()  # the first one allocates
+    """Measure rendering on the first objects, which are kept, then training on maps of noise."""
+    step = _probe_step(job)  # first: it refuses start weights that cannot be trained on
     # the first objects compile kernels
     plan = _data_plan(job, job.seed, expected=True, off_record=True)
     folder = job.folder / OBJECTS
     data.build_dataset(plan, data.SHARD, folder, workers=1, on_progress=data.ignore, farm=job.farm)
 
-    stop = Event()
     done_at: list[tuple[int, float]] = []
 
     def note(done: int, total: int) -> None:
-        if stop.is_set():
-            raise KeyboardInterrupt
         done_at.append((done, time.perf_counter()))
         on_progress(done - data.SHARD, total - data.SHARD)
 
-    def render() -> None:
-        # Objects that were there when a measurement was killed say nothing about the pace. A
-        # cluster knows its processes once it has rendered.
-        count = data.SHARD
-        while len(done_at) <= NOTES_EACH * job.renderers:
-            done_at.clear()
-            objects = max(PACE_OBJECTS, PACE_OBJECTS_EACH * job.renderers)
-            count += data.SHARD * ceil(objects / data.SHARD)
-            data.build_dataset(
-                plan, count, folder, workers=job.workers, on_progress=note, farm=job.farm
-            )
-
-    steps = 0
-    with ThreadPoolExecutor(1) as pool:
-        start_s = time.perf_counter()
-        rendering = pool.submit(render)
-        try:
-            while steps < PACE_STEPS or not rendering.done():
-                step()
-                steps += 1
-        finally:
-            stop.set()
-        seconds = time.perf_counter() - start_s
-        rendering.result()
+    # Objects that were there when a measurement was killed say nothing about the pace. A cluster
+    # knows its processes once it has rendered.
+    count = data.SHARD
+    while len(done_at) <= NOTES_EACH * job.renderers:
+        done_at.clear()
+        objects = max(PACE_OBJECTS, PACE_OBJECTS_EACH * job.renderers)
+        count += data.SHARD * ceil(objects / data.SHARD)
+        data.build_dataset(
+            plan, count, folder, workers=job.workers, on_progress=note, farm=job.farm
+        )
 
     # Workers take seconds to start, once for all objects: the pace counts from the first piece of
     # each on. The first note says how many objects were there before.
     first, first_s = done_at[job.renderers]
     last, last_s = done_at[-1]
+
+    step()  # the first one allocates
+    start_s = time.perf_counter()
+    for _ in range(PACE_STEPS):
+        step()
+    seconds = time.perf_counter() - start_s
     return Pace(
-        objects_per_s=(last - first) / (last_s - first_s), samples_per_s=steps * BATCH / seconds
+        objects_per_s=(last - first) / (last_s - first_s),
+        samples_per_s=PACE_STEPS * BATCH / seconds,
     )
 
 
@@ -548,76 +524,6 @@ def _parts_of(found: Recordings, stage: Path, tracked: data.Tracked) -> dict[Par
     return write_parts(found, _transfer_folder(found, stage) / PARTS, tracked)
 
 
-class _Rendering:
-    """Rendering of a stage's objects in a thread, while the network trains on those that are there.
-
-    Leaving it ends the rendering: finished shards are kept.
-    """
-
-    def __init__(self, job: Adaptation, count: int) -> None:
-        self._job = job
-        self._count = count
-        self._stop = Event()
-        self._error: BaseException | None = None
-        self._thread = Thread(target=self._render, name="rendering")
-        self._thread.start()
-
-    def _render(self) -> None:
-        def on_progress(_done: int, _total: int) -> None:
-            if self._stop.is_set():
-                raise KeyboardInterrupt
-
-        try:
-            data.build_dataset(
-                _data_plan(self._job, self._job.seed, expected=True, off_record=True),
-                self._count,
-                self._job.folder / OBJECTS,
-                workers=self._job.workers,
-                on_progress=on_progress,
-                farm=self._job.farm,
-            )
-        except BaseException as error:  # noqa: BLE001  raised again where the objects are waited for
-            self._error = error
-
-    def wait_for(self, objects: int, stop: Callable[[], bool] = lambda: False) -> None:
-        """Wait until the first `objects` are on disk. Raises what ended the rendering before."""
-        folder = self._job.folder / OBJECTS
-        seeds = range(self._job.seed, self._job.seed + objects, data.SHARD)
-        missing = [data.shard_path(folder, seed) for seed in seeds]
-        while True:
-            # asked first: what a thread that has ended made is there by then
-            is_rendering = self._thread.is_alive()
-            missing = [path for path in missing if not path.exists()]
-            if not missing:
-                return
-            if stop():
-                raise KeyboardInterrupt
-            if not is_rendering:
-                raise self._error or SceneError(f"{missing[0]} was not rendered: try again")
-            time.sleep(POLL_S)
-
-    def close(self) -> None:
-        """End the rendering."""
-        self._stop.set()
-        self._thread.join()
-
-
-class _Watched:
-    """Watch of a run whose wish to stop is also heard between its steps, while it waits."""
-
-    def __init__(self, watch: training.Watch) -> None:
-        self._watch = watch
-        self.stop: Callable[[], bool] = lambda: False
-
-    @contextmanager
-    def __call__(
-        self, running: training.Running, recipe: training.Recipe, name: str
-    ) -> Generator[training.Running]:
-        with self._watch(running, recipe, name) as watched:
-            self.stop = watched.stop
-            yield watched
-
-
 def _train_stages(
     job: Adaptation,
     plan: Plan,
@@ -645,9 +551,7 @@ def _train_network(
     tracked: data.Tracked,
     watch: training.Watch | None,
 ) -> None:
-    """Train a stage's network on from the stage before, while its objects are rendered."""
-    # A cluster's driver changes the current folder while it connects, in the rendering's thread.
-    job = replace(job, folder=job.folder.absolute())
+    """Render a stage's objects, then train its network on from the stage before."""
     stage = plan.stages[number]
     before = job.folder / _stage_name(number - 1) / NETWORK if number else job.start_folder
     recipe = stage.recipe()
@@ -658,53 +562,55 @@ def _train_network(
     else:
         inputs = TrainingInputs.of_maps(job.rig, job.sensor, models.load_record(before))
     held_out = _test_set(job, HELD_OUT, data.HELD_OUT_SEED, HELD_OUT_OBJECTS, tracked)
-    there = plan.objects_before(number)
-    watched = _Watched(watch or training.unwatched)
+    _render_objects(job, stage.objects, tracked)
 
-    with closing(_Rendering(job, stage.objects)) as rendering:
-
-        def shards_of(epoch: int) -> int:
-            objects = stage.objects_at(epoch, there)
-            rendering.wait_for(objects, watched.stop)
-            return objects // data.SHARD
-
-        with tracked("rendering the first objects"):
-            rendering.wait_for(stage.objects_at(0, there))
-        if inputs.noise:
-            first = _first_objects(job, stage, rendering)
-            recipe = inputs.noise.fitted(recipe, start.normal, first)
-        store = data.open_packed_maps(
-            [job.folder / OBJECTS],
-            out.parent / PACKED,
-            normal=start.normal,
-            trained=inputs.trained,
-            growth=shards_of,
-            maps_rig=inputs.maps_rig,
-            locked=job.locked is not None,
+    if inputs.noise:
+        first = _first_objects(job, stage)
+        recipe = inputs.noise.fitted(recipe, start.normal, first)
+    store = data.open_packed_maps(
+        [job.folder / OBJECTS],
+        out.parent / PACKED,
+        normal=start.normal,
+        trained=inputs.trained,
+        growth=lambda _: stage.objects // data.SHARD,
+        maps_rig=inputs.maps_rig,
+        locked=job.locked is not None,
+    )
+    with store as source:
+        record = training.record_run(
+            recipe,
+            out,
+            inputs.rig,
+            runs,
+            before,
+            bench=inputs.bench,
+            bare_wall_counts=inputs.bare_wall_counts,
         )
-        with store as source:
-            record = training.record_run(
-                recipe,
-                out,
-                inputs.rig,
-                runs,
-                before,
-                bench=inputs.bench,
-                bare_wall_counts=inputs.bare_wall_counts,
-            )
-            fabric = training.open_fabric(recipe, accelerator=job.accelerator)
-            origin = training.digest_of(start, source.digest)
-            run = training.TrainingRun(recipe, out, record, origin, watch=watched)
-            maps = source.held_out(held_out, HELD_OUT_OBJECTS)
-            if inputs.noise:
-                maps = inputs.noise.added_to(maps)
-            training.run_direct(fabric, run, start, source, maps)
+        fabric = training.open_fabric(recipe, accelerator=job.accelerator)
+        origin = training.digest_of(start, source.digest)
+        run = training.TrainingRun(recipe, out, record, origin, watch=watch or training.unwatched)
+        maps = source.held_out(held_out, HELD_OUT_OBJECTS)
+        if inputs.noise:
+            maps = inputs.noise.added_to(maps)
+        training.run_direct(fabric, run, start, source, maps)
 
 
-def _first_objects(job: Adaptation, stage: Stage, rendering: _Rendering) -> list[training.MapSet]:
-    """Wait for a stage's first objects, and return them shard by shard."""
+def _render_objects(job: Adaptation, count: int, tracked: data.Tracked) -> None:
+    """Render objects for the bench as it may be, up to `count` with those that are there."""
+    with tracked(f"rendering objects for this bench, {count} in all") as on_progress:
+        data.build_dataset(
+            _data_plan(job, job.seed, expected=True, off_record=True),
+            count,
+            job.folder / OBJECTS,
+            workers=job.workers,
+            on_progress=on_progress,
+            farm=job.farm,
+        )
+
+
+def _first_objects(job: Adaptation, stage: Stage) -> list[training.MapSet]:
+    """Return a stage's first objects, shard by shard."""
     count = min(FIRST_OBJECTS, stage.objects)
-    rendering.wait_for(count)
     objects = data.open_dataset(job.folder / OBJECTS, locked=True)
     return list(islice(objects.chunks(), count // data.SHARD))
 
@@ -727,7 +633,7 @@ def _test_set(
             _data_plan(job, first_seed, expected=False, off_record=off_record),
             count,
             folder,
-            workers=job.workers + 1,
+            workers=job.workers,
             on_progress=on_progress,
             farm=job.farm,
         )

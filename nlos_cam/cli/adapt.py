@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shlex
 from functools import cache
 from pathlib import Path
@@ -71,7 +72,7 @@ def adapt(
     workers: Annotated[
         int | None,
         typer.Option(
-            "--workers", min=1, help="Processes that render (default: half of the cores)."
+            "--workers", min=1, help="Processes that render (default: as many as cores)."
         ),
     ] = None,
     accelerator: Annotated[
@@ -102,11 +103,14 @@ def adapt(
     overwrite: common.Overwrite = False,
     json: common.Json = False,
 ) -> None:
-    """Make weights for one bench: render objects for exactly its rig, and train on meanwhile.
+    """Make weights for one bench: render objects for exactly its rig, then train on with them.
 
     Killed at any moment, the same command goes on. More --minutes go on from what is there. Labelled
     recordings of known objects in BENCH/recordings are used too.
     """
+    # Before torch is loaded, which reads it. Threads that spin while they wait for a busy core hold
+    # up the others: beside any other work two of them trained a fifth of what one does.
+    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     own = Path(bench) if Path(bench).is_dir() else None
     folder = own if out is None else None
     rig, measured = bench_or_rig(bench)

@@ -4,10 +4,10 @@ from collections.abc import Callable, Generator
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 from unittest.mock import Mock
 
 import pytest
+import torch
 from made_adaptations import finish_network, job_in
 from nlos_calibration import Rig, load_rig
 from nlos_models import CheckpointRecord, DirectNetwork, load_network, training
@@ -17,8 +17,8 @@ from nlos_models.training.recipe import DirectSize
 
 from nlos_cam.adapt import NETWORK_FILE, Adaptation, adapt, calibration_spread
 from nlos_cam.adapt.plan import load_plan
-from nlos_cam.adapt.run import _Rendering, _train_network, _with_first_start
-from nlos_cam.dataset import DatasetPlan, build_dataset, ignore, shard_path, untracked
+from nlos_cam.adapt.run import _all_cores, _with_first_start
+from nlos_cam.dataset import DatasetPlan, build_dataset, ignore
 from nlos_cam.errors import SceneError
 from nlos_cam.files import FileBusyError, claim
 from nlos_cam.reconstruct import weights_for
@@ -170,58 +170,22 @@ def test_packed_maps_of_a_whole_network_are_removed(tmp_path: Path) -> None:
     assert not packed.exists()
 
 
-class LateRendering(_Rendering):
-    """Rendering whose thread ends, with the last objects, while its files are looked for."""
-
-    def __init__(self, job: Adaptation) -> None:
-        self._job = job
-        self._error = None
-        last = shard_path(job.folder / "objects", 0)
-        last.parent.mkdir()
-        self._thread: Any = Mock(is_alive=lambda: bool(last.touch()))
-
-
-def test_objects_that_come_as_the_rendering_ends_are_seen(tmp_path: Path) -> None:
-    LateRendering(job_in(tmp_path / "work", load_rig("paper-rig"))).wait_for(100)
-
-
-def test_training_has_the_folder_of_its_job_wherever_ray_is(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Ray's driver changes the current folder for the seconds in which it connects."""
-    monkeypatch.chdir(tmp_path)
-    job = job_in(Path("work"), load_rig("paper-rig"))
-    opened = Mock(side_effect=KeyboardInterrupt)
-
-    def connect(self: Any, *_: object) -> None:
-        monkeypatch.chdir("/")
-        self.wait_for = self.close = lambda *_: None
-
-    monkeypatch.setattr(_Rendering, "__init__", connect)
-    monkeypatch.setattr("nlos_cam.adapt.run._test_set", Mock())
-    monkeypatch.setattr("nlos_cam.dataset.open_packed_maps", opened)
-    plan = load_plan(job.folder)
-    assert plan
-    with pytest.raises(KeyboardInterrupt):
-        _train_network(job, plan, 0, untracked, None)
-
-    (objects,), packed = opened.call_args.args
-    assert objects == tmp_path / "work" / "objects"
-    assert packed == tmp_path / "work" / "stage-1" / "packed"
-
-
 @pytest.mark.parametrize("cores", CORES)
-def test_rendering_and_training_share_the_cores(
+def test_rendering_then_training_take_all_cores(
     cores: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A thread that waits for a core on which objects are rendered makes all the others wait."""
+    """One after the other: a thread that waits for a core on which objects are rendered makes all
+    the others wait.
+    """
     monkeypatch.setattr("os.cpu_count", lambda: cores)
+    before = torch.get_num_threads()
 
     job = Adaptation(load_rig("paper-rig"), calibration_spread(None), tmp_path)
+    with _all_cores():
+        threads = torch.get_num_threads()
 
-    assert job.workers + job.threads == max(cores, 2)
-    assert min(job.workers, job.threads) >= 1
-    assert replace(job, workers=cores).threads == 1
+    assert job.workers == threads == cores
+    assert torch.get_num_threads() == before
 
 
 def test_start_weights_of_another_size_stop_before_rendering(

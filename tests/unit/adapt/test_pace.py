@@ -16,6 +16,9 @@ PIECE_S = 0.5
 """Time in which a process renders a piece."""
 
 
+STEP_S = 0.4
+
+
 class Machine:
     """Machine with a number of processes, and a clock that only their work moves."""
 
@@ -27,6 +30,10 @@ class Machine:
     def perf_counter(self) -> float:
         """Return the time."""
         return self.now_s
+
+    def step(self) -> None:
+        """Train a step."""
+        self.now_s += STEP_S
 
     def build(self, _plan: Any, count: int, *_: object, on_progress: Any, **__: object) -> None:
         """Render, each process a piece at a time, each in about the same time."""
@@ -52,12 +59,13 @@ def test_the_pace_is_that_of_any_number_of_processes(
     machine = Machine(processes)
     monkeypatch.setattr(run, "time", machine)
     monkeypatch.setattr(run.data, "build_dataset", machine.build)
-    monkeypatch.setattr(run, "_probe_step", lambda _: lambda: None)
+    monkeypatch.setattr(run, "_probe_step", lambda _: machine.step)
     job = Adaptation(load_rig("paper-rig"), calibration_spread(None), tmp_path, workers=processes)
 
     pace = run._measure_pace(job, lambda _done, _total: None)
 
     assert pace.objects_per_s == pytest.approx(processes * PIECE / PIECE_S, rel=0.15)
+    assert pace.samples_per_s == pytest.approx(run.BATCH / STEP_S)
     assert machine.objects % run.data.SHARD == 0
 
 
@@ -75,7 +83,7 @@ def test_the_pace_of_a_cluster_is_known_once_it_has_rendered(
 
     monkeypatch.setattr(run, "time", machine)
     monkeypatch.setattr(run.data, "build_dataset", build)
-    monkeypatch.setattr(run, "_probe_step", lambda _: lambda: None)
+    monkeypatch.setattr(run, "_probe_step", lambda _: machine.step)
     job = Adaptation(load_rig("paper-rig"), calibration_spread(None), tmp_path, farm=farm)
 
     pace = run._measure_pace(job, lambda _done, _total: None)
