@@ -71,9 +71,7 @@ def adapt(
     backend: Backend = "cpu",
     workers: Annotated[
         int | None,
-        typer.Option(
-            "--workers", min=1, help="Processes that render (default: as many as cores)."
-        ),
+        typer.Option("--workers", min=1, help="Processes that render (default: as many as cores)."),
     ] = None,
     accelerator: Annotated[
         Literal["auto", "cpu", "cuda"],

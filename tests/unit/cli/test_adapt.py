@@ -37,7 +37,7 @@ def test_what_is_no_bench_is_said_in_one_line(run: Any, bench: str, why: str, co
     assert "Traceback" not in err
 
 
-def test_recording_of_an_unknown_object_is_refused_before_the_work(
+def test_recording_of_an_unknown_object_is_refused_first(
     run: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     make_bench(Path("bench"))
