@@ -3,7 +3,6 @@ minutes would bring.
 """
 
 import csv
-import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -27,6 +26,7 @@ from nlos_cam.report import (
     Table,
     figure_of,
     png,
+    saved_picture,
     write_document,
 )
 
@@ -35,6 +35,8 @@ MIN_EPOCHS = 8
 MIN_GROWTH = 1.25
 """Samples of two stages' ends, one over the other, from which on their difference says more than
 chance does."""
+SHEET = "sheet.png"
+"""Pictures of the objects, in the folder of an evaluation."""
 LATE_SHARE = 0.5
 """The gain of further work is read off the second half of a run."""
 
@@ -139,12 +141,6 @@ def transfer_words(found: Transfer) -> str:
     )
 
 
-def _sheet(title: str, caption: str, folder: Path, page: Path) -> Picture:
-    """Return the pictures of objects in an evaluation's folder, for a page elsewhere."""
-    path = folder / "sheet.png"
-    return Picture(title, caption, path.read_bytes(), os.path.relpath(path, page.parent))
-
-
 def _transfer_parts(found: Transfer, rows: Rows, page: Path) -> list[Section | Picture]:
     words = transfer_words(found)
     objects = {
@@ -158,7 +154,8 @@ def _transfer_parts(found: Transfer, rows: Rows, page: Path) -> list[Section | P
         [Banner("good" if found.is_better else "doubtful", words, ""), table, Facts(objects)],
     )
     title = "Objects held out, after the fit"
-    return [section, _sheet(title, "One frame each.", found.folder / AFTER, page)]
+    sheet = saved_picture(title, "One frame each.", found.folder / AFTER / SHEET, page)
+    return [section, sheet]
 
 
 @dataclass(frozen=True)
@@ -254,10 +251,10 @@ def write_page(
                 f"On {HELD_OUT_OBJECTS} objects that no training saw; by them the epoch was chosen.",
                 draw_curves(curves),
             ),
-            _sheet(
+            saved_picture(
                 "Truth, reconstruction and difference",
                 "The 54 test objects.",
-                result.weights.parent / REPORT,
+                result.weights.parent / REPORT / SHEET,
                 page,
             ),
             *(_transfer_parts(result.transfer, tables.recordings, page) if result.transfer else []),

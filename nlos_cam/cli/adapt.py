@@ -190,8 +190,8 @@ def _forecast(rig: walls.Rig, folder: Path | None) -> benches.ForecastRecord:
 
 
 def _recordings(folder: Path) -> adaptation.Recordings | None:
-    """Return the labelled recordings in a bench folder, if there are any. Raises RecordingError for
-    one whose object is not known: it would end the work after it was done.
+    """Return the labelled recordings in a bench folder, if there are any. Raises RecordingError at
+    once for one whose object is not known, which would end the work within some minutes.
     """
     loaded = benches.load_bench(folder, weights=False)
     recordings = folder / adaptation.RECORDINGS

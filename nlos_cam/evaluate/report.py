@@ -8,7 +8,6 @@ import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import cached_property
-from math import floor, log10
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -41,6 +40,7 @@ from nlos_cam.report import (
     Picture,
     Section,
     Table,
+    estimate_in_words,
     saved_picture,
     write_document,
 )
@@ -503,18 +503,9 @@ def _next_commands(figures: Mapping[str, Any]) -> list[str]:
 def format_interval(
     figure: Mapping[str, float | None] | metrics.Interval, digits: int | None = None
 ) -> str:
-    """Format an estimate and its interval, by default with two digits of the half width, "0.696
-    (0.660 to 0.731)"; of one object "0.696 (one object: no interval)".
-    """
+    """Format an estimate and its interval as `estimate_in_words` does."""
     parts = asdict(figure) if isinstance(figure, metrics.Interval) else figure
-    value, low, high = (parts[name] for name in ("value", "low", "high"))
-    if value is None:
-        return "none"
-    if low is None or high is None:
-        return f"{value:.{3 if digits is None else digits}f} (one object: no interval)"
-    if digits is None:
-        digits = min(max(1 - floor(log10((high - low) / 2)), 0), 3) if high > low else 3
-    return f"{value:.{digits}f} ({low:.{digits}f} to {high:.{digits}f})"
+    return estimate_in_words(parts["value"], parts["low"], parts["high"], digits)
 
 
 def _row(figures: Mapping[str, Any], metric: str, baselines: Sequence[str]) -> tuple[str, ...]:

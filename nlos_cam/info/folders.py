@@ -22,6 +22,7 @@ from nlos_cam.info.files import (
     read_json,
 )
 from nlos_cam.reconstruct import rig_in_words
+from nlos_cam.report import estimate_in_words
 
 
 def describe_bench(folder: Path, _verify: bool) -> Description | None:
@@ -201,21 +202,9 @@ def describe_figures(folder: Path, _verify: bool) -> Description:
         if name in figures
     }
     if iou := figures.get("silhouette_iou"):
-        facts["silhouette IoU"] = _interval(iou)
+        facts["silhouette IoU"] = estimate_in_words(iou["value"], iou["low"], iou["high"], 3)
     following = _page_in(folder)
     return Description("evaluation", facts, "", "nlos-cam evaluate", "", "JSON", following)
-
-
-def _interval(figure: Mapping[str, float | None]) -> str:
-    """Return an estimate with its interval, which one object does not have."""
-    value = figure["value"]
-    low = figure["low"]
-    high = figure["high"]
-    if value is None:
-        return "none"
-    if low is None or high is None:
-        return f"{value:.3f} (one object: no interval)"
-    return f"{value:.3f} ({low:.3f} to {high:.3f})"
 
 
 def describe_tradeoff(folder: Path, _verify: bool) -> Description:

@@ -2,9 +2,11 @@
 
 import base64
 import io
+import os
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from html import escape
+from math import floor, log10
 from pathlib import Path
 from string import Template
 from typing import TYPE_CHECKING
@@ -85,9 +87,25 @@ class Picture:
         return width > WIDE_PIXELS
 
 
-def saved_picture(title: str, caption: str, path: Path) -> Picture:
-    """Return a PNG file as a picture."""
-    return Picture(title, caption, path.read_bytes(), path.name)
+def saved_picture(title: str, caption: str, path: Path, page: Path | None = None) -> Picture:
+    """Return a PNG file as a picture of a report, which lies beside it or at `page`."""
+    name = path.name if page is None else os.path.relpath(path, page.parent)
+    return Picture(title, caption, path.read_bytes(), name)
+
+
+def estimate_in_words(
+    value: float | None, low: float | None, high: float | None, digits: int | None = None
+) -> str:
+    """Format an estimate and its interval, by default with two digits of the half width, "0.696
+    (0.660 to 0.731)"; of one object "0.696 (one object: no interval)".
+    """
+    if value is None:
+        return "none"
+    if low is None or high is None:
+        return f"{value:.{3 if digits is None else digits}f} (one object: no interval)"
+    if digits is None:
+        digits = min(max(1 - floor(log10((high - low) / 2)), 0), 3) if high > low else 3
+    return f"{value:.{digits}f} ({low:.{digits}f} to {high:.{digits}f})"
 
 
 def figure_of(width_in: float, height_in: float) -> "Figure":

@@ -35,6 +35,18 @@ def no_bench(_camera: object) -> Any:
     raise AssertionError("nothing is opened to list recordings")
 
 
+def record_at_home(monkeypatch: pytest.MonkeyPatch, folder: Path) -> None:
+    """Put recordings of just enough objects into a folder, made on the home rig."""
+
+    def sidecar_of(path: Path) -> Any:
+        return SimpleNamespace(label=path.stem, rig=HOME)
+
+    monkeypatch.setattr("nlos_cam.adapt.recordings.load_sidecar", sidecar_of)
+    folder.mkdir(exist_ok=True)
+    for number in range(MIN_OBJECTS):
+        (folder / f"object-{number}.bag").touch()
+
+
 def test_no_object_is_in_two_parts() -> None:
     labels = [f"object-{number:02d}" for number in range(20)]
 
@@ -57,14 +69,9 @@ def test_recordings_without_a_label_are_left_out(tmp_path: Path) -> None:
 def test_recordings_of_a_bench_that_moved_are_left_out(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, moved_m: float, found: bool
 ) -> None:
-    def sidecar_of(path: Path) -> Any:
-        return SimpleNamespace(label=path.stem, rig=HOME)
-
-    monkeypatch.setattr("nlos_cam.adapt.recordings.load_sidecar", sidecar_of)
+    record_at_home(monkeypatch, tmp_path)
     lidar = HOME.lidar.model_copy(update={"distance_m": HOME.lidar.distance_m + moved_m})
     now = HOME.model_copy(update={"lidar": lidar})
-    for number in range(MIN_OBJECTS):
-        (tmp_path / f"object-{number}.bag").touch()
     said: list[str] = []
 
     recordings = find_recordings(tmp_path, now, no_bench, said.append)
@@ -103,12 +110,7 @@ def test_recordings_in_another_box_are_left_out(
     assert box is not None
     aside = box.model_copy(update={"x_min_m": box.x_min_m + 0.03, "x_max_m": box.x_max_m + 0.03})
     now = HOME.model_copy(update={"object_box": aside})
-    monkeypatch.setattr(
-        "nlos_cam.adapt.recordings.load_sidecar",
-        lambda path: SimpleNamespace(label=path.stem, rig=HOME),
-    )
-    for number in range(MIN_OBJECTS):
-        (tmp_path / f"object-{number}.bag").touch()
+    record_at_home(monkeypatch, tmp_path)
     said: list[str] = []
 
     assert find_recordings(tmp_path, now, no_bench, said.append) is None
@@ -119,12 +121,7 @@ def test_recordings_made_meanwhile_are_not_taken_for_read(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """What is made of three recordings bears their name, also where there are four by then."""
-    monkeypatch.setattr(
-        "nlos_cam.adapt.recordings.load_sidecar",
-        lambda path: SimpleNamespace(label=path.stem, rig=HOME),
-    )
-    for number in range(MIN_OBJECTS):
-        (tmp_path / f"object-{number}.bag").touch()
+    record_at_home(monkeypatch, tmp_path)
     listed = find_recordings(tmp_path, HOME, no_bench, print)
     assert listed is not None
 
@@ -139,14 +136,8 @@ def test_recordings_made_meanwhile_are_not_taken_for_read(
 def test_a_mesh_elsewhere_counts_for_the_digest(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(
-        "nlos_cam.adapt.recordings.load_sidecar",
-        lambda path: SimpleNamespace(label=path.stem, rig=HOME),
-    )
     folder = tmp_path / "recordings"
-    folder.mkdir()
-    for number in range(MIN_OBJECTS):
-        (folder / f"object-{number}.bag").touch()
+    record_at_home(monkeypatch, folder)
     (folder / "object-0.truth.toml").write_text('file = "../mesh.stl"\n', encoding="utf-8")
 
     def digest() -> str:

@@ -229,6 +229,14 @@ def test_bench_of_the_settings_gives_way_to_what_is_given(
     assert calls == [given]
 
 
+def see_nothing(
+    camera: Camera = "sim",
+    bench_folder: Annotated[Path | None, typer.Option("--bench")] = None,
+) -> None:
+    """Take a camera and a bench, as `live` does."""
+    del camera, bench_folder
+
+
 @pytest.mark.parametrize(
     ("serial", "words", "notes"),
     [("f0000001", [], 1), ("f0000001", ["--bench", "other"], 0), ("simulated", [], 0)],
@@ -242,13 +250,7 @@ def test_left_out_bench_is_noted_where_no_other_is_named(
 ) -> None:
     make_bench(Path("mine"), serial=serial)
 
-    def command(
-        camera: Camera = "sim",
-        bench_folder: Annotated[Path | None, typer.Option("--bench")] = None,
-    ) -> None:
-        del camera, bench_folder
-
-    serve_as(monkeypatch, "live", command)
+    serve_as(monkeypatch, "live", see_nothing)
     Path(FILE).write_text('bench = "mine"\n', encoding="utf-8")
 
     assert main(["live", "sim", *words]) == 0
@@ -302,13 +304,7 @@ def test_command_without_a_camera_says_that_sim_is_used(
 ) -> None:
     make_bench(Path("bench"), serial=serial)
 
-    def command(
-        camera: Camera = "sim",
-        bench_folder: Annotated[Path | None, typer.Option("--bench")] = None,
-    ) -> None:
-        del camera, bench_folder
-
-    serve_as(monkeypatch, "live", command)
+    serve_as(monkeypatch, "live", see_nothing)
 
     assert main(["live", *words]) == 0
     found = capsys.readouterr().err
