@@ -401,9 +401,10 @@ def _data_plan(
 
 def _measure_pace(job: Adaptation, on_progress: Callable[[int, int], None]) -> Pace:
     """Measure rendering on the first objects, which are kept, then training on maps of noise."""
-    step = _probe_step(job)  # first: it refuses start weights that cannot be trained on
-    # the first objects compile kernels
     plan = _data_plan(job, job.seed, expected=True, off_record=True)
+    # before the objects: it refuses start weights that cannot be trained on
+    step = _probe_step(job, data.map_noise(plan))
+    # the first objects compile kernels
     folder = job.folder / OBJECTS
     data.build_dataset(plan, data.SHARD, folder, workers=1, on_progress=data.ignore, farm=job.farm)
 
@@ -440,19 +441,21 @@ def _measure_pace(job: Adaptation, on_progress: Callable[[int, int], None]) -> P
     )
 
 
-def _probe_step(job: Adaptation) -> Callable[[], None]:
-    """Return a training step on maps of noise, which leaves the start weights as they are."""
+def _probe_step(job: Adaptation, noise: training.MapNoise) -> Callable[[], None]:
+    """Return a training step on made-up maps, which leaves the start weights as they are."""
     recipe = _probe_recipe()
     network, _ = _start(recipe, job.start_folder)
     fabric = training.open_fabric(recipe, accelerator=job.accelerator)
     network = network.to(fabric.device).train()
     optimizer = torch.optim.AdamW(network.parameters(), 1e-12)
-    normal = torch.randn(BATCH, 2, 64, 80, device=fabric.device)
+    maps = torch.randn(BATCH, 2, 64, 80, device=fabric.device).half()
+    batch = training.NormalBatch(maps, torch.zeros_like(maps[:, 0, :, :64]), maps[:, 1].abs())
 
     def step() -> None:
         # in the training's own precision: bfloat16 is several times as fast where a CPU has it
         with fabric.autocast():
-            loss = network.logits(normal).float().square().mean()
+            # another noise, wall and offset for each object, which take as long as a small network
+            loss = training.step_error(recipe, network.normal, network.logits, batch, noise)
         optimizer.zero_grad(set_to_none=True)
         loss.backward()
         optimizer.step()

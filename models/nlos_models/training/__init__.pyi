@@ -49,6 +49,7 @@ __all__ = [
     "run_transfer",
     "run_uncertainty",
     "run_vae",
+    "step_error",
     "store_in_bytes",
     "subtract_bare_wall",
     "train_direct",
@@ -73,7 +74,7 @@ from .data import (
     first_of,
     subtract_bare_wall,
 )
-from .direct import NormalBatch, NormalSource, train_direct, varied
+from .direct import NormalBatch, NormalSource, step_error, train_direct, varied
 from .distributed import launch, open_fabric
 from .loop import Running, digest_of, fit
 from .losses import latent_error, two_heads_error

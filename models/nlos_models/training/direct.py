@@ -2,7 +2,7 @@
 heads.
 """
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import NamedTuple, Protocol
 
@@ -80,11 +80,7 @@ def train_direct(
     logits = running.maybe_compile(network.logits)
 
     def loss(batch: NormalBatch, _: float) -> Tensor:
-        # Maps are rendered once, without noise; each step draws its own, so that none is learnt.
-        normal = varied(recipe, network.normal, batch, source.noise)
-        return two_heads_error(
-            logits(normal + recipe.noise * torch.randn_like(normal)), batch.image
-        )
+        return step_error(recipe, network.normal, logits, batch, source.noise)
 
     figures = fit(
         network,
@@ -171,6 +167,21 @@ def transfer_direct(
 
     figures = in_two_phases(recipe, len(maps.image), folder, running or Running(), fit_phase)
     return network.cpu().eval(), figures
+
+
+def step_error(
+    recipe: DirectRecipe,
+    cells: CellNormal,
+    logits: Callable[[Tensor], Tensor],
+    batch: NormalBatch,
+    noise: MapNoise | None,
+) -> Tensor:
+    """Return the loss of a training step: of a batch's maps as another bench or moment would give
+    them.
+    """
+    # Maps are rendered once, without noise; each step draws its own, so that none is learnt.
+    normal = varied(recipe, cells, batch, noise)
+    return two_heads_error(logits(normal + recipe.noise * torch.randn_like(normal)), batch.image)
 
 
 def varied(

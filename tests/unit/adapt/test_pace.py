@@ -59,7 +59,7 @@ def test_the_pace_is_that_of_any_number_of_processes(
     machine = Machine(processes)
     monkeypatch.setattr(run, "time", machine)
     monkeypatch.setattr(run.data, "build_dataset", machine.build)
-    monkeypatch.setattr(run, "_probe_step", lambda _: machine.step)
+    monkeypatch.setattr(run, "_probe_step", lambda *_: machine.step)
     job = Adaptation(load_rig("paper-rig"), calibration_spread(None), tmp_path, workers=processes)
 
     pace = run._measure_pace(job, lambda _done, _total: None)
@@ -83,7 +83,7 @@ def test_the_pace_of_a_cluster_is_known_once_it_has_rendered(
 
     monkeypatch.setattr(run, "time", machine)
     monkeypatch.setattr(run.data, "build_dataset", build)
-    monkeypatch.setattr(run, "_probe_step", lambda _: machine.step)
+    monkeypatch.setattr(run, "_probe_step", lambda *_: machine.step)
     job = Adaptation(load_rig("paper-rig"), calibration_spread(None), tmp_path, farm=farm)
 
     pace = run._measure_pace(job, lambda _done, _total: None)
