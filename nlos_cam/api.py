@@ -122,8 +122,8 @@ def open_stream(
     """Open a camera and load the networks, without starting the camera yet; call it as
     `nlos_cam.open`.
 
-    `uri` is `l515`, `l515:SERIAL`, `sim`, `sim:bare-wall`, `sim:scene.toml`, `bag:run.bag` or the
-    path of a recording;
+    `uri` is `l515`, `l515:SERIAL`, `sim`, `sim:bare-wall`, `sim:scene.toml`, `sample`,
+    `bag:run.bag` or the path of a recording;
     `wall` a record of `calibrate --wall`, or `bench` a bench folder of `calibrate --bench`, which
     brings its wall and its own weights; `weights` a folder of other weights than these or the
     shipped ones that serve its rig best; maps are the mean of the last `average` frames.

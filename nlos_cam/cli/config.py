@@ -44,7 +44,7 @@ SETTINGS = {
     "bench": Setting(
         frozenset({"live", "replay", "view", "capture", "evaluate", "detect", "predict"}),
         None,
-        "--bench, unless another CAMERA, --wall or --rig is given",
+        "--bench, unless another CAMERA, --wall, --rig or --dataset is given",
     ),
     "weights": Setting(frozenset({"live", "replay", "view", "evaluate"}), None, "--weights"),
     "view_port": Setting(frozenset({"demo", "live", "view"}), None, "--view-port"),

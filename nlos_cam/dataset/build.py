@@ -211,6 +211,7 @@ def processes(workers: int) -> Farm:
     def make(plan: DatasetPlan, pieces: Sequence[range]) -> Pieces:
         left = deque(pieces)
         farm = dict[Connection, Worker]()
+        dismissed: list[Worker] = []
         lost = 0
         try:
             while left or farm:
@@ -229,11 +230,13 @@ def processes(workers: int) -> Farm:
                             " and build again"
                         )
                     if not worker.asked:
-                        farm.pop(worker.pipe).end()
+                        del farm[worker.pipe]
+                        dismissed.append(worker)
+                        worker.dismiss()
                     if made:
                         yield made
         finally:
-            for worker in farm.values():
+            for worker in (*dismissed, *farm.values()):
                 worker.end()
 
     return make

@@ -154,7 +154,8 @@ class RunReport:
     """p50, p95 and p99 from timestamp to result; see `FrameReader.offset_s` for the two clocks."""
     stages_ms: Mapping[str, float]
     """Median by stage: delivery (from the timestamp to the reader), wait (for a frame), queue,
-    maps, bench (difference and drift), network, view (hand-over to the viewer)."""
+    maps, bench (difference and drift), network, doubt (the uncertainty network), view (hand-over
+    to the viewer)."""
     counts: Mapping[str, int]
     """Counts above 0, by name: the camera's own, incomplete and dropped_camera; dropped_loop:
     processing was too slow; failed; blank, half_invalid, saturated (see `frame_issues`); stalls."""

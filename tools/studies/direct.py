@@ -1,5 +1,5 @@
 """Direct networks side by side, each trained for equal processor seconds:
-docs/figures/direct_ablations.json and .md.
+docs/figures/direct_ablations.json, and the tables of docs/direct.md, which are printed.
 
 And a learning curve over runs of one recipe with other budgets: docs/figures/direct_curve.json,
 docs/images/direct_curve.png.
@@ -172,7 +172,7 @@ def draw_curve(rows: list[dict[str, Any]]) -> Figure:
 
 
 def as_markdown(rows: list[dict[str, Any]]) -> str:
-    """Return docs/direct_ablations.md."""
+    """Return the tables of docs/direct.md, one for each test set."""
     parts = [f"# Direct networks: {budget_of(rows)}"]
     for key in rows[0]["values"]:
         first = {metric: np.array(each) for metric, each in rows[0]["values"][key].items()}
@@ -241,7 +241,6 @@ def compare(chosen: Namespace, source: PackedMaps) -> None:
         rows = [*(one for one in rows if one["name"] != row["name"]), row]
         name = row["name"]
         path.write_text(json.dumps(rows), encoding="utf-8")
-        (chosen.out / "direct_ablations.md").write_text(as_markdown(rows), encoding="utf-8")
         figures = {
             key: over_objects({m: np.array(v) for m, v in rows[-1]["values"][key].items()})
             for key in sets
@@ -254,6 +253,8 @@ def compare(chosen: Namespace, source: PackedMaps) -> None:
                 {metric: format_interval(figure) for metric, figure in each.items()},
                 flush=True,
             )
+    if rows:
+        print(as_markdown(rows))
     curve = sorted(
         (row for row in rows if row["name"].startswith("curve")), key=itemgetter("samples")
     )

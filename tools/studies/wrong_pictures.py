@@ -307,7 +307,9 @@ def report(outcomes: Sequence[Outcome]) -> dict[str, Any]:
 
 
 def markdown(facts: dict[str, Any]) -> str:
-    """Return the table of docs/physics-check.md."""
+    """Return a table of the shares, with a row for each group and harm; docs/physics-check.md has some
+    of them.
+    """
     columns = "seen", "seen_wrong", "seen_wrong_by_the_harm", "nothing", "green_wrong"
     head = ["frames", *(column.replace("_", " ") for column in columns)]
     rows = [
