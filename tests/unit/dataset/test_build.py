@@ -423,6 +423,21 @@ def test_closing_ends_workers_while_they_send(monkeypatch: Patch) -> None:
     assert not active_children()
 
 
+@pytest.mark.usefixtures("_forked")
+def test_all_pieces_come_before_any_process_is_waited_for(monkeypatch: Patch) -> None:
+    """A process without work takes a second to end: a pace that counted it would be too low."""
+    monkeypatch.setattr(MAKER, lambda _, piece: samples_of(piece))
+    waited_for: list[object] = []
+    end = worker.Worker.end
+    monkeypatch.setattr(worker.Worker, "end", lambda self: (waited_for.append(self), end(self))[1])
+
+    before = [len(waited_for) for _ in processes(2)(PLAN, PIECES)]
+
+    assert before == [0] * len(PIECES)
+    assert len(waited_for) == 2
+    assert not active_children()
+
+
 @pytest.mark.slow
 def test_processes_make_the_samples_of_one_process(tmp_path: Path) -> None:
     build_dataset(PLAN, 4, tmp_path, workers=2, on_progress=lambda *_: None)
