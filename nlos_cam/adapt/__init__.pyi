@@ -23,14 +23,13 @@ __all__ = [
     "write_page",
 ]
 
+from .job import OBJECTS, Adaptation
 from .locked import LockedNoise
 from .plan import PLAN, Locked, Pace, Plan, Stage, bench_sensor, calibration_spread
 from .recordings import RECORDINGS, Recordings, Transfer, find_recordings
 from .report import Tables, transfer_words, write_page
 from .run import (
     NETWORK_FILE,
-    OBJECTS,
-    Adaptation,
     AdaptResult,
     Measure,
     adapt,

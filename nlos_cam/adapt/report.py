@@ -10,9 +10,10 @@ from pathlib import Path
 import numpy as np
 from nlos_models import TRAINING_LOG
 
+from nlos_cam.adapt.job import NETWORK
 from nlos_cam.adapt.plan import HELD_OUT_OBJECTS, Plan
 from nlos_cam.adapt.recordings import Transfer, iou_of
-from nlos_cam.adapt.run import AFTER, NETWORK, REPORT, AdaptResult
+from nlos_cam.adapt.run import AFTER, REPORT, AdaptResult
 from nlos_cam.bench import ForecastRecord
 from nlos_cam.camera import FRAMES_PER_S
 from nlos_cam.forecast import SCATTER_IOU

@@ -7,30 +7,40 @@ leaves its result there and is not done again, so that a killed adaptation goes 
 import json
 import os
 import shutil
-import time
 from collections.abc import Callable, Generator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from hashlib import sha256
 from itertools import islice
-from math import ceil
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import nlos_models as models
 import torch
-from nlos_calibration import Rig
 from nlos_models import training
 
 from nlos_cam import dataset as data
 from nlos_cam.adapt.inputs import TrainingInputs
+from nlos_cam.adapt.job import (
+    EARLIER_QUALITY,
+    HELD_OUT,
+    JUDGED,
+    NETWORK,
+    OBJECTS,
+    OUTLIERS,
+    QUALITY,
+    WEIGHTS,
+    Adaptation,
+    data_plan,
+    is_whole,
+    render_set,
+    start_network,
+)
+from nlos_cam.adapt.pace import measure_pace
 from nlos_cam.adapt.plan import (
-    BATCH,
     FIRST_OBJECTS,
     HELD_OUT_OBJECTS,
     PLAN,
-    Locked,
-    Pace,
     Plan,
     Stage,
     load_plan,
@@ -46,26 +56,17 @@ from nlos_cam.adapt.recordings import (
     parts_of,
     write_parts,
 )
+from nlos_cam.adapt.verdicts import train_uncertainty
 from nlos_cam.errors import OutputExistsError, SceneError
 from nlos_cam.files import (
     CHECKSUMS,
     atomic_directory,
-    cache_folder,
     checksums_of,
     claim,
-    write_checked,
 )
 from nlos_cam.reconstruct import check_alignable, weights_for
-from nlos_cam.render import RENDERING_VERSION, SensorModel
+from nlos_cam.render import RENDERING_VERSION
 
-OBJECTS = "objects"
-HELD_OUT = "held-out"
-JUDGED = "judged"
-QUALITY = "scored"
-OUTLIERS = "outliers"
-UNCERTAINTY = "uncertainty"
-NETWORK = "network"
-WEIGHTS = "weights"
 NETWORK_FILE = f"{models.DIRECT}.safetensors"
 PACKED = "packed"
 BEFORE = "before"
@@ -78,70 +79,10 @@ PARTS = "parts"
 STAGE = "stage-{}"
 REPORT = "report"
 FIGURES = "figures.json"
-EARLIER_QUALITY = "quality"
-"""Folder of the quality model's objects in nlos-cam 0.2.0, where they were on the rig itself."""
-QUALITY_SEED = 40_000_000
-JUDGED_SEED = 35_000_000
-"""First seeds of the objects that the quality model and the uncertainty network are fitted to:
-neither a bench's network nor shipped weights were trained on these."""
-QUALITY_OBJECTS = 600, 6000
-"""Objects that the quality model is fitted to, at least and at most."""
-QUALITY_PER_MINUTE = 60
-SHARE_GENERIC = 0.5
-PACE_OBJECTS = 200
-PACE_OBJECTS_EACH = 50
-"""Objects that the pace is measured on: at least these, and these for each process that renders.
-Many processes bring their first pieces at the same moment, whatever these took."""
-PACE_STEPS = 12
-NOTES_EACH = 3
-"""Fewest calls of `on_progress` for each process that a pace is measured by."""
-RECIPE = "doubt"
 
 Measure = Callable[[Path | None, Path, Path | None], None]
 """Measures weights (None: the shipped ones) on a dataset (None: the bench's test objects): writes
 FIGURES and a report into a folder."""
-
-
-@dataclass(frozen=True)
-class Adaptation:
-    """Request for an adaptation: the bench, the weights to start from, and the processes to use."""
-
-    rig: Rig
-    spread: data.RigSpread
-    """How far the bench may be off its rig."""
-    folder: Path
-    start: Path | None = None
-    """Start weights; None for the shipped ones that serve the rig best."""
-    sensor: SensorModel = field(default_factory=SensorModel)
-    seed: int = 0
-    workers: int = field(default_factory=lambda: os.cpu_count() or 1)
-    """Processes that render."""
-    farm: data.Farm | None = None
-    """Cluster that renders in place of `workers` processes here."""
-    accelerator: Literal["auto", "cpu", "cuda"] = "auto"
-    locked: Locked | None = None
-    """Locked differences in place of maps; their weights are for a study, not for `live`."""
-    recordings: Recordings | None = None
-    """Recordings of known objects on the bench, if there are any."""
-    begin_again: bool = False
-    """True to empty a folder that holds an adaptation to another rig; else that is an error."""
-    began_from: Path | None = None
-    """Shipped weights that the work in the folder began from. They stay the start weights, also
-    where a later version of the program would choose others."""
-
-    @property
-    def start_folder(self) -> Path:
-        """Folder of the start weights."""
-        if self.start:
-            return models.weights_folder(self.start)
-        if self.locked:  # differences in the bench's own cells, which the wall grid has not
-            return weights_for(self.rig, models.RIG_WEIGHTS)
-        return self.began_from or weights_for(self.rig)
-
-    @property
-    def renderers(self) -> int:
-        """Number of processes that render, as far as a farm knows."""
-        return getattr(self.farm, "workers", 1) if self.farm else self.workers
 
 
 @dataclass(frozen=True)
@@ -228,7 +169,7 @@ def adapt(
         transfer = _transfer(job, folders[-1], measure, tracked, watch)
         last = transfer.folder if transfer and transfer.is_better else folders[-1]
         was_there = (last / REPORT / FIGURES).exists()
-        _train_uncertainty(job, plan, last, tracked, watch)
+        train_uncertainty(job, plan, last, tracked, watch)
         after = _figures(measure, last / WEIGHTS, last / REPORT)
         return AdaptResult(
             last / WEIGHTS,
@@ -315,7 +256,7 @@ def _plan_for(job: Adaptation, minutes: float, tracked: data.Tracked) -> Plan:
         if not job.locked:  # before minutes of measuring and rendering
             check_alignable(job.rig, models.load_record(job.start_folder))
         with tracked("measuring the pace of this machine") as on_progress:
-            pace = _measure_pace(job, on_progress)
+            pace = measure_pace(job, on_progress)
         plan = Plan(
             rig_checksum=job.rig.checksum,
             spread=job.spread,
@@ -332,7 +273,7 @@ def _plan_for(job: Adaptation, minutes: float, tracked: data.Tracked) -> Plan:
             " these, or choose another --out"
         )
     # the shipped weights of another version are no change of mind, once they are trained on
-    has_begun = _is_whole(job.folder / _stage_name(0) / NETWORK, models.NETWORK_ONNX)
+    has_begun = is_whole(job.folder / _stage_name(0) / NETWORK, models.NETWORK_ONNX)
     if (job.start or not has_begun) and plan.start != _start_checksum(job):
         raise SceneError(
             f"{job.folder} began from other start weights than {job.start or 'the shipped ones'}:"
@@ -370,116 +311,6 @@ def _checksum(path: Path) -> str:
     return sha256(path.read_bytes()).hexdigest()
 
 
-def _data_plan(
-    job: Adaptation, first_seed: int, *, expected: bool, off_record: bool
-) -> data.DatasetPlan:
-    """Return the plan of objects on the bench as it may be where `off_record`, else on the rig
-    itself.
-    """
-    if job.locked:
-        return data.DatasetPlan(
-            job.rig,
-            first_seed,
-            job.sensor,
-            accuracy=data.LOCKED,
-            objects=data.Objects(share_generic=SHARE_GENERIC),
-            radiometry=job.locked.radiometry,
-            material=job.locked.material,
-        )
-    return data.DatasetPlan(
-        job.rig,
-        first_seed,
-        job.sensor,
-        accuracy="draft",
-        objects=data.Objects(share_generic=SHARE_GENERIC),
-        spread=job.spread if off_record else data.RigSpread(),
-        expected=expected,
-        objects_per_rig=data.OBJECTS_PER_RIG if off_record else 1,
-        off_record=off_record,
-    )
-
-
-def _measure_pace(job: Adaptation, on_progress: Callable[[int, int], None]) -> Pace:
-    """Measure rendering on the first objects, which are kept, then training on maps of noise."""
-    plan = _data_plan(job, job.seed, expected=True, off_record=True)
-    # before the objects: it refuses start weights that cannot be trained on
-    step = _probe_step(job, data.map_noise(plan))
-    # the first objects compile kernels
-    folder = job.folder / OBJECTS
-    data.build_dataset(plan, data.SHARD, folder, workers=1, on_progress=data.ignore, farm=job.farm)
-
-    done_at: list[tuple[int, float]] = []
-
-    def note(done: int, total: int) -> None:
-        done_at.append((done, time.perf_counter()))
-        on_progress(done - data.SHARD, total - data.SHARD)
-
-    # Objects that were there when a measurement was killed say nothing about the pace. A cluster
-    # knows its processes once it has rendered.
-    count = data.SHARD
-    while len(done_at) <= NOTES_EACH * job.renderers:
-        done_at.clear()
-        objects = max(PACE_OBJECTS, PACE_OBJECTS_EACH * job.renderers)
-        count += data.SHARD * ceil(objects / data.SHARD)
-        data.build_dataset(
-            plan, count, folder, workers=job.workers, on_progress=note, farm=job.farm
-        )
-
-    # Workers take seconds to start, once for all objects: the pace counts from the first piece of
-    # each on. The first note says how many objects were there before.
-    first, first_s = done_at[job.renderers]
-    last, last_s = done_at[-1]
-
-    step()  # the first one allocates
-    start_s = time.perf_counter()
-    for _ in range(PACE_STEPS):
-        step()
-    seconds = time.perf_counter() - start_s
-    return Pace(
-        objects_per_s=(last - first) / (last_s - first_s),
-        samples_per_s=PACE_STEPS * BATCH / seconds,
-    )
-
-
-def _probe_step(job: Adaptation, noise: training.MapNoise) -> Callable[[], None]:
-    """Return a training step on made-up maps, which leaves the start weights as they are."""
-    recipe = _probe_recipe()
-    network, _ = _start(recipe, job.start_folder)
-    fabric = training.open_fabric(recipe, accelerator=job.accelerator)
-    network = network.to(fabric.device).train()
-    optimizer = torch.optim.AdamW(network.parameters(), 1e-12)
-    maps = torch.randn(BATCH, 2, 64, 80, device=fabric.device).half()
-    batch = training.NormalBatch(maps, torch.zeros_like(maps[:, 0, :, :64]), maps[:, 1].abs())
-
-    def step() -> None:
-        # in the training's own precision: bfloat16 is several times as fast where a CPU has it
-        with fabric.autocast():
-            # another noise, wall and offset for each object, which take as long as a small network
-            loss = training.step_error(recipe, network.normal, network.logits, batch, noise)
-        optimizer.zero_grad(set_to_none=True)
-        loss.backward()
-        optimizer.step()
-        float(loss.detach())  # waits for a GPU, which would count steps that it has not done
-
-    return step
-
-
-def _start(
-    recipe: training.DirectRecipe, folder: Path
-) -> tuple[models.DirectNetwork, list[training.Recipe]]:
-    """Return the direct network in a folder, and the runs that made it. Raises TrainingError for
-    weights that the recipe does not go on from.
-    """
-    network, runs = training.direct_start(recipe, folder)
-    if network is None:
-        raise SceneError("the recipe of an adaptation starts from scratch")
-    return network, runs
-
-
-def _probe_recipe() -> training.DirectRecipe:
-    return Stage(minutes=1.0, objects=FIRST_OBJECTS, epochs=1, steps=10).recipe()
-
-
 def _transfer(
     job: Adaptation,
     stage: Path,
@@ -496,7 +327,7 @@ def _transfer(
     folder = _transfer_folder(found, stage)
     parts = _parts_of(found, stage, tracked)
     network = folder / NETWORK
-    if not _is_whole(network, models.NETWORK_ONNX):
+    if not is_whole(network, models.NETWORK_ONNX):
         fit_to_recordings(
             stage / NETWORK, parts, network, job.accelerator, watch or training.unwatched
         )
@@ -541,7 +372,7 @@ def _train_stages(
             f"stage {number + 1} of {len(plan.stages)}: {stage.objects} objects,"
             f" {stage.samples} samples"
         )
-        if not _is_whole(folders[number] / NETWORK, models.NETWORK_ONNX):
+        if not is_whole(folders[number] / NETWORK, models.NETWORK_ONNX):
             _train_network(job, plan, number, tracked, watch)
         # Gigabytes, which are made again from the objects if needed.
         shutil.rmtree(folders[number] / PACKED, ignore_errors=True)
@@ -559,12 +390,12 @@ def _train_network(
     before = job.folder / _stage_name(number - 1) / NETWORK if number else job.start_folder
     recipe = stage.recipe()
     out = job.folder / _stage_name(number) / NETWORK
-    start, runs = _start(recipe, before)
+    start, runs = start_network(recipe, before)
     if job.locked:
         inputs = TrainingInputs.of_locked(job.rig, job.sensor, job.locked)
     else:
         inputs = TrainingInputs.of_maps(job.rig, job.sensor, models.load_record(before))
-    held_out = _test_set(job, HELD_OUT, data.HELD_OUT_SEED, HELD_OUT_OBJECTS, tracked)
+    held_out = render_set(job, HELD_OUT, data.HELD_OUT_SEED, HELD_OUT_OBJECTS, tracked)
     _render_objects(job, stage.objects, tracked)
 
     if inputs.noise:
@@ -602,7 +433,7 @@ def _render_objects(job: Adaptation, count: int, tracked: data.Tracked) -> None:
     """Render objects for the bench as it may be, up to `count` with those that are there."""
     with tracked(f"rendering objects for this bench, {count} in all") as on_progress:
         data.build_dataset(
-            _data_plan(job, job.seed, expected=True, off_record=True),
+            data_plan(job, job.seed, expected=True, off_record=True),
             count,
             job.folder / OBJECTS,
             workers=job.workers,
@@ -616,122 +447,6 @@ def _first_objects(job: Adaptation, stage: Stage) -> list[training.MapSet]:
     count = min(FIRST_OBJECTS, stage.objects)
     objects = data.open_dataset(job.folder / OBJECTS, locked=True)
     return list(islice(objects.chunks(), count // data.SHARD))
-
-
-def _test_set(
-    job: Adaptation,
-    name: str,
-    first_seed: int,
-    count: int,
-    tracked: data.Tracked,
-    *,
-    off_record: bool = False,
-) -> Path:
-    """Return a folder of `count` objects with the sensor's noise, on the rig itself or on the bench
-    as it may be.
-    """
-    folder = job.folder / name
-    with tracked(f"rendering {count} objects ({name})") as on_progress:
-        data.build_dataset(
-            _data_plan(job, first_seed, expected=False, off_record=off_record),
-            count,
-            folder,
-            workers=job.workers,
-            on_progress=on_progress,
-            farm=job.farm,
-        )
-    return folder
-
-
-def _train_uncertainty(
-    job: Adaptation, plan: Plan, folder: Path, tracked: data.Tracked, watch: training.Watch | None
-) -> None:
-    """Train the uncertainty network of a network, fit its quality model, and put all three into
-    WEIGHTS in one step, unless that is there.
-    """
-    if (folder / WEIGHTS).exists():
-        return
-
-    network = folder / NETWORK
-    uncertainty = folder / UNCERTAINTY  # gets copies of the network's files too
-    if not _is_whole(uncertainty, models.UNCERTAINTY_ONNX):
-        _train_uncertainty_network(job, plan, network, uncertainty, tracked, watch)
-    _fit_quality(job, plan, uncertainty, tracked)
-
-    names = *checksums_of(network), *checksums_of(uncertainty)
-    with atomic_directory(folder / WEIGHTS) as part:
-        write_checked(part, {name: (uncertainty / name).read_bytes() for name in names})
-
-
-def _train_uncertainty_network(
-    job: Adaptation,
-    plan: Plan,
-    watched: Path,
-    out: Path,
-    tracked: data.Tracked,
-    watch: training.Watch | None,
-) -> None:
-    """Train the uncertainty network of the weights in `watched`: on objects that these were not
-    trained on, empty benches and outliers.
-    """
-    # A kill between its files: the training has ended, and writes them again.
-    (out / models.UNCERTAINTY_RECORD).unlink(missing_ok=True)
-
-    recipe = plan.uncertainty_recipe(_uncertainty_recipe())
-    objects = _test_set(job, JUDGED, JUDGED_SEED, recipe.objects, tracked)
-    sets = data.open_dataset(objects), data.open_dataset(job.folder / HELD_OUT)
-    pipeline = models.load_reconstructor(watched, cache_folder() / "onnx")
-    data.check_uncertainty_data(recipe, pipeline, *sets)
-
-    kinds = list(data.outliers_beside(SHARE_GENERIC))
-    record = training.record_uncertainty_run(recipe, out, watched, kinds)
-    with tracked("rendering empty benches and outliers") as on_progress:
-        samples = data.uncertainty_sets(recipe, pipeline, sets, job.folder / OUTLIERS, on_progress)
-
-    fabric = training.open_fabric(recipe, accelerator=job.accelerator)
-    run = training.TrainingRun(
-        recipe,
-        out,
-        pipeline.record,
-        record.watches,
-        watch=watch or training.unwatched,
-    )
-    training.run_uncertainty(fabric, run, record, watched, *samples)
-
-
-def _fit_quality(job: Adaptation, plan: Plan, weights: Path, tracked: data.Tracked) -> None:
-    """Fit the quality model beside weights and their uncertainty network: to objects on benches
-    that are off their record, as a real one is.
-    """
-    at_least, at_most = QUALITY_OBJECTS
-    count = min(max(round(QUALITY_PER_MINUTE * plan.minutes), at_least), at_most)
-    objects = _test_set(job, QUALITY, QUALITY_SEED, count, tracked, off_record=True)
-
-    graphs = cache_folder() / "onnx"
-    pipeline = models.load_reconstructor(weights, graphs)
-    uncertainty = models.load_uncertainty_model(weights, graphs, quality=False)
-    if uncertainty is None:
-        raise SceneError(f"{weights} has no uncertainty network: delete it, and try again")
-
-    with tracked("reconstructing objects for the quality model") as on_progress:
-        found = data.quality_set(
-            pipeline, uncertainty, data.open_dataset(objects), count, on_progress
-        )
-    with tracked("fitting the quality model") as on_progress:
-        training.run_quality(weights, found, on_progress)
-
-
-def _is_whole(folder: Path, last: str) -> bool:
-    """Return whether a folder of weights has all its files, of which `last` is written last."""
-    names = checksums_of(folder)
-    return last in names and all((folder / name).is_file() for name in names)
-
-
-def _uncertainty_recipe() -> training.UncertaintyRecipe:
-    recipe = training.load_recipe(training.packaged_recipes()[RECIPE])
-    if not isinstance(recipe, training.UncertaintyRecipe):
-        raise SceneError(f"{RECIPE} is no recipe of an uncertainty network")
-    return recipe
 
 
 def _figures(

@@ -34,7 +34,7 @@ from nlos_cam.cli.benches import store_forecast
 from nlos_cam.cli.common import tracked
 from nlos_cam.dataset import RigRange
 from nlos_cam.errors import NlosCamError
-from nlos_cam.evaluate import echoes_of, over_objects, per_object, plain, truth_of
+from nlos_cam.evaluate import echoes_of, format_interval, over_objects, per_object, plain, truth_of
 from nlos_cam.objects import benchmark_objects, image_from_depth, object_box
 from nlos_cam.reconstruct import (
     Arrival,
@@ -233,6 +233,33 @@ def numbers_of(rig: Rig) -> dict[str, float]:
     }
 
 
+def as_table(rows: Sequence[dict[str, Any]]) -> str:
+    """Return the table of docs/adapt.md: silhouette IoU, RMSE and share within 2 percent of the
+    depth after each number of minutes, beside the forecast.
+    """
+    minutes = list(dict.fromkeys(each for row in rows for each in row["minutes"]))
+    lines: list[list[str]] = []
+    for row in rows:
+        true = row["true"]
+        line = [
+            f"{true['distance_m']:.3f} m, {true['yaw_deg']:.0f}°, gap {true['gap_m']:.3f} m",
+            f"{row['expected_iou']:.2f}",
+        ]
+        for each in minutes:
+            figures = row["minutes"].get(each)
+            line.append(_in_words(figures) if figures else "")
+        lines.append(line)
+    head = ["bench", "forecast", *(f"{each} minutes" for each in minutes)]
+    return harness.table(head, lines)
+
+
+def _in_words(figures: dict[str, Any]) -> str:
+    iou = format_interval(figures["silhouette_iou"], 3)
+    rmse_mm = figures["foreground_rmse_mm"]["value"]
+    within = figures["accuracy_within_2_percent"]["value"]
+    return f"{iou}, {rmse_mm:.0f} mm, {within:.2f}"
+
+
 def draw(rows: Sequence[dict[str, Any]]) -> Figure:
     """Draw each bench's silhouette IoU over its minutes, with its forecast."""
     figure = Figure(figsize=(6.0, 3.6), layout="constrained")
@@ -274,6 +301,7 @@ def main() -> None:
             done = [each for each in rows if each]
             machine = f"{os.cpu_count()} cores, {platform.machine()}"
             harness.write("benches", {"machine": machine, "benches": done}, asked.out)
+    print(as_table(rows))
     harness.save("benches", draw(rows), asked.out, dpi=110)
 
 

@@ -146,8 +146,8 @@ def test_a_bench_calibrated_again_begins_again_when_asked(
         raise KeyboardInterrupt
 
     # the pace is measured on objects of the new rig
-    monkeypatch.setattr("nlos_cam.adapt.run.PACE_OBJECTS", 1)
-    monkeypatch.setattr("nlos_cam.adapt.run.PACE_STEPS", 1)
+    monkeypatch.setattr("nlos_cam.adapt.pace.PACE_OBJECTS", 1)
+    monkeypatch.setattr("nlos_cam.adapt.pace.PACE_STEPS", 1)
     with pytest.raises(KeyboardInterrupt):
         adapt(replace(job, rig=bench_elsewhere(), begin_again=True), 1.0, stop)
 

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 from nlos_calibration import load_rig
 
-from nlos_cam.adapt import Adaptation, calibration_spread, run
+from nlos_cam.adapt import Adaptation, calibration_spread
+from nlos_cam.adapt import pace as machine_pace
 from nlos_cam.dataset.build import PIECE
 
 PIECE_S = 0.5
@@ -57,16 +58,16 @@ def test_the_pace_is_that_of_any_number_of_processes(
 ) -> None:
     """The first pieces of 20 processes arrive together: 200 objects would seem to take no time."""
     machine = Machine(processes)
-    monkeypatch.setattr(run, "time", machine)
-    monkeypatch.setattr(run.data, "build_dataset", machine.build)
-    monkeypatch.setattr(run, "_probe_step", lambda *_: machine.step)
+    monkeypatch.setattr(machine_pace, "time", machine)
+    monkeypatch.setattr(machine_pace.data, "build_dataset", machine.build)
+    monkeypatch.setattr(machine_pace, "_probe_step", lambda *_: machine.step)
     job = Adaptation(load_rig("paper-rig"), calibration_spread(None), tmp_path, workers=processes)
 
-    pace = run._measure_pace(job, lambda _done, _total: None)
+    pace = machine_pace.measure_pace(job, lambda _done, _total: None)
 
     assert pace.objects_per_s == pytest.approx(processes * PIECE / PIECE_S, rel=0.15)
-    assert pace.samples_per_s == pytest.approx(run.BATCH / STEP_S)
-    assert machine.objects % run.data.SHARD == 0
+    assert pace.samples_per_s == pytest.approx(machine_pace.BATCH / STEP_S)
+    assert machine.objects % machine_pace.data.SHARD == 0
 
 
 def test_the_pace_of_a_cluster_is_known_once_it_has_rendered(
@@ -74,19 +75,19 @@ def test_the_pace_of_a_cluster_is_known_once_it_has_rendered(
 ) -> None:
     """After a killed measurement the first objects are there, and nothing was connected to."""
     machine = Machine(30)
-    machine.objects = run.data.SHARD
+    machine.objects = machine_pace.data.SHARD
     farm: Any = SimpleNamespace(workers=1)
 
     def build(*arguments: Any, **others: Any) -> None:
         machine.build(*arguments, **others)
-        farm.workers = machine.processes if machine.objects > run.data.SHARD else 1
+        farm.workers = machine.processes if machine.objects > machine_pace.data.SHARD else 1
 
-    monkeypatch.setattr(run, "time", machine)
-    monkeypatch.setattr(run.data, "build_dataset", build)
-    monkeypatch.setattr(run, "_probe_step", lambda *_: machine.step)
+    monkeypatch.setattr(machine_pace, "time", machine)
+    monkeypatch.setattr(machine_pace.data, "build_dataset", build)
+    monkeypatch.setattr(machine_pace, "_probe_step", lambda *_: machine.step)
     job = Adaptation(load_rig("paper-rig"), calibration_spread(None), tmp_path, farm=farm)
 
-    pace = run._measure_pace(job, lambda _done, _total: None)
+    pace = machine_pace.measure_pace(job, lambda _done, _total: None)
 
     assert pace.objects_per_s == pytest.approx(30 * PIECE / PIECE_S, rel=0.15)
 
