@@ -2,6 +2,7 @@
 docs/images/stations.png.
 
     python tools/studies/stations.py WORK [--objects N] [--samples M] [--seeds S] [--sets NAMES ...]
+        [--compile]
 
 The same objects are rendered on the paper's bench for a lidar at "home" (0.20 m from the wall),
 "near" (0.15 m) and "back" (0.10 m farther from the object), and for an occluder whose gap is "wide"
@@ -17,6 +18,7 @@ import os
 import platform
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -222,11 +224,15 @@ def trained(
     recipe: DirectRecipe,
     maps: Maps,
     folder: Path,
+    *,
+    compiled: bool = False,
 ) -> StationsNetwork:
     """Train the network of some stations, or go on with it."""
     torch.manual_seed(recipe.seed)
     network = StationsNetwork(recipe, [source.normal for source in sources])
     steps = recipe.objects // recipe.batch
+    running = Running(compiled=compiled)
+    logits = running.maybe_compile(network.logits)
 
     def batches(generator: torch.Generator) -> Iterator[list[NormalBatch]]:
         return matched(sources, recipe.batch, steps, generator.initial_seed())
@@ -237,7 +243,7 @@ def trained(
             for station, one, source in zip(network.stations, batch, sources, strict=True)
         ]
         noisy = [normal + recipe.noise * torch.randn_like(normal) for normal in normals]
-        return two_heads_error(network.logits(noisy), batch[0].image)
+        return two_heads_error(logits(noisy), batch[0].image)
 
     chosen = [maps[station] for station in stations]
     with tracked(f"training {'+'.join(stations)}, seed {recipe.seed}") as on_progress:
@@ -249,7 +255,7 @@ def trained(
             loss=loss,
             score=lambda: figures_of(network.images(chosen), chosen[0].image),
             folder=folder,
-            running=Running(on_step=on_progress),
+            running=replace(running, on_step=on_progress),
         )
     return network.cpu().eval()
 
@@ -323,6 +329,7 @@ def main() -> None:
     parser.add_argument("--samples", type=int, default=1_500_000)
     parser.add_argument("--seeds", type=int, default=3)
     parser.add_argument("--sets", nargs="+", default=SETS, help="stations joined by +")
+    parser.add_argument("--compile", action="store_true", help="needs a C++ compiler (g++)")
     parser.add_argument("--out", type=Path, help="folder of the results (default: docs)")
     asked = parser.parse_args()
     harness.claim(asked.work)
@@ -358,7 +365,12 @@ def main() -> None:
                 done = folder / "judged.json"
                 if not done.exists():
                     network = trained(
-                        stations, [sources[each] for each in stations], own, sets[TESTS[2]], folder
+                        stations,
+                        [sources[each] for each in stations],
+                        own,
+                        sets[TESTS[2]],
+                        folder,
+                        compiled=asked.compile,
                     )
                     values = judged(network, sets, stations)
                     done.write_text(json.dumps(values), encoding="utf-8")
