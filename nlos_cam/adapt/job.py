@@ -124,10 +124,31 @@ def render_set(
     """Return a folder of `count` objects with the sensor's noise, on the rig itself or on the bench
     as it may be.
     """
+    plan = data_plan(job, first_seed, expected=False, off_record=off_record)
+    title = f"rendering {count} objects ({name})"
+    return render_objects(job, plan, name, count, title, tracked)
+
+
+def render_training_objects(job: Adaptation, count: int, tracked: data.Tracked) -> None:
+    """Render objects for the bench as it may be, up to `count` with those that are there."""
+    plan = data_plan(job, job.seed, expected=True, off_record=True)
+    title = f"rendering objects for this bench, {count} in all"
+    render_objects(job, plan, OBJECTS, count, title, tracked)
+
+
+def render_objects(
+    job: Adaptation,
+    plan: data.DatasetPlan,
+    name: str,
+    count: int,
+    title: str,
+    tracked: data.Tracked,
+) -> Path:
+    """Render the first `count` objects of a plan into a folder of the adaptation, and return it."""
     folder = job.folder / name
-    with tracked(f"rendering {count} objects ({name})") as on_progress:
+    with tracked(title) as on_progress:
         data.build_dataset(
-            data_plan(job, first_seed, expected=False, off_record=off_record),
+            plan,
             count,
             folder,
             workers=job.workers,

@@ -139,9 +139,10 @@ class Plan(Record):
         """Minutes of all stages."""
         return sum(stage.minutes for stage in self.stages)
 
-    def objects_before(self, stage: int) -> int:
-        """Return the number of objects that earlier stages have rendered."""
-        return self.stages[stage - 1].objects if stage else 0
+    @property
+    def objects(self) -> int:
+        """Number of objects that all stages have rendered."""
+        return self.stages[-1].objects if self.stages else 0
 
     def extended(self, minutes: float) -> "Plan":
         """Return the plan with a stage for what `minutes` are more than its own; itself where they
@@ -151,7 +152,7 @@ class Plan(Record):
         if further <= SAME_MINUTES:
             return self
         seconds = 60 * further * NETWORK_SHARE
-        before = self.objects_before(len(self.stages))
+        before = self.objects
         objects_per_s = self.pace.objects_per_s
         samples_per_s = self.pace.samples_per_s
 

@@ -31,9 +31,9 @@ from nlos_cam.adapt.job import (
     QUALITY,
     WEIGHTS,
     Adaptation,
-    data_plan,
     is_whole,
     render_set,
+    render_training_objects,
     start_network,
 )
 from nlos_cam.adapt.pace import measure_pace
@@ -396,7 +396,7 @@ def _train_network(
     else:
         inputs = TrainingInputs.of_maps(job.rig, job.sensor, models.load_record(before))
     held_out = render_set(job, HELD_OUT, data.HELD_OUT_SEED, HELD_OUT_OBJECTS, tracked)
-    _render_objects(job, stage.objects, tracked)
+    render_training_objects(job, stage.objects, tracked)
 
     if inputs.noise:
         first = _first_objects(job, stage)
@@ -406,7 +406,7 @@ def _train_network(
         out.parent / PACKED,
         normal=start.normal,
         trained=inputs.trained,
-        growth=lambda _: stage.objects // data.SHARD,
+        shards=stage.objects // data.SHARD,
         maps_rig=inputs.maps_rig,
         locked=job.locked is not None,
     )
@@ -427,19 +427,6 @@ def _train_network(
         if inputs.noise:
             maps = inputs.noise.added_to(maps)
         training.run_direct(fabric, run, start, source, maps)
-
-
-def _render_objects(job: Adaptation, count: int, tracked: data.Tracked) -> None:
-    """Render objects for the bench as it may be, up to `count` with those that are there."""
-    with tracked(f"rendering objects for this bench, {count} in all") as on_progress:
-        data.build_dataset(
-            data_plan(job, job.seed, expected=True, off_record=True),
-            count,
-            job.folder / OBJECTS,
-            workers=job.workers,
-            on_progress=on_progress,
-            farm=job.farm,
-        )
 
 
 def _first_objects(job: Adaptation, stage: Stage) -> list[training.MapSet]:

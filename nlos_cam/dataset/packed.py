@@ -7,7 +7,7 @@ its datasets and the rig that their maps are aligned with, and serves no others 
 """
 
 import hashlib
-from collections.abc import Callable, Generator, Iterator, Sequence
+from collections.abc import Generator, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -43,8 +43,6 @@ from nlos_cam.reconstruct import WALL_GRID, is_wall_grid, recorded_counts, rig_f
 from nlos_cam.render import Material, SensorModel
 
 CELLS = "cells.npz"
-Growth = Callable[[int], int]
-"""Returns the number of shards that an epoch sees, once they are there."""
 STATISTICS_SHARDS = 40
 """Shards of each dataset that the cells' statistics are taken from: 4,000 objects."""
 
@@ -71,7 +69,7 @@ class PackedMaps:
         *,
         trained: CheckpointRecord | None = None,
         color: bool = False,
-        growth: Growth | None = None,
+        shards: int | None = None,
         maps_rig: Rig | None = None,
         run: str = "",
         packing: Packing | None = None,
@@ -81,10 +79,10 @@ class PackedMaps:
         """Open or make the store: use `open_packed_maps`, which claims its folder.
 
         Normalisation: `normal`, unless it belongs to weights `trained` for another rig than the
-        maps are aligned with. Else it is fitted to the first shards; with `growth`, to those that
-        the first epoch sees, so that a killed run fits the same one again.
+        maps are aligned with. Else it is fitted to the first shards; with `shards`, to no others
+        than these, so that a killed run fits the same one again.
 
-        Objects of an epoch: the shards that `growth` allows it, by default all that are there.
+        Objects of an epoch: the first `shards`, by default all that are there.
         `run` names the training run, which has epochs of its own in a store that runs share.
 
         Alignment: with the rig `maps_rig`, by default the plan's, or the wall grid for a plan of
@@ -118,7 +116,7 @@ class PackedMaps:
         self._datasets = list(datasets)
         self._opened = opened
         self._store = store
-        self._growth = growth
+        self._shards = shards
         self._run = run
         self._packing = packing or Packing(1)
         self.normal = CellNormal(color=color)
@@ -141,9 +139,9 @@ class PackedMaps:
         if self._stores_counts:
             self._rows[COUNTS] = MAP_ROWS, MAP_COLUMNS
 
-        shards = [shard for one in opened for shard in one.shards]
-        self._keys = {shard.path: shard_key(shard) for shard in shards}
-        self._sizes = {shard.path: len(shard.seeds) for shard in shards}
+        there = [shard for one in opened for shard in one.shards]
+        self._keys = {shard.path: shard_key(shard) for shard in there}
+        self._sizes = {shard.path: len(shard.seeds) for shard in there}
         self._index = StoreIndex.read(store)
         self._index.open_for(self.maps_rig, opened, self._keys)
 
@@ -162,7 +160,7 @@ class PackedMaps:
             raise SceneError(
                 f"{store} holds maps that are normalised for other weights: name another --store"
             )
-        if growth is None:
+        if shards is None:
             self.refresh(on_progress)
 
     def _write_cells(self, opened: Sequence[Dataset], normal: CellNormal | None) -> None:
@@ -170,9 +168,7 @@ class PackedMaps:
         if normal:
             self.normal.load_state_dict(normal.state_dict())
         else:
-            shards = STATISTICS_SHARDS
-            if self._growth:
-                shards = min(shards, self._growth(0))
+            shards = min(STATISTICS_SHARDS, self._shards or STATISTICS_SHARDS)
             some = [
                 read_aligned(shard, self.maps_rig)[0]
                 for one in opened
@@ -305,7 +301,7 @@ class PackedMaps:
         key = f"{self._run}{generator.initial_seed()}"
         epochs = self._index.epochs
         if key not in epochs:
-            self.refresh(shards=self._growth(len(epochs)) if self._growth else None)
+            self.refresh(shards=self._shards)
             epochs[key] = len(self)
             self._index.write()
         count = int(epochs[key])
@@ -362,7 +358,7 @@ def open_packed_maps(
     *,
     trained: CheckpointRecord | None = None,
     color: bool = False,
-    growth: Growth | None = None,
+    shards: int | None = None,
     maps_rig: Rig | None = None,
     run: str = "",
     processes: int = 1,
@@ -383,7 +379,7 @@ def open_packed_maps(
             normal,
             trained=trained,
             color=color,
-            growth=growth,
+            shards=shards,
             maps_rig=maps_rig,
             run=run,
             packing=made_ready,

@@ -249,7 +249,11 @@ def as_table(rows: Sequence[dict[str, Any]]) -> str:
             figures = row["minutes"].get(each)
             line.append(_in_words(figures) if figures else "")
         lines.append(line)
-    head = ["bench", "forecast", *(f"{each} minutes" for each in minutes)]
+    head = [
+        "bench",
+        "forecast",
+        *(f"{each} minutes" if each != "0" else "at once" for each in minutes),
+    ]
     return harness.table(head, lines)
 
 

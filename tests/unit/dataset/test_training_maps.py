@@ -707,12 +707,12 @@ def test_statistics_are_of_the_shards_that_the_first_epoch_sees(
     folder: Path, tmp_path: Path, store_folder: Path
 ) -> None:
     """A run that was killed before its first epoch finds more shards when it begins again."""
-    with open_packed_maps([folder], store_folder, growth=lambda _epoch: 1) as packed:
+    with open_packed_maps([folder], store_folder, shards=1) as packed:
         alone = packed.digest
     _add(folder, 5)
-    with open_packed_maps([folder], tmp_path / "again", growth=lambda _epoch: 1) as packed:
+    with open_packed_maps([folder], tmp_path / "again", shards=1) as packed:
         assert packed.digest == alone
-    with open_packed_maps([folder], tmp_path / "more", growth=lambda _epoch: 2) as packed:
+    with open_packed_maps([folder], tmp_path / "more", shards=2) as packed:
         assert packed.digest != alone
 
 
@@ -798,7 +798,7 @@ def test_store_of_other_objects_is_refused(tmp_path: Path, begun: Path) -> None:
 
 def test_store_without_a_shard_knows_its_data(tmp_path: Path, folder: Path) -> None:
     """Statistics of the cells are taken before a shard is packed."""
-    with open_packed_maps([folder], tmp_path / "store", growth=lambda _: 1) as packed:
+    with open_packed_maps([folder], tmp_path / "store", shards=1) as packed:
         assert len(packed) == 0
 
     _assert_refused(tmp_path / "store", _add(tmp_path / "b", 20), "other data")
