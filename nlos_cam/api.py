@@ -26,7 +26,7 @@ from nlos_cam import reconstruct
 from nlos_cam.bench import load_bench, load_serving
 from nlos_cam.camera import Camera, OnProgress, full_uri, open_camera
 from nlos_cam.errors import NlosCamError
-from nlos_cam.live import RunStatistics
+from nlos_cam.live import BackgroundPhysicsCheck, RunStatistics
 from nlos_cam.recording import with_telemetry
 
 
@@ -84,6 +84,7 @@ class Stream:
                 abandon_source=lambda: camera.__exit__(None, None, None),
             )
             self._reader = entered.enter_context(reader)
+            entered.enter_context(self._pipeline.checks)
             self._entered = entered.pop_all()
         self._results = reconstruct.iterate_results(
             reader, self._pipeline, self._clock, self._statistics.fail, telemetry
@@ -137,7 +138,8 @@ def open_stream(
         raise NlosCamError(
             f"average is {average}: give a number of frames from 1 to {reconstruct.MAX_AVERAGE}"
         )
-    loaded = load_bench(bench) if bench else None
+    # The bench's own weights may be lost or damaged where others are named.
+    loaded = load_bench(bench, weights=weights is None) if bench else None
     camera = open_camera(uri, on_progress=on_progress)
     if loaded:
         calibrated = loaded.for_camera(camera)
@@ -147,11 +149,20 @@ def open_stream(
     found = load_serving(
         calibrated, Path(weights) if weights else own, loaded, Path(wall) if wall else None
     )
+    is_recorded = full_uri(uri).startswith("bag:")
+    # As `replay` and `live` check: some verdicts rest on it.
+    checks = (
+        reconstruct.PeriodicPhysicsCheck(calibrated.rig)
+        if is_recorded
+        else BackgroundPhysicsCheck(calibrated.rig)
+    )
     pipeline = reconstruct.build_pipeline(
-        calibrated, found.network, average, uncertainty_model=found.uncertainty_model
+        calibrated,
+        found.network,
+        average,
+        uncertainty_model=found.uncertainty_model,
+        checks=checks,
     )
     reconstruct.warm_up(camera, pipeline)
     notes = (*calibrated.warnings, *found.mismatches)
-    return Stream(
-        camera, pipeline, lossless=full_uri(uri).startswith("bag:"), notes=notes, clock=clock
-    )
+    return Stream(camera, pipeline, lossless=is_recorded, notes=notes, clock=clock)

@@ -287,13 +287,14 @@ def packaged_rigs() -> list[Path]:
 
 
 def load_rig(name_or_path: str | Path) -> Rig:
-    """Load a packaged rig by name (`paper-rig`, `bare-wall`), or a rig from a TOML file.
+    """Load a packaged rig by name (`paper-rig`, `bare-wall`), or a rig from a TOML file; a file of
+    that name goes first.
 
     Raises RecordFileError where it cannot be read, UnknownRigError for a name that no rig has.
     """
     packaged = {path.stem: path for path in packaged_rigs()}
     source = Path(name_or_path)
-    if str(name_or_path) in packaged:
+    if str(name_or_path) in packaged and not source.is_file():
         source = packaged[str(name_or_path)]
     elif not source.exists() and str(name_or_path) == source.stem:
         near = get_close_matches(source.stem, packaged, 1)

@@ -159,6 +159,7 @@ def render_objects(
 
 
 def is_whole(folder: Path, last: str) -> bool:
-    """Return whether a folder of weights has all its files, of which `last` is written last."""
-    names = checksums_of(folder)
-    return last in names and all((folder / name).is_file() for name in names)
+    """Return whether a folder of weights has all its files, of which `last` is written last, with
+    their checksums.
+    """
+    return last in checksums_of(folder) and not training.damaged_files(folder)

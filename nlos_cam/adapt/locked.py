@@ -1,6 +1,5 @@
 """Noise of locked differences, and the normalization in which a network sees them."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -47,9 +46,7 @@ class LockedNoise:
             intensity=np.maximum(counts, MIN_COUNTS).astype(np.float32),
         )
 
-    def fitted(
-        self, recipe: DirectRecipe, normal: CellNormal, some: Sequence[MapSet]
-    ) -> DirectRecipe:
+    def fitted(self, recipe: DirectRecipe, normal: CellNormal, some: MapSet) -> DirectRecipe:
         """Set a normalization to this noise, and return the recipe that draws it at each step.
 
         Everything is divided by a common multiple k of each cell's noise, so that noise of one
@@ -57,7 +54,7 @@ class LockedNoise:
         below the limit of the normalization.
         """
         std = np.where(np.isfinite(self.std) & (self.std > 0), self.std, np.inf)
-        differences = np.concatenate([np.stack([one.depth_m, one.intensity], 1) for one in some])
+        differences = np.stack([some.depth_m, some.intensity], 1)
         ratio = np.nan_to_num(np.abs(differences) / std)
         multiple = max(1.0, float(np.quantile(ratio, LARGEST_SHARE)) / normal.limit)
         spread = np.where(np.isfinite(std), multiple * std, 1.0)

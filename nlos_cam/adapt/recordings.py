@@ -171,14 +171,14 @@ def _is_as_before(recorded: Rig, rig: Rig) -> bool:
 
 
 def write_parts(found: Recordings, folder: Path, tracked: data.Tracked) -> dict[Part, Path]:
-    """Write each part as a dataset into a folder, unless it is there; return their folders.
+    """Write each part as a dataset into a folder, unless it is whole there; return their folders.
 
     Raises RecordingError for a recording of which the truth is not known.
     """
     folders: dict[Part, Path] = {}
-    for part in parts_of(list(found.by_label)):
+    for part, labels in parts_of(list(found.by_label)).items():
         folders[part] = folder / part
-        if (folder / part).is_dir():
+        if _is_whole(folder / part, labels):
             continue
         frames = 1 if part == "judged" else data.FRAMES_PER_RECORDING
         with tracked(f"reading recordings ({part})") as on_progress:
@@ -190,6 +190,21 @@ def write_parts(found: Recordings, folder: Path, tracked: data.Tracked) -> dict[
             )
         data.write_shards(labelled, folder / part)
     return folders
+
+
+def _is_whole(folder: Path, labels: Sequence[str]) -> bool:
+    """Return whether a folder holds a dataset of the objects with these labels, with all its shards
+    undamaged.
+    """
+    try:
+        dataset = data.open_dataset(folder)
+        for shard in dataset.shards:
+            data.check_arrays(shard)
+        found = dataset.column("category").tolist()
+    except RecordingError:
+        return False
+    # the seeds number the frames of a part
+    return dataset.seeds == set(range(len(dataset))) and set(found) == set(labels)
 
 
 def fit_to_recordings(
@@ -208,9 +223,10 @@ def fit_to_recordings(
     if not isinstance(recipe, training.TransferRecipe):
         raise SceneError(f"{RECIPE} is no recipe of a transfer")
     recipe = recipe.of_objects(len(data.open_dataset(parts["adaptation"])))
+    # all of them, since those beyond the recipe's number would be whole objects
+    recipe = recipe.model_copy(update={"held_out": len(data.open_dataset(parts["validation"]))})
     network, trained = training.transfer_start(recipe, start, partial=False, on_report=data.ignore)
     maps = data.read_maps(recipe, parts["adaptation"], parts["validation"], None, start=trained)
-    recipe = recipe.model_copy(update={"held_out": len(maps.held_out.image)})
     record = maps.record_run(recipe, out, trained.runs, start, trained=trained)
     fabric = training.open_fabric(recipe, accelerator=accelerator)
     origin = training.digest_of(network, maps.digest)

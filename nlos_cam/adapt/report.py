@@ -16,6 +16,7 @@ from nlos_cam.adapt.recordings import Transfer, iou_of
 from nlos_cam.adapt.run import AFTER, REPORT, AdaptResult
 from nlos_cam.bench import ForecastRecord
 from nlos_cam.camera import FRAMES_PER_S
+from nlos_cam.files import TEXT_LIMIT, read_bounded
 from nlos_cam.forecast import SCATTER_IOU
 from nlos_cam.report import (
     Banner,
@@ -44,7 +45,7 @@ LATE_SHARE = 0.5
 
 @dataclass(frozen=True)
 class Curve:
-    """Held-out silhouette IoU of one stage."""
+    """Held-out silhouette IoU of one stage; empty where its log is damaged."""
 
     samples: Sequence[int]
     """Trained on, earlier stages included, at the end of each epoch."""
@@ -56,17 +57,23 @@ def read_curves(plan: Plan, logs: Sequence[Path]) -> list[Curve]:
     curves: list[Curve] = []
     before = 0
     for stage, path in zip(plan.stages, logs, strict=True):
-        with path.open(encoding="utf-8", newline="") as file:
-            rows = list(csv.DictReader(file))
         samples = stage.samples // stage.epochs
-        curves.append(
-            Curve(
-                [before + samples * (k + 1) for k in range(len(rows))],
-                [float(row["held_out_iou"]) for row in rows],
-            )
-        )
-        before += samples * len(rows)
+        iou = _read_log(path, stage.epochs)
+        curves.append(Curve([before + samples * (k + 1) for k in range(len(iou))], iou))
+        before += stage.samples
     return curves
+
+
+def _read_log(path: Path, epochs: int) -> list[float]:
+    """Return the held-out silhouette IoU of each epoch from the log of a whole run; none from a
+    damaged or cut one, whose last row would pass for the end of the run.
+    """
+    try:
+        text = read_bounded(path, TEXT_LIMIT).decode()
+        iou = [float(row["held_out_iou"]) for row in csv.DictReader(text.splitlines())]
+    except (OSError, ValueError, TypeError, KeyError, csv.Error):
+        return []
+    return iou if len(iou) == epochs and text.endswith("\n") else []
 
 
 def gain_by_doubling(curves: Sequence[Curve]) -> float | None:
@@ -123,6 +130,12 @@ def draw_curves(curves: Sequence[Curve]) -> bytes:
     if len(curves) > 1:
         axis.legend()
     return png(figure)
+
+
+def _lost_words(curves: Sequence[Curve]) -> str:
+    """Return in words which stages have no curve; empty where all have one."""
+    lost = [f"{number}" for number, curve in enumerate(curves, 1) if not curve.iou]
+    return f" Left out, since {TRAINING_LOG} is damaged: stage {', '.join(lost)}." if lost else ""
 
 
 Rows = Sequence[tuple[str, str, str]]
@@ -186,13 +199,13 @@ def _heading(plan: Plan) -> tuple[str, str]:
     return "What locked differences show on this bench", subtitle
 
 
-def _facts(plan: Plan, curves: Sequence[Curve], expected: ForecastRecord | None) -> Facts:
+def _facts(plan: Plan, expected: ForecastRecord | None) -> Facts:
     """Return the numbers of a plan, and those of a forecast."""
     spread = plan.spread
     pace = plan.pace
     facts = {
         "objects rendered for this bench": f"{plan.stages[-1].objects}",
-        "samples trained on": f"{curves[-1].samples[-1]}",
+        "samples trained on": f"{sum(stage.samples for stage in plan.stages)}",
         "expected by the forecast": f"{expected.expected_iou:.2f}" if expected else "",
         "objects that change no cell: nothing there": (
             f"{expected.hidden_share:.0%}" if expected and expected.hidden_share else ""
@@ -244,12 +257,13 @@ def write_page(
                         ),
                         tables.test_objects,
                     ),
-                    _facts(plan, curves, expected),
+                    _facts(plan, expected),
                 ],
             ),
             Picture(
                 "Learning curve",
-                f"On {HELD_OUT_OBJECTS} objects that no training saw; by them the epoch was chosen.",
+                f"On {HELD_OUT_OBJECTS} objects that no training saw; by them the epoch was chosen."
+                + _lost_words(curves),
                 draw_curves(curves),
             ),
             saved_picture(

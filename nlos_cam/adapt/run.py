@@ -11,13 +11,13 @@ from collections.abc import Callable, Generator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from hashlib import sha256
-from itertools import islice
 from pathlib import Path
 from typing import Any
 
 import nlos_models as models
 import torch
 from nlos_models import training
+from nlos_models.errors import CheckpointError
 
 from nlos_cam import dataset as data
 from nlos_cam.adapt.inputs import TrainingInputs
@@ -42,7 +42,6 @@ from nlos_cam.adapt.plan import (
     HELD_OUT_OBJECTS,
     PLAN,
     Plan,
-    Stage,
     load_plan,
 )
 from nlos_cam.adapt.recordings import (
@@ -60,9 +59,11 @@ from nlos_cam.adapt.verdicts import train_uncertainty
 from nlos_cam.errors import OutputExistsError, SceneError
 from nlos_cam.files import (
     CHECKSUMS,
+    TEXT_LIMIT,
     atomic_directory,
     checksums_of,
     claim,
+    read_bounded,
 )
 from nlos_cam.reconstruct import check_alignable, weights_for
 from nlos_cam.render import RENDERING_VERSION
@@ -161,14 +162,14 @@ def adapt(
             _parts_of(job.recordings, folders[-1], tracked)
         _train_stages(job, plan, folders, tracked, watch, on_message)
         if job.locked:
-            was_there = (folders[-1] / REPORT / FIGURES).exists()
+            was_there = _stored_figures(folders[-1] / REPORT) is not None
             after = _figures(measure, folders[-1] / NETWORK, folders[-1] / REPORT)
             guess = after["baselines"][GUESS]
             return AdaptResult(folders[-1] / NETWORK, plan, folders, guess, after, was_there)
 
         transfer = _transfer(job, folders[-1], measure, tracked, watch)
         last = transfer.folder if transfer and transfer.is_better else folders[-1]
-        was_there = (last / REPORT / FIGURES).exists()
+        was_there = _stored_figures(last / REPORT) is not None
         train_uncertainty(job, plan, last, tracked, watch)
         after = _figures(measure, last / WEIGHTS, last / REPORT)
         return AdaptResult(
@@ -399,7 +400,8 @@ def _train_network(
     render_training_objects(job, stage.objects, tracked)
 
     if inputs.noise:
-        first = _first_objects(job, stage)
+        objects = data.open_dataset(job.folder / OBJECTS, locked=True)
+        first = objects.first(min(FIRST_OBJECTS, stage.objects))
         recipe = inputs.noise.fitted(recipe, start.normal, first)
     store = data.open_packed_maps(
         [job.folder / OBJECTS],
@@ -429,29 +431,39 @@ def _train_network(
         training.run_direct(fabric, run, start, source, maps)
 
 
-def _first_objects(job: Adaptation, stage: Stage) -> list[training.MapSet]:
-    """Return a stage's first objects, shard by shard."""
-    count = min(FIRST_OBJECTS, stage.objects)
-    objects = data.open_dataset(job.folder / OBJECTS, locked=True)
-    return list(islice(objects.chunks(), count // data.SHARD))
-
-
 def _figures(
     measure: Measure, weights: Path | None, folder: Path, objects: Path | None = None
 ) -> dict[str, Any]:
-    """Return the figures of weights on a dataset, measured once into a folder."""
-    if not (folder / FIGURES).exists():
+    """Return the figures of weights on a dataset, measured once into a folder; again where they are
+    damaged.
+    """
+    if _stored_figures(folder) is None:
         measure(weights, folder, objects)
     return json.loads((folder / FIGURES).read_text(encoding="utf-8"))
+
+
+def _stored_figures(folder: Path) -> dict[str, Any] | None:
+    """Return the figures in a folder; None where there are none, or damaged ones."""
+    try:
+        found = json.loads(read_bounded(folder / FIGURES, TEXT_LIMIT))
+        iou_of(found)
+    except (OSError, ValueError, TypeError, KeyError, RecursionError):
+        return None
+    return found
 
 
 def install(weights: Path, target: Path) -> None:
     """Copy an adaptation's weights to where the bench keeps its own, in one step.
 
-    Raises OutputExistsError where `target` is a file.
+    Raises OutputExistsError where `target` is a file, CheckpointError where the weights are
+    damaged.
     """
     if target.exists() and not target.is_dir():
         raise OutputExistsError(f"{target} is a file, but weights are a folder: move it away")
+    if damaged := training.damaged_files(weights):
+        raise CheckpointError(
+            f"{weights / damaged[0]} is missing or damaged, so {target} stays: adapt again"
+        )
     with atomic_directory(target) as part:
         for name in (*checksums_of(weights), CHECKSUMS):
             shutil.copy2(weights / name, part / name)

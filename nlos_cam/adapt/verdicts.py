@@ -18,7 +18,7 @@ from nlos_cam.adapt.job import (
     is_whole,
     render_set,
 )
-from nlos_cam.adapt.plan import Plan
+from nlos_cam.adapt.plan import HELD_OUT_OBJECTS, Plan
 from nlos_cam.errors import SceneError
 from nlos_cam.files import atomic_directory, cache_folder, checksums_of, write_checked
 
@@ -37,9 +37,9 @@ def train_uncertainty(
     job: Adaptation, plan: Plan, folder: Path, tracked: data.Tracked, watch: training.Watch | None
 ) -> None:
     """Train the uncertainty network of a network, fit its quality model, and put all three into
-    WEIGHTS in one step, unless that is there.
+    WEIGHTS in one step, unless that is whole.
     """
-    if (folder / WEIGHTS).exists():
+    if is_whole(folder / WEIGHTS, models.UNCERTAINTY_ONNX):
         return
 
     network = folder / NETWORK
@@ -64,12 +64,15 @@ def _train_uncertainty_network(
     """Train the uncertainty network of the weights in `watched`: on objects that these were not
     trained on, empty benches and outliers.
     """
-    # A kill between its files: the training has ended, and writes them again.
-    (out / models.UNCERTAINTY_RECORD).unlink(missing_ok=True)
+    # A kill between its files, or damage: the training goes on or begins again, and writes them
+    # again. Damaged copies of the network's files would pass for those of other weights.
+    for name in (models.UNCERTAINTY_RECORD, *training.damaged_files(out)):
+        (out / name).unlink(missing_ok=True)
 
     recipe = plan.uncertainty_recipe(_uncertainty_recipe())
     objects = render_set(job, JUDGED, JUDGED_SEED, recipe.objects, tracked)
-    sets = data.open_dataset(objects), data.open_dataset(job.folder / HELD_OUT)
+    held_out = render_set(job, HELD_OUT, data.HELD_OUT_SEED, HELD_OUT_OBJECTS, tracked)
+    sets = data.open_dataset(objects), data.open_dataset(held_out)
     pipeline = models.load_reconstructor(watched, cache_folder() / "onnx")
     data.check_uncertainty_data(recipe, pipeline, *sets)
 

@@ -12,6 +12,7 @@ import nlos_calibration as walls
 from nlos_calibration.errors import CalibrationError, RecordFileError
 from nlos_models import RECORD, load_record
 from nlos_models.errors import CheckpointError
+from nlos_models.training import damaged_files
 
 from nlos_cam import __version__
 from nlos_cam.bench.folder import load_bench
@@ -97,7 +98,9 @@ class BenchEdit:
 
 
 def check_new(folder: Path) -> None:
-    """Raise OutputExistsError where a bench cannot be made or continued at a path."""
+    """Raise OutputExistsError where a bench cannot be made or continued at a path, RecordFileError
+    where the record of the one that is there cannot be read.
+    """
     if os.path.lexists(folder) and not folder.is_dir():
         raise OutputExistsError(f"{folder} is a file, but --bench must be a folder: choose another")
     nearest = next(path for path in folder.absolute().parents if os.path.lexists(path))
@@ -109,6 +112,8 @@ def check_new(folder: Path) -> None:
         raise OutputExistsError(
             f"{folder} holds other files and no bench: choose another name for --bench"
         )
+    if is_bench(folder):
+        load_bench_record(folder)
 
 
 def _is_unfinished(path: Path) -> bool:
@@ -152,9 +157,15 @@ def write_weights(folder: Path, source: Path, test_iou: float | None = None) -> 
 
     Weights of exactly this bench's rig get the rig into their record, by which `weights_serve`
     knows them when the bench is measured again, and their IoU on the test objects on it. Raises
-    CheckpointError for a folder without weights, RecordFileError for a bench that is damaged.
+    CheckpointError for a folder without weights, or with damaged ones, RecordFileError for a bench
+    that is damaged.
     """
     record = load_record(source)
+    if damaged := damaged_files(source):
+        raise CheckpointError(
+            f"{source / damaged[0]} is missing or damaged, so the weights of {folder} stay: copy or"
+            " train them again"
+        )
     rig = load_bench(folder, weights=False).rig
     out = folder / WEIGHTS
     with edit_bench(folder) as edit:

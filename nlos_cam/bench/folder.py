@@ -20,7 +20,12 @@ from nlos_cam.bench.record import (
 )
 from nlos_cam.camera import Camera
 from nlos_cam.files import CHECKSUMS
-from nlos_cam.reconstruct import CalibratedRig, check_intrinsics, occluder_assumed
+from nlos_cam.reconstruct import (
+    CalibratedRig,
+    check_intrinsics,
+    is_other_camera,
+    occluder_assumed,
+)
 
 
 @dataclass(frozen=True)
@@ -94,14 +99,10 @@ class Bench:
         """Return `calibrated` for an opened camera. Raises CalibrationError for another camera than
         the one that the bench was measured with.
         """
-        for intrinsics in (
-            self.measured.record.rig.pinhole,
-            *([self.measured.reference.intrinsics] if self.measured.reference else []),
-        ):
-            check_intrinsics(intrinsics, camera.intrinsics)
+        check_intrinsics(self.measured, camera.intrinsics)
         measured = self.record.camera.serial
         given = camera.identity.get("serial", "")
-        if measured and given and measured != given:
+        if is_other_camera(measured, given):
             raise CalibrationError(
                 f"{self.folder} was measured with camera {measured}, this is {given}: use that"
                 " camera, or calibrate the bench with this one"

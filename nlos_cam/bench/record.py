@@ -23,13 +23,15 @@ WEIGHTS = "weights"
 """Folder of a bench with its own weights."""
 VERSION = 1
 MAKE_ONE = "make a bench with `nlos-cam calibrate --wall --bench bench/`"
+MAKE_ANOTHER = "restore it, or make another bench with `nlos-cam calibrate --wall --bench other/`"
+"""Of a damaged record: a measurement in the same folder would need it."""
 
 
 def _known_version(version: Any) -> Any:
     if isinstance(version, int) and version != VERSION:
         raise ValueError(
-            f"this nlos-cam reads version {VERSION} only: calibrate the bench again, or use the"
-            " nlos-cam that wrote it"
+            f"this nlos-cam reads version {VERSION} only: use the nlos-cam that wrote it, or"
+            " calibrate into another bench folder"
         )
     return version
 
@@ -141,7 +143,7 @@ def load_bench_record(folder: Path) -> BenchRecord:
         raise RecordFileError(f"no bench folder {folder}: {MAKE_ONE}")
     if not (folder / MANIFEST).exists():
         raise RecordFileError(f"{folder} is not a bench folder (no {MANIFEST}): {MAKE_ONE}")
-    return read_record(folder / MANIFEST, BenchRecord, "bench", MAKE_ONE)
+    return read_record(folder / MANIFEST, BenchRecord, "bench", MAKE_ANOTHER)
 
 
 def sha256_of(path: Path) -> str:

@@ -1,7 +1,6 @@
 """Files that `calibrate` writes: the record, the bare wall's reference and the report."""
 
 import os
-from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -9,7 +8,7 @@ from nlos_calibration import BareWall, MeasuredWall, WallRecord, dump_toml, save
 
 from nlos_cam.calibrate.report import report_html
 from nlos_cam.errors import OutputExistsError
-from nlos_cam.files import atomic_file
+from nlos_cam.files import atomic_files
 
 
 @dataclass(frozen=True)
@@ -41,17 +40,17 @@ class WallFiles:
 def write_record(files: WallFiles, record: WallRecord, reference: BareWall | None) -> WallRecord:
     """Write the three files and return the record, which names its reference.
 
-    They replace earlier ones only when all are complete, so an interrupted run leaves the earlier
-    set whole.
+    They take the places of earlier ones together, when all are on the disk. A power cut between two
+    of the renames leaves a record that `load_measured` refuses, since its reference is another.
     """
-    with ExitStack() as parts:
-        record_part = parts.enter_context(atomic_file(files.record))
+    paths = [files.record, files.report, *([files.reference] if reference is not None else [])]
+    with atomic_files(*paths) as parts:
         if reference is not None:
-            digest = save_reference(parts.enter_context(atomic_file(files.reference)), reference)
+            digest = save_reference(parts[-1], reference)
             record = record.model_copy(
                 update={"reference": files.reference.name, "reference_sha256": digest}
             )
         html = report_html(MeasuredWall(record, reference), files.record.name)
-        parts.enter_context(atomic_file(files.report)).write_text(html, encoding="utf-8")
-        record_part.write_text(dump_toml(record), encoding="utf-8")
+        parts[0].write_text(dump_toml(record), encoding="utf-8")
+        parts[1].write_text(html, encoding="utf-8")
     return record

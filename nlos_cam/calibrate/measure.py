@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from nlos_cam.camera import Camera
 from nlos_cam.frames import Frame, maps_from_frame, saturated_share
-from nlos_cam.reconstruct import check_intrinsics
+from nlos_cam.reconstruct import check_intrinsics, is_other_camera
 from nlos_cam.recording import with_telemetry
 
 CELSIUS_EVERY_S = 1.0
@@ -270,9 +270,8 @@ def measure_occluder(
     """
     record = bare.record
     statistics = capture.statistics.depth
-    for known in (record.rig.pinhole, *([bare.reference.intrinsics] if bare.reference else [])):
-        check_intrinsics(known, capture.intrinsics)
-    if record.serial and capture.serial and record.serial != capture.serial:
+    check_intrinsics(bare, capture.intrinsics)
+    if is_other_camera(record.serial, capture.serial):
         raise CalibrationError(
             f"the bare wall was measured with the camera {record.serial}, this is {capture.serial}:"
             " use that camera, or calibrate the bare wall with this one"

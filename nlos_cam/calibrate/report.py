@@ -3,6 +3,7 @@ use.
 """
 
 import shlex
+from collections.abc import Mapping
 from html import escape
 
 import nlos_calibration as walls
@@ -33,6 +34,8 @@ def report_html(wall: walls.MeasuredWall, record_file: str) -> str:
     record = wall.record
     maps = [NO_MAPS] if wall.reference is None else wall_maps(record, wall.reference)
     subtitle = f"{record.created}, {record.camera}, {record.frames} frames of the bare wall"
+    if wall.reference and record.occluder and record.occluder.source == "detected":
+        subtitle += f", {wall.reference.frames} with the occluder"
     parts = [
         banner(record),
         ranges(record),
@@ -188,21 +191,29 @@ def way_up(record: walls.WallRecord) -> str:
 
 
 def device(wall: walls.MeasuredWall) -> str:
-    """Return the camera, its settings and temperatures."""
+    """Return the camera, its settings and temperatures, those of the newer measurement where the
+    occluder was found after the wall.
+    """
     record = wall.record
     reference = wall.reference
     pinhole = record.rig.pinhole
-    span = reference.celsius_span if reference is not None else {}
+    settings_then = record.settings
+    celsius_then = record.temperatures_c
+    span: Mapping[str, float] = {}
+    if reference is not None:
+        settings_then = reference.settings or settings_then
+        celsius_then = reference.celsius or celsius_then
+        span = reference.celsius_span
     facts = {
         "camera": record.camera,
         "serial": record.serial or "not known",
         "firmware": record.firmware or "not known",
         "depth image": f"{pinhole.width} x {pinhole.height} pixels",
     }
-    celsius = {name: f"{value:.1f} °C" for name, value in record.temperatures_c.items()}
+    celsius = {name: f"{value:.1f} °C" for name, value in celsius_then.items()}
     for name in celsius.keys() & span.keys():
         celsius[name] += f", changed by {span[name]:.1f}"
-    settings = {name: f"{value:g}" for name, value in record.settings.items()}
+    settings = {name: f"{value:g}" for name, value in settings_then.items()}
     parts = [("Device", facts), ("Temperatures", celsius), ("Settings", settings)]
     tables = "".join(
         f"<div><h3>{name}</h3>{pairs(values)}</div>" for name, values in parts if values

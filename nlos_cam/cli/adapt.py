@@ -20,7 +20,7 @@ from nlos_cam import camera as cameras
 from nlos_cam import dataset, forecast, objects, reconstruct, render
 from nlos_cam import evaluate as evaluation
 from nlos_cam.cli import common
-from nlos_cam.cli.benches import bench_or_rig
+from nlos_cam.cli.benches import bench_or_rig, names_folder
 from nlos_cam.cli.dataset import Backend, rendering_farm
 from nlos_cam.cli.train import watched_run
 from nlos_cam.errors import OutputExistsError
@@ -109,7 +109,7 @@ def adapt(
     # Before torch is loaded, which reads it. Threads that spin while they wait for a busy core hold
     # up the others: beside any other work two of them trained a fifth of what one does.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
-    own = Path(bench) if Path(bench).is_dir() else None
+    own = Path(bench) if names_folder(bench) else None
     folder = own if out is None else None
     rig, measured = bench_or_rig(bench)
     locked = _locked(frames, radiometry, material, given=pulse_ns is not None)

@@ -146,12 +146,22 @@ def _note_doubt(name: str, record: walls.WallRecord) -> None:
         common.say(f"note: {name} calls itself doubtful: {record.advice}")
 
 
+def names_folder(name: str) -> bool:
+    """Return whether a name is that of a bench folder, and not of a packaged rig beside a folder
+    that happens to be called like it.
+    """
+    if name.endswith(FOLDER_ENDS):
+        return True
+    packaged = {path.stem for path in walls.packaged_rigs()}
+    return benches.is_bench(Path(name)) if name in packaged else Path(name).is_dir()
+
+
 def bench_or_rig(name: str | Path) -> tuple[walls.Rig, walls.MeasuredWall | None]:
     """Return the rig of a bench folder, a wall record, a rig's file or a packaged rig and, where it
     was measured, its wall; print what is doubtful about it.
     """
     name = str(name)
-    if Path(name).is_dir() or name.endswith(FOLDER_ENDS):
+    if names_folder(name):
         loaded = benches.load_bench(name, weights=False)
         _note_warnings(loaded)
         return loaded.rig, loaded.measured

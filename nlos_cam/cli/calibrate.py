@@ -296,14 +296,22 @@ def calibrate(
         record = capture.record(fit, facts | {"way_up": way_up}, by_hand)
         inliers = fit.inliers if isinstance(fit, walls.WallFit) else None
     record = target.write(record, None if inliers is None else capture.reference(inliers))
+    written = f"{target.files.record} is written"
+    if target.folder:
+        written += "; `nlos-cam predict` makes the forecast of the bench"
+    with interrupted_by_signals(written):
+        _report(target, record, as_json=json)
+
+
+def _report(target: Target, record: walls.WallRecord, *, as_json: bool) -> None:
+    """Forecast what a bench that was written can show, and print the measurement, whether the
+    weights serve it, and the next step.
+    """
     fields = record.model_dump(mode="json", include=JSON_FIELDS)
     files = target.files
     result = fields | {"out": str(files.record), "report": str(files.report)}
     if target.folder:
-        with interrupted_by_signals(
-            f"{files.record} is written; `nlos-cam predict` makes the forecast of the bench"
-        ):
-            benching.store_forecast(target.folder)
+        benching.store_forecast(target.folder)
     loaded = _written_bench(target.folder) if target.folder else None
     rig = loaded.rig if loaded else record.beam_rig
     own = loaded.weights if loaded else None
@@ -319,7 +327,7 @@ def calibrate(
     if target.folder:
         result["bench"] = str(target.folder)
         text += f"\nNext: {escape(_next_step(target.folder, record, served))}"
-    finish(result, as_json=json, text=text, marked=True)
+    finish(result, as_json=as_json, text=text, marked=True)
 
 
 def _refuse_board_options(
@@ -376,6 +384,8 @@ class Target(NamedTuple):
         if folder:
             files = benching.files_in_bench(folder, occluder=bool(bare), overwrite=overwrite)
         else:
+            if out is not None and out.suffix != ".toml":
+                raise typer.BadParameter(f"--out {out}: choose a name that ends in .toml")
             path = output_path(out, "wall", ".toml", overwrite=overwrite)
             files = bench.WallFiles.beside(path, overwrite=overwrite)
         return cls(folder, bare, files, overwrite)

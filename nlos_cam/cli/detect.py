@@ -32,6 +32,7 @@ from nlos_cam.cli.common import (
     output_path,
     progress,
     refuse_ignored,
+    say,
     stderr,
     tracked,
 )
@@ -79,8 +80,8 @@ class TerminalHands:
         ask(f"Turn {turn + 1} of {self._plan.turns}: {words}. Step back and press Enter.")
         if not self._read_line():
             raise NlosCamError(
-                f"stdin ended before turn {turn + 1}: run the same command in a terminal, with"
-                f" --out {shlex.quote(str(self._folder))}, to go on"
+                f"stdin ended before turn {turn + 1}: in a terminal,"
+                f" {detection.how_to_go_on(self._folder)}"
             )
 
 
@@ -164,14 +165,9 @@ def detect(
     before = detection.Session.open(folder).plan if goes_on else None
     asked.check(camera, before)
     source = _open(camera)
-    with interrupted_by_signals(_kept(folder)):
+    with interrupted_by_signals(f"whole turns are in {folder}; {detection.how_to_go_on(folder)}"):
         session = _measure(source, chosen, asked, before, folder)
         _report(session, show_serial=show_serial, as_json=json)
-
-
-def _kept(folder: Path) -> str:
-    out = shlex.quote(str(folder))
-    return f"whole turns are in {folder}; the same command goes on with --out {out}"
 
 
 def _rig_option(bench_folder: Path | None, wall: Path | None) -> str:
@@ -287,7 +283,12 @@ def _measure(
     folder: Path,
 ) -> detection.Session:
     with source:
-        rig = chosen.open(source).rig if chosen.record else source.rig
+        rig = source.rig
+        if chosen.record:
+            bench = chosen.open(source)
+            rig = bench.rig
+            for warning in bench.warnings:
+                say(f"note: {warning}")
         plan = asked.plan(source, rig, before)
         if before is None and detection.is_session(folder):  # --overwrite, all else in order
             shutil.rmtree(folder)

@@ -145,7 +145,7 @@ def predict(
         show(_table(found), narrow_columns=TABLE_COLUMNS)
         lines.insert(0, forecast.COLUMNS)
     finish(facts, as_json=json, text="\n".join(lines))
-    if shape is None and rig is not None and Path(rig).is_dir():  # last: it can be refused
+    if shape is None and rig is not None and benches.names_folder(rig):  # last: it can be refused
         _renew_forecast(Path(rig), found)
 
 

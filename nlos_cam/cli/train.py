@@ -348,7 +348,6 @@ def direct(
             packed = data_sets.open_packed_maps(
                 data,
                 store or run.out / "packed",
-                on_progress,
                 start.normal if start else None,
                 trained=trained,
                 color=recipe.colour,
@@ -356,13 +355,16 @@ def direct(
                 run=f"{run.out.resolve()} ",
                 processes=pack_workers,
                 held_out=held_out_data,
+                pack_now=False,
             )
             source = held.enter_context(packed)
+            held_out = source.held_out(held_out_data, recipe.held_out)
+            recipe = recipe.model_copy(update={"held_out": len(held_out.image)})
+            # before the packing, which can take many minutes: it refuses the folder of another run
+            record = source.record_run(recipe, run.out, runs, weights)
+            source.refresh(on_progress)
         if not training.has_state(run.out):
             source.forget_run()
-        held_out = source.held_out(held_out_data, recipe.held_out)
-        recipe = recipe.model_copy(update={"held_out": len(held_out.image)})
-        record = source.record_run(recipe, run.out, runs, weights)
         # The best epoch is that of these held-out maps: a run cannot go on with others.
         judged = data_sets.data_key(data_sets.open_dataset(held_out_data, color=recipe.colour))
         job = run.training(recipe, record, training.digest_of(start, source.digest, judged))

@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from nlos_calibration import Rig
 from nlos_models import CellNormal, CheckpointRecord, channels_of
-from nlos_models.training import MapNoise, MapSet, NormalBatch, Recipe, first_of, record_run
+from nlos_models.training import MapNoise, MapSet, NormalBatch, Recipe, record_run
 
 from nlos_cam.dataset.build import SHARD
 from nlos_cam.dataset.packed_index import StoreIndex, damaged, shard_key
@@ -64,7 +64,6 @@ class PackedMaps:
         self,
         datasets: Sequence[Path],
         store: Path,
-        on_progress: OnProgress = ignore,
         normal: CellNormal | None = None,
         *,
         trained: CheckpointRecord | None = None,
@@ -75,6 +74,7 @@ class PackedMaps:
         packing: Packing | None = None,
         locked: bool = False,
         held_out: Path | None = None,
+        pack_now: bool = True,
     ) -> None:
         """Open or make the store: use `open_packed_maps`, which claims its folder.
 
@@ -82,7 +82,8 @@ class PackedMaps:
         maps are aligned with. Else it is fitted to the first shards; with `shards`, to no others
         than these, so that a killed run fits the same one again.
 
-        Objects of an epoch: the first `shards`, by default all that are there.
+        Objects of an epoch: the first `shards`, by default all that are there. Those are packed at
+        once, unless `pack_now` is False: then by `refresh`, or when the first epoch begins.
         `run` names the training run, which has epochs of its own in a store that runs share.
 
         Alignment: with the rig `maps_rig`, by default the plan's, or the wall grid for a plan of
@@ -128,6 +129,8 @@ class PackedMaps:
             )
         self._color = color
         self._locked = locked
+        self._held_out: Dataset | None = None
+        """Compared with all shards, also with those that appear later."""
         if held_out:
             self._open_held_out(held_out)
 
@@ -160,8 +163,8 @@ class PackedMaps:
             raise SceneError(
                 f"{store} holds maps that are normalised for other weights: name another --store"
             )
-        if shards is None:
-            self.refresh(on_progress)
+        if shards is None and pack_now:
+            self.refresh()
 
     def _write_cells(self, opened: Sequence[Dataset], normal: CellNormal | None) -> None:
         """Write a normalisation to the store, or that of the first shards' statistics."""
@@ -202,6 +205,8 @@ class PackedMaps:
     def refresh(self, on_progress: OnProgress = ignore, shards: int | None = None) -> None:
         """Add the shards that appeared in the datasets since the last time, of the first `shards`
         where that is given; of one that has grown since, its further objects.
+
+        Raises SceneError where these are held-out objects.
         """
         index = self._index
         known = index.shards
@@ -232,9 +237,14 @@ class PackedMaps:
             on_progress(number, len(new))
 
     def _key(self, path: Path) -> str:
-        """Return the `shard_key` of a shard, which is read once, its head until it is full."""
-        if self._sizes.get(path, 0) < SHARD:
+        """Return the `shard_key` of a shard, which is read once, its head until it is full. Raises
+        SceneError where it has grown by held-out objects.
+        """
+        known = self._sizes.get(path, 0)
+        if known < SHARD:
             head = read_head(path)
+            if self._held_out and len(head.seeds) > known:
+                check_held_out(Dataset(path.parent, head.plan, (head,)), self._held_out)
             self._sizes[path] = len(head.seeds)
             if path not in self._keys:
                 self._keys[path] = shard_key(head)
@@ -247,7 +257,7 @@ class PackedMaps:
         Raises SceneError for a dataset of the same objects, or of benches that cannot be aligned.
         """
         opened = self._open_held_out(folder)
-        maps = aligned_with(first_of(opened.arrays(), count), opened.benches(), self.maps_rig)[0]
+        maps = aligned_with(opened.first(count), opened.benches(), self.maps_rig)[0]
         if not len(maps.image):
             raise SceneError(
                 f"no object of {folder} can be aligned with {self.maps_rig.name}: its box has another"
@@ -259,6 +269,7 @@ class PackedMaps:
         opened = open_dataset(folder, color=self._color, locked=self._locked)
         for training in self._opened:
             check_held_out(training, opened)
+        self._held_out = opened
         return opened
 
     def record_run(
@@ -353,7 +364,6 @@ def _rigs_of(plan: DatasetPlan) -> tuple[Rig, RigRange | None]:
 def open_packed_maps(
     datasets: Sequence[Path],
     store: Path,
-    on_progress: OnProgress = ignore,
     normal: CellNormal | None = None,
     *,
     trained: CheckpointRecord | None = None,
@@ -364,6 +374,7 @@ def open_packed_maps(
     processes: int = 1,
     locked: bool = False,
     held_out: Path | None = None,
+    pack_now: bool = True,
 ) -> Generator[PackedMaps]:
     """Open or make a store, and hold the right to write it until the end of the block.
 
@@ -375,7 +386,6 @@ def open_packed_maps(
         yield PackedMaps(
             datasets,
             store,
-            on_progress,
             normal,
             trained=trained,
             color=color,
@@ -385,4 +395,5 @@ def open_packed_maps(
             packing=made_ready,
             locked=locked,
             held_out=held_out,
+            pack_now=pack_now,
         )

@@ -1,12 +1,13 @@
 """Rows that the packed maps hold of a shard, made by this process or by others beside it."""
 
 import signal
+from collections import deque
 from collections.abc import Generator, Iterable, Iterator, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures import Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from dataclasses import dataclass
-from itertools import repeat
+from itertools import islice
 from multiprocessing import get_context
 from pathlib import Path
 from threading import Thread
@@ -23,7 +24,7 @@ from nlos_models.training import MapSet
 from nlos_cam.dataset.plan import DatasetPlan
 from nlos_cam.dataset.reader import MAP_CHANNELS
 from nlos_cam.dataset.shards import Shard, read_arrays, read_head
-from nlos_cam.dataset.worker import end_with_parent
+from nlos_cam.dataset.worker import AHEAD, end_with_parent
 from nlos_cam.errors import WorkersLostError
 from nlos_cam.processes import safe_children
 from nlos_cam.reconstruct import align_samples, is_wall_grid, own_rig
@@ -118,10 +119,18 @@ class Packing:
             self._pool = ProcessPoolExecutor(
                 self._processes, mp_context=get_context("spawn"), initializer=_begin
             )
+        # The rows of a shard take megabytes: only a few are made before they are asked for.
+        left = iter(paths)
+        ahead = AHEAD * self._processes
+        made: deque[Future[dict[str, Float16]]] = deque()
         try:
-            with safe_children():
-                found = self._pool.map(_rows, repeat(packer), paths)
-            yield from found
+            while True:
+                with safe_children():
+                    for path in islice(left, ahead - len(made)):
+                        made.append(self._pool.submit(_rows, packer, path))
+                if not made:
+                    return
+                yield made.popleft().result()
         except BrokenProcessPool as error:
             raise WorkersLostError(
                 "a process that packs maps ended: free memory, or lower --pack-workers"

@@ -10,11 +10,12 @@ from itertools import islice
 from typing import Any
 
 from nlos_cam import __version__
-from nlos_cam.dataset.plan import DatasetPlan
+from nlos_cam.dataset.plan import OBJECTS_VERSION, DatasetPlan
 from nlos_cam.dataset.samples import Samples, make_samples
 from nlos_cam.dataset.worker import use_one_thread
 from nlos_cam.errors import NlosCamError, SceneError, WorkersLostError
 from nlos_cam.processes import package_folder, safe_children
+from nlos_cam.render import RENDERING_VERSION
 
 MAX_RETRIES = 5
 """Deaths of its worker that a piece survives."""
@@ -92,12 +93,20 @@ class RayFarm:
 
 def make_piece(plan: DatasetPlan, piece: range, wanted: str) -> Samples:
     """Return samples, as a worker. Raises SceneError where this machine has another version than
-    `wanted`.
+    `wanted`, or would make other bits by the plan.
     """
     if wanted != VERSION:
         raise SceneError(
             f"a worker has nlos-cam {VERSION}, not {wanted}: install the same version on every"
             " machine"
+        )
+    # between two releases, commits of the same version number may differ in these
+    own = RENDERING_VERSION, OBJECTS_VERSION
+    planned = plan.rendering_version, plan.objects.version
+    if own != planned:
+        raise SceneError(
+            f"a worker has renderer {own[0]} and objects {own[1]}, the plan renderer {planned[0]}"
+            f" and objects {planned[1]}: install the same commit on every machine"
         )
     use_one_thread()
     return make_samples(plan, piece)

@@ -1,7 +1,7 @@
 """Reader of datasets: whole, or streamed in shuffled batches where they are larger than memory."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from hashlib import sha256
 from itertools import accumulate
 from pathlib import Path
@@ -72,6 +72,21 @@ class Dataset:
             *(np.concatenate(parts) for parts in zip(*map(self.read, self.shards), strict=True))
         )
 
+    def first(self, count: int) -> MapSet:
+        """Read the maps and images of the first `count` objects, or of all if there are fewer, and
+        no shard beyond them.
+        """
+        parts: list[MapSet] = []
+        rows = 0
+        for chunk in self.chunks():
+            parts.append(chunk)
+            if (rows := rows + len(chunk.image)) >= count:
+                break
+        names = (one.name for one in fields(MapSet))
+        return MapSet(
+            *(np.concatenate([getattr(part, name) for part in parts])[:count] for name in names)
+        )
+
     def chunks(self) -> Iterator[MapSet]:
         """Yield all maps and images in order, one shard at a time."""
         for shard in self.shards:
@@ -81,29 +96,18 @@ class Dataset:
         """Read a shard's maps and images."""
         return read_arrays(shard, self.channels)
 
-    def batches(
-        self, seed: int, epoch: int, batch: int, *, rank: int = 0, world: int = 1
-    ) -> Iterator[MapBatch]:
+    def batches(self, seed: int, epoch: int, batch: int) -> Iterator[MapBatch]:
         """Yield one epoch of batches, shuffled and mirrored at random, by seed and epoch alone;
-        `row` is the dataset's.
-
-        Each of `world` processes gets its share of every batch: together they see the batches of a
-        single process. The last, smaller batch is left out. Raises SceneError where a batch cannot
-        be shared evenly.
+        `row` is the dataset's. The last, smaller batch is left out.
         """
-        if batch % world or not 0 <= rank < world <= len(self):
-            raise SceneError(
-                f"a batch of {batch} cannot be shared by {world} processes: use a multiple of"
-                f" {world}"
-            )
         generator = np.random.default_rng([seed, epoch])
         blocks = self._shuffled_blocks(generator)
         order = np.concatenate([rows for _, rows in blocks])
         mirrored = generator.random(len(order)) < 0.5
         window = _Window(self, [shards for shards, _ in blocks])
         for start in range(0, len(order) - min(batch, len(order)) + 1, batch):
-            rows = order[start : start + batch][rank::world]
-            yield as_batch(window.take(rows), rows, mirrored[start : start + batch][rank::world])
+            rows = order[start : start + batch]
+            yield as_batch(window.take(rows), rows, mirrored[start : start + batch])
 
     def _shuffled_blocks(
         self, generator: np.random.Generator
@@ -173,8 +177,12 @@ def check_held_out(training: Dataset, held_out: Dataset) -> None:
         _check_recordings(training, held_out)
     if any(recorded):
         return  # their seeds number frames
-    if training.plan.objects.meshes != held_out.plan.objects.meshes:
-        return  # a seed is another object
+    objects = training.plan.objects, held_out.plan.objects
+    have_generic = all(each.share_generic > 0 for each in objects)
+    # With other meshes a seed is another object, unless it is a generic shape, which follows from
+    # the seed alone.
+    if objects[0].meshes != objects[1].meshes and not have_generic:
+        return
     both = training.seeds & held_out.seeds
     if both:
         raise SceneError(

@@ -21,7 +21,6 @@ from nlos_models.training import (
     MapSource,
     Recipe,
     WithNoise,
-    first_of,
     record_run,
     subtract_bare_wall,
 )
@@ -30,7 +29,7 @@ from nlos_cam.dataset.packed import map_noise
 from nlos_cam.dataset.packed_index import data_key
 from nlos_cam.dataset.packing import rig_of_weights
 from nlos_cam.dataset.plan import RECORDED, DatasetPlan, RigSpread
-from nlos_cam.dataset.reader import MAP_CHANNELS, Dataset, check_held_out, open_dataset
+from nlos_cam.dataset.reader import Dataset, check_held_out, open_dataset
 from nlos_cam.errors import SceneError
 from nlos_cam.frames import MAP_COLUMNS, MAP_ROWS, maps_from_frame
 from nlos_cam.reconstruct import (
@@ -112,16 +111,7 @@ class Streamed:
 
     def first(self, count: int) -> MapSet:
         """Return the first `count` objects, in memory."""
-        parts = list[MapSet]()
-        rows = 0
-        for chunk in self.dataset.chunks():
-            parts.append(chunk)
-            if (rows := rows + len(chunk.image)) >= count:
-                break
-        arrays = (
-            np.concatenate([getattr(part, name) for part in parts])[:count] for name in MAP_CHANNELS
-        )
-        maps = MapSet(*arrays)
+        maps = self.dataset.first(count)
         return subtract_bare_wall(maps, *self.bare) if self.bare else maps
 
     def batches(self, batch: int, generator: torch.Generator) -> Iterator[MapBatch]:
@@ -156,7 +146,7 @@ def read_maps(
 
     To expected maps the sensor's noise is added, in each epoch another draw. A stream reads a whole
     dataset and keeps a few shards in memory. Maps of another rig than that of the weights that a
-    transfer has as its `start` are aligned with it.
+    transfer has as its `start` are aligned with it; expected ones are refused.
     """
     if wall and recipe.maps == "raw maps":
         raise SceneError(
@@ -174,18 +164,24 @@ def read_maps(
     bare = None
     if recipe.maps == "difference maps":
         bare = measured_bare_wall(wall) if wall else render_bare_wall(plan)
-    held_out = first_of(other.arrays(), recipe.held_out)
+    held_out = other.first(recipe.held_out)
     if bare:
         held_out = subtract_bare_wall(held_out, *bare)
     rig = plan.rig
     if start:
         rig = rig_to_align_with(rig, start) or rig
+        if plan.expected and (plan.rigs or rig != plan.rig):
+            raise SceneError(
+                f"{data} holds expected maps, to which training adds the sensor's noise, but these"
+                f" weights need maps aligned with {rig.name}, whose light is scaled: build them"
+                " without --expected-maps"
+            )
         held_out = align_all(held_out, other.benches(), start)
     source: MapSource
     if stream:
         source = Streamed(dataset, dataset.column("image"), bare)
     else:
-        maps = first_of(dataset.arrays(), recipe.objects)
+        maps = dataset.first(recipe.objects)
         maps = subtract_bare_wall(maps, *bare) if bare else maps
         source = InMemory(align_all(maps, dataset.benches(), start) if start else maps)
     training = WithNoise(source, map_noise(plan)) if plan.expected else source

@@ -344,7 +344,7 @@ def uncertainty_sets(
             Benches.of(plan, pipeline.record),
             on_progress=on_progress,
         )
-        ordinary = first_of(dataset.arrays(), objects)
+        ordinary = dataset.first(objects)
         visible = visible_objects(ordinary, dataset, on_progress)
         benches = compress(dataset.benches(), visible)
         maps_rig = _maps_rig_of(plan, pipeline.record)
@@ -397,7 +397,6 @@ def quality_set(
     figures = list[Float32]()
     iou = list[Float32]()
     error_v = list[Float32]()
-    done = 0
     kinds = dataset.column("category").astype(np.str_)[:objects]
     if not can_leave_out(kinds.tolist()):
         raise SceneError(
@@ -408,14 +407,16 @@ def quality_set(
     maps_rig = _maps_rig_of(dataset.plan, pipeline.record)
     benches = dataset.benches()
     seen = np.ones(len(kinds), np.bool_)
+    start = 0
     for expected in dataset.chunks():
-        if done == len(kinds):
+        if start == len(kinds):
             break
-        maps = noise.expose(expected, done) if noise else expected
-        end = min(done + len(maps.image), len(kinds))
-        count = end - done
+        maps = noise.expose(expected, start) if noise else expected
+        end = min(start + len(maps.image), len(kinds))
+        count = end - start
         maps, kept, _ = aligned_with(first_of(maps, count), islice(benches, count), maps_rig)
-        seen[done:end] = kept
+        seen[start:end] = kept
+        done = start
         for part in parts_of(np.arange(len(maps.image))):
             depth_m = maps.depth_m[part]
             intensity = maps.intensity[part]
@@ -430,7 +431,7 @@ def quality_set(
             error_v.append(shared_error_v(image, truth))
             done += len(part)
             on_progress(done, len(kinds))
-        done = end
+        start = end
     kinds = kinds[seen]
     found = np.concatenate(iou), np.concatenate(error_v)
     return QualitySet(np.concatenate(figures), *found, kinds, ~np.isin(kinds, tuple(CATEGORIES)))

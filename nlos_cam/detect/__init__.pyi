@@ -13,6 +13,7 @@ __all__ = [
     "SimulatedHands",
     "Turn",
     "analyze",
+    "how_to_go_on",
     "is_session",
     "measure_turn",
     "measure_turns",
@@ -35,5 +36,5 @@ from .measure import (
 )
 from .plan import BASELINE, BLOCK_TURNS, Plan, Setting, min_blocks
 from .report import REPORT, power_text, verdict, write_report
-from .session import Session, is_session
+from .session import Session, how_to_go_on, is_session
 from .turns import CHANNELS, Turn

@@ -409,7 +409,9 @@ def _overlapping(group: Group, generator: np.random.Generator) -> tuple[NDArray[
     index[group.used] = np.arange(np.count_nonzero(group.used))
     places = np.argwhere(group.used)
     centers = places[generator.integers(len(places), size=POWER_DRAWS)]
-    steps = [0] if group.patch == 1 else [0, -1, 1, -group.patch // 3, group.patch // 3]
+    # Neighbors at one cell, and at a third of the patch, which is the same for the smaller patch.
+    third = group.patch // 3
+    steps = [0] if group.patch == 1 else sorted({-third, -1, 0, 1, third})
     cells: list[NDArray[np.int64]] = []
     shares: list[Float64] = []
     for down in steps:

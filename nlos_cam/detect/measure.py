@@ -8,7 +8,7 @@ import numpy as np
 from nlos_cam.camera import QUEUED_SETS, Camera
 from nlos_cam.detect.hands import Hands
 from nlos_cam.detect.plan import BASELINE, Setting
-from nlos_cam.detect.session import Session
+from nlos_cam.detect.session import Session, how_to_go_on
 from nlos_cam.detect.turns import Turn, TurnSums
 from nlos_cam.errors import CameraError, CameraLostError
 from nlos_cam.frames import Frame
@@ -132,7 +132,7 @@ def measure_turn(
             if frame is None:
                 raise CameraLostError(
                     f"{camera.uri} ended within a turn: the turns before it are in"
-                    f" {session.folder}; the same command goes on with --out {session.folder}"
+                    f" {session.folder}; {how_to_go_on(session.folder)}"
                 )
             if number >= SETTLING_FRAMES:
                 sums.add(frame)

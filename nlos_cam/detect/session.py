@@ -1,6 +1,7 @@
 """Session: the folder of a detection, with its plan and one file for each turn."""
 
 import json
+import shlex
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -102,6 +103,11 @@ class Session:
                 )
             turns.append(turn)
         return turns
+
+
+def how_to_go_on(folder: Path) -> str:
+    """Return in words how the command goes on with a session; --overwrite would delete its turns."""
+    return f"the same command, without --overwrite, goes on with --out {shlex.quote(str(folder))}"
 
 
 def is_session(folder: Path) -> bool:

@@ -7,6 +7,7 @@ __all__ = [
     "OutputExistsError",
     "atomic_directory",
     "atomic_file",
+    "atomic_files",
     "cache_folder",
     "checksums_of",
     "claim",
@@ -26,7 +27,7 @@ __all__ = [
     "write_checked",
 ]
 
-from .atomic import atomic_directory, atomic_file
+from .atomic import atomic_directory, atomic_file, atomic_files
 from .cache import cache_folder, load_cached
 from .checksums import CHECKSUMS, checksums_of, read_checked, write_checked
 from .claims import DISK_ERRORS, claim, is_claimed, reservations

@@ -4,7 +4,7 @@ import ctypes
 import os
 import shutil
 from collections.abc import Generator
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from fnmatch import fnmatch
 from pathlib import Path
 
@@ -34,6 +34,24 @@ def atomic_file(path: Path, *, exclusive: bool = False) -> Generator[Path]:
         else:
             part.replace(path)
         _flush_entries(path.parent)
+
+
+@contextmanager
+def atomic_files(*paths: Path) -> Generator[list[Path]]:
+    """Yield a path to write to for each of several files that belong together; on success flush all
+    of them to disk, then rename one right after the other, else delete them.
+
+    Raises FileBusyError while another process writes one of them.
+    """
+    with ExitStack() as claims:
+        parts = [claims.enter_context(claim(path)) / path.name for path in paths]
+        yield parts
+        for part in parts:
+            _flush_file(part)
+        for part, path in zip(parts, paths, strict=True):
+            part.replace(path)
+        for folder in {path.parent for path in paths}:
+            _flush_entries(folder)
 
 
 def _link_exclusively(part: Path, path: Path) -> None:

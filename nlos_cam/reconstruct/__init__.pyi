@@ -56,6 +56,7 @@ __all__ = [
     "grid_of",
     "grid_refusal",
     "ignore",
+    "is_other_camera",
     "is_wall_grid",
     "iterate_batched",
     "iterate_results",
@@ -92,7 +93,13 @@ from .alignment import (
     rig_to_align_with,
     training_rig,
 )
-from .bench import CalibratedRig, check_intrinsics, occluder_assumed, open_bench
+from .bench import (
+    CalibratedRig,
+    check_intrinsics,
+    is_other_camera,
+    occluder_assumed,
+    open_bench,
+)
 from .edge import EdgeRepair, edge_cells
 from .flat_field import measured_counts
 from .frame_reader import Arrival, FrameReader, ignore

@@ -159,12 +159,17 @@ def open_bench(wall: Path | None, camera: Camera) -> CalibratedRig:
             return CalibratedRig(camera.rig)
         return CalibratedRig(walls.load_rig("paper-rig"), notes=(NOT_MEASURED,))
     measured = walls.load_measured(wall)
-    for intrinsics in [
-        measured.record.rig.pinhole,
-        *([measured.reference.intrinsics] if measured.reference else []),
-    ]:
-        check_intrinsics(intrinsics, camera.intrinsics)
-    return CalibratedRig(measured.record.beam_rig, measured, _notes(measured.record, camera))
+    check_intrinsics(measured, camera.intrinsics)
+    serial = camera.identity.get("serial", "")
+    notes: list[str] = []
+    if is_other_camera(measured.record.serial, serial):
+        notes.append(
+            f"the wall was measured with camera {measured.record.serial}, this is {serial}:"
+            " calibrate the wall with this one"
+        )
+    if measured.record.occluder is None:
+        notes.append(occluder_assumed(wall))
+    return CalibratedRig(measured.record.beam_rig, measured, tuple(notes))
 
 
 def occluder_assumed(place: Path) -> str:
@@ -175,10 +180,21 @@ def occluder_assumed(place: Path) -> str:
     )
 
 
-def check_intrinsics(measured: walls.Intrinsics, given: walls.Intrinsics) -> None:
-    """Raise CalibrationError if a camera's intrinsics `given` are not those that the wall was
-    measured with.
+def is_other_camera(measured: str, given: str) -> bool:
+    """Return whether two serial numbers are of two cameras; an empty one is not known."""
+    return bool(measured and given) and measured != given
+
+
+def check_intrinsics(measured: walls.MeasuredWall, given: walls.Intrinsics) -> None:
+    """Raise CalibrationError if a camera's intrinsics `given` are not those that the wall and its
+    reference were measured with.
     """
+    _check_intrinsics(measured.record.rig.pinhole, given)
+    if measured.reference:
+        _check_intrinsics(measured.reference.intrinsics, given)
+
+
+def _check_intrinsics(measured: walls.Intrinsics, given: walls.Intrinsics) -> None:
     if (measured.width, measured.height) != (given.width, given.height):
         raise CalibrationError(
             f"the wall was measured at {measured.width}x{measured.height}, the camera delivers"
@@ -203,15 +219,3 @@ def _mismatch_pixels(one: walls.Intrinsics, other: walls.Intrinsics) -> float:
     along_x = [other.ppx + (x - one.ppx) * other.fx / one.fx - x for x in (-0.5, one.width - 0.5)]
     along_y = [other.ppy + (y - one.ppy) * other.fy / one.fy - y for y in (-0.5, one.height - 0.5)]
     return max(abs(pixels) for pixels in along_x + along_y)
-
-
-def _notes(record: walls.WallRecord, camera: Camera) -> tuple[str, ...]:
-    serial = camera.identity.get("serial", "")
-    if not serial or not record.serial or serial == record.serial:
-        return ()
-    return (
-        (
-            f"the wall was measured with camera {record.serial}, this is {serial}: calibrate the"
-            " wall with this one"
-        ),
-    )

@@ -13,7 +13,7 @@ from nlos_models import pipeline as networks
 from nlos_models.arrays import Float16, Float32
 from nlos_models.pipeline import RemappingNetwork
 from nlos_models.training import checkpoints
-from nlos_models.training.data import MapBatch, MapSet, map_batches
+from nlos_models.training.data import MapBatch, MapSet, first_of, map_batches
 from nlos_models.training.recipe import recipe_of
 from torch import Tensor, nn
 from torch.nn import functional
@@ -85,6 +85,9 @@ class SmallDataset:
 
     def arrays(self) -> MapSet:
         return self._maps
+
+    def first(self, count: int) -> MapSet:
+        return first_of(self._maps, count)
 
     def benches(self) -> Iterator[Any]:
         return repeat(self.plan.rig, len(self))

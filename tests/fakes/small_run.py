@@ -178,6 +178,13 @@ def be_killed(recipe_json: str, folder: str, moment: int) -> None:
     run_watched(recipe_of(json.loads(recipe_json)), Path(folder), Executioner(moment))
 
 
+def fail_in_one(fabric: Fabric, rank: int, error: Exception) -> None:
+    """Run in each of two processes: fail in one of them, and wait for it in the other."""
+    if fabric.global_rank == rank:
+        raise error
+    fabric.all_reduce(torch.ones(1))
+
+
 def on_two(fabric: Fabric, folder: Path) -> dict[str, Any]:
     """Run in each of two processes: train once in one go, and once stopped by the other process and
     resumed.

@@ -28,7 +28,8 @@ from nlos_cam.bench import TEST_IOU, ForecastRecord, edit_bench, load_bench
 from nlos_cam.camera.protocol import Camera
 from nlos_cam.errors import CameraNotFoundError, NlosCamError
 from nlos_cam.forecast import FORECAST_VERSION
-from nlos_cam.reconstruct import FrameResult
+from nlos_cam.live import BackgroundPhysicsCheck
+from nlos_cam.reconstruct import FrameResult, PeriodicPhysicsCheck
 
 LATE = """
 import json, sys
@@ -131,6 +132,46 @@ def test_notes_say_that_a_benchs_own_weights_fall_short(
     assert any("0.45" in note and "where 0.64 is expected" in note for note in stream.notes)
 
 
+def test_lost_weights_of_a_bench_do_not_matter_beside_others(
+    opened: Open, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: list[bool] = []
+
+    def load(folder: Path, *, weights: bool) -> Any:
+        asked.append(weights)
+        raise RecordFileError(f"{folder}: seen")
+
+    monkeypatch.setattr(api, "load_bench", load)
+    for chosen in (None, "any"):
+        with pytest.raises(RecordFileError, match="seen"):
+            opened(WallCamera(1), bench=tmp_path / "bench", weights=chosen)
+
+    assert asked == [True, False]
+
+
+@pytest.mark.parametrize(
+    ("uri", "kind"), [("bag:fake.bag", PeriodicPhysicsCheck), ("sim", BackgroundPhysicsCheck)]
+)
+def test_stream_checks_its_pictures_as_commands_do(
+    opened: Open, monkeypatch: pytest.MonkeyPatch, uri: str, kind: type
+) -> None:
+    entered: list[object] = []
+    monkeypatch.setattr(kind, "__enter__", lambda self: entered.append(self) or self)
+    monkeypatch.setattr(kind, "__exit__", lambda *_: None)
+    with opened(WallCamera(3), uri) as stream:
+        next(stream)
+
+    assert len(entered) == 1
+
+
+def test_recorded_picture_has_its_own_check(opened: Open) -> None:
+    with opened(WallCamera(2)) as stream:
+        seen = next(stream)
+
+    assert seen.check is not None
+    assert seen.check.frame_number == seen.frame_number
+
+
 def test_points_are_surface_in_wall_frame(opened: Open) -> None:
     with opened(WallCamera(1)) as stream:
         seen = next(stream)
@@ -209,7 +250,9 @@ def test_stream_applies_wall_and_average(opened: Open, tmp_path: Path) -> None:
         seen = list(stream)
 
     assert stream.rig.name == "measured"
-    assert [bool(seen[number].warnings) for number in (20, -1)] == [False, True]
+    new = [[text for text in seen[at].warnings if text not in stream.notes] for at in (20, -1)]
+
+    assert [bool(warnings) for warnings in new] == [False, True]
 
     single, mean = (
         np.nanstd(one.difference.depth_m) for one in (seen[0], seen[30]) if one.difference

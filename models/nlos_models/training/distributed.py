@@ -5,6 +5,8 @@ batch.
 import multiprocessing
 from collections.abc import Callable
 from functools import partial
+from multiprocessing.queues import SimpleQueue
+from traceback import format_exception_only
 from typing import Any, Literal
 
 import numpy as np
@@ -81,21 +83,26 @@ def launch(fabric: Fabric, work: Callable[..., Any], *arguments: Any) -> Any:
     """Run `work(fabric, *arguments)` in every process and return the leading one's result.
 
     With several processes, work, arguments and result have to be picklable. Errors of this package
-    are raised as they are; an interruption is passed on to all processes, waited for, and raised as
-    KeyboardInterrupt.
+    are raised as they are, that of the process which failed first; an interruption is passed on to
+    all processes, waited for, and raised as KeyboardInterrupt.
     """
     # No other process, no pickling: a debugger, and a test's closures, work.
     if fabric.world_size == 1:
         return work(fabric, *arguments)
+    # The error of one process ends the others, in their next sum of gradients, with errors that
+    # say no more than that: the first one in the queue is the cause.
+    with safe_children():
+        errors = multiprocessing.get_context("spawn").SimpleQueue()
     try:
         with safe_children():
-            result = fabric.launch(partial(_return_errors, work=work, arguments=arguments))
+            result = fabric.launch(
+                partial(_return_errors, work=work, arguments=arguments, errors=errors)
+            )
     except (ProcessRaisedException, ProcessExitedException) as error:
+        if not errors.empty():
+            raise errors.get() from error
         # A process that a signal ended has no error of its own.
-        last_line = str(error).strip().splitlines()[-1]
-        raise TrainingError(
-            f"a training process ended early ({last_line}): repeat the command to resume"
-        ) from error
+        raise _ended_early(str(error).strip().splitlines()[-1]) from error
     except KeyboardInterrupt:
         _end_all()
         raise
@@ -104,18 +111,31 @@ def launch(fabric: Fabric, work: Callable[..., Any], *arguments: Any) -> Any:
     return result
 
 
-def _return_errors(fabric: Fabric, work: Callable[..., Any], arguments: tuple[Any, ...]) -> Any:
+def _return_errors(
+    fabric: Fabric,
+    work: Callable[..., Any],
+    arguments: tuple[Any, ...],
+    errors: SimpleQueue[Exception],
+) -> Any:
     """Run in each process; return expected errors, since raised ones reach the parent only as a
-    traceback's text.
+    traceback's text. All errors but interruptions go into the queue too.
     """
     try:
         return work(fabric, *arguments)
-    except (ValueError, OSError, KeyboardInterrupt) as error:
+    except KeyboardInterrupt as error:
+        return error
+    except Exception as error:
         # Raised across processes, an error arrives as a traceback's text; as a value it keeps its
         # class and message.
-        if isinstance(error, KeyboardInterrupt) or hasattr(error, "exit_code"):
+        if hasattr(error, "exit_code"):
+            errors.put(error)
             return error
+        errors.put(_ended_early(format_exception_only(error)[-1].strip()))
         raise
+
+
+def _ended_early(reason: str) -> TrainingError:
+    return TrainingError(f"a training process ended early ({reason}): repeat the command to resume")
 
 
 def _end_all() -> None:

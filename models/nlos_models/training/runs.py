@@ -16,7 +16,7 @@ from nlos_cam.files import OutputExistsError, claim, program_name
 from nlos_models.arrays import Float16
 from nlos_models.checkpoint import load_network, load_pipeline
 from nlos_models.direct import DirectNetwork
-from nlos_models.errors import TrainingError
+from nlos_models.errors import CheckpointError, TrainingError
 from nlos_models.export import export_folder
 from nlos_models.pipeline import RemappingNetwork, new_vae
 from nlos_models.quality import UNCERTAINTY_FILES, QualityRecord
@@ -59,6 +59,7 @@ from nlos_models.training.tasks import (
     train_vae,
 )
 from nlos_models.training.uncertainty import UncertaintySet, calibrate, train_uncertainty
+from nlos_models.training.weight_files import damaged_files
 from nlos_models.uncertainty_network import save_uncertainty_network
 from nlos_models.vae import Encoder, ResVae
 
@@ -124,11 +125,22 @@ class TrainingRun(Generic[R]):
     def finished(self) -> Scores | None:
         """Return the figures of this run where it has ended already, with its weights in `out`.
 
-        Raises RecipeError where the run that ended there had another origin.
+        Raises RecipeError where the run that ended there had another origin, CheckpointError where
+        its weights are missing or damaged.
         """
         if not (self.out / RECORD).exists():
             return None
-        return read_finished(self.out, self.origin, self.earlier_origin)
+        figures = read_finished(self.out, self.origin, self.earlier_origin)
+        # The states are gone by now: a run whose weights were lost cannot go on from them, and its
+        # figures alone would pass for a success.
+        if figures is not None:
+            for folder in (self.out, self.out / FITTED):
+                if damaged := damaged_files(folder):
+                    raise CheckpointError(
+                        f"{folder / damaged[0]} is missing or damaged: delete {self.out} to train"
+                        " again"
+                    )
+        return figures
 
     def finish(self, figures: Scores, parts: Iterable[str] = ()) -> None:
         """Remove the states of a run whose weights are saved, and keep its figures."""

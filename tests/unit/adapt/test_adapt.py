@@ -1,5 +1,7 @@
 """Adaptation to a bench, stopped and resumed."""
 
+import json
+import shutil
 from collections.abc import Callable, Generator
 from contextlib import contextmanager
 from dataclasses import replace
@@ -10,16 +12,24 @@ import pytest
 import torch
 from made_adaptations import finish_network, job_in
 from nlos_calibration import Rig, load_rig
-from nlos_models import CheckpointRecord, DirectNetwork, load_network, training
-from nlos_models.errors import TrainingError
+from nlos_models import (
+    NETWORK_ONNX,
+    CheckpointRecord,
+    DirectNetwork,
+    load_network,
+    shipped_folder,
+    training,
+)
+from nlos_models.errors import CheckpointError, TrainingError
 from nlos_models.training.checkpoints import save_direct
 from nlos_models.training.recipe import DirectSize
 
-from nlos_cam.adapt import NETWORK_FILE, Adaptation, adapt, calibration_spread
+from nlos_cam.adapt import NETWORK_FILE, Adaptation, adapt, calibration_spread, install, verdicts
+from nlos_cam.adapt.job import is_whole
 from nlos_cam.adapt.plan import load_plan
-from nlos_cam.adapt.run import _all_cores, _with_first_start
-from nlos_cam.dataset import DatasetPlan, build_dataset, ignore
-from nlos_cam.errors import SceneError
+from nlos_cam.adapt.run import FIGURES, _all_cores, _figures, _with_first_start
+from nlos_cam.dataset import HELD_OUT_SEED, DatasetPlan, build_dataset, ignore, untracked
+from nlos_cam.errors import RecordingError, SceneError
 from nlos_cam.files import FileBusyError, claim
 from nlos_cam.reconstruct import weights_for
 from nlos_cam.render import RENDERING_VERSION
@@ -168,6 +178,102 @@ def test_packed_maps_of_a_whole_network_are_removed(tmp_path: Path) -> None:
         adapt(job, 1.0, no_figures, tracked=until_judged)
 
     assert not packed.exists()
+
+
+def damage(path: Path) -> None:
+    """Change a byte of a file in its middle."""
+    content = bytearray(path.read_bytes())
+    content[len(content) // 2] ^= 1
+    path.write_bytes(content)
+
+
+def test_network_with_a_damaged_file_is_not_whole(tmp_path: Path) -> None:
+    job = job_in(tmp_path / "work", load_rig("paper-rig"))
+    finish_network(job.folder)
+    network = job.folder / "stage-1" / "network"
+    assert is_whole(network, NETWORK_ONNX)
+
+    damage(network / NETWORK_FILE)
+
+    assert not is_whole(network, NETWORK_ONNX)
+
+
+def test_damaged_weights_are_not_installed(tmp_path: Path) -> None:
+    made = Path(shutil.copytree(shipped_folder(), tmp_path / "made"))
+    target = tmp_path / "weights"
+    install(made, target)
+    before = (target / NETWORK_FILE).read_bytes()
+
+    damage(made / NETWORK_FILE)
+
+    with pytest.raises(CheckpointError, match=f"{NETWORK_FILE} is missing or damaged"):
+        install(made, target)
+    assert (target / NETWORK_FILE).read_bytes() == before
+
+
+@pytest.mark.parametrize("content", ["", '{"silhouette_iou": {"val', "{}", "[]"])
+def test_damaged_figures_are_measured_again(tmp_path: Path, content: str) -> None:
+    whole = {"silhouette_iou": {"value": 0.5}}
+    measured: list[Path] = []
+
+    def measure(_weights: Path | None, folder: Path, _objects: Path | None) -> None:
+        measured.append(folder)
+        folder.mkdir(exist_ok=True)
+        (folder / FIGURES).write_text(json.dumps(whole), encoding="utf-8")
+
+    assert _figures(measure, None, tmp_path) == _figures(measure, None, tmp_path) == whole
+    (tmp_path / FIGURES).write_text(content, encoding="utf-8")
+
+    assert _figures(measure, None, tmp_path) == whole
+    assert len(measured) == 2
+
+
+def whole_stage(folder: Path) -> Path:
+    """Return a stage with the shipped weights as its own: network, uncertainty and all."""
+    finish_network(folder)
+    for name in ("uncertainty", "weights"):
+        shutil.copytree(shipped_folder(), folder / "stage-1" / name)
+    return folder / "stage-1"
+
+
+@pytest.mark.parametrize("name", [NETWORK_FILE, "quality.json"])
+def test_damaged_weights_of_a_stage_are_made_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str
+) -> None:
+    job = job_in(tmp_path / "work", load_rig("paper-rig"))
+    stage = whole_stage(job.folder)
+    plan = load_plan(job.folder)
+    assert plan
+    monkeypatch.setattr(verdicts, "_fit_quality", Mock())
+    damage(stage / "weights" / name)
+
+    verdicts.train_uncertainty(job, plan, stage, untracked, None)
+
+    assert (stage / "weights" / name).read_bytes() == (shipped_folder() / name).read_bytes()
+
+
+def test_held_out_objects_are_made_whole_for_the_uncertainty(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Also where the network is whole, for which they were rendered."""
+    job = job_in(tmp_path / "work", load_rig("paper-rig"))
+    stage = whole_stage(job.folder)
+    shutil.rmtree(stage / "weights")
+    damage(stage / "uncertainty" / NETWORK_FILE)
+    plan = load_plan(job.folder)
+    assert plan
+    made: list[tuple[str, int]] = []
+
+    def build(plan: DatasetPlan, _count: int, folder: Path, **_: object) -> None:
+        made.append((folder.name, plan.first_seed))
+
+    monkeypatch.setattr("nlos_cam.dataset.build_dataset", build)
+
+    with pytest.raises(RecordingError, match="no dataset"):
+        verdicts.train_uncertainty(job, plan, stage, untracked, None)
+
+    assert dict(made)["held-out"] == HELD_OUT_SEED
+    assert not (stage / "uncertainty" / NETWORK_FILE).exists()
 
 
 @pytest.mark.parametrize("cores", CORES)

@@ -13,13 +13,22 @@ import numpy as np
 import pytest
 from made_adaptations import finish_network, job_in
 from nlos_calibration import load_rig
-from nlos_models import load_reconstructor, load_record, silhouette_iou
+from nlos_models import load_reconstructor, load_record, shipped_folder, silhouette_iou
+from nlos_models.training import MapSet, unwatched
 
 from nlos_cam.adapt import adapt, find_recordings
-from nlos_cam.adapt.recordings import MIN_OBJECTS, Recordings, Transfer, parts_of
+from nlos_cam.adapt.recordings import (
+    MIN_OBJECTS,
+    Part,
+    Recordings,
+    Transfer,
+    fit_to_recordings,
+    parts_of,
+    write_parts,
+)
 from nlos_cam.adapt.report import transfer_words
 from nlos_cam.bench import load_bench
-from nlos_cam.dataset import open_dataset
+from nlos_cam.dataset import Labelled, open_dataset, untracked, write_shards
 from nlos_cam.errors import RecordingError
 from nlos_cam.evaluate import reconstruct_all
 from nlos_cam.files import cache_folder
@@ -167,6 +176,68 @@ def test_a_recording_without_a_truth_stops_before_training(
         adapt(replace(job, recordings=found), 1.0, measure)
 
     training.assert_not_called()
+
+
+def labelled_of(label: str, frames: int) -> Labelled:
+    """Return frames of an object as they are read from recordings."""
+    generator = np.random.default_rng([frames, len(label)])
+    depth_m, intensity = generator.random((2, frames, 64, 80), np.float32)
+    images = generator.random((frames, 64, 64), np.float32).astype(np.float16)
+    maps = MapSet(depth_m, intensity, images)
+    truth_m = np.zeros((frames, 64, 64), np.float32)
+    return Labelled(maps, maps, truth_m, (label,) * frames, ("a.bag",) * frames, HOME)
+
+
+def test_all_frames_of_validation_choose_the_epoch(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Those that the recipe has no room for would be whole objects."""
+    counts: dict[Part, int] = {"adaptation": 4, "validation": 60}
+    parts = {part: tmp_path / part for part in counts}
+    for part, folder in parts.items():
+        write_shards(labelled_of(part, counts[part]), folder)
+    run_transfer = Mock()
+    monkeypatch.setattr("nlos_models.training.run_transfer", run_transfer)
+
+    fit_to_recordings(shipped_folder(), parts, tmp_path / "out", "cpu", unwatched)
+
+    _, run, _, _, training, held_out = run_transfer.call_args.args
+    assert (len(training.image), len(held_out.image)) == (4, 60)
+    assert (run.recipe.objects, run.recipe.held_out) == (4, 60)
+
+
+def cut(path: Path) -> None:
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+
+
+def empty(path: Path) -> None:
+    for shard in path.parent.iterdir():
+        shard.unlink()
+
+
+@pytest.mark.parametrize("damage", [cut, Path.unlink, empty])
+def test_damaged_parts_of_recordings_are_written_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, damage: Callable[[Path], None]
+) -> None:
+    labels = list(OBJECTS)
+    found = Recordings(tmp_path, {label: [Path(label)] for label in labels}, no_bench, "0" * 12)
+
+    def read(paths: list[Path], **_: object) -> Labelled:
+        read_parts.append([path.name for path in paths])
+        return labelled_of(paths[0].name, 150)
+
+    read_parts: list[list[str]] = []
+    monkeypatch.setattr("nlos_cam.dataset.read_labelled", read)
+    folders = write_parts(found, tmp_path / "parts", untracked)
+    written = {path: path.read_bytes() for path in (tmp_path / "parts").rglob("*.h5")}
+    write_parts(found, tmp_path / "parts", untracked)
+    assert len(read_parts) == len(folders) == len(parts_of(labels))
+
+    damage(folders["validation"] / "shard-000000000.h5")
+    write_parts(found, tmp_path / "parts", untracked)
+
+    assert read_parts[len(folders) :] == [parts_of(labels)["validation"]]
+    assert {path: path.read_bytes() for path in (tmp_path / "parts").rglob("*.h5")} == written
 
 
 def record_bench(run: Callable[..., Any]) -> Path:

@@ -39,6 +39,23 @@ def test_a_curve_has_the_samples_of_the_stages_before(tmp_path: Path) -> None:
     assert second.iou == [0.5, 0.6]
 
 
+@pytest.mark.parametrize(
+    "content",
+    ["", "epoch,held_out", "epoch,held_out_iou\n0,0.5\n", "epoch,held_out_iou\n0,0.5\n1,0."],
+)
+def test_a_damaged_log_has_no_curve_and_is_named(tmp_path: Path, content: str) -> None:
+    """Its last row would pass for the end of the stage."""
+    result = result_in(tmp_path / "work")
+    (result.folders[0] / "network" / "log.csv").write_text(content, encoding="utf-8")
+
+    write_page(result, Tables([]), [], tmp_path / "page.html", kept=True)
+
+    text = (tmp_path / "page.md").read_text(encoding="utf-8")
+    assert "log.csv is damaged: stage 1" in text
+    assert f"{result.plan.stages[0].samples}" in text
+    assert "Too few epochs" in text
+
+
 def test_the_gain_of_one_stage_is_its_late_slope() -> None:
     doublings = [k / 4 for k in range(MIN_EPOCHS)]
 

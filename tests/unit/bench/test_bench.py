@@ -8,6 +8,7 @@ from made_benches import SERIAL, make_bench, wall_of, write_wall
 from nlos_calibration import load_measured
 from nlos_calibration.errors import CalibrationError, RecordFileError
 from nlos_models import load_record, shipped_folder
+from nlos_models.errors import CheckpointError
 from small_frames import FrameCamera
 
 from nlos_cam.bench import (
@@ -183,6 +184,22 @@ def test_lost_weights_do_not_lock_the_bench(folder: Path) -> None:
     write_weights(folder, shipped_folder())
 
     assert load_bench(folder).weights == folder / "weights"
+
+
+@pytest.mark.parametrize("name", ["direct.safetensors", "doubt.onnx", "quality.json"])
+def test_damaged_weights_do_not_replace_those_in_use(
+    folder: Path, tmp_path: Path, name: str
+) -> None:
+    write_weights(folder, shipped_folder())
+    source = Path(shutil.copytree(shipped_folder(), tmp_path / "own"))
+    content = (source / name).read_bytes()
+    (source / name).write_bytes(content[: len(content) // 2])
+
+    with pytest.raises(CheckpointError, match=f"{name} is missing or damaged"):
+        write_weights(folder, source)
+
+    assert load_bench(folder).weights == folder / "weights"
+    assert (folder / "weights" / name).read_bytes() == content
 
 
 def test_a_stopped_first_measurement_is_repeated(tmp_path: Path) -> None:

@@ -192,6 +192,12 @@ def test_report_device_has_temperatures_and_settings(measured: Measured) -> None
     for words in ("f0246262", "1.5.8.1", "laser_power", "80", "41.3 °C", "1.5", "64 x 48"):
         assert words in html
 
+    newer = replace(wall.reference, celsius={"LLD": 52.0}, settings={"laser_power": 60.0})
+    html = report.device(MeasuredWall(wall.record, newer))
+
+    assert "52.0 °C" in html
+    assert "41.3 °C" not in html
+
     assert "°C" not in report.device(MeasuredWall(measured().record, None))
 
 

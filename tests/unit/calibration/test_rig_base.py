@@ -60,3 +60,14 @@ def test_scene_changes_a_base_rig(tmp_path: Path) -> None:
 def test_base_that_cannot_be_used_is_named(tmp_path: Path, text: str, word: str) -> None:
     with pytest.raises(RecordFileError, match=word):
         load_rig(rig_file(tmp_path, text))
+
+
+def test_file_goes_before_a_packaged_rig_of_its_name(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    own = rig_file(tmp_path, 'base = "paper-rig"\n[lidar]\ndistance_m = 0.25\n')
+    own.rename(tmp_path / "wide-rig")
+    monkeypatch.chdir(tmp_path)
+
+    assert load_rig("wide-rig").lidar.distance_m == 0.25
+    assert load_rig("paper-rig") == PAPER

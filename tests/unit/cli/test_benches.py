@@ -359,3 +359,26 @@ def test_own_weights_on_the_wall_grid_say_how_far_they_are(bench: Path) -> None:
     write_weights(bench, own, 0.45)
 
     assert "0.45" in verdict(bench)
+
+
+@pytest.mark.parametrize("damage", [noise, a_later_version])
+def test_damaged_bench_is_refused_before_a_camera_is_opened(
+    run: Run, bench: Path, damage: Callable[[Path], None]
+) -> None:
+    damage(bench)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("nlos_cam.cli.calibrate._capture", None)
+        ended = run("calibrate", "sim", "--wall", "--bench", bench, "--overwrite", code=4)
+
+    assert "another bench" in ended.err
+
+
+def test_folder_of_results_does_not_hide_a_packaged_rig(bench: Path) -> None:
+    Path("wide-rig").mkdir()
+    rig, measured = bench_or_rig("wide-rig")
+
+    assert (rig, measured) == (load_rig("wide-rig"), None)
+
+    bench.rename("paper-rig")
+
+    assert bench_or_rig("paper-rig")[1] is not None

@@ -398,3 +398,7 @@ def test_board_json_is_the_board_that_was_printed(run: Run, shown: Run) -> None:
         assert Board.model_validate(result) == board
 
     assert_has(shown(*command).out, "6 x 9", "30 mm", "a4", "100 %", "board.pdf")
+
+
+def test_record_of_another_suffix_is_refused(run: Run) -> None:
+    assert ".toml" in run("calibrate", "sim", "--wall", "--out", "wall.rec", code=2).err

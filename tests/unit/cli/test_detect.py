@@ -171,6 +171,17 @@ def test_new_session_keeps_the_name_of_its_bench(
     assert plan.rig_option == "--bench bench"
 
 
+def test_occluder_that_was_not_measured_is_noted(
+    run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bare = make_bench(tmp_path / "bench") / "stations/main/wall.toml"
+    camera_at_a_terminal(monkeypatch)
+
+    err = run("detect", "l515", "--wall", bare, "--out", "session", code=1).err
+
+    assert "note: the occluder has not been measured" in err
+
+
 @pytest.mark.parametrize(
     "ignored",
     [
@@ -222,5 +233,7 @@ def test_terminal_asks_for_each_turn_until_stdin_ends(
     hands = TerminalHands(made_plan(control=True), Path("a session"), lambda: next(lines))
     hands.place(0, object_in=True)
     assert "Turn 1 of 32" in capsys.readouterr().err
-    with pytest.raises(NlosCamError, match="stdin ended"):
+    with pytest.raises(NlosCamError, match="stdin ended") as refused:
         hands.place(1, object_in=False)
+
+    assert str(refused.value).endswith("without --overwrite, goes on with --out 'a session'")

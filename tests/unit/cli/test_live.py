@@ -275,7 +275,10 @@ def test_begin_and_end_of_a_warning_print_once(
     monkeypatch.setattr("nlos_cam.reconstruct.frame_reader.QUEUE_FRAMES", 1000)
     monkeypatch.setattr("nlos_cam.reconstruct.summaries.ENDS_AFTER_FRAMES", 5)
     report = run(*command, "--wall", "wall.toml")
-    [(warning, frames)] = report["warnings"].items()
+    # besides the note on the occluder, which holds for every frame
+    [(warning, frames)] = [
+        (text, count) for text, count in report["warnings"].items() if "occluder" not in text
+    ]
 
     assert 0 < frames < 100
     assert report.err.count("drifted") == 2

@@ -1,6 +1,7 @@
 """`train direct`: a run belongs to its training maps and to its held-out maps."""
 
 import json
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -8,10 +9,12 @@ import numpy as np
 import pytest
 from fake_workers import samples_of
 from nlos_calibration import load_rig
+from nlos_models import shipped_folder
 from nlos_models.training import runs
 from nlos_models.training.run_files import FINISHED
 
 from nlos_cam.dataset import HELD_OUT_SEED, DatasetPlan, open_packed_maps
+from nlos_cam.dataset.packed import MAPS
 from nlos_cam.dataset.shards import shard_path, store
 
 RIG = load_rig("paper-rig")
@@ -62,6 +65,20 @@ def test_a_run_does_not_go_on_with_other_held_out_maps(
 
     assert run(*command, "--held-out", held_out, *out) == first
     assert "other weights or objects" in run(*command, "--held-out", others, *out, code=4).err
+
+
+def test_a_folder_of_another_run_is_refused_before_packing(tmp_path: Path, run: Any) -> None:
+    """Packing may take twenty minutes."""
+    (tmp_path / "direct.toml").write_text(RECIPE, encoding="utf-8")
+    out = Path(shutil.copytree(shipped_folder(), tmp_path / "out"))
+    command = "train", "direct", "--recipe", tmp_path / "direct.toml", "--out", out
+    sets = (
+        *("--dataset", dataset_in(tmp_path / "maps", 0)),
+        *("--held-out", dataset_in(tmp_path / "held", HELD_OUT_SEED)),
+    )
+
+    assert "weights from another run" in run(*command, *sets, code=1).err
+    assert not (out / "packed" / MAPS).exists()
 
 
 @pytest.mark.usefixtures("one_thread")

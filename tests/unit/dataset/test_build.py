@@ -641,6 +641,19 @@ def test_ray_worker_of_another_version_is_refused() -> None:
         make_piece(PLAN, range(1), "9.9")
 
 
+@pytest.mark.parametrize(
+    "plan",
+    [
+        replace(PLAN, rendering_version=PLAN.rendering_version + 1),
+        replace(PLAN, objects=replace(PLAN.objects, version=PLAN.objects.version + 1)),
+    ],
+    ids=["renderer", "objects"],
+)
+def test_ray_worker_of_another_renderer_is_refused(plan: DatasetPlan) -> None:
+    with pytest.raises(SceneError, match="same commit on every machine"):
+        make_piece(plan, range(1), nlos_cam.__version__)
+
+
 @pytest.mark.slow
 @pytest.mark.skipif(find_spec("ray") is None, reason="needs Ray (the extra `many`)")
 def test_cluster_of_two_machines_makes_equal_samples(tmp_path: Path) -> None:

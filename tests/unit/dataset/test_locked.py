@@ -83,7 +83,7 @@ def test_normalized_noise_has_one_strength_in_all_cells() -> None:
     strong = MapSet(some.depth_m + 1e-5, some.intensity + 0.1, some.image)
 
     recipe = noise.fitted(
-        Stage(minutes=1.0, objects=100, epochs=1, steps=9).recipe(), normal, [strong]
+        Stage(minutes=1.0, objects=100, epochs=1, steps=9).recipe(), normal, strong
     )
 
     many = MapSet(*np.zeros((2, 200, 64, 80), np.float32), np.zeros((200, 64, 64), np.float16))

@@ -18,7 +18,7 @@ from nlos_cam.dataset import DatasetPlan, reader
 from nlos_cam.dataset.locked import LOCKED
 from nlos_cam.dataset.reader import MAP_CHANNELS, Dataset, _Window, open_dataset
 from nlos_cam.dataset.shards import shard_path, store
-from nlos_cam.errors import RecordingError, SceneError
+from nlos_cam.errors import RecordingError
 
 PLAN = DatasetPlan(load_rig("paper-rig"), 40)
 COUNT = 43
@@ -44,10 +44,8 @@ def data(folder: Path) -> Dataset:
     return open_dataset(folder)
 
 
-def _rows(
-    data: Dataset, seed: int = 0, epoch: int = 0, batch: int = 4, **others: int
-) -> list[list[int]]:
-    return [found.row.tolist() for found in data.batches(seed, epoch, batch, **others)]
+def _rows(data: Dataset, seed: int = 0, epoch: int = 0, batch: int = 4) -> list[list[int]]:
+    return [found.row.tolist() for found in data.batches(seed, epoch, batch)]
 
 
 def _every_row(data: Dataset, batch: int = 1) -> list[int]:
@@ -77,6 +75,21 @@ def test_dataset_is_read_as_stored(data: Dataset, name: str) -> None:
 
     np.testing.assert_array_equal(getattr(data.arrays(), name), stored)
     np.testing.assert_array_equal(np.concatenate(parts), stored)
+
+
+@pytest.mark.parametrize(("count", "shards"), [(1, 1), (5, 1), (6, 2), (99, 9)])
+def test_first_objects_are_read_without_the_other_shards(
+    data: Dataset, monkeypatch: pytest.MonkeyPatch, count: int, shards: int
+) -> None:
+    read = Mock(wraps=reader.read_arrays)
+    monkeypatch.setattr(reader, "read_arrays", read)
+
+    first = data.first(count)
+
+    assert read.call_count == shards
+    stored = samples_of(range(40, 40 + min(count, COUNT)))
+    for name in MAP_CHANNELS:
+        np.testing.assert_array_equal(getattr(first, name), stored[name])
 
 
 @pytest.mark.parametrize("batch", [1, 4, 7, 43, 100])
@@ -109,24 +122,6 @@ def test_batches_repeat_by_seed_and_epoch(data: Dataset) -> None:
 @pytest.mark.parametrize(("seed", "epoch"), [(3, 2), (4, 1)])
 def test_batches_of_another_seed_or_epoch_differ(data: Dataset, seed: int, epoch: int) -> None:
     assert _rows(data, 3, 1) != _rows(data, seed, epoch)
-
-
-@pytest.mark.parametrize("world", [2, 3])
-def test_processes_share_the_batches_of_one_process(data: Dataset, world: int) -> None:
-    alone = list(data.batches(0, 0, 6))
-
-    for rank in range(world):
-        shares = list(data.batches(0, 0, 6, rank=rank, world=world))
-        for share, whole in zip(shares, alone, strict=True):
-            assert share.row.tolist() == whole.row.tolist()[rank::world]
-            assert share.mirrored.tolist() == whole.mirrored.tolist()[rank::world]
-            _assert_as_stored(share)
-
-
-@pytest.mark.parametrize(("rank", "world"), [(0, 4), (2, 2), (-1, 2)])
-def test_impossible_share_of_a_batch_is_refused(data: Dataset, rank: int, world: int) -> None:
-    with pytest.raises(SceneError, match=r"batch of 6 .* processes"):
-        next(data.batches(0, 0, 6, rank=rank, world=world))
 
 
 def test_samples_of_three_shards_are_shuffled_together(data: Dataset) -> None:

@@ -4,7 +4,10 @@ subtract.
 
 import json
 import shutil
+from collections.abc import Callable
+from concurrent.futures import Future
 from concurrent.futures.process import BrokenProcessPool
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -17,7 +20,7 @@ import pytest
 import torch
 from fake_workers import samples_of
 from nlos_calibration import Rig, load_rig
-from nlos_models import CellNormal
+from nlos_models import CellNormal, load_record, shipped_folder
 from nlos_models.training import MapBatch
 from nlos_models.training.data import flip_some, subtract_bare_wall
 from small_maps import SmallDataset, small_maps
@@ -139,6 +142,14 @@ def test_maps_of_many_rigs_need_something_that_aligns_them(data: str, other: str
 def _first_batch(data: str, seed: int, *, stream: bool) -> MapBatch:
     maps = _read(data, stream=stream, objects=6).training
     return next(iter(maps.batches(6, torch.Generator().manual_seed(seed))))
+
+
+@pytest.mark.parametrize(("weights", "refused"), [("direct", False), ("any", True)])
+def test_expected_maps_that_need_alignment_are_refused(weights: str, refused: bool) -> None:
+    start = load_record(shipped_folder(weights))
+
+    with pytest.raises(SceneError, match="--expected-maps") if refused else nullcontext():
+        read_maps(RECIPE, Path("expected"), Path("other"), None, start=start)
 
 
 streamed_or_not = pytest.mark.parametrize("stream", [False, True])
@@ -454,6 +465,24 @@ def test_meshes_of_the_same_seeds_are_other_objects(tmp_path: Path, store_folder
         assert len(packed.held_out(held_out, 2).image) == 2
 
 
+@pytest.mark.parametrize("shares", [(0.5, 0.5), (0.5, 0.0), (0.0, 0.5)])
+def test_generic_shapes_of_the_same_seeds_are_refused(
+    tmp_path: Path, shares: tuple[float, float]
+) -> None:
+    """Which they are follows from the seed alone, also between meshes."""
+    plans = (
+        replace(PLAN, objects=Objects(share_generic=shares[0])),
+        replace(PLAN, objects=Objects((), (("cup.obj", "0" * 64),), share_generic=shares[1])),
+    )
+    both = [
+        open_dataset(_add(tmp_path / name, 0, plan))
+        for name, plan in zip(("training", "held-out"), plans, strict=True)
+    ]
+
+    with pytest.raises(SceneError, match="have the seeds") if all(shares) else nullcontext():
+        check_held_out(*both)
+
+
 @pytest.mark.parametrize(("plan", "kept"), [(PLAN, True), (MANY, False), (OTHER, False)])
 def test_cells_of_weights_serve_maps_of_their_own_rig_alone(
     tmp_path: Path, store_folder: Path, plan: DatasetPlan, kept: bool
@@ -630,6 +659,19 @@ def test_new_shards_enter_new_epochs(folder: Path, store_folder: Path) -> None:
         assert len(_epoch(packed, 2)[0]) == 10
 
 
+def test_new_shards_of_held_out_objects_are_refused(
+    folder: Path, tmp_path: Path, store_folder: Path
+) -> None:
+    held_out = _add(tmp_path / "held-out", 100)
+
+    with open_packed_maps([folder], store_folder, held_out=held_out) as packed:
+        _add(folder, 5)
+        _epoch(packed, 1)
+        _add(folder, 100)
+        with pytest.raises(SceneError, match=r"5 objects of .*held-out have the seeds"):
+            _epoch(packed, 2)
+
+
 @pytest.mark.parametrize("sizes", ["known", "of a store before they were kept"])
 def test_store_takes_the_rest_of_a_shard_that_grew(
     folder: Path, store_folder: Path, sizes: str
@@ -694,13 +736,46 @@ def test_a_process_that_ends_while_it_packs_is_told(
     folder: Path, store_folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     _add(folder, 5)
-    pool = Mock(**{"map.side_effect": BrokenProcessPool})
+    pool = Mock(**{"submit.side_effect": BrokenProcessPool})
     monkeypatch.setattr(packing, "ProcessPoolExecutor", lambda *_, **__: pool)
 
     with pytest.raises(WorkersLostError, match="lower --pack-workers"):
         open_packed_maps([folder], store_folder, processes=2).__enter__()
 
     pool.shutdown.assert_called_once_with(cancel_futures=True)
+
+
+class _Pool:
+    """Process pool that works in this process, and counts what it was asked for."""
+
+    def __init__(self) -> None:
+        self.asked = 0
+
+    def submit(self, work: Callable[..., Any], *arguments: Any) -> Future[Any]:
+        self.asked += 1
+        done: Future[Any] = Future()
+        done.set_result(work(*arguments))
+        return done
+
+    def shutdown(self, **_: bool) -> None:
+        """End nothing."""
+
+
+def test_processes_pack_a_few_shards_ahead(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    paths = [shard_path(_add(folder, first), first) for first in range(0, 100, SHARD)]
+    pool = _Pool()
+    monkeypatch.setattr(packing, "ProcessPoolExecutor", lambda *_, **__: pool)
+    packer = packing.Packer.of(PLAN.rig, CellNormal(), with_counts=False)
+    ahead = packing.AHEAD * 2
+
+    with packing.packing(2) as opened:
+        for number, (path, rows) in enumerate(
+            zip(paths, opened.rows_of(packer, paths), strict=True), 1
+        ):
+            assert pool.asked <= number - 1 + ahead
+            np.testing.assert_array_equal(rows[MAPS], packer.rows(path)[MAPS])
+
+    assert pool.asked == len(paths)
 
 
 def test_statistics_are_of_the_shards_that_the_first_epoch_sees(

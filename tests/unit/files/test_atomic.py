@@ -8,7 +8,13 @@ from typing import Any
 import pytest
 
 from nlos_cam.errors import OutputExistsError
-from nlos_cam.files import FileBusyError, atomic_directory, atomic_file, cache_folder
+from nlos_cam.files import (
+    FileBusyError,
+    atomic_directory,
+    atomic_file,
+    atomic_files,
+    cache_folder,
+)
 
 
 @pytest.mark.parametrize(
@@ -180,3 +186,25 @@ def test_directory_is_old_or_new_whenever_its_writer_dies(tmp_path: Path) -> Non
     whole = "a/new b/new c/new"
 
     assert states == {old, f"{whole} mine1/old mine2/old", "", whole}
+
+
+def test_files_that_belong_together_appear_together(tmp_path: Path) -> None:
+    paths = [tmp_path / "one", tmp_path / "two"]
+    with atomic_files(*paths) as parts:
+        for part, text in zip(parts, ("first", "second"), strict=True):
+            part.write_text(text)
+
+        assert not any(path.exists() for path in paths)
+
+    assert [path.read_text() for path in paths] == ["first", "second"]
+
+    def stop_between() -> None:
+        with atomic_files(*paths) as parts:
+            parts[0].write_text("third")
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        stop_between()
+
+    assert [path.read_text() for path in paths] == ["first", "second"]
+    assert {*tmp_path.iterdir()} == {*paths}

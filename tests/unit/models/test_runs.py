@@ -2,6 +2,7 @@
 overwritten.
 """
 
+from collections.abc import Callable
 from contextlib import nullcontext
 from functools import partial
 from pathlib import Path
@@ -12,7 +13,7 @@ import torch
 from nlos_calibration.rig import load_rig
 from nlos_models import CheckpointRecord, checkpoint
 from nlos_models.direct import DirectNetwork
-from nlos_models.errors import TrainingError
+from nlos_models.errors import CheckpointError, TrainingError
 from nlos_models.pipeline import RemappingNetwork
 from nlos_models.records import UNCERTAINTY_RECORD
 from nlos_models.training import open_fabric, runs
@@ -124,6 +125,26 @@ def test_folder_is_held_until_the_weights_are_saved(
     assert held == [tmp_path]
     with claim(tmp_path, inside=True):
         assert (tmp_path / FINISHED).exists()
+
+
+@pytest.mark.parametrize("damage", [Path.unlink, lambda path: path.write_bytes(b"cut")])
+def test_finished_run_with_damaged_weights_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, damage: Callable[[Path], object]
+) -> None:
+    trained = SmallVae(), {"held_out_loss": 1.0}
+    monkeypatch.setattr(runs, "train_vae", Mock(return_value=trained))
+    training = TrainingRun(VAE, tmp_path, CheckpointRecord.of([VAE], NAMED))
+
+    def train() -> object:
+        fabric = open_fabric(VAE, accelerator="cpu")
+        return run_vae(fabric, training, None, small_images(2, 0), small_images(2, 1))
+
+    assert train() == train()
+
+    damage(tmp_path / "decoder.safetensors")
+
+    with pytest.raises(CheckpointError, match=r"decoder\.safetensors .*to train again"):
+        train()
 
 
 def _start(recipe: Recipe, weights: Path) -> object:

@@ -499,6 +499,26 @@ def test_two_processes_end_with_weights_of_one(tmp_path: Path) -> None:
     assert made["again"] == made["net"]
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("rank", [0, 1])
+@pytest.mark.parametrize(
+    ("error", "raised"),
+    [
+        (TrainingError("the disk is full"), "^the disk is full$"),
+        (ZeroDivisionError("by nothing"), "ended early .ZeroDivisionError: by nothing"),
+    ],
+    ids=["expected", "unexpected"],
+)
+def test_launch_raises_the_error_of_the_one_that_failed(
+    rank: int, error: Exception, raised: str
+) -> None:
+    """The other one loses its connection, which says nothing about the cause."""
+    fabric = open_fabric(small_recipe(), accelerator="cpu", devices=2)
+
+    with pytest.raises(TrainingError, match=raised):
+        launch(fabric, small_run.fail_in_one, rank, error)
+
+
 def test_open_fabric_refuses_uneven_batch_and_missing_gpus(monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(RecipeError, match=r"batch of 4 .* 3 processes"):
         open_fabric(small_recipe(), accelerator="cpu", devices=3)
