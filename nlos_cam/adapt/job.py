@@ -13,7 +13,7 @@ from nlos_cam import dataset as data
 from nlos_cam.adapt.plan import Locked
 from nlos_cam.adapt.recordings import Recordings
 from nlos_cam.errors import SceneError
-from nlos_cam.files import checksums_of
+from nlos_cam.files import checksums_of, damaged_files
 from nlos_cam.reconstruct import weights_for
 from nlos_cam.render import SensorModel
 
@@ -162,4 +162,4 @@ def is_whole(folder: Path, last: str) -> bool:
     """Return whether a folder of weights has all its files, of which `last` is written last, with
     their checksums.
     """
-    return last in checksums_of(folder) and not training.damaged_files(folder)
+    return last in checksums_of(folder) and not damaged_files(folder)

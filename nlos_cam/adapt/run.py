@@ -63,6 +63,7 @@ from nlos_cam.files import (
     atomic_directory,
     checksums_of,
     claim,
+    damaged_files,
     read_bounded,
 )
 from nlos_cam.reconstruct import check_alignable, weights_for
@@ -437,8 +438,9 @@ def _figures(
     """Return the figures of weights on a dataset, measured once into a folder; again where they are
     damaged.
     """
-    if _stored_figures(folder) is None:
-        measure(weights, folder, objects)
+    if (stored := _stored_figures(folder)) is not None:
+        return stored
+    measure(weights, folder, objects)
     return json.loads((folder / FIGURES).read_text(encoding="utf-8"))
 
 
@@ -460,7 +462,7 @@ def install(weights: Path, target: Path) -> None:
     """
     if target.exists() and not target.is_dir():
         raise OutputExistsError(f"{target} is a file, but weights are a folder: move it away")
-    if damaged := training.damaged_files(weights):
+    if damaged := damaged_files(weights):
         raise CheckpointError(
             f"{weights / damaged[0]} is missing or damaged, so {target} stays: adapt again"
         )

@@ -20,7 +20,13 @@ from nlos_cam.adapt.job import (
 )
 from nlos_cam.adapt.plan import HELD_OUT_OBJECTS, Plan
 from nlos_cam.errors import SceneError
-from nlos_cam.files import atomic_directory, cache_folder, checksums_of, write_checked
+from nlos_cam.files import (
+    atomic_directory,
+    cache_folder,
+    checksums_of,
+    damaged_files,
+    write_checked,
+)
 
 UNCERTAINTY = "uncertainty"
 QUALITY_SEED = 40_000_000
@@ -66,7 +72,7 @@ def _train_uncertainty_network(
     """
     # A kill between its files, or damage: the training goes on or begins again, and writes them
     # again. Damaged copies of the network's files would pass for those of other weights.
-    for name in (models.UNCERTAINTY_RECORD, *training.damaged_files(out)):
+    for name in (models.UNCERTAINTY_RECORD, *damaged_files(out)):
         (out / name).unlink(missing_ok=True)
 
     recipe = plan.uncertainty_recipe(_uncertainty_recipe())

@@ -12,7 +12,6 @@ import nlos_calibration as walls
 from nlos_calibration.errors import CalibrationError, RecordFileError
 from nlos_models import RECORD, load_record
 from nlos_models.errors import CheckpointError
-from nlos_models.training import damaged_files
 
 from nlos_cam import __version__
 from nlos_cam.bench.folder import load_bench
@@ -29,7 +28,13 @@ from nlos_cam.bench.record import (
     sha256_of,
 )
 from nlos_cam.errors import OutputExistsError
-from nlos_cam.files import CHECKSUMS, atomic_directory, atomic_file, write_checked
+from nlos_cam.files import (
+    CHECKSUMS,
+    atomic_directory,
+    atomic_file,
+    damaged_files,
+    write_checked,
+)
 from nlos_cam.reconstruct import weights_serve
 
 TEST_IOU = "test_iou"
@@ -108,12 +113,12 @@ def check_new(folder: Path) -> None:
         raise OutputExistsError(
             f"{folder} cannot be made, because {nearest} is a file: choose another --bench"
         )
-    if folder.is_dir() and not is_bench(folder) and not all(map(_is_unfinished, folder.iterdir())):
+    if is_bench(folder):
+        load_bench_record(folder)
+    elif folder.is_dir() and not all(map(_is_unfinished, folder.iterdir())):
         raise OutputExistsError(
             f"{folder} holds other files and no bench: choose another name for --bench"
         )
-    if is_bench(folder):
-        load_bench_record(folder)
 
 
 def _is_unfinished(path: Path) -> bool:

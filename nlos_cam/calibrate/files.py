@@ -44,13 +44,13 @@ def write_record(files: WallFiles, record: WallRecord, reference: BareWall | Non
     of the renames leaves a record that `load_measured` refuses, since its reference is another.
     """
     paths = [files.record, files.report, *([files.reference] if reference is not None else [])]
-    with atomic_files(*paths) as parts:
+    with atomic_files(*paths) as (record_part, report_part, *reference_part):
         if reference is not None:
-            digest = save_reference(parts[-1], reference)
+            digest = save_reference(reference_part[0], reference)
             record = record.model_copy(
                 update={"reference": files.reference.name, "reference_sha256": digest}
             )
         html = report_html(MeasuredWall(record, reference), files.record.name)
-        parts[0].write_text(dump_toml(record), encoding="utf-8")
-        parts[1].write_text(html, encoding="utf-8")
+        record_part.write_text(dump_toml(record), encoding="utf-8")
+        report_part.write_text(html, encoding="utf-8")
     return record

@@ -125,7 +125,7 @@ def rig_or_default(bench: Path | None, rig: str | None, default: str) -> walls.R
         raise typer.BadParameter("--bench and --rig each name a rig: give one")
     if bench is not None:
         loaded = benches.load_bench(bench, weights=False)
-        _note_warnings(loaded)
+        note_warnings(loaded.calibrated)
         return loaded.rig
     name = rig or default
     found = walls.rig_named(name)
@@ -134,9 +134,9 @@ def rig_or_default(bench: Path | None, rig: str | None, default: str) -> walls.R
     return found
 
 
-def _note_warnings(bench: benches.Bench) -> None:
+def note_warnings(bench: reconstruct.CalibratedRig) -> None:
     """Print the warnings about a bench that hold for every frame."""
-    for warning in bench.calibrated.warnings:
+    for warning in bench.warnings:
         common.say(f"note: {warning}")
 
 
@@ -163,7 +163,7 @@ def bench_or_rig(name: str | Path) -> tuple[walls.Rig, walls.MeasuredWall | None
     name = str(name)
     if names_folder(name):
         loaded = benches.load_bench(name, weights=False)
-        _note_warnings(loaded)
+        note_warnings(loaded.calibrated)
         return loaded.rig, loaded.measured
     if walls.is_wall_record(name):
         measured = walls.load_measured(Path(name))

@@ -32,7 +32,6 @@ from nlos_cam.cli.common import (
     output_path,
     progress,
     refuse_ignored,
-    say,
     stderr,
     tracked,
 )
@@ -287,8 +286,7 @@ def _measure(
         if chosen.record:
             bench = chosen.open(source)
             rig = bench.rig
-            for warning in bench.warnings:
-                say(f"note: {warning}")
+            benches.note_warnings(bench)
         plan = asked.plan(source, rig, before)
         if before is None and detection.is_session(folder):  # --overwrite, all else in order
             shutil.rmtree(folder)

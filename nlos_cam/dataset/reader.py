@@ -68,9 +68,7 @@ class Dataset:
 
     def arrays(self) -> MapSet:
         """Read all maps and images."""
-        return MapSet(
-            *(np.concatenate(parts) for parts in zip(*map(self.read, self.shards), strict=True))
-        )
+        return self.first(len(self))
 
     def first(self, count: int) -> MapSet:
         """Read the maps and images of the first `count` objects, or of all if there are fewer, and

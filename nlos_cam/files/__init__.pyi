@@ -11,6 +11,7 @@ __all__ = [
     "cache_folder",
     "checksums_of",
     "claim",
+    "damaged_files",
     "describe",
     "is_claimed",
     "load_cached",
@@ -29,7 +30,7 @@ __all__ = [
 
 from .atomic import atomic_directory, atomic_file, atomic_files
 from .cache import cache_folder, load_cached
-from .checksums import CHECKSUMS, checksums_of, read_checked, write_checked
+from .checksums import CHECKSUMS, checksums_of, damaged_files, read_checked, write_checked
 from .claims import DISK_ERRORS, claim, is_claimed, reservations
 from .errors import FileBusyError, OutputExistsError
 from .hdf5 import read_hdf5, read_hdf5_text

@@ -5,7 +5,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from nlos_cam.files.atomic import atomic_file
-from nlos_cam.files.reading import TEXT_LIMIT, read_bounded
+from nlos_cam.files.reading import TENSOR_LIMIT, TEXT_LIMIT, read_bounded
 
 CHECKSUMS = "SHA256SUMS"
 
@@ -34,6 +34,19 @@ def read_checked(path: Path, limit: int) -> bytes:
     if expected not in {None, hashlib.sha256(content).hexdigest()}:
         raise ValueError(f"damaged: its checksum differs from {CHECKSUMS}")
     return content
+
+
+def damaged_files(folder: Path) -> list[str]:
+    """Return the names of the files that a folder's SHA256SUMS lists and that are missing,
+    unreadable or different; none where there is no such list.
+    """
+    damaged: list[str] = []
+    for name in checksums_of(folder):
+        try:
+            read_checked(folder / name, TENSOR_LIMIT)
+        except (OSError, ValueError):
+            damaged.append(name)
+    return damaged
 
 
 def write_checked(folder: Path, contents: Mapping[str, bytes]) -> None:

@@ -226,7 +226,7 @@ def compare(chosen: Namespace, source: PackedMaps) -> None:
     sets = {
         "kinds": rendered_objects(rig).maps,
         "unseen": rendered_objects(rig, test="unseen").maps,
-        "held_out": first_of(open_dataset(chosen.held_out).arrays(), base.held_out),
+        "held_out": open_dataset(chosen.held_out).first(base.held_out),
     }
     torch.set_num_threads(1)  # after rendering, whose threads set the number anew
     path = chosen.out / "figures" / "direct_ablations.json"

@@ -35,7 +35,6 @@ from nlos_models.training import (
     NormalBatch,
     Running,
     figures_of,
-    first_of,
     fit,
     load_recipe,
     parts_of,
@@ -179,7 +178,7 @@ def rendered(place: str, work: Path, seed: int, count: int) -> Path:
 def held_out(place: str, work: Path) -> MapSet:
     """Return held-out maps with a station's own noise."""
     opened = open_dataset(rendered(place, work, HELD_OUT_SEED, HELD_OUT), expected=True)
-    maps = first_of(opened.arrays(), HELD_OUT)
+    maps = opened.first(HELD_OUT)
     return map_noise(opened.plan).expose(maps, HELD_OUT_SEED + [*PLACES].index(place))
 
 

@@ -24,7 +24,6 @@ __all__ = [
     "as_batch",
     "can_leave_out",
     "compressor_start",
-    "damaged_files",
     "digest_of",
     "direct_start",
     "figures_of",
@@ -114,4 +113,3 @@ from .runs import (
 )
 from .tasks import figures_of, parts_of, rebuild, run
 from .uncertainty import UncertaintySet
-from .weight_files import damaged_files

@@ -12,7 +12,7 @@ from typing import Any, Generic, TypeVar
 import torch
 from lightning_fabric import Fabric
 
-from nlos_cam.files import OutputExistsError, claim, program_name
+from nlos_cam.files import OutputExistsError, claim, damaged_files, program_name
 from nlos_models.arrays import Float16
 from nlos_models.checkpoint import load_network, load_pipeline
 from nlos_models.direct import DirectNetwork
@@ -59,7 +59,6 @@ from nlos_models.training.tasks import (
     train_vae,
 )
 from nlos_models.training.uncertainty import UncertaintySet, calibrate, train_uncertainty
-from nlos_models.training.weight_files import damaged_files
 from nlos_models.uncertainty_network import save_uncertainty_network
 from nlos_models.vae import Encoder, ResVae
 
