@@ -176,7 +176,7 @@ def write_weights(folder: Path, source: Path, test_iou: float | None = None) -> 
     with edit_bench(folder) as edit:
         names = sorted(path.name for path in source.iterdir() if path.is_file())
         # an uncertainty network of earlier weights would watch others than those beside it
-        with atomic_directory(out, drop="*") as part:
+        with atomic_directory(out, drop=["*"]) as part:
             for name in names:
                 shutil.copyfile(source / name, part / name)
             fields = rig.model_dump(mode="json")

@@ -22,7 +22,7 @@ from nlos_calibration import Intrinsics
 from nlos_cam.camera.streams import BYTES_PER_PIXEL, FRAMES_PER_S, SAME_INSTANT_S, FrameSet
 from nlos_cam.camera.timestamps import SAME_CLOCK_S
 from nlos_cam.errors import DiskFullError, OutputExistsError, RecordingError
-from nlos_cam.files import FileBusyError, claim
+from nlos_cam.files import FileBusyError, claim, replaced_folder
 from nlos_cam.threads import BoundedQueue
 
 RESERVE_BYTES = 200_000_000
@@ -276,9 +276,12 @@ log = logging.getLogger(__name__)
 
 
 class _Replaced:
-    """Files that a recording replaces, in the folder of its claim until it has its first set."""
+    """Files that a recording replaces, in the folder of its claim until it has its first set; also
+    after a kill, when the next claim puts them back.
+    """
 
-    def __init__(self, paths: Sequence[Path], folder: Path) -> None:
+    def __init__(self, paths: Sequence[Path] = (), folder: Path = Path()) -> None:
+        self._folder = folder
         self._kept = {path: folder / path.name for path in paths}
         self._free: list[Path] = []
         """Paths that are the new recording's by now."""
@@ -293,9 +296,12 @@ class _Replaced:
     def drop(self) -> None:
         """Delete the files: the new recording stands."""
         self._free.clear()
-        for kept in self._kept.values():
-            with suppress(OSError):  # they go with the folder
-                kept.unlink(missing_ok=True)
+        if self._kept:
+            self._kept = {}
+            dropped = self._folder.with_suffix(".dropped")
+            with suppress(OSError):
+                self._folder.rename(dropped)  # both files in one step, for a kill between the two
+            shutil.rmtree(dropped, ignore_errors=True)
 
     def put_back(self) -> None:
         """Put the files in the place of a recording without a set; without effect after `drop`."""
@@ -353,7 +359,7 @@ class Recording:
         self._free = free
         self._overwrite = overwrite
         self._claim = ExitStack()
-        self._replaced = _Replaced((), path)
+        self._replaced = _Replaced()
         self._source: tuple[Any, Any] = (None, None)
         """Device and SDK, for the next take."""
         self._recorder: SdkRecorder | None = None
@@ -412,9 +418,9 @@ class Recording:
     def _take_away(self, folder: Path) -> None:
         """Move the recording that this one replaces, and its sidecar, into a folder."""
         paths = self.path, self.path.with_suffix(SIDECAR_SUFFIX)
-        self._replaced = _Replaced(paths, folder)
-        self._claim.callback(self._replaced.put_back)
         try:
+            self._replaced = _Replaced(paths, replaced_folder(folder))
+            self._claim.callback(self._replaced.put_back)
             self._replaced.take_away()
         except OSError as error:
             raise self._cannot_be_written(error) from error

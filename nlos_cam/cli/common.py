@@ -244,11 +244,11 @@ def tracked(description: str, *, at_once: bool = True) -> Generator[Callable[[in
 
 
 @contextmanager
-def stop_on_signals(note: str = "") -> Generator[Event]:
+def stop_on_signals(note: str = "", hurry: Event | None = None) -> Generator[Event]:
     """Yield an event that Ctrl-C, SIGTERM or SIGHUP sets within the block, so that the loop
     ends and results are printed.
 
-    The first signal prints `note`, for loops whose end takes long.
+    The first signal prints `note`, for loops whose end takes long; the next one sets `hurry`.
     """
     stop = Event()
 
@@ -256,6 +256,8 @@ def stop_on_signals(note: str = "") -> Generator[Event]:
         if note and not stop.is_set():
             with suppress(RuntimeError):  # the signal came within a write to stderr
                 say(note)
+        if hurry and stop.is_set():
+            hurry.set()
         stop.set()
 
     with _on_signals(set_stop):

@@ -139,7 +139,7 @@ def live(
         if view_file:
             control.bench.is_saving = lambda: True
         with (
-            common.stop_on_signals() as stop,
+            common.stop_on_signals(hurry=control.hurry) as stop,
             loop.RealtimePriority(priority, control.strain_of(stop)),
             viewing.saving(viewer, bench, view_file) as viewers,
             frame_log or nullcontext(),

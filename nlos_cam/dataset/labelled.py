@@ -369,7 +369,7 @@ def write_shards(labelled: Labelled, folder: Path, command: str = "") -> None:
     plan = DatasetPlan(labelled.rig, first_seed=0, accuracy=RECORDED)
     samples = _samples(labelled, plan)
     folder.parent.mkdir(parents=True, exist_ok=True)
-    with atomic_directory(folder, drop=SHARD_PATTERN) as whole:
+    with atomic_directory(folder, drop=[SHARD_PATTERN]) as whole:
         for start in range(0, len(labelled.label), SHARD):
             part = {name: values[start : start + SHARD] for name, values in samples.items()}
             try:

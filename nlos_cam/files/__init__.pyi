@@ -23,6 +23,7 @@ __all__ = [
     "read_hdf5",
     "read_hdf5_text",
     "read_toml",
+    "replaced_folder",
     "reservations",
     "with_commit",
     "write_checked",
@@ -31,7 +32,7 @@ __all__ = [
 from .atomic import atomic_directory, atomic_file, atomic_files
 from .cache import cache_folder, load_cached
 from .checksums import CHECKSUMS, checksums_of, damaged_files, read_checked, write_checked
-from .claims import DISK_ERRORS, claim, is_claimed, reservations
+from .claims import DISK_ERRORS, claim, is_claimed, replaced_folder, reservations
 from .errors import FileBusyError, OutputExistsError
 from .hdf5 import read_hdf5, read_hdf5_text
 from .program import program_commit, program_name, with_commit

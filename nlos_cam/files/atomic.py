@@ -3,7 +3,7 @@
 import ctypes
 import os
 import shutil
-from collections.abc import Generator
+from collections.abc import Collection, Generator
 from contextlib import ExitStack, contextmanager, suppress
 from fnmatch import fnmatch
 from pathlib import Path
@@ -71,12 +71,13 @@ def _link_exclusively(part: Path, path: Path) -> None:
 
 
 @contextmanager
-def atomic_directory(out: Path, *, drop: str = "") -> Generator[Path]:
+def atomic_directory(out: Path, *, drop: Collection[str] = ()) -> Generator[Path]:
     """Yield an empty directory; on success flush it to disk and let it take the place of `out` in
     one rename.
 
-    Entries of `out` with other names stay, but for files that match the pattern `drop`, as in
-    `fnmatch`: they go in the same step, or after the new entries where there is no such step.
+    Entries of `out` with other names stay, but for files that match a pattern of `drop`, as in
+    `fnmatch`, and folders that match one with a slash at its end: they go in the same step, or
+    after the new entries where there is no such step.
     Raises OutputExistsError where `out` is a file, or appeared meanwhile, and FileBusyError while
     another process writes it.
     """
@@ -131,10 +132,16 @@ def _rename_new(part: Path, out: Path) -> None:
         ) from error
 
 
-def _replace_directory(part: Path, out: Path, folder: Path, drop: str) -> None:
+def _is_dropped(entry: Path, drop: Collection[str]) -> bool:
+    is_folder = entry.is_dir() and not entry.is_symlink()
+    name = f"{entry.name}/" if is_folder else entry.name
+    return any(fnmatch(name, pattern) for pattern in drop if pattern.endswith("/") == is_folder)
+
+
+def _replace_directory(part: Path, out: Path, folder: Path, drop: Collection[str]) -> None:
     replaced = [entry.name for entry in part.iterdir()]
     others = [entry for entry in out.iterdir() if entry.name not in replaced]
-    dropped = [entry for entry in others if fnmatch(entry.name, drop) and not entry.is_dir()]
+    dropped = [entry for entry in others if _is_dropped(entry, drop)]
     others = [entry for entry in others if entry not in dropped]
 
     fixed = Path.cwd().is_relative_to(out) or any(entry.is_mount() for entry in (out, *others))
@@ -147,7 +154,7 @@ def _replace_directory(part: Path, out: Path, folder: Path, drop: str) -> None:
             (out / name).rename(folder / f"old {name}")
         (part / name).replace(out / name)
     for entry in dropped:
-        entry.unlink()
+        entry.rename(folder / f"old {entry.name}")
 
 
 def _link_all(entries: list[Path], target: Path) -> bool:

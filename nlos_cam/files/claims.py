@@ -15,6 +15,8 @@ from nlos_cam.files.errors import FileBusyError
 CLAIM = ".{}.part"
 LOCK = "lock"
 HOLDER = "holder"
+REPLACED = "replaced"
+"""Folder of a claim for what the new file replaces until it stands: `replaced_folder`."""
 DISK_ERRORS = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EIO}
 """Errors of a disk that is full, beyond a quota or a limit, read-only or broken."""
 TRIES = 5
@@ -32,9 +34,9 @@ def claim(path: Path, *, inside: bool = False) -> Generator[Path]:
     unfinished parts.
 
     The folder is removed at the end. The system releases the claim of a process that dies;
-    leftovers of killed processes in the same folder go with the first claim in it. Raises
-    FileBusyError, with the holder, while another process has the claim; OSError where the folder
-    cannot be written to.
+    leftovers of killed processes in the same folder go with the first claim in it, but for what is
+    in `replaced_folder`: that is put back. Raises FileBusyError, with the holder, while another
+    process has the claim; OSError where the folder cannot be written to.
     """
     path = _resolve(path)
     folder = path / CLAIM.format("claim") if inside else path.with_name(CLAIM.format(path.name))
@@ -92,6 +94,16 @@ def _lock_new_folder(path: Path, folder: Path) -> FileLock:
     raise FileBusyError(
         f"{path} is being written by {_holder(folder)}: wait for it, or choose another name"
     )
+
+
+def replaced_folder(claimed: Path) -> Path:
+    """Return a new folder in a claim's folder, for the files that a new one replaces before it is
+    whole. If the process is killed meanwhile, the next claim puts them back, in place of the new
+    one. Raises OSError.
+    """
+    folder = claimed / REPLACED
+    folder.mkdir(exist_ok=True)
+    return folder
 
 
 def is_claimed(path: Path) -> bool:
@@ -160,7 +172,14 @@ def _holder(folder: Path) -> str:
         return "another process"
 
 
+def _put_back(folder: Path) -> None:
+    """Put back the files that a killed process had taken away."""
+    for kept in (folder / REPLACED).glob("*"):
+        kept.replace(folder.parent / kept.name)
+
+
 def _empty(folder: Path) -> None:
+    _put_back(folder)
     for entry in folder.iterdir():
         if entry.name in {LOCK, HOLDER}:
             continue
@@ -177,5 +196,7 @@ def _sweep(folder: Path) -> None:
     _swept.add(folder.absolute())
     for left in folder.glob(CLAIM.format("*")):
         if (left / LOCK).is_file() and (lock := _acquire(left)):
-            shutil.rmtree(left, ignore_errors=True)
+            with suppress(OSError):  # what cannot be put back now stays for a later claim
+                _put_back(left)
+                shutil.rmtree(left, ignore_errors=True)
             lock.release()

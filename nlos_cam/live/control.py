@@ -74,6 +74,8 @@ class RunControl:
         self.warnings: tuple[str, ...] = ()
         """Warnings about the run's pace."""
         self._run = RunContext(uri, folder, clock, wall=wall)
+        self.hurry = self._run.hurry
+        """Set it to end without reading a recording back."""
         self.pipeline = PipelineCommands(self._run)
         self.saving = SavingCommands(self._run)
         self.recording = RecordingCommands(self._run)
@@ -170,6 +172,7 @@ class RunControl:
             running: list[Callable[[], str]] = []
             if self.recording.recording:
                 self._message = "closing the recording and reading it back"
+                log.warning("%s: interrupt again to end without it", self._message)
                 running.append(self.recording.stop_recording)
             if self.saving.is_saving:
                 running.append(self.saving.end_session)

@@ -1,7 +1,9 @@
 """Recording that begins and ends while a live run goes on, with its sidecar."""
 
 from collections import Counter
+from functools import partial
 from pathlib import Path
+from threading import Event
 from typing import Protocol, runtime_checkable
 
 from nlos_calibration import Rig
@@ -90,8 +92,9 @@ class LiveRecording:
         """True if the camera closed the file, since no frame came."""
         return self._recording.done and not self._recording.disk_full
 
-    def stop(self) -> str:
-        """Close the file, read it back, write the sidecar's end, and return the outcome in words.
+    def stop(self, hurry: Event) -> str:
+        """Close the file, read it back until `hurry` is set, write the sidecar's end, and return the
+        outcome in words.
 
         Raises RecordingError for a damaged file, DiskFullError where there was no room.
         """
@@ -113,13 +116,31 @@ class LiveRecording:
             follows_another=True,
             events=Counter(self._counts) - self._counts_before,
         )
-        final = recordings.finalize(result, recordings.verify)
+        final = recordings.finalize(result, partial(_read_back, hurry))
         if final.error:
             raise final.error
         if not final.sets:
             return "nothing was recorded: no frame came"
         ends = {"disk full": "; the disk is full", "lost": "; it ended as the camera fell silent"}
+        verified = "verified" if final.verified else "not read back"
         return (
             f"recorded {final.sets} frames ({final.sets / FRAMES_PER_S:.1f} s) to {self.path};"
-            f" verified{ends.get(state, '')}"
+            f" {verified}{ends.get(state, '')}"
         )
+
+
+class _Hurried(Exception):  # noqa: N818  # no error: the user would not wait
+    """End of a reading that the user did not wait for."""
+
+
+def _read_back(hurry: Event, path: Path) -> recordings.VerifyResult | None:
+    """Return the contents of a closed recording; None once `hurry` is set."""
+
+    def go_on() -> None:
+        if hurry.is_set():
+            raise _Hurried
+
+    try:
+        return recordings.verify(path, on_frame=go_on)
+    except _Hurried:
+        return None

@@ -7,6 +7,7 @@ import time
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 from functools import partial
+from math import inf
 from threading import Event
 from typing import Self
 
@@ -30,6 +31,9 @@ from nlos_cam.view import Moment, Viewer
 
 ADVICE = "plug it straight into a USB 3 port; `nlos-cam doctor` says what is wrong"
 """Advice on the page while no frame comes, unless the camera has logged a warning of its own."""
+FALL_S = 0.2
+PAUSE_S = 10.0
+"""Steps of a recording's time, back and on, beyond which its clock was set between two frames."""
 
 
 class LiveDisplay:
@@ -104,12 +108,19 @@ class CameraNotes(logging.Handler):
 
 
 def pace(frames: Iterable[Frame], stop: Event, clock: Clock) -> Iterator[Frame]:
-    """Yield recorded frames at the intervals of their timestamps, or later."""
-    offset_s: float | None = None
+    """Yield recorded frames at the intervals of their timestamps, or later.
+
+    Where the recording's own clock is set, back by more than FALL_S or on by more than PAUSE_S, the
+    intervals count from that frame on.
+    """
+    offset_s = 0.0
+    before_s = inf
     for frame in frames:
-        if offset_s is None:
-            offset_s = clock() - frame.timestamp_s
-        if stop.wait(max(0.0, frame.timestamp_s + offset_s - clock())):
+        time_s = frame.timestamp_s
+        if not before_s - FALL_S <= time_s <= before_s + PAUSE_S:
+            offset_s = clock() - time_s
+        before_s = time_s
+        if stop.wait(max(0.0, time_s + offset_s - clock())):
             return
         yield frame
 

@@ -8,6 +8,7 @@ from contextlib import ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
 from queue import Empty, Queue
+from threading import Event
 from typing import Any, Protocol, runtime_checkable
 
 from nlos_calibration import MeasuredWall, Rig, WallRecord
@@ -75,6 +76,8 @@ class RunContext:
     wall: tuple[Rig, WallFile] | None = None
     """Rig and record of the measured wall, for sidecars of recordings."""
     files: WrittenFiles = field(default_factory=WrittenFiles)
+    hurry: Event = field(default_factory=Event)
+    """Set once recordings are no longer to be read back."""
     on_frame: list[OnFrame] = field(default_factory=list[OnFrame])
     """Called with each frame of the camera, in the reader's thread."""
 
@@ -239,7 +242,7 @@ class RecordingCommands:
             raise NlosCamError("nothing is being recorded")
         self.recording = None
         self._run.on_frame.remove(recording.add)
-        outcome = recording.stop()
+        outcome = recording.stop(self._run.hurry)
         if not recording.path.exists():  # no frame came
             return outcome
         return f"{outcome}, {self._run.files.note(recording.path)}"

@@ -242,14 +242,14 @@ def export_recording(
 ) -> ExportResult:
     """Write the selected frames of a recording into the directory `out`.
 
-    Setting `stop` ends it early and keeps the frames so far, and so does damage within the
-    recording. Raises RecordingError for streams that the recording does not have, and where there
-    is no frame to write.
+    What an earlier export wrote there goes. Setting `stop` ends it early and keeps the frames so
+    far, and so does damage within the recording. Raises RecordingError for streams that the
+    recording does not have, and where there is no frame to write.
     """
     streams = _streams(bag, options)
     written: Counter[str] = Counter(dict.fromkeys(streams, 0))
     damage = ""
-    with atomic_directory(out) as part:
+    with atomic_directory(out, drop=_written_before(out)) as part:
         (part / INFO).write_text(json.dumps(_info(bag, options), indent=1) + "\n", encoding="utf-8")
         with ExitStack() as closing:
             sinks = {stream: _sink(bag, stream, part, options.format) for stream in streams}
@@ -281,6 +281,17 @@ def export_recording(
     if points:
         written[POINTS] = points.written
     return ExportResult(dict(written), str(out), damage)
+
+
+def _written_before(out: Path) -> list[str]:
+    """Return the names that an earlier export gave in a folder: its frames are of another recording
+    or choice.
+    """
+    earlier = _read_json(out / INFO)
+    streams = earlier.get("streams") if isinstance(earlier, dict) else None
+    if not isinstance(streams, dict):
+        return []
+    return [f"{POINTS}/", *(f"{name}{end}" for name in streams for end in ("/", ".csv", ".npz"))]
 
 
 class _Instants:

@@ -106,9 +106,11 @@ def export_ros2(
         raise RecordingError(f"{bag.path} has no stream that can be written: it has {encodings}")
     written: Counter[str] = Counter(dict.fromkeys(streams, 0))
     damage = ""
-    with atomic_directory(out) as part:
+    name = out.resolve().name
+    # an earlier export's in the other storage would be read with this one's metadata
+    with atomic_directory(out, drop=(f"{name}.db3", f"{name}.mcap")) as part:
         # rosbags names its files by the folder, which it has to make itself.
-        folder = part / out.resolve().name
+        folder = part / name
         plugin = StoragePlugin.MCAP if options.storage == "mcap" else StoragePlugin.SQLITE3
         try:
             with Writer(folder, version=8, storage_plugin=plugin) as writer:

@@ -1,5 +1,6 @@
 """Media of a replay: contact sheet of some frames, saved view, still pictures, video."""
 
+import logging
 import re
 from collections.abc import Generator, Mapping, Sequence
 from contextlib import contextmanager, suppress
@@ -16,6 +17,8 @@ from nlos_cam.reconstruct import CalibratedRig, FrameResult
 from nlos_cam.recording import FRAME_STEM, FrameNames
 from nlos_cam.replay.object_files import OBJECT_FILE, ObjectFiles
 from nlos_cam.report import figure_of
+
+log = logging.getLogger(__name__)
 
 VIEW = "view.html"
 VIDEO = "replay.webm"
@@ -86,10 +89,10 @@ class ReplayMedia:
     def into(self, folder: Path) -> Generator[None]:
         """Write the media into a folder; after an error there are no stills."""
         rig = self._bench.rig
+        session = None
         if self._view:
-            self._viewers.append(
-                views.SessionFile(folder / VIEW, rig, self._bench.measured, keeps_all=True)
-            )
+            session = views.SessionFile(folder / VIEW, rig, self._bench.measured, keeps_all=True)
+            self._viewers.append(session)
         if self.video:
             self._viewers.append(views.VideoFile(folder / VIDEO))
         if self._formats:
@@ -98,6 +101,8 @@ class ReplayMedia:
             )
         with views.Viewers(self._viewers):
             yield
+        if session and session.problem:
+            log.warning("%s", session.problem)
         if self._stills:
             moments = [views.Moment.recorded(result) for result in self._stills.results()]
             names = FrameNames()

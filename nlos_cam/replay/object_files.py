@@ -21,6 +21,11 @@ OBJECT_FORMATS = ("ply", "glb", "obj", "csv", "npz", "points")
 """Suffixes of `SurfaceMesh.save`, and "points" for a .ply without faces."""
 OBJECT_FILE = re.compile(rf"{FRAME_STEM}(-points\.ply|\.(ply|glb|obj|csv|npz))")
 """Names that ObjectFiles gives."""
+OBJECT_PATTERNS = tuple(
+    f"[0-9][0-9][0-9][0-9][0-9][0-9]*{suffix}"
+    for suffix in ("-points.ply", ".ply", ".glb", ".obj", ".csv", ".npz")
+)
+"""The same names, as patterns of `fnmatch`."""
 
 
 @dataclass
@@ -77,7 +82,7 @@ def export_objects(
     """
     arrays, box = _read(result)
     numbers = arrays["frame_number"]
-    with atomic_directory(out) as part:
+    with atomic_directory(out, drop=OBJECT_PATTERNS) as part:
         files = ObjectFiles(part, box, formats, every)
         for k, number in enumerate(numbers):
             if stop.is_set():

@@ -123,9 +123,10 @@ class Playback(PlaybackViewer):
                 f"no command {command!r} with {dict(arguments)!r}: this view exports a frame by"
                 " number"
             )
+        if not self._exporting.acquire(blocking=False):
+            raise NlosCamError("another frame is being exported: wait for its answer")
         try:
-            with self._exporting:
-                return self._export(number, time_s)
+            return self._export(number, time_s)
         except NlosCamError:
             raise
         except OSError as error:
@@ -134,6 +135,8 @@ class Playback(PlaybackViewer):
                 f"{place}: {error.strerror or error}: check that it is still there and that its"
                 " folder has room and can be written"
             ) from error
+        finally:
+            self._exporting.release()
 
     def _export(self, number: int, time_s: float | None) -> str:
         """Reconstruct one frame again, since the page's copy is rounded, and write its files with the
@@ -151,11 +154,13 @@ class Playback(PlaybackViewer):
 
     def _frames_up_to(self, number: int, time_s: float | None) -> list[Frame]:
         """Return a frame, the last, and those before it. Raises NlosCamError where it is not
-        there.
+        there, and once the view closes: reading on to it may take long.
         """
         frames = deque[Frame](maxlen=FRAMES_BEFORE + 1)
         with open_camera(self._camera.uri) as camera:
             for frame in camera:
+                if self.closed:
+                    raise NlosCamError("the view ends: nothing was exported")
                 frames.append(frame)
                 if self._is_at(frame, number, time_s):
                     return [*frames]

@@ -13,7 +13,7 @@ from typing import NamedTuple, Self
 
 from nlos_calibration import MeasuredWall, Rig
 
-from nlos_cam.errors import RecordingError
+from nlos_cam.errors import DiskFullError, RecordingError
 from nlos_cam.threads import LatestValue
 from nlos_cam.view.messages import MomentPacker, bench_message, pack
 from nlos_cam.view.server import LOOPBACK, POLICY, SANDBOX, Assets, Send, Served, ViewServer
@@ -228,6 +228,11 @@ class PlaybackViewer(Website):
         super().__exit__()
         self._file.close()
 
+    @property
+    def closed(self) -> bool:
+        """True once the view is being left, in any thread."""
+        return self._closed
+
     def show(self, moment: Moment) -> None:
         self._keep(self._chunks.add(moment))
 
@@ -238,8 +243,14 @@ class PlaybackViewer(Website):
     def _keep(self, chunk: bytes | None) -> None:
         if chunk is not None:
             with self._changed:
-                self._file.seek(self._ends[-1])
-                self._file.write(chunk)
+                try:
+                    self._file.seek(self._ends[-1])
+                    self._file.write(chunk)
+                except OSError as error:
+                    raise DiskFullError(
+                        f"{tempfile.gettempdir()} takes no more of the view ({error.strerror}):"
+                        " free some space there, or name another folder in TMPDIR"
+                    ) from error
                 self._ends.append(self._ends[-1] + len(chunk))
                 self._changed.notify_all()
 
@@ -295,12 +306,14 @@ class RecordedView(Website):
     def __init__(self, path: Path, *, host: str = LOOPBACK, port: int | None = None) -> None:
         super().__init__(host=host, port=port)
         try:
-            content = path.read_bytes()
+            with path.open("rb") as file:  # of any size: the mark first
+                start = file.read(1000)
+                content = start + file.read() if SESSION_MARK in start else b""
         except OSError as error:
             raise RecordingError(
                 f"{path} cannot be read ({error.strerror}): name a saved session (.html)"
             ) from error
-        if SESSION_MARK not in content[:1000]:
+        if not content:
             raise RecordingError(
                 f"{path} is no saved session: make one with `live --save-view` or `replay"
                 " --save-view`"

@@ -76,6 +76,13 @@ def test_bag_of_ros_2_gives_the_same_reconstructions(bags: SimpleNamespace, run:
         assert all(whole[name].tobytes() == other[name].tobytes() for name in whole.files)
 
 
+def test_export_to_ros_replaces_one_in_the_other_storage(run: Run) -> None:
+    run("export", SAMPLE, "--ros2", "ros")
+    run("export", SAMPLE, "--ros2", "ros", "--storage", "mcap", "--overwrite")
+
+    assert sorted(path.name for path in Path("ros").iterdir()) == ["metadata.yaml", "ros.mcap"]
+
+
 def test_millimetres_are_rounded(run: Run) -> None:
     run("export", SAMPLE, "--ros2", "mm")
     with ReplayCamera(SAMPLE) as exact, ReplayCamera(Path("mm")) as rounded:

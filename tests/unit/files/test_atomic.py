@@ -117,6 +117,8 @@ def test_atomic_directory_replaces_entries_by_name(
     for folder in ("inner", "kept/deep"):
         (out / folder).mkdir(parents=True)
         (out / folder / "old.txt").write_text("old")
+    (out / "past").mkdir()
+    (out / "past" / "gone.txt").write_text("old")
     (out / "mine.txt").write_text("mine")
     (out / "stale-1.txt").write_text("old")
     (out / "stale-2.txt").write_text("old")
@@ -126,7 +128,7 @@ def test_atomic_directory_replaces_entries_by_name(
         monkeypatch.setattr("nlos_cam.files.atomic._link_all", lambda *_: False)
     if way == "current folder":
         monkeypatch.chdir(out)
-    with atomic_directory(out, drop="stale-*.txt") as part:
+    with atomic_directory(out, drop=["stale-*.txt", "past*/"]) as part:
         (part / "inner").mkdir()
         (part / "inner" / "new.txt").write_text("new")
         (part / "stale-2.txt").write_text("new")

@@ -110,6 +110,34 @@ def test_next_claim_removes_parts_of_the_killed_alone(
     assert [path.name for path in tmp_path.iterdir()] == [".mine.part"]
 
 
+def replace_and_hang(path: Path, ready: Any) -> None:
+    with claim(path) as folder:
+        path.replace(files.replaced_folder(folder) / path.name)
+        path.write_text("begun", encoding="utf-8")
+        ready.set()
+        threading.Event().wait(60)
+
+
+@pytest.mark.parametrize("next_name", ["a", "b"])
+def test_next_claim_puts_back_what_the_killed_had_taken_away(
+    tmp_path: Path, next_name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "a").write_text("old", encoding="utf-8")
+    ready = FORK.Event()
+    process = FORK.Process(target=replace_and_hang, args=(tmp_path / "a", ready))
+    process.start()
+
+    assert ready.wait(20)
+
+    os.kill(process.pid or 0, signal.SIGKILL)
+    process.join()
+    monkeypatch.setattr("nlos_cam.files.claims._swept", set())
+    with claim(tmp_path / next_name):
+        assert (tmp_path / "a").read_text(encoding="utf-8") == "old"
+
+    assert [path.name for path in tmp_path.iterdir()] == ["a"]
+
+
 def race(path: Path, start: Any, results: Any, number: int) -> None:
     start.wait()
     try:

@@ -544,9 +544,26 @@ def test_recording_that_the_camera_ended_is_called_lost(
     assert "duplicate" not in sidecar.summary.events
 
 
+def test_recording_is_not_read_back_in_a_hurry(
+    tmp_path: Path, noise_world: Any, hurried_clock: Any
+) -> None:
+    control = RunControl(folder=tmp_path)
+    with SimulatedCamera("sim:noise", noise_world(), clock=hurried_clock()) as camera:
+        control.attach(camera, Pipeline(CalibratedRig(RIG), sheet_network))
+        frames = control.watch(camera)
+        control.run("record", {})
+        for _ in range(10):
+            next(frames)
+        control.hurry.set()
+        answer = control.run("stop_recording", {})
+
+    assert "not read back" in answer
+    assert load_sidecar(next(tmp_path.glob("*.json"))).state == "interrupted"
+
+
 def test_recording_without_a_frame_is_in_no_folder(control: RunControl, tmp_path: Path) -> None:
     nothing = SimpleNamespace(
-        path=tmp_path / "live.bag", problem="", add=Mock(), stop=lambda: "nothing was recorded"
+        path=tmp_path / "live.bag", problem="", add=Mock(), stop=lambda _: "nothing was recorded"
     )
     control.recording.recording = nothing  # type: ignore[assignment]
     control._run.on_frame.append(nothing.add)

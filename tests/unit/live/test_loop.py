@@ -54,6 +54,21 @@ def test_pace_yields_frames_at_their_timestamps() -> None:
     assert list(pace([small_frame(0)], stop, lambda: 0.0)) == []
 
 
+@pytest.mark.parametrize("other", [1, 100_000])
+def test_pace_goes_on_where_the_recordings_clock_is_set(other: int) -> None:
+    now_s = [0.0]
+
+    class Waits(Event):
+        def wait(self, timeout: float | None = None) -> bool:
+            now_s[0] += timeout or 0.0
+            return False
+
+    numbers = (1000, 1001, other, other + 1, other + 2)
+    passed_s = [now_s[0] for _ in pace(map(small_frame, numbers), Waits(), lambda: now_s[0])]
+
+    assert passed_s == pytest.approx([0, PERIOD_S, PERIOD_S, 2 * PERIOD_S, 3 * PERIOD_S])
+
+
 class Lockstep(ListViewer):
     """Viewer, camera and clock in one step: a frame arrives 5 ms after its timestamp, once the last
     was shown.

@@ -103,6 +103,23 @@ def test_export_writes_only_chosen_streams_and_frames(noise_bag: Path, tmp_path:
     ]
 
 
+def test_export_replaces_an_earlier_one_and_keeps_other_files(
+    noise_bag: Path, tmp_path: Path
+) -> None:
+    out = tmp_path / "out"
+    exported(noise_bag, out)
+    (out / "notes.txt").write_text("mine")
+    (out / "mine").mkdir()
+    exported(noise_bag, out, streams=["infrared"], format="npz")
+
+    assert sorted(path.name for path in out.iterdir()) == [
+        "export.json",
+        "infrared.npz",
+        "mine",
+        "notes.txt",
+    ]
+
+
 def test_export_that_is_stopped_keeps_written_frames(noise_bag: Path, tmp_path: Path) -> None:
     stop = Event()
     seen = []

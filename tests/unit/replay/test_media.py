@@ -166,6 +166,15 @@ def test_media_of_a_failed_replay_have_no_stills(tmp_path: Path) -> None:
     assert {file.name for file in tmp_path.iterdir()} == {VIEW}
 
 
+def test_replay_says_that_its_saved_view_is_full(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr("nlos_cam.view.session_file.MAX_BYTES", 1)
+    replay_moments(tmp_path / "out", 60, view=True)
+
+    assert "view.html is full" in caplog.text
+
+
 def test_recorded_moment_is_at_its_own_time() -> None:
     stages_s = {"wait": 9.0, "maps": 0.001, "network": 0.01}
     result = replace(FULL.result, published_s=77.0, stages_s=stages_s)

@@ -46,6 +46,15 @@ def test_export_of_a_result_equals_the_files_of_its_replay(replay: Path, tmp_pat
     np.testing.assert_allclose(vertices_m(out), vertices_m(replay / "object"), atol=1e-9)
 
 
+def test_export_replaces_the_files_of_an_earlier_one(replay: Path, tmp_path: Path) -> None:
+    out = tmp_path / "exported"
+    export_objects(replay / RESULT, out, OBJECT_FORMATS, stop=Event())
+    (out / "notes.csv").write_text("mine")
+    export_objects(replay / RESULT, out, ["ply"], 3, stop=Event())
+
+    assert names_in(out) == ["000000.ply", "000003.ply", "000006.ply", "notes.csv"]
+
+
 def test_export_stops_when_asked(replay: Path, tmp_path: Path) -> None:
     stop = Event()
     stop.set()

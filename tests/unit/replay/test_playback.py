@@ -112,6 +112,20 @@ def test_export_of_no_frame_is_refused(
     assert list(tmp_path.iterdir()) == []
 
 
+def test_second_export_at_a_time_is_refused(playback: Playback) -> None:
+    with playback._exporting, pytest.raises(NlosCamError, match="another frame is being exported"):
+        playback.run("export", {"frame": 61})
+
+
+def test_export_ends_with_the_view(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("nlos_cam.replay.playback.open_camera", lambda _: recording())
+    networks = SheetNetwork(), None
+    with Playback(recording(), BENCH, networks, folder=tmp_path, host=HERE) as playback:
+        pass
+    with pytest.raises(NlosCamError, match="the view ends"):
+        playback.run("export", {"frame": 61})
+
+
 def test_export_into_a_lost_folder_says_why(playback: Playback, tmp_path: Path) -> None:
     tmp_path.rmdir()
     with pytest.raises(NlosCamError, match=re.escape(str(tmp_path))):

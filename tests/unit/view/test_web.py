@@ -1,4 +1,6 @@
 import base64
+import errno
+import io
 import json
 import threading
 from collections.abc import Iterator
@@ -19,7 +21,7 @@ from made_up_moments import NO_MAPS, NOTHING, RIG, bump, full_moment, moment, wi
 from measured_walls import exact_wall
 from view_streams import ask, messages, messages_of, saved_moments
 
-from nlos_cam.errors import RecordingError
+from nlos_cam.errors import DiskFullError, RecordingError
 from nlos_cam.frames import LidarMaps
 from nlos_cam.objects import object_box
 from nlos_cam.reconstruct.network import Quality, Uncertainty
@@ -196,6 +198,19 @@ def test_session_is_served_in_an_origin_of_its_own(saved: Path) -> None:
     assert "allow-same-origin" not in policy
     assert "sandbox" not in live_policy
     assert len(messages_of(page)) == len(messages_of(saved.read_bytes()))
+
+
+def test_view_of_a_recording_names_the_full_folder(monkeypatch: pytest.MonkeyPatch) -> None:
+    class FullDisk(io.BytesIO):
+        def write(self, _: object) -> int:
+            raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr("tempfile.TemporaryFile", FullDisk)
+    monkeypatch.setattr("tempfile.gettempdir", lambda: "/elsewhere")
+    with PlaybackViewer(RIG) as viewer:
+        viewer.show(full_moment(1))
+        with pytest.raises(DiskFullError, match=r"/elsewhere .*TMPDIR"):
+            viewer.finish()
 
 
 @pytest.mark.parametrize(
