@@ -20,6 +20,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from nlos_calibration.errors import CalibrationError
 from nlos_models.errors import ModelError
+from PIL import Image
 
 from nlos_cam.cli.common import tracked
 from nlos_cam.cli.main import main as nlos_cam
@@ -33,6 +34,7 @@ from program_state import program_digest  # noqa: E402  a study's own folder is 
 
 DOCS = ROOT / "docs"
 DIGITS = 5
+COLORS = 64
 STUDIES = "tools/studies"
 CLAIM = "results-of.json"
 """File that says what the results in a folder are of."""
@@ -168,10 +170,15 @@ def rounded(facts: Any) -> Any:
 
 
 def save(name: str, figure: Figure, folder: Path | None = None, dpi: int = 100) -> None:
-    """Write docs/images/NAME.png, or the same in another folder."""
+    """Write docs/images/NAME.png, or the same in another folder, with a palette: a third of the
+    bytes.
+    """
     path = (folder or DOCS) / "images" / f"{name}.png"
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=dpi)
+    with Image.open(path) as picture:
+        small = picture.convert("RGB").quantize(COLORS, dither=Image.Dither.NONE)
+    small.save(path, optimize=True)
 
 
 def named(text: str) -> tuple[str, Path]:

@@ -32,7 +32,6 @@ from nlos_calibration import (
 )
 from nlos_calibration.arrays import Float64
 from numpy.typing import NDArray
-from PIL import Image
 
 from nlos_cam.objects import orthographic_depth, triangulate
 from nlos_cam.render import (
@@ -299,7 +298,7 @@ def arrivals(data: Path) -> dict[str, Any]:
         axes.set_xlabel("position in the scan", fontsize=7)
         axes.tick_params(labelsize=7)
     figure.axes[0].set_ylabel("measured - rendered\n(bins of 16 ps)", fontsize=7)
-    save("reality_arrivals", figure)
+    harness.save("reality_arrivals", figure)
     return {"rows": rows, "bin_mm_one_way": 1e3 * LIGHT_M_PER_S * 16e-12 / 2}
 
 
@@ -492,7 +491,7 @@ def ratios(data: Path) -> dict[str, Any]:
     axes.set_xlabel("third bounce over direct, peak over peak")
     axes.set_ylabel("share of 324 histograms")
     axes.legend(fontsize=7)
-    save("reality_ratio", figure)
+    harness.save("reality_ratio", figure)
     return result
 
 
@@ -558,17 +557,8 @@ def pictures(data: Path) -> dict[str, Any]:
         axes.imshow(front.T, origin="lower", cmap="gray", extent=(0.1, 1.2, 0.1, 1.1))
         axes.set_title(name, fontsize=8)
         axes.tick_params(labelsize=7)
-    save("reality_u", figure)
+    harness.save("reality_u", figure)
     return result
-
-
-def save(name: str, figure: Figure) -> None:
-    """Write docs/images/NAME.png with a palette of 32 colors."""
-    harness.save(name, figure)
-    path = harness.DOCS / "images" / f"{name}.png"
-    with Image.open(path) as picture:
-        small = picture.convert("RGB").quantize(32)
-    small.save(path, optimize=True)
 
 
 PARTS: dict[str, Callable[[Path], dict[str, Any]]] = {

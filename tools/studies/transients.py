@@ -23,7 +23,6 @@ import trimesh
 from matplotlib.figure import Figure
 from nlos_calibration import rig_named
 from nlos_calibration.arrays import Float32
-from PIL import Image
 
 from nlos_cam import render as renderer
 from nlos_cam.evaluate import machine
@@ -34,7 +33,6 @@ OBJECTS = "cup", "airplane", "table"
 RIG = rig_named("paper-rig")
 BOX = object_box(RIG)
 TOOLS = Path(__file__).parent
-COLORS = 32
 SAMPLES = 128, 256, 512, 1024, 2048
 """Of each point by mitransient."""
 CONVERGED = 16384
@@ -171,13 +169,6 @@ def distance(histograms: Float32, truth: Float32) -> float:
     return float(np.abs(of_sum_one(histograms) - truth).sum(0).mean())
 
 
-def save(figure: Figure) -> None:
-    """Write the picture with a palette, as the docs keep theirs small."""
-    harness.save("transients", figure, dpi=70)
-    path = harness.DOCS / "images/transients.png"
-    Image.open(path).convert("RGB").quantize(COLORS).save(path, optimize=True)
-
-
 def main() -> None:
     """Render, let tal look, and write figures and picture."""
     parser = harness.options(__doc__)
@@ -186,7 +177,7 @@ def main() -> None:
     options = parser.parse_args()
     with TemporaryDirectory() as folder:
         found, figure = captures(options.tal_python, Path(folder))
-    save(figure)
+    harness.save("transients", figure, dpi=70)
     facts = {"machine": machine(), "load_average_1_min": os.getloadavg()[0], "objects": found}
     path = harness.DOCS / "figures" / "transients.json"
     old = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
