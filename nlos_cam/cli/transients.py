@@ -201,6 +201,7 @@ def write_transient(
     """Render a transient, write it and print what it holds. Raises SceneError where no light
     returns.
     """
+    save = transients.save_transient  # needs an extra, which is missed before the long work
     start_s = time.perf_counter()
     with tracked("rendering the transient", at_once=False) as on_progress:
         found = transients.render_transient(scene, capture, accuracy, backend, on_progress)
@@ -211,7 +212,7 @@ def write_transient(
             "no light returns within the bins: move the object into the box, or widen --bins,"
             " --start-m and --wall-extent"
         )
-    transients.save_transient(path, found)
+    save(path, found)
     shape = " x ".join(map(str, found.histograms.shape))
     facts = {"capture": found.kind, "layout": found.layout.name, "shape": found.histograms.shape}
     window = {"start_m": found.start_m, "bin_m": found.bin_m, "energy": float(found.curve.sum())}

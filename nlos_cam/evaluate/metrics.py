@@ -3,7 +3,7 @@
 And the error against size and detail of the surface, and by zone of the image (SI 6).
 """
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any, NamedTuple
 
@@ -18,6 +18,7 @@ PerObject = dict[str, Float64]
 """Values of every object (n,) by the metric's name."""
 
 RESAMPLES = 2000
+BLOCK = 2_000_000
 TARGETS = {
     "silhouette_iou": 0.90,
     "accuracy_mean_abs": 0.98,
@@ -123,16 +124,20 @@ def interval(values: Float64) -> Interval:
         return Interval(None, None, None)
     if values.size == 1:  # every resample is that value, and would make it look certain
         return Interval(float(values[0]), None, None)
-    means = values[resampled(len(values))].mean(1)
+    means = np.concatenate([values[part].mean(1) for part in resampled(len(values))])
     low, high = np.quantile(means, [0.025, 0.975])
     return Interval(float(values.mean()), float(low), float(high))
 
 
-def resampled(count: int) -> NDArray[np.int64]:
-    """Return the object indices (RESAMPLES, count) of each bootstrap resample, from a fixed
-    seed.
+def resampled(count: int) -> Iterator[NDArray[np.int64]]:
+    """Yield the object indices (k, count) of bootstrap resamples, RESAMPLES in all, from a fixed
+    seed. A block of them holds at most about BLOCK indices, so that memory does not grow with the
+    set.
     """
-    return np.random.default_rng(0).integers(0, count, (RESAMPLES, count))
+    random = np.random.default_rng(0)
+    rows = max(BLOCK // count, 1)
+    for start in range(0, RESAMPLES, rows):
+        yield random.integers(0, count, (min(rows, RESAMPLES - start), count))
 
 
 def meets(name: str, figure: Interval) -> bool:
@@ -298,7 +303,8 @@ def rank_correlation(measure: Float64, error: Float64) -> Interval:
     ranks = _ranked_pairs(measure, error)
     if ranks is None:
         return Interval(None, None, None)
-    low, high = np.nanquantile(_correlation(ranks[:, resampled(ranks.shape[1])]), [0.025, 0.975])
+    found = [_correlation(ranks[:, part]) for part in resampled(ranks.shape[1])]
+    low, high = np.nanquantile(np.concatenate(found), [0.025, 0.975])
     return Interval(float(_correlation(ranks[:, None])[0]), float(low), float(high))
 
 

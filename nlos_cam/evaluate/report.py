@@ -339,8 +339,10 @@ def _by_shown(
 
 
 def write_report(folder: Path, evaluation: Evaluation, figures: Mapping[str, Any]) -> None:
-    """Write the report's folder; an earlier one is replaced once all files are written."""
-    with atomic_directory(folder) as part:
+    """Write the report's folder; an earlier one is replaced once all files are written, with its
+    pictures that this one lacks.
+    """
+    with atomic_directory(folder, drop=[UNSEEN_SHEET, QUALITY]) as part:
         (part / "figures.json").write_text(json.dumps(figures, indent=2) + "\n", encoding="utf-8")
         _write_objects(part / "objects.csv", evaluation)
         _draw(part, evaluation)

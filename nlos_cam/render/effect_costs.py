@@ -35,9 +35,12 @@ def costs(
     clock: Callable[[], float] = time.perf_counter,
 ) -> dict[str, float]:
     """Return the seconds that each included effect adds to a rendering, by name; 0 for effects left
-    out, and for the only one that brings light, without which nothing can be rendered.
+    out, for the only one that brings light, without which nothing can be rendered, and for all of a
+    plan without light.
     """
     names = [effect.name for effect in plan if effect.included]
+    if not brings_light(names):
+        return dict.fromkeys((effect.name for effect in plan), 0.0)
 
     # An effect's own cost is what a rendering saves without it. Effects share work, so the costs do
     # not add up to the whole; noise may make one negative.

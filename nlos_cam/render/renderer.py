@@ -71,7 +71,9 @@ class Rendering:
     d^2.
     """
     color: Float32 | None = None
-    """(64, 80, 3); intensity in each channel of the albedo, if it has three."""
+    """(64, 80, 3); intensity in each channel of the albedo; None unless it has three and the object
+    returns light.
+    """
 
 
 def render(
@@ -198,7 +200,9 @@ def beam_histograms(
     wanted = chosen[lit[chosen]]
     if job is None or not wanted.size:
         return np.zeros((len(chosen), job.bins if job else 1), np.float32)
-    some = job if len(wanted) == len(job.laser_spot_m) else job.select((np.cumsum(lit) - 1)[wanted])
+    places = (np.cumsum(lit) - 1)[wanted]
+    is_whole = np.array_equal(places, np.arange(len(job.laser_spot_m)))
+    some = job if is_whole else job.select(places)
     return _spread_over(lit[chosen], transport(some, backend))
 
 

@@ -133,6 +133,12 @@ class WallPaths:
         cell_m = cells.points_m.reshape(-1, 3)
         return cls(job, _in_sight(scene, job, laser_m), _in_sight(scene, job, cell_m))
 
+    @property
+    def table_bytes(self) -> int:
+        """Memory of the tables of lengths and of light between patches, laser points and cells."""
+        patches = 0 if self.job is None else len(self.job.patches.point_m)
+        return 2 * 8 * patches * (len(self.lit) + len(self.seen))
+
     @cached_property
     def _lengths_m(self) -> tuple[Float64, Float64]:
         """d2 (laser points, patches) and d3 (cells, patches)."""

@@ -19,6 +19,8 @@ CAPTURES: tuple[CaptureKind, ...] = get_args(CaptureKind)
 DEFAULT_CELLS = {"lidar": 32, "confocal": 32, "single": 32, "exhaustive": 8}
 MAX_BYTES = 1 << 30
 """Largest histograms, as readers of this package take them."""
+MAX_TABLES = 4 << 30
+"""Largest tables of the paths between wall and object."""
 MAX_POINTS = 128
 """Cells along a side of the wall grid."""
 SPARE_BINS = 2
@@ -134,6 +136,12 @@ def render_transient(
     )
     bin_m = capture.bin_m or scene.rig.device.bin_m
     paths = WallPaths.of(scene, laser_m.reshape(-1, 3), cells, bin_m, setting)
+    if paths.table_bytes > MAX_TABLES:
+        raise SceneError(
+            f"the paths from the object to {side} x {side} cells need"
+            f" {paths.table_bytes / 2**30:.1f} GiB, at most {MAX_TABLES >> 30}: take fewer cells, or"
+            " a coarser accuracy"
+        )
     first = floor(capture.start_m / bin_m + 1e-9)
     _, longest_m = paths.range_m(first_and_last=capture.first_and_last)
     tail = _pulse_tail(scene.pulse_ns, bin_m)

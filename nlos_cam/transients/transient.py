@@ -69,8 +69,9 @@ class Transient:
     @property
     def paired(self) -> bool:
         """True if each detector's point has a laser point of its own, as in confocal captures."""
+        # A list of points may stand for a grid, so that only their numbers are compared.
         one_axis = self.layout in {Layout.T_Sx_Sy, Layout.T_Si}
-        return one_axis and self.laser_grid_m.shape == self.detector_grid_m.shape
+        return one_axis and self.laser_grid_m.size == self.detector_grid_m.size
 
     @property
     def kind(self) -> str:

@@ -54,6 +54,19 @@ def _found(depth: np.ndarray, accuracy: Accuracy) -> np.ndarray:
     )
 
 
+def test_chosen_beams_come_in_the_order_asked_for() -> None:
+    scene = Scene(RIG, _hill(16))
+    count = len(prepare(scene, STOPS["draft"]).beams.on_wall)
+    whole = three_bounce(scene, "reference", chosen=np.arange(count)[:40])
+    chosen = np.array([7, 3, 3, 39])
+
+    assert np.array_equal(three_bounce(scene, "reference", chosen=chosen), whole[chosen])
+    everything = three_bounce(scene, "draft")
+    backwards = three_bounce(scene, "draft", chosen=np.arange(count)[::-1])
+
+    np.testing.assert_allclose(backwards[::-1], everything, rtol=1e-4, atol=1e-9)
+
+
 def _relay(cells: int) -> np.ndarray:
     return _found(
         _hill(32),

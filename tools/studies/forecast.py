@@ -12,7 +12,8 @@ estimate's IoU to the network's, and leaves each rig out in turn; put the line's
 scatter into nlos_cam/forecast/curve.py. The figures are those of docs/figures/figures.json, of the
 trials below (the wide rig's weights had 0.834 when the line was fitted), those of the map of rigs
 (docs/figures/rig_map.json: maps aligned with the training rig), and of files with rows of
-{"name", "rig" (a file), "silhouette_iou", "foreground_rmse_mm"}, as `adapt` measures a bench.
+{"name", "rig" (a file), "silhouette_iou", "foreground_rmse_mm"}, as `adapt` measures a bench. The
+five benches of docs/figures/benches.json, forecast before they were adapted, are not in the fit.
 """
 
 import argparse
@@ -117,6 +118,22 @@ def measured_on_the_map(home: Rig) -> Iterator[Measured]:
         )
 
 
+def after_an_hour() -> list[dict[str, Any]]:
+    """Return what was forecast for the five benches before they were adapted, and what they have
+    after an hour. Pictures of objects that change no cell count 0 there.
+    """
+    found = json.loads((harness.DOCS / "figures" / "benches.json").read_text(encoding="utf-8"))
+    return [
+        {
+            "name": bench["name"],
+            "expected_iou": bench["expected_iou"],
+            "hidden_share": bench["hidden_share"],
+            "network_iou": bench["minutes"]["60"]["silhouette_iou"]["value"],
+        }
+        for bench in found["benches"]
+    ]
+
+
 def measured_in(path: Path) -> Iterator[Measured]:
     """Yield the figures of a file."""
     for row in json.loads(path.read_text(encoding="utf-8")):
@@ -180,8 +197,13 @@ def fit(
     }
 
 
-def draw(rows: list[Measured], forecasts: list[Forecast], found: dict[str, Any]) -> Figure:
-    """Return a figure of network over linear IoU with the line."""
+def draw(
+    rows: list[Measured],
+    forecasts: list[Forecast],
+    found: dict[str, Any],
+    benches: list[dict[str, Any]],
+) -> Figure:
+    """Return a figure of network over linear IoU with the line, and of the benches."""
     figure = Figure(figsize=(6, 5), layout="constrained")
     axis = figure.subplots()
     for kind, marker in (("home", "*"), ("for the rig", "o"), ("aligned", "x")):
@@ -192,6 +214,9 @@ def draw(rows: list[Measured], forecasts: list[Forecast], found: dict[str, Any])
         ]
         if pairs:
             axis.scatter(*np.array(pairs).T, marker=marker, label=f"network: {kind}")
+    linear = [(each["expected_iou"] - found["offset"]) / found["slope"] for each in benches]
+    reached = [bench["network_iou"] for bench in benches]
+    axis.scatter(linear, reached, marker="s", label="five benches after an hour")
     ends = np.array([0.4, 0.85])
     axis.plot(ends, found["offset"] + found["slope"] * ends, "k-", lw=0.8, label="line")
     axis.set(xlabel="IoU of the linear estimate", ylabel="IoU of the network")
@@ -254,9 +279,10 @@ def main() -> None:
         }
         for row, found in zip(measured, forecasts, strict=True)
     ]
+    benches = after_an_hour()
     facts = {"machine": evaluate.machine(), "guess": guess, "fit": fitted, "rows": rows}
-    harness.write("forecast", facts)
-    harness.save("forecast", draw(measured, forecasts, fitted))
+    harness.write("forecast", facts | {"benches": benches})
+    harness.save("forecast", draw(measured, forecasts, fitted, benches))
     print(json.dumps(fitted, indent=2))
 
 

@@ -78,6 +78,18 @@ def test_interval_lies_about_the_mean_and_repeats() -> None:
     assert interval(values) == found
 
 
+@pytest.mark.parametrize("count", [7, 54])
+def test_resamples_do_not_depend_on_their_blocks(
+    count: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    whole = np.concatenate([*metrics.resampled(count)])
+    monkeypatch.setattr("nlos_cam.evaluate.metrics.BLOCK", 100)
+    parts = [*metrics.resampled(count)]
+
+    assert len(parts) > 1
+    assert np.array_equal(np.concatenate(parts), whole)
+
+
 @pytest.mark.parametrize(
     ("values", "expected"), [([np.nan] * 2, None), ([0.5], 0.5), ([np.nan, 2], 2)]
 )

@@ -263,6 +263,9 @@ def test_second_set_and_recognition_are_reported(
     text = _written(tmp_path / "out", with_second_set)
 
     assert {path.name for path in (tmp_path / "out").iterdir()} == {*FILES, "sheet-unseen.png"}
+    _written(tmp_path / "out", _judgement(3))
+
+    assert {path.name for path in (tmp_path / "out").iterdir()} == FILES
     assert "2 objects of kinds that training never sees" in text
     assert "recognised as their kind" in text
 

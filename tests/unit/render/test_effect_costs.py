@@ -1,5 +1,6 @@
 """Seconds that each effect of a rendering costs."""
 
+from dataclasses import replace
 from unittest.mock import Mock
 
 import numpy as np
@@ -35,6 +36,13 @@ def test_costs_are_the_seconds_that_each_effect_adds(monkeypatch: pytest.MonkeyP
     assert list(found) == [effect.name for effect in plan]
     assert list(found.values()) == pytest.approx(expected)
     assert sum(effect.included for effect in plan) >= 4
+
+
+def test_plan_without_light_costs_nothing() -> None:
+    scene = Scene(load_rig("paper-rig"))
+    plan = [replace(effect, included=False) for effect in render(scene, "draft").plan]
+
+    assert set(costs(scene, "draft", plan).values()) == {0.0}
 
 
 def test_only_light_of_an_empty_scene_costs_nothing() -> None:

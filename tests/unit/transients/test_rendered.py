@@ -204,6 +204,12 @@ def test_capture_out_of_range_is_refused(options: dict[str, object], word: str) 
         render_transient(MATT, Capture(**options), EXACT)  # pyright: ignore[reportArgumentType]
 
 
+def test_capture_of_too_many_paths_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("nlos_cam.transients.rendered.MAX_TABLES", 1 << 10)
+    with pytest.raises(SceneError, match="the paths from the object"):
+        render_transient(MATT, Capture("confocal", cells=8), EXACT)
+
+
 @pytest.mark.parametrize("photons", [0.0, -1.0, float("nan")])
 def test_noise_of_no_photons_is_refused(photons: float) -> None:
     with pytest.raises(SceneError, match="photons is"):

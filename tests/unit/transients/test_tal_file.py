@@ -168,6 +168,21 @@ def test_file_of_tal_without_places_or_normals_is_read(tmp_path: Path) -> None:
     assert main(["info", str(path), "--out", str(tmp_path / "look.png")]) == 0
 
 
+def test_list_of_laser_points_stands_for_the_detectors_grid(
+    saved: Path, tmp_path: Path, transients: dict[str, Transient]
+) -> None:
+    path = tmp_path / "list.hdf5"
+    path.write_bytes((saved / "confocal.hdf5").read_bytes())
+    points = transients["confocal"].laser_grid_m.reshape(-1, 3)
+    replaced("laser_grid_xyz", points)(path)
+    found = load_transient(path)
+
+    assert found.kind == "confocal"
+    assert np.allclose(
+        back_projection(found), back_projection(load_transient(saved / "confocal.hdf5"))
+    )
+
+
 def replaced(name: str, value: Any) -> Callable[[Path], None]:
     def harm(path: Path) -> None:
         with h5py.File(path, "r+") as file:
