@@ -108,10 +108,16 @@ def check_new(folder: Path) -> None:
     """
     if os.path.lexists(folder) and not folder.is_dir():
         raise OutputExistsError(f"{folder} is a file, but --bench must be a folder: choose another")
-    nearest = next(path for path in folder.absolute().parents if os.path.lexists(path))
+    whole = folder.absolute()
+    nearest = next(path for path in (whole, *whole.parents) if os.path.lexists(path))
     if not nearest.is_dir():
         raise OutputExistsError(
             f"{folder} cannot be made, because {nearest} is a file: choose another --bench"
+        )
+    if not os.access(nearest, os.W_OK):
+        raise OutputExistsError(
+            f"{folder} cannot be written, since {nearest} is read-only: choose another --bench, or"
+            " change its permissions"
         )
     if is_bench(folder):
         load_bench_record(folder)

@@ -141,9 +141,11 @@ def note_warnings(bench: reconstruct.CalibratedRig) -> None:
 
 
 def _note_doubt(name: str, record: walls.WallRecord) -> None:
-    """Print that a wall record is doubtful by its own verdict."""
+    """Print that a wall record is doubtful by its own verdict, or of a bare wall."""
     if record.verdict == "doubtful":
         common.say(f"note: {name} calls itself doubtful: {record.advice}")
+    if record.occluder is None:
+        common.say(f"note: {reconstruct.occluder_assumed(Path(name))}")
 
 
 def names_folder(name: str) -> bool:

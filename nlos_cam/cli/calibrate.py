@@ -37,6 +37,7 @@ from nlos_cam.cli.common import (
     progress,
     say,
     stderr,
+    stop_on_signals,
     tracked,
 )
 
@@ -391,12 +392,19 @@ class Target(NamedTuple):
         return cls(folder, bare, files, overwrite)
 
     def write(self, record: walls.WallRecord, reference: walls.BareWall | None) -> walls.WallRecord:
-        """Write the measurement, and return the record, which names its reference."""
-        if self.folder:
-            return benching.write_to_bench(
-                self.folder, self.files, record, reference, overwrite=self.overwrite
-            )
-        return bench.write_record(self.files, record, reference)
+        """Write the measurement, and return the record, which names its reference. An interruption
+        waits for the end: half of the files would fit no record.
+        """
+        with stop_on_signals() as stop:
+            if self.folder:
+                record = benching.write_to_bench(
+                    self.folder, self.files, record, reference, overwrite=self.overwrite
+                )
+            else:
+                record = bench.write_record(self.files, record, reference)
+        if stop.is_set():
+            raise KeyboardInterrupt(f"{self.files.record} is written")
+        return record
 
 
 def _bench_folder(folder: Path | None, occluder: Path | None, out: Path | None) -> Path | None:

@@ -224,7 +224,8 @@ def _choose_camera(values: dict[str, Any], used: dict[str, Value]) -> bool:
         raise typer.BadParameter(f"CAMERA is {argument!r} and --camera is {option!r}: give one")
     given = option if argument is None else argument
     if given is not None and (
-        _is_another(given, used["camera"]) or (given == "sim" and _is_of_a_lidar(used.get("bench")))
+        _is_another(given, used["camera"])
+        or (given == "sim" and any(_is_of_a_lidar(used.get(name)) for name in ("bench", "wall")))
     ):
         _drop_bench(values, used, given)
     values["camera"] = (
@@ -274,12 +275,18 @@ def _take_default_camera(values: dict[str, Any]) -> None:
 
 
 def _serial_of(folder: str | Path) -> str | None:
-    """Return the serial number of the camera that measured a bench; None for what is no bench."""
-    if not _is_bench(str(folder)):
-        return None
-    from nlos_cam.bench import load_bench_record
+    """Return the serial number of the camera that measured a bench or a wall record; None for what
+    is neither.
+    """
+    from nlos_calibration import is_wall_record, load_wall
 
     try:
+        if is_wall_record(str(folder)):
+            return load_wall(Path(folder)).serial
+        if not _is_bench(str(folder)):
+            return None
+        from nlos_cam.bench import load_bench_record
+
         return load_bench_record(Path(folder)).camera.serial
     except CalibrationError:
         return None
@@ -292,7 +299,7 @@ def _is_simulated(serial: str) -> bool:
 
 
 def _is_of_a_lidar(bench: Value | None) -> bool:
-    """Return True for a bench of the settings that a real lidar measured."""
+    """Return True for a bench or a wall record of the settings that a real lidar measured."""
     if bench is None or bench.value is None:
         return False
     serial = _serial_of(str(bench.value))

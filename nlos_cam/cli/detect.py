@@ -6,7 +6,6 @@ from __future__ import annotations
 
 import secrets
 import shlex
-import shutil
 import sys
 from collections.abc import Callable
 from contextlib import suppress
@@ -288,9 +287,9 @@ def _measure(
             rig = bench.rig
             benches.note_warnings(bench)
         plan = asked.plan(source, rig, before)
-        if before is None and detection.is_session(folder):  # --overwrite, all else in order
-            shutil.rmtree(folder)
-        session = detection.Session.start(folder, plan)
+        begins_again = before is None and detection.is_session(folder)  # by --overwrite
+        start = detection.Session.begin if begins_again else detection.Session.start
+        session = start(folder, plan)
         hands: detection.Hands = (
             detection.SimulatedHands(source, control=asked.control)
             if isinstance(source, cameras.SimulatedCamera)

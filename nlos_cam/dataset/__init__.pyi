@@ -37,6 +37,7 @@ __all__ = [
     "build_dataset",
     "build_transients",
     "check_arrays",
+    "check_held_out",
     "check_truths",
     "check_uncertainty_data",
     "data_key",
@@ -114,7 +115,7 @@ from .packed import PackedMaps, map_noise, open_packed_maps
 from .packed_index import data_key
 from .plan import RECORDED, DatasetPlan, Objects, RigSpread
 from .ray_backend import ray_farm
-from .reader import Dataset, open_dataset
+from .reader import Dataset, check_held_out, open_dataset
 from .rig_range import OBJECTS_PER_RIG, RigRange
 from .samples import (
     Tracked,

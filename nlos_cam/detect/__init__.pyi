@@ -35,6 +35,6 @@ from .measure import (
     swept_settings,
 )
 from .plan import BASELINE, BLOCK_TURNS, Plan, Setting, min_blocks
-from .report import REPORT, power_text, verdict, write_report
-from .session import Session, how_to_go_on, is_session
+from .report import power_text, verdict, write_report
+from .session import REPORT, Session, how_to_go_on, is_session
 from .turns import CHANNELS, Turn

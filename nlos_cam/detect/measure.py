@@ -47,7 +47,7 @@ def setting_as_started(camera: Camera) -> Setting:
     """Return the options that an entered camera started with, so that a session which goes on later
     is measured under them too: a lidar may choose its laser power at every start.
     """
-    return _as_started(_swept_options(camera))
+    return _as_started(_accepted_options(camera))
 
 
 def _as_started(swept: Mapping[str, Mapping[str, Any]]) -> Setting:
@@ -61,13 +61,26 @@ def _swept_options(camera: Camera) -> dict[str, dict[str, Any]]:
     return {each["name"]: each for each in options if each["name"] in SWEPT}
 
 
+def _accepted_options(camera: Camera) -> dict[str, dict[str, Any]]:
+    """Return the options that an entered camera takes again at their present values: each turn sets
+    them, and a firmware may refuse some.
+    """
+    if not isinstance(camera, AdjustableCamera):
+        return {}
+    return {
+        name: each
+        for name, each in _swept_options(camera).items()
+        if _accepts(camera, name, float(each["value"]))
+    }
+
+
 def swept_settings(camera: Camera) -> tuple[Setting, ...]:
     """Return the settings of a sweep that an entered camera accepts: as it started, then one option
     changed at a time.
 
     Raises CameraError for a camera without options.
     """
-    swept = _swept_options(camera)
+    swept = _accepted_options(camera)
     if not isinstance(camera, AdjustableCamera) or not swept:
         raise CameraError(f"{camera.uri} offers no options to sweep: leave out --settings sweep")
     as_started = _as_started(swept)
@@ -104,7 +117,10 @@ def measure_turns(
     """
     frames = iter(camera)
     order = session.plan.order()
-    for number in session.missing():
+    missing = session.missing()
+    for number in missing:  # of a block that is measured again, no earlier turn may remain
+        session.path(number).unlink(missing_ok=True)
+    for number in missing:
         object_in = bool(order[number])
         hands.place(number, object_in=object_in)
         turn = measure_turn(frames, camera, session, object_in=object_in, on_frame=on_frame)

@@ -25,7 +25,6 @@ from nlos_cam.report import (
     png,
 )
 
-REPORT = "detection.html"
 UNITS = {"depth": (1e3, "mm"), "infrared": (1.0, "counts"), "confidence": (1.0, "steps")}
 """Factor and unit in which a channel is reported."""
 NOT_DETERMINED = "not determined"

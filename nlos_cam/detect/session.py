@@ -8,12 +8,14 @@ from pathlib import Path
 from nlos_calibration import first_problem
 from pydantic import ValidationError
 
-from nlos_cam.detect.plan import Plan
+from nlos_cam.detect.plan import BLOCK_TURNS, Plan
 from nlos_cam.detect.turns import Turn
 from nlos_cam.errors import OutputExistsError, RecordingError
 from nlos_cam.files import TEXT_LIMIT, atomic_file, read_bounded
 
 PLAN = "detection.json"
+TURNS = "turn-*.npz"
+REPORT = "detection.html"
 TOGETHER = ("serial", "turns", "frames", "alpha", "control", "settings", "rig")
 """Fields of the plan that a command must repeat in order to go on with a session."""
 
@@ -46,7 +48,16 @@ class Session:
             raise OutputExistsError(
                 f"{folder} exists and is no detection: choose another name for --out"
             )
+        return cls.begin(folder, plan)
+
+    @classmethod
+    def begin(cls, folder: Path, plan: Plan) -> "Session":
+        """Create a session in a folder. An earlier one there goes, with its page; other files
+        stay.
+        """
         folder.mkdir(parents=True, exist_ok=True)
+        for path in (folder / PLAN, folder / REPORT, *folder.glob(TURNS)):
+            path.unlink(missing_ok=True)
         with atomic_file(folder / PLAN) as part:
             part.write_text(plan.model_dump_json(indent=1), encoding="utf-8")
         return cls(folder, plan)
@@ -76,8 +87,20 @@ class Session:
         return self.folder / f"turn-{turn + 1:04d}.npz"
 
     def missing(self) -> list[int]:
-        """Return the turns that are still to be measured, in order."""
-        return [turn for turn in range(self.plan.turns) if not self.path(turn).exists()]
+        """Return the turns that are still to be measured, in order.
+
+        Where one was deleted before a later one of its block, the whole block is: with turns of two
+        days, the drift that each block's contrast leaves out would take the object along.
+        """
+        turns = range(self.plan.turns)
+        there = [self.path(turn).exists() for turn in turns]
+
+        def goes_on(turn: int) -> bool:
+            block = turn - turn % BLOCK_TURNS
+            states = there[block : block + BLOCK_TURNS]
+            return not there[turn] or states != sorted(states, reverse=True)
+
+        return [turn for turn in turns if goes_on(turn)]
 
     def turns(self) -> list[Turn]:
         """Read the turns of all whole blocks from the start on. Raises RecordingError for a file

@@ -66,18 +66,18 @@ class Turn:
         except (OSError, ValueError, KeyError, TypeError, AttributeError, OverflowError) as error:
             raise RecordingError(
                 f"{path} is not a turn of `nlos-cam detect`: delete it, and the same command"
-                " measures it again"
+                " measures its four turns again"
             ) from error
         shapes = turn.time_s.shape, turn.mean.shape, turn.std.shape
         if shapes != ((settings,), (settings, *MAPS), (settings, *MAPS)):
             raise RecordingError(
                 f"{path} has arrays of shapes {shapes}, not those of {settings} settings: delete"
-                " it, and the same command measures it again"
+                " it, and the same command measures its four turns again"
             )
         if not np.isfinite(turn.time_s).all():
             raise RecordingError(
-                f"{path} holds no time for a setting: delete it, and the same command measures it"
-                " again"
+                f"{path} holds no time for a setting: delete it, and the same command measures its"
+                " four turns again"
             )
         return turn
 

@@ -25,9 +25,11 @@ def install_command(path: str) -> str:
     return f"sudo install -m 644 {quote(path)} /etc/udev/rules.d/{FILE_NAME} && {RELOAD}"
 
 
-WRITE_AND_INSTALL = f"nlos-cam doctor --write-udev {FILE_NAME} && {install_command(FILE_NAME)}"
-"""Shell command that writes and installs the rules; they apply to a camera plugged in
-afterwards.
+WRITE_AND_INSTALL = (
+    f"nlos-cam doctor --write-udev {FILE_NAME} --overwrite && {install_command(FILE_NAME)}"
+)
+"""Shell command that writes and installs the rules, also a second time; they apply to a camera
+plugged in afterwards.
 """
 
 

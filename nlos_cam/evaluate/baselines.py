@@ -16,6 +16,7 @@ from torch import Tensor
 
 from nlos_cam import dataset as data
 from nlos_cam.camera import OnProgress
+from nlos_cam.errors import FolderBusyError, NlosCamError, OutputExistsError, SceneError
 from nlos_cam.reconstruct import NUMBERS_COLUMN, WALL_GRID, align_samples
 
 NEIGHBOURS = 2000
@@ -119,19 +120,41 @@ def on_wall_grid(maps: MapSet, benches: Iterable[Rig]) -> MapSet:
 
 
 def training_maps(
-    plan: data.DatasetPlan, cache: Path, workers: int, on_progress: OnProgress
+    plan: data.DatasetPlan,
+    cache: Path,
+    workers: int,
+    on_progress: OnProgress,
+    first_seed: int = data.TRAINING_SEED,
 ) -> data.Dataset:
-    """Build the first NEIGHBOURS training objects on the plan's rig and sensor into the cache,
-    once.
+    """Build NEIGHBOURS training objects from a seed on, on the plan's rig and sensor, into the
+    cache, once.
 
     An interrupted build resumes. The folder's name is a checksum of rig, sensor and objects. For
     recordings the objects are rendered on the bench's measured rig, with the simulated sensor.
+    Raises SceneError while another process builds them, or where the cache cannot be written to.
     """
     accuracy = "standard" if plan.accuracy == data.RECORDED else plan.accuracy
-    plan = replace(plan, first_seed=data.TRAINING_SEED, accuracy=accuracy, objects=data.Objects())
+    plan = replace(plan, first_seed=first_seed, accuracy=accuracy, objects=data.Objects())
     folder = cache / "neighbours" / f"{_checksum(plan)}-{NEIGHBOURS}"
-    data.build_dataset(plan, NEIGHBOURS, folder, workers=workers, on_progress=on_progress)
+    try:
+        data.build_dataset(plan, NEIGHBOURS, folder, workers=workers, on_progress=on_progress)
+    except (FolderBusyError, OutputExistsError) as error:
+        if found := _whole(folder):  # another process reads it, or nobody may write to it
+            return found
+        raise SceneError(
+            f"the training objects for the nearest neighbour cannot be rendered into {folder}: wait"
+            " for another evaluation, set NLOS_CAM_CACHE to another folder, or give --no-nearest"
+        ) from error
     return data.open_dataset(folder)
+
+
+def _whole(folder: Path) -> data.Dataset | None:
+    """Return the dataset in a folder if it has all NEIGHBOURS; else None."""
+    try:
+        found = data.open_dataset(folder)
+    except NlosCamError:
+        return None
+    return found if len(found) == NEIGHBOURS else None
 
 
 def _checksum(plan: data.DatasetPlan) -> str:

@@ -176,6 +176,8 @@ class HeldOutObjects:
     """The rig of each object."""
     recorded: MapSet | None = None
     """Maps as a lidar measured them, from which difference maps are made; None where `maps` are."""
+    dataset: data.Dataset | None = None
+    """Dataset that they are of; None for rendered ones."""
 
     def input_of(self, record: CheckpointRecord, bare: data.BareMaps | None) -> MapSet:
         """Return the maps that the network takes; see `network_input`."""
@@ -251,6 +253,7 @@ def dataset_objects(folder: Path) -> HeldOutObjects:
         opened.plan,
         [*opened.benches()],
         recorded=None if recorded is opened else recorded.arrays(),
+        dataset=opened,
     )
     return found if opened.plan.rigs is None else _seen_on_the_grid(found)
 
@@ -311,17 +314,20 @@ def baseline_answers(
     objects: HeldOutObjects, training: Path | None, *, nearest: bool, tracked: Tracked = untracked
 ) -> tuple[dict[str, Float32], data.Dataset | None]:
     """Return the baselines' images by name, and the training objects searched for the nearest
-    neighbour, if wanted.
+    neighbour, if wanted. Raises SceneError where objects of a dataset are among those.
     """
+    first_seed = _first_training_seed(objects.dataset)
     if not nearest:
-        images = data.procedural_images(data.TRAINING_SEED, trivial.NEIGHBOURS, objects.plan.box)
+        images = data.procedural_images(first_seed, trivial.NEIGHBOURS, objects.plan.box)
         return trivial.trivial_answers(len(objects.names), trivial.mean_image(images)), None
     if training:
         opened = data.open_dataset(training)
+        if objects.dataset:
+            data.check_held_out(opened, objects.dataset)
     else:
         with tracked("rendering training objects for the nearest neighbour, once") as on_progress:
             opened = trivial.training_maps(
-                objects.plan, cache_folder(), os.cpu_count() or 1, on_progress
+                objects.plan, cache_folder(), os.cpu_count() or 1, on_progress, first_seed
             )
     with tracked("searching the nearest neighbours") as on_progress:
         if objects.plan.rigs is None and opened.plan.rigs is None:
@@ -329,6 +335,19 @@ def baseline_answers(
         # maps of two rigs are compared where both see the same points of the wall
         sought = trivial.on_wall_grid(objects.maps, objects.benches)
         return trivial.answers_with_nearest(sought, opened, on_progress, on_grid=True), opened
+
+
+def _first_training_seed(dataset: data.Dataset | None) -> int:
+    """Return the first of NEIGHBOURS seeds of training objects that are none of a dataset's: among
+    them each object would be its own nearest neighbour.
+    """
+    first = data.TRAINING_SEED
+    if dataset is None or dataset.plan.accuracy == data.RECORDED:  # their seeds number frames
+        return first
+    taken = dataset.seeds
+    while not taken.isdisjoint(range(first, first + trivial.NEIGHBOURS)):
+        first += trivial.NEIGHBOURS
+    return first
 
 
 def notes_about(

@@ -11,9 +11,10 @@ from typing import Any
 from zipfile import BadZipFile, ZipFile
 
 import numpy as np
-from nlos_calibration import load_rig, load_wall
+from nlos_calibration import load_measured, load_rig, load_wall
 from nlos_models.training import load_recipe
 
+from nlos_cam.bench import load_bench_record
 from nlos_cam.camera import camera_to_name
 from nlos_cam.errors import NlosCamError, RecordingError
 from nlos_cam.files import read_arrays, read_bounded, read_toml, with_commit
@@ -224,8 +225,10 @@ def _frames(arrays: Any) -> dict[str, str]:
     }
 
 
-def describe_toml(path: Path, _verify: bool) -> Description | None:
-    """Describe a wall record, scene, rig, recipe or settings file, by its keys."""
+def describe_toml(path: Path, verify: bool) -> Description | None:
+    """Describe a wall record, scene, rig, recipe or settings file, by its keys. A record's reference
+    is read only to `verify`.
+    """
     try:
         keys = read_toml(path)
     except UnicodeDecodeError as error:
@@ -237,7 +240,7 @@ def describe_toml(path: Path, _verify: bool) -> Description | None:
     quoted = shlex.quote(str(path))
     checked = "all fields"
     if {"created", "verdict"} & set(keys):
-        return _wall(path, quoted) if "bench_version" not in keys else _bench_record(path)
+        return _bench_record(path) if "bench_version" in keys else _wall(path, quoted, verify)
     if "task" in keys:
         recipe = load_recipe(path)
         facts = {"task": recipe.task, "epochs": str(recipe.epochs)}
@@ -265,17 +268,21 @@ def describe_toml(path: Path, _verify: bool) -> Description | None:
         return Description("scene of the simulated camera", facts, checked=checked, next=following)
     if path.name == "nlos-cam.toml":
         return Description(
-            "settings", {key: str(value) for key, value in keys.items()}, next=["nlos-cam config"]
+            "settings",
+            {key: str(value) for key, value in keys.items()},
+            checked="that it is TOML; `nlos-cam config` checks names and values",
+            next=["nlos-cam config"],
         )
     return None
 
 
 def _bench_record(path: Path) -> Description:
+    load_bench_record(path.parent)
     folder = shlex.quote(str(path.parent))
-    return Description("record of a bench", next=[f"nlos-cam info {folder}"])
+    return Description("record of a bench", checked="all fields", next=[f"nlos-cam info {folder}"])
 
 
-def _wall(path: Path, quoted: str) -> Description:
+def _wall(path: Path, quoted: str, verify: bool) -> Description:
     record = load_wall(path)
     facts = {
         "verdict": f"{record.verdict}: {record.advice}",
@@ -290,11 +297,10 @@ def _wall(path: Path, quoted: str) -> Description:
     if record.reference:
         reference = path.with_name(record.reference)
         facts["reference"] = record.reference
-        problem = (
-            ""
-            if reference.exists()
-            else f"its reference {reference} is missing: put it back, or calibrate again"
-        )
+        if not reference.exists():
+            problem = f"its reference {reference} is missing: put it back, or calibrate again"
+        elif verify:
+            load_measured(path)
     camera = camera_to_name(record)
     following = [f"nlos-cam live --camera {camera} --wall {quoted}"]
     if record.occluder is None:
@@ -307,7 +313,7 @@ def _wall(path: Path, quoted: str) -> Description:
         str(record.created),
         "nlos-cam calibrate",
         problem,
-        "all fields",
+        "all fields and the reference" if verify else "all fields; --verify reads the reference",
         following,
     )
 

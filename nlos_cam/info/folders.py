@@ -25,8 +25,10 @@ from nlos_cam.reconstruct import rig_in_words
 from nlos_cam.report import estimate_in_words
 
 
-def describe_bench(folder: Path, _verify: bool) -> Description | None:
-    """Describe a bench folder from its record; its checksums are always compared."""
+def describe_bench(folder: Path, verify: bool) -> Description | None:
+    """Describe a bench folder from its record; its checksums are always compared, those of its
+    weights' tensors only to `verify`.
+    """
     if not is_bench(folder):
         return None
     bench = load_bench(folder)
@@ -52,8 +54,8 @@ def describe_bench(folder: Path, _verify: bool) -> Description | None:
         facts | {"changed": changed},
         created,
         record.program,
-        "",
-        "checksums of all files but the tensors'",
+        _checksum_problem(bench.weights) if verify and bench.weights else "",
+        "checksums of all files" if verify else "checksums of all files but the tensors'",
         following,
     )
 
@@ -136,7 +138,7 @@ def _checksum_problem(folder: Path) -> str:
 
 
 def describe_run(folder: Path, _verify: bool) -> Description:
-    """Describe a training run from its log."""
+    """Describe a training run from its log, and by the checksums of its weights once finished."""
     with (folder / TRAINING_LOG).open(encoding="utf-8", newline="") as file:
         rows = [*csv.DictReader(file)]
     finished = (folder / RECORD).exists()
@@ -152,7 +154,9 @@ def describe_run(folder: Path, _verify: bool) -> Description:
         }
     quoted = shlex.quote(str(folder))
     following = [f"nlos-cam evaluate --weights {quoted}"] if finished else []
-    return Description("training run", facts, "", "", "", "log", following)
+    problem = _checksum_problem(folder) if finished else ""
+    checked = f"log, checksums in {CHECKSUMS}" if finished else "log"
+    return Description("training run", facts, "", "", problem, checked, following)
 
 
 def _page_in(folder: Path) -> list[str]:

@@ -135,13 +135,25 @@ def _pack(state: State) -> bytes:
 
 
 def _unpack(path: Path) -> State | None:
-    """Return the state in a file, or None where it is none, or its digest does not match."""
+    """Return the state in a file, or None where it is none, or its digest does not match. Raises
+    CheckpointError where the file cannot be read, which says nothing of the state.
+    """
+    if not path.is_file():
+        return None
     try:
         raw = read_bounded(path, TENSOR_LIMIT)
-        if len(raw) < DIGEST or hashlib.sha256(memoryview(raw)[DIGEST:]).digest() != raw[:DIGEST]:
-            return None
+    except OSError as error:
+        raise CheckpointError(
+            f"{path} cannot be read ({error.strerror or error}): the same command goes on once it"
+            " can"
+        ) from error
+    if len(raw) < DIGEST or hashlib.sha256(memoryview(raw)[DIGEST:]).digest() != raw[:DIGEST]:
+        return None
+    try:
         # `weights_only`: a pickle from outside could run any program.
         state = torch.load(io.BytesIO(raw[DIGEST:]), map_location="cpu", weights_only=True)
+    except MemoryError:
+        raise
     except Exception:  # noqa: BLE001  the unpickler raises almost anything for crafted bytes
         return None
     return cast("State", state) if isinstance(state, dict) else None

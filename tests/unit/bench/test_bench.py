@@ -263,7 +263,18 @@ def test_folder_with_other_files_does_not_become_a_bench(folder: Path, tmp_path:
     (tmp_path / "file").touch()
 
     assert is_bench(folder)
+    with pytest.raises(OutputExistsError, match="no bench"):
+        check_new(Path("/"))
     for taken in ("photos", "file", "file/bench"):
         assert not is_bench(tmp_path / taken)
         with pytest.raises(OutputExistsError):
             check_new(tmp_path / taken)
+
+
+def test_read_only_bench_is_refused_before_it_is_measured(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("os.access", lambda *_: False)  # root may write everywhere
+    for place in ("", "none/bench"):
+        with pytest.raises(OutputExistsError, match="read-only"):
+            check_new(tmp_path / place)

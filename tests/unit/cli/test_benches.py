@@ -2,6 +2,7 @@
 
 import shutil
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +19,7 @@ from nlos_cam.bench import (
     weights_verdict,
     write_weights,
 )
-from nlos_cam.cli.benches import bench_or_rig
+from nlos_cam.cli.benches import bench_or_rig, rig_or_default
 from nlos_cam.cli.calibrate import _written_bench
 from nlos_cam.forecast import FORECAST_VERSION
 from nlos_cam.reconstruct import WALL_GRID
@@ -179,6 +180,14 @@ def test_doubtful_record_is_named_where_its_rig_is_used(run: Run) -> None:
 
     assert "measure again" in run(*words, "--bench", "bench").err
     assert "measure again" in run(*words, "--rig", "bench/stations/main/wall.toml").err
+
+
+def test_assumed_occluder_of_a_wall_record_is_named(capsys: pytest.CaptureFixture[str]) -> None:
+    write_wall(Path("bench"), wall_of())
+    name = "bench/stations/main/wall.toml"
+    for read in (bench_or_rig, partial(rig_or_default, None, default="paper-rig")):
+        read(name)
+        assert "the occluder has not been measured" in capsys.readouterr().err
 
 
 def test_doubtful_record_is_named_before_weights_are_made(

@@ -257,6 +257,25 @@ def test_left_out_bench_is_noted_where_no_other_is_named(
     assert capsys.readouterr().err.count("is not used with sim") == notes
 
 
+@pytest.mark.parametrize(("serial", "used"), [("f0000001", False), ("simulated", True)])
+def test_wall_of_a_lidar_is_not_used_with_sim(
+    monkeypatch: pytest.MonkeyPatch, serial: str, used: bool
+) -> None:
+    make_bench(Path("mine"), serial=serial)
+    record = next(Path("mine").rglob("wall.toml"))
+    walls: list[Path | None] = []
+
+    def command(camera: Camera = "sim", wall: Path | None = None) -> None:
+        del camera
+        walls.append(wall)
+
+    serve_as(monkeypatch, "live", command)
+    Path(FILE).write_text(f'wall = "{record}"\n', encoding="utf-8")
+
+    assert main(["live", "sim"]) == 0
+    assert (walls[0] is not None) == used
+
+
 @pytest.mark.parametrize(
     ("serial", "words", "camera"),
     [

@@ -79,6 +79,7 @@ class Stored(SmallDataset):
     def __init__(self, first_seed: int, count: int, rig: Rig = RIG) -> None:
         plan = DatasetPlan(rig, first_seed)
         super().__init__(_maps(plan, count), plan)
+        self.seeds = set(range(first_seed, first_seed + count))
 
     def column(self, name: str) -> Any:
         return {"category": np.array(["cup", "hat", "cup"], object), "seed": np.arange(3)}[name]
@@ -99,7 +100,15 @@ def guessing(monkeypatch: Patch) -> list[DatasetPlan]:
     monkeypatch.setattr(baselines, "training_maps", training_maps)
     monkeypatch.setattr(baselines, "NEIGHBOURS", 4)
     monkeypatch.setattr(report, "load_reconstructor", lambda *_: Guesser())
-    monkeypatch.setattr(subjects.data, "open_dataset", lambda _: Stored(HELD_OUT_SEED, 3))
+
+    def open_dataset(folder: Path) -> Stored:
+        stored = Stored(HELD_OUT_SEED, 3)
+        stored.folder = folder
+        if folder.name == "training":  # the same maps under other seeds
+            stored.seeds = set(range(TRAINING_SEED, TRAINING_SEED + 3))
+        return stored
+
+    monkeypatch.setattr(subjects.data, "open_dataset", open_dataset)
     return asked
 
 

@@ -20,7 +20,13 @@ from nlos_cam.detect import (
     write_report,
 )
 from nlos_cam.detect.session import PLAN
-from nlos_cam.errors import CameraLostError, NlosCamError, OutputExistsError, RecordingError
+from nlos_cam.errors import (
+    CameraError,
+    CameraLostError,
+    NlosCamError,
+    OutputExistsError,
+    RecordingError,
+)
 from nlos_cam.frames import Frame
 
 PINHOLE = load_rig("bare-wall").pinhole.scaled(80, 64)
@@ -86,6 +92,52 @@ def test_resumed_session_equals_an_unbroken_one(tmp_path: Path) -> None:
         np.testing.assert_array_equal(one.mean, other.mean)
 
 
+def test_block_with_a_deleted_turn_is_measured_again_as_a_whole(tmp_path: Path) -> None:
+    """Turns of two days in a block would leave nothing of the object beside the drift."""
+    session = Session.start(tmp_path / "s", made_plan(frames=2))
+    measured(session, FakeCamera())
+    last = session.plan.turns - 1
+    for turn in (1, 2, last):
+        session.path(turn).unlink()
+
+    assert session.missing() == [0, 1, 2, 3, last]
+
+    camera = FakeCamera(5000)
+    camera.limit = 5000 + 2 * (2 + SETTLING_FRAMES)  # the third one has no frame
+    with pytest.raises(CameraLostError):
+        measured(session, camera)
+
+    assert session.missing() == [2, 3, last]
+
+
+def test_session_that_begins_again_keeps_other_files(tmp_path: Path) -> None:
+    session = Session.start(tmp_path, made_plan(frames=2))
+    measured(session, FakeCamera())
+    (tmp_path / "notes.txt").write_text("mine")
+    Session.begin(tmp_path, made_plan(7, frames=3))
+
+    assert sorted(path.name for path in tmp_path.iterdir()) == [PLAN, "notes.txt"]
+
+
+def test_option_that_the_firmware_refuses_is_left_out(tmp_path: Path) -> None:
+    class StubbornCamera(FakeCamera):
+        def set_option(self, name: str, value: float) -> str:
+            if name == "min_distance":
+                raise CameraError("min_distance: refused")
+            return super().set_option(name, value)
+
+    camera: Any = StubbornCamera()
+    start = setting_as_started(camera)
+
+    assert set(start.options) == {"laser_power"}
+    assert {name for each in swept_settings(camera) for name in each.options} == {"laser_power"}
+
+    session = Session.start(tmp_path / "s", made_plan(frames=2, settings=(start,)))
+    measured(session, camera)
+
+    assert not session.missing()
+
+
 def test_turn_of_another_session_is_found_by_its_frames(tmp_path: Path) -> None:
     session = Session.start(tmp_path / "s", made_plan(frames=3))
     other = Session.start(tmp_path / "other", made_plan(frames=4))
@@ -106,7 +158,7 @@ def test_turn_without_numbers_is_refused(tmp_path: Path, damage: str) -> None:
     )
     replace(turn, **wrong).save(session.path(0))
 
-    with pytest.raises(RecordingError, match="measures it again"):
+    with pytest.raises(RecordingError, match="measures its four turns again"):
         session.turns()
 
 

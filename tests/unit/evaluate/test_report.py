@@ -13,6 +13,7 @@ from unittest.mock import Mock
 import numpy as np
 import pytest
 from nlos_calibration import load_rig
+from nlos_models import CheckpointRecord
 from page_reader import read_page
 
 from nlos_cam.dataset import procedural_images
@@ -27,6 +28,7 @@ from nlos_cam.evaluate.report import (
     write_report,
 )
 from nlos_cam.objects import object_box, object_depth
+from nlos_cam.render import SensorModel
 from nlos_cam.report import figure_of, png
 
 BOX = object_box(load_rig("paper-rig"))
@@ -86,6 +88,16 @@ def undrawn(drawn: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 def _rows(folder: Path) -> list[dict[str, str]]:
     with (folder / "objects.csv").open(encoding="utf-8", newline="") as file:
         return list(csv.DictReader(file))
+
+
+def test_weights_are_measured_at_the_gain_of_their_training() -> None:
+    rig = load_rig("paper-rig")
+    own = CheckpointRecord(rig_name=rig.name, rig_checksum=rig.checksum, bare_wall_counts=120.0)
+    moved = rig.model_copy(update={"lidar": rig.lidar.model_copy(update={"distance_m": 0.205})})
+
+    assert report.sensor_of(own, rig).bare_wall_counts == 120.0
+    assert report.sensor_of(own, moved) == SensorModel()  # alignment takes the gain out
+    assert report.sensor_of(own.model_copy(update={"bare_wall_counts": None}), rig) == SensorModel()
 
 
 def test_figures_have_names_that_scripts_depend_on() -> None:

@@ -28,7 +28,7 @@ from nlos_cam.dataset import (
 )
 from nlos_cam.dataset.samples import make_samples
 from nlos_cam.dataset.shards import shard_path, store
-from nlos_cam.errors import SceneError
+from nlos_cam.errors import FolderBusyError, SceneError
 from nlos_cam.evaluate import (
     HeldOutObjects,
     as_map_set,
@@ -334,6 +334,44 @@ def test_baselines_without_training_maps_are_two(monkeypatch: pytest.MonkeyPatch
 
     assert (set(answers), among) == ({"all_background", "mean_object"}, None)
     np.testing.assert_allclose(answers["mean_object"][1], trained.mean(0), atol=1e-3)
+
+
+def test_objects_of_a_dataset_are_not_their_own_neighbours(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(baselines, "NEIGHBOURS", 3)
+    dataset = SimpleNamespace(plan=PLAN, seeds={TRAINING_SEED + 1, TRAINING_SEED + 3})
+    objects = replace(JUDGED, dataset=dataset)
+    trained = procedural_images(TRAINING_SEED + 6, 3, BOX).astype(np.float32)
+
+    answers, _ = baseline_answers(objects, None, nearest=False)
+
+    np.testing.assert_allclose(answers["mean_object"][1], trained.mean(0), atol=1e-3)
+
+
+def test_training_maps_of_the_same_objects_are_refused(elsewhere: SmallDataset) -> None:
+    objects = replace(JUDGED, dataset=elsewhere)
+    opened = Mock(return_value=elsewhere)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(module.data, "open_dataset", opened)
+        with pytest.raises(SceneError, match="same folder"):
+            baseline_answers(objects, Path("training"), nearest=True)
+
+
+def test_whole_training_maps_are_read_beside_their_builder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(baselines, "NEIGHBOURS", 2)
+    made = training_maps(replace(PLAN, accuracy="draft"), tmp_path, 1, lambda *_: None)
+    busy = Mock(side_effect=FolderBusyError("another process"))
+    monkeypatch.setattr(baselines.data, "build_dataset", busy)
+
+    again = training_maps(replace(PLAN, accuracy="draft"), tmp_path, 1, lambda *_: None)
+
+    assert again.folder == made.folder
+
+    with pytest.raises(SceneError, match="--no-nearest"):
+        training_maps(replace(PLAN, accuracy="draft"), tmp_path, 1, lambda *_: None, 7)
 
 
 def test_baselines_are_empty_and_mean_images(images: np.ndarray) -> None:

@@ -5,6 +5,7 @@ another error.
 import hashlib
 import json
 import os
+import shutil
 import subprocess
 import sys
 from collections.abc import Callable
@@ -14,10 +15,12 @@ from threading import Event
 import numpy as np
 import pytest
 from fake_workers import samples_of
+from made_benches import make_bench
 from made_turns import made_plan, made_turns
 from nlos_calibration.rig import load_rig
 from nlos_models import shipped_folder
 
+from nlos_cam.bench import write_weights
 from nlos_cam.calibrate import WallFiles, write_record
 from nlos_cam.dataset.plan import DatasetPlan
 from nlos_cam.dataset.shards import shard_path, store
@@ -240,6 +243,44 @@ def test_changed_weights_and_lone_wall_records_are_damaged(
     (tmp_path / "SHA256SUMS").unlink()
 
     assert "no networks" in describe(tmp_path).problem
+
+
+def test_verify_reads_what_a_record_names(files: dict[str, Path], tmp_path: Path) -> None:
+    for suffix in (".toml", ".npz"):
+        path = files["wall record"].with_suffix(suffix)
+        (tmp_path / path.name).write_bytes(path.read_bytes())
+
+    assert describe(tmp_path / "wall.toml", verify=True).problem == ""
+
+    (tmp_path / "wall.npz").write_bytes((tmp_path / "wall.npz").read_bytes()[:-500])
+
+    assert "wall.npz" in describe(tmp_path / "wall.toml", verify=True).problem
+
+    (tmp_path / "bench.toml").write_text("bench_version = 99\ncreated = 'nonsense'\n")
+
+    assert describe(tmp_path / "bench.toml").problem
+
+
+def test_verify_reads_the_weights_of_a_bench(tmp_path: Path) -> None:
+    bench = make_bench(tmp_path / "bench")
+    write_weights(bench, shipped_folder())
+
+    assert describe(bench, verify=True).problem == ""
+
+    (bench / "weights" / "direct.safetensors").write_bytes(b"changed")
+
+    assert "direct.safetensors" in describe(bench, verify=True).problem
+
+
+def test_checksums_of_a_finished_run_are_compared(tmp_path: Path) -> None:
+    shutil.copytree(shipped_folder(), tmp_path / "run")
+    (tmp_path / "run" / "log.csv").write_text("epoch,loss\n1,0.5\n")
+
+    assert describe(tmp_path / "run").problem == ""
+
+    (tmp_path / "run" / "direct.safetensors").write_bytes(b"changed")
+
+    assert "direct.safetensors is damaged" in describe(tmp_path / "run").problem
 
 
 @pytest.mark.parametrize(

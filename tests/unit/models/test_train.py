@@ -287,6 +287,20 @@ def test_read_best_refuses_a_missing_or_damaged_state(tmp_path: Path, how: str) 
         run_files.read_best(tmp_path)
 
 
+def test_state_that_cannot_be_read_is_not_called_damaged(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for step in (1, 2):
+        run_files.write_last(tmp_path, _state(step))
+    refused = Mock(side_effect=PermissionError(13, "Permission denied"))
+    monkeypatch.setattr(run_files, "read_bounded", refused)
+
+    with pytest.raises(CheckpointError, match=r"cannot be read \(Permission denied\)") as caught:
+        run_files.read_last(tmp_path, pytest.fail)
+
+    assert "delete" not in str(caught.value)
+
+
 def test_read_last_refuses_where_both_states_are_damaged(tmp_path: Path) -> None:
     for step in (1, 2):
         run_files.write_last(tmp_path, _state(step))
