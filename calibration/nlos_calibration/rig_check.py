@@ -339,6 +339,10 @@ def judge_rig(rig: Rig, view: Footprint, occluder: OccluderRecord | None) -> tup
     name = "the occluder"
     if rig.occluder and not occluder:
         name += " (not measured, the paper's is assumed)"
+    if rig.lidar.yaw_deg < 0.0 and not (rig.occluder and rig.occluder.x_m < 0.0):
+        # A finer turn in that direction would only look farther from the object.
+        away = f"the lidar looks away from the object (yaw {rig.lidar.yaw_deg:.0f} degrees)"
+        return (f"{away}: turn it to its right, or mirror the bench",)
     problems = _too_little_wall(rig, view)
     if rig.occluder is not None and rig.occluder.x_m < 0.0 > rig.lidar.yaw_deg:
         # The lidar looks that way too: nothing is misplaced, the whole bench is a mirror image.

@@ -14,7 +14,7 @@ from typing import Any
 import nlos_calibration as walls
 import numpy as np
 from nlos_calibration.arrays import Float64
-from nlos_calibration.errors import CalibrationError, WallRefusedError
+from nlos_calibration.errors import CalibrationError, OccluderRefusedError, WallRefusedError
 from numpy.typing import NDArray
 
 from nlos_cam.camera import Camera
@@ -157,6 +157,10 @@ def check_way_up(gravity_m_s2: walls.Gravity | None, said: walls.WayUp) -> walls
     raise CalibrationError(f"by gravity the camera is upside down, {TURN_IT}")
 
 
+USUAL_OFFSET_M = 0.015
+"""Range offset beyond which a tape is rather wrong than the lidar: an L515's is some millimetres."""
+BESIDE_OCCLUDER_M = 0.06
+"""Depth that a moved wall may be off its reference by; an occluder stands farther before it."""
 NEAR_WALL_M = 0.02
 """Off the plane; with the occluder in place, pixels beyond are on the occluder or straddle its
 edge.
@@ -184,7 +188,15 @@ def measure_by_depth(
         return _fit_depth(capture, offset_m / length)
 
     taped = walls.fit_with_tape_distance(partial(_fit_depth, capture), tape_m, fit_along_rays)
-    return taped.fit, _offset_fields(taped)
+    fit = taped.fit
+    off_m = abs(taped.offset_m)
+    if off_m > USUAL_OFFSET_M and fit.verdict != "doubtful":
+        advice = (
+            f"tape and lidar are {1e3 * off_m:.0f} mm apart, where an L515's beams start some"
+            " millimetres beside its glass: measure the distance from the glass again"
+        )
+        fit = replace(fit, verdict="doubtful", advice=advice)
+    return fit, _offset_fields(taped)
 
 
 def _fit_with_known_offset(
@@ -282,25 +294,37 @@ def measure_occluder(
     depth_m = statistics.mean_m() + offset_m
     noise = statistics.noise()
     pose = walls.wall_from_zero(record)
-    found = walls.find_occluder(
-        depth_m,
-        noise,
-        capture.intrinsics,
-        pose,
-        np.random.default_rng(0),
-        distance_std_m=record.distance_std_m,
-        yaw_std_deg=record.yaw_std_deg,
-    )
-    # the wall is fitted again beside the occluder: if the lidar moved, the occluder's place would
-    # be wrong as well
-    off_m = np.abs(walls.points_m(record, depth_m - offset_m, capture.intrinsics)[..., 2])
-    beside = np.where((off_m < NEAR_WALL_M) & ~found.pixels, depth_m, np.nan)
     origin_m = record.range_offset_m - offset_m
 
     def fit_beside(wall_m: NDArray[np.float64]) -> walls.WallFit:
         generator = np.random.default_rng(0)
         return walls.fit_wall(wall_m, capture.intrinsics, generator, noise, origin_m)
 
+    try:
+        found = walls.find_occluder(
+            depth_m,
+            noise,
+            capture.intrinsics,
+            pose,
+            np.random.default_rng(0),
+            distance_std_m=record.distance_std_m,
+            yaw_std_deg=record.yaw_std_deg,
+        )
+    except OccluderRefusedError:
+        # a wall that is centimetres off its record would pass for an occluder, or hide behind it
+        fits: list[walls.WallFit] = []
+        if bare.reference is not None:
+            with suppress(WallRefusedError):  # no wall to compare: the occluder's refusal says more
+                pair = _in_common(bare.reference, offset_m, depth_m)
+                near = np.abs(pair[1] - pair[0]) < BESIDE_OCCLUDER_M
+                fits = [fit_beside(np.where(near, each, np.nan)) for each in pair]
+        if fits:
+            _raise_if_moved(*fits)
+        raise
+    # the wall is fitted again beside the occluder: if the lidar moved, the occluder's place would
+    # be wrong as well
+    off_m = np.abs(walls.points_m(record, depth_m - offset_m, capture.intrinsics)[..., 2])
+    beside = np.where((off_m < NEAR_WALL_M) & ~found.pixels, depth_m, np.nan)
     wall = fit_beside(beside)
     _raise_if_disturbed(capture, np.isfinite(beside))
     if bare.reference is None:

@@ -144,4 +144,5 @@ def _beyond(name: str, value: float, unit: str, trained: tuple[float, float]) ->
     allowed = TOLERANCE_M if unit == "m" else TOLERANCE_DEG
     if low - allowed <= value <= high + allowed:
         return ""
-    return f"{name} {value:.3g} {unit}, {low:g} to {high:g} trained"
+    shown = round(value, 3 if unit == "m" else 1) + 0.0  # no "-0"
+    return f"{name} {shown:g} {unit}, {low:g} to {high:g} trained"

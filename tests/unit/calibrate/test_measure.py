@@ -3,6 +3,8 @@ from collections.abc import Mapping
 from dataclasses import replace
 from datetime import date
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -230,6 +232,30 @@ def test_measure_occluder_refuses_a_lidar_that_moved(
 ) -> None:
     with pytest.raises(WallRefusedError, match=amount):
         measure_occluder(bench_seen(lidar=lidar), bare)
+
+
+@pytest.mark.parametrize("distance_m", [0.19, 0.21])
+def test_wall_that_moved_far_is_taken_for_no_occluder(
+    seen: CaptureStatistics, bare: MeasuredWall, distance_m: float
+) -> None:
+    depth_m = seen.statistics.depth.mean_m().astype(np.float32)
+    reference: Any = SimpleNamespace(
+        depth_m=depth_m, inliers=np.isfinite(depth_m), intrinsics=INTRINSICS
+    )
+    moved = bench_seen(lidar=LidarPose(distance_m=distance_m, yaw_deg=45.0))
+
+    with pytest.raises(WallRefusedError, match=r"the lidar has moved .* 10\.0 mm"):
+        measure_occluder(moved, replace(bare, reference=reference))
+
+
+@pytest.mark.parametrize(("tape_m", "verdict"), [(0.205, "good"), (0.214, "doubtful")])
+def test_tape_far_from_the_lidar_is_doubtful(
+    seen: CaptureStatistics, tape_m: float, verdict: str
+) -> None:
+    fit, _ = measure.measure_by_depth(seen, tape_m)
+
+    assert fit.verdict == verdict
+    assert ("from the glass again" in fit.advice) == (verdict == "doubtful")
 
 
 def test_measure_occluder_refuses_a_lidar_that_was_turned_over(bare: MeasuredWall) -> None:

@@ -87,6 +87,13 @@ def test_distance_and_angle_are_left_to_the_wall(bench: Rig) -> None:
     assert problems(bench, measured=False) == ()
 
 
+@pytest.mark.parametrize("yaw_deg", [-22.0, -45.0])
+def test_lidar_that_looks_away_from_the_object_is_told_to_turn(yaw_deg: float) -> None:
+    (problem,) = problems(rig(yaw_deg=yaw_deg), measured=False)
+
+    assert "away from the object" in problem
+
+
 @pytest.mark.parametrize(
     ("gap_m", "advice"),
     [
@@ -204,14 +211,14 @@ def test_judge_rig_advises_an_occluder_where_there_is_none() -> None:
 
 
 def test_judge_rig_advises_the_least_turn_to_the_occluder() -> None:
-    (problem,) = problems(rig(yaw_deg=-45.0))
+    (problem,) = problems(rig(0.3, 0.05, yaw_deg=5.0))
     turn = amount(problem, "degrees")
 
     def seen(yaw_deg: float) -> float:
-        bench = rig(yaw_deg=yaw_deg)
+        bench = rig(0.3, 0.05, yaw_deg=yaw_deg)
         return wall_visible_share(bench, bench.object_box, seen_by(bench))
 
-    assert seen(turn - 45.0) >= rig_check.MIN_SEEN > seen(turn - 46.0)
+    assert seen(turn + 5.0) >= rig_check.MIN_SEEN > seen(turn + 4.0)
 
 
 def test_judge_rig_widens_an_aperture_that_no_turn_opens() -> None:
