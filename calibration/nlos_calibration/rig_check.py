@@ -340,7 +340,7 @@ def judge_rig(rig: Rig, view: Footprint, occluder: OccluderRecord | None) -> tup
     if rig.occluder and not occluder:
         name += " (not measured, the paper's is assumed)"
     if rig.lidar.yaw_deg < 0.0 and not (rig.occluder and rig.occluder.x_m < 0.0):
-        # A finer turn in that direction would only look farther from the object.
+        # The other problems and their remedies take the lidar to look the right way.
         away = f"the lidar looks away from the object (yaw {rig.lidar.yaw_deg:.0f} degrees)"
         return (f"{away}: turn it to its right, or mirror the bench",)
     problems = _too_little_wall(rig, view)

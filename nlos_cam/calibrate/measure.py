@@ -312,14 +312,14 @@ def measure_occluder(
         )
     except OccluderRefusedError:
         # a wall that is centimetres off its record would pass for an occluder, or hide behind it
-        fits: list[walls.WallFit] = []
         if bare.reference is not None:
+            then_m, now_m = _in_common(bare.reference, offset_m, depth_m)
+            near = np.abs(now_m - then_m) < BESIDE_OCCLUDER_M
+            fits: list[walls.WallFit] = []
             with suppress(WallRefusedError):  # no wall to compare: the occluder's refusal says more
-                pair = _in_common(bare.reference, offset_m, depth_m)
-                near = np.abs(pair[1] - pair[0]) < BESIDE_OCCLUDER_M
-                fits = [fit_beside(np.where(near, each, np.nan)) for each in pair]
-        if fits:
-            _raise_if_moved(*fits)
+                fits = [fit_beside(np.where(near, each_m, np.nan)) for each_m in (then_m, now_m)]
+            if fits:
+                _raise_if_moved(*fits)
         raise
     # the wall is fitted again beside the occluder: if the lidar moved, the occluder's place would
     # be wrong as well

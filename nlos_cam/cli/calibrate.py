@@ -445,38 +445,25 @@ def _bare_wall(source: Path) -> walls.MeasuredWall:
     return benches.load_bare_wall(source) if source.is_dir() else walls.load_measured(source)
 
 
-def _is_of_simulated_bag(record: walls.WallRecord) -> bool:
-    """Return whether a record is of a recording of the simulated camera, whose scene it does not
-    name.
-    """
-    return record.camera.startswith("bag:") and not cameras.camera_to_name(record).startswith(
-        "l515"
-    )
-
-
-def _source_to_name(record: walls.WallRecord) -> str:
-    """Return the options of a next measurement of the same bench."""
-    if _is_of_simulated_bag(record):
-        return "--bag F.bag"
-    return f"--camera {cameras.camera_to_name(record)}"
-
-
 def _next_step(folder: Path, record: walls.WallRecord, served: reconstruct.WeightsVerdict) -> str:
     """Return the command to go on with; weights of its own come before live pictures where the
     bench needs them.
     """
     name = shlex.quote(str(folder))
+    camera = cameras.camera_to_name(record)
+    source = f"--camera {camera}"
+    live = f"nlos-cam live {source} --bench {name}"
+    # A recording of the simulated camera does not name its scene.
+    if record.camera.startswith("bag:") and camera.startswith("sim:"):
+        source = "--bag F.bag"
+        live = f"nlos-cam replay F.bag --bench {name}"
     if record.verdict == "doubtful":
         return "mend what makes the record doubtful, and measure again"
     if record.occluder is None:
-        occluder = f"nlos-cam calibrate --occluder {name} {_source_to_name(record)}"
-        step = f"put the occluder up, then {occluder}"
+        step = f"put the occluder up, then nlos-cam calibrate --occluder {name} {source}"
         if record.verdict == "out of range":
             step = f"correct it, and give the same command with --overwrite; or {step}"
         return step
-    live = f"nlos-cam live --camera {cameras.camera_to_name(record)} --bench {name}"
-    if _is_of_simulated_bag(record):
-        live = f"nlos-cam replay F.bag --bench {name}"
     # An adaptation from before is to the rig that was just replaced.
     again = " --overwrite" if (folder / WORK / adaptation.PLAN).exists() else ""
     return live if served.serve else f"nlos-cam adapt {name} --minutes 10{again}, then {live}"

@@ -47,7 +47,7 @@ def setting_as_started(camera: Camera) -> Setting:
     """Return the options that an entered camera started with, so that a session which goes on later
     is measured under them too: a lidar may choose its laser power at every start.
     """
-    return _as_started(_accepted_options(camera))
+    return _as_started(_swept_options(camera))
 
 
 def _as_started(swept: Mapping[str, Mapping[str, Any]]) -> Setting:
@@ -56,21 +56,17 @@ def _as_started(swept: Mapping[str, Mapping[str, Any]]) -> Setting:
 
 
 def _swept_options(camera: Camera) -> dict[str, dict[str, Any]]:
-    """Return the options of an entered camera that a sweep changes; none of one without options."""
-    options = camera.adjustable() if isinstance(camera, AdjustableCamera) else []
-    return {each["name"]: each for each in options if each["name"] in SWEPT}
+    """Return the options of an entered camera that a sweep changes; none of one without options.
 
-
-def _accepted_options(camera: Camera) -> dict[str, dict[str, Any]]:
-    """Return the options that an entered camera takes again at their present values: each turn sets
-    them, and a firmware may refuse some.
+    Only those that it takes again at their present values: each turn sets them, and a firmware may
+    refuse some.
     """
     if not isinstance(camera, AdjustableCamera):
         return {}
     return {
-        name: each
-        for name, each in _swept_options(camera).items()
-        if _accepts(camera, name, float(each["value"]))
+        each["name"]: each
+        for each in camera.adjustable()
+        if each["name"] in SWEPT and _accepts(camera, each["name"], float(each["value"]))
     }
 
 
@@ -80,7 +76,7 @@ def swept_settings(camera: Camera) -> tuple[Setting, ...]:
 
     Raises CameraError for a camera without options.
     """
-    swept = _accepted_options(camera)
+    swept = _swept_options(camera)
     if not isinstance(camera, AdjustableCamera) or not swept:
         raise CameraError(f"{camera.uri} offers no options to sweep: leave out --settings sweep")
     as_started = _as_started(swept)

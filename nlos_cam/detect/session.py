@@ -92,15 +92,17 @@ class Session:
         Where one was deleted before a later one of its block, the whole block is: with turns of two
         days, the drift that each block's contrast leaves out would take the object along.
         """
-        turns = range(self.plan.turns)
-        there = [self.path(turn).exists() for turn in turns]
-
-        def goes_on(turn: int) -> bool:
-            block = turn - turn % BLOCK_TURNS
-            states = there[block : block + BLOCK_TURNS]
-            return not there[turn] or states != sorted(states, reverse=True)
-
-        return [turn for turn in turns if goes_on(turn)]
+        missing: list[int] = []
+        for first in range(0, self.plan.turns, BLOCK_TURNS):
+            block = range(first, first + BLOCK_TURNS)
+            there = [self.path(turn).exists() for turn in block]
+            has_hole = there != sorted(there, reverse=True)
+            missing += [
+                turn
+                for turn, is_there in zip(block, there, strict=True)
+                if has_hole or not is_there
+            ]
+        return missing
 
     def turns(self) -> list[Turn]:
         """Read the turns of all whole blocks from the start on. Raises RecordingError for a file

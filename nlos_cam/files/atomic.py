@@ -133,7 +133,7 @@ def _rename_new(part: Path, out: Path) -> None:
 
 
 def _is_dropped(entry: Path, drop: Collection[str]) -> bool:
-    is_folder = entry.is_dir() and not entry.is_symlink()
+    is_folder = entry.is_dir()
     name = f"{entry.name}/" if is_folder else entry.name
     return any(fnmatch(name, pattern) for pattern in drop if pattern.endswith("/") == is_folder)
 
@@ -154,7 +154,10 @@ def _replace_directory(part: Path, out: Path, folder: Path, drop: Collection[str
             (out / name).rename(folder / f"old {name}")
         (part / name).replace(out / name)
     for entry in dropped:
-        entry.rename(folder / f"old {entry.name}")
+        if entry.is_dir() and not entry.is_symlink():
+            shutil.rmtree(entry)
+        else:
+            entry.unlink()
 
 
 def _link_all(entries: list[Path], target: Path) -> bool:

@@ -1,7 +1,6 @@
 """Descriptions of folders, known by a file that each kind holds."""
 
 import csv
-import hashlib
 import shlex
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -12,7 +11,7 @@ from nlos_models import RECORD, TRAINING_LOG, load_record
 from nlos_cam.bench import MANIFEST, is_bench, load_bench
 from nlos_cam.camera import camera_to_name
 from nlos_cam.errors import RecordingError
-from nlos_cam.files import CHECKSUMS, TEXT_LIMIT, checksums_of, read_bounded
+from nlos_cam.files import CHECKSUMS, TEXT_LIMIT, damaged_files, read_bounded
 from nlos_cam.info.files import (
     Description,
     count,
@@ -126,15 +125,13 @@ def describe_weights(folder: Path, _verify: bool) -> Description:
 
 def _checksum_problem(folder: Path) -> str:
     """Return the first file that is missing or differs from its checksum; empty if none does."""
-    for name, digest in checksums_of(folder).items():
-        file = folder / name
-        if not file.exists():
-            return f"{file} is missing: copy the weights again"
-        if hashlib.sha256(file.read_bytes()).hexdigest() != digest:
-            return (
-                f"{file} is damaged (its checksum differs from {CHECKSUMS}): copy the weights again"
-            )
-    return ""
+    damaged = damaged_files(folder)
+    if not damaged:
+        return ""
+    file = folder / damaged[0]
+    if not file.exists():
+        return f"{file} is missing: copy the weights again"
+    return f"{file} is damaged (its checksum differs from {CHECKSUMS}): copy the weights again"
 
 
 def describe_run(folder: Path, _verify: bool) -> Description:

@@ -8,6 +8,7 @@ from collections import Counter, deque
 from collections.abc import Callable, Collection
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass, replace
+from glob import escape
 from math import isfinite
 from pathlib import Path
 from tempfile import TemporaryFile
@@ -291,7 +292,8 @@ def _written_before(out: Path) -> list[str]:
     streams = earlier.get("streams") if isinstance(earlier, dict) else None
     if not isinstance(streams, dict):
         return []
-    return [f"{POINTS}/", *(f"{name}{end}" for name in streams for end in ("/", ".csv", ".npz"))]
+    names = [escape(name) for name in streams]  # whatever the file says, no name is a pattern
+    return [f"{POINTS}/", *(f"{name}{end}" for name in names for end in ("/", ".csv", ".npz"))]
 
 
 class _Instants:

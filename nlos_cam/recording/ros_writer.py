@@ -5,6 +5,7 @@ import logging
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
+from glob import escape
 from math import floor
 from pathlib import Path
 from threading import Event
@@ -108,7 +109,7 @@ def export_ros2(
     damage = ""
     name = out.resolve().name
     # an earlier export's in the other storage would be read with this one's metadata
-    with atomic_directory(out, drop=(f"{name}.db3", f"{name}.mcap")) as part:
+    with atomic_directory(out, drop=[f"{escape(name)}.{end}" for end in ("db3", "mcap")]) as part:
         # rosbags names its files by the folder, which it has to make itself.
         folder = part / name
         plugin = StoragePlugin.MCAP if options.storage == "mcap" else StoragePlugin.SQLITE3

@@ -19,12 +19,10 @@ from nlos_cam.recording import FRAME_STEM, FrameNames
 
 OBJECT_FORMATS = ("ply", "glb", "obj", "csv", "npz", "points")
 """Suffixes of `SurfaceMesh.save`, and "points" for a .ply without faces."""
-OBJECT_FILE = re.compile(rf"{FRAME_STEM}(-points\.ply|\.(ply|glb|obj|csv|npz))")
+ENDINGS = {name: "-points.ply" if name == "points" else f".{name}" for name in OBJECT_FORMATS}
+OBJECT_FILE = re.compile(rf"{FRAME_STEM}({'|'.join(map(re.escape, ENDINGS.values()))})")
 """Names that ObjectFiles gives."""
-OBJECT_PATTERNS = tuple(
-    f"[0-9][0-9][0-9][0-9][0-9][0-9]*{suffix}"
-    for suffix in ("-points.ply", ".ply", ".glb", ".obj", ".csv", ".npz")
-)
+OBJECT_PATTERNS = [f"[0-9][0-9][0-9][0-9][0-9][0-9]*{ending}" for ending in ENDINGS.values()]
 """The same names, as patterns of `fnmatch`."""
 
 
@@ -56,12 +54,9 @@ class ObjectFiles:
         self.folder.mkdir(exist_ok=True)
         stem = self._names.stem(number)
         for name in self.formats:
-            if name == "points":
-                path = self.folder / f"{stem}-points.ply"
-                path.write_bytes(mesh.points_only.as_bytes(".ply"))
-            else:
-                path = self.folder / f"{stem}.{name}"
-                path.write_bytes(mesh.as_bytes(f".{name}"))
+            path = self.folder / f"{stem}{ENDINGS[name]}"
+            surface = mesh.points_only if name == "points" else mesh
+            path.write_bytes(surface.as_bytes(path.suffix))
         self.written += 1
 
 

@@ -159,7 +159,7 @@ class Playback(PlaybackViewer):
         frames = deque[Frame](maxlen=FRAMES_BEFORE + 1)
         with open_camera(self._camera.uri) as camera:
             for frame in camera:
-                if self.closed:
+                if self._closed:
                     raise NlosCamError("the view ends: nothing was exported")
                 frames.append(frame)
                 if self._is_at(frame, number, time_s):

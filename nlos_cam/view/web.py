@@ -228,11 +228,6 @@ class PlaybackViewer(Website):
         super().__exit__()
         self._file.close()
 
-    @property
-    def closed(self) -> bool:
-        """True once the view is being left, in any thread."""
-        return self._closed
-
     def show(self, moment: Moment) -> None:
         self._keep(self._chunks.add(moment))
 

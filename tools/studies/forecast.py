@@ -214,7 +214,7 @@ def draw(
         ]
         if pairs:
             axis.scatter(*np.array(pairs).T, marker=marker, label=f"network: {kind}")
-    linear = [(each["expected_iou"] - found["offset"]) / found["slope"] for each in benches]
+    linear = [(bench["expected_iou"] - found["offset"]) / found["slope"] for bench in benches]
     reached = [bench["network_iou"] for bench in benches]
     axis.scatter(linear, reached, marker="s", label="five benches after an hour")
     ends = np.array([0.4, 0.85])

@@ -140,6 +140,17 @@ def test_atomic_directory_replaces_entries_by_name(
     assert [path.name for path in tmp_path.iterdir()] == ["out"]
 
 
+def test_dropped_files_are_no_folders_nor_links_to_them(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    (out / "folder").mkdir(parents=True)
+    (out / "link").symlink_to(out / "folder")
+    (out / "old.txt").write_text("old")
+    with atomic_directory(out, drop=["*"]) as part:
+        (part / "new.txt").write_text("new")
+
+    assert sorted(path.name for path in out.iterdir()) == ["folder", "link", "new.txt"]
+
+
 def overwrite_and_die(out: Path, calls: int) -> None:
     """Write a directory over another, and die before the call of the system with this number that
     renames or links.

@@ -6,6 +6,7 @@ import multiprocessing
 import os
 import signal
 import threading
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 from unittest.mock import Mock
@@ -85,17 +86,22 @@ def hold(path: Path, ready: Any) -> None:
         threading.Event().wait(60)
 
 
-def test_next_claim_removes_parts_of_the_killed_alone(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def kill_within(work: Callable[[Path, Any], None], path: Path) -> None:
+    """Kill a process that has done its work on a path and holds the claim."""
     ready = FORK.Event()
-    process = FORK.Process(target=hold, args=(tmp_path / "a", ready))
+    process = FORK.Process(target=work, args=(path, ready))
     process.start()
 
     assert ready.wait(20)
 
     os.kill(process.pid or 0, signal.SIGKILL)
     process.join()
+
+
+def test_next_claim_removes_parts_of_the_killed_alone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    kill_within(hold, tmp_path / "a")
     (tmp_path / ".mine.part").mkdir()  # somebody else's, without our lock
 
     assert (tmp_path / ".a.part" / "part").exists()
@@ -123,14 +129,7 @@ def test_next_claim_puts_back_what_the_killed_had_taken_away(
     tmp_path: Path, next_name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (tmp_path / "a").write_text("old", encoding="utf-8")
-    ready = FORK.Event()
-    process = FORK.Process(target=replace_and_hang, args=(tmp_path / "a", ready))
-    process.start()
-
-    assert ready.wait(20)
-
-    os.kill(process.pid or 0, signal.SIGKILL)
-    process.join()
+    kill_within(replace_and_hang, tmp_path / "a")
     monkeypatch.setattr("nlos_cam.files.claims._swept", set())
     with claim(tmp_path / next_name):
         assert (tmp_path / "a").read_text(encoding="utf-8") == "old"

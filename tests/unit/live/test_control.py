@@ -1,6 +1,7 @@
 import json
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Generator, Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from threading import Event
@@ -518,14 +519,22 @@ def test_no_command_begins_while_the_run_ends(
     assert control.status()["control"]["commands"] == []
 
 
+@contextmanager
+def attached(
+    control: RunControl, world: Any, clock: Any
+) -> Generator[tuple[SimulatedCamera, Iterator[Frame]]]:
+    """A simulated camera that a run's commands control, and the frames that pass them."""
+    with SimulatedCamera("sim:noise", world, clock=clock) as camera:
+        control.attach(camera, Pipeline(CalibratedRig(RIG), sheet_network))
+        yield camera, control.watch(camera)
+
+
 def test_recording_that_the_camera_ended_is_called_lost(
     tmp_path: Path, noise_world: Any, hurried_clock: Any
 ) -> None:
     wall = RIG, WallFile(path="wall.toml", sha256="0" * 64)
     control = RunControl(folder=tmp_path, wall=wall)
-    with SimulatedCamera("sim:noise", noise_world(), clock=hurried_clock()) as camera:
-        control.attach(camera, Pipeline(CalibratedRig(RIG), sheet_network))
-        frames = control.watch(camera)
+    with attached(control, noise_world(), hurried_clock()) as (camera, frames):
         next(frames)
         camera.counts["duplicate"] = 4  # before the recording
         control.run("record", {})
@@ -548,9 +557,7 @@ def test_recording_is_not_read_back_in_a_hurry(
     tmp_path: Path, noise_world: Any, hurried_clock: Any
 ) -> None:
     control = RunControl(folder=tmp_path)
-    with SimulatedCamera("sim:noise", noise_world(), clock=hurried_clock()) as camera:
-        control.attach(camera, Pipeline(CalibratedRig(RIG), sheet_network))
-        frames = control.watch(camera)
+    with attached(control, noise_world(), hurried_clock()) as (_, frames):
         control.run("record", {})
         for _ in range(10):
             next(frames)
@@ -575,9 +582,7 @@ def test_page_says_that_a_recording_has_no_room(
     tmp_path: Path, noise_world: Any, hurried_clock: Any
 ) -> None:
     control = RunControl(folder=tmp_path)
-    with SimulatedCamera("sim:noise", noise_world(), clock=hurried_clock()) as camera:
-        control.attach(camera, Pipeline(CalibratedRig(RIG), sheet_network))
-        frames = control.watch(camera)
+    with attached(control, noise_world(), hurried_clock()) as (_, frames):
         next(frames)
         control.run("record", {})
         before = control.status()

@@ -120,6 +120,18 @@ def test_export_replaces_an_earlier_one_and_keeps_other_files(
     ]
 
 
+def test_export_takes_no_name_of_an_earlier_one_for_a_pattern(
+    noise_bag: Path, tmp_path: Path
+) -> None:
+    out = tmp_path / "out"
+    out.mkdir()
+    (out / INFO).write_text('{"streams": {"*": {}}}')
+    (out / "mine.csv").write_text("mine")
+    exported(noise_bag, out, streams=["infrared"], format="npz")
+
+    assert (out / "mine.csv").read_text() == "mine"
+
+
 def test_export_that_is_stopped_keeps_written_frames(noise_bag: Path, tmp_path: Path) -> None:
     stop = Event()
     seen = []
