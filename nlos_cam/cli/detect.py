@@ -92,7 +92,12 @@ def detect(
     bench_folder: benches.BenchFolder = None,
     turns: Annotated[
         int | None,
-        typer.Option("--turns", min=8, max=4096, help="Turns, a multiple of 4 (default: 32)."),
+        typer.Option(
+            "--turns",
+            min=16,
+            max=4096,
+            help="Turns, a multiple of 4; --alpha 0.01 needs at least 32 (default: 32).",
+        ),
     ] = None,
     frames: Annotated[
         int | None,
@@ -160,10 +165,11 @@ def detect(
     folder = folder.resolve() if folder.is_symlink() else folder  # --overwrite keeps a link
     chosen = benches.choose(bench_folder, wall, reconstructs=False)
     goes_on = detection.is_session(folder) and not overwrite
-    before = detection.Session.open(folder).plan if goes_on else None
-    asked.check(camera, before)
+    existing = detection.Session.open(folder) if goes_on else None
+    asked.check(camera, existing)
     source = _open(camera)
     with interrupted_by_signals(f"whole turns are in {folder}; {detection.how_to_go_on(folder)}"):
+        before = existing.plan if existing else None
         session = _measure(source, chosen, asked, before, folder)
         _report(session, show_serial=show_serial, as_json=json)
 
@@ -211,13 +217,18 @@ class Asked(NamedTuple):
         why = f"the turns in {folder} are analyzed by the plan they were measured by"
         refuse_ignored(why, given | others, "give a camera in place of the folder")
 
-    def check(self, uri: str, before: detection.Plan | None) -> None:
-        """Raise typer.BadParameter for a wrong number, before the camera is opened."""
-        self._plan(before, camera=uri)
-        if before and self.seed not in {None, before.seed}:
+    def check(self, uri: str, existing: detection.Session | None) -> None:
+        """Check before the camera is opened. Raises typer.BadParameter for a wrong number,
+        RecordingError for another plan than that of the session that goes on.
+        """
+        plan = self._plan(existing.plan if existing else None, camera=uri)
+        if existing is None:
+            return
+        existing.refuse_another(plan)
+        if self.seed not in {None, existing.plan.seed}:
             raise typer.BadParameter(
                 f"--seed {self.seed} draws another order of turns than the session that goes on"
-                f" (seed {before.seed}): omit it, or choose another folder"
+                f" (seed {existing.plan.seed}): omit it, or choose another folder"
             )
 
     def plan(

@@ -2,6 +2,7 @@
 
 import json
 import shlex
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -16,7 +17,9 @@ from nlos_cam.files import TEXT_LIMIT, atomic_file, read_bounded
 PLAN = "detection.json"
 TURNS = "turn-*.npz"
 REPORT = "detection.html"
-TOGETHER = ("serial", "turns", "frames", "alpha", "control", "settings", "rig")
+ASKED = ("turns", "frames", "alpha", "control")
+"""Fields of the plan that a command gives by itself, before a camera is open."""
+TOGETHER = (*ASKED, "serial", "settings", "rig")
 """Fields of the plan that a command must repeat in order to go on with a session."""
 
 
@@ -37,12 +40,7 @@ class Session:
         if is_session(folder):
             session = cls.open(folder)
             # A real camera is known by its serial number; simulated ones share theirs.
-            for name in (*TOGETHER, "camera") if plan.is_simulated else TOGETHER:
-                if getattr(session.plan, name) != getattr(plan, name):
-                    raise RecordingError(
-                        f"{folder} was begun with another {name}: repeat that command, or choose"
-                        " another folder (a plan that changes midway has no false-alarm rate)"
-                    )
+            session.refuse_another(plan, (*TOGETHER, "camera") if plan.is_simulated else TOGETHER)
             return session
         if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
             raise OutputExistsError(
@@ -81,6 +79,18 @@ class Session:
             raise RecordingError(
                 f"{path} is not a valid plan ({first_problem(error)}): restore it, or begin again"
             ) from error
+
+    def refuse_another(self, plan: Plan, names: Sequence[str] = ASKED) -> None:
+        """Raise RecordingError for a plan with another value in one of the named fields."""
+        for name in names:
+            before, asked = getattr(self.plan, name), getattr(plan, name)
+            if before != asked:
+                is_number = name in ASKED and name != "control"
+                values = f" ({before}, not {asked})" if is_number else ""
+                raise RecordingError(
+                    f"{self.folder} was begun with another {name}{values}: repeat that command, or"
+                    " choose another folder (a plan that changes midway has no false-alarm rate)"
+                )
 
     def path(self, turn: int) -> Path:
         """Return the file of a turn, counted from 0."""

@@ -25,12 +25,17 @@ FILES: dict[str, tuple[str, Describe]] = {
     ".html": ("page", files.describe_page),
     ".h5": ("dataset shard", transients.describe_hdf5),
     ".hdf5": ("transient", transients.describe_transient),
+    ".obj": ("mesh", files.describe_mesh),
+    ".ply": ("mesh", files.describe_mesh),
+    ".stl": ("mesh", files.describe_mesh),
 }
 """Word for a damaged file, and reader, by suffix."""
 KINDS = (
     "recordings (.bag) and their sidecars (.json), .npz files, saved views and reports (.html),"
-    " wall, scene, rig and recipe files (.toml), dataset shards (.h5), transients (.hdf5), and the folders of benches,"
-    " datasets, training runs, weights, replays, exports, evaluations, detections and trade-offs"
+    " wall, scene, rig and recipe files (.toml), dataset shards (.h5), transients (.hdf5), meshes"
+    " and point clouds (.obj, .ply, .stl), and the folders of benches, recordings, datasets,"
+    " training runs, weights, replays, exports, files of frames, evaluations, detections and"
+    " trade-offs"
 )
 
 

@@ -1,6 +1,7 @@
 """Description of a file or folder, and readers of single files."""
 
 import json
+import re
 import shlex
 import tomllib
 import zlib
@@ -21,6 +22,8 @@ from nlos_cam.files import read_arrays, read_bounded, read_toml, with_commit
 from nlos_cam.view import SESSION_MARK
 
 MAX_TEXT_BYTES = 16 << 20
+MAX_HEAD_BYTES = 64 << 10
+"""Of a .ply file."""
 
 
 @dataclass(frozen=True)
@@ -122,6 +125,30 @@ def describe_bag(path: Path, verify: bool) -> Description:
         "every message" if verify else "index; --verify reads every message",
         following,
     )
+
+
+def describe_mesh(path: Path, _verify: bool) -> Description:
+    """Describe a mesh, or a point cloud of `export`, by its triangles or points and its size."""
+    from nlos_cam.objects import read_mesh
+
+    if points := _points_alone(path):
+        return Description("point cloud", {"points": points}, checked="head")
+    triangles = read_mesh(path).triangles
+    corners = triangles.reshape(-1, 3)
+    size = " x ".join(f"{side:.4g}" for side in np.ptp(corners, axis=0))
+    facts = {"triangles": str(len(triangles)), "size": f"{size} (x, y, z, in the file's unit)"}
+    following = [f"nlos-cam render {shlex.quote(str(path))}"]
+    return Description("mesh", facts, checked="all of it", next=following)
+
+
+def _points_alone(path: Path) -> str:
+    """Return the number of points of a .ply without faces; empty for any other file."""
+    with path.open("rb") as file:
+        head, end, _ = file.read(MAX_HEAD_BYTES).partition(b"end_header")
+    vertices = re.search(rb"^element vertex (\d+)", head, re.MULTILINE)
+    if not (head.startswith(b"ply") and end and vertices) or b"element face" in head:
+        return ""
+    return vertices[1].decode()
 
 
 REPLAYED = "result of a replay"

@@ -1,7 +1,9 @@
 """Descriptions of folders, known by a file that each kind holds."""
 
 import csv
+import re
 import shlex
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -21,6 +23,7 @@ from nlos_cam.info.files import (
     read_json,
 )
 from nlos_cam.reconstruct import rig_in_words
+from nlos_cam.recording import FRAME_STEM
 from nlos_cam.report import estimate_in_words
 
 
@@ -257,6 +260,43 @@ def _json(path: Path) -> Mapping[str, Any]:
     return found
 
 
+def describe_recordings(folder: Path, verify: bool) -> Description:
+    """Describe a folder of recordings, such as a bench's, from each one's index and sidecar."""
+    paths = sorted(folder.glob("*.bag"))
+    labels = dict[str, int]()
+    problem = ""
+    for path in paths:
+        try:
+            found = describe_bag(path, verify)
+        except RecordingError as error:
+            problem = problem or str(error)
+            continue
+        problem = problem or found.problem
+        label = found.facts.get("label", "none")
+        labels[label] = labels.get(label, 0) + 1
+    facts = {"recordings": str(len(paths))} | {
+        f"labeled {label}" if label != "none" else "without a label": str(number)
+        for label, number in sorted(labels.items())
+    }
+    checked = "every message" if verify else "indices; --verify reads every message"
+    following = [f"nlos-cam info {shlex.quote(str(path))}" for path in paths[:1]]
+    return Description("recordings", facts, "", "", problem, checked, following)
+
+
+def describe_frame_files(folder: Path, _verify: bool) -> Description:
+    """Describe a folder of files of single frames: images or point clouds of `export`, hidden
+    objects of `replay` or `live`.
+    """
+    names = [path.name for path in folder.glob(FRAME_FILES)]
+    numbers = sorted(int(re.split(r"\D", name, maxsplit=1)[0]) for name in names)
+    endings = Counter(re.sub(FRAME_STEM, "", name, count=1) for name in names)
+    facts = {ending: count(number, "file") for ending, number in sorted(endings.items())}
+    facts["frames"] = f"{numbers[0]} to {numbers[-1]}"
+    return Description("files of single frames", facts, checked="names of the files")
+
+
+FRAME_FILES = "[0-9][0-9][0-9][0-9][0-9][0-9]*.*"
+"""Names of files of single frames, which begin with the frame's number."""
 FOLDERS: list[tuple[str, str, Callable[[Path, bool], Description | None]]] = [
     (MANIFEST, "bench", describe_bench),
     ("metadata.yaml", "recording", describe_bag),
@@ -268,5 +308,7 @@ FOLDERS: list[tuple[str, str, Callable[[Path, bool], Description | None]]] = [
     ("figures.json", "evaluation", describe_figures),
     ("tradeoff.json", "trade-off", describe_tradeoff),
     ("detection.json", "detection", describe_detection),
+    ("*.bag", "recordings", describe_recordings),
+    (FRAME_FILES, "files of single frames", describe_frame_files),
 ]
 """File that each kind holds, kind and reader; the first that fits is taken."""

@@ -9,6 +9,7 @@ from contextlib import nullcontext
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
+from unittest.mock import Mock
 
 import pytest
 from made_benches import make_bench, wall_of
@@ -41,7 +42,7 @@ def test_stored_turns_are_analyzed_again(run: Run, tmp_path: Path) -> None:
 def test_folder_may_be_named_like_a_camera(run: Run, tmp_path: Path) -> None:
     folder = stored(tmp_path / "sim")
 
-    assert "multiple of 4" in run("detect", "sim", "--turns", 10, "--out", folder, code=2).err
+    assert "multiple of 4" in run("detect", "sim", "--turns", 18, "--out", folder, code=2).err
     assert run("detect", "./sim")["detected"]
 
 
@@ -115,16 +116,16 @@ def test_unknown_power_is_null_and_said_in_words(
 
 
 def test_wrong_number_of_turns_is_refused_in_one_line(run: Run, tmp_path: Path) -> None:
-    err = run("detect", "sim", "--turns", 10, "--out", tmp_path / "s", code=2).err
+    err = run("detect", "sim", "--turns", 18, "--out", tmp_path / "s", code=2).err
 
-    assert "error: turns must be a multiple of 4 (got 10)" in err
+    assert "error: turns must be a multiple of 4 (got 18)" in err
     assert not (tmp_path / "s").exists()
 
 
 def test_refused_command_overwrites_no_session(run: Run, tmp_path: Path) -> None:
     session = Session.start(tmp_path / "session", made_plan())
 
-    run("detect", "sim", "--turns", 10, "--out", session.folder, "--overwrite", code=2)
+    run("detect", "sim", "--turns", 18, "--out", session.folder, "--overwrite", code=2)
 
     assert Session.open(session.folder).plan == session.plan
 
@@ -155,6 +156,32 @@ def test_session_of_another_seed_is_refused(run: Run, tmp_path: Path) -> None:
 
     assert "the session that goes on (seed 3)" in err
     assert session.path(0).read_bytes() == b"measured"
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (("--turns", 36), "another turns (32, not 36)"),
+        (("--frames", 31), "another frames (30, not 31)"),
+        (("--alpha", 0.05), "another alpha (0.01, not 0.05)"),
+        (("--control",), "another control:"),
+    ],
+)
+def test_another_plan_is_refused_before_a_camera_is_open(
+    run: Run,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    options: tuple[Any, ...],
+    words: str,
+) -> None:
+    session = Session.start(tmp_path / "session", made_plan(frames=30, turns=32))
+    opened = Mock()
+    monkeypatch.setattr("nlos_cam.camera.open_camera", opened)
+
+    err = run("detect", "l515", *options, "--out", session.folder, code=4).err
+
+    assert words in err
+    assert not opened.called
 
 
 @pytest.mark.parametrize("words", [["l515", "--bench", "bench"], ["bench", "--camera", "l515"]])

@@ -27,6 +27,7 @@ from nlos_cam.dataset.shards import shard_path, store
 from nlos_cam.detect import Session
 from nlos_cam.errors import RecordingError
 from nlos_cam.info import Description, describe
+from nlos_cam.objects import SurfaceMesh
 from nlos_cam.recording import BagReader, ExportOptions, export_recording
 from nlos_cam.report import Document
 
@@ -100,6 +101,16 @@ def files(
     made["detection"] = session.folder
     made["plan of a detection"] = session.folder / "detection.json"
     made["turn of a detection"] = session.path(0)
+    made["mesh"] = folder / "triangle.obj"
+    made["mesh"].write_text("v 0 0 0\nv 1 0 0\nv 0 2 0\nf 1 2 3\n")
+    made["files of single frames"] = folder / "objects"
+    made["files of single frames"].mkdir()
+    surface = SurfaceMesh(np.zeros((3, 3)), np.array([[0, 1, 2]]))
+    made["point cloud"] = made["files of single frames"] / "000003-points.ply"
+    made["point cloud"].write_bytes(surface.points_only.as_bytes(".ply"))
+    made["recordings"] = folder / "recordings"
+    made["recordings"].mkdir()
+    shutil.copy(noise_bag, made["recordings"] / "a.bag")
     return made
 
 
@@ -123,6 +134,7 @@ KINDS = [
     ),
     *("figures of an evaluation", "table of a trade-off"),
     *("detection", "plan of a detection", "turn of a detection"),
+    *("mesh", "point cloud", "files of single frames", "recordings"),
 ]
 
 
@@ -142,6 +154,38 @@ def test_recording_has_its_frames_and_duration(files: dict[str, Path]) -> None:
 
     assert facts["depth"].startswith("20 frames, 30 per second")
     assert facts["duration"] == "0.6 s"
+
+
+def test_mesh_has_its_triangles_and_its_size(files: dict[str, Path]) -> None:
+    facts = describe(files["mesh"]).facts
+
+    assert facts["triangles"] == "1"
+    assert facts["size"].startswith("1 x 2 x 0 ")
+    assert describe(files["point cloud"]).facts == {"points": "3"}
+
+
+def test_folder_of_frames_counts_each_ending(tmp_path: Path) -> None:
+    for name in ("000001.ply", "000001-points.ply", "000003-2.ply", "1234567.csv"):
+        (tmp_path / name).touch()
+
+    facts = describe(tmp_path).facts
+
+    assert facts == {
+        "-points.ply": "1 file",
+        ".csv": "1 file",
+        ".ply": "2 files",
+        "frames": "1 to 1234567",
+    }
+
+
+def test_one_damaged_recording_makes_a_folder_damaged(noise_bag: Path, tmp_path: Path) -> None:
+    shutil.copy(noise_bag, tmp_path / "whole.bag")
+    (tmp_path / "cut.bag").write_bytes(noise_bag.read_bytes()[:100])
+
+    found = describe(tmp_path)
+
+    assert "cut.bag" in found.problem
+    assert found.facts["recordings"] == "2"
 
 
 def test_sample_is_the_packaged_recording() -> None:
@@ -194,7 +238,13 @@ def test_damaged_file_has_one_line_that_says_so(
     files: dict[str, Path], tmp_path: Path, kind: str, damage: str
 ) -> None:
     if files[kind].is_dir():
-        marks = {"dataset": "shard-*.h5", "weights": "checkpoint.json", "training run": "log.csv"}
+        marks = {
+            "dataset": "shard-*.h5",
+            "weights": "checkpoint.json",
+            "training run": "log.csv",
+            "recordings": "*.bag",
+            "files of single frames": "*.ply",
+        }
         source = next(files[kind].glob(marks.get(kind, "*.json")))
         place = tmp_path
     else:
@@ -209,7 +259,8 @@ def test_damaged_file_has_one_line_that_says_so(
     assert "\n" not in found.problem
     assert "Traceback" not in found.problem
 
-    if damage in {"cut", "noise"} and kind not in {"training run", "scene of the simulated camera"}:
+    unread = {"training run", "scene of the simulated camera", "files of single frames"}
+    if damage in {"cut", "noise"} and kind not in unread:
         assert str(place) in found.problem or source.name in found.problem
 
 
