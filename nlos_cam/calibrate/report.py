@@ -10,7 +10,7 @@ import nlos_calibration as walls
 
 from nlos_cam.calibrate.report_drawings import bench_picture, footprint_picture
 from nlos_cam.calibrate.report_maps import wall_maps
-from nlos_cam.camera import camera_to_name
+from nlos_cam.camera import pictures_command
 from nlos_cam.report import Picture, bullets, commands, figure, page, pairs, table
 
 BAR_WIDTH = 640.0
@@ -230,10 +230,10 @@ def usage(record: walls.WallRecord, record_file: str) -> str:
     if record.reference:
         facts |= {"bare wall's reference": record.reference, "its SHA-256": record.reference_sha256}
     name = shlex.quote(record_file)
-    live = f"nlos-cam live --camera {camera_to_name(record)} --wall {name}"
-    lines = commands([live, f"nlos-cam render cup --rig {name}"])
+    pictures = pictures_command(record, f"--wall {name}")
+    lines = commands([pictures, f"nlos-cam render cup --rig {name}"])
     use = (
-        "Keep the files together. The first command shows the hidden object live; the second"
-        " renders for this bench."
+        "Keep the files together. The first command shows the hidden object; the second renders for"
+        " this bench."
     )
     return f"<section><h2>Files and use</h2>{pairs(facts)}<p>{use}</p>{lines}</section>"

@@ -40,6 +40,7 @@ __all__ = [
     "open_camera",
     "open_world",
     "pack_loop",
+    "pictures_command",
     "read_packaged",
     "recording_s",
     "render_loop",
@@ -47,6 +48,7 @@ __all__ = [
     "sample_from_sdk",
     "sdk_serial",
     "shared_context",
+    "source_to_name",
     "stream_name",
 ]
 
@@ -62,7 +64,16 @@ from .recorder import (
     recording_s,
     repair_command,
 )
-from .registry import NAMES, PLAIN_NAMES, SIMULATED, camera_to_name, full_uri, open_camera
+from .registry import (
+    NAMES,
+    PLAIN_NAMES,
+    SIMULATED,
+    camera_to_name,
+    full_uri,
+    open_camera,
+    pictures_command,
+    source_to_name,
+)
 from .sdk import MAC_WHEEL, WHEEL, load_sdk, sdk_serial
 from .session import QUEUED_SETS, find_streams
 from .simulated import SimulatedCamera, SoftwareLidar

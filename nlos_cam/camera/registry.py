@@ -95,3 +95,23 @@ def camera_to_name(wall: WallRecord) -> str:
     if is_simulated:
         return "sim:SCENE.toml"
     return wall.camera if wall.camera.startswith("l515") else "l515"
+
+
+def source_to_name(wall: WallRecord) -> str:
+    """Return the option of a `calibrate` to type next on a measured wall: --camera with its lidar,
+    or --bag for a recording of the simulated camera, which does not name its scene.
+    """
+    camera = camera_to_name(wall)
+    if wall.camera.startswith("bag:") and camera.startswith("sim:"):
+        return "--bag F.bag"
+    return f"--camera {camera}"
+
+
+def pictures_command(wall: WallRecord, rig_option: str) -> str:
+    """Return the command to type next for pictures on a measured wall: `live`, or `replay` where
+    only a recording shows the bench. `rig_option` names the bench, as in "--bench bench".
+    """
+    source = source_to_name(wall)
+    if source.startswith("--bag "):
+        return f"nlos-cam replay {source.removeprefix('--bag ')} {rig_option}"
+    return f"nlos-cam live {source} {rig_option}"

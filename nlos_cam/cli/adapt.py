@@ -160,12 +160,15 @@ def adapt(
         more += f" --frames {locked.frames} --radiometry {locked.radiometry}"
         more += f" --pulse-ns {sensor.pulse_ns:g} --material {material or 'matt'}"
     if folder and not locked:
-        camera = cameras.camera_to_name(measured.record) if measured else "l515"
-        live = f"nlos-cam live --camera {camera} --bench {name}"
+        pictures = (
+            cameras.pictures_command(measured.record, place)
+            if measured
+            else f"nlos-cam live --camera l515 {place}"
+        )
         if kept:
-            commands = [live]
+            commands = [pictures]
         elif _has_weights_of_another_rig(folder):
-            commands = [f"{live} --weights {shlex.quote(_better_weights(result, rig))}"]
+            commands = [f"{pictures} --weights {shlex.quote(_better_weights(result, rig))}"]
     # the pace that the plan was made with is that of these
     machines: dict[str, Any] = {
         "--out": out,

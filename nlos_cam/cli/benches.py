@@ -65,6 +65,8 @@ class Choice(NamedTuple):
         """Return the rig for an opened camera. Raises CalibrationError where they do not fit."""
         if self.bench:
             return self.bench.for_camera(camera)
+        if self.record is None:
+            _note_recorded_wall(camera.uri)
         return reconstruct.open_bench(self.record, camera)
 
     @property
@@ -132,6 +134,17 @@ def rig_or_default(bench: Path | None, rig: str | None, default: str) -> walls.R
     if walls.is_wall_record(name):
         _note_doubt(name, walls.load_wall(Path(name)))
     return found
+
+
+def _note_recorded_wall(uri: str) -> None:
+    """Print on which measured wall a recording was made, where the command names none."""
+    scheme, _, path = uri.partition(":")
+    wall = recordings.recorded_wall(Path(path)) if scheme == "bag" else None
+    if wall:
+        common.say(
+            f"note: {path} was recorded on the wall of {wall.path}: name its bench (--bench) or"
+            " this record (--wall)"
+        )
 
 
 def note_warnings(bench: reconstruct.CalibratedRig) -> None:

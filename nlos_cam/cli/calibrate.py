@@ -450,13 +450,8 @@ def _next_step(folder: Path, record: walls.WallRecord, served: reconstruct.Weigh
     bench needs them.
     """
     name = shlex.quote(str(folder))
-    camera = cameras.camera_to_name(record)
-    source = f"--camera {camera}"
-    live = f"nlos-cam live {source} --bench {name}"
-    # A recording of the simulated camera does not name its scene.
-    if record.camera.startswith("bag:") and camera.startswith("sim:"):
-        source = "--bag F.bag"
-        live = f"nlos-cam replay F.bag --bench {name}"
+    source = cameras.source_to_name(record)
+    pictures = cameras.pictures_command(record, f"--bench {name}")
     if record.verdict == "doubtful":
         return "mend what makes the record doubtful, and measure again"
     if record.occluder is None:
@@ -466,7 +461,9 @@ def _next_step(folder: Path, record: walls.WallRecord, served: reconstruct.Weigh
         return step
     # An adaptation from before is to the rig that was just replaced.
     again = " --overwrite" if (folder / WORK / adaptation.PLAN).exists() else ""
-    return live if served.serve else f"nlos-cam adapt {name} --minutes 10{again}, then {live}"
+    if served.serve:
+        return pictures
+    return f"nlos-cam adapt {name} --minutes 10{again}, then {pictures}"
 
 
 def _source(

@@ -16,7 +16,7 @@ from nlos_calibration import load_measured, load_rig, load_wall
 from nlos_models.training import load_recipe
 
 from nlos_cam.bench import load_bench_record
-from nlos_cam.camera import camera_to_name
+from nlos_cam.camera import pictures_command, source_to_name
 from nlos_cam.errors import NlosCamError, RecordingError
 from nlos_cam.files import read_arrays, read_bounded, read_toml, with_commit
 from nlos_cam.view import SESSION_MARK
@@ -328,11 +328,10 @@ def _wall(path: Path, quoted: str, verify: bool) -> Description:
             problem = f"its reference {reference} is missing: put it back, or calibrate again"
         elif verify:
             load_measured(path)
-    camera = camera_to_name(record)
-    following = [f"nlos-cam live --camera {camera} --wall {quoted}"]
+    following = [pictures_command(record, f"--wall {quoted}")]
     if record.occluder is None:
         following.append(
-            f"nlos-cam calibrate --occluder {quoted} --camera {camera} --out occluder.toml"
+            f"nlos-cam calibrate --occluder {quoted} {source_to_name(record)} --out occluder.toml"
         )
     return Description(
         "wall record",

@@ -11,7 +11,7 @@ from typing import Any
 from nlos_models import RECORD, TRAINING_LOG, load_record
 
 from nlos_cam.bench import MANIFEST, is_bench, load_bench
-from nlos_cam.camera import camera_to_name
+from nlos_cam.camera import pictures_command, source_to_name
 from nlos_cam.errors import RecordingError
 from nlos_cam.files import CHECKSUMS, TEXT_LIMIT, damaged_files, read_bounded
 from nlos_cam.info.files import (
@@ -37,8 +37,7 @@ def describe_bench(folder: Path, verify: bool) -> Description | None:
     record = bench.record
     quoted = shlex.quote(str(folder))
     facts = {"camera": record.camera.serial or "not known"}
-    camera = camera_to_name(bench.measured.record)
-    following = [f"nlos-cam live --camera {camera} --bench {quoted}"]
+    following = [pictures_command(bench.measured.record, f"--bench {quoted}")]
     for name, measured in bench.stations.items():
         wall = measured.record
         facts[f"station {name}"] = (
@@ -47,7 +46,8 @@ def describe_bench(folder: Path, verify: bool) -> Description | None:
         )
         facts[f"verdict on {name}"] = f"{wall.verdict}: {wall.advice}"
         if wall.occluder is None:
-            following.insert(0, f"nlos-cam calibrate --occluder {quoted} --camera {camera}")
+            source = source_to_name(bench.measured.record)
+            following.insert(0, f"nlos-cam calibrate --occluder {quoted} {source}")
     facts["weights"] = "its own" if bench.weights else "none: the shipped ones are used"
     created = f"{record.created:%Y-%m-%d %H:%M:%S} UTC"
     changed = f"{record.changed:%Y-%m-%d %H:%M:%S} UTC"

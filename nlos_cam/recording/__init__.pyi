@@ -29,6 +29,7 @@ __all__ = [
     "load_sidecar",
     "open_lidar_bag",
     "open_recording",
+    "recorded_wall",
     "repair_recording",
     "sidecar_path",
     "verify",
@@ -53,6 +54,7 @@ from .sidecar import (
     WallFile,
     load_measured_wall,
     load_sidecar,
+    recorded_wall,
     sidecar_path,
 )
 from .telemetry import Telemetry, with_telemetry

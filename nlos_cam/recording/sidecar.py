@@ -132,6 +132,14 @@ def load_sidecar(path: Path) -> Sidecar:
         raise RecordingError(f"{path} cannot be read: {describe(error)}") from error
 
 
+def recorded_wall(recording: Path) -> WallFile | None:
+    """Return the wall record that a recording's sidecar names; None without one."""
+    try:
+        return load_sidecar(sidecar_path(recording)).wall
+    except RecordingError:
+        return None
+
+
 def versions() -> dict[str, str]:
     """Return the versions of this program, its commit, librealsense's Python package and Python,
     and the platform.

@@ -332,6 +332,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path, help="folder of the results (default: docs)")
     asked = parser.parse_args()
     harness.claim(asked.work)
+    threads = torch.get_num_threads()
 
     places = [place for place in PLACES if any(place in each.split("+") for each in asked.sets)]
     folders = {place: rendered(place, asked.work, FIRST_SEED, asked.objects) for place in places}
@@ -339,6 +340,7 @@ def main() -> None:
         which: {place: test_maps(place, which) for place in places} for which in TESTS[:2]
     }
     sets[TESTS[2]] = {place: held_out(place, asked.work) for place in places}
+    torch.set_num_threads(threads)  # rendering set the number anew
     recipe = load_recipe(RECIPE)
     if not isinstance(recipe, DirectRecipe):
         raise SceneError(f"{RECIPE} is no recipe of a direct network")

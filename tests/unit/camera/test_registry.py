@@ -4,10 +4,17 @@ import tomllib
 from pathlib import Path
 
 import pytest
-from made_benches import make_bench
+from made_benches import make_bench, wall_of
 from packaging.requirements import Requirement
 
-from nlos_cam.camera import SIMULATED, open_camera
+from nlos_cam.camera import (
+    SIMULATED,
+    camera_to_name,
+    open_camera,
+    pictures_command,
+    source_to_name,
+)
+from nlos_cam.camera.protocol import SIMULATED_SERIAL
 from nlos_cam.camera.sdk import MAC_WHEEL, WHEEL, load_sdk, wheel_for
 from nlos_cam.errors import CameraError, CameraNotFoundError, UnknownCameraError
 from nlos_cam.recording import ReplayCamera
@@ -108,3 +115,24 @@ def test_wheel_is_the_one_that_the_package_requires(system: str, machine: str, m
 
     assert asked == ([wheel] if wheel else [])
     assert wheel in {WHEEL, MAC_WHEEL, None}
+
+
+@pytest.mark.parametrize(
+    ("serial", "measured_from", "source", "pictures"),
+    [
+        ("f123", "l515:f123", "--camera l515:f123", "live --camera l515:f123"),
+        ("f123", "bag:wall.bag", "--camera l515", "live --camera l515"),
+        (SIMULATED_SERIAL, "sim:a.toml", "--camera sim:SCENE.toml", "live --camera sim:SCENE.toml"),
+        (SIMULATED_SERIAL, "bag:wall.bag", "--bag F.bag", "replay F.bag"),
+    ],
+)
+def test_next_command_names_what_the_wall_was_measured_with(
+    serial: str, measured_from: str, source: str, pictures: str
+) -> None:
+    wall = wall_of(serial=serial, camera=measured_from).record
+
+    assert source_to_name(wall) == source
+    assert pictures_command(wall, "--bench b") == f"nlos-cam {pictures} --bench b"
+    assert camera_to_name(wall) == source.removeprefix("--camera ").replace(
+        "--bag F.bag", "sim:SCENE.toml"
+    )

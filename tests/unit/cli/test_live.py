@@ -36,6 +36,7 @@ from nlos_cam.live.statistics import RunReport
 from nlos_cam.reconstruct import CalibratedRig, OwnMaps, open_bench
 from nlos_cam.reconstruct.consistency import COMPLETE, MapConsistency
 from nlos_cam.reconstruct.verdict import Verdict
+from nlos_cam.recording import WallFile
 from nlos_cam.view import NullViewer, SessionFile
 
 TIMES = {"p50": 1.04, "p95": 2.0, "p99": 3.06}
@@ -215,6 +216,17 @@ def test_replay_on_a_wall_notes_that_the_rig_differs(run: Run) -> None:
         assert str(file["rig_name"]) == "measured"
 
     assert run(*WALLED, "none.toml", code=4)["error"]["type"] == "RecordFileError"
+
+
+@pytest.mark.usefixtures("opened")
+def test_replay_notes_the_wall_of_the_recording(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    wall = WallFile(path="my bench/wall.toml", sha256="a" * 64)
+    monkeypatch.setattr("nlos_cam.recording.recorded_wall", lambda _: wall)
+    write_wall(Path("wall.toml"))
+
+    note = "run.bag was recorded on the wall of my bench/wall.toml"
+    assert note in run(*REPLAY).err
+    assert note not in run(*WALLED, "wall.toml").err
 
 
 def test_replay_writes_its_folder_and_one_json_object(opened: Opened, run: Run) -> None:

@@ -18,6 +18,7 @@ from nlos_cam.recording import (
     SidecarFile,
     VerifyResult,
     load_sidecar,
+    recorded_wall,
     sidecar_path,
 )
 from nlos_cam.recording.quality import MIN_PAIRS, Quality, QualityMeter
@@ -199,6 +200,8 @@ def test_sidecar_prefers_the_rig_of_a_measured_wall(
 
     assert found.rig == rig == record.rig != bench
     assert found.wall.sha256 == hashlib.sha256(wall_toml.read_bytes()).hexdigest()
+    assert recorded_wall(path.with_suffix(".bag")) == wall
+    assert recorded_wall(tmp_path / "none.bag") is None
 
     with pytest.raises(RecordFileError):
         load_measured_wall(tmp_path / "none.toml")
