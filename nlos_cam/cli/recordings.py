@@ -30,7 +30,8 @@ AnyBag = Annotated[
     Path,
     typer.Argument(
         metavar="FILE",
-        help="Recording of any RealSense camera, or with --object a reconstruction.npz.",
+        help="Recording of any RealSense camera, or with --object a replay's folder or its"
+        " reconstruction.npz.",
     ),
 ]
 Folder = Annotated[Path | None, typer.Option("--out", help="Folder to write.")]
@@ -155,6 +156,8 @@ def export(
     if metres or storage != "sqlite3":
         raise typer.BadParameter("--metres and --storage need --ros2")
     folder = common.output_path(out, "export", "", overwrite=overwrite)
+    if (bag / replays.RESULT).is_file():
+        bag = bag / replays.RESULT  # the folder of a replay stands for its result
     if bag.suffix == ".npz" or as_object:
         if form != "png" or ply or streams:
             raise typer.BadParameter(

@@ -1,6 +1,7 @@
 __all__ = [
     "OBJECT_FORMATS",
     "REPORT",
+    "RESULT",
     "VIDEO",
     "Playback",
     "ReplayMedia",
@@ -11,4 +12,4 @@ __all__ = [
 from .media import VIDEO, ReplayMedia
 from .object_files import OBJECT_FORMATS, export_objects
 from .playback import Playback
-from .replay import REPORT, replay_recording
+from .replay import REPORT, RESULT, replay_recording

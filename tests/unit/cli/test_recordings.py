@@ -8,6 +8,7 @@ from collections.abc import Callable
 from pathlib import Path
 from threading import Event
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -103,6 +104,21 @@ def test_interrupted_export_of_objects_says_what_it_kept(
 
     assert "holds the surfaces until then" in printed.err
     assert "nothing was written" not in printed.err
+
+
+def test_folder_of_a_replay_stands_for_its_result(
+    shown: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    export = Mock(return_value=2)
+    monkeypatch.setattr("nlos_cam.replay.export_objects", export)
+    result = tmp_path / "replayed" / "reconstruction.npz"
+    result.parent.mkdir()
+    result.touch()
+
+    shown("export", result.parent, "--object", "ply", "--out", tmp_path / "out")
+    shown("export", result.parent, "--out", tmp_path / "out", code=2)
+
+    assert [call.args[0] for call in export.call_args_list] == [result]
 
 
 def test_export_reports_its_files_and_overwrites_if_asked(
