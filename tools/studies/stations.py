@@ -2,7 +2,7 @@
 docs/images/stations.png.
 
     python tools/studies/stations.py WORK [--objects N] [--samples M] [--seeds S] [--sets NAMES ...]
-        [--compile]
+        [--compile] [--name NAME]
 
 The same objects are rendered on the paper's bench for a lidar at "home" (0.20 m from the wall),
 "near" (0.15 m) and "back" (0.10 m farther from the object), and for an occluder whose gap is "wide"
@@ -330,6 +330,7 @@ def main() -> None:
     parser.add_argument("--sets", nargs="+", default=SETS, help="stations joined by +")
     parser.add_argument("--compile", action="store_true", help="needs a C++ compiler (g++)")
     parser.add_argument("--out", type=Path, help="folder of the results (default: docs)")
+    parser.add_argument("--name", default="stations", help="of the results' files")
     asked = parser.parse_args()
     harness.claim(asked.work)
     threads = torch.get_num_threads()
@@ -392,8 +393,8 @@ def main() -> None:
                     "samples": asked.samples,
                     "stations": found,
                 }
-                harness.write("stations", facts, asked.out)
-    harness.save("stations", draw(found), asked.out, dpi=110)
+                harness.write(asked.name, facts, asked.out)
+    harness.save(asked.name, draw(found), asked.out, dpi=110)
 
 
 if __name__ == "__main__":
