@@ -23,7 +23,7 @@ from nlos_cam.info.files import (
     read_json,
 )
 from nlos_cam.reconstruct import rig_in_words
-from nlos_cam.recording import FRAME_STEM
+from nlos_cam.recording import FRAME_GLOB, FRAME_STEM
 from nlos_cam.report import estimate_in_words
 
 
@@ -263,7 +263,7 @@ def _json(path: Path) -> Mapping[str, Any]:
 def describe_recordings(folder: Path, verify: bool) -> Description:
     """Describe a folder of recordings, such as a bench's, from each one's index and sidecar."""
     paths = sorted(folder.glob("*.bag"))
-    labels = dict[str, int]()
+    labels = Counter[str]()
     problem = ""
     for path in paths:
         try:
@@ -272,8 +272,7 @@ def describe_recordings(folder: Path, verify: bool) -> Description:
             problem = problem or str(error)
             continue
         problem = problem or found.problem
-        label = found.facts.get("label", "none")
-        labels[label] = labels.get(label, 0) + 1
+        labels[found.facts.get("label", "none")] += 1
     facts = {"recordings": str(len(paths))} | {
         f"labeled {label}" if label != "none" else "without a label": str(number)
         for label, number in sorted(labels.items())
@@ -295,8 +294,7 @@ def describe_frame_files(folder: Path, _verify: bool) -> Description:
     return Description("files of single frames", facts, checked="names of the files")
 
 
-FRAME_FILES = "[0-9][0-9][0-9][0-9][0-9][0-9]*.*"
-"""Names of files of single frames, which begin with the frame's number."""
+FRAME_FILES = f"{FRAME_GLOB}.*"
 FOLDERS: list[tuple[str, str, Callable[[Path, bool], Description | None]]] = [
     (MANIFEST, "bench", describe_bench),
     ("metadata.yaml", "recording", describe_bag),

@@ -1,4 +1,5 @@
 __all__ = [
+    "FRAME_GLOB",
     "FRAME_STEM",
     "SAMPLE",
     "BagReader",
@@ -40,7 +41,7 @@ from .bag_reader import SAMPLE, BagReader
 from .capture import CaptureResult, CaptureSession, CaptureTarget, finalize
 from .export import ExportOptions, ExportResult, Format, export_recording
 from .formats import is_ros2, open_recording
-from .frame_names import FRAME_STEM, FrameNames
+from .frame_names import FRAME_GLOB, FRAME_STEM, FrameNames
 from .playback import ReplayCamera, VerifyResult, open_lidar_bag, verify
 from .quality import QualityMeter
 from .repair import RepairResult, repair_recording

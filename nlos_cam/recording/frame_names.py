@@ -4,6 +4,8 @@ from collections import Counter
 
 FRAME_STEM = r"\d{6,}(-\d+)?"
 """Pattern of a frame's stem."""
+FRAME_GLOB = "[0-9][0-9][0-9][0-9][0-9][0-9]*"
+"""Names that begin with a frame's stem, as a pattern of `fnmatch`."""
 
 
 class FrameNames:

@@ -15,14 +15,14 @@ from nlos_cam.errors import RecordingError
 from nlos_cam.files import atomic_directory, read_arrays
 from nlos_cam.objects import mesh_from_depth
 from nlos_cam.reconstruct import ignore
-from nlos_cam.recording import FRAME_STEM, FrameNames
+from nlos_cam.recording import FRAME_GLOB, FRAME_STEM, FrameNames
 
 OBJECT_FORMATS = ("ply", "glb", "obj", "csv", "npz", "points")
 """Suffixes of `SurfaceMesh.save`, and "points" for a .ply without faces."""
 ENDINGS = {name: "-points.ply" if name == "points" else f".{name}" for name in OBJECT_FORMATS}
 OBJECT_FILE = re.compile(rf"{FRAME_STEM}({'|'.join(map(re.escape, ENDINGS.values()))})")
 """Names that ObjectFiles gives."""
-OBJECT_PATTERNS = [f"[0-9][0-9][0-9][0-9][0-9][0-9]*{ending}" for ending in ENDINGS.values()]
+OBJECT_PATTERNS = [f"{FRAME_GLOB}{ending}" for ending in ENDINGS.values()]
 """The same names, as patterns of `fnmatch`."""
 
 
