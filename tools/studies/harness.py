@@ -8,6 +8,7 @@ docs/, `table` prints Markdown.
 
 import hashlib
 import json
+import re
 import sys
 from argparse import ArgumentParser, ArgumentTypeError, RawDescriptionHelpFormatter
 from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
@@ -155,7 +156,18 @@ def write(name: str, facts: Any, folder: Path | None = None) -> None:
     """Write docs/figures/NAME.json, or the same in another folder, with DIGITS of each number."""
     path = (folder or DOCS) / "figures" / f"{name}.json"
     path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(json.dumps(rounded(facts), indent=1) + "\n", encoding="utf-8")
+    path.write_text(with_records_on_one_line(rounded(facts)), encoding="utf-8")
+
+
+def with_records_on_one_line(facts: Any) -> str:
+    """Return facts as indented JSON whose innermost lists and records take one line each."""
+    text = json.dumps(facts, indent=1)
+    return re.sub(r"[\[{][^\[\]{}]+[\]}]", _on_one_line, text) + "\n"
+
+
+def _on_one_line(innermost: re.Match[str]) -> str:
+    """Join the lines of a list or record that holds no other."""
+    return re.sub(r"\n\s*", " ", innermost[0])
 
 
 def rounded(facts: Any) -> Any:

@@ -65,6 +65,14 @@ def test_studies_and_attacks_know_one_state_of_the_program(harness: ModuleType, 
     assert {"*.toml", "SHA256SUMS"} < set(state.PATTERNS)
 
 
+def test_figures_come_back_as_written_a_record_a_line(harness: ModuleType) -> None:
+    facts = {"a, {b}": [{"value": 0.5, "of": "two\nlines"}, {"value": [1, 2], "empty": []}]}
+    text = harness.with_records_on_one_line(facts)
+
+    assert json.loads(text) == facts
+    assert '{ "value": 0.5, "of": "two\\nlines" }' in text.split("\n  ")[1]
+
+
 def test_line_that_a_kill_cut_short_is_made_again(harness: ModuleType, tmp_path: Path) -> None:
     path = tmp_path / "results.jsonl"
     path.write_text('{"a": 1}\n{"a": 2}\n{"a"', encoding="utf-8")
