@@ -30,6 +30,8 @@ JUDGED_EVERY = 3
 """Every third object is held out to judge the result."""
 VALIDATION_EVERY = 4
 """Of the others, every fourth is held out to choose the epoch."""
+MIN_FRAMES = 2
+"""Least that a network trains on."""
 DIGITS = 12
 TRUTHS = ".bag", ".json", ".toml", ".npy", ".stl", ".obj", ".ply"
 Part = Literal["adaptation", "validation", "judged"]
@@ -190,6 +192,11 @@ def write_parts(found: Recordings, folder: Path, tracked: data.Tracked) -> dict[
             )
         data.write_shards(labelled, folder / part)
     return folders
+
+
+def are_enough(parts: Mapping[Part, Path]) -> bool:
+    """Return whether the datasets of recordings hold frames enough to train on."""
+    return len(data.open_dataset(parts["adaptation"])) >= MIN_FRAMES
 
 
 def _is_whole(folder: Path, labels: Sequence[str]) -> bool:

@@ -50,6 +50,7 @@ from nlos_cam.adapt.recordings import (
     Part,
     Recordings,
     Transfer,
+    are_enough,
     fit_to_recordings,
     iou_of,
     parts_of,
@@ -160,7 +161,10 @@ def adapt(
         before = {} if job.locked else _figures(measure, job.start_folder, job.folder / BEFORE)
         if job.recordings and not job.locked:
             # Now, since one that cannot be used is an error, before minutes of training.
-            _parts_of(job.recordings, folders[-1], tracked)
+            parts = _parts_of(job.recordings, folders[-1], tracked)
+            if not are_enough(parts):
+                on_message(f"note: {job.recordings.folder} holds too few frames: nothing is fitted")
+                job = replace(job, recordings=None)
         _train_stages(job, plan, folders, tracked, watch, on_message)
         if job.locked:
             was_there = _stored_figures(folders[-1] / REPORT) is not None

@@ -123,7 +123,7 @@ def adapt(
     optional: dict[str, Any] = {"workers": workers} if workers else {}
     job = adaptation.Adaptation(
         rig,
-        adaptation.calibration_spread(measured),
+        adaptation.calibration_spread(measured).within(rig),
         work,
         weights,
         sensor,
@@ -134,17 +134,19 @@ def adapt(
         begin_again=overwrite,
         **optional,
     )
+    so_far = f"what was made is kept in {work}; give the same command to go on"
     try:
-        result = adaptation.adapt(
-            job,
-            minutes,
-            _measure_on(job),
-            tracked=common.tracked,
-            watch=watched_run,
-            on_message=common.say,
-        )
+        with common.interrupted_by_signals():  # a library may turn it into another error
+            result = adaptation.adapt(
+                job,
+                minutes,
+                _measure_on(job),
+                tracked=common.tracked,
+                watch=watched_run,
+                on_message=common.say,
+            )
     except KeyboardInterrupt:
-        common.exit_interrupted(f"what was made is kept in {work}; give the same command to go on")
+        common.exit_interrupted(so_far)
     target = result.weights
     kept = result.is_better if locked else _is_worth_keeping(result, folder)
     if kept and not locked:
@@ -240,7 +242,7 @@ def _better_weights(result: adaptation.AdaptResult, rig: walls.Rig) -> str:
 def _better_words(result: adaptation.AdaptResult) -> str:
     """Return which weights are better than those of an adaptation that is not kept."""
     if result.is_better:
-        return "weights in use, which stay (more --minutes help)"
+        return "weights in use (more --minutes help)"
     if result.shipped_are_better:
         return f"shipped weights ({result.shipped_iou:.3f}; more --minutes help)"
     return "start weights (more --minutes help)"
@@ -281,11 +283,11 @@ def _report(
     adaptation.write_page(result, tables, commands, page, kept=kept)
     _, before, after = rows[0]
     state = "was finished before" if result.was_there else "done"
-    worse = "" if kept or result.plan.locked else f", worse than the {_better_words(result)}"
-    text = (
-        f"{state}: {rows[0][0]} {before} -> {after} on this bench{worse}; weights in {target},"
-        f" report {page}"
-    )
+    outcome = f"; weights in {target}"
+    if not kept and not result.plan.locked:
+        better = _better_words(result)
+        outcome = f", worse than the {better}: not used, the weights in use stay ({target})"
+    text = f"{state}: {rows[0][0]} {before} -> {after} on this bench{outcome}; report {page}"
     if expected and expected.hidden_share:
         text += f"; {forecast.hidden_words(expected.hidden_share)}"
     facts: dict[str, Any] = {

@@ -95,11 +95,12 @@ GainSpread = Annotated[
     ),
 ]
 ObjectsPerRig = Annotated[
-    int,
+    int | None,
     typer.Option(
         "--objects-per-rig",
         min=1,
-        help="Objects that share a draw of the spreads; 50 render 4 times as fast.",
+        help="Objects that share a draw of the spreads (default: 1, with --any-rig 25); 50 render 4"
+        " times as fast.",
     ),
 ]
 OffRecord = Annotated[
@@ -192,7 +193,7 @@ def build(
     gain_spread_percent: GainSpread = 0.0,
     off_record: OffRecord = False,
     any_rig: AnyRig = False,
-    objects_per_rig: ObjectsPerRig = 1,
+    objects_per_rig: ObjectsPerRig = None,
     accuracy: AccuracyName = "standard",
     expected_maps: Expected = False,
     workers: Workers = None,
@@ -218,9 +219,7 @@ def build(
         spread=spread,
         textures=tuple(shapes.TEXTURES) if colour else (),
         expected=expected_maps,
-        objects_per_rig=(
-            data.OBJECTS_PER_RIG if any_rig and objects_per_rig == 1 else objects_per_rig
-        ),
+        objects_per_rig=objects_per_rig or (data.OBJECTS_PER_RIG if any_rig else 1),
         off_record=off_record,
         rigs=data.RigRange() if any_rig else None,
     )

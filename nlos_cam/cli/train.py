@@ -94,7 +94,8 @@ class RunOptions:
         bool,
         typer.Option(
             "--compile",
-            help="Run the networks through torch.compile; faster, needs a C++ compiler.",
+            help="Run the networks through torch.compile; needs a C++ compiler, and is faster but for"
+            " the compressor on a CPU.",
         ),
     ] = False
     json: Json = False
@@ -455,6 +456,8 @@ def doubt(
     pipeline = models.load_reconstructor(weights, cache_folder() / "onnx")
     datasets = data_sets.open_dataset(data), data_sets.open_dataset(held_out_data)
     data_sets.check_uncertainty_data(recipe, pipeline, *datasets)
+    available = min(recipe.held_out, len(datasets[1]))
+    recipe = recipe.model_copy(update={"held_out": available})
     kinds = list(data_sets.outliers_beside(datasets[0].plan.objects.share_generic))
     about = training.record_uncertainty_run(recipe, run.out, watched, kinds)
     with tracked("rendering empty benches and outliers") as on_progress:

@@ -114,6 +114,8 @@ WIDE = BenchSpread(0.004, 0.6, 0.7, 60.0, 0.006, 0.003, 0.002, 0.2)
 """Deviations of an empty bench that must not look like an object."""
 NO_OCCLUDER_SHARE = 0.1
 """Share of empty benches without an occluder: a bare wall."""
+OFF_WALL_M = 0.01
+"""Least distance of an object from the wall."""
 
 
 def vary_bench(
@@ -174,8 +176,12 @@ def far(generator: Generator, box: ObjectBox) -> Float32:
 
 @hides
 def near(generator: Generator, box: ObjectBox) -> Float32:
-    """Add an object that sticks out of the box, 40 to 90 mm nearer to the wall."""
-    return draw_object(generator, box, front_m=0.0) - np.float32(generator.uniform(0.04, 0.09))
+    """Add an object that sticks out of the box, 40 to 90 mm nearer to the wall, as far as there is
+    room before it.
+    """
+    depth_m = draw_object(generator, box, front_m=0.0)
+    room_m = max(box.z_near_m - OFF_WALL_M, 0.0)
+    return depth_m - np.float32(min(generator.uniform(0.04, 0.09), room_m))
 
 
 @hides
@@ -241,15 +247,20 @@ def tilted(generator: Generator, box: ObjectBox) -> Float32:
     return draw_object(generator, box, **pose)
 
 
+def _depth_in(box: ObjectBox, share: float, generator: Generator) -> float:
+    """Return a depth between the box's front and a share of its far side's depth, which in a thin
+    box may lie before the front.
+    """
+    return float(generator.uniform(box.z_near_m, max(share * box.z_far_m, box.z_near_m)))
+
+
 @hides
 def plates(generator: Generator, box: ObjectBox) -> Float32:
     """Add a large slanted plate without relief."""
     steps = np.linspace(-0.5, 0.5, OBJECT_PIXELS)
     x, y = np.meshgrid(steps, -steps)
     slope_x, slope_y = generator.uniform(-1, 1, 2)
-    depth_m = generator.uniform(box.z_near_m, 0.8 * box.z_far_m) + shapes.box_width_m(box) * (
-        slope_x * x + slope_y * y
-    )
+    depth_m = _depth_in(box, 0.8, generator) + shapes.box_width_m(box) * (slope_x * x + slope_y * y)
     half_x, half_y = generator.uniform(0.3, 0.5, 2)
     covered = (abs(x) < half_x) & (abs(y) < half_y) & (depth_m > 0.5 * box.z_near_m)
     return np.where(covered, depth_m, np.nan).astype(np.float32)
@@ -347,9 +358,7 @@ def bars(generator: Generator, box: ObjectBox) -> Float32:
     """Add a cage of parallel bars, upright or lying."""
     period = int(generator.integers(10, 24))
     at = (np.arange(OBJECT_PIXELS) + int(generator.integers(period))) % period < max(2, period // 4)
-    depth_m = np.where(at, generator.uniform(box.z_near_m, 0.7 * box.z_far_m), np.nan).astype(
-        np.float32
-    )
+    depth_m = np.where(at, _depth_in(box, 0.7, generator), np.nan).astype(np.float32)
     sheet = np.ascontiguousarray(np.broadcast_to(depth_m, (OBJECT_PIXELS, OBJECT_PIXELS)))
     return sheet if generator.random() < 0.5 else np.ascontiguousarray(sheet.T)
 
@@ -363,7 +372,7 @@ def rings(generator: Generator, box: ObjectBox) -> Float32:
     turn = euler_matrix(*np.radians(generator.uniform(-60, 60, 3)))[:3, :3]
     pose = shapes.Pose(
         size_m=shapes.box_width_m(box) * generator.uniform(0.55, 0.9),
-        front_m=generator.uniform(0, 0.1),
+        front_m=min(generator.uniform(0, 0.1), 0.5 * (box.z_far_m - box.z_near_m)),
     )
     return shapes.orthographic_depth(
         shapes.place(np.asarray(ring.triangles) @ turn.T, pose, box), box

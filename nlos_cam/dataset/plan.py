@@ -101,6 +101,12 @@ class RigSpread(Record):
                 f"a gain spread of {self.gain_share:.0%} leaves no light: keep it below 100 %"
             )
 
+    def within(self, rig: Rig) -> "RigSpread":
+        """Return the spread with places so near the rig's that the occluder stays beside the object
+        box.
+        """
+        return self.model_copy(update={"place_m": min(self.place_m, _free_m(rig))})
+
     def draw(self, rig: Rig, sensor: SensorModel, seed: int) -> tuple[Rig, SensorModel]:
         """Return the rig and the sensor of one draw; without a spread they are the given ones."""
         if self == RigSpread():

@@ -58,6 +58,16 @@ class Dataset:
         """Yield each sample's rig as it is known, in their order."""
         return (self.plan.known_rig(seed) for shard in self.shards for seed in shard.seeds)
 
+    def up_to(self, count: int) -> "Dataset":
+        """Return the dataset of the first `count` objects, or itself if there are no more."""
+        shards: list[Shard] = []
+        left = count
+        for shard in self.shards:
+            if left > 0:
+                shards.append(replace(shard, seeds=shard.seeds[:left]))
+            left -= len(shard.seeds)
+        return replace(self, shards=tuple(shards))
+
     def as_recorded(self) -> "Dataset":
         """Return the dataset with maps as the lidar measured them, from which a measured bare wall
         is subtracted; itself where it has no others.

@@ -92,6 +92,11 @@ class RigRange(Record):
         # A lidar that sees the object directly is no bench of this kind.
         low_m, high_m = self.gap_m
         high_m = min(high_m, _sight_m(distance_m, x_m, box) - MARGIN_M)
+        if not high_m > 0:
+            raise SceneError(
+                f"the lidar sees the object box of {rig.name} past any occluder: move the box farther"
+                " from the lidar along the wall"
+            )
         gap_m = _between((min(low_m, high_m), high_m), share[3])
 
         lidar = rig.lidar.model_copy(
@@ -130,5 +135,6 @@ def _sight_m(distance_m: float, edge_m: float, box: ObjectBox) -> float:
     """
     # Lines to the box's nearest edges pass lowest: at its two ends along the wall.
     ends_m = np.array([box.x_min_m, box.x_max_m])
-    passed_m = distance_m + (box.z_near_m - distance_m) * edge_m / ends_m
+    with np.errstate(divide="ignore", invalid="ignore"):  # a box that begins at the lidar's foot
+        passed_m = distance_m + (box.z_near_m - distance_m) * edge_m / ends_m
     return float(passed_m.min())

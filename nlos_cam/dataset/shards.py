@@ -104,15 +104,19 @@ def shard_origin(path: Path) -> tuple[str, str]:
 
 
 def read_arrays(head: Shard, names: Sequence[str]) -> list[NDArray[Any]]:
-    """Return arrays of a shard. Raises RecordingError where one differs from its checksum."""
+    """Return arrays of the objects of a head. The shard may have more, where its dataset was
+    extended since the head was read, or is not used whole.
+
+    Raises RecordingError where an array differs from its checksum.
+    """
+    count = len(head.seeds)
     with open_shard(head.path) as file:
         found = [_checked(head.path, name, file) for name in names]
+        rows = max(count, len(_checked(head.path, "seed", file)))
     for name, values in zip(names, found, strict=True):
-        if len(values) != len(head.seeds):
-            raise _damaged(
-                head.path, f"{name} has {len(values)} rows for {len(head.seeds)} objects"
-            )
-    return found
+        if len(values) != rows:
+            raise _damaged(head.path, f"{name} has {len(values)} rows for {rows} objects")
+    return [values[:count] for values in found]
 
 
 def check_arrays(head: Shard) -> None:
@@ -148,9 +152,9 @@ def _as_bytes(samples: Samples, provenance: str, command: str) -> bytes:
     memory = BytesIO()
     with h5py.File(memory, "w") as file:
         seeds = samples["seed"]
-        file.attrs.update(
-            {"plan": provenance, "plan_sha256": _digest(provenance.encode()), "command": command}
-        )
+        file.attrs.update({"plan": provenance, "plan_sha256": _digest(provenance.encode())})
+        # a path may hold bytes that are no text, which HDF5 does not store
+        file.attrs["command"] = command.encode("utf-8", "backslashreplace").decode()
         file.attrs["package_version"] = __version__
         file.attrs["commit"] = program_commit()
         file.attrs.update({"first_seed": int(seeds[0]), "last_seed": int(seeds[-1])})

@@ -144,8 +144,8 @@ def read_maps(
     """Return the maps of a recipe. Raises SceneError where they are too few, of two rigs, or not
     held out.
 
-    To expected maps the sensor's noise is added, in each epoch another draw. A stream reads a whole
-    dataset and keeps a few shards in memory. Maps of another rig than that of the weights that a
+    To expected maps the sensor's noise is added, in each epoch another draw. A stream reads the
+    objects from disk and keeps a few shards in memory. Maps of another rig than that of the weights that a
     transfer has as its `start` are aligned with it; expected ones are refused.
     """
     if wall and recipe.maps == "raw maps":
@@ -156,11 +156,6 @@ def read_maps(
     for each in (dataset, other):
         _check_one_rig(each.plan, recipe, start)
     plan = dataset.plan
-    count = len(dataset)
-    if stream and count != recipe.objects:
-        raise SceneError(
-            f"{data} holds {count} objects, and a stream reads all of them: give --objects {count}"
-        )
     bare = None
     if recipe.maps == "difference maps":
         bare = measured_bare_wall(wall) if wall else render_bare_wall(plan)
@@ -179,7 +174,8 @@ def read_maps(
         held_out = align_all(held_out, other.benches(), start)
     source: MapSource
     if stream:
-        source = Streamed(dataset, dataset.column("image"), bare)
+        used = dataset.up_to(recipe.objects)
+        source = Streamed(used, used.column("image"), bare)
     else:
         maps = dataset.first(recipe.objects)
         maps = subtract_bare_wall(maps, *bare) if bare else maps

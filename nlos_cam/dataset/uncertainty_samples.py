@@ -387,8 +387,13 @@ def quality_set(
     maps get noise.
 
     Raises SceneError where weights and dataset do not fit together, or the dataset has too few
-    kinds.
+    objects or kinds.
     """
+    if len(dataset) < objects:
+        raise SceneError(
+            f"{dataset.folder} holds {len(dataset)} objects, and {objects} are wanted: build more,"
+            " or lower --objects"
+        )
     if pipeline.record.input != "raw maps" or not _fit(dataset.plan, pipeline.record):
         raise SceneError(
             "the quality model needs raw maps of the weights' own rig: use another --dataset or"

@@ -8,7 +8,7 @@ record says what they gave. All settings here run as in `live`: ONNX Runtime, on
 import shlex
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field, replace
 from itertools import repeat
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -28,7 +28,7 @@ from nlos_cam.evaluate.metrics import SMALLER_IS_BETTER, TARGETS, Figures, Inter
 from nlos_cam.evaluate.render_tradeoff import INCOMPLETE, undominated, write_table
 from nlos_cam.files import atomic_directory
 from nlos_cam.objects import benchmark_objects, object_box, unseen_objects
-from nlos_cam.render import MultiBounce, paper_scene
+from nlos_cam.render import MultiBounce, SensorModel, paper_scene
 from nlos_cam.report import (
     Banner,
     Bullets,
@@ -102,6 +102,7 @@ class ObjectSet:
     truth: Float32
     """(n, 64, 64) in v."""
     echoes: list[MultiBounce]
+    sensor: SensorModel = field(default_factory=SensorModel)
 
     @classmethod
     def of(
@@ -114,7 +115,7 @@ class ObjectSet:
 
     def maps(self, frames: int) -> MapSet:
         """Return maps averaged over frames, as `live` forms them."""
-        sensed = subjects.sense(self.echoes, self.rig, frames=frames)
+        sensed = subjects.sense(self.echoes, self.rig, self.sensor, frames=frames)
         return subjects.as_map_set(sensed, self.truth)
 
 
@@ -123,6 +124,10 @@ class BothSets(NamedTuple):
 
     kinds: ObjectSet
     unseen: ObjectSet
+
+    def seen_by(self, sensor: SensorModel) -> "BothSets":
+        """Return the sets as another sensor sees them."""
+        return BothSets(*(replace(each, sensor=sensor) for each in self))
 
 
 @dataclass(frozen=True)
@@ -162,7 +167,11 @@ def open_reconstruct_bench(
         checksum: _both_sets(rig, count, tracked)
         for checksum, rig in {rig.checksum: rig for rig in rigs.values()}.items()
     }
-    return ReconstructBench(networks, {name: rendered[rig.checksum] for name, rig in rigs.items()})
+    sets = {
+        name: rendered[rig.checksum].seen_by(subjects.sensor_of(networks[name].record, rig))
+        for name, rig in rigs.items()
+    }
+    return ReconstructBench(networks, sets)
 
 
 def _both_sets(rig: Rig, count: int | None, tracked: subjects.Tracked) -> BothSets:

@@ -18,7 +18,6 @@ from nlos_models import (
     ANY,
     GOOD_IOU,
     RIG_WEIGHTS,
-    CheckpointRecord,
     load_reconstructor,
     load_uncertainty_model,
     shipped_folder,
@@ -32,8 +31,7 @@ from nlos_cam.evaluate.figures import LABELS
 from nlos_cam.evaluate.recognition import PER_KIND, recognised
 from nlos_cam.files import atomic_directory, cache_folder, program_name
 from nlos_cam.objects import CATEGORIES
-from nlos_cam.reconstruct import rig_to_align_with, weights_for
-from nlos_cam.render import SensorModel
+from nlos_cam.reconstruct import weights_for
 from nlos_cam.report import (
     Banner,
     Bullets,
@@ -152,16 +150,6 @@ class Evaluation:
         }
 
 
-def sensor_of(record: CheckpointRecord, rig: Rig) -> SensorModel:
-    """Return the sensor under which weights are measured on a rig: the simulated camera's, at the
-    gain of their training where their maps are not aligned, which would take it out.
-    """
-    counts = record.bare_wall_counts
-    if counts is None or rig_to_align_with(rig, record) is not None:
-        return SensorModel()
-    return SensorModel(bare_wall_counts=counts)
-
-
 def evaluate(
     weights: Path | None,
     objects: subjects.HeldOutObjects | Path | None = None,
@@ -194,7 +182,7 @@ def evaluate(
     second: subjects.HeldOutObjects | None = None
     if objects is None:
         rig = rig or subjects.rig_of(record)
-        render = partial(subjects.rendered_objects, rig, sensor=sensor_of(record, rig))
+        render = partial(subjects.rendered_objects, rig, sensor=subjects.sensor_of(record, rig))
         second = None if count else render(tracked=tracked, test="unseen")
         objects = render(count, tracked)
     bare = subjects.bare_wall_for(record, objects.plan, wall)

@@ -76,6 +76,16 @@ def truth_of(subjects: Sequence[Subject], box: ObjectBox) -> Float32:
     return np.stack([shapes.image_from_depth(subject.depth_m, box) for subject in subjects])
 
 
+def sensor_of(record: CheckpointRecord, rig: Rig) -> SensorModel:
+    """Return the sensor under which weights are measured on a rig: the simulated camera's, at the
+    gain of their training where their maps are not aligned, which would take it out.
+    """
+    counts = record.bare_wall_counts
+    if counts is None or rig_to_align_with(rig, record) is not None:
+        return SensorModel()
+    return SensorModel(bare_wall_counts=counts)
+
+
 def echoes_of(
     subjects: Sequence[Subject], rig: Rig, on_progress: OnProgress, pulse_ns: float = 0.0
 ) -> list[MultiBounce]:

@@ -89,6 +89,9 @@ class SmallDataset:
     def first(self, count: int) -> MapSet:
         return first_of(self._maps, count)
 
+    def up_to(self, count: int) -> "SmallDataset":
+        return SmallDataset(self.first(count), self.plan, self.folder, min(self.seeds))
+
     def benches(self) -> Iterator[Any]:
         return repeat(self.plan.rig, len(self))
 

@@ -36,7 +36,7 @@ class Recipe(BaseModel, frozen=True, extra="forbid"):
     task: str
     colour: bool = False
     """Train on RGB albedo in place of depth, in simulation only."""
-    seed: int = Field(default=0, ge=0)
+    seed: int = Field(default=0, ge=0, lt=2**63)
     objects: int = Field(gt=0)
     """Training objects: for a VAE seeds 0, 1, ..., else the first of a dataset; held-out objects
     are different ones. For a direct network the samples of an epoch, drawn from all objects that
@@ -50,7 +50,7 @@ class Recipe(BaseModel, frozen=True, extra="forbid"):
     """Initial rate, or one-cycle's peak; above the rate at which a plateau run ends (SI 3 and
     4).
     """
-    betas: tuple[float, float] = (0.5, 0.999)
+    betas: tuple[Share, Share] = (0.5, 0.999)
     schedule: Literal["one-cycle", "plateau", "cosine"] = "plateau"
     warm_up_steps: int = Field(default=100, ge=0)
     """Cosine schedule: steps in which the rate rises."""

@@ -22,6 +22,7 @@ from nlos_cam.adapt.recordings import (
     Part,
     Recordings,
     Transfer,
+    are_enough,
     fit_to_recordings,
     parts_of,
     write_parts,
@@ -176,6 +177,19 @@ def test_a_recording_without_a_truth_stops_before_training(
         adapt(replace(job, recordings=found), 1.0, measure)
 
     training.assert_not_called()
+
+
+def test_recordings_of_one_frame_are_left_out_before_training(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    found = Recordings(
+        tmp_path, {label: [Path(label)] for label in list(OBJECTS)[:3]}, no_bench, "0" * 12
+    )
+    monkeypatch.setattr(
+        "nlos_cam.dataset.read_labelled", lambda paths, **_: labelled_of(paths[0].name, 1)
+    )
+
+    assert not are_enough(write_parts(found, tmp_path / "parts", untracked))
 
 
 def labelled_of(label: str, frames: int) -> Labelled:

@@ -116,6 +116,14 @@ def test_quality_model_sees_maps_as_the_direct_network_does(
     np.testing.assert_array_equal(np.stack(network.intensity), aligned.intensity)
 
 
+def test_quality_model_of_fewer_objects_than_wanted_is_refused(built: Callable[..., Path]) -> None:
+    dataset = open_dataset(built("maps"))
+    judge: Any = lambda *_: None  # noqa: E731
+
+    with pytest.raises(SceneError, match=f"holds {OBJECTS} objects, and 6000 are wanted"):
+        quality_set(Network(), judge, dataset, 6000, lambda *_: None)
+
+
 def test_quality_model_of_one_kind_is_refused_before_its_work(
     built: Callable[..., Path], monkeypatch: pytest.MonkeyPatch
 ) -> None:

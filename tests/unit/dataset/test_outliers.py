@@ -98,6 +98,19 @@ def test_outlier_shows_surface_before_the_wall(name: str) -> None:
         assert stimulus.scene.rig == stimulus.rig
 
 
+@every_outlier
+@pytest.mark.parametrize("z_m", [(0.02, 0.3), (0.08, 0.36), (0.30, 0.37)])
+def test_outlier_of_another_box_is_before_the_wall_too(name: str, z_m: tuple[float, float]) -> None:
+    near_m, far_m = z_m
+    box = BOX.model_copy(update={"z_near_m": near_m, "z_far_m": far_m})
+    plain = Stimulus(RIG.model_copy(update={"object_box": box}), SENSOR)
+    kind = {**TRAINING_OUTLIERS, **HELD_OUT_OUTLIERS}[name]
+
+    for seed in SEEDS:
+        depth_m = draw_outlier(kind, np.random.default_rng(seed), plain).depth_m
+        assert np.nanmin(depth_m) > 0.0
+
+
 def test_kinds_to_learn_and_to_judge_differ() -> None:
     assert not set(TRAINING_OUTLIERS) & set(HELD_OUT_OUTLIERS)
     assert {*TRAINING_OUTLIERS, *HELD_OUT_OUTLIERS} > SHAPE_OUTLIERS

@@ -22,7 +22,7 @@ from nlos_cam.dataset.plan import (
     scene_row,
 )
 from nlos_cam.errors import SceneError
-from nlos_cam.objects import CATEGORIES, TEXTURES
+from nlos_cam.objects import CATEGORIES, TEXTURES, object_box
 from nlos_cam.render import Material, SceneFile, SensorModel
 
 RIG = load_rig("paper-rig")
@@ -244,6 +244,18 @@ def test_plan_check_refuses_impossible_plans(changes: dict[str, Any], words: str
 @pytest.mark.parametrize("textures", [(), tuple(TEXTURES)])
 def test_plan_check_accepts_possible_plans(textures: tuple[str, ...]) -> None:
     replace(PLAN, textures=textures).check()
+
+
+def test_spread_within_a_rig_keeps_the_occluder_beside_the_box() -> None:
+    rig = load_rig("paper-rig")
+    assert rig.occluder is not None
+    close = rig.occluder.model_copy(update={"x_m": object_box(rig).x_min_m - 0.0002})
+    tight = rig.model_copy(update={"occluder": close})
+    spread = RigSpread(place_m=0.0005, angle_deg=0.1)
+
+    assert spread.within(rig) == spread
+    spread.within(tight).check(tight)
+    assert spread.within(tight).place_m == pytest.approx(0.0002)
 
 
 def test_spread_refuses_negative_lengths() -> None:

@@ -17,7 +17,7 @@ from nlos_models.training import MapBatch, MapSet
 from nlos_cam.dataset import DatasetPlan, reader
 from nlos_cam.dataset.locked import LOCKED
 from nlos_cam.dataset.reader import MAP_CHANNELS, Dataset, _Window, open_dataset
-from nlos_cam.dataset.shards import shard_path, store
+from nlos_cam.dataset.shards import shard_origin, shard_path, store
 from nlos_cam.errors import RecordingError
 
 PLAN = DatasetPlan(load_rig("paper-rig"), 40)
@@ -66,6 +66,35 @@ def _assert_as_stored(found: MapBatch) -> None:
 def test_dataset_has_its_samples_and_plan(data: Dataset) -> None:
     assert len(data) == COUNT
     assert data.plan == PLAN
+
+
+@pytest.mark.parametrize("count", [1, SHARD, 2 * SHARD + 3, COUNT, COUNT + 1])
+def test_first_objects_of_a_dataset_are_a_dataset(data: Dataset, count: int) -> None:
+    first = data.up_to(count)
+    wanted = min(count, COUNT)
+
+    assert len(first) == wanted
+    assert sorted(_every_row(first)) == list(range(wanted))
+    np.testing.assert_array_equal(first.arrays().image, data.first(count).image)
+
+
+def test_dataset_stays_as_opened_while_it_is_extended(folder: Path, tmp_path: Path) -> None:
+    copy = Path(shutil.copytree(folder, tmp_path / "copy"))
+    opened = open_dataset(copy)
+    before = opened.arrays()
+    last = 40 + COUNT - COUNT % SHARD
+    longer = samples_of(range(last, last + SHARD))
+    store(shard_path(copy, last), longer, PLAN.provenance, "")
+
+    np.testing.assert_array_equal(opened.arrays().image, before.image)
+    assert len(open_dataset(copy)) == last + SHARD - 40
+
+
+def test_command_of_a_shard_may_hold_bytes_that_are_no_text(tmp_path: Path) -> None:
+    path = shard_path(tmp_path, 40)
+    store(path, samples_of(range(40, 42)), PLAN.provenance, "build --out bad\udcff")
+
+    assert shard_origin(path)[1] == "build --out bad\\udcff"
 
 
 @pytest.mark.parametrize("name", MAP_CHANNELS)

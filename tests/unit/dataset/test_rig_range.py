@@ -56,6 +56,13 @@ def test_rig_without_an_occluder_cannot_be_drawn_around() -> None:
         RigRange().draw(load_rig("bare-wall"), 0)
 
 
+@pytest.mark.parametrize("x_min_m", [0.0, 0.01])
+def test_box_that_every_gap_shows_cannot_be_drawn_around(x_min_m: float) -> None:
+    box = object_box(HOME).model_copy(update={"x_min_m": x_min_m, "x_max_m": x_min_m + 0.25})
+    with pytest.raises(SceneError, match="past any occluder"):
+        RigRange().extremes(HOME.model_copy(update={"object_box": box}))
+
+
 def test_range_needs_its_lower_end_first() -> None:
     with pytest.raises(ValidationError, match="lower end"):
         RigRange(gap_m=(0.2, 0.1))

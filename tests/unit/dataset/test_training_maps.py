@@ -186,20 +186,17 @@ def test_noise_has_its_stated_deviation_in_intensity_alone(stream: bool) -> None
 
 
 @pytest.mark.parametrize(
-    ("held_out", "wall", "stream", "word"),
+    ("held_out", "wall", "word"),
     [
-        ("other/../data", None, False, "--held-out"),
-        ("data again", None, False, "6 objects of .* seeds"),
-        ("other", WALL, False, r"wall\.toml"),
-        ("other-rig", None, False, "rigs"),
-        ("other", None, True, "--objects 6"),
+        ("other/../data", None, "--held-out"),
+        ("data again", None, "6 objects of .* seeds"),
+        ("other", WALL, r"wall\.toml"),
+        ("other-rig", None, "rigs"),
     ],
 )
-def test_read_maps_refuses_what_does_not_fit(
-    held_out: str, wall: Path | None, stream: bool, word: str
-) -> None:
+def test_read_maps_refuses_what_does_not_fit(held_out: str, wall: Path | None, word: str) -> None:
     with pytest.raises(SceneError, match=word):
-        _read("data", held_out, wall, stream=stream)
+        _read("data", held_out, wall)
 
 
 def test_rendered_bare_wall_cancels_a_frame_of_bare_wall() -> None:
@@ -316,6 +313,12 @@ def test_first_streamed_maps_are_at_most_all(stream: Streamed) -> None:
 
 def test_read_maps_streams_training_maps() -> None:
     assert isinstance(_read(stream=True, objects=6).training, Streamed)
+
+
+def test_stream_holds_the_first_objects_of_its_recipe() -> None:
+    images = _read(stream=True, objects=4).training.image
+
+    np.testing.assert_array_equal(images, small_maps(6, 4).image[:4])
 
 
 SHARD = 5

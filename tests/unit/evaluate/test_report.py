@@ -17,7 +17,7 @@ from nlos_models import CheckpointRecord
 from page_reader import read_page
 
 from nlos_cam.dataset import procedural_images
-from nlos_cam.evaluate import LABELS, report
+from nlos_cam.evaluate import LABELS, report, subjects
 from nlos_cam.evaluate.metrics import TARGETS, Interval, Predictions
 from nlos_cam.evaluate.report import (
     Evaluation,
@@ -95,9 +95,11 @@ def test_weights_are_measured_at_the_gain_of_their_training() -> None:
     own = CheckpointRecord(rig_name=rig.name, rig_checksum=rig.checksum, bare_wall_counts=120.0)
     moved = rig.model_copy(update={"lidar": rig.lidar.model_copy(update={"distance_m": 0.205})})
 
-    assert report.sensor_of(own, rig).bare_wall_counts == 120.0
-    assert report.sensor_of(own, moved) == SensorModel()  # alignment takes the gain out
-    assert report.sensor_of(own.model_copy(update={"bare_wall_counts": None}), rig) == SensorModel()
+    assert subjects.sensor_of(own, rig).bare_wall_counts == 120.0
+    assert subjects.sensor_of(own, moved) == SensorModel()  # alignment takes the gain out
+    assert (
+        subjects.sensor_of(own.model_copy(update={"bare_wall_counts": None}), rig) == SensorModel()
+    )
 
 
 def test_figures_have_names_that_scripts_depend_on() -> None:
